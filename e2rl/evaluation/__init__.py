@@ -1,0 +1,1 @@
+"""The closed-loop protocol and the files that a run writes."""

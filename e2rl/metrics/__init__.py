@@ -1,0 +1,1 @@
+"""How we tell: safety, realism and statistics as pure functions."""

@@ -1,0 +1,1 @@
+"""What is likely: the frozen reverse-time SDE prior over joint traffic futures."""

@@ -1,0 +1,1 @@
+"""What a situation is: recordings, scenes, lane graphs and their sources."""

@@ -1,0 +1,1 @@
+"""How it moves: dynamics, geometry, observation, reward, environment."""

@@ -1,0 +1,79 @@
+"""Geometry of routes: polylines with a vertex every SPACING metres, whose arc length is SPACING x vertex index.
+
+Routes are smoothed, so chords are a little shorter than SPACING; projection and interpolation use the index scale alike.
+"""
+
+import torch
+from torch import Tensor
+
+SPACING = 2.0  # m of arc length between vertices
+
+
+def _take(route: Tensor, index: Tensor) -> Tensor:
+    """Vertices route [..., P, 2] at index [..., K] -> [..., K, 2], leading dims broadcast."""
+    lead = torch.broadcast_shapes(route.shape[:-2], index.shape[:-1])
+    route = route.expand(*lead, *route.shape[-2:])
+    index = index.expand(*lead, index.shape[-1])
+    return route.gather(-2, index[..., None].expand(*index.shape, 2))
+
+
+def nearest_vertex(points: Tensor, route: Tensor, hint: Tensor | None = None, window: float = 20.0) -> Tensor:
+    """Index [..., K] of the vertex of route [..., P, 2] nearest to points [..., K, 2].
+
+    hint [..., K]: expected arc length; vertices farther than `window` m of it are not looked at (self-crossing routes).
+    """
+    squared = (route**2).sum(-1)[..., None, :] - 2 * points @ route.transpose(-1, -2)
+    if hint is not None:
+        arc = SPACING * torch.arange(route.shape[-2], device=route.device, dtype=points.dtype)
+        squared = squared.masked_fill((arc - hint[..., None]).abs() > window, torch.inf)
+    return squared.argmin(-1)
+
+
+def project(
+    points: Tensor, route: Tensor, hint: Tensor | None = None, window: float = 20.0
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Project points [..., K, 2] on route [..., P, 2] -> arc length s, offset d (left positive), heading, each [..., K].
+
+    Leading dims broadcast. Beyond the ends the first and last segments go on straight.
+    """
+    last = route.shape[-2] - 2
+    vertex = nearest_vertex(points, route, hint, window)
+    best = None
+    for start in ((vertex - 1).clamp(0, last), vertex.clamp(0, last)):
+        a, b = _take(route, start), _take(route, start + 1)
+        along = b - a
+        length = along.norm(dim=-1).clamp(min=1e-6)
+        unit = along / length[..., None]
+        offset = points - a
+        t = (offset * unit).sum(-1) / length
+        low = torch.where(start == 0, -torch.inf, 0.0)
+        high = torch.where(start == last, torch.inf, 1.0)
+        t = torch.maximum(torch.minimum(t, high), low)
+        gap = (offset - t[..., None] * along).norm(dim=-1)
+        d = unit[..., 0] * offset[..., 1] - unit[..., 1] * offset[..., 0]
+        found = (gap, SPACING * (start + t), torch.where(d < 0, -gap, gap), torch.atan2(unit[..., 1], unit[..., 0]))
+        best = found if best is None else tuple(
+            torch.where(found[0] < best[0], new, old) for new, old in zip(found, best, strict=True)
+        )
+    return best[1], best[2], best[3]
+
+
+def interpolate(route: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Point [..., K, 2], heading [rad] and curvature [1/m] (each [..., K]) of route [..., P, 2] at arc length s [..., K].
+
+    Points lie on the chords; headings turn linearly between vertex tangents, so they are continuous in s. Beyond the
+    ends the route goes on straight. Differentiable in s.
+    """
+    last = route.shape[-2] - 2
+    u = s / SPACING
+    i = u.detach().floor().clamp(0, last).long()
+    t = u - i
+    before, a, b, after = (_take(route, j) for j in ((i - 1).clamp(min=0), i, i + 1, (i + 2).clamp(max=last + 1)))
+    xy = a + t[..., None] * (b - a)
+    first, second = b - before, after - a
+    angle = torch.atan2(first[..., 1], first[..., 0])
+    cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+    turn = torch.atan2(cross, (first * second).sum(-1))
+    inside = (t >= 0) & (t <= 1)
+    heading = angle + t.clamp(0, 1) * turn
+    return xy, heading, torch.where(inside, turn / SPACING, 0.0)

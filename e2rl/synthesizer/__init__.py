@@ -1,0 +1,1 @@
+"""What is dangerous: topology, feasibility, skeleton, anchoring, potentials, guided control."""
