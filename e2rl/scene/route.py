@@ -1,6 +1,6 @@
 """Geometry of routes: polylines with a vertex every SPACING metres, whose arc length is SPACING x vertex index.
 
-Routes are smoothed, so chords are a little shorter than SPACING; projection and interpolation use the index scale alike.
+Routes are smoothed, so chords are a little shorter than SPACING; projection and interpolation share the index scale.
 """
 
 import torch
@@ -32,7 +32,7 @@ def nearest_vertex(points: Tensor, route: Tensor, hint: Tensor | None = None, wi
 def project(
     points: Tensor, route: Tensor, hint: Tensor | None = None, window: float = 20.0
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Project points [..., K, 2] on route [..., P, 2] -> arc length s, offset d (left positive), heading, each [..., K].
+    """Points [..., K, 2] on route [..., P, 2] -> arc length s, offset d (left positive), heading; each [..., K].
 
     Leading dims broadcast. Beyond the ends the first and last segments go on straight.
     """
@@ -59,7 +59,7 @@ def project(
 
 
 def interpolate(route: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Point [..., K, 2], heading [rad] and curvature [1/m] (each [..., K]) of route [..., P, 2] at arc length s [..., K].
+    """Point [..., K, 2], heading [rad], curvature [1/m] (each [..., K]) of route [..., P, 2] at arc length s [..., K].
 
     Points lie on the chords; headings turn linearly between vertex tangents, so they are continuous in s. Beyond the
     ends the route goes on straight. Differentiable in s.

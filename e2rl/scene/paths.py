@@ -1,0 +1,66 @@
+"""Vehicle paths over arc length: resampling, Whittaker smoothing and the heading of a body that follows its front axle.
+
+Paths are built over distance, not over time, so a creeping or standing vehicle cannot spin.
+"""
+
+import numpy as np
+from scipy.linalg import solveh_banded
+
+WHEELBASE = 0.6  # of the body's length; the axles lie 0.3 lengths before and behind its centre
+
+
+def arc_length(points: np.ndarray) -> np.ndarray:
+    """Cumulative length [..., P] of polylines [..., P, 2], starting at 0."""
+    steps = np.linalg.norm(np.diff(points, axis=-2), axis=-1)
+    return np.concatenate([np.zeros_like(steps[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
+
+
+def resample(points: np.ndarray, spacing: float) -> np.ndarray:
+    """Polyline [P, 2] at equal steps of at most `spacing` m, both ends kept -> [Q, 2], Q >= 2."""
+    s = arc_length(points)
+    keep = np.concatenate([[True], np.diff(s) > 1e-9])
+    count = max(int(np.ceil(s[-1] / spacing)), 1) + 1
+    at = np.linspace(0.0, s[-1], count)
+    return np.stack([np.interp(at, s[keep], points[keep, axis]) for axis in (0, 1)], -1)
+
+
+def offset(points: np.ndarray, distance: np.ndarray | float) -> np.ndarray:
+    """Polyline [P, 2] moved `distance` m (scalar or [P]) to its left."""
+    tangent = np.gradient(points, axis=0)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-9)
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], -1)
+    return points + np.broadcast_to(distance, len(points))[:, None] * normal
+
+
+def whittaker(values: np.ndarray, penalty: float) -> np.ndarray:
+    """Smooth values [T, C] (or [T]): argmin |z - y|^2 + penalty |D3 z|^2 (Whittaker 1923), D3 the third difference."""
+    count = len(values)
+    if count < 4:
+        return values
+    third = np.array([-1.0, 3.0, -3.0, 1.0])
+    bands = np.zeros((4, count))  # lower form: bands[k, i] = A[i + k, i]
+    for k in range(4):
+        for a in range(4 - k):
+            bands[k, a : a + count - 3] += third[a] * third[a + k]
+    bands *= penalty
+    bands[0] += 1.0
+    return solveh_banded(bands, values, lower=True)
+
+
+def tractrix(front: np.ndarray, wheelbase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses of bodies whose front axles run along `front` while their rear axles follow without side slip.
+
+    front [..., P, 2] in small steps (well below the wheelbase); wheelbase [...] m -> centres [..., P, 2] midway between
+    the axles, and unwrapped headings [..., P]. Kinematic bicycle: the rear axle moves along the body (a tractrix).
+    """
+    wheelbase = np.asarray(wheelbase, float)[..., None]
+    first = front[..., min(2, front.shape[-2] - 1), :] - front[..., 0, :]
+    norm = np.linalg.norm(first, axis=-1, keepdims=True)
+    unit = np.where(norm > 1e-9, first / np.maximum(norm, 1e-9), np.array([1.0, 0.0]))
+    rear = np.empty_like(front)
+    rear[..., 0, :] = front[..., 0, :] - wheelbase * unit
+    for p in range(1, front.shape[-2]):
+        body = front[..., p, :] - rear[..., p - 1, :]
+        rear[..., p, :] = front[..., p, :] - wheelbase * body / np.linalg.norm(body, axis=-1, keepdims=True)
+    body = front - rear
+    return (front + rear) / 2, np.unwrap(np.arctan2(body[..., 1], body[..., 0]), axis=-1)

@@ -1,0 +1,97 @@
+"""Kinematics of recordings: one smoother for all logs, and what a causal observer knows at a frame."""
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from e2rl.scene.recording import DT
+
+WINDOW, ORDER = 15, 2  # Savitzky-Golay: frames, polynomial order (design.md section 4)
+CAUSAL_WINDOW = 11  # frames: the current one and 1 s of history
+
+
+def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tracks [F, A, 4] stamped ts [F] s on a grid of DT; a grid frame is valid where both its neighbours are."""
+    ts = ts - ts[0]
+    count = int(round(ts[-1] / DT)) + 1
+    grid = np.arange(count) * DT
+    if count == len(ts) and np.abs(ts - grid).max() < 0.02:
+        return states, valid
+    right = np.clip(np.searchsorted(ts, grid - 1e-6), 1, len(ts) - 1)
+    left = right - 1
+    weight = np.clip((grid - ts[left]) / np.maximum(ts[right] - ts[left], 1e-6), 0, 1)[:, None]
+    turn = (states[right, :, 2] - states[left, :, 2] + np.pi) % (2 * np.pi) - np.pi
+    out = states[left] + weight[..., None] * (states[right] - states[left])
+    out[..., 2] = states[left, :, 2] + weight * turn
+    near_left, near_right = weight < 0.02 / DT, weight > 1 - 0.02 / DT
+    known = (valid[left] | near_right) & (valid[right] | near_left)
+    return out, known
+
+
+def drop_heading_flips(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """valid [F, A] without the frames that a heading jump > 1 rad divides from the track's longest run."""
+    valid = valid.copy()
+    jump = np.abs((np.diff(states[..., 2], axis=0) + np.pi) % (2 * np.pi) - np.pi) > 1.0
+    jump &= valid[1:] & valid[:-1]
+    for agent in np.flatnonzero(jump.any(0)):
+        run = np.concatenate([[0], np.cumsum(jump[:, agent])])
+        longest = np.bincount(run[valid[:, agent]]).argmax()
+        valid[:, agent] &= run == longest
+    return valid
+
+
+def pieces(valid: np.ndarray) -> list[tuple[int, int]]:
+    """[start, end) of the runs of True in valid [F]."""
+    edge = np.diff(np.concatenate([[False], valid, [False]]).astype(np.int8))
+    return list(zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1), strict=True))
+
+
+def smooth(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Tracks [F, A, 4] with smoothed positions, and the speed along the heading from their derivative.
+
+    Savitzky-Golay per contiguous piece; a piece shorter than the window takes the longest odd window it can.
+    """
+    out = states.copy()
+    for agent in range(states.shape[1]):
+        for start, end in pieces(valid[:, agent]):
+            window = min(WINDOW, (end - start - 1) // 2 * 2 + 1)
+            if window <= ORDER:
+                continue
+            track = states[start:end, agent, :2]
+            out[start:end, agent, :2] = savgol_filter(track, window, ORDER, axis=0)
+            velocity = savgol_filter(track, window, ORDER, deriv=1, delta=DT, axis=0)
+            heading = states[start:end, agent, 2]
+            along = velocity[:, 0] * np.cos(heading) + velocity[:, 1] * np.sin(heading)
+            out[start:end, agent, 3] = np.clip(along, 0.0, 45.0)
+    return out
+
+
+def causal_state(states: np.ndarray, valid: np.ndarray, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """State [A, 4], acceleration [A] and yaw rate [A] at `frame` from the frames up to it only.
+
+    Least squares over the contiguous trailing frames, at most CAUSAL_WINDOW: quadratic in position (linear below five
+    frames), linear in heading. The heading is the recorded one.
+    """
+    first = max(frame - CAUSAL_WINDOW + 1, 0)
+    time = (np.arange(first, frame + 1) - frame) * DT
+    known = np.flip(np.logical_and.accumulate(np.flip(valid[first:frame + 1], 0), axis=0), 0).astype(float)
+    count = known.sum(0)
+    heading = np.unwrap(states[first:frame + 1, :, 2], axis=0)
+    basis = np.stack([np.ones_like(time), time, time**2], 1)
+    position = _fit(basis, known, states[first:frame + 1, :, :2], quadratic=count >= 5)
+    turn = _fit(basis, known, heading[..., None], quadratic=np.zeros_like(count, bool))
+    angle = states[frame, :, 2]
+    unit = np.stack([np.cos(angle), np.sin(angle)], -1)
+    speed = np.clip((position[:, 1] * unit).sum(-1), 0.0, 45.0)
+    accel = np.clip(2 * (position[:, 2] * unit).sum(-1), -6.0, 4.0)
+    single = count < 2
+    speed = np.where(single, states[frame, :, 3], speed)
+    accel, yaw_rate = np.where(single | (speed < 0.1), 0.0, accel), np.where(single, 0.0, turn[:, 1, 0])
+    return np.concatenate([position[:, 0], angle[:, None], speed[:, None]], 1), accel, np.clip(yaw_rate, -1.0, 1.0)
+
+
+def _fit(basis: np.ndarray, weight: np.ndarray, value: np.ndarray, quadratic: np.ndarray) -> np.ndarray:
+    """Weighted polynomial coefficients [A, 3, C] of value [W, A, C] on basis [W, 3]."""
+    gram = np.einsum("wi,wa,wj->aij", basis, weight, basis)
+    drop = np.where(quadratic, 0.0, 1e9)
+    gram += 1e-9 * np.eye(3) + drop[:, None, None] * np.diag([0.0, 0.0, 1.0])
+    return np.linalg.solve(gram, np.einsum("wi,wa,wac->aic", basis, weight, np.nan_to_num(value)))

@@ -1,0 +1,146 @@
+"""From the `data` config group to a SceneSet: parallel parsing, a cache keyed by content, invalid scenes counted."""
+
+import hashlib
+import json
+import multiprocessing
+import os
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from tensordict import TensorDict
+from tqdm import tqdm
+
+from e2rl.errors import InputError
+from e2rl.scene import bundled, procedural, scenarionet
+from e2rl.scene.build import BuildSettings, build_scene, ego_overlaps
+from e2rl.scene.recording import Recording
+from e2rl.scene.scene import SceneSet, stack, validate
+
+VERSION = 1  # of the scene builder: raise it when the same recording would make another scene
+
+
+def load_scenes(data, num_scenes: int | None = None, split: str | None = None) -> SceneSet:
+    """The scenes that a `data` config names (conf/data/*.yaml), at most `num_scenes` of them.
+
+    split: overrides data.split for the bundled and procedural sources. Raises InputError for a missing or empty path
+    and, unless data.skip_invalid, for the first invalid scene.
+    """
+    settings = BuildSettings(**data.build)
+    split = split or data.split
+    if data.source == "scenarionet":
+        if not data.path:
+            raise InputError("data.path is not set; pass data.path=FOLDER_OR_ZIP of ScenarioDescription pickles")
+        scenes = _scenarionet(data, settings)
+    elif data.source == "bundled":
+        scenes = _cached(_fingerprint(bundled.asset_bytes(split), settings, None), data,
+                         lambda: _build_all(bundled.load_recordings(split), settings, data, "bundled", split))
+    elif data.source == "procedural":
+        recordings = procedural.generate_recordings(data.count, data.seed, split)
+        scenes = _build_all(recordings, settings, data, "procedural", split)
+    else:
+        raise InputError(f"data.source={data.source}: expected bundled, procedural or scenarionet")
+    return scenes.first(num_scenes)
+
+
+def _fingerprint(content: bytes, settings: BuildSettings, extra) -> str:
+    head = json.dumps([VERSION, asdict(settings), extra], sort_keys=True)
+    return hashlib.sha256(head.encode() + content).hexdigest()[:24]
+
+
+def _scenarionet(data, settings: BuildSettings) -> SceneSet:
+    files = scenarionet.list_files(data.path)
+    starts = list(data.starts) if data.starts else None
+    digest = hashlib.sha256()
+    for path in sorted({container if Path(container).is_file() else os.path.join(container, member)
+                        for container, member in files}):
+        digest.update(Path(path).read_bytes())
+    locations = scenarionet.read_locations(data.path)
+    extra = [starts, bool(data.skip_invalid), sorted(locations.items())]
+    split = data.split or Path(data.path).stem
+    key = _fingerprint(digest.digest(), settings, extra)
+
+    def build() -> SceneSet:
+        tasks = [(c, m, locations.get(Path(m).stem, ""), starts, settings) for c, m in files]
+        with ProcessPoolExecutor(data.workers, multiprocessing.get_context("spawn")) as pool:
+            done = list(tqdm(pool.map(_read_file, tasks, chunksize=4), "reading scenes", len(tasks), unit="file"))
+        return _assemble([row for rows in done for row in rows], data, None, split)
+
+    return _cached(key, data, build)
+
+
+def _read_file(task) -> list[tuple]:
+    """Rows (scene or None, id, location, dataset, reason it was left out) of one scenario file."""
+    container, member, location, starts, settings = task
+    torch.set_num_threads(1)
+    try:
+        content = scenarionet.read_bytes(container, member)
+        recordings = list(scenarionet.read_recordings(content, member, location, starts, settings.steps))
+    except InputError as error:
+        return [(None, member, location, "", str(error))]
+    return [_build_row(recording, settings) for recording in recordings]
+
+
+def _build_row(recording: Recording, settings: BuildSettings) -> tuple:
+    name = (recording.scene_id, recording.location, recording.dataset)
+    try:
+        scene = build_scene(recording, settings)
+        validate(scene, recording.scene_id)
+    except InputError as error:
+        return (None, *name, str(error))
+    if ego_overlaps(scene):
+        return (None, *name, "")
+    return (scene, *name, None)
+
+
+def _build_all(recordings, settings: BuildSettings, data, dataset: str, split: str) -> SceneSet:
+    rows = [_build_row(recording, settings) for recording in tqdm(recordings, f"building {dataset} scenes")]
+    return _assemble(rows, data, dataset, split)
+
+
+def _assemble(rows: list[tuple], data, dataset: str | None, split: str) -> SceneSet:
+    """Stack the good rows; raise the first invalid one's message unless data.skip_invalid."""
+    dropped = Counter()
+    for scene, name, _, _, reason in rows:
+        if scene is None and reason:
+            if not data.skip_invalid:
+                raise InputError(f"{reason} (data.skip_invalid=true leaves such scenes out)")
+            dropped["invalid"] += 1
+            tqdm.write(f"left out {name}: {reason}")
+        elif scene is None:
+            dropped["ego overlaps a vehicle at the start"] += 1
+    good = [row for row in rows if row[0] is not None]
+    if not good:
+        raise InputError(f"no valid scene among {len(rows)} ({dict(dropped)})")
+    return SceneSet(stack([row[0] for row in good]), [row[1] for row in good], [row[2] for row in good],
+                    dataset or good[0][3], split, dict(dropped))
+
+
+def _cached(key: str, data, build) -> SceneSet:
+    """The SceneSet under a key of the cache folder, built and stored (atomically) where it is not there."""
+    path = Path(data.cache) / f"scenes-{key}.safetensors"
+    if path.exists():
+        try:
+            return _load(path)
+        except (SafetensorError, KeyError, ValueError) as error:
+            tqdm.write(f"rebuilding the damaged cache file {path}: {error}")
+    scenes = build()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    names = {"scene_id": scenes.scene_id, "location": scenes.location, "dataset": scenes.dataset,
+             "split": scenes.split, "dropped": scenes.dropped}
+    part = path.with_suffix(f".{os.getpid()}.part")
+    save_file({key: value.contiguous() for key, value in scenes.scenes.items()}, part,
+              metadata={"scenes": json.dumps(names)})
+    part.replace(path)
+    return scenes
+
+
+def _load(path: Path) -> SceneSet:
+    with safe_open(path, "pt") as file:
+        names = json.loads(file.metadata()["scenes"])
+        columns = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
+    return SceneSet(TensorDict(columns, batch_size=[len(names["scene_id"])]), **names)
