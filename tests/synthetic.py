@@ -1,34 +1,17 @@
 """Scenes with known answers: a straight two-lane road along +x, every key of the scene contract present."""
 
 import math
-from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict
 
 from e2rl.scene.recording import DT, LIGHT_UNKNOWN, PEDESTRIAN, VEHICLE
-from e2rl.sim.route import SPACING
+from e2rl.scene.route import SPACING
+from e2rl.scene.scene import SceneSet
 
 LANE_WIDTH = 3.5  # m; lane 0 at y = 0, lane 1 (its left neighbour) at y = 3.5, both towards +x
 MARGIN = 1.0  # m beyond a lane's half width that still counts as on the road (design.md section 5)
 BACK = 20.0  # m of route behind each vehicle
-
-
-@dataclass
-class SceneSet:
-    """The interface of e2rl.scene.scene.SceneSet, until that exists."""
-
-    scenes: TensorDict
-    scene_id: list
-    location: list
-    dataset: str
-    split: str
-
-    def __len__(self):
-        return self.scenes.batch_size[0]
-
-    def batch(self, indices):
-        return self.scenes[indices]
 
 
 def make_scenes(
@@ -47,7 +30,7 @@ def make_scenes(
     num_routes: int = 6,
     num_points: int = 150,
 ) -> SceneSet:
-    """num_scenes scenes at constant logged velocity; scene k's egos start k metres further on, so scenes can be told apart.
+    """Scenes at constant logged velocity; scene k starts k metres further on, so scenes can be told apart.
 
     Vehicle i starts at x = gap * i in lane i % 2 at `speed` unless `vehicles` lists (x [m], lane, speed [m/s]) of each,
     ego first; a speed of 0 makes it parked (the ego excepted). VRU j walks along the road at y = -6 m, off it.
@@ -57,7 +40,7 @@ def make_scenes(
         vehicles = [(gap * i, i % 2, speed) for i in range(num_vehicles)]
     x, lane, v = (torch.tensor(column, dtype=torch.float32) for column in zip(*vehicles, strict=True))
     if len(vehicles) > max_vehicles or num_vrus > max_agents - max_vehicles:
-        raise ValueError(f"{len(vehicles)} vehicles and {num_vrus} VRUs do not fit {max_vehicles} and {max_agents} rows")
+        raise ValueError(f"{len(vehicles)} vehicles, {num_vrus} VRUs exceed {max_vehicles}, {max_agents} rows")
     shift = torch.arange(num_scenes, dtype=torch.float32)[:, None]
     start = torch.zeros(num_scenes, max_agents, 4)
     n, u = len(vehicles), max_vehicles + num_vrus
@@ -81,12 +64,13 @@ def make_scenes(
         "logged_valid": valid[:, None].repeat(1, steps + 1, 1),
         "scene_index": torch.arange(num_scenes),
     }
-    scenes |= _routes(start[:, :max_vehicles], valid[:, :max_vehicles], num_routes, num_points, limit, red_light_x, road)
+    cars = start[:, :max_vehicles], valid[:, :max_vehicles]
+    scenes |= _routes(*cars, num_routes, num_points, limit, red_light_x, road)
     scenes |= {key: value.expand(num_scenes, *value.shape).clone() for key, value in _map(road).items()}
     scenes |= _lights(num_scenes, steps, red_light_x)
     return SceneSet(
         scenes=TensorDict(scenes, [num_scenes]), scene_id=[f"synthetic-{k}" for k in range(num_scenes)],
-        location=["straight"] * num_scenes, dataset="synthetic", split="test",
+        location=["straight"] * num_scenes, dataset="synthetic", split="test", dropped={},
     )
 
 

@@ -1,0 +1,81 @@
+"""Unicycle motion with actions (acceleration, yaw rate), forwards and backwards, whole horizons at once.
+
+A state is (x [m], y [m], heading [rad], speed [m/s]); a step lasts DT and moves at the mean of the two speeds along
+the mean of the two headings. Speeds are held in [0, MAX_SPEED]; yaw rates by the tightest turn and the lateral
+acceleration.
+"""
+
+import torch
+from torch import Tensor
+
+from e2rl.scene.recording import DT
+
+MAX_SPEED = 40.0  # m/s
+MAX_LATERAL = 8.0  # m/s^2, about what tyres hold
+MAX_CURVATURE = 0.3  # 1/m, of the path of a car's centre at full lock
+
+
+def wrap(angle: Tensor) -> Tensor:
+    """Angle [rad] in [-pi, pi)."""
+    return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
+
+
+def yaw_rate_bound(speed: Tensor) -> Tensor:
+    """Largest |yaw rate| [rad/s] at speed [m/s]: MAX_CURVATURE * v at low speeds, MAX_LATERAL / v at high ones."""
+    return torch.minimum(MAX_CURVATURE * speed, MAX_LATERAL / speed.clamp(min=1e-3))
+
+
+def step(state: Tensor, action: Tensor) -> Tensor:
+    """State [..., 4] after one DT of action [..., 2] = (acceleration m/s^2, yaw rate rad/s)."""
+    return rollout(state, action[..., None, :])[..., 0, :]
+
+
+def rollout(start: Tensor, actions: Tensor) -> Tensor:
+    """States [..., H, 4] at steps 1..H from start [..., 4] under actions [..., H, 2], without a loop over time.
+
+    The speed recursion v' = clip(v + a DT, 0, MAX_SPEED) is a composition of shifted clips, which are closed under
+    composition, hence a parallel scan of log2 H levels; the rest are cumulative sums.
+    """
+    v0 = start[..., 3:4]
+    speed = bounded_speed(v0, actions[..., 0] * DT)
+    before = torch.cat([v0.expand_as(speed[..., :1]), speed[..., :-1]], -1)
+    mean = (before + speed) / 2
+    bound = yaw_rate_bound(mean)
+    turn = torch.maximum(torch.minimum(actions[..., 1], bound), -bound) * DT
+    heading = start[..., 2:3] + turn.cumsum(-1)
+    along, middle = mean * DT, heading - turn / 2
+    x = start[..., 0:1] + (along * middle.cos()).cumsum(-1)
+    y = start[..., 1:2] + (along * middle.sin()).cumsum(-1)
+    return torch.stack([x, y, wrap(heading), speed], -1)
+
+
+def bounded_speed(v0: Tensor, change: Tensor, low: float = 0.0, high: float = MAX_SPEED) -> Tensor:
+    """Speeds [..., H] of v' = clip(v + change, low, high) from v0 [..., 1] under change [..., H]; exact, parallel in H.
+
+    Each step maps v to clip(v + c, l, h); after clip(v + c1, l1, h1) it is clip(v + c1 + c2, clip(l1 + c2, l2, h2),
+    clip(h1 + c2, l2, h2)) (Hillis and Steele's scan over these triples).
+    """
+    shape = torch.broadcast_shapes(v0.shape[:-1], change.shape[:-1])
+    change = change.expand(*shape, change.shape[-1])
+    lo, hi = torch.full_like(change, low), torch.full_like(change, high)
+    horizon, width = change.shape[-1], 1
+    while width < horizon:
+        c, tail_lo, tail_hi = change[..., width:], lo[..., width:], hi[..., width:]
+
+        def later(value: Tensor, c=c, tail_lo=tail_lo, tail_hi=tail_hi, width=width) -> Tensor:
+            moved = torch.minimum(torch.maximum(value[..., :-width] + c, tail_lo), tail_hi)
+            return torch.cat([value[..., :width], moved], -1)
+
+        lo, hi = later(lo), later(hi)
+        change = torch.cat([change[..., :width], change[..., :-width] + c], -1)
+        width *= 2
+    return torch.minimum(torch.maximum(v0 + change, lo), hi)
+
+
+def inverse(states: Tensor) -> Tensor:
+    """Actions [..., H, 2] that lead along states [..., H + 1, 4]: speed and heading differences over DT.
+
+    `rollout(states[..., 0, :], inverse(states))` returns the speeds and headings wherever these respect the bounds.
+    """
+    change = states[..., 1:, 2:] - states[..., :-1, 2:]
+    return torch.stack([change[..., 1], wrap(change[..., 0])], -1) / DT
