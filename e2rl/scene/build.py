@@ -11,7 +11,7 @@ from e2rl.scene.drivable import drivable_field
 from e2rl.scene.lane_graph import LaneGraph, Route, believed_width, wrap
 from e2rl.scene.recording import VEHICLE, Recording
 from e2rl.scene.route import SPACING, project
-from e2rl.scene.smoothing import causal_state, drop_heading_flips, smooth
+from e2rl.scene.smoothing import causal_state, drop_jumps, smooth
 
 STANDING = 0.5  # m/s
 FIT = 2.0  # m: mean distance of a recorded future to a candidate that still counts as the way driven
@@ -36,7 +36,7 @@ def build_scene(recording: Recording, settings: BuildSettings) -> TensorDict:
     Raises InputError where the recording makes none (no ego, no lanes, NaN states, the ego overlapped at the start).
     """
     recording.validate()
-    valid = drop_heading_flips(recording.states, recording.valid)
+    valid = drop_jumps(recording.states, recording.valid)
     valid[:, recording.ego] = recording.valid[:, recording.ego]
     states = smooth(recording.states, valid)
     frame = recording.current

@@ -19,18 +19,20 @@ def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> t
     right = np.clip(np.searchsorted(ts, grid - 1e-6), 1, len(ts) - 1)
     left = right - 1
     weight = np.clip((grid - ts[left]) / np.maximum(ts[right] - ts[left], 1e-6), 0, 1)[:, None]
+    near_left, near_right = weight * DT < 0.02, (1 - weight) * DT < 0.02
+    weight = np.where(near_left & ~valid[right], 0.0, np.where(near_right & ~valid[left], 1.0, weight))
     turn = (states[right, :, 2] - states[left, :, 2] + np.pi) % (2 * np.pi) - np.pi
     out = states[left] + weight[..., None] * (states[right] - states[left])
     out[..., 2] = states[left, :, 2] + weight * turn
-    near_left, near_right = weight < 0.02 / DT, weight > 1 - 0.02 / DT
     known = (valid[left] | near_right) & (valid[right] | near_left)
     return out, known
 
 
-def drop_heading_flips(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """valid [F, A] without the frames that a heading jump > 1 rad divides from the track's longest run."""
+def drop_jumps(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """valid [F, A] without frames that a jump (over 1 rad or 5 m in a step) divides from the track's longest run."""
     valid = valid.copy()
     jump = np.abs((np.diff(states[..., 2], axis=0) + np.pi) % (2 * np.pi) - np.pi) > 1.0
+    jump |= np.linalg.norm(np.diff(states[..., :2], axis=0), axis=-1) > 5.0
     jump &= valid[1:] & valid[:-1]
     for agent in np.flatnonzero(jump.any(0)):
         run = np.concatenate([[0], np.cumsum(jump[:, agent])])

@@ -1,0 +1,67 @@
+"""Free-space representation, for vehicles without a lane: the same x, read as accelerations and path curvatures.
+
+The acceleration knots mean what they mean on a route; the two lateral knots are curvatures of the driven path, half way
+and at the end of the lateral horizon, linear in between from the current one and held after it.
+"""
+
+import torch
+from torch import Tensor
+
+from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS, LaneState, lateral_horizon, speeds
+from e2rl.scene.recording import DT
+
+YAW_RATE_SCALE = 0.1  # rad/s at the current speed a unit of x, floored at 3 m/s
+
+
+def curvature_scale(v: Tensor) -> Tensor:
+    """1/m a unit of x at speed v."""
+    return YAW_RATE_SCALE / v.clamp(min=3.0)
+
+
+def decode(x: Tensor, state: LaneState) -> LaneState:
+    """Plans (fields [..., V, HORIZON]) of x [..., V, SIZE] by integrating curvature over travelled distance.
+
+    The route fields keep the state's offset: s advances with the way, d, d1 and d2 are held.
+    """
+    v, travelled = speeds(state, ACCEL_SCALE * x[..., :KNOTS])
+    scale = curvature_scale(state.v)[..., None]
+    reach = lateral_horizon(state.v)[..., None]
+    half, end = scale * x[..., KNOTS, None], scale * x[..., KNOTS + 1, None]
+    u = (2 * travelled / reach).clamp(max=2.0)
+    first, second = u.clamp(max=1.0), (u - 1).clamp(min=0.0)
+    now = state.kappa[..., None]
+    kappa = now + (half - now) * first + (end - half) * second
+    beyond = (travelled - reach).clamp(min=0)
+    turned = 0.5 * reach * (now * first + (half - now) * first**2 / 2 + half * second + (end - half) * second**2 / 2)
+    heading = state.heading[..., None] + turned + end * beyond
+    before = torch.cat([state.heading[..., None], heading[..., :-1]], -1)
+    step = torch.diff(travelled, dim=-1, prepend=torch.zeros_like(travelled[..., :1]))
+    middle = (heading + before) / 2
+    held = torch.zeros_like(v)
+    speed = torch.cat([state.v[..., None], v[..., :-1]], -1)
+    return LaneState(
+        state.s[..., None] + travelled, state.d[..., None] + held, held, held, v, (v - speed) / DT,
+        state.x[..., None] + (step * torch.cos(middle)).cumsum(-1),
+        state.y[..., None] + (step * torch.sin(middle)).cumsum(-1), heading, kappa)
+
+
+def fit(heading: Tensor, known: Tensor, state: LaneState, knots: Tensor) -> Tensor:
+    """Lateral knots [..., V, 2] whose path has the recorded headings [..., V, HORIZON], by ridge least squares.
+
+    The heading is linear in the curvature knots once the travelled distance (from `knots`, m/s^2) is known.
+    """
+    _, travelled = speeds(state, knots)
+    reach = lateral_horizon(state.v)[..., None]
+    u = (2 * travelled / reach).clamp(max=2.0)
+    first, second = u.clamp(max=1.0), (u - 1).clamp(min=0.0)
+    beyond = (travelled - reach).clamp(min=0)
+    scale = curvature_scale(state.v)[..., None]
+    half = 0.5 * reach * (first**2 / 2 + second - second**2 / 2)
+    end = 0.5 * reach * second**2 / 2 + beyond
+    given = 0.5 * reach * state.kappa[..., None] * (first - first**2 / 2)
+    turn = heading - state.heading[..., None]
+    turn = (turn + torch.pi) % (2 * torch.pi) - torch.pi
+    unit = torch.stack([scale * half, scale * end], -1) * known[..., None]
+    rest = (turn - given) * known
+    gram = unit.transpose(-1, -2) @ unit + 1e-3 * torch.eye(2, device=unit.device)
+    return torch.linalg.solve(gram, (unit * rest[..., None]).sum(-2)[..., None])[..., 0].clamp(-6.0, 6.0)
