@@ -1,0 +1,324 @@
+"""What a run writes and reads back: rollouts/*.npz, rollouts.csv, metrics.json (design.md section 6).
+
+Every file appears whole: it is written under a temporary name beside its place and renamed.
+"""
+
+import csv
+import io
+import json
+import math
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import e2rl
+from e2rl.errors import InputError
+from e2rl.metrics.catalogue import EVENT, IDENTITY, METRICS
+from e2rl.scene.recording import AGENT_TYPES, DT
+
+FORMAT = "e2rl-rollout/1"
+ROLLOUTS, TABLE, METRICS_FILE = "rollouts", "rollouts.csv", "metrics.json"
+METRIC_COLUMNS = tuple(metric.source for metric in METRICS.values())
+COLUMNS = ("dataset", "split", "method", "ego_policy", *IDENTITY, *METRIC_COLUMNS, *EVENT)
+TEXT_COLUMNS = ("dataset", "split", "method", "ego_policy", "scene_id", "location", "contact_type")
+SCALARS = ("format", "scene_id", "location", "dataset", "split", "method", "ego_policy", "seed", "eta", "dt", "ego")
+ARRAYS = (
+    "states",
+    "valid",
+    "size",
+    "agent_type",
+    "simulated",
+    "adversaries",
+    "logged",
+    "logged_valid",
+    "lane_points",
+    "lane_offsets",
+    "lane_width",
+    "drivable_points",
+    "drivable_offsets",
+)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where rollouts come from: the columns that a rollout dict does not hold."""
+
+    dataset: str
+    split: str
+    method: str
+    ego_policy: str
+
+
+# --- rollouts
+
+
+def write_rollouts(folder: Path, rollouts: dict, source: Source) -> list[Path]:
+    """Write one npz per rollout of a rollout dict into folder/ and return their paths."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for index in range(len(rollouts["states"])):
+        arrays = rollout_arrays(rollouts, index, source)
+        path = folder / rollout_name(arrays)
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **arrays)
+        replace(path, buffer.getvalue())
+        paths.append(path)
+    return paths
+
+
+def rollout_name(arrays: dict) -> str:
+    """<method>__<ego>__<eta>__<scene_id>__<seed>.npz; characters that no file name bears become '-'."""
+    parts = (arrays["method"], arrays["ego_policy"], f"{float(arrays['eta']):g}", arrays["scene_id"], arrays["seed"])
+    return "__".join(re.sub(r"[^A-Za-z0-9._+-]", "-", str(part)) for part in parts) + ".npz"
+
+
+def rollout_arrays(rollouts: dict, index: int, source: Source) -> dict[str, np.ndarray]:
+    """The arrays of one rollout of a rollout dict, as format e2rl-rollout/1 wants them."""
+    tensors = {key: value for key, value in rollouts.items() if isinstance(value, Tensor) and value.dim()}
+    row = {key: value[index].detach().cpu() for key, value in tensors.items()}
+    eta = row["eta"].item() if "eta" in row else float(rollouts["eta"])
+    kinds = np.array(AGENT_TYPES)[row["agent_type"].numpy()]
+    lanes, lane_offsets, lanes_kept = polylines(row["lane_points"], row["lane_index"], minimum=2)
+    rings, ring_offsets, _ = polylines(row["drivable_points"], row["drivable_index"], minimum=3)
+    return {
+        "format": np.array(FORMAT),
+        "scene_id": np.array(str(rollouts["scene_id"][index])),
+        "location": np.array(str(rollouts["location"][index])),
+        "dataset": np.array(source.dataset),
+        "split": np.array(source.split),
+        "method": np.array(source.method),
+        "ego_policy": np.array(source.ego_policy),
+        "seed": np.array(int(row["seed"]), np.int64),
+        "eta": np.array(eta, np.float64),
+        "dt": np.array(DT, np.float64),
+        "ego": np.array(0, np.int64),
+        "states": row["states"].float().numpy(),
+        "valid": row["valid"].bool().numpy(),
+        "size": row["size"].float().numpy(),
+        "agent_type": kinds,
+        "simulated": row["simulated"].bool().numpy(),
+        "adversaries": row["adversaries"].bool().numpy(),
+        "logged": row["logged"].float().numpy(),
+        "logged_valid": row["logged_valid"].bool().numpy(),
+        "lane_points": lanes,
+        "lane_offsets": lane_offsets,
+        "lane_width": row["lane_width"].float().numpy()[lanes_kept],
+        "drivable_points": rings,
+        "drivable_offsets": ring_offsets,
+    }
+
+
+def polylines(points: Tensor, index: Tensor, minimum: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(points [M, 2] float32, offsets [L + 1] int64, kept line numbers [L]) of padded points [P, 2], index [P].
+
+    Lines of fewer than `minimum` points describe nothing and are left out.
+    """
+    points, index = points.float().numpy(), index.numpy()
+    counts = np.bincount(index[index >= 0], minlength=1)
+    kept = np.flatnonzero(counts >= minimum)
+    chosen = np.isin(index, kept)
+    order = np.argsort(index[chosen], kind="stable")
+    return points[chosen][order], np.concatenate([[0], np.cumsum(counts[kept])]).astype(np.int64), kept
+
+
+def read_rollout(path: Path) -> dict[str, object]:
+    """The arrays of one npz, scalars as python values; InputError where it is no rollout."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            data = {key: archive[key] for key in archive.files}
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        raise InputError(f"{path}: no readable rollout ({error}); run evaluate.py again to write it anew") from error
+    missing = [key for key in (*SCALARS, *ARRAYS) if key not in data]
+    if missing or str(data["format"]) != FORMAT:
+        raise InputError(
+            f"{path}: not of format {FORMAT} (missing: {', '.join(missing) or 'nothing'}; format: "
+            f"{data.get('format')}); give a folder that evaluate.py wrote"
+        )
+    return {key: value.item() if key in SCALARS else value for key, value in data.items()}
+
+
+def read_rollouts(folder: Path) -> list[dict[str, object]]:
+    """All rollouts of a folder (or of a run's folder), in the order of their names."""
+    folder = Path(folder)
+    paths = sorted((folder / ROLLOUTS if (folder / ROLLOUTS).is_dir() else folder).glob("*.npz"))
+    if not paths:
+        raise InputError(f"{folder}: no rollouts (*.npz) here; give the folder of a run that evaluate.py wrote")
+    return [read_rollout(path) for path in paths]
+
+
+def as_rollout_dict(rollouts: Sequence[dict]) -> dict:
+    """The rollout dict of tensors (leading B, padded) of rollouts as read from files, ready for score_rollouts.
+
+    `seconds` and transport are not in the files: seconds are NaN and transport is absent.
+    """
+
+    def pad(name: str, fill: float) -> Tensor:
+        arrays = [torch.as_tensor(rollout[name]) for rollout in rollouts]
+        shape = [max(sizes) for sizes in zip(*(array.shape for array in arrays), strict=True)]
+        result = torch.full((len(arrays), *shape), fill, dtype=arrays[0].dtype)
+        for row, array in zip(result, arrays, strict=True):
+            row[tuple(slice(length) for length in array.shape)] = array
+        return result
+
+    result = {
+        name: pad(name, 0)
+        for name in (
+            "states",
+            "valid",
+            "size",
+            "simulated",
+            "adversaries",
+            "logged",
+            "logged_valid",
+            "lane_points",
+            "lane_width",
+            "drivable_points",
+        )
+    }
+    codes = [
+        {
+            "agent_type": np.array([AGENT_TYPES.index(kind) for kind in rollout["agent_type"]], np.int64),
+            "lane_index": line_numbers(rollout["lane_offsets"]),
+            "drivable_index": line_numbers(rollout["drivable_offsets"]),
+        }
+        for rollout in rollouts
+    ]
+    for name in codes[0]:
+        arrays = [torch.as_tensor(code[name]) for code in codes]
+        fill = -1 if name.endswith("index") else 0
+        result[name] = torch.nn.utils.rnn.pad_sequence(arrays, batch_first=True, padding_value=fill)
+    result |= {name: [rollout[name] for rollout in rollouts] for name in ("scene_id", "location")}
+    return result | {
+        "seed": torch.tensor([rollout["seed"] for rollout in rollouts]),
+        "eta": torch.tensor([rollout["eta"] for rollout in rollouts], dtype=torch.float64),
+        "seconds": torch.full((len(rollouts),), torch.nan),
+    }
+
+
+def line_numbers(offsets: np.ndarray) -> np.ndarray:
+    """The line number of each point [M] of lines that start and end at offsets [L + 1]."""
+    return np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+
+
+# --- rows
+
+
+def write_rows(path: Path, rows: Sequence[dict]) -> None:
+    """Write rollouts.csv: one line per rollout, NaN as an empty cell.
+
+    rows are those of score_rollouts with dataset, split, method and ego_policy added (`label_rows`).
+    """
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows([cell(row.get(column, math.nan)) for column in COLUMNS] for row in rows)
+    replace(Path(path), buffer.getvalue().encode())
+
+
+def label_rows(rows: Iterable[dict], source: Source) -> list[dict]:
+    """Rows with their source's columns."""
+    return [{**vars(source), **row} for row in rows]
+
+
+def cell(value: object) -> object:
+    if isinstance(value, bool):
+        return int(value)
+    return "" if isinstance(value, float) and math.isnan(value) else value
+
+
+def read_rows(path: Path) -> list[dict]:
+    """The rows of a rollouts.csv: text columns as text, seed and partner as int, all else as float (empty: NaN)."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such table; give the folder of a run that evaluate.py wrote")
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    return [
+        {
+            key: value if key in TEXT_COLUMNS else int(value) if key in ("seed", "partner") else float(value or "nan")
+            for key, value in row.items()
+        }
+        for row in rows
+    ]
+
+
+# --- metrics
+
+
+def write_metrics(path: Path, rows: Sequence[dict]) -> None:
+    """Write metrics.json from the rows of `evaluation.summary.metric_rows`; NaN becomes null (strict JSON)."""
+    replace(Path(path), json.dumps(nulls(list(rows)), indent=1, allow_nan=False).encode())
+
+
+def read_metrics(path: Path) -> list[dict]:
+    """The rows of a metrics.json, null as NaN inside `metrics` and `paired`."""
+    path = Path(path)
+    try:
+        rows = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: no readable metrics ({error}); give a metrics.json that a run wrote") from error
+    return [{key: nans(value) if key in ("metrics", "paired") else value for key, value in row.items()} for row in rows]
+
+
+def nulls(value: object) -> object:
+    """The value with every float that is not finite replaced by None."""
+    if isinstance(value, dict):
+        return {key: nulls(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [nulls(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def nans(value: object) -> object:
+    """The value with None replaced by NaN, in nested dicts."""
+    if isinstance(value, dict):
+        return {key: nans(part) for key, part in value.items()}
+    return math.nan if value is None else value
+
+
+def git_commit() -> str:
+    """The package's commit, with '+changes' where tracked files differ from it; "" outside a git checkout."""
+
+    def git(*arguments: str) -> str | None:
+        try:
+            done = subprocess.run(
+                ["git", *arguments], cwd=Path(e2rl.__file__).parent, capture_output=True, text=True, timeout=20
+            )
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    commit = git("rev-parse", "HEAD")
+    changes = git("status", "--porcelain", "--untracked-files=no")
+    return "" if commit is None else commit + ("+changes" if changes else "")
+
+
+def command_line() -> str:
+    """The command that runs, quoted for a shell."""
+    return shlex.join(["python", *sys.argv])
+
+
+def replace(path: Path, data: bytes) -> None:
+    """Write data under a temporary name beside path, then rename: a reader never meets half a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise

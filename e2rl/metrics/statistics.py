@@ -1,0 +1,131 @@
+"""Means and 95% intervals over rollouts, bootstrapped by cluster: whole locations (or scenes) are drawn, not rollouts.
+
+Rows are the dicts of `metrics.score.score_rollouts`, features those of `metrics.realism.motion_features`, one of each
+per rollout. Every resampled mean is a quotient of two sums that are linear in the clusters' multiplicities, hence one
+matrix product serves all draws and metrics. Fewer than two clusters with known values give no interval: NaN.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from e2rl.metrics.catalogue import METRICS, Metric
+from e2rl.metrics.realism import realism
+
+DRAWS = 1000
+REALISM_DRAWS = 400  # each costs a pass over all samples
+LEVELS = (0.025, 0.975)
+Row = dict[str, object]
+Features = dict[str, Tensor]
+
+
+def cluster_index(rows: Sequence[Row]) -> tuple[Tensor, int]:
+    """(cluster [R] int64, number of clusters) of rows: by location, by scene where there is none."""
+    names = [f"location {row['location']}" if row["location"] else f"scene {row['scene_id']}" for row in rows]
+    number = {name: index for index, name in enumerate(sorted(set(names)))}
+    return torch.tensor([number[name] for name in names], dtype=torch.int64), len(number)
+
+
+def bootstrap_draws(clusters: int, draws: int = DRAWS, seed: int = 0) -> Tensor:
+    """Multiplicities [1 + draws, clusters] float64 of clusters drawn with replacement; row 0 counts each once."""
+    generator = torch.Generator().manual_seed(seed)
+    chosen = torch.randint(max(clusters, 1), (draws, clusters), generator=generator)
+    counts = torch.zeros(draws, clusters, dtype=torch.float64)
+    counts.scatter_add_(1, chosen, torch.ones_like(chosen, dtype=torch.float64))
+    return torch.cat([torch.ones(1, clusters, dtype=torch.float64), counts])
+
+
+def resampled_means(values: Tensor, weights: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
+    """Weighted means [D, M] per draw [D, C] of values, weights [R, M] of rollouts in cluster [R], NaN values left out."""
+    weights = torch.where(values.isnan() | weights.isnan(), 0.0, weights)
+    shape = (draws.shape[1], values.shape[1])
+    total = values.new_zeros(shape).index_add(0, cluster, values.nan_to_num(0.0) * weights)
+    count = values.new_zeros(shape).index_add(0, cluster, weights)
+    return (draws @ total) / (draws @ count)  # 0 / 0 is NaN
+
+
+def interval(samples: Tensor, known_clusters: int) -> dict[str, float]:
+    """{mean, low, high} of samples [D], row 0 the estimate; the interval needs two clusters that know the value."""
+    samples = samples.where(samples.isfinite(), torch.nan)
+    low, high = samples[1:].nanquantile(samples.new_tensor(LEVELS)).tolist() if known_clusters > 1 else (torch.nan,) * 2
+    return {"mean": samples[0].item(), "low": low, "high": high}
+
+
+def metric_table(rows: Sequence[Row], metrics: Sequence[Metric]) -> tuple[Tensor, Tensor]:
+    """Values and weights [R, M] float64 of the rows' metrics; NaN where a row lacks one."""
+
+    def table(names: list[str], absent: float) -> Tensor:
+        cells = [[float(row.get(name, torch.nan)) if name else absent for name in names] for row in rows]
+        return torch.tensor(cells, dtype=torch.float64).reshape(len(rows), len(names))
+
+    return table([metric.source for metric in metrics], torch.nan), table([metric.weight for metric in metrics], 1.0)
+
+
+def summarise(
+    rows: Sequence[Row], features: Sequence[Features], draws: int = DRAWS, realism_draws: int = REALISM_DRAWS
+) -> dict[str, dict[str, float]]:
+    """{metric: {mean, low, high, n}} of one group of rollouts (one method, ego and eta), in the catalogue's order.
+
+    n is the number of rollouts that the value rests on; what cannot be computed is NaN with n = 0.
+    """
+    if len(rows) != len(features):
+        raise ValueError(f"{len(rows)} rows but {len(features)} features; they are made together by score_rollouts")
+    cluster, clusters = cluster_index(rows)
+    single = [metric for metric in METRICS.values() if not metric.pooled]
+    values, weights = metric_table(rows, single)
+    means = resampled_means(values, weights, cluster, bootstrap_draws(clusters, draws))
+    known = ~values.isnan() & (weights > 0)
+    result = {
+        metric.name: interval(means[:, column], len(cluster[known[:, column]].unique()))
+        | {"n": int(known[:, column].sum())}
+        for column, metric in enumerate(single)
+    }
+    used = torch.tensor([bool(sample["a_lon"].numel()) for sample in features], dtype=torch.bool)
+    pooled = realism(list(features), cluster, bootstrap_draws(clusters, realism_draws))
+    for name, samples in pooled.items():
+        result[name] = interval(samples, len(cluster[used].unique())) | {"n": int(used.sum())}
+    return {name: result[name] for name in METRICS}
+
+
+def paired_differences(
+    rows: Sequence[Row],
+    features: Sequence[Features],
+    other_rows: Sequence[Row],
+    other_features: Sequence[Features],
+    draws: int = DRAWS,
+    realism_draws: int = REALISM_DRAWS,
+) -> dict[str, dict[str, float]]:
+    """{metric: {difference, low, high, n}} of this group minus the other, over the n (scene, seed) both have.
+
+    Both groups are resampled with the same clusters. Metrics per collision (rir, relvel, ...) and weighted ones compare
+    the two groups' own quotients on these pairs; all other metrics use only the pairs in which both are known.
+    """
+    place = {(row["scene_id"], row["seed"]): index for index, row in enumerate(other_rows)}
+    pairs = [(index, place[key]) for index, row in enumerate(rows) if (key := (row["scene_id"], row["seed"])) in place]
+    ours, theirs = [rows[a] for a, _ in pairs], [other_rows[b] for _, b in pairs]
+    cluster, clusters = cluster_index(ours)
+    single = [metric for metric in METRICS.values() if not metric.pooled]
+    (first, first_weight), (second, second_weight) = metric_table(ours, single), metric_table(theirs, single)
+    matched = first.isnan() | second.isnan()
+    strict = torch.tensor([metric.name not in PER_COLLISION for metric in single]) & matched
+    first, second = first.masked_fill(strict, torch.nan), second.masked_fill(strict, torch.nan)
+    multiplicities = bootstrap_draws(clusters, draws)
+    means = resampled_means(first, first_weight, cluster, multiplicities) - resampled_means(
+        second, second_weight, cluster, multiplicities
+    )
+    result = {}
+    for column, metric in enumerate(single):
+        known = ~first[:, column].isnan() | ~second[:, column].isnan()
+        result[metric.name] = interval(means[:, column], len(cluster[known].unique())) | {"n": int(known.sum())}
+    multiplicities = bootstrap_draws(clusters, realism_draws)
+    samples = [
+        realism([group[pair[side]] for pair in pairs], cluster, multiplicities)
+        for side, group in enumerate((features, other_features))
+    ]
+    for name in samples[0]:
+        result[name] = interval(samples[0][name] - samples[1][name], clusters) | {"n": len(pairs)}
+    return {name: {"difference": result[name].pop("mean"), **result[name]} for name in METRICS}
+
+
+PER_COLLISION = frozenset({"rir", "at_fault", "relvel"})

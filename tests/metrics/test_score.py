@@ -1,0 +1,183 @@
+"""The rows agree with the protocol's independent scorer, which knows the rollout files alone."""
+
+import csv
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from e2rl.evaluation.files import Source, as_rollout_dict, label_rows, read_rollouts, write_rollouts, write_rows
+from e2rl.metrics.catalogue import MAIN
+from e2rl.metrics.score import score_rollouts
+from e2rl.metrics.statistics import summarise
+from tests.metrics.random_rollouts import random_rollouts
+
+SCORER = Path(__file__).resolve().parents[3] / "shared" / "tools" / "score_rollouts.py"
+
+
+def test_rows_and_summary_agree_with_the_independent_scorer(tmp_path):
+    if not SCORER.is_file():
+        pytest.skip(f"needs the independent scorer at {SCORER.parent.name}/{SCORER.name} beside the repository")
+    pytest.importorskip("pandas", reason="the independent scorer reads tables with pandas")
+    rollouts = random_rollouts(48, seed=3)
+    rows, features = score_rollouts(rollouts)
+    assert sum(row["cfr"] == 1 for row in rows) >= 12, "the generator must produce contacts"
+    source = Source("synthetic", "test", "e2", "idm")
+    write_rollouts(tmp_path / "rollouts", rollouts, source)
+    write_rows(tmp_path / "rollouts.csv", label_rows(rows, source))
+    tight = ("relvel=1e-5", "min_dtc=1e-5", "ttc_c=1e-6", "aor_step=1e-9", "macc=1e-6", "contact_time=1e-9")
+    done = subprocess.run(
+        [
+            sys.executable,
+            SCORER,
+            tmp_path / "rollouts",
+            "--json",
+            tmp_path / "theirs.json",
+            "--out",
+            tmp_path / "theirs.csv",
+            "--tolerance",
+            *tight,
+        ],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    theirs = json.loads((tmp_path / "theirs.json").read_text())
+    agreement = theirs["agreement"]
+    assert agreement["joined"] == len(rows) and not agreement["missing"]
+    assert {name: part["disagree"] for name, part in agreement["metrics"].items()} == dict.fromkeys(
+        agreement["metrics"], 0
+    )
+    compare_columns(rows, tmp_path / "theirs.csv")
+    compare_summary(summarise(rows, features), theirs["groups"][0]["metrics"])
+
+
+def compare_columns(rows, table):
+    """Columns that the scorer writes but does not compare by itself."""
+    with table.open(newline="") as file:
+        theirs = {(row["scene_id"], int(row["seed"])): row for row in csv.DictReader(file)}
+    for row in rows:
+        other = theirs[row["scene_id"], row["seed"]]
+        for name in (
+            "cfr_vru",
+            "bg_pairs",
+            "front",
+            "side",
+            "rear",
+            "progress",
+            "ttc_c_all",
+            "aor_left_out",
+            "aor_vehicle_steps",
+            "start_overlap_ego",
+            "start_overlap_bg",
+            "contact_step",
+        ):
+            expected = float(other[name] or "nan")
+            assert row[name] == pytest.approx(expected, abs=1e-4, nan_ok=True), (row["scene_id"], name)
+        assert row["partner"] == int(other["partner"])
+
+
+def compare_summary(ours, theirs):
+    same = {
+        "cfr": "cfr",
+        "cfr_bg": "cfr_bg",
+        "side": "side",
+        "relvel": "relvel",
+        "progress": "progress",
+        "aor_step": "aor_pooled",
+        "aor_any": "aor_any",
+        "real": "real_sub",
+        "real_norm": "real_norm",
+        "w1_a_lon": "w1_a_lon",
+        "w1_a_lat": "w1_a_lat",
+        "w1_jerk": "w1_jerk",
+    }
+    for name, other in same.items():
+        if other not in theirs:
+            continue
+        assert ours[name]["mean"] == pytest.approx(theirs[other]["mean"], abs=1e-6), name
+        width = theirs[other]["high"] - theirs[other]["low"]
+        for end in ("low", "high"):  # two bootstraps of a hundred clusters and more: the same to their own noise
+            assert ours[name][end] == pytest.approx(theirs[other][end], abs=0.2 * width + 1e-9), (name, end)
+        assert ours[name]["n"] == theirs[other]["n"], name
+
+
+def test_scores_survive_the_files(tmp_path):
+    rollouts = random_rollouts(6, seed=8)
+    write_rollouts(tmp_path, rollouts, Source("synthetic", "test", "e2", "idm"))
+    read = as_rollout_dict(read_rollouts(tmp_path))
+    place = {
+        (scene, seed): index
+        for index, (scene, seed) in enumerate(zip(read["scene_id"], read["seed"].tolist(), strict=True))
+    }
+    before, after = score_rollouts(rollouts)[0], score_rollouts(read)[0]
+    for row in before:
+        other = after[place[row["scene_id"], row["seed"]]]
+        for name in row.keys() - {"seconds"}:
+            assert row[name] == other[name] or (math.isnan(row[name]) and math.isnan(other[name])), name
+
+
+def test_rows_do_not_depend_on_the_batch_they_are_scored_in():
+    rollouts = random_rollouts(5, seed=2)
+    together, _ = score_rollouts(rollouts)
+    for index in range(5):
+        alone = {
+            key: value[index : index + 1] if isinstance(value, torch.Tensor | list) else value
+            for key, value in rollouts.items()
+        }
+        assert str(score_rollouts(alone)[0][0]) == str(together[index])
+
+
+def test_moving_the_world_changes_no_metric():
+    rollouts = random_rollouts(4, seed=5)
+    moved = dict(rollouts)
+    shift = torch.tensor([64.0, -32.0])  # exact in float32 at this size, up to the last bits of small coordinates
+    for key in ("states", "logged"):
+        moved[key] = torch.cat([rollouts[key][..., :2] + shift, rollouts[key][..., 2:]], -1)
+    for key in ("lane_points", "drivable_points"):
+        moved[key] = rollouts[key] + shift
+    for before, after in zip(score_rollouts(rollouts)[0], score_rollouts(moved)[0], strict=True):
+        for name in ("cfr", "min_dtc", "ttc_c", "aor_step", "progress", "real"):
+            assert after[name] == pytest.approx(before[name], abs=2e-3, nan_ok=True), name
+
+
+def test_every_metric_of_the_design_is_summarised_in_its_order():
+    rows, features = score_rollouts(random_rollouts(4))
+    assert list(summarise(rows, features, draws=20, realism_draws=5))[:20] == [
+        "cfr",
+        "cfr_adv",
+        "cfr_vru",
+        "cfr_bg",
+        "front",
+        "side",
+        "rear",
+        "rir",
+        "at_fault",
+        "relvel",
+        "min_dtc",
+        "ttc_c",
+        "macc",
+        "progress",
+        "aor_step",
+        "aor_any",
+        "real",
+        "real_norm",
+        "transport",
+        "seconds_per_rollout",
+    ]
+    assert all(metric.source in rows[0] for metric in MAIN)
+
+
+def test_transport_is_the_control_s_energy_and_unknown_without_control():
+    rollouts = random_rollouts(3)
+    assert all(math.isnan(row["transport"]) for row in score_rollouts(rollouts)[0])
+    rollouts |= {
+        "transport_adversary": torch.tensor([1.0, 2, 3]),
+        "transport_others": torch.tensor([0.5, 0, 1]),
+        "transport_anchor": torch.zeros(3),
+    }
+    assert [row["transport"] for row in score_rollouts(rollouts)[0]] == [1.5, 2.0, 4.0]
