@@ -1,0 +1,46 @@
+"""Reward terms, pure and per step; the reward is their weighted sum (weights in conf/sim)."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from e2rl.errors import InputError
+
+TERMS = ("progress", "contact", "off_road", "comfort", "speeding", "lane_offset")
+
+
+def reward_terms(
+    progress: Tensor, contact: Tensor, off_road: Tensor, action: Tensor, last_action: Tensor, speed: Tensor,
+    limit: Tensor, offset: Tensor, dt: float,
+) -> dict[str, Tensor]:
+    """The TERMS, each [B], from what happened in one step of dt seconds.
+
+    progress [B] m along the mission; contact, off_road [B] bool; action, last_action [B, 2]: executed acceleration and
+    yaw rate; speed, limit [B] m/s (limit 0 unknown: never exceeded); offset [B] m from the mission route.
+    """
+    jerk = (action[:, 0] - last_action[:, 0]) / dt
+    lateral = speed * action[:, 1]
+    comfort = (action[:, 0] / 4) ** 2 + (lateral / 4) ** 2 + (jerk / 20) ** 2
+    excess = (speed - limit).clamp(min=0) / limit.clamp(min=1.0)
+    return {
+        "progress": progress,
+        "contact": contact.float(),
+        "off_road": off_road.float(),
+        "comfort": comfort.clamp(max=3.0),
+        "speeding": torch.where(limit > 0, excess, 0.0).clamp(max=1.0),
+        "lane_offset": (offset.abs() / 2).clamp(max=1.0),
+    }
+
+
+def check_weights(weights: Mapping[str, float]) -> dict[str, float]:
+    """The weight of every term; raises InputError for a name that is no term or a term without weight."""
+    wrong = set(weights) ^ set(TERMS)
+    if wrong:
+        raise InputError(f"sim.reward: {', '.join(sorted(wrong))} missing or unknown; give exactly {', '.join(TERMS)}")
+    return {name: float(weights[name]) for name in TERMS}
+
+
+def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
+    """Reward [B]."""
+    return sum(weights[name] * terms[name] for name in TERMS)

@@ -1,0 +1,197 @@
+"""DrivingEnv: specs, partial resets, one scene per trajectory, seeds, given traffic, contact, off-road, map ends."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.collectors import Collector
+from torchrl.envs import TransformedEnv
+from torchrl.envs.transforms import Transform
+from torchrl.envs.utils import check_env_specs
+
+from e2rl.errors import InputError
+from e2rl.scene.recording import DT
+from e2rl.sim.env import DrivingEnv, SimSettings
+from tests.synthetic import make_scenes
+
+
+def make_env(batch=2, settings=None, **scene):
+    return DrivingEnv(make_scenes(**{"num_scenes": 3} | scene), settings or SimSettings(), batch)
+
+
+def act(env, acceleration=0.0, yaw_rate=0.0):
+    action = torch.tensor([acceleration, yaw_rate]).repeat(env.batch_size[0], 1)
+    return env.step(TensorDict({"action": action}, env.batch_size))["next"]
+
+
+def drive(env, steps, acceleration=0.0, yaw_rate=0.0):
+    """The td after `steps` equal actions, or at the first step where all are done."""
+    for _ in range(steps):
+        td = act(env, acceleration, yaw_rate)
+        if td["done"].all():
+            break
+    return td
+
+
+def test_specs():
+    check_env_specs(make_env(), seed=0)
+    check_env_specs(make_env(settings=SimSettings(replay_ego=True)), seed=0)
+
+
+def test_partial_resets_keep_the_others_running():
+    """next.timestep is timestep + 1 at every transition, and a trajectory never changes its scene."""
+    env = make_env(batch=8, num_vehicles=4, num_scenes=5)
+    env.set_seed(0)
+    torch.manual_seed(0)
+    data = env.rollout(200, break_when_any_done=False)
+    assert (data["next", "timestep"] == data["timestep"] + 1).all()
+    assert (data["next", "scene_index"] == data["scene_index"]).all()
+    done = data["next", "done"][:, :-1]
+    assert done.any(1).all() and (data["timestep"][:, 1:][done] == 0).all()
+    same = data["scene_index"][:, 1:] == data["scene_index"][:, :-1]
+    assert same[~done].all() and not same[done].all()
+    carried = (data["next", "observation"][:, :-1] == data["observation"][:, 1:]).all(-1, keepdim=True)
+    assert carried[~done].all() and not carried[done].any()
+
+
+def test_seed_makes_batches_identical():
+    def batch():
+        torch.manual_seed(7)
+        env = make_env(batch=4, num_scenes=6)
+        policy = TensorDictModule(lambda o: 3 * torch.randn(len(o), 2), ["observation"], ["action"])
+        collector = Collector(env, policy, frames_per_batch=80, total_frames=80, auto_register_policy_transforms=False)
+        env.set_seed(3)
+        return next(iter(collector))
+
+    first, second = batch(), batch()
+    assert (first["scene_index"] == second["scene_index"]).all()
+    assert torch.equal(first["next", "observation"], second["next", "observation"])
+
+
+class Inject(Transform):
+    """A synthesizer in small: names the scene and its traffic before the environment resets."""
+
+    def _reset_env_preprocess(self, tensordict):
+        env = self.parent.base_env
+        batch = env.batch_size[0]
+        tensordict = TensorDict({}, env.batch_size) if tensordict is None else tensordict
+        tensordict["scene_index"] = torch.full((batch, 1), 2)
+        scene = env.scenes.batch([2] * batch)
+        states = scene["logged"] + torch.tensor([0.0, 50.0, 0.0, 0.0])
+        env.set_traffic(torch.arange(batch), states, scene["logged_valid"])
+        return tensordict
+
+
+def test_transform_injects_scene_and_traffic():
+    env = TransformedEnv(make_env(batch=3), Inject())
+    td = env.reset()
+    assert (td["scene_index"] == 2).all()
+    td = env.rand_step(td)["next"]
+    world = env.base_env.world()
+    vehicles = world.route.shape[1]
+    assert (world.states[:, 1:3, 1] >= 50).all()
+    assert torch.equal(world.states[:, vehicles:], world.scene["logged"][:, 1, vehicles:]), "VRUs replay the log"
+
+
+def test_traffic_of_wrong_shape_or_nan_is_refused():
+    env = make_env()
+    scene = env.scenes.batch([0])
+    with pytest.raises(InputError, match="expected"):
+        env.set_traffic(torch.tensor([0]), scene["logged"][:, 1:], scene["logged_valid"][:, 1:])
+    with pytest.raises(InputError, match="NaN"):
+        env.set_traffic(torch.tensor([0]), scene["logged"] * torch.nan, scene["logged_valid"])
+
+
+def test_written_traffic_is_executed_and_seen_as_plan():
+    env = make_env()
+    env.reset()
+    act(env)
+    before = env.world()
+    future = before.states[:, None].repeat(1, 50, 1, 1)
+    future[..., 1] += DT * torch.arange(1, 51)[:, None]
+    future[..., 3] = 5.0
+    present = before.valid[:, None].repeat(1, 50, 1)
+    present[:, 1:, 2] = False
+    env.write_traffic(1, future, present)
+    act(env)
+    act(env)
+    world = env.world()
+    vehicles = world.route.shape[1]
+    assert torch.allclose(world.states[:, 1:vehicles], future[:, 1, 1:vehicles])
+    assert not world.valid[:, 2].any() and world.valid[:, 1].all(), "a vehicle whose traffic turns invalid is gone"
+    assert torch.allclose(world.plan[:, 1, :47], future[:, 2:49, 1])
+    assert torch.allclose(world.states[:, vehicles:], world.scene["logged"][:, 3, vehicles:])
+
+
+def test_accelerations_of_traffic_and_ego():
+    env = make_env()
+    env.reset()
+    env.world()
+    act(env, acceleration=1.5)
+    world = env.world()
+    assert torch.allclose(world.accel[:, 0], torch.tensor(1.5), atol=1e-4)
+    assert torch.allclose(world.accel[:, 1:], torch.zeros(()), atol=1e-4)
+
+
+def test_running_into_a_parked_car_terminates_at_the_first_overlap():
+    env = make_env(num_scenes=1, vehicles=[(0.0, 0, 10.0), (30.0, 0, 0.0)])
+    env.reset()
+    td = drive(env, 80)
+    assert td["metrics", "contact"].all() and td["terminated"].all() and not td["metrics", "contact_vru"].any()
+    front = td["timestep"] * DT * 10.0 + 4.5
+    assert ((front > 30.0) & (front < 31.0 + 1e-3)).all()
+    assert (td["reward"] < -5).all()
+
+
+def test_leaving_the_road_terminates():
+    env = make_env(num_scenes=1, num_vehicles=1, num_vrus=0)
+    env.reset()
+    td = drive(env, 80, yaw_rate=-0.3)
+    assert td["metrics", "off_road"].all() and td["terminated"].all() and not td["metrics", "contact"].any()
+
+
+def test_pedestrian_contact_is_its_own_metric():
+    env = make_env(num_scenes=1, num_vehicles=1, settings=SimSettings(end_off_road=False))
+    scene = env.scenes.scenes
+    scene["logged"][:, :, 32, 1] = 0.0
+    env.reset()
+    td = drive(env, 80)
+    assert td["metrics", "contact_vru"].all() and td["terminated"].all() and not td["metrics", "contact"].any()
+
+
+def test_map_end_truncates():
+    env = make_env(num_scenes=1, num_vehicles=1, road=(-60.0, 40.0))
+    env.reset()
+    td = drive(env, 80)
+    assert td["truncated"].all() and not td["terminated"].any()
+    assert 38 <= td["metrics", "progress"].mean() <= 41 and not env.world().valid[:, 0].any()
+
+
+def test_replayed_ego_follows_its_log_and_progress_is_its_way():
+    env = make_env(num_scenes=1, num_vehicles=2, settings=SimSettings(replay_ego=True))
+    env.reset()
+    td = drive(env, 80, acceleration=-8.0)
+    assert torch.allclose(env.world().states[:, 0], env.scene["logged"][:, 80, 0], atol=1e-4)
+    assert torch.allclose(td["metrics", "progress"], torch.tensor(80.0), atol=1e-3)
+
+
+def test_lonely_ego_and_no_lights():
+    """N = 1: nobody else, padded or not."""
+    scenes = make_scenes(1, num_vehicles=1, num_vrus=0, max_vehicles=1, max_agents=1)
+    scenes.scenes["light_state"] = scenes.scenes["light_state"][..., :0]
+    env = DrivingEnv(scenes, SimSettings(), 2)
+    check_env_specs(env)
+    env.reset()
+    assert torch.isfinite(drive(env, 80)["observation"]).all()
+
+
+def test_observation_is_of_order_one():
+    env = make_env(batch=4, num_vehicles=20, red_light_x=60.0)
+    data = env.rollout(80, break_when_any_done=False)
+    assert data["observation"].abs().max() <= 5 and torch.isfinite(data["observation"]).all()
+    assert data["observation"].shape[-1] <= 300
+
+
+def test_unknown_reward_term_is_refused():
+    with pytest.raises(InputError, match="speeding"):
+        make_env(settings=SimSettings(reward={"progress": 1.0}))
