@@ -16,6 +16,7 @@ from e2rl.metrics.realism import realism
 DRAWS = 1000
 REALISM_DRAWS = 400  # each costs a pass over all samples
 LEVELS = (0.025, 0.975)
+PER_COLLISION = frozenset({"rir", "at_fault", "relvel"})
 Row = dict[str, object]
 Features = dict[str, Tensor]
 
@@ -37,7 +38,7 @@ def bootstrap_draws(clusters: int, draws: int = DRAWS, seed: int = 0) -> Tensor:
 
 
 def resampled_means(values: Tensor, weights: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
-    """Weighted means [D, M] per draw [D, C] of values, weights [R, M] of rollouts in cluster [R], NaN values left out."""
+    """Weighted means [D, M] per draw [D, C] of values, weights [R, M] of rollouts in cluster [R]; NaN is left out."""
     weights = torch.where(values.isnan() | weights.isnan(), 0.0, weights)
     shape = (draws.shape[1], values.shape[1])
     total = values.new_zeros(shape).index_add(0, cluster, values.nan_to_num(0.0) * weights)
@@ -111,9 +112,8 @@ def paired_differences(
     strict = torch.tensor([metric.name not in PER_COLLISION for metric in single]) & matched
     first, second = first.masked_fill(strict, torch.nan), second.masked_fill(strict, torch.nan)
     multiplicities = bootstrap_draws(clusters, draws)
-    means = resampled_means(first, first_weight, cluster, multiplicities) - resampled_means(
-        second, second_weight, cluster, multiplicities
-    )
+    means = resampled_means(first, first_weight, cluster, multiplicities)
+    means = means - resampled_means(second, second_weight, cluster, multiplicities)
     result = {}
     for column, metric in enumerate(single):
         known = ~first[:, column].isnan() | ~second[:, column].isnan()
@@ -123,9 +123,8 @@ def paired_differences(
         realism([group[pair[side]] for pair in pairs], cluster, multiplicities)
         for side, group in enumerate((features, other_features))
     ]
+    used = torch.tensor([bool(features[a]["a_lon"].numel() and other_features[b]["a_lon"].numel()) for a, b in pairs])
     for name in samples[0]:
-        result[name] = interval(samples[0][name] - samples[1][name], clusters) | {"n": len(pairs)}
+        change = samples[0][name] - samples[1][name]
+        result[name] = interval(change, len(cluster[used.bool()].unique())) | {"n": int(used.sum())}
     return {name: {"difference": result[name].pop("mean"), **result[name]} for name in METRICS}
-
-
-PER_COLLISION = frozenset({"rir", "at_fault", "relvel"})
