@@ -69,7 +69,7 @@ def interaction_score(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     meet = (spread < 2) & (np.abs(np.sin(turn / 2)) > np.sin(0.25)) & (late < 4)[:, :, None, None] & others
     meet &= moving[:, None, :, None] & moving[None, :, None, :]
     crossing = np.minimum(meet.any((0, 1)).sum(1), 4)
-    first = np.where(valid, states[..., 2], np.nan)
-    heading = np.unwrap(np.where(valid, first, 0.0), axis=0)
-    span = np.where(valid, heading, -np.inf).max(0) - np.where(valid, heading, np.inf).min(0)
+    turned = np.diff(states[..., 2], axis=0)
+    turned = np.where(valid[1:] & valid[:-1], np.arctan2(np.sin(turned), np.cos(turned)), 0.0).cumsum(0)
+    span = turned.max(0) - turned.min(0)
     return np.where(valid.any(0), close + 2 * crossing + 2 * (span > 0.5), -np.inf)

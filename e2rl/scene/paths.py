@@ -1,4 +1,4 @@
-"""Vehicle paths over arc length: resampling, Whittaker smoothing and the heading of a body that follows its front axle.
+"""Vehicle paths over arc length: Whittaker smoothing and the heading of a body that follows its front axle.
 
 Paths are built over distance, not over time, so a creeping or standing vehicle cannot spin.
 """
@@ -13,15 +13,6 @@ def arc_length(points: np.ndarray) -> np.ndarray:
     """Cumulative length [..., P] of polylines [..., P, 2], starting at 0."""
     steps = np.linalg.norm(np.diff(points, axis=-2), axis=-1)
     return np.concatenate([np.zeros_like(steps[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
-
-
-def resample(points: np.ndarray, spacing: float) -> np.ndarray:
-    """Polyline [P, 2] at equal steps of at most `spacing` m, both ends kept -> [Q, 2], Q >= 2."""
-    s = arc_length(points)
-    keep = np.concatenate([[True], np.diff(s) > 1e-9])
-    count = max(int(np.ceil(s[-1] / spacing)), 1) + 1
-    at = np.linspace(0.0, s[-1], count)
-    return np.stack([np.interp(at, s[keep], points[keep, axis]) for axis in (0, 1)], -1)
 
 
 def offset(points: np.ndarray, distance: np.ndarray | float) -> np.ndarray:

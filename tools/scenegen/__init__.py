@@ -1,0 +1,1 @@
+"""Build-time generator of the bundled scenes: parametric layouts -> netconvert -> SUMO -> smooth tracks -> assets."""
