@@ -68,7 +68,7 @@ def _scenarionet(data, settings: BuildSettings) -> SceneSet:
         tasks = [(c, m, locations.get(Path(m).stem, ""), starts, settings) for c, m in files]
         with ProcessPoolExecutor(data.workers, multiprocessing.get_context("spawn")) as pool:
             done = list(tqdm(pool.map(_read_file, tasks, chunksize=4), "reading scenes", len(tasks), unit="file"))
-        return _assemble([row for rows in done for row in rows], data, None, split)
+        return _assemble([(_tensors(scene), *rest) for rows in done for scene, *rest in rows], data, None, split)
 
     return _cached(key, data, build)
 
@@ -82,7 +82,16 @@ def _read_file(task) -> list[tuple]:
         recordings = list(scenarionet.read_recordings(content, member, location, starts, settings.steps))
     except InputError as error:
         return [(None, member, location, "", str(error))]
-    return [_build_row(recording, settings) for recording in recordings]
+    rows = [_build_row(recording, settings) for recording in recordings]
+    # Plain arrays cross the process border; tensors would each hold a shared-memory file open.
+    return [(None if scene is None else {key: value.numpy() for key, value in scene.items()}, *rest)
+            for scene, *rest in rows]
+
+
+def _tensors(scene: dict | None) -> TensorDict | None:
+    if scene is None:
+        return None
+    return TensorDict({key: torch.from_numpy(value) for key, value in scene.items()}, batch_size=[])
 
 
 def _build_row(recording: Recording, settings: BuildSettings) -> tuple:

@@ -1,0 +1,41 @@
+"""Who is ahead of whom along the routes."""
+
+import torch
+from torch import Tensor
+
+from e2rl.scene.route import project
+
+SIDE_GAP = 0.3  # m of free space to either side that still makes somebody a leader
+FREE = 200.0  # m: the gap of a vehicle with nobody ahead
+
+
+def leaders(
+    s: Tensor, width: Tensor, length: Tensor, points: Tensor, agents: Tensor, size: Tensor, present: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The nearest agent ahead of each vehicle on its route: gap [m] (FREE if none), its speed along the route, index.
+
+    s [B, V]: the vehicles' arc lengths; width, length [B, V]; points [B, V, P, 2]; agents [B, M, 4]: states to look at,
+    of which rows 0..V-1 are the vehicles themselves; size [B, M, 2]; present [B, M].
+    """
+    vehicles = s.shape[1]
+    at, offset, heading = project(agents[:, None, :, :2], points)  # [B, V, M]
+    turn = agents[:, None, :, 2] - heading
+    cos, sin = torch.cos(turn), torch.sin(turn)
+    half_side = (size[:, None, :, 0] * sin.abs() + size[:, None, :, 1] * cos.abs()) / 2
+    half_along = (size[:, None, :, 0] * cos.abs() + size[:, None, :, 1] * sin.abs()) / 2
+    ahead = at - s[..., None]
+    inside = offset.abs() < width[..., None] / 2 + half_side + SIDE_GAP
+    itself = torch.eye(vehicles, agents.shape[1], dtype=torch.bool, device=s.device)
+    candidate = inside & (ahead > 0) & present[:, None, :] & ~itself
+    gap = torch.where(candidate, ahead - length[..., None] / 2 - half_along, FREE)
+    nearest = gap.min(-1)
+    speed = (agents[:, None, :, 3] * cos).gather(-1, nearest.indices[..., None])[..., 0]
+    return nearest.values.clamp(max=FREE), speed, nearest.indices
+
+
+def idm_acceleration(
+    v: Tensor, target: Tensor, gap: Tensor, leader: Tensor, headway: float, jam: float, accel: float, brake: float
+) -> Tensor:
+    """Intelligent Driver Model: v, target [m/s], gap [m] to a leader driving `leader` m/s -> acceleration [m/s^2]."""
+    wanted = jam + (v * headway + v * (v - leader) / (2 * (accel * brake) ** 0.5)).clamp(min=0)
+    return accel * (1 - (v / target.clamp(min=1.0)) ** 4 - (wanted / gap.clamp(min=0.1)) ** 2)

@@ -1,0 +1,211 @@
+"""The frozen prior: routes, encoding, sampling and decoding of the joint future of a scene's vehicles."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from e2rl.prior import free_space, lane_relative
+from e2rl.prior.bounds import BoundSettings, acceleration_caps
+from e2rl.prior.denoiser import Denoiser, DenoiserSettings, Encoding
+from e2rl.prior.features import edge_features, node_features
+from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate
+from e2rl.prior.route_choice import RouteChoice, sample_route
+from e2rl.prior.sde import ddim_step, euler_maruyama_step, path_kl
+from e2rl.prior.traffic import Traffic, make_traffic
+from e2rl.scene.route import project
+
+CLEAN = 0.01  # noise level at which the ego's plan is shown to the network
+STANDING, HOLD = 0.5, 2.0  # m/s, m: a standing vehicle whose 5-s plan is shorter than this is held
+
+
+@dataclass(frozen=True)
+class SamplerSettings:
+    """sampler: ddim (churn 1 is the ancestral reverse SDE, 0 deterministic) or euler_maruyama; steps K; temperature of
+    initial and injected noise; temperature of the route choice."""
+
+    sampler: str = "ddim"
+    steps: int = 8
+    churn: float = 1.0
+    temperature: float = 0.6
+    route_temperature: float = 0.5
+
+
+@dataclass
+class Context:
+    """One replan of B scenes: traffic, lane states [B, V], network encoding, the ego's plan as x [B, SIZE], the caps
+    [B, V] on acceleration, and who is active [B, V] (simulated now, not parked, not the ego)."""
+
+    traffic: Traffic
+    state: LaneState
+    encoding: Encoding
+    ego_x: Tensor
+    cap: Tensor
+    active: Tensor
+
+
+@dataclass
+class Sample:
+    """x0 [B, V, SIZE] and the discrete path KL [B, V] that control added."""
+
+    x0: Tensor
+    kl: Tensor
+
+
+Control = Callable[[Tensor, Tensor, int, Context, Callable[[Tensor], Tensor]], tuple[Tensor, Tensor, Tensor]]
+
+
+class Prior(nn.Module):
+    """p0 over joint futures; frozen once trained.
+
+    A control (Algorithm 1's inner loop) may be given to `sample`; without one the reverse SDE is the nominal prior.
+    """
+
+    def __init__(self, denoiser: DenoiserSettings | None = None, sampler: SamplerSettings | None = None,
+                 bounds: BoundSettings | None = None, free_space: bool = False):
+        super().__init__()
+        self.denoiser = Denoiser(denoiser or DenoiserSettings())
+        self.route_choice = RouteChoice()
+        self.sampler, self.bounds = sampler or SamplerSettings(), bounds or BoundSettings()
+        self.free_space = free_space
+
+    @property
+    def schedule(self):
+        """The noise schedule (SDE) of the denoiser."""
+        return self.denoiser.schedule
+
+    @torch.no_grad()
+    def start(self, scene: TensorDictBase, generator: torch.Generator | None = None,
+              route: Tensor | None = None) -> tuple[Traffic, LaneState]:
+        """Traffic and start states of scenes [B]; route [B, V] fixes candidates where >= 0, the rest is sampled.
+
+        The ego follows its mission route.
+        """
+        chosen = sample_route(self.route_choice(scene), self.sampler.route_temperature, generator)
+        if route is not None:
+            chosen = torch.where(route >= 0, route, chosen)
+        chosen = torch.cat([scene["route_log"][:, :1], chosen[:, 1:]], 1)
+        traffic = make_traffic(scene, chosen, self.free_space)
+        vehicles = chosen.shape[1]
+        hint = torch.full(chosen.shape, 20.0, device=chosen.device)
+        state = locate(scene["start"][:, :vehicles], scene["start_accel"][:, :vehicles],
+                       scene["start_yaw_rate"][:, :vehicles], traffic.points, hint)
+        return traffic, state
+
+    @torch.no_grad()
+    def encode(self, traffic: Traffic, state: LaneState, agents: Tensor, present: Tensor, step: Tensor,
+               ego_plan: Tensor, exempt: Tensor | None = None) -> Context:
+        """Everything that stays the same over the denoising steps of a replan.
+
+        agents [B, N, 4], present [B, N]: everybody now; step [B]: simulated steps; ego_plan [B, HORIZON, 4]: the ego's
+        states ahead; exempt [B, V]: vehicles whose bounds ignore the ego.
+        """
+        vehicles = state.s.shape[1]
+        here = present[:, :vehicles]
+        encoding = self.denoiser.encode(node_features(traffic, state, agents, present, step),
+                                        edge_features(traffic, state), here)
+        exempt = torch.zeros_like(here) if exempt is None else exempt
+        cap = acceleration_caps(self.bounds, traffic, state, agents, present, exempt)
+        active = here & traffic.modelled
+        active = torch.cat([torch.zeros_like(active[:, :1]), active[:, 1:]], 1)
+        return Context(traffic, state, encoding, plan_to_x(ego_plan, state, traffic), cap, active)
+
+    def denoise(self, x: Tensor, level: Tensor, context: Context) -> Tensor:
+        """x0 [B, V, SIZE] of x at a scalar noise level; the ego's row is its plan, given clean."""
+        x = torch.cat([context.ego_x[:, None], x[:, 1:]], 1)
+        levels = level.expand(x.shape[:2]).clone()
+        levels[:, 0] = CLEAN
+        x0 = self.denoiser(x, levels, context.encoding)
+        return torch.cat([context.ego_x[:, None], x0[:, 1:]], 1)
+
+    def decode(self, x0: Tensor, context: Context, capped: bool = True) -> LaneState:
+        """Planned motion, fields [B, V, HORIZON], of x0; capped: under the acceleration bounds of the executed part."""
+        state = context.state
+        if capped:
+            x0 = torch.cat([torch.minimum(x0[..., :1], context.cap[..., None]), x0[..., 1:]], -1)
+            state = LaneState(**{**vars(state), "a": torch.minimum(state.a, context.cap)})
+        lane = lane_relative.decode(x0, state, context.traffic.points)
+        on_lane = context.traffic.has_lane[..., None]
+        if bool(on_lane.all()):
+            return lane
+        free = free_space.decode(x0, state)
+        return LaneState(*(torch.where(on_lane, getattr(lane, f.name), getattr(free, f.name))
+                           for f in fields(LaneState)))
+
+    def sample(self, context: Context, generator: torch.Generator | None = None,
+               control: Control | None = None) -> Sample:
+        """One joint sample by the reverse SDE from level `start` to 0 (eq. Euler-Maruyama, or ancestral steps).
+
+        control(x, level, k, context, denoise) -> (x, x0 before, x0 after control); see e2rl/synthesizer/control.py.
+        """
+        settings, shape = self.sampler, (*context.state.s.shape, SIZE)
+        device = context.ego_x.device
+        levels = self.schedule.levels(settings.steps, device)
+        draw = lambda: settings.temperature * torch.randn(shape, generator=generator, device=device)  # noqa: E731
+        x, kl = draw(), torch.zeros(shape[:2], device=device)
+        for k in range(settings.steps, 0, -1):
+            high, low = levels[settings.steps - k], levels[settings.steps - k + 1]
+            if control is None:
+                with torch.no_grad():
+                    x0 = nominal = self.denoise(x, high, context)
+            else:
+                x, nominal, x0 = control(x, high, k, context, lambda y, t=high: self.denoise(y, t, context))
+            noise = draw()
+            after, variance = self._step(x, x0, high, low, noise)
+            if control is not None and k > 1:
+                shift = after - self._step(x, nominal, high, low, noise)[0]
+                kl = kl + path_kl(shift, variance * settings.temperature**2)
+            x = x0 if k == 1 else after
+        return Sample(x, kl)
+
+    def _step(self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """x at the lower level and the variance of the injected noise."""
+        if self.sampler.sampler == "euler_maruyama":
+            score = self.schedule.score(x, x0, high)
+            return euler_maruyama_step(self.schedule, x, score, high, low, noise)
+        after, scale = ddim_step(self.schedule, x, x0, high, low, noise, self.sampler.churn)
+        return after, scale**2
+
+    @torch.no_grad()
+    def plan(self, x0: Tensor, context: Context) -> "Plan":
+        """The motion that is executed: decoded under the bounds, standing and parked vehicles held, routes ended."""
+        motion = self.decode(x0, context)
+        state, traffic = context.state, context.traffic
+        short = (motion.s[..., -1] - state.s) < HOLD
+        hold = ((state.v < STANDING) & short) | ~context.active
+        still = state.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
+        zero = torch.zeros_like(still.v)
+        still = LaneState(**{**vars(still), "v": zero, "a": zero})
+        motion = LaneState(*(torch.where(hold[..., None], getattr(still, f.name), getattr(motion, f.name))
+                             for f in fields(LaneState)))
+        gone = traffic.open[..., None] & (motion.s >= traffic.length[..., None]) & traffic.has_lane[..., None]
+        return Plan(motion, ~(gone.cumsum(-1) > 0))
+
+
+@dataclass
+class Plan:
+    """Planned motion (fields [B, V, HORIZON]) and on_map [B, V, HORIZON]: False once a vehicle's route has ended."""
+
+    motion: LaneState
+    on_map: Tensor = field(repr=False)
+
+    def states(self) -> Tensor:
+        """[B, V, HORIZON, 4]."""
+        return self.motion.states()
+
+    def after(self, steps: int) -> LaneState:
+        """The lane states [B, V] once `steps` have been executed."""
+        return self.motion.map(lambda value: value[..., steps - 1])
+
+
+def plan_to_x(plan: Tensor, state: LaneState, traffic: Traffic) -> Tensor:
+    """The ego's planned states [B, HORIZON, 4] as x [B, SIZE] on its mission route."""
+    ego = state.map(lambda value: value[:, 0])
+    before = torch.cat([ego.v[:, None], plan[..., :-1, 3]], 1)
+    hint = ego.s[:, None] + ((plan[..., 3] + before) / 2 * 0.1).cumsum(-1)
+    s, d, _ = project(plan[..., :2], traffic.points[:, 0], hint)
+    zero = torch.zeros_like(s)
+    track = LaneState(s, d, zero, zero, plan[..., 3], zero, plan[..., 0], plan[..., 1], plan[..., 2], zero)
+    return lane_relative.fit(track, torch.ones_like(s), ego)[0]
