@@ -66,6 +66,7 @@ class DrivingEnv(EnvBase):
         self.scenes, self.settings = scenes, settings
         self._weights = check_weights(settings.reward)
         self._generator = torch.Generator()
+        self.resets = 0  # counted on the host, so that policies notice new episodes without asking the device
         self._make_specs(batch_size)
         self.scene = scenes.batch(torch.zeros(batch_size, dtype=torch.long)).to(device)
         self.horizon = self.scene["logged"].shape[1] - 1
@@ -153,6 +154,7 @@ class DrivingEnv(EnvBase):
         self.mission = mission_of(self.scene)
         self._traffic.reset(self.scene, index)
         self._restart_ego(mask)
+        self.resets += 1
         none = torch.zeros(batch, dtype=torch.bool, device=self.device)
         return TensorDict(
             self._observed(Outcome(none, none, none, self._place[0] - self._start_s)) | self._done(none, none),

@@ -55,9 +55,11 @@ def stop_ahead(
 ) -> Tensor:
     """Metres [B] from arc length s [B] to the next stop line to halt at, inf for none.
 
-    Red binds before the line. Yellow binds only where braking at `braking` m/s^2 from speed [B] still halts before it.
+    Yellow binds where braking at `braking` m/s^2 from speed [B] still halts before the line, red where twice that does:
+    who cannot halt goes on rather than stand in the junction.
     """
     state, ahead = light_now(mission, scene, step), mission.light_s - s[:, None]
-    can_halt = ahead > speed[:, None] ** 2 / (2 * braking)
-    binds = (ahead > 0) & ((state == LIGHT_RED) | ((state == LIGHT_YELLOW) & can_halt))
+    needed = speed[:, None] ** 2 / (2 * ahead.clamp(min=1e-3))
+    red, yellow = (state == LIGHT_RED) & (needed < 2 * braking), (state == LIGHT_YELLOW) & (needed < braking)
+    binds = (ahead > 0) & (red | yellow)
     return ahead.masked_fill(~binds, torch.inf).amin(1)

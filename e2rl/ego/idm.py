@@ -1,0 +1,96 @@
+"""Intelligent driver model on the mission route (Treiber et al. 2000; method_and_baselines.md 4.5, standard sign)."""
+
+import torch
+from torch import Tensor
+
+from e2rl.ego.base import PLAN_STEPS, Ego
+from e2rl.ego.path import MissionPath, look_up
+from e2rl.scene.recording import DT
+from e2rl.scene.route import project
+from e2rl.sim.dynamics import MAX_SPEED, bounded_speed, wrap
+from e2rl.sim.mission import limit_at
+from e2rl.sim.world import World
+
+REACTION = 0.5  # s ahead at which the speed caps are met
+LINE_GAP = 1.0  # m kept to a stop line
+
+
+class IDMEgo(Ego):
+    """Keeps its mission lane and follows the nearest agent ahead within the lateral gate; never changes lanes."""
+
+    def __init__(
+        self, desired_speed: float = 10.0, headway: float = 1.0, standstill_gap: float = 5.0, acceleration: float = 1.0,
+        braking: float = 3.0, exponent: float = 4.0, hardest_braking: float = 8.0, gate_margin: float = 0.3,
+        lateral_acceleration: float = 3.0, use_limits: bool = True, obey_lights: bool = True, replan_every: int = 1,
+    ) -> None:
+        """Fields: conf/ego/idm.yaml."""
+        super().__init__(replan_every)
+        self.desired_speed, self.headway, self.standstill_gap = desired_speed, headway, standstill_gap
+        self.acceleration, self.braking, self.exponent = acceleration, braking, exponent
+        self.hardest_braking, self.gate_margin = hardest_braking, gate_margin
+        self.lateral_acceleration, self.use_limits, self.obey_lights = lateral_acceleration, use_limits, obey_lights
+
+    def plan(self, world: World) -> Tensor:
+        """The present IDM acceleration held for the whole plan, within the path's speed caps."""
+        path, speed = MissionPath(world), world.states[:, 0, 3]
+        caps = path.speed_caps(self.desired_speed, self.lateral_acceleration, self.braking, self.use_limits, False)
+        gap, leading = self.leader(world, path)
+        desired = self.desired(path)
+        accel = idm_acceleration(
+            speed, desired, gap, leading, self.acceleration, self.braking, self.headway, self.standstill_gap,
+            self.exponent,
+        )
+        allowed = look_up(caps, (REACTION * speed)[:, None])[:, 0]
+        accel = torch.minimum(accel, ((allowed - speed) / REACTION).clamp(max=self.acceleration))
+        accel = accel.clamp(-self.hardest_braking, self.acceleration)
+        future = bounded_speed(speed[:, None], (accel * DT)[:, None].expand(-1, PLAN_STEPS), 0.0, MAX_SPEED)
+        future = torch.minimum(future, torch.maximum(desired, speed)[:, None])
+        return path.drive(torch.cat([speed[:, None], future], 1))
+
+    def desired(self, path: MissionPath) -> Tensor:
+        """Desired speed [B]: the limit here where known and wanted, else the set one."""
+        set_speed = torch.full_like(path.s, self.desired_speed)
+        if not self.use_limits:
+            return set_speed
+        limit = limit_at(path.mission, path.s)
+        return torch.where(limit > 0, limit, set_speed)
+
+    def leader(self, world: World, path: MissionPath) -> tuple[Tensor, Tensor]:
+        """Free gap [B] m, inf for none, and speed [B] m/s along the route of the nearest agent or red light ahead.
+
+        An agent leads when its box comes laterally within half the ego's width + gate_margin of the route.
+        """
+        others, size = world.states[:, 1:], world.scene["size"]
+        s, d, heading = project(others[..., :2], path.route)
+        turned = wrap(others[..., 2] - heading)
+        half = (size[:, 1:] / 2).unbind(-1)
+        along = turned.cos().abs() * half[0] + turned.sin().abs() * half[1]
+        across = turned.sin().abs() * half[0] + turned.cos().abs() * half[1]
+        inside = d.abs() < across + size[:, :1, 1] / 2 + self.gate_margin
+        leads = inside & (s > path.s[:, None]) & world.valid[:, 1:]
+        gaps = (s - path.s[:, None] - along - size[:, :1, 0] / 2).masked_fill(~leads, torch.inf)
+        gap, index = gaps.min(1)
+        leading = (others[..., 3] * turned.cos()).gather(1, index[:, None])[:, 0].clamp(min=0)
+        if self.obey_lights:
+            light = path.stop_distance(self.braking, LINE_GAP) + self.standstill_gap
+            gap, leading = torch.minimum(gap, light), torch.where(light < gap, 0.0, leading)
+        return gap, leading
+
+
+def idm_acceleration(
+    speed: Tensor, desired: Tensor, gap: Tensor, leading: Tensor, acceleration: float, braking: float, headway: float,
+    standstill_gap: float, exponent: float,
+) -> Tensor:
+    """IDM acceleration [...] m/s^2; gap [...] m may be inf (free road); speeds in m/s.
+
+    a (1 - (v / v0)^n - (s* / s)^2) with s* = s0 + max(0, v T + v (v - v_leader) / (2 sqrt(a b))). Above the desired
+    speed the free term is -b (1 - (v0 / v)^(a n / b)) (Treiber and Kesting's improved IDM): it brakes by b at most.
+    """
+    closing = speed - leading
+    wanted = standstill_gap + (
+        speed * headway + speed * closing / (2 * (acceleration * braking) ** 0.5)
+    ).clamp(min=0)
+    below = acceleration * (1 - (speed / desired).clamp(max=1) ** exponent)
+    above = -braking * (1 - (desired / speed.clamp(min=1e-3)).clamp(max=1) ** (acceleration * exponent / braking))
+    free = torch.where(speed > desired, above, below)
+    return free - acceleration * (wanted / gap.clamp(min=0.1)) ** 2

@@ -1,0 +1,125 @@
+"""The lane-graph planner of STRIVE (Rempe et al. 2022), by the behaviour in method_and_baselines.md 4.4.
+
+It samples speed profiles along the mission, predicts everyone else on every route that they may take, and drives the
+longest profile whose probability of collision is small enough. Vectorised over scenes, profiles, others, routes, time.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from e2rl.ego.base import PLAN_STEPS, Ego
+from e2rl.ego.path import MissionPath, look_up
+from e2rl.ego.prediction import Prediction, predict
+from e2rl.ego.risk import collision_hazard
+from e2rl.scene.recording import DT
+from e2rl.sim.world import World
+
+PLAN_DT = 0.2  # s between nodes of a profile
+HALVES = (12, 13)  # nodes towards the first and the second speed target: 5 s in all
+CAP_PASSES = 3  # fixed-point passes of the speed caps
+
+
+class LaneGraphEgo(Ego):
+    """STRIVE's planner on our routes; differences: the ego takes its mission instead of the first branch of its lane,
+    obeys curve speeds, known limits and lights (its speeds are capped by them), and its plan is drivable by a car."""
+
+    def __init__(
+        self, max_speed: float = 20.0, max_acceleration: float = 4.0, speeds: int = 5, max_risk: float = 0.1,
+        risk_slope: float = 0.3, risk_growth: float = 0.02, interaction_distance: float = 70.0,
+        predicted_speeds: tuple[float, ...] = (0.5, 1.0), predicted_acceleration: float = 0.5,
+        match_distance: float = 2.0, match_angle: float = 20.0, lateral_acceleration: float = 3.0,
+        braking: float = 3.0, use_limits: bool = True, obey_lights: bool = True, see_vrus: bool = True,
+        replan_every: int = 5,
+    ) -> None:
+        """Fields: conf/ego/lane_graph.yaml."""
+        super().__init__(replan_every)
+        self.max_speed, self.max_acceleration, self.speeds = max_speed, max_acceleration, int(speeds)
+        self.max_risk, self.risk_slope, self.risk_growth = max_risk, risk_slope, risk_growth
+        self.interaction_distance = interaction_distance
+        self.predicted_speeds, self.predicted_acceleration = tuple(predicted_speeds), predicted_acceleration
+        self.match_distance, self.match_angle = match_distance, match_angle
+        self.lateral_acceleration, self.braking = lateral_acceleration, braking
+        self.use_limits, self.obey_lights, self.see_vrus = use_limits, obey_lights, see_vrus
+
+    def plan(self, world: World) -> Tensor:
+        """The chosen profile as states [B, PLAN_STEPS, 4]."""
+        path = MissionPath(world)
+        speed = self.profiles(world, path)
+        driven = torch.nn.functional.pad(((speed[..., 1:] + speed[..., :-1]) / 2 * PLAN_DT).cumsum(-1), (1, 0))
+        poses = path.at(path.ahead(driven.transpose(0, 1))).transpose(0, 1)
+        hazard = collision_hazard(
+            poses, world.scene["size"][:, 0], self.predict(world), self.risk_slope, self.risk_growth
+        )
+        best = self.choose(hazard, driven[..., -1], self.matched(path))
+        chosen = speed[torch.arange(len(best), device=best.device), best]
+        return path.drive(upsample(chosen))
+
+    def profiles(self, world: World, path: MissionPath) -> Tensor:
+        """Speeds [B, C, 26] every PLAN_DT s of the C = speeds^2 profiles.
+
+        Two halves of the horizon have a target each, evenly spaced over what max_acceleration reaches from the speed
+        at the half's begin; then the path's caps, as far as braking at max_acceleration attains them.
+        """
+        first, second = HALVES
+        start, slope = world.states[:, 0, 3], self.max_acceleration * PLAN_DT
+        caps = path.speed_caps(
+            self.max_speed, self.lateral_acceleration, self.braking, self.use_limits, self.obey_lights
+        )
+        top = caps.amax(1).clamp(min=0).sqrt()
+        one = approach(start[:, None], targets(start, top, first * slope, self.speeds), slope, first)
+        begin = one[..., -1]
+        aims = targets(begin, top[:, None], second * slope, self.speeds)
+        two = approach(begin[..., None], aims, slope, second)
+        one = one[:, :, None].expand(-1, -1, self.speeds, -1)
+        speed = torch.cat([start[:, None, None, None].expand(*one.shape[:3], 1), one, two], -1).flatten(1, 2)
+        nodes = torch.arange(speed.shape[-1], device=speed.device)
+        hardest = (start[:, None, None] - slope * nodes).clamp(min=0)
+        wanted = speed
+        for _ in range(CAP_PASSES):
+            driven = ((speed[..., 1:] + speed[..., :-1]) / 2 * PLAN_DT).cumsum(-1)
+            allowed = look_up(caps, torch.nn.functional.pad(driven, (1, 0)))
+            speed = torch.minimum(wanted, torch.maximum(allowed, hardest))
+        return speed
+
+    def predict(self, world: World) -> Prediction:
+        """Everyone within interaction_distance on every matched route at every predicted speed."""
+        return predict(
+            world, sum(HALVES), PLAN_DT, self.predicted_speeds, self.predicted_acceleration * self.max_acceleration,
+            self.interaction_distance, self.match_distance, self.match_angle, self.see_vrus,
+        )
+
+    def matched(self, path: MissionPath) -> Tensor:
+        """Bool [B]: the ego is on its mission route, near it and along it."""
+        return (path.d.abs() < self.match_distance) & (path.turned.abs() < torch.pi * self.match_angle / 180)
+
+    def choose(self, hazard: Tensor, driven: Tensor, matched: Tensor) -> Tensor:
+        """Profile [B] by hazard [B, C] = -log(1 - probability of collision) and way [B, C]: among those below max_risk
+        the longest (the shortest for an ego off its route that is not alone), if none the least hazardous."""
+        allowed = hazard < -math.log1p(-self.max_risk)
+        longest = matched | (hazard == 0).all(1)
+        wish = torch.where(longest[:, None], driven, -driven).masked_fill(~allowed, -torch.inf)
+        return torch.where(allowed.any(1), wish.argmax(1), hazard.argmin(1))
+
+
+def targets(start: Tensor, top: Tensor, reach: float, count: int) -> Tensor:
+    """Target speeds [..., count], evenly from max(0, start - reach) to min(top, start + reach); start, top [...]."""
+    low, high = (start - reach).clamp(min=0), torch.minimum(top, start + reach)
+    share = torch.linspace(0, 1, count, device=start.device, dtype=start.dtype)
+    return low[..., None] + share * (high - low)[..., None]
+
+
+def approach(start: Tensor, aims: Tensor, slope: float, steps: int) -> Tensor:
+    """Speeds [..., steps] moving from start [...] to aims [...] by at most `slope` a step, then holding."""
+    steps = torch.arange(1, steps + 1, device=start.device, dtype=start.dtype)
+    change = aims - start
+    return start[..., None] + change.sign()[..., None] * torch.minimum(change.abs()[..., None], slope * steps)
+
+
+def upsample(speed: Tensor) -> Tensor:
+    """Speeds [B, PLAN_STEPS + 1] every DT, linear between nodes [B, 26] every PLAN_DT."""
+    place = torch.arange(PLAN_STEPS + 1, device=speed.device) * (DT / PLAN_DT)
+    low = place.floor().long().clamp(max=speed.shape[1] - 2)
+    share = place - low
+    return speed[:, low] * (1 - share) + speed[:, low + 1] * share

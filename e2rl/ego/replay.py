@@ -1,0 +1,31 @@
+"""The ego as recorded. In the environment, `sim.replay_ego=true` follows the log exactly; this plans by it."""
+
+import torch
+from torch import Tensor
+
+from e2rl.ego.base import PLAN_STEPS, Ego
+from e2rl.scene.recording import DT
+from e2rl.sim.world import World
+
+
+class ReplayEgo(Ego):
+    """Plans the recording and, where the environment does not replay it, tracks it through the unicycle.
+
+    After the recording's end the last speed and heading are held.
+    """
+
+    def __init__(self, replan_every: int = 1) -> None:
+        super().__init__(replan_every)
+
+    def plan(self, world: World) -> Tensor:
+        """Recorded states [B, PLAN_STEPS, 4] of the coming steps."""
+        track, known = world.scene["logged"][:, :, 0], world.scene["logged_valid"][:, :, 0]
+        steps = torch.arange(track.shape[1], device=track.device)
+        last = torch.where(known, steps, 0).amax(1)
+        want = world.step[:, None] + torch.arange(1, PLAN_STEPS + 1, device=track.device)
+        at = want.minimum(last[:, None])
+        row = torch.arange(len(track), device=track.device)[:, None]
+        state = track[row, at]
+        over = (want - at)[..., None] * DT * state[..., 3:]
+        direction = torch.stack([state[..., 2].cos(), state[..., 2].sin()], -1)
+        return torch.cat([state[..., :2] + over * direction, state[..., 2:]], -1)
