@@ -18,7 +18,7 @@ from e2rl.sim.world import World
 
 PLAN_DT = 0.2  # s between nodes of a profile
 HALVES = (12, 13)  # nodes towards the first and the second speed target: 5 s in all
-CAP_PASSES = 3  # fixed-point passes of the speed caps
+EARLIER = 0.01  # weight of the mean way: of profiles halted at one point, as by a red light, the first there is longest
 
 
 class LaneGraphEgo(Ego):
@@ -52,7 +52,8 @@ class LaneGraphEgo(Ego):
         hazard = collision_hazard(
             poses, world.scene["size"][:, 0], self.predict(world), self.risk_slope, self.risk_growth
         )
-        best = self.choose(hazard, driven[..., -1], self.matched(path))
+        way = driven[..., -1] + EARLIER * driven.mean(-1)
+        best = self.choose(hazard, way, self.matched(path))
         chosen = speed[torch.arange(len(best), device=best.device), best]
         return path.drive(upsample(chosen))
 
@@ -73,15 +74,8 @@ class LaneGraphEgo(Ego):
         aims = targets(begin, top[:, None], second * slope, self.speeds)
         two = approach(begin[..., None], aims, slope, second)
         one = one[:, :, None].expand(-1, -1, self.speeds, -1)
-        speed = torch.cat([start[:, None, None, None].expand(*one.shape[:3], 1), one, two], -1).flatten(1, 2)
-        nodes = torch.arange(speed.shape[-1], device=speed.device)
-        hardest = (start[:, None, None] - slope * nodes).clamp(min=0)
-        wanted = speed
-        for _ in range(CAP_PASSES):
-            driven = ((speed[..., 1:] + speed[..., :-1]) / 2 * PLAN_DT).cumsum(-1)
-            allowed = look_up(caps, torch.nn.functional.pad(driven, (1, 0)))
-            speed = torch.minimum(wanted, torch.maximum(allowed, hardest))
-        return speed
+        wanted = torch.cat([start[:, None, None, None].expand(*one.shape[:3], 1), one, two], -1).flatten(1, 2)
+        return capped(wanted, caps, slope)
 
     def predict(self, world: World) -> Prediction:
         """Everyone within interaction_distance on every matched route at every predicted speed."""
@@ -115,6 +109,23 @@ def approach(start: Tensor, aims: Tensor, slope: float, steps: int) -> Tensor:
     steps = torch.arange(1, steps + 1, device=start.device, dtype=start.dtype)
     change = aims - start
     return start[..., None] + change.sign()[..., None] * torch.minimum(change.abs()[..., None], slope * steps)
+
+
+def capped(wanted: Tensor, caps: Tensor, slope: float) -> Tensor:
+    """Speeds [B, C, 26] that follow wanted [B, C, 26] under the squared caps [B, K] of the path, braking by at most
+    `slope` a node.
+
+    Where the caps bind depends on the way driven so far, so this steps through the 26 nodes, all profiles at once.
+    """
+    speed = wanted[..., 0]
+    speeds, driven = [speed], torch.zeros_like(speed)
+    for node in wanted.unbind(-1)[1:]:
+        allowed = look_up(caps, driven + speed * PLAN_DT)
+        after = torch.minimum(node, torch.maximum(allowed, (speed - slope).clamp(min=0)))
+        driven = driven + (speed + after) / 2 * PLAN_DT
+        speed = after
+        speeds.append(speed)
+    return torch.stack(speeds, -1)
 
 
 def upsample(speed: Tensor) -> Tensor:
