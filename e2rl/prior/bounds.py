@@ -12,7 +12,7 @@ from torch import Tensor
 from e2rl.prior.features import curve_speed
 from e2rl.prior.lane_relative import LaneState
 from e2rl.prior.leaders import FREE, idm_acceleration, leaders
-from e2rl.prior.traffic import Traffic
+from e2rl.prior.routed import RoutedScene
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,13 @@ class BoundSettings:
 
 
 def acceleration_caps(
-    settings: BoundSettings, traffic: Traffic, state: LaneState, agents: Tensor, present: Tensor, exempt: Tensor
+    settings: BoundSettings, routed: RoutedScene, state: LaneState, agents: Tensor, present: Tensor, exempt: Tensor
 ) -> Tensor:
     """Highest acceleration [B, V] each vehicle may take now.
 
     agents [B, N, 4], present [B, N]: everybody now; exempt [B, V]: vehicles whose bounds ignore the ego (adversaries).
     """
-    size = traffic.scene["size"]
+    size = routed.scene["size"]
     vehicles = state.s.shape[1]
     width, length = size[:, :vehicles, 1], size[:, :vehicles, 0]
     cap = torch.full_like(state.v, 20.0)
@@ -52,29 +52,29 @@ def acceleration_caps(
             seen = torch.cat([present[:, :1] & (not hidden), present[:, 1:]], 1)
             if hidden and not bool(rows.any()):
                 continue
-            gap, speed, _ = leaders(state.s, width, length, traffic.points, agents, size, seen)
+            gap, speed, _ = leaders(state.s, width, length, routed.points, agents, size, seen)
             bound = idm_acceleration(state.v, free, gap, speed.clamp(min=0), settings.headway, settings.jam,
                                      settings.accel, settings.brake).clamp(min=settings.floor)
             cap = torch.where(rows & (gap < FREE), torch.minimum(cap, bound), cap)
     if settings.curve:
-        allowed = curve_speed(state, traffic.points, settings.curve_lateral, settings.curve_brake)
+        allowed = curve_speed(state, routed.points, settings.curve_lateral, settings.curve_brake)
         cap = torch.minimum(cap, ((allowed - state.v) / 0.5).clamp(min=settings.curve_floor))
     if settings.crossing:
-        cap = torch.minimum(cap, _crossing(settings, traffic, state, present[:, :vehicles], exempt, length))
+        cap = torch.minimum(cap, _crossing(settings, routed, state, present[:, :vehicles], exempt, length))
     return cap
 
 
 def _crossing(
-    settings: BoundSettings, traffic: Traffic, state: LaneState, present: Tensor, exempt: Tensor, length: Tensor
+    settings: BoundSettings, routed: RoutedScene, state: LaneState, present: Tensor, exempt: Tensor, length: Tensor
 ) -> Tensor:
     """Of two vehicles whose routes cross, the later by less than `crossing_time` stops before the place if it can."""
-    mine = traffic.conflict_s - state.s[..., None]
+    mine = routed.conflict_s - state.s[..., None]
     theirs = mine.transpose(1, 2)
     v = state.v.clamp(min=0.5)
     arrive, other = mine / v[..., None], theirs / v[:, None, :]
-    crossing = traffic.crossing.abs().clamp(max=torch.pi) > 0.35
+    crossing = routed.crossing.abs().clamp(max=torch.pi) > 0.35
     moving = (present & (state.v > 0.5))[:, None, :]
-    active = (traffic.conflict & crossing & (mine > 0) & (theirs > 0) & moving & (arrive < 8.0)
+    active = (routed.conflict & crossing & (mine > 0) & (theirs > 0) & moving & (arrive < 8.0)
               & (arrive >= other) & (arrive - other < settings.crossing_time))
     active[..., 0] &= ~exempt
     room = (mine - length[..., None] / 2 - 3.0).clamp(min=0.1)

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import LaneState
 from e2rl.prior.leaders import FREE, idm_acceleration, leaders
-from e2rl.prior.traffic import Traffic
+from e2rl.prior.routed import RoutedScene
 from e2rl.scene.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
 from e2rl.scene.route import SPACING, interpolate
 
@@ -24,18 +24,18 @@ def _at(values: Tensor, s: Tensor) -> Tensor:
     return values.gather(-1, index[..., None])[..., 0]
 
 
-def _lights(traffic: Traffic, state: LaneState, step: Tensor) -> list[Tensor]:
+def _lights(routed: RoutedScene, state: LaneState, step: Tensor) -> list[Tensor]:
     """Per light of the route: nearness, red, yellow, green, braking needed to stop at it (12 s ahead at most)."""
     out = []
-    states = traffic.scene["light_state"]
-    for k in range(traffic.light.shape[-1]):
-        ahead = traffic.light_s[..., k] - state.s
-        seen = (traffic.light[..., k] >= 0) & (ahead > -1.0) & (ahead < 120.0)
+    states = routed.scene["light_state"]
+    for k in range(routed.light.shape[-1]):
+        ahead = routed.light_s[..., k] - state.s
+        seen = (routed.light[..., k] >= 0) & (ahead > -1.0) & (ahead < 120.0)
         if states.shape[-1]:
             now = states[torch.arange(len(states), device=step.device), step.clamp(max=states.shape[1] - 1)]
-            colour = now.gather(1, traffic.light[..., k].clamp(min=0))
+            colour = now.gather(1, routed.light[..., k].clamp(min=0))
         else:
-            colour = torch.zeros_like(traffic.light[..., k])
+            colour = torch.zeros_like(routed.light[..., k])
         need = (state.v**2 / (2 * ahead.clamp(min=1.0))).clamp(max=8.0)
         out.append(torch.where(seen, 1 - ahead / 120.0, 0.0))
         out += [(seen & (colour == c)).float() for c in (LIGHT_RED, LIGHT_YELLOW, LIGHT_GREEN)]
@@ -50,25 +50,25 @@ def curve_speed(state: LaneState, points: Tensor, lateral: float, brake: float) 
     return torch.sqrt(lateral / curvature.clamp(min=1e-4) + 2 * brake * ahead).min(-1).values
 
 
-def node_features(traffic: Traffic, state: LaneState, agents: Tensor, present: Tensor, step: Tensor) -> Tensor:
+def node_features(routed: RoutedScene, state: LaneState, agents: Tensor, present: Tensor, step: Tensor) -> Tensor:
     """[B, V, NODE] from lane states [B, V], agents' states [B, N, 4], present [B, N] and the simulated step [B]."""
-    scene, vehicles = traffic.scene, state.s.shape[1]
+    scene, vehicles = routed.scene, state.s.shape[1]
     size = scene["size"]
     v, width, length = state.v, size[:, :vehicles, 1], size[:, :vehicles, 0]
-    limit = _at(traffic.limit, state.s)
+    limit = _at(routed.limit, state.s)
     known = limit > 0
     offsets = torch.tensor(CURVATURE_AT + TURN_AT, device=v.device)
-    _, heading, curvature = interpolate(traffic.points, state.s[..., None] + torch.cat([offsets, offsets[:1] * 0]))
+    _, heading, curvature = interpolate(routed.points, state.s[..., None] + torch.cat([offsets, offsets[:1] * 0]))
     count = len(CURVATURE_AT)
     turn = (heading[..., count:-1] - heading[..., -1:] + torch.pi) % (2 * torch.pi) - torch.pi
-    curve = curve_speed(state, traffic.points, COMFORT_LATERAL, COMFORT_BRAKE)
-    rest = torch.where(traffic.open, traffic.length - state.s, 200.0).clamp(-10.0, 200.0)
+    curve = curve_speed(state, routed.points, COMFORT_LATERAL, COMFORT_BRAKE)
+    rest = torch.where(routed.open, routed.length - state.s, 200.0).clamp(-10.0, 200.0)
     moved = torch.stack([torch.cos(agents[..., 2]), torch.sin(agents[..., 2])], -1) * agents[..., 3:]
     future = torch.cat([torch.cat([agents[..., :2] + t * moved, agents[..., 2:]], -1) for t in LEADER_AT], 1)
     lead, first = [], None
     for k in range(len(LEADER_AT)):
         there = future[:, k * agents.shape[1]:(k + 1) * agents.shape[1]]
-        gap, speed, _ = leaders(state.s, width, length, traffic.points, there, size, present)
+        gap, speed, _ = leaders(state.s, width, length, routed.points, there, size, present)
         first = (gap, speed) if first is None else first
         lead += [torch.exp(-gap.clamp(min=0) / 20.0), torch.where(gap < FREE, (v - speed) / 5.0, 0.0)]
     target = torch.where(known, limit, 15.0)
@@ -78,13 +78,13 @@ def node_features(traffic: Traffic, state: LaneState, agents: Tensor, present: T
         torch.where(known, (limit - v) / 10, 0.0), torch.where(known, limit / 15, 0.0),
         *(curvature[..., :count] * 15).clamp(-3, 3).unbind(-1), *turn.unbind(-1), state.kappa * v,
         ((curve - v) / 5).clamp(-2, 2), torch.exp(-rest.clamp(min=0) / 30), (rest < 200).float(), *lead,
-        idm / 2, *_lights(traffic, state, step), length / 5, width / 2, traffic.parked.float(),
-        traffic.has_lane.float(), (first[0] < FREE).float(), (v * v / (2 * first[0].clamp(min=1.0))).clamp(max=8) / 4,
+        idm / 2, *_lights(routed, state, step), length / 5, width / 2, routed.parked.float(),
+        routed.has_lane.float(), (first[0] < FREE).float(), (v * v / (2 * first[0].clamp(min=1.0))).clamp(max=8) / 4,
         (v / 10) ** 2, torch.sqrt(v.clamp(min=0) + 1e-3) / 3]
     return torch.stack(features, -1)
 
 
-def edge_features(traffic: Traffic, state: LaneState) -> Tensor:
+def edge_features(routed: RoutedScene, state: LaneState) -> Tensor:
     """[B, V, V, EDGE]: j in i's frame, and where their routes meet."""
     x, y, heading, v = state.x, state.y, state.heading, state.v
     cos, sin = torch.cos(heading)[..., None], torch.sin(heading)[..., None]
@@ -94,9 +94,9 @@ def edge_features(traffic: Traffic, state: LaneState) -> Tensor:
     vx, vy = v[:, None, :] * torch.cos(turn) - v[..., None], v[:, None, :] * torch.sin(turn)
     distance = torch.sqrt(dx**2 + dy**2 + 0.01)
     closing = -(along * vx + aside * vy) / distance
-    mine = traffic.conflict_s - state.s[..., None]
+    mine = routed.conflict_s - state.s[..., None]
     theirs = mine.transpose(1, 2)
-    meet = traffic.conflict & (mine > -3) & (theirs > -3)
+    meet = routed.conflict & (mine > -3) & (theirs > -3)
     arrival = mine / v[..., None].clamp(min=1.0) - theirs / v[:, None, :].clamp(min=1.0)
     zero = torch.zeros_like(mine)
     features = [
@@ -104,6 +104,6 @@ def edge_features(traffic: Traffic, state: LaneState) -> Tensor:
         closing / 10, torch.exp(-distance / 5), meet.float(),
         torch.where(meet, torch.exp(-mine.clamp(min=0) / 30), zero),
         torch.where(meet, torch.exp(-theirs.clamp(min=0) / 30), zero),
-        torch.where(meet, torch.cos(traffic.crossing), zero), torch.where(meet, torch.sin(traffic.crossing), zero),
+        torch.where(meet, torch.cos(routed.crossing), zero), torch.where(meet, torch.sin(routed.crossing), zero),
         torch.where(meet, torch.tanh(arrival / 3), zero)]
     return torch.stack(features, -1)

@@ -11,10 +11,10 @@ from e2rl.prior import free_space, lane_relative
 from e2rl.prior.bounds import BoundSettings, acceleration_caps
 from e2rl.prior.denoiser import Denoiser, DenoiserSettings, Encoding
 from e2rl.prior.features import edge_features, node_features
-from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate
+from e2rl.prior.lane_relative import HORIZON, LaneState, locate
 from e2rl.prior.route_choice import RouteChoice, sample_route
+from e2rl.prior.routed import RoutedScene, route_scene
 from e2rl.prior.sde import ddim_step, euler_maruyama_step, path_kl
-from e2rl.prior.traffic import Traffic, make_traffic
 from e2rl.scene.route import project
 
 CLEAN = 0.01  # noise level at which the ego's plan is shown to the network
@@ -35,10 +35,10 @@ class SamplerSettings:
 
 @dataclass
 class Context:
-    """One replan of B scenes: traffic, lane states [B, V], network encoding, the ego's plan as x [B, SIZE], the caps
+    """One replan of B scenes: routed, lane states [B, V], network encoding, the ego's plan as x [B, SIZE], the caps
     [B, V] on acceleration, and who is active [B, V] (simulated now, not parked, not the ego)."""
 
-    traffic: Traffic
+    routed: RoutedScene
     state: LaneState
     encoding: Encoding
     ego_x: Tensor
@@ -77,25 +77,23 @@ class Prior(nn.Module):
         return self.denoiser.schedule
 
     @torch.no_grad()
-    def start(self, scene: TensorDictBase, generator: torch.Generator | None = None,
-              route: Tensor | None = None) -> tuple[Traffic, LaneState]:
-        """Traffic and start states of scenes [B]; route [B, V] fixes candidates where >= 0, the rest is sampled.
+    def choose_routes(self, scene: TensorDictBase, uniform: Tensor) -> Tensor:
+        """A route candidate [B, V] for each vehicle, drawn by uniform [B, V, R]; the ego's is its mission."""
+        chosen = sample_route(self.route_choice(scene), self.sampler.route_temperature, uniform)
+        return torch.cat([scene["route_log"][:, :1], chosen[:, 1:]], 1)
 
-        The ego follows its mission route.
-        """
-        chosen = sample_route(self.route_choice(scene), self.sampler.route_temperature, generator)
-        if route is not None:
-            chosen = torch.where(route >= 0, route, chosen)
-        chosen = torch.cat([scene["route_log"][:, :1], chosen[:, 1:]], 1)
-        traffic = make_traffic(scene, chosen, self.free_space)
+    @torch.no_grad()
+    def start(self, scene: TensorDictBase, chosen: Tensor) -> tuple[RoutedScene, LaneState]:
+        """RoutedScene and start states of scenes [B] whose vehicles follow candidates chosen [B, V]."""
+        routed = route_scene(scene, chosen, self.free_space)
         vehicles = chosen.shape[1]
         hint = torch.full(chosen.shape, 20.0, device=chosen.device)
         state = locate(scene["start"][:, :vehicles], scene["start_accel"][:, :vehicles],
-                       scene["start_yaw_rate"][:, :vehicles], traffic.points, hint)
-        return traffic, state
+                       scene["start_yaw_rate"][:, :vehicles], routed.points, hint)
+        return routed, state
 
     @torch.no_grad()
-    def encode(self, traffic: Traffic, state: LaneState, agents: Tensor, present: Tensor, step: Tensor,
+    def encode(self, routed: RoutedScene, state: LaneState, agents: Tensor, present: Tensor, step: Tensor,
                ego_plan: Tensor, exempt: Tensor | None = None) -> Context:
         """Everything that stays the same over the denoising steps of a replan.
 
@@ -104,13 +102,13 @@ class Prior(nn.Module):
         """
         vehicles = state.s.shape[1]
         here = present[:, :vehicles]
-        encoding = self.denoiser.encode(node_features(traffic, state, agents, present, step),
-                                        edge_features(traffic, state), here)
+        encoding = self.denoiser.encode(node_features(routed, state, agents, present, step),
+                                        edge_features(routed, state), here)
         exempt = torch.zeros_like(here) if exempt is None else exempt
-        cap = acceleration_caps(self.bounds, traffic, state, agents, present, exempt)
-        active = here & traffic.modelled
+        cap = acceleration_caps(self.bounds, routed, state, agents, present, exempt)
+        active = here & routed.modelled
         active = torch.cat([torch.zeros_like(active[:, :1]), active[:, 1:]], 1)
-        return Context(traffic, state, encoding, plan_to_x(ego_plan, state, traffic), cap, active)
+        return Context(routed, state, encoding, plan_to_x(ego_plan, state, routed), cap, active)
 
     def denoise(self, x: Tensor, level: Tensor, context: Context) -> Tensor:
         """x0 [B, V, SIZE] of x at a scalar noise level; the ego's row is its plan, given clean."""
@@ -126,25 +124,24 @@ class Prior(nn.Module):
         if capped:
             x0 = torch.cat([torch.minimum(x0[..., :1], context.cap[..., None]), x0[..., 1:]], -1)
             state = LaneState(**{**vars(state), "a": torch.minimum(state.a, context.cap)})
-        lane = lane_relative.decode(x0, state, context.traffic.points)
-        on_lane = context.traffic.has_lane[..., None]
+        lane = lane_relative.decode(x0, state, context.routed.points)
+        on_lane = context.routed.has_lane[..., None]
         if bool(on_lane.all()):
             return lane
         free = free_space.decode(x0, state)
         return LaneState(*(torch.where(on_lane, getattr(lane, f.name), getattr(free, f.name))
                            for f in fields(LaneState)))
 
-    def sample(self, context: Context, generator: torch.Generator | None = None,
-               control: Control | None = None) -> Sample:
+    def sample(self, context: Context, noise: Tensor, control: Control | None = None) -> Sample:
         """One joint sample by the reverse SDE from level `start` to 0 (eq. Euler-Maruyama, or ancestral steps).
 
+        noise [steps, B, V, SIZE]: standard normal, the first slice starts the reverse SDE, the others drive it.
         control(x, level, k, context, denoise) -> (x, x0 before, x0 after control); see e2rl/synthesizer/control.py.
         """
-        settings, shape = self.sampler, (*context.state.s.shape, SIZE)
-        device = context.ego_x.device
-        levels = self.schedule.levels(settings.steps, device)
-        draw = lambda: settings.temperature * torch.randn(shape, generator=generator, device=device)  # noqa: E731
-        x, kl = draw(), torch.zeros(shape[:2], device=device)
+        settings = self.sampler
+        levels = self.schedule.levels(settings.steps, noise.device)
+        noise = settings.temperature * noise
+        x, kl = noise[0], torch.zeros(noise.shape[1:3], device=noise.device)
         for k in range(settings.steps, 0, -1):
             high, low = levels[settings.steps - k], levels[settings.steps - k + 1]
             if control is None:
@@ -152,13 +149,14 @@ class Prior(nn.Module):
                     x0 = nominal = self.denoise(x, high, context)
             else:
                 x, nominal, x0 = control(x, high, k, context, lambda y, t=high: self.denoise(y, t, context))
-            noise = draw()
-            after, variance = self._step(x, x0, high, low, noise)
-            if control is not None and k > 1:
-                shift = after - self._step(x, nominal, high, low, noise)[0]
-                kl = kl + path_kl(shift, variance * settings.temperature**2)
-            x = x0 if k == 1 else after
-        return Sample(x, kl)
+            before = x
+            if k > 1:  # the last step takes x0 itself
+                xi = noise[settings.steps - k + 1]
+                x, variance = self._step(x, x0, high, low, xi)
+                if control is not None:
+                    shift = x - self._step(before, nominal, high, low, xi)[0]
+                    kl = kl + path_kl(shift, variance * settings.temperature**2)
+        return Sample(x0, kl)
 
     def _step(self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """x at the lower level and the variance of the injected noise."""
@@ -172,7 +170,7 @@ class Prior(nn.Module):
     def plan(self, x0: Tensor, context: Context) -> "Plan":
         """The motion that is executed: decoded under the bounds, standing and parked vehicles held, routes ended."""
         motion = self.decode(x0, context)
-        state, traffic = context.state, context.traffic
+        state, routed = context.state, context.routed
         short = (motion.s[..., -1] - state.s) < HOLD
         hold = ((state.v < STANDING) & short) | ~context.active
         still = state.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
@@ -180,7 +178,7 @@ class Prior(nn.Module):
         still = LaneState(**{**vars(still), "v": zero, "a": zero})
         motion = LaneState(*(torch.where(hold[..., None], getattr(still, f.name), getattr(motion, f.name))
                              for f in fields(LaneState)))
-        gone = traffic.open[..., None] & (motion.s >= traffic.length[..., None]) & traffic.has_lane[..., None]
+        gone = routed.open[..., None] & (motion.s >= routed.length[..., None]) & routed.has_lane[..., None]
         return Plan(motion, ~(gone.cumsum(-1) > 0))
 
 
@@ -200,12 +198,12 @@ class Plan:
         return self.motion.map(lambda value: value[..., steps - 1])
 
 
-def plan_to_x(plan: Tensor, state: LaneState, traffic: Traffic) -> Tensor:
+def plan_to_x(plan: Tensor, state: LaneState, routed: RoutedScene) -> Tensor:
     """The ego's planned states [B, HORIZON, 4] as x [B, SIZE] on its mission route."""
     ego = state.map(lambda value: value[:, 0])
     before = torch.cat([ego.v[:, None], plan[..., :-1, 3]], 1)
     hint = ego.s[:, None] + ((plan[..., 3] + before) / 2 * 0.1).cumsum(-1)
-    s, d, _ = project(plan[..., :2], traffic.points[:, 0], hint)
+    s, d, _ = project(plan[..., :2], routed.points[:, 0], hint)
     zero = torch.zeros_like(s)
     track = LaneState(s, d, zero, zero, plan[..., 3], zero, plan[..., 0], plan[..., 1], plan[..., 2], zero)
     return lane_relative.fit(track, torch.ones_like(s), ego)[0]

@@ -59,9 +59,8 @@ class RouteChoice(nn.Module):
         return logits.masked_fill(~valid, -torch.inf)
 
 
-def sample_route(logits: Tensor, temperature: float, generator: torch.Generator | None) -> Tensor:
-    """A candidate [B, V] for each vehicle; temperature 0: the most likely."""
+def sample_route(logits: Tensor, temperature: float, uniform: Tensor) -> Tensor:
+    """A candidate [B, V] for each vehicle by the Gumbel trick on uniform [B, V, R]; temperature 0: the most likely."""
     if temperature <= 0:
         return logits.argmax(-1)
-    uniform = torch.rand(logits.shape, generator=generator, device=logits.device).clamp(1e-9, 1 - 1e-9)
-    return (logits / temperature - torch.log(-torch.log(uniform))).argmax(-1)
+    return (logits / temperature - torch.log(-torch.log(uniform.clamp(1e-9, 1 - 1e-7)))).argmax(-1)

@@ -8,7 +8,7 @@ from tqdm import tqdm
 from e2rl.prior import free_space, lane_relative
 from e2rl.prior.features import edge_features, node_features
 from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS, KNOTS, LaneState, locate
-from e2rl.prior.traffic import Traffic, make_traffic
+from e2rl.prior.routed import RoutedScene, route_scene
 from e2rl.scene.recording import DT
 from e2rl.scene.route import project
 
@@ -34,14 +34,14 @@ def make_windows(scenes: TensorDictBase, free: bool = False, chunk: int = 32) ->
     for begin in tqdm(range(0, len(scenes), chunk), "training windows"):
         scene = scenes[begin:begin + chunk]
         vehicles = scene["route_log"].shape[1]
-        traffic = make_traffic(scene, scene["route_log"].clamp(min=0), free)
+        routed = route_scene(scene, scene["route_log"].clamp(min=0), free)
         logged, valid = scene["logged"][:, :, :vehicles], scene["logged_valid"][:, :, :vehicles]
         accel = derivative(logged[..., 3], valid).clamp(-6.0, 4.0)
         turn = torch.where(valid, logged[..., 2], 0.0)
         unwrapped = torch.cumsum(torch.cat([turn[:, :1], _wrap(turn.diff(dim=1))], 1), 1)
         yaw_rate = derivative(unwrapped, valid).clamp(-1.0, 1.0)
-        parts += [_window(traffic, offset, accel, yaw_rate, causal=False) for offset in OFFSETS]
-        parts.append(_window(traffic, 0, accel, yaw_rate, causal=True))
+        parts += [_window(routed, offset, accel, yaw_rate, causal=False) for offset in OFFSETS]
+        parts.append(_window(routed, 0, accel, yaw_rate, causal=True))
     windows = torch.cat(parts)
     return windows[windows["weight"].sum(-1) > 0]
 
@@ -50,19 +50,19 @@ def _wrap(angle: Tensor) -> Tensor:
     return (angle + torch.pi) % (2 * torch.pi) - torch.pi
 
 
-def _window(traffic: Traffic, offset: int, accel: Tensor, yaw_rate: Tensor, causal: bool) -> TensorDict:
+def _window(routed: RoutedScene, offset: int, accel: Tensor, yaw_rate: Tensor, causal: bool) -> TensorDict:
     """Windows [B] at a frame: nodes [R, NODE], pairs [R, R, EDGE], present [R], x0 [R, SIZE], knot_weight [R, SIZE]
     (knots inside the recorded future), weight [R] of the vehicle in the loss, and for the trajectory term v, a, d, d1,
     d2 [R], ahead, aside, known [R, KNOTS]: recorded way and offset at 0.5 s steps. causal: start states as a causal
     observer estimates them; otherwise exact."""
-    scene, vehicles = traffic.scene, traffic.route.shape[1]
+    scene, vehicles = routed.scene, routed.route.shape[1]
     logged, valid = scene["logged"][:, offset], scene["logged_valid"][:, offset] & scene["valid"]
     rate = (scene["start_accel"][:, :vehicles], scene["start_yaw_rate"][:, :vehicles]) if causal else (
         accel[:, offset], yaw_rate[:, offset])
     agents = scene["start"] if causal else logged
-    state = locate(agents[:, :vehicles], *rate, traffic.points)
+    state = locate(agents[:, :vehicles], *rate, routed.points)
     step = torch.full((len(logged),), offset, dtype=torch.long)
-    nodes, pairs = node_features(traffic, state, agents, valid, step), edge_features(traffic, state)
+    nodes, pairs = node_features(routed, state, agents, valid, step), edge_features(routed, state)
     future = slice(offset + 1, offset + 1 + HORIZON)
     tracks = scene["logged"][:, future, :vehicles].transpose(1, 2)
     known = scene["logged_valid"][:, future, :vehicles].transpose(1, 2)
@@ -71,13 +71,13 @@ def _window(traffic: Traffic, offset: int, accel: Tensor, yaw_rate: Tensor, caus
         tracks = torch.cat([tracks, tracks.new_zeros(*tracks.shape[:2], short, 4)], 2)
         known = torch.cat([known, known.new_zeros(*known.shape[:2], short)], 2)
     known = known.cumprod(-1).bool()
-    x0, error, s, d = _targets(traffic, state, tracks, known)
+    x0, error, s, d = _targets(routed, state, tracks, known)
     ends = torch.arange(1, KNOTS + 1) * KNOT_STEPS - 1
     at_knots = known[..., ends]
     moving = torch.where(known, tracks[..., 3], 0.0).amax(-1).clamp(min=state.v) > 0.5
     here = valid[:, :vehicles]
-    fits = (scene["route_log"] >= 0) | ~traffic.has_lane
-    use = here & traffic.modelled & fits & (error < MAX_ERROR) & (known.sum(-1) >= KNOT_STEPS)
+    fits = (scene["route_log"] >= 0) | ~routed.has_lane
+    use = here & routed.modelled & fits & (error < MAX_ERROR) & (known.sum(-1) >= KNOT_STEPS)
     columns = {
         "nodes": nodes, "present": here, "x0": x0, "weight": use * torch.where(moving, 1.0, STANDING_WEIGHT),
         "knot_weight": torch.cat([at_knots, known[..., [24]], known[..., [44]]], -1).float(),
@@ -92,14 +92,14 @@ def _window(traffic: Traffic, offset: int, accel: Tensor, yaw_rate: Tensor, caus
     return TensorDict(window, batch_size=[len(logged)])
 
 
-def _targets(traffic: Traffic, state: LaneState, tracks: Tensor, known: Tensor) -> tuple[Tensor, ...]:
+def _targets(routed: RoutedScene, state: LaneState, tracks: Tensor, known: Tensor) -> tuple[Tensor, ...]:
     """x0 [B, V, SIZE] of tracks [B, V, HORIZON, 4], its error [B, V], and the recorded s, d [B, V, HORIZON]."""
     hint = state.s[..., None] + (torch.where(known, tracks[..., 3], 0.0) * DT).cumsum(-1)
-    s, d, _ = project(tracks[..., :2], traffic.points, hint)
+    s, d, _ = project(tracks[..., :2], routed.points, hint)
     zero = torch.zeros_like(s)
     track = LaneState(s, d, zero, zero, tracks[..., 3], zero, tracks[..., 0], tracks[..., 1], tracks[..., 2], zero)
     x0, error = lane_relative.fit(track, known.float(), state)
-    if bool(traffic.has_lane.all()):
+    if bool(routed.has_lane.all()):
         return x0, error, s, d
     knots = lane_relative.ACCEL_SCALE * x0[..., :KNOTS]
     bend = free_space.fit(tracks[..., 2], known.float(), state, knots)
@@ -107,5 +107,5 @@ def _targets(traffic: Traffic, state: LaneState, tracks: Tensor, known: Tensor) 
     motion = free_space.decode(free, state)
     gap = torch.hypot(motion.x - tracks[..., 0], motion.y - tracks[..., 1])
     free_error = (gap * known).sum(-1) / known.sum(-1).clamp(min=1) / 2
-    lane = traffic.has_lane
+    lane = routed.has_lane
     return torch.where(lane[..., None], x0, free), torch.where(lane, error, free_error), s, d

@@ -14,7 +14,7 @@ CONFLICT_GAP = 2.5  # m between routes that meet
 
 
 @dataclass
-class Traffic:
+class RoutedScene:
     """The routes of B scenes' vehicles and what follows from them.
 
     route [B, V]; points [B, V, P, 2]; length [B, V]; open [B, V]; limit [B, V, P]; light, light_s [B, V, 2];
@@ -45,8 +45,8 @@ def take_route(values: Tensor, route: Tensor) -> Tensor:
     return values.gather(2, index).squeeze(2)
 
 
-def make_traffic(scene: TensorDictBase, route: Tensor, free_space: bool = False) -> Traffic:
-    """The Traffic of scenes [B] whose vehicles follow candidates route [B, V].
+def route_scene(scene: TensorDictBase, route: Tensor, free_space: bool = False) -> RoutedScene:
+    """The RoutedScene of scenes [B] whose vehicles follow candidates route [B, V].
 
     free_space: represent every vehicle without its lane (the ablation).
     """
@@ -58,7 +58,7 @@ def make_traffic(scene: TensorDictBase, route: Tensor, free_space: bool = False)
     conflict, conflict_s, crossing = (torch.cat(parts) for parts in zip(*pairs, strict=True))
     both = (valid & ~parked & has_lane)
     conflict = conflict & both[:, :, None] & both[:, None, :]
-    return Traffic(
+    return RoutedScene(
         scene, route, points, take_route(scene["route_length"], route), take_route(scene["route_open"], route),
         take_route(scene["route_limit"], route), take_route(scene["route_light"], route),
         take_route(scene["route_light_s"], route), conflict, conflict_s, crossing, valid & ~parked, parked,
@@ -66,7 +66,7 @@ def make_traffic(scene: TensorDictBase, route: Tensor, free_space: bool = False)
 
 
 def _conflicts(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """First meeting of every route pair of points [B, V, P, 2] (see Traffic)."""
+    """First meeting of every route pair of points [B, V, P, 2] (see RoutedScene)."""
     line = points[:, :, :CONFLICT_RANGE:CONFLICT_STRIDE]
     batch, vehicles, count, _ = line.shape
     flat = line.reshape(batch, vehicles * count, 2)

@@ -1,0 +1,118 @@
+"""Sparse gradient control (Sec. IV-B2): the masked control of one replan, inside every step of the reverse SDE.
+
+Guidance replaces the score s by s - grad V (design.md 7.1), which is the same as moving the clean estimate:
+x0 <- x0 - (sigma^2 / alpha) grad V. What is added here is a bound per vehicle, so that eta stays a usable dial: the
+gradient is scaled by noise level and clipped before eta multiplies it; V_feas has a clip of its own.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from e2rl.errors import InputError
+from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS
+from e2rl.prior.prior import Context, Prior
+from e2rl.synthesizer.anchoring import Anchor, blend_clean, blend_literal
+from e2rl.synthesizer.potentials import (
+    PotentialContext,
+    PotentialSettings,
+    adversarial_potential,
+    annealed_temperature,
+    feasibility_potential,
+)
+
+MIN_ALPHA = 0.05
+
+
+@dataclass(frozen=True)
+class ControlSettings:
+    """conf/synthesizer/e2.yaml explains each."""
+
+    gradient: str = "denoiser"
+    scaling: str = "sigma"
+    adversarial_clip: float = 0.3
+    feasibility: float = 1.0
+    feasibility_clip: float = 0.5
+    feasibility_scope: str = "all"
+    anchoring: str = "clean"
+    anchor_level: float = 0.5
+
+    def __post_init__(self):
+        for name, choices in (("gradient", ("denoiser", "clean")), ("scaling", ("score", "sigma", "unit")),
+                              ("feasibility_scope", ("all", "support")), ("anchoring", ("clean", "literal", "off"))):
+            if getattr(self, name) not in choices:
+                raise InputError(f"synthesizer.control.{name} is {getattr(self, name)!r}; choose one of {choices}")
+
+
+def clip_rows(gradient: Tensor, limit: float) -> Tensor:
+    """gradient [B, V, D] with each row's norm at most `limit`."""
+    return gradient * (limit / gradient.norm(dim=-1, keepdim=True).clamp(min=limit))
+
+
+class SparseControl:
+    """The control of one replan of B scenes; called by `Prior.sample` at every noise level.
+
+    eta [B]: intensity; coalition [B, V]: C*; anchor: the skeleton's proposal; anchor_noise [B, V, SIZE]: for the
+    literal blend. `jump` [B, V] holds the anchor's mean shift energy, ||shift||^2 / (2 sigma^2), after sampling.
+    """
+
+    def __init__(self, prior: Prior, settings: ControlSettings, potentials: PotentialSettings, where: PotentialContext,
+                 coalition: Tensor, eta: Tensor, anchor: Anchor, strength: float, anchor_noise: Tensor):
+        self.prior, self.settings, self.potentials, self.where = prior, settings, potentials, where
+        self.coalition, self.eta, self.anchor, self.strength = coalition, eta, anchor, strength
+        self.anchor_noise = anchor_noise
+        levels = prior.schedule.levels(prior.sampler.steps)
+        nearest = int((levels[:-1] - settings.anchor_level).abs().argmin())
+        self.anchor_step = prior.sampler.steps - nearest
+        self.jump = torch.zeros(coalition.shape, device=eta.device)
+
+    def __call__(self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Callable[[Tensor], Tensor]
+                 ) -> tuple[Tensor, Tensor, Tensor]:
+        """(x after anchoring, denoised x0, controlled x0) at step k; anchoring comes first (design.md 7.2)."""
+        if k == self.anchor_step and self.settings.anchoring != "off" and self.strength > 0:
+            x = self._anchored(x, level, context, denoise)
+        heat = annealed_temperature(level, self.potentials)
+        with torch.enable_grad():
+            if self.settings.gradient == "denoiser":
+                variable = x.detach().requires_grad_(True)
+                x0 = denoise(variable)
+            else:
+                with torch.no_grad():
+                    x0 = denoise(x)
+                variable = x0 = x0.detach().requires_grad_(True)
+            states = self.prior.decode(x0, context, capped=False).states()
+            threat = adversarial_potential(states, self.where, self.potentials, heat)
+            infeasible = feasibility_potential(states, self.where, self.potentials)
+            (towards,) = torch.autograd.grad(threat.sum(), variable, retain_graph=True)
+            (away,) = torch.autograd.grad(infeasible.sum(), variable)
+        weight = self._weight(level)
+        towards = clip_rows(weight * towards, self.settings.adversarial_clip)
+        away = clip_rows(self.settings.feasibility * weight * away, self.settings.feasibility_clip)
+        whom = context.active if self.settings.feasibility_scope == "all" else self.coalition
+        shift = self.eta[:, None, None] * towards * self.coalition[..., None] + away * whom[..., None]
+        acts = (context.active & (self.eta > 0)[:, None])[..., None]
+        x0 = x0.detach()
+        return x, x0, x0 - torch.where(acts, shift, 0.0)
+
+    def _weight(self, level: Tensor) -> Tensor:
+        """Factor between grad V and the shift of x0: sigma^2 / alpha is the exact score form, the others tame it."""
+        alpha, sigma = self.prior.schedule.alpha(level), self.prior.schedule.sigma(level)
+        if self.settings.scaling == "score":
+            return sigma**2 / alpha.clamp(min=MIN_ALPHA)
+        return sigma if self.settings.scaling == "sigma" else torch.ones_like(sigma)
+
+    def _anchored(self, x: Tensor, level: Tensor, context: Context, denoise) -> Tensor:
+        """Topological anchoring of the coalition at this level; books the jump's energy."""
+        with torch.no_grad():
+            x0 = denoise(x)
+        alpha, sigma = self.prior.schedule.alpha(level), self.prior.schedule.sigma(level)
+        proposal = torch.cat([self.anchor.knots / ACCEL_SCALE, x0[..., KNOTS:]], -1)
+        mask = self.anchor.has & self.coalition & context.active & (self.eta > 0)[:, None]
+        if self.settings.anchoring == "clean":
+            after = blend_clean(x, x0, proposal, alpha, mask, self.strength)
+        else:
+            after = blend_literal(x, proposal, alpha, sigma, mask, self.strength, self.anchor_noise)
+        self.jump = ((after - x) ** 2).sum(-1) / (2 * sigma**2)
+        return after

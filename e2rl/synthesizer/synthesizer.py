@@ -1,0 +1,189 @@
+"""One synthesizer for training and evaluation: Algorithm 1's inner part, scene by scene in batches, without TorchRL.
+
+At a scene's start: routes, reference rollout, topology, feasibility, skeleton. At every replan: encode once, anchor,
+sample under sparse control. With eta = 0 nothing is controlled, and the traffic is the prior's, bit for bit.
+"""
+
+from dataclasses import dataclass, fields, is_dataclass, replace
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate
+from e2rl.prior.prior import Context, Plan, Prior
+from e2rl.prior.routed import RoutedScene, route_scene
+from e2rl.sim.world import World
+from e2rl.synthesizer.anchoring import AnchorSettings, propose
+from e2rl.synthesizer.control import ControlSettings, SparseControl
+from e2rl.synthesizer.feasibility import FeasibilitySettings, feasible_vehicles
+from e2rl.synthesizer.potentials import PotentialContext, PotentialSettings
+from e2rl.synthesizer.skeleton import Skeleton, SkeletonSettings, build_skeleton
+from e2rl.synthesizer.topology import TopologySettings, topological_candidates
+
+
+@dataclass(frozen=True)
+class SynthesizerSettings:
+    """Settings of all parts (conf/synthesizer/e2.yaml); reselect: replans between two choices of the support, 0: the
+    support of the start frame is kept."""
+
+    topology: TopologySettings = TopologySettings()
+    feasibility: FeasibilitySettings = FeasibilitySettings()
+    skeleton: SkeletonSettings = SkeletonSettings()
+    anchor: AnchorSettings = AnchorSettings()
+    potentials: PotentialSettings = PotentialSettings()
+    control: ControlSettings = ControlSettings()
+    reselect: int = 4
+
+
+@dataclass
+class Episode:
+    """What a synthesizer keeps of B running scenes; every tensor has the batch first.
+
+    seed [B]: of the scene's noise; eta [B]; replans [B]; routed; state [B, V]: where the last executed plan led;
+    coalition, target [B, V]: C* and whom each acts on; adversaries [B, V]: in C* at any time; kl, jump [B, V]: path KL
+    of the control so far and energy of anchoring.
+    """
+
+    seed: Tensor
+    eta: Tensor
+    replans: Tensor
+    routed: RoutedScene
+    state: LaneState
+    coalition: Tensor
+    target: Tensor
+    adversaries: Tensor
+    kl: Tensor
+    jump: Tensor
+
+
+def take_rows(value, rows: Tensor):
+    """Rows of every tensor in a nested dataclass."""
+    if is_dataclass(value):
+        return type(value)(*(take_rows(getattr(value, f.name), rows) for f in fields(value)))
+    return value[rows]
+
+
+def put_rows(value, rows: Tensor, new):
+    """`value` with `rows` of every tensor replaced by those of `new` (nested dataclasses, out of place)."""
+    if is_dataclass(value):
+        return type(value)(*(put_rows(getattr(value, f.name), rows, getattr(new, f.name)) for f in fields(value)))
+    out = value.clone()
+    out[rows] = new
+    return out
+
+
+def noise_of(seed: Tensor, draw: int, shape: tuple[int, ...], uniform: bool = False) -> Tensor:
+    """Random numbers [B, *shape] that depend on each scene's seed and the draw's number only, not on the batch."""
+    rows = []
+    for value in seed.tolist():
+        generator = torch.Generator().manual_seed((int(value) * 1_000_003 + draw) % (2**63))
+        rows.append((torch.rand if uniform else torch.randn)(shape, generator=generator))
+    return torch.stack(rows).to(seed.device)
+
+
+class Synthesizer:
+    """Frozen prior and settings; `begin` and `replan` drive an Episode."""
+
+    def __init__(self, prior: Prior, settings: SynthesizerSettings | None = None):
+        self.prior = prior.requires_grad_(False).eval()
+        self.settings = settings or SynthesizerSettings()
+        self.statistics: dict[str, float] = {}
+
+    def begin(self, scene: TensorDictBase, seed: Tensor, eta: Tensor) -> Episode:
+        """Episodes of scenes [B] with routes drawn from the prior; seed [B] int64, eta [B]."""
+        uniform = noise_of(seed, 0, tuple(scene["route_valid"].shape[1:]), uniform=True)
+        routed, state = self.prior.start(scene, self.prior.choose_routes(scene, uniform))
+        none = torch.zeros_like(routed.parked)
+        zero = torch.zeros_like(routed.length)
+        return Episode(seed, eta, torch.zeros_like(seed), routed, state, none, none.long() - 1, none, zero, zero)
+
+    def replan(self, episode: Episode, world: World, ego_plan: Tensor) -> tuple[Episode, Plan]:
+        """The episodes and the plan of the coming HORIZON steps, given the ego's plan [B, HORIZON, 4] (detached).
+
+        All scenes of the batch must have been planned equally often.
+        """
+        ego_plan, count = ego_plan.detach(), int(episode.replans[0])
+        episode = replace(episode, state=self._with_ego(episode, world))
+        world = replace(world, route=episode.routed.route)
+        controlled = bool((episode.eta > 0).any())
+        due = count == 0 or (self.settings.reselect > 0 and count % self.settings.reselect == 0)
+        if controlled and due:
+            episode, world = self._select(episode, world, ego_plan, count)
+        context = self._encode(episode, world, ego_plan, episode.coalition)
+        noise = self._noise(episode.seed, count)
+        control = self._control(episode, world, ego_plan) if controlled else None
+        sample = self.prior.sample(context, noise, control)
+        plan = self.prior.plan(sample.x0, context)
+        return replace(
+            episode, replans=episode.replans + 1, kl=episode.kl + sample.kl,
+            jump=episode.jump + (control.jump if control else 0.0)), plan
+
+    def _noise(self, seed: Tensor, count: int) -> Tensor:
+        steps, vehicles = self.prior.sampler.steps, self._vehicles
+        return noise_of(seed, 1 + count, (steps, vehicles, SIZE)).transpose(0, 1)
+
+    def _with_ego(self, episode: Episode, world: World) -> LaneState:
+        """The lane states with the ego's row as it really is now."""
+        self._vehicles = episode.routed.route.shape[1]
+        ego = locate(world.states[:, :1], world.accel[:, :1], torch.zeros_like(world.accel[:, :1]),
+                     episode.routed.points[:, :1])
+        return LaneState(*(torch.cat([getattr(ego, f.name), getattr(episode.state, f.name)[:, 1:]], 1)
+                           for f in fields(LaneState)))
+
+    def _encode(self, episode: Episode, world: World, ego_plan: Tensor, exempt: Tensor) -> Context:
+        return self.prior.encode(episode.routed, episode.state, world.states, world.valid, world.step, ego_plan, exempt)
+
+    def _select(self, episode: Episode, world: World, ego_plan: Tensor, count: int) -> tuple[Episode, World]:
+        """Topology on a reference rollout, feasibility, skeleton; the coalition takes the routes that meet targets."""
+        scene, vehicles = world.scene, self._vehicles
+        context = self._encode(episode, world, ego_plan, torch.zeros_like(episode.coalition))
+        nominal = self.prior.plan(self.prior.sample(context, self._noise(episode.seed, count)).x0, context)
+        reference = torch.cat([ego_plan[:, None], nominal.states()[:, 1:]], 1).transpose(1, 2)
+        valid = world.valid[:, None, :vehicles] & nominal.on_map.transpose(1, 2)
+        found = topological_candidates(reference, valid, scene["size"][:, :vehicles], self.settings.topology)
+        feasible = feasible_vehicles(scene, world, self.settings.feasibility).mask
+        steps = round(self.settings.skeleton.step / 0.1)
+        expected = reference[:, steps - 1::steps].transpose(1, 2)
+        skeleton = build_skeleton(scene, world, found.candidates & feasible, feasible, self.settings.skeleton, expected)
+        self._count(skeleton, found.candidates, feasible)
+        anchor = propose(scene, world, skeleton, ego_plan, self.settings.anchor)
+        acts = skeleton.coalition & (episode.eta > 0)[:, None]
+        episode = self._reroute(replace(
+            episode, coalition=acts, target=torch.where(acts, skeleton.target, -1),
+            adversaries=episode.adversaries | acts), world, torch.where(acts & anchor.has, anchor.route, world.route))
+        return episode, replace(world, route=episode.routed.route)
+
+    def _reroute(self, episode: Episode, world: World, route: Tensor) -> Episode:
+        """The episodes with vehicles moved to other candidates, placed on them where they are now."""
+        changed = route != episode.routed.route
+        if not bool(changed.any()):
+            return episode
+        routed = route_scene(world.scene, route, self.prior.free_space)
+        old = episode.state
+        moved = locate(world.states[:, :self._vehicles], old.a, old.kappa * old.v, routed.points)
+        state = LaneState(*(torch.where(changed, getattr(moved, f.name), getattr(old, f.name))
+                            for f in fields(LaneState)))
+        return replace(episode, routed=routed, state=state)
+
+    def _control(self, episode: Episode, world: World, ego_plan: Tensor) -> SparseControl:
+        settings, vehicles = self.settings, self._vehicles
+        near = torch.where(episode.target >= 0, 1, 0)
+        near = torch.where(episode.target > 0, 2, near)
+        skeleton = Skeleton(episode.coalition, episode.target, near, episode.coalition, episode.coalition,
+                            episode.replans, episode.replans)
+        anchor = propose(world.scene, world, skeleton, ego_plan, settings.anchor)
+        anchor = replace(anchor, has=anchor.has & (anchor.route == episode.routed.route))
+        where = PotentialContext(
+            world.scene, world.states[:, :vehicles], episode.state.a, world.valid[:, :vehicles], episode.routed.points,
+            episode.routed.has_lane, ego_plan[:, :HORIZON], episode.target)
+        literal = noise_of(episode.seed, 10_000 + int(episode.replans[0]), (vehicles, SIZE))
+        return SparseControl(self.prior, settings.control, settings.potentials, where, episode.coalition, episode.eta,
+                             anchor, settings.anchor.strength, literal)
+
+    def _count(self, skeleton: Skeleton, candidates: Tensor, feasible: Tensor) -> None:
+        """Running totals for logging."""
+        counts = {"scenes": len(candidates), "candidates": int(candidates.sum()), "feasible": int(feasible.sum()),
+                  "coalition": int(skeleton.coalition.sum()), **skeleton.counts()}
+        for name, value in counts.items():
+            self.statistics[name] = self.statistics.get(name, 0) + value
