@@ -98,6 +98,7 @@ def _constant(riders: _Riders, accel: Tensor, settings: AnchorSettings) -> Tenso
     v0 = riders.v[..., None, None, None]
     free = v0 + accel[..., None] * time
     free = torch.minimum(free.clamp(min=0), v0.clamp(min=settings.top_speed))
+    braking = (v0 + settings.min_accel * time).clamp(min=0)  # nobody loses speed faster, bend or not
     speed = free
     for _ in range(3):
         way = torch.nn.functional.pad(((speed[..., 1:] + speed[..., :-1]) / 2 * DT).cumsum(-1), (1, 0))
@@ -105,7 +106,7 @@ def _constant(riders: _Riders, accel: Tensor, settings: AnchorSettings) -> Tenso
         low = at.long()
         table = riders.envelope[..., None, :].expand(*way.shape[:-1], TURNING)
         bound = torch.lerp(table.gather(-1, low), table.gather(-1, low + 1), at - low)
-        speed = torch.minimum(free, bound.clamp(min=0).sqrt())
+        speed = torch.maximum(torch.minimum(free, bound.clamp(min=0).sqrt()), braking)
     stride = HORIZON // KNOTS
     knot = stride * torch.arange(1, KNOTS + 1, device=accel.device)
     slope = (speed[..., knot + EXTRA] - speed[..., knot - EXTRA]) / (2 * EXTRA * DT)

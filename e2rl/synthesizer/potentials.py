@@ -234,7 +234,7 @@ def adversarial_potential(states: Tensor, context: PotentialContext, settings: P
     cost = ttc_cost(offset, closing, settings.ttc_time, settings.ttc_miss).amax(-1)
     moment = torch.softmax(-apart.detach() / heat, -1)
     bearing = offset.detach() / (_length(offset.detach()) + 0.1)[..., None]
-    impact = (-(closing * bearing).sum(-1).clamp(-CLOSING, CLOSING) * moment).sum(-1) / CLOSING
+    impact = (-(closing * bearing).sum(-1).clamp(-2 * CLOSING, 2 * CLOSING) * moment).sum(-1) / CLOSING
     value = settings.distance * nearest / LENGTH + settings.ttc * (1 - cost) - settings.impact_speed * impact
     acts = context.valid & (context.target >= 0) & context.valid.gather(1, index)
     acts[:, 0] = False

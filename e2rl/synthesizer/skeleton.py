@@ -75,25 +75,22 @@ def _extreme(mask: Tensor, distance: Tensor, count: int, farthest: bool = False)
 
 
 def lane_of(states: Tensor, scene: TensorDictBase) -> Tensor:
-    """Lane index [B, K] nearest to states [B, K, 4] among those not against them; -1 without any."""
+    """Lane index [B, K] nearest to states [B, K, 4] of those that run within 60 degrees of them; -1 without any."""
     points, lane = scene["lane_points"], scene["lane_index"]
-    if points.shape[1] < 2:
-        return torch.full(states.shape[:2], -1, device=states.device)
-    ahead = torch.diff(points, dim=1)
-    same = lane[:, 1:] == lane[:, :-1]
+    ahead = torch.nn.functional.normalize(torch.diff(points, dim=1), dim=-1)
+    ends = torch.nn.functional.pad(lane[:, 1:] != lane[:, :-1], (0, 1), value=True)  # a lane's last point looks back
     ahead = torch.cat([ahead, ahead[:, -1:]], 1)
-    last = torch.cat([~same, torch.ones_like(same[:, :1])], 1)  # the last point of a lane looks back
-    ahead = torch.where(last[..., None], ahead.roll(1, 1), ahead)
+    ahead = torch.where(ends[..., None], ahead.roll(1, 1), ahead)
     forward = torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)
     along = forward @ ahead.transpose(1, 2)
-    gap = torch.cdist(states[..., :2], points).masked_fill((along < 0) | (lane < 0)[:, None], torch.inf)
+    gap = torch.cdist(states[..., :2], points).masked_fill((along < 0.5) | (lane < 0)[:, None], torch.inf)
     nearest, index = gap.min(-1)
     return torch.where(nearest.isfinite(), lane.gather(1, index), -1)
 
 
 def _beside_ego(states: Tensor, asked: Tensor, scene: TensorDictBase) -> Tensor:
-    """Bool [B, K]: vehicles states[:, 1:] [B, 1 + K, 4] are on the lane of the ego states[:, 0], on a neighbour of it, or
-    on what these go on into (maps cut lanes). Only scenes with anybody `asked` [B, K] are looked at: maps are large.
+    """Bool [B, K]: vehicles states[:, 1:] [B, 1 + K, 4] are on the lane of the ego states[:, 0], on a neighbour of it,
+    or on what these go on into (maps cut lanes). Only scenes with anybody `asked` [B, K] are looked at: maps are large.
     """
     rows = asked.any(1).nonzero()[:, 0]
     scene = scene.select("lane_points", "lane_index", "lane_left", "lane_right", "lane_exits")[rows]
