@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 from zipfile import BadZipFile
+from zlib import error as ZlibError
 
 import numpy as np
 import torch
@@ -35,7 +36,7 @@ def read_rollout(path: Path) -> dict[str, object]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             data = {key: archive[key] for key in archive.files}
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
+    except (OSError, ValueError, EOFError, BadZipFile, ZlibError) as error:
         raise InputError(f"{path}: no readable rollout ({error}); run evaluate.py again to write it anew") from error
     missing = [key for key in (*SCALARS, *ARRAYS) if key not in data]
     if missing or str(data["format"]) != FORMAT:

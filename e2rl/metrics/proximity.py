@@ -16,8 +16,9 @@ def smallest_gap(states: Tensor, valid: Tensor, size: Tensor, stop: Tensor) -> T
 
     states [B, T+1, N, 4] with the ego in row 0, valid [B, T+1, N], size [B, N, 2].
     """
-    seen = (valid & valid[..., :1] & up_to(stop, states.shape[1])[..., None])[..., 1:]
-    gap = distance(states[:, :, :1], size[:, None, :1], states[:, :, 1:], size[:, None, 1:])
+    seen = valid & valid[..., :1] & up_to(stop, states.shape[1])[..., None]
+    seen[..., 0] = False
+    gap = distance(states[:, :, :1], size[:, None, :1], states, size[:, None])
     smallest = gap.masked_fill(~seen, torch.inf).flatten(1).amin(-1)
     return smallest.masked_fill(smallest.isinf(), torch.nan)
 

@@ -97,7 +97,7 @@ def realism(features: list[dict[str, Tensor]], cluster: Tensor, draws: Tensor) -
     for name in FEATURES:
         pair = torch.cat([sample[name] for sample in features], 1) if features else draws.new_zeros(2, 0)
         if not pair.shape[1]:
-            return {key: torch.full_like(draws[:, 0], torch.nan) for key in ("real", "real_norm", *w1_names())}
+            return {key: draws.new_full((len(draws),), torch.nan) for key in ("real", "real_norm", *w1_names())}
         counts = torch.tensor([sample[name].shape[1] for sample in features], device=pair.device)
         parts.append(wasserstein(pair, cluster.repeat_interleave(counts), draws.to(pair)))
         log = pair[1].sort().values

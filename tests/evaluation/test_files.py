@@ -1,0 +1,139 @@
+"""Files of a run: exact keys and types, readable without pickle, whole or absent, the same when read back."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from e2rl.errors import InputError
+from e2rl.evaluation import files
+from e2rl.evaluation.files import COLUMNS, Source, label_rows, read_metrics, read_rows, write_metrics, write_rollouts
+from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollout, read_rollouts
+from e2rl.evaluation.summary import metric_rows
+from e2rl.metrics.score import score_rollouts
+from tests.metrics.random_rollouts import random_rollouts
+
+SOURCE = Source("synthetic", "test", "e2", "idm")
+DTYPES = {
+    "format": "U", "scene_id": "U", "location": "U", "dataset": "U", "split": "U", "method": "U", "ego_policy": "U",
+    "seed": "i", "eta": "f", "dt": "f", "ego": "i", "states": "f4", "valid": "b", "size": "f4", "agent_type": "U",
+    "simulated": "b", "adversaries": "b", "logged": "f4", "logged_valid": "b", "lane_points": "f", "lane_offsets": "i",
+    "lane_width": "f", "drivable_points": "f", "drivable_offsets": "i",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def rollouts():
+    return random_rollouts(6, seed=1)
+
+
+def test_rollouts_have_the_format_s_keys_types_and_names(tmp_path, rollouts):
+    paths = write_rollouts(tmp_path, rollouts, SOURCE)
+    assert [path.name for path in paths][:2] == ["e2__idm__2__scene_0__0.npz", "e2__idm__2__scene_0__1.npz"]
+    assert sorted(tmp_path.iterdir()) == sorted(paths), "no temporary file is left"
+    for index, path in enumerate(paths):
+        with np.load(path, allow_pickle=False) as archive:
+            data = dict(archive)
+        assert data.keys() == DTYPES.keys()
+        for key, kind in DTYPES.items():
+            assert data[key].dtype.kind == kind[0] and (len(kind) < 2 or data[key].dtype == kind), key
+        assert str(data["format"]) == "e2rl-rollout/1" and float(data["dt"]) == 0.1 and int(data["ego"]) == 0
+        assert data["states"].shape == (81, 48, 4)
+        for name, least in (("lane", 2), ("drivable", 3)):
+            offsets = data[f"{name}_offsets"]
+            assert offsets[0] == 0 and offsets[-1] == len(data[f"{name}_points"]) and (np.diff(offsets) >= least).all()
+        assert len(data["lane_width"]) == len(data["lane_offsets"]) - 1 and (data["lane_width"] > 0).all()
+        np.testing.assert_array_equal(data["states"], rollouts["states"][index].numpy())
+
+
+def test_lines_too_short_to_be_lines_are_left_out():
+    points = torch.arange(12.0).reshape(6, 2)
+    kept, offsets, numbers = files.polylines(points, torch.tensor([0, 0, 3, 4, 4, -1]), minimum=2)
+    assert (
+        numbers.tolist() == [0, 4] and offsets.tolist() == [0, 2, 4] and kept.tolist() == points[[0, 1, 3, 4]].tolist()
+    )
+    empty, offsets, _ = files.polylines(points[:0], torch.zeros(0, dtype=torch.int64), minimum=3)
+    assert empty.shape == (0, 2) and offsets.tolist() == [0]
+
+
+def test_rollouts_read_back_are_those_written(tmp_path, rollouts):
+    write_rollouts(tmp_path / "rollouts", rollouts, SOURCE)
+    read = as_rollout_dict(read_rollouts(tmp_path))
+    for key in ("states", "valid", "size", "agent_type", "adversaries", "logged"):
+        torch.testing.assert_close(read[key], rollouts[key], equal_nan=True, rtol=0, atol=0)
+    assert read["scene_id"] == rollouts["scene_id"] and read["eta"].tolist() == [2.0] * 6
+
+
+def test_names_that_no_path_may_hold_are_mended(tmp_path, rollouts):
+    odd = rollouts | {"scene_id": ["a/../b c"] * 6}
+    path = write_rollouts(tmp_path, odd, SOURCE)[0]
+    assert path.parent == tmp_path and path.name == "e2__idm__2__a-..-b-c__0.npz"
+    assert read_rollout(path)["scene_id"] == "a/../b c"
+
+
+def test_bad_rollout_files_are_named(tmp_path, rollouts):
+    broken, foreign = tmp_path / "broken.npz", tmp_path / "foreign.npz"
+    whole = write_rollouts(tmp_path / "good", rollouts, SOURCE)[0].read_bytes()
+    broken.write_bytes(whole[: len(whole) // 2])
+    np.savez(foreign, format=np.array("other/1"))
+    for path in (broken, foreign, tmp_path / "absent.npz"):
+        with pytest.raises(InputError, match=path.name):
+            read_rollout(path)
+    with pytest.raises(InputError, match="no rollouts"):
+        read_rollouts(tmp_path / "nowhere")
+
+
+def test_rows_read_back_are_those_written(tmp_path, rollouts):
+    rows = label_rows(score_rollouts(rollouts)[0], SOURCE)
+    files.write_rows(tmp_path / "rollouts.csv", rows)
+    read = read_rows(tmp_path / "rollouts.csv")
+    assert list(read[0]) == list(COLUMNS) and len(read) == 6
+    for row, other in zip(rows, read, strict=True):
+        for column in COLUMNS:
+            same = row[column] == other[column] or (math.isnan(row[column]) and math.isnan(other[column]))
+            assert same, (column, row[column], other[column])
+
+
+def test_metrics_are_strict_json_with_counts_command_and_paired_differences(tmp_path, rollouts):
+    rows, features = score_rollouts(rollouts)
+    both = label_rows(rows, SOURCE) + label_rows(rows, Source("synthetic", "test", "nominal", "idm"))
+    both[6:] = [row | {"eta": 0.0} for row in both[6:]]
+    result = metric_rows(both, features * 2, "python evaluate.py", draws=50, realism_draws=5, stage="after")
+    write_metrics(tmp_path / "metrics.json", result)
+    text = (tmp_path / "metrics.json").read_text()
+    assert "NaN" not in text
+    stored = json.loads(text)
+    assert [row["method"] for row in stored] == ["e2", "nominal"] and [row["eta"] for row in stored] == [2.0, 0.0]
+    first = stored[0]
+    assert (first["n_scenes"], first["n_seeds"], first["n_rollouts"]) == (3, 2, 6)
+    assert first["command"] == "python evaluate.py" and first["stage"] == "after" and "git" in first
+    assert first["metrics"]["transport"] == {"mean": None, "low": None, "high": None, "n": 0}
+    assert (
+        first["paired"].keys() == {"nominal"}
+        and {"difference", "low", "high"} <= first["paired"]["nominal"]["cfr"].keys()
+    )
+    assert math.isnan(read_metrics(tmp_path / "metrics.json")[0]["metrics"]["transport"]["mean"])
+
+
+def test_several_intensities_of_one_method_are_told_apart(rollouts):
+    rows, features = score_rollouts(rollouts)
+    many = [row | {"eta": eta} for eta in (1.0, 2.0) for row in label_rows(rows, SOURCE)]
+    many += label_rows(rows, Source("synthetic", "test", "nominal", "idm"))
+    many += label_rows(rows, Source("synthetic", "test", "nominal", "lane_graph"))
+    result = metric_rows(many, features * 4, "", draws=10, realism_draws=2)
+    assert [list(row["paired"]) for row in result] == [["e2@2", "nominal"], ["e2@1", "nominal"], ["e2@1", "e2@2"], []]
+
+
+def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "metrics.json"
+    files.replace(path, b"old")
+
+    def fail(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(files.os, "replace", fail)
+    with pytest.raises(KeyboardInterrupt):
+        files.replace(path, b"new")
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]

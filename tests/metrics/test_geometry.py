@@ -1,0 +1,66 @@
+"""Areas and edge parts of oriented boxes against shapely and closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from e2rl.metrics.contact import pair_overlap
+from e2rl.metrics.geometry import EDGES, edge_distances, edge_parts_inside, overlap_area
+from e2rl.sim.geometry import corners
+
+shapely = pytest.importorskip("shapely")
+
+
+def random_boxes(count, seed, spread=4.0):
+    draw = torch.rand(count, 6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    state = torch.stack([draw[:, 0] * spread, draw[:, 1] * spread, draw[:, 2] * 7, draw[:, 3]], -1)
+    return state, 0.3 + draw[:, 4:] * torch.tensor([6.0, 3.0], dtype=torch.float64)
+
+
+def polygons(state, size):
+    return shapely.polygons(corners(state, size).numpy())
+
+
+def test_overlap_area_is_shapely_s():
+    first, second = random_boxes(4000, 1), random_boxes(4000, 2)
+    expected = shapely.area(shapely.intersection(polygons(*first), polygons(*second)))
+    area = overlap_area(*first, *second)
+    assert (expected > 0).mean() > 0.4
+    np.testing.assert_allclose(area, expected, atol=1e-9)
+    apart = torch.zeros(4000, dtype=torch.bool)
+    assert not pair_overlap(*first, *second, apart).any(), "pairs that are not possible have no overlap"
+    np.testing.assert_allclose(pair_overlap(*first, *second, ~apart), np.where(expected > 1e-6, expected, 0), atol=1e-9)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, math.pi / 2, math.pi, 2.5])
+def test_shared_and_collinear_edges_need_no_special_case(turn):
+    size = torch.tensor([4.0, 2.0], dtype=torch.float64)
+    state = torch.tensor([3.0, -1.0, turn, 0.0], dtype=torch.float64)
+    forward = torch.tensor([math.cos(turn), math.sin(turn), 0, 0], dtype=torch.float64)
+    for shift, expected in ((0.0, 8.0), (1.0, 6.0), (4.0, 0.0), (5.0, 0.0)):
+        other = state + shift * forward
+        assert overlap_area(state, size, other, size).item() == pytest.approx(expected, abs=1e-9)
+    assert overlap_area(state, size, state, size / 2).item() == pytest.approx(2.0, abs=1e-9)
+
+
+def test_edge_parts_are_shapely_s():
+    first, second = random_boxes(600, 3), random_boxes(600, 4)
+    parts, corner = edge_parts_inside(*first, *second), corners(*first).numpy()
+    other = polygons(*second)
+    for edge in range(4):
+        line = shapely.linestrings(corner[:, [edge, (edge + 1) % 4]])
+        np.testing.assert_allclose(parts[:, edge], shapely.length(shapely.intersection(line, other)), atol=1e-9)
+    point = second[0][:, :2]
+    line = shapely.linestrings(corner[:, [0, 1]])
+    np.testing.assert_allclose(
+        edge_distances(*first, point)[:, 0], shapely.distance(line, shapely.points(point.numpy())), atol=1e-9
+    )
+
+
+def test_edges_are_named_after_where_they_lie():
+    state, size = torch.zeros(4, dtype=torch.float64), torch.tensor([4.0, 2.0], dtype=torch.float64)
+    for name, point in {"front": (2.0, 0), "rear": (-2.0, 0), "left": (0, 1.0), "right": (0, -1.0)}.items():
+        distances = edge_distances(state, size, torch.tensor(point, dtype=torch.float64))
+        assert EDGES[int(distances.argmin())] == name

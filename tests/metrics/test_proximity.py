@@ -1,0 +1,66 @@
+"""Closest-approach cost, gaps, acceleration and progress against closed forms."""
+
+import math
+
+import pytest
+import torch
+
+from e2rl.metrics.proximity import closest_approach_cost, ego_path, mean_acceleration, mean_worst_cost, progress
+from tests.metrics.test_contact import course, row
+
+
+def pair(offset, velocity):
+    """Ego standing at the origin, another at an offset with a velocity."""
+    heading, speed = math.atan2(velocity[1], velocity[0]), math.hypot(*velocity)
+    return torch.tensor([[0.0, 0, 0, 0], [*offset, heading, speed]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    "offset, velocity, expected",
+    [
+        ((10, 0), (-5, 0), 0.1353),
+        ((10, 1), (-5, 0), 0.0821),
+        ((5, 0), (-10, 0), 0.8825),
+        ((10, 0), (5, 0), 0.0),
+        ((40, 3), (0, 0), 0.0),
+    ],
+)
+def test_closest_approach_cost_has_the_reference_values(offset, velocity, expected):
+    assert closest_approach_cost(pair(offset, velocity))[1].item() == pytest.approx(expected, abs=1e-4)
+
+
+def test_a_convoy_at_one_speed_costs_nothing_however_fast():
+    convoy = torch.tensor([[0.0, 0, 0.4, 20], [30, 5, 0.4, 20]], dtype=torch.float64)
+    assert closest_approach_cost(convoy)[1] < 1e-9
+
+
+def test_cost_is_the_mean_over_steps_of_the_worst_adversary():
+    cost = torch.tensor([[[0.0, 0.2, 0.9], [0.0, 0.4, 0.1], [0, 1, 1]]])
+    counted = torch.tensor([[[False, True, False], [False, True, True], [False, False, False]]])
+    assert mean_worst_cost(cost, counted).item() == pytest.approx(0.3)
+    assert mean_worst_cost(cost, counted & False).isnan().all(), "no adversary: unknown, not 0"
+
+
+def test_gap_is_the_smallest_box_distance():
+    assert row(course(0, 0, 0, 5), course(0, 5, 0, 5))["min_dtc"] == pytest.approx(3.0, abs=1e-5)
+    assert math.isnan(row(course(0, 0, 0, 5))["min_dtc"]), "nobody else: unknown"
+
+
+def test_constant_braking_has_its_own_mean_acceleration_and_way():
+    result = row(course(0, 0, 0.3, 20, accel=-2))
+    assert result["macc"] == pytest.approx(2, abs=1e-3)
+    assert result["progress"] == pytest.approx(20 * 8 - 64, abs=1e-3)
+
+
+def test_short_paths_have_no_acceleration():
+    path = torch.zeros(2, 81, 4, dtype=torch.float64)
+    path[..., 3] = torch.arange(81)
+    values = mean_acceleration(path, torch.tensor([6, 7]), 0.1)
+    assert values[0].isnan() and values[1] == pytest.approx(10)
+
+
+def test_gaps_of_the_ego_s_track_are_closed_before_measuring():
+    states, valid = course(0, 0, 0, 10)
+    valid[3:6] = False
+    path, count = ego_path(states[None, :, None], valid[None, :, None], torch.tensor([80]))
+    assert count.item() == 78 and progress(path, count).item() == pytest.approx(80)

@@ -1,0 +1,96 @@
+"""Realism: identities of the distance, what is counted, and the pooled figures by an independent route."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import wasserstein_distance
+
+from e2rl.metrics.realism import CLIP, FEATURES, motion_features, realism, wasserstein
+from e2rl.metrics.score import score_rollouts
+from tests.metrics.random_rollouts import random_rollouts
+
+
+def features_of(rollouts):
+    return score_rollouts(rollouts)[1]
+
+
+def once(clusters):
+    return torch.ones(1, clusters, dtype=torch.float64), torch.arange(clusters)
+
+
+def test_the_recording_is_wholly_like_itself():
+    rollouts = random_rollouts(6)
+    features = features_of(rollouts | {"logged": rollouts["states"]})
+    draws, cluster = once(6)
+    table = realism(features, cluster, draws)
+    assert table["real"].item() == 1 and table["real_norm"].item() == 1
+
+
+def test_distance_is_symmetric_and_scipy_s():
+    pair = torch.randn(2, 500, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    pair[1] = pair[1] * 1.7 + 0.4
+    draws, cluster = torch.ones(1, 1, dtype=torch.float64), torch.zeros(500, dtype=torch.int64)
+    distance = wasserstein(pair, cluster, draws).item()
+    assert distance == pytest.approx(wasserstein_distance(*pair.numpy()))
+    assert distance == pytest.approx(wasserstein(pair.flip(0), cluster, draws).item())
+    assert distance == pytest.approx((pair.sort(-1).values.diff(dim=0)).abs().mean().item()), "quantile form"
+
+
+def test_split_halves_of_one_sample_are_close_and_a_shift_is_its_own_distance():
+    sample = torch.randn(40000, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    cluster, draws = torch.zeros(20000, dtype=torch.int64), torch.ones(1, 1, dtype=torch.float64)
+    assert wasserstein(sample.reshape(2, -1), cluster, draws).item() < 0.03
+    shifted = torch.stack([sample[:20000], sample[:20000] + 0.25])
+    assert wasserstein(shifted, cluster, draws).item() == pytest.approx(0.25)
+
+
+def test_a_draw_equals_the_distance_of_the_repeated_samples():
+    generator = torch.Generator().manual_seed(2)
+    pair = torch.randn(2, 9000, generator=generator, dtype=torch.float64)  # more than one block of columns
+    cluster = torch.randint(5, (9000,), generator=generator)
+    draws = torch.tensor([[1.0, 0, 2, 1, 3], [0, 0, 5, 0, 0], [0, 0, 0, 0, 0]], dtype=torch.float64)
+    result = wasserstein(pair, cluster, draws)
+    for draw, distance in zip(draws[:2], result[:2], strict=True):
+        repeated = pair.repeat_interleave(draw[cluster].long(), dim=1)
+        assert distance.item() == pytest.approx(wasserstein_distance(*repeated.numpy()))
+    assert result[2].isnan()
+
+
+def test_pooled_figures_follow_the_definition():
+    features = features_of(random_rollouts(8, seed=4))
+    draws, cluster = once(8)
+    table = realism(features, cluster, draws)
+    distances, scaled = [], []
+    for name in FEATURES:
+        simulated, log = np.concatenate([sample[name].numpy() for sample in features], 1)
+        distances.append(wasserstein_distance(simulated, log))
+        scaled.append(distances[-1] / np.subtract(*np.quantile(log, [0.95, 0.05])))
+        assert table[f"w1_{name}"].item() == pytest.approx(distances[-1])
+        assert max(abs(simulated).max(), abs(log).max()) <= CLIP[name]
+    assert table["real"].item() == pytest.approx(1 - np.minimum(distances, 1).mean())
+    assert table["real_norm"].item() == pytest.approx(1 - np.minimum(scaled, 1).mean())
+
+
+def test_the_ego_the_parked_and_what_happens_after_the_stop_do_not_count():
+    rollouts = random_rollouts(4, seed=6)
+    before = features_of(rollouts)
+    changed = {key: value.clone() if isinstance(value, torch.Tensor) else value for key, value in rollouts.items()}
+    changed["logged"][:, :, 0] += 5 * torch.rand(changed["logged"][:, :, 0].shape)  # the ego's own log
+    assert all(torch.equal(a[name], b[name]) for a, b in zip(before, features_of(changed), strict=True) for name in a)
+    states, valid = torch.zeros(1, 81, 3, 4, dtype=torch.float64), torch.ones(1, 81, 3, dtype=torch.bool)
+    states[:, :, 1, 3] = 5.0
+    agents = torch.tensor([[False, True, True]])
+    for stop, blocks in ((80, 16), (34, 6), (9, 1)):
+        sample = motion_features(states, valid, states, valid, agents, torch.tensor([stop]), 0.1)[0]
+        assert [sample[name].shape[1] for name in FEATURES] == [blocks - 1, blocks - 1, max(blocks - 2, 0)], stop
+
+
+def test_a_constant_turn_has_its_lateral_acceleration():
+    time = torch.arange(81, dtype=torch.float64) * 0.1
+    states = torch.stack([time, time, 3.0 + 0.2 * time, 4.0 + 0.5 * time], -1)[None, :, None].expand(1, 81, 2, 4)
+    valid, agents = torch.ones(1, 81, 2, dtype=torch.bool), torch.tensor([[False, True]])
+    sample = motion_features(states, valid, states, valid, agents, torch.tensor([80]), 0.1)[0]
+    middle = 4.0 + 0.5 * (0.55 + 0.5 * torch.arange(15))
+    torch.testing.assert_close(sample["a_lat"][0], (0.2 * middle).double(), atol=1e-6, rtol=0)
+    torch.testing.assert_close(sample["a_lon"][0], torch.full((15,), 0.5, dtype=torch.float64))
+    assert sample["jerk"].abs().max() < 1e-9

@@ -1,0 +1,122 @@
+"""Intervals: coverage, pooling, pairing, and what is unknown."""
+
+import math
+
+import pytest
+import torch
+
+from e2rl.metrics.score import score_rollouts
+from e2rl.metrics.statistics import bootstrap_draws, cluster_index, paired_differences, resampled_means, summarise
+from tests.metrics.random_rollouts import random_rollouts
+
+
+def rows_of(values, clusters=None, name="cfr", **columns):
+    """Rows that know one metric, one scene each, and features without samples."""
+    empty = {key: torch.zeros(2, 0, dtype=torch.float64) for key in ("a_lon", "a_lat", "jerk")}
+    rows = [
+        {"scene_id": f"s{index}", "location": str(clusters[index]) if clusters else "", "seed": 0, name: value}
+        | {key: column[index] for key, column in columns.items()}
+        for index, value in enumerate(values)
+    ]
+    return rows, [empty] * len(rows)
+
+
+def brief(rows, features):
+    return summarise(rows, features, draws=300, realism_draws=2)
+
+
+def test_intervals_cover_the_truth_in_about_95_of_100_cases_when_rollouts_come_in_clusters():
+    """Rates that vary between locations; treating the rollouts as independent would cover in about 70 of 100."""
+    generator = torch.Generator().manual_seed(0)
+    clusters, members, trials = 40, 8, 400
+    rates = torch.distributions.Beta(1.0, 2.0)
+    torch.manual_seed(0)
+    chance = rates.sample((trials, clusters, 1)).double()
+    values = (torch.rand(trials, clusters, members, generator=generator) < chance).double()
+    cluster = torch.arange(clusters).repeat_interleave(members)
+    draws = bootstrap_draws(clusters, 400)
+    means = resampled_means(values.flatten(1).T, torch.ones(clusters * members, trials).double(), cluster, draws)
+    low, high = means[1:].quantile(torch.tensor([0.025, 0.975], dtype=torch.float64), dim=0)
+    covered = ((low <= 1 / 3) & (high >= 1 / 3)).double().mean().item()
+    assert 0.91 <= covered <= 0.98, covered
+    alone = torch.arange(clusters * members)
+    means = resampled_means(
+        values.flatten(1).T, torch.ones(len(alone), trials).double(), alone, bootstrap_draws(len(alone), 400)
+    )
+    low, high = means[1:].quantile(torch.tensor([0.025, 0.975], dtype=torch.float64), dim=0)
+    assert ((low <= 1 / 3) & (high >= 1 / 3)).double().mean().item() < covered - 0.08
+
+
+def test_locations_are_clusters_and_scenes_where_there_is_none():
+    rows = [
+        {"location": place, "scene_id": name}
+        for place, name in (("a", "1"), ("a", "2"), ("", "1"), ("", "1"), ("", "2"), ("1", "9"))
+    ]
+    cluster, count = cluster_index(rows)
+    assert count == 4 and cluster[0] == cluster[1] and cluster[2] == cluster[3] != cluster[4]
+    assert cluster[5] not in cluster[:5].tolist(), "a location and a scene of the same name are different clusters"
+
+
+def test_unknown_values_are_left_out_and_counted_and_never_zero():
+    table = brief(*rows_of([1.0, math.nan, 0.0, math.nan], name="relvel"))
+    assert table["relvel"]["n"] == 2 and table["relvel"]["mean"] == 0.5
+    assert table["progress"]["n"] == 0 and math.isnan(table["progress"]["mean"])
+    assert table["real"]["n"] == 0 and math.isnan(table["real"]["mean"])
+
+
+def test_one_cluster_gives_no_interval():
+    table = brief(*rows_of([1.0, 0.0], clusters=["a", "a"]))
+    assert table["cfr"]["mean"] == 0.5 and math.isnan(table["cfr"]["low"]) and math.isnan(table["cfr"]["high"])
+
+
+def test_off_road_share_is_pooled_over_vehicle_steps():
+    table = brief(*rows_of([0.5, 0.0, math.nan], name="aor_step", aor_vehicle_steps=[10, 90, 0]))
+    assert table["aor_step"]["mean"] == pytest.approx(0.05) and table["aor_step"]["n"] == 2
+
+
+def test_a_paired_difference_uses_shared_scenes_and_is_narrower_than_unpaired_ones():
+    generator = torch.Generator().manual_seed(3)
+    base = torch.rand(60, generator=generator) * 10
+    ours, features = rows_of((base + 1 + 0.1 * torch.rand(60, generator=generator)).tolist(), name="progress")
+    theirs, other = rows_of(base.tolist(), name="progress")
+    result = paired_differences(ours[:50], features[:50], theirs[10:], other[10:], draws=300, realism_draws=2)
+    assert result["progress"]["n"] == 40
+    assert 1.0 < result["progress"]["low"] < result["progress"]["difference"] < result["progress"]["high"] < 1.1
+    own = brief(ours, features)["progress"]
+    assert own["high"] - own["low"] > 10 * (result["progress"]["high"] - result["progress"]["low"])
+
+
+def test_paired_ratios_compare_the_two_groups_own_collisions():
+    nan = math.nan
+    ours, theirs = rows_of([1.0, 1.0, nan, nan], name="rir"), rows_of([nan, 0.0, 1.0, nan], name="rir")
+    result = paired_differences(*ours, *theirs, draws=300, realism_draws=2)["rir"]
+    assert result["difference"] == pytest.approx(0.5) and result["n"] == 3
+
+
+def test_groups_without_a_shared_scene_have_no_difference():
+    ours, theirs = rows_of([1.0, 0.0]), rows_of([1.0, 0.0])
+    for row in theirs[0]:
+        row["seed"] = 7
+    result = paired_differences(*ours, *theirs, draws=50, realism_draws=2)
+    assert all(math.isnan(value["difference"]) and value["n"] == 0 for value in result.values())
+
+
+def test_a_method_does_not_differ_from_itself():
+    rows, features = score_rollouts(random_rollouts(8))
+    result = paired_differences(rows, features, rows, features, draws=50, realism_draws=5)
+    assert all(value["difference"] == 0 or math.isnan(value["difference"]) for value in result.values())
+    assert result["real"]["difference"] == 0 == result["cfr"]["low"]
+
+
+def test_the_order_of_rows_and_the_draws_seed_fix_the_interval():
+    rows, features = score_rollouts(random_rollouts(8))
+    first = summarise(rows, features, draws=50, realism_draws=5)
+    again = summarise(rows[::-1], features[::-1], draws=50, realism_draws=5)
+    for name, value in first.items():
+        assert again[name] == pytest.approx(value, nan_ok=True), name
+
+
+def test_rows_and_features_must_belong_together():
+    rows, features = rows_of([1.0, 0.0])
+    with pytest.raises(ValueError, match="2 rows but 1 features"):
+        summarise(rows, features[:1])
