@@ -26,7 +26,7 @@ def test_free_road_accelerates_to_the_top_speed():
 
 
 def test_stops_behind_a_parked_car():
-    env, _ = world_of(vehicles=[(0.0, 0, 10.0), (50.0, 0, 0.0)])
+    env, _ = world_of(vehicles=[(0.0, 0, 10.0), (50.0, 0, 0.0)], num_vrus=0)
     data = env.rollout(80, EgoPolicy(LaneGraphEgo(), env))
     state = env.world().states[0, 0]
     assert not data["next", "terminated"].any() and state[3] < 1.0 and 20 < state[0] < 46

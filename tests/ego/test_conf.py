@@ -1,0 +1,32 @@
+"""The YAML files build what they name, and agree with the classes' own defaults."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from e2rl.ego.base import PLAN_STEPS
+from e2rl.ego.idm import IDMEgo
+from e2rl.ego.lane_graph import LaneGraphEgo
+from e2rl.ego.replay import ReplayEgo
+from e2rl.sim.env import DrivingEnv, SimSettings
+from tests.synthetic import make_scenes
+
+CONF = Path(__file__).parents[2] / "conf"
+
+
+@pytest.mark.parametrize(("name", "kind"), [("idm", IDMEgo), ("lane_graph", LaneGraphEgo), ("replay", ReplayEgo)])
+def test_egos(name, kind):
+    ego = instantiate(OmegaConf.load(CONF / "ego" / f"{name}.yaml"))
+    assert type(ego) is kind and vars(ego) == vars(kind())
+    env = DrivingEnv(make_scenes(2), SimSettings(), 2)
+    env.reset()
+    plan = ego.plan(env.world())
+    assert plan.shape == (2, PLAN_STEPS, 4) and torch.isfinite(plan).all()
+
+
+def test_sim():
+    settings = instantiate(OmegaConf.load(CONF / "sim" / "default.yaml"))
+    assert {**vars(settings), "reward": dict(settings.reward)} == vars(SimSettings())

@@ -1,0 +1,39 @@
+"""Mission: limits along it, the state of its lights, and which of them bind."""
+
+import torch
+
+from e2rl.sim.mission import light_now, limit_at, mission_of, stop_ahead
+from tests.synthetic import BACK, make_scenes
+
+
+def test_limits_are_read_at_the_nearest_vertex():
+    scene = make_scenes(1, limit=9.0).scenes
+    scene["route_limit"][0, 0, 0, 20:] = 14.0
+    limit = limit_at(mission_of(scene), torch.tensor([[0.0, 38.0, 40.0, 1000.0]]))
+    assert limit.tolist() == [[9.0, 9.0, 14.0, 14.0]]
+
+
+def test_end_is_infinite_where_the_route_goes_on():
+    assert mission_of(make_scenes(1, road=(-60.0, 90.0)).scenes).end.item() == 90.0 + BACK
+    assert mission_of(make_scenes(1).scenes).end.isinf().all()
+
+
+def stop(colour, speed, light_x=50.0):
+    scene = make_scenes(1, red_light_x=light_x).scenes
+    scene["light_state"][:] = colour
+    where = torch.tensor([BACK]), torch.tensor([float(speed)])
+    return stop_ahead(mission_of(scene), scene, torch.zeros(1, dtype=torch.long), *where, braking=3.0).item()
+
+
+def test_red_binds_unless_halting_is_hopeless_yellow_where_it_is_comfortable():
+    assert stop(colour=1, speed=10) == 50.0 and stop(colour=2, speed=10) == 50.0
+    assert stop(colour=1, speed=20) == 50.0 and stop(colour=2, speed=20) == float("inf")
+    assert stop(colour=1, speed=30) == float("inf")
+    assert stop(colour=3, speed=10) == float("inf") and stop(colour=0, speed=10) == float("inf")
+    assert stop(colour=1, speed=1, light_x=-5.0) == float("inf"), "a line passed binds no longer"
+
+
+def test_scenes_without_lights():
+    scene = make_scenes(2).scenes
+    scene["light_state"] = scene["light_state"][..., :0]
+    assert (light_now(mission_of(scene), scene, torch.zeros(2, dtype=torch.long)) == 0).all()

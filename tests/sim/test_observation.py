@@ -1,0 +1,64 @@
+"""Observations: the same under a rigid motion of the scene and in any order of the others; blind to padding."""
+
+import torch
+
+from e2rl.scene.scene import SceneSet
+from e2rl.sim.env import DrivingEnv, SimSettings
+from tests.synthetic import make_scenes
+
+
+def scenes_with_everything():
+    return make_scenes(2, num_vehicles=9, num_vrus=3, red_light_x=70.0)
+
+
+def observe(scenes: SceneSet):
+    env = DrivingEnv(scenes, SimSettings(), len(scenes))
+    td = env.reset()
+    index = torch.arange(len(scenes))[:, None]
+    env.reset(td.select("scene_index").set("scene_index", index))
+    action = torch.tensor([0.5, 0.05]).repeat(len(scenes), 1)
+    for _ in range(10):
+        td = env.step(td.empty().set("action", action))["next"]
+    return td["observation"]
+
+
+def quarter_turn(scenes: SceneSet, shift: torch.Tensor):
+    """Rotate the scene by +90 degrees about the origin, then shift it."""
+    s = scenes.scenes
+
+    def turn(xy):
+        return torch.stack([-xy[..., 1], xy[..., 0]], -1) + shift
+
+    for key in ("start", "logged"):
+        s[key] = torch.cat([turn(s[key][..., :2]), s[key][..., 2:3] + torch.pi / 2, s[key][..., 3:]], -1)
+    for key in ("route_points", "light_points", "lane_points", "drivable_points"):
+        s[key] = turn(s[key])
+    last = s["field"].shape[-1] - 1
+    origin = s["field_origin"]
+    s["field"] = s["field"].transpose(1, 2).flip(1).contiguous()
+    s["field_origin"] = torch.stack([-(origin[:, 1] + last), origin[:, 0]], -1) + shift
+    return scenes
+
+
+def test_rigid_motion_changes_nothing():
+    moved = observe(quarter_turn(scenes_with_everything(), torch.tensor([40.0, -25.0])))
+    assert torch.allclose(observe(scenes_with_everything()), moved, atol=2e-3)
+
+
+def test_order_of_the_others_changes_nothing():
+    scenes = scenes_with_everything()
+    rows = torch.cat([torch.tensor([0]), 1 + torch.randperm(31, generator=torch.Generator().manual_seed(0)),
+                      torch.arange(32, 48)])
+    for key in ("start", "start_accel", "start_yaw_rate", "valid", "size", "agent_type", "parked"):
+        scenes.scenes[key] = scenes.scenes[key][:, rows]
+    for key in ("logged", "logged_valid"):
+        scenes.scenes[key] = scenes.scenes[key][:, :, rows]
+    assert torch.allclose(observe(scenes), observe(scenes_with_everything()), atol=1e-5)
+
+
+def test_absent_agents_leave_no_trace():
+    scenes = scenes_with_everything()
+    for key in ("start", "logged"):
+        absent = ~scenes.scenes["valid" if key == "start" else "logged_valid"]
+        scenes.scenes[key] = torch.where(absent[..., None], 1e3, scenes.scenes[key])
+    assert torch.equal(observe(scenes), observe(scenes_with_everything()))

@@ -1,0 +1,39 @@
+"""Reward terms: signs, scales, unknown limits, and the weighted sum."""
+
+import torch
+
+from e2rl.sim.reward import TERMS, check_weights, reward_terms, weighted_sum
+
+QUIET = {
+    "progress": torch.ones(1), "contact": torch.tensor([False]), "off_road": torch.tensor([False]),
+    "action": torch.zeros(1, 2), "last_action": torch.zeros(1, 2), "speed": torch.full((1,), 10.0),
+    "limit": torch.full((1,), 12.0), "offset": torch.zeros(1), "dt": 0.1,
+}
+
+
+def term(name, **changes):
+    return reward_terms(**QUIET | changes)[name].item()
+
+
+def test_quiet_driving_only_earns_progress():
+    terms = reward_terms(**QUIET)
+    assert set(terms) == set(TERMS)
+    assert {name: value.item() for name, value in terms.items()} == {name: float(name == "progress") for name in TERMS}
+
+
+def test_terms_grow_with_what_they_name():
+    assert term("contact", contact=torch.tensor([True])) == 1 and term("off_road", off_road=torch.tensor([True])) == 1
+    assert abs(term("speeding", speed=torch.tensor([15.0])) - 0.25) < 1e-6
+    assert term("speeding", speed=torch.tensor([15.0]), limit=torch.zeros(1)) == 0
+    assert term("lane_offset", offset=torch.tensor([-1.0])) == 0.5
+    steady = torch.tensor([[4.0, 0.0]])
+    assert abs(term("comfort", action=steady, last_action=steady) - 1) < 1e-6
+    turning = torch.tensor([[0.0, 0.4]])
+    assert abs(term("comfort", action=turning) - 1) < 1e-6
+    assert term("comfort", action=steady) > term("comfort", action=steady, last_action=steady)
+
+
+def test_reward_is_linear_in_the_weights():
+    weights = check_weights({name: float(k) for k, name in enumerate(TERMS)})
+    terms = {name: torch.tensor([2.0**k]) for k, name in enumerate(TERMS)}
+    assert weighted_sum(terms, weights).item() == sum(k * 2.0**k for k in range(len(TERMS)))
