@@ -194,12 +194,13 @@ def _propose(riders: _Riders, path: Tensor, size: Tensor, settings: AnchorSettin
     return pick // fine.shape[-1], knots, offset
 
 
-def propose(scene: TensorDictBase, world: World, skeleton: Skeleton, ego_plan: Tensor,
-            settings: AnchorSettings) -> Anchor:
+def propose(scene: TensorDictBase, world: World, skeleton: Skeleton, ego_plan: Tensor, settings: AnchorSettings,
+            keep_route: bool = False) -> Anchor:
     """The skeleton-consistent clean state of Sec. IV-A3 for scenes [B]; ego_plan [B, H >= 50, 4].
 
     Links are worked off from the ego outwards: those that act on the ego meet its plan, the others meet their target's
-    proposal, or its route at present speed where it has none.
+    proposal, or its route at present speed where it has none. keep_route: only the candidates that vehicles follow now
+    (between two choices of the support, where nobody changes its route).
     """
     vehicles = scene["route_points"].shape[1]
     times = DT * torch.arange(1, HORIZON + 1, device=ego_plan.device)
@@ -212,6 +213,9 @@ def propose(scene: TensorDictBase, world: World, skeleton: Skeleton, ego_plan: T
     for depth in range(1, int(skeleton.depth.max()) + 1):
         index, present = compact(skeleton.depth == depth)
         riders = _riders(scene, world, index, settings)
+        if keep_route:
+            followed = torch.arange(riders.usable.shape[-1], device=index.device) == take(world.route, index)[..., None]
+            riders.usable = riders.usable & followed
         target = skeleton.target.gather(1, index).clamp(min=0)
         size = take(scene["size"], target)
         chosen, found, late = _propose(riders, take(expected, target), size, settings)

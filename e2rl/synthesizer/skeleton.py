@@ -66,6 +66,15 @@ class Skeleton:
             "chains": int(self.chains.sum())}
 
 
+def chain_depth(target: Tensor) -> Tensor:
+    """Links to the ego [B, V] int64 of targets [B, V] (0 the ego, -1 nobody); 0 for those who act on nobody."""
+    at, depth = target, (target >= 0).long()
+    while bool((at > 0).any()) and int(depth.max()) < target.shape[1]:  # a chain is never longer than the vehicles
+        depth = depth + (at > 0)
+        at = torch.where(at > 0, target.gather(1, at.clamp(min=0)), at)
+    return depth
+
+
 def _extreme(mask: Tensor, distance: Tensor, count: int, farthest: bool = False) -> Tensor:
     """The `count` members of mask [B, V] nearest to the ego (or farthest); equals by index."""
     key = (-distance if farthest else distance).masked_fill(~mask, torch.inf)

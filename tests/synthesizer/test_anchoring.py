@@ -61,6 +61,18 @@ def test_the_candidate_that_meets_the_target_is_chosen():
     assert anchored(world, 1)[0].route[0, 1] == 2
 
 
+def test_a_kept_route_is_the_only_one_looked_at():
+    world = make_world([EGO, (40.0, -30.0, 0.0, 8.0)])
+    add_route(world, 1, 2, UP)
+    support = mask(world, 1)
+    skeleton = build_skeleton(world.scene, world, support, support, SkeletonSettings())
+    plan = cruise(world.scene, world, TIMES)[:, 0]
+    assert not propose(world.scene, world, skeleton, plan, AnchorSettings(), keep_route=True).has.any()
+    world.route[:, 1] = 2
+    kept = propose(world.scene, world, skeleton, plan, AnchorSettings(), keep_route=True)
+    assert kept.has[0, 1] and torch.equal(kept.route, world.route)
+
+
 def test_who_cannot_meet_the_target_has_no_anchor_and_keeps_its_route():
     world = make_world([EGO, (40.0, 30.0, UP, 8.0), (10.0, -90.0, UP, 5.0)])
     anchor, skeleton = anchored(world, 1, 2)

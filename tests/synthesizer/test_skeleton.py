@@ -4,7 +4,18 @@ import pytest
 import torch
 
 from e2rl.errors import InputError
-from e2rl.synthesizer.skeleton import NEAREST_FEASIBLE, NOBODY, SUPPORTED, SkeletonSettings, build_skeleton, lane_of
+from e2rl.synthesizer.anchoring import AnchorSettings, propose
+from e2rl.synthesizer.feasibility import FeasibilitySettings, feasible_vehicles
+from e2rl.synthesizer.skeleton import (
+    NEAREST_FEASIBLE,
+    NOBODY,
+    SUPPORTED,
+    SkeletonSettings,
+    build_skeleton,
+    chain_depth,
+    lane_of,
+)
+from e2rl.synthesizer.topology import TopologySettings, topological_candidates
 from tests.synthesizer.crossing import make_world, mask
 
 UP = math.pi / 2
@@ -95,6 +106,7 @@ def test_every_link_leads_to_the_ego_and_absent_vehicles_take_no_part():
         chains += int(result.chains.sum())
         assert not (result.coalition & ~(support & world.valid[:, :8])).any() and not result.coalition[:, 0].any()
         assert torch.equal(result.coalition, result.target >= 0) and torch.equal(result.coalition, result.depth > 0)
+        assert torch.equal(chain_depth(result.target), result.depth)
         for b, i in result.coalition.nonzero().tolist():
             way = [i]
             while way[-1] != 0:
@@ -107,3 +119,15 @@ def test_every_link_leads_to_the_ego_and_absent_vehicles_take_no_part():
 def test_bad_settings_are_refused():
     with pytest.raises(InputError, match="near"):
         SkeletonSettings(near=0)
+
+
+def test_an_ego_alone_passes_through_every_room():
+    world = make_world([EGO], copies=2)
+    scene, plan = world.scene, world.scene["logged"][:, 1:51, 0]
+    found = topological_candidates(scene["logged"][:, :, :8], scene["logged_valid"][:, :, :8], scene["size"][:, :8],
+                                   TopologySettings())
+    feasible = feasible_vehicles(scene, world, FeasibilitySettings()).mask
+    result = build(world, found.candidates & feasible, feasible)
+    anchor = propose(scene, world, result, plan, AnchorSettings())
+    assert not (found.candidates | feasible | result.coalition | anchor.has).any()
+    assert result.source.tolist() == [NOBODY, NOBODY]
