@@ -29,7 +29,7 @@ class SamplerSettings:
     sampler: str = "ddim"
     steps: int = 8
     churn: float = 1.0
-    temperature: float = 0.6
+    temperature: float = 0.8
     route_temperature: float = 0.5
 
 

@@ -1,0 +1,78 @@
+"""The closed-loop protocol: methods x scenes x seeds with one ego, and the files of design.md section 6."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from e2rl.ego.base import Ego
+from e2rl.evaluation.files import (
+    METRICS_FILE,
+    ROLLOUTS,
+    TABLE,
+    Source,
+    label_rows,
+    write_metrics,
+    write_rollouts,
+    write_rows,
+)
+from e2rl.evaluation.summary import metric_rows
+from e2rl.metrics.score import score_rollouts
+from e2rl.scene.scene import SceneSet
+from e2rl.sim.env import SimSettings
+from e2rl.synthesizer.rollout import roll_out
+from e2rl.synthesizer.synthesizer import Synthesizer
+
+
+@dataclass
+class Method:
+    """A row of the table: its name, synthesizer and intensity."""
+
+    name: str
+    synthesizer: Synthesizer
+    eta: float
+
+
+def scene_seed(scene: int, seed: int) -> int:
+    """The noise seed of a rollout: the same for every method (paired)."""
+    return seed * 1_000_003 + scene
+
+
+def run_protocol(
+    scenes: SceneSet, methods: list[Method], ego: Ego, ego_name: str, seeds: list[int], sim: SimSettings,
+    folder: Path | None = None, batch: int = 64, device: str = "cpu", **fields,
+) -> list[dict]:
+    """Roll out every method on every (scene, seed), score, and return the rows of metrics.json.
+
+    folder: where rollouts/, rollouts.csv and metrics.json are written (None: nowhere). fields join each row.
+    """
+    tasks = [(scene, seed) for seed in seeds for scene in range(len(scenes))]
+    rows, features = [], []
+    with tqdm(total=len(tasks) * len(methods), desc="rollouts", unit="rollout") as bar:
+        for method in methods:
+            source = Source(scenes.dataset, scenes.split, method.name, ego_name)
+            for begin in range(0, len(tasks), batch):
+                part = tasks[begin:begin + batch]
+                rollouts = _roll_out(scenes, part, method, ego, sim, device)
+                scored, samples = score_rollouts(rollouts)
+                rows += label_rows(scored, source)
+                features += samples
+                if folder is not None:
+                    write_rollouts(Path(folder) / ROLLOUTS, rollouts, source)
+                bar.set_postfix(method=method.name, eta=method.eta)
+                bar.update(len(part))
+    result = metric_rows(rows, features, **fields)
+    if folder is not None:
+        write_rows(Path(folder) / TABLE, rows)
+        write_metrics(Path(folder) / METRICS_FILE, result)
+    return result
+
+
+def _roll_out(scenes: SceneSet, part: list[tuple[int, int]], method: Method, ego: Ego, sim: SimSettings, device: str
+              ) -> dict:
+    index = torch.tensor([scene for scene, _ in part])
+    noise = torch.tensor([scene_seed(*task) for task in part])
+    eta = torch.full((len(part),), float(method.eta))
+    rollouts = roll_out(scenes, index, noise, eta, ego, method.synthesizer, sim, device=device)
+    return rollouts | {"seed": torch.tensor([seed for _, seed in part]), "eta": float(method.eta)}
