@@ -41,17 +41,20 @@ def whittaker(values: np.ndarray, penalty: float) -> np.ndarray:
 def tractrix(front: np.ndarray, wheelbase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Poses of bodies whose front axles run along `front` while their rear axles follow without side slip.
 
-    front [..., P, 2] in small steps (well below the wheelbase); wheelbase [...] m -> centres [..., P, 2] midway between
-    the axles, and unwrapped headings [..., P]. Kinematic bicycle: the rear axle moves along the body (a tractrix).
+    front [..., P, 2]; wheelbase [...] m -> centres [..., P, 2] midway between the axles, unwrapped headings [..., P].
+    Kinematic bicycle: the rear axle moves along the body. While the front axle moves h m straight in direction p, the
+    body's angle d to p shrinks as tan(d/2) <- tan(d/2) exp(-h/wheelbase), the tractrix in closed form.
     """
     wheelbase = np.asarray(wheelbase, float)[..., None]
-    first = front[..., min(2, front.shape[-2] - 1), :] - front[..., 0, :]
-    norm = np.linalg.norm(first, axis=-1, keepdims=True)
-    unit = np.where(norm > 1e-9, first / np.maximum(norm, 1e-9), np.array([1.0, 0.0]))
-    rear = np.empty_like(front)
-    rear[..., 0, :] = front[..., 0, :] - wheelbase * unit
-    for p in range(1, front.shape[-2]):
-        body = front[..., p, :] - rear[..., p - 1, :]
-        rear[..., p, :] = front[..., p, :] - wheelbase * body / np.linalg.norm(body, axis=-1, keepdims=True)
-    body = front - rear
-    return (front + rear) / 2, np.unwrap(np.arctan2(body[..., 1], body[..., 0]), axis=-1)
+    steps = np.diff(front, axis=-2)
+    length = np.linalg.norm(steps, axis=-1)
+    along = np.arctan2(steps[..., 1], steps[..., 0])
+    shrink = np.exp(-length / wheelbase)
+    heading = np.empty(front.shape[:-1])
+    heading[..., 0] = along[..., 0]
+    for p in range(steps.shape[-2]):
+        turn = heading[..., p] - along[..., p]
+        aside = 2 * np.arctan(np.tan(turn / 2) * shrink[..., p])
+        heading[..., p + 1] = np.where(length[..., p] > 0, along[..., p] + aside, heading[..., p])
+    heading = np.unwrap(heading, axis=-1)
+    return front - wheelbase[..., None] / 2 * np.stack([np.cos(heading), np.sin(heading)], -1), heading

@@ -16,11 +16,12 @@ from e2rl.scene.paths import WHEELBASE, arc_length, offset, tractrix, whittaker
 from e2rl.scene.recording import DT, LIGHT_RED, LIGHT_YELLOW, VEHICLE, Recording
 from e2rl.scene.traffic_flow import STEP, Fleet, roll
 
-WARM_UP = 40  # frames before the recorded ones, in which drivers settle
+WARM_UP = 15  # frames before the recorded ones, in which drivers settle
 ROUTE = 420.0  # m at most
 RADIUS = 120.0  # m around the focus in which vehicles are spawned
 MOVED, BORDER, LATERAL = 20.0, 25.0, 5.0  # m the ego drives, m of way it must have left, m/s^2
 PATH_PENALTY = 300.0
+JUNCTIONS = 0.75  # share of scenes that are centred on a junction
 REPAIRS, ATTEMPTS = 4, 40
 MOST, MOST_PARKED = 28, 8
 
@@ -106,7 +107,9 @@ def generate(ground: Ground, scene_id: str, rng: np.random.Generator) -> Recordi
 def draw_fleet(ground: Ground, rng: np.random.Generator) -> tuple[Fleet | None, list[list[str]]]:
     """Vehicles on random lanes near a random focus, with safe gaps, and the lanes of their routes."""
     graph = ground.graph
-    focus = graph.points[rng.integers(len(graph.points))]
+    inside = np.flatnonzero([graph.ids[lane].startswith(":") for lane in graph.lane_of])  # points within junctions
+    pool = inside if len(inside) and rng.random() < JUNCTIONS else np.arange(len(graph.points))
+    focus = graph.points[pool[rng.integers(len(pool))]]
     near = np.flatnonzero(np.linalg.norm(graph.points - focus, axis=1) < RADIUS)
     wanted = int(rng.integers(8, MOST + 1))
     drawn: list[tuple[str, float]] = []
@@ -156,7 +159,7 @@ def make_fleet(ground: Ground, ways: list[list[str]], start: np.ndarray, size: n
     here = limit[np.arange(count), np.minimum((start / STEP).astype(int), steps - 1)]
     return Fleet(front, centre, heading, limit, length, start, size, accel=rng.uniform(1.2, 2.2, count),
                  brake=rng.uniform(1.6, 2.6, count), headway=np.clip(rng.lognormal(np.log(1.3), 0.3, count), 0.8, 2.3),
-                 gap=rng.uniform(1.8, 3.5, count), speed=rng.uniform(0.4, 1.0, count) * here)
+                 gap=rng.uniform(1.8, 3.5, count), speed=rng.uniform(0.1, 1.0, count) * here)
 
 
 def stop_lines(ground: Ground, ways, fleet: Fleet, lights) -> list[tuple[int, float, np.ndarray]]:

@@ -127,7 +127,7 @@ def bridge_short_lanes(lanes: dict[str, Lane]) -> None:
 
 
 def run(layout: Layout, path: Path, net: Net, folder: Path, seed: int, rng) -> tuple[list[Track], dict]:
-    """Simulate; returns the tracks and the light states, lane id -> [RECORDED / DT], of the lanes that lights control."""
+    """Simulate; returns the tracks and the light states (lane id -> [RECORDED / DT]) of the controlled lanes."""
     demand = write_demand(layout, folder, WARM_UP + RECORDED, rng)
     libsumo.start(["sumo", "-n", str(path), "-r", str(demand), "--seed", str(seed), *SUMO])
     try:
