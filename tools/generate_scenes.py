@@ -1,4 +1,4 @@
-"""Write the bundled scenes: python tools/generate_scenes.py [--seed 0] [--nets 90] [--out e2rl/assets/scenes].
+"""Write the bundled scenes: python tools/generate_scenes.py [--seed 0] [--nets 80] [--out e2rl/assets/scenes].
 
 Needs the build-time extra: pip install -e '.[sumo]'. The same seed and SUMO version give the same files.
 """
@@ -41,7 +41,7 @@ def make_net(index: int, family, seed: int, most: int, folder: Path):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--nets", type=int, default=90)
+    parser.add_argument("--nets", type=int, default=80)
     parser.add_argument("--windows", type=int, default=3, help="at most this many scenes of a net")
     parser.add_argument("--out", type=Path, default=Path("e2rl/assets/scenes"))
     options = parser.parse_args()

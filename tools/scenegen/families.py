@@ -16,9 +16,9 @@ def bends(rng: np.random.Generator, radius: float) -> np.ndarray:
     return np.array([0.0, 0.0, *(rng.uniform(-1, 1, 3) / radius)])
 
 
-def star(rng, name: str, family: str, kind: str, angles, lanes, speeds, ranks, flow, pocket=False) -> Layout:
+def star(rng, name: str, kind: str, angles, lanes, speeds, ranks, flow, pocket=False) -> Layout:
     """A junction of arms; lanes, speeds, ranks per arm; flow: vehicles per hour and inward lane, per arm."""
-    layout = Layout(name, family, rng.uniform(3.2, 3.7))
+    layout = Layout(name, rng.uniform(3.2, 3.7))
     centre = layout.node(np.zeros(2), kind, rng.uniform(5, 9))
     median = layout.lane_width if pocket else rng.choice([0.0, 0.3])
     arms = []
@@ -53,13 +53,13 @@ def signalled_cross(rng, name: str) -> Layout:
     """Four-way signals with left-turn pockets."""
     major, minor = int(rng.integers(2, 4)), 2
     speed = rng.uniform(13, 17.5)
-    return star(rng, name, "signalled_cross", SIGNAL, cross_angles(rng, 4, 0.12), [major, minor] * 2,
+    return star(rng, name, SIGNAL, cross_angles(rng, 4, 0.12), [major, minor] * 2,
                 [speed, MEDIUM] * 2, [3, 2] * 2, rng.uniform(0.3, 0.8) * np.array([420, 330] * 2), pocket=True)
 
 
 def signalled_small(rng, name: str) -> Layout:
     """Four-way signals of single-lane streets."""
-    return star(rng, name, "signalled_small", SIGNAL, cross_angles(rng), [1] * 4, [MEDIUM] * 4, [2] * 4,
+    return star(rng, name, SIGNAL, cross_angles(rng), [1] * 4, [MEDIUM] * 4, [2] * 4,
                 rng.uniform(0.3, 0.8, 4) * 480)
 
 
@@ -68,7 +68,7 @@ def priority_cross(rng, name: str) -> Layout:
     lanes = int(rng.integers(1, 3))
     kind = rng.choice([PRIORITY, "priority_stop"])
     speed = rng.uniform(11, 16.5)
-    return star(rng, name, "priority_cross", kind, cross_angles(rng), [lanes, 1] * 2, [speed, 11.1] * 2, [4, 1] * 2,
+    return star(rng, name, kind, cross_angles(rng), [lanes, 1] * 2, [speed, 11.1] * 2, [4, 1] * 2,
                 rng.uniform(0.4, 0.8) * np.array([560, 260] * 2))
 
 
@@ -76,19 +76,19 @@ def t_junction(rng, name: str) -> Layout:
     """A side road that ends at a main road."""
     angles = rng.uniform(0, 2 * np.pi) + np.array([0, np.pi, np.pi / 2 + rng.uniform(-0.35, 0.35)])
     lanes = int(rng.integers(1, 3))
-    return star(rng, name, "t_junction", PRIORITY, angles, [lanes, lanes, 1], [MEDIUM, MEDIUM, 11.1], [4, 4, 1],
+    return star(rng, name, PRIORITY, angles, [lanes, lanes, 1], [MEDIUM, MEDIUM, 11.1], [4, 4, 1],
                 rng.uniform(0.4, 0.8) * np.array([600, 600, 380]))
 
 
 def allway_stop(rng, name: str) -> Layout:
     """All-way stop of residential streets."""
-    return star(rng, name, "allway_stop", STOP, cross_angles(rng), [1] * 4, [11.1] * 4, [2] * 4,
+    return star(rng, name, STOP, cross_angles(rng), [1] * 4, [11.1] * 4, [2] * 4,
                 rng.uniform(0.4, 0.8, 4) * 330)
 
 
 def curved_road(rng, name: str) -> Layout:
     """A winding road with a side road or two."""
-    layout = Layout(name, "curved_road", rng.uniform(3.3, 3.7))
+    layout = Layout(name, rng.uniform(3.3, 3.7))
     speed, lanes = rng.uniform(11, 16), int(rng.integers(1, 3))
     signs = np.resize([1, -1], 6) * rng.choice([-1, 1])
     axis = road_axis(np.zeros(2), rng.uniform(0, 2 * np.pi), 420.0,

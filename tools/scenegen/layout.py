@@ -53,7 +53,6 @@ class Layout:
     """Nodes, edges, connections and demand of one net; coordinates are kept by netconvert as they are given here."""
 
     name: str
-    family: str
     lane_width: float
     nodes: list[dict] = field(default_factory=list)
     edges: list[dict] = field(default_factory=list)

@@ -15,7 +15,7 @@ def ring_points(radius: float, begin: float, end: float) -> np.ndarray:
 
 def roundabout(rng, name: str) -> Layout:
     """A one-lane roundabout of three to five arms; the ring's speed bounds its lateral acceleration to 1.3 m/s^2."""
-    layout = Layout(name, "roundabout", rng.uniform(3.5, 4.0))
+    layout = Layout(name, rng.uniform(3.5, 4.0))
     count = int(rng.integers(3, 6))
     radius = rng.uniform(13, 18) + 2.0 * (count - 3)
     angles = np.sort(rng.uniform(0, 2 * np.pi) + np.arange(count) * 2 * np.pi / count + rng.uniform(-0.15, 0.15, count))
@@ -55,7 +55,7 @@ def carriageway(layout: Layout, axis: np.ndarray, cuts: list[tuple[float, float,
 
 def ramp(rng, name: str) -> Layout:
     """A motorway with an on-ramp, and half of the time an off-ramp at the end of the auxiliary lane (a weave)."""
-    layout = Layout(name, "ramp", rng.uniform(3.5, 3.7))
+    layout = Layout(name, rng.uniform(3.5, 3.7))
     speed, lanes, weave = rng.uniform(22, 28), int(rng.integers(2, 4)), bool(rng.random() < 0.5)
     axis = road_axis(np.zeros(2), rng.uniform(0, 2 * np.pi), 860.0, rng.uniform(-1, 1, 5) / 900)
     cuts = [(0.0, 300.0, lanes), (300.0 + GAP, 540.0, lanes + 1), (540.0 + 1.5 * GAP, 0.0, lanes)]
@@ -94,7 +94,7 @@ def _ramp_axis(axis: np.ndarray, at: float, right: float, rng, ahead: bool) -> n
 
 def arterial(rng, name: str) -> Layout:
     """A main road with side streets and driveways on both sides, one of them signalled half of the time."""
-    layout = Layout(name, "arterial", rng.uniform(3.2, 3.6))
+    layout = Layout(name, rng.uniform(3.2, 3.6))
     speed, lanes = rng.uniform(12, 16), 2
     heading, median = rng.uniform(0, 2 * np.pi), rng.choice([0.0, 0.4])
     axis = road_axis(np.zeros(2), heading, 560.0, rng.uniform(-1, 1, 4) / 700)
@@ -140,7 +140,7 @@ def _through_demand(layout: Layout, arms: list[list[Arm]], rng, main: float, sid
 
 def grid(rng, name: str) -> Layout:
     """Two by two junctions, shifted by chance, with all-way stops, priorities and signals."""
-    layout = Layout(name, "grid", rng.uniform(3.2, 3.6))
+    layout = Layout(name, rng.uniform(3.2, 3.6))
     pitch = rng.uniform(85, 120)
     place = {(i, j): np.array([i, j]) * pitch + rng.uniform(-14, 14, 2) for i in range(2) for j in range(2)}
     kinds = rng.choice(["allway_stop", "priority", "traffic_light", "right_before_left"], 4)
@@ -169,7 +169,7 @@ def grid(rng, name: str) -> Layout:
 
 def lane_drop(rng, name: str) -> Layout:
     """A one-way road that loses its right lane."""
-    layout = Layout(name, "lane_drop", rng.uniform(3.3, 3.7))
+    layout = Layout(name, rng.uniform(3.3, 3.7))
     speed, lanes = rng.uniform(14, 19), int(rng.integers(2, 4))
     axis = road_axis(np.zeros(2), rng.uniform(0, 2 * np.pi), 560.0, rng.uniform(-1, 1, 5) / 350)
     road = carriageway(layout, axis, [(0.0, 300.0, lanes), (300.0 + 1.3 * GAP, 0.0, lanes - 1)], speed)
