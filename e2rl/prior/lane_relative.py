@@ -129,7 +129,7 @@ def decode(x: Tensor, state: LaneState, points: Tensor) -> LaneState:
     reach = lateral_horizon(state.v)[..., None]
     u = (travelled / reach).clamp(max=1.0)
     c = offset_coefficients(state, half, end)
-    d, d1, d2 = _polynomial(c, u)
+    d, d1, d2 = polynomial(c, u)
     d1, d2 = d1 / reach, d2 / reach**2
     s = state.s[..., None] + travelled
     xy, heading, curvature = interpolate(points, s)
@@ -140,7 +140,7 @@ def decode(x: Tensor, state: LaneState, points: Tensor) -> LaneState:
     return LaneState(s, d, d1, d2, v, (v - before) / DT, xy[..., 0], xy[..., 1], heading, curvature + d2)
 
 
-def _polynomial(c: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def polynomial(c: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Value, first and second derivative (in u) of the polynomial c [..., 7] at u [..., H], by Horner's rule."""
     value = first = second = torch.zeros_like(u)
     for k in range(6, -1, -1):
@@ -161,10 +161,10 @@ def fit(track: LaneState, known: Tensor, state: LaneState) -> tuple[Tensor, Tens
     reach = lateral_horizon(state.v)[..., None]
     u = (travelled / reach).clamp(max=1.0)
     zero = torch.zeros_like(state.d)
-    base = _polynomial(offset_coefficients(state, zero, zero), u)[0]
+    base = polynomial(offset_coefficients(state, zero, zero), u)[0]
     still = LaneState(*(zero for _ in fields(LaneState)))
     still.v = state.v
-    parts = [_polynomial(offset_coefficients(still, *pair), u)[0] for pair in ((zero + 1, zero), (zero, zero + 1))]
+    parts = [polynomial(offset_coefficients(still, *pair), u)[0] for pair in ((zero + 1, zero), (zero, zero + 1))]
     basis = torch.stack(parts, -1) * known[..., None]
     # In units of x: half = (d + end) / 2 + BEND x_0, end = OFFSET x_1.
     unit = torch.stack([BEND_SCALE * basis[..., 0], OFFSET_SCALE * (basis[..., 1] + 0.5 * basis[..., 0])], -1)

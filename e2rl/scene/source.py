@@ -6,7 +6,7 @@ import multiprocessing
 import os
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -24,24 +24,27 @@ from e2rl.scene.scene import SceneSet, stack, validate
 VERSION = 1  # of the scene builder: raise it when the same recording would make another scene
 
 
-def load_scenes(data, num_scenes: int | None = None, split: str | None = None) -> SceneSet:
+def load_scenes(
+    data, num_scenes: int | None = None, split: str | None = None, starts: list[int] | None = None
+) -> SceneSet:
     """The scenes that a `data` config names (conf/data/*.yaml), at most `num_scenes` of them.
 
-    split: overrides data.split for the bundled and procedural sources. Raises InputError for a missing or empty path
-    and, unless data.skip_invalid, for the first invalid scene.
+    split: overrides data.split for the bundled and procedural sources. starts: several scenes a log, one from each of
+    these start frames; default: the log's own start frame, or data.starts. Raises InputError for a missing or empty
+    path and, unless data.skip_invalid, for the first invalid scene.
     """
     settings = BuildSettings(**data.build)
     split = split or data.split
     if data.source == "scenarionet":
         if not data.path:
             raise InputError("data.path is not set; pass data.path=FOLDER_OR_ZIP of ScenarioDescription pickles")
-        scenes = _scenarionet(data, settings)
+        scenes = _scenarionet(data, settings, starts)
     elif data.source == "bundled":
-        scenes = _cached(_fingerprint(bundled.asset_bytes(split), settings, None), data,
-                         lambda: _build_all(bundled.load_recordings(split), settings, data, "bundled", split))
+        scenes = _cached(_fingerprint(bundled.asset_bytes(split), settings, starts), data, lambda: _build_all(
+            _from_starts(bundled.load_recordings(split), starts), settings, data, "bundled", split))
     elif data.source == "procedural":
         recordings = procedural.generate_recordings(data.count, data.seed, split)
-        scenes = _build_all(recordings, settings, data, "procedural", split)
+        scenes = _build_all(_from_starts(recordings, starts), settings, data, "procedural", split)
     else:
         raise InputError(f"data.source={data.source}: expected bundled, procedural or scenarionet")
     return scenes.first(num_scenes)
@@ -52,9 +55,16 @@ def _fingerprint(content: bytes, settings: BuildSettings, extra) -> str:
     return hashlib.sha256(head.encode() + content).hexdigest()[:24]
 
 
-def _scenarionet(data, settings: BuildSettings) -> SceneSet:
+def _from_starts(recordings: list[Recording], starts: list[int] | None) -> list[Recording]:
+    if starts is None:
+        return recordings
+    return [replace(recording, current=start, scene_id=f"{recording.scene_id}@{start}")
+            for recording in recordings for start in starts]
+
+
+def _scenarionet(data, settings: BuildSettings, starts: list[int] | None) -> SceneSet:
     files = scenarionet.list_files(data.path)
-    starts = list(data.starts) if data.starts else None
+    starts = list(data.starts) if starts is None and data.starts else starts
     digest = hashlib.sha256()
     for path in sorted({container if Path(container).is_file() else os.path.join(container, member)
                         for container, member in files}):

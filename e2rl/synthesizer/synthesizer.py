@@ -18,7 +18,7 @@ from e2rl.synthesizer.anchoring import AnchorSettings, propose
 from e2rl.synthesizer.control import ControlSettings, SparseControl
 from e2rl.synthesizer.feasibility import FeasibilitySettings, feasible_vehicles
 from e2rl.synthesizer.potentials import PotentialContext, PotentialSettings
-from e2rl.synthesizer.skeleton import Skeleton, SkeletonSettings, build_skeleton
+from e2rl.synthesizer.skeleton import Skeleton, SkeletonSettings, build_skeleton, chain_depth
 from e2rl.synthesizer.topology import TopologySettings, topological_candidates
 
 
@@ -168,12 +168,10 @@ class Synthesizer:
 
     def _control(self, episode: Episode, world: World, ego_plan: Tensor) -> SparseControl:
         settings, vehicles = self.settings, self._vehicles
-        near = torch.where(episode.target >= 0, 1, 0)
-        near = torch.where(episode.target > 0, 2, near)
-        skeleton = Skeleton(episode.coalition, episode.target, near, episode.coalition, episode.coalition,
-                            episode.replans, episode.replans)
-        anchor = propose(world.scene, world, skeleton, ego_plan, settings.anchor)
-        anchor = replace(anchor, has=anchor.has & (anchor.route == episode.routed.route))
+        depth = chain_depth(episode.target)
+        skeleton = Skeleton(episode.coalition, episode.target, depth, depth == 1, depth > 1, episode.replans,
+                            episode.replans)
+        anchor = propose(world.scene, world, skeleton, ego_plan, settings.anchor, keep_route=True)
         where = PotentialContext(
             world.scene, world.states[:, :vehicles], episode.state.a, world.valid[:, :vehicles], episode.routed.points,
             episode.routed.has_lane, ego_plan[:, :HORIZON], episode.target)
