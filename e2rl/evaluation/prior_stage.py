@@ -1,4 +1,4 @@
-"""`python train.py stage=prior`: train a prior on the user's data and measure its nominal closed loop on held-out logs."""
+"""`python train.py stage=prior`: train a prior on the user's data and measure its closed loop on held-out logs."""
 
 import hashlib
 from pathlib import Path

@@ -18,7 +18,8 @@ from e2rl.prior.routed import RoutedScene
 @dataclass(frozen=True)
 class BoundSettings:
     """Headway [s], jam gap [m], acceleration and comfortable braking [m/s^2] of the leader bound and its floor; lateral
-    acceleration and braking of the curve bound; time gap [s] and braking of the crossing bound; each can be off."""
+    acceleration and braking of the curve bound; time gap [s] and braking of the crossing bound; each can be off.
+    onset [m/s^2]: what a bound may take off the current acceleration at once, the rest follows over half a second."""
 
     leader: bool = True
     headway: float = 0.5
@@ -33,6 +34,7 @@ class BoundSettings:
     crossing: bool = True
     crossing_time: float = 2.0
     crossing_brake: float = 5.0
+    onset: float = 2.0
 
 
 def acceleration_caps(

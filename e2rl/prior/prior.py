@@ -123,7 +123,8 @@ class Prior(nn.Module):
         state = context.state
         if capped:
             x0 = torch.cat([torch.minimum(x0[..., :1], context.cap[..., None]), x0[..., 1:]], -1)
-            state = LaneState(**{**vars(state), "a": torch.minimum(state.a, context.cap)})
+            onset = torch.minimum(state.a, torch.maximum(context.cap, state.a - self.bounds.onset))
+            state = LaneState(**{**vars(state), "a": onset})
         lane = lane_relative.decode(x0, state, context.routed.points)
         on_lane = context.routed.has_lane[..., None]
         if bool(on_lane.all()):
