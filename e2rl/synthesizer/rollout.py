@@ -39,12 +39,34 @@ def roll_out(
         tensordict = env.reset()
         world = env.base_env.world()
         states.append(world.states), valid.append(world.valid)
+        contact = torch.zeros(len(index), dtype=torch.bool, device=world.states.device)
         for _ in range(env.base_env.horizon):
             tensordict = step_mdp(env.step(policy(tensordict)))
+            contact = contact | tensordict["metrics", "contact"][:, 0]
             world = env.base_env.world()
             states.append(world.states), valid.append(world.valid)
-    return _rollout(scenes, index, seed, torch.stack(states, 1), torch.stack(valid, 1), world.scene,
-                    transform.episode, (time.perf_counter() - begin) / len(index), settings.replay_ego)
+    rollout = _rollout(scenes, index, seed, torch.stack(states, 1), torch.stack(valid, 1), world.scene,
+                       transform.episode, (time.perf_counter() - begin) / len(index), settings.replay_ego)
+    return rollout | {"contact": contact.cpu()}
+
+
+def synthesize_traffic(scenes: SceneSet, synthesizer: Synthesizer, sim: SimSettings, batch: int = 64,
+                       device: str = "cpu"):
+    """A function (ego, scene_index [S], eta, seed) -> the D' of Algorithm 1 against that ego: scene_index, states
+    [S, T+1, N, 4], valid, adversaries [S, N], contact [S] (the ego was hit by or hit a vehicle) and route [S, V]."""
+
+    def synthesize(ego: Ego, scene_index: Tensor, eta: float, seed: int) -> dict[str, Tensor]:
+        parts = []
+        for rows in scene_index.split(batch):
+            noise = rows + seed * 1_000_003
+            parts.append(roll_out(scenes, rows, noise, torch.full((len(rows),), float(eta)), ego, synthesizer, sim,
+                                  device=device))
+        names = {"states": "states", "valid": "valid", "adversaries": "adversaries", "contact": "contact",
+                 "route": "routes"}
+        return {"scene_index": scene_index} | {
+            name: torch.cat([part[key] for part in parts]) for name, key in names.items()}
+
+    return synthesize
 
 
 def _rollout(scenes: SceneSet, index, seed, states, valid, scene, episode, seconds: float, replayed: bool) -> dict:

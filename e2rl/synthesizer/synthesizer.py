@@ -148,10 +148,11 @@ class Synthesizer:
         skeleton = build_skeleton(scene, world, found.candidates & feasible, feasible, self.settings.skeleton, expected)
         self._count(skeleton, found.candidates, feasible)
         anchor = propose(scene, world, skeleton, ego_plan, self.settings.anchor)
-        acts = skeleton.coalition & (episode.eta > 0)[:, None]
+        # A member that no route and acceleration lead to its target is pruned (Sec. IV-A3: infeasible configurations).
+        acts = skeleton.coalition & anchor.has & (episode.eta > 0)[:, None]
         episode = self._reroute(replace(
             episode, coalition=acts, target=torch.where(acts, skeleton.target, -1),
-            adversaries=episode.adversaries | acts), world, torch.where(acts & anchor.has, anchor.route, world.route))
+            adversaries=episode.adversaries | acts), world, torch.where(acts, anchor.route, world.route))
         return episode, replace(world, route=episode.routed.route)
 
     def _reroute(self, episode: Episode, world: World, route: Tensor) -> Episode:
