@@ -1,0 +1,183 @@
+"""The learned ego's network: observation normalisation, a squashed Gaussian actor and a critic, and its file."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import Bounded
+from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+
+from e2rl.ego.reference import reference_action
+from e2rl.errors import InputError
+from e2rl.sim.observation import OBSERVATION_SIZE
+
+WEIGHTS = "actor.safetensors"  # file name of an ActorCritic inside a checkpoint
+NARROWEST = 0.01  # least standard deviation before squashing, as a share of half the action range
+STEEPEST = 0.95  # reference actions are kept within this share of the bounds, so that their atanh stays finite
+
+
+class Normaliser(nn.Module):
+    """Running mean and variance of observations; they change in `observe` alone, so evaluation leaves them frozen."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("variance", torch.ones(size))
+
+    @torch.no_grad()
+    def observe(self, observation: Tensor) -> None:
+        """Take observations [..., D] into the statistics (Chan et al.'s pairwise update)."""
+        flat = observation.reshape(-1, observation.shape[-1])
+        total = self.count + len(flat)
+        share, delta = (len(flat) / total).float(), flat.mean(0) - self.mean
+        spread = self.variance * (1 - share) + flat.var(0, correction=0) * share
+        self.variance.copy_(spread + delta**2 * share * (1 - share))
+        self.mean.add_(delta * share)
+        self.count.copy_(total)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Observations of zero mean and unit variance, cut at 5."""
+        return ((observation - self.mean) / self.variance.sqrt().clamp(min=0.05)).clamp(-5, 5)
+
+
+class ActorNetwork(nn.Module):
+    """Mean and standard deviation of the action before squashing.
+
+    The mean is the reference's action (if `reference`) plus the network's; the latter is unbounded, so it can override
+    the reference anywhere. It begins at zero: an untrained actor drives as the reference does, or as half-way between
+    the action's bounds without one.
+    """
+
+    def __init__(
+        self, normaliser: Normaliser, hidden: Sequence[int], reference: bool, initial_std: Sequence[float], low: Tensor,
+        high: Tensor,
+    ) -> None:
+        super().__init__()
+        self.normaliser, self.reference = normaliser, reference
+        self.trunk = perceptron(OBSERVATION_SIZE, hidden, 2, last_gain=0.0)
+        self.spread = nn.Parameter((torch.tensor(initial_std) - NARROWEST).logit(1e-4))
+        self.register_buffer("middle", (high + low) / 2, persistent=False)
+        self.register_buffer("reach", (high - low) / 2, persistent=False)
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """loc, scale [..., 2] from observation [..., D]."""
+        loc = self.trunk(self.normaliser(observation))
+        if self.reference:
+            share = (reference_action(observation) - self.middle) / self.reach
+            loc = loc + share.clamp(-STEEPEST, STEEPEST).atanh()
+        return loc, self.std.expand_as(loc)
+
+    @property
+    def std(self) -> Tensor:
+        """Standard deviations [2] before squashing, in halves of the action's range."""
+        return NARROWEST + self.spread.sigmoid()
+
+    def deterministic(self, observation: Tensor) -> Tensor:
+        """Most central action [..., 2] (m/s^2, rad/s)."""
+        return self.middle + self.reach * self(observation)[0].tanh()
+
+
+class ActorCritic(nn.Module):
+    """TorchRL actor and critic over one normaliser.
+
+    actor reads "observation", writes loc, scale, action, action_log_prob; critic writes state_value.
+    """
+
+    def __init__(
+        self, low: Tensor, high: Tensor, hidden: Sequence[int] = (256, 256), reference: bool = True,
+        initial_std: Sequence[float] = (0.12, 0.04), device: str | torch.device = "cpu",
+    ) -> None:
+        """low, high [2]: bounds of (acceleration, yaw rate); other fields: conf/ego/actor.yaml."""
+        super().__init__()
+        device = torch.device(device)
+        low, high = low.to(device, torch.float32), high.to(device, torch.float32)
+        self.low, self.high, self.device = low, high, device
+        self.architecture = {
+            "observation": OBSERVATION_SIZE, "hidden": [int(size) for size in hidden], "reference": bool(reference),
+            "low": _rounded(low), "high": _rounded(high),
+        }
+        self.normaliser = Normaliser(OBSERVATION_SIZE)
+        self.network = ActorNetwork(self.normaliser, hidden, reference, initial_std, low.cpu(), high.cpu())
+        values = nn.Sequential(self.normaliser, perceptron(OBSERVATION_SIZE, hidden, 1, last_gain=1.0))
+        self.to(device)
+        self.actor = ProbabilisticActor(
+            TensorDictModule(self.network, ["observation"], ["loc", "scale"]), in_keys=["loc", "scale"],
+            out_keys=["action"], distribution_class=TanhNormal, distribution_kwargs={"low": low, "high": high},
+            spec=Bounded(low, high, device=device), return_log_prob=True,
+        )
+        self.critic = ValueOperator(values.to(device), in_keys=["observation"])
+
+    def save(self, path: Path) -> None:
+        """Write weights and statistics to a safetensors file whose header tells the architecture."""
+        weights = {key: value.detach().cpu().contiguous() for key, value in self.weights().items()}
+        save_file(weights, path, metadata={"architecture": json.dumps(self.architecture, sort_keys=True)})
+
+    def load(self, path: Path) -> None:
+        """Read a file of `save`; raises InputError for a damaged file or one of another architecture."""
+        try:
+            with safe_open(path, "pt") as file:
+                saved = json.loads((file.metadata() or {}).get("architecture", "null"))
+                weights = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        except (SafetensorError, OSError, json.JSONDecodeError) as error:
+            raise InputError(f"{path}: not a readable actor file ({error}); give an {WEIGHTS} file") from None
+        if saved != self.architecture:
+            raise InputError(f"{path}: an actor of another architecture: {_differences(saved, self.architecture)}; set "
+                             "ego.* and sim.* as in the run that wrote it")
+        own = self.weights()
+        wrong = set(own) ^ set(weights) or {key for key in own if own[key].shape != weights[key].shape}
+        if wrong:
+            raise InputError(f"{path}: weights {', '.join(sorted(wrong))} do not fit; the file is damaged")
+        self.set_weights(weights)
+
+    @torch.no_grad()
+    def set_weights(self, weights: Mapping[str, Tensor]) -> None:
+        """Take over the values of `weights()`, in place."""
+        for key, value in self.weights().items():
+            value.copy_(weights[key])
+
+    def weights(self) -> dict[str, Tensor]:
+        """Every parameter and buffer once, though actor and critic share the normaliser."""
+        named = dict(self.named_parameters()) | dict(self.named_buffers())
+        kept = {key: value for key, value in named.items() if not key.endswith((".middle", ".reach"))}
+        return {key: value for key, value in kept.items() if not key.startswith("actor.")}
+
+
+def find_weights(path: str | Path) -> Path:
+    """The actor file that `path` names: the file, a checkpoint folder, or the newest checkpoint of a run folder."""
+    path = Path(path)
+    if path.is_dir():
+        found = [path / WEIGHTS] if (path / WEIGHTS).is_file() else sorted(path.glob(f"checkpoints/*/{WEIGHTS}"))
+        if found:
+            return found[-1]
+    if not path.is_file():
+        raise InputError(f"{path}: no actor there; give an {WEIGHTS}, a checkpoint folder or a run folder")
+    return path
+
+
+def perceptron(size: int, hidden: Sequence[int], out: int, last_gain: float) -> nn.Sequential:
+    """Layers size -> hidden -> out with SiLU; orthogonal weights, the last ones scaled by last_gain."""
+    sizes, layers = [size, *hidden], []
+    for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
+        layers += [nn.Linear(fan_in, fan_out), nn.SiLU()]
+    layers.append(nn.Linear(sizes[-1], out))
+    for layer in layers[::2]:
+        nn.init.orthogonal_(layer.weight, 2**0.5 if layer is not layers[-1] else last_gain)
+        nn.init.zeros_(layer.bias)
+    return nn.Sequential(*layers)
+
+
+def _rounded(value: Tensor) -> list[float]:
+    return [round(number, 6) for number in value.tolist()]
+
+
+def _differences(saved: dict | None, own: dict) -> str:
+    if not isinstance(saved, dict):
+        return "its header names none"
+    keys = [key for key in own if saved.get(key) != own[key]]
+    return ", ".join(f"{key} {saved.get(key)} instead of {own[key]}" for key in keys) or "unknown fields"

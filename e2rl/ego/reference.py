@@ -1,0 +1,114 @@
+"""A route follower that reads only the observation: where the learned ego starts from, and what it corrects.
+
+Steering is pure pursuit of the mission; the acceleration is the least of IDM's to every agent in the corridor and to a
+red light, and of what limits and curves ahead allow. Pure functions of the observation of e2rl.sim.observation.
+"""
+
+import torch
+from torch import Tensor
+
+from e2rl.ego.idm import idm_acceleration
+from e2rl.sim.observation import FAR, LOOK_AHEAD, NEAR, NEAREST, PROBE_X, PROBE_Y, SPEED
+
+EGO = slice(0, 11)
+ROUTE = slice(11, 11 + 5 * len(LOOK_AHEAD))
+LIGHTS = slice(ROUTE.stop, ROUTE.stop + 8)
+AGENTS = slice(LIGHTS.stop + len(PROBE_X) * len(PROBE_Y), LIGHTS.stop + len(PROBE_X) * len(PROBE_Y) + 15 * NEAREST)
+
+DESIRED_SPEED = 12.0  # m/s where no limit is known
+PURSUIT_TIME, PURSUIT_MIN, PURSUIT_MAX = 1.0, 4.0, 25.0  # s, m, m: how far ahead steering aims
+ACCELERATION, BRAKING, HARDEST_BRAKING = 1.5, 2.5, 7.0  # m/s^2
+HEADWAY, STANDSTILL_GAP, EXPONENT = 1.2, 3.0, 4.0  # s, m
+LATERAL = 2.5  # m/s^2 in curves
+GATE_MARGIN = 0.3  # m beyond the half widths
+REACTION = 0.5  # s in which a speed cap is met
+LINE_GAP = 1.0  # m kept to a stop line
+
+
+def executed_action(observation: Tensor) -> Tensor:
+    """Last executed action [..., 2] (m/s^2, rad/s) that an observation [..., D] reports."""
+    return torch.stack([4 * observation[..., 1], observation[..., 2]], -1)
+
+
+def reference_action(observation: Tensor) -> Tensor:
+    """Action [..., 2] (m/s^2, rad/s) of the route follower at observation [..., D]."""
+    ego = observation[..., EGO]
+    route = observation[..., ROUTE].unflatten(-1, (len(LOOK_AHEAD), 5))
+    speed = ego[..., 0] * SPEED
+    path = torch.stack([route[..., 0] * FAR, route[..., 1] * NEAR], -1)
+    limit = ego[..., 6] * SPEED
+    desired = torch.where(limit > 0, limit, DESIRED_SPEED).clamp(min=1.0)
+    gap, leading = _gaps(observation, path)
+    follow = idm_acceleration(
+        speed[..., None], desired[..., None], gap, leading, ACCELERATION, BRAKING, HEADWAY, STANDSTILL_GAP, EXPONENT
+    ).amin(-1)
+    accel = torch.minimum(follow, _capped(route, speed)).clamp(-HARDEST_BRAKING, ACCELERATION)
+    return torch.stack([accel, speed * _pursuit(path, speed)], -1)
+
+
+def _pursuit(path: Tensor, speed: Tensor) -> Tensor:
+    """Curvature [...] 1/m of the circle through the ego and the point of path [..., K, 2] a second ahead."""
+    ahead = path.new_tensor(LOOK_AHEAD)
+    reach = (PURSUIT_TIME * speed).clamp(PURSUIT_MIN, PURSUIT_MAX)
+    high = torch.searchsorted(ahead, reach.contiguous()).clamp(1, len(LOOK_AHEAD) - 1)
+    share = (reach - ahead[high - 1]) / (ahead[high] - ahead[high - 1])
+
+    def point(index: Tensor) -> Tensor:
+        return path.gather(-2, index[..., None, None].expand(*index.shape, 1, 2))[..., 0, :]
+
+    aim = torch.lerp(point(high - 1), point(high), share[..., None])
+    return 2 * aim[..., 1] / aim.square().sum(-1).clamp(min=1.0)
+
+
+def _capped(route: Tensor, speed: Tensor) -> Tensor:
+    """Acceleration [...] that meets, within REACTION, the speed from which limits and curves ahead can be obeyed."""
+    ahead, curvature, limit = route.new_tensor(LOOK_AHEAD), route[..., 3].abs() / 10, route[..., 4] * SPEED
+    squared = torch.minimum(
+        LATERAL / curvature.clamp(min=1e-3), torch.where(limit > 0, limit, torch.inf) ** 2
+    )
+    allowed = (squared + 2 * BRAKING * (ahead - speed[..., None] * REACTION).clamp(min=0)).amin(-1).sqrt()
+    return (allowed - speed) / REACTION
+
+
+def _gaps(observation: Tensor, path: Tensor) -> tuple[Tensor, Tensor]:
+    """Free gap [..., NEAREST + 2] m along path [..., K, 2], inf for none, and speed along it, of agents and lights."""
+    ego = observation[..., EGO]
+    half_length, half_width = 2.5 * ego[..., 8, None], ego[..., 9, None]
+    agents = observation[..., AGENTS].unflatten(-1, (NEAREST, 15))
+    place = torch.stack([agents[..., 1] * FAR, agents[..., 2] * NEAR], -1)
+    along, apart, direction = _on_path(place, path)
+    cos, sin = agents[..., 3], agents[..., 4]
+    aligned = cos * direction[..., 0] + sin * direction[..., 1]
+    across = (sin * direction[..., 0] - cos * direction[..., 1]).abs()
+    length, width = 2.5 * agents[..., 9], agents[..., 10]
+    inside = apart < across * length + aligned.abs() * width + half_width + GATE_MARGIN
+    leads = inside & (along > 0) & (agents[..., 0] > 0)
+    gap = (along - aligned.abs() * length - across * width - half_length).masked_fill(~leads, torch.inf)
+    leading = (agents[..., 7] * SPEED * aligned).clamp(min=0)
+    halt = _halts(observation, ego[..., 0] * SPEED) - half_length - LINE_GAP + STANDSTILL_GAP
+    return torch.cat([gap, halt], -1), torch.cat([leading, torch.zeros_like(halt)], -1)
+
+
+def _on_path(place: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Points place [..., A, 2] at the nearest segment of the ego's origin + path [..., K, 2]: metres along, metres
+    apart, each [..., A], and the segment's direction [..., A, 2]."""
+    corner = torch.cat([torch.zeros_like(path[..., :1, :]), path], -2)
+    leg = corner.diff(dim=-2)
+    length = leg.norm(dim=-1).clamp(min=1e-3)
+    unit = (leg / length[..., None])[..., None, :, :]
+    offset = place[..., :, None, :] - corner[..., None, :-1, :]
+    t = torch.minimum((offset * unit).sum(-1).clamp(min=0), length[..., None, :])
+    apart, index = (offset - t[..., None] * unit).norm(dim=-1).min(-1)
+    begun = (length.cumsum(-1) - length)[..., None, :]
+    along = (begun + t).gather(-1, index[..., None])[..., 0]
+    direction = unit.expand(*t.shape, 2).gather(-2, index[..., None, None].expand(*index.shape, 1, 2))[..., 0, :]
+    return along, apart, direction
+
+
+def _halts(observation: Tensor, speed: Tensor) -> Tensor:
+    """Metres [..., 2] to the stop lines that bind: red if twice BRAKING still halts before it, yellow if BRAKING."""
+    light = observation[..., LIGHTS].unflatten(-1, (2, 4))
+    ahead = -30 * light[..., 3].clamp(min=1e-4).log()
+    needed = speed[..., None] ** 2 / (2 * ahead.clamp(min=1e-3))
+    binds = ((light[..., 0] > 0) & (needed < 2 * BRAKING)) | ((light[..., 1] > 0) & (needed < BRAKING))
+    return ahead.masked_fill(~binds | (ahead <= 0), torch.inf)

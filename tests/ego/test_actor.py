@@ -1,0 +1,130 @@
+"""The learned ego: its observation is the environment's, its plan comes true, its file fits or is refused."""
+
+import pytest
+import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from e2rl.ego.actor import ActorEgo
+from e2rl.ego.base import PLAN_STEPS, EgoPolicy
+from e2rl.ego.network import Normaliser, find_weights
+from e2rl.ego.reference import reference_action
+from e2rl.errors import InputError
+from e2rl.sim.env import DrivingEnv, SimSettings
+from tests.synthetic import make_scenes
+
+
+def wild(ego, scale=0.3):
+    """Give the untrained network an opinion of its own."""
+    torch.manual_seed(0)
+    torch.nn.init.normal_(ego.network.network.trunk[-1].weight, std=scale)
+    return ego
+
+
+def test_own_observation_is_the_environments():
+    env, ego = DrivingEnv(make_scenes(3, num_vehicles=8), SimSettings(), 3), wild(ActorEgo(hidden=(16,)))
+    td = env.reset()
+    for _ in range(10):
+        world = env.world()
+        seen = ego.act(world, td["observation"])
+        assert torch.allclose(ego.act(world), seen, atol=1e-5)
+        td["action"] = seen
+        td = env.step(td)["next"].exclude("reward")
+
+
+def test_plan_is_what_it_does_on_a_lonely_road():
+    """Actions held as in the plan, alone on the road: the plan comes true exactly, and planning changes nothing."""
+    env = DrivingEnv(make_scenes(2, num_vehicles=1, num_vrus=0), SimSettings(), 2)
+    ego, td = wild(ActorEgo(hidden=(16,)), 0.1), env.reset()
+    plan = ego.plan(env.world())
+    assert plan.shape == (2, PLAN_STEPS, 4) and torch.equal(plan, ego.plan(env.world()))
+    for step in range(PLAN_STEPS):
+        if step % 5 == 0:
+            action = ego.act(env.world(), td["observation"])
+        td["action"] = action
+        td = env.step(td)["next"].exclude("reward")
+        if td["done"].any():
+            break
+        assert torch.allclose(env.world().states[:, 0], plan[:, step], atol=1e-3), step
+    assert step > 15
+
+
+def test_plans_expect_the_others_plans():
+    """A leader that plans to halt makes the ego plan to halt; by its velocity alone it would go on."""
+    env = DrivingEnv(make_scenes(2, vehicles=[(0.0, 0, 10.0), (25.0, 0, 10.0)]), SimSettings(), 2)
+    env.reset()
+    ego, world = ActorEgo(hidden=(8,)), env.world()
+    going_on = ego.plan(world)
+    future = world.states[:, None].repeat(1, PLAN_STEPS, 1, 1)
+    future[..., 3] = 0.0
+    env.write_traffic(0, future, world.valid[:, None].repeat(1, PLAN_STEPS, 1))
+    halting = ego.plan(env.world())
+    assert (going_on[:, -1, 3] > 8).all() and (halting[:, -1, 3] < 3).all()
+
+
+def test_the_network_can_override_the_reference():
+    ego = ActorEgo(hidden=(8,))
+    env = DrivingEnv(make_scenes(2), SimSettings(), 2)
+    observation = env.reset()["observation"]
+    assert torch.allclose(ego.network.network.deterministic(observation), reference_action(observation), atol=1e-4)
+    with torch.no_grad():
+        ego.network.network.trunk[-1].bias.copy_(torch.tensor([8.0, -8.0]))
+    assert torch.allclose(ego.network.network.deterministic(observation), torch.tensor([5.0, -1.6]), atol=1e-2)
+
+
+def test_samples_stay_within_the_bounds_and_have_their_log_probability():
+    ego, env = ActorEgo(hidden=(8,), initial_std=(0.9, 0.9)), DrivingEnv(make_scenes(2), SimSettings(), 64)
+    with set_exploration_type(ExplorationType.RANDOM):
+        td = ego.network.actor(env.reset())
+    low, high = ego.network.low, ego.network.high
+    assert ((td["action"] >= low) & (td["action"] <= high)).all() and td["action"].std(0).min() > 0.1
+    assert torch.allclose(ego.network.actor.get_dist(td).log_prob(td["action"]), td["action_log_prob"], atol=1e-3)
+
+
+def test_normaliser_equals_the_statistics_of_all_it_saw_and_is_frozen_otherwise():
+    normaliser, parts = Normaliser(3), [2 + 3 * torch.randn(n, 3) for n in (5, 100, 31)]
+    for part in parts:
+        normaliser.observe(part)
+        normaliser(part)
+    everything = torch.cat(parts)
+    assert torch.allclose(normaliser.mean, everything.mean(0), atol=1e-5)
+    assert torch.allclose(normaliser.variance, everything.var(0, correction=0), rtol=1e-4)
+
+
+def test_file_round_trip(tmp_path):
+    first, second = wild(ActorEgo(hidden=(8,))), ActorEgo(hidden=(8,))
+    first.network.normaliser.observe(torch.randn(10, first.network.normaliser.mean.shape[0]))
+    folder = tmp_path / "checkpoints" / "round-000001"
+    folder.mkdir(parents=True)
+    first.network.save(folder / "actor.safetensors")
+    assert find_weights(tmp_path) == find_weights(folder) == folder / "actor.safetensors"
+    second = ActorEgo(hidden=(8,), checkpoint=str(tmp_path))
+    env = DrivingEnv(make_scenes(2), SimSettings(), 2)
+    policies = [EgoPolicy(ego, env)(env.reset().clone()) for ego in (first, second)]
+    observation = policies[0]["observation"]
+    acted, valued = [], []
+    for ego in (first, second):
+        acted.append(ego.network.network.deterministic(observation))
+        valued.append(ego.network.critic(policies[0])["state_value"])
+    assert torch.equal(*acted) and torch.equal(*valued)
+
+
+def test_another_architecture_damage_and_absence_are_refused(tmp_path):
+    file = tmp_path / "actor.safetensors"
+    ActorEgo(hidden=(8,)).network.save(file)
+    with pytest.raises(InputError, match=r"actor\.safetensors: .*hidden \[8\] instead of \[16\]"):
+        ActorEgo(hidden=(16,), checkpoint=str(file))
+    with pytest.raises(InputError, match="high"):
+        ActorEgo(hidden=(8,), max_acceleration=2.0, checkpoint=str(file))
+    file.write_bytes(b"no weights")
+    with pytest.raises(InputError, match="not a readable actor file"):
+        ActorEgo(hidden=(8,), checkpoint=str(file))
+    with pytest.raises(InputError, match="no actor there"):
+        ActorEgo(checkpoint=str(tmp_path / "missing"))
+
+
+def test_it_collects_and_survives_a_change_of_batch():
+    ego = ActorEgo(hidden=(8,))
+    for batch in (2, 3):
+        env = DrivingEnv(make_scenes(3, num_vehicles=2), SimSettings(), batch)
+        data = env.rollout(30, EgoPolicy(ego, env))
+        assert torch.isfinite(data["action"]).all() and torch.isfinite(ego.plan(env.world())).all()
