@@ -1,0 +1,107 @@
+"""Checkpoints of an evolution run: everything that the rounds to come depend on, written whole or not at all.
+
+A checkpoint is a folder checkpoints/round-000002 of state.pt (optimiser, curriculum, sampler, counters, generators;
+read with weights_only), actor.safetensors (weights and observation statistics; also what `ego.checkpoint` takes),
+traffic.safetensors (the last D') and config.json.
+"""
+
+import json
+import os
+import pickle
+import random
+import shutil
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+
+from e2rl.ego.actor import ActorEgo
+from e2rl.ego.network import WEIGHTS
+from e2rl.errors import InputError
+from e2rl.learning.evolution import Evolution
+
+STATE, TRAFFIC, CONFIG, FORMAT = "state.pt", "traffic.safetensors", "config.json", "e2rl-checkpoint/1"
+
+
+def save_checkpoint(folder: Path, run: Evolution, config: dict, keep_last: int = 2) -> Path:
+    """Write checkpoints/round-<rounds done> under a run's folder; all but the keep_last newest are deleted."""
+    parent = Path(folder) / "checkpoints"
+    parent.mkdir(parents=True, exist_ok=True)
+    target, partial = parent / f"round-{run.round:06d}", parent / f".partial-{os.getpid()}"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+    state = {"format": FORMAT, "run": run.state_dict(), "generators": generator_states()}
+    torch.save(state, partial / STATE)
+    if isinstance(run.ego, ActorEgo):
+        run.ego.network.save(partial / WEIGHTS)
+    stored = {key: value.detach().cpu().contiguous() for key, value in run.traffic.items() if torch.is_tensor(value)}
+    save_file(stored, partial / TRAFFIC)
+    (partial / CONFIG).write_text(json.dumps(config, indent=1, sort_keys=True))
+    shutil.rmtree(target, ignore_errors=True)
+    partial.replace(target)
+    for old in sorted(parent.glob("round-*"))[: -max(1, keep_last)]:
+        shutil.rmtree(old)
+    return target
+
+
+def latest_checkpoint(path: str | Path) -> Path:
+    """The checkpoint folder that `path` names: itself, or the newest of a run's folder."""
+    path = Path(path)
+    found = [path] if (path / STATE).is_file() else sorted(path.glob(f"checkpoints/round-*/{STATE}"))
+    if not found:
+        raise InputError(f"{path}: holds no checkpoint; give a run's folder or one of its checkpoints/round-*")
+    return found[-1] if found[-1].is_dir() else found[-1].parent
+
+
+def saved_config(path: str | Path) -> dict:
+    """The configuration of the run that wrote the checkpoint `path` names."""
+    file = latest_checkpoint(path) / CONFIG
+    try:
+        return json.loads(file.read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise InputError(f"{file}: not readable ({error}); resume from an older checkpoint") from None
+
+
+def load_checkpoint(path: str | Path, run: Evolution) -> int:
+    """Bring a run, built as the one that was saved, to its state, generators last; returns the rounds done."""
+    folder = latest_checkpoint(path)
+    file = folder / STATE
+    try:
+        state = torch.load(file, weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise InputError(f"{file}: damaged ({str(error).splitlines()[0]}); resume from an older checkpoint") from None
+    if not isinstance(state, dict) or state.get("format") != FORMAT:
+        raise InputError(f"{file}: not a checkpoint of this program ({FORMAT}); give a run's folder")
+    if isinstance(run.ego, ActorEgo):
+        run.ego.network.load(folder / WEIGHTS)
+    try:
+        run.load_state_dict(state["run"])
+    except (KeyError, ValueError, RuntimeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{file}: its learner is of another kind or shape ({error}); resume with the configuration "
+                         f"in {folder / CONFIG}") from None
+    run.traffic = load_file(folder / TRAFFIC)
+    restore_generators(state["generators"])
+    return run.round
+
+
+def generator_states() -> dict:
+    """States of the global generators of torch, CUDA, numpy and python, as plain values and tensors."""
+    name, keys, position, has_gauss, cached = np.random.get_state()
+    return {
+        "torch": torch.get_rng_state(), "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        "numpy": [name, keys.tolist(), position, has_gauss, cached], "python": list(random.getstate()),
+    }
+
+
+def restore_generators(states: dict) -> None:
+    """Set the global generators to `generator_states`."""
+    torch.set_rng_state(states["torch"])
+    if torch.cuda.is_available() and states["cuda"]:
+        torch.cuda.set_rng_state_all(states["cuda"])
+    name, keys, position, has_gauss, cached = states["numpy"]
+    np.random.set_state((name, np.array(keys, dtype=np.uint32), position, has_gauss, cached))
+    version, internal, gauss = states["python"]
+    random.setstate((version, tuple(internal), gauss))

@@ -1,0 +1,170 @@
+"""Expert pairs (observation, action) from recordings and planners, and the actor's warm start from them.
+
+Recorded pairs come in two kinds. Replayed: the ego follows its log exactly and the action is the inverse unicycle's.
+Disturbed: the ego tracks its log while its actions are perturbed for a second now and then (Laskey et al. 2017), so
+that the pairs show the way back; the label is the undisturbed action.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.objectives import BCLoss
+from tqdm import tqdm
+
+from e2rl.ego.base import Ego
+from e2rl.ego.network import WEIGHTS, ActorCritic
+from e2rl.ego.replay import ReplayEgo
+from e2rl.errors import InputError
+from e2rl.learning.driving import Disturbance, drive, episodes_of
+from e2rl.learning.pool import TrafficPool
+from e2rl.learning.update import clip_expert, take_step
+from e2rl.scene.scene import SceneSet
+from e2rl.sim.env import DrivingEnv, SimSettings
+
+BURST, PAUSE = 10, 20  # steps: a disturbance lasts, and the time between the beginnings of two
+
+
+@dataclass(frozen=True)
+class ImitationSettings:
+    """Fields: conf/learner/imitation.yaml."""
+
+    epochs: int = 20
+    minibatch: int = 512
+    learning_rate: float = 5e-4
+    weight_decay: float = 1e-4
+    max_grad_norm: float = 1.0
+    held_out: float = 0.1
+    drives: int = 1
+    disturbed_acceleration: float = 1.0
+    disturbed_yaw_rate: float = 0.08
+    batch: int = 64
+    seed: int = 0
+
+
+def recorded_pairs(scenes: SceneSet, sim: SimSettings, settings: ImitationSettings) -> TensorDict:
+    """Pairs [M] (observation, action, scene_index) of every recording, replayed once and disturbed `drives` times.
+
+    A disturbed drive counts until it touches something or leaves the road; actions are clipped to 0.99 of the bounds.
+    """
+    generator = torch.Generator().manual_seed(settings.seed)
+    pool, parts = TrafficPool.recorded(torch.arange(len(scenes))), []
+    batch = min(settings.batch, len(scenes))
+    exact = DrivingEnv(scenes, replace(sim, replay_ego=True, end_on_contact=False, end_off_road=False), batch)
+    free = DrivingEnv(scenes, replace(sim, replay_ego=False), batch)
+    todo = [(rows, number) for number in range(settings.drives + 1) for rows in _batches(len(pool), batch)]
+    for rows, number in tqdm(todo, "expert pairs", unit="batch", leave=False):
+        env, disturb = (exact, None) if number == 0 else (free, _bursts(len(rows), settings, generator))
+        frames = drive(env, ReplayEgo(), pool, rows, disturb)
+        parts.append(_pairs(frames, "executed" if number == 0 else "intended", pool.scene_index[rows], env))
+    return torch.cat(parts)
+
+
+def corrective_pairs(env: DrivingEnv, teacher: Ego, pool: TrafficPool) -> TensorDict:
+    """Pairs [M] of the teacher's drives through the pool's adversarial rows that it survives (Algorithm 1's corrective
+    supervision: what another driver did where the ego is attacked); empty where it survives none."""
+    rows_of, batch = pool.adversarial.nonzero()[:, 0], env.batch_size[0]
+    parts = []
+    for places in _batches(len(rows_of), batch):
+        rows = rows_of[places]
+        frames = drive(env, teacher, pool, rows)
+        survived = ~episodes_of(frames, pool, rows).failed.to(env.device)
+        frames["alive"] = frames["alive"] & survived[:, None]
+        parts.append(_pairs(frames, "executed", pool.scene_index[rows], env))
+    if not parts:
+        raise InputError("corrective supervision: the pool holds no adversarial traffic")
+    return torch.cat(parts)
+
+
+def _batches(count: int, batch: int) -> list[Tensor]:
+    """Rows 0..count-1 in batches of exactly `batch`, the last one filled up by repetition."""
+    return list((torch.arange(-(-count // batch) * batch) % count).split(batch)) if count else []
+
+
+def _bursts(batch: int, settings: ImitationSettings, generator: torch.Generator) -> Disturbance:
+    """Constant offsets of random size for BURST steps out of every PAUSE, at another phase in each scene."""
+    size = torch.tensor([settings.disturbed_acceleration, settings.disturbed_yaw_rate])
+    offsets = torch.randn(batch, 100, 2, generator=generator) * size
+    phase = torch.randint(PAUSE, (batch,), generator=generator)
+
+    def disturb(action: Tensor, step: int) -> Tensor:
+        place = step + phase
+        offset = offsets[torch.arange(batch), place // PAUSE] * (place % PAUSE < BURST)[:, None]
+        return action + offset.to(action.device)
+
+    return disturb
+
+
+def _pairs(frames: TensorDictBase, label: str, scene_index: Tensor, env: DrivingEnv) -> TensorDict:
+    alive = frames["alive"]
+    action = clip_expert(frames[label], env.action_spec.space.low[0], env.action_spec.space.high[0])
+    scene = scene_index[:, None].to(alive.device).expand(alive.shape)
+    count = int(alive.sum())
+    return TensorDict({"observation": frames["observation"][alive], "action": action[alive], "scene_index":
+                       scene[alive]}, batch_size=[count]).cpu()
+
+
+class Imitation:
+    """Behaviour cloning of an ActorCritic's actor from pairs, held-out scenes apart. `history` has a row per epoch."""
+
+    def __init__(self, network: ActorCritic, pairs: TensorDictBase, settings: ImitationSettings) -> None:
+        self.network, self.settings, self.history = network, settings, []
+        self._generator = torch.Generator().manual_seed(settings.seed)
+        scenes = pairs["scene_index"].unique()
+        scenes = scenes[torch.randperm(len(scenes), generator=self._generator)]
+        apart = scenes[: round(settings.held_out * len(scenes))]
+        held_out = torch.isin(pairs["scene_index"], apart)
+        pairs = pairs.select("observation", "action").to(network.device)
+        self.train, self.held_out = pairs[~held_out.to(pairs.device)], pairs[held_out.to(pairs.device)]
+        self.loss = BCLoss(network.actor)
+        self.optimiser = torch.optim.AdamW(
+            network.network.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
+        )
+        network.normaliser.observe(self.train["observation"])
+
+    @torch.no_grad()
+    def measure(self, pairs: TensorDictBase) -> tuple[float, float]:
+        """Mean negative log-likelihood of pairs, and mean distance of the deterministic action as a share of half the
+        range; NaN without pairs."""
+        if not len(pairs):
+            return float("nan"), float("nan")
+        with torch.random.fork_rng(devices=[]):  # the loss samples an action; measuring must not move the generator
+            likelihood = self.loss(pairs)["loss_bc"].item()
+        reach = (self.network.high - self.network.low) / 2
+        miss = (self.network.network.deterministic(pairs["observation"]) - pairs["action"]).abs() / reach
+        return likelihood, miss.mean().item()
+
+    def epoch(self) -> dict[str, float]:
+        """One pass over the training pairs; returns losses on both parts."""
+        order = torch.randperm(len(self.train), generator=self._generator).to(self.network.device)
+        for index in order.split(self.settings.minibatch):
+            take_step(self.optimiser, self.loss(self.train[index])["loss_bc"], self.settings.max_grad_norm)
+        (fit, miss), (held_fit, held_miss) = self.measure(self.train), self.measure(self.held_out)
+        row = {"loss": fit, "miss": miss, "held_out_loss": held_fit, "held_out_miss": held_miss}
+        self.history.append(row)
+        return row
+
+
+def imitate(
+    network: ActorCritic, pairs: TensorDictBase, settings: ImitationSettings, folder: Path | None = None,
+    log: Callable[[dict[str, float], int], None] | None = None,
+) -> dict[str, float]:
+    """Clone the pairs for settings.epochs and keep the weights of the least held-out loss (of the last epoch where no
+    scene is held out). They are written to folder / WEIGHTS whenever they improve; returns that epoch's row."""
+    run, best, kept = Imitation(network, pairs, settings), None, None
+    for epoch in (bar := tqdm(range(settings.epochs), "imitation", unit="epoch")):
+        row = run.epoch()
+        bar.set_postfix({name: f"{value:.3f}" for name, value in row.items()})
+        if log is not None:
+            log({f"train/imitation_{name}": value for name, value in row.items()}, epoch)
+        if best is None or not row["held_out_loss"] >= best["held_out_loss"]:
+            best, kept = row | {"epoch": float(epoch)}, {key: value.clone() for key, value in network.weights().items()}
+            if folder is not None:
+                network.save(Path(folder) / WEIGHTS)
+    if kept is None:
+        raise InputError(f"learner.imitation.epochs={settings.epochs}: at least one epoch")
+    network.set_weights(kept)
+    return best

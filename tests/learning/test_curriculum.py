@@ -1,0 +1,115 @@
+"""Schedules, regret and priorities as defined, and a state that goes on exactly."""
+
+import pytest
+import torch
+
+from e2rl.errors import InputError
+from e2rl.learning.curriculum import CurriculumScheduler, CurriculumSettings, ranks
+
+
+def scheduler(num_scenes=6, rounds=10, **settings):
+    return CurriculumScheduler(num_scenes, rounds, CurriculumSettings(**settings))
+
+
+def episodes(curriculum, scenes, returns, adversarial=True):
+    curriculum.update(torch.tensor(scenes), torch.tensor(returns), torch.full((len(scenes),), adversarial))
+
+
+def test_constant_and_linear_intensity_and_share():
+    constant, linear = scheduler(schedule="constant", eta=2.0), scheduler(
+        schedule="linear", eta=0.5, eta_final=2.5, ramp=0.5, share=0.0, share_final=0.9
+    )
+    etas, shares = [], []
+    for _ in range(10):
+        etas.append(linear.eta), shares.append(linear.share)
+        assert constant.eta == 2.0 and constant.share == 0.5
+        linear.advance(1.0), constant.advance(0.0)
+    assert etas == pytest.approx([0.5, 0.9, 1.3, 1.7, 2.1] + [2.5] * 5)
+    assert shares == pytest.approx([0.0, 0.18, 0.36, 0.54, 0.72] + [0.9] * 5)
+
+
+def test_adaptive_intensity_seeks_the_band_within_its_bounds():
+    curriculum = scheduler(eta=1.0, eta_step=0.5, eta_min=0.5, eta_max=2.0, target_low=0.2, target_high=0.4)
+    seen = []
+    for rate in (0.0, 0.3, 0.1, 0.1, 0.9, 0.9, 0.9, 0.9, 0.9):
+        curriculum.advance(rate)
+        seen.append(curriculum.eta)
+    assert seen == [1.5, 1.5, 2.0, 2.0, 1.5, 1.0, 0.5, 0.5, 0.5]
+
+
+def test_adaptive_intensity_settles_where_the_ego_collides_as_often_as_wanted():
+    """An ego that collides at rate eta / 4 ends in the band."""
+    curriculum = scheduler(eta=0.25, target_low=0.4, target_high=0.5, eta_step=0.25)
+    for _ in range(40):
+        curriculum.advance(curriculum.eta / 4)
+    assert 0.4 <= curriculum.eta / 4 <= 0.5
+
+
+def test_regret_is_best_return_less_recent_adversarial_return():
+    curriculum = scheduler(smoothing=0.5)
+    episodes(curriculum, [0, 1, 1], [8.0, 8.0, 4.0], adversarial=False)
+    assert curriculum.regret().isnan().all(), "nothing is known of adversarial traffic yet"
+    episodes(curriculum, [0, 0, 1], [1.0, 3.0, 8.0])
+    assert curriculum.regret()[:2].tolist() == [6.0, 0.0]
+    episodes(curriculum, [0], [8.0])
+    assert curriculum.regret()[0] == 3.0, "recent returns are smoothed"
+
+
+def test_priorities_are_a_distribution_that_prefers_regret_unseen_and_stale_scenes():
+    curriculum = scheduler(num_scenes=4, staleness=0.0)
+    assert torch.allclose(curriculum.priority(), torch.full((4,), 0.25))
+    episodes(curriculum, [0, 1, 2], [8.0, 8.0, 8.0], adversarial=False)
+    episodes(curriculum, [0, 1, 2], [8.0, 4.0, 0.0])
+    priority = curriculum.priority()
+    assert priority.sum().item() == pytest.approx(1.0)
+    assert priority[3] > priority[2] > priority[1] > priority[0] > 0
+    stale = scheduler(num_scenes=4, staleness=1.0)
+    stale._drawn = torch.tensor([0, 1, 2, 3])
+    stale.round = 3
+    assert torch.allclose(stale.priority(), torch.tensor([3.0, 2.0, 1.0, 0.0]) / 6)
+
+
+def test_priorities_do_not_depend_on_the_scale_of_returns():
+    first, second = scheduler(num_scenes=3), scheduler(num_scenes=3)
+    for curriculum, scale in ((first, 1.0), (second, 100.0)):
+        episodes(curriculum, [0, 1, 2], [5.0 * scale] * 3, adversarial=False)
+        episodes(curriculum, [0, 1, 2], [1.0 * scale, 2.0 * scale, 3.0 * scale])
+    assert torch.equal(first.priority(), second.priority())
+
+
+def test_draws_follow_the_priorities_without_repetition_within_a_pass():
+    curriculum = scheduler(num_scenes=5, staleness=0.0, temperature=1.0)
+    episodes(curriculum, list(range(5)), [9.0] * 5, adversarial=False)
+    episodes(curriculum, list(range(5)), [0.0, 1.0, 2.0, 3.0, 4.0])
+    expected = curriculum.priority()
+    counts = torch.bincount(torch.stack([curriculum.draw(1) for _ in range(4000)]).flatten(), minlength=5)
+    assert torch.allclose(counts / 4000, expected, atol=0.03)
+    chosen = curriculum.draw(13)
+    assert torch.bincount(chosen, minlength=5).tolist().count(3) == 3 and len(chosen) == 13
+    assert len(curriculum.draw(4).unique()) == 4
+
+
+def test_ranks_share_ties():
+    assert ranks(torch.tensor([5.0, 1.0, 5.0, torch.inf, 0.0])).tolist() == [2.5, 4.0, 2.5, 1.0, 5.0]
+
+
+def test_state_goes_on_exactly():
+    first = scheduler()
+    for _ in range(3):
+        first.draw(2)
+        episodes(first, [0, 3], [1.0, 2.0])
+        first.advance(0.1)
+    second = scheduler()
+    second.load_state_dict(first.state_dict())
+    for curriculum in (first, second):
+        curriculum.advance(0.9)
+    assert torch.equal(first.draw(4), second.draw(4)) and first.eta == second.eta
+    assert torch.equal(first.priority(), second.priority())
+    with pytest.raises(InputError, match="holds 6 scenes, the data 5"):
+        scheduler(num_scenes=5).load_state_dict(first.state_dict())
+
+
+def test_wrong_settings_are_refused():
+    for settings in ({"schedule": "cosine"}, {"target_low": 0.6}, {"share": 1.5}, {"temperature": 0.0}):
+        with pytest.raises(InputError, match="curriculum"):
+            CurriculumSettings(**settings)
