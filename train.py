@@ -8,9 +8,42 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from e2rl.errors import InputError
-from e2rl.evaluation.build import set_up
+from e2rl.evaluation.before_after import BeforeAfter
+from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_synthesizer, caption, resolved, set_up
 from e2rl.evaluation.prior_stage import run_prior_stage
-from e2rl.report.tables import metric_tables, print_tables
+from e2rl.evaluation.resume import resumed
+from e2rl.learning.build import build_evolution, build_logger, run_imitation
+from e2rl.learning.checkpoint import load_checkpoint, save_checkpoint
+from e2rl.report.tables import metric_tables, print_tables, save_tables
+from e2rl.scene.source import load_scenes
+from e2rl.synthesizer.rollout import synthesize_traffic
+
+
+def evolve(config: DictConfig, folder: Path) -> None:
+    """Rounds of Algorithm 1: synthesize D' against the current ego, improve the ego on it, move the curriculum."""
+    scenes = load_scenes(config.data, config.num_scenes, split="train")
+    prior, origin = build_prior(config, config.device)
+    synthesizer, ego, sim = build_synthesizer(config, prior), build_ego(config), build_sim(config)
+    synthesize = synthesize_traffic(scenes, synthesizer, sim, config.batch, config.device)
+    run, logger = build_evolution(config, scenes, sim, ego, synthesize), build_logger(config, folder)
+    measure = BeforeAfter(config, synthesizer, sim, folder)
+    done = load_checkpoint(config.resume, run) if config.resume else 0
+    if done == 0:
+        measure("before", run.ego)
+        save_checkpoint(folder, run, resolved(config), config.keep_last)
+    for number in range(done, config.rounds):
+        metrics = run.run_round()
+        logger.log(metrics, number)
+        save_checkpoint(folder, run, resolved(config), config.keep_last)
+        print(f"round {number + 1}/{config.rounds}: eta {metrics['curriculum/eta']:.2f}, adversarial collisions "
+              f"{metrics['synthesizer/contact']:.0%} of {metrics['synthesizer/scenes']:.0f} scenes, "
+              f"{metrics['time/synthesize']:.0f} s synthesis, {metrics['time/improve']:.0f} s learning", flush=True)
+    logger.close()
+    rows = measure("after", run.ego)
+    tables = metric_tables(rows, caption(config, origin))
+    save_tables(folder / "tables.md", tables)
+    print_tables(tables)
+    print(f"\nwritten to {folder}; evaluate with: python evaluate.py ego=actor ego.checkpoint={folder}")
 
 
 def train_prior(config: DictConfig, folder: Path) -> None:
@@ -20,13 +53,21 @@ def train_prior(config: DictConfig, folder: Path) -> None:
     print(f"\ncheckpoint: {path}\nuse it with prior.checkpoint={path}")
 
 
-STAGES = {"prior": train_prior}
+def imitate(config: DictConfig, folder: Path) -> None:
+    """Warm-start the actor from the recorded egos."""
+    scenes = load_scenes(config.data, config.num_scenes, split="train")
+    losses = run_imitation(config, scenes, build_sim(config), build_ego(config), folder, build_logger(config, folder))
+    print(", ".join(f"{name} {value:.4f}" for name, value in losses.items()))
+    print(f"start evolution rounds from it with ego.checkpoint={folder}")
+
+
+STAGES = {"evolution": evolve, "prior": train_prior, "imitation": imitate}
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 def main(config: DictConfig) -> None:
-    folder = Path(HydraConfig.get().runtime.output_dir)
     try:
+        config, folder = resumed(config, Path(HydraConfig.get().runtime.output_dir))
         if config.stage not in STAGES:
             raise InputError(f"stage={config.stage}: choose one of {', '.join(STAGES)}")
         set_up(config)

@@ -76,26 +76,32 @@ def _scenarionet(data, settings: BuildSettings, starts: list[int] | None) -> Sce
 
     def build() -> SceneSet:
         tasks = [(c, m, locations.get(Path(m).stem, ""), starts, settings) for c, m in files]
-        with ProcessPoolExecutor(data.workers, multiprocessing.get_context("spawn")) as pool:
-            done = list(tqdm(pool.map(_read_file, tasks, chunksize=4), "reading scenes", len(tasks), unit="file"))
-        return _assemble([(_tensors(scene), *rest) for rows in done for scene, *rest in rows], data, None, split)
+        return _assemble(_in_parallel(_read_file, tasks, data.workers), data, None, split)
 
     return _cached(key, data, build)
+
+
+def _in_parallel(work, tasks: list, workers: int) -> list[tuple]:
+    """The rows of all tasks, worked off by several processes."""
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), torch.set_num_threads, (1,)) as pool:
+        done = list(tqdm(pool.map(work, tasks, chunksize=4), "building scenes", len(tasks), unit="log"))
+    return [(_tensors(scene), *rest) for rows in done for scene, *rest in rows]
 
 
 def _read_file(task) -> list[tuple]:
     """Rows (scene or None, id, location, dataset, reason it was left out) of one scenario file."""
     container, member, location, starts, settings = task
-    torch.set_num_threads(1)
     try:
         content = scenarionet.read_bytes(container, member)
         recordings = list(scenarionet.read_recordings(content, member, location, starts, settings.steps))
     except InputError as error:
         return [(None, member, location, "", str(error))]
-    rows = [_build_row(recording, settings) for recording in recordings]
-    # Plain arrays cross the process border; tensors would each hold a shared-memory file open.
-    return [(None if scene is None else {key: value.numpy() for key, value in scene.items()}, *rest)
-            for scene, *rest in rows]
+    return [_build_row(recording, settings) for recording in recordings]
+
+
+def _build_recording(task) -> list[tuple]:
+    """The row of one (recording, settings)."""
+    return [_build_row(*task)]
 
 
 def _tensors(scene: dict | None) -> TensorDict | None:
@@ -113,12 +119,13 @@ def _build_row(recording: Recording, settings: BuildSettings) -> tuple:
         return (None, *name, str(error))
     if ego_overlaps(scene):
         return (None, *name, "")
-    return (scene, *name, None)
+    # Plain arrays cross the process border; tensors would each hold a shared-memory file open.
+    return ({key: value.numpy() for key, value in scene.items()}, *name, None)
 
 
 def _build_all(recordings, settings: BuildSettings, data, dataset: str, split: str) -> SceneSet:
-    rows = [_build_row(recording, settings) for recording in tqdm(recordings, f"building {dataset} scenes")]
-    return _assemble(rows, data, dataset, split)
+    tasks = [(recording, settings) for recording in recordings]
+    return _assemble(_in_parallel(_build_recording, tasks, data.workers), data, dataset, split)
 
 
 def _assemble(rows: list[tuple], data, dataset: str | None, split: str) -> SceneSet:

@@ -17,7 +17,12 @@ from e2rl.sim.world import World
 from e2rl.synthesizer.anchoring import AnchorSettings, propose
 from e2rl.synthesizer.control import ControlSettings, SparseControl
 from e2rl.synthesizer.feasibility import FeasibilitySettings, feasible_vehicles
-from e2rl.synthesizer.potentials import PotentialContext, PotentialSettings
+from e2rl.synthesizer.potentials import (
+    PotentialContext,
+    PotentialSettings,
+    adversarial_potential,
+    feasibility_potential,
+)
 from e2rl.synthesizer.skeleton import Skeleton, SkeletonSettings, build_skeleton, chain_depth
 from e2rl.synthesizer.topology import TopologySettings, topological_candidates
 
@@ -25,7 +30,8 @@ from e2rl.synthesizer.topology import TopologySettings, topological_candidates
 @dataclass(frozen=True)
 class SynthesizerSettings:
     """Settings of all parts (conf/synthesizer/e2.yaml); reselect: replans between two choices of the support, 0: the
-    support of the start frame is kept."""
+    support of the start frame is kept; samples: joint samples a replan, of which each scene keeps the one with the
+    least selection * V_feas + eta * V_adv."""
 
     topology: TopologySettings = TopologySettings()
     feasibility: FeasibilitySettings = FeasibilitySettings()
@@ -34,6 +40,8 @@ class SynthesizerSettings:
     potentials: PotentialSettings = PotentialSettings()
     control: ControlSettings = ControlSettings()
     reselect: int = 4
+    samples: int = 1
+    selection: float = 1.0
 
 
 @dataclass
@@ -82,6 +90,12 @@ def noise_of(seed: Tensor, draw: int, shape: tuple[int, ...], uniform: bool = Fa
     return torch.stack(rows).to(seed.device)
 
 
+def _cheaper(one: tuple[Tensor, ...], two: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """Per scene, the tuple whose last entry [B] is smaller; the first of equals."""
+    less = two[-1] < one[-1]
+    return tuple(torch.where(less.view(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(one, two, strict=True))
+
+
 class Synthesizer:
     """Frozen prior and settings; `begin` and `replan` drive an Episode."""
 
@@ -111,17 +125,29 @@ class Synthesizer:
         if controlled and due:
             episode, world = self._select(episode, world, ego_plan, count)
         context = self._encode(episode, world, ego_plan, episode.coalition)
-        noise = self._noise(episode.seed, count)
-        control = self._control(episode, world, ego_plan) if controlled else None
-        sample = self.prior.sample(context, noise, control)
-        plan = self.prior.plan(sample.x0, context)
-        return replace(
-            episode, replans=episode.replans + 1, kl=episode.kl + sample.kl,
-            jump=episode.jump + (control.jump if control else 0.0)), plan
+        where = self._where(episode, world, ego_plan)
+        control = self._control(episode, world, where) if controlled else None
+        best = None
+        for draw in range(self.settings.samples):
+            sample = self.prior.sample(context, self._noise(episode.seed, count, draw), control)
+            jump = control.jump if control else torch.zeros_like(sample.kl)
+            found = (sample.x0, sample.kl, jump, self._cost(sample.x0, context, where, episode.eta))
+            best = found if best is None else _cheaper(best, found)
+        return replace(episode, replans=episode.replans + 1, kl=episode.kl + best[1],
+                       jump=episode.jump + best[2]), self.prior.plan(best[0], context)
 
-    def _noise(self, seed: Tensor, count: int) -> Tensor:
+    def _noise(self, seed: Tensor, count: int, draw: int = 0) -> Tensor:
         steps, vehicles = self.prior.sampler.steps, self._vehicles
-        return noise_of(seed, 1 + count, (steps, vehicles, SIZE)).transpose(0, 1)
+        return noise_of(seed, 1 + count + 1000 * draw, (steps, vehicles, SIZE)).transpose(0, 1)
+
+    def _cost(self, x0: Tensor, context: Context, where: PotentialContext, eta: Tensor) -> Tensor:
+        """V_feas of everybody plus eta V_adv of the coalition [B]: whole joint samples are compared, never vehicles."""
+        if self.settings.samples == 1:
+            return torch.zeros_like(eta)
+        states = self.prior.decode(x0, context).states()
+        infeasible = feasibility_potential(states, where, self.settings.potentials) * context.active
+        threat = adversarial_potential(states, where, self.settings.potentials)
+        return self.settings.selection * infeasible.sum(-1) + eta * threat.sum(-1)
 
     def _with_ego(self, episode: Episode, world: World) -> LaneState:
         """The lane states with the ego's row as it really is now."""
@@ -167,16 +193,19 @@ class Synthesizer:
                             for f in fields(LaneState)))
         return replace(episode, routed=routed, state=state)
 
-    def _control(self, episode: Episode, world: World, ego_plan: Tensor) -> SparseControl:
-        settings, vehicles = self.settings, self._vehicles
+    def _where(self, episode: Episode, world: World, ego_plan: Tensor) -> PotentialContext:
+        vehicles = self._vehicles
+        return PotentialContext(
+            world.scene, world.states[:, :vehicles], episode.state.a, world.valid[:, :vehicles], episode.routed.points,
+            episode.routed.has_lane, ego_plan[:, :HORIZON], episode.target)
+
+    def _control(self, episode: Episode, world: World, where: PotentialContext) -> SparseControl:
+        settings = self.settings
         depth = chain_depth(episode.target)
         skeleton = Skeleton(episode.coalition, episode.target, depth, depth == 1, depth > 1, episode.replans,
                             episode.replans)
-        anchor = propose(world.scene, world, skeleton, ego_plan, settings.anchor, keep_route=True)
-        where = PotentialContext(
-            world.scene, world.states[:, :vehicles], episode.state.a, world.valid[:, :vehicles], episode.routed.points,
-            episode.routed.has_lane, ego_plan[:, :HORIZON], episode.target)
-        literal = noise_of(episode.seed, 10_000 + int(episode.replans[0]), (vehicles, SIZE))
+        anchor = propose(world.scene, world, skeleton, where.ego_plan, settings.anchor, keep_route=True)
+        literal = noise_of(episode.seed, 10_000 + int(episode.replans[0]), (self._vehicles, SIZE))
         return SparseControl(self.prior, settings.control, settings.potentials, where, episode.coalition, episode.eta,
                              anchor, settings.anchor.strength, literal)
 
