@@ -1,0 +1,68 @@
+"""The joint denoiser: equivariant under permutations of vehicles, blind to absent ones, a mix of x and network."""
+
+import torch
+
+from e2rl.prior.denoiser import Denoiser
+from e2rl.prior.features import EDGE, NODE
+from e2rl.prior.lane_relative import SIZE
+from tests.prior.small import small_prior
+
+BATCH, VEHICLES = 2, 6
+
+
+def inputs(seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    draw = lambda *shape: torch.randn(BATCH, VEHICLES, *shape, generator=generator)  # noqa: E731
+    present = torch.tensor([[True] * 6, [True, True, False, True, False, False]])
+    return draw(SIZE), torch.rand(BATCH, VEHICLES, generator=generator), draw(NODE), draw(VEHICLES, EDGE), present
+
+
+def run(net, x, level, nodes, pairs, present):
+    return net(x, level, net.encode(nodes, pairs, present))
+
+
+def test_vehicles_may_be_listed_in_any_order():
+    net, (x, level, nodes, pairs, present) = small_prior().denoiser, inputs()
+    order = torch.tensor([3, 0, 5, 1, 4, 2])
+    there = run(net, x[:, order], level[:, order], nodes[:, order], pairs[:, order][:, :, order], present[:, order])
+    torch.testing.assert_close(there, run(net, x, level, nodes, pairs, present)[:, order], rtol=0, atol=1e-5)
+
+
+def test_absent_vehicles_do_not_influence_the_others():
+    net, (x, level, nodes, pairs, present) = small_prior().denoiser, inputs()
+    here = run(net, x, level, nodes, pairs, present)
+    hidden = ~present
+    x, nodes, pairs = x.clone(), nodes.clone(), pairs.clone()
+    x[hidden], nodes[hidden] = 50.0, -9.0
+    pairs[hidden[:, None, :].expand(pairs.shape[:3])] = 7.0
+    there = run(net, x, level, nodes, pairs, present)
+    torch.testing.assert_close(there[present], here[present], rtol=0, atol=0)
+
+
+def test_present_vehicles_influence_each_other():
+    net, (x, level, nodes, pairs, present) = small_prior().denoiser, inputs()
+    here = run(net, x, level, nodes, pairs, present)
+    x = x.clone()
+    x[:, 1] += 1
+    assert (run(net, x, level, nodes, pairs, present)[0, 3] != here[0, 3]).any()
+
+
+def test_scenes_of_a_batch_do_not_influence_each_other():
+    net, values = small_prior().denoiser, inputs()
+    alone = run(net, *(value[:1] for value in values))
+    torch.testing.assert_close(alone, run(net, *values)[:1], rtol=0, atol=1e-5)
+
+
+def test_an_untrained_denoiser_scales_x_and_a_clean_one_keeps_it():
+    x, level, nodes, pairs, present = inputs()
+    net = Denoiser()
+    torch.testing.assert_close(run(net, x, level, nodes, pairs, present), net.schedule.alpha(level)[..., None] * x)
+    clean = run(small_prior().denoiser, x, torch.zeros_like(level), nodes, pairs, present)
+    torch.testing.assert_close(clean, x)
+
+
+def test_a_repeated_encoding_is_that_of_a_repeated_batch():
+    net, (x, level, nodes, pairs, present) = small_prior().denoiser, inputs()
+    tiled = net.encode(nodes, pairs, present).repeat(2)
+    both = net(torch.cat([x, x + 1]), torch.cat([level, level]), tiled)
+    torch.testing.assert_close(both[BATCH:], run(net, x + 1, level, nodes, pairs, present), rtol=0, atol=1e-5)

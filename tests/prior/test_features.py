@@ -1,0 +1,60 @@
+"""Features: the same wherever the scene lies, and the listed ones (and no others) change sign in a mirror."""
+
+import math
+
+import pytest
+import torch
+
+from e2rl.prior.features import EDGE, NODE, SIDED_EDGE, SIDED_NODE, curve_speed, edge_features, node_features
+from e2rl.prior.lane_relative import locate
+from e2rl.prior.routed import route_scene
+from tests.prior.small import arc, curved_scenes, mirrored, moved
+
+
+def features(scene):
+    vehicles = scene["route_log"].shape[1]
+    routed = route_scene(scene, scene["route_log"].clamp(min=0))
+    state = locate(scene["start"][:, :vehicles], scene["start_accel"][:, :vehicles],
+                   scene["start_yaw_rate"][:, :vehicles], routed.points)
+    step = torch.zeros(len(scene), dtype=torch.long)
+    nodes = node_features(routed, state, scene["start"], scene["valid"], step)
+    here = scene["valid"][0, :vehicles]
+    return nodes[:, here], edge_features(routed, state)[:, here][:, :, here]
+
+
+def test_there_are_as_many_as_declared_and_all_are_finite():
+    nodes, edges = features(curved_scenes())
+    assert nodes.shape[-1] == NODE and edges.shape[-1] == EDGE
+    assert nodes.isfinite().all() and edges.isfinite().all()
+
+
+@pytest.mark.parametrize(("kind", "sided"), [(0, SIDED_NODE), (1, SIDED_EDGE)], ids=["nodes", "edges"])
+def test_a_mirror_flips_exactly_the_sided_features(kind, sided):
+    scene = curved_scenes()
+    here, there = features(scene)[kind], features(mirrored(scene))[kind]
+    sign = torch.ones(here.shape[-1])
+    sign[list(sided)] = -1
+    torch.testing.assert_close(there, here * sign, rtol=0, atol=2e-3)
+    flipping = ((here - there).abs() > 5e-3).flatten(0, -2).any(0).nonzero()[:, 0].tolist()
+    assert set(flipping) == set(sided), "every listed feature is looked at by this scene"
+
+
+def test_features_do_not_know_where_the_scene_lies():
+    scene = curved_scenes()
+    for here, there in zip(features(scene), features(moved(scene, 120.0, -40.0, 0.7)), strict=True):
+        torch.testing.assert_close(there, here, rtol=0, atol=5e-3)
+
+
+def test_a_queue_a_light_and_a_limit_are_seen():
+    nodes, _ = features(curved_scenes(limit=15.0))
+    ego = nodes[0, 0]
+    assert ego[0] == pytest.approx(0.8) and ego[7] == pytest.approx(0.7) and ego[8] == pytest.approx(1.0)
+    gap = -20 * math.log(ego[25])
+    assert gap == pytest.approx(18 - 4.5, abs=0.2)
+    assert ego[32] == pytest.approx(1 - 30 / 120, abs=0.01) and ego[33:36].tolist() == [1, 0, 0]
+
+
+def test_the_curve_speed_of_a_circle_is_that_of_its_radius():
+    points = arc(0, 0, 0, 0.02)[None, None]
+    state = locate(torch.tensor([[[0.0, 0.0, 0.0, 8.0]]]), torch.zeros(1, 1), torch.zeros(1, 1), points)
+    assert curve_speed(state, points, 2.5, 1.2).item() == pytest.approx(math.sqrt(2.5 / 0.02), rel=1e-2)

@@ -1,0 +1,53 @@
+"""Who leads whom: gaps between bumpers, who does not count, and the equilibrium of the car-following model."""
+
+import pytest
+import torch
+
+from e2rl.prior.leaders import FREE, idm_acceleration, leaders
+from tests.prior.small import arc
+
+LENGTH, WIDTH = 4.0, 2.0
+
+
+def lead(agents, vehicles=1, present=None, size=None):
+    """Leaders of the first `vehicles` of agents (x, y, heading, speed), all on the x axis as their route."""
+    agents = torch.tensor(agents, dtype=torch.float32)[None]
+    size = torch.tensor([LENGTH, WIDTH]).expand(1, agents.shape[1], 2) if size is None else size
+    present = torch.ones(agents.shape[:2], dtype=torch.bool) if present is None else present
+    points = arc(0.0, 0.0, 0.0, 0.0)[None, None].expand(1, vehicles, -1, -1)
+    s = agents[:, :vehicles, 0] + 20.0
+    box = torch.full((1, vehicles), WIDTH), torch.full((1, vehicles), LENGTH)
+    return tuple(value[0] for value in leaders(s, *box, points, agents, size, present))
+
+
+def test_the_gap_is_between_bumpers_of_the_nearest():
+    gap, speed, index = lead([(0, 0, 0, 9), (30, 0.3, 0, 6), (18, 0, 0, 7)])
+    assert gap.item() == pytest.approx(18 - LENGTH) and speed.item() == pytest.approx(7) and index.item() == 2
+
+
+def test_those_behind_beside_absent_or_identical_do_not_lead():
+    present = torch.tensor([[True, True, True, False]])
+    gap, _, _ = lead([(0, 0, 0, 9), (-5, 0, 0, 9), (12, 3.5, 0, 9), (12, 0, 0, 9)], present=present)
+    assert gap.item() == FREE
+
+
+def test_a_vehicle_across_the_lane_leads_with_its_side_and_stands_along_it():
+    gap, speed, _ = lead([(0, 0, 0, 9), (20, 2.0, torch.pi / 2, 5)])
+    assert gap.item() == pytest.approx(20 - LENGTH / 2 - WIDTH / 2, abs=1e-4)
+    assert speed.item() == pytest.approx(0, abs=1e-4)
+
+
+def test_everyone_of_a_queue_follows_the_next():
+    gap, _, index = lead([(0, 0, 0, 5), (10, 0, 0, 5), (20, 0, 0, 5)], vehicles=3)
+    assert index[:2].tolist() == [1, 2] and gap.tolist() == pytest.approx([6, 6, FREE])
+
+
+def test_equilibrium_gap_free_road_and_closing():
+    v, target = torch.tensor(10.0), torch.tensor(15.0)
+    settings = (1.5, 2.0, 1.2, 2.0)
+    free = 1 - (v / target) ** 4
+    equilibrium = (2.0 + 1.5 * v) / free.sqrt()
+    assert idm_acceleration(v, target, equilibrium, v, *settings).item() == pytest.approx(0, abs=1e-5)
+    assert idm_acceleration(torch.tensor(0.0), target, torch.tensor(1e6), v, *settings).item() == pytest.approx(1.2)
+    slower, faster = (idm_acceleration(v, target, equilibrium, v + dv, *settings) for dv in (-3, 3))
+    assert slower < 0 < faster, "closing in brakes, falling behind accelerates"
