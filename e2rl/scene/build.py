@@ -8,13 +8,17 @@ from tensordict import TensorDict
 
 from e2rl.errors import InputError
 from e2rl.scene.drivable import drivable_field
-from e2rl.scene.lane_graph import LaneGraph, Route, believed_width, wrap
+from e2rl.scene.interaction import overlap
+from e2rl.scene.lane_graph import LaneGraph, Route, believed_width
+from e2rl.scene.log_route import route_from_log
+from e2rl.scene.paths import wrap
 from e2rl.scene.recording import VEHICLE, Recording
 from e2rl.scene.route import SPACING, project
 from e2rl.scene.smoothing import causal_state, drop_jumps, smooth
 
 STANDING = 0.5  # m/s
 FIT = 2.0  # m: mean distance of a recorded future to a candidate that still counts as the way driven
+PASSED = 1.0  # m behind the vehicle's centre beyond which a stop line no longer counts
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,7 @@ def build_scene(recording: Recording, settings: BuildSettings) -> TensorDict:
     """
     recording.validate()
     valid = drop_jumps(recording.states, recording.valid)
-    valid[:, recording.ego] = recording.valid[:, recording.ego]
+    valid[:, recording.ego] = recording.valid[:, recording.ego]  # whoever drops the ego drops the scene
     states = smooth(recording.states, valid)
     frame = recording.current
     start, accel, yaw_rate = causal_state(recording.states, valid, frame)
@@ -87,7 +91,7 @@ def _participants(recording: Recording, states, valid, settings: BuildSettings) 
     cars = np.argsort(now, kind="stable")[:settings.vehicles]
     span = slice(frame, frame + settings.steps + 1)
     nearest = np.where(valid[span] & valid[span, [ego]], apart[span], np.inf).min(0, initial=np.inf)
-    nearest[vehicle] = np.inf
+    nearest[vehicle] = nearest[ego] = np.inf
     rest = np.argsort(nearest, kind="stable")[:settings.others]
     agents = np.full(settings.vehicles + settings.others, -1)
     cars, rest = cars[np.isfinite(now[cars])], rest[np.isfinite(nearest[rest])]
@@ -118,13 +122,17 @@ def _routes(scene: dict, graph: LaneGraph, recording: Recording, origin, setting
         for index, route in enumerate(found):
             _write_route(out, (row, index), route, origin, lights)
         scene["parked"][row] = speed < STANDING and not _on_lane(graph, found, scene["start"][row], origin)
-    return out | {"route_log": _driven(scene, out, settings)}
+    out["route_log"] = _driven(scene, out, settings)
+    if out["route_log"][0] < 0:
+        _add_mission(out, scene, graph, origin, lights)
+    return out
 
 
 def _write_route(out: dict, at: tuple[int, int], route: Route, origin, lights: dict[str, int]) -> None:
     out["route_points"][at], out["route_length"][at] = route.points - origin, route.length
     out["route_open"][at], out["route_valid"][at], out["route_limit"][at] = route.open, True, route.limit
-    ahead = [(lights[name], s) for name, s in route.lanes if name in lights and s > 12.0][:2]
+    ahead = [(lights[name], s) for name, s in route.lanes if name in lights and s > route.here - PASSED][:2]
+    out["route_light"][at], out["route_light_s"][at] = -1, 0.0
     for k, (index, s) in enumerate(ahead):
         out["route_light"][at][k], out["route_light_s"][at][k] = index, s
 
@@ -143,13 +151,13 @@ def _on_lane(graph: LaneGraph, found: list[Route], state, origin) -> bool:
 
 
 def _driven(scene: dict, routes: dict, settings: BuildSettings) -> np.ndarray:
-    """The candidate nearest to each vehicle's recorded future, -1 where none is; the ego always gets one."""
+    """The candidate nearest to each vehicle's recorded future, -1 where none is near."""
     rows = slice(0, settings.vehicles)
     track = torch.from_numpy(scene["logged"][:, rows, :2].swapaxes(0, 1).copy())
     known = torch.from_numpy(scene["logged_valid"][:, rows].T.copy())
     points = torch.from_numpy(routes["route_points"])
     s, d, heading = project(track[:, None], points)
-    turned = (heading - torch.from_numpy(scene["logged"][:, rows, 2].T.copy())[:, None] + np.pi) % (2 * np.pi) - np.pi
+    turned = wrap(heading - torch.from_numpy(scene["logged"][:, rows, 2].T.copy())[:, None])
     over = (s - torch.from_numpy(routes["route_length"])[..., None]).clamp(min=0) * torch.from_numpy(
         ~routes["route_open"])[..., None]
     cost = d.abs() + 2.0 * turned.abs() + over
@@ -157,25 +165,15 @@ def _driven(scene: dict, routes: dict, settings: BuildSettings) -> np.ndarray:
     mean = (cost * weight).sum(-1) / weight.sum(-1).clamp(min=1)
     mean[~torch.from_numpy(routes["route_valid"])] = torch.inf
     driven = torch.where((mean.min(1).values < FIT) & (weight.sum(-1) > 0).squeeze(1), mean.argmin(1), -1).numpy()
-    if driven[0] < 0:
-        _mission_from_log(scene, routes)
-        driven[0] = 0
     return driven
 
 
-def _mission_from_log(scene: dict, routes: dict) -> None:
-    """Candidate 0 of the ego becomes its recorded way, prolonged straight, where no lane route fits it."""
-    track = scene["logged"][scene["logged_valid"][:, 0], 0]
-    moved = np.concatenate([[True], np.linalg.norm(np.diff(track[:, :2], axis=0), axis=1) > 1e-3])
-    line, heading = track[moved, :2], scene["start"][0, 2]
-    line = np.concatenate([line[:1] - 20.0 * np.array([[np.cos(heading), np.sin(heading)]]), line])
-    last = track[-1, 2]
-    line = np.concatenate([line, line[-1:] + 300.0 * np.array([[np.cos(last), np.sin(last)]])])
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    at = np.arange(routes["route_points"].shape[2]) * SPACING
-    routes["route_points"][0, 0] = np.stack([np.interp(at, arc, line[:, axis]) for axis in range(2)], 1)
-    routes["route_length"][0, 0] = at[-1]
-    routes["route_open"][0, 0], routes["route_valid"][0, 0] = False, True
+def _add_mission(out: dict, scene: dict, graph: LaneGraph, origin, lights: dict[str, int]) -> None:
+    """The ego's recorded way becomes its last candidate and its mission, where no lane route fits it."""
+    track = scene["logged"][scene["logged_valid"][:, 0], 0] + [*origin, 0.0, 0.0]
+    slot = min(int(out["route_valid"][0].sum()), out["route_valid"].shape[1] - 1)
+    _write_route(out, (0, slot), route_from_log(graph, track, out["route_points"].shape[2]), origin, lights)
+    out["route_log"][0] = slot
 
 
 def _lights(recording: Recording, frame: int, origin, steps: int) -> dict:
@@ -211,18 +209,7 @@ def _map(recording: Recording, graph: LaneGraph, scene: dict, origin, settings: 
 
 def ego_overlaps(scene: TensorDict) -> bool:
     """Whether the ego's box overlaps another vehicle's at the start frame."""
-    state, size = scene["start"].double(), scene["size"].double()
-    others = torch.where(scene["valid"] & (scene["agent_type"] == VEHICLE))[0]
-    for other in others[others != 0]:
-        gap = torch.tensor(-torch.inf)
-        for a, b in ((0, other), (other, 0)):
-            delta = state[b, :2] - state[a, :2]
-            turn = wrap((state[b, 2] - state[a, 2]).item())
-            c, s = np.cos(state[a, 2].item()), np.sin(state[a, 2].item())
-            local = torch.stack([c * delta[0] + s * delta[1], -s * delta[0] + c * delta[1]]).abs()
-            extent = torch.stack([size[b, 0] * abs(np.cos(turn)) + size[b, 1] * abs(np.sin(turn)),
-                                  size[b, 0] * abs(np.sin(turn)) + size[b, 1] * abs(np.cos(turn))])
-            gap = torch.maximum(gap, (local - (size[a] + extent) / 2).max())
-        if gap < 0:
-            return True
-    return False
+    others = scene["valid"] & (scene["agent_type"] == VEHICLE)
+    others[0] = False
+    pose, size = scene["start"].double().numpy(), scene["size"].double().numpy()
+    return bool((overlap(pose[:1], size[:1], pose, size) & others.numpy()).any())

@@ -9,6 +9,11 @@ from scipy.linalg import solveh_banded
 WHEELBASE = 0.6  # of the body's length; the axles lie 0.3 lengths before and behind its centre
 
 
+def wrap(angle):
+    """Angles [rad] in [-pi, pi)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
 def arc_length(points: np.ndarray) -> np.ndarray:
     """Cumulative length [..., P] of polylines [..., P, 2], starting at 0."""
     steps = np.linalg.norm(np.diff(points, axis=-2), axis=-1)

@@ -3,8 +3,10 @@ through their public converters), read without ever executing what a file names.
 
 import csv
 import io
+import lzma
 import pickle
 import zipfile
+import zlib
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,9 +30,16 @@ from e2rl.scene.recording import (
 from e2rl.scene.smoothing import resample_uniform
 
 TYPES = {"VEHICLE": VEHICLE, "PEDESTRIAN": PEDESTRIAN, "CYCLIST": CYCLIST}
-LIGHTS = {"GO": LIGHT_GREEN, "CAUTION": LIGHT_YELLOW, "STOP": LIGHT_RED}  # by the last word of LANE_STATE_...
+LIGHTS = {  # by the last word of LANE_STATE_... (Waymo) or TRAFFIC_LIGHT_... (nuPlan)
+    "GO": LIGHT_GREEN, "CAUTION": LIGHT_YELLOW, "STOP": LIGHT_RED,
+    "GREEN": LIGHT_GREEN, "YELLOW": LIGHT_YELLOW, "RED": LIGHT_RED,
+}
 BUILTINS = {"set", "frozenset", "list", "dict", "tuple", "int", "float", "bool", "str", "bytes", "bytearray", "complex"}
-NUMPY = {"_reconstruct", "scalar", "ndarray", "dtype", "_frombuffer"}
+NUMPY = {  # what arrays and numbers of numpy 1 (numpy.core) and 2 (numpy._core) name
+    "numpy": {"ndarray", "dtype"},
+    "numpy._core.multiarray": {"_reconstruct", "scalar"},
+    "numpy._core.numeric": {"_frombuffer"},
+}
 
 
 class _Unpickler(pickle.Unpickler):
@@ -41,8 +50,9 @@ class _Unpickler(pickle.Unpickler):
             return super().find_class(module, name)
         if (module, name) == ("collections", "defaultdict"):
             return defaultdict
-        if module.split(".")[0] == "numpy" and name in NUMPY:
-            return super().find_class(module.replace("numpy.core", "numpy._core"), name)
+        array_module = module.replace("numpy.core.", "numpy._core.")
+        if name in NUMPY.get(array_module, ()):
+            return super().find_class(array_module, name)
         raise pickle.UnpicklingError(f"names the forbidden class {module}.{name}")
 
 
@@ -50,10 +60,9 @@ def safe_load(stream, name: str) -> dict:
     """The dict in a pickle stream; InputError naming the file where it is damaged or names a forbidden class."""
     try:
         content = _Unpickler(stream).load()
-    except (pickle.UnpicklingError, EOFError, AttributeError, ImportError, IndexError, KeyError, TypeError, ValueError,
-            UnicodeDecodeError, zipfile.BadZipFile, OSError) as error:
-        raise InputError(f"{name}: cannot be read: {error}; only numpy arrays and plain containers are read, so export "
-                         "the scenario again or leave it out (data.skip_invalid=true)") from error
+    except Exception as error:  # damaged bytes raise anything, from EOFError to MemoryError
+        raise InputError(f"{name}: cannot be read: {str(error) or type(error).__name__}; only numpy arrays and plain "
+                         "containers are read, so export the scenario again") from error
     if not isinstance(content, dict):
         raise InputError(f"{name}: holds a {type(content).__name__}, expected a ScenarioDescription dict")
     return content
@@ -82,11 +91,14 @@ def list_files(path: str) -> list[tuple[str, str]]:
 
 
 def read_bytes(container: str, member: str) -> bytes:
-    """The content of one member of a folder or zip."""
-    if Path(container).is_dir():
-        return (Path(container) / member).read_bytes()
-    with zipfile.ZipFile(container) as archive:
-        return archive.read(member)
+    """The content of one member of a folder or zip; InputError naming it where it cannot be read."""
+    try:
+        if Path(container).is_dir():
+            return (Path(container) / member).read_bytes()
+        with zipfile.ZipFile(container) as archive:
+            return archive.read(member)
+    except (OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, lzma.LZMAError) as error:
+        raise InputError(f"{member} in {container}: cannot be read: {error}; copy or export it again") from error
 
 
 def read_locations(path: str) -> dict[str, str]:
@@ -111,14 +123,15 @@ def read_recordings(
     """
     data = safe_load(io.BytesIO(content), name)
     try:
-        recording = _parse(data, name, location)
+        recording, given = _parse(data, name, location)
+    except InputError as error:
+        raise InputError(str(error) if str(error).startswith(name) else f"{name}: {error}") from error
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{name}: not a ScenarioDescription: {type(error).__name__} {error}") from error
-    frames, given = len(recording.states), data["metadata"].get("current_time_index")
+        raise InputError(f"{name}: not a ScenarioDescription: {type(error).__name__} {error}; export the scenario "
+                         "again or leave it out") from error
+    frames = len(recording.states)
     if starts is None:
-        starts = [int(given)] if given is not None else list(range(10, frames - window, window + 11)) or [10]
+        starts = [given] if given is not None else list(range(10, frames - window, window + 11)) or [10]
         names = [recording.scene_id] if len(starts) == 1 else [f"{recording.scene_id}@{s}" for s in starts]
     else:
         starts = [s for s in starts if s <= frames - window // 2]
@@ -127,7 +140,8 @@ def read_recordings(
         yield Recording(**{**vars(recording), "current": start, "scene_id": scene_id})
 
 
-def _parse(data: dict, name: str, location: str) -> Recording:
+def _parse(data: dict, name: str, location: str) -> tuple[Recording, int | None]:
+    """The whole log at 10 Hz and its own start frame, if it names one."""
     metadata = data["metadata"]
     tracks, sdc = list(data["tracks"].items()), metadata.get("sdc_id")
     keys = [str(key) for key, _ in tracks]
@@ -150,13 +164,18 @@ def _parse(data: dict, name: str, location: str) -> Recording:
         raise InputError(f"{name}: track {keys[agent]} is NaN or infinite at frame {frame}, where it is marked valid")
     states[~valid] = 0.0
     ts = np.asarray(metadata.get("ts", np.arange(frames) * DT), float)
-    states, valid = resample_uniform(states, valid, ts) if len(ts) == frames else (states, valid)
+    if len(ts) != frames:
+        raise InputError(f"{name}: {len(ts)} time stamps for {frames} frames; repair metadata.ts")
+    states, valid = resample_uniform(states, valid, ts)
+    seconds = ts - ts[0]
+    given = metadata.get("current_time_index")
     lanes, drivable = _map(data["map_features"])
-    return Recording(
+    recording = Recording(
         scene_id=str(data.get("id") or metadata.get("scenario_id")), location=location or str(metadata.get("map", "")),
         dataset=str(metadata.get("dataset", "scenarionet")), states=states, valid=valid, size=np.array(size),
         agent_type=np.array([TYPES.get(track["type"], OTHER) for _, track in tracks]), ego=keys.index(str(sdc)),
-        lanes=lanes, drivable=drivable, lights=_lights(data.get("dynamic_map_states", {}), lanes, len(states)))
+        lanes=lanes, drivable=drivable, lights=_lights(data.get("dynamic_map_states", {}), lanes, seconds, len(states)))
+    return recording, None if given is None else int(round(seconds[int(given)] / DT))
 
 
 def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
@@ -180,17 +199,19 @@ def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
     return lanes, drivable
 
 
-def _lights(dynamic: dict, lanes: dict[str, Lane], frames: int) -> dict[str, np.ndarray]:
-    """Light states [F] by the lane they control; unknown frames keep the last known state."""
+def _lights(dynamic: dict, lanes: dict[str, Lane], seconds: np.ndarray, frames: int) -> dict[str, np.ndarray]:
+    """Light states [frames] at 10 Hz by the lane they control, from states stamped `seconds`; what is unknown keeps the
+    last known state."""
+    now = np.searchsorted(seconds, np.arange(frames) * DT + DT / 2) - 1
     lights = {}
     for key, light in dynamic.items():
         lane = str(light.get("lane", key))
         if lane not in lanes:
             continue
-        out, last = np.zeros(frames, np.int8), LIGHT_UNKNOWN
-        for frame, state in enumerate(list(light["state"].get("object_state", ()))[:frames]):
-            last = LIGHTS.get(str(state).rsplit("_", 1)[-1], last) if state is not None else last
-            out[frame] = last
-        out[frame + 1:] = last
-        lights[lane] = out
+        states, last = np.zeros(len(seconds), np.int8), LIGHT_UNKNOWN
+        given = list(light["state"].get("object_state", ()))
+        for frame in range(len(seconds)):
+            last = LIGHTS.get(str(given[frame]).rsplit("_", 1)[-1], last) if frame < len(given) else last
+            states[frame] = last
+        lights[lane] = states[now]
     return lights

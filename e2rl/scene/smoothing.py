@@ -3,14 +3,27 @@
 import numpy as np
 from scipy.signal import savgol_filter
 
+from e2rl.errors import InputError
+from e2rl.scene.paths import wrap
 from e2rl.scene.recording import DT
 
 WINDOW, ORDER = 15, 2  # Savitzky-Golay: frames, polynomial order (design.md section 4)
 CAUSAL_WINDOW = 11  # frames: the current one and 1 s of history
+MAX_TURN, MAX_WAY = 1.0, 5.0  # rad, m in one frame; more is a jump
+MAX_GAP = 0.55  # s between time stamps that interpolation bridges (2 Hz annotations)
+TOP_SPEED = 45.0  # m/s; recorded speeds beyond it are glitches
 
 
 def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tracks [F, A, 4] stamped ts [F] s on a grid of DT; a grid frame is valid where both its neighbours are."""
+    """Tracks [F, A, 4] stamped ts [F] s on a grid of DT from ts[0] on.
+
+    A grid frame is valid where the frames on both its sides are, at most MAX_GAP apart, or one of them is as good as
+    simultaneous. Raises InputError for time stamps that do not increase or are not in seconds.
+    """
+    step = np.diff(ts)
+    if not (np.isfinite(ts).all() and (step > 0).all() and 0.01 < np.median(step) < 1.0 and step.max() < 60.0):
+        raise InputError(f"time stamps do not increase in seconds (median step {np.median(step):g}); repair "
+                         "metadata.ts")
     ts = ts - ts[0]
     count = int(round(ts[-1] / DT)) + 1
     grid = np.arange(count) * DT
@@ -21,24 +34,44 @@ def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> t
     weight = np.clip((grid - ts[left]) / np.maximum(ts[right] - ts[left], 1e-6), 0, 1)[:, None]
     near_left, near_right = weight * DT < 0.02, (1 - weight) * DT < 0.02
     weight = np.where(near_left & ~valid[right], 0.0, np.where(near_right & ~valid[left], 1.0, weight))
-    turn = (states[right, :, 2] - states[left, :, 2] + np.pi) % (2 * np.pi) - np.pi
+    turn = wrap(states[right, :, 2] - states[left, :, 2])
     out = states[left] + weight[..., None] * (states[right] - states[left])
     out[..., 2] = states[left, :, 2] + weight * turn
-    known = (valid[left] | near_right) & (valid[right] | near_left)
-    return out, known
+    bridged = (ts[right] - ts[left] < MAX_GAP)[:, None] | near_left | near_right
+    return out, (valid[left] | near_right) & (valid[right] | near_left) & bridged
 
 
 def drop_jumps(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """valid [F, A] without frames that a jump (over 1 rad or 5 m in a step) divides from the track's longest run."""
+    """valid [F, A] without frames that jumps (over MAX_TURN or MAX_WAY in a step) divide from the track's longest run.
+
+    A run beyond a jump is kept where it agrees with the frames kept before it, so a glitch of a few frames costs these
+    frames only; a heading that flips for good costs the shorter side.
+    """
     valid = valid.copy()
-    jump = np.abs((np.diff(states[..., 2], axis=0) + np.pi) % (2 * np.pi) - np.pi) > 1.0
-    jump |= np.linalg.norm(np.diff(states[..., :2], axis=0), axis=-1) > 5.0
+    jump = np.abs(wrap(np.diff(states[..., 2], axis=0))) > MAX_TURN
+    jump |= np.linalg.norm(np.diff(states[..., :2], axis=0), axis=-1) > MAX_WAY
     jump &= valid[1:] & valid[:-1]
     for agent in np.flatnonzero(jump.any(0)):
         run = np.concatenate([[0], np.cumsum(jump[:, agent])])
-        longest = np.bincount(run[valid[:, agent]]).argmax()
-        valid[:, agent] &= run == longest
+        valid[:, agent] = _consistent(states[:, agent], valid[:, agent], run)
     return valid
+
+
+def _consistent(track: np.ndarray, valid: np.ndarray, run: np.ndarray) -> np.ndarray:
+    """Frames [F] of one track [F, 4] in its longest run (run [F]: number of jumps so far) and the runs that fit it."""
+    count = np.bincount(run[valid])
+    keep = valid & (run == count.argmax())
+    for runs, inner, outer in ((range(count.argmax() + 1, len(count)), 0, -1), (range(count.argmax())[::-1], -1, 0)):
+        edge = np.flatnonzero(keep)[outer]
+        for number in runs:
+            frames = np.flatnonzero(valid & (run == number))
+            if not len(frames):
+                continue
+            change = track[frames[inner]] - track[edge]
+            if abs(wrap(change[2])) <= MAX_TURN and np.hypot(*change[:2]) <= MAX_WAY * abs(frames[inner] - edge):
+                keep[frames] = True
+                edge = frames[outer]
+    return keep
 
 
 def pieces(valid: np.ndarray) -> list[tuple[int, int]]:
@@ -53,6 +86,7 @@ def smooth(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     Savitzky-Golay per contiguous piece; a piece shorter than the window takes the longest odd window it can.
     """
     out = states.copy()
+    out[..., 3] = np.clip(out[..., 3], 0.0, TOP_SPEED)
     for agent in range(states.shape[1]):
         for start, end in pieces(valid[:, agent]):
             window = min(WINDOW, (end - start - 1) // 2 * 2 + 1)
@@ -63,7 +97,7 @@ def smooth(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
             velocity = savgol_filter(track, window, ORDER, deriv=1, delta=DT, axis=0)
             heading = states[start:end, agent, 2]
             along = velocity[:, 0] * np.cos(heading) + velocity[:, 1] * np.sin(heading)
-            out[start:end, agent, 3] = np.clip(along, 0.0, 45.0)
+            out[start:end, agent, 3] = np.clip(along, 0.0, TOP_SPEED)
     return out
 
 
@@ -83,10 +117,10 @@ def causal_state(states: np.ndarray, valid: np.ndarray, frame: int) -> tuple[np.
     turn = _fit(basis, known, heading[..., None], quadratic=np.zeros_like(count, bool))
     angle = states[frame, :, 2]
     unit = np.stack([np.cos(angle), np.sin(angle)], -1)
-    speed = np.clip((position[:, 1] * unit).sum(-1), 0.0, 45.0)
+    speed = np.clip((position[:, 1] * unit).sum(-1), 0.0, TOP_SPEED)
     accel = np.clip(2 * (position[:, 2] * unit).sum(-1), -6.0, 4.0)
     single = count < 2
-    speed = np.where(single, states[frame, :, 3], speed)
+    speed = np.where(single, np.clip(states[frame, :, 3], 0.0, TOP_SPEED), speed)
     accel, yaw_rate = np.where(single | (speed < 0.1), 0.0, accel), np.where(single, 0.0, turn[:, 1, 0])
     return np.concatenate([position[:, 0], angle[:, None], speed[:, None]], 1), accel, np.clip(yaw_rate, -1.0, 1.0)
 

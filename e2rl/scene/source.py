@@ -4,9 +4,12 @@ import hashlib
 import json
 import multiprocessing
 import os
+import sys
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -21,7 +24,8 @@ from e2rl.scene.build import BuildSettings, build_scene, ego_overlaps
 from e2rl.scene.recording import Recording
 from e2rl.scene.scene import SceneSet, stack, validate
 
-VERSION = 1  # of the scene builder: raise it when the same recording would make another scene
+OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are dropped
+VERSION = 2  # of the scene builder: raise it when the same recording would make another scene
 
 
 def load_scenes(
@@ -34,6 +38,8 @@ def load_scenes(
     path and, unless data.skip_invalid, for the first invalid scene.
     """
     settings = BuildSettings(**data.build)
+    if num_scenes is not None and num_scenes < 1:
+        raise InputError(f"num_scenes={num_scenes}: expected at least 1, or null for all")
     split = split or data.split
     if data.source == "scenarionet":
         if not data.path:
@@ -70,8 +76,8 @@ def _scenarionet(data, settings: BuildSettings, starts: list[int] | None) -> Sce
                         for container, member in files}):
         digest.update(Path(path).read_bytes())
     locations = scenarionet.read_locations(data.path)
-    extra = [starts, bool(data.skip_invalid), sorted(locations.items())]
     split = data.split or Path(data.path).stem
+    extra = [starts, bool(data.skip_invalid), sorted(locations.items()), split]
     key = _fingerprint(digest.digest(), settings, extra)
 
     def build() -> SceneSet:
@@ -81,11 +87,17 @@ def _scenarionet(data, settings: BuildSettings, starts: list[int] | None) -> Sce
     return _cached(key, data, build)
 
 
-def _in_parallel(work, tasks: list, workers: int) -> list[tuple]:
-    """The rows of all tasks, worked off by several processes."""
+def _in_parallel(work, tasks: list, workers: int) -> Iterator[tuple]:
+    """The rows of all tasks, worked off by several processes (by this one where there is work for one only)."""
+    show = partial(tqdm, desc="building scenes", total=len(tasks), unit="log")
+    if min(workers, len(tasks)) <= 1:
+        yield from (row for rows in show(map(work, tasks)) for row in rows)
+        return
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), torch.set_num_threads, (1,)) as pool:
-        done = list(tqdm(pool.map(work, tasks, chunksize=4), "building scenes", len(tasks), unit="log"))
-    return [(_tensors(scene), *rest) for rows in done for scene, *rest in rows]
+        try:
+            yield from (row for rows in show(pool.map(work, tasks, chunksize=4)) for row in rows)
+        finally:  # whoever stops at an invalid scene does not wait for the others
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _read_file(task) -> list[tuple]:
@@ -96,7 +108,8 @@ def _read_file(task) -> list[tuple]:
         recordings = list(scenarionet.read_recordings(content, member, location, starts, settings.steps))
     except InputError as error:
         return [(None, member, location, "", str(error))]
-    return [_build_row(recording, settings) for recording in recordings]
+    rows = [_build_row(recording, settings, f"{member}: ") for recording in recordings]
+    return rows or [(None, member, location, "", TOO_SHORT)]
 
 
 def _build_recording(task) -> list[tuple]:
@@ -104,21 +117,19 @@ def _build_recording(task) -> list[tuple]:
     return [_build_row(*task)]
 
 
-def _tensors(scene: dict | None) -> TensorDict | None:
-    if scene is None:
-        return None
+def _tensors(scene: dict) -> TensorDict:
     return TensorDict({key: torch.from_numpy(value) for key, value in scene.items()}, batch_size=[])
 
 
-def _build_row(recording: Recording, settings: BuildSettings) -> tuple:
+def _build_row(recording: Recording, settings: BuildSettings, file: str = "") -> tuple:
     name = (recording.scene_id, recording.location, recording.dataset)
     try:
         scene = build_scene(recording, settings)
         validate(scene, recording.scene_id)
     except InputError as error:
-        return (None, *name, str(error))
+        return (None, *name, f"{file}{error}")
     if ego_overlaps(scene):
-        return (None, *name, "")
+        return (None, *name, OVERLAP)
     # Plain arrays cross the process border; tensors would each hold a shared-memory file open.
     return ({key: value.numpy() for key, value in scene.items()}, *name, None)
 
@@ -128,22 +139,26 @@ def _build_all(recordings, settings: BuildSettings, data, dataset: str, split: s
     return _assemble(_in_parallel(_build_recording, tasks, data.workers), data, dataset, split)
 
 
-def _assemble(rows: list[tuple], data, dataset: str | None, split: str) -> SceneSet:
+def _assemble(rows: Iterable[tuple], data, dataset: str | None, split: str) -> SceneSet:
     """Stack the good rows; raise the first invalid one's message unless data.skip_invalid."""
-    dropped = Counter()
-    for scene, name, _, _, reason in rows:
-        if scene is None and reason:
-            if not data.skip_invalid:
-                raise InputError(f"{reason} (data.skip_invalid=true leaves such scenes out)")
+    dropped, good = Counter(), []
+    for scene, name, location, source, reason in rows:
+        if scene is not None:
+            good.append((scene, name, location, source))
+        elif reason in (OVERLAP, TOO_SHORT):
+            dropped[reason] += 1
+        elif data.skip_invalid:
             dropped["invalid"] += 1
-            tqdm.write(f"left out {name}: {reason}")
-        elif scene is None:
-            dropped["ego overlaps a vehicle at the start"] += 1
-    good = [row for row in rows if row[0] is not None]
+            tqdm.write(f"left out {name}: {reason}", sys.stderr)
+        else:
+            raise InputError(f"{reason} (data.skip_invalid=true leaves such scenes out)")
     if not good:
-        raise InputError(f"no valid scene among {len(rows)} ({dict(dropped)})")
-    return SceneSet(stack([row[0] for row in good]), [row[1] for row in good], [row[2] for row in good],
-                    dataset or good[0][3], split, dict(dropped))
+        left_out = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
+        raise InputError(f"no valid scene in {data.get('path') or f'{dataset} {split}'} ({left_out}); see the messages "
+                         "above, or pass other data")
+    scenes, names, locations, sources = zip(*good, strict=True)
+    return SceneSet(stack([_tensors(scene) for scene in scenes]), list(names), list(locations), dataset or sources[0],
+                    split, dict(dropped))
 
 
 def _cached(key: str, data, build) -> SceneSet:
@@ -152,16 +167,25 @@ def _cached(key: str, data, build) -> SceneSet:
     if path.exists():
         try:
             return _load(path)
-        except (SafetensorError, KeyError, ValueError) as error:
+        except (SafetensorError, KeyError, ValueError, TypeError, OSError) as error:
             tqdm.write(f"rebuilding the damaged cache file {path}: {error}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"data.cache={data.cache}: cannot be made ({error}); pass a writable folder") from error
     scenes = build()
-    path.parent.mkdir(parents=True, exist_ok=True)
     names = {"scene_id": scenes.scene_id, "location": scenes.location, "dataset": scenes.dataset,
              "split": scenes.split, "dropped": scenes.dropped}
     part = path.with_suffix(f".{os.getpid()}.part")
-    save_file({key: value.contiguous() for key, value in scenes.scenes.items()}, part,
-              metadata={"scenes": json.dumps(names)})
-    part.replace(path)
+    try:
+        save_file({key: value.contiguous() for key, value in scenes.scenes.items()}, part,
+                  metadata={"scenes": json.dumps(names)})
+        part.replace(path)
+    except OSError as error:
+        raise InputError(f"data.cache={data.cache}: cannot be written ({error}); free space, or pass another "
+                         "folder") from error
+    finally:
+        part.unlink(missing_ok=True)
     return scenes
 
 
