@@ -152,7 +152,7 @@ def find_weights(path: str | Path) -> Path:
     """The actor file that `path` names: the file, a checkpoint folder, or the newest checkpoint of a run folder."""
     path = Path(path)
     if path.is_dir():
-        found = [path / WEIGHTS] if (path / WEIGHTS).is_file() else sorted(path.glob(f"checkpoints/*/{WEIGHTS}"))
+        found = [path / WEIGHTS] if (path / WEIGHTS).is_file() else sorted(path.glob(f"checkpoints/round-*/{WEIGHTS}"))
         if found:
             return found[-1]
     if not path.is_file():

@@ -55,11 +55,11 @@ def run_imitation(
 
 def _policy(config: DictConfig, scenes: SceneSet, sim: SimSettings, ego: Ego) -> PolicyImprovement:
     learner, expert = config.learner, None
-    if learner.expert.recorded and learner.update.cloning > 0:
+    if learner.expert.recorded and learner.ppo.cloning > 0:
         expert = _pairs(recorded_pairs(scenes, sim, instantiate(learner.imitation)), config.device)
-    teacher = instantiate(learner.expert.teacher) if learner.update.cloning > 0 else None
+    teacher = instantiate(learner.expert.teacher) if learner.ppo.cloning > 0 else None
     return PolicyImprovement(
-        ego, scenes, sim, instantiate(learner.update), instantiate(learner.collect), expert, teacher, config.seed,
+        ego, scenes, sim, instantiate(learner.ppo), instantiate(learner.collect), expert, teacher, config.seed,
         config.device,
     )
 

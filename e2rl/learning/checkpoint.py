@@ -7,7 +7,6 @@ traffic.safetensors (the last D') and config.json.
 
 import json
 import os
-import pickle
 import random
 import shutil
 from pathlib import Path
@@ -29,7 +28,8 @@ def save_checkpoint(folder: Path, run: Evolution, config: dict, keep_last: int =
     parent = Path(folder) / "checkpoints"
     parent.mkdir(parents=True, exist_ok=True)
     target, partial = parent / f"round-{run.round:06d}", parent / f".partial-{os.getpid()}"
-    shutil.rmtree(partial, ignore_errors=True)
+    for left in parent.glob(".partial-*"):
+        shutil.rmtree(left)
     partial.mkdir()
     state = {"format": FORMAT, "run": run.state_dict(), "generators": generator_states()}
     torch.save(state, partial / STATE)
@@ -68,9 +68,9 @@ def load_checkpoint(path: str | Path, run: Evolution) -> int:
     folder = latest_checkpoint(path)
     file = folder / STATE
     try:
-        state = torch.load(file, weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        raise InputError(f"{file}: damaged ({str(error).splitlines()[0]}); resume from an older checkpoint") from None
+        state = torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged pickle raises whatever its bytes happen to mean
+        raise InputError(f"{file}: damaged ({type(error).__name__}); resume from an older checkpoint") from error
     if not isinstance(state, dict) or state.get("format") != FORMAT:
         raise InputError(f"{file}: not a checkpoint of this program ({FORMAT}); give a run's folder")
     if isinstance(run.ego, ActorEgo):

@@ -18,7 +18,8 @@ def pools(index=(2, 0, 1)):
 def test_joined_rows_keep_their_traffic():
     attack, recorded = pools()
     both, other_way, twice = attack + recorded, recorded + attack, attack + attack
-    assert both.traffic.tolist() == [0, 1, 2] + [RECORDED] * 3 and other_way.traffic.tolist() == [RECORDED] * 3 + [0, 1, 2]
+    assert both.traffic.tolist() == [0, 1, 2] + [RECORDED] * 3
+    assert other_way.traffic.tolist() == [RECORDED] * 3 + [0, 1, 2]
     assert twice.traffic.tolist() == list(range(6)) and len(twice.states) == 6
     assert both.adversarial.tolist() == [True] * 3 + [False] * 3 and len(both) == 6
 

@@ -1,0 +1,64 @@
+"""Finished episodes are told from the collected frames, without the bias towards short ones."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from e2rl.learning.episodes import finished_episodes
+from tests.learning.small import small_run
+
+
+def frames(lengths, total, fail=()):
+    """One environment: episodes of these lengths in turn, reward 1 a step; those in `fail` end by contact."""
+    timestep = torch.cat([torch.arange(1, n + 1) for n in lengths])[:total]
+    number = torch.cat([torch.full((n,), k) for k, n in enumerate(lengths)])[:total]
+    done = torch.tensor([t == lengths[k] for t, k in zip(timestep.tolist(), number.tolist(), strict=True)])
+    contact = done & torch.tensor([k in fail for k in number.tolist()])
+    row = number[None, :, None]
+    return TensorDict({
+        "traffic_row": row, "scene_index": row + 10,
+        "next": {"timestep": timestep[None, :, None], "done": done[None, :, None], "reward": torch.ones(1, total, 1),
+                 "metrics": {"contact": contact[None, :, None], "contact_vru": torch.zeros(1, total, 1).bool(),
+                             "off_road": torch.zeros(1, total, 1).bool(), "progress": 2.0 * timestep[None, :, None]}},
+    }, [1, total])
+
+
+def test_returns_outcomes_and_scenes_of_episodes_across_batches():
+    data = frames([10, 4, 10, 10], 34, fail=(1,))
+    episodes = finished_episodes([data[:, :12], data[:, 12:]], torch.tensor([False, True, True, False]), 10)
+    assert episodes.row.tolist() == [0, 1, 2, 3] and episodes.scene_index.tolist() == [10, 11, 12, 13]
+    assert episodes.returns.tolist() == [10.0, 4.0, 10.0, 10.0]
+    assert episodes.progress.tolist() == [20.0, 8.0, 20.0, 20.0]
+    assert episodes.failed.tolist() == [False, True, False, False]
+    summary = episodes.summary()
+    assert summary["contact"] == 0.25 and summary["contact_adversarial"] == 0.5 and summary["contact_nominal"] == 0.0
+    assert "acceleration" not in summary, "what was not measured is left out"
+
+
+def test_episodes_that_could_not_have_lasted_do_not_count():
+    """The second begins 5 steps before the end: only a failure could be finished by then."""
+    data = frames([10, 3, 10], 15, fail=(1,))
+    assert finished_episodes([data], torch.zeros(3, dtype=torch.bool), 10).row.tolist() == [0]
+
+
+def test_the_failure_rate_is_unbiased():
+    """Half of the environments' episodes fail after 3 of 10 steps; counting every finished one would say more."""
+    torch.manual_seed(0)
+    batches, total = [], 20
+    for _ in range(300):
+        fails = torch.rand(12) < 0.5
+        lengths = torch.where(fails, 3, 10).tolist()
+        batches.append(frames(lengths, total, fail=fails.nonzero()[:, 0].tolist()))
+    data = torch.cat(batches, 0)
+    fair = finished_episodes([data], torch.zeros(12, dtype=torch.bool), 10).failed.float().mean().item()
+    naive = data["next", "metrics", "contact"].sum() / data["next", "done"].sum()
+    assert fair == pytest.approx(0.5, abs=0.04) and naive > fair + 0.07
+
+
+def test_a_rounds_episodes_are_those_of_its_pool():
+    run = small_run()
+    run.run_round()
+    episodes = run.episodes
+    assert len(episodes) == 8 and set(episodes.row.tolist()) <= set(range(6))
+    assert torch.equal(episodes.adversarial, episodes.row < 3)
+    assert torch.isin(episodes.scene_index, run.traffic["scene_index"]).all()

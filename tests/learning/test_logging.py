@@ -1,0 +1,37 @@
+"""Scalars land in a file each, in the known groups, and go on after a resume."""
+
+import pytest
+
+from e2rl.errors import InputError
+from e2rl.learning.logging import RunLogger
+
+
+def test_csv_rows_go_on_after_a_resume(tmp_path):
+    for step in (1, 2):
+        logger = RunLogger("csv", tmp_path)
+        logger.log({"train/loss": 0.5 * step, "eval/after_cfr": float("nan")}, step)
+        logger.close()
+        del logger
+    scalars = tmp_path / "logs" / "scalars"
+    assert (scalars / "train" / "loss.csv").read_text().split() == ["1,0.5", "2,1.0"]
+    assert not (scalars / "eval").exists(), "NaN is no measurement"
+
+
+def test_none_writes_nothing(tmp_path):
+    RunLogger("none", tmp_path).log({"train/loss": 1.0}, 0)
+    assert not list(tmp_path.iterdir())
+
+
+def test_unknown_groups_and_kinds_are_refused(tmp_path):
+    with pytest.raises(InputError, match="loss"):
+        RunLogger("none", tmp_path).log({"loss": 1.0}, 0)
+    with pytest.raises(InputError, match="logger.kind=paper"):
+        RunLogger("paper", tmp_path)
+
+
+def test_wandb_is_offline(tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    logger = RunLogger("wandb", tmp_path, project="test")
+    logger.log({"train/loss": 1.0}, 1)
+    logger.close()
+    assert list((tmp_path / "wandb").glob("offline-run-*/*.wandb"))
