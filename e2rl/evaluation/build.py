@@ -32,7 +32,9 @@ def build_prior(config: DictConfig, device: str = "cpu") -> tuple[Prior, dict]:
 def build_synthesizer(config: DictConfig, prior: Prior) -> Synthesizer:
     """The synthesizer of the `synthesizer` group on a prior."""
     parts = {name: part(**config.synthesizer[name]) for name, part in PARTS.items() if name in config.synthesizer}
-    return Synthesizer(prior, SynthesizerSettings(**parts, reselect=config.synthesizer.get("reselect", 4)))
+    scalars = {name: config.synthesizer[name] for name in ("reselect", "samples", "selection")
+               if name in config.synthesizer}
+    return Synthesizer(prior, SynthesizerSettings(**parts, **scalars))
 
 
 def build_ego(config: DictConfig) -> Ego:

@@ -30,14 +30,14 @@ class AnchorSettings:
     """Settings of the proposals and of the blend; conf/synthesizer/e2.yaml explains each."""
 
     strength: float = 0.5
-    min_accel: float = -5.0
-    max_accel: float = 4.0
+    min_accel: float = -3.0
+    max_accel: float = 2.0
     options: int = 19
     lateral_accel: float = 4.0
     turn_brake: float = 3.0
     top_speed: float = 25.0
     margin: float = 0.0
-    accel_cost: float = 0.05
+    accel_cost: float = 0.2
     lateral_cost: float = 0.05
     max_offset: float = 1.0
 

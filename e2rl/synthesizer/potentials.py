@@ -37,12 +37,12 @@ class PotentialSettings:
     pair_margin: float = 0.3
     pair_disks: int = 3
     neighbours: int = 6
-    accel: float = 0.1
-    min_accel: float = -5.0
-    max_accel: float = 3.0
+    accel: float = 0.5
+    min_accel: float = -3.5
+    max_accel: float = 2.0
     max_lateral_accel: float = 4.0
-    jerk: float = 0.1
-    max_jerk: float = 6.0
+    jerk: float = 1.0
+    max_jerk: float = 2.0
     wrong_way: float = 0.1
     distance: float = 1.0
     distance_kind: str = "centre"

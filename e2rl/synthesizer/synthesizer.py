@@ -14,7 +14,7 @@ from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate
 from e2rl.prior.prior import Context, Plan, Prior
 from e2rl.prior.routed import RoutedScene, route_scene
 from e2rl.sim.world import World
-from e2rl.synthesizer.anchoring import AnchorSettings, propose
+from e2rl.synthesizer.anchoring import Anchor, AnchorSettings, propose
 from e2rl.synthesizer.control import ControlSettings, SparseControl
 from e2rl.synthesizer.feasibility import FeasibilitySettings, feasible_vehicles
 from e2rl.synthesizer.potentials import (
@@ -29,9 +29,11 @@ from e2rl.synthesizer.topology import TopologySettings, topological_candidates
 
 @dataclass(frozen=True)
 class SynthesizerSettings:
-    """Settings of all parts (conf/synthesizer/e2.yaml); reselect: replans between two choices of the support, 0: the
-    support of the start frame is kept; samples: joint samples a replan, of which each scene keeps the one with the
-    least selection * V_feas + eta * V_adv."""
+    """Settings of all parts (conf/synthesizer/e2.yaml).
+
+    reselect: replans after which a coalition that can no longer meet its targets is chosen anew, 0: never; samples:
+    joint samples a replan, of which each scene keeps the one with the least selection * V_feas + eta * V_adv.
+    """
 
     topology: TopologySettings = TopologySettings()
     feasibility: FeasibilitySettings = FeasibilitySettings()
@@ -39,7 +41,7 @@ class SynthesizerSettings:
     anchor: AnchorSettings = AnchorSettings()
     potentials: PotentialSettings = PotentialSettings()
     control: ControlSettings = ControlSettings()
-    reselect: int = 4
+    reselect: int = 2
     samples: int = 1
     selection: float = 1.0
 
@@ -66,7 +68,9 @@ class Episode:
 
 
 def take_rows(value, rows: Tensor):
-    """Rows of every tensor in a nested dataclass."""
+    """Rows of every tensor in a nested dataclass; None stays None."""
+    if value is None:
+        return None
     if is_dataclass(value):
         return type(value)(*(take_rows(getattr(value, f.name), rows) for f in fields(value)))
     return value[rows]
@@ -123,7 +127,11 @@ class Synthesizer:
         controlled = bool((episode.eta > 0).any())
         due = count == 0 or (self.settings.reselect > 0 and count % self.settings.reselect == 0)
         if controlled and due:
-            episode, world = self._select(episode, world, ego_plan, count)
+            rows = ((episode.eta > 0) & ~self._viable(episode, world, ego_plan)).nonzero().squeeze(-1)
+            if len(rows):
+                chosen = self._select(take_rows(episode, rows), take_rows(world, rows), ego_plan[rows], count)
+                episode = put_rows(episode, rows, chosen)
+                world = replace(world, route=episode.routed.route)
         context = self._encode(episode, world, ego_plan, episode.coalition)
         where = self._where(episode, world, ego_plan)
         control = self._control(episode, world, where) if controlled else None
@@ -160,7 +168,18 @@ class Synthesizer:
     def _encode(self, episode: Episode, world: World, ego_plan: Tensor, exempt: Tensor) -> Context:
         return self.prior.encode(episode.routed, episode.state, world.states, world.valid, world.step, ego_plan, exempt)
 
-    def _select(self, episode: Episode, world: World, ego_plan: Tensor, count: int) -> tuple[Episode, World]:
+    def _viable(self, episode: Episode, world: World, ego_plan: Tensor) -> Tensor:
+        """[B]: some member of the coalition can still meet its target, so the coalition stays as it is."""
+        return self._anchor(episode, world, ego_plan).has.any(1)
+
+    def _anchor(self, episode: Episode, world: World, ego_plan: Tensor) -> Anchor:
+        """Proposals for the present coalition on its present routes."""
+        depth = chain_depth(episode.target)
+        skeleton = Skeleton(episode.coalition, episode.target, depth, depth == 1, depth > 1, episode.replans,
+                            episode.replans)
+        return propose(world.scene, world, skeleton, ego_plan, self.settings.anchor, keep_route=True)
+
+    def _select(self, episode: Episode, world: World, ego_plan: Tensor, count: int) -> Episode:
         """Topology on a reference rollout, feasibility, skeleton; the coalition takes the routes that meet targets."""
         scene, vehicles = world.scene, self._vehicles
         context = self._encode(episode, world, ego_plan, torch.zeros_like(episode.coalition))
@@ -176,10 +195,9 @@ class Synthesizer:
         anchor = propose(scene, world, skeleton, ego_plan, self.settings.anchor)
         # A member that no route and acceleration lead to its target is pruned (Sec. IV-A3: infeasible configurations).
         acts = skeleton.coalition & anchor.has & (episode.eta > 0)[:, None]
-        episode = self._reroute(replace(
+        return self._reroute(replace(
             episode, coalition=acts, target=torch.where(acts, skeleton.target, -1),
             adversaries=episode.adversaries | acts), world, torch.where(acts, anchor.route, world.route))
-        return episode, replace(world, route=episode.routed.route)
 
     def _reroute(self, episode: Episode, world: World, route: Tensor) -> Episode:
         """The episodes with vehicles moved to other candidates, placed on them where they are now."""
@@ -200,11 +218,7 @@ class Synthesizer:
             episode.routed.has_lane, ego_plan[:, :HORIZON], episode.target)
 
     def _control(self, episode: Episode, world: World, where: PotentialContext) -> SparseControl:
-        settings = self.settings
-        depth = chain_depth(episode.target)
-        skeleton = Skeleton(episode.coalition, episode.target, depth, depth == 1, depth > 1, episode.replans,
-                            episode.replans)
-        anchor = propose(world.scene, world, skeleton, where.ego_plan, settings.anchor, keep_route=True)
+        settings, anchor = self.settings, self._anchor(episode, world, where.ego_plan)
         literal = noise_of(episode.seed, 10_000 + int(episode.replans[0]), (self._vehicles, SIZE))
         return SparseControl(self.prior, settings.control, settings.potentials, where, episode.coalition, episode.eta,
                              anchor, settings.anchor.strength, literal)
