@@ -59,18 +59,23 @@ def load_prior(
         raise InputError(f"{path}: not a readable safetensors file ({error}); train the prior again") from error
     if metadata.get("format") != FORMAT:
         raise InputError(f"{path}: format {metadata.get('format')!r}, expected {FORMAT!r}; is it a prior checkpoint?")
-    architecture = json.loads(metadata["architecture"])
-    if architecture["features"] != [NODE, EDGE, SIZE]:
-        raise InputError(f"{path}: made for {architecture['features']} features, this version has "
-                         f"{[NODE, EDGE, SIZE]}; train the prior again with `python train.py stage=prior`")
-    prior = Prior(DenoiserSettings(**architecture["denoiser"]), sampler, bounds, architecture["free_space"])
+    try:
+        architecture, origin = json.loads(metadata["architecture"]), json.loads(metadata["origin"])
+        made_for, denoiser = architecture["features"], DenoiserSettings(**architecture["denoiser"])
+        free_space = architecture["free_space"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: another architecture (its header: {error}); train the prior again") from error
+    if made_for != [NODE, EDGE, SIZE]:
+        raise InputError(f"{path}: made for {made_for} features, this version has {[NODE, EDGE, SIZE]}; train the "
+                         "prior again with `python train.py stage=prior`")
+    prior = Prior(denoiser, sampler, bounds, free_space)
     expected = {key: value.shape for key, value in prior.state_dict().items()}
     wrong = [key for key in expected.keys() | tensors.keys()
              if key not in tensors or key not in expected or tensors[key].shape != expected[key]]
     if wrong:
         raise InputError(f"{path}: another architecture ({sorted(wrong)[0]} does not fit); train the prior again")
     prior.load_state_dict(tensors)
-    return prior.requires_grad_(False).eval().to(device), json.loads(metadata["origin"])
+    return prior.requires_grad_(False).eval().to(device), origin
 
 
 def bundled_checkpoint() -> Path:

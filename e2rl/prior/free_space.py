@@ -9,6 +9,7 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS, LaneState, lateral_horizon, speeds
 from e2rl.scene.recording import DT
+from e2rl.sim.dynamics import wrap
 
 YAW_RATE_SCALE = 0.1  # rad/s at the current speed a unit of x, floored at 3 m/s
 
@@ -59,8 +60,7 @@ def fit(heading: Tensor, known: Tensor, state: LaneState, knots: Tensor) -> Tens
     half = 0.5 * reach * (first**2 / 2 + second - second**2 / 2)
     end = 0.5 * reach * second**2 / 2 + beyond
     given = 0.5 * reach * state.kappa[..., None] * (first - first**2 / 2)
-    turn = heading - state.heading[..., None]
-    turn = (turn + torch.pi) % (2 * torch.pi) - torch.pi
+    turn = wrap(heading - state.heading[..., None])
     unit = torch.stack([scale * half, scale * end], -1) * known[..., None]
     rest = (turn - given) * known
     gram = unit.transpose(-1, -2) @ unit + 1e-3 * torch.eye(2, device=unit.device)

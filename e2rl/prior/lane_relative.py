@@ -13,6 +13,7 @@ from torch import Tensor
 
 from e2rl.scene.recording import DT
 from e2rl.scene.route import interpolate, project
+from e2rl.sim.dynamics import wrap
 
 HORIZON = 50  # steps of DT
 KNOTS, LATERAL = 10, 2
@@ -57,7 +58,7 @@ def locate(states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hint
         states[..., None, :2], points, None if hint is None else hint[..., None]))
     _, heading, curvature = (value[..., 0, :] if value.ndim == 4 else value[..., 0]
                              for value in interpolate(points, s[..., None]))
-    turn = (states[..., 2] - heading + torch.pi) % (2 * torch.pi) - torch.pi
+    turn = wrap(states[..., 2] - heading)
     v = states[..., 3]
     kappa = (yaw_rate / v.clamp(min=1.0)).clamp(-0.25, 0.25)
     d1 = torch.tan(turn.clamp(-1.0, 1.0)) * (1 - curvature * d).clamp(min=0.3)

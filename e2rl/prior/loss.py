@@ -97,7 +97,7 @@ def denoising_loss(prior: Prior, batch: TensorDictBase, settings: TrainingSettin
 
 
 def _trajectory_error(x0: Tensor, batch: TensorDictBase) -> Tensor:
-    """Huber error [W, R] of way ahead and (twice) of offset at the knots' times, in m."""
+    """Huber error [W, R] of way ahead and (twice, on lanes) of offset at the knots' times, in m."""
     zero = torch.zeros_like(batch["v"])
     state = LaneState(zero, batch["d"], batch["d1"], batch["d2"], batch["v"], batch["a"], zero, zero, zero, zero)
     knots, half, end = split(x0, state)
@@ -108,7 +108,7 @@ def _trajectory_error(x0: Tensor, batch: TensorDictBase) -> Tensor:
     d = polynomial(offset_coefficients(state, half, end), u)[0]
     known = batch["known"].float()
     ahead = F.huber_loss(travelled, batch["ahead"], reduction="none")
-    aside = F.huber_loss(2 * d, 2 * batch["aside"], reduction="none")
+    aside = F.huber_loss(2 * d, 2 * batch["aside"], reduction="none") * batch["on_lane"][..., None]
     return ((ahead + aside) * known).sum(-1) / KNOTS
 
 

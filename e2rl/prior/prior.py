@@ -36,7 +36,8 @@ class SamplerSettings:
 @dataclass
 class Context:
     """One replan of B scenes: routed, lane states [B, V], network encoding, the ego's plan as x [B, SIZE], the caps
-    [B, V] on acceleration, and who is active [B, V] (simulated now, not parked, not the ego)."""
+    [B, V] on acceleration, who is active [B, V] (simulated now, not parked, not the ego), and whether every vehicle has
+    a lane (asked once, on the host)."""
 
     routed: RoutedScene
     state: LaneState
@@ -44,6 +45,7 @@ class Context:
     ego_x: Tensor
     cap: Tensor
     active: Tensor
+    all_on_lane: bool
 
 
 @dataclass
@@ -108,7 +110,8 @@ class Prior(nn.Module):
         cap = acceleration_caps(self.bounds, routed, state, agents, present, exempt)
         active = here & routed.modelled
         active = torch.cat([torch.zeros_like(active[:, :1]), active[:, 1:]], 1)
-        return Context(routed, state, encoding, plan_to_x(ego_plan, state, routed), cap, active)
+        return Context(routed, state, encoding, plan_to_x(ego_plan, state, routed), cap, active,
+                       bool(routed.has_lane.all()))
 
     def denoise(self, x: Tensor, level: Tensor, context: Context) -> Tensor:
         """x0 [B, V, SIZE] of x at a scalar noise level; the ego's row is its plan, given clean."""
@@ -126,9 +129,9 @@ class Prior(nn.Module):
             onset = torch.minimum(state.a, torch.maximum(context.cap, state.a - self.bounds.onset))
             state = LaneState(**{**vars(state), "a": onset})
         lane = lane_relative.decode(x0, state, context.routed.points)
-        on_lane = context.routed.has_lane[..., None]
-        if bool(on_lane.all()):
+        if context.all_on_lane:
             return lane
+        on_lane = context.routed.has_lane[..., None]
         free = free_space.decode(x0, state)
         return LaneState(*(torch.where(on_lane, getattr(lane, f.name), getattr(free, f.name))
                            for f in fields(LaneState)))
@@ -200,11 +203,16 @@ class Plan:
 
 
 def plan_to_x(plan: Tensor, state: LaneState, routed: RoutedScene) -> Tensor:
-    """The ego's planned states [B, HORIZON, 4] as x [B, SIZE] on its mission route."""
+    """The ego's planned states [B, HORIZON, 4] as x [B, SIZE] on its mission route, or in free space where that is how
+    it is represented."""
     ego = state.map(lambda value: value[:, 0])
     before = torch.cat([ego.v[:, None], plan[..., :-1, 3]], 1)
     hint = ego.s[:, None] + ((plan[..., 3] + before) / 2 * 0.1).cumsum(-1)
     s, d, _ = project(plan[..., :2], routed.points[:, 0], hint)
     zero = torch.zeros_like(s)
     track = LaneState(s, d, zero, zero, plan[..., 3], zero, plan[..., 0], plan[..., 1], plan[..., 2], zero)
-    return lane_relative.fit(track, torch.ones_like(s), ego)[0]
+    known = torch.ones_like(s)
+    x = lane_relative.fit(track, known, ego)[0]
+    bend = free_space.fit(plan[..., 2], known, ego, lane_relative.ACCEL_SCALE * x[..., :lane_relative.KNOTS])
+    free = torch.cat([x[..., :lane_relative.KNOTS], bend], -1)
+    return torch.where(routed.has_lane[:, :1], x, free)

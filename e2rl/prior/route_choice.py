@@ -6,6 +6,7 @@ from torch import Tensor, nn
 
 from e2rl.scene.recording import LIGHT_GREEN, LIGHT_RED
 from e2rl.scene.route import SPACING, interpolate, project
+from e2rl.sim.dynamics import wrap
 
 FEATURES = 16
 PROBES = (10.0, 20.0, 35.0, 55.0, 80.0)  # m ahead where the turn is looked at
@@ -17,7 +18,6 @@ def candidate_features(scene: TensorDictBase) -> Tensor:
     vehicles = points.shape[1]
     start = scene["start"][:, :vehicles]
     s, d, heading = (value[..., 0] for value in project(start[:, :, None, None, :2], points))
-    wrap = lambda angle: (angle + torch.pi) % (2 * torch.pi) - torch.pi  # noqa: E731
     v = start[..., 3][..., None].expand_as(s)
     at = s[..., None] + torch.tensor((0.0, *PROBES), device=s.device)
     angle = interpolate(points, at)[1]

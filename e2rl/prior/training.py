@@ -24,22 +24,23 @@ HELD_OUT = 8  # one place in so many is held out for validation
 def train_route_choice(prior: Prior, scenes: TensorDictBase, settings: TrainingSettings) -> float:
     """Cross-entropy on the candidate driven, over vehicles with a choice; returns the accuracy on the training set."""
     parts = [candidate_features(scenes[i:i + 64]) for i in range(0, len(scenes), 64)]
+    device = next(prior.route_choice.parameters()).device
     features = torch.cat(parts)
     valid, label = scenes["route_valid"], scenes["route_log"]
     use = scenes["valid"][:, :label.shape[1]] & ~scenes["parked"][:, :label.shape[1]] & (label >= 0)
     use &= valid.sum(-1) > 1
     use[:, 0] &= label[:, 0] >= 0
-    features, valid, label = features[use], valid[use], label[use]
+    features, valid, label = (value[use].to(device) for value in (features, valid, label))
     if not len(label):
         return float("nan")
     generator = torch.Generator().manual_seed(settings.seed)
     optimiser = torch.optim.AdamW(prior.route_choice.parameters(), 3e-3, weight_decay=0.05)
     for _ in tqdm(range(settings.route_steps), "route choice"):
-        pick = torch.randint(len(label), (512,), generator=generator)
+        pick = torch.randint(len(label), (512,), generator=generator).to(device)
         sample = features[pick]
-        sample = sample + 0.05 * torch.randn(sample.shape, generator=generator)
+        sample = sample + 0.05 * torch.randn(sample.shape, generator=generator).to(device)
         logits = prior.route_choice.net(sample)[..., 0].masked_fill(~valid[pick], -1e4)
-        loss = F.cross_entropy(logits, label[pick], label_smoothing=0.0)
+        loss = F.cross_entropy(logits, label[pick])
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -114,7 +115,7 @@ class PriorTraining:
         """Go on from a `state_dict`."""
         self.prior.denoiser.load_state_dict(state["denoiser"])
         self.prior.route_choice.load_state_dict(state["route_choice"])
-        self.average = {key: value.clone() for key, value in state["average"].items()}
+        self.average = {key: value.to(self.device, copy=True) for key, value in state["average"].items()}
         self.optimiser.load_state_dict(state["optimiser"])
         self.step = state["step"]
         self.generator.set_state(state["generator"].cpu())
@@ -141,13 +142,16 @@ def train_prior(prior: Prior, scenes: SceneSet, settings: TrainingSettings, vali
     begin, mask = time.perf_counter(), held_out(scenes)
     windows = make_windows(scenes.scenes[~mask], prior.free_space)
     test = make_windows(scenes.scenes[mask], prior.free_space)
+    if not len(windows) or not len(test):
+        raise InputError(f"{len(windows)} training and {len(test)} held-out windows of {len(scenes)} scenes: too few "
+                         "vehicles are recorded for a second on a known route; train on more or longer logs")
     origin = origin | {"windows": len(windows), "held_out_windows": len(test)}
     torch.manual_seed(settings.seed)
     accuracy = train_route_choice(prior, scenes.scenes[~mask], settings)
     run, best = PriorTraining(prior, windows, settings), {"loss": float("inf"), "weights": None, "step": 0}
     state_file = folder / "training.pt"
     if state_file.exists():
-        saved = torch.load(state_file, weights_only=True)
+        saved = torch.load(state_file, map_location="cpu", weights_only=True)
         run.load_state_dict(saved["run"])
         best = saved["best"]
     while run.step < settings.steps:

@@ -11,6 +11,7 @@ from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS, KNOTS, LaneState, loca
 from e2rl.prior.routed import RoutedScene, route_scene
 from e2rl.scene.recording import DT
 from e2rl.scene.route import project
+from e2rl.sim.dynamics import wrap
 
 OFFSETS = (0, 5, 10, 15)  # frames after a scene's start frame at which a window begins
 ROWS = 16  # vehicles of a window: the modelled ones nearest to the ego
@@ -38,7 +39,7 @@ def make_windows(scenes: TensorDictBase, free: bool = False, chunk: int = 32) ->
         logged, valid = scene["logged"][:, :, :vehicles], scene["logged_valid"][:, :, :vehicles]
         accel = derivative(logged[..., 3], valid).clamp(-6.0, 4.0)
         turn = torch.where(valid, logged[..., 2], 0.0)
-        unwrapped = torch.cumsum(torch.cat([turn[:, :1], _wrap(turn.diff(dim=1))], 1), 1)
+        unwrapped = torch.cumsum(torch.cat([turn[:, :1], wrap(turn.diff(dim=1))], 1), 1)
         yaw_rate = derivative(unwrapped, valid).clamp(-1.0, 1.0)
         parts += [_window(routed, offset, accel, yaw_rate, causal=False) for offset in OFFSETS]
         parts.append(_window(routed, 0, accel, yaw_rate, causal=True))
@@ -46,22 +47,19 @@ def make_windows(scenes: TensorDictBase, free: bool = False, chunk: int = 32) ->
     return windows[windows["weight"].sum(-1) > 0]
 
 
-def _wrap(angle: Tensor) -> Tensor:
-    return (angle + torch.pi) % (2 * torch.pi) - torch.pi
-
-
 def _window(routed: RoutedScene, offset: int, accel: Tensor, yaw_rate: Tensor, causal: bool) -> TensorDict:
     """Windows [B] at a frame: nodes [R, NODE], pairs [R, R, EDGE], present [R], x0 [R, SIZE], knot_weight [R, SIZE]
     (knots inside the recorded future), weight [R] of the vehicle in the loss, and for the trajectory term v, a, d, d1,
-    d2 [R], ahead, aside, known [R, KNOTS]: recorded way and offset at 0.5 s steps. causal: start states as a causal
-    observer estimates them; otherwise exact."""
+    d2, on_lane [R], ahead, aside, known [R, KNOTS]: recorded way and offset at 0.5 s steps (the offset counts on_lane
+    only: in free space the lateral knots are no offsets). causal: start states as a causal observer estimates them;
+    otherwise exact."""
     scene, vehicles = routed.scene, routed.route.shape[1]
     logged, valid = scene["logged"][:, offset], scene["logged_valid"][:, offset] & scene["valid"]
     rate = (scene["start_accel"][:, :vehicles], scene["start_yaw_rate"][:, :vehicles]) if causal else (
         accel[:, offset], yaw_rate[:, offset])
     agents = scene["start"] if causal else logged
     state = locate(agents[:, :vehicles], *rate, routed.points)
-    step = torch.full((len(logged),), offset, dtype=torch.long)
+    step = torch.full((len(logged),), offset, dtype=torch.long, device=logged.device)
     nodes, pairs = node_features(routed, state, agents, valid, step), edge_features(routed, state)
     future = slice(offset + 1, offset + 1 + HORIZON)
     tracks = scene["logged"][:, future, :vehicles].transpose(1, 2)
@@ -71,8 +69,8 @@ def _window(routed: RoutedScene, offset: int, accel: Tensor, yaw_rate: Tensor, c
         tracks = torch.cat([tracks, tracks.new_zeros(*tracks.shape[:2], short, 4)], 2)
         known = torch.cat([known, known.new_zeros(*known.shape[:2], short)], 2)
     known = known.cumprod(-1).bool()
-    x0, error, s, d = _targets(routed, state, tracks, known)
-    ends = torch.arange(1, KNOTS + 1) * KNOT_STEPS - 1
+    x0, error, ahead, d = _targets(routed, state, tracks, known)
+    ends = torch.arange(1, KNOTS + 1, device=known.device) * KNOT_STEPS - 1
     at_knots = known[..., ends]
     moving = torch.where(known, tracks[..., 3], 0.0).amax(-1).clamp(min=state.v) > 0.5
     here = valid[:, :vehicles]
@@ -82,9 +80,10 @@ def _window(routed: RoutedScene, offset: int, accel: Tensor, yaw_rate: Tensor, c
         "nodes": nodes, "present": here, "x0": x0, "weight": use * torch.where(moving, 1.0, STANDING_WEIGHT),
         "knot_weight": torch.cat([at_knots, known[..., [24]], known[..., [44]]], -1).float(),
         "v": state.v, "a": state.a, "d": state.d, "d1": state.d1, "d2": state.d2,
-        "ahead": (s - state.s[..., None])[..., ends], "aside": d[..., ends], "known": at_knots}
+        "on_lane": routed.has_lane, "ahead": ahead[..., ends], "aside": d[..., ends], "known": at_knots}
     distance = (logged[:, :vehicles, :2] - logged[:, :1, :2]).norm(dim=-1)
-    order = (distance + 1e3 * ~use + 1e4 * ~here).index_fill(1, torch.tensor([0]), -1.0).argsort(1)[:, :ROWS]
+    distance = torch.cat([torch.full_like(distance[:, :1], -1e6), distance[:, 1:]], 1)  # the ego leads
+    order = (distance + 1e3 * ~use + 1e4 * ~here).argsort(1)[:, :ROWS]
     take = lambda value: value.gather(1, order.reshape(*order.shape, *[1] * (value.ndim - 2))  # noqa: E731
                                       .expand(*order.shape, *value.shape[2:]))
     window = {key: take(value) for key, value in columns.items()}
@@ -93,14 +92,15 @@ def _window(routed: RoutedScene, offset: int, accel: Tensor, yaw_rate: Tensor, c
 
 
 def _targets(routed: RoutedScene, state: LaneState, tracks: Tensor, known: Tensor) -> tuple[Tensor, ...]:
-    """x0 [B, V, SIZE] of tracks [B, V, HORIZON, 4], its error [B, V], and the recorded s, d [B, V, HORIZON]."""
+    """x0 [B, V, SIZE] of tracks [B, V, HORIZON, 4], its error [B, V], the recorded way and offset [B, V, HORIZON]."""
     hint = state.s[..., None] + (torch.where(known, tracks[..., 3], 0.0) * DT).cumsum(-1)
     s, d, _ = project(tracks[..., :2], routed.points, hint)
     zero = torch.zeros_like(s)
     track = LaneState(s, d, zero, zero, tracks[..., 3], zero, tracks[..., 0], tracks[..., 1], tracks[..., 2], zero)
     x0, error = lane_relative.fit(track, known.float(), state)
+    ahead = s - state.s[..., None]
     if bool(routed.has_lane.all()):
-        return x0, error, s, d
+        return x0, error, ahead, d
     knots = lane_relative.ACCEL_SCALE * x0[..., :KNOTS]
     bend = free_space.fit(tracks[..., 2], known.float(), state, knots)
     free = torch.cat([x0[..., :KNOTS], bend], -1)
@@ -108,4 +108,7 @@ def _targets(routed: RoutedScene, state: LaneState, tracks: Tensor, known: Tenso
     gap = torch.hypot(motion.x - tracks[..., 0], motion.y - tracks[..., 1])
     free_error = (gap * known).sum(-1) / known.sum(-1).clamp(min=1) / 2
     lane = routed.has_lane
-    return torch.where(lane[..., None], x0, free), torch.where(lane, error, free_error), s, d
+    before = torch.cat([state.v[..., None], tracks[..., :-1, 3]], -1)
+    driven = (torch.where(known, (tracks[..., 3] + before) / 2, 0.0) * DT).cumsum(-1)
+    return (torch.where(lane[..., None], x0, free), torch.where(lane, error, free_error),
+            torch.where(lane[..., None], ahead, driven), d)

@@ -121,7 +121,7 @@ def test_fitting_a_decoded_plan_gives_it_back(generator):
     assert error.max() < 0.1
     torch.testing.assert_close(found[:, :KNOTS], x[:, :KNOTS], rtol=0, atol=0.15)
     # The ridge pulls lateral knots towards 0; the offsets they stand for are met within centimetres.
-    torch.testing.assert_close(decode(found, state, points).d, plan.d, rtol=0, atol=0.06)
+    torch.testing.assert_close(decode(found, state, points).d, plan.d, rtol=0, atol=0.08)
 
 
 def test_unknown_steps_do_not_influence_a_fit(generator):

@@ -1,0 +1,72 @@
+"""Checkpoints: the same prior comes back, and what does not fit is refused in a sentence."""
+
+import json
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from e2rl.errors import InputError
+from e2rl.prior.checkpoint import load_prior, save_prior
+from e2rl.prior.prior import SamplerSettings
+from tests.prior.small import small_prior
+
+
+@pytest.mark.parametrize("free_space", [False, True])
+def test_a_saved_prior_comes_back(tmp_path, free_space):
+    prior = small_prior(free_space=free_space)
+    path = save_prior(prior, tmp_path / "new", {"command": "x", "step": 3})
+    back, origin = load_prior(str(path), SamplerSettings(steps=3))
+    assert origin == {"command": "x", "step": 3} and back.free_space == free_space and back.sampler.steps == 3
+    assert back.denoiser.settings == prior.denoiser.settings
+    for key, value in prior.state_dict().items():
+        assert torch.equal(value, back.state_dict()[key])
+    assert not any(parameter.requires_grad for parameter in back.parameters()) and not back.training
+
+
+def test_the_name_tells_weights_apart(tmp_path):
+    first, second, again = (save_prior(small_prior(seed), tmp_path, {}) for seed in (0, 1, 0))
+    assert first == again != second
+    assert sorted(tmp_path.iterdir()) == sorted({first, second})
+
+
+def rewritten(path, change, drop=None):
+    """The checkpoint with its architecture passed through `change`, without tensor `drop`."""
+    with safe_open(path, "pt") as file:
+        metadata = dict(file.metadata())
+        tensors = {key: file.get_tensor(key) for key in file.keys() if key != drop}  # noqa: SIM118
+    architecture = json.loads(metadata["architecture"])
+    change(architecture)
+    save_file(tensors, path, metadata | {"architecture": json.dumps(architecture)})
+    return str(path)
+
+
+@pytest.mark.parametrize("change", [
+    lambda a: a["denoiser"].update(width=16),
+    lambda a: a["denoiser"].update(blocks=2),
+    lambda a: a["denoiser"].update(layers=2),
+    lambda a: a.update(features=[1, 2, 3]),
+    lambda a: a.pop("denoiser"),
+    lambda a: a.pop("features"),
+], ids=["width", "blocks", "unknown-setting", "features", "no-network", "no-features"])
+def test_another_architecture_is_refused(tmp_path, change):
+    path = rewritten(save_prior(small_prior(), tmp_path, {}), change)
+    with pytest.raises(InputError, match="prior-"):
+        load_prior(path)
+
+
+def test_missing_damaged_foreign_and_incomplete_files_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        load_prior(str(tmp_path / "none.safetensors"))
+    broken = tmp_path / "broken.safetensors"
+    broken.write_bytes(b"not a checkpoint")
+    with pytest.raises(InputError, match="broken"):
+        load_prior(str(broken))
+    foreign = tmp_path / "foreign.safetensors"
+    save_file({"x": torch.zeros(1)}, foreign)
+    with pytest.raises(InputError, match="format"):
+        load_prior(str(foreign))
+    path = rewritten(save_prior(small_prior(), tmp_path, {}), lambda a: None, drop="denoiser.head.1.bias")
+    with pytest.raises(InputError, match="head"):
+        load_prior(path)

@@ -1,0 +1,224 @@
+"""The prior as a whole: nominal reverse SDE, path KL, the ego's row, bounds, ends of routes."""
+
+import pytest
+import torch
+
+from e2rl.prior.bounds import BoundSettings
+from e2rl.prior.lane_relative import HORIZON, SIZE, decode
+from e2rl.prior.prior import Prior, SamplerSettings, plan_to_x
+from e2rl.prior.route_choice import sample_route
+from tests.prior.small import VEHICLES, arc, curved_scenes, small_prior
+
+FREE = BoundSettings(leader=False, curve=False, crossing=False)
+MEAN, STD = 0.4, 0.6
+
+
+def context_of(prior, scene, **options):
+    vehicles = scene["route_log"].shape[1]
+    routed, state = prior.start(scene, scene["route_log"].clamp(min=0))
+    ego = scene["logged"][:, 1:HORIZON + 1, 0]
+    step = torch.zeros(len(scene), dtype=torch.long)
+    assert state.s.shape[1] == vehicles
+    return prior.encode(routed, state, scene["start"], scene["valid"], step, ego, **options)
+
+
+def noise_for(prior, scene, seed=0):
+    shape = (prior.sampler.steps, *scene["route_log"].shape, SIZE)
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def gaussian_prior(**sampler):
+    """A prior whose denoiser is that of independent N(MEAN, STD^2) data."""
+    prior = Prior(sampler=SamplerSettings(temperature=1.0, **sampler))
+
+    def denoise(x, level, context):
+        alpha, sigma = prior.schedule.alpha(level), prior.schedule.sigma(level)
+        return MEAN + STD**2 * alpha / (alpha**2 * STD**2 + sigma**2) * (x - alpha * MEAN)
+
+    prior.denoise = denoise
+    return prior
+
+
+@pytest.mark.parametrize("sampler", [{"steps": 50}, {"steps": 50, "churn": 0.0},
+                                     {"steps": 200, "sampler": "euler_maruyama"}], ids=str)
+def test_sampling_draws_from_gaussian_data(sampler):
+    prior = gaussian_prior(**sampler)
+    noise = torch.randn(prior.sampler.steps, 500, 1, SIZE, generator=torch.Generator().manual_seed(0))
+    sample = prior.sample(None, noise)
+    assert sample.x0.mean().item() == pytest.approx(MEAN, abs=0.04)
+    assert sample.x0.std().item() == pytest.approx(STD, abs=0.03)
+    assert (sample.kl == 0).all()
+
+
+@pytest.mark.parametrize("sampler", [{"steps": 4}, {"steps": 5, "churn": 0.7},
+                                     {"steps": 4, "sampler": "euler_maruyama"}], ids=str)
+@pytest.mark.parametrize("temperature", [1.0, 0.8])
+def test_path_kl_is_that_of_the_two_laws_of_the_path(sampler, temperature):
+    """With a linear denoiser the path (x_K .. x_1) is Gaussian: its law is read off unit noises, one per scene."""
+    prior = gaussian_prior(**sampler)
+    prior.sampler = SamplerSettings(**{**vars(prior.sampler), "temperature": temperature})
+    steps, push = prior.sampler.steps, 0.3
+    noise = torch.zeros(steps, steps + 1, 1, SIZE)
+    for k in range(steps):
+        noise[k, k + 1] = 1.0  # scene 0 has no noise: the mean
+
+    def paths(shift):
+        seen = []
+
+        def control(x, level, k, context, denoise):
+            seen.append(x[:, 0, 0])
+            x0 = denoise(x)
+            return x, x0, x0 + shift
+
+        kl = prior.sample(None, noise, control).kl
+        return torch.stack(seen, -1).double(), kl
+
+    (free, none), (pushed, kl) = paths(0.0), paths(push)
+    mix = (free[1:] - free[:1]).T
+    moved = pushed[0] - free[0]
+    expected = 0.5 * moved @ torch.linalg.solve(mix @ mix.T, moved) * SIZE
+    assert (none == 0).all()
+    torch.testing.assert_close(kl[:, 0].double(), expected.expand(steps + 1), rtol=1e-3, atol=0)
+
+
+def test_the_ego_s_row_is_its_plan_in_every_estimate():
+    scene, prior = curved_scenes(2), small_prior()
+    context = context_of(prior, scene)
+    noise = noise_for(prior, scene)
+    x0 = prior.denoise(noise[0], torch.tensor(0.7), context)
+    assert torch.equal(x0[:, 0], context.ego_x)
+    assert torch.equal(prior.sample(context, noise).x0[:, 0], context.ego_x)
+    other = noise.clone()
+    other[:, :, 0] = 9.0
+    assert torch.equal(prior.sample(context, other).x0, prior.sample(context, noise).x0), "noise of its row is unused"
+
+
+@pytest.mark.parametrize("free_space", [False, True])
+def test_the_ego_s_plan_becomes_the_x_that_decodes_to_it(free_space):
+    scene = curved_scenes()
+    prior = small_prior(free_space=free_space, bounds=FREE)
+    context = context_of(prior, scene)
+    plan = scene["logged"][:, 1:HORIZON + 1, 0]
+    x = torch.zeros(*scene["route_log"].shape, SIZE)
+    x[:, 0] = context.ego_x
+    decoded = prior.decode(x, context, capped=False).states()[:, 0]
+    assert (decoded - plan)[..., :2].norm(dim=-1).max() < 0.3
+
+
+def test_a_plan_decodes_back_from_lane_coordinates():
+    scene, prior = curved_scenes(), small_prior()
+    routed, state = prior.start(scene, scene["route_log"].clamp(min=0))
+    ego = state.map(lambda value: value[:, :1])
+    x = 0.3 * torch.ones(1, 1, SIZE)
+    wanted = decode(x, ego, routed.points[:, :1])
+    again = decode(plan_to_x(wanted.states()[:, 0], state, routed)[:, None], ego, routed.points[:, :1])
+    gap = torch.hypot(again.x - wanted.x, again.y - wanted.y)
+    assert gap.max() < 0.15
+
+
+def test_bounds_cap_what_is_executed_and_only_that():
+    scene = curved_scenes()
+    scene["start"][:, 1, :2] = torch.tensor([7.5, 0.0])  # 3 m ahead of the ego
+    scene["start"][:, 5] = torch.tensor([0.5, 0.0, 0.0, 8.0])
+    scene["route_points"][:, 5] = arc(0.5, 0.0, 0.0, 0.0)
+    x0 = torch.ones(*scene["route_log"].shape, SIZE)
+    tight, loose = (small_prior(bounds=bounds) for bounds in (BoundSettings(), FREE))
+    capped, free = context_of(tight, scene), context_of(loose, scene)
+    assert (capped.cap <= free.cap).all() and (free.cap > 10).all()
+    assert capped.cap[0, 5] < -2
+    assert (tight.decode(x0, capped).v[0, 5, :5] < loose.decode(x0, free).v[0, 5, :5]).all()
+    torch.testing.assert_close(tight.decode(x0, capped, capped=False).v, loose.decode(x0, free).v)
+
+
+def test_an_exempt_vehicle_does_not_mind_the_ego():
+    scene = curved_scenes()
+    scene["start"][:, 5] = torch.tensor([-7.0, 0.0, 0.0, 8.0])
+    scene["route_points"][:, 5] = arc(-7.0, 0.0, 0.0, 0.0)
+    prior = small_prior()
+    exempt = torch.zeros(scene["route_log"].shape, dtype=torch.bool)
+    exempt[:, 5] = True
+    shy, bold = context_of(prior, scene).cap, context_of(prior, scene, exempt=exempt).cap
+    assert bold[0, 5] > shy[0, 5]
+    others = torch.arange(shy.shape[1]) != 5
+    assert torch.equal(shy[:, others], bold[:, others])
+
+
+def test_parked_absent_and_waiting_vehicles_stay_and_the_ego_is_not_moved():
+    scene, prior = curved_scenes(), small_prior()
+    scene["parked"][:, 1] = True
+    scene["start"][:, 4, 3] = 0.1
+    context = context_of(prior, scene)
+    plan = prior.plan(-torch.ones(*scene["route_log"].shape, SIZE), context)
+    states = plan.states()
+    still = [0, 1, 4, *range(len(VEHICLES), scene["route_log"].shape[1])]
+    start = scene["start"][:, :scene["route_log"].shape[1]]
+    torch.testing.assert_close(states[:, still, :, :3], start[:, still, None, :3].expand(-1, -1, HORIZON, -1))
+    assert (states[:, still, :, 3] == 0).all()
+    assert context.active[0].tolist() == [False, False, True, True, True, True, False, False]
+
+
+def test_vehicles_end_where_an_open_route_ends():
+    scene, prior = curved_scenes(), small_prior(bounds=FREE)
+    scene["route_length"][:, 2] = 30.0  # 10 m ahead, at 7 m/s
+    scene["route_length"][:, 3], scene["route_open"][:, 3] = 30.0, False
+    plan = prior.plan(torch.zeros(*scene["route_log"].shape, SIZE), context_of(prior, scene))
+    last = int(plan.on_map[0, 2].sum())
+    assert 10 <= last <= 18 and plan.on_map[0, 2, :last].all() and plan.on_map[0, 3].all()
+    assert (plan.motion.s[0, 2, :last] < 30).all() and plan.motion.s[0, 2, last] >= 30
+
+
+def test_samples_do_not_depend_on_the_batch_nor_on_absent_vehicles():
+    scene, prior = curved_scenes(3), small_prior()
+    for copy in range(3):
+        scene["start"][copy, 1, 3] += copy
+    noise = noise_for(prior, scene)
+    whole = prior.sample(context_of(prior, scene), noise).x0
+    alone = prior.sample(context_of(prior, scene[1:2]), noise[:, 1:2]).x0
+    torch.testing.assert_close(whole[1:2], alone, rtol=0, atol=2e-4)
+    wild = noise.clone()
+    wild[:, :, len(VEHICLES):] = 5.0
+    here = scene["valid"][0, :scene["route_log"].shape[1]]
+    torch.testing.assert_close(prior.sample(context_of(prior, scene), wild).x0[:, here], whole[:, here])
+
+
+def test_temperature_scales_every_noise():
+    scene, hot = curved_scenes(), small_prior(sampler=SamplerSettings(temperature=1.0))
+    cold = small_prior(sampler=SamplerSettings(temperature=0.5))
+    noise = noise_for(hot, scene)
+    context = context_of(hot, scene)
+    torch.testing.assert_close(cold.sample(context, 2 * noise).x0, hot.sample(context, noise).x0)
+
+
+def test_the_same_weights_carry_lane_and_free_space_plans_apart():
+    scene = curved_scenes()
+    scene["route_valid"][:, 3] = False
+    prior = small_prior(bounds=FREE)
+    context = context_of(prior, scene)
+    x0 = torch.ones(*scene["route_log"].shape, SIZE)
+    mixed = prior.decode(x0, context)
+    free = small_prior(bounds=FREE, free_space=True)
+    alone = free.decode(x0, context_of(free, scene))
+    torch.testing.assert_close(mixed.states()[:, 3], alone.states()[:, 3])
+    assert (mixed.states()[:, 1] != alone.states()[:, 1]).any()
+    assert (alone.kappa[:, 1, -1].abs() > 0.01).all(), "curvature knots bend the path"
+
+
+def test_routes_are_drawn_in_proportion_and_never_where_there_is_none():
+    logits = torch.tensor([1.0, 0.0, -torch.inf]).expand(20_000, 1, 3)
+    uniform = torch.rand(logits.shape, generator=torch.Generator().manual_seed(0))
+    chosen = sample_route(logits, 0.5, uniform)[:, 0]
+    share = torch.bincount(chosen, minlength=3) / len(chosen)
+    torch.testing.assert_close(share, torch.softmax(logits[0, 0] / 0.5, -1), rtol=0, atol=0.01)
+    assert (sample_route(logits, 0.0, uniform) == 0).all()
+
+
+def test_the_ego_follows_its_mission_whatever_is_drawn():
+    scene, prior = curved_scenes(), small_prior()
+    scene["route_valid"][:, :, 1] = scene["route_valid"][:, :, 0]
+    scene["route_log"][:, 0] = 1
+    uniform = torch.full(scene["route_valid"].shape, 0.5)
+    uniform[..., 0] = 0.999999
+    chosen = prior.choose_routes(scene, uniform)
+    assert chosen[0, 0] == 1 and (chosen[0, 1:] == 0).all()
+
+
