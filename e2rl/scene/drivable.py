@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 CELL = 1.0  # m
 MARGIN = 1.0  # m beyond half the lane width that still counts as on the road
 FAR = 10.0  # m, the field's cap
+INSIDE = 1.0  # m; cells at least this deep inside one lane are not looked at for others
 
 
 def drivable_field(
@@ -23,13 +24,15 @@ def drivable_field(
     grid = np.stack(np.meshgrid(origin[0] + axis, origin[1] + axis, indexing="ij"), -1).reshape(-1, 2)
     field = np.full(len(grid), FAR)
     if lines:
-        # One search per width: the nearest line is not always the one whose border is nearest.
+        # One search per width, the widest first: the nearest line is not always the one whose border is nearest.
         width = np.round(np.repeat(widths, [len(line) for line in lines]), 1)
         points = np.concatenate(lines)
-        for each in np.unique(width):
-            reach = each / 2 + MARGIN
-            distance = cKDTree(points[width == each]).query(grid, distance_upper_bound=FAR + reach)[0]
-            field = np.minimum(field, distance - reach)
+        for each in np.unique(width)[::-1]:
+            reach, own = each / 2 + MARGIN, points[width == each]
+            reached = (grid >= own.min(0) - FAR - reach).all(1) & (grid <= own.max(0) + FAR + reach).all(1)
+            unsettled = np.flatnonzero(reached & (field > -INSIDE))
+            distance = cKDTree(own).query(grid[unsettled], distance_upper_bound=FAR + reach)[0]
+            field[unsettled] = np.minimum(field[unsettled], distance - reach)
     for ring in polygons:
         low, high = ring.min(0) - FAR, ring.max(0) + FAR
         near = np.flatnonzero((grid >= low).all(1) & (grid <= high).all(1))

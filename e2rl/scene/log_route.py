@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from e2rl.scene.lane_graph import BEHIND, LaneGraph, Route, smooth_vertices
+from e2rl.scene.lane_graph import BEHIND, LaneGraph, Route, headings, smooth_vertices
 from e2rl.scene.paths import arc_length
 from e2rl.scene.route import SPACING
 
@@ -31,7 +31,7 @@ def route_from_log(graph: LaneGraph, track: np.ndarray, vertices: int) -> Route:
     line = np.concatenate([line, line[-1:] + vertices * SPACING * _direction(line)])
     arc, at = arc_length(line), np.arange(vertices) * SPACING
     points = smooth_vertices(np.stack([np.interp(at, arc, line[:, axis]) for axis in range(2)], 1))
-    lanes, limit = _lanes_along(graph, points)
+    lanes, limit = _lanes_along(graph, points, known)
     return Route(points, min(known, at[-1]), bool(known < at[-1]), lanes, limit, BEHIND)
 
 
@@ -41,13 +41,13 @@ def _direction(line: np.ndarray) -> np.ndarray:
     return back / np.linalg.norm(back)
 
 
-def _lanes_along(graph: LaneGraph, points: np.ndarray) -> tuple[list[tuple[str, float]], np.ndarray]:
-    """Lanes (id, arc length at which they begin) under route vertices [P, 2], and the speed limit [P] there."""
-    tangent = np.gradient(points, axis=0)
+def _lanes_along(graph: LaneGraph, points: np.ndarray, length: float) -> tuple[list[tuple[str, float]], np.ndarray]:
+    """Lanes (id, arc length at which they begin) under the first `length` m of route vertices [P, 2], and the speed
+    limit [P] there."""
     lanes, limit = [], np.zeros(len(points), np.float32)
-    for index, (point, angle) in enumerate(zip(points, np.arctan2(tangent[:, 1], tangent[:, 0]), strict=True)):
+    for index, (point, angle) in enumerate(zip(points, headings(points), strict=True)):
         near = graph.near_lanes(point, angle)
-        if near:
+        if near and index * SPACING <= length:
             limit[index] = graph.lanes[near[0][0]].speed_limit
             if near[0][0] not in [name for name, _ in lanes]:
                 lanes.append((near[0][0], index * SPACING))

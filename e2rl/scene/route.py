@@ -25,7 +25,8 @@ def nearest_vertex(points: Tensor, route: Tensor, hint: Tensor | None = None, wi
     squared = (route**2).sum(-1)[..., None, :] - 2 * points @ route.transpose(-1, -2)
     if hint is not None:
         arc = SPACING * torch.arange(route.shape[-2], device=route.device, dtype=points.dtype)
-        squared = squared.masked_fill((arc - hint[..., None]).abs() > window, torch.inf)
+        near = hint.clamp(0, SPACING * (route.shape[-2] - 1))  # beyond the ends, the end is what is near
+        squared = squared.masked_fill((arc - near[..., None]).abs() > window, torch.inf)
     return squared.argmin(-1)
 
 

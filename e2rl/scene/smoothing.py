@@ -32,7 +32,7 @@ def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> t
     right = np.clip(np.searchsorted(ts, grid - 1e-6), 1, len(ts) - 1)
     left = right - 1
     weight = np.clip((grid - ts[left]) / np.maximum(ts[right] - ts[left], 1e-6), 0, 1)[:, None]
-    near_left, near_right = weight * DT < 0.02, (1 - weight) * DT < 0.02
+    near_left, near_right = (grid - ts[left] < 0.02)[:, None], (ts[right] - grid < 0.02)[:, None]
     weight = np.where(near_left & ~valid[right], 0.0, np.where(near_right & ~valid[left], 1.0, weight))
     turn = wrap(states[right, :, 2] - states[left, :, 2])
     out = states[left] + weight[..., None] * (states[right] - states[left])
@@ -111,10 +111,11 @@ def causal_state(states: np.ndarray, valid: np.ndarray, frame: int) -> tuple[np.
     time = (np.arange(first, frame + 1) - frame) * DT
     known = np.flip(np.logical_and.accumulate(np.flip(valid[first:frame + 1], 0), axis=0), 0).astype(float)
     count = known.sum(0)
-    heading = np.unwrap(states[first:frame + 1, :, 2], axis=0)
+    way = states[first:frame + 1, :, :2] - states[frame, :, :2]  # small numbers, so that the fit is exact
+    turned = np.unwrap(np.where(known > 0, states[first:frame + 1, :, 2] - states[frame, :, 2], 0.0), axis=0)
     basis = np.stack([np.ones_like(time), time, time**2], 1)
-    position = _fit(basis, known, states[first:frame + 1, :, :2], quadratic=count >= 5)
-    turn = _fit(basis, known, heading[..., None], quadratic=np.zeros_like(count, bool))
+    position = _fit(basis, known, way, quadratic=count >= 5)
+    turn = _fit(basis, known, turned[..., None], quadratic=np.zeros_like(count, bool))
     angle = states[frame, :, 2]
     unit = np.stack([np.cos(angle), np.sin(angle)], -1)
     speed = np.clip((position[:, 1] * unit).sum(-1), 0.0, TOP_SPEED)
@@ -122,7 +123,8 @@ def causal_state(states: np.ndarray, valid: np.ndarray, frame: int) -> tuple[np.
     single = count < 2
     speed = np.where(single, np.clip(states[frame, :, 3], 0.0, TOP_SPEED), speed)
     accel, yaw_rate = np.where(single | (speed < 0.1), 0.0, accel), np.where(single, 0.0, turn[:, 1, 0])
-    return np.concatenate([position[:, 0], angle[:, None], speed[:, None]], 1), accel, np.clip(yaw_rate, -1.0, 1.0)
+    here = states[frame, :, :2] + position[:, 0]
+    return np.concatenate([here, angle[:, None], speed[:, None]], 1), accel, np.clip(yaw_rate, -1.0, 1.0)
 
 
 def _fit(basis: np.ndarray, weight: np.ndarray, value: np.ndarray, quadratic: np.ndarray) -> np.ndarray:
