@@ -1,0 +1,157 @@
+"""From configurations to scene sets: what is cached is what was built, what is left out is counted."""
+
+import os
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from e2rl.errors import InputError
+from e2rl.scene import source
+from e2rl.scene.source import load_scenes
+from tests.scene.descriptions import (
+    ALL,
+    Malicious,
+    data_config,
+    description,
+    fork,
+    lane,
+    numbered,
+    straight,
+    write_folder,
+    write_zip,
+)
+
+
+def scenes_of(count: int) -> list[dict]:
+    return numbered([description({"ego": straight(20 + k, 0, 8), "7": straight(50, 3.5, 6)}) for k in range(count)])
+
+
+def bad_scenes() -> dict[str, dict | bytes]:
+    """Named ways to be no scene."""
+    nan = description()
+    nan["tracks"]["7"]["state"]["position"][40] = np.nan
+    return {
+        "forbidden class posix.system": pickle.dumps({"x": Malicious(os.system, "true")}),
+        "no ego": description(sdc_id="nobody"), "no lanes": description(lanes={"b": lane([[0, 0]])}),
+        "NaN or infinite": nan, "cannot be read": b"nonsense",
+    }
+
+
+def same(a, b) -> None:
+    assert a.scene_id == b.scene_id and a.location == b.location and a.dropped == b.dropped
+    assert (a.dataset, a.split) == (b.dataset, b.split) and set(a.scenes.keys()) == set(b.scenes.keys())
+    for key, value in a.scenes.items():
+        assert torch.equal(value, b.scenes[key]) and value.dtype == b.scenes[key].dtype, key
+
+
+def test_folder_zip_cache_and_workers_give_identical_scenes(tmp_path, monkeypatch):
+    folder = write_folder(tmp_path / "x", scenes_of(3))
+    first = load_scenes(data_config(folder, tmp_path / "a"))
+    assert first.scene_id == ["scene-0", "scene-1", "scene-2"] and first.dataset == "made" and first.split == "x"
+    zipped = write_zip(tmp_path / "x.zip", scenes_of(3))
+    same(first, load_scenes(data_config(zipped, tmp_path / "b")))
+    same(first, load_scenes(data_config(folder, tmp_path / "c", workers=2)))
+    assert [path.suffix for path in (tmp_path / "a").iterdir()] == [".safetensors"]
+    monkeypatch.setattr(source, "build_scene", None)  # nothing is built again
+    same(first, load_scenes(data_config(folder, tmp_path / "a")))
+    limited = load_scenes(data_config(folder, tmp_path / "a"), num_scenes=2)
+    assert limited.scene_id == first.scene_id[:2]
+
+
+def test_the_cache_is_keyed_by_content_and_settings(tmp_path):
+    folder, cache = write_folder(tmp_path / "x", scenes_of(1)), tmp_path / "cache"
+    load_scenes(data_config(folder, cache))
+    write_folder(folder, numbered([description({"ego": straight(33, 0, 5)})]))
+    assert load_scenes(data_config(folder, cache)).scenes["start"][0, 0, 3].item() == pytest.approx(5.0, abs=1e-4)
+    assert load_scenes(data_config(folder, cache, build={"field_cells": 32})).scenes["field"].shape == (1, 32, 32)
+    assert load_scenes(data_config(folder, cache, split="mine")).split == "mine"
+    assert load_scenes(data_config(folder, cache), starts=[10, 30]).scene_id == ["scene-0@10", "scene-0@30"]
+    assert len(list(cache.iterdir())) == 5
+
+
+@pytest.mark.parametrize("damage", ["truncated", "nonsense", "other", "empty"])
+def test_a_damaged_cache_is_rebuilt(tmp_path, damage):
+    config = data_config(write_folder(tmp_path / "x", scenes_of(2)), tmp_path / "cache")
+    first = load_scenes(config)
+    (path,) = (tmp_path / "cache").iterdir()
+    content = path.read_bytes()
+    if damage == "other":
+        save_file({"a": torch.zeros(1)}, path)
+    else:
+        path.write_bytes({"truncated": content[:len(content) // 2], "nonsense": b"\xff" * 64, "empty": b""}[damage])
+    same(first, load_scenes(config))
+    assert path.read_bytes() == content or len(path.read_bytes()) == len(content)
+    assert list((tmp_path / "cache").iterdir()) == [path]
+
+
+@pytest.mark.parametrize("reason", bad_scenes())
+def test_the_first_invalid_scene_stops_the_load_and_leaves_nothing(tmp_path, reason):
+    folder = write_folder(tmp_path / "x", [*scenes_of(1), bad_scenes()[reason]])
+    with pytest.raises(InputError, match=rf"(?s)sd_01\.pkl.*{reason}.*data\.skip_invalid=true") as caught:
+        load_scenes(data_config(folder, tmp_path / "cache"))
+    assert "\n" not in str(caught.value) and not list((tmp_path / "cache").iterdir())
+
+
+def test_invalid_scenes_are_skipped_and_counted_on_request(tmp_path):
+    folder = write_folder(tmp_path / "x", [*bad_scenes().values(), *scenes_of(2)])
+    config = data_config(folder, tmp_path / "cache", skip_invalid=True)
+    found = load_scenes(config)
+    assert found.scene_id == ["scene-0", "scene-1"] and found.dropped == {"invalid": 5}
+    assert load_scenes(config).dropped == {"invalid": 5}  # from the cache too
+    for name in ("sd_05.pkl", "sd_06.pkl"):
+        (folder / name).unlink()
+    with pytest.raises(InputError, match="no valid scene.*5 invalid"):
+        load_scenes(config)
+
+
+def test_overlaps_with_the_ego_and_logs_too_short_are_dropped_and_counted(tmp_path):
+    close = description({"ego": straight(20, 0, 8), "7": straight(23, 0.5, 8)})
+    folder = write_folder(tmp_path / "x", [close, *scenes_of(1)])
+    found = load_scenes(data_config(folder, tmp_path / "cache"))
+    assert len(found) == 1 and found.dropped == {source.OVERLAP: 1}
+    with pytest.raises(InputError, match=f"no valid scene in .*x .2 {source.TOO_SHORT}"):
+        load_scenes(data_config(folder, tmp_path / "cache"), starts=[80])
+
+
+def test_start_frames_of_the_config_make_windows(tmp_path):
+    folder = write_folder(tmp_path / "x", scenes_of(2))
+    found = load_scenes(data_config(folder, tmp_path / "cache", starts=[10, 40]))
+    assert found.scene_id == ["scene-0@10", "scene-0@40", "scene-1@10", "scene-1@40"]
+    ego = found.scenes["logged_valid"][:, :, 0].sum(1)
+    assert ego.tolist() == [81, 51, 81, 51] and len(ALL) == 91
+
+
+def test_places_of_an_index_reach_the_scenes(tmp_path):
+    write_folder(tmp_path / "x", scenes_of(2))
+    (tmp_path / "index.csv").write_text("file,location_group\nsd_00.pkl,a\nsd_01.pkl,b\n")
+    assert load_scenes(data_config(tmp_path / "x", tmp_path / "cache")).location == ["a", "b"]
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"path": None}, r"data\.path is not set"), ({"path": "nowhere"}, "nowhere: no such file or folder"),
+    ({"source": "spreadsheet"}, r"data\.source=spreadsheet: expected bundled, procedural or scenarionet"),
+    ({"source": "bundled", "split": "best"}, "split 'best'"),
+])
+def test_configurations_that_name_nothing_say_so(tmp_path, change, message):
+    config = data_config(tmp_path, tmp_path / "cache")
+    vars(config).update(change)
+    with pytest.raises(InputError, match=message):
+        load_scenes(config)
+    with pytest.raises(InputError, match="num_scenes=0"):
+        load_scenes(data_config(tmp_path, tmp_path / "cache"), num_scenes=0)
+
+
+def test_a_cache_that_cannot_be_made_is_named(tmp_path):
+    folder = write_folder(tmp_path / "x", scenes_of(1))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="data.cache=.*file.*cannot be made"):
+        load_scenes(data_config(folder, tmp_path / "file"))
+
+
+def test_scenes_with_unlike_maps_are_one_set(tmp_path):
+    scenes = [*scenes_of(1), description(lanes=fork() | {"more": lane([[0, 30], [90, 30]])})]
+    found = load_scenes(data_config(write_folder(tmp_path / "x", scenes), tmp_path / "cache"))
+    assert found.scenes["lane_width"].shape == (2, 5) and found.scene_id == ["scene-0", "fork"]
