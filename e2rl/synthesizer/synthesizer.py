@@ -13,6 +13,8 @@ from torch import Tensor
 from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate
 from e2rl.prior.prior import Context, Plan, Prior
 from e2rl.prior.routed import RoutedScene, route_scene
+from e2rl.scene.recording import DT
+from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
 from e2rl.synthesizer.anchoring import Anchor, AnchorSettings, propose
 from e2rl.synthesizer.control import ControlSettings, SparseControl
@@ -25,6 +27,9 @@ from e2rl.synthesizer.potentials import (
 )
 from e2rl.synthesizer.skeleton import Skeleton, SkeletonSettings, build_skeleton, chain_depth
 from e2rl.synthesizer.topology import TopologySettings, topological_candidates
+
+LOOK = 5  # steps of the ego's plan over which its present yaw rate is taken
+PER_SAMPLE, LITERAL = 1000, 500  # numbers of draws: of a joint sample's, and of the literal blend's first
 
 
 @dataclass(frozen=True)
@@ -85,11 +90,12 @@ def put_rows(value, rows: Tensor, new):
     return out
 
 
-def noise_of(seed: Tensor, draw: int, shape: tuple[int, ...], uniform: bool = False) -> Tensor:
-    """Random numbers [B, *shape] that depend on each scene's seed and the draw's number only, not on the batch."""
+def noise_of(seed: Tensor, draw: Tensor, shape: tuple[int, ...], uniform: bool = False) -> Tensor:
+    """Random numbers [B, *shape] that depend on each scene's seed [B] and number of the draw [B] only, not on the
+    batch."""
     rows = []
-    for value in seed.tolist():
-        generator = torch.Generator().manual_seed((int(value) * 1_000_003 + draw) % (2**63))
+    for value, number in torch.stack([seed, draw], -1).tolist():
+        generator = torch.Generator().manual_seed((value * 1_000_003 + number) % (2**63))
         rows.append((torch.rand if uniform else torch.randn)(shape, generator=generator))
     return torch.stack(rows).to(seed.device)
 
@@ -110,43 +116,36 @@ class Synthesizer:
 
     def begin(self, scene: TensorDictBase, seed: Tensor, eta: Tensor) -> Episode:
         """Episodes of scenes [B] with routes drawn from the prior; seed [B] int64, eta [B]."""
-        uniform = noise_of(seed, 0, tuple(scene["route_valid"].shape[1:]), uniform=True)
+        uniform = noise_of(seed, torch.zeros_like(seed), tuple(scene["route_valid"].shape[1:]), uniform=True)
         routed, state = self.prior.start(scene, self.prior.choose_routes(scene, uniform))
         none = torch.zeros_like(routed.parked)
         zero = torch.zeros_like(routed.length)
         return Episode(seed, eta, torch.zeros_like(seed), routed, state, none, none.long() - 1, none, zero, zero)
 
     def replan(self, episode: Episode, world: World, ego_plan: Tensor) -> tuple[Episode, Plan]:
-        """The episodes and the plan of the coming HORIZON steps, given the ego's plan [B, HORIZON, 4] (detached).
-
-        All scenes of the batch must have been planned equally often.
-        """
-        ego_plan, count = ego_plan.detach(), int(episode.replans[0])
-        episode = replace(episode, state=self._with_ego(episode, world))
+        """The episodes and the plan of the coming HORIZON steps, given the ego's plan [B, HORIZON, 4] (detached)."""
+        ego_plan = ego_plan.detach()
+        episode = replace(episode, state=self._placed(episode, world, ego_plan))
         world = replace(world, route=episode.routed.route)
         controlled = bool((episode.eta > 0).any())
-        due = count == 0 or (self.settings.reselect > 0 and count % self.settings.reselect == 0)
-        if controlled and due:
-            rows = ((episode.eta > 0) & ~self._viable(episode, world, ego_plan)).nonzero().squeeze(-1)
-            if len(rows):
-                chosen = self._select(take_rows(episode, rows), take_rows(world, rows), ego_plan[rows], count)
-                episode = put_rows(episode, rows, chosen)
-                world = replace(world, route=episode.routed.route)
+        if controlled:
+            episode = self._reselected(episode, world, ego_plan)
+            world = replace(world, route=episode.routed.route)
         context = self._encode(episode, world, ego_plan, episode.coalition)
         where = self._where(episode, world, ego_plan)
         control = self._control(episode, world, where) if controlled else None
         best = None
         for draw in range(self.settings.samples):
-            sample = self.prior.sample(context, self._noise(episode.seed, count, draw), control)
+            sample = self.prior.sample(context, self._noise(episode, draw), control)
             jump = control.jump if control else torch.zeros_like(sample.kl)
             found = (sample.x0, sample.kl, jump, self._cost(sample.x0, context, where, episode.eta))
             best = found if best is None else _cheaper(best, found)
         return replace(episode, replans=episode.replans + 1, kl=episode.kl + best[1],
                        jump=episode.jump + best[2]), self.prior.plan(best[0], context)
 
-    def _noise(self, seed: Tensor, count: int, draw: int = 0) -> Tensor:
-        steps, vehicles = self.prior.sampler.steps, self._vehicles
-        return noise_of(seed, 1 + count + 1000 * draw, (steps, vehicles, SIZE)).transpose(0, 1)
+    def _noise(self, episode: Episode, sample: int = 0) -> Tensor:
+        shape = (self.prior.sampler.steps, episode.routed.route.shape[1], SIZE)
+        return noise_of(episode.seed, 1 + episode.replans + PER_SAMPLE * sample, shape).transpose(0, 1)
 
     def _cost(self, x0: Tensor, context: Context, where: PotentialContext, eta: Tensor) -> Tensor:
         """V_feas of everybody plus eta V_adv of the coalition [B]: whole joint samples are compared, never vehicles."""
@@ -157,16 +156,37 @@ class Synthesizer:
         threat = adversarial_potential(states, where, self.settings.potentials)
         return self.settings.selection * infeasible.sum(-1) + eta * threat.sum(-1)
 
-    def _with_ego(self, episode: Episode, world: World) -> LaneState:
-        """The lane states with the ego's row as it really is now."""
-        self._vehicles = episode.routed.route.shape[1]
-        ego = locate(world.states[:, :1], world.accel[:, :1], torch.zeros_like(world.accel[:, :1]),
-                     episode.routed.points[:, :1])
-        return LaneState(*(torch.cat([getattr(ego, f.name), getattr(episode.state, f.name)[:, 1:]], 1)
-                           for f in fields(LaneState)))
+    def _placed(self, episode: Episode, world: World, ego_plan: Tensor) -> LaneState:
+        """The lane states now: the ego as it really drove and is about to turn, the others where their plans led;
+        plans in free space do not know their routes, so the place beside them is looked up."""
+        state, routed = episode.state, episode.routed
+        yaw_rate = wrap(ego_plan[:, LOOK - 1, 2] - world.states[:, 0, 2]) / (LOOK * DT)
+        ego = torch.zeros_like(routed.parked)
+        ego[:, 0] = True
+        v = torch.where(ego, world.states[:, :1, 3], state.v)
+        now = locate(world.states[:, :ego.shape[1]], torch.where(ego, world.accel[:, :1], state.a),
+                     torch.where(ego, yaw_rate[:, None], state.kappa * state.v), routed.points, state.s + ego * v / 2)
+        beside = ("s", "d", "d1", "d2")
+        looked_up = {name: ego | ~routed.has_lane if name in beside else ego for name in vars(state)}
+        return LaneState(**{name: torch.where(rows, getattr(now, name), getattr(state, name))
+                            for name, rows in looked_up.items()})
 
     def _encode(self, episode: Episode, world: World, ego_plan: Tensor, exempt: Tensor) -> Context:
         return self.prior.encode(episode.routed, episode.state, world.states, world.valid, world.step, ego_plan, exempt)
+
+    def _reselected(self, episode: Episode, world: World, ego_plan: Tensor) -> Episode:
+        """The episodes, those with a new support whose choice is due and whose coalition is of no use any more."""
+        every = self.settings.reselect
+        due = (episode.replans == 0) | ((episode.replans % every == 0) if every > 0 else False)
+        rows = (due & (episode.eta > 0)).nonzero().squeeze(-1)
+        if not len(rows):
+            return episode
+        asked = take_rows(episode, rows), take_rows(world, rows), ego_plan[rows]
+        lost = (~self._viable(*asked)).nonzero().squeeze(-1)
+        if not len(lost):
+            return episode
+        chosen = self._select(take_rows(asked[0], lost), take_rows(asked[1], lost), asked[2][lost])
+        return put_rows(episode, rows[lost], chosen)
 
     def _viable(self, episode: Episode, world: World, ego_plan: Tensor) -> Tensor:
         """[B]: some member of the coalition can still meet its target, so the coalition stays as it is."""
@@ -179,22 +199,25 @@ class Synthesizer:
                             episode.replans)
         return propose(world.scene, world, skeleton, ego_plan, self.settings.anchor, keep_route=True)
 
-    def _select(self, episode: Episode, world: World, ego_plan: Tensor, count: int) -> Episode:
+    def _select(self, episode: Episode, world: World, ego_plan: Tensor) -> Episode:
         """Topology on a reference rollout, feasibility, skeleton; the coalition takes the routes that meet targets."""
-        scene, vehicles = world.scene, self._vehicles
+        scene, vehicles = world.scene, episode.routed.route.shape[1]
         context = self._encode(episode, world, ego_plan, torch.zeros_like(episode.coalition))
-        nominal = self.prior.plan(self.prior.sample(context, self._noise(episode.seed, count)).x0, context)
+        nominal = self.prior.plan(self.prior.sample(context, self._noise(episode)).x0, context)
         reference = torch.cat([ego_plan[:, None], nominal.states()[:, 1:]], 1).transpose(1, 2)
         valid = world.valid[:, None, :vehicles] & nominal.on_map.transpose(1, 2)
         found = topological_candidates(reference, valid, scene["size"][:, :vehicles], self.settings.topology)
         feasible = feasible_vehicles(scene, world, self.settings.feasibility).mask
-        steps = round(self.settings.skeleton.step / 0.1)
+        steps = round(self.settings.skeleton.step / DT)
         expected = reference[:, steps - 1::steps].transpose(1, 2)
         skeleton = build_skeleton(scene, world, found.candidates & feasible, feasible, self.settings.skeleton, expected)
         self._count(skeleton, found.candidates, feasible)
         anchor = propose(scene, world, skeleton, ego_plan, self.settings.anchor)
-        # A member that no route and acceleration lead to its target is pruned (Sec. IV-A3: infeasible configurations).
+        # A member that no route and acceleration lead to its target is pruned (Sec. IV-A3: infeasible configurations),
+        # and so is everybody whose chain to the ego leads over it.
         acts = skeleton.coalition & anchor.has & (episode.eta > 0)[:, None]
+        for _ in range(self.settings.skeleton.max_chain - 1):
+            acts = acts & ((skeleton.target <= 0) | acts.gather(1, skeleton.target.clamp(min=0)))
         return self._reroute(replace(
             episode, coalition=acts, target=torch.where(acts, skeleton.target, -1),
             adversaries=episode.adversaries | acts), world, torch.where(acts, anchor.route, world.route))
@@ -206,20 +229,20 @@ class Synthesizer:
             return episode
         routed = route_scene(world.scene, route, self.prior.free_space)
         old = episode.state
-        moved = locate(world.states[:, :self._vehicles], old.a, old.kappa * old.v, routed.points)
+        moved = locate(world.states[:, :route.shape[1]], old.a, old.kappa * old.v, routed.points)
         state = LaneState(*(torch.where(changed, getattr(moved, f.name), getattr(old, f.name))
                             for f in fields(LaneState)))
         return replace(episode, routed=routed, state=state)
 
     def _where(self, episode: Episode, world: World, ego_plan: Tensor) -> PotentialContext:
-        vehicles = self._vehicles
+        vehicles = episode.routed.route.shape[1]
         return PotentialContext(
             world.scene, world.states[:, :vehicles], episode.state.a, world.valid[:, :vehicles], episode.routed.points,
             episode.routed.has_lane, ego_plan[:, :HORIZON], episode.target)
 
     def _control(self, episode: Episode, world: World, where: PotentialContext) -> SparseControl:
         settings, anchor = self.settings, self._anchor(episode, world, where.ego_plan)
-        literal = noise_of(episode.seed, 10_000 + int(episode.replans[0]), (self._vehicles, SIZE))
+        literal = noise_of(episode.seed, LITERAL + episode.replans, (*episode.target.shape[1:], SIZE))
         return SparseControl(self.prior, settings.control, settings.potentials, where, episode.coalition, episode.eta,
                              anchor, settings.anchor.strength, literal)
 

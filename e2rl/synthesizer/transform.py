@@ -38,19 +38,19 @@ class AdversarialSynthesizer(Transform):
         batch = self._env.batch_size[0]
         tensordict = TensorDict({}, batch_size=[batch]) if tensordict is None else tensordict
         mask = tensordict.get("_reset", None)
-        mask = torch.ones(batch, dtype=torch.bool) if mask is None else mask.reshape(batch).cpu()
-        rows = mask.nonzero().squeeze(-1)
-        index, seed, eta = self.draw(len(rows))
-        chosen = torch.zeros(batch, 1, dtype=torch.long)
-        chosen[rows, 0] = index.cpu()
-        tensordict["scene_index"] = chosen.to(self._env.device)
+        mask = torch.ones(batch, dtype=torch.bool) if mask is None else mask.reshape(batch)
+        device = self._env.device
+        rows = mask.to(device).nonzero().squeeze(-1)
+        index, seed, eta = (value.to(device) for value in self.draw(len(rows)))
+        chosen = self._env.scene["scene_index"].clone()  # rows that go on keep their scene
+        chosen[rows] = index
+        tensordict["scene_index"] = chosen[:, None]
         self._pending = (rows, seed, eta)
         return tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         rows, seed, eta = self._pending
         device = self._env.device
-        rows, seed, eta = rows.to(device), seed.to(device), eta.to(device)
         world = self._env.world()
         fresh = self.synthesizer.begin(world.scene[rows], seed, eta)
         self.episode = fresh if self.episode is None else put_rows(self.episode, rows, fresh)
@@ -64,30 +64,27 @@ class AdversarialSynthesizer(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         world = self._env.world()
-        due = (world.step - self._planned == self.every) & ~next_tensordict["done"].reshape(-1)
+        # An ego that has left truncates its episode; who goes on stepping still needs traffic.
+        running = (world.step < self._env.horizon) & ~next_tensordict["terminated"].reshape(-1)
+        due = (world.step - self._planned >= self.every) & running
         rows = due.nonzero().squeeze(-1)
         if len(rows):
             self._replan(rows, world)
         return next_tensordict
 
     def _replan(self, rows: Tensor, world: World) -> None:
-        """Plans of environments `rows`, in groups that have been planned equally often."""
+        """New plans of environments `rows`, written into the traffic."""
         ego_plan = self.ego.plan(world)
-        for count in self.episode.replans[rows].unique().tolist():
-            group = rows[self.episode.replans[rows] == count]
+        if len(rows) == len(world.step):  # spares copies of maps
+            episode, plan = self.synthesizer.replan(self.episode, world, ego_plan)
+            self.episode = replace(episode, state=plan.after(self.every))
+        else:
             episode, plan = self.synthesizer.replan(
-                take_rows(self.episode, group), take_rows_of_world(world, group), ego_plan[group])
-            self.episode = put_rows(self.episode, group, replace(episode, state=plan.after(self.every)))
-            states, valid = plan.states().transpose(1, 2), plan.on_map.transpose(1, 2)
-            vehicles = states.shape[2]
-            self._plan[0][group, :, :vehicles] = states
-            self._plan[1][group, :, :vehicles] = valid & world.valid[group][:, None, :vehicles]
-            self._planned[group] = world.step[group]
+                take_rows(self.episode, rows), take_rows(world, rows), ego_plan[rows])
+            self.episode = put_rows(self.episode, rows, replace(episode, state=plan.after(self.every)))
+        states, valid = plan.states().transpose(1, 2), plan.on_map.transpose(1, 2)
+        vehicles = states.shape[2]
+        self._plan[0][rows, :, :vehicles] = states
+        self._plan[1][rows, :, :vehicles] = valid & world.valid[rows][:, None, :vehicles]
+        self._planned[rows] = world.step[rows]
         self._env.write_traffic(self._planned, *self._plan, self.episode.routed.route)
-
-
-def take_rows_of_world(world: World, rows: Tensor) -> World:
-    """The world of some of its scenes."""
-    plan = None if world.plan is None else world.plan[rows]
-    return World(world.scene[rows], world.step[rows], world.states[rows], world.valid[rows], world.accel[rows],
-                 world.route[rows], plan)
