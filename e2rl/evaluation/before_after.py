@@ -1,6 +1,4 @@
 """The before/after table of an evolution run: the same scenes and seeds, nominal and adversarial, for both policies."""
-
-import json
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -41,4 +39,4 @@ class BeforeAfter:
         file = self.folder / METRICS_FILE
         earlier = [row for row in (read_metrics(file) if file.exists() else []) if row.get("stage") != stage]
         write_metrics(file, earlier + rows)
-        return json.loads(file.read_text())
+        return read_metrics(file)
