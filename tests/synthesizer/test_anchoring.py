@@ -31,7 +31,7 @@ def travelled(knots, speed, accel=0.0):
 
 
 @pytest.mark.parametrize("ahead, way, speed", [
-    (40.0, 30.0, 10.0), (40.0, 45.0, 10.0), (30.0, 20.0, 4.0), (20.0, 25.0, 12.0), (45.0, 30.0, 0.5)])
+    (40.0, 30.0, 10.0), (40.0, 45.0, 10.0), (30.0, 20.0, 4.0), (20.0, 25.0, 12.0), (45.0, 16.0, 0.5)])
 def test_both_arrive_at_the_crossing_at_once(ahead, way, speed):
     world = make_world([EGO, (ahead, -way, UP, speed)])
     anchor, _ = anchored(world, 1)
