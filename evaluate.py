@@ -1,14 +1,13 @@
 """Closed-loop evaluation: `python evaluate.py [data=...] [ego=...] [eta=...]` prints and saves a metric table."""
 
-import sys
 from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from e2rl.errors import InputError
-from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_synthesizer, caption, set_up
+from e2rl.errors import InputError, stop
+from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_synthesizer, caption, check_protocol, set_up
 from e2rl.evaluation.protocol import Method, run_protocol
 from e2rl.report.tables import metric_tables, save_tables
 from e2rl.scene.source import load_scenes
@@ -17,6 +16,7 @@ from e2rl.scene.source import load_scenes
 def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     """Run the methods of a configuration and return the rows of metrics.json."""
     set_up(config)
+    check_protocol(config)
     scenes = load_scenes(config.data, config.num_scenes)
     prior, origin = build_prior(config, config.device)
     synthesizer, ego, sim = build_synthesizer(config, prior), build_ego(config), build_sim(config)
@@ -36,7 +36,7 @@ def main(config: DictConfig) -> None:
     try:
         evaluate(config, Path(HydraConfig.get().runtime.output_dir))
     except InputError as error:
-        sys.exit(f"error: {error}")
+        stop(error)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,12 @@
 """Training: `python train.py` runs evolution rounds; `stage=prior` trains a prior, `stage=imitation` an actor."""
 
-import sys
 from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from e2rl.errors import InputError
+from e2rl.errors import InputError, stop
 from e2rl.evaluation.before_after import BeforeAfter
 from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_synthesizer, caption, resolved, set_up
 from e2rl.evaluation.prior_stage import run_prior_stage
@@ -73,7 +72,7 @@ def main(config: DictConfig) -> None:
         set_up(config)
         STAGES[config.stage](config, folder)
     except InputError as error:
-        sys.exit(f"error: {error}")
+        stop(error)
 
 
 if __name__ == "__main__":

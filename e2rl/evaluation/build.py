@@ -6,7 +6,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from e2rl.ego.base import Ego
-from e2rl.errors import InputError
+from e2rl.errors import InputError, settings_of
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.checkpoint import load_prior
 from e2rl.prior.prior import Prior, SamplerSettings
@@ -25,13 +25,14 @@ PARTS = {"topology": TopologySettings, "feasibility": FeasibilitySettings, "skel
 
 def build_prior(config: DictConfig, device: str = "cpu") -> tuple[Prior, dict]:
     """The frozen prior of `config.prior` and the origin in its checkpoint."""
-    return load_prior(config.prior.checkpoint, SamplerSettings(**config.prior.sampler),
-                      BoundSettings(**config.prior.bounds), device)
+    return load_prior(config.prior.checkpoint, settings_of(SamplerSettings, config.prior.sampler, "prior.sampler"),
+                      settings_of(BoundSettings, config.prior.bounds, "prior.bounds"), device)
 
 
 def build_synthesizer(config: DictConfig, prior: Prior) -> Synthesizer:
     """The synthesizer of the `synthesizer` group on a prior."""
-    parts = {name: part(**config.synthesizer[name]) for name, part in PARTS.items() if name in config.synthesizer}
+    parts = {name: settings_of(part, config.synthesizer[name], f"synthesizer.{name}")
+             for name, part in PARTS.items() if name in config.synthesizer}
     scalars = {name: config.synthesizer[name] for name in ("reselect", "samples", "selection")
                if name in config.synthesizer}
     return Synthesizer(prior, SynthesizerSettings(**parts, **scalars))
@@ -51,17 +52,40 @@ def build_ego(config: DictConfig) -> Ego:
 
 def build_sim(config: DictConfig) -> SimSettings:
     """Simulator settings; ego=replay follows the recording exactly."""
-    sim = instantiate(config.sim)
+    try:
+        sim = instantiate(config.sim)
+    except InstantiationException as error:
+        raise InputError(f"sim: cannot be built: {error.__cause__ or error}; compare it with conf/sim") from error
     if config.ego.get("_target_", "").endswith("ReplayEgo"):
         sim.replay_ego = True
     return sim
 
 
 def set_up(config: DictConfig) -> None:
-    """Threads and device of this process; InputError where the device is not there."""
+    """Threads and device of this process; InputError where the device is not there or a size is impossible."""
+    for key in ("threads", "batch"):
+        if config[key] < 1:
+            raise InputError(f"{key}={config[key]}: expected at least 1")
     torch.set_num_threads(config.threads)
     if str(config.device).startswith("cuda") and not torch.cuda.is_available():
         raise InputError(f"device={config.device}: no CUDA device is available; use device=cpu")
+    try:
+        torch.empty(1, device=config.device)
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(f"device={config.device}: {str(error).splitlines()[0]}; use device=cpu or cuda") from error
+
+
+def check_protocol(config: DictConfig) -> None:
+    """InputError for methods, seeds or an intensity that evaluate.py cannot run."""
+    known = list(dict.fromkeys(["nominal", config.synthesizer.name]))
+    for name in config.methods:
+        if name not in known:
+            raise InputError(f"methods={list(config.methods)}: {name} is none of {', '.join(known)}; choose another "
+                             "with synthesizer=")
+    if not config.methods or not config.seeds:
+        raise InputError(f"methods={list(config.methods)}, seeds={list(config.seeds)}: name at least one of each")
+    if not 0 <= config.eta < float("inf"):
+        raise InputError(f"eta={config.eta}: the intensity is at least 0 (0 to 3 are sensible)")
 
 
 def caption(config: DictConfig, origin: dict) -> str:

@@ -6,8 +6,9 @@ import multiprocessing
 import os
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +19,7 @@ from safetensors.torch import save_file
 from tensordict import TensorDict
 from tqdm import tqdm
 
-from e2rl.errors import InputError
+from e2rl.errors import InputError, settings_of
 from e2rl.scene import bundled, procedural, scenarionet
 from e2rl.scene.build import BuildSettings, build_scene, ego_overlaps
 from e2rl.scene.recording import Recording
@@ -37,7 +38,7 @@ def load_scenes(
     these start frames; default: the log's own start frame, or data.starts. Raises InputError for a missing or empty
     path and, unless data.skip_invalid, for the first invalid scene.
     """
-    settings = BuildSettings(**data.build)
+    settings = settings_of(BuildSettings, data.build, "data.build")
     if num_scenes is not None and num_scenes < 1:
         raise InputError(f"num_scenes={num_scenes}: expected at least 1, or null for all")
     split = split or data.split
@@ -87,7 +88,7 @@ def _scenarionet(data, settings: BuildSettings, starts: list[int] | None) -> Sce
     return _cached(key, data, build)
 
 
-def _in_parallel(work, tasks: list, workers: int) -> Iterator[tuple]:
+def _in_parallel(work, tasks: list, workers: int) -> Generator[tuple]:
     """The rows of all tasks, worked off by several processes (by this one where there is work for one only)."""
     show = partial(tqdm, desc="building scenes", total=len(tasks), unit="log")
     if min(workers, len(tasks)) <= 1:
@@ -139,19 +140,20 @@ def _build_all(recordings, settings: BuildSettings, data, dataset: str, split: s
     return _assemble(_in_parallel(_build_recording, tasks, data.workers), data, dataset, split)
 
 
-def _assemble(rows: Iterable[tuple], data, dataset: str | None, split: str) -> SceneSet:
+def _assemble(rows: Generator[tuple], data, dataset: str | None, split: str) -> SceneSet:
     """Stack the good rows; raise the first invalid one's message unless data.skip_invalid."""
     dropped, good = Counter(), []
-    for scene, name, location, source, reason in rows:
-        if scene is not None:
-            good.append((scene, name, location, source))
-        elif reason in (OVERLAP, TOO_SHORT):
-            dropped[reason] += 1
-        elif data.skip_invalid:
-            dropped["invalid"] += 1
-            tqdm.write(f"left out {name}: {reason}", sys.stderr)
-        else:
-            raise InputError(f"{reason} (data.skip_invalid=true leaves such scenes out)")
+    with closing(rows):  # the bar ends before a message
+        for scene, name, location, source, reason in rows:
+            if scene is not None:
+                good.append((scene, name, location, source))
+            elif reason in (OVERLAP, TOO_SHORT):
+                dropped[reason] += 1
+            elif data.skip_invalid:
+                dropped["invalid"] += 1
+                tqdm.write(f"left out {name}: {reason}", sys.stderr)
+            else:
+                raise InputError(f"{reason} (data.skip_invalid=true leaves such scenes out)")
     if not good:
         left_out = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
         raise InputError(f"no valid scene in {data.get('path') or f'{dataset} {split}'} ({left_out}); see the messages "

@@ -1,0 +1,180 @@
+"""Bad input through train.py and evaluate.py: one line names what is wrong and how to mend it, nothing half-written.
+
+Most cases run the scripts in this process, which spares seconds of imports each; one of each script is a real process.
+"""
+
+import os
+import pickle
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from e2rl.prior.checkpoint import save_prior
+from e2rl.prior.denoiser import DenoiserSettings
+from e2rl.prior.prior import Prior
+from tests.scene.descriptions import Malicious, description, lane, numbered, straight, write_folder
+
+ROOT = Path(__file__).parents[1]
+SMALL = ["data.build.field_cells=64", "data.build.vehicles=4", "data.build.others=2", "data.workers=1"]
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """Folders of good and bad scenes, checkpoints of several kinds."""
+    root = tmp_path_factory.mktemp("input")
+    good = numbered([description({"ego": straight(20 + k, 0, 8), "7": straight(50, 3.5, 6)}) for k in range(2)])
+    nan = description()
+    nan["tracks"]["7"]["state"]["position"][40] = np.nan
+    bad = {"forbidden": pickle.dumps({"x": Malicious(os.system, f"touch {root / 'ran'}")}),
+           "no_ego": description(sdc_id="nobody"), "no_lanes": description(lanes={"b": lane([[0, 0]])}), "nan": nan,
+           "damaged": b"nonsense"}
+    write_folder(root / "good", good)
+    for name, scene in bad.items():
+        write_folder(root / name, [good[0], scene])
+    (root / "empty").mkdir()
+    torch.manual_seed(0)
+    path = save_prior(Prior(DenoiserSettings(width=16, heads=2, blocks=1, pair=8)), root, {"data": "made"})
+    path.rename(root / "prior.safetensors")
+    _variants(root)
+    return root
+
+
+def _variants(root: Path) -> None:
+    """Checkpoints that are none: of another architecture, another format, cut off, not safetensors."""
+    with safe_open(root / "prior.safetensors", "pt") as file:
+        metadata, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    save_file(tensors, root / "plain.safetensors")
+    save_file(dict(list(tensors.items())[1:]), root / "other.safetensors", metadata)
+    save_file(tensors, root / "unknown.safetensors", metadata | {"architecture": '{"denoiser": {"depth": 3}}'})
+    save_file(tensors, root / "format.safetensors", metadata | {"format": "e2rl-prior/9"})
+    content = (root / "prior.safetensors").read_bytes()
+    (root / "cut.safetensors").write_bytes(content[:len(content) // 2])
+    (root / "text.safetensors").write_text("no checkpoint")
+
+
+def arguments(world: Path, folder: Path, data: str, *more: str) -> list[str]:
+    """Overrides for scenes `data` with everything that is written below `folder`."""
+    return ["data=scenarionet", f"data.path={world / data}", f"data.cache={folder / 'cache'}", *SMALL,
+            f"prior.checkpoint={world / 'prior.safetensors'}", f"hydra.run.dir={folder / 'run'}", *more]
+
+
+def left_behind(folder: Path) -> list[str]:
+    """Files below a folder other than Hydra's record of the configuration and the log."""
+    return [str(path.relative_to(folder)) for path in folder.rglob("*")
+            if path.is_file() and ".hydra" not in path.parts and path.suffix != ".log"]
+
+
+def call(script: str, overrides: list[str], monkeypatch, capsys) -> tuple[int, str]:
+    """Exit status and what stderr says of a script run in this process, progress bars apart."""
+    monkeypatch.setattr(sys, "argv", [str(ROOT / script), *overrides])
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    threads = torch.get_num_threads()
+    try:
+        runpy.run_path(str(ROOT / script), run_name="__main__")
+        status = 0
+    except SystemExit as stop:
+        status = stop.code
+    finally:
+        GlobalHydra.instance().clear()
+        torch.set_num_threads(threads)
+    said = capsys.readouterr()
+    assert "Traceback" not in said.err + said.out
+    return status, said.err
+
+
+def error_line(said: str) -> str:
+    """The one line that begins with error:."""
+    lines = [line for line in said.splitlines() if line.startswith("error: ")]
+    assert len(lines) == 1, said
+    return lines[0]
+
+
+DATA = [
+    ("nowhere", "nowhere: no such file or folder", "pass one that holds"),
+    ("empty", "holds no .pkl", "convert the logs"),
+    ("forbidden", "sd_01.pkl: cannot be read: names the forbidden class posix.system", "data.skip_invalid=true"),
+    ("damaged", "sd_01.pkl: cannot be read", "data.skip_invalid=true"),
+    ("no_ego", "sd_01.pkl: no ego", "leave it out"),
+    ("no_lanes", "sd_01.pkl: scene 'fork': no lanes", "leave the scene"),
+    ("nan", "sd_01.pkl: track 7 is NaN or infinite at frame 40", "data.skip_invalid=true"),
+]
+CHECKPOINTS = [
+    ("none", "none.safetensors: no such file", "train one"), ("plain", "plain.safetensors: format None", "prior"),
+    ("format", "format.safetensors: format 'e2rl-prior/9'", "expected"),
+    ("other", "other.safetensors: another architecture", "train the prior again"),
+    ("unknown", "unknown.safetensors: ", "train the prior again"),
+    ("cut", "cut.safetensors: not a readable", "train the prior again"),
+    ("text", "text.safetensors: not a readable", "train the prior again"),
+]
+
+
+@pytest.mark.parametrize(("script", "data", "what", "remedy"), [*(("evaluate.py", *case) for case in DATA),
+                                                                ("train.py", *DATA[2])])
+def test_bad_scenes(world, tmp_path, monkeypatch, capsys, script, data, what, remedy):
+    status, said = call(script, arguments(world, tmp_path, data), monkeypatch, capsys)
+    assert status == 2 and what in error_line(said) and remedy in error_line(said)
+    assert not left_behind(tmp_path) and not (world / "ran").exists()
+
+
+@pytest.mark.parametrize(("script", "name", "what", "remedy"), [*(("evaluate.py", *case) for case in CHECKPOINTS),
+                                                                ("train.py", *CHECKPOINTS[3])])
+def test_bad_checkpoints(world, tmp_path, monkeypatch, capsys, script, name, what, remedy):
+    overrides = arguments(world, tmp_path, "good", f"prior.checkpoint={world / name}.safetensors")
+    status, said = call(script, overrides, monkeypatch, capsys)
+    assert status == 2 and what in error_line(said) and remedy in error_line(said)
+    assert [path.split("-")[0] for path in left_behind(tmp_path)] == ["cache/scenes"]
+
+
+@pytest.mark.parametrize(("script", "override", "what"), [
+    ("evaluate.py", "data.pth=x", "pth"), ("train.py", "round=3", "round"), ("evaluate.py", "ego=taxi", "taxi"),
+    ("train.py", "prior.sampler.step=3", "step"), ("train.py", "synthesizer=e3", "e3"),
+    ("evaluate.py", "eta", "eta"),
+])
+def test_unknown_keys_and_choices(world, tmp_path, monkeypatch, capsys, script, override, what):
+    status, said = call(script, [*arguments(world, tmp_path, "good"), override], monkeypatch, capsys)
+    assert status == 1 and what in said and not left_behind(tmp_path)  # Hydra's own message
+
+
+@pytest.mark.parametrize(("script", "overrides", "what"), [
+    ("train.py", ["stage=sleep"], "stage=sleep: choose one of"), ("evaluate.py", ["num_scenes=0"], "num_scenes=0"),
+    ("evaluate.py", ["data.source=bundled", "data.split=best"], "split 'best'"),
+    ("evaluate.py", ["data.source=spreadsheet"], "data.source=spreadsheet"),
+    ("evaluate.py", ["+prior.sampler.speed=3"], "speed"), ("evaluate.py", ["+data.build.depth=3"], "depth"),
+    ("evaluate.py", ["+synthesizer.control.depth=3"], "depth"), ("evaluate.py", ["+sim.gravity=3"], "gravity"),
+    ("evaluate.py", ["ego._target_=torch.nn.ReLU"], "ego=torch.nn.ReLU"),
+    ("evaluate.py", ["ego._target_=no.such.Driver"], "ego=no.such.Driver"),
+    ("evaluate.py", ["seeds=[]"], "seeds"), ("evaluate.py", ["methods=[e3]"], "e3"),
+    ("evaluate.py", ["device=tpu9"], "device=tpu9"), ("train.py", ["resume=nowhere"], "resume=nowhere"),
+    ("evaluate.py", ["eta=-1"], "eta"), ("evaluate.py", ["batch=0"], "batch=0"),
+    ("evaluate.py", ["ego=actor", "ego.checkpoint=none.safetensors"], "none.safetensors"),
+])
+def test_impossible_settings(world, tmp_path, monkeypatch, capsys, script, overrides, what):
+    status, said = call(script, arguments(world, tmp_path, "good", *overrides), monkeypatch, capsys)
+    assert status == 2 and what in error_line(said)
+    assert all(path.startswith("cache/scenes-") for path in left_behind(tmp_path))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="has CUDA")
+@pytest.mark.parametrize("script", ["evaluate.py", "train.py"])
+def test_a_device_that_is_not_there(world, tmp_path, script):
+    done = subprocess.run([sys.executable, str(ROOT / script), *arguments(world, tmp_path, "good", "device=cuda")],
+                          capture_output=True, text=True, timeout=120, cwd=tmp_path)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert error_line(done.stderr) == "error: device=cuda: no CUDA device is available; use device=cpu"
+    assert not left_behind(tmp_path)
+
+
+def test_skipped_scenes_are_counted_in_the_table(world, tmp_path, monkeypatch, capsys):
+    overrides = arguments(world, tmp_path, "nan", "data.skip_invalid=true", "methods=[nominal]", "seeds=[0]",
+                          "save_rollouts=false", "prior.sampler.steps=2")
+    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    assert status == 0 and "left out sd_01.pkl: sd_01.pkl: track 7 is NaN" in said
+    assert "left out: 1 scenes (invalid)" in " ".join((tmp_path / "run" / "tables.md").read_text().split())
