@@ -7,6 +7,7 @@ from e2rl.ego.base import PLAN_STEPS, Ego
 from e2rl.ego.path import MissionPath, look_up
 from e2rl.scene.recording import DT
 from e2rl.scene.route import project
+from e2rl.sim.car_following import desired_gap
 from e2rl.sim.dynamics import MAX_SPEED, bounded_speed, wrap
 from e2rl.sim.mission import limit_at
 from e2rl.sim.world import World
@@ -86,10 +87,7 @@ def idm_acceleration(
     a (1 - (v / v0)^n - (s* / s)^2) with s* = s0 + max(0, v T + v (v - v_leader) / (2 sqrt(a b))). Above the desired
     speed the free term is -b (1 - (v0 / v)^(a n / b)) (Treiber and Kesting's improved IDM): it brakes by b at most.
     """
-    closing = speed - leading
-    wanted = standstill_gap + (
-        speed * headway + speed * closing / (2 * (acceleration * braking) ** 0.5)
-    ).clamp(min=0)
+    wanted = desired_gap(speed, leading, headway, standstill_gap, acceleration, braking)
     below = acceleration * (1 - (speed / desired).clamp(max=1) ** exponent)
     above = -braking * (1 - (desired / speed.clamp(min=1e-3)).clamp(max=1) ** (acceleration * exponent / braking))
     free = torch.where(speed > desired, above, below)

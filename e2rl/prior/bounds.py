@@ -44,7 +44,7 @@ def acceleration_caps(
 
     agents [B, N, 4], present [B, N]: everybody now; exempt [B, V]: vehicles whose bounds ignore the ego (adversaries).
     """
-    size = routed.scene["size"]
+    size = routed.size
     vehicles = state.s.shape[1]
     width, length = size[:, :vehicles, 1], size[:, :vehicles, 0]
     cap = torch.full_like(state.v, 20.0)

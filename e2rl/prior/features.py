@@ -27,7 +27,7 @@ def _at(values: Tensor, s: Tensor) -> Tensor:
 def _lights(routed: RoutedScene, state: LaneState, step: Tensor) -> list[Tensor]:
     """Per light of the route: nearness, red, yellow, green, braking needed to stop at it (12 s ahead at most)."""
     out = []
-    states = routed.scene["light_state"]
+    states = routed.light_state
     for k in range(routed.light.shape[-1]):
         ahead = routed.light_s[..., k] - state.s
         seen = (routed.light[..., k] >= 0) & (ahead > -1.0) & (ahead < 120.0)
@@ -52,8 +52,7 @@ def curve_speed(state: LaneState, points: Tensor, lateral: float, brake: float) 
 
 def node_features(routed: RoutedScene, state: LaneState, agents: Tensor, present: Tensor, step: Tensor) -> Tensor:
     """[B, V, NODE] from lane states [B, V], agents' states [B, N, 4], present [B, N] and the simulated step [B]."""
-    scene, vehicles = routed.scene, state.s.shape[1]
-    size = scene["size"]
+    size, vehicles = routed.size, state.s.shape[1]
     v, width, length = state.v, size[:, :vehicles, 1], size[:, :vehicles, 0]
     limit = _at(routed.limit, state.s)
     known = limit > 0

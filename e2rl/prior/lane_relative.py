@@ -92,7 +92,7 @@ def offset_coefficients(state: LaneState, half: Tensor, end: Tensor) -> Tensor:
     and `end` at 1, where it is flat."""
     reach = lateral_horizon(state.v)
     low = torch.stack([state.d, state.d1 * reach, 0.5 * state.d2 * reach**2], -1)
-    at_half = low @ low.new_tensor([1.0, 0.5, 0.25])
+    at_half = low[..., 0] + 0.5 * low[..., 1] + 0.25 * low[..., 2]
     slope, bend = low[..., 1] + 2 * low[..., 2], 2 * low[..., 2]
     target = torch.stack([half - at_half, end - low.sum(-1), -slope, -bend], -1)
     return torch.cat([low, target @ _offset_basis(low.device).T], -1)
@@ -115,12 +115,6 @@ def split(x: Tensor, state: LaneState) -> tuple[Tensor, Tensor, Tensor]:
     end = OFFSET_SCALE * x[..., KNOTS + 1]
     half = 0.5 * (state.d + end) + BEND_SCALE * x[..., KNOTS]
     return ACCEL_SCALE * x[..., :KNOTS], half, end
-
-
-def join(knots: Tensor, half: Tensor, end: Tensor, state: LaneState) -> Tensor:
-    """Inverse of `split`."""
-    bend = (half - 0.5 * (state.d + end)) / BEND_SCALE
-    return torch.cat([knots / ACCEL_SCALE, bend[..., None], end[..., None] / OFFSET_SCALE], -1)
 
 
 def decode(x: Tensor, state: LaneState, points: Tensor) -> LaneState:

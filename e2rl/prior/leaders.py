@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from e2rl.scene.route import project
+from e2rl.sim.car_following import desired_gap
 
 SIDE_GAP = 0.3  # m of free space to either side that still makes somebody a leader
 FREE = 200.0  # m: the gap of a vehicle with nobody ahead
@@ -36,6 +37,9 @@ def leaders(
 def idm_acceleration(
     v: Tensor, target: Tensor, gap: Tensor, leader: Tensor, headway: float, jam: float, accel: float, brake: float
 ) -> Tensor:
-    """Intelligent Driver Model: v, target [m/s], gap [m] to a leader driving `leader` m/s -> acceleration [m/s^2]."""
-    wanted = jam + (v * headway + v * (v - leader) / (2 * (accel * brake) ** 0.5)).clamp(min=0)
+    """Intelligent Driver Model: v, target [m/s], gap [m] to a leader driving `leader` m/s -> acceleration [m/s^2].
+
+    The original free-road term; planners drive by the improved one of ego.idm.
+    """
+    wanted = desired_gap(v, leader, headway, jam, accel, brake)
     return accel * (1 - (v / target.clamp(min=1.0)) ** 4 - (wanted / gap.clamp(min=0.1)) ** 2)

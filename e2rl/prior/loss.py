@@ -86,7 +86,7 @@ def denoising_loss(prior: Prior, batch: TensorDictBase, settings: TrainingSettin
     level = level[:, None].expand(-1, rows).clone()
     level[:, 0] = torch.where(clean, CLEAN, level[:, 0])
     eps = torch.randn(batch["x0"].shape, generator=generator, device=device)
-    x = net.schedule.alpha(level)[..., None] * batch["x0"] + net.schedule.sigma(level)[..., None] * eps
+    x = net.schedule.noised(batch["x0"], level[..., None], eps)
     x0 = net(x, level, encoding).float()
     weight = batch["weight"] * torch.cat([(~clean)[:, None].float(), torch.ones_like(batch["weight"][:, 1:])], 1)
     total = weight.sum().clamp(min=1)

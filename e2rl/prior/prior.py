@@ -1,7 +1,7 @@
 """The frozen prior: routes, encoding, sampling and decoding of the joint future of a scene's vehicles."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 
 import torch
 from tensordict import TensorDictBase
@@ -14,7 +14,7 @@ from e2rl.prior.features import edge_features, node_features
 from e2rl.prior.lane_relative import HORIZON, LaneState, locate
 from e2rl.prior.route_choice import RouteChoice, sample_route
 from e2rl.prior.routed import RoutedScene, route_scene
-from e2rl.prior.sde import ddim_step, euler_maruyama_step, path_kl
+from e2rl.prior.sde import NoiseSchedule, ddim_step, euler_maruyama_step, path_kl
 from e2rl.scene.route import project
 
 CLEAN = 0.01  # noise level at which the ego's plan is shown to the network
@@ -74,7 +74,7 @@ class Prior(nn.Module):
         self.free_space = free_space
 
     @property
-    def schedule(self):
+    def schedule(self) -> NoiseSchedule:
         """The noise schedule (SDE) of the denoiser."""
         return self.denoiser.schedule
 
@@ -191,7 +191,7 @@ class Plan:
     """Planned motion (fields [B, V, HORIZON]) and on_map [B, V, HORIZON]: False once a vehicle's route has ended."""
 
     motion: LaneState
-    on_map: Tensor = field(repr=False)
+    on_map: Tensor
 
     def states(self) -> Tensor:
         """[B, V, HORIZON, 4]."""

@@ -15,15 +15,16 @@ CONFLICT_GAP = 2.5  # m between routes that meet
 
 @dataclass
 class RoutedScene:
-    """The routes of B scenes' vehicles and what follows from them.
+    """The routes of B scenes' vehicles and what follows from them; no maps, so that it is copied cheaply.
 
-    route [B, V]; points [B, V, P, 2]; length [B, V]; open [B, V]; limit [B, V, P]; light, light_s [B, V, 2];
-    conflict [B, V, V] bool, conflict_s [B, V, V]: arc length on i's route where it first meets j's; crossing [B, V, V]:
-    angle there [rad]; modelled [B, V]: vehicles that the prior moves or conditions on; parked [B, V];
-    has_lane [B, V]: others are represented in free space.
+    size [B, N, 2]; light_state [B, T+1, L]; route [B, V]; points [B, V, P, 2]; length [B, V]; open [B, V]; limit
+    [B, V, P]; light, light_s [B, V, 2]; conflict [B, V, V] bool, conflict_s [B, V, V]: arc length on i's route where it
+    first meets j's; crossing [B, V, V]: angle there [rad]; modelled [B, V]: vehicles that the prior moves or conditions
+    on; parked [B, V]; has_lane [B, V]: others are represented in free space.
     """
 
-    scene: TensorDictBase
+    size: Tensor
+    light_state: Tensor
     route: Tensor
     points: Tensor
     length: Tensor
@@ -59,10 +60,10 @@ def route_scene(scene: TensorDictBase, route: Tensor, free_space: bool = False) 
     both = (valid & ~parked & has_lane)
     conflict = conflict & both[:, :, None] & both[:, None, :]
     return RoutedScene(
-        scene, route, points, take_route(scene["route_length"], route), take_route(scene["route_open"], route),
-        take_route(scene["route_limit"], route), take_route(scene["route_light"], route),
-        take_route(scene["route_light_s"], route), conflict, conflict_s, crossing, valid & ~parked, parked,
-        has_lane & (not free_space))
+        scene["size"], scene["light_state"], route, points, take_route(scene["route_length"], route),
+        take_route(scene["route_open"], route), take_route(scene["route_limit"], route),
+        take_route(scene["route_light"], route), take_route(scene["route_light_s"], route), conflict, conflict_s,
+        crossing, valid & ~parked, parked, has_lane & (not free_space))
 
 
 def _conflicts(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -41,19 +41,20 @@ def make_windows(scenes: TensorDictBase, free: bool = False, chunk: int = 32) ->
         turn = torch.where(valid, logged[..., 2], 0.0)
         unwrapped = torch.cumsum(torch.cat([turn[:, :1], wrap(turn.diff(dim=1))], 1), 1)
         yaw_rate = derivative(unwrapped, valid).clamp(-1.0, 1.0)
-        parts += [_window(routed, offset, accel, yaw_rate, causal=False) for offset in OFFSETS]
-        parts.append(_window(routed, 0, accel, yaw_rate, causal=True))
+        parts += [_window(scene, routed, offset, accel, yaw_rate, causal=False) for offset in OFFSETS]
+        parts.append(_window(scene, routed, 0, accel, yaw_rate, causal=True))
     windows = torch.cat(parts)
     return windows[windows["weight"].sum(-1) > 0]
 
 
-def _window(routed: RoutedScene, offset: int, accel: Tensor, yaw_rate: Tensor, causal: bool) -> TensorDict:
+def _window(scene: TensorDictBase, routed: RoutedScene, offset: int, accel: Tensor, yaw_rate: Tensor, causal: bool
+            ) -> TensorDict:
     """Windows [B] at a frame: nodes [R, NODE], pairs [R, R, EDGE], present [R], x0 [R, SIZE], knot_weight [R, SIZE]
     (knots inside the recorded future), weight [R] of the vehicle in the loss, and for the trajectory term v, a, d, d1,
     d2, on_lane [R], ahead, aside, known [R, KNOTS]: recorded way and offset at 0.5 s steps (the offset counts on_lane
     only: in free space the lateral knots are no offsets). causal: start states as a causal observer estimates them;
     otherwise exact."""
-    scene, vehicles = routed.scene, routed.route.shape[1]
+    vehicles = routed.route.shape[1]
     logged, valid = scene["logged"][:, offset], scene["logged_valid"][:, offset] & scene["valid"]
     rate = (scene["start_accel"][:, :vehicles], scene["start_yaw_rate"][:, :vehicles]) if causal else (
         accel[:, offset], yaw_rate[:, offset])

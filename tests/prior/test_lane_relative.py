@@ -11,7 +11,6 @@ from e2rl.prior.lane_relative import (
     LaneState,
     decode,
     fit,
-    join,
     lateral_horizon,
     speeds,
     split,
@@ -103,12 +102,6 @@ def test_a_standing_vehicle_does_not_move_sideways():
     for name in ("x", "y", "heading"):
         torch.testing.assert_close(getattr(plan, name), getattr(state, name)[:, None].expand(1, HORIZON), rtol=0,
                                    atol=1e-4)
-
-
-def test_splitting_and_joining_are_inverse(generator):
-    state = straight(9.0, d=0.7, count=COUNT)
-    x = torch.randn(COUNT, SIZE, generator=generator)
-    torch.testing.assert_close(join(*split(x, state), state), x, rtol=0, atol=1e-5)
 
 
 def test_fitting_a_decoded_plan_gives_it_back(generator):
