@@ -62,12 +62,16 @@ class ActorNetwork(nn.Module):
         self.normaliser, self.reference = normaliser, reference
         self.trunk = perceptron(OBSERVATION_SIZE, hidden, 2, last_gain=0.0)
         self.spread = nn.Parameter((torch.tensor(initial_std) - NARROWEST).logit(1e-4))
+        self.noise: Tensor | None = None  # [D] standard deviations added to the network's input while cloning
         self.register_buffer("middle", (high + low) / 2, persistent=False)
         self.register_buffer("reach", (high - low) / 2, persistent=False)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """loc, scale [..., 2] from observation [..., D]."""
-        loc = self.trunk(self.normaliser(observation))
+        seen = self.normaliser(observation)
+        if self.noise is not None:
+            seen = seen + self.noise * torch.randn_like(seen)
+        loc = self.trunk(seen)
         if self.reference:
             share = (reference_action(observation) - self.middle) / self.reach
             loc = loc + share.clamp(-STEEPEST, STEEPEST).atanh()

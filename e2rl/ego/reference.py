@@ -10,15 +10,16 @@ from torch import Tensor
 from e2rl.ego.idm import idm_acceleration
 from e2rl.sim.observation import FAR, LOOK_AHEAD, NEAR, NEAREST, PROBE_X, PROBE_Y, SPEED
 
-EGO = slice(0, 11)
+EGO, LAST_ACTION = slice(0, 11), (1, 2)
 ROUTE = slice(11, 11 + 5 * len(LOOK_AHEAD))
 LIGHTS = slice(ROUTE.stop, ROUTE.stop + 8)
 AGENTS = slice(LIGHTS.stop + len(PROBE_X) * len(PROBE_Y), LIGHTS.stop + len(PROBE_X) * len(PROBE_Y) + 15 * NEAREST)
 
 DESIRED_SPEED = 12.0  # m/s where no limit is known
-PURSUIT_TIME, PURSUIT_MIN, PURSUIT_MAX = 1.0, 4.0, 25.0  # s, m, m: how far ahead steering aims
+PURSUIT_TIME, PURSUIT_MIN, PURSUIT_MAX = 1.5, 6.0, 30.0  # s, m, m: how far ahead steering aims
 ACCELERATION, BRAKING, HARDEST_BRAKING = 1.5, 2.5, 7.0  # m/s^2
 HEADWAY, STANDSTILL_GAP, EXPONENT = 1.2, 3.0, 4.0  # s, m
+COOLNESS = 0.99  # of the ACC model: 0 is IDM
 LATERAL = 2.5  # m/s^2 in curves
 GATE_MARGIN = 0.3  # m beyond the half widths
 REACTION = 0.5  # s in which a speed cap is met
@@ -38,16 +39,30 @@ def reference_action(observation: Tensor) -> Tensor:
     path = torch.stack([route[..., 0] * FAR, route[..., 1] * NEAR], -1)
     limit = ego[..., 6] * SPEED
     desired = torch.where(limit > 0, limit, DESIRED_SPEED).clamp(min=1.0)
-    gap, leading = _gaps(observation, path)
-    follow = idm_acceleration(
-        speed[..., None], desired[..., None], gap, leading, ACCELERATION, BRAKING, HEADWAY, STANDSTILL_GAP, EXPONENT
-    ).amin(-1)
+    follow = _following(speed[..., None], desired[..., None], *_leaders(observation, path)).amin(-1)
     accel = torch.minimum(follow, _capped(route, speed)).clamp(-HARDEST_BRAKING, ACCELERATION)
+    accel = torch.maximum(accel, -speed / REACTION)  # who stands has nothing to brake: 0, as in recordings
     return torch.stack([accel, speed * _pursuit(path, speed)], -1)
 
 
+def _following(speed: Tensor, desired: Tensor, gap: Tensor, leading: Tensor, acceleration: Tensor) -> Tensor:
+    """Acceleration [..., K] of the ACC model (Kesting, Treiber and Helbing 2010) behind leaders [..., K].
+
+    IDM brakes at full strength where a gap is short though the leader pulls away, as after every cut-in. Where it asks
+    for less than the constant-acceleration heuristic, which only avoids the crash, it is softened towards the latter.
+    """
+    own = idm_acceleration(speed, desired, gap, leading, ACCELERATION, BRAKING, HEADWAY, STANDSTILL_GAP, EXPONENT)
+    space, steady = gap.clamp(0.5, 1e3), acceleration.clamp(-HARDEST_BRAKING, ACCELERATION)
+    stops_first = leading * (speed - leading) <= -2 * space * steady
+    halting = speed**2 * steady / (leading**2 - 2 * space * steady).clamp(min=1e-3)
+    closing = steady - (speed - leading).clamp(min=0) ** 2 / (2 * space)
+    least = torch.where(stops_first, halting, closing)
+    soft = (1 - COOLNESS) * own + COOLNESS * (least + BRAKING * ((own - least) / BRAKING).tanh())
+    return torch.where((own < least) & gap.isfinite(), soft, own)
+
+
 def _pursuit(path: Tensor, speed: Tensor) -> Tensor:
-    """Curvature [...] 1/m of the circle through the ego and the point of path [..., K, 2] a second ahead."""
+    """Curvature [...] 1/m of the circle through the ego and the point of path [..., K, 2] PURSUIT_TIME ahead."""
     ahead = path.new_tensor(LOOK_AHEAD)
     reach = (PURSUIT_TIME * speed).clamp(PURSUIT_MIN, PURSUIT_MAX)
     high = torch.searchsorted(ahead, reach.contiguous()).clamp(1, len(LOOK_AHEAD) - 1)
@@ -70,8 +85,9 @@ def _capped(route: Tensor, speed: Tensor) -> Tensor:
     return (allowed - speed) / REACTION
 
 
-def _gaps(observation: Tensor, path: Tensor) -> tuple[Tensor, Tensor]:
-    """Free gap [..., NEAREST + 2] m along path [..., K, 2], inf for none, and speed along it, of agents and lights."""
+def _leaders(observation: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Free gap [..., NEAREST + 2] m along path [..., K, 2], inf for none, speed along it and acceleration, of agents
+    and stop lines."""
     ego = observation[..., EGO]
     half_length, half_width = 2.5 * ego[..., 8, None], ego[..., 9, None]
     agents = observation[..., AGENTS].unflatten(-1, (NEAREST, 15))
@@ -86,7 +102,9 @@ def _gaps(observation: Tensor, path: Tensor) -> tuple[Tensor, Tensor]:
     gap = (along - aligned.abs() * length - across * width - half_length).masked_fill(~leads, torch.inf)
     leading = (agents[..., 7] * SPEED * aligned).clamp(min=0)
     halt = _halts(observation, ego[..., 0] * SPEED) - half_length - LINE_GAP + STANDSTILL_GAP
-    return torch.cat([gap, halt], -1), torch.cat([leading, torch.zeros_like(halt)], -1)
+    still = torch.zeros_like(halt)
+    steady = 4 * agents[..., 8] * aligned
+    return torch.cat([gap, halt], -1), torch.cat([leading, still], -1), torch.cat([steady, still], -1)
 
 
 def _on_path(place: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor]:

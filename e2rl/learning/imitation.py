@@ -3,6 +3,9 @@
 Recorded pairs come in two kinds. Replayed: the ego follows its log exactly and the action is the inverse unicycle's.
 Disturbed: the ego tracks its log while its actions are perturbed for a second now and then (Laskey et al. 2017), so
 that the pairs show the way back; the label is the undisturbed action.
+
+While it clones, the network's input carries noise, most on the last executed action: actions last, so an actor that
+saw it would copy it and never learn what it depends on (de Haan et al. 2019).
 """
 
 from collections.abc import Callable
@@ -17,6 +20,7 @@ from tqdm import tqdm
 
 from e2rl.ego.base import Ego
 from e2rl.ego.network import WEIGHTS, ActorCritic
+from e2rl.ego.reference import LAST_ACTION
 from e2rl.ego.replay import ReplayEgo
 from e2rl.errors import InputError
 from e2rl.learning.driving import Disturbance, drive, episodes_of
@@ -32,15 +36,17 @@ BURST, PAUSE = 10, 20  # steps: a disturbance lasts, and the time between the be
 class ImitationSettings:
     """Fields: conf/learner/imitation.yaml."""
 
-    epochs: int = 20
+    epochs: int = 8
     minibatch: int = 512
-    learning_rate: float = 5e-4
-    weight_decay: float = 1e-4
+    learning_rate: float = 3e-4
+    weight_decay: float = 1e-2
     max_grad_norm: float = 1.0
     held_out: float = 0.1
-    drives: int = 1
+    drives: int = 3
     disturbed_acceleration: float = 1.0
-    disturbed_yaw_rate: float = 0.08
+    disturbed_yaw_rate: float = 0.15
+    feature_noise: float = 0.3
+    last_action_noise: float = 1.0
     batch: int = 64
     seed: int = 0
 
@@ -124,6 +130,8 @@ class Imitation:
             network.network.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
         )
         network.normaliser.observe(self.train["observation"])
+        self._noise = torch.full_like(network.normaliser.mean, settings.feature_noise)
+        self._noise[list(LAST_ACTION)] = settings.last_action_noise
 
     @torch.no_grad()
     def measure(self, pairs: TensorDictBase) -> tuple[float, float]:
@@ -140,8 +148,10 @@ class Imitation:
     def epoch(self) -> dict[str, float]:
         """One pass over the training pairs; returns losses on both parts."""
         order = torch.randperm(len(self.train), generator=self._generator).to(self.network.device)
+        self.network.network.noise = self._noise
         for index in order.split(self.settings.minibatch):
             take_step(self.optimiser, self.loss(self.train[index])["loss_bc"], self.settings.max_grad_norm)
+        self.network.network.noise = None
         (fit, miss), (held_fit, held_miss) = self.measure(self.train), self.measure(self.held_out)
         row = {"loss": fit, "miss": miss, "held_out_loss": held_fit, "held_out_miss": held_miss}
         self.history.append(row)
