@@ -20,7 +20,8 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     scenes = load_scenes(config.data, config.num_scenes)
     prior, origin = build_prior(config, config.device)
     synthesizer, ego, sim = build_synthesizer(config, prior), build_ego(config), build_sim(config)
-    methods = [Method(name, synthesizer, 0.0 if name == "nominal" else config.eta) for name in config.methods]
+    methods = [Method(name, synthesizer, 0.0 if name == "nominal" else config.eta)
+               for name in dict.fromkeys(config.methods)]
     name = HydraConfig.get().runtime.choices["ego"]
     rows = run_protocol(scenes, methods, ego, name, list(config.seeds), sim, folder, config.batch, config.device)
     dropped = "".join(f"; left out: {count} scenes ({reason})" for reason, count in scenes.dropped.items())

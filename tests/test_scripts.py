@@ -173,7 +173,7 @@ def test_a_device_that_is_not_there(world, tmp_path, script):
 
 
 def test_skipped_scenes_are_counted_in_the_table(world, tmp_path, monkeypatch, capsys):
-    overrides = arguments(world, tmp_path, "nan", "data.skip_invalid=true", "methods=[nominal]", "seeds=[0]",
+    overrides = arguments(world, tmp_path, "nan", "data.skip_invalid=true", "synthesizer=nominal", "seeds=[0]",
                           "save_rollouts=false", "prior.sampler.steps=2")
     status, said = call("evaluate.py", overrides, monkeypatch, capsys)
     assert status == 0 and "left out sd_01.pkl: sd_01.pkl: track 7 is NaN" in said
