@@ -1,4 +1,5 @@
 """The before/after table of an evolution run: the same scenes and seeds, nominal and adversarial, for both policies."""
+
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
