@@ -54,7 +54,7 @@ def acceleration_caps(
             seen = torch.cat([present[:, :1] & (not hidden), present[:, 1:]], 1)
             if hidden and not bool(rows.any()):
                 continue
-            gap, speed, _ = leaders(state.s, width, length, routed.points, agents, size, seen)
+            gap, speed, _ = leaders(state.s, width, length, routed.points, agents, size, seen, state.d)
             bound = idm_acceleration(state.v, free, gap, speed.clamp(min=0), settings.headway, settings.jam,
                                      settings.accel, settings.brake).clamp(min=settings.floor)
             cap = torch.where(rows & (gap < FREE), torch.minimum(cap, bound), cap)

@@ -11,12 +11,14 @@ FREE = 200.0  # m: the gap of a vehicle with nobody ahead
 
 
 def leaders(
-    s: Tensor, width: Tensor, length: Tensor, points: Tensor, agents: Tensor, size: Tensor, present: Tensor
+    s: Tensor, width: Tensor, length: Tensor, points: Tensor, agents: Tensor, size: Tensor, present: Tensor,
+    d: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The nearest agent ahead of each vehicle on its route: gap [m] (FREE if none), its speed along the route, index.
 
     s [B, V]: the vehicles' arc lengths; width, length [B, V]; points [B, V, P, 2]; agents [B, M, 4]: states to look at,
-    of which rows 0..V-1 are the vehicles themselves; size [B, M, 2]; present [B, M].
+    of which rows 0..V-1 are the vehicles themselves; size [B, M, 2]; present [B, M]. d [B, V]: the vehicles' offsets:
+    whoever is in the band between a vehicle's own offset and its route is ahead too (it changes lanes through it).
     """
     vehicles = s.shape[1]
     at, offset, heading = project(agents[:, None, :, :2], points)  # [B, V, M]
@@ -25,7 +27,9 @@ def leaders(
     half_side = (size[:, None, :, 0] * sin.abs() + size[:, None, :, 1] * cos.abs()) / 2
     half_along = (size[:, None, :, 0] * cos.abs() + size[:, None, :, 1] * sin.abs()) / 2
     ahead = at - s[..., None]
-    inside = offset.abs() < width[..., None] / 2 + half_side + SIDE_GAP
+    own = torch.zeros_like(s)[..., None] if d is None else d[..., None]
+    aside = offset - torch.minimum(torch.maximum(offset, own.clamp(max=0)), own.clamp(min=0))
+    inside = aside.abs() < width[..., None] / 2 + half_side + SIDE_GAP
     itself = torch.eye(vehicles, agents.shape[1], dtype=torch.bool, device=s.device)
     candidate = inside & (ahead > 0) & present[:, None, :] & ~itself
     gap = torch.where(candidate, ahead - length[..., None] / 2 - half_along, FREE)

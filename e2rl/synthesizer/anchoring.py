@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.errors import InputError
-from e2rl.prior.lane_relative import HORIZON, KNOTS, LaneState, speeds
+from e2rl.prior.lane_relative import HORIZON, KNOTS, LaneState, lateral_horizon, speeds
 from e2rl.scene.recording import DT
 from e2rl.scene.route import SPACING, interpolate, project
 from e2rl.sim.dynamics import wrap
@@ -22,6 +22,7 @@ from e2rl.synthesizer.motion import compact, cruise, fade, place, ride, take
 from e2rl.synthesizer.skeleton import Skeleton
 
 EXTRA = 2  # steps beyond the horizon, for the slope of the speed at the last knot
+SWING = 0.2  # peak of the lateral decoder's offset, per unit of slope and lateral horizon
 TURNING = 64  # vertices ahead whose curvature is looked at
 
 
@@ -40,6 +41,8 @@ class AnchorSettings:
     accel_cost: float = 0.2
     lateral_cost: float = 0.05
     max_offset: float = 1.0
+    max_shift: float = 4.5
+    max_swing: float = 1.0
 
     def __post_init__(self):
         if not 0 <= self.strength <= 1:
@@ -170,10 +173,13 @@ def _best(cost: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
 def _riders(scene: TensorDictBase, world: World, index: Tensor, settings: AnchorSettings) -> _Riders:
     vehicles = scene["route_points"].shape[1]
     states = take(world.states[:, :vehicles], index)
-    s, d, _ = place(states, scene, index)
+    s, d, error = place(states, scene, index)
     routes = take(scene["route_points"], index)
     end = take(scene["route_length"], index)
-    usable = take(scene["route_valid"], index)
+    swing = SWING * error.clamp(-1.0, 1.0).tan().abs() * lateral_horizon(states[..., 3])[..., None]
+    followed = torch.arange(s.shape[-1], device=s.device) == take(world.route, index)[..., None]
+    reachable = (d.abs() <= settings.max_shift) & (swing <= settings.max_swing)
+    usable = take(scene["route_valid"], index) & (reachable | followed)
     return _Riders(routes, usable, end, s, d, states[..., 3], take(world.accel[:, :vehicles], index),
                    take(scene["size"], index), turn_envelope(routes, s, settings))
 
