@@ -1,7 +1,8 @@
 """The learned ego's network: observation normalisation, a squashed Gaussian actor and a critic, and its file."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
-from e2rl.ego.reference import reference_action
+from e2rl.ego.reference import LAST_ACTION, reference_action
 from e2rl.errors import InputError
 from e2rl.sim.observation import OBSERVATION_SIZE
 
@@ -62,7 +63,7 @@ class ActorNetwork(nn.Module):
         self.normaliser, self.reference = normaliser, reference
         self.trunk = perceptron(OBSERVATION_SIZE, hidden, 2, last_gain=0.0)
         self.spread = nn.Parameter((torch.tensor(initial_std) - NARROWEST).logit(1e-4))
-        self.noise: Tensor | None = None  # [D] standard deviations added to the network's input while cloning
+        self.noise: Tensor | None = None  # [D], set by `noisy`
         self.register_buffer("middle", (high + low) / 2, persistent=False)
         self.register_buffer("reach", (high - low) / 2, persistent=False)
 
@@ -76,6 +77,16 @@ class ActorNetwork(nn.Module):
             share = (reference_action(observation) - self.middle) / self.reach
             loc = loc + share.clamp(-STEEPEST, STEEPEST).atanh()
         return loc, self.std.expand_as(loc)
+
+    @contextmanager
+    def noisy(self, features: float, last_action: float) -> Iterator[None]:
+        """While cloning: noise of these standard deviations on the network's normalised input, not the reference's."""
+        self.noise = torch.full_like(self.normaliser.mean, features)
+        self.noise[list(LAST_ACTION)] = last_action
+        try:
+            yield
+        finally:
+            self.noise = None
 
     @property
     def std(self) -> Tensor:

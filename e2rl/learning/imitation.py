@@ -20,7 +20,6 @@ from tqdm import tqdm
 
 from e2rl.ego.base import Ego
 from e2rl.ego.network import WEIGHTS, ActorCritic
-from e2rl.ego.reference import LAST_ACTION
 from e2rl.ego.replay import ReplayEgo
 from e2rl.errors import InputError
 from e2rl.learning.driving import Disturbance, drive, episodes_of
@@ -130,8 +129,6 @@ class Imitation:
             network.network.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
         )
         network.normaliser.observe(self.train["observation"])
-        self._noise = torch.full_like(network.normaliser.mean, settings.feature_noise)
-        self._noise[list(LAST_ACTION)] = settings.last_action_noise
 
     @torch.no_grad()
     def measure(self, pairs: TensorDictBase) -> tuple[float, float]:
@@ -148,10 +145,11 @@ class Imitation:
     def epoch(self) -> dict[str, float]:
         """One pass over the training pairs; returns losses on both parts."""
         order = torch.randperm(len(self.train), generator=self._generator).to(self.network.device)
-        self.network.network.noise = self._noise
-        for index in order.split(self.settings.minibatch):
-            take_step(self.optimiser, self.loss(self.train[index])["loss_bc"], self.settings.max_grad_norm)
-        self.network.network.noise = None
+        settings = self.settings
+        for index in order.split(settings.minibatch):
+            with self.network.network.noisy(settings.feature_noise, settings.last_action_noise):
+                loss = self.loss(self.train[index])["loss_bc"]
+            take_step(self.optimiser, loss, settings.max_grad_norm)
         (fit, miss), (held_fit, held_miss) = self.measure(self.train), self.measure(self.held_out)
         row = {"loss": fit, "miss": miss, "held_out_loss": held_fit, "held_out_miss": held_miss}
         self.history.append(row)

@@ -34,7 +34,7 @@ class CollectSettings:
 
     batch: int = 64
     steps: int = 80
-    iterations: int = 10
+    iterations: int = 20
 
 
 class PolicyImprovement:

@@ -29,10 +29,12 @@ class UpdateSettings:
     epochs: int = 4
     minibatch: int = 1024
     max_grad_norm: float = 0.5
-    target_kl: float = 0.03
+    target_kl: float = 0.02
     critic_warmup: int = 1
     cloning: float = 0.1
     cloning_minibatch: int = 256
+    feature_noise: float = 0.3
+    last_action_noise: float = 1.0
 
 
 class Learner:
@@ -103,7 +105,8 @@ class Learner:
         }
         if expert is not None and len(expert) and settings.cloning > 0 and not warming:
             pick = torch.randint(len(expert), (settings.cloning_minibatch,), device=expert.device)
-            losses["loss_cloning"] = self.cloning(expert[pick].to(self.network.device))["loss_bc"]
+            with self.network.network.noisy(settings.feature_noise, settings.last_action_noise):
+                losses["loss_cloning"] = self.cloning(expert[pick].to(self.network.device))["loss_bc"]
             total = total + settings.cloning * losses["loss_cloning"]
         take_step(self.optimiser, total, settings.max_grad_norm)
         return {name: value.detach().mean() for name, value in losses.items()}

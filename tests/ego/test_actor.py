@@ -128,3 +128,14 @@ def test_it_collects_and_survives_a_change_of_batch():
         env = DrivingEnv(make_scenes(3, num_vehicles=2), SimSettings(), batch)
         data = env.rollout(30, EgoPolicy(ego, env))
         assert torch.isfinite(data["action"]).all() and torch.isfinite(ego.plan(env.world())).all()
+
+
+def test_noise_is_the_networks_alone_and_ends_with_the_block():
+    ego, env = wild(ActorEgo(hidden=(8,))), DrivingEnv(make_scenes(2), SimSettings(), 2)
+    observation, network = env.reset()["observation"], ego.network.network
+    clean = network.deterministic(observation)
+    with network.noisy(0.3, 1.0):
+        assert not torch.equal(network.deterministic(observation), clean)
+        torch.nn.init.zeros_(network.trunk[-1].weight)
+        assert torch.allclose(network.deterministic(observation), reference_action(observation), atol=1e-4)
+    assert torch.equal(network.deterministic(observation), network.deterministic(observation))
