@@ -25,7 +25,7 @@ def evolve(config: DictConfig, folder: Path) -> None:
     synthesizer, ego, sim = build_synthesizer(config, prior), build_ego(config), build_sim(config)
     synthesize = synthesize_traffic(scenes, synthesizer, sim, config.batch, config.device)
     run, logger = build_evolution(config, scenes, sim, ego, synthesize), build_logger(config, folder)
-    measure = BeforeAfter(config, synthesizer, sim, folder)
+    measure = BeforeAfter(config, HydraConfig.get().runtime.choices["ego"], synthesizer, sim, folder)
     done = load_checkpoint(config.resume, run) if config.resume else 0
     if done == 0:
         measure("before", run.ego)

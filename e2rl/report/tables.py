@@ -78,9 +78,16 @@ def means_table(group: Sequence[dict], settings: str, metrics: Sequence[Metric])
 
 
 def paired_table(group: Sequence[dict]) -> Table:
-    """Differences of every method to the first one over the same (scene, seed), per cent points for shares."""
+    """Differences of every method to the first one over the same (scene, seed), per cent points for shares; where rows
+    have stages, of each method after training to the same method before.
+    """
     first, names = group[0], column_names(group)
-    columns = [(name, difference_to(row, first, group)) for name, row in zip(names[1:], group[1:], strict=True)]
+    reference = names[0]
+    if any(row.get("stage") == "after" for row in group):
+        reference = "before"
+        columns = [(name, row["paired"].get("before")) for name, row in zip(names, group, strict=True)]
+    else:
+        columns = [(name, difference_to(row, first, group)) for name, row in zip(names[1:], group[1:], strict=True)]
     columns = [(name, paired) for name, paired in columns if paired]
     body = [
         [heading(metric, points=True), *(difference_cell(metric, paired.get(metric.name)) for _, paired in columns)]
@@ -88,7 +95,7 @@ def paired_table(group: Sequence[dict]) -> Table:
         if any(not math.isnan(paired[metric.name]["difference"]) for _, paired in columns if metric.name in paired)
     ]
     caption = (
-        f"{place(first)}. Difference to {names[0]} [95% interval], paired by (scene, seed); * the interval "
+        f"{place(first)}. Difference to {reference} [95% interval], paired by (scene, seed); * the interval "
         "leaves out 0."
     )
     return Table(caption, ["", *(name for name, _ in columns)], body if columns else [])
