@@ -42,7 +42,7 @@ def evolve(config: DictConfig, folder: Path) -> None:
     tables = metric_tables(rows, caption(config, origin))
     save_tables(folder / "tables.md", tables)
     print_tables(tables)
-    print(f"\nwritten to {folder}; evaluate with: python evaluate.py ego=actor ego.checkpoint={folder}")
+    print(f"\nwritten to {folder}; {run.improve.outcome(folder)}")
 
 
 def train_prior(config: DictConfig, folder: Path) -> None:

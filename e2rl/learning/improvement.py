@@ -4,8 +4,10 @@ Both are called with the round's pool and the curriculum, improve their `ego` an
 episodes that they saw.
 """
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
@@ -98,6 +100,10 @@ class PolicyImprovement:
         self.sampler.set_extra_state(state["sampler"])
         self.frames = state["frames"]
 
+    def outcome(self, folder: Path) -> str:
+        """How to evaluate the improved ego of a run's folder."""
+        return f"evaluate the policy with: python evaluate.py ego=actor ego.checkpoint={folder}"
+
     def close(self) -> None:
         """Shut the collector down."""
         self._collector.shutdown()
@@ -137,6 +143,12 @@ class PlannerImprovement:
         metrics = {"objective_before": before["objective"], "objective": after["objective"],
                    "trials": float(len(tuning.trials)), **chosen}
         return metrics | driven[_name(tuning.best)].summary(), driven[_name(tuning.best)]
+
+    def outcome(self, folder: Path) -> str:
+        """Write the last round's whole grid to tuning.json; how to evaluate the planner as tuned."""
+        (folder / "tuning.json").write_text(json.dumps({"best": self.present, "trials": self.trials}, indent=1))
+        tuned = " ".join(f"ego.{key}={self.present[key]}" for key in self.grid)
+        return f"every trial of the last round is in tuning.json; evaluate the planner as tuned with: {tuned}"
 
     def state_dict(self) -> dict:
         """The best parameters so far."""

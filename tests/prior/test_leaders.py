@@ -51,3 +51,14 @@ def test_equilibrium_gap_free_road_and_closing():
     assert idm_acceleration(torch.tensor(0.0), target, torch.tensor(1e6), v, *settings).item() == pytest.approx(1.2)
     slower, faster = (idm_acceleration(v, target, equilibrium, v + dv, *settings) for dv in (-3, 3))
     assert slower < 0 < faster, "closing in brakes, falling behind accelerates"
+
+
+def test_whoever_is_between_a_vehicle_and_its_route_is_ahead_too():
+    points = torch.stack([2.0 * torch.arange(60), torch.zeros(60)], -1).expand(1, 2, 60, 2)
+    agents = torch.tensor([[[20.0, 3.5, 0.0, 10.0], [40.0, 3.5, 0.0, 4.0]]])
+    size, present = torch.tensor([4.0, 2.0]).expand(1, 2, 2), torch.ones(1, 2, dtype=torch.bool)
+    s, width, length = agents[..., 0], size[..., 1], size[..., 0]
+    on_route = leaders(s, width, length, points, agents, size, present)
+    changing = leaders(s, width, length, points, agents, size, present, agents[..., 1])
+    assert on_route[0][0, 0] == FREE
+    assert torch.isclose(changing[0][0, 0], torch.tensor(16.0)) and changing[1][0, 0] == 4.0

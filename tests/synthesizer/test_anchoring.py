@@ -56,9 +56,23 @@ def test_a_leader_brakes_and_a_follower_speeds_up():
 
 
 def test_the_candidate_that_meets_the_target_is_chosen():
+    world = make_world([EGO, (40.0, -30.0, UP, 8.0)])
+    world.scene["route_points"][:, 1, 2] = world.scene["route_points"][:, 1, 0]
+    world.scene["route_valid"][:, 1, 2] = True
+    add_route(world, 1, 0, 0.0)  # the one it follows leads away from the ego's
+    assert anchored(world, 1)[0].route[0, 1] == 2
+
+
+def test_a_route_that_a_vehicle_would_swing_off_or_cannot_shift_to_is_not_taken():
     world = make_world([EGO, (40.0, -30.0, 0.0, 8.0)])
     add_route(world, 1, 2, UP)
-    assert anchored(world, 1)[0].route[0, 1] == 2
+    assert not anchored(world, 1)[0].has.any()
+    assert anchored(world, 1, max_swing=100.0)[0].route[0, 1] == 2
+    beside = make_world([EGO, (30.0, -6.0, 0.0, 8.0)])
+    beside.scene["route_points"][:, 1, 2] = beside.scene["route_points"][:, 1, 0] + torch.tensor([0.0, 6.0])
+    beside.scene["route_valid"][:, 1, 2] = True
+    assert not anchored(beside, 1)[0].has.any()
+    assert anchored(beside, 1, max_shift=7.0)[0].route[0, 1] == 2
 
 
 def test_a_kept_route_is_the_only_one_looked_at():
