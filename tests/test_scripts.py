@@ -153,7 +153,8 @@ def test_unknown_keys_and_choices(world, tmp_path, monkeypatch, capsys, script, 
     ("evaluate.py", ["ego._target_=no.such.Driver"], "ego=no.such.Driver"),
     ("evaluate.py", ["seeds=[]"], "seeds"), ("evaluate.py", ["methods=[e3]"], "e3"),
     ("evaluate.py", ["device=tpu9"], "device=tpu9"), ("train.py", ["resume=nowhere"], "resume=nowhere"),
-    ("evaluate.py", ["eta=-1"], "eta"), ("evaluate.py", ["batch=0"], "batch=0"),
+    ("evaluate.py", ["eta=-1"], "eta"), ("evaluate.py", ["eta=abc"], "eta=abc"),
+    ("evaluate.py", ["num_scenes=0"], "num_scenes=0"), ("evaluate.py", ["batch=0"], "batch=0"),
     ("evaluate.py", ["ego=actor", "ego.checkpoint=none.safetensors"], "none.safetensors"),
 ])
 def test_impossible_settings(world, tmp_path, monkeypatch, capsys, script, overrides, what):

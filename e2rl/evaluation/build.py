@@ -84,8 +84,12 @@ def check_protocol(config: DictConfig) -> None:
                              "with synthesizer=")
     if not config.methods or not config.seeds:
         raise InputError(f"methods={list(config.methods)}, seeds={list(config.seeds)}: name at least one of each")
-    if not 0 <= config.eta < float("inf"):
-        raise InputError(f"eta={config.eta}: the intensity is at least 0 (0 to 3 are sensible)")
+    if not isinstance(config.eta, int | float) or not 0 <= config.eta < float("inf"):
+        raise InputError(f"eta={config.eta}: the intensity is a number of at least 0 (0 to 3 are sensible)")
+    if not all(isinstance(seed, int) for seed in config.seeds):
+        raise InputError(f"seeds={list(config.seeds)}: sampling seeds are whole numbers")
+    if config.num_scenes is not None and not (isinstance(config.num_scenes, int) and config.num_scenes > 0):
+        raise InputError(f"num_scenes={config.num_scenes}: a whole number of at least 1, or null for all")
 
 
 def caption(config: DictConfig, origin: dict) -> str:
