@@ -62,7 +62,7 @@ def build_sim(config: DictConfig) -> SimSettings:
 
 
 def set_up(config: DictConfig) -> None:
-    """Threads and device of this process; InputError where the device is not there or a size is impossible."""
+    """Threads, device and torch's seed; InputError where the device is not there or a size is impossible."""
     for key in ("threads", "batch"):
         if config[key] < 1:
             raise InputError(f"{key}={config[key]}: expected at least 1")
@@ -73,6 +73,7 @@ def set_up(config: DictConfig) -> None:
         torch.empty(1, device=config.device)
     except (RuntimeError, AssertionError) as error:
         raise InputError(f"device={config.device}: {str(error).splitlines()[0]}; use device=cpu or cuda") from error
+    torch.manual_seed(config.get("seed", 0))  # first weights and exploration; evaluation's noise has seeds of its own
 
 
 def check_protocol(config: DictConfig) -> None:

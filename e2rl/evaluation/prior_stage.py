@@ -3,7 +3,6 @@
 import hashlib
 from pathlib import Path
 
-import torch
 from omegaconf import DictConfig
 
 from e2rl.ego.replay import ReplayEgo
@@ -25,7 +24,6 @@ def run_prior_stage(config: DictConfig, folder: Path) -> tuple[Path, list[dict]]
     options = dict(config.prior.training)
     starts, validate_every = list(options.pop("starts")), options.pop("validate_every")
     scenes = load_scenes(config.data, None, _split(config), starts)
-    torch.manual_seed(config.seed)
     network = Prior(DenoiserSettings(**config.prior.network), SamplerSettings(**config.prior.sampler),
                     BoundSettings(**config.prior.bounds), config.prior.free_space).to(config.device)
     origin = {"data": f"{scenes.dataset}/{scenes.split}", "scenes": len(scenes), "starts": starts,
