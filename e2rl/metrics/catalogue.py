@@ -11,7 +11,6 @@ class Metric:
     about: str
     unit: str = ""
     share: bool = False
-    better: int = 0  # +1 more, -1 less is better for the traffic or the ego it measures; 0 neither
     column: str = ""  # of the rows, where it differs from the name; "" is the name
     weight: str = ""
     pooled: bool = False  # computed from the samples of all rollouts together, not from the rows
@@ -25,7 +24,7 @@ MAIN = (
     Metric("cfr", "ego hits any vehicle", share=True),
     Metric("cfr_adv", "ego hits an adversary", share=True),
     Metric("cfr_vru", "ego hits a pedestrian or cyclist", share=True),
-    Metric("cfr_bg", "other simulated vehicles hit each other", share=True, better=-1),
+    Metric("cfr_bg", "other simulated vehicles hit each other", share=True),
     Metric("front", "first contact at the ego's front", share=True),
     Metric("side", "first contact at the ego's side", share=True),
     Metric("rear", "first contact at the ego's rear", share=True),
@@ -36,10 +35,10 @@ MAIN = (
     Metric("ttc_c", "time-to-collision cost, adversaries"),
     Metric("macc", "ego's mean |acceleration|", unit="m/s²"),
     Metric("progress", "ego's way", unit="m"),
-    Metric("aor_step", "off the road, of vehicle-steps", share=True, better=-1, weight="aor_vehicle_steps"),
-    Metric("aor_any", "off the road, of rollouts", share=True, better=-1),
-    Metric("real", "realism, 1 - mean capped W1", better=1, pooled=True),
-    Metric("real_norm", "realism, W1 over the log's range", better=1, pooled=True),
+    Metric("aor_step", "off the road, of vehicle-steps", share=True, weight="aor_vehicle_steps"),
+    Metric("aor_any", "off the road, of rollouts", share=True),
+    Metric("real", "realism, 1 - mean capped W1", pooled=True),
+    Metric("real_norm", "realism, W1 over the log's range", pooled=True),
     Metric("transport", "path KL of the control"),
     Metric("seconds_per_rollout", "wall time", unit="s", column="seconds"),
 )
@@ -47,14 +46,14 @@ EXTRA = (
     Metric("front_any", "ego's front in contact at first contact", share=True),
     Metric("side_any", "ego's side in contact at first contact", share=True),
     Metric("rear_any", "ego's rear in contact at first contact", share=True),
-    Metric("bg_pairs", "pairs of other vehicles that hit each other", better=-1),
+    Metric("bg_pairs", "pairs of other vehicles that hit each other"),
     Metric("ttc_c_all", "time-to-collision cost, all agents"),
     Metric("transport_adversary", "path KL of the control, adversaries"),
     Metric("transport_others", "path KL of the control, other vehicles"),
     Metric("transport_anchor", "anchor jump"),
-    Metric("w1_a_lon", "W1 of longitudinal acceleration", unit="m/s²", better=-1, pooled=True),
-    Metric("w1_a_lat", "W1 of lateral acceleration", unit="m/s²", better=-1, pooled=True),
-    Metric("w1_jerk", "W1 of |jerk|", unit="m/s³", better=-1, pooled=True),
+    Metric("w1_a_lon", "W1 of longitudinal acceleration", unit="m/s²", pooled=True),
+    Metric("w1_a_lat", "W1 of lateral acceleration", unit="m/s²", pooled=True),
+    Metric("w1_jerk", "W1 of |jerk|", unit="m/s³", pooled=True),
 )
 METRICS = {metric.name: metric for metric in MAIN + EXTRA}
 IDENTITY = ("scene_id", "location", "seed", "eta")  # of a row, before its metrics

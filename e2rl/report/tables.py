@@ -174,8 +174,9 @@ def number(metric: Metric, value: float, signed: bool = False) -> str:
 
 
 def save_tables(path: Path, tables: Sequence[Table]) -> None:
-    """Write the tables into one markdown file, whole."""
-    replace(Path(path), "\n".join(table.markdown() for table in tables).encode())
+    """Write the tables into one markdown file, whole, with what each metric says below them."""
+    parts = [*(table.markdown() for table in tables), f"```\n{legend()}\n```\n"]
+    replace(Path(path), "\n".join(parts).encode())
 
 
 def print_tables(tables: Sequence[Table]) -> None:
