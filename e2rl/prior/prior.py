@@ -35,14 +35,14 @@ class SamplerSettings:
 
 @dataclass
 class Context:
-    """One replan of B scenes: routed, lane states [B, V], network encoding, the ego's plan as x [B, SIZE], the caps
-    [B, V] on acceleration, who is active [B, V] (simulated now, not parked, not the ego), and whether every vehicle has
+    """One replan of B scenes: routed, lane states [B, V], network encoding, the ego's plan as x [B, SIZE] (None where it
+    is unknown and sampled like everybody else's), the caps [B, V] on acceleration, who is active [B, V] (simulated now, not parked, not the ego), and whether every vehicle has
     a lane (asked once, on the host)."""
 
     routed: RoutedScene
     state: LaneState
     encoding: Encoding
-    ego_x: Tensor
+    ego_x: Tensor | None
     cap: Tensor
     active: Tensor
     all_on_lane: bool
@@ -96,11 +96,11 @@ class Prior(nn.Module):
 
     @torch.no_grad()
     def encode(self, routed: RoutedScene, state: LaneState, agents: Tensor, present: Tensor, step: Tensor,
-               ego_plan: Tensor, exempt: Tensor | None = None) -> Context:
+               ego_plan: Tensor | None, exempt: Tensor | None = None) -> Context:
         """Everything that stays the same over the denoising steps of a replan.
 
         agents [B, N, 4], present [B, N]: everybody now; step [B]: simulated steps; ego_plan [B, HORIZON, 4]: the ego's
-        states ahead; exempt [B, V]: vehicles whose bounds ignore the ego.
+        states ahead, None (open loop) where nobody knows them; exempt [B, V]: vehicles whose bounds ignore the ego.
         """
         vehicles = state.s.shape[1]
         here = present[:, :vehicles]
@@ -110,11 +110,14 @@ class Prior(nn.Module):
         cap = acceleration_caps(self.bounds, routed, state, agents, present, exempt)
         active = here & routed.modelled
         active = torch.cat([torch.zeros_like(active[:, :1]), active[:, 1:]], 1)
-        return Context(routed, state, encoding, plan_to_x(ego_plan, state, routed), cap, active,
+        ego_x = None if ego_plan is None else plan_to_x(ego_plan, state, routed)
+        return Context(routed, state, encoding, ego_x, cap, active,
                        bool(routed.has_lane.all()))
 
     def denoise(self, x: Tensor, level: Tensor, context: Context) -> Tensor:
-        """x0 [B, V, SIZE] of x at a scalar noise level; the ego's row is its plan, given clean."""
+        """x0 [B, V, SIZE] of x at a scalar noise level; the ego's row is its plan, given clean, where that is known."""
+        if context.ego_x is None:
+            return self.denoiser(x, level.expand(x.shape[:2]), context.encoding)
         x = torch.cat([context.ego_x[:, None], x[:, 1:]], 1)
         levels = level.expand(x.shape[:2]).clone()
         levels[:, 0] = CLEAN
