@@ -35,9 +35,9 @@ class SamplerSettings:
 
 @dataclass
 class Context:
-    """One replan of B scenes: routed, lane states [B, V], network encoding, the ego's plan as x [B, SIZE] (None where it
-    is unknown and sampled like everybody else's), the caps [B, V] on acceleration, who is active [B, V] (simulated now, not parked, not the ego), and whether every vehicle has
-    a lane (asked once, on the host)."""
+    """One replan of B scenes: routed, lane states [B, V], network encoding, the ego's plan as x [B, SIZE] (None where
+    it is unknown and sampled like everybody else's), the caps [B, V] on acceleration, who is active [B, V] (simulated
+    now, not parked, not the ego), and whether every vehicle has a lane (asked once, on the host)."""
 
     routed: RoutedScene
     state: LaneState
