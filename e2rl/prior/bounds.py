@@ -1,7 +1,8 @@
 """Feasibility bounds: how hard each vehicle may accelerate in the part of a plan that is executed.
 
 They are part of the simulated traffic for every method alike, and stand in each table's caption. What they allow is a
-cap on acceleration; they never push a vehicle forward.
+cap on acceleration; they never push a vehicle forward. A cap acts only on a vehicle whose plan is not feasible as it
+stands: it meets somebody else's plan, or takes a curve too fast.
 """
 
 from dataclasses import dataclass
@@ -13,13 +14,17 @@ from e2rl.prior.features import curve_speed
 from e2rl.prior.lane_relative import LaneState
 from e2rl.prior.leaders import FREE, idm_acceleration, leaders
 from e2rl.prior.routed import RoutedScene
+from e2rl.scene.recording import DT
+from e2rl.sim.geometry import overlap
 
 
 @dataclass(frozen=True)
 class BoundSettings:
     """Headway [s], jam gap [m], acceleration and comfortable braking [m/s^2] of the leader bound and its floor; lateral
     acceleration and braking of the curve bound; time gap [s] and braking of the crossing bound; each can be off.
-    onset [m/s^2]: what a bound may take off the current acceleration at once, the rest follows over half a second."""
+    onset [m/s^2]: what a bound may take off the current acceleration at once, the rest follows over half a second;
+    look [s], ahead, aside [m]: a plan is feasible if its box, larger by that much, meets nobody's for so long (look 0:
+    caps act always)."""
 
     leader: bool = True
     headway: float = 0.5
@@ -35,6 +40,9 @@ class BoundSettings:
     crossing_time: float = 2.0
     crossing_brake: float = 5.0
     onset: float = 2.0
+    look: float = 3.0
+    ahead: float = 1.5
+    aside: float = 0.2
 
 
 def acceleration_caps(
@@ -83,3 +91,31 @@ def _crossing(
     need = state.v[..., None] ** 2 / (2 * room)
     stops = active & (need <= settings.crossing_brake) & (need > 0.8)
     return torch.where(stops, -need, 20.0).amin(-1)
+
+
+LOOK_STRIDE = 3  # steps between the times at which plans are compared
+
+
+def infeasible(
+    settings: BoundSettings, routed: RoutedScene, motion: LaneState, agents: Tensor, present: Tensor, exempt: Tensor
+) -> Tensor:
+    """Vehicles [B, V] whose plan must not be driven as it stands: it meets somebody's plan within `look`, or takes a
+    curve at more than `curve_lateral`.
+
+    motion: fields [B, V, HORIZON]; agents [B, N, 4], present [B, N]: everybody now, of whom those without a plan keep
+    their velocity; exempt [B, V]: vehicles that may meet the ego.
+    """
+    steps = torch.arange(LOOK_STRIDE - 1, round(settings.look / DT), LOOK_STRIDE, device=agents.device)
+    vehicles = motion.v.shape[1]
+    plans = motion.states()[:, :, steps]
+    others = agents[:, vehicles:, None].expand(-1, -1, len(steps), -1)
+    velocity = others[..., 3:] * torch.stack([torch.cos(others[..., 2]), torch.sin(others[..., 2])], -1)
+    moved = others[..., :2] + velocity * (DT * (steps + 1))[:, None]
+    everybody = torch.cat([plans, torch.cat([moved, others[..., 2:]], -1)], 1)
+    grown = routed.size[:, :vehicles] + routed.size.new_tensor([2 * settings.ahead, 2 * settings.aside])
+    meets = overlap(plans[:, :, None], grown[:, :, None, None], everybody[:, None], routed.size[:, None, :, None])
+    ignored = torch.eye(vehicles, agents.shape[1], dtype=torch.bool, device=agents.device).expand(len(agents), -1, -1)
+    ignored = ignored | ~present[:, None, :]
+    ignored = torch.cat([ignored[..., :1] | exempt[..., None], ignored[..., 1:]], -1)
+    lateral = (motion.v**2 * motion.kappa.abs())[..., steps].amax(-1)
+    return (meets.any(-1) & ~ignored).any(-1) | (lateral > settings.curve_lateral)

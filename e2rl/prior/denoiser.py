@@ -13,12 +13,13 @@ from e2rl.prior.sde import NoiseSchedule
 
 @dataclass(frozen=True)
 class DenoiserSettings:
-    """Width, attention heads, blocks, width of the pair embedding."""
+    """Width, attention heads, blocks, width of the pair embedding, share of activations dropped in training."""
 
     width: int = 96
     heads: int = 4
     blocks: int = 3
     pair: int = 24
+    dropout: float = 0.1
 
 
 @dataclass
@@ -39,7 +40,7 @@ class Encoding:
 class Block(nn.Module):
     """Attention over vehicles and an MLP, both modulated by noise level and node (adaLN-zero)."""
 
-    def __init__(self, width: int, heads: int, pair: int):
+    def __init__(self, width: int, heads: int, pair: int, dropout: float):
         super().__init__()
         self.heads = heads
         self.norm_attention = nn.LayerNorm(width, elementwise_affine=False)
@@ -48,7 +49,9 @@ class Block(nn.Module):
         self.qkv = nn.Linear(width, 3 * width)
         self.pair_value = nn.Linear(heads * pair, width)
         self.out = nn.Linear(width, width)
-        self.mlp = nn.Sequential(nn.Linear(width, 3 * width), nn.GELU(), nn.Linear(3 * width, width))
+        self.mlp = nn.Sequential(nn.Linear(width, 3 * width), nn.GELU(), nn.Dropout(dropout),
+                                 nn.Linear(3 * width, width))
+        self.drop = nn.Dropout(dropout)
         nn.init.zeros_(self.modulation.weight)
         nn.init.zeros_(self.modulation.bias)
 
@@ -57,7 +60,7 @@ class Block(nn.Module):
         batch, vehicles, width = h.shape
         q, k, v = self.qkv(self.norm_attention(h) * (1 + scale_a) + shift_a).reshape(
             batch, vehicles, 3, self.heads, width // self.heads).permute(2, 0, 3, 1, 4)
-        weight = torch.softmax(q @ k.transpose(-1, -2) / math.sqrt(q.shape[-1]) + bias, -1)
+        weight = self.drop(torch.softmax(q @ k.transpose(-1, -2) / math.sqrt(q.shape[-1]) + bias, -1))
         mixed = (weight @ v).transpose(1, 2).reshape(batch, vehicles, width)
         pair = torch.einsum("bhij,bije->bihe", weight, pairs).flatten(2)
         h = h + gate_a * self.out(mixed + self.pair_value(pair))
@@ -73,13 +76,14 @@ class Denoiser(nn.Module):
         self.schedule = NoiseSchedule()
         self.register_buffer("node_mean", torch.zeros(NODE))
         self.register_buffer("node_std", torch.ones(NODE))
-        self.encode_node = nn.Sequential(nn.Linear(NODE, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
+        self.encode_node = nn.Sequential(nn.Linear(NODE, 2 * width), nn.GELU(), nn.Dropout(settings.dropout),
+                                         nn.Linear(2 * width, width))
         self.encode_pair = nn.Sequential(nn.Linear(EDGE, 48), nn.GELU(), nn.Linear(48, settings.pair), nn.GELU())
         self.bias = nn.Linear(settings.pair, settings.heads * settings.blocks)
         self.embed_x = nn.Linear(SIZE, width)
         self.embed_level = nn.Sequential(nn.Linear(32, width), nn.GELU(), nn.Linear(width, width))
         self.blocks = nn.ModuleList(
-            Block(width, settings.heads, settings.pair) for _ in range(settings.blocks))
+            Block(width, settings.heads, settings.pair, settings.dropout) for _ in range(settings.blocks))
         self.head = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, SIZE))
         nn.init.zeros_(self.head[1].weight)
         nn.init.zeros_(self.head[1].bias)

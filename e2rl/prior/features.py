@@ -13,7 +13,7 @@ CURVATURE_AT = (0.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)  # m ahead
 TURN_AT = (10.0, 20.0, 40.0, 60.0, 80.0)
 LEADER_AT = (0.0, 1.5, 3.0)  # s ahead, the others at constant velocity
 COMFORT_LATERAL, COMFORT_BRAKE = 2.5, 1.2  # m/s^2
-NODE, EDGE = 50, 15
+NODE, EDGE = 51, 15
 SIDED_NODE = (2, 3, 4, *range(9, 22))  # features that change sign under a mirror image
 SIDED_EDGE = (1, 3, 5, 13)
 
@@ -50,8 +50,13 @@ def curve_speed(state: LaneState, points: Tensor, lateral: float, brake: float) 
     return torch.sqrt(lateral / curvature.clamp(min=1e-4) + 2 * brake * ahead).min(-1).values
 
 
-def node_features(routed: RoutedScene, state: LaneState, agents: Tensor, present: Tensor, step: Tensor) -> Tensor:
-    """[B, V, NODE] from lane states [B, V], agents' states [B, N, 4], present [B, N] and the simulated step [B]."""
+def node_features(routed: RoutedScene, state: LaneState, agents: Tensor, present: Tensor, step: Tensor,
+                  estimated: Tensor) -> Tensor:
+    """[B, V, NODE] from lane states [B, V], agents' states [B, N, 4], present [B, N] and the simulated step [B].
+
+    estimated [B] bool: the states are a causal observer's estimates (a recording's start), not exact ones (simulated
+    later on); trust in the present speed and acceleration depends on it.
+    """
     size, vehicles = routed.size, state.s.shape[1]
     v, width, length = state.v, size[:, :vehicles, 1], size[:, :vehicles, 0]
     limit = _at(routed.limit, state.s)
@@ -79,7 +84,7 @@ def node_features(routed: RoutedScene, state: LaneState, agents: Tensor, present
         ((curve - v) / 5).clamp(-2, 2), torch.exp(-rest.clamp(min=0) / 30), (rest < 200).float(), *lead,
         idm / 2, *_lights(routed, state, step), length / 5, width / 2, routed.parked.float(),
         routed.has_lane.float(), (first[0] < FREE).float(), (v * v / (2 * first[0].clamp(min=1.0))).clamp(max=8) / 4,
-        (v / 10) ** 2, torch.sqrt(v.clamp(min=0) + 1e-3) / 3]
+        (v / 10) ** 2, torch.sqrt(v.clamp(min=0) + 1e-3) / 3, estimated[:, None].float().expand_as(v)]
     return torch.stack(features, -1)
 
 

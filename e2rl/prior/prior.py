@@ -8,7 +8,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from e2rl.prior import free_space, lane_relative
-from e2rl.prior.bounds import BoundSettings, acceleration_caps
+from e2rl.prior.bounds import BoundSettings, acceleration_caps, infeasible
 from e2rl.prior.denoiser import Denoiser, DenoiserSettings, Encoding
 from e2rl.prior.features import edge_features, node_features
 from e2rl.prior.lane_relative import HORIZON, LaneState, locate
@@ -36,13 +36,17 @@ class SamplerSettings:
 @dataclass
 class Context:
     """One replan of B scenes: routed, lane states [B, V], network encoding, the ego's plan as x [B, SIZE] (None where
-    it is unknown and sampled like everybody else's), the caps [B, V] on acceleration, who is active [B, V] (simulated
+    it is unknown and sampled like everybody else's), everybody now (agents [B, N, 4], present [B, N]) and whose bounds
+    ignore the ego [B, V], the caps [B, V] on acceleration, who is active [B, V] (simulated
     now, not parked, not the ego), and whether every vehicle has a lane (asked once, on the host)."""
 
     routed: RoutedScene
     state: LaneState
     encoding: Encoding
     ego_x: Tensor | None
+    agents: Tensor
+    present: Tensor
+    exempt: Tensor
     cap: Tensor
     active: Tensor
     all_on_lane: bool
@@ -104,14 +108,14 @@ class Prior(nn.Module):
         """
         vehicles = state.s.shape[1]
         here = present[:, :vehicles]
-        encoding = self.denoiser.encode(node_features(routed, state, agents, present, step),
+        encoding = self.denoiser.encode(node_features(routed, state, agents, present, step, step == 0),
                                         edge_features(routed, state), here)
         exempt = torch.zeros_like(here) if exempt is None else exempt
         cap = acceleration_caps(self.bounds, routed, state, agents, present, exempt)
         active = here & routed.modelled
         active = torch.cat([torch.zeros_like(active[:, :1]), active[:, 1:]], 1)
         ego_x = None if ego_plan is None else plan_to_x(ego_plan, state, routed)
-        return Context(routed, state, encoding, ego_x, cap, active,
+        return Context(routed, state, encoding, ego_x, agents, present, exempt, cap, active,
                        bool(routed.has_lane.all()))
 
     def denoise(self, x: Tensor, level: Tensor, context: Context) -> Tensor:
@@ -175,18 +179,38 @@ class Prior(nn.Module):
 
     @torch.no_grad()
     def plan(self, x0: Tensor, context: Context) -> "Plan":
-        """The motion that is executed: decoded under the bounds, standing and parked vehicles held, routes ended."""
-        motion = self.decode(x0, context)
-        state, routed = context.state, context.routed
+        """The motion that is executed: decoded, under the bounds where that is needed, standing and parked vehicles held, routes ended."""
+        motion = self._feasible(x0, context)
+        routed = context.routed
+        gone = routed.open[..., None] & (motion.s >= routed.length[..., None]) & routed.has_lane[..., None]
+        return Plan(motion, ~(gone.cumsum(-1) > 0))
+
+    def _feasible(self, x0: Tensor, context: Context) -> LaneState:
+        """Motion of x0 as it is where that is feasible, under the bounds elsewhere: a cap may put a vehicle in the way
+        of another, so that is asked twice."""
+        capped = self._held(self.decode(x0, context), context)
+        if self.bounds.look <= 0:
+            return capped
+        motion = self._held(self.decode(x0, context, capped=False), context)
+        for _ in range(2):
+            bad = infeasible(self.bounds, context.routed, motion, context.agents, context.present, context.exempt)
+            motion = select(bad, capped, motion)
+        return motion
+
+    def _held(self, motion: LaneState, context: Context) -> LaneState:
+        """Standing vehicles whose plan is too short to be a start, and whoever is not active, stay where they are."""
+        state = context.state
         short = (motion.s[..., -1] - state.s) < HOLD
-        hold = ((state.v < STANDING) & short) | ~context.active
         still = state.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
         zero = torch.zeros_like(still.v)
         still = LaneState(**{**vars(still), "v": zero, "a": zero})
-        motion = LaneState(*(torch.where(hold[..., None], getattr(still, f.name), getattr(motion, f.name))
-                             for f in fields(LaneState)))
-        gone = routed.open[..., None] & (motion.s >= routed.length[..., None]) & routed.has_lane[..., None]
-        return Plan(motion, ~(gone.cumsum(-1) > 0))
+        return select(((state.v < STANDING) & short) | ~context.active, still, motion)
+
+
+def select(rows: Tensor, one: LaneState, other: LaneState) -> LaneState:
+    """Motion [B, V, HORIZON] of `one` in rows [B, V], of `other` elsewhere."""
+    return LaneState(*(torch.where(rows[..., None], getattr(one, f.name), getattr(other, f.name))
+                       for f in fields(LaneState)))
 
 
 @dataclass

@@ -72,6 +72,7 @@ class PriorTraining:
     def run(self, until: int) -> dict[str, float]:
         """Train up to step `until`; returns the running losses."""
         running: dict[str, float] = {}
+        self.prior.train()
         bar = tqdm(range(self.step, until), "prior", initial=self.step, total=self.settings.steps, unit="step")
         for _ in bar:
             pick = torch.randint(len(self.windows), (self.settings.batch,), generator=self.generator,
@@ -100,6 +101,7 @@ class PriorTraining:
         """Within this context the prior holds the averaged weights."""
         raw = {key: value.clone() for key, value in self.prior.denoiser.state_dict().items()}
         self.prior.denoiser.load_state_dict(self.average)
+        self.prior.eval()
         try:
             yield self.prior
         finally:

@@ -17,7 +17,9 @@ from e2rl.sim.mission import mission_of
 from tests.scene.descriptions import ALL, FRAMES, description, fork, lane, straight, track
 
 SETTINGS = BuildSettings(field_cells=64)
-WAYMO = Path(__file__).parents[2] / ".." / "shared" / "data" / "waymo" / "tune.zip"
+DATA = Path(__file__).parents[2] / ".." / "shared" / "data"
+# Every seventh Waymo log; all of nuScenes mini: left-hand traffic in six of ten logs, lanes without connectivity.
+RECORDED = {"waymo": (DATA / "waymo" / "tune.zip", 7), "nuscenes": (DATA / "nuscenes_mini" / "scenes.zip", 1)}
 
 
 def recorded(tracks=None, lanes=None, **metadata):
@@ -184,18 +186,19 @@ def test_recordings_that_make_no_scene_say_why(change, message):
         build_scene(recording, SETTINGS)
 
 
-@pytest.fixture(scope="module")
-def waymo():
-    if not WAYMO.exists():
-        pytest.skip("needs ../shared/data/waymo/tune.zip, which is not in the repository")
-    files = scenarionet.list_files(str(WAYMO))[::7]
+@pytest.fixture(scope="module", params=RECORDED)
+def recorded_scenes(request):
+    path, stride = RECORDED[request.param]
+    if not path.exists():
+        pytest.skip(f"needs {path.parent.name}/{path.name} in ../shared/data, which is not in the repository")
+    files = scenarionet.list_files(str(path))[::stride]
     return [build_scene(recording, SETTINGS) for file in files for recording in scenarionet.read_recordings(
         scenarionet.read_bytes(*file), file[1], "", None, 80)]
 
 
-def test_recorded_scenes_keep_the_schema_and_their_parked_cars_stay(waymo):
+def test_recorded_scenes_keep_the_schema_and_their_parked_cars_stay(recorded_scenes):
     parked = moved = 0
-    for index, scene in enumerate(waymo):
+    for index, scene in enumerate(recorded_scenes):
         validate(scene, str(index))
         assert torch.isfinite(scene["logged"]).all() and (scene["logged"][..., 3] >= 0).all()
         stay = scene["parked"] & scene["valid"]
@@ -206,6 +209,6 @@ def test_recorded_scenes_keep_the_schema_and_their_parked_cars_stay(waymo):
     assert parked > 50 and moved <= 0.02 * parked
 
 
-def test_recorded_vehicles_find_the_way_they_drove(waymo):
-    found = [(scene["route_log"] >= 0)[scene["valid"][:32] & ~scene["parked"][:32]] for scene in waymo]
+def test_recorded_vehicles_find_the_way_they_drove(recorded_scenes):
+    found = [(scene["route_log"] >= 0)[scene["valid"][:32] & ~scene["parked"][:32]] for scene in recorded_scenes]
     assert torch.cat(found).float().mean() > 0.93
