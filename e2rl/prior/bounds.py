@@ -1,121 +1,135 @@
-"""Feasibility bounds: how hard each vehicle may accelerate in the part of a plan that is executed.
+"""Feasibility bounds: who must brake, and how hard, in the part of a plan that is executed.
 
-They are part of the simulated traffic for every method alike, and stand in each table's caption. What they allow is a
-cap on acceleration; they never push a vehicle forward. A cap acts only on a vehicle whose plan is not feasible as it
-stands: it meets somebody else's plan, or takes a curve too fast.
+They are part of the simulated traffic for every method alike, and stand in each table's caption. A joint plan is driven
+as it stands where it is feasible. A vehicle whose plan runs into somebody else's, or takes a curve too fast, gets a cap
+on its acceleration: the braking that just avoids it. A cap never pushes a vehicle forward.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
-from e2rl.prior.features import curve_speed
 from e2rl.prior.lane_relative import LaneState
-from e2rl.prior.leaders import FREE, idm_acceleration, leaders
-from e2rl.prior.routed import RoutedScene
 from e2rl.scene.recording import DT
 from e2rl.sim.geometry import overlap
+
+FREE = 20.0  # m/s^2: the cap of a vehicle whose plan is feasible
+STRIDE = 3  # steps between the times at which plans are compared
+GENTLE = 0.5  # m/s^2: whoever is in somebody's way brakes at least so much
 
 
 @dataclass(frozen=True)
 class BoundSettings:
-    """Headway [s], jam gap [m], acceleration and comfortable braking [m/s^2] of the leader bound and its floor; lateral
-    acceleration and braking of the curve bound; time gap [s] and braking of the crossing bound; each can be off.
-    onset [m/s^2]: what a bound may take off the current acceleration at once, the rest follows over half a second;
-    look [s], ahead, aside [m]: a plan is feasible if its box, larger by that much, meets nobody's for so long (look 0:
-    caps act always)."""
+    """meeting, curve: which of the bounds act; look [s]: how far ahead plans are compared; gap [m]: kept to whomever a
+    plan runs into, aside [m]: to either side; lateral [m/s^2]: what curves may cost; floor [m/s^2]: hardest braking;
+    onset [m/s^2]: what a bound may take off the current acceleration at once, the rest follows over half a second."""
 
-    leader: bool = True
-    headway: float = 0.5
-    jam: float = 1.2
-    accel: float = 3.0
-    brake: float = 3.5
-    floor: float = -7.0
+    meeting: bool = True
     curve: bool = True
-    curve_lateral: float = 4.2
-    curve_brake: float = 1.2
-    curve_floor: float = -3.0
-    crossing: bool = True
-    crossing_time: float = 2.0
-    crossing_brake: float = 5.0
-    onset: float = 2.0
     look: float = 3.0
-    ahead: float = 1.5
-    aside: float = 0.2
+    gap: float = 1.2
+    aside: float = 0.1
+    lateral: float = 5.0
+    floor: float = -7.0
+    onset: float = 2.0
 
 
-def acceleration_caps(
-    settings: BoundSettings, routed: RoutedScene, state: LaneState, agents: Tensor, present: Tensor, exempt: Tensor
-) -> Tensor:
-    """Highest acceleration [B, V] each vehicle may take now.
+@dataclass
+class Surroundings:
+    """Everybody now: agents [B, N, 4], their size [B, N, 2], present [B, N]; exempt [B, V]: vehicles that may meet the
+    ego (adversaries)."""
 
-    agents [B, N, 4], present [B, N]: everybody now; exempt [B, V]: vehicles whose bounds ignore the ego (adversaries).
+    agents: Tensor
+    size: Tensor
+    present: Tensor
+    exempt: Tensor
+
+
+def bounded(
+    settings: BoundSettings, decode: Callable[[Tensor | None], LaneState], state: LaneState, around: Surroundings
+) -> LaneState:
+    """The motion decode(None), fields [B, V, HORIZON], with decode(cap) for the vehicles that get a cap [B, V].
+
+    Braking may put a vehicle in the way of the one behind, so plans are compared twice.
     """
-    size = routed.size
-    vehicles = state.s.shape[1]
-    width, length = size[:, :vehicles, 1], size[:, :vehicles, 0]
-    cap = torch.full_like(state.v, 20.0)
-    if settings.leader:
-        free = torch.full_like(state.v, 60.0)
-        for hidden, rows in ((False, ~exempt), (True, exempt)):
-            seen = torch.cat([present[:, :1] & (not hidden), present[:, 1:]], 1)
-            if hidden and not bool(rows.any()):
-                continue
-            gap, speed, _ = leaders(state.s, width, length, routed.points, agents, size, seen, state.d)
-            bound = idm_acceleration(state.v, free, gap, speed.clamp(min=0), settings.headway, settings.jam,
-                                     settings.accel, settings.brake).clamp(min=settings.floor)
-            cap = torch.where(rows & (gap < FREE), torch.minimum(cap, bound), cap)
+    motion = decode(None)
+    cap = torch.full_like(state.v, FREE)
+    for _ in range(2):
+        cap = torch.minimum(cap, acceleration_caps(settings, motion, state, around))
+        motion = select(cap < FREE, decode(cap), motion)
+    return motion
+
+
+def acceleration_caps(settings: BoundSettings, motion: LaneState, state: LaneState, around: Surroundings) -> Tensor:
+    """Highest acceleration [B, V] each vehicle may take now, FREE where its planned motion [B, V, HORIZON] from state
+    [B, V] is feasible."""
+    steps = torch.arange(STRIDE - 1, round(settings.look / DT), STRIDE, device=state.v.device)
+    need = torch.full_like(state.v, -FREE)
+    if settings.meeting:
+        need = torch.maximum(need, _meeting(settings, motion, state, around, steps))
     if settings.curve:
-        allowed = curve_speed(state, routed.points, settings.curve_lateral, settings.curve_brake)
-        cap = torch.minimum(cap, ((allowed - state.v) / 0.5).clamp(min=settings.curve_floor))
-    if settings.crossing:
-        cap = torch.minimum(cap, _crossing(settings, routed, state, present[:, :vehicles], exempt, length))
-    return cap
+        need = torch.maximum(need, _curve(settings, motion, state, steps))
+    return (-need).clamp(min=settings.floor)
 
 
-def _crossing(
-    settings: BoundSettings, routed: RoutedScene, state: LaneState, present: Tensor, exempt: Tensor, length: Tensor
-) -> Tensor:
-    """Of two vehicles whose routes cross, the later by less than `crossing_time` stops before the place if it can."""
-    mine = routed.conflict_s - state.s[..., None]
-    theirs = mine.transpose(1, 2)
-    v = state.v.clamp(min=0.5)
-    arrive, other = mine / v[..., None], theirs / v[:, None, :]
-    crossing = routed.crossing.abs().clamp(max=torch.pi) > 0.35
-    moving = (present & (state.v > 0.5))[:, None, :]
-    active = (routed.conflict & crossing & (mine > 0) & (theirs > 0) & moving & (arrive < 8.0)
-              & (arrive >= other) & (arrive - other < settings.crossing_time))
-    active[..., 0] &= ~exempt
-    room = (mine - length[..., None] / 2 - 3.0).clamp(min=0.1)
-    need = state.v[..., None] ** 2 / (2 * room)
-    stops = active & (need <= settings.crossing_brake) & (need > 0.8)
-    return torch.where(stops, -need, 20.0).amin(-1)
+def _meeting(settings: BoundSettings, motion: LaneState, state: LaneState, around: Surroundings, steps: Tensor
+             ) -> Tensor:
+    """Braking [B, V] that keeps a vehicle `gap` short of whomever its plan runs into first: to that one's speed along
+    its own way if it moves on (v - u)^2 / 2 room, u = 0 if it crosses or comes towards it.
 
-
-LOOK_STRIDE = 3  # steps between the times at which plans are compared
-
-
-def infeasible(
-    settings: BoundSettings, routed: RoutedScene, motion: LaneState, agents: Tensor, present: Tensor, exempt: Tensor
-) -> Tensor:
-    """Vehicles [B, V] whose plan must not be driven as it stands: it meets somebody's plan within `look`, or takes a
-    curve at more than `curve_lateral`.
-
-    motion: fields [B, V, HORIZON]; agents [B, N, 4], present [B, N]: everybody now, of whom those without a plan keep
-    their velocity; exempt [B, V]: vehicles that may meet the ego.
+    Of two that meet, the one that has the other farther ahead of itself brakes.
     """
-    steps = torch.arange(LOOK_STRIDE - 1, round(settings.look / DT), LOOK_STRIDE, device=agents.device)
-    vehicles = motion.v.shape[1]
+    everybody = planned(motion, around.agents, steps)
+    vehicles = state.v.shape[1]
+    first, meet = _first_meeting(everybody, around, settings.aside, vehicles)
+    index = first[..., None, None].expand(*first.shape, 1, 4)
+    other = everybody[:, None].expand(-1, vehicles, -1, -1, -1).gather(3, index)[..., 0, :]
+    mine = everybody[:, :vehicles, None].expand(-1, -1, first.shape[2], -1, -1).gather(3, index)[..., 0, :]
+    gap = other[..., :2] - mine[..., :2]
+    ahead, theirs = ((gap[..., 0] * torch.cos(pose[..., 2]) + gap[..., 1] * torch.sin(pose[..., 2])) * sign
+                     for pose, sign in ((mine, 1), (other, -1)))
+    yields = meet & (ahead > theirs)
+    u = (other[..., 3] * torch.cos(other[..., 2] - mine[..., 2])).clamp(min=0)
+    way = (motion.s[..., steps] - state.s[..., None]).gather(-1, first)
+    room = (way - settings.gap - u * DT * (steps[first] + 1)).clamp(min=0.3)
+    need = (state.v[..., None] - u).clamp(min=0) ** 2 / (2 * room)
+    return torch.where(yields, need.clamp(min=GENTLE), -FREE).amax(-1)
+
+
+def _first_meeting(everybody: Tensor, around: Surroundings, aside: float, vehicles: int) -> tuple[Tensor, Tensor]:
+    """Index of the time [B, V, N] at which i's box, wider by `aside` on both sides, first overlaps j's, and whether it
+    does at all."""
+    wide = around.size[:, :vehicles] + around.size.new_tensor([0.0, 2 * aside])
+    meets = overlap(everybody[:, :vehicles, None], wide[:, :, None, None], everybody[:, None],
+                    around.size[:, None, :, None])
+    itself = torch.eye(vehicles, around.present.shape[1], dtype=torch.bool, device=meets.device)
+    counts = around.present[:, None, :] & around.present[:, :vehicles, None] & ~itself
+    counts = torch.cat([counts[..., :1] & ~around.exempt[..., None], counts[..., 1:]], -1)
+    meets = meets & counts[..., None]
+    return meets.int().argmax(-1), meets.any(-1)
+
+
+def planned(motion: LaneState, agents: Tensor, steps: Tensor) -> Tensor:
+    """Everybody's states [B, N, len(steps), 4] at steps ahead: vehicles as planned, the others at their velocity."""
     plans = motion.states()[:, :, steps]
-    others = agents[:, vehicles:, None].expand(-1, -1, len(steps), -1)
+    others = agents[:, motion.v.shape[1]:, None].expand(-1, -1, len(steps), -1)
     velocity = others[..., 3:] * torch.stack([torch.cos(others[..., 2]), torch.sin(others[..., 2])], -1)
     moved = others[..., :2] + velocity * (DT * (steps + 1))[:, None]
-    everybody = torch.cat([plans, torch.cat([moved, others[..., 2:]], -1)], 1)
-    grown = routed.size[:, :vehicles] + routed.size.new_tensor([2 * settings.ahead, 2 * settings.aside])
-    meets = overlap(plans[:, :, None], grown[:, :, None, None], everybody[:, None], routed.size[:, None, :, None])
-    ignored = torch.eye(vehicles, agents.shape[1], dtype=torch.bool, device=agents.device).expand(len(agents), -1, -1)
-    ignored = ignored | ~present[:, None, :]
-    ignored = torch.cat([ignored[..., :1] | exempt[..., None], ignored[..., 1:]], -1)
-    lateral = (motion.v**2 * motion.kappa.abs())[..., steps].amax(-1)
-    return (meets.any(-1) & ~ignored).any(-1) | (lateral > settings.curve_lateral)
+    return torch.cat([plans, torch.cat([moved, others[..., 2:]], -1)], 1)
+
+
+def _curve(settings: BoundSettings, motion: LaneState, state: LaneState, steps: Tensor) -> Tensor:
+    """Braking [B, V] that meets every place of the plan at no more than `lateral`."""
+    v, kappa = motion.v[..., steps], motion.kappa[..., steps].abs()
+    allowed = settings.lateral / kappa.clamp(min=1e-4)
+    way = (motion.s[..., steps] - state.s[..., None]).clamp(min=1.0)
+    need = ((state.v[..., None] ** 2 - allowed) / (2 * way)).clamp(min=0)
+    return torch.where(v**2 > allowed, need, -FREE).amax(-1)
+
+
+def select(rows: Tensor, one: LaneState, other: LaneState) -> LaneState:
+    """Motion [B, V, HORIZON] of `one` in rows [B, V], of `other` elsewhere."""
+    return LaneState(*(torch.where(rows[..., None], getattr(one, f.name), getattr(other, f.name))
+                       for f in fields(LaneState)))

@@ -8,7 +8,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from e2rl.prior import free_space, lane_relative
-from e2rl.prior.bounds import BoundSettings, acceleration_caps, infeasible
+from e2rl.prior.bounds import BoundSettings, Surroundings, bounded, select
 from e2rl.prior.denoiser import Denoiser, DenoiserSettings, Encoding
 from e2rl.prior.features import edge_features, node_features
 from e2rl.prior.lane_relative import HORIZON, LaneState, locate
@@ -36,18 +36,14 @@ class SamplerSettings:
 @dataclass
 class Context:
     """One replan of B scenes: routed, lane states [B, V], network encoding, the ego's plan as x [B, SIZE] (None where
-    it is unknown and sampled like everybody else's), everybody now (agents [B, N, 4], present [B, N]) and whose bounds
-    ignore the ego [B, V], the caps [B, V] on acceleration, who is active [B, V] (simulated
-    now, not parked, not the ego), and whether every vehicle has a lane (asked once, on the host)."""
+    it is unknown and sampled like everybody else's), everybody around, who is active [B, V] (simulated now, not parked,
+    not the ego), and whether every vehicle has a lane (asked once, on the host)."""
 
     routed: RoutedScene
     state: LaneState
     encoding: Encoding
     ego_x: Tensor | None
-    agents: Tensor
-    present: Tensor
-    exempt: Tensor
-    cap: Tensor
+    around: Surroundings
     active: Tensor
     all_on_lane: bool
 
@@ -110,12 +106,11 @@ class Prior(nn.Module):
         here = present[:, :vehicles]
         encoding = self.denoiser.encode(node_features(routed, state, agents, present, step, step == 0),
                                         edge_features(routed, state), here)
-        exempt = torch.zeros_like(here) if exempt is None else exempt
-        cap = acceleration_caps(self.bounds, routed, state, agents, present, exempt)
+        around = Surroundings(agents, routed.size, present, torch.zeros_like(here) if exempt is None else exempt)
         active = here & routed.modelled
         active = torch.cat([torch.zeros_like(active[:, :1]), active[:, 1:]], 1)
         ego_x = None if ego_plan is None else plan_to_x(ego_plan, state, routed)
-        return Context(routed, state, encoding, ego_x, agents, present, exempt, cap, active,
+        return Context(routed, state, encoding, ego_x, around, active,
                        bool(routed.has_lane.all()))
 
     def denoise(self, x: Tensor, level: Tensor, context: Context) -> Tensor:
@@ -128,12 +123,12 @@ class Prior(nn.Module):
         x0 = self.denoiser(x, levels, context.encoding)
         return torch.cat([context.ego_x[:, None], x0[:, 1:]], 1)
 
-    def decode(self, x0: Tensor, context: Context, capped: bool = True) -> LaneState:
-        """Planned motion, fields [B, V, HORIZON], of x0; capped: under the acceleration bounds of the executed part."""
+    def decode(self, x0: Tensor, context: Context, cap: Tensor | None = None) -> LaneState:
+        """Planned motion, fields [B, V, HORIZON], of x0; cap [B, V]: of the acceleration in the executed part."""
         state = context.state
-        if capped:
-            x0 = torch.cat([torch.minimum(x0[..., :1], context.cap[..., None]), x0[..., 1:]], -1)
-            onset = torch.minimum(state.a, torch.maximum(context.cap, state.a - self.bounds.onset))
+        if cap is not None:
+            x0 = torch.cat([torch.minimum(x0[..., :1], cap[..., None]), x0[..., 1:]], -1)
+            onset = torch.minimum(state.a, torch.maximum(cap, state.a - self.bounds.onset))
             state = LaneState(**{**vars(state), "a": onset})
         lane = lane_relative.decode(x0, state, context.routed.points)
         if context.all_on_lane:
@@ -180,37 +175,22 @@ class Prior(nn.Module):
     @torch.no_grad()
     def plan(self, x0: Tensor, context: Context) -> "Plan":
         """The motion that is executed: decoded, under the bounds where that is needed, standing and parked vehicles held, routes ended."""
-        motion = self._feasible(x0, context)
         routed = context.routed
+        motion = bounded(self.bounds, lambda cap: self._held(self.decode(x0, context, cap), context), context.state,
+                         context.around)
         gone = routed.open[..., None] & (motion.s >= routed.length[..., None]) & routed.has_lane[..., None]
         return Plan(motion, ~(gone.cumsum(-1) > 0))
 
-    def _feasible(self, x0: Tensor, context: Context) -> LaneState:
-        """Motion of x0 as it is where that is feasible, under the bounds elsewhere: a cap may put a vehicle in the way
-        of another, so that is asked twice."""
-        capped = self._held(self.decode(x0, context), context)
-        if self.bounds.look <= 0:
-            return capped
-        motion = self._held(self.decode(x0, context, capped=False), context)
-        for _ in range(2):
-            bad = infeasible(self.bounds, context.routed, motion, context.agents, context.present, context.exempt)
-            motion = select(bad, capped, motion)
-        return motion
-
     def _held(self, motion: LaneState, context: Context) -> LaneState:
-        """Standing vehicles whose plan is too short to be a start, and whoever is not active, stay where they are."""
+        """Standing vehicles whose plan is too short to be a start, and the parked, stay where they are."""
         state = context.state
+        stays = ~context.active
+        stays[:, 0] = False
         short = (motion.s[..., -1] - state.s) < HOLD
         still = state.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
         zero = torch.zeros_like(still.v)
         still = LaneState(**{**vars(still), "v": zero, "a": zero})
-        return select(((state.v < STANDING) & short) | ~context.active, still, motion)
-
-
-def select(rows: Tensor, one: LaneState, other: LaneState) -> LaneState:
-    """Motion [B, V, HORIZON] of `one` in rows [B, V], of `other` elsewhere."""
-    return LaneState(*(torch.where(rows[..., None], getattr(one, f.name), getattr(other, f.name))
-                       for f in fields(LaneState)))
+        return select(((state.v < STANDING) & short) | stays, still, motion)
 
 
 @dataclass
