@@ -96,7 +96,7 @@ def check_protocol(config: DictConfig) -> None:
 def caption(config: DictConfig, origin: dict) -> str:
     """What stands in every table's caption: the settings that all methods share."""
     sampler, bounds = config.prior.sampler, config.prior.bounds
-    on = [name for name in ("leader", "curve", "crossing") if bounds[name]]
+    on = [name for name in ("meeting", "curve") if bounds[name]]
     return (f"Prior {config.prior.checkpoint} ({origin.get('data', 'unknown data')}); {sampler.sampler}, K = "
             f"{sampler.steps}, temperature {sampler.temperature:g} (routes {sampler.route_temperature:g}), one sample "
             f"a replan, replanned every 0.5 s; acceleration bounds: {', '.join(on) or 'none'}")

@@ -29,7 +29,7 @@ class SamplerSettings:
     sampler: str = "ddim"
     steps: int = 8
     churn: float = 1.0
-    temperature: float = 0.8
+    temperature: float = 1.0
     route_temperature: float = 0.5
 
 
@@ -174,7 +174,7 @@ class Prior(nn.Module):
 
     @torch.no_grad()
     def plan(self, x0: Tensor, context: Context) -> "Plan":
-        """The motion that is executed: decoded, under the bounds where that is needed, standing and parked vehicles held, routes ended."""
+        """The motion that is executed: decoded, under bounds where it needs them, standing vehicles held, routes ended."""
         routed = context.routed
         motion = bounded(self.bounds, lambda cap: self._held(self.decode(x0, context, cap), context), context.state,
                          context.around)
