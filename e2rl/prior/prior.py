@@ -126,9 +126,9 @@ class Prior(nn.Module):
     def denoise(self, x: Tensor, level: Tensor, context: Context) -> Tensor:
         """x0 [B, V, SIZE] of x at a scalar noise level; the ego's row is its plan, given clean, where that is known."""
         if context.ego_x is None:
-            return self.denoiser(x, level.expand(x.shape[:2]), context.encoding)
+            return self.denoiser(x, level.expand(1, x.shape[1]), context.encoding)
         x = torch.cat([context.ego_x[:, None], x[:, 1:]], 1)
-        levels = level.expand(x.shape[:2]).clone()
+        levels = level.repeat(1, x.shape[1])
         levels[:, 0] = CLEAN
         x0 = self.denoiser(x, levels, context.encoding)
         return torch.cat([context.ego_x[:, None], x0[:, 1:]], 1)
