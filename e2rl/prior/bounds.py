@@ -11,7 +11,7 @@ from torch import Tensor
 
 from e2rl.prior.features import curve_speed
 from e2rl.prior.lane_relative import LaneState
-from e2rl.prior.leaders import FREE, idm_acceleration, leaders
+from e2rl.prior.leaders import FREE, Ahead, idm_acceleration
 from e2rl.prior.routed import RoutedScene
 
 
@@ -50,14 +50,11 @@ def acceleration_caps(
     cap = torch.full_like(state.v, 20.0)
     if settings.leader:
         free = torch.full_like(state.v, 60.0)
-        for hidden, rows in ((False, ~exempt), (True, exempt)):
-            seen = torch.cat([present[:, :1] & (not hidden), present[:, 1:]], 1)
-            if hidden and not bool(rows.any()):
-                continue
-            gap, speed, _ = leaders(state.s, width, length, routed.points, agents, size, seen, state.d)
-            bound = idm_acceleration(state.v, free, gap, speed.clamp(min=0), settings.headway, settings.jam,
-                                     settings.accel, settings.brake).clamp(min=settings.floor)
-            cap = torch.where(rows & (gap < FREE), torch.minimum(cap, bound), cap)
+        ahead = Ahead(state.s, width, length, routed.points, agents, size, present, state.d.abs())
+        gap, speed, _ = ahead.nearest(state.d, blind=exempt)
+        bound = idm_acceleration(state.v, free, gap, speed.clamp(min=0), settings.headway, settings.jam,
+                                 settings.accel, settings.brake).clamp(min=settings.floor)
+        cap = torch.where(gap < FREE, torch.minimum(cap, bound), cap)
     if settings.curve:
         allowed = curve_speed(state, routed.points, settings.curve_lateral, settings.curve_brake)
         cap = torch.minimum(cap, ((allowed - state.v) / 0.5).clamp(min=settings.curve_floor))

@@ -121,7 +121,7 @@ class Prior(nn.Module):
         active = torch.cat([torch.zeros_like(active[:, :1]), active[:, 1:]], 1)
         ego_x = None if ego_plan is None else plan_to_x(ego_plan, state, routed)
         return Context(routed, state, encoding, ego_x, cap, active,
-                       bool(routed.has_lane.all()))
+                       bool((routed.has_lane | ~here).all()))
 
     def denoise(self, x: Tensor, level: Tensor, context: Context) -> Tensor:
         """x0 [B, V, SIZE] of x at a scalar noise level; the ego's row is its plan, given clean, where that is known."""
@@ -133,18 +133,19 @@ class Prior(nn.Module):
         x0 = self.denoiser(x, levels, context.encoding)
         return torch.cat([context.ego_x[:, None], x0[:, 1:]], 1)
 
-    def decode(self, x0: Tensor, context: Context, capped: bool = True) -> LaneState:
-        """Planned motion, fields [B, V, HORIZON], of x0; capped: under the acceleration bounds of the executed part."""
+    def decode(self, x0: Tensor, context: Context, capped: bool = True, steps: slice = slice(None)) -> LaneState:
+        """Planned motion, fields [B, V, HORIZON] (or those `steps` of it), of x0; capped: under the acceleration bounds
+        of the executed part."""
         state = context.state
         if capped:
             x0 = torch.cat([torch.minimum(x0[..., :1], context.cap[..., None]), x0[..., 1:]], -1)
             onset = torch.minimum(state.a, torch.maximum(context.cap, state.a - self.bounds.onset))
             state = LaneState(**{**vars(state), "a": onset})
-        lane = lane_relative.decode(x0, state, context.routed.points)
+        lane = lane_relative.decode(x0, state, context.routed.points, steps)
         if context.all_on_lane:
             return lane
         on_lane = context.routed.has_lane[..., None]
-        free = free_space.decode(x0, state)
+        free = free_space.decode(x0, state).map(lambda value: value[..., steps])
         return LaneState(*(torch.where(on_lane, getattr(lane, f.name), getattr(free, f.name))
                            for f in fields(LaneState)))
 

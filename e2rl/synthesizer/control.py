@@ -22,6 +22,7 @@ from e2rl.synthesizer.potentials import (
     adversarial_potential,
     annealed_temperature,
     feasibility_potential,
+    sampled_steps,
 )
 
 MIN_ALPHA = 0.05
@@ -91,7 +92,7 @@ class SparseControl:
                 with torch.no_grad():
                     x0 = denoise(x)
                 variable = x0 = x0.detach().requires_grad_(True)
-            states = self.prior.decode(x0, context, capped=False).states()
+            states = self.prior.decode(x0, context, False, sampled_steps(self.potentials)).states()
             threat = adversarial_potential(states, self.where, self.potentials, heat)
             infeasible = feasibility_potential(states, self.where, self.potentials)
             (towards,) = torch.autograd.grad(threat.sum(), variable, retain_graph=True)
