@@ -2,8 +2,8 @@
 chain.
 
 Both act on decoded states [B, V, H', 4] (x, y [m], heading [rad], speed [m/s]) at every stride-th step and are
-returned per vehicle, [B, V]. Everybody else is detached in a vehicle's own term: the ego is a black box, targets are not drawn to
-their pursuers, and the gradient of row i is that of V_i alone. Gradients are finite everywhere.
+returned per vehicle, [B, V]. Everybody else is detached in a vehicle's own term: the ego is a black box, targets are
+not drawn to their pursuers, and the gradient of row i is that of V_i alone. Gradients are finite everywhere.
 """
 
 import math
