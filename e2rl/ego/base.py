@@ -48,6 +48,7 @@ class Ego(ABC):
             raise InputError(f"ego.replan_every={replan_every}: choose 1 to {PLAN_STEPS} steps")
         self.replan_every = int(replan_every)
         self._planned: tuple[Tensor, Tensor] | None = None  # start of each plan and its states; step of planning
+        self._announced: tuple[World, Tensor] | None = None  # the moment and the plan
 
     def reset(self, world: World) -> None:
         """Called after every reset; the scenes whose world.step is 0 begin anew. An ego with memory clears it here."""
@@ -58,6 +59,20 @@ class Ego(ABC):
     def plan(self, world: World) -> Tensor:
         """Planned states [B, PLAN_STEPS, 4] of the egos at steps 1.. from now, 0.1 s apart, without side effects."""
 
+    def announce(self, world: World) -> Tensor:
+        """`plan`, for whoever plans against the ego: planning anew at the same moment, `act` drives what was announced.
+        """
+        self._announced = world, self.plan(world)
+        return self._announced[1]
+
+    def _fresh(self, world: World) -> Tensor:
+        """The announced plan if it was made at this moment, else a new one."""
+        if self._announced is not None:
+            then, plan = self._announced
+            if all(torch.equal(getattr(then, name), getattr(world, name)) for name in ("step", "states", "valid")):
+                return plan
+        return self.plan(world)
+
     def act(self, world: World, observation: Tensor | None = None) -> Tensor:
         """Action [B, 2] (acceleration, yaw rate) for the next step.
 
@@ -65,13 +80,13 @@ class Ego(ABC):
         """
         state, row = world.states[:, 0], torch.arange(len(world.step), device=world.step.device)
         if self._planned is None or self.replan_every == 1:
-            self._planned = (torch.cat([state[:, None], self.plan(world)], 1), world.step.clone())
+            self._planned = (torch.cat([state[:, None], self._fresh(world)], 1), world.step.clone())
         else:
             states, since = self._planned
             age = world.step - since
             due = (age >= self.replan_every) | (age < 0) | (world.step == 0)
             if due.any():
-                fresh = torch.cat([state[:, None], self.plan(world)], 1)
+                fresh = torch.cat([state[:, None], self._fresh(world)], 1)
                 states = torch.where(due[:, None, None], fresh, states)
                 self._planned = (states, torch.where(due, world.step, since))
         states, since = self._planned

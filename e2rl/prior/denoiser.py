@@ -25,16 +25,19 @@ class DenoiserSettings:
 @dataclass
 class Encoding:
     """What the network keeps of a scene over the denoising steps of one replan: nodes [B, V, W], pair values
-    [B, V, V, E], attention biases per block [B, heads, V, V] (absent vehicles at -inf)."""
+    [B, V, V, E], per block attention biases [B, heads, V, V] (absent vehicles at -inf) and the nodes' share of the
+    modulation [B, V, 6 W]."""
 
     nodes: Tensor
     pairs: Tensor
     biases: list[Tensor]
+    modulations: list[Tensor]
 
     def repeat(self, count: int) -> "Encoding":
         """The same scenes `count` times along the batch."""
         tile = lambda value: value.repeat(count, *[1] * (value.ndim - 1))  # noqa: E731
-        return Encoding(tile(self.nodes), tile(self.pairs), [tile(bias) for bias in self.biases])
+        return Encoding(tile(self.nodes), tile(self.pairs), *(
+            [tile(value) for value in values] for values in (self.biases, self.modulations)))
 
 
 class Block(nn.Module):
@@ -55,16 +58,19 @@ class Block(nn.Module):
         nn.init.zeros_(self.modulation.weight)
         nn.init.zeros_(self.modulation.bias)
 
-    def forward(self, h: Tensor, condition: Tensor, bias: Tensor, pairs: Tensor) -> Tensor:
-        shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = self.modulation(condition).chunk(6, -1)
+    def forward(self, h: Tensor, modulation: Tensor, bias: Tensor, pairs: Tensor) -> Tensor:
+        """h [B, V, W]; modulation [B, V, 6 W] of Denoiser.modulated."""
+        shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = modulation.chunk(6, -1)
         batch, vehicles, width = h.shape
-        q, k, v = self.qkv(self.norm_attention(h) * (1 + scale_a) + shift_a).reshape(
-            batch, vehicles, 3, self.heads, width // self.heads).permute(2, 0, 3, 1, 4)
-        weight = self.drop(torch.softmax(q @ k.transpose(-1, -2) / math.sqrt(q.shape[-1]) + bias, -1))
-        mixed = (weight @ v).transpose(1, 2).reshape(batch, vehicles, width)
-        pair = torch.einsum("bhij,bije->bihe", weight, pairs).flatten(2)
-        h = h + gate_a * self.out(mixed + self.pair_value(pair))
-        return h + gate_m * self.mlp(self.norm_mlp(h) * (1 + scale_m) + shift_m)
+        each = width // self.heads
+        q, k, v = self.qkv(torch.addcmul(shift_a, self.norm_attention(h), scale_a)).reshape(
+            batch, vehicles, 3, self.heads, each).permute(2, 0, 3, 1, 4).flatten(1, 2)
+        logits = torch.baddbmm(bias.flatten(0, 1), q, k.transpose(1, 2), alpha=1 / math.sqrt(each))
+        weight = self.drop(torch.softmax(logits, -1))
+        mixed = (weight @ v).unflatten(0, (batch, self.heads)).transpose(1, 2).flatten(2)
+        pair = (weight.unflatten(0, (batch, self.heads)).transpose(1, 2) @ pairs).flatten(2)
+        h = torch.addcmul(h, gate_a, self.out(mixed + self.pair_value(pair)))
+        return torch.addcmul(h, gate_m, self.mlp(torch.addcmul(shift_m, self.norm_mlp(h), scale_m)))
 
 
 class Denoiser(nn.Module):
@@ -82,6 +88,9 @@ class Denoiser(nn.Module):
         self.bias = nn.Linear(settings.pair, settings.heads * settings.blocks)
         self.embed_x = nn.Linear(SIZE, width)
         self.embed_level = nn.Sequential(nn.Linear(32, width), nn.GELU(), nn.Linear(width, width))
+        scales = torch.tensor([0.0, 1.0, 0.0, 0.0, 1.0, 0.0]).repeat_interleave(width)
+        self.register_buffer("unit_scale", scales, persistent=False)
+        self.register_buffer("frequencies", torch.logspace(-0.3, 1.7, 16), persistent=False)
         self.blocks = nn.ModuleList(
             Block(width, settings.heads, settings.pair, settings.dropout) for _ in range(settings.blocks))
         self.head = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, SIZE))
@@ -94,14 +103,22 @@ class Denoiser(nn.Module):
         pair = self.encode_pair(pairs)
         absent = torch.zeros_like(present, dtype=pair.dtype).masked_fill(~present, -1e4)[:, None, None, :]
         bias = self.bias(pair).permute(0, 3, 1, 2) + absent
-        return Encoding(node, pair, list(bias.chunk(self.settings.blocks, 1)))
+        # The modulation is linear in node and level: the nodes' share is the same for all levels.
+        modulations = [node @ block.modulation.weight.T for block in self.blocks]
+        return Encoding(node, pair, [part.contiguous() for part in bias.chunk(self.settings.blocks, 1)], modulations)
+
+    def modulated(self, level: Tensor) -> list[Tensor]:
+        """The levels' share of each block's modulation, level [..., V] -> [..., V, 6 W]; scales around 1."""
+        angle = level[..., None] * self.frequencies
+        level = self.embed_level(torch.cat([torch.sin(angle), torch.cos(angle)], -1))
+        return [block.modulation(level) + self.unit_scale for block in self.blocks]
 
     def forward(self, x: Tensor, level: Tensor, encoding: Encoding) -> Tensor:
-        """Denoised estimate x0 [B, V, SIZE] of x [B, V, SIZE] at noise level [B, V]."""
-        angle = level[..., None] * torch.logspace(-0.3, 1.7, 16, device=x.device)
+        """Denoised estimate x0 [B, V, SIZE] of x [B, V, SIZE] at noise level [B, V], or [1, V] where it is the same for
+        all scenes."""
         h = self.embed_x(x) + encoding.nodes
-        condition = encoding.nodes + self.embed_level(torch.cat([torch.sin(angle), torch.cos(angle)], -1))
-        for block, bias in zip(self.blocks, encoding.biases, strict=True):
-            h = block(h, condition, bias, encoding.pairs)
+        shares = zip(self.blocks, encoding.biases, encoding.modulations, self.modulated(level), strict=True)
+        for block, bias, of_node, of_level in shares:
+            h = block(h, of_node + of_level, bias, encoding.pairs)
         alpha, sigma = self.schedule.alpha(level)[..., None], self.schedule.sigma(level)[..., None]
         return alpha * x + sigma * self.head(h).to(x.dtype)

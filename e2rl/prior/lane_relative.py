@@ -117,10 +117,13 @@ def split(x: Tensor, state: LaneState) -> tuple[Tensor, Tensor, Tensor]:
     return ACCEL_SCALE * x[..., :KNOTS], half, end
 
 
-def decode(x: Tensor, state: LaneState, points: Tensor) -> LaneState:
-    """Plans [..., V, HORIZON] (every field with a trailing time axis) of x [..., V, SIZE] on routes [..., V, P, 2]."""
+def decode(x: Tensor, state: LaneState, points: Tensor, steps: slice = slice(None)) -> LaneState:
+    """Plans [..., V, HORIZON] (every field with a trailing time axis) of x [..., V, SIZE] on routes [..., V, P, 2], or
+    those `steps` of them."""
     knots, half, end = split(x, state)
     v, travelled = speeds(state, knots)
+    accel = torch.diff(v, dim=-1, prepend=state.v[..., None])[..., steps] / DT
+    v, travelled = v[..., steps], travelled[..., steps]
     reach = lateral_horizon(state.v)[..., None]
     u = (travelled / reach).clamp(max=1.0)
     c = offset_coefficients(state, half, end)
@@ -131,8 +134,7 @@ def decode(x: Tensor, state: LaneState, points: Tensor) -> LaneState:
     normal = torch.stack([-torch.sin(heading), torch.cos(heading)], -1)
     xy = xy + d[..., None] * normal
     heading = heading + torch.atan(d1 / (1 - curvature * d).clamp(min=0.3))
-    before = torch.cat([state.v[..., None], v[..., :-1]], -1)
-    return LaneState(s, d, d1, d2, v, (v - before) / DT, xy[..., 0], xy[..., 1], heading, curvature + d2)
+    return LaneState(s, d, d1, d2, v, accel, xy[..., 0], xy[..., 1], heading, curvature + d2)
 
 
 def polynomial(c: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:

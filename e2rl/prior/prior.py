@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from e2rl.errors import InputError
 from e2rl.prior import free_space, lane_relative
 from e2rl.prior.bounds import BoundSettings, Surroundings, bounded, select
 from e2rl.prior.denoiser import Denoiser, DenoiserSettings, Encoding
@@ -14,7 +16,7 @@ from e2rl.prior.features import edge_features, node_features
 from e2rl.prior.lane_relative import HORIZON, LaneState, locate
 from e2rl.prior.route_choice import RouteChoice, sample_route
 from e2rl.prior.routed import RoutedScene, route_scene
-from e2rl.prior.sde import NoiseSchedule, ddim_step, euler_maruyama_step, path_kl
+from e2rl.prior.sde import SAMPLERS, NoiseSchedule, path_kl, reverse_step
 from e2rl.scene.route import project
 
 CLEAN = 0.01  # noise level at which the ego's plan is shown to the network
@@ -23,14 +25,21 @@ STANDING, HOLD = 0.5, 2.0  # m/s, m: a standing vehicle whose 5-s plan is shorte
 
 @dataclass(frozen=True)
 class SamplerSettings:
-    """sampler: ddim (churn 1 is the ancestral reverse SDE, 0 deterministic) or euler_maruyama; steps K; temperature of
-    initial and injected noise; temperature of the route choice."""
+    """sampler: ddim, dpm_solver_pp (DPM-Solver++ 2M) or euler_maruyama; churn of the first two (1 is the reverse SDE, 0
+    deterministic); steps K; temperature of initial and injected noise; temperature of the route choice."""
 
     sampler: str = "ddim"
     steps: int = 8
     churn: float = 1.0
     temperature: float = 1.0
     route_temperature: float = 0.5
+
+    def __post_init__(self):
+        if self.sampler not in SAMPLERS:
+            raise InputError(f"prior.sampler.sampler is {self.sampler!r}; choose one of {', '.join(SAMPLERS)}")
+        if self.steps < 1 or not 0 <= self.churn <= 1:
+            raise InputError("prior.sampler needs steps >= 1 and churn between 0 and 1; they are "
+                             f"{self.steps} and {self.churn}")
 
 
 @dataclass
@@ -111,35 +120,36 @@ class Prior(nn.Module):
         active = torch.cat([torch.zeros_like(active[:, :1]), active[:, 1:]], 1)
         ego_x = None if ego_plan is None else plan_to_x(ego_plan, state, routed)
         return Context(routed, state, encoding, ego_x, around, active,
-                       bool(routed.has_lane.all()))
+                       bool((routed.has_lane | ~here).all()))
 
     def denoise(self, x: Tensor, level: Tensor, context: Context) -> Tensor:
         """x0 [B, V, SIZE] of x at a scalar noise level; the ego's row is its plan, given clean, where that is known."""
         if context.ego_x is None:
-            return self.denoiser(x, level.expand(x.shape[:2]), context.encoding)
+            return self.denoiser(x, level.expand(1, x.shape[1]), context.encoding)
         x = torch.cat([context.ego_x[:, None], x[:, 1:]], 1)
-        levels = level.expand(x.shape[:2]).clone()
+        levels = level.repeat(1, x.shape[1])
         levels[:, 0] = CLEAN
         x0 = self.denoiser(x, levels, context.encoding)
         return torch.cat([context.ego_x[:, None], x0[:, 1:]], 1)
 
-    def decode(self, x0: Tensor, context: Context, cap: Tensor | None = None) -> LaneState:
-        """Planned motion, fields [B, V, HORIZON], of x0; cap [B, V]: of the acceleration in the executed part."""
+    def decode(self, x0: Tensor, context: Context, cap: Tensor | None = None, steps: slice = slice(None)) -> LaneState:
+        """Planned motion, fields [B, V, HORIZON] (or those `steps` of it), of x0; cap [B, V]: of the acceleration in the
+        executed part."""
         state = context.state
         if cap is not None:
             x0 = torch.cat([torch.minimum(x0[..., :1], cap[..., None]), x0[..., 1:]], -1)
             onset = torch.minimum(state.a, torch.maximum(cap, state.a - self.bounds.onset))
             state = LaneState(**{**vars(state), "a": onset})
-        lane = lane_relative.decode(x0, state, context.routed.points)
+        lane = lane_relative.decode(x0, state, context.routed.points, steps)
         if context.all_on_lane:
             return lane
         on_lane = context.routed.has_lane[..., None]
-        free = free_space.decode(x0, state)
+        free = free_space.decode(x0, state).map(lambda value: value[..., steps])
         return LaneState(*(torch.where(on_lane, getattr(lane, f.name), getattr(free, f.name))
                            for f in fields(LaneState)))
 
     def sample(self, context: Context, noise: Tensor, control: Control | None = None) -> Sample:
-        """One joint sample by the reverse SDE from level `start` to 0 (eq. Euler-Maruyama, or ancestral steps).
+        """One joint sample by the reverse SDE from level `start` to 0, with the steps of `sde.reverse_step`.
 
         noise [steps, B, V, SIZE]: standard normal, the first slice starts the reverse SDE, the others drive it.
         control(x, level, k, context, denoise) -> (x, x0 before, x0 after control); see e2rl/synthesizer/control.py.
@@ -147,7 +157,7 @@ class Prior(nn.Module):
         settings = self.sampler
         levels = self.schedule.levels(settings.steps, noise.device)
         noise = settings.temperature * noise
-        x, kl = noise[0], torch.zeros(noise.shape[1:3], device=noise.device)
+        x, kl, past, nominal_past = noise[0], torch.zeros(noise.shape[1:3], device=noise.device), None, None
         for k in range(settings.steps, 0, -1):
             high, low = levels[settings.steps - k], levels[settings.steps - k + 1]
             if control is None:
@@ -155,22 +165,14 @@ class Prior(nn.Module):
                     x0 = nominal = self.denoise(x, high, context)
             else:
                 x, nominal, x0 = control(x, high, k, context, lambda y, t=high: self.denoise(y, t, context))
-            before = x
             if k > 1:  # the last step takes x0 itself
-                xi = noise[settings.steps - k + 1]
-                x, variance = self._step(x, x0, high, low, xi)
-                if control is not None:
-                    shift = x - self._step(before, nominal, high, low, xi)[0]
-                    kl = kl + path_kl(shift, variance * settings.temperature**2)
+                step = partial(reverse_step, settings.sampler, self.schedule, x, high=high, low=low,
+                               noise=noise[settings.steps - k + 1], churn=settings.churn)
+                x, variance = step(x0=x0, past=past)
+                if control is not None:  # against what the prior would do from the same visited states
+                    kl = kl + path_kl(x - step(x0=nominal, past=nominal_past)[0], variance * settings.temperature**2)
+                past, nominal_past = (x0, high), (nominal, high)
         return Sample(x0, kl)
-
-    def _step(self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """x at the lower level and the variance of the injected noise."""
-        if self.sampler.sampler == "euler_maruyama":
-            score = self.schedule.score(x, x0, high)
-            return euler_maruyama_step(self.schedule, x, score, high, low, noise)
-        after, scale = ddim_step(self.schedule, x, x0, high, low, noise, self.sampler.churn)
-        return after, scale**2
 
     @torch.no_grad()
     def plan(self, x0: Tensor, context: Context) -> "Plan":

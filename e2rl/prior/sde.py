@@ -49,6 +49,10 @@ class NoiseSchedule:
         """The noise eps that x_t holds given x0."""
         return (x - self.alpha(t) * x0) / self.sigma(t)
 
+    def log_ratio(self, t: Tensor) -> Tensor:
+        """lambda(t) = log(alpha / sigma), half the log of the signal-to-noise ratio; infinite at 0."""
+        return torch.log(self.alpha(t) / self.sigma(t))
+
     def levels(self, steps: int, device=None) -> Tensor:
         """Noise levels t_K > ... > t_0 = 0, [steps + 1], evenly spaced."""
         return torch.linspace(self.start, 0.0, steps + 1, device=device)
@@ -76,6 +80,38 @@ def ddim_step(
     eps = schedule.noise(x, x0, high)
     rest = torch.sqrt((sigma_low**2 - scale**2).clamp(min=0))
     return alpha_low * x0 + rest * eps + scale * noise, scale
+
+
+def multistep_estimate(
+    schedule: NoiseSchedule, x0: Tensor, past: Tensor, before: Tensor, high: Tensor, low: Tensor
+) -> Tensor:
+    """The clean estimate that DPM-Solver++ 2M steps with (Lu et al. 2022, algorithm 2): x0 at level high, extrapolated
+    to the middle of the step in log(alpha / sigma) with the estimate `past` of the level `before` it.
+
+    With it, ddim_step is 2M: second order at churn 0, the SDE variant at churn 1. The level low must be above 0.
+    """
+    middle, last, end = (schedule.log_ratio(t) for t in (high, before, low))
+    return x0 + 0.5 * (end - middle) / (middle - last) * (x0 - past)
+
+
+SAMPLERS = ("ddim", "dpm_solver_pp", "euler_maruyama")
+
+
+def reverse_step(
+    sampler: str, schedule: NoiseSchedule, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor,
+    churn: float, past: tuple[Tensor, Tensor] | None,
+) -> tuple[Tensor, Tensor]:
+    """One step of a sampler of SAMPLERS from level high to low > 0: (x_low, variance of the injected noise).
+
+    past: the clean estimate of the step before and its level, None at the first; only dpm_solver_pp looks at it. Given
+    past, every step is affine in x0, so two steps with the same noise differ by the shift of their means.
+    """
+    if sampler == "euler_maruyama":
+        return euler_maruyama_step(schedule, x, schedule.score(x, x0, high), high, low, noise)
+    if sampler == "dpm_solver_pp" and past is not None:
+        x0 = multistep_estimate(schedule, x0, *past, high, low)
+    after, scale = ddim_step(schedule, x, x0, high, low, noise, churn)
+    return after, scale**2
 
 
 def path_kl(shift: Tensor, variance: Tensor) -> Tensor:

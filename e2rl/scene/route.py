@@ -3,6 +3,8 @@
 Routes are smoothed, so chords are a little shorter than SPACING; projection and interpolation share the index scale.
 """
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -39,9 +41,19 @@ def project(
     """
     last = route.shape[-2] - 2
     vertex = nearest_vertex(points, route, hint, window)
+    return onto_segments(points, vertex, last, lambda index: _take(route, index))
+
+
+def onto_segments(
+    points: Tensor, vertex: Tensor, last: int, take: Callable[[Tensor], Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`project` of points [..., 2] whose nearest vertices [...] are known, onto the segments at either side of these.
+
+    last: index of the last segment; take: the vertices [..., 2] at an index [...].
+    """
     best = None
     for start in ((vertex - 1).clamp(0, last), vertex.clamp(0, last)):
-        a, b = _take(route, start), _take(route, start + 1)
+        a, b = take(start), take(start + 1)
         along = b - a
         length = along.norm(dim=-1).clamp(min=1e-6)
         unit = along / length[..., None]

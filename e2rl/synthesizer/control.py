@@ -14,6 +14,7 @@ from torch import Tensor
 from e2rl.errors import InputError
 from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS
 from e2rl.prior.prior import Context, Prior
+from e2rl.prior.sde import NoiseSchedule
 from e2rl.synthesizer.anchoring import Anchor, blend_clean, blend_literal
 from e2rl.synthesizer.potentials import (
     PotentialContext,
@@ -21,6 +22,7 @@ from e2rl.synthesizer.potentials import (
     adversarial_potential,
     annealed_temperature,
     feasibility_potential,
+    sampled_steps,
 )
 
 MIN_ALPHA = 0.05
@@ -49,6 +51,14 @@ class ControlSettings:
 def clip_rows(gradient: Tensor, limit: float) -> Tensor:
     """gradient [B, V, D] with each row's norm at most `limit`."""
     return gradient * (limit / gradient.norm(dim=-1, keepdim=True).clamp(min=limit))
+
+
+def gradient_weight(schedule: NoiseSchedule, level: Tensor, scaling: str) -> Tensor:
+    """Factor between grad V and the shift of x0: score (sigma^2 / alpha) is the exact form, sigma and unit tame it."""
+    alpha, sigma = schedule.alpha(level), schedule.sigma(level)
+    if scaling == "score":
+        return sigma**2 / alpha.clamp(min=MIN_ALPHA)
+    return sigma if scaling == "sigma" else torch.ones_like(sigma)
 
 
 class SparseControl:
@@ -82,12 +92,12 @@ class SparseControl:
                 with torch.no_grad():
                     x0 = denoise(x)
                 variable = x0 = x0.detach().requires_grad_(True)
-            states = self.prior.decode(x0, context).states()
+            states = self.prior.decode(x0, context, steps=sampled_steps(self.potentials)).states()
             threat = adversarial_potential(states, self.where, self.potentials, heat)
             infeasible = feasibility_potential(states, self.where, self.potentials)
             (towards,) = torch.autograd.grad(threat.sum(), variable, retain_graph=True)
             (away,) = torch.autograd.grad(infeasible.sum(), variable)
-        weight = self._weight(level)
+        weight = gradient_weight(self.prior.schedule, level, self.settings.scaling)
         towards = clip_rows(weight * towards, self.settings.adversarial_clip)
         away = clip_rows(self.settings.feasibility * weight * away, self.settings.feasibility_clip)
         whom = context.active if self.settings.feasibility_scope == "all" else self.coalition
@@ -95,13 +105,6 @@ class SparseControl:
         acts = (context.active & (self.eta > 0)[:, None])[..., None]
         x0 = x0.detach()
         return x, x0, x0 - torch.where(acts, shift, 0.0)
-
-    def _weight(self, level: Tensor) -> Tensor:
-        """Factor between grad V and the shift of x0: sigma^2 / alpha is the exact score form, the others tame it."""
-        alpha, sigma = self.prior.schedule.alpha(level), self.prior.schedule.sigma(level)
-        if self.settings.scaling == "score":
-            return sigma**2 / alpha.clamp(min=MIN_ALPHA)
-        return sigma if self.settings.scaling == "sigma" else torch.ones_like(sigma)
 
     def _anchored(self, x: Tensor, level: Tensor, context: Context, denoise) -> Tensor:
         """Topological anchoring of the coalition at this level; books the jump's energy."""

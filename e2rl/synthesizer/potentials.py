@@ -1,9 +1,9 @@
 """The potentials of the control, eq. (potential_decomp): V_feas of every vehicle, V_adv of the coalition along its
 chain.
 
-Both act on decoded states [B, V, H, 4] (x, y [m], heading [rad], speed [m/s], steps of DT) and are returned per
-vehicle, [B, V]. Everybody else is detached in a vehicle's own term: the ego is a black box, targets are not drawn to
-their pursuers, and the gradient of row i is that of V_i alone. Gradients are finite everywhere.
+Both act on decoded states [B, V, H', 4] (x, y [m], heading [rad], speed [m/s]) at every stride-th step and are
+returned per vehicle, [B, V]. Everybody else is detached in a vehicle's own term: the ego is a black box, targets are
+not drawn to their pursuers, and the gradient of row i is that of V_i alone. Gradients are finite everywhere.
 """
 
 import math
@@ -180,19 +180,23 @@ def _motion_terms(states: Tensor, context: PotentialContext, settings: Potential
     return settings.accel * excess.mean(-1) + settings.jerk * rough.mean(-1)
 
 
-def _sampled(states: Tensor, context: PotentialContext, settings: PotentialSettings) -> Tensor:
-    """Every stride-th step of states [B, V, H, 4], row 0 replaced by the detached ego plan."""
-    at = slice(settings.stride - 1, states.shape[2], settings.stride)
-    ego = context.ego_plan[:, None, :states.shape[2]].detach()
-    return torch.cat([ego, states[:, 1:]], 1)[:, :, at]
+def sampled_steps(settings: PotentialSettings) -> slice:
+    """The steps of a plan that the potentials look at."""
+    return slice(settings.stride - 1, None, settings.stride)
+
+
+def _with_ego(states: Tensor, context: PotentialContext, settings: PotentialSettings) -> Tensor:
+    """Sampled states [B, V, H', 4], row 0 replaced by the detached ego plan."""
+    ego = context.ego_plan[:, None, sampled_steps(settings)].detach()
+    return torch.cat([ego[:, :, :states.shape[2]], states[:, 1:]], 1)
 
 
 def feasibility_potential(states: Tensor, context: PotentialContext, settings: PotentialSettings) -> Tensor:
-    """V_feas [B, V] of decoded states [B, V, H, 4]: off-road, offset from the route, overlap with others (except
-    between an adversary and its target), acceleration, jerk, wrong way (design.md 7.3). 0 for the ego and for absent
-    vehicles.
+    """V_feas [B, V] of decoded states [B, V, H', 4] at `sampled_steps`: off-road, offset from the route, overlap
+    with others (except between an adversary and its target), acceleration, jerk, wrong way (design.md 7.3). 0 for the
+    ego and for absent vehicles.
     """
-    states = _sampled(states, context, settings)
+    states = _with_ego(states, context, settings)
     value = (_road_terms(states, context, settings) + _motion_terms(states, context, settings)
              + settings.pair * _overlap_term(states, context, settings))
     counted = context.valid.clone()
@@ -213,12 +217,13 @@ def ttc_cost(offset: Tensor, closing: Tensor, time_scale: float = 1.0, miss_scal
 
 def adversarial_potential(states: Tensor, context: PotentialContext, settings: PotentialSettings,
                           temperature: Tensor | float | None = None) -> Tensor:
-    """V_adv [B, V] of decoded states [B, V, H, 4] along the chain: low where a vehicle meets its own target.
+    """V_adv [B, V] of decoded states [B, V, H', 4] at `sampled_steps`, along the chain: low where a vehicle
+    meets its own target.
 
     Soft minimum over time of the distance to the target (in units of 2 m; temperature in m, default `narrow`), TTC cost
     and closing speed, all against the detached target. 0 outside the coalition.
     """
-    states = _sampled(states, context, settings)
+    states = _with_ego(states, context, settings)
     index = context.target.clamp(min=0)
     size = context.scene["size"][:, :states.shape[1]]
     target = states.detach().gather(1, index[..., None, None].expand_as(states))

@@ -19,11 +19,13 @@ from e2rl.sim.world import World
 from e2rl.synthesizer.anchoring import Anchor, AnchorSettings, propose
 from e2rl.synthesizer.control import ControlSettings, SparseControl
 from e2rl.synthesizer.feasibility import FeasibilitySettings, feasible_vehicles
+from e2rl.synthesizer.grouping import clone, crop_episode, crop_world, gather_plans, group_scenes, write_episode
 from e2rl.synthesizer.potentials import (
     PotentialContext,
     PotentialSettings,
     adversarial_potential,
     feasibility_potential,
+    sampled_steps,
 )
 from e2rl.synthesizer.skeleton import Skeleton, SkeletonSettings, build_skeleton, chain_depth
 from e2rl.synthesizer.topology import TopologySettings, topological_candidates
@@ -125,18 +127,30 @@ class Synthesizer:
     def replan(self, episode: Episode, world: World, ego_plan: Tensor) -> tuple[Episode, Plan]:
         """The episodes and the plan of the coming HORIZON steps, given the ego's plan [B, HORIZON, 4] (detached)."""
         ego_plan = ego_plan.detach()
+        noise = torch.stack([self._noise(episode, draw) for draw in range(self.settings.samples)])
+        groups, (batch, width) = group_scenes(world), episode.routed.route.shape
+        whole, plans = clone(episode), []
+        for group in groups:
+            part, plan = self._replan_group(crop_episode(episode, group, width), crop_world(world, group),
+                                            ego_plan[group.rows], noise[:, :, group.rows, :group.vehicles])
+            write_episode(whole, part, group)
+            plans.append((group, plan))
+        return whole, gather_plans(plans, batch, width)
+
+    def _replan_group(self, episode: Episode, world: World, ego_plan: Tensor, noise: Tensor) -> tuple[Episode, Plan]:
+        """`replan` of a group; noise [samples, steps, B, V, SIZE]."""
         episode = replace(episode, state=self._placed(episode, world, ego_plan))
         world = replace(world, route=episode.routed.route)
-        controlled = bool((episode.eta > 0).any())
+        controlled, anchor = bool((episode.eta > 0).any()), None
         if controlled:
-            episode = self._reselected(episode, world, ego_plan)
+            episode, anchor = self._reselected(episode, world, ego_plan, noise[0])
             world = replace(world, route=episode.routed.route)
         context = self._encode(episode, world, ego_plan, episode.coalition)
         where = self._where(episode, world, ego_plan)
-        control = self._control(episode, world, where) if controlled else None
+        control = self._control(episode, where, anchor) if controlled else None
         best = None
-        for draw in range(self.settings.samples):
-            sample = self.prior.sample(context, self._noise(episode, draw), control)
+        for draw in noise:
+            sample = self.prior.sample(context, draw, control)
             jump = control.jump if control else torch.zeros_like(sample.kl)
             found = (sample.x0, sample.kl, jump, self._cost(sample.x0, context, where, episode.eta))
             best = found if best is None else _cheaper(best, found)
@@ -151,7 +165,7 @@ class Synthesizer:
         """V_feas of everybody plus eta V_adv of the coalition [B]: whole joint samples are compared, never vehicles."""
         if self.settings.samples == 1:
             return torch.zeros_like(eta)
-        states = self.prior.decode(x0, context).states()
+        states = self.prior.decode(x0, context, steps=sampled_steps(self.settings.potentials)).states()
         infeasible = feasibility_potential(states, where, self.settings.potentials) * context.active
         threat = adversarial_potential(states, where, self.settings.potentials)
         return self.settings.selection * infeasible.sum(-1) + eta * threat.sum(-1)
@@ -174,23 +188,19 @@ class Synthesizer:
     def _encode(self, episode: Episode, world: World, ego_plan: Tensor, exempt: Tensor) -> Context:
         return self.prior.encode(episode.routed, episode.state, world.states, world.valid, world.step, ego_plan, exempt)
 
-    def _reselected(self, episode: Episode, world: World, ego_plan: Tensor) -> Episode:
-        """The episodes, those with a new support whose choice is due and whose coalition is of no use any more."""
+    def _reselected(self, episode: Episode, world: World, ego_plan: Tensor, noise: Tensor) -> tuple[Episode, Anchor]:
+        """The episodes and their anchors, those with a new support whose choice is due and of whose coalition no member
+        can meet its target any more."""
         every = self.settings.reselect
         due = (episode.replans == 0) | ((episode.replans % every == 0) if every > 0 else False)
-        rows = (due & (episode.eta > 0)).nonzero().squeeze(-1)
+        anchor = self._anchor(episode, world, ego_plan)
+        rows = (due & (episode.eta > 0) & ~anchor.has.any(1)).nonzero().squeeze(-1)
         if not len(rows):
-            return episode
-        asked = take_rows(episode, rows), take_rows(world, rows), ego_plan[rows]
-        lost = (~self._viable(*asked)).nonzero().squeeze(-1)
-        if not len(lost):
-            return episode
-        chosen = self._select(take_rows(asked[0], lost), take_rows(asked[1], lost), asked[2][lost])
-        return put_rows(episode, rows[lost], chosen)
-
-    def _viable(self, episode: Episode, world: World, ego_plan: Tensor) -> Tensor:
-        """[B]: some member of the coalition can still meet its target, so the coalition stays as it is."""
-        return self._anchor(episode, world, ego_plan).has.any(1)
+            return episode, anchor
+        lost, there = take_rows(episode, rows), take_rows(world, rows)
+        chosen = self._select(lost, there, ego_plan[rows], noise[:, rows])
+        found = self._anchor(chosen, replace(there, route=chosen.routed.route), ego_plan[rows])
+        return put_rows(episode, rows, chosen), put_rows(anchor, rows, found)
 
     def _anchor(self, episode: Episode, world: World, ego_plan: Tensor) -> Anchor:
         """Proposals for the present coalition on its present routes."""
@@ -199,11 +209,11 @@ class Synthesizer:
                             episode.replans)
         return propose(world.scene, world, skeleton, ego_plan, self.settings.anchor, keep_route=True)
 
-    def _select(self, episode: Episode, world: World, ego_plan: Tensor) -> Episode:
+    def _select(self, episode: Episode, world: World, ego_plan: Tensor, noise: Tensor) -> Episode:
         """Topology on a reference rollout, feasibility, skeleton; the coalition takes the routes that meet targets."""
         scene, vehicles = world.scene, episode.routed.route.shape[1]
         context = self._encode(episode, world, ego_plan, torch.zeros_like(episode.coalition))
-        nominal = self.prior.plan(self.prior.sample(context, self._noise(episode)).x0, context)
+        nominal = self.prior.plan(self.prior.sample(context, noise).x0, context)
         reference = torch.cat([ego_plan[:, None], nominal.states()[:, 1:]], 1).transpose(1, 2)
         valid = world.valid[:, None, :vehicles] & nominal.on_map.transpose(1, 2)
         found = topological_candidates(reference, valid, scene["size"][:, :vehicles], self.settings.topology)
@@ -227,7 +237,8 @@ class Synthesizer:
         changed = route != episode.routed.route
         if not bool(changed.any()):
             return episode
-        routed = route_scene(world.scene, route, self.prior.free_space)
+        rows = changed.any(1).nonzero().squeeze(-1)
+        routed = put_rows(episode.routed, rows, route_scene(world.scene[rows], route[rows], self.prior.free_space))
         old = episode.state
         moved = locate(world.states[:, :route.shape[1]], old.a, old.kappa * old.v, routed.points)
         state = LaneState(*(torch.where(changed, getattr(moved, f.name), getattr(old, f.name))
@@ -240,8 +251,8 @@ class Synthesizer:
             world.scene, world.states[:, :vehicles], episode.state.a, world.valid[:, :vehicles], episode.routed.points,
             episode.routed.has_lane, ego_plan[:, :HORIZON], episode.target)
 
-    def _control(self, episode: Episode, world: World, where: PotentialContext) -> SparseControl:
-        settings, anchor = self.settings, self._anchor(episode, world, where.ego_plan)
+    def _control(self, episode: Episode, where: PotentialContext, anchor: Anchor) -> SparseControl:
+        settings = self.settings
         literal = noise_of(episode.seed, LITERAL + episode.replans, (*episode.target.shape[1:], SIZE))
         return SparseControl(self.prior, settings.control, settings.potentials, where, episode.coalition, episode.eta,
                              anchor, settings.anchor.strength, literal)

@@ -74,7 +74,7 @@ class AdversarialSynthesizer(Transform):
 
     def _replan(self, rows: Tensor, world: World) -> None:
         """New plans of environments `rows`, written into the traffic."""
-        ego_plan = self.ego.plan(world)
+        ego_plan = self.ego.announce(world)
         if len(rows) == len(world.step):  # spares copies of maps
             episode, plan = self.synthesizer.replan(self.episode, world, ego_plan)
             self.episode = replace(episode, state=plan.after(self.every))

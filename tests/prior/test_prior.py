@@ -40,6 +40,7 @@ def gaussian_prior(**sampler):
 
 
 @pytest.mark.parametrize("sampler", [{"steps": 50}, {"steps": 50, "churn": 0.0},
+                                     {"steps": 50, "sampler": "dpm_solver_pp"},
                                      {"steps": 200, "sampler": "euler_maruyama"}], ids=str)
 def test_sampling_draws_from_gaussian_data(sampler):
     prior = gaussian_prior(**sampler)
@@ -51,6 +52,7 @@ def test_sampling_draws_from_gaussian_data(sampler):
 
 
 @pytest.mark.parametrize("sampler", [{"steps": 4}, {"steps": 5, "churn": 0.7},
+                                     {"steps": 5, "sampler": "dpm_solver_pp"},
                                      {"steps": 4, "sampler": "euler_maruyama"}], ids=str)
 @pytest.mark.parametrize("temperature", [1.0, 0.8])
 def test_path_kl_is_that_of_the_two_laws_of_the_path(sampler, temperature):

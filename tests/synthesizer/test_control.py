@@ -12,6 +12,7 @@ from e2rl.synthesizer.potentials import (
     PotentialSettings,
     adversarial_potential,
     feasibility_potential,
+    sampled_steps,
 )
 from tests.prior.small import small_prior
 from tests.synthesizer.traffic_scenes import ROWS, scenes
@@ -57,7 +58,7 @@ class Case:
         return x0 - nominal, after - x
 
     def values(self, x0):
-        states = self.prior.decode(x0, self.context, capped=False).states()
+        states = self.prior.decode(x0, self.context, False, sampled_steps(PotentialSettings())).states()
         return (adversarial_potential(states, self.where, PotentialSettings())[:, MEMBER],
                 feasibility_potential(states, self.where, PotentialSettings())[:, 1:].sum(-1))
 

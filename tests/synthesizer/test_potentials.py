@@ -7,14 +7,14 @@ import torch
 
 from e2rl.errors import InputError
 from e2rl.sim.geometry import corners
+from e2rl.synthesizer import potentials
 from e2rl.synthesizer.motion import cruise
 from e2rl.synthesizer.potentials import (
     PotentialContext,
     PotentialSettings,
-    adversarial_potential,
     annealed_temperature,
     box_gap,
-    feasibility_potential,
+    sampled_steps,
     ttc_cost,
 )
 from tests.synthesizer.crossing import make_world
@@ -22,6 +22,16 @@ from tests.synthesizer.crossing import make_world
 UP = math.pi / 2
 EGO = (0.0, 0.0, 0.0, 10.0)
 SETTINGS = PotentialSettings()
+
+
+def feasibility_potential(states, context, settings):
+    return potentials.feasibility_potential(states[:, :, sampled_steps(settings)], context, settings)
+
+
+def adversarial_potential(states, context, settings, *temperature):
+    return potentials.adversarial_potential(states[:, :, sampled_steps(settings)], context, settings, *temperature)
+
+
 POTENTIALS = [feasibility_potential, adversarial_potential]
 
 

@@ -1,0 +1,29 @@
+"""The simulator through TorchRL's Collector with the learned actor, as in an evolution round."""
+
+import time
+from collections.abc import Iterator
+
+import torch
+from measure import Bench, Row
+from torchrl.collectors import Collector
+
+from e2rl.ego.actor import ActorEgo
+from e2rl.sim.env import DrivingEnv
+
+STEPS = 40
+
+
+def collector(bench: Bench) -> Iterator[Row]:
+    """Ego steps per second at 32 to 512 scenes a batch."""
+    for batch in (32, 128, 512):
+        env, actor = DrivingEnv(bench.scenes, bench.sim, batch), ActorEgo().network.actor
+        source = Collector(env, actor, frames_per_batch=batch * STEPS, total_frames=batch * STEPS * (bench.repeats + 1),
+                           auto_register_policy_transforms=False)
+        times = []
+        with torch.no_grad():
+            begin = time.perf_counter()
+            for _ in source:
+                times.append(time.perf_counter() - begin)
+                begin = time.perf_counter()
+        source.shutdown()
+        yield bench.row("collector", "with the actor", bench.pick(batch), batch * STEPS / min(times[1:]), "ego steps/s")

@@ -1,0 +1,125 @@
+"""What every benchmark shares: the scenes and parts under test, timing, and the row that is written."""
+
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+from tensordict import TensorDict
+from torch import Tensor
+
+from e2rl.ego.base import Ego
+from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_synthesizer
+from e2rl.scene.scene import SceneSet
+from e2rl.scene.source import load_scenes
+from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.synthesizer.synthesizer import Synthesizer
+
+CONF = Path(__file__).resolve().parent.parent / "conf"
+
+
+def versions() -> dict[str, str]:
+    """Of what the figures depend on."""
+    return {"python": platform.python_version()} | {name: version(name) for name in ("torch", "torchrl", "tensordict")}
+
+
+@dataclass
+class Row:
+    """A figure. variant: what of the benchmark; batch: scenes at once; agents, map_points: rows a scene has; value in
+    unit; load: of the machine in the minute before; processes, threads of each."""
+
+    benchmark: str
+    variant: str
+    batch: int
+    agents: int
+    map_points: int
+    value: float
+    unit: str
+    processes: int = 1
+    threads: int = field(default_factory=torch.get_num_threads)
+    load: float = field(default_factory=lambda: round(os.getloadavg()[0], 2))
+    versions: dict[str, str] = field(default_factory=versions)
+
+    def plain(self) -> dict:
+        """As a row of the JSON file."""
+        return asdict(self)
+
+
+@dataclass
+class Bench:
+    """What is measured: data (a ScenarioNet folder or zip, None: the bundled scenes), prior checkpoint, repeats."""
+
+    data: str | None
+    checkpoint: str
+    repeats: int
+
+    @cached_property
+    def config(self) -> DictConfig:
+        """Of evaluate.py with its defaults."""
+        return self.configured("evaluate")
+
+    def configured(self, name: str, *overrides: str) -> DictConfig:
+        """Configuration `name` on the data and prior under test."""
+        data = ["data=scenarionet", f"data.path={self.data}"] if self.data else ["data=bundled"]
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            return compose(name, [*data, f"prior.checkpoint={self.checkpoint}", *overrides])
+
+    @cached_property
+    def scenes(self) -> SceneSet:
+        """All scenes of the data."""
+        return load_scenes(self.config.data)
+
+    @cached_property
+    def synthesizer(self) -> Synthesizer:
+        """e2 on the prior under test."""
+        return build_synthesizer(self.config, build_prior(self.config)[0])
+
+    @cached_property
+    def ego(self) -> Ego:
+        """lane_graph."""
+        return build_ego(self.config)
+
+    @cached_property
+    def sim(self) -> SimSettings:
+        """The simulator's defaults."""
+        return build_sim(self.config)
+
+    def pick(self, batch: int, dense: bool = False) -> Tensor:
+        """Scene indices [batch], repeated where there are too few; dense: those with most vehicles."""
+        vehicles = self.scenes.scenes["route_log"].shape[1]
+        count = self.scenes.scenes["valid"][:, :vehicles].sum(1)
+        order = count.argsort(descending=True, stable=True) if dense else torch.arange(len(count))
+        return order[torch.arange(batch) % len(order)]
+
+    def environment(self, index: Tensor) -> DrivingEnv:
+        """The simulator at the start of scenes index [B]."""
+        env = DrivingEnv(self.scenes, self.sim, len(index))
+        env.reset(TensorDict({"scene_index": index[:, None]}, batch_size=[len(index)]))
+        return env
+
+    def row(self, benchmark: str, variant: str, index: Tensor, value: float, unit: str, **fields) -> Row:
+        """A Row whose sizes are those of scenes index [B]: agents present and lane points, a scene's mean."""
+        scene = self.scenes.scenes
+        agents = scene["valid"][index].sum(-1).float().mean().round()
+        points = (scene["lane_index"][index] >= 0).sum(-1).float().mean().round()
+        return Row(benchmark, variant, len(index), int(agents), int(points), value, unit, **fields)
+
+    def best(self, function: Callable[[], object]) -> float:
+        """Least wall time [s] of the repeats, after one call that is not counted."""
+        function()
+        times = []
+        for _ in range(self.repeats):
+            begin = time.perf_counter()
+            function()
+            times.append(time.perf_counter() - begin)
+        return min(times)
+
+
+Benchmark = Callable[[Bench], Iterator[Row]]

@@ -1,0 +1,53 @@
+"""`python benchmarks/run.py --json FILE [--only NAME] [--data PATH]`: how fast the parts are, as a table and as rows.
+
+Least time of the repeats, one thread, one process; timings on a shared machine are worth their load column.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import torch
+from collector import collector
+from evolution_round import evolution_round
+from guided_replan import guided_replan
+from measure import Bench, Benchmark
+from memory import memory
+from ppo_update import ppo_update
+from simulator import simulator
+from synthesized_rollout import synthesized_rollout
+
+from e2rl.errors import InputError, stop
+
+BENCHMARKS: dict[str, Benchmark] = {function.__name__: function for function in (
+    simulator, collector, ppo_update, guided_replan, synthesized_rollout, evolution_round, memory)}
+
+
+def main(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=Path, required=True, help="file for the rows")
+    parser.add_argument("--only", action="append", choices=sorted(BENCHMARKS), help="this benchmark (repeatable)")
+    parser.add_argument("--data", help="ScenarioNet folder or zip; default: the bundled test scenes")
+    parser.add_argument("--prior", default="bundled", help="checkpoint of a prior")
+    parser.add_argument("--repeats", type=int, default=5)
+    options = parser.parse_args(arguments)
+    if options.repeats < 1:
+        raise InputError(f"--repeats {options.repeats}: expected at least 1")
+    torch.set_num_threads(1)
+    bench, rows = Bench(options.data, options.prior, options.repeats), []
+    line = "{:20} {:44} {:>5} {:>6} {:>10} {:>12} {:18} {:>5}"
+    print(line.format("benchmark", "variant", "batch", "agents", "map points", "value", "unit", "load"))
+    for name in options.only or BENCHMARKS:
+        for row in BENCHMARKS[name](bench):
+            print(line.format(row.benchmark, row.variant, row.batch, row.agents, row.map_points, f"{row.value:.4g}",
+                              row.unit, f"{row.load:.1f}"), flush=True)
+            rows.append(row.plain())
+            options.json.write_text(json.dumps(rows, indent=1))
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except InputError as error:
+        stop(error)
