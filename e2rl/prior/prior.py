@@ -133,8 +133,8 @@ class Prior(nn.Module):
         return torch.cat([context.ego_x[:, None], x0[:, 1:]], 1)
 
     def decode(self, x0: Tensor, context: Context, cap: Tensor | None = None, steps: slice = slice(None)) -> LaneState:
-        """Planned motion, fields [B, V, HORIZON] (or those `steps` of it), of x0; cap [B, V]: of the acceleration in the
-        executed part."""
+        """Planned motion, fields [B, V, HORIZON] (or those `steps` of it), of x0; cap [B, V]: of the acceleration in
+        the executed part."""
         state = context.state
         if cap is not None:
             x0 = torch.cat([torch.minimum(x0[..., :1], cap[..., None]), x0[..., 1:]], -1)
@@ -176,7 +176,7 @@ class Prior(nn.Module):
 
     @torch.no_grad()
     def plan(self, x0: Tensor, context: Context) -> "Plan":
-        """The motion that is executed: decoded, under bounds where it needs them, standing vehicles held, routes ended."""
+        """The motion that is executed: decoded, bounded where it must be, standing vehicles held, routes ended."""
         routed = context.routed
         motion = bounded(self.bounds, lambda cap: self._held(self.decode(x0, context, cap), context), context.state,
                          context.around)

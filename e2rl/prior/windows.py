@@ -44,7 +44,8 @@ def make_windows(scenes: TensorDictBase, free: bool = False, chunk: int = 32) ->
         unwrapped = torch.cumsum(torch.cat([turn[:, :1], wrap(turn.diff(dim=1))], 1), 1)
         yaw_rate = derivative(unwrapped, valid).clamp(-1.0, 1.0)
         frames = {"exact": OFFSETS, "perturbed": OFFSETS, "causal": (0,)}
-        parts += [_window(scene, routed, offset, accel, yaw_rate, start) for start in STARTS for offset in frames[start]]
+        parts += [_window(scene, routed, offset, accel, yaw_rate, start)
+                  for start in STARTS for offset in frames[start]]
     windows = torch.cat(parts)
     return windows[windows["weight"].sum(-1) > 0]
 

@@ -9,7 +9,7 @@ from e2rl.prior.prior import Prior, SamplerSettings, plan_to_x
 from e2rl.prior.route_choice import sample_route
 from tests.prior.small import VEHICLES, arc, curved_scenes, small_prior
 
-FREE = BoundSettings(leader=False, curve=False, crossing=False)
+FREE = BoundSettings(meeting=False, curve=False)
 MEAN, STD = 0.4, 0.6
 
 
@@ -103,7 +103,7 @@ def test_the_ego_s_plan_becomes_the_x_that_decodes_to_it(free_space):
     plan = scene["logged"][:, 1:HORIZON + 1, 0]
     x = torch.zeros(*scene["route_log"].shape, SIZE)
     x[:, 0] = context.ego_x
-    decoded = prior.decode(x, context, capped=False).states()[:, 0]
+    decoded = prior.decode(x, context).states()[:, 0]
     assert (decoded - plan)[..., :2].norm(dim=-1).max() < 0.3
 
 
@@ -118,31 +118,21 @@ def test_a_plan_decodes_back_from_lane_coordinates():
     assert gap.max() < 0.15
 
 
-def test_bounds_cap_what_is_executed_and_only_that():
+def test_bounds_change_what_is_executed_of_infeasible_plans_and_only_of_them():
     scene = curved_scenes()
-    scene["start"][:, 1, :2] = torch.tensor([7.5, 0.0])  # 3 m ahead of the ego
-    scene["start"][:, 5] = torch.tensor([0.5, 0.0, 0.0, 8.0])
-    scene["route_points"][:, 5] = arc(0.5, 0.0, 0.0, 0.0)
-    x0 = torch.ones(*scene["route_log"].shape, SIZE)
-    tight, loose = (small_prior(bounds=bounds) for bounds in (BoundSettings(), FREE))
-    capped, free = context_of(tight, scene), context_of(loose, scene)
-    assert (capped.cap <= free.cap).all() and (free.cap > 10).all()
-    assert capped.cap[0, 5] < -2
-    assert (tight.decode(x0, capped).v[0, 5, :5] < loose.decode(x0, free).v[0, 5, :5]).all()
-    torch.testing.assert_close(tight.decode(x0, capped, capped=False).v, loose.decode(x0, free).v)
-
-
-def test_an_exempt_vehicle_does_not_mind_the_ego():
-    scene = curved_scenes()
-    scene["start"][:, 5] = torch.tensor([-7.0, 0.0, 0.0, 8.0])
+    scene["start"][:, 5] = torch.tensor([-7.0, 0.0, 0.0, 14.0])  # runs into the ego from behind
     scene["route_points"][:, 5] = arc(-7.0, 0.0, 0.0, 0.0)
-    prior = small_prior()
+    x0 = torch.zeros(*scene["route_log"].shape, SIZE)
+    tight, loose = (small_prior(bounds=bounds) for bounds in (BoundSettings(curve=False), FREE))
+    free = loose.plan(x0, context_of(loose, scene)).motion.v
+    shy = tight.plan(x0, context_of(tight, scene)).motion.v
     exempt = torch.zeros(scene["route_log"].shape, dtype=torch.bool)
     exempt[:, 5] = True
-    shy, bold = context_of(prior, scene).cap, context_of(prior, scene, exempt=exempt).cap
-    assert bold[0, 5] > shy[0, 5]
+    bold = tight.plan(x0, context_of(tight, scene, exempt=exempt)).motion.v
+    assert (shy[0, 5, 2:] < free[0, 5, 2:]).all()
     others = torch.arange(shy.shape[1]) != 5
-    assert torch.equal(shy[:, others], bold[:, others])
+    assert torch.equal(shy[:, others], free[:, others]) and torch.equal(bold[:, others], free[:, others])
+    assert torch.equal(bold[0, 5], free[0, 5]), "an adversary may meet the ego"
 
 
 def test_parked_absent_and_waiting_vehicles_stay_and_the_ego_is_not_moved():
@@ -152,7 +142,7 @@ def test_parked_absent_and_waiting_vehicles_stay_and_the_ego_is_not_moved():
     context = context_of(prior, scene)
     plan = prior.plan(-torch.ones(*scene["route_log"].shape, SIZE), context)
     states = plan.states()
-    still = [0, 1, 4, *range(len(VEHICLES), scene["route_log"].shape[1])]
+    still = [1, 4, *range(len(VEHICLES), scene["route_log"].shape[1])]
     start = scene["start"][:, :scene["route_log"].shape[1]]
     torch.testing.assert_close(states[:, still, :, :3], start[:, still, None, :3].expand(-1, -1, HORIZON, -1))
     assert (states[:, still, :, 3] == 0).all()
