@@ -24,12 +24,17 @@ def nearest_vertex(points: Tensor, route: Tensor, hint: Tensor | None = None, wi
 
     hint [..., K]: expected arc length; vertices farther than `window` m of it are not looked at (self-crossing routes).
     """
-    squared = (route**2).sum(-1)[..., None, :] - 2 * points @ route.transpose(-1, -2)
-    if hint is not None:
-        arc = SPACING * torch.arange(route.shape[-2], device=route.device, dtype=points.dtype)
-        near = hint.clamp(0, SPACING * (route.shape[-2] - 1))  # beyond the ends, the end is what is near
-        squared = squared.masked_fill((arc - near[..., None]).abs() > window, torch.inf)
-    return squared.argmin(-1)
+    count = route.shape[-2]
+    if hint is None:
+        squared = (route**2).sum(-1)[..., None, :] - 2 * points @ route.transpose(-1, -2)
+        return squared.argmin(-1)
+    near = hint.clamp(0, SPACING * (count - 1))  # beyond the ends, the end is what is near
+    width = min(int(2 * window / SPACING) + 1, count)
+    first = ((near - window) / SPACING).ceil().clamp(0, count - width).long()
+    index = first[..., None] + torch.arange(width, device=first.device)
+    gap = _take(route, index.flatten(-2)).unflatten(-2, index.shape[-2:]) - points[..., None, :]
+    outside = (SPACING * index - near[..., None]).abs() > window
+    return first + gap.square().sum(-1).masked_fill(outside, torch.inf).argmin(-1)
 
 
 def project(

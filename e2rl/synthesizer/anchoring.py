@@ -68,8 +68,9 @@ class Anchor:
 
 @dataclass
 class _Riders:
-    """The vehicles that look for a proposal: slots [B, M] and their candidates [B, M, R]."""
+    """The vehicles that look for a proposal: slots [B, M] and their candidates [B, M, R], numbered as in the scene."""
 
+    candidate: Tensor
     routes: Tensor
     usable: Tensor
     end: Tensor
@@ -170,17 +171,20 @@ def _best(cost: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
     return pick, *rows
 
 
-def _riders(scene: TensorDictBase, world: World, index: Tensor, settings: AnchorSettings) -> _Riders:
-    vehicles = scene["route_points"].shape[1]
-    states = take(world.states[:, :vehicles], index)
-    s, d, error = place(states, scene, index)
-    routes = take(scene["route_points"], index)
-    end = take(scene["route_length"], index)
+def _riders(scene: TensorDictBase, world: World, index: Tensor, settings: AnchorSettings, keep_route: bool) -> _Riders:
+    vehicles, count = scene["route_points"].shape[1:3]
+    states, route = take(world.states[:, :vehicles], index), take(world.route, index)[..., None]
+    candidate = route.clamp(min=0) if keep_route else torch.arange(count, device=index.device).expand(*index.shape, -1)
+    row = torch.arange(len(index), device=index.device)[:, None, None]
+    of = lambda key: scene[key][row, index[..., None], candidate]  # noqa: E731
+    routes, end = of("route_points"), of("route_length")
+    s, d, error = place(states, routes)
     swing = SWING * error.clamp(-1.0, 1.0).tan().abs() * lateral_horizon(states[..., 3])[..., None]
-    followed = torch.arange(s.shape[-1], device=s.device) == take(world.route, index)[..., None]
     reachable = (d.abs() <= settings.max_shift) & (swing <= settings.max_swing)
-    usable = take(scene["route_valid"], index) & (reachable | followed)
-    return _Riders(routes, usable, end, s, d, states[..., 3], take(world.accel[:, :vehicles], index),
+    usable = of("route_valid") & (reachable | (candidate == route))
+    if keep_route:
+        usable = usable & (route >= 0)
+    return _Riders(candidate, routes, usable, end, s, d, states[..., 3], take(world.accel[:, :vehicles], index),
                    take(scene["size"], index), turn_envelope(routes, s, settings))
 
 
@@ -218,10 +222,7 @@ def propose(scene: TensorDictBase, world: World, skeleton: Skeleton, ego_plan: T
     offset = expected.new_full(shape, torch.inf)
     for depth in range(1, int(skeleton.depth.max()) + 1):
         index, present = compact(skeleton.depth == depth)
-        riders = _riders(scene, world, index, settings)
-        if keep_route:
-            followed = torch.arange(riders.usable.shape[-1], device=index.device) == take(world.route, index)[..., None]
-            riders.usable = riders.usable & followed
+        riders = _riders(scene, world, index, settings, keep_route)
         target = skeleton.target.gather(1, index).clamp(min=0)
         size = take(scene["size"], target)
         chosen, found, late = _propose(riders, take(expected, target), size, settings)
@@ -232,6 +233,7 @@ def propose(scene: TensorDictBase, world: World, skeleton: Skeleton, ego_plan: T
         own = riders.routes.gather(2, pick[..., None, None].expand(-1, -1, 1, *riders.routes.shape[3:]))[:, :, 0]
         rides = ride(own, riders.s.gather(2, pick) + way, riders.d.gather(2, pick) * fade(way, riders.v[..., None]), v)
         expected = _write(expected, index, ok, rides)
+        chosen = riders.candidate.gather(2, pick)[..., 0]
         route, knots = _write(route, index, ok, chosen), _write(knots, index, ok, found)
         offset = _write(offset, index, ok, late)
     has = offset.isfinite()

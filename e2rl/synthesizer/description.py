@@ -63,8 +63,8 @@ def describe(scene: TensorDictBase, world: World, vehicle: int, row: int = 0,
     judged = feasible_vehicles(scene, world, settings)
     state, ego, size = world.states[0, vehicle], world.states[0, 0], scene["size"][0, vehicle].tolist()
     limit = float(mission_of(scene).limit[0, 10])
-    s, d, _ = (x[0, 0] for x in place(world.states[:, vehicle:vehicle + 1], scene,
-                                      world.route.new_full((1, 1), vehicle)))
+    here = slice(vehicle, vehicle + 1)
+    s, d, _ = (x[0, 0] for x in place(world.states[:, here], scene["route_points"][:, here]))
     lines = [f"The ego drives at {ego[3]:.1f} m/s" + (f" (limit {limit:.0f} m/s)." if limit else "."),
              f"Vehicle {vehicle} ({size[0]:.1f} x {size[1]:.1f} m) is {_bearing(to_frame(state[:2], ego))}, "
              f"{_course(float(state[2] - ego[2]))}, at {state[3]:.1f} m/s"

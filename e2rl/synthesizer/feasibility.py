@@ -185,8 +185,7 @@ def feasible_vehicles(scene: TensorDictBase, world: World, settings: Feasibility
     """
     vehicles = scene["route_points"].shape[1]
     states = world.states[:, :vehicles].detach()
-    index = torch.arange(vehicles, device=states.device).expand(states.shape[:2])
-    s, d, error = place(states, scene, index)
+    s, d, error = place(states, scene["route_points"])
     fits = (d.abs() <= settings.lateral_bound) & (error.abs() <= settings.heading_bound) & scene["route_valid"]
     drivable = off_road(states[..., :2], scene["field"], scene["field_origin"]) <= 0
     associated = fits.any(-1) & drivable

@@ -25,12 +25,11 @@ def take(values: Tensor, index: Tensor) -> Tensor:
     return values.gather(1, index.reshape(*index.shape, *[1] * (values.dim() - 2)).expand(shape))
 
 
-def place(values: Tensor, scene: TensorDictBase, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Where states values [B, M, 4] of vehicles index [B, M] lie on each of their routes.
+def place(values: Tensor, routes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Where states values [B, M, 4] lie on routes [B, M, R, P, 2].
 
     Returns arc length s [m], lateral offset d [m, left positive] and heading error [rad, in -pi..pi], each [B, M, R].
     """
-    routes = take(scene["route_points"], index)
     s, d, heading = project(values[:, :, None, None, :2], routes)
     error = torch.remainder(values[:, :, None, 2] - heading[..., 0] + torch.pi, 2 * torch.pi) - torch.pi
     return s[..., 0], d[..., 0], error

@@ -8,6 +8,7 @@ not drawn to their pursuers, and the gradient of row i is that of V_i alone. Gra
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from tensordict import TensorDictBase
@@ -79,6 +80,17 @@ class PotentialContext:
     ego_plan: Tensor
     target: Tensor
 
+    @cached_property
+    def place(self) -> tuple[Tensor, Tensor]:
+        """Arc length and offset [B, V] of the start on the route."""
+        s, d, _ = project(self.start[:, :, None, :2], self.route)
+        return s[..., 0], d[..., 0]
+
+    @cached_property
+    def beyond(self) -> Tensor:
+        """Metres [B, V] off the drivable area at the start."""
+        return off_road(self.start[..., :2], self.scene["field"], self.scene["field_origin"])
+
 
 def annealed_temperature(noise_level: Tensor | float, settings: PotentialSettings) -> Tensor:
     """Soft-min temperature [m] at a noise level in [0, 1]: `wide` in pure noise, `narrow` at the end, geometric
@@ -123,7 +135,9 @@ def _neighbours(states: Tensor, context: PotentialContext, size: Tensor, count: 
     both = context.valid[:, :, None] & context.valid[:, None]
     itself = torch.eye(gap.shape[-1], dtype=torch.bool, device=gap.device)
     gap = gap.masked_fill(~both | chases | chases.transpose(1, 2) | itself, torch.inf)
-    near, index = gap.topk(min(count, gap.shape[-1]), largest=False)
+    near = gap < 5.0
+    count = min(count, max(int(near.sum(-1).max()), 1))  # who is farther costs nothing
+    near, index = gap.topk(count, largest=False)
     return index, near < 5.0
 
 
@@ -150,16 +164,17 @@ def _road_terms(states: Tensor, context: PotentialContext, settings: PotentialSe
     """Weighted off-road, lateral and wrong-way terms; no worse than at the start costs nothing."""
     scene = context.scene
     beyond = off_road(states[..., :2], scene["field"], scene["field_origin"])
-    before = off_road(context.start[..., :2], scene["field"], scene["field_origin"])
-    allowed = before.clamp(min=-settings.off_road_margin)[..., None]
+    allowed = context.beyond.clamp(min=-settings.off_road_margin)[..., None]
     leaving = (beyond - allowed).clamp(0, 5).square().mean(-1)
+    s, d = context.place
     with torch.no_grad():
-        s, d, _ = project(torch.cat([context.start[:, :, None, :2], states[..., :2]], 2), context.route)
-        xy, heading, _ = interpolate(context.route, s[..., 1:])
+        track = torch.cat([context.start[:, :, None, :2], states[..., :2]], 2)
+        hint = s[..., None] + track.diff(dim=2).norm(dim=-1).cumsum(-1)
+        xy, heading, _ = interpolate(context.route, project(track[:, :, 1:], context.route, hint)[0])
     cos, sin = heading.cos(), heading.sin()
     delta = states[..., :2] - xy
     aside = (cos * delta[..., 1] - sin * delta[..., 0]).abs()
-    bound = d[..., :1].abs().clamp(min=settings.lateral_bound)
+    bound = d[..., None].abs().clamp(min=settings.lateral_bound)
     drifting = (aside - bound).clamp(0, 5).square().mean(-1)
     against = ((-(states[..., 2] - heading).cos()).clamp(min=0) * states[..., 3]).mean(-1)
     on_route = settings.lateral * drifting + settings.wrong_way * against

@@ -121,7 +121,7 @@ def influence(scene: TensorDictBase, world: World, index: Tensor, present: Tenso
     most tau_long if i kept its speed.
     """
     states = take(world.states[:, :expected.shape[1]], index)
-    s, _, _ = place(states, scene, index)
+    s, _, _ = place(states, take(scene["route_points"], index))
     slots, count = index.shape[1], len(times)
     b, m, r = (take(scene["route_valid"], index) & present[..., None]).nonzero(as_tuple=True)  # padding is most of it
     route = scene["route_points"][b, index[b, m], r]
