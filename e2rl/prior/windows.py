@@ -10,15 +10,13 @@ from e2rl.prior.features import edge_features, node_features
 from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS, KNOTS, LaneState, locate
 from e2rl.prior.routed import RoutedScene, route_scene
 from e2rl.scene.recording import DT
-from e2rl.scene.route import interpolate, project
+from e2rl.scene.route import project
 from e2rl.sim.dynamics import wrap
 
-OFFSETS = (0, 5)  # frames after a scene's start frame at which a window begins
+OFFSETS = (0, 5, 10, 15)  # frames after a scene's start frame at which a window begins
 ROWS = 16  # vehicles of a window: the modelled ones nearest to the ego
-STARTS = ("exact", "perturbed", "causal")  # what is known of the vehicles' states at a window's first frame
 MAX_ERROR = 0.5  # m: windows that the representation reproduces worse teach nothing (wrong or self-crossing route)
 STANDING_WEIGHT = 0.25
-PERTURB = (0.3, 0.4, 0.2, 0.02)  # m/s, m/s^2, m, 1
 
 
 def derivative(values: Tensor, valid: Tensor) -> Tensor:
@@ -43,29 +41,25 @@ def make_windows(scenes: TensorDictBase, free: bool = False, chunk: int = 32) ->
         turn = torch.where(valid, logged[..., 2], 0.0)
         unwrapped = torch.cumsum(torch.cat([turn[:, :1], wrap(turn.diff(dim=1))], 1), 1)
         yaw_rate = derivative(unwrapped, valid).clamp(-1.0, 1.0)
-        frames = {"exact": OFFSETS, "perturbed": OFFSETS, "causal": (0,)}
-        parts += [_window(scene, routed, offset, accel, yaw_rate, start)
-                  for start in STARTS for offset in frames[start]]
+        parts += [_window(scene, routed, offset, accel, yaw_rate, causal=False) for offset in OFFSETS]
+        parts.append(_window(scene, routed, 0, accel, yaw_rate, causal=True))
     windows = torch.cat(parts)
     return windows[windows["weight"].sum(-1) > 0]
 
 
-def _window(scene: TensorDictBase, routed: RoutedScene, offset: int, accel: Tensor, yaw_rate: Tensor, start: str
+def _window(scene: TensorDictBase, routed: RoutedScene, offset: int, accel: Tensor, yaw_rate: Tensor, causal: bool
             ) -> TensorDict:
     """Windows [B] at a frame: nodes [R, NODE], pairs [R, R, EDGE], present [R], x0 [R, SIZE], knot_weight [R, SIZE]
     (knots inside the recorded future), weight [R] of the vehicle in the loss, and for the trajectory term v, a, d, d1,
     d2, on_lane [R], ahead, aside, known [R, KNOTS]: recorded way and offset at 0.5 s steps (the offset counts on_lane
-    only: in free space the lateral knots are no offsets). start: states at the frame are "exact", "perturbed" (as a
-    simulated vehicle that has left the recorded path: its x0 leads back) or as a "causal" observer estimates them."""
-    vehicles, causal = routed.route.shape[1], start == "causal"
+    only: in free space the lateral knots are no offsets). causal (a key too): start states as a causal observer
+    estimates them; otherwise exact."""
+    vehicles = routed.route.shape[1]
     logged, valid = scene["logged"][:, offset], scene["logged_valid"][:, offset] & scene["valid"]
     rate = (scene["start_accel"][:, :vehicles], scene["start_yaw_rate"][:, :vehicles]) if causal else (
         accel[:, offset], yaw_rate[:, offset])
     agents = scene["start"] if causal else logged
     state = locate(agents[:, :vehicles], *rate, routed.points)
-    if start == "perturbed":
-        state = _perturbed(state, routed.points)
-        agents = torch.cat([state.states(), agents[:, vehicles:]], 1)
     step = torch.full((len(logged),), offset, dtype=torch.long, device=logged.device)
     estimated = torch.full_like(step, causal, dtype=torch.bool)
     nodes, pairs = node_features(routed, state, agents, valid, step, estimated), edge_features(routed, state)
@@ -96,23 +90,8 @@ def _window(scene: TensorDictBase, routed: RoutedScene, offset: int, accel: Tens
                                       .expand(*order.shape, *value.shape[2:]))
     window = {key: take(value) for key, value in columns.items()}
     window["pairs"] = take(take(pairs).transpose(1, 2)).transpose(1, 2)
-    window["start"] = torch.full((len(logged),), STARTS.index(start), device=logged.device)
+    window["causal"] = estimated
     return TensorDict(window, batch_size=[len(logged)])
-
-
-def _perturbed(state: LaneState, points: Tensor) -> LaneState:
-    """States [B, V] off the recorded ones by N(0, PERTURB^2) in speed, acceleration, offset and direction, where the
-    vehicle moves; its pose follows."""
-    generator = torch.Generator(state.v.device).manual_seed(0)
-    moving = state.v > 0.5
-    noise = [scale * moving * torch.randn(state.v.shape, generator=generator, device=state.v.device)
-             for scale in PERTURB]
-    v, a, d, d1 = (state.v + noise[0]).clamp(min=0), state.a + noise[1], state.d + noise[2], state.d1 + noise[3]
-    _, heading, _ = (value[..., 0, :] if value.ndim == 4 else value[..., 0]
-                     for value in interpolate(points, state.s[..., None]))
-    x, y = state.x - noise[2] * torch.sin(heading), state.y + noise[2] * torch.cos(heading)
-    return LaneState(state.s, d, d1, state.d2, v, a, x, y, state.heading + torch.atan(d1) - torch.atan(state.d1),
-                     state.kappa)
 
 
 def _targets(routed: RoutedScene, state: LaneState, tracks: Tensor, known: Tensor) -> tuple[Tensor, ...]:

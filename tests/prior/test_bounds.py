@@ -17,7 +17,7 @@ CAR = (4.0, 2.0)
 def traffic(*cars, turn=0.0, exempt=()):
     """Vehicles (x, y, heading, speed) on routes of curvature `turn`: decode(cap) at constant speed, state, around."""
     agents = torch.tensor([cars], dtype=torch.float32)
-    routes = torch.stack([arc(x, y, heading, turn)[0] for x, y, heading, _ in cars])[None]
+    routes = torch.stack([arc(x, y, heading, turn) for x, y, heading, _ in cars])[None]
     zero = torch.zeros(1, len(cars))
     state = locate(agents, zero, zero + turn * agents[..., 3], routes, zero + 20.0)
     size = torch.tensor(CAR).expand(1, len(cars), 2)
@@ -59,7 +59,7 @@ def test_a_follower_brakes_to_its_leader_s_speed_in_the_room_there_is(speed):
 
 
 def test_braking_is_never_harder_than_the_floor_nor_softer_than_gentle():
-    hard, soft = traffic((0, 0, 0, 15), (8, 0, 0, 0)), traffic((0, 0, 0, 1.5), (6, 0, 0, 0))
+    hard, soft = traffic((0, 0, 0, 15), (8, 0, 0, 0)), traffic((0, 0, 0, 1.0), (6.5, 0, 0, 0))
     assert caps(*hard, floor=-5.0)[0] == -5.0
     assert caps(*soft)[0] == -GENTLE
 
@@ -102,6 +102,6 @@ def test_a_curve_is_met_at_the_lateral_acceleration_allowed():
 
 def test_whoever_follows_a_braking_vehicle_brakes_too():
     decode, state, around = traffic((20, 0, 0, 0), (0, 0, 0, 12), (-6.5, 0, 0, 12))
-    assert caps(decode, state, around)[2] == FREE, "its plan meets nobody's as they stand"
-    motion = bounded(BoundSettings(), decode, state, around)
+    assert caps(decode, state, around, look=1.6)[2] == FREE, "its plan meets nobody's as they stand"
+    motion = bounded(BoundSettings(look=1.6), decode, state, around)
     assert (motion.v <= decode(None).v + 1e-5).all() and motion.v[0, 2, 10] < 12 - 0.2

@@ -17,7 +17,7 @@ def features(scene):
     state = locate(scene["start"][:, :vehicles], scene["start_accel"][:, :vehicles],
                    scene["start_yaw_rate"][:, :vehicles], routed.points)
     step = torch.zeros(len(scene), dtype=torch.long)
-    nodes = node_features(routed, state, scene["start"], scene["valid"], step)
+    nodes = node_features(routed, state, scene["start"], scene["valid"], step, step == 0)
     here = scene["valid"][0, :vehicles]
     return nodes[:, here], edge_features(routed, state)[:, here][:, :, here]
 

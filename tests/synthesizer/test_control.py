@@ -58,7 +58,7 @@ class Case:
         return x0 - nominal, after - x
 
     def values(self, x0):
-        states = self.prior.decode(x0, self.context, False, sampled_steps(PotentialSettings())).states()
+        states = self.prior.decode(x0, self.context, steps=sampled_steps(PotentialSettings())).states()
         return (adversarial_potential(states, self.where, PotentialSettings())[:, MEMBER],
                 feasibility_potential(states, self.where, PotentialSettings())[:, 1:].sum(-1))
 
