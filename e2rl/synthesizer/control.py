@@ -77,6 +77,7 @@ class SparseControl:
         nearest = int((levels[:-1] - settings.anchor_level).abs().argmin())
         self.anchor_step = prior.sampler.steps - nearest
         self.jump = torch.zeros(coalition.shape, device=eta.device)
+        self.hunts = bool(coalition.any())  # asked once, on the host: without a coalition V_adv is 0
 
     def __call__(self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Callable[[Tensor], Tensor]
                  ) -> tuple[Tensor, Tensor, Tensor]:
@@ -93,9 +94,11 @@ class SparseControl:
                     x0 = denoise(x)
                 variable = x0 = x0.detach().requires_grad_(True)
             states = self.prior.decode(x0, context, steps=sampled_steps(self.potentials)).states()
-            threat = adversarial_potential(states, self.where, self.potentials, heat)
+            towards = torch.zeros_like(x)
+            if self.hunts:
+                threat = adversarial_potential(states, self.where, self.potentials, heat)
+                (towards,) = torch.autograd.grad(threat.sum(), variable, retain_graph=True)
             infeasible = feasibility_potential(states, self.where, self.potentials)
-            (towards,) = torch.autograd.grad(threat.sum(), variable, retain_graph=True)
             (away,) = torch.autograd.grad(infeasible.sum(), variable)
         weight = gradient_weight(self.prior.schedule, level, self.settings.scaling)
         towards = clip_rows(weight * towards, self.settings.adversarial_clip)

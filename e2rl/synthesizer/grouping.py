@@ -1,4 +1,4 @@
-"""Scenes of like size together: padding is most of a batch, and small groups stay within the processor's cache.
+"""Scenes of like size together: half of a batch is padding, and of small groups most is overhead.
 
 Vehicles and other agents fill their rows from the front, so that a group is cropped by slices of what is in use.
 """
@@ -13,7 +13,8 @@ from e2rl.prior.lane_relative import HORIZON, LaneState
 from e2rl.prior.prior import Plan
 from e2rl.sim.world import World
 
-ROWS = 256  # vehicle rows of a group: its activations fit the second-level cache
+ROWS = 160, 1024  # vehicle rows from which a group may end, and at most
+SHRUNK = 0.55  # share of its largest scene at which the next scene begins another group
 OF_ALL = {"size", "start", "start_accel", "start_yaw_rate", "valid", "agent_type", "parked"}  # keys with all agents
 OF_VEHICLES = {"route_points", "route_length", "route_open", "route_valid", "route_limit", "route_light",
                "route_light_s", "route_log"}
@@ -34,18 +35,20 @@ class Group:
 
 
 def group_scenes(world: World) -> list[Group]:
-    """The scenes of a batch by vehicles in use, in groups of at most ROWS vehicle rows (one scene at least)."""
+    """The scenes of a batch in groups by vehicles in use (see ROWS and SHRUNK; one scene at least)."""
     width = world.route.shape[1]
     used = world.valid | world.scene["valid"]
     place = torch.arange(1, used.shape[1] + 1, device=used.device)
     vehicles = (used[:, :width] * place[:width]).amax(1).clamp(min=1)
     others = (used[:, width:] * place[:used.shape[1] - width]).amax(1) if used.shape[1] > width else vehicles * 0
     order = vehicles.argsort(descending=True, stable=True)
-    sizes, groups, begin = vehicles[order].tolist(), [], 0
-    while begin < len(sizes):
-        end = min(begin + max(ROWS // sizes[begin], 1), len(sizes))
+    sizes, begin, groups = vehicles[order].tolist(), 0, []
+    for end in range(1, len(sizes) + 1):
+        size, filled = sizes[begin], sizes[begin] * (end - begin)
+        if end < len(sizes) and filled + size <= ROWS[1] and (filled < ROWS[0] or sizes[end] > SHRUNK * size):
+            continue
         rows = order[begin:end]
-        groups.append(Group(rows, sizes[begin], int(others[rows].max())))
+        groups.append(Group(rows, size, int(others[rows].max())))
         begin = end
     return groups
 

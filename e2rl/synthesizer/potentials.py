@@ -170,7 +170,7 @@ def _road_terms(states: Tensor, context: PotentialContext, settings: PotentialSe
     with torch.no_grad():
         track = torch.cat([context.start[:, :, None, :2], states[..., :2]], 2)
         hint = s[..., None] + track.diff(dim=2).norm(dim=-1).cumsum(-1)
-        xy, heading, _ = interpolate(context.route, project(track[:, :, 1:], context.route, hint)[0])
+        xy, heading, _ = interpolate(context.route, project(track[:, :, 1:], context.route, hint, 10.0)[0])
     cos, sin = heading.cos(), heading.sin()
     delta = states[..., :2] - xy
     aside = (cos * delta[..., 1] - sin * delta[..., 0]).abs()

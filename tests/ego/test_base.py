@@ -56,6 +56,21 @@ def test_policy_collects_and_replans_at_its_own_rate():
     assert ego.plans == 16
 
 
+def test_what_was_announced_is_driven_and_asked_for_once():
+    env = DrivingEnv(make_scenes(2, num_vehicles=1), SimSettings(), 2)
+    env.reset()
+    ego, world = Cruise(replan_every=5), env.world()
+    ego.announce(world)
+    ego.act(env.world())
+    assert ego.plans == 1, "the same moment"
+    moved = env.world()
+    moved.states = moved.states + 0.1
+    Cruise.reset(ego, moved)
+    moved.step = moved.step * 0
+    ego.act(moved)
+    assert ego.plans == 2, "another one"
+
+
 def test_a_reset_in_between_makes_a_new_plan_there():
     """Environment 0 hits a wall early and starts anew while 1 drives on: both stay on their lanes' centre."""
     scenes = make_scenes(2, vehicles=[(0.0, 0, 10.0), (23.0, 0, 0.0)])

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from e2rl.prior.leaders import FREE, idm_acceleration, leaders
+from e2rl.prior.leaders import FREE, SIDE_GAP, Ahead, idm_acceleration, leaders
+from e2rl.scene.route import project
 from tests.prior.small import arc
 
 LENGTH, WIDTH = 4.0, 2.0
@@ -62,3 +63,39 @@ def test_whoever_is_between_a_vehicle_and_its_route_is_ahead_too():
     changing = leaders(s, width, length, points, agents, size, present, agents[..., 1])
     assert on_route[0][0, 0] == FREE
     assert torch.isclose(changing[0][0, 0], torch.tensor(16.0)) and changing[1][0, 0] == 4.0
+
+
+def all_pairs(s, width, length, points, agents, size, present, d):
+    """The definition, with every agent projected onto every route."""
+    at, offset, heading = project(agents[:, None, :, :2], points)
+    turn = agents[:, None, :, 2] - heading
+    cos, sin = turn.cos(), turn.sin()
+    side = (size[:, None, :, 0] * sin.abs() + size[:, None, :, 1] * cos.abs()) / 2
+    along = (size[:, None, :, 0] * cos.abs() + size[:, None, :, 1] * sin.abs()) / 2
+    aside = offset - torch.minimum(torch.maximum(offset, d[..., None].clamp(max=0)), d[..., None].clamp(min=0))
+    leads = (aside.abs() < width[..., None] / 2 + side + SIDE_GAP) & (at > s[..., None]) & present[:, None]
+    leads &= ~torch.eye(*leads.shape[1:], dtype=torch.bool) & present[:, :s.shape[1], None]
+    gap = torch.where(leads, at - s[..., None] - length[..., None] / 2 - along, FREE).min(-1)
+    return gap.values.clamp(max=FREE), (agents[:, None, :, 3] * cos).gather(-1, gap.indices[..., None])[..., 0]
+
+
+def test_pruned_pairs_are_those_that_could_not_lead():
+    generator = torch.Generator().manual_seed(0)
+    batch, vehicles, count = 40, 6, 10
+    draw = lambda *shape: torch.rand(shape, generator=generator)  # noqa: E731
+    bend = 0.04 * (draw(batch, vehicles, 1) - 0.5) * torch.arange(150) + 6.28 * draw(batch, vehicles, 1)
+    step = 2.0 * torch.stack([bend.cos(), bend.sin()], -1)
+    points = step.cumsum(2) + 60 * (draw(batch, vehicles, 1, 2) - 0.5)
+    # Around points of the first route, so that many are near one.
+    place = points[:, 0, torch.randint(0, 150, (count,), generator=generator)] + 8 * (draw(batch, count, 2) - 0.5)
+    agents = torch.cat([place, 6.28 * draw(batch, count, 1), 10 * draw(batch, count, 1)], -1)
+    size = torch.tensor([4.5, 2.0]).expand(batch, count, 2)
+    present, d = draw(batch, count) < 0.8, 6 * (draw(batch, vehicles) - 0.5)
+    width, length, s = size[:, :vehicles, 1], size[:, :vehicles, 0], 60 * draw(batch, vehicles)
+    expected = all_pairs(s, width, length, points, agents, size, present, d)
+    found = Ahead(s, width, length, points, agents, size, present, d.abs()).nearest(d)
+    led = expected[0] < FREE
+    assert led.sum() > 40
+    torch.testing.assert_close(found[0], expected[0], rtol=0, atol=1e-3)
+    torch.testing.assert_close(found[1][led], expected[1][led], rtol=0, atol=1e-3)
+    assert torch.equal(found[1][~led], agents[:, :vehicles, 3][~led]), "nobody ahead moves as the vehicle does"

@@ -86,7 +86,9 @@ def test_scenes_that_were_planned_differently_often_share_a_batch():
         torch.testing.assert_close(alone.states(), plan.states()[row:row + 1], rtol=0, atol=5e-3)
 
 
-def test_without_intensity_the_plan_is_the_prior_s_bit_for_bit():
+def test_without_intensity_the_plan_is_the_prior_s():
+    """Padding, which replan crops, changes the order of sums and nothing else; in equal batches eta = 0 is bit for bit
+    the same (test_control)."""
     on, scene = synthesizer(), scenes(2).scenes
     episode, plan = replanned(on, scene, 0.0)
     world = world_of(scene)
@@ -96,7 +98,9 @@ def test_without_intensity_the_plan_is_the_prior_s_bit_for_bit():
     shape = (on.prior.sampler.steps, ROWS, SIZE)
     noise = noise_of(placed.seed, torch.ones(2, dtype=torch.long), shape).transpose(0, 1)
     nominal = on.prior.plan(on.prior.sample(context, noise).x0, context)
-    assert torch.equal(plan.states(), nominal.states())
+    here = scene["valid"][:, :ROWS]
+    torch.testing.assert_close(plan.states()[here], nominal.states()[here], rtol=1e-4, atol=1e-4)
+    assert torch.equal(plan.on_map[here], nominal.on_map[here])
     assert not episode.coalition.any() and (episode.kl == 0).all() and (episode.jump == 0).all()
 
 
@@ -117,13 +121,13 @@ def test_a_chain_over_a_pruned_member_is_pruned(monkeypatch):
     from e2rl.synthesizer import synthesizer as module
 
     on, scene = synthesizer(), scenes(1).scenes
-    target = torch.tensor([[-1, 0, 1, 0, 2, -1, -1, -1]])
+    target = torch.tensor([[-1, 0, 1, 0, 2, -1]])  # the rows in use
     acts = target >= 0
     build, propose = module.build_skeleton, module.propose
 
     def chained(*arguments):
         return replace(build(*arguments), coalition=acts, target=target,
-                       depth=torch.tensor([[0, 1, 2, 1, 3, 0, 0, 0]]))
+                       depth=torch.tensor([[0, 1, 2, 1, 3, 0]]))
 
     def without_one(scene, world, skeleton, *arguments, **options):
         has = skeleton.coalition.clone()

@@ -1,0 +1,71 @@
+"""Groups hold every scene once, waste little, and cropping and writing back is the identity."""
+
+from dataclasses import fields, is_dataclass
+
+import torch
+from tensordict import TensorDict
+
+from e2rl.sim.world import World
+from e2rl.synthesizer.grouping import ROWS, SHRUNK, clone, crop_episode, crop_world, group_scenes, write_episode
+from tests.synthesizer.test_synthesizer import begin, world_of
+from tests.synthesizer.traffic_scenes import scenes, synthesizer
+
+WIDTH, AGENTS = 32, 40
+
+
+def sized(counts, others=0):
+    """A World whose scenes have so many vehicles, and so many other agents."""
+    valid = torch.arange(AGENTS) < torch.tensor(counts)[:, None]
+    valid[:, WIDTH:WIDTH + others] = True
+    empty = torch.zeros(len(counts), AGENTS)
+    scene = TensorDict({"valid": valid}, batch_size=[len(counts)])
+    return World(scene, empty[:, 0].long(), empty[..., None].expand(-1, -1, 4), valid, empty,
+                 torch.zeros(len(counts), WIDTH, dtype=torch.long))
+
+
+def test_every_scene_is_in_one_group_that_holds_its_vehicles_and_wastes_less_than_half():
+    counts = torch.randint(1, WIDTH + 1, (200,), generator=torch.Generator().manual_seed(0)).tolist()
+    groups = group_scenes(sized(counts, others=3))
+    assert sorted(torch.cat([group.rows for group in groups]).tolist()) == list(range(200))
+    for group in groups:
+        here = [counts[row] for row in group.rows.tolist()]
+        rows = group.vehicles * len(here)
+        assert group.vehicles == max(here) and group.others == 3 and rows <= ROWS[1]
+        assert min(here) > SHRUNK * group.vehicles or rows < 2 * ROWS[0]
+
+
+def test_small_batches_are_one_group():
+    (group,) = group_scenes(sized([1, 12, 3]))
+    assert group.rows.tolist() == [1, 2, 0] and group.vehicles == 12 and group.others == 0
+
+
+def leaves(value):
+    return [leaf for f in fields(value) for leaf in leaves(getattr(value, f.name))] if is_dataclass(value) else [value]
+
+
+def test_writing_back_what_was_cropped_changes_nothing_and_what_changed_arrives():
+    on, scene = synthesizer(), scenes(3).scenes
+    world, episode = world_of(scene), begin(on, scene, 1.0)
+    width = episode.routed.route.shape[1]
+    (group,) = group_scenes(world)
+    assert group.vehicles < width, "there is padding to crop"
+    part, whole = crop_episode(episode, group, width), clone(episode)
+    write_episode(whole, part, group)
+    for before, after in zip(leaves(episode), leaves(whole), strict=True):
+        torch.testing.assert_close(after, before)
+    part.routed.conflict_s[0, 1, 2] += 7.0
+    part.kl[1, 3] += 1.0
+    write_episode(whole, part, group)
+    assert whole.routed.conflict_s[group.rows[0], 1, 2] == episode.routed.conflict_s[group.rows[0], 1, 2] + 7
+    assert whole.kl[group.rows[1], 3] == 1 and whole.kl.sum() == 1
+
+
+def test_a_cropped_world_holds_the_same_agents():
+    scene = scenes(3).scenes
+    world = world_of(scene)
+    (group,) = group_scenes(world)
+    small = crop_world(world, group)
+    assert small.valid.sum() == world.valid.sum() and small.route.shape[1] == group.vehicles
+    torch.testing.assert_close(small.states[small.valid], world.states[group.rows][world.valid[group.rows]])
+    assert small.scene["route_points"].shape[1] == group.vehicles
+    assert small.scene["size"].shape[1] == small.states.shape[1]
