@@ -1,5 +1,6 @@
 """Training: `python train.py` runs evolution rounds; `stage=prior` trains a prior, `stage=imitation` an actor."""
 
+import sys
 from pathlib import Path
 
 import hydra
@@ -13,6 +14,7 @@ from e2rl.evaluation.prior_stage import run_prior_stage
 from e2rl.evaluation.resume import resumed
 from e2rl.learning.build import build_evolution, build_logger, run_imitation
 from e2rl.learning.checkpoint import load_checkpoint, save_checkpoint
+from e2rl.prior.distributed import follower_overrides, started_by_torchrun
 from e2rl.report.tables import metric_tables, print_tables, save_tables
 from e2rl.scene.source import load_scenes
 from e2rl.synthesizer.rollout import synthesize_traffic
@@ -47,7 +49,10 @@ def evolve(config: DictConfig, folder: Path) -> None:
 
 def train_prior(config: DictConfig, folder: Path) -> None:
     """Train a prior and print its nominal closed loop on held-out logs."""
-    path, rows = run_prior_stage(config, folder)
+    outcome = run_prior_stage(config, folder)
+    if outcome is None:
+        return  # another process of torchrun is the leader and reports
+    path, rows = outcome
     print_tables(metric_tables(rows, f"nominal closed loop of {path.name} on held-out logs, ego replayed"))
     print(f"\ncheckpoint: {path}\nuse it with prior.checkpoint={path}")
 
@@ -69,6 +74,9 @@ def main(config: DictConfig) -> None:
         config, folder = resumed(config, Path(HydraConfig.get().runtime.output_dir))
         if config.stage not in STAGES:
             raise InputError(f"stage={config.stage}: choose one of {', '.join(STAGES)}")
+        if started_by_torchrun() and config.stage != "prior":
+            raise InputError(f"torchrun: stage={config.stage} runs in one process; start it with python, or several "
+                             "processes with stage=prior")
         set_up(config)
         STAGES[config.stage](config, folder)
     except InputError as error:
@@ -76,4 +84,5 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
+    sys.argv += follower_overrides()
     main()

@@ -1,12 +1,13 @@
 """The prior's loss: denoising in x with a small trajectory term, on augmented windows."""
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
-from tensordict import TensorDictBase
-from torch import Tensor
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
 
+from e2rl.prior.denoiser import Denoiser
 from e2rl.prior.features import SIDED_EDGE, SIDED_NODE
 from e2rl.prior.lane_relative import (
     HORIZON,
@@ -21,28 +22,9 @@ from e2rl.prior.lane_relative import (
     split,
 )
 from e2rl.prior.prior import CLEAN, Prior
+from e2rl.prior.training_settings import TrainingSettings
 
-
-@dataclass(frozen=True)
-class TrainingSettings:
-    """Optimisation steps; windows a batch and noise levels a window; peak learning rate; weight decay; EMA decay;
-    weight of the trajectory term; share of other vehicles hidden; feature noise [standard deviations]; noise on the
-    current acceleration [m/s^2]; share of windows that are mirrored; bf16 autocast; route-choice steps; seed."""
-
-    steps: int = 3000
-    batch: int = 32
-    levels: int = 4
-    learning_rate: float = 1e-3
-    weight_decay: float = 0.1
-    ema: float = 0.998
-    trajectory: float = 0.5
-    drop: float = 0.1
-    feature_noise: float = 0.1
-    accel_noise: float = 0.35
-    mirror: float = 0.5
-    bf16: bool = True
-    route_steps: int = 600
-    seed: int = 0
+LEAST, CONSTANT = 0.02, 1e6  # smallest standard deviation of a feature; that of one that never varied: it says nothing
 
 
 def augment(batch: TensorDictBase, settings: TrainingSettings, generator: torch.Generator) -> TensorDictBase:
@@ -70,30 +52,61 @@ def augment(batch: TensorDictBase, settings: TrainingSettings, generator: torch.
     return batch
 
 
+def draw(batch: TensorDictBase, settings: TrainingSettings, generator: torch.Generator) -> TensorDict:
+    """The random numbers of the loss of windows [W] at L = `levels` noise levels each: feature [W, R, NODE] standard
+    normal; level [W, L] in (0.01, 0.99), stratified; clean [W, L] bool: the ego's row is given clean (in half);
+    noise [W, L, R, SIZE] standard normal."""
+    size, count, device = len(batch), settings.levels, batch["x0"].device
+    feature = torch.randn(batch["nodes"].shape, generator=generator, device=device)
+    u = torch.rand(count, size, generator=generator, device=device)
+    level = (torch.arange(count, device=device)[:, None] + u) / count * 0.98 + 0.01
+    clean = torch.rand(count, size, generator=generator, device=device) < 0.5
+    noise = torch.randn(count, *batch["x0"].shape, generator=generator, device=device)
+    return TensorDict({"feature": feature, "level": level.T, "clean": clean.T, "noise": noise.transpose(0, 1)}, [size])
+
+
+def loss_weight(batch: TensorDictBase, drawn: TensorDictBase) -> Tensor:
+    """[L * W, R], level by level: the windows' weights, 0 for an ego that is given clean."""
+    weight = batch["weight"].expand(drawn["level"].shape[1], *batch["weight"].shape).clone()
+    weight[..., 0] *= ~drawn["clean"].T
+    return weight.flatten(0, 1)
+
+
+class DenoisingLoss(nn.Module):
+    """The denoiser's loss as a module, so that DistributedDataParallel and torch.compile can wrap it."""
+
+    def __init__(self, denoiser: Denoiser, settings: TrainingSettings):
+        super().__init__()
+        self.denoiser, self.settings = denoiser, settings
+
+    def forward(self, batch: TensorDictBase, drawn: TensorDictBase, total: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(loss, its action term, its trajectory term) of windows [W] with the random numbers of `draw`.
+
+        total: what the weighted sums are divided by: their summed `loss_weight`; where several processes share a
+        batch, the mean of that over them, so that the mean of their gradients is the gradient of the whole batch.
+        """
+        net, count = self.denoiser, drawn["level"].shape[1]
+        scale = self.settings.feature_noise * net.node_std * ((net.node_std > LEAST) & (net.node_std < CONSTANT))
+        nodes = batch["nodes"] + scale * drawn["feature"]
+        encoding = net.encode(nodes, batch["pairs"], batch["present"]).repeat(count)
+        weight, tiled = loss_weight(batch, drawn), torch.cat([batch] * count)
+        level = drawn["level"].T.reshape(-1, 1).expand(-1, weight.shape[1]).clone()
+        level[:, 0] = torch.where(drawn["clean"].T.reshape(-1), CLEAN, level[:, 0])
+        x = net.schedule.noised(tiled["x0"], level[..., None], drawn["noise"].transpose(0, 1).flatten(0, 1))
+        x0 = net(x, level, encoding).float()
+        squared = (x0 - tiled["x0"]) ** 2 * tiled["knot_weight"]
+        action = (squared.sum(-1) / SIZE * weight).sum() / total
+        trajectory = (_trajectory_error(x0, tiled) * weight).sum() / total
+        return action + self.settings.trajectory * trajectory, action.detach(), trajectory.detach()
+
+
 def denoising_loss(prior: Prior, batch: TensorDictBase, settings: TrainingSettings, generator: torch.Generator
                    ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Loss of a batch of windows [W] at `levels` noise levels each, stratified; the ego's row is clean in half."""
-    net, count = prior.denoiser, settings.levels
-    size, rows = batch["present"].shape
-    device = batch["x0"].device
-    noise = torch.randn(batch["nodes"].shape, generator=generator, device=device)
-    nodes = batch["nodes"] + settings.feature_noise * net.node_std * noise * (net.node_std > 0.02)
-    encoding = net.encode(nodes, batch["pairs"], batch["present"]).repeat(count)
-    batch = torch.cat([batch] * count)
-    u = torch.rand(count, size, generator=generator, device=device)
-    level = ((torch.arange(count, device=device)[:, None] + u) / count).reshape(-1) * 0.98 + 0.01
-    clean = torch.rand(count * size, generator=generator, device=device) < 0.5
-    level = level[:, None].expand(-1, rows).clone()
-    level[:, 0] = torch.where(clean, CLEAN, level[:, 0])
-    eps = torch.randn(batch["x0"].shape, generator=generator, device=device)
-    x = net.schedule.noised(batch["x0"], level[..., None], eps)
-    x0 = net(x, level, encoding).float()
-    weight = batch["weight"] * torch.cat([(~clean)[:, None].float(), torch.ones_like(batch["weight"][:, 1:])], 1)
-    total = weight.sum().clamp(min=1)
-    squared = (x0 - batch["x0"]) ** 2 * batch["knot_weight"]
-    action = (squared.sum(-1) / SIZE * weight).sum() / total
-    trajectory = (_trajectory_error(x0, batch) * weight).sum() / total
-    return action + settings.trajectory * trajectory, {"action": action.detach(), "trajectory": trajectory.detach()}
+    """Loss of a batch of windows [W] at `levels` noise levels each, and its two terms."""
+    drawn = draw(batch, settings, generator)
+    total = loss_weight(batch, drawn).sum().clamp(min=1)
+    loss, action, trajectory = DenoisingLoss(prior.denoiser, settings)(batch, drawn, total)
+    return loss, {"action": action, "trajectory": trajectory}
 
 
 def _trajectory_error(x0: Tensor, batch: TensorDictBase) -> Tensor:
@@ -117,7 +130,7 @@ def held_out_loss(prior: Prior, windows: TensorDictBase, settings: TrainingSetti
     """Denoising loss on windows, with a fixed seed and no augmentation."""
     device = next(prior.parameters()).device
     generator = torch.Generator(device).manual_seed(1)
-    plain = TrainingSettings(**{**vars(settings), "feature_noise": 0.0})
+    plain = replace(settings, feature_noise=0.0)
     losses = []
     for k in range(min(batches, len(windows) // settings.batch + 1)):
         batch = windows[k * settings.batch:(k + 1) * settings.batch].to(device)

@@ -1,8 +1,11 @@
-"""Training the prior: windows over whole logs, moving average of the weights, best checkpoint kept, exact resume."""
+"""Training the prior: windows over whole logs, validation on places held out, best checkpoint kept, exact resume."""
 
 import json
+import platform
 import time
+from collections.abc import Callable
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -12,13 +15,19 @@ from tqdm import tqdm
 
 from e2rl.errors import InputError
 from e2rl.prior.checkpoint import save_prior
-from e2rl.prior.loss import TrainingSettings, augment, denoising_loss, held_out_loss
+from e2rl.prior.distributed import ALONE, Processes
+from e2rl.prior.loss import held_out_loss
+from e2rl.prior.optimisation import PriorTraining
 from e2rl.prior.prior import Prior
 from e2rl.prior.route_choice import candidate_features
-from e2rl.prior.windows import make_windows
+from e2rl.prior.training_settings import TrainingSettings
+from e2rl.prior.windows import STANDING_WEIGHT, make_windows
 from e2rl.scene.scene import SceneSet
 
 HELD_OUT = 8  # one place in so many is held out for validation
+STATE, PROGRESS = "training.pt", "progress.jsonl"
+
+ClosedLoop = Callable[[Prior], dict[str, float]]  # figures of a prior that drives held-out scenes
 
 
 def train_route_choice(prior: Prior, scenes: TensorDictBase, settings: TrainingSettings) -> float:
@@ -49,80 +58,6 @@ def train_route_choice(prior: Prior, scenes: TensorDictBase, settings: TrainingS
     return (logits.argmax(-1) == label).float().mean().item()
 
 
-class PriorTraining:
-    """The state of one training run: network, its moving average, optimiser, progress and generator."""
-
-    def __init__(self, prior: Prior, windows: TensorDictBase, settings: TrainingSettings):
-        self.prior, self.windows, self.settings, self.step = prior, windows, settings, 0
-        self.device = next(prior.parameters()).device
-        self.generator = torch.Generator(self.device).manual_seed(settings.seed)
-        nodes = windows["nodes"][windows["present"]]
-        prior.denoiser.node_mean.copy_(nodes.mean(0))
-        prior.denoiser.node_std.copy_(nodes.std(0).clamp(min=0.02))
-        self.optimiser = torch.optim.AdamW(prior.denoiser.parameters(), settings.learning_rate,
-                                           weight_decay=settings.weight_decay)
-        self.average = {key: value.clone() for key, value in prior.denoiser.state_dict().items()}
-
-    def learning_rate(self) -> float:
-        """Linear warm-up over 50 steps, then a cosine to 0."""
-        warm = min(1.0, (self.step + 1) / 50)
-        done = torch.tensor(self.step / self.settings.steps * torch.pi)
-        return self.settings.learning_rate * warm * 0.5 * (1 + torch.cos(done).item())
-
-    def run(self, until: int) -> dict[str, float]:
-        """Train up to step `until`; returns the running losses."""
-        running: dict[str, float] = {}
-        self.prior.train()
-        bar = tqdm(range(self.step, until), "prior", initial=self.step, total=self.settings.steps, unit="step")
-        for _ in bar:
-            pick = torch.randint(len(self.windows), (self.settings.batch,), generator=self.generator,
-                                 device=self.device).to(self.windows["x0"].device)
-            batch = augment(self.windows[pick].to(self.device), self.settings, self.generator)
-            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.settings.bf16):
-                loss, parts = denoising_loss(self.prior, batch, self.settings, self.generator)
-            for group in self.optimiser.param_groups:
-                group["lr"] = self.learning_rate()
-            self.optimiser.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(self.prior.denoiser.parameters(), 1.0)
-            self.optimiser.step()
-            self.step += 1
-            decay = min(self.settings.ema, (1 + self.step) / (10 + self.step))
-            for key, value in self.prior.denoiser.state_dict().items():
-                self.average[key].lerp_(value, 1 - decay)
-            if self.step % 20 == 0:
-                for key, value in parts.items():
-                    running[key] = 0.9 * running.get(key, value.item()) + 0.1 * value.item()
-                bar.set_postfix({key: f"{value:.3f}" for key, value in running.items()})
-        return running
-
-    @contextmanager
-    def averaged(self):
-        """Within this context the prior holds the averaged weights."""
-        raw = {key: value.clone() for key, value in self.prior.denoiser.state_dict().items()}
-        self.prior.denoiser.load_state_dict(self.average)
-        self.prior.eval()
-        try:
-            yield self.prior
-        finally:
-            self.prior.denoiser.load_state_dict(raw)
-
-    def state_dict(self) -> dict:
-        """Everything that exact resumption needs."""
-        return {"denoiser": self.prior.denoiser.state_dict(), "route_choice": self.prior.route_choice.state_dict(),
-                "average": self.average, "optimiser": self.optimiser.state_dict(), "step": self.step,
-                "generator": self.generator.get_state()}
-
-    def load_state_dict(self, state: dict) -> None:
-        """Go on from a `state_dict`."""
-        self.prior.denoiser.load_state_dict(state["denoiser"])
-        self.prior.route_choice.load_state_dict(state["route_choice"])
-        self.average = {key: value.to(self.device, copy=True) for key, value in state["average"].items()}
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.step = state["step"]
-        self.generator.set_state(state["generator"].cpu())
-
-
 def held_out(scenes: SceneSet) -> torch.Tensor:
     """[S] bool: scenes of the places (or, without places, the logs) that are held out."""
     place = [location or scene_id.split("@")[0]
@@ -135,41 +70,128 @@ def held_out(scenes: SceneSet) -> torch.Tensor:
     return mask
 
 
-def train_prior(prior: Prior, scenes: SceneSet, settings: TrainingSettings, validate_every: int, folder: Path,
-                origin: dict) -> Path:
-    """Train `prior` on scenes and return the path of the best checkpoint (by held-out loss of the averaged weights).
-
-    folder: holds training.pt, from which an interrupted run goes on exactly, progress.jsonl and the checkpoint.
-    """
-    begin, mask = time.perf_counter(), held_out(scenes)
-    windows = make_windows(scenes.scenes[~mask], prior.free_space)
-    test = make_windows(scenes.scenes[mask], prior.free_space)
+def window_sets(scenes: SceneSet, free_space: bool) -> tuple[TensorDictBase, TensorDictBase]:
+    """(training, held-out) windows; InputError where there are none, or none in which a vehicle moves."""
+    mask = held_out(scenes)
+    windows, test = (make_windows(scenes.scenes[part], free_space) for part in (~mask, mask))
     if not len(windows) or not len(test):
         raise InputError(f"{len(windows)} training and {len(test)} held-out windows of {len(scenes)} scenes: too few "
                          "vehicles are recorded for a second on a known route; train on more or longer logs")
-    origin = origin | {"windows": len(windows), "held_out_windows": len(test)}
-    torch.manual_seed(settings.seed)
-    accuracy = train_route_choice(prior, scenes.scenes[~mask], settings)
-    run, best = PriorTraining(prior, windows, settings), {"loss": float("inf"), "weights": None, "step": 0}
-    state_file = folder / "training.pt"
-    if state_file.exists():
-        saved = torch.load(state_file, map_location="cpu", weights_only=True)
-        run.load_state_dict(saved["run"])
-        best = saved["best"]
+    for name, part in (("training", windows), ("held-out", test)):
+        if not bool((part["weight"] > STANDING_WEIGHT).any()):
+            raise InputError(f"no vehicle moves in the {len(part)} {name} windows of {len(scenes)} scenes; train on "
+                             "logs with moving traffic")
+    return windows, test
+
+
+@dataclass
+class Record:
+    """What a run knows besides its weights: validations so far (the lines of progress.jsonl), the best one's loss, step
+    and weights, the route choice's accuracy, and the wall seconds of each stage over all interruptions."""
+
+    lines: list[dict] = field(default_factory=list)
+    best: dict = field(default_factory=lambda: {"held_out": float("inf"), "step": 0, "weights": None})
+    accuracy: float = float("nan")
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def timed(self, stage: str):
+        """Add the wall seconds of the block to a stage's."""
+        begin = time.perf_counter()
+        yield
+        self.seconds[stage] = round(self.seconds.get(stage, 0.0) + time.perf_counter() - begin, 1)
+
+    def add(self, line: dict, prior: Prior) -> None:
+        """Take up a validation of `prior`, and its weights where its held-out loss is the lowest.
+
+        The loss alone chooses: thousands of windows at fixed noise make it precise, whereas the closed loop's figures
+        on a few scenes scatter more between validations than the checkpoints differ (see conf/prior/default.yaml), and
+        the best of several such draws is mostly luck. They are there to show what the loss does not.
+        """
+        self.lines.append(line)
+        if line["held_out"] < self.best["held_out"]:
+            weights = {key: value.detach().cpu().clone() for key, value in prior.state_dict().items()}
+            self.best = {"held_out": line["held_out"], "step": line["step"], "weights": weights}
+
+    def write(self, folder: Path, run: dict, fingerprint: str) -> None:
+        """progress.jsonl and training.pt with the run's state: each appears whole."""
+        _replace(folder / PROGRESS, lambda part: part.write_text("".join(json.dumps(x) + "\n" for x in self.lines)))
+        _replace(folder / STATE, lambda part: torch.save(
+            {"run": run, "record": vars(self), "fingerprint": fingerprint}, part))
+
+
+def train_prior(prior: Prior, scenes: SceneSet, settings: TrainingSettings, folder: Path, origin: dict,
+                closed_loop: ClosedLoop | None = None, processes: Processes = ALONE) -> Path | None:
+    """Train `prior` on scenes and return the path of the best checkpoint (by held-out loss of the averaged weights);
+    None in processes other than the leader.
+
+    folder: holds training.pt, from which an interrupted run goes on exactly, progress.jsonl and the checkpoint. origin:
+    what is known of data and command; the checkpoint keeps it, and what comes of the training, in its header.
+    closed_loop: figures that every `closed_loop_every`-th validation and the last one log beside the held-out loss.
+    """
+    record, state, data = Record(), None, origin.get("fingerprint", "")
+    if (folder / STATE).exists():
+        state = torch.load(folder / STATE, map_location="cpu", weights_only=True)
+        if state.get("fingerprint") != data:
+            raise InputError(f"{folder / STATE}: the interrupted run had other data; go on with the same scenes")
+        record = Record(**state["record"])
+    with record.timed("windows"):
+        windows, test = window_sets(scenes, prior.free_space)
+    if state is None:
+        with record.timed("routes"):
+            record.accuracy = train_route_choice(prior, scenes.scenes[~held_out(scenes)], settings)
+    run = PriorTraining(prior, windows, settings, processes)
+    if state is not None:
+        run.load_state_dict(state["run"])
     while run.step < settings.steps:
-        losses = run.run(min(run.step + validate_every, settings.steps))
-        with run.averaged():
-            loss = held_out_loss(prior, test, settings)
-            if loss < best["loss"]:
-                weights = {key: value.clone() for key, value in prior.state_dict().items()}
-                best = {"loss": loss, "weights": weights, "step": run.step}
-        tqdm.write(f"step {run.step}: held-out loss {loss:.4f} (best {best['loss']:.4f} at {best['step']})")
-        with (folder / "progress.jsonl").open("a") as file:
-            file.write(json.dumps({"step": run.step, "held_out": loss, **losses}) + "\n")
-        part = state_file.with_suffix(".part")
-        torch.save({"run": run.state_dict(), "best": best}, part)
-        part.replace(state_file)
-    prior.load_state_dict(best["weights"])
-    return save_prior(prior, folder, origin | {
-        "held_out_loss": best["loss"], "step": best["step"], "route_accuracy": accuracy,
-        "seconds": round(time.perf_counter() - begin, 1)})
+        with record.timed("steps"):
+            losses = run.run(min(run.step + settings.validate_every, settings.steps))
+        with record.timed("validation"), run.averaged():
+            if processes.leader:
+                record.add(_validate(run, test, losses, closed_loop), prior)
+                tqdm.write(_line(record))
+        state = run.state_dict()
+        if processes.leader:
+            record.write(folder, state, data)
+    return _checkpoint(run, record, folder, origin | {
+        "windows": len(windows), "held_out_windows": len(test)}) if processes.leader else None
+
+
+def _validate(run: PriorTraining, test: TensorDictBase, losses: dict[str, float], closed_loop: ClosedLoop | None
+              ) -> dict[str, float]:
+    settings = run.settings
+    line = {"step": run.step, "held_out": held_out_loss(run.prior, test, settings), **losses}
+    number, last = -(-run.step // settings.validate_every), run.step == settings.steps
+    every = settings.closed_loop_every
+    if closed_loop is not None and every and (last or number % every == 0):
+        line |= closed_loop(run.prior)
+    return line
+
+
+def _line(record: Record) -> str:
+    line, best = record.lines[-1], record.best
+    text = f"step {line['step']}: held-out loss {line['held_out']:.4f} (best {best['held_out']:.4f} at {best['step']})"
+    figures = [f"{key} {line[key]:.4f}" for key in line if key not in ("step", "held_out", "action", "trajectory")]
+    return "; closed loop ".join([text, ", ".join(figures)] if figures else [text])
+
+
+def _checkpoint(run: PriorTraining, record: Record, folder: Path, origin: dict) -> Path:
+    """Write the best weights, with everything that made them in the header."""
+    best = record.best
+    run.prior.load_state_dict(best["weights"])
+    figures = next(line for line in record.lines if line["step"] == best["step"])
+    versions = {"python": platform.python_version(), "torch": torch.__version__}
+    seconds = origin.get("seconds", {}) | record.seconds
+    seconds["total"] = round(sum(seconds.values()), 1)
+    tqdm.write("seconds: " + ", ".join(f"{stage} {value:.0f}" for stage, value in seconds.items()))
+    return save_prior(run.prior.eval(), folder, origin | {
+        "validation": figures, "held_out_loss": best["held_out"], "step": best["step"],
+        "route_accuracy": record.accuracy, "processes": run.processes.count, "device": str(run.device),
+        "versions": versions, "seconds": seconds})
+
+
+def _replace(path: Path, write: Callable[[Path], object]) -> None:
+    """Let `write` fill a file beside path, then rename it: a reader never meets half a file."""
+    part = path.with_name(path.name + ".part")
+    write(part)
+    part.replace(path)

@@ -101,7 +101,7 @@ def test_a_curve_is_met_at_the_lateral_acceleration_allowed():
 
 
 def test_whoever_follows_a_braking_vehicle_brakes_too():
-    decode, state, around = traffic((20, 0, 0, 0), (0, 0, 0, 12), (-6.5, 0, 0, 12))
+    decode, state, around = traffic((20, 0, 0, 0), (0, 0, 0, 12), (-5.0, 0, 0, 12))
     assert caps(decode, state, around, look=1.6)[2] == FREE, "its plan meets nobody's as they stand"
     motion = bounded(BoundSettings(look=1.6), decode, state, around)
     assert (motion.v <= decode(None).v + 1e-5).all() and motion.v[0, 2, 10] < 12 - 0.2

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from e2rl.prior.loss import TrainingSettings, augment, denoising_loss, held_out_loss
+from e2rl.prior.loss import augment, denoising_loss, held_out_loss
+from e2rl.prior.training_settings import TrainingSettings
 from e2rl.prior.windows import make_windows
 from tests.prior.small import curved_scenes, small_prior
 

@@ -1,6 +1,7 @@
 """Training: exact resume, the averaged weights, held-out places, and the whole stage on a few scenes."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,14 +9,16 @@ import torch
 from e2rl.errors import InputError
 from e2rl.prior.checkpoint import load_prior
 from e2rl.prior.denoiser import DenoiserSettings
-from e2rl.prior.loss import TrainingSettings, denoising_loss
+from e2rl.prior.loss import denoising_loss
+from e2rl.prior.optimisation import PriorTraining
 from e2rl.prior.prior import Prior
-from e2rl.prior.training import PriorTraining, held_out, train_prior, train_route_choice
+from e2rl.prior.training import Record, held_out, train_prior, train_route_choice
+from e2rl.prior.training_settings import TrainingSettings
 from e2rl.prior.windows import make_windows
 from tests.prior.small import curved_scenes
 from tests.synthetic import make_scenes
 
-SETTINGS = TrainingSettings(steps=20, batch=4, levels=2, route_steps=5, learning_rate=3e-3)
+SETTINGS = TrainingSettings(steps=20, batch=4, levels=2, route_steps=5, learning_rate=3e-3, validate_every=10)
 
 
 @pytest.fixture(scope="module")
@@ -97,19 +100,78 @@ def test_places_are_held_out_whole():
         held_out(scenes)
 
 
-def test_the_stage_writes_a_loadable_checkpoint_and_resumes(tmp_path):
+def four_places():
     scenes = make_scenes(4)
     scenes.location[:] = ["a", "b", "c", "d"]
-    whole = train_prior(untrained(), scenes, SETTINGS, 10, _folder(tmp_path / "whole"), {"command": "test"})
-    part = _folder(tmp_path / "part")
-    train_prior(untrained(), scenes, SETTINGS, 10, part, {"command": "test"})
-    again = train_prior(untrained(seed=3), scenes, SETTINGS, 10, part, {"command": "test"})
-    one, origin = load_prior(str(whole))
-    two, _ = load_prior(str(again))
+    return scenes
+
+
+def test_the_stage_writes_a_loadable_checkpoint_that_says_what_made_it(tmp_path):
+    path = train_prior(untrained(), four_places(), SETTINGS, tmp_path, {"command": "test", "seconds": {"scenes": 1.0}})
+    prior, origin = load_prior(str(path))
+    state = torch.load(tmp_path / "training.pt", weights_only=True)
+    best = state["record"]["best"]
+    assert all(torch.equal(value, best["weights"][key]) for key, value in prior.state_dict().items())
+    lines = [json.loads(line) for line in (tmp_path / "progress.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [10, 20] and origin["validation"] in lines
+    assert origin["held_out_loss"] == min(line["held_out"] for line in lines)
+    assert origin["windows"] > 0 and origin["held_out_windows"] > 0 and origin["command"] == "test"
+    assert origin["versions"]["torch"] == torch.__version__ and origin["processes"] == 1
+    assert {"scenes", "windows", "routes", "steps", "validation", "total"} == origin["seconds"].keys()
+
+
+def test_an_interrupted_stage_ends_as_the_whole_one_bit_for_bit(tmp_path):
+    """Interrupted in its last validation: the state of the one before is on the disk. Accuracy of the route choice and
+    the lines of progress.jsonl are taken up too, and no line is doubled."""
+    whole, part = _folder(tmp_path / "whole"), _folder(tmp_path / "part")
+    calls = []
+
+    def interrupting(prior):
+        calls.append(1)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return {"real": 0.5}
+
+    def steady(prior):
+        return {"real": 0.5}
+
+    settings = replace(SETTINGS, closed_loop_every=1)
+    one, origin = load_prior(str(train_prior(untrained(), four_places(), settings, whole, {}, steady)))
+    with pytest.raises(KeyboardInterrupt):
+        train_prior(untrained(), four_places(), settings, part, {}, interrupting)
+    two, again = load_prior(str(train_prior(untrained(seed=3), four_places(), settings, part, {}, steady)))
     assert all(torch.equal(a, b) for a, b in zip(one.state_dict().values(), two.state_dict().values(), strict=True))
-    assert origin["windows"] > 0 and origin["held_out_windows"] > 0
-    lines = [json.loads(line) for line in (tmp_path / "whole" / "progress.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines] == [10, 20]
+    assert (whole / "progress.jsonl").read_text() == (part / "progress.jsonl").read_text()
+    for key in ("validation", "route_accuracy", "step"):
+        assert origin[key] == again[key] or origin[key] != origin[key]
+
+
+def test_a_run_does_not_go_on_with_other_data(tmp_path):
+    train_prior(untrained(), four_places(), SETTINGS, tmp_path, {"fingerprint": "one"})
+    with pytest.raises(InputError, match="other data"):
+        train_prior(untrained(), four_places(), SETTINGS, tmp_path, {"fingerprint": "two"})
+
+
+def test_the_closed_loop_is_driven_by_the_averaged_weights_at_every_nth_validation_and_the_last(tmp_path):
+    seen = []
+    settings = replace(SETTINGS, steps=5, validate_every=1, closed_loop_every=2)
+
+    def closed_loop(prior):
+        seen.append({key: value.clone() for key, value in prior.state_dict().items()})
+        return {"real": 0.25}
+
+    train_prior(untrained(), four_places(), settings, tmp_path, {}, closed_loop)
+    lines = [json.loads(line) for line in (tmp_path / "progress.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines if "real" in line] == [2, 4, 5]
+    average = torch.load(tmp_path / "training.pt", weights_only=True)["run"]["average"]
+    assert all(torch.equal(seen[-1][f"denoiser.{key}"], value) for key, value in average.items())
+
+
+def test_the_lowest_held_out_loss_is_kept_whatever_the_closed_loop_says():
+    record, prior = Record(), untrained()
+    for step, (loss, real) in enumerate([(0.5, 0.9), (0.4, 0.1), (0.6, 1.0)]):
+        record.add({"step": step, "held_out": loss, "real": real}, prior)
+    assert record.best["step"] == 1 and len(record.lines) == 3
 
 
 def _folder(path):
@@ -122,4 +184,11 @@ def test_logs_without_a_usable_window_are_named(tmp_path):
     scenes.location[:] = ["a", "b"]
     scenes.scenes["logged_valid"][:, 1:] = False
     with pytest.raises(InputError, match="window"):
-        train_prior(untrained(), scenes, SETTINGS, 10, tmp_path, {})
+        train_prior(untrained(), scenes, SETTINGS, tmp_path, {})
+
+
+def test_logs_without_a_moving_vehicle_are_named(tmp_path):
+    scenes = make_scenes(2, speed=0.0)
+    scenes.location[:] = ["a", "b"]
+    with pytest.raises(InputError, match="no vehicle moves"):
+        train_prior(untrained(), scenes, SETTINGS, tmp_path, {})
