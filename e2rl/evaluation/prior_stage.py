@@ -44,8 +44,10 @@ def run_prior_stage(config: DictConfig, folder: Path) -> tuple[Path, list[dict]]
 def _network(config: DictConfig) -> Prior:
     """An untrained prior; its first weights follow the run's seed."""
     network = settings_of(DenoiserSettings, config.prior.network, "prior.network")
+    if not isinstance(network.dropout, int | float) or not 0 <= network.dropout < 1:
+        raise InputError(f"prior.network.dropout={network.dropout}: expected a share of at least 0 and below 1")
     for name, value in vars(network).items():
-        if type(value) is not int or value < 1:
+        if name != "dropout" and (type(value) is not int or value < 1):
             raise InputError(f"prior.network.{name}={value}: expected a whole number of at least 1")
     if network.width % network.heads:
         raise InputError(f"prior.network.width={network.width}: expected a multiple of heads={network.heads}")
