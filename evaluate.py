@@ -1,4 +1,4 @@
-"""Closed-loop evaluation: `python evaluate.py [data=...] [ego=...] [eta=...]` prints and saves a metric table."""
+"""Closed-loop evaluation: `python evaluate.py [data=...] [ego=...] [eta=...]` prints and saves metric tables."""
 
 from pathlib import Path
 
@@ -7,8 +7,12 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from e2rl.errors import InputError, stop
-from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_synthesizer, caption, check_protocol, set_up
-from e2rl.evaluation.protocol import Method, run_protocol
+from e2rl.evaluation.build import build_ego, build_methods, build_prior, build_sim, caption, check_protocol, set_up
+from e2rl.evaluation.files import METRICS_FILE, write_metrics
+from e2rl.evaluation.open_loop import open_loop_rows
+from e2rl.evaluation.protocol import run_protocol
+from e2rl.evaluation.realism_meta import meta_rows
+from e2rl.metrics.catalogue import CLOSED_LOOP
 from e2rl.report.tables import metric_tables, save_tables
 from e2rl.scene.source import load_scenes
 
@@ -19,13 +23,17 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     check_protocol(config)
     scenes = load_scenes(config.data, config.num_scenes)
     prior, origin = build_prior(config, config.device)
-    synthesizer, ego, sim = build_synthesizer(config, prior), build_ego(config), build_sim(config)
-    methods = [Method(name, synthesizer, 0.0 if name == "nominal" else config.eta)
-               for name in dict.fromkeys(config.methods)]
+    methods, ego, sim = build_methods(config, prior), build_ego(config), build_sim(config)
     name = HydraConfig.get().runtime.choices["ego"]
-    rows = run_protocol(scenes, methods, ego, name, list(config.seeds), sim, folder, config.batch, config.device)
+    rows = []
+    if config.open_loop_samples:
+        rows += open_loop_rows(scenes, methods, config.open_loop_samples, config.device)
+    rows += run_protocol(scenes, methods, ego, name, list(config.seeds), sim, folder, config.batch, config.device)
+    if config.meta_rollouts:
+        rows += meta_rows(scenes, methods, ego, name, sim, config.meta_rollouts, config.batch, config.device)
+    write_metrics(folder / METRICS_FILE, rows)
     dropped = "".join(f"; left out: {count} scenes ({reason})" for reason, count in scenes.dropped.items())
-    tables = metric_tables(rows, caption(config, origin) + dropped)
+    tables = metric_tables(rows, caption(config, origin) + dropped, CLOSED_LOOP[config.metrics])
     save_tables(folder / "tables.md", tables)
     print("\n\n".join(table.text() for table in tables))
     print(f"\nwritten to {folder}")

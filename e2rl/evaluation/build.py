@@ -1,4 +1,8 @@
-"""From a run's configuration to its objects: prior, synthesizer, ego, simulator settings."""
+"""From a run's configuration to its objects: prior, synthesizers and methods, ego, simulator settings."""
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from hydra.errors import InstantiationException
@@ -7,11 +11,17 @@ from omegaconf import DictConfig, OmegaConf
 
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError, settings_of
+from e2rl.evaluation.protocol import Method
+from e2rl.metrics.catalogue import CLOSED_LOOP
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.checkpoint import load_prior
 from e2rl.prior.prior import Prior, SamplerSettings
 from e2rl.sim.env import SimSettings
 from e2rl.synthesizer.anchoring import AnchorSettings
+from e2rl.synthesizer.baselines.baseline import Baseline
+from e2rl.synthesizer.baselines.constant_velocity import ConstantVelocity
+from e2rl.synthesizer.baselines.idm import IDM
+from e2rl.synthesizer.baselines.replay import Replay
 from e2rl.synthesizer.control import ControlSettings
 from e2rl.synthesizer.feasibility import FeasibilitySettings
 from e2rl.synthesizer.potentials import PotentialSettings
@@ -21,6 +31,9 @@ from e2rl.synthesizer.topology import TopologySettings
 
 PARTS = {"topology": TopologySettings, "feasibility": FeasibilitySettings, "skeleton": SkeletonSettings,
          "anchor": AnchorSettings, "potentials": PotentialSettings, "control": ControlSettings}
+BASELINES: dict[str, Callable[[Prior], Baseline]] = {  # under the bounds of the prior that they stand beside
+    "replay": lambda prior: Replay(), "constant_velocity": lambda prior: ConstantVelocity(),
+    "idm": lambda prior: IDM(prior.bounds)}
 
 
 def build_prior(config: DictConfig, device: str = "cpu") -> tuple[Prior, dict]:
@@ -29,13 +42,34 @@ def build_prior(config: DictConfig, device: str = "cpu") -> tuple[Prior, dict]:
                       settings_of(BoundSettings, config.prior.bounds, "prior.bounds"), device)
 
 
-def build_synthesizer(config: DictConfig, prior: Prior) -> Synthesizer:
+def build_synthesizer(config: DictConfig, prior: Prior) -> Synthesizer | Baseline:
     """The synthesizer of the `synthesizer` group on a prior."""
+    if config.synthesizer.name in BASELINES:
+        return BASELINES[config.synthesizer.name](prior)
     parts = {name: settings_of(part, config.synthesizer[name], f"synthesizer.{name}")
              for name, part in PARTS.items() if name in config.synthesizer}
     scalars = {name: config.synthesizer[name] for name in ("reselect", "samples", "selection")
                if name in config.synthesizer}
     return Synthesizer(prior, SynthesizerSettings(**parts, **scalars))
+
+
+def build_methods(config: DictConfig, prior: Prior) -> list[Method]:
+    """The rows of `config.methods`, then the uncontrolled prior at each of `config.temperatures`."""
+    synthesizer = build_synthesizer(config, prior)
+    nominal = synthesizer if isinstance(synthesizer, Synthesizer) else Synthesizer(prior)
+    methods = []
+    for name in dict.fromkeys(config.methods):
+        if name in BASELINES:
+            methods.append(Method(name, BASELINES[name](prior), 0.0))
+        elif name == "nominal":
+            methods.append(Method(name, nominal, 0.0))
+        else:
+            methods.append(Method(name, synthesizer, config.eta))
+    for value in dict.fromkeys(config.temperatures):
+        heated = copy.copy(prior)  # the same weights
+        heated.sampler = replace(prior.sampler, temperature=value, route_temperature=value)
+        methods.append(Method(f"nominal T={value:g}", Synthesizer(heated), 0.0))
+    return methods
 
 
 def build_ego(config: DictConfig) -> Ego:
@@ -78,13 +112,20 @@ def set_up(config: DictConfig) -> None:
 
 def check_protocol(config: DictConfig) -> None:
     """InputError for methods, seeds or an intensity that evaluate.py cannot run."""
-    known = list(dict.fromkeys(["nominal", config.synthesizer.name]))
+    known = list(dict.fromkeys(["nominal", *BASELINES, config.synthesizer.name]))
     for name in config.methods:
         if name not in known:
             raise InputError(f"methods={list(config.methods)}: {name} is none of {', '.join(known)}; choose another "
                              "with synthesizer=")
-    if not config.methods or not config.seeds:
+    if not (config.methods or config.temperatures) or not config.seeds:
         raise InputError(f"methods={list(config.methods)}, seeds={list(config.seeds)}: name at least one of each")
+    if not all(isinstance(value, int | float) and 0 < value < float("inf") for value in config.temperatures):
+        raise InputError(f"temperatures={list(config.temperatures)}: expected numbers above 0")
+    for key in ("open_loop_samples", "meta_rollouts"):
+        if not isinstance(config[key], int) or config[key] < 0:
+            raise InputError(f"{key}={config[key]}: expected a whole number of at least 0")
+    if config.metrics not in CLOSED_LOOP:
+        raise InputError(f"metrics={config.metrics}: choose one of {', '.join(CLOSED_LOOP)}")
     if not isinstance(config.eta, int | float) or not 0 <= config.eta < float("inf"):
         raise InputError(f"eta={config.eta}: the intensity is a number of at least 0 (0 to 3 are sensible)")
     if not all(isinstance(seed, int) for seed in config.seeds):

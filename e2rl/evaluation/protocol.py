@@ -21,16 +21,17 @@ from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.env import SimSettings
+from e2rl.synthesizer.baselines.baseline import Baseline
 from e2rl.synthesizer.rollout import roll_out
 from e2rl.synthesizer.synthesizer import Synthesizer
 
 
 @dataclass
 class Method:
-    """A row of the table: its name, synthesizer and intensity."""
+    """A row of the table: its name, who makes the traffic and at which intensity."""
 
     name: str
-    synthesizer: Synthesizer
+    synthesizer: Synthesizer | Baseline
     eta: float
 
 
@@ -54,7 +55,7 @@ def run_protocol(
             source = Source(scenes.dataset, scenes.split, method.name, ego_name)
             for begin in range(0, len(tasks), batch):
                 part = tasks[begin:begin + batch]
-                rollouts = _roll_out(scenes, part, method, ego, sim, device)
+                rollouts = roll_out_part(scenes, part, method, ego, sim, device)
                 scored, samples = score_rollouts(rollouts)
                 rows += label_rows(scored, source)
                 features += samples
@@ -69,8 +70,9 @@ def run_protocol(
     return result
 
 
-def _roll_out(scenes: SceneSet, part: list[tuple[int, int]], method: Method, ego: Ego, sim: SimSettings, device: str
-              ) -> dict:
+def roll_out_part(scenes: SceneSet, part: list[tuple[int, int]], method: Method, ego: Ego, sim: SimSettings,
+                  device: str = "cpu") -> dict:
+    """The rollout dict of (scene, seed) pairs under one method."""
     index = torch.tensor([scene for scene, _ in part])
     noise = torch.tensor([scene_seed(*task) for task in part])
     eta = torch.full((len(part),), float(method.eta))

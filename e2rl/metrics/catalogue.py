@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from e2rl.metrics.meta_metric import FEATURES
+
 
 @dataclass(frozen=True)
 class Metric:
@@ -13,6 +15,7 @@ class Metric:
     share: bool = False
     column: str = ""  # of the rows, where it differs from the name; "" is the name
     weight: str = ""
+    per: str = ""  # rows' column that the metric is a quotient by: sum over sum, not a mean of quotients
     pooled: bool = False  # computed from the samples of all rollouts together, not from the rows
 
     @property
@@ -47,6 +50,10 @@ EXTRA = (
     Metric("side_any", "ego's side in contact at first contact", share=True),
     Metric("rear_any", "ego's rear in contact at first contact", share=True),
     Metric("bg_pairs", "pairs of other vehicles that hit each other"),
+    Metric("touched", "moving vehicles that touch another simulated one", share=True, weight="moving_vehicles"),
+    Metric("parked_moved", "parked vehicles that move > 2 m", share=True, weight="parked_vehicles"),
+    Metric("starts", "standing vehicles that start, per one that starts in the log", share=True, column="starters",
+           per="starters_log"),
     Metric("ttc_c_all", "time-to-collision cost, all agents"),
     Metric("transport_adversary", "path KL of the control, adversaries"),
     Metric("transport_others", "path KL of the control, other vehicles"),
@@ -56,6 +63,25 @@ EXTRA = (
     Metric("w1_jerk", "W1 of |jerk|", unit="m/s³", pooled=True),
 )
 METRICS = {metric.name: metric for metric in MAIN + EXTRA}
+TRAFFIC = tuple(METRICS[name] for name in (
+    "cfr", "cfr_bg", "touched", "aor_step", "aor_any", "real", "real_norm", "w1_a_lon", "w1_a_lat", "w1_jerk",
+    "parked_moved", "starts", "seconds_per_rollout"))  # what says whether background traffic is realistic
+CLOSED_LOOP = {"main": MAIN, "traffic": TRAFFIC}
+OPEN_LOOP = tuple(
+    Metric(f"{name}_{horizon}", about.format(horizon), unit=unit) for horizon in (3, 5) for name, about, unit in (
+        ("min_ade", "mean displacement over {} s, each vehicle's best sample", "m"),
+        ("mean_ade", "the same, mean over samples", "m"),
+        ("joint_ade", "the same, the scene's best sample for all its vehicles", "m"),
+        ("cv_ade", "constant velocity's displacement over {} s, same vehicles", "m"),
+        ("min_ade_ratio", "min_ade over cv_ade at {} s", ""), ("mean_ade_ratio", "mean_ade over cv_ade at {} s", "")))
+META = (
+    Metric("meta_metric", "realism meta-metric, weighted likelihood of the log"),
+    *(Metric(name, f"likelihood of the logged {name.replace('_', ' ')}, weight {feature.weight:g}")
+      for name, feature in FEATURES.items()),
+    Metric("real_split_half", "`real` of one half of the logs against the other"),
+)
+OPEN_LOOP_STAGE, META_STAGE = "open loop", "meta-metric"
+STAGES = {OPEN_LOOP_STAGE: OPEN_LOOP, META_STAGE: META}  # parts of a run with metrics of their own
 IDENTITY = ("scene_id", "location", "seed", "eta")  # of a row, before its metrics
 EVENT = (
     "contact_time",
@@ -63,6 +89,9 @@ EVENT = (
     "partner",
     "contact_step",
     "aor_vehicle_steps",
+    "moving_vehicles",
+    "parked_vehicles",
+    "starters_log",
     "aor_left_out",
     "start_overlap_ego",
     "start_overlap_bg",

@@ -131,7 +131,8 @@ def vulnerable_contact(area: Tensor, vehicle: Tensor, stop: Tensor) -> Tensor:
 
 
 def background_pairs(states: Tensor, valid: Tensor, size: Tensor, traffic: Tensor, stop: Tensor) -> tuple[Tensor, ...]:
-    """Counts [B] of pairs of `traffic` [B, N] vehicles that overlap at a step 1..stop, and at step 0.
+    """Counts [B] of pairs of `traffic` [B, N] vehicles that overlap at a step 1..stop, and at step 0; and who is among
+    the first [B, N] bool.
 
     Pairs that overlap at step 0 already are left out of the first count.
     """
@@ -152,7 +153,10 @@ def background_pairs(states: Tensor, valid: Tensor, size: Tensor, traffic: Tenso
     )
     overlap[index] = area > 0
     later = (overlap & up_to(stop, states.shape[1])[..., None]).any(1)
-    return (later & ~overlap[:, 0]).sum(-1), overlap[:, 0].sum(-1)
+    meets = later & ~overlap[:, 0]
+    touched = torch.zeros_like(traffic, dtype=torch.int64).index_add(1, one, meets.long())
+    touched = touched.index_add(1, two, meets.long()) > 0
+    return meets.sum(-1), overlap[:, 0].sum(-1), touched
 
 
 def nearby(states: Tensor, size: Tensor, one: Tensor, two: Tensor, possible: Tensor) -> tuple[Tensor, ...]:

@@ -107,6 +107,24 @@ def realism(features: list[dict[str, Tensor]], cluster: Tensor, draws: Tensor) -
     return table | dict(zip(w1_names(), parts, strict=True))
 
 
+def split_half(features: list[dict[str, Tensor]], cluster: Tensor, halves: Tensor) -> Tensor:
+    """`real` [S] of one half of the logs against the other: the ceiling that sampling noise and the scenes' variety set.
+
+    halves [S, C] bool: which clusters of rollouts (cluster [R]) are in the first half of each split; NaN where a half
+    is empty.
+    """
+    parts = []
+    for name in FEATURES:
+        log = torch.cat([sample[name][1] for sample in features])
+        counts = torch.tensor([sample[name].shape[1] for sample in features])
+        owner = cluster.repeat_interleave(counts)
+        values, order = log.sort()
+        first = halves[:, owner[order]].to(log)
+        share = [side.cumsum(1) / side.sum(1, keepdim=True) for side in (first, 1 - first)]
+        parts.append(((share[0] - share[1]).abs()[:, :-1] @ values.diff()))
+    return 1 - torch.stack(parts).clamp(max=1).mean(0)
+
+
 def w1_names() -> list[str]:
     return [f"w1_{name}" for name in FEATURES]
 

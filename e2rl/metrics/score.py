@@ -23,7 +23,8 @@ from e2rl.metrics.proximity import (
     progress,
     smallest_gap,
 )
-from e2rl.metrics.realism import motion_features, realism
+from e2rl.metrics.realism import MOVING, motion_features, realism
+from e2rl.metrics.standing import standing_columns
 from e2rl.scene.recording import DT, VEHICLE
 
 CHUNK = 32  # rollouts scored at once: bounds the memory of the pairwise steps
@@ -72,8 +73,9 @@ def score_batch(batch: dict[str, Tensor], dt: float) -> tuple[dict[str, Tensor],
     stop = contact.stop
     columns = contact_columns(states, valid, size, batch["adversaries"], contact, dt)
     columns["cfr_vru"] = vulnerable_contact(area, vehicle, stop).to(states.dtype)
-    pairs, pairs_at_start = background_pairs(states, valid, size, traffic, stop)
+    pairs, pairs_at_start, touched = background_pairs(states, valid, size, traffic, stop)
     columns |= {"cfr_bg": (pairs > 0).to(states.dtype), "bg_pairs": pairs, "start_overlap_bg": pairs_at_start > 0}
+    columns |= touched_columns(batch, traffic & touched, traffic) | standing_columns(batch, traffic)
     columns |= motion_columns(batch, contact, dt)
     columns |= off_road(states, valid, traffic, stop, {key: batch[key] for key in MAP})
     features = motion_features(states, valid, batch["logged"], batch["logged_valid"], traffic, stop, dt)
@@ -104,6 +106,16 @@ def contact_columns(
         "partner": contact.partner,
         "start_overlap_ego": contact.overlaps_start,
     }
+
+
+def touched_columns(batch: dict[str, Tensor], touched: Tensor, traffic: Tensor) -> dict[str, Tensor]:
+    """Share of the traffic's moving vehicles (in the rollout or in its log) that another one touches; touched [B, N]."""
+    fastest = [(batch[track][..., 3] * batch[known]).amax(1)
+               for track, known in (("states", "valid"), ("logged", "logged_valid"))]
+    moving = traffic & (torch.maximum(*fastest) > MOVING)
+    number = moving.sum(-1)
+    share = (touched & moving).sum(-1).to(batch["states"].dtype) / number  # 0 / 0 is NaN
+    return {"touched": share, "moving_vehicles": number}
 
 
 def motion_columns(batch: dict[str, Tensor], contact: EgoContact, dt: float) -> dict[str, Tensor]:

@@ -37,12 +37,13 @@ def bootstrap_draws(clusters: int, draws: int = DRAWS, seed: int = 0) -> Tensor:
     return torch.cat([torch.ones(1, clusters, dtype=torch.float64), counts])
 
 
-def resampled_means(values: Tensor, weights: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
-    """Weighted means [D, M] per draw [D, C] of values, weights [R, M] of rollouts in cluster [R]; NaN is left out."""
-    weights = torch.where(values.isnan() | weights.isnan(), 0.0, weights)
-    shape = (draws.shape[1], values.shape[1])
-    total = values.new_zeros(shape).index_add(0, cluster, values.nan_to_num(0.0) * weights)
-    count = values.new_zeros(shape).index_add(0, cluster, weights)
+def resampled_means(totals: Tensor, weights: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
+    """Quotients [D, M] per draw [D, C] of the sums of totals, weights [R, M] of rollouts in cluster [R]; where either
+    is NaN the rollout is left out."""
+    unknown = totals.isnan() | weights.isnan()
+    shape = (draws.shape[1], totals.shape[1])
+    total = totals.new_zeros(shape).index_add(0, cluster, totals.masked_fill(unknown, 0.0))
+    count = totals.new_zeros(shape).index_add(0, cluster, weights.masked_fill(unknown, 0.0))
     return (draws @ total) / (draws @ count)  # 0 / 0 is NaN
 
 
@@ -54,13 +55,18 @@ def interval(samples: Tensor, known_clusters: int) -> dict[str, float]:
 
 
 def metric_table(rows: Sequence[Row], metrics: Sequence[Metric]) -> tuple[Tensor, Tensor]:
-    """Values and weights [R, M] float64 of the rows' metrics; NaN where a row lacks one."""
+    """Weighted values and weights [R, M] float64 of the rows' metrics; NaN where a row lacks one. A metric `per` another
+    column is not weighted: it is summed and divided by the sum of that column."""
 
     def table(names: list[str], absent: float) -> Tensor:
         cells = [[float(row.get(name, torch.nan)) if name else absent for name in names] for row in rows]
         return torch.tensor(cells, dtype=torch.float64).reshape(len(rows), len(names))
 
-    return table([metric.source for metric in metrics], torch.nan), table([metric.weight for metric in metrics], 1.0)
+    values = table([metric.source for metric in metrics], torch.nan)
+    weights = table([metric.weight for metric in metrics], 1.0)
+    per = table([metric.per for metric in metrics], torch.nan)
+    quotient = torch.tensor([bool(metric.per) for metric in metrics])
+    return torch.where(quotient, values, values * weights), torch.where(quotient, per, weights)
 
 
 def summarise(
@@ -74,9 +80,9 @@ def summarise(
         raise ValueError(f"{len(rows)} rows but {len(features)} features; they are made together by score_rollouts")
     cluster, clusters = cluster_index(rows)
     single = [metric for metric in METRICS.values() if not metric.pooled]
-    values, weights = metric_table(rows, single)
-    means = resampled_means(values, weights, cluster, bootstrap_draws(clusters, draws))
-    known = ~values.isnan() & (weights > 0)
+    totals, weights = metric_table(rows, single)
+    means = resampled_means(totals, weights, cluster, bootstrap_draws(clusters, draws))
+    known = ~totals.isnan() & (weights > 0)
     result = {
         metric.name: interval(means[:, column], len(cluster[known[:, column]].unique()))
         | {"n": int(known[:, column].sum())}

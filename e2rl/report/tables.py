@@ -10,7 +10,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from e2rl.evaluation.files import replace
-from e2rl.metrics.catalogue import EXTRA, MAIN, METRICS, Metric
+from e2rl.metrics.catalogue import MAIN, META_STAGE, METRICS, OPEN_LOOP_STAGE, STAGES, Metric
+
+
+RESTS_ON = {
+    OPEN_LOOP_STAGE: "(n) vehicles: others than the ego, faster than 0.5 m/s in the log at the start, recorded throughout "
+    "the horizon; causal start states, a route drawn per sample; samples without acceleration bounds.",
+    META_STAGE: "(n) scenes. Likelihood of the log under each vehicle's histogram over all rollouts and steps; vehicles "
+    "recorded throughout. A deterministic method's rollout stands for all.",
+}
 
 
 @dataclass
@@ -43,19 +51,21 @@ class Table:
         return "\n".join([line(self.head), align, *map(line, self.rows), "", self.caption, ""])
 
 
-def metric_tables(rows: Sequence[dict], settings: str = "", extra: bool = False) -> list[Table]:
+def metric_tables(rows: Sequence[dict], settings: str = "", metrics: Sequence[Metric] = MAIN) -> list[Table]:
     """Tables of rows as in metrics.json. `settings` (prior, samples, bounds, ...) joins every caption.
 
-    extra: also the metrics beyond the design's list. Metrics that no column knows are left out, named in the caption.
+    metrics: of the closed-loop tables; those that no column knows are left out, named in the caption. Rows of the
+    stages `open loop` and `meta-metric` have tables and metrics of their own.
     """
     groups: dict[tuple, list[dict]] = {}
     for row in rows:
-        groups.setdefault((row["dataset"], row["split"], row["ego"]), []).append(row)
+        stage = row.get("stage") if row.get("stage") in STAGES else None
+        groups.setdefault((row["dataset"], row["split"], row["ego"], stage), []).append(row)
     tables = []
-    for group in groups.values():
-        tables.append(means_table(group, settings, MAIN + (EXTRA if extra else ())))
+    for (*_, stage), group in groups.items():
+        tables.append(means_table(group, settings, STAGES.get(stage, metrics)))
         if len(group) > 1:
-            tables.append(paired_table(group))
+            tables.append(paired_table(group, metrics))
     return [table for table in tables if table.rows]
 
 
@@ -66,10 +76,8 @@ def means_table(group: Sequence[dict], settings: str, metrics: Sequence[Metric])
         return any(row["metrics"].get(metric.name, {}).get("n", 0) for row in group)
 
     names = column_names(group)
-    caption = (
-        f"{place(group[0])}. {counts(group, names)} Mean [95% interval, bootstrap by location or scene]; "
-        "(n) rollouts where fewer count."
-    )
+    rests_on = RESTS_ON.get(group[0].get("stage"), "(n) rollouts where fewer count.")
+    caption = f"{place(group[0])}. {counts(group, names)} Mean [95% interval, bootstrap by location or scene]; {rests_on}"
     unknown = [metric.name for metric in metrics if not known(metric)]
     caption += f" {settings.rstrip('.')}." if settings else ""
     caption += f" Not computable here: {', '.join(unknown)}." if unknown else ""
@@ -77,7 +85,7 @@ def means_table(group: Sequence[dict], settings: str, metrics: Sequence[Metric])
     return Table(caption, ["", *names], body)
 
 
-def paired_table(group: Sequence[dict]) -> Table:
+def paired_table(group: Sequence[dict], metrics: Sequence[Metric] = MAIN) -> Table:
     """Differences of every method to the first one over the same (scene, seed), per cent points for shares; where rows
     have stages, of each method after training to the same method before.
     """
@@ -91,7 +99,7 @@ def paired_table(group: Sequence[dict]) -> Table:
     columns = [(name, paired) for name, paired in columns if paired]
     body = [
         [heading(metric, points=True), *(difference_cell(metric, paired.get(metric.name)) for _, paired in columns)]
-        for metric in MAIN
+        for metric in metrics
         if any(not math.isnan(paired[metric.name]["difference"]) for _, paired in columns if metric.name in paired)
     ]
     caption = (
@@ -126,7 +134,9 @@ def counts(group: Sequence[dict], names: Sequence[str]) -> str:
 def column_names(group: Sequence[dict]) -> list[str]:
     """method, with eta where it is not 0 and the stage where there is one."""
     return [
-        " ".join(filter(None, (str(row.get("stage", "")), row["method"], f"η={row['eta']:g}" if row["eta"] else "")))
+        " ".join(filter(None, (
+            "" if row.get("stage") in STAGES else str(row.get("stage", "")),
+            row["method"], f"η={row['eta']:g}" if row["eta"] else "")))
         for row in group
     ]
 
@@ -186,5 +196,6 @@ def print_tables(tables: Sequence[Table]) -> None:
 
 def legend() -> str:
     """One line per metric: its name and what it says."""
-    width = max(map(len, METRICS))
-    return "\n".join(f"{metric.name.ljust(width)}  {metric.about}" for metric in METRICS.values())
+    metrics = (*METRICS.values(), *(metric for stage in STAGES.values() for metric in stage))
+    width = max(len(metric.name) for metric in metrics)
+    return "\n".join(f"{metric.name.ljust(width)}  {metric.about}" for metric in metrics)

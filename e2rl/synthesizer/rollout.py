@@ -79,7 +79,7 @@ def _rollout(scenes: SceneSet, index, seed, states, valid, scene, episode, secon
     acted = episode.adversaries
     rollout = {
         "states": states, "valid": valid, "size": scene["size"], "agent_type": scene["agent_type"],
-        "simulated": simulated, "adversaries": adversaries, "logged": scene["logged"],
+        "parked": scene["parked"], "simulated": simulated, "adversaries": adversaries, "logged": scene["logged"],
         "logged_valid": scene["logged_valid"] & start[:, None], **{key: scene[key] for key in MAP_KEYS},
         "seed": seed, "seconds": torch.full((len(index),), seconds), "routes": episode.routed.route,
         "transport_adversary": (episode.kl * acted).sum(-1), "transport_others": (episode.kl * ~acted).sum(-1),

@@ -154,8 +154,10 @@ class Synthesizer:
             jump = control.jump if control else torch.zeros_like(sample.kl)
             found = (sample.x0, sample.kl, jump, self._cost(sample.x0, context, where, episode.eta))
             best = found if best is None else _cheaper(best, found)
+        plan = self.prior.plan(best[0], context)
+        there = world.valid[:, :plan.on_map.shape[1], None]  # who is gone does not come back
         return replace(episode, replans=episode.replans + 1, kl=episode.kl + best[1],
-                       jump=episode.jump + best[2]), self.prior.plan(best[0], context)
+                       jump=episode.jump + best[2]), replace(plan, on_map=plan.on_map & there)
 
     def _noise(self, episode: Episode, sample: int = 0) -> Tensor:
         shape = (self.prior.sampler.steps, episode.routed.route.shape[1], SIZE)

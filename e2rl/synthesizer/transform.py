@@ -85,6 +85,6 @@ class AdversarialSynthesizer(Transform):
         states, valid = plan.states().transpose(1, 2), plan.on_map.transpose(1, 2)
         vehicles = states.shape[2]
         self._plan[0][rows, :, :vehicles] = states
-        self._plan[1][rows, :, :vehicles] = valid & world.valid[rows][:, None, :vehicles]
+        self._plan[1][rows, :, :vehicles] = valid
         self._planned[rows] = world.step[rows]
         self._env.write_traffic(self._planned, *self._plan, self.episode.routed.route)

@@ -1,0 +1,153 @@
+"""The realism meta-metric of traffic models over many rollouts a scene, and the log's own split-half `real`.
+
+Histograms are sums over rollouts, so batches of rollouts are counted as they come and memory stays flat.
+"""
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from tqdm import tqdm
+
+from e2rl.ego.base import Ego
+from e2rl.evaluation.files import command_line, git_commit
+from e2rl.evaluation.protocol import Method, roll_out_part
+from e2rl.metrics.catalogue import META_STAGE
+from e2rl.metrics.meta_features import track_features
+from e2rl.metrics.meta_metric import (
+    FEATURES,
+    HISTOGRAMS,
+    INDICATIONS,
+    bin_counts,
+    bin_index,
+    likelihood,
+    log_bernoulli,
+    log_probability,
+    meta_metric,
+)
+from e2rl.metrics.realism import motion_features, split_half
+from e2rl.metrics.statistics import LEVELS, bootstrap_draws, cluster_index, interval, resampled_means
+from e2rl.prior.routed import take_route
+from e2rl.scene.recording import DT, VEHICLE
+from e2rl.scene.scene import SceneSet
+from e2rl.sim.env import SimSettings
+from e2rl.synthesizer.baselines.baseline import Baseline
+from e2rl.synthesizer.baselines.replay import Replay
+
+TRACKS = 512  # vehicles of rollouts looked at at once: bounds the memory of the pairwise features
+SPLITS = 200  # of the logs into halves
+
+
+class Tally:
+    """Counts of the features' bins and of indications for every vehicle [S * V] of scenes [S], over rollouts."""
+
+    def __init__(self, scenes: TensorDictBase):
+        self.scenes, self.vehicles = scenes, scenes["route_log"].shape[1]
+        size = len(scenes) * self.vehicles
+        self.counts = {name: torch.zeros(size, FEATURES[name].bins, dtype=torch.float64) for name in HISTOGRAMS}
+        self.hits = {name: torch.zeros(size, dtype=torch.float64) for name in INDICATIONS}
+
+    def add(self, index: Tensor, rollouts: dict, weight: int = 1) -> None:
+        """Count rollouts of scenes index [B] int64, each as `weight` equal ones."""
+        batch = {**rollouts, **road_of(self.scenes[index], rollouts["routes"])}
+        rollout, agent = evaluated(self.scenes[index]).nonzero(as_tuple=True)
+        for part in torch.arange(len(rollout)).split(TRACKS):
+            key = index[rollout[part]] * self.vehicles + agent[part]
+            values, events = track_features(batch, rollout[part], agent[part])
+            for name, (value, known) in values.items():
+                bins = bin_counts(bin_index(value, FEATURES[name]), known, FEATURES[name].bins)
+                self.counts[name].index_add_(0, key, bins, alpha=weight)
+            for name, event in events.items():
+                self.hits[name].index_add_(0, key, event.double(), alpha=weight)
+
+    def likelihoods(self, rollouts: int) -> dict[str, Tensor]:
+        """Likelihood [S] of each feature's logged values after `rollouts` rollouts of every scene; NaN without any."""
+        scenes, found = self.scenes, {name: [] for name in FEATURES}
+        batch = {"states": scenes["logged"], "valid": scenes["logged_valid"], "size": scenes["size"],
+                 **road_of(scenes, scenes["route_log"])}
+        scene, agent = evaluated(scenes).nonzero(as_tuple=True)
+        for part in torch.arange(len(scene)).split(TRACKS):
+            key = scene[part] * self.vehicles + agent[part]
+            values, events = track_features(batch, scene[part], agent[part])
+            for name, (value, known) in values.items():
+                log_p = log_probability(self.counts[name][key], bin_index(value, FEATURES[name]))
+                found[name].append((log_p, known))
+            for name, event in events.items():
+                log_p = log_bernoulli(self.hits[name][key], rollouts, event)[:, None]
+                found[name].append((log_p, torch.ones_like(log_p, dtype=torch.bool)))
+        joined = {name: [torch.cat(column) for column in zip(*parts, strict=True)] for name, parts in found.items()}
+        return {name: likelihood(*columns, scene, len(scenes)) for name, columns in joined.items()}
+
+
+def evaluated(scene: TensorDictBase) -> Tensor:
+    """Bool [B, V]: vehicles other than the ego that are there at the start and recorded throughout."""
+    vehicles = scene["route_log"].shape[1]
+    chosen = scene["valid"] & scene["logged_valid"].all(1) & (scene["agent_type"] == VEHICLE)
+    return torch.cat([torch.zeros_like(chosen[:, :1]), chosen[:, 1:vehicles]], 1)
+
+
+def road_of(scene: TensorDictBase, route: Tensor) -> dict[str, Tensor]:
+    """Road, lights and ways of scenes [B] whose vehicles follow candidates route [B, V] (-1: no way, so no lights)."""
+    chosen = route.clamp(min=0)
+    light = take_route(scene["route_light"], chosen)
+    return {"field": scene["field"], "field_origin": scene["field_origin"], "light_state": scene["light_state"],
+            "route_points": take_route(scene["route_points"], chosen),
+            "route_light": torch.where((route >= 0)[..., None], light, -1),
+            "route_light_s": take_route(scene["route_light_s"], chosen)}
+
+
+def meta_rows(scenes: SceneSet, methods: list[Method], ego: Ego, ego_name: str, sim: SimSettings, rollouts: int,
+              batch: int = 64, device: str = "cpu") -> list[dict]:
+    """Rows of metrics.json, stage `meta-metric`: every feature's likelihood and their weighted sum over `rollouts`
+    rollouts of each scene, with intervals by place. The row of the log also has its split-half `real`."""
+    tallies = [Tally(scenes.scenes) for _ in methods]
+    tasks = [[(scene, seed) for seed in range(1 if isinstance(method.synthesizer, Baseline) else rollouts)
+              for scene in range(len(scenes))] for method in methods]
+    with tqdm(total=sum(map(len, tasks)), desc="meta-metric", unit="rollout") as bar:
+        for method, tally, todo in zip(methods, tallies, tasks, strict=True):
+            weight = rollouts * len(scenes) // len(todo)
+            for begin in range(0, len(todo), batch):
+                part = todo[begin:begin + batch]
+                found = roll_out_part(scenes, part, method, ego, sim, device)
+                tally.add(torch.tensor([scene for scene, _ in part]), found, weight)
+                bar.update(len(part))
+    rows = []
+    for method, tally in zip(methods, tallies, strict=True):
+        metrics = summarise_meta(tally.likelihoods(rollouts), scenes)
+        if isinstance(method.synthesizer, Replay):
+            metrics["real_split_half"] = log_split_half(scenes)
+        rows.append({
+            "dataset": scenes.dataset, "split": scenes.split, "method": method.name, "ego": ego_name,
+            "eta": method.eta, "n_scenes": len(scenes), "n_seeds": rollouts, "n_rollouts": rollouts * len(scenes),
+            "git": git_commit(), "command": command_line(), "stage": META_STAGE, "metrics": metrics, "paired": {}})
+    return rows
+
+
+def summarise_meta(likelihoods: dict[str, Tensor], scenes: SceneSet) -> dict[str, dict[str, float]]:
+    """{metric: {mean, low, high, n}} of likelihoods [S] a scene; n counts the scenes with a vehicle to look at."""
+    cluster, clusters = _clusters(scenes)
+    table = torch.stack([meta_metric(likelihoods), *likelihoods.values()], -1)
+    means = resampled_means(table, torch.ones_like(table), cluster, bootstrap_draws(clusters))
+    known = ~table.isnan()
+    return {name: interval(means[:, k], len(cluster[known[:, k]].unique())) | {"n": int(known[:, k].sum())}
+            for k, name in enumerate(("meta_metric", *likelihoods))}
+
+
+def log_split_half(scenes: SceneSet) -> dict[str, float]:
+    """Mean and 95% range of `real` between random halves of the logs, whole places apart; n counts scenes."""
+    scene = scenes.scenes
+    simulated = scene["valid"] & (scene["agent_type"] == VEHICLE)
+    simulated[:, 0] = False
+    simulated[:, scene["route_log"].shape[1]:] = False
+    log = scene["logged"].double(), scene["logged_valid"]
+    features = motion_features(*log, *log, simulated, torch.full((len(scene),), log[0].shape[1] - 1), DT)
+    cluster, clusters = _clusters(scenes)
+    generator = torch.Generator().manual_seed(0)
+    order = torch.rand(SPLITS, clusters, generator=generator).argsort(1)
+    values = split_half(features, cluster, order < clusters // 2)
+    low, high = values.nanquantile(values.new_tensor(LEVELS)).tolist()
+    return {"mean": values.nanmean().item(), "low": low, "high": high, "n": len(scenes)}
+
+
+def _clusters(scenes: SceneSet) -> tuple[Tensor, int]:
+    return cluster_index([{"location": place, "scene_id": name}
+                          for place, name in zip(scenes.location, scenes.scene_id, strict=True)])

@@ -1,0 +1,54 @@
+"""Open-loop displacement: how far sampled plans end up from the recording, of moving vehicles other than the ego.
+
+ADE is the mean distance over all steps of 0.1 s up to a horizon, of vehicles recorded throughout it. minADE takes each
+vehicle's best sample, the joint minADE the scene's best sample for all its vehicles at once. Ratios are quotients of
+sums over vehicles.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from e2rl.scene.recording import DT
+
+MOVING = 0.5  # m/s, logged speed at the start frame above which a vehicle counts
+
+
+def moving_vehicles(logged: Tensor, logged_valid: Tensor, simulated: Tensor, steps: int) -> Tensor:
+    """Bool [B, V]: simulated vehicles, not the ego, faster than MOVING at step 0 of the log and recorded to `steps`.
+
+    logged [B, T+1, V, 4], logged_valid [B, T+1, V], simulated [B, V].
+    """
+    throughout = logged_valid[:, :steps + 1].all(1) if logged.shape[1] > steps else torch.zeros_like(simulated)
+    counted = simulated & throughout & (logged[:, 0, :, 3] > MOVING)
+    return torch.cat([torch.zeros_like(counted[:, :1]), counted[:, 1:]], 1)
+
+
+def displacement(plans: Tensor, logged: Tensor) -> Tensor:
+    """Running ADE [B, S, V, H] [m] of plans [B, S, V, H, >= 2] against the log [B, V, H, >= 2] of the same steps."""
+    gap = (plans[..., :2] - logged[:, None, ..., :2]).norm(dim=-1)
+    return gap.cumsum(-1) / torch.arange(1, gap.shape[-1] + 1, device=gap.device)
+
+
+def scene_displacements(
+    plans: Tensor, reference: Tensor, logged: Tensor, logged_valid: Tensor, simulated: Tensor, horizons: Sequence[float]
+) -> dict[str, Tensor]:
+    """Sums [B] over each scene's counted vehicles, and their number, for every horizon [s].
+
+    plans [B, S, V, H, 4]: samples of steps 1..H; reference [B, V, H, 4]: constant velocity; logged [B, T+1, V, 4].
+    Keys, with the horizon in s appended: min_ade_, mean_ade_, joint_ade_ (the best joint sample), cv_ade_, vehicles_.
+    """
+    future = logged[:, 1:plans.shape[3] + 1].transpose(1, 2)
+    planned, straight = displacement(plans, future), displacement(reference[:, None], future)[:, 0]
+    columns = {}
+    for horizon in horizons:
+        steps = round(horizon / DT)
+        counted = moving_vehicles(logged, logged_valid, simulated, steps)
+        ade = torch.where(counted[:, None], planned[..., steps - 1], 0.0)
+        found = {
+            "min_ade": ade.amin(1).sum(-1), "mean_ade": ade.mean(1).sum(-1), "joint_ade": ade.sum(-1).amin(1),
+            "cv_ade": torch.where(counted, straight[..., steps - 1], 0.0).sum(-1), "vehicles": counted.sum(-1),
+        }
+        columns |= {f"{name}_{horizon:g}": value for name, value in found.items()}
+    return columns

@@ -1,0 +1,1 @@
+"""Background traffic to compare with, on the synthesizer's interface."""
