@@ -7,6 +7,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from e2rl.errors import InputError, stop
+from e2rl.evaluation.avoidable import search_effort
 from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_synthesizer, caption, check_protocol, set_up
 from e2rl.evaluation.protocol import Method, run_protocol
 from e2rl.report.tables import metric_tables, save_tables
@@ -25,7 +26,8 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     name = HydraConfig.get().runtime.choices["ego"]
     rows = run_protocol(scenes, methods, ego, name, list(config.seeds), sim, folder, config.batch, config.device)
     dropped = "".join(f"; left out: {count} scenes ({reason})" for reason, count in scenes.dropped.items())
-    tables = metric_tables(rows, caption(config, origin) + dropped)
+    effort = search_effort(scenes.scenes["logged"].shape[1] - 1)
+    tables = metric_tables(rows, f"{caption(config, origin)}; {effort}{dropped}")
     save_tables(folder / "tables.md", tables)
     print("\n\n".join(table.text() for table in tables))
     print(f"\nwritten to {folder}")

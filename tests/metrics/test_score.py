@@ -153,6 +153,7 @@ def test_every_metric_of_the_design_is_summarised_in_its_order():
         "cfr_adv",
         "cfr_vru",
         "cfr_bg",
+        "avoidable",
         "front",
         "side",
         "rear",
