@@ -38,7 +38,7 @@ def knot_count(steps: int) -> int:
 
 def accelerations(knots: Tensor, steps: int) -> Tensor:
     """Accelerations [..., T] of knots [..., K], linear between them, at the middle of each step."""
-    at = (torch.arange(steps, device=knots.device) + 0.5) / KNOT_STEPS
+    at = (torch.arange(steps, device=knots.device, dtype=knots.dtype) + 0.5) / KNOT_STEPS
     index = at.long()
     return torch.lerp(knots[..., index], knots[..., index + 1], at - index)
 
@@ -59,11 +59,11 @@ def shifts(knots: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     """
     count = knots.shape[-1]
     at = torch.arange(steps + 1, device=knots.device, dtype=knots.dtype) / KNOT_STEPS
-    gap = (at[:, None] - torch.arange(count + 2, device=knots.device)).abs()  # two more: the last knot is held
+    since = at[:, None] - torch.arange(count + 2, device=knots.device)  # two more: the last knot is held
+    gap = since.abs()
     near, far = gap < 1, gap < 2
     basis = torch.where(near, 2 / 3 - gap**2 + gap**3 / 2, (2 - gap) ** 3 / 6) * far
-    side = (at[:, None] - torch.arange(count + 2, device=knots.device)).sign()
-    slope = torch.where(near, -2 * gap + 1.5 * gap**2, -((2 - gap) ** 2) / 2) * far * side
+    slope = torch.where(near, -2 * gap + 1.5 * gap**2, -((2 - gap) ** 2) / 2) * far * since.sign()
     held = torch.cat([torch.zeros_like(knots[..., :2]), knots[..., 2:], knots[..., -1:].expand(*knots.shape[:-1], 2)],
                      -1)
     return held @ basis.T, held @ slope.T / (KNOT_STEPS * DT)
@@ -86,9 +86,9 @@ def drive(
     path = RoutePath(start, route)
     offset, slope = path.offset(way)
     aside, rate = shifts(shift, steps)
-    offset, slope = offset + aside, slope + rate * speed / speed.clamp(min=CREEP) ** 2
-    curvature = interpolate(route, path.s[..., None] + way)[2]
+    offset, curvature = offset + aside, interpolate(route, path.s[..., None] + way)[2]
     inner = (1 - curvature * offset).clamp(min=0.2)
+    slope = slope + inner * rate * speed / speed.clamp(min=CREEP) ** 2
     stretch = torch.hypot(inner, slope)
     along = way.diff(dim=-1) * 2 / (stretch[..., 1:] + stretch[..., :-1])
     ahead = path.s[..., None] + torch.nn.functional.pad(along.cumsum(-1), (1, 0))

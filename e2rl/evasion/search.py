@@ -21,16 +21,19 @@ BRAKES = (2.0, 4.0, 6.0, 8.0)  # m/s^2 held from a moment on, or for a while
 BEGINS = (0.0, 1.0, 2.0, 3.0, 4.0)  # s
 DABS = ((3.0, 1.0), (3.0, 2.0), (6.0, 1.0), (6.0, 2.0), (-2.0, 2.0), (-4.0, 2.0))  # m/s^2 of braking, s it lasts
 SHIFTS = (0.0, 1.5, -1.5, 3.5, -3.5, 2.5, -2.5)  # m beside the mission
+RAMP = 3  # knots that a shift takes
 WAYS = 8  # ways a profile is tried on
 CHUNK = 8  # rollouts searched at once: bounds the memory
 
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """clearance [m] an evasion keeps; the strategy's samples a round, survivors, rounds at most, and its largest
-    standard deviations of an acceleration [m/s^2] and of a shift [m]."""
+    """clearance [m] an evasion keeps to others, and shoulder [m] its centre keeps inside the road's border, which lies
+    1 m beyond the lanes (recorded egos keep 0.8 m); the strategy's samples a round, survivors, rounds at most, and its
+    largest standard deviations of an acceleration [m/s^2] and of a shift [m]."""
 
     clearance: float = 0.05
+    shoulder: float = 0.5
     samples: int = 192
     survivors: int = 24
     rounds: int = 16
@@ -78,8 +81,8 @@ def find_evasions(
     scene: TensorDictBase, states: Tensor, valid: Tensor, sim: SimSettings, settings: SearchSettings | None = None,
     moment: Tensor | None = None,
 ) -> Evasions:
-    """Search for every rollout of scenes [B] with states [B, T+1, N, 4], valid [B, T+1, N] (all agents, the ego in row
-    0), from step moment [B] (default 0: the start frame) to the last step, within the simulator's bounds.
+    """Search for every rollout of scenes [B], at least one, with states [B, T+1, N, 4], valid [B, T+1, N] (all agents,
+    the ego in row 0), from step moment [B] (default 0: the start frame) to the last step, within the simulator's bounds.
 
     Evasions hold the T steps from that moment on. A rollout's result does not depend on the batch: all draw the same
     numbers.
@@ -88,9 +91,6 @@ def find_evasions(
     moment = torch.zeros(len(states), dtype=torch.int64, device=states.device) if moment is None else moment
     parts = [_search(scene[rows], states[rows].float(), valid[rows], moment[rows], Limits.of(sim), settings)
              for rows in torch.arange(len(states), device=states.device).split(CHUNK)]
-    if not parts:
-        none = states.new_zeros(0)
-        return Evasions(none.bool(), states.new_zeros(0, states.shape[1] - 1, 2), states[:, 1:, 0], none, none.long())
     return Evasions(*(torch.cat([getattr(part, name) for part in parts]) for name in Evasions.__dataclass_fields__))
 
 
@@ -101,7 +101,7 @@ def _search(scene: TensorDictBase, states: Tensor, valid: Tensor, moment: Tensor
     driven = dynamics.inverse(states[:, :, 0])[..., 0].masked_fill(~valid[:, 1:, 0], 0.0)
     driven = driven.gather(1, (moment[:, None] + torch.arange(steps, device=moment.device)).clamp(max=steps - 1))
     route, accel, shift = grid(driven, scene["route_valid"][:, 0], scene["route_log"][:, 0])
-    trials = _drive(around, routes, route, accel, shift, steps, limits, settings.clearance)
+    trials = _drive(around, routes, route, accel, shift, steps, limits, settings)
     result, tried = _kept(trials), torch.full((len(states),), route.shape[1], device=states.device)
     open_rows = (~result.found).nonzero()[:, 0]
     generator = torch.Generator().manual_seed(0)
@@ -113,7 +113,7 @@ def _search(scene: TensorDictBase, states: Tensor, valid: Tensor, moment: Tensor
         parents = _pick(pool, pool.best(settings.survivors))
         children = _mutated(parents, noise)
         part = around.rows(open_rows)
-        trials = _drive(part, routes[open_rows], *children, steps, limits, settings.clearance)
+        trials = _drive(part, routes[open_rows], *children, steps, limits, settings)
         pool = Trials(*(torch.cat([getattr(parents, name), getattr(trials, name)], 1)
                         for name in Trials.__dataclass_fields__))
         best = _kept(pool)
@@ -158,17 +158,18 @@ def grid(driven: Tensor, route_valid: Tensor, mission: Tensor) -> tuple[Tensor, 
     accel, (route, shift) = profiles(driven), ways(route_valid, mission)
     batch, count, knots = accel.shape
     shape = (batch, count, route.shape[1])
+    ramp = (torch.arange(-1, knots - 1, device=shift.device) / RAMP).clamp(0, 1)
     wide = accel[:, :, None].expand(*shape, knots).flatten(1, 2)
     return (route[:, None].expand(shape).flatten(1), wide,
-            shift[:, None, :, None].expand(*shape, knots).flatten(1, 2))
+            (shift[:, None, :, None] * ramp).expand(*shape, knots).flatten(1, 2))
 
 
 def _drive(around: Surroundings, routes: Tensor, route: Tensor, accel: Tensor, shift: Tensor, steps: int,
-           limits: Limits, clearance: float) -> Trials:
+           limits: Limits, settings: SearchSettings) -> Trials:
     row = torch.arange(len(route), device=route.device)[:, None]
     start = around.start[:, None].expand(*route.shape, 4)
     actions, states = drive(start, routes[row, route], accel, shift, steps, limits)
-    missed = violations(states, around, clearance).sum(-1)
+    missed = violations(states, around, settings.clearance, settings.shoulder).sum(-1)
     return Trials(route, accel, shift, actions, states, missed, peak_acceleration(start, states)[..., -1])
 
 

@@ -55,13 +55,14 @@ class Surroundings:
         return Surroundings(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
-def violations(states: Tensor, around: Surroundings, clearance: float) -> Tensor:
-    """Metres [B, C, T] by which trajectories [B, C, T, 4] of the egos miss `clearance` [m] to others and the road.
+def violations(states: Tensor, around: Surroundings, clearance: float, shoulder: float) -> Tensor:
+    """Metres [B, C, T] by which trajectories [B, C, T, 4] of the egos miss `clearance` [m] to others, and the road less
+    a `shoulder` [m] inside its border.
 
     0 at a step that keeps both, and after the episode. As in DrivingEnv contact counts at every step, with everybody,
     the road from the first time on it, and nothing once the map has ended.
     """
-    missed = (contact_depth(states, around, clearance) + beyond_road(states, around)) * around.counts[:, None]
+    missed = (contact_depth(states, around, clearance) + beyond_road(states, around, shoulder)) * around.counts[:, None]
     return missed.masked_fill(gone_before(states, missed, around)[..., None], 0.0)
 
 
@@ -84,10 +85,10 @@ def _contact_depth(states: Tensor, around: Surroundings, clearance: float) -> Te
     return depth.index_add(0, place, (clearance - apart).clamp(min=0)).view(states.shape[:-1])
 
 
-def beyond_road(states: Tensor, around: Surroundings) -> Tensor:
-    """Metres [B, C, T] beyond the drivable border, from the first time on the road."""
-    first = off_road(around.start[:, None, :2], around.field, around.origin)
-    beyond = off_road(states[..., :2], around.field, around.origin)
+def beyond_road(states: Tensor, around: Surroundings, shoulder: float) -> Tensor:
+    """Metres [B, C, T] beyond a line `shoulder` m inside the drivable border, from the first time within it."""
+    first = off_road(around.start[:, None, :2], around.field, around.origin) + shoulder
+    beyond = off_road(states[..., :2], around.field, around.origin) + shoulder
     before = torch.cat([first[..., None].expand_as(beyond[..., :1]), beyond[..., :-1]], -1)
     return beyond.clamp(min=0) * (before.cummin(-1).values <= 0)
 
