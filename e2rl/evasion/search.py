@@ -82,7 +82,7 @@ def find_evasions(
     moment: Tensor | None = None,
 ) -> Evasions:
     """Search for every rollout of scenes [B], at least one, with states [B, T+1, N, 4], valid [B, T+1, N] (all agents,
-    the ego in row 0), from step moment [B] (default 0: the start frame) to the last step, within the simulator's bounds.
+    the ego in row 0), from step moment [B] (default 0: the start frame) to the last, within the simulator's bounds.
 
     Evasions hold the T steps from that moment on. A rollout's result does not depend on the batch: all draw the same
     numbers.
