@@ -7,6 +7,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from e2rl.errors import InputError, stop
+from e2rl.evaluation.avoidable import search_effort
 from e2rl.evaluation.build import build_ego, build_methods, build_prior, build_sim, caption, check_protocol, set_up
 from e2rl.evaluation.files import METRICS_FILE, write_metrics
 from e2rl.evaluation.open_loop import open_loop_rows
@@ -33,7 +34,8 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
         rows += meta_rows(scenes, methods, ego, name, sim, config.meta_rollouts, config.batch, config.device)
     write_metrics(folder / METRICS_FILE, rows)
     dropped = "".join(f"; left out: {count} scenes ({reason})" for reason, count in scenes.dropped.items())
-    tables = metric_tables(rows, caption(config, origin) + dropped, CLOSED_LOOP[config.metrics])
+    effort = search_effort(scenes.scenes["logged"].shape[1] - 1)
+    tables = metric_tables(rows, f"{caption(config, origin)}; {effort}{dropped}", CLOSED_LOOP[config.metrics])
     save_tables(folder / "tables.md", tables)
     print("\n\n".join(table.text() for table in tables))
     print(f"\nwritten to {folder}")

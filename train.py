@@ -37,7 +37,8 @@ def evolve(config: DictConfig, folder: Path) -> None:
         logger.log(metrics, number)
         save_checkpoint(folder, run, resolved(config), config.keep_last)
         print(f"round {number + 1}/{config.rounds}: eta {metrics['curriculum/eta']:.2f}, adversarial collisions "
-              f"{metrics['synthesizer/contact']:.0%} of {metrics['synthesizer/scenes']:.0f} scenes, "
+              f"{metrics['synthesizer/contact']:.0%} of {metrics['synthesizer/scenes']:.0f} scenes "
+              f"({metrics['synthesizer/left_out']:.0f} left out: no way found to avoid them), "
               f"{metrics['time/synthesize']:.0f} s synthesis, {metrics['time/improve']:.0f} s learning", flush=True)
     logger.close()
     rows = measure("after", run.ego)

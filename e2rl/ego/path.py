@@ -34,7 +34,7 @@ class RoutePath:
         self.residual = torch.zeros_like(state[..., :2])
         self.residual = state[..., :2] - self.at(torch.zeros_like(s)[..., None])[..., 0, :2]
 
-    def _offset(self, ahead: Tensor) -> tuple[Tensor, Tensor]:
+    def offset(self, ahead: Tensor) -> tuple[Tensor, Tensor]:
         """Lateral offset and its slope at `ahead` [..., K] metres on along the route."""
         d, length = self.d[..., None], self.length[..., None]
         slope = torch.tan(self.turned.clamp(-MAX_SLOPE, MAX_SLOPE))[..., None]
@@ -44,7 +44,7 @@ class RoutePath:
     def at(self, ahead: Tensor) -> Tensor:
         """Poses [..., K, 3] at `ahead` [..., K] metres on along the route."""
         xy, heading, curvature = interpolate(self.route, self.s[..., None] + ahead)
-        offset, slope = self._offset(ahead)
+        offset, slope = self.offset(ahead)
         normal = torch.stack([-heading.sin(), heading.cos()], -1)
         fading = torch.exp(-ahead.clamp(min=0) / self.length[..., None])[..., None] * self.residual[..., None, :]
         turn = torch.atan2(slope, (1 - curvature * offset).clamp(min=0.2))
@@ -53,7 +53,7 @@ class RoutePath:
     def ahead(self, distance: Tensor) -> Tensor:
         """Metres along the route [..., K] after driving `distance` [..., K] (growing, from 0) along the path."""
         _, _, curvature = interpolate(self.route, self.s[..., None] + distance)
-        offset, slope = self._offset(distance)
+        offset, slope = self.offset(distance)
         stretch = torch.hypot((1 - curvature * offset).clamp(min=0.2), slope)
         step = distance.diff(dim=-1, prepend=torch.zeros_like(distance[..., :1]))
         return (step / stretch).cumsum(-1)

@@ -1,4 +1,4 @@
-"""Open-loop accuracy of traffic models: plans from the causal start states, the ego's future unknown, against the log."""
+"""Open-loop accuracy of traffic models: plans from causal start states, the ego unknown, against the log."""
 
 import torch
 from tensordict import TensorDictBase

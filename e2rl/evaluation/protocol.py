@@ -7,6 +7,7 @@ import torch
 from tqdm import tqdm
 
 from e2rl.ego.base import Ego
+from e2rl.evaluation.avoidable import add_avoidable
 from e2rl.evaluation.files import (
     METRICS_FILE,
     ROLLOUTS,
@@ -57,6 +58,7 @@ def run_protocol(
                 part = tasks[begin:begin + batch]
                 rollouts = roll_out_part(scenes, part, method, ego, sim, device)
                 scored, samples = score_rollouts(rollouts)
+                add_avoidable(scored, rollouts, scenes.batch([scene for scene, _ in part]), sim)
                 rows += label_rows(scored, source)
                 features += samples
                 if folder is not None:

@@ -14,6 +14,7 @@ from e2rl.learning.evolution import Evolution, Measure, Synthesize
 from e2rl.learning.imitation import imitate, recorded_pairs
 from e2rl.learning.improvement import PlannerImprovement, PolicyImprovement
 from e2rl.learning.logging import RunLogger
+from e2rl.learning.solvability import solvability
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.env import SimSettings
 
@@ -33,7 +34,8 @@ def build_evolution(
         improve = _planner(config, scenes, sim)
     else:
         raise InputError(f"learner.kind={config.learner.kind}: choose policy or planner")
-    return Evolution(curriculum, improve, synthesize, instantiate(config.learner.round), config.seed, measure)
+    solvable = solvability(scenes, sim) if curriculum.settings.solvable_only else None
+    return Evolution(curriculum, improve, synthesize, instantiate(config.learner.round), config.seed, measure, solvable)
 
 
 def build_logger(config: DictConfig, folder: Path) -> RunLogger:

@@ -35,6 +35,7 @@ class CurriculumSettings:
     temperature: float = 0.3
     staleness: float = 0.2
     smoothing: float = 0.3
+    solvable_only: bool = True
 
     def __post_init__(self) -> None:
         if self.schedule not in SCHEDULES:
@@ -121,6 +122,13 @@ class CurriculumScheduler:
         before = self._recent[scenes]
         moved = before + self.settings.smoothing * (mean - before)
         self._recent[scenes] = torch.where(before.isnan(), mean, moved)
+
+    def leave_out(self, scene_index: Tensor) -> None:
+        """Scenes whose adversarial traffic was not driven because nobody could: not known to hold regret, they count as
+        solved until they are driven, or they would come first in every draw."""
+        scene_index = scene_index.cpu()
+        recent, best = self._recent[scene_index], self._best[scene_index]
+        self._recent[scene_index] = torch.where(recent.isnan() & best.isfinite(), best, recent)
 
     def advance(self, collision_rate: float | None = None) -> None:
         """Go to the next round. collision_rate: the ego's in this round's adversarial traffic, deterministic and in

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from e2rl.ego.base import Ego
@@ -12,6 +13,7 @@ from e2rl.learning.curriculum import CurriculumScheduler
 from e2rl.learning.episodes import Episodes
 from e2rl.learning.improvement import PlannerImprovement, PolicyImprovement
 from e2rl.learning.pool import TrafficPool
+from e2rl.learning.solvability import Solvable
 
 NOMINAL = ("prior", "log", "none")
 Synthesize = Callable[[Ego, Tensor, float, int], Mapping[str, Tensor]]
@@ -36,14 +38,15 @@ class Evolution:
     synthesize(ego, scene_index [S], eta, seed) -> {scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N],
     adversaries [S, N] bool, contact [S] bool, and optionally route [S, V]}: closed-loop traffic against that ego and
     whether it was hit. measure(ego, round) -> metrics, called before and after the improvement of each round.
+    solvable(traffic) -> bool [S]: rows that enter D'; all for None.
     """
 
     def __init__(
         self, curriculum: CurriculumScheduler, improve: PolicyImprovement | PlannerImprovement, synthesize: Synthesize,
-        settings: RoundSettings, seed: int = 0, measure: Measure | None = None,
+        settings: RoundSettings, seed: int = 0, measure: Measure | None = None, solvable: Solvable | None = None,
     ) -> None:
         self.curriculum, self.improve, self.synthesize = curriculum, improve, synthesize
-        self.settings, self.seed, self.measure = settings, seed, measure
+        self.settings, self.seed, self.measure, self.solvable = settings, seed, measure, solvable
         self.traffic: dict[str, Tensor] = {}
         self.episodes: Episodes | None = None
 
@@ -62,22 +65,28 @@ class Evolution:
         clock = [time.perf_counter()]
         scenes = self.curriculum.draw(self.settings.scenes)
         state, seed = self.curriculum.summary(), self.seed * 1_000_003 + self.round
-        self.traffic = dict(self.synthesize(self.ego, scenes, self.curriculum.eta, seed))
+        attack = self.synthesize(self.ego, scenes, self.curriculum.eta, seed)
+        kept = torch.ones_like(attack["contact"]) if self.solvable is None else self.solvable(attack)
+        self.traffic = {name: value[kept] for name, value in attack.items()}
         pool = TrafficPool.synthesized(self.traffic, adversarial=True) + self._nominal(scenes, seed)
+        pool = pool if len(pool) else TrafficPool.recorded(scenes)  # without nominal traffic there may be nothing left
         clock.append(time.perf_counter())
         before = self._measured("before")
         clock.append(time.perf_counter())
         learned, self.episodes = self.improve(pool, self.curriculum)
         clock.append(time.perf_counter())
         after = self._measured("after")
-        contact = self.traffic["contact"].float().mean().item()
-        attacked = self.traffic["adversaries"].any(-1).float().mean().item()
+        contact = attack["contact"].float().mean().item()
         self.curriculum.update(self.episodes.scene_index, self.episodes.returns, self.episodes.adversarial)
+        self.curriculum.leave_out(attack["scene_index"][~kept])
         self.curriculum.advance(contact)
         spent = [later - earlier for earlier, later in zip(clock[:-1], clock[1:], strict=True)]
         return {
             **_group("curriculum", state), **_group("train", learned), **before, **after,
-            **_group("synthesizer", {"contact": contact, "attacked": attacked, "scenes": float(len(scenes))}),
+            **_group("synthesizer", {
+                "contact": contact, "attacked": attack["adversaries"].any(-1).float().mean().item(),
+                "scenes": float(len(scenes)), "left_out": float((~kept).sum()),
+            }),
             **_group("time", {"synthesize": spent[0], "improve": spent[2]}),
         }
 

@@ -28,6 +28,7 @@ MAIN = (
     Metric("cfr_adv", "ego hits an adversary", share=True),
     Metric("cfr_vru", "ego hits a pedestrian or cyclist", share=True),
     Metric("cfr_bg", "other simulated vehicles hit each other", share=True),
+    Metric("avoidable", "collisions that some ego actions avoid, found by search", share=True),
     Metric("front", "first contact at the ego's front", share=True),
     Metric("side", "first contact at the ego's side", share=True),
     Metric("rear", "first contact at the ego's rear", share=True),
@@ -46,6 +47,8 @@ MAIN = (
     Metric("seconds_per_rollout", "wall time", unit="s", column="seconds"),
 )
 EXTRA = (
+    Metric("avoidable_1s", "the same, acting only 1 s before contact", share=True),
+    Metric("evasion_accel", "peak acceleration of the mildest evasion found", unit="m/s²"),
     Metric("front_any", "ego's front in contact at first contact", share=True),
     Metric("side_any", "ego's side in contact at first contact", share=True),
     Metric("rear_any", "ego's rear in contact at first contact", share=True),
@@ -83,6 +86,8 @@ META = (
 OPEN_LOOP_STAGE, META_STAGE = "open loop", "meta-metric"
 STAGES = {OPEN_LOOP_STAGE: OPEN_LOOP, META_STAGE: META}  # parts of a run with metrics of their own
 IDENTITY = ("scene_id", "location", "seed", "eta")  # of a row, before its metrics
+SEARCH = ("evasion_tried", "evasion_seconds")  # what the search for evasions took
+EVASION = ("avoidable", "avoidable_1s", "evasion_accel", *SEARCH)  # NaN until evaluation.avoidable has searched
 EVENT = (
     "contact_time",
     "contact_type",
@@ -95,4 +100,5 @@ EVENT = (
     "aor_left_out",
     "start_overlap_ego",
     "start_overlap_bg",
+    *SEARCH,
 )  # of a row, beside the metrics

@@ -48,7 +48,8 @@ def bin_index(values: Tensor, feature: Feature) -> Tensor:
 
 def bin_counts(index: Tensor, known: Tensor, bins: int) -> Tensor:
     """Number [M, bins] of known [M, T] values in each bin index [M, T]."""
-    return torch.zeros(len(index), bins, dtype=torch.float64, device=index.device).scatter_add_(1, index, known.double())
+    empty = torch.zeros(len(index), bins, dtype=torch.float64, device=index.device)
+    return empty.scatter_add(1, index, known.double())
 
 
 def log_probability(counts: Tensor, index: Tensor) -> Tensor:

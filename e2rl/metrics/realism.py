@@ -108,7 +108,7 @@ def realism(features: list[dict[str, Tensor]], cluster: Tensor, draws: Tensor) -
 
 
 def split_half(features: list[dict[str, Tensor]], cluster: Tensor, halves: Tensor) -> Tensor:
-    """`real` [S] of one half of the logs against the other: the ceiling that sampling noise and the scenes' variety set.
+    """`real` [S] of one half of the logs against the other: the ceiling that sampling and the scenes' variety set.
 
     halves [S, C] bool: which clusters of rollouts (cluster [R]) are in the first half of each split; NaN where a half
     is empty.
@@ -121,7 +121,7 @@ def split_half(features: list[dict[str, Tensor]], cluster: Tensor, halves: Tenso
         values, order = log.sort()
         first = halves[:, owner[order]].to(log)
         share = [side.cumsum(1) / side.sum(1, keepdim=True) for side in (first, 1 - first)]
-        parts.append(((share[0] - share[1]).abs()[:, :-1] @ values.diff()))
+        parts.append((share[0] - share[1]).abs()[:, :-1] @ values.diff())
     return 1 - torch.stack(parts).clamp(max=1).mean(0)
 
 

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from e2rl.metrics.catalogue import EVASION
 from e2rl.metrics.contact import (
     KINDS,
     EgoContact,
@@ -82,6 +83,7 @@ def score_batch(batch: dict[str, Tensor], dt: float) -> tuple[dict[str, Tensor],
     once, owner = torch.ones(1, 1, dtype=states.dtype), torch.zeros(1, dtype=torch.int64)
     single = [realism([sample], owner, once) for sample in features]
     columns |= {name: torch.cat([values[name] for values in single]) for name in REALISM}
+    columns |= {name: torch.full_like(columns["cfr"], torch.nan) for name in EVASION}
     return columns | transport_columns(batch, states), features
 
 

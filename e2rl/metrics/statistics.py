@@ -16,7 +16,7 @@ from e2rl.metrics.realism import realism
 DRAWS = 1000
 REALISM_DRAWS = 400  # each costs a pass over all samples
 LEVELS = (0.025, 0.975)
-PER_COLLISION = frozenset({"rir", "at_fault", "relvel"})
+PER_COLLISION = frozenset({"avoidable", "avoidable_1s", "evasion_accel", "rir", "at_fault", "relvel"})
 Row = dict[str, object]
 Features = dict[str, Tensor]
 

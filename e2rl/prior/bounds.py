@@ -6,12 +6,12 @@ on its acceleration: the braking that just avoids it. A cap never pushes a vehic
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
-from e2rl.prior.lane_relative import LaneState
+from e2rl.prior.lane_relative import ACCEL_SCALE, LaneState
 from e2rl.scene.recording import DT
 from e2rl.sim.geometry import overlap
 
@@ -127,6 +127,14 @@ def _curve(settings: BoundSettings, motion: LaneState, state: LaneState, steps: 
     way = (motion.s[..., steps] - state.s[..., None]).clamp(min=1.0)
     need = ((state.v[..., None] ** 2 - allowed) / (2 * way)).clamp(min=0)
     return torch.where(v**2 > allowed, need, -FREE).amax(-1)
+
+
+def under(cap: Tensor | None, x0: Tensor, state: LaneState, onset: float) -> tuple[Tensor, LaneState]:
+    """x0 [B, V, SIZE] and state [B, V] with their next and (by at most `onset`) present acceleration under cap [B, V]."""
+    if cap is None:
+        return x0, state
+    present = torch.minimum(state.a, torch.maximum(cap, state.a - onset))
+    return torch.cat([torch.minimum(x0[..., :1], cap[..., None] / ACCEL_SCALE), x0[..., 1:]], -1), replace(state, a=present)
 
 
 def select(rows: Tensor, one: LaneState, other: LaneState) -> LaneState:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from e2rl.errors import InputError
 from e2rl.prior import free_space, lane_relative
-from e2rl.prior.bounds import BoundSettings, Surroundings, bounded, select
+from e2rl.prior.bounds import BoundSettings, Surroundings, bounded, select, under
 from e2rl.prior.denoiser import Denoiser, DenoiserSettings, Encoding
 from e2rl.prior.features import edge_features, node_features
 from e2rl.prior.lane_relative import HORIZON, LaneState, locate
@@ -135,11 +135,7 @@ class Prior(nn.Module):
     def decode(self, x0: Tensor, context: Context, cap: Tensor | None = None, steps: slice = slice(None)) -> LaneState:
         """Planned motion, fields [B, V, HORIZON] (or those `steps` of it), of x0; cap [B, V]: of the acceleration in
         the executed part."""
-        state = context.state
-        if cap is not None:
-            x0 = torch.cat([torch.minimum(x0[..., :1], cap[..., None]), x0[..., 1:]], -1)
-            onset = torch.minimum(state.a, torch.maximum(cap, state.a - self.bounds.onset))
-            state = LaneState(**{**vars(state), "a": onset})
+        x0, state = under(cap, x0, context.state, self.bounds.onset)
         lane = lane_relative.decode(x0, state, context.routed.points, steps)
         if context.all_on_lane:
             return lane

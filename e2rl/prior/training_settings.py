@@ -16,8 +16,9 @@ class TrainingSettings:
     """Start frames of the scenes cut from each log; optimisation steps; windows a step, over all processes together,
     and noise levels a window; peak learning rate; weight decay; EMA decay; weight of the trajectory term; share of
     other vehicles hidden; feature noise [standard deviations]; noise on the current acceleration [m/s^2]; share of
-    windows that are mirrored; share of windows whose start states are estimates of a causal observer; bf16 autocast; torch.compile; route-choice steps; steps between validations; validations
-    between closed loops (0: none) and their scenes; seed.
+    windows that are mirrored, and of those whose start states are a causal observer's estimates; bf16 autocast;
+    torch.compile; route-choice steps; steps between validations; validations between closed loops (0: none) and their
+    scenes; seed.
 
     Raises InputError for a value of the wrong kind or out of range."""
 

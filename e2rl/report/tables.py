@@ -12,7 +12,6 @@ from pathlib import Path
 from e2rl.evaluation.files import replace
 from e2rl.metrics.catalogue import MAIN, META_STAGE, METRICS, OPEN_LOOP_STAGE, STAGES, Metric
 
-
 RESTS_ON = {
     OPEN_LOOP_STAGE: "(n) vehicles: others than the ego, faster than 0.5 m/s in the log at the start, recorded throughout "
     "the horizon; causal start states, a route drawn per sample; samples without acceleration bounds.",

@@ -113,3 +113,12 @@ def test_wrong_settings_are_refused():
     for settings in ({"schedule": "cosine"}, {"target_low": 0.6}, {"share": 1.5}, {"temperature": 0.0}):
         with pytest.raises(InputError, match="curriculum"):
             CurriculumSettings(**settings)
+
+
+def test_scenes_left_out_are_not_drawn_first():
+    curriculum = scheduler(num_scenes=4, staleness=0.0)
+    episodes(curriculum, [0, 1, 2, 3], [5.0] * 4, adversarial=False)
+    episodes(curriculum, [0], [1.0])
+    curriculum.leave_out(torch.tensor([0, 1]))
+    assert curriculum.regret().nan_to_num(-1).tolist() == [4.0, 0.0, -1.0, -1.0]
+    assert curriculum.priority()[1] < curriculum.priority().min() + 1e-9, "the ones not yet driven come first"

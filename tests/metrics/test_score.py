@@ -148,11 +148,12 @@ def test_moving_the_world_changes_no_metric():
 
 def test_every_metric_of_the_design_is_summarised_in_its_order():
     rows, features = score_rollouts(random_rollouts(4))
-    assert list(summarise(rows, features, draws=20, realism_draws=5))[:20] == [
+    assert list(summarise(rows, features, draws=20, realism_draws=5))[:21] == [
         "cfr",
         "cfr_adv",
         "cfr_vru",
         "cfr_bg",
+        "avoidable",
         "front",
         "side",
         "rear",

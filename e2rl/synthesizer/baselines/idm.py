@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.ego.idm import idm_acceleration
-from e2rl.prior.bounds import BoundSettings, acceleration_caps
+from e2rl.prior.bounds import BoundSettings, Surroundings, bounded
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, decode, locate
 from e2rl.prior.leaders import FREE, leaders
 from e2rl.prior.prior import STANDING, Plan
@@ -55,14 +55,12 @@ class IDM(Baseline):
         vehicles = routed.route.shape[1]
         present = world.valid[:, :vehicles]
         state = _with_ego(episode.state, world, routed)
-        cap = acceleration_caps(self.bounds, routed, state, world.states, world.valid, torch.zeros_like(present))
-        wanted = torch.minimum(self._wanted(routed, state, world), cap)
-        onset = torch.minimum(state.a, torch.maximum(cap, state.a - self.bounds.onset))
-        x = torch.zeros(*state.v.shape, SIZE, device=state.v.device)
-        x[..., :KNOTS] = wanted[..., None] / ACCEL_SCALE
-        motion = decode(x, replace(state, a=onset), routed.points)
+        x = (self._wanted(routed, state, world) / ACCEL_SCALE)[..., None].expand(*state.v.shape, KNOTS)
+        x = torch.cat([x, x.new_zeros(*state.v.shape, SIZE - KNOTS)], -1)
         frozen = routed.parked | (world.scene["start"][:, :vehicles, 3] < STANDING) | ~present
-        motion = _held(motion, state, frozen)
+        around = Surroundings(world.states, routed.size, world.valid, torch.zeros_like(present))
+        motion = bounded(self.bounds, lambda cap: _held(decode(*under(cap, x, state, self.bounds.onset), routed.points),
+                                                        state, frozen), state, around)
         gone = routed.open[..., None] & (motion.s >= routed.length[..., None]) & routed.has_lane[..., None]
         return Plan(motion, present[..., None] & ~(gone.cumsum(-1) > 0))
 

@@ -1,0 +1,43 @@
+"""Which of the collisions found an ego could have avoided: columns of the rollouts' rows (design.md section 5)."""
+
+import time
+
+import torch
+from tensordict import TensorDictBase
+
+from e2rl.evasion.search import SearchSettings, find_evasions
+from e2rl.scene.recording import DT
+from e2rl.sim.env import SimSettings
+
+LATE = 1.0  # s before contact: what acting only then still avoids is told apart
+
+
+def add_avoidable(rows: list[dict], rollouts: dict, scene: TensorDictBase, sim: SimSettings) -> None:
+    """Add to the rows (of score_rollouts, in place) of rollouts whose ego hit a vehicle: avoidable and avoidable_1s (0
+    or 1: an evasion was found from the start frame, from LATE seconds before contact), evasion_accel [m/s^2] of the
+    mildest one from the start, evasion_tried (manoeuvres driven) and evasion_seconds. Others get nothing: NaN.
+
+    rollouts: the rollout dict [B] of the rows; scene: their scenes [B].
+    """
+    collided = [index for index, row in enumerate(rows) if row["cfr"] == 1]
+    if not collided:
+        return
+    begin, picked = time.perf_counter(), torch.tensor(collided)
+    given = scene[picked], rollouts["states"][picked], rollouts["valid"][picked]
+    contact = torch.tensor([int(rows[index]["contact_step"]) for index in collided])
+    early = find_evasions(*given, sim)
+    late = find_evasions(*given, sim, moment=(contact - round(LATE / DT)).clamp(min=0))
+    found = early.found | late.found  # who can avoid it late can do so early: by driving as recorded until then
+    peak = torch.where(early.found, early.peak, torch.where(late.found, late.peak, torch.nan))
+    spent = (time.perf_counter() - begin) / len(collided)
+    for place, index in enumerate(collided):
+        rows[index] |= {
+            "avoidable": float(found[place]), "avoidable_1s": float(late.found[place]),
+            "evasion_accel": peak[place].item(), "evasion_tried": int(early.tried[place] + late.tried[place]),
+            "evasion_seconds": spent,
+        }
+
+
+def search_effort(steps: int) -> str:
+    """What `avoidable` rests on, for captions: rollouts of `steps` steps."""
+    return f"avoidable: not found after {SearchSettings().effort(steps)} counts as no"
