@@ -111,7 +111,7 @@ def contact_columns(
 
 
 def touched_columns(batch: dict[str, Tensor], touched: Tensor, traffic: Tensor) -> dict[str, Tensor]:
-    """Share of the traffic's moving vehicles (in the rollout or in its log) that another one touches; touched [B, N]."""
+    """Share of the traffic's moving vehicles (in the rollout or its log) that another one touches; touched [B, N]."""
     fastest = [(batch[track][..., 3] * batch[known]).amax(1)
                for track, known in (("states", "valid"), ("logged", "logged_valid"))]
     moving = traffic & (torch.maximum(*fastest) > MOVING)

@@ -55,8 +55,8 @@ def interval(samples: Tensor, known_clusters: int) -> dict[str, float]:
 
 
 def metric_table(rows: Sequence[Row], metrics: Sequence[Metric]) -> tuple[Tensor, Tensor]:
-    """Weighted values and weights [R, M] float64 of the rows' metrics; NaN where a row lacks one. A metric `per` another
-    column is not weighted: it is summed and divided by the sum of that column."""
+    """Weighted values and weights [R, M] float64 of the rows' metrics; NaN where a row lacks one. A metric `per`
+    another column is not weighted: it is summed and divided by the sum of that column."""
 
     def table(names: list[str], absent: float) -> Tensor:
         cells = [[float(row.get(name, torch.nan)) if name else absent for name in names] for row in rows]

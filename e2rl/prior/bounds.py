@@ -130,11 +130,12 @@ def _curve(settings: BoundSettings, motion: LaneState, state: LaneState, steps: 
 
 
 def under(cap: Tensor | None, x0: Tensor, state: LaneState, onset: float) -> tuple[Tensor, LaneState]:
-    """x0 [B, V, SIZE] and state [B, V] with their next and (by at most `onset`) present acceleration under cap [B, V]."""
+    """x0 [B, V, SIZE] and state [B, V], their next and (by at most `onset`) present acceleration under cap [B, V]."""
     if cap is None:
         return x0, state
     present = torch.minimum(state.a, torch.maximum(cap, state.a - onset))
-    return torch.cat([torch.minimum(x0[..., :1], cap[..., None] / ACCEL_SCALE), x0[..., 1:]], -1), replace(state, a=present)
+    first = torch.minimum(x0[..., :1], cap[..., None] / ACCEL_SCALE)
+    return torch.cat([first, x0[..., 1:]], -1), replace(state, a=present)
 
 
 def select(rows: Tensor, one: LaneState, other: LaneState) -> LaneState:

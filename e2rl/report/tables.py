@@ -13,10 +13,10 @@ from e2rl.evaluation.files import replace
 from e2rl.metrics.catalogue import MAIN, META_STAGE, METRICS, OPEN_LOOP_STAGE, STAGES, Metric
 
 RESTS_ON = {
-    OPEN_LOOP_STAGE: "(n) vehicles: others than the ego, faster than 0.5 m/s in the log at the start, recorded throughout "
-    "the horizon; causal start states, a route drawn per sample; samples without acceleration bounds.",
-    META_STAGE: "(n) scenes. Likelihood of the log under each vehicle's histogram over all rollouts and steps; vehicles "
-    "recorded throughout. A deterministic method's rollout stands for all.",
+    OPEN_LOOP_STAGE: "(n) vehicles: others than the ego, faster than 0.5 m/s in the log at the start, recorded "
+    "throughout the horizon; causal start states, a route drawn per sample; samples without acceleration bounds.",
+    META_STAGE: "(n) scenes. Likelihood of the log under each vehicle's histogram over all rollouts and steps; "
+    "vehicles recorded throughout. A deterministic method's rollout stands for all.",
 }
 
 
@@ -76,7 +76,8 @@ def means_table(group: Sequence[dict], settings: str, metrics: Sequence[Metric])
 
     names = column_names(group)
     rests_on = RESTS_ON.get(group[0].get("stage"), "(n) rollouts where fewer count.")
-    caption = f"{place(group[0])}. {counts(group, names)} Mean [95% interval, bootstrap by location or scene]; {rests_on}"
+    caption = f"{place(group[0])}. {counts(group, names)} "
+    caption += f"Mean [95% interval, bootstrap by location or scene]; {rests_on}"
     unknown = [metric.name for metric in metrics if not known(metric)]
     caption += f" {settings.rstrip('.')}." if settings else ""
     caption += f" Not computable here: {', '.join(unknown)}." if unknown else ""

@@ -23,7 +23,7 @@ class Baseline(ABC):
     predicts = True  # False: it looks the future up, so there is no open-loop error to report
 
     def routes(self, scene: TensorDictBase) -> Tensor:
-        """Route candidates [B, V] that the vehicles are said to follow: the recorded ones, the first where none fits."""
+        """Route candidates [B, V] that the vehicles are said to follow: the recorded ones, else the first."""
         return scene["route_log"].clamp(min=0)
 
     @torch.no_grad()

@@ -1,4 +1,4 @@
-"""IDM lane-following under the prior's own acceleration bounds, standing cars frozen: the traffic that a prior must beat.
+"""IDM lane-following under the prior's own acceleration bounds, standing cars frozen: the traffic a prior must beat.
 
 Every vehicle keeps the route candidate nearest to it, returns to its middle, and accelerates by the Intelligent Driver
 Model (Treiber et al. 2000) behind the nearest agent or red light ahead. Bounds, decoder and the end of a vehicle at the
@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.ego.idm import idm_acceleration
-from e2rl.prior.bounds import BoundSettings, Surroundings, bounded
+from e2rl.prior.bounds import BoundSettings, Surroundings, bounded, under
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, decode, locate
 from e2rl.prior.leaders import FREE, leaders
 from e2rl.prior.prior import STANDING, Plan
@@ -96,7 +96,8 @@ def _red_light(routed: RoutedScene, state: LaneState, step: Tensor, brake: float
 def _with_ego(state: LaneState, world: World, routed: RoutedScene) -> LaneState:
     """The lane states with the ego where it really is."""
     ego = slice(0, 1)
-    now = locate(world.states[:, ego], world.accel[:, ego], torch.zeros_like(world.accel[:, ego]), routed.points[:, ego])
+    accel = world.accel[:, ego]
+    now = locate(world.states[:, ego], accel, torch.zeros_like(accel), routed.points[:, ego])
     return LaneState(**{name: torch.cat([getattr(now, name), value[:, 1:]], 1) for name, value in vars(state).items()})
 
 
