@@ -62,7 +62,7 @@ def sample_plan(synthesizer: Synthesizer | Baseline, scene: TensorDictBase, seed
     context = prior.encode(episode.routed, episode.state, scene["start"], scene["valid"], zero, None)
     shape = (prior.sampler.steps, episode.routed.route.shape[1], SIZE)
     noise = noise_of(seed, zero + 1, shape).transpose(0, 1)
-    return prior.decode(prior.sample(context, noise).x0, context, capped=False).states()
+    return prior.decode(prior.sample(context, noise).x0, context).states()
 
 
 def _displacements(scene: TensorDictBase, plans: Tensor) -> dict[str, Tensor]:
