@@ -2,6 +2,7 @@
 
 import hashlib
 import time
+from copy import deepcopy
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -81,7 +82,7 @@ def _closed_loop(scenes: SceneSet, settings: TrainingSettings, device: str) -> C
     some = _chosen(first, [k * len(first) // count for k in range(count)])
 
     def closed_loop(prior: Prior) -> dict[str, float]:
-        metrics = _nominal(prior, some, device, None)[0]["metrics"]
+        metrics = _nominal(deepcopy(prior), some, device, None)[0]["metrics"]  # a synthesizer freezes its prior
         return {name: round(metrics[name]["mean"], 4) for name in FIGURES}
 
     return closed_loop

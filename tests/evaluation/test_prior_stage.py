@@ -40,8 +40,10 @@ def test_each_held_out_log_is_driven_from_its_earliest_start():
     assert first.scene_id == ["a@10", "c@30"] and first.location == ["p", "p"] and len(first.scenes) == 2
 
 
-def test_the_closed_loop_gives_the_same_figures_each_time_and_others_for_other_weights():
+def test_the_closed_loop_is_repeatable_follows_the_weights_and_leaves_them_in_training():
     scenes = logs([f"{k}@10" for k in range(4)], ["p", "p", "p", "q"])
     closed_loop = _closed_loop(scenes, TrainingSettings(closed_loop_scenes=2), "cpu")
-    one, again, other = (closed_loop(small_prior(seed)) for seed in (0, 0, 1))
+    priors = [small_prior(seed).requires_grad_(True).train() for seed in (0, 0, 1)]
+    one, again, other = (closed_loop(prior) for prior in priors)
     assert tuple(one) == FIGURES and one == again and one["real"] != other["real"]
+    assert priors[0].training and all(value.requires_grad for value in priors[0].parameters())  # still in training
