@@ -25,12 +25,14 @@ from e2rl.synthesizer.baselines.replay import Replay
 from e2rl.synthesizer.control import ControlSettings
 from e2rl.synthesizer.feasibility import FeasibilitySettings
 from e2rl.synthesizer.potentials import PotentialSettings
+from e2rl.synthesizer.reasoner import ReasonerSettings
 from e2rl.synthesizer.skeleton import SkeletonSettings
 from e2rl.synthesizer.synthesizer import Synthesizer, SynthesizerSettings
 from e2rl.synthesizer.topology import TopologySettings
 
-PARTS = {"topology": TopologySettings, "feasibility": FeasibilitySettings, "skeleton": SkeletonSettings,
-         "anchor": AnchorSettings, "potentials": PotentialSettings, "control": ControlSettings}
+PARTS = {"topology": TopologySettings, "feasibility": FeasibilitySettings, "reasoner": ReasonerSettings,
+         "skeleton": SkeletonSettings, "anchor": AnchorSettings, "potentials": PotentialSettings,
+         "control": ControlSettings}
 BASELINES: dict[str, Callable[[Prior], Baseline]] = {  # under the bounds of the prior that they stand beside
     "replay": lambda prior: Replay(), "constant_velocity": lambda prior: ConstantVelocity(),
     "idm": lambda prior: IDM(prior.bounds)}

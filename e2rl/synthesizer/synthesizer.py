@@ -18,7 +18,7 @@ from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
 from e2rl.synthesizer.anchoring import Anchor, AnchorSettings, propose
 from e2rl.synthesizer.control import ControlSettings, SparseControl
-from e2rl.synthesizer.feasibility import FeasibilitySettings, feasible_vehicles
+from e2rl.synthesizer.feasibility import FeasibilitySettings
 from e2rl.synthesizer.grouping import clone, crop_episode, crop_world, gather_plans, group_scenes, write_episode
 from e2rl.synthesizer.potentials import (
     PotentialContext,
@@ -27,6 +27,7 @@ from e2rl.synthesizer.potentials import (
     feasibility_potential,
     sampled_steps,
 )
+from e2rl.synthesizer.reasoner import ReasonerSettings, build_reasoner
 from e2rl.synthesizer.skeleton import Skeleton, SkeletonSettings, build_skeleton, chain_depth
 from e2rl.synthesizer.topology import TopologySettings, topological_candidates
 
@@ -44,6 +45,7 @@ class SynthesizerSettings:
 
     topology: TopologySettings = TopologySettings()
     feasibility: FeasibilitySettings = FeasibilitySettings()
+    reasoner: ReasonerSettings = ReasonerSettings()
     skeleton: SkeletonSettings = SkeletonSettings()
     anchor: AnchorSettings = AnchorSettings()
     potentials: PotentialSettings = PotentialSettings()
@@ -115,6 +117,7 @@ class Synthesizer:
         self.prior = prior.requires_grad_(False).eval()
         self.settings = settings or SynthesizerSettings()
         self.statistics: dict[str, float] = {}
+        self.feasible_vehicles = build_reasoner(self.settings.reasoner, self.statistics)
 
     def begin(self, scene: TensorDictBase, seed: Tensor, eta: Tensor) -> Episode:
         """Episodes of scenes [B] with routes drawn from the prior; seed [B] int64, eta [B]."""
@@ -219,7 +222,7 @@ class Synthesizer:
         reference = torch.cat([ego_plan[:, None], nominal.states()[:, 1:]], 1).transpose(1, 2)
         valid = world.valid[:, None, :vehicles] & nominal.on_map.transpose(1, 2)
         found = topological_candidates(reference, valid, scene["size"][:, :vehicles], self.settings.topology)
-        feasible = feasible_vehicles(scene, world, self.settings.feasibility).mask
+        feasible = self.feasible_vehicles(scene, world, self.settings.feasibility).mask
         steps = round(self.settings.skeleton.step / DT)
         expected = reference[:, steps - 1::steps].transpose(1, 2)
         skeleton = build_skeleton(scene, world, found.candidates & feasible, feasible, self.settings.skeleton, expected)

@@ -7,6 +7,7 @@ from omegaconf import OmegaConf
 from e2rl.synthesizer.anchoring import AnchorSettings
 from e2rl.synthesizer.feasibility import FeasibilitySettings
 from e2rl.synthesizer.potentials import PotentialSettings
+from e2rl.synthesizer.reasoner import ReasonerSettings
 from e2rl.synthesizer.skeleton import SkeletonSettings
 from e2rl.synthesizer.topology import TopologySettings
 
@@ -14,7 +15,8 @@ CONFIG = Path(__file__).parents[2] / "conf" / "synthesizer" / "e2.yaml"
 
 
 @pytest.mark.parametrize("key, settings", [
-    ("topology", TopologySettings), ("feasibility", FeasibilitySettings), ("skeleton", SkeletonSettings),
+    ("topology", TopologySettings), ("feasibility", FeasibilitySettings),
+    ("reasoner", ReasonerSettings), ("skeleton", SkeletonSettings),
     ("anchor", AnchorSettings), ("potentials", PotentialSettings)])
 def test_the_config_lists_every_setting(key, settings):
     config = OmegaConf.load(CONFIG)[key]
