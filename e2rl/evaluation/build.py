@@ -1,8 +1,6 @@
 """From a run's configuration to its objects: prior, synthesizers and methods, ego, simulator settings."""
 
-import copy
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 from hydra.errors import InstantiationException
@@ -37,6 +35,8 @@ BASELINES: dict[str, Callable[[Prior], Baseline]] = {  # under the bounds of the
     "replay": lambda prior: Replay(), "constant_velocity": lambda prior: ConstantVelocity(),
     "idm": lambda prior: IDM(prior.bounds)}
 
+VARIED = ("checkpoint", "sampler", "bounds")  # of `prior` in the variants of a table
+
 
 def build_prior(config: DictConfig, device: str = "cpu") -> tuple[Prior, dict]:
     """The frozen prior of `config.prior` and the origin in its checkpoint."""
@@ -56,7 +56,7 @@ def build_synthesizer(config: DictConfig, prior: Prior) -> Synthesizer | Baselin
 
 
 def build_methods(config: DictConfig, prior: Prior) -> list[Method]:
-    """The rows of `config.methods`, then the uncontrolled prior at each of `config.temperatures`."""
+    """The rows of `config.methods`, then the uncontrolled prior under each of `config.variants`."""
     synthesizer = build_synthesizer(config, prior)
     nominal = synthesizer if isinstance(synthesizer, Synthesizer) else Synthesizer(prior)
     methods = []
@@ -67,10 +67,9 @@ def build_methods(config: DictConfig, prior: Prior) -> list[Method]:
             methods.append(Method(name, nominal, 0.0))
         else:
             methods.append(Method(name, synthesizer, config.eta))
-    for value in dict.fromkeys(config.temperatures):
-        heated = copy.copy(prior)  # the same weights
-        heated.sampler = replace(prior.sampler, temperature=value, route_temperature=value)
-        methods.append(Method(f"nominal T={value:g}", Synthesizer(heated), 0.0))
+    for name, changes in config.variants.items():
+        changed = OmegaConf.merge(config, {"prior": changes})
+        methods.append(Method(name, Synthesizer(build_prior(changed, config.device)[0]), 0.0))
     return methods
 
 
@@ -119,10 +118,11 @@ def check_protocol(config: DictConfig) -> None:
         if name not in known:
             raise InputError(f"methods={list(config.methods)}: {name} is none of {', '.join(known)}; choose another "
                              "with synthesizer=")
-    if not (config.methods or config.temperatures) or not config.seeds:
+    if not (config.methods or config.variants) or not config.seeds:
         raise InputError(f"methods={list(config.methods)}, seeds={list(config.seeds)}: name at least one of each")
-    if not all(isinstance(value, int | float) and 0 < value < float("inf") for value in config.temperatures):
-        raise InputError(f"temperatures={list(config.temperatures)}: expected numbers above 0")
+    for name, changes in config.variants.items():
+        if name in known or not isinstance(changes, DictConfig) or not set(changes) <= {*VARIED}:
+            raise InputError(f"variants.{name}={changes}: a new name, with changes to {', '.join(VARIED)} of `prior`")
     for key in ("open_loop_samples", "meta_rollouts"):
         if not isinstance(config[key], int) or config[key] < 0:
             raise InputError(f"{key}={config[key]}: expected a whole number of at least 0")
