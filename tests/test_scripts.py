@@ -184,11 +184,12 @@ def test_skipped_scenes_are_counted_in_the_table(world, tmp_path, monkeypatch, c
     assert not list(tmp_path.rglob("*.npz"))
 
 
-def test_the_prior_s_experiment_has_rows_of_all_stages(tmp_path, monkeypatch, capsys):
-    """Open loop, closed loop and meta-metric of three procedural scenes with the bundled prior."""
+def test_the_prior_s_experiment_has_rows_of_all_stages(world, tmp_path, monkeypatch, capsys):
+    """Open loop, closed loop and meta-metric of three procedural scenes with an untrained prior."""
     overrides = ["experiment=prior", "data=procedural", "data.count=3", f"data.cache={tmp_path / 'cache'}",
                  "data.workers=1", "data.build.vehicles=8", "data.build.field_cells=128", "seeds=[0]",
-                 "open_loop_samples=2", "meta_rollouts=2", "prior.sampler.steps=2", f"hydra.run.dir={tmp_path / 'run'}"]
+                 "open_loop_samples=2", "meta_rollouts=2", "prior.sampler.steps=2", f"hydra.run.dir={tmp_path / 'run'}",
+                 f"prior.checkpoint={world / 'prior.safetensors'}"]
     status, said = call("evaluate.py", overrides, monkeypatch, capsys)
     assert status == 0, said
     rows = read_metrics(tmp_path / "run" / "metrics.json")
