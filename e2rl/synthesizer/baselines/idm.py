@@ -55,7 +55,8 @@ class IDM(Baseline):
         vehicles = routed.route.shape[1]
         present = world.valid[:, :vehicles]
         state = _with_ego(episode.state, world, routed)
-        x = (self._wanted(routed, state, world) / ACCEL_SCALE)[..., None].expand(*state.v.shape, KNOTS)
+        wanted = self._wanted(routed, state, world).clamp(min=self.bounds.floor)
+        x = (wanted / ACCEL_SCALE)[..., None].expand(*state.v.shape, KNOTS)
         x = torch.cat([x, x.new_zeros(*state.v.shape, SIZE - KNOTS)], -1)
         frozen = routed.parked | (world.scene["start"][:, :vehicles, 3] < STANDING) | ~present
         around = Surroundings(world.states, routed.size, world.valid, torch.zeros_like(present))

@@ -7,7 +7,7 @@ import torch
 
 from e2rl.prior.bounds import FREE, BoundSettings, Surroundings, acceleration_caps
 from e2rl.prior.lane_relative import HORIZON
-from e2rl.scene.recording import LIGHT_RED, LIGHT_YELLOW
+from e2rl.scene.recording import DT, LIGHT_RED, LIGHT_YELLOW
 from e2rl.synthesizer.baselines.idm import IDM, IDMSettings
 from tests.prior.small import curved_scenes
 from tests.synthesizer.crossing import make_world
@@ -122,6 +122,14 @@ def test_a_vehicle_is_gone_once_its_route_leaves_the_map():
     x, there = rollouts["states"][0, :, 1:3, 0], rollouts["valid"][0, :, 1:3]
     assert there[:, 1].all() and not there[-1, 0] and (x[:, 0][there[:, 0]] <= 80.5).all()
     assert (there[1:, 0] <= there[:-1, 0]).all(), "nobody comes back"
+
+
+@pytest.mark.parametrize("floor", [-7.0, -4.0])
+def test_it_never_brakes_harder_than_the_bounds_do(floor):
+    scene_set = make_scenes(1, vehicles=[AWAY, (0, 0, 12), (9, 0, 2)], num_vrus=0, steps=40, max_vehicles=ROWS,
+                            max_agents=ROWS + 2, road=(-200.0, 400.0))
+    speed = drive(scene_set, IDM(BoundSettings(floor=floor)), 0.0)["states"][0, :, 1, 3]
+    assert (speed.diff() / DT).min().item() == pytest.approx(floor, abs=1e-2)
 
 
 CROSSING = [(-150, 40, 0, 10), (0, 0, 0, 10), (22, -22, math.pi / 2, 10)]  # two that reach (22, 0) together
