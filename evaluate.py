@@ -29,7 +29,8 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     rows = []
     if config.open_loop_samples:
         rows += open_loop_rows(scenes, methods, config.open_loop_samples, config.device)
-    rows += run_protocol(scenes, methods, ego, name, list(config.seeds), sim, folder, config.batch, config.device)
+    rows += run_protocol(scenes, methods, ego, name, list(config.seeds), sim, folder, config.batch, config.device,
+                         config.save_rollouts)
     if config.meta_rollouts:
         rows += meta_rows(scenes, methods, ego, name, sim, config.meta_rollouts, config.batch, config.device)
     write_metrics(folder / METRICS_FILE, rows)

@@ -43,11 +43,12 @@ def scene_seed(scene: int, seed: int) -> int:
 
 def run_protocol(
     scenes: SceneSet, methods: list[Method], ego: Ego, ego_name: str, seeds: list[int], sim: SimSettings,
-    folder: Path | None = None, batch: int = 64, device: str = "cpu", **fields,
+    folder: Path | None = None, batch: int = 64, device: str = "cpu", save_rollouts: bool = True, **fields,
 ) -> list[dict]:
     """Roll out every method on every (scene, seed), score, and return the rows of metrics.json.
 
-    folder: where rollouts/, rollouts.csv and metrics.json are written (None: nowhere). fields join each row.
+    folder: where rollouts/ (if save_rollouts), rollouts.csv and metrics.json are written (None: nowhere). fields join
+    each row.
     """
     tasks = [(scene, seed) for seed in seeds for scene in range(len(scenes))]
     rows, features = [], []
@@ -61,7 +62,7 @@ def run_protocol(
                 add_avoidable(scored, rollouts, scenes.batch([scene for scene, _ in part]), sim)
                 rows += label_rows(scored, source)
                 features += samples
-                if folder is not None:
+                if folder is not None and save_rollouts:
                     write_rollouts(Path(folder) / ROLLOUTS, rollouts, source)
                 bar.set_postfix(method=method.name, eta=method.eta)
                 bar.update(len(part))

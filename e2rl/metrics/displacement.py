@@ -39,7 +39,8 @@ def scene_displacements(
     plans [B, S, V, H, 4]: samples of steps 1..H; reference [B, V, H, 4]: constant velocity; logged [B, T+1, V, 4].
     Keys, with the horizon in s appended: min_ade_, mean_ade_, joint_ade_ (the best joint sample), cv_ade_, vehicles_.
     """
-    future = logged[:, 1:plans.shape[3] + 1].transpose(1, 2)
+    steps = torch.arange(1, plans.shape[3] + 1, device=logged.device)
+    future = logged[:, steps.clamp(max=logged.shape[1] - 1)].transpose(1, 2)  # nobody counts after the log's end
     planned, straight = displacement(plans, future), displacement(reference[:, None], future)[:, 0]
     columns = {}
     for horizon in horizons:

@@ -121,7 +121,8 @@ def split_half(features: list[dict[str, Tensor]], cluster: Tensor, halves: Tenso
         values, order = log.sort()
         first = halves[:, owner[order]].to(log)
         share = [side.cumsum(1) / side.sum(1, keepdim=True) for side in (first, 1 - first)]
-        parts.append((share[0] - share[1]).abs()[:, :-1] @ values.diff())
+        known = (first > 0).any(1) & (first < 1).any(1)
+        parts.append(((share[0] - share[1]).abs()[:, :-1] @ values.diff()).where(known, torch.nan))
     return 1 - torch.stack(parts).clamp(max=1).mean(0)
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.stats import wasserstein_distance
 
-from e2rl.metrics.realism import CLIP, FEATURES, motion_features, realism, wasserstein
+from e2rl.metrics.realism import CLIP, FEATURES, motion_features, realism, split_half, wasserstein
 from e2rl.metrics.score import score_rollouts
 from tests.metrics.random_rollouts import random_rollouts
 
@@ -94,3 +94,34 @@ def test_a_constant_turn_has_its_lateral_acceleration():
     torch.testing.assert_close(sample["a_lat"][0], (0.2 * middle).double(), atol=1e-6, rtol=0)
     torch.testing.assert_close(sample["a_lon"][0], torch.full((15,), 0.5, dtype=torch.float64))
     assert sample["jerk"].abs().max() < 1e-9
+
+
+def logs(*samples):
+    """Features of rollouts whose logs hold the samples, alike in every feature; the rollouts themselves are far off."""
+    return [{name: torch.stack([sample + 99, sample]) for name in FEATURES} for sample in samples]
+
+
+def test_halves_of_the_same_logs_are_wholly_alike_and_a_shift_is_its_own_distance():
+    sample = torch.randn(50, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    cluster, halves = torch.arange(4), torch.tensor([[True, True, False, False], [True, False, False, True]])
+    assert split_half(logs(*[sample] * 4), cluster, halves).tolist() == pytest.approx([1, 1])
+    shifted = split_half(logs(sample, sample, sample + 0.25, sample + 0.25), cluster, halves)
+    assert shifted.tolist() == pytest.approx([0.75, 1])
+    assert split_half(logs(sample, sample, sample + 7, sample + 7), cluster, halves)[0].item() == 0, "capped"
+
+
+def test_split_halves_are_scipy_s_whichever_half_is_first_and_keep_clusters_together():
+    generator = torch.Generator().manual_seed(4)
+    samples = [torch.randn(20 + 9 * k, generator=generator, dtype=torch.float64) * (1 + 0.1 * k) for k in range(6)]
+    cluster, halves = torch.tensor([0, 0, 1, 1, 2, 2]), torch.tensor([[True, False, False], [False, True, True]])
+    one, other = split_half(logs(*samples), cluster, halves).tolist()
+    distance = wasserstein_distance(torch.cat(samples[:2]).numpy(), torch.cat(samples[2:]).numpy())
+    assert one == pytest.approx(1 - distance) and other == pytest.approx(one)
+
+
+def test_an_empty_half_is_unknown():
+    sample = torch.zeros(3, dtype=torch.float64)
+    halves = torch.tensor([[False, False], [True, True], [True, False]])
+    assert split_half(logs(sample, sample), torch.arange(2), halves).isnan().tolist() == [True, True, False]
+    for short in (sample[:1], sample[:0]):  # nor is there a second half of one value or none
+        assert split_half(logs(short, sample[:0]), torch.arange(2), halves).isnan().all()

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.ego.idm import idm_acceleration
+from e2rl.ego.idm import LINE_GAP, idm_acceleration
 from e2rl.prior.bounds import BoundSettings, Surroundings, bounded, under
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, decode, locate
 from e2rl.prior.leaders import FREE, leaders
@@ -55,7 +55,8 @@ class IDM(Baseline):
         vehicles = routed.route.shape[1]
         present = world.valid[:, :vehicles]
         state = _with_ego(episode.state, world, routed)
-        x = (self._wanted(routed, state, world) / ACCEL_SCALE)[..., None].expand(*state.v.shape, KNOTS)
+        wanted = self._wanted(routed, state, world).clamp(min=self.bounds.floor)
+        x = (wanted / ACCEL_SCALE)[..., None].expand(*state.v.shape, KNOTS)
         x = torch.cat([x, x.new_zeros(*state.v.shape, SIZE - KNOTS)], -1)
         frozen = routed.parked | (world.scene["start"][:, :vehicles, 3] < STANDING) | ~present
         around = Surroundings(world.states, routed.size, world.valid, torch.zeros_like(present))
@@ -73,7 +74,7 @@ class IDM(Baseline):
         at = (state.s / SPACING).round().long().clamp(0, routed.limit.shape[-1] - 1)
         limit = routed.limit.gather(-1, at[..., None])[..., 0]
         desired = torch.where(limit > 0, limit, world.scene["start"][:, :vehicles, 3].clamp(min=own.speed))
-        line = _red_light(routed, state, world.step, 2 * own.braking) - length / 2 + own.standstill_gap
+        line = _red_light(routed, state, world.step, 2 * own.braking) - length / 2 - LINE_GAP + own.standstill_gap
         return torch.minimum(*(
             idm_acceleration(state.v, desired, free.clamp(min=0.1), leading, own.acceleration, own.braking, own.headway,
                              own.standstill_gap, own.exponent)

@@ -1,0 +1,96 @@
+"""From a configuration to methods, and what a run that cannot be is told."""
+
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from e2rl.errors import InputError
+from e2rl.evaluation.build import BASELINES, build_methods, build_sim, check_protocol
+from e2rl.metrics.catalogue import CLOSED_LOOP, TRAFFIC
+from e2rl.synthesizer.baselines.baseline import Baseline
+from e2rl.synthesizer.synthesizer import Synthesizer
+from tests.prior.small import small_prior
+
+CONF = str(Path(__file__).parents[2] / "conf")
+
+
+def config_of(*overrides):
+    with initialize_config_dir(CONF, version_base="1.3"):
+        return compose("evaluate", list(overrides))
+
+
+def methods_of(*overrides):
+    config = config_of(*overrides)
+    check_protocol(config)
+    return build_methods(config, small_prior())
+
+
+def named(methods):
+    return [(method.name, method.eta) for method in methods]
+
+
+def test_the_prior_stands_beside_the_baselines_with_the_ego_replayed():
+    config = config_of("experiment=prior")
+    check_protocol(config)
+    methods = build_methods(config, small_prior())
+    assert named(methods) == [("replay", 0), ("constant_velocity", 0), ("idm", 0), ("nominal", 0)]
+    assert [isinstance(method.synthesizer, Baseline) for method in methods] == [True, True, True, False]
+    assert config.open_loop_samples > 0 and config.meta_rollouts > 0 and build_sim(config).replay_ego
+    assert CLOSED_LOOP[config.metrics] == TRAFFIC
+
+
+def test_by_default_the_prior_stands_beside_its_control():
+    methods = methods_of("eta=1.5")
+    assert named(methods) == [("nominal", 0), ("e2", 1.5)] and not build_sim(config_of()).replay_ego
+    assert methods[0].synthesizer is methods[1].synthesizer
+
+
+def test_a_name_twice_is_one_row_and_rows_keep_their_order():
+    assert named(methods_of("methods=[idm,nominal,idm]")) == [("idm", 0), ("nominal", 0)]
+
+
+@pytest.mark.parametrize("name", list(BASELINES))
+def test_a_baseline_as_synthesizer_is_a_row_that_eta_does_not_touch_beside_the_prior(name):
+    methods = methods_of(f"synthesizer={name}", "eta=2")
+    assert named(methods) == [("nominal", 0), (name, 0)]
+    assert isinstance(methods[0].synthesizer, Synthesizer) and isinstance(methods[1].synthesizer, Baseline)
+
+
+def test_idm_is_under_the_prior_s_own_bounds():
+    prior = small_prior()
+    methods = build_methods(config_of("methods=[idm]"), prior)
+    assert methods[0].synthesizer.bounds is prior.bounds
+
+
+def test_temperatures_are_rows_of_the_same_weights_and_leave_the_prior_alone():
+    config, prior = config_of("methods=[nominal]", "temperatures=[0.5,1.2,0.5]"), small_prior()
+    before = prior.sampler
+    methods = build_methods(config, prior)
+    assert named(methods) == [("nominal", 0), ("nominal T=0.5", 0), ("nominal T=1.2", 0)]
+    heated = [method.synthesizer.prior for method in methods]
+    assert [(one.sampler.temperature, one.sampler.route_temperature) for one in heated[1:]] == [(0.5, 0.5), (1.2, 1.2)]
+    assert prior.sampler is before is heated[0].sampler
+    assert all(one is other for one, other in zip(heated[1].parameters(), prior.parameters(), strict=True))
+    assert named(methods_of("methods=[]", "temperatures=[1]")) == [("nominal T=1", 0)]
+
+
+@pytest.mark.parametrize(("overrides", "message"), [
+    (["methods=[e3]"], r"methods=\['e3'\]: e3 is none of nominal, replay, constant_velocity, idm, e2; .*synthesizer="),
+    (["methods=[e2]", "synthesizer=nominal"], "e2 is none of nominal, replay, constant_velocity, idm;"),
+    (["methods=[]"], r"methods=\[\], seeds=\[0, 1\]: name at least one of each"),
+    (["seeds=[]"], r"seeds=\[\]: name at least one"),
+    (["seeds=[0.5]"], r"seeds=\[0.5\]: sampling seeds are whole numbers"),
+    (["temperatures=[1,0]"], r"temperatures=\[1, 0\]: expected numbers above 0"),
+    (["temperatures=[hot]"], r"temperatures=\['hot'\]: expected numbers above 0"),
+    (["temperatures=[.inf]"], "temperatures=.*above 0"),
+    (["open_loop_samples=-1"], "open_loop_samples=-1: expected a whole number of at least 0"),
+    (["open_loop_samples=many"], "open_loop_samples=many: expected a whole number"),
+    (["meta_rollouts=1.5"], "meta_rollouts=1.5: expected a whole number"),
+    (["metrics=all"], "metrics=all: choose one of main, traffic"),
+    (["eta=-0.1"], "eta=-0.1: the intensity is a number of at least 0"), (["eta=.nan"], "eta=.nan: the intensity"),
+    (["num_scenes=0"], "num_scenes=0: a whole number of at least 1, or null"),
+])
+def test_what_cannot_run_is_named_with_its_remedy(overrides, message):
+    with pytest.raises(InputError, match=message):
+        check_protocol(config_of(*overrides))

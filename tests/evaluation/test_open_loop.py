@@ -1,0 +1,93 @@
+"""Open loop: closed forms for constant velocity, who predicts, and what samples may change."""
+
+import pytest
+import torch
+
+from e2rl.evaluation.open_loop import HORIZONS, open_loop_rows, sample_plan
+from e2rl.evaluation.protocol import Method
+from e2rl.metrics.catalogue import OPEN_LOOP, OPEN_LOOP_STAGE
+from e2rl.prior.bounds import BoundSettings
+from e2rl.synthesizer.baselines.constant_velocity import ConstantVelocity
+from e2rl.synthesizer.baselines.idm import IDM
+from e2rl.synthesizer.baselines.replay import Replay
+from tests.synthesizer.traffic_scenes import scenes, synthesizer
+
+STRAIGHT = Method("constant_velocity", ConstantVelocity(), 0.0)
+
+
+def places(count=4, acceleration=0.0, steps=60):
+    """Scenes at two places in which everybody drives at constant acceleration."""
+    scene_set = scenes(count, steps=steps)
+    time = 0.1 * torch.arange(steps + 1)
+    moving = scene_set.scenes["start"][..., 3] > 0
+    scene_set.scenes["logged"][..., 0] += acceleration / 2 * time[:, None] ** 2 * moving[:, None]
+    scene_set.location[:] = ["p", "q"] * (count // 2)
+    return scene_set
+
+
+def metrics(scene_set, method=STRAIGHT, samples=3):
+    return open_loop_rows(scene_set, [method], samples)[0]["metrics"]
+
+
+def test_constant_velocity_is_off_by_what_the_log_accelerates():
+    found = metrics(places(acceleration=1.2))
+    for horizon, steps in zip(HORIZONS, (30, 50), strict=True):
+        expected = (0.6 * (0.1 * torch.arange(1, steps + 1)) ** 2).mean().item()
+        for name in ("min_ade", "mean_ade", "joint_ade", "cv_ade"):
+            assert found[f"{name}_{horizon:g}"]["mean"] == pytest.approx(expected, rel=1e-4), name
+        for name in ("min_ade_ratio", "mean_ade_ratio"):
+            row = found[f"{name}_{horizon:g}"]
+            assert row["mean"] == pytest.approx(1) and row["low"] == pytest.approx(1) == row["high"]
+
+
+def test_every_figure_of_the_catalogue_counts_the_moving_vehicles_but_not_the_ego():
+    found = metrics(places())
+    assert set(found) == {metric.name for metric in OPEN_LOOP}
+    assert {row["n"] for row in found.values()} == {4 * 4}  # six vehicles, of which the ego and a parked one do not
+    assert found["cv_ade_5"]["mean"] == pytest.approx(0, abs=1e-4)
+
+
+def test_a_log_too_short_for_a_horizon_leaves_it_unknown():
+    found = metrics(places(steps=40))
+    assert found["cv_ade_3"]["n"] == 16 and found["cv_ade_5"]["n"] == 0
+    assert found["min_ade_5"]["mean"] != found["min_ade_5"]["mean"]
+
+
+def test_who_looks_the_future_up_or_attacks_has_no_row_and_baselines_have_one_sample():
+    on = synthesizer()
+    methods = [Method("replay", Replay(), 0.0), STRAIGHT, Method("idm", IDM(BoundSettings()), 0.0),
+               Method("nominal", on, 0.0), Method("e2", on, 2.0)]
+    rows = open_loop_rows(places(2), methods, 3)
+    assert [(row["method"], row["n_seeds"], row["n_rollouts"]) for row in rows] == [
+        ("constant_velocity", 1, 2), ("idm", 1, 2), ("nominal", 3, 6)]
+    assert all(row["stage"] == OPEN_LOOP_STAGE and row["ego"] == "unknown" and row["n_scenes"] == 2 for row in rows)
+
+
+def test_more_samples_find_better_ones_and_the_joint_choice_is_between():
+    scene_set, method = places(acceleration=0.5), Method("nominal", synthesizer(), 0.0)
+    one, few, many = (metrics(scene_set, method, samples) for samples in (1, 2, 5))
+    for at in ("_3", "_5"):
+        best = [found[f"min_ade{at}"]["mean"] for found in (one, few, many)]
+        assert best[0] > best[1] > best[2], "samples are added, not drawn anew"
+        assert best[2] < many[f"joint_ade{at}"]["mean"] < many[f"mean_ade{at}"]["mean"]
+        assert best[0] == pytest.approx(one[f"mean_ade{at}"]["mean"]) == pytest.approx(one[f"joint_ade{at}"]["mean"])
+        assert many[f"cv_ade{at}"]["mean"] == one[f"cv_ade{at}"]["mean"]
+
+
+def test_ratios_are_quotients_of_the_same_vehicles_errors():
+    found = metrics(places(acceleration=0.5), Method("nominal", synthesizer(), 0.0))
+    for name in ("min_ade", "mean_ade"):
+        quotient = found[f"{name}_5"]["mean"] / found["cv_ade_5"]["mean"]
+        assert found[f"{name}_ratio_5"]["mean"] == pytest.approx(quotient)
+
+
+def test_plans_begin_at_the_start_do_not_know_the_future_and_are_the_same_in_any_batch():
+    scene, on, seed = scenes(3).scenes, synthesizer(), torch.tensor([4, 5, 6])
+    plan = sample_plan(on, scene, seed)
+    assert plan.shape == (3, 8, 50, 4) and (plan[:, :6, 0, :2] - scene["start"][:, :6, :2]).norm(dim=-1).max() < 1.5
+    blind = scene.clone()
+    blind["logged"][:, 1:] = 1e4
+    blind["logged_valid"][:, 1:] = False
+    assert torch.equal(sample_plan(on, blind, seed), plan)
+    torch.testing.assert_close(sample_plan(on, scene[1:2], seed[1:2]), plan[1:2], rtol=0, atol=5e-3)
+    assert not torch.allclose(sample_plan(on, scene, seed + 1), plan)

@@ -1,0 +1,150 @@
+"""The meta-metric over rollouts: a log that equals all rollouts, and what the tally does not depend on."""
+
+import copy
+
+import pytest
+import torch
+
+from e2rl.ego.replay import ReplayEgo
+from e2rl.evaluation.protocol import Method, roll_out_part
+from e2rl.evaluation.realism_meta import Tally, evaluated, log_split_half, meta_rows, summarise_meta
+from e2rl.metrics.catalogue import META, META_STAGE
+from e2rl.metrics.meta_metric import FEATURES, HISTOGRAMS, SMOOTHING, meta_metric
+from e2rl.sim.env import SimSettings
+from e2rl.synthesizer.baselines.constant_velocity import ConstantVelocity
+from e2rl.synthesizer.baselines.replay import Replay
+from tests.synthesizer.traffic_scenes import scenes, synthesizer
+
+SIM, STEPS = SimSettings(replay_ego=True), 30
+KNOWN = {"linear_speed": STEPS - 2, "angular_speed": STEPS - 2, "linear_accel": STEPS - 4, "angular_accel": STEPS - 4}
+
+
+def places(count=2, **options):
+    scene_set = scenes(count, steps=STEPS, **options)
+    scene_set.location[:] = ["p", "q"] * (count // 2)
+    return scene_set
+
+
+def logs_of(scene_set):
+    """The logs as rollouts."""
+    scene = scene_set.scenes
+    return {"states": scene["logged"], "valid": scene["logged_valid"], "size": scene["size"],
+            "routes": scene["route_log"]}
+
+
+def sampled(scene_set, seeds, on=None):
+    """[(scene indices, rollouts)] of a random prior, one for each seed."""
+    method = Method("nominal", on or synthesizer(), 0.0)
+    index = torch.arange(len(scene_set))
+    return [(index, roll_out_part(scene_set, [(k, seed) for k in range(len(scene_set))], method, ReplayEgo(), SIM))
+            for seed in seeds]
+
+
+def likelihoods(scene_set, parts, rollouts):
+    tally = Tally(scene_set.scenes)
+    for index, part in parts:
+        tally.add(index, part)
+    return tally.likelihoods(rollouts)
+
+
+def same(one, other):
+    for name in FEATURES:
+        torch.testing.assert_close(other[name], one[name], equal_nan=True, msg=name)
+
+
+@pytest.mark.parametrize("rollouts", [1, 4, 32])
+def test_a_log_that_equals_all_rollouts_is_as_likely_as_the_smoothing_lets_it_be(rollouts):
+    """At constant velocity every feature of motion stays in one bin, so each likelihood has a closed form."""
+    scene_set = places()
+    index = torch.arange(2)
+    found = likelihoods(scene_set, [(index, logs_of(scene_set))] * rollouts, rollouts)
+    for name, steps in KNOWN.items():
+        expected = (rollouts * steps + SMOOTHING) / (rollouts * steps + SMOOTHING * FEATURES[name].bins)
+        assert found[name].tolist() == pytest.approx([expected] * 2, rel=1e-5), name
+    sure = (rollouts + SMOOTHING) / (rollouts + 2 * SMOOTHING)
+    assert found["offroad"].tolist() == found["red_light"].tolist() == pytest.approx([sure] * 2)
+    assert rollouts < 32 or found["road_edge"].min() > 0.99
+
+
+def test_more_rollouts_like_the_log_make_it_likelier_and_others_less_likely():
+    scene_set = places()
+    index, logs = torch.arange(2), logs_of(scene_set)
+    [(_, other)] = sampled(scene_set, [0])
+    values = [meta_metric(likelihoods(scene_set, [(index, part) for part in parts], len(parts))).mean().item()
+              for parts in ([other] * 4, [logs, other, other, other], [logs] * 4, [logs] * 16)]
+    assert values == sorted(values) and values[0] > 0 and values[-1] < 1
+
+
+def test_neither_the_order_of_rollouts_nor_their_batches_matter_and_a_weight_is_a_number_of_rollouts():
+    scene_set = places()
+    parts = sampled(scene_set, [0, 1, 2])
+    found = likelihoods(scene_set, parts, 3)
+    same(found, likelihoods(scene_set, parts[::-1], 3))
+    rows = [(index[k:k + 1], {key: value[k:k + 1] for key, value in part.items() if isinstance(value, torch.Tensor)})
+            for index, part in parts for k in range(2)]
+    same(found, likelihoods(scene_set, rows, 3))
+    weighed, repeated = Tally(scene_set.scenes), likelihoods(scene_set, parts[:1] * 3, 3)
+    weighed.add(*parts[0], weight=3)
+    same(repeated, weighed.likelihoods(3))
+
+
+def test_the_order_of_vehicles_does_not_matter():
+    scene_set = places()
+    [(index, part)] = sampled(scene_set, [0])
+    found = likelihoods(scene_set, [(index, part)], 1)
+    order, all_rows = torch.tensor([0, 4, 2, 5, 1, 3, 7, 6]), torch.tensor([0, 4, 2, 5, 1, 3, 7, 6, 8, 9])
+    other = copy.deepcopy(scene_set)
+    scene = other.scenes
+    for key in ("start", "valid", "size", "agent_type", "parked"):
+        scene[key] = scene[key][:, all_rows]
+    for key in ("logged", "logged_valid"):
+        scene[key] = scene[key][:, :, all_rows]
+    for key in ("route_points", "route_light", "route_light_s", "route_log"):
+        scene[key] = scene[key][:, order]
+    shuffled = {"states": part["states"][:, :, all_rows], "valid": part["valid"][:, :, all_rows],
+                "size": part["size"][:, all_rows], "routes": part["routes"][:, order]}
+    same(found, likelihoods(other, [(index, shuffled)], 1))
+
+
+def test_vehicles_recorded_throughout_are_looked_at_and_a_scene_without_any_is_unknown():
+    scene_set = places()
+    scene_set.scenes["logged_valid"][0, 20:, 1:] = False
+    scene_set.scenes["logged_valid"][1, 3, 2] = False
+    chosen = evaluated(scene_set.scenes)
+    assert chosen[0].sum() == 0 and chosen[1].nonzero()[:, 0].tolist() == [1, 3, 4, 5]
+    found = likelihoods(scene_set, [(torch.arange(2), logs_of(scene_set))], 1)
+    assert all(value.isnan().tolist() == [True, False] for value in found.values())
+    assert {row["n"] for row in summarise_meta(found, scene_set).values()} == {1}
+
+
+def test_the_rows_of_a_run():
+    scene_set, rollouts = places(), 3
+    methods = [Method("replay", Replay(), 0.0), Method("constant_velocity", ConstantVelocity(), 0.0),
+               Method("nominal", synthesizer(), 0.0)]
+    rows = meta_rows(scene_set, methods, ReplayEgo(), "replay", SIM, rollouts, batch=4)
+    assert [row["method"] for row in rows] == ["replay", "constant_velocity", "nominal"]
+    assert all((row["stage"], row["n_seeds"], row["n_rollouts"]) == (META_STAGE, 3, 6) for row in rows)
+    replay, straight, nominal = (row["metrics"] for row in rows)
+    assert set(replay) == {metric.name for metric in META}
+    assert set(straight) == set(replay) - {"real_split_half"} == set(nominal)
+    for name in HISTOGRAMS:  # in these scenes both are the log
+        assert straight[name]["mean"] == pytest.approx(replay[name]["mean"], rel=1e-4), name
+    expected = (rollouts * 28 + SMOOTHING) / (rollouts * 28 + 10 * SMOOTHING)
+    assert replay["linear_speed"]["mean"] == pytest.approx(expected, rel=1e-5)
+    for row in (replay, straight, nominal):
+        total = sum(FEATURES[name].weight * row[name]["mean"] for name in FEATURES)
+        assert row["meta_metric"]["mean"] == pytest.approx(total)
+    assert nominal["meta_metric"]["mean"] < replay["meta_metric"]["mean"] < 1
+    counted = likelihoods(scene_set, sampled(scene_set, range(rollouts)), rollouts)
+    assert nominal["meta_metric"]["mean"] == pytest.approx(meta_metric(counted).mean().item(), rel=1e-6)
+
+
+def test_split_halves_part_whole_places():
+    scene_set = places(4)
+    row = log_split_half(scene_set)
+    assert (row["mean"], row["low"], row["high"], row["n"]) == (1, 1, 1, 4), "everybody at constant velocity"
+    time = 0.1 * torch.arange(STEPS + 1)
+    scene_set.scenes["logged"][1::2, :, 1:6, 3] += 0.3 * time[:, None]  # place q speeds up by 0.3 m/s^2
+    assert log_split_half(scene_set)["mean"] == pytest.approx(1 - 0.3 / 3, abs=0.01), "of three features one differs"
+    scene_set.location[:] = ["p"] * 4
+    assert log_split_half(scene_set)["mean"] != log_split_half(scene_set)["mean"], "one place has no halves"
