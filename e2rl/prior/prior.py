@@ -40,6 +40,9 @@ class SamplerSettings:
         if self.steps < 1 or not 0 <= self.churn <= 1:
             raise InputError("prior.sampler needs steps >= 1 and churn between 0 and 1; they are "
                              f"{self.steps} and {self.churn}")
+        for name in ("temperature", "route_temperature"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise InputError(f"prior.sampler.{name}={getattr(self, name)}: expected a number of at least 0")
 
 
 @dataclass

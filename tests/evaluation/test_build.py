@@ -1,8 +1,10 @@
 """From a configuration to methods, and what a run that cannot be is told."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 
 from e2rl.errors import InputError
@@ -63,16 +65,21 @@ def test_idm_is_under_the_prior_s_own_bounds():
     assert methods[0].synthesizer.bounds is prior.bounds
 
 
-def test_temperatures_are_rows_of_the_same_weights_and_leave_the_prior_alone():
-    config, prior = config_of("methods=[nominal]", "temperatures=[0.5,1.2,0.5]"), small_prior()
-    before = prior.sampler
-    methods = build_methods(config, prior)
-    assert named(methods) == [("nominal", 0), ("nominal T=0.5", 0), ("nominal T=1.2", 0)]
-    heated = [method.synthesizer.prior for method in methods]
-    assert [(one.sampler.temperature, one.sampler.route_temperature) for one in heated[1:]] == [(0.5, 0.5), (1.2, 1.2)]
-    assert prior.sampler is before is heated[0].sampler
-    assert all(one is other for one, other in zip(heated[1].parameters(), prior.parameters(), strict=True))
-    assert named(methods_of("methods=[]", "temperatures=[1]")) == [("nominal T=1", 0)]
+def test_variants_are_rows_of_the_prior_with_what_they_change_and_nothing_else():
+    config = config_of("methods=[]", "+variants.cold={sampler: {temperature: 0.5}}",
+                       "+variants.free={bounds: {meeting: false}}")
+    check_protocol(config)
+    methods = build_methods(config, small_prior())
+    assert named(methods) == [("cold", 0), ("free", 0)]
+    cold, free = (method.synthesizer.prior for method in methods)
+    assert cold.sampler == replace(free.sampler, temperature=0.5) and free.bounds == replace(cold.bounds, meeting=False)
+    assert all(torch.equal(*pair) for pair in zip(cold.parameters(), free.parameters(), strict=True))
+
+
+def test_every_row_of_the_ablation_can_be_built():
+    config = config_of("experiment=prior_ablation")
+    check_protocol(config)
+    assert len(build_methods(config, small_prior())) == 1 + len(config.variants)
 
 
 @pytest.mark.parametrize(("overrides", "message"), [
@@ -81,9 +88,9 @@ def test_temperatures_are_rows_of_the_same_weights_and_leave_the_prior_alone():
     (["methods=[]"], r"methods=\[\], seeds=\[0, 1\]: name at least one of each"),
     (["seeds=[]"], r"seeds=\[\]: name at least one"),
     (["seeds=[0.5]"], r"seeds=\[0.5\]: sampling seeds are whole numbers"),
-    (["temperatures=[1,0]"], r"temperatures=\[1, 0\]: expected numbers above 0"),
-    (["temperatures=[hot]"], r"temperatures=\['hot'\]: expected numbers above 0"),
-    (["temperatures=[.inf]"], "temperatures=.*above 0"),
+    (["+variants.idm={sampler: {steps: 4}}"], "variants.idm=.*a new name"),
+    (["+variants.other={training: {steps: 4}}"], "variants.other=.*checkpoint, sampler, bounds of `prior`"),
+    (["+variants.other=4"], "variants.other=4"),
     (["open_loop_samples=-1"], "open_loop_samples=-1: expected a whole number of at least 0"),
     (["open_loop_samples=many"], "open_loop_samples=many: expected a whole number"),
     (["meta_rollouts=1.5"], "meta_rollouts=1.5: expected a whole number"),
@@ -94,3 +101,8 @@ def test_temperatures_are_rows_of_the_same_weights_and_leave_the_prior_alone():
 def test_what_cannot_run_is_named_with_its_remedy(overrides, message):
     with pytest.raises(InputError, match=message):
         check_protocol(config_of(*overrides))
+
+
+def test_a_variant_of_impossible_temperature_says_so():
+    with pytest.raises(InputError, match="temperature=-1"):
+        methods_of("+variants.cold={sampler: {temperature: -1}}")
