@@ -117,6 +117,16 @@ def test_vehicles_recorded_throughout_are_looked_at_and_a_scene_without_any_is_u
     assert {row["n"] for row in summarise_meta(found, scene_set).values()} == {1}
 
 
+def test_lights_belong_to_ways_so_that_whoever_follows_none_runs_none():
+    scene_set = places(red_light_x=30.0)
+    hits = []
+    for routes in (scene_set.scenes["route_log"], torch.full_like(scene_set.scenes["route_log"], -1)):
+        tally = Tally(scene_set.scenes)
+        tally.add(torch.arange(2), logs_of(scene_set) | {"routes": routes})
+        hits.append(tally.hits["red_light"].view(2, -1).sum(1).tolist())
+    assert hits == [[2, 2], [0, 0]]  # those at 22 and 10 m pass 30 m within 3 s
+
+
 def test_the_rows_of_a_run():
     scene_set, rollouts = places(), 3
     methods = [Method("replay", Replay(), 0.0), Method("constant_velocity", ConstantVelocity(), 0.0),

@@ -146,6 +146,9 @@ def test_a_red_light_is_run_when_the_front_passes_its_line_while_it_is_red():
     early[5:], late[:9] = GREEN, GREEN
     assert crossing_of(red) and not crossing_of(green)
     assert not crossing_of(early) and not crossing_of(late), "red before or after only"
+    only, but = green.clone(), red.clone()
+    only[7], but[7] = LIGHT_RED, GREEN
+    assert crossing_of(only) and not crossing_of(but), "the colour once it is across counts"
     assert not crossing_of(red, light=(-1, -1)), "no light of its route"
     assert not crossing_of(red, speed=2.0), "it does not get there"
     known = torch.ones(1, 20, dtype=torch.bool)
@@ -208,5 +211,5 @@ def test_features_do_not_depend_on_the_order_of_agents_nor_on_who_is_asked_with_
 
 def test_what_absent_agents_hold_does_not_matter():
     batch, (rollout, agent) = random_batch(2), tracks()
-    wild = batch["states"].masked_fill(~batch["valid"][..., None], 3.0)
+    wild = batch["states"].masked_fill(~batch["valid"][..., None], 500.0)  # off the map
     compare(track_features(batch, rollout, agent), track_features(batch | {"states": wild}, rollout, agent))
