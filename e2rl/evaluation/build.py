@@ -22,6 +22,7 @@ from e2rl.synthesizer.baselines.idm import IDM
 from e2rl.synthesizer.baselines.replay import Replay
 from e2rl.synthesizer.control import ControlSettings
 from e2rl.synthesizer.feasibility import FeasibilitySettings
+from e2rl.synthesizer.interception import InterceptionSettings
 from e2rl.synthesizer.potentials import PotentialSettings
 from e2rl.synthesizer.reasoner import ReasonerSettings
 from e2rl.synthesizer.skeleton import SkeletonSettings
@@ -29,7 +30,7 @@ from e2rl.synthesizer.synthesizer import Synthesizer, SynthesizerSettings
 from e2rl.synthesizer.topology import TopologySettings
 
 PARTS = {"topology": TopologySettings, "feasibility": FeasibilitySettings, "reasoner": ReasonerSettings,
-         "skeleton": SkeletonSettings, "anchor": AnchorSettings, "potentials": PotentialSettings,
+         "skeleton": SkeletonSettings, "anchor": AnchorSettings, "interception": InterceptionSettings, "potentials": PotentialSettings,
          "control": ControlSettings}
 BASELINES: dict[str, Callable[[Prior], Baseline]] = {  # under the bounds of the prior that they stand beside
     "replay": lambda prior: Replay(), "constant_velocity": lambda prior: ConstantVelocity(),
@@ -50,7 +51,7 @@ def build_synthesizer(config: DictConfig, prior: Prior) -> Synthesizer | Baselin
         return BASELINES[config.synthesizer.name](prior)
     parts = {name: settings_of(part, config.synthesizer[name], f"synthesizer.{name}")
              for name, part in PARTS.items() if name in config.synthesizer}
-    scalars = {name: config.synthesizer[name] for name in ("reselect", "samples", "selection")
+    scalars = {name: config.synthesizer[name] for name in ("support", "reselect", "samples", "selection")
                if name in config.synthesizer}
     return Synthesizer(prior, SynthesizerSettings(**parts, **scalars))
 

@@ -1,6 +1,6 @@
 """What of a scene stays the same while it runs, once every vehicle has a route: worked out once per scene."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from tensordict import TensorDictBase
@@ -64,6 +64,36 @@ def route_scene(scene: TensorDictBase, route: Tensor, free_space: bool = False) 
         take_route(scene["route_open"], route), take_route(scene["route_limit"], route),
         take_route(scene["route_light"], route), take_route(scene["route_light_s"], route), conflict, conflict_s,
         crossing, valid & ~parked, parked, has_lane & (not free_space))
+
+
+def follow_ways(routed: RoutedScene, scene: TensorDictBase, who: Tensor, leaves: Tensor, ways: Tensor,
+                state_s: Tensor) -> RoutedScene:
+    """The scenes with vehicles who [B, V] on other lines: those that leave their lanes [B, V] on ways [B, V, P, 2],
+    the others back on their candidates. On a way there are no lights, and the limit is that of the lane at s."""
+    route, off = routed.route, leaves & who
+    vertex = (state_s / SPACING).round().long().clamp(0, routed.limit.shape[-1] - 1)[..., None]
+    here = routed.limit.gather(-1, vertex).expand_as(routed.limit)
+
+    def change(old: Tensor, lane: Tensor, way: Tensor) -> Tensor:
+        extra = [1] * (old.dim() - 2)
+        new = torch.where(off.view(*off.shape, *extra), way, lane)
+        return torch.where(who.view(*who.shape, *extra), new, old)
+
+    lane = {key: take_route(scene[f"route_{key}"], route)
+            for key in ("points", "length", "open", "limit", "light", "light_s")}
+    points = change(routed.points, lane["points"], ways)
+    length = torch.full_like(routed.length, SPACING * (points.shape[2] - 1))
+    conflict, conflict_s, crossing = routed.conflict.clone(), routed.conflict_s.clone(), routed.crossing.clone()
+    for b in who.any(1).nonzero()[:, 0].tolist():
+        conflict[b:b + 1], conflict_s[b:b + 1], crossing[b:b + 1] = _conflicts(points[b:b + 1])
+    both = routed.modelled & routed.has_lane
+    return replace(
+        routed, points=points, conflict=conflict & both[:, :, None] & both[:, None], conflict_s=conflict_s,
+        crossing=crossing, length=change(routed.length, lane["length"], length),
+        open=change(routed.open, lane["open"], torch.zeros_like(off)),
+        limit=change(routed.limit, lane["limit"], here),
+        light=change(routed.light, lane["light"], torch.full_like(routed.light, -1)),
+        light_s=change(routed.light_s, lane["light_s"], torch.zeros_like(routed.light_s)))
 
 
 def _conflicts(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -6,7 +6,7 @@ meets its target: reference section 3.3 and 12.14. It is evaluated with the prio
 times are those the prior would draw.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from tensordict import TensorDictBase
@@ -18,6 +18,7 @@ from e2rl.scene.recording import DT
 from e2rl.scene.route import SPACING, interpolate, project
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
+from e2rl.synthesizer.interception import Interception, InterceptionSettings, intercept
 from e2rl.synthesizer.motion import compact, cruise, fade, place, ride, take
 from e2rl.synthesizer.skeleton import Skeleton
 
@@ -30,7 +31,7 @@ TURNING = 64  # vertices ahead whose curvature is looked at
 class AnchorSettings:
     """Settings of the proposals and of the blend; conf/synthesizer/e2.yaml explains each."""
 
-    strength: float = 0.5
+    strength: float = 1.0
     min_accel: float = -3.0
     max_accel: float = 2.0
     options: int = 19
@@ -54,16 +55,17 @@ class AnchorSettings:
 @dataclass(frozen=True)
 class Anchor:
     """route [B, V] int64: candidate to follow (the present one where `has` is false); knots [B, V, 10] acceleration
-    knots [m/s^2] at 0.5 .. 5.0 s; lateral [B, V]: target offset [m], 0: on the centreline; has [B, V]: C* members that
-    can meet their target; offset [B, V]: difference [s] between the arrival times at the meeting point, inf where
-    `has` is false.
+    knots [m/s^2] at 0.5 .. 5.0 s; has [B, V]: C* members that can meet their target; cost [B, V]: in seconds, inf where
+    `has` is false; leaves [B, V]: members that meet it on a way of their own, points [B, V, P, 2] (vertices SPACING m
+    apart), and not on a lane.
     """
 
     route: Tensor
     knots: Tensor
-    lateral: Tensor
     has: Tensor
-    offset: Tensor
+    cost: Tensor
+    leaves: Tensor
+    points: Tensor
 
 
 @dataclass
@@ -200,44 +202,67 @@ def _propose(riders: _Riders, path: Tensor, size: Tensor, settings: AnchorSettin
     width = (settings.max_accel - settings.min_accel) / (settings.options - 1)
     fine = grid.gather(-1, pick) + width * torch.linspace(-1, 1, 9, device=path.device)
     cost, offset, knots = _score(riders, fine.clamp(settings.min_accel, settings.max_accel), target, settings)
-    pick, offset, knots = _best(cost, offset, knots)
-    return pick // fine.shape[-1], knots, offset
+    pick, offset, knots, cost = _best(cost, offset, knots, cost)
+    return pick // fine.shape[-1], knots, offset, cost
 
 
 def propose(scene: TensorDictBase, world: World, skeleton: Skeleton, ego_plan: Tensor, settings: AnchorSettings,
-            keep_route: bool = False) -> Anchor:
-    """The skeleton-consistent clean state of Sec. IV-A3 for scenes [B]; ego_plan [B, H >= 50, 4].
+            interception: InterceptionSettings, eta: Tensor, keep_route: bool = False) -> Anchor:
+    """The skeleton-consistent clean state of Sec. IV-A3 for scenes [B]; ego_plan [B, H >= 50, 4], eta [B].
 
-    Links are worked off from the ego outwards: those that act on the ego meet its plan, the others meet their target's
-    proposal, or its route at present speed where it has none. keep_route: only the candidates that vehicles follow now
+    Links are worked off from the ego outwards: those that act on the ego meet its plan, on a lane or (where that costs
+    less) by an interception; the others meet their target's proposal, or its route at present speed where it has none
+    on a lane. keep_route: only the candidates that vehicles follow now
     (between two choices of the support, where nobody changes its route).
     """
-    vehicles = scene["route_points"].shape[1]
     times = DT * torch.arange(1, HORIZON + 1, device=ego_plan.device)
     expected = cruise(scene, world, times)
     expected[:, 0] = ego_plan[:, :HORIZON].detach()
-    route = world.route.clone()
-    shape = route.shape
-    knots = expected.new_zeros(*shape, KNOTS)
-    offset = expected.new_full(shape, torch.inf)
+    found = Anchor(world.route.clone(), expected.new_zeros(*world.route.shape, KNOTS), skeleton.coalition & False,
+                   expected.new_full(world.route.shape, torch.inf), skeleton.coalition & False,
+                   torch.zeros_like(scene["route_points"][:, :, 0]))
     for depth in range(1, int(skeleton.depth.max()) + 1):
         index, present = compact(skeleton.depth == depth)
         riders = _riders(scene, world, index, settings, keep_route)
         target = skeleton.target.gather(1, index).clamp(min=0)
-        size = take(scene["size"], target)
-        chosen, found, late = _propose(riders, take(expected, target), size, settings)
-        ok = present & (late <= settings.max_offset)
-        pick = chosen[..., None]
-        way = _decode(riders, found[:, :, None, None])
-        v, way = (x[:, :, 0, 0] for x in way)
-        own = riders.routes.gather(2, pick[..., None, None].expand(-1, -1, 1, *riders.routes.shape[3:]))[:, :, 0]
-        rides = ride(own, riders.s.gather(2, pick) + way, riders.d.gather(2, pick) * fade(way, riders.v[..., None]), v)
-        expected = _write(expected, index, ok, rides)
-        chosen = riders.candidate.gather(2, pick)[..., 0]
-        route, knots = _write(route, index, ok, chosen), _write(knots, index, ok, found)
-        offset = _write(offset, index, ok, late)
-    has = offset.isfinite()
-    return Anchor(route, knots, expected.new_zeros(shape[0], vehicles), has, offset)
+        pick, knots, late, cost = _propose(riders, take(expected, target), take(scene["size"], target), settings)
+        cost = cost.masked_fill(~present | (late > settings.max_offset), torch.inf)
+        way = None
+        if depth == 1 and interception.reach > 0:
+            way = _intercept(scene, world, index, expected, target, eta, interception)
+        on_lane = cost.isfinite() if way is None else cost.isfinite() & ~(way.cost < cost)
+        expected = _write(expected, index, on_lane, _rides(riders, pick, knots))
+        chosen = riders.candidate.gather(2, pick[..., None])[..., 0]
+        found = _noted(found, index, on_lane, has=on_lane, cost=cost, knots=knots, route=chosen)
+        if way is not None:
+            leaves = present & (way.cost < cost)
+            found = _noted(found, index, leaves, has=leaves, leaves=leaves, **vars(way))
+    return found
+
+
+def _noted(anchor: Anchor, index: Tensor, mask: Tensor, **rows: Tensor) -> Anchor:
+    """The Anchor with fields' rows [B, M, ...] written at slots index [B, M] where mask [B, M]."""
+    return replace(anchor, **{name: _write(getattr(anchor, name), index, mask, new) for name, new in rows.items()})
+
+
+def _rides(riders: _Riders, pick: Tensor, knots: Tensor) -> Tensor:
+    """States [B, M, H, 4] of the riders on candidates pick [B, M] with knots [B, M, 10]."""
+    pick = pick[..., None]
+    v, way = (x[:, :, 0, 0] for x in _decode(riders, knots[:, :, None, None]))
+    own = riders.routes.gather(2, pick[..., None, None].expand(-1, -1, 1, *riders.routes.shape[3:]))[:, :, 0]
+    return ride(own, riders.s.gather(2, pick) + way, riders.d.gather(2, pick) * fade(way, riders.v[..., None]), v)
+
+
+def _intercept(scene: TensorDictBase, world: World, index: Tensor, expected: Tensor, target: Tensor, eta: Tensor,
+               settings: InterceptionSettings) -> Interception:
+    """Interceptions of slots index [B, M]; everybody else is expected to drive as in expected [B, V, H, 4]."""
+    vehicles = expected.shape[1]
+    row = torch.arange(vehicles, device=index.device)
+    there = world.valid[:, None, :vehicles] & (row != index[..., None]) & (row != target[..., None])
+    sizes, wide = scene["size"][:, :vehicles], (-1, index.shape[1], -1, -1)
+    others = (expected[:, None].expand(*wide, -1), sizes[:, None].expand(wide), there)
+    return intercept(scene, take(world.states, index), take(sizes, index), take(expected, target), take(sizes, target),
+                     eta, others, settings)
 
 
 def _write(full: Tensor, index: Tensor, mask: Tensor, rows: Tensor) -> Tensor:

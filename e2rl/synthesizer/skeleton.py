@@ -66,6 +66,12 @@ class Skeleton:
             "chains": int(self.chains.sum())}
 
 
+def direct(support: Tensor) -> Skeleton:
+    """Everybody of support [B, V] acting on the ego."""
+    nobody, none = torch.zeros_like(support), torch.zeros_like(support[:, 0], dtype=torch.int64)
+    return Skeleton(support, torch.where(support, 0, -1), support.long(), support, nobody, none, none)
+
+
 def chain_depth(target: Tensor) -> Tensor:
     """Links to the ego [B, V] int64 of targets [B, V] (0 the ego, -1 nobody); 0 for those who act on nobody."""
     at, depth = target, (target >= 0).long()
@@ -199,12 +205,13 @@ def _link_chains(after: Tensor, near: Tensor, far: Tensor, settings: SkeletonSet
 
 
 def build_skeleton(scene: TensorDictBase, world: World, support: Tensor, feasible: Tensor, settings: SkeletonSettings,
-                   expected: Tensor | None = None) -> Skeleton:
+                   expected: Tensor | None = None, cost: Tensor | None = None) -> Skeleton:
     """Algorithm 2 for scenes [B]: support [B, V] = S, feasible [B, V] = F.
 
     expected [B, V, K, 4]: where everybody will be every `step` s up to `horizon`, say in the reference rollout;
-    default: at present speed along its route. Where S is empty the nearest of F act on the ego; where F is empty too,
-    nobody.
+    default: at present speed along its route; cost [B, V]: what it takes each to meet the ego, inf where it cannot;
+    default: the distance in metres. The near agents are those of S whom it costs least; where S has none the least of F
+    act on the ego; where F has none either, nobody.
     """
     vehicles = support.shape[1]
     states = world.states[:, :vehicles].detach()
@@ -213,8 +220,10 @@ def build_skeleton(scene: TensorDictBase, world: World, support: Tensor, feasibl
     distance = (states[..., :2] - states[:, :1, :2]).norm(dim=-1)
     ego = torch.arange(vehicles, device=states.device) == 0
     support, feasible = (mask & world.valid[:, :vehicles] & ~ego for mask in (support, feasible))
-    source = torch.where(support.any(1), SUPPORTED, torch.where(feasible.any(1), NEAREST_FEASIBLE, NOBODY))
-    near = _extreme(torch.where(support.any(1, keepdim=True), support, feasible), distance, settings.near)
+    cost = distance if cost is None else cost
+    first, second = (mask & cost.isfinite() for mask in (support, feasible))
+    source = torch.where(first.any(1), SUPPORTED, torch.where(second.any(1), NEAREST_FEASIBLE, NOBODY))
+    near = _extreme(torch.where(first.any(1, keepdim=True), first, second), cost, settings.near)
     index, present = compact(support | near)
     pool = present & take(support & ~near & (distance > settings.tau_dist) & (distance <= settings.max_dist), index)
     pool &= ~_beside_ego(torch.cat([states[:, :1], take(states, index)], 1), pool, scene)

@@ -10,9 +10,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from e2rl.errors import InputError
 from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate
 from e2rl.prior.prior import Context, Plan, Prior
-from e2rl.prior.routed import RoutedScene, route_scene
+from e2rl.prior.routed import RoutedScene, follow_ways, route_scene
 from e2rl.scene.recording import DT
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
@@ -20,6 +21,7 @@ from e2rl.synthesizer.anchoring import Anchor, AnchorSettings, propose
 from e2rl.synthesizer.control import ControlSettings, SparseControl
 from e2rl.synthesizer.feasibility import FeasibilitySettings
 from e2rl.synthesizer.grouping import clone, crop_episode, crop_world, gather_plans, group_scenes, write_episode
+from e2rl.synthesizer.interception import InterceptionSettings
 from e2rl.synthesizer.potentials import (
     PotentialContext,
     PotentialSettings,
@@ -28,19 +30,22 @@ from e2rl.synthesizer.potentials import (
     sampled_steps,
 )
 from e2rl.synthesizer.reasoner import ReasonerSettings, build_reasoner
-from e2rl.synthesizer.skeleton import Skeleton, SkeletonSettings, build_skeleton, chain_depth
+from e2rl.synthesizer.skeleton import Skeleton, SkeletonSettings, build_skeleton, chain_depth, direct
 from e2rl.synthesizer.topology import TopologySettings, topological_candidates
 
 LOOK = 5  # steps of the ego's plan over which its present yaw rate is taken
-PER_SAMPLE, LITERAL = 1000, 500  # numbers of draws: of a joint sample's, and of the literal blend's first
+PER_SAMPLE, LITERAL, SUPPORT = 1000, 500, 750  # numbers of draws: a joint sample's, the literal blend's, a support's
+SUPPORTS = ("feasible", "topology", "random")
 
 
 @dataclass(frozen=True)
 class SynthesizerSettings:
     """Settings of all parts (conf/synthesizer/e2.yaml).
 
-    reselect: replans after which a coalition that can no longer meet its targets is chosen anew, 0: never; samples:
-    joint samples a replan, of which each scene keeps the one with the least selection * V_feas + eta * V_adv.
+    support: whom the coalition is chosen from: feasible (S = S_top and F), topology (S_top alone) or random (as many
+    as there are near agents, whoever they are), the ablations of table 2; reselect: replans after which a coalition
+    that can no longer meet its targets is chosen anew, 0: never; samples: joint samples a replan, of which each scene
+    keeps the one with the least selection * V_feas + eta * V_adv.
     """
 
     topology: TopologySettings = TopologySettings()
@@ -48,11 +53,17 @@ class SynthesizerSettings:
     reasoner: ReasonerSettings = ReasonerSettings()
     skeleton: SkeletonSettings = SkeletonSettings()
     anchor: AnchorSettings = AnchorSettings()
+    interception: InterceptionSettings = InterceptionSettings()
     potentials: PotentialSettings = PotentialSettings()
     control: ControlSettings = ControlSettings()
+    support: str = "feasible"
     reselect: int = 2
     samples: int = 1
     selection: float = 1.0
+
+    def __post_init__(self):
+        if self.support not in SUPPORTS:
+            raise InputError(f"synthesizer.support is {self.support!r}; choose one of {', '.join(SUPPORTS)}")
 
 
 @dataclass
@@ -60,7 +71,8 @@ class Episode:
     """What a synthesizer keeps of B running scenes; every tensor has the batch first.
 
     seed [B]: of the scene's noise; eta [B]; replans [B]; routed; state [B, V]: where the last executed plan led;
-    coalition, target [B, V]: C* and whom each acts on; adversaries [B, V]: in C* at any time; kl, jump [B, V]: path KL
+    coalition, target [B, V]: C* and whom each acts on; adversaries [B, V]: in C* at any time; leaves [B, V]: on an
+    interception instead of its lane; kl, jump [B, V]: path KL
     of the control so far and energy of anchoring.
     """
 
@@ -72,6 +84,7 @@ class Episode:
     coalition: Tensor
     target: Tensor
     adversaries: Tensor
+    leaves: Tensor
     kl: Tensor
     jump: Tensor
 
@@ -125,7 +138,7 @@ class Synthesizer:
         routed, state = self.prior.start(scene, self.prior.choose_routes(scene, uniform))
         none = torch.zeros_like(routed.parked)
         zero = torch.zeros_like(routed.length)
-        return Episode(seed, eta, torch.zeros_like(seed), routed, state, none, none.long() - 1, none, zero, zero)
+        return Episode(seed, eta, torch.zeros_like(seed), routed, state, none, none.long() - 1, none, none, zero, zero)
 
     def replan(self, episode: Episode, world: World, ego_plan: Tensor) -> tuple[Episode, Plan]:
         """The episodes and the plan of the coming HORIZON steps, given the ego's plan [B, HORIZON, 4] (detached)."""
@@ -147,6 +160,7 @@ class Synthesizer:
         controlled, anchor = bool((episode.eta > 0).any()), None
         if controlled:
             episode, anchor = self._reselected(episode, world, ego_plan, noise[0])
+            episode = self._followed(episode, world, anchor)
             world = replace(world, route=episode.routed.route)
         context = self._encode(episode, world, ego_plan, episode.coalition)
         where = self._where(episode, world, ego_plan)
@@ -212,7 +226,8 @@ class Synthesizer:
         depth = chain_depth(episode.target)
         skeleton = Skeleton(episode.coalition, episode.target, depth, depth == 1, depth > 1, episode.replans,
                             episode.replans)
-        return propose(world.scene, world, skeleton, ego_plan, self.settings.anchor, keep_route=True)
+        return propose(world.scene, world, skeleton, ego_plan, self.settings.anchor, self.settings.interception,
+                       episode.eta, keep_route=True)
 
     def _select(self, episode: Episode, world: World, ego_plan: Tensor, noise: Tensor) -> Episode:
         """Topology on a reference rollout, feasibility, skeleton; the coalition takes the routes that meet targets."""
@@ -225,9 +240,14 @@ class Synthesizer:
         feasible = self.feasible_vehicles(scene, world, self.settings.feasibility).mask
         steps = round(self.settings.skeleton.step / DT)
         expected = reference[:, steps - 1::steps].transpose(1, 2)
-        skeleton = build_skeleton(scene, world, found.candidates & feasible, feasible, self.settings.skeleton, expected)
+        support, fallback = self._support(episode, world, found.candidates, feasible)
+        everybody = direct(support | fallback)  # whom it costs least to meet the ego are the near agents
+        cost = propose(scene, world, everybody, ego_plan, self.settings.anchor, self.settings.interception,
+                       episode.eta).cost
+        skeleton = build_skeleton(scene, world, support, fallback, self.settings.skeleton, expected, cost)
         self._count(skeleton, found.candidates, feasible)
-        anchor = propose(scene, world, skeleton, ego_plan, self.settings.anchor)
+        anchor = propose(scene, world, skeleton, ego_plan, self.settings.anchor, self.settings.interception,
+                         episode.eta)
         # A member that no route and acceleration lead to its target is pruned (Sec. IV-A3: infeasible configurations),
         # and so is everybody whose chain to the ego leads over it.
         acts = skeleton.coalition & anchor.has & (episode.eta > 0)[:, None]
@@ -237,9 +257,22 @@ class Synthesizer:
             episode, coalition=acts, target=torch.where(acts, skeleton.target, -1),
             adversaries=episode.adversaries | acts), world, torch.where(acts, anchor.route, world.route))
 
+    def _support(self, episode: Episode, world: World, candidates: Tensor, feasible: Tensor) -> tuple[Tensor, Tensor]:
+        """S [B, V] and who may take its place where it is empty, by `support` (eq. support_selection)."""
+        if self.settings.support == "random":
+            there = world.valid[:, :feasible.shape[1]] & ~episode.routed.parked
+            there = there & (torch.arange(feasible.shape[1], device=there.device) > 0)
+            draw = noise_of(episode.seed, SUPPORT + episode.replans, tuple(feasible.shape[1:]), uniform=True)
+            rank = draw.masked_fill(~there, torch.inf).argsort(-1).argsort(-1)
+            chosen = there & (rank < self.settings.skeleton.near)
+            return chosen, chosen
+        if self.settings.support == "topology":
+            return candidates, candidates
+        return candidates & feasible, feasible
+
     def _reroute(self, episode: Episode, world: World, route: Tensor) -> Episode:
         """The episodes with vehicles moved to other candidates, placed on them where they are now."""
-        changed = route != episode.routed.route
+        changed = (route != episode.routed.route) | episode.leaves
         if not bool(changed.any()):
             return episode
         rows = changed.any(1).nonzero().squeeze(-1)
@@ -248,7 +281,20 @@ class Synthesizer:
         moved = locate(world.states[:, :route.shape[1]], old.a, old.kappa * old.v, routed.points)
         state = LaneState(*(torch.where(changed, getattr(moved, f.name), getattr(old, f.name))
                             for f in fields(LaneState)))
-        return replace(episode, routed=routed, state=state)
+        return replace(episode, routed=routed, state=state, leaves=episode.leaves & ~changed)
+
+    def _followed(self, episode: Episode, world: World, anchor: Anchor) -> Episode:
+        """The episodes with those who intercept on their ways, and those who did back on their lanes."""
+        leaves = anchor.leaves & episode.coalition & (episode.eta > 0)[:, None]
+        changed = leaves | episode.leaves
+        if not bool(changed.any()):
+            return episode
+        old = episode.state
+        routed = follow_ways(episode.routed, world.scene, changed, leaves, anchor.points, old.s)
+        moved = locate(world.states[:, :changed.shape[1]], old.a, old.kappa * old.v, routed.points)
+        state = LaneState(*(torch.where(changed, getattr(moved, f.name), getattr(old, f.name))
+                            for f in fields(LaneState)))
+        return replace(episode, routed=routed, state=state, leaves=leaves)
 
     def _where(self, episode: Episode, world: World, ego_plan: Tensor) -> PotentialContext:
         vehicles = episode.routed.route.shape[1]
