@@ -30,8 +30,8 @@ from e2rl.synthesizer.synthesizer import Synthesizer, SynthesizerSettings
 from e2rl.synthesizer.topology import TopologySettings
 
 PARTS = {"topology": TopologySettings, "feasibility": FeasibilitySettings, "reasoner": ReasonerSettings,
-         "skeleton": SkeletonSettings, "anchor": AnchorSettings, "interception": InterceptionSettings, "potentials": PotentialSettings,
-         "control": ControlSettings}
+         "skeleton": SkeletonSettings, "anchor": AnchorSettings, "interception": InterceptionSettings,
+         "potentials": PotentialSettings, "control": ControlSettings}
 BASELINES: dict[str, Callable[[Prior], Baseline]] = {  # under the bounds of the prior that they stand beside
     "replay": lambda prior: Replay(), "constant_velocity": lambda prior: ConstantVelocity(),
     "idm": lambda prior: IDM(prior.bounds)}

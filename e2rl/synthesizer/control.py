@@ -34,12 +34,12 @@ class ControlSettings:
 
     gradient: str = "denoiser"
     scaling: str = "sigma"
-    adversarial_clip: float = 0.3
+    adversarial_clip: float = 0.5
     feasibility: float = 1.0
     feasibility_clip: float = 0.5
     feasibility_scope: str = "all"
     anchoring: str = "clean"
-    anchor_level: float = 0.5
+    anchor_level: float = 0.2
 
     def __post_init__(self):
         for name, choices in (("gradient", ("denoiser", "clean")), ("scaling", ("score", "sigma", "unit")),

@@ -13,6 +13,8 @@ from e2rl.sim.mission import mission_of
 from e2rl.sim.world import World
 from e2rl.synthesizer.motion import arrival_window, place
 
+APART = 10.0  # s a metre: lines that touch meet there, and not where they only come near
+
 
 @dataclass(frozen=True)
 class FeasibilitySettings:
@@ -21,7 +23,7 @@ class FeasibilitySettings:
     horizon: float = 5.0
     lateral_bound: float = 2.0
     heading_bound: float = 0.8
-    corridor: float = 2.5
+    corridor: float = 6.0
     sample_spacing: float = 3.0
     sample_reach: float = 120.0
     brake: float = 5.0
@@ -102,7 +104,7 @@ def _meetings(samples: dict[str, Tensor], ego: dict[str, Tensor], settings: Feas
     """Best pair of samples of each candidate [Q] with the mission: index on both [Q], offset, earliest, latest [Q].
 
     Of the pairs closer than the corridor that both can occupy at once, the one whose nominal arrival times differ
-    least; offset is inf where there is none.
+    least, where the lines touch if they do anywhere; offset is inf where there is none.
     """
     squared = torch.cdist(samples["xy"], ego["xy"], compute_mode="use_mm_for_euclid_dist").square()
     earliest = torch.maximum(samples["earliest"][:, :, None], ego["earliest"][:, None])
@@ -111,11 +113,13 @@ def _meetings(samples: dict[str, Tensor], ego: dict[str, Tensor], settings: Feas
     meets = (squared < settings.corridor**2) & (earliest <= latest)
     meets &= samples["inside"][:, :, None] & ego["inside"][:, None]
     prefer = torch.arange(nominal.shape[1], device=nominal.device)[:, None] * 1e-3  # of equals the first
-    cost = (nominal + prefer).masked_fill(~meets, torch.inf).flatten(1)
+    apart = (squared.sqrt() - settings.sample_spacing).clamp(min=0)
+    cost = (nominal + prefer + APART * apart).masked_fill(~meets, torch.inf).flatten(1)
     pick = cost.argmin(-1, keepdim=True)
-    found = (x.flatten(1).gather(1, pick)[:, 0] for x in (earliest, latest))
+    nominal = nominal.masked_fill(~meets, torch.inf)
+    found = (x.flatten(1).gather(1, pick)[:, 0] for x in (nominal, earliest, latest))
     count = ego["xy"].shape[1]
-    return pick[:, 0] // count, pick[:, 0] % count, cost.gather(1, pick)[:, 0], *found
+    return pick[:, 0] // count, pick[:, 0] % count, *found
 
 
 def _sample(route: Tensor, s: Tensor, end: Tensor, speed: Tensor, length: Tensor, limits: tuple[float, float, float],

@@ -1,6 +1,6 @@
 """Interceptions: proposals that no lane leads to (Sec. IV-B1), a smooth way from a vehicle's pose to its target's path.
 
-A lane-graph proposal can only choose when a vehicle is where its lane leads, and every planner expects it there. Whoever
+A lane-graph proposal can only choose when a vehicle is where its lane leads, where every planner expects it. Whoever
 drifts over, cuts in or turns in early leaves its lane for a few seconds. Here is that way in closed form: a cubic from
 the pose to where the target will be at one of several moments, driven at one constant acceleration, on the drivable
 area, clear of everybody else, within limits of acceleration that grow with the intensity. The prior then plans along
@@ -152,7 +152,8 @@ def intercept(scene: TensorDictBase, states: Tensor, size: Tensor, target: Tenso
     gone = (v[..., None] * moments + 0.5 * accel[..., None] * moments**2).clamp(min=0)
     gone = gone.masked_fill(moments >= time[..., None], -1.0)
     ok &= _clear(ways, gone, size, (others[0][:, :, :, steps - 1], *others[1:]))
-    cost = settings.accel_cost * accel.abs() + settings.lateral_cost * lateral + settings.time_cost * time - settings.preference
+    cost = settings.accel_cost * accel.abs() + settings.lateral_cost * lateral + settings.time_cost * time
+    cost = cost - settings.preference
     return _cheapest(ways, accel, time, cost.masked_fill(~ok, torch.inf), scene["route_points"].shape[3])
 
 

@@ -88,6 +88,12 @@ class Episode:
     kl: Tensor
     jump: Tensor
 
+    @classmethod
+    def start(cls, seed: Tensor, eta: Tensor, routed: RoutedScene, state: LaneState) -> "Episode":
+        """Episodes whose first replan is due: nobody is controlled yet."""
+        none, zero = torch.zeros_like(routed.parked), torch.zeros_like(routed.length)
+        return cls(seed, eta, torch.zeros_like(seed), routed, state, none, none.long() - 1, none, none, zero, zero)
+
 
 def take_rows(value, rows: Tensor):
     """Rows of every tensor in a nested dataclass; None stays None."""
@@ -136,9 +142,7 @@ class Synthesizer:
         """Episodes of scenes [B] with routes drawn from the prior; seed [B] int64, eta [B]."""
         uniform = noise_of(seed, torch.zeros_like(seed), tuple(scene["route_valid"].shape[1:]), uniform=True)
         routed, state = self.prior.start(scene, self.prior.choose_routes(scene, uniform))
-        none = torch.zeros_like(routed.parked)
-        zero = torch.zeros_like(routed.length)
-        return Episode(seed, eta, torch.zeros_like(seed), routed, state, none, none.long() - 1, none, none, zero, zero)
+        return Episode.start(seed, eta, routed, state)
 
     def replan(self, episode: Episode, world: World, ego_plan: Tensor) -> tuple[Episode, Plan]:
         """The episodes and the plan of the coming HORIZON steps, given the ego's plan [B, HORIZON, 4] (detached)."""

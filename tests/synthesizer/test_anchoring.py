@@ -7,6 +7,7 @@ from e2rl.errors import InputError
 from e2rl.prior.lane_relative import LaneState, speeds
 from e2rl.scene.recording import DT
 from e2rl.synthesizer.anchoring import AnchorSettings, blend_clean, blend_literal, propose
+from e2rl.synthesizer.interception import InterceptionSettings
 from e2rl.synthesizer.motion import cruise
 from e2rl.synthesizer.skeleton import SkeletonSettings, build_skeleton
 from tests.synthesizer.crossing import add_route, make_world, mask
@@ -16,11 +17,19 @@ EGO = (0.0, 0.0, 0.0, 10.0)
 TIMES = DT * torch.arange(1, 51)
 
 
+LANES = InterceptionSettings(reach=0.0)
+
+
+def proposed(world, skeleton, plan, settings=None, interception=LANES, eta=2.0, **options):
+    return propose(world.scene, world, skeleton, plan, settings or AnchorSettings(), interception,
+                   torch.full((len(plan),), eta), **options)
+
+
 def anchored(world, *vehicles, near=2, **settings):
     support = mask(world, *vehicles)
     skeleton = build_skeleton(world.scene, world, support, support, SkeletonSettings(near=near))
     plan = cruise(world.scene, world, TIMES)[:, 0]
-    return propose(world.scene, world, skeleton, plan, AnchorSettings(**settings)), skeleton
+    return proposed(world, skeleton, plan, AnchorSettings(**settings)), skeleton
 
 
 def travelled(knots, speed, accel=0.0):
@@ -39,7 +48,7 @@ def test_both_arrive_at_the_crossing_at_once(ahead, way, speed):
     gone = travelled(anchor.knots[0, 1], speed)
     arrival = torch.searchsorted(gone, torch.tensor(way)).item() * DT
     assert arrival == pytest.approx(ahead / 10, abs=0.25)
-    assert anchor.offset[0, 1] < 0.25 and anchor.lateral[0, 1] == 0
+    assert anchor.cost[0, 1] < 0.25 + 0.2 * anchor.knots[0, 1].abs().max() and not anchor.leaves.any()
 
 
 def test_the_gentlest_of_equal_arrivals_wins():
@@ -81,9 +90,9 @@ def test_a_kept_route_is_the_only_one_looked_at():
     support = mask(world, 1)
     skeleton = build_skeleton(world.scene, world, support, support, SkeletonSettings())
     plan = cruise(world.scene, world, TIMES)[:, 0]
-    assert not propose(world.scene, world, skeleton, plan, AnchorSettings(), keep_route=True).has.any()
+    assert not proposed(world, skeleton, plan, keep_route=True).has.any()
     world.route[:, 1] = 2
-    kept = propose(world.scene, world, skeleton, plan, AnchorSettings(), keep_route=True)
+    kept = proposed(world, skeleton, plan, keep_route=True)
     assert kept.has[0, 1] and torch.equal(kept.route, world.route)
 
 
@@ -91,7 +100,7 @@ def test_who_cannot_meet_the_target_has_no_anchor_and_keeps_its_route():
     world = make_world([EGO, (40.0, 30.0, UP, 8.0), (10.0, -90.0, UP, 5.0)])
     anchor, skeleton = anchored(world, 1, 2)
     assert skeleton.coalition[0, 1:3].all() and not anchor.has.any() and not anchor.knots.any()
-    assert torch.equal(anchor.route, world.route) and anchor.offset.isinf().all()
+    assert torch.equal(anchor.route, world.route) and anchor.cost.isinf().all()
 
 
 def test_a_chain_s_first_link_meets_its_target_not_the_ego():

@@ -38,8 +38,8 @@ class Case:
         target = torch.where(self.coalition, 0, -1)
         self.where = PotentialContext(self.scene, self.scene["start"][:, :ROWS], state.a, self.scene["valid"][:, :ROWS],
                                       routed.points, routed.has_lane, plan, target)
-        self.anchor = Anchor(route, torch.full((count, ROWS, KNOTS), -2.0), torch.zeros(count, ROWS),
-                             self.coalition.clone(), torch.zeros(count, ROWS))
+        self.anchor = Anchor(route, torch.full((count, ROWS, KNOTS), -2.0), self.coalition.clone(),
+                             torch.zeros(count, ROWS), self.coalition & False, routed.points)
         self.generator = torch.Generator().manual_seed(0)
         self.noise = torch.randn(self.prior.sampler.steps, count, ROWS, SIZE, generator=self.generator)
 

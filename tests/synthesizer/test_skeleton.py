@@ -6,6 +6,7 @@ import torch
 from e2rl.errors import InputError
 from e2rl.synthesizer.anchoring import AnchorSettings, propose
 from e2rl.synthesizer.feasibility import FeasibilitySettings, feasible_vehicles
+from e2rl.synthesizer.interception import InterceptionSettings
 from e2rl.synthesizer.skeleton import (
     NEAREST_FEASIBLE,
     NOBODY,
@@ -128,6 +129,6 @@ def test_an_ego_alone_passes_through_every_room():
                                    TopologySettings())
     feasible = feasible_vehicles(scene, world, FeasibilitySettings()).mask
     result = build(world, found.candidates & feasible, feasible)
-    anchor = propose(scene, world, result, plan, AnchorSettings())
+    anchor = propose(scene, world, result, plan, AnchorSettings(), InterceptionSettings(), torch.full((2,), 2.0))
     assert not (found.candidates | feasible | result.coalition | anchor.has).any()
     assert result.source.tolist() == [NOBODY, NOBODY]

@@ -33,8 +33,7 @@ class Baseline(ABC):
         vehicles = routed.route.shape[1]
         state = locate(scene["start"][:, :vehicles], scene["start_accel"][:, :vehicles],
                        scene["start_yaw_rate"][:, :vehicles], routed.points, torch.full_like(routed.length, ARRIVAL))
-        none, zero = torch.zeros_like(routed.parked), torch.zeros_like(routed.length)
-        return Episode(seed, eta, torch.zeros_like(seed), routed, state, none, none.long() - 1, none, zero, zero)
+        return Episode.start(seed, eta, routed, state)
 
     @torch.no_grad()
     def replan(self, episode: Episode, world: World, ego_plan: Tensor) -> tuple[Episode, Plan]:
