@@ -7,6 +7,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.scene.route import SPACING
+from e2rl.sim.dynamics import wrap
 
 CONFLICT_STRIDE = 2  # vertices: conflicts are looked for every 4 m
 CONFLICT_RANGE = 80  # vertices ahead of the route's begin
@@ -55,8 +56,9 @@ def route_scene(scene: TensorDictBase, route: Tensor, free_space: bool = False) 
     points = take_route(scene["route_points"], route)
     valid, parked = scene["valid"][:, :vehicles], scene["parked"][:, :vehicles]
     has_lane = take_route(scene["route_valid"], route)
-    pairs = [_conflicts(points[b:b + 1]) for b in range(len(points))]  # a scene at a time keeps the pairs in the cache
-    conflict, conflict_s, crossing = (torch.cat(parts) for parts in zip(*pairs, strict=True))
+    everybody = torch.arange(vehicles, device=points.device)
+    pairs = [_conflicts(scene_points, everybody)[0] for scene_points in points]
+    conflict, conflict_s, crossing = (torch.stack(parts) for parts in zip(*pairs, strict=True))
     both = (valid & ~parked & has_lane)
     conflict = conflict & both[:, :, None] & both[:, None, :]
     return RoutedScene(
@@ -66,51 +68,52 @@ def route_scene(scene: TensorDictBase, route: Tensor, free_space: bool = False) 
         crossing, valid & ~parked, parked, has_lane & (not free_space))
 
 
-def follow_ways(routed: RoutedScene, scene: TensorDictBase, who: Tensor, leaves: Tensor, ways: Tensor,
-                state_s: Tensor) -> RoutedScene:
-    """The scenes with vehicles who [B, V] on other lines: those that leave their lanes [B, V] on ways [B, V, P, 2],
-    the others back on their candidates. On a way there are no lights, and the limit is that of the lane at s."""
-    route, off = routed.route, leaves & who
-    vertex = (state_s / SPACING).round().long().clamp(0, routed.limit.shape[-1] - 1)[..., None]
-    here = routed.limit.gather(-1, vertex).expand_as(routed.limit)
+def reroute(routed: RoutedScene, scene: TensorDictBase, route: Tensor, who: Tensor, leaves: Tensor, ways: Tensor,
+            free_space: bool = False) -> RoutedScene:
+    """`routed` with vehicles who [B, V] on other lines: their candidates route [B, V], or, for those that leave their
+    lanes [B, V], ways [B, V, P, 2]. On a way there are no lights; its limit is the highest of the candidate's."""
+    off = leaves & who
+    keys = ("points", "length", "open", "limit", "light", "light_s", "valid")
+    lane = {key: take_route(scene[f"route_{key}"], route) for key in keys}
 
-    def change(old: Tensor, lane: Tensor, way: Tensor) -> Tensor:
+    def change(old: Tensor, lane: Tensor, way: Tensor | float) -> Tensor:
         extra = [1] * (old.dim() - 2)
-        new = torch.where(off.view(*off.shape, *extra), way, lane)
+        new = torch.where(off.view(*off.shape, *extra), torch.as_tensor(way, dtype=old.dtype, device=old.device), lane)
         return torch.where(who.view(*who.shape, *extra), new, old)
 
-    lane = {key: take_route(scene[f"route_{key}"], route)
-            for key in ("points", "length", "open", "limit", "light", "light_s")}
     points = change(routed.points, lane["points"], ways)
-    length = torch.full_like(routed.length, SPACING * (points.shape[2] - 1))
-    conflict, conflict_s, crossing = routed.conflict.clone(), routed.conflict_s.clone(), routed.crossing.clone()
+    pairs = [value.clone() for value in (routed.conflict, routed.conflict_s, routed.crossing)]
     for b in who.any(1).nonzero()[:, 0].tolist():
-        conflict[b:b + 1], conflict_s[b:b + 1], crossing[b:b + 1] = _conflicts(points[b:b + 1])
-    both = routed.modelled & routed.has_lane
+        rows = who[b].nonzero()[:, 0]
+        for old, mine, theirs in zip(pairs, *_conflicts(points[b], rows), strict=True):
+            old[b][:, rows], old[b][rows] = theirs.T, mine
+    both = routed.modelled & lane["valid"]
     return replace(
-        routed, points=points, conflict=conflict & both[:, :, None] & both[:, None], conflict_s=conflict_s,
-        crossing=crossing, length=change(routed.length, lane["length"], length),
-        open=change(routed.open, lane["open"], torch.zeros_like(off)),
-        limit=change(routed.limit, lane["limit"], here),
-        light=change(routed.light, lane["light"], torch.full_like(routed.light, -1)),
-        light_s=change(routed.light_s, lane["light_s"], torch.zeros_like(routed.light_s)))
+        routed, route=torch.where(who, route, routed.route), points=points,
+        length=change(routed.length, lane["length"], SPACING * (points.shape[2] - 1)),
+        open=change(routed.open, lane["open"], False),
+        limit=change(routed.limit, lane["limit"], lane["limit"].amax(-1, keepdim=True)),
+        light=change(routed.light, lane["light"], -1), light_s=change(routed.light_s, lane["light_s"], 0.0),
+        conflict=pairs[0] & both[:, :, None] & both[:, None], conflict_s=pairs[1], crossing=pairs[2],
+        has_lane=change(routed.has_lane, lane["valid"] & (not free_space), not free_space))
 
 
-def _conflicts(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """First meeting of every route pair of points [B, V, P, 2] (see RoutedScene)."""
-    line = points[:, :, :CONFLICT_RANGE:CONFLICT_STRIDE]
-    batch, vehicles, count, _ = line.shape
-    flat = line.reshape(batch, vehicles * count, 2)
-    center = flat.mean(1, keepdim=True)
-    near = torch.cdist(flat - center, flat - center) < CONFLICT_GAP
-    near = near.reshape(batch, vehicles, count, vehicles, count)
-    meets = near.any(-1)  # [B, V, C, V]: this vertex of i meets j's route somewhere
-    first = meets.float().argmax(2)  # [B, V, V]
-    conflict = meets.any(2) & ~torch.eye(vehicles, dtype=torch.bool, device=points.device)
-    tangent = torch.gradient(line, dim=2)[0]
+def _conflicts(points: Tensor, rows: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """First meetings of routes rows [C] with every route of points [V, P, 2], a scene at a time (its pairs stay in the
+    cache): conflict, conflict_s and crossing (see RoutedScene) of each of rows with each [C, V], and of each [V] with
+    each of rows, also as [C, V]."""
+    line = points[:, :CONFLICT_RANGE:CONFLICT_STRIDE]
+    vehicles, count, _ = line.shape
+    flat = line.reshape(-1, 2)
+    flat = flat - flat.mean(0)
+    near = torch.cdist(flat.view(vehicles, count, 2)[rows].flatten(0, 1), flat) < CONFLICT_GAP
+    near = near.view(len(rows), count, vehicles, count)
+    meets = near.any(3)  # [C, K, V]: this vertex of a row's route meets the other somewhere
+    first, other = meets.float().argmax(1), near.any(1).float().argmax(2)  # the same place unless they share a stretch
+    conflict = meets.any(1) & (rows[:, None] != torch.arange(vehicles, device=rows.device))
+    tangent = torch.gradient(line, dim=1)[0]
     angle = torch.atan2(tangent[..., 1], tangent[..., 0])
-    mine = angle.gather(2, first)
-    at = first.transpose(1, 2)  # where j first meets i, on j's route: the same place unless they share a stretch
-    theirs = angle[:, None].expand(-1, vehicles, -1, -1).gather(3, at[..., None])[..., 0]
-    crossing = (theirs - mine + torch.pi) % (2 * torch.pi) - torch.pi
-    return conflict, first * (SPACING * CONFLICT_STRIDE), crossing
+    theirs = angle.gather(1, other.T).T
+    crossing = (theirs - angle[rows].gather(1, first) + torch.pi) % (2 * torch.pi) - torch.pi
+    way = SPACING * CONFLICT_STRIDE
+    return (conflict, first * way, crossing), (conflict, other * way, wrap(-crossing))

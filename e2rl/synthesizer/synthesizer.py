@@ -13,7 +13,7 @@ from torch import Tensor
 from e2rl.errors import InputError
 from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate
 from e2rl.prior.prior import Context, Plan, Prior
-from e2rl.prior.routed import RoutedScene, follow_ways, route_scene
+from e2rl.prior.routed import RoutedScene, reroute
 from e2rl.scene.recording import DT
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
@@ -164,7 +164,8 @@ class Synthesizer:
         controlled, anchor = bool((episode.eta > 0).any()), None
         if controlled:
             episode, anchor = self._reselected(episode, world, ego_plan, noise[0])
-            episode = self._followed(episode, world, anchor)
+            leaves = anchor.leaves & episode.coalition & (episode.eta > 0)[:, None]
+            episode = self._onto(episode, world, episode.routed.route, leaves, anchor.points)
             world = replace(world, route=episode.routed.route)
         context = self._encode(episode, world, ego_plan, episode.coalition)
         where = self._where(episode, world, ego_plan)
@@ -257,9 +258,9 @@ class Synthesizer:
         acts = skeleton.coalition & anchor.has & (episode.eta > 0)[:, None]
         for _ in range(self.settings.skeleton.max_chain - 1):
             acts = acts & ((skeleton.target <= 0) | acts.gather(1, skeleton.target.clamp(min=0)))
-        return self._reroute(replace(
-            episode, coalition=acts, target=torch.where(acts, skeleton.target, -1),
-            adversaries=episode.adversaries | acts), world, torch.where(acts, anchor.route, world.route))
+        episode = replace(episode, coalition=acts, target=torch.where(acts, skeleton.target, -1),
+                          adversaries=episode.adversaries | acts)
+        return self._onto(episode, world, torch.where(acts, anchor.route, world.route), acts & False, anchor.points)
 
     def _support(self, episode: Episode, world: World, candidates: Tensor, feasible: Tensor) -> tuple[Tensor, Tensor]:
         """S [B, V] and who may take its place where it is empty, by `support` (eq. support_selection)."""
@@ -274,28 +275,15 @@ class Synthesizer:
             return candidates, candidates
         return candidates & feasible, feasible
 
-    def _reroute(self, episode: Episode, world: World, route: Tensor) -> Episode:
-        """The episodes with vehicles moved to other candidates, placed on them where they are now."""
-        changed = (route != episode.routed.route) | episode.leaves
+    def _onto(self, episode: Episode, world: World, route: Tensor, leaves: Tensor, ways: Tensor) -> Episode:
+        """The episodes with vehicles moved to candidates route [B, V], or those that leave their lanes [B, V] to ways
+        [B, V, P, 2], placed on them where they are now. Who left its lane and leaves it no more returns."""
+        changed = (route != episode.routed.route) | leaves | episode.leaves
         if not bool(changed.any()):
             return episode
-        rows = changed.any(1).nonzero().squeeze(-1)
-        routed = put_rows(episode.routed, rows, route_scene(world.scene[rows], route[rows], self.prior.free_space))
+        routed = reroute(episode.routed, world.scene, route, changed, leaves, ways, self.prior.free_space)
         old = episode.state
         moved = locate(world.states[:, :route.shape[1]], old.a, old.kappa * old.v, routed.points)
-        state = LaneState(*(torch.where(changed, getattr(moved, f.name), getattr(old, f.name))
-                            for f in fields(LaneState)))
-        return replace(episode, routed=routed, state=state, leaves=episode.leaves & ~changed)
-
-    def _followed(self, episode: Episode, world: World, anchor: Anchor) -> Episode:
-        """The episodes with those who intercept on their ways, and those who did back on their lanes."""
-        leaves = anchor.leaves & episode.coalition & (episode.eta > 0)[:, None]
-        changed = leaves | episode.leaves
-        if not bool(changed.any()):
-            return episode
-        old = episode.state
-        routed = follow_ways(episode.routed, world.scene, changed, leaves, anchor.points, old.s)
-        moved = locate(world.states[:, :changed.shape[1]], old.a, old.kappa * old.v, routed.points)
         state = LaneState(*(torch.where(changed, getattr(moved, f.name), getattr(old, f.name))
                             for f in fields(LaneState)))
         return replace(episode, routed=routed, state=state, leaves=leaves)
