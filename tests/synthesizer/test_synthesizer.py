@@ -205,3 +205,16 @@ def test_the_ego_is_seen_as_it_drives_and_free_vehicles_beside_their_route(free_
     kept = placed.d[:, 1:6] - start.d[:, 1:6]
     torch.testing.assert_close(kept, torch.full_like(kept, 0.0 if free_space else 0.25), rtol=0, atol=1e-3)
     torch.testing.assert_close(placed.x[:, 1:], episode.state.x[:, 1:])
+
+
+def test_who_leaves_its_lane_returns_to_it_once_it_meets_nobody():
+    on, scene = synthesizer(reselect=0), scenes(3).scenes
+    world = world_of(scene)
+    lanes = begin(on, scene, 2.0)
+    episode, _ = on.replan(lanes, world, EGO.plan(world))
+    assert episode.leaves.any() and not (episode.leaves & ~episode.coalition).any()
+    moved = (episode.routed.points != lanes.routed.points).flatten(2).any(-1)
+    assert torch.equal(moved, episode.leaves)
+    nobody = replace(episode, coalition=episode.coalition & False, target=episode.target * 0 - 1)
+    calm, _ = on.replan(nobody, world, EGO.plan(world))
+    assert not calm.leaves.any() and torch.equal(calm.routed.points, lanes.routed.points)
