@@ -78,7 +78,8 @@ class SkeletonPicture:
         title = (f"{shorten(rollout['scene_id'])}   seed {rollout['seed']}   intensity {rollout['eta']:g}   "
                  f"{rollout['method']} vs {rollout['ego_policy']}   chosen at {self.step * rollout['dt']:.1f} s")
         draw.text((8 * UNIT, 5 * UNIT), title, font=drawing.font(16), fill=drawing.INK)
-        panels = ((f"time until boxes come within {self.settings.clearance:g} m [s], {self.time:.1f} s into the reference", self.matrix()),
+        within = f"{self.settings.clearance:g} m"
+        panels = ((f"s until boxes are within {within}, {self.time:.1f} s into the reference rollout", self.matrix()),
                   (f"risk graph then, edges of TTC < {self.ttc(self.settings.edge_threshold):.1f} s", self.graph()),
                   ("active chain, and the ways that came of it", self.chain()))
         for index, (caption, panel) in enumerate(panels):
