@@ -7,7 +7,7 @@ import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import ConfigKeyError, ConfigTypeError
+from omegaconf.errors import OmegaConfBaseException
 
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError, settings_of
@@ -104,7 +104,7 @@ def varied(config: DictConfig, name: str) -> DictConfig:
             raise InputError(f"variants.{name}: {key} is none of {', '.join(VARIED)}, nor in one of them")
         try:
             OmegaConf.update(changed, key, value, merge=True)
-        except (ConfigKeyError, ConfigTypeError) as error:
+        except OmegaConfBaseException as error:
             reason = str(error).splitlines()[0]
             raise InputError(f"variants.{name}: {key}={value}: {reason}; compare it with conf/") from error
     return changed
