@@ -4,12 +4,15 @@ At a scene's start: routes, reference rollout, topology, feasibility, skeleton. 
 sample under sparse control. With eta = 0 nothing is controlled, and the traffic is the prior's, bit for bit.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from e2rl.ego.base import Ego
 from e2rl.errors import InputError
 from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate
 from e2rl.prior.prior import Context, Plan, Prior
@@ -22,6 +25,7 @@ from e2rl.synthesizer.control import ControlSettings, SparseControl
 from e2rl.synthesizer.feasibility import FeasibilitySettings
 from e2rl.synthesizer.grouping import clone, crop_episode, crop_world, gather_plans, group_scenes, write_episode
 from e2rl.synthesizer.interception import InterceptionSettings
+from e2rl.synthesizer.lookahead import Lookahead
 from e2rl.synthesizer.potentials import (
     PotentialContext,
     PotentialSettings,
@@ -144,20 +148,23 @@ class Synthesizer:
         routed, state = self.prior.start(scene, self.prior.choose_routes(scene, uniform))
         return Episode.start(seed, eta, routed, state)
 
-    def replan(self, episode: Episode, world: World, ego_plan: Tensor) -> tuple[Episode, Plan]:
-        """The episodes and the plan of the coming HORIZON steps, given the ego's plan [B, HORIZON, 4] (detached)."""
+    def replan(self, episode: Episode, world: World, ego_plan: Tensor, ego: Ego | None = None) -> tuple[Episode, Plan]:
+        """The episodes and the plan of the coming HORIZON steps, given the ego's plan [B, HORIZON, 4] (detached); ego:
+        whom `control.lookahead` asks how it would react."""
         ego_plan = ego_plan.detach()
         noise = torch.stack([self._noise(episode, draw) for draw in range(self.settings.samples)])
         groups, (batch, width) = group_scenes(world), episode.routed.route.shape
         whole, plans = clone(episode), []
         for group in groups:
             part, plan = self._replan_group(crop_episode(episode, group, width), crop_world(world, group),
-                                            ego_plan[group.rows], noise[:, :, group.rows, :group.vehicles])
+                                            ego_plan[group.rows], noise[:, :, group.rows, :group.vehicles],
+                                            None if ego is None else partial(Lookahead(ego, world), group))
             write_episode(whole, part, group)
             plans.append((group, plan))
         return whole, gather_plans(plans, batch, width)
 
-    def _replan_group(self, episode: Episode, world: World, ego_plan: Tensor, noise: Tensor) -> tuple[Episode, Plan]:
+    def _replan_group(self, episode: Episode, world: World, ego_plan: Tensor, noise: Tensor,
+                      react: Callable[[Tensor], Tensor] | None) -> tuple[Episode, Plan]:
         """`replan` of a group; noise [samples, steps, B, V, SIZE]."""
         episode = replace(episode, state=self._placed(episode, world, ego_plan))
         world = replace(world, route=episode.routed.route)
@@ -169,7 +176,7 @@ class Synthesizer:
             world = replace(world, route=episode.routed.route)
         context = self._encode(episode, world, ego_plan, episode.coalition)
         where = self._where(episode, world, ego_plan)
-        control = self._control(episode, where, anchor) if controlled else None
+        control = self._control(episode, where, anchor, react) if controlled else None
         best = None
         for draw in noise:
             sample = self.prior.sample(context, draw, control)
@@ -294,11 +301,12 @@ class Synthesizer:
             world.scene, world.states[:, :vehicles], episode.state.a, world.valid[:, :vehicles], episode.routed.points,
             episode.routed.has_lane, ego_plan[:, :HORIZON], episode.target)
 
-    def _control(self, episode: Episode, where: PotentialContext, anchor: Anchor) -> SparseControl:
+    def _control(self, episode: Episode, where: PotentialContext, anchor: Anchor, react: Callable | None
+                 ) -> SparseControl:
         settings = self.settings
         literal = noise_of(episode.seed, LITERAL + episode.replans, (*episode.target.shape[1:], SIZE))
         return SparseControl(self.prior, settings.control, settings.potentials, where, episode.coalition, episode.eta,
-                             anchor, settings.anchor.strength, literal)
+                             anchor, settings.anchor.strength, literal, react)
 
     def _count(self, skeleton: Skeleton, candidates: Tensor, feasible: Tensor) -> None:
         """Running totals for logging."""
