@@ -155,6 +155,10 @@ def test_unknown_keys_and_choices(world, tmp_path, monkeypatch, capsys, script, 
     ("evaluate.py", ["ego._target_=no.such.Driver"], "ego=no.such.Driver"),
     ("evaluate.py", ["seeds=[]"], "seeds"), ("evaluate.py", ["methods=[e3]"], "e3"),
     ("evaluate.py", ["device=tpu9"], "device=tpu9"), ("train.py", ["resume=nowhere"], "resume=nowhere"),
+    ("evaluate.py", ["scene=9"], "scene=9"),
+    ("evaluate.py", ["scene=nowhere"], "scene=nowhere"), ("evaluate.py", ["figure=pie"], "figure=pie"),
+    ("evaluate.py", ["+variants.x={synthesizer.control.depth: 3}"], "depth"),
+    ("evaluate.py", ["+variants.x={synthesizer.support: best}"], "support is 'best'"),
     ("evaluate.py", ["eta=-1"], "eta"), ("evaluate.py", ["eta=abc"], "eta=abc"),
     ("evaluate.py", ["num_scenes=0"], "num_scenes=0"), ("evaluate.py", ["batch=0"], "batch=0"),
     ("evaluate.py", ["ego=actor", "ego.checkpoint=none.safetensors"], "none.safetensors"),
@@ -182,6 +186,47 @@ def test_skipped_scenes_are_counted_in_the_table(world, tmp_path, monkeypatch, c
     assert status == 0 and "left out sd_01.pkl: sd_01.pkl: track 7 is NaN" in said
     assert "left out: 1 scenes (invalid)" in " ".join((tmp_path / "run" / "tables.md").read_text().split())
     assert not list(tmp_path.rglob("*.npz"))
+
+
+SHORT = ["data.split=tune", "num_scenes=2", "data.workers=1", "data.build.steps=20", "data.build.vehicles=8",
+         "data.build.others=2", "data.build.field_cells=128", "prior.sampler.steps=2"]  # of the bundled scenes
+EXPERIMENTS = [
+    ("table2", [("random_k", 2), ("topology", 2), ("e2", 2), ("nominal", 0)], None),
+    ("table3", [("e2", 2), ("nominal", 0), ("no V_feas", 2), ("no V_adv", 2), ("no anchoring", 2),
+                ("literal anchoring", 2), ("no interception", 2), ("no proposal", 2), ("V_adv alone", 2)], None),
+    ("intensity", [("e2", 0), ("e2", 1), ("e2", 2), ("e2", 3)], "intensity.png"),
+    ("skeleton", [("e2", 2)], "skeleton.png"),
+]
+
+
+@pytest.mark.parametrize(("experiment", "methods", "figure"), EXPERIMENTS)
+def test_the_adversaries_experiments_have_their_rows_and_figures(world, tmp_path, monkeypatch, capsys, experiment,
+                                                                methods, figure):
+    """Two of the bundled scenes with the bundled prior; the paper's tables 2 and 3 and its figures."""
+    overrides = [f"experiment={experiment}", *SHORT, f"data.cache={world / 'bundled'}", "seeds=[0]",
+                 f"hydra.run.dir={tmp_path / 'run'}"]
+    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    assert status == 0, said
+    rows = read_metrics(tmp_path / "run" / "metrics.json")
+    assert [(row["method"], row["eta"]) for row in rows] == methods
+    assert all((row["n_scenes"], row["n_rollouts"]) == (2, 2) for row in rows)
+    assert all(len(row["paired"]) == len(methods) - 1 for row in rows)
+    for row in rows:
+        known = row["metrics"]["real_adv"]["n"]
+        assert known > 0 if row["eta"] else known == 0
+    assert len(list((tmp_path / "run" / "rollouts").glob("*.npz"))) == 2 * len(methods)
+    assert [path.name for path in (tmp_path / "run").glob("*.png")] == ([figure] if figure else [])
+
+
+def test_one_scene_is_driven_as_among_all(world, tmp_path, monkeypatch, capsys):
+    found = []
+    for which in ("scene=null", "scene=1"):
+        folder = tmp_path / which
+        status, said = call("evaluate.py", [*SHORT, f"data.cache={world / 'bundled'}", "seeds=[1]", "methods=[e2]",
+                                            which, "batch=1", f"hydra.run.dir='{folder}'"], monkeypatch, capsys)
+        assert status == 0, said
+        found.append({path.name: path.read_bytes() for path in (folder / "rollouts").glob("*.npz")})
+    assert len(found[0]) == 2 and len(found[1]) == 1 and found[1].items() <= found[0].items()
 
 
 def test_the_prior_s_experiment_has_rows_of_all_stages(world, tmp_path, monkeypatch, capsys):

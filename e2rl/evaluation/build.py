@@ -1,11 +1,13 @@
 """From a run's configuration to its objects: prior, synthesizers and methods, ego, simulator settings."""
 
+import copy
 from collections.abc import Callable
 
 import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError, settings_of
@@ -36,7 +38,8 @@ BASELINES: dict[str, Callable[[Prior], Baseline]] = {  # under the bounds of the
     "replay": lambda prior: Replay(), "constant_velocity": lambda prior: ConstantVelocity(),
     "idm": lambda prior: IDM(prior.bounds)}
 
-VARIED = ("checkpoint", "sampler", "bounds")  # of `prior` in the variants of a table
+FIGURES = ("intensity", "skeleton")
+VARIED = ("prior", "synthesizer")  # groups that the variants of a table may change
 
 
 def build_prior(config: DictConfig, device: str = "cpu") -> tuple[Prior, dict]:
@@ -57,21 +60,54 @@ def build_synthesizer(config: DictConfig, prior: Prior) -> Synthesizer | Baselin
 
 
 def build_methods(config: DictConfig, prior: Prior) -> list[Method]:
-    """The rows of `config.methods`, then the uncontrolled prior under each of `config.variants`."""
+    """The rows of `config.methods` and of those `config.variants` that it does not name, each at every `config.eta`."""
     synthesizer = build_synthesizer(config, prior)
     nominal = synthesizer if isinstance(synthesizer, Synthesizer) else Synthesizer(prior)
     methods = []
-    for name in dict.fromkeys(config.methods):
-        if name in BASELINES:
+    for name in dict.fromkeys([*config.methods, *config.variants]):
+        if name in config.variants:
+            changed = varied(config, name)
+            own = prior if changed.prior == config.prior else build_prior(changed, config.device)[0]
+            methods += at_intensities(name, build_synthesizer(changed, own), config)
+        elif name in BASELINES:
             methods.append(Method(name, BASELINES[name](prior), 0.0))
         elif name == "nominal":
             methods.append(Method(name, nominal, 0.0))
         else:
-            methods.append(Method(name, synthesizer, config.eta))
-    for name, changes in config.variants.items():
-        changed = OmegaConf.merge(config, {"prior": changes})
-        methods.append(Method(name, Synthesizer(build_prior(changed, config.device)[0]), 0.0))
+            methods += at_intensities(name, synthesizer, config)
     return methods
+
+
+def at_intensities(name: str, synthesizer: Synthesizer | Baseline, config: DictConfig) -> list[Method]:
+    """A row of the table at every intensity that is asked for; a baseline knows none but 0."""
+    etas = [0.0] if isinstance(synthesizer, Baseline) else intensities(config)
+    return [Method(name, synthesizer, eta) for eta in etas]
+
+
+def intensities(config: DictConfig) -> list[float]:
+    """`config.eta`, one or several; InputError for what is no intensity."""
+    etas = list(config.eta) if isinstance(config.eta, ListConfig) else [config.eta]
+    if not etas or not all(isinstance(eta, int | float) and 0 <= eta < float("inf") for eta in etas):
+        raise InputError(f"eta={config.eta}: the intensity is a number of at least 0 (0 to 3 are sensible), or a list "
+                         "of such numbers")
+    return [float(eta) for eta in dict.fromkeys(etas)]
+
+
+def varied(config: DictConfig, name: str) -> DictConfig:
+    """The configuration with the changes of `config.variants.NAME`, of dotted or nested keys; InputError for others
+    than those of VARIED."""
+    changed, changes = copy.deepcopy(config), config.variants[name]
+    if not isinstance(changes, DictConfig):
+        raise InputError(f"variants.{name}={changes}: expected changes, such as {{synthesizer.support: random}}")
+    for key, value in changes.items():
+        if key.split(".")[0] not in VARIED:
+            raise InputError(f"variants.{name}: {key} is none of {', '.join(VARIED)}, nor in one of them")
+        try:
+            OmegaConf.update(changed, key, value, merge=True)
+        except OmegaConfBaseException as error:
+            reason = str(error).splitlines()[0]
+            raise InputError(f"variants.{name}: {key}={value}: {reason}; compare it with conf/") from error
+    return changed
 
 
 def build_ego(config: DictConfig) -> Ego:
@@ -116,34 +152,48 @@ def check_protocol(config: DictConfig) -> None:
     """InputError for methods, seeds or an intensity that evaluate.py cannot run."""
     known = list(dict.fromkeys(["nominal", *BASELINES, config.synthesizer.name]))
     for name in config.methods:
-        if name not in known:
-            raise InputError(f"methods={list(config.methods)}: {name} is none of {', '.join(known)}; choose another "
-                             "with synthesizer=")
+        if name not in (*known, *config.variants):
+            raise InputError(f"methods={list(config.methods)}: {name} is none of "
+                             f"{', '.join([*known, *config.variants])}; choose another with synthesizer=")
     if not (config.methods or config.variants) or not config.seeds:
         raise InputError(f"methods={list(config.methods)}, seeds={list(config.seeds)}: name at least one of each")
-    for name, changes in config.variants.items():
-        if name in known or not isinstance(changes, DictConfig) or not set(changes) <= {*VARIED}:
-            raise InputError(f"variants.{name}={changes}: a new name, with changes to {', '.join(VARIED)} of `prior`")
+    for name in config.variants:
+        if name in known:
+            raise InputError(f"variants.{name}: {name} is a row already; choose another name")
+        varied(config, name)
+    check_figure(config)
     for key in ("open_loop_samples", "meta_rollouts"):
         if not isinstance(config[key], int) or config[key] < 0:
             raise InputError(f"{key}={config[key]}: expected a whole number of at least 0")
     if config.metrics not in CLOSED_LOOP:
         raise InputError(f"metrics={config.metrics}: choose one of {', '.join(CLOSED_LOOP)}")
-    if not isinstance(config.eta, int | float) or not 0 <= config.eta < float("inf"):
-        raise InputError(f"eta={config.eta}: the intensity is a number of at least 0 (0 to 3 are sensible)")
     if not all(isinstance(seed, int) for seed in config.seeds):
         raise InputError(f"seeds={list(config.seeds)}: sampling seeds are whole numbers")
     if config.num_scenes is not None and not (isinstance(config.num_scenes, int) and config.num_scenes > 0):
         raise InputError(f"num_scenes={config.num_scenes}: a whole number of at least 1, or null for all")
 
 
+def check_figure(config: DictConfig) -> None:
+    """InputError for intensities that are none, or for a figure that could not be drawn of the run."""
+    several = len(intensities(config)) > 1
+    if config.figure is None:
+        return
+    if config.figure not in FIGURES:
+        raise InputError(f"figure={config.figure}: choose one of {', '.join(FIGURES)}, or null")
+    if not config.save_rollouts:
+        raise InputError(f"figure={config.figure}: drawn from the rollouts' files; set save_rollouts=true")
+    if config.figure == "intensity" and not several:
+        raise InputError(f"figure=intensity, eta={config.eta}: name several intensities, such as eta=[0,1,2,3]")
+
+
 def caption(config: DictConfig, origin: dict) -> str:
     """What stands in every table's caption: the settings that all methods share."""
     sampler, bounds = config.prior.sampler, config.prior.bounds
     on = [name for name in ("meeting", "curve") if bounds[name]]
+    changes = "".join(f"; {name}: {what}".replace("'", "") for name, what in config.variants.items())
     return (f"Prior {config.prior.checkpoint} ({origin.get('data', 'unknown data')}); {sampler.sampler}, K = "
             f"{sampler.steps}, temperature {sampler.temperature:g} (routes {sampler.route_temperature:g}), one sample "
-            f"a replan, replanned every 0.5 s; acceleration bounds: {', '.join(on) or 'none'}")
+            f"a replan, replanned every 0.5 s; acceleration bounds: {', '.join(on) or 'none'}{changes}")
 
 
 def resolved(config: DictConfig) -> dict:

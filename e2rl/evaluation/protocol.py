@@ -36,21 +36,25 @@ class Method:
     eta: float
 
 
+SEEDS_APART = 1_000_003
+
+
 def scene_seed(scene: int, seed: int) -> int:
     """The noise seed of a rollout: the same for every method (paired)."""
-    return seed * 1_000_003 + scene
+    return seed * SEEDS_APART + scene
 
 
 def run_protocol(
     scenes: SceneSet, methods: list[Method], ego: Ego, ego_name: str, seeds: list[int], sim: SimSettings,
-    folder: Path | None = None, batch: int = 64, device: str = "cpu", save_rollouts: bool = True, **fields,
+    folder: Path | None = None, batch: int = 64, device: str = "cpu", save_rollouts: bool = True,
+    only: list[int] | None = None, **fields,
 ) -> list[dict]:
     """Roll out every method on every (scene, seed), score, and return the rows of metrics.json.
 
     folder: where rollouts/ (if save_rollouts), rollouts.csv and metrics.json are written (None: nowhere). fields join
-    each row.
+    each row. only: positions of the scenes to run, with the noise that they have among all (None: all).
     """
-    tasks = [(scene, seed) for seed in seeds for scene in range(len(scenes))]
+    tasks = [(scene, seed) for seed in seeds for scene in (range(len(scenes)) if only is None else only)]
     rows, features = [], []
     with tqdm(total=len(tasks) * len(methods), desc="rollouts", unit="rollout") as bar:
         for method in methods:

@@ -17,6 +17,7 @@ class Metric:
     weight: str = ""
     per: str = ""  # rows' column that the metric is a quotient by: sum over sum, not a mean of quotients
     pooled: bool = False  # computed from the samples of all rollouts together, not from the rows
+    median: bool = False  # over the rollouts that know it, instead of the mean
 
     @property
     def source(self) -> str:
@@ -35,6 +36,7 @@ MAIN = (
     Metric("rir", "rear impacts per collision", share=True),
     Metric("at_fault", "ego's fault, per collision", share=True),
     Metric("relvel", "speed difference before contact", unit="m/s"),
+    Metric("contact_time", "median time of the first contact", unit="s", median=True),
     Metric("min_dtc", "smallest gap to another agent", unit="m"),
     Metric("ttc_c", "time-to-collision cost, adversaries"),
     Metric("macc", "ego's mean |acceleration|", unit="m/s²"),
@@ -42,6 +44,7 @@ MAIN = (
     Metric("aor_step", "off the road, of vehicle-steps", share=True, weight="aor_vehicle_steps"),
     Metric("aor_any", "off the road, of rollouts", share=True),
     Metric("real", "realism, 1 - mean capped W1", pooled=True),
+    Metric("real_adv", "realism of the adversaries alone", pooled=True),
     Metric("real_norm", "realism, W1 over the log's range", pooled=True),
     Metric("transport", "path KL of the control"),
     Metric("seconds_per_rollout", "wall time", unit="s", column="seconds"),
@@ -69,7 +72,10 @@ METRICS = {metric.name: metric for metric in MAIN + EXTRA}
 TRAFFIC = tuple(METRICS[name] for name in (
     "cfr", "cfr_bg", "touched", "aor_step", "aor_any", "real", "real_norm", "w1_a_lon", "w1_a_lat", "w1_jerk",
     "parked_moved", "starts", "seconds_per_rollout"))  # what says whether background traffic is realistic
-CLOSED_LOOP = {"main": MAIN, "traffic": TRAFFIC}
+ADVERSARIES = tuple(METRICS[name] for name in (
+    "cfr", "cfr_adv", "avoidable", "contact_time", "front", "side", "rear", "rir", "relvel", "ttc_c", "cfr_bg",
+    "aor_step", "real", "real_adv", "transport"))  # what tells adversaries apart: failures found, and what they cost
+CLOSED_LOOP = {"main": MAIN, "traffic": TRAFFIC, "adversaries": ADVERSARIES}
 OPEN_LOOP = tuple(
     Metric(f"{name}_{horizon}", about.format(horizon), unit=unit) for horizon in (3, 5) for name, about, unit in (
         ("min_ade", "mean displacement over {} s, each vehicle's best sample", "m"),
@@ -89,7 +95,6 @@ IDENTITY = ("scene_id", "location", "seed", "eta")  # of a row, before its metri
 SEARCH = ("evasion_tried", "evasion_seconds")  # what the search for evasions took
 EVASION = ("avoidable", "avoidable_1s", "evasion_accel", *SEARCH)  # NaN until evaluation.avoidable has searched
 EVENT = (
-    "contact_time",
     "contact_type",
     "partner",
     "contact_step",

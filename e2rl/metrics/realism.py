@@ -3,7 +3,7 @@
 Longitudinal and lateral acceleration and |jerk| on means over blocks of 0.5 s, of the simulated vehicles other than the
 ego that move, in frames valid in both the rollout and its log; clipped (recorded tracks hold glitches), never dropped.
 real = 1 - mean_k min(1, W1_k) over the pooled samples of a set of rollouts; real_norm divides W1_k by the log's 5-95%
-range.
+range. real_adv is `real` of the adversaries alone, against the logs of the same vehicles.
 """
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from e2rl.sim.dynamics import wrap
 
 FEATURES = ("a_lon", "a_lat", "jerk")
+OF_ADVERSARIES = tuple(f"{name}_adversary" for name in FEATURES)
 CLIP = {"a_lon": 10.0, "a_lat": 10.0, "jerk": 20.0}  # m/s2, m/s2, m/s3
 BLOCK = 0.5  # s
 MOVING = 0.5  # m/s
@@ -41,6 +42,18 @@ def motion_features(
         for features, part in zip(result, sample.split(mask.sum((1, 2)).tolist(), 1), strict=True):
             features[name] = part.clone()
     return result
+
+
+def traffic_features(
+    states: Tensor, valid: Tensor, logged: Tensor, logged_valid: Tensor, agents: Tensor, adversaries: Tensor,
+    stop: Tensor, dt: float
+) -> list[dict[str, Tensor]]:
+    """`motion_features` of agents, and of those of them that are adversaries [B, N] under names of their own."""
+    tracks = states, valid, logged, logged_valid
+    everybody = motion_features(*tracks, agents, stop, dt)
+    theirs = motion_features(*tracks, agents & adversaries, stop, dt)
+    return [sample | dict(zip(OF_ADVERSARIES, own.values(), strict=True))
+            for sample, own in zip(everybody, theirs, strict=True)]
 
 
 def by_block(values: Tensor, block: int, blocks: int) -> Tensor:
@@ -89,12 +102,19 @@ def wasserstein(pair: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
 
 
 def realism(features: list[dict[str, Tensor]], cluster: Tensor, draws: Tensor) -> dict[str, Tensor]:
-    """real, real_norm, w1_a_lon, w1_a_lat, w1_jerk [D] of the pooled samples of rollouts, per draw of clusters [D, C].
+    """real, real_norm, w1_a_lon, w1_a_lat, w1_jerk and real_adv [D] of the pooled samples of rollouts, per draw of
+    clusters [D, C].
 
-    features as from `motion_features`, one entry per rollout of cluster [R] int64. NaN where a feature has no sample.
+    features as from `traffic_features`, one entry per rollout of cluster [R] int64. NaN where a feature has no sample.
     """
+    adversaries = _pooled(features, cluster, draws, OF_ADVERSARIES)
+    return _pooled(features, cluster, draws, FEATURES) | {"real_adv": adversaries["real"]}
+
+
+def _pooled(features: list[dict[str, Tensor]], cluster: Tensor, draws: Tensor, names: tuple[str, ...]):
+    """`realism` but for real_adv, of the samples of these names."""
     parts, ranges = [], []
-    for name in FEATURES:
+    for name in names:
         pair = torch.cat([sample[name] for sample in features], 1) if features else draws.new_zeros(2, 0)
         if not pair.shape[1]:
             return {key: draws.new_full((len(draws),), torch.nan) for key in ("real", "real_norm", *w1_names())}

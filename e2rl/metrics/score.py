@@ -24,14 +24,14 @@ from e2rl.metrics.proximity import (
     progress,
     smallest_gap,
 )
-from e2rl.metrics.realism import MOVING, motion_features, realism
+from e2rl.metrics.realism import MOVING, realism, traffic_features
 from e2rl.metrics.standing import standing_columns
 from e2rl.scene.recording import DT, VEHICLE
 
 CHUNK = 32  # rollouts scored at once: bounds the memory of the pairwise steps
 TRANSPORT = ("transport_adversary", "transport_others", "transport_anchor")
 MAP = ("lane_points", "lane_index", "lane_width", "drivable_points", "drivable_index")
-REALISM = ("real", "real_norm", "w1_a_lon", "w1_a_lat", "w1_jerk")
+REALISM = ("real", "real_norm", "w1_a_lon", "w1_a_lat", "w1_jerk", "real_adv")
 
 
 def score_rollouts(rollouts: dict, dt: float = DT) -> tuple[list[dict], list[dict[str, Tensor]]]:
@@ -79,7 +79,8 @@ def score_batch(batch: dict[str, Tensor], dt: float) -> tuple[dict[str, Tensor],
     columns |= touched_columns(batch, traffic & touched, traffic) | standing_columns(batch, traffic)
     columns |= motion_columns(batch, contact, dt)
     columns |= off_road(states, valid, traffic, stop, {key: batch[key] for key in MAP})
-    features = motion_features(states, valid, batch["logged"], batch["logged_valid"], traffic, stop, dt)
+    features = traffic_features(states, valid, batch["logged"], batch["logged_valid"], traffic, batch["adversaries"],
+                                stop, dt)
     once, owner = torch.ones(1, 1, dtype=states.dtype), torch.zeros(1, dtype=torch.int64)
     single = [realism([sample], owner, once) for sample in features]
     columns |= {name: torch.cat([values[name] for values in single]) for name in REALISM}

@@ -1,6 +1,6 @@
 """Means and 95% intervals over rollouts, bootstrapped by cluster: whole locations (or scenes) are drawn, not rollouts.
 
-Rows are the dicts of `metrics.score.score_rollouts`, features those of `metrics.realism.motion_features`, one of each
+Rows are the dicts of `metrics.score.score_rollouts`, features those of `metrics.realism.traffic_features`, one of each
 per rollout. Every resampled mean is a quotient of two sums that are linear in the clusters' multiplicities, hence one
 matrix product serves all draws and metrics. Fewer than two clusters with known values give no interval: NaN.
 """
@@ -16,7 +16,7 @@ from e2rl.metrics.realism import realism
 DRAWS = 1000
 REALISM_DRAWS = 400  # each costs a pass over all samples
 LEVELS = (0.025, 0.975)
-PER_COLLISION = frozenset({"avoidable", "avoidable_1s", "evasion_accel", "rir", "at_fault", "relvel"})
+PER_COLLISION = frozenset({"avoidable", "avoidable_1s", "evasion_accel", "rir", "at_fault", "relvel", "contact_time"})
 Row = dict[str, object]
 Features = dict[str, Tensor]
 
@@ -45,6 +45,28 @@ def resampled_means(totals: Tensor, weights: Tensor, cluster: Tensor, draws: Ten
     total = totals.new_zeros(shape).index_add(0, cluster, totals.masked_fill(unknown, 0.0))
     count = totals.new_zeros(shape).index_add(0, cluster, weights.masked_fill(unknown, 0.0))
     return (draws @ total) / (draws @ count)  # 0 / 0 is NaN
+
+
+def resampled_medians(values: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
+    """Median [D] of values [R] of rollouts in cluster [R], each as often as a draw [D, C] has its cluster; NaN ones are
+    left out, and a draw without any is NaN."""
+    known = ~values.isnan()
+    values, order = values[known].sort()
+    if not len(values):
+        return draws.new_full((len(draws),), torch.nan)
+    reached = draws[:, cluster[known][order]].cumsum(1)
+    half = reached[:, -1:] / 2
+    low, high = ((passed.long().argmax(1)) for passed in (reached >= half, reached > half))
+    return ((values[low] + values[high]) / 2).where(half[:, 0] > 0, torch.nan)
+
+
+def resampled(totals: Tensor, weights: Tensor, cluster: Tensor, draws: Tensor, metrics: Sequence[Metric]) -> Tensor:
+    """The metrics [D, M] of each draw, from `metric_table`'s values and weights: quotients of sums, or medians."""
+    table = resampled_means(totals, weights, cluster, draws)
+    for column, metric in enumerate(metrics):
+        if metric.median:
+            table[:, column] = resampled_medians(totals[:, column], cluster, draws)
+    return table
 
 
 def interval(samples: Tensor, known_clusters: int) -> dict[str, float]:
@@ -81,18 +103,24 @@ def summarise(
     cluster, clusters = cluster_index(rows)
     single = [metric for metric in METRICS.values() if not metric.pooled]
     totals, weights = metric_table(rows, single)
-    means = resampled_means(totals, weights, cluster, bootstrap_draws(clusters, draws))
+    means = resampled(totals, weights, cluster, bootstrap_draws(clusters, draws), single)
     known = ~totals.isnan() & (weights > 0)
     result = {
         metric.name: interval(means[:, column], len(cluster[known[:, column]].unique()))
         | {"n": int(known[:, column].sum())}
         for column, metric in enumerate(single)
     }
-    used = torch.tensor([bool(sample["a_lon"].numel()) for sample in features], dtype=torch.bool)
     pooled = realism(list(features), cluster, bootstrap_draws(clusters, realism_draws))
     for name, samples in pooled.items():
+        used = has_samples(features, name)
         result[name] = interval(samples, len(cluster[used].unique())) | {"n": int(used.sum())}
     return {name: result[name] for name in METRICS}
+
+
+def has_samples(features: Sequence[Features], name: str) -> Tensor:
+    """Bool [R]: rollouts with anything that the pooled metric `name` counts."""
+    key = "a_lon_adversary" if name == "real_adv" else "a_lon"
+    return torch.tensor([bool(sample[key].numel()) for sample in features], dtype=torch.bool)
 
 
 def paired_differences(
@@ -118,8 +146,8 @@ def paired_differences(
     strict = torch.tensor([metric.name not in PER_COLLISION for metric in single]) & matched
     first, second = first.masked_fill(strict, torch.nan), second.masked_fill(strict, torch.nan)
     multiplicities = bootstrap_draws(clusters, draws)
-    means = resampled_means(first, first_weight, cluster, multiplicities)
-    means = means - resampled_means(second, second_weight, cluster, multiplicities)
+    means = resampled(first, first_weight, cluster, multiplicities, single)
+    means = means - resampled(second, second_weight, cluster, multiplicities, single)
     result = {}
     for column, metric in enumerate(single):
         known = ~first[:, column].isnan() | ~second[:, column].isnan()
@@ -129,8 +157,10 @@ def paired_differences(
         realism([group[pair[side]] for pair in pairs], cluster, multiplicities)
         for side, group in enumerate((features, other_features))
     ]
-    used = torch.tensor([bool(features[a]["a_lon"].numel() and other_features[b]["a_lon"].numel()) for a, b in pairs])
     for name in samples[0]:
+        used = [has_samples([group[pair[side]] for pair in pairs], name)
+                for side, group in enumerate((features, other_features))]
+        used = used[0] & used[1]
         change = samples[0][name] - samples[1][name]
-        result[name] = interval(change, len(cluster[used.bool()].unique())) | {"n": int(used.sum())}
+        result[name] = interval(change, len(cluster[used].unique())) | {"n": int(used.sum())}
     return {name: {"difference": result[name].pop("mean"), **result[name]} for name in METRICS}

@@ -3,11 +3,15 @@
 World coordinates are metres with y up; a `View` says which square of the world a picture shows.
 """
 
+import io
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+
+from e2rl.evaluation.files import replace
 
 SUPERSAMPLING = 2
 GROUND, ROAD, CENTRELINE = "#eef0ec", "#d5d9df", "#f7f8fa"
@@ -168,3 +172,10 @@ def shade(colour: str, share: float) -> tuple[int, int, int]:
 def font(size: float) -> ImageFont.FreeTypeFont:
     """A font of a height in finished pixels."""
     return ImageFont.load_default(size=SUPERSAMPLING * size)
+
+
+def save_picture(path: Path, picture: Image.Image) -> None:
+    """Write a PNG, whole."""
+    buffer = io.BytesIO()
+    picture.save(buffer, "PNG", optimize=True)
+    replace(Path(path), buffer.getvalue())

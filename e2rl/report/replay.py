@@ -14,6 +14,7 @@ from e2rl.errors import InputError
 from e2rl.evaluation.files import ROLLOUTS, TABLE, read_rows, replace, rollout_name
 from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollout
 from e2rl.metrics.score import score_rollouts
+from e2rl.report import drawing
 from e2rl.report.picture import Replay
 
 FRAME_MS = 100  # real time at 10 Hz
@@ -34,9 +35,7 @@ def save_replay(replay: Replay, folder: Path) -> tuple[Path, Path]:
     name = rollout_name(replay.rollout).removesuffix(".npz")
     gif, png = Path(folder) / f"{name}.gif", Path(folder) / f"{name}.png"
     replace(gif, animation(replay.frames()))
-    buffer = io.BytesIO()
-    replay.strip().save(buffer, "PNG", optimize=True)
-    replace(png, buffer.getvalue())
+    drawing.save_picture(png, replay.strip())
     return gif, png
 
 

@@ -132,11 +132,13 @@ def counts(group: Sequence[dict], names: Sequence[str]) -> str:
 
 
 def column_names(group: Sequence[dict]) -> list[str]:
-    """method, with eta where it is not 0 and the stage where there is one."""
+    """method, with eta where it is not 0 or the method has several, and the stage where there is one."""
+    several = {row["method"] for row in group if any(
+        other["method"] == row["method"] and other["eta"] != row["eta"] for other in group)}
     return [
         " ".join(filter(None, (
             "" if row.get("stage") in STAGES else str(row.get("stage", "")),
-            row["method"], f"η={row['eta']:g}" if row["eta"] else "")))
+            row["method"], f"η={row['eta']:g}" if row["eta"] or row["method"] in several else "")))
         for row in group
     ]
 

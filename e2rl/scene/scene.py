@@ -96,6 +96,15 @@ class SceneSet:
         """Scenes [B] at `indices` (a sequence or tensor of positions)."""
         return self.scenes[torch.as_tensor(indices)]
 
+    def place(self, which: int | str) -> int:
+        """The position of a scene named by position or id; InputError where there is none."""
+        if isinstance(which, int) and 0 <= which < len(self):
+            return which
+        if which in self.scene_id:
+            return self.scene_id.index(which)
+        raise InputError(f"scene={which}: expected a position below {len(self)} or the id of a scene, such as "
+                         f"{self.scene_id[0]}")
+
     def first(self, count: int | None) -> "SceneSet":
         """The first `count` scenes (all for None)."""
         if count is None or count >= len(self):

@@ -26,6 +26,7 @@ from e2rl.synthesizer.potentials import (
 )
 
 MIN_ALPHA = 0.05
+TINY = 1e-12  # keeps a clip of 0, which is no shift at all, from 0 / 0
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class ControlSettings:
 
 def clip_rows(gradient: Tensor, limit: float) -> Tensor:
     """gradient [B, V, D] with each row's norm at most `limit`."""
-    return gradient * (limit / gradient.norm(dim=-1, keepdim=True).clamp(min=limit))
+    return gradient * (limit / gradient.norm(dim=-1, keepdim=True).clamp(min=max(limit, TINY)))
 
 
 def gradient_weight(schedule: NoiseSchedule, level: Tensor, scaling: str) -> Tensor:

@@ -34,6 +34,7 @@ from e2rl.synthesizer.potentials import (
     sampled_steps,
 )
 from e2rl.synthesizer.reasoner import ReasonerSettings, build_reasoner
+from e2rl.synthesizer.selection import Selection
 from e2rl.synthesizer.skeleton import Skeleton, SkeletonSettings, build_skeleton, chain_depth, direct
 from e2rl.synthesizer.topology import TopologySettings, topological_candidates
 
@@ -140,6 +141,7 @@ class Synthesizer:
         self.prior = prior.requires_grad_(False).eval()
         self.settings = settings or SynthesizerSettings()
         self.statistics: dict[str, float] = {}
+        self.on_selection: Callable[[Selection], None] | None = None  # told of every choice of coalitions
         self.feasible_vehicles = build_reasoner(self.settings.reasoner, self.statistics)
 
     def begin(self, scene: TensorDictBase, seed: Tensor, eta: Tensor) -> Episode:
@@ -267,6 +269,11 @@ class Synthesizer:
             acts = acts & ((skeleton.target <= 0) | acts.gather(1, skeleton.target.clamp(min=0)))
         episode = replace(episode, coalition=acts, target=torch.where(acts, skeleton.target, -1),
                           adversaries=episode.adversaries | acts)
+        if self.on_selection:
+            self.on_selection(Selection(
+                episode.seed, world.step, reference[:, found.steps],
+                (DT * (found.steps + 1)).expand(len(reference), -1), found.weights, found.candidates, feasible,
+                episode.coalition, episode.target))
         return self._onto(episode, world, torch.where(acts, anchor.route, world.route), acts & False, anchor.points)
 
     def _support(self, episode: Episode, world: World, candidates: Tensor, feasible: Tensor) -> tuple[Tensor, Tensor]:

@@ -85,6 +85,18 @@ def test_the_ego_the_parked_and_what_happens_after_the_stop_do_not_count():
         assert [sample[name].shape[1] for name in FEATURES] == [blocks - 1, blocks - 1, max(blocks - 2, 0)], stop
 
 
+def test_real_adv_is_real_of_a_traffic_of_adversaries_alone():
+    rollouts = random_rollouts(6, seed=3)
+    alone = rollouts | {"simulated": rollouts["simulated"] & rollouts["adversaries"]}
+    draws, cluster = once(6)
+    ours, theirs = (realism(features_of(given), cluster, draws) for given in (rollouts, alone))
+    assert ours["real_adv"] == theirs["real"] == theirs["real_adv"] and ours["real_adv"] != ours["real"]
+    nobody = rollouts | {"adversaries": torch.zeros_like(rollouts["adversaries"])}
+    rows, features = score_rollouts(nobody)
+    table = realism(features, cluster, draws)
+    assert table["real_adv"].isnan() and table["real"] == ours["real"] and rows[0]["real_adv"] != rows[0]["real_adv"]
+
+
 def test_a_constant_turn_has_its_lateral_acceleration():
     time = torch.arange(81, dtype=torch.float64) * 0.1
     states = torch.stack([time, time, 3.0 + 0.2 * time, 4.0 + 0.5 * time], -1)[None, :, None].expand(1, 81, 2, 4)

@@ -148,7 +148,7 @@ def test_moving_the_world_changes_no_metric():
 
 def test_every_metric_of_the_design_is_summarised_in_its_order():
     rows, features = score_rollouts(random_rollouts(4))
-    assert list(summarise(rows, features, draws=20, realism_draws=5))[:21] == [
+    assert list(summarise(rows, features, draws=20, realism_draws=5))[:23] == [
         "cfr",
         "cfr_adv",
         "cfr_vru",
@@ -160,6 +160,7 @@ def test_every_metric_of_the_design_is_summarised_in_its_order():
         "rir",
         "at_fault",
         "relvel",
+        "contact_time",
         "min_dtc",
         "ttc_c",
         "macc",
@@ -167,6 +168,7 @@ def test_every_metric_of_the_design_is_summarised_in_its_order():
         "aor_step",
         "aor_any",
         "real",
+        "real_adv",
         "real_norm",
         "transport",
         "seconds_per_rollout",

@@ -5,14 +5,22 @@ import math
 import pytest
 import torch
 
+from e2rl.metrics.realism import FEATURES, OF_ADVERSARIES
 from e2rl.metrics.score import score_rollouts
-from e2rl.metrics.statistics import bootstrap_draws, cluster_index, paired_differences, resampled_means, summarise
+from e2rl.metrics.statistics import (
+    bootstrap_draws,
+    cluster_index,
+    paired_differences,
+    resampled_means,
+    resampled_medians,
+    summarise,
+)
 from tests.metrics.random_rollouts import random_rollouts
 
 
 def rows_of(values, clusters=None, name="cfr", **columns):
     """Rows that know one metric, one scene each, and features without samples."""
-    empty = {key: torch.zeros(2, 0, dtype=torch.float64) for key in ("a_lon", "a_lat", "jerk")}
+    empty = {key: torch.zeros(2, 0, dtype=torch.float64) for key in (*FEATURES, *OF_ADVERSARIES)}
     rows = [
         {"scene_id": f"s{index}", "location": str(clusters[index]) if clusters else "", "seed": 0, name: value}
         | {key: column[index] for key, column in columns.items()}
@@ -62,6 +70,20 @@ def test_unknown_values_are_left_out_and_counted_and_never_zero():
     assert table["relvel"]["n"] == 2 and table["relvel"]["mean"] == 0.5
     assert table["progress"]["n"] == 0 and math.isnan(table["progress"]["mean"])
     assert table["real"]["n"] == 0 and math.isnan(table["real"]["mean"])
+
+
+def test_a_median_draw_is_the_median_of_the_repeated_values():
+    generator = torch.Generator().manual_seed(0)
+    values, cluster = torch.rand(41, generator=generator).double(), torch.randint(6, (41,), generator=generator)
+    values[::7] = torch.nan
+    draws = torch.cat([bootstrap_draws(6, 20), torch.zeros(1, 6, dtype=torch.float64)])
+    medians = resampled_medians(values, cluster, draws)
+    for draw, median in zip(draws[:-1], medians[:-1], strict=True):
+        repeated = values.repeat_interleave(draw[cluster].long())
+        assert median.item() == pytest.approx(repeated.nanquantile(0.5, interpolation="midpoint").item())
+    assert medians[-1].isnan() and resampled_medians(values * torch.nan, cluster, draws).isnan().all()
+    table = brief(*rows_of([1.0, math.nan, 9.0, 2.0], name="contact_time"))["contact_time"]
+    assert (table["mean"], table["n"]) == (2.0, 3)
 
 
 def test_one_cluster_gives_no_interval():

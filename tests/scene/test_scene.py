@@ -50,6 +50,10 @@ def test_the_set_is_sliced(scenes):
     first = whole.first(1)
     assert len(first) == 1 and first.scene_id == ["a"] and first.location == ["p"] and first.dropped == {"invalid": 1}
     assert whole.batch([1, 0, 1])["scene_index"].tolist() == [1, 0, 1]
+    assert [whole.place(which) for which in (0, 1, "a", "b")] == [0, 1, 0, 1]
+    for which in (2, -1, "c"):
+        with pytest.raises(InputError, match=f"scene={which}: expected a position below 2 or the id of a scene"):
+            whole.place(which)
     assert whole.to("cpu").scenes.device == torch.device("cpu")
 
 

@@ -101,6 +101,7 @@ def test_shifts_are_bounded_per_vehicle_and_grow_with_intensity():
 def test_clipping_keeps_directions_and_short_rows():
     rows = torch.tensor([[[3.0, 4.0], [0.3, 0.4], [0.0, 0.0]]])
     torch.testing.assert_close(clip_rows(rows, 1.0), torch.tensor([[[0.6, 0.8], [0.3, 0.4], [0.0, 0.0]]]))
+    assert (clip_rows(rows, 0.0) == 0).all(), "a clip of 0 is no shift, also where there is no gradient"
 
 
 @pytest.mark.parametrize("scaling", ["score", "sigma", "unit"])

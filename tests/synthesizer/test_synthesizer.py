@@ -218,3 +218,19 @@ def test_who_leaves_its_lane_returns_to_it_once_it_meets_nobody():
     nobody = replace(episode, coalition=episode.coalition & False, target=episode.target * 0 - 1)
     calm, _ = on.replan(nobody, world, EGO.plan(world))
     assert not calm.leaves.any() and torch.equal(calm.routed.points, lanes.routed.points)
+
+
+def test_a_listener_hears_of_every_choice_and_changes_nothing():
+    heard, scene = [], scenes(3).scenes
+    for eta in (0.0, 2.0):
+        silent, listened = synthesizer(), synthesizer()
+        listened.on_selection = heard.append
+        episode, plan = replanned(listened, scene, eta, [5, 6, 7])
+        assert torch.equal(plan.states(), replanned(silent, scene, eta, [5, 6, 7])[1].states())
+        assert bool(heard) == (eta > 0)
+    (chosen,) = heard
+    assert chosen.seed.tolist() == [5, 6, 7] and chosen.step.tolist() == [0, 0, 0]
+    used = chosen.coalition.shape[1]
+    assert torch.equal(chosen.coalition, episode.coalition[:, :used]) and chosen.weights.shape[2:] == (used, used)
+    assert torch.equal(chosen.target, episode.target[:, :used]) and not (chosen.coalition & ~chosen.feasible).any()
+    assert chosen.reference.shape[:3] == chosen.weights.shape[:3] and chosen.moments[0, 0] == pytest.approx(0.1)
