@@ -74,6 +74,12 @@ def _speed_basis(device: torch.device) -> Tensor:
     return ((hat[1:] + hat[:-1]) / 2 * DT).cumsum(0).float().to(device)
 
 
+def way_weights(device=None) -> Tensor:
+    """[KNOTS]: mean way driven over the horizon that a unit of each acceleration knot adds, m."""
+    basis = _speed_basis(torch.device(device or "cpu"))
+    return ((torch.cat([torch.zeros_like(basis[:1]), basis[:-1]]) + basis) / 2 * DT).cumsum(0).mean(0)[1:]
+
+
 @cache
 def _offset_basis(device: torch.device) -> Tensor:
     """[4, 4]: polynomial coefficients of u^3..u^6 from (d(1/2), d(1), d'(1), d''(1)) less the given lower terms."""

@@ -92,7 +92,7 @@ class Prior(nn.Module):
 
     @torch.no_grad()
     def choose_routes(self, scene: TensorDictBase, uniform: Tensor) -> Tensor:
-        """A route candidate [B, V] for each vehicle, drawn by uniform [B, V, R]; the ego's is its mission."""
+        """A route candidate [B, V] for each vehicle, drawn by uniform [B, V]; the ego's is its mission."""
         chosen = sample_route(self.route_choice(scene), self.sampler.route_temperature, uniform)
         return torch.cat([scene["route_log"][:, :1], chosen[:, 1:]], 1)
 

@@ -146,7 +146,7 @@ class Synthesizer:
 
     def begin(self, scene: TensorDictBase, seed: Tensor, eta: Tensor) -> Episode:
         """Episodes of scenes [B] with routes drawn from the prior; seed [B] int64, eta [B]."""
-        uniform = noise_of(seed, torch.zeros_like(seed), tuple(scene["route_valid"].shape[1:]), uniform=True)
+        uniform = noise_of(seed, torch.zeros_like(seed), tuple(scene["route_valid"].shape[1:2]), uniform=True)
         routed, state = self.prior.start(scene, self.prior.choose_routes(scene, uniform))
         return Episode.start(seed, eta, routed, state)
 
