@@ -14,7 +14,7 @@ def guided_replan(bench: Bench) -> Iterator[Row]:
     of the ego's plan beside it."""
     for dense in (True, False):
         scenes = "densest scenes" if dense else "first scenes"
-        for batch in (1, 8, 32):
+        for batch in bench.batches(1, 8, 32):
             index = bench.pick(batch, dense)
             world = bench.environment(index).world()
             plan = bench.ego.plan(world)

@@ -54,19 +54,25 @@ class Row:
 
 @dataclass
 class Bench:
-    """What is measured: data (a ScenarioNet folder or zip, None: the bundled scenes), prior checkpoint, repeats."""
+    """What is measured: data (a ScenarioNet folder or zip, None: the bundled scenes), prior checkpoint, repeats.
+
+    largest: scenes at once at most, None: as many as the benchmark wants; train: overrides of conf/train.yaml.
+    """
 
     data: str | None
     checkpoint: str
     repeats: int
+    largest: int | None = None
+    train: tuple[str, ...] = ()
 
     @cached_property
     def config(self) -> DictConfig:
         """Of evaluate.py with its defaults."""
         return self.configured("evaluate")
 
-    def configured(self, name: str, *overrides: str) -> DictConfig:
+    def configured(self, name: str) -> DictConfig:
         """Configuration `name` on the data and prior under test."""
+        overrides = self.train if name == "train" else ()
         data = ["data=scenarionet", f"data.path={self.data}"] if self.data else ["data=bundled"]
         with initialize_config_dir(str(CONF), version_base="1.3"):
             return compose(name, [*data, f"prior.checkpoint={self.checkpoint}", *overrides])
@@ -91,6 +97,10 @@ class Bench:
         """The simulator's defaults."""
         return build_sim(self.config)
 
+    def batches(self, *sizes: int) -> list[int]:
+        """The sizes, none above `largest` (once each)."""
+        return sorted({min(size, self.largest or size) for size in sizes})
+
     def pick(self, batch: int, dense: bool = False) -> Tensor:
         """Scene indices [batch], repeated where there are too few; dense: those with most vehicles."""
         vehicles = self.scenes.scenes["route_log"].shape[1]
@@ -113,13 +123,17 @@ class Bench:
 
     def best(self, function: Callable[[], object]) -> float:
         """Least wall time [s] of the repeats, after one call that is not counted."""
+        return self.both(function)[0]
+
+    def both(self, function: Callable[[], object]) -> tuple[float, float]:
+        """`best`, and the least time [s] that the process was on a core, which others on the machine hardly change."""
         function()
-        times = []
+        wall, cpu = [], []
         for _ in range(self.repeats):
-            begin = time.perf_counter()
+            begin, begun = time.perf_counter(), time.process_time()
             function()
-            times.append(time.perf_counter() - begin)
-        return min(times)
+            wall.append(time.perf_counter() - begin), cpu.append(time.process_time() - begun)
+        return min(wall), min(cpu)
 
 
 Benchmark = Callable[[Bench], Iterator[Row]]

@@ -11,7 +11,7 @@ STEPS = 40
 
 def simulator(bench: Bench) -> Iterator[Row]:
     """Agent-steps per second, by the agents' rows that are present, at 1 to 512 scenes a batch."""
-    for batch in (1, 4, 32, 128, 512):
+    for batch in bench.batches(1, 4, 32, 128, 512):
         index = bench.pick(batch)
         env = bench.environment(index)
         action = TensorDict({"action": torch.zeros(batch, 2)}, batch_size=[batch])
