@@ -56,7 +56,8 @@ class Row:
 class Bench:
     """What is measured: data (a ScenarioNet folder or zip, None: the bundled scenes), prior checkpoint, repeats.
 
-    largest: scenes at once at most, None: as many as the benchmark wants; train: overrides of conf/train.yaml.
+    largest: scenes at once at most, None: as many as the benchmark wants; train: overrides of conf/train.yaml; compile:
+    measure compiled steps too.
     """
 
     data: str | None
@@ -64,6 +65,7 @@ class Bench:
     repeats: int
     largest: int | None = None
     train: tuple[str, ...] = ()
+    compile: bool = True
 
     @cached_property
     def config(self) -> DictConfig:
@@ -101,11 +103,10 @@ class Bench:
         """The sizes, none above `largest` (once each)."""
         return sorted({min(size, self.largest or size) for size in sizes})
 
-    def pick(self, batch: int, dense: bool = False) -> Tensor:
-        """Scene indices [batch], repeated where there are too few; dense: those with most vehicles."""
-        vehicles = self.scenes.scenes["route_log"].shape[1]
-        count = self.scenes.scenes["valid"][:, :vehicles].sum(1)
-        order = count.argsort(descending=True, stable=True) if dense else torch.arange(len(count))
+    def pick(self, batch: int, agents: int | None = None) -> Tensor:
+        """Scene indices [batch], repeated where there are too few; agents: those with nearest to so many first."""
+        count = self.scenes.scenes["valid"].sum(1)
+        order = torch.arange(len(count)) if agents is None else (count - agents).abs().argsort(stable=True)
         return order[torch.arange(batch) % len(order)]
 
     def environment(self, index: Tensor) -> DrivingEnv:

@@ -33,13 +33,15 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--largest", type=int, help="scenes at once at most; default: as many as a benchmark wants")
     parser.add_argument("--train", nargs="*", default=[], metavar="KEY=VALUE", help="overrides of conf/train.yaml")
+    parser.add_argument("--no-compile", dest="compile", action="store_false", help="leave compiled steps out")
     options = parser.parse_args(arguments)
     for name in ("repeats", "largest"):
         value = getattr(options, name)
         if value is not None and value < 1:
             raise InputError(f"--{name} {value}: expected at least 1")
     torch.set_num_threads(1)
-    bench, rows = Bench(options.data, options.prior, options.repeats, options.largest, tuple(options.train)), []
+    bench, rows = Bench(options.data, options.prior, options.repeats, options.largest, tuple(options.train),
+                        options.compile), []
     line = "{:20} {:44} {:>5} {:>6} {:>10} {:>12} {:18} {:>5}"
     print(line.format("benchmark", "variant", "batch", "agents", "map points", "value", "unit", "load"))
     for name in options.only or BENCHMARKS:
