@@ -18,7 +18,7 @@ from e2rl.sim.drivable import off_road
 from e2rl.sim.env import DrivingEnv, compiled
 from e2rl.sim.geometry import separation
 
-STEPS = 40
+STEPS = 80  # an episode, its reset included
 AGENTS = 32  # a scene, where the data have scenes of so many
 BATCHES = 1, 4, 32, 128, 512
 

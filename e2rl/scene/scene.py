@@ -96,6 +96,16 @@ class SceneSet:
         """Scenes [B] at `indices` (a sequence or tensor of positions)."""
         return self.scenes[torch.as_tensor(indices)]
 
+    def copy_into(self, batch: TensorDictBase, rows: torch.Tensor, indices: torch.Tensor) -> None:
+        """Overwrite rows [b] (ascending) of a batch of scenes by the scenes at `indices` [b], in place."""
+        whole = len(rows) == len(batch)
+        for key in self.scenes.keys():  # noqa: SIM118 - not a dict
+            source, target = self.scenes[key], batch[key]
+            if whole and source.device == target.device:  # without a second copy, whose pages cost more than the first
+                torch.index_select(source, 0, indices, out=target)
+            else:
+                target[rows] = source[indices].to(target.device)
+
     def first(self, count: int | None) -> "SceneSet":
         """The first `count` scenes (all for None)."""
         if count is None or count >= len(self):

@@ -25,6 +25,8 @@ from e2rl.sim.step import Rules, Running, Stepped, replay_step, step
 from e2rl.sim.traffic import Traffic
 from e2rl.sim.world import World
 
+STARTING = ("start", "start_accel", "start_yaw_rate", "size", "agent_type", "field", "field_origin", "light_state",
+            "route_points", "route_length", "route_open", "route_limit", "route_light", "route_light_s", "route_log")
 DEFAULT_REWARD = {
     "progress": 0.1, "contact": -10.0, "off_road": -5.0, "comfort": -0.02, "speeding": -0.1, "lane_offset": -0.02,
 }
@@ -149,8 +151,8 @@ class DrivingEnv(EnvBase):
             rows = torch.randint(len(self.scenes), (len(index),), generator=self._generator)
         else:
             rows = chosen.view(batch)[index].cpu()
-        fresh = self.scenes.batch(rows).to(self.device)
-        self.scene[index] = fresh
+        self.scenes.copy_into(self.scene, index, rows)
+        fresh = self.scene if len(index) == batch else self.scene.select(*STARTING)[index]
         mission = mission_of(fresh)
         write_rows(self._setting, index, setting_of(fresh, mission))
         self._traffic.reset(self.scene, index)

@@ -35,7 +35,10 @@ class Traffic:
 
     def reset(self, scene: TensorDictBase, index: Tensor) -> None:
         """Scenes index [b] begin anew: with what was scheduled for them, else with their recording; plans are void."""
-        self.states[index], self.valid[index] = scene["logged"][index], scene["logged_valid"][index]
+        if len(index) == len(self.states):
+            self.states.copy_(scene["logged"]), self.valid.copy_(scene["logged_valid"])
+        else:
+            self.states[index], self.valid[index] = scene["logged"][index], scene["logged_valid"][index]
         self.route[index] = scene["route_log"][index]
         vehicles, kept = self.route.shape[1], []
         for rows, states, valid, route in self._scheduled:
