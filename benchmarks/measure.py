@@ -2,6 +2,7 @@
 
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
@@ -33,14 +34,14 @@ def versions() -> dict[str, str]:
 @dataclass
 class Row:
     """A figure. variant: what of the benchmark; batch: scenes at once; agents, map_points: rows a scene has; value in
-    unit; load: of the machine in the minute before; processes, threads of each."""
+    unit, None where it could not be measured; load: of the machine in the minute before; processes, threads of each."""
 
     benchmark: str
     variant: str
     batch: int
     agents: int
     map_points: int
-    value: float
+    value: float | None
     unit: str
     processes: int = 1
     threads: int = field(default_factory=torch.get_num_threads)
@@ -57,7 +58,7 @@ class Bench:
     """What is measured: data (a ScenarioNet folder or zip, None: the bundled scenes), prior checkpoint, repeats.
 
     largest: scenes at once at most, None: as many as the benchmark wants; train: overrides of conf/train.yaml; compile:
-    measure compiled steps too.
+    measure compiled steps too; peers: the interpreter that has the peers.
     """
 
     data: str | None
@@ -66,6 +67,7 @@ class Bench:
     largest: int | None = None
     train: tuple[str, ...] = ()
     compile: bool = True
+    peers: str = sys.executable
 
     @cached_property
     def config(self) -> DictConfig:

@@ -25,6 +25,9 @@ def test_every_benchmark_runs(name, tmp_path):
     run.main(["--json", str(path), "--only", name, *SMALL, *SHORT])
     rows = json.loads(path.read_text())
     assert rows and {row["benchmark"] for row in rows} == {name}
+    if name.startswith("peer_"):  # they are not installed where the tests run
+        assert all(row["value"] or row["variant"].startswith("absent: ") for row in rows)
+        return
     assert all(row["value"] > 0 and row["threads"] == 1 and row["versions"]["torch"] for row in rows)
     assert len({(row["variant"], row["batch"], row["unit"], row["processes"]) for row in rows}) == len(rows)
 
