@@ -13,9 +13,10 @@ SPACING = 2.0  # m of arc length between vertices
 
 def _take(route: Tensor, index: Tensor) -> Tensor:
     """Vertices route [..., P, 2] at index [..., K] -> [..., K, 2], leading dims broadcast."""
-    lead = torch.broadcast_shapes(route.shape[:-2], index.shape[:-1])
-    route = route.expand(*lead, *route.shape[-2:])
-    index = index.expand(*lead, index.shape[-1])
+    if route.shape[:-2] != index.shape[:-1]:
+        lead = torch.broadcast_shapes(route.shape[:-2], index.shape[:-1])
+        route = route.expand(*lead, *route.shape[-2:])
+        index = index.expand(*lead, index.shape[-1])
     return route.gather(-2, index[..., None].expand(*index.shape, 2))
 
 
@@ -96,7 +97,8 @@ def interpolate(route: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     u = s / SPACING
     i = u.detach().floor().clamp(0, last).long()
     t = u - i
-    before, a, b, after = (_take(route, j) for j in ((i - 1).clamp(min=0), i, i + 1, (i + 2).clamp(max=last + 1)))
+    four = torch.cat([i - 1, i, i + 1, i + 2], -1).clamp(0, last + 1)
+    before, a, b, after = _take(route, four).unflatten(-2, (4, i.shape[-1])).unbind(-3)
     xy = a + t[..., None] * (b - a)
     first, second = b - before, after - a
     angle = torch.atan2(first[..., 1], first[..., 0])
