@@ -16,13 +16,14 @@ from measure import Bench, Benchmark
 from memory import memory
 from peer import peer_benchmarks
 from ppo_update import ppo_update
+from scaling import scaling
 from simulator import simulator
 from synthesized_rollout import synthesized_rollout
 
 from e2rl.errors import InputError, stop
 
-BENCHMARKS: dict[str, Benchmark] = {function.__name__: function for function in (
-    simulator, collector, ppo_update, guided_replan, synthesized_rollout, evolution_round, memory)} | peer_benchmarks
+OWN = (simulator, collector, ppo_update, guided_replan, synthesized_rollout, evolution_round, memory, scaling)
+BENCHMARKS: dict[str, Benchmark] = {function.__name__: function for function in OWN} | peer_benchmarks
 
 
 def main(arguments: list[str]) -> None:

@@ -9,6 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError, settings_of
+from e2rl.evaluation.processes import cores
 from e2rl.evaluation.protocol import Method
 from e2rl.metrics.catalogue import CLOSED_LOOP
 from e2rl.prior.bounds import BoundSettings
@@ -112,7 +113,8 @@ def set_up(config: DictConfig) -> None:
 
 
 def check_protocol(config: DictConfig) -> None:
-    """InputError for methods, seeds or an intensity that evaluate.py cannot run."""
+    """InputError for methods, seeds, an intensity or processes that evaluate.py cannot run."""
+    processes_of(config)
     known = list(dict.fromkeys(["nominal", *BASELINES, config.synthesizer.name]))
     for name in config.methods:
         if name not in known:
@@ -134,6 +136,19 @@ def check_protocol(config: DictConfig) -> None:
         raise InputError(f"seeds={list(config.seeds)}: sampling seeds are whole numbers")
     if config.num_scenes is not None and not (isinstance(config.num_scenes, int) and config.num_scenes > 0):
         raise InputError(f"num_scenes={config.num_scenes}: a whole number of at least 1, or null for all")
+
+
+def processes_of(config: DictConfig) -> int:
+    """Processes that rollouts are spread over: one a core by default, one on a device that they would share."""
+    given, device = config.processes, str(config.device)
+    if given is None:
+        return cores() if device == "cpu" and config.threads == 1 else 1
+    if not isinstance(given, int) or given < 1:
+        raise InputError(f"processes={given}: expected a whole number of at least 1, or null for one a core")
+    if given > 1 and (device != "cpu" or config.threads > 1):
+        raise InputError(f"processes={given}, threads={config.threads}, device={device}: several processes have one "
+                         "thread each and the CPU; set threads=1 device=cpu, or processes=1")
+    return given
 
 
 def caption(config: DictConfig, origin: dict) -> str:
