@@ -17,15 +17,15 @@ PEERS = "highway_env", "vmas", "torchdrivesim", "waymax"
 
 def _benchmark(name: str) -> Benchmark:
     def peer(bench: Bench) -> Iterator[Row]:
-        """Agent-steps per second of its own step, which each row's variant names."""
+        """Agent-steps per CPU second of its own step, which each row's variant names."""
         run = subprocess.run([bench.peers, str(SCRIPT), name, str(bench.repeats)], capture_output=True, text=True)
         if run.returncode:
             reason = run.stderr.strip().splitlines()[-1]
-            yield Row(f"peer_{name}", f"absent: {reason}", 0, 0, 0, None, "agent-steps/s")
+            yield Row(f"peer_{name}", f"absent: {reason}", 0, 0, 0, None, "agent-steps/CPU s")
             return
         found = json.loads(run.stdout.splitlines()[-1])
         for batch, agents, work, value in found["rows"]:
-            row = Row(f"peer_{name}", work, batch, agents, 0, value, "agent-steps/s")
+            row = Row(f"peer_{name}", work, batch, agents, 0, value, "agent-steps/CPU s")
             row.versions = row.versions | {name: found["version"]}
             yield row
 

@@ -1,4 +1,4 @@
-"""`PYTHON benchmarks/peers.py NAME REPEATS`: agent-steps per second of another simulator, as JSON, one thread.
+"""`PYTHON benchmarks/peers.py NAME REPEATS`: agent-steps per CPU second of another simulator, as JSON, one thread.
 
 Run by `peer.py` in an interpreter that has the peer (extra `peers`), so nothing of e2rl is imported. Every peer moves
 about 32 vehicles a scene at 0.1 s a step and does what its own step does; `work` says what that is.
@@ -11,16 +11,17 @@ from collections.abc import Callable, Iterator
 from importlib.metadata import PackageNotFoundError, version
 
 AGENTS, STEPS = 32, 20
-Measured = tuple[int, int, str, float]  # scenes at once, agents a scene, work, agent-steps per second
+Measured = tuple[int, int, str, float]  # scenes at once, agents a scene, work, agent-steps per CPU second
 
 
 def best(function: Callable[[], int], repeats: int) -> float:
-    """Most agent-steps per second of the repeats, after one call that is not counted; function returns agent-steps."""
+    """Most agent-steps per second on a core (whoever else is on the machine) of the repeats, after one call that is not
+    counted; function returns agent-steps."""
     function()
     rates = []
     for _ in range(repeats):
-        begin = time.perf_counter()
-        rates.append(function() / (time.perf_counter() - begin))
+        begin = time.process_time()
+        rates.append(function() / (time.process_time() - begin))
     return max(rates)
 
 
