@@ -106,6 +106,16 @@ class SceneSet:
         raise InputError(f"scene={which}: expected a position below {len(self)} or the id of a scene, such as "
                          f"{self.scene_id[0]}")
 
+    def copy_into(self, batch: TensorDictBase, rows: torch.Tensor, indices: torch.Tensor) -> None:
+        """Overwrite rows [b] (ascending) of a batch of scenes by the scenes at `indices` [b], in place."""
+        whole = len(rows) == len(batch)
+        for key in self.scenes.keys():  # noqa: SIM118 - not a dict
+            source, target = self.scenes[key], batch[key]
+            if whole and source.device == target.device:  # without a second copy, whose pages cost more than the first
+                torch.index_select(source, 0, indices, out=target)
+            else:
+                target[rows] = source[indices].to(target.device)
+
     def first(self, count: int | None) -> "SceneSet":
         """The first `count` scenes (all for None)."""
         if count is None or count >= len(self):

@@ -68,7 +68,8 @@ class SparseControl:
 
     eta [B]: intensity; coalition [B, V]: C*; anchor: the skeleton's proposal; anchor_noise [B, V, SIZE]: for the
     literal blend; react: the ego's states [B, HORIZON, 4] against planned states [B, V, HORIZON, 4], asked at
-    settings.lookahead of the noise levels (None: its plan stays what it is). `jump` [B, V] holds the anchor's mean shift energy, ||shift||^2 / (2 sigma^2), after sampling.
+    settings.lookahead of the noise levels (None: its plan stays what it is). `jump` [B, V] holds the anchor's mean
+    shift energy, ||shift||^2 / (2 sigma^2), after sampling.
     """
 
     def __init__(self, prior: Prior, settings: ControlSettings, potentials: PotentialSettings, where: PotentialContext,
