@@ -42,12 +42,16 @@ class ControlSettings:
     anchoring: str = "clean"
     anchor_level: float = 0.2
     lookahead: int = 0
+    transport_budget: float | None = None
 
     def __post_init__(self):
         for name, choices in (("gradient", ("denoiser", "clean")), ("scaling", ("score", "sigma", "unit")),
                               ("feasibility_scope", ("all", "support")), ("anchoring", ("clean", "literal", "off"))):
             if getattr(self, name) not in choices:
                 raise InputError(f"synthesizer.control.{name} is {getattr(self, name)!r}; choose one of {choices}")
+        if self.transport_budget is not None and not self.transport_budget >= 0:
+            raise InputError(f"synthesizer.control.transport_budget is {self.transport_budget}; expected at least 0, "
+                             "or null for no limit")
 
 
 def clip_rows(gradient: Tensor, limit: float) -> Tensor:

@@ -181,7 +181,7 @@ class Synthesizer:
         control = self._control(episode, where, anchor, react) if controlled else None
         best = None
         for draw in noise:
-            sample = self.prior.sample(context, draw, control)
+            sample = self.prior.sample(context, draw, control, self._budget(episode))
             jump = control.jump if control else torch.zeros_like(sample.kl)
             found = (sample.x0, sample.kl, jump, self._cost(sample.x0, context, where, episode.eta))
             best = found if best is None else _cheaper(best, found)
@@ -193,6 +193,11 @@ class Synthesizer:
     def _noise(self, episode: Episode, sample: int = 0) -> Tensor:
         shape = (self.prior.sampler.steps, episode.routed.route.shape[1], SIZE)
         return noise_of(episode.seed, 1 + episode.replans + PER_SAMPLE * sample, shape).transpose(0, 1)
+
+    def _budget(self, episode: Episode) -> Tensor | None:
+        """Path KL [B] that control may still add to each scene."""
+        limit = self.settings.control.transport_budget
+        return None if limit is None else (limit - episode.kl.sum(-1)).clamp(min=0)
 
     def _cost(self, x0: Tensor, context: Context, where: PotentialContext, eta: Tensor) -> Tensor:
         """V_feas of everybody plus eta V_adv of the coalition [B]: whole joint samples are compared, never vehicles."""
