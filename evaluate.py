@@ -54,13 +54,13 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     effort = search_effort(scenes.scenes["logged"].shape[1] - 1)
     tables = metric_tables(rows, f"{caption(config, origin)}; {effort}{dropped}", CLOSED_LOOP[config.metrics])
     save_tables(folder / "tables.md", tables)
+    print("\n\n".join(table.text() for table in tables))
     if config.figure == "intensity":
         save_picture(folder / "intensity.png", intensity_figure(intensity_ladder(folder)))
     if chain:
         rollout = chain.rollout(scenes, name, folder)
         save_picture(folder / "skeleton.png", skeleton_figure(
             rollout, chain.kept, chain.method.synthesizer.settings.topology))
-    print("\n\n".join(table.text() for table in tables))
     print(f"\nwritten to {folder}")
     return rows
 
