@@ -8,7 +8,16 @@ from omegaconf import DictConfig
 
 from e2rl.errors import InputError, stop
 from e2rl.evaluation.avoidable import search_effort
-from e2rl.evaluation.build import build_ego, build_methods, build_prior, build_sim, caption, check_protocol, set_up
+from e2rl.evaluation.build import (
+    build_ego,
+    build_methods,
+    build_prior,
+    build_sim,
+    caption,
+    check_protocol,
+    processes_of,
+    set_up,
+)
 from e2rl.evaluation.chains import LongestChain
 from e2rl.evaluation.files import METRICS_FILE, write_metrics
 from e2rl.evaluation.ladders import intensity_ladder
@@ -37,7 +46,7 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     if config.open_loop_samples:
         rows += open_loop_rows(scenes, methods, config.open_loop_samples, config.device)
     rows += run_protocol(scenes, methods, ego, name, list(config.seeds), sim, folder, config.batch, config.device,
-                         config.save_rollouts, only)
+                         config.save_rollouts, processes_of(config), only)
     if config.meta_rollouts:
         rows += meta_rows(scenes, methods, ego, name, sim, config.meta_rollouts, config.batch, config.device)
     write_metrics(folder / METRICS_FILE, rows)

@@ -12,10 +12,9 @@ ETA = 2.0
 def guided_replan(bench: Bench) -> Iterator[Row]:
     """Milliseconds a scene and replan in the middle of an episode, for the densest scenes and for the first ones, and
     of the ego's plan beside it."""
-    for dense in (True, False):
-        scenes = "densest scenes" if dense else "first scenes"
-        for batch in (1, 8, 32):
-            index = bench.pick(batch, dense)
+    for scenes, agents in (("densest scenes", bench.scenes.scenes["valid"].shape[1]), ("first scenes", None)):
+        for batch in bench.batches(1, 8, 32):
+            index = bench.pick(batch, agents)
             world = bench.environment(index).world()
             plan = bench.ego.plan(world)
             episode = bench.synthesizer.begin(world.scene, index, torch.full((batch,), ETA))

@@ -2,6 +2,7 @@
 
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
@@ -33,14 +34,14 @@ def versions() -> dict[str, str]:
 @dataclass
 class Row:
     """A figure. variant: what of the benchmark; batch: scenes at once; agents, map_points: rows a scene has; value in
-    unit; load: of the machine in the minute before; processes, threads of each."""
+    unit, None where it could not be measured; load: of the machine in the minute before; processes, threads of each."""
 
     benchmark: str
     variant: str
     batch: int
     agents: int
     map_points: int
-    value: float
+    value: float | None
     unit: str
     processes: int = 1
     threads: int = field(default_factory=torch.get_num_threads)
@@ -54,19 +55,28 @@ class Row:
 
 @dataclass
 class Bench:
-    """What is measured: data (a ScenarioNet folder or zip, None: the bundled scenes), prior checkpoint, repeats."""
+    """What is measured: data (a ScenarioNet folder or zip, None: the bundled scenes), prior checkpoint, repeats.
+
+    largest: scenes at once at most, None: as many as the benchmark wants; train: overrides of conf/train.yaml; compile:
+    measure compiled steps too; peers: the interpreter that has the peers.
+    """
 
     data: str | None
     checkpoint: str
     repeats: int
+    largest: int | None = None
+    train: tuple[str, ...] = ()
+    compile: bool = True
+    peers: str = sys.executable
 
     @cached_property
     def config(self) -> DictConfig:
         """Of evaluate.py with its defaults."""
         return self.configured("evaluate")
 
-    def configured(self, name: str, *overrides: str) -> DictConfig:
+    def configured(self, name: str) -> DictConfig:
         """Configuration `name` on the data and prior under test."""
+        overrides = self.train if name == "train" else ()
         data = ["data=scenarionet", f"data.path={self.data}"] if self.data else ["data=bundled"]
         with initialize_config_dir(str(CONF), version_base="1.3"):
             return compose(name, [*data, f"prior.checkpoint={self.checkpoint}", *overrides])
@@ -91,11 +101,14 @@ class Bench:
         """The simulator's defaults."""
         return build_sim(self.config)
 
-    def pick(self, batch: int, dense: bool = False) -> Tensor:
-        """Scene indices [batch], repeated where there are too few; dense: those with most vehicles."""
-        vehicles = self.scenes.scenes["route_log"].shape[1]
-        count = self.scenes.scenes["valid"][:, :vehicles].sum(1)
-        order = count.argsort(descending=True, stable=True) if dense else torch.arange(len(count))
+    def batches(self, *sizes: int) -> list[int]:
+        """The sizes, none above `largest` (once each)."""
+        return sorted({min(size, self.largest or size) for size in sizes})
+
+    def pick(self, batch: int, agents: int | None = None) -> Tensor:
+        """Scene indices [batch], repeated where there are too few; agents: those with nearest to so many first."""
+        count = self.scenes.scenes["valid"].sum(1)
+        order = torch.arange(len(count)) if agents is None else (count - agents).abs().argsort(stable=True)
         return order[torch.arange(batch) % len(order)]
 
     def environment(self, index: Tensor) -> DrivingEnv:
@@ -113,13 +126,17 @@ class Bench:
 
     def best(self, function: Callable[[], object]) -> float:
         """Least wall time [s] of the repeats, after one call that is not counted."""
+        return self.both(function)[0]
+
+    def both(self, function: Callable[[], object]) -> tuple[float, float]:
+        """`best`, and the least time [s] that the process was on a core, which others on the machine hardly change."""
         function()
-        times = []
+        wall, cpu = [], []
         for _ in range(self.repeats):
-            begin = time.perf_counter()
+            begin, begun = time.perf_counter(), time.process_time()
             function()
-            times.append(time.perf_counter() - begin)
-        return min(times)
+            wall.append(time.perf_counter() - begin), cpu.append(time.process_time() - begun)
+        return min(wall), min(cpu)
 
 
 Benchmark = Callable[[Bench], Iterator[Row]]

@@ -3,6 +3,7 @@
 import multiprocessing
 import resource
 from collections.abc import Iterator
+from dataclasses import replace
 
 import torch
 from measure import Bench, Row
@@ -13,21 +14,24 @@ from e2rl.synthesizer.rollout import roll_out
 
 def memory(bench: Bench) -> Iterator[Row]:
     """MiB at most resident: the scenes alone, 512 of them simulated, 32 rolled out against e2."""
-    for name, batch in (("scenes alone", 1), ("simulator", 512), ("e2 rollout", 32)):
-        context = multiprocessing.get_context("spawn")
+    context, alone = multiprocessing.get_context("spawn"), 0.0
+    for name, size in (("simulator", 512), ("e2 rollout", 32)):
+        (batch,) = bench.batches(size)
         with context.Pool(1) as pool:
-            value = pool.apply(_peak, (bench.data, bench.checkpoint, name, batch))
+            alone, value = pool.apply(_peak, (replace(bench), name, batch))  # without what is loaded
         yield bench.row("memory", name, bench.pick(batch), value, "MiB")
+    yield bench.row("memory", "scenes alone", bench.pick(1), alone, "MiB")
 
 
-def _peak(data: str | None, checkpoint: str, name: str, batch: int) -> float:
+def _peak(bench: Bench, name: str, batch: int) -> tuple[float, float]:
+    """With the scenes loaded, and after the work."""
     torch.set_num_threads(1)
-    bench = Bench(data, checkpoint, repeats=1)
     index = bench.pick(batch)
+    alone = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     if name == "simulator":
         env = bench.environment(index)
         for _ in range(5):
             env._step(TensorDict({"action": torch.zeros(batch, 2)}, batch_size=[batch]))
-    elif name == "e2 rollout":
+    else:
         roll_out(bench.scenes, index, index, torch.full((batch,), 2.0), bench.ego, bench.synthesizer, bench.sim)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return alone, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

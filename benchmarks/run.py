@@ -1,4 +1,4 @@
-"""`python benchmarks/run.py --json FILE [--only NAME] [--data PATH]`: how fast the parts are, as a table and as rows.
+"""`python benchmarks/run.py --json FILE [--only NAME] [--data PATH] [--peers PYTHON]`: how fast the parts are.
 
 Least time of the repeats, one thread, one process; timings on a shared machine are worth their load column.
 """
@@ -14,14 +14,16 @@ from evolution_round import evolution_round
 from guided_replan import guided_replan
 from measure import Bench, Benchmark
 from memory import memory
+from peer import peer_benchmarks
 from ppo_update import ppo_update
+from scaling import scaling
 from simulator import simulator
 from synthesized_rollout import synthesized_rollout
 
 from e2rl.errors import InputError, stop
 
-BENCHMARKS: dict[str, Benchmark] = {function.__name__: function for function in (
-    simulator, collector, ppo_update, guided_replan, synthesized_rollout, evolution_round, memory)}
+OWN = (simulator, collector, ppo_update, guided_replan, synthesized_rollout, evolution_round, memory, scaling)
+BENCHMARKS: dict[str, Benchmark] = {function.__name__: function for function in OWN} | peer_benchmarks
 
 
 def main(arguments: list[str]) -> None:
@@ -31,17 +33,25 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--data", help="ScenarioNet folder or zip; default: the bundled test scenes")
     parser.add_argument("--prior", default="bundled", help="checkpoint of a prior")
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--largest", type=int, help="scenes at once at most; default: as many as a benchmark wants")
+    parser.add_argument("--train", nargs="*", default=[], metavar="KEY=VALUE", help="overrides of conf/train.yaml")
+    parser.add_argument("--no-compile", dest="compile", action="store_false", help="leave compiled steps out")
+    parser.add_argument("--peers", default=sys.executable, help="interpreter that has the peers (extra `peers`)")
     options = parser.parse_args(arguments)
-    if options.repeats < 1:
-        raise InputError(f"--repeats {options.repeats}: expected at least 1")
+    for name in ("repeats", "largest"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise InputError(f"--{name} {value}: expected at least 1")
     torch.set_num_threads(1)
-    bench, rows = Bench(options.data, options.prior, options.repeats), []
-    line = "{:20} {:44} {:>5} {:>6} {:>10} {:>12} {:18} {:>5}"
+    bench, rows = Bench(options.data, options.prior, options.repeats, options.largest, tuple(options.train),
+                        options.compile, options.peers), []
+    line = "{:20} {:60} {:>5} {:>6} {:>10} {:>12} {:18} {:>5}"
     print(line.format("benchmark", "variant", "batch", "agents", "map points", "value", "unit", "load"))
     for name in options.only or BENCHMARKS:
         for row in BENCHMARKS[name](bench):
-            print(line.format(row.benchmark, row.variant, row.batch, row.agents, row.map_points, f"{row.value:.4g}",
-                              row.unit, f"{row.load:.1f}"), flush=True)
+            value = "-" if row.value is None else f"{row.value:.4g}"
+            print(line.format(row.benchmark, row.variant, row.batch, row.agents, row.map_points, value, row.unit,
+                              f"{row.load:.1f}"), flush=True)
             rows.append(row.plain())
             options.json.write_text(json.dumps(rows, indent=1))
 

@@ -1,57 +1,48 @@
 """A whole rollout: 8 s, 16 replans of the traffic, ego lane_graph."""
 
-import time
-from collections.abc import Iterator
+import cProfile
+import inspect
+import pstats
+from collections.abc import Callable, Iterator
 
 import torch
 from measure import Bench, Row
 
 from e2rl.prior.prior import Prior
-from e2rl.synthesizer import synthesizer as parts
+from e2rl.sim.env import DrivingEnv
 from e2rl.synthesizer.rollout import roll_out
-
-BATCH = 32
-SUPPORT = ("topological_candidates", "feasible_vehicles", "build_skeleton")  # what the choice of a support costs
-
-
-class Stopwatch:
-    """Adds up the time inside named functions of a module or class while in use."""
-
-    def __init__(self, owner, names: tuple[str, ...]):
-        self.owner, self.original, self.seconds = owner, {name: getattr(owner, name) for name in names}, 0.0
-
-    def __enter__(self):
-        for name, function in self.original.items():
-            setattr(self.owner, name, self._timed(function))
-        return self
-
-    def __exit__(self, *_):
-        for name, function in self.original.items():
-            setattr(self.owner, name, function)
-
-    def _timed(self, function):
-        def timed(*args, **options):
-            begin = time.perf_counter()
-            try:
-                return function(*args, **options)
-            finally:
-                self.seconds += time.perf_counter() - begin
-        return timed
+from e2rl.synthesizer.skeleton import build_skeleton
+from e2rl.synthesizer.topology import topological_candidates
 
 
 def synthesized_rollout(bench: Bench) -> Iterator[Row]:
-    """Seconds a rollout of the nominal prior and of e2, and shares of e2's time: choice of the support, sampling."""
-    index = bench.pick(BATCH)
+    """Seconds a rollout of the nominal prior and of e2, and shares of e2's time by part."""
+    (batch,) = bench.batches(32)
+    index = bench.pick(batch)
 
     def run(eta: float) -> None:
-        roll_out(bench.scenes, index, index, torch.full((BATCH,), eta), bench.ego, bench.synthesizer, bench.sim)
+        roll_out(bench.scenes, index, index, torch.full((batch,), eta), bench.ego, bench.synthesizer, bench.sim)
 
     for name, eta in (("nominal", 0.0), ("e2, eta 2", 2.0)):
-        yield bench.row("synthesized_rollout", name, index, bench.best(lambda e=eta: run(e)) / BATCH, "s/rollout")
-    stages = ("topology, feasibility and skeleton", parts, SUPPORT), ("sampling", Prior, ("sample",))
-    for name, owner, names in stages:
-        begin = time.perf_counter()
-        with Stopwatch(owner, names) as watch:
-            run(2.0)
-        share = watch.seconds / (time.perf_counter() - begin)
-        yield bench.row("synthesized_rollout", f"e2: {name}", index, 100 * share, "% of the rollout")
+        wall, cpu = bench.both(lambda e=eta: run(e))
+        yield bench.row("synthesized_rollout", name, index, wall / batch, "s/rollout")
+        yield bench.row("synthesized_rollout", name, index, cpu / batch, "CPU s/rollout")
+    parts = {
+        "topology, feasibility and skeleton": (topological_candidates, bench.synthesizer.feasible_vehicles,
+                                               build_skeleton),
+        "sampling": (Prior.sample,), "bounds and decoding of the plan": (Prior.plan,),
+        "plans of lane_graph": (type(bench.ego).plan,), "simulator": (DrivingEnv._step,),
+    }
+    profile = cProfile.Profile(builtins=False)  # Python's functions alone: little beside torch's operations
+    profile.runcall(run, 2.0)
+    for name, functions in parts.items():
+        yield bench.row("synthesized_rollout", f"e2: {name}", index, 100 * share(profile, functions),
+                        "% of the rollout")
+
+
+def share(profile: cProfile.Profile, functions: tuple[Callable, ...]) -> float:
+    """Of a profile's time, what was spent inside `functions`."""
+    stats = pstats.Stats(profile)
+    spent = {(file, line): row[3] for (file, line, _), row in stats.stats.items()}  # row: calls, own and total time
+    code = [inspect.unwrap(function).__code__ for function in functions]
+    return sum(spent.get((part.co_filename, part.co_firstlineno), 0.0) for part in code) / stats.total_tt

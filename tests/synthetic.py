@@ -59,8 +59,8 @@ def make_scenes(
     parked[:, 0] = False
     zeros = torch.zeros(num_scenes, max_agents)
     scenes = {
-        "start": start, "start_accel": zeros, "start_yaw_rate": zeros.clone(), "valid": valid, "size": size,
-        "agent_type": kind, "parked": parked, "logged": logged,
+        "start": start, "start_accel": zeros, "start_yaw_rate": zeros.clone(), "past": _past(start[:, :max_vehicles]),
+        "valid": valid, "size": size, "agent_type": kind, "parked": parked, "logged": logged,
         "logged_valid": valid[:, None].repeat(1, steps + 1, 1),
         "scene_index": torch.arange(num_scenes),
     }
@@ -72,6 +72,13 @@ def make_scenes(
         scenes=TensorDict(scenes, [num_scenes]), scene_id=[f"synthetic-{k}" for k in range(num_scenes)],
         location=["straight"] * num_scenes, dataset="synthetic", split="test", dropped={},
     )
+
+
+def _past(start):
+    """Everybody came straight on."""
+    past = torch.zeros(*start.shape[:2], 10, 3)
+    past[..., 0] = -start[..., 3:] * DT * torch.arange(1, 11)
+    return past
 
 
 def _routes(start, valid, num_routes, num_points, limit, red_light_x, road):

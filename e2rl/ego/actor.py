@@ -10,8 +10,10 @@ from e2rl.ego.network import ActorCritic, find_weights
 from e2rl.scene.recording import DT
 from e2rl.scene.route import project
 from e2rl.sim import dynamics
-from e2rl.sim.mission import Mission, mission_of
-from e2rl.sim.observation import observe
+from e2rl.sim.around import axes, look_around
+from e2rl.sim.mission import mission_of
+from e2rl.sim.observation import EgoState, lens, observe, probe
+from e2rl.sim.setting import Place, Setting, setting_of
 from e2rl.sim.world import World
 
 HOLD = 5  # steps for which a planned action is held: 10 evaluations of the network per plan
@@ -44,8 +46,8 @@ class ActorEgo(Ego):
         yaw_rate = self._yaw_rate(world)
         self._seen = (world.step.clone(), world.states[:, 0].clone(), yaw_rate)
         if observation is None:
-            mission = mission_of(world.scene)
-            observation = _look(world, mission, world.states[:, 0], torch.stack([world.accel[:, 0], yaw_rate], -1))
+            action = torch.stack([world.accel[:, 0], yaw_rate], -1)
+            observation = _look(world, setting_of(world.scene, mission_of(world.scene)), world.states[:, 0], action)
         return self.network.network.deterministic(observation)
 
     @torch.no_grad()
@@ -54,7 +56,7 @@ class ActorEgo(Ego):
 
         The others move as they plan to, or at constant velocity where nobody plans.
         """
-        mission, future = mission_of(world.scene), _others(world)
+        setting, future = setting_of(world.scene, mission_of(world.scene)), _others(world)
         ego, action = world.states[:, 0], torch.stack([world.accel[:, 0], self._yaw_rate(world)], -1)
         pieces = []
         for done in range(0, PLAN_STEPS, HOLD):
@@ -63,7 +65,7 @@ class ActorEgo(Ego):
                 valid=world.valid, accel=torch.cat([action[:, :1], _accelerations(world, future, done)], 1),
                 route=world.route,
             )
-            action = self.network.network.deterministic(_look(now, mission, ego, action))
+            action = self.network.network.deterministic(_look(now, setting, ego, action))
             driven = dynamics.rollout(ego, action[:, None].expand(-1, HOLD, -1))
             last_two = torch.cat([ego[:, None], driven], 1)[:, -2:]
             ego, action = driven[:, -1], dynamics.inverse(last_two)[:, 0]
@@ -85,10 +87,14 @@ class ActorEgo(Ego):
         return torch.where(world.step == 0, first, known)
 
 
-def _look(world: World, mission: Mission, ego: Tensor, action: Tensor) -> Tensor:
+def _look(world: World, setting: Setting, ego: Tensor, action: Tensor) -> Tensor:
     """Observation [B, D] of a world, the environment's function."""
-    place = tuple(value[:, 0] for value in project(ego[:, None, :2], mission.points))
-    return observe(world, mission, place, action)
+    place = Place(*(value[:, 0] for value in project(ego[:, None, :2], setting.points)))
+    turn, glass = axes(ego), lens(ego.device)
+    around = look_around(ego, turn, setting, world.states[:, 1:], world.valid[:, 1:], world.accel[:, 1:])
+    horizon = world.scene["logged"].shape[1] - 1
+    return observe(glass, setting, EgoState(ego, turn, action, place), world.step, horizon,
+                   probe(glass, setting, ego, turn), around)[0]
 
 
 def _others(world: World) -> Tensor:

@@ -11,6 +11,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError, settings_of
+from e2rl.evaluation.processes import cores
 from e2rl.evaluation.protocol import Method
 from e2rl.metrics.catalogue import CLOSED_LOOP
 from e2rl.prior.bounds import BoundSettings
@@ -149,7 +150,8 @@ def set_up(config: DictConfig) -> None:
 
 
 def check_protocol(config: DictConfig) -> None:
-    """InputError for methods, seeds or an intensity that evaluate.py cannot run."""
+    """InputError for methods, seeds, an intensity or processes that evaluate.py cannot run."""
+    processes_of(config)
     known = list(dict.fromkeys(["nominal", *BASELINES, config.synthesizer.name]))
     for name in config.methods:
         if name not in (*known, *config.variants):
@@ -184,6 +186,22 @@ def check_figure(config: DictConfig) -> None:
         raise InputError(f"figure={config.figure}: drawn from the rollouts' files; set save_rollouts=true")
     if config.figure == "intensity" and not several:
         raise InputError(f"figure=intensity, eta={config.eta}: name several intensities, such as eta=[0,1,2,3]")
+
+
+def processes_of(config: DictConfig) -> int:
+    """Processes that rollouts are spread over: one a core by default, one on a device that they would share, and one
+    for the skeleton figure, which listens to the synthesizer."""
+    given, device = config.processes, str(config.device)
+    if config.figure == "skeleton":
+        return 1
+    if given is None:
+        return cores() if device == "cpu" and config.threads == 1 else 1
+    if not isinstance(given, int) or given < 1:
+        raise InputError(f"processes={given}: expected a whole number of at least 1, or null for one a core")
+    if given > 1 and (device != "cpu" or config.threads > 1):
+        raise InputError(f"processes={given}, threads={config.threads}, device={device}: several processes have one "
+                         "thread each and the CPU; set threads=1 device=cpu, or processes=1")
+    return given
 
 
 def caption(config: DictConfig, origin: dict) -> str:

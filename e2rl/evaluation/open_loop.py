@@ -10,6 +10,7 @@ from e2rl.metrics.catalogue import OPEN_LOOP_STAGE
 from e2rl.metrics.displacement import scene_displacements
 from e2rl.metrics.statistics import bootstrap_draws, cluster_index, interval, resampled_means
 from e2rl.prior.lane_relative import HORIZON, SIZE
+from e2rl.prior.spread import main_direction, spread_noise, stratified
 from e2rl.scene.recording import VEHICLE
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.world import World
@@ -35,9 +36,8 @@ def open_loop_rows(scenes: SceneSet, methods: list[Method], samples: int, device
         parts = []
         for index in torch.arange(len(scenes)).split(BATCH):
             scene = scenes.batch(index).to(device)
-            plans = [sample_plan(method.synthesizer, scene, index.to(device) + sample * 1_000_003)
-                     for sample in range(count)]
-            parts.append(_displacements(scene, torch.stack(plans, 1)))
+            seed = index.to(device) + 1_000_003 * torch.arange(count, device=device)[:, None]
+            parts.append(_displacements(scene, sample_plans(method.synthesizer, scene, seed)))
         columns = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
         rows.append({
             "dataset": scenes.dataset, "split": scenes.split, "method": method.name, "ego": EGO, "eta": method.eta,
@@ -46,23 +46,36 @@ def open_loop_rows(scenes: SceneSet, methods: list[Method], samples: int, device
     return rows
 
 
-def sample_plan(synthesizer: Synthesizer | Baseline, scene: TensorDictBase, seed: Tensor) -> Tensor:
-    """One joint plan [B, V, HORIZON, 4] of scenes [B] from their start states, routes drawn anew; seed [B] int64.
+def sample_plans(synthesizer: Synthesizer | Baseline, scene: TensorDictBase, seed: Tensor) -> Tensor:
+    """Joint plans [B, S, V, HORIZON, 4] of scenes [B] from their start states; seed [S, B] int64.
 
-    The prior's plan stands as sampled: the acceleration bounds belong to the executed half second, and the present
-    ones held over 5 s would make it a tenth less accurate.
+    The prior's samples are stratified (prior/spread.py) and stand as drawn: the acceleration bounds belong to the
+    executed half second, and the present ones held over 5 s would make them a tenth less accurate.
     """
+    if isinstance(synthesizer, Baseline):
+        return torch.stack([_straight_plan(synthesizer, scene, one) for one in seed], 1)
+    prior, (count, batch), vehicles = synthesizer.prior, seed.shape, scene["route_log"].shape[1]
+    draw = lambda number, *shape, uniform=False: noise_of(  # noqa: E731
+        seed.flatten(), torch.full((count * batch,), number), shape, uniform).unflatten(0, (count, batch))
+    order, place = draw(0, 2, vehicles, uniform=True).unbind(2), draw(2, 2, vehicles, uniform=True)[0].unbind(1)
+    noise = draw(1, prior.sampler.steps, vehicles, SIZE).transpose(1, 2)
+    noise = spread_noise(noise, main_direction(prior.schedule, prior.sampler, noise.device), order[1], place[1])
+    plans = []
+    for uniform, one in zip(stratified(order[0], place[0]), noise, strict=True):
+        routed, state = prior.start(scene, prior.choose_routes(scene, uniform))
+        zero = torch.zeros(batch, dtype=torch.long, device=seed.device)
+        context = prior.encode(routed, state, scene["start"], scene["valid"], zero, None)
+        plans.append(prior.decode(prior.sample(context, one).x0, context).states())
+    return torch.stack(plans, 1)
+
+
+def _straight_plan(synthesizer: Baseline, scene: TensorDictBase, seed: Tensor) -> Tensor:
+    """The plan [B, V, HORIZON, 4] of a baseline; seed [B]."""
     zero = torch.zeros_like(seed)
     episode = synthesizer.begin(scene, seed, zero.float())
-    if isinstance(synthesizer, Baseline):
-        world = World(scene, zero, scene["start"], scene["valid"], scene["start_accel"], episode.routed.route)
-        unknown = scene["start"][:, :1].expand(-1, HORIZON, -1)  # baselines do not look at the ego's plan
-        return synthesizer.replan(episode, world, unknown)[1].states()
-    prior = synthesizer.prior
-    context = prior.encode(episode.routed, episode.state, scene["start"], scene["valid"], zero, None)
-    shape = (prior.sampler.steps, episode.routed.route.shape[1], SIZE)
-    noise = noise_of(seed, zero + 1, shape).transpose(0, 1)
-    return prior.decode(prior.sample(context, noise).x0, context).states()
+    world = World(scene, zero, scene["start"], scene["valid"], scene["start_accel"], episode.routed.route)
+    unknown = scene["start"][:, :1].expand(-1, HORIZON, -1)  # baselines do not look at the ego's plan
+    return synthesizer.replan(episode, world, unknown)[1].states()
 
 
 def _displacements(scene: TensorDictBase, plans: Tensor) -> dict[str, Tensor]:

@@ -18,6 +18,7 @@ from e2rl.evaluation.files import (
     write_rollouts,
     write_rows,
 )
+from e2rl.evaluation.processes import spread
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
 from e2rl.scene.scene import SceneSet
@@ -46,35 +47,51 @@ def scene_seed(scene: int, seed: int) -> int:
 
 def run_protocol(
     scenes: SceneSet, methods: list[Method], ego: Ego, ego_name: str, seeds: list[int], sim: SimSettings,
-    folder: Path | None = None, batch: int = 64, device: str = "cpu", save_rollouts: bool = True,
+    folder: Path | None = None, batch: int = 64, device: str = "cpu", save_rollouts: bool = True, processes: int = 1,
     only: list[int] | None = None, **fields,
 ) -> list[dict]:
     """Roll out every method on every (scene, seed), score, and return the rows of metrics.json.
 
-    folder: where rollouts/ (if save_rollouts), rollouts.csv and metrics.json are written (None: nowhere). fields join
-    each row. only: positions of the scenes to run, with the noise that they have among all (None: all).
+    folder: where rollouts/ (if save_rollouts), rollouts.csv and metrics.json are written (None: nowhere); batch: at
+    once, in each of so many processes: the rows do not depend on their number. only: positions of the scenes to run,
+    with the noise that they have among all (None: all). fields join each row.
     """
     tasks = [(scene, seed) for seed in seeds for scene in (range(len(scenes)) if only is None else only)]
+    count = -(-len(tasks) // batch)
+    parts = [tasks[k * len(tasks) // count:(k + 1) * len(tasks) // count] for k in range(count)]
+    jobs = [(method, part) for method in methods for part in parts]
+    into = Path(folder) / ROLLOUTS if folder is not None and save_rollouts else None
+
+    def work(job: tuple[Method, list[tuple[int, int]]]) -> tuple[list[dict], list[dict]]:
+        return score_part(scenes, *job, ego, ego_name, sim, into, device)
+
     rows, features = [], []
     with tqdm(total=len(tasks) * len(methods), desc="rollouts", unit="rollout") as bar:
-        for method in methods:
-            source = Source(scenes.dataset, scenes.split, method.name, ego_name)
-            for begin in range(0, len(tasks), batch):
-                part = tasks[begin:begin + batch]
-                rollouts = roll_out_part(scenes, part, method, ego, sim, device)
-                scored, samples = score_rollouts(rollouts)
-                add_avoidable(scored, rollouts, scenes.batch([scene for scene, _ in part]), sim)
-                rows += label_rows(scored, source)
-                features += samples
-                if folder is not None and save_rollouts:
-                    write_rollouts(Path(folder) / ROLLOUTS, rollouts, source)
-                bar.set_postfix(method=method.name, eta=method.eta)
-                bar.update(len(part))
+        results = spread(work, jobs, processes, cost=lambda job: job[0].eta)
+        for (method, part), (found, samples) in zip(jobs, results, strict=True):
+            rows += found
+            features += samples
+            bar.set_postfix(method=method.name, eta=method.eta)
+            bar.update(len(part))
     result = metric_rows(rows, features, **fields)
     if folder is not None:
         write_rows(Path(folder) / TABLE, rows)
         write_metrics(Path(folder) / METRICS_FILE, result)
     return result
+
+
+def score_part(
+    scenes: SceneSet, method: Method, part: list[tuple[int, int]], ego: Ego, ego_name: str, sim: SimSettings,
+    folder: Path | None, device: str,
+) -> tuple[list[dict], list[dict]]:
+    """Rows and realism samples (arrays) of (scene, seed) pairs under one method; folder: for their files, or None."""
+    rollouts = roll_out_part(scenes, part, method, ego, sim, device)
+    source = Source(scenes.dataset, scenes.split, method.name, ego_name)
+    scored, samples = score_rollouts(rollouts)
+    add_avoidable(scored, rollouts, scenes.batch([scene for scene, _ in part]), sim)
+    if folder is not None:
+        write_rollouts(folder, rollouts, source)
+    return label_rows(scored, source), samples
 
 
 def roll_out_part(scenes: SceneSet, part: list[tuple[int, int]], method: Method, ego: Ego, sim: SimSettings,

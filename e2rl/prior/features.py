@@ -6,15 +6,16 @@ from torch import Tensor
 from e2rl.prior.lane_relative import LaneState
 from e2rl.prior.leaders import FREE, idm_acceleration, leaders
 from e2rl.prior.routed import RoutedScene
-from e2rl.scene.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
+from e2rl.scene.recording import DT, LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
 from e2rl.scene.route import SPACING, interpolate
+from e2rl.scene.smoothing import PAST
 
 CURVATURE_AT = (0.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)  # m ahead
 TURN_AT = (10.0, 20.0, 40.0, 60.0, 80.0)
 LEADER_AT = (0.0, 1.5, 3.0)  # s ahead, the others at constant velocity
 COMFORT_LATERAL, COMFORT_BRAKE = 2.5, 1.2  # m/s^2
-NODE, EDGE = 51, 15
-SIDED_NODE = (2, 3, 4, *range(9, 22))  # features that change sign under a mirror image
+NODE, EDGE = 51 + PAST + 4, 15
+SIDED_NODE = (2, 3, 4, *range(9, 22), *range(51 + PAST, NODE))  # features that change sign under a mirror image
 SIDED_EDGE = (1, 3, 5, 13)
 
 
@@ -41,6 +42,16 @@ def _lights(routed: RoutedScene, state: LaneState, step: Tensor) -> list[Tensor]
         out += [(seen & (colour == c)).float() for c in (LIGHT_RED, LIGHT_YELLOW, LIGHT_GREEN)]
         out.append(torch.where(seen & (colour != LIGHT_GREEN), need / 4, 0.0))
     return out
+
+
+def past_features(past: Tensor, v: Tensor, estimated: Tensor) -> list[Tensor]:
+    """PAST + 4 features [B, V] of what was seen before the start: the speed in each 0.1 s against the present one, the
+    way aside and the turn 0.5 s and 1 s ago. Only an estimate needs them: 0 where states are exact."""
+    ahead = torch.cat([torch.zeros_like(past[..., :1, 0]), past[..., 0]], -1)
+    change = ((-ahead.diff(dim=-1) / DT - v[..., None]) / 2).clamp(-2, 2)
+    at = past[..., PAST // 2 - 1::PAST // 2, :]
+    features = torch.cat([change, at[..., 1].clamp(-5, 5), 5 * at[..., 2].clamp(-1, 1)], -1)
+    return (features * estimated[:, None, None]).unbind(-1)
 
 
 def curve_speed(state: LaneState, points: Tensor, lateral: float, brake: float) -> Tensor:
@@ -84,7 +95,8 @@ def node_features(routed: RoutedScene, state: LaneState, agents: Tensor, present
         ((curve - v) / 5).clamp(-2, 2), torch.exp(-rest.clamp(min=0) / 30), (rest < 200).float(), *lead,
         idm / 2, *_lights(routed, state, step), length / 5, width / 2, routed.parked.float(),
         routed.has_lane.float(), (first[0] < FREE).float(), (v * v / (2 * first[0].clamp(min=1.0))).clamp(max=8) / 4,
-        (v / 10) ** 2, torch.sqrt(v.clamp(min=0) + 1e-3) / 3, estimated[:, None].float().expand_as(v)]
+        (v / 10) ** 2, torch.sqrt(v.clamp(min=0) + 1e-3) / 3, estimated[:, None].float().expand_as(v),
+        *past_features(routed.past, v, estimated)]
     return torch.stack(features, -1)
 
 

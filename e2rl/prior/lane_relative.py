@@ -74,6 +74,12 @@ def _speed_basis(device: torch.device) -> Tensor:
     return ((hat[1:] + hat[:-1]) / 2 * DT).cumsum(0).float().to(device)
 
 
+def way_weights(device=None) -> Tensor:
+    """[KNOTS]: mean way driven over the horizon that a unit of each acceleration knot adds, m."""
+    basis = _speed_basis(torch.device(device or "cpu"))
+    return ((torch.cat([torch.zeros_like(basis[:1]), basis[:-1]]) + basis) / 2 * DT).cumsum(0).mean(0)[1:]
+
+
 @cache
 def _offset_basis(device: torch.device) -> Tensor:
     """[4, 4]: polynomial coefficients of u^3..u^6 from (d(1/2), d(1), d'(1), d''(1)) less the given lower terms."""
@@ -137,14 +143,44 @@ def decode(x: Tensor, state: LaneState, points: Tensor, steps: slice = slice(Non
     return LaneState(s, d, d1, d2, v, accel, xy[..., 0], xy[..., 1], heading, curvature + d2)
 
 
+class _Polynomial(torch.autograd.Function):
+    """Horner's rule with its derivative in closed form: what autograd would record are a hundred small operations."""
+
+    @staticmethod
+    def forward(ctx, c: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        value, first, second, third = horner(c, u)
+        ctx.save_for_backward(c, u, first, second, third)
+        return value, first, second
+
+    @staticmethod
+    def backward(ctx, *grads: Tensor) -> tuple[Tensor, Tensor]:
+        c, u, first, second, third = ctx.saved_tensors
+        powers = [torch.ones_like(u), u]
+        for _ in range(5):
+            powers.append(powers[-1] * u)
+        table = torch.stack(powers, -2)  # [..., 7, H]
+        of_value, of_first, of_second = (
+            (table[..., :7 - shift, :] * grad[..., None, :]).sum(-1) for shift, grad in enumerate(grads))
+        power, pad = torch.arange(7, device=c.device, dtype=c.dtype), torch.nn.functional.pad
+        of_c = of_value + power * pad(of_first, (1, 0)) + power * (power - 1) * pad(of_second, (2, 0))
+        return of_c.sum_to_size(c.shape), grads[0] * first + grads[1] * second + grads[2] * third
+
+
 def polynomial(c: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Value, first and second derivative (in u) of the polynomial c [..., 7] at u [..., H], by Horner's rule."""
-    value = first = second = torch.zeros_like(u)
-    for k in range(6, -1, -1):
-        second = second * u + 2 * first
+    """Value, first and second derivative (in u) of the polynomial c [..., 7] at u [..., H]."""
+    return _Polynomial.apply(c, u)
+
+
+def horner(c: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Value and three derivatives of the polynomial c [..., 7] at u [..., H], by Horner's rule."""
+    value, first = c[..., 6, None] * u + c[..., 5, None], c[..., 6, None]
+    second = third = torch.zeros_like(first)
+    for k in range(4, -1, -1):
+        third = third * u + 3 * second
+        second = second * u + (first + first)
         first = first * u + value
         value = value * u + c[..., k, None]
-    return value, first, second
+    return value, first, second, third
 
 
 def fit(track: LaneState, known: Tensor, state: LaneState) -> tuple[Tensor, Tensor]:

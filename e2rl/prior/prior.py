@@ -19,6 +19,7 @@ from e2rl.prior.routed import RoutedScene, route_scene
 from e2rl.prior.sde import SAMPLERS, NoiseSchedule, path_kl, reverse_step
 from e2rl.scene.route import project
 
+SPENT = 0.999  # share of a budget from which it counts as used up
 CLEAN = 0.01  # noise level at which the ego's plan is shown to the network
 STANDING, HOLD = 0.5, 2.0  # m/s, m: a standing vehicle whose 5-s plan is shorter than this is held
 
@@ -92,7 +93,7 @@ class Prior(nn.Module):
 
     @torch.no_grad()
     def choose_routes(self, scene: TensorDictBase, uniform: Tensor) -> Tensor:
-        """A route candidate [B, V] for each vehicle, drawn by uniform [B, V, R]; the ego's is its mission."""
+        """A route candidate [B, V] for each vehicle, drawn by uniform [B, V]; the ego's is its mission."""
         chosen = sample_route(self.route_choice(scene), self.sampler.route_temperature, uniform)
         return torch.cat([scene["route_log"][:, :1], chosen[:, 1:]], 1)
 
@@ -147,11 +148,14 @@ class Prior(nn.Module):
         return LaneState(*(torch.where(on_lane, getattr(lane, f.name), getattr(free, f.name))
                            for f in fields(LaneState)))
 
-    def sample(self, context: Context, noise: Tensor, control: Control | None = None) -> Sample:
+    def sample(self, context: Context, noise: Tensor, control: Control | None = None,
+               budget: Tensor | None = None) -> Sample:
         """One joint sample by the reverse SDE from level `start` to 0, with the steps of `sde.reverse_step`.
 
         noise [steps, B, V, SIZE]: standard normal, the first slice starts the reverse SDE, the others drive it.
         control(x, level, k, context, denoise) -> (x, x0 before, x0 after control); see e2rl/synthesizer/control.py.
+        budget [B]: path KL that control may add to a scene, all vehicles together (None: any). A step that would
+        exceed it moves by the share of its control that uses it up; none of the later ones is controlled.
         """
         settings = self.sampler
         levels = self.schedule.levels(settings.steps, noise.device)
@@ -169,8 +173,16 @@ class Prior(nn.Module):
                                noise=noise[settings.steps - k + 1], churn=settings.churn)
                 x, variance = step(x0=x0, past=past)
                 if control is not None:  # against what the prior would do from the same visited states
-                    kl = kl + path_kl(x - step(x0=nominal, past=nominal_past)[0], variance * settings.temperature**2)
+                    plain = step(x0=nominal, past=nominal_past)[0]
+                    added = path_kl(x - plain, variance * settings.temperature**2)
+                    if budget is not None:
+                        share = within(budget, kl, added)[:, None, None]
+                        x, x0 = plain + share * (x - plain), nominal + share * (x0 - nominal)
+                        added = share[..., 0] ** 2 * added
+                    kl = kl + added
                 past, nominal_past = (x0, high), (nominal, high)
+            elif budget is not None and control is not None:  # without noise there is no KL to count
+                x0 = torch.where((kl.sum(-1) < SPENT * budget)[:, None, None], x0, nominal)
         return Sample(x0, kl)
 
     @torch.no_grad()
@@ -208,6 +220,13 @@ class Plan:
     def after(self, steps: int) -> LaneState:
         """The lane states [B, V] once `steps` have been executed."""
         return self.motion.map(lambda value: value[..., steps - 1])
+
+
+def within(budget: Tensor, spent: Tensor, added: Tensor) -> Tensor:
+    """Share [B] of a step's shift that keeps path KL within the budget [B]: spent, added [B, V]; KL grows with the
+    square of the shift."""
+    left = (budget - spent.sum(-1)).clamp(min=0)
+    return (left / added.sum(-1).clamp(min=1e-12)).clamp(max=1.0).sqrt()
 
 
 def plan_to_x(plan: Tensor, state: LaneState, routed: RoutedScene) -> Tensor:

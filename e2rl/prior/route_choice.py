@@ -60,7 +60,10 @@ class RouteChoice(nn.Module):
 
 
 def sample_route(logits: Tensor, temperature: float, uniform: Tensor) -> Tensor:
-    """A candidate [B, V] for each vehicle by the Gumbel trick on uniform [B, V, R]; temperature 0: the most likely."""
+    """A candidate [...] of logits [..., R] for each uniform number [...] in [0, 1), by the inverse of the distribution
+    function; temperature 0: the most likely."""
     if temperature <= 0:
         return logits.argmax(-1)
-    return (logits / temperature - torch.log(-torch.log(uniform.clamp(1e-9, 1 - 1e-7)))).argmax(-1)
+    total = torch.softmax(logits / temperature, -1).cumsum(-1)
+    below = uniform.clamp(max=1 - 1e-6)[..., None] * total[..., -1:]  # never past the last possible one
+    return (total <= below).sum(-1)

@@ -21,7 +21,8 @@ class RoutedScene:
     size [B, N, 2]; light_state [B, T+1, L]; route [B, V]; points [B, V, P, 2]; length [B, V]; open [B, V]; limit
     [B, V, P]; light, light_s [B, V, 2]; conflict [B, V, V] bool, conflict_s [B, V, V]: arc length on i's route where it
     first meets j's; crossing [B, V, V]: angle there [rad]; modelled [B, V]: vehicles that the prior moves or conditions
-    on; parked [B, V]; has_lane [B, V]: others are represented in free space.
+    on; parked [B, V]; has_lane [B, V]: others are represented in free space;
+    past [B, V, 10, 3]: before the start frame (see the scene).
     """
 
     size: Tensor
@@ -39,6 +40,7 @@ class RoutedScene:
     modelled: Tensor
     parked: Tensor
     has_lane: Tensor
+    past: Tensor
 
 
 def take_route(values: Tensor, route: Tensor) -> Tensor:
@@ -65,7 +67,7 @@ def route_scene(scene: TensorDictBase, route: Tensor, free_space: bool = False) 
         scene["size"], scene["light_state"], route, points, take_route(scene["route_length"], route),
         take_route(scene["route_open"], route), take_route(scene["route_limit"], route),
         take_route(scene["route_light"], route), take_route(scene["route_light_s"], route), conflict, conflict_s,
-        crossing, valid & ~parked, parked, has_lane & (not free_space))
+        crossing, valid & ~parked, parked, has_lane & (not free_space), scene["past"][:, :vehicles])
 
 
 def reroute(routed: RoutedScene, scene: TensorDictBase, route: Tensor, who: Tensor, leaves: Tensor, ways: Tensor,

@@ -14,7 +14,7 @@ from e2rl.scene.log_route import route_from_log
 from e2rl.scene.paths import wrap
 from e2rl.scene.recording import VEHICLE, Recording
 from e2rl.scene.route import SPACING, project
-from e2rl.scene.smoothing import causal_state, drop_jumps, smooth
+from e2rl.scene.smoothing import PAST, causal_past, causal_state, drop_jumps, smooth
 
 STANDING = 0.5  # m/s
 FIT = 2.0  # m: mean distance of a recorded future to a candidate that still counts as the way driven
@@ -69,6 +69,9 @@ def build_scene(recording: Recording, settings: BuildSettings) -> TensorDict:
     known = valid[frame:frame + last, chosen]
     scene["logged"][:last, rows] = np.where(known[..., None], states[frame:frame + last, chosen] - [*origin, 0, 0], 0)
     scene["logged_valid"][:last, rows] = known
+    scene["past"] = np.zeros((settings.vehicles, PAST, 3))
+    cars = rows[rows < settings.vehicles]
+    scene["past"][cars] = causal_past(recording.states, valid, frame, start[:, 3])[agents[cars]]
     scene |= _routes(scene, graph, recording, origin, settings)
     scene |= _lights(recording, frame, origin, settings.steps)
     scene |= _map(recording, graph, scene, origin, settings)

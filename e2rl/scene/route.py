@@ -13,9 +13,10 @@ SPACING = 2.0  # m of arc length between vertices
 
 def _take(route: Tensor, index: Tensor) -> Tensor:
     """Vertices route [..., P, 2] at index [..., K] -> [..., K, 2], leading dims broadcast."""
-    lead = torch.broadcast_shapes(route.shape[:-2], index.shape[:-1])
-    route = route.expand(*lead, *route.shape[-2:])
-    index = index.expand(*lead, index.shape[-1])
+    if route.shape[:-2] != index.shape[:-1]:
+        lead = torch.broadcast_shapes(route.shape[:-2], index.shape[:-1])
+        route = route.expand(*lead, *route.shape[-2:])
+        index = index.expand(*lead, index.shape[-1])
     return route.gather(-2, index[..., None].expand(*index.shape, 2))
 
 
@@ -54,26 +55,36 @@ def onto_segments(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`project` of points [..., 2] whose nearest vertices [...] are known, onto the segments at either side of these.
 
-    last: index of the last segment; take: the vertices [..., 2] at an index [...].
+    last: index of the last segment; take: the vertices [2, ..., 2] at an index [2, ...].
     """
-    best = None
-    for start in ((vertex - 1).clamp(0, last), vertex.clamp(0, last)):
-        a, b = take(start), take(start + 1)
-        along = b - a
-        length = along.norm(dim=-1).clamp(min=1e-6)
-        unit = along / length[..., None]
-        offset = points - a
-        t = (offset * unit).sum(-1) / length
-        low = torch.where(start == 0, -torch.inf, 0.0)
-        high = torch.where(start == last, torch.inf, 1.0)
-        t = torch.maximum(torch.minimum(t, high), low)
-        gap = (offset - t[..., None] * along).norm(dim=-1)
-        d = unit[..., 0] * offset[..., 1] - unit[..., 1] * offset[..., 0]
-        found = (gap, SPACING * (start + t), torch.where(d < 0, -gap, gap), torch.atan2(unit[..., 1], unit[..., 0]))
-        best = found if best is None else tuple(
-            torch.where(found[0] < best[0], new, old) for new, old in zip(found, best, strict=True)
-        )
-    return best[1], best[2], best[3]
+    start = torch.stack([vertex - 1, vertex]).clamp(0, last)
+    a = take(start)
+    return onto_nearer(points, start, last, a, *segment(a, take(start + 1)))
+
+
+def segment(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """From a to b [..., 2]: the difference, its length [...] (at least 1e-6), its direction, its heading [...]."""
+    along = b - a
+    length = along.norm(dim=-1).clamp(min=1e-6)
+    unit = along / length[..., None]
+    return along, length, unit, torch.atan2(unit[..., 1], unit[..., 0])
+
+
+def onto_nearer(
+    points: Tensor, start: Tensor, last: int, a: Tensor, along: Tensor, length: Tensor, unit: Tensor, heading: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Arc length, offset and heading [...] of points [..., 2] on the nearer of two segments [2, ...] (see `segment`)
+    that begin at vertices start [2, ...], a [2, ..., 2]; the first of equals."""
+    offset = points - a
+    t = (offset * unit).sum(-1) / length
+    low = torch.where(start == 0, -torch.inf, 0.0)
+    high = torch.where(start == last, torch.inf, 1.0)
+    t = torch.maximum(torch.minimum(t, high), low)
+    gap = (offset - t[..., None] * along).norm(dim=-1)
+    d = unit[..., 0] * offset[..., 1] - unit[..., 1] * offset[..., 0]
+    second = gap[1] < gap[0]
+    first, other = torch.stack([SPACING * (start + t), torch.where(d < 0, -gap, gap), heading], -1)
+    return torch.where(second[..., None], other, first).unbind(-1)
 
 
 def interpolate(route: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -86,7 +97,8 @@ def interpolate(route: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     u = s / SPACING
     i = u.detach().floor().clamp(0, last).long()
     t = u - i
-    before, a, b, after = (_take(route, j) for j in ((i - 1).clamp(min=0), i, i + 1, (i + 2).clamp(max=last + 1)))
+    four = torch.cat([i - 1, i, i + 1, i + 2], -1).clamp(0, last + 1)
+    before, a, b, after = _take(route, four).unflatten(-2, (4, i.shape[-1])).unbind(-3)
     xy = a + t[..., None] * (b - a)
     first, second = b - before, after - a
     angle = torch.atan2(first[..., 1], first[..., 0])

@@ -6,6 +6,7 @@ P vertices; S lights; M, D map points; L lanes. Positions are relative to the sc
 | key | shape | |
 | --- | --- | --- |
 | start, start_accel, start_yaw_rate | [N, 4], [N], [N] | causal estimate at the start frame |
+| past | [V, 10, 3] | 0.1 s, 0.2 s, ... before the start frame: m ahead and left, turn, as seen from there |
 | valid, parked | [N] bool | present at the start frame; standing off the lanes |
 | size, agent_type | [N, 2], [N] int64 | length and width; index into AGENT_TYPES |
 | logged, logged_valid | [T+1, N, 4], [T+1, N] | smoothed recording, row 0 the start frame |
@@ -34,11 +35,11 @@ RAGGED = {  # key: value of its padding; these first dims differ between scenes
     "lane_left": -1, "lane_right": -1, "drivable_points": 0.0, "drivable_index": -1,
 }
 KEYS = {  # key: number of dims of one scene
-    "start": 2, "start_accel": 1, "start_yaw_rate": 1, "valid": 1, "parked": 1, "size": 2, "agent_type": 1, "logged": 3,
-    "logged_valid": 2, "route_points": 4, "route_length": 2, "route_open": 2, "route_valid": 2, "route_limit": 3,
-    "route_light": 3, "route_light_s": 3, "route_log": 1, "light_state": 2, "light_points": 2, "lane_points": 2,
-    "lane_index": 1, "lane_width": 1, "lane_exits": 2, "lane_left": 1, "lane_right": 1, "drivable_points": 2,
-    "drivable_index": 1, "field": 2, "field_origin": 1,
+    "start": 2, "start_accel": 1, "start_yaw_rate": 1, "past": 3, "valid": 1, "parked": 1, "size": 2, "agent_type": 1,
+    "logged": 3, "logged_valid": 2, "route_points": 4, "route_length": 2, "route_open": 2, "route_valid": 2,
+    "route_limit": 3, "route_light": 3, "route_light_s": 3, "route_log": 1, "light_state": 2, "light_points": 2,
+    "lane_points": 2, "lane_index": 1, "lane_width": 1, "lane_exits": 2, "lane_left": 1, "lane_right": 1,
+    "drivable_points": 2, "drivable_index": 1, "field": 2, "field_origin": 1,
 }
 
 
@@ -104,6 +105,16 @@ class SceneSet:
             return self.scene_id.index(which)
         raise InputError(f"scene={which}: expected a position below {len(self)} or the id of a scene, such as "
                          f"{self.scene_id[0]}")
+
+    def copy_into(self, batch: TensorDictBase, rows: torch.Tensor, indices: torch.Tensor) -> None:
+        """Overwrite rows [b] (ascending) of a batch of scenes by the scenes at `indices` [b], in place."""
+        whole = len(rows) == len(batch)
+        for key in self.scenes.keys():  # noqa: SIM118 - not a dict
+            source, target = self.scenes[key], batch[key]
+            if whole and source.device == target.device:  # without a second copy, whose pages cost more than the first
+                torch.index_select(source, 0, indices, out=target)
+            else:
+                target[rows] = source[indices].to(target.device)
 
     def first(self, count: int | None) -> "SceneSet":
         """The first `count` scenes (all for None)."""

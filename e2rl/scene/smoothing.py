@@ -9,6 +9,7 @@ from e2rl.scene.recording import DT
 
 WINDOW, ORDER = 15, 2  # Savitzky-Golay: frames, polynomial order (design.md section 4)
 CAUSAL_WINDOW = 11  # frames: the current one and 1 s of history
+PAST = CAUSAL_WINDOW - 1  # frames of that history
 MAX_TURN, MAX_WAY = 1.0, 5.0  # rad, m in one frame; more is a jump
 MAX_GAP = 0.55  # s between time stamps that interpolation bridges (2 Hz annotations)
 TOP_SPEED = 45.0  # m/s; recorded speeds beyond it are glitches
@@ -125,6 +126,27 @@ def causal_state(states: np.ndarray, valid: np.ndarray, frame: int) -> tuple[np.
     accel, yaw_rate = np.where(single | (speed < 0.1), 0.0, accel), np.where(single, 0.0, turn[:, 1, 0])
     here = states[frame, :, :2] + position[:, 0]
     return np.concatenate([here, angle[:, None], speed[:, None]], 1), accel, np.clip(yaw_rate, -1.0, 1.0)
+
+
+def causal_past(states: np.ndarray, valid: np.ndarray, frame: int, speed: np.ndarray) -> np.ndarray:
+    """Where the agents were [A, PAST, 3] 0.1 s, 0.2 s, ... before `frame`, as recorded: m ahead and left, rad, all as
+    seen from the recorded pose at `frame`.
+
+    speed [A]: at `frame`. Before the contiguous trailing frames an agent counts as having come straight on at its
+    speed, which is how one is described of whom nothing is known.
+    """
+    back = np.arange(1, PAST + 1)
+    frames = np.clip(frame - back, 0, None)
+    known = np.logical_and.accumulate(valid[frames] & (frame >= back)[:, None] & valid[frame], axis=0)
+    way = states[frames, :, :2] - states[frame, :, :2]
+    angle = states[frame, :, 2]
+    cos, sin = np.cos(angle), np.sin(angle)
+    seen = np.stack([way[..., 0] * cos + way[..., 1] * sin, way[..., 1] * cos - way[..., 0] * sin,
+                     wrap(states[frames, :, 2] - angle)], -1)
+    first = np.concatenate([np.zeros_like(seen[:1]), seen])[known.sum(0), np.arange(len(angle))]  # the earliest known
+    since = np.maximum(back[:, None] - known.sum(0), 0) * DT
+    straight = first - np.stack([since * speed, 0 * since, 0 * since], -1)
+    return np.where(known[..., None], seen, straight).swapaxes(0, 1)
 
 
 def _fit(basis: np.ndarray, weight: np.ndarray, value: np.ndarray, quadratic: np.ndarray) -> np.ndarray:

@@ -26,7 +26,7 @@ from e2rl.scene.recording import Recording
 from e2rl.scene.scene import SceneSet, stack, validate
 
 OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are dropped
-VERSION = 2  # of the scene builder: raise it when the same recording would make another scene
+VERSION = 3  # of the scene builder: raise it when the same recording would make another scene
 
 
 def load_scenes(

@@ -1,5 +1,6 @@
 """Look-up of the drivable field: metres beyond the border of the drivable area (design.md section 5)."""
 
+import torch
 from torch import Tensor
 
 from e2rl.scene.drivable import CELL, FAR
@@ -16,11 +17,10 @@ def off_road(points: Tensor, field: Tensor, origin: Tensor) -> Tensor:
     outside = ((place < 0) | (place > cells - 1)).any(-1)
     low = place.detach().floor().clamp(0, cells - 2)
     share = (place - low).clamp(0, 1)
-    index = (low[..., 0] * cells + low[..., 1]).long().view(batch, -1)
-    flat = field.flatten(1)
-    v00, v01, v10, v11 = (
-        flat.gather(1, index + shift).view(outside.shape).to(points.dtype) for shift in (0, 1, cells, cells + 1)
-    )
-    sx, sy = share[..., 0], share[..., 1]
-    value = (1 - sx) * ((1 - sy) * v00 + sy * v01) + sx * ((1 - sy) * v10 + sy * v11)
-    return value.masked_fill(outside, FAR)
+    index = (low[..., 0] * cells + low[..., 1]).long()
+    four = index[..., None] + torch.arange(2, device=index.device) * cells  # rows x and x + 1 of the cell
+    four = four[..., None] + torch.arange(2, device=index.device)
+    value = field.flatten(1).gather(1, four.view(batch, -1)).view(four.shape).to(points.dtype)
+    sx, sy = share[..., 0], share[..., 1:]
+    value = (1 - sy) * value[..., 0] + sy * value[..., 1]
+    return ((1 - sx) * value[..., 0] + sx * value[..., 1]).masked_fill(outside, FAR)

@@ -26,8 +26,16 @@ def yaw_rate_bound(speed: Tensor) -> Tensor:
 
 
 def step(state: Tensor, action: Tensor) -> Tensor:
-    """State [..., 4] after one DT of action [..., 2] = (acceleration m/s^2, yaw rate rad/s)."""
-    return rollout(state, action[..., None, :])[..., 0, :]
+    """State [..., 4] after one DT of action [..., 2] = (acceleration m/s^2, yaw rate rad/s): `rollout` of one step."""
+    x, y, heading, before = state.unbind(-1)
+    acceleration, yaw_rate = action.unbind(-1)
+    speed = (before + acceleration * DT).clamp(0.0, MAX_SPEED)
+    mean = (before + speed) / 2
+    bound = yaw_rate_bound(mean)
+    turn = torch.clamp(yaw_rate, -bound, bound) * DT
+    heading = heading + turn
+    along, middle = mean * DT, heading - turn / 2
+    return torch.stack([x + along * middle.cos(), y + along * middle.sin(), wrap(heading), speed], -1)
 
 
 def rollout(start: Tensor, actions: Tensor) -> Tensor:

@@ -1,7 +1,10 @@
 """DrivingEnv: B scenes at once, the ego driven by actions, the traffic by given trajectories."""
 
-from collections.abc import Mapping
+import os
+import shutil
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -9,18 +12,21 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from e2rl.scene.recording import DT, VEHICLE
+from e2rl.errors import InputError
 from e2rl.scene.route import project
 from e2rl.scene.scene import SceneSet
-from e2rl.sim import dynamics
+from e2rl.sim.around import axes, look_around
 from e2rl.sim.drivable import off_road
-from e2rl.sim.geometry import separation
-from e2rl.sim.mission import Mission, limit_at, mission_of
-from e2rl.sim.observation import OBSERVATION_SIZE, observe
-from e2rl.sim.reward import check_weights, reward_terms, weighted_sum
+from e2rl.sim.mission import Mission, mission_of
+from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, lens, observe, probe
+from e2rl.sim.reward import check_weights
+from e2rl.sim.setting import Place, setting_of, write_rows
+from e2rl.sim.step import Rules, Running, Stepped, replay_step, step
 from e2rl.sim.traffic import Traffic
 from e2rl.sim.world import World
 
+STARTING = ("start", "start_accel", "start_yaw_rate", "size", "agent_type", "field", "field_origin", "light_state",
+            "route_points", "route_length", "route_open", "route_limit", "route_light", "route_light_s", "route_log")
 DEFAULT_REWARD = {
     "progress": 0.1, "contact": -10.0, "off_road": -5.0, "comfort": -0.02, "speeding": -0.1, "lane_offset": -0.02,
 }
@@ -28,7 +34,10 @@ DEFAULT_REWARD = {
 
 @dataclass
 class SimSettings:
-    """Bounds of the ego's action, when an episode ends, and the reward weights (conf/sim/default.yaml)."""
+    """Bounds of the ego's action, when an episode ends, and the reward weights (conf/sim/default.yaml).
+
+    compile: the step by torch.compile, which needs a C++ compiler: equal but for rounding.
+    """
 
     max_acceleration: float = 5.0
     max_braking: float = 8.0
@@ -36,17 +45,8 @@ class SimSettings:
     end_on_contact: bool = True
     end_off_road: bool = True
     replay_ego: bool = False
+    compile: bool = False
     reward: Mapping[str, float] = field(default_factory=lambda: dict(DEFAULT_REWARD))
-
-
-@dataclass
-class Outcome:
-    """What one step did, each [B]: contact with a vehicle and with another agent, off the road (all bool), way [m]."""
-
-    contact: Tensor
-    contact_vru: Tensor
-    off_road: Tensor
-    way: Tensor
 
 
 class DrivingEnv(EnvBase):
@@ -64,20 +64,20 @@ class DrivingEnv(EnvBase):
     def __init__(self, scenes: SceneSet, settings: SimSettings, batch_size: int, device="cpu") -> None:
         super().__init__(device=device, batch_size=[batch_size])
         self.scenes, self.settings = scenes, settings
-        self._weights = check_weights(settings.reward)
         self._generator = torch.Generator()
         self.resets = 0  # counted on the host, so that policies notice new episodes without asking the device
         self._make_specs(batch_size)
         self.scene = scenes.batch(torch.zeros(batch_size, dtype=torch.long)).to(device)
         self.horizon = self.scene["logged"].shape[1] - 1
-        self._traffic = Traffic(self.scene)
+        weights = torch.tensor(check_weights(settings.reward), device=self.device)
+        self._rules = Rules(self.horizon, settings.end_on_contact, settings.end_off_road, weights, self._low,
+                            self._high)
+        self._traffic, self._lens = Traffic(self.scene), lens(self.device)
+        self._setting = setting_of(self.scene, mission_of(self.scene))
         zeros = torch.zeros(batch_size, device=device)
-        self._clock = zeros.long()
-        self._ego, self._action = zeros[:, None].repeat(1, 4), zeros[:, None].repeat(1, 2)
-        self._present, self._been_on_road = zeros.bool(), zeros.bool()
-        self._place: tuple[Tensor, Tensor, Tensor] = (zeros, zeros, zeros)
-        self._start_s = zeros
-        self.mission: Mission = mission_of(self.scene)
+        flags = torch.zeros(batch_size, dtype=torch.bool, device=device)
+        self._running = Running(zeros.long(), zeros[:, None].repeat(1, 4), zeros[:, None].repeat(1, 2),
+                                Place(zeros, zeros, zeros), flags, flags, zeros)
 
     def _make_specs(self, batch: int) -> None:
         low = torch.tensor([-self.settings.max_braking, -self.settings.max_yaw_rate], device=self.device)
@@ -122,22 +122,23 @@ class DrivingEnv(EnvBase):
         step_from: int or [B]; states [B, h, N, 4], valid [B, h, N]; steps beyond T are dropped from the traffic but
         stay in `World.plan`. route [B, V]: candidates now followed, default unchanged.
         """
-        step_from = torch.as_tensor(step_from, device=self.device).expand(self._clock.shape)
+        step_from = torch.as_tensor(step_from, device=self.device).expand(self._running.clock.shape)
         self._traffic.write(step_from, states, valid, route)
 
     def world(self) -> World:
         """The present moment. Its `scene` is the environment's own storage: overwritten at the next reset."""
-        states, valid, accel = self._traffic.at(self._clock)
-        first = (self._clock == 0)[:, None]
+        now = self._running
+        states, valid, accel = self._traffic.at(now.clock)
+        first = (now.clock == 0)[:, None]
         states = torch.where(first[..., None], self.scene["start"], states)
         valid = torch.where(first, self.scene["valid"], valid)
         accel = torch.where(first, self.scene["start_accel"], accel)
         return World(
-            scene=self.scene, step=self._clock,
-            states=torch.cat([self._ego[:, None], states[:, 1:]], 1),
-            valid=torch.cat([self._present[:, None], valid[:, 1:]], 1),
-            accel=torch.cat([self._action[:, :1], accel[:, 1:]], 1),
-            route=self._traffic.route, plan=self._traffic.plan(self._clock),
+            scene=self.scene, step=now.clock,
+            states=torch.cat([now.ego[:, None], states[:, 1:]], 1),
+            valid=torch.cat([now.present[:, None], valid[:, 1:]], 1),
+            accel=torch.cat([now.action[:, :1], accel[:, 1:]], 1),
+            route=self._traffic.route, plan=self._traffic.plan(now.clock),
         )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_) -> TensorDict:
@@ -150,91 +151,69 @@ class DrivingEnv(EnvBase):
             rows = torch.randint(len(self.scenes), (len(index),), generator=self._generator)
         else:
             rows = chosen.view(batch)[index].cpu()
-        self.scene[index] = self.scenes.batch(rows).to(self.device)
-        self.mission = mission_of(self.scene)
+        self.scenes.copy_into(self.scene, index, rows)
+        fresh = self.scene if len(index) == batch else self.scene.select(*STARTING)[index]
+        mission = mission_of(fresh)
+        write_rows(self._setting, index, setting_of(fresh, mission))
         self._traffic.reset(self.scene, index)
-        self._restart_ego(mask)
+        self._restart(mask, index, fresh, mission)
         self.resets += 1
-        none = torch.zeros(batch, dtype=torch.bool, device=self.device)
-        return TensorDict(
-            self._observed(Outcome(none, none, none, self._place[0] - self._start_s)) | self._done(none, none),
-            batch_size=self.batch_size, device=self.device,
-        )
+        return self._reset_output()
 
-    def _restart_ego(self, mask: Tensor) -> None:
-        """Start state, mission place and flags of the environments where mask [B]."""
-        scene, column = self.scene, mask[:, None]
+    def _restart(self, mask: Tensor, index: Tensor, scene: TensorDictBase, mission: Mission) -> None:
+        """Start states of the environments where mask [B], index [b], whose scenes are scene [b]."""
+        ego = scene["start"][:, 0]
+        s, d, heading = (value[:, 0] for value in project(ego[:, None, :2], mission.points))
+        on_road = off_road(ego[:, None, :2], scene["field"], scene["field_origin"])[:, 0] <= 0
         first = torch.stack([scene["start_accel"][:, 0], scene["start_yaw_rate"][:, 0]], -1)
-        self._ego = torch.where(column, scene["start"][:, 0], self._ego)
-        self._action = torch.where(column, first, self._action)
-        self._clock = self._clock.masked_fill(mask, 0)
-        self._present = self._present | mask
-        on_road = self._beyond_border() <= 0
-        self._been_on_road = torch.where(mask, on_road, self._been_on_road)
-        self._place = tuple(map(lambda new, old: torch.where(mask, new, old), self._project(None), self._place))
-        self._start_s = torch.where(mask, self._place[0], self._start_s)
+        started = Running(torch.zeros_like(index), ego, first, Place(s, d, heading), mask[index], on_road, s)
 
+        def put(old: Tensor, new: Tensor) -> Tensor:
+            return old.index_copy(0, index, new)
+
+        old = self._running
+        place = Place(*(put(*pair) for pair in zip(old.place, started.place, strict=True)))
+        self._running = Running(*(place if isinstance(new, Place) else put(value, new)
+                                  for value, new in zip(old, started, strict=True)))
+
+    def _reset_output(self) -> TensorDict:
+        now, world = self._running, self.world()
+        turn = axes(now.ego)
+        around = look_around(now.ego, turn, self._setting, world.states[:, 1:], world.valid[:, 1:], world.accel[:, 1:])
+        observation, _ = observe(self._lens, self._setting, EgoState(now.ego, turn, now.action, now.place), now.clock,
+                                 self.horizon, probe(self._lens, self._setting, now.ego, turn), around)
+        none = torch.zeros_like(now.present)
+        return self._output(Stepped(observation, now.start_s, none, none, none, none, none, now.place.s - now.start_s))
+
+    @torch.no_grad()  # what an environment keeps must not grow a graph, step after step
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        before, last_action = self._ego, self._action
-        self._clock = (self._clock + 1).clamp(max=self.horizon)
-        if self.settings.replay_ego:
-            row = torch.arange(len(self._clock), device=self.device)
-            known = self.scene["logged_valid"][row, self._clock, 0]
-            self._ego = torch.where(known[:, None], self.scene["logged"][row, self._clock, 0], before)
-            self._present = self._present & known
-        else:
-            action = torch.maximum(torch.minimum(tensordict["action"], self._high), self._low)
-            self._ego = dynamics.step(before, action)
-        self._action = dynamics.inverse(torch.stack([before, self._ego], 1))[:, 0]
-        old_s = self._place[0]
-        self._place = self._project(old_s + before[:, 3] * DT)
-        outcome = self._outcome(old_s)
-        left = ~self._present | (self._place[0] >= self.mission.end)
-        s, offset, _ = self._place
-        terms = reward_terms(
-            outcome.way, outcome.contact | outcome.contact_vru, outcome.off_road, self._action, last_action,
-            self._ego[:, 3], limit_at(self.mission, s), offset, DT,
-        )
-        self._present = ~left
-        touched = (outcome.contact | outcome.contact_vru) & self.settings.end_on_contact
-        terminated = touched | (outcome.off_road & self.settings.end_off_road)
-        truncated = (self._clock >= self.horizon) | left
-        reward = {"reward": weighted_sum(terms, self._weights)[:, None]}
-        return TensorDict(
-            self._observed(outcome) | self._done(terminated, truncated) | reward, batch_size=self.batch_size,
-            device=self.device,
-        )
+        replays, traffic = self.settings.replay_ego, (self._traffic.states, self._traffic.valid)
+        function = replay_step if replays else step
+        function = compiled(function) if self.settings.compile else function
+        given = (self.scene["logged"], self.scene["logged_valid"]) if replays else tensordict["action"]
+        self._running, done = function(self._running, given, traffic, self._setting, self._rules, self._lens)
+        return self._output(done).set("reward", done.reward[:, None])
 
-    def _outcome(self, old_s: Tensor) -> Outcome:
-        """Contact is looked for against every agent present; off the road counts from the first time on it."""
-        states, valid, _ = self._traffic.at(self._clock)
-        size = self.scene["size"]
-        gap = separation(self._ego[:, None], size[:, :1], states[:, 1:], size[:, 1:])
-        hit = (gap < 0) & valid[:, 1:] & self._present[:, None]
-        vehicle = self.scene["agent_type"][:, 1:] == VEHICLE
-        beyond = self._beyond_border() > 0
-        off = beyond & self._been_on_road & self._present
-        self._been_on_road = self._been_on_road | ~beyond
-        return Outcome((hit & vehicle).any(1), (hit & ~vehicle).any(1), off, self._place[0] - old_s)
-
-    def _beyond_border(self) -> Tensor:
-        return off_road(self._ego[:, None, :2], self.scene["field"], self.scene["field_origin"])[:, 0]
-
-    def _project(self, hint: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Arc length, offset and heading, each [B], of the mission route at the ego."""
-        hint = None if hint is None else hint[:, None]
-        return tuple(value[:, 0] for value in project(self._ego[:, None, :2], self.mission.points, hint))
-
-    def _observed(self, outcome: Outcome) -> dict:
-        flags = {name: getattr(outcome, name)[:, None] for name in ("contact", "contact_vru", "off_road")}
-        progress = (self._place[0] - self._start_s)[:, None]
-        return {
-            "observation": observe(self.world(), self.mission, self._place, self._action),
+    def _output(self, stepped: Stepped) -> TensorDict:
+        """What an environment returns of a step but the reward."""
+        shape, device = self.batch_size, self.device
+        metrics = {name: getattr(stepped, name)[:, None] for name in ("contact", "contact_vru", "off_road", "progress")}
+        return TensorDict({
+            "observation": stepped.observation,
             "scene_index": self.scene["scene_index"][:, None].clone(),
-            "timestep": self._clock[:, None].clone(),
-            "metrics": TensorDict(flags | {"progress": progress}, batch_size=self.batch_size, device=self.device),
-        }
+            "timestep": self._running.clock[:, None].clone(),
+            "metrics": TensorDict(metrics, batch_size=shape, device=device),
+            "done": (stepped.terminated | stepped.truncated)[:, None],
+            "terminated": stepped.terminated[:, None],
+            "truncated": stepped.truncated[:, None],
+        }, batch_size=shape, device=device)
 
-    def _done(self, terminated: Tensor, truncated: Tensor) -> dict:
-        return {"done": (terminated | truncated)[:, None], "terminated": terminated[:, None],
-                "truncated": truncated[:, None]}
+
+@cache
+def compiled(function: Callable) -> Callable:
+    """torch.compile of a step, one for all environments; raises InputError where nothing can compile C++."""
+    names = (os.environ.get("CXX", "c++"), "c++", "g++", "clang++")
+    if not any(shutil.which(name) for name in names):
+        raise InputError("sim.compile=true: no C++ compiler found (CXX, c++, g++, clang++); install one or leave it "
+                         "false")
+    return torch.compile(function, fullgraph=True)

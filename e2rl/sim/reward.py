@@ -33,14 +33,14 @@ def reward_terms(
     }
 
 
-def check_weights(weights: Mapping[str, float]) -> dict[str, float]:
-    """The weight of every term; raises InputError for a name that is no term or a term without weight."""
+def check_weights(weights: Mapping[str, float]) -> list[float]:
+    """The weights in the order of TERMS; raises InputError for a name that is no term or a term without weight."""
     wrong = set(weights) ^ set(TERMS)
     if wrong:
         raise InputError(f"sim.reward: {', '.join(sorted(wrong))} missing or unknown; give exactly {', '.join(TERMS)}")
-    return {name: float(weights[name]) for name in TERMS}
+    return [float(weights[name]) for name in TERMS]
 
 
-def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
-    """Reward [B]."""
-    return sum(weights[name] * terms[name] for name in TERMS)
+def weighted_sum(terms: Mapping[str, Tensor], weights: Tensor) -> Tensor:
+    """Reward [B]; weights [6] in the order of TERMS."""
+    return torch.stack([terms[name] for name in TERMS], -1) @ weights

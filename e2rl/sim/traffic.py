@@ -35,7 +35,10 @@ class Traffic:
 
     def reset(self, scene: TensorDictBase, index: Tensor) -> None:
         """Scenes index [b] begin anew: with what was scheduled for them, else with their recording; plans are void."""
-        self.states[index], self.valid[index] = scene["logged"][index], scene["logged_valid"][index]
+        if len(index) == len(self.states):
+            self.states.copy_(scene["logged"]), self.valid.copy_(scene["logged_valid"])
+        else:
+            self.states[index], self.valid[index] = scene["logged"][index], scene["logged_valid"][index]
         self.route[index] = scene["route_log"][index]
         vehicles, kept = self.route.shape[1], []
         for rows, states, valid, route in self._scheduled:
@@ -65,14 +68,8 @@ class Traffic:
         self._plan = (step_from, states)
 
     def at(self, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """States [B, N, 4], valid [B, N] and acceleration [B, N] at step [B].
-
-        The acceleration is the speed difference over the last step, 0 where there was none.
-        """
-        row = torch.arange(len(step), device=step.device)
-        states, valid, before = self.states[row, step], self.valid[row, step], (step - 1).clamp(min=0)
-        accel = (states[..., 3] - self.states[row, before, :, 3]) / DT
-        return states, valid, accel * (valid & self.valid[row, before])
+        """`traffic_at` step [B]."""
+        return traffic_at(self.states, self.valid, step)
 
     def plan(self, step: Tensor) -> Tensor | None:
         """Rest [B, N, H, 4] at steps step + 1 .. of the last plan written, its last state held; None without one."""
@@ -83,3 +80,14 @@ class Traffic:
         at = (torch.arange(horizon, device=step.device) + (step - since)[:, None]).clamp(0, horizon - 1)
         row = torch.arange(len(step), device=step.device)[:, None]
         return states[row, at].transpose(1, 2)
+
+
+def traffic_at(states: Tensor, valid: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """States [B, N, 4], valid [B, N] and acceleration [B, N] of trajectories [B, T+1, N, 4], [B, T+1, N] at step [B].
+
+    The acceleration is the speed difference over the last step, 0 where there was none.
+    """
+    row, before = torch.arange(len(step), device=step.device), (step - 1).clamp(min=0)
+    now, there = states[row, step], valid[row, step]
+    accel = (now[..., 3] - states[row, before, :, 3]) / DT
+    return now, there, accel * (there & valid[row, before])

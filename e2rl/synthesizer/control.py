@@ -6,7 +6,7 @@ gradient is scaled by noise level and clipped before eta multiplies it; V_feas h
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -41,12 +41,17 @@ class ControlSettings:
     feasibility_scope: str = "all"
     anchoring: str = "clean"
     anchor_level: float = 0.2
+    lookahead: int = 0
+    transport_budget: float | None = None
 
     def __post_init__(self):
         for name, choices in (("gradient", ("denoiser", "clean")), ("scaling", ("score", "sigma", "unit")),
                               ("feasibility_scope", ("all", "support")), ("anchoring", ("clean", "literal", "off"))):
             if getattr(self, name) not in choices:
                 raise InputError(f"synthesizer.control.{name} is {getattr(self, name)!r}; choose one of {choices}")
+        if self.transport_budget is not None and not self.transport_budget >= 0:
+            raise InputError(f"synthesizer.control.transport_budget is {self.transport_budget}; expected at least 0, "
+                             "or null for no limit")
 
 
 def clip_rows(gradient: Tensor, limit: float) -> Tensor:
@@ -66,14 +71,19 @@ class SparseControl:
     """The control of one replan of B scenes; called by `Prior.sample` at every noise level.
 
     eta [B]: intensity; coalition [B, V]: C*; anchor: the skeleton's proposal; anchor_noise [B, V, SIZE]: for the
-    literal blend. `jump` [B, V] holds the anchor's mean shift energy, ||shift||^2 / (2 sigma^2), after sampling.
+    literal blend; react: the ego's states [B, HORIZON, 4] against planned states [B, V, HORIZON, 4], asked at
+    settings.lookahead of the noise levels (None: its plan stays what it is). `jump` [B, V] holds the anchor's mean
+    shift energy, ||shift||^2 / (2 sigma^2), after sampling.
     """
 
     def __init__(self, prior: Prior, settings: ControlSettings, potentials: PotentialSettings, where: PotentialContext,
-                 coalition: Tensor, eta: Tensor, anchor: Anchor, strength: float, anchor_noise: Tensor):
+                 coalition: Tensor, eta: Tensor, anchor: Anchor, strength: float, anchor_noise: Tensor,
+                 react: Callable[[Tensor], Tensor] | None = None):
         self.prior, self.settings, self.potentials, self.where = prior, settings, potentials, where
         self.coalition, self.eta, self.anchor, self.strength = coalition, eta, anchor, strength
-        self.anchor_noise = anchor_noise
+        self.anchor_noise, self.react = anchor_noise, react
+        self.refreshed = {round(prior.sampler.steps * i / (settings.lookahead + 1))
+                          for i in range(1, settings.lookahead + 1)} if react is not None else set()
         levels = prior.schedule.levels(prior.sampler.steps)
         nearest = int((levels[:-1] - settings.anchor_level).abs().argmin())
         self.anchor_step = prior.sampler.steps - nearest
@@ -94,6 +104,9 @@ class SparseControl:
                 with torch.no_grad():
                     x0 = denoise(x)
                 variable = x0 = x0.detach().requires_grad_(True)
+            if k in self.refreshed and self.hunts:
+                planned = self.prior.decode(x0.detach(), context).states()
+                self.where = replace(self.where, ego_plan=self.react(planned))
             states = self.prior.decode(x0, context, steps=sampled_steps(self.potentials)).states()
             towards = torch.zeros_like(x)
             if self.hunts:

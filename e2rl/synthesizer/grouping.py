@@ -16,8 +16,8 @@ from e2rl.sim.world import World
 ROWS = 160, 1024  # vehicle rows from which a group may end, and at most
 SHRUNK = 0.55  # share of its largest scene at which the next scene begins another group
 OF_ALL = {"size", "start", "start_accel", "start_yaw_rate", "valid", "agent_type", "parked"}  # keys with all agents
-OF_VEHICLES = {"route_points", "route_length", "route_open", "route_valid", "route_limit", "route_light",
-               "route_light_s", "route_log"}
+OF_VEHICLES = {"past", "route_points", "route_length", "route_open", "route_valid", "route_limit",
+               "route_light", "route_light_s", "route_log"}
 WHOLE = {"field", "field_origin", "light_state", "lane_points", "lane_index", "lane_exits", "lane_left", "lane_right",
          "scene_index"}
 UNCROPPED = {"seed", "eta", "replans", "light_state"}  # fields of an Episode without a vehicle axis

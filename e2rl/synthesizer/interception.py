@@ -33,7 +33,7 @@ class InterceptionSettings:
     """Limits per unit of intensity and costs of interceptions; conf/synthesizer/e2.yaml explains each."""
 
     reach: float = 5.0
-    push: float = 1.0
+    push: float = 1.5
     brake: float = 1.2
     lateral: float = 2.0
     shoulder: float = 0.5

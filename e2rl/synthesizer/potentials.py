@@ -141,23 +141,18 @@ def _neighbours(states: Tensor, context: PotentialContext, size: Tensor, count: 
     return index, near < 5.0
 
 
-def _pick(values: Tensor, index: Tensor) -> Tensor:
-    """values [B, V, ...] at index [B, V, Q] -> [B, V, Q, ...]."""
-    return values[torch.arange(len(values), device=values.device)[:, None, None], index]
-
-
 def _overlap_term(states: Tensor, context: PotentialContext, settings: PotentialSettings) -> Tensor:
     """Mean over steps, sum over neighbours of the squared shortfall of the gap [m^2]; pairs too near now may stay
     so.
     """
     size = context.scene["size"][:, :states.shape[1]]
     index, near = _neighbours(states, context, size, settings.neighbours)
-    others, other_size = _pick(states.detach(), index), _pick(size, index)
-    gap = box_gap(states[:, :, None], size[:, :, None, None], others, other_size[:, :, :, None], settings.pair_disks)
-    start = _pick(context.start, index)
-    now = box_gap(context.start[:, :, None], size[:, :, None], start, other_size, settings.pair_disks)
-    wanted = now.clamp(max=settings.pair_margin)[..., None]
-    return ((wanted - gap).clamp(min=0).square().mean(-1) * near).sum(-1)
+    scene, own, rank = near.nonzero(as_tuple=True)  # most of the nearest are too far to cost anything
+    mine, them = (scene, own), (scene, index[scene, own, rank])
+    gap = box_gap(states[mine], size[mine][:, None], states.detach()[them], size[them][:, None], settings.pair_disks)
+    now = box_gap(context.start[mine], size[mine], context.start[them], size[them], settings.pair_disks)
+    missing = (now.clamp(max=settings.pair_margin)[:, None] - gap).clamp(min=0).square().mean(-1)
+    return torch.zeros_like(states[..., 0, 0]).index_put(mine, missing, accumulate=True)
 
 
 def _road_terms(states: Tensor, context: PotentialContext, settings: PotentialSettings) -> Tensor:

@@ -6,11 +6,13 @@ sample under sparse control. With eta = 0 nothing is controlled, and the traffic
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from e2rl.ego.base import Ego
 from e2rl.errors import InputError
 from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate
 from e2rl.prior.prior import Context, Plan, Prior
@@ -23,6 +25,7 @@ from e2rl.synthesizer.control import ControlSettings, SparseControl
 from e2rl.synthesizer.feasibility import FeasibilitySettings
 from e2rl.synthesizer.grouping import clone, crop_episode, crop_world, gather_plans, group_scenes, write_episode
 from e2rl.synthesizer.interception import InterceptionSettings
+from e2rl.synthesizer.lookahead import Lookahead
 from e2rl.synthesizer.potentials import (
     PotentialContext,
     PotentialSettings,
@@ -143,24 +146,27 @@ class Synthesizer:
 
     def begin(self, scene: TensorDictBase, seed: Tensor, eta: Tensor) -> Episode:
         """Episodes of scenes [B] with routes drawn from the prior; seed [B] int64, eta [B]."""
-        uniform = noise_of(seed, torch.zeros_like(seed), tuple(scene["route_valid"].shape[1:]), uniform=True)
+        uniform = noise_of(seed, torch.zeros_like(seed), tuple(scene["route_valid"].shape[1:2]), uniform=True)
         routed, state = self.prior.start(scene, self.prior.choose_routes(scene, uniform))
         return Episode.start(seed, eta, routed, state)
 
-    def replan(self, episode: Episode, world: World, ego_plan: Tensor) -> tuple[Episode, Plan]:
-        """The episodes and the plan of the coming HORIZON steps, given the ego's plan [B, HORIZON, 4] (detached)."""
+    def replan(self, episode: Episode, world: World, ego_plan: Tensor, ego: Ego | None = None) -> tuple[Episode, Plan]:
+        """The episodes and the plan of the coming HORIZON steps, given the ego's plan [B, HORIZON, 4] (detached); ego:
+        whom `control.lookahead` asks how it would react."""
         ego_plan = ego_plan.detach()
         noise = torch.stack([self._noise(episode, draw) for draw in range(self.settings.samples)])
         groups, (batch, width) = group_scenes(world), episode.routed.route.shape
         whole, plans = clone(episode), []
         for group in groups:
             part, plan = self._replan_group(crop_episode(episode, group, width), crop_world(world, group),
-                                            ego_plan[group.rows], noise[:, :, group.rows, :group.vehicles])
+                                            ego_plan[group.rows], noise[:, :, group.rows, :group.vehicles],
+                                            None if ego is None else partial(Lookahead(ego, world), group))
             write_episode(whole, part, group)
             plans.append((group, plan))
         return whole, gather_plans(plans, batch, width)
 
-    def _replan_group(self, episode: Episode, world: World, ego_plan: Tensor, noise: Tensor) -> tuple[Episode, Plan]:
+    def _replan_group(self, episode: Episode, world: World, ego_plan: Tensor, noise: Tensor,
+                      react: Callable[[Tensor], Tensor] | None) -> tuple[Episode, Plan]:
         """`replan` of a group; noise [samples, steps, B, V, SIZE]."""
         episode = replace(episode, state=self._placed(episode, world, ego_plan))
         world = replace(world, route=episode.routed.route)
@@ -172,10 +178,10 @@ class Synthesizer:
             world = replace(world, route=episode.routed.route)
         context = self._encode(episode, world, ego_plan, episode.coalition)
         where = self._where(episode, world, ego_plan)
-        control = self._control(episode, where, anchor) if controlled else None
+        control = self._control(episode, where, anchor, react) if controlled else None
         best = None
         for draw in noise:
-            sample = self.prior.sample(context, draw, control)
+            sample = self.prior.sample(context, draw, control, self._budget(episode))
             jump = control.jump if control else torch.zeros_like(sample.kl)
             found = (sample.x0, sample.kl, jump, self._cost(sample.x0, context, where, episode.eta))
             best = found if best is None else _cheaper(best, found)
@@ -187,6 +193,11 @@ class Synthesizer:
     def _noise(self, episode: Episode, sample: int = 0) -> Tensor:
         shape = (self.prior.sampler.steps, episode.routed.route.shape[1], SIZE)
         return noise_of(episode.seed, 1 + episode.replans + PER_SAMPLE * sample, shape).transpose(0, 1)
+
+    def _budget(self, episode: Episode) -> Tensor | None:
+        """Path KL [B] that control may still add to each scene."""
+        limit = self.settings.control.transport_budget
+        return None if limit is None else (limit - episode.kl.sum(-1)).clamp(min=0)
 
     def _cost(self, x0: Tensor, context: Context, where: PotentialContext, eta: Tensor) -> Tensor:
         """V_feas of everybody plus eta V_adv of the coalition [B]: whole joint samples are compared, never vehicles."""
@@ -302,11 +313,12 @@ class Synthesizer:
             world.scene, world.states[:, :vehicles], episode.state.a, world.valid[:, :vehicles], episode.routed.points,
             episode.routed.has_lane, ego_plan[:, :HORIZON], episode.target)
 
-    def _control(self, episode: Episode, where: PotentialContext, anchor: Anchor) -> SparseControl:
+    def _control(self, episode: Episode, where: PotentialContext, anchor: Anchor, react: Callable | None
+                 ) -> SparseControl:
         settings = self.settings
         literal = noise_of(episode.seed, LITERAL + episode.replans, (*episode.target.shape[1:], SIZE))
         return SparseControl(self.prior, settings.control, settings.potentials, where, episode.coalition, episode.eta,
-                             anchor, settings.anchor.strength, literal)
+                             anchor, settings.anchor.strength, literal, react)
 
     def _count(self, skeleton: Skeleton, candidates: Tensor, feasible: Tensor) -> None:
         """Running totals for logging."""

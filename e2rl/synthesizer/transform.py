@@ -76,11 +76,11 @@ class AdversarialSynthesizer(Transform):
         """New plans of environments `rows`, written into the traffic."""
         ego_plan = self.ego.announce(world)
         if len(rows) == len(world.step):  # spares copies of maps
-            episode, plan = self.synthesizer.replan(self.episode, world, ego_plan)
+            episode, plan = self.synthesizer.replan(self.episode, world, ego_plan, self.ego)
             self.episode = replace(episode, state=plan.after(self.every))
         else:
             episode, plan = self.synthesizer.replan(
-                take_rows(self.episode, rows), take_rows(world, rows), ego_plan[rows])
+                take_rows(self.episode, rows), take_rows(world, rows), ego_plan[rows], self.ego)
             self.episode = put_rows(self.episode, rows, replace(episode, state=plan.after(self.every)))
         states, valid = plan.states().transpose(1, 2), plan.on_map.transpose(1, 2)
         vehicles = states.shape[2]

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from e2rl.evaluation.open_loop import HORIZONS, open_loop_rows, sample_plan
+from e2rl.evaluation.open_loop import HORIZONS, open_loop_rows, sample_plans
 from e2rl.evaluation.protocol import Method
 from e2rl.metrics.catalogue import OPEN_LOOP, OPEN_LOOP_STAGE
 from e2rl.prior.bounds import BoundSettings
@@ -82,12 +82,13 @@ def test_ratios_are_quotients_of_the_same_vehicles_errors():
 
 
 def test_plans_begin_at_the_start_do_not_know_the_future_and_are_the_same_in_any_batch():
-    scene, on, seed = scenes(3).scenes, synthesizer(), torch.tensor([4, 5, 6])
-    plan = sample_plan(on, scene, seed)
-    assert plan.shape == (3, 8, 50, 4) and (plan[:, :6, 0, :2] - scene["start"][:, :6, :2]).norm(dim=-1).max() < 1.5
+    scene, on, seed = scenes(3).scenes, synthesizer(), torch.tensor([[4, 5, 6], [7, 8, 9]])
+    plan = sample_plans(on, scene, seed)
+    assert plan.shape == (3, 2, 8, 50, 4)
+    assert (plan[:, :, :6, 0, :2] - scene["start"][:, None, :6, :2]).norm(dim=-1).max() < 1.5
     blind = scene.clone()
     blind["logged"][:, 1:] = 1e4
     blind["logged_valid"][:, 1:] = False
-    assert torch.equal(sample_plan(on, blind, seed), plan)
-    torch.testing.assert_close(sample_plan(on, scene[1:2], seed[1:2]), plan[1:2], rtol=0, atol=5e-3)
-    assert not torch.allclose(sample_plan(on, scene, seed + 1), plan)
+    assert torch.equal(sample_plans(on, blind, seed), plan)
+    torch.testing.assert_close(sample_plans(on, scene[1:2], seed[:, 1:2]), plan[1:2], rtol=0, atol=5e-3)
+    assert not torch.allclose(sample_plans(on, scene, seed + 1), plan)

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -78,3 +79,19 @@ def test_nothing_is_written_without_a_folder(tmp_path, monkeypatch):
     rows = run_protocol(scenes(1, steps=10), [Method("nominal", synthesizer(), 0.0)], IDMEgo(), "idm", [0],
                         SimSettings())
     assert len(rows) == 1 and not list(tmp_path.iterdir())
+
+
+def test_processes_change_nothing_but_the_time(tmp_path):
+    """Two forked processes give the rows, tables and rollouts of one, bit for bit."""
+    scene_set, folders = scenes(3, steps=20), (tmp_path / "one", tmp_path / "two")
+    for processes, folder in enumerate(folders, 1):
+        methods = [Method("nominal", synthesizer(), 0.0), Method("e2", synthesizer(), 3.0)]
+        run_protocol(scene_set, methods, IDMEgo(), "idm", SEEDS, SimSettings(), folder, batch=2, processes=processes)
+    one, two = (read_rows(folder / TABLE) for folder in folders)
+    timed = {"seconds_per_rollout", "seconds", "evasion_seconds"}
+    for row, other in zip(one, two, strict=True):
+        assert {k: str(v) for k, v in row.items() if k not in timed} == {
+            k: str(v) for k, v in other.items() if k not in timed}
+    for path in sorted((folders[0] / ROLLOUTS).iterdir()):
+        first, second = np.load(path), np.load(folders[1] / ROLLOUTS / path.name)
+        assert all(np.array_equal(first[key], second[key]) for key in first.files), path.name

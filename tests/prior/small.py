@@ -56,6 +56,8 @@ def curved_scenes(copies: int = 1, rows: int = 8, **options) -> TensorDict:
         track = torch.stack([turn.cos(), turn.sin()], -1) * speed * 0.1
         xy = torch.tensor([x, y]) + track.cumsum(0) - track[:1]
         scene["logged"][:, :, i] = torch.cat([xy, turn[:, None], torch.full_like(turn, speed)[:, None]], -1)
+        back = 0.1 * torch.arange(1, 11)
+        scene["past"][:, i] = torch.stack([0.2 * back**2 - speed * back, 0.3 * back, -0.1 * back], -1)
     scene["route_length"][:] = 250.0
     scene["route_open"][:, :count, 0] = True
     return scene
@@ -69,6 +71,7 @@ def mirrored(scene: TensorDict) -> TensorDict:
     for key in ("route_points", "light_points", "lane_points", "drivable_points"):
         scene[key] = scene[key] * torch.tensor([1.0, -1.0])
     scene["start_yaw_rate"] = -scene["start_yaw_rate"]
+    scene["past"] = scene["past"] * torch.tensor([1.0, -1.0, -1.0])
     return scene
 
 

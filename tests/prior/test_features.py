@@ -11,12 +11,12 @@ from e2rl.prior.routed import route_scene
 from tests.prior.small import arc, curved_scenes, mirrored, moved
 
 
-def features(scene):
+def features(scene, step=None):
     vehicles = scene["route_log"].shape[1]
     routed = route_scene(scene, scene["route_log"].clamp(min=0))
     state = locate(scene["start"][:, :vehicles], scene["start_accel"][:, :vehicles],
                    scene["start_yaw_rate"][:, :vehicles], routed.points)
-    step = torch.zeros(len(scene), dtype=torch.long)
+    step = torch.zeros(len(scene), dtype=torch.long) if step is None else step
     nodes = node_features(routed, state, scene["start"], scene["valid"], step, step == 0)
     here = scene["valid"][0, :vehicles]
     return nodes[:, here], edge_features(routed, state)[:, here][:, :, here]
@@ -43,6 +43,17 @@ def test_features_do_not_know_where_the_scene_lies():
     scene = curved_scenes()
     for here, there in zip(features(scene), features(moved(scene, 120.0, -40.0, 0.7)), strict=True):
         torch.testing.assert_close(there, here, rtol=0, atol=5e-3)
+
+
+def test_only_estimates_look_at_the_past():
+    scene = curved_scenes()
+    changed = scene.clone()
+    changed["past"] = changed["past"] + 0.3 * torch.arange(1, 11)[:, None]
+    first, now = torch.zeros(1, dtype=torch.long), torch.full((1,), 5)
+    assert not torch.equal(features(scene)[0], features(changed)[0])
+    assert torch.equal(features(scene, now)[0], features(changed, now)[0])
+    alone = features(scene, first)[0][0, 0, 51:61]  # 8 m/s now, 0.4 m/s^2 less and less before
+    torch.testing.assert_close(alone, -0.2 * (0.2 * torch.arange(10) + 0.1) / 2 * torch.ones(10), rtol=0, atol=1e-4)
 
 
 def test_a_queue_a_light_and_a_limit_are_seen():

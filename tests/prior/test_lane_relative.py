@@ -12,6 +12,7 @@ from e2rl.prior.lane_relative import (
     decode,
     fit,
     lateral_horizon,
+    polynomial,
     speeds,
     split,
 )
@@ -134,3 +135,16 @@ def test_travelled_distance_is_the_integral_of_speed(generator):
     before = torch.cat([state.v[:, None], v[:, :-1]], 1)
     torch.testing.assert_close(way.diff(dim=-1, prepend=torch.zeros(COUNT, 1)), (v + before) / 2 * 0.1, rtol=0,
                                atol=1e-5)
+
+
+def test_the_polynomial_and_its_gradients():
+    """Value and derivatives are those of the power sum; the gradients in closed form are the numerical ones."""
+    draw = torch.Generator().manual_seed(2)
+    c = torch.randn(3, 2, 7, generator=draw, dtype=torch.float64, requires_grad=True)
+    u = torch.rand(3, 2, 5, generator=draw, dtype=torch.float64, requires_grad=True)
+    power, at = torch.arange(7), u[..., None]
+    value, first, second = polynomial(c, u)
+    assert torch.allclose(value, (c[..., None, :] * at**power).sum(-1))
+    assert torch.allclose(first, (c[..., None, 1:] * power[1:] * at ** power[:-1]).sum(-1))
+    assert torch.allclose(second, (c[..., None, 2:] * (power * (power - 1))[2:] * at ** power[:-2]).sum(-1))
+    assert torch.autograd.gradcheck(polynomial, (c, u))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from e2rl.errors import InputError
-from e2rl.scene.smoothing import causal_state, drop_jumps, pieces, resample_uniform, smooth
+from e2rl.scene.smoothing import causal_past, causal_state, drop_jumps, pieces, resample_uniform, smooth
 
 TIME = np.arange(40) * 0.1
 
@@ -50,6 +50,30 @@ def test_short_histories_stay_finite(known):
     assert np.isfinite(start).all() and np.isfinite(accel).all() and np.isfinite(yaw_rate).all()
     if known > 1:
         assert abs(start[0, 3] - 7.0) < 0.5
+
+
+def test_the_past_is_seen_from_the_present_and_blind_to_the_future_and_to_gaps_before():
+    states, valid, speed = accelerating(), np.ones((40, 1), bool), np.array([7.0])
+    back = np.arange(1, 11) * 0.1
+    past = causal_past(states, valid, 20, speed)
+    assert past.shape == (1, 10, 3)
+    assert np.allclose(past[0, :, 0], -7.0 * back + 1.5 * back**2 / 2) and np.allclose(past[0, :, 1:], 0)
+    states[21:], valid[21:], states[:15] = np.nan, False, 1e6
+    valid[14] = False
+    short = causal_past(states, valid, 20, speed)
+    assert np.allclose(short[0, :5], past[0, :5])
+    assert np.allclose(np.diff(short[0, 4:, 0]), -0.7) and np.allclose(short[0, :, 1:], 0)
+    assert np.allclose(causal_past(states, valid, 0, speed)[0, :, 0], -7.0 * back), "straight on where nothing is known"
+
+
+def test_a_turn_shows_in_the_past():
+    angle = np.linspace(3.0, 3.5, 20)  # across the cut
+    states = np.stack([10 * np.sin(angle), -10 * np.cos(angle), angle, np.zeros(20)], -1)[:, None]
+    states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
+    past = causal_past(states, np.ones((20, 1), bool), 19, np.array([1.0]))[0]
+    turned = -np.arange(1, 11) * 0.5 / 19
+    assert np.allclose(past[:, 2], turned)
+    assert np.allclose(past[:, 0], 10 * np.sin(turned)) and np.allclose(past[:, 1], 10 * (1 - np.cos(turned)))
 
 
 def test_smoothing_keeps_quadratics_and_takes_speed_along_the_heading():

@@ -31,6 +31,12 @@ def test_constant_acceleration_is_exact():
     assert torch.allclose(states[:, 0], 2 * t + 0.75 * t**2, atol=1e-4)
 
 
+def test_a_step_is_a_rollout_of_one():
+    start, actions = random_case()
+    start, action = start.float(), actions[:, 0].float()
+    assert torch.equal(dynamics.step(start, action), dynamics.rollout(start, action[:, None])[:, 0])
+
+
 def test_rollout_equals_recursion_with_clipped_speeds():
     start, actions = random_case()
     parallel = dynamics.rollout(start, actions)

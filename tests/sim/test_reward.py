@@ -34,6 +34,6 @@ def test_terms_grow_with_what_they_name():
 
 
 def test_reward_is_linear_in_the_weights():
-    weights = check_weights({name: float(k) for k, name in enumerate(TERMS)})
+    weights = torch.tensor(check_weights({name: float(k) for k, name in enumerate(TERMS)}))
     terms = {name: torch.tensor([2.0**k]) for k, name in enumerate(TERMS)}
     assert weighted_sum(terms, weights).item() == sum(k * 2.0**k for k in range(len(TERMS)))

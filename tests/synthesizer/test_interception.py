@@ -41,7 +41,8 @@ def driven(found, speed):
     return torch.cat([xy, heading[:, None], v[:, None]], -1)
 
 
-@pytest.mark.parametrize("vehicle", [BESIDE, (25.0, -20.0, UP, 9.0), (60.0, 3.5, math.pi, 8.0), (-15.0, 0.0, 0.0, 11.0)])
+@pytest.mark.parametrize("vehicle", [BESIDE, (25.0, -20.0, UP, 9.0), (60.0, 3.5, math.pi, 8.0),
+                                     (-15.0, 0.0, 0.0, 11.0)])
 def test_the_boxes_touch_if_everybody_drives_as_expected(vehicle):
     found, expected, size = met([EGO, vehicle])
     assert found.cost.isfinite().all()

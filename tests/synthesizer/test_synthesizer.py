@@ -7,9 +7,10 @@ import torch
 
 from e2rl.ego.idm import IDMEgo
 from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState
+from e2rl.prior.prior import SamplerSettings
 from e2rl.sim.world import World
 from e2rl.synthesizer.control import ControlSettings
-from e2rl.synthesizer.synthesizer import Synthesizer, noise_of, put_rows, take_rows
+from e2rl.synthesizer.synthesizer import Synthesizer, SynthesizerSettings, noise_of, put_rows, take_rows
 from tests.prior.small import curved_scenes, small_prior
 from tests.synthesizer.traffic_scenes import ROWS, scenes, synthesizer
 
@@ -234,3 +235,25 @@ def test_a_listener_hears_of_every_choice_and_changes_nothing():
     assert torch.equal(chosen.coalition, episode.coalition[:, :used]) and chosen.weights.shape[2:] == (used, used)
     assert torch.equal(chosen.target, episode.target[:, :used]) and not (chosen.coalition & ~chosen.feasible).any()
     assert chosen.reference.shape[:3] == chosen.weights.shape[:3] and chosen.moments[0, 0] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("sampler", ["ddim", "dpm_solver_pp", "euler_maruyama"])
+def test_the_transport_budget_of_a_rollout_holds_and_is_used(sampler):
+    scene = scenes(3).scenes
+    settings = SamplerSettings(sampler=sampler, steps=4)
+
+    def spent(budget):
+        on = Synthesizer(small_prior(0, sampler=settings), SynthesizerSettings(
+            control=ControlSettings(transport_budget=budget)))
+        episode, plan = replanned(on, scene, 2.0, times=3)
+        return episode.kl.sum(-1), plan
+
+    free, _ = spent(None)
+    limit = float(free.min()) / 3
+    assert limit > 0
+    capped, _ = spent(limit)
+    assert (capped <= 1.001 * limit).all() and (capped > 0.99 * limit).all()
+    none, _ = spent(0.0)
+    assert (none == 0).all()
+    roomy, plan = spent(2 * float(free.max()))
+    torch.testing.assert_close(roomy, free, rtol=1e-3, atol=1e-4)

@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from e2rl.ego.base import Ego
 from e2rl.prior.lane_relative import HORIZON, LaneState, locate
 from e2rl.prior.prior import Plan
 from e2rl.prior.routed import route_scene
@@ -36,8 +37,8 @@ class Baseline(ABC):
         return Episode.start(seed, eta, routed, state)
 
     @torch.no_grad()
-    def replan(self, episode: Episode, world: World, ego_plan: Tensor) -> tuple[Episode, Plan]:
-        """The episodes and the plan of the coming HORIZON steps; the ego's plan is not looked at."""
+    def replan(self, episode: Episode, world: World, ego_plan: Tensor, ego: Ego | None = None) -> tuple[Episode, Plan]:
+        """The episodes and the plan of the coming HORIZON steps; neither the ego nor its plan is asked."""
         return replace(episode, replans=episode.replans + 1), self.plan(episode, world)
 
     @abstractmethod

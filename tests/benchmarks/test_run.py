@@ -1,0 +1,37 @@
+"""Every benchmark runs, and writes rows that can be read, at a size that takes seconds."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+sys.path.insert(0, str(FOLDER))  # the benchmarks are scripts beside each other, as their command sees them
+
+import run  # noqa: E402
+
+from e2rl.errors import InputError  # noqa: E402
+
+SMALL = ["--repeats", "1", "--largest", "1", "--no-compile"]
+SHORT = ["--train", "num_scenes=2", "batch=2", "learner.round.scenes=1", "learner.collect.batch=2",
+         "learner.collect.steps=80", "learner.collect.iterations=1", "learner.ppo.epochs=1",
+         "learner.expert.teacher=null", "learner.expert.recorded=false", "measure.scenes=1"]
+
+
+@pytest.mark.parametrize("name", sorted(run.BENCHMARKS))
+def test_every_benchmark_runs(name, tmp_path):
+    path = tmp_path / "rows.json"
+    run.main(["--json", str(path), "--only", name, *SMALL, *SHORT])
+    rows = json.loads(path.read_text())
+    assert rows and {row["benchmark"] for row in rows} == {name}
+    if name.startswith("peer_"):  # they are not installed where the tests run
+        assert all(row["value"] or row["variant"].startswith("absent: ") for row in rows)
+        return
+    assert all(row["value"] > 0 and row["threads"] == 1 and row["versions"]["torch"] for row in rows)
+    assert len({(row["variant"], row["batch"], row["unit"], row["processes"]) for row in rows}) == len(rows)
+
+
+def test_impossible_sizes_are_refused(tmp_path):
+    with pytest.raises(InputError, match="--largest 0"):
+        run.main(["--json", str(tmp_path / "rows.json"), "--largest", "0"])

@@ -1,0 +1,46 @@
+"""Work over processes: order, errors, and children that die."""
+
+import os
+
+import pytest
+import torch
+
+from e2rl.errors import InputError
+from e2rl.evaluation.processes import cores, spread
+
+
+def square(job):
+    return {"value": torch.full((3,), float(job)) ** 2, "process": os.getpid()}
+
+
+def test_results_keep_the_order_of_the_jobs_whoever_does_them():
+    found = list(spread(square, range(7), 3, cost=float))
+    assert [result["value"][0].item() for result in found] == [float(k**2) for k in range(7)]
+    assert os.getpid() not in {result["process"] for result in found}
+
+
+@pytest.mark.parametrize(("jobs", "processes"), [(range(3), 1), ([5], 4)])
+def test_one_process_or_one_job_stays_here(jobs, processes):
+    assert {result["process"] for result in spread(square, jobs, processes, cost=float)} == {os.getpid()}
+
+
+def refuse(job):
+    raise InputError(f"job {job}: refused")
+
+
+def test_errors_of_the_children_arrive():
+    with pytest.raises(InputError, match="refused"):
+        list(spread(refuse, range(4), 2, cost=float))
+
+
+def vanish(job):
+    os._exit(9)
+
+
+def test_a_child_that_dies_is_named():
+    with pytest.raises(InputError, match="processes=2"):
+        list(spread(vanish, range(4), 2, cost=float))
+
+
+def test_cores():
+    assert 1 <= cores() <= (os.cpu_count() or 1)
