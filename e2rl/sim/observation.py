@@ -94,7 +94,8 @@ def light_features(lens: Lens, setting: Setting, step: Tensor, s: Tensor) -> Ten
     """[B, 2 * 4]: the mission's lights red, yellow, green (one-hot while ahead) and how near (1 at hand, 0 far)."""
     if not setting.colours.shape[2]:
         return s.new_zeros(len(s), 8)
-    now = setting.colours.flatten(0, 1).index_select(0, setting.row[:, 0] * setting.colours.shape[1] + step)
+    recorded = setting.colours.shape[1]  # planners look beyond it: the last state stays
+    now = setting.colours.flatten(0, 1).index_select(0, setting.row[:, 0] * recorded + step.clamp(max=recorded - 1))
     state = now.gather(1, setting.light.clamp(min=0)).masked_fill(setting.light < 0, LIGHT_UNKNOWN)
     ahead = setting.light_s - s[:, None]
     seen = (setting.light >= 0) & (ahead > -2)
