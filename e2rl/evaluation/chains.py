@@ -10,9 +10,10 @@ from e2rl.evaluation.files import ROLLOUTS, rollout_name
 from e2rl.evaluation.protocol import SEEDS_APART, Method
 from e2rl.evaluation.rollout_reader import read_rollout
 from e2rl.scene.scene import SceneSet
+from e2rl.synthesizer.episode import take_rows
 from e2rl.synthesizer.selection import Selection
 from e2rl.synthesizer.skeleton import chain_depth
-from e2rl.synthesizer.synthesizer import Synthesizer, take_rows
+from e2rl.synthesizer.synthesizer import Synthesizer
 
 
 @dataclass

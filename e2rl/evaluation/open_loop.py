@@ -16,7 +16,8 @@ from e2rl.scene.scene import SceneSet
 from e2rl.sim.world import World
 from e2rl.synthesizer.baselines.baseline import Baseline
 from e2rl.synthesizer.baselines.constant_velocity import straight_on
-from e2rl.synthesizer.synthesizer import Synthesizer, noise_of
+from e2rl.synthesizer.episode import noise_of
+from e2rl.synthesizer.synthesizer import Synthesizer
 
 HORIZONS = (3.0, 5.0)  # s
 EGO = "unknown"  # of the rows: nobody is told the ego's plan

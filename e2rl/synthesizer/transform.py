@@ -11,7 +11,8 @@ from torchrl.envs import Transform
 from e2rl.ego.base import Ego
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.sim.world import World
-from e2rl.synthesizer.synthesizer import Episode, Synthesizer, put_rows, take_rows
+from e2rl.synthesizer.episode import Episode, put_rows, take_rows
+from e2rl.synthesizer.synthesizer import Synthesizer
 
 
 class AdversarialSynthesizer(Transform):

@@ -10,7 +10,8 @@ from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState
 from e2rl.prior.prior import SamplerSettings
 from e2rl.sim.world import World
 from e2rl.synthesizer.control import ControlSettings
-from e2rl.synthesizer.synthesizer import Synthesizer, SynthesizerSettings, noise_of, put_rows, take_rows
+from e2rl.synthesizer.episode import noise_of, put_rows, take_rows
+from e2rl.synthesizer.synthesizer import Synthesizer, SynthesizerSettings
 from tests.prior.small import curved_scenes, small_prior
 from tests.synthesizer.traffic_scenes import ROWS, scenes, synthesizer
 

@@ -12,7 +12,7 @@ from e2rl.prior.lane_relative import HORIZON, LaneState, locate
 from e2rl.prior.prior import Plan
 from e2rl.prior.routed import route_scene
 from e2rl.sim.world import World
-from e2rl.synthesizer.synthesizer import Episode
+from e2rl.synthesizer.episode import Episode
 
 ARRIVAL = 20.0  # m, arc length near which a route passes its vehicle's start
 

@@ -21,7 +21,7 @@ from e2rl.scene.recording import LIGHT_RED, LIGHT_YELLOW
 from e2rl.scene.route import SPACING
 from e2rl.sim.world import World
 from e2rl.synthesizer.baselines.baseline import Baseline
-from e2rl.synthesizer.synthesizer import Episode
+from e2rl.synthesizer.episode import Episode
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import torch
 from e2rl.prior.prior import Plan
 from e2rl.sim.world import World
 from e2rl.synthesizer.baselines.baseline import Baseline, off_route, steps_ahead
-from e2rl.synthesizer.synthesizer import Episode
+from e2rl.synthesizer.episode import Episode
 
 
 class Replay(Baseline):
