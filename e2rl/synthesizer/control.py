@@ -2,7 +2,9 @@
 
 Guidance replaces the score s by s - grad V (design.md 7.1), which is the same as moving the clean estimate:
 x0 <- x0 - (sigma^2 / alpha) grad V. What is added here is a bound per vehicle, so that eta stays a usable dial: the
-gradient is scaled by noise level and clipped before eta multiplies it; V_feas has a clip of its own.
+gradient is scaled by noise level and clipped before eta multiplies it; V_feas has a clip of its own. Only V_adv is
+pulled back through the network: V_feas acts on the clean estimate, and only once that has taken shape
+(`feasibility_level`), with the same outcome at a fraction of the cost.
 """
 
 from collections.abc import Callable
@@ -36,8 +38,9 @@ class ControlSettings:
     gradient: str = "denoiser"
     scaling: str = "sigma"
     adversarial_clip: float = 0.5
-    feasibility: float = 1.0
-    feasibility_clip: float = 0.5
+    feasibility: float = 4.0
+    feasibility_clip: float = 1.0
+    feasibility_level: float = 0.5
     feasibility_scope: str = "all"
     anchoring: str = "clean"
     anchor_level: float = 0.2
@@ -87,6 +90,7 @@ class SparseControl:
         levels = prior.schedule.levels(prior.sampler.steps)
         nearest = int((levels[:-1] - settings.anchor_level).abs().argmin())
         self.anchor_step = prior.sampler.steps - nearest
+        self.mend_step = int((levels[:-1] <= settings.feasibility_level).sum())
         self.jump = torch.zeros(coalition.shape, device=eta.device)
         self.hunts = bool(coalition.any())  # asked once, on the host: without a coalition V_adv is 0
 
@@ -95,33 +99,39 @@ class SparseControl:
         """(x after anchoring, denoised x0, controlled x0) at step k; anchoring comes first (design.md 7.2)."""
         if k == self.anchor_step and self.settings.anchoring != "off" and self.strength > 0:
             x = self._anchored(x, level, context, denoise)
-        heat = annealed_temperature(level, self.potentials)
-        with torch.enable_grad():
-            if self.settings.gradient == "denoiser":
-                variable = x.detach().requires_grad_(True)
-                x0 = denoise(variable)
-            else:
-                with torch.no_grad():
-                    x0 = denoise(x)
-                variable = x0 = x0.detach().requires_grad_(True)
-            if k in self.refreshed and self.hunts:
-                planned = self.prior.decode(x0.detach(), context).states()
-                self.where = replace(self.where, ego_plan=self.react(planned))
-            states = self.prior.decode(x0, context, steps=sampled_steps(self.potentials)).states()
-            towards = torch.zeros_like(x)
-            if self.hunts:
-                threat = adversarial_potential(states, self.where, self.potentials, heat)
-                (towards,) = torch.autograd.grad(threat.sum(), variable, retain_graph=True)
-            infeasible = feasibility_potential(states, self.where, self.potentials)
-            (away,) = torch.autograd.grad(infeasible.sum(), variable)
+        x0, towards, away = self._gradients(x, level, k, context, denoise)
         weight = gradient_weight(self.prior.schedule, level, self.settings.scaling)
         towards = clip_rows(weight * towards, self.settings.adversarial_clip)
         away = clip_rows(self.settings.feasibility * weight * away, self.settings.feasibility_clip)
         whom = context.active if self.settings.feasibility_scope == "all" else self.coalition
         shift = self.eta[:, None, None] * towards * self.coalition[..., None] + away * whom[..., None]
         acts = (context.active & (self.eta > 0)[:, None])[..., None]
-        x0 = x0.detach()
         return x, x0, x0 - torch.where(acts, shift, 0.0)
+
+    def _gradients(self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Callable[[Tensor], Tensor]
+                   ) -> tuple[Tensor, Tensor, Tensor]:
+        """(x0, grad V_adv, grad V_feas): the one by x or x0, as set, the other by x0."""
+        towards = away = torch.zeros_like(x)
+        mends = k <= self.mend_step
+        with torch.enable_grad():
+            variable = x.detach().requires_grad_(self.hunts and self.settings.gradient == "denoiser")
+            denoised = denoise(variable)
+            x0 = denoised.detach().requires_grad_(True)
+            if k in self.refreshed and self.hunts:
+                planned = self.prior.decode(x0.detach(), context).states()
+                self.where = replace(self.where, ego_plan=self.react(planned))
+            if self.hunts or mends:
+                states = self.prior.decode(x0, context, steps=sampled_steps(self.potentials)).states()
+            if self.hunts:
+                heat = annealed_temperature(level, self.potentials)
+                threat = adversarial_potential(states, self.where, self.potentials, heat)
+                (towards,) = torch.autograd.grad(threat.sum(), x0, retain_graph=True)
+            if mends:
+                infeasible = feasibility_potential(states, self.where, self.potentials)
+                (away,) = torch.autograd.grad(infeasible.sum(), x0)
+        if variable.requires_grad:
+            (towards,) = torch.autograd.grad(denoised, variable, towards)
+        return x0.detach(), towards, away
 
     def _anchored(self, x: Tensor, level: Tensor, context: Context, denoise) -> Tensor:
         """Topological anchoring of the coalition at this level; books the jump's energy."""

@@ -81,6 +81,19 @@ def test_feasibility_may_move_others_but_never_the_ego_parked_or_absent_ones():
     assert (shift[:, [2, 3, 4]] != 0).any(), "feasibility acts beyond the support"
 
 
+def test_feasibility_acts_once_the_clean_estimate_has_taken_shape():
+    case = Case()
+    case.scene["start"][:, 2, 1] = 2.2
+    case.context.state.d[:, 2] = -1.3
+    levels = case.prior.schedule.levels(case.prior.sampler.steps)
+    for k in range(1, case.prior.sampler.steps + 1):
+        level = float(levels[case.prior.sampler.steps - k])
+        shift, _ = case.shift(level=level, k=k, feasibility_level=0.5, adversarial_clip=0.0)
+        assert bool((shift != 0).any()) == (level <= 0.5), level
+    first, _ = case.shift(level=1.0, k=case.prior.sampler.steps, feasibility_level=1.0, adversarial_clip=0.0)
+    assert (first != 0).any(), "at 1 it acts from the start"
+
+
 def test_without_intensity_nothing_moves_in_a_mixed_batch():
     case = Case()
     shift, jump = case.shift(eta=[0.0, 1.0, 0.0, 2.0], strength=1.0, k=case.control().anchor_step)
