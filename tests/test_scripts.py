@@ -193,10 +193,25 @@ SHORT = ["data.split=tune", "num_scenes=2", "data.workers=1", "data.build.steps=
 EXPERIMENTS = [
     ("table2", [("random_k", 2), ("topology", 2), ("e2", 2), ("nominal", 0)], None),
     ("table3", [("e2", 2), ("nominal", 0), ("no V_feas", 2), ("no V_adv", 2), ("no anchoring", 2),
-                ("literal anchoring", 2), ("no interception", 2), ("no proposal", 2), ("V_adv alone", 2)], None),
+                ("literal anchoring", 2), ("no interception", 2), ("no proposal", 2), ("V_adv alone", 2),
+                ("V_adv alone x4", 2), ("V_adv alone x16", 2), ("no bounds", 2), ("no bounds, no V_feas", 2)], None),
     ("intensity", [("e2", 0), ("e2", 1), ("e2", 2), ("e2", 3)], "intensity.png"),
     ("skeleton", [("e2", 2)], "skeleton.png"),
 ]
+
+
+def test_a_round_of_evolution_from_the_first_command_to_its_tables(world, tmp_path, monkeypatch, capsys):
+    overrides = arguments(world, tmp_path, "good", "data.build.steps=20", "prior.sampler.steps=2", "rounds=1",
+                          "batch=2", "learner.round.scenes=2", "learner.collect.batch=2", "learner.collect.steps=20",
+                          "learner.collect.iterations=1", "measure.scenes=2")
+    status, said = call("train.py", overrides, monkeypatch, capsys)
+    assert status == 0, said
+    rows = read_metrics(tmp_path / "run" / "metrics.json")
+    assert {(row["stage"], row["method"]) for row in rows} == {
+        (stage, method) for stage in ("before", "after") for method in ("nominal", "e2")}
+    tables = (tmp_path / "run" / "tables.md").read_text()
+    assert "cfr [%]" in tables and "cfr [points]" in tables and "after" in tables
+    assert list((tmp_path / "run" / "checkpoints").iterdir())
 
 
 @pytest.mark.parametrize(("experiment", "methods", "figure"), EXPERIMENTS)

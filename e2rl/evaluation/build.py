@@ -208,7 +208,7 @@ def caption(config: DictConfig, origin: dict) -> str:
     """What stands in every table's caption: the settings that all methods share."""
     sampler, bounds = config.prior.sampler, config.prior.bounds
     on = [name for name in ("meeting", "curve") if bounds[name]]
-    changes = "".join(f"; {name}: {what}".replace("'", "") for name, what in config.variants.items())
+    changes = "".join(f"; {name}: {what}".replace("'", "") for name, what in config.get("variants", {}).items())
     return (f"Prior {config.prior.checkpoint} ({origin.get('data', 'unknown data')}); {sampler.sampler}, K = "
             f"{sampler.steps}, temperature {sampler.temperature:g} (routes {sampler.route_temperature:g}), one sample "
             f"a replan, replanned every 0.5 s; acceleration bounds: {', '.join(on) or 'none'}{changes}")
