@@ -205,12 +205,13 @@ class Synthesizer:
         expected = reference[:, steps - 1::steps].transpose(1, 2)
         support, fallback = self._support(episode, world, found.candidates, feasible)
         everybody = direct(support | fallback)  # whom it costs least to meet the ego are the near agents
-        cost = propose(scene, world, everybody, ego_plan, self.settings.anchor, self.settings.interception,
-                       episode.eta).cost
-        skeleton = build_skeleton(scene, world, support, fallback, self.settings.skeleton, expected, cost)
-        self._count(skeleton, found.candidates, feasible)
-        anchor = propose(scene, world, skeleton, ego_plan, self.settings.anchor, self.settings.interception,
+        anchor = propose(scene, world, everybody, ego_plan, self.settings.anchor, self.settings.interception,
                          episode.eta)
+        skeleton = build_skeleton(scene, world, support, fallback, self.settings.skeleton, expected, anchor.cost)
+        self._count(skeleton, found.candidates, feasible)
+        if bool(skeleton.far.any()):  # otherwise everybody meets the ego, as just proposed
+            anchor = propose(scene, world, skeleton, ego_plan, self.settings.anchor, self.settings.interception,
+                             episode.eta)
         # A member that no route and acceleration lead to its target is pruned (Sec. IV-A3: infeasible configurations),
         # and so is everybody whose chain to the ego leads over it.
         acts = skeleton.coalition & anchor.has & (episode.eta > 0)[:, None]
