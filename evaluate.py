@@ -45,8 +45,20 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     rows = []
     if config.open_loop_samples:
         rows += open_loop_rows(scenes, methods, config.open_loop_samples, config.device)
-    rows += run_protocol(scenes, methods, ego, name, list(config.seeds), sim, folder, config.batch, config.device,
-                         config.save_rollouts, processes_of(config), only)
+    rows += run_protocol(
+        scenes,
+        methods,
+        ego,
+        name,
+        list(config.seeds),
+        sim,
+        folder,
+        config.batch,
+        config.device,
+        config.save_rollouts,
+        processes_of(config),
+        only,
+    )
     if config.meta_rollouts:
         rows += meta_rows(scenes, methods, ego, name, sim, config.meta_rollouts, config.batch, config.device)
     write_metrics(folder / METRICS_FILE, rows)
@@ -59,8 +71,9 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
         save_picture(folder / "intensity.png", intensity_figure(intensity_ladder(folder)))
     if chain:
         rollout = chain.rollout(scenes, name, folder)
-        save_picture(folder / "skeleton.png", skeleton_figure(
-            rollout, chain.kept, chain.method.synthesizer.settings.topology))
+        save_picture(
+            folder / "skeleton.png", skeleton_figure(rollout, chain.kept, chain.method.synthesizer.settings.topology)
+        )
     print(f"\nwritten to {folder}")
     return rows
 

@@ -8,16 +8,16 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from e2rl.errors import InputError, stop
-from e2rl.evaluation.before_after import BeforeAfter
 from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_synthesizer, caption, resolved, set_up
-from e2rl.evaluation.prior_stage import run_prior_stage
-from e2rl.evaluation.resume import resumed
+from e2rl.learning.before_after import BeforeAfter
 from e2rl.learning.build import build_evolution, build_logger, run_imitation
 from e2rl.learning.checkpoint import load_checkpoint, save_checkpoint
-from e2rl.prior.distributed import follower_overrides, started_by_torchrun
+from e2rl.learning.prior_training.distributed import follower_overrides, started_by_torchrun
+from e2rl.learning.prior_training.stage import run_prior_stage
+from e2rl.learning.resume import resumed
 from e2rl.report.tables import metric_tables, print_tables, save_tables
 from e2rl.scene.source import load_scenes
-from e2rl.synthesizer.rollout import synthesize_traffic
+from e2rl.traffic.rollout import synthesize_traffic
 
 
 def evolve(config: DictConfig, folder: Path) -> None:
@@ -36,10 +36,13 @@ def evolve(config: DictConfig, folder: Path) -> None:
         metrics = run.run_round()
         logger.log(metrics, number)
         save_checkpoint(folder, run, resolved(config), config.keep_last)
-        print(f"round {number + 1}/{config.rounds}: eta {metrics['curriculum/eta']:.2f}, adversarial collisions "
-              f"{metrics['synthesizer/contact']:.0%} of {metrics['synthesizer/scenes']:.0f} scenes "
-              f"({metrics['synthesizer/left_out']:.0f} left out: no way found to avoid them), "
-              f"{metrics['time/synthesize']:.0f} s synthesis, {metrics['time/improve']:.0f} s learning", flush=True)
+        print(
+            f"round {number + 1}/{config.rounds}: eta {metrics['curriculum/eta']:.2f}, adversarial collisions "
+            f"{metrics['synthesizer/contact']:.0%} of {metrics['synthesizer/scenes']:.0f} scenes "
+            f"({metrics['synthesizer/left_out']:.0f} left out: no way found to avoid them), "
+            f"{metrics['time/synthesize']:.0f} s synthesis, {metrics['time/improve']:.0f} s learning",
+            flush=True,
+        )
     logger.close()
     rows = measure("after", run.ego)
     tables = metric_tables(rows, caption(config, origin))
@@ -76,8 +79,10 @@ def main(config: DictConfig) -> None:
         if config.stage not in STAGES:
             raise InputError(f"stage={config.stage}: choose one of {', '.join(STAGES)}")
         if started_by_torchrun() and config.stage != "prior":
-            raise InputError(f"torchrun: stage={config.stage} runs in one process; start it with python, or several "
-                             "processes with stage=prior")
+            raise InputError(
+                f"torchrun: stage={config.stage} runs in one process; start it with python, or several "
+                "processes with stage=prior"
+            )
         set_up(config)
         STAGES[config.stage](config, folder)
     except InputError as error:

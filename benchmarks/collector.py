@@ -17,8 +17,15 @@ def collector(bench: Bench) -> Iterator[Row]:
     """Ego steps per second at 32 to 512 scenes a batch."""
     for batch in bench.batches(32, 128, 512):
         env, actor = DrivingEnv(bench.scenes, bench.sim, batch), ActorEgo().network.actor
-        source = Collector(env, actor, frames_per_batch=batch * STEPS, total_frames=batch * STEPS * (bench.repeats + 1),
-                           trust_policy=True, track_traj_ids=False, auto_register_policy_transforms=False)
+        source = Collector(
+            env,
+            actor,
+            frames_per_batch=batch * STEPS,
+            total_frames=batch * STEPS * (bench.repeats + 1),
+            trust_policy=True,
+            track_traj_ids=False,
+            auto_register_policy_transforms=False,
+        )
         times = []
         with torch.no_grad():
             begin = time.perf_counter()

@@ -8,7 +8,7 @@ from measure import Bench, Row
 
 from e2rl.evaluation.build import build_ego
 from e2rl.learning.build import build_evolution
-from e2rl.synthesizer.rollout import synthesize_traffic
+from e2rl.traffic.rollout import synthesize_traffic
 
 
 def evolution_round(bench: Bench) -> Iterator[Row]:

@@ -20,9 +20,11 @@ def guided_replan(bench: Bench) -> Iterator[Row]:
             episode = bench.synthesizer.begin(world.scene, index, torch.full((batch,), ETA))
             episode, _ = bench.synthesizer.replan(episode, world, plan)
             calm = replace(episode, eta=torch.zeros_like(episode.eta))
-            parts = {"unguided": lambda e=calm, w=world, p=plan: bench.synthesizer.replan(e, w, p),
-                     f"guided, eta {ETA:g}": lambda e=episode, w=world, p=plan: bench.synthesizer.replan(e, w, p),
-                     "plan of lane_graph": lambda w=world: bench.ego.plan(w)}
+            parts = {
+                "unguided": lambda e=calm, w=world, p=plan: bench.synthesizer.replan(e, w, p),
+                f"guided, eta {ETA:g}": lambda e=episode, w=world, p=plan: bench.synthesizer.replan(e, w, p),
+                "plan of lane_graph": lambda w=world: bench.ego.plan(w),
+            }
             for variant, function in parts.items():
                 value = 1e3 * bench.best(function) / batch
                 yield bench.row("guided_replan", f"{variant}, {scenes}", index, value, "ms/scene")

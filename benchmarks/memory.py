@@ -9,7 +9,7 @@ import torch
 from measure import Bench, Row
 from tensordict import TensorDict
 
-from e2rl.synthesizer.rollout import roll_out
+from e2rl.traffic.rollout import roll_out
 
 
 def memory(bench: Bench) -> Iterator[Row]:

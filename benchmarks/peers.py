@@ -30,9 +30,16 @@ def highway_env(repeats: int) -> Iterator[Measured]:
     import gymnasium
     import highway_env  # noqa: F401 - registers its environments
 
-    env = gymnasium.make("highway-v0", config={
-        "vehicles_count": AGENTS - 1, "simulation_frequency": 10, "policy_frequency": 10, "duration": 10 * STEPS,
-        "observation": {"type": "Kinematics", "vehicles_count": 13}})
+    env = gymnasium.make(
+        "highway-v0",
+        config={
+            "vehicles_count": AGENTS - 1,
+            "simulation_frequency": 10,
+            "policy_frequency": 10,
+            "duration": 10 * STEPS,
+            "observation": {"type": "Kinematics", "vehicles_count": 13},
+        },
+    )
 
     def steps() -> int:
         env.reset(seed=0)
@@ -77,8 +84,9 @@ def torchdrivesim(repeats: int) -> Iterator[Measured]:
     axis = torch.linspace(-side / 2, side / 2, cells + 1)
     vertices = torch.cartesian_prod(axis, axis)
     corner = (torch.arange(cells)[:, None] * (cells + 1) + torch.arange(cells)).flatten()
-    faces = torch.cat([corner[:, None] + torch.tensor([0, 1, cells + 1]),
-                       corner[:, None] + torch.tensor([1, cells + 2, cells + 1])])
+    faces = torch.cat(
+        [corner[:, None] + torch.tensor([0, 1, cells + 1]), corner[:, None] + torch.tensor([1, cells + 2, cells + 1])]
+    )
     for batch in (1, 16):
         mesh = BirdviewMesh.set_properties(BaseMesh(verts=vertices[None], faces=faces[None]), "road").expand(batch)
         spot = 12.0 * torch.cartesian_prod(torch.arange(8.0), torch.arange(4.0)).expand(batch, -1, -1)
@@ -87,8 +95,13 @@ def torchdrivesim(repeats: int) -> Iterator[Measured]:
         kinematic.set_state(torch.cat([spot, torch.zeros(batch, AGENTS, 2)], -1))
         config = TorchDriveConfig(renderer=DummyRendererConfig())
         size = torch.tensor([4.5, 2.0]).expand(batch, AGENTS, 2)
-        simulator = Simulator(mesh, {"vehicle": kinematic}, {"vehicle": size},
-                              {"vehicle": torch.ones(batch, AGENTS, dtype=torch.bool)}, config)
+        simulator = Simulator(
+            mesh,
+            {"vehicle": kinematic},
+            {"vehicle": size},
+            {"vehicle": torch.ones(batch, AGENTS, dtype=torch.bool)},
+            config,
+        )
         action = {"vehicle": torch.zeros(batch, AGENTS, 2)}
 
         def steps(simulator=simulator, action=action, batch=batch) -> int:
@@ -101,8 +114,11 @@ def torchdrivesim(repeats: int) -> Iterator[Measured]:
         yield batch, AGENTS, "bicycle of all, collisions, off-road of all, no observation", best(steps, repeats)
 
 
-PEERS = {"highway_env": ("highway-env", highway_env), "vmas": ("vmas", vmas),
-         "torchdrivesim": ("torchdrivesim", torchdrivesim)}
+PEERS = {
+    "highway_env": ("highway-env", highway_env),
+    "vmas": ("vmas", vmas),
+    "torchdrivesim": ("torchdrivesim", torchdrivesim),
+}
 
 
 if __name__ == "__main__":

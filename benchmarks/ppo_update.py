@@ -16,8 +16,13 @@ def ppo_update(bench: Bench) -> Iterator[Row]:
     config = bench.configured("train")
     batch, steps = config.learner.collect.batch, config.learner.collect.steps
     network = ActorEgo().network
-    source = Collector(DrivingEnv(bench.scenes, bench.sim, batch), network.actor, frames_per_batch=batch * steps,
-                       total_frames=batch * steps, auto_register_policy_transforms=False)
+    source = Collector(
+        DrivingEnv(bench.scenes, bench.sim, batch),
+        network.actor,
+        frames_per_batch=batch * steps,
+        total_frames=batch * steps,
+        auto_register_policy_transforms=False,
+    )
     data = next(iter(source))
     source.shutdown()
     learner = Learner(network, instantiate(config.learner.ppo, critic_warmup=0, cloning=0.0, target_kl=1e9))

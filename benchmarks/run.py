@@ -43,15 +43,36 @@ def main(arguments: list[str]) -> None:
         if value is not None and value < 1:
             raise InputError(f"--{name} {value}: expected at least 1")
     torch.set_num_threads(1)
-    bench, rows = Bench(options.data, options.prior, options.repeats, options.largest, tuple(options.train),
-                        options.compile, options.peers), []
+    bench, rows = (
+        Bench(
+            options.data,
+            options.prior,
+            options.repeats,
+            options.largest,
+            tuple(options.train),
+            options.compile,
+            options.peers,
+        ),
+        [],
+    )
     line = "{:20} {:60} {:>5} {:>6} {:>10} {:>12} {:18} {:>5}"
     print(line.format("benchmark", "variant", "batch", "agents", "map points", "value", "unit", "load"))
     for name in options.only or BENCHMARKS:
         for row in BENCHMARKS[name](bench):
             value = "-" if row.value is None else f"{row.value:.4g}"
-            print(line.format(row.benchmark, row.variant, row.batch, row.agents, row.map_points, value, row.unit,
-                              f"{row.load:.1f}"), flush=True)
+            print(
+                line.format(
+                    row.benchmark,
+                    row.variant,
+                    row.batch,
+                    row.agents,
+                    row.map_points,
+                    value,
+                    row.unit,
+                    f"{row.load:.1f}",
+                ),
+                flush=True,
+            )
             rows.append(row.plain())
             options.json.write_text(json.dumps(rows, indent=1))
 

@@ -11,7 +11,7 @@ from measure import Bench, Row
 from tensordict import TensorDict
 
 from e2rl.evaluation.processes import spread
-from e2rl.synthesizer.rollout import roll_out
+from e2rl.traffic.rollout import roll_out
 
 SCENES = 64, 512, 2048, 10_000
 STEPS = 20

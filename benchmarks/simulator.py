@@ -34,8 +34,9 @@ def simulator(bench: Bench) -> Iterator[Row]:
             env = DrivingEnv(bench.scenes, replace(bench.sim, compile=fast), batch)
             wall, cpu = bench.both(lambda e=env, i=index: run(e, i))
             yield bench.row("simulator", f"step and observation{name}", index, STEPS * agents / wall, "agent-steps/s")
-            yield bench.row("simulator", f"step and observation{name}", index, STEPS * agents / cpu,
-                            "agent-steps/CPU s")
+            yield bench.row(
+                "simulator", f"step and observation{name}", index, STEPS * agents / cpu, "agent-steps/CPU s"
+            )
         for batch in bench.batches(1, 16, 64):
             index = bench.pick(batch, AGENTS)
             function = compiled(everybody) if fast else everybody
@@ -44,10 +45,16 @@ def simulator(bench: Bench) -> Iterator[Row]:
                 yield bench.row("simulator", f"everybody driven{name}", index, value, unit)
     if bench.compile:
         index = bench.pick(*bench.batches(32), AGENTS)
-        one, two = (run(DrivingEnv(bench.scenes, replace(bench.sim, compile=fast), len(index)), index)
-                    for fast in kinds)
-        yield bench.row("simulator", "compiled against eager, largest difference", index,
-                        (one - two).abs().max().item(), "of a feature")
+        one, two = (
+            run(DrivingEnv(bench.scenes, replace(bench.sim, compile=fast), len(index)), index) for fast in kinds
+        )
+        yield bench.row(
+            "simulator",
+            "compiled against eager, largest difference",
+            index,
+            (one - two).abs().max().item(),
+            "of a feature",
+        )
 
 
 def run(env: DrivingEnv, index: Tensor) -> Tensor:
@@ -59,8 +66,9 @@ def run(env: DrivingEnv, index: Tensor) -> Tensor:
     return done["observation"]
 
 
-def everybody(states: Tensor, action: Tensor, size: Tensor, pairs: Tensor, field: Tensor, origin: Tensor
-              ) -> tuple[Tensor, Tensor, Tensor]:
+def everybody(
+    states: Tensor, action: Tensor, size: Tensor, pairs: Tensor, field: Tensor, origin: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """All agents' next states [B, N, 4], the pairs [2, Q] that touch [B, Q], metres beyond the border [B, N]."""
     states = dynamics.step(states, action)
     one, two = pairs

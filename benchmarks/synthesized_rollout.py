@@ -10,9 +10,9 @@ from measure import Bench, Row
 
 from e2rl.prior.prior import Prior
 from e2rl.sim.env import DrivingEnv
-from e2rl.synthesizer.rollout import roll_out
 from e2rl.synthesizer.skeleton import build_skeleton
 from e2rl.synthesizer.topology import topological_candidates
+from e2rl.traffic.rollout import roll_out
 
 
 def synthesized_rollout(bench: Bench) -> Iterator[Row]:
@@ -28,16 +28,22 @@ def synthesized_rollout(bench: Bench) -> Iterator[Row]:
         yield bench.row("synthesized_rollout", name, index, wall / batch, "s/rollout")
         yield bench.row("synthesized_rollout", name, index, cpu / batch, "CPU s/rollout")
     parts = {
-        "topology, feasibility and skeleton": (topological_candidates, bench.synthesizer.feasible_vehicles,
-                                               build_skeleton),
-        "sampling": (Prior.sample,), "bounds and decoding of the plan": (Prior.plan,),
-        "plans of lane_graph": (type(bench.ego).plan,), "simulator": (DrivingEnv._step,),
+        "topology, feasibility and skeleton": (
+            topological_candidates,
+            bench.synthesizer.feasible_vehicles,
+            build_skeleton,
+        ),
+        "sampling": (Prior.sample,),
+        "bounds and decoding of the plan": (Prior.plan,),
+        "plans of lane_graph": (type(bench.ego).plan,),
+        "simulator": (DrivingEnv._step,),
     }
     profile = cProfile.Profile(builtins=False)  # Python's functions alone: little beside torch's operations
     profile.runcall(run, 2.0)
     for name, functions in parts.items():
-        yield bench.row("synthesized_rollout", f"e2: {name}", index, 100 * share(profile, functions),
-                        "% of the rollout")
+        yield bench.row(
+            "synthesized_rollout", f"e2: {name}", index, 100 * share(profile, functions), "% of the rollout"
+        )
 
 
 def share(profile: cProfile.Profile, functions: tuple[Callable, ...]) -> float:

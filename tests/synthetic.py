@@ -59,8 +59,15 @@ def make_scenes(
     parked[:, 0] = False
     zeros = torch.zeros(num_scenes, max_agents)
     scenes = {
-        "start": start, "start_accel": zeros, "start_yaw_rate": zeros.clone(), "past": _past(start[:, :max_vehicles]),
-        "valid": valid, "size": size, "agent_type": kind, "parked": parked, "logged": logged,
+        "start": start,
+        "start_accel": zeros,
+        "start_yaw_rate": zeros.clone(),
+        "past": _past(start[:, :max_vehicles]),
+        "valid": valid,
+        "size": size,
+        "agent_type": kind,
+        "parked": parked,
+        "logged": logged,
         "logged_valid": valid[:, None].repeat(1, steps + 1, 1),
         "scene_index": torch.arange(num_scenes),
     }
@@ -69,8 +76,12 @@ def make_scenes(
     scenes |= {key: value.expand(num_scenes, *value.shape).clone() for key, value in _map(road).items()}
     scenes |= _lights(num_scenes, steps, red_light_x)
     return SceneSet(
-        scenes=TensorDict(scenes, [num_scenes]), scene_id=[f"synthetic-{k}" for k in range(num_scenes)],
-        location=["straight"] * num_scenes, dataset="synthetic", split="test", dropped={},
+        scenes=TensorDict(scenes, [num_scenes]),
+        scene_id=[f"synthetic-{k}" for k in range(num_scenes)],
+        location=["straight"] * num_scenes,
+        dataset="synthetic",
+        split="test",
+        dropped={},
     )
 
 

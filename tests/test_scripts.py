@@ -35,9 +35,13 @@ def world(tmp_path_factory):
     good = numbered([description({"ego": straight(20 + k, 0, 8), "7": straight(50, 3.5, 6)}) for k in range(2)])
     nan = description()
     nan["tracks"]["7"]["state"]["position"][40] = np.nan
-    bad = {"forbidden": pickle.dumps({"x": Malicious(os.system, f"touch {root / 'ran'}")}),
-           "no_ego": description(sdc_id="nobody"), "no_lanes": description(lanes={"b": lane([[0, 0]])}), "nan": nan,
-           "damaged": b"nonsense"}
+    bad = {
+        "forbidden": pickle.dumps({"x": Malicious(os.system, f"touch {root / 'ran'}")}),
+        "no_ego": description(sdc_id="nobody"),
+        "no_lanes": description(lanes={"b": lane([[0, 0]])}),
+        "nan": nan,
+        "damaged": b"nonsense",
+    }
     write_folder(root / "good", good)
     for name, scene in bad.items():
         write_folder(root / name, [good[0], scene])
@@ -58,20 +62,30 @@ def _variants(root: Path) -> None:
     save_file(tensors, root / "unknown.safetensors", metadata | {"architecture": '{"denoiser": {"depth": 3}}'})
     save_file(tensors, root / "format.safetensors", metadata | {"format": "e2rl-prior/9"})
     content = (root / "prior.safetensors").read_bytes()
-    (root / "cut.safetensors").write_bytes(content[:len(content) // 2])
+    (root / "cut.safetensors").write_bytes(content[: len(content) // 2])
     (root / "text.safetensors").write_text("no checkpoint")
 
 
 def arguments(world: Path, folder: Path, data: str, *more: str) -> list[str]:
     """Overrides for scenes `data` with everything that is written below `folder`."""
-    return ["data=scenarionet", f"data.path={world / data}", f"data.cache={folder / 'cache'}", *SMALL,
-            f"prior.checkpoint={world / 'prior.safetensors'}", f"hydra.run.dir={folder / 'run'}", *more]
+    return [
+        "data=scenarionet",
+        f"data.path={world / data}",
+        f"data.cache={folder / 'cache'}",
+        *SMALL,
+        f"prior.checkpoint={world / 'prior.safetensors'}",
+        f"hydra.run.dir={folder / 'run'}",
+        *more,
+    ]
 
 
 def left_behind(folder: Path) -> list[str]:
     """Files below a folder other than Hydra's record of the configuration and the log."""
-    return [str(path.relative_to(folder)) for path in folder.rglob("*")
-            if path.is_file() and ".hydra" not in path.parts and path.suffix != ".log"]
+    return [
+        str(path.relative_to(folder))
+        for path in folder.rglob("*")
+        if path.is_file() and ".hydra" not in path.parts and path.suffix != ".log"
+    ]
 
 
 def call(script: str, overrides: list[str], monkeypatch, capsys) -> tuple[int, str]:
@@ -109,7 +123,8 @@ DATA = [
     ("nan", "sd_01.pkl: track 7 is NaN or infinite at frame 40", "data.skip_invalid=true"),
 ]
 CHECKPOINTS = [
-    ("none", "none.safetensors: no such file", "train one"), ("plain", "plain.safetensors: format None", "prior"),
+    ("none", "none.safetensors: no such file", "train one"),
+    ("plain", "plain.safetensors: format None", "prior"),
     ("format", "format.safetensors: format 'e2rl-prior/9'", "expected"),
     ("other", "other.safetensors: another architecture", "train the prior again"),
     ("unknown", "unknown.safetensors: ", "train the prior again"),
@@ -118,16 +133,19 @@ CHECKPOINTS = [
 ]
 
 
-@pytest.mark.parametrize(("script", "data", "what", "remedy"), [*(("evaluate.py", *case) for case in DATA),
-                                                                ("train.py", *DATA[2])])
+@pytest.mark.parametrize(
+    ("script", "data", "what", "remedy"), [*(("evaluate.py", *case) for case in DATA), ("train.py", *DATA[2])]
+)
 def test_bad_scenes(world, tmp_path, monkeypatch, capsys, script, data, what, remedy):
     status, said = call(script, arguments(world, tmp_path, data), monkeypatch, capsys)
     assert status == 2 and what in error_line(said) and remedy in error_line(said)
     assert not left_behind(tmp_path) and not (world / "ran").exists()
 
 
-@pytest.mark.parametrize(("script", "name", "what", "remedy"), [*(("evaluate.py", *case) for case in CHECKPOINTS),
-                                                                ("train.py", *CHECKPOINTS[3])])
+@pytest.mark.parametrize(
+    ("script", "name", "what", "remedy"),
+    [*(("evaluate.py", *case) for case in CHECKPOINTS), ("train.py", *CHECKPOINTS[3])],
+)
 def test_bad_checkpoints(world, tmp_path, monkeypatch, capsys, script, name, what, remedy):
     overrides = arguments(world, tmp_path, "good", f"prior.checkpoint={world / name}.safetensors")
     status, said = call(script, overrides, monkeypatch, capsys)
@@ -135,34 +153,51 @@ def test_bad_checkpoints(world, tmp_path, monkeypatch, capsys, script, name, wha
     assert [path.split("-")[0] for path in left_behind(tmp_path)] == ["cache/scenes"]
 
 
-@pytest.mark.parametrize(("script", "override", "what"), [
-    ("evaluate.py", "data.pth=x", "pth"), ("train.py", "round=3", "round"), ("evaluate.py", "ego=taxi", "taxi"),
-    ("train.py", "prior.sampler.step=3", "step"), ("train.py", "synthesizer=e3", "e3"),
-    ("evaluate.py", "eta", "eta"),
-])
+@pytest.mark.parametrize(
+    ("script", "override", "what"),
+    [
+        ("evaluate.py", "data.pth=x", "pth"),
+        ("train.py", "round=3", "round"),
+        ("evaluate.py", "ego=taxi", "taxi"),
+        ("train.py", "prior.sampler.step=3", "step"),
+        ("train.py", "synthesizer=e3", "e3"),
+        ("evaluate.py", "eta", "eta"),
+    ],
+)
 def test_unknown_keys_and_choices(world, tmp_path, monkeypatch, capsys, script, override, what):
     status, said = call(script, [*arguments(world, tmp_path, "good"), override], monkeypatch, capsys)
     assert status == 1 and what in said and not left_behind(tmp_path)  # Hydra's own message
 
 
-@pytest.mark.parametrize(("script", "overrides", "what"), [
-    ("train.py", ["stage=sleep"], "stage=sleep: choose one of"), ("evaluate.py", ["num_scenes=0"], "num_scenes=0"),
-    ("evaluate.py", ["data.source=bundled", "data.split=best"], "split 'best'"),
-    ("evaluate.py", ["data.source=spreadsheet"], "data.source=spreadsheet"),
-    ("evaluate.py", ["+prior.sampler.speed=3"], "speed"), ("evaluate.py", ["+data.build.depth=3"], "depth"),
-    ("evaluate.py", ["+synthesizer.control.depth=3"], "depth"), ("evaluate.py", ["+sim.gravity=3"], "gravity"),
-    ("evaluate.py", ["ego._target_=torch.nn.ReLU"], "ego=torch.nn.ReLU"),
-    ("evaluate.py", ["ego._target_=no.such.Driver"], "ego=no.such.Driver"),
-    ("evaluate.py", ["seeds=[]"], "seeds"), ("evaluate.py", ["methods=[e3]"], "e3"),
-    ("evaluate.py", ["device=tpu9"], "device=tpu9"), ("train.py", ["resume=nowhere"], "resume=nowhere"),
-    ("evaluate.py", ["scene=9"], "scene=9"),
-    ("evaluate.py", ["scene=nowhere"], "scene=nowhere"), ("evaluate.py", ["figure=pie"], "figure=pie"),
-    ("evaluate.py", ["+variants.x={synthesizer.control.depth: 3}"], "depth"),
-    ("evaluate.py", ["+variants.x={synthesizer.support: best}"], "support is 'best'"),
-    ("evaluate.py", ["eta=-1"], "eta"), ("evaluate.py", ["eta=abc"], "eta=abc"),
-    ("evaluate.py", ["num_scenes=0"], "num_scenes=0"), ("evaluate.py", ["batch=0"], "batch=0"),
-    ("evaluate.py", ["ego=actor", "ego.checkpoint=none.safetensors"], "none.safetensors"),
-])
+@pytest.mark.parametrize(
+    ("script", "overrides", "what"),
+    [
+        ("train.py", ["stage=sleep"], "stage=sleep: choose one of"),
+        ("evaluate.py", ["num_scenes=0"], "num_scenes=0"),
+        ("evaluate.py", ["data.source=bundled", "data.split=best"], "split 'best'"),
+        ("evaluate.py", ["data.source=spreadsheet"], "data.source=spreadsheet"),
+        ("evaluate.py", ["+prior.sampler.speed=3"], "speed"),
+        ("evaluate.py", ["+data.build.depth=3"], "depth"),
+        ("evaluate.py", ["+synthesizer.control.depth=3"], "depth"),
+        ("evaluate.py", ["+sim.gravity=3"], "gravity"),
+        ("evaluate.py", ["ego._target_=torch.nn.ReLU"], "ego=torch.nn.ReLU"),
+        ("evaluate.py", ["ego._target_=no.such.Driver"], "ego=no.such.Driver"),
+        ("evaluate.py", ["seeds=[]"], "seeds"),
+        ("evaluate.py", ["methods=[e3]"], "e3"),
+        ("evaluate.py", ["device=tpu9"], "device=tpu9"),
+        ("train.py", ["resume=nowhere"], "resume=nowhere"),
+        ("evaluate.py", ["scene=9"], "scene=9"),
+        ("evaluate.py", ["scene=nowhere"], "scene=nowhere"),
+        ("evaluate.py", ["figure=pie"], "figure=pie"),
+        ("evaluate.py", ["+variants.x={synthesizer.control.depth: 3}"], "depth"),
+        ("evaluate.py", ["+variants.x={synthesizer.support: best}"], "support is 'best'"),
+        ("evaluate.py", ["eta=-1"], "eta"),
+        ("evaluate.py", ["eta=abc"], "eta=abc"),
+        ("evaluate.py", ["num_scenes=0"], "num_scenes=0"),
+        ("evaluate.py", ["batch=0"], "batch=0"),
+        ("evaluate.py", ["ego=actor", "ego.checkpoint=none.safetensors"], "none.safetensors"),
+    ],
+)
 def test_impossible_settings(world, tmp_path, monkeypatch, capsys, script, overrides, what):
     status, said = call(script, arguments(world, tmp_path, "good", *overrides), monkeypatch, capsys)
     assert status == 2 and what in error_line(said)
@@ -172,54 +207,109 @@ def test_impossible_settings(world, tmp_path, monkeypatch, capsys, script, overr
 @pytest.mark.skipif(torch.cuda.is_available(), reason="has CUDA")
 @pytest.mark.parametrize("script", ["evaluate.py", "train.py"])
 def test_a_device_that_is_not_there(world, tmp_path, script):
-    done = subprocess.run([sys.executable, str(ROOT / script), *arguments(world, tmp_path, "good", "device=cuda")],
-                          capture_output=True, text=True, timeout=120, cwd=tmp_path)
+    done = subprocess.run(
+        [sys.executable, str(ROOT / script), *arguments(world, tmp_path, "good", "device=cuda")],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=tmp_path,
+    )
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert error_line(done.stderr) == "error: device=cuda: no CUDA device is available; use device=cpu"
     assert not left_behind(tmp_path)
 
 
 def test_skipped_scenes_are_counted_in_the_table(world, tmp_path, monkeypatch, capsys):
-    overrides = arguments(world, tmp_path, "nan", "data.skip_invalid=true", "synthesizer=nominal", "seeds=[0]",
-                          "save_rollouts=false", "prior.sampler.steps=2")
+    overrides = arguments(
+        world,
+        tmp_path,
+        "nan",
+        "data.skip_invalid=true",
+        "synthesizer=nominal",
+        "seeds=[0]",
+        "save_rollouts=false",
+        "prior.sampler.steps=2",
+    )
     status, said = call("evaluate.py", overrides, monkeypatch, capsys)
     assert status == 0 and "left out sd_01.pkl: sd_01.pkl: track 7 is NaN" in said
     assert "left out: 1 scenes (invalid)" in " ".join((tmp_path / "run" / "tables.md").read_text().split())
     assert not list(tmp_path.rglob("*.npz"))
 
 
-SHORT = ["data.split=tune", "num_scenes=2", "data.workers=1", "data.build.steps=20", "data.build.vehicles=8",
-         "data.build.others=2", "data.build.field_cells=128", "prior.sampler.steps=2"]  # of the bundled scenes
+SHORT = [
+    "data.split=tune",
+    "num_scenes=2",
+    "data.workers=1",
+    "data.build.steps=20",
+    "data.build.vehicles=8",
+    "data.build.others=2",
+    "data.build.field_cells=128",
+    "prior.sampler.steps=2",
+]  # of the bundled scenes
 EXPERIMENTS = [
     ("table2", [("random_k", 2), ("topology", 2), ("e2", 2), ("nominal", 0)], None),
-    ("table3", [("e2", 2), ("nominal", 0), ("no V_feas", 2), ("no V_adv", 2), ("no anchoring", 2),
-                ("literal anchoring", 2), ("no interception", 2), ("no proposal", 2), ("V_adv alone", 2),
-                ("V_adv alone x4", 2), ("V_adv alone x16", 2), ("no bounds", 2), ("no bounds, no V_feas", 2)], None),
+    (
+        "table3",
+        [
+            ("e2", 2),
+            ("nominal", 0),
+            ("no V_feas", 2),
+            ("no V_adv", 2),
+            ("no anchoring", 2),
+            ("literal anchoring", 2),
+            ("no interception", 2),
+            ("no proposal", 2),
+            ("V_adv alone", 2),
+            ("V_adv alone x4", 2),
+            ("V_adv alone x16", 2),
+            ("no bounds", 2),
+            ("no bounds, no V_feas", 2),
+        ],
+        None,
+    ),
     ("intensity", [("e2", 0), ("e2", 1), ("e2", 2), ("e2", 3)], "intensity.png"),
     ("skeleton", [("e2", 2)], "skeleton.png"),
 ]
 
 
 def test_a_round_of_evolution_from_the_first_command_to_its_tables(world, tmp_path, monkeypatch, capsys):
-    overrides = arguments(world, tmp_path, "good", "data.build.steps=20", "prior.sampler.steps=2", "rounds=1",
-                          "batch=2", "learner.round.scenes=2", "learner.collect.batch=2", "learner.collect.steps=20",
-                          "learner.collect.iterations=1", "measure.scenes=2")
+    overrides = arguments(
+        world,
+        tmp_path,
+        "good",
+        "data.build.steps=20",
+        "prior.sampler.steps=2",
+        "rounds=1",
+        "batch=2",
+        "learner.round.scenes=2",
+        "learner.collect.batch=2",
+        "learner.collect.steps=20",
+        "learner.collect.iterations=1",
+        "measure.scenes=2",
+    )
     status, said = call("train.py", overrides, monkeypatch, capsys)
     assert status == 0, said
     rows = read_metrics(tmp_path / "run" / "metrics.json")
     assert {(row["stage"], row["method"]) for row in rows} == {
-        (stage, method) for stage in ("before", "after") for method in ("nominal", "e2")}
+        (stage, method) for stage in ("before", "after") for method in ("nominal", "e2")
+    }
     tables = (tmp_path / "run" / "tables.md").read_text()
     assert "cfr [%]" in tables and "cfr [points]" in tables and "after" in tables
     assert list((tmp_path / "run" / "checkpoints").iterdir())
 
 
 @pytest.mark.parametrize(("experiment", "methods", "figure"), EXPERIMENTS)
-def test_the_adversaries_experiments_have_their_rows_and_figures(world, tmp_path, monkeypatch, capsys, experiment,
-                                                                methods, figure):
+def test_the_adversaries_experiments_have_their_rows_and_figures(
+    world, tmp_path, monkeypatch, capsys, experiment, methods, figure
+):
     """Two of the bundled scenes with the bundled prior; the paper's tables 2 and 3 and its figures."""
-    overrides = [f"experiment={experiment}", *SHORT, f"data.cache={world / 'bundled'}", "seeds=[0]",
-                 f"hydra.run.dir={tmp_path / 'run'}"]
+    overrides = [
+        f"experiment={experiment}",
+        *SHORT,
+        f"data.cache={world / 'bundled'}",
+        "seeds=[0]",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    ]
     status, said = call("evaluate.py", overrides, monkeypatch, capsys)
     assert status == 0, said
     rows = read_metrics(tmp_path / "run" / "metrics.json")
@@ -237,8 +327,20 @@ def test_one_scene_is_driven_as_among_all(world, tmp_path, monkeypatch, capsys):
     found = []
     for which in ("scene=null", "scene=1"):
         folder = tmp_path / which
-        status, said = call("evaluate.py", [*SHORT, f"data.cache={world / 'bundled'}", "seeds=[1]", "methods=[e2]",
-                                            which, "batch=1", f"hydra.run.dir='{folder}'"], monkeypatch, capsys)
+        status, said = call(
+            "evaluate.py",
+            [
+                *SHORT,
+                f"data.cache={world / 'bundled'}",
+                "seeds=[1]",
+                "methods=[e2]",
+                which,
+                "batch=1",
+                f"hydra.run.dir='{folder}'",
+            ],
+            monkeypatch,
+            capsys,
+        )
         assert status == 0, said
         found.append({path.name: path.read_bytes() for path in (folder / "rollouts").glob("*.npz")})
     assert len(found[0]) == 2 and len(found[1]) == 1 and found[1].items() <= found[0].items()
@@ -246,10 +348,21 @@ def test_one_scene_is_driven_as_among_all(world, tmp_path, monkeypatch, capsys):
 
 def test_the_prior_s_experiment_has_rows_of_all_stages(world, tmp_path, monkeypatch, capsys):
     """Open loop, closed loop and meta-metric of three procedural scenes with an untrained prior."""
-    overrides = ["experiment=prior", "data=procedural", "data.count=3", f"data.cache={tmp_path / 'cache'}",
-                 "data.workers=1", "data.build.vehicles=8", "data.build.field_cells=128", "seeds=[0]",
-                 "open_loop_samples=2", "meta_rollouts=2", "prior.sampler.steps=2", f"hydra.run.dir={tmp_path / 'run'}",
-                 f"prior.checkpoint={world / 'prior.safetensors'}"]
+    overrides = [
+        "experiment=prior",
+        "data=procedural",
+        "data.count=3",
+        f"data.cache={tmp_path / 'cache'}",
+        "data.workers=1",
+        "data.build.vehicles=8",
+        "data.build.field_cells=128",
+        "seeds=[0]",
+        "open_loop_samples=2",
+        "meta_rollouts=2",
+        "prior.sampler.steps=2",
+        f"hydra.run.dir={tmp_path / 'run'}",
+        f"prior.checkpoint={world / 'prior.safetensors'}",
+    ]
     status, said = call("evaluate.py", overrides, monkeypatch, capsys)
     assert status == 0, said
     rows = read_metrics(tmp_path / "run" / "metrics.json")
@@ -257,7 +370,10 @@ def test_the_prior_s_experiment_has_rows_of_all_stages(world, tmp_path, monkeypa
     assert sum(map(len, found.values())) == len(rows)
     methods = ["replay", "constant_velocity", "idm", "nominal"]
     assert {stage: [row["method"] for row in part] for stage, part in found.items()} == {
-        OPEN_LOOP_STAGE: methods[1:], META_STAGE: methods, None: methods}
+        OPEN_LOOP_STAGE: methods[1:],
+        META_STAGE: methods,
+        None: methods,
+    }
     for stage, metrics in STAGES.items():
         known = [metric.name for metric in metrics if metric.name != "real_split_half"]
         assert all(set(known) <= set(row["metrics"]) for row in found[stage])

@@ -32,17 +32,22 @@ def sample(recording: Recording) -> dict[str, np.ndarray]:
     rows = rows[np.isfinite(apart[rows])]
     valid = drop_jumps(recording.states[:, rows], recording.valid[:, rows])
     states = smooth(recording.states[:, rows], valid)
-    states, valid = states[now:now + STEPS + 1], valid[now:now + STEPS + 1]
+    states, valid = states[now : now + STEPS + 1], valid[now : now + STEPS + 1]
     speed = states[..., 3]
     lon = np.diff(speed, axis=0) / DT
     lat = lateral_acceleration(states, valid)[1:]
     both = valid[1:] & valid[:-1]
     travelled = np.where(both, np.linalg.norm(np.diff(states[..., :2], axis=0), axis=-1), 0.0).sum(0)
     driven = both & (speed[1:] > MOVING) & (travelled > 2.0)
-    return {"speed m/s": speed[1:][driven], "a_lon m/s^2": lon[driven], "a_lat m/s^2": lat[driven],
-            "agents": np.array([len(rows)]), "moving share": travelled > 2.0,
-            "standing share": (speed[1:] < MOVING)[both & (travelled > 2.0)],
-            "overlaps": np.array([len(overlapping_pairs(states, valid, recording.size[rows]))])}
+    return {
+        "speed m/s": speed[1:][driven],
+        "a_lon m/s^2": lon[driven],
+        "a_lat m/s^2": lat[driven],
+        "agents": np.array([len(rows)]),
+        "moving share": travelled > 2.0,
+        "standing share": (speed[1:] < MOVING)[both & (travelled > 2.0)],
+        "overlaps": np.array([len(overlapping_pairs(states, valid, recording.size[rows]))]),
+    }
 
 
 def pool(recordings) -> dict[str, np.ndarray]:
@@ -59,11 +64,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", help="folder or zip of recorded scenarios")
     options = parser.parse_args()
-    logs = pool(recording for container, member in scenarionet.list_files(options.logs)
-                for recording in scenarionet.read_recordings(scenarionet.read_bytes(container, member), member, "",
-                                                             None, STEPS))
-    sets = {"bundled": pool(r for split in SPLITS for r in load_recordings(split)),
-            "procedural": pool(procedural.generate_recordings(100, 0, "train")), "recorded": logs}
+    logs = pool(
+        recording
+        for container, member in scenarionet.list_files(options.logs)
+        for recording in scenarionet.read_recordings(scenarionet.read_bytes(container, member), member, "", None, STEPS)
+    )
+    sets = {
+        "bundled": pool(r for split in SPLITS for r in load_recordings(split)),
+        "procedural": pool(procedural.generate_recordings(100, 0, "train")),
+        "recorded": logs,
+    }
     print("| | " + " | ".join(f"{name}, n = {part['n'][0]}" for name, part in sets.items()) + " |")
     print("|-|" + "-|" * len(sets))
     for row in ROWS:

@@ -23,9 +23,15 @@ class ActorEgo(Ego):
     """Drives by the actor's most central action; `network` is what the learner improves, in place."""
 
     def __init__(
-        self, hidden: Sequence[int] = (256, 256), reference: bool = True, initial_std: Sequence[float] = (0.12, 0.04),
-        max_acceleration: float = 5.0, max_braking: float = 8.0, max_yaw_rate: float = 1.6,
-        checkpoint: str | None = None, device: str = "cpu",
+        self,
+        hidden: Sequence[int] = (256, 256),
+        reference: bool = True,
+        initial_std: Sequence[float] = (0.12, 0.04),
+        max_acceleration: float = 5.0,
+        max_braking: float = 8.0,
+        max_yaw_rate: float = 1.6,
+        checkpoint: str | None = None,
+        device: str = "cpu",
     ) -> None:
         """Fields: conf/ego/actor.yaml. Raises InputError where the checkpoint is missing or does not fit."""
         super().__init__(replan_every=1)
@@ -61,8 +67,11 @@ class ActorEgo(Ego):
         pieces = []
         for done in range(0, PLAN_STEPS, HOLD):
             now = World(
-                scene=world.scene, step=world.step + done, states=torch.cat([ego[:, None], future[:, 1:, done]], 1),
-                valid=world.valid, accel=torch.cat([action[:, :1], _accelerations(world, future, done)], 1),
+                scene=world.scene,
+                step=world.step + done,
+                states=torch.cat([ego[:, None], future[:, 1:, done]], 1),
+                valid=world.valid,
+                accel=torch.cat([action[:, :1], _accelerations(world, future, done)], 1),
                 route=world.route,
             )
             action = self.network.network.deterministic(_look(now, setting, ego, action))
@@ -93,8 +102,15 @@ def _look(world: World, setting: Setting, ego: Tensor, action: Tensor) -> Tensor
     turn, glass = axes(ego), lens(ego.device)
     around = look_around(ego, turn, setting, world.states[:, 1:], world.valid[:, 1:], world.accel[:, 1:])
     horizon = world.scene["logged"].shape[1] - 1
-    return observe(glass, setting, EgoState(ego, turn, action, place), world.step, horizon,
-                   probe(glass, setting, ego, turn), around)[0]
+    return observe(
+        glass,
+        setting,
+        EgoState(ego, turn, action, place),
+        world.step,
+        horizon,
+        probe(glass, setting, ego, turn),
+        around,
+    )[0]
 
 
 def _others(world: World) -> Tensor:

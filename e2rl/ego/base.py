@@ -60,8 +60,7 @@ class Ego(ABC):
         """Planned states [B, PLAN_STEPS, 4] of the egos at steps 1.. from now, 0.1 s apart, without side effects."""
 
     def announce(self, world: World) -> Tensor:
-        """`plan`, for whoever plans against the ego: planning anew at the same moment, `act` drives what was announced.
-        """
+        """`plan`, for whoever plans against the ego; planning anew at the same moment, `act` drives it."""
         self._announced = world, self.plan(world)
         return self._announced[1]
 

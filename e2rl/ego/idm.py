@@ -20,9 +20,19 @@ class IDMEgo(Ego):
     """Keeps its mission lane and follows the nearest agent ahead within the lateral gate; never changes lanes."""
 
     def __init__(
-        self, desired_speed: float = 10.0, headway: float = 1.0, standstill_gap: float = 5.0, acceleration: float = 1.0,
-        braking: float = 3.0, exponent: float = 4.0, hardest_braking: float = 8.0, gate_margin: float = 0.3,
-        lateral_acceleration: float = 3.0, use_limits: bool = True, obey_lights: bool = True, replan_every: int = 1,
+        self,
+        desired_speed: float = 10.0,
+        headway: float = 1.0,
+        standstill_gap: float = 5.0,
+        acceleration: float = 1.0,
+        braking: float = 3.0,
+        exponent: float = 4.0,
+        hardest_braking: float = 8.0,
+        gate_margin: float = 0.3,
+        lateral_acceleration: float = 3.0,
+        use_limits: bool = True,
+        obey_lights: bool = True,
+        replan_every: int = 1,
     ) -> None:
         """Fields: conf/ego/idm.yaml."""
         super().__init__(replan_every)
@@ -38,7 +48,14 @@ class IDMEgo(Ego):
         gap, leading = self.leader(world, path)
         desired = self.desired(path)
         accel = idm_acceleration(
-            speed, desired, gap, leading, self.acceleration, self.braking, self.headway, self.standstill_gap,
+            speed,
+            desired,
+            gap,
+            leading,
+            self.acceleration,
+            self.braking,
+            self.headway,
+            self.standstill_gap,
             self.exponent,
         )
         allowed = look_up(caps, (REACTION * speed)[:, None])[:, 0]
@@ -79,8 +96,15 @@ class IDMEgo(Ego):
 
 
 def idm_acceleration(
-    speed: Tensor, desired: Tensor, gap: Tensor, leading: Tensor, acceleration: float, braking: float, headway: float,
-    standstill_gap: float, exponent: float,
+    speed: Tensor,
+    desired: Tensor,
+    gap: Tensor,
+    leading: Tensor,
+    acceleration: float,
+    braking: float,
+    headway: float,
+    standstill_gap: float,
+    exponent: float,
 ) -> Tensor:
     """IDM acceleration [...] m/s^2; gap [...] m may be inf (free road); speeds in m/s.
 

@@ -26,11 +26,23 @@ class LaneGraphEgo(Ego):
     obeys curve speeds, known limits and lights (its speeds are capped by them), and its plan is drivable by a car."""
 
     def __init__(
-        self, max_speed: float = 20.0, max_acceleration: float = 4.0, speeds: int = 5, max_risk: float = 0.1,
-        risk_slope: float = 0.3, risk_growth: float = 0.02, interaction_distance: float = 70.0,
-        predicted_speeds: tuple[float, ...] = (0.5, 1.0), predicted_acceleration: float = 0.5,
-        match_distance: float = 2.0, match_angle: float = 20.0, lateral_acceleration: float = 3.0,
-        braking: float = 3.0, use_limits: bool = True, obey_lights: bool = True, see_vrus: bool = True,
+        self,
+        max_speed: float = 20.0,
+        max_acceleration: float = 4.0,
+        speeds: int = 5,
+        max_risk: float = 0.1,
+        risk_slope: float = 0.3,
+        risk_growth: float = 0.02,
+        interaction_distance: float = 70.0,
+        predicted_speeds: tuple[float, ...] = (0.5, 1.0),
+        predicted_acceleration: float = 0.5,
+        match_distance: float = 2.0,
+        match_angle: float = 20.0,
+        lateral_acceleration: float = 3.0,
+        braking: float = 3.0,
+        use_limits: bool = True,
+        obey_lights: bool = True,
+        see_vrus: bool = True,
         replan_every: int = 5,
     ) -> None:
         """Fields: conf/ego/lane_graph.yaml."""
@@ -80,8 +92,15 @@ class LaneGraphEgo(Ego):
     def predict(self, world: World) -> Prediction:
         """Everyone within interaction_distance on every matched route at every predicted speed."""
         return predict(
-            world, sum(HALVES), PLAN_DT, self.predicted_speeds, self.predicted_acceleration * self.max_acceleration,
-            self.interaction_distance, self.match_distance, self.match_angle, self.see_vrus,
+            world,
+            sum(HALVES),
+            PLAN_DT,
+            self.predicted_speeds,
+            self.predicted_acceleration * self.max_acceleration,
+            self.interaction_distance,
+            self.match_distance,
+            self.match_angle,
+            self.see_vrus,
         )
 
     def matched(self, path: MissionPath) -> Tensor:

@@ -56,7 +56,12 @@ class ActorNetwork(nn.Module):
     """
 
     def __init__(
-        self, normaliser: Normaliser, hidden: Sequence[int], reference: bool, initial_std: Sequence[float], low: Tensor,
+        self,
+        normaliser: Normaliser,
+        hidden: Sequence[int],
+        reference: bool,
+        initial_std: Sequence[float],
+        low: Tensor,
         high: Tensor,
     ) -> None:
         super().__init__()
@@ -105,8 +110,13 @@ class ActorCritic(nn.Module):
     """
 
     def __init__(
-        self, low: Tensor, high: Tensor, hidden: Sequence[int] = (256, 256), reference: bool = True,
-        initial_std: Sequence[float] = (0.12, 0.04), device: str | torch.device = "cpu",
+        self,
+        low: Tensor,
+        high: Tensor,
+        hidden: Sequence[int] = (256, 256),
+        reference: bool = True,
+        initial_std: Sequence[float] = (0.12, 0.04),
+        device: str | torch.device = "cpu",
     ) -> None:
         """low, high [2]: bounds of (acceleration, yaw rate); other fields: conf/ego/actor.yaml."""
         super().__init__()
@@ -114,17 +124,24 @@ class ActorCritic(nn.Module):
         low, high = low.to(device, torch.float32), high.to(device, torch.float32)
         self.low, self.high, self.device = low, high, device
         self.architecture = {
-            "observation": OBSERVATION_SIZE, "hidden": [int(size) for size in hidden], "reference": bool(reference),
-            "low": _rounded(low), "high": _rounded(high),
+            "observation": OBSERVATION_SIZE,
+            "hidden": [int(size) for size in hidden],
+            "reference": bool(reference),
+            "low": _rounded(low),
+            "high": _rounded(high),
         }
         self.normaliser = Normaliser(OBSERVATION_SIZE)
         self.network = ActorNetwork(self.normaliser, hidden, reference, initial_std, low.cpu(), high.cpu())
         values = nn.Sequential(self.normaliser, perceptron(OBSERVATION_SIZE, hidden, 1, last_gain=1.0))
         self.to(device)
         self.actor = ProbabilisticActor(
-            TensorDictModule(self.network, ["observation"], ["loc", "scale"]), in_keys=["loc", "scale"],
-            out_keys=["action"], distribution_class=TanhNormal, distribution_kwargs={"low": low, "high": high},
-            spec=Bounded(low, high, device=device), return_log_prob=True,
+            TensorDictModule(self.network, ["observation"], ["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            out_keys=["action"],
+            distribution_class=TanhNormal,
+            distribution_kwargs={"low": low, "high": high},
+            spec=Bounded(low, high, device=device),
+            return_log_prob=True,
         )
         self.critic = ValueOperator(values.to(device), in_keys=["observation"])
 
@@ -142,8 +159,10 @@ class ActorCritic(nn.Module):
         except (SafetensorError, OSError, json.JSONDecodeError) as error:
             raise InputError(f"{path}: not a readable actor file ({error}); give an {WEIGHTS} file") from None
         if saved != self.architecture:
-            raise InputError(f"{path}: an actor of another architecture: {_differences(saved, self.architecture)}; set "
-                             "ego.* and sim.* as in the run that wrote it")
+            raise InputError(
+                f"{path}: an actor of another architecture: {_differences(saved, self.architecture)}; set "
+                "ego.* and sim.* as in the run that wrote it"
+            )
         own = self.weights()
         wrong = set(own) ^ set(weights) or {key for key in own if own[key].shape != weights[key].shape}
         if wrong:

@@ -72,7 +72,12 @@ class MissionPath(RoutePath):
         super().__init__(world.states[:, 0], self.mission.points)
 
     def speed_caps(
-        self, desired: float, lateral: float, braking: float, limits: bool = True, lights: bool = True,
+        self,
+        desired: float,
+        lateral: float,
+        braking: float,
+        limits: bool = True,
+        lights: bool = True,
         stop_gap: float = 1.0,
     ) -> Tensor:
         """Squares [B, HORIZON / SPACING] of the highest speeds, every SPACING metres ahead, from which `braking` m/s^2

@@ -19,8 +19,15 @@ class Prediction:
 
 
 def predict(
-    world: World, steps: int, dt: float, speed_factors: tuple[float, ...], acceleration: float, reach: float,
-    match_distance: float, match_angle: float, see_vrus: bool,
+    world: World,
+    steps: int,
+    dt: float,
+    speed_factors: tuple[float, ...],
+    acceleration: float,
+    reach: float,
+    match_distance: float,
+    match_angle: float,
+    see_vrus: bool,
 ) -> Prediction:
     """Trajectories of `steps` steps of dt of everyone within `reach` m of the ego.
 
@@ -42,15 +49,20 @@ def predict(
     straight[batch, agent] = False
     lost_batch, lost_agent = straight.nonzero(as_tuple=True)
     path = RoutePath(states[batch, agent], world.scene["route_points"][batch, agent, candidate])
-    poses = torch.cat([
-        path.at(ahead(states[batch, agent, 3], steps, dt, speed_factors, acceleration).flatten(1)),
-        straight_on(states[lost_batch, lost_agent],
-                    ahead(states[lost_batch, lost_agent, 3], steps, dt, speed_factors, acceleration).flatten(1)),
-    ])
+    poses = torch.cat(
+        [
+            path.at(ahead(states[batch, agent, 3], steps, dt, speed_factors, acceleration).flatten(1)),
+            straight_on(
+                states[lost_batch, lost_agent],
+                ahead(states[lost_batch, lost_agent, 3], steps, dt, speed_factors, acceleration).flatten(1),
+            ),
+        ]
+    )
     batch, agent = torch.cat([batch, lost_batch]), torch.cat([agent, lost_agent])
     count = len(speed_factors)
     return Prediction(
-        poses.view(-1, steps + 1, 3), world.scene["size"][batch, agent].repeat_interleave(count, 0),
+        poses.view(-1, steps + 1, 3),
+        world.scene["size"][batch, agent].repeat_interleave(count, 0),
         batch.repeat_interleave(count),
     )
 

@@ -78,9 +78,7 @@ def _pursuit(path: Tensor, speed: Tensor) -> Tensor:
 def _capped(route: Tensor, speed: Tensor) -> Tensor:
     """Acceleration [...] that meets, within REACTION, the speed from which limits and curves ahead can be obeyed."""
     ahead, curvature, limit = route.new_tensor(LOOK_AHEAD), route[..., 3].abs() / 10, route[..., 4] * SPEED
-    squared = torch.minimum(
-        LATERAL / curvature.clamp(min=1e-3), torch.where(limit > 0, limit, torch.inf) ** 2
-    )
+    squared = torch.minimum(LATERAL / curvature.clamp(min=1e-3), torch.where(limit > 0, limit, torch.inf) ** 2)
     allowed = (squared + 2 * BRAKING * (ahead - speed[..., None] * REACTION).clamp(min=0)).amin(-1).sqrt()
     return (allowed - speed) / REACTION
 

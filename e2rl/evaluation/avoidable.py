@@ -32,8 +32,10 @@ def add_avoidable(rows: list[dict], rollouts: dict, scene: TensorDictBase, sim: 
     spent = (time.perf_counter() - begin) / len(collided)
     for place, index in enumerate(collided):
         rows[index] |= {
-            "avoidable": float(found[place]), "avoidable_1s": float(late.found[place]),
-            "evasion_accel": peak[place].item(), "evasion_tried": int(early.tried[place] + late.tried[place]),
+            "avoidable": float(found[place]),
+            "avoidable_1s": float(late.found[place]),
+            "evasion_accel": peak[place].item(),
+            "evasion_tried": int(early.tried[place] + late.tried[place]),
             "evasion_seconds": spent,
         }
 

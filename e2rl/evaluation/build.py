@@ -19,10 +19,6 @@ from e2rl.prior.checkpoint import load_prior
 from e2rl.prior.prior import Prior, SamplerSettings
 from e2rl.sim.env import SimSettings
 from e2rl.synthesizer.anchoring import AnchorSettings
-from e2rl.synthesizer.baselines.baseline import Baseline
-from e2rl.synthesizer.baselines.constant_velocity import ConstantVelocity
-from e2rl.synthesizer.baselines.idm import IDM
-from e2rl.synthesizer.baselines.replay import Replay
 from e2rl.synthesizer.control import ControlSettings
 from e2rl.synthesizer.feasibility import FeasibilitySettings
 from e2rl.synthesizer.interception import InterceptionSettings
@@ -31,13 +27,26 @@ from e2rl.synthesizer.reasoner import ReasonerSettings
 from e2rl.synthesizer.skeleton import SkeletonSettings
 from e2rl.synthesizer.synthesizer import Synthesizer, SynthesizerSettings
 from e2rl.synthesizer.topology import TopologySettings
+from e2rl.traffic.constant_velocity import ConstantVelocity
+from e2rl.traffic.idm import IDM
+from e2rl.traffic.replay import Replay
+from e2rl.traffic.traffic import Baseline
 
-PARTS = {"topology": TopologySettings, "feasibility": FeasibilitySettings, "reasoner": ReasonerSettings,
-         "skeleton": SkeletonSettings, "anchor": AnchorSettings, "interception": InterceptionSettings,
-         "potentials": PotentialSettings, "control": ControlSettings}
+PARTS = {
+    "topology": TopologySettings,
+    "feasibility": FeasibilitySettings,
+    "reasoner": ReasonerSettings,
+    "skeleton": SkeletonSettings,
+    "anchor": AnchorSettings,
+    "interception": InterceptionSettings,
+    "potentials": PotentialSettings,
+    "control": ControlSettings,
+}
 BASELINES: dict[str, Callable[[Prior], Baseline]] = {  # under the bounds of the prior that they stand beside
-    "replay": lambda prior: Replay(), "constant_velocity": lambda prior: ConstantVelocity(),
-    "idm": lambda prior: IDM(prior.bounds)}
+    "replay": lambda prior: Replay(),
+    "constant_velocity": lambda prior: ConstantVelocity(),
+    "idm": lambda prior: IDM(prior.bounds),
+}
 
 FIGURES = ("intensity", "skeleton")
 VARIED = ("prior", "synthesizer")  # groups that the variants of a table may change
@@ -45,18 +54,28 @@ VARIED = ("prior", "synthesizer")  # groups that the variants of a table may cha
 
 def build_prior(config: DictConfig, device: str = "cpu") -> tuple[Prior, dict]:
     """The frozen prior of `config.prior` and the origin in its checkpoint."""
-    return load_prior(config.prior.checkpoint, settings_of(SamplerSettings, config.prior.sampler, "prior.sampler"),
-                      settings_of(BoundSettings, config.prior.bounds, "prior.bounds"), device)
+    return load_prior(
+        config.prior.checkpoint,
+        settings_of(SamplerSettings, config.prior.sampler, "prior.sampler"),
+        settings_of(BoundSettings, config.prior.bounds, "prior.bounds"),
+        device,
+    )
 
 
 def build_synthesizer(config: DictConfig, prior: Prior) -> Synthesizer | Baseline:
     """The synthesizer of the `synthesizer` group on a prior."""
     if config.synthesizer.name in BASELINES:
         return BASELINES[config.synthesizer.name](prior)
-    parts = {name: settings_of(part, config.synthesizer[name], f"synthesizer.{name}")
-             for name, part in PARTS.items() if name in config.synthesizer}
-    scalars = {name: config.synthesizer[name] for name in ("support", "reselect", "samples", "selection")
-               if name in config.synthesizer}
+    parts = {
+        name: settings_of(part, config.synthesizer[name], f"synthesizer.{name}")
+        for name, part in PARTS.items()
+        if name in config.synthesizer
+    }
+    scalars = {
+        name: config.synthesizer[name]
+        for name in ("support", "reselect", "samples", "selection")
+        if name in config.synthesizer
+    }
     return Synthesizer(prior, SynthesizerSettings(**parts, **scalars))
 
 
@@ -89,8 +108,10 @@ def intensities(config: DictConfig) -> list[float]:
     """`config.eta`, one or several; InputError for what is no intensity."""
     etas = list(config.eta) if isinstance(config.eta, ListConfig) else [config.eta]
     if not etas or not all(isinstance(eta, int | float) and 0 <= eta < float("inf") for eta in etas):
-        raise InputError(f"eta={config.eta}: the intensity is a number of at least 0 (0 to 3 are sensible), or a list "
-                         "of such numbers")
+        raise InputError(
+            f"eta={config.eta}: the intensity is a number of at least 0 (0 to 3 are sensible), or a list "
+            "of such numbers"
+        )
     return [float(eta) for eta in dict.fromkeys(etas)]
 
 
@@ -116,8 +137,10 @@ def build_ego(config: DictConfig) -> Ego:
     try:
         ego = instantiate(config.ego)
     except InstantiationException as error:
-        raise InputError(f"ego={config.ego.get('_target_')}: cannot be built: {error.__cause__ or error}; check the "
-                         "class path and its arguments in conf/ego") from error
+        raise InputError(
+            f"ego={config.ego.get('_target_')}: cannot be built: {error.__cause__ or error}; check the "
+            "class path and its arguments in conf/ego"
+        ) from error
     if not isinstance(ego, Ego):
         raise InputError(f"ego={config.ego.get('_target_')}: is no e2rl.ego.base.Ego; subclass it and define plan()")
     return ego
@@ -155,8 +178,10 @@ def check_protocol(config: DictConfig) -> None:
     known = list(dict.fromkeys(["nominal", *BASELINES, config.synthesizer.name]))
     for name in config.methods:
         if name not in (*known, *config.variants):
-            raise InputError(f"methods={list(config.methods)}: {name} is none of "
-                             f"{', '.join([*known, *config.variants])}; choose another with synthesizer=")
+            raise InputError(
+                f"methods={list(config.methods)}: {name} is none of "
+                f"{', '.join([*known, *config.variants])}; choose another with synthesizer="
+            )
     if not (config.methods or config.variants) or not config.seeds:
         raise InputError(f"methods={list(config.methods)}, seeds={list(config.seeds)}: name at least one of each")
     for name in config.variants:
@@ -199,8 +224,10 @@ def processes_of(config: DictConfig) -> int:
     if not isinstance(given, int) or given < 1:
         raise InputError(f"processes={given}: expected a whole number of at least 1, or null for one a core")
     if given > 1 and (device != "cpu" or config.threads > 1):
-        raise InputError(f"processes={given}, threads={config.threads}, device={device}: several processes have one "
-                         "thread each and the CPU; set threads=1 device=cpu, or processes=1")
+        raise InputError(
+            f"processes={given}, threads={config.threads}, device={device}: several processes have one "
+            "thread each and the CPU; set threads=1 device=cpu, or processes=1"
+        )
     return given
 
 
@@ -209,9 +236,11 @@ def caption(config: DictConfig, origin: dict) -> str:
     sampler, bounds = config.prior.sampler, config.prior.bounds
     on = [name for name in ("meeting", "curve") if bounds[name]]
     changes = "".join(f"; {name}: {what}".replace("'", "") for name, what in config.get("variants", {}).items())
-    return (f"Prior {config.prior.checkpoint} ({origin.get('data', 'unknown data')}); {sampler.sampler}, K = "
-            f"{sampler.steps}, temperature {sampler.temperature:g} (routes {sampler.route_temperature:g}), one sample "
-            f"a replan, replanned every 0.5 s; acceleration bounds: {', '.join(on) or 'none'}{changes}")
+    return (
+        f"Prior {config.prior.checkpoint} ({origin.get('data', 'unknown data')}); {sampler.sampler}, K = "
+        f"{sampler.steps}, temperature {sampler.temperature:g} (routes {sampler.route_temperature:g}), one sample "
+        f"a replan, replanned every 0.5 s; acceleration bounds: {', '.join(on) or 'none'}{changes}"
+    )
 
 
 def resolved(config: DictConfig) -> dict:

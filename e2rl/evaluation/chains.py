@@ -27,14 +27,24 @@ class LongestChain:
 
     def __post_init__(self):
         if not isinstance(self.method.synthesizer, Synthesizer) or self.method.eta <= 0:
-            raise InputError(f"figure=skeleton: {self.method.name} at eta={self.method.eta:g} chooses no coalition; "
-                             "name e2 first in methods, at an eta above 0")
+            raise InputError(
+                f"figure=skeleton: {self.method.name} at eta={self.method.eta:g} chooses no coalition; "
+                "name e2 first in methods, at an eta above 0"
+            )
         self.method.synthesizer.on_selection = self
 
     def __call__(self, selection: Selection) -> None:
-        ranks = zip(*(value.tolist() for value in (
-            chain_depth(selection.target).amax(1), selection.coalition.sum(1), link_risk(selection).amax(1))),
-            strict=True)
+        ranks = zip(
+            *(
+                value.tolist()
+                for value in (
+                    chain_depth(selection.target).amax(1),
+                    selection.coalition.sum(1),
+                    link_risk(selection).amax(1),
+                )
+            ),
+            strict=True,
+        )
         for row, rank in enumerate(ranks):
             if rank > self.rank:
                 self.kept, self.rank = take_rows(selection, [row]), rank
@@ -42,11 +52,19 @@ class LongestChain:
     def rollout(self, scenes: SceneSet, ego_name: str, folder: Path) -> dict:
         """The rollout that the kept selection belongs to, from its file; InputError where nobody was chosen."""
         if self.kept is None:
-            raise InputError("figure=skeleton: no vehicle was chosen in any scene; evaluate more scenes, or name one "
-                             "with scene=")
+            raise InputError(
+                "figure=skeleton: no vehicle was chosen in any scene; evaluate more scenes, or name one with scene="
+            )
         seed, scene = divmod(int(self.kept.seed), SEEDS_APART)
-        name = rollout_name({"method": self.method.name, "ego_policy": ego_name, "eta": self.method.eta,
-                             "scene_id": scenes.scene_id[scene], "seed": seed})
+        name = rollout_name(
+            {
+                "method": self.method.name,
+                "ego_policy": ego_name,
+                "eta": self.method.eta,
+                "scene_id": scenes.scene_id[scene],
+                "seed": seed,
+            }
+        )
         return read_rollout(Path(folder) / ROLLOUTS / name)
 
 

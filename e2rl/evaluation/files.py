@@ -1,18 +1,16 @@
 """What a run writes, and its tables read back: rollouts/*.npz, rollouts.csv, metrics.json (design.md section 6).
 
-Every file appears whole: it is written under a temporary name beside its place and renamed.
+Every file appears whole (`e2rl.files.write_atomically`).
 """
 
 import csv
 import io
 import json
 import math
-import os
 import re
 import shlex
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +20,7 @@ from torch import Tensor
 
 import e2rl
 from e2rl.errors import InputError
+from e2rl.files import write_atomically
 from e2rl.metrics.catalogue import EVENT, IDENTITY, METRICS
 from e2rl.scene.recording import AGENT_TYPES, DT
 
@@ -55,7 +54,7 @@ def write_rollouts(folder: Path, rollouts: dict, source: Source) -> list[Path]:
         path = folder / rollout_name(arrays)
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **arrays)
-        replace(path, buffer.getvalue())
+        write_atomically(path, buffer.getvalue())
         paths.append(path)
     return paths
 
@@ -127,7 +126,7 @@ def write_rows(path: Path, rows: Sequence[dict]) -> None:
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(COLUMNS)
     writer.writerows([cell(row.get(column, math.nan)) for column in COLUMNS] for row in rows)
-    replace(Path(path), buffer.getvalue().encode())
+    write_atomically(path, buffer.getvalue())
 
 
 def label_rows(rows: Iterable[dict], source: Source) -> list[dict]:
@@ -162,7 +161,7 @@ def read_rows(path: Path) -> list[dict]:
 
 def write_metrics(path: Path, rows: Sequence[dict]) -> None:
     """Write metrics.json from the rows of `evaluation.summary.metric_rows`; NaN becomes null (strict JSON)."""
-    replace(Path(path), json.dumps(nulls(list(rows)), indent=1, allow_nan=False).encode())
+    write_atomically(path, json.dumps(nulls(list(rows)), indent=1, allow_nan=False))
 
 
 def read_metrics(path: Path) -> list[dict]:
@@ -211,17 +210,3 @@ def git_commit() -> str:
 def command_line() -> str:
     """The command that runs, quoted for a shell."""
     return shlex.join(["python", *sys.argv])
-
-
-def replace(path: Path, data: bytes) -> None:
-    """Write data under a temporary name beside path, then rename: a reader never meets half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise

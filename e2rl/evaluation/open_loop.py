@@ -14,10 +14,10 @@ from e2rl.prior.spread import main_direction, spread_noise, stratified
 from e2rl.scene.recording import VEHICLE
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.world import World
-from e2rl.synthesizer.baselines.baseline import Baseline
-from e2rl.synthesizer.baselines.constant_velocity import straight_on
 from e2rl.synthesizer.episode import noise_of
 from e2rl.synthesizer.synthesizer import Synthesizer
+from e2rl.traffic.constant_velocity import straight_on
+from e2rl.traffic.traffic import Baseline
 
 HORIZONS = (3.0, 5.0)  # s
 EGO = "unknown"  # of the rows: nobody is told the ego's plan
@@ -40,10 +40,23 @@ def open_loop_rows(scenes: SceneSet, methods: list[Method], samples: int, device
             seed = index.to(device) + 1_000_003 * torch.arange(count, device=device)[:, None]
             parts.append(_displacements(scene, sample_plans(method.synthesizer, scene, seed)))
         columns = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-        rows.append({
-            "dataset": scenes.dataset, "split": scenes.split, "method": method.name, "ego": EGO, "eta": method.eta,
-            "n_scenes": len(scenes), "n_seeds": count, "n_rollouts": len(scenes) * count, "git": git_commit(),
-            "command": command_line(), "stage": OPEN_LOOP_STAGE, "metrics": _summary(columns, scenes), "paired": {}})
+        rows.append(
+            {
+                "dataset": scenes.dataset,
+                "split": scenes.split,
+                "method": method.name,
+                "ego": EGO,
+                "eta": method.eta,
+                "n_scenes": len(scenes),
+                "n_seeds": count,
+                "n_rollouts": len(scenes) * count,
+                "git": git_commit(),
+                "command": command_line(),
+                "stage": OPEN_LOOP_STAGE,
+                "metrics": _summary(columns, scenes),
+                "paired": {},
+            }
+        )
     return rows
 
 
@@ -57,7 +70,8 @@ def sample_plans(synthesizer: Synthesizer | Baseline, scene: TensorDictBase, see
         return torch.stack([_straight_plan(synthesizer, scene, one) for one in seed], 1)
     prior, (count, batch), vehicles = synthesizer.prior, seed.shape, scene["route_log"].shape[1]
     draw = lambda number, *shape, uniform=False: noise_of(  # noqa: E731
-        seed.flatten(), torch.full((count * batch,), number), shape, uniform).unflatten(0, (count, batch))
+        seed.flatten(), torch.full((count * batch,), number), shape, uniform
+    ).unflatten(0, (count, batch))
     order, place = draw(0, 2, vehicles, uniform=True).unbind(2), draw(2, 2, vehicles, uniform=True)[0].unbind(1)
     noise = draw(1, prior.sampler.steps, vehicles, SIZE).transpose(1, 2)
     noise = spread_noise(noise, main_direction(prior.schedule, prior.sampler, noise.device), order[1], place[1])
@@ -98,12 +112,12 @@ def _summary(columns: dict[str, Tensor], scenes: SceneSet) -> dict[str, dict[str
     result = {}
     for at in (f"_{horizon:g}" for horizon in HORIZONS):
         vehicles, straight = columns[f"vehicles{at}"], columns[f"cv_ade{at}"]
-        quotients = {f"{name}{at}": (columns[name + at], vehicles)
-                     for name in ("min_ade", "mean_ade", "joint_ade", "cv_ade")}
+        quotients = {
+            f"{name}{at}": (columns[name + at], vehicles) for name in ("min_ade", "mean_ade", "joint_ade", "cv_ade")
+        }
         quotients |= {f"{name}_ratio{at}": (columns[name + at], straight) for name in ("min_ade", "mean_ade")}
         totals, weights = (torch.stack(column, -1) for column in zip(*quotients.values(), strict=True))
         means = resampled_means(totals, weights, cluster, draws)
         places = len(cluster[vehicles > 0].unique())
-        result |= {name: interval(means[:, k], places) | {"n": int(vehicles.sum())}
-                   for k, name in enumerate(quotients)}
+        result |= {name: interval(means[:, k], places) | {"n": int(vehicles.sum())} for k, name in enumerate(quotients)}
     return result

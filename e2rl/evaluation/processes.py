@@ -41,8 +41,10 @@ def spread(
             for k in range(len(jobs)):
                 yield torch.load(io.BytesIO(futures[k].result()), weights_only=False)  # from a child of ours
         except BrokenProcessPool as error:
-            raise InputError(f"processes={processes}: one of them was ended from outside, for want of memory perhaps; "
-                             "use fewer, or a smaller batch") from error
+            raise InputError(
+                f"processes={processes}: one of them was ended from outside, for want of memory perhaps; "
+                "use fewer, or a smaller batch"
+            ) from error
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
 

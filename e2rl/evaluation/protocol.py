@@ -23,9 +23,9 @@ from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.env import SimSettings
-from e2rl.synthesizer.baselines.baseline import Baseline
-from e2rl.synthesizer.rollout import roll_out
 from e2rl.synthesizer.synthesizer import Synthesizer
+from e2rl.traffic.rollout import roll_out
+from e2rl.traffic.traffic import Baseline
 
 
 @dataclass
@@ -46,9 +46,19 @@ def scene_seed(scene: int, seed: int) -> int:
 
 
 def run_protocol(
-    scenes: SceneSet, methods: list[Method], ego: Ego, ego_name: str, seeds: list[int], sim: SimSettings,
-    folder: Path | None = None, batch: int = 64, device: str = "cpu", save_rollouts: bool = True, processes: int = 1,
-    only: list[int] | None = None, **fields,
+    scenes: SceneSet,
+    methods: list[Method],
+    ego: Ego,
+    ego_name: str,
+    seeds: list[int],
+    sim: SimSettings,
+    folder: Path | None = None,
+    batch: int = 64,
+    device: str = "cpu",
+    save_rollouts: bool = True,
+    processes: int = 1,
+    only: list[int] | None = None,
+    **fields,
 ) -> list[dict]:
     """Roll out every method on every (scene, seed), score, and return the rows of metrics.json.
 
@@ -58,7 +68,7 @@ def run_protocol(
     """
     tasks = [(scene, seed) for seed in seeds for scene in (range(len(scenes)) if only is None else only)]
     count = -(-len(tasks) // batch)
-    parts = [tasks[k * len(tasks) // count:(k + 1) * len(tasks) // count] for k in range(count)]
+    parts = [tasks[k * len(tasks) // count : (k + 1) * len(tasks) // count] for k in range(count)]
     jobs = [(method, part) for method in methods for part in parts]
     into = Path(folder) / ROLLOUTS if folder is not None and save_rollouts else None
 
@@ -81,8 +91,14 @@ def run_protocol(
 
 
 def score_part(
-    scenes: SceneSet, method: Method, part: list[tuple[int, int]], ego: Ego, ego_name: str, sim: SimSettings,
-    folder: Path | None, device: str,
+    scenes: SceneSet,
+    method: Method,
+    part: list[tuple[int, int]],
+    ego: Ego,
+    ego_name: str,
+    sim: SimSettings,
+    folder: Path | None,
+    device: str,
 ) -> tuple[list[dict], list[dict]]:
     """Rows and realism samples (arrays) of (scene, seed) pairs under one method; folder: for their files, or None."""
     rollouts = roll_out_part(scenes, part, method, ego, sim, device)
@@ -94,8 +110,9 @@ def score_part(
     return label_rows(scored, source), samples
 
 
-def roll_out_part(scenes: SceneSet, part: list[tuple[int, int]], method: Method, ego: Ego, sim: SimSettings,
-                  device: str = "cpu") -> dict:
+def roll_out_part(
+    scenes: SceneSet, part: list[tuple[int, int]], method: Method, ego: Ego, sim: SimSettings, device: str = "cpu"
+) -> dict:
     """The rollout dict of (scene, seed) pairs under one method."""
     index = torch.tensor([scene for scene, _ in part])
     noise = torch.tensor([scene_seed(*task) for task in part])

@@ -30,8 +30,8 @@ from e2rl.prior.routed import take_route
 from e2rl.scene.recording import DT, VEHICLE
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.env import SimSettings
-from e2rl.synthesizer.baselines.baseline import Baseline
-from e2rl.synthesizer.baselines.replay import Replay
+from e2rl.traffic.replay import Replay
+from e2rl.traffic.traffic import Baseline
 
 TRACKS = 512  # vehicles of rollouts looked at at once: bounds the memory of the pairwise features
 SPLITS = 200  # of the logs into halves
@@ -62,8 +62,12 @@ class Tally:
     def likelihoods(self, rollouts: int) -> dict[str, Tensor]:
         """Likelihood [S] of each feature's logged values after `rollouts` rollouts of every scene; NaN without any."""
         scenes, found = self.scenes, {name: [] for name in FEATURES}
-        batch = {"states": scenes["logged"], "valid": scenes["logged_valid"], "size": scenes["size"],
-                 **road_of(scenes, scenes["route_log"])}
+        batch = {
+            "states": scenes["logged"],
+            "valid": scenes["logged_valid"],
+            "size": scenes["size"],
+            **road_of(scenes, scenes["route_log"]),
+        }
         scene, agent = evaluated(scenes).nonzero(as_tuple=True)
         for part in torch.arange(len(scene)).split(TRACKS):
             key = scene[part] * self.vehicles + agent[part]
@@ -89,24 +93,42 @@ def road_of(scene: TensorDictBase, route: Tensor) -> dict[str, Tensor]:
     """Road, lights and ways of scenes [B] whose vehicles follow candidates route [B, V] (-1: no way, so no lights)."""
     chosen = route.clamp(min=0)
     light = take_route(scene["route_light"], chosen)
-    return {"field": scene["field"], "field_origin": scene["field_origin"], "light_state": scene["light_state"],
-            "route_points": take_route(scene["route_points"], chosen),
-            "route_light": torch.where((route >= 0)[..., None], light, -1),
-            "route_light_s": take_route(scene["route_light_s"], chosen)}
+    return {
+        "field": scene["field"],
+        "field_origin": scene["field_origin"],
+        "light_state": scene["light_state"],
+        "route_points": take_route(scene["route_points"], chosen),
+        "route_light": torch.where((route >= 0)[..., None], light, -1),
+        "route_light_s": take_route(scene["route_light_s"], chosen),
+    }
 
 
-def meta_rows(scenes: SceneSet, methods: list[Method], ego: Ego, ego_name: str, sim: SimSettings, rollouts: int,
-              batch: int = 64, device: str = "cpu") -> list[dict]:
+def meta_rows(
+    scenes: SceneSet,
+    methods: list[Method],
+    ego: Ego,
+    ego_name: str,
+    sim: SimSettings,
+    rollouts: int,
+    batch: int = 64,
+    device: str = "cpu",
+) -> list[dict]:
     """Rows of metrics.json, stage `meta-metric`: every feature's likelihood and their weighted sum over `rollouts`
     rollouts of each scene, with intervals by place. The row of the log also has its split-half `real`."""
     tallies = [Tally(scenes.scenes) for _ in methods]
-    tasks = [[(scene, seed) for seed in range(1 if isinstance(method.synthesizer, Baseline) else rollouts)
-              for scene in range(len(scenes))] for method in methods]
+    tasks = [
+        [
+            (scene, seed)
+            for seed in range(1 if isinstance(method.synthesizer, Baseline) else rollouts)
+            for scene in range(len(scenes))
+        ]
+        for method in methods
+    ]
     with tqdm(total=sum(map(len, tasks)), desc="meta-metric", unit="rollout") as bar:
         for method, tally, todo in zip(methods, tallies, tasks, strict=True):
             weight = rollouts * len(scenes) // len(todo)
             for begin in range(0, len(todo), batch):
-                part = todo[begin:begin + batch]
+                part = todo[begin : begin + batch]
                 found = roll_out_part(scenes, part, method, ego, sim, device)
                 tally.add(torch.tensor([scene for scene, _ in part]), found, weight)
                 bar.update(len(part))
@@ -115,10 +137,23 @@ def meta_rows(scenes: SceneSet, methods: list[Method], ego: Ego, ego_name: str, 
         metrics = summarise_meta(tally.likelihoods(rollouts), scenes)
         if isinstance(method.synthesizer, Replay):
             metrics["real_split_half"] = log_split_half(scenes)
-        rows.append({
-            "dataset": scenes.dataset, "split": scenes.split, "method": method.name, "ego": ego_name,
-            "eta": method.eta, "n_scenes": len(scenes), "n_seeds": rollouts, "n_rollouts": rollouts * len(scenes),
-            "git": git_commit(), "command": command_line(), "stage": META_STAGE, "metrics": metrics, "paired": {}})
+        rows.append(
+            {
+                "dataset": scenes.dataset,
+                "split": scenes.split,
+                "method": method.name,
+                "ego": ego_name,
+                "eta": method.eta,
+                "n_scenes": len(scenes),
+                "n_seeds": rollouts,
+                "n_rollouts": rollouts * len(scenes),
+                "git": git_commit(),
+                "command": command_line(),
+                "stage": META_STAGE,
+                "metrics": metrics,
+                "paired": {},
+            }
+        )
     return rows
 
 
@@ -128,8 +163,10 @@ def summarise_meta(likelihoods: dict[str, Tensor], scenes: SceneSet) -> dict[str
     table = torch.stack([meta_metric(likelihoods), *likelihoods.values()], -1)
     means = resampled_means(table, torch.ones_like(table), cluster, bootstrap_draws(clusters))
     known = ~table.isnan()
-    return {name: interval(means[:, k], len(cluster[known[:, k]].unique())) | {"n": int(known[:, k].sum())}
-            for k, name in enumerate(("meta_metric", *likelihoods))}
+    return {
+        name: interval(means[:, k], len(cluster[known[:, k]].unique())) | {"n": int(known[:, k].sum())}
+        for k, name in enumerate(("meta_metric", *likelihoods))
+    }
 
 
 def log_split_half(scenes: SceneSet) -> dict[str, float]:
@@ -137,7 +174,7 @@ def log_split_half(scenes: SceneSet) -> dict[str, float]:
     scene = scenes.scenes
     simulated = scene["valid"] & (scene["agent_type"] == VEHICLE)
     simulated[:, 0] = False
-    simulated[:, scene["route_log"].shape[1]:] = False
+    simulated[:, scene["route_log"].shape[1] :] = False
     log = scene["logged"].double(), scene["logged_valid"]
     features = motion_features(*log, *log, simulated, torch.full((len(scene),), log[0].shape[1] - 1), DT)
     cluster, clusters = _clusters(scenes)
@@ -149,5 +186,6 @@ def log_split_half(scenes: SceneSet) -> dict[str, float]:
 
 
 def _clusters(scenes: SceneSet) -> tuple[Tensor, int]:
-    return cluster_index([{"location": place, "scene_id": name}
-                          for place, name in zip(scenes.location, scenes.scene_id, strict=True)])
+    return cluster_index(
+        [{"location": place, "scene_id": name} for place, name in zip(scenes.location, scenes.scene_id, strict=True)]
+    )

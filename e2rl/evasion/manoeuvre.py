@@ -64,8 +64,9 @@ def shifts(knots: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     near, far = gap < 1, gap < 2
     basis = torch.where(near, 2 / 3 - gap**2 + gap**3 / 2, (2 - gap) ** 3 / 6) * far
     slope = torch.where(near, -2 * gap + 1.5 * gap**2, -((2 - gap) ** 2) / 2) * far * since.sign()
-    held = torch.cat([torch.zeros_like(knots[..., :2]), knots[..., 2:], knots[..., -1:].expand(*knots.shape[:-1], 2)],
-                     -1)
+    held = torch.cat(
+        [torch.zeros_like(knots[..., :2]), knots[..., 2:], knots[..., -1:].expand(*knots.shape[:-1], 2)], -1
+    )
     return held @ basis.T, held @ slope.T / (KNOT_STEPS * DT)
 
 

@@ -42,8 +42,9 @@ class SearchSettings:
 
     def effort(self, steps: int) -> str:
         """What is tried before a collision counts as not avoided, in words."""
-        return (f"{len(profiles(torch.zeros(1, steps))[0]) * WAYS} manoeuvres, then {self.rounds} rounds of "
-                f"{self.samples}")
+        return (
+            f"{len(profiles(torch.zeros(1, steps))[0]) * WAYS} manoeuvres, then {self.rounds} rounds of {self.samples}"
+        )
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,11 @@ class Trials:
 
 
 def find_evasions(
-    scene: TensorDictBase, states: Tensor, valid: Tensor, sim: SimSettings, settings: SearchSettings | None = None,
+    scene: TensorDictBase,
+    states: Tensor,
+    valid: Tensor,
+    sim: SimSettings,
+    settings: SearchSettings | None = None,
     moment: Tensor | None = None,
 ) -> Evasions:
     """Search for every rollout of scenes [B], at least one, with states [B, T+1, N, 4], valid [B, T+1, N] (all agents,
@@ -89,13 +94,16 @@ def find_evasions(
     """
     settings = settings or SearchSettings()
     moment = torch.zeros(len(states), dtype=torch.int64, device=states.device) if moment is None else moment
-    parts = [_search(scene[rows], states[rows].float(), valid[rows], moment[rows], Limits.of(sim), settings)
-             for rows in torch.arange(len(states), device=states.device).split(CHUNK)]
+    parts = [
+        _search(scene[rows], states[rows].float(), valid[rows], moment[rows], Limits.of(sim), settings)
+        for rows in torch.arange(len(states), device=states.device).split(CHUNK)
+    ]
     return Evasions(*(torch.cat([getattr(part, name) for part in parts]) for name in Evasions.__dataclass_fields__))
 
 
-def _search(scene: TensorDictBase, states: Tensor, valid: Tensor, moment: Tensor, limits: Limits,
-            settings: SearchSettings) -> Evasions:
+def _search(
+    scene: TensorDictBase, states: Tensor, valid: Tensor, moment: Tensor, limits: Limits, settings: SearchSettings
+) -> Evasions:
     around, routes = Surroundings.of(scene, states, valid, moment), scene["route_points"][:, 0]
     steps = states.shape[1] - 1
     driven = dynamics.inverse(states[:, :, 0])[..., 0].masked_fill(~valid[:, 1:, 0], 0.0)
@@ -114,11 +122,17 @@ def _search(scene: TensorDictBase, states: Tensor, valid: Tensor, moment: Tensor
         children = _mutated(parents, noise)
         part = around.rows(open_rows)
         trials = _drive(part, routes[open_rows], *children, steps, limits, settings)
-        pool = Trials(*(torch.cat([getattr(parents, name), getattr(trials, name)], 1)
-                        for name in Trials.__dataclass_fields__))
+        pool = Trials(
+            *(torch.cat([getattr(parents, name), getattr(trials, name)], 1) for name in Trials.__dataclass_fields__)
+        )
         best = _kept(pool)
-        result = Evasions(*(getattr(result, name).index_copy(0, open_rows, getattr(best, name))
-                            for name in ("found", "actions", "states", "peak")), result.tried)
+        result = Evasions(
+            *(
+                getattr(result, name).index_copy(0, open_rows, getattr(best, name))
+                for name in ("found", "actions", "states", "peak")
+            ),
+            result.tried,
+        )
         tried[open_rows] += settings.samples
         left = (~best.found).nonzero()[:, 0]
         open_rows, pool = open_rows[left], _rows(pool, left)
@@ -145,10 +159,11 @@ def ways(route_valid: Tensor, mission: Tensor) -> tuple[Tensor, Tensor]:
     own = mission[:, None].expand(-1, len(SHIFTS))
     others = torch.arange(count, device=mission.device).expand(batch, -1)
     route = torch.cat([own[:, :3], others, own[:, 3:]], 1)
-    moved = torch.cat([shift[:3].expand(batch, -1), torch.zeros_like(others, dtype=shift.dtype),
-                       shift[3:].expand(batch, -1)], 1)
+    moved = torch.cat(
+        [shift[:3].expand(batch, -1), torch.zeros_like(others, dtype=shift.dtype), shift[3:].expand(batch, -1)], 1
+    )
     useful = torch.ones_like(route, dtype=torch.bool)
-    useful[:, 3:3 + count] = route_valid & (others != mission[:, None])
+    useful[:, 3 : 3 + count] = route_valid & (others != mission[:, None])
     order = torch.argsort(~useful, dim=1, stable=True)[:, :WAYS]
     return route.gather(1, order), moved.gather(1, order)
 
@@ -160,12 +175,23 @@ def grid(driven: Tensor, route_valid: Tensor, mission: Tensor) -> tuple[Tensor, 
     shape = (batch, count, route.shape[1])
     ramp = (torch.arange(-1, knots - 1, device=shift.device) / RAMP).clamp(0, 1)
     wide = accel[:, :, None].expand(*shape, knots).flatten(1, 2)
-    return (route[:, None].expand(shape).flatten(1), wide,
-            (shift[:, None, :, None] * ramp).expand(*shape, knots).flatten(1, 2))
+    return (
+        route[:, None].expand(shape).flatten(1),
+        wide,
+        (shift[:, None, :, None] * ramp).expand(*shape, knots).flatten(1, 2),
+    )
 
 
-def _drive(around: Surroundings, routes: Tensor, route: Tensor, accel: Tensor, shift: Tensor, steps: int,
-           limits: Limits, settings: SearchSettings) -> Trials:
+def _drive(
+    around: Surroundings,
+    routes: Tensor,
+    route: Tensor,
+    accel: Tensor,
+    shift: Tensor,
+    steps: int,
+    limits: Limits,
+    settings: SearchSettings,
+) -> Trials:
     row = torch.arange(len(route), device=route.device)[:, None]
     start = around.start[:, None].expand(*route.shape, 4)
     actions, states = drive(start, routes[row, route], accel, shift, steps, limits)
@@ -180,7 +206,7 @@ def _noise(settings: SearchSettings, knots: int, generator: torch.Generator) -> 
     parent = torch.rand(count, generator=generator)
     strength = torch.rand(count, 2, generator=generator).square() + 0.02
     gap = torch.arange(knots)[:, None] - torch.arange(knots)
-    smooth = torch.exp(-(gap / 2.0) ** 2 / 2)
+    smooth = torch.exp(-((gap / 2.0) ** 2) / 2)
     smooth = smooth / smooth.norm(dim=-1, keepdim=True)
     white = torch.randn(2, count, knots, generator=generator)
     disturbed = white @ smooth.T * strength.T[..., None]
@@ -196,8 +222,13 @@ def _mutated(parents: Trials, noise: tuple[Tensor, Tensor, Tensor]) -> tuple[Ten
 def _kept(trials: Trials) -> Evasions:
     """The best manoeuvre of each rollout."""
     best = _pick(trials, trials.best(1))
-    return Evasions(best.missed[:, 0] == 0, best.actions[:, 0], best.states[:, 0], best.peak[:, 0],
-                    torch.zeros_like(best.route[:, 0]))
+    return Evasions(
+        best.missed[:, 0] == 0,
+        best.actions[:, 0],
+        best.states[:, 0],
+        best.peak[:, 0],
+        torch.zeros_like(best.route[:, 0]),
+    )
 
 
 def _pick(trials: Trials, index: Tensor) -> Trials:

@@ -47,8 +47,18 @@ class Surroundings:
         others = states[row[:, None], step, 1:].masked_fill(~present[..., None], AWAY)[:, :, ever]
         start, mission = states[row, moment, 0], mission_of(scene)
         begin = project(start[:, None, :2], mission.points)[0][:, 0]
-        return Surroundings(start, scene["size"][:, 0], counts, others, scene["size"][:, 1:][:, ever], scene["field"],
-                            scene["field_origin"], mission.points, begin, mission.end)
+        return Surroundings(
+            start,
+            scene["size"][:, 0],
+            counts,
+            others,
+            scene["size"][:, 1:][:, ever],
+            scene["field"],
+            scene["field_origin"],
+            mission.points,
+            begin,
+            mission.end,
+        )
 
     def rows(self, index: Tensor) -> "Surroundings":
         """Those of some egos."""
@@ -78,8 +88,9 @@ def _contact_depth(states: Tensor, around: Surroundings, clearance: float) -> Te
     gap_y = states[..., None, 1] - around.others[:, None, ..., 1]
     near = gap_x.square_().add_(gap_y.square_()) < reach.square()[:, None, None]
     row, trial, step, other = near.nonzero(as_tuple=True)
-    apart = separation(states[row, trial, step], around.size[row], around.others[row, step, other],
-                       around.other_size[row, other])
+    apart = separation(
+        states[row, trial, step], around.size[row], around.others[row, step, other], around.other_size[row, other]
+    )
     place = (row * states.shape[1] + trial) * states.shape[2] + step
     depth = states.new_zeros(states.shape[:-1]).view(-1)
     return depth.index_add(0, place, (clearance - apart).clamp(min=0)).view(states.shape[:-1])

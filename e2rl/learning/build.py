@@ -20,7 +20,11 @@ from e2rl.sim.env import SimSettings
 
 
 def build_evolution(
-    config: DictConfig, scenes: SceneSet, sim: SimSettings, ego: Ego, synthesize: Synthesize,
+    config: DictConfig,
+    scenes: SceneSet,
+    sim: SimSettings,
+    ego: Ego,
+    synthesize: Synthesize,
     measure: Measure | None = None,
 ) -> Evolution:
     """An Evolution of `ego` by config.learner and config.curriculum over config.rounds rounds.
@@ -61,7 +65,14 @@ def _policy(config: DictConfig, scenes: SceneSet, sim: SimSettings, ego: Ego) ->
         expert = _pairs(recorded_pairs(scenes, sim, instantiate(learner.imitation)), config.device)
     teacher = instantiate(learner.expert.teacher) if learner.ppo.cloning > 0 else None
     return PolicyImprovement(
-        ego, scenes, sim, instantiate(learner.ppo), instantiate(learner.collect), expert, teacher, config.seed,
+        ego,
+        scenes,
+        sim,
+        instantiate(learner.ppo),
+        instantiate(learner.collect),
+        expert,
+        teacher,
+        config.seed,
         config.device,
     )
 
@@ -75,6 +86,12 @@ def _planner(config: DictConfig, scenes: SceneSet, sim: SimSettings) -> PlannerI
     make_ego = get_class(present.pop("_target_"))
     learner = config.learner
     return PlannerImprovement(
-        make_ego, present, OmegaConf.to_container(learner.grid), scenes, sim, instantiate(learner.tuning),
-        learner.batch, config.device,
+        make_ego,
+        present,
+        OmegaConf.to_container(learner.grid),
+        scenes,
+        sim,
+        instantiate(learner.tuning),
+        learner.batch,
+        config.device,
     )

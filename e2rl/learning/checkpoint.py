@@ -80,8 +80,10 @@ def load_checkpoint(path: str | Path, run: Evolution) -> int:
     except (KeyError, ValueError, RuntimeError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{file}: its learner is of another kind or shape ({error}); resume with the configuration "
-                         f"in {folder / CONFIG}") from None
+        raise InputError(
+            f"{file}: its learner is of another kind or shape ({error}); resume with the configuration "
+            f"in {folder / CONFIG}"
+        ) from None
     run.traffic = load_file(folder / TRAFFIC)
     restore_generators(state["generators"])
     return run.round
@@ -91,8 +93,10 @@ def generator_states() -> dict:
     """States of the global generators of torch, CUDA, numpy and python, as plain values and tensors."""
     name, keys, position, has_gauss, cached = np.random.get_state()
     return {
-        "torch": torch.get_rng_state(), "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
-        "numpy": [name, keys.tolist(), position, has_gauss, cached], "python": list(random.getstate()),
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        "numpy": [name, keys.tolist(), position, has_gauss, cached],
+        "python": list(random.getstate()),
     }
 
 

@@ -106,8 +106,11 @@ class CurriculumScheduler:
         if count < 1:
             raise InputError(f"learner.round.scenes={count}: at least one scene a round")
         whole = torch.arange(total).repeat(count // total)
-        rest = torch.multinomial(self.priority().double(), count % total, generator=self._generator) \
-            if count % total else whole[:0]
+        rest = (
+            torch.multinomial(self.priority().double(), count % total, generator=self._generator)
+            if count % total
+            else whole[:0]
+        )
         chosen = torch.cat([whole, rest])
         self._drawn[chosen] = self.round
         return chosen
@@ -148,14 +151,22 @@ class CurriculumScheduler:
 
     def state_dict(self) -> dict:
         """Everything that changes."""
-        return {"round": self.round, "adapted": self._adapted, "best": self._best, "recent": self._recent,
-                "drawn": self._drawn, "generator": self._generator.get_state()}
+        return {
+            "round": self.round,
+            "adapted": self._adapted,
+            "best": self._best,
+            "recent": self._recent,
+            "drawn": self._drawn,
+            "generator": self._generator.get_state(),
+        }
 
     def load_state_dict(self, state: dict) -> None:
         """Go on from a `state_dict`; raises InputError where the number of scenes differs."""
         if len(state["best"]) != len(self._best):
-            raise InputError(f"the checkpoint's curriculum holds {len(state['best'])} scenes, the data "
-                             f"{len(self._best)}; resume with the data of the run")
+            raise InputError(
+                f"the checkpoint's curriculum holds {len(state['best'])} scenes, the data "
+                f"{len(self._best)}; resume with the data of the run"
+            )
         self.round, self._adapted = state["round"], state["adapted"]
         self._best, self._recent, self._drawn = (state[key].clone() for key in ("best", "recent", "drawn"))
         self._generator.set_state(state["generator"].cpu())

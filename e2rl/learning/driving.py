@@ -16,9 +16,7 @@ from e2rl.sim.env import DrivingEnv
 Disturbance = Callable[[Tensor, int], Tensor]  # (action [B, 2], step) -> the action [B, 2] executed instead
 
 
-def drive(
-    env: DrivingEnv, ego: Ego, pool: TrafficPool, rows: Tensor, disturb: Disturbance | None = None
-) -> TensorDict:
+def drive(env: DrivingEnv, ego: Ego, pool: TrafficPool, rows: Tensor, disturb: Disturbance | None = None) -> TensorDict:
     """One episode in each of pool rows [B] with `ego` at the wheel; B is the environment's batch.
 
     Returns [B, T]: observation, intended (the ego's action), executed (after disturbance and bounds) [.., 2], alive
@@ -43,11 +41,20 @@ def drive(
 
 def _frame(td: TensorDictBase, after: TensorDictBase, intended: Tensor, alive: Tensor) -> TensorDict:
     metrics = after["metrics"]
-    return TensorDict({
-        "observation": td["observation"], "intended": intended, "executed": executed_action(after["observation"]),
-        "alive": alive, "reward": after["reward"][:, 0] * alive, "off_road": metrics["off_road"][:, 0] & alive,
-        "contact": (metrics["contact"] | metrics["contact_vru"])[:, 0] & alive, "progress": metrics["progress"][:, 0],
-    }, batch_size=alive.shape, device=alive.device)
+    return TensorDict(
+        {
+            "observation": td["observation"],
+            "intended": intended,
+            "executed": executed_action(after["observation"]),
+            "alive": alive,
+            "reward": after["reward"][:, 0] * alive,
+            "off_road": metrics["off_road"][:, 0] & alive,
+            "contact": (metrics["contact"] | metrics["contact_vru"])[:, 0] & alive,
+            "progress": metrics["progress"][:, 0],
+        },
+        batch_size=alive.shape,
+        device=alive.device,
+    )
 
 
 def episodes_of(frames: TensorDictBase, pool: TrafficPool, rows: Tensor) -> Episodes:
@@ -56,9 +63,14 @@ def episodes_of(frames: TensorDictBase, pool: TrafficPool, rows: Tensor) -> Epis
     last = frames["progress"].gather(1, (count - 1)[:, None])[:, 0]
     effort = (frames["executed"][..., 0].abs() * frames["alive"]).sum(1) / count
     return Episodes(
-        row=rows, scene_index=pool.scene_index[rows], adversarial=pool.adversarial[rows],
-        contact=frames["contact"].any(1), off_road=frames["off_road"].any(1), returns=frames["reward"].sum(1),
-        progress=last, acceleration=effort,
+        row=rows,
+        scene_index=pool.scene_index[rows],
+        adversarial=pool.adversarial[rows],
+        contact=frames["contact"].any(1),
+        off_road=frames["off_road"].any(1),
+        returns=frames["reward"].sum(1),
+        progress=last,
+        acceleration=effort,
     )
 
 

@@ -7,8 +7,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 OUTCOME_KEYS = (
-    "traffic_row", "scene_index", ("next", "timestep"), ("next", "done"), ("next", "reward"),
-    ("next", "metrics", "contact"), ("next", "metrics", "contact_vru"), ("next", "metrics", "off_road"),
+    "traffic_row",
+    "scene_index",
+    ("next", "timestep"),
+    ("next", "done"),
+    ("next", "reward"),
+    ("next", "metrics", "contact"),
+    ("next", "metrics", "contact_vru"),
+    ("next", "metrics", "off_road"),
     ("next", "metrics", "progress"),
 )
 
@@ -38,8 +44,13 @@ class Episodes:
     def summary(self) -> dict[str, float]:
         """Means over all episodes and over those in adversarial and in nominal traffic; kinds without any are left
         out."""
-        values = {"contact": self.contact.float(), "off_road": self.off_road.float(), "return": self.returns,
-                  "progress": self.progress, "acceleration": self.acceleration}
+        values = {
+            "contact": self.contact.float(),
+            "off_road": self.off_road.float(),
+            "return": self.returns,
+            "progress": self.progress,
+            "acceleration": self.acceleration,
+        }
         kinds = {"": torch.ones_like(self.adversarial), "_adversarial": self.adversarial, "_nominal": ~self.adversarial}
         result = {"episodes": float(len(self))}
         for suffix, rows in kinds.items():
@@ -66,7 +77,12 @@ def finished_episodes(batches: list[TensorDictBase], adversarial: Tensor, horizo
     contact = flat["next", "metrics", "contact"] | flat["next", "metrics", "contact_vru"]
     row = flat["traffic_row"][ended]
     return Episodes(
-        row=row, scene_index=flat["scene_index"][ended], adversarial=adversarial[row], contact=contact[ended],
-        off_road=flat["next", "metrics", "off_road"][ended], returns=total[ended].float(),
-        progress=flat["next", "metrics", "progress"][ended], acceleration=torch.full((len(row),), torch.nan),
+        row=row,
+        scene_index=flat["scene_index"][ended],
+        adversarial=adversarial[row],
+        contact=contact[ended],
+        off_road=flat["next", "metrics", "off_road"][ended],
+        returns=total[ended].float(),
+        progress=flat["next", "metrics", "progress"][ended],
+        acceleration=torch.full((len(row),), torch.nan),
     )

@@ -42,8 +42,14 @@ class Evolution:
     """
 
     def __init__(
-        self, curriculum: CurriculumScheduler, improve: PolicyImprovement | PlannerImprovement, synthesize: Synthesize,
-        settings: RoundSettings, seed: int = 0, measure: Measure | None = None, solvable: Solvable | None = None,
+        self,
+        curriculum: CurriculumScheduler,
+        improve: PolicyImprovement | PlannerImprovement,
+        synthesize: Synthesize,
+        settings: RoundSettings,
+        seed: int = 0,
+        measure: Measure | None = None,
+        solvable: Solvable | None = None,
     ) -> None:
         self.curriculum, self.improve, self.synthesize = curriculum, improve, synthesize
         self.settings, self.seed, self.measure, self.solvable = settings, seed, measure, solvable
@@ -82,11 +88,19 @@ class Evolution:
         self.curriculum.advance(contact)
         spent = [later - earlier for earlier, later in zip(clock[:-1], clock[1:], strict=True)]
         return {
-            **_group("curriculum", state), **_group("train", learned), **before, **after,
-            **_group("synthesizer", {
-                "contact": contact, "attacked": attack["adversaries"].any(-1).float().mean().item(),
-                "scenes": float(len(scenes)), "left_out": float((~kept).sum()),
-            }),
+            **_group("curriculum", state),
+            **_group("train", learned),
+            **before,
+            **after,
+            **_group(
+                "synthesizer",
+                {
+                    "contact": contact,
+                    "attacked": attack["adversaries"].any(-1).float().mean().item(),
+                    "scenes": float(len(scenes)),
+                    "left_out": float((~kept).sum()),
+                },
+            ),
             **_group("time", {"synthesize": spent[0], "improve": spent[2]}),
         }
 

@@ -108,8 +108,10 @@ def _pairs(frames: TensorDictBase, label: str, scene_index: Tensor, env: Driving
     action = clip_expert(frames[label], env.action_spec.space.low[0], env.action_spec.space.high[0])
     scene = scene_index[:, None].to(alive.device).expand(alive.shape)
     count = int(alive.sum())
-    return TensorDict({"observation": frames["observation"][alive], "action": action[alive], "scene_index":
-                       scene[alive]}, batch_size=[count]).cpu()
+    return TensorDict(
+        {"observation": frames["observation"][alive], "action": action[alive], "scene_index": scene[alive]},
+        batch_size=[count],
+    ).cpu()
 
 
 class Imitation:
@@ -157,7 +159,10 @@ class Imitation:
 
 
 def imitate(
-    network: ActorCritic, pairs: TensorDictBase, settings: ImitationSettings, folder: Path | None = None,
+    network: ActorCritic,
+    pairs: TensorDictBase,
+    settings: ImitationSettings,
+    folder: Path | None = None,
     log: Callable[[dict[str, float], int], None] | None = None,
 ) -> dict[str, float]:
     """Clone the pairs for settings.epochs and keep the weights of the least held-out loss (of the last epoch where no

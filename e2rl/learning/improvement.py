@@ -43,8 +43,16 @@ class PolicyImprovement:
     """Collects episodes with the actor's stochastic policy in the round's pool and updates it after each batch."""
 
     def __init__(
-        self, ego: ActorEgo, scenes: SceneSet, sim: SimSettings, update: UpdateSettings, collect: CollectSettings,
-        expert: TensorDictBase | None = None, teacher: Ego | None = None, seed: int = 0, device: str = "cpu",
+        self,
+        ego: ActorEgo,
+        scenes: SceneSet,
+        sim: SimSettings,
+        update: UpdateSettings,
+        collect: CollectSettings,
+        expert: TensorDictBase | None = None,
+        teacher: Ego | None = None,
+        seed: int = 0,
+        device: str = "cpu",
     ) -> None:
         """expert: pairs to clone all along (`recorded_pairs`); teacher: an ego whose survived drives through the
         round's adversarial traffic are cloned too (`corrective_pairs`)."""
@@ -52,15 +60,23 @@ class PolicyImprovement:
             raise InputError(f"learner=ppo_bc improves ego=actor, not {type(ego).__name__}; use learner=planner_tuning")
         horizon = scenes.scenes["logged"].shape[1] - 1
         if collect.steps * collect.iterations < horizon:
-            raise InputError(f"learner.collect: {collect.steps} x {collect.iterations} steps a round cannot hold an "
-                             f"episode of {horizon}")
+            raise InputError(
+                f"learner.collect: {collect.steps} x {collect.iterations} steps a round cannot hold an "
+                f"episode of {horizon}"
+            )
         self.ego, self.settings, self.expert, self.teacher, self.horizon = ego, collect, expert, teacher, horizon
         self.learner, self.frames = Learner(ego.network, update), 0
         self.sampler = SceneSampler(len(scenes), collect.batch, seed)
         self.env = TransformedEnv(DrivingEnv(scenes, sim, collect.batch, device), self.sampler)
         self._collector = Collector(
-            self.env, ego.network.actor, frames_per_batch=collect.batch * collect.steps, total_frames=-1,
-            trust_policy=True, track_traj_ids=False, auto_register_policy_transforms=False, device=device,
+            self.env,
+            ego.network.actor,
+            frames_per_batch=collect.batch * collect.steps,
+            total_frames=-1,
+            trust_policy=True,
+            track_traj_ids=False,
+            auto_register_policy_transforms=False,
+            device=device,
         )
         self._batches = iter(self._collector)
 
@@ -91,8 +107,7 @@ class PolicyImprovement:
 
     def state_dict(self) -> dict:
         """Learner, sampler and frames; the weights are the network's."""
-        return {"learner": self.learner.state_dict(), "frames": self.frames,
-                "sampler": self.sampler.get_extra_state()}
+        return {"learner": self.learner.state_dict(), "frames": self.frames, "sampler": self.sampler.get_extra_state()}
 
     def load_state_dict(self, state: dict) -> None:
         """Go on from a `state_dict`."""
@@ -113,14 +128,23 @@ class PlannerImprovement:
     """Tunes a planner's parameters on the round's pool; `ego` is the planner with the best parameters so far."""
 
     def __init__(
-        self, make_ego: Callable[..., Ego], present: Parameters, grid: Mapping[str, Sequence], scenes: SceneSet,
-        sim: SimSettings, settings: TuningSettings | None = None, batch: int = 64, device: str = "cpu",
+        self,
+        make_ego: Callable[..., Ego],
+        present: Parameters,
+        grid: Mapping[str, Sequence],
+        scenes: SceneSet,
+        sim: SimSettings,
+        settings: TuningSettings | None = None,
+        batch: int = 64,
+        device: str = "cpu",
     ) -> None:
         """make_ego(**parameters) -> Ego; present: parameters to begin with; grid: values to try of some of them."""
         unknown = sorted(set(grid) - set(present))
         if unknown:
-            raise InputError(f"learner.grid: {', '.join(unknown)} are no parameters of the planner; it has "
-                             f"{', '.join(sorted(present))}")
+            raise InputError(
+                f"learner.grid: {', '.join(unknown)} are no parameters of the planner; it has "
+                f"{', '.join(sorted(present))}"
+            )
         self.make_ego, self.present, self.grid = make_ego, dict(present), {key: list(grid[key]) for key in grid}
         self.settings, self.env = settings or TuningSettings(), DrivingEnv(scenes, sim, batch, device)
         self.ego, self.trials = make_ego(**present), []
@@ -138,10 +162,17 @@ class PlannerImprovement:
         tuning = tune(evaluate, self.present, self.grid, self.settings)
         before, after = tuning.trials[0], next(t for t in tuning.trials if t["parameters"] == tuning.best)
         self.present, self.trials, self.ego = tuning.best, tuning.trials, self.make_ego(**tuning.best)
-        chosen = {f"parameter_{key}": float(value) for key, value in self.present.items()
-                  if key in self.grid and isinstance(value, int | float)}
-        metrics = {"objective_before": before["objective"], "objective": after["objective"],
-                   "trials": float(len(tuning.trials)), **chosen}
+        chosen = {
+            f"parameter_{key}": float(value)
+            for key, value in self.present.items()
+            if key in self.grid and isinstance(value, int | float)
+        }
+        metrics = {
+            "objective_before": before["objective"],
+            "objective": after["objective"],
+            "trials": float(len(tuning.trials)),
+            **chosen,
+        }
         return metrics | driven[_name(tuning.best)].summary(), driven[_name(tuning.best)]
 
     def outcome(self, folder: Path) -> str:

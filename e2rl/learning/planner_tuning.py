@@ -44,7 +44,9 @@ def combinations(grid: Mapping[str, Sequence]) -> list[Parameters]:
 
 
 def tune(
-    evaluate: Callable[[Parameters], Mapping[str, float]], present: Parameters, grid: Mapping[str, Sequence],
+    evaluate: Callable[[Parameters], Mapping[str, float]],
+    present: Parameters,
+    grid: Mapping[str, Sequence],
     settings: TuningSettings | None = None,
 ) -> Tuning:
     """Try the present parameters, then the whole grid; keep the best admissible trial, the present one in a tie.

@@ -30,8 +30,9 @@ class TrafficPool:
     @staticmethod
     def recorded(scene_index: Tensor) -> "TrafficPool":
         """Rows that replay the recordings of scenes [R]."""
-        return TrafficPool(scene_index, torch.zeros(len(scene_index), dtype=torch.bool),
-                           torch.full((len(scene_index),), RECORDED))
+        return TrafficPool(
+            scene_index, torch.zeros(len(scene_index), dtype=torch.bool), torch.full((len(scene_index),), RECORDED)
+        )
 
     @staticmethod
     def synthesized(traffic: Mapping[str, Tensor], adversarial: bool) -> "TrafficPool":
@@ -41,8 +42,14 @@ class TrafficPool:
         if missing:
             raise InputError(f"synthesized traffic lacks {', '.join(sorted(missing))}; return them from synthesize()")
         index = traffic["scene_index"].cpu()
-        return TrafficPool(index, torch.full((len(index),), adversarial), torch.arange(len(index)),
-                           traffic["states"].cpu(), traffic["valid"].cpu(), _optional(traffic.get("route")))
+        return TrafficPool(
+            index,
+            torch.full((len(index),), adversarial),
+            torch.arange(len(index)),
+            traffic["states"].cpu(),
+            traffic["valid"].cpu(),
+            _optional(traffic.get("route")),
+        )
 
     def __add__(self, other: "TrafficPool") -> "TrafficPool":
         """Both pools' rows, this one's first."""
@@ -51,8 +58,11 @@ class TrafficPool:
         if (self.route is None) != (other.route is None) and self.states is not None and other.states is not None:
             raise InputError("traffic pools with and without routes cannot be one; give route in both or in neither")
         return TrafficPool(
-            torch.cat([self.scene_index, other.scene_index]), torch.cat([self.adversarial, other.adversarial]),
-            torch.cat([self.traffic, shifted]), _joined(self.states, other.states), _joined(self.valid, other.valid),
+            torch.cat([self.scene_index, other.scene_index]),
+            torch.cat([self.adversarial, other.adversarial]),
+            torch.cat([self.traffic, shifted]),
+            _joined(self.states, other.states),
+            _joined(self.valid, other.valid),
             _joined(self.route, other.route),
         )
 

@@ -42,12 +42,14 @@ class Learner:
 
     def __init__(self, network: ActorCritic, settings: UpdateSettings) -> None:
         self.network, self.settings, self.updates = network, settings, 0
-        self.gae = GAE(
-            gamma=settings.gamma, lmbda=settings.lmbda, value_network=network.critic, deactivate_vmap=True
-        )
+        self.gae = GAE(gamma=settings.gamma, lmbda=settings.lmbda, value_network=network.critic, deactivate_vmap=True)
         self.ppo = ClipPPOLoss(
-            network.actor, network.critic, clip_epsilon=settings.clip, entropy_coeff=settings.entropy,
-            critic_coeff=settings.critic, normalize_advantage=False,
+            network.actor,
+            network.critic,
+            clip_epsilon=settings.clip,
+            entropy_coeff=settings.entropy,
+            critic_coeff=settings.critic,
+            normalize_advantage=False,
         )
         self.cloning = BCLoss(network.actor)
         self.optimiser = torch.optim.Adam(network.parameters(), settings.learning_rate)
@@ -79,8 +81,12 @@ class Learner:
             self.network.normaliser.observe(flat["observation"])
         self.updates += 1
         result = {name: torch.stack(values).mean().item() for name, values in sums.items()}
-        return result | {"stopped_by_kl": float(stopped), "std_acceleration": self._std()[0], "std_yaw_rate":
-                         self._std()[1], "steps": float(len(sums["kl"]))}
+        return result | {
+            "stopped_by_kl": float(stopped),
+            "std_acceleration": self._std()[0],
+            "std_yaw_rate": self._std()[1],
+            "steps": float(len(sums["kl"])),
+        }
 
     def _with_advantages(self, data: TensorDictBase) -> TensorDict:
         """Frames [B T] of the keys PPO needs, advantages normalised over the whole batch."""
@@ -99,8 +105,11 @@ class Learner:
         if not warming:
             total = total + out["loss_objective"] + out["loss_entropy"]
         losses = {
-            "loss_objective": out["loss_objective"], "loss_critic": out["loss_critic"], "kl": out["kl_approx"],
-            "clip_fraction": out["clip_fraction"], "entropy": out["entropy"],
+            "loss_objective": out["loss_objective"],
+            "loss_critic": out["loss_critic"],
+            "kl": out["kl_approx"],
+            "clip_fraction": out["clip_fraction"],
+            "entropy": out["entropy"],
             "explained_variance": out["explained_variance"].mean(),
         }
         if expert is not None and len(expert) and settings.cloning > 0 and not warming:

@@ -58,8 +58,13 @@ EXTRA = (
     Metric("bg_pairs", "pairs of other vehicles that hit each other"),
     Metric("touched", "moving vehicles that touch another simulated one", share=True, weight="moving_vehicles"),
     Metric("parked_moved", "parked vehicles that move > 2 m", share=True, weight="parked_vehicles"),
-    Metric("starts", "standing vehicles that start, per one that starts in the log", share=True, column="starters",
-           per="starters_log"),
+    Metric(
+        "starts",
+        "standing vehicles that start, per one that starts in the log",
+        share=True,
+        column="starters",
+        per="starters_log",
+    ),
     Metric("ttc_c_all", "time-to-collision cost, all agents"),
     Metric("transport_adversary", "path KL of the control, adversaries"),
     Metric("transport_others", "path KL of the control, other vehicles"),
@@ -69,24 +74,63 @@ EXTRA = (
     Metric("w1_jerk", "W1 of |jerk|", unit="m/s³", pooled=True),
 )
 METRICS = {metric.name: metric for metric in MAIN + EXTRA}
-TRAFFIC = tuple(METRICS[name] for name in (
-    "cfr", "cfr_bg", "touched", "aor_step", "aor_any", "real", "real_norm", "w1_a_lon", "w1_a_lat", "w1_jerk",
-    "parked_moved", "starts", "seconds_per_rollout"))  # what says whether background traffic is realistic
-ADVERSARIES = tuple(METRICS[name] for name in (
-    "cfr", "cfr_adv", "avoidable", "contact_time", "front", "side", "rear", "rir", "relvel", "ttc_c", "cfr_bg",
-    "aor_step", "real", "real_adv", "transport"))  # what tells adversaries apart: failures found, and what they cost
+TRAFFIC = tuple(
+    METRICS[name]
+    for name in (
+        "cfr",
+        "cfr_bg",
+        "touched",
+        "aor_step",
+        "aor_any",
+        "real",
+        "real_norm",
+        "w1_a_lon",
+        "w1_a_lat",
+        "w1_jerk",
+        "parked_moved",
+        "starts",
+        "seconds_per_rollout",
+    )
+)  # what says whether background traffic is realistic
+ADVERSARIES = tuple(
+    METRICS[name]
+    for name in (
+        "cfr",
+        "cfr_adv",
+        "avoidable",
+        "contact_time",
+        "front",
+        "side",
+        "rear",
+        "rir",
+        "relvel",
+        "ttc_c",
+        "cfr_bg",
+        "aor_step",
+        "real",
+        "real_adv",
+        "transport",
+    )
+)  # what tells adversaries apart: failures found, and what they cost
 CLOSED_LOOP = {"main": MAIN, "traffic": TRAFFIC, "adversaries": ADVERSARIES}
 OPEN_LOOP = tuple(
-    Metric(f"{name}_{horizon}", about.format(horizon), unit=unit) for horizon in (3, 5) for name, about, unit in (
+    Metric(f"{name}_{horizon}", about.format(horizon), unit=unit)
+    for horizon in (3, 5)
+    for name, about, unit in (
         ("min_ade", "mean displacement over {} s, each vehicle's best sample", "m"),
         ("mean_ade", "the same, mean over samples", "m"),
         ("joint_ade", "the same, the scene's best sample for all its vehicles", "m"),
         ("cv_ade", "constant velocity's displacement over {} s, same vehicles", "m"),
-        ("min_ade_ratio", "min_ade over cv_ade at {} s", ""), ("mean_ade_ratio", "mean_ade over cv_ade at {} s", "")))
+        ("min_ade_ratio", "min_ade over cv_ade at {} s", ""),
+        ("mean_ade_ratio", "mean_ade over cv_ade at {} s", ""),
+    )
+)
 META = (
     Metric("meta_metric", "realism meta-metric, weighted likelihood of the log"),
-    *(Metric(name, f"likelihood of the logged {name.replace('_', ' ')}, weight {feature.weight:g}")
-      for name, feature in FEATURES.items()),
+    *(
+        Metric(name, f"likelihood of the logged {name.replace('_', ' ')}, weight {feature.weight:g}")
+        for name, feature in FEATURES.items()
+    ),
     Metric("real_split_half", "`real` of one half of the logs against the other"),
 )
 OPEN_LOOP_STAGE, META_STAGE = "open loop", "meta-metric"

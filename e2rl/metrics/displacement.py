@@ -20,7 +20,7 @@ def moving_vehicles(logged: Tensor, logged_valid: Tensor, simulated: Tensor, ste
 
     logged [B, T+1, V, 4], logged_valid [B, T+1, V], simulated [B, V].
     """
-    throughout = logged_valid[:, :steps + 1].all(1) if logged.shape[1] > steps else torch.zeros_like(simulated)
+    throughout = logged_valid[:, : steps + 1].all(1) if logged.shape[1] > steps else torch.zeros_like(simulated)
     counted = simulated & throughout & (logged[:, 0, :, 3] > MOVING)
     return torch.cat([torch.zeros_like(counted[:, :1]), counted[:, 1:]], 1)
 
@@ -48,8 +48,11 @@ def scene_displacements(
         counted = moving_vehicles(logged, logged_valid, simulated, steps)
         ade = torch.where(counted[:, None], planned[..., steps - 1], 0.0)
         found = {
-            "min_ade": ade.amin(1).sum(-1), "mean_ade": ade.mean(1).sum(-1), "joint_ade": ade.sum(-1).amin(1),
-            "cv_ade": torch.where(counted, straight[..., steps - 1], 0.0).sum(-1), "vehicles": counted.sum(-1),
+            "min_ade": ade.amin(1).sum(-1),
+            "mean_ade": ade.mean(1).sum(-1),
+            "joint_ade": ade.sum(-1).amin(1),
+            "cv_ade": torch.where(counted, straight[..., steps - 1], 0.0).sum(-1),
+            "vehicles": counted.sum(-1),
         }
         columns |= {f"{name}_{horizon:g}": value for name, value in found.items()}
     return columns

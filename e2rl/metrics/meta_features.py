@@ -19,8 +19,9 @@ BESIDE_ANGLE, BESIDE = 0.175, 0.5  # rad, m: an overlap in width below BESIDE co
 FAR = 1e3  # m, the distance of nobody
 
 
-def track_features(batch: dict[str, Tensor], rollout: Tensor, agent: Tensor
-                   ) -> tuple[dict[str, tuple[Tensor, Tensor]], dict[str, Tensor]]:
+def track_features(
+    batch: dict[str, Tensor], rollout: Tensor, agent: Tensor
+) -> tuple[dict[str, tuple[Tensor, Tensor]], dict[str, Tensor]]:
     """(values and where they are known, each [M, T], of every histogram feature; indications [M] bool) of the tracks
     (rollout [M], agent [M]) of B rollouts.
 
@@ -35,13 +36,16 @@ def track_features(batch: dict[str, Tensor], rollout: Tensor, agent: Tensor
     pairs = (track, own, others, size, valid[rollout] & ~itself[:, None])
     gap = nearest_object(*pairs)
     vehicles = batch["route_points"].shape[1]
-    beyond = beyond_road(states[:, :, :vehicles], batch["size"][:, :vehicles].float(), batch["field"],
-                         batch["field_origin"])[rollout, :, agent]
+    beyond = beyond_road(
+        states[:, :, :vehicles], batch["size"][:, :vehicles].float(), batch["field"], batch["field_origin"]
+    )[rollout, :, agent]
     ways = (batch[key][rollout, agent] for key in ("route_points", "route_light", "route_light_s"))
     red = runs_red_light(track, known, own, *ways, batch["light_state"][rollout, 1:])
     values = motion(track, known) | {
-        "nearest_object": (gap, known), "time_to_collision": (time_to_collision(*pairs), known),
-        "road_edge": (beyond, known)}
+        "nearest_object": (gap, known),
+        "time_to_collision": (time_to_collision(*pairs), known),
+        "road_edge": (beyond, known),
+    }
     return values, {"collision": ((gap < 0) & known).any(1), "offroad": ((beyond > 0) & known).any(1), "red_light": red}
 
 
@@ -62,8 +66,12 @@ def motion(track: Tensor, known: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
     velocity, moved = central(track[..., :2], known)
     speed = velocity.norm(dim=-1)
     turn, turned = central(track[..., 2], known, angle=True)
-    return {"linear_speed": (speed, moved), "linear_accel": central(speed, moved),
-            "angular_speed": (turn, turned), "angular_accel": central(turn, turned)}
+    return {
+        "linear_speed": (speed, moved),
+        "linear_accel": central(speed, moved),
+        "angular_speed": (turn, turned),
+        "angular_accel": central(turn, turned),
+    }
 
 
 def nearest_object(track: Tensor, size: Tensor, others: Tensor, other_size: Tensor, seen: Tensor) -> Tensor:

@@ -45,15 +45,23 @@ def motion_features(
 
 
 def traffic_features(
-    states: Tensor, valid: Tensor, logged: Tensor, logged_valid: Tensor, agents: Tensor, adversaries: Tensor,
-    stop: Tensor, dt: float
+    states: Tensor,
+    valid: Tensor,
+    logged: Tensor,
+    logged_valid: Tensor,
+    agents: Tensor,
+    adversaries: Tensor,
+    stop: Tensor,
+    dt: float,
 ) -> list[dict[str, Tensor]]:
     """`motion_features` of agents, and of those of them that are adversaries [B, N] under names of their own."""
     tracks = states, valid, logged, logged_valid
     everybody = motion_features(*tracks, agents, stop, dt)
     theirs = motion_features(*tracks, agents & adversaries, stop, dt)
-    return [sample | dict(zip(OF_ADVERSARIES, own.values(), strict=True))
-            for sample, own in zip(everybody, theirs, strict=True)]
+    return [
+        sample | dict(zip(OF_ADVERSARIES, own.values(), strict=True))
+        for sample, own in zip(everybody, theirs, strict=True)
+    ]
 
 
 def by_block(values: Tensor, block: int, blocks: int) -> Tensor:

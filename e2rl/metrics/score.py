@@ -79,8 +79,9 @@ def score_batch(batch: dict[str, Tensor], dt: float) -> tuple[dict[str, Tensor],
     columns |= touched_columns(batch, traffic & touched, traffic) | standing_columns(batch, traffic)
     columns |= motion_columns(batch, contact, dt)
     columns |= off_road(states, valid, traffic, stop, {key: batch[key] for key in MAP})
-    features = traffic_features(states, valid, batch["logged"], batch["logged_valid"], traffic, batch["adversaries"],
-                                stop, dt)
+    features = traffic_features(
+        states, valid, batch["logged"], batch["logged_valid"], traffic, batch["adversaries"], stop, dt
+    )
     once, owner = torch.ones(1, 1, dtype=states.dtype), torch.zeros(1, dtype=torch.int64)
     single = [realism([sample], owner, once) for sample in features]
     columns |= {name: torch.cat([values[name] for values in single]) for name in REALISM}
@@ -113,8 +114,10 @@ def contact_columns(
 
 def touched_columns(batch: dict[str, Tensor], touched: Tensor, traffic: Tensor) -> dict[str, Tensor]:
     """Share of the traffic's moving vehicles (in the rollout or its log) that another one touches; touched [B, N]."""
-    fastest = [(batch[track][..., 3] * batch[known]).amax(1)
-               for track, known in (("states", "valid"), ("logged", "logged_valid"))]
+    fastest = [
+        (batch[track][..., 3] * batch[known]).amax(1)
+        for track, known in (("states", "valid"), ("logged", "logged_valid"))
+    ]
     moving = traffic & (torch.maximum(*fastest) > MOVING)
     number = moving.sum(-1)
     share = (touched & moving).sum(-1).to(batch["states"].dtype) / number  # 0 / 0 is NaN

@@ -28,7 +28,11 @@ def standing_columns(batch: dict[str, Tensor], traffic: Tensor) -> dict[str, Ten
     parked = counted & batch["parked"]
     standing = counted & ~batch["parked"] & (states[:, 0, :, 3] < STANDING)
     now, log = moved(states, valid), moved(batch["logged"], batch["logged_valid"])
-    columns = {"parked_moved": (parked & now).sum(-1) / parked.sum(-1), "parked_vehicles": parked.sum(-1),
-               "starters": (standing & now).sum(-1), "starters_log": (standing & log).sum(-1),
-               "standing": standing.sum(-1)}
+    columns = {
+        "parked_moved": (parked & now).sum(-1) / parked.sum(-1),
+        "parked_vehicles": parked.sum(-1),
+        "starters": (standing & now).sum(-1),
+        "starters_log": (standing & log).sum(-1),
+        "standing": standing.sum(-1),
+    }
     return {name: value.to(states.dtype) for name, value in columns.items()}

@@ -158,8 +158,10 @@ def paired_differences(
         for side, group in enumerate((features, other_features))
     ]
     for name in samples[0]:
-        used = [has_samples([group[pair[side]] for pair in pairs], name)
-                for side, group in enumerate((features, other_features))]
+        used = [
+            has_samples([group[pair[side]] for pair in pairs], name)
+            for side, group in enumerate((features, other_features))
+        ]
         used = used[0] & used[1]
         change = samples[0][name] - samples[1][name]
         result[name] = interval(change, len(cluster[used].unique())) | {"n": int(used.sum())}

@@ -74,8 +74,9 @@ def acceleration_caps(settings: BoundSettings, motion: LaneState, state: LaneSta
     return (-need).clamp(min=settings.floor)
 
 
-def _meeting(settings: BoundSettings, motion: LaneState, state: LaneState, around: Surroundings, steps: Tensor
-             ) -> Tensor:
+def _meeting(
+    settings: BoundSettings, motion: LaneState, state: LaneState, around: Surroundings, steps: Tensor
+) -> Tensor:
     """Braking [B, V] that keeps a vehicle `gap` short of whomever its plan runs into first: to that one's speed along
     its own way if it moves on (v - u)^2 / 2 room, u = 0 if it crosses or comes towards it.
 
@@ -88,8 +89,10 @@ def _meeting(settings: BoundSettings, motion: LaneState, state: LaneState, aroun
     other = everybody[:, None].expand(-1, vehicles, -1, -1, -1).gather(3, index)[..., 0, :]
     mine = everybody[:, :vehicles, None].expand(-1, -1, first.shape[2], -1, -1).gather(3, index)[..., 0, :]
     gap = other[..., :2] - mine[..., :2]
-    ahead, theirs = ((gap[..., 0] * torch.cos(pose[..., 2]) + gap[..., 1] * torch.sin(pose[..., 2])) * sign
-                     for pose, sign in ((mine, 1), (other, -1)))
+    ahead, theirs = (
+        (gap[..., 0] * torch.cos(pose[..., 2]) + gap[..., 1] * torch.sin(pose[..., 2])) * sign
+        for pose, sign in ((mine, 1), (other, -1))
+    )
     yields = meet & (ahead > theirs)
     u = (other[..., 3] * torch.cos(other[..., 2] - mine[..., 2])).clamp(min=0)
     way = (motion.s[..., steps] - state.s[..., None]).gather(-1, first)
@@ -102,8 +105,9 @@ def _first_meeting(everybody: Tensor, around: Surroundings, aside: float, vehicl
     """Index of the time [B, V, N] at which i's box, wider by `aside` on both sides, first overlaps j's, and whether it
     does at all."""
     wide = around.size[:, :vehicles] + around.size.new_tensor([0.0, 2 * aside])
-    meets = overlap(everybody[:, :vehicles, None], wide[:, :, None, None], everybody[:, None],
-                    around.size[:, None, :, None])
+    meets = overlap(
+        everybody[:, :vehicles, None], wide[:, :, None, None], everybody[:, None], around.size[:, None, :, None]
+    )
     itself = torch.eye(vehicles, around.present.shape[1], dtype=torch.bool, device=meets.device)
     counts = around.present[:, None, :] & around.present[:, :vehicles, None] & ~itself
     counts = torch.cat([counts[..., :1] & ~around.exempt[..., None], counts[..., 1:]], -1)
@@ -114,7 +118,7 @@ def _first_meeting(everybody: Tensor, around: Surroundings, aside: float, vehicl
 def planned(motion: LaneState, agents: Tensor, steps: Tensor) -> Tensor:
     """Everybody's states [B, N, len(steps), 4] at steps ahead: vehicles as planned, the others at their velocity."""
     plans = motion.states()[:, :, steps]
-    others = agents[:, motion.v.shape[1]:, None].expand(-1, -1, len(steps), -1)
+    others = agents[:, motion.v.shape[1] :, None].expand(-1, -1, len(steps), -1)
     velocity = others[..., 3:] * torch.stack([torch.cos(others[..., 2]), torch.sin(others[..., 2])], -1)
     moved = others[..., :2] + velocity * (DT * (steps + 1))[:, None]
     return torch.cat([plans, torch.cat([moved, others[..., 2:]], -1)], 1)
@@ -140,5 +144,6 @@ def under(cap: Tensor | None, x0: Tensor, state: LaneState, onset: float) -> tup
 
 def select(rows: Tensor, one: LaneState, other: LaneState) -> LaneState:
     """Motion [B, V, HORIZON] of `one` in rows [B, V], of `other` elsewhere."""
-    return LaneState(*(torch.where(rows[..., None], getattr(one, f.name), getattr(other, f.name))
-                       for f in fields(LaneState)))
+    return LaneState(
+        *(torch.where(rows[..., None], getattr(one, f.name), getattr(other, f.name)) for f in fields(LaneState))
+    )

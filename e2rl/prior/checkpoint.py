@@ -26,8 +26,11 @@ def save_prior(prior: Prior, folder: Path, origin: dict) -> Path:
 
     origin: what made it (command, commit, data fingerprint, settings, validation), kept in the header as JSON.
     """
-    architecture = {"denoiser": asdict(prior.denoiser.settings), "free_space": prior.free_space,
-                    "features": [NODE, EDGE, SIZE]}
+    architecture = {
+        "denoiser": asdict(prior.denoiser.settings),
+        "free_space": prior.free_space,
+        "features": [NODE, EDGE, SIZE],
+    }
     metadata = {"format": FORMAT, "architecture": json.dumps(architecture), "origin": json.dumps(origin)}
     tensors = {key: value.detach().cpu().contiguous() for key, value in prior.state_dict().items()}
     content = save(tensors, metadata)
@@ -49,8 +52,10 @@ def load_prior(
     """
     path = bundled_checkpoint() if checkpoint == BUNDLED else Path(checkpoint)
     if not path.exists():
-        raise InputError(f"prior.checkpoint={checkpoint}: no such file; train one with `python train.py stage=prior`, "
-                         f"or use prior.checkpoint={BUNDLED}")
+        raise InputError(
+            f"prior.checkpoint={checkpoint}: no such file; train one with `python train.py stage=prior`, "
+            f"or use prior.checkpoint={BUNDLED}"
+        )
     try:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
@@ -66,12 +71,17 @@ def load_prior(
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: another architecture (its header: {error}); train the prior again") from error
     if made_for != [NODE, EDGE, SIZE]:
-        raise InputError(f"{path}: made for {made_for} features, this version has {[NODE, EDGE, SIZE]}; train the "
-                         "prior again with `python train.py stage=prior`")
+        raise InputError(
+            f"{path}: made for {made_for} features, this version has {[NODE, EDGE, SIZE]}; train the "
+            "prior again with `python train.py stage=prior`"
+        )
     prior = Prior(denoiser, sampler, bounds, free_space)
     expected = {key: value.shape for key, value in prior.state_dict().items()}
-    wrong = [key for key in expected.keys() | tensors.keys()
-             if key not in tensors or key not in expected or tensors[key].shape != expected[key]]
+    wrong = [
+        key
+        for key in expected.keys() | tensors.keys()
+        if key not in tensors or key not in expected or tensors[key].shape != expected[key]
+    ]
     if wrong:
         raise InputError(f"{path}: another architecture ({sorted(wrong)[0]} does not fit); train the prior again")
     prior.load_state_dict(tensors)

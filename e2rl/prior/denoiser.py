@@ -36,8 +36,11 @@ class Encoding:
     def repeat(self, count: int) -> "Encoding":
         """The same scenes `count` times along the batch."""
         tile = lambda value: value.repeat(count, *[1] * (value.ndim - 1))  # noqa: E731
-        return Encoding(tile(self.nodes), tile(self.pairs), *(
-            [tile(value) for value in values] for values in (self.biases, self.modulations)))
+        return Encoding(
+            tile(self.nodes),
+            tile(self.pairs),
+            *([tile(value) for value in values] for values in (self.biases, self.modulations)),
+        )
 
 
 class Block(nn.Module):
@@ -52,8 +55,9 @@ class Block(nn.Module):
         self.qkv = nn.Linear(width, 3 * width)
         self.pair_value = nn.Linear(heads * pair, width)
         self.out = nn.Linear(width, width)
-        self.mlp = nn.Sequential(nn.Linear(width, 3 * width), nn.GELU(), nn.Dropout(dropout),
-                                 nn.Linear(3 * width, width))
+        self.mlp = nn.Sequential(
+            nn.Linear(width, 3 * width), nn.GELU(), nn.Dropout(dropout), nn.Linear(3 * width, width)
+        )
         self.drop = nn.Dropout(dropout)
         nn.init.zeros_(self.modulation.weight)
         nn.init.zeros_(self.modulation.bias)
@@ -63,8 +67,12 @@ class Block(nn.Module):
         shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = modulation.chunk(6, -1)
         batch, vehicles, width = h.shape
         each = width // self.heads
-        q, k, v = self.qkv(torch.addcmul(shift_a, self.norm_attention(h), scale_a)).reshape(
-            batch, vehicles, 3, self.heads, each).permute(2, 0, 3, 1, 4).flatten(1, 2)
+        q, k, v = (
+            self.qkv(torch.addcmul(shift_a, self.norm_attention(h), scale_a))
+            .reshape(batch, vehicles, 3, self.heads, each)
+            .permute(2, 0, 3, 1, 4)
+            .flatten(1, 2)
+        )
         logits = torch.baddbmm(bias.flatten(0, 1), q, k.transpose(1, 2), alpha=1 / math.sqrt(each))
         weight = self.drop(torch.softmax(logits, -1))
         mixed = (weight @ v).unflatten(0, (batch, self.heads)).transpose(1, 2).flatten(2)
@@ -82,8 +90,9 @@ class Denoiser(nn.Module):
         self.schedule = NoiseSchedule()
         self.register_buffer("node_mean", torch.zeros(NODE))
         self.register_buffer("node_std", torch.ones(NODE))
-        self.encode_node = nn.Sequential(nn.Linear(NODE, 2 * width), nn.GELU(), nn.Dropout(settings.dropout),
-                                         nn.Linear(2 * width, width))
+        self.encode_node = nn.Sequential(
+            nn.Linear(NODE, 2 * width), nn.GELU(), nn.Dropout(settings.dropout), nn.Linear(2 * width, width)
+        )
         self.encode_pair = nn.Sequential(nn.Linear(EDGE, 48), nn.GELU(), nn.Linear(48, settings.pair), nn.GELU())
         self.bias = nn.Linear(settings.pair, settings.heads * settings.blocks)
         self.embed_x = nn.Linear(SIZE, width)
@@ -92,7 +101,8 @@ class Denoiser(nn.Module):
         self.register_buffer("unit_scale", scales, persistent=False)
         self.register_buffer("frequencies", torch.logspace(-0.3, 1.7, 16), persistent=False)
         self.blocks = nn.ModuleList(
-            Block(width, settings.heads, settings.pair, settings.dropout) for _ in range(settings.blocks))
+            Block(width, settings.heads, settings.pair, settings.dropout) for _ in range(settings.blocks)
+        )
         self.head = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, SIZE))
         nn.init.zeros_(self.head[1].weight)
         nn.init.zeros_(self.head[1].bias)

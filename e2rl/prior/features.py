@@ -4,11 +4,11 @@ import torch
 from torch import Tensor
 
 from e2rl.prior.lane_relative import LaneState
-from e2rl.prior.leaders import FREE, idm_acceleration, leaders
 from e2rl.prior.routed import RoutedScene
 from e2rl.scene.recording import DT, LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
 from e2rl.scene.route import SPACING, interpolate
 from e2rl.scene.smoothing import PAST
+from e2rl.sim.leaders import FREE, idm_acceleration, leaders
 
 CURVATURE_AT = (0.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)  # m ahead
 TURN_AT = (10.0, 20.0, 40.0, 60.0, 80.0)
@@ -49,7 +49,7 @@ def past_features(past: Tensor, v: Tensor, estimated: Tensor) -> list[Tensor]:
     way aside and the turn 0.5 s and 1 s ago. Only an estimate needs them: 0 where states are exact."""
     ahead = torch.cat([torch.zeros_like(past[..., :1, 0]), past[..., 0]], -1)
     change = ((-ahead.diff(dim=-1) / DT - v[..., None]) / 2).clamp(-2, 2)
-    at = past[..., PAST // 2 - 1::PAST // 2, :]
+    at = past[..., PAST // 2 - 1 :: PAST // 2, :]
     features = torch.cat([change, at[..., 1].clamp(-5, 5), 5 * at[..., 2].clamp(-1, 1)], -1)
     return (features * estimated[:, None, None]).unbind(-1)
 
@@ -61,8 +61,9 @@ def curve_speed(state: LaneState, points: Tensor, lateral: float, brake: float) 
     return torch.sqrt(lateral / curvature.clamp(min=1e-4) + 2 * brake * ahead).min(-1).values
 
 
-def node_features(routed: RoutedScene, state: LaneState, agents: Tensor, present: Tensor, step: Tensor,
-                  estimated: Tensor) -> Tensor:
+def node_features(
+    routed: RoutedScene, state: LaneState, agents: Tensor, present: Tensor, step: Tensor, estimated: Tensor
+) -> Tensor:
     """[B, V, NODE] from lane states [B, V], agents' states [B, N, 4], present [B, N] and the simulated step [B].
 
     estimated [B] bool: the states are a causal observer's estimates (a recording's start), not exact ones (simulated
@@ -82,21 +83,42 @@ def node_features(routed: RoutedScene, state: LaneState, agents: Tensor, present
     future = torch.cat([torch.cat([agents[..., :2] + t * moved, agents[..., 2:]], -1) for t in LEADER_AT], 1)
     lead, first = [], None
     for k in range(len(LEADER_AT)):
-        there = future[:, k * agents.shape[1]:(k + 1) * agents.shape[1]]
+        there = future[:, k * agents.shape[1] : (k + 1) * agents.shape[1]]
         gap, speed, _ = leaders(state.s, width, length, routed.points, there, size, present)
         first = (gap, speed) if first is None else first
         lead += [torch.exp(-gap.clamp(min=0) / 20.0), torch.where(gap < FREE, (v - speed) / 5.0, 0.0)]
     target = torch.where(known, limit, 15.0)
     idm = idm_acceleration(v, target, *first, 1.0, 2.0, 1.5, 2.0).clamp(-6.0, 2.0)
     features = [
-        v / 10, state.a / 2, state.d, state.d1 * 5, state.d2 * 20, (v < 0.5).float(), known.float(),
-        torch.where(known, (limit - v) / 10, 0.0), torch.where(known, limit / 15, 0.0),
-        *(curvature[..., :count] * 15).clamp(-3, 3).unbind(-1), *turn.unbind(-1), state.kappa * v,
-        ((curve - v) / 5).clamp(-2, 2), torch.exp(-rest.clamp(min=0) / 30), (rest < 200).float(), *lead,
-        idm / 2, *_lights(routed, state, step), length / 5, width / 2, routed.parked.float(),
-        routed.has_lane.float(), (first[0] < FREE).float(), (v * v / (2 * first[0].clamp(min=1.0))).clamp(max=8) / 4,
-        (v / 10) ** 2, torch.sqrt(v.clamp(min=0) + 1e-3) / 3, estimated[:, None].float().expand_as(v),
-        *past_features(routed.past, v, estimated)]
+        v / 10,
+        state.a / 2,
+        state.d,
+        state.d1 * 5,
+        state.d2 * 20,
+        (v < 0.5).float(),
+        known.float(),
+        torch.where(known, (limit - v) / 10, 0.0),
+        torch.where(known, limit / 15, 0.0),
+        *(curvature[..., :count] * 15).clamp(-3, 3).unbind(-1),
+        *turn.unbind(-1),
+        state.kappa * v,
+        ((curve - v) / 5).clamp(-2, 2),
+        torch.exp(-rest.clamp(min=0) / 30),
+        (rest < 200).float(),
+        *lead,
+        idm / 2,
+        *_lights(routed, state, step),
+        length / 5,
+        width / 2,
+        routed.parked.float(),
+        routed.has_lane.float(),
+        (first[0] < FREE).float(),
+        (v * v / (2 * first[0].clamp(min=1.0))).clamp(max=8) / 4,
+        (v / 10) ** 2,
+        torch.sqrt(v.clamp(min=0) + 1e-3) / 3,
+        estimated[:, None].float().expand_as(v),
+        *past_features(routed.past, v, estimated),
+    ]
     return torch.stack(features, -1)
 
 
@@ -116,10 +138,20 @@ def edge_features(routed: RoutedScene, state: LaneState) -> Tensor:
     arrival = mine / v[..., None].clamp(min=1.0) - theirs / v[:, None, :].clamp(min=1.0)
     zero = torch.zeros_like(mine)
     features = [
-        along / 30, aside / 10, torch.cos(turn), torch.sin(turn), vx / 10, vy / 10, torch.exp(-distance / 20),
-        closing / 10, torch.exp(-distance / 5), meet.float(),
+        along / 30,
+        aside / 10,
+        torch.cos(turn),
+        torch.sin(turn),
+        vx / 10,
+        vy / 10,
+        torch.exp(-distance / 20),
+        closing / 10,
+        torch.exp(-distance / 5),
+        meet.float(),
         torch.where(meet, torch.exp(-mine.clamp(min=0) / 30), zero),
         torch.where(meet, torch.exp(-theirs.clamp(min=0) / 30), zero),
-        torch.where(meet, torch.cos(routed.crossing), zero), torch.where(meet, torch.sin(routed.crossing), zero),
-        torch.where(meet, torch.tanh(arrival / 3), zero)]
+        torch.where(meet, torch.cos(routed.crossing), zero),
+        torch.where(meet, torch.sin(routed.crossing), zero),
+        torch.where(meet, torch.tanh(arrival / 3), zero),
+    ]
     return torch.stack(features, -1)

@@ -41,9 +41,17 @@ def decode(x: Tensor, state: LaneState) -> LaneState:
     held = torch.zeros_like(v)
     speed = torch.cat([state.v[..., None], v[..., :-1]], -1)
     return LaneState(
-        state.s[..., None] + travelled, state.d[..., None] + held, held, held, v, (v - speed) / DT,
+        state.s[..., None] + travelled,
+        state.d[..., None] + held,
+        held,
+        held,
+        v,
+        (v - speed) / DT,
         state.x[..., None] + (step * torch.cos(middle)).cumsum(-1),
-        state.y[..., None] + (step * torch.sin(middle)).cumsum(-1), heading, kappa)
+        state.y[..., None] + (step * torch.sin(middle)).cumsum(-1),
+        heading,
+        kappa,
+    )
 
 
 def fit(heading: Tensor, known: Tensor, state: LaneState, knots: Tensor) -> Tensor:

@@ -54,10 +54,12 @@ class LaneState:
 
 def locate(states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hint: Tensor | None = None) -> LaneState:
     """LaneState of vehicles states [B, V, 4] on their routes points [B, V, P, 2]; hint [B, V]: expected arc length."""
-    s, d, _ = (value[..., 0] for value in project(
-        states[..., None, :2], points, None if hint is None else hint[..., None]))
-    _, heading, curvature = (value[..., 0, :] if value.ndim == 4 else value[..., 0]
-                             for value in interpolate(points, s[..., None]))
+    s, d, _ = (
+        value[..., 0] for value in project(states[..., None, :2], points, None if hint is None else hint[..., None])
+    )
+    _, heading, curvature = (
+        value[..., 0, :] if value.ndim == 4 else value[..., 0] for value in interpolate(points, s[..., None])
+    )
     turn = wrap(states[..., 2] - heading)
     v = states[..., 3]
     kappa = (yaw_rate / v.clamp(min=1.0)).clamp(-0.25, 0.25)
@@ -160,7 +162,8 @@ class _Polynomial(torch.autograd.Function):
             powers.append(powers[-1] * u)
         table = torch.stack(powers, -2)  # [..., 7, H]
         of_value, of_first, of_second = (
-            (table[..., :7 - shift, :] * grad[..., None, :]).sum(-1) for shift, grad in enumerate(grads))
+            (table[..., : 7 - shift, :] * grad[..., None, :]).sum(-1) for shift, grad in enumerate(grads)
+        )
         power, pad = torch.arange(7, device=c.device, dtype=c.dtype), torch.nn.functional.pad
         of_c = of_value + power * pad(of_first, (1, 0)) + power * (power - 1) * pad(of_second, (2, 0))
         return of_c.sum_to_size(c.shape), grads[0] * first + grads[1] * second + grads[2] * third

@@ -39,8 +39,9 @@ class SamplerSettings:
         if self.sampler not in SAMPLERS:
             raise InputError(f"prior.sampler.sampler is {self.sampler!r}; choose one of {', '.join(SAMPLERS)}")
         if self.steps < 1 or not 0 <= self.churn <= 1:
-            raise InputError("prior.sampler needs steps >= 1 and churn between 0 and 1; they are "
-                             f"{self.steps} and {self.churn}")
+            raise InputError(
+                f"prior.sampler needs steps >= 1 and churn between 0 and 1; they are {self.steps} and {self.churn}"
+            )
         for name in ("temperature", "route_temperature"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise InputError(f"prior.sampler.{name}={getattr(self, name)}: expected a number of at least 0")
@@ -78,8 +79,13 @@ class Prior(nn.Module):
     A control (Algorithm 1's inner loop) may be given to `sample`; without one the reverse SDE is the nominal prior.
     """
 
-    def __init__(self, denoiser: DenoiserSettings | None = None, sampler: SamplerSettings | None = None,
-                 bounds: BoundSettings | None = None, free_space: bool = False):
+    def __init__(
+        self,
+        denoiser: DenoiserSettings | None = None,
+        sampler: SamplerSettings | None = None,
+        bounds: BoundSettings | None = None,
+        free_space: bool = False,
+    ):
         super().__init__()
         self.denoiser = Denoiser(denoiser or DenoiserSettings())
         self.route_choice = RouteChoice()
@@ -103,13 +109,26 @@ class Prior(nn.Module):
         routed = route_scene(scene, chosen, self.free_space)
         vehicles = chosen.shape[1]
         hint = torch.full(chosen.shape, 20.0, device=chosen.device)
-        state = locate(scene["start"][:, :vehicles], scene["start_accel"][:, :vehicles],
-                       scene["start_yaw_rate"][:, :vehicles], routed.points, hint)
+        state = locate(
+            scene["start"][:, :vehicles],
+            scene["start_accel"][:, :vehicles],
+            scene["start_yaw_rate"][:, :vehicles],
+            routed.points,
+            hint,
+        )
         return routed, state
 
     @torch.no_grad()
-    def encode(self, routed: RoutedScene, state: LaneState, agents: Tensor, present: Tensor, step: Tensor,
-               ego_plan: Tensor | None, exempt: Tensor | None = None) -> Context:
+    def encode(
+        self,
+        routed: RoutedScene,
+        state: LaneState,
+        agents: Tensor,
+        present: Tensor,
+        step: Tensor,
+        ego_plan: Tensor | None,
+        exempt: Tensor | None = None,
+    ) -> Context:
         """Everything that stays the same over the denoising steps of a replan.
 
         agents [B, N, 4], present [B, N]: everybody now; step [B]: simulated steps; ego_plan [B, HORIZON, 4]: the ego's
@@ -117,14 +136,14 @@ class Prior(nn.Module):
         """
         vehicles = state.s.shape[1]
         here = present[:, :vehicles]
-        encoding = self.denoiser.encode(node_features(routed, state, agents, present, step, step == 0),
-                                        edge_features(routed, state), here)
+        encoding = self.denoiser.encode(
+            node_features(routed, state, agents, present, step, step == 0), edge_features(routed, state), here
+        )
         around = Surroundings(agents, routed.size, present, torch.zeros_like(here) if exempt is None else exempt)
         active = here & routed.modelled
         active = torch.cat([torch.zeros_like(active[:, :1]), active[:, 1:]], 1)
         ego_x = None if ego_plan is None else plan_to_x(ego_plan, state, routed)
-        return Context(routed, state, encoding, ego_x, around, active,
-                       bool((routed.has_lane | ~here).all()))
+        return Context(routed, state, encoding, ego_x, around, active, bool((routed.has_lane | ~here).all()))
 
     def denoise(self, x: Tensor, level: Tensor, context: Context) -> Tensor:
         """x0 [B, V, SIZE] of x at a scalar noise level; the ego's row is its plan, given clean, where that is known."""
@@ -145,11 +164,13 @@ class Prior(nn.Module):
             return lane
         on_lane = context.routed.has_lane[..., None]
         free = free_space.decode(x0, state).map(lambda value: value[..., steps])
-        return LaneState(*(torch.where(on_lane, getattr(lane, f.name), getattr(free, f.name))
-                           for f in fields(LaneState)))
+        return LaneState(
+            *(torch.where(on_lane, getattr(lane, f.name), getattr(free, f.name)) for f in fields(LaneState))
+        )
 
-    def sample(self, context: Context, noise: Tensor, control: Control | None = None,
-               budget: Tensor | None = None) -> Sample:
+    def sample(
+        self, context: Context, noise: Tensor, control: Control | None = None, budget: Tensor | None = None
+    ) -> Sample:
         """One joint sample by the reverse SDE from level `start` to 0, with the steps of `sde.reverse_step`.
 
         noise [steps, B, V, SIZE]: standard normal, the first slice starts the reverse SDE, the others drive it.
@@ -169,8 +190,16 @@ class Prior(nn.Module):
             else:
                 x, nominal, x0 = control(x, high, k, context, lambda y, t=high: self.denoise(y, t, context))
             if k > 1:  # the last step takes x0 itself
-                step = partial(reverse_step, settings.sampler, self.schedule, x, high=high, low=low,
-                               noise=noise[settings.steps - k + 1], churn=settings.churn)
+                step = partial(
+                    reverse_step,
+                    settings.sampler,
+                    self.schedule,
+                    x,
+                    high=high,
+                    low=low,
+                    noise=noise[settings.steps - k + 1],
+                    churn=settings.churn,
+                )
                 x, variance = step(x0=x0, past=past)
                 if control is not None:  # against what the prior would do from the same visited states
                     plain = step(x0=nominal, past=nominal_past)[0]
@@ -189,8 +218,9 @@ class Prior(nn.Module):
     def plan(self, x0: Tensor, context: Context) -> "Plan":
         """The motion that is executed: decoded, bounded where it must be, standing vehicles held, routes ended."""
         routed = context.routed
-        motion = bounded(self.bounds, lambda cap: self._held(self.decode(x0, context, cap), context), context.state,
-                         context.around)
+        motion = bounded(
+            self.bounds, lambda cap: self._held(self.decode(x0, context, cap), context), context.state, context.around
+        )
         gone = routed.open[..., None] & (motion.s >= routed.length[..., None]) & routed.has_lane[..., None]
         return Plan(motion, ~(gone.cumsum(-1) > 0))
 
@@ -240,6 +270,6 @@ def plan_to_x(plan: Tensor, state: LaneState, routed: RoutedScene) -> Tensor:
     track = LaneState(s, d, zero, zero, plan[..., 3], zero, plan[..., 0], plan[..., 1], plan[..., 2], zero)
     known = torch.ones_like(s)
     x = lane_relative.fit(track, known, ego)[0]
-    bend = free_space.fit(plan[..., 2], known, ego, lane_relative.ACCEL_SCALE * x[..., :lane_relative.KNOTS])
-    free = torch.cat([x[..., :lane_relative.KNOTS], bend], -1)
+    bend = free_space.fit(plan[..., 2], known, ego, lane_relative.ACCEL_SCALE * x[..., : lane_relative.KNOTS])
+    free = torch.cat([x[..., : lane_relative.KNOTS], bend], -1)
     return torch.where(routed.has_lane[:, :1], x, free)

@@ -37,10 +37,23 @@ def candidate_features(scene: TensorDictBase) -> Tensor:
     yaw_rate = scene["start_yaw_rate"][:, :vehicles, None].expand_as(s)
     rest = (scene["route_length"] - s).clamp(0, 100) / 50
     bend = (yaw_rate / v.clamp(min=2.0) - turn[..., 0] / 10.0) * 10
-    return torch.stack([
-        d.abs(), d, wrap(start[..., 2][..., None] - heading) * 3, *turn.unbind(-1), rest, v / 10, excess, bend,
-        (seen & (colour == LIGHT_GREEN)).float(), (seen & (colour == LIGHT_RED)).float(), rank / 3, (v - limit) / 10,
-    ], -1)
+    return torch.stack(
+        [
+            d.abs(),
+            d,
+            wrap(start[..., 2][..., None] - heading) * 3,
+            *turn.unbind(-1),
+            rest,
+            v / 10,
+            excess,
+            bend,
+            (seen & (colour == LIGHT_GREEN)).float(),
+            (seen & (colour == LIGHT_RED)).float(),
+            rank / 3,
+            (v - limit) / 10,
+        ],
+        -1,
+    )
 
 
 class RouteChoice(nn.Module):
@@ -48,8 +61,9 @@ class RouteChoice(nn.Module):
 
     def __init__(self, width: int = 64):
         super().__init__()
-        self.net = nn.Sequential(nn.Linear(FEATURES, width), nn.GELU(), nn.Linear(width, width), nn.GELU(),
-                                 nn.Linear(width, 1))
+        self.net = nn.Sequential(
+            nn.Linear(FEATURES, width), nn.GELU(), nn.Linear(width, width), nn.GELU(), nn.Linear(width, 1)
+        )
 
     def forward(self, scene: TensorDictBase) -> Tensor:
         """Logits [B, V, R]; -inf where there is no candidate, but for candidate 0 of a vehicle without any."""

@@ -61,17 +61,37 @@ def route_scene(scene: TensorDictBase, route: Tensor, free_space: bool = False) 
     everybody = torch.arange(vehicles, device=points.device)
     pairs = [_conflicts(scene_points, everybody)[0] for scene_points in points]
     conflict, conflict_s, crossing = (torch.stack(parts) for parts in zip(*pairs, strict=True))
-    both = (valid & ~parked & has_lane)
+    both = valid & ~parked & has_lane
     conflict = conflict & both[:, :, None] & both[:, None, :]
     return RoutedScene(
-        scene["size"], scene["light_state"], route, points, take_route(scene["route_length"], route),
-        take_route(scene["route_open"], route), take_route(scene["route_limit"], route),
-        take_route(scene["route_light"], route), take_route(scene["route_light_s"], route), conflict, conflict_s,
-        crossing, valid & ~parked, parked, has_lane & (not free_space), scene["past"][:, :vehicles])
+        scene["size"],
+        scene["light_state"],
+        route,
+        points,
+        take_route(scene["route_length"], route),
+        take_route(scene["route_open"], route),
+        take_route(scene["route_limit"], route),
+        take_route(scene["route_light"], route),
+        take_route(scene["route_light_s"], route),
+        conflict,
+        conflict_s,
+        crossing,
+        valid & ~parked,
+        parked,
+        has_lane & (not free_space),
+        scene["past"][:, :vehicles],
+    )
 
 
-def reroute(routed: RoutedScene, scene: TensorDictBase, route: Tensor, who: Tensor, leaves: Tensor, ways: Tensor,
-            free_space: bool = False) -> RoutedScene:
+def reroute(
+    routed: RoutedScene,
+    scene: TensorDictBase,
+    route: Tensor,
+    who: Tensor,
+    leaves: Tensor,
+    ways: Tensor,
+    free_space: bool = False,
+) -> RoutedScene:
     """`routed` with vehicles who [B, V] on other lines: their candidates route [B, V], or, for those that leave their
     lanes [B, V], ways [B, V, P, 2]. On a way there are no lights; its limit is the highest of the candidate's."""
     off = leaves & who
@@ -91,13 +111,19 @@ def reroute(routed: RoutedScene, scene: TensorDictBase, route: Tensor, who: Tens
             old[b][:, rows], old[b][rows] = theirs.T, mine
     both = routed.modelled & lane["valid"]
     return replace(
-        routed, route=torch.where(who, route, routed.route), points=points,
+        routed,
+        route=torch.where(who, route, routed.route),
+        points=points,
         length=change(routed.length, lane["length"], SPACING * (points.shape[2] - 1)),
         open=change(routed.open, lane["open"], False),
         limit=change(routed.limit, lane["limit"], lane["limit"].amax(-1, keepdim=True)),
-        light=change(routed.light, lane["light"], -1), light_s=change(routed.light_s, lane["light_s"], 0.0),
-        conflict=pairs[0] & both[:, :, None] & both[:, None], conflict_s=pairs[1], crossing=pairs[2],
-        has_lane=change(routed.has_lane, lane["valid"] & (not free_space), not free_space))
+        light=change(routed.light, lane["light"], -1),
+        light_s=change(routed.light_s, lane["light_s"], 0.0),
+        conflict=pairs[0] & both[:, :, None] & both[:, None],
+        conflict_s=pairs[1],
+        crossing=pairs[2],
+        has_lane=change(routed.has_lane, lane["valid"] & (not free_space), not free_space),
+    )
 
 
 def _conflicts(points: Tensor, rows: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:

@@ -98,8 +98,15 @@ SAMPLERS = ("ddim", "dpm_solver_pp", "euler_maruyama")
 
 
 def reverse_step(
-    sampler: str, schedule: NoiseSchedule, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor,
-    churn: float, past: tuple[Tensor, Tensor] | None,
+    sampler: str,
+    schedule: NoiseSchedule,
+    x: Tensor,
+    x0: Tensor,
+    high: Tensor,
+    low: Tensor,
+    noise: Tensor,
+    churn: float,
+    past: tuple[Tensor, Tensor] | None,
 ) -> tuple[Tensor, Tensor]:
     """One step of a sampler of SAMPLERS from level high to low > 0: (x_low, variance of the injected noise).
 

@@ -38,7 +38,7 @@ def main_direction(schedule: NoiseSchedule, sampler: SamplerSettings, device=Non
     """Unit vector [steps, SIZE] of noise: along it the way driven grows fastest, in which samples differ most."""
     way = torch.zeros(SIZE, device=device)
     weights = way_weights(device)
-    way[:len(weights)] = weights
+    way[: len(weights)] = weights
     direction = impulses(schedule, sampler, device)[:, None] * way
     return direction / direction.norm()
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from e2rl.evaluation.files import replace
+from e2rl.files import write_atomically
 
 SUPERSAMPLING = 2
 GROUND, ROAD, CENTRELINE = "#eef0ec", "#d5d9df", "#f7f8fa"
@@ -178,4 +178,4 @@ def save_picture(path: Path, picture: Image.Image) -> None:
     """Write a PNG, whole."""
     buffer = io.BytesIO()
     picture.save(buffer, "PNG", optimize=True)
-    replace(Path(path), buffer.getvalue())
+    write_atomically(Path(path), buffer.getvalue())

@@ -22,7 +22,7 @@ def intensity_figure(paths: Sequence[Path]) -> Image.Image:
     figure = Image.new("RGB", (ACROSS * (SIDE + GAP) - GAP, down * (SIDE + GAP) - GAP), drawing.PANEL)
     for index, replay in enumerate(replays):
         place = ((index % ACROSS) * (SIDE + GAP), (index // ACROSS) * (SIDE + GAP))
-        figure.paste(panel(replay, replays[index + 1:]), place)
+        figure.paste(panel(replay, replays[index + 1 :]), place)
     return figure
 
 

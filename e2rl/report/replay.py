@@ -11,8 +11,9 @@ from pathlib import Path
 from PIL import Image
 
 from e2rl.errors import InputError
-from e2rl.evaluation.files import ROLLOUTS, TABLE, read_rows, replace, rollout_name
+from e2rl.evaluation.files import ROLLOUTS, TABLE, read_rows, rollout_name
 from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollout
+from e2rl.files import write_atomically
 from e2rl.metrics.score import score_rollouts
 from e2rl.report import drawing
 from e2rl.report.picture import Replay
@@ -34,7 +35,7 @@ def save_replay(replay: Replay, folder: Path) -> tuple[Path, Path]:
     """Write <name>.gif and <name>.png (the strip) into folder and return their paths."""
     name = rollout_name(replay.rollout).removesuffix(".npz")
     gif, png = Path(folder) / f"{name}.gif", Path(folder) / f"{name}.png"
-    replace(gif, animation(replay.frames()))
+    write_atomically(gif, animation(replay.frames()))
     drawing.save_picture(png, replay.strip())
     return gif, png
 

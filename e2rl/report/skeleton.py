@@ -35,7 +35,8 @@ class SkeletonPicture:
     def __post_init__(self):
         chosen = self.selection
         self.coalition, self.candidates, self.feasible = (
-            value[0].cpu().numpy() for value in (chosen.coalition, chosen.candidates, chosen.feasible))
+            value[0].cpu().numpy() for value in (chosen.coalition, chosen.candidates, chosen.feasible)
+        )
         self.target, self.step = chosen.target[0].tolist(), int(chosen.step)
         everything = chosen.weights[0].sum((1, 2))
         moment = int((link_risk(chosen)[0] + 1e-6 * everything).argmax())
@@ -51,21 +52,24 @@ class SkeletonPicture:
         own = [0, *np.flatnonzero(self.coalition).tolist()]
         edges = self.weights * (self.weights >= self.settings.edge_threshold)
         others = [i for i in np.argsort(-edges.sum(1), kind="stable").tolist() if edges[i].any() and i not in own]
-        return own + sorted(others[:max(NODES - len(own), 0)])
+        return own + sorted(others[: max(NODES - len(own), 0)])
 
     def square(self) -> View:
         """The window of both maps: the ego and the coalition, now and at the moment of risk."""
         own = self.coalition.copy()
         own[0] = True
-        points = np.concatenate([states[:len(own)][own, :2] for states in (self.now, self.risky)])
+        points = np.concatenate([states[: len(own)][own, :2] for states in (self.now, self.risky)])
         side = float(np.clip(np.ptp(points, axis=0).max() + MARGIN, SMALLEST, LARGEST))
         return View(tuple((points.min(0) + points.max(0)) / 2), side, SIDE)
 
     def colour(self, agent: int) -> str:
         if agent == 0:
             return drawing.EGO
-        for mask, colour in ((self.coalition, drawing.ADVERSARY), (self.candidates, CANDIDATE),
-                             (self.feasible, FEASIBLE)):
+        for mask, colour in (
+            (self.coalition, drawing.ADVERSARY),
+            (self.candidates, CANDIDATE),
+            (self.feasible, FEASIBLE),
+        ):
             if agent < len(mask) and mask[agent]:
                 return colour
         return drawing.BACKGROUND
@@ -75,13 +79,17 @@ class SkeletonPicture:
         width = 3 * SIDE + 2 * GAP
         figure = Image.new("RGB", (UNIT * width, UNIT * (SIDE + HEAD + FOOT)), drawing.PANEL)
         draw, rollout = ImageDraw.Draw(figure), self.rollout
-        title = (f"{shorten(rollout['scene_id'])}   seed {rollout['seed']}   intensity {rollout['eta']:g}   "
-                 f"{rollout['method']} vs {rollout['ego_policy']}   chosen at {self.step * rollout['dt']:.1f} s")
+        title = (
+            f"{shorten(rollout['scene_id'])}   seed {rollout['seed']}   intensity {rollout['eta']:g}   "
+            f"{rollout['method']} vs {rollout['ego_policy']}   chosen at {self.step * rollout['dt']:.1f} s"
+        )
         draw.text((8 * UNIT, 5 * UNIT), title, font=drawing.font(16), fill=drawing.INK)
         within = f"{self.settings.clearance:g} m"
-        panels = ((f"s until boxes are within {within}, {self.time:.1f} s into the reference rollout", self.matrix()),
-                  (f"risk graph then, edges of TTC < {self.ttc(self.settings.edge_threshold):.1f} s", self.graph()),
-                  ("active chain, and the ways that came of it", self.chain()))
+        panels = (
+            (f"s until boxes are within {within}, {self.time:.1f} s into the reference rollout", self.matrix()),
+            (f"risk graph then, edges of TTC < {self.ttc(self.settings.edge_threshold):.1f} s", self.graph()),
+            ("active chain, and the ways that came of it", self.chain()),
+        )
         for index, (caption, panel) in enumerate(panels):
             left = index * (SIDE + GAP) * UNIT
             draw.text((left + 8 * UNIT, 35 * UNIT), caption, font=drawing.font(15), fill=drawing.MUTED)
@@ -111,8 +119,13 @@ class SkeletonPicture:
                 draw.rectangle(box, fill=ground, outline=drawing.PANEL, width=UNIT)
                 if i != j and weight > 0:
                     ink = drawing.PANEL if weight > 0.6 else drawing.INK
-                    draw.text(((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), f"{self.ttc(weight):.1f}", font=face,
-                              fill=ink, anchor="mm")
+                    draw.text(
+                        ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2),
+                        f"{self.ttc(weight):.1f}",
+                        font=face,
+                        fill=ink,
+                        anchor="mm",
+                    )
         for row, i in enumerate(nodes):
             for column, j in enumerate(nodes):
                 if i and self.coalition[i] and self.target[i] == j:
@@ -140,7 +153,7 @@ class SkeletonPicture:
         image = self.road.window(self.view)
         draw, places = ImageDraw.Draw(image), self.view.place(self.now[:, :2])
         for agent in [*np.flatnonzero(self.coalition).tolist(), 0]:
-            path = self.rollout["states"][self.step:, agent, :2][self.rollout["valid"][self.step:, agent]]
+            path = self.rollout["states"][self.step :, agent, :2][self.rollout["valid"][self.step :, agent]]
             drawing.draw_trail(draw, self.view, path, self.colour(agent), 0.6)
         self.vehicles(draw, self.now)
         for agent in np.flatnonzero(self.coalition).tolist():
@@ -158,12 +171,24 @@ class SkeletonPicture:
         """Numbers beside the vehicles of the matrix."""
         for agent in self.nodes():
             x, y = self.view.place(states[agent, :2])
-            draw.text((x + 17 * UNIT, y - 17 * UNIT), name(agent), font=drawing.font(16), fill=drawing.INK, anchor="mm",
-                      stroke_width=2 * UNIT, stroke_fill=drawing.PANEL)
+            draw.text(
+                (x + 17 * UNIT, y - 17 * UNIT),
+                name(agent),
+                font=drawing.font(16),
+                fill=drawing.INK,
+                anchor="mm",
+                stroke_width=2 * UNIT,
+                stroke_fill=drawing.PANEL,
+            )
 
     def legend(self, draw: ImageDraw.ImageDraw, middle: float) -> None:
-        entries = (("ego", drawing.EGO), ("coalition C*", drawing.ADVERSARY), ("candidate of the topology", CANDIDATE),
-                   ("feasible, no candidate", FEASIBLE), ("others", drawing.BACKGROUND))
+        entries = (
+            ("ego", drawing.EGO),
+            ("coalition C*", drawing.ADVERSARY),
+            ("candidate of the topology", CANDIDATE),
+            ("feasible, no candidate", FEASIBLE),
+            ("others", drawing.BACKGROUND),
+        )
         x = 8 * UNIT
         for text, colour in entries:
             box = (x, middle - 7 * UNIT, x + 20 * UNIT, middle + 7 * UNIT)
@@ -187,5 +212,6 @@ def arrow(draw: ImageDraw.ImageDraw, start: np.ndarray, end: np.ndarray) -> None
     left = np.array([-ahead[1], ahead[0]])
     tip = start + 0.75 * (end - start)
     draw.line([tuple(start), tuple(end)], fill=drawing.INK, width=4 * UNIT)
-    draw.polygon([tuple(tip + 14 * UNIT * ahead), tuple(tip + 9 * UNIT * left), tuple(tip - 9 * UNIT * left)],
-                 fill=drawing.INK)
+    draw.polygon(
+        [tuple(tip + 14 * UNIT * ahead), tuple(tip + 9 * UNIT * left), tuple(tip - 9 * UNIT * left)], fill=drawing.INK
+    )

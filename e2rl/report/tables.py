@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from e2rl.evaluation.files import replace
+from e2rl.files import write_atomically
 from e2rl.metrics.catalogue import MAIN, META_STAGE, METRICS, OPEN_LOOP_STAGE, STAGES, Metric
 
 RESTS_ON = {
@@ -133,12 +133,22 @@ def counts(group: Sequence[dict], names: Sequence[str]) -> str:
 
 def column_names(group: Sequence[dict]) -> list[str]:
     """method, with eta where it is not 0 or the method has several, and the stage where there is one."""
-    several = {row["method"] for row in group if any(
-        other["method"] == row["method"] and other["eta"] != row["eta"] for other in group)}
+    several = {
+        row["method"]
+        for row in group
+        if any(other["method"] == row["method"] and other["eta"] != row["eta"] for other in group)
+    }
     return [
-        " ".join(filter(None, (
-            "" if row.get("stage") in STAGES else str(row.get("stage", "")),
-            row["method"], f"η={row['eta']:g}" if row["eta"] or row["method"] in several else "")))
+        " ".join(
+            filter(
+                None,
+                (
+                    "" if row.get("stage") in STAGES else str(row.get("stage", "")),
+                    row["method"],
+                    f"η={row['eta']:g}" if row["eta"] or row["method"] in several else "",
+                ),
+            )
+        )
         for row in group
     ]
 
@@ -188,7 +198,7 @@ def number(metric: Metric, value: float, signed: bool = False) -> str:
 def save_tables(path: Path, tables: Sequence[Table]) -> None:
     """Write the tables into one markdown file, whole, with what each metric says below them."""
     parts = [*(table.markdown() for table in tables), f"```\n{legend()}\n```\n"]
-    replace(Path(path), "\n".join(parts).encode())
+    write_atomically(Path(path), "\n".join(parts))
 
 
 def print_tables(tables: Sequence[Table]) -> None:

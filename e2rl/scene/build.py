@@ -55,9 +55,14 @@ def build_scene(recording: Recording, settings: BuildSettings) -> TensorDict:
     chosen = agents[rows]
     count = settings.vehicles + settings.others
     scene = {
-        "start": np.zeros((count, 4)), "start_accel": np.zeros(count), "start_yaw_rate": np.zeros(count),
-        "valid": np.zeros(count, bool), "size": np.ones((count, 2)), "agent_type": np.zeros(count, np.int64),
-        "parked": np.zeros(count, bool), "logged": np.zeros((settings.steps + 1, count, 4)),
+        "start": np.zeros((count, 4)),
+        "start_accel": np.zeros(count),
+        "start_yaw_rate": np.zeros(count),
+        "valid": np.zeros(count, bool),
+        "size": np.ones((count, 2)),
+        "agent_type": np.zeros(count, np.int64),
+        "parked": np.zeros(count, bool),
+        "logged": np.zeros((settings.steps + 1, count, 4)),
         "logged_valid": np.zeros((settings.steps + 1, count), bool),
     }
     present = valid[frame, chosen]
@@ -66,8 +71,8 @@ def build_scene(recording: Recording, settings: BuildSettings) -> TensorDict:
     scene["valid"][rows], scene["size"][rows] = present, recording.size[chosen]
     scene["agent_type"][rows] = recording.agent_type[chosen]
     last = min(settings.steps + 1, len(valid) - frame)
-    known = valid[frame:frame + last, chosen]
-    scene["logged"][:last, rows] = np.where(known[..., None], states[frame:frame + last, chosen] - [*origin, 0, 0], 0)
+    known = valid[frame : frame + last, chosen]
+    scene["logged"][:last, rows] = np.where(known[..., None], states[frame : frame + last, chosen] - [*origin, 0, 0], 0)
     scene["logged_valid"][:last, rows] = known
     scene["past"] = np.zeros((settings.vehicles, PAST, 3))
     cars = rows[rows < settings.vehicles]
@@ -91,15 +96,15 @@ def _participants(recording: Recording, states, valid, settings: BuildSettings) 
     apart = np.linalg.norm(states[:, :, :2] - states[:, [ego], :2], axis=-1)
     now = np.where(valid[frame] & vehicle, apart[frame], np.inf)
     now[ego] = -1.0
-    cars = np.argsort(now, kind="stable")[:settings.vehicles]
+    cars = np.argsort(now, kind="stable")[: settings.vehicles]
     span = slice(frame, frame + settings.steps + 1)
     nearest = np.where(valid[span] & valid[span, [ego]], apart[span], np.inf).min(0, initial=np.inf)
     nearest[vehicle] = nearest[ego] = np.inf
-    rest = np.argsort(nearest, kind="stable")[:settings.others]
+    rest = np.argsort(nearest, kind="stable")[: settings.others]
     agents = np.full(settings.vehicles + settings.others, -1)
     cars, rest = cars[np.isfinite(now[cars])], rest[np.isfinite(nearest[rest])]
-    agents[:len(cars)] = cars
-    agents[settings.vehicles:settings.vehicles + len(rest)] = rest
+    agents[: len(cars)] = cars
+    agents[settings.vehicles : settings.vehicles + len(rest)] = rest
     return agents
 
 
@@ -107,10 +112,13 @@ def _routes(scene: dict, graph: LaneGraph, recording: Recording, origin, setting
     """Route candidates of every vehicle, the one driven, the lights on them, and who is parked."""
     shape = (settings.vehicles, settings.routes)
     out = {
-        "route_points": np.zeros((*shape, settings.vertices, 2)), "route_length": np.zeros(shape),
-        "route_open": np.zeros(shape, bool), "route_valid": np.zeros(shape, bool),
+        "route_points": np.zeros((*shape, settings.vertices, 2)),
+        "route_length": np.zeros(shape),
+        "route_open": np.zeros(shape, bool),
+        "route_valid": np.zeros(shape, bool),
         "route_limit": np.zeros((*shape, settings.vertices), np.float32),
-        "route_light": np.full((*shape, 2), -1), "route_light_s": np.zeros((*shape, 2)),
+        "route_light": np.full((*shape, 2), -1),
+        "route_light_s": np.zeros((*shape, 2)),
     }
     lights = {name: index for index, name in enumerate(recording.lights)}
     reach = (settings.vertices - 1) * SPACING
@@ -162,7 +170,8 @@ def _driven(scene: dict, routes: dict, settings: BuildSettings) -> np.ndarray:
     s, d, heading = project(track[:, None], points)
     turned = wrap(heading - torch.from_numpy(scene["logged"][:, rows, 2].T.copy())[:, None])
     over = (s - torch.from_numpy(routes["route_length"])[..., None]).clamp(min=0) * torch.from_numpy(
-        ~routes["route_open"])[..., None]
+        ~routes["route_open"]
+    )[..., None]
     cost = d.abs() + 2.0 * turned.abs() + over
     weight = known[:, None].double()
     mean = (cost * weight).sum(-1) / weight.sum(-1).clamp(min=1)
@@ -185,8 +194,10 @@ def _lights(recording: Recording, frame: int, origin, steps: int) -> dict:
         return {"light_state": np.zeros((steps + 1, 0), np.int64), "light_points": np.zeros((0, 2))}
     frames = np.minimum(frame + np.arange(steps + 1), len(next(iter(recording.lights.values()))) - 1)
     points = [recording.lanes[name].points[0] for name in recording.lights]
-    return {"light_state": np.stack([state[frames] for state in recording.lights.values()], 1).astype(np.int64),
-            "light_points": np.stack(points) - origin}
+    return {
+        "light_state": np.stack([state[frames] for state in recording.lights.values()], 1).astype(np.int64),
+        "light_points": np.stack(points) - origin,
+    }
 
 
 def _map(recording: Recording, graph: LaneGraph, scene: dict, origin, settings: BuildSettings) -> dict:
@@ -197,17 +208,30 @@ def _map(recording: Recording, graph: LaneGraph, scene: dict, origin, settings: 
     exits = np.full((len(lines), 6), -1)
     for index, name in enumerate(graph.ids):
         nexts = [number[other] for other in graph.graph.successors(name)][:6]
-        exits[index, :len(nexts)] = nexts
-    neighbour = {side: np.array([next((number[n] for n in getattr(graph.lanes[name], side) if n in number), -1)
-                                 for name in graph.ids]) for side in ("left", "right")}
+        exits[index, : len(nexts)] = nexts
+    neighbour = {
+        side: np.array(
+            [next((number[n] for n in getattr(graph.lanes[name], side) if n in number), -1) for name in graph.ids]
+        )
+        for side in ("left", "right")
+    }
     rings = [ring - origin for ring in recording.drivable if len(ring) >= 3]
     ego = scene["logged"][scene["logged_valid"][:, 0], 0, :2]
     field, field_origin = drivable_field(lines, widths, rings, (ego.min(0) + ego.max(0)) / 2, settings.field_cells)
     points = lambda parts: np.concatenate(parts) if parts else np.zeros((0, 2))  # noqa: E731
     index = lambda parts: np.repeat(np.arange(len(parts)), [len(part) for part in parts])  # noqa: E731
-    return {"lane_points": points(lines), "lane_index": index(lines), "lane_width": widths, "lane_exits": exits,
-            "lane_left": neighbour["left"], "lane_right": neighbour["right"], "drivable_points": points(rings),
-            "drivable_index": index(rings), "field": field, "field_origin": field_origin}
+    return {
+        "lane_points": points(lines),
+        "lane_index": index(lines),
+        "lane_width": widths,
+        "lane_exits": exits,
+        "lane_left": neighbour["left"],
+        "lane_right": neighbour["right"],
+        "drivable_points": points(rings),
+        "drivable_index": index(rings),
+        "field": field,
+        "field_origin": field_origin,
+    }
 
 
 def ego_overlaps(scene: TensorDict) -> bool:

@@ -51,22 +51,30 @@ def pack(maps: list[SceneMap], scenes: list[tuple[Recording, int]]) -> dict[str,
     """Arrays of an archive from maps and (recording, first frame on its map's light programme) on them."""
     lanes = [(place.name, name, lane) for place in maps for name, lane in place.lanes.items()]
     number = {(place, name): index for index, (place, name, _) in enumerate(lanes)}
-    pairs = {kind: np.array([(number[p, n], number[p, other]) for p, n, lane in lanes for other in getattr(lane, kind)],
-                            np.int32).reshape(-1, 2) for kind in ("exits", "left", "right")}
+    pairs = {
+        kind: np.array(
+            [(number[p, n], number[p, other]) for p, n, lane in lanes for other in getattr(lane, kind)], np.int32
+        ).reshape(-1, 2)
+        for kind in ("exits", "left", "right")
+    }
     polygons = [ring for place in maps for ring in place.drivable]
     lights = [(number[place.name, name], state) for place in maps for name, state in place.lights.items()]
     states = [np.moveaxis(_steady(rec), 0, 1) for rec, _ in scenes]
     return {
-        "format": np.array(FORMAT), "map_name": np.array([place.name for place in maps]),
+        "format": np.array(FORMAT),
+        "map_name": np.array([place.name for place in maps]),
         "map_lanes": _counts([place.lanes for place in maps]),
         "map_polygons": _counts([place.drivable for place in maps]),
         "map_lights": _counts([place.lights for place in maps]),
         "map_parked": _counts([place.parked for place in maps]),
-        "lane_id": np.array([name for _, name, _ in lanes]), "lane_counts": _counts([row[2].points for row in lanes]),
+        "lane_id": np.array([name for _, name, _ in lanes]),
+        "lane_counts": _counts([row[2].points for row in lanes]),
         "lane_points": _quantise(_join([row[2].points for row in lanes], (2,)), MILLI),
         "lane_width": _quantise([row[2].width for row in lanes], MILLI),
-        "lane_speed": _quantise([row[2].speed_limit for row in lanes], MILLI), **pairs,
-        "polygon_counts": _counts(polygons), "polygon_points": _quantise(_join(polygons, (2,)), MILLI),
+        "lane_speed": _quantise([row[2].speed_limit for row in lanes], MILLI),
+        **pairs,
+        "polygon_counts": _counts(polygons),
+        "polygon_points": _quantise(_join(polygons, (2,)), MILLI),
         "light_lane": np.array([row[0] for row in lights], np.int32),
         "light_states": np.array([row[1] for row in lights], np.int8),
         "parked": _quantise(_join([place.parked for place in maps], (3,)), UNIT[:3]),
@@ -74,7 +82,8 @@ def pack(maps: list[SceneMap], scenes: list[tuple[Recording, int]]) -> dict[str,
         "scene_id": np.array([rec.scene_id for rec, _ in scenes]),
         "scene_map": np.array([[p.name for p in maps].index(rec.location) for rec, _ in scenes], np.int32),
         "scene_first": np.array([first for _, first in scenes], np.int32),
-        "scene_ego": np.array([rec.ego for rec, _ in scenes], np.int32), "scene_agents": _counts(states),
+        "scene_ego": np.array([rec.ego for rec, _ in scenes], np.int32),
+        "scene_agents": _counts(states),
         "states": np.concatenate([_second_difference(_quantise(part, UNIT)) for part in states]),
         "valid": np.concatenate([rec.valid.T for rec, _ in scenes]),
         "size": _quantise(np.concatenate([rec.size for rec, _ in scenes]), MILLI),
@@ -128,19 +137,34 @@ def _split(values: np.ndarray, counts: np.ndarray) -> list[np.ndarray]:
 def read_maps(arrays: dict[str, np.ndarray]) -> list[SceneMap]:
     """The maps of an archive."""
     ids = [str(name) for name in arrays["lane_id"]]
-    lanes = [Lane(points * MILLI, float(width * MILLI), float(speed * MILLI)) for points, width, speed in zip(
-        _split(arrays["lane_points"], arrays["lane_counts"]), arrays["lane_width"], arrays["lane_speed"], strict=True)]
+    lanes = [
+        Lane(points * MILLI, float(width * MILLI), float(speed * MILLI))
+        for points, width, speed in zip(
+            _split(arrays["lane_points"], arrays["lane_counts"]),
+            arrays["lane_width"],
+            arrays["lane_speed"],
+            strict=True,
+        )
+    ]
     for kind in ("exits", "left", "right"):
         for a, b in arrays[kind]:
             getattr(lanes[a], kind).append(ids[b])
     polygons = [ring * MILLI for ring in _split(arrays["polygon_points"], arrays["polygon_counts"])]
-    own = {key: _split(np.arange(arrays[f"map_{key}"].sum()), arrays[f"map_{key}"])
-           for key in ("lanes", "polygons", "lights", "parked")}
-    return [SceneMap(
-        str(name), {ids[k]: lanes[k] for k in own["lanes"][m]}, [polygons[k] for k in own["polygons"][m]],
-        {ids[arrays["light_lane"][k]]: arrays["light_states"][k] for k in own["lights"][m]},
-        arrays["parked"][own["parked"][m]] * UNIT[:3], arrays["parked_size"][own["parked"][m]] * MILLI,
-    ) for m, name in enumerate(arrays["map_name"])]
+    own = {
+        key: _split(np.arange(arrays[f"map_{key}"].sum()), arrays[f"map_{key}"])
+        for key in ("lanes", "polygons", "lights", "parked")
+    }
+    return [
+        SceneMap(
+            str(name),
+            {ids[k]: lanes[k] for k in own["lanes"][m]},
+            [polygons[k] for k in own["polygons"][m]],
+            {ids[arrays["light_lane"][k]]: arrays["light_states"][k] for k in own["lights"][m]},
+            arrays["parked"][own["parked"][m]] * UNIT[:3],
+            arrays["parked_size"][own["parked"][m]] * MILLI,
+        )
+        for m, name in enumerate(arrays["map_name"])
+    ]
 
 
 def read_recordings(arrays: dict[str, np.ndarray], name: str) -> list[Recording]:
@@ -150,22 +174,43 @@ def read_recordings(arrays: dict[str, np.ndarray], name: str) -> list[Recording]
         agents = arrays["scene_agents"]
         states = np.cumsum(np.cumsum(arrays["states"], axis=1), axis=1) * UNIT
         states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
-        rows = zip(arrays["scene_id"], arrays["scene_map"], arrays["scene_first"], arrays["scene_ego"],
-                   _split(states, agents), _split(arrays["valid"], agents), _split(arrays["size"] * MILLI, agents),
-                   strict=True)
+        rows = zip(
+            arrays["scene_id"],
+            arrays["scene_map"],
+            arrays["scene_first"],
+            arrays["scene_ego"],
+            _split(states, agents),
+            _split(arrays["valid"], agents),
+            _split(arrays["size"] * MILLI, agents),
+            strict=True,
+        )
         return [_recording(maps[place], *row).validate() for row in rows for place in [row[1]]]
     except (KeyError, IndexError, ValueError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"bundled scenes {name}: arrays do not fit together ({error!r}); restore the file from git, "
-                         "or write it again with tools/generate_scenes.py") from error
+        raise InputError(
+            f"bundled scenes {name}: arrays do not fit together ({error!r}); restore the file from git, "
+            "or write it again with tools/generate_scenes.py"
+        ) from error
 
 
 def _recording(place: SceneMap, scene_id, _, first, ego, states, valid, size) -> Recording:
     states = np.where(valid.T[..., None], np.moveaxis(states, 0, 1), 0.0)
-    lights = {lane: state[first:first + FRAMES] for lane, state in place.lights.items()}
-    return Recording(str(scene_id), place.name, "bundled", states, valid.T, size, np.full(len(size), VEHICLE), int(ego),
-                     place.lanes, place.drivable, lights, CURRENT)
+    lights = {lane: state[first : first + FRAMES] for lane, state in place.lights.items()}
+    return Recording(
+        str(scene_id),
+        place.name,
+        "bundled",
+        states,
+        valid.T,
+        size,
+        np.full(len(size), VEHICLE),
+        int(ego),
+        place.lanes,
+        place.drivable,
+        lights,
+        CURRENT,
+    )
 
 
 @lru_cache(maxsize=3)

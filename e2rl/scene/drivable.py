@@ -58,6 +58,8 @@ def _border(ring: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _dense(ring: np.ndarray) -> np.ndarray:
     """Points at most 0.5 m apart along a closed ring."""
     closed = np.concatenate([ring, ring[:1]])
-    parts = [np.linspace(a, b, max(int(np.ceil(np.linalg.norm(b - a) / 0.5)), 1), endpoint=False)
-             for a, b in zip(closed[:-1], closed[1:], strict=True)]
+    parts = [
+        np.linspace(a, b, max(int(np.ceil(np.linalg.norm(b - a) / 0.5)), 1), endpoint=False)
+        for a, b in zip(closed[:-1], closed[1:], strict=True)
+    ]
     return np.concatenate(parts)

@@ -66,11 +66,17 @@ def infer_exits(lanes: dict[str, Lane]) -> dict[str, list[str]]:
     exits = {}
     for name in ids:
         lane = lanes[name]
-        near = [j for j in tree.query_ball_point(lane.points[-1], JOIN_GAP)
-                if ids[j] != name and abs(wrap(angle[ids[j]][0] - angle[name][-1])) < JOIN_ANGLE]
+        near = [
+            j
+            for j in tree.query_ball_point(lane.points[-1], JOIN_GAP)
+            if ids[j] != name and abs(wrap(angle[ids[j]][0] - angle[name][-1])) < JOIN_ANGLE
+        ]
         if lane.heights is not None:
-            near = [j for j in near if lanes[ids[j]].heights is None
-                    or abs(lanes[ids[j]].heights[0] - lane.heights[-1]) < JOIN_HEIGHT]
+            near = [
+                j
+                for j in near
+                if lanes[ids[j]].heights is None or abs(lanes[ids[j]].heights[0] - lane.heights[-1]) < JOIN_HEIGHT
+            ]
         exits[name] = [ids[j] for j in near]
     return exits
 
@@ -83,8 +89,9 @@ class LaneGraph:
     """
 
     def __init__(self, lanes: dict[str, Lane]):
-        self.lanes = {name: lane for name, lane in lanes.items()
-                      if len(lane.points) >= 2 and arc_length(lane.points)[-1] >= 0.5}
+        self.lanes = {
+            name: lane for name, lane in lanes.items() if len(lane.points) >= 2 and arc_length(lane.points)[-1] >= 0.5
+        }
         self.ids = list(self.lanes)
         exits = {name: lane.exits for name, lane in self.lanes.items()}
         if not any(exits.values()):
@@ -113,8 +120,10 @@ class LaneGraph:
         for cost, point, gap in sorted(zip(distance + 2.5 * angle, near, distance, strict=True)):
             found.setdefault(self.lane_of[point], (cost, point, gap))
         best = list(found.items())[:MAX_START_LANES]
-        return [(self.ids[lane], float(point - self.first_point[lane]) * self.spacing(lane), gap)
-                for lane, (_, point, gap) in best]
+        return [
+            (self.ids[lane], float(point - self.first_point[lane]) * self.spacing(lane), gap)
+            for lane, (_, point, gap) in best
+        ]
 
     def spacing(self, lane: int) -> float:
         """Distance between neighbouring points of a lane's resampled line, m."""
@@ -193,9 +202,10 @@ class LaneGraph:
         length = min(arc[-1] - begin * scale, (vertices - 1) * SPACING)
         limit = np.zeros(vertices, np.float32)
         for name, start in starts:
-            limit[max(int(start // SPACING), 0):] = self.lanes[name].speed_limit
-        return Route(points, float(length), bool(not inside[-1]),
-                     [(name, start * scale) for name, start in starts], limit)
+            limit[max(int(start // SPACING), 0) :] = self.lanes[name].speed_limit
+        return Route(
+            points, float(length), bool(not inside[-1]), [(name, start * scale) for name, start in starts], limit
+        )
 
     def candidates(self, position: np.ndarray, heading: float, speed: float, count: int, vertices: int) -> list[Route]:
         """Up to `count` route candidates of a vehicle, the nearest lane's first (prior_pilot B.2)."""
@@ -211,8 +221,10 @@ class LaneGraph:
                 route.here = before + arc - begin
                 shift = int(round(route.here / SPACING)) - 10
                 at = np.clip(probes + shift, 0, vertices - 1)
-                same = any(np.linalg.norm(route.points[at][:, None] - other.points[None], axis=-1).min(1).max()
-                           < SAME_GAP for other in found)
+                same = any(
+                    np.linalg.norm(route.points[at][:, None] - other.points[None], axis=-1).min(1).max() < SAME_GAP
+                    for other in found
+                )
                 if not same:
                     found.append(route)
                 if len(found) == count:
@@ -224,5 +236,5 @@ def smooth_vertices(points: np.ndarray) -> np.ndarray:
     """Route vertices [P, 2], Gaussian smoothed with both ends in place (odd extension)."""
     pad = 6
     head = 2 * points[0] - points[pad:0:-1]
-    tail = 2 * points[-1] - points[-2:-pad - 2:-1]
+    tail = 2 * points[-1] - points[-2 : -pad - 2 : -1]
     return gaussian_filter1d(np.concatenate([head, points, tail]), SMOOTHING, axis=0)[pad:-pad]

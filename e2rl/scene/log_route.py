@@ -25,7 +25,7 @@ def route_from_log(graph: LaneGraph, track: np.ndarray, vertices: int) -> Route:
     onward = graph.candidates(track[-1, :2], track[-1, 2], track[-1, 3], 1, vertices)
     if onward:
         ahead = int(np.ceil((onward[0].here + JOIN) / SPACING))
-        used = onward[0].points[ahead:max(int(onward[0].length / SPACING) + 1, ahead + 1)]
+        used = onward[0].points[ahead : max(int(onward[0].length / SPACING) + 1, ahead + 1)]
         line = np.concatenate([line, used])
         known = max(known, arc_length(line)[-1])
     line = np.concatenate([line, line[-1:] + vertices * SPACING * _direction(line)])

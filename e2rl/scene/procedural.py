@@ -80,7 +80,7 @@ def generate(ground: Ground, scene_id: str, rng: np.random.Generator) -> Recordi
     span = next(iter(place.lights.values())).shape[0] if place.lights else 0
     total = WARM_UP + FRAMES
     first = int(rng.integers(span - total + 1)) if span else 0
-    lights = {lane: state[first:first + total] for lane, state in place.lights.items()}
+    lights = {lane: state[first : first + total] for lane, state in place.lights.items()}
     fleet.lights = stop_lines(ground, ways, fleet, lights)
     for _ in range(REPAIRS):
         progress = roll(fleet, total)[WARM_UP:]
@@ -100,8 +100,20 @@ def generate(ground: Ground, scene_id: str, rng: np.random.Generator) -> Recordi
         return None
     states, valid, size = add_parked(place, states, valid, fleet.size, ego, rng)
     recorded = {lane: state[WARM_UP:] for lane, state in lights.items()}
-    return Recording(scene_id, place.name, "procedural", states, valid, size, np.full(len(size), VEHICLE), ego,
-                     place.lanes, place.drivable, recorded, CURRENT).validate()
+    return Recording(
+        scene_id,
+        place.name,
+        "procedural",
+        states,
+        valid,
+        size,
+        np.full(len(size), VEHICLE),
+        ego,
+        place.lanes,
+        place.drivable,
+        recorded,
+        CURRENT,
+    ).validate()
 
 
 def draw_fleet(ground: Ground, rng: np.random.Generator) -> tuple[Fleet | None, list[list[str]]]:
@@ -157,9 +169,20 @@ def make_fleet(ground: Ground, ways: list[list[str]], start: np.ndarray, size: n
     factor = np.clip(rng.normal(1.0, 0.1, count), 0.75, 1.2)[:, None]
     limit = np.minimum(factor * limit, np.sqrt(rng.uniform(1.4, 2.6, (count, 1)) / np.maximum(bend, 1e-4)))
     here = limit[np.arange(count), np.minimum((start / STEP).astype(int), steps - 1)]
-    return Fleet(front, centre, heading, limit, length, start, size, accel=rng.uniform(1.2, 2.2, count),
-                 brake=rng.uniform(1.6, 2.6, count), headway=np.clip(rng.lognormal(np.log(1.3), 0.3, count), 0.8, 2.3),
-                 gap=rng.uniform(1.8, 3.5, count), speed=rng.uniform(0.1, 1.0, count) * here)
+    return Fleet(
+        front,
+        centre,
+        heading,
+        limit,
+        length,
+        start,
+        size,
+        accel=rng.uniform(1.2, 2.2, count),
+        brake=rng.uniform(1.6, 2.6, count),
+        headway=np.clip(rng.lognormal(np.log(1.3), 0.3, count), 0.8, 2.3),
+        gap=rng.uniform(1.8, 3.5, count),
+        speed=rng.uniform(0.1, 1.0, count) * here,
+    )
 
 
 def stop_lines(ground: Ground, ways, fleet: Fleet, lights) -> list[tuple[int, float, np.ndarray]]:
@@ -168,8 +191,11 @@ def stop_lines(ground: Ground, ways, fleet: Fleet, lights) -> list[tuple[int, fl
     found = []
     for k, way in enumerate(ways):
         begins = np.cumsum([0.0, *[ground.graph.arc[name] for name in way]])
-        found += [(k, float(begins[j]), np.isin(lights[name], (LIGHT_RED, LIGHT_YELLOW))) for j, name in enumerate(way)
-                  if name in lights and begins[j] > fleet.start[k]]
+        found += [
+            (k, float(begins[j]), np.isin(lights[name], (LIGHT_RED, LIGHT_YELLOW)))
+            for j, name in enumerate(way)
+            if name in lights and begins[j] > fleet.start[k]
+        ]
     return found
 
 
@@ -201,10 +227,13 @@ def choose_ego(fleet: Fleet, progress, states, valid, rng) -> int | None:
 def add_parked(place: SceneMap, states, valid, size, ego: int, rng) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The traffic and some of the map's parked cars, where nobody touches them."""
     apart = np.linalg.norm(place.parked[:, :2] - states[CURRENT, ego, :2], axis=-1)
-    chosen = np.argsort(apart, kind="stable")[:int(rng.integers(0, MOST_PARKED + 1))]
+    chosen = np.argsort(apart, kind="stable")[: int(rng.integers(0, MOST_PARKED + 1))]
     pose, body = place.parked[chosen], place.parked_size[chosen]
     hit = (overlap(states[:, :, None, :3], size[:, None] + 0.2, pose, body) & valid[..., None]).any((0, 1))
     pose, body = pose[~hit], body[~hit]
     still = np.tile(np.concatenate([pose, np.zeros((len(pose), 1))], -1), (len(states), 1, 1))
-    return (np.concatenate([states, still], 1), np.concatenate([valid, np.ones(still.shape[:2], bool)], 1),
-            np.concatenate([size, body]))
+    return (
+        np.concatenate([states, still], 1),
+        np.concatenate([valid, np.ones(still.shape[:2], bool)], 1),
+        np.concatenate([size, body]),
+    )

@@ -56,8 +56,10 @@ class Recording:
         where = f"scene {self.scene_id!r}"
         frames, agents = self.valid.shape if self.valid.ndim == 2 else (0, 0)
         if self.states.shape != (frames, agents, 4) or not frames or not agents:
-            raise InputError(f"{where}: states {self.states.shape} do not match valid {self.valid.shape}; expected "
-                             "[frames, agents, 4] and [frames, agents]")
+            raise InputError(
+                f"{where}: states {self.states.shape} do not match valid {self.valid.shape}; expected "
+                "[frames, agents, 4] and [frames, agents]"
+            )
         if not 0 <= self.ego < agents:
             raise InputError(f"{where}: no ego; name its track in metadata.sdc_id, or leave the scene out")
         if not self.lanes:
@@ -67,18 +69,24 @@ class Recording:
         if not self.valid[self.current, self.ego]:
             raise InputError(f"{where}: the ego is not recorded at the start frame {self.current}")
         if self.agent_type[self.ego] != VEHICLE:
-            raise InputError(f"{where}: the ego is a {AGENT_TYPES[self.agent_type[self.ego]]}, expected a vehicle; "
-                             "name another track in metadata.sdc_id, or leave the scene out")
+            raise InputError(
+                f"{where}: the ego is a {AGENT_TYPES[self.agent_type[self.ego]]}, expected a vehicle; "
+                "name another track in metadata.sdc_id, or leave the scene out"
+            )
         for name, lane in self.lanes.items():
             if lane.points.ndim != 2 or lane.points.shape[1] != 2 or not np.isfinite(lane.points).all():
-                raise InputError(f"{where}: the centreline of lane {name} is not a list of finite points; repair the "
-                                 "map or leave the lane out")
+                raise InputError(
+                    f"{where}: the centreline of lane {name} is not a list of finite points; repair the "
+                    "map or leave the lane out"
+                )
         if not all(np.isfinite(ring).all() for ring in self.drivable):
             raise InputError(f"{where}: a drivable polygon holds NaN or infinite points; repair the map")
         if not np.isfinite(self.states[self.valid]).all():
             frame, agent = np.argwhere(self.valid & ~np.isfinite(self.states).all(-1))[0]
-            raise InputError(f"{where}: NaN or infinite state of agent {agent} at frame {frame}, marked valid; mark it "
-                             "invalid or repair the log")
+            raise InputError(
+                f"{where}: NaN or infinite state of agent {agent} at frame {frame}, marked valid; mark it "
+                "invalid or repair the log"
+            )
         used = self.valid.any(0)
         if not (np.isfinite(self.size[used]).all() and (self.size[used] > 0).all()):
             raise InputError(f"{where}: an agent's length or width is not positive; repair the log")

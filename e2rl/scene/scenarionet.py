@@ -31,8 +31,12 @@ from e2rl.scene.smoothing import resample_uniform
 
 TYPES = {"VEHICLE": VEHICLE, "PEDESTRIAN": PEDESTRIAN, "CYCLIST": CYCLIST}
 LIGHTS = {  # by the last word of LANE_STATE_... (Waymo) or TRAFFIC_LIGHT_... (nuPlan)
-    "GO": LIGHT_GREEN, "CAUTION": LIGHT_YELLOW, "STOP": LIGHT_RED,
-    "GREEN": LIGHT_GREEN, "YELLOW": LIGHT_YELLOW, "RED": LIGHT_RED,
+    "GO": LIGHT_GREEN,
+    "CAUTION": LIGHT_YELLOW,
+    "STOP": LIGHT_RED,
+    "GREEN": LIGHT_GREEN,
+    "YELLOW": LIGHT_YELLOW,
+    "RED": LIGHT_RED,
 }
 BUILTINS = {"set", "frozenset", "list", "dict", "tuple", "int", "float", "bool", "str", "bytes", "bytearray", "complex"}
 NUMPY = {  # what arrays and numbers of numpy 1 (numpy.core) and 2 (numpy._core) name
@@ -61,8 +65,10 @@ def safe_load(stream, name: str) -> dict:
     try:
         content = _Unpickler(stream).load()
     except Exception as error:  # damaged bytes raise anything, from EOFError to MemoryError
-        raise InputError(f"{name}: cannot be read: {str(error) or type(error).__name__}; only numpy arrays and plain "
-                         "containers are read, so export the scenario again") from error
+        raise InputError(
+            f"{name}: cannot be read: {str(error) or type(error).__name__}; only numpy arrays and plain "
+            "containers are read, so export the scenario again"
+        ) from error
     if not isinstance(content, dict):
         raise InputError(f"{name}: holds a {type(content).__name__}, expected a ScenarioDescription dict")
     return content
@@ -83,8 +89,9 @@ def list_files(path: str) -> list[tuple[str, str]]:
             files = [(str(root), name) for name in sorted(archive.namelist()) if name.endswith(".pkl")]
     else:
         raise InputError(f"data.path={path}: neither a folder nor a zip file")
-    files = [(root, name) for root, name in files
-             if Path(name).name not in ("dataset_summary.pkl", "dataset_mapping.pkl")]
+    files = [
+        (root, name) for root, name in files if Path(name).name not in ("dataset_summary.pkl", "dataset_mapping.pkl")
+    ]
     if not files:
         raise InputError(f"data.path={path}: holds no .pkl scenario; convert the logs with ScenarioNet first")
     return files
@@ -127,8 +134,10 @@ def read_recordings(
     except InputError as error:
         raise InputError(str(error) if str(error).startswith(name) else f"{name}: {error}") from error
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{name}: not a ScenarioDescription: {type(error).__name__} {error}; export the scenario "
-                         "again or leave it out") from error
+        raise InputError(
+            f"{name}: not a ScenarioDescription: {type(error).__name__} {error}; export the scenario "
+            "again or leave it out"
+        ) from error
     frames = len(recording.states)
     if starts is None:
         starts = [given] if given is not None else list(range(10, frames - window, window + 11)) or [10]
@@ -155,8 +164,9 @@ def _parse(data: dict, name: str, location: str) -> tuple[Recording, int | None]
         states[:, index, :2], states[:, index, 2] = np.asarray(state["position"])[:, :2], state["heading"]
         states[:, index, 3] = np.linalg.norm(np.asarray(state["velocity"])[:, :2], axis=1)
         valid[:, index] = known
-        box = [np.median(np.asarray(state[key]).reshape(-1)[known]) if known.any() else 1.0
-               for key in ("length", "width")]
+        box = [
+            np.median(np.asarray(state[key]).reshape(-1)[known]) if known.any() else 1.0 for key in ("length", "width")
+        ]
         size.append(sorted(box, reverse=True) if track["type"] == "VEHICLE" else box)
     bad = valid & ~np.isfinite(states).all(-1)
     if bad.any():
@@ -171,10 +181,18 @@ def _parse(data: dict, name: str, location: str) -> tuple[Recording, int | None]
     given = metadata.get("current_time_index")
     lanes, drivable = _map(data["map_features"])
     recording = Recording(
-        scene_id=str(data.get("id") or metadata.get("scenario_id")), location=location or str(metadata.get("map", "")),
-        dataset=str(metadata.get("dataset", "scenarionet")), states=states, valid=valid, size=np.array(size),
-        agent_type=np.array([TYPES.get(track["type"], OTHER) for _, track in tracks]), ego=keys.index(str(sdc)),
-        lanes=lanes, drivable=drivable, lights=_lights(data.get("dynamic_map_states", {}), lanes, seconds, len(states)))
+        scene_id=str(data.get("id") or metadata.get("scenario_id")),
+        location=location or str(metadata.get("map", "")),
+        dataset=str(metadata.get("dataset", "scenarionet")),
+        states=states,
+        valid=valid,
+        size=np.array(size),
+        agent_type=np.array([TYPES.get(track["type"], OTHER) for _, track in tracks]),
+        ego=keys.index(str(sdc)),
+        lanes=lanes,
+        drivable=drivable,
+        lights=_lights(data.get("dynamic_map_states", {}), lanes, seconds, len(states)),
+    )
     return recording, None if given is None else int(round(seconds[int(given)] / DT))
 
 
@@ -187,13 +205,22 @@ def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
             continue
         line = np.asarray(feature["polyline"], float)
         width = np.asarray(feature.get("width", ()), float)
-        ids = {side: [str(item["feature_id"] if isinstance(item, dict) else item)
-                      for item in feature.get(f"{side}_neighbor", ())] for side in ("left", "right")}
+        ids = {
+            side: [
+                str(item["feature_id"] if isinstance(item, dict) else item)
+                for item in feature.get(f"{side}_neighbor", ())
+            ]
+            for side in ("left", "right")
+        }
         heights = line[:, 2] if line.shape[1] > 2 and "polygon" not in feature else None
         lanes[str(key)] = Lane(
-            points=line[:, :2], width=float(np.median(width.sum(-1))) if width.ndim == 2 and len(width) else 0.0,
+            points=line[:, :2],
+            width=float(np.median(width.sum(-1))) if width.ndim == 2 and len(width) else 0.0,
             speed_limit=float(feature.get("speed_limit_kmh") or 0.0) / 3.6,
-            exits=[str(other) for other in feature.get("exit_lanes", ())], heights=heights, **ids)
+            exits=[str(other) for other in feature.get("exit_lanes", ())],
+            heights=heights,
+            **ids,
+        )
         if "polygon" in feature and len(feature["polygon"]) >= 3:
             drivable.append(np.asarray(feature["polygon"], float)[:, :2])
     return lanes, drivable

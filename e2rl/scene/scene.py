@@ -31,15 +31,48 @@ from tensordict import TensorDict, TensorDictBase
 from e2rl.errors import InputError
 
 RAGGED = {  # key: value of its padding; these first dims differ between scenes
-    "light_state": 0, "light_points": 0.0, "lane_points": 0.0, "lane_index": -1, "lane_width": 0.0, "lane_exits": -1,
-    "lane_left": -1, "lane_right": -1, "drivable_points": 0.0, "drivable_index": -1,
+    "light_state": 0,
+    "light_points": 0.0,
+    "lane_points": 0.0,
+    "lane_index": -1,
+    "lane_width": 0.0,
+    "lane_exits": -1,
+    "lane_left": -1,
+    "lane_right": -1,
+    "drivable_points": 0.0,
+    "drivable_index": -1,
 }
 KEYS = {  # key: number of dims of one scene
-    "start": 2, "start_accel": 1, "start_yaw_rate": 1, "past": 3, "valid": 1, "parked": 1, "size": 2, "agent_type": 1,
-    "logged": 3, "logged_valid": 2, "route_points": 4, "route_length": 2, "route_open": 2, "route_valid": 2,
-    "route_limit": 3, "route_light": 3, "route_light_s": 3, "route_log": 1, "light_state": 2, "light_points": 2,
-    "lane_points": 2, "lane_index": 1, "lane_width": 1, "lane_exits": 2, "lane_left": 1, "lane_right": 1,
-    "drivable_points": 2, "drivable_index": 1, "field": 2, "field_origin": 1,
+    "start": 2,
+    "start_accel": 1,
+    "start_yaw_rate": 1,
+    "past": 3,
+    "valid": 1,
+    "parked": 1,
+    "size": 2,
+    "agent_type": 1,
+    "logged": 3,
+    "logged_valid": 2,
+    "route_points": 4,
+    "route_length": 2,
+    "route_open": 2,
+    "route_valid": 2,
+    "route_limit": 3,
+    "route_light": 3,
+    "route_light_s": 3,
+    "route_log": 1,
+    "light_state": 2,
+    "light_points": 2,
+    "lane_points": 2,
+    "lane_index": 1,
+    "lane_width": 1,
+    "lane_exits": 2,
+    "lane_left": 1,
+    "lane_right": 1,
+    "drivable_points": 2,
+    "drivable_index": 1,
+    "field": 2,
+    "field_origin": 1,
 }
 
 
@@ -103,8 +136,9 @@ class SceneSet:
             return which
         if which in self.scene_id:
             return self.scene_id.index(which)
-        raise InputError(f"scene={which}: expected a position below {len(self)} or the id of a scene, such as "
-                         f"{self.scene_id[0]}")
+        raise InputError(
+            f"scene={which}: expected a position below {len(self)} or the id of a scene, such as {self.scene_id[0]}"
+        )
 
     def copy_into(self, batch: TensorDictBase, rows: torch.Tensor, indices: torch.Tensor) -> None:
         """Overwrite rows [b] (ascending) of a batch of scenes by the scenes at `indices` [b], in place."""
@@ -120,8 +154,9 @@ class SceneSet:
         """The first `count` scenes (all for None)."""
         if count is None or count >= len(self):
             return self
-        return SceneSet(self.scenes[:count], self.scene_id[:count], self.location[:count], self.dataset, self.split,
-                        self.dropped)
+        return SceneSet(
+            self.scenes[:count], self.scene_id[:count], self.location[:count], self.dataset, self.split, self.dropped
+        )
 
     def to(self, device) -> "SceneSet":
         """The same scenes on a device."""

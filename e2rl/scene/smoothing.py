@@ -23,8 +23,9 @@ def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> t
     """
     step = np.diff(ts)
     if not (np.isfinite(ts).all() and (step > 0).all() and 0.01 < np.median(step) < 1.0 and step.max() < 60.0):
-        raise InputError(f"time stamps do not increase in seconds (median step {np.median(step):g}); repair "
-                         "metadata.ts")
+        raise InputError(
+            f"time stamps do not increase in seconds (median step {np.median(step):g}); repair metadata.ts"
+        )
     ts = ts - ts[0]
     count = int(round(ts[-1] / DT)) + 1
     grid = np.arange(count) * DT
@@ -110,10 +111,10 @@ def causal_state(states: np.ndarray, valid: np.ndarray, frame: int) -> tuple[np.
     """
     first = max(frame - CAUSAL_WINDOW + 1, 0)
     time = (np.arange(first, frame + 1) - frame) * DT
-    known = np.flip(np.logical_and.accumulate(np.flip(valid[first:frame + 1], 0), axis=0), 0).astype(float)
+    known = np.flip(np.logical_and.accumulate(np.flip(valid[first : frame + 1], 0), axis=0), 0).astype(float)
     count = known.sum(0)
-    way = states[first:frame + 1, :, :2] - states[frame, :, :2]  # small numbers, so that the fit is exact
-    turned = np.unwrap(np.where(known > 0, states[first:frame + 1, :, 2] - states[frame, :, 2], 0.0), axis=0)
+    way = states[first : frame + 1, :, :2] - states[frame, :, :2]  # small numbers, so that the fit is exact
+    turned = np.unwrap(np.where(known > 0, states[first : frame + 1, :, 2] - states[frame, :, 2], 0.0), axis=0)
     basis = np.stack([np.ones_like(time), time, time**2], 1)
     position = _fit(basis, known, way, quadratic=count >= 5)
     turn = _fit(basis, known, turned[..., None], quadratic=np.zeros_like(count, bool))
@@ -141,8 +142,14 @@ def causal_past(states: np.ndarray, valid: np.ndarray, frame: int, speed: np.nda
     way = states[frames, :, :2] - states[frame, :, :2]
     angle = states[frame, :, 2]
     cos, sin = np.cos(angle), np.sin(angle)
-    seen = np.stack([way[..., 0] * cos + way[..., 1] * sin, way[..., 1] * cos - way[..., 0] * sin,
-                     wrap(states[frames, :, 2] - angle)], -1)
+    seen = np.stack(
+        [
+            way[..., 0] * cos + way[..., 1] * sin,
+            way[..., 1] * cos - way[..., 0] * sin,
+            wrap(states[frames, :, 2] - angle),
+        ],
+        -1,
+    )
     first = np.concatenate([np.zeros_like(seen[:1]), seen])[known.sum(0), np.arange(len(angle))]  # the earliest known
     since = np.maximum(back[:, None] - known.sum(0), 0) * DT
     straight = first - np.stack([since * speed, 0 * since, 0 * since], -1)

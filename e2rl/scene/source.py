@@ -47,8 +47,11 @@ def load_scenes(
             raise InputError("data.path is not set; pass data.path=FOLDER_OR_ZIP of ScenarioDescription pickles")
         scenes = _scenarionet(data, settings, starts)
     elif data.source == "bundled":
-        scenes = _cached(_fingerprint(bundled.asset_bytes(split), settings, starts), data, lambda: _build_all(
-            _from_starts(bundled.load_recordings(split), starts), settings, data, "bundled", split))
+        scenes = _cached(
+            _fingerprint(bundled.asset_bytes(split), settings, starts),
+            data,
+            lambda: _build_all(_from_starts(bundled.load_recordings(split), starts), settings, data, "bundled", split),
+        )
     elif data.source == "procedural":
         recordings = procedural.generate_recordings(data.count, data.seed, split)
         scenes = _build_all(_from_starts(recordings, starts), settings, data, "procedural", split)
@@ -65,16 +68,20 @@ def _fingerprint(content: bytes, settings: BuildSettings, extra) -> str:
 def _from_starts(recordings: list[Recording], starts: list[int] | None) -> list[Recording]:
     if starts is None:
         return recordings
-    return [replace(recording, current=start, scene_id=f"{recording.scene_id}@{start}")
-            for recording in recordings for start in starts]
+    return [
+        replace(recording, current=start, scene_id=f"{recording.scene_id}@{start}")
+        for recording in recordings
+        for start in starts
+    ]
 
 
 def _scenarionet(data, settings: BuildSettings, starts: list[int] | None) -> SceneSet:
     files = scenarionet.list_files(data.path)
     starts = list(data.starts) if starts is None and data.starts else starts
     digest = hashlib.sha256()
-    for path in sorted({container if Path(container).is_file() else os.path.join(container, member)
-                        for container, member in files}):
+    for path in sorted(
+        {container if Path(container).is_file() else os.path.join(container, member) for container, member in files}
+    ):
         digest.update(Path(path).read_bytes())
     locations = scenarionet.read_locations(data.path)
     split = data.split or Path(data.path).stem
@@ -156,11 +163,19 @@ def _assemble(rows: Generator[tuple], data, dataset: str | None, split: str) -> 
                 raise InputError(f"{reason} (data.skip_invalid=true leaves such scenes out)")
     if not good:
         left_out = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
-        raise InputError(f"no valid scene in {data.get('path') or f'{dataset} {split}'} ({left_out}); see the messages "
-                         "above, or pass other data")
+        raise InputError(
+            f"no valid scene in {data.get('path') or f'{dataset} {split}'} ({left_out}); see the messages "
+            "above, or pass other data"
+        )
     scenes, names, locations, sources = zip(*good, strict=True)
-    return SceneSet(stack([_tensors(scene) for scene in scenes]), list(names), list(locations), dataset or sources[0],
-                    split, dict(dropped))
+    return SceneSet(
+        stack([_tensors(scene) for scene in scenes]),
+        list(names),
+        list(locations),
+        dataset or sources[0],
+        split,
+        dict(dropped),
+    )
 
 
 def _cached(key: str, data, build) -> SceneSet:
@@ -176,16 +191,25 @@ def _cached(key: str, data, build) -> SceneSet:
     except OSError as error:
         raise InputError(f"data.cache={data.cache}: cannot be made ({error}); pass a writable folder") from error
     scenes = build()
-    names = {"scene_id": scenes.scene_id, "location": scenes.location, "dataset": scenes.dataset,
-             "split": scenes.split, "dropped": scenes.dropped}
+    names = {
+        "scene_id": scenes.scene_id,
+        "location": scenes.location,
+        "dataset": scenes.dataset,
+        "split": scenes.split,
+        "dropped": scenes.dropped,
+    }
     part = path.with_suffix(f".{os.getpid()}.part")
     try:
-        save_file({key: value.contiguous() for key, value in scenes.scenes.items()}, part,
-                  metadata={"scenes": json.dumps(names)})
+        save_file(
+            {key: value.contiguous() for key, value in scenes.scenes.items()},
+            part,
+            metadata={"scenes": json.dumps(names)},
+        )
         part.replace(path)
     except OSError as error:
-        raise InputError(f"data.cache={data.cache}: cannot be written ({error}); free space, or pass another "
-                         "folder") from error
+        raise InputError(
+            f"data.cache={data.cache}: cannot be written ({error}); free space, or pass another folder"
+        ) from error
     finally:
         part.unlink(missing_ok=True)
     return scenes

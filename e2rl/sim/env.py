@@ -25,10 +25,30 @@ from e2rl.sim.step import Rules, Running, Stepped, replay_step, step
 from e2rl.sim.traffic import Traffic
 from e2rl.sim.world import World
 
-STARTING = ("start", "start_accel", "start_yaw_rate", "size", "agent_type", "field", "field_origin", "light_state",
-            "route_points", "route_length", "route_open", "route_limit", "route_light", "route_light_s", "route_log")
+STARTING = (
+    "start",
+    "start_accel",
+    "start_yaw_rate",
+    "size",
+    "agent_type",
+    "field",
+    "field_origin",
+    "light_state",
+    "route_points",
+    "route_length",
+    "route_open",
+    "route_limit",
+    "route_light",
+    "route_light_s",
+    "route_log",
+)
 DEFAULT_REWARD = {
-    "progress": 0.1, "contact": -10.0, "off_road": -5.0, "comfort": -0.02, "speeding": -0.1, "lane_offset": -0.02,
+    "progress": 0.1,
+    "contact": -10.0,
+    "off_road": -5.0,
+    "comfort": -0.02,
+    "speeding": -0.1,
+    "lane_offset": -0.02,
 }
 
 
@@ -70,14 +90,22 @@ class DrivingEnv(EnvBase):
         self.scene = scenes.batch(torch.zeros(batch_size, dtype=torch.long)).to(device)
         self.horizon = self.scene["logged"].shape[1] - 1
         weights = torch.tensor(check_weights(settings.reward), device=self.device)
-        self._rules = Rules(self.horizon, settings.end_on_contact, settings.end_off_road, weights, self._low,
-                            self._high)
+        self._rules = Rules(
+            self.horizon, settings.end_on_contact, settings.end_off_road, weights, self._low, self._high
+        )
         self._traffic, self._lens = Traffic(self.scene), lens(self.device)
         self._setting = setting_of(self.scene, mission_of(self.scene))
         zeros = torch.zeros(batch_size, device=device)
         flags = torch.zeros(batch_size, dtype=torch.bool, device=device)
-        self._running = Running(zeros.long(), zeros[:, None].repeat(1, 4), zeros[:, None].repeat(1, 2),
-                                Place(zeros, zeros, zeros), flags, flags, zeros)
+        self._running = Running(
+            zeros.long(),
+            zeros[:, None].repeat(1, 4),
+            zeros[:, None].repeat(1, 2),
+            Place(zeros, zeros, zeros),
+            flags,
+            flags,
+            zeros,
+        )
 
     def _make_specs(self, batch: int) -> None:
         low = torch.tensor([-self.settings.max_braking, -self.settings.max_yaw_rate], device=self.device)
@@ -92,15 +120,24 @@ class DrivingEnv(EnvBase):
             return Unbounded((batch, size), dtype=dtype, device=self.device)
 
         self.observation_spec = Composite(
-            observation=number(torch.float32, OBSERVATION_SIZE), scene_index=number(torch.int64),
+            observation=number(torch.float32, OBSERVATION_SIZE),
+            scene_index=number(torch.int64),
             timestep=number(torch.int64),
-            metrics=Composite(contact=flag(), contact_vru=flag(), off_road=flag(), progress=number(torch.float32),
-                              shape=[batch], device=self.device),
-            shape=[batch], device=self.device,
+            metrics=Composite(
+                contact=flag(),
+                contact_vru=flag(),
+                off_road=flag(),
+                progress=number(torch.float32),
+                shape=[batch],
+                device=self.device,
+            ),
+            shape=[batch],
+            device=self.device,
         )
         self.reward_spec = number(torch.float32)
-        self.full_done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=[batch],
-                                        device=self.device)
+        self.full_done_spec = Composite(
+            done=flag(), terminated=flag(), truncated=flag(), shape=[batch], device=self.device
+        )
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
@@ -134,11 +171,13 @@ class DrivingEnv(EnvBase):
         valid = torch.where(first, self.scene["valid"], valid)
         accel = torch.where(first, self.scene["start_accel"], accel)
         return World(
-            scene=self.scene, step=now.clock,
+            scene=self.scene,
+            step=now.clock,
             states=torch.cat([now.ego[:, None], states[:, 1:]], 1),
             valid=torch.cat([now.present[:, None], valid[:, 1:]], 1),
             accel=torch.cat([now.action[:, :1], accel[:, 1:]], 1),
-            route=self._traffic.route, plan=self._traffic.plan(now.clock),
+            route=self._traffic.route,
+            plan=self._traffic.plan(now.clock),
         )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_) -> TensorDict:
@@ -173,15 +212,23 @@ class DrivingEnv(EnvBase):
 
         old = self._running
         place = Place(*(put(*pair) for pair in zip(old.place, started.place, strict=True)))
-        self._running = Running(*(place if isinstance(new, Place) else put(value, new)
-                                  for value, new in zip(old, started, strict=True)))
+        self._running = Running(
+            *(place if isinstance(new, Place) else put(value, new) for value, new in zip(old, started, strict=True))
+        )
 
     def _reset_output(self) -> TensorDict:
         now, world = self._running, self.world()
         turn = axes(now.ego)
         around = look_around(now.ego, turn, self._setting, world.states[:, 1:], world.valid[:, 1:], world.accel[:, 1:])
-        observation, _ = observe(self._lens, self._setting, EgoState(now.ego, turn, now.action, now.place), now.clock,
-                                 self.horizon, probe(self._lens, self._setting, now.ego, turn), around)
+        observation, _ = observe(
+            self._lens,
+            self._setting,
+            EgoState(now.ego, turn, now.action, now.place),
+            now.clock,
+            self.horizon,
+            probe(self._lens, self._setting, now.ego, turn),
+            around,
+        )
         none = torch.zeros_like(now.present)
         return self._output(Stepped(observation, now.start_s, none, none, none, none, none, now.place.s - now.start_s))
 
@@ -198,15 +245,19 @@ class DrivingEnv(EnvBase):
         """What an environment returns of a step but the reward."""
         shape, device = self.batch_size, self.device
         metrics = {name: getattr(stepped, name)[:, None] for name in ("contact", "contact_vru", "off_road", "progress")}
-        return TensorDict({
-            "observation": stepped.observation,
-            "scene_index": self.scene["scene_index"][:, None].clone(),
-            "timestep": self._running.clock[:, None].clone(),
-            "metrics": TensorDict(metrics, batch_size=shape, device=device),
-            "done": (stepped.terminated | stepped.truncated)[:, None],
-            "terminated": stepped.terminated[:, None],
-            "truncated": stepped.truncated[:, None],
-        }, batch_size=shape, device=device)
+        return TensorDict(
+            {
+                "observation": stepped.observation,
+                "scene_index": self.scene["scene_index"][:, None].clone(),
+                "timestep": self._running.clock[:, None].clone(),
+                "metrics": TensorDict(metrics, batch_size=shape, device=device),
+                "done": (stepped.terminated | stepped.truncated)[:, None],
+                "terminated": stepped.terminated[:, None],
+                "truncated": stepped.truncated[:, None],
+            },
+            batch_size=shape,
+            device=device,
+        )
 
 
 @cache
@@ -214,6 +265,7 @@ def compiled(function: Callable) -> Callable:
     """torch.compile of a step, one for all environments; raises InputError where nothing can compile C++."""
     names = (os.environ.get("CXX", "c++"), "c++", "g++", "clang++")
     if not any(shutil.which(name) for name in names):
-        raise InputError("sim.compile=true: no C++ compiler found (CXX, c++, g++, clang++); install one or leave it "
-                         "false")
+        raise InputError(
+            "sim.compile=true: no C++ compiler found (CXX, c++, g++, clang++); install one or leave it false"
+        )
     return torch.compile(function, fullgraph=True)

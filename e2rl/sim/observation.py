@@ -37,9 +37,13 @@ class Lens(NamedTuple):
 def lens(device: torch.device) -> Lens:
     """The Lens on a device, made once."""
     numbers = lambda *values: torch.tensor(values, device=device)  # noqa: E731
-    return Lens(numbers(*LOOK_AHEAD, 0.0), torch.cartesian_prod(numbers(*PROBE_X), numbers(*PROBE_Y)),
-                numbers(FAR, NEAR), numbers(FAR, NEAR, 1.0, 1.0, SPEED, SPEED, SPEED, 4.0, 2.5, 1.0, 1.0)[:, None],
-                numbers(1, 2, 3))
+    return Lens(
+        numbers(*LOOK_AHEAD, 0.0),
+        torch.cartesian_prod(numbers(*PROBE_X), numbers(*PROBE_Y)),
+        numbers(FAR, NEAR),
+        numbers(FAR, NEAR, 1.0, 1.0, SPEED, SPEED, SPEED, 4.0, 2.5, 1.0, 1.0)[:, None],
+        numbers(1, 2, 3),
+    )
 
 
 class EgoState(NamedTuple):
@@ -59,8 +63,13 @@ def observe(
     step [B] of horizon; beyond [B, 25]: `probe` there; around: the others.
     """
     route, limit = route_features(lens, setting, ego)
-    parts = [ego_features(setting, ego, limit, step / horizon), route, light_features(lens, setting, step, ego.place.s),
-             (beyond / 4).clamp(-1, 1), agent_features(lens, setting, ego, around)]
+    parts = [
+        ego_features(setting, ego, limit, step / horizon),
+        route,
+        light_features(lens, setting, step, ego.place.s),
+        (beyond / 4).clamp(-1, 1),
+        agent_features(lens, setting, ego, around),
+    ]
     return torch.cat(parts, -1), limit
 
 
@@ -74,10 +83,22 @@ def ego_features(setting: Setting, ego: EgoState, limit: Tensor, time: Tensor) -
     """[B, 11]: speed, last action, lane pose, speed limit, way left before the map ends, size, share of time gone."""
     state, action, place, size = ego.state, ego.action, ego.place, setting.size
     turned = state[:, 2] - place.heading
-    return torch.stack([
-        state[:, 3] / SPEED, action[:, 0] / 4, action[:, 1], (place.d / 3).clamp(-2, 2), turned.sin(), turned.cos(),
-        limit / SPEED, ((setting.end - place.s) / 100).clamp(0, 1), size[:, 0] / 5, size[:, 1] / 2, time,
-    ], -1)
+    return torch.stack(
+        [
+            state[:, 3] / SPEED,
+            action[:, 0] / 4,
+            action[:, 1],
+            (place.d / 3).clamp(-2, 2),
+            turned.sin(),
+            turned.cos(),
+            limit / SPEED,
+            ((setting.end - place.s) / 100).clamp(0, 1),
+            size[:, 0] / 5,
+            size[:, 1] / 2,
+            time,
+        ],
+        -1,
+    )
 
 
 def route_features(lens: Lens, setting: Setting, ego: EgoState) -> tuple[Tensor, Tensor]:
@@ -110,9 +131,15 @@ def agent_features(lens: Lens, setting: Setting, ego: EgoState, around: Around) 
     apart = around.local.square().sum(1).masked_fill(~around.present, torch.inf)
     count = min(NEAREST, apart.shape[1])
     index = apart.topk(count, dim=1, largest=False).indices
-    everybody = torch.cat([
-        around.local, around.direction, setting.half,
-        torch.stack([around.gap, around.speed, around.accel, setting.vehicle, around.present], 1)], 1)
+    everybody = torch.cat(
+        [
+            around.local,
+            around.direction,
+            setting.half,
+            torch.stack([around.gap, around.speed, around.accel, setting.vehicle, around.present], 1),
+        ],
+        1,
+    )
     near = everybody.gather(2, index[:, None].expand(-1, everybody.shape[1], -1))
     local, direction, half, gap, speed, accel, vehicle, present = near.split((2, 2, 2, 1, 1, 1, 1, 1), 1)
     velocity = speed * direction - torch.nn.functional.pad(ego.state[:, 3:, None], (0, 0, 0, 1))

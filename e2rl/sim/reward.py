@@ -11,8 +11,15 @@ TERMS = ("progress", "contact", "off_road", "comfort", "speeding", "lane_offset"
 
 
 def reward_terms(
-    progress: Tensor, contact: Tensor, off_road: Tensor, action: Tensor, last_action: Tensor, speed: Tensor,
-    limit: Tensor, offset: Tensor, dt: float,
+    progress: Tensor,
+    contact: Tensor,
+    off_road: Tensor,
+    action: Tensor,
+    last_action: Tensor,
+    speed: Tensor,
+    limit: Tensor,
+    offset: Tensor,
+    dt: float,
 ) -> dict[str, Tensor]:
     """The TERMS, each [B], from what happened in one step of dt seconds.
 

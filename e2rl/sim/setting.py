@@ -59,9 +59,20 @@ def setting_of(scene: TensorDictBase, mission: Mission) -> Setting:
     """The Setting of scenes [B] whose egos have these missions; field, lights and sizes are the scenes' own storage."""
     half = scene["size"][:, 1:].transpose(1, 2) / 2
     row = torch.arange(len(half), device=half.device)[:, None]
-    return Setting(mission.points, legs_of(mission.points, mission.limit), row, mission.end, mission.light,
-                   mission.light_s, scene["light_state"], scene["field"], scene["field_origin"], scene["size"][:, 0],
-                   half.contiguous(), scene["agent_type"][:, 1:] == VEHICLE)
+    return Setting(
+        mission.points,
+        legs_of(mission.points, mission.limit),
+        row,
+        mission.end,
+        mission.light,
+        mission.light_s,
+        scene["light_state"],
+        scene["field"],
+        scene["field_origin"],
+        scene["size"][:, 0],
+        half.contiguous(),
+        scene["agent_type"][:, 1:] == VEHICLE,
+    )
 
 
 def write_rows(setting: Setting, rows: Tensor, new: Setting) -> None:

@@ -65,7 +65,11 @@ def step(
 
 
 def replay_step(
-    running: Running, logged: tuple[Tensor, Tensor], traffic: tuple[Tensor, Tensor], setting: Setting, rules: Rules,
+    running: Running,
+    logged: tuple[Tensor, Tensor],
+    traffic: tuple[Tensor, Tensor],
+    setting: Setting,
+    rules: Rules,
     lens: Lens,
 ) -> tuple[Running, Stepped]:
     """`step` of egos that follow their recording, states [B, T+1, N, 4] and presence [B, T+1, N] of it, and are gone
@@ -77,7 +81,12 @@ def replay_step(
 
 
 def advance(
-    running: Running, ego: Tensor, present: Tensor, traffic: tuple[Tensor, Tensor], setting: Setting, rules: Rules,
+    running: Running,
+    ego: Tensor,
+    present: Tensor,
+    traffic: tuple[Tensor, Tensor],
+    setting: Setting,
+    rules: Rules,
     lens: Lens,
 ) -> tuple[Running, Stepped]:
     """What comes of a step that leads the egos to states ego [B, 4]; present [B]: those still there."""
@@ -98,5 +107,13 @@ def advance(
     terms = reward_terms(way, touched, off_road, action, running.action, ego[:, 3], limit, place.d, DT)
     terminated = (touched & rules.end_on_contact) | (off_road & rules.end_off_road)
     after = Running(clock, ego, action, place, ~left, running.been_on_road | ~off, running.start_s)
-    return after, Stepped(observation, weighted_sum(terms, rules.weights), contact, contact_vru, off_road, terminated,
-                        (clock >= rules.horizon) | left, place.s - running.start_s)
+    return after, Stepped(
+        observation,
+        weighted_sum(terms, rules.weights),
+        contact,
+        contact_vru,
+        off_road,
+        terminated,
+        (clock >= rules.horizon) | left,
+        place.s - running.start_s,
+    )

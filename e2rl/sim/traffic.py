@@ -24,14 +24,16 @@ class Traffic:
         """Trajectories of scenes rows [b] from their coming reset on; raises InputError on a wrong shape or NaN."""
         expected = (len(rows), *self.states.shape[1:])
         if tuple(states.shape) != expected or tuple(valid.shape) != expected[:-1]:
-            raise InputError(f"set_traffic: states {tuple(states.shape)} and valid {tuple(valid.shape)} for "
-                             f"{len(rows)} rows; expected {expected} and {expected[:-1]}")
+            raise InputError(
+                f"set_traffic: states {tuple(states.shape)} and valid {tuple(valid.shape)} for "
+                f"{len(rows)} rows; expected {expected} and {expected[:-1]}"
+            )
         if not torch.isfinite(states[valid]).all():
             raise InputError("set_traffic: NaN or infinite states marked valid; mark them invalid")
         device = self.states.device
-        self._scheduled.append(tuple(
-            value if value is None else value.to(device) for value in (rows, states, valid, route)
-        ))
+        self._scheduled.append(
+            tuple(value if value is None else value.to(device) for value in (rows, states, valid, route))
+        )
 
     def reset(self, scene: TensorDictBase, index: Tensor) -> None:
         """Scenes index [b] begin anew: with what was scheduled for them, else with their recording; plans are void."""

@@ -60,8 +60,9 @@ def measure_agreement(
     ours, theirs, compared = [], [], 0
     for rows in tqdm(torch.arange(len(scenes)).split(BATCH), "scenes", unit="batch"):
         scene = scenes.batch(rows)
-        world = World(scene, torch.zeros_like(rows), scene["start"], scene["valid"], scene["start_accel"],
-                      scene["route_log"])
+        world = World(
+            scene, torch.zeros_like(rows), scene["start"], scene["valid"], scene["start_accel"], scene["route_log"]
+        )
         rules = feasible_vehicles(scene, world, settings)
         criteria = torch.stack([rules.associated, rules.conflicting, rules.relevant], -1)
         for row, found in enumerate(reasoner.judge(scene, world, rules)):
@@ -77,6 +78,8 @@ def measure_agreement(
 def agreement_table(found: dict[str, Agreement], compared: int, scenes: int) -> str:
     """Raw agreement, Cohen's kappa and counts, as text."""
     head = f"{'':<20}{'agree':>8}{'kappa':>8}{'n':>7}{'both':>7}{'neither':>9}{'rules only':>12}{'model only':>12}"
-    lines = [f"{name:<20}{100 * a.raw:>7.1f}%{a.kappa:>8.3f}{a.n:>7}{a.both:>7}{a.neither:>9}{a.first:>12}"
-             f"{a.second:>12}" for name, a in found.items()]
+    lines = [
+        f"{name:<20}{100 * a.raw:>7.1f}%{a.kappa:>8.3f}{a.n:>7}{a.both:>7}{a.neither:>9}{a.first:>12}{a.second:>12}"
+        for name, a in found.items()
+    ]
     return "\n".join([head, *lines, f"{compared} of {scenes} scenes; in the others the model gave no usable answer"])

@@ -159,8 +159,13 @@ def _targets(riders: _Riders, path: Tensor, size: Tensor, settings: AnchorSettin
     touch = (riders.size[..., 0] + size[..., 0]) / 2
     aside = (1 - along**2) / path[:, :, None, :, 3].clamp(min=1.0)
     corridor = (riders.size[..., 1] + size[..., 1]) / 2 + settings.margin
-    return {"s": s, "d": d, "slack": 0.8 * touch[..., None, None] * along.clamp(min=0) ** 2, "aside": aside,
-            "corridor": corridor}
+    return {
+        "s": s,
+        "d": d,
+        "slack": 0.8 * touch[..., None, None] * along.clamp(min=0) ** 2,
+        "aside": aside,
+        "corridor": corridor,
+    }
 
 
 def _best(cost: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
@@ -168,8 +173,9 @@ def _best(cost: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
     pick = cost.flatten(2).argmin(-1)
     flat = [value.flatten(2, 3) for value in values]
     at = [pick[..., None, None] if value.dim() == 4 else pick[..., None] for value in flat]
-    rows = [value.gather(2, i.expand(*i.shape[:3], *value.shape[3:]))[:, :, 0]
-            for value, i in zip(flat, at, strict=True)]
+    rows = [
+        value.gather(2, i.expand(*i.shape[:3], *value.shape[3:]))[:, :, 0] for value, i in zip(flat, at, strict=True)
+    ]
     return pick, *rows
 
 
@@ -186,8 +192,18 @@ def _riders(scene: TensorDictBase, world: World, index: Tensor, settings: Anchor
     usable = of("route_valid") & (reachable | (candidate == route))
     if keep_route:
         usable = usable & (route >= 0)
-    return _Riders(candidate, routes, usable, end, s, d, states[..., 3], take(world.accel[:, :vehicles], index),
-                   take(scene["size"], index), turn_envelope(routes, s, settings))
+    return _Riders(
+        candidate,
+        routes,
+        usable,
+        end,
+        s,
+        d,
+        states[..., 3],
+        take(world.accel[:, :vehicles], index),
+        take(scene["size"], index),
+        turn_envelope(routes, s, settings),
+    )
 
 
 def _propose(riders: _Riders, path: Tensor, size: Tensor, settings: AnchorSettings):
@@ -206,8 +222,16 @@ def _propose(riders: _Riders, path: Tensor, size: Tensor, settings: AnchorSettin
     return pick // fine.shape[-1], knots, offset, cost
 
 
-def propose(scene: TensorDictBase, world: World, skeleton: Skeleton, ego_plan: Tensor, settings: AnchorSettings,
-            interception: InterceptionSettings, eta: Tensor, keep_route: bool = False) -> Anchor:
+def propose(
+    scene: TensorDictBase,
+    world: World,
+    skeleton: Skeleton,
+    ego_plan: Tensor,
+    settings: AnchorSettings,
+    interception: InterceptionSettings,
+    eta: Tensor,
+    keep_route: bool = False,
+) -> Anchor:
     """The skeleton-consistent clean state of Sec. IV-A3 for scenes [B]; ego_plan [B, H >= 50, 4], eta [B].
 
     Links are worked off from the ego outwards: those that act on the ego meet its plan, on a lane or (where that costs
@@ -218,9 +242,14 @@ def propose(scene: TensorDictBase, world: World, skeleton: Skeleton, ego_plan: T
     times = DT * torch.arange(1, HORIZON + 1, device=ego_plan.device)
     expected = cruise(scene, world, times)
     expected[:, 0] = ego_plan[:, :HORIZON].detach()
-    found = Anchor(world.route.clone(), expected.new_zeros(*world.route.shape, KNOTS), skeleton.coalition & False,
-                   expected.new_full(world.route.shape, torch.inf), skeleton.coalition & False,
-                   torch.zeros_like(scene["route_points"][:, :, 0]))
+    found = Anchor(
+        world.route.clone(),
+        expected.new_zeros(*world.route.shape, KNOTS),
+        skeleton.coalition & False,
+        expected.new_full(world.route.shape, torch.inf),
+        skeleton.coalition & False,
+        torch.zeros_like(scene["route_points"][:, :, 0]),
+    )
     for depth in range(1, int(skeleton.depth.max()) + 1):
         index, present = compact(skeleton.depth == depth)
         riders = _riders(scene, world, index, settings, keep_route)
@@ -253,16 +282,31 @@ def _rides(riders: _Riders, pick: Tensor, knots: Tensor) -> Tensor:
     return ride(own, riders.s.gather(2, pick) + way, riders.d.gather(2, pick) * fade(way, riders.v[..., None]), v)
 
 
-def _intercept(scene: TensorDictBase, world: World, index: Tensor, expected: Tensor, target: Tensor, eta: Tensor,
-               settings: InterceptionSettings) -> Interception:
+def _intercept(
+    scene: TensorDictBase,
+    world: World,
+    index: Tensor,
+    expected: Tensor,
+    target: Tensor,
+    eta: Tensor,
+    settings: InterceptionSettings,
+) -> Interception:
     """Interceptions of slots index [B, M]; everybody else is expected to drive as in expected [B, V, H, 4]."""
     vehicles = expected.shape[1]
     row = torch.arange(vehicles, device=index.device)
     there = world.valid[:, None, :vehicles] & (row != index[..., None]) & (row != target[..., None])
     sizes, wide = scene["size"][:, :vehicles], (-1, index.shape[1], -1, -1)
     others = (expected[:, None].expand(*wide, -1), sizes[:, None].expand(wide), there)
-    return intercept(scene, take(world.states, index), take(sizes, index), take(expected, target), take(sizes, target),
-                     eta, others, settings)
+    return intercept(
+        scene,
+        take(world.states, index),
+        take(sizes, index),
+        take(expected, target),
+        take(sizes, target),
+        eta,
+        others,
+        settings,
+    )
 
 
 def _write(full: Tensor, index: Tensor, mask: Tensor, rows: Tensor) -> Tensor:
@@ -273,8 +317,9 @@ def _write(full: Tensor, index: Tensor, mask: Tensor, rows: Tensor) -> Tensor:
     return full.scatter(1, at, torch.where(mask, rows, full.gather(1, at)))
 
 
-def blend_clean(x: Tensor, x0: Tensor, anchor_x0: Tensor, alpha: Tensor | float, mask: Tensor,
-                strength: float) -> Tensor:
+def blend_clean(
+    x: Tensor, x0: Tensor, anchor_x0: Tensor, alpha: Tensor | float, mask: Tensor, strength: float
+) -> Tensor:
     """Anchoring that keeps the noise (design.md 7.2): x0' = (1 - a) x0 + a anchor_x0 on `mask`, the noise of x as it
     was.
 
@@ -285,8 +330,15 @@ def blend_clean(x: Tensor, x0: Tensor, anchor_x0: Tensor, alpha: Tensor | float,
     return torch.where(mask, x + alpha * strength * (anchor_x0 - x0), x)
 
 
-def blend_literal(x: Tensor, anchor_x0: Tensor, alpha: Tensor | float, sigma: Tensor | float, mask: Tensor,
-                  strength: float, noise: Tensor) -> Tensor:
+def blend_literal(
+    x: Tensor,
+    anchor_x0: Tensor,
+    alpha: Tensor | float,
+    sigma: Tensor | float,
+    mask: Tensor,
+    strength: float,
+    noise: Tensor,
+) -> Tensor:
     """Anchoring as printed, eq. (anchor_injection): (1 - a) x + a (alpha anchor_x0 + sigma noise) on `mask`.
 
     Independent noises shrink the noise variance by (1 - a)^2 + a^2; kept for the ablation. Shapes as in blend_clean,

@@ -48,13 +48,19 @@ class ControlSettings:
     transport_budget: float | None = None
 
     def __post_init__(self):
-        for name, choices in (("gradient", ("denoiser", "clean")), ("scaling", ("score", "sigma", "unit")),
-                              ("feasibility_scope", ("all", "support")), ("anchoring", ("clean", "literal", "off"))):
+        for name, choices in (
+            ("gradient", ("denoiser", "clean")),
+            ("scaling", ("score", "sigma", "unit")),
+            ("feasibility_scope", ("all", "support")),
+            ("anchoring", ("clean", "literal", "off")),
+        ):
             if getattr(self, name) not in choices:
                 raise InputError(f"synthesizer.control.{name} is {getattr(self, name)!r}; choose one of {choices}")
         if self.transport_budget is not None and not self.transport_budget >= 0:
-            raise InputError(f"synthesizer.control.transport_budget is {self.transport_budget}; expected at least 0, "
-                             "or null for no limit")
+            raise InputError(
+                f"synthesizer.control.transport_budget is {self.transport_budget}; expected at least 0, "
+                "or null for no limit"
+            )
 
 
 def clip_rows(gradient: Tensor, limit: float) -> Tensor:
@@ -79,14 +85,27 @@ class SparseControl:
     shift energy, ||shift||^2 / (2 sigma^2), after sampling.
     """
 
-    def __init__(self, prior: Prior, settings: ControlSettings, potentials: PotentialSettings, where: PotentialContext,
-                 coalition: Tensor, eta: Tensor, anchor: Anchor, strength: float, anchor_noise: Tensor,
-                 react: Callable[[Tensor], Tensor] | None = None):
+    def __init__(
+        self,
+        prior: Prior,
+        settings: ControlSettings,
+        potentials: PotentialSettings,
+        where: PotentialContext,
+        coalition: Tensor,
+        eta: Tensor,
+        anchor: Anchor,
+        strength: float,
+        anchor_noise: Tensor,
+        react: Callable[[Tensor], Tensor] | None = None,
+    ):
         self.prior, self.settings, self.potentials, self.where = prior, settings, potentials, where
         self.coalition, self.eta, self.anchor, self.strength = coalition, eta, anchor, strength
         self.anchor_noise, self.react = anchor_noise, react
-        self.refreshed = {round(prior.sampler.steps * i / (settings.lookahead + 1))
-                          for i in range(1, settings.lookahead + 1)} if react is not None else set()
+        self.refreshed = (
+            {round(prior.sampler.steps * i / (settings.lookahead + 1)) for i in range(1, settings.lookahead + 1)}
+            if react is not None
+            else set()
+        )
         levels = prior.schedule.levels(prior.sampler.steps)
         nearest = int((levels[:-1] - settings.anchor_level).abs().argmin())
         self.anchor_step = prior.sampler.steps - nearest
@@ -94,8 +113,9 @@ class SparseControl:
         self.jump = torch.zeros(coalition.shape, device=eta.device)
         self.hunts = bool(coalition.any())  # asked once, on the host: without a coalition V_adv is 0
 
-    def __call__(self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Callable[[Tensor], Tensor]
-                 ) -> tuple[Tensor, Tensor, Tensor]:
+    def __call__(
+        self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """(x after anchoring, denoised x0, controlled x0) at step k; anchoring comes first (design.md 7.2)."""
         if k == self.anchor_step and self.settings.anchoring != "off" and self.strength > 0:
             x = self._anchored(x, level, context, denoise)
@@ -108,8 +128,9 @@ class SparseControl:
         acts = (context.active & (self.eta > 0)[:, None])[..., None]
         return x, x0, x0 - torch.where(acts, shift, 0.0)
 
-    def _gradients(self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Callable[[Tensor], Tensor]
-                   ) -> tuple[Tensor, Tensor, Tensor]:
+    def _gradients(
+        self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """(x0, grad V_adv, grad V_feas): the one by x or x0, as set, the other by x0."""
         towards = away = torch.zeros_like(x)
         mends = k <= self.mend_step

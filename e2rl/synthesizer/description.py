@@ -58,10 +58,13 @@ def present_vehicles(scene: TensorDictBase, world: World, row: int) -> list[int]
 
 def describe_ego(scene: TensorDictBase, world: World, row: int) -> str:
     """How the ego of scene `row` drives, and where its mission leads."""
-    mission = mission_of(scene[row:row + 1])
-    limit, s = float(mission.limit[0, 10]), project(world.states[row:row + 1, :1, :2], mission.points)[0][0, 0]
-    return (f"The ego drives at {world.states[row, 0, 3]:.1f} m/s" + (f" (limit {limit:.0f} m/s)" if limit else "")
-            + f"; its way {_way(mission.points[0], s)}.")
+    mission = mission_of(scene[row : row + 1])
+    limit, s = float(mission.limit[0, 10]), project(world.states[row : row + 1, :1, :2], mission.points)[0][0, 0]
+    return (
+        f"The ego drives at {world.states[row, 0, 3]:.1f} m/s"
+        + (f" (limit {limit:.0f} m/s)" if limit else "")
+        + f"; its way {_way(mission.points[0], s)}."
+    )
 
 
 def describe_vehicle(scene: TensorDictBase, world: World, judged: Feasibility, row: int, vehicle: int) -> str:
@@ -69,10 +72,14 @@ def describe_vehicle(scene: TensorDictBase, world: World, judged: Feasibility, r
     conflict table of the rules, without their verdict)."""
     state, ego, size = world.states[row, vehicle], world.states[row, 0], scene["size"][row, vehicle].tolist()
     here = slice(vehicle, vehicle + 1)
-    s, d, turned = (x[0, 0] for x in place(world.states[row:row + 1, here], scene["route_points"][row:row + 1, here]))
-    lines = [f"Vehicle {vehicle} ({size[0]:.1f} x {size[1]:.1f} m) is {_bearing(to_frame(state[:2], ego))}, "
-             f"{_course(float(state[2] - ego[2]))}, at {state[3]:.1f} m/s"
-             + (", parked." if scene["parked"][row, vehicle] else ".")]
+    s, d, turned = (
+        x[0, 0] for x in place(world.states[row : row + 1, here], scene["route_points"][row : row + 1, here])
+    )
+    lines = [
+        f"Vehicle {vehicle} ({size[0]:.1f} x {size[1]:.1f} m) is {_bearing(to_frame(state[:2], ego))}, "
+        f"{_course(float(state[2] - ego[2]))}, at {state[3]:.1f} m/s"
+        + (", parked." if scene["parked"][row, vehicle] else ".")
+    ]
     table = judged.conflicts
     for candidate in scene["route_valid"][row, vehicle].nonzero()[:, 0].tolist():
         at = (row, vehicle, candidate)
@@ -81,21 +88,32 @@ def describe_vehicle(scene: TensorDictBase, world: World, judged: Feasibility, r
         text += _way(scene["route_points"][at], s[candidate])
         text += _lights(scene[row], int(world.step[row]), vehicle, candidate, float(s[candidate]))
         if table.has[at]:
-            text += (f"; meets the ego's way in {table.own_s[at] - s[candidate]:.0f} m, both can be there "
-                     f"{table.earliest[at]:.1f} to {table.latest[at]:.1f} s from now, {table.offset[at]:.1f} s apart "
-                     "at present speeds")
+            text += (
+                f"; meets the ego's way in {table.own_s[at] - s[candidate]:.0f} m, both can be there "
+                f"{table.earliest[at]:.1f} to {table.latest[at]:.1f} s from now, {table.offset[at]:.1f} s apart "
+                "at present speeds"
+            )
         else:
             text += "; does not meet the ego's way in time"
         lines.append(text + ".")
     return " ".join(lines if len(lines) > 1 else [*lines, "It follows no lane."])
 
 
-def describe(scene: TensorDictBase, world: World, vehicle: int, row: int = 0,
-             settings: FeasibilitySettings | None = None) -> str:
+def describe(
+    scene: TensorDictBase, world: World, vehicle: int, row: int = 0, settings: FeasibilitySettings | None = None
+) -> str:
     """The ego and `vehicle` of scene `row` of the batch [B] in words, with the verdict of the rules: for people."""
     judged = feasible_vehicles(scene, world, settings or FeasibilitySettings())
-    verdict = {"on a lane": judged.associated, "can meet the ego": judged.conflicting,
-               "moving or in the way": judged.relevant}
+    verdict = {
+        "on a lane": judged.associated,
+        "can meet the ego": judged.conflicting,
+        "moving or in the way": judged.relevant,
+    }
     rules = ", ".join(f"{name}: {'yes' if mask[row, vehicle] else 'no'}" for name, mask in verdict.items())
-    return " ".join([describe_ego(scene, world, row), describe_vehicle(scene, world, judged, row, vehicle),
-                     f"Rules: {rules}. Feasible: {'yes' if judged.mask[row, vehicle] else 'no'}."])
+    return " ".join(
+        [
+            describe_ego(scene, world, row),
+            describe_vehicle(scene, world, judged, row, vehicle),
+            f"Rules: {rules}. Feasible: {'yes' if judged.mask[row, vehicle] else 'no'}.",
+        ]
+    )

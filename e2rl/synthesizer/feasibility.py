@@ -37,11 +37,14 @@ class FeasibilitySettings:
 
     def __post_init__(self):
         if min(self.horizon, self.brake, self.push, self.ego_brake, self.ego_push, self.top_speed) <= 0:
-            raise InputError("synthesizer.feasibility: horizon, brake, push, ego_brake, ego_push and top_speed must be "
-                             "positive")
+            raise InputError(
+                "synthesizer.feasibility: horizon, brake, push, ego_brake, ego_push and top_speed must be positive"
+            )
         if not 0 < self.sample_spacing < self.sample_reach or self.corridor < 0.8 * self.sample_spacing:
-            raise InputError("synthesizer.feasibility: sample_spacing must be below sample_reach and at most 1.25 x "
-                             f"corridor ({self.corridor} m), or crossings fall between the samples")
+            raise InputError(
+                "synthesizer.feasibility: sample_spacing must be below sample_reach and at most 1.25 x "
+                f"corridor ({self.corridor} m), or crossings fall between the samples"
+            )
 
 
 @dataclass(frozen=True)
@@ -122,8 +125,15 @@ def _meetings(samples: dict[str, Tensor], ego: dict[str, Tensor], settings: Feas
     return pick[:, 0] // count, pick[:, 0] % count, *found
 
 
-def _sample(route: Tensor, s: Tensor, end: Tensor, speed: Tensor, length: Tensor, limits: tuple[float, float, float],
-            settings: FeasibilitySettings) -> dict[str, Tensor]:
+def _sample(
+    route: Tensor,
+    s: Tensor,
+    end: Tensor,
+    speed: Tensor,
+    length: Tensor,
+    limits: tuple[float, float, float],
+    settings: FeasibilitySettings,
+) -> dict[str, Tensor]:
     """Samples ahead of arc length s [Q] on route [Q, P, 2]: place, heading, and when the vehicle can be there [Q,
     K].
     """
@@ -132,8 +142,15 @@ def _sample(route: Tensor, s: Tensor, end: Tensor, speed: Tensor, length: Tensor
     xy, heading, _ = interpolate(route, arc)
     way = way.expand_as(arc)
     earliest, latest = _presence(way, speed[:, None], length[:, None], limits)
-    return {"arc": arc, "xy": xy, "heading": heading, "earliest": earliest, "latest": latest,
-            "nominal": way / speed.clamp(min=1.0)[:, None], "inside": arc <= end[:, None]}
+    return {
+        "arc": arc,
+        "xy": xy,
+        "heading": heading,
+        "earliest": earliest,
+        "latest": latest,
+        "nominal": way / speed.clamp(min=1.0)[:, None],
+        "inside": arc <= end[:, None],
+    }
 
 
 def find_conflicts(scene: TensorDictBase, world: World, own_s: Tensor, settings: FeasibilitySettings) -> Conflicts:
@@ -148,15 +165,30 @@ def find_conflicts(scene: TensorDictBase, world: World, own_s: Tensor, settings:
     b, v, r = looked.nonzero(as_tuple=True)
     size = scene["size"][..., 0]
     ego_s = project(states[:, :1, :2], mission.points)[0][:, 0]
-    ego = _sample(mission.points, ego_s, mission.end, states[:, 0, 3], size[:, 0],
-                  (settings.ego_brake, settings.ego_push, settings.top_speed), settings)
-    own = _sample(scene["route_points"][b, v, r], own_s[b, v, r], scene["route_length"][b, v, r], states[b, v, 3],
-                  size[b, v], (settings.brake, settings.push, settings.top_speed), settings)
+    ego = _sample(
+        mission.points,
+        ego_s,
+        mission.end,
+        states[:, 0, 3],
+        size[:, 0],
+        (settings.ego_brake, settings.ego_push, settings.top_speed),
+        settings,
+    )
+    own = _sample(
+        scene["route_points"][b, v, r],
+        own_s[b, v, r],
+        scene["route_length"][b, v, r],
+        states[b, v, 3],
+        size[b, v],
+        (settings.brake, settings.push, settings.top_speed),
+        settings,
+    )
     ego = {key: value[b] for key, value in ego.items()}
     i, j, offset, earliest, latest = _meetings(own, ego, settings)
     row = torch.arange(len(b), device=b.device)
-    shift, ego_shift = _refine(own["xy"][row, i], own["heading"][row, i], ego["xy"][row, j], ego["heading"][row, j],
-                               settings.sample_spacing)
+    shift, ego_shift = _refine(
+        own["xy"][row, i], own["heading"][row, i], ego["xy"][row, j], ego["heading"][row, j], settings.sample_spacing
+    )
     found = offset.isfinite()
     values = (own["arc"][row, i] + shift, ego["arc"][row, j] + ego_shift, earliest, latest, offset)
 

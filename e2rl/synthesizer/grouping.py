@@ -16,10 +16,28 @@ from e2rl.sim.world import World
 ROWS = 160, 1024  # vehicle rows from which a group may end, and at most
 SHRUNK = 0.55  # share of its largest scene at which the next scene begins another group
 OF_ALL = {"size", "start", "start_accel", "start_yaw_rate", "valid", "agent_type", "parked"}  # keys with all agents
-OF_VEHICLES = {"past", "route_points", "route_length", "route_open", "route_valid", "route_limit",
-               "route_light", "route_light_s", "route_log"}
-WHOLE = {"field", "field_origin", "light_state", "lane_points", "lane_index", "lane_exits", "lane_left", "lane_right",
-         "scene_index"}
+OF_VEHICLES = {
+    "past",
+    "route_points",
+    "route_length",
+    "route_open",
+    "route_valid",
+    "route_limit",
+    "route_light",
+    "route_light_s",
+    "route_log",
+}
+WHOLE = {
+    "field",
+    "field_origin",
+    "light_state",
+    "lane_points",
+    "lane_index",
+    "lane_exits",
+    "lane_left",
+    "lane_right",
+    "scene_index",
+}
 UNCROPPED = {"seed", "eta", "replans", "light_state"}  # fields of an Episode without a vehicle axis
 PAIRS = {"conflict", "conflict_s", "crossing"}
 
@@ -40,7 +58,7 @@ def group_scenes(world: World) -> list[Group]:
     used = world.valid | world.scene["valid"]
     place = torch.arange(1, used.shape[1] + 1, device=used.device)
     vehicles = (used[:, :width] * place[:width]).amax(1).clamp(min=1)
-    others = (used[:, width:] * place[:used.shape[1] - width]).amax(1) if used.shape[1] > width else vehicles * 0
+    others = (used[:, width:] * place[: used.shape[1] - width]).amax(1) if used.shape[1] > width else vehicles * 0
     order = vehicles.argsort(descending=True, stable=True)
     sizes, begin, groups = vehicles[order].tolist(), 0, []
     for end in range(1, len(sizes) + 1):
@@ -62,11 +80,17 @@ def crop_world(world: World, group: Group) -> World:
         if key in OF_ALL:
             scene[key] = world.scene[key][rows][:, agents]
         elif key in OF_VEHICLES:
-            scene[key] = world.scene[key][rows, :group.vehicles]
+            scene[key] = world.scene[key][rows, : group.vehicles]
         elif key in WHOLE:
             scene[key] = world.scene[key][rows]
-    return World(TensorDict(scene, batch_size=[len(rows)]), world.step[rows], world.states[rows][:, agents],
-                 world.valid[rows][:, agents], world.accel[rows][:, agents], world.route[rows, :group.vehicles])
+    return World(
+        TensorDict(scene, batch_size=[len(rows)]),
+        world.step[rows],
+        world.states[rows][:, agents],
+        world.valid[rows][:, agents],
+        world.accel[rows][:, agents],
+        world.route[rows, : group.vehicles],
+    )
 
 
 def crop_episode(value, group: Group, width: int, name: str = ""):
@@ -77,10 +101,10 @@ def crop_episode(value, group: Group, width: int, name: str = ""):
     if name in UNCROPPED:
         return value
     if name in PAIRS:
-        return value[:, :group.vehicles, :group.vehicles]
+        return value[:, : group.vehicles, : group.vehicles]
     if name == "size":
-        return torch.cat([value[:, :group.vehicles], value[:, width:width + group.others]], 1)
-    return value[:, :group.vehicles]
+        return torch.cat([value[:, : group.vehicles], value[:, width : width + group.others]], 1)
+    return value[:, : group.vehicles]
 
 
 def write_episode(full, part, group: Group, name: str = "") -> None:
@@ -93,7 +117,7 @@ def write_episode(full, part, group: Group, name: str = "") -> None:
     elif name in UNCROPPED:
         full[group.rows] = part
     elif name != "size":
-        full[group.rows, :group.vehicles] = part
+        full[group.rows, : group.vehicles] = part
 
 
 def gather_plans(plans: list[tuple[Group, Plan]], batch: int, width: int) -> Plan:
@@ -104,12 +128,15 @@ def gather_plans(plans: list[tuple[Group, Plan]], batch: int, width: int) -> Pla
     whole = Plan(motion, torch.zeros_like(zero, dtype=torch.bool))
     for group, plan in plans:
         for field in fields(LaneState):
-            getattr(motion, field.name)[group.rows, :group.vehicles] = getattr(plan.motion, field.name)
-        whole.on_map[group.rows, :group.vehicles] = plan.on_map
+            getattr(motion, field.name)[group.rows, : group.vehicles] = getattr(plan.motion, field.name)
+        whole.on_map[group.rows, : group.vehicles] = plan.on_map
     return whole
 
 
 def clone(value):
     """A nested dataclass with every tensor copied."""
-    return replace(value, **{f.name: clone(getattr(value, f.name)) for f in fields(value)}) if is_dataclass(
-        value) else value.clone()
+    return (
+        replace(value, **{f.name: clone(getattr(value, f.name)) for f in fields(value)})
+        if is_dataclass(value)
+        else value.clone()
+    )

@@ -44,9 +44,11 @@ class InterceptionSettings:
 
     def __post_init__(self):
         if min(self.push, self.brake, self.lateral) < 0 or not 0 <= self.reach <= HORIZON * DT:
-            raise InputError("synthesizer.interception needs push, brake and lateral of at least 0, and reach between "
-                             f"0 (none) and {HORIZON * DT} s; they are {self.push}, {self.brake}, {self.lateral} and "
-                             f"{self.reach}")
+            raise InputError(
+                "synthesizer.interception needs push, brake and lateral of at least 0, and reach between "
+                f"0 (none) and {HORIZON * DT} s; they are {self.push}, {self.brake}, {self.lateral} and "
+                f"{self.reach}"
+            )
 
 
 @dataclass(frozen=True)
@@ -98,8 +100,9 @@ def _ways(states: Tensor, aim: Tensor) -> _Ways:
     bearing = wrap(torch.atan2(gap[..., 1], gap[..., 0]) - heading)
     end = torch.stack([heading + 2 * bearing, heading + bearing, aim[..., 2]], -1).flatten(2)
     heading, bearing, xy = (x.repeat_interleave(ENDS, 2) for x in (heading, bearing, aim[..., :2]))
-    points, slope = cubic(states[:, :, None, :2].expand_as(xy), heading, xy, end,
-                          torch.linspace(0, 1, SAMPLES, device=states.device))
+    points, slope = cubic(
+        states[:, :, None, :2].expand_as(xy), heading, xy, end, torch.linspace(0, 1, SAMPLES, device=states.device)
+    )
     way = torch.nn.functional.pad(points.diff(dim=3).norm(dim=-1).cumsum(-1), (1, 0))
     return _Ways(points, slope, way, bearing, wrap(end - heading), end)
 
@@ -122,13 +125,22 @@ def _clear(ways: _Ways, gone: Tensor, size: Tensor, others: tuple[Tensor, Tensor
     heading = torch.atan2(slope[..., 1:], slope[..., :1])
     pose = torch.cat([ways.points.gather(3, index), heading, torch.zeros_like(heading)], -1)
     states, sizes, there = others
-    hit = overlap(pose[:, :, :, None], (size + ROOM)[:, :, None, None, None], states[:, :, None],
-                  sizes[:, :, None, :, None])
+    hit = overlap(
+        pose[:, :, :, None], (size + ROOM)[:, :, None, None, None], states[:, :, None], sizes[:, :, None, :, None]
+    )
     return ~(hit & there[:, :, None, :, None] & (gone >= 0)[:, :, :, None]).flatten(3).any(-1)
 
 
-def intercept(scene: TensorDictBase, states: Tensor, size: Tensor, target: Tensor, target_size: Tensor, eta: Tensor,
-              others: tuple[Tensor, Tensor, Tensor], settings: InterceptionSettings) -> Interception:
+def intercept(
+    scene: TensorDictBase,
+    states: Tensor,
+    size: Tensor,
+    target: Tensor,
+    target_size: Tensor,
+    eta: Tensor,
+    others: tuple[Tensor, Tensor, Tensor],
+    settings: InterceptionSettings,
+) -> Interception:
     """The cheapest interception of each vehicle.
 
     states [B, M, 4], size [B, M, 2]; target [B, M, H, 4]: where its target will be at steps 1..H, target_size; eta [B];

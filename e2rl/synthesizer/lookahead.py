@@ -33,7 +33,7 @@ class Lookahead:
         velocity = states[..., 3:] * torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)
         now = world
         for done in range(0, HORIZON, self.period):
-            pieces.append(self.ego.plan(now)[:, :self.period])
+            pieces.append(self.ego.plan(now)[:, : self.period])
             after = done + self.period
             moved = torch.cat([states[..., :2] + DT * after * velocity, states[..., 2:]], -1)
             ego, others = pieces[-1][:, -1:], planned[:, 1:, min(after, HORIZON) - 1]
@@ -45,5 +45,7 @@ class Lookahead:
         if len(group.rows) == len(self.world.step) and bool((group.rows.diff() > 0).all()):
             return self.world
         world = self.world
-        return World(world.scene[group.rows], *(getattr(world, name)[group.rows]
-                                                for name in ("step", "states", "valid", "accel", "route")))
+        return World(
+            world.scene[group.rows],
+            *(getattr(world, name)[group.rows] for name in ("step", "states", "valid", "accel", "route")),
+        )

@@ -145,7 +145,7 @@ def _overlap_term(states: Tensor, context: PotentialContext, settings: Potential
     """Mean over steps, sum over neighbours of the squared shortfall of the gap [m^2]; pairs too near now may stay
     so.
     """
-    size = context.scene["size"][:, :states.shape[1]]
+    size = context.scene["size"][:, : states.shape[1]]
     index, near = _neighbours(states, context, size, settings.neighbours)
     scene, own, rank = near.nonzero(as_tuple=True)  # most of the nearest are too far to cost anything
     mine, them = (scene, own), (scene, index[scene, own, rank])
@@ -198,7 +198,7 @@ def sampled_steps(settings: PotentialSettings) -> slice:
 def _with_ego(states: Tensor, context: PotentialContext, settings: PotentialSettings) -> Tensor:
     """Sampled states [B, V, H', 4], row 0 replaced by the detached ego plan."""
     ego = context.ego_plan[:, None, sampled_steps(settings)].detach()
-    return torch.cat([ego[:, :, :states.shape[2]], states[:, 1:]], 1)
+    return torch.cat([ego[:, :, : states.shape[2]], states[:, 1:]], 1)
 
 
 def feasibility_potential(states: Tensor, context: PotentialContext, settings: PotentialSettings) -> Tensor:
@@ -207,8 +207,11 @@ def feasibility_potential(states: Tensor, context: PotentialContext, settings: P
     ego and for absent vehicles.
     """
     states = _with_ego(states, context, settings)
-    value = (_road_terms(states, context, settings) + _motion_terms(states, context, settings)
-             + settings.pair * _overlap_term(states, context, settings))
+    value = (
+        _road_terms(states, context, settings)
+        + _motion_terms(states, context, settings)
+        + settings.pair * _overlap_term(states, context, settings)
+    )
     counted = context.valid.clone()
     counted[:, 0] = False
     return torch.where(counted, value, 0.0)
@@ -225,8 +228,9 @@ def ttc_cost(offset: Tensor, closing: Tensor, time_scale: float = 1.0, miss_scal
     return torch.exp(-0.5 * (time / time_scale) ** 2 - 0.5 * miss.square().sum(-1) / miss_scale**2)
 
 
-def adversarial_potential(states: Tensor, context: PotentialContext, settings: PotentialSettings,
-                          temperature: Tensor | float | None = None) -> Tensor:
+def adversarial_potential(
+    states: Tensor, context: PotentialContext, settings: PotentialSettings, temperature: Tensor | float | None = None
+) -> Tensor:
     """V_adv [B, V] of decoded states [B, V, H', 4] at `sampled_steps`, along the chain: low where a vehicle
     meets its own target.
 
@@ -235,7 +239,7 @@ def adversarial_potential(states: Tensor, context: PotentialContext, settings: P
     """
     states = _with_ego(states, context, settings)
     index = context.target.clamp(min=0)
-    size = context.scene["size"][:, :states.shape[1]]
+    size = context.scene["size"][:, : states.shape[1]]
     target = states.detach().gather(1, index[..., None, None].expand_as(states))
     offset = target[..., :2] - states[..., :2]
     if settings.distance_kind == "box":

@@ -26,7 +26,7 @@ SCHEMA = {
                 "required": ["id", *CRITERIA],
                 "additionalProperties": False,
             },
-        },
+        }
     },
     "required": ["vehicles"],
     "additionalProperties": False,
@@ -37,8 +37,10 @@ def messages(ego: str, vehicles: dict[int, str]) -> list[dict[str, str]]:
     """The chat of one scene: the instructions, then the description of the ego and of each vehicle."""
     listed = "\n".join(f"- {text}" for text in vehicles.values())
     asked = ", ".join(str(vehicle) for vehicle in vehicles)
-    return [{"role": "system", "content": INSTRUCTIONS},
-            {"role": "user", "content": f"{ego}\n{listed}\nJudge vehicles {asked}."}]
+    return [
+        {"role": "system", "content": INSTRUCTIONS},
+        {"role": "user", "content": f"{ego}\n{listed}\nJudge vehicles {asked}."},
+    ]
 
 
 def read_answer(text: str, vehicles: list[int]) -> Verdicts:

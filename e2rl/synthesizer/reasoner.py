@@ -67,14 +67,19 @@ class LanguageReasoner:
         try:
             import openai
         except ImportError as error:
-            raise InputError("synthesizer.reasoner.kind=lm: the openai client is not installed; install e2rl with its "
-                             "extra: pip install 'e2rl[lm]'") from error
+            raise InputError(
+                "synthesizer.reasoner.kind=lm: the openai client is not installed; install e2rl with its "
+                "extra: pip install 'e2rl[lm]'"
+            ) from error
         try:
-            self._client = openai.OpenAI(base_url=settings.base_url, timeout=settings.timeout,
-                                         max_retries=settings.retries)
+            self._client = openai.OpenAI(
+                base_url=settings.base_url, timeout=settings.timeout, max_retries=settings.retries
+            )
         except openai.OpenAIError as error:
-            raise InputError(f"synthesizer.reasoner.kind=lm: {str(error).splitlines()[0]} (for an endpoint without "
-                             "keys any OPENAI_API_KEY will do)") from error
+            raise InputError(
+                f"synthesizer.reasoner.kind=lm: {str(error).splitlines()[0]} (for an endpoint without "
+                "keys any OPENAI_API_KEY will do)"
+            ) from error
         self._failures = (openai.OpenAIError, ValueError)
         self.settings, self.statistics, self._lock = settings, statistics, threading.Lock()
         statistics.update({name: statistics.get(name, 0) for name in COUNTS})
@@ -130,7 +135,8 @@ class LanguageReasoner:
 
     def _ask(self, chat: list[dict[str, str]]) -> str:
         done = self._client.chat.completions.create(
-            model=self.settings.model, messages=chat, temperature=0, response_format=FORMAT)
+            model=self.settings.model, messages=chat, temperature=0, response_format=FORMAT
+        )
         if not getattr(done, "choices", None) or not done.choices[0].message.content:
             raise ValueError("the endpoint sent no answer")
         return done.choices[0].message.content
@@ -149,8 +155,11 @@ class LanguageReasoner:
         count = self._count("lm_fallbacks")
         if str(count).rstrip("0") == "1":
             what = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-            warnings.warn(f"language-model reasoner: the rules decided for {count} of "
-                          f"{self.statistics['lm_scenes']} scenes so far ({what})", stacklevel=2)
+            warnings.warn(
+                f"language-model reasoner: the rules decided for {count} of "
+                f"{self.statistics['lm_scenes']} scenes so far ({what})",
+                stacklevel=2,
+            )
 
 
 def _write(path: Path, text: str) -> None:
@@ -162,5 +171,6 @@ def _write(path: Path, text: str) -> None:
             file.write(text)
         os.replace(name, path)
     except OSError as error:
-        raise InputError(f"synthesizer.reasoner.cache={path.parent}: cannot be written ({error}); pass a writable "
-                         "folder") from error
+        raise InputError(
+            f"synthesizer.reasoner.cache={path.parent}: cannot be written ({error}); pass a writable folder"
+        ) from error

@@ -38,8 +38,10 @@ class SkeletonSettings:
 
     def __post_init__(self):
         if self.near < 1 or self.far < 0 or self.max_chain < 1:
-            raise InputError("synthesizer.skeleton needs near >= 1, far >= 0 and max_chain >= 1; it has "
-                             f"{self.near}, {self.far}, {self.max_chain}")
+            raise InputError(
+                "synthesizer.skeleton needs near >= 1, far >= 0 and max_chain >= 1; it has "
+                f"{self.near}, {self.far}, {self.max_chain}"
+            )
         if not 0 < self.step <= self.horizon or min(self.brake, self.push, self.top_speed) <= 0:
             raise InputError("synthesizer.skeleton needs 0 < step <= horizon, and positive brake, push and top_speed")
 
@@ -63,7 +65,8 @@ class Skeleton:
         """Numbers of scenes by source, and of viable chains, for logging."""
         names = ("supported", "nearest_feasible", "nobody")
         return {name: int((self.source == code).sum()) for code, name in enumerate(names)} | {
-            "chains": int(self.chains.sum())}
+            "chains": int(self.chains.sum())
+        }
 
 
 def direct(support: Tensor) -> Skeleton:
@@ -118,15 +121,22 @@ def _beside_ego(states: Tensor, asked: Tensor, scene: TensorDictBase) -> Tensor:
     return torch.zeros_like(asked).index_put((rows,), beside & (lane >= 0) & (ego_lane >= 0)[:, None])
 
 
-def influence(scene: TensorDictBase, world: World, index: Tensor, present: Tensor, expected: Tensor, times: Tensor,
-              settings: SkeletonSettings) -> Tensor:
+def influence(
+    scene: TensorDictBase,
+    world: World,
+    index: Tensor,
+    present: Tensor,
+    expected: Tensor,
+    times: Tensor,
+    settings: SkeletonSettings,
+) -> Tensor:
     """When each slot can act on each other slot and on the ego: bool [B, M, M + 1, K], the last target is the ego.
 
     index, present [B, M]: slots; expected [B, V, K, 4]: where everybody will be at times [K]. Slot i can act on j at a
     time when j lies on one of i's routes, i can be there by then, and the longitudinal headway between them would be at
     most tau_long if i kept its speed.
     """
-    states = take(world.states[:, :expected.shape[1]], index)
+    states = take(world.states[:, : expected.shape[1]], index)
     s, _, _ = place(states, take(scene["route_points"], index))
     slots, count = index.shape[1], len(times)
     b, m, r = (take(scene["route_valid"], index) & present[..., None]).nonzero(as_tuple=True)  # padding is most of it
@@ -204,8 +214,15 @@ def _link_chains(after: Tensor, near: Tensor, far: Tensor, settings: SkeletonSet
     return target, depth, kept
 
 
-def build_skeleton(scene: TensorDictBase, world: World, support: Tensor, feasible: Tensor, settings: SkeletonSettings,
-                   expected: Tensor | None = None, cost: Tensor | None = None) -> Skeleton:
+def build_skeleton(
+    scene: TensorDictBase,
+    world: World,
+    support: Tensor,
+    feasible: Tensor,
+    settings: SkeletonSettings,
+    expected: Tensor | None = None,
+    cost: Tensor | None = None,
+) -> Skeleton:
     """Algorithm 2 for scenes [B]: support [B, V] = S, feasible [B, V] = F.
 
     expected [B, V, K, 4]: where everybody will be every `step` s up to `horizon`, say in the reference rollout;

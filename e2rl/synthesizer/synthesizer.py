@@ -102,15 +102,20 @@ class Synthesizer:
         groups, (batch, width) = group_scenes(world), episode.routed.route.shape
         whole, plans = clone(episode), []
         for group in groups:
-            part, plan = self._replan_group(crop_episode(episode, group, width), crop_world(world, group),
-                                            ego_plan[group.rows], noise[:, :, group.rows, :group.vehicles],
-                                            None if ego is None else partial(Lookahead(ego, world), group))
+            part, plan = self._replan_group(
+                crop_episode(episode, group, width),
+                crop_world(world, group),
+                ego_plan[group.rows],
+                noise[:, :, group.rows, : group.vehicles],
+                None if ego is None else partial(Lookahead(ego, world), group),
+            )
             write_episode(whole, part, group)
             plans.append((group, plan))
         return whole, gather_plans(plans, batch, width)
 
-    def _replan_group(self, episode: Episode, world: World, ego_plan: Tensor, noise: Tensor,
-                      react: Callable[[Tensor], Tensor] | None) -> tuple[Episode, Plan]:
+    def _replan_group(
+        self, episode: Episode, world: World, ego_plan: Tensor, noise: Tensor, react: Callable[[Tensor], Tensor] | None
+    ) -> tuple[Episode, Plan]:
         """`replan` of a group; noise [samples, steps, B, V, SIZE]."""
         episode = replace(episode, state=self._placed(episode, world, ego_plan))
         world = replace(world, route=episode.routed.route)
@@ -130,9 +135,10 @@ class Synthesizer:
             found = (sample.x0, sample.kl, jump, self._cost(sample.x0, context, where, episode.eta))
             best = found if best is None else _cheaper(best, found)
         plan = self.prior.plan(best[0], context)
-        there = world.valid[:, :plan.on_map.shape[1], None]  # who is gone does not come back
-        return replace(episode, replans=episode.replans + 1, kl=episode.kl + best[1],
-                       jump=episode.jump + best[2]), replace(plan, on_map=plan.on_map & there)
+        there = world.valid[:, : plan.on_map.shape[1], None]  # who is gone does not come back
+        return replace(
+            episode, replans=episode.replans + 1, kl=episode.kl + best[1], jump=episode.jump + best[2]
+        ), replace(plan, on_map=plan.on_map & there)
 
     def _noise(self, episode: Episode, sample: int = 0) -> Tensor:
         shape = (self.prior.sampler.steps, episode.routed.route.shape[1], SIZE)
@@ -160,12 +166,18 @@ class Synthesizer:
         ego = torch.zeros_like(routed.parked)
         ego[:, 0] = True
         v = torch.where(ego, world.states[:, :1, 3], state.v)
-        now = locate(world.states[:, :ego.shape[1]], torch.where(ego, world.accel[:, :1], state.a),
-                     torch.where(ego, yaw_rate[:, None], state.kappa * state.v), routed.points, state.s + ego * v / 2)
+        now = locate(
+            world.states[:, : ego.shape[1]],
+            torch.where(ego, world.accel[:, :1], state.a),
+            torch.where(ego, yaw_rate[:, None], state.kappa * state.v),
+            routed.points,
+            state.s + ego * v / 2,
+        )
         beside = ("s", "d", "d1", "d2")
         looked_up = {name: ego | ~routed.has_lane if name in beside else ego for name in vars(state)}
-        return LaneState(**{name: torch.where(rows, getattr(now, name), getattr(state, name))
-                            for name, rows in looked_up.items()})
+        return LaneState(
+            **{name: torch.where(rows, getattr(now, name), getattr(state, name)) for name, rows in looked_up.items()}
+        )
 
     def _encode(self, episode: Episode, world: World, ego_plan: Tensor, exempt: Tensor) -> Context:
         return self.prior.encode(episode.routed, episode.state, world.states, world.valid, world.step, ego_plan, exempt)
@@ -187,10 +199,19 @@ class Synthesizer:
     def _anchor(self, episode: Episode, world: World, ego_plan: Tensor) -> Anchor:
         """Proposals for the present coalition on its present routes."""
         depth = chain_depth(episode.target)
-        skeleton = Skeleton(episode.coalition, episode.target, depth, depth == 1, depth > 1, episode.replans,
-                            episode.replans)
-        return propose(world.scene, world, skeleton, ego_plan, self.settings.anchor, self.settings.interception,
-                       episode.eta, keep_route=True)
+        skeleton = Skeleton(
+            episode.coalition, episode.target, depth, depth == 1, depth > 1, episode.replans, episode.replans
+        )
+        return propose(
+            world.scene,
+            world,
+            skeleton,
+            ego_plan,
+            self.settings.anchor,
+            self.settings.interception,
+            episode.eta,
+            keep_route=True,
+        )
 
     def _select(self, episode: Episode, world: World, ego_plan: Tensor, noise: Tensor) -> Episode:
         """Topology on a reference rollout, feasibility, skeleton; the coalition takes the routes that meet targets."""
@@ -202,34 +223,49 @@ class Synthesizer:
         found = topological_candidates(reference, valid, scene["size"][:, :vehicles], self.settings.topology)
         feasible = self.feasible_vehicles(scene, world, self.settings.feasibility).mask
         steps = round(self.settings.skeleton.step / DT)
-        expected = reference[:, steps - 1::steps].transpose(1, 2)
+        expected = reference[:, steps - 1 :: steps].transpose(1, 2)
         support, fallback = self._support(episode, world, found.candidates, feasible)
         everybody = direct(support | fallback)  # whom it costs least to meet the ego are the near agents
-        anchor = propose(scene, world, everybody, ego_plan, self.settings.anchor, self.settings.interception,
-                         episode.eta)
+        anchor = propose(
+            scene, world, everybody, ego_plan, self.settings.anchor, self.settings.interception, episode.eta
+        )
         skeleton = build_skeleton(scene, world, support, fallback, self.settings.skeleton, expected, anchor.cost)
         self._count(skeleton, found.candidates, feasible)
         if bool(skeleton.far.any()):  # otherwise everybody meets the ego, as just proposed
-            anchor = propose(scene, world, skeleton, ego_plan, self.settings.anchor, self.settings.interception,
-                             episode.eta)
+            anchor = propose(
+                scene, world, skeleton, ego_plan, self.settings.anchor, self.settings.interception, episode.eta
+            )
         # A member that no route and acceleration lead to its target is pruned (Sec. IV-A3: infeasible configurations),
         # and so is everybody whose chain to the ego leads over it.
         acts = skeleton.coalition & anchor.has & (episode.eta > 0)[:, None]
         for _ in range(self.settings.skeleton.max_chain - 1):
             acts = acts & ((skeleton.target <= 0) | acts.gather(1, skeleton.target.clamp(min=0)))
-        episode = replace(episode, coalition=acts, target=torch.where(acts, skeleton.target, -1),
-                          adversaries=episode.adversaries | acts)
+        episode = replace(
+            episode,
+            coalition=acts,
+            target=torch.where(acts, skeleton.target, -1),
+            adversaries=episode.adversaries | acts,
+        )
         if self.on_selection:
-            self.on_selection(Selection(
-                episode.seed, world.step, reference[:, found.steps],
-                (DT * (found.steps + 1)).expand(len(reference), -1), found.weights, found.candidates, feasible,
-                episode.coalition, episode.target))
+            self.on_selection(
+                Selection(
+                    episode.seed,
+                    world.step,
+                    reference[:, found.steps],
+                    (DT * (found.steps + 1)).expand(len(reference), -1),
+                    found.weights,
+                    found.candidates,
+                    feasible,
+                    episode.coalition,
+                    episode.target,
+                )
+            )
         return self._onto(episode, world, torch.where(acts, anchor.route, world.route), acts & False, anchor.points)
 
     def _support(self, episode: Episode, world: World, candidates: Tensor, feasible: Tensor) -> tuple[Tensor, Tensor]:
         """S [B, V] and who may take its place where it is empty, by `support` (eq. support_selection)."""
         if self.settings.support == "random":
-            there = world.valid[:, :feasible.shape[1]] & ~episode.routed.parked
+            there = world.valid[:, : feasible.shape[1]] & ~episode.routed.parked
             there = there & (torch.arange(feasible.shape[1], device=there.device) > 0)
             draw = noise_of(episode.seed, SUPPORT + episode.replans, tuple(feasible.shape[1:]), uniform=True)
             rank = draw.masked_fill(~there, torch.inf).argsort(-1).argsort(-1)
@@ -247,27 +283,51 @@ class Synthesizer:
             return episode
         routed = reroute(episode.routed, world.scene, route, changed, leaves, ways, self.prior.free_space)
         old = episode.state
-        moved = locate(world.states[:, :route.shape[1]], old.a, old.kappa * old.v, routed.points)
-        state = LaneState(*(torch.where(changed, getattr(moved, f.name), getattr(old, f.name))
-                            for f in fields(LaneState)))
+        moved = locate(world.states[:, : route.shape[1]], old.a, old.kappa * old.v, routed.points)
+        state = LaneState(
+            *(torch.where(changed, getattr(moved, f.name), getattr(old, f.name)) for f in fields(LaneState))
+        )
         return replace(episode, routed=routed, state=state, leaves=leaves)
 
     def _where(self, episode: Episode, world: World, ego_plan: Tensor) -> PotentialContext:
         vehicles = episode.routed.route.shape[1]
         return PotentialContext(
-            world.scene, world.states[:, :vehicles], episode.state.a, world.valid[:, :vehicles], episode.routed.points,
-            episode.routed.has_lane, ego_plan[:, :HORIZON], episode.target)
+            world.scene,
+            world.states[:, :vehicles],
+            episode.state.a,
+            world.valid[:, :vehicles],
+            episode.routed.points,
+            episode.routed.has_lane,
+            ego_plan[:, :HORIZON],
+            episode.target,
+        )
 
-    def _control(self, episode: Episode, where: PotentialContext, anchor: Anchor, react: Callable | None
-                 ) -> SparseControl:
+    def _control(
+        self, episode: Episode, where: PotentialContext, anchor: Anchor, react: Callable | None
+    ) -> SparseControl:
         settings = self.settings
         literal = noise_of(episode.seed, LITERAL + episode.replans, (*episode.target.shape[1:], SIZE))
-        return SparseControl(self.prior, settings.control, settings.potentials, where, episode.coalition, episode.eta,
-                             anchor, settings.anchor.strength, literal, react)
+        return SparseControl(
+            self.prior,
+            settings.control,
+            settings.potentials,
+            where,
+            episode.coalition,
+            episode.eta,
+            anchor,
+            settings.anchor.strength,
+            literal,
+            react,
+        )
 
     def _count(self, skeleton: Skeleton, candidates: Tensor, feasible: Tensor) -> None:
         """Running totals for logging."""
-        counts = {"scenes": len(candidates), "candidates": int(candidates.sum()), "feasible": int(feasible.sum()),
-                  "coalition": int(skeleton.coalition.sum()), **skeleton.counts()}
+        counts = {
+            "scenes": len(candidates),
+            "candidates": int(candidates.sum()),
+            "feasible": int(feasible.sum()),
+            "coalition": int(skeleton.coalition.sum()),
+            **skeleton.counts(),
+        }
         for name, value in counts.items():
             self.statistics[name] = self.statistics.get(name, 0) + value

@@ -42,12 +42,16 @@ class TopologySettings:
         if self.clique_weight not in ("mean", "sum"):
             raise InputError(f"synthesizer.topology.clique_weight is {self.clique_weight!r}; choose mean or sum")
         if self.stride < 1 or self.beta <= 0 or self.clearance < 0 or not 0 < self.edge_threshold < 1:
-            raise InputError("synthesizer.topology needs stride >= 1, beta > 0, clearance >= 0 and edge_threshold "
-                             f"between 0 and 1; it has {self.stride}, {self.beta}, {self.clearance}, "
-                             f"{self.edge_threshold}")
+            raise InputError(
+                "synthesizer.topology needs stride >= 1, beta > 0, clearance >= 0 and edge_threshold "
+                f"between 0 and 1; it has {self.stride}, {self.beta}, {self.clearance}, "
+                f"{self.edge_threshold}"
+            )
         if self.max_nodes < 2 or self.max_clique < 2:
-            raise InputError("synthesizer.topology.max_nodes and max_clique must be at least 2, the ego and another; "
-                             f"they are {self.max_nodes} and {self.max_clique}")
+            raise InputError(
+                "synthesizer.topology.max_nodes and max_clique must be at least 2, the ego and another; "
+                f"they are {self.max_nodes} and {self.max_clique}"
+            )
 
 
 @dataclass(frozen=True)
@@ -80,10 +84,16 @@ def _axis_interval(states: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
     other_length, other_width = length[..., None, :], width[..., None, :]
     first = last = None
     for place, speed, extent in (
-        (ci * dx + si * dy, ci * dvx + si * dvy,
-         length[..., :, None] + turn_cos * other_length + turn_sin * other_width),
-        (ci * dy - si * dx, ci * dvy - si * dvx,
-         width[..., :, None] + turn_sin * other_length + turn_cos * other_width),
+        (
+            ci * dx + si * dy,
+            ci * dvx + si * dvy,
+            length[..., :, None] + turn_cos * other_length + turn_sin * other_width,
+        ),
+        (
+            ci * dy - si * dx,
+            ci * dvy - si * dvx,
+            width[..., :, None] + turn_sin * other_length + turn_cos * other_width,
+        ),
     ):
         still = speed.abs() < 1e-6  # then the projections overlap always or never
         inverse = 1 / torch.where(still, 1.0, speed)
@@ -145,9 +155,10 @@ def _trim(clique: tuple[int, ...], weight: np.ndarray, far: np.ndarray, limit: i
 
 def _rank(cliques: set[tuple[int, ...]], weight: np.ndarray, far: np.ndarray, settings: TopologySettings):
     """The heaviest cliques first; equals by their members' mean distance to the ego, then by index."""
+
     def key(clique):
         size = len(clique)
-        total = fsum(weight[i, j] for k, i in enumerate(clique) for j in clique[k + 1:])
+        total = fsum(weight[i, j] for k, i in enumerate(clique) for j in clique[k + 1 :])
         if settings.clique_weight == "mean":
             total /= size * (size - 1) / 2
         return -round(total, 6), fsum(far[i] for i in clique) / size, clique

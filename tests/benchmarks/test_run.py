@@ -14,9 +14,19 @@ import run  # noqa: E402
 from e2rl.errors import InputError  # noqa: E402
 
 SMALL = ["--repeats", "1", "--largest", "1", "--no-compile"]
-SHORT = ["--train", "num_scenes=2", "batch=2", "learner.round.scenes=1", "learner.collect.batch=2",
-         "learner.collect.steps=80", "learner.collect.iterations=1", "learner.ppo.epochs=1",
-         "learner.expert.teacher=null", "learner.expert.recorded=false", "measure.scenes=1"]
+SHORT = [
+    "--train",
+    "num_scenes=2",
+    "batch=2",
+    "learner.round.scenes=1",
+    "learner.collect.batch=2",
+    "learner.collect.steps=80",
+    "learner.collect.iterations=1",
+    "learner.ppo.epochs=1",
+    "learner.expert.teacher=null",
+    "learner.expert.recorded=false",
+    "measure.scenes=1",
+]
 
 
 @pytest.mark.parametrize("name", sorted(run.BENCHMARKS))

@@ -47,8 +47,9 @@ def test_deviations_are_made_good():
 def test_policy_collects_and_replans_at_its_own_rate():
     env = DrivingEnv(make_scenes(2, num_vehicles=1), SimSettings(), 2)
     ego = Cruise(replan_every=5)
-    collector = Collector(env, EgoPolicy(ego, env), frames_per_batch=160, total_frames=160,
-                          auto_register_policy_transforms=False)
+    collector = Collector(
+        env, EgoPolicy(ego, env), frames_per_batch=160, total_frames=160, auto_register_policy_transforms=False
+    )
     ego.plans = 0  # building the collector tries the policy out
     data = next(iter(collector))
     assert data["next", "done"][:, -1].all() and not data["next", "terminated"].any()

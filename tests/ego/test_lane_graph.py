@@ -69,7 +69,7 @@ def test_scenes_of_a_batch_do_not_mix():
     together = LaneGraphEgo().plan(env.world())
     for k in range(3):
         alone = DrivingEnv(scenes, SimSettings(), 1)
-        alone.reset(alone.reset().select("scene_index").set("scene_index", index[k:k + 1]))
+        alone.reset(alone.reset().select("scene_index").set("scene_index", index[k : k + 1]))
         assert torch.allclose(LaneGraphEgo().plan(alone.world())[0], together[k], atol=1e-4)
     assert not torch.allclose(together[0], together[1])
 

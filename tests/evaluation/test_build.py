@@ -10,8 +10,8 @@ from hydra import compose, initialize_config_dir
 from e2rl.errors import InputError
 from e2rl.evaluation.build import BASELINES, build_methods, build_sim, caption, check_protocol
 from e2rl.metrics.catalogue import CLOSED_LOOP, TRAFFIC
-from e2rl.synthesizer.baselines.baseline import Baseline
 from e2rl.synthesizer.synthesizer import Synthesizer
+from e2rl.traffic.traffic import Baseline
 from tests.prior.small import small_prior
 
 CONF = str(Path(__file__).parents[2] / "conf")
@@ -66,8 +66,12 @@ def test_idm_is_under_the_prior_s_own_bounds():
 
 
 def test_variants_are_rows_of_the_prior_with_what_they_change_and_nothing_else():
-    config = config_of("methods=[]", "eta=0", "+variants.cold={prior: {sampler: {temperature: 0.5}}}",
-                       "+variants.free={prior.bounds.meeting: false}")
+    config = config_of(
+        "methods=[]",
+        "eta=0",
+        "+variants.cold={prior: {sampler: {temperature: 0.5}}}",
+        "+variants.free={prior.bounds.meeting: false}",
+    )
     check_protocol(config)
     methods = build_methods(config, small_prior())
     assert named(methods) == [("cold", 0), ("free", 0)]
@@ -77,8 +81,13 @@ def test_variants_are_rows_of_the_prior_with_what_they_change_and_nothing_else()
 
 
 def test_variants_of_the_control_share_the_prior_and_differ_in_what_they_name():
-    config = config_of("methods=[far,e2]", "eta=1", "+variants.far={synthesizer: {skeleton: {far: 2}, reselect: 0}}",
-                       "+variants.near={synthesizer.skeleton.far: 0}", "+variants.same={}")
+    config = config_of(
+        "methods=[far,e2]",
+        "eta=1",
+        "+variants.far={synthesizer: {skeleton: {far: 2}, reselect: 0}}",
+        "+variants.near={synthesizer.skeleton.far: 0}",
+        "+variants.same={}",
+    )
     check_protocol(config)
     prior = small_prior()
     methods = build_methods(config, prior)
@@ -93,44 +102,64 @@ def test_several_intensities_are_a_row_each_but_of_what_knows_none():
     config = config_of("methods=[nominal,idm,e2]", "eta=[1,0,1,2.5]", "+variants.near={synthesizer.skeleton.far: 0}")
     check_protocol(config)
     assert named(build_methods(config, small_prior())) == [
-        ("nominal", 0), ("idm", 0), ("e2", 1), ("e2", 0), ("e2", 2.5), ("near", 1), ("near", 0), ("near", 2.5)]
+        ("nominal", 0),
+        ("idm", 0),
+        ("e2", 1),
+        ("e2", 0),
+        ("e2", 2.5),
+        ("near", 1),
+        ("near", 0),
+        ("near", 2.5),
+    ]
 
 
-@pytest.mark.parametrize(("experiment", "rows"), [
-    ("prior_ablation", 15), ("table2", 4), ("table3", 13), ("intensity", 4), ("skeleton", 1)])
+@pytest.mark.parametrize(
+    ("experiment", "rows"), [("prior_ablation", 15), ("table2", 4), ("table3", 13), ("intensity", 4), ("skeleton", 1)]
+)
 def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(experiment, rows):
     config = config_of(f"experiment={experiment}")
     check_protocol(config)
     methods = build_methods(config, small_prior())
     assert len(methods) == rows and len({(method.name, method.eta) for method in methods}) == rows
-    settings = [(method.synthesizer.settings, method.synthesizer.prior.sampler, method.synthesizer.prior.bounds)
-                for method in methods if method.name in config.variants]
+    settings = [
+        (method.synthesizer.settings, method.synthesizer.prior.sampler, method.synthesizer.prior.bounds)
+        for method in methods
+        if method.name in config.variants
+    ]
     assert all(settings.count(each) == 1 for each in settings), "no two variants are the same"
     assert all(name in caption(config, {}) for name in config.variants)
 
 
-@pytest.mark.parametrize(("overrides", "message"), [
-    (["methods=[e3]"], r"methods=\['e3'\]: e3 is none of nominal, replay, constant_velocity, idm, e2; .*synthesizer="),
-    (["methods=[e2]", "synthesizer=nominal"], "e2 is none of nominal, replay, constant_velocity, idm;"),
-    (["methods=[]"], r"methods=\[\], seeds=\[0, 1\]: name at least one of each"),
-    (["seeds=[]"], r"seeds=\[\]: name at least one"),
-    (["seeds=[0.5]"], r"seeds=\[0.5\]: sampling seeds are whole numbers"),
-    (["+variants.idm={prior.sampler.steps: 4}"], "variants.idm: idm is a row already"),
-    (["+variants.other={training: {steps: 4}}"], "variants.other: training is none of prior, synthesizer"),
-    (["+variants.other={synthesizer.contrl.feasibility: 0}"], "variants.other: .*'contrl' .*compare it with conf/"),
-    (["+variants.other={synthesizer: {control: {depth: 0}}}"], "variants.other: .*'depth' .*compare it with conf/"),
-    (["+variants.other=4"], "variants.other=4: expected changes"),
-    (["eta=[]"], r"eta=\[\]: the intensity"), (["eta=[1,-1]"], r"eta=\[1, -1\]: the intensity"),
-    (["figure=pie"], "figure=pie: choose one of intensity, skeleton, or null"),
-    (["figure=intensity"], "figure=intensity, eta=2.0: name several"),
-    (["figure=skeleton", "save_rollouts=false"], "figure=skeleton: .*save_rollouts=true"),
-    (["open_loop_samples=-1"], "open_loop_samples=-1: expected a whole number of at least 0"),
-    (["open_loop_samples=many"], "open_loop_samples=many: expected a whole number"),
-    (["meta_rollouts=1.5"], "meta_rollouts=1.5: expected a whole number"),
-    (["metrics=all"], "metrics=all: choose one of main, traffic, adversaries"),
-    (["eta=-0.1"], "eta=-0.1: the intensity is a number of at least 0"), (["eta=.nan"], "eta=.nan: the intensity"),
-    (["num_scenes=0"], "num_scenes=0: a whole number of at least 1, or null"),
-])
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["methods=[e3]"],
+            r"methods=\['e3'\]: e3 is none of nominal, replay, constant_velocity, idm, e2; .*synthesizer=",
+        ),
+        (["methods=[e2]", "synthesizer=nominal"], "e2 is none of nominal, replay, constant_velocity, idm;"),
+        (["methods=[]"], r"methods=\[\], seeds=\[0, 1\]: name at least one of each"),
+        (["seeds=[]"], r"seeds=\[\]: name at least one"),
+        (["seeds=[0.5]"], r"seeds=\[0.5\]: sampling seeds are whole numbers"),
+        (["+variants.idm={prior.sampler.steps: 4}"], "variants.idm: idm is a row already"),
+        (["+variants.other={training: {steps: 4}}"], "variants.other: training is none of prior, synthesizer"),
+        (["+variants.other={synthesizer.contrl.feasibility: 0}"], "variants.other: .*'contrl' .*compare it with conf/"),
+        (["+variants.other={synthesizer: {control: {depth: 0}}}"], "variants.other: .*'depth' .*compare it with conf/"),
+        (["+variants.other=4"], "variants.other=4: expected changes"),
+        (["eta=[]"], r"eta=\[\]: the intensity"),
+        (["eta=[1,-1]"], r"eta=\[1, -1\]: the intensity"),
+        (["figure=pie"], "figure=pie: choose one of intensity, skeleton, or null"),
+        (["figure=intensity"], "figure=intensity, eta=2.0: name several"),
+        (["figure=skeleton", "save_rollouts=false"], "figure=skeleton: .*save_rollouts=true"),
+        (["open_loop_samples=-1"], "open_loop_samples=-1: expected a whole number of at least 0"),
+        (["open_loop_samples=many"], "open_loop_samples=many: expected a whole number"),
+        (["meta_rollouts=1.5"], "meta_rollouts=1.5: expected a whole number"),
+        (["metrics=all"], "metrics=all: choose one of main, traffic, adversaries"),
+        (["eta=-0.1"], "eta=-0.1: the intensity is a number of at least 0"),
+        (["eta=.nan"], "eta=.nan: the intensity"),
+        (["num_scenes=0"], "num_scenes=0: a whole number of at least 1, or null"),
+    ],
+)
 def test_what_cannot_run_is_named_with_its_remedy(overrides, message):
     with pytest.raises(InputError, match=message):
         check_protocol(config_of(*overrides))

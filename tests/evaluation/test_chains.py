@@ -8,8 +8,8 @@ from e2rl.errors import InputError
 from e2rl.evaluation.chains import LongestChain, link_risk
 from e2rl.evaluation.protocol import Method, run_protocol
 from e2rl.sim.env import SimSettings
-from e2rl.synthesizer.baselines.replay import Replay
 from e2rl.synthesizer.selection import Selection
+from e2rl.traffic.replay import Replay
 from tests.synthesizer.traffic_scenes import scenes, synthesizer
 
 
@@ -19,8 +19,17 @@ def selection(*targets, seed=0, risk=0.5):
     count, vehicles = target.shape
     weights = torch.full((count, 2, vehicles, vehicles), risk)
     moments, acts = torch.tensor([[0.1, 0.6]]).expand(count, 2), target >= 0
-    return Selection(torch.arange(count) + seed, torch.zeros(count).long(), torch.zeros(count, 2, vehicles, 4), moments,
-                     weights, acts, acts, acts, target)
+    return Selection(
+        torch.arange(count) + seed,
+        torch.zeros(count).long(),
+        torch.zeros(count, 2, vehicles, 4),
+        moments,
+        weights,
+        acts,
+        acts,
+        acts,
+        target,
+    )
 
 
 def listener():
@@ -31,10 +40,13 @@ def test_links_then_members_then_risk_decide_and_the_first_of_equals_stays():
     chain = listener()
     chain(selection([-1, -1, -1, -1]))
     assert chain.kept is None
-    for given, seed in ((selection([-1, 0, -1, -1], [-1, 0, 0, -1]), 1), (selection([-1, 0, 0, -1], seed=10), 1),
-                        (selection([-1, 0, 0, -1], seed=20, risk=0.9), 20),
-                        (selection([-1, 0, 0, 0], [-1, 0, 1, -1], seed=30), 31),
-                        (selection([-1, 0, 0, 0], seed=40), 31)):
+    for given, seed in (
+        (selection([-1, 0, -1, -1], [-1, 0, 0, -1]), 1),
+        (selection([-1, 0, 0, -1], seed=10), 1),
+        (selection([-1, 0, 0, -1], seed=20, risk=0.9), 20),
+        (selection([-1, 0, 0, 0], [-1, 0, 1, -1], seed=30), 31),
+        (selection([-1, 0, 0, 0], seed=40), 31),
+    ):
         chain(given)
         assert chain.kept.seed.tolist() == [seed] and len(chain.kept.target) == 1
 

@@ -124,16 +124,3 @@ def test_several_intensities_of_one_method_are_told_apart(rollouts):
     many += label_rows(rows, Source("synthetic", "test", "nominal", "lane_graph"))
     result = metric_rows(many, features * 4, "", draws=10, realism_draws=2)
     assert [list(row["paired"]) for row in result] == [["e2@2", "nominal"], ["e2@1", "nominal"], ["e2@1", "e2@2"], []]
-
-
-def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
-    path = tmp_path / "metrics.json"
-    files.replace(path, b"old")
-
-    def fail(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(files.os, "replace", fail)
-    with pytest.raises(KeyboardInterrupt):
-        files.replace(path, b"new")
-    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]

@@ -7,9 +7,9 @@ from e2rl.evaluation.open_loop import HORIZONS, open_loop_rows, sample_plans
 from e2rl.evaluation.protocol import Method
 from e2rl.metrics.catalogue import OPEN_LOOP, OPEN_LOOP_STAGE
 from e2rl.prior.bounds import BoundSettings
-from e2rl.synthesizer.baselines.constant_velocity import ConstantVelocity
-from e2rl.synthesizer.baselines.idm import IDM
-from e2rl.synthesizer.baselines.replay import Replay
+from e2rl.traffic.constant_velocity import ConstantVelocity
+from e2rl.traffic.idm import IDM
+from e2rl.traffic.replay import Replay
 from tests.synthesizer.traffic_scenes import scenes, synthesizer
 
 STRAIGHT = Method("constant_velocity", ConstantVelocity(), 0.0)
@@ -55,11 +55,19 @@ def test_a_log_too_short_for_a_horizon_leaves_it_unknown():
 
 def test_who_looks_the_future_up_or_attacks_has_no_row_and_baselines_have_one_sample():
     on = synthesizer()
-    methods = [Method("replay", Replay(), 0.0), STRAIGHT, Method("idm", IDM(BoundSettings()), 0.0),
-               Method("nominal", on, 0.0), Method("e2", on, 2.0)]
+    methods = [
+        Method("replay", Replay(), 0.0),
+        STRAIGHT,
+        Method("idm", IDM(BoundSettings()), 0.0),
+        Method("nominal", on, 0.0),
+        Method("e2", on, 2.0),
+    ]
     rows = open_loop_rows(places(2), methods, 3)
     assert [(row["method"], row["n_seeds"], row["n_rollouts"]) for row in rows] == [
-        ("constant_velocity", 1, 2), ("idm", 1, 2), ("nominal", 3, 6)]
+        ("constant_velocity", 1, 2),
+        ("idm", 1, 2),
+        ("nominal", 3, 6),
+    ]
     assert all(row["stage"] == OPEN_LOOP_STAGE and row["ego"] == "unknown" and row["n_scenes"] == 2 for row in rows)
 
 

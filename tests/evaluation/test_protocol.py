@@ -57,16 +57,21 @@ def test_the_independent_scorer_agrees(run):
         pytest.skip(f"the independent scorer is not there: {SCORER}")
     pytest.importorskip("shapely")
     folder = run[1]
-    done = subprocess.run([sys.executable, SCORER, folder / ROLLOUTS, "--csv", folder / TABLE, "--bootstrap", "20"],
-                          capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, SCORER, folder / ROLLOUTS, "--csv", folder / TABLE, "--bootstrap", "20"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_methods_share_the_noise_of_a_scene_and_seed():
     assert scene_seed(3, 1) == scene_seed(3, 1) and len({scene_seed(i, j) for i in range(50) for j in range(5)}) == 250
     scene_set, on = scenes(SCENES), synthesizer()
-    twice = run_protocol(scene_set, [Method("one", on, 0.0), Method("two", synthesizer(), 0.0)], IDMEgo(), "idm", [4],
-                         SimSettings())
+    twice = run_protocol(
+        scene_set, [Method("one", on, 0.0), Method("two", synthesizer(), 0.0)], IDMEgo(), "idm", [4], SimSettings()
+    )
     one, two = (row["metrics"] for row in twice)
     for name in one:
         if not name.startswith("seconds"):
@@ -76,8 +81,9 @@ def test_methods_share_the_noise_of_a_scene_and_seed():
 
 def test_nothing_is_written_without_a_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    rows = run_protocol(scenes(1, steps=10), [Method("nominal", synthesizer(), 0.0)], IDMEgo(), "idm", [0],
-                        SimSettings())
+    rows = run_protocol(
+        scenes(1, steps=10), [Method("nominal", synthesizer(), 0.0)], IDMEgo(), "idm", [0], SimSettings()
+    )
     assert len(rows) == 1 and not list(tmp_path.iterdir())
 
 
@@ -91,7 +97,8 @@ def test_processes_change_nothing_but_the_time(tmp_path):
     timed = {"seconds_per_rollout", "seconds", "evasion_seconds"}
     for row, other in zip(one, two, strict=True):
         assert {k: str(v) for k, v in row.items() if k not in timed} == {
-            k: str(v) for k, v in other.items() if k not in timed}
+            k: str(v) for k, v in other.items() if k not in timed
+        }
     for path in sorted((folders[0] / ROLLOUTS).iterdir()):
         first, second = np.load(path), np.load(folders[1] / ROLLOUTS / path.name)
         assert all(np.array_equal(first[key], second[key]) for key in first.files), path.name

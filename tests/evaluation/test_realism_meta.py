@@ -11,8 +11,8 @@ from e2rl.evaluation.realism_meta import Tally, evaluated, log_split_half, meta_
 from e2rl.metrics.catalogue import META, META_STAGE
 from e2rl.metrics.meta_metric import FEATURES, HISTOGRAMS, SMOOTHING, meta_metric
 from e2rl.sim.env import SimSettings
-from e2rl.synthesizer.baselines.constant_velocity import ConstantVelocity
-from e2rl.synthesizer.baselines.replay import Replay
+from e2rl.traffic.constant_velocity import ConstantVelocity
+from e2rl.traffic.replay import Replay
 from tests.synthesizer.traffic_scenes import scenes, synthesizer
 
 SIM, STEPS = SimSettings(replay_ego=True), 30
@@ -28,16 +28,22 @@ def places(count=2, **options):
 def logs_of(scene_set):
     """The logs as rollouts."""
     scene = scene_set.scenes
-    return {"states": scene["logged"], "valid": scene["logged_valid"], "size": scene["size"],
-            "routes": scene["route_log"]}
+    return {
+        "states": scene["logged"],
+        "valid": scene["logged_valid"],
+        "size": scene["size"],
+        "routes": scene["route_log"],
+    }
 
 
 def sampled(scene_set, seeds, on=None):
     """[(scene indices, rollouts)] of a random prior, one for each seed."""
     method = Method("nominal", on or synthesizer(), 0.0)
     index = torch.arange(len(scene_set))
-    return [(index, roll_out_part(scene_set, [(k, seed) for k in range(len(scene_set))], method, ReplayEgo(), SIM))
-            for seed in seeds]
+    return [
+        (index, roll_out_part(scene_set, [(k, seed) for k in range(len(scene_set))], method, ReplayEgo(), SIM))
+        for seed in seeds
+    ]
 
 
 def likelihoods(scene_set, parts, rollouts):
@@ -70,8 +76,10 @@ def test_more_rollouts_like_the_log_make_it_likelier_and_others_less_likely():
     scene_set = places()
     index, logs = torch.arange(2), logs_of(scene_set)
     [(_, other)] = sampled(scene_set, [0])
-    values = [meta_metric(likelihoods(scene_set, [(index, part) for part in parts], len(parts))).mean().item()
-              for parts in ([other] * 4, [logs, other, other, other], [logs] * 4, [logs] * 16)]
+    values = [
+        meta_metric(likelihoods(scene_set, [(index, part) for part in parts], len(parts))).mean().item()
+        for parts in ([other] * 4, [logs, other, other, other], [logs] * 4, [logs] * 16)
+    ]
     assert values == sorted(values) and values[0] > 0 and values[-1] < 1
 
 
@@ -80,8 +88,11 @@ def test_neither_the_order_of_rollouts_nor_their_batches_matter_and_a_weight_is_
     parts = sampled(scene_set, [0, 1, 2])
     found = likelihoods(scene_set, parts, 3)
     same(found, likelihoods(scene_set, parts[::-1], 3))
-    rows = [(index[k:k + 1], {key: value[k:k + 1] for key, value in part.items() if isinstance(value, torch.Tensor)})
-            for index, part in parts for k in range(2)]
+    rows = [
+        (index[k : k + 1], {key: value[k : k + 1] for key, value in part.items() if isinstance(value, torch.Tensor)})
+        for index, part in parts
+        for k in range(2)
+    ]
     same(found, likelihoods(scene_set, rows, 3))
     weighed, repeated = Tally(scene_set.scenes), likelihoods(scene_set, parts[:1] * 3, 3)
     weighed.add(*parts[0], weight=3)
@@ -101,8 +112,12 @@ def test_the_order_of_vehicles_does_not_matter():
         scene[key] = scene[key][:, :, all_rows]
     for key in ("route_points", "route_light", "route_light_s", "route_log"):
         scene[key] = scene[key][:, order]
-    shuffled = {"states": part["states"][:, :, all_rows], "valid": part["valid"][:, :, all_rows],
-                "size": part["size"][:, all_rows], "routes": part["routes"][:, order]}
+    shuffled = {
+        "states": part["states"][:, :, all_rows],
+        "valid": part["valid"][:, :, all_rows],
+        "size": part["size"][:, all_rows],
+        "routes": part["routes"][:, order],
+    }
     same(found, likelihoods(other, [(index, shuffled)], 1))
 
 
@@ -129,8 +144,11 @@ def test_lights_belong_to_ways_so_that_whoever_follows_none_runs_none():
 
 def test_the_rows_of_a_run():
     scene_set, rollouts = places(), 3
-    methods = [Method("replay", Replay(), 0.0), Method("constant_velocity", ConstantVelocity(), 0.0),
-               Method("nominal", synthesizer(), 0.0)]
+    methods = [
+        Method("replay", Replay(), 0.0),
+        Method("constant_velocity", ConstantVelocity(), 0.0),
+        Method("nominal", synthesizer(), 0.0),
+    ]
     rows = meta_rows(scene_set, methods, ReplayEgo(), "replay", SIM, rollouts, batch=4)
     assert [row["method"] for row in rows] == ["replay", "constant_velocity", "nominal"]
     assert all((row["stage"], row["n_seeds"], row["n_rollouts"]) == (META_STAGE, 3, 6) for row in rows)

@@ -28,8 +28,13 @@ def brake_check(scenes):
         states[:, :, 1, 1], states[:, :, 1, 3] = 0.0, speed
         adversaries = torch.zeros(len(index), states.shape[2], dtype=torch.bool)
         adversaries[:, 1] = eta > 0
-        return {"scene_index": index, "states": states, "valid": valid, "adversaries": adversaries,
-                "contact": torch.full((len(index),), eta > 1)}
+        return {
+            "scene_index": index,
+            "states": states,
+            "valid": valid,
+            "adversaries": adversaries,
+            "contact": torch.full((len(index),), eta > 1),
+        }
 
     return synthesize
 
@@ -38,9 +43,12 @@ def small_run(seed=0, hidden=(16,), nominal="log", rounds=4, scenes=None, collec
     torch.manual_seed(seed)
     scenes = scenes or small_scenes()
     improve = PolicyImprovement(
-        ActorEgo(hidden=hidden), scenes, SimSettings(),
+        ActorEgo(hidden=hidden),
+        scenes,
+        SimSettings(),
         UpdateSettings(**({"minibatch": 64, "epochs": 2, "critic_warmup": 0, "target_kl": 1.0} | update)),
-        collect or CollectSettings(batch=4, steps=20, iterations=2), seed=seed,
+        collect or CollectSettings(batch=4, steps=20, iterations=2),
+        seed=seed,
     )
     curriculum = CurriculumScheduler(len(scenes), rounds, CurriculumSettings(), seed)
     return Evolution(curriculum, improve, brake_check(scenes), RoundSettings(scenes=3, nominal=nominal), seed, measure)

@@ -56,8 +56,9 @@ def test_planner_learner():
 
 def test_imitation_stage(tmp_path):
     config, scenes = small(config_of()), small_scenes(3)
-    row = run_imitation(config, scenes, instantiate(config.sim), instantiate(config.ego), tmp_path,
-                        build_logger(config, tmp_path))
+    row = run_imitation(
+        config, scenes, instantiate(config.sim), instantiate(config.ego), tmp_path, build_logger(config, tmp_path)
+    )
     assert row["epoch"] == 0.0 and (tmp_path / "actor.safetensors").is_file()
     assert (tmp_path / "logs/scalars/train/imitation_loss.csv").is_file()
 

@@ -17,8 +17,9 @@ CONFIG = {"seed": 0, "ego": {"hidden": [16]}}
 
 
 def rounds(run, count):
-    return [{name: value for name, value in run.run_round().items() if not name.startswith("time/")}
-            for _ in range(count)]
+    return [
+        {name: value for name, value in run.run_round().items() if not name.startswith("time/")} for _ in range(count)
+    ]
 
 
 def test_resumed_rounds_are_those_of_one_run(tmp_path):

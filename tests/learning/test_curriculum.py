@@ -16,8 +16,9 @@ def episodes(curriculum, scenes, returns, adversarial=True):
 
 
 def test_constant_and_linear_intensity_and_share():
-    constant, linear = scheduler(schedule="constant", eta=2.0), scheduler(
-        schedule="linear", eta=0.5, eta_final=2.5, ramp=0.5, share=0.0, share_final=0.9
+    constant, linear = (
+        scheduler(schedule="constant", eta=2.0),
+        scheduler(schedule="linear", eta=0.5, eta_final=2.5, ramp=0.5, share=0.0, share_final=0.9),
     )
     etas, shares = [], []
     for _ in range(10):

@@ -15,12 +15,24 @@ def frames(lengths, total, fail=()):
     done = torch.tensor([t == lengths[k] for t, k in zip(timestep.tolist(), number.tolist(), strict=True)])
     contact = done & torch.tensor([k in fail for k in number.tolist()])
     row = number[None, :, None]
-    return TensorDict({
-        "traffic_row": row, "scene_index": row + 10,
-        "next": {"timestep": timestep[None, :, None], "done": done[None, :, None], "reward": torch.ones(1, total, 1),
-                 "metrics": {"contact": contact[None, :, None], "contact_vru": torch.zeros(1, total, 1).bool(),
-                             "off_road": torch.zeros(1, total, 1).bool(), "progress": 2.0 * timestep[None, :, None]}},
-    }, [1, total])
+    return TensorDict(
+        {
+            "traffic_row": row,
+            "scene_index": row + 10,
+            "next": {
+                "timestep": timestep[None, :, None],
+                "done": done[None, :, None],
+                "reward": torch.ones(1, total, 1),
+                "metrics": {
+                    "contact": contact[None, :, None],
+                    "contact_vru": torch.zeros(1, total, 1).bool(),
+                    "off_road": torch.zeros(1, total, 1).bool(),
+                    "progress": 2.0 * timestep[None, :, None],
+                },
+            },
+        },
+        [1, total],
+    )
 
 
 def test_returns_outcomes_and_scenes_of_episodes_across_batches():

@@ -23,8 +23,11 @@ def test_standing_still_is_refused_though_its_objective_is_the_least():
 
 def test_every_combination_is_tried_once_the_present_one_first():
     seen = []
-    tuning = tune(lambda p: seen.append((p["speed"], p["caution"])) or road(p), PRESENT,
-                  {"speed": [5.0, 10.0], "caution": [1.0, 2.0]})
+    tuning = tune(
+        lambda p: seen.append((p["speed"], p["caution"])) or road(p),
+        PRESENT,
+        {"speed": [5.0, 10.0], "caution": [1.0, 2.0]},
+    )
     assert seen[0] == (10.0, 1.0) and len(seen) == len(set(seen)) == len(tuning.trials) == 4
     columns = {"parameters", "collision", "comfort", "progress", "speed", "objective", "admissible"}
     assert set(tuning.trials[0]) == columns
@@ -36,11 +39,15 @@ def test_objective_is_collision_comfort_and_lost_progress():
 
 
 def test_the_present_parameters_stay_where_nothing_is_better():
-    worse = tune(lambda p: {"collision": p["speed"] - 10, "comfort": 0.0, "progress": 1.0}, PRESENT,
-                 {"speed": [10, 11]})
+    worse = tune(
+        lambda p: {"collision": p["speed"] - 10, "comfort": 0.0, "progress": 1.0}, PRESENT, {"speed": [10, 11]}
+    )
     assert worse.best == PRESENT
-    nan = tune(lambda p: {"collision": 0.1 if p["speed"] == 10.0 else float("nan"), "comfort": 0.0, "progress": 1.0},
-               PRESENT, {"speed": [10.0, 11.0]})
+    nan = tune(
+        lambda p: {"collision": 0.1 if p["speed"] == 10.0 else float("nan"), "comfort": 0.0, "progress": 1.0},
+        PRESENT,
+        {"speed": [10.0, 11.0]},
+    )
     assert nan.best == PRESENT and not nan.trials[1]["admissible"]
 
 

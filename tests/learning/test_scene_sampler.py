@@ -28,8 +28,13 @@ def collect(env, steps, seed=0):
     torch.manual_seed(seed)
     batch = env.batch_size[0]
     collector = Collector(
-        env, ActorEgo(hidden=(8,), initial_std=(0.9, 0.5)).network.actor, frames_per_batch=batch * steps,
-        total_frames=-1, trust_policy=True, track_traj_ids=False, auto_register_policy_transforms=False,
+        env,
+        ActorEgo(hidden=(8,), initial_std=(0.9, 0.5)).network.actor,
+        frames_per_batch=batch * steps,
+        total_frames=-1,
+        trust_policy=True,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
     )
     data = next(iter(collector))
     collector.shutdown()

@@ -13,8 +13,15 @@ from tests.learning.small import small_scenes
 
 
 def collector_of(env, ego, steps):
-    return Collector(env, ego.network.actor, frames_per_batch=env.batch_size[0] * steps, total_frames=-1,
-                     trust_policy=True, track_traj_ids=False, auto_register_policy_transforms=False)
+    return Collector(
+        env,
+        ego.network.actor,
+        frames_per_batch=env.batch_size[0] * steps,
+        total_frames=-1,
+        trust_policy=True,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
+    )
 
 
 def batch_of(ego, batch=8, steps=20):
@@ -26,8 +33,9 @@ def batch_of(ego, batch=8, steps=20):
 
 def expert_of(data, action):
     observation = data["observation"].reshape(-1, data["observation"].shape[-1])
-    return TensorDict({"observation": observation, "action": torch.tensor(action).repeat(len(observation), 1)},
-                      [len(observation)])
+    return TensorDict(
+        {"observation": observation, "action": torch.tensor(action).repeat(len(observation), 1)}, [len(observation)]
+    )
 
 
 def test_ppo_learns_to_drive_from_standing():
@@ -36,8 +44,10 @@ def test_ppo_learns_to_drive_from_standing():
     torch.manual_seed(0)
     scenes = small_scenes(4, steps=30, vehicles=[(0.0, 0, 5.0), (60.0, 0, 0.0)], num_vrus=0)
     ego = ActorEgo(hidden=(32,), reference=False, initial_std=(0.4, 0.02))
-    learner = Learner(ego.network, UpdateSettings(learning_rate=3e-3, minibatch=240, gamma=0.95, critic_warmup=0,
-                                                  target_kl=0.2, epochs=6))
+    learner = Learner(
+        ego.network,
+        UpdateSettings(learning_rate=3e-3, minibatch=240, gamma=0.95, critic_warmup=0, target_kl=0.2, epochs=6),
+    )
     collector = collector_of(DrivingEnv(scenes, SimSettings(), 16), ego, 30)
     progress = []
     for _, data in zip(range(15), collector, strict=False):
@@ -51,8 +61,9 @@ def test_ppo_learns_to_drive_from_standing():
 def test_cloning_pulls_the_actor_towards_the_expert():
     torch.manual_seed(0)
     ego = ActorEgo(hidden=(16,))
-    learner = Learner(ego.network, UpdateSettings(critic_warmup=0, cloning=1.0, minibatch=80, learning_rate=3e-3,
-                                                  target_kl=1e9))
+    learner = Learner(
+        ego.network, UpdateSettings(critic_warmup=0, cloning=1.0, minibatch=80, learning_rate=3e-3, target_kl=1e9)
+    )
     data, losses = batch_of(ego), []
     expert = expert_of(data, [-3.0, 0.2])
     for _ in range(4):

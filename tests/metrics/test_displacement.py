@@ -19,7 +19,7 @@ def logs(scenes=3, vehicles=4, seed=0):
 
 def sampled(logged, samples, noise=1.0, seed=1):
     """Plans [B, S, V, STEPS, 4]: the log and noise."""
-    future = logged[:, 1:STEPS + 1].transpose(1, 2)[:, None]
+    future = logged[:, 1 : STEPS + 1].transpose(1, 2)[:, None]
     generator = torch.Generator().manual_seed(seed)
     shape = (len(logged), samples, *future.shape[2:])
     return future + noise * torch.randn(shape, generator=generator)
@@ -42,11 +42,12 @@ def test_a_steady_drift_has_its_mean_distance_at_every_horizon():
 
 def test_it_does_not_depend_on_where_the_scene_lies():
     logged, *_ = logs()
-    plans, future = sampled(logged, 3), logged[:, 1:STEPS + 1].transpose(1, 2)
+    plans, future = sampled(logged, 3), logged[:, 1 : STEPS + 1].transpose(1, 2)
     turn = torch.tensor([[0.6, 0.8], [-0.8, 0.6]])
     place = lambda track: torch.cat([track[..., :2] @ turn + 30.0, track[..., 2:]], -1)  # noqa: E731
-    torch.testing.assert_close(displacement(place(plans), place(future)), displacement(plans, future), rtol=1e-4,
-                               atol=1e-4)
+    torch.testing.assert_close(
+        displacement(place(plans), place(future)), displacement(plans, future), rtol=1e-4, atol=1e-4
+    )
 
 
 def test_a_sample_equal_to_the_log_makes_the_best_error_zero_but_not_the_mean():
@@ -77,8 +78,13 @@ def test_neither_the_order_of_samples_nor_of_vehicles_matters():
     plans, reference = sampled(logged, 4), sampled(logged, 1, seed=5)[:, 0]
     order = torch.tensor([0, 3, 1, 2])  # the ego stays first
     found = columns(plans, logged, valid, simulated, reference=reference)
-    other = columns(plans.flip(1)[:, :, order], logged[:, :, order], valid[:, :, order], simulated[:, order],
-                    reference=reference[:, order])
+    other = columns(
+        plans.flip(1)[:, :, order],
+        logged[:, :, order],
+        valid[:, :, order],
+        simulated[:, order],
+        reference=reference[:, order],
+    )
     for name, value in found.items():
         torch.testing.assert_close(other[name], value)
 

@@ -28,8 +28,13 @@ def cars(*states):
     track = torch.tensor(states[:1], dtype=torch.float64)[:, None]
     others = torch.tensor([[states[1:]]], dtype=torch.float64)
     size = torch.tensor(CAR, dtype=torch.float64)
-    return [track, size[None], others, size.expand(1, len(states) - 1, 2),
-            torch.ones(1, 1, len(states) - 1, dtype=torch.bool)]
+    return [
+        track,
+        size[None],
+        others,
+        size.expand(1, len(states) - 1, 2),
+        torch.ones(1, 1, len(states) - 1, dtype=torch.bool),
+    ]
 
 
 def ttc(*states):
@@ -46,8 +51,9 @@ def test_a_steady_turn_has_its_speed_and_yaw_rate_and_edges_are_unknown():
     for name, (values, known) in found.items():
         edge = 1 if name.endswith("speed") else 2
         assert known[0].tolist() == [False] * edge + [True] * (20 - 2 * edge) + [False] * edge, name
-        torch.testing.assert_close(values[0, edge:-edge], torch.full((20 - 2 * edge,), expected[name] + 0.0).double(),
-                                   rtol=1e-3, atol=1e-6)
+        torch.testing.assert_close(
+            values[0, edge:-edge], torch.full((20 - 2 * edge,), expected[name] + 0.0).double(), rtol=1e-3, atol=1e-6
+        )
 
 
 def test_central_differences_are_exact_for_parabolas_and_need_both_neighbours():
@@ -80,8 +86,11 @@ def test_the_nearest_object_is_the_smallest_signed_distance():
     overlaps = 0
     for m in range(25):
         for t in range(2):
-            gaps = [minkowski_distance(track[m, t], size[m], others[m, t, n], other_size[m, n])
-                    for n in range(5) if seen[m, t, n]]
+            gaps = [
+                minkowski_distance(track[m, t], size[m], others[m, t, n], other_size[m, n])
+                for n in range(5)
+                if seen[m, t, n]
+            ]
             expected = min(gaps, default=FAR)
             overlaps += expected < 0
             assert found[m, t].item() == pytest.approx(expected, abs=2e-6)
@@ -135,8 +144,9 @@ def crossing_of(light_state, known=None, light=(0, -1), speed=10.0):
     track[0, :, 0] = speed * DT * torch.arange(steps)
     known = torch.ones(1, steps, dtype=torch.bool) if known is None else known
     route = torch.stack([2.0 * torch.arange(-5, 40), torch.zeros(45)], -1)[None]
-    return runs_red_light(track, known, torch.tensor([CAR]), route, torch.tensor([light]),
-                          torch.tensor([[18.0, 0.0]]), light_state[None]).item()  # 18 m from the route's begin
+    return runs_red_light(
+        track, known, torch.tensor([CAR]), route, torch.tensor([light]), torch.tensor([[18.0, 0.0]]), light_state[None]
+    ).item()  # 18 m from the route's begin
 
 
 def test_a_red_light_is_run_when_the_front_passes_its_line_while_it_is_red():
@@ -165,10 +175,17 @@ def random_batch(seed=0):
     forward = torch.stack([heading.cos(), heading.sin()], -1)[:, :, None]
     points = rollouts["states"][:, 0, :8, None, :2].nan_to_num() + 2.0 * torch.arange(40)[:, None] * forward
     light = torch.randint(-1, 2, (3, 8, 2), generator=generator)
-    return {"states": rollouts["states"].nan_to_num(), "valid": rollouts["valid"], "size": rollouts["size"],
-            "field": torch.full((3, 400, 400), -1.5), "field_origin": torch.full((3, 2), -200.0),
-            "light_state": torch.full((3, 31, 2), LIGHT_RED), "route_points": points,
-            "route_light": light, "route_light_s": 12 * torch.rand(3, 8, 2, generator=generator)}
+    return {
+        "states": rollouts["states"].nan_to_num(),
+        "valid": rollouts["valid"],
+        "size": rollouts["size"],
+        "field": torch.full((3, 400, 400), -1.5),
+        "field_origin": torch.full((3, 2), -200.0),
+        "light_state": torch.full((3, 31, 2), LIGHT_RED),
+        "route_points": points,
+        "route_light": light,
+        "route_light_s": 12 * torch.rand(3, 8, 2, generator=generator),
+    }
 
 
 def tracks():
@@ -189,8 +206,9 @@ def test_features_do_not_depend_on_where_the_scene_lies():
     assert found[1]["collision"].any() and found[1]["red_light"].any() and not found[1]["offroad"].any()
     cos, sin = math.cos(0.7), math.sin(0.7)
     turn, shift = torch.tensor([[cos, sin], [-sin, cos]]), torch.tensor([15.0, -8.0])
-    states = torch.cat([batch["states"][..., :2] @ turn + shift, batch["states"][..., 2:3] + 0.7,
-                        batch["states"][..., 3:]], -1)
+    states = torch.cat(
+        [batch["states"][..., :2] @ turn + shift, batch["states"][..., 2:3] + 0.7, batch["states"][..., 3:]], -1
+    )
     elsewhere = batch | {"states": states, "route_points": batch["route_points"] @ turn + shift}
     compare(found, track_features(elsewhere, rollout, agent))
 
@@ -199,14 +217,22 @@ def test_features_do_not_depend_on_the_order_of_agents_nor_on_who_is_asked_with_
     batch, (rollout, agent) = random_batch(1), tracks()
     found = track_features(batch, rollout, agent)
     order = torch.tensor([0, 5, 7, 1, 3, 2, 6, 4, 9, 10, 8])
-    other = batch | {"states": batch["states"][:, :, order], "valid": batch["valid"][:, :, order],
-                     "size": batch["size"][:, order]}
+    other = batch | {
+        "states": batch["states"][:, :, order],
+        "valid": batch["valid"][:, :, order],
+        "size": batch["size"][:, order],
+    }
     other |= {key: batch[key][:, order[:8]] for key in ("route_points", "route_light", "route_light_s")}
     compare(found, track_features(other, rollout, order[:8].argsort()[agent]))
     some = torch.tensor([17, 2, 9])
     part = track_features(batch, rollout[some], agent[some])
-    compare(({name: tuple(column[some] for column in pair) for name, pair in found[0].items()},
-             {name: event[some] for name, event in found[1].items()}), part)
+    compare(
+        (
+            {name: tuple(column[some] for column in pair) for name, pair in found[0].items()},
+            {name: event[some] for name, event in found[1].items()},
+        ),
+        part,
+    )
 
 
 def test_what_absent_agents_hold_does_not_matter():

@@ -35,8 +35,13 @@ def values(batch, who=None):
 
 
 def test_everybody_is_counted_once_and_where_it_belongs():
-    assert values(rollouts()) == {"parked_moved": 0.5, "parked_vehicles": 2, "starters": 1, "starters_log": 1,
-                                  "standing": 3}
+    assert values(rollouts()) == {
+        "parked_moved": 0.5,
+        "parked_vehicles": 2,
+        "starters": 1,
+        "starters_log": 1,
+        "standing": 3,
+    }
 
 
 def test_the_log_as_a_rollout_starts_as_many_as_the_log_and_moves_no_parked_vehicle():
@@ -48,8 +53,13 @@ def test_the_log_as_a_rollout_starts_as_many_as_the_log_and_moves_no_parked_vehi
 def test_who_is_no_traffic_is_not_counted():
     who = traffic()
     who[0, [PARKED_MOVES, STARTS]] = False
-    assert values(rollouts(), who) == {"parked_moved": 0, "parked_vehicles": 1, "starters": 0, "starters_log": 1,
-                                       "standing": 2}
+    assert values(rollouts(), who) == {
+        "parked_moved": 0,
+        "parked_vehicles": 1,
+        "starters": 0,
+        "starters_log": 1,
+        "standing": 2,
+    }
 
 
 def test_it_does_not_depend_on_place_or_order():

@@ -9,9 +9,11 @@ SCHEDULE = NoiseSchedule()
 
 def denoiser(mean, std):
     """E[x_0 | x_t] of data N(mean, std^2), as a function of x and t."""
+
     def estimate(x, t):
         alpha, sigma = SCHEDULE.alpha(t), SCHEDULE.sigma(t)
         return mean + std**2 * alpha / (alpha**2 * std**2 + sigma**2) * (x - alpha * mean)
+
     return estimate
 
 

@@ -37,15 +37,21 @@ def arc(x: float, y: float, heading: float, curvature: float, count: int = 150, 
 
 
 VEHICLES = [  # x, y, heading, speed, curvature and side offset of the route
-    (0.0, 0.0, 0.0, 8.0, 0.0, 0.3), (18.0, 0.4, 0.05, 6.0, 0.01, -0.2), (30.0, -25.0, 1.5, 7.0, -0.012, 0.5),
-    (-15.0, 6.0, -0.2, 9.0, 0.004, 0.0), (45.0, 30.0, -1.7, 0.2, 0.008, -0.4), (5.0, 3.5, 0.1, 8.0, 0.0, 0.0)]
+    (0.0, 0.0, 0.0, 8.0, 0.0, 0.3),
+    (18.0, 0.4, 0.05, 6.0, 0.01, -0.2),
+    (30.0, -25.0, 1.5, 7.0, -0.012, 0.5),
+    (-15.0, 6.0, -0.2, 9.0, 0.004, 0.0),
+    (45.0, 30.0, -1.7, 0.2, 0.008, -0.4),
+    (5.0, 3.5, 0.1, 8.0, 0.0, 0.0),
+]
 
 
 def curved_scenes(copies: int = 1, rows: int = 8, **options) -> TensorDict:
     """Scenes [copies] of VEHICLES, each beside its own curved route, one behind another, some crossing; red lights."""
     count = len(VEHICLES)
-    scene = make_scenes(copies, num_vehicles=count, num_vrus=1, max_vehicles=rows, max_agents=rows + 2,
-                        red_light_x=30.0, **options).scenes
+    scene = make_scenes(
+        copies, num_vehicles=count, num_vrus=1, max_vehicles=rows, max_agents=rows + 2, red_light_x=30.0, **options
+    ).scenes
     time = 0.1 * torch.arange(scene["logged"].shape[1])
     for i, (x, y, heading, speed, curvature, aside) in enumerate(VEHICLES):
         scene["start"][:, i] = torch.tensor([x, y, heading, speed])

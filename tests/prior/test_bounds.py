@@ -55,7 +55,7 @@ def test_a_follower_brakes_to_its_leader_s_speed_in_the_room_there_is(speed):
     cap = caps(decode, state, around, gap=1.0)
     time = contact_time((15 - CAR[0]) / (10 - speed))
     room = 10 * time - 1.0 - speed * time
-    assert cap.tolist() == pytest.approx([-(10 - speed) ** 2 / (2 * room), FREE], rel=2e-2)
+    assert cap.tolist() == pytest.approx([-((10 - speed) ** 2) / (2 * room), FREE], rel=2e-2)
 
 
 def test_braking_is_never_harder_than_the_floor_nor_softer_than_gentle():
@@ -85,8 +85,12 @@ def test_absent_vehicles_are_in_nobody_s_way():
 def test_a_pedestrian_without_a_plan_keeps_its_velocity():
     decode, state, around = traffic((0, 0, 0, 10))
     walker = torch.tensor([[[20.0, -3.0, math.pi / 2, 1.5]]])
-    around = Surroundings(torch.cat([around.agents, walker], 1), torch.cat([around.size, torch.ones(1, 1, 2)], 1),
-                          torch.ones(1, 2, dtype=torch.bool), around.exempt)
+    around = Surroundings(
+        torch.cat([around.agents, walker], 1),
+        torch.cat([around.size, torch.ones(1, 1, 2)], 1),
+        torch.ones(1, 2, dtype=torch.bool),
+        around.exempt,
+    )
     assert caps(decode, state, around)[0] < -1
     around.agents[0, 1, 3] = 0.0
     assert caps(decode, state, around)[0] == FREE

@@ -42,14 +42,18 @@ def rewritten(path, change, drop=None):
     return str(path)
 
 
-@pytest.mark.parametrize("change", [
-    lambda a: a["denoiser"].update(width=16),
-    lambda a: a["denoiser"].update(blocks=2),
-    lambda a: a["denoiser"].update(layers=2),
-    lambda a: a.update(features=[1, 2, 3]),
-    lambda a: a.pop("denoiser"),
-    lambda a: a.pop("features"),
-], ids=["width", "blocks", "unknown-setting", "features", "no-network", "no-features"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda a: a["denoiser"].update(width=16),
+        lambda a: a["denoiser"].update(blocks=2),
+        lambda a: a["denoiser"].update(layers=2),
+        lambda a: a.update(features=[1, 2, 3]),
+        lambda a: a.pop("denoiser"),
+        lambda a: a.pop("features"),
+    ],
+    ids=["width", "blocks", "unknown-setting", "features", "no-network", "no-features"],
+)
 def test_another_architecture_is_refused(tmp_path, change):
     path = rewritten(save_prior(small_prior(), tmp_path, {}), change)
     with pytest.raises(InputError, match="prior-"):

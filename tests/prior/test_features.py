@@ -14,8 +14,12 @@ from tests.prior.small import arc, curved_scenes, mirrored, moved
 def features(scene, step=None):
     vehicles = scene["route_log"].shape[1]
     routed = route_scene(scene, scene["route_log"].clamp(min=0))
-    state = locate(scene["start"][:, :vehicles], scene["start_accel"][:, :vehicles],
-                   scene["start_yaw_rate"][:, :vehicles], routed.points)
+    state = locate(
+        scene["start"][:, :vehicles],
+        scene["start_accel"][:, :vehicles],
+        scene["start_yaw_rate"][:, :vehicles],
+        routed.points,
+    )
     step = torch.zeros(len(scene), dtype=torch.long) if step is None else step
     nodes = node_features(routed, state, scene["start"], scene["valid"], step, step == 0)
     here = scene["valid"][0, :vehicles]

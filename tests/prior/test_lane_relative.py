@@ -35,8 +35,9 @@ def routes(count=COUNT):
 def straight(v, a=0.0, d=0.0, heading=0.0, count=1):
     """Vehicles at 20 m of a route along +x."""
     full = lambda value: torch.full((count,), float(value))  # noqa: E731
-    return LaneState(full(20), full(d), full(heading).tan(), full(0), full(v), full(a), full(0), full(d), full(heading),
-                     full(0))
+    return LaneState(
+        full(20), full(d), full(heading).tan(), full(0), full(v), full(a), full(0), full(d), full(heading), full(0)
+    )
 
 
 def test_plans_begin_where_and_as_the_vehicle_is(generator):
@@ -101,8 +102,9 @@ def test_a_standing_vehicle_does_not_move_sideways():
     x = torch.cat([-torch.ones(1, KNOTS), torch.tensor([[3.0, -4.0]])], 1)
     plan = decode(x, state, arc(0, 0, 0, 0)[None])
     for name in ("x", "y", "heading"):
-        torch.testing.assert_close(getattr(plan, name), getattr(state, name)[:, None].expand(1, HORIZON), rtol=0,
-                                   atol=1e-4)
+        torch.testing.assert_close(
+            getattr(plan, name), getattr(state, name)[:, None].expand(1, HORIZON), rtol=0, atol=1e-4
+        )
 
 
 def test_fitting_a_decoded_plan_gives_it_back(generator):
@@ -133,8 +135,9 @@ def test_travelled_distance_is_the_integral_of_speed(generator):
     state = straight(3.0, a=-1.0, count=COUNT)
     v, way = speeds(state, torch.randn(COUNT, KNOTS, generator=generator))
     before = torch.cat([state.v[:, None], v[:, :-1]], 1)
-    torch.testing.assert_close(way.diff(dim=-1, prepend=torch.zeros(COUNT, 1)), (v + before) / 2 * 0.1, rtol=0,
-                               atol=1e-5)
+    torch.testing.assert_close(
+        way.diff(dim=-1, prepend=torch.zeros(COUNT, 1)), (v + before) / 2 * 0.1, rtol=0, atol=1e-5
+    )
 
 
 def test_the_polynomial_and_its_gradients():

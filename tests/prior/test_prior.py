@@ -16,7 +16,7 @@ MEAN, STD = 0.4, 0.6
 def context_of(prior, scene, **options):
     vehicles = scene["route_log"].shape[1]
     routed, state = prior.start(scene, scene["route_log"].clamp(min=0))
-    ego = scene["logged"][:, 1:HORIZON + 1, 0]
+    ego = scene["logged"][:, 1 : HORIZON + 1, 0]
     step = torch.zeros(len(scene), dtype=torch.long)
     assert state.s.shape[1] == vehicles
     return prior.encode(routed, state, scene["start"], scene["valid"], step, ego, **options)
@@ -39,9 +39,16 @@ def gaussian_prior(**sampler):
     return prior
 
 
-@pytest.mark.parametrize("sampler", [{"steps": 50}, {"steps": 50, "churn": 0.0},
-                                     {"steps": 50, "sampler": "dpm_solver_pp"},
-                                     {"steps": 200, "sampler": "euler_maruyama"}], ids=str)
+@pytest.mark.parametrize(
+    "sampler",
+    [
+        {"steps": 50},
+        {"steps": 50, "churn": 0.0},
+        {"steps": 50, "sampler": "dpm_solver_pp"},
+        {"steps": 200, "sampler": "euler_maruyama"},
+    ],
+    ids=str,
+)
 def test_sampling_draws_from_gaussian_data(sampler):
     prior = gaussian_prior(**sampler)
     noise = torch.randn(prior.sampler.steps, 500, 1, SIZE, generator=torch.Generator().manual_seed(0))
@@ -51,9 +58,16 @@ def test_sampling_draws_from_gaussian_data(sampler):
     assert (sample.kl == 0).all()
 
 
-@pytest.mark.parametrize("sampler", [{"steps": 4}, {"steps": 5, "churn": 0.7},
-                                     {"steps": 5, "sampler": "dpm_solver_pp"},
-                                     {"steps": 4, "sampler": "euler_maruyama"}], ids=str)
+@pytest.mark.parametrize(
+    "sampler",
+    [
+        {"steps": 4},
+        {"steps": 5, "churn": 0.7},
+        {"steps": 5, "sampler": "dpm_solver_pp"},
+        {"steps": 4, "sampler": "euler_maruyama"},
+    ],
+    ids=str,
+)
 @pytest.mark.parametrize("temperature", [1.0, 0.8])
 def test_path_kl_is_that_of_the_two_laws_of_the_path(sampler, temperature):
     """With a linear denoiser the path (x_K .. x_1) is Gaussian: its law is read off unit noises, one per scene."""
@@ -100,7 +114,7 @@ def test_the_ego_s_plan_becomes_the_x_that_decodes_to_it(free_space):
     scene = curved_scenes()
     prior = small_prior(free_space=free_space, bounds=FREE)
     context = context_of(prior, scene)
-    plan = scene["logged"][:, 1:HORIZON + 1, 0]
+    plan = scene["logged"][:, 1 : HORIZON + 1, 0]
     x = torch.zeros(*scene["route_log"].shape, SIZE)
     x[:, 0] = context.ego_x
     decoded = prior.decode(x, context).states()[:, 0]
@@ -143,7 +157,7 @@ def test_parked_absent_and_waiting_vehicles_stay_and_the_ego_is_not_moved():
     plan = prior.plan(-torch.ones(*scene["route_log"].shape, SIZE), context)
     states = plan.states()
     still = [1, 4, *range(len(VEHICLES), scene["route_log"].shape[1])]
-    start = scene["start"][:, :scene["route_log"].shape[1]]
+    start = scene["start"][:, : scene["route_log"].shape[1]]
     torch.testing.assert_close(states[:, still, :, :3], start[:, still, None, :3].expand(-1, -1, HORIZON, -1))
     assert (states[:, still, :, 3] == 0).all()
     assert context.active[0].tolist() == [False, False, True, True, True, True, False, False]
@@ -168,8 +182,8 @@ def test_samples_do_not_depend_on_the_batch_nor_on_absent_vehicles():
     alone = prior.sample(context_of(prior, scene[1:2]), noise[:, 1:2]).x0
     torch.testing.assert_close(whole[1:2], alone, rtol=0, atol=2e-4)
     wild = noise.clone()
-    wild[:, :, len(VEHICLES):] = 5.0
-    here = scene["valid"][0, :scene["route_log"].shape[1]]
+    wild[:, :, len(VEHICLES) :] = 5.0
+    here = scene["valid"][0, : scene["route_log"].shape[1]]
     torch.testing.assert_close(prior.sample(context_of(prior, scene), wild).x0[:, here], whole[:, here])
 
 
@@ -211,8 +225,6 @@ def test_the_ego_follows_its_mission_whatever_is_drawn():
     scene["route_log"][:, 0] = 1
     chosen = prior.choose_routes(scene, torch.zeros(scene["route_valid"].shape[:2]))
     assert chosen[0, 0] == 1 and (chosen[0, 1:] == 0).all()
-
-
 
 
 def test_without_a_plan_the_ego_is_sampled_like_everybody_else():

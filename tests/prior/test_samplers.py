@@ -14,7 +14,12 @@ from tests.prior.gaussian import SCHEDULE, denoiser, flow, moments, run
 MEAN, STD, WEIGHT = 1.3, 0.4, 5.0  # data N(1.3, 0.4^2) and V = WEIGHT x^2 / 2
 TILTED = 0.72222, 0.29814  # of exp(-V) times the data: precision 1 / 0.16 + 5, mean 1.3 / 0.16 / precision
 DDPM, DDIM, SDE_2M, ODE_2M, EULER = (
-    ("ddim", 1.0), ("ddim", 0.0), ("dpm_solver_pp", 1.0), ("dpm_solver_pp", 0.0), ("euler_maruyama", 1.0))
+    ("ddim", 1.0),
+    ("ddim", 0.0),
+    ("dpm_solver_pp", 1.0),
+    ("dpm_solver_pp", 0.0),
+    ("euler_maruyama", 1.0),
+)
 
 
 def test_the_tilted_gaussian_is_the_reference_s():
@@ -30,9 +35,16 @@ def test_many_steps_draw_the_data(sampler, data):
     assert mean == pytest.approx(data[0], abs=0.018) and std == pytest.approx(data[1], abs=0.003)
 
 
-@pytest.mark.parametrize(("sampler", "mean", "std"), [
-    (DDPM, 0.7222, 0.2029), (DDIM, 0.7171, 0.2246), (SDE_2M, 0.7222, 0.2386), (ODE_2M, 0.7167, 0.2454),
-    (EULER, 0.7140, 0.3345)])
+@pytest.mark.parametrize(
+    ("sampler", "mean", "std"),
+    [
+        (DDPM, 0.7222, 0.2029),
+        (DDIM, 0.7171, 0.2246),
+        (SDE_2M, 0.7222, 0.2386),
+        (ODE_2M, 0.7167, 0.2454),
+        (EULER, 0.7140, 0.3345),
+    ],
+)
 def test_bias_of_the_samplers_at_eight_steps(sampler, mean, std):
     """The score is exactly the tilt's, so what is left is the sampler's: first-order ones lose a quarter to a third of
     the spread, Euler-Maruyama adds an eighth, the second-order ones lose a fifth."""
@@ -49,14 +61,23 @@ def guided(gradient, scaling):
         through = x0 if gradient == "clean" else x
         (away,) = torch.autograd.grad((WEIGHT * x0**2 / 2).sum(), through)
         return (x0 - gradient_weight(SCHEDULE, t, scaling) * away).detach()
+
     return estimate
 
 
-@pytest.mark.parametrize(("gradient", "scaling", "sampler", "mean", "std"), [
-    ("denoiser", "score", DDPM, 0.5838, 0.2806), ("denoiser", "score", SDE_2M, 0.5841, 0.2826),
-    ("denoiser", "score", EULER, 0.5838, 0.2831), ("denoiser", "score", DDIM, 0.4966, 0.2676),
-    ("denoiser", "score", ODE_2M, 0.4964, 0.2683), ("denoiser", "sigma", DDPM, 0.0578, 0.0739),
-    ("clean", "score", DDPM, 0.0882, 0.2495), ("clean", "sigma", DDPM, 0.0084, 0.0693)])
+@pytest.mark.parametrize(
+    ("gradient", "scaling", "sampler", "mean", "std"),
+    [
+        ("denoiser", "score", DDPM, 0.5838, 0.2806),
+        ("denoiser", "score", SDE_2M, 0.5841, 0.2826),
+        ("denoiser", "score", EULER, 0.5838, 0.2831),
+        ("denoiser", "score", DDIM, 0.4966, 0.2676),
+        ("denoiser", "score", ODE_2M, 0.4964, 0.2683),
+        ("denoiser", "sigma", DDPM, 0.0578, 0.0739),
+        ("clean", "score", DDPM, 0.0882, 0.2495),
+        ("clean", "sigma", DDPM, 0.0084, 0.0693),
+    ],
+)
 def test_bias_of_the_guidance_modes(gradient, scaling, sampler, mean, std):
     """Many steps, so that what is left is the mode's: through the denoiser with the exact weight, V of the estimate
     instead of E[exp -V] goes beyond the tilt (0.58 of 0.72); deterministic samplers add to it; the straight-through
@@ -96,9 +117,23 @@ def test_the_first_step_and_a_constant_estimate_are_ddim_s():
 def test_control_shifts_the_mean_only_so_that_path_energy_is_that_of_two_gaussians(sampler):
     high, low, x = (torch.tensor(v, dtype=torch.float64) for v in (0.6, 0.4, 1.7))
     before = torch.tensor(0.8, dtype=torch.float64)
-    steps = [[reverse_step(sampler, SCHEDULE, x, torch.tensor(x0), high, low, torch.tensor(noise), 1.0,
-                           (torch.tensor(past), before)) for noise in (-1.0, 0.5)]
-             for x0, past in ((0.2, 0.1), (0.5, 0.3))]
+    steps = [
+        [
+            reverse_step(
+                sampler,
+                SCHEDULE,
+                x,
+                torch.tensor(x0),
+                high,
+                low,
+                torch.tensor(noise),
+                1.0,
+                (torch.tensor(past), before),
+            )
+            for noise in (-1.0, 0.5)
+        ]
+        for x0, past in ((0.2, 0.1), (0.5, 0.3))
+    ]
     shifts = [controlled[0] - nominal[0] for nominal, controlled in zip(*steps, strict=True)]
     torch.testing.assert_close(shifts[0], shifts[1])
     scale = (steps[0][1][0] - steps[0][0][0]) / 1.5

@@ -43,8 +43,9 @@ def test_variance_is_preserved_and_the_drift_is_the_schedule_s():
 def test_the_integral_of_beta_is_exact():
     low, high = torch.tensor(0.2, dtype=torch.float64), torch.tensor(0.9, dtype=torch.float64)
     grid = torch.linspace(0.2, 0.9, 20_001, dtype=torch.float64)
-    torch.testing.assert_close(SCHEDULE.beta_integral(high, low), torch.trapezoid(SCHEDULE.beta(grid), grid),
-                               rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        SCHEDULE.beta_integral(high, low), torch.trapezoid(SCHEDULE.beta(grid), grid), rtol=1e-6, atol=0
+    )
 
 
 def test_the_score_of_the_denoised_estimate_is_the_gradient_of_the_log_density():
@@ -76,10 +77,12 @@ def test_an_ancestral_step_is_the_posterior_given_both_ends():
 
 def guided(sign):
     """Prior N(0, 1), V = (E[x_0 | x] - 2)^2 / 2, and the score s + sign grad V as a clean estimate."""
+
     def guide(x, t):
         x0 = gaussian_denoiser(x, t, 0.0, 1.0)
         gradient = SCHEDULE.alpha(t) * (x0 - 2)
         return x0 + sign * SCHEDULE.sigma(t) ** 2 / SCHEDULE.alpha(t) * gradient
+
     return guide
 
 

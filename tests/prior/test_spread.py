@@ -27,8 +27,9 @@ def test_every_stratum_holds_one_sample_and_each_sample_is_uniform():
 def test_any_one_sample_is_standard_normal_and_vehicles_are_independent():
     settings = SamplerSettings(steps=3)
     direction = main_direction(SCHEDULE, settings)
-    noise = spread_noise(draws(COUNT, 3, SCENES, 2, SIZE, normal=True), direction, draws(COUNT, SCENES, 2),
-                         draws(SCENES, 2))
+    noise = spread_noise(
+        draws(COUNT, 3, SCENES, 2, SIZE, normal=True), direction, draws(COUNT, SCENES, 2), draws(SCENES, 2)
+    )
     for sample in noise[:2]:
         rows = sample.permute(1, 2, 0, 3).flatten(1)  # [SCENES, vehicles x steps x SIZE]
         assert rows.mean(0).abs().max() < 0.03

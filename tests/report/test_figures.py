@@ -29,8 +29,9 @@ def test_panels_stand_by_eta_at_their_contacts_and_without_one_at_the_first_of_t
     assert figure.size == (2 * SIDE + GAP, 2 * SIDE + GAP)
     replays = [load_replay(path, 60.0, SIDE) for path in paths]
     assert replays[0].contact is None and replays[1].contact > replays[2].contact
-    for index, (time, phase) in enumerate(((replays[1].contact, None), (replays[1].contact, 0.25),
-                                           (replays[2].contact, 0.25))):
+    for index, (time, phase) in enumerate(
+        ((replays[1].contact, None), (replays[1].contact, 0.25), (replays[2].contact, 0.25))
+    ):
         left, top = (index % 2) * (SIDE + GAP), (index // 2) * (SIDE + GAP)
         panel = figure.crop((left, top, left + SIDE, top + SIDE))
         assert panel.tobytes() == replays[index].picture(time, phase=phase).tobytes()
@@ -46,8 +47,17 @@ def shown(tmp_path_factory):
     size = torch.as_tensor(rollout["size"])[None, None].expand(*reference.shape[:3], 2)
     weights = pair_weights(reference, torch.ones(reference.shape[:3], dtype=torch.bool), size, settings)
     coalition, candidates = (torch.tensor([[False, True, True, third]]) for third in (False, True))
-    chosen = Selection(torch.tensor([0]), torch.tensor([0]), reference, 0.5 * torch.arange(10.0)[None], weights,
-                       candidates, coalition, coalition, torch.tensor([[-1, 0, 1, -1]]))
+    chosen = Selection(
+        torch.tensor([0]),
+        torch.tensor([0]),
+        reference,
+        0.5 * torch.arange(10.0)[None],
+        weights,
+        candidates,
+        coalition,
+        coalition,
+        torch.tensor([[-1, 0, 1, -1]]),
+    )
     return SkeletonPicture(rollout, chosen, settings)
 
 
@@ -65,7 +75,11 @@ def test_times_of_the_matrix_are_those_the_weights_came_from(shown):
 
 def test_vehicles_have_the_colour_of_their_part(shown):
     assert [shown.colour(agent) for agent in range(4)] == [
-        drawing.EGO, drawing.ADVERSARY, drawing.ADVERSARY, drawing.VULNERABLE]
+        drawing.EGO,
+        drawing.ADVERSARY,
+        drawing.ADVERSARY,
+        drawing.VULNERABLE,
+    ]
     assert shown.colour(9) == drawing.BACKGROUND, "a pedestrian is in no risk graph"
     image = shown.chain().reduce(drawing.SUPERSAMPLING)
     for agent in range(3):

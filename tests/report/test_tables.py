@@ -32,8 +32,9 @@ def test_tables_list_known_metrics_in_the_design_s_order(rows):
 
 def test_a_sweep_names_every_intensity(rows):
     scores, features = score_rollouts(random_rollouts(4, seed=5))
-    labelled = [row | {"eta": eta} for eta in (0.0, 2.0)
-                for row in label_rows(scores, Source("synthetic", "test", "e2", "idm"))]
+    labelled = [
+        row | {"eta": eta} for eta in (0.0, 2.0) for row in label_rows(scores, Source("synthetic", "test", "e2", "idm"))
+    ]
     means, paired = metric_tables(metric_rows(labelled, features * 2, "test", draws=5, realism_draws=2))
     assert means.head == ["", "e2 η=0", "e2 η=2"] and paired.head == ["", "e2 η=2"]
     assert "Difference to e2 η=0" in paired.caption

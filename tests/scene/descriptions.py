@@ -16,11 +16,17 @@ def track(position, heading, speed, kind: str = "VEHICLE", valid=None, size=(4.5
     position = np.broadcast_to(np.asarray(position, float), (FRAMES, 2))
     heading, speed = (np.broadcast_to(np.asarray(value, float), (FRAMES,)).copy() for value in (heading, speed))
     velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1)
-    return {"type": kind, "state": {
-        "position": np.concatenate([position, np.zeros((FRAMES, 1))], 1), "heading": heading, "velocity": velocity,
-        "valid": np.ones(FRAMES, bool) if valid is None else np.asarray(valid),
-        "length": np.full(FRAMES, size[0]), "width": np.full(FRAMES, size[1]),
-    }}
+    return {
+        "type": kind,
+        "state": {
+            "position": np.concatenate([position, np.zeros((FRAMES, 1))], 1),
+            "heading": heading,
+            "velocity": velocity,
+            "valid": np.ones(FRAMES, bool) if valid is None else np.asarray(valid),
+            "length": np.full(FRAMES, size[0]),
+            "width": np.full(FRAMES, size[1]),
+        },
+    }
 
 
 def straight(x: float, y: float, speed: float, **options) -> dict:
@@ -32,8 +38,13 @@ def lane(points, exits=(), speed_kmh: float = 50.0, width: float = 3.6, **more) 
     """A lane of constant width along points [P, 2]."""
     points = np.asarray(points, float)
     polyline = np.concatenate([points, np.zeros((len(points), 1))], 1)
-    return {"type": "LANE_SURFACE_STREET", "polyline": polyline, "speed_limit_kmh": speed_kmh,
-            "width": np.full((len(points), 2), width / 2), "exit_lanes": list(exits)} | more
+    return {
+        "type": "LANE_SURFACE_STREET",
+        "polyline": polyline,
+        "speed_limit_kmh": speed_kmh,
+        "width": np.full((len(points), 2), width / 2),
+        "exit_lanes": list(exits),
+    } | more
 
 
 def fork(connected: bool = True) -> dict:
@@ -46,20 +57,36 @@ def fork(connected: bool = True) -> dict:
     left = np.concatenate([arc, [[120.0, 320.0]]])
     return {
         "in": lane([[0, 0], [50, 0], [100, 0]], ["on", "left"] if connected else ()),
-        "on": lane([[100, 0], [250, 0], [400, 0]], speed_kmh=72.0), "left": lane(left),
+        "on": lane([[100, 0], [250, 0], [400, 0]], speed_kmh=72.0),
+        "left": lane(left),
         "near": lane([[0, 3.5], [100, 3.5]]),
-        "bike": lane([[0, -4], [100, -4]]) | {"type": "LANE_BIKE_LANE"}, "dot": lane([[0, 0]]),
+        "bike": lane([[0, -4], [100, -4]]) | {"type": "LANE_BIKE_LANE"},
+        "dot": lane([[0, 0]]),
     }
 
 
 def description(tracks: dict | None = None, lanes: dict | None = None, **metadata) -> dict:
     """A scenario of tracks (default: the ego at 8 m/s on `in`, a car ahead on `near`, a pedestrian) on the fork."""
-    tracks = tracks or {"ego": straight(20, 0, 8), "7": straight(50, 3.5, 6),
-                        "p": straight(40, -6, 1, kind="PEDESTRIAN", size=(0.6, 0.6))}
+    tracks = tracks or {
+        "ego": straight(20, 0, 8),
+        "7": straight(50, 3.5, 6),
+        "p": straight(40, -6, 1, kind="PEDESTRIAN", size=(0.6, 0.6)),
+    }
     return {
-        "id": "fork", "version": "test", "length": FRAMES, "tracks": tracks, "map_features": lanes or fork(),
-        "dynamic_map_states": {}, "metadata": {"sdc_id": "ego", "ts": ALL * 0.1, "dataset": "made",
-                                               "scenario_id": "fork", "current_time_index": 10} | metadata,
+        "id": "fork",
+        "version": "test",
+        "length": FRAMES,
+        "tracks": tracks,
+        "map_features": lanes or fork(),
+        "dynamic_map_states": {},
+        "metadata": {
+            "sdc_id": "ego",
+            "ts": ALL * 0.1,
+            "dataset": "made",
+            "scenario_id": "fork",
+            "current_time_index": 10,
+        }
+        | metadata,
     }
 
 
@@ -104,6 +131,18 @@ class DataConfig(SimpleNamespace):
 
 def data_config(path, cache, **options) -> DataConfig:
     """The scenarionet group with small fields."""
-    return DataConfig(**({"source": "scenarionet", "path": str(path), "split": None, "starts": None,
-                          "skip_invalid": False, "cache": str(cache), "workers": 1,
-                          "build": {"field_cells": 64}} | options))
+    return DataConfig(
+        **(
+            {
+                "source": "scenarionet",
+                "path": str(path),
+                "split": None,
+                "starts": None,
+                "skip_invalid": False,
+                "cache": str(cache),
+                "workers": 1,
+                "build": {"field_cells": 64},
+            }
+            | options
+        )
+    )

@@ -87,8 +87,10 @@ def test_the_nearest_take_part_the_ego_first():
     cars = {f"c{k}": straight(40 + 8.0 * k, 0 if k % 2 else 3.5, 8) for k in range(6)}
     late = straight(40, 3.5, 8, valid=ALL > 30)
     people = {f"p{k}": straight(30, -5 - k, 8, kind="PEDESTRIAN", valid=5 * k < ALL) for k in range(4)}
-    scene = build(cars | {"late": late, "ego": straight(20, 0, 8)} | people,
-                  settings=BuildSettings(field_cells=64, vehicles=4, others=3))
+    scene = build(
+        cars | {"late": late, "ego": straight(20, 0, 8)} | people,
+        settings=BuildSettings(field_cells=64, vehicles=4, others=3),
+    )
     assert scene["start"][:4, 0].tolist() == pytest.approx([0, 20, 28, 36], abs=0.01)
     assert (scene["start"][4:, 1] * scene["valid"][4:]).tolist() == pytest.approx([-5, -6, 0], abs=0.01)
     assert scene["logged_valid"][:, 4:].any(0).all() and scene["valid"].tolist() == [True] * 6 + [False]
@@ -135,8 +137,11 @@ def test_limits_and_lights_lie_on_the_route():
 
 def test_a_light_close_ahead_counts_where_the_map_begins_at_the_vehicle():
     full = description({"ego": straight(-6.4, 0, 8)})
-    full["map_features"]["before"] = full["map_features"]["in"] | {"polyline": np.array([[0.0, 0], [8, 0]]),
-                                                                   "width": np.zeros((0, 2)), "exit_lanes": ["next"]}
+    full["map_features"]["before"] = full["map_features"]["in"] | {
+        "polyline": np.array([[0.0, 0], [8, 0]]),
+        "width": np.zeros((0, 2)),
+        "exit_lanes": ["next"],
+    }
     full["map_features"]["next"] = full["map_features"]["on"] | {"polyline": np.array([[8.0, 0], [300, 0]])}
     del full["map_features"]["in"], full["map_features"]["near"]
     full["dynamic_map_states"] = {"next": {"state": {"object_state": ["LANE_STATE_STOP"]}}}
@@ -149,10 +154,19 @@ def test_a_light_close_ahead_counts_where_the_map_begins_at_the_vehicle():
 
 
 def test_only_vehicles_that_stand_beside_the_lanes_are_parked():
-    scene = build({"ego": straight(20, 0, 8), "queue": straight(60, 0, 0), "kerb": straight(60, -6, 0),
-                   "slow": straight(60, 9, 1.0)})
-    parked = {round(y): bool(p) for y, p, v in zip(scene["start"][:, 1].tolist(), scene["parked"], scene["valid"],
-                                                   strict=True) if v}
+    scene = build(
+        {
+            "ego": straight(20, 0, 8),
+            "queue": straight(60, 0, 0),
+            "kerb": straight(60, -6, 0),
+            "slow": straight(60, 9, 1.0),
+        }
+    )
+    parked = {
+        round(y): bool(p)
+        for y, p, v in zip(scene["start"][:, 1].tolist(), scene["parked"], scene["valid"], strict=True)
+        if v
+    }
     assert parked == {0: False, -6: True, 9: False} and scene["parked"].sum() == 1
 
 
@@ -167,18 +181,23 @@ def test_overlap_with_the_ego_is_seen_and_only_that():
     assert not ego_overlaps(build({"ego": straight(20, 0, 8), "p": walker}))
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    (lambda r: setattr(r, "lanes", {}), "no lanes"), (lambda r: setattr(r, "ego", -1), "no ego"),
-    (lambda r: setattr(r, "ego", 2), "the ego is a pedestrian"), (lambda r: setattr(r, "current", 0), "start frame 0"),
-    (lambda r: setattr(r, "current", 90), "start frame 90"),
-    (lambda r: r.valid.__setitem__((10, 0), False), "not recorded"),
-    (lambda r: r.states.__setitem__((40, 1, 0), np.nan), "NaN or infinite state of agent 1 at frame 40"),
-    (lambda r: r.size.__setitem__((1, 0), 0.0), "length or width is not positive"),
-    (lambda r: r.lanes["on"].points.__setitem__((0, 0), np.inf), "centreline of lane on"),
-    (lambda r: r.drivable.append(np.full((3, 2), np.nan)), "drivable polygon"),
-    (lambda r: [setattr(each, "points", each.points[:1]) for each in r.lanes.values()], "no lane is at least"),
-    (lambda r: setattr(r, "valid", r.valid[:, :2]), "do not match"),
-])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda r: setattr(r, "lanes", {}), "no lanes"),
+        (lambda r: setattr(r, "ego", -1), "no ego"),
+        (lambda r: setattr(r, "ego", 2), "the ego is a pedestrian"),
+        (lambda r: setattr(r, "current", 0), "start frame 0"),
+        (lambda r: setattr(r, "current", 90), "start frame 90"),
+        (lambda r: r.valid.__setitem__((10, 0), False), "not recorded"),
+        (lambda r: r.states.__setitem__((40, 1, 0), np.nan), "NaN or infinite state of agent 1 at frame 40"),
+        (lambda r: r.size.__setitem__((1, 0), 0.0), "length or width is not positive"),
+        (lambda r: r.lanes["on"].points.__setitem__((0, 0), np.inf), "centreline of lane on"),
+        (lambda r: r.drivable.append(np.full((3, 2), np.nan)), "drivable polygon"),
+        (lambda r: [setattr(each, "points", each.points[:1]) for each in r.lanes.values()], "no lane is at least"),
+        (lambda r: setattr(r, "valid", r.valid[:, :2]), "do not match"),
+    ],
+)
 def test_recordings_that_make_no_scene_say_why(change, message):
     recording = recorded()
     change(recording)
@@ -192,8 +211,11 @@ def recorded_scenes(request):
     if not path.exists():
         pytest.skip(f"needs {path.parent.name}/{path.name} in ../shared/data, which is not in the repository")
     files = scenarionet.list_files(str(path))[::stride]
-    return [build_scene(recording, SETTINGS) for file in files for recording in scenarionet.read_recordings(
-        scenarionet.read_bytes(*file), file[1], "", None, 80)]
+    return [
+        build_scene(recording, SETTINGS)
+        for file in files
+        for recording in scenarionet.read_recordings(scenarionet.read_bytes(*file), file[1], "", None, 80)
+    ]
 
 
 def test_recorded_scenes_keep_the_schema_and_their_parked_cars_stay(recorded_scenes):

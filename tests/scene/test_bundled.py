@@ -43,7 +43,7 @@ def test_ego_drives_and_keeps_off_the_border(recordings):
     for recording in recordings:
         assert recording.states.shape[0] == FRAMES and recording.current == CURRENT
         assert recording.valid[:, recording.ego].all()
-        track = recording.states[CURRENT:CURRENT + 81, recording.ego, :2]
+        track = recording.states[CURRENT : CURRENT + 81, recording.ego, :2]
         assert arc_length(track)[-1] > 20.0
 
 
@@ -117,18 +117,28 @@ def test_lights_are_those_of_junction_lanes(recordings):
 
 def small_set() -> tuple[SceneMap, Recording]:
     rng = np.random.default_rng(1)
-    lanes = {"a": Lane(np.array([[0.0, 0.0], [50.0, 1.5]]), 3.4, 13.9, ["b"], ["c"]), "b": Lane(np.eye(2), 3.5, 8.0),
-             "c": Lane(np.array([[0.0, 3.4], [50.0, 5.0]]), 3.4, 13.9, right=["a"])}
-    place = SceneMap("here", lanes, [np.eye(3)[:, :2]], {"b": rng.integers(0, 4, 200).astype(np.int8)},
-                     rng.normal(size=(2, 3)), np.full((2, 2), 2.0))
+    lanes = {
+        "a": Lane(np.array([[0.0, 0.0], [50.0, 1.5]]), 3.4, 13.9, ["b"], ["c"]),
+        "b": Lane(np.eye(2), 3.5, 8.0),
+        "c": Lane(np.array([[0.0, 3.4], [50.0, 5.0]]), 3.4, 13.9, right=["a"]),
+    }
+    place = SceneMap(
+        "here",
+        lanes,
+        [np.eye(3)[:, :2]],
+        {"b": rng.integers(0, 4, 200).astype(np.int8)},
+        rng.normal(size=(2, 3)),
+        np.full((2, 2), 2.0),
+    )
     states = rng.normal(size=(FRAMES, 3, 4)).cumsum(0)
     states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
     valid = rng.random((FRAMES, 3)) < 0.8
     valid[:, 1] = True
     states = np.where(valid[..., None], states, 0.0)
-    lights = {"b": place.lights["b"][7:7 + FRAMES]}
-    return place, Recording("x", "here", "bundled", states, valid, np.full((3, 2), 2.5), np.zeros(3, int), 1, lanes,
-                            place.drivable, lights)
+    lights = {"b": place.lights["b"][7 : 7 + FRAMES]}
+    return place, Recording(
+        "x", "here", "bundled", states, valid, np.full((3, 2), 2.5), np.zeros(3, int), 1, lanes, place.drivable, lights
+    )
 
 
 def test_round_trip():

@@ -17,7 +17,9 @@ def lanes(**more) -> dict[str, Lane]:
     """`in` along x = 0..100; `on` straight to 400 and `left`, an arc of 20 m radius up to y = 320, both after it."""
     return {
         "in": Lane(np.array([[0.0, 0], [50, 0], [100, 0]]), 3.5, 14.0, exits=["on", "left"]),
-        "on": Lane(np.array([[100.0, 0], [400, 0]]), 3.5, 20.0), "left": Lane(LEFT, 3.5, 10.0), **more,
+        "on": Lane(np.array([[100.0, 0], [400, 0]]), 3.5, 20.0),
+        "left": Lane(LEFT, 3.5, 10.0),
+        **more,
     }
 
 
@@ -42,7 +44,7 @@ def test_of_many_leaves_the_nearest_forks_come_first():
     row, ids = {}, [f"s{k}" for k in range(7)]
     for k, name in enumerate(ids):
         start = np.array([30.0 * k, 0.0])
-        row[name] = Lane(np.array([start, start + [30, 0]]), exits=[f"t{k}", *ids[k + 1:k + 2]])
+        row[name] = Lane(np.array([start, start + [30, 0]]), exits=[f"t{k}", *ids[k + 1 : k + 2]])
         row[f"t{k}"] = Lane(np.array([start + [30, 0], start + [40, 10 + k], start + [45, 300]]))
     turns = [way[-1] for way in ways(LaneGraph(row), 5.0, speed=20.0)]
     assert turns == ["t6", "t0", "t1", "t2"]  # the straightest way on, then the turns in the order of the road
@@ -54,7 +56,7 @@ def test_a_route_follows_its_lanes_and_ends_where_the_map_does():
     assert on.here == left.here == 20.0 and on.length == 298.0 and not on.open
     assert np.allclose(on.points[:, 1], 0, atol=1e-6) and np.allclose(np.diff(on.points[:, 0]), SPACING, atol=1e-6)
     true = LineString([(40, 0), (100, 0), *LEFT])
-    inside = left.points[:int(left.length / SPACING) + 1]
+    inside = left.points[: int(left.length / SPACING) + 1]
     assert max(true.distance(Point(*point)) for point in inside) < 0.25
     assert [name for name, _ in left.lanes] == ["in", "left"] and abs(left.lanes[1][1] - 60.0) < 0.5
     assert on.limit[10] == 14.0 and on.limit[40] == 20.0 and left.limit[40] == 10.0
@@ -64,15 +66,18 @@ def test_a_route_follows_its_lanes_and_ends_where_the_map_does():
 
 
 def test_the_map_does_not_end_where_a_long_lane_began_far_behind():
-    long = {"a": Lane(np.array([[-400.0, 0], [0, 0]]), exits=["b"]),
-            "b": Lane(np.array([[0.0, 0], [400, 0]]), exits=[])}
+    long = {
+        "a": Lane(np.array([[-400.0, 0], [0, 0]]), exits=["b"]),
+        "b": Lane(np.array([[0.0, 0], [400, 0]]), exits=[]),
+    }
     (route,) = LaneGraph(long).candidates(np.array([-5.0, 0.0]), 0.0, 8.0, 6, 150)
     assert not route.open and route.length == 298.0
 
 
 def test_twice_the_same_way_is_one_candidate_and_neighbours_are_more():
-    twin = lanes(again=Lane(np.array([[0.0, 0.3], [100, 0.3]]), exits=["on"]),
-                 beside=Lane(np.array([[0.0, 3.5], [400, 3.5]])))
+    twin = lanes(
+        again=Lane(np.array([[0.0, 0.3], [100, 0.3]]), exits=["on"]), beside=Lane(np.array([[0.0, 3.5], [400, 3.5]]))
+    )
     assert ways(LaneGraph(twin), 60.0) == [("in", "on"), ("in", "left"), ("beside",)]
     assert ways(LaneGraph(twin), 60.0, heading=np.pi) == []
     assert ways(LaneGraph(twin), 60.0, y=-30.0) == []
@@ -80,8 +85,10 @@ def test_twice_the_same_way_is_one_candidate_and_neighbours_are_more():
 
 def test_a_roundabout_is_left_and_a_ring_does_not_end():
     quarter = [np.linspace(k * np.pi / 2, (k + 1) * np.pi / 2, 20) for k in range(4)]
-    ring = {f"r{k}": Lane(np.stack([15 * np.cos(a), 15 * np.sin(a)], 1), exits=[f"r{(k + 1) % 4}"])
-            for k, a in enumerate(quarter)}
+    ring = {
+        f"r{k}": Lane(np.stack([15 * np.cos(a), 15 * np.sin(a)], 1), exits=[f"r{(k + 1) % 4}"])
+        for k, a in enumerate(quarter)
+    }
     (route,) = LaneGraph(ring).candidates(np.array([15.0, 0.5]), np.pi / 2, 5.0, 6, 150)
     assert not route.open and np.abs(np.linalg.norm(route.points[:-8], axis=1) - 15).max() < 0.3
     ring["r1"].exits.append("out")
@@ -94,11 +101,16 @@ def test_connectivity_is_inferred_from_geometry_and_heights():
     def flat(a, b, height):
         return Lane(np.array([a, b], float), heights=np.full(2, height))
 
-    found = infer_exits({
-        "a": flat([0, 0], [50, 0], 5.0), "b": flat([50.5, 0.3], [90, 0], 5.5), "back": flat([50, 0], [0, 0], 5.0),
-        "bridge": flat([50, 0], [100, 10], 12.0), "far": flat([54, 0], [90, 0], 5.0),
-        "side": flat([50, 0], [50, 50], 5.0),
-    })
+    found = infer_exits(
+        {
+            "a": flat([0, 0], [50, 0], 5.0),
+            "b": flat([50.5, 0.3], [90, 0], 5.5),
+            "back": flat([50, 0], [0, 0], 5.0),
+            "bridge": flat([50, 0], [100, 10], 12.0),
+            "far": flat([54, 0], [90, 0], 5.0),
+            "side": flat([50, 0], [50, 50], 5.0),
+        }
+    )
     assert found["a"] == ["b"] and found["bridge"] == [] and found["back"] == []
     no_heights = infer_exits({"a": Lane(np.array([[0.0, 0], [50, 0]])), "b": flat([50, 0], [90, 0], 40.0)})
     assert no_heights["a"] == ["b"]
@@ -113,8 +125,11 @@ def test_files_without_connectivity_give_the_same_candidates():
 
 
 def test_lanes_too_short_are_left_out_and_widths_doubted():
-    assert LaneGraph(lanes(dot=Lane(np.zeros((1, 2))), stub=Lane(np.array([[0.0, 0], [0.3, 0]])))).ids == \
-        ["in", "on", "left"]
+    assert LaneGraph(lanes(dot=Lane(np.zeros((1, 2))), stub=Lane(np.array([[0.0, 0], [0.3, 0]])))).ids == [
+        "in",
+        "on",
+        "left",
+    ]
     assert [believed_width(w) for w in (0.0, float("nan"), 2.5, 3.2, 6.0, 90.0)] == [3.7, 3.7, 2.5, 3.2, 6.0, 3.7]
     points = resample(np.array([[0.0, 0], [0, 3], [4, 3]]), 1.0)
     assert len(points) == 8 and np.allclose(points[3], [0, 3])

@@ -25,9 +25,20 @@ def straight(angle: float, start, limit: float = 12.0, steps: int = 200) -> tupl
 def fleet(lines, begin, speed) -> Fleet:
     front, heading, limit = (np.stack(part) for part in zip(*lines, strict=True))
     count = len(lines)
-    return Fleet(front, front, heading, limit, np.full(count, 190.0), np.array(begin, float),
-                 np.tile([4.6, 1.9], (count, 1)), np.full(count, 1.6), np.full(count, 2.0), np.full(count, 1.3),
-                 np.full(count, 2.0), np.array(speed, float))
+    return Fleet(
+        front,
+        front,
+        heading,
+        limit,
+        np.full(count, 190.0),
+        np.array(begin, float),
+        np.tile([4.6, 1.9], (count, 1)),
+        np.full(count, 1.6),
+        np.full(count, 2.0),
+        np.full(count, 1.3),
+        np.full(count, 2.0),
+        np.array(speed, float),
+    )
 
 
 def test_free_vehicle_reaches_its_speed():
@@ -78,7 +89,7 @@ def test_recordings_are_sound(recordings):
         assert np.abs(aside - WHEELBASE / 2 * recording.size[:, 0] * yaw_rate)[inner].max() < 0.1
         accel = np.diff(speed, axis=0)[inner[1:] & inner[:-1]] / DT
         assert np.abs(accel).max() < 8.0
-        way = np.linalg.norm(np.diff(states[CURRENT:CURRENT + 81, recording.ego, :2], axis=0), axis=-1).sum()
+        way = np.linalg.norm(np.diff(states[CURRENT : CURRENT + 81, recording.ego, :2], axis=0), axis=-1).sum()
         assert valid[:, recording.ego].all() and way > 19.0
 
 

@@ -10,26 +10,9 @@ import numpy as np
 import pytest
 
 from e2rl.errors import InputError
-from e2rl.scene.recording import (
-    LIGHT_GREEN,
-    LIGHT_RED,
-    LIGHT_UNKNOWN,
-    LIGHT_YELLOW,
-    OTHER,
-    PEDESTRIAN,
-    VEHICLE,
-)
+from e2rl.scene.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, OTHER, PEDESTRIAN, VEHICLE
 from e2rl.scene.scenarionet import list_files, read_bytes, read_locations, read_recordings, safe_load
-from tests.scene.descriptions import (
-    ALL,
-    FRAMES,
-    Malicious,
-    description,
-    fork,
-    straight,
-    write_folder,
-    write_zip,
-)
+from tests.scene.descriptions import ALL, FRAMES, Malicious, description, fork, straight, write_folder, write_zip
 
 
 def read(scene: dict, starts=None, location: str = "place") -> list:
@@ -37,12 +20,19 @@ def read(scene: dict, starts=None, location: str = "place") -> list:
 
 
 @pytest.mark.parametrize("protocol", [3, 4, 5])
-@pytest.mark.parametrize("call", [
-    lambda path: Malicious(os.system, f"touch {path}"), lambda path: Malicious(open, str(path), "w"),
-    lambda path: Malicious(eval, f"open({str(path)!r}, 'w')"), lambda path: Malicious(os.mkdir, str(path)),
-    lambda path: Malicious(np.save, str(path), 1), lambda path: Malicious(getattr, "a", "upper"),
-    lambda path: Malicious(np.load, str(path)), lambda path: collections.OrderedDict(a=1),
-])
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda path: Malicious(os.system, f"touch {path}"),
+        lambda path: Malicious(open, str(path), "w"),
+        lambda path: Malicious(eval, f"open({str(path)!r}, 'w')"),
+        lambda path: Malicious(os.mkdir, str(path)),
+        lambda path: Malicious(np.save, str(path), 1),
+        lambda path: Malicious(getattr, "a", "upper"),
+        lambda path: Malicious(np.load, str(path)),
+        lambda path: collections.OrderedDict(a=1),
+    ],
+)
 def test_forbidden_classes_are_refused_by_name_and_never_run(tmp_path, call, protocol):
     mark = tmp_path / "ran.npy"
     content = pickle.dumps({"metadata": {"x": call(mark)}}, protocol)
@@ -52,20 +42,41 @@ def test_forbidden_classes_are_refused_by_name_and_never_run(tmp_path, call, pro
 
 
 def test_dotted_names_and_other_modules_of_numpy_are_refused():
-    for module, name in (("numpy", "ndarray.tofile"), ("numpy", "fromfile"), ("numpy.core.multiarray", "fromfile"),
-                         ("numpy.testing", "dtype"), ("builtins", "eval"), ("builtins", "getattr"),
-                         ("collections", "namedtuple"), ("numpy.core", "multiarray")):
-        content = b"\x80\x04\x8c" + bytes([len(module)]) + module.encode() + b"\x8c" + bytes([len(name)]) \
-            + name.encode() + b"\x93."
+    for module, name in (
+        ("numpy", "ndarray.tofile"),
+        ("numpy", "fromfile"),
+        ("numpy.core.multiarray", "fromfile"),
+        ("numpy.testing", "dtype"),
+        ("builtins", "eval"),
+        ("builtins", "getattr"),
+        ("collections", "namedtuple"),
+        ("numpy.core", "multiarray"),
+    ):
+        content = (
+            b"\x80\x04\x8c"
+            + bytes([len(module)])
+            + module.encode()
+            + b"\x8c"
+            + bytes([len(name)])
+            + name.encode()
+            + b"\x93."
+        )
         with pytest.raises(InputError, match="forbidden class"):
             safe_load(io.BytesIO(content), "made.pkl")
 
 
 @pytest.mark.parametrize("protocol", [3, 4, 5])
 def test_arrays_of_both_numpys_and_containers_are_read(protocol):
-    held = {"a": np.arange(6.0).reshape(2, 3), "b": np.float32(2.5), "c": np.array(["x", None], object),
-            "d": collections.defaultdict(dict, {"k": {1}}), "e": (frozenset({2}), 1j, b"z", bytearray(b"y")),
-            "f": np.asfortranarray(np.eye(3)), "g": np.array(["LANE"]), "h": np.bool_(True)}
+    held = {
+        "a": np.arange(6.0).reshape(2, 3),
+        "b": np.float32(2.5),
+        "c": np.array(["x", None], object),
+        "d": collections.defaultdict(dict, {"k": {1}}),
+        "e": (frozenset({2}), 1j, b"z", bytearray(b"y")),
+        "f": np.asfortranarray(np.eye(3)),
+        "g": np.array(["LANE"]),
+        "h": np.bool_(True),
+    }
     new = pickle.dumps(held, protocol)
     old = new.replace(b"numpy._core.", b"numpy.core.") if protocol == 3 else new
     if protocol > 3:  # lengths of names stand in the stream
@@ -78,9 +89,10 @@ def test_arrays_of_both_numpys_and_containers_are_read(protocol):
         assert all(np.array_equal(found[key], held[key]) for key in "abcfgh") and found["e"] == held["e"]
 
 
-@pytest.mark.parametrize("content", [
-    b"", b"nonsense", pickle.dumps(description())[:5000], pickle.dumps([1]), b"\x80\x04\x95", b"\x80\x05}q\x00(",
-])
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"nonsense", pickle.dumps(description())[:5000], pickle.dumps([1]), b"\x80\x04\x95", b"\x80\x05}q\x00("],
+)
 def test_damaged_files_are_named(content):
     with pytest.raises(InputError, match=r"^made\.pkl: "):
         safe_load(io.BytesIO(content), "made.pkl")
@@ -101,8 +113,11 @@ def test_folders_and_zips_hold_the_same_scenes(tmp_path):
 def test_paths_that_hold_nothing_say_so(tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "file.bin").write_bytes(b"x" * 100)
-    for name, message in (("none", "no such file or folder"), ("empty", r"no \.pkl scenario"),
-                          ("file.bin", "neither a folder nor a zip")):
+    for name, message in (
+        ("none", "no such file or folder"),
+        ("empty", r"no \.pkl scenario"),
+        ("file.bin", "neither a folder nor a zip"),
+    ):
         with pytest.raises(InputError, match=message) as caught:
             list_files(str(tmp_path / name))
         assert str(tmp_path / name) in str(caught.value)
@@ -119,9 +134,12 @@ def test_a_damaged_zip_member_is_named(tmp_path):
 
 
 def test_tracks_types_sizes_and_the_map_arrive():
-    tracks = {"ego": straight(20, 0, 8), 5: straight(40, 0, 6, size=(1.7, 4.1)),
-              "cone": straight(60, 0, 0, kind="TRAFFIC_CONE"),
-              "p": straight(0, 9, 1, kind="PEDESTRIAN", size=(0.5, 0.6))}
+    tracks = {
+        "ego": straight(20, 0, 8),
+        5: straight(40, 0, 6, size=(1.7, 4.1)),
+        "cone": straight(60, 0, 0, kind="TRAFFIC_CONE"),
+        "p": straight(0, 9, 1, kind="PEDESTRIAN", size=(0.5, 0.6)),
+    }
     tracks["p"]["state"]["valid"] = np.where(ALL < 30, 1.0, 0.0)[:, None]  # as nuScenes files have it
     tracks["p"]["state"]["length"] = tracks["p"]["state"]["length"][:, None]
     tracks["p"]["state"]["position"][30:] = np.nan
@@ -139,8 +157,11 @@ def test_tracks_types_sizes_and_the_map_arrive():
 
 def test_lane_polygons_are_drivable_and_neighbours_named():
     lanes = fork()
-    lanes["in"] |= {"polygon": np.array([[0, -2, 0], [100, -2, 0], [100, 2, 0]]), "left_neighbor": [
-        {"feature_id": "near"}], "right_neighbor": ["bike"]}
+    lanes["in"] |= {
+        "polygon": np.array([[0, -2, 0], [100, -2, 0], [100, 2, 0]]),
+        "left_neighbor": [{"feature_id": "near"}],
+        "right_neighbor": ["bike"],
+    }
     (recording,) = read(description(lanes=lanes))
     assert [ring.tolist() for ring in recording.drivable] == [[[0, -2], [100, -2], [100, 2]]]
     assert recording.lanes["in"].left == ["near"] and recording.lanes["in"].right == ["bike"]
@@ -149,14 +170,24 @@ def test_lane_polygons_are_drivable_and_neighbours_named():
 
 def test_lights_keep_their_last_known_state():
     states = ["LANE_STATE_UNKNOWN", "LANE_STATE_ARROW_STOP", None, "LANE_STATE_CAUTION", "LANE_STATE_GO"]
-    scene = description() | {"dynamic_map_states": {
-        "a": {"lane": "on", "state": {"object_state": states}},
-        "left": {"state": {"object_state": ["TRAFFIC_LIGHT_RED"]}},
-        "b": {"lane": "nowhere", "state": {"object_state": states}}, "near": {"state": {}}}}
+    scene = description() | {
+        "dynamic_map_states": {
+            "a": {"lane": "on", "state": {"object_state": states}},
+            "left": {"state": {"object_state": ["TRAFFIC_LIGHT_RED"]}},
+            "b": {"lane": "nowhere", "state": {"object_state": states}},
+            "near": {"state": {}},
+        }
+    }
     (recording,) = read(scene)
     assert recording.lights.keys() == {"on", "left", "near"}
-    assert recording.lights["on"][:6].tolist() == [LIGHT_UNKNOWN, LIGHT_RED, LIGHT_RED, LIGHT_YELLOW, LIGHT_GREEN,
-                                                   LIGHT_GREEN]
+    assert recording.lights["on"][:6].tolist() == [
+        LIGHT_UNKNOWN,
+        LIGHT_RED,
+        LIGHT_RED,
+        LIGHT_YELLOW,
+        LIGHT_GREEN,
+        LIGHT_GREEN,
+    ]
     assert (recording.lights["left"] == LIGHT_RED).all() and (recording.lights["near"] == LIGHT_UNKNOWN).all()
     assert all(len(light) == FRAMES for light in recording.lights.values())
 
@@ -186,18 +217,23 @@ def test_start_frames():
     assert [r.current for r in read(long)] == [10, 101, 192]
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    (lambda s: s["metadata"].update(sdc_id="nobody"), r"no ego: metadata\.sdc_id='nobody'"),
-    (lambda s: s["metadata"].pop("sdc_id"), "no ego"), (lambda s: s.pop("metadata"), "not a ScenarioDescription"),
-    (lambda s: s.update(tracks={}), "no ego"), (lambda s: s.update(metadata=3), "not a ScenarioDescription"),
-    (lambda s: s["tracks"]["7"].pop("state"), "not a ScenarioDescription.*state"),
-    (lambda s: s["tracks"]["7"]["state"]["position"].fill(np.nan), "track 7 is NaN or infinite at frame 0"),
-    (lambda s: s["metadata"].update(ts=ALL[:5]), "5 time stamps for 91 frames"),
-    (lambda s: s["metadata"].update(ts=ALL[::-1] * 0.1), "time stamps do not increase"),
-    (lambda s: s["metadata"].update(current_time_index="x"), "not a ScenarioDescription"),
-    (lambda s: s["tracks"]["7"]["state"].update(position=np.zeros((4, 3))), "not a ScenarioDescription"),
-    (lambda s: s.update(map_features=[1]), "not a ScenarioDescription"),
-])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: s["metadata"].update(sdc_id="nobody"), r"no ego: metadata\.sdc_id='nobody'"),
+        (lambda s: s["metadata"].pop("sdc_id"), "no ego"),
+        (lambda s: s.pop("metadata"), "not a ScenarioDescription"),
+        (lambda s: s.update(tracks={}), "no ego"),
+        (lambda s: s.update(metadata=3), "not a ScenarioDescription"),
+        (lambda s: s["tracks"]["7"].pop("state"), "not a ScenarioDescription.*state"),
+        (lambda s: s["tracks"]["7"]["state"]["position"].fill(np.nan), "track 7 is NaN or infinite at frame 0"),
+        (lambda s: s["metadata"].update(ts=ALL[:5]), "5 time stamps for 91 frames"),
+        (lambda s: s["metadata"].update(ts=ALL[::-1] * 0.1), "time stamps do not increase"),
+        (lambda s: s["metadata"].update(current_time_index="x"), "not a ScenarioDescription"),
+        (lambda s: s["tracks"]["7"]["state"].update(position=np.zeros((4, 3))), "not a ScenarioDescription"),
+        (lambda s: s.update(map_features=[1]), "not a ScenarioDescription"),
+    ],
+)
 def test_what_is_wrong_is_named_with_the_file(change, message):
     scene = description()
     change(scene)

@@ -34,7 +34,7 @@ def test_stacking_pads_ragged_keys_and_changes_nothing_else(scenes):
             inner = value[tuple(slice(0, size) for size in scene[key].shape)]
             assert torch.equal(inner, scene[key]) and value.dtype == scene[key].dtype, key
             if key in RAGGED and value.shape[0] > scene[key].shape[0]:
-                assert (value[scene[key].shape[0]:] == RAGGED[key]).all(), key
+                assert (value[scene[key].shape[0] :] == RAGGED[key]).all(), key
     assert both["lane_width"].shape[1] == 5 and both["lane_width"][0, 4] == 0 and both["lane_width"][1, 4] == 4.0
 
 
@@ -57,14 +57,17 @@ def test_the_set_is_sliced(scenes):
     assert whole.to("cpu").scenes.device == torch.device("cpu")
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    (lambda scene: scene.pop("field"), r"scene 'x'.*'field' is missing"),
-    (lambda scene: scene.set("start_accel", scene["start"]), "start_accel has 2 dims, expected 1"),
-    (lambda scene: scene["logged"].fill_(float("nan")), "logged holds NaN"),
-    (lambda scene: scene["field"].fill_(float("inf")), "field holds NaN or infinite"),
-    (lambda scene: scene["valid"].fill_(False), "the ego is absent or has no route"),
-    (lambda scene: scene["route_log"].fill_(-1), "the ego is absent or has no route"),
-])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda scene: scene.pop("field"), r"scene 'x'.*'field' is missing"),
+        (lambda scene: scene.set("start_accel", scene["start"]), "start_accel has 2 dims, expected 1"),
+        (lambda scene: scene["logged"].fill_(float("nan")), "logged holds NaN"),
+        (lambda scene: scene["field"].fill_(float("inf")), "field holds NaN or infinite"),
+        (lambda scene: scene["valid"].fill_(False), "the ego is absent or has no route"),
+        (lambda scene: scene["route_log"].fill_(-1), "the ego is absent or has no route"),
+    ],
+)
 def test_what_breaks_the_schema_is_named(scenes, change, message):
     scene = scenes[0].clone()
     validate(scene, "x")

@@ -45,7 +45,7 @@ def test_the_start_state_is_blind_to_the_future_and_to_gaps_before():
 @pytest.mark.parametrize("known", [1, 2, 3, 5])
 def test_short_histories_stay_finite(known):
     states, valid = accelerating(), np.zeros((40, 1), bool)
-    valid[21 - known:21] = True
+    valid[21 - known : 21] = True
     start, accel, yaw_rate = causal_state(states, valid, 20)
     assert np.isfinite(start).all() and np.isfinite(accel).all() and np.isfinite(yaw_rate).all()
     if known > 1:

@@ -35,8 +35,10 @@ def bad_scenes() -> dict[str, dict | bytes]:
     nan["tracks"]["7"]["state"]["position"][40] = np.nan
     return {
         "forbidden class posix.system": pickle.dumps({"x": Malicious(os.system, "true")}),
-        "no ego": description(sdc_id="nobody"), "no lanes": description(lanes={"b": lane([[0, 0]])}),
-        "NaN or infinite": nan, "cannot be read": b"nonsense",
+        "no ego": description(sdc_id="nobody"),
+        "no lanes": description(lanes={"b": lane([[0, 0]])}),
+        "NaN or infinite": nan,
+        "cannot be read": b"nonsense",
     }
 
 
@@ -81,7 +83,7 @@ def test_a_damaged_cache_is_rebuilt(tmp_path, damage):
     if damage == "other":
         save_file({"a": torch.zeros(1)}, path)
     else:
-        path.write_bytes({"truncated": content[:len(content) // 2], "nonsense": b"\xff" * 64, "empty": b""}[damage])
+        path.write_bytes({"truncated": content[: len(content) // 2], "nonsense": b"\xff" * 64, "empty": b""}[damage])
     same(first, load_scenes(config))
     assert path.read_bytes() == content or len(path.read_bytes()) == len(content)
     assert list((tmp_path / "cache").iterdir()) == [path]
@@ -130,11 +132,15 @@ def test_places_of_an_index_reach_the_scenes(tmp_path):
     assert load_scenes(data_config(tmp_path / "x", tmp_path / "cache")).location == ["a", "b"]
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"path": None}, r"data\.path is not set"), ({"path": "nowhere"}, "nowhere: no such file or folder"),
-    ({"source": "spreadsheet"}, r"data\.source=spreadsheet: expected bundled, procedural or scenarionet"),
-    ({"source": "bundled", "split": "best"}, "split 'best'"),
-])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"path": None}, r"data\.path is not set"),
+        ({"path": "nowhere"}, "nowhere: no such file or folder"),
+        ({"source": "spreadsheet"}, r"data\.source=spreadsheet: expected bundled, procedural or scenarionet"),
+        ({"source": "bundled", "split": "best"}, "split 'best'"),
+    ],
+)
 def test_configurations_that_name_nothing_say_so(tmp_path, change, message):
     config = data_config(tmp_path, tmp_path / "cache")
     vars(config).update(change)

@@ -51,8 +51,9 @@ def test_rigid_motion_changes_nothing():
 
 def test_order_of_the_others_changes_nothing():
     scenes = scenes_with_everything()
-    rows = torch.cat([torch.tensor([0]), 1 + torch.randperm(31, generator=torch.Generator().manual_seed(0)),
-                      torch.arange(32, 48)])
+    rows = torch.cat(
+        [torch.tensor([0]), 1 + torch.randperm(31, generator=torch.Generator().manual_seed(0)), torch.arange(32, 48)]
+    )
     for key in ("start", "start_accel", "start_yaw_rate", "valid", "size", "agent_type", "parked"):
         scenes.scenes[key] = scenes.scenes[key][:, rows]
     for key in ("logged", "logged_valid"):
@@ -73,6 +74,7 @@ def test_beyond_the_recording_a_light_keeps_its_last_state_in_its_own_scene():
     scene["light_state"][0], scene["light_state"][1] = LIGHT_RED, LIGHT_GREEN
     setting, last = setting_of(scene, mission_of(scene)), scene["light_state"].shape[1] - 1
     here = torch.full((2,), 20.0)
-    at_the_end, beyond = (light_features(lens("cpu"), setting, torch.full((2,), step), here)
-                          for step in (last, last + 40))
+    at_the_end, beyond = (
+        light_features(lens("cpu"), setting, torch.full((2,), step), here) for step in (last, last + 40)
+    )
     assert torch.equal(beyond, at_the_end) and beyond[0, 0] == 1 and beyond[1, 2] == 1

@@ -5,9 +5,15 @@ import torch
 from e2rl.sim.reward import TERMS, check_weights, reward_terms, weighted_sum
 
 QUIET = {
-    "progress": torch.ones(1), "contact": torch.tensor([False]), "off_road": torch.tensor([False]),
-    "action": torch.zeros(1, 2), "last_action": torch.zeros(1, 2), "speed": torch.full((1,), 10.0),
-    "limit": torch.full((1,), 12.0), "offset": torch.zeros(1), "dt": 0.1,
+    "progress": torch.ones(1),
+    "contact": torch.tensor([False]),
+    "off_road": torch.tensor([False]),
+    "action": torch.zeros(1, 2),
+    "last_action": torch.zeros(1, 2),
+    "speed": torch.full((1,), 10.0),
+    "limit": torch.full((1,), 12.0),
+    "offset": torch.zeros(1),
+    "dt": 0.1,
 }
 
 

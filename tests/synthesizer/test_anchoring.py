@@ -21,8 +21,16 @@ LANES = InterceptionSettings(reach=0.0)
 
 
 def proposed(world, skeleton, plan, settings=None, interception=LANES, eta=2.0, **options):
-    return propose(world.scene, world, skeleton, plan, settings or AnchorSettings(), interception,
-                   torch.full((len(plan),), eta), **options)
+    return propose(
+        world.scene,
+        world,
+        skeleton,
+        plan,
+        settings or AnchorSettings(),
+        interception,
+        torch.full((len(plan),), eta),
+        **options,
+    )
 
 
 def anchored(world, *vehicles, near=2, **settings):
@@ -39,8 +47,10 @@ def travelled(knots, speed, accel=0.0):
     return speeds(state, knots)[1]
 
 
-@pytest.mark.parametrize("ahead, way, speed", [
-    (40.0, 30.0, 10.0), (40.0, 45.0, 10.0), (30.0, 20.0, 4.0), (20.0, 25.0, 12.0), (45.0, 16.0, 0.5)])
+@pytest.mark.parametrize(
+    "ahead, way, speed",
+    [(40.0, 30.0, 10.0), (40.0, 45.0, 10.0), (30.0, 20.0, 4.0), (20.0, 25.0, 12.0), (45.0, 16.0, 0.5)],
+)
 def test_both_arrive_at_the_crossing_at_once(ahead, way, speed):
     world = make_world([EGO, (ahead, -way, UP, speed)])
     anchor, _ = anchored(world, 1)
@@ -116,8 +126,13 @@ def test_accelerations_are_bounded_and_bends_slow_down():
     arc, radius = 2.0 * torch.arange(150) - 20, 15.0
     bend = (arc - 15).clamp(0, radius * math.pi / 2)  # straight up, then left on to the ego's lane, against it
     rest = (arc - 15 - radius * math.pi / 2).clamp(min=0)
-    line = torch.stack([60 - radius * (1 - (bend / radius).cos()) - rest,
-                        -15 + radius * (bend / radius).sin() + (arc - 15).clamp(max=0)], -1)
+    line = torch.stack(
+        [
+            60 - radius * (1 - (bend / radius).cos()) - rest,
+            -15 + radius * (bend / radius).sin() + (arc - 15).clamp(max=0),
+        ],
+        -1,
+    )
     world.scene["route_points"][:, 1, 0] = line
     anchor, _ = anchored(world, 1, max_offset=10.0)
     knots = anchor.knots[0, 1]
@@ -142,8 +157,9 @@ def test_clean_blend_keeps_the_noise_and_the_printed_one_halves_its_variance():
     assert (literal - mean)[members].var() == pytest.approx(0.5 * sigma**2, rel=0.02)
     for blended in (clean, literal):
         assert torch.equal(blended[~members], x[~members])
-    torch.testing.assert_close(blend_clean(x, x0, anchor, alpha, members, 1.0)[members],
-                               (alpha * anchor + sigma * noise)[members])
+    torch.testing.assert_close(
+        blend_clean(x, x0, anchor, alpha, members, 1.0)[members], (alpha * anchor + sigma * noise)[members]
+    )
     assert torch.equal(blend_clean(x, x0, anchor, alpha, members, 0.0), x)
 
 

@@ -33,21 +33,45 @@ class Case:
         step = torch.zeros(count, dtype=torch.long)
         self.coalition = torch.zeros(count, ROWS, dtype=torch.bool)
         self.coalition[:, MEMBER] = True
-        self.context = self.prior.encode(routed, state, self.scene["start"], self.scene["valid"], step, plan,
-                                         self.coalition)
+        self.context = self.prior.encode(
+            routed, state, self.scene["start"], self.scene["valid"], step, plan, self.coalition
+        )
         target = torch.where(self.coalition, 0, -1)
-        self.where = PotentialContext(self.scene, self.scene["start"][:, :ROWS], state.a, self.scene["valid"][:, :ROWS],
-                                      routed.points, routed.has_lane, plan, target)
-        self.anchor = Anchor(route, torch.full((count, ROWS, KNOTS), -2.0), self.coalition.clone(),
-                             torch.zeros(count, ROWS), self.coalition & False, routed.points)
+        self.where = PotentialContext(
+            self.scene,
+            self.scene["start"][:, :ROWS],
+            state.a,
+            self.scene["valid"][:, :ROWS],
+            routed.points,
+            routed.has_lane,
+            plan,
+            target,
+        )
+        self.anchor = Anchor(
+            route,
+            torch.full((count, ROWS, KNOTS), -2.0),
+            self.coalition.clone(),
+            torch.zeros(count, ROWS),
+            self.coalition & False,
+            routed.points,
+        )
         self.generator = torch.Generator().manual_seed(0)
         self.noise = torch.randn(self.prior.sampler.steps, count, ROWS, SIZE, generator=self.generator)
 
     def control(self, eta=1.0, strength=0.0, **settings):
         eta = torch.full((len(self.scene),), eta) if isinstance(eta, float) else torch.tensor(eta)
         extra = torch.randn(len(self.scene), ROWS, SIZE, generator=torch.Generator().manual_seed(7))
-        return SparseControl(self.prior, ControlSettings(**settings), PotentialSettings(), self.where, self.coalition,
-                             eta, self.anchor, strength, extra)
+        return SparseControl(
+            self.prior,
+            ControlSettings(**settings),
+            PotentialSettings(),
+            self.where,
+            self.coalition,
+            eta,
+            self.anchor,
+            strength,
+            extra,
+        )
 
     def shift(self, level=0.5, k=1, seed=0, **options):
         """(x0 after - x0 before control, x after - x before anchoring) at one noise level."""
@@ -59,8 +83,10 @@ class Case:
 
     def values(self, x0):
         states = self.prior.decode(x0, self.context, steps=sampled_steps(PotentialSettings())).states()
-        return (adversarial_potential(states, self.where, PotentialSettings())[:, MEMBER],
-                feasibility_potential(states, self.where, PotentialSettings())[:, 1:].sum(-1))
+        return (
+            adversarial_potential(states, self.where, PotentialSettings())[:, MEMBER],
+            feasibility_potential(states, self.where, PotentialSettings())[:, 1:].sum(-1),
+        )
 
 
 OTHERS = [i for i in range(ROWS) if i != MEMBER]

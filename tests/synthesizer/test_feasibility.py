@@ -44,14 +44,17 @@ def test_windows_hold_what_both_can_reach():
     assert earliest == pytest.approx(alone, abs=0.15) and latest == SETTINGS.horizon
 
 
-@pytest.mark.parametrize("vehicle, conflicting", [
-    ((-20.0, 0.0, 0.0, 12.0), True),  # behind in the same lane
-    ((25.0, 0.0, 0.0, 8.0), True),  # ahead in the same lane
-    ((0.0, 12.0, 0.0, 10.0), False),  # parallel
-    ((30.0, 20.0, UP, 10.0), False),  # has crossed already
-    ((110.0, -100.0, UP, 2.0), False),  # cannot be there in time
-    ((60.0, 0.0, LEFT, 10.0), True),  # head-on
-])
+@pytest.mark.parametrize(
+    "vehicle, conflicting",
+    [
+        ((-20.0, 0.0, 0.0, 12.0), True),  # behind in the same lane
+        ((25.0, 0.0, 0.0, 8.0), True),  # ahead in the same lane
+        ((0.0, 12.0, 0.0, 10.0), False),  # parallel
+        ((30.0, 20.0, UP, 10.0), False),  # has crossed already
+        ((110.0, -100.0, UP, 2.0), False),  # cannot be there in time
+        ((60.0, 0.0, LEFT, 10.0), True),  # head-on
+    ],
+)
 def test_who_can_meet_the_ego(vehicle, conflicting):
     assert judge(vehicle)[0].conflicting[0, 1] == conflicting
 
@@ -63,14 +66,17 @@ def test_only_the_candidate_that_crosses_is_listed():
     assert table.has[0, 1].nonzero().tolist() == [[3]] and table.best[0, 1] == 3
 
 
-@pytest.mark.parametrize("vehicle, parked, relevant", [
-    ((14.0, 0.0, 0.0, 0.0), False, True),  # standing in the way
-    ((14.0, 0.0, 0.0, 0.0), True, False),  # the same, parked
-    ((40.0, 0.0, 0.0, 0.0), False, False),  # standing too far ahead
-    ((14.0, 4.0, 0.0, 0.0), False, False),  # standing beside
-    ((-14.0, 0.0, 0.0, 0.0), False, False),  # standing behind
-    ((40.0, -20.0, UP, 3.0), False, True),  # moving
-])
+@pytest.mark.parametrize(
+    "vehicle, parked, relevant",
+    [
+        ((14.0, 0.0, 0.0, 0.0), False, True),  # standing in the way
+        ((14.0, 0.0, 0.0, 0.0), True, False),  # the same, parked
+        ((40.0, 0.0, 0.0, 0.0), False, False),  # standing too far ahead
+        ((14.0, 4.0, 0.0, 0.0), False, False),  # standing beside
+        ((-14.0, 0.0, 0.0, 0.0), False, False),  # standing behind
+        ((40.0, -20.0, UP, 3.0), False, True),  # moving
+    ],
+)
 def test_who_is_relevant(vehicle, parked, relevant):
     world = make_world([EGO, vehicle])
     world.scene["parked"][:, 1] = parked
@@ -115,8 +121,13 @@ def test_compact_lists_true_entries_first():
 def test_the_description_names_place_motion_conflict_and_verdict():
     world = make_world([EGO, (50.0, -40.0, UP, 10.0)])
     text = describe(world.scene, world, 1)
-    for part in ("50 m ahead of it and 40 m to its right", "90 degrees to the left", "10.0 m/s", "in 40 m",
-                 "Feasible: yes"):
+    for part in (
+        "50 m ahead of it and 40 m to its right",
+        "90 degrees to the left",
+        "10.0 m/s",
+        "in 40 m",
+        "Feasible: yes",
+    ):
         assert part in text, text
 
 

@@ -16,11 +16,17 @@ WIDTH, AGENTS = 32, 40
 def sized(counts, others=0):
     """A World whose scenes have so many vehicles, and so many other agents."""
     valid = torch.arange(AGENTS) < torch.tensor(counts)[:, None]
-    valid[:, WIDTH:WIDTH + others] = True
+    valid[:, WIDTH : WIDTH + others] = True
     empty = torch.zeros(len(counts), AGENTS)
     scene = TensorDict({"valid": valid}, batch_size=[len(counts)])
-    return World(scene, empty[:, 0].long(), empty[..., None].expand(-1, -1, 4), valid, empty,
-                 torch.zeros(len(counts), WIDTH, dtype=torch.long))
+    return World(
+        scene,
+        empty[:, 0].long(),
+        empty[..., None].expand(-1, -1, 4),
+        valid,
+        empty,
+        torch.zeros(len(counts), WIDTH, dtype=torch.long),
+    )
 
 
 def test_every_scene_is_in_one_group_that_holds_its_vehicles_and_wastes_less_than_half():

@@ -27,8 +27,16 @@ def met(vehicles, eta=2.0, settings=FREE, world=None):
     scene, expected = world.scene, cruise(world.scene, world, TIMES)
     size, count = scene["size"][:, :8], len(vehicles)
     others = (expected[:, None], size[:, None], (torch.arange(8) > 1)[None, None] & (torch.arange(8) < count))
-    found = intercept(scene, world.states[:, 1:2], size[:, 1:2], expected[:, :1], size[:, :1],
-                      torch.full((len(scene),), eta), others, settings)
+    found = intercept(
+        scene,
+        world.states[:, 1:2],
+        size[:, 1:2],
+        expected[:, :1],
+        size[:, :1],
+        torch.full((len(scene),), eta),
+        others,
+        settings,
+    )
     return found, expected, size
 
 
@@ -41,8 +49,9 @@ def driven(found, speed):
     return torch.cat([xy, heading[:, None], v[:, None]], -1)
 
 
-@pytest.mark.parametrize("vehicle", [BESIDE, (25.0, -20.0, UP, 9.0), (60.0, 3.5, math.pi, 8.0),
-                                     (-15.0, 0.0, 0.0, 11.0)])
+@pytest.mark.parametrize(
+    "vehicle", [BESIDE, (25.0, -20.0, UP, 9.0), (60.0, 3.5, math.pi, 8.0), (-15.0, 0.0, 0.0, 11.0)]
+)
 def test_the_boxes_touch_if_everybody_drives_as_expected(vehicle):
     found, expected, size = met([EGO, vehicle])
     assert found.cost.isfinite().all()

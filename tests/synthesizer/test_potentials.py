@@ -43,9 +43,16 @@ def situation(*vehicles, targets=(), copies=1):
     target = torch.full((copies, 8), -1)
     for vehicle, aim in targets:
         target[:, vehicle] = aim
-    return states, PotentialContext(scene, scene["start"][:, :8], scene["start_accel"][:, :8], world.valid[:, :8],
-                                    scene["route_points"][:, :, 0], scene["route_valid"].any(-1), states[:, 0].clone(),
-                                    target)
+    return states, PotentialContext(
+        scene,
+        scene["start"][:, :8],
+        scene["start_accel"][:, :8],
+        world.valid[:, :8],
+        scene["route_points"][:, :, 0],
+        scene["route_valid"].any(-1),
+        states[:, 0].clone(),
+        target,
+    )
 
 
 def rough(states, seed=0):
@@ -56,8 +63,14 @@ def rough(states, seed=0):
 
 
 def busy(copies=1):
-    states, context = situation((12.0, 2.0, 0.1, 9.0), (20.0, -8.0, UP, 6.0), (22.0, -12.0, UP, 7.0),
-                                (15.0, 3.0, 0.0, 10.0), targets=[(1, 0), (2, 1)], copies=copies)
+    states, context = situation(
+        (12.0, 2.0, 0.1, 9.0),
+        (20.0, -8.0, UP, 6.0),
+        (22.0, -12.0, UP, 7.0),
+        (15.0, 3.0, 0.0, 10.0),
+        targets=[(1, 0), (2, 1)],
+        copies=copies,
+    )
     field = torch.linspace(-4, 4, context.scene["field"].shape[-1]).half()
     context.scene["field"] = field.expand_as(context.scene["field"]).contiguous()
     return rough(states), context
@@ -95,16 +108,18 @@ def test_a_vehicle_s_term_moves_that_vehicle_alone_and_never_the_ego(potential):
     value = potential(states, context, SETTINGS)
     assert value[0, 0] == 0
     for vehicle in (1, 2):
-        gradient, plan = torch.autograd.grad(value[0, vehicle], (states, context.ego_plan), retain_graph=True,
-                                             allow_unused=True)
+        gradient, plan = torch.autograd.grad(
+            value[0, vehicle], (states, context.ego_plan), retain_graph=True, allow_unused=True
+        )
         moved = gradient.abs().sum((0, 2, 3))
         assert moved[vehicle] > 0 and moved.sum() == moved[vehicle] and plan is None
 
 
 @pytest.mark.parametrize("kind", ["centre", "box"])
 def test_gradients_are_finite_for_coincident_and_standing_vehicles(kind):
-    states, context = situation((0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), (5.0, 0.0, 0.0, 0.0),
-                                targets=[(1, 0), (2, 1), (3, 0)])
+    states, context = situation(
+        (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), (5.0, 0.0, 0.0, 0.0), targets=[(1, 0), (2, 1), (3, 0)]
+    )
     for plans in (states, torch.zeros_like(states), 1e3 * torch.ones_like(states)):
         plans = plans.clone().requires_grad_()
         held = replace(context, ego_plan=plans[:, 0].detach())
@@ -168,8 +183,13 @@ def test_adversary_and_target_do_not_repel_each_other():
 def test_cruising_alone_is_free_and_each_fault_costs():
     states, context = situation((60.0, 3.5, 0.0, 10.0))
     assert feasibility_potential(states, context, SETTINGS)[0, 1] == 0
-    faults = {"off_road": states.clone(), "lateral": states.clone(), "accel": states.clone(), "jerk": states.clone(),
-              "wrong_way": states.clone()}
+    faults = {
+        "off_road": states.clone(),
+        "lateral": states.clone(),
+        "accel": states.clone(),
+        "jerk": states.clone(),
+        "wrong_way": states.clone(),
+    }
     faults["lateral"][:, 1, 20:, 1] += 3
     faults["accel"][:, 1, :, 3] += torch.arange(50) * 0.6
     faults["jerk"][:, 1, 24:29, 3] += 4
@@ -195,9 +215,16 @@ def test_who_starts_off_the_road_or_beside_its_route_is_only_kept_from_worse():
     assert feasibility_potential(states, context, SETTINGS)[0, 1] == 0
 
 
-@pytest.mark.parametrize("offset, closing, cost", [
-    ((10, 0), (-5, 0), 0.1353), ((10, 1), (-5, 0), 0.0821), ((5, 0), (-10, 0), 0.8825), ((10, 0), (5, 0), 0.0),
-    ((40, 3), (0, 0), 0.0)])
+@pytest.mark.parametrize(
+    "offset, closing, cost",
+    [
+        ((10, 0), (-5, 0), 0.1353),
+        ((10, 1), (-5, 0), 0.0821),
+        ((5, 0), (-10, 0), 0.8825),
+        ((10, 0), (5, 0), 0.0),
+        ((40, 3), (0, 0), 0.0),
+    ],
+)
 def test_ttc_cost_has_its_published_values(offset, closing, cost):
     value = ttc_cost(torch.tensor(offset, dtype=torch.float64), torch.tensor(closing, dtype=torch.float64))
     assert value == pytest.approx(cost, abs=2e-4)

@@ -37,8 +37,12 @@ def world(copies=1):
 
 def ask(url, tmp_path, made, statistics=None, **settings):
     counts = {} if statistics is None else statistics
-    reasoner = LanguageReasoner(ReasonerSettings(**({
-        "kind": "lm", "model": "small", "base_url": url, "retries": 0, "cache": str(tmp_path)} | settings)), counts)
+    reasoner = LanguageReasoner(
+        ReasonerSettings(
+            **({"kind": "lm", "model": "small", "base_url": url, "retries": 0, "cache": str(tmp_path)} | settings)
+        ),
+        counts,
+    )
     return reasoner(made.scene, made, RULES), counts
 
 
@@ -65,13 +69,20 @@ def test_the_conflict_table_stays_and_parked_vehicles_are_not_asked_about(tmp_pa
     torch.testing.assert_close(result.conflicts.own_s, feasible_vehicles(made.scene, made, RULES).conflicts.own_s)
 
 
-@pytest.mark.parametrize("answer", [
-    "no JSON at all", "[]", '{"vehicles": [{"id": 1}]}',
-    json.dumps({"vehicles": [{"id": number} | dict.fromkeys(CRITERIA, True) for number in (1, 7)]}),
-    json.dumps({"vehicles": [{"id": 1} | dict.fromkeys(CRITERIA, True)]}),
-    json.dumps({"vehicles": [{"id": number} | dict.fromkeys(CRITERIA, "yes") for number in (1, 2)]}),
-    (500, "out of order"), (404, "no such model"), "",
-])
+@pytest.mark.parametrize(
+    "answer",
+    [
+        "no JSON at all",
+        "[]",
+        '{"vehicles": [{"id": 1}]}',
+        json.dumps({"vehicles": [{"id": number} | dict.fromkeys(CRITERIA, True) for number in (1, 7)]}),
+        json.dumps({"vehicles": [{"id": 1} | dict.fromkeys(CRITERIA, True)]}),
+        json.dumps({"vehicles": [{"id": number} | dict.fromkeys(CRITERIA, "yes") for number in (1, 2)]}),
+        (500, "out of order"),
+        (404, "no such model"),
+        "",
+    ],
+)
 def test_the_rules_decide_where_the_model_fails(tmp_path, answer):
     made = world(2)
     with chat_server(lambda request: answer) as (url, _), pytest.warns(UserWarning, match="rules decided for 1 of"):

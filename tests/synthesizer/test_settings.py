@@ -14,10 +14,17 @@ from e2rl.synthesizer.topology import TopologySettings
 CONFIG = Path(__file__).parents[2] / "conf" / "synthesizer" / "e2.yaml"
 
 
-@pytest.mark.parametrize("key, settings", [
-    ("topology", TopologySettings), ("feasibility", FeasibilitySettings),
-    ("reasoner", ReasonerSettings), ("skeleton", SkeletonSettings),
-    ("anchor", AnchorSettings), ("potentials", PotentialSettings)])
+@pytest.mark.parametrize(
+    "key, settings",
+    [
+        ("topology", TopologySettings),
+        ("feasibility", FeasibilitySettings),
+        ("reasoner", ReasonerSettings),
+        ("skeleton", SkeletonSettings),
+        ("anchor", AnchorSettings),
+        ("potentials", PotentialSettings),
+    ],
+)
 def test_the_config_lists_every_setting(key, settings):
     config = OmegaConf.load(CONFIG)[key]
     assert set(config) == set(asdict(settings()))

@@ -25,8 +25,9 @@ COLUMN = [(30.0, -20.0 - 18 * k, UP, 8.0) for k in range(3)]  # one behind the o
 
 
 def build(world, support, feasible=None, **settings):
-    return build_skeleton(world.scene, world, support, support if feasible is None else feasible,
-                          SkeletonSettings(**settings))
+    return build_skeleton(
+        world.scene, world, support, support if feasible is None else feasible, SkeletonSettings(**settings)
+    )
 
 
 def test_near_vehicles_act_on_the_ego():
@@ -52,8 +53,10 @@ def test_a_column_forms_a_chain_and_its_intermediate_is_controlled():
     assert result.chains.tolist() == [1]
 
 
-@pytest.mark.parametrize("change", [
-    {"max_chain": 2}, {"tau_long": 10.0}, {"horizon": 1.0}, {"max_dist": 40.0}, {"far": 0}, {"tau_dist": 90.0}])
+@pytest.mark.parametrize(
+    "change",
+    [{"max_chain": 2}, {"tau_long": 10.0}, {"horizon": 1.0}, {"max_dist": 40.0}, {"far": 0}, {"tau_dist": 90.0}],
+)
 def test_chains_beyond_the_limits_are_pruned_to_the_near(change):
     world = make_world([EGO, *COLUMN])
     result = build(world, mask(world, 1, 2, 3), near=1, **change)
@@ -125,8 +128,9 @@ def test_bad_settings_are_refused():
 def test_an_ego_alone_passes_through_every_room():
     world = make_world([EGO], copies=2)
     scene, plan = world.scene, world.scene["logged"][:, 1:51, 0]
-    found = topological_candidates(scene["logged"][:, :, :8], scene["logged_valid"][:, :, :8], scene["size"][:, :8],
-                                   TopologySettings())
+    found = topological_candidates(
+        scene["logged"][:, :, :8], scene["logged_valid"][:, :, :8], scene["size"][:, :8], TopologySettings()
+    )
     feasible = feasible_vehicles(scene, world, FeasibilitySettings()).mask
     result = build(world, found.candidates & feasible, feasible)
     anchor = propose(scene, world, result, plan, AnchorSettings(), InterceptionSettings(), torch.full((2,), 2.0))

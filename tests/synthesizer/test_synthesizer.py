@@ -19,8 +19,14 @@ EGO = IDMEgo()
 
 
 def world_of(scene):
-    return World(scene, torch.zeros(len(scene), dtype=torch.long), scene["start"], scene["valid"],
-                 scene["start_accel"], scene["route_log"].clamp(min=0))
+    return World(
+        scene,
+        torch.zeros(len(scene), dtype=torch.long),
+        scene["start"],
+        scene["valid"],
+        scene["start_accel"],
+        scene["route_log"].clamp(min=0),
+    )
 
 
 def begin(on, scene, eta, seeds=None):
@@ -85,7 +91,7 @@ def test_scenes_that_were_planned_differently_often_share_a_batch():
         one = replace(take_rows(fresh, torch.tensor([row])), replans=torch.tensor([count]))
         there = take_rows(world, torch.tensor([row]))
         _, alone = on.replan(one, there, EGO.plan(there))
-        torch.testing.assert_close(alone.states(), plan.states()[row:row + 1], rtol=0, atol=5e-3)
+        torch.testing.assert_close(alone.states(), plan.states()[row : row + 1], rtol=0, atol=5e-3)
 
 
 def test_without_intensity_the_plan_is_the_prior_s():
@@ -128,8 +134,7 @@ def test_a_chain_over_a_pruned_member_is_pruned(monkeypatch):
     build, propose = module.build_skeleton, module.propose
 
     def chained(*arguments):
-        return replace(build(*arguments), coalition=acts, target=target,
-                       depth=torch.tensor([[0, 1, 2, 1, 3, 0]]))
+        return replace(build(*arguments), coalition=acts, target=target, depth=torch.tensor([[0, 1, 2, 1, 3, 0]]))
 
     def without_one(scene, world, skeleton, *arguments, **options):
         has = skeleton.coalition.clone()
@@ -196,7 +201,7 @@ def test_the_ego_is_seen_as_it_drives_and_free_vehicles_beside_their_route(free_
     scene = curved_scenes()
     on = Synthesizer(small_prior(free_space=free_space))
     world = world_of(scene)
-    turning = scene["logged"][:, 1:HORIZON + 1, 0].clone()
+    turning = scene["logged"][:, 1 : HORIZON + 1, 0].clone()
     turning[..., 2] = 0.2 * 0.1 * torch.arange(1, HORIZON + 1)  # the ego turns at 0.2 rad/s
     episode = on.begin(scene, torch.tensor([0]), torch.zeros(1))
     episode = replace(episode, state=episode.state.map(lambda value: value + 0.25))
@@ -244,8 +249,9 @@ def test_the_transport_budget_of_a_rollout_holds_and_is_used(sampler):
     settings = SamplerSettings(sampler=sampler, steps=4)
 
     def spent(budget):
-        on = Synthesizer(small_prior(0, sampler=settings), SynthesizerSettings(
-            control=ControlSettings(transport_budget=budget)))
+        on = Synthesizer(
+            small_prior(0, sampler=settings), SynthesizerSettings(control=ControlSettings(transport_budget=budget))
+        )
         episode, plan = replanned(on, scene, 2.0, times=3)
         return episode.kl.sum(-1), plan
 

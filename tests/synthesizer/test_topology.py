@@ -40,6 +40,7 @@ def test_first_contact_is_that_of_stepped_polygons():
     velocity = states[..., 3:] * torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)
     kinds = []
     for pair in range(len(states)):
+
         def at(t, pair=pair):
             moved = states[pair, :, None].repeat(1, len(t), 1)
             moved[..., :2] += t[:, None] * velocity[pair, :, None]
@@ -100,8 +101,12 @@ def test_the_ego_is_never_a_candidate_whatever_the_number_of_vehicles(count):
 
 def test_two_vehicles_head_on_are_one_clique():
     states = torch.tensor([[[0.0, 0, 0, 10], [70, 0, torch.pi, 10]]])
-    result = topological_candidates(rollout(states), torch.ones(1, 81, 2, dtype=torch.bool),
-                                    torch.tensor([[[4.0, 2.0]]]).expand(1, 2, 2), TopologySettings())
+    result = topological_candidates(
+        rollout(states),
+        torch.ones(1, 81, 2, dtype=torch.bool),
+        torch.tensor([[[4.0, 2.0]]]).expand(1, 2, 2),
+        TopologySettings(),
+    )
     assert result.candidates.tolist() == [[False, True]]
     assert (0, 1) in result.groups[0][0] and result.edges[0, 0] == 1
 
@@ -124,8 +129,9 @@ def test_a_queue_far_from_the_ego_counts_only_without_relevance():
 
 def test_large_cliques_are_cut_down_and_keep_the_ego():
     states, size = random_boxes(1, 8, 1.0, 3)
-    result = topological_candidates(states[:, None], torch.ones(1, 1, 8, dtype=torch.bool), size,
-                                    TopologySettings(max_clique=3))
+    result = topological_candidates(
+        states[:, None], torch.ones(1, 1, 8, dtype=torch.bool), size, TopologySettings(max_clique=3)
+    )
     assert all(len(clique) == 3 and clique[0] == 0 for clique in result.groups[0][0])
 
 

@@ -6,8 +6,8 @@ from e2rl.ego.idm import IDMEgo
 from e2rl.prior.prior import SamplerSettings
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.env import SimSettings
-from e2rl.synthesizer.rollout import roll_out
 from e2rl.synthesizer.synthesizer import Synthesizer, SynthesizerSettings
+from e2rl.traffic.rollout import roll_out
 from tests.prior.small import small_prior
 from tests.synthetic import make_scenes
 
@@ -29,5 +29,6 @@ def drive(scene_set: SceneSet, on: Synthesizer, eta: float, seeds=None, ego=None
     """Rollouts of every scene once."""
     index = torch.arange(len(scene_set))
     seeds = index if seeds is None else torch.tensor(seeds)
-    return roll_out(scene_set, index, seeds, torch.full((len(index),), eta), ego or IDMEgo(), on, SimSettings(),
-                    **options)
+    return roll_out(
+        scene_set, index, seeds, torch.full((len(index),), eta), ego or IDMEgo(), on, SimSettings(), **options
+    )

@@ -53,14 +53,22 @@ def signalled_cross(rng, name: str) -> Layout:
     """Four-way signals with left-turn pockets."""
     major, minor = int(rng.integers(2, 4)), 2
     speed = rng.uniform(13, 17.5)
-    return star(rng, name, SIGNAL, cross_angles(rng, 4, 0.12), [major, minor] * 2,
-                [speed, MEDIUM] * 2, [3, 2] * 2, rng.uniform(0.3, 0.8) * np.array([420, 330] * 2), pocket=True)
+    return star(
+        rng,
+        name,
+        SIGNAL,
+        cross_angles(rng, 4, 0.12),
+        [major, minor] * 2,
+        [speed, MEDIUM] * 2,
+        [3, 2] * 2,
+        rng.uniform(0.3, 0.8) * np.array([420, 330] * 2),
+        pocket=True,
+    )
 
 
 def signalled_small(rng, name: str) -> Layout:
     """Four-way signals of single-lane streets."""
-    return star(rng, name, SIGNAL, cross_angles(rng), [1] * 4, [MEDIUM] * 4, [2] * 4,
-                rng.uniform(0.3, 0.8, 4) * 480)
+    return star(rng, name, SIGNAL, cross_angles(rng), [1] * 4, [MEDIUM] * 4, [2] * 4, rng.uniform(0.3, 0.8, 4) * 480)
 
 
 def priority_cross(rng, name: str) -> Layout:
@@ -68,22 +76,37 @@ def priority_cross(rng, name: str) -> Layout:
     lanes = int(rng.integers(1, 3))
     kind = rng.choice([PRIORITY, "priority_stop"])
     speed = rng.uniform(11, 16.5)
-    return star(rng, name, kind, cross_angles(rng), [lanes, 1] * 2, [speed, 11.1] * 2, [4, 1] * 2,
-                rng.uniform(0.4, 0.8) * np.array([560, 260] * 2))
+    return star(
+        rng,
+        name,
+        kind,
+        cross_angles(rng),
+        [lanes, 1] * 2,
+        [speed, 11.1] * 2,
+        [4, 1] * 2,
+        rng.uniform(0.4, 0.8) * np.array([560, 260] * 2),
+    )
 
 
 def t_junction(rng, name: str) -> Layout:
     """A side road that ends at a main road."""
     angles = rng.uniform(0, 2 * np.pi) + np.array([0, np.pi, np.pi / 2 + rng.uniform(-0.35, 0.35)])
     lanes = int(rng.integers(1, 3))
-    return star(rng, name, PRIORITY, angles, [lanes, lanes, 1], [MEDIUM, MEDIUM, 11.1], [4, 4, 1],
-                rng.uniform(0.4, 0.8) * np.array([600, 600, 380]))
+    return star(
+        rng,
+        name,
+        PRIORITY,
+        angles,
+        [lanes, lanes, 1],
+        [MEDIUM, MEDIUM, 11.1],
+        [4, 4, 1],
+        rng.uniform(0.4, 0.8) * np.array([600, 600, 380]),
+    )
 
 
 def allway_stop(rng, name: str) -> Layout:
     """All-way stop of residential streets."""
-    return star(rng, name, STOP, cross_angles(rng), [1] * 4, [11.1] * 4, [2] * 4,
-                rng.uniform(0.4, 0.8, 4) * 330)
+    return star(rng, name, STOP, cross_angles(rng), [1] * 4, [11.1] * 4, [2] * 4, rng.uniform(0.4, 0.8, 4) * 330)
 
 
 def curved_road(rng, name: str) -> Layout:
@@ -91,8 +114,12 @@ def curved_road(rng, name: str) -> Layout:
     layout = Layout(name, rng.uniform(3.3, 3.7))
     speed, lanes = rng.uniform(11, 16), int(rng.integers(1, 3))
     signs = np.resize([1, -1], 6) * rng.choice([-1, 1])
-    axis = road_axis(np.zeros(2), rng.uniform(0, 2 * np.pi), 420.0,
-                     np.array([0, *(signs * rng.uniform(0.4, 1.0, 6) * 1.3 / speed**2), 0]))
+    axis = road_axis(
+        np.zeros(2),
+        rng.uniform(0, 2 * np.pi),
+        420.0,
+        np.array([0, *(signs * rng.uniform(0.4, 1.0, 6) * 1.3 / speed**2), 0]),
+    )
     at = 210.0 + rng.uniform(-40, 40)
     main = [cut(axis, 0, at)[::-1], cut(axis, at, 0)]
     centre = layout.node(main[1][0], PRIORITY, rng.uniform(5, 8))
@@ -106,8 +133,17 @@ def curved_road(rng, name: str) -> Layout:
 
 # Families with the number of their nets in a round of 30; nets of a family fall into all splits.
 FAMILIES: list[tuple[Callable[[np.random.Generator, str], Layout], int]] = [
-    (signalled_cross, 6), (signalled_small, 2), (priority_cross, 4), (t_junction, 3), (allway_stop, 3),
-    (roundabout, 3), (ramp, 2), (arterial, 3), (curved_road, 2), (grid, 1), (lane_drop, 1),
+    (signalled_cross, 6),
+    (signalled_small, 2),
+    (priority_cross, 4),
+    (t_junction, 3),
+    (allway_stop, 3),
+    (roundabout, 3),
+    (ramp, 2),
+    (arterial, 3),
+    (curved_road, 2),
+    (grid, 1),
+    (lane_drop, 1),
 ]
 
 

@@ -75,8 +75,17 @@ class Layout:
     def edge(self, start: str, end: str, left: np.ndarray, lanes: int, speed: float, rank: int = 1) -> str:
         """Add a carriageway whose left border is the polyline `left`; returns its id."""
         shape = " ".join(f"{x:.3f},{y:.3f}" for x, y in left)
-        row = {"id": f"e{len(self.edges)}", "from": start, "to": end, "numLanes": lanes, "speed": f"{speed:.3f}",
-               "width": f"{self.lane_width:.3f}", "priority": rank, "spreadType": "right", "shape": shape}
+        row = {
+            "id": f"e{len(self.edges)}",
+            "from": start,
+            "to": end,
+            "numLanes": lanes,
+            "speed": f"{speed:.3f}",
+            "width": f"{self.lane_width:.3f}",
+            "priority": rank,
+            "spreadType": "right",
+            "shape": shape,
+        }
         self.edges.append(row)
         return row["id"]
 
@@ -84,8 +93,18 @@ class Layout:
         """Allow the lane pairs (from, to; 0 is the rightmost) between edges a and b."""
         self.connections += [{"from": a, "to": b, "fromLane": i, "toLane": j} for i, j in pairs]
 
-    def arm(self, node: str, axis: np.ndarray, lanes: int, speed: float, rank: int, median: float = 0.0,
-            pocket: float = 0.0, border: str | None = None, taper: float = 34.0) -> Arm:
+    def arm(
+        self,
+        node: str,
+        axis: np.ndarray,
+        lanes: int,
+        speed: float,
+        rank: int,
+        median: float = 0.0,
+        pocket: float = 0.0,
+        border: str | None = None,
+        taper: float = 34.0,
+    ) -> Arm:
         """A two-way road from `node` outwards along `axis`.
 
         pocket > 0: a left-turn lane of that length takes the median (at least a lane wide) before the junction; it
@@ -125,10 +144,14 @@ class Layout:
     def write(self, folder: Path) -> list[str]:
         """Write the three XML files; returns netconvert's arguments for them."""
         arguments = []
-        for option, tag, rows in (("node", "nodes", self.nodes), ("edge", "edges", self.edges),
-                                  ("connection", "connections", self.connections)):
-            lines = [f"  <{option} " + " ".join(f"{k}={quoteattr(str(v))}" for k, v in row.items()) + "/>"
-                     for row in rows]
+        for option, tag, rows in (
+            ("node", "nodes", self.nodes),
+            ("edge", "edges", self.edges),
+            ("connection", "connections", self.connections),
+        ):
+            lines = [
+                f"  <{option} " + " ".join(f"{k}={quoteattr(str(v))}" for k, v in row.items()) + "/>" for row in rows
+            ]
             path = folder / f"{self.name}.{option}.xml"
             path.write_text("\n".join([f"<{tag}>", *lines, f"</{tag}>"]))
             arguments += [f"--{option}-files", str(path)]

@@ -49,8 +49,10 @@ def carriageway(layout: Layout, axis: np.ndarray, cuts: list[tuple[float, float,
     for (_, end, _), (begin, _, _) in zip(cuts[:-1], cuts[1:], strict=True):
         nodes.append(layout.node(cut(axis, (begin + end) / 2, 0)[0]))
     nodes.append(layout.node(axis[-1], border=True))
-    return [layout.edge(nodes[k], nodes[k + 1], cut(axis, begin, end), lanes, speed, 5)
-            for k, (begin, end, lanes) in enumerate(cuts)]
+    return [
+        layout.edge(nodes[k], nodes[k + 1], cut(axis, begin, end), lanes, speed, 5)
+        for k, (begin, end, lanes) in enumerate(cuts)
+    ]
 
 
 def ramp(rng, name: str) -> Layout:
@@ -102,8 +104,10 @@ def arterial(rng, name: str) -> Layout:
     signal = int(rng.integers(0, 8))
     bounds = [0.0, *stops, 560.0]
     nodes = [layout.node(axis[0], border=True)]
-    nodes += [layout.node(cut(axis, s, 0)[0], "traffic_light" if k == signal else "priority", rng.uniform(4, 7))
-              for k, s in enumerate(stops)]
+    nodes += [
+        layout.node(cut(axis, s, 0)[0], "traffic_light" if k == signal else "priority", rng.uniform(4, 7))
+        for k, s in enumerate(stops)
+    ]
     nodes.append(layout.node(axis[-1], border=True))
     arms: list[list[Arm]] = [[] for _ in nodes]
     for k in range(len(bounds) - 1):
@@ -134,8 +138,9 @@ def _through_demand(layout: Layout, arms: list[list[Arm]], rng, main: float, sid
         others = [j for j in range(len(doors)) if j != k]
         weight = np.array([doors[j][2] for j in others]) * rng.uniform(0.5, 1.5, len(others))
         volume = rng.uniform(0.4, 0.8) * flow
-        layout.demand += [(source, doors[j][1], float(volume * w / weight.sum()))
-                          for j, w in zip(others, weight, strict=True)]
+        layout.demand += [
+            (source, doors[j][1], float(volume * w / weight.sum())) for j, w in zip(others, weight, strict=True)
+        ]
 
 
 def grid(rng, name: str) -> Layout:

@@ -16,13 +16,34 @@ from scenegen.layout import Layout
 from scenegen.traffic import write_demand
 
 NETCONVERT = {
-    "no-turnarounds": "true", "junctions.internal-link-detail": "15", "junctions.limit-turn-speed": "2.0",
-    "default.junctions.radius": "6", "junctions.corner-detail": "8", "rectangular-lane-cut": "false",
-    "junctions.scurve-stretch": "1.0", "tls.default-type": "actuated", "tls.left-green.time": "8",
-    "offset.disable-normalization": "true", "no-warnings": "true",
+    "no-turnarounds": "true",
+    "junctions.internal-link-detail": "15",
+    "junctions.limit-turn-speed": "2.0",
+    "default.junctions.radius": "6",
+    "junctions.corner-detail": "8",
+    "rectangular-lane-cut": "false",
+    "junctions.scurve-stretch": "1.0",
+    "tls.default-type": "actuated",
+    "tls.left-green.time": "8",
+    "offset.disable-normalization": "true",
+    "no-warnings": "true",
 }
-SUMO = ["--step-length", str(DT), "--lateral-resolution", "0.3", "--time-to-teleport", "-1", "--collision.action",
-        "warn", "--collision.check-junctions", "true", "--no-warnings", "true", "--no-step-log", "true"]
+SUMO = [
+    "--step-length",
+    str(DT),
+    "--lateral-resolution",
+    "0.3",
+    "--time-to-teleport",
+    "-1",
+    "--collision.action",
+    "warn",
+    "--collision.check-junctions",
+    "true",
+    "--no-warnings",
+    "true",
+    "--no-step-log",
+    "true",
+]
 WARM_UP, RECORDED, LEAD = 60.0, 100.0, 8.0  # s; tracks begin LEAD s before the recorded time, for the smoothers
 STATES = {"r": LIGHT_RED, "u": LIGHT_RED, "y": LIGHT_YELLOW, "Y": LIGHT_YELLOW, "g": LIGHT_GREEN, "G": LIGHT_GREEN}
 SHORTEST = 1.0  # m: shorter lanes are bridged by their neighbours
@@ -54,8 +75,9 @@ def convert(layout: Layout, folder: Path) -> tuple[Path, Net]:
     path = folder / f"{layout.name}.net.xml"
     options = [part for key, value in NETCONVERT.items() for part in (f"--{key}", value)]
     program = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
-    done = subprocess.run([program, *layout.write(folder), "--output-file", path, *options], capture_output=True,
-                          text=True)
+    done = subprocess.run(
+        [program, *layout.write(folder), "--output-file", path, *options], capture_output=True, text=True
+    )
     if done.returncode:
         raise RuntimeError(f"netconvert failed on {layout.name}: {done.stderr}")
     return path, read_net(ET.parse(path).getroot(), layout)
@@ -77,7 +99,7 @@ def read_net(root: ET.Element, layout: Layout) -> Net:
             width = float(lane.get("width", layout.lane_width))
             lanes[ids[k]] = Lane(points, width, float(lane.get("speed")))
             if not inside:
-                lanes[ids[k]].left, lanes[ids[k]].right = ids[k + 1:k + 2], ids[max(k - 1, 0):k]
+                lanes[ids[k]].left, lanes[ids[k]].right = ids[k + 1 : k + 2], ids[max(k - 1, 0) : k]
                 ribbons.append(ribbon(points, width))
     for link in root.iter("connection"):
         target = link.get("via") or f"{link.get('to')}_{link.get('toLane')}"
@@ -107,8 +129,12 @@ def add_taper(lanes: dict[str, Lane], ending: str, target: str) -> Lane:
     w = last.points[1] - last.points[0]
     reach = np.linalg.norm(b - a)
     t = np.linspace(0, 1, 16)[:, None]
-    hermite = ((2 * t**3 - 3 * t**2 + 1) * a + (t**3 - 2 * t**2 + t) * reach * u / np.linalg.norm(u)
-               + (3 * t**2 - 2 * t**3) * b + (t**3 - t**2) * reach * w / np.linalg.norm(w))
+    hermite = (
+        (2 * t**3 - 3 * t**2 + 1) * a
+        + (t**3 - 2 * t**2 + t) * reach * u / np.linalg.norm(u)
+        + (3 * t**2 - 2 * t**3) * b
+        + (t**3 - t**2) * reach * w / np.linalg.norm(w)
+    )
     lane = Lane(hermite, first.width, last.speed_limit, [target])
     lanes[f"taper_{ending}"] = lane
     first.exits.append(f"taper_{ending}")
@@ -169,6 +195,8 @@ def densify(lanes: dict[str, Lane], spacing: float = 4.0) -> None:
     """Give every lane a vertex at least every `spacing` m, so curves and straights read alike."""
     for lane in lanes.values():
         steps = np.diff(arc_length(lane.points))
-        parts = [resample(lane.points[k:k + 2], spacing)[:-1] if steps[k] > spacing else lane.points[k:k + 1]
-                 for k in range(len(steps))]
+        parts = [
+            resample(lane.points[k : k + 2], spacing)[:-1] if steps[k] > spacing else lane.points[k : k + 1]
+            for k in range(len(steps))
+        ]
         lane.points = np.concatenate([*parts, lane.points[-1:]])

@@ -77,9 +77,9 @@ def stack_tracks(tracks: list[Track], frames: int, rng) -> tuple[np.ndarray, np.
     for k, track in enumerate(tracks):
         own = smooth_track(track, rng) if len(track.heading) > 20 else np.zeros((0, 4))
         first = max(track.first, 0)
-        own = own[first - track.first:][:max(frames - first, 0)]
-        states[first:first + len(own), k] = own
-        valid[first:first + len(own), k] = True
+        own = own[first - track.first :][: max(frames - first, 0)]
+        states[first : first + len(own), k] = own
+        valid[first : first + len(own), k] = True
     return states, valid, np.array([track.size for track in tracks]).reshape(-1, 2)
 
 

@@ -22,7 +22,7 @@ def candidates(states, valid, border: np.ndarray, rng) -> list[tuple[float, int,
         here = np.flatnonzero(valid[span].any(0))
         part, known = states[span, here], valid[span, here]
         score = interaction_score(part, known)
-        way = np.linalg.norm(np.diff(part[CURRENT:CURRENT + 81, :, :2], axis=0), axis=-1).sum(0)
+        way = np.linalg.norm(np.diff(part[CURRENT : CURRENT + 81, :, :2], axis=0), axis=-1).sum(0)
         apart = np.linalg.norm(part[..., None, :2] - border, axis=-1).min(-1).min(0)
         good = known.all(0) & (way > MOVED) & (part[..., 3].max(0) > 3.0) & (apart >= BORDER)
         noise = rng.gumbel(size=len(here))
@@ -79,7 +79,23 @@ def cut_windows(place: SceneMap, states, valid, size, border, most: int, rng) ->
             continue
         egos.add(ego)
         tracks = np.where(known[:, rows, None], traffic[:, rows], 0.0)
-        kept.append((Recording(f"{place.name}_{first:04d}", place.name, "bundled", tracks, known[:, rows], bodies[rows],
-                               np.full(len(rows), VEHICLE), 0, place.lanes, place.drivable,
-                               {lane: state[span] for lane, state in place.lights.items()}, CURRENT), first))
+        kept.append(
+            (
+                Recording(
+                    f"{place.name}_{first:04d}",
+                    place.name,
+                    "bundled",
+                    tracks,
+                    known[:, rows],
+                    bodies[rows],
+                    np.full(len(rows), VEHICLE),
+                    0,
+                    place.lanes,
+                    place.drivable,
+                    {lane: state[span] for lane, state in place.lights.items()},
+                    CURRENT,
+                ),
+                first,
+            )
+        )
     return kept, refused

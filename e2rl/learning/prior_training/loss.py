@@ -1,0 +1,143 @@
+"""The prior's loss: denoising in x with a small trajectory term, on augmented windows."""
+
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from e2rl.learning.prior_training.settings import TrainingSettings
+from e2rl.prior.denoiser import Denoiser
+from e2rl.prior.features import SIDED_EDGE, SIDED_NODE
+from e2rl.prior.lane_relative import (
+    HORIZON,
+    KNOT_STEPS,
+    KNOTS,
+    SIZE,
+    LaneState,
+    lateral_horizon,
+    offset_coefficients,
+    polynomial,
+    speeds,
+    split,
+)
+from e2rl.prior.prior import CLEAN, Prior
+
+LEAST, CONSTANT = 0.02, 1e6  # smallest standard deviation of a feature; that of one that never varied: it says nothing
+
+
+def augment(batch: TensorDictBase, settings: TrainingSettings, generator: torch.Generator) -> TensorDictBase:
+    """Mirrored, noisy windows with some of the other vehicles hidden."""
+    batch, size, device = batch.clone(), batch.shape[0], batch["x0"].device
+    draw = lambda *shape: torch.rand(shape, generator=generator, device=device)  # noqa: E731
+    flip = torch.where(draw(size) < settings.mirror, -1.0, 1.0)
+    for key, columns in (("nodes", SIDED_NODE), ("pairs", SIDED_EDGE), ("x0", (KNOTS, KNOTS + 1))):
+        sign = torch.ones(batch[key].shape[-1], device=device)
+        sign = torch.where(
+            torch.isin(torch.arange(len(sign), device=device), torch.tensor(columns, device=device)),
+            flip[:, None],
+            sign,
+        )
+        batch[key] = batch[key] * sign.reshape(size, *[1] * (batch[key].ndim - 2), -1)
+    for key in ("d", "d1", "d2", "aside"):
+        batch[key] = batch[key] * flip.reshape(size, *[1] * (batch[key].ndim - 1))
+    hidden = draw(*batch["present"].shape) < settings.drop
+    hidden[:, 0] = False
+    batch["present"] = batch["present"] & ~hidden
+    batch["weight"] = batch["weight"] * ~hidden
+    noisy = (draw(*batch["a"].shape) < 0.5) * settings.accel_noise
+    noise = noisy * torch.randn(batch["a"].shape, generator=generator, device=device)
+    batch["a"] = batch["a"] + noise
+    batch["nodes"] = batch["nodes"] + torch.cat(
+        [torch.zeros_like(noise)[..., None], noise[..., None] / 2, torch.zeros_like(batch["nodes"][..., 2:])], -1
+    )
+    return batch
+
+
+def draw(batch: TensorDictBase, settings: TrainingSettings, generator: torch.Generator) -> TensorDict:
+    """The random numbers of the loss of windows [W] at L = `levels` noise levels each: feature [W, R, NODE] standard
+    normal; level [W, L] in (0.01, 0.99), stratified; clean [W, L] bool: the ego's row is given clean (in half);
+    noise [W, L, R, SIZE] standard normal."""
+    size, count, device = len(batch), settings.levels, batch["x0"].device
+    feature = torch.randn(batch["nodes"].shape, generator=generator, device=device)
+    u = torch.rand(count, size, generator=generator, device=device)
+    level = (torch.arange(count, device=device)[:, None] + u) / count * 0.98 + 0.01
+    clean = torch.rand(count, size, generator=generator, device=device) < 0.5
+    noise = torch.randn(count, *batch["x0"].shape, generator=generator, device=device)
+    return TensorDict({"feature": feature, "level": level.T, "clean": clean.T, "noise": noise.transpose(0, 1)}, [size])
+
+
+def loss_weight(batch: TensorDictBase, drawn: TensorDictBase) -> Tensor:
+    """[L * W, R], level by level: the windows' weights, 0 for an ego that is given clean."""
+    weight = batch["weight"].expand(drawn["level"].shape[1], *batch["weight"].shape).clone()
+    weight[..., 0] *= ~drawn["clean"].T
+    return weight.flatten(0, 1)
+
+
+class DenoisingLoss(nn.Module):
+    """The denoiser's loss as a module, so that DistributedDataParallel and torch.compile can wrap it."""
+
+    def __init__(self, denoiser: Denoiser, settings: TrainingSettings):
+        super().__init__()
+        self.denoiser, self.settings = denoiser, settings
+
+    def forward(self, batch: TensorDictBase, drawn: TensorDictBase, total: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(loss, its action term, its trajectory term) of windows [W] with the random numbers of `draw`.
+
+        total: what the weighted sums are divided by: their summed `loss_weight`; where several processes share a
+        batch, the mean of that over them, so that the mean of their gradients is the gradient of the whole batch.
+        """
+        net, count = self.denoiser, drawn["level"].shape[1]
+        scale = self.settings.feature_noise * net.node_std * ((net.node_std > LEAST) & (net.node_std < CONSTANT))
+        nodes = batch["nodes"] + scale * drawn["feature"]
+        encoding = net.encode(nodes, batch["pairs"], batch["present"]).repeat(count)
+        weight, tiled = loss_weight(batch, drawn), torch.cat([batch] * count)
+        level = drawn["level"].T.reshape(-1, 1).expand(-1, weight.shape[1]).clone()
+        level[:, 0] = torch.where(drawn["clean"].T.reshape(-1), CLEAN, level[:, 0])
+        x = net.schedule.noised(tiled["x0"], level[..., None], drawn["noise"].transpose(0, 1).flatten(0, 1))
+        x0 = net(x, level, encoding).float()
+        squared = (x0 - tiled["x0"]) ** 2 * tiled["knot_weight"]
+        action = (squared.sum(-1) / SIZE * weight).sum() / total
+        trajectory = (_trajectory_error(x0, tiled) * weight).sum() / total
+        return action + self.settings.trajectory * trajectory, action.detach(), trajectory.detach()
+
+
+def denoising_loss(
+    prior: Prior, batch: TensorDictBase, settings: TrainingSettings, generator: torch.Generator
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Loss of a batch of windows [W] at `levels` noise levels each, and its two terms."""
+    drawn = draw(batch, settings, generator)
+    total = loss_weight(batch, drawn).sum().clamp(min=1)
+    loss, action, trajectory = DenoisingLoss(prior.denoiser, settings)(batch, drawn, total)
+    return loss, {"action": action, "trajectory": trajectory}
+
+
+def _trajectory_error(x0: Tensor, batch: TensorDictBase) -> Tensor:
+    """Huber error [W, R] of way ahead and (twice, on lanes) of offset at the knots' times, in m."""
+    zero = torch.zeros_like(batch["v"])
+    state = LaneState(zero, batch["d"], batch["d1"], batch["d2"], batch["v"], batch["a"], zero, zero, zero, zero)
+    knots, half, end = split(x0, state)
+    _, travelled = speeds(state, knots)
+    ends = torch.arange(KNOT_STEPS - 1, HORIZON, KNOT_STEPS, device=x0.device)
+    travelled = travelled[..., ends]
+    u = (travelled / lateral_horizon(state.v)[..., None]).clamp(max=1.0)
+    d = polynomial(offset_coefficients(state, half, end), u)[0]
+    known = batch["known"].float()
+    ahead = F.huber_loss(travelled, batch["ahead"], reduction="none")
+    aside = F.huber_loss(2 * d, 2 * batch["aside"], reduction="none") * batch["on_lane"][..., None]
+    return ((ahead + aside) * known).sum(-1) / KNOTS
+
+
+@torch.no_grad()
+def held_out_loss(prior: Prior, windows: TensorDictBase, settings: TrainingSettings, batches: int = 20) -> float:
+    """Denoising loss on windows, with a fixed seed and no augmentation."""
+    device = next(prior.parameters()).device
+    generator = torch.Generator(device).manual_seed(1)
+    plain = replace(settings, feature_noise=0.0)
+    losses = []
+    for k in range(min(batches, len(windows) // settings.batch + 1)):
+        batch = windows[k * settings.batch : (k + 1) * settings.batch].to(device)
+        if len(batch):
+            losses.append(denoising_loss(prior, batch, plain, generator)[0].item())
+    return sum(losses) / len(losses)

@@ -1,0 +1,30 @@
+"""`resume=RUN_DIR`: an interrupted run goes on in its own folder with its own configuration."""
+
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from e2rl.errors import InputError
+
+OVERRIDES = ("rounds", "device", "threads")  # what may change when a run goes on
+
+
+def resumed(config: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
+    """(configuration, folder) to run: those of `config.resume`, but for the OVERRIDES given on the command line."""
+    if not config.resume:
+        return config, folder
+    saved_folder = Path(config.resume).resolve()
+    file = saved_folder / ".hydra" / "config.yaml"
+    if not file.exists():
+        raise InputError(
+            f"resume={config.resume}: no run is there ({file} is missing); give the folder that the "
+            "interrupted run printed"
+        )
+    saved = OmegaConf.load(file)
+    given = {item.split("=", 1)[0] for item in HydraConfig.get().overrides.task}
+    for key in OVERRIDES:
+        if key in given:
+            saved[key] = config[key]
+    saved.resume = str(saved_folder)
+    return saved, saved_folder

@@ -1,0 +1,216 @@
+"""Several processes train one prior: equal weights everywhere, the whole batch's update, exact resume, and the command.
+
+Two processes over gloo run `_work` once; the tests look at what they left behind.
+"""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch.multiprocessing import spawn
+
+from e2rl.errors import InputError
+from e2rl.learning.prior_training.distributed import ALONE, Processes, follower_overrides, joined
+from e2rl.learning.prior_training.loss import draw
+from e2rl.learning.prior_training.optimisation import PriorTraining
+from e2rl.learning.prior_training.settings import TrainingSettings
+from e2rl.learning.prior_training.windows import make_windows
+from e2rl.prior.checkpoint import load_prior
+from tests.prior.small import curved_scenes, small_prior
+
+ROOT = Path(__file__).parents[3]
+SETTINGS = TrainingSettings(steps=6, batch=4, levels=2, bf16=False)
+
+
+def training(windows, processes, seed=0):
+    return PriorTraining(small_prior(seed).requires_grad_(True), windows, SETTINGS, processes)
+
+
+def prearranged(windows, part=slice(None)):
+    """Whole batches with their random numbers, or a part of each."""
+    batches = [windows[k : k + 4] for k in (0, 3, 1)]
+    drawn = [draw(batch, SETTINGS, torch.Generator().manual_seed(k)) for k, batch in enumerate(batches)]
+    return [(batch[part], numbers[part]) for batch, numbers in zip(batches, drawn, strict=True)]
+
+
+def updates(run, windows, part=slice(None)):
+    """The gradients after the first of three prearranged updates, and the weights after the last."""
+    gradients = None
+    for batch, numbers in prearranged(windows, part):
+        run.update(batch, numbers)
+        gradients = gradients or {key: value.grad.clone() for key, value in run.prior.denoiser.named_parameters()}
+    return gradients, dict(run.prior.denoiser.state_dict())
+
+
+def _refuse():
+    raise InputError("the leader's trouble")
+
+
+def _work(rank, folder, port):
+    torch.set_num_threads(1)
+    os.environ |= {
+        "RANK": str(rank),
+        "LOCAL_RANK": str(rank),
+        "WORLD_SIZE": "2",
+        "LOCAL_WORLD_SIZE": "2",
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(port),
+        "TORCHELASTIC_RUN_ID": "test",
+    }
+    windows = torch.load(folder / "windows.pt", weights_only=False)
+    with joined("cpu") as (processes, device):
+        assert (processes.rank, processes.count, device) == (rank, 2, "cpu")
+        whole = training(windows, processes, seed=rank)  # other first weights: the leader's count
+        half = whole.run(3), whole.state_dict()
+        torch.save(half[1], folder / f"half{rank}.pt")
+        whole.run(6)
+        again = training(windows, processes)
+        again.load_state_dict(torch.load(folder / f"half{rank}.pt", weights_only=True))
+        again.run(6)
+        shared = updates(training(windows, processes), windows, slice(2 * rank, 2 * rank + 2))
+        try:
+            processes.leader_first(_refuse)
+            said = ""
+        except InputError as error:
+            said = str(error)
+        mean = processes.mean(torch.tensor([float(rank)]))
+        order = processes.gather(rank), processes.from_leader(lambda: f"by {rank}")
+    torch.save(
+        {
+            "average": whole.average,
+            "weights": dict(whole.prior.denoiser.state_dict()),
+            "mean": mean.item(),
+            "generator": whole.generator.get_state(),
+            "resumed": again.average,
+            "shared": shared,
+            "said": said,
+            "order": order,
+            "overrides": follower_overrides(),
+        },
+        folder / f"rank{rank}.pt",
+    )
+
+
+@pytest.fixture(scope="module")
+def windows():
+    windows = make_windows(curved_scenes(2))
+    windows["weight"][:2, 1:4] = 0
+    return windows
+
+
+@pytest.fixture(scope="module")
+def ranks(windows, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("ranks")
+    torch.save(windows, folder / "windows.pt")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    spawn(_work, (folder, port), nprocs=2)
+    return [torch.load(folder / f"rank{rank}.pt", weights_only=False) for rank in (0, 1)]
+
+
+def same(one, two):
+    return all(torch.equal(one[key], two[key]) for key in one)
+
+
+def test_weights_and_averages_are_the_same_everywhere_and_the_noise_is_not(ranks):
+    one, two = ranks
+    assert same(one["weights"], two["weights"]) and same(one["average"], two["average"])
+    assert not torch.equal(one["generator"], two["generator"])
+
+
+def test_an_interrupted_run_of_two_goes_on_exactly(ranks):
+    for rank in ranks:
+        assert same(rank["average"], rank["resumed"])
+
+
+def test_halves_of_a_batch_make_the_update_of_the_whole(ranks, windows):
+    """Also where the halves weigh differently."""
+    weight = prearranged(windows)[0][0]["weight"]
+    assert weight[:2].sum() != weight[2:].sum()
+    gradients, weights = updates(training(windows, ALONE), windows)
+    for rank in ranks:
+        for key, value in gradients.items():
+            torch.testing.assert_close(rank["shared"][0][key], value, rtol=1e-4, atol=1e-6, msg=key)
+        for key, value in weights.items():
+            torch.testing.assert_close(rank["shared"][1][key], value, rtol=1e-3, atol=1e-5, msg=key)
+
+
+def test_the_leader_speaks_for_all(ranks):
+    for rank in ranks:
+        assert rank["said"] == "the leader's trouble" and rank["mean"] == 0.5 and rank["order"] == ([0, 1], "by 0")
+    assert ranks[0]["overrides"] == [] and "hydra.output_subdir=null" in ranks[1]["overrides"]
+
+
+def test_alone_nothing_is_communicated():
+    value = torch.ones(2)
+    assert torch.equal(ALONE.mean(value), value) and ALONE.gather(3) == [3] and ALONE.from_leader(lambda: 4) == 4
+    module = torch.nn.Linear(1, 1)
+    assert ALONE.averaging(module) is module and ALONE.leader
+    with joined("cpu") as alone:
+        assert alone == (ALONE, "cpu")
+
+
+def test_a_batch_that_cannot_be_shared_and_another_number_of_processes_are_refused(windows):
+    with pytest.raises(InputError, match="batch=4: 3 processes"):
+        PriorTraining(small_prior(), windows, SETTINGS, Processes(0, 3))
+    run = training(windows, ALONE)
+    state = run.state_dict()
+    with pytest.raises(InputError, match="had 2 processes"):
+        run.load_state_dict(state | {"generators": state["generators"] * 2})
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="one process a GPU: tests the CPU's way")
+def test_torchrun_trains_with_the_real_command(tmp_path):
+    small = [
+        "data=procedural",
+        "data.count=4",
+        "data.workers=1",
+        "data.build.field_cells=64",
+        "data.build.vehicles=4",
+        "data.build.others=2",
+        "prior.network.width=16",
+        "prior.network.heads=2",
+        "prior.network.blocks=1",
+        "prior.training.steps=2",
+        "prior.training.validate_every=1",
+        "prior.training.route_steps=5",
+        "prior.training.closed_loop_scenes=1",
+        "prior.training.closed_loop_every=1",
+        "prior.training.batch=4",
+        "prior.training.starts=[10]",
+        "prior.sampler.steps=2",
+        "data.build.steps=20",
+        f"hydra.run.dir={tmp_path / 'run'}",
+        f"data.cache={tmp_path / 'cache'}",
+    ]
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "torch.distributed.run",
+            "--standalone",
+            "--nproc_per_node=2",
+            str(ROOT / "train.py"),
+            "stage=prior",
+            *small,
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("checkpoint: ") == 1 and done.stdout.count("step 2: held-out loss") == 1
+    assert {path.name for path in tmp_path.iterdir()} <= {"run", "cache"}
+    checkpoints = list((tmp_path / "run").glob("prior-*.safetensors"))
+    assert len(checkpoints) == 1 and (tmp_path / "run" / "metrics.json").exists()
+    origin = load_prior(str(checkpoints[0]))[1]
+    assert origin["processes"] == 2 and origin["settings"]["batch"] == 4 and "stage=prior" in origin["command"]
+    lines = [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [1, 2] and {"real", "aor_step", "cfr_bg"} <= lines[0].keys()

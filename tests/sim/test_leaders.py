@@ -1,0 +1,101 @@
+"""Who leads whom: gaps between bumpers, who does not count, and the equilibrium of the car-following model."""
+
+import pytest
+import torch
+
+from e2rl.scene.route import project
+from e2rl.sim.leaders import FREE, SIDE_GAP, Ahead, idm_acceleration, leaders
+from tests.prior.small import arc
+
+LENGTH, WIDTH = 4.0, 2.0
+
+
+def lead(agents, vehicles=1, present=None, size=None):
+    """Leaders of the first `vehicles` of agents (x, y, heading, speed), all on the x axis as their route."""
+    agents = torch.tensor(agents, dtype=torch.float32)[None]
+    size = torch.tensor([LENGTH, WIDTH]).expand(1, agents.shape[1], 2) if size is None else size
+    present = torch.ones(agents.shape[:2], dtype=torch.bool) if present is None else present
+    points = arc(0.0, 0.0, 0.0, 0.0)[None, None].expand(1, vehicles, -1, -1)
+    s = agents[:, :vehicles, 0] + 20.0
+    box = torch.full((1, vehicles), WIDTH), torch.full((1, vehicles), LENGTH)
+    return tuple(value[0] for value in leaders(s, *box, points, agents, size, present))
+
+
+def test_the_gap_is_between_bumpers_of_the_nearest():
+    gap, speed, index = lead([(0, 0, 0, 9), (30, 0.3, 0, 6), (18, 0, 0, 7)])
+    assert gap.item() == pytest.approx(18 - LENGTH) and speed.item() == pytest.approx(7) and index.item() == 2
+
+
+def test_those_behind_beside_absent_or_identical_do_not_lead():
+    present = torch.tensor([[True, True, True, False]])
+    gap, _, _ = lead([(0, 0, 0, 9), (-5, 0, 0, 9), (12, 3.5, 0, 9), (12, 0, 0, 9)], present=present)
+    assert gap.item() == FREE
+
+
+def test_a_vehicle_across_the_lane_leads_with_its_side_and_stands_along_it():
+    gap, speed, _ = lead([(0, 0, 0, 9), (20, 2.0, torch.pi / 2, 5)])
+    assert gap.item() == pytest.approx(20 - LENGTH / 2 - WIDTH / 2, abs=1e-4)
+    assert speed.item() == pytest.approx(0, abs=1e-4)
+
+
+def test_everyone_of_a_queue_follows_the_next():
+    gap, _, index = lead([(0, 0, 0, 5), (10, 0, 0, 5), (20, 0, 0, 5)], vehicles=3)
+    assert index[:2].tolist() == [1, 2] and gap.tolist() == pytest.approx([6, 6, FREE])
+
+
+def test_equilibrium_gap_free_road_and_closing():
+    v, target = torch.tensor(10.0), torch.tensor(15.0)
+    settings = (1.5, 2.0, 1.2, 2.0)
+    free = 1 - (v / target) ** 4
+    equilibrium = (2.0 + 1.5 * v) / free.sqrt()
+    assert idm_acceleration(v, target, equilibrium, v, *settings).item() == pytest.approx(0, abs=1e-5)
+    assert idm_acceleration(torch.tensor(0.0), target, torch.tensor(1e6), v, *settings).item() == pytest.approx(1.2)
+    slower, faster = (idm_acceleration(v, target, equilibrium, v + dv, *settings) for dv in (-3, 3))
+    assert slower < 0 < faster, "closing in brakes, falling behind accelerates"
+
+
+def test_whoever_is_between_a_vehicle_and_its_route_is_ahead_too():
+    points = torch.stack([2.0 * torch.arange(60), torch.zeros(60)], -1).expand(1, 2, 60, 2)
+    agents = torch.tensor([[[20.0, 3.5, 0.0, 10.0], [40.0, 3.5, 0.0, 4.0]]])
+    size, present = torch.tensor([4.0, 2.0]).expand(1, 2, 2), torch.ones(1, 2, dtype=torch.bool)
+    s, width, length = agents[..., 0], size[..., 1], size[..., 0]
+    on_route = leaders(s, width, length, points, agents, size, present)
+    changing = leaders(s, width, length, points, agents, size, present, agents[..., 1])
+    assert on_route[0][0, 0] == FREE
+    assert torch.isclose(changing[0][0, 0], torch.tensor(16.0)) and changing[1][0, 0] == 4.0
+
+
+def all_pairs(s, width, length, points, agents, size, present, d):
+    """The definition, with every agent projected onto every route."""
+    at, offset, heading = project(agents[:, None, :, :2], points)
+    turn = agents[:, None, :, 2] - heading
+    cos, sin = turn.cos(), turn.sin()
+    side = (size[:, None, :, 0] * sin.abs() + size[:, None, :, 1] * cos.abs()) / 2
+    along = (size[:, None, :, 0] * cos.abs() + size[:, None, :, 1] * sin.abs()) / 2
+    aside = offset - torch.minimum(torch.maximum(offset, d[..., None].clamp(max=0)), d[..., None].clamp(min=0))
+    leads = (aside.abs() < width[..., None] / 2 + side + SIDE_GAP) & (at > s[..., None]) & present[:, None]
+    leads &= ~torch.eye(*leads.shape[1:], dtype=torch.bool) & present[:, : s.shape[1], None]
+    gap = torch.where(leads, at - s[..., None] - length[..., None] / 2 - along, FREE).min(-1)
+    return gap.values.clamp(max=FREE), (agents[:, None, :, 3] * cos).gather(-1, gap.indices[..., None])[..., 0]
+
+
+def test_pruned_pairs_are_those_that_could_not_lead():
+    generator = torch.Generator().manual_seed(0)
+    batch, vehicles, count = 40, 6, 10
+    draw = lambda *shape: torch.rand(shape, generator=generator)  # noqa: E731
+    bend = 0.04 * (draw(batch, vehicles, 1) - 0.5) * torch.arange(150) + 6.28 * draw(batch, vehicles, 1)
+    step = 2.0 * torch.stack([bend.cos(), bend.sin()], -1)
+    points = step.cumsum(2) + 60 * (draw(batch, vehicles, 1, 2) - 0.5)
+    # Around points of the first route, so that many are near one.
+    place = points[:, 0, torch.randint(0, 150, (count,), generator=generator)] + 8 * (draw(batch, count, 2) - 0.5)
+    agents = torch.cat([place, 6.28 * draw(batch, count, 1), 10 * draw(batch, count, 1)], -1)
+    size = torch.tensor([4.5, 2.0]).expand(batch, count, 2)
+    present, d = draw(batch, count) < 0.8, 6 * (draw(batch, vehicles) - 0.5)
+    width, length, s = size[:, :vehicles, 1], size[:, :vehicles, 0], 60 * draw(batch, vehicles)
+    expected = all_pairs(s, width, length, points, agents, size, present, d)
+    found = Ahead(s, width, length, points, agents, size, present, d.abs()).nearest(d)
+    led = expected[0] < FREE
+    assert led.sum() > 40
+    torch.testing.assert_close(found[0], expected[0], rtol=0, atol=1e-3)
+    torch.testing.assert_close(found[1][led], expected[1][led], rtol=0, atol=1e-3)
+    assert torch.equal(found[1][~led], agents[:, :vehicles, 3][~led]), "nobody ahead moves as the vehicle does"
