@@ -12,8 +12,9 @@ from omegaconf import DictConfig
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from e2rl.errors import InputError, settings_of, stop  # noqa: E402
+from e2rl.errors import InputError, stop
 from e2rl.scene.source import load_scenes  # noqa: E402
+from e2rl.settings import settings_of  # noqa: E402
 from e2rl.synthesizer.agreement import agreement_table, measure_agreement  # noqa: E402
 from e2rl.synthesizer.feasibility import FeasibilitySettings  # noqa: E402
 from e2rl.synthesizer.reasoner import LanguageReasoner, ReasonerSettings  # noqa: E402

@@ -10,13 +10,14 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from e2rl.ego.base import Ego
-from e2rl.errors import InputError, settings_of
+from e2rl.errors import InputError
 from e2rl.evaluation.processes import cores
 from e2rl.evaluation.protocol import Method
 from e2rl.metrics.catalogue import CLOSED_LOOP
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.checkpoint import load_prior
 from e2rl.prior.prior import Prior, SamplerSettings
+from e2rl.settings import settings_of
 from e2rl.sim.env import SimSettings
 from e2rl.synthesizer.anchoring import AnchorSettings
 from e2rl.synthesizer.control import ControlSettings

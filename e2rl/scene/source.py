@@ -19,11 +19,12 @@ from safetensors.torch import save_file
 from tensordict import TensorDict
 from tqdm import tqdm
 
-from e2rl.errors import InputError, settings_of
+from e2rl.errors import InputError
 from e2rl.scene import bundled, procedural, scenarionet
 from e2rl.scene.build import BuildSettings, build_scene, ego_overlaps
 from e2rl.scene.recording import Recording
 from e2rl.scene.scene import SceneSet, stack, validate
+from e2rl.settings import settings_of
 
 OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are dropped
 VERSION = 3  # of the scene builder: raise it when the same recording would make another scene

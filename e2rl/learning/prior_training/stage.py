@@ -8,7 +8,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from e2rl.ego.replay import ReplayEgo
-from e2rl.errors import InputError, settings_of
+from e2rl.errors import InputError
 from e2rl.evaluation.files import command_line, git_commit
 from e2rl.evaluation.protocol import Method, run_protocol
 from e2rl.learning.prior_training.distributed import joined
@@ -19,6 +19,7 @@ from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.prior import Prior, SamplerSettings
 from e2rl.scene.scene import SceneSet
 from e2rl.scene.source import load_scenes
+from e2rl.settings import settings_of
 from e2rl.sim.env import SimSettings
 from e2rl.synthesizer.synthesizer import Synthesizer
 

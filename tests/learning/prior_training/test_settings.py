@@ -2,8 +2,9 @@
 
 import pytest
 
-from e2rl.errors import InputError, settings_of
+from e2rl.errors import InputError
 from e2rl.learning.prior_training.settings import TrainingSettings
+from e2rl.settings import settings_of
 
 
 @pytest.mark.parametrize(

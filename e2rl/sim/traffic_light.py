@@ -1,0 +1,32 @@
+"""Traffic light states: the one look-up for planners, observations, features of the prior and metrics."""
+
+import torch
+from torch import Tensor
+
+from e2rl.scene.recording import LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW
+
+
+def light_state_at(light_state: Tensor, light: Tensor, step: Tensor) -> Tensor:
+    """States [B, ...] of the lights with indices light [B, ...] at steps [B]; LIGHT_UNKNOWN where the index is -1.
+
+    light_state [B, T + 1, S]: recorded states. Beyond the recording its last state holds.
+    """
+    if not light_state.shape[-1]:
+        return torch.full_like(light, LIGHT_UNKNOWN)
+    row = torch.arange(len(step), device=step.device)
+    now = light_state[row, step.clamp(0, light_state.shape[1] - 1)]
+    state = now.gather(1, light.clamp(min=0).flatten(1)).view(light.shape)
+    return state.masked_fill(light < 0, LIGHT_UNKNOWN)
+
+
+def stop_line_distance(
+    state: Tensor, ahead: Tensor, speed: Tensor, red_braking: float, yellow_braking: float
+) -> Tensor:
+    """Metres [...] to the next stop line to halt at, inf for none; state, ahead [..., K]: of K lights.
+
+    A red light binds where braking at less than red_braking m/s^2 from speed [...] m/s halts before its line, a yellow
+    one at less than yellow_braking: a vehicle that cannot halt goes on rather than stand in the junction.
+    """
+    needed = speed[..., None] ** 2 / (2 * ahead.clamp(min=1e-3))
+    red, yellow = (state == LIGHT_RED) & (needed < red_braking), (state == LIGHT_YELLOW) & (needed < yellow_braking)
+    return ahead.masked_fill(~((ahead > 0) & (red | yellow)), torch.inf).amin(-1)
