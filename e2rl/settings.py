@@ -1,4 +1,4 @@
-"""Typed settings: a dataclass filled from a group of the configuration, with one clear message for what does not fit."""
+"""Typed settings: dataclasses filled from groups of the configuration; what does not fit has one clear message."""
 
 from collections.abc import Collection, Mapping
 from typing import TypeVar

@@ -35,7 +35,7 @@ def test_one_line_names_the_key(name, value, expected):
 
 
 def test_unknown_keys_are_named():
-    with pytest.raises(InputError, match="prior.training: .*depth"):
+    with pytest.raises(InputError, match="prior.training.depth"):
         settings_of(TrainingSettings, {"depth": 3}, "prior.training")
 
 
