@@ -7,27 +7,24 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from e2rl.build import build_ego, build_prior, build_traffic, caption, resolved, set_up
 from e2rl.errors import InputError, stop
-from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_synthesizer, caption, resolved, set_up
-from e2rl.learning.before_after import BeforeAfter
-from e2rl.learning.build import build_evolution, build_logger, run_imitation
+from e2rl.learning.build import build_evolution, build_logger, build_measure, run_imitation
 from e2rl.learning.checkpoint import load_checkpoint, save_checkpoint
 from e2rl.learning.prior_training.distributed import follower_overrides, started_by_torchrun
 from e2rl.learning.prior_training.stage import run_prior_stage
 from e2rl.learning.resume import resumed
 from e2rl.report.tables import metric_tables, print_tables, save_tables
 from e2rl.scene.source import load_scenes
-from e2rl.traffic.rollout import synthesize_traffic
 
 
 def evolve(config: DictConfig, folder: Path) -> None:
     """Rounds of Algorithm 1: synthesize D' against the current ego, improve the ego on it, move the curriculum."""
     scenes = load_scenes(config.data, config.num_scenes, split="train")
     prior, origin = build_prior(config, config.device)
-    synthesizer, ego, sim = build_synthesizer(config, prior), build_ego(config), build_sim(config)
-    synthesize = synthesize_traffic(scenes, synthesizer, sim, config.batch, config.device)
-    run, logger = build_evolution(config, scenes, sim, ego, synthesize), build_logger(config, folder)
-    measure = BeforeAfter(config, HydraConfig.get().runtime.choices["ego"], synthesizer, sim, folder)
+    traffic, ego = build_traffic(config.synthesizer, prior), build_ego(config)
+    run, logger = build_evolution(config, scenes, ego, traffic), build_logger(config, folder)
+    measure = build_measure(config, ego, HydraConfig.get().runtime.choices["ego"], traffic, prior, folder)
     done = load_checkpoint(config.resume, run) if config.resume else 0
     if done == 0:
         measure("before", run.ego)
@@ -38,14 +35,13 @@ def evolve(config: DictConfig, folder: Path) -> None:
         save_checkpoint(folder, run, resolved(config), config.keep_last)
         print(
             f"round {number + 1}/{config.rounds}: eta {metrics['curriculum/eta']:.2f}, adversarial collisions "
-            f"{metrics['synthesizer/contact']:.0%} of {metrics['synthesizer/scenes']:.0f} scenes "
+            f"{metrics.get('synthesizer/contact', float('nan')):.0%} in {metrics['synthesizer/scenes']:.0f} scenes "
             f"({metrics['synthesizer/left_out']:.0f} left out: no way found to avoid them), "
             f"{metrics['time/synthesize']:.0f} s synthesis, {metrics['time/improve']:.0f} s learning",
             flush=True,
         )
     logger.close()
-    rows = measure("after", run.ego)
-    tables = metric_tables(rows, caption(config, origin))
+    tables = metric_tables(measure("after", run.ego), caption(config, origin))
     save_tables(folder / "tables.md", tables)
     print_tables(tables)
     print(f"\nwritten to {folder}; {run.improve.outcome(folder)}")
@@ -64,7 +60,7 @@ def train_prior(config: DictConfig, folder: Path) -> None:
 def imitate(config: DictConfig, folder: Path) -> None:
     """Warm-start the actor from the recorded egos."""
     scenes = load_scenes(config.data, config.num_scenes, split="train")
-    losses = run_imitation(config, scenes, build_sim(config), build_ego(config), folder, build_logger(config, folder))
+    losses = run_imitation(config, scenes, build_ego(config), folder, build_logger(config, folder))
     print(", ".join(f"{name} {value:.4f}" for name, value in losses.items()))
     print(f"start evolution rounds from it with ego.checkpoint={folder}")
 
@@ -73,22 +69,25 @@ STAGES = {"evolution": evolve, "prior": train_prior, "imitation": imitate}
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
-def main(config: DictConfig) -> None:
+def run(config: DictConfig) -> None:
+    """One stage of training, as configured."""
     try:
         config, folder = resumed(config, Path(HydraConfig.get().runtime.output_dir))
         if config.stage not in STAGES:
             raise InputError(f"stage={config.stage}: choose one of {', '.join(STAGES)}")
         if started_by_torchrun() and config.stage != "prior":
-            raise InputError(
-                f"torchrun: stage={config.stage} runs in one process; start it with python, or several "
-                "processes with stage=prior"
-            )
+            raise InputError(f"torchrun: stage={config.stage} runs in one process, started with python")
         set_up(config)
         STAGES[config.stage](config, folder)
     except InputError as error:
         stop(error)
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """The command, in this process or in one of torchrun's."""
     sys.argv += follower_overrides()
+    run()
+
+
+if __name__ == "__main__":
     main()

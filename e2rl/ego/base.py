@@ -1,4 +1,4 @@
-"""One interface for whoever drives: planners, learned actors and outside code, in collection and evaluation alike.
+"""One interface for all egos: planners, learned actors and outside code, in collection and evaluation alike.
 
 An outside planner plugs in by Hydra's `_target_`, in a YAML file of its own in conf/ego that lists its arguments. This
 one is whole: it holds the ego's speed along its mission for the coming five seconds.
@@ -18,8 +18,8 @@ one is whole: it holds the ego's speed along its mission for the coming five sec
             speed = world.states[:, 0, 3:] * self.gain                # [B, 1] m/s
             return path.drive(speed.expand(-1, PLAN_STEPS + 1))       # [B, 50, 4] x, y, heading, speed
 
-`plan` is all that it must have: `act` tracks the plan. An ego that maps observations to actions overrides `act` and
-plans by whatever it expects of itself.
+`plan` is all that it must have: `act` tracks the plan. An ego that maps observations to actions overrides `act`, and
+plans what it expects itself to do.
 """
 
 from abc import ABC, abstractmethod
@@ -40,57 +40,33 @@ CATCH_UP = 1.0  # 1/s: rate at which an error along the plan is made good
 
 
 class Ego(ABC):
-    """Drives the ego of B scenes at once. `plan` is a pure function of the World; `act` follows it."""
+    """Drives the ego of B scenes at once. `plan` is a pure function of the World; `act` follows it.
+
+    replays_log: the environment moves this ego along its recording (`SimSettings.replay_ego`) and ignores its actions.
+    """
+
+    replays_log = False
 
     def __init__(self, replan_every: int = 5) -> None:
         """replan_every: steps between two plans (5 is 2 Hz, 1 every step), at most PLAN_STEPS."""
         if not 1 <= replan_every <= PLAN_STEPS:
             raise InputError(f"ego.replan_every={replan_every}: choose 1 to {PLAN_STEPS} steps")
         self.replan_every = int(replan_every)
-        self._planned: tuple[Tensor, Tensor] | None = None  # start of each plan and its states; step of planning
-        self._announced: tuple[World, Tensor] | None = None  # the moment and the plan
 
-    def reset(self, world: World) -> None:
-        """Called after every reset; the scenes whose world.step is 0 begin anew. An ego with memory clears it here."""
-        if self._planned is not None and len(self._planned[1]) != len(world.step):
-            self._planned = None
+    def reset(self, world: World) -> None:  # noqa: B027 - most egos have no memory
+        """Called before the first plan of new episodes, those with world.step 0. An ego with memory clears it here."""
 
     @abstractmethod
     def plan(self, world: World) -> Tensor:
         """Planned states [B, PLAN_STEPS, 4] of the egos at steps 1.. from now, 0.1 s apart, without side effects."""
 
-    def announce(self, world: World) -> Tensor:
-        """`plan`, for whoever plans against the ego; planning anew at the same moment, `act` drives it."""
-        self._announced = world, self.plan(world)
-        return self._announced[1]
+    def act(self, world: World, observation: Tensor, plan: Tensor) -> Tensor:
+        """Action [B, 2] (acceleration [m/s^2], yaw rate [rad/s]) for the next step; by default it tracks the plan.
 
-    def _fresh(self, world: World) -> Tensor:
-        """The announced plan if it was made at this moment, else a new one."""
-        if self._announced is not None:
-            then, plan = self._announced
-            if all(torch.equal(getattr(then, name), getattr(world, name)) for name in ("step", "states", "valid")):
-                return plan
-        return self.plan(world)
-
-    def act(self, world: World, observation: Tensor | None = None) -> Tensor:
-        """Action [B, 2] (acceleration, yaw rate) for the next step.
-
-        observation [B, D]: the environment's, for egos that want it (planners read the world).
+        observation [B, D]: the environment's; plan [B, 1 + PLAN_STEPS, 4]: states now and at the coming steps, of the
+        last plan made.
         """
-        state, row = world.states[:, 0], torch.arange(len(world.step), device=world.step.device)
-        if self._planned is None or self.replan_every == 1:
-            self._planned = (torch.cat([state[:, None], self._fresh(world)], 1), world.step.clone())
-        else:
-            states, since = self._planned
-            age = world.step - since
-            due = (age >= self.replan_every) | (age < 0) | (world.step == 0)
-            if due.any():
-                fresh = torch.cat([state[:, None], self._fresh(world)], 1)
-                states = torch.where(due[:, None, None], fresh, states)
-                self._planned = (states, torch.where(due, world.step, since))
-        states, since = self._planned
-        age = world.step - since
-        return track(state, states[row, age], states[row, age + 1])
+        return track(world.states[:, 0], plan[:, 0], plan[:, 1])
 
 
 def return_length(speed: Tensor) -> Tensor:
@@ -112,26 +88,55 @@ def track(state: Tensor, planned: Tensor, following: Tensor) -> Tensor:
     return dynamics.inverse(torch.stack([state, aimed], -2))[..., 0, :]
 
 
-class EgoPolicy(TensorDictModuleBase):
-    """An Ego as a TorchRL policy of one environment: reads its world (and "observation"), writes "action"."""
+class EgoPlanner(TensorDictModuleBase):
+    """Writes what an Ego plans to do in a DrivingEnv with `agents=True`: ("ego", "plan") [B, PLAN_STEPS, 4].
 
-    in_keys = ["observation"]
-    out_keys = ["action"]
+    Plans every `replan_every` steps; in between, the key holds the rest of the last plan, its last state held. Reads
+    timestep, agents and, where there is one, the traffic's plan.
+    """
+
+    in_keys = ["timestep", "agents"]
+    out_keys = [("ego", "plan")]
 
     def __init__(self, ego: Ego, env) -> None:
-        """env: a DrivingEnv, or a TransformedEnv around one."""
+        """env: the DrivingEnv (or a TransformedEnv around it) whose running scenes the ego drives in."""
         super().__init__()
-        self.ego = ego
-        self._env = (getattr(env, "base_env", env),)  # in a tuple: the policy must not own the environment as a module
-        self._resets = -1
+        base = getattr(env, "base_env", env)
+        self.ego, self.scene, self.bounds = ego, base.scene, base.action_spec.space
+        self._plan: Tensor | None = None  # [B, 1 + PLAN_STEPS, 4] as planned, the state at the time of planning first
+        self._planned_at: Tensor | None = None  # [B] step of planning
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        env = self._env[0]
-        world = env.world()
-        if env.resets != self._resets:
+        tensordict["ego", "plan"] = self.plan(World.of(tensordict, self.scene))[:, 1:]
+        return tensordict
+
+    def plan(self, world: World) -> Tensor:
+        """States [B, 1 + PLAN_STEPS, 4] now and at the coming steps of the last plan, made anew where due."""
+        if bool((world.step == 0).any()):
             self.ego.reset(world)
-            self._resets = env.resets
-        spec = env.action_spec
-        action = self.ego.act(world, tensordict.get("observation", None))
-        tensordict["action"] = action.clamp(spec.space.low, spec.space.high)
+        if self._plan is None or self._planned_at is None:
+            self._plan = torch.zeros(len(world.step), 1 + PLAN_STEPS, 4, device=world.states.device)
+            self._planned_at = torch.full_like(world.step, -PLAN_STEPS)
+        age = world.step - self._planned_at
+        due = (age >= self.ego.replan_every) | (age < 0) | (world.step == 0)
+        if bool(due.any()):
+            fresh = torch.cat([world.states[:, :1], self.ego.plan(world)], 1)
+            self._plan = torch.where(due[:, None, None], fresh, self._plan)
+            self._planned_at = torch.where(due, world.step, self._planned_at)
+        ahead = (world.step - self._planned_at)[:, None] + torch.arange(1 + PLAN_STEPS, device=world.step.device)
+        return self._plan.gather(1, ahead.clamp(max=PLAN_STEPS)[..., None].expand(-1, -1, 4))
+
+
+class EgoPolicy(EgoPlanner):
+    """An Ego as a TorchRL policy: writes its plan and the "action" [B, 2], within the action's bounds."""
+
+    in_keys = ["observation", "timestep", "agents"]
+    out_keys = ["action", ("ego", "plan")]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        world = World.of(tensordict, self.scene)
+        plan = self.plan(world)
+        action = self.ego.act(world, tensordict["observation"], plan)
+        tensordict["action"] = action.clamp(self.bounds.low, self.bounds.high)
+        tensordict["ego", "plan"] = plan[:, 1:]
         return tensordict

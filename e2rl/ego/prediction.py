@@ -35,7 +35,7 @@ def predict(
     degrees), straight on where it is on none; other agents go straight on (left out without see_vrus). Each is
     predicted at each speed factor times its speed, approached at `acceleration` m/s^2.
     """
-    states, vehicles = world.states, world.route.shape[1]
+    states, vehicles = world.states, world.scene["route_log"].shape[1]
     near = (states[..., :2] - states[:, :1, :2]).norm(dim=-1) < reach
     seen = world.valid & near
     seen[:, 0] = False

@@ -14,6 +14,8 @@ class ReplayEgo(Ego):
     After the recording's end the last speed and heading are held.
     """
 
+    replays_log = True
+
     def __init__(self, replan_every: int = 1) -> None:
         super().__init__(replan_every)
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from e2rl.errors import InputError
@@ -10,61 +11,40 @@ from e2rl.evaluation.files import ROLLOUTS, rollout_name
 from e2rl.evaluation.protocol import SEEDS_APART, Method
 from e2rl.evaluation.rollout_reader import read_rollout
 from e2rl.scene.scene import SceneSet
-from e2rl.synthesizer.episode import take_rows
 from e2rl.synthesizer.selection import Selection
 from e2rl.synthesizer.skeleton import chain_depth
-from e2rl.synthesizer.synthesizer import Synthesizer
+from e2rl.traffic.rows import take_rows
 
 
 @dataclass
 class LongestChain:
-    """Listens to a method's synthesizer and keeps its selection of the longest chain, then of the largest coalition,
-    then of the greatest risk between its members; of equals the first. `kept`: that selection, B = 1."""
+    """Listens to a method and keeps its selection of the longest chain, then of the largest coalition, then of the
+    greatest risk between its members; of equals the first. `kept`: that selection, B = 1."""
 
     method: Method
     kept: Selection | None = None
     rank: tuple[float, ...] = (0, 0, 0)
 
-    def __post_init__(self):
-        if not isinstance(self.method.synthesizer, Synthesizer) or self.method.eta <= 0:
-            raise InputError(
-                f"figure=skeleton: {self.method.name} at eta={self.method.eta:g} chooses no coalition; "
-                "name e2 first in methods, at an eta above 0"
-            )
-        self.method.synthesizer.on_selection = self
+    def __post_init__(self) -> None:
+        self.method.traffic.on_selection = self
 
     def __call__(self, selection: Selection) -> None:
-        ranks = zip(
-            *(
-                value.tolist()
-                for value in (
-                    chain_depth(selection.target).amax(1),
-                    selection.coalition.sum(1),
-                    link_risk(selection).amax(1),
-                )
-            ),
-            strict=True,
-        )
-        for row, rank in enumerate(ranks):
+        depth, size = chain_depth(selection.target).amax(1), selection.coalition.sum(1)
+        ranks = torch.stack([depth.double(), size.double(), link_risk(selection).amax(1).double()], 1)
+        for row, rank in enumerate(map(tuple, ranks.tolist())):
             if rank > self.rank:
-                self.kept, self.rank = take_rows(selection, [row]), rank
+                self.kept, self.rank = take_rows(selection, torch.tensor([row])), rank
 
     def rollout(self, scenes: SceneSet, ego_name: str, folder: Path) -> dict:
         """The rollout that the kept selection belongs to, from its file; InputError where nobody was chosen."""
         if self.kept is None:
             raise InputError(
-                "figure=skeleton: no vehicle was chosen in any scene; evaluate more scenes, or name one with scene="
+                f"figure=skeleton: {self.method.name} at eta={self.method.eta:g} chose no adversary in any scene; name "
+                "e2 first in methods, at an eta above 0, and evaluate more scenes, or name one with scene="
             )
         seed, scene = divmod(int(self.kept.seed), SEEDS_APART)
-        name = rollout_name(
-            {
-                "method": self.method.name,
-                "ego_policy": ego_name,
-                "eta": self.method.eta,
-                "scene_id": scenes.scene_id[scene],
-                "seed": seed,
-            }
-        )
+        identity = {"method": self.method.name, "ego_policy": ego_name, "eta": self.method.eta}
+        name = rollout_name(identity | {"scene_id": scenes.scene_id[scene], "seed": seed})
         return read_rollout(Path(folder) / ROLLOUTS / name)
 
 

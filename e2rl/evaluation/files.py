@@ -13,6 +13,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -131,7 +132,7 @@ def write_rows(path: Path, rows: Sequence[dict]) -> None:
 
 def label_rows(rows: Iterable[dict], source: Source) -> list[dict]:
     """Rows with their source's columns."""
-    return [{**vars(source), **row} for row in rows]
+    return [vars(source) | row for row in rows]
 
 
 def cell(value: object) -> object:
@@ -190,6 +191,7 @@ def nans(value: object) -> object:
     return math.nan if value is None else value
 
 
+@cache
 def git_commit() -> str:
     """The package's commit, with '+changes' where tracked files differ from it; "" outside a git checkout."""
 

@@ -1,23 +1,19 @@
-"""Open-loop accuracy of traffic models: plans from causal start states, the ego unknown, against the log."""
+"""Open-loop accuracy of traffic methods: plans from causal start states, the ego unknown, against the log."""
+
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.evaluation.files import command_line, git_commit
-from e2rl.evaluation.protocol import Method
+from e2rl.evaluation.protocol import SEEDS_APART, Method
+from e2rl.evaluation.summary import metric_row
 from e2rl.metrics.catalogue import OPEN_LOOP_STAGE
 from e2rl.metrics.displacement import scene_displacements
 from e2rl.metrics.statistics import bootstrap_draws, cluster_index, interval, resampled_means
-from e2rl.prior.lane_relative import HORIZON, SIZE
-from e2rl.prior.spread import main_direction, spread_noise, stratified
 from e2rl.scene.recording import VEHICLE
 from e2rl.scene.scene import SceneSet
-from e2rl.sim.world import World
-from e2rl.synthesizer.episode import noise_of
-from e2rl.synthesizer.synthesizer import Synthesizer
-from e2rl.traffic.constant_velocity import straight_on
-from e2rl.traffic.traffic import Baseline
+from e2rl.traffic.traffic import keep_velocity
 
 HORIZONS = (3.0, 5.0)  # s
 EGO = "unknown"  # of the rows: nobody is told the ego's plan
@@ -25,80 +21,31 @@ BATCH = 32  # scenes planned at once
 
 
 @torch.no_grad()
-def open_loop_rows(scenes: SceneSet, methods: list[Method], samples: int, device: str = "cpu") -> list[dict]:
-    """Rows of metrics.json, stage `open loop`, of every method that predicts: minADE, mean and joint ADE over `samples`
-    and their ratios to constant velocity's ADE on the same vehicles, with intervals by place."""
+def open_loop_rows(scenes: SceneSet, methods: Sequence[Method], samples: int, device: str = "cpu") -> list[dict]:
+    """Rows of metrics.json, stage `open loop`, of every uncontrolled method that predicts: minADE, mean and joint ADE
+    over `samples` and their ratios to constant velocity's ADE on the same vehicles, with intervals by place."""
     rows = []
     for method in methods:
-        baseline = isinstance(method.synthesizer, Baseline)
-        if method.eta > 0 or (baseline and not method.synthesizer.predicts):
+        if method.eta > 0 or not method.traffic.predicts:
             continue
-        count = 1 if baseline else samples
+        count = samples if method.traffic.stochastic else 1
         parts = []
         for index in torch.arange(len(scenes)).split(BATCH):
             scene = scenes.batch(index).to(device)
-            seed = index.to(device) + 1_000_003 * torch.arange(count, device=device)[:, None]
-            parts.append(_displacements(scene, sample_plans(method.synthesizer, scene, seed)))
+            seed = index.to(device) + SEEDS_APART * torch.arange(count, device=device)[:, None]
+            parts.append(_displacements(scene, method.traffic.open_loop_plans(scene, seed)))
         columns = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-        rows.append(
-            {
-                "dataset": scenes.dataset,
-                "split": scenes.split,
-                "method": method.name,
-                "ego": EGO,
-                "eta": method.eta,
-                "n_scenes": len(scenes),
-                "n_seeds": count,
-                "n_rollouts": len(scenes) * count,
-                "git": git_commit(),
-                "command": command_line(),
-                "stage": OPEN_LOOP_STAGE,
-                "metrics": _summary(columns, scenes),
-                "paired": {},
-            }
-        )
+        key = (scenes.dataset, scenes.split, method.name, EGO, method.eta)
+        metrics = _summary(columns, scenes)
+        rows.append(metric_row(key, len(scenes), count, len(scenes) * count, metrics, stage=OPEN_LOOP_STAGE))
     return rows
-
-
-def sample_plans(synthesizer: Synthesizer | Baseline, scene: TensorDictBase, seed: Tensor) -> Tensor:
-    """Joint plans [B, S, V, HORIZON, 4] of scenes [B] from their start states; seed [S, B] int64.
-
-    The prior's samples are stratified (prior/spread.py) and stand as drawn: the acceleration bounds belong to the
-    executed half second, and the present ones held over 5 s would make them a tenth less accurate.
-    """
-    if isinstance(synthesizer, Baseline):
-        return torch.stack([_straight_plan(synthesizer, scene, one) for one in seed], 1)
-    prior, (count, batch), vehicles = synthesizer.prior, seed.shape, scene["route_log"].shape[1]
-    draw = lambda number, *shape, uniform=False: noise_of(  # noqa: E731
-        seed.flatten(), torch.full((count * batch,), number), shape, uniform
-    ).unflatten(0, (count, batch))
-    order, place = draw(0, 2, vehicles, uniform=True).unbind(2), draw(2, 2, vehicles, uniform=True)[0].unbind(1)
-    noise = draw(1, prior.sampler.steps, vehicles, SIZE).transpose(1, 2)
-    noise = spread_noise(noise, main_direction(prior.schedule, prior.sampler, noise.device), order[1], place[1])
-    plans = []
-    for uniform, one in zip(stratified(order[0], place[0]), noise, strict=True):
-        routed, state = prior.start(scene, prior.choose_routes(scene, uniform))
-        zero = torch.zeros(batch, dtype=torch.long, device=seed.device)
-        context = prior.encode(routed, state, scene["start"], scene["valid"], zero, None)
-        plans.append(prior.decode(prior.sample(context, one).x0, context).states())
-    return torch.stack(plans, 1)
-
-
-def _straight_plan(synthesizer: Baseline, scene: TensorDictBase, seed: Tensor) -> Tensor:
-    """The plan [B, V, HORIZON, 4] of a baseline; seed [B]."""
-    zero = torch.zeros_like(seed)
-    episode = synthesizer.begin(scene, seed, zero.float())
-    world = World(scene, zero, scene["start"], scene["valid"], scene["start_accel"], episode.routed.route)
-    unknown = scene["start"][:, :1].expand(-1, HORIZON, -1)  # baselines do not look at the ego's plan
-    return synthesizer.replan(episode, world, unknown)[1].states()
 
 
 def _displacements(scene: TensorDictBase, plans: Tensor) -> dict[str, Tensor]:
     """The columns of `scene_displacements` of simulated vehicles for plans [B, S, V, HORIZON, 4]."""
     vehicles = plans.shape[2]
     here = scene["valid"][:, :vehicles] & (scene["agent_type"][:, :vehicles] == VEHICLE)
-    times = torch.arange(1, HORIZON + 1, device=plans.device)[None]
-    straight = straight_on(scene["start"][:, :vehicles], times)
+    straight = keep_velocity(scene["start"][:, :vehicles])
     logged, valid = scene["logged"][:, :, :vehicles], scene["logged_valid"][:, :, :vehicles]
     columns = scene_displacements(plans, straight, logged, valid, here, HORIZONS)
     return {name: value.cpu().double() for name, value in columns.items()}

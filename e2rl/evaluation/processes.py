@@ -21,7 +21,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def spread(
+def in_processes(
     function: Callable[[Job], Result], jobs: Sequence[Job], processes: int, cost: Callable[[Job], float]
 ) -> Iterator[Result]:
     """function(job) of each job, in their order, by so many forked processes of one thread each; the dearest begin

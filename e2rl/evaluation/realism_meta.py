@@ -3,14 +3,15 @@
 Histograms are sums over rollouts, so batches of rollouts are counted as they come and memory stays flat.
 """
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
-from e2rl.ego.base import Ego
-from e2rl.evaluation.files import command_line, git_commit
-from e2rl.evaluation.protocol import Method, roll_out_part
+from e2rl.evaluation.protocol import Method, Setup
+from e2rl.evaluation.summary import metric_row
 from e2rl.metrics.catalogue import META_STAGE
 from e2rl.metrics.meta_features import track_features
 from e2rl.metrics.meta_metric import (
@@ -29,9 +30,6 @@ from e2rl.metrics.statistics import LEVELS, bootstrap_draws, cluster_index, inte
 from e2rl.prior.routed import take_route
 from e2rl.scene.recording import DT, VEHICLE
 from e2rl.scene.scene import SceneSet
-from e2rl.sim.env import SimSettings
-from e2rl.traffic.replay import Replay
-from e2rl.traffic.traffic import Baseline
 
 TRACKS = 512  # vehicles of rollouts looked at at once: bounds the memory of the pairwise features
 SPLITS = 200  # of the logs into halves
@@ -103,57 +101,29 @@ def road_of(scene: TensorDictBase, route: Tensor) -> dict[str, Tensor]:
     }
 
 
-def meta_rows(
-    scenes: SceneSet,
-    methods: list[Method],
-    ego: Ego,
-    ego_name: str,
-    sim: SimSettings,
-    rollouts: int,
-    batch: int = 64,
-    device: str = "cpu",
-) -> list[dict]:
+def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int) -> list[dict]:
     """Rows of metrics.json, stage `meta-metric`: every feature's likelihood and their weighted sum over `rollouts`
-    rollouts of each scene, with intervals by place. The row of the log also has its split-half `real`."""
-    tallies = [Tally(scenes.scenes) for _ in methods]
-    tasks = [
-        [
-            (scene, seed)
-            for seed in range(1 if isinstance(method.synthesizer, Baseline) else rollouts)
-            for scene in range(len(scenes))
-        ]
-        for method in methods
-    ]
-    with tqdm(total=sum(map(len, tasks)), desc="meta-metric", unit="rollout") as bar:
-        for method, tally, todo in zip(methods, tallies, tasks, strict=True):
-            weight = rollouts * len(scenes) // len(todo)
-            for begin in range(0, len(todo), batch):
-                part = todo[begin : begin + batch]
-                found = roll_out_part(scenes, part, method, ego, sim, device)
-                tally.add(torch.tensor([scene for scene, _ in part]), found, weight)
+    rollouts of each scene, with intervals by place. The row of the log also has its split-half `real`.
+
+    One rollout of a deterministic method stands for all.
+    """
+    scenes, rows = setup.scenes, []
+    seeds = [rollouts if method.traffic.stochastic else 1 for method in methods]
+    with tqdm(total=sum(seeds) * len(scenes), desc="meta-metric", unit="rollout") as bar:
+        for method, count in zip(methods, seeds, strict=True):
+            tally, tasks = (
+                Tally(scenes.scenes),
+                [(scene, seed) for seed in range(count) for scene in range(len(scenes))],
+            )
+            for begin in range(0, len(tasks), setup.batch):
+                part = tasks[begin : begin + setup.batch]
+                tally.add(torch.tensor([scene for scene, _ in part]), setup.roll_out(method, part), rollouts // count)
                 bar.update(len(part))
-    rows = []
-    for method, tally in zip(methods, tallies, strict=True):
-        metrics = summarise_meta(tally.likelihoods(rollouts), scenes)
-        if isinstance(method.synthesizer, Replay):
-            metrics["real_split_half"] = log_split_half(scenes)
-        rows.append(
-            {
-                "dataset": scenes.dataset,
-                "split": scenes.split,
-                "method": method.name,
-                "ego": ego_name,
-                "eta": method.eta,
-                "n_scenes": len(scenes),
-                "n_seeds": rollouts,
-                "n_rollouts": rollouts * len(scenes),
-                "git": git_commit(),
-                "command": command_line(),
-                "stage": META_STAGE,
-                "metrics": metrics,
-                "paired": {},
-            }
-        )
+            metrics = summarise_meta(tally.likelihoods(rollouts), scenes)
+            if method.traffic.replays_log:
+                metrics["real_split_half"] = log_split_half(scenes)
+            key = (scenes.dataset, scenes.split, method.name, setup.ego_name, method.eta)
+            rows.append(metric_row(key, len(scenes), rollouts, rollouts * len(scenes), metrics, stage=META_STAGE))
     return rows
 
 

@@ -1,45 +1,49 @@
 """From a run's configuration to the parts of its evolution."""
 
+from functools import partial
 from pathlib import Path
 
-from hydra.utils import get_class, instantiate
-from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDictBase
+from omegaconf import DictConfig, OmegaConf, open_dict
 
+from e2rl.build import build_sim, built, load_choice, resolved
 from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError
-from e2rl.learning.curriculum import CurriculumScheduler
-from e2rl.learning.evolution import Evolution, Measure, Synthesize
-from e2rl.learning.imitation import imitate, recorded_pairs
-from e2rl.learning.improvement import PlannerImprovement, PolicyImprovement
+from e2rl.evaluation.protocol import Method, Setup
+from e2rl.learning.before_after import BeforeAfter
+from e2rl.learning.curriculum.scheduler import CurriculumScheduler
+from e2rl.learning.evolution import Evolution, RoundSettings, Synthesize
+from e2rl.learning.imitation import ImitationSettings, imitate, recorded_pairs
+from e2rl.learning.improvement import Improvement
 from e2rl.learning.logging import RunLogger
-from e2rl.learning.solvability import solvability
+from e2rl.learning.solvability import solvable
+from e2rl.prior.prior import Prior
 from e2rl.scene.scene import SceneSet
-from e2rl.sim.env import SimSettings
+from e2rl.scene.source import load_scenes
+from e2rl.settings import settings_of
+from e2rl.traffic.rollout import synthesize_traffic
+from e2rl.traffic.traffic import Traffic
 
 
 def build_evolution(
-    config: DictConfig,
-    scenes: SceneSet,
-    sim: SimSettings,
-    ego: Ego,
-    synthesize: Synthesize,
-    measure: Measure | None = None,
+    config: DictConfig, scenes: SceneSet, ego: Ego, traffic: Traffic, synthesize: Synthesize | None = None
 ) -> Evolution:
-    """An Evolution of `ego` by config.learner and config.curriculum over config.rounds rounds.
+    """An Evolution of `ego` against `traffic` by config.learner and config.curriculum over config.rounds rounds.
 
-    learner.kind=policy needs ego=actor, which is improved in place; kind=planner tunes the class config.ego names.
+    synthesize: makes D'; default: closed-loop rollouts with `traffic`.
     """
-    curriculum = CurriculumScheduler(len(scenes), config.rounds, instantiate(config.curriculum), config.seed)
-    if config.learner.kind == "policy":
-        improve = _policy(config, scenes, sim, ego)
-    elif config.learner.kind == "planner":
-        improve = _planner(config, scenes, sim)
-    else:
-        raise InputError(f"learner.kind={config.learner.kind}: choose policy or planner")
-    solvable = solvability(scenes, sim) if curriculum.settings.solvable_only else None
-    return Evolution(curriculum, improve, synthesize, instantiate(config.learner.round), config.seed, measure, solvable)
+    sim, seed = build_sim(config), config.seed
+    synthesize = synthesize or synthesize_traffic(scenes, traffic, sim, config.batch, config.device)
+    given = {"num_scenes": len(scenes), "rounds": config.rounds, "seed": seed}
+    curriculum = built(config.curriculum, "curriculum", CurriculumScheduler, **given)
+    settings = settings_of(RoundSettings, config.learner.round, "learner.round")
+    learner = OmegaConf.create({key: value for key, value in config.learner.items() if key != "round"})
+    parameters = {key: value for key, value in resolved(config.ego).items() if key != "_target_"}
+    live = traffic if settings.traffic == "live" else None
+    given = {"ego": ego, "parameters": parameters, "scenes": scenes, "sim": sim, "traffic": live, "seed": seed}
+    improve = built(learner, "learner", Improvement, device=config.device, **given)
+    keep = partial(solvable, scenes=scenes, sim=sim) if curriculum.solvable_only else None
+    return Evolution(curriculum, improve, synthesize, settings, seed, keep)
 
 
 def build_logger(config: DictConfig, folder: Path) -> RunLogger:
@@ -47,51 +51,32 @@ def build_logger(config: DictConfig, folder: Path) -> RunLogger:
     return RunLogger(config.logger.kind, folder, config.logger.project, config.logger.name)
 
 
+def build_measure(
+    config: DictConfig, ego: Ego, ego_name: str, traffic: Traffic, prior: Prior, folder: Path
+) -> BeforeAfter:
+    """The before/after table: nominal traffic and the run's adversary on the scenes of `config.measure`.
+
+    Sources with splits of their own are measured on their tune split; a path's scenes on `measure.path`, or, where
+    there is none, on the first of the training scenes (the row's split says which).
+    """
+    options, data = config.measure, config.data.copy()
+    if options.path:
+        with open_dict(data):
+            data.path, data.split = options.path, None
+    scenes = load_scenes(data, options.scenes, split="tune")
+    nominal = built(load_choice("synthesizer", "nominal"), "synthesizer", Traffic, prior=prior)
+    methods = [Method("nominal", nominal), Method(config.synthesizer.name, traffic, options.eta)]
+    setup = Setup(scenes, ego, ego_name, build_sim(config), config.batch, config.device)
+    return BeforeAfter(setup, methods, list(options.seeds), folder)
+
+
 def run_imitation(
-    config: DictConfig, scenes: SceneSet, sim: SimSettings, ego: Ego, folder: Path, logger: RunLogger | None = None
+    config: DictConfig, scenes: SceneSet, ego: Ego, folder: Path, logger: RunLogger | None = None
 ) -> dict[str, float]:
     """stage=imitation: clone the recorded egos of `scenes` into ego=actor, in place; writes folder/actor.safetensors
     and returns the losses of the epoch kept."""
-    settings = instantiate(config.learner.imitation) if "imitation" in config.learner else None
-    if settings is None or not isinstance(ego, ActorEgo):
+    if "imitation" not in config.learner or not isinstance(ego, ActorEgo):
         raise InputError("stage=imitation: it trains ego=actor with learner=ppo_bc; set both")
-    pairs = recorded_pairs(scenes, sim, settings)
+    settings = settings_of(ImitationSettings, {**config.learner.imitation, "seed": config.seed}, "learner.imitation")
+    pairs = recorded_pairs(scenes, build_sim(config), settings)
     return imitate(ego.network, pairs, settings, folder, None if logger is None else logger.log)
-
-
-def _policy(config: DictConfig, scenes: SceneSet, sim: SimSettings, ego: Ego) -> PolicyImprovement:
-    learner, expert = config.learner, None
-    if learner.expert.recorded and learner.ppo.cloning > 0:
-        expert = _pairs(recorded_pairs(scenes, sim, instantiate(learner.imitation)), config.device)
-    teacher = instantiate(learner.expert.teacher) if learner.ppo.cloning > 0 else None
-    return PolicyImprovement(
-        ego,
-        scenes,
-        sim,
-        instantiate(learner.ppo),
-        instantiate(learner.collect),
-        expert,
-        teacher,
-        config.seed,
-        config.device,
-    )
-
-
-def _pairs(pairs: TensorDictBase, device: str) -> TensorDictBase:
-    return pairs.select("observation", "action").to(device)
-
-
-def _planner(config: DictConfig, scenes: SceneSet, sim: SimSettings) -> PlannerImprovement:
-    present = OmegaConf.to_container(config.ego, resolve=True)
-    make_ego = get_class(present.pop("_target_"))
-    learner = config.learner
-    return PlannerImprovement(
-        make_ego,
-        present,
-        OmegaConf.to_container(learner.grid),
-        scenes,
-        sim,
-        instantiate(learner.tuning),
-        learner.batch,
-        config.device,
-    )

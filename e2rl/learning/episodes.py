@@ -1,4 +1,4 @@
-"""What the collected episodes came to, one row per episode."""
+"""What collected episodes came to, one row per episode."""
 
 from dataclasses import dataclass
 
@@ -6,16 +6,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+OUTCOMES = ("contact", "contact_vru", "off_road", "progress")
 OUTCOME_KEYS = (
-    "traffic_row",
+    ("traffic", "row"),
     "scene_index",
-    ("next", "timestep"),
-    ("next", "done"),
-    ("next", "reward"),
-    ("next", "metrics", "contact"),
-    ("next", "metrics", "contact_vru"),
-    ("next", "metrics", "off_road"),
-    ("next", "metrics", "progress"),
+    *(("next", name) for name in ("timestep", "done", "episode_reward")),
+    *(("next", "metrics", name) for name in OUTCOMES),
 )
 
 
@@ -44,13 +40,8 @@ class Episodes:
     def summary(self) -> dict[str, float]:
         """Means over all episodes and over those in adversarial and in nominal traffic; kinds without any are left
         out."""
-        values = {
-            "contact": self.contact.float(),
-            "off_road": self.off_road.float(),
-            "return": self.returns,
-            "progress": self.progress,
-            "acceleration": self.acceleration,
-        }
+        values = {"contact": self.contact.float(), "off_road": self.off_road.float(), "return": self.returns}
+        values |= {"progress": self.progress, "acceleration": self.acceleration}
         kinds = {"": torch.ones_like(self.adversarial), "_adversarial": self.adversarial, "_nominal": ~self.adversarial}
         result = {"episodes": float(len(self))}
         for suffix, rows in kinds.items():
@@ -61,28 +52,26 @@ class Episodes:
         return result
 
 
+def concatenated(parts: list[Episodes]) -> Episodes:
+    """All episodes of the parts, in order."""
+    return Episodes(*(torch.cat([getattr(part, name) for part in parts]) for name in Episodes.__dataclass_fields__))
+
+
 def finished_episodes(batches: list[TensorDictBase], adversarial: Tensor, horizon: int) -> Episodes:
     """Episodes of a round's batches [B, T_i] in order (OUTCOME_KEYS), all environments reset at the first frame.
 
-    Episodes that began less than `horizon` steps before the end of the data count for nothing: of these only the short
-    ones, the failures, are finished. adversarial [R]: of the pool's rows.
+    Episodes that began less than `horizon` steps before the end of the data are left out: of these only the short ones,
+    the failures, are finished. adversarial [R]: of the pool's rows.
     """
     data = torch.cat([batch.select(*OUTCOME_KEYS).to("cpu") for batch in batches], 1)
-    flat = {key: data[key][..., 0] for key in OUTCOME_KEYS}
-    steps = flat["next", "timestep"]
-    begin = torch.arange(data.shape[1]) - steps + 1
-    ended = flat["next", "done"] & (begin + horizon <= data.shape[1])
-    padded = torch.nn.functional.pad(flat["next", "reward"].double().cumsum(1), (1, 0))
-    total = padded[:, 1:] - padded.gather(1, begin.clamp(min=0))
-    contact = flat["next", "metrics", "contact"] | flat["next", "metrics", "contact_vru"]
-    row = flat["traffic_row"][ended]
+    after, metrics = data["next"], data["next", "metrics"]
+    begin = torch.arange(data.shape[1]) - after["timestep"][..., 0] + 1
+    ended = after["done"][..., 0] & (begin + horizon <= data.shape[1])
+    row, contact = data["traffic", "row"][ended][:, 0], metrics["contact"] | metrics["contact_vru"]
     return Episodes(
-        row=row,
-        scene_index=flat["scene_index"][ended],
-        adversarial=adversarial[row],
-        contact=contact[ended],
-        off_road=flat["next", "metrics", "off_road"][ended],
-        returns=total[ended].float(),
-        progress=flat["next", "metrics", "progress"][ended],
-        acceleration=torch.full((len(row),), torch.nan),
+        row,
+        data["scene_index"][ended][:, 0],
+        adversarial[row],
+        *(value[ended][:, 0] for value in (contact, metrics["off_road"], after["episode_reward"], metrics["progress"])),
+        torch.full((len(row),), torch.nan),
     )

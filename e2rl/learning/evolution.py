@@ -8,16 +8,16 @@ import torch
 from torch import Tensor
 
 from e2rl.ego.base import Ego
-from e2rl.errors import InputError
-from e2rl.learning.curriculum import CurriculumScheduler
+from e2rl.learning.curriculum.scheduler import CurriculumScheduler
 from e2rl.learning.episodes import Episodes
-from e2rl.learning.improvement import PlannerImprovement, PolicyImprovement
-from e2rl.learning.pool import TrafficPool
-from e2rl.learning.solvability import Solvable
+from e2rl.learning.improvement import Improvement
+from e2rl.settings import check_choice
+from e2rl.traffic.pool import TrafficPool
 
-NOMINAL = ("prior", "log", "none")
+NOMINAL, TRAFFIC = ("prior", "log", "none"), ("replay", "live")
+NOISES = 16  # rows with noise of their own that a scene has in live traffic
 Synthesize = Callable[[Ego, Tensor, float, int], Mapping[str, Tensor]]
-Measure = Callable[[Ego, int], Mapping[str, float]]
+Solvable = Callable[[Mapping[str, Tensor]], Tensor]
 
 
 @dataclass(frozen=True)
@@ -26,33 +26,43 @@ class RoundSettings:
 
     scenes: int = 64
     nominal: str = "prior"
+    traffic: str = "replay"
 
     def __post_init__(self) -> None:
-        if self.nominal not in NOMINAL:
-            raise InputError(f"learner.round.nominal={self.nominal}: choose one of {', '.join(NOMINAL)}")
+        check_choice("learner.round.nominal", self.nominal, NOMINAL)
+        check_choice("learner.round.traffic", self.traffic, TRAFFIC)
+
+
+@dataclass
+class Attack:
+    """What a round drives in: the pool, scenes [L] left out of it, and metrics; contact: the attacked ego's rate of
+    contacts, None where it is not known before the episodes are driven."""
+
+    pool: TrafficPool
+    left_out: Tensor
+    metrics: dict[str, float]
+    contact: float | None = None
 
 
 class Evolution:
     """The state of a run: curriculum, improvement (which holds the ego) and the last round's D'.
 
     synthesize(ego, scene_index [S], eta, seed) -> {scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N],
-    adversaries [S, N] bool, contact [S] bool, and optionally route [S, V]}: closed-loop traffic against that ego and
-    whether it was hit. measure(ego, round) -> metrics, called before and after the improvement of each round.
+    adversaries [S, N] bool, contact [S] bool}: closed-loop traffic against that ego and whether it was hit.
     solvable(traffic) -> bool [S]: rows that enter D'; all for None.
     """
 
     def __init__(
         self,
         curriculum: CurriculumScheduler,
-        improve: PolicyImprovement | PlannerImprovement,
+        improve: Improvement,
         synthesize: Synthesize,
         settings: RoundSettings,
         seed: int = 0,
-        measure: Measure | None = None,
         solvable: Solvable | None = None,
     ) -> None:
         self.curriculum, self.improve, self.synthesize = curriculum, improve, synthesize
-        self.settings, self.seed, self.measure, self.solvable = settings, seed, measure, solvable
+        self.settings, self.seed, self.solvable = settings, seed, solvable
         self.traffic: dict[str, Tensor] = {}
         self.episodes: Episodes | None = None
 
@@ -67,53 +77,48 @@ class Evolution:
         return self.curriculum.round
 
     def run_round(self) -> dict[str, float]:
-        """One round; returns its metrics, named by group (train/, curriculum/, synthesizer/, eval/, time/)."""
-        clock = [time.perf_counter()]
+        """One round; returns its metrics, named by group (train/, curriculum/, synthesizer/, time/)."""
+        begin = time.perf_counter()
         scenes = self.curriculum.draw(self.settings.scenes)
         state, seed = self.curriculum.summary(), self.seed * 1_000_003 + self.round
-        attack = self.synthesize(self.ego, scenes, self.curriculum.eta, seed)
-        kept = torch.ones_like(attack["contact"]) if self.solvable is None else self.solvable(attack)
-        self.traffic = {name: value[kept] for name, value in attack.items()}
-        pool = TrafficPool.synthesized(self.traffic, adversarial=True) + self._nominal(scenes, seed)
-        pool = pool if len(pool) else TrafficPool.recorded(scenes)  # without nominal traffic there may be nothing left
-        clock.append(time.perf_counter())
-        before = self._measured("before")
-        clock.append(time.perf_counter())
-        learned, self.episodes = self.improve(pool, self.curriculum)
-        clock.append(time.perf_counter())
-        after = self._measured("after")
-        contact = attack["contact"].float().mean().item()
+        attack = self._live(scenes, seed) if self.settings.traffic == "live" else self._synthesized(scenes, seed)
+        synthesized = time.perf_counter()
+        learned, self.episodes = self.improve(attack.pool, self.curriculum)
+        spent = {"synthesize": synthesized - begin, "improve": time.perf_counter() - synthesized}
         self.curriculum.update(self.episodes.scene_index, self.episodes.returns, self.episodes.adversarial)
-        self.curriculum.leave_out(attack["scene_index"][~kept])
+        self.curriculum.leave_out(attack.left_out)
+        contact = learned.get("contact_adversarial") if attack.contact is None else attack.contact
         self.curriculum.advance(contact)
-        spent = [later - earlier for earlier, later in zip(clock[:-1], clock[1:], strict=True)]
-        return {
-            **_group("curriculum", state),
-            **_group("train", learned),
-            **before,
-            **after,
-            **_group(
-                "synthesizer",
-                {
-                    "contact": contact,
-                    "attacked": attack["adversaries"].any(-1).float().mean().item(),
-                    "scenes": float(len(scenes)),
-                    "left_out": float((~kept).sum()),
-                },
-            ),
-            **_group("time", {"synthesize": spent[0], "improve": spent[2]}),
-        }
+        attacked = {"scenes": float(len(scenes)), "left_out": float(len(attack.left_out)), **attack.metrics}
+        attacked |= {} if contact is None else {"contact": contact}
+        groups = {"curriculum": state, "train": learned, "synthesizer": attacked, "time": spent}
+        return {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
 
-    def _nominal(self, scenes: Tensor, seed: int) -> TrafficPool:
-        """The same scenes without an adversary: the prior's traffic (eta 0), the recording, or none."""
+    def _synthesized(self, scenes: Tensor, seed: int) -> Attack:
+        """D' against the current ego, less what no driver survives, and nominal traffic."""
+        eta = self.curriculum.eta
+        traffic = self.synthesize(self.ego, scenes, eta, seed)
+        kept = torch.ones_like(traffic["contact"]) if self.solvable is None else self.solvable(traffic)
+        self.traffic = {name: value[kept] for name, value in traffic.items()}
+        pool = TrafficPool.stored(self.traffic, eta)
         if self.settings.nominal == "prior":
-            return TrafficPool.synthesized(self.synthesize(self.ego, scenes, 0.0, seed), adversarial=False)
-        return TrafficPool.recorded(scenes if self.settings.nominal == "log" else scenes[:0])
+            pool = pool + TrafficPool.stored(self.synthesize(self.ego, scenes, 0.0, seed), 0.0)
+        elif self.settings.nominal == "log" or not len(pool):  # without nominal traffic there may be nothing left
+            pool = pool + TrafficPool.recorded(scenes)
+        attacked = traffic["adversaries"].any(-1).float().mean().item()
+        left_out, contact = traffic["scene_index"][~kept], traffic["contact"].float().mean().item()
+        return Attack(pool, left_out, {"attacked": attacked}, contact)
 
-    def _measured(self, stage: str) -> dict[str, float]:
-        if self.measure is None:
-            return {}
-        return {f"eval/{stage}_{name}": value for name, value in self.measure(self.ego, self.round).items()}
+    def _live(self, scenes: Tensor, seed: int) -> Attack:
+        """Rows whose traffic is replanned against the learning ego, attacked and nominal."""
+        index = scenes.repeat(NOISES)
+        noise = index + (seed * NOISES + torch.arange(NOISES).repeat_interleave(len(scenes))) * 1_000_003
+        pool = TrafficPool.live(index, torch.full((len(index),), float(self.curriculum.eta)), noise)
+        if self.settings.nominal == "prior":
+            pool = pool + TrafficPool.live(index, torch.zeros(len(index)), noise)
+        elif self.settings.nominal == "log":
+            pool = pool + TrafficPool.recorded(scenes)
+        return Attack(pool, scenes[:0], {})
 
     def state_dict(self) -> dict:
         """Curriculum and improvement; weights, traffic and generators are the checkpoint's."""
@@ -123,7 +128,3 @@ class Evolution:
         """Go on from a `state_dict`."""
         self.curriculum.load_state_dict(state["curriculum"])
         self.improve.load_state_dict(state["improvement"])
-
-
-def _group(name: str, values: Mapping[str, float]) -> dict[str, float]:
-    return {f"{name}/{key}": value for key, value in values.items()}

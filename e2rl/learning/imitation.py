@@ -22,11 +22,11 @@ from e2rl.ego.base import Ego
 from e2rl.ego.network import WEIGHTS, ActorCritic
 from e2rl.ego.replay import ReplayEgo
 from e2rl.errors import InputError
-from e2rl.learning.driving import Disturbance, drive, episodes_of
-from e2rl.learning.pool import TrafficPool
+from e2rl.learning.driving import Disturbance, PoolDriver, episodes_of, filled_batches
 from e2rl.learning.update import clip_expert, take_step
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.traffic.pool import TrafficPool
 
 BURST, PAUSE = 10, 20  # steps: a disturbance lasts, and the time between the beginnings of two
 
@@ -53,40 +53,37 @@ class ImitationSettings:
 def recorded_pairs(scenes: SceneSet, sim: SimSettings, settings: ImitationSettings) -> TensorDict:
     """Pairs [M] (observation, action, scene_index) of every recording, replayed once and disturbed `drives` times.
 
-    A disturbed drive counts until it touches something or leaves the road; actions are clipped to 0.99 of the bounds.
+    A disturbed episode counts until it touches something or leaves the road; actions are clipped to 0.99 of the bounds.
     """
     generator = torch.Generator().manual_seed(settings.seed)
     pool, parts = TrafficPool.recorded(torch.arange(len(scenes))), []
     batch = min(settings.batch, len(scenes))
-    exact = DrivingEnv(scenes, replace(sim, replay_ego=True, end_on_contact=False, end_off_road=False), batch)
-    free = DrivingEnv(scenes, replace(sim, replay_ego=False), batch)
-    todo = [(rows, number) for number in range(settings.drives + 1) for rows in _batches(len(pool), batch)]
+    exact = PoolDriver(scenes, replace(sim, replay_ego=True, end_on_contact=False, end_off_road=False), batch)
+    free = PoolDriver(scenes, replace(sim, replay_ego=False), batch)
+    todo = [(rows, number) for number in range(settings.drives + 1) for rows in filled_batches(len(pool), batch)]
     for rows, number in tqdm(todo, "expert pairs", unit="batch", leave=False):
-        env, disturb = (exact, None) if number == 0 else (free, _bursts(len(rows), settings, generator))
-        frames = drive(env, ReplayEgo(), pool, rows, disturb)
-        parts.append(_pairs(frames, "executed" if number == 0 else "intended", pool.scene_index[rows], env))
+        driver, label, disturb = (
+            (exact, "executed", None) if number == 0 else (free, "intended", _bursts(len(rows), settings, generator))
+        )
+        frames = driver.drive(ReplayEgo(), pool, rows, disturb)
+        parts.append(_pairs(frames, label, pool.scene_index[rows], driver.env))
     return torch.cat(parts)
 
 
-def corrective_pairs(env: DrivingEnv, teacher: Ego, pool: TrafficPool) -> TensorDict:
-    """Pairs [M] of the teacher's drives through the pool's adversarial rows that it survives (Algorithm 1's corrective
+def corrective_pairs(driver: PoolDriver, teacher: Ego, pool: TrafficPool) -> TensorDict:
+    """Pairs [M] of the teacher's episodes in the pool's adversarial rows that it survives (Algorithm 1's corrective
     supervision: what another driver did where the ego is attacked); empty where it survives none."""
-    rows_of, batch = pool.adversarial.nonzero()[:, 0], env.batch_size[0]
+    adversarial = pool.adversarial.nonzero()[:, 0]
     parts = []
-    for places in _batches(len(rows_of), batch):
-        rows = rows_of[places]
-        frames = drive(env, teacher, pool, rows)
-        survived = ~episodes_of(frames, pool, rows).failed.to(env.device)
+    for picked in filled_batches(len(adversarial), driver.env.batch_size[0]):
+        rows = adversarial[picked]
+        frames = driver.drive(teacher, pool, rows)
+        survived = ~episodes_of(frames, pool, rows).failed.to(frames.device)
         frames["alive"] = frames["alive"] & survived[:, None]
-        parts.append(_pairs(frames, "executed", pool.scene_index[rows], env))
+        parts.append(_pairs(frames, "executed", pool.scene_index[rows], driver.env))
     if not parts:
         raise InputError("corrective supervision: the pool holds no adversarial traffic")
     return torch.cat(parts)
-
-
-def _batches(count: int, batch: int) -> list[Tensor]:
-    """Rows 0..count-1 in batches of exactly `batch`, the last one filled up by repetition."""
-    return list((torch.arange(-(-count // batch) * batch) % count).split(batch)) if count else []
 
 
 def _bursts(batch: int, settings: ImitationSettings, generator: torch.Generator) -> Disturbance:
@@ -95,9 +92,9 @@ def _bursts(batch: int, settings: ImitationSettings, generator: torch.Generator)
     offsets = torch.randn(batch, 100, 2, generator=generator) * size
     phase = torch.randint(PAUSE, (batch,), generator=generator)
 
-    def disturb(action: Tensor, step: int) -> Tensor:
-        place = step + phase
-        offset = offsets[torch.arange(batch), place // PAUSE] * (place % PAUSE < BURST)[:, None]
+    def disturb(action: Tensor, step: Tensor) -> Tensor:
+        since = step.cpu() + phase
+        offset = offsets[torch.arange(batch), since // PAUSE] * (since % PAUSE < BURST)[:, None]
         return action + offset.to(action.device)
 
     return disturb
@@ -107,11 +104,8 @@ def _pairs(frames: TensorDictBase, label: str, scene_index: Tensor, env: Driving
     alive = frames["alive"]
     action = clip_expert(frames[label], env.action_spec.space.low[0], env.action_spec.space.high[0])
     scene = scene_index[:, None].to(alive.device).expand(alive.shape)
-    count = int(alive.sum())
-    return TensorDict(
-        {"observation": frames["observation"][alive], "action": action[alive], "scene_index": scene[alive]},
-        batch_size=[count],
-    ).cpu()
+    pairs = {"observation": frames["observation"][alive], "action": action[alive], "scene_index": scene[alive]}
+    return TensorDict(pairs, batch_size=[int(alive.sum())]).cpu()
 
 
 class Imitation:

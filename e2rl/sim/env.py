@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -15,169 +15,130 @@ from torchrl.envs import EnvBase
 from e2rl.errors import InputError
 from e2rl.scene.route import project
 from e2rl.scene.scene import SceneSet
-from e2rl.sim.around import axes, look_around
 from e2rl.sim.drivable import off_road
 from e2rl.sim.mission import Mission, mission_of
-from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, lens, observe, probe
-from e2rl.sim.reward import check_weights
-from e2rl.sim.setting import Place, setting_of, write_rows
-from e2rl.sim.step import Rules, Running, Stepped, replay_step, step
-from e2rl.sim.traffic import Traffic
+from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, observation_config, observe
+from e2rl.sim.reward import DEFAULT_WEIGHTS, check_weights
+from e2rl.sim.static import FrenetPose, static_scene, write_rows
+from e2rl.sim.step import Outcome, StepConfig, replay_step, step
+from e2rl.sim.trajectories import Trajectories
 from e2rl.sim.world import World
 
-STARTING = (
-    "start",
-    "start_accel",
-    "start_yaw_rate",
-    "size",
-    "agent_type",
-    "field",
-    "field_origin",
-    "light_state",
-    "route_points",
-    "route_length",
-    "route_open",
-    "route_limit",
-    "route_light",
-    "route_light_s",
-    "route_log",
-)
-DEFAULT_REWARD = {
-    "progress": 0.1,
-    "contact": -10.0,
-    "off_road": -5.0,
-    "comfort": -0.02,
-    "speeding": -0.1,
-    "lane_offset": -0.02,
-}
+AT_RESET = ("start", "start_accel", "start_yaw_rate", "size", "agent_type", "field", "field_origin", "light_state")
+AT_RESET += tuple(f"route_{name}" for name in ("points", "length", "open", "limit", "light", "light_s", "log"))
+FLAGS, METRICS = ("terminated", "truncated"), ("contact", "contact_vru", "off_road", "progress")
 
 
 @dataclass
 class SimSettings:
-    """Bounds of the ego's action, when an episode ends, and the reward weights (conf/sim/default.yaml).
-
-    compile: the step by torch.compile, which needs a C++ compiler: equal but for rounding.
-    """
+    """Bounds of the ego's action, what ends an episode early, and the reward weights (conf/sim/default.yaml)."""
 
     max_acceleration: float = 5.0
     max_braking: float = 8.0
     max_yaw_rate: float = 1.6
     end_on_contact: bool = True
     end_off_road: bool = True
+    end_when_gone: bool = True
     replay_ego: bool = False
     compile: bool = False
-    reward: Mapping[str, float] = field(default_factory=lambda: dict(DEFAULT_REWARD))
+    reward: dict[str, float] = field(default_factory=lambda: dict(DEFAULT_WEIGHTS))
 
 
 class DrivingEnv(EnvBase):
     """Closed-loop driving in batches of recorded or synthesized scenes.
 
-    Keys of the step: action [B, 2] (m/s^2, rad/s); observation [B, OBSERVATION_SIZE]; reward, done, terminated,
-    truncated [B, 1]; scene_index, timestep [B, 1] int64; metrics: contact, contact_vru, off_road [B, 1] bool at this
-    step and progress [B, 1], metres along the mission since the start. Maps stay here: read them by `world()`.
+    Keys of a step: action [B, 2] (m/s^2, rad/s); observation [B, OBSERVATION_SIZE]; reward, done, terminated, truncated
+    [B, 1]; scene_index, timestep [B, 1] int64; metrics: contact, contact_vru, off_road [B, 1] bool at this step and
+    progress [B, 1], m along the mission since the start. With agents=True also agents: states [B, N, 4], valid [B, N],
+    accel [B, N] and yaw_rate [B, 1] of the ego, for policies that plan. Maps stay in `scene`.
 
-    An episode terminates at contact and off the road (settings) and is truncated after the scenes' T steps or where
-    the map ends. A reset takes the scenes named by "scene_index" [B, 1] in its input, else draws them uniformly from
-    the environment's own generator (`set_seed`). Their traffic is what `set_traffic` gave, else the recording.
+    An episode terminates at contact and off the road (settings) and is truncated after the scenes' T steps or where the
+    ego leaves the scene. A reset takes the scenes named by "scene_index" [B, 1] in its input, else draws them uniformly
+    from the environment's own generator (`set_seed`). Their traffic is what `set_traffic` gave, else the recording.
     """
 
-    def __init__(self, scenes: SceneSet, settings: SimSettings, batch_size: int, device="cpu") -> None:
+    def __init__(self, scenes: SceneSet, settings: SimSettings, batch_size: int, device="cpu", agents=False) -> None:
         super().__init__(device=device, batch_size=[batch_size])
-        self.scenes, self.settings = scenes, settings
+        self.scenes, self.settings, self.agents = scenes, settings, agents
         self._generator = torch.Generator()
-        self.resets = 0  # counted on the host, so that policies notice new episodes without asking the device
-        self._make_specs(batch_size)
         self.scene = scenes.batch(torch.zeros(batch_size, dtype=torch.long)).to(device)
+        """The running scenes, one storage for good: a reset overwrites its rows."""
         self.horizon = self.scene["logged"].shape[1] - 1
-        weights = torch.tensor(check_weights(settings.reward), device=self.device)
-        self._rules = Rules(
-            self.horizon, settings.end_on_contact, settings.end_off_road, weights, self._low, self._high
-        )
-        self._traffic, self._lens = Traffic(self.scene), lens(self.device)
-        self._setting = setting_of(self.scene, mission_of(self.scene))
+        low = torch.tensor([-settings.max_braking, -settings.max_yaw_rate], device=device)
+        high = torch.tensor([settings.max_acceleration, settings.max_yaw_rate], device=device)
+        weights = torch.tensor(check_weights(settings.reward), device=device)
+        ends = settings.end_on_contact, settings.end_off_road, settings.end_when_gone
+        self._config = StepConfig(self.horizon, *ends, weights, low, high, observation_config(self.device))
+        self._trajectories = Trajectories(self.scene)
+        self._static = static_scene(self.scene, mission_of(self.scene))
         zeros = torch.zeros(batch_size, device=device)
         flags = torch.zeros(batch_size, dtype=torch.bool, device=device)
-        self._running = Running(
-            zeros.long(),
-            zeros[:, None].repeat(1, 4),
-            zeros[:, None].repeat(1, 2),
-            Place(zeros, zeros, zeros),
-            flags,
-            flags,
-            zeros,
+        pose = FrenetPose(zeros, zeros.clone(), zeros.clone())
+        self._ego = EgoState(
+            zeros.long(), zeros[:, None].repeat(1, 4), zeros[:, None].repeat(1, 2), pose, flags, flags.clone(), zeros
         )
+        self._make_specs(batch_size, self.scene["start"].shape[1])
 
-    def _make_specs(self, batch: int) -> None:
-        low = torch.tensor([-self.settings.max_braking, -self.settings.max_yaw_rate], device=self.device)
-        high = torch.tensor([self.settings.max_acceleration, self.settings.max_yaw_rate], device=self.device)
+    def _make_specs(self, batch: int, agents: int) -> None:
+        low, high = self._config.low, self._config.high
         self.action_spec = Bounded(low.repeat(batch, 1), high.repeat(batch, 1), device=self.device)
-        self._low, self._high = low, high
 
-        def flag() -> Binary:
-            return Binary(1, shape=(batch, 1), dtype=torch.bool, device=self.device)
+        def flag(size: int = 1) -> Binary:
+            return Binary(size, shape=(batch, size), dtype=torch.bool, device=self.device)
 
-        def number(dtype: torch.dtype, size: int = 1) -> Unbounded:
-            return Unbounded((batch, size), dtype=dtype, device=self.device)
+        def number(*size: int, dtype: torch.dtype = torch.float32) -> Unbounded:
+            return Unbounded((batch, *(size or (1,))), dtype=dtype, device=self.device)
 
-        self.observation_spec = Composite(
-            observation=number(torch.float32, OBSERVATION_SIZE),
-            scene_index=number(torch.int64),
-            timestep=number(torch.int64),
-            metrics=Composite(
-                contact=flag(),
-                contact_vru=flag(),
-                off_road=flag(),
-                progress=number(torch.float32),
-                shape=[batch],
-                device=self.device,
-            ),
-            shape=[batch],
-            device=self.device,
-        )
-        self.reward_spec = number(torch.float32)
-        self.full_done_spec = Composite(
-            done=flag(), terminated=flag(), truncated=flag(), shape=[batch], device=self.device
-        )
+        def group(**specs) -> Composite:
+            return Composite(**specs, shape=[batch], device=self.device)
+
+        specs = {
+            "observation": number(OBSERVATION_SIZE),
+            "scene_index": number(dtype=torch.int64),
+            "timestep": number(dtype=torch.int64),
+            "metrics": group(contact=flag(), contact_vru=flag(), off_road=flag(), progress=number()),
+        }
+        if self.agents:
+            states, valid, accel = number(agents, 4), flag(agents), number(agents)
+            specs["agents"] = group(states=states, valid=valid, accel=accel, yaw_rate=number())
+        self.observation_spec = group(**specs)
+        self.reward_spec = number()
+        self.full_done_spec = group(done=flag(), terminated=flag(), truncated=flag())
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self._generator.manual_seed(seed)
 
-    def set_traffic(self, rows: Tensor, states: Tensor, valid: Tensor, route: Tensor | None = None) -> None:
+    def set_traffic(self, rows: Tensor, states: Tensor, valid: Tensor) -> None:
         """Traffic of environments rows [b] int64 from their coming reset on, instead of the recording.
 
-        states [b, T+1, N, 4], valid [b, T+1, N]; step 0 is taken to be the scene's start. The ego's row is ignored,
-        pedestrians, cyclists and others keep replaying the log. route [b, V]: candidates followed, default route_log.
+        states [b, T+1, N, 4], valid [b, T+1, N]; step 0 is taken to be the scene's start. The ego's row is ignored;
+        pedestrians, cyclists and others keep replaying the log. Raises InputError on a wrong shape or NaN.
         """
-        self._traffic.schedule(rows, states, valid, route)
+        self._trajectories.schedule(rows, states, valid)
 
-    def write_traffic(
-        self, step_from: int | Tensor, states: Tensor, valid: Tensor, route: Tensor | None = None
-    ) -> None:
-        """Overwrite the vehicles' traffic at steps step_from + 1 .. step_from + h of all environments.
+    def write_traffic(self, rows: Tensor, states: Tensor, valid: Tensor) -> None:
+        """Overwrite the vehicles' traffic of environments rows [b] at the coming steps; those beyond T are dropped.
 
-        step_from: int or [B]; states [B, h, N, 4], valid [B, h, N]; steps beyond T are dropped from the traffic but
-        stay in `World.plan`. route [B, V]: candidates now followed, default unchanged.
+        states [b, V, H, 4], valid [b, V, H].
         """
-        step_from = torch.as_tensor(step_from, device=self.device).expand(self._running.clock.shape)
-        self._traffic.write(step_from, states, valid, route)
+        self._trajectories.write(rows, self._ego.step[rows], states, valid)
 
     def world(self) -> World:
         """The present moment. Its `scene` is the environment's own storage: overwritten at the next reset."""
-        now = self._running
-        states, valid, accel = self._traffic.at(now.clock)
-        first = (now.clock == 0)[:, None]
+        ego = self._ego
+        states, valid, accel = self._trajectories.at(ego.step)
+        first = (ego.step == 0)[:, None]
         states = torch.where(first[..., None], self.scene["start"], states)
         valid = torch.where(first, self.scene["valid"], valid)
         accel = torch.where(first, self.scene["start_accel"], accel)
         return World(
-            scene=self.scene,
-            step=now.clock,
-            states=torch.cat([now.ego[:, None], states[:, 1:]], 1),
-            valid=torch.cat([now.present[:, None], valid[:, 1:]], 1),
-            accel=torch.cat([now.action[:, :1], accel[:, 1:]], 1),
-            route=self._traffic.route,
-            plan=self._traffic.plan(now.clock),
+            self.scene,
+            ego.step,
+            torch.cat([ego.state[:, None], states[:, 1:]], 1),
+            torch.cat([ego.present[:, None], valid[:, 1:]], 1),
+            torch.cat([ego.action[:, :1], accel[:, 1:]], 1),
+            yaw_rate=ego.action[:, 1],
         )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_) -> TensorDict:
@@ -191,73 +152,63 @@ class DrivingEnv(EnvBase):
         else:
             rows = chosen.view(batch)[index].cpu()
         self.scenes.copy_into(self.scene, index, rows)
-        fresh = self.scene if len(index) == batch else self.scene.select(*STARTING)[index]
+        fresh = self.scene if len(index) == batch else self.scene.select(*AT_RESET)[index]
         mission = mission_of(fresh)
-        write_rows(self._setting, index, setting_of(fresh, mission))
-        self._traffic.reset(self.scene, index)
-        self._restart(mask, index, fresh, mission)
-        self.resets += 1
+        write_rows(self._static, index, static_scene(fresh, mission))
+        self._trajectories.reset(self.scene, index)
+        self._restart(index, fresh, mission)
         return self._reset_output()
 
-    def _restart(self, mask: Tensor, index: Tensor, scene: TensorDictBase, mission: Mission) -> None:
-        """Start states of the environments where mask [B], index [b], whose scenes are scene [b]."""
-        ego = scene["start"][:, 0]
-        s, d, heading = (value[:, 0] for value in project(ego[:, None, :2], mission.points))
-        on_road = off_road(ego[:, None, :2], scene["field"], scene["field_origin"])[:, 0] <= 0
-        first = torch.stack([scene["start_accel"][:, 0], scene["start_yaw_rate"][:, 0]], -1)
-        started = Running(torch.zeros_like(index), ego, first, Place(s, d, heading), mask[index], on_road, s)
+    def _restart(self, index: Tensor, scene: TensorDictBase, mission: Mission) -> None:
+        """Start states of environments index [b], whose scenes are scene [b]."""
+        state = scene["start"][:, 0]
+        pose = FrenetPose(*(value[:, 0] for value in project(state[:, None, :2], mission.points)))
+        on_road = off_road(state[:, None, :2], scene["field"], scene["field_origin"])[:, 0] <= 0
+        action = torch.stack([scene["start_accel"][:, 0], scene["start_yaw_rate"][:, 0]], -1)
+        fresh = EgoState(torch.zeros_like(index), state, action, pose, torch.ones_like(on_road), on_road, pose.s)
 
         def put(old: Tensor, new: Tensor) -> Tensor:
             return old.index_copy(0, index, new)
 
-        old = self._running
-        place = Place(*(put(*pair) for pair in zip(old.place, started.place, strict=True)))
-        self._running = Running(
-            *(place if isinstance(new, Place) else put(value, new) for value, new in zip(old, started, strict=True))
-        )
+        old = self._ego
+        pose = FrenetPose(*map(put, old.pose, fresh.pose))
+        values = {name: put(getattr(old, name), getattr(fresh, name)) for name in old._fields if name != "pose"}
+        self._ego = EgoState(pose=pose, **values)
 
     def _reset_output(self) -> TensorDict:
-        now, world = self._running, self.world()
-        turn = axes(now.ego)
-        around = look_around(now.ego, turn, self._setting, world.states[:, 1:], world.valid[:, 1:], world.accel[:, 1:])
-        observation, _ = observe(
-            self._lens,
-            self._setting,
-            EgoState(now.ego, turn, now.action, now.place),
-            now.clock,
-            self.horizon,
-            probe(self._lens, self._setting, now.ego, turn),
-            around,
-        )
-        none = torch.zeros_like(now.present)
-        return self._output(Stepped(observation, now.start_s, none, none, none, none, none, now.place.s - now.start_s))
+        ego, world = self._ego, self.world()
+        others = world.states[:, 1:], world.valid[:, 1:], world.accel[:, 1:]
+        features = observe(self._config.observation, self._static, ego, others, self.horizon).features
+        none = torch.zeros_like(ego.present)
+        outcome = dict.fromkeys((*FLAGS, *METRICS), none)
+        return self._output(outcome | {"observation": features, "progress": ego.pose.s - ego.start_s})
 
     @torch.no_grad()  # what an environment keeps must not grow a graph, step after step
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        replays, traffic = self.settings.replay_ego, (self._traffic.states, self._traffic.valid)
+        replays, tracks = self.settings.replay_ego, (self._trajectories.states, self._trajectories.valid)
         function = replay_step if replays else step
         function = compiled(function) if self.settings.compile else function
         given = (self.scene["logged"], self.scene["logged_valid"]) if replays else tensordict["action"]
-        self._running, done = function(self._running, given, traffic, self._setting, self._rules, self._lens)
-        return self._output(done).set("reward", done.reward[:, None])
+        self._ego, outcome = function(self._ego, given, tracks, self._static, self._config)
+        return self._output(outcome).set("reward", outcome["reward"][:, None])
 
-    def _output(self, stepped: Stepped) -> TensorDict:
+    def _output(self, outcome: Outcome) -> TensorDict:
         """What an environment returns of a step but the reward."""
         shape, device = self.batch_size, self.device
-        metrics = {name: getattr(stepped, name)[:, None] for name in ("contact", "contact_vru", "off_road", "progress")}
-        return TensorDict(
-            {
-                "observation": stepped.observation,
-                "scene_index": self.scene["scene_index"][:, None].clone(),
-                "timestep": self._running.clock[:, None].clone(),
-                "metrics": TensorDict(metrics, batch_size=shape, device=device),
-                "done": (stepped.terminated | stepped.truncated)[:, None],
-                "terminated": stepped.terminated[:, None],
-                "truncated": stepped.truncated[:, None],
-            },
-            batch_size=shape,
-            device=device,
-        )
+        flags = {name: outcome[name][:, None] for name in FLAGS}
+        result = {
+            "observation": outcome["observation"],
+            "scene_index": self.scene["scene_index"][:, None].clone(),
+            "timestep": self._ego.step[:, None].clone(),
+            "metrics": TensorDict({name: outcome[name][:, None] for name in METRICS}, shape, device=device),
+            "done": flags["terminated"] | flags["truncated"],
+            **flags,
+        }
+        if self.agents:
+            now = self.world()
+            agents = {"states": now.states, "valid": now.valid, "accel": now.accel, "yaw_rate": now.yaw_rate[:, None]}
+            result["agents"] = TensorDict(agents, shape, device=device)
+        return TensorDict(result, shape, device=device)
 
 
 @cache

@@ -1,6 +1,6 @@
 """What a learned ego sees: an ego-centred vector of OBSERVATION_SIZE numbers of order one.
 
-Blocks: ego (11), mission route ahead (12 x 5), lights (2 x 4), drivable probes (5 x 5), nearest agents (12 x 15).
+Blocks: ego (11), mission route ahead (12 x 5), lights (2 x 4), drivable border (5 x 5), nearest agents (12 x 15).
 """
 
 from functools import cache
@@ -9,10 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from e2rl.scene.recording import LIGHT_UNKNOWN
-from e2rl.sim.around import Around
 from e2rl.sim.drivable import off_road
-from e2rl.sim.setting import Place, Setting, look_along
+from e2rl.sim.neighbours import Neighbours, neighbours_of, rotation_into
+from e2rl.sim.static import FrenetPose, StaticScene, look_along
+from e2rl.sim.traffic_light import light_state_at
 
 LOOK_AHEAD = (2.0, 4.0, 7.0, 10.0, 14.0, 19.0, 25.0, 32.0, 40.0, 50.0, 62.0, 75.0)  # m along the mission
 PROBE_X, PROBE_Y = (-3.0, 0.0, 5.0, 11.0, 20.0), (-5.0, -2.5, 0.0, 2.5, 5.0)  # m in the ego's frame
@@ -22,9 +22,26 @@ SPEED, FAR, NEAR = 15.0, 40.0, 10.0  # scales: m/s, m, m
 OBSERVATION_SIZE = 11 + 5 * len(LOOK_AHEAD) + 8 + len(PROBE_X) * len(PROBE_Y) + 15 * NEAREST
 
 
-class Lens(NamedTuple):
-    """The numbers above as tensors: arc lengths ahead [13], the last 0; probes [25, 2]; scales of a route point [2] and
-    of an agent's features [11, 1]; light colours [3]."""
+class EgoState(NamedTuple):
+    """The egos of B scenes now.
+
+    step [B] int64; state [B, 4]: x, y, heading, speed; action [B, 2]: last executed acceleration and yaw rate; pose:
+    Frenet pose on the mission; present [B] bool: still in the scene; been_on_road [B] bool: being off the road counts
+    from then on; start_s [B]: arc length at the start.
+    """
+
+    step: Tensor
+    state: Tensor
+    action: Tensor
+    pose: FrenetPose
+    present: Tensor
+    been_on_road: Tensor
+    start_s: Tensor
+
+
+class ObservationConfig(NamedTuple):
+    """The constants of the observation as tensors: arc lengths ahead [13] m, the last one 0; probes [25, 2] m; scales
+    of a route point [2] and of an agent's features [11, 1]; light colours [3]."""
 
     ahead: Tensor
     probes: Tensor
@@ -33,119 +50,99 @@ class Lens(NamedTuple):
     colours: Tensor
 
 
+class Observed(NamedTuple):
+    """An observation and what it was made of: features [B, OBSERVATION_SIZE], neighbours, border [B, 25]: m beyond the
+    drivable border at the probes, limit [B]: speed limit at the ego [m/s], 0 unknown."""
+
+    features: Tensor
+    neighbours: Neighbours
+    border: Tensor
+    limit: Tensor
+
+
 @cache
-def lens(device: torch.device) -> Lens:
-    """The Lens on a device, made once."""
-    numbers = lambda *values: torch.tensor(values, device=device)  # noqa: E731
-    return Lens(
-        numbers(*LOOK_AHEAD, 0.0),
-        torch.cartesian_prod(numbers(*PROBE_X), numbers(*PROBE_Y)),
-        numbers(FAR, NEAR),
-        numbers(FAR, NEAR, 1.0, 1.0, SPEED, SPEED, SPEED, 4.0, 2.5, 1.0, 1.0)[:, None],
-        numbers(1, 2, 3),
-    )
+def observation_config(device: torch.device) -> ObservationConfig:
+    """The ObservationConfig on a device, made once."""
 
+    def numbers(*values: float) -> Tensor:
+        return torch.tensor(values, device=device)
 
-class EgoState(NamedTuple):
-    """The egos now: state [B, 4], turn = `around.axes` of it, the last action executed [B, 2], its place."""
-
-    state: Tensor
-    turn: Tensor
-    action: Tensor
-    place: Place
+    scales = numbers(FAR, NEAR, 1.0, 1.0, SPEED, SPEED, SPEED, 4.0, 2.5, 1.0, 1.0)[:, None]
+    probes = torch.cartesian_prod(numbers(*PROBE_X), numbers(*PROBE_Y))
+    return ObservationConfig(numbers(*LOOK_AHEAD, 0.0), probes, numbers(FAR, NEAR), scales, numbers(1, 2, 3))
 
 
 def observe(
-    lens: Lens, setting: Setting, ego: EgoState, step: Tensor, horizon: int, beyond: Tensor, around: Around
-) -> tuple[Tensor, Tensor]:
-    """Observation [B, OBSERVATION_SIZE], and the speed limit at the ego [B].
+    config: ObservationConfig, static: StaticScene, ego: EgoState, agents: tuple[Tensor, Tensor, Tensor], horizon: int
+) -> Observed:
+    """What egos see in scenes of `horizon` steps.
 
-    step [B] of horizon; beyond [B, 25]: `probe` there; around: the others.
+    agents: states [B, M, 4], presence [B, M] and accelerations [B, M] of the others.
     """
-    route, limit = route_features(lens, setting, ego)
-    parts = [
-        ego_features(setting, ego, limit, step / horizon),
+    rotation = rotation_into(ego.state)
+    neighbours = neighbours_of(ego.state, rotation, static.size, static.half_size, *agents)
+    probes = torch.baddbmm(ego.state[:, None, :2], config.probes.expand(len(rotation), -1, -1), rotation)
+    border = off_road(probes, static.field, static.origin)
+    route, limit = route_features(config, static, ego, rotation)
+    blocks = [
+        ego_features(static, ego, limit, ego.step / horizon),
         route,
-        light_features(lens, setting, step, ego.place.s),
-        (beyond / 4).clamp(-1, 1),
-        agent_features(lens, setting, ego, around),
+        light_features(config, static, ego.step, ego.pose.s),
+        (border / 4).clamp(-1, 1),
+        agent_features(config, static, ego, neighbours),
     ]
-    return torch.cat(parts, -1), limit
+    return Observed(torch.cat(blocks, -1), neighbours, border, limit)
 
 
-def probe(lens: Lens, setting: Setting, state: Tensor, turn: Tensor) -> Tensor:
-    """[B, 25]: drivable field at a grid of points around and ahead of an ego at state [B, 4]."""
-    points = torch.baddbmm(state[:, None, :2], lens.probes.expand(len(state), -1, -1), turn)
-    return off_road(points, setting.field, setting.origin)
+def ego_features(static: StaticScene, ego: EgoState, limit: Tensor, time: Tensor) -> Tensor:
+    """[B, 11]: speed, last action (2), offset and heading to the mission (3), speed limit, way left before the map
+    ends, size (2), share of the time gone."""
+    state, action, pose, size = ego.state, ego.action, ego.pose, static.size
+    turned = state[:, 2] - pose.heading
+    left = ((static.mission.end - pose.s) / 100).clamp(0, 1)
+    features = [state[:, 3] / SPEED, action[:, 0] / 4, action[:, 1], (pose.d / 3).clamp(-2, 2), turned.sin()]
+    features += [turned.cos(), limit / SPEED, left, size[:, 0] / 5, size[:, 1] / 2, time]
+    return torch.stack(features, -1)
 
 
-def ego_features(setting: Setting, ego: EgoState, limit: Tensor, time: Tensor) -> Tensor:
-    """[B, 11]: speed, last action, lane pose, speed limit, way left before the map ends, size, share of time gone."""
-    state, action, place, size = ego.state, ego.action, ego.place, setting.size
-    turned = state[:, 2] - place.heading
-    return torch.stack(
-        [
-            state[:, 3] / SPEED,
-            action[:, 0] / 4,
-            action[:, 1],
-            (place.d / 3).clamp(-2, 2),
-            turned.sin(),
-            turned.cos(),
-            limit / SPEED,
-            ((setting.end - place.s) / 100).clamp(0, 1),
-            size[:, 0] / 5,
-            size[:, 1] / 2,
-            time,
-        ],
-        -1,
-    )
-
-
-def route_features(lens: Lens, setting: Setting, ego: EgoState) -> tuple[Tensor, Tensor]:
-    """[B, 12 * 5]: mission points ahead in the ego's frame, relative heading, curvature, speed limit; and the limit at
-    the ego [B]."""
-    xy, heading, curvature, limit = look_along(setting, ego.place.s[:, None] + lens.ahead)
-    local = (xy - ego.state[:, None, :2]).bmm(ego.turn.transpose(1, 2)) / lens.point
+def route_features(
+    config: ObservationConfig, static: StaticScene, ego: EgoState, rotation: Tensor
+) -> tuple[Tensor, Tensor]:
+    """[B, 12 * 5]: mission points ahead in the ego's frame (2), relative heading, curvature, speed limit; and the speed
+    limit at the ego [B]."""
+    xy, heading, curvature, limit = look_along(static, ego.pose.s[:, None] + config.ahead)
+    local = (xy - ego.state[:, None, :2]).bmm(rotation.transpose(1, 2)) / config.point
     turned = (heading - ego.state[:, 2:3]).sin()
     features = torch.cat([local, torch.stack([turned, (10 * curvature).clamp(-2, 2), limit / SPEED], -1)], -1)
     return features[:, :-1].clamp(-5, 5).flatten(1), limit[:, -1]
 
 
-def light_features(lens: Lens, setting: Setting, step: Tensor, s: Tensor) -> Tensor:
-    """[B, 2 * 4]: the mission's lights red, yellow, green (one-hot while ahead) and how near (1 at hand, 0 far)."""
-    if not setting.colours.shape[2]:
+def light_features(config: ObservationConfig, static: StaticScene, step: Tensor, s: Tensor) -> Tensor:
+    """[B, 2 * 4]: the mission's lights red, yellow, green (one-hot while ahead) and nearness (1 at hand, 0 far)."""
+    if not static.light_state.shape[2]:
         return s.new_zeros(len(s), 8)
-    recorded = setting.colours.shape[1]  # planners look beyond it: the last state stays
-    now = setting.colours.flatten(0, 1).index_select(0, setting.row[:, 0] * recorded + step.clamp(max=recorded - 1))
-    state = now.gather(1, setting.light.clamp(min=0)).masked_fill(setting.light < 0, LIGHT_UNKNOWN)
-    ahead = setting.light_s - s[:, None]
-    seen = (setting.light >= 0) & (ahead > -2)
-    colours = state[..., None] == lens.colours
+    light, ahead = static.mission.light, static.mission.light_s - s[:, None]
+    seen = (light >= 0) & (ahead > -2)
+    colours = light_state_at(static.light_state, light, step)[..., None] == config.colours
     near = (-ahead.clamp(min=0) / 30).exp()
     return (torch.cat([colours.to(s.dtype), near[..., None]], -1) * seen[..., None]).flatten(1)
 
 
-def agent_features(lens: Lens, setting: Setting, ego: EgoState, around: Around) -> Tensor:
-    """[B, 12 * 15]: nearest agents; present, relative pose and velocity, speed, acceleration, size, type, gap and
-    closest approach at constant velocities (method_and_baselines.md 8.5, fixed form). Absent agents are zeros."""
-    apart = around.local.square().sum(1).masked_fill(~around.present, torch.inf)
+def agent_features(config: ObservationConfig, static: StaticScene, ego: EgoState, others: Neighbours) -> Tensor:
+    """[B, 12 * 15]: of the nearest agents presence, relative pose (4) and velocity (2), speed, acceleration, size (2),
+    whether it is a vehicle, gap, and time and distance of the closest approach at constant velocities; absent agents
+    are zeros."""
+    apart = others.position.square().sum(1).masked_fill(~others.present, torch.inf)
     count = min(NEAREST, apart.shape[1])
     index = apart.topk(count, dim=1, largest=False).indices
-    everybody = torch.cat(
-        [
-            around.local,
-            around.direction,
-            setting.half,
-            torch.stack([around.gap, around.speed, around.accel, setting.vehicle, around.present], 1),
-        ],
-        1,
-    )
+    scalars = torch.stack([others.gap, others.speed, others.accel, static.vehicle, others.present], 1)
+    everybody = torch.cat([others.position, others.direction, static.half_size, scalars], 1)
     near = everybody.gather(2, index[:, None].expand(-1, everybody.shape[1], -1))
     local, direction, half, gap, speed, accel, vehicle, present = near.split((2, 2, 2, 1, 1, 1, 1, 1), 1)
     velocity = speed * direction - torch.nn.functional.pad(ego.state[:, 3:, None], (0, 0, 0, 1))
     time = (-(local * velocity).sum(1, True) / (velocity.square().sum(1, True) + 1e-3)).clamp(0, 8)
     miss = (local + velocity * time).norm(dim=1, keepdim=True)
-    scaled = torch.cat([local, direction, velocity, speed, accel, half, vehicle], 1) / lens.agent
+    scaled = torch.cat([local, direction, velocity, speed, accel, half, vehicle], 1) / config.agent
     decay = torch.cat([-time / 2, -miss / 5], 1).exp()
     features = torch.cat([present, scaled.clamp(-5, 5), (gap / NEAR).clamp(-1, 2), decay], 1) * present
     features = features.transpose(1, 2).flatten(1)

@@ -7,7 +7,9 @@ from torch import Tensor
 
 from e2rl.errors import InputError
 
-TERMS = ("progress", "contact", "off_road", "comfort", "speeding", "lane_offset")
+DEFAULT_WEIGHTS = {"progress": 0.1, "contact": -10.0, "off_road": -5.0, "comfort": -0.02, "speeding": -0.1}
+DEFAULT_WEIGHTS["lane_offset"] = -0.02
+TERMS = tuple(DEFAULT_WEIGHTS)
 
 
 def reward_terms(

@@ -1,18 +1,20 @@
-"""What an ego or a synthesizer sees of a batch of running scenes."""
+"""What a planner or a traffic method sees of a batch of running scenes."""
 
 from dataclasses import dataclass
 
+import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 
 @dataclass
 class World:
-    """The moment of B scenes; agents [0] are the egos, agents [:V] the vehicles.
+    """The present moment of B scenes; agent 0 is the ego, agents [:V] are the vehicles.
 
-    scene: Scene TensorDict [B]; step [B] int64, simulated steps since the start frame; states [B, N, 4] x, y, heading,
-    speed; valid [B, N]: present now; accel [B, N] m/s^2; route [B, V] int64: the route candidate each vehicle follows;
-    plan [B, N, H, 4]: the others' current planned states at 0.1 s, or None where nobody plans (recorded traffic).
+    scene: Scene TensorDict [B]; step [B] int64: simulated steps since the start frame; states [B, N, 4]: x, y, heading,
+    speed; valid [B, N]: present now; accel [B, N] m/s^2; yaw_rate [B] rad/s: the ego's last executed one; plan
+    [B, V, H, 4]: states at the coming steps that the vehicles plan (None: unknown); route [B, V] int64: the route
+    candidates that the vehicles follow (None: unknown).
     """
 
     scene: TensorDictBase
@@ -20,5 +22,25 @@ class World:
     states: Tensor
     valid: Tensor
     accel: Tensor
-    route: Tensor
+    route: Tensor | None = None
     plan: Tensor | None = None
+    yaw_rate: Tensor | None = None
+
+    @classmethod
+    def at_start(cls, scene: TensorDictBase) -> "World":
+        """Scenes [B] at their start frames."""
+        step = torch.zeros(scene.batch_size[0], dtype=torch.int64, device=scene["start"].device)
+        start = (scene[key] for key in ("start", "valid", "start_accel"))
+        return cls(scene, step, *start, route=scene["route_log"], yaw_rate=scene["start_yaw_rate"][:, 0])
+
+    @classmethod
+    def of(cls, tensordict: TensorDictBase, scene: TensorDictBase) -> "World":
+        """The moment that a DrivingEnv with `agents=True` reports in a TensorDict [B]; scene: `DrivingEnv.scene`."""
+        agents = tensordict["agents"]
+        return cls(
+            scene,
+            tensordict["timestep"][:, 0],
+            *(agents[key] for key in ("states", "valid", "accel")),
+            plan=tensordict.get(("traffic", "plan"), None),
+            yaw_rate=agents["yaw_rate"][:, 0],
+        )

@@ -1,1 +1,1 @@
-"""Background traffic to compare with, on the synthesizer's interface."""
+"""Who drives the other vehicles: one interface, the plain methods behind it, and its TorchRL transform."""

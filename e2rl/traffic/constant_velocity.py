@@ -1,31 +1,20 @@
-"""Constant velocity: everybody goes straight on from the causal start state, wherever that leads."""
+"""Constant velocity: everybody goes straight on from its causal start state."""
 
-import torch
 from torch import Tensor
 
-from e2rl.prior.prior import Plan
-from e2rl.scene.recording import DT
 from e2rl.sim.world import World
-from e2rl.synthesizer.episode import Episode
-from e2rl.traffic.traffic import Baseline, off_route, steps_ahead
+from e2rl.traffic.traffic import State, Traffic, TrafficPlan, keep_velocity, steps_ahead
 
 
-class ConstantVelocity(Baseline):
+class ConstantVelocity(Traffic):
     """Straight along the start heading at the start speed; parked vehicles stay parked, nobody ever leaves."""
 
-    def plan(self, episode: Episode, world: World) -> Plan:
+    stochastic = False
+
+    def replan(self, state: State, world: World, ego_plan: Tensor) -> tuple[State, TrafficPlan]:
         """States at the coming steps, from the start frame on."""
-        parked = episode.routed.parked
-        start = world.scene["start"][:, : parked.shape[1]]
-        start = torch.cat([start[..., :3], start[..., 3:].masked_fill(parked[..., None], 0.0)], -1)
-        states = straight_on(start, steps_ahead(world))
-        there = world.valid[:, : parked.shape[1], None].expand(states.shape[:-1])
-        return Plan(off_route(states), there)
-
-
-def straight_on(start: Tensor, step: Tensor) -> Tensor:
-    """States [B, V, H, 4] of vehicles start [B, V, 4] at steps [B or 1, H] after the start frame."""
-    way = start[..., 3, None] * DT * step[:, None]
-    direction = torch.stack([start[..., 2].cos(), start[..., 2].sin()], -1)[..., None, :]
-    xy = start[..., None, :2] + way[..., None] * direction
-    return torch.cat([xy, start[..., None, 2:].expand(*xy.shape[:-1], 2)], -1)
+        scene, vehicles = world.scene, world.scene["route_log"].shape[1]
+        start = scene["start"][:, :vehicles].clone()
+        start[..., 3] = start[..., 3].masked_fill(scene["parked"][:, :vehicles], 0.0)
+        states = keep_velocity(start, steps_ahead(world)[:, None])
+        return state, TrafficPlan(states, world.valid[:, :vehicles, None].expand(states.shape[:-1]))

@@ -1,8 +1,8 @@
-"""IDM lane-following under the prior's own acceleration bounds, standing cars frozen: the traffic a prior must beat.
+"""IDM lane-following under the prior's acceleration bounds, standing cars frozen: the traffic that a prior must beat.
 
-Every vehicle keeps the route candidate nearest to it, returns to its middle, and accelerates by the Intelligent Driver
-Model (Treiber et al. 2000) behind the nearest agent or red light ahead. Bounds, decoder and the end of a vehicle at the
-map's border are those of the prior (e2rl/prior/bounds.py, lane_relative.py).
+Every vehicle keeps the route candidate nearest to it, returns to its centreline, and accelerates by the Intelligent
+Driver Model (Treiber et al. 2000) behind the nearest agent or red light ahead. Bounds, decoder and the end of a vehicle
+at the map's border are those of the prior (e2rl/prior/bounds.py, lane_relative.py).
 """
 
 from dataclasses import dataclass, replace
@@ -12,117 +12,105 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.ego.idm import LINE_GAP, idm_acceleration
-from e2rl.prior.bounds import BoundSettings, Surroundings, bounded, under
+from e2rl.prior.bounds import Surroundings, bounded, under
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, decode, locate
-from e2rl.prior.prior import STANDING, Plan
-from e2rl.prior.routed import RoutedScene
-from e2rl.scene.recording import LIGHT_RED, LIGHT_YELLOW
+from e2rl.prior.prior import STANDING, Prior
+from e2rl.prior.routed import RoutedScene, route_scene
 from e2rl.scene.route import SPACING
 from e2rl.sim.leaders import FREE, leaders
+from e2rl.sim.traffic_light import light_state_at, stop_line_distance
 from e2rl.sim.world import World
-from e2rl.synthesizer.episode import Episode
-from e2rl.traffic.traffic import Baseline
+from e2rl.traffic.traffic import REPLAN_STEPS, Traffic, TrafficPlan
+
+ARRIVAL = 20.0  # m, arc length near which a route passes its vehicle's start
 
 
-@dataclass(frozen=True)
-class IDMSettings:
-    """Time gap [s], gap at standstill [m], maximum acceleration and comfortable braking [m/s^2], exponent; speed [m/s]
-    wanted where no limit is known and the vehicle is slower."""
+@dataclass
+class IDMState:
+    """routed: the vehicles' routes; lane [B, V]: lane states to which the executed plans led."""
 
-    headway: float = 1.5
-    standstill_gap: float = 2.0
-    acceleration: float = 1.0
-    braking: float = 2.0
-    exponent: float = 4.0
-    speed: float = 10.0
+    routed: RoutedScene
+    lane: LaneState
 
 
-class IDM(Baseline):
+class IDM(Traffic):
     """Car-following on the nearest route candidate; vehicles that stand at the start stand for good."""
 
-    def __init__(self, bounds: BoundSettings, settings: IDMSettings | None = None):
-        """bounds: those of the prior it is compared with."""
-        self.bounds, self.settings = bounds, settings or IDMSettings()
+    stochastic = False
 
-    def routes(self, scene: TensorDictBase) -> Tensor:
-        """The nearest candidate [B, V] of everybody; the ego's is its mission."""
-        nearest = torch.zeros_like(scene["route_log"])
-        return torch.cat([scene["route_log"][:, :1], nearest[:, 1:]], 1)
+    def __init__(
+        self,
+        prior: Prior,
+        headway: float = 1.5,
+        standstill_gap: float = 2.0,
+        acceleration: float = 1.0,
+        braking: float = 2.0,
+        exponent: float = 4.0,
+        speed: float = 10.0,
+    ) -> None:
+        """prior: whose bounds apply; fields: conf/synthesizer/idm.yaml."""
+        self.bounds, self.speed, self.standstill_gap, self.braking = prior.bounds, speed, standstill_gap, braking
+        self.driver = (acceleration, braking, headway, standstill_gap, exponent)
 
-    def plan(self, episode: Episode, world: World) -> Plan:
+    @torch.no_grad()
+    def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> IDMState:
+        """Start states on the nearest candidate of everybody; the ego's is its mission."""
+        mission = scenes["route_log"][:, :1]
+        routed = route_scene(scenes, torch.cat([mission, torch.zeros_like(scenes["route_log"][:, 1:])], 1))
+        vehicles = routed.route.shape[1]
+        start = (scenes[key][:, :vehicles] for key in ("start", "start_accel", "start_yaw_rate"))
+        return IDMState(routed, locate(*start, routed.points, torch.full_like(routed.length, ARRIVAL)))
+
+    @torch.no_grad()
+    def replan(self, state: IDMState, world: World, ego_plan: Tensor) -> tuple[IDMState, TrafficPlan]:
         """One acceleration for the whole plan, under the bounds of the executed part."""
-        routed = episode.routed
+        routed = state.routed
         vehicles = routed.route.shape[1]
         present = world.valid[:, :vehicles]
-        state = _with_ego(episode.state, world, routed)
-        wanted = self._wanted(routed, state, world).clamp(min=self.bounds.floor)
-        x = (wanted / ACCEL_SCALE)[..., None].expand(*state.v.shape, KNOTS)
-        x = torch.cat([x, x.new_zeros(*state.v.shape, SIZE - KNOTS)], -1)
+        lane = _with_ego(state.lane, world, routed)
+        wanted = self._wanted(routed, lane, world).clamp(min=self.bounds.floor)
+        x = (wanted / ACCEL_SCALE)[..., None].expand(*lane.v.shape, KNOTS)
+        x = torch.cat([x, x.new_zeros(*lane.v.shape, SIZE - KNOTS)], -1)
         frozen = routed.parked | (world.scene["start"][:, :vehicles, 3] < STANDING) | ~present
-        around = Surroundings(world.states, routed.size, world.valid, torch.zeros_like(present))
-        motion = bounded(
-            self.bounds,
-            lambda cap: _held(decode(*under(cap, x, state, self.bounds.onset), routed.points), state, frozen),
-            state,
-            around,
-        )
+
+        def decoded(cap: Tensor | None) -> LaneState:
+            return _held(decode(*under(cap, x, lane, self.bounds.onset), routed.points), lane, frozen)
+
+        everybody = Surroundings(world.states, routed.size, world.valid, torch.zeros_like(present))
+        motion = bounded(self.bounds, decoded, lane, everybody)
         gone = routed.open[..., None] & (motion.s >= routed.length[..., None]) & routed.has_lane[..., None]
-        return Plan(motion, present[..., None] & ~(gone.cumsum(-1) > 0))
+        plan = TrafficPlan(motion.states(), present[..., None] & ~(gone.cumsum(-1) > 0), route=routed.route)
+        return IDMState(routed, motion.map(lambda value: value[..., REPLAN_STEPS - 1])), plan
 
-    def _wanted(self, routed: RoutedScene, state: LaneState, world: World) -> Tensor:
+    def _wanted(self, routed: RoutedScene, lane: LaneState, world: World) -> Tensor:
         """IDM acceleration [B, V] behind the leader or the light, whichever brakes harder."""
-        own, vehicles = self.settings, state.v.shape[1]
+        vehicles = lane.v.shape[1]
         length, width = routed.size[:, :vehicles, 0], routed.size[:, :vehicles, 1]
-        gap, speed, _ = leaders(state.s, width, length, routed.points, world.states, routed.size, world.valid, state.d)
+        gap, speed, _ = leaders(lane.s, width, length, routed.points, world.states, routed.size, world.valid, lane.d)
         gap = torch.where(gap < FREE, gap, torch.inf)
-        at = (state.s / SPACING).round().long().clamp(0, routed.limit.shape[-1] - 1)
+        at = (lane.s / SPACING).round().long().clamp(0, routed.limit.shape[-1] - 1)
         limit = routed.limit.gather(-1, at[..., None])[..., 0]
-        desired = torch.where(limit > 0, limit, world.scene["start"][:, :vehicles, 3].clamp(min=own.speed))
-        line = _red_light(routed, state, world.step, 2 * own.braking) - length / 2 - LINE_GAP + own.standstill_gap
-        return torch.minimum(
-            *(
-                idm_acceleration(
-                    state.v,
-                    desired,
-                    free.clamp(min=0.1),
-                    leading,
-                    own.acceleration,
-                    own.braking,
-                    own.headway,
-                    own.standstill_gap,
-                    own.exponent,
-                )
-                for free, leading in ((gap, speed.clamp(min=0)), (line, torch.zeros_like(line)))
-            )
-        )
+        desired = torch.where(limit > 0, limit, world.scene["start"][:, :vehicles, 3].clamp(min=self.speed))
+        light = light_state_at(routed.light_state, routed.light, world.step)
+        brake = 2 * self.braking
+        line = stop_line_distance(light, routed.light_s - lane.s[..., None], lane.v, brake, brake)
+        line = line - length / 2 - LINE_GAP + self.standstill_gap
+        behind = idm_acceleration(lane.v, desired, gap.clamp(min=0.1), speed.clamp(min=0), *self.driver)
+        halting = idm_acceleration(lane.v, desired, line.clamp(min=0.1), torch.zeros_like(line), *self.driver)
+        return torch.minimum(behind, halting)
 
 
-def _red_light(routed: RoutedScene, state: LaneState, step: Tensor, brake: float) -> Tensor:
-    """Metres [B, V] to the next stop line of a red or yellow light at which `brake` m/s^2 still halts; inf for none."""
-    if not routed.light_state.shape[-1]:
-        return torch.full_like(state.s, torch.inf)
-    row = torch.arange(len(step), device=step.device)
-    now = routed.light_state[row, step.clamp(max=routed.light_state.shape[1] - 1)]
-    ahead = routed.light_s - state.s[..., None]
-    colour = now[:, None].expand(-1, ahead.shape[1], -1).gather(-1, routed.light.clamp(min=0))
-    stops = (routed.light >= 0) & ((colour == LIGHT_RED) | (colour == LIGHT_YELLOW)) & (ahead > 0)
-    stops = stops & (state.v[..., None] ** 2 < 2 * brake * ahead)
-    return ahead.masked_fill(~stops, torch.inf).amin(-1)
-
-
-def _with_ego(state: LaneState, world: World, routed: RoutedScene) -> LaneState:
+def _with_ego(lane: LaneState, world: World, routed: RoutedScene) -> LaneState:
     """The lane states with the ego where it really is."""
-    ego = slice(0, 1)
-    accel = world.accel[:, ego]
-    now = locate(world.states[:, ego], accel, torch.zeros_like(accel), routed.points[:, ego])
-    return LaneState(**{name: torch.cat([getattr(now, name), value[:, 1:]], 1) for name, value in vars(state).items()})
+    accel = world.accel[:, :1]
+    now = locate(world.states[:, :1], accel, torch.zeros_like(accel), routed.points[:, :1])
+    return LaneState(**{name: torch.cat([getattr(now, name), value[:, 1:]], 1) for name, value in vars(lane).items()})
 
 
-def _held(motion: LaneState, state: LaneState, frozen: Tensor) -> LaneState:
+def _held(motion: LaneState, lane: LaneState, frozen: Tensor) -> LaneState:
     """The motion [B, V, HORIZON] with frozen [B, V] vehicles standing where they are."""
-    still = state.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
+    still = lane.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
     zero = torch.zeros_like(still.v)
     still = replace(still, v=zero, a=zero)
-    return LaneState(
-        **{name: torch.where(frozen[..., None], getattr(still, name), value) for name, value in vars(motion).items()}
-    )
+    moved = {name: torch.where(frozen[..., None], getattr(still, name), value) for name, value in vars(motion).items()}
+    return LaneState(**moved)

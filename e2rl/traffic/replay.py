@@ -1,23 +1,21 @@
 """Log replay: everybody drives as recorded, and is there when recorded."""
 
 import torch
+from torch import Tensor
 
-from e2rl.prior.prior import Plan
 from e2rl.sim.world import World
-from e2rl.synthesizer.episode import Episode
-from e2rl.traffic.traffic import Baseline, off_route, steps_ahead
+from e2rl.traffic.traffic import State, Traffic, TrafficPlan, steps_ahead
 
 
-class Replay(Baseline):
-    """The recording, smoothed as it is in the scene; after its end a vehicle is gone, in its gaps too."""
+class Replay(Traffic):
+    """The smoothed recording; a vehicle is absent in gaps of its track and after its end."""
 
-    predicts = False
+    stochastic, predicts, replays_log = False, False, True
 
-    def plan(self, episode: Episode, world: World) -> Plan:
-        """Recorded states and validity of the coming steps; nobody is there after the recording's last step."""
-        vehicles = episode.routed.route.shape[1]
+    def replan(self, state: State, world: World, ego_plan: Tensor) -> tuple[State, TrafficPlan]:
+        """Recorded states and presence of the coming steps."""
         logged, valid = world.scene["logged"], world.scene["logged_valid"]
-        step = steps_ahead(world)
+        vehicles, step = world.scene["route_log"].shape[1], steps_ahead(world)
         row, at = torch.arange(len(step), device=step.device)[:, None], step.clamp(max=logged.shape[1] - 1)
         known = valid[row, at, :vehicles] & (step < logged.shape[1])[..., None]
-        return Plan(off_route(logged[row, at, :vehicles].transpose(1, 2)), known.transpose(1, 2))
+        return state, TrafficPlan(logged[row, at, :vehicles].transpose(1, 2), known.transpose(1, 2))

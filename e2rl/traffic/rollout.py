@@ -1,21 +1,24 @@
-"""Closed-loop rollouts of scenes with an ego and synthesized traffic: what evaluation measures and D' is made of."""
+"""Closed-loop rollouts of scenes with an ego and live traffic: what evaluation measures and D' is made of."""
 
 import time
 from dataclasses import replace
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from e2rl.ego.base import Ego, EgoPolicy
 from e2rl.scene.recording import VEHICLE
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.synthesizer.synthesizer import Synthesizer
+from e2rl.traffic.pool import TrafficPool
+from e2rl.traffic.traffic import Traffic
 from e2rl.traffic.transform import AdversarialSynthesizer
 
 MAP_KEYS = ("lane_points", "lane_index", "lane_width", "drivable_points", "drivable_index")
+SCENE_KEYS = ("size", "agent_type", "parked", "logged", *MAP_KEYS)
 
 
 @torch.no_grad()
@@ -25,102 +28,70 @@ def roll_out(
     seed: Tensor,
     eta: Tensor,
     ego: Ego,
-    synthesizer: Synthesizer,
+    traffic: Traffic,
     sim: SimSettings,
-    replan: int = 5,
     device: str = "cpu",
 ) -> dict:
     """Rollouts of scenes index [B] with seeds [B] and intensities eta [B] to their last step.
 
     The rollout dict that e2rl.metrics and e2rl.evaluation.files read: states [B, T+1, N, 4], valid, size, agent_type,
-    simulated, adversaries, logged, logged_valid, map keys, seed, scene_id, location, seconds (wall time a rollout) and
-    the transport (path KL of adversaries and others, anchor jump), plus routes [B, V].
+    simulated, adversaries, logged, logged_valid, map keys, seed, scene_id, location, seconds (wall time a rollout),
+    transport (path KL of adversaries and others, anchor jump), routes [B, V] and contact [B] (the ego touched a
+    vehicle).
     """
     begin = time.perf_counter()
-    settings = replace(sim, end_on_contact=False, end_off_road=False)
-    transform = AdversarialSynthesizer(synthesizer, ego, lambda count: (index, seed, eta), replan)
-    env = TransformedEnv(DrivingEnv(scenes, settings, len(index), device), transform)
-    policy = EgoPolicy(ego, env)
-    states, valid = [], []
+    settings = replace(sim, end_on_contact=False, end_off_road=False, end_when_gone=False)
+    settings.replay_ego = sim.replay_ego or ego.replays_log
+    pool = TrafficPool.live(index.cpu(), eta.cpu().float(), seed.cpu())
+    base = DrivingEnv(scenes, settings, len(index), device, agents=True)
+    env = TransformedEnv(base, AdversarialSynthesizer(pool, torch.arange, traffic, ego))
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        tensordict = env.reset()
-        world = env.base_env.world()
-        states.append(world.states), valid.append(world.valid)
-        contact = torch.zeros(len(index), dtype=torch.bool, device=world.states.device)
-        for _ in range(env.base_env.horizon):
-            tensordict = step_mdp(env.step(policy(tensordict)))
-            contact = contact | tensordict["metrics", "contact"][:, 0]
-            world = env.base_env.world()
-            states.append(world.states), valid.append(world.valid)
-    rollout = _rollout(
-        scenes,
-        index,
-        seed,
-        torch.stack(states, 1),
-        torch.stack(valid, 1),
-        world.scene,
-        transform.episode,
-        (time.perf_counter() - begin) / len(index),
-        settings.replay_ego,
-    )
-    return rollout | {"contact": contact.cpu()}
+        steps = env.rollout(base.horizon, EgoPolicy(ego, env))
+    names = {"scene_id": scenes.scene_id, "location": scenes.location}
+    rollout = {name: [values[i] for i in index.tolist()] for name, values in names.items()} | {"seed": seed.cpu()}
+    rollout |= {key: value.cpu() for key, value in _driven(steps, base.scene, settings.replay_ego).items()}
+    seconds = (time.perf_counter() - begin) / len(index)
+    return rollout | {"seconds": torch.full((len(index),), seconds)}
 
 
-def synthesize_traffic(
-    scenes: SceneSet, synthesizer: Synthesizer, sim: SimSettings, batch: int = 64, device: str = "cpu"
-):
-    """A function (ego, scene_index [S], eta, seed) -> the D' of Algorithm 1 against that ego: scene_index, states
-    [S, T+1, N, 4], valid, adversaries [S, N], contact [S] (the ego was hit by or hit a vehicle) and route [S, V]."""
+def _driven(steps: TensorDictBase, scene: TensorDictBase, replayed: bool) -> dict[str, Tensor]:
+    """The tensors of the rollout dict from the frames [B, T] of a rollout."""
+    agents, traffic = steps["next", "agents"], steps["next", "traffic"]
+    tracks = {name: torch.cat([steps["agents", name][:, :1], agents[name]], 1) for name in ("states", "valid")}
+    count, vehicles = tracks["states"].shape[2], traffic["adversary"].shape[2]
+    start = scene["valid"]
+    simulated = start & (torch.arange(count, device=start.device) < vehicles) & (scene["agent_type"] == VEHICLE)
+    simulated[:, 0] &= not replayed
+    acted = traffic["adversary"].any(1)
+    kl, last = traffic["path_kl"][:, -1], traffic[:, -1]
+    jump = last["anchor_jump"] if "anchor_jump" in last else torch.zeros_like(kl)
+    return {
+        **tracks,
+        **{key: scene[key] for key in SCENE_KEYS},
+        "logged_valid": scene["logged_valid"] & start[:, None],
+        "simulated": simulated,
+        "adversaries": torch.nn.functional.pad(acted, (0, count - vehicles)),
+        "routes": last["route"],
+        "transport_adversary": (kl * acted).sum(-1),
+        "transport_others": (kl * ~acted).sum(-1),
+        "transport_anchor": jump.sum(-1),
+        "contact": steps["next", "metrics", "contact"].any(1)[:, 0],
+    }
+
+
+def synthesize_traffic(scenes: SceneSet, traffic: Traffic, sim: SimSettings, batch: int = 64, device: str = "cpu"):
+    """A function (ego, scene_index [S], eta, seed) -> the D' of Algorithm 1 against that ego.
+
+    D': scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N], adversaries [S, N], contact [S] (the ego touched a
+    vehicle).
+    """
 
     def synthesize(ego: Ego, scene_index: Tensor, eta: float, seed: int) -> dict[str, Tensor]:
         parts = []
         for rows in scene_index.split(batch):
-            noise = rows + seed * 1_000_003
-            parts.append(
-                roll_out(
-                    scenes, rows, noise, torch.full((len(rows),), float(eta)), ego, synthesizer, sim, device=device
-                )
-            )
-        names = {
-            "states": "states",
-            "valid": "valid",
-            "adversaries": "adversaries",
-            "contact": "contact",
-            "route": "routes",
-        }
-        return {"scene_index": scene_index} | {
-            name: torch.cat([part[key] for part in parts]) for name, key in names.items()
-        }
+            noise, intensity = rows + seed * 1_000_003, torch.full((len(rows),), float(eta))
+            parts.append(roll_out(scenes, rows, noise, intensity, ego, traffic, sim, device))
+        names = ("states", "valid", "adversaries", "contact")
+        return {"scene_index": scene_index} | {name: torch.cat([part[name] for part in parts]) for name in names}
 
     return synthesize
-
-
-def _rollout(scenes: SceneSet, index, seed, states, valid, scene, episode, seconds: float, replayed: bool) -> dict:
-    agents, vehicles = states.shape[2], episode.adversaries.shape[1]
-    start = scene["valid"]
-    simulated = start & (torch.arange(agents, device=start.device) < vehicles) & (scene["agent_type"] == VEHICLE)
-    simulated[:, 0] &= not replayed
-    adversaries = torch.zeros_like(start)
-    adversaries[:, :vehicles] = episode.adversaries
-    acted = episode.adversaries
-    rollout = {
-        "states": states,
-        "valid": valid,
-        "size": scene["size"],
-        "agent_type": scene["agent_type"],
-        "parked": scene["parked"],
-        "simulated": simulated,
-        "adversaries": adversaries,
-        "logged": scene["logged"],
-        "logged_valid": scene["logged_valid"] & start[:, None],
-        **{key: scene[key] for key in MAP_KEYS},
-        "seed": seed,
-        "seconds": torch.full((len(index),), seconds),
-        "routes": episode.routed.route,
-        "transport_adversary": (episode.kl * acted).sum(-1),
-        "transport_others": (episode.kl * ~acted).sum(-1),
-        "transport_anchor": episode.jump.sum(-1),
-    }
-    rollout = {key: value.cpu() for key, value in rollout.items()}
-    where = index.tolist()
-    return rollout | {"scene_id": [scenes.scene_id[i] for i in where], "location": [scenes.location[i] for i in where]}

@@ -1,63 +1,114 @@
-"""What all baseline traffic shares: the synthesizer's interface (begin, replan) without a prior, noise or control."""
+"""The extension point for whatever drives the other vehicles: recordings, car-following, the prior, e2 and its rivals.
+
+A method is a class with one or two methods, and a YAML file in conf/synthesizer with its `_target_`, a `name` and its
+settings. This one is whole; it lets every vehicle brake to a halt:
+
+    class Halt(Traffic):
+        stochastic = False
+
+        def __init__(self, prior=None, braking: float = 2.0):
+            self.braking = braking
+
+        def replan(self, state, world, ego_plan):
+            now = world.states[:, : world.scene["route_log"].shape[1], None]        # [B, V, 1, 4]
+            time = DT * torch.arange(1, HORIZON + 1, device=now.device)              # [H]
+            time = torch.minimum(time, now[..., 3] / self.braking)                   # [B, V, H], until the halt
+            way = now[..., 3] * time - self.braking * time**2 / 2
+            xy = now[..., :2] + way[..., None] * torch.stack([now[..., 2].cos(), now[..., 2].sin()], -1)
+            rest = torch.stack([now[..., 2].expand_as(way), now[..., 3] - self.braking * time], -1)
+            present = world.valid[:, : way.shape[1], None].expand_as(way)
+            return state, TrafficPlan(torch.cat([xy, rest], -1), present)
+"""
 
 from abc import ABC, abstractmethod
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.ego.base import Ego
-from e2rl.prior.lane_relative import HORIZON, LaneState, locate
-from e2rl.prior.prior import Plan
-from e2rl.prior.routed import route_scene
+from e2rl.prior.lane_relative import HORIZON
+from e2rl.prior.prior import Prior
+from e2rl.scene.recording import DT
 from e2rl.sim.world import World
-from e2rl.synthesizer.episode import Episode
 
-ARRIVAL = 20.0  # m, arc length near which a route passes its vehicle's start
+REPLAN_STEPS = 5  # steps of DT between two replans: 0.5 s, the same for every method
+State = Any  # of B running scenes: a tensor, a TensorDict or a (nested) dataclass of them, batch first; or None
 
 
-class Baseline(ABC):
-    """Deterministic background traffic: one rollout of a scene stands for all seeds."""
+@dataclass
+class TrafficPlan:
+    """Planned motion of the vehicles of B scenes over the coming HORIZON steps.
 
-    deterministic = True
-    predicts = True  # False: it looks the future up, so there is no open-loop error to report
+    states [B, V, HORIZON, 4] (the ego's row is ignored); present [B, V, HORIZON] bool: false from the step on at which
+    a vehicle has left; adversary [B, V] bool: under adversarial control now (None: nobody); path_kl [B, V]: discrete
+    path KL of the control since the start (None: 0); route [B, V] int64: route candidates followed, -1 none (None: the
+    recorded ones); figures {name: [B, V]}: what else a method reports, written under ("traffic", name).
+    """
 
-    def routes(self, scene: TensorDictBase) -> Tensor:
-        """Route candidates [B, V] that the vehicles are said to follow: the recorded ones, else the first."""
-        return scene["route_log"].clamp(min=0)
+    states: Tensor
+    present: Tensor
+    adversary: Tensor | None = None
+    path_kl: Tensor | None = None
+    route: Tensor | None = None
+    figures: dict[str, Tensor] = field(default_factory=dict)
 
-    @torch.no_grad()
-    def begin(self, scene: TensorDictBase, seed: Tensor, eta: Tensor) -> Episode:
-        """Episodes of scenes [B]; seed and eta are kept and change nothing."""
-        routed = route_scene(scene, self.routes(scene))
-        vehicles = routed.route.shape[1]
-        state = locate(
-            scene["start"][:, :vehicles],
-            scene["start_accel"][:, :vehicles],
-            scene["start_yaw_rate"][:, :vehicles],
-            routed.points,
-            torch.full_like(routed.length, ARRIVAL),
-        )
-        return Episode.start(seed, eta, routed, state)
 
-    @torch.no_grad()
-    def replan(self, episode: Episode, world: World, ego_plan: Tensor, ego: Ego | None = None) -> tuple[Episode, Plan]:
-        """The episodes and the plan of the coming HORIZON steps; neither the ego nor its plan is asked."""
-        return replace(episode, replans=episode.replans + 1), self.plan(episode, world)
+class Traffic(ABC):
+    """Drives all vehicles but the ego of B scenes at once. Built as `_target_(prior=prior, **settings)`.
+
+    stochastic: seeds matter; adversarial: the intensity eta matters; predicts: plans can be compared with the log in
+    open loop; replays_log: it is the recording itself; queries_ego: `replan` takes `react`, a function that asks the
+    ego how it would drive against a plan: react(rows [G] of the batch, states [G, V, HORIZON, 4]) -> [G, HORIZON, 4];
+    figures: names of what its plans report; on_selection: told of every choice of adversaries, where it makes one.
+    """
+
+    stochastic = True
+    adversarial = False
+    predicts = True
+    replays_log = False
+    queries_ego = False
+    figures: tuple[str, ...] = ()
+    on_selection: Callable[[Any], None] | None = None
+
+    def __init__(self, prior: Prior | None = None) -> None:  # noqa: B027
+        """prior: the frozen prior of the run; methods without one ignore it."""
+
+    def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> State:
+        """State of new episodes in scenes [B], with seeds [B] int64 of their noise and intensities eta [B]."""
+        return None
 
     @abstractmethod
-    def plan(self, episode: Episode, world: World) -> Plan:
-        """Motion (fields [B, V, HORIZON]) and presence of the coming steps."""
+    def replan(self, state: State, world: World, ego_plan: Tensor) -> tuple[State, TrafficPlan]:
+        """State and plan at this moment, given the ego's planned states ego_plan [B, >= HORIZON, 4].
+
+        Called every REPLAN_STEPS steps; the first REPLAN_STEPS steps of a plan are driven as they stand.
+        """
+
+    def open_loop_plans(self, scene: TensorDictBase, seed: Tensor) -> Tensor:
+        """Joint plans [B, S, V, HORIZON, 4] of scenes [B] from their start frames; seed [S, B] int64: one per sample.
+
+        By default those of the first replan beside an ego that keeps its velocity.
+        """
+        world = World.at_start(scene)
+        ego_plan = keep_velocity(world.states[:, 0])
+        eta = torch.zeros(len(world.step), device=seed.device)
+        plans = [self.replan(self.reset(scene, one, eta), world, ego_plan)[1].states for one in seed]
+        return torch.stack(plans, 1)
+
+
+def keep_velocity(states: Tensor, steps: Tensor | None = None) -> Tensor:
+    """States [..., H, 4] of agents [..., 4] after `steps` [H] (or [..., H]) steps at constant velocity; default
+    1..HORIZON."""
+    steps = torch.arange(1, HORIZON + 1, device=states.device) if steps is None else steps
+    way = states[..., 3, None] * DT * steps
+    direction = torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)[..., None, :]
+    xy = states[..., None, :2] + way[..., None] * direction
+    return torch.cat([xy, states[..., None, 2:].expand(*xy.shape[:-1], 2)], -1)
 
 
 def steps_ahead(world: World) -> Tensor:
     """The coming simulated steps [B, HORIZON] int64."""
     return world.step[:, None] + torch.arange(1, HORIZON + 1, device=world.step.device)
-
-
-def off_route(states: Tensor) -> LaneState:
-    """States [..., 4] as a LaneState of vehicles whose place along a route nobody asks for."""
-    x, y, heading, v = states.unbind(-1)
-    zero = torch.zeros_like(v)
-    return LaneState(zero, zero, zero, zero, v, zero, x, y, heading, zero)

@@ -1,93 +1,188 @@
-"""AdversarialSynthesizer: the synthesizer as a TorchRL transform over DrivingEnv."""
+"""AdversarialSynthesizer: the TorchRL transform that gives every episode its scene and its traffic."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import Transform
 
 from e2rl.ego.base import Ego
 from e2rl.prior.lane_relative import HORIZON
-from e2rl.sim.world import World
-from e2rl.synthesizer.episode import Episode, put_rows, take_rows
-from e2rl.synthesizer.synthesizer import Synthesizer
+from e2rl.sim.env import DrivingEnv
+from e2rl.traffic.lookahead import Lookahead
+from e2rl.traffic.pool import LIVE, RECORDED, TrafficPool
+from e2rl.traffic.rows import put_rows, take_rows
+from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan, keep_velocity
+
+Draw = Callable[[int], Tensor]  # count -> pool rows [count] of the episodes that begin
 
 
 class AdversarialSynthesizer(Transform):
-    """Injects scenes at reset and re-plans their traffic every `replan` steps against the ego's current plan.
+    """Draws a pool row for every new episode, injects its scene, and drives its traffic.
 
-    draw(count) -> (scene indices [count], seeds [count], eta [count]) names the scenes of a reset. Executed states are
-    the planned ones; a vehicle whose route ends at the map's border is gone from that step on.
+    Rows with recorded or stored traffic replay it. LIVE rows react: before a step at which a replan is due (every
+    REPLAN_STEPS steps) the traffic method plans against ("ego", "plan") [B, H, 4], which the policy has written at the
+    same moment; the ego of a policy that writes none is expected to keep its velocity.
+
+    Writes ("traffic", ...): row [B, 1] int64, eta [B, 1], adversary [B, V] bool (under control now) and, with a traffic
+    method, plan [B, V, H, 4] (states planned for the coming steps; for the policy alone, not stacked over time),
+    path_kl [B, V], route [B, V] int64 and the method's figures [B, V].
     """
 
-    def __init__(
-        self, synthesizer: Synthesizer, ego: Ego, draw: Callable[[int], tuple[Tensor, Tensor, Tensor]], replan: int = 5
-    ):
+    def __init__(self, pool: TrafficPool, draw: Draw, traffic: Traffic | None = None, ego: Ego | None = None) -> None:
+        """traffic: drives LIVE rows; ego: whom a method that queries the ego asks."""
         super().__init__()
-        self.synthesizer, self.ego, self.draw, self.every = synthesizer, ego, draw, replan
-        self.episode: Episode | None = None
-        self._pending: tuple[Tensor, Tensor, Tensor] | None = None
-        self._plan: tuple[Tensor, Tensor] | None = None  # states [B, H, N, 4] and valid [B, H, N] being executed
-        self._planned: Tensor | None = None  # [B] step of the plan
+        self.pool, self.draw, self.traffic, self.ego = pool, draw, traffic, ego
+        self._drawn: Tensor | None = None  # [B] pool row of each episode
+        self._state: State = None
+        self._plan: TensorDict | None = None  # [B] the plan being driven
+        self._planned_at: Tensor | None = None  # [B] step of its planning
 
     @property
-    def _env(self):
+    def _env(self) -> DrivingEnv:
         return self.parent.base_env
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
-        batch = self._env.batch_size[0]
-        tensordict = TensorDict({}, batch_size=[batch]) if tensordict is None else tensordict
+        env = self._env
+        if tensordict is None:
+            tensordict = TensorDict({}, batch_size=env.batch_size, device=env.device)
         mask = tensordict.get("_reset", None)
-        mask = torch.ones(batch, dtype=torch.bool) if mask is None else mask.reshape(batch)
-        device = self._env.device
-        rows = mask.to(device).nonzero().squeeze(-1)
-        index, seed, eta = (value.to(device) for value in self.draw(len(rows)))
-        chosen = self._env.scene["scene_index"].clone()  # rows that go on keep their scene
-        chosen[rows] = index
-        tensordict["scene_index"] = chosen[:, None]
-        self._pending = (rows, seed, eta)
+        mask = torch.ones(env.batch_size, dtype=torch.bool) if mask is None else mask.view(env.batch_size).cpu()
+        rows = mask.nonzero()[:, 0]
+        if self._drawn is None:
+            self._drawn = torch.zeros(env.batch_size, dtype=torch.int64)
+        self._drawn[rows] = self.draw(len(rows)).cpu()
+        self._inject(rows)
+        tensordict["scene_index"] = self.pool.scene_index[self._drawn][:, None].to(env.device)
         return tensordict
 
+    def _inject(self, rows: Tensor) -> None:
+        """Schedule stored traffic for the coming reset of environments rows [b]."""
+        source = self.pool.source[self._drawn[rows]]
+        stored = source >= 0
+        if bool(stored.any()):
+            at = source[stored]
+            self._env.set_traffic(rows[stored].to(self._env.device), self.pool.states[at], self.pool.valid[at])
+
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        rows, seed, eta = self._pending
-        device = self._env.device
-        world = self._env.world()
-        fresh = self.synthesizer.begin(world.scene[rows], seed, eta)
-        self.episode = fresh if self.episode is None else put_rows(self.episode, rows, fresh)
-        self.ego.reset(world)
+        if self.traffic is not None:
+            self._begin(tensordict_reset["timestep"][:, 0] == 0)
+        return self._write(tensordict_reset)
+
+    def _begin(self, first: Tensor) -> None:
+        """New states of the traffic method and no plan yet in environments first [B] bool that have just been reset."""
+        env, rows = self._env, first.nonzero()[:, 0]
+        world, drawn = env.world(), self._drawn[rows.cpu()]
+        seed, eta = (getattr(self.pool, name)[drawn].to(env.device) for name in ("seed", "eta"))
+        whole = self._plan is None or len(rows) == len(first)
+        fresh = self.traffic.reset(world.scene if whole else world.scene[rows], seed, eta)
+        self._state = fresh if whole else put_rows(self._state, rows, fresh)
         if self._plan is None:
-            shape = (len(world.step), HORIZON, world.states.shape[1])
-            self._plan = (world.states.new_zeros(*shape, 4), torch.zeros(shape, dtype=torch.bool, device=device))
-            self._planned = torch.zeros_like(world.step)
-        self._replan(rows, world)
-        return tensordict_reset
+            self._plan, self._planned_at = self._empty_plan(), torch.zeros_like(world.step)
+        vehicles = self._plan["states"].shape[1]
+        self._plan["states"][rows] = keep_velocity(world.states[rows, :vehicles])
+        self._plan["route"][rows] = world.scene["route_log"][rows].clamp(min=0)
+        for name in ("adversary", "path_kl", *self.traffic.figures):
+            self._plan[name][rows] = 0
+        self._planned_at[rows] = -REPLAN_STEPS
+
+    def _empty_plan(self) -> TensorDict:
+        shape, device = self._env.scene["route_log"].shape, self._env.device
+        zero, none = torch.zeros(shape, device=device), torch.zeros(shape, dtype=torch.bool, device=device)
+        plan = {"states": zero[..., None, None].repeat(1, 1, HORIZON, 4), "adversary": none, "path_kl": zero}
+        plan |= {"route": zero.long(), **{name: zero.clone() for name in self.traffic.figures}}
+        return TensorDict(plan, batch_size=shape[:1], device=device)
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Before a step: replan the live traffic of environments in which that is due."""
+        if self.traffic is not None:
+            step = tensordict["timestep"][:, 0]
+            live = (self.pool.source[self._drawn] == LIVE).to(step.device)
+            rows = (live & (step - self._planned_at >= REPLAN_STEPS)).nonzero()[:, 0]
+            if len(rows):
+                self._replan(rows, tensordict.get(("ego", "plan"), None))
+        return tensordict
+
+    @torch.no_grad()
+    def _replan(self, rows: Tensor, ego_plan: Tensor | None) -> None:
+        """New plans of environments rows [b], written into the environment's traffic."""
+        world = self._env.world()
+        ego_plan = keep_velocity(world.states[:, 0]) if ego_plan is None else ego_plan
+        whole = len(rows) == len(world.step)
+        state, now = (self._state, world) if whole else (take_rows(self._state, rows), take_rows(world, rows))
+        queries = {"react": Lookahead(self.ego, now)} if self.traffic.queries_ego and self.ego is not None else {}
+        state, plan = self.traffic.replan(state, now, ego_plan if whole else ego_plan[rows], **queries)
+        self._state = state if whole else put_rows(self._state, rows, state)
+        self._note(rows, plan)
+        self._planned_at[rows] = world.step[rows]
+        self._env.write_traffic(rows, plan.states, plan.present)
+
+    def _note(self, rows: Tensor, plan: TrafficPlan) -> None:
+        """Take over what a plan reports; what it does not stays as it is."""
+        given = {"states": plan.states, "adversary": plan.adversary, "path_kl": plan.path_kl, "route": plan.route}
+        for name, value in (given | plan.figures).items():
+            if value is not None:
+                self._plan[name][rows] = value.to(self._plan[name].dtype)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        world = self._env.world()
-        # An ego that has left truncates its episode; who goes on stepping still needs traffic.
-        running = (world.step < self._env.horizon) & ~next_tensordict["terminated"].reshape(-1)
-        due = (world.step - self._planned >= self.every) & running
-        rows = due.nonzero().squeeze(-1)
-        if len(rows):
-            self._replan(rows, world)
-        return next_tensordict
+        return self._write(next_tensordict)
 
-    def _replan(self, rows: Tensor, world: World) -> None:
-        """New plans of environments `rows`, written into the traffic."""
-        ego_plan = self.ego.announce(world)
-        if len(rows) == len(world.step):  # spares copies of maps
-            episode, plan = self.synthesizer.replan(self.episode, world, ego_plan, self.ego)
-            self.episode = replace(episode, state=plan.after(self.every))
+    def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The transform's keys at the present moment."""
+        device = self._env.device
+        drawn = self._drawn[:, None]
+        keys = {"row": drawn.to(device, copy=True), "eta": self.pool.eta[drawn].to(device)}
+        if self.traffic is None:
+            keys["adversary"] = self._stored_adversaries()
         else:
-            episode, plan = self.synthesizer.replan(
-                take_rows(self.episode, rows), take_rows(world, rows), ego_plan[rows], self.ego
-            )
-            self.episode = put_rows(self.episode, rows, replace(episode, state=plan.after(self.every)))
-        states, valid = plan.states().transpose(1, 2), plan.on_map.transpose(1, 2)
-        vehicles = states.shape[2]
-        self._plan[0][rows, :, :vehicles] = states
-        self._plan[1][rows, :, :vehicles] = valid
-        self._planned[rows] = world.step[rows]
-        self._env.write_traffic(self._planned, *self._plan, self.episode.routed.route)
+            step = tensordict["timestep"][:, 0]
+            keys |= self._plan.exclude("states").clone().to_dict()
+            keys["plan"] = self._plan_from(step)
+            replayed = (self.pool.source[self._drawn] != LIVE).to(device)
+            if bool(replayed.any()):
+                keys["adversary"] = torch.where(replayed[:, None], self._stored_adversaries(), keys["adversary"])
+        tensordict["traffic"] = TensorDict(keys, batch_size=tensordict.batch_size, device=device)
+        return tensordict
+
+    def _plan_from(self, step: Tensor) -> Tensor:
+        """States [B, V, H, 4] planned for the steps after `step` [B], the last one held."""
+        states = self._plan["states"]
+        age = (step - self._planned_at.clamp(min=0)).clamp(min=0)
+        ahead = (age[:, None] + torch.arange(HORIZON, device=age.device)).clamp(max=HORIZON - 1)
+        row = torch.arange(len(age), device=age.device)[:, None]
+        return states.transpose(1, 2)[row, ahead].transpose(1, 2)
+
+    def _stored_adversaries(self) -> Tensor:
+        """Bool [B, V]: adversaries of stored traffic; nobody in recorded and live rows."""
+        env, source = self._env, self.pool.source[self._drawn]
+        vehicles = env.scene["route_log"].shape[1]
+        none = torch.zeros(len(source), vehicles, dtype=torch.bool)
+        if self.pool.adversaries is not None:
+            stored = self.pool.adversaries[source.clamp(min=0), :vehicles]
+            none = torch.where((source > RECORDED)[:, None], stored, none)
+        return none.to(env.device)
+
+    def _post_step_mdp_hooks(self, tensordict: TensorDictBase, tensordict_: TensorDictBase):
+        """Drop the plan from what is stacked over time: 0.8 kB a vehicle and step, of use to the policy alone."""
+        for key in (("traffic", "plan"), ("next", "traffic", "plan")):
+            if key in tensordict.keys(True):
+                del tensordict[key]
+        return tensordict, tensordict_
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Declares the ("traffic", ...) keys."""
+        env = self._env
+        batch, vehicles = env.scene["route_log"].shape
+
+        def number(*size: int, dtype: torch.dtype = torch.float32) -> Unbounded:
+            return Unbounded((batch, *size), dtype=dtype, device=env.device)
+
+        flags = Binary(vehicles, shape=(batch, vehicles), dtype=torch.bool, device=env.device)
+        specs = {"row": number(1, dtype=torch.int64), "eta": number(1), "adversary": flags}
+        if self.traffic is not None:
+            specs |= {"plan": number(vehicles, HORIZON, 4), "route": number(vehicles, dtype=torch.int64)}
+            specs |= {name: number(vehicles) for name in ("path_kl", *self.traffic.figures)}
+        observation_spec["traffic"] = Composite(**specs, shape=[batch], device=env.device)
+        return observation_spec

@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 from e2rl.ego.replay import ReplayEgo
 from e2rl.errors import InputError
 from e2rl.evaluation.files import command_line, git_commit
-from e2rl.evaluation.protocol import Method, run_protocol
+from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.learning.prior_training.distributed import joined
 from e2rl.learning.prior_training.settings import TrainingSettings
 from e2rl.learning.prior_training.training import ClosedLoop, held_out, train_prior
@@ -21,7 +21,7 @@ from e2rl.scene.scene import SceneSet
 from e2rl.scene.source import load_scenes
 from e2rl.settings import settings_of
 from e2rl.sim.env import SimSettings
-from e2rl.synthesizer.synthesizer import Synthesizer
+from e2rl.traffic.nominal import NominalTraffic
 
 FIGURES = ("real", "aor_step", "cfr_bg")  # of the closed loop at a validation
 
@@ -82,17 +82,8 @@ def _origin(scenes: SceneSet, settings: TrainingSettings, seconds: float) -> dic
 
 def _nominal(prior: Prior, scenes: SceneSet, device: str, folder: Path | None, **fields) -> list[dict]:
     """Metrics rows of the unguided prior as traffic round the replayed ego."""
-    return run_protocol(
-        scenes,
-        [Method("nominal", Synthesizer(prior), 0.0)],
-        ReplayEgo(),
-        "replay",
-        [0],
-        SimSettings(replay_ego=True),
-        folder,
-        device=device,
-        **fields,
-    )
+    setup = Setup(scenes, ReplayEgo(), "replay", SimSettings(), device=device)
+    return run_protocol(setup, [Method("nominal", NominalTraffic(prior))], [0], folder, **fields)
 
 
 def _closed_loop(scenes: SceneSet, settings: TrainingSettings, device: str) -> ClosedLoop:

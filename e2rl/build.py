@@ -1,0 +1,239 @@
+"""From a run's configuration to its objects: prior, traffic methods, ego, simulator settings."""
+
+import copy
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException, InstantiationException
+from hydra.types import RunMode
+from hydra.utils import instantiate
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from e2rl.ego.base import Ego
+from e2rl.errors import InputError
+from e2rl.evaluation.processes import cores
+from e2rl.evaluation.protocol import Method
+from e2rl.metrics.catalogue import CLOSED_LOOP
+from e2rl.prior.bounds import BoundSettings
+from e2rl.prior.checkpoint import load_prior
+from e2rl.prior.prior import Prior, SamplerSettings
+from e2rl.settings import check_choice, settings_of
+from e2rl.sim.env import SimSettings
+from e2rl.traffic.traffic import Traffic
+
+FIGURES = ("intensity", "skeleton")
+VARIED = ("prior", "synthesizer")  # groups that the variants of a table may change
+
+
+# --- configuration
+
+
+def conf_folder() -> Path:
+    """The folder of the configuration: installed with the package, or conf/ of a checkout."""
+    package = Path(__file__).parent
+    installed = package / "commands" / "conf"
+    return installed if installed.is_dir() else package.parent / "conf"
+
+
+def load_config(name: str = "evaluate", overrides: tuple[str, ...] | list[str] = ()) -> DictConfig:
+    """The configuration of train or evaluate with Hydra overrides, outside of the scripts."""
+    if GlobalHydra.instance().is_initialized():
+        return compose(name, list(overrides))
+    with initialize_config_dir(str(conf_folder().resolve()), version_base="1.3"):
+        return compose(name, list(overrides))
+
+
+def load_choice(group: str, name: str) -> DictConfig:
+    """The file conf/<group>/<name>.yaml, of the running script's search path, where there is one.
+
+    Raises InputError listing the choices where there is none of this name.
+    """
+    if not GlobalHydra.instance().is_initialized():
+        with initialize_config_dir(str(conf_folder().resolve()), version_base="1.3"):
+            return load_choice(group, name)
+    loader = GlobalHydra.instance().config_loader()
+    try:
+        config = loader.load_configuration(None, [f"+{group}={name}"], RunMode.RUN, validate_sweep_overrides=False)
+    except HydraException as error:
+        choices = ", ".join(loader.get_group_options(group))
+        raise InputError(f"{group}={name}: none of {choices}; add a file to the group in conf/") from error
+    return config[group]
+
+
+def resolved(config: DictConfig) -> dict[str, Any]:
+    """The configuration as plain containers, for the files of a run."""
+    plain = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
+
+
+def built(config: DictConfig, where: str, kind: type, **given: Any) -> Any:
+    """What `_target_` of a group builds, outside code included; InputError where it cannot be built or is no `kind`."""
+    settings = {key: value for key, value in config.items() if key != "name"}
+    target = settings.get("_target_")
+    try:
+        made = instantiate(settings, _partial_=True, _convert_="all")(**given)
+    except InputError:
+        raise
+    except (InstantiationException, TypeError) as error:
+        reason = f"{where}={target}: cannot be built: {error.__cause__ or error}"
+        raise InputError(f"{reason}; check the class path and its arguments in conf/{where}") from error
+    if not isinstance(made, kind):
+        raise InputError(f"{where}={target}: is no {kind.__module__}.{kind.__name__}; subclass it")
+    return made
+
+
+# --- objects
+
+
+def build_prior(config: DictConfig, device: str = "cpu") -> tuple[Prior, dict]:
+    """The frozen prior of `config.prior` and the origin in its checkpoint."""
+    sampler = settings_of(SamplerSettings, config.prior.sampler, "prior.sampler")
+    bounds = settings_of(BoundSettings, config.prior.bounds, "prior.bounds")
+    return load_prior(config.prior.checkpoint, sampler, bounds, device)
+
+
+def build_traffic(synthesizer: DictConfig, prior: Prior) -> Traffic:
+    """The traffic method of a `synthesizer` group on a prior."""
+    return built(synthesizer, "synthesizer", Traffic, prior=prior)
+
+
+def build_methods(config: DictConfig, prior: Prior) -> list[Method]:
+    """The rows of `config.methods` and of those `config.variants` that it does not name; methods with an intensity have
+    a row for each `config.eta`."""
+    methods = []
+    for name in dict.fromkeys([*config.methods, *config.variants]):
+        if name in config.variants:
+            changed = varied(config, name)
+            own = prior if changed.prior == config.prior else build_prior(changed, config.device)[0]
+            traffic = build_traffic(changed.synthesizer, own)
+        else:
+            traffic = build_traffic(method_config(config, name), prior)
+        etas = intensities(config) if traffic.adversarial else [0.0]
+        methods += [Method(name, traffic, eta) for eta in etas]
+    return methods
+
+
+def method_config(config: DictConfig, name: str) -> DictConfig:
+    """A method's configuration: the run's `synthesizer` group where it has this name, else the file of the group."""
+    return config.synthesizer if name == config.synthesizer.name else load_choice("synthesizer", name)
+
+
+def build_ego(config: DictConfig) -> Ego:
+    """The ego of the `ego` group, an outside planner's class included."""
+    return built(config.ego, "ego", Ego)
+
+
+def build_sim(config: DictConfig) -> SimSettings:
+    """The simulator's settings."""
+    return settings_of(SimSettings, config.sim, "sim")
+
+
+def set_up(config: DictConfig) -> None:
+    """Threads, device and torch's seed; InputError where the device is not there or a size is impossible."""
+    check_counts(config, threads=1, batch=1)
+    torch.set_num_threads(config.threads)
+    if str(config.device).startswith("cuda") and not torch.cuda.is_available():
+        raise InputError(f"device={config.device}: no CUDA device is available; use device=cpu")
+    try:
+        torch.empty(1, device=config.device)
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(f"device={config.device}: {str(error).splitlines()[0]}; use device=cpu or cuda") from error
+    torch.manual_seed(config.get("seed", 0))  # first weights and exploration; evaluation's noise has seeds of its own
+
+
+# --- what evaluate.py is asked for
+
+
+def intensities(config: DictConfig) -> list[float]:
+    """`config.eta`, one or several; InputError for what is no intensity."""
+    etas = list(config.eta) if isinstance(config.eta, ListConfig) else [config.eta]
+    if not etas or not all(isinstance(eta, int | float) and 0 <= eta < float("inf") for eta in etas):
+        raise InputError(
+            f"eta={config.eta}: the intensity is a number of at least 0 (0 to 3 are sensible), or a list of them"
+        )
+    return [float(eta) for eta in dict.fromkeys(etas)]
+
+
+def varied(config: DictConfig, name: str) -> DictConfig:
+    """The configuration with the changes of `config.variants.NAME`, of dotted or nested keys; InputError for others
+    than those of VARIED."""
+    changed, changes = copy.deepcopy(config), config.variants[name]
+    if not isinstance(changes, DictConfig):
+        raise InputError(f"variants.{name}={changes}: expected changes, such as {{synthesizer.support: random}}")
+    for key, value in changes.items():
+        if str(key).split(".")[0] not in VARIED:
+            raise InputError(f"variants.{name}: {key} is none of {', '.join(VARIED)}, nor in one of them")
+        try:
+            OmegaConf.update(changed, str(key), value, merge=True)
+        except OmegaConfBaseException as error:
+            reason = str(error).splitlines()[0]
+            raise InputError(f"variants.{name}: {key}={value}: {reason}; compare it with conf/") from error
+    return changed
+
+
+def check_counts(config: Mapping, **least: int) -> None:
+    """InputError for settings that are no whole numbers of at least these."""
+    for key, low in least.items():
+        if type(config[key]) is not int or config[key] < low:
+            raise InputError(f"{key}={config[key]}: expected a whole number of at least {low}")
+
+
+def check_evaluation(config: DictConfig) -> None:
+    """InputError for methods, seeds, an intensity, a figure or processes that evaluate.py cannot run."""
+    processes_of(config)
+    check_counts(config, open_loop_samples=0, meta_rollouts=0)
+    check_choice("metrics", config.metrics, CLOSED_LOOP)
+    if not (config.methods or config.variants) or not config.seeds:
+        raise InputError(f"methods={list(config.methods)}, seeds={list(config.seeds)}: name at least one of each")
+    if not all(isinstance(seed, int) for seed in config.seeds):
+        raise InputError(f"seeds={list(config.seeds)}: sampling seeds are whole numbers")
+    if config.num_scenes is not None:
+        check_counts(config, num_scenes=1)
+    for name in config.methods:
+        if name not in config.variants:
+            method_config(config, name)
+    for name in config.variants:
+        varied(config, name)
+    several = len(intensities(config)) > 1
+    if config.figure is None:
+        return
+    check_choice("figure", config.figure, FIGURES)
+    if not config.save_rollouts:
+        raise InputError(f"figure={config.figure}: drawn from the rollouts' files; set save_rollouts=true")
+    if config.figure == "intensity" and not several:
+        raise InputError(f"figure=intensity, eta={config.eta}: name several intensities, such as eta=[0,1,2,3]")
+
+
+def processes_of(config: DictConfig) -> int:
+    """Processes that share the rollouts: one a core by default, one on a device that they would share, and one for the
+    skeleton figure, which listens to the traffic method."""
+    given, device = config.processes, str(config.device)
+    if config.figure == "skeleton":
+        return 1
+    if given is None:
+        return cores() if device == "cpu" and config.threads == 1 else 1
+    check_counts(config, processes=1)
+    if given > 1 and (device != "cpu" or config.threads > 1):
+        raise InputError(
+            f"processes={given}, threads={config.threads}, device={device}: several processes have one thread each and "
+            "the CPU; set threads=1 device=cpu, or processes=1"
+        )
+    return given
+
+
+def caption(config: DictConfig, origin: dict) -> str:
+    """What stands in every table's caption: the settings that all methods share."""
+    sampler, bounds = config.prior.sampler, config.prior.bounds
+    on = [name for name in ("meeting", "curve") if bounds[name]]
+    changes = "".join(f"; {name}: {what}".replace("'", "") for name, what in config.get("variants", {}).items())
+    return (
+        f"Prior {config.prior.checkpoint} ({origin.get('data', 'unknown data')}); {sampler.sampler}, K = "
+        f"{sampler.steps}, temperature {sampler.temperature:g} (routes {sampler.route_temperature:g}), one sample "
+        f"a replan, replanned every 0.5 s; acceleration bounds: {', '.join(on) or 'none'}{changes}"
+    )

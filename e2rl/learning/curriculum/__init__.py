@@ -1,0 +1,1 @@
+"""The curriculum: which scenes are attacked, how strongly, and how often episodes meet an adversary."""

@@ -1,0 +1,56 @@
+"""The intensity follows a band of collision rates: it rises while the ego copes and falls while it does not."""
+
+from e2rl.learning.curriculum.scheduler import CurriculumScheduler
+from e2rl.settings import check_range
+
+
+class AdaptiveCurriculum(CurriculumScheduler):
+    """Moves eta by eta_step a round, up below the target band of collision rates and down above it."""
+
+    def __init__(
+        self,
+        num_scenes: int,
+        rounds: int,
+        seed: int = 0,
+        eta: float = 1.0,
+        eta_min: float = 0.25,
+        eta_max: float = 5.0,
+        eta_step: float = 0.25,
+        target_low: float = 0.25,
+        target_high: float = 0.45,
+        share: float = 0.5,
+        **scenes,
+    ) -> None:
+        """Fields: conf/curriculum/adaptive.yaml."""
+        super().__init__(num_scenes, rounds, seed, **scenes)
+        check_range("curriculum.target_low", target_low, 0, target_high)
+        check_range("curriculum.target_high", target_high, target_low, 1)
+        check_range("curriculum.share", share, 0, 1)
+        self._eta, self._share, self._band = eta, share, (target_low, target_high)
+        self._bounds, self._step = (eta_min, eta_max), eta_step
+
+    @property
+    def eta(self) -> float:
+        """Intensity, following the band."""
+        return self._eta
+
+    @property
+    def share(self) -> float:
+        """The share of adversarial episodes."""
+        return self._share
+
+    def advance(self, collision_rate: float | None = None) -> None:
+        """Go to the next round; without a collision rate the intensity stays."""
+        super().advance(collision_rate)
+        if collision_rate is not None:
+            low, high = self._band
+            moved = self._eta + self._step * ((collision_rate < low) - (collision_rate > high))
+            self._eta = min(max(moved, self._bounds[0]), self._bounds[1])
+
+    def extra_state(self) -> dict:
+        """The present intensity."""
+        return {"eta": self._eta}
+
+    def load_extra_state(self, state: dict) -> None:
+        """Go on from an `extra_state`."""
+        self._eta = state["eta"]

@@ -1,0 +1,143 @@
+"""The extension point for curricula: the intensity and share of adversarial episodes, and the priorities of scenes.
+
+Scenes are prioritised as in prioritised level replay (Jiang et al. 2021): by the rank of a regret estimate, mixed with
+staleness. The regret of a scene is the best return seen there, in any traffic, less the recent return in adversarial
+traffic: high where the ego is known to be able to drive and the adversary keeps it from it, low where the scene is
+solved, and low where nobody ever drove well.
+"""
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor
+
+from e2rl.errors import InputError
+from e2rl.settings import check_range
+
+
+class CurriculumScheduler(ABC):
+    """State over S scenes. Per round: `draw` scenes, read `eta` and `share`, `update` with outcomes, `advance`.
+
+    A schedule is a subclass in a file of its own with the properties `eta` and `share`, and a YAML file in
+    conf/curriculum with its `_target_` and settings; what it keeps between rounds goes into `extra_state`.
+    """
+
+    def __init__(
+        self,
+        num_scenes: int,
+        rounds: int,
+        seed: int = 0,
+        prioritised: bool = True,
+        temperature: float = 0.3,
+        staleness: float = 0.2,
+        smoothing: float = 0.3,
+        solvable_only: bool = True,
+    ) -> None:
+        """rounds: of the whole run; other fields: conf/curriculum/adaptive.yaml. Raises InputError out of range."""
+        if num_scenes < 1:
+            raise InputError("curriculum: no scenes; check data.path and data.split")
+        check_range("curriculum.temperature", temperature, 1e-6)
+        check_range("curriculum.staleness", staleness, 0, 1)
+        check_range("curriculum.smoothing", smoothing, 1e-6, 1)
+        self.rounds, self.round, self.prioritised, self.solvable_only = rounds, 0, prioritised, solvable_only
+        self.temperature, self.staleness, self.smoothing = temperature, staleness, smoothing
+        self._generator = torch.Generator().manual_seed(seed)
+        self._best = torch.full((num_scenes,), -torch.inf)
+        self._recent = torch.full((num_scenes,), torch.nan)
+        self._drawn = torch.full((num_scenes,), -1, dtype=torch.int64)
+
+    @property
+    @abstractmethod
+    def eta(self) -> float:
+        """Adversarial intensity of this round."""
+
+    @property
+    @abstractmethod
+    def share(self) -> float:
+        """Share of this round's episodes in adversarial traffic."""
+
+    def extra_state(self) -> dict:
+        """What a schedule keeps between rounds besides the scenes' state."""
+        return {}
+
+    def load_extra_state(self, state: dict) -> None:  # noqa: B027
+        """Go on from an `extra_state`."""
+
+    def regret(self) -> Tensor:
+        """Estimated regret [S], at least 0; NaN for scenes never driven in adversarial traffic."""
+        return (self._best - self._recent).clamp(min=0)
+
+    def priority(self) -> Tensor:
+        """Probability [S] with which scenes are drawn: (1 - staleness) by rank of regret, scenes not yet driven in
+        adversarial traffic first, the rest by the rounds since they were last drawn."""
+        count = len(self._best)
+        if not self.prioritised:
+            return torch.full((count,), 1 / count)
+        weight = (1 / ranks(self.regret().nan_to_num(nan=torch.inf))) ** (1 / self.temperature)
+        age = (self.round - self._drawn).float()
+        old = age / age.sum() if age.sum() > 0 else torch.full((count,), 1 / count)
+        return (1 - self.staleness) * weight / weight.sum() + self.staleness * old
+
+    def draw(self, count: int) -> Tensor:
+        """Scenes [count] to synthesize for, by priority without replacement; all scenes once more for each full
+        round through them."""
+        total = len(self._best)
+        check_range("learner.round.scenes", count, 1)
+        chosen = torch.arange(total).repeat(count // total)
+        if count % total:
+            rest = torch.multinomial(self.priority().double(), count % total, generator=self._generator)
+            chosen = torch.cat([chosen, rest])
+        self._drawn[chosen] = self.round
+        return chosen
+
+    def update(self, scene_index: Tensor, returns: Tensor, adversarial: Tensor) -> None:
+        """Take in episodes [E]: scene, return, and whether the traffic was adversarial."""
+        scene_index, returns, adversarial = scene_index.cpu(), returns.cpu().float(), adversarial.cpu()
+        self._best = self._best.scatter_reduce(0, scene_index, returns, "amax")
+        scenes, inverse = scene_index[adversarial].unique(return_inverse=True)
+        total = torch.zeros(len(scenes)).index_add(0, inverse, returns[adversarial])
+        mean = total / torch.bincount(inverse, minlength=len(scenes)).clamp(min=1)
+        before = self._recent[scenes]
+        moved = before + self.smoothing * (mean - before)
+        self._recent[scenes] = torch.where(before.isnan(), mean, moved)
+
+    def leave_out(self, scene_index: Tensor) -> None:
+        """Scenes whose adversarial traffic was not driven because no driver survives it. They count as solved until
+        they are driven, or they would come first in every draw."""
+        scene_index = scene_index.cpu()
+        recent, best = self._recent[scene_index], self._best[scene_index]
+        self._recent[scene_index] = torch.where(recent.isnan() & best.isfinite(), best, recent)
+
+    def advance(self, collision_rate: float | None = None) -> None:
+        """Go to the next round. collision_rate: the ego's in this round's adversarial traffic."""
+        self.round += 1
+
+    def summary(self) -> dict[str, float]:
+        """Figures to log."""
+        regret, seen = self.regret(), ~self._recent.isnan()
+        result = {"eta": self.eta, "share": self.share, "scenes_seen": seen.float().mean().item()}
+        return result | ({"regret": regret[seen].mean().item()} if seen.any() else {})
+
+    def state_dict(self) -> dict:
+        """Everything that changes."""
+        scenes = {"best": self._best, "recent": self._recent, "drawn": self._drawn}
+        return scenes | {"round": self.round, "generator": self._generator.get_state(), "extra": self.extra_state()}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on from a `state_dict`; raises InputError where the number of scenes differs."""
+        if len(state["best"]) != len(self._best):
+            raise InputError(
+                f"the checkpoint's curriculum holds {len(state['best'])} scenes, the data {len(self._best)}; resume "
+                "with the data of the run"
+            )
+        self._best, self._recent, self._drawn = (state[key].clone() for key in ("best", "recent", "drawn"))
+        self.round = state["round"]
+        self._generator.set_state(state["generator"].cpu())
+        self.load_extra_state(state["extra"])
+
+
+def ranks(value: Tensor) -> Tensor:
+    """Ranks [S] of values [S], 1 for the largest; equal values share the mean of their ranks."""
+    _, inverse, count = value.unique(return_inverse=True, return_counts=True)
+    above = count.flip(0).cumsum(0).flip(0) - count
+    return (above + (count + 1) / 2)[inverse]

@@ -1,0 +1,153 @@
+"""The update of a planner: grid search over its parameters on the round's adversarial and nominal scenes.
+
+The paper tunes its lane-graph planner so. Progress needs a guard: standing still is the trivial optimum of safety and
+comfort.
+"""
+
+import itertools
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from e2rl.ego.base import Ego
+from e2rl.errors import InputError
+from e2rl.files import write_atomically
+from e2rl.learning.curriculum.scheduler import CurriculumScheduler
+from e2rl.learning.driving import PoolDriver
+from e2rl.learning.episodes import Episodes
+from e2rl.learning.improvement import Improvement
+from e2rl.scene.scene import SceneSet
+from e2rl.settings import settings_of
+from e2rl.sim.env import SimSettings
+from e2rl.traffic.pool import TrafficPool
+from e2rl.traffic.traffic import Traffic
+
+Parameters = dict[str, object]
+NEEDED = ("collision", "comfort", "progress")
+
+
+@dataclass(frozen=True)
+class TuningSettings:
+    """Fields: conf/learner/planner_tuning.yaml."""
+
+    comfort: float = 0.1
+    progress: float = 0.1
+    progress_floor: float = 0.9
+
+
+@dataclass
+class Tuning:
+    """Result: the best parameters, and one row per trial (parameters, metrics, objective, admissible), the present
+    parameters first."""
+
+    best: Parameters
+    trials: list[dict]
+
+
+def combinations(grid: Mapping[str, Sequence]) -> list[Parameters]:
+    """Every combination of a grid {name: values}; raises InputError for a name without values."""
+    empty = [name for name, values in grid.items() if not len(values)]
+    if not grid or empty:
+        raise InputError(f"learner.grid: {', '.join(empty) or 'it is empty'}; give each parameter a list of values")
+    return [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
+
+
+def tune(
+    evaluate: Callable[[Parameters], Mapping[str, float]],
+    present: Parameters,
+    grid: Mapping[str, Sequence],
+    settings: TuningSettings | None = None,
+) -> Tuning:
+    """Try the present parameters, then the whole grid; keep the best admissible trial, the present one in a tie.
+
+    evaluate(parameters) -> metrics with "collision" (rate), "comfort" (mean |acceleration|, m/s^2) and "progress" (m);
+    further ones are logged. Objective: collision + comfort weight * comfort + progress weight * share of the present
+    progress that is lost. Inadmissible: less than progress_floor of the present progress, or a metric that is NaN.
+    """
+    settings = settings or TuningSettings()
+    trials, reference, tried = [], None, [present]
+    tried += [present | choice for choice in combinations(grid) if present | choice != present]
+    for parameters in tqdm(tried, "planner tuning", unit="trial", leave=False):
+        metrics = dict(evaluate(parameters))
+        missing = [name for name in NEEDED if name not in metrics]
+        if missing:
+            raise InputError(f"planner tuning: evaluate() returned no {', '.join(missing)}")
+        reference = metrics["progress"] if reference is None else reference
+        kept = metrics["progress"] / max(reference, 1e-6)
+        objective = (
+            metrics["collision"] + settings.comfort * metrics["comfort"] + settings.progress * max(0.0, 1 - kept)
+        )
+        admissible = not math.isnan(objective) and kept >= settings.progress_floor
+        trials.append({"parameters": parameters, **metrics, "objective": objective, "admissible": admissible})
+    if math.isnan(trials[0]["objective"]):
+        raise InputError("planner tuning: the present parameters yield NaN metrics; check the scenes")
+    best = min((trial for trial in trials if trial["admissible"] or trial is trials[0]), key=lambda t: t["objective"])
+    return Tuning(best["parameters"], trials)
+
+
+class PlannerImprovement(Improvement):
+    """Tunes a planner's parameters on the round's pool; `ego` is the planner with the best parameters so far."""
+
+    def __init__(
+        self,
+        ego: Ego,
+        parameters: Mapping[str, Any],
+        scenes: SceneSet,
+        sim: SimSettings,
+        grid: Mapping[str, Sequence],
+        tuning: Mapping[str, Any] | None = None,
+        batch: int = 64,
+        traffic: Traffic | None = None,
+        seed: int = 0,
+        device: str = "cpu",
+    ) -> None:
+        """parameters: those that `ego` was built with; grid: values to try of some of them; others:
+        conf/learner/planner_tuning.yaml. Raises InputError for a grid that does not fit, or for live traffic."""
+        unknown = sorted(set(grid) - set(parameters))
+        if unknown:
+            own = ", ".join(sorted(parameters))
+            raise InputError(f"learner.grid: {', '.join(unknown)} are no parameters of the planner; it has {own}")
+        if traffic is not None:
+            raise InputError("learner.round.traffic=live: a planner is tuned on stored traffic; set it to replay")
+        self.ego, self.present, self.grid = ego, dict(parameters), {key: list(grid[key]) for key in grid}
+        self.settings = settings_of(TuningSettings, tuning or {}, "learner.tuning")
+        self.driver, self.trials = PoolDriver(scenes, sim, batch, device), []
+
+    def __call__(self, pool: TrafficPool, curriculum: CurriculumScheduler) -> tuple[dict[str, float], Episodes]:
+        """Drive the pool once with every combination of the grid; the whole grid is left in `trials`."""
+        driven: dict[str, Episodes] = {}
+
+        def evaluate(parameters: Parameters) -> dict[str, float]:
+            episodes = self.driver.drive_all(type(self.ego)(**parameters), pool)
+            driven[repr(parameters)] = episodes
+            summary = episodes.summary()
+            return {"collision": summary["contact"], "comfort": summary["acceleration"]} | summary
+
+        tuning = tune(evaluate, self.present, self.grid, self.settings)
+        before, after = tuning.trials[0], next(t for t in tuning.trials if t["parameters"] == tuning.best)
+        self.present, self.trials, self.ego = tuning.best, tuning.trials, type(self.ego)(**tuning.best)
+        chosen = {key: value for key, value in self.present.items() if key in self.grid}
+        metrics = {f"parameter_{key}": float(value) for key, value in chosen.items() if isinstance(value, int | float)}
+        metrics |= {"objective_before": before["objective"], "objective": after["objective"]}
+        episodes = driven[repr(tuning.best)]
+        return metrics | {"trials": float(len(tuning.trials))} | episodes.summary(), episodes
+
+    def outcome(self, folder: Path) -> str:
+        """Write the last round's whole grid to tuning.json; how to evaluate the planner as tuned."""
+        write_atomically(folder / "tuning.json", json.dumps({"best": self.present, "trials": self.trials}, indent=1))
+        tuned = " ".join(f"ego.{key}={self.present[key]}" for key in self.grid)
+        return f"every trial of the last round is in tuning.json; evaluate the planner as tuned with: {tuned}"
+
+    def state_dict(self) -> dict:
+        """The best parameters so far."""
+        return {"present": dict(self.present)}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on from a `state_dict`."""
+        self.present = dict(state["present"])
+        self.ego = type(self.ego)(**self.present)

@@ -1,0 +1,156 @@
+"""The update of a learned ego: PPO and behaviour cloning on episodes that the collector drives in the round's pool."""
+
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, RewardSum, TransformedEnv
+from tqdm import tqdm
+
+from e2rl.ego.actor import ActorEgo
+from e2rl.ego.base import Ego, EgoPlanner
+from e2rl.errors import InputError
+from e2rl.learning.curriculum.scheduler import CurriculumScheduler
+from e2rl.learning.driving import PoolDriver
+from e2rl.learning.episodes import OUTCOME_KEYS, Episodes, finished_episodes
+from e2rl.learning.imitation import ImitationSettings, corrective_pairs, recorded_pairs
+from e2rl.learning.improvement import Improvement
+from e2rl.learning.update import Learner, UpdateSettings
+from e2rl.scene.scene import SceneSet
+from e2rl.settings import settings_of
+from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.traffic.pool import TrafficPool
+from e2rl.traffic.traffic import Traffic
+from e2rl.traffic.transform import AdversarialSynthesizer
+
+EXPERT_KEYS = ("observation", "action")
+
+
+@dataclass(frozen=True)
+class CollectSettings:
+    """Fields: conf/learner/ppo_bc.yaml."""
+
+    batch: int = 64
+    steps: int = 80
+    iterations: int = 20
+
+
+class RowDraw:
+    """Draws pool rows by probability [R], with a generator of its own."""
+
+    def __init__(self, probability: Tensor, seed: int = 0) -> None:
+        self.probability, self.generator = probability, torch.Generator().manual_seed(seed)
+
+    def __call__(self, count: int) -> Tensor:
+        """Rows [count]."""
+        return torch.multinomial(self.probability, count, replacement=True, generator=self.generator)
+
+
+class PolicyImprovement(Improvement):
+    """Collects episodes with the actor's stochastic policy in the round's pool and updates it after each batch."""
+
+    ego: ActorEgo
+
+    def __init__(
+        self,
+        ego: Ego,
+        scenes: SceneSet,
+        sim: SimSettings,
+        traffic: Traffic | None = None,
+        seed: int = 0,
+        device: str = "cpu",
+        collect: Mapping[str, Any] | None = None,
+        ppo: Mapping[str, Any] | None = None,
+        imitation: Mapping[str, Any] | None = None,
+        recorded: bool = False,
+        teacher: Ego | None = None,
+        parameters: Mapping[str, Any] | None = None,
+    ) -> None:
+        """recorded: clone what the recorded egos did all along; teacher: an ego whose survived episodes in the round's
+        adversarial traffic are cloned too; others: conf/learner/ppo_bc.yaml.
+
+        Raises InputError where the ego is no actor or a round cannot hold an episode.
+        """
+        if not isinstance(ego, ActorEgo):
+            raise InputError(f"learner=ppo_bc improves ego=actor, not {type(ego).__name__}; use learner=planner_tuning")
+        self.settings = settings_of(CollectSettings, collect or {}, "learner.collect")
+        update = settings_of(UpdateSettings, ppo or {}, "learner.ppo")
+        batch, self.horizon = self.settings.batch, scenes.scenes["logged"].shape[1] - 1
+        if self.settings.steps * self.settings.iterations < self.horizon:
+            raise InputError(
+                f"learner.collect: {self.settings.steps} x {self.settings.iterations} steps a round cannot hold an "
+                f"episode of {self.horizon}"
+            )
+        self.ego, self.learner, self.frames = ego, Learner(ego.network, update), 0
+        self.expert, self.teacher = None, teacher if update.cloning > 0 else None
+        if recorded and update.cloning > 0:
+            pairs = settings_of(ImitationSettings, {"seed": seed, **(imitation or {})}, "learner.imitation")
+            self.expert = recorded_pairs(scenes, sim, pairs).select(*EXPERT_KEYS).to(device)
+        if self.teacher is not None:
+            self.driver = PoolDriver(scenes, sim, batch, device)
+        every = torch.arange(len(scenes))
+        self.draw = RowDraw(torch.full((len(scenes),), 1 / len(scenes), dtype=torch.float64), seed)
+        self.synthesizer = AdversarialSynthesizer(TrafficPool.recorded(every), self.draw, traffic)
+        base = DrivingEnv(scenes, sim, batch, device, agents=traffic is not None)
+        self.env = TransformedEnv(base, Compose(self.synthesizer, RewardSum()))
+        actor = ego.network.actor
+        self._collector = Collector(
+            self.env,
+            actor if traffic is None else TensorDictSequential(EgoPlanner(ego, base), actor),
+            frames_per_batch=batch * self.settings.steps,
+            total_frames=-1,
+            trust_policy=True,
+            track_traj_ids=False,
+            auto_register_policy_transforms=False,
+            device=device,
+        )
+        self._batches = iter(self._collector)
+
+    def __call__(self, pool: TrafficPool, curriculum: CurriculumScheduler) -> tuple[dict[str, float], Episodes]:
+        """Every environment begins anew; `iterations` times: collect [B, steps], update."""
+        expert = self._expert(pool)
+        self.synthesizer.pool = pool
+        self.draw.probability = pool.probabilities(curriculum.priority(), curriculum.share)
+        self._collector.reset()
+        kept, rows = [], []
+        for _ in (bar := tqdm(range(self.settings.iterations), "collect and update", unit="batch", leave=False)):
+            data = next(self._batches)
+            self.frames += data.numel()
+            kept.append(data.select(*OUTCOME_KEYS).cpu().clone())
+            rows.append(self.learner.update(data, expert))
+            self._collector.update_policy_weights_()
+            bar.set_postfix(reward=f"{data['next', 'reward'].mean().item():.3f}", kl=f"{rows[-1]['kl']:.4f}")
+        episodes = finished_episodes(kept, pool.adversarial, self.horizon)
+        columns: dict[str, list[float]] = defaultdict(list)
+        for name, value in (pair for row in rows for pair in row.items()):
+            columns[name].append(value)
+        metrics = {name: sum(values) / len(values) for name, values in sorted(columns.items())}
+        counts = {"frames": float(self.frames), "expert_pairs": float(0 if expert is None else len(expert))}
+        return metrics | episodes.summary() | counts, episodes
+
+    def _expert(self, pool: TrafficPool) -> TensorDictBase | None:
+        if self.teacher is None or not bool((pool.adversarial & (pool.source >= 0)).any()):
+            return self.expert
+        pairs = corrective_pairs(self.driver, self.teacher, pool).select(*EXPERT_KEYS)
+        return pairs if self.expert is None else torch.cat([self.expert, pairs.to(self.expert.device)])
+
+    def outcome(self, folder: Path) -> str:
+        """How to evaluate the improved ego of a run's folder."""
+        return f"evaluate the policy with: python evaluate.py ego=actor ego.checkpoint={folder}"
+
+    def state_dict(self) -> dict:
+        """Learner, draws and frames; the weights are the network's."""
+        return {"learner": self.learner.state_dict(), "frames": self.frames, "draws": self.draw.generator.get_state()}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on from a `state_dict`."""
+        self.learner.load_state_dict(state["learner"])
+        self.draw.generator.set_state(state["draws"].cpu())
+        self.frames = state["frames"]

@@ -1,0 +1,73 @@
+"""The trajectories of everyone but the ego: the recording, stored ones, or plans that are written as they are made."""
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from e2rl.errors import InputError
+from e2rl.scene.recording import DT
+
+
+class Trajectories:
+    """Trajectories states [B, T+1, N, 4], valid [B, T+1, N] of B running scenes.
+
+    Vehicles (the first V rows) may be overwritten; pedestrians, cyclists and others always replay the recording.
+    """
+
+    def __init__(self, scene: TensorDictBase) -> None:
+        self.states, self.valid = scene["logged"].clone(), scene["logged_valid"].clone()
+        self.vehicles = scene["route_log"].shape[1]
+        self._scheduled: list[tuple[Tensor, Tensor, Tensor]] = []
+
+    def schedule(self, rows: Tensor, states: Tensor, valid: Tensor) -> None:
+        """Trajectories of scenes rows [b] from their coming reset on; raises InputError on a wrong shape or NaN."""
+        expected = (len(rows), *self.states.shape[1:])
+        if tuple(states.shape) != expected or tuple(valid.shape) != expected[:-1]:
+            raise InputError(
+                f"set_traffic: states {tuple(states.shape)} and valid {tuple(valid.shape)} for {len(rows)} rows; "
+                f"expected {expected} and {expected[:-1]}"
+            )
+        if not torch.isfinite(states[valid]).all():
+            raise InputError("set_traffic: NaN or infinite states marked valid; mark them invalid")
+        device = self.states.device
+        self._scheduled.append((rows.to(device), states.to(device), valid.to(device)))
+
+    def reset(self, scene: TensorDictBase, index: Tensor) -> None:
+        """Scenes index [b] begin anew, with what was scheduled for them, else with their recording."""
+        if len(index) == len(self.states):
+            self.states.copy_(scene["logged"]), self.valid.copy_(scene["logged_valid"])
+        else:
+            self.states[index], self.valid[index] = scene["logged"][index], scene["logged_valid"][index]
+        waiting, self._scheduled = self._scheduled, []
+        for rows, states, valid in waiting:
+            now = torch.isin(rows, index)
+            self.states[rows[now], :, : self.vehicles] = states[now][:, :, : self.vehicles].to(self.states.dtype)
+            self.valid[rows[now], :, : self.vehicles] = valid[now][:, :, : self.vehicles]
+            if not bool(now.all()):
+                self._scheduled.append((rows[~now], states[~now], valid[~now]))
+
+    def write(self, rows: Tensor, step: Tensor, states: Tensor, valid: Tensor) -> None:
+        """Overwrite the vehicles of scenes rows [b] at steps step [b] + 1 .. + H; those beyond T are dropped.
+
+        states [b, V, H, 4], valid [b, V, H].
+        """
+        at = step[:, None] + torch.arange(1, states.shape[2] + 1, device=step.device)
+        inside = at < self.states.shape[1]
+        row, at = rows[:, None].expand_as(at)[inside], at[inside]
+        self.states[row, at, : self.vehicles] = states.transpose(1, 2)[inside].to(self.states.dtype)
+        self.valid[row, at, : self.vehicles] = valid.transpose(1, 2)[inside]
+
+    def at(self, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """`trajectories_at` step [B]."""
+        return trajectories_at(self.states, self.valid, step)
+
+
+def trajectories_at(states: Tensor, valid: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """States [B, N, 4], valid [B, N] and acceleration [B, N] of trajectories [B, T+1, N, 4], [B, T+1, N] at step [B].
+
+    The acceleration is the speed difference over the last step, 0 where there was none.
+    """
+    row, before = torch.arange(len(step), device=step.device), (step - 1).clamp(min=0)
+    now, there = states[row, step], valid[row, step]
+    accel = (now[..., 3] - states[row, before, :, 3]) / DT
+    return now, there, accel * (there & valid[row, before])

@@ -1,0 +1,109 @@
+"""Scenes of like size are planned together: half of a batch is padding, and small groups are mostly overhead.
+
+Vehicles and other agents fill their rows from the front, so that a group is cropped by slices of the rows in use.
+"""
+
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import TypeVar
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from e2rl.sim.world import World
+
+ROWS = 160, 1024  # vehicle rows from which a group may end, and at most
+SHRUNK = 0.55  # share of its largest scene at which the next scene begins another group
+OF_ALL = {"size", "start", "start_accel", "start_yaw_rate", "valid", "agent_type", "parked"}  # keys with all agents
+OF_VEHICLES = {"past", "route_points", "route_length", "route_open", "route_valid", "route_limit"}
+OF_VEHICLES |= {"route_light", "route_light_s", "route_log"}
+WHOLE = {"field", "field_origin", "light_state", "lane_points", "lane_index", "lane_exits", "lane_left", "lane_right"}
+WHOLE |= {"scene_index"}
+NO_VEHICLES = {"seed", "eta", "replans", "light_state"}  # fields of a state without a vehicle axis
+PAIRS = {"conflict", "conflict_s", "crossing"}  # fields [B, V, V]
+FIXED = {"size", "light_state"}  # fields that never change
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True)
+class Group:
+    """Scenes rows [G] int64 of a batch, with the numbers of vehicle rows and of other agents' rows in use."""
+
+    rows: Tensor
+    vehicles: int
+    others: int
+
+
+def group_scenes(world: World) -> list[Group]:
+    """The scenes of a batch in groups by vehicles in use (see ROWS and SHRUNK; one scene at least)."""
+    width = world.scene["route_log"].shape[1]
+    used = world.valid | world.scene["valid"]
+    position = torch.arange(1, used.shape[1] + 1, device=used.device)
+    vehicles = (used[:, :width] * position[:width]).amax(1).clamp(min=1)
+    others = vehicles * 0
+    if used.shape[1] > width:
+        others = (used[:, width:] * position[: used.shape[1] - width]).amax(1)
+    order = vehicles.argsort(descending=True, stable=True)
+    sizes, begin, groups = vehicles[order].tolist(), 0, []
+    for end in range(1, len(sizes) + 1):
+        size, filled = sizes[begin], sizes[begin] * (end - begin)
+        if end < len(sizes) and filled + size <= ROWS[1] and (filled < ROWS[0] or sizes[end] > SHRUNK * size):
+            continue
+        rows = order[begin:end]
+        groups.append(Group(rows, size, int(others[rows].max())))
+        begin = end
+    return groups
+
+
+def crop_world(world: World, group: Group) -> World:
+    """The group's Worlds [G], with the scene keys that planning reads."""
+    width, rows = world.scene["route_log"].shape[1], group.rows
+    agents = torch.cat([torch.arange(group.vehicles), width + torch.arange(group.others)]).to(rows.device)
+    scene = {}
+    for key in world.scene.keys():  # noqa: SIM118 - not a dict
+        if key in OF_ALL:
+            scene[key] = world.scene[key][rows][:, agents]
+        elif key in OF_VEHICLES:
+            scene[key] = world.scene[key][rows, : group.vehicles]
+        elif key in WHOLE:
+            scene[key] = world.scene[key][rows]
+    now = (getattr(world, name)[rows][:, agents] for name in ("states", "valid", "accel"))
+    return World(TensorDict(scene, batch_size=[len(rows)]), world.step[rows], *now)
+
+
+def crop_state(value: Value, group: Group, width: int, name: str = "") -> Value:
+    """The group's part of a state (a nested dataclass of tensors) whose scenes have `width` vehicle rows."""
+    if is_dataclass(value):
+        parts = {f.name: crop_state(getattr(value, f.name), group, width, f.name) for f in fields(value)}
+        return replace(value, **parts)
+    value = value[group.rows]
+    if name in NO_VEHICLES:
+        return value
+    if name in PAIRS:
+        return value[:, : group.vehicles, : group.vehicles]
+    if name == "size":
+        return torch.cat([value[:, : group.vehicles], value[:, width : width + group.others]], 1)
+    return value[:, : group.vehicles]
+
+
+def write_state(full: Value, part: Value, group: Group, name: str = "") -> None:
+    """Write the group's part of a state back, in place."""
+    if is_dataclass(full):
+        for field in fields(full):
+            write_state(getattr(full, field.name), getattr(part, field.name), group, field.name)
+    elif name in FIXED:
+        return
+    elif name in PAIRS:
+        index = torch.arange(group.vehicles)
+        full[group.rows[:, None, None], index[:, None], index] = part
+    elif name in NO_VEHICLES:
+        full[group.rows] = part
+    else:
+        full[group.rows, : group.vehicles] = part
+
+
+def clone(value: Value) -> Value:
+    """A nested dataclass with every tensor copied."""
+    if not is_dataclass(value):
+        return value.clone()
+    return replace(value, **{field.name: clone(getattr(value, field.name)) for field in fields(value)})

@@ -1,0 +1,40 @@
+"""How the ego would react: its real policy rolled forward against a plan of the others, as a black box."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from e2rl.ego.base import Ego
+from e2rl.prior.lane_relative import HORIZON
+from e2rl.scene.recording import DT
+from e2rl.sim.world import World
+from e2rl.traffic.rows import take_rows
+
+
+@dataclass
+class Lookahead:
+    """Asks the egos of scenes [B] how they would drive; period: steps between two of their plans."""
+
+    ego: Ego
+    world: World
+    period: int = 10
+
+    @torch.no_grad()
+    def __call__(self, rows: Tensor, planned: Tensor) -> Tensor:
+        """The egos' states [G, HORIZON, 4] in scenes rows [G] against vehicles planned [G, V, HORIZON, 4].
+
+        The ego's row is not read; agents that are not planned keep their velocity.
+        """
+        whole = len(rows) == len(self.world.step) and bool((rows.diff() > 0).all())
+        world = self.world if whole else replace(take_rows(self.world, rows), plan=None)
+        states, vehicles, pieces = world.states, planned.shape[1], []
+        velocity = states[..., 3:] * torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)
+        now = world
+        for done in range(0, HORIZON, self.period):
+            pieces.append(self.ego.plan(now)[:, : self.period])
+            after = done + self.period
+            moved = torch.cat([states[..., :2] + DT * after * velocity, states[..., 2:]], -1)
+            ego, others = pieces[-1][:, -1:], planned[:, 1:, min(after, HORIZON) - 1]
+            now = replace(now, step=world.step + after, states=torch.cat([ego, others, moved[:, vehicles:]], 1))
+        return torch.cat(pieces, 1)[:, :HORIZON]

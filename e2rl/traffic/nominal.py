@@ -1,0 +1,133 @@
+"""The prior as background traffic: every 0.5 s a joint sample of the reverse SDE, given the ego's plan, no control."""
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate
+from e2rl.prior.prior import Context, Prior
+from e2rl.prior.routed import RoutedScene
+from e2rl.prior.spread import main_direction, spread_noise, stratified
+from e2rl.scene.recording import DT
+from e2rl.sim.dynamics import wrap
+from e2rl.sim.world import World
+from e2rl.traffic.grouping import Group, clone, crop_state, crop_world, group_scenes, write_state
+from e2rl.traffic.rows import noise_of
+from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan
+
+LOOK = 5  # steps of the ego's plan over which its present yaw rate is taken
+
+
+@dataclass
+class PriorState:
+    """B scenes driven by the prior; every tensor has the batch first.
+
+    seed [B]: of the scene's noise; replans [B]: replans so far; routed: the vehicles' routes; lane [B, V]: lane states
+    to which the executed plans led.
+    """
+
+    seed: Tensor
+    replans: Tensor
+    routed: RoutedScene
+    lane: LaneState
+
+
+class NominalTraffic(Traffic):
+    """Unguided samples of the frozen prior; the ego's row of the joint state is its plan."""
+
+    def __init__(self, prior: Prior) -> None:
+        self.prior = prior.requires_grad_(False).eval()
+
+    def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> State:
+        """States of scenes [B] with routes drawn from the prior."""
+        uniform = noise_of(seed, torch.zeros_like(seed), tuple(scenes["route_valid"].shape[1:2]), uniform=True)
+        routed, lane = self.prior.start(scenes, self.prior.choose_routes(scenes, uniform))
+        return PriorState(seed, torch.zeros_like(seed), routed, lane)
+
+    def replan(self, state: State, world: World, ego_plan: Tensor) -> tuple[State, TrafficPlan]:
+        """States and plans of the coming HORIZON steps; scenes of like size are planned together."""
+        ego_plan, noise = ego_plan.detach(), self.noise(state)
+        batch, width = state.routed.route.shape
+        whole = clone(state)
+        states = world.states.new_zeros(batch, width, HORIZON, 4)
+        present = torch.zeros(batch, width, HORIZON, dtype=torch.bool, device=states.device)
+        for group in group_scenes(world):
+            rows, vehicles = group.rows, group.vehicles
+            part, x0, context = self.replan_group(
+                crop_state(state, group, width),
+                crop_world(world, group),
+                ego_plan[rows],
+                noise[:, rows, :vehicles],
+                group,
+            )
+            plan = self.prior.plan(x0, context)
+            part = replace(part, replans=part.replans + 1, lane=plan.after(REPLAN_STEPS))
+            write_state(whole, part, group)
+            states[rows, :vehicles] = plan.states()
+            there = world.valid[rows, :vehicles, None]  # a vehicle that has left does not come back
+            present[rows, :vehicles] = plan.on_map & there
+        return whole, TrafficPlan(states, present, route=whole.routed.route)
+
+    def replan_group(
+        self, state: State, world: World, ego_plan: Tensor, noise: Tensor, group: Group
+    ) -> tuple[State, Tensor, Context]:
+        """State, joint sample x0 [G, V, SIZE] and context of a group; noise [K, G, V, SIZE]."""
+        state = replace(state, lane=self.lane_now(state, world, ego_plan))
+        context = self.encode(state, world, ego_plan)
+        return state, self.prior.sample(context, noise).x0, context
+
+    def noise(self, state: State) -> Tensor:
+        """Standard normal noise [K, B, V, SIZE] of the coming replan."""
+        shape = (self.prior.sampler.steps, state.routed.route.shape[1], SIZE)
+        return noise_of(state.seed, 1 + state.replans, shape).transpose(0, 1)
+
+    def encode(self, state: State, world: World, ego_plan: Tensor, exempt: Tensor | None = None) -> Context:
+        """The prior's context of a replan; exempt [B, V]: vehicles whose bounds ignore the ego."""
+        now = world.states, world.valid, world.step
+        return self.prior.encode(state.routed, state.lane, *now, ego_plan, exempt)
+
+    def lane_now(self, state: State, world: World, ego_plan: Tensor) -> LaneState:
+        """Lane states now: the ego as it really drove and is about to turn, the others where their plans led.
+
+        Plans in free space do not know their routes, so that their arc lengths and offsets are projected.
+        """
+        lane, routed = state.lane, state.routed
+        yaw_rate = wrap(ego_plan[:, LOOK - 1, 2] - world.states[:, 0, 2]) / (LOOK * DT)
+        ego = torch.zeros_like(routed.parked)
+        ego[:, 0] = True
+        v = torch.where(ego, world.states[:, :1, 3], lane.v)
+        accel = torch.where(ego, world.accel[:, :1], lane.a)
+        turning = torch.where(ego, yaw_rate[:, None], lane.kappa * lane.v)
+        now = locate(world.states[:, : ego.shape[1]], accel, turning, routed.points, lane.s + ego * v / 2)
+        projected = {name: ego | ~routed.has_lane for name in ("s", "d", "d1", "d2")}
+
+        def merged(name: str) -> Tensor:
+            return torch.where(projected.get(name, ego), getattr(now, name), getattr(lane, name))
+
+        return LaneState(*(merged(field.name) for field in fields(LaneState)))
+
+    @torch.no_grad()
+    def open_loop_plans(self, scene: TensorDictBase, seed: Tensor) -> Tensor:
+        """Joint samples [B, S, V, HORIZON, 4] beside an ego whose plan is unknown, stratified over the S samples.
+
+        They stand as drawn: acceleration bounds belong to the executed half second; held over 5 s the present ones
+        would make the samples a tenth less accurate.
+        """
+        prior, (count, batch), vehicles = self.prior, seed.shape, scene["route_log"].shape[1]
+
+        def draw(number: int, *shape: int, uniform: bool = False) -> Tensor:
+            numbers = torch.full((count * batch,), number)
+            return noise_of(seed.flatten(), numbers, shape, uniform).unflatten(0, (count, batch))
+
+        order, position = draw(0, 2, vehicles, uniform=True).unbind(2), draw(2, 2, vehicles, uniform=True)[0].unbind(1)
+        noise = draw(1, prior.sampler.steps, vehicles, SIZE).transpose(1, 2)
+        direction = main_direction(prior.schedule, prior.sampler, noise.device)
+        noise = spread_noise(noise, direction, order[1], position[1])
+        step, plans = torch.zeros(batch, dtype=torch.long, device=seed.device), []
+        for uniform, one in zip(stratified(order[0], position[0]), noise, strict=True):
+            routed, lane = prior.start(scene, prior.choose_routes(scene, uniform))
+            context = prior.encode(routed, lane, scene["start"], scene["valid"], step, None)
+            plans.append(prior.decode(prior.sample(context, one).x0, context).states())
+        return torch.stack(plans, 1)
