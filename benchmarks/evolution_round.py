@@ -6,17 +6,15 @@ from collections.abc import Iterator
 import torch
 from measure import Bench, Row
 
-from e2rl.evaluation.build import build_ego
+from e2rl.build import build_ego
 from e2rl.learning.build import build_evolution
-from e2rl.traffic.rollout import synthesize_traffic
 
 
 def evolution_round(bench: Bench) -> Iterator[Row]:
     """Seconds of one round, not repeated: it takes minutes; synthesis is of D' and of its nominal scenes."""
     config = bench.configured("train")
-    synthesize = synthesize_traffic(bench.scenes, bench.synthesizer, bench.sim, config.batch)
     torch.manual_seed(0)
-    run = build_evolution(config, bench.scenes, bench.sim, build_ego(config), synthesize)
+    run = build_evolution(config, bench.scenes, build_ego(config), bench.traffic)
     begin = time.perf_counter()
     metrics = run.run_round()
     total = time.perf_counter() - begin

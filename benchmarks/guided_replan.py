@@ -17,12 +17,12 @@ def guided_replan(bench: Bench) -> Iterator[Row]:
             index = bench.pick(batch, agents)
             world = bench.environment(index).world()
             plan = bench.ego.plan(world)
-            episode = bench.synthesizer.begin(world.scene, index, torch.full((batch,), ETA))
-            episode, _ = bench.synthesizer.replan(episode, world, plan)
-            calm = replace(episode, eta=torch.zeros_like(episode.eta))
+            state = bench.traffic.reset(world.scene, index, torch.full((batch,), ETA))
+            state, _ = bench.traffic.replan(state, world, plan)
+            calm = replace(state, eta=torch.zeros_like(state.eta))
             parts = {
-                "unguided": lambda e=calm, w=world, p=plan: bench.synthesizer.replan(e, w, p),
-                f"guided, eta {ETA:g}": lambda e=episode, w=world, p=plan: bench.synthesizer.replan(e, w, p),
+                "unguided": lambda s=calm, w=world, p=plan: bench.traffic.replan(s, w, p),
+                f"guided, eta {ETA:g}": lambda s=state, w=world, p=plan: bench.traffic.replan(s, w, p),
                 "plan of lane_graph": lambda w=world: bench.ego.plan(w),
             }
             for variant, function in parts.items():

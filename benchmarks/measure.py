@@ -8,22 +8,18 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from importlib.metadata import version
-from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from tensordict import TensorDict
 from torch import Tensor
 
+from e2rl.build import build_ego, build_prior, build_sim, build_traffic, load_config
 from e2rl.ego.base import Ego
-from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_synthesizer
 from e2rl.scene.scene import SceneSet
 from e2rl.scene.source import load_scenes
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.synthesizer.synthesizer import Synthesizer
-
-CONF = Path(__file__).resolve().parent.parent / "conf"
+from e2rl.traffic.traffic import Traffic
 
 
 def versions() -> dict[str, str]:
@@ -78,8 +74,7 @@ class Bench:
         """Configuration `name` on the data and prior under test."""
         overrides = self.train if name == "train" else ()
         data = ["data=scenarionet", f"data.path={self.data}"] if self.data else ["data=bundled"]
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            return compose(name, [*data, f"prior.checkpoint={self.checkpoint}", *overrides])
+        return load_config(name, [*data, f"prior.checkpoint={self.checkpoint}", *overrides])
 
     @cached_property
     def scenes(self) -> SceneSet:
@@ -87,9 +82,9 @@ class Bench:
         return load_scenes(self.config.data)
 
     @cached_property
-    def synthesizer(self) -> Synthesizer:
+    def traffic(self) -> Traffic:
         """e2 on the prior under test."""
-        return build_synthesizer(self.config, build_prior(self.config)[0])
+        return build_traffic(self.config.synthesizer, build_prior(self.config)[0])
 
     @cached_property
     def ego(self) -> Ego:

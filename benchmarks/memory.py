@@ -33,5 +33,5 @@ def _peak(bench: Bench, name: str, batch: int) -> tuple[float, float]:
         for _ in range(5):
             env._step(TensorDict({"action": torch.zeros(batch, 2)}, batch_size=[batch]))
     else:
-        roll_out(bench.scenes, index, index, torch.full((batch,), 2.0), bench.ego, bench.synthesizer, bench.sim)
+        roll_out(bench.scenes, index, index, torch.full((batch,), 2.0), bench.ego, bench.traffic, bench.sim)
     return alone, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

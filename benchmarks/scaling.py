@@ -10,7 +10,7 @@ import torch
 from measure import Bench, Row
 from tensordict import TensorDict
 
-from e2rl.evaluation.processes import spread
+from e2rl.evaluation.processes import in_processes
 from e2rl.traffic.rollout import roll_out
 
 SCENES = 64, 512, 2048, 10_000
@@ -34,12 +34,12 @@ def scaling(bench: Bench) -> Iterator[Row]:
 
     def work(index: torch.Tensor) -> None:
         eta = torch.full((len(index),), 2.0)
-        roll_out(bench.scenes, index, index, eta, bench.ego, bench.synthesizer, bench.sim)
+        roll_out(bench.scenes, index, index, eta, bench.ego, bench.traffic, bench.sim)
 
     work(parts[0])
     for processes in (1, 2, 1, 2):  # in turn: the machine's load changes
         begin = time.perf_counter()
-        list(spread(work, parts, processes, cost=len))
+        list(in_processes(work, parts, processes, cost=len))
         seconds[processes] = min(time.perf_counter() - begin, seconds.get(processes, torch.inf))
     for processes, spent in seconds.items():
         yield bench.row("scaling", "e2, eta 2", torch.cat(parts), spent / count, "s/rollout", processes=processes)

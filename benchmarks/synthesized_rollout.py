@@ -21,7 +21,7 @@ def synthesized_rollout(bench: Bench) -> Iterator[Row]:
     index = bench.pick(batch)
 
     def run(eta: float) -> None:
-        roll_out(bench.scenes, index, index, torch.full((batch,), eta), bench.ego, bench.synthesizer, bench.sim)
+        roll_out(bench.scenes, index, index, torch.full((batch,), eta), bench.ego, bench.traffic, bench.sim)
 
     for name, eta in (("nominal", 0.0), ("e2, eta 2", 2.0)):
         wall, cpu = bench.both(lambda e=eta: run(e))
@@ -30,7 +30,7 @@ def synthesized_rollout(bench: Bench) -> Iterator[Row]:
     parts = {
         "topology, feasibility and skeleton": (
             topological_candidates,
-            bench.synthesizer.feasible_vehicles,
+            bench.traffic.feasible_vehicles,
             build_skeleton,
         ),
         "sampling": (Prior.sample,),

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from e2rl.errors import InputError, stop
+from e2rl.errors import InputError, stop  # noqa: E402
 from e2rl.scene.source import load_scenes  # noqa: E402
 from e2rl.settings import settings_of  # noqa: E402
 from e2rl.synthesizer.agreement import agreement_table, measure_agreement  # noqa: E402

@@ -12,6 +12,7 @@ from torchrl.envs.utils import check_env_specs
 from e2rl.errors import InputError
 from e2rl.scene.recording import DT
 from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.world import World
 from tests.synthetic import make_scenes
 
 
@@ -36,6 +37,18 @@ def drive(env, steps, acceleration=0.0, yaw_rate=0.0):
 def test_specs():
     check_env_specs(make_env(), seed=0)
     check_env_specs(make_env(settings=SimSettings(replay_ego=True)), seed=0)
+    check_env_specs(DrivingEnv(make_scenes(3), SimSettings(), 2, agents=True), seed=0)
+
+
+def test_the_reported_agents_are_the_environments_world():
+    """A policy that reads the TensorDict sees the same moment as who asks the environment."""
+    env = DrivingEnv(make_scenes(3), SimSettings(), 2, agents=True)
+    env.reset()
+    told = World.of(act(env, acceleration=1.0, yaw_rate=0.2), env.scene)
+    now = env.world()
+    for name in ("step", "states", "valid", "accel", "yaw_rate"):
+        assert torch.equal(getattr(told, name), getattr(now, name)), name
+    assert torch.allclose(told.yaw_rate, torch.tensor(0.2), atol=1e-4)
 
 
 def test_partial_resets_keep_the_others_running():
@@ -88,7 +101,7 @@ def test_transform_injects_scene_and_traffic():
     assert (td["scene_index"] == 2).all()
     td = env.rand_step(td)["next"]
     world = env.base_env.world()
-    vehicles = world.route.shape[1]
+    vehicles = world.scene["route_log"].shape[1]
     assert (world.states[:, 1:3, 1] >= 50).all()
     assert torch.equal(world.states[:, vehicles:], world.scene["logged"][:, 1, vehicles:]), "VRUs replay the log"
 
@@ -102,24 +115,23 @@ def test_traffic_of_wrong_shape_or_nan_is_refused():
         env.set_traffic(torch.tensor([0]), scene["logged"] * torch.nan, scene["logged_valid"])
 
 
-def test_written_traffic_is_executed_and_seen_as_plan():
+def test_written_traffic_is_executed():
     env = make_env()
     env.reset()
     act(env)
     before = env.world()
-    future = before.states[:, None].repeat(1, 50, 1, 1)
-    future[..., 1] += DT * torch.arange(1, 51)[:, None]
+    vehicles = before.scene["route_log"].shape[1]
+    future = before.states[:, :vehicles, None].repeat(1, 1, 50, 1)
+    future[..., 1] += DT * torch.arange(1, 51)
     future[..., 3] = 5.0
-    present = before.valid[:, None].repeat(1, 50, 1)
-    present[:, 1:, 2] = False
-    env.write_traffic(1, future, present)
+    present = before.valid[:, :vehicles, None].repeat(1, 1, 50)
+    present[:, 2, 1:] = False
+    env.write_traffic(torch.arange(2), future, present)
     act(env)
     act(env)
     world = env.world()
-    vehicles = world.route.shape[1]
-    assert torch.allclose(world.states[:, 1:vehicles], future[:, 1, 1:vehicles])
+    assert torch.allclose(world.states[:, 1:vehicles], future[:, 1:, 1])
     assert not world.valid[:, 2].any() and world.valid[:, 1].all(), "a vehicle whose traffic turns invalid is gone"
-    assert torch.allclose(world.plan[:, 1, :47], future[:, 2:49, 1])
     assert torch.allclose(world.states[:, vehicles:], world.scene["logged"][:, 3, vehicles:])
 
 
@@ -165,6 +177,14 @@ def test_map_end_truncates():
     td = drive(env, 80)
     assert td["truncated"].all() and not td["terminated"].any()
     assert 38 <= td["metrics", "progress"].mean() <= 41 and not env.world().valid[:, 0].any()
+
+
+def test_an_episode_goes_on_beyond_the_map_where_the_settings_say_so():
+    """Evaluation records whole episodes, whatever becomes of the ego."""
+    env = make_env(num_scenes=1, num_vehicles=1, road=(-60.0, 40.0), settings=SimSettings(end_when_gone=False))
+    env.reset()
+    assert drive(env, 79)["done"].sum() == 0 and not env.world().valid[:, 0].any()
+    assert act(env)["truncated"].all()
 
 
 def test_replayed_ego_follows_its_log_and_progress_is_its_way():

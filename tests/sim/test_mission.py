@@ -2,7 +2,8 @@
 
 import torch
 
-from e2rl.sim.mission import light_now, limit_at, mission_of, stop_ahead
+from e2rl.sim.mission import limit_at, mission_of, stop_ahead
+from e2rl.sim.traffic_light import light_state_at
 from tests.synthetic import BACK, make_scenes
 
 
@@ -36,4 +37,5 @@ def test_red_binds_unless_halting_is_hopeless_yellow_where_it_is_comfortable():
 def test_scenes_without_lights():
     scene = make_scenes(2).scenes
     scene["light_state"] = scene["light_state"][..., :0]
-    assert (light_now(mission_of(scene), scene, torch.zeros(2, dtype=torch.long)) == 0).all()
+    now = light_state_at(scene["light_state"], mission_of(scene).light, torch.zeros(2, dtype=torch.long))
+    assert (now == 0).all()

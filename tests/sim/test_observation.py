@@ -6,8 +6,8 @@ from e2rl.scene.recording import LIGHT_GREEN, LIGHT_RED
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.mission import mission_of
-from e2rl.sim.observation import lens, light_features
-from e2rl.sim.setting import setting_of
+from e2rl.sim.observation import light_features, observation_config
+from e2rl.sim.static import static_scene
 from tests.synthetic import make_scenes
 
 
@@ -72,9 +72,9 @@ def test_absent_agents_leave_no_trace():
 def test_beyond_the_recording_a_light_keeps_its_last_state_in_its_own_scene():
     scene = scenes_with_everything().scenes
     scene["light_state"][0], scene["light_state"][1] = LIGHT_RED, LIGHT_GREEN
-    setting, last = setting_of(scene, mission_of(scene)), scene["light_state"].shape[1] - 1
+    static, last = static_scene(scene, mission_of(scene)), scene["light_state"].shape[1] - 1
     here = torch.full((2,), 20.0)
     at_the_end, beyond = (
-        light_features(lens("cpu"), setting, torch.full((2,), step), here) for step in (last, last + 40)
+        light_features(observation_config(torch.device("cpu")), static, torch.full((2,), step), here) for step in (last, last + 40)
     )
     assert torch.equal(beyond, at_the_end) and beyond[0, 0] == 1 and beyond[1, 2] == 1

@@ -3,17 +3,17 @@
 import torch
 
 from e2rl.scene.route import SPACING, interpolate, project
-from e2rl.sim.around import axes, look_around
 from e2rl.sim.geometry import separation, to_frame
 from e2rl.sim.mission import Mission, limit_at, mission_of
-from e2rl.sim.setting import follow, look_along, setting_of, write_rows
+from e2rl.sim.neighbours import neighbours_of, rotation_into
+from e2rl.sim.static import follow, look_along, static_scene, write_rows
 from tests.synthetic import make_scenes
 
 BATCH, COUNT = 64, 60
 
 
 def winding(seed=0):
-    """A Setting whose missions bend at random, with its mission."""
+    """A StaticScene whose missions bend at random, with its mission."""
     draw = torch.Generator().manual_seed(seed)
     heading = (0.15 * torch.randn(BATCH, COUNT, generator=draw)).cumsum(1)
     points = (SPACING * torch.stack([heading.cos(), heading.sin()], -1)).cumsum(1)
@@ -21,23 +21,23 @@ def winding(seed=0):
     scene = make_scenes(BATCH, num_points=COUNT).scenes
     mission = mission_of(scene)
     mission = Mission(points, limit, mission.end, mission.light, mission.light_s)
-    return setting_of(scene, mission), mission, draw
+    return static_scene(scene, mission), mission, draw
 
 
-def test_the_place_is_the_projection_on_the_mission():
-    setting, mission, draw = winding()
+def test_the_pose_is_the_projection_on_the_mission():
+    static, mission, draw = winding()
     hint = 150 * torch.rand(BATCH, generator=draw) - 15
     near = mission.points[torch.arange(BATCH), (hint / SPACING).long().clamp(0, COUNT - 1)]
     xy = near + 3 * torch.randn(BATCH, 2, generator=draw)
     expected = project(xy[:, None], mission.points, hint[:, None])
-    for found, value in zip(follow(setting, xy, hint), expected, strict=True):
+    for found, value in zip(follow(static, xy, hint), expected, strict=True):
         assert torch.equal(found, value[:, 0])
 
 
 def test_the_way_ahead_is_interpolated_with_its_limit():
-    setting, mission, draw = winding()
+    static, mission, draw = winding()
     s = 160 * torch.rand(BATCH, 40, generator=draw) - 20
-    xy, heading, curvature, limit = look_along(setting, s)
+    xy, heading, curvature, limit = look_along(static, s)
     for found, value in zip((xy, heading, curvature), interpolate(mission.points, s), strict=True):
         assert torch.allclose(found, value, atol=1e-5)
     assert torch.equal(limit, limit_at(mission, s))
@@ -45,24 +45,26 @@ def test_the_way_ahead_is_interpolated_with_its_limit():
 
 def test_others_are_seen_in_the_ego_frame_with_their_gap():
     scene = make_scenes(BATCH, num_vehicles=20, num_vrus=5).scenes
-    setting, draw = setting_of(scene, mission_of(scene)), torch.Generator().manual_seed(1)
-    spread = torch.tensor([6.0, 6.0, 3.0, 5.0])
-    states = spread * torch.randn(BATCH, 48, 4, generator=draw)
+    static, draw = static_scene(scene, mission_of(scene)), torch.Generator().manual_seed(1)
+    scale = torch.tensor([6.0, 6.0, 3.0, 5.0])
+    states = scale * torch.randn(BATCH, 48, 4, generator=draw)
     ego, others = states[:, 0], states[:, 1:]
-    around = look_around(ego, axes(ego), setting, others, scene["valid"][:, 1:], others[..., 0])
-    assert torch.allclose(around.local.transpose(1, 2), to_frame(others[..., :2], ego[:, None]), atol=1e-5)
+    sizes, present = (static.size, static.half_size), scene["valid"][:, 1:]
+    seen = neighbours_of(ego, rotation_into(ego), *sizes, others, present, others[..., 0])
+    assert torch.allclose(seen.position.transpose(1, 2), to_frame(others[..., :2], ego[:, None]), atol=1e-5)
     turned = others[..., 2] - ego[:, None, 2]
-    assert torch.allclose(around.direction, torch.stack([turned.cos(), turned.sin()], 1), atol=1e-5)
+    assert torch.allclose(seen.direction, torch.stack([turned.cos(), turned.sin()], 1), atol=1e-5)
     size = scene["size"]
-    assert torch.allclose(around.gap, separation(ego[:, None], size[:, :1], others, size[:, 1:]), atol=1e-5)
+    assert torch.allclose(seen.gap, separation(ego[:, None], size[:, :1], others, size[:, 1:]), atol=1e-5)
 
 
 def test_rows_that_begin_anew_are_those_of_their_scene():
     scene = make_scenes(4, num_vehicles=3, red_light_x=50.0).scenes
     other = make_scenes(2, num_vehicles=7, limit=7.0, red_light_x=70.0).scenes
-    setting, rows = setting_of(scene, mission_of(scene)), torch.tensor([2, 0])
-    fresh = setting_of(other, mission_of(other))
-    scene[rows] = other  # as the environment does: the rest of a Setting is the scenes' own storage
-    write_rows(setting, rows, fresh)
-    for name, value in setting_of(scene, mission_of(scene))._asdict().items():
-        assert torch.equal(getattr(setting, name), value), name
+    static, rows = static_scene(scene, mission_of(scene)), torch.tensor([2, 0])
+    fresh = static_scene(other, mission_of(other))
+    scene[rows] = other  # as the environment does: the rest of a StaticScene is the scenes' own storage
+    write_rows(static, rows, fresh)
+    expected = static_scene(scene, mission_of(scene))
+    for found, value in zip((*static.mission, *static[1:]), (*expected.mission, *expected[1:]), strict=True):
+        assert torch.equal(found, value)
