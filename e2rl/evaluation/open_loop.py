@@ -10,7 +10,7 @@ from e2rl.metrics.catalogue import OPEN_LOOP_STAGE
 from e2rl.metrics.displacement import scene_displacements
 from e2rl.metrics.statistics import bootstrap_draws, cluster_index, interval, resampled_means
 from e2rl.prior.lane_relative import HORIZON, SIZE
-from e2rl.prior.spread import main_direction, spread_noise, stratified
+from e2rl.prior.stratified_sampling import main_direction, stratified_noise, stratified_uniform
 from e2rl.scene.recording import VEHICLE
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.world import World
@@ -63,8 +63,8 @@ def open_loop_rows(scenes: SceneSet, methods: list[Method], samples: int, device
 def sample_plans(synthesizer: Synthesizer | Baseline, scene: TensorDictBase, seed: Tensor) -> Tensor:
     """Joint plans [B, S, V, HORIZON, 4] of scenes [B] from their start states; seed [S, B] int64.
 
-    The prior's samples are stratified (prior/spread.py) and stand as drawn: the acceleration bounds belong to the
-    executed half second, and the present ones held over 5 s would make them a tenth less accurate.
+    The prior's samples are stratified (prior/stratified_sampling.py) and stand as drawn: the acceleration bounds belong
+    to the executed half second, and the present ones held over 5 s would make them a tenth less accurate.
     """
     if isinstance(synthesizer, Baseline):
         return torch.stack([_straight_plan(synthesizer, scene, one) for one in seed], 1)
@@ -74,9 +74,9 @@ def sample_plans(synthesizer: Synthesizer | Baseline, scene: TensorDictBase, see
     ).unflatten(0, (count, batch))
     order, place = draw(0, 2, vehicles, uniform=True).unbind(2), draw(2, 2, vehicles, uniform=True)[0].unbind(1)
     noise = draw(1, prior.sampler.steps, vehicles, SIZE).transpose(1, 2)
-    noise = spread_noise(noise, main_direction(prior.schedule, prior.sampler, noise.device), order[1], place[1])
+    noise = stratified_noise(noise, main_direction(prior.schedule, prior.sampler, noise.device), order[1], place[1])
     plans = []
-    for uniform, one in zip(stratified(order[0], place[0]), noise, strict=True):
+    for uniform, one in zip(stratified_uniform(order[0], place[0]), noise, strict=True):
         routed, state = prior.start(scene, prior.choose_routes(scene, uniform))
         zero = torch.zeros(batch, dtype=torch.long, device=seed.device)
         context = prior.encode(routed, state, scene["start"], scene["valid"], zero, None)

@@ -3,11 +3,12 @@
 import torch
 from torch import Tensor
 
+from e2rl.prior.lane_relative import LaneState
 from e2rl.prior.prior import Plan
 from e2rl.scene.recording import DT
 from e2rl.sim.world import World
 from e2rl.synthesizer.episode import Episode
-from e2rl.traffic.traffic import Baseline, off_route, steps_ahead
+from e2rl.traffic.traffic import Baseline, steps_ahead
 
 
 class ConstantVelocity(Baseline):
@@ -20,7 +21,7 @@ class ConstantVelocity(Baseline):
         start = torch.cat([start[..., :3], start[..., 3:].masked_fill(parked[..., None], 0.0)], -1)
         states = straight_on(start, steps_ahead(world))
         there = world.valid[:, : parked.shape[1], None].expand(states.shape[:-1])
-        return Plan(off_route(states), there)
+        return Plan(LaneState.from_states(states), there)
 
 
 def straight_on(start: Tensor, step: Tensor) -> Tensor:

@@ -11,14 +11,15 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.ego.idm import LINE_GAP, idm_acceleration
-from e2rl.prior.bounds import BoundSettings, Surroundings, bounded, under
+from e2rl.ego.idm import LINE_GAP
+from e2rl.prior.bounds import BoundSettings, Obstacles, apply_cap, bounded
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, decode, locate
-from e2rl.prior.prior import STANDING, Plan
+from e2rl.prior.prior import STANDING_SPEED, Plan
 from e2rl.prior.routed import RoutedScene
 from e2rl.scene.recording import LIGHT_RED, LIGHT_YELLOW
 from e2rl.scene.route import SPACING
-from e2rl.sim.leaders import FREE, leaders
+from e2rl.sim.car_following import IDMParameters, idm_acceleration
+from e2rl.sim.leaders import FREE_GAP, leaders
 from e2rl.sim.world import World
 from e2rl.synthesizer.episode import Episode
 from e2rl.traffic.traffic import Baseline
@@ -58,13 +59,13 @@ class IDM(Baseline):
         wanted = self._wanted(routed, state, world).clamp(min=self.bounds.floor)
         x = (wanted / ACCEL_SCALE)[..., None].expand(*state.v.shape, KNOTS)
         x = torch.cat([x, x.new_zeros(*state.v.shape, SIZE - KNOTS)], -1)
-        frozen = routed.parked | (world.scene["start"][:, :vehicles, 3] < STANDING) | ~present
-        around = Surroundings(world.states, routed.size, world.valid, torch.zeros_like(present))
+        frozen = routed.parked | (world.scene["start"][:, :vehicles, 3] < STANDING_SPEED) | ~present
+        obstacles = Obstacles(world.states, routed.size, world.valid, torch.zeros_like(present))
         motion = bounded(
             self.bounds,
-            lambda cap: _held(decode(*under(cap, x, state, self.bounds.onset), routed.points), state, frozen),
+            lambda cap: _held(decode(*apply_cap(cap, x, state, self.bounds.onset), routed.points), state, frozen),
             state,
-            around,
+            obstacles,
         )
         gone = routed.open[..., None] & (motion.s >= routed.length[..., None]) & routed.has_lane[..., None]
         return Plan(motion, present[..., None] & ~(gone.cumsum(-1) > 0))
@@ -72,29 +73,17 @@ class IDM(Baseline):
     def _wanted(self, routed: RoutedScene, state: LaneState, world: World) -> Tensor:
         """IDM acceleration [B, V] behind the leader or the light, whichever brakes harder."""
         own, vehicles = self.settings, state.v.shape[1]
-        length, width = routed.size[:, :vehicles, 0], routed.size[:, :vehicles, 1]
-        gap, speed, _ = leaders(state.s, width, length, routed.points, world.states, routed.size, world.valid, state.d)
-        gap = torch.where(gap < FREE, gap, torch.inf)
+        length = routed.size[:, :vehicles, 0]
+        gap, speed, _ = leaders(state.s, routed.points, world.states, routed.size, world.valid, state.d)
+        gap = torch.where(gap < FREE_GAP, gap, torch.inf)
         at = (state.s / SPACING).round().long().clamp(0, routed.limit.shape[-1] - 1)
         limit = routed.limit.gather(-1, at[..., None])[..., 0]
         desired = torch.where(limit > 0, limit, world.scene["start"][:, :vehicles, 3].clamp(min=own.speed))
         line = _red_light(routed, state, world.step, 2 * own.braking) - length / 2 - LINE_GAP + own.standstill_gap
-        return torch.minimum(
-            *(
-                idm_acceleration(
-                    state.v,
-                    desired,
-                    free.clamp(min=0.1),
-                    leading,
-                    own.acceleration,
-                    own.braking,
-                    own.headway,
-                    own.standstill_gap,
-                    own.exponent,
-                )
-                for free, leading in ((gap, speed.clamp(min=0)), (line, torch.zeros_like(line)))
-            )
-        )
+        driver = IDMParameters(own.headway, own.standstill_gap, own.acceleration, own.braking, own.exponent)
+        follow = idm_acceleration(state.v, desired, gap.clamp(min=0.1), speed.clamp(min=0), driver, improved=True)
+        halt = idm_acceleration(state.v, desired, line.clamp(min=0.1), torch.zeros_like(line), driver, improved=True)
+        return torch.minimum(follow, halt)
 
 
 def _red_light(routed: RoutedScene, state: LaneState, step: Tensor, brake: float) -> Tensor:

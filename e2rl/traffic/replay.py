@@ -2,10 +2,11 @@
 
 import torch
 
+from e2rl.prior.lane_relative import LaneState
 from e2rl.prior.prior import Plan
 from e2rl.sim.world import World
 from e2rl.synthesizer.episode import Episode
-from e2rl.traffic.traffic import Baseline, off_route, steps_ahead
+from e2rl.traffic.traffic import Baseline, steps_ahead
 
 
 class Replay(Baseline):
@@ -20,4 +21,4 @@ class Replay(Baseline):
         step = steps_ahead(world)
         row, at = torch.arange(len(step), device=step.device)[:, None], step.clamp(max=logged.shape[1] - 1)
         known = valid[row, at, :vehicles] & (step < logged.shape[1])[..., None]
-        return Plan(off_route(logged[row, at, :vehicles].transpose(1, 2)), known.transpose(1, 2))
+        return Plan(LaneState.from_states(logged[row, at, :vehicles].transpose(1, 2)), known.transpose(1, 2))

@@ -8,7 +8,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.ego.base import Ego
-from e2rl.prior.lane_relative import HORIZON, LaneState, locate
+from e2rl.prior.lane_relative import HORIZON, locate
 from e2rl.prior.prior import Plan
 from e2rl.prior.routed import route_scene
 from e2rl.sim.world import World
@@ -54,10 +54,3 @@ class Baseline(ABC):
 def steps_ahead(world: World) -> Tensor:
     """The coming simulated steps [B, HORIZON] int64."""
     return world.step[:, None] + torch.arange(1, HORIZON + 1, device=world.step.device)
-
-
-def off_route(states: Tensor) -> LaneState:
-    """States [..., 4] as a LaneState of vehicles whose place along a route nobody asks for."""
-    x, y, heading, v = states.unbind(-1)
-    zero = torch.zeros_like(v)
-    return LaneState(zero, zero, zero, zero, v, zero, x, y, heading, zero)
