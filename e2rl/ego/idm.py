@@ -6,9 +6,9 @@ from torch import Tensor
 from e2rl.ego.base import PLAN_STEPS, Ego
 from e2rl.ego.path import MissionPath, look_up
 from e2rl.scene.recording import DT
-from e2rl.scene.route import project
 from e2rl.sim.car_following import IDMParameters, idm_acceleration
-from e2rl.sim.dynamics import MAX_SPEED, bounded_speed, wrap
+from e2rl.sim.dynamics import MAX_SPEED, bounded_speed
+from e2rl.sim.leaders import leaders
 from e2rl.sim.mission import limit_at
 from e2rl.sim.world import World
 
@@ -69,17 +69,9 @@ class IDMEgo(Ego):
 
         An agent leads when its box comes laterally within half the ego's width + gate_margin of the route.
         """
-        others, size = world.states[:, 1:], world.scene["size"]
-        s, d, heading = project(others[..., :2], path.route)
-        turned = wrap(others[..., 2] - heading)
-        half = (size[:, 1:] / 2).unbind(-1)
-        along = turned.cos().abs() * half[0] + turned.sin().abs() * half[1]
-        across = turned.sin().abs() * half[0] + turned.cos().abs() * half[1]
-        inside = d.abs() < across + size[:, :1, 1] / 2 + self.gate_margin
-        leads = inside & (s > path.s[:, None]) & world.valid[:, 1:]
-        gaps = (s - path.s[:, None] - along - size[:, :1, 0] / 2).masked_fill(~leads, torch.inf)
-        gap, index = gaps.min(1)
-        leading = (others[..., 3] * turned.cos()).gather(1, index[:, None])[:, 0].clamp(min=0)
+        route, size = path.route[:, None], world.scene["size"]
+        found = leaders(path.s[:, None], route, world.states, size, world.valid, None, self.gate_margin, torch.inf)
+        gap, leading = found.gap[:, 0], found.speed[:, 0].clamp(min=0)
         if self.obey_lights:
             light = path.stop_distance(self.braking, LINE_GAP) + self.standstill_gap
             gap, leading = torch.minimum(gap, light), torch.where(light < gap, 0.0, leading)

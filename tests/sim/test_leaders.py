@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from e2rl.scene.route import project
-from e2rl.sim.leaders import FREE_GAP, GATE_MARGIN, leaders
+from e2rl.sim.leaders import FREE_GAP, leaders
 from tests.prior.small import arc
 
 LENGTH, WIDTH = 4.0, 2.0
@@ -53,7 +53,7 @@ def test_whoever_is_between_a_vehicle_and_its_route_is_ahead_too():
     assert torch.isclose(changing[0][0, 0], torch.tensor(16.0)) and changing[1][0, 0] == 4.0
 
 
-def all_pairs(s, points, agents, size, present, d):
+def all_pairs(s, points, agents, size, present, d, margin, free_gap):
     """The definition, with every agent projected onto every route."""
     length, width = size[:, : s.shape[1]].unbind(-1)
     at, offset, heading = project(agents[:, None, :, :2], points)
@@ -62,15 +62,17 @@ def all_pairs(s, points, agents, size, present, d):
     side = (size[:, None, :, 0] * sin.abs() + size[:, None, :, 1] * cos.abs()) / 2
     along = (size[:, None, :, 0] * cos.abs() + size[:, None, :, 1] * sin.abs()) / 2
     aside = offset - torch.minimum(torch.maximum(offset, d[..., None].clamp(max=0)), d[..., None].clamp(min=0))
-    leads = (aside.abs() < width[..., None] / 2 + side + GATE_MARGIN) & (at > s[..., None]) & present[:, None]
+    leads = (aside.abs() < width[..., None] / 2 + side + margin) & (at > s[..., None]) & present[:, None]
     leads &= ~torch.eye(*leads.shape[1:], dtype=torch.bool) & present[:, : s.shape[1], None]
-    gap = torch.where(leads, at - s[..., None] - length[..., None] / 2 - along, FREE_GAP).min(-1)
-    return gap.values.clamp(max=FREE_GAP), (agents[:, None, :, 3] * cos).gather(-1, gap.indices[..., None])[..., 0]
+    gap, index = torch.where(leads, at - s[..., None] - length[..., None] / 2 - along, free_gap).min(-1)
+    return gap.clamp(max=free_gap), (agents[:, None, :, 3] * cos).gather(-1, index[..., None])[..., 0], index
 
 
-def test_pruned_pairs_are_those_that_could_not_lead():
+@pytest.mark.parametrize(("vehicles", "offsets", "free_gap"), [(6, True, FREE_GAP), (1, False, torch.inf)])
+def test_pruned_pairs_are_those_that_could_not_lead(vehicles, offsets, free_gap):
+    """Of all vehicles as the traffic asks, and of the ego alone without a horizon as the IDM ego does."""
     generator = torch.Generator().manual_seed(0)
-    batch, vehicles, count = 40, 6, 10
+    batch, count = 40 * 6 // vehicles, 10
     draw = lambda *shape: torch.rand(shape, generator=generator)  # noqa: E731
     bend = 0.04 * (draw(batch, vehicles, 1) - 0.5) * torch.arange(150) + 6.28 * draw(batch, vehicles, 1)
     step = 2.0 * torch.stack([bend.cos(), bend.sin()], -1)
@@ -79,12 +81,12 @@ def test_pruned_pairs_are_those_that_could_not_lead():
     place = points[:, 0, torch.randint(0, 150, (count,), generator=generator)] + 8 * (draw(batch, count, 2) - 0.5)
     agents = torch.cat([place, 6.28 * draw(batch, count, 1), 10 * draw(batch, count, 1)], -1)
     size = torch.tensor([4.5, 2.0]).expand(batch, count, 2)
-    present, d = draw(batch, count) < 0.8, 6 * (draw(batch, vehicles) - 0.5)
-    s = 60 * draw(batch, vehicles)
-    expected = all_pairs(s, points, agents, size, present, d)
-    found = leaders(s, points, agents, size, present, d)
-    led = expected[0] < FREE_GAP
-    assert led.sum() > 40
-    torch.testing.assert_close(found[0], expected[0], rtol=0, atol=1e-3)
-    torch.testing.assert_close(found[1][led], expected[1][led], rtol=0, atol=1e-3)
-    assert torch.equal(found[1][~led], agents[:, :vehicles, 3][~led]), "nobody ahead moves as the vehicle does"
+    present, d = draw(batch, count) < 0.8, 6 * (draw(batch, vehicles) - 0.5) * offsets
+    given = (60 * draw(batch, vehicles), points, agents, size, present)
+    expected = all_pairs(*given, d, 0.5, free_gap)
+    found = leaders(*given, d if offsets else None, 0.5, free_gap)
+    led = expected[0] < free_gap
+    assert led.sum() > 40 and torch.equal(found.index[led], expected[2][led])
+    torch.testing.assert_close(found.gap, expected[0], rtol=0, atol=1e-4)
+    torch.testing.assert_close(found.speed[led], expected[1][led], rtol=0, atol=1e-4)
+    assert torch.equal(found.speed[~led], agents[:, :vehicles, 3][~led]), "nobody ahead moves as the vehicle does"
