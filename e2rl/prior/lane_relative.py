@@ -18,8 +18,8 @@ from e2rl.scene.route import interpolate, project
 from e2rl.sim.dynamics import wrap
 
 HORIZON = 50  # steps of DT
-KNOTS, LATERAL = 10, 2
-SIZE = KNOTS + LATERAL
+KNOTS = 10
+SIZE = KNOTS + 2
 KNOT_STEPS = HORIZON // KNOTS
 ACCEL_SCALE = 1.0  # m/s^2 a unit of x
 OFFSET_SCALE, BEND_SCALE = 0.5, 0.15  # m a unit of x: end offset; half-way offset from the mean of now and the end
@@ -168,7 +168,13 @@ class _Polynomial(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, c: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        value, first, second, third = horner(c, u)
+        value, first = c[..., 6, None] * u + c[..., 5, None], c[..., 6, None]
+        second = third = torch.zeros_like(first)
+        for k in range(4, -1, -1):
+            third = third * u + 3 * second
+            second = second * u + (first + first)
+            first = first * u + value
+            value = value * u + c[..., k, None]
         ctx.save_for_backward(c, u, first, second, third)
         return value, first, second
 
@@ -190,18 +196,6 @@ class _Polynomial(torch.autograd.Function):
 def polynomial(c: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Value, first and second derivative (in u) of the polynomial c [..., 7] at u [..., H]."""
     return _Polynomial.apply(c, u)
-
-
-def horner(c: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Value and three derivatives of the polynomial c [..., 7] at u [..., H], by Horner's rule."""
-    value, first = c[..., 6, None] * u + c[..., 5, None], c[..., 6, None]
-    second = third = torch.zeros_like(first)
-    for k in range(4, -1, -1):
-        third = third * u + 3 * second
-        second = second * u + (first + first)
-        first = first * u + value
-        value = value * u + c[..., k, None]
-    return value, first, second, third
 
 
 def fit(track: LaneState, known: Tensor, state: LaneState) -> tuple[Tensor, Tensor]:

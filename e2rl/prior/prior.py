@@ -15,7 +15,7 @@ from e2rl.prior.features import edge_features, node_features
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, LaneState, select
 from e2rl.prior.route_choice import RouteChoice, sample_route
 from e2rl.prior.routed import RoutedScene, route_scene, start_state
-from e2rl.prior.sde import SAMPLERS, NoiseSchedule, path_kl, reverse_step
+from e2rl.prior.sde import SAMPLERS, path_kl, reverse_step
 from e2rl.scene.recording import DT
 from e2rl.scene.route import project
 from e2rl.settings import check_choice, check_range
@@ -111,12 +111,7 @@ class Prior(nn.Module):
         self.denoiser = Denoiser(denoiser)
         self.route_choice = RouteChoice()
         self.sampler, self.bounds = sampler or SamplerSettings(), bounds or BoundSettings()
-        self.free_space = free_space
-
-    @property
-    def schedule(self) -> NoiseSchedule:
-        """The noise schedule (SDE) of the denoiser."""
-        return self.denoiser.schedule
+        self.schedule, self.free_space = self.denoiser.schedule, free_space
 
     @torch.no_grad()
     def choose_routes(self, scene: TensorDictBase, uniform: Tensor) -> Tensor:
