@@ -98,11 +98,11 @@ def _meeting_braking(
     """
     vehicles = state.v.shape[1]
     others = constant_velocity(obstacles.agents[:, vehicles:], DT * (steps + 1))
-    everybody = torch.cat([motion.states()[:, :, steps], others], 1)  # [B, N, len(steps), 4]
-    first, meet = _first_meeting(everybody, obstacles, settings.aside, vehicles)
+    tracks = torch.cat([motion.states()[:, :, steps], others], 1)  # [B, N, len(steps), 4]
+    first, meet = _first_meeting(tracks, obstacles, settings.aside, vehicles)
     index = first[..., None, None].expand(*first.shape, 1, 4)
-    other = everybody[:, None].expand(-1, vehicles, -1, -1, -1).gather(3, index)[..., 0, :]
-    own = everybody[:, :vehicles, None].expand(-1, -1, first.shape[2], -1, -1).gather(3, index)[..., 0, :]
+    other = tracks[:, None].expand(-1, vehicles, -1, -1, -1).gather(3, index)[..., 0, :]
+    own = tracks[:, :vehicles, None].expand(-1, -1, first.shape[2], -1, -1).gather(3, index)[..., 0, :]
     dx, dy = (other[..., :2] - own[..., :2]).unbind(-1)
     ahead = dx * torch.cos(own[..., 2]) + dy * torch.sin(own[..., 2])  # m, the other along the vehicle's heading
     ahead_of_other = -(dx * torch.cos(other[..., 2]) + dy * torch.sin(other[..., 2]))
@@ -114,12 +114,12 @@ def _meeting_braking(
     return torch.where(yields, braking.clamp(min=MIN_BRAKING), -NO_CAP).amax(-1)
 
 
-def _first_meeting(everybody: Tensor, obstacles: Obstacles, aside: float, vehicles: int) -> tuple[Tensor, Tensor]:
+def _first_meeting(tracks: Tensor, obstacles: Obstacles, aside: float, vehicles: int) -> tuple[Tensor, Tensor]:
     """Index of the time [B, V, N] at which i's box, wider by `aside` on both sides, first overlaps j's, and whether it
     does at all."""
     size, present = obstacles.size, obstacles.present
     wide = size[:, :vehicles] + size.new_tensor([0.0, 2 * aside])
-    meets = overlap(everybody[:, :vehicles, None], wide[:, :, None, None], everybody[:, None], size[:, None, :, None])
+    meets = overlap(tracks[:, :vehicles, None], wide[:, :, None, None], tracks[:, None], size[:, None, :, None])
     itself = torch.eye(vehicles, present.shape[1], dtype=torch.bool, device=meets.device)
     counts = present[:, None, :] & present[:, :vehicles, None] & ~itself
     counts = torch.cat([counts[..., :1] & ~obstacles.exempt[..., None], counts[..., 1:]], -1)

@@ -235,8 +235,8 @@ def _fit_knots(track: LaneState, known: Tensor, state: LaneState) -> Tensor:
     weight = known.to(basis.dtype)[..., None]
     rows = torch.cat([weight * basis[:, 1:], 0.5 * weight * distance[:, 1:]], -2)
     speed = track.v - state.v[..., None] - state.a[..., None] * basis[:, 0]
-    way = track.s - state.s[..., None] - state.v[..., None] * time - state.a[..., None] * distance[:, 0]
-    target = torch.cat([weight[..., 0] * speed, 0.5 * weight[..., 0] * way], -1)
+    driven = track.s - state.s[..., None] - state.v[..., None] * time - state.a[..., None] * distance[:, 0]
+    target = torch.cat([weight[..., 0] * speed, 0.5 * weight[..., 0] * driven], -1)
     second = torch.diff(torch.eye(KNOTS + 1, device=known.device), n=2, dim=0)
     damp = 0.02 * second[:, 1:].T @ second[:, 1:] + 1e-3 * torch.eye(KNOTS, device=known.device)
     pull = -0.02 * second[:, 1:].T @ second[:, 0] * state.a[..., None]

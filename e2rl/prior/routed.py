@@ -61,23 +61,14 @@ def route_scene(scene: TensorDictBase, route: Tensor, free_space: bool = False) 
     assigned = {name: take_route(scene[f"route_{name}"], route) for name in ROUTE_FIELDS}
     valid, parked = scene["valid"][:, :vehicles], scene["parked"][:, :vehicles]
     has_lane = take_route(scene["route_valid"], route)
-    everybody = torch.arange(vehicles, device=route.device)
-    pairs = [_conflicts(points, everybody)[0] for points in assigned["points"]]
+    all_rows = torch.arange(vehicles, device=route.device)
+    pairs = [_conflicts(points, all_rows)[0] for points in assigned["points"]]
     conflict, conflict_s, crossing = (torch.stack(parts) for parts in zip(*pairs, strict=True))
     both = valid & ~parked & has_lane
-    return RoutedScene(
-        size=scene["size"],
-        light_state=scene["light_state"],
-        past=scene["past"][:, :vehicles],
-        route=route,
-        **assigned,
-        conflict=conflict & both[:, :, None] & both[:, None, :],
-        conflict_s=conflict_s,
-        crossing=crossing,
-        modelled=valid & ~parked,
-        parked=parked,
-        has_lane=has_lane & (not free_space),
-    )
+    given = (scene["size"], scene["light_state"], scene["past"][:, :vehicles], route)
+    meet = {"conflict": conflict & both[:, :, None] & both[:, None, :], "conflict_s": conflict_s, "crossing": crossing}
+    kind = {"modelled": valid & ~parked, "parked": parked, "has_lane": has_lane & (not free_space)}
+    return RoutedScene(*given, **assigned, **meet, **kind)
 
 
 def start_state(scene: TensorDictBase, routed: RoutedScene) -> LaneState:
@@ -92,14 +83,14 @@ def reroute(
     routed: RoutedScene,
     scene: TensorDictBase,
     route: Tensor,
-    who: Tensor,
+    moved: Tensor,
     off_lane: Tensor,
     off_lane_path: Tensor,
     free_space: bool = False,
 ) -> RoutedScene:
-    """`routed` with vehicles who [B, V] on other lines: their candidates route [B, V] or, where off_lane [B, V], the
+    """`routed` with the vehicles `moved` [B, V] on new lines: candidates route [B, V] or, where off_lane [B, V], the
     off_lane_path [B, V, P, 2]. Such a path has no lights; its limit is the highest of the candidate's."""
-    off_lane = off_lane & who
+    off_lane = off_lane & moved
     lane = {name: take_route(scene[f"route_{name}"], route) for name in (*ROUTE_FIELDS, "valid")}
     path = {"points": off_lane_path, "length": SPACING * (off_lane_path.shape[2] - 1), "open": False}
     path |= {"limit": lane["limit"].amax(-1, keepdim=True), "light": -1, "light_s": 0.0}
@@ -108,24 +99,18 @@ def reroute(
         extra = [1] * (old.dim() - 2)
         on_path = torch.as_tensor(on_path, dtype=old.dtype, device=old.device)
         new = torch.where(off_lane.view(*off_lane.shape, *extra), on_path, on_lane)
-        return torch.where(who.view(*who.shape, *extra), new, old)
+        return torch.where(moved.view(*moved.shape, *extra), new, old)
 
     changed = {name: change(getattr(routed, name), lane[name], path[name]) for name in ROUTE_FIELDS}
     pairs = [value.clone() for value in (routed.conflict, routed.conflict_s, routed.crossing)]
-    for b in who.any(1).nonzero()[:, 0].tolist():
-        rows = who[b].nonzero()[:, 0]
+    for b in moved.any(1).nonzero()[:, 0].tolist():
+        rows = moved[b].nonzero()[:, 0]
         for old, own, other in zip(pairs, *_conflicts(changed["points"][b], rows), strict=True):
             old[b][:, rows], old[b][rows] = other.T, own
     both = routed.modelled & lane["valid"]
-    return replace(
-        routed,
-        route=torch.where(who, route, routed.route),
-        **changed,
-        conflict=pairs[0] & both[:, :, None] & both[:, None],
-        conflict_s=pairs[1],
-        crossing=pairs[2],
-        has_lane=change(routed.has_lane, lane["valid"] & (not free_space), not free_space),
-    )
+    changed |= {"conflict": pairs[0] & both[:, :, None] & both[:, None], "conflict_s": pairs[1], "crossing": pairs[2]}
+    has_lane = change(routed.has_lane, lane["valid"] & (not free_space), not free_space)
+    return replace(routed, route=torch.where(moved, route, routed.route), has_lane=has_lane, **changed)
 
 
 def _conflicts(points: Tensor, rows: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:

@@ -75,18 +75,18 @@ def _near_pairs(points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Te
     vertices = (starts[:, None] + torch.arange(STRETCH + 1, device=s.device)).clamp(max=count - 1)
     stretches = points[:, :, vertices]  # [B, V, C, STRETCH + 1, 2]
     low, high = stretches.amin(3), stretches.amax(3)
-    place, far = xy[b, m], room[b, v, m] + SPACING / 2
-    outside = torch.maximum(low[b, v] - place[:, None], place[:, None] - high[b, v]).clamp(min=0)  # [Q, C, 2]
+    position, far = xy[b, m], room[b, v, m] + SPACING / 2
+    outside = torch.maximum(low[b, v] - position[:, None], position[:, None] - high[b, v]).clamp(min=0)  # [Q, C, 2]
     near = outside.square().sum(-1) < far.square()[:, None]
     tip = points[:, :, -1] - points[:, :, -2]
     tip = tip / tip.norm(dim=-1, keepdim=True).clamp(min=1e-6)
-    past, unit = place - points[b, v, -1], tip[b, v]
+    past, unit = position - points[b, v, -1], tip[b, v]
     beyond = ((past * unit).sum(-1) > 0) & ((past[:, 1] * unit[:, 0] - past[:, 0] * unit[:, 1]).abs() < far)
     near[:, -1] |= beyond
     ahead = (near & (SPACING * vertices[:, -1] >= s[b, v][:, None] - SPACING)).any(-1) | beyond
-    b, v, m, place, near = b[ahead], v[ahead], m[ahead], place[ahead], near[ahead]
+    b, v, m, position, near = b[ahead], v[ahead], m[ahead], position[ahead], near[ahead]
     pair, stretch = near.nonzero(as_tuple=True)
-    squared = (stretches[b[pair], v[pair], stretch] - place[pair][:, None]).square().sum(-1)
+    squared = (stretches[b[pair], v[pair], stretch] - position[pair][:, None]).square().sum(-1)
     nearest, within = squared.min(-1)
     table = nearest.new_full(near.shape, torch.inf).index_put((pair, stretch), nearest)
     vertex = torch.zeros_like(table, dtype=torch.long).index_put((pair, stretch), vertices[stretch, 0] + within)

@@ -30,10 +30,8 @@ class PriorTraining:
     def __init__(self, prior: Prior, windows: TensorDictBase, settings: TrainingSettings, processes: Processes = ALONE):
         """Raises InputError where the processes cannot share a batch evenly."""
         if settings.batch % processes.count:
-            raise InputError(
-                f"prior.training.batch={settings.batch}: {processes.count} processes share the windows of "
-                "a step evenly; choose a multiple of their number"
-            )
+            text = f"prior.training.batch={settings.batch}: {processes.count} processes share the windows of a step"
+            raise InputError(f"{text} evenly; choose a multiple of their number")
         self.prior, self.windows, self.settings, self.processes = prior, windows, settings, processes
         self.step, self.share = 0, settings.batch // processes.count
         self.device = next(prior.parameters()).device

@@ -66,10 +66,8 @@ def held_out(scenes: SceneSet) -> Tensor:
     chosen = set(sorted(set(places))[::HELD_OUT])
     mask = torch.tensor([name in chosen for name in places])
     if bool(mask.all()):
-        raise InputError(
-            f"all {len(scenes)} scenes are of one place ({places[0]!r}), so none can be held out for "
-            "validation; train on logs of several places"
-        )
+        where = f"all {len(scenes)} scenes are of one place ({places[0]!r})"
+        raise InputError(f"{where}, so none can be held out for validation; train on logs of several places")
     return mask
 
 
@@ -78,16 +76,13 @@ def window_sets(scenes: SceneSet, free_space: bool) -> tuple[TensorDictBase, Ten
     mask = held_out(scenes)
     windows, test = (make_windows(scenes.scenes[part], free_space) for part in (~mask, mask))
     if not len(windows) or not len(test):
-        raise InputError(
-            f"{len(windows)} training and {len(test)} held-out windows of {len(scenes)} scenes: too few "
-            "vehicles are recorded for a second on a known route; train on more or longer logs"
-        )
+        counts = f"{len(windows)} training and {len(test)} held-out windows of {len(scenes)} scenes"
+        reason = "too few vehicles are recorded for a second on a known route"
+        raise InputError(f"{counts}: {reason}; train on more or longer logs")
     for name, part in (("training", windows), ("held-out", test)):
         if not bool((part["weight"] > STANDING_WEIGHT).any()):
-            raise InputError(
-                f"no vehicle moves in the {len(part)} {name} windows of {len(scenes)} scenes; train on "
-                "logs with moving traffic"
-            )
+            where = f"in the {len(part)} {name} windows of {len(scenes)} scenes"
+            raise InputError(f"no vehicle moves {where}; train on logs with moving traffic")
     return windows, test
 
 
