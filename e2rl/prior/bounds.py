@@ -23,12 +23,7 @@ MIN_BRAKING = 0.5  # m/s^2 of a vehicle that must give way
 
 @dataclass(frozen=True)
 class BoundSettings:
-    """Fields: conf/prior/default.yaml.
-
-    meeting, curve: which of the bounds act; look [s]: how far ahead plans are compared; gap [m]: kept to the agent that
-    a plan runs into, aside [m]: to either side; lateral [m/s^2]: allowed in curves; floor [m/s^2]: hardest braking;
-    onset [m/s^2]: how far a bound may lower the current acceleration at once, the rest follows over half a second.
-    """
+    """Fields: conf/prior/default.yaml."""
 
     meeting: bool = True
     curve: bool = True

@@ -27,11 +27,7 @@ STANDING_SPEED, HOLD_DISTANCE = 0.5, 2.0  # m/s, m: a vehicle slower than this w
 
 @dataclass(frozen=True)
 class SamplerSettings:
-    """sampler: ddim, dpm_solver_pp (DPM-Solver++ 2M) or euler_maruyama; steps K; churn of the first two (DDIM's eta: 1
-    is the reverse SDE, 0 deterministic); temperature of initial and injected noise; temperature of the route choice.
-
-    Raises InputError for a value out of range.
-    """
+    """Fields: conf/prior/default.yaml; churn is DDIM's eta. Raises InputError for a value out of range."""
 
     sampler: str = "ddim"
     steps: int = 8
