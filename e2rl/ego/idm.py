@@ -6,9 +6,9 @@ from torch import Tensor
 from e2rl.ego.base import PLAN_STEPS, Ego
 from e2rl.ego.path import MissionPath, look_up
 from e2rl.scene.recording import DT
-from e2rl.scene.route import project
-from e2rl.sim.car_following import desired_gap
-from e2rl.sim.dynamics import MAX_SPEED, bounded_speed, wrap
+from e2rl.sim.car_following import IDMParameters, idm_acceleration
+from e2rl.sim.dynamics import MAX_SPEED, bounded_speed
+from e2rl.sim.leaders import leaders
 from e2rl.sim.mission import limit_at
 from e2rl.sim.world import World
 
@@ -47,17 +47,8 @@ class IDMEgo(Ego):
         caps = path.speed_caps(self.desired_speed, self.lateral_acceleration, self.braking, self.use_limits, False)
         gap, leading = self.leader(world, path)
         desired = self.desired(path)
-        accel = idm_acceleration(
-            speed,
-            desired,
-            gap,
-            leading,
-            self.acceleration,
-            self.braking,
-            self.headway,
-            self.standstill_gap,
-            self.exponent,
-        )
+        driver = IDMParameters(self.headway, self.standstill_gap, self.acceleration, self.braking, self.exponent)
+        accel = idm_acceleration(speed, desired, gap, leading, driver, improved=True)
         allowed = look_up(caps, (REACTION * speed)[:, None])[:, 0]
         accel = torch.minimum(accel, ((allowed - speed) / REACTION).clamp(max=self.acceleration))
         accel = accel.clamp(-self.hardest_braking, self.acceleration)
@@ -78,41 +69,10 @@ class IDMEgo(Ego):
 
         An agent leads when its box comes laterally within half the ego's width + gate_margin of the route.
         """
-        others, size = world.states[:, 1:], world.scene["size"]
-        s, d, heading = project(others[..., :2], path.route)
-        turned = wrap(others[..., 2] - heading)
-        half = (size[:, 1:] / 2).unbind(-1)
-        along = turned.cos().abs() * half[0] + turned.sin().abs() * half[1]
-        across = turned.sin().abs() * half[0] + turned.cos().abs() * half[1]
-        inside = d.abs() < across + size[:, :1, 1] / 2 + self.gate_margin
-        leads = inside & (s > path.s[:, None]) & world.valid[:, 1:]
-        gaps = (s - path.s[:, None] - along - size[:, :1, 0] / 2).masked_fill(~leads, torch.inf)
-        gap, index = gaps.min(1)
-        leading = (others[..., 3] * turned.cos()).gather(1, index[:, None])[:, 0].clamp(min=0)
+        route, size = path.route[:, None], world.scene["size"]
+        found = leaders(path.s[:, None], route, world.states, size, world.valid, None, self.gate_margin, torch.inf)
+        gap, leading = found.gap[:, 0], found.speed[:, 0].clamp(min=0)
         if self.obey_lights:
             light = path.stop_distance(self.braking, LINE_GAP) + self.standstill_gap
             gap, leading = torch.minimum(gap, light), torch.where(light < gap, 0.0, leading)
         return gap, leading
-
-
-def idm_acceleration(
-    speed: Tensor,
-    desired: Tensor,
-    gap: Tensor,
-    leading: Tensor,
-    acceleration: float,
-    braking: float,
-    headway: float,
-    standstill_gap: float,
-    exponent: float,
-) -> Tensor:
-    """IDM acceleration [...] m/s^2; gap [...] m may be inf (free road); speeds in m/s.
-
-    a (1 - (v / v0)^n - (s* / s)^2) with s* = s0 + max(0, v T + v (v - v_leader) / (2 sqrt(a b))). Above the desired
-    speed the free term is -b (1 - (v0 / v)^(a n / b)) (Treiber and Kesting's improved IDM): it brakes by b at most.
-    """
-    wanted = desired_gap(speed, leading, headway, standstill_gap, acceleration, braking)
-    below = acceleration * (1 - (speed / desired).clamp(max=1) ** exponent)
-    above = -braking * (1 - (desired / speed.clamp(min=1e-3)).clamp(max=1) ** (acceleration * exponent / braking))
-    free = torch.where(speed > desired, above, below)
-    return free - acceleration * (wanted / gap.clamp(min=0.1)) ** 2

@@ -7,7 +7,7 @@ red light, and of what limits and curves ahead allow. Pure functions of the obse
 import torch
 from torch import Tensor
 
-from e2rl.ego.idm import idm_acceleration
+from e2rl.sim.car_following import IDMParameters, idm_acceleration
 from e2rl.sim.observation import FAR, LOOK_AHEAD, NEAR, NEAREST, PROBE_X, PROBE_Y, SPEED
 
 EGO, LAST_ACTION = slice(0, 11), (1, 2)
@@ -19,6 +19,7 @@ DESIRED_SPEED = 12.0  # m/s where no limit is known
 PURSUIT_TIME, PURSUIT_MIN, PURSUIT_MAX = 1.5, 6.0, 30.0  # s, m, m: how far ahead steering aims
 ACCELERATION, BRAKING, HARDEST_BRAKING = 1.5, 2.5, 7.0  # m/s^2
 HEADWAY, STANDSTILL_GAP, EXPONENT = 1.2, 3.0, 4.0  # s, m
+DRIVER = IDMParameters(HEADWAY, STANDSTILL_GAP, ACCELERATION, BRAKING, EXPONENT)
 COOLNESS = 0.99  # of the ACC model: 0 is IDM
 LATERAL = 2.5  # m/s^2 in curves
 GATE_MARGIN = 0.3  # m beyond the half widths
@@ -51,7 +52,7 @@ def _following(speed: Tensor, desired: Tensor, gap: Tensor, leading: Tensor, acc
     IDM brakes at full strength where a gap is short though the leader pulls away, as after every cut-in. Where it asks
     for less than the constant-acceleration heuristic, which only avoids the crash, it is softened towards the latter.
     """
-    own = idm_acceleration(speed, desired, gap, leading, ACCELERATION, BRAKING, HEADWAY, STANDSTILL_GAP, EXPONENT)
+    own = idm_acceleration(speed, desired, gap, leading, DRIVER, improved=True)
     space, steady = gap.clamp(0.5, 1e3), acceleration.clamp(-HARDEST_BRAKING, ACCELERATION)
     stops_first = leading * (speed - leading) <= -2 * space * steady
     halting = speed**2 * steady / (leading**2 - 2 * space * steady).clamp(min=1e-3)

@@ -1,8 +1,7 @@
-"""Prior checkpoints: safetensors with the architecture and the origin in the header; nothing is ever unpickled."""
+"""Prior checkpoints: safetensors with architecture and origin in the header; nothing is ever unpickled."""
 
 import hashlib
 import json
-import os
 from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
@@ -11,6 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from e2rl.errors import InputError
+from e2rl.files import write_atomically
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.features import EDGE, NODE
@@ -19,27 +19,20 @@ from e2rl.prior.prior import Prior, SamplerSettings
 
 FORMAT = "e2rl-prior/1"
 BUNDLED = "bundled"
+FEATURES = [NODE, EDGE, SIZE]
 
 
 def save_prior(prior: Prior, folder: Path, origin: dict) -> Path:
-    """Write `prior-<content hash>.safetensors` into folder and return its path.
+    """Write `prior-<hash of the weights>.safetensors` into folder and return its path.
 
     origin: what made it (command, commit, data fingerprint, settings, validation), kept in the header as JSON.
     """
-    architecture = {
-        "denoiser": asdict(prior.denoiser.settings),
-        "free_space": prior.free_space,
-        "features": [NODE, EDGE, SIZE],
-    }
-    metadata = {"format": FORMAT, "architecture": json.dumps(architecture), "origin": json.dumps(origin)}
+    network = asdict(prior.denoiser.settings)
+    architecture = {"denoiser": network, "free_space": prior.free_space, "features": FEATURES}
+    header = {"format": FORMAT, "architecture": json.dumps(architecture), "origin": json.dumps(origin)}
     tensors = {key: value.detach().cpu().contiguous() for key, value in prior.state_dict().items()}
-    content = save(tensors, metadata)
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"prior-{hashlib.sha256(save(tensors)).hexdigest()[:12]}.safetensors"
-    part = path.with_suffix(f".{os.getpid()}.part")
-    part.write_bytes(content)
-    part.replace(path)
+    path = Path(folder) / f"prior-{hashlib.sha256(save(tensors)).hexdigest()[:12]}.safetensors"
+    write_atomically(path, save(tensors, header))
     return path
 
 
@@ -48,7 +41,7 @@ def load_prior(
 ) -> tuple[Prior, dict]:
     """The frozen prior in a checkpoint file (or `bundled`), and its origin.
 
-    Raises InputError naming the file where it is missing, damaged or of another architecture.
+    Raises InputError, naming the file, where it is missing, damaged or of another architecture.
     """
     path = bundled_checkpoint() if checkpoint == BUNDLED else Path(checkpoint)
     if not path.exists():
@@ -58,33 +51,21 @@ def load_prior(
         )
     try:
         with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
+            header = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
     except (SafetensorError, OSError) as error:
         raise InputError(f"{path}: not a readable safetensors file ({error}); train the prior again") from error
-    if metadata.get("format") != FORMAT:
-        raise InputError(f"{path}: format {metadata.get('format')!r}, expected {FORMAT!r}; is it a prior checkpoint?")
+    if header.get("format") != FORMAT:
+        raise InputError(f"{path}: format {header.get('format')!r}, expected {FORMAT!r}; is it a prior checkpoint?")
     try:
-        architecture, origin = json.loads(metadata["architecture"]), json.loads(metadata["origin"])
-        made_for, denoiser = architecture["features"], DenoiserSettings(**architecture["denoiser"])
-        free_space = architecture["free_space"]
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: another architecture (its header: {error}); train the prior again") from error
-    if made_for != [NODE, EDGE, SIZE]:
-        raise InputError(
-            f"{path}: made for {made_for} features, this version has {[NODE, EDGE, SIZE]}; train the "
-            "prior again with `python train.py stage=prior`"
-        )
-    prior = Prior(denoiser, sampler, bounds, free_space)
-    expected = {key: value.shape for key, value in prior.state_dict().items()}
-    wrong = [
-        key
-        for key in expected.keys() | tensors.keys()
-        if key not in tensors or key not in expected or tensors[key].shape != expected[key]
-    ]
-    if wrong:
-        raise InputError(f"{path}: another architecture ({sorted(wrong)[0]} does not fit); train the prior again")
-    prior.load_state_dict(tensors)
+        architecture, origin = json.loads(header["architecture"]), json.loads(header["origin"])
+        if architecture["features"] != FEATURES:
+            raise ValueError(f"made for {architecture['features']} features, this version has {FEATURES}")
+        prior = Prior(DenoiserSettings(**architecture["denoiser"]), sampler, bounds, architecture["free_space"])
+        prior.load_state_dict(tensors)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split("\n\t")[:2])  # of torch's list of tensors that do not fit, the first
+        raise InputError(f"{path}: another architecture ({reason}); train the prior again") from error
     return prior.requires_grad_(False).eval().to(device), origin
 
 

@@ -6,14 +6,19 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from e2rl.errors import InputError
 from e2rl.prior.features import EDGE, NODE
 from e2rl.prior.lane_relative import SIZE
 from e2rl.prior.sde import NoiseSchedule
+from e2rl.settings import check_range
 
 
 @dataclass(frozen=True)
 class DenoiserSettings:
-    """Width, attention heads, blocks, width of the pair embedding, share of activations dropped in training."""
+    """Width, attention heads, blocks, width of the pair embedding, share of activations dropped in training.
+
+    Raises InputError for a size below 1, a width that is no multiple of the heads, or a share outside of [0, 1].
+    """
 
     width: int = 96
     heads: int = 4
@@ -21,12 +26,21 @@ class DenoiserSettings:
     pair: int = 24
     dropout: float = 0.1
 
+    def __post_init__(self) -> None:
+        for name in ("width", "heads", "blocks", "pair"):
+            check_range(f"prior.network.{name}", getattr(self, name), 1)
+        check_range("prior.network.dropout", self.dropout, 0, 1)
+        if self.width % self.heads:
+            raise InputError(f"prior.network.width={self.width}: expected a multiple of heads={self.heads}")
+
 
 @dataclass
 class Encoding:
-    """What the network keeps of a scene over the denoising steps of one replan: nodes [B, V, W], pair values
-    [B, V, V, E], per block attention biases [B, heads, V, V] (absent vehicles at -inf) and the nodes' share of the
-    modulation [B, V, 6 W]."""
+    """What the network computes of a scene once per replan, for all denoising steps.
+
+    nodes [B, V, W]; pairs [B, V, V, E]; of each block: the attention biases [B, heads, V, V] (-1e4 at absent vehicles)
+    and the nodes' part of the modulation [B, V, 6 W].
+    """
 
     nodes: Tensor
     pairs: Tensor
@@ -35,16 +49,16 @@ class Encoding:
 
     def repeat(self, count: int) -> "Encoding":
         """The same scenes `count` times along the batch."""
-        tile = lambda value: value.repeat(count, *[1] * (value.ndim - 1))  # noqa: E731
-        return Encoding(
-            tile(self.nodes),
-            tile(self.pairs),
-            *([tile(value) for value in values] for values in (self.biases, self.modulations)),
-        )
+
+        def tile(value: Tensor) -> Tensor:
+            return value.repeat(count, *[1] * (value.ndim - 1))
+
+        biases, modulations = ([tile(value) for value in values] for values in (self.biases, self.modulations))
+        return Encoding(tile(self.nodes), tile(self.pairs), biases, modulations)
 
 
 class Block(nn.Module):
-    """Attention over vehicles and an MLP, both modulated by noise level and node (adaLN-zero)."""
+    """Attention over vehicles and an MLP, modulated by noise level and node (adaLN-Zero, Peebles and Xie 2023)."""
 
     def __init__(self, width: int, heads: int, pair: int, dropout: float):
         super().__init__()
@@ -55,15 +69,14 @@ class Block(nn.Module):
         self.qkv = nn.Linear(width, 3 * width)
         self.pair_value = nn.Linear(heads * pair, width)
         self.out = nn.Linear(width, width)
-        self.mlp = nn.Sequential(
-            nn.Linear(width, 3 * width), nn.GELU(), nn.Dropout(dropout), nn.Linear(3 * width, width)
-        )
+        hidden = 3 * width
+        self.mlp = nn.Sequential(nn.Linear(width, hidden), nn.GELU(), nn.Dropout(dropout), nn.Linear(hidden, width))
         self.drop = nn.Dropout(dropout)
         nn.init.zeros_(self.modulation.weight)
         nn.init.zeros_(self.modulation.bias)
 
     def forward(self, h: Tensor, modulation: Tensor, bias: Tensor, pairs: Tensor) -> Tensor:
-        """h [B, V, W]; modulation [B, V, 6 W] of Denoiser.modulated."""
+        """h [B, V, W] after the block; modulation [B, V, 6 W]; bias [B, heads, V, V]; pairs [B, V, V, E]."""
         shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = modulation.chunk(6, -1)
         batch, vehicles, width = h.shape
         each = width // self.heads
@@ -82,17 +95,17 @@ class Block(nn.Module):
 
 
 class Denoiser(nn.Module):
-    """x0 = alpha x + sigma F(x, t | scene), jointly over vehicles; t may differ between them (the ego's is clean)."""
+    """x0 = alpha x + sigma F(x, t | scene), jointly over vehicles. The noise level t may differ between them."""
 
-    def __init__(self, settings: DenoiserSettings = DenoiserSettings()):  # noqa: B008 - frozen
+    def __init__(self, settings: DenoiserSettings | None = None):
         super().__init__()
-        self.settings, width = settings, settings.width
+        self.settings = settings = settings or DenoiserSettings()
+        width = settings.width
         self.schedule = NoiseSchedule()
         self.register_buffer("node_mean", torch.zeros(NODE))
         self.register_buffer("node_std", torch.ones(NODE))
-        self.encode_node = nn.Sequential(
-            nn.Linear(NODE, 2 * width), nn.GELU(), nn.Dropout(settings.dropout), nn.Linear(2 * width, width)
-        )
+        dropout = nn.Dropout(settings.dropout)
+        self.encode_node = nn.Sequential(nn.Linear(NODE, 2 * width), nn.GELU(), dropout, nn.Linear(2 * width, width))
         self.encode_pair = nn.Sequential(nn.Linear(EDGE, 48), nn.GELU(), nn.Linear(48, settings.pair), nn.GELU())
         self.bias = nn.Linear(settings.pair, settings.heads * settings.blocks)
         self.embed_x = nn.Linear(SIZE, width)
@@ -100,9 +113,8 @@ class Denoiser(nn.Module):
         scales = torch.tensor([0.0, 1.0, 0.0, 0.0, 1.0, 0.0]).repeat_interleave(width)
         self.register_buffer("unit_scale", scales, persistent=False)
         self.register_buffer("frequencies", torch.logspace(-0.3, 1.7, 16), persistent=False)
-        self.blocks = nn.ModuleList(
-            Block(width, settings.heads, settings.pair, settings.dropout) for _ in range(settings.blocks)
-        )
+        sizes = (width, settings.heads, settings.pair, settings.dropout)
+        self.blocks = nn.ModuleList(Block(*sizes) for _ in range(settings.blocks))
         self.head = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, SIZE))
         nn.init.zeros_(self.head[1].weight)
         nn.init.zeros_(self.head[1].bias)
@@ -113,22 +125,21 @@ class Denoiser(nn.Module):
         pair = self.encode_pair(pairs)
         absent = torch.zeros_like(present, dtype=pair.dtype).masked_fill(~present, -1e4)[:, None, None, :]
         bias = self.bias(pair).permute(0, 3, 1, 2) + absent
-        # The modulation is linear in node and level: the nodes' share is the same for all levels.
+        # The modulation is linear in node and level: the nodes' part is the same for all levels.
         modulations = [node @ block.modulation.weight.T for block in self.blocks]
         return Encoding(node, pair, [part.contiguous() for part in bias.chunk(self.settings.blocks, 1)], modulations)
 
     def modulated(self, level: Tensor) -> list[Tensor]:
-        """The levels' share of each block's modulation, level [..., V] -> [..., V, 6 W]; scales around 1."""
+        """The level's part of each block's modulation [..., V, 6 W], of level [..., V]; scales are around 1."""
         angle = level[..., None] * self.frequencies
         level = self.embed_level(torch.cat([torch.sin(angle), torch.cos(angle)], -1))
         return [block.modulation(level) + self.unit_scale for block in self.blocks]
 
     def forward(self, x: Tensor, level: Tensor, encoding: Encoding) -> Tensor:
-        """Denoised estimate x0 [B, V, SIZE] of x [B, V, SIZE] at noise level [B, V], or [1, V] where it is the same for
-        all scenes."""
+        """Denoised estimate x0 [B, V, SIZE] of x [B, V, SIZE] at noise level [B, V], or [1, V] for all scenes."""
         h = self.embed_x(x) + encoding.nodes
-        shares = zip(self.blocks, encoding.biases, encoding.modulations, self.modulated(level), strict=True)
-        for block, bias, of_node, of_level in shares:
+        parts = zip(self.blocks, encoding.biases, encoding.modulations, self.modulated(level), strict=True)
+        for block, bias, of_node, of_level in parts:
             h = block(h, of_node + of_level, bias, encoding.pairs)
         alpha, sigma = self.schedule.alpha(level)[..., None], self.schedule.sigma(level)[..., None]
         return alpha * x + sigma * self.head(h).to(x.dtype)

@@ -1,17 +1,17 @@
-"""Free-space representation, for vehicles without a lane: the same x, read as accelerations and path curvatures.
+"""Free-space plans, for vehicles without a lane: the same x, read as accelerations and path curvatures.
 
-The acceleration knots mean what they mean on a route; the two lateral knots are curvatures of the driven path, half way
-and at the end of the lateral horizon, linear in between from the current one and held after it.
+The acceleration knots mean what they mean on a route. The two lateral knots are curvatures of the driven path, half way
+along and at the end of the lateral horizon: linear in between, from the current curvature on, and held after the end.
 """
 
 import torch
 from torch import Tensor
 
-from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS, LaneState, lateral_horizon, speeds
+from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS, LaneState, lateral_horizon, ridge, speeds
 from e2rl.scene.recording import DT
 from e2rl.sim.dynamics import wrap
 
-YAW_RATE_SCALE = 0.1  # rad/s at the current speed a unit of x, floored at 3 m/s
+YAW_RATE_SCALE = 0.1  # rad/s a unit of x, at the current speed or 3 m/s
 
 
 def curvature_scale(v: Tensor) -> Tensor:
@@ -19,39 +19,34 @@ def curvature_scale(v: Tensor) -> Tensor:
     return YAW_RATE_SCALE / v.clamp(min=3.0)
 
 
-def decode(x: Tensor, state: LaneState) -> LaneState:
-    """Plans (fields [..., V, HORIZON]) of x [..., V, SIZE] by integrating curvature over travelled distance.
+def _segments(travelled: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Shares of the first and the second half of the lateral horizon that are driven, and the metres beyond it."""
+    u = (2 * travelled / reach).clamp(max=2.0)
+    return u.clamp(max=1.0), (u - 1).clamp(min=0.0), (travelled - reach).clamp(min=0)
 
-    The route fields keep the state's offset: s advances with the way, d, d1 and d2 are held.
+
+def decode(x: Tensor, state: LaneState) -> LaneState:
+    """Planned motion (fields [..., V, HORIZON]) of x [..., V, SIZE], by integrating curvature over travelled distance.
+
+    Of the Frenet fields, s advances with the travelled distance, d is held, d1 and d2 are 0.
     """
     v, travelled = speeds(state, ACCEL_SCALE * x[..., :KNOTS])
     scale = curvature_scale(state.v)[..., None]
     reach = lateral_horizon(state.v)[..., None]
     half, end = scale * x[..., KNOTS, None], scale * x[..., KNOTS + 1, None]
-    u = (2 * travelled / reach).clamp(max=2.0)
-    first, second = u.clamp(max=1.0), (u - 1).clamp(min=0.0)
+    first, second, beyond = _segments(travelled, reach)
     now = state.kappa[..., None]
     kappa = now + (half - now) * first + (end - half) * second
-    beyond = (travelled - reach).clamp(min=0)
     turned = 0.5 * reach * (now * first + (half - now) * first**2 / 2 + half * second + (end - half) * second**2 / 2)
     heading = state.heading[..., None] + turned + end * beyond
     before = torch.cat([state.heading[..., None], heading[..., :-1]], -1)
     step = torch.diff(travelled, dim=-1, prepend=torch.zeros_like(travelled[..., :1]))
     middle = (heading + before) / 2
-    held = torch.zeros_like(v)
-    speed = torch.cat([state.v[..., None], v[..., :-1]], -1)
-    return LaneState(
-        state.s[..., None] + travelled,
-        state.d[..., None] + held,
-        held,
-        held,
-        v,
-        (v - speed) / DT,
-        state.x[..., None] + (step * torch.cos(middle)).cumsum(-1),
-        state.y[..., None] + (step * torch.sin(middle)).cumsum(-1),
-        heading,
-        kappa,
-    )
+    xs = state.x[..., None] + (step * torch.cos(middle)).cumsum(-1)
+    ys = state.y[..., None] + (step * torch.sin(middle)).cumsum(-1)
+    accel = (v - torch.cat([state.v[..., None], v[..., :-1]], -1)) / DT
+    s, zero = state.s[..., None] + travelled, torch.zeros_like(v)
+    return LaneState(s, state.d[..., None] + zero, zero, zero, v, accel, xs, ys, heading, kappa)
 
 
 def fit(heading: Tensor, known: Tensor, state: LaneState, knots: Tensor) -> Tensor:
@@ -61,15 +56,11 @@ def fit(heading: Tensor, known: Tensor, state: LaneState, knots: Tensor) -> Tens
     """
     _, travelled = speeds(state, knots)
     reach = lateral_horizon(state.v)[..., None]
-    u = (2 * travelled / reach).clamp(max=2.0)
-    first, second = u.clamp(max=1.0), (u - 1).clamp(min=0.0)
-    beyond = (travelled - reach).clamp(min=0)
+    first, second, beyond = _segments(travelled, reach)
     scale = curvature_scale(state.v)[..., None]
     half = 0.5 * reach * (first**2 / 2 + second - second**2 / 2)
     end = 0.5 * reach * second**2 / 2 + beyond
     given = 0.5 * reach * state.kappa[..., None] * (first - first**2 / 2)
     turn = wrap(heading - state.heading[..., None])
     unit = torch.stack([scale * half, scale * end], -1) * known[..., None]
-    rest = (turn - given) * known
-    gram = unit.transpose(-1, -2) @ unit + 1e-3 * torch.eye(2, device=unit.device)
-    return torch.linalg.solve(gram, (unit * rest[..., None]).sum(-2)[..., None])[..., 0].clamp(-6.0, 6.0)
+    return ridge(unit, (turn - given) * known, 1e-3 * torch.eye(2, device=unit.device)).clamp(-6.0, 6.0)

@@ -1,4 +1,4 @@
-"""What of a scene stays the same while it runs, once every vehicle has a route: worked out once per scene."""
+"""RoutedScene: the static tensors of a scene once every vehicle has been assigned a route."""
 
 from dataclasses import dataclass, replace
 
@@ -6,27 +6,31 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from e2rl.prior.lane_relative import LaneState, locate
 from e2rl.scene.route import SPACING
 from e2rl.sim.dynamics import wrap
 
 CONFLICT_STRIDE = 2  # vertices: conflicts are looked for every 4 m
-CONFLICT_RANGE = 80  # vertices ahead of the route's begin
-CONFLICT_GAP = 2.5  # m between routes that meet
+CONFLICT_RANGE = 80  # vertices from the route's start on
+CONFLICT_GAP = 2.5  # m: routes nearer than this are in conflict
+START = 20.0  # m: arc length near which a route passes its vehicle's start
+ROUTE_FIELDS = ("points", "length", "open", "limit", "light", "light_s")  # scene["route_..."] of the assigned candidate
 
 
 @dataclass
 class RoutedScene:
-    """The routes of B scenes' vehicles and what follows from them; no maps, so that it is copied cheaply.
+    """Tensors of B scenes that stay the same while these run. It holds no map, so that it is cheap to copy.
 
-    size [B, N, 2]; light_state [B, T+1, L]; route [B, V]; points [B, V, P, 2]; length [B, V]; open [B, V]; limit
-    [B, V, P]; light, light_s [B, V, 2]; conflict [B, V, V] bool, conflict_s [B, V, V]: arc length on i's route where it
-    first meets j's; crossing [B, V, V]: angle there [rad]; modelled [B, V]: vehicles that the prior moves or conditions
-    on; parked [B, V]; has_lane [B, V]: others are represented in free space;
-    past [B, V, 10, 3]: before the start frame (see the scene).
+    size [B, N, 2]; light_state [B, T+1, L]; past [B, V, 10, 3]: see the scene. Of the assigned route candidates: route
+    [B, V], their index; points [B, V, P, 2]; length [B, V]; open [B, V]: the route ends at the map's border; limit
+    [B, V, P]; light, light_s [B, V, 2]. conflict [B, V, V] bool: the routes of i and j meet; conflict_s [B, V, V]: arc
+    length on i's route where it first does; crossing [B, V, V]: angle between them there [rad]. modelled [B, V]: the
+    prior moves the vehicle or conditions on it; parked [B, V]; has_lane [B, V]: else it is represented in free space.
     """
 
     size: Tensor
     light_state: Tensor
+    past: Tensor
     route: Tensor
     points: Tensor
     length: Tensor
@@ -40,7 +44,6 @@ class RoutedScene:
     modelled: Tensor
     parked: Tensor
     has_lane: Tensor
-    past: Tensor
 
 
 def take_route(values: Tensor, route: Tensor) -> Tensor:
@@ -55,93 +58,78 @@ def route_scene(scene: TensorDictBase, route: Tensor, free_space: bool = False) 
     free_space: represent every vehicle without its lane (the ablation).
     """
     vehicles = route.shape[1]
-    points = take_route(scene["route_points"], route)
+    assigned = {name: take_route(scene[f"route_{name}"], route) for name in ROUTE_FIELDS}
     valid, parked = scene["valid"][:, :vehicles], scene["parked"][:, :vehicles]
     has_lane = take_route(scene["route_valid"], route)
-    everybody = torch.arange(vehicles, device=points.device)
-    pairs = [_conflicts(scene_points, everybody)[0] for scene_points in points]
+    all_rows = torch.arange(vehicles, device=route.device)
+    pairs = [_conflicts(points, all_rows)[0] for points in assigned["points"]]
     conflict, conflict_s, crossing = (torch.stack(parts) for parts in zip(*pairs, strict=True))
     both = valid & ~parked & has_lane
-    conflict = conflict & both[:, :, None] & both[:, None, :]
-    return RoutedScene(
-        scene["size"],
-        scene["light_state"],
-        route,
-        points,
-        take_route(scene["route_length"], route),
-        take_route(scene["route_open"], route),
-        take_route(scene["route_limit"], route),
-        take_route(scene["route_light"], route),
-        take_route(scene["route_light_s"], route),
-        conflict,
-        conflict_s,
-        crossing,
-        valid & ~parked,
-        parked,
-        has_lane & (not free_space),
-        scene["past"][:, :vehicles],
+    given = (scene["size"], scene["light_state"], scene["past"][:, :vehicles], route)
+    meet = {"conflict": conflict & both[:, :, None] & both[:, None, :], "conflict_s": conflict_s, "crossing": crossing}
+    kind = {"modelled": valid & ~parked, "parked": parked, "has_lane": has_lane & (not free_space)}
+    return RoutedScene(*given, **assigned, **meet, **kind)
+
+
+def start_state(scene: TensorDictBase, routed: RoutedScene) -> LaneState:
+    """The lane states [B, V] of the vehicles at the start of scenes [B]."""
+    start, accel, yaw_rate = (
+        scene[key][:, : routed.route.shape[1]] for key in ("start", "start_accel", "start_yaw_rate")
     )
+    return locate(start, accel, yaw_rate, routed.points, torch.full_like(routed.length, START))
 
 
 def reroute(
     routed: RoutedScene,
     scene: TensorDictBase,
     route: Tensor,
-    who: Tensor,
-    leaves: Tensor,
-    ways: Tensor,
+    moved: Tensor,
+    off_lane: Tensor,
+    off_lane_path: Tensor,
     free_space: bool = False,
 ) -> RoutedScene:
-    """`routed` with vehicles who [B, V] on other lines: their candidates route [B, V], or, for those that leave their
-    lanes [B, V], ways [B, V, P, 2]. On a way there are no lights; its limit is the highest of the candidate's."""
-    off = leaves & who
-    keys = ("points", "length", "open", "limit", "light", "light_s", "valid")
-    lane = {key: take_route(scene[f"route_{key}"], route) for key in keys}
+    """`routed` with the vehicles `moved` [B, V] on new lines: candidates route [B, V] or, where off_lane [B, V], the
+    off_lane_path [B, V, P, 2]. Such a path has no lights; its limit is the highest of the candidate's."""
+    off_lane = off_lane & moved
+    lane = {name: take_route(scene[f"route_{name}"], route) for name in (*ROUTE_FIELDS, "valid")}
+    path = {"points": off_lane_path, "length": SPACING * (off_lane_path.shape[2] - 1), "open": False}
+    path |= {"limit": lane["limit"].amax(-1, keepdim=True), "light": -1, "light_s": 0.0}
 
-    def change(old: Tensor, lane: Tensor, way: Tensor | float) -> Tensor:
+    def change(old: Tensor, on_lane: Tensor, on_path: Tensor | float) -> Tensor:
         extra = [1] * (old.dim() - 2)
-        new = torch.where(off.view(*off.shape, *extra), torch.as_tensor(way, dtype=old.dtype, device=old.device), lane)
-        return torch.where(who.view(*who.shape, *extra), new, old)
+        on_path = torch.as_tensor(on_path, dtype=old.dtype, device=old.device)
+        new = torch.where(off_lane.view(*off_lane.shape, *extra), on_path, on_lane)
+        return torch.where(moved.view(*moved.shape, *extra), new, old)
 
-    points = change(routed.points, lane["points"], ways)
+    changed = {name: change(getattr(routed, name), lane[name], path[name]) for name in ROUTE_FIELDS}
     pairs = [value.clone() for value in (routed.conflict, routed.conflict_s, routed.crossing)]
-    for b in who.any(1).nonzero()[:, 0].tolist():
-        rows = who[b].nonzero()[:, 0]
-        for old, mine, theirs in zip(pairs, *_conflicts(points[b], rows), strict=True):
-            old[b][:, rows], old[b][rows] = theirs.T, mine
+    for b in moved.any(1).nonzero()[:, 0].tolist():
+        rows = moved[b].nonzero()[:, 0]
+        for old, own, other in zip(pairs, *_conflicts(changed["points"][b], rows), strict=True):
+            old[b][:, rows], old[b][rows] = other.T, own
     both = routed.modelled & lane["valid"]
-    return replace(
-        routed,
-        route=torch.where(who, route, routed.route),
-        points=points,
-        length=change(routed.length, lane["length"], SPACING * (points.shape[2] - 1)),
-        open=change(routed.open, lane["open"], False),
-        limit=change(routed.limit, lane["limit"], lane["limit"].amax(-1, keepdim=True)),
-        light=change(routed.light, lane["light"], -1),
-        light_s=change(routed.light_s, lane["light_s"], 0.0),
-        conflict=pairs[0] & both[:, :, None] & both[:, None],
-        conflict_s=pairs[1],
-        crossing=pairs[2],
-        has_lane=change(routed.has_lane, lane["valid"] & (not free_space), not free_space),
-    )
+    changed |= {"conflict": pairs[0] & both[:, :, None] & both[:, None], "conflict_s": pairs[1], "crossing": pairs[2]}
+    has_lane = change(routed.has_lane, lane["valid"] & (not free_space), not free_space)
+    return replace(routed, route=torch.where(moved, route, routed.route), has_lane=has_lane, **changed)
 
 
 def _conflicts(points: Tensor, rows: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """First meetings of routes rows [C] with every route of points [V, P, 2], a scene at a time (its pairs stay in the
-    cache): conflict, conflict_s and crossing (see RoutedScene) of each of rows with each [C, V], and of each [V] with
-    each of rows, also as [C, V]."""
+    """Where the routes of vehicles rows [C] first meet every route of points [V, P, 2].
+
+    Returns conflict, conflict_s and crossing (see RoutedScene) [C, V] twice: of each of rows with each route, and of
+    each route with each of rows. One scene at a time, so that its pairs stay in the cache.
+    """
     line = points[:, :CONFLICT_RANGE:CONFLICT_STRIDE]
     vehicles, count, _ = line.shape
     flat = line.reshape(-1, 2)
     flat = flat - flat.mean(0)
     near = torch.cdist(flat.view(vehicles, count, 2)[rows].flatten(0, 1), flat) < CONFLICT_GAP
     near = near.view(len(rows), count, vehicles, count)
-    meets = near.any(3)  # [C, K, V]: this vertex of a row's route meets the other somewhere
-    first, other = meets.float().argmax(1), near.any(1).float().argmax(2)  # the same place unless they share a stretch
+    meets = near.any(3)  # [C, K, V]: this vertex of a row's route meets the other route somewhere
+    first, other = meets.float().argmax(1), near.any(1).float().argmax(2)  # one point, unless they share a stretch
     conflict = meets.any(1) & (rows[:, None] != torch.arange(vehicles, device=rows.device))
     tangent = torch.gradient(line, dim=1)[0]
     angle = torch.atan2(tangent[..., 1], tangent[..., 0])
-    theirs = angle.gather(1, other.T).T
-    crossing = (theirs - angle[rows].gather(1, first) + torch.pi) % (2 * torch.pi) - torch.pi
-    way = SPACING * CONFLICT_STRIDE
-    return (conflict, first * way, crossing), (conflict, other * way, wrap(-crossing))
+    crossing = (angle.gather(1, other.T).T - angle[rows].gather(1, first) + torch.pi) % (2 * torch.pi) - torch.pi
+    spacing = SPACING * CONFLICT_STRIDE
+    return (conflict, first * spacing, crossing), (conflict, other * spacing, wrap(-crossing))

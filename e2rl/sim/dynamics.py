@@ -20,6 +20,13 @@ def wrap(angle: Tensor) -> Tensor:
     return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
 
 
+def constant_velocity(states: Tensor, times: Tensor) -> Tensor:
+    """States [..., K, 4] at times [K] s ahead of states [..., 4] that keep their heading and speed."""
+    velocity = states[..., 3:] * torch.stack([torch.cos(states[..., 2]), torch.sin(states[..., 2])], -1)
+    xy = states[..., None, :2] + times[:, None] * velocity[..., None, :]
+    return torch.cat([xy, states[..., None, 2:].expand(*xy.shape[:-1], 2)], -1)
+
+
 def yaw_rate_bound(speed: Tensor) -> Tensor:
     """Largest |yaw rate| [rad/s] at speed [m/s]: MAX_CURVATURE * v at low speeds, MAX_LATERAL / v at high ones."""
     return torch.minimum(MAX_CURVATURE * speed, MAX_LATERAL / speed.clamp(min=1e-3))

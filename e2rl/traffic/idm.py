@@ -11,18 +11,17 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.ego.idm import LINE_GAP, idm_acceleration
-from e2rl.prior.bounds import Surroundings, bounded, under
+from e2rl.ego.idm import LINE_GAP
+from e2rl.prior.bounds import Obstacles, apply_cap, bounded
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, decode, locate
-from e2rl.prior.prior import STANDING, Prior
-from e2rl.prior.routed import RoutedScene, route_scene
+from e2rl.prior.prior import STANDING_SPEED, Prior
+from e2rl.prior.routed import RoutedScene, route_scene, start_state
 from e2rl.scene.route import SPACING
-from e2rl.sim.leaders import FREE, leaders
+from e2rl.sim.car_following import IDMParameters, idm_acceleration
+from e2rl.sim.leaders import FREE_GAP, leaders
 from e2rl.sim.traffic_light import light_state_at, stop_line_distance
 from e2rl.sim.world import World
 from e2rl.traffic.traffic import REPLAN_STEPS, Traffic, TrafficPlan
-
-ARRIVAL = 20.0  # m, arc length near which a route passes its vehicle's start
 
 
 @dataclass
@@ -50,16 +49,14 @@ class IDM(Traffic):
     ) -> None:
         """prior: whose bounds apply; fields: conf/synthesizer/idm.yaml."""
         self.bounds, self.speed, self.standstill_gap, self.braking = prior.bounds, speed, standstill_gap, braking
-        self.driver = (acceleration, braking, headway, standstill_gap, exponent)
+        self.driver = IDMParameters(headway, standstill_gap, acceleration, braking, exponent)
 
     @torch.no_grad()
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> IDMState:
         """Start states on the nearest candidate of everybody; the ego's is its mission."""
         mission = scenes["route_log"][:, :1]
         routed = route_scene(scenes, torch.cat([mission, torch.zeros_like(scenes["route_log"][:, 1:])], 1))
-        vehicles = routed.route.shape[1]
-        start = (scenes[key][:, :vehicles] for key in ("start", "start_accel", "start_yaw_rate"))
-        return IDMState(routed, locate(*start, routed.points, torch.full_like(routed.length, ARRIVAL)))
+        return IDMState(routed, start_state(scenes, routed))
 
     @torch.no_grad()
     def replan(self, state: IDMState, world: World, ego_plan: Tensor) -> tuple[IDMState, TrafficPlan]:
@@ -71,12 +68,12 @@ class IDM(Traffic):
         wanted = self._wanted(routed, lane, world).clamp(min=self.bounds.floor)
         x = (wanted / ACCEL_SCALE)[..., None].expand(*lane.v.shape, KNOTS)
         x = torch.cat([x, x.new_zeros(*lane.v.shape, SIZE - KNOTS)], -1)
-        frozen = routed.parked | (world.scene["start"][:, :vehicles, 3] < STANDING) | ~present
+        frozen = routed.parked | (world.scene["start"][:, :vehicles, 3] < STANDING_SPEED) | ~present
 
         def decoded(cap: Tensor | None) -> LaneState:
-            return _held(decode(*under(cap, x, lane, self.bounds.onset), routed.points), lane, frozen)
+            return _held(decode(*apply_cap(cap, x, lane, self.bounds.onset), routed.points), lane, frozen)
 
-        everybody = Surroundings(world.states, routed.size, world.valid, torch.zeros_like(present))
+        everybody = Obstacles(world.states, routed.size, world.valid, torch.zeros_like(present))
         motion = bounded(self.bounds, decoded, lane, everybody)
         gone = routed.open[..., None] & (motion.s >= routed.length[..., None]) & routed.has_lane[..., None]
         plan = TrafficPlan(motion.states(), present[..., None] & ~(gone.cumsum(-1) > 0), route=routed.route)
@@ -85,9 +82,9 @@ class IDM(Traffic):
     def _wanted(self, routed: RoutedScene, lane: LaneState, world: World) -> Tensor:
         """IDM acceleration [B, V] behind the leader or the light, whichever brakes harder."""
         vehicles = lane.v.shape[1]
-        length, width = routed.size[:, :vehicles, 0], routed.size[:, :vehicles, 1]
-        gap, speed, _ = leaders(lane.s, width, length, routed.points, world.states, routed.size, world.valid, lane.d)
-        gap = torch.where(gap < FREE, gap, torch.inf)
+        length = routed.size[:, :vehicles, 0]
+        gap, speed, _ = leaders(lane.s, routed.points, world.states, routed.size, world.valid, lane.d)
+        gap = torch.where(gap < FREE_GAP, gap, torch.inf)
         at = (lane.s / SPACING).round().long().clamp(0, routed.limit.shape[-1] - 1)
         limit = routed.limit.gather(-1, at[..., None])[..., 0]
         desired = torch.where(limit > 0, limit, world.scene["start"][:, :vehicles, 3].clamp(min=self.speed))
@@ -95,8 +92,8 @@ class IDM(Traffic):
         brake = 2 * self.braking
         line = stop_line_distance(light, routed.light_s - lane.s[..., None], lane.v, brake, brake)
         line = line - length / 2 - LINE_GAP + self.standstill_gap
-        behind = idm_acceleration(lane.v, desired, gap.clamp(min=0.1), speed.clamp(min=0), *self.driver)
-        halting = idm_acceleration(lane.v, desired, line.clamp(min=0.1), torch.zeros_like(line), *self.driver)
+        behind = idm_acceleration(lane.v, desired, gap.clamp(min=0.1), speed.clamp(min=0), self.driver, True)
+        halting = idm_acceleration(lane.v, desired, line.clamp(min=0.1), torch.zeros_like(line), self.driver, True)
         return torch.minimum(behind, halting)
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate
 from e2rl.prior.prior import Context, Prior
 from e2rl.prior.routed import RoutedScene
-from e2rl.prior.spread import main_direction, spread_noise, stratified
+from e2rl.prior.stratified_sampling import main_direction, stratified_noise, stratified_uniform
 from e2rl.scene.recording import DT
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
@@ -124,9 +124,9 @@ class NominalTraffic(Traffic):
         order, position = draw(0, 2, vehicles, uniform=True).unbind(2), draw(2, 2, vehicles, uniform=True)[0].unbind(1)
         noise = draw(1, prior.sampler.steps, vehicles, SIZE).transpose(1, 2)
         direction = main_direction(prior.schedule, prior.sampler, noise.device)
-        noise = spread_noise(noise, direction, order[1], position[1])
+        noise = stratified_noise(noise, direction, order[1], position[1])
         step, plans = torch.zeros(batch, dtype=torch.long, device=seed.device), []
-        for uniform, one in zip(stratified(order[0], position[0]), noise, strict=True):
+        for uniform, one in zip(stratified_uniform(order[0], position[0]), noise, strict=True):
             routed, lane = prior.start(scene, prior.choose_routes(scene, uniform))
             context = prior.encode(routed, lane, scene["start"], scene["valid"], step, None)
             plans.append(prior.decode(prior.sample(context, one).x0, context).states())

@@ -1,40 +1,17 @@
-"""IDM: equilibrium gap, sign of the approach term, free road, leaders, red lights."""
+"""The IDM ego: leaders, red lights, returning to its lane; the model itself: tests/sim/test_car_following.py."""
 
 import torch
 
 from e2rl.ego.base import EgoPolicy
-from e2rl.ego.idm import IDMEgo, idm_acceleration
+from e2rl.ego.idm import IDMEgo
 from e2rl.sim.env import DrivingEnv, SimSettings
 from tests.synthetic import make_scenes
-
-CONSTANTS = {"acceleration": 1.0, "braking": 3.0, "headway": 1.0, "standstill_gap": 5.0, "exponent": 4.0}
-
-
-def accel(speed, desired, gap, leading):
-    values = (torch.tensor(float(value)) for value in (speed, desired, gap, leading))
-    return idm_acceleration(*values, **CONSTANTS).item()
 
 
 def drive(steps=80, ego=None, **scene):
     env = DrivingEnv(make_scenes(1, **scene), SimSettings(), 1)
     data = env.rollout(steps, EgoPolicy(ego or IDMEgo(), env))
     return env, data
-
-
-def test_equilibrium_gap():
-    """At constant speed behind a leader of the same speed: gap = (s0 + v T) / sqrt(1 - (v / v0)^4)."""
-    gap = (5 + 6 * 1.0) / (1 - (6 / 10) ** 4) ** 0.5
-    assert abs(accel(6, 10, gap, 6)) < 1e-5
-    assert accel(6, 10, gap + 1, 6) > 0 > accel(6, 10, gap - 1, 6)
-
-
-def test_approaching_brakes_and_receding_does_not():
-    assert accel(8, 10, 15, 2) < -1 and accel(8, 10, 15, 2) < accel(8, 10, 15, 8) < accel(8, 10, 15, 12)
-
-
-def test_free_road_and_too_fast():
-    assert abs(accel(10, 10, torch.inf, 0)) < 1e-6 and accel(0, 10, torch.inf, 0) == 1.0
-    assert -3.0 <= accel(20, 10, torch.inf, 0) < 0
 
 
 def test_settles_behind_a_slower_leader():

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from e2rl.prior import lane_relative
-from e2rl.prior.bounds import FREE, GENTLE, STRIDE, BoundSettings, Surroundings, acceleration_caps, bounded
+from e2rl.prior.bounds import MIN_BRAKING, NO_CAP, STRIDE, BoundSettings, Obstacles, acceleration_caps, bounded
 from e2rl.prior.lane_relative import SIZE, locate
 from e2rl.scene.recording import DT
 from tests.prior.small import arc
@@ -15,7 +15,7 @@ CAR = (4.0, 2.0)
 
 
 def traffic(*cars, turn=0.0, exempt=()):
-    """Vehicles (x, y, heading, speed) on routes of curvature `turn`: decode(cap) at constant speed, state, around."""
+    """Vehicles (x, y, heading, speed) on routes of curvature `turn`: decode(cap) at constant speed, state, others."""
     agents = torch.tensor([cars], dtype=torch.float32)
     routes = torch.stack([arc(x, y, heading, turn) for x, y, heading, _ in cars])[None]
     zero = torch.zeros(1, len(cars))
@@ -30,11 +30,11 @@ def traffic(*cars, turn=0.0, exempt=()):
             x[..., 0] = torch.minimum(x[..., 0], cap)
         return lane_relative.decode(x, state, routes)
 
-    return decode, state, Surroundings(agents, size, torch.ones(1, len(cars), dtype=torch.bool), ignores)
+    return decode, state, Obstacles(agents, size, torch.ones(1, len(cars), dtype=torch.bool), ignores)
 
 
-def caps(decode, state, around, **settings):
-    return acceleration_caps(BoundSettings(**settings), decode(None), state, around)[0]
+def caps(decode, state, obstacles, **settings):
+    return acceleration_caps(BoundSettings(**settings), decode(None), state, obstacles)[0]
 
 
 def contact_time(seconds):
@@ -43,69 +43,69 @@ def contact_time(seconds):
 
 
 def test_plans_that_meet_nobody_are_free():
-    decode, state, around = traffic((0, 0, 0, 10), (30, 0, 0, 10), (0, 3.5, 0, 12), (40, -3.5, math.pi, 9))
-    assert (caps(decode, state, around) == FREE).all()
-    motion = bounded(BoundSettings(), decode, state, around)
+    decode, state, obstacles = traffic((0, 0, 0, 10), (30, 0, 0, 10), (0, 3.5, 0, 12), (40, -3.5, math.pi, 9))
+    assert (caps(decode, state, obstacles) == NO_CAP).all()
+    motion = bounded(BoundSettings(), decode, state, obstacles)
     assert torch.equal(motion.states(), decode(None).states())
 
 
 @pytest.mark.parametrize("speed", [0.0, 4.0])
 def test_a_follower_brakes_to_its_leader_s_speed_in_the_room_there_is(speed):
-    decode, state, around = traffic((0, 0, 0, 10), (15, 0, 0, speed))
-    cap = caps(decode, state, around, gap=1.0)
+    decode, state, obstacles = traffic((0, 0, 0, 10), (15, 0, 0, speed))
+    cap = caps(decode, state, obstacles, gap=1.0)
     time = contact_time((15 - CAR[0]) / (10 - speed))
     room = 10 * time - 1.0 - speed * time
-    assert cap.tolist() == pytest.approx([-((10 - speed) ** 2) / (2 * room), FREE], rel=2e-2)
+    assert cap.tolist() == pytest.approx([-((10 - speed) ** 2) / (2 * room), NO_CAP], rel=2e-2)
 
 
 def test_braking_is_never_harder_than_the_floor_nor_softer_than_gentle():
     hard, soft = traffic((0, 0, 0, 15), (8, 0, 0, 0)), traffic((0, 0, 0, 1.0), (6.5, 0, 0, 0))
     assert caps(*hard, floor=-5.0)[0] == -5.0
-    assert caps(*soft)[0] == -GENTLE
+    assert caps(*soft)[0] == -MIN_BRAKING
 
 
 def test_of_two_that_cross_the_later_one_brakes():
-    decode, state, around = traffic((-20, 0, 0, 10), (0, -23, math.pi / 2, 10))
-    cap = caps(decode, state, around)
-    assert cap[0] == FREE and cap[1] < -1
+    decode, state, obstacles = traffic((-20, 0, 0, 10), (0, -23, math.pi / 2, 10))
+    cap = caps(decode, state, obstacles)
+    assert cap[0] == NO_CAP and cap[1] < -1
 
 
 def test_only_an_exempt_vehicle_may_meet_the_ego():
     cars = (12, 0, 0, 0), (0, 0, 0, 10), (-12, 0, 0, 13)
     shy, bold = caps(*traffic(*cars)), caps(*traffic(*cars, exempt=[1]))
-    assert shy[1] < 0 and bold[1] == FREE and bold[2] == shy[2] < 0
+    assert shy[1] < 0 and bold[1] == NO_CAP and bold[2] == shy[2] < 0
 
 
 def test_absent_vehicles_are_in_nobody_s_way():
-    decode, state, around = traffic((0, 0, 0, 10), (15, 0, 0, 0))
-    around.present[0, 1] = False
-    assert (caps(decode, state, around) == FREE).all()
+    decode, state, obstacles = traffic((0, 0, 0, 10), (15, 0, 0, 0))
+    obstacles.present[0, 1] = False
+    assert (caps(decode, state, obstacles) == NO_CAP).all()
 
 
 def test_a_pedestrian_without_a_plan_keeps_its_velocity():
-    decode, state, around = traffic((0, 0, 0, 10))
+    decode, state, obstacles = traffic((0, 0, 0, 10))
     walker = torch.tensor([[[20.0, -3.0, math.pi / 2, 1.5]]])
-    around = Surroundings(
-        torch.cat([around.agents, walker], 1),
-        torch.cat([around.size, torch.ones(1, 1, 2)], 1),
+    obstacles = Obstacles(
+        torch.cat([obstacles.agents, walker], 1),
+        torch.cat([obstacles.size, torch.ones(1, 1, 2)], 1),
         torch.ones(1, 2, dtype=torch.bool),
-        around.exempt,
+        obstacles.exempt,
     )
-    assert caps(decode, state, around)[0] < -1
-    around.agents[0, 1, 3] = 0.0
-    assert caps(decode, state, around)[0] == FREE
+    assert caps(decode, state, obstacles)[0] < -1
+    obstacles.agents[0, 1, 3] = 0.0
+    assert caps(decode, state, obstacles)[0] == NO_CAP
 
 
 def test_a_curve_is_met_at_the_lateral_acceleration_allowed():
-    decode, state, around = traffic((0, 0, 0, 12), turn=1 / 20.0)
-    cap = caps(decode, state, around, lateral=4.0)[0]
+    decode, state, obstacles = traffic((0, 0, 0, 12), turn=1 / 20.0)
+    cap = caps(decode, state, obstacles, lateral=4.0)[0]
     assert cap == pytest.approx(-(12**2 - 4.0 * 20) / (2 * 12 * STRIDE * DT), rel=0.1) or cap == -7.0
-    assert caps(decode, state, around, lateral=8.0)[0] == FREE
-    assert caps(decode, state, around, lateral=4.0, curve=False)[0] == FREE
+    assert caps(decode, state, obstacles, lateral=8.0)[0] == NO_CAP
+    assert caps(decode, state, obstacles, lateral=4.0, curve=False)[0] == NO_CAP
 
 
 def test_whoever_follows_a_braking_vehicle_brakes_too():
-    decode, state, around = traffic((20, 0, 0, 0), (0, 0, 0, 12), (-5.0, 0, 0, 12))
-    assert caps(decode, state, around, look=1.6)[2] == FREE, "its plan meets nobody's as they stand"
-    motion = bounded(BoundSettings(look=1.6), decode, state, around)
+    decode, state, obstacles = traffic((20, 0, 0, 0), (0, 0, 0, 12), (-5.0, 0, 0, 12))
+    assert caps(decode, state, obstacles, look=1.6)[2] == NO_CAP, "its plan meets nobody's as they stand"
+    motion = bounded(BoundSettings(look=1.6), decode, state, obstacles)
     assert (motion.v <= decode(None).v + 1e-5).all() and motion.v[0, 2, 10] < 12 - 0.2

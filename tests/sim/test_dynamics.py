@@ -74,3 +74,12 @@ def test_gradients_flow(horizon):
     start[:, 3] += 5
     actions = (actions * 0.1).requires_grad_()
     assert torch.autograd.gradcheck(lambda a: dynamics.rollout(start, a), actions)
+
+
+def test_constant_velocity_is_a_rollout_without_actions():
+    start, _ = random_case()
+    actions = torch.zeros(len(start), 20, 2, dtype=torch.float64)
+    times = DT * torch.arange(1, 21, dtype=torch.float64)
+    found, expected = dynamics.constant_velocity(start, times), dynamics.rollout(start, actions)
+    torch.testing.assert_close(found[..., :2], expected[..., :2])
+    assert torch.equal(found[..., 2:], start[:, None, 2:].expand(-1, 20, -1))

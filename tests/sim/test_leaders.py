@@ -1,10 +1,10 @@
-"""Who leads whom: gaps between bumpers, who does not count, and the equilibrium of the car-following model."""
+"""Who leads whom: gaps between bumpers, and who does not count."""
 
 import pytest
 import torch
 
 from e2rl.scene.route import project
-from e2rl.sim.leaders import FREE, SIDE_GAP, Ahead, idm_acceleration, leaders
+from e2rl.sim.leaders import FREE_GAP, leaders
 from tests.prior.small import arc
 
 LENGTH, WIDTH = 4.0, 2.0
@@ -17,8 +17,7 @@ def lead(agents, vehicles=1, present=None, size=None):
     present = torch.ones(agents.shape[:2], dtype=torch.bool) if present is None else present
     points = arc(0.0, 0.0, 0.0, 0.0)[None, None].expand(1, vehicles, -1, -1)
     s = agents[:, :vehicles, 0] + 20.0
-    box = torch.full((1, vehicles), WIDTH), torch.full((1, vehicles), LENGTH)
-    return tuple(value[0] for value in leaders(s, *box, points, agents, size, present))
+    return tuple(value[0] for value in leaders(s, points, agents, size, present))
 
 
 def test_the_gap_is_between_bumpers_of_the_nearest():
@@ -29,7 +28,7 @@ def test_the_gap_is_between_bumpers_of_the_nearest():
 def test_those_behind_beside_absent_or_identical_do_not_lead():
     present = torch.tensor([[True, True, True, False]])
     gap, _, _ = lead([(0, 0, 0, 9), (-5, 0, 0, 9), (12, 3.5, 0, 9), (12, 0, 0, 9)], present=present)
-    assert gap.item() == FREE
+    assert gap.item() == FREE_GAP
 
 
 def test_a_vehicle_across_the_lane_leads_with_its_side_and_stands_along_it():
@@ -40,48 +39,40 @@ def test_a_vehicle_across_the_lane_leads_with_its_side_and_stands_along_it():
 
 def test_everyone_of_a_queue_follows_the_next():
     gap, _, index = lead([(0, 0, 0, 5), (10, 0, 0, 5), (20, 0, 0, 5)], vehicles=3)
-    assert index[:2].tolist() == [1, 2] and gap.tolist() == pytest.approx([6, 6, FREE])
-
-
-def test_equilibrium_gap_free_road_and_closing():
-    v, target = torch.tensor(10.0), torch.tensor(15.0)
-    settings = (1.5, 2.0, 1.2, 2.0)
-    free = 1 - (v / target) ** 4
-    equilibrium = (2.0 + 1.5 * v) / free.sqrt()
-    assert idm_acceleration(v, target, equilibrium, v, *settings).item() == pytest.approx(0, abs=1e-5)
-    assert idm_acceleration(torch.tensor(0.0), target, torch.tensor(1e6), v, *settings).item() == pytest.approx(1.2)
-    slower, faster = (idm_acceleration(v, target, equilibrium, v + dv, *settings) for dv in (-3, 3))
-    assert slower < 0 < faster, "closing in brakes, falling behind accelerates"
+    assert index[:2].tolist() == [1, 2] and gap.tolist() == pytest.approx([6, 6, FREE_GAP])
 
 
 def test_whoever_is_between_a_vehicle_and_its_route_is_ahead_too():
     points = torch.stack([2.0 * torch.arange(60), torch.zeros(60)], -1).expand(1, 2, 60, 2)
     agents = torch.tensor([[[20.0, 3.5, 0.0, 10.0], [40.0, 3.5, 0.0, 4.0]]])
     size, present = torch.tensor([4.0, 2.0]).expand(1, 2, 2), torch.ones(1, 2, dtype=torch.bool)
-    s, width, length = agents[..., 0], size[..., 1], size[..., 0]
-    on_route = leaders(s, width, length, points, agents, size, present)
-    changing = leaders(s, width, length, points, agents, size, present, agents[..., 1])
-    assert on_route[0][0, 0] == FREE
+    s = agents[..., 0]
+    on_route = leaders(s, points, agents, size, present)
+    changing = leaders(s, points, agents, size, present, agents[..., 1])
+    assert on_route[0][0, 0] == FREE_GAP
     assert torch.isclose(changing[0][0, 0], torch.tensor(16.0)) and changing[1][0, 0] == 4.0
 
 
-def all_pairs(s, width, length, points, agents, size, present, d):
+def all_pairs(s, points, agents, size, present, d, margin, free_gap):
     """The definition, with every agent projected onto every route."""
+    length, width = size[:, : s.shape[1]].unbind(-1)
     at, offset, heading = project(agents[:, None, :, :2], points)
     turn = agents[:, None, :, 2] - heading
     cos, sin = turn.cos(), turn.sin()
     side = (size[:, None, :, 0] * sin.abs() + size[:, None, :, 1] * cos.abs()) / 2
     along = (size[:, None, :, 0] * cos.abs() + size[:, None, :, 1] * sin.abs()) / 2
     aside = offset - torch.minimum(torch.maximum(offset, d[..., None].clamp(max=0)), d[..., None].clamp(min=0))
-    leads = (aside.abs() < width[..., None] / 2 + side + SIDE_GAP) & (at > s[..., None]) & present[:, None]
+    leads = (aside.abs() < width[..., None] / 2 + side + margin) & (at > s[..., None]) & present[:, None]
     leads &= ~torch.eye(*leads.shape[1:], dtype=torch.bool) & present[:, : s.shape[1], None]
-    gap = torch.where(leads, at - s[..., None] - length[..., None] / 2 - along, FREE).min(-1)
-    return gap.values.clamp(max=FREE), (agents[:, None, :, 3] * cos).gather(-1, gap.indices[..., None])[..., 0]
+    gap, index = torch.where(leads, at - s[..., None] - length[..., None] / 2 - along, free_gap).min(-1)
+    return gap.clamp(max=free_gap), (agents[:, None, :, 3] * cos).gather(-1, index[..., None])[..., 0], index
 
 
-def test_pruned_pairs_are_those_that_could_not_lead():
+@pytest.mark.parametrize(("vehicles", "offsets", "free_gap"), [(6, True, FREE_GAP), (1, False, torch.inf)])
+def test_pruned_pairs_are_those_that_could_not_lead(vehicles, offsets, free_gap):
+    """Of all vehicles as the traffic asks, and of the ego alone without a horizon as the IDM ego does."""
     generator = torch.Generator().manual_seed(0)
-    batch, vehicles, count = 40, 6, 10
+    batch, count = 40 * 6 // vehicles, 10
     draw = lambda *shape: torch.rand(shape, generator=generator)  # noqa: E731
     bend = 0.04 * (draw(batch, vehicles, 1) - 0.5) * torch.arange(150) + 6.28 * draw(batch, vehicles, 1)
     step = 2.0 * torch.stack([bend.cos(), bend.sin()], -1)
@@ -90,12 +81,12 @@ def test_pruned_pairs_are_those_that_could_not_lead():
     place = points[:, 0, torch.randint(0, 150, (count,), generator=generator)] + 8 * (draw(batch, count, 2) - 0.5)
     agents = torch.cat([place, 6.28 * draw(batch, count, 1), 10 * draw(batch, count, 1)], -1)
     size = torch.tensor([4.5, 2.0]).expand(batch, count, 2)
-    present, d = draw(batch, count) < 0.8, 6 * (draw(batch, vehicles) - 0.5)
-    width, length, s = size[:, :vehicles, 1], size[:, :vehicles, 0], 60 * draw(batch, vehicles)
-    expected = all_pairs(s, width, length, points, agents, size, present, d)
-    found = Ahead(s, width, length, points, agents, size, present, d.abs()).nearest(d)
-    led = expected[0] < FREE
-    assert led.sum() > 40
-    torch.testing.assert_close(found[0], expected[0], rtol=0, atol=1e-3)
-    torch.testing.assert_close(found[1][led], expected[1][led], rtol=0, atol=1e-3)
-    assert torch.equal(found[1][~led], agents[:, :vehicles, 3][~led]), "nobody ahead moves as the vehicle does"
+    present, d = draw(batch, count) < 0.8, 6 * (draw(batch, vehicles) - 0.5) * offsets
+    given = (60 * draw(batch, vehicles), points, agents, size, present)
+    expected = all_pairs(*given, d, 0.5, free_gap)
+    found = leaders(*given, d if offsets else None, 0.5, free_gap)
+    led = expected[0] < free_gap
+    assert led.sum() > 40 and torch.equal(found.index[led], expected[2][led])
+    torch.testing.assert_close(found.gap, expected[0], rtol=0, atol=1e-4)
+    torch.testing.assert_close(found.speed[led], expected[1][led], rtol=0, atol=1e-4)
+    assert torch.equal(found.speed[~led], agents[:, :vehicles, 3][~led]), "nobody ahead moves as the vehicle does"

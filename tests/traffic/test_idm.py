@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from e2rl.prior.bounds import FREE, BoundSettings, Surroundings, acceleration_caps
+from e2rl.prior.bounds import NO_CAP, BoundSettings, Obstacles, acceleration_caps
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.scene.recording import DT, LIGHT_RED, LIGHT_YELLOW
 from e2rl.traffic.idm import IDM, IDMSettings
@@ -177,10 +177,10 @@ CROSSING = [(-150, 40, 0, 10), (0, 0, 0, 10), (22, -22, math.pi / 2, 10)]  # two
 def caps_of(world, plan, settings):
     on = IDM(NO_BOUNDS)
     state = on.begin(world.scene, torch.zeros(1, dtype=torch.int64), torch.zeros(1)).state
-    around = Surroundings(
+    obstacles = Obstacles(
         world.states, world.scene["size"], world.valid, torch.zeros_like(world.valid[:, : state.v.shape[1]])
     )
-    return acceleration_caps(settings, plan.motion, state, around)[0]
+    return acceleration_caps(settings, plan.motion, state, obstacles)[0]
 
 
 def test_it_is_under_the_bounds_of_the_prior():
@@ -188,8 +188,8 @@ def test_it_is_under_the_bounds_of_the_prior():
     settings, world = BoundSettings(), make_world(CROSSING)
     free, bounded = plan_of(world), plan_of(world, settings)
     caps = caps_of(world, free, settings)
-    brakes = caps < FREE
-    assert brakes.sum() == 1 and (caps_of(world, bounded, settings)[~brakes] == FREE).all()
+    brakes = caps < NO_CAP
+    assert brakes.sum() == 1 and (caps_of(world, bounded, settings)[~brakes] == NO_CAP).all()
     row = brakes.nonzero().item()
     first, before = bounded.motion.v[0, row, 4].item(), world.states[0, row, 3].item()
     onset = max(caps[row].item(), -settings.onset)

@@ -1,4 +1,4 @@
-"""One process, or several that torchrun starts: who writes, how gradients and figures are averaged, who goes first."""
+"""One training process, or several started by torchrun: gradients and figures are averaged, one process writes."""
 
 import contextlib
 import os
@@ -16,20 +16,22 @@ from torch.nn.parallel import DistributedDataParallel
 from e2rl.errors import InputError
 
 Value = TypeVar("Value")
-PATIENCE = timedelta(hours=6)  # the others wait while the leader parses logs or validates
+TIMEOUT = timedelta(hours=6)  # the others wait while the leader parses logs or validates
 
 
 @dataclass(frozen=True)
 class Processes:
-    """This process among those that train together: `rank` of `count`. Every method but `leader` is collective: all
-    processes call it in the same order. Alone (count 1) none communicates."""
+    """This process, `rank`, among `count` that train together.
+
+    Every method but `leader` is collective: all processes call it in the same order. With count 1 none communicates.
+    """
 
     rank: int = 0
     count: int = 1
 
     @property
     def leader(self) -> bool:
-        """The one process that prints, validates and writes."""
+        """Whether this is the process that prints, validates and writes."""
         return self.rank == 0
 
     def mean(self, value: Tensor) -> Tensor:
@@ -48,7 +50,7 @@ class Processes:
         return values
 
     def from_leader(self, work: Callable[[], Value]) -> Value:
-        """What `work()` returns in the leader, in every process; its InputError is everybody's."""
+        """What `work()` returns in the leader, in every process; an InputError of the leader is raised in all."""
         if self.count == 1:
             return work()
         result: list = [None, None]
@@ -63,19 +65,13 @@ class Processes:
         return result[0]
 
     def leader_first(self, work: Callable[[], Value]) -> Value:
-        """`work()` of every process, the leader's first: what it caches the others only read."""
-        mine: list[Value] = []
-        self.from_leader(lambda: mine.append(work()))
-        return mine[0] if self.leader else work()
+        """`work()` of every process, first the leader's, whose cached files the others then read."""
+        own: list[Value] = []
+        self.from_leader(lambda: own.append(work()))
+        return own[0] if self.leader else work()
 
-    def same(self, module: nn.Module) -> None:
-        """The leader's parameters and buffers in every process."""
-        if self.count > 1:
-            for value in module.state_dict().values():
-                dist.broadcast(value, 0)
-
-    def averaging(self, module: nn.Module) -> nn.Module:
-        """The module, its gradients averaged over the processes by every backward pass."""
+    def data_parallel(self, module: nn.Module) -> nn.Module:
+        """The module with the leader's parameters, whose gradients every backward pass averages over the processes."""
         # Its buffers are statistics of the windows, which are the same everywhere.
         return module if self.count == 1 else DistributedDataParallel(module, broadcast_buffers=False)
 
@@ -84,35 +80,33 @@ ALONE = Processes()
 
 
 @contextmanager
-def joined(device: str) -> Iterator[tuple[Processes, str]]:
-    """(processes, this process's device): those that torchrun started, over gloo on the CPU and NCCL on GPUs (one GPU
-    a process), or this one alone. The others than the leader keep silent inside."""
+def process_group(device: str) -> Iterator[tuple[Processes, str]]:
+    """(processes, this process's device): those that torchrun started, or this one alone.
+
+    They communicate over gloo on the CPU and NCCL on GPUs, one GPU each. All but the leader are silent inside. Raises
+    InputError where there are more processes than GPUs.
+    """
     if not started_by_torchrun():
         yield ALONE, device
         return
-    local, here = int(os.environ["LOCAL_RANK"]), int(os.environ["LOCAL_WORLD_SIZE"])
-    on_gpu = device.startswith("cuda")
+    on_gpu, local, count = device.startswith("cuda"), int(os.environ["LOCAL_RANK"]), int(os.environ["LOCAL_WORLD_SIZE"])
     if on_gpu:
-        if here > torch.cuda.device_count():
-            raise InputError(
-                f"torchrun --nproc_per_node={here}: this machine has {torch.cuda.device_count()} GPUs; "
-                "start at most one process for each"
-            )
+        gpus = torch.cuda.device_count()
+        if count > gpus:
+            raise InputError(f"torchrun --nproc_per_node={count}: this machine has {gpus} GPUs; start at most {gpus}")
         device = f"cuda:{local}"
         torch.cuda.set_device(local)
-    dist.init_process_group("nccl" if on_gpu else "gloo", timeout=PATIENCE)
+    dist.init_process_group("nccl" if on_gpu else "gloo", timeout=TIMEOUT)
     processes = Processes(dist.get_rank(), dist.get_world_size())
     try:
-        with contextlib.nullcontext() if processes.leader else _silent():
+        with contextlib.ExitStack() as stack:
+            if not processes.leader:
+                nowhere = stack.enter_context(open(os.devnull, "w"))
+                stack.enter_context(contextlib.redirect_stdout(nowhere))
+                stack.enter_context(contextlib.redirect_stderr(nowhere))
             yield processes, device
     finally:
         dist.destroy_process_group()
-
-
-@contextmanager
-def _silent() -> Iterator[None]:
-    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
-        yield
 
 
 def started_by_torchrun() -> bool:

@@ -1,4 +1,4 @@
-"""The prior's loss: denoising in x with a small trajectory term, on augmented windows."""
+"""The prior's training loss: denoising of x plus a small trajectory term, on augmented windows."""
 
 from dataclasses import replace
 
@@ -22,43 +22,44 @@ from e2rl.prior.lane_relative import (
     speeds,
     split,
 )
-from e2rl.prior.prior import CLEAN, Prior
+from e2rl.prior.prior import EGO_LEVEL, Prior
 
-LEAST, CONSTANT = 0.02, 1e6  # smallest standard deviation of a feature; that of one that never varied: it says nothing
+MIN_STD = 0.02  # smallest standard deviation that a feature is divided by
+CONSTANT_STD = 1e6  # of a feature that never varied, so that it has no effect
+SIDED = {"nodes": SIDED_NODE, "pairs": SIDED_EDGE, "x0": (KNOTS, KNOTS + 1)}  # columns whose sign a mirror flips
 
 
 def augment(batch: TensorDictBase, settings: TrainingSettings, generator: torch.Generator) -> TensorDictBase:
-    """Mirrored, noisy windows with some of the other vehicles hidden."""
+    """Windows [W] mirrored, with noise on the accelerations and some of the other vehicles hidden."""
     batch, size, device = batch.clone(), batch.shape[0], batch["x0"].device
-    draw = lambda *shape: torch.rand(shape, generator=generator, device=device)  # noqa: E731
-    flip = torch.where(draw(size) < settings.mirror, -1.0, 1.0)
-    for key, columns in (("nodes", SIDED_NODE), ("pairs", SIDED_EDGE), ("x0", (KNOTS, KNOTS + 1))):
-        sign = torch.ones(batch[key].shape[-1], device=device)
-        sign = torch.where(
-            torch.isin(torch.arange(len(sign), device=device), torch.tensor(columns, device=device)),
-            flip[:, None],
-            sign,
-        )
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(shape, generator=generator, device=device)
+
+    flip = torch.where(uniform(size) < settings.mirror, -1.0, 1.0)
+    for key, columns in SIDED.items():
+        sign = torch.ones(size, batch[key].shape[-1], device=device)
+        sign[:, list(columns)] = flip[:, None]
         batch[key] = batch[key] * sign.reshape(size, *[1] * (batch[key].ndim - 2), -1)
     for key in ("d", "d1", "d2", "aside"):
         batch[key] = batch[key] * flip.reshape(size, *[1] * (batch[key].ndim - 1))
-    hidden = draw(*batch["present"].shape) < settings.drop
+    hidden = uniform(*batch["present"].shape) < settings.drop
     hidden[:, 0] = False
     batch["present"] = batch["present"] & ~hidden
     batch["weight"] = batch["weight"] * ~hidden
-    noisy = (draw(*batch["a"].shape) < 0.5) * settings.accel_noise
+    noisy = (uniform(*batch["a"].shape) < 0.5) * settings.accel_noise
     noise = noisy * torch.randn(batch["a"].shape, generator=generator, device=device)
     batch["a"] = batch["a"] + noise
-    batch["nodes"] = batch["nodes"] + torch.cat(
-        [torch.zeros_like(noise)[..., None], noise[..., None] / 2, torch.zeros_like(batch["nodes"][..., 2:])], -1
-    )
+    batch["nodes"][..., 1] += noise / 2
     return batch
 
 
 def draw(batch: TensorDictBase, settings: TrainingSettings, generator: torch.Generator) -> TensorDict:
-    """The random numbers of the loss of windows [W] at L = `levels` noise levels each: feature [W, R, NODE] standard
-    normal; level [W, L] in (0.01, 0.99), stratified; clean [W, L] bool: the ego's row is given clean (in half);
-    noise [W, L, R, SIZE] standard normal."""
+    """The random numbers of the loss of windows [W] at L = `levels` noise levels each.
+
+    feature [W, R, NODE]: standard normal; level [W, L]: in (0.01, 0.99), stratified; clean [W, L] bool: the ego's row
+    is given nearly noise-free (in half); noise [W, L, R, SIZE]: standard normal.
+    """
     size, count, device = len(batch), settings.levels, batch["x0"].device
     feature = torch.randn(batch["nodes"].shape, generator=generator, device=device)
     u = torch.rand(count, size, generator=generator, device=device)
@@ -85,16 +86,16 @@ class DenoisingLoss(nn.Module):
     def forward(self, batch: TensorDictBase, drawn: TensorDictBase, total: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(loss, its action term, its trajectory term) of windows [W] with the random numbers of `draw`.
 
-        total: what the weighted sums are divided by: their summed `loss_weight`; where several processes share a
-        batch, the mean of that over them, so that the mean of their gradients is the gradient of the whole batch.
+        total: what the weighted sums are divided by, the sum of `loss_weight`; where several processes share a batch,
+        its mean over them, so that the mean of their gradients is the gradient of the whole batch.
         """
         net, count = self.denoiser, drawn["level"].shape[1]
-        scale = self.settings.feature_noise * net.node_std * ((net.node_std > LEAST) & (net.node_std < CONSTANT))
+        scale = self.settings.feature_noise * net.node_std * ((net.node_std > MIN_STD) & (net.node_std < CONSTANT_STD))
         nodes = batch["nodes"] + scale * drawn["feature"]
         encoding = net.encode(nodes, batch["pairs"], batch["present"]).repeat(count)
         weight, tiled = loss_weight(batch, drawn), torch.cat([batch] * count)
         level = drawn["level"].T.reshape(-1, 1).expand(-1, weight.shape[1]).clone()
-        level[:, 0] = torch.where(drawn["clean"].T.reshape(-1), CLEAN, level[:, 0])
+        level[:, 0] = torch.where(drawn["clean"].T.reshape(-1), EGO_LEVEL, level[:, 0])
         x = net.schedule.noised(tiled["x0"], level[..., None], drawn["noise"].transpose(0, 1).flatten(0, 1))
         x0 = net(x, level, encoding).float()
         squared = (x0 - tiled["x0"]) ** 2 * tiled["knot_weight"]
@@ -114,30 +115,24 @@ def denoising_loss(
 
 
 def _trajectory_error(x0: Tensor, batch: TensorDictBase) -> Tensor:
-    """Huber error [W, R] of way ahead and (twice, on lanes) of offset at the knots' times, in m."""
+    """Huber error [W, R] in m of travelled distance and (twice, on lanes) of offset at the knots' times."""
     zero = torch.zeros_like(batch["v"])
     state = LaneState(zero, batch["d"], batch["d1"], batch["d2"], batch["v"], batch["a"], zero, zero, zero, zero)
     knots, half, end = split(x0, state)
-    _, travelled = speeds(state, knots)
-    ends = torch.arange(KNOT_STEPS - 1, HORIZON, KNOT_STEPS, device=x0.device)
-    travelled = travelled[..., ends]
+    travelled = speeds(state, knots)[1][..., KNOT_STEPS - 1 : HORIZON : KNOT_STEPS]
     u = (travelled / lateral_horizon(state.v)[..., None]).clamp(max=1.0)
     d = polynomial(offset_coefficients(state, half, end), u)[0]
-    known = batch["known"].float()
     ahead = F.huber_loss(travelled, batch["ahead"], reduction="none")
     aside = F.huber_loss(2 * d, 2 * batch["aside"], reduction="none") * batch["on_lane"][..., None]
-    return ((ahead + aside) * known).sum(-1) / KNOTS
+    return ((ahead + aside) * batch["known"].float()).sum(-1) / KNOTS
 
 
 @torch.no_grad()
 def held_out_loss(prior: Prior, windows: TensorDictBase, settings: TrainingSettings, batches: int = 20) -> float:
-    """Denoising loss on windows, with a fixed seed and no augmentation."""
+    """Denoising loss on at most `batches` batches of windows, with a fixed seed and without augmentation."""
     device = next(prior.parameters()).device
     generator = torch.Generator(device).manual_seed(1)
     plain = replace(settings, feature_noise=0.0)
-    losses = []
-    for k in range(min(batches, len(windows) // settings.batch + 1)):
-        batch = windows[k * settings.batch : (k + 1) * settings.batch].to(device)
-        if len(batch):
-            losses.append(denoising_loss(prior, batch, plain, generator)[0].item())
+    parts = windows[: batches * settings.batch].split(settings.batch)
+    losses = [denoising_loss(prior, part.to(device), plain, generator)[0].item() for part in parts]
     return sum(losses) / len(losses)

@@ -1,15 +1,18 @@
-"""Optimising the denoiser: the state of one run, its steps, the moving average of the weights, exact resume."""
+"""Optimisation of the denoiser: one run's state, its steps, the moving average of the weights, exact resume."""
 
 import math
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
+from torch.optim.swa_utils import AveragedModel
 from tqdm import tqdm
 
 from e2rl.errors import InputError
 from e2rl.learning.prior_training.distributed import ALONE, Processes
-from e2rl.learning.prior_training.loss import CONSTANT, LEAST, DenoisingLoss, augment, draw, loss_weight
+from e2rl.learning.prior_training.loss import CONSTANT_STD, MIN_STD, DenoisingLoss, augment, draw, loss_weight
 from e2rl.learning.prior_training.settings import TrainingSettings
 from e2rl.prior.prior import Prior
 
@@ -18,36 +21,33 @@ RANK_SEED = 1_000_003  # between the generators' seeds of two processes
 
 
 class PriorTraining:
-    """The state of one training run: network, its moving average, optimiser, progress and generator.
+    """The state of one training run: network, moving average of its weights, optimiser, progress and generator.
 
-    Of `count` processes each draws its own share of a step's windows and noise; their gradients are averaged, hence
-    weights and averages are the same in all of them, and a run is determined by its seed and their number.
+    Each process draws its own share of a step's windows and noise, and their gradients are averaged. Hence weights and
+    averages are the same in all processes, and a run is determined by its seed and the number of processes.
     """
 
     def __init__(self, prior: Prior, windows: TensorDictBase, settings: TrainingSettings, processes: Processes = ALONE):
+        """Raises InputError where the processes cannot share a batch evenly."""
         if settings.batch % processes.count:
-            raise InputError(
-                f"prior.training.batch={settings.batch}: {processes.count} processes share the windows of "
-                "a step evenly; choose a multiple of their number"
-            )
+            text = f"prior.training.batch={settings.batch}: {processes.count} processes share the windows of a step"
+            raise InputError(f"{text} evenly; choose a multiple of their number")
         self.prior, self.windows, self.settings, self.processes = prior, windows, settings, processes
         self.step, self.share = 0, settings.batch // processes.count
         self.device = next(prior.parameters()).device
         self.generator = torch.Generator(self.device).manual_seed(settings.seed + RANK_SEED * processes.rank)
-        nodes = windows["nodes"][windows["present"]]
-        spread = nodes.std(0)
+        nodes, causal = windows["nodes"][windows["present"]], windows["causal"]
+        std = nodes.std(0)
         prior.denoiser.node_mean.copy_(nodes.mean(0))
-        prior.denoiser.node_std.copy_(torch.where(spread < 1e-6, CONSTANT, spread.clamp(min=LEAST)))
-        self.rows = [
-            rows for rows in (windows["causal"].nonzero()[:, 0], (~windows["causal"]).nonzero()[:, 0]) if len(rows)
-        ]
-        processes.same(prior)
-        loss = processes.averaging(DenoisingLoss(prior.denoiser, settings))
+        prior.denoiser.node_std.copy_(torch.where(std < 1e-6, CONSTANT_STD, std.clamp(min=MIN_STD)))
+        self.rows = [rows for rows in (causal.nonzero()[:, 0], (~causal).nonzero()[:, 0]) if len(rows)]
+        loss = processes.data_parallel(DenoisingLoss(prior.denoiser, settings))
         self.loss = torch.compile(loss) if settings.compile else loss
         self.optimiser = torch.optim.AdamW(
             prior.denoiser.parameters(), settings.learning_rate, weight_decay=settings.weight_decay, fused=True
         )
-        self.average = {key: value.clone() for key, value in prior.denoiser.state_dict().items()}
+        self.average = AveragedModel(prior.denoiser, multi_avg_fn=self._average)
+        self.average.update_parameters(prior.denoiser)  # the first one copies: the average starts at the first weights
 
     def learning_rate(self) -> float:
         """Linear warm-up, then a cosine to 0."""
@@ -55,28 +55,28 @@ class PriorTraining:
         return self.settings.learning_rate * warm * 0.5 * (1 + math.cos(self.step / self.settings.steps * math.pi))
 
     def run(self, until: int) -> dict[str, float]:
-        """Train up to step `until`; returns the running losses."""
+        """Train up to step `until`; returns the running means of the loss's terms."""
         running: dict[str, float] = {}
         self.prior.train()
         bar = tqdm(range(self.step, until), "prior", initial=self.step, total=self.settings.steps, unit="step")
         for _ in bar:
             batch = augment(self.windows[self.pick()].to(self.device), self.settings, self.generator)
-            parts = self.update(batch, draw(batch, self.settings, self.generator))
+            terms = self.update(batch, draw(batch, self.settings, self.generator))
             if self.step % 20 == 0:
-                for key, value in zip(("action", "trajectory"), self.processes.mean(parts).tolist(), strict=True):
+                for key, value in zip(("action", "trajectory"), self.processes.mean(terms).tolist(), strict=True):
                     running[key] = 0.9 * running.get(key, value) + 0.1 * value
                 bar.set_postfix({key: f"{value:.3f}" for key, value in running.items()})
         return running
 
-    def pick(self) -> torch.Tensor:
-        """The windows of a step [share]: a share `causal` of them with estimated starts, where there are both kinds."""
-        draw = torch.rand(2, self.share, generator=self.generator, device=self.device).to(self.rows[0].device)
-        picks = [rows[(draw[1] * len(rows)).long()] for rows in self.rows]
-        return torch.where(draw[0] < self.settings.causal, picks[0], picks[-1])
+    def pick(self) -> Tensor:
+        """Indices [share] of a step's windows: a share `causal` of them with estimated starts, where there are both."""
+        uniform = torch.rand(2, self.share, generator=self.generator, device=self.device).to(self.rows[0].device)
+        picks = [rows[(uniform[1] * len(rows)).long()] for rows in self.rows]
+        return torch.where(uniform[0] < self.settings.causal, picks[0], picks[-1])
 
-    def update(self, batch: TensorDictBase, drawn: TensorDictBase) -> torch.Tensor:
+    def update(self, batch: TensorDictBase, drawn: TensorDictBase) -> Tensor:
         """One step on this process's windows with the random numbers of `loss.draw`; returns the loss's terms [2]."""
-        # Dropout's draws follow step and process, so that a run that was interrupted repeats them.
+        # The seed of dropout follows from step and process, so that a resumed run repeats it.
         torch.manual_seed(self.settings.seed + RANK_SEED * (self.step * self.processes.count + self.processes.rank))
         total = self.processes.mean(loss_weight(batch, drawn).sum()).clamp(min=1)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.settings.bf16):
@@ -88,43 +88,47 @@ class PriorTraining:
         torch.nn.utils.clip_grad_norm_(self.prior.denoiser.parameters(), 1.0)
         self.optimiser.step()
         self.step += 1
-        decay = min(self.settings.ema, (1 + self.step) / (10 + self.step))
-        for key, value in self.prior.denoiser.state_dict().items():
-            self.average[key].lerp_(value, 1 - decay)
+        self.average.update_parameters(self.prior.denoiser)
         return torch.stack([action, trajectory])
 
+    def _average(self, average: list[Tensor], current: list[Tensor], _count: Tensor) -> None:
+        """Exponential moving average whose decay grows to `ema`; by the step here, `_count` may lie on the GPU."""
+        decay = min(self.settings.ema, (1 + self.step) / (10 + self.step))
+        for mean, value in zip(average, current, strict=True):
+            mean.lerp_(value, 1 - decay)
+
     @contextmanager
-    def averaged(self):
-        """Within this context the prior holds the averaged weights, ready to drive."""
-        raw = {key: value.clone() for key, value in self.prior.denoiser.state_dict().items()}
-        self.prior.denoiser.load_state_dict(self.average)
+    def averaged(self) -> Iterator[Prior]:
+        """Within this context the prior has the averaged weights and is in evaluation mode."""
+        denoiser = self.prior.denoiser
+        self.prior.denoiser = self.average.module
         self.prior.eval()
         try:
             yield self.prior
         finally:
-            self.prior.denoiser.load_state_dict(raw)
+            self.prior.denoiser = denoiser
 
     def state_dict(self) -> dict:
-        """Everything that exact resumption needs. Collective: all processes ask for it at once."""
+        """Everything that exact resumption needs. Collective: all processes call it at once."""
         return {
             "denoiser": self.prior.denoiser.state_dict(),
             "route_choice": self.prior.route_choice.state_dict(),
-            "average": self.average,
+            "average": self.average.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "step": self.step,
             "generators": self.processes.gather(self.generator.get_state().cpu()),
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """Go on from a `state_dict`; InputError where another number of processes made it."""
-        if len(state["generators"]) != self.processes.count:
+        """Go on from a `state_dict`. Raises InputError where another number of processes made it."""
+        count, generators = self.processes.count, state["generators"]
+        if len(generators) != count:
             raise InputError(
-                f"the interrupted run had {len(state['generators'])} processes, this one has "
-                f"{self.processes.count}; go on with as many"
+                f"the interrupted run had {len(generators)} processes, this one has {count}; go on with as many"
             )
         self.prior.denoiser.load_state_dict(state["denoiser"])
         self.prior.route_choice.load_state_dict(state["route_choice"])
-        self.average = {key: value.to(self.device, copy=True) for key, value in state["average"].items()}
+        self.average.load_state_dict(state["average"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.step = state["step"]
-        self.generator.set_state(state["generators"][self.processes.rank].cpu())
+        self.generator.set_state(generators[self.processes.rank].cpu())

@@ -1,19 +1,22 @@
-"""Training the prior: windows over whole logs, validation on places held out, best checkpoint kept, exact resume."""
+"""Training the prior: windows over whole logs, validation on held-out places, best checkpoint kept, exact resume."""
 
 import json
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDictBase
+from torch import Tensor
 from tqdm import tqdm
 
 from e2rl.errors import InputError
+from e2rl.files import write_atomically
 from e2rl.learning.prior_training.distributed import ALONE, Processes
 from e2rl.learning.prior_training.loss import held_out_loss
 from e2rl.learning.prior_training.optimisation import PriorTraining
@@ -27,18 +30,16 @@ from e2rl.scene.scene import SceneSet
 HELD_OUT = 8  # one place in so many is held out for validation
 STATE, PROGRESS = "training.pt", "progress.jsonl"
 
-ClosedLoop = Callable[[Prior], dict[str, float]]  # figures of a prior that drives held-out scenes
+ClosedLoop = Callable[[Prior], dict[str, float]]  # metrics of a prior that drives held-out scenes
 
 
 def train_route_choice(prior: Prior, scenes: TensorDictBase, settings: TrainingSettings) -> float:
-    """Cross-entropy on the candidate driven, over vehicles with a choice; returns the accuracy on the training set."""
-    parts = [candidate_features(scenes[i : i + 64]) for i in range(0, len(scenes), 64)]
+    """Train by cross-entropy on the candidate driven, over vehicles with a choice; returns the training accuracy."""
     device = next(prior.route_choice.parameters()).device
-    features = torch.cat(parts)
+    features = torch.cat([candidate_features(part) for part in scenes.split(64)])
     valid, label = scenes["route_valid"], scenes["route_log"]
     use = scenes["valid"][:, : label.shape[1]] & ~scenes["parked"][:, : label.shape[1]] & (label >= 0)
     use &= valid.sum(-1) > 1
-    use[:, 0] &= label[:, 0] >= 0
     features, valid, label = (value[use].to(device) for value in (features, valid, label))
     if not len(label):
         return float("nan")
@@ -58,42 +59,36 @@ def train_route_choice(prior: Prior, scenes: TensorDictBase, settings: TrainingS
     return (logits.argmax(-1) == label).float().mean().item()
 
 
-def held_out(scenes: SceneSet) -> torch.Tensor:
-    """[S] bool: scenes of the places (or, without places, the logs) that are held out."""
-    place = [
-        location or scene_id.split("@")[0] for location, scene_id in zip(scenes.location, scenes.scene_id, strict=True)
-    ]
-    chosen = set(sorted(set(place))[::HELD_OUT])
-    mask = torch.tensor([name in chosen for name in place])
+def held_out(scenes: SceneSet) -> Tensor:
+    """[S] bool: scenes of held-out places (without places: of held-out logs). Raises InputError where all are."""
+    names = zip(scenes.location, scenes.scene_id, strict=True)
+    places = [location or scene_id.split("@")[0] for location, scene_id in names]
+    chosen = set(sorted(set(places))[::HELD_OUT])
+    mask = torch.tensor([name in chosen for name in places])
     if bool(mask.all()):
-        raise InputError(
-            f"all {len(scenes)} scenes are of one place ({place[0]!r}), so none can be held out for "
-            "validation; train on logs of several places"
-        )
+        where = f"all {len(scenes)} scenes are of one place ({places[0]!r})"
+        raise InputError(f"{where}, so none can be held out for validation; train on logs of several places")
     return mask
 
 
 def window_sets(scenes: SceneSet, free_space: bool) -> tuple[TensorDictBase, TensorDictBase]:
-    """(training, held-out) windows; InputError where there are none, or none in which a vehicle moves."""
+    """(training, held-out) windows. Raises InputError where there are none, or none in which a vehicle moves."""
     mask = held_out(scenes)
     windows, test = (make_windows(scenes.scenes[part], free_space) for part in (~mask, mask))
     if not len(windows) or not len(test):
-        raise InputError(
-            f"{len(windows)} training and {len(test)} held-out windows of {len(scenes)} scenes: too few "
-            "vehicles are recorded for a second on a known route; train on more or longer logs"
-        )
+        counts = f"{len(windows)} training and {len(test)} held-out windows of {len(scenes)} scenes"
+        reason = "too few vehicles are recorded for a second on a known route"
+        raise InputError(f"{counts}: {reason}; train on more or longer logs")
     for name, part in (("training", windows), ("held-out", test)):
         if not bool((part["weight"] > STANDING_WEIGHT).any()):
-            raise InputError(
-                f"no vehicle moves in the {len(part)} {name} windows of {len(scenes)} scenes; train on "
-                "logs with moving traffic"
-            )
+            where = f"in the {len(part)} {name} windows of {len(scenes)} scenes"
+            raise InputError(f"no vehicle moves {where}; train on logs with moving traffic")
     return windows, test
 
 
 @dataclass
 class Record:
-    """What a run knows besides its weights: validations so far (the lines of progress.jsonl), the best one's loss, step
+    """What a run knows besides its weights: the validations so far (lines of progress.jsonl), the best one's loss, step
     and weights, the route choice's accuracy, and the wall seconds of each stage over all interruptions."""
 
     lines: list[dict] = field(default_factory=list)
@@ -102,31 +97,38 @@ class Record:
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
-    def timed(self, stage: str):
-        """Add the wall seconds of the block to a stage's."""
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the wall seconds of the block to those of a stage."""
         begin = time.perf_counter()
         yield
         self.seconds[stage] = round(self.seconds.get(stage, 0.0) + time.perf_counter() - begin, 1)
 
     def add(self, line: dict, prior: Prior) -> None:
-        """Take up a validation of `prior`, and its weights where its held-out loss is the lowest.
+        """Add a validation of `prior`, and keep its weights where its held-out loss is the lowest.
 
-        The loss alone chooses: thousands of windows at fixed noise make it precise, whereas the closed loop's figures
-        on a few scenes scatter more between validations than the checkpoints differ (see conf/prior/default.yaml), and
-        the best of several such draws is mostly luck. They are there to show what the loss does not.
+        The loss alone chooses: thousands of windows at fixed noise make it precise. Closed-loop metrics on a few scenes
+        scatter more between validations than the checkpoints differ (see conf/prior/default.yaml), so the best of
+        several would mostly be luck; they are reported only.
         """
         self.lines.append(line)
         if line["held_out"] < self.best["held_out"]:
             weights = {key: value.detach().cpu().clone() for key, value in prior.state_dict().items()}
             self.best = {"held_out": line["held_out"], "step": line["step"], "weights": weights}
 
+    def summary(self) -> str:
+        """The last validation in one line."""
+        line, best = self.lines[-1], self.best
+        text = f"step {line['step']}: held-out loss {line['held_out']:.4f} "
+        text += f"(best {best['held_out']:.4f} at {best['step']})"
+        losses = ("step", "held_out", "action", "trajectory")
+        figures = [f"{key} {value:.4f}" for key, value in line.items() if key not in losses]
+        return text + ("; closed loop " + ", ".join(figures) if figures else "")
+
     def write(self, folder: Path, run: dict, fingerprint: str) -> None:
-        """progress.jsonl and training.pt with the run's state: each appears whole."""
-        _replace(folder / PROGRESS, lambda part: part.write_text("".join(json.dumps(x) + "\n" for x in self.lines)))
-        _replace(
-            folder / STATE,
-            lambda part: torch.save({"run": run, "record": vars(self), "fingerprint": fingerprint}, part),
-        )
+        """progress.jsonl, and training.pt with the run's state."""
+        state = {"run": run, "record": vars(self), "fingerprint": fingerprint}
+        write_atomically(folder / PROGRESS, "".join(json.dumps(line) + "\n" for line in self.lines))
+        write_atomically(folder / STATE, partial(torch.save, state))
 
 
 def train_prior(
@@ -142,8 +144,9 @@ def train_prior(
     None in processes other than the leader.
 
     folder: holds training.pt, from which an interrupted run goes on exactly, progress.jsonl and the checkpoint. origin:
-    what is known of data and command; the checkpoint keeps it, and what comes of the training, in its header.
-    closed_loop: figures that every `closed_loop_every`-th validation and the last one log beside the held-out loss.
+    what is known of data and command; the checkpoint's header holds it, with the results of the training. closed_loop:
+    metrics that every `closed_loop_every`-th validation and the last one report beside the held-out loss. Raises
+    InputError where an interrupted run had other data, or where scenes are too few.
     """
     record, state, data = Record(), None, origin.get("fingerprint", "")
     if (folder / STATE).exists():
@@ -165,20 +168,19 @@ def train_prior(
         with record.timed("validation"), run.averaged():
             if processes.leader:
                 record.add(_validate(run, test, losses, closed_loop), prior)
-                tqdm.write(_line(record))
+                tqdm.write(record.summary())
         state = run.state_dict()
         if processes.leader:
             record.write(folder, state, data)
-    return (
-        _checkpoint(run, record, folder, origin | {"windows": len(windows), "held_out_windows": len(test)})
-        if processes.leader
-        else None
-    )
+    if not processes.leader:
+        return None
+    return _checkpoint(run, record, folder, origin | {"windows": len(windows), "held_out_windows": len(test)})
 
 
 def _validate(
     run: PriorTraining, test: TensorDictBase, losses: dict[str, float], closed_loop: ClosedLoop | None
 ) -> dict[str, float]:
+    """Held-out loss, training losses and, where it is due, the closed loop's metrics."""
     settings = run.settings
     line = {"step": run.step, "held_out": held_out_loss(run.prior, test, settings), **losses}
     number, last = -(-run.step // settings.validate_every), run.step == settings.steps
@@ -188,41 +190,21 @@ def _validate(
     return line
 
 
-def _line(record: Record) -> str:
-    line, best = record.lines[-1], record.best
-    text = f"step {line['step']}: held-out loss {line['held_out']:.4f} (best {best['held_out']:.4f} at {best['step']})"
-    figures = [f"{key} {line[key]:.4f}" for key in line if key not in ("step", "held_out", "action", "trajectory")]
-    return "; closed loop ".join([text, ", ".join(figures)] if figures else [text])
-
-
 def _checkpoint(run: PriorTraining, record: Record, folder: Path, origin: dict) -> Path:
-    """Write the best weights, with everything that made them in the header."""
+    """Write the best weights; the header says what made them."""
     best = record.best
     run.prior.load_state_dict(best["weights"])
-    figures = next(line for line in record.lines if line["step"] == best["step"])
-    versions = {"python": platform.python_version(), "torch": torch.__version__}
     seconds = origin.get("seconds", {}) | record.seconds
     seconds["total"] = round(sum(seconds.values()), 1)
     tqdm.write("seconds: " + ", ".join(f"{stage} {value:.0f}" for stage, value in seconds.items()))
-    return save_prior(
-        run.prior.eval(),
-        folder,
-        origin
-        | {
-            "validation": figures,
-            "held_out_loss": best["held_out"],
-            "step": best["step"],
-            "route_accuracy": record.accuracy,
-            "processes": run.processes.count,
-            "device": str(run.device),
-            "versions": versions,
-            "seconds": seconds,
-        },
-    )
-
-
-def _replace(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` fill a file beside path, then rename it: a reader never meets half a file."""
-    part = path.with_name(path.name + ".part")
-    write(part)
-    part.replace(path)
+    results = {
+        "validation": next(line for line in record.lines if line["step"] == best["step"]),
+        "held_out_loss": best["held_out"],
+        "step": best["step"],
+        "route_accuracy": record.accuracy,
+        "processes": run.processes.count,
+        "device": str(run.device),
+        "versions": {"python": platform.python_version(), "torch": torch.__version__},
+        "seconds": seconds,
+    }
+    return save_prior(run.prior.eval(), folder, origin | results)

@@ -1,4 +1,4 @@
-"""Training windows of the prior: what a vehicle's situation is at a frame, and the x that reproduces its next 5 s."""
+"""Training windows of the prior: a vehicle's situation at a frame, and the x that reproduces its next 5 s."""
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,7 +15,7 @@ from e2rl.sim.dynamics import wrap
 
 OFFSETS = (0, 5, 10, 15)  # frames after a scene's start frame at which a window begins
 ROWS = 16  # vehicles of a window: the modelled ones nearest to the ego
-MAX_ERROR = 0.5  # m: windows that the representation reproduces worse teach nothing (wrong or self-crossing route)
+MAX_ERROR = 0.5  # m: windows that the representation fits worse are not trained on (wrong or self-crossing route)
 STANDING_WEIGHT = 0.25
 
 
@@ -30,19 +30,19 @@ def derivative(values: Tensor, valid: Tensor) -> Tensor:
 
 
 def make_windows(scenes: TensorDictBase, free: bool = False, chunk: int = 32) -> TensorDict:
-    """Windows [W] of scenes [S] (see `_window` for the keys), the empty ones left out."""
+    """Windows [W] of scenes [S] (see `_window` for the keys), without the empty ones; free: all in free space."""
     parts = []
-    for begin in tqdm(range(0, len(scenes), chunk), "training windows"):
-        scene = scenes[begin : begin + chunk]
+    for scene in tqdm(scenes.split(chunk), "training windows"):
         vehicles = scene["route_log"].shape[1]
         routed = route_scene(scene, scene["route_log"].clamp(min=0), free)
         logged, valid = scene["logged"][:, :, :vehicles], scene["logged_valid"][:, :, :vehicles]
         accel = derivative(logged[..., 3], valid).clamp(-6.0, 4.0)
-        turn = torch.where(valid, logged[..., 2], 0.0)
-        unwrapped = torch.cumsum(torch.cat([turn[:, :1], wrap(turn.diff(dim=1))], 1), 1)
+        heading = torch.where(valid, logged[..., 2], 0.0)
+        unwrapped = torch.cumsum(torch.cat([heading[:, :1], wrap(heading.diff(dim=1))], 1), 1)
         yaw_rate = derivative(unwrapped, valid).clamp(-1.0, 1.0)
-        parts += [_window(scene, routed, offset, accel, yaw_rate, causal=False) for offset in OFFSETS]
-        parts.append(_window(scene, routed, 0, accel, yaw_rate, causal=True))
+        exact = [_window(scene, routed, offset, accel[:, offset], yaw_rate[:, offset], False) for offset in OFFSETS]
+        observed = (scene["start_accel"][:, :vehicles], scene["start_yaw_rate"][:, :vehicles])
+        parts += [*exact, _window(scene, routed, 0, *observed, True)]
     windows = torch.cat(parts)
     return windows[windows["weight"].sum(-1) > 0]
 
@@ -50,90 +50,76 @@ def make_windows(scenes: TensorDictBase, free: bool = False, chunk: int = 32) ->
 def _window(
     scene: TensorDictBase, routed: RoutedScene, offset: int, accel: Tensor, yaw_rate: Tensor, causal: bool
 ) -> TensorDict:
-    """Windows [B] at a frame: nodes [R, NODE], pairs [R, R, EDGE], present [R], x0 [R, SIZE], knot_weight [R, SIZE]
-    (knots inside the recorded future), weight [R] of the vehicle in the loss, and for the trajectory term v, a, d, d1,
-    d2, on_lane [R], ahead, aside, known [R, KNOTS]: recorded way and offset at 0.5 s steps (the offset counts on_lane
-    only: in free space the lateral knots are no offsets). causal (a key too): start states as a causal observer
-    estimates them; otherwise exact."""
+    """Windows [B] of R rows at frame `offset`, where accelerations and yaw rates [B, V] are given.
+
+    nodes [R, NODE], pairs [R, R, EDGE], present [R], x0 [R, SIZE]; weight [R] of a vehicle in the loss, knot_weight
+    [R, SIZE]: knots inside the recorded future; v, a, d, d1, d2 [R]: the start state; ahead, aside [R, KNOTS]: recorded
+    distance and offset at the knots, known [R, KNOTS]: recorded there, on_lane [R]: aside counts (in free space the
+    lateral knots are no offsets); causal []: start states are a causal observer's estimates, otherwise exact.
+    """
     vehicles = routed.route.shape[1]
     logged, valid = scene["logged"][:, offset], scene["logged_valid"][:, offset] & scene["valid"]
-    rate = (
-        (scene["start_accel"][:, :vehicles], scene["start_yaw_rate"][:, :vehicles])
-        if causal
-        else (accel[:, offset], yaw_rate[:, offset])
-    )
     agents = scene["start"] if causal else logged
-    state = locate(agents[:, :vehicles], *rate, routed.points)
+    state = locate(agents[:, :vehicles], accel, yaw_rate, routed.points)
     step = torch.full((len(logged),), offset, dtype=torch.long, device=logged.device)
     estimated = torch.full_like(step, causal, dtype=torch.bool)
-    nodes, pairs = node_features(routed, state, agents, valid, step, estimated), edge_features(routed, state)
-    future = slice(offset + 1, offset + 1 + HORIZON)
-    tracks = scene["logged"][:, future, :vehicles].transpose(1, 2)
-    known = scene["logged_valid"][:, future, :vehicles].transpose(1, 2)
-    short = HORIZON - known.shape[2]
-    if short > 0:
-        tracks = torch.cat([tracks, tracks.new_zeros(*tracks.shape[:2], short, 4)], 2)
-        known = torch.cat([known, known.new_zeros(*known.shape[:2], short)], 2)
-    known = known.cumprod(-1).bool()
+    tracks, known = _future(scene, offset, vehicles)
     x0, error, ahead, d = _targets(routed, state, tracks, known)
-    ends = torch.arange(1, KNOTS + 1, device=known.device) * KNOT_STEPS - 1
+    ends = slice(KNOT_STEPS - 1, HORIZON, KNOT_STEPS)
     at_knots = known[..., ends]
     moving = torch.where(known, tracks[..., 3], 0.0).amax(-1).clamp(min=state.v) > 0.5
     here = valid[:, :vehicles]
     fits = (scene["route_log"] >= 0) | ~routed.has_lane
     use = here & routed.modelled & fits & (error < MAX_ERROR) & (known.sum(-1) >= KNOT_STEPS)
-    columns = {
-        "nodes": nodes,
+    columns = {name: getattr(state, name) for name in ("v", "a", "d", "d1", "d2")} | {
+        "nodes": node_features(routed, state, agents, valid, step, estimated),
         "present": here,
         "x0": x0,
         "weight": use * torch.where(moving, 1.0, STANDING_WEIGHT),
         "knot_weight": torch.cat([at_knots, known[..., [24]], known[..., [44]]], -1).float(),
-        "v": state.v,
-        "a": state.a,
-        "d": state.d,
-        "d1": state.d1,
-        "d2": state.d2,
         "on_lane": routed.has_lane,
         "ahead": ahead[..., ends],
         "aside": d[..., ends],
         "known": at_knots,
     }
     distance = (logged[:, :vehicles, :2] - logged[:, :1, :2]).norm(dim=-1)
-    distance = torch.cat([torch.full_like(distance[:, :1], -1e6), distance[:, 1:]], 1)  # the ego leads
+    distance[:, 0] = -1e6  # the ego leads
     order = (distance + 1e3 * ~use + 1e4 * ~here).argsort(1)[:, :ROWS]
 
     def take(value: Tensor) -> Tensor:
         index = order.reshape(*order.shape, *[1] * (value.ndim - 2))
         return value.gather(1, index.expand(*order.shape, *value.shape[2:]))
 
-    window = {key: take(value) for key, value in columns.items()}
-    window["pairs"] = take(take(pairs).transpose(1, 2)).transpose(1, 2)
-    window["causal"] = estimated
+    pairs = take(take(edge_features(routed, state)).transpose(1, 2)).transpose(1, 2)
+    window = {key: take(value) for key, value in columns.items()} | {"pairs": pairs, "causal": estimated}
     return TensorDict(window, batch_size=[len(logged)])
 
 
+def _future(scene: TensorDictBase, offset: int, vehicles: int) -> tuple[Tensor, Tensor]:
+    """States [B, V, HORIZON, 4] recorded after frame `offset`, and up to where they are known [B, V, HORIZON]."""
+    future = slice(offset + 1, offset + 1 + HORIZON)
+    tracks = scene["logged"][:, future, :vehicles].transpose(1, 2)
+    known = scene["logged_valid"][:, future, :vehicles].transpose(1, 2)
+    short = HORIZON - known.shape[2]
+    tracks, known = torch.nn.functional.pad(tracks, (0, 0, 0, short)), torch.nn.functional.pad(known, (0, short))
+    return tracks, known.cumprod(-1).bool()
+
+
 def _targets(routed: RoutedScene, state: LaneState, tracks: Tensor, known: Tensor) -> tuple[Tensor, ...]:
-    """x0 [B, V, SIZE] of tracks [B, V, HORIZON, 4], its error [B, V], the recorded way and offset [B, V, HORIZON]."""
+    """x0 [B, V, SIZE] of tracks [B, V, HORIZON, 4], its error [B, V], recorded distance and offset [B, V, HORIZON]."""
     hint = state.s[..., None] + (torch.where(known, tracks[..., 3], 0.0) * DT).cumsum(-1)
     s, d, _ = project(tracks[..., :2], routed.points, hint)
-    zero = torch.zeros_like(s)
-    track = LaneState(s, d, zero, zero, tracks[..., 3], zero, tracks[..., 0], tracks[..., 1], tracks[..., 2], zero)
-    x0, error = lane_relative.fit(track, known.float(), state)
-    ahead = s - state.s[..., None]
-    if bool(routed.has_lane.all()):
+    x0, error = lane_relative.fit(LaneState.from_states(tracks, s, d), known.float(), state)
+    ahead, lane = s - state.s[..., None], routed.has_lane
+    if bool(lane.all()):
         return x0, error, ahead, d
     knots = lane_relative.ACCEL_SCALE * x0[..., :KNOTS]
-    bend = free_space.fit(tracks[..., 2], known.float(), state, knots)
-    free = torch.cat([x0[..., :KNOTS], bend], -1)
+    lateral = free_space.fit(tracks[..., 2], known.float(), state, knots)
+    free = torch.cat([x0[..., :KNOTS], lateral], -1)
     motion = free_space.decode(free, state)
     gap = torch.hypot(motion.x - tracks[..., 0], motion.y - tracks[..., 1])
     free_error = (gap * known).sum(-1) / known.sum(-1).clamp(min=1) / 2
-    lane = routed.has_lane
     before = torch.cat([state.v[..., None], tracks[..., :-1, 3]], -1)
     driven = (torch.where(known, (tracks[..., 3] + before) / 2, 0.0) * DT).cumsum(-1)
-    return (
-        torch.where(lane[..., None], x0, free),
-        torch.where(lane, error, free_error),
-        torch.where(lane[..., None], ahead, driven),
-        d,
-    )
+    x0, ahead = torch.where(lane[..., None], x0, free), torch.where(lane[..., None], ahead, driven)
+    return x0, torch.where(lane, error, free_error), ahead, d

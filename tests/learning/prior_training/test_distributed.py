@@ -15,7 +15,7 @@ import torch
 from torch.multiprocessing import spawn
 
 from e2rl.errors import InputError
-from e2rl.learning.prior_training.distributed import ALONE, Processes, follower_overrides, joined
+from e2rl.learning.prior_training.distributed import ALONE, Processes, follower_overrides, process_group
 from e2rl.learning.prior_training.loss import draw
 from e2rl.learning.prior_training.optimisation import PriorTraining
 from e2rl.learning.prior_training.settings import TrainingSettings
@@ -63,7 +63,7 @@ def _work(rank, folder, port):
         "TORCHELASTIC_RUN_ID": "test",
     }
     windows = torch.load(folder / "windows.pt", weights_only=False)
-    with joined("cpu") as (processes, device):
+    with process_group("cpu") as (processes, device):
         assert (processes.rank, processes.count, device) == (rank, 2, "cpu")
         whole = training(windows, processes, seed=rank)  # other first weights: the leader's count
         half = whole.run(3), whole.state_dict()
@@ -82,11 +82,11 @@ def _work(rank, folder, port):
         order = processes.gather(rank), processes.from_leader(lambda: f"by {rank}")
     torch.save(
         {
-            "average": whole.average,
+            "average": whole.average.state_dict(),
             "weights": dict(whole.prior.denoiser.state_dict()),
             "mean": mean.item(),
             "generator": whole.generator.get_state(),
-            "resumed": again.average,
+            "resumed": again.average.state_dict(),
             "shared": shared,
             "said": said,
             "order": order,
@@ -151,8 +151,8 @@ def test_alone_nothing_is_communicated():
     value = torch.ones(2)
     assert torch.equal(ALONE.mean(value), value) and ALONE.gather(3) == [3] and ALONE.from_leader(lambda: 4) == 4
     module = torch.nn.Linear(1, 1)
-    assert ALONE.averaging(module) is module and ALONE.leader
-    with joined("cpu") as alone:
+    assert ALONE.data_parallel(module) is module and ALONE.leader
+    with process_group("cpu") as alone:
         assert alone == (ALONE, "cpu")
 
 

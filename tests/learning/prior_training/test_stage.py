@@ -17,14 +17,14 @@ CONF = str(Path(__file__).parents[3] / "conf")
 @pytest.mark.parametrize(
     ("override", "what"),
     [
-        ("+prior.training.x=1", "prior.training: .*'x'"),
+        ("+prior.training.x=1", "prior.training.x=1"),
         ("prior.training.steps=abc", "prior.training.steps=abc"),
         ("prior.training.steps=0", "prior.training.steps=0"),
         ("prior.network.width=95", "multiple of heads=4"),
         ("prior.network.blocks=two", "prior.network.blocks=two"),
-        ("+prior.network.depth=2", "prior.network: .*'depth'"),
+        ("+prior.network.depth=2", "prior.network.depth=2"),
         ("prior.training.starts=[]", "prior.training.starts"),
-        ("+prior.bounds.up=1", "prior.bounds: .*'up'"),
+        ("+prior.bounds.up=1", "prior.bounds.up=1"),
     ],
 )
 def test_impossible_settings_are_named_before_anything_is_read(tmp_path, override, what):

@@ -42,7 +42,8 @@ def test_ten_steps_and_ten_more_are_twenty(windows):
     second = PriorTraining(untrained(seed=5), windows, SETTINGS)
     second.load_state_dict(saved)
     second.run(20)
-    for one, two in ((whole.prior.state_dict(), second.prior.state_dict()), (whole.average, second.average)):
+    for one, two in ((whole.prior, second.prior), (whole.average, second.average)):
+        one, two = one.state_dict(), two.state_dict()
         assert all(torch.equal(one[key], two[key]) for key in one)
 
 
@@ -69,9 +70,20 @@ def test_averaged_weights_are_held_only_inside_the_context(windows):
     raw = {key: value.clone() for key, value in run.prior.denoiser.state_dict().items()}
     with run.averaged():
         inside = run.prior.denoiser.state_dict()
-        assert all(torch.equal(inside[key], run.average[key]) for key in raw)
+        assert all(torch.equal(inside[key], run.average.module.state_dict()[key]) for key in raw)
         assert any(not torch.equal(inside[key], raw[key]) for key in raw)
     assert all(torch.equal(value, raw[key]) for key, value in run.prior.denoiser.state_dict().items())
+
+
+def test_the_average_is_exponential_with_a_decay_that_grows_to_ema(windows):
+    run = PriorTraining(untrained(), windows, replace(SETTINGS, ema=0.2))
+    expected = {key: value.clone() for key, value in run.prior.denoiser.state_dict().items()}
+    for decay in (2 / 11, 0.2, 0.2):
+        run.run(run.step + 1)
+        for key, value in run.prior.denoiser.state_dict().items():
+            expected[key].lerp_(value, 1 - decay)
+    found = run.average.module.state_dict()
+    assert all(torch.equal(found[key], value) for key, value in expected.items())
 
 
 def test_the_rate_warms_up_and_ends_at_zero(windows):
@@ -164,7 +176,8 @@ def test_the_closed_loop_is_driven_by_the_averaged_weights_at_every_nth_validati
     lines = [json.loads(line) for line in (tmp_path / "progress.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines if "real" in line] == [2, 4, 5]
     average = torch.load(tmp_path / "training.pt", weights_only=True)["run"]["average"]
-    assert all(torch.equal(seen[-1][f"denoiser.{key}"], value) for key, value in average.items())
+    del average["n_averaged"]
+    assert all(torch.equal(seen[-1][key.replace("module", "denoiser", 1)], value) for key, value in average.items())
 
 
 def test_the_lowest_held_out_loss_is_kept_whatever_the_closed_loop_says():

@@ -1,4 +1,4 @@
-"""Spread samples: one in each stratum of a vehicle, and any one of them as random as an independent one."""
+"""Stratified samples: one in each stratum of a vehicle, and any one of them as random as an independent one."""
 
 import pytest
 import torch
@@ -6,7 +6,7 @@ import torch
 from e2rl.prior.lane_relative import KNOTS, SIZE
 from e2rl.prior.prior import SamplerSettings
 from e2rl.prior.sde import NoiseSchedule
-from e2rl.prior.spread import impulses, main_direction, spread_noise, stratified
+from e2rl.prior.stratified_sampling import impulse_response, main_direction, stratified_noise, stratified_uniform
 
 SCHEDULE, COUNT, SCENES = NoiseSchedule(), 4, 30_000
 
@@ -17,7 +17,7 @@ def draws(*shape: int, normal: bool = False) -> torch.Tensor:
 
 
 def test_every_stratum_holds_one_sample_and_each_sample_is_uniform():
-    uniform = stratified(draws(COUNT, SCENES), draws(SCENES))
+    uniform = stratified_uniform(draws(COUNT, SCENES), draws(SCENES))
     assert (((uniform * COUNT).floor().sort(0).values) == torch.arange(COUNT)[:, None]).all()
     quantiles = torch.linspace(0.05, 0.95, 10)
     for sample in uniform:
@@ -27,7 +27,7 @@ def test_every_stratum_holds_one_sample_and_each_sample_is_uniform():
 def test_any_one_sample_is_standard_normal_and_vehicles_are_independent():
     settings = SamplerSettings(steps=3)
     direction = main_direction(SCHEDULE, settings)
-    noise = spread_noise(
+    noise = stratified_noise(
         draws(COUNT, 3, SCENES, 2, SIZE, normal=True), direction, draws(COUNT, SCENES, 2), draws(SCENES, 2)
     )
     for sample in noise[:2]:
@@ -41,7 +41,7 @@ def test_any_one_sample_is_standard_normal_and_vehicles_are_independent():
 def test_samples_differ_along_the_direction_and_keep_the_rest():
     direction = main_direction(SCHEDULE, SamplerSettings(steps=3))
     before = draws(COUNT, 3, 50, 2, SIZE, normal=True)
-    after = spread_noise(before, direction, draws(COUNT, 50, 2), draws(50, 2))
+    after = stratified_noise(before, direction, draws(COUNT, 50, 2), draws(50, 2))
     along = torch.einsum("skbvx,kx->sbv", after, direction).sort(0).values
     edges = torch.special.ndtri(torch.arange(1, COUNT) / COUNT)[:, None, None]
     assert (along[:-1] <= edges + 1e-4).all() and (along[1:] >= edges - 1e-4).all()
@@ -52,9 +52,9 @@ def test_samples_differ_along_the_direction_and_keep_the_rest():
 
 @pytest.mark.parametrize("options", [{}, {"sampler": "dpm_solver_pp"}, {"sampler": "euler_maruyama"}])
 def test_impulses_are_those_of_the_reverse_process(options):
-    many = impulses(SCHEDULE, SamplerSettings(steps=300, **options))
+    many = impulse_response(SCHEDULE, SamplerSettings(steps=300, **options))
     assert many.square().sum().item() == pytest.approx(1.0, abs=0.05), "the variance of x0 comes out"
-    alone = impulses(SCHEDULE, SamplerSettings(steps=16, churn=0.0))
+    alone = impulse_response(SCHEDULE, SamplerSettings(steps=16, churn=0.0))
     assert alone[1:].abs().max() == 0 and alone[0] > 0.8
 
 
