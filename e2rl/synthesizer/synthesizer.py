@@ -28,11 +28,11 @@ from e2rl.synthesizer.grouping import clone, crop_episode, crop_world, gather_pl
 from e2rl.synthesizer.interception import InterceptionSettings
 from e2rl.synthesizer.lookahead import Lookahead
 from e2rl.synthesizer.potentials import (
+    SAMPLED_STEPS,
     PotentialContext,
     PotentialSettings,
     adversarial_potential,
     feasibility_potential,
-    sampled_steps,
 )
 from e2rl.synthesizer.reasoner import ReasonerSettings, build_reasoner
 from e2rl.synthesizer.selection import Selection
@@ -122,8 +122,8 @@ class Synthesizer:
         controlled, anchor = bool((episode.eta > 0).any()), None
         if controlled:
             episode, anchor = self._reselected(episode, world, ego_plan, noise[0])
-            leaves = anchor.leaves & episode.coalition & (episode.eta > 0)[:, None]
-            episode = self._onto(episode, world, episode.routed.route, leaves, anchor.points)
+            leaves = anchor.off_lane & episode.coalition & (episode.eta > 0)[:, None]
+            episode = self._onto(episode, world, episode.routed.route, leaves, anchor.off_lane_path)
             world = replace(world, route=episode.routed.route)
         context = self._encode(episode, world, ego_plan, episode.coalition)
         where = self._where(episode, world, ego_plan)
@@ -153,7 +153,7 @@ class Synthesizer:
         """V_feas of everybody plus eta V_adv of the coalition [B]: whole joint samples are compared, never vehicles."""
         if self.settings.samples == 1:
             return torch.zeros_like(eta)
-        states = self.prior.decode(x0, context, steps=sampled_steps(self.settings.potentials)).states()
+        states = self.prior.decode(x0, context, steps=SAMPLED_STEPS).states()
         infeasible = feasibility_potential(states, where, self.settings.potentials) * context.active
         threat = adversarial_potential(states, where, self.settings.potentials)
         return self.settings.selection * infeasible.sum(-1) + eta * threat.sum(-1)
@@ -188,7 +188,7 @@ class Synthesizer:
         every = self.settings.reselect
         due = (episode.replans == 0) | ((episode.replans % every == 0) if every > 0 else False)
         anchor = self._anchor(episode, world, ego_plan)
-        rows = (due & (episode.eta > 0) & ~anchor.has.any(1)).nonzero().squeeze(-1)
+        rows = (due & (episode.eta > 0) & ~anchor.feasible.any(1)).nonzero().squeeze(-1)
         if not len(rows):
             return episode, anchor
         lost, there = take_rows(episode, rows), take_rows(world, rows)
@@ -237,7 +237,7 @@ class Synthesizer:
             )
         # A member that no route and acceleration lead to its target is pruned (Sec. IV-A3: infeasible configurations),
         # and so is everybody whose chain to the ego leads over it.
-        acts = skeleton.coalition & anchor.has & (episode.eta > 0)[:, None]
+        acts = skeleton.coalition & anchor.feasible & (episode.eta > 0)[:, None]
         for _ in range(self.settings.skeleton.max_chain - 1):
             acts = acts & ((skeleton.target <= 0) | acts.gather(1, skeleton.target.clamp(min=0)))
         episode = replace(
@@ -260,7 +260,9 @@ class Synthesizer:
                     episode.target,
                 )
             )
-        return self._onto(episode, world, torch.where(acts, anchor.route, world.route), acts & False, anchor.points)
+        return self._onto(
+            episode, world, torch.where(acts, anchor.route, world.route), acts & False, anchor.off_lane_path
+        )
 
     def _support(self, episode: Episode, world: World, candidates: Tensor, feasible: Tensor) -> tuple[Tensor, Tensor]:
         """S [B, V] and who may take its place where it is empty, by `support` (eq. support_selection)."""

@@ -134,5 +134,5 @@ def test_an_ego_alone_passes_through_every_room():
     feasible = feasible_vehicles(scene, world, FeasibilitySettings()).mask
     result = build(world, found.candidates & feasible, feasible)
     anchor = propose(scene, world, result, plan, AnchorSettings(), InterceptionSettings(), torch.full((2,), 2.0))
-    assert not (found.candidates | feasible | result.coalition | anchor.has).any()
+    assert not (found.candidates | feasible | result.coalition | anchor.feasible).any()
     assert result.source.tolist() == [NOBODY, NOBODY]
