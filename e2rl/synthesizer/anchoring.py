@@ -1,4 +1,4 @@
-"""Topological anchoring (Sec. IV-B1): a coarse lane-graph proposal for every link of the skeleton, and its blend.
+"""Topological anchoring (Sec. IV-B1): a coarse lane-graph proposal for every link of the skeleton.
 
 A proposal is a candidate route and a constant acceleration, within limits of speed and curvature, with which a vehicle
 meets its target. The prior's own decoder turns it into motion, so arrival times are those that the prior would plan.
@@ -76,8 +76,9 @@ class Anchor:
 
 
 class _Candidates(NamedTuple):
-    """M vehicles that need a proposal, speed, accel [B, M] and size [B, M, 2], and their R candidate routes: number in
-    the scene, points [B, M, R, P, 2], usable (bool), end [m], Frenet pose s, d [B, M, R] and speed_bound [B, M, R, 64].
+    """Vehicles [B, M] that need a proposal: speed, accel, size [B, M, 2], and their candidate routes [B, M, R]: number
+    in the scene, points [B, M, R, P, 2], usable (bool), end [m], Frenet pose s, d [m], and bend_bound [B, M, R, 64]:
+    squared speed allowed at the vertices ahead.
     """
 
     number: Tensor
@@ -86,16 +87,16 @@ class _Candidates(NamedTuple):
     end: Tensor
     s: Tensor
     d: Tensor
-    speed_bound: Tensor
+    bend_bound: Tensor
     speed: Tensor
     accel: Tensor
     size: Tensor
 
 
 class _Target(NamedTuple):
-    """A target's path seen along each candidate: s, d [B, M, R, H]; slack [m]: the boxes touch so much before the
-    centres meet where both move alike; crossing_time [s/m] of a target that crosses; corridor [B, M] m: lateral
-    distance at which the boxes touch.
+    """A target's path seen along each candidate, [B, M, R, H]: s, d [m]; slack [m] by which boxes that move alike touch
+    before their centres meet; crossing_time [s/m]: until a crossing target is over the centreline; corridor [B, M] m:
+    lateral distance at which the boxes touch.
     """
 
     s: Tensor
@@ -105,7 +106,7 @@ class _Target(NamedTuple):
     corridor: Tensor
 
 
-def _bend_speeds(route: Tensor, s: Tensor) -> Tensor:
+def _bend_bound(route: Tensor, s: Tensor) -> Tensor:
     """Squared speed [..., BEND_VERTICES] allowed at arc lengths s + SPACING k of route [..., P, 2], s [...]: by the
     curvature there, and by what BEND_BRAKING can still lose before the bends ahead.
     """
@@ -131,16 +132,16 @@ def _candidates(
     if keep_route:
         usable = usable & (route >= 0)
     accel, size = take(world.accel[:, :vehicles], index), take(scene["size"], index)
-    return _Candidates(number, points, usable, end, s, d, _bend_speeds(points, s), states[..., 3], accel, size)
+    return _Candidates(number, points, usable, end, s, d, _bend_bound(points, s), states[..., 3], accel, size)
 
 
 def _along(candidates: _Candidates, path: Tensor, size: Tensor) -> _Target:
     """A target's path [B, M, H, 4] and size [B, M, 2] seen along each candidate."""
     s, d, heading = project(path[:, :, None, :, :2], candidates.points)
-    alike = wrap(path[:, :, None, :, 2] - heading).cos()
+    cosine = wrap(path[:, :, None, :, 2] - heading).cos()
     touch = (candidates.size + size) / 2
-    slack = 0.8 * touch[..., 0, None, None] * alike.clamp(min=0) ** 2
-    crossing_time = (1 - alike**2) / path[:, :, None, :, 3].clamp(min=1.0)
+    slack = 0.8 * touch[..., 0, None, None] * cosine.clamp(min=0) ** 2
+    crossing_time = (1 - cosine**2) / path[:, :, None, :, 3].clamp(min=1.0)
     return _Target(s, d, slack, crossing_time, touch[..., 1])
 
 
@@ -159,7 +160,7 @@ def _knots(candidates: _Candidates, accel: Tensor, settings: AnchorSettings) -> 
         travelled = torch.nn.functional.pad(((speed[..., 1:] + speed[..., :-1]) / 2 * DT).cumsum(-1), (1, 0))
         at = (travelled / SPACING).clamp(max=BEND_VERTICES - 1.001)
         low = at.long()
-        table = candidates.speed_bound[..., None, :].expand(*travelled.shape[:-1], BEND_VERTICES)
+        table = candidates.bend_bound[..., None, :].expand(*travelled.shape[:-1], BEND_VERTICES)
         bound = torch.lerp(table.gather(-1, low), table.gather(-1, low + 1), at - low)
         speed = torch.maximum(torch.minimum(free, bound.clamp(min=0).sqrt()), braking)
     knot = KNOT_STEPS * torch.arange(1, KNOTS + 1, device=accel.device)
@@ -222,9 +223,9 @@ def propose(
 ) -> Anchor:
     """The skeleton-consistent clean state of Sec. IV-A3 for scenes [B]; ego_plan [B, H >= 50, 4], eta [B].
 
-    Links are worked off from the ego outwards. Vehicles that act on the ego meet its plan on a lane or, where that
-    costs less, by an interception; the others meet their target's proposal on a lane, or its route at present speed
-    where it has none. keep_route: only the routes that vehicles follow now are considered.
+    Proposals are made from the ego outwards. Vehicles that act on the ego meet its plan on a lane or, where that costs
+    less, by an interception. The others meet their target's lane proposal; a target without one keeps its speed along
+    its route. keep_route: consider only the routes that vehicles follow now.
     """
     times = DT * torch.arange(1, HORIZON + 1, device=ego_plan.device)
     expected = constant_speed_states(scene, world, times)
@@ -262,21 +263,3 @@ def _states(candidates: _Candidates, pick: Tensor, knots: Tensor) -> Tensor:
 def _updated(anchor: Anchor, index: Tensor, mask: Tensor, **rows: Tensor) -> Anchor:
     """The Anchor with rows [B, M, ...] of its fields written at vehicles index [B, M] where mask [B, M]."""
     return replace(anchor, **{name: put(getattr(anchor, name), index, mask, new) for name, new in rows.items()})
-
-
-def blend_clean(x: Tensor, x0: Tensor, anchor_x0: Tensor, alpha: Tensor, mask: Tensor, strength: float) -> Tensor:
-    """Anchoring that keeps the noise of x: x0' = (1 - a) x0 + a anchor_x0 for the vehicles of mask [B, V].
-
-    x, x0, anchor_x0 [B, V, D]; alpha: signal scale of the noise level (square root of the paper's gamma-bar); strength
-    a in [0, 1]. With x = alpha x0 + sigma e the result is alpha x0' + sigma e.
-    """
-    return torch.where(mask[..., None], x + alpha * strength * (anchor_x0 - x0), x)
-
-
-def blend_literal(x: Tensor, noised_anchor: Tensor, mask: Tensor, strength: float) -> Tensor:
-    """Anchoring as printed, eq. (anchor_injection): (1 - a) x + a noised_anchor for the vehicles of mask [B, V].
-
-    noised_anchor [B, V, D]: alpha anchor_x0 + sigma e' with noise e' of its own. The variance of the noise shrinks by
-    (1 - a)^2 + a^2; kept for the ablation.
-    """
-    return torch.where(mask[..., None], (1 - strength) * x + strength * noised_anchor, x)

@@ -17,7 +17,7 @@ from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS
 from e2rl.prior.prior import Context, Prior
 from e2rl.prior.sde import NoiseSchedule
 from e2rl.settings import check_choice, check_range
-from e2rl.synthesizer.anchoring import Anchor, blend_clean, blend_literal
+from e2rl.synthesizer.anchoring import Anchor
 from e2rl.synthesizer.potentials import (
     SAMPLED_STEPS,
     PotentialContext,
@@ -123,11 +123,12 @@ class SparseControl:
             variable = x.detach().requires_grad_(self.has_coalition and self.settings.gradient == "denoiser")
             denoised = denoise(variable)
             x0 = denoised.detach().requires_grad_(True)
+            if not self.has_coalition and not with_feasibility:
+                return x0.detach(), adversarial, feasibility
             if k in self.response_steps and self.has_coalition and self.ego_response is not None:
                 planned = self.prior.decode(x0.detach(), context).states()
                 self.conditions = replace(self.conditions, ego_plan=self.ego_response(planned))
-            if self.has_coalition or with_feasibility:
-                states = self.prior.decode(x0, context, steps=SAMPLED_STEPS).states()
+            states = self.prior.decode(x0, context, steps=SAMPLED_STEPS).states()
             if self.has_coalition:
                 temperature = annealed_temperature(level, self.potentials)
                 value = adversarial_potential(states, self.conditions, self.potentials, temperature)
@@ -140,16 +141,21 @@ class SparseControl:
         return x0.detach(), adversarial, feasibility
 
     def _anchored(self, x: Tensor, level: Tensor, context: Context, denoise: Callable[[Tensor], Tensor]) -> Tensor:
-        """x after topological anchoring of the coalition at this level; records the energy of the shift."""
+        """x after topological anchoring of the coalition at this level; records the energy of the shift.
+
+        With x = alpha x0 + sigma e and proposal a, clean anchoring at strength w is alpha ((1 - w) x0 + w a) + sigma e.
+        The printed one, eq. (anchor_injection), is (1 - w) x + w (alpha a + sigma e'): with a noise e' of its own it
+        shrinks the noise variance by (1 - w)^2 + w^2. It is kept for the ablation.
+        """
         with torch.no_grad():
             x0 = denoise(x)
-        schedule = self.prior.schedule
+        schedule, strength = self.prior.schedule, self.strength
         proposal = torch.cat([self.anchor.knots / ACCEL_SCALE, x0[..., KNOTS:]], -1)
-        mask = self.anchor.feasible & self.coalition & context.active & (self.eta > 0)[:, None]
         if self.settings.anchoring == "clean":
-            after = blend_clean(x, x0, proposal, schedule.alpha(level), mask, self.strength)
+            blend = x + schedule.alpha(level) * strength * (proposal - x0)
         else:
-            noised = schedule.noised(proposal, level, self.anchor_noise)
-            after = blend_literal(x, noised, mask, self.strength)
+            blend = (1 - strength) * x + strength * schedule.noised(proposal, level, self.anchor_noise)
+        mask = self.anchor.feasible & self.coalition & context.active & (self.eta > 0)[:, None]
+        after = torch.where(mask[..., None], blend, x)
         self.jump = ((after - x) ** 2).sum(-1) / (2 * schedule.sigma(level) ** 2)
         return after

@@ -49,11 +49,12 @@ def _next_light(scene: TensorDictBase, step: Tensor, vehicle: int, candidate: in
     return f", {colour} light in {ahead:.0f} m" if colour and ahead >= 0 else ""
 
 
-def present_vehicles(scene: TensorDictBase, world: World, row: int) -> list[int]:
-    """The vehicles of scene `row` that may be asked about: present, not parked, not the ego."""
+def describe(scene: TensorDictBase, world: World, conflicts: Conflicts, row: int) -> tuple[str, dict[int, str]]:
+    """The ego of scene `row` in words, and every vehicle that is present and not parked, by its index."""
     vehicles = scene["route_points"].shape[1]
-    here = world.valid[row, :vehicles] & ~scene["parked"][row, :vehicles]
-    return [vehicle for vehicle in here.nonzero()[:, 0].tolist() if vehicle > 0]
+    present = (world.valid[row, :vehicles] & ~scene["parked"][row, :vehicles]).nonzero()[:, 0].tolist()
+    texts = {vehicle: describe_vehicle(scene, world, conflicts, row, vehicle) for vehicle in present if vehicle > 0}
+    return describe_ego(scene, world, row), texts
 
 
 def describe_ego(scene: TensorDictBase, world: World, row: int) -> str:
@@ -61,7 +62,7 @@ def describe_ego(scene: TensorDictBase, world: World, row: int) -> str:
     mission = mission_of(scene[row : row + 1])
     limit, s = float(mission.limit[0, 10]), project(world.states[row : row + 1, :1, :2], mission.points)[0][0, 0]
     limited = f" (limit {limit:.0f} m/s)" if limit else ""
-    return f"The ego drives at {world.states[row, 0, 3]:.1f} m/s{limited}; its way {_course(mission.points[0], s)}."
+    return f"The ego drives at {world.states[row, 0, 3]:.1f} m/s{limited}; its route {_course(mission.points[0], s)}."
 
 
 def describe_vehicle(scene: TensorDictBase, world: World, conflicts: Conflicts, row: int, vehicle: int) -> str:
@@ -81,10 +82,10 @@ def describe_vehicle(scene: TensorDictBase, world: World, conflicts: Conflicts, 
         at = (row, vehicle, candidate)
         course = _course(scene["route_points"][at], s[candidate])
         light = _next_light(scene[rows], world.step[rows], vehicle, candidate, float(s[candidate]))
-        meeting = "; does not meet the ego's way in time"
+        meeting = "; does not meet the ego's route in time"
         if conflicts.exists[at]:
             meeting = (
-                f"; meets the ego's way in {conflicts.own_s[at] - s[candidate]:.0f} m, both can be there "
+                f"; meets the ego's route in {conflicts.s[at] - s[candidate]:.0f} m, both can be there "
                 f"{conflicts.earliest[at]:.1f} to {conflicts.latest[at]:.1f} s from now, "
                 f"{conflicts.time_gap[at]:.1f} s apart at present speeds"
             )

@@ -42,14 +42,13 @@ class FeasibilitySettings:
 class Conflicts:
     """Conflict points of the candidate routes with the ego's mission route; each [B, V, R], 0 where `exists` is false.
 
-    exists: the routes meet, and both vehicles can be there at the same time within the horizon; own_s, ego_s [m]: arc
-    lengths of the conflict point on the candidate and on the mission; earliest, latest [s]: times at which both can be
-    there; time_gap [s]: difference of the arrival times at present speeds.
+    exists: the routes meet, and both vehicles can be there at the same time within the horizon; s [m]: arc length of
+    the conflict point on the candidate; earliest, latest [s]: times at which both can be there; time_gap [s]: between
+    their arrivals at present speeds.
     """
 
     exists: Tensor
-    own_s: Tensor
-    ego_s: Tensor
+    s: Tensor
     earliest: Tensor
     latest: Tensor
     time_gap: Tensor
@@ -113,20 +112,15 @@ def _conflict_samples(own: _Samples, ego: _Samples, settings: FeasibilitySetting
     return pick[:, 0] // count, pick[:, 0] % count, *(value.flatten(1).gather(1, pick)[:, 0] for value in values)
 
 
-def _to_intersection(points: Tensor, heading: Tensor, ego: Tensor, ego_heading: Tensor) -> tuple[Tensor, Tensor]:
-    """Shifts [Q] in m along two routes from near points [Q, 2] to where their tangents cross.
-
-    Where they are near parallel, the ego's point moves to the foot point of the other.
+def _to_intersection(points: Tensor, heading: Tensor, ego: Tensor, ego_heading: Tensor) -> Tensor:
+    """Shift [Q] in m along a route from points [Q, 2] to where its tangent crosses that of the ego's route at near
+    points `ego` [Q, 2]; 0 where they are near parallel.
     """
     u, w, gap = direction(heading), direction(ego_heading), ego - points
     cross = u[..., 0] * w[..., 1] - u[..., 1] * w[..., 0]
     crossing = cross.abs() > 0.3
-    safe = torch.where(crossing, cross, 1.0)
-    own = (gap[..., 0] * w[..., 1] - gap[..., 1] * w[..., 0]) / safe
-    other = (gap[..., 0] * u[..., 1] - gap[..., 1] * u[..., 0]) / safe
-    own = torch.where(crossing, own, 0.0)
-    other = torch.where(crossing, other, -(gap * w).sum(-1))
-    return own.clamp(-SAMPLE_SPACING, SAMPLE_SPACING), other.clamp(-SAMPLE_SPACING, SAMPLE_SPACING)
+    shift = (gap[..., 0] * w[..., 1] - gap[..., 1] * w[..., 0]) / torch.where(crossing, cross, 1.0)
+    return torch.where(crossing, shift, 0.0).clamp(-SAMPLE_SPACING, SAMPLE_SPACING)
 
 
 def find_conflicts(scene: TensorDictBase, world: World, own_s: Tensor, settings: FeasibilitySettings) -> Conflicts:
@@ -144,14 +138,14 @@ def find_conflicts(scene: TensorDictBase, world: World, own_s: Tensor, settings:
     i, j, earliest, latest, time_gap = _conflict_samples(own, ego, settings)
     row = torch.arange(len(b), device=b.device)
     mine, its = (row, i), (row, j)
-    shift, ego_shift = _to_intersection(own.xy[mine], own.heading[mine], ego.xy[its], ego.heading[its])
+    conflict_s = own.s[mine] + _to_intersection(own.xy[mine], own.heading[mine], ego.xy[its], ego.heading[its])
     found = time_gap.isfinite()
 
     def table(value: Tensor) -> Tensor:
         return torch.zeros_like(own_s).index_put(at, torch.where(found, value, 0.0).to(own_s.dtype))
 
-    values = (own.s[mine] + shift, ego.s[its] + ego_shift, earliest, latest, time_gap)
-    return Conflicts(torch.zeros_like(asked).index_put(at, found), *(table(value) for value in values))
+    exists = torch.zeros_like(asked).index_put(at, found)
+    return Conflicts(exists, *(table(value) for value in (conflict_s, earliest, latest, time_gap)))
 
 
 def blocks_ego(scene: TensorDictBase, world: World, settings: FeasibilitySettings) -> Tensor:

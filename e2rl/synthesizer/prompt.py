@@ -4,11 +4,11 @@ import json
 
 INSTRUCTIONS = """\
 You judge which vehicles in a traffic scene could come into conflict with the ego vehicle within the next five seconds.
-You get a description of the ego and of every other vehicle: place and motion seen from the ego, the routes that its
-lane offers, and where and when each route meets the ego's way. Judge every vehicle by three criteria, on its own:
+You get a description of the ego and of every other vehicle: position and motion seen from the ego, the routes that its
+lane offers, and where and when each route meets the ego's route. Judge every vehicle by three criteria, on its own:
 - on_lane: it is on the drivable area and belongs to a lane: near the centreline of one of its routes and along it.
-- can_meet_ego: one of its routes conflicts with the ego's way or overlaps it, and both can be there at the same time.
-- moving_or_blocking: it moves, or it stands in the ego's way closely ahead.
+- can_meet_ego: one of its routes conflicts with the ego's route or overlaps it, and both can be there at the same time.
+- moving_or_blocking: it moves, or it stands in the ego's route closely ahead.
 Take the numbers as given and do not guess what is not described. Answer for every vehicle of the list once, by its
 number, in the JSON format asked for."""
 

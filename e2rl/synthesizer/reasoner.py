@@ -10,6 +10,7 @@ import threading
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from e2rl.errors import InputError
 from e2rl.files import write_atomically
 from e2rl.settings import check_choice, check_range
 from e2rl.sim.world import World
-from e2rl.synthesizer.description import describe_ego, describe_vehicle, present_vehicles
+from e2rl.synthesizer.description import describe
 from e2rl.synthesizer.feasibility import Feasibility, FeasibilitySettings, feasible_vehicles
 from e2rl.synthesizer.prompt import SCHEMA, Verdicts, messages, read_answer
 
@@ -97,13 +98,9 @@ class LanguageReasoner:
 
     def judge(self, scene: TensorDictBase, world: World, rules: Feasibility) -> list[Verdicts | None]:
         """Per scene [B] the model's verdicts ({} where there is nobody to ask about), or None where it failed."""
-        egos, vehicles = [], []
-        for row in range(len(world.step)):
-            egos.append(describe_ego(scene, world, row))
-            present = present_vehicles(scene, world, row)
-            vehicles.append({v: describe_vehicle(scene, world, rules.conflicts, row, v) for v in present})
+        described = [describe(scene, world, rules.conflicts, row) for row in range(len(world.step))]
         with ThreadPoolExecutor(self.settings.workers) as pool:
-            return list(pool.map(self._verdicts, egos, vehicles))
+            return list(pool.map(self._verdicts, *zip(*described, strict=True)))
 
     def _verdicts(self, ego: str, vehicles: dict[int, str]) -> Verdicts | None:
         """Verdicts on one scene, from the cache or the endpoint."""
@@ -112,13 +109,10 @@ class LanguageReasoner:
         self._count("lm_scenes")
         chat = messages(ego, vehicles)
         path = self._path(chat)
-        try:
-            if path.is_file():
-                verdicts = read_answer(path.read_text(), list(vehicles))
-                self._count("lm_cached")
-                return verdicts
-        except (OSError, ValueError):
-            path.unlink(missing_ok=True)  # damaged: ask again
+        with suppress(OSError, ValueError):  # no answer yet, or a damaged one: ask
+            verdicts = read_answer(path.read_text(), list(vehicles))
+            self._count("lm_cached")
+            return verdicts
         try:
             self._count("lm_requests")
             answer = self._ask(chat)

@@ -14,15 +14,7 @@ from torch import Tensor
 from e2rl.scene.route import project
 from e2rl.settings import check_range
 from e2rl.sim.world import World
-from e2rl.synthesizer.motion import (
-    compact,
-    constant_speed_states,
-    direction,
-    frenet_pose,
-    reachable_distance,
-    smallest,
-    take,
-)
+from e2rl.synthesizer.motion import compact, direction, frenet_pose, put, reachable_distance, smallest, take
 
 SUPPORTED, NEAREST_FEASIBLE, NOBODY = range(3)  # where the near agents came from
 
@@ -173,14 +165,12 @@ def _shortest_chain(
     return found, last, parents
 
 
-def _link_chains(after: Tensor, near: Tensor, far: Tensor, max_links: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Targets and depths [B, M] of the slots (target M: the ego, -1: none), and the far slots [B, M] with a viable
-    chain of at most `max_links` links to a near slot.
+def _link_chains(after: Tensor, near: Tensor, far: Tensor, max_links: int) -> tuple[Tensor, Tensor]:
+    """Targets [B, M] of the slots (M: the ego, -1: none), and the far slots [B, M] bool with a viable chain of at most
+    `max_links` links to a near slot.
     """
-    slots = near.shape[1]
-    target = torch.where(near, slots, -1)
-    depth = near.long()
-    kept = torch.zeros_like(far)
+    target = torch.where(near, near.shape[1], -1)
+    viable = torch.zeros_like(far)
     initiators, there = compact(far)
     for k in range(initiators.shape[1]):
         start = initiators[:, k]
@@ -188,16 +178,14 @@ def _link_chains(after: Tensor, near: Tensor, far: Tensor, max_links: int) -> tu
         blocked = (target >= 0) & ~near
         found, current, parents = _shortest_chain(after, start, near, blocked, max_links)
         found = torch.where(there[:, k] & ~taken, found, 0)
-        viable = there[:, k] & (taken | (found > 0))
-        kept = kept.scatter(1, start[:, None], viable[:, None] | kept.gather(1, start[:, None]))
+        linked = (there[:, k] & (taken | (found > 0)))[:, None]
+        viable = viable.scatter(1, start[:, None], linked | viable.gather(1, start[:, None]))
         for link in range(len(parents), 0, -1):
             active = found >= link
             before = parents[link - 1].gather(1, current[:, None])
-            step = torch.where(active[:, None], current[:, None], target.gather(1, before))
-            deeper = torch.where(active[:, None], depth.gather(1, current[:, None]) + 1, depth.gather(1, before))
-            target, depth = target.scatter(1, before, step), depth.scatter(1, before, deeper)
+            target = target.scatter(1, before, torch.where(active[:, None], current[:, None], target.gather(1, before)))
             current = torch.where(active, before[:, 0], current)
-    return target, depth, kept
+    return target, viable
 
 
 def build_skeleton(
@@ -206,21 +194,19 @@ def build_skeleton(
     support: Tensor,
     feasible: Tensor,
     settings: SkeletonSettings,
-    expected: Tensor | None = None,
-    cost: Tensor | None = None,
+    expected: Tensor,
+    cost: Tensor,
 ) -> Skeleton:
     """Algorithm 2 for scenes [B]: support [B, V] = S, feasible [B, V] = F.
 
-    expected [B, V, K, 4]: states of everybody every `step` s up to `horizon` (default: at present speed along their
-    routes); cost [B, V]: of meeting the ego, inf for vehicles that cannot (default: the distance in m). The near agents
-    are those of S with the least cost; where S has none, those of F; where F has none either, nobody.
+    expected [B, V, K, 4]: states of everybody every `step` s from now; cost [B, V]: of meeting the ego, inf for
+    vehicles that cannot. The near agents are those of S with the least cost; where S has none, those of F; where F has
+    none either, nobody.
     """
     vehicles = support.shape[1]
     states = world.states[:, :vehicles].detach()
-    times = settings.step * torch.arange(1, round(settings.horizon / settings.step) + 1, device=states.device)
-    expected = constant_speed_states(scene, world, times) if expected is None else expected[:, :, : len(times)].detach()
+    expected = expected[:, :, : round(settings.horizon / settings.step)].detach()
     distance = (states[..., :2] - states[:, :1, :2]).norm(dim=-1)
-    cost = distance if cost is None else cost
     ego = torch.arange(vehicles, device=states.device) == 0
     support, feasible = (mask & world.valid[:, :vehicles] & ~ego for mask in (support, feasible))
     first, second = (mask & cost.isfinite() for mask in (support, feasible))
@@ -233,14 +219,9 @@ def build_skeleton(
     far = smallest(distant, -take(distance, index), settings.far)
     linked = present & far.any(1, keepdim=True)  # no far agent, no chain to look for
     after = _first_after(influence(scene, world, (index, linked), expected, settings))
-    target, depth, kept = _link_chains(after, present & take(near, index), far, settings.max_chain - 1)
+    slot_target, viable = _link_chains(after, present & take(near, index), far, settings.max_chain - 1)
     vehicle = torch.cat([index, torch.zeros_like(index[:, :1])], 1)  # of each slot; the last is the ego
-    target = torch.where(target >= 0, vehicle.gather(1, target.clamp(min=0)), -1)
-
-    def by_vehicle(values: Tensor, fill: int) -> Tensor:
-        full = torch.full((*support.shape,), fill, dtype=values.dtype, device=values.device)
-        return full.scatter(1, index, values.masked_fill(~present, fill))
-
-    depth = by_vehicle(depth, 0)
-    has_chain = by_vehicle(kept.long(), 0) > 0
-    return Skeleton(depth > 0, by_vehicle(target, -1), depth, near, has_chain, kept.sum(1), source)
+    target = torch.full_like(support, -1, dtype=torch.int64)
+    target = put(target, index, slot_target >= 0, vehicle.gather(1, slot_target.clamp(min=0)))
+    far = put(torch.zeros_like(support), index, present, viable)
+    return Skeleton(target >= 0, target, chain_depth(target), near, far, far.sum(1), source)

@@ -6,11 +6,10 @@ import torch
 from e2rl.errors import InputError
 from e2rl.prior.lane_relative import LaneState, speeds
 from e2rl.scene.recording import DT
-from e2rl.synthesizer.anchoring import AnchorSettings, blend_clean, blend_literal, propose
+from e2rl.synthesizer.anchoring import AnchorSettings, propose
 from e2rl.synthesizer.interception import InterceptionSettings
 from e2rl.synthesizer.motion import constant_speed_states
-from e2rl.synthesizer.skeleton import SkeletonSettings, build_skeleton
-from tests.synthesizer.crossing import add_route, make_world, mask
+from tests.synthesizer.crossing import add_route, make_world, mask, skeleton_of
 
 UP = math.pi / 2
 EGO = (0.0, 0.0, 0.0, 10.0)
@@ -35,7 +34,7 @@ def proposed(world, skeleton, plan, settings=None, interception=LANES, eta=2.0, 
 
 def anchored(world, *vehicles, near=2, **settings):
     support = mask(world, *vehicles)
-    skeleton = build_skeleton(world.scene, world, support, support, SkeletonSettings(near=near))
+    skeleton = skeleton_of(world, support, near=near)
     plan = constant_speed_states(world.scene, world, TIMES)[:, 0]
     return proposed(world, skeleton, plan, AnchorSettings(**settings)), skeleton
 
@@ -98,7 +97,7 @@ def test_a_kept_route_is_the_only_one_looked_at():
     world = make_world([EGO, (40.0, -30.0, 0.0, 8.0)])
     add_route(world, 1, 2, UP)
     support = mask(world, 1)
-    skeleton = build_skeleton(world.scene, world, support, support, SkeletonSettings())
+    skeleton = skeleton_of(world, support)
     plan = constant_speed_states(world.scene, world, TIMES)[:, 0]
     assert not proposed(world, skeleton, plan, keep_route=True).feasible.any()
     world.route[:, 1] = 2
@@ -142,25 +141,6 @@ def test_accelerations_are_bounded_and_bends_slow_down():
     speed, way = speeds(state, knots)
     inside = (way > 16) & (way < 34)
     assert inside.any() and (speed[inside] < 1.1 * math.sqrt(4.0 * radius)).all()
-
-
-def test_clean_blend_keeps_the_noise_and_the_printed_one_halves_its_variance():
-    generator = torch.Generator().manual_seed(0)
-    x0, anchor = torch.randn(2, 4, 12, generator=generator).expand(2000, 2, 4, 12).unbind(1)
-    noise, other = torch.randn(2, 2000, 4, 12, generator=generator)
-    alpha, sigma = 0.8, 0.6
-    x, members = alpha * x0 + sigma * noise, torch.tensor([False, True, True, False]).expand(2000, 4)
-    clean = blend_clean(x, x0, anchor, alpha, members, 0.5)
-    literal = blend_literal(x, alpha * anchor + sigma * other, members, 0.5)
-    mean = alpha * (x0 + anchor) / 2
-    assert (clean - mean)[members].var() == pytest.approx(sigma**2, rel=0.02)
-    assert (literal - mean)[members].var() == pytest.approx(0.5 * sigma**2, rel=0.02)
-    for blended in (clean, literal):
-        assert torch.equal(blended[~members], x[~members])
-    torch.testing.assert_close(
-        blend_clean(x, x0, anchor, alpha, members, 1.0)[members], (alpha * anchor + sigma * noise)[members]
-    )
-    assert torch.equal(blend_clean(x, x0, anchor, alpha, members, 0.0), x)
 
 
 def test_bad_settings_are_refused():

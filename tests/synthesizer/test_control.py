@@ -201,7 +201,8 @@ def anchored(case, strength, **settings):
 @pytest.mark.parametrize(("anchoring", "variance"), [("clean", 1.0), ("literal", 0.5)])
 def test_anchoring_keeps_the_noise_and_the_printed_blend_halves_it(anchoring, variance):
     case = Case(count=600)
-    _, level, _, after = anchored(case, 0.5, anchoring=anchoring, gradient="clean")
+    _, level, x, after = anchored(case, 0.5, anchoring=anchoring, gradient="clean")
+    assert torch.equal(after[:, OTHERS], x[:, OTHERS])
     alpha, sigma = case.prior.schedule.alpha(level), case.prior.schedule.sigma(level)
     mean = alpha * (0.5 * 0.3 - 0.5 * 2.0 / ACCEL_SCALE)
     knots = after[:, MEMBER, :KNOTS]

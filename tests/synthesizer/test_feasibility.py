@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from e2rl.errors import InputError
-from e2rl.synthesizer.description import describe_vehicle
+from e2rl.synthesizer.description import describe
 from e2rl.synthesizer.feasibility import EGO_ACCELERATION, FeasibilitySettings, feasible_vehicles
 from e2rl.synthesizer.motion import MAX_BRAKING, arrival_window, compact, reachable_distance
 from tests.synthesizer.crossing import add_route, make_world
@@ -23,8 +23,7 @@ def test_routes_that_cross_meet_where_the_lines_do():
     result, _ = judge((50.3, -41.7, UP, 10.0))
     table = result.conflicts
     assert result.mask[0].tolist() == [False, True] + [False] * 6
-    assert table.own_s[0, 1, 0] == pytest.approx(20 + 41.7, abs=0.05)
-    assert table.ego_s[0, 1, 0] == pytest.approx(20 + 50.3, abs=0.05)
+    assert table.s[0, 1, 0] == pytest.approx(20 + 41.7, abs=0.05)
     assert table.exists[0, 1].tolist() == [True] + [False] * 5 and not table.exists[0, 2].any()
 
 
@@ -32,8 +31,7 @@ def test_an_oblique_crossing_is_found_too():
     heading = 0.7
     result, _ = judge((20.0, -30.0, heading, 12.0))
     way = 30 / math.sin(heading)
-    assert result.conflicts.own_s[0, 1, 0] == pytest.approx(20 + way, abs=0.1)
-    assert result.conflicts.ego_s[0, 1, 0] == pytest.approx(20 + 20 + way * math.cos(heading), abs=0.1)
+    assert result.conflicts.s[0, 1, 0] == pytest.approx(20 + way, abs=0.1)
 
 
 def test_windows_hold_what_both_can_reach():
@@ -99,7 +97,7 @@ def test_absent_vehicles_and_the_ego_are_never_feasible_and_scenes_do_not_mix():
     world.valid[1, 1] = False
     result = feasible_vehicles(world.scene, world, SETTINGS)
     assert result.mask[:, 1].tolist() == [True, False, True] and not result.mask[:, 0].any()
-    torch.testing.assert_close(result.conflicts.own_s[2], alone.conflicts.own_s[0])
+    torch.testing.assert_close(result.conflicts.s[2], alone.conflicts.s[0])
 
 
 def test_arrival_windows_solve_the_equations_of_motion():
@@ -121,7 +119,9 @@ def test_compact_lists_true_entries_first():
 def test_the_description_names_position_motion_and_conflict():
     world = make_world([EGO, (50.0, -40.0, UP, 10.0)])
     conflicts = feasible_vehicles(world.scene, world, SETTINGS).conflicts
-    text = describe_vehicle(world.scene, world, conflicts, 0, 1)
+    ego, vehicles = describe(world.scene, world, conflicts, 0)
+    (text,) = vehicles.values()
+    assert ego.startswith("The ego drives at 10.0 m/s") and ego.endswith("goes straight on.")
     for part in ("50 m ahead of it and 40 m to its right", "90 degrees to the left", "10.0 m/s", "in 40 m"):
         assert part in text, text
 
