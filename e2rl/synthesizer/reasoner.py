@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -69,7 +70,11 @@ class LanguageReasoner:
         except ImportError as error:
             reason = "the openai client is not installed; install e2rl with its extra: pip install 'e2rl[lm]'"
             raise InputError(f"{where}: {reason}") from error
-        options = {"base_url": settings.base_url, "timeout": settings.timeout, "max_retries": settings.retries}
+        options: dict[str, Any] = {
+            "base_url": settings.base_url,
+            "timeout": settings.timeout,
+            "max_retries": settings.retries,
+        }
         try:
             self._client = openai.OpenAI(**options)
         except openai.OpenAIError as error:
@@ -128,8 +133,8 @@ class LanguageReasoner:
         return verdicts
 
     def _ask(self, chat: list[dict[str, str]]) -> str:
-        request = {"model": self.settings.model, "messages": chat, "temperature": 0, "response_format": FORMAT}
-        completion = self._client.chat.completions.create(**request)
+        request: dict[str, Any] = {"model": self.settings.model, "messages": chat, "response_format": FORMAT}
+        completion = self._client.chat.completions.create(**request, temperature=0)
         if not getattr(completion, "choices", None) or not completion.choices[0].message.content:
             raise ValueError("the endpoint sent no answer")
         return completion.choices[0].message.content

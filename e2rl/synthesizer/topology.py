@@ -79,15 +79,10 @@ def time_to_collision(states: Tensor, size: Tensor, horizon: float = 8.0) -> Ten
     dx, dy, dvx, dvy = (value[..., None, :] - value[..., :, None] for value in moving)
     ci, si, cj, sj = cos[..., :, None], sin[..., :, None], cos[..., None, :], sin[..., None, :]
     turn_cos, turn_sin = (ci * cj + si * sj).abs(), (ci * sj - si * cj).abs()
-    (length, width), (other_length, other_width) = (
-        (half[..., 0], half[..., 1]) for half in (size[..., :, None, :] / 2, size[..., None, :, :] / 2)
-    )
-    along = _overlap_interval(
-        ci * dx + si * dy, ci * dvx + si * dvy, length + turn_cos * other_length + turn_sin * other_width
-    )
-    across = _overlap_interval(
-        ci * dy - si * dx, ci * dvy - si * dvx, width + turn_sin * other_length + turn_cos * other_width
-    )
+    half = size / 2
+    (li, wi), (lj, wj) = half[..., :, None, :].unbind(-1), half[..., None, :, :].unbind(-1)
+    along = _overlap_interval(ci * dx + si * dy, ci * dvx + si * dvy, li + turn_cos * lj + turn_sin * wj)
+    across = _overlap_interval(ci * dy - si * dx, ci * dvy - si * dvx, wi + turn_sin * lj + turn_cos * wj)
     begin, end = torch.maximum(along[0], across[0]), torch.minimum(along[1], across[1])  # on the normals of box i
     begin, end = torch.maximum(begin, begin.transpose(-1, -2)), torch.minimum(end, end.transpose(-1, -2))
     first = begin.clamp(min=0)
@@ -126,13 +121,12 @@ def _trim(clique: tuple[int, ...], weight: np.ndarray, distance: np.ndarray, lim
     return tuple(sorted(sorted(clique, key=lambda i: (i != 0, -total[i], distance[i], i))[:limit]))
 
 
-def _top_cliques(
-    adjacency: np.ndarray, relevant: np.ndarray, weight: np.ndarray, distance: np.ndarray, settings: TopologySettings
-) -> list[tuple[int, ...]]:
-    """The cliques of largest mean weight in one graph [V, V] that have a `relevant` node; ties by distance, then index.
+def _top_cliques(graph: tuple[np.ndarray, ...], settings: TopologySettings) -> list[tuple[int, ...]]:
+    """The cliques of largest mean weight in a graph that have a relevant node; ties by distance, then index.
 
-    distance [V]: m from each vehicle to the ego.
+    graph: adjacency [V, V], relevant nodes [V] bool, weights [V, V], distance [V] of each vehicle to the ego in m.
     """
+    adjacency, relevant, weight, distance = graph
     nodes = np.flatnonzero(adjacency.any(-1))
     if len(nodes) < 2:
         return []
@@ -168,7 +162,7 @@ def topological_candidates(states: Tensor, valid: Tensor, size: Tensor, settings
     host = [x.cpu().numpy() for x in (adjacency.to(torch.uint8), relevant, weights, distance)]
     score = torch.zeros(states.shape[0], states.shape[2])
     cliques = [
-        [_top_cliques(*graph, settings) for graph in zip(*scene, strict=True)] for scene in zip(*host, strict=True)
+        [_top_cliques(graph, settings) for graph in zip(*scene, strict=True)] for scene in zip(*host, strict=True)
     ]
     for row, scene in zip(score, cliques, strict=True):
         for clique in (clique for step in scene for clique in step):
