@@ -72,10 +72,9 @@ def describe_vehicle(scene: TensorDictBase, world: World, conflicts: Conflicts, 
     """
     rows, here = slice(row, row + 1), slice(vehicle, vehicle + 1)
     state, ego, size = world.states[row, vehicle], world.states[row, 0], scene["size"][row, vehicle].tolist()
-    parked = ", parked" if scene["parked"][row, vehicle] else ""
     sentences = [
         f"Vehicle {vehicle} ({size[0]:.1f} x {size[1]:.1f} m) is {_position(to_frame(state[:2], ego))}, "
-        f"{_heading(float(state[2] - ego[2]))}, at {state[3]:.1f} m/s{parked}."
+        f"{_heading(float(state[2] - ego[2]))}, at {state[3]:.1f} m/s."
     ]
     s, d, error = (x[0, 0] for x in frenet_pose(world.states[rows, here], scene["route_points"][rows, here]))
     for candidate in scene["route_valid"][row, vehicle].nonzero()[:, 0].tolist():
