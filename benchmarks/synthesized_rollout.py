@@ -28,11 +28,7 @@ def synthesized_rollout(bench: Bench) -> Iterator[Row]:
         yield bench.row("synthesized_rollout", name, index, wall / batch, "s/rollout")
         yield bench.row("synthesized_rollout", name, index, cpu / batch, "CPU s/rollout")
     parts = {
-        "topology, feasibility and skeleton": (
-            topological_candidates,
-            bench.traffic.feasible_vehicles,
-            build_skeleton,
-        ),
+        "topology, feasibility and skeleton": (topological_candidates, bench.traffic.feasible_vehicles, build_skeleton),
         "sampling": (Prior.sample,),
         "bounds and decoding of the plan": (Prior.plan,),
         "plans of lane_graph": (type(bench.ego).plan,),

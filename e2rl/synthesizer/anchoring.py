@@ -1,30 +1,42 @@
-"""Topological anchoring (Sec. IV-B1): a coarse lane-graph proposal for every link of the skeleton, and how it is
-blended.
+"""Topological anchoring (Sec. IV-B1): a coarse lane-graph proposal for every link of the skeleton.
 
-A proposal is a route candidate and a constant acceleration (within limits of speed and curvature) with which a vehicle
-meets its target: reference section 3.3 and 12.14. It is evaluated with the prior's own decoder of speeds, so arrival
-times are those the prior would draw.
+A proposal is a candidate route and a constant acceleration, within limits of speed and curvature, with which a vehicle
+meets its target. The prior's own decoder turns it into motion, so arrival times are those that the prior would plan.
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.errors import InputError
-from e2rl.prior.lane_relative import HORIZON, KNOTS, LaneState, lateral_horizon, speeds
+from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS, KNOTS, LaneState, lateral_horizon, speeds
+from e2rl.prior.routed import take_route
 from e2rl.scene.recording import DT
 from e2rl.scene.route import SPACING, interpolate, project
+from e2rl.settings import check_range
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
-from e2rl.synthesizer.interception import Interception, InterceptionSettings, intercept
-from e2rl.synthesizer.motion import compact, cruise, fade, place, ride, take
+from e2rl.synthesizer.interception import InterceptionSettings, intercept
+from e2rl.synthesizer.motion import (
+    TOP_SPEED,
+    compact,
+    constant_speed_states,
+    frenet_pose,
+    put,
+    remaining_offset,
+    states_on_route,
+    take,
+)
 from e2rl.synthesizer.skeleton import Skeleton
 
+COARSE, FINE = 19, 9  # accelerations tried on each route: over the whole range, then around the best
+LATERAL_ACCEL = 4.0  # m/s^2 in bends
+BEND_BRAKING = 3.0  # m/s^2 with which a vehicle slows down for a bend
 EXTRA = 2  # steps beyond the horizon, for the slope of the speed at the last knot
 SWING = 0.2  # peak of the lateral decoder's offset, per unit of slope and lateral horizon
-TURNING = 64  # vertices ahead whose curvature is looked at
+BEND_VERTICES = 64  # of a route ahead, whose curvature bounds the speed
 
 
 @dataclass(frozen=True)
@@ -34,192 +46,169 @@ class AnchorSettings:
     strength: float = 1.0
     min_accel: float = -3.0
     max_accel: float = 2.0
-    options: int = 19
-    lateral_accel: float = 4.0
-    turn_brake: float = 3.0
-    top_speed: float = 25.0
-    margin: float = 0.0
     accel_cost: float = 0.2
     lateral_cost: float = 0.05
     max_offset: float = 1.0
     max_shift: float = 4.5
     max_swing: float = 1.0
 
-    def __post_init__(self):
-        if not 0 <= self.strength <= 1:
-            raise InputError(f"synthesizer.anchor.strength is {self.strength}; it must lie between 0 (no anchor) and 1")
-        if self.min_accel >= self.max_accel or self.options < 2:
-            raise InputError("synthesizer.anchor needs min_accel < max_accel and at least 2 options")
+    def __post_init__(self) -> None:
+        check_range("synthesizer.anchor.strength", self.strength, 0, 1)
+        check_range("synthesizer.anchor.max_accel", self.max_accel, self.min_accel + 0.1)
 
 
 @dataclass(frozen=True)
 class Anchor:
-    """route [B, V] int64: candidate to follow (the present one where `has` is false); knots [B, V, 10] acceleration
-    knots [m/s^2] at 0.5 .. 5.0 s; has [B, V]: C* members that can meet their target; cost [B, V]: in seconds, inf where
-    `has` is false; leaves [B, V]: members that meet it on a way of their own, points [B, V, P, 2] (vertices SPACING m
-    apart), and not on a lane.
+    """The proposals of a skeleton.
+
+    route [B, V] int64: candidate to follow (the present one where not feasible); knots [B, V, 10]: accelerations
+    [m/s^2] at 0.5 .. 5.0 s; feasible [B, V] bool: members of C* that can meet their target; cost [B, V] in s, inf where
+    not feasible; off_lane [B, V] bool: members that meet it on off_lane_path [B, V, P, 2] (a vertex every SPACING m)
+    instead of a lane.
     """
 
     route: Tensor
     knots: Tensor
-    has: Tensor
+    feasible: Tensor
     cost: Tensor
-    leaves: Tensor
+    off_lane: Tensor
+    off_lane_path: Tensor
+
+
+class _Candidates(NamedTuple):
+    """Vehicles [B, M] that need a proposal: speed, accel, size [B, M, 2], and their candidate routes [B, M, R]: number
+    in the scene, points [B, M, R, P, 2], usable (bool), end [m], Frenet pose s, d [m], and bend_bound [B, M, R, 64]:
+    squared speed allowed at the vertices ahead.
+    """
+
+    number: Tensor
     points: Tensor
-
-
-@dataclass
-class _Riders:
-    """The vehicles that look for a proposal: slots [B, M] and their candidates [B, M, R], numbered as in the scene."""
-
-    candidate: Tensor
-    routes: Tensor
     usable: Tensor
     end: Tensor
     s: Tensor
     d: Tensor
-    v: Tensor
-    a: Tensor
+    bend_bound: Tensor
+    speed: Tensor
+    accel: Tensor
     size: Tensor
-    envelope: Tensor
 
 
-def turn_envelope(route: Tensor, s: Tensor, settings: AnchorSettings) -> Tensor:
-    """Squared speed [..., K] allowed at arc lengths s + SPACING k, route [..., P, 2], s [...].
-
-    Bounded by curvature there and by what braking at turn_brake can still lose before the bends ahead.
+class _Target(NamedTuple):
+    """A target's path seen along each candidate, [B, M, R, H]: s, d [m]; slack [m] by which boxes that move alike touch
+    before their centres meet; crossing_time [s/m]: until a crossing target is over the centreline; corridor [B, M] m:
+    lateral distance at which the boxes touch.
     """
-    way = SPACING * torch.arange(TURNING, device=s.device)
-    curvature = interpolate(route, s[..., None] + way)[2]
-    bound = settings.lateral_accel / curvature.abs().clamp(min=1e-4) + 2 * settings.turn_brake * way
-    return bound.flip(-1).cummin(-1).values.flip(-1) - 2 * settings.turn_brake * way
+
+    s: Tensor
+    d: Tensor
+    slack: Tensor
+    crossing_time: Tensor
+    corridor: Tensor
 
 
-def _constant(riders: _Riders, accel: Tensor, settings: AnchorSettings) -> Tensor:
+def _bend_bound(route: Tensor, s: Tensor) -> Tensor:
+    """Squared speed [..., BEND_VERTICES] allowed at arc lengths s + SPACING k of route [..., P, 2], s [...]: by the
+    curvature there, and by what BEND_BRAKING can still lose before the bends ahead.
+    """
+    distance = SPACING * torch.arange(BEND_VERTICES, device=s.device)
+    curvature = interpolate(route, s[..., None] + distance)[2]
+    bound = LATERAL_ACCEL / curvature.abs().clamp(min=1e-4) + 2 * BEND_BRAKING * distance
+    return bound.flip(-1).cummin(-1).values.flip(-1) - 2 * BEND_BRAKING * distance
+
+
+def _candidates(
+    scene: TensorDictBase, world: World, index: Tensor, settings: AnchorSettings, keep_route: bool
+) -> _Candidates:
+    """The candidate routes of vehicles index [B, M]; keep_route: only the one that each follows."""
+    vehicles, count = scene["route_points"].shape[1:3]
+    states, route = take(world.states[:, :vehicles], index), take(world.route, index)[..., None]
+    number = route.clamp(min=0) if keep_route else torch.arange(count, device=index.device).expand(*index.shape, -1)
+    at = (torch.arange(len(index), device=index.device)[:, None, None], index[..., None], number)
+    points, end, valid = (scene[key][at] for key in ("route_points", "route_length", "route_valid"))
+    s, d, error = frenet_pose(states, points)
+    swing = SWING * error.clamp(-1.0, 1.0).tan().abs() * lateral_horizon(states[..., 3])[..., None]
+    reachable = (d.abs() <= settings.max_shift) & (swing <= settings.max_swing)
+    usable = valid & (reachable | (number == route))
+    if keep_route:
+        usable = usable & (route >= 0)
+    accel, size = take(world.accel[:, :vehicles], index), take(scene["size"], index)
+    return _Candidates(number, points, usable, end, s, d, _bend_bound(points, s), states[..., 3], accel, size)
+
+
+def _along(candidates: _Candidates, path: Tensor, size: Tensor) -> _Target:
+    """A target's path [B, M, H, 4] and size [B, M, 2] seen along each candidate."""
+    s, d, heading = project(path[:, :, None, :, :2], candidates.points)
+    cosine = wrap(path[:, :, None, :, 2] - heading).cos()
+    touch = (candidates.size + size) / 2
+    slack = 0.8 * touch[..., 0, None, None] * cosine.clamp(min=0) ** 2
+    crossing_time = (1 - cosine**2) / path[:, :, None, :, 3].clamp(min=1.0)
+    return _Target(s, d, slack, crossing_time, touch[..., 1])
+
+
+def _knots(candidates: _Candidates, accel: Tensor, settings: AnchorSettings) -> Tensor:
     """Knots [B, M, R, A, 10] that hold accelerations accel [B, M, R, A] but for standstill, top speed and bends.
 
-    The bound on speed depends on the way, the way on speed: a few fixed-point steps from the unbounded motion.
+    The bound on speed depends on the distance, which depends on speed: three fixed-point steps from the free motion.
     """
     time = DT * torch.arange(HORIZON + EXTRA + 1, device=accel.device)
-    v0 = riders.v[..., None, None, None]
+    v0 = candidates.speed[..., None, None, None]
     free = v0 + accel[..., None] * time
-    free = torch.minimum(free.clamp(min=0), v0.clamp(min=settings.top_speed))
+    free = torch.minimum(free.clamp(min=0), v0.clamp(min=TOP_SPEED))
     braking = (v0 + settings.min_accel * time).clamp(min=0)  # nobody loses speed faster, bend or not
     speed = free
     for _ in range(3):
-        way = torch.nn.functional.pad(((speed[..., 1:] + speed[..., :-1]) / 2 * DT).cumsum(-1), (1, 0))
-        at = (way / SPACING).clamp(max=TURNING - 1.001)
+        travelled = torch.nn.functional.pad(((speed[..., 1:] + speed[..., :-1]) / 2 * DT).cumsum(-1), (1, 0))
+        at = (travelled / SPACING).clamp(max=BEND_VERTICES - 1.001)
         low = at.long()
-        table = riders.envelope[..., None, :].expand(*way.shape[:-1], TURNING)
+        table = candidates.bend_bound[..., None, :].expand(*travelled.shape[:-1], BEND_VERTICES)
         bound = torch.lerp(table.gather(-1, low), table.gather(-1, low + 1), at - low)
         speed = torch.maximum(torch.minimum(free, bound.clamp(min=0).sqrt()), braking)
-    stride = HORIZON // KNOTS
-    knot = stride * torch.arange(1, KNOTS + 1, device=accel.device)
+    knot = KNOT_STEPS * torch.arange(1, KNOTS + 1, device=accel.device)
     slope = (speed[..., knot + EXTRA] - speed[..., knot - EXTRA]) / (2 * EXTRA * DT)
     return slope.clamp(settings.min_accel, settings.max_accel)
 
 
-def _decode(riders: _Riders, knots: Tensor) -> tuple[Tensor, Tensor]:
-    """Speed and way [..., HORIZON] of knots [B, M, R, A, 10], by the prior's decoder."""
-    shape = knots.shape[:-1]
-    zero = torch.zeros(shape, device=knots.device)
-    state = LaneState(*(zero for _ in range(10)))
-    state.v, state.a = (x[..., None, None].expand(shape) for x in (riders.v, riders.a))
-    return speeds(state, knots)
+def _decode(candidates: _Candidates, knots: Tensor) -> tuple[Tensor, Tensor]:
+    """Speed and travelled distance [B, M, R, A, H] of knots [B, M, R, A, 10], by the prior's decoder."""
+    zero = knots.new_zeros(knots.shape[:-1])
+    v, a = (x[..., None, None].expand(zero.shape) for x in (candidates.speed, candidates.accel))
+    return speeds(LaneState(zero, zero, zero, zero, v, a, zero, zero, zero, zero), knots)
 
 
-def _score(riders: _Riders, accel: Tensor, target: dict[str, Tensor], settings: AnchorSettings):
-    """Cost, arrival offset [s] (both [B, M, R, A]) and knots [B, M, R, A, 10] of accelerations accel [B, M, R, A].
+def _score(
+    candidates: _Candidates, accel: Tensor, target: _Target, settings: AnchorSettings
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Cost and time gap [s] (both [B, M, R, A]) and knots [B, M, R, A, 10] of accelerations accel [B, M, R, A].
 
-    At each step at which the target is on a candidate, the vehicle's distance to that point over its speed is the
-    difference of the two arrival times; the step counts that makes it least.
+    At each step at which the target is on a candidate, the vehicle's distance to that point over its speed is the gap
+    between the two arrival times; the smallest counts.
     """
-    knots = _constant(riders, accel, settings)
-    v, way = _decode(riders, knots)
-    there, d = target["s"][..., None, :], target["d"][..., None, :]
-    own_d = riders.d[..., None, None] * fade(way, riders.v[..., None, None, None])
-    across = (d - own_d).abs()
-    short = (there - riders.s[..., None, None] - way).abs() - target["slack"][..., None, :]
-    late = short.clamp(min=0) / v.clamp(min=1.0) + across * target["aside"][..., None, :]
-    met = (across <= target["corridor"][..., None, None, None]) & (there <= riders.end[..., None, None])
-    offset = late.masked_fill(~met, torch.inf).amin(-1)
-    offset = offset.masked_fill(~riders.usable[..., None], torch.inf)
-    cost = offset + settings.accel_cost * accel.abs() + settings.lateral_cost * riders.d.abs()[..., None]
-    return cost, offset, knots
+    knots = _knots(candidates, accel, settings)
+    v, travelled = _decode(candidates, knots)
+    offset = candidates.d[..., None, None] * remaining_offset(travelled, candidates.speed[..., None, None, None])
+    lateral = (target.d[..., None, :] - offset).abs()
+    ahead = target.s[..., None, :]
+    missing = (ahead - candidates.s[..., None, None] - travelled).abs() - target.slack[..., None, :]
+    time_gap = missing.clamp(min=0) / v.clamp(min=1.0) + lateral * target.crossing_time[..., None, :]
+    met = (lateral <= target.corridor[..., None, None, None]) & (ahead <= candidates.end[..., None, None])
+    time_gap = time_gap.masked_fill(~met, torch.inf).amin(-1).masked_fill(~candidates.usable[..., None], torch.inf)
+    cost = time_gap + settings.accel_cost * accel.abs() + settings.lateral_cost * candidates.d.abs()[..., None]
+    return cost, time_gap, knots
 
 
-def _targets(riders: _Riders, path: Tensor, size: Tensor, settings: AnchorSettings) -> dict[str, Tensor]:
-    """A target's path [B, M, H, 4] and size [B, M, 2] seen along each candidate.
-
-    s, d [B, M, R, H]: place on the candidate; slack [m]: boxes that move alike touch before their centres meet; aside
-    [s/m]: time per metre until a crossing target is over the centreline; corridor [B, M]: half widths that touch.
-    """
-    s, d, heading = project(path[:, :, None, :, :2], riders.routes)
-    along = wrap(path[:, :, None, :, 2] - heading).cos()
-    touch = (riders.size[..., 0] + size[..., 0]) / 2
-    aside = (1 - along**2) / path[:, :, None, :, 3].clamp(min=1.0)
-    corridor = (riders.size[..., 1] + size[..., 1]) / 2 + settings.margin
-    return {
-        "s": s,
-        "d": d,
-        "slack": 0.8 * touch[..., None, None] * along.clamp(min=0) ** 2,
-        "aside": aside,
-        "corridor": corridor,
-    }
-
-
-def _best(cost: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
-    """Rows of values [B, M, R, A, ...] at the least cost [B, M, R, A]; the first is the flat index [B, M]."""
+def _on_lane(
+    candidates: _Candidates, path: Tensor, size: Tensor, settings: AnchorSettings
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The proposal of least cost on the candidates: candidate [B, M], knots [B, M, 10], cost [B, M] (inf for none)."""
+    target = _along(candidates, path, size)
+    low, high = settings.min_accel, settings.max_accel
+    grid = torch.linspace(low, high, COARSE, device=path.device).expand(*candidates.s.shape, COARSE)
+    best = _score(candidates, grid, target, settings)[0].argmin(-1, keepdim=True)  # per candidate
+    fine = grid.gather(-1, best) + (high - low) / (COARSE - 1) * torch.linspace(-1, 1, FINE, device=path.device)
+    cost, time_gap, knots = _score(candidates, fine.clamp(low, high), target, settings)
     pick = cost.flatten(2).argmin(-1)
-    flat = [value.flatten(2, 3) for value in values]
-    at = [pick[..., None, None] if value.dim() == 4 else pick[..., None] for value in flat]
-    rows = [
-        value.gather(2, i.expand(*i.shape[:3], *value.shape[3:]))[:, :, 0] for value, i in zip(flat, at, strict=True)
-    ]
-    return pick, *rows
-
-
-def _riders(scene: TensorDictBase, world: World, index: Tensor, settings: AnchorSettings, keep_route: bool) -> _Riders:
-    vehicles, count = scene["route_points"].shape[1:3]
-    states, route = take(world.states[:, :vehicles], index), take(world.route, index)[..., None]
-    candidate = route.clamp(min=0) if keep_route else torch.arange(count, device=index.device).expand(*index.shape, -1)
-    row = torch.arange(len(index), device=index.device)[:, None, None]
-    of = lambda key: scene[key][row, index[..., None], candidate]  # noqa: E731
-    routes, end = of("route_points"), of("route_length")
-    s, d, error = place(states, routes)
-    swing = SWING * error.clamp(-1.0, 1.0).tan().abs() * lateral_horizon(states[..., 3])[..., None]
-    reachable = (d.abs() <= settings.max_shift) & (swing <= settings.max_swing)
-    usable = of("route_valid") & (reachable | (candidate == route))
-    if keep_route:
-        usable = usable & (route >= 0)
-    return _Riders(
-        candidate,
-        routes,
-        usable,
-        end,
-        s,
-        d,
-        states[..., 3],
-        take(world.accel[:, :vehicles], index),
-        take(scene["size"], index),
-        turn_envelope(routes, s, settings),
-    )
-
-
-def _propose(riders: _Riders, path: Tensor, size: Tensor, settings: AnchorSettings):
-    """Candidate [B, M], knots [B, M, 10], offset [B, M]: a coarse grid of accelerations, then a fine one around its
-    best.
-    """
-    target = _targets(riders, path, size, settings)
-    grid = torch.linspace(settings.min_accel, settings.max_accel, settings.options, device=path.device)
-    grid = grid.expand(*riders.s.shape, settings.options)
-    cost, _, _ = _score(riders, grid, target, settings)
-    pick = cost.argmin(-1, keepdim=True)  # per candidate
-    width = (settings.max_accel - settings.min_accel) / (settings.options - 1)
-    fine = grid.gather(-1, pick) + width * torch.linspace(-1, 1, 9, device=path.device)
-    cost, offset, knots = _score(riders, fine.clamp(settings.min_accel, settings.max_accel), target, settings)
-    pick, offset, knots, cost = _best(cost, offset, knots, cost)
-    return pick // fine.shape[-1], knots, offset, cost
+    cost, time_gap, knots = (take_route(value.flatten(2, 3), pick) for value in (cost, time_gap, knots))
+    return pick // FINE, knots, cost.masked_fill(time_gap > settings.max_offset, torch.inf)
 
 
 def propose(
@@ -234,115 +223,43 @@ def propose(
 ) -> Anchor:
     """The skeleton-consistent clean state of Sec. IV-A3 for scenes [B]; ego_plan [B, H >= 50, 4], eta [B].
 
-    Links are worked off from the ego outwards: those that act on the ego meet its plan, on a lane or (where that costs
-    less) by an interception; the others meet their target's proposal, or its route at present speed where it has none
-    on a lane. keep_route: only the candidates that vehicles follow now
-    (between two choices of the support, where nobody changes its route).
+    Proposals are made from the ego outwards. Vehicles that act on the ego meet its plan on a lane or, where that costs
+    less, by an interception. The others meet their target's lane proposal; a target without one keeps its speed along
+    its route. keep_route: consider only the routes that vehicles follow now.
     """
     times = DT * torch.arange(1, HORIZON + 1, device=ego_plan.device)
-    expected = cruise(scene, world, times)
+    expected = constant_speed_states(scene, world, times)
     expected[:, 0] = ego_plan[:, :HORIZON].detach()
-    found = Anchor(
-        world.route.clone(),
-        expected.new_zeros(*world.route.shape, KNOTS),
-        skeleton.coalition & False,
-        expected.new_full(world.route.shape, torch.inf),
-        skeleton.coalition & False,
-        torch.zeros_like(scene["route_points"][:, :, 0]),
-    )
+    nobody, cost = torch.zeros_like(skeleton.coalition), expected.new_full(world.route.shape, torch.inf)
+    knots, path = expected.new_zeros(*world.route.shape, KNOTS), torch.zeros_like(scene["route_points"][:, :, 0])
+    anchor = Anchor(world.route.clone(), knots, nobody, cost, nobody, path)
     for depth in range(1, int(skeleton.depth.max()) + 1):
         index, present = compact(skeleton.depth == depth)
-        riders = _riders(scene, world, index, settings, keep_route)
         target = skeleton.target.gather(1, index).clamp(min=0)
-        pick, knots, late, cost = _propose(riders, take(expected, target), take(scene["size"], target), settings)
-        cost = cost.masked_fill(~present | (late > settings.max_offset), torch.inf)
-        way = None
+        candidates = _candidates(scene, world, index, settings, keep_route)
+        pick, knots, cost = _on_lane(candidates, take(expected, target), take(scene["size"], target), settings)
+        cost, off_lane, found = cost.masked_fill(~present, torch.inf), torch.zeros_like(present), None
         if depth == 1 and interception.reach > 0:
-            way = _intercept(scene, world, index, expected, target, eta, interception)
-        on_lane = cost.isfinite() if way is None else cost.isfinite() & ~(way.cost < cost)
-        expected = _write(expected, index, on_lane, _rides(riders, pick, knots))
-        chosen = riders.candidate.gather(2, pick[..., None])[..., 0]
-        found = _noted(found, index, on_lane, has=on_lane, cost=cost, knots=knots, route=chosen)
-        if way is not None:
-            leaves = present & (way.cost < cost)
-            found = _noted(found, index, leaves, has=leaves, leaves=leaves, **vars(way))
-    return found
+            found = intercept(world, index, target, expected, eta, interception)
+            off_lane = present & (found.cost < cost)
+        on_lane = cost.isfinite() & ~off_lane
+        expected = put(expected, index, on_lane, _states(candidates, pick, knots))
+        route = take_route(candidates.number, pick)
+        anchor = _updated(anchor, index, on_lane, feasible=on_lane, cost=cost, knots=knots, route=route)
+        if found is not None:
+            rows = {"feasible": off_lane, "off_lane": off_lane, "cost": found.cost, "knots": found.knots}
+            anchor = _updated(anchor, index, off_lane, off_lane_path=found.path, **rows)
+    return anchor
 
 
-def _noted(anchor: Anchor, index: Tensor, mask: Tensor, **rows: Tensor) -> Anchor:
-    """The Anchor with fields' rows [B, M, ...] written at slots index [B, M] where mask [B, M]."""
-    return replace(anchor, **{name: _write(getattr(anchor, name), index, mask, new) for name, new in rows.items()})
+def _states(candidates: _Candidates, pick: Tensor, knots: Tensor) -> Tensor:
+    """States [B, M, H, 4] of the vehicles on candidates pick [B, M] with knots [B, M, 10]."""
+    v, travelled = (x[:, :, 0, 0] for x in _decode(candidates, knots[:, :, None, None]))
+    route, s, d = (take_route(x, pick) for x in (candidates.points, candidates.s, candidates.d))
+    offset = d[..., None] * remaining_offset(travelled, candidates.speed[..., None])
+    return states_on_route(route, s[..., None] + travelled, offset, v)
 
 
-def _rides(riders: _Riders, pick: Tensor, knots: Tensor) -> Tensor:
-    """States [B, M, H, 4] of the riders on candidates pick [B, M] with knots [B, M, 10]."""
-    pick = pick[..., None]
-    v, way = (x[:, :, 0, 0] for x in _decode(riders, knots[:, :, None, None]))
-    own = riders.routes.gather(2, pick[..., None, None].expand(-1, -1, 1, *riders.routes.shape[3:]))[:, :, 0]
-    return ride(own, riders.s.gather(2, pick) + way, riders.d.gather(2, pick) * fade(way, riders.v[..., None]), v)
-
-
-def _intercept(
-    scene: TensorDictBase,
-    world: World,
-    index: Tensor,
-    expected: Tensor,
-    target: Tensor,
-    eta: Tensor,
-    settings: InterceptionSettings,
-) -> Interception:
-    """Interceptions of slots index [B, M]; everybody else is expected to drive as in expected [B, V, H, 4]."""
-    vehicles = expected.shape[1]
-    row = torch.arange(vehicles, device=index.device)
-    there = world.valid[:, None, :vehicles] & (row != index[..., None]) & (row != target[..., None])
-    sizes, wide = scene["size"][:, :vehicles], (-1, index.shape[1], -1, -1)
-    others = (expected[:, None].expand(*wide, -1), sizes[:, None].expand(wide), there)
-    return intercept(
-        scene,
-        take(world.states, index),
-        take(sizes, index),
-        take(expected, target),
-        take(sizes, target),
-        eta,
-        others,
-        settings,
-    )
-
-
-def _write(full: Tensor, index: Tensor, mask: Tensor, rows: Tensor) -> Tensor:
-    """full [B, V, ...] with rows [B, M, ...] at index [B, M] where mask [B, M]."""
-    extra = [1] * (full.dim() - 2)
-    mask = mask.view(*mask.shape, *extra)
-    at = index.view(*index.shape, *extra).expand(*index.shape, *full.shape[2:])
-    return full.scatter(1, at, torch.where(mask, rows, full.gather(1, at)))
-
-
-def blend_clean(
-    x: Tensor, x0: Tensor, anchor_x0: Tensor, alpha: Tensor | float, mask: Tensor, strength: float
-) -> Tensor:
-    """Anchoring that keeps the noise (design.md 7.2): x0' = (1 - a) x0 + a anchor_x0 on `mask`, the noise of x as it
-    was.
-
-    x, x0, anchor_x0 [B, V, D]; alpha: signal scale of the noise level (square root of the paper's gamma-bar);
-    mask [B, V] or [B, V, D]; strength a in [0, 1]. With x = alpha x0 + sigma e this is alpha x0' + sigma e.
-    """
-    mask = mask if mask.dim() == x.dim() else mask[..., None]
-    return torch.where(mask, x + alpha * strength * (anchor_x0 - x0), x)
-
-
-def blend_literal(
-    x: Tensor,
-    anchor_x0: Tensor,
-    alpha: Tensor | float,
-    sigma: Tensor | float,
-    mask: Tensor,
-    strength: float,
-    noise: Tensor,
-) -> Tensor:
-    """Anchoring as printed, eq. (anchor_injection): (1 - a) x + a (alpha anchor_x0 + sigma noise) on `mask`.
-
-    Independent noises shrink the noise variance by (1 - a)^2 + a^2; kept for the ablation. Shapes as in blend_clean,
-    noise [B, V, D] standard normal.
-    """
-    mask = mask if mask.dim() == x.dim() else mask[..., None]
-    return torch.where(mask, (1 - strength) * x + strength * (alpha * anchor_x0 + sigma * noise), x)
+def _updated(anchor: Anchor, index: Tensor, mask: Tensor, **rows: Tensor) -> Anchor:
+    """The Anchor with rows [B, M, ...] of its fields written at vehicles index [B, M] where mask [B, M]."""
+    return replace(anchor, **{name: put(getattr(anchor, name), index, mask, new) for name, new in rows.items()})

@@ -5,7 +5,7 @@ sample under sparse control. With eta = 0 nothing is controlled, and the traffic
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.errors import InputError
-from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate
+from e2rl.prior.lane_relative import HORIZON, SIZE, locate, select
 from e2rl.prior.prior import Context, Prior
 from e2rl.prior.routed import reroute
 from e2rl.scene.recording import DT
@@ -130,8 +130,8 @@ class E2(NominalTraffic):
             return state, self.prior.sample(context, noise).x0, context
         world = replace(world, route=state.routed.route)
         state, anchor = self._reselected(state, world, ego_plan, noise)
-        off_lane = anchor.leaves & state.coalition & (state.eta > 0)[:, None]
-        state = self._onto(state, world, state.routed.route, off_lane, anchor.points)
+        off_lane = anchor.off_lane & state.coalition & (state.eta > 0)[:, None]
+        state = self._onto(state, world, state.routed.route, off_lane, anchor.off_lane_path)
         context = self.encode(state, world, ego_plan, state.coalition)
         control = self._control(state, self._potential_context(state, world, ego_plan), anchor, group)
         sample = self.prior.sample(context, noise, control, self._budget(state))
@@ -150,7 +150,7 @@ class E2(NominalTraffic):
         if self.reselect > 0:
             due = due | (state.replans % self.reselect == 0)
         anchor = self._anchor(state, world, ego_plan)
-        rows = (due & (state.eta > 0) & ~anchor.has.any(1)).nonzero().squeeze(-1)
+        rows = (due & (state.eta > 0) & ~anchor.feasible.any(1)).nonzero().squeeze(-1)
         if not len(rows):
             return state, anchor
         there = take_rows(world, rows)
@@ -188,7 +188,7 @@ class E2(NominalTraffic):
         if bool(skeleton.far.any()):  # otherwise everybody meets the ego, as just proposed
             anchor = self._propose(skeleton, state, world, ego_plan)
         # Infeasible configurations are pruned (Sec. IV-A3): members without a proposal, and whoever acts through them.
-        acts = skeleton.coalition & anchor.has & (state.eta > 0)[:, None]
+        acts = skeleton.coalition & anchor.feasible & (state.eta > 0)[:, None]
         for _ in range(self.skeleton.max_chain - 1):
             acts = acts & ((skeleton.target <= 0) | acts.gather(1, skeleton.target.clamp(min=0)))
         state = replace(state, coalition=acts, target=torch.where(acts, skeleton.target, -1))
@@ -198,7 +198,7 @@ class E2(NominalTraffic):
             at = reference[:, found.steps]
             self.on_selection(Selection(state.seed, world.step, at, moments, found.weights, *chosen))
         return self._onto(
-            state, world, torch.where(acts, anchor.route, state.routed.route), acts & False, anchor.points
+            state, world, torch.where(acts, anchor.route, state.routed.route), acts & False, anchor.off_lane_path
         )
 
     def _support(self, state: E2State, world: World, candidates: Tensor, feasible: Tensor) -> tuple[Tensor, Tensor]:
@@ -221,8 +221,7 @@ class E2(NominalTraffic):
         routed = reroute(state.routed, world.scene, route, changed, off_lane, paths, self.prior.free_space)
         old = state.lane
         moved = locate(world.states[:, : route.shape[1]], old.a, old.kappa * old.v, routed.points)
-        values = (torch.where(changed, getattr(moved, f.name), getattr(old, f.name)) for f in fields(LaneState))
-        return replace(state, routed=routed, lane=LaneState(*values), off_lane=off_lane)
+        return replace(state, routed=routed, lane=select(changed, moved, old), off_lane=off_lane)
 
     def _potential_context(self, state: E2State, world: World, ego_plan: Tensor) -> PotentialContext:
         vehicles, routed = state.routed.route.shape[1], state.routed

@@ -1,36 +1,39 @@
-"""Interceptions: proposals that no lane leads to (Sec. IV-B1), a smooth way from a vehicle's pose to its target's path.
+"""Interceptions: proposals off the lanes (Sec. IV-B1), a smooth path from a vehicle's pose to its target's path.
 
-A lane-graph proposal can only choose when a vehicle is where its lane leads, where every planner expects it. Whoever
-drifts over, cuts in or turns in early leaves its lane for a few seconds. Here is that way in closed form: a cubic from
-the pose to where the target will be at one of several moments, driven at one constant acceleration, on the drivable
-area, clear of everybody else, within limits of acceleration that grow with the intensity. The prior then plans along
-this way as along any route, so what is driven stays a sample of the prior.
+A lane-graph proposal can only choose when a vehicle is where its lane leads, where every planner expects it. Vehicles
+that drift over, cut in or turn in early leave their lane for a few seconds. Such a path is proposed in closed form: a
+cubic from the pose to where the target will be at one of several moments, driven at one constant acceleration, on the
+drivable area, clear of everybody else, within limits of acceleration that are proportional to the intensity. The prior
+then plans along it as along any route, so what is driven stays a sample of the prior.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.errors import InputError
 from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS
+from e2rl.prior.routed import take_route
 from e2rl.scene.recording import DT
 from e2rl.scene.route import SPACING
+from e2rl.settings import check_range
 from e2rl.sim.drivable import off_road
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.geometry import overlap
+from e2rl.sim.world import World
+from e2rl.synthesizer.motion import direction, take
 
-ENDS = 3  # directions tried at the end of a way
-SAMPLES = 17  # points of a way at which it is looked at
-MAX_BEARING, MAX_TURN = 1.05, 1.4  # rad between heading and target, and between the two ends of a way
+ENDS = 3  # directions tried at the end of a path
+SAMPLES = 17  # points of a path that are checked
+MAX_BEARING, MAX_TURN = 1.05, 1.4  # rad between heading and target, and between both ends of a path
 MAX_CURVATURE = 0.12  # 1/m, what a car's steering allows
-ROOM = 0.3  # m kept to others on the way
+CLEARANCE = 0.3  # m kept to others on the path
 
 
 @dataclass(frozen=True)
 class InterceptionSettings:
-    """Limits per unit of intensity and costs of interceptions; conf/synthesizer/e2.yaml explains each."""
+    """Limits per unit of intensity, and costs; conf/synthesizer/e2.yaml explains each."""
 
     reach: float = 5.0
     push: float = 1.5
@@ -42,152 +45,138 @@ class InterceptionSettings:
     time_cost: float = 0.1
     preference: float = 2.0
 
-    def __post_init__(self):
-        if min(self.push, self.brake, self.lateral) < 0 or not 0 <= self.reach <= HORIZON * DT:
-            raise InputError(
-                "synthesizer.interception needs push, brake and lateral of at least 0, and reach between "
-                f"0 (none) and {HORIZON * DT} s; they are {self.push}, {self.brake}, {self.lateral} and "
-                f"{self.reach}"
-            )
+    def __post_init__(self) -> None:
+        for name in ("push", "brake", "lateral"):
+            check_range(f"synthesizer.interception.{name}", getattr(self, name), 0)
+        check_range("synthesizer.interception.reach", self.reach, 0, HORIZON * DT)
 
 
-@dataclass(frozen=True)
-class Interception:
-    """points [B, M, P, 2]: the way, a vertex every SPACING m; knots [B, M, 10] m/s^2; cost [B, M] in seconds, inf where
-    there is none within the limits."""
+class Interception(NamedTuple):
+    """path [B, M, P, 2]: a vertex every SPACING m; knots [B, M, 10]: accelerations in m/s^2; cost [B, M] in s, inf for
+    vehicles that have no interception within the limits.
+    """
 
-    points: Tensor
+    path: Tensor
     knots: Tensor
     cost: Tensor
 
 
-def _direction(heading: Tensor) -> Tensor:
-    return torch.stack([heading.cos(), heading.sin()], -1)
+class _Paths(NamedTuple):
+    """O paths of each vehicle: points and tangents [B, M, O, U, 2] at even parameters; length [B, M, O, U]: m to each
+    point; bearing, turn [B, M, O]: angles from the heading to the target and to the end; end_heading [B, M, O].
+    """
+
+    points: Tensor
+    tangents: Tensor
+    length: Tensor
+    bearing: Tensor
+    turn: Tensor
+    end_heading: Tensor
 
 
 def cubic(start: Tensor, heading: Tensor, end: Tensor, end_heading: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-    """Points and derivatives [..., U, 2] at u [U] of the cubic between poses [..., 2] and [...]; where one circle
-    touches both poses it is that circle's arc, to a thousandth."""
+    """Points and derivatives [..., U, 2] at u [U] in [0, 1] of the cubic Hermite curve between poses [..., 2], [...].
+
+    Where one circle is tangent to both poses the curve is its arc, to a thousandth of the radius.
+    """
     chord = end - start
     bearing = wrap(torch.atan2(chord[..., 1], chord[..., 0]) - heading)
     chord = chord.norm(dim=-1)[..., None] / (bearing / 2).cos().square().clamp(min=0.5)[..., None]
     a, b = start[..., None, :], end[..., None, :]
-    m, n = (chord * _direction(heading))[..., None, :], (chord * _direction(end_heading))[..., None, :]
+    m, n = (chord * direction(heading))[..., None, :], (chord * direction(end_heading))[..., None, :]
     u = u[:, None]
     points = (2 * u**3 - 3 * u**2 + 1) * a + (u**3 - 2 * u**2 + u) * m + (3 * u**2 - 2 * u**3) * b + (u**3 - u**2) * n
-    slope = (6 * u**2 - 6 * u) * (a - b) + (3 * u**2 - 4 * u + 1) * m + (3 * u**2 - 2 * u) * n
-    return points, slope
+    tangents = (6 * u**2 - 6 * u) * (a - b) + (3 * u**2 - 4 * u + 1) * m + (3 * u**2 - 2 * u) * n
+    return points, tangents
 
 
-@dataclass(frozen=True)
-class _Ways:
-    """O ways of each vehicle: points, slope [B, M, O, U, 2] at even parameters, way [B, M, O, U]: metres to each point,
-    bearing, turn [B, M, O]: of the target against the heading, and between both ends; end [B, M, O]: heading there."""
-
-    points: Tensor
-    slope: Tensor
-    way: Tensor
-    bearing: Tensor
-    turn: Tensor
-    end: Tensor
-
-
-def _ways(states: Tensor, aim: Tensor) -> _Ways:
-    """Ways from states [B, M, 4] to aims [B, M, I, 4], ENDS for each: an arc, straight at the aim in the end, or into
-    the target's direction."""
-    heading = states[:, :, None, 2].expand(aim.shape[:3])
-    gap = aim[..., :2] - states[:, :, None, :2]
+def _paths(states: Tensor, meeting: Tensor) -> _Paths:
+    """Paths from states [B, M, 4] to meeting states [B, M, I, 4], ENDS to each: along an arc, straight at the target in
+    the end, or into the target's direction.
+    """
+    heading = states[:, :, None, 2].expand(meeting.shape[:3])
+    gap = meeting[..., :2] - states[:, :, None, :2]
     bearing = wrap(torch.atan2(gap[..., 1], gap[..., 0]) - heading)
-    end = torch.stack([heading + 2 * bearing, heading + bearing, aim[..., 2]], -1).flatten(2)
-    heading, bearing, xy = (x.repeat_interleave(ENDS, 2) for x in (heading, bearing, aim[..., :2]))
-    points, slope = cubic(
-        states[:, :, None, :2].expand_as(xy), heading, xy, end, torch.linspace(0, 1, SAMPLES, device=states.device)
-    )
-    way = torch.nn.functional.pad(points.diff(dim=3).norm(dim=-1).cumsum(-1), (1, 0))
-    return _Ways(points, slope, way, bearing, wrap(end - heading), end)
+    end_heading = torch.stack([heading + 2 * bearing, heading + bearing, meeting[..., 2]], -1).flatten(2)
+    heading, bearing, xy = (x.repeat_interleave(ENDS, 2) for x in (heading, bearing, meeting[..., :2]))
+    start, u = states[:, :, None, :2].expand_as(xy), torch.linspace(0, 1, SAMPLES, device=states.device)
+    points, tangents = cubic(start, heading, xy, end_heading, u)
+    length = torch.nn.functional.pad(points.diff(dim=3).norm(dim=-1).cumsum(-1), (1, 0))
+    return _Paths(points, tangents, length, bearing, wrap(end_heading - heading), end_heading)
 
 
-def _lateral(ways: _Ways, v: Tensor, accel: Tensor) -> tuple[Tensor, Tensor]:
-    """Largest lateral acceleration [m/s^2] and curvature [1/m] (both [B, M, O]) on ways entered at speed v [B, M, 1]
-    and driven at accel [B, M, O]."""
-    turn = wrap(torch.atan2(ways.slope[..., 1], ways.slope[..., 0]).diff(dim=-1))
-    curvature = (turn / ways.way.diff(dim=-1).clamp(min=0.1)).abs()
-    squared = (v[..., None] ** 2 + 2 * accel[..., None] * ways.way[..., 1:]).clamp(min=0)
+def _lateral(paths: _Paths, speed: Tensor, accel: Tensor) -> tuple[Tensor, Tensor]:
+    """Largest lateral acceleration [m/s^2] and curvature [1/m] (both [B, M, O]) on paths entered at speed [B, M, 1] and
+    driven at accel [B, M, O].
+    """
+    turn = wrap(torch.atan2(paths.tangents[..., 1], paths.tangents[..., 0]).diff(dim=-1))
+    curvature = (turn / paths.length.diff(dim=-1).clamp(min=0.1)).abs()
+    squared = (speed[..., None] ** 2 + 2 * accel[..., None] * paths.length[..., 1:]).clamp(min=0)
     return (squared * curvature).amax(-1), curvature.amax(-1)
 
 
-def _clear(ways: _Ways, gone: Tensor, size: Tensor, others: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    """Bool [B, M, O]: vehicles that have gone `gone` [B, M, O, W] m of their ways (< 0: arrived) touch none of the
-    others (states [B, M, J, W, 4], sizes [B, M, J, 2], presence [B, M, J])."""
-    index = torch.searchsorted(ways.way.contiguous(), gone.contiguous()).clamp(0, SAMPLES - 1)
+def _clear(paths: _Paths, travelled: Tensor, size: Tensor, others: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    """Bool [B, M, O]: after `travelled` [B, M, O, W] m of their paths (< 0: arrived) vehicles touch none of the others.
+
+    others: states [B, J, W, 4] at the same moments and sizes [B, J, 2] of everybody, and who counts [B, M, J] bool.
+    """
+    index = torch.searchsorted(paths.length.contiguous(), travelled.contiguous()).clamp(0, SAMPLES - 1)
     index = index[..., None].expand(*index.shape, 2)
-    slope = ways.slope.gather(3, index)
-    heading = torch.atan2(slope[..., 1:], slope[..., :1])
-    pose = torch.cat([ways.points.gather(3, index), heading, torch.zeros_like(heading)], -1)
-    states, sizes, there = others
-    hit = overlap(
-        pose[:, :, :, None], (size + ROOM)[:, :, None, None, None], states[:, :, None], sizes[:, :, None, :, None]
-    )
-    return ~(hit & there[:, :, None, :, None] & (gone >= 0)[:, :, :, None]).flatten(3).any(-1)
+    tangent = paths.tangents.gather(3, index)
+    heading = torch.atan2(tangent[..., 1:], tangent[..., :1])
+    pose = torch.cat([paths.points.gather(3, index), heading, torch.zeros_like(heading)], -1)
+    states, sizes, counts = others
+    boxes = (pose[:, :, :, None], (size + CLEARANCE)[:, :, None, None, None])
+    hit = overlap(*boxes, states[:, None, None], sizes[:, None, None, :, None])
+    return ~(hit & counts[:, :, None, :, None] & (travelled >= 0)[:, :, :, None]).flatten(3).any(-1)
 
 
 def intercept(
-    scene: TensorDictBase,
-    states: Tensor,
-    size: Tensor,
-    target: Tensor,
-    target_size: Tensor,
-    eta: Tensor,
-    others: tuple[Tensor, Tensor, Tensor],
-    settings: InterceptionSettings,
+    world: World, index: Tensor, target: Tensor, expected: Tensor, eta: Tensor, settings: InterceptionSettings
 ) -> Interception:
-    """The cheapest interception of each vehicle.
+    """The cheapest interception by each of vehicles index [B, M] of its target [B, M], at intensities eta [B].
 
-    states [B, M, 4], size [B, M, 2]; target [B, M, H, 4]: where its target will be at steps 1..H, target_size; eta [B];
-    others: whom it must not touch on the way, their states [B, M, J, H, 4], sizes [B, M, J, 2] and presence [B, M, J].
+    expected [B, V, H, 4]: states of everybody at steps 1..H; on the way nobody but the target is touched.
     """
+    scene, vehicles = world.scene, expected.shape[1]
+    states, target_states = take(world.states, index), take(expected, target)
+    size, target_size = take(scene["size"], index), take(scene["size"], target)
     steps = torch.arange(KNOT_STEPS, round(settings.reach / DT) + 1, KNOT_STEPS, device=states.device)
-    aim, moments = target[:, :, steps - 1], DT * steps
-    ways, v = _ways(states, aim), states[:, :, None, 3]
-    time = moments.repeat_interleave(ENDS).expand_as(ways.bearing)
+    meeting, times = target_states[:, :, steps - 1], DT * steps
+    paths, v = _paths(states, meeting), states[:, :, None, 3]
+    time = times.repeat_interleave(ENDS).expand_as(paths.bearing)
     # Boxes that move alike touch before their centres meet.
-    alike = wrap(ways.end - aim[..., 2].repeat_interleave(ENDS, -1)).cos().clamp(min=0) ** 2
-    length = ways.way[..., -1] - 0.4 * (size[..., 0] + target_size[..., 0])[..., None] * alike
+    alike = wrap(paths.end_heading - meeting[..., 2].repeat_interleave(ENDS, -1)).cos().clamp(min=0) ** 2
+    length = paths.length[..., -1] - 0.4 * (size[..., 0] + target_size[..., 0])[..., None] * alike
     accel = 2 * (length.clamp(min=0) - v * time) / time**2
-    lateral, curvature = _lateral(ways, v, accel)
+    lateral, curvature = _lateral(paths, v, accel)
     field, origin, dial = scene["field"], scene["field_origin"], eta[:, None, None]
     allowed = off_road(states[..., :2], field, origin).clamp(min=settings.shoulder)[..., None]
     ok = (accel <= settings.push * dial) & (accel >= -settings.brake * dial) & (v + accel * time >= 0)
     ok &= (lateral <= settings.lateral * dial) & (curvature < MAX_CURVATURE)
-    ok &= (ways.bearing.abs() < MAX_BEARING) & (ways.turn.abs() < MAX_TURN)
-    ok &= off_road(ways.points, field, origin).amax(-1) <= allowed
-    gone = (v[..., None] * moments + 0.5 * accel[..., None] * moments**2).clamp(min=0)
-    gone = gone.masked_fill(moments >= time[..., None], -1.0)
-    ok &= _clear(ways, gone, size, (others[0][:, :, :, steps - 1], *others[1:]))
+    ok &= (paths.bearing.abs() < MAX_BEARING) & (paths.turn.abs() < MAX_TURN)
+    ok &= off_road(paths.points, field, origin).amax(-1) <= allowed
+    travelled = (v[..., None] * times + 0.5 * accel[..., None] * times**2).clamp(min=0)
+    travelled = travelled.masked_fill(times >= time[..., None], -1.0)
+    row = torch.arange(vehicles, device=index.device)
+    counts = world.valid[:, None, :vehicles] & (row != index[..., None]) & (row != target[..., None])
+    ok &= _clear(paths, travelled, size, (expected[:, :, steps - 1], scene["size"][:, :vehicles], counts))
     cost = settings.accel_cost * accel.abs() + settings.lateral_cost * lateral + settings.time_cost * time
-    cost = cost - settings.preference
-    return _cheapest(ways, accel, time, cost.masked_fill(~ok, torch.inf), scene["route_points"].shape[3])
+    cost, pick = (cost - settings.preference).masked_fill(~ok, torch.inf).min(-1)
+    knot_times = DT * KNOT_STEPS * torch.arange(1, HORIZON // KNOT_STEPS + 1, device=cost.device)
+    knots = take_route(accel, pick)[..., None] * (knot_times <= take_route(time, pick)[..., None])
+    points, length, heading = (take_route(x, pick) for x in (paths.points, paths.length, paths.end_heading))
+    return Interception(_resampled(points, length, heading, scene["route_points"].shape[3]), knots, cost)
 
 
-def _cheapest(ways: _Ways, accel: Tensor, time: Tensor, cost: Tensor, vertices: int) -> Interception:
-    cost, pick = cost.min(-1)
-
-    def best(values: Tensor) -> Tensor:
-        index = pick.view(*pick.shape, *[1] * (values.dim() - 2)).expand(*pick.shape, 1, *values.shape[3:])
-        return values.gather(2, index)[:, :, 0]
-
-    at = DT * KNOT_STEPS * torch.arange(1, HORIZON // KNOT_STEPS + 1, device=cost.device)
-    knots = best(accel)[..., None] * (at <= best(time)[..., None])
-    return Interception(_resampled(best(ways.points), best(ways.way), best(ways.end), vertices), knots, cost)
-
-
-def _resampled(points: Tensor, way: Tensor, heading: Tensor, count: int) -> Tensor:
-    """Vertices [B, M, count, 2] every SPACING m along polylines points [B, M, U, 2] of lengths way [B, M, U], then
-    straight on along heading [B, M]."""
-    s = SPACING * torch.arange(count, device=points.device, dtype=points.dtype).expand(*way.shape[:2], count)
-    after = torch.searchsorted(way.contiguous(), s.contiguous(), right=True).clamp(1, SAMPLES - 1)
-    low, high = way.gather(-1, after - 1), way.gather(-1, after)
+def _resampled(points: Tensor, length: Tensor, heading: Tensor, count: int) -> Tensor:
+    """Vertices [B, M, count, 2] every SPACING m along polylines points [B, M, U, 2] of cumulative length [B, M, U],
+    then straight on along heading [B, M].
+    """
+    s = SPACING * torch.arange(count, device=points.device, dtype=points.dtype).expand(*length.shape[:2], count)
+    after = torch.searchsorted(length.contiguous(), s.contiguous(), right=True).clamp(1, SAMPLES - 1)
+    low, high = length.gather(-1, after - 1), length.gather(-1, after)
     share = ((s - low) / (high - low).clamp(min=1e-6)).clamp(max=1.0)
     a, b = (points.gather(2, i[..., None].expand(*i.shape, 2)) for i in (after - 1, after))
-    beyond = (s - way[..., -1:]).clamp(min=0)
-    return a + share[..., None] * (b - a) + beyond[..., None] * _direction(heading)[:, :, None]
+    beyond = (s - length[..., -1:]).clamp(min=0)
+    return a + share[..., None] * (b - a) + beyond[..., None] * direction(heading)[:, :, None]

@@ -1,15 +1,23 @@
-"""Coarse motion along routes, shared by feasibility, skeleton and anchoring: what a vehicle could reach and by when."""
+"""What feasibility, skeleton and anchoring share: picking vehicles, and coarse motion along routes."""
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from e2rl.prior.lane_relative import lateral_horizon
+from e2rl.prior.routed import take_route
 from e2rl.scene.route import interpolate, project
+from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
+
+# What any vehicle is assumed to be able to do: the braking and acceleration of a passenger car, urban speeds.
+MAX_BRAKING = 5.0  # m/s^2
+MAX_ACCELERATION = 4.0  # m/s^2
+TOP_SPEED = 25.0  # m/s up to which vehicles accelerate; a faster one keeps its speed
 
 
 def compact(mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Slots of the true entries of mask [B, V]: index [B, M] int64 (ascending, true ones first), present [B, M] bool.
+    """The true entries of mask [B, V] as M slots: index [B, M] int64 (ascending, true ones first), present [B, M] bool.
 
     M is the largest count of the batch, at least 1.
     """
@@ -25,70 +33,82 @@ def take(values: Tensor, index: Tensor) -> Tensor:
     return values.gather(1, index.reshape(*index.shape, *[1] * (values.dim() - 2)).expand(shape))
 
 
-def place(values: Tensor, routes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Where states values [B, M, 4] lie on routes [B, M, R, P, 2].
+def put(values: Tensor, index: Tensor, mask: Tensor, rows: Tensor) -> Tensor:
+    """values [B, V, ...] with rows [B, M, ...] at index [B, M] where mask [B, M]."""
+    ones = [1] * (values.dim() - 2)
+    at = index.view(*index.shape, *ones).expand(*index.shape, *values.shape[2:])
+    return values.scatter(1, at, torch.where(mask.view(*mask.shape, *ones), rows, values.gather(1, at)))
 
-    Returns arc length s [m], lateral offset d [m, left positive] and heading error [rad, in -pi..pi], each [B, M, R].
+
+def smallest(mask: Tensor, key: Tensor, count: int) -> Tensor:
+    """The `count` members of mask [..., V] of smallest key [..., V]; ties by index."""
+    order = key.masked_fill(~mask, torch.inf).argsort(dim=-1, stable=True)
+    return mask & (order.argsort(-1) < count)
+
+
+def direction(heading: Tensor) -> Tensor:
+    """Unit vectors [..., 2] of headings [...] in rad."""
+    return torch.stack([heading.cos(), heading.sin()], -1)
+
+
+def frenet_pose(states: Tensor, routes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Arc length s [m], lateral offset d [m, left positive] and heading error [rad] of states [B, M, 4] on routes
+    [B, M, R, P, 2]; each [B, M, R].
     """
-    s, d, heading = project(values[:, :, None, None, :2], routes)
-    error = torch.remainder(values[:, :, None, 2] - heading[..., 0] + torch.pi, 2 * torch.pi) - torch.pi
-    return s[..., 0], d[..., 0], error
+    s, d, heading = project(states[:, :, None, None, :2], routes)
+    return s[..., 0], d[..., 0], wrap(states[:, :, None, 2] - heading[..., 0])
 
 
-def fade(travelled: Tensor, speed: Tensor) -> Tensor:
-    """Share of a lateral offset that is left after `travelled` m: quintic, done within 4 s of way (10 to 80 m)."""
-    u = (travelled / (4 * speed).clamp(10.0, 80.0)).clamp(0, 1)
+def remaining_offset(travelled: Tensor, speed: Tensor) -> Tensor:
+    """Share of a lateral offset that is left after `travelled` m: a quintic over the prior's lateral horizon."""
+    u = (travelled / lateral_horizon(speed)).clamp(0, 1)
     return 1 - u**3 * (10 + u * (6 * u - 15))
 
 
-def ride(route: Tensor, s: Tensor, d: Tensor, speed: Tensor) -> Tensor:
-    """States [..., K, 4] at arc lengths s [..., K] of route [..., P, 2], offset d [..., K], with speed [..., K]."""
+def states_on_route(route: Tensor, s: Tensor, d: Tensor, speed: Tensor) -> Tensor:
+    """States [..., K, 4] at arc lengths s [..., K] and lateral offsets d [..., K] of route [..., P, 2], at `speed`."""
     xy, heading, _ = interpolate(route, s)
     normal = torch.stack([-heading.sin(), heading.cos()], -1)
     return torch.cat([xy + d[..., None] * normal, heading[..., None], speed.expand(s.shape)[..., None]], -1)
 
 
-def cruise(scene: TensorDictBase, world: World, times: Tensor) -> Tensor:
-    """Every vehicle at its present speed along the route it follows (straight on where it has none) -> [B, V, K, 4].
+def constant_speed_states(scene: TensorDictBase, world: World, times: Tensor) -> Tensor:
+    """States [B, V, K, 4] of all vehicles at `times` [K] s from now, each at its present speed along its route.
 
-    times [K] s from now. The offset from the route fades as in the prior.
+    Vehicles without a route go straight on. Lateral offsets vanish as in the prior's plans.
     """
-    vehicles = scene["route_points"].shape[1]
-    states = world.states[:, :vehicles]
-    choice = world.route.clamp(min=0)[..., None]
-    has = scene["route_valid"].gather(2, choice)[..., 0] & (world.route >= 0)
-    route = scene["route_points"].gather(2, choice[..., None, None].expand(-1, -1, 1, *scene["route_points"].shape[3:]))
-    route = route[:, :, 0]
+    states = world.states[:, : scene["route_points"].shape[1]]
+    chosen = world.route.clamp(min=0)
+    has_route = take_route(scene["route_valid"], chosen) & (world.route >= 0)
+    route = take_route(scene["route_points"], chosen)
     s, d, _ = project(states[:, :, None, :2], route)
     speed = states[..., 3:]
     travelled = speed * times
-    riding = ride(route, s + travelled, d * fade(travelled, speed), speed)
-    forward = torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)[:, :, None]
-    rest = states[:, :, None, 2:].expand(*travelled.shape, 2)
-    straight = torch.cat([states[:, :, None, :2] + travelled[..., None] * forward, rest], -1)
-    return torch.where(has[..., None, None], riding, straight)
+    along = states_on_route(route, s + travelled, d * remaining_offset(travelled, speed), speed)
+    xy = states[:, :, None, :2] + travelled[..., None] * direction(states[..., 2])[:, :, None]
+    straight = torch.cat([xy, states[:, :, None, 2:].expand(*travelled.shape, 2)], -1)
+    return torch.where(has_route[..., None, None], along, straight)
 
 
-def arrival_window(distance: Tensor, speed: Tensor, brake: float, push: float, top: float) -> tuple[Tensor, Tensor]:
-    """Earliest and latest time [s] at which a vehicle can be `distance` m further on (<= 0: now); latest is inf if it
-    can stop before.
+def arrival_window(distance: Tensor, speed: Tensor, acceleration: float = MAX_ACCELERATION) -> tuple[Tensor, Tensor]:
+    """Earliest and latest time [s] at which a vehicle at `speed` can have driven `distance` m (0 for distances <= 0).
 
-    brake, push > 0: largest deceleration and acceleration [m/s^2]; top: speed [m/s] above which it does not accelerate.
+    The earliest is at full acceleration up to TOP_SPEED; the latest at full braking, inf where it can stop before.
     """
     x = distance.clamp(min=0)
-    cap = speed.clamp(min=top)
-    ramp = (cap**2 - speed**2) / (2 * push)
-    pushing = ((speed**2 + 2 * push * torch.minimum(x, ramp)).sqrt() - speed) / push
-    earliest = pushing + (x - ramp).clamp(min=0) / cap
-    rest = speed**2 - 2 * brake * x
-    latest = torch.where((rest > 0) | (distance <= 0), (speed - rest.clamp(min=0).sqrt()) / brake, torch.inf)
+    cap = speed.clamp(min=TOP_SPEED)
+    ramp = (cap**2 - speed**2) / (2 * acceleration)
+    accelerating = ((speed**2 + 2 * acceleration * torch.minimum(x, ramp)).sqrt() - speed) / acceleration
+    earliest = accelerating + (x - ramp).clamp(min=0) / cap
+    rest = speed**2 - 2 * MAX_BRAKING * x
+    latest = torch.where((rest > 0) | (distance <= 0), (speed - rest.clamp(min=0).sqrt()) / MAX_BRAKING, torch.inf)
     return earliest, torch.where(distance <= 0, 0.0, latest)
 
 
-def reach(speed: Tensor, times: Tensor, brake: float, push: float, top: float) -> tuple[Tensor, Tensor]:
-    """Least and largest way [m] that a vehicle can have gone after `times` s; arguments as in arrival_window."""
-    stop = torch.minimum(times, speed / brake)
-    least = speed * stop - 0.5 * brake * stop**2
-    cap = speed.clamp(min=top)
-    ramp = torch.minimum(times, (cap - speed) / push)
-    return least, speed * ramp + 0.5 * push * ramp**2 + cap * (times - ramp)
+def reachable_distance(speed: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+    """Least and largest distance [m] that a vehicle at `speed` can have driven after `times` s."""
+    stop = torch.minimum(times, speed / MAX_BRAKING)
+    least = speed * stop - 0.5 * MAX_BRAKING * stop**2
+    cap = speed.clamp(min=TOP_SPEED)
+    ramp = torch.minimum(times, (cap - speed) / MAX_ACCELERATION)
+    return least, speed * ramp + 0.5 * MAX_ACCELERATION * ramp**2 + cap * (times - ramp)

@@ -1,30 +1,31 @@
-"""Who applies the criteria of Sec. IV-A2: the rules, or a language model behind their interface.
+"""Who applies the criteria of Sec. IV-A2: the rules of feasibility.py, or a language model in their place.
 
-The model is asked about all vehicles of a scene in one request, about the scenes of a batch at the same time. Its
-answers are kept on disk by content. Wherever it fails, the rules decide for that scene, and this is counted.
+The model is asked about all vehicles of a scene in one request, and about the scenes of a batch in parallel. Answers
+are cached on disk by content. Where a request fails, the rules decide for that scene, and this is counted.
 """
 
 import hashlib
 import json
-import os
-import tempfile
 import threading
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 
 from e2rl.errors import InputError
+from e2rl.files import write_atomically
+from e2rl.settings import check_choice, check_range
 from e2rl.sim.world import World
-from e2rl.synthesizer.description import describe_ego, describe_vehicle, present_vehicles
+from e2rl.synthesizer.description import describe
 from e2rl.synthesizer.feasibility import Feasibility, FeasibilitySettings, feasible_vehicles
 from e2rl.synthesizer.prompt import SCHEMA, Verdicts, messages, read_answer
 
-KINDS = ("rules", "lm")
 FORMAT = {"type": "json_schema", "json_schema": {"name": "feasibility", "strict": True, "schema": SCHEMA}}
 COUNTS = ("lm_scenes", "lm_requests", "lm_cached", "lm_fallbacks")
 Reasoner = Callable[[TensorDictBase, World, FeasibilitySettings], Feasibility]
@@ -32,7 +33,7 @@ Reasoner = Callable[[TensorDictBase, World, FeasibilitySettings], Feasibility]
 
 @dataclass(frozen=True)
 class ReasonerSettings:
-    """Fields: `reasoner` in conf/synthesizer/e2.yaml."""
+    """Settings of the reasoner; conf/synthesizer/e2.yaml explains each."""
 
     kind: str = "rules"
     model: str | None = None
@@ -43,12 +44,11 @@ class ReasonerSettings:
     cache: str = ".cache/reasoner"
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise InputError(f"synthesizer.reasoner.kind={self.kind}: choose one of {', '.join(KINDS)}")
+        check_choice("synthesizer.reasoner.kind", self.kind, ("rules", "lm"))
+        for name, low in (("timeout", 1e-3), ("retries", 0), ("workers", 1)):
+            check_range(f"synthesizer.reasoner.{name}", getattr(self, name), low)
         if self.kind == "lm" and not self.model:
             raise InputError("synthesizer.reasoner.kind=lm: name a model with synthesizer.reasoner.model=NAME")
-        if self.timeout <= 0 or self.retries < 0 or self.workers < 1:
-            raise InputError("synthesizer.reasoner: timeout must be positive, retries at least 0, workers at least 1")
 
 
 def build_reasoner(settings: ReasonerSettings, statistics: dict[str, float]) -> Reasoner:
@@ -59,40 +59,37 @@ def build_reasoner(settings: ReasonerSettings, statistics: dict[str, float]) -> 
 class LanguageReasoner:
     """Asks an OpenAI-compatible endpoint; called as `feasible_vehicles` is.
 
-    statistics: lm_scenes judged, lm_requests sent, lm_cached answers, lm_fallbacks (scenes that the rules decided). The
-    first fallback warns, and every tenfold of it.
+    statistics: lm_scenes judged, lm_requests sent, lm_cached answers, lm_fallbacks (scenes that the rules decided).
+    Warns of the 1st, 10th, 100th, ... fallback. Raises InputError without the client, a key or a writable cache.
     """
 
     def __init__(self, settings: ReasonerSettings, statistics: dict[str, float]) -> None:
+        where = "synthesizer.reasoner.kind=lm"
         try:
             import openai
         except ImportError as error:
-            raise InputError(
-                "synthesizer.reasoner.kind=lm: the openai client is not installed; install e2rl with its "
-                "extra: pip install 'e2rl[lm]'"
-            ) from error
+            reason = "the openai client is not installed; install e2rl with its extra: pip install 'e2rl[lm]'"
+            raise InputError(f"{where}: {reason}") from error
+        base_url, timeout = settings.base_url, settings.timeout
         try:
-            self._client = openai.OpenAI(
-                base_url=settings.base_url, timeout=settings.timeout, max_retries=settings.retries
-            )
+            self._client = openai.OpenAI(base_url=base_url, timeout=timeout, max_retries=settings.retries)
         except openai.OpenAIError as error:
-            raise InputError(
-                f"synthesizer.reasoner.kind=lm: {str(error).splitlines()[0]} (for an endpoint without "
-                "keys any OPENAI_API_KEY will do)"
-            ) from error
+            reason = f"{str(error).splitlines()[0]} (for an endpoint without keys any OPENAI_API_KEY will do)"
+            raise InputError(f"{where}: {reason}") from error
         self._failures = (openai.OpenAIError, ValueError)
         self.settings, self.statistics, self._lock = settings, statistics, threading.Lock()
         statistics.update({name: statistics.get(name, 0) for name in COUNTS})
 
     def __call__(self, scene: TensorDictBase, world: World, settings: FeasibilitySettings) -> Feasibility:
-        """Feasible vehicles of scenes [B]: the model's three criteria where it answers, the rules' otherwise. The
-        conflict table is always the rules', and so is that neither the ego nor parked vehicles are feasible."""
+        """Feasible vehicles of scenes [B]: by the model's verdicts on the three criteria, or the rules' where it fails.
+
+        The conflict points are always the rules', and neither the ego nor parked vehicles are ever feasible.
+        """
         rules = feasible_vehicles(scene, world, settings)
-        verdicts = self.judge(scene, world, rules)
         criteria = torch.stack([rules.associated, rules.conflicting, rules.relevant], -1).cpu()
-        for row, found in enumerate(verdicts):
-            if found:
-                criteria[row, list(found)] = torch.tensor(list(found.values()))
+        for row, verdicts in enumerate(self.judge(scene, world, rules)):
+            if verdicts:
+                criteria[row, list(verdicts)] = torch.tensor(list(verdicts.values()))
         criteria = criteria.to(rules.mask.device)
         vehicles = rules.mask.shape[1]
         mask = criteria.all(-1) & world.valid[:, :vehicles] & ~scene["parked"][:, :vehicles]
@@ -102,47 +99,44 @@ class LanguageReasoner:
 
     def judge(self, scene: TensorDictBase, world: World, rules: Feasibility) -> list[Verdicts | None]:
         """Per scene [B] the model's verdicts ({} where there is nobody to ask about), or None where it failed."""
-        asked = []
-        for row in range(len(world.step)):
-            present = present_vehicles(scene, world, row)
-            texts = {vehicle: describe_vehicle(scene, world, rules, row, vehicle) for vehicle in present}
-            asked.append((describe_ego(scene, world, row), texts))
+        described = [describe(scene, world, rules.conflicts, row) for row in range(len(world.step))]
         with ThreadPoolExecutor(self.settings.workers) as pool:
-            return list(pool.map(lambda scene_text: self._verdicts(*scene_text), asked))
+            return list(pool.map(self._verdicts, *zip(*described, strict=True)))
 
     def _verdicts(self, ego: str, vehicles: dict[int, str]) -> Verdicts | None:
+        """Verdicts on one scene, from the cache or the endpoint."""
         if not vehicles:
             return {}
         self._count("lm_scenes")
         chat = messages(ego, vehicles)
         path = self._path(chat)
-        try:
-            if path.is_file():
-                found = read_answer(path.read_text(), list(vehicles))
-                self._count("lm_cached")
-                return found
-        except (OSError, ValueError):
-            path.unlink(missing_ok=True)  # damaged: ask again
+        with suppress(OSError, ValueError):  # no answer yet, or a damaged one: ask
+            verdicts = read_answer(path.read_text(), list(vehicles))
+            self._count("lm_cached")
+            return verdicts
         try:
             self._count("lm_requests")
             answer = self._ask(chat)
-            found = read_answer(answer, list(vehicles))
+            verdicts = read_answer(answer, list(vehicles))
         except self._failures as error:
             self._fell_back(error)
             return None
-        _write(path, answer)
-        return found
+        try:
+            write_atomically(path, answer)
+        except OSError as error:
+            where = f"synthesizer.reasoner.cache={path.parent}"
+            raise InputError(f"{where}: cannot be written ({error}); pass a writable folder") from error
+        return verdicts
 
     def _ask(self, chat: list[dict[str, str]]) -> str:
-        done = self._client.chat.completions.create(
-            model=self.settings.model, messages=chat, temperature=0, response_format=FORMAT
-        )
-        if not getattr(done, "choices", None) or not done.choices[0].message.content:
+        request: dict[str, Any] = {"model": self.settings.model, "messages": chat, "response_format": FORMAT}
+        completion = self._client.chat.completions.create(**request, temperature=0)
+        if not getattr(completion, "choices", None) or not completion.choices[0].message.content:
             raise ValueError("the endpoint sent no answer")
-        return done.choices[0].message.content
+        return completion.choices[0].message.content
 
     def _path(self, chat: list[dict[str, str]]) -> Path:
-        """Where the answer to a chat is kept: by endpoint, model, prompt, description and schema."""
+        """The cache file of a chat: by endpoint, model, prompt, description and schema."""
         key = json.dumps([self.settings.base_url, self.settings.model, chat, FORMAT], sort_keys=True)
         return Path(self.settings.cache) / f"{hashlib.sha256(key.encode()).hexdigest()}.json"
 
@@ -154,23 +148,6 @@ class LanguageReasoner:
     def _fell_back(self, error: Exception) -> None:
         count = self._count("lm_fallbacks")
         if str(count).rstrip("0") == "1":
-            what = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-            warnings.warn(
-                f"language-model reasoner: the rules decided for {count} of "
-                f"{self.statistics['lm_scenes']} scenes so far ({what})",
-                stacklevel=2,
-            )
-
-
-def _write(path: Path, text: str) -> None:
-    """Whole or not at all; InputError where the folder cannot be written."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".part-")
-        with os.fdopen(handle, "w") as file:
-            file.write(text)
-        os.replace(name, path)
-    except OSError as error:
-        raise InputError(
-            f"synthesizer.reasoner.cache={path.parent}: cannot be written ({error}); pass a writable folder"
-        ) from error
+            reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+            scenes = f"{count} of {self.statistics['lm_scenes']} scenes so far"
+            warnings.warn(f"language-model reasoner: the rules decided for {scenes} ({reason})", stacklevel=2)

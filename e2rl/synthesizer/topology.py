@@ -1,11 +1,12 @@
-"""Who is entangled with the ego: risk graphs of a reference rollout, their cliques and a score over time (Sec. IV-A1).
+"""Topological bifurcation (Sec. IV-A1): the vehicles that a reference rollout entangles with the ego.
 
-Batched over scenes and steps up to the adjacency; cliques are enumerated on the host by networkx.
+Pairs are weighted by their time to collision (eq. ttc_weight), the maximal cliques of each step's risk graph are ranked
+by mean weight, and members of the top cliques score over time (eq. temporal_scoring). Batched up to the adjacency;
+networkx enumerates the cliques on the host.
 
-Only maximal cliques compete. Ranked by mean weight, a clique always has a pair that weighs at least as much, so listing
-sub-cliques would leave nothing but pairs; ranked by sum, a maximal clique outweighs its own sub-cliques, which would
-fill the top places with the same vehicles again. A sub-clique enters only in the place of a maximal clique that is
-larger than `max_clique` (a queue, a pile of parked cars): its heaviest members, the ego kept.
+Only maximal cliques compete: the mean weight of a sub-clique's best pair is never below the clique's, so ranking all of
+them would leave pairs only. Cliques larger than `max_clique` (a queue, a pile of parked cars) are cut down to their
+heaviest members, the ego kept.
 """
 
 from dataclasses import dataclass
@@ -17,7 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from e2rl.errors import InputError
+from e2rl.settings import check_range
+from e2rl.synthesizer.motion import smallest
 
 
 @dataclass(frozen=True)
@@ -32,97 +34,63 @@ class TopologySettings:
     edge_threshold: float = 0.1
     max_nodes: int = 24
     max_clique: int = 4
-    clique_weight: str = "mean"
-    ego_relevance: bool = True
     max_hops: int = 2
     top_cliques: int = 3
     candidates: int = 10
 
-    def __post_init__(self):
-        if self.clique_weight not in ("mean", "sum"):
-            raise InputError(f"synthesizer.topology.clique_weight is {self.clique_weight!r}; choose mean or sum")
-        if self.stride < 1 or self.beta <= 0 or self.clearance < 0 or not 0 < self.edge_threshold < 1:
-            raise InputError(
-                "synthesizer.topology needs stride >= 1, beta > 0, clearance >= 0 and edge_threshold "
-                f"between 0 and 1; it has {self.stride}, {self.beta}, {self.clearance}, "
-                f"{self.edge_threshold}"
-            )
-        if self.max_nodes < 2 or self.max_clique < 2:
-            raise InputError(
-                "synthesizer.topology.max_nodes and max_clique must be at least 2, the ego and another; "
-                f"they are {self.max_nodes} and {self.max_clique}"
-            )
+    def __post_init__(self) -> None:
+        for name, low in (("stride", 1), ("clearance", 0), ("max_nodes", 2), ("max_clique", 2), ("beta", 1e-3)):
+            check_range(f"synthesizer.topology.{name}", getattr(self, name), low)
+        check_range("synthesizer.topology.edge_threshold", self.edge_threshold, 1e-6, 1 - 1e-6)
 
 
 @dataclass(frozen=True)
 class TopologyResult:
-    """score [B, V] f_i of eq. (temporal_scoring), the ego's own count included; candidates [B, V] bool S_top, never the
-    ego; weights [B, T', V, V] pair risks at the steps looked at, steps [T'] int64; edges, cliques [B, T'] int64:
-    numbers of graph edges and of cliques that competed; groups[b][t']: the top cliques, each a tuple of vehicle
-    indices.
+    """score [B, V]: f_i of eq. (temporal_scoring), the ego's own included; candidates [B, V] bool: S_top, never the
+    ego; weights [B, T', V, V]: pair risks at the steps [T'] int64 analysed; cliques[b][t']: the top cliques of a step,
+    each a tuple of vehicle indices.
     """
 
     score: Tensor
     candidates: Tensor
     weights: Tensor
     steps: Tensor
-    edges: Tensor
-    cliques: Tensor
-    groups: list[list[list[tuple[int, ...]]]]
+    cliques: list[list[list[tuple[int, ...]]]]
 
 
-def _axis_interval(states: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
-    """Times [..., N, N] between which boxes i and j overlap on both axes of box i; (inf, -inf) where they never do."""
-    cos, sin = states[..., 2].cos(), states[..., 2].sin()
-    vx, vy = cos * states[..., 3], sin * states[..., 3]
-    x, y = states[..., 0], states[..., 1]
-    dx, dy, dvx, dvy = (value[..., None, :] - value[..., :, None] for value in (x, y, vx, vy))
-    ci, si = cos[..., :, None], sin[..., :, None]
-    turn_cos = (ci * cos[..., None, :] + si * sin[..., None, :]).abs()
-    turn_sin = (ci * sin[..., None, :] - si * cos[..., None, :]).abs()
-    length, width = (size[..., k] / 2 for k in (0, 1))
-    other_length, other_width = length[..., None, :], width[..., None, :]
-    first = last = None
-    for place, speed, extent in (
-        (
-            ci * dx + si * dy,
-            ci * dvx + si * dvy,
-            length[..., :, None] + turn_cos * other_length + turn_sin * other_width,
-        ),
-        (
-            ci * dy - si * dx,
-            ci * dvy - si * dvx,
-            width[..., :, None] + turn_sin * other_length + turn_cos * other_width,
-        ),
-    ):
-        still = speed.abs() < 1e-6  # then the projections overlap always or never
-        inverse = 1 / torch.where(still, 1.0, speed)
-        middle, spread = -place * inverse, extent * inverse.abs()
-        spread = torch.where(still, torch.where(place.abs() <= extent, torch.inf, -torch.inf), spread)
-        first = middle - spread if first is None else torch.maximum(first, middle - spread)
-        last = middle + spread if last is None else torch.minimum(last, middle + spread)
-    return first, last
+def _overlap_interval(offset: Tensor, closing: Tensor, extent: Tensor) -> tuple[Tensor, Tensor]:
+    """Times during which |offset + closing t| <= extent; (inf, -inf) for never."""
+    still = closing.abs() < 1e-6  # then the projections overlap always or never
+    inverse = 1 / torch.where(still, 1.0, closing)
+    middle, half = -offset * inverse, extent * inverse.abs()
+    half = torch.where(still, torch.where(offset.abs() <= extent, torch.inf, -torch.inf), half)
+    return middle - half, middle + half
 
 
 def time_to_collision(states: Tensor, size: Tensor, horizon: float = 8.0) -> Tensor:
-    """First contact of oriented boxes at constant velocity and heading, states [..., N, 4], size [..., N, 2] -> s
-    [..., N, N].
+    """Time [s] to the first contact of oriented boxes at constant velocity and heading: states [..., N, 4], size
+    [..., N, 2] -> [..., N, N].
 
-    Separating axes in closed form: on each of the four box normals the projections overlap during one interval of time,
-    and the boxes touch during the intersection of the four. 0 where they overlap now (and for i = j), inf where they do
-    not touch within `horizon` s. Exactly symmetric.
+    Separating axis theorem in closed form: the boxes touch while their projections on all four face normals overlap. 0
+    where they overlap now (and for i = j), inf without contact within `horizon` s. Exactly symmetric.
     """
-    entry, leave = _axis_interval(states, size)
-    entry = torch.maximum(entry, entry.transpose(-1, -2))
-    leave = torch.minimum(leave, leave.transpose(-1, -2))
-    first = entry.clamp(min=0)
-    return torch.where((entry <= leave) & (leave >= 0) & (first <= horizon), first, torch.inf)
+    cos, sin = states[..., 2].cos(), states[..., 2].sin()
+    moving = (states[..., 0], states[..., 1], cos * states[..., 3], sin * states[..., 3])
+    dx, dy, dvx, dvy = (value[..., None, :] - value[..., :, None] for value in moving)
+    ci, si, cj, sj = cos[..., :, None], sin[..., :, None], cos[..., None, :], sin[..., None, :]
+    turn_cos, turn_sin = (ci * cj + si * sj).abs(), (ci * sj - si * cj).abs()
+    half = size / 2
+    (li, wi), (lj, wj) = half[..., :, None, :].unbind(-1), half[..., None, :, :].unbind(-1)
+    along = _overlap_interval(ci * dx + si * dy, ci * dvx + si * dvy, li + turn_cos * lj + turn_sin * wj)
+    across = _overlap_interval(ci * dy - si * dx, ci * dvy - si * dvx, wi + turn_sin * lj + turn_cos * wj)
+    begin, end = torch.maximum(along[0], across[0]), torch.minimum(along[1], across[1])  # on the normals of box i
+    begin, end = torch.maximum(begin, begin.transpose(-1, -2)), torch.minimum(end, end.transpose(-1, -2))
+    first = begin.clamp(min=0)
+    return torch.where((begin <= end) & (end >= 0) & (first <= horizon), first, torch.inf)
 
 
 def pair_weights(states: Tensor, valid: Tensor, size: Tensor, settings: TopologySettings) -> Tensor:
-    """Risk weight of each pair, eq. (ttc_weight): states [..., N, 4], valid [..., N] -> [..., N, N], 0 on the
-    diagonal.
-    """
+    """Risk weights [..., N, N] of eq. (ttc_weight), 0 on the diagonal: states [..., N, 4], valid [..., N] bool."""
     ttc = time_to_collision(states, size + settings.clearance, settings.horizon)
     weight = torch.sigmoid((settings.tau_max - ttc) / settings.beta)
     both = valid[..., :, None] & valid[..., None, :]
@@ -136,8 +104,8 @@ def maximal_cliques(adjacency: bytes, nodes: int) -> tuple[tuple[int, ...], ...]
     return tuple(tuple(sorted(clique)) for clique in networkx.find_cliques(networkx.Graph(edges.tolist())))
 
 
-def _reachable(adjacency: Tensor, hops: int) -> Tensor:
-    """Nodes [..., V] within `hops` edges of node 0."""
+def _within_hops(adjacency: Tensor, hops: int) -> Tensor:
+    """Nodes [..., V] bool within `hops` edges of the ego (node 0)."""
     near = torch.zeros(adjacency.shape[:-1], dtype=torch.bool, device=adjacency.device)
     near[..., 0] = True
     for _ in range(hops):
@@ -145,80 +113,64 @@ def _reachable(adjacency: Tensor, hops: int) -> Tensor:
     return near
 
 
-def _trim(clique: tuple[int, ...], weight: np.ndarray, far: np.ndarray, limit: int) -> tuple[int, ...]:
-    """The `limit` members of a clique with the largest total weight inside it; the ego (0) always stays."""
+def _trim(clique: tuple[int, ...], weight: np.ndarray, distance: np.ndarray, limit: int) -> tuple[int, ...]:
+    """The `limit` members of a clique with the largest total weight inside it; the ego always stays."""
     if len(clique) <= limit:
         return clique
-    bond = {i: round(fsum(weight[i, j] for j in clique), 6) for i in clique}
-    return tuple(sorted(sorted(clique, key=lambda i: (i != 0, -bond[i], far[i], i))[:limit]))
+    total = {i: round(fsum(weight[i, j] for j in clique), 6) for i in clique}
+    return tuple(sorted(sorted(clique, key=lambda i: (i != 0, -total[i], distance[i], i))[:limit]))
 
 
-def _rank(cliques: set[tuple[int, ...]], weight: np.ndarray, far: np.ndarray, settings: TopologySettings):
-    """The heaviest cliques first; equals by their members' mean distance to the ego, then by index."""
+def _top_cliques(graph: tuple[np.ndarray, ...], settings: TopologySettings) -> list[tuple[int, ...]]:
+    """The cliques of largest mean weight in a graph that have a relevant node; ties by distance, then index.
 
-    def key(clique):
-        size = len(clique)
-        total = fsum(weight[i, j] for k, i in enumerate(clique) for j in clique[k + 1 :])
-        if settings.clique_weight == "mean":
-            total /= size * (size - 1) / 2
-        return -round(total, 6), fsum(far[i] for i in clique) / size, clique
-
-    return sorted(cliques, key=key)[: settings.top_cliques]
-
-
-def _step_groups(adjacency, near, weight, far, settings) -> tuple[list[tuple[int, ...]], int]:
-    """Top cliques of one graph [V, V] and the number that competed; near [V]: nodes that make a clique relevant."""
+    graph: adjacency [V, V], relevant nodes [V] bool, weights [V, V], distance [V] of each vehicle to the ego in m.
+    """
+    adjacency, relevant, weight, distance = graph
     nodes = np.flatnonzero(adjacency.any(-1))
     if len(nodes) < 2:
-        return [], 0
+        return []
+
+    def rank(clique: tuple[int, ...]) -> tuple[float, float, tuple[int, ...]]:
+        size = len(clique)
+        total = fsum(weight[i, j] for k, i in enumerate(clique) for j in clique[k + 1 :])
+        return -round(total / (size * (size - 1) / 2), 6), fsum(distance[i] for i in clique) / size, clique
+
     found = maximal_cliques(np.ascontiguousarray(adjacency[np.ix_(nodes, nodes)]).tobytes(), len(nodes))
-    named = (_trim(tuple(int(nodes[i]) for i in clique), weight, far, settings.max_clique) for clique in found)
-    relevant = {clique for clique in named if near[list(clique)].any()}
-    return _rank(relevant, weight, far, settings), len(relevant)
-
-
-def _select(score: Tensor, distance: Tensor, present: Tensor, count: int) -> Tensor:
-    """The `count` vehicles of largest positive score, equals by distance, then by index; never the ego."""
-    allowed = present & (score > 0)
-    allowed[:, 0] = False
-    order = distance.argsort(dim=-1, stable=True)
-    ranked = score.masked_fill(~allowed, -1).gather(-1, order)
-    order = order.gather(-1, ranked.argsort(dim=-1, descending=True, stable=True))
-    rank = order.argsort(-1)
-    return allowed & (rank < count)
+    named = (tuple(int(nodes[i]) for i in clique) for clique in found)
+    trimmed = {_trim(clique, weight, distance, settings.max_clique) for clique in named}
+    return sorted((clique for clique in trimmed if relevant[list(clique)].any()), key=rank)[: settings.top_cliques]
 
 
 def topological_candidates(states: Tensor, valid: Tensor, size: Tensor, settings: TopologySettings) -> TopologyResult:
     """Candidates S_top of a reference rollout (Sec. IV-A1, eqs. ttc_weight and temporal_scoring).
 
-    states [B, T, V, 4], valid [B, T, V] bool, size [B, V, 2]; row 0 is the ego, which is a node of the graphs but
-    never a candidate. Looks at every `stride`-th step; scores count those steps only.
+    states [B, T, V, 4], valid [B, T, V] bool, size [B, V, 2] m; row 0 is the ego, which is a node of the graphs but
+    never a candidate. Every `stride`-th step is analysed and counts once.
     """
     steps = torch.arange(0, states.shape[1], settings.stride, device=states.device)
     states, valid = states[:, steps].detach(), valid[:, steps]
     weights = pair_weights(states, valid, size[:, None].expand(*states.shape[:-1], 2), settings)
     distance = (states[..., :2] - states[..., :1, :2]).norm(dim=-1)
     distance = distance.masked_fill(~valid | ~valid[..., :1], torch.inf)
-    rank = distance.argsort(dim=-1, stable=True).argsort(-1)
-    kept = (rank < settings.max_nodes) & valid
-    adjacency = (weights >= settings.edge_threshold) & kept[..., :, None] & kept[..., None, :]
-    edges = adjacency.sum((-1, -2)) // 2
-    near = kept
-    if settings.ego_relevance:  # members of a relevant clique lie at most one hop beyond its nearest one
-        near = _reachable(adjacency, settings.max_hops)
-        wide = _reachable(adjacency, settings.max_hops + 1)
-        adjacency = adjacency & wide[..., :, None] & wide[..., None, :]
-    host = [x.cpu().numpy() for x in (adjacency.to(torch.uint8), near, weights, distance)]
+    nodes = smallest(valid, distance, settings.max_nodes)
+    adjacency = (weights >= settings.edge_threshold) & nodes[..., :, None] & nodes[..., None, :]
+    # Only cliques with a member within max_hops of the ego count; all their members lie within one hop more.
+    relevant = _within_hops(adjacency, settings.max_hops)
+    nodes = _within_hops(adjacency, settings.max_hops + 1)
+    adjacency = adjacency & nodes[..., :, None] & nodes[..., None, :]
+    host = [x.cpu().numpy() for x in (adjacency.to(torch.uint8), relevant, weights, distance)]
     score = torch.zeros(states.shape[0], states.shape[2])
-    cliques = torch.zeros(states.shape[:2], dtype=torch.int64)
-    groups = []
-    for b in range(states.shape[0]):
-        groups.append([])
-        for t in range(states.shape[1]):
-            top, cliques[b, t] = _step_groups(*(x[b, t] for x in host), settings)
-            groups[b].append(top)
-            for clique in top:
-                score[b, list(clique)] += 1
+    cliques = [
+        [_top_cliques(graph, settings) for graph in zip(*scene, strict=True)] for scene in zip(*host, strict=True)
+    ]
+    for row, scene in zip(score, cliques, strict=True):
+        for clique in (clique for step in scene for clique in step):
+            row[list(clique)] += 1
     score = score.to(states.device)
-    candidates = _select(score, distance.amin(1), valid[:, 0], settings.candidates)
-    return TopologyResult(score, candidates, weights, steps, edges, cliques.to(states.device), groups)
+    # The vehicles of largest positive score; ties by least distance to the ego, then by index.
+    scored = valid[:, 0] & (score > 0)
+    scored[:, 0] = False
+    tie = distance.amin(1).argsort(dim=-1, stable=True).argsort(-1)
+    candidates = smallest(scored, tie - score * score.shape[1], settings.candidates)
+    return TopologyResult(score, candidates, weights, steps, cliques)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from e2rl.ego.idm import LINE_GAP
 from e2rl.prior.bounds import Obstacles, apply_cap, bounded
-from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, decode, locate
+from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, decode, locate, select
 from e2rl.prior.prior import STANDING_SPEED, Prior
 from e2rl.prior.routed import RoutedScene, route_scene, start_state
 from e2rl.scene.route import SPACING
@@ -108,6 +108,4 @@ def _held(motion: LaneState, lane: LaneState, frozen: Tensor) -> LaneState:
     """The motion [B, V, HORIZON] with frozen [B, V] vehicles standing where they are."""
     still = lane.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
     zero = torch.zeros_like(still.v)
-    still = replace(still, v=zero, a=zero)
-    moved = {name: torch.where(frozen[..., None], getattr(still, name), value) for name, value in vars(motion).items()}
-    return LaneState(**moved)
+    return select(frozen, replace(still, v=zero, a=zero), motion)

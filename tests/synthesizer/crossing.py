@@ -6,6 +6,8 @@ import torch
 
 from e2rl.scene.route import SPACING
 from e2rl.sim.world import World
+from e2rl.synthesizer.motion import constant_speed_states
+from e2rl.synthesizer.skeleton import Skeleton, SkeletonSettings, build_skeleton
 from tests.synthetic import BACK, make_scenes
 
 
@@ -54,3 +56,13 @@ def mask(world: World, *vehicles: int) -> torch.Tensor:
     chosen = torch.zeros(world.scene["route_points"].shape[:2], dtype=torch.bool)
     chosen[:, list(vehicles)] = True
     return chosen
+
+
+def skeleton_of(world: World, support: torch.Tensor, feasible: torch.Tensor | None = None, **settings) -> Skeleton:
+    """The skeleton if everybody keeps its speed and the nearest vehicles act on the ego."""
+    chosen = SkeletonSettings(**settings)
+    times = chosen.step * torch.arange(1, 11)
+    distance = (world.states[:, : support.shape[1], :2] - world.states[:, :1, :2]).norm(dim=-1)
+    expected = constant_speed_states(world.scene, world, times)
+    feasible = support if feasible is None else feasible
+    return build_skeleton(world.scene, world, support, feasible, chosen, expected, distance)

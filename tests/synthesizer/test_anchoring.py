@@ -6,11 +6,10 @@ import torch
 from e2rl.errors import InputError
 from e2rl.prior.lane_relative import LaneState, speeds
 from e2rl.scene.recording import DT
-from e2rl.synthesizer.anchoring import AnchorSettings, blend_clean, blend_literal, propose
+from e2rl.synthesizer.anchoring import AnchorSettings, propose
 from e2rl.synthesizer.interception import InterceptionSettings
-from e2rl.synthesizer.motion import cruise
-from e2rl.synthesizer.skeleton import SkeletonSettings, build_skeleton
-from tests.synthesizer.crossing import add_route, make_world, mask
+from e2rl.synthesizer.motion import constant_speed_states
+from tests.synthesizer.crossing import add_route, make_world, mask, skeleton_of
 
 UP = math.pi / 2
 EGO = (0.0, 0.0, 0.0, 10.0)
@@ -35,8 +34,8 @@ def proposed(world, skeleton, plan, settings=None, interception=LANES, eta=2.0, 
 
 def anchored(world, *vehicles, near=2, **settings):
     support = mask(world, *vehicles)
-    skeleton = build_skeleton(world.scene, world, support, support, SkeletonSettings(near=near))
-    plan = cruise(world.scene, world, TIMES)[:, 0]
+    skeleton = skeleton_of(world, support, near=near)
+    plan = constant_speed_states(world.scene, world, TIMES)[:, 0]
     return proposed(world, skeleton, plan, AnchorSettings(**settings)), skeleton
 
 
@@ -54,11 +53,11 @@ def travelled(knots, speed, accel=0.0):
 def test_both_arrive_at_the_crossing_at_once(ahead, way, speed):
     world = make_world([EGO, (ahead, -way, UP, speed)])
     anchor, _ = anchored(world, 1)
-    assert anchor.has[0].tolist() == [False, True] + [False] * 6
+    assert anchor.feasible[0].tolist() == [False, True] + [False] * 6
     gone = travelled(anchor.knots[0, 1], speed)
     arrival = torch.searchsorted(gone, torch.tensor(way)).item() * DT
     assert arrival == pytest.approx(ahead / 10, abs=0.25)
-    assert anchor.cost[0, 1] < 0.25 + 0.2 * anchor.knots[0, 1].abs().max() and not anchor.leaves.any()
+    assert anchor.cost[0, 1] < 0.25 + 0.2 * anchor.knots[0, 1].abs().max() and not anchor.off_lane.any()
 
 
 def test_the_gentlest_of_equal_arrivals_wins():
@@ -70,7 +69,7 @@ def test_the_gentlest_of_equal_arrivals_wins():
 def test_a_leader_brakes_and_a_follower_speeds_up():
     world = make_world([EGO, (25.0, 0.0, 0.0, 10.0), (-20.0, 0.0, 0.0, 10.0)])
     anchor, _ = anchored(world, 1, 2)
-    assert anchor.has[0, 1:3].all()
+    assert anchor.feasible[0, 1:3].all()
     assert anchor.knots[0, 1].mean() < -0.3 and anchor.knots[0, 2].mean() > 0.3
 
 
@@ -85,12 +84,12 @@ def test_the_candidate_that_meets_the_target_is_chosen():
 def test_a_route_that_a_vehicle_would_swing_off_or_cannot_shift_to_is_not_taken():
     world = make_world([EGO, (40.0, -30.0, 0.0, 8.0)])
     add_route(world, 1, 2, UP)
-    assert not anchored(world, 1)[0].has.any()
+    assert not anchored(world, 1)[0].feasible.any()
     assert anchored(world, 1, max_swing=100.0)[0].route[0, 1] == 2
     beside = make_world([EGO, (30.0, -6.0, 0.0, 8.0)])
     beside.scene["route_points"][:, 1, 2] = beside.scene["route_points"][:, 1, 0] + torch.tensor([0.0, 6.0])
     beside.scene["route_valid"][:, 1, 2] = True
-    assert not anchored(beside, 1)[0].has.any()
+    assert not anchored(beside, 1)[0].feasible.any()
     assert anchored(beside, 1, max_shift=7.0)[0].route[0, 1] == 2
 
 
@@ -98,25 +97,25 @@ def test_a_kept_route_is_the_only_one_looked_at():
     world = make_world([EGO, (40.0, -30.0, 0.0, 8.0)])
     add_route(world, 1, 2, UP)
     support = mask(world, 1)
-    skeleton = build_skeleton(world.scene, world, support, support, SkeletonSettings())
-    plan = cruise(world.scene, world, TIMES)[:, 0]
-    assert not proposed(world, skeleton, plan, keep_route=True).has.any()
+    skeleton = skeleton_of(world, support)
+    plan = constant_speed_states(world.scene, world, TIMES)[:, 0]
+    assert not proposed(world, skeleton, plan, keep_route=True).feasible.any()
     world.route[:, 1] = 2
     kept = proposed(world, skeleton, plan, keep_route=True)
-    assert kept.has[0, 1] and torch.equal(kept.route, world.route)
+    assert kept.feasible[0, 1] and torch.equal(kept.route, world.route)
 
 
 def test_who_cannot_meet_the_target_has_no_anchor_and_keeps_its_route():
     world = make_world([EGO, (40.0, 30.0, UP, 8.0), (10.0, -90.0, UP, 5.0)])
     anchor, skeleton = anchored(world, 1, 2)
-    assert skeleton.coalition[0, 1:3].all() and not anchor.has.any() and not anchor.knots.any()
+    assert skeleton.coalition[0, 1:3].all() and not anchor.feasible.any() and not anchor.knots.any()
     assert torch.equal(anchor.route, world.route) and anchor.cost.isinf().all()
 
 
 def test_a_chain_s_first_link_meets_its_target_not_the_ego():
     world = make_world([EGO, (30.0, -20.0, UP, 8.0), (30.0, -38.0, UP, 8.0)])
     anchor, skeleton = anchored(world, 1, 2, near=1)
-    assert skeleton.target[0, 1:3].tolist() == [0, 1] and anchor.has[0, 1:3].all()
+    assert skeleton.target[0, 1:3].tolist() == [0, 1] and anchor.feasible[0, 1:3].all()
     gap = (18 + travelled(anchor.knots[0, 1], 8.0) - travelled(anchor.knots[0, 2], 8.0)).abs().min()
     assert gap < 4.5  # the boxes would touch
 
@@ -136,31 +135,12 @@ def test_accelerations_are_bounded_and_bends_slow_down():
     world.scene["route_points"][:, 1, 0] = line
     anchor, _ = anchored(world, 1, max_offset=10.0)
     knots = anchor.knots[0, 1]
-    assert knots.min() >= -5.0 and knots.max() <= 4.0 and anchor.has[0, 1]
+    assert knots.min() >= -5.0 and knots.max() <= 4.0 and anchor.feasible[0, 1]
     state = LaneState(*(torch.zeros(()) for _ in range(10)))
     state.v = torch.tensor(12.0)
     speed, way = speeds(state, knots)
     inside = (way > 16) & (way < 34)
     assert inside.any() and (speed[inside] < 1.1 * math.sqrt(4.0 * radius)).all()
-
-
-def test_clean_blend_keeps_the_noise_and_the_printed_one_halves_its_variance():
-    generator = torch.Generator().manual_seed(0)
-    x0, anchor = torch.randn(2, 4, 12, generator=generator).expand(2000, 2, 4, 12).unbind(1)
-    noise, other = torch.randn(2, 2000, 4, 12, generator=generator)
-    alpha, sigma = 0.8, 0.6
-    x, members = alpha * x0 + sigma * noise, torch.tensor([False, True, True, False]).expand(2000, 4)
-    clean = blend_clean(x, x0, anchor, alpha, members, 0.5)
-    literal = blend_literal(x, anchor, alpha, sigma, members, 0.5, other)
-    mean = alpha * (x0 + anchor) / 2
-    assert (clean - mean)[members].var() == pytest.approx(sigma**2, rel=0.02)
-    assert (literal - mean)[members].var() == pytest.approx(0.5 * sigma**2, rel=0.02)
-    for blended in (clean, literal):
-        assert torch.equal(blended[~members], x[~members])
-    torch.testing.assert_close(
-        blend_clean(x, x0, anchor, alpha, members, 1.0)[members], (alpha * anchor + sigma * noise)[members]
-    )
-    assert torch.equal(blend_clean(x, x0, anchor, alpha, members, 0.0), x)
 
 
 def test_bad_settings_are_refused():

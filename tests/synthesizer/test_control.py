@@ -6,13 +6,13 @@ import torch
 from e2rl.errors import InputError
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE
 from e2rl.synthesizer.anchoring import Anchor
-from e2rl.synthesizer.control import ControlSettings, SparseControl, clip_rows
+from e2rl.synthesizer.control import ControlSettings, SparseControl, clip_rows, gradient_weight
 from e2rl.synthesizer.potentials import (
+    SAMPLED_STEPS,
     PotentialContext,
     PotentialSettings,
     adversarial_potential,
     feasibility_potential,
-    sampled_steps,
 )
 from tests.prior.small import small_prior
 from tests.synthesizer.traffic_scenes import ROWS, scenes
@@ -82,7 +82,7 @@ class Case:
         return x0 - nominal, after - x
 
     def values(self, x0):
-        states = self.prior.decode(x0, self.context, steps=sampled_steps(PotentialSettings())).states()
+        states = self.prior.decode(x0, self.context, steps=SAMPLED_STEPS).states()
         return (
             adversarial_potential(states, self.where, PotentialSettings())[:, MEMBER],
             feasibility_potential(states, self.where, PotentialSettings())[:, 1:].sum(-1),
@@ -93,8 +93,8 @@ OTHERS = [i for i in range(ROWS) if i != MEMBER]
 
 
 @pytest.mark.parametrize("gradient", ["denoiser", "clean"])
-def test_within_the_support_only_its_members_are_moved(gradient):
-    shift, _ = Case().shift(feasibility_scope="support", gradient=gradient)
+def test_v_adv_moves_members_of_the_coalition_only(gradient):
+    shift, _ = Case().shift(feasibility=0.0, gradient=gradient)
     assert (shift[:, OTHERS] == 0).all() and (shift[:, MEMBER] != 0).any()
 
 
@@ -143,14 +143,13 @@ def test_clipping_keeps_directions_and_short_rows():
     assert (clip_rows(rows, 0.0) == 0).all(), "a clip of 0 is no shift, also where there is no gradient"
 
 
-@pytest.mark.parametrize("scaling", ["score", "sigma", "unit"])
-def test_the_weight_of_the_gradient(scaling):
+def test_the_weight_of_the_gradient():
     case, level = Case(), torch.tensor(0.5)
-    plain = {"feasibility": 0.0, "adversarial_clip": 1e6}
-    unit, scaled = case.shift(scaling="unit", **plain)[0], case.shift(scaling=scaling, **plain)[0]
-    alpha, sigma = case.prior.schedule.alpha(level), case.prior.schedule.sigma(level)
-    factor = {"score": sigma**2 / alpha, "sigma": sigma, "unit": 1.0}[scaling]
-    torch.testing.assert_close(scaled, factor * unit)
+    score, sigma = (
+        case.shift(scaling=scaling, feasibility=0.0, adversarial_clip=1e6)[0] for scaling in ("score", "sigma")
+    )
+    assert gradient_weight(case.prior.schedule, level, "sigma") == case.prior.schedule.sigma(level)
+    torch.testing.assert_close(score, case.prior.schedule.sigma(level) / case.prior.schedule.alpha(level) * sigma)
 
 
 @pytest.mark.parametrize("gradient", ["denoiser", "clean"])
@@ -183,7 +182,7 @@ def test_zero_intensity_sampling_is_the_nominal_sample_bit_for_bit():
 
 def test_path_energy_is_booked_where_control_acts():
     case = Case()
-    sample = case.prior.sample(case.context, case.noise, case.control(feasibility_scope="support"))
+    sample = case.prior.sample(case.context, case.noise, case.control())
     assert (sample.kl[:, MEMBER] > 0).all() and (sample.kl[:, [0, 5, 6, 7]] == 0).all()
 
 
@@ -202,7 +201,8 @@ def anchored(case, strength, **settings):
 @pytest.mark.parametrize(("anchoring", "variance"), [("clean", 1.0), ("literal", 0.5)])
 def test_anchoring_keeps_the_noise_and_the_printed_blend_halves_it(anchoring, variance):
     case = Case(count=600)
-    _, level, _, after = anchored(case, 0.5, anchoring=anchoring, gradient="clean")
+    _, level, x, after = anchored(case, 0.5, anchoring=anchoring, gradient="clean")
+    assert torch.equal(after[:, OTHERS], x[:, OTHERS])
     alpha, sigma = case.prior.schedule.alpha(level), case.prior.schedule.sigma(level)
     mean = alpha * (0.5 * 0.3 - 0.5 * 2.0 / ACCEL_SCALE)
     knots = after[:, MEMBER, :KNOTS]
@@ -233,11 +233,13 @@ def test_anchoring_happens_once_at_the_level_nearest_to_the_set_one_and_can_be_o
     moved = [bool((case.shift(k=k, strength=0.5)[1] != 0).any()) for k in range(1, case.prior.sampler.steps + 1)]
     assert moved == [k == step for k in range(1, case.prior.sampler.steps + 1)]
     assert (case.shift(k=step, strength=0.5, anchoring="off")[1] == 0).all()
-    case.anchor.has[:] = False
+    case.anchor.feasible[:] = False
     assert (case.shift(k=step, strength=0.5)[1] == 0).all(), "members that cannot meet their target are not anchored"
 
 
-@pytest.mark.parametrize("wrong", [{"gradient": "x"}, {"scaling": "x"}, {"feasibility_scope": "x"}, {"anchoring": "x"}])
+@pytest.mark.parametrize(
+    "wrong", [{"gradient": "x"}, {"scaling": "unit"}, {"anchoring": "x"}, {"transport_budget": -1.0}]
+)
 def test_settings_are_checked(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):
         ControlSettings(**wrong)

@@ -137,9 +137,9 @@ def test_a_chain_over_a_pruned_member_is_pruned(monkeypatch):
         return replace(build(*arguments), coalition=acts, target=target, depth=torch.tensor([[0, 1, 2, 1, 3, 0]]))
 
     def without_one(scene, world, skeleton, *arguments, **options):
-        has = skeleton.coalition.clone()
-        has[:, 1] = False
-        return replace(propose(scene, world, skeleton, *arguments, **options), has=has)
+        feasible = skeleton.coalition.clone()
+        feasible[:, 1] = False
+        return replace(propose(scene, world, skeleton, *arguments, **options), feasible=feasible)
 
     monkeypatch.setattr(module, "build_skeleton", chained)
     monkeypatch.setattr(module, "propose", without_one)
@@ -148,7 +148,7 @@ def test_a_chain_over_a_pruned_member_is_pruned(monkeypatch):
 
 
 def test_within_the_support_others_keep_their_nominal_energy():
-    on = synthesizer(control=ControlSettings(feasibility_scope="support"))
+    on = synthesizer(control=ControlSettings(feasibility=0.0))
     episode, _ = replanned(on, scenes(3).scenes, 2.0, times=2)
     assert (episode.kl[~episode.adversaries] == 0).all() and (episode.kl[episode.adversaries] > 0).all()
 

@@ -5,8 +5,8 @@ import torch
 
 from e2rl.errors import InputError
 from e2rl.synthesizer.description import describe
-from e2rl.synthesizer.feasibility import FeasibilitySettings, feasible_vehicles
-from e2rl.synthesizer.motion import arrival_window, compact, reach
+from e2rl.synthesizer.feasibility import EGO_ACCELERATION, FeasibilitySettings, feasible_vehicles
+from e2rl.synthesizer.motion import MAX_BRAKING, arrival_window, compact, reachable_distance
 from tests.synthesizer.crossing import add_route, make_world
 
 UP, LEFT = math.pi / 2, math.pi
@@ -23,23 +23,21 @@ def test_routes_that_cross_meet_where_the_lines_do():
     result, _ = judge((50.3, -41.7, UP, 10.0))
     table = result.conflicts
     assert result.mask[0].tolist() == [False, True] + [False] * 6
-    assert table.own_s[0, 1, 0] == pytest.approx(20 + 41.7, abs=0.05)
-    assert table.ego_s[0, 1, 0] == pytest.approx(20 + 50.3, abs=0.05)
-    assert table.best[0, 1] == 0 and table.best[0, 2] == -1
+    assert table.s[0, 1, 0] == pytest.approx(20 + 41.7, abs=0.05)
+    assert table.exists[0, 1].tolist() == [True] + [False] * 5 and not table.exists[0, 2].any()
 
 
 def test_an_oblique_crossing_is_found_too():
     heading = 0.7
     result, _ = judge((20.0, -30.0, heading, 12.0))
     way = 30 / math.sin(heading)
-    assert result.conflicts.own_s[0, 1, 0] == pytest.approx(20 + way, abs=0.1)
-    assert result.conflicts.ego_s[0, 1, 0] == pytest.approx(20 + 20 + way * math.cos(heading), abs=0.1)
+    assert result.conflicts.s[0, 1, 0] == pytest.approx(20 + way, abs=0.1)
 
 
 def test_windows_hold_what_both_can_reach():
     table = judge((50.0, -40.0, UP, 10.0))[0].conflicts
     earliest, latest = table.earliest[0, 1, 0], table.latest[0, 1, 0]
-    push = SETTINGS.ego_push
+    push = EGO_ACCELERATION
     alone = (math.sqrt(100 + 2 * push * (50 - 4.5 / 2)) - 10) / push  # the ego flat out, to its front bumper
     assert earliest == pytest.approx(alone, abs=0.15) and latest == SETTINGS.horizon
 
@@ -63,7 +61,7 @@ def test_only_the_candidate_that_crosses_is_listed():
     world = make_world([EGO, (40.0, 20.0, 0.0, 8.0)])
     add_route(world, 1, 3, -UP)
     table = feasible_vehicles(world.scene, world, SETTINGS).conflicts
-    assert table.has[0, 1].nonzero().tolist() == [[3]] and table.best[0, 1] == 3
+    assert table.exists[0, 1].nonzero().tolist() == [[3]]
 
 
 @pytest.mark.parametrize(
@@ -99,18 +97,18 @@ def test_absent_vehicles_and_the_ego_are_never_feasible_and_scenes_do_not_mix():
     world.valid[1, 1] = False
     result = feasible_vehicles(world.scene, world, SETTINGS)
     assert result.mask[:, 1].tolist() == [True, False, True] and not result.mask[:, 0].any()
-    torch.testing.assert_close(result.conflicts.own_s[2], alone.conflicts.own_s[0])
+    torch.testing.assert_close(result.conflicts.s[2], alone.conflicts.s[0])
 
 
 def test_arrival_windows_solve_the_equations_of_motion():
     speed, x = torch.tensor([0.0, 5.0, 10.0, 30.0]), torch.tensor([10.0, 40.0, 9.0, 60.0])
-    earliest, latest = arrival_window(x, speed, 5.0, 4.0, 25.0)
+    earliest, latest = arrival_window(x, speed)
     for e, way, v in zip(earliest.tolist(), x.tolist(), speed.tolist(), strict=True):
-        most = reach(torch.tensor(v), torch.tensor(e), 5.0, 4.0, 25.0)[1]
+        most = reachable_distance(torch.tensor(v), torch.tensor(e))[1]
         assert most == pytest.approx(way, abs=1e-3)
     assert latest.tolist()[:2] == [torch.inf, torch.inf]
-    assert 10 * latest[2] - 2.5 * latest[2] ** 2 == pytest.approx(9.0, abs=1e-4)
-    assert arrival_window(torch.tensor(-3.0), torch.tensor(7.0), 5.0, 4.0, 25.0)[1] == 0
+    assert 10 * latest[2] - MAX_BRAKING / 2 * latest[2] ** 2 == pytest.approx(9.0, abs=1e-4)
+    assert arrival_window(torch.tensor(-3.0), torch.tensor(7.0))[1] == 0
 
 
 def test_compact_lists_true_entries_first():
@@ -118,19 +116,16 @@ def test_compact_lists_true_entries_first():
     assert index[0].tolist() == [1, 2] and present.tolist() == [[True, True], [False, False]]
 
 
-def test_the_description_names_place_motion_conflict_and_verdict():
+def test_the_description_names_position_motion_and_conflict():
     world = make_world([EGO, (50.0, -40.0, UP, 10.0)])
-    text = describe(world.scene, world, 1)
-    for part in (
-        "50 m ahead of it and 40 m to its right",
-        "90 degrees to the left",
-        "10.0 m/s",
-        "in 40 m",
-        "Feasible: yes",
-    ):
+    conflicts = feasible_vehicles(world.scene, world, SETTINGS).conflicts
+    ego, vehicles = describe(world.scene, world, conflicts, 0)
+    (text,) = vehicles.values()
+    assert ego.startswith("The ego drives at 10.0 m/s") and ego.endswith("goes straight on.")
+    for part in ("50 m ahead of it and 40 m to its right", "90 degrees to the left", "10.0 m/s", "in 40 m"):
         assert part in text, text
 
 
-def test_samples_too_far_apart_are_refused():
-    with pytest.raises(InputError, match="sample_spacing"):
-        FeasibilitySettings(sample_spacing=10.0)
+def test_a_corridor_narrower_than_the_sampling_is_refused():
+    with pytest.raises(InputError, match="corridor"):
+        FeasibilitySettings(corridor=2.0)

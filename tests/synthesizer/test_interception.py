@@ -11,7 +11,7 @@ from e2rl.scene.recording import DT
 from e2rl.scene.route import SPACING, interpolate
 from e2rl.sim.geometry import overlap
 from e2rl.synthesizer.interception import InterceptionSettings, cubic, intercept
-from e2rl.synthesizer.motion import cruise
+from e2rl.synthesizer.motion import constant_speed_states
 from tests.synthesizer.crossing import make_world
 
 UP = math.pi / 2
@@ -22,22 +22,12 @@ FREE = replace(InterceptionSettings(), push=2.0, brake=2.0, lateral=2.0)
 
 
 def met(vehicles, eta=2.0, settings=FREE, world=None):
-    """Vehicle 1's interception of the ego, which cruises, among the others, which cruise too."""
+    """Vehicle 1's interception of the ego among the others, all of which keep their speed."""
     world = world or make_world(vehicles)
-    scene, expected = world.scene, cruise(world.scene, world, TIMES)
-    size, count = scene["size"][:, :8], len(vehicles)
-    others = (expected[:, None], size[:, None], (torch.arange(8) > 1)[None, None] & (torch.arange(8) < count))
-    found = intercept(
-        scene,
-        world.states[:, 1:2],
-        size[:, 1:2],
-        expected[:, :1],
-        size[:, :1],
-        torch.full((len(scene),), eta),
-        others,
-        settings,
-    )
-    return found, expected, size
+    scene, expected = world.scene, constant_speed_states(world.scene, world, TIMES)
+    index, target = (torch.full((len(scene), 1), vehicle) for vehicle in (1, 0))
+    found = intercept(world, index, target, expected, torch.full((len(scene),), eta), settings)
+    return found, expected, scene["size"][:, :8]
 
 
 def driven(found, speed):
@@ -45,7 +35,7 @@ def driven(found, speed):
     state = LaneState(*(torch.zeros(()) for _ in range(10)))
     state.v, state.a = torch.tensor(speed), found.knots[0, 0, 0]
     v, way = speeds(state, found.knots[0, 0])
-    xy, heading, _ = interpolate(found.points[0, 0], way)
+    xy, heading, _ = interpolate(found.path[0, 0], way)
     return torch.cat([xy, heading[:, None], v[:, None]], -1)
 
 
@@ -61,7 +51,7 @@ def test_the_boxes_touch_if_everybody_drives_as_expected(vehicle):
 
 def test_a_way_begins_at_the_vehicle_in_its_direction_with_a_vertex_every_two_metres():
     found, _, _ = met([EGO, BESIDE])
-    points = found.points[0, 0]
+    points = found.path[0, 0]
     assert torch.allclose(points[0], torch.tensor(BESIDE[:2]), atol=1e-4)
     step = points.diff(dim=0)
     assert (step.norm(dim=-1) - SPACING).abs().max() < 0.02
@@ -98,7 +88,7 @@ def test_what_is_proposed_keeps_the_limits(eta):
     knots = found.knots[some, 0]
     assert (knots <= settings.push * eta + 1e-5).all() and (knots >= -settings.brake * eta - 1e-5).all()
     v = world.states[some, 1, 3]
-    _, _, curvature = interpolate(found.points[some, 0], torch.arange(2.0, 20.0, 2.0).expand(int(some.sum()), -1))
+    _, _, curvature = interpolate(found.path[some, 0], torch.arange(2.0, 20.0, 2.0).expand(int(some.sum()), -1))
     slow = v[:, None] ** 2 - 2 * settings.brake * eta * torch.arange(2.0, 20.0, 2.0)
     assert ((slow.clamp(min=0) * curvature.abs()).amax(-1) < 1.3 * settings.lateral * eta).all()
 
@@ -122,7 +112,7 @@ def test_a_turned_and_moved_scene_has_the_turned_and_moved_way():
     spin = torch.tensor([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
     moved = [(*(spin @ torch.tensor(v[:2]) + shift).tolist(), v[2] + turn, v[3]) for v in (EGO, BESIDE)]
     other = met(moved)[0]
-    torch.testing.assert_close(other.points[0, 0], one.points[0, 0] @ spin.T + shift, atol=2e-3, rtol=1e-4)
+    torch.testing.assert_close(other.path[0, 0], one.path[0, 0] @ spin.T + shift, atol=2e-3, rtol=1e-4)
     torch.testing.assert_close(other.cost, one.cost, atol=1e-3, rtol=1e-4)
 
 

@@ -8,13 +8,13 @@ import torch
 from e2rl.errors import InputError
 from e2rl.sim.geometry import corners
 from e2rl.synthesizer import potentials
-from e2rl.synthesizer.motion import cruise
+from e2rl.synthesizer.motion import constant_speed_states
 from e2rl.synthesizer.potentials import (
+    SAMPLED_STEPS,
     PotentialContext,
     PotentialSettings,
     annealed_temperature,
     box_gap,
-    sampled_steps,
     ttc_cost,
 )
 from tests.synthesizer.crossing import make_world
@@ -25,11 +25,11 @@ SETTINGS = PotentialSettings()
 
 
 def feasibility_potential(states, context, settings):
-    return potentials.feasibility_potential(states[:, :, sampled_steps(settings)], context, settings)
+    return potentials.feasibility_potential(states[:, :, SAMPLED_STEPS], context, settings)
 
 
 def adversarial_potential(states, context, settings, *temperature):
-    return potentials.adversarial_potential(states[:, :, sampled_steps(settings)], context, settings, *temperature)
+    return potentials.adversarial_potential(states[:, :, SAMPLED_STEPS], context, settings, *temperature)
 
 
 POTENTIALS = [feasibility_potential, adversarial_potential]
@@ -38,7 +38,7 @@ POTENTIALS = [feasibility_potential, adversarial_potential]
 def situation(*vehicles, targets=(), copies=1):
     """Cruising states [B, 8, 50, 4] in float64, and their context; targets: (vehicle, target) pairs."""
     world = make_world([EGO, *vehicles], copies)
-    states = cruise(world.scene, world, 0.1 * torch.arange(1, 51)).double()
+    states = constant_speed_states(world.scene, world, 0.1 * torch.arange(1, 51)).double()
     scene = world.scene.apply(lambda x: x.double() if x.dtype == torch.float32 else x)
     target = torch.full((copies, 8), -1)
     for vehicle, aim in targets:
@@ -76,12 +76,11 @@ def busy(copies=1):
     return rough(states), context
 
 
-@pytest.mark.parametrize("kind", ["centre", "box"])
 @pytest.mark.parametrize("potential", POTENTIALS)
-def test_gradients_are_those_of_finite_differences(potential, kind):
+def test_gradients_are_those_of_finite_differences(potential):
     states, context = busy()
     # The impact term is left out: the moment of the impact is detached in it, by design.
-    settings = replace(SETTINGS, distance_kind=kind, max_jerk=0.5, max_lateral_accel=0.5, impact_speed=0.0)
+    settings = replace(SETTINGS, max_jerk=0.5, max_lateral_accel=0.5, impact_speed=0.0)
     states.requires_grad_()
     value = potential(states, context, settings)
     gradient = torch.autograd.grad(value.sum(), states)[0]
@@ -115,28 +114,24 @@ def test_a_vehicle_s_term_moves_that_vehicle_alone_and_never_the_ego(potential):
         assert moved[vehicle] > 0 and moved.sum() == moved[vehicle] and plan is None
 
 
-@pytest.mark.parametrize("kind", ["centre", "box"])
-def test_gradients_are_finite_for_coincident_and_standing_vehicles(kind):
+def test_gradients_are_finite_for_coincident_and_standing_vehicles():
     states, context = situation(
         (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), (5.0, 0.0, 0.0, 0.0), targets=[(1, 0), (2, 1), (3, 0)]
     )
     for plans in (states, torch.zeros_like(states), 1e3 * torch.ones_like(states)):
         plans = plans.clone().requires_grad_()
         held = replace(context, ego_plan=plans[:, 0].detach())
-        settings = replace(SETTINGS, distance_kind=kind)
         for potential in POTENTIALS:
-            value = potential(plans, held, settings)
+            value = potential(plans, held, SETTINGS)
             assert value.isfinite().all()
             assert torch.autograd.grad(value.sum(), plans)[0].isfinite().all()
 
 
-@pytest.mark.parametrize("kind", ["centre", "box"])
-def test_approaching_the_target_lowers_v_adv(kind):
-    settings = replace(SETTINGS, distance_kind=kind)
+def test_approaching_the_target_lowers_v_adv():
     values = []
     for late in (30.0, 20.0, 10.0, 5.0, 0.0):  # m by which the crossing vehicle misses the ego's arrival
         states, context = situation((30.0, -30.0 - late, UP, 10.0), targets=[(1, 0)])
-        values.append(adversarial_potential(states, context, settings)[0, 1].item())
+        values.append(adversarial_potential(states, context, SETTINGS)[0, 1].item())
     assert values == sorted(values, reverse=True) and values[0] - values[-1] > 3
 
 
@@ -256,5 +251,5 @@ def test_the_temperature_anneals_from_wide_to_narrow():
 
 
 def test_bad_settings_are_refused():
-    with pytest.raises(InputError, match="distance_kind"):
-        PotentialSettings(distance_kind="corner")
+    with pytest.raises(InputError, match="narrow"):
+        PotentialSettings(narrow=0.0)

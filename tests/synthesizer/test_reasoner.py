@@ -66,7 +66,7 @@ def test_the_conflict_table_stays_and_parked_vehicles_are_not_asked_about(tmp_pa
         result, _ = ask(url, tmp_path, made)
     assert result.mask[0].tolist() == [False, True] + [False] * 6
     assert "Vehicle 2" not in requests[0]["messages"][-1]["content"]
-    torch.testing.assert_close(result.conflicts.own_s, feasible_vehicles(made.scene, made, RULES).conflicts.own_s)
+    torch.testing.assert_close(result.conflicts.s, feasible_vehicles(made.scene, made, RULES).conflicts.s)
 
 
 @pytest.mark.parametrize(

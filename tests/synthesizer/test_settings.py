@@ -5,7 +5,9 @@ import pytest
 from omegaconf import OmegaConf
 
 from e2rl.synthesizer.anchoring import AnchorSettings
+from e2rl.synthesizer.control import ControlSettings
 from e2rl.synthesizer.feasibility import FeasibilitySettings
+from e2rl.synthesizer.interception import InterceptionSettings
 from e2rl.synthesizer.potentials import PotentialSettings
 from e2rl.synthesizer.reasoner import ReasonerSettings
 from e2rl.synthesizer.skeleton import SkeletonSettings
@@ -22,7 +24,9 @@ CONFIG = Path(__file__).parents[2] / "conf" / "synthesizer" / "e2.yaml"
         ("reasoner", ReasonerSettings),
         ("skeleton", SkeletonSettings),
         ("anchor", AnchorSettings),
+        ("interception", InterceptionSettings),
         ("potentials", PotentialSettings),
+        ("control", ControlSettings),
     ],
 )
 def test_the_config_lists_every_setting(key, settings):

@@ -7,32 +7,18 @@ from e2rl.errors import InputError
 from e2rl.synthesizer.anchoring import AnchorSettings, propose
 from e2rl.synthesizer.feasibility import FeasibilitySettings, feasible_vehicles
 from e2rl.synthesizer.interception import InterceptionSettings
-from e2rl.synthesizer.skeleton import (
-    NEAREST_FEASIBLE,
-    NOBODY,
-    SUPPORTED,
-    SkeletonSettings,
-    build_skeleton,
-    chain_depth,
-    lane_of,
-)
+from e2rl.synthesizer.skeleton import NEAREST_FEASIBLE, NOBODY, SUPPORTED, SkeletonSettings, chain_depth, lane_of
 from e2rl.synthesizer.topology import TopologySettings, topological_candidates
-from tests.synthesizer.crossing import make_world, mask
+from tests.synthesizer.crossing import make_world, mask, skeleton_of
 
 UP = math.pi / 2
 EGO = (0.0, 0.0, 0.0, 10.0)
 COLUMN = [(30.0, -20.0 - 18 * k, UP, 8.0) for k in range(3)]  # one behind the other, towards the ego's way
 
 
-def build(world, support, feasible=None, **settings):
-    return build_skeleton(
-        world.scene, world, support, support if feasible is None else feasible, SkeletonSettings(**settings)
-    )
-
-
 def test_near_vehicles_act_on_the_ego():
     world = make_world([EGO, (12.0, 3.5, 0.0, 10.0), (-14.0, 0.0, 0.0, 10.0), (60.0, 3.5, 0.0, 10.0)])
-    result = build(world, mask(world, 1, 2, 3))
+    result = skeleton_of(world, mask(world, 1, 2, 3))
     assert result.coalition.nonzero().tolist() == [[0, 1], [0, 2]]
     assert result.target[0, :4].tolist() == [-1, 0, 0, -1] and result.depth[0, :4].tolist() == [0, 1, 1, 0]
     assert result.source.tolist() == [SUPPORTED] and result.chains.tolist() == [0]
@@ -40,13 +26,13 @@ def test_near_vehicles_act_on_the_ego():
 
 def test_a_support_smaller_than_its_capacity_is_used_whole():
     world = make_world([EGO, (12.0, 3.5, 0.0, 10.0)])
-    result = build(world, mask(world, 1), near=3, far=2)
+    result = skeleton_of(world, mask(world, 1), near=3, far=2)
     assert result.coalition.nonzero().tolist() == [[0, 1]]
 
 
 def test_a_column_forms_a_chain_and_its_intermediate_is_controlled():
     world = make_world([EGO, *COLUMN])
-    result = build(world, mask(world, 1, 2, 3), near=1)
+    result = skeleton_of(world, mask(world, 1, 2, 3), near=1)
     assert result.target[0, :4].tolist() == [-1, 0, 1, 2]
     assert result.depth[0, :4].tolist() == [0, 1, 2, 3]
     assert result.near[0].nonzero().tolist() == [[1]] and result.far[0].nonzero().tolist() == [[3]]
@@ -59,30 +45,30 @@ def test_a_column_forms_a_chain_and_its_intermediate_is_controlled():
 )
 def test_chains_beyond_the_limits_are_pruned_to_the_near(change):
     world = make_world([EGO, *COLUMN])
-    result = build(world, mask(world, 1, 2, 3), near=1, **change)
+    result = skeleton_of(world, mask(world, 1, 2, 3), near=1, **change)
     assert result.coalition.nonzero().tolist() == [[0, 1]] and result.chains.tolist() == [0]
 
 
 def test_without_the_intermediate_in_the_support_there_is_no_chain():
     world = make_world([EGO, *COLUMN])
-    assert build(world, mask(world, 1, 3), near=1).coalition.nonzero().tolist() == [[0, 1]]
+    assert skeleton_of(world, mask(world, 1, 3), near=1).coalition.nonzero().tolist() == [[0, 1]]
 
 
 def test_a_vehicle_that_drives_away_starts_no_chain():
     world = make_world([EGO, COLUMN[0], (30.0, -38.0, -UP, 8.0)])
-    assert build(world, mask(world, 1, 2), near=1).chains.tolist() == [0]
+    assert skeleton_of(world, mask(world, 1, 2), near=1).chains.tolist() == [0]
 
 
 def test_effects_may_not_precede_their_causes():
     # 2 can act on 1 only once 1 has passed the ego's corridor: the link to the ego is over by then.
     world = make_world([EGO, (30.0, -20.0, UP, 12.0), (75.0, 30.0, math.pi, 9.0)])
-    late = build(world, mask(world, 1, 2), near=1)
+    late = skeleton_of(world, mask(world, 1, 2), near=1)
     assert late.chains.tolist() == [0]
 
 
 def test_the_ego_s_own_and_neighbour_lanes_hold_no_initiator():
     world = make_world([EGO, (12.0, -10.0, UP, 8.0), (-30.0, 3.5, 0.0, 12.0), (-20.0, 0.0, 0.0, 12.0)])
-    result = build(world, mask(world, 1, 2, 3), near=1)
+    result = skeleton_of(world, mask(world, 1, 2, 3), near=1)
     assert result.coalition.nonzero().tolist() == [[0, 1]] and not result.far.any()
     assert lane_of(world.states[:, :4], world.scene).tolist() == [[0, -1, 1, 0]]
 
@@ -91,7 +77,7 @@ def test_an_empty_support_falls_back_to_the_nearest_feasible_then_to_nobody():
     world = make_world([EGO, (40.0, -30.0, UP, 8.0), (12.0, 3.5, 0.0, 10.0), (20.0, 3.5, 0.0, 9.0)], copies=3)
     support, feasible = mask(world, 1), mask(world, 1, 2, 3)
     support[1:], feasible[2] = False, False
-    result = build(world, support, feasible)
+    result = skeleton_of(world, support, feasible)
     assert result.source.tolist() == [SUPPORTED, NEAREST_FEASIBLE, NOBODY]
     assert result.coalition.nonzero().tolist() == [[0, 1], [1, 2], [1, 3]]
     assert result.counts() == {"supported": 1, "nearest_feasible": 1, "nobody": 1, "chains": 0}
@@ -106,7 +92,7 @@ def test_every_link_leads_to_the_ego_and_absent_vehicles_take_no_part():
         world = make_world([EGO, *COLUMN, *spots.tolist()], copies=4)
         world.valid[:, 1:8] &= torch.rand(4, 7, generator=generator) < 0.9
         support = torch.rand(4, 8, generator=generator) < 0.8
-        result = build(world, support, near=1, far=2, tau_long=40.0)
+        result = skeleton_of(world, support, near=1, far=2, tau_long=40.0)
         chains += int(result.chains.sum())
         assert not (result.coalition & ~(support & world.valid[:, :8])).any() and not result.coalition[:, 0].any()
         assert torch.equal(result.coalition, result.target >= 0) and torch.equal(result.coalition, result.depth > 0)
@@ -132,7 +118,7 @@ def test_an_ego_alone_passes_through_every_room():
         scene["logged"][:, :, :8], scene["logged_valid"][:, :, :8], scene["size"][:, :8], TopologySettings()
     )
     feasible = feasible_vehicles(scene, world, FeasibilitySettings()).mask
-    result = build(world, found.candidates & feasible, feasible)
+    result = skeleton_of(world, found.candidates & feasible, feasible)
     anchor = propose(scene, world, result, plan, AnchorSettings(), InterceptionSettings(), torch.full((2,), 2.0))
-    assert not (found.candidates | feasible | result.coalition | anchor.has).any()
+    assert not (found.candidates | feasible | result.coalition | anchor.feasible).any()
     assert result.source.tolist() == [NOBODY, NOBODY]

@@ -108,7 +108,7 @@ def test_two_vehicles_head_on_are_one_clique():
         TopologySettings(),
     )
     assert result.candidates.tolist() == [[False, True]]
-    assert (0, 1) in result.groups[0][0] and result.edges[0, 0] == 1
+    assert (0, 1) in result.cliques[0][0] and result.weights[0, 0, 0, 1] >= TopologySettings().edge_threshold
 
 
 def test_absent_vehicles_are_left_out():
@@ -119,12 +119,12 @@ def test_absent_vehicles_are_left_out():
     assert result.candidates.tolist() == [[False, False, True]]
 
 
-def test_a_queue_far_from_the_ego_counts_only_without_relevance():
-    queue = [[200.0 + 5 * k, 50, 0, 0] for k in range(4)]
-    states = torch.tensor([[[0.0, 0, 0, 10], *queue]])
-    arguments = rollout(states), torch.ones(1, 81, 5, dtype=torch.bool), torch.tensor([[[4.5, 2.0]]]).expand(1, 5, 2)
-    assert not topological_candidates(*arguments, TopologySettings()).candidates.any()
-    assert topological_candidates(*arguments, TopologySettings(ego_relevance=False)).candidates.any()
+@pytest.mark.parametrize(("x", "y", "counts"), [(200.0, 50.0, False), (40.0, 0.0, True)])
+def test_a_queue_counts_only_where_the_ego_is_entangled_with_it(x, y, counts):
+    queue = [[x + 5 * k, y, 0, 0] for k in range(4)]
+    states, present = torch.tensor([[[0.0, 0, 0, 10], *queue]]), torch.ones(1, 81, 5, dtype=torch.bool)
+    size = torch.tensor([[[4.5, 2.0]]]).expand(1, 5, 2)
+    assert topological_candidates(rollout(states), present, size, TopologySettings()).candidates.any() == counts
 
 
 def test_large_cliques_are_cut_down_and_keep_the_ego():
@@ -132,11 +132,11 @@ def test_large_cliques_are_cut_down_and_keep_the_ego():
     result = topological_candidates(
         states[:, None], torch.ones(1, 1, 8, dtype=torch.bool), size, TopologySettings(max_clique=3)
     )
-    assert all(len(clique) == 3 and clique[0] == 0 for clique in result.groups[0][0])
+    assert all(len(clique) == 3 and clique[0] == 0 for clique in result.cliques[0][0])
 
 
 def test_bad_settings_name_their_key():
-    with pytest.raises(InputError, match="clique_weight"):
-        TopologySettings(clique_weight="median")
+    with pytest.raises(InputError, match="max_clique"):
+        TopologySettings(max_clique=1)
     with pytest.raises(InputError, match="edge_threshold"):
         TopologySettings(edge_threshold=1.5)

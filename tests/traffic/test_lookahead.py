@@ -6,7 +6,7 @@ from e2rl.scene.recording import DT
 from e2rl.synthesizer.control import ControlSettings
 from e2rl.synthesizer.grouping import group_scenes
 from e2rl.synthesizer.lookahead import Lookahead
-from e2rl.synthesizer.motion import cruise
+from e2rl.synthesizer.motion import constant_speed_states
 from tests.synthesizer.test_synthesizer import EGO, begin, world_of
 from tests.synthesizer.traffic_scenes import scenes, synthesizer
 
@@ -16,14 +16,14 @@ TIMES = DT * torch.arange(1, HORIZON + 1)
 def test_one_period_as_long_as_the_horizon_is_the_ego_s_plan():
     world = world_of(scenes(3).scenes)
     look, (group,) = Lookahead(EGO, world, HORIZON), group_scenes(world)
-    planned = cruise(world.scene, world, TIMES)[group.rows]
+    planned = constant_speed_states(world.scene, world, TIMES)[group.rows]
     torch.testing.assert_close(look(group, planned), EGO.plan(world)[group.rows])
 
 
 def test_the_ego_reacts_to_what_the_others_plan():
     world = world_of(scenes(2).scenes)
     look, (group,) = Lookahead(IDMEgo(), world, 5), group_scenes(world)
-    onward = cruise(world.scene, world, TIMES)[group.rows]
+    onward = constant_speed_states(world.scene, world, TIMES)[group.rows]
     halted = onward.clone()
     halted[:, 1] = world.states[group.rows, 1, None]  # the vehicle ahead stands still from now on
     halted[:, 1, :, 3] = 0.0

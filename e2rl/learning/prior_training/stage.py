@@ -63,7 +63,7 @@ def _untrained(config: DictConfig) -> Prior:
 def _nominal(prior: Prior, scenes: SceneSet, device: str, folder: Path | None, **fields: str) -> list[dict]:
     """Metrics rows of the uncontrolled prior as traffic around the replayed ego."""
     setup = Setup(scenes, ReplayEgo(), "replay", SimSettings(), device=device)
-    return run_protocol(setup, [Method("nominal", NominalTraffic(prior))], [0], folder, **fields: str)
+    return run_protocol(setup, [Method("nominal", NominalTraffic(prior))], [0], folder, **fields)
 
 
 def _closed_loop(scenes: SceneSet, settings: TrainingSettings, device: str) -> ClosedLoop:

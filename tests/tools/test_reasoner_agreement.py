@@ -6,12 +6,12 @@ import math
 import pytest
 import torch
 
-from e2rl.synthesizer.agreement import Agreement, agreement_table, measure_agreement
 from e2rl.synthesizer.feasibility import FeasibilitySettings
 from e2rl.synthesizer.prompt import CRITERIA
 from e2rl.synthesizer.reasoner import LanguageReasoner, ReasonerSettings
 from tests.synthesizer.chat_server import asked, chat_server
 from tests.synthesizer.traffic_scenes import scenes
+from tools.reasoner_agreement import Agreement, agreement_table, measure_agreement
 
 
 def test_kappa_is_cohen_s():
