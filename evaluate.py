@@ -40,7 +40,7 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     prior, origin = build_prior(config, config.device)
     methods, ego, sim = build_methods(config, prior), build_ego(config), build_sim(config)
     name = HydraConfig.get().runtime.choices["ego"]
-    only = None if config.scene is None else [scenes.place(config.scene)]
+    only = None if config.scene is None else [scenes.index(config.scene)]
     chain = LongestChain(methods[0]) if config.figure == "skeleton" else None
     rows = []
     if config.open_loop_samples:

@@ -10,7 +10,7 @@ from e2rl.sim.setting import Setting
 
 class Around(NamedTuple):
     """local [B, 2, M]: x forward and y left of the ego [m]; direction [B, 2, M]: cosine and sine of the turn from its
-    heading; gap [B, M]: `geometry.separation` [m]; speed, accel [B, M]; present [B, M] bool."""
+    heading; gap [B, M]: `boxes.separation` [m]; speed, accel [B, M]; present [B, M] bool."""
 
     local: Tensor
     direction: Tensor
@@ -37,7 +37,7 @@ def look_around(ego: Tensor, turn: Tensor, setting: Setting, states: Tensor, pre
 
 
 def gap_around(local: Tensor, direction: Tensor, own: Tensor, half: Tensor) -> Tensor:
-    """`geometry.separation` [B, M] of a box of half size own [B, 2, 1] from boxes of half sizes half [B, 2, M] at
+    """`boxes.separation` [B, M] of a box of half size own [B, 2, 1] from boxes of half sizes half [B, 2, M] at
     local, direction [B, 2, M] in its frame."""
     size = direction.abs()
     size = torch.stack([size, size.flip(1)], 1)  # rows: what of a box's length and width reaches along the other's axes

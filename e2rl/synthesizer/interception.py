@@ -15,11 +15,11 @@ from torch import Tensor
 
 from e2rl.errors import InputError
 from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS
+from e2rl.scene.boxes import overlap
 from e2rl.scene.recording import DT
 from e2rl.scene.route import SPACING
 from e2rl.sim.drivable import off_road
 from e2rl.sim.dynamics import wrap
-from e2rl.sim.geometry import overlap
 
 ENDS = 3  # directions tried at the end of a way
 SAMPLES = 17  # points of a way at which it is looked at

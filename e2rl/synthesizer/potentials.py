@@ -15,11 +15,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.errors import InputError
+from e2rl.scene.boxes import to_frame
 from e2rl.scene.recording import DT
 from e2rl.scene.route import interpolate, project
 from e2rl.sim.drivable import off_road
 from e2rl.sim.dynamics import wrap
-from e2rl.sim.geometry import to_frame
 
 LENGTH = 2.0  # m: distances of V_adv are in this unit, so that eta of 0 to 3 is a usable dial
 CLOSING = 10.0  # m/s: unit of the impact speed

@@ -137,15 +137,16 @@ def test_places_of_an_index_reach_the_scenes(tmp_path):
     [
         ({"path": None}, r"data\.path is not set"),
         ({"path": "nowhere"}, "nowhere: no such file or folder"),
-        ({"source": "spreadsheet"}, r"data\.source=spreadsheet: expected bundled, procedural or scenarionet"),
-        ({"source": "bundled", "split": "best"}, "split 'best'"),
+        ({"workers": "many"}, r"data\.workers=many"),
+        ({"_target_": "no.such.Source"}, r"^data=no\.such\.Source: cannot be built: .*no"),
+        ({"_target_": "torch.nn.ReLU"}, r"^data=torch\.nn\.ReLU: is no e2rl\.scene\.source\.Source"),
+        ({"_target_": "e2rl.scene.bundled.BundledSource", "split": "best"}, "split 'best'"),
     ],
 )
 def test_configurations_that_name_nothing_say_so(tmp_path, change, message):
     config = data_config(tmp_path, tmp_path / "cache")
-    vars(config).update(change)
     with pytest.raises(InputError, match=message):
-        load_scenes(config)
+        load_scenes(config | change)
     with pytest.raises(InputError, match="num_scenes=0"):
         load_scenes(data_config(tmp_path, tmp_path / "cache"), num_scenes=0)
 

@@ -2,9 +2,9 @@
 
 import torch
 
+from e2rl.scene.boxes import separation, to_frame
 from e2rl.scene.route import SPACING, interpolate, project
 from e2rl.sim.around import axes, look_around
-from e2rl.sim.geometry import separation, to_frame
 from e2rl.sim.mission import Mission, limit_at, mission_of
 from e2rl.sim.setting import follow, look_along, setting_of, write_rows
 from tests.synthetic import make_scenes

@@ -35,7 +35,7 @@ def run_prior_stage(config: DictConfig, folder: Path) -> tuple[Path, list[dict]]
         network = _network(config).to(device)
         begin = time.perf_counter()
         scenes = processes.leader_first(
-            lambda: load_scenes(config.data, config.num_scenes, _split(config), list(settings.starts))
+            lambda: load_scenes(config.data, config.num_scenes, "train", list(settings.starts))
         )
         origin = _origin(scenes, settings, time.perf_counter() - begin)
         path = train_prior(network, scenes, settings, folder, origin, _closed_loop(scenes, settings, device), processes)
@@ -60,11 +60,6 @@ def _network(config: DictConfig) -> Prior:
         settings_of(BoundSettings, config.prior.bounds, "prior.bounds"),
         config.prior.free_space,
     )
-
-
-def _split(config: DictConfig) -> str | None:
-    """The bundled and procedural sources train on their train split; a path's split is the path's own."""
-    return None if config.data.source == "scenarionet" else "train"
 
 
 def _origin(scenes: SceneSet, settings: TrainingSettings, seconds: float) -> dict:
