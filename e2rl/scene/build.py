@@ -70,29 +70,30 @@ def _agents(recording: Recording, frame: int, valid: np.ndarray, settings: Build
     shift = np.array([*origin, 0.0, 0.0])
     tracks = _participants(recording, frame, states, valid, settings)
     rows = np.flatnonzero(tracks >= 0)
-    chosen, count = tracks[rows], len(tracks)
+    chosen, cars = tracks[rows], rows[rows < settings.vehicles]
+    frames = frame + np.arange(settings.steps + 1)
+    recorded = np.minimum(frames, len(valid) - 1)
+    present = valid[frame, chosen]
+    known = valid[recorded][:, chosen] & (frames < len(valid))[:, None]
+    logged = np.where(known[..., None], states[recorded][:, chosen] - shift, 0.0)
+
+    def padded(values: np.ndarray, fill: float = 0) -> np.ndarray:
+        out = np.full((len(tracks), *values.shape[1:]), fill, values.dtype)
+        out[rows] = values
+        return out
+
     scene = {
-        "start": np.zeros((count, 4)),
-        "start_accel": np.zeros(count),
-        "start_yaw_rate": np.zeros(count),
-        "valid": np.zeros(count, bool),
-        "size": np.ones((count, 2)),
-        "agent_type": np.zeros(count, np.int64),
-        "parked": np.zeros(count, bool),
-        "logged": np.zeros((settings.steps + 1, count, 4)),
-        "logged_valid": np.zeros((settings.steps + 1, count), bool),
+        "start": padded((start[chosen] - shift) * present[:, None]),
+        "start_accel": padded(accel[chosen] * present),
+        "start_yaw_rate": padded(yaw_rate[chosen] * present),
+        "valid": padded(present),
+        "size": padded(recording.size[chosen].astype(float), 1),
+        "agent_type": padded(recording.agent_type[chosen].astype(np.int64)),
+        "parked": np.zeros(len(tracks), bool),
+        "logged": padded(logged.swapaxes(0, 1)).swapaxes(0, 1),
+        "logged_valid": padded(known.T).T,
         "past": np.zeros((settings.vehicles, PAST, 3)),
     }
-    present = valid[frame, chosen]
-    scene["start"][rows] = (start[chosen] - shift) * present[:, None]
-    scene["start_accel"][rows], scene["start_yaw_rate"][rows] = accel[chosen] * present, yaw_rate[chosen] * present
-    scene["valid"][rows], scene["size"][rows] = present, recording.size[chosen]
-    scene["agent_type"][rows] = recording.agent_type[chosen]
-    span = slice(frame, frame + settings.steps + 1)
-    known = valid[span, chosen]
-    scene["logged"][: len(known), rows] = np.where(known[..., None], states[span, chosen] - shift, 0)
-    scene["logged_valid"][: len(known), rows] = known
-    cars = rows[rows < settings.vehicles]
     scene["past"][cars] = causal_past(recording.states, valid, frame, start[:, 3])[tracks[cars]]
     return scene, origin
 

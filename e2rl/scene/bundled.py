@@ -60,7 +60,7 @@ class BundledSource(Source):
     has_splits = True
 
     def logs(self) -> list[str]:
-        return [str(name) for name in unpack(asset_bytes(self.split_name), self.split_name)["scene_id"]]
+        return list(_recordings_by_id(self.split_name))
 
     def read(self, log: str) -> Iterator[Recording]:
         yield _recordings_by_id(self.split_name)[log]

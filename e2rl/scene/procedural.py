@@ -175,7 +175,7 @@ def stop_lines(
 ) -> list[StopLine]:
     """The stop lines of all lights on the routes, ahead of the vehicles; closed: lane id -> [T] red or yellow."""
     return [
-        StopLine(k, float(s), closed[name])
+        (k, float(s), closed[name])
         for k, route in enumerate(routes)
         for name, s in zip(route, graph.lane_starts(route)[:-1], strict=True)
         if name in closed and s > fleet.start[k]

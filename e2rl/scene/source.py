@@ -50,8 +50,9 @@ class _Row(NamedTuple):
 
 @dataclass
 class Source(ABC):
-    """Where recordings come from. A subclass is a dataclass whose fields are the keys of its YAML file, and defines
-    `logs` and `read`; with `fingerprint` its scenes are cached.
+    """Where recordings come from. A subclass is a dataclass whose fields are the keys of its YAML file.
+
+    It defines `logs` and `read`, and `fingerprint` where its scenes are to be cached.
 
     path: file or folder of the logs, for sources that need one; split: train, tune or test where `has_splits`, else the
     name of the split in tables (default: the stem of `path`); starts: start frames of the scenes that are cut from each
@@ -90,7 +91,7 @@ class Source(ABC):
     def root(self) -> Path:
         """`path`; raises InputError where it is not set or not there."""
         if not self.path:
-            raise InputError(f"data.path is not set; pass data.path=FOLDER_OR_FILE of {self.holds}")
+            raise InputError(f"data.path is not set; pass data.path=FOLDER_OR_ZIP of {self.holds}")
         if not Path(self.path).exists():
             raise InputError(f"data.path={self.path}: no such file or folder; pass one that holds {self.holds}")
         return Path(self.path)
@@ -105,8 +106,9 @@ class Source(ABC):
         content = self.fingerprint()
         if content is None:
             return self._build()
-        settings = [type(self).__qualname__, self.split_name, self.starts, self.skip_invalid, asdict(self.build)]
-        key = hashlib.sha256(json.dumps([VERSION, *settings]).encode() + content).hexdigest()[:24]
+        settings = asdict(self) | {"split": self.split_name, "source": type(self).__qualname__}
+        settings = {key: value for key, value in settings.items() if key not in ("path", "cache", "workers")}
+        key = hashlib.sha256(json.dumps([VERSION, settings], sort_keys=True).encode() + content).hexdigest()[:24]
         return _cached(Path(self.cache) / f"scenes-{key}.safetensors", self._build)
 
     def _windows(self, log: str) -> Iterator[Recording]:
@@ -196,9 +198,10 @@ def _source(data: Mapping) -> Source:
     try:
         kind = get_class(target)
     except Exception as error:  # importing a module raises anything
-        raise InputError(f"data={target}: cannot be built: {error}; name a class as _target_") from error
+        reason = error.__cause__ or error
+        raise InputError(f"data={target}: cannot be built: {reason}; name a subclass of Source as _target_") from error
     if not issubclass(kind, Source):
-        raise InputError(f"data={target}: is no e2rl.scene.source.Source; subclass it and define logs() and read()")
+        raise InputError(f"data={target}: is no e2rl.scene.source.Source; subclass it, and define logs() and read()")
     build = settings_of(BuildSettings, data.get("build", {}), "data.build")
     values = {key: value for key, value in data.items() if key not in ("_target_", "build")}
     return replace(settings_of(kind, values, "data"), build=build)

@@ -7,25 +7,17 @@ candidates and share no code with it, so that bundled seeds keep giving the same
 """
 
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from e2rl.scene.recording import DT
 
+StopLine = tuple[int, float, np.ndarray]  # on a path: the vehicle, arc length m, [T] whether its light is closed
 STEP = 1.0  # m between the points of a path
 AHEAD = 70  # m that a driver looks ahead for leaders
 COMFORT, HARDEST = 3.5, 7.0  # m/s^2: braking that a light or a crossing vehicle may ask for; that physics allows
 NEAR = 2.3  # m between two routes that conflict
 HORIZON = 6.0  # s before arrival within which drivers look at a conflict
-
-
-class StopLine(NamedTuple):
-    """A stop line on a vehicle's path: the vehicle's index, arc length [m], and whether it is closed [T]."""
-
-    vehicle: int
-    s: float
-    closed: np.ndarray
 
 
 @dataclass
@@ -55,13 +47,12 @@ class Fleet:
         """The fleet of the vehicles `keep` (indices) alone."""
         arrays = {name: value[keep] for name, value in vars(self).items() if name != "lights"}
         number = {int(old): new for new, old in enumerate(keep)}
-        lights = [line._replace(vehicle=number[line.vehicle]) for line in self.lights if line.vehicle in number]
-        return replace(self, **arrays, lights=lights)
+        return replace(self, **arrays, lights=[(number[k], s, closed) for k, s, closed in self.lights if k in number])
 
 
 def roll(fleet: Fleet, frames: int) -> np.ndarray:
     """Progress [frames, A] m of all vehicles along their paths."""
-    enter, leave = conflicts(fleet)
+    between = conflicts(fleet)
     s, v = fleet.start.copy(), fleet.speed.copy()
     progress = np.empty((frames, len(s)))
     for frame in range(frames):
@@ -70,7 +61,7 @@ def roll(fleet: Fleet, frames: int) -> np.ndarray:
         gap, leader_speed = leaders(fleet, s, v, present)
         accel = idm(fleet, v, _speed_bound(fleet, s, v), gap, leader_speed)
         stop = stop_distance(fleet, s, v, frame)
-        stop = np.minimum(stop, yield_distance(fleet, s, v, present, enter, leave, stop))
+        stop = np.minimum(stop, yield_distance(fleet, s, v, present, between, stop))
         halt = idm(fleet, v, np.full(len(v), np.inf), stop + fleet.gap - 0.5, np.zeros(len(v)))
         accel = np.clip(np.minimum(accel, halt), -HARDEST, fleet.accel)
         after = np.maximum(v + accel * DT, 0.0)
@@ -173,19 +164,14 @@ def stop_distance(fleet: Fleet, s: np.ndarray, v: np.ndarray, frame: int) -> np.
 
 
 def yield_distance(
-    fleet: Fleet,
-    s: np.ndarray,
-    v: np.ndarray,
-    present: np.ndarray,
-    enter: np.ndarray,
-    leave: np.ndarray,
-    stop: np.ndarray,
+    fleet: Fleet, s: np.ndarray, v: np.ndarray, present: np.ndarray, between: tuple[np.ndarray, ...], stop: np.ndarray
 ) -> np.ndarray:
     """Distance [A] m from each front bumper to the first conflict that another vehicle reaches first; inf: none.
 
-    Who is inside goes on; of two that approach, the one that arrives first goes first; who waits at a red light
-    (stop [A]: distance to it) does not count; who cannot stop any more goes.
+    between: see `conflicts`; stop [A]: distance to a red light. A vehicle inside a conflict goes on; of two that
+    approach, the one that arrives first goes first; who waits at a red light does not count; who cannot stop goes.
     """
+    enter, leave = between
     half = fleet.size[:, :1] / 2
     room = enter - s[:, None] - half  # from i to its conflict with j
     inside = (room < 0) & (s[:, None] - half < leave)

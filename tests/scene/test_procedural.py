@@ -9,7 +9,7 @@ from e2rl.scene.interaction import lateral_acceleration, overlapping_pairs
 from e2rl.scene.paths import WHEELBASE
 from e2rl.scene.procedural import ProceduralSource
 from e2rl.scene.recording import DT, LIGHT_RED, Recording
-from e2rl.scene.traffic_flow import Fleet, StopLine, conflicts, roll
+from e2rl.scene.traffic_flow import Fleet, conflicts, roll
 
 
 def generate(count: int, seed: int, split: str) -> list[Recording]:
@@ -61,7 +61,7 @@ def test_red_light_stops_and_green_does_not():
     closed = np.ones(250, bool)
     for shut, stops in ((closed, True), (~closed, False)):
         made = fleet([straight(0, (0, 0))], [0], [10.0])
-        made.lights = [StopLine(0, 90.0, shut)]
+        made.lights = [(0, 90.0, shut)]
         end = roll(made, 150)[-1, 0]
         assert (end + 2.3 < 90.0) == stops
 
