@@ -145,7 +145,7 @@ def _routes(
             _write_route(out, (row, index), route, origin, lights)
         scene["parked"][row] = speed < STANDING and not any(_on_lane(graph, route, position) for route in found)
     out["route_log"] = _driven(scene, out)
-    if out["route_log"][0] < 0:  # no lane route fits the ego's recorded way: it becomes the last candidate
+    if out["route_log"][0] < 0:  # no lane route fits the ego's recorded path: it becomes the last candidate
         slot = min(int(out["route_valid"][0].sum()), settings.routes - 1)
         track = scene["logged"][scene["logged_valid"][:, 0], 0] + [*origin, 0.0, 0.0]
         _write_route(out, (0, slot), route_from_log(graph, track, settings.vertices), origin, lights)

@@ -1,4 +1,4 @@
-"""The drivable area as a field: distance beyond its border, on a 1 m grid around the ego's recorded way."""
+"""The drivable area as a field: distance beyond its border, on a 1 m grid around the ego's recorded path."""
 
 import numpy as np
 from matplotlib.path import Path

@@ -1,4 +1,4 @@
-"""The recorded way of a vehicle as a route, for missions that no lane route fits (lane changes, car parks)."""
+"""The recorded path of a vehicle as a route, for missions that no lane route fits (lane changes, car parks)."""
 
 import numpy as np
 

@@ -1,7 +1,7 @@
 """Source of fresh traffic on the bundled lane graphs, generated when it is loaded.
 
-Vehicles follow random routes by the IDM, keep to red lights, yield at crossing routes to whoever arrives first, and
-drift a little within their lanes. Draws with overlaps are repaired by leaving a vehicle out, or discarded.
+Vehicles follow random routes by the IDM, stop at red lights, give way at crossing routes to the vehicle that arrives
+first, and drift a little within their lanes. A draw with overlaps is repaired by leaving a vehicle out, or discarded.
 """
 
 from collections.abc import Iterator

@@ -9,7 +9,7 @@ import pickle
 import zipfile
 import zlib
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -191,8 +191,8 @@ def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
             width=float(np.median(width.sum(-1))) if width.ndim == 2 and len(width) else 0.0,
             speed_limit=float(feature.get("speed_limit_kmh") or 0.0) / 3.6,
             exits=[str(other) for other in feature.get("exit_lanes", ())],
-            left=_neighbours(feature, "left"),
-            right=_neighbours(feature, "right"),
+            left=_ids(feature.get("left_neighbor", ())),
+            right=_ids(feature.get("right_neighbor", ())),
             heights=line[:, 2] if line.shape[1] > 2 and "polygon" not in feature else None,
         )
         if len(feature.get("polygon", ())) >= 3:
@@ -200,8 +200,7 @@ def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
     return lanes, drivable
 
 
-def _neighbours(feature: dict, side: str) -> list[str]:
-    items = feature.get(f"{side}_neighbor", ())
+def _ids(items: Iterable) -> list[str]:
     return [str(item["feature_id"] if isinstance(item, dict) else item) for item in items]
 
 

@@ -146,7 +146,7 @@ class Source(ABC):
         with ProcessPoolExecutor(self.workers, spawn, torch.set_num_threads, (1,)) as pool:
             try:
                 yield from (row for rows in show(pool.map(self._rows_of, logs, chunksize=4)) for row in rows)
-            finally:  # whoever stops at an invalid scene does not wait for the others
+            finally:  # stopping at an invalid scene, do not wait for the others
                 pool.shutdown(wait=False, cancel_futures=True)
 
     def _build(self) -> SceneSet:
@@ -167,8 +167,8 @@ class Source(ABC):
                     raise InputError(f"{row.reason} (data.skip_invalid=true leaves such scenes out)")
         if not scenes:
             left_out = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
-            place = self.path or f"split {self.split_name}"
-            raise InputError(f"no valid scene in {place} ({left_out}); see the messages above, or pass other data")
+            data = self.path or f"split {self.split_name}"
+            raise InputError(f"no valid scene in {data} ({left_out}); see the messages above, or pass other data")
         tensors = [TensorDict({key: torch.from_numpy(value) for key, value in scene.items()}) for scene in scenes]
         ids, locations, datasets = map(list, zip(*names, strict=True))
         return SceneSet(stack(tensors), ids, locations, datasets[0], self.split_name, dict(dropped))
