@@ -13,10 +13,10 @@ from measure import Bench, Row
 from tensordict import TensorDict
 from torch import Tensor
 
+from e2rl.scene.boxes import separation
 from e2rl.sim import dynamics
 from e2rl.sim.drivable import off_road
 from e2rl.sim.env import DrivingEnv, compiled
-from e2rl.sim.geometry import separation
 
 STEPS = 80  # an episode, its reset included
 AGENTS = 32  # a scene, where the data have scenes of so many

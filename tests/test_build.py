@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from e2rl.evaluation.build import BASELINES, build_methods, build_sim, caption, check_protocol
+from e2rl.synthesizer.synthesizer import Synthesizer
 from hydra import compose, initialize_config_dir
 
 from e2rl.errors import InputError
-from e2rl.evaluation.build import BASELINES, build_methods, build_sim, caption, check_protocol
 from e2rl.metrics.catalogue import CLOSED_LOOP, TRAFFIC
-from e2rl.synthesizer.synthesizer import Synthesizer
 from e2rl.traffic.traffic import Baseline
 from tests.prior.small import small_prior
 

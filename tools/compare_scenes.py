@@ -13,10 +13,11 @@ from scipy.stats import wasserstein_distance
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from e2rl.scene import procedural, scenarionet  # noqa: E402
-from e2rl.scene.bundled import SPLITS, load_recordings  # noqa: E402
+from e2rl.scene.bundled import SPLITS, BundledSource  # noqa: E402
 from e2rl.scene.interaction import lateral_acceleration, overlapping_pairs  # noqa: E402
+from e2rl.scene.procedural import ProceduralSource  # noqa: E402
 from e2rl.scene.recording import DT, VEHICLE, Recording  # noqa: E402
+from e2rl.scene.scenarionet import ScenarioNetSource  # noqa: E402
 from e2rl.scene.smoothing import drop_jumps, smooth  # noqa: E402
 
 MOVING, STEPS = 0.5, 80
@@ -64,14 +65,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", help="folder or zip of recorded scenarios")
     options = parser.parse_args()
-    logs = pool(
-        recording
-        for container, member in scenarionet.list_files(options.logs)
-        for recording in scenarionet.read_recordings(scenarionet.read_bytes(container, member), member, "", None, STEPS)
-    )
+    logs = pool(ScenarioNetSource(options.logs).recordings())
     sets = {
-        "bundled": pool(r for split in SPLITS for r in load_recordings(split)),
-        "procedural": pool(procedural.generate_recordings(100, 0, "train")),
+        "bundled": pool(r for split in SPLITS for r in BundledSource(split=split).recordings()),
+        "procedural": pool(ProceduralSource(split="train", count=100).recordings()),
         "recorded": logs,
     }
     print("| | " + " | ".join(f"{name}, n = {part['n'][0]}" for name, part in sets.items()) + " |")

@@ -14,12 +14,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from scenegen.archive import pack  # noqa: E402
 from scenegen.families import schedule  # noqa: E402
 from scenegen.simulate import DT, RECORDED, convert, densify, run  # noqa: E402
 from scenegen.tracks import park, stack_tracks  # noqa: E402
 from scenegen.windows import cut_windows  # noqa: E402
 
-from e2rl.scene.bundled import SPLITS, SceneMap, pack  # noqa: E402
+from e2rl.scene.bundled import SPLITS, SceneMap  # noqa: E402
 
 PATTERN = ("train", "train", "tune", "train", "test")  # of every five nets: 60 / 20 / 20 per cent
 
@@ -33,9 +34,9 @@ def make_net(index: int, family, seed: int, most: int, folder: Path):
     states, valid, size = stack_tracks(tracks, round(RECORDED / DT), rng)
     densify(net.lanes)
     parking = park(net, states, valid, size, rng)
-    place = SceneMap(layout.name, net.lanes, net.drivable + parking.strips, lights, parking.pose, parking.size)
-    scenes, refused = cut_windows(place, states, valid, size, net.border, most, rng)
-    return place, scenes, refused
+    scene_map = SceneMap(layout.name, net.lanes, net.drivable + parking.strips, lights, parking.pose, parking.size)
+    scenes, refused = cut_windows(scene_map, states, valid, size, net.border, most, rng)
+    return scene_map, scenes, refused
 
 
 def main() -> None:
@@ -49,16 +50,16 @@ def main() -> None:
     nets, refusals = [], Counter()
     with tempfile.TemporaryDirectory() as folder:
         for index, family in enumerate(schedule(options.nets)):
-            place, scenes, refused = make_net(index, family, options.seed, options.windows, Path(folder))
+            scene_map, scenes, refused = make_net(index, family, options.seed, options.windows, Path(folder))
             refusals += refused
-            print(f"{place.name}: {len(scenes)} scenes, refused {dict(refused)}", flush=True)
+            print(f"{scene_map.name}: {len(scenes)} scenes, refused {dict(refused)}", flush=True)
             if scenes:
-                nets.append((family.__name__, place, scenes))
+                nets.append((family.__name__, scene_map, scenes))
     nets.sort(key=lambda row: row[0])  # stable: families one after another, so that all splits get their share of each
     made = {split: ([], []) for split in SPLITS}
-    for turn, (_, place, scenes) in enumerate(nets):
+    for turn, (_, scene_map, scenes) in enumerate(nets):
         maps, kept = made[PATTERN[turn % len(PATTERN)]]
-        maps.append(place)
+        maps.append(scene_map)
         kept.extend(scenes)
     options.out.mkdir(parents=True, exist_ok=True)
     for split, (maps, scenes) in made.items():

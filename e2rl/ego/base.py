@@ -30,8 +30,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from e2rl.errors import InputError
+from e2rl.scene.boxes import to_frame
 from e2rl.sim import dynamics
-from e2rl.sim.geometry import to_frame
 from e2rl.sim.world import World
 
 PLAN_STEPS = 50  # H: planned steps of DT

@@ -6,10 +6,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from e2rl.scene.boxes import separation
 from e2rl.scene.recording import DT
 from e2rl.scene.route import project
 from e2rl.sim.drivable import off_road
-from e2rl.sim.geometry import separation
 from e2rl.sim.mission import mission_of
 
 PAIRS = 8_000_000  # boxes compared at once: bounds the memory

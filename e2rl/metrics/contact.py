@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from e2rl.metrics.geometry import edge_distances, edge_parts_inside, overlap_area, velocity
+from e2rl.scene.boxes import separation
 from e2rl.sim.dynamics import wrap
-from e2rl.sim.geometry import separation
 
 MIN_AREA = 1e-6  # m2: a smaller overlap is the rounding of float32 positions
 FRONT, SIDE, REAR = 0, 1, 2

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from e2rl.metrics.contact import FRONT, EgoContact
-from e2rl.sim.geometry import separation
+from e2rl.scene.boxes import separation
 
 STANDING = 0.1  # m/s
 CUT_IN_STEPS = 10  # 1 s at 10 Hz

@@ -1,4 +1,4 @@
-"""What scoring asks of oriented boxes beside `sim.geometry`: exact overlap area, the parts of edges inside another box.
+"""What scoring asks of oriented boxes beside `scene.boxes`: exact overlap area, the parts of edges inside another box.
 
 A box is a state (x, y, heading, speed) and a size (length, width); leading dimensions broadcast. float64 is advised
 where an overlap of 1e-6 m2 decides.
@@ -7,9 +7,9 @@ where an overlap of 1e-6 m2 decides.
 import torch
 from torch import Tensor
 
-from e2rl.sim.geometry import corners, to_frame
+from e2rl.scene.boxes import corners, to_frame
 
-EDGES = ("left", "rear", "right", "front")  # edge i runs from corner i to corner i + 1 of sim.geometry.corners
+EDGES = ("left", "rear", "right", "front")  # edge i runs from corner i to corner i + 1 of scene.boxes.corners
 
 
 def velocity(states: Tensor) -> Tensor:

@@ -7,11 +7,11 @@ Names: B rollouts, M tracks (one vehicle of one rollout each), N agents, T steps
 import torch
 from torch import Tensor
 
+from e2rl.scene.boxes import corners, signed_distance
 from e2rl.scene.recording import DT, LIGHT_RED
 from e2rl.scene.route import project
 from e2rl.sim.drivable import off_road
 from e2rl.sim.dynamics import wrap
-from e2rl.sim.geometry import corners, signed_distance
 
 TTC_CAP = 5.0  # s
 AHEAD_ANGLE = 1.31  # rad (75 degrees) between headings beyond which nobody follows anybody

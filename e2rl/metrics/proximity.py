@@ -5,8 +5,8 @@ from torch import Tensor
 
 from e2rl.metrics.contact import up_to
 from e2rl.metrics.geometry import velocity
+from e2rl.scene.boxes import distance
 from e2rl.sim.dynamics import wrap
-from e2rl.sim.geometry import distance
 
 SMOOTHING = 0.5  # s, moving average of the ego's speed before its derivative
 

@@ -7,18 +7,20 @@ import torch
 from tensordict import TensorDict
 
 from e2rl.errors import InputError
+from e2rl.scene import boxes
 from e2rl.scene.drivable import drivable_field
-from e2rl.scene.interaction import overlap
-from e2rl.scene.lane_graph import LaneGraph, Route, believed_width
+from e2rl.scene.lane_graph import BEHIND, LaneGraph, Route, plausible_width
 from e2rl.scene.log_route import route_from_log
 from e2rl.scene.paths import wrap
 from e2rl.scene.recording import VEHICLE, Recording
 from e2rl.scene.route import SPACING, project
 from e2rl.scene.smoothing import PAST, causal_past, causal_state, drop_jumps, smooth
 
+Arrays = dict[str, np.ndarray]
 STANDING = 0.5  # m/s
-FIT = 2.0  # m: mean distance of a recorded future to a candidate that still counts as the way driven
+FIT = 2.0  # m: mean distance of a recorded future from a candidate that still counts as the route driven
 PASSED = 1.0  # m behind the vehicle's centre beyond which a stop line no longer counts
+MAX_EXITS, MAX_LIGHTS = 6, 2  # successors of a lane, lights of a route that a scene keeps
 
 
 @dataclass(frozen=True)
@@ -37,206 +39,199 @@ class BuildSettings:
 def build_scene(recording: Recording, settings: BuildSettings) -> TensorDict:
     """The Scene of a recording from its start frame (schema: e2rl/scene/scene.py).
 
-    Raises InputError where the recording makes none (no ego, no lanes, NaN states, the ego overlapped at the start).
+    Raises InputError where the recording makes none (no ego, no lanes, NaN states).
     """
-    recording.validate()
+    frame = recording.validate().current
+    assert frame is not None
     valid = drop_jumps(recording.states, recording.valid)
-    valid[:, recording.ego] = recording.valid[:, recording.ego]  # whoever drops the ego drops the scene
-    states = smooth(recording.states, valid)
-    frame = recording.current
-    start, accel, yaw_rate = causal_state(recording.states, valid, frame)
-    start = np.where(valid[frame, :, None], start, 0.0)
-    agents = _participants(recording, states, valid, settings)
-    origin = np.round(start[recording.ego, :2])
+    valid[:, recording.ego] = recording.valid[:, recording.ego]  # without the ego there is no scene
     graph = LaneGraph(recording.lanes)
     if not graph.ids:
         raise InputError(f"scene {recording.scene_id!r}: no lane is at least 0.5 m long; leave the scene out")
-    rows = np.flatnonzero(agents >= 0)
-    chosen = agents[rows]
-    count = settings.vehicles + settings.others
-    scene = {
-        "start": np.zeros((count, 4)),
-        "start_accel": np.zeros(count),
-        "start_yaw_rate": np.zeros(count),
-        "valid": np.zeros(count, bool),
-        "size": np.ones((count, 2)),
-        "agent_type": np.zeros(count, np.int64),
-        "parked": np.zeros(count, bool),
-        "logged": np.zeros((settings.steps + 1, count, 4)),
-        "logged_valid": np.zeros((settings.steps + 1, count), bool),
-    }
-    present = valid[frame, chosen]
-    scene["start"][rows] = (start[chosen] - [*origin, 0, 0]) * present[:, None]
-    scene["start_accel"][rows], scene["start_yaw_rate"][rows] = accel[chosen] * present, yaw_rate[chosen] * present
-    scene["valid"][rows], scene["size"][rows] = present, recording.size[chosen]
-    scene["agent_type"][rows] = recording.agent_type[chosen]
-    last = min(settings.steps + 1, len(valid) - frame)
-    known = valid[frame : frame + last, chosen]
-    scene["logged"][:last, rows] = np.where(known[..., None], states[frame : frame + last, chosen] - [*origin, 0, 0], 0)
-    scene["logged_valid"][:last, rows] = known
-    scene["past"] = np.zeros((settings.vehicles, PAST, 3))
-    cars = rows[rows < settings.vehicles]
-    scene["past"][cars] = causal_past(recording.states, valid, frame, start[:, 3])[agents[cars]]
-    scene |= _routes(scene, graph, recording, origin, settings)
+    scene, origin = _agents(recording, frame, valid, settings)
+    lights = {name: index for index, name in enumerate(recording.lights)}
+    scene |= _routes(scene, graph, origin, lights, settings)
     scene |= _lights(recording, frame, origin, settings.steps)
     scene |= _map(recording, graph, scene, origin, settings)
     return TensorDict({key: _tensor(value) for key, value in scene.items()}, batch_size=[])
 
 
 def _tensor(value: np.ndarray) -> torch.Tensor:
-    value = torch.from_numpy(np.ascontiguousarray(value))
-    return value.float() if value.dtype == torch.float64 else value
+    tensor = torch.from_numpy(np.ascontiguousarray(value))
+    return tensor.float() if tensor.dtype == torch.float64 else tensor
 
 
-def _participants(recording: Recording, states, valid, settings: BuildSettings) -> np.ndarray:
-    """Track of each agent row, -1 for padding: the ego, the vehicles nearest to it at the start frame, then the others
-    that come nearest to it."""
-    frame, ego = recording.current, recording.ego
-    vehicle = recording.agent_type == VEHICLE
-    apart = np.linalg.norm(states[:, :, :2] - states[:, [ego], :2], axis=-1)
-    now = np.where(valid[frame] & vehicle, apart[frame], np.inf)
+def _agents(recording: Recording, frame: int, valid: np.ndarray, settings: BuildSettings) -> tuple[Arrays, np.ndarray]:
+    """Start states, past and recorded future of the agents that take part, and the scene's origin [2]."""
+    states = smooth(recording.states, valid)
+    start, accel, yaw_rate = causal_state(recording.states, valid, frame)
+    start = np.where(valid[frame, :, None], start, 0.0)
+    origin = np.round(start[recording.ego, :2])
+    shift = np.array([*origin, 0.0, 0.0])
+    tracks = _participants(recording, frame, states, valid, settings)
+    rows = np.flatnonzero(tracks >= 0)
+    chosen, cars = tracks[rows], rows[rows < settings.vehicles]
+    frames = frame + np.arange(settings.steps + 1)
+    recorded = np.minimum(frames, len(valid) - 1)
+    present = valid[frame, chosen]
+    known = valid[recorded][:, chosen] & (frames < len(valid))[:, None]
+    logged = np.where(known[..., None], states[recorded][:, chosen] - shift, 0.0)
+
+    def padded(values: np.ndarray, fill: float = 0) -> np.ndarray:
+        out = np.full((len(tracks), *values.shape[1:]), fill, values.dtype)
+        out[rows] = values
+        return out
+
+    scene = {
+        "start": padded((start[chosen] - shift) * present[:, None]),
+        "start_accel": padded(accel[chosen] * present),
+        "start_yaw_rate": padded(yaw_rate[chosen] * present),
+        "valid": padded(present),
+        "size": padded(recording.size[chosen].astype(float), 1),
+        "agent_type": padded(recording.agent_type[chosen].astype(np.int64)),
+        "parked": np.zeros(len(tracks), bool),
+        "logged": padded(logged.swapaxes(0, 1)).swapaxes(0, 1),
+        "logged_valid": padded(known.T).T,
+        "past": np.zeros((settings.vehicles, PAST, 3)),
+    }
+    scene["past"][cars] = causal_past(recording.states, valid, frame, start[:, 3])[tracks[cars]]
+    return scene, origin
+
+
+def _participants(
+    recording: Recording, frame: int, states: np.ndarray, valid: np.ndarray, settings: BuildSettings
+) -> np.ndarray:
+    """The track of each agent [N], -1 for padding: the ego, the vehicles nearest to it at the start frame, then the
+    other agents that come nearest to it."""
+    ego, vehicle = recording.ego, recording.agent_type == VEHICLE
+    distance = np.linalg.norm(states[:, :, :2] - states[:, [ego], :2], axis=-1)
+    now = np.where(valid[frame] & vehicle, distance[frame], np.inf)
     now[ego] = -1.0
     cars = np.argsort(now, kind="stable")[: settings.vehicles]
     span = slice(frame, frame + settings.steps + 1)
-    nearest = np.where(valid[span] & valid[span, [ego]], apart[span], np.inf).min(0, initial=np.inf)
+    nearest = np.where(valid[span] & valid[span, [ego]], distance[span], np.inf).min(0, initial=np.inf)
     nearest[vehicle] = nearest[ego] = np.inf
-    rest = np.argsort(nearest, kind="stable")[: settings.others]
-    agents = np.full(settings.vehicles + settings.others, -1)
-    cars, rest = cars[np.isfinite(now[cars])], rest[np.isfinite(nearest[rest])]
-    agents[: len(cars)] = cars
-    agents[settings.vehicles : settings.vehicles + len(rest)] = rest
-    return agents
+    others = np.argsort(nearest, kind="stable")[: settings.others]
+    tracks = np.full(settings.vehicles + settings.others, -1)
+    cars, others = cars[np.isfinite(now[cars])], others[np.isfinite(nearest[others])]
+    tracks[: len(cars)] = cars
+    tracks[settings.vehicles : settings.vehicles + len(others)] = others
+    return tracks
 
 
-def _routes(scene: dict, graph: LaneGraph, recording: Recording, origin, settings: BuildSettings) -> dict:
-    """Route candidates of every vehicle, the one driven, the lights on them, and who is parked."""
-    shape = (settings.vehicles, settings.routes)
+def _routes(
+    scene: Arrays, graph: LaneGraph, origin: np.ndarray, lights: dict[str, int], settings: BuildSettings
+) -> Arrays:
+    """Route candidates of every vehicle and the one driven; sets scene["parked"]. lights: lane id -> index."""
+    shape, reach = (settings.vehicles, settings.routes), (settings.vertices - 1) * SPACING
     out = {
         "route_points": np.zeros((*shape, settings.vertices, 2)),
-        "route_length": np.zeros(shape),
+        "route_length": np.full(shape, reach),
         "route_open": np.zeros(shape, bool),
         "route_valid": np.zeros(shape, bool),
         "route_limit": np.zeros((*shape, settings.vertices), np.float32),
-        "route_light": np.full((*shape, 2), -1),
-        "route_light_s": np.zeros((*shape, 2)),
+        "route_light": np.full((*shape, MAX_LIGHTS), -1),
+        "route_light_s": np.zeros((*shape, MAX_LIGHTS)),
     }
-    lights = {name: index for index, name in enumerate(recording.lights)}
-    reach = (settings.vertices - 1) * SPACING
     for row in range(settings.vehicles):
         x, y, heading, speed = scene["start"][row]
-        ahead = np.arange(settings.vertices)[:, None] * SPACING - 20.0
+        ahead = np.arange(settings.vertices)[:, None] * SPACING - BEHIND
         out["route_points"][row] = np.array([x, y]) + ahead * np.array([np.cos(heading), np.sin(heading)])
-        out["route_length"][row] = reach
         if not scene["valid"][row]:
             continue
-        found = graph.candidates(np.array([x, y]) + origin, heading, speed, settings.routes, settings.vertices)
+        position = np.array([x, y]) + origin
+        found = graph.candidates(position, heading, speed, settings.routes, settings.vertices)
         for index, route in enumerate(found):
             _write_route(out, (row, index), route, origin, lights)
-        scene["parked"][row] = speed < STANDING and not _on_lane(graph, found, scene["start"][row], origin)
-    out["route_log"] = _driven(scene, out, settings)
-    if out["route_log"][0] < 0:
-        _add_mission(out, scene, graph, origin, lights)
+        scene["parked"][row] = speed < STANDING and not any(_on_lane(graph, route, position) for route in found)
+    out["route_log"] = _driven(scene, out)
+    if out["route_log"][0] < 0:  # no lane route fits the ego's recorded path: it becomes the last candidate
+        slot = min(int(out["route_valid"][0].sum()), settings.routes - 1)
+        track = scene["logged"][scene["logged_valid"][:, 0], 0] + [*origin, 0.0, 0.0]
+        _write_route(out, (0, slot), route_from_log(graph, track, settings.vertices), origin, lights)
+        out["route_log"][0] = slot
     return out
 
 
-def _write_route(out: dict, at: tuple[int, int], route: Route, origin, lights: dict[str, int]) -> None:
+def _write_route(out: Arrays, at: tuple[int, int], route: Route, origin: np.ndarray, lights: dict[str, int]) -> None:
     out["route_points"][at], out["route_length"][at] = route.points - origin, route.length
     out["route_open"][at], out["route_valid"][at], out["route_limit"][at] = route.open, True, route.limit
-    ahead = [(lights[name], s) for name, s in route.lanes if name in lights and s > route.here - PASSED][:2]
+    ahead = [(lights[name], s) for name, s in route.lanes if name in lights and s > route.vehicle_s - PASSED]
     out["route_light"][at], out["route_light_s"][at] = -1, 0.0
-    for k, (index, s) in enumerate(ahead):
+    for k, (index, s) in enumerate(ahead[:MAX_LIGHTS]):
         out["route_light"][at][k], out["route_light_s"][at][k] = index, s
 
 
-def _on_lane(graph: LaneGraph, found: list[Route], state, origin) -> bool:
-    """Whether a vehicle stands within the lane of one of its candidates."""
-    if not found:
-        return False
-    point = torch.from_numpy(state[None, :2] + origin)
-    for route in found:
-        s, d, _ = project(point, torch.from_numpy(route.points), torch.full((1,), 20.0))
-        lane = [name for name, start in route.lanes if start <= s.item() + 1e-6][-1:] or [route.lanes[0][0]]
-        if abs(d.item()) < believed_width(graph.lanes[lane[0]].width) / 2 + 0.3:
-            return True
-    return False
+def _on_lane(graph: LaneGraph, route: Route, position: np.ndarray) -> bool:
+    """Whether a position [2] on the map lies within the lane of a route there."""
+    s, d, _ = project(torch.from_numpy(position[None]), torch.from_numpy(route.points), torch.full((1,), BEHIND))
+    lane = [name for name, start in route.lanes if start <= s.item() + 1e-6][-1:] or [route.lanes[0][0]]
+    return abs(d.item()) < plausible_width(graph.lanes[lane[0]].width) / 2 + 0.3
 
 
-def _driven(scene: dict, routes: dict, settings: BuildSettings) -> np.ndarray:
-    """The candidate nearest to each vehicle's recorded future, -1 where none is near."""
-    rows = slice(0, settings.vehicles)
-    track = torch.from_numpy(scene["logged"][:, rows, :2].swapaxes(0, 1).copy())
-    known = torch.from_numpy(scene["logged_valid"][:, rows].T.copy())
-    points = torch.from_numpy(routes["route_points"])
-    s, d, heading = project(track[:, None], points)
-    turned = wrap(heading - torch.from_numpy(scene["logged"][:, rows, 2].T.copy())[:, None])
-    over = (s - torch.from_numpy(routes["route_length"])[..., None]).clamp(min=0) * torch.from_numpy(
-        ~routes["route_open"]
-    )[..., None]
-    cost = d.abs() + 2.0 * turned.abs() + over
+def _driven(scene: Arrays, routes: Arrays) -> np.ndarray:
+    """The candidate [V] nearest to each vehicle's recorded future, -1 where none is near."""
+    route = {key: torch.from_numpy(value) for key, value in routes.items()}
+    cars = len(routes["route_points"])
+    track = torch.from_numpy(scene["logged"][:, :cars].swapaxes(0, 1).copy())
+    known = torch.from_numpy(scene["logged_valid"][:, :cars].T.copy())
+    s, d, heading = project(track[:, None, :, :2].contiguous(), route["route_points"])
+    turned = wrap(heading - track[:, None, :, 2])
+    over = (s - route["route_length"][..., None]).clamp(min=0) * ~route["route_open"][..., None]
     weight = known[:, None].double()
-    mean = (cost * weight).sum(-1) / weight.sum(-1).clamp(min=1)
-    mean[~torch.from_numpy(routes["route_valid"])] = torch.inf
-    driven = torch.where((mean.min(1).values < FIT) & (weight.sum(-1) > 0).squeeze(1), mean.argmin(1), -1).numpy()
-    return driven
+    mean = ((d.abs() + 2.0 * turned.abs() + over) * weight).sum(-1) / weight.sum(-1).clamp(min=1)
+    mean[~route["route_valid"]] = torch.inf
+    return torch.where((mean.min(1).values < FIT) & known.any(1), mean.argmin(1), -1).numpy()
 
 
-def _add_mission(out: dict, scene: dict, graph: LaneGraph, origin, lights: dict[str, int]) -> None:
-    """The ego's recorded way becomes its last candidate and its mission, where no lane route fits it."""
-    track = scene["logged"][scene["logged_valid"][:, 0], 0] + [*origin, 0.0, 0.0]
-    slot = min(int(out["route_valid"][0].sum()), out["route_valid"].shape[1] - 1)
-    _write_route(out, (0, slot), route_from_log(graph, track, out["route_points"].shape[2]), origin, lights)
-    out["route_log"][0] = slot
-
-
-def _lights(recording: Recording, frame: int, origin, steps: int) -> dict:
+def _lights(recording: Recording, frame: int, origin: np.ndarray, steps: int) -> Arrays:
     """Light states over the simulated steps (the last known one goes on) and the points where their lanes begin."""
     if not recording.lights:
         return {"light_state": np.zeros((steps + 1, 0), np.int64), "light_points": np.zeros((0, 2))}
-    frames = np.minimum(frame + np.arange(steps + 1), len(next(iter(recording.lights.values()))) - 1)
-    points = [recording.lanes[name].points[0] for name in recording.lights]
-    return {
-        "light_state": np.stack([state[frames] for state in recording.lights.values()], 1).astype(np.int64),
-        "light_points": np.stack(points) - origin,
-    }
+    states = np.stack(list(recording.lights.values()), 1)
+    frames = np.minimum(frame + np.arange(steps + 1), len(states) - 1)
+    points = np.stack([recording.lanes[name].points[0] for name in recording.lights])
+    return {"light_state": states[frames].astype(np.int64), "light_points": points - origin}
 
 
-def _map(recording: Recording, graph: LaneGraph, scene: dict, origin, settings: BuildSettings) -> dict:
+def _map(recording: Recording, graph: LaneGraph, scene: Arrays, origin: np.ndarray, settings: BuildSettings) -> Arrays:
     """Lane centrelines at 1 m with widths and neighbours, polygons, and the drivable field."""
     number = {name: index for index, name in enumerate(graph.ids)}
+    lanes = [graph.lanes[name] for name in graph.ids]
     lines = [graph.line[name] - origin for name in graph.ids]
-    widths = np.array([believed_width(graph.lanes[name].width) for name in graph.ids])
-    exits = np.full((len(lines), 6), -1)
+    widths = np.array([plausible_width(lane.width) for lane in lanes])
+    exits = np.full((len(lines), MAX_EXITS), -1)
     for index, name in enumerate(graph.ids):
-        nexts = [number[other] for other in graph.graph.successors(name)][:6]
+        nexts = [number[other] for other in graph.graph.successors(name)][:MAX_EXITS]
         exits[index, : len(nexts)] = nexts
-    neighbour = {
-        side: np.array(
-            [next((number[n] for n in getattr(graph.lanes[name], side) if n in number), -1) for name in graph.ids]
-        )
-        for side in ("left", "right")
-    }
     rings = [ring - origin for ring in recording.drivable if len(ring) >= 3]
     ego = scene["logged"][scene["logged_valid"][:, 0], 0, :2]
     field, field_origin = drivable_field(lines, widths, rings, (ego.min(0) + ego.max(0)) / 2, settings.field_cells)
-    points = lambda parts: np.concatenate(parts) if parts else np.zeros((0, 2))  # noqa: E731
-    index = lambda parts: np.repeat(np.arange(len(parts)), [len(part) for part in parts])  # noqa: E731
+    lane_points, lane_index = _joined(lines)
+    drivable_points, drivable_index = _joined(rings)
     return {
-        "lane_points": points(lines),
-        "lane_index": index(lines),
+        "lane_points": lane_points,
+        "lane_index": lane_index,
         "lane_width": widths,
         "lane_exits": exits,
-        "lane_left": neighbour["left"],
-        "lane_right": neighbour["right"],
-        "drivable_points": points(rings),
-        "drivable_index": index(rings),
+        "lane_left": np.array([next((number[n] for n in lane.left if n in number), -1) for lane in lanes]),
+        "lane_right": np.array([next((number[n] for n in lane.right if n in number), -1) for lane in lanes]),
+        "drivable_points": drivable_points,
+        "drivable_index": drivable_index,
         "field": field,
         "field_origin": field_origin,
     }
+
+
+def _joined(parts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The points of polylines in a row [P, 2], and which polyline each belongs to [P]."""
+    index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    return np.concatenate([np.zeros((0, 2)), *parts]), index
 
 
 def ego_overlaps(scene: TensorDict) -> bool:
     """Whether the ego's box overlaps another vehicle's at the start frame."""
     others = scene["valid"] & (scene["agent_type"] == VEHICLE)
     others[0] = False
-    pose, size = scene["start"].double().numpy(), scene["size"].double().numpy()
-    return bool((overlap(pose[:1], size[:1], pose, size) & others.numpy()).any())
+    pose, size = scene["start"].double(), scene["size"].double()
+    return bool((boxes.overlap(pose[:1], size[:1], pose, size) & others).any())

@@ -1,15 +1,20 @@
-"""Vehicle paths over arc length: Whittaker smoothing and the heading of a body that follows its front axle.
+"""Polylines and vehicle paths over arc length: Whittaker smoothing, the heading of a body behind its front axle.
 
-Paths are built over distance, not over time, so a creeping or standing vehicle cannot spin.
+Paths are functions of distance, not of time, so a creeping or standing vehicle cannot spin.
 """
+
+from typing import TypeVar
 
 import numpy as np
 from scipy.linalg import solveh_banded
+from torch import Tensor
+
+Angle = TypeVar("Angle", float, np.ndarray, Tensor)
 
 WHEELBASE = 0.6  # of the body's length; the axles lie 0.3 lengths before and behind its centre
 
 
-def wrap(angle):
+def wrap(angle: Angle) -> Angle:
     """Angles [rad] in [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
@@ -20,8 +25,31 @@ def arc_length(points: np.ndarray) -> np.ndarray:
     return np.concatenate([np.zeros_like(steps[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
 
 
-def offset(points: np.ndarray, distance: np.ndarray | float) -> np.ndarray:
-    """Polyline [P, 2] moved `distance` m (scalar or [P]) to its left."""
+def points_at(line: np.ndarray, arc: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Points [Q, 2] of a polyline [P, 2] at arc lengths `at` [Q]; arc [P]: its own. It goes on straight at its end."""
+    points = np.stack([np.interp(at, arc, line[:, axis]) for axis in range(2)], 1)
+    beyond = at > arc[-1]
+    if beyond.any():
+        unit = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
+        points[beyond] = line[-1] + (at[beyond] - arc[-1])[:, None] * unit
+    return points
+
+
+def resample(points: np.ndarray, spacing: float) -> np.ndarray:
+    """Points [Q, 2] nearly every `spacing` m along points [P, 2]: the length is divided evenly."""
+    arc = arc_length(points)
+    count = max(int(np.ceil(arc[-1] / spacing)), 1) + 1
+    return points_at(points, arc, np.linspace(0.0, arc[-1], count))
+
+
+def tangent_angle(points: np.ndarray) -> np.ndarray:
+    """Direction [P] rad of a polyline [P, 2] at its points."""
+    tangent = np.gradient(points, axis=0)
+    return np.arctan2(tangent[:, 1], tangent[:, 0])
+
+
+def shift_left(points: np.ndarray, distance: np.ndarray | float) -> np.ndarray:
+    """Polyline [P, 2] shifted `distance` m (scalar or [P]) to its left."""
     tangent = np.gradient(points, axis=0)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-9)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], -1)

@@ -1,6 +1,7 @@
-"""What a source yields: one recorded (or generated) piece of traffic with its map, on the host, in numpy."""
+"""What a source yields: one recorded or generated piece of traffic with its map, on the host, in numpy."""
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -10,6 +11,7 @@ VEHICLE, PEDESTRIAN, CYCLIST, OTHER = range(4)
 AGENT_TYPES = ("vehicle", "pedestrian", "cyclist", "other")
 LIGHT_UNKNOWN, LIGHT_RED, LIGHT_YELLOW, LIGHT_GREEN = range(4)
 DT = 0.1  # s, the time step of every recording, scene and simulation
+HISTORY = 10  # frames of history before a start frame that is chosen here
 
 
 @dataclass
@@ -35,7 +37,7 @@ class Recording:
 
     states [F, A, 4]: x, y [m], heading [rad], speed [m/s]; valid [F, A]; size [A, 2]: length, width [m];
     agent_type [A]; ego: index of the ego's track; lights: lane id -> [F] light state; drivable: polygons [P, 2];
-    current: the start frame, with at least one frame of history before it.
+    current: the start frame, with at least one frame of history before it; None where the log names none.
     """
 
     scene_id: str
@@ -49,45 +51,58 @@ class Recording:
     lanes: dict[str, Lane]
     drivable: list[np.ndarray] = field(default_factory=list)
     lights: dict[str, np.ndarray] = field(default_factory=dict)
-    current: int = 10
+    current: int | None = HISTORY
+
+    def windows(self, starts: Sequence[int] | None, steps: int) -> Iterator["Recording"]:
+        """The recordings of `steps` simulated steps that this log makes, with ids of the form `id@start`.
+
+        One from each of `starts` that leaves at least half of the steps recorded. Default: the log's own start frame,
+        or, where it names none, as many windows as fit one after another (at least one).
+        """
+        frames = len(self.states)
+        if starts:
+            starts = [start for start in starts if start <= frames - steps // 2]
+        else:
+            starts = range(HISTORY, frames - steps, steps + HISTORY + 1) if self.current is None else ()
+            if len(starts) < 2:
+                yield replace(self, current=HISTORY) if self.current is None else self
+                return
+        for start in starts:
+            yield replace(self, current=start, scene_id=f"{self.scene_id}@{start}")
 
     def validate(self) -> "Recording":
         """Return self; raise InputError naming the scene where tracks, ego or lanes cannot make a scene."""
-        where = f"scene {self.scene_id!r}"
+        if problem := self._problem():
+            raise InputError(f"scene {self.scene_id!r}: {problem}")
+        return self
+
+    def _problem(self) -> str | None:
+        """What is wrong with the recording and how to mend it; None: nothing."""
         frames, agents = self.valid.shape if self.valid.ndim == 2 else (0, 0)
         if self.states.shape != (frames, agents, 4) or not frames or not agents:
-            raise InputError(
-                f"{where}: states {self.states.shape} do not match valid {self.valid.shape}; expected "
-                "[frames, agents, 4] and [frames, agents]"
-            )
+            shapes = f"states {self.states.shape} do not match valid {self.valid.shape}"
+            return f"{shapes}; expected [frames, agents, 4] and [frames, agents]"
         if not 0 <= self.ego < agents:
-            raise InputError(f"{where}: no ego; name its track in metadata.sdc_id, or leave the scene out")
+            return "no ego; name its track in metadata.sdc_id, or leave the scene out"
         if not self.lanes:
-            raise InputError(f"{where}: no lanes; routes need lane centrelines, so leave the scene out")
-        if not 1 <= self.current < frames - 1:
-            raise InputError(f"{where}: start frame {self.current} leaves no history or no future in {frames} frames")
+            return "no lanes; routes need lane centrelines, so leave the scene out"
+        if self.current is None or not 1 <= self.current < frames - 1:
+            return f"start frame {self.current} leaves no history or no future in {frames} frames"
         if not self.valid[self.current, self.ego]:
-            raise InputError(f"{where}: the ego is not recorded at the start frame {self.current}")
+            return f"the ego is not recorded at the start frame {self.current}"
         if self.agent_type[self.ego] != VEHICLE:
-            raise InputError(
-                f"{where}: the ego is a {AGENT_TYPES[self.agent_type[self.ego]]}, expected a vehicle; "
-                "name another track in metadata.sdc_id, or leave the scene out"
-            )
+            kind = AGENT_TYPES[self.agent_type[self.ego]]
+            return f"the ego is a {kind}, expected a vehicle; name another track, or leave the scene out"
         for name, lane in self.lanes.items():
             if lane.points.ndim != 2 or lane.points.shape[1] != 2 or not np.isfinite(lane.points).all():
-                raise InputError(
-                    f"{where}: the centreline of lane {name} is not a list of finite points; repair the "
-                    "map or leave the lane out"
-                )
+                return f"the centreline of lane {name} is not a list of finite points; repair the map or drop the lane"
         if not all(np.isfinite(ring).all() for ring in self.drivable):
-            raise InputError(f"{where}: a drivable polygon holds NaN or infinite points; repair the map")
-        if not np.isfinite(self.states[self.valid]).all():
-            frame, agent = np.argwhere(self.valid & ~np.isfinite(self.states).all(-1))[0]
-            raise InputError(
-                f"{where}: NaN or infinite state of agent {agent} at frame {frame}, marked valid; mark it "
-                "invalid or repair the log"
-            )
-        used = self.valid.any(0)
-        if not (np.isfinite(self.size[used]).all() and (self.size[used] > 0).all()):
-            raise InputError(f"{where}: an agent's length or width is not positive; repair the log")
-        return self
+            return "a drivable polygon holds NaN or infinite points; repair the map"
+        bad = self.valid & ~np.isfinite(self.states).all(-1)
+        if bad.any():
+            frame, agent = np.argwhere(bad)[0]
+            return f"NaN or infinite state of agent {agent} at frame {frame}; mark it invalid or repair the log"
+        size = self.size[self.valid.any(0)]
+        if not (np.isfinite(size).all() and (size > 0).all()):
+            return "an agent's length or width is not positive; repair the log"
+        return None

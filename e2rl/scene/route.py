@@ -23,7 +23,7 @@ def _take(route: Tensor, index: Tensor) -> Tensor:
 def nearest_vertex(points: Tensor, route: Tensor, hint: Tensor | None = None, window: float = 20.0) -> Tensor:
     """Index [..., K] of the vertex of route [..., P, 2] nearest to points [..., K, 2].
 
-    hint [..., K]: expected arc length; vertices farther than `window` m of it are not looked at (self-crossing routes).
+    hint [..., K]: expected arc length; only vertices within `window` m of it count, for routes that cross themselves.
     """
     count = route.shape[-2]
     if hint is None:
@@ -41,9 +41,10 @@ def nearest_vertex(points: Tensor, route: Tensor, hint: Tensor | None = None, wi
 def project(
     points: Tensor, route: Tensor, hint: Tensor | None = None, window: float = 20.0
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Points [..., K, 2] on route [..., P, 2] -> arc length s, offset d (left positive), heading; each [..., K].
+    """Frenet coordinates of points [..., K, 2] on route [..., P, 2]: arc length s [m], offset d [m] (left positive) and
+    the route's heading [rad] at s; each [..., K].
 
-    Leading dims broadcast. Beyond the ends the first and last segments go on straight.
+    hint, window: see `nearest_vertex`. Leading dims broadcast. Beyond the ends the route goes on straight.
     """
     last = route.shape[-2] - 2
     vertex = nearest_vertex(points, route, hint, window)
@@ -53,9 +54,10 @@ def project(
 def onto_segments(
     points: Tensor, vertex: Tensor, last: int, take: Callable[[Tensor], Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """`project` of points [..., 2] whose nearest vertices [...] are known, onto the segments at either side of these.
+    """`project` of points [..., 2] whose nearest vertices [...] are known.
 
-    last: index of the last segment; take: the vertices [2, ..., 2] at an index [2, ...].
+    They are projected onto the two segments that meet at the vertex. last: index of the last segment; take: a function
+    from indices [2, ...] to vertices [2, ..., 2].
     """
     start = torch.stack([vertex - 1, vertex]).clamp(0, last)
     a = take(start)
@@ -73,8 +75,12 @@ def segment(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def onto_nearer(
     points: Tensor, start: Tensor, last: int, a: Tensor, along: Tensor, length: Tensor, unit: Tensor, heading: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Arc length, offset and heading [...] of points [..., 2] on the nearer of two segments [2, ...] (see `segment`)
-    that begin at vertices start [2, ...], a [2, ..., 2]; the first of equals."""
+    """Arc length, offset and heading [...] of points [..., 2] on the nearer of two segments, the first where both are
+    equally near.
+
+    start [2, ...], a [2, ..., 2]: index and position of the vertex where each segment begins; last: index of the last
+    segment; along, length, unit, heading [2, ...]: see `segment`.
+    """
     offset = points - a
     t = (offset * unit).sum(-1) / length
     low = torch.where(start == 0, -torch.inf, 0.0)
@@ -84,13 +90,14 @@ def onto_nearer(
     d = unit[..., 0] * offset[..., 1] - unit[..., 1] * offset[..., 0]
     second = gap[1] < gap[0]
     first, other = torch.stack([SPACING * (start + t), torch.where(d < 0, -gap, gap), heading], -1)
-    return torch.where(second[..., None], other, first).unbind(-1)
+    s, d, heading = torch.where(second[..., None], other, first).unbind(-1)
+    return s, d, heading
 
 
 def interpolate(route: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Point [..., K, 2], heading [rad], curvature [1/m] (each [..., K]) of route [..., P, 2] at arc length s [..., K].
 
-    Points lie on the chords; headings turn linearly between vertex tangents, so they are continuous in s. Beyond the
+    Points lie on the chords; the heading turns linearly from vertex to vertex, so it is continuous in s. Beyond the
     ends the route goes on straight. Differentiable in s.
     """
     last = route.shape[-2] - 2

@@ -1,43 +1,34 @@
-"""Source `scenarionet`: a folder or zip of ScenarioDescription pickles (Waymo, nuScenes, nuPlan, Argoverse 2, Lyft
-through their public converters), read without ever executing what a file names."""
+"""Source of ScenarioNet logs: ScenarioDescription pickles, which public converters make of Waymo, nuScenes, nuPlan,
+Argoverse 2 and Lyft. They are read without ever executing what a file names."""
 
 import csv
 import io
+import json
 import lzma
 import pickle
 import zipfile
 import zlib
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from e2rl.errors import InputError
-from e2rl.scene.recording import (
-    CYCLIST,
-    DT,
-    LIGHT_GREEN,
-    LIGHT_RED,
-    LIGHT_UNKNOWN,
-    LIGHT_YELLOW,
-    OTHER,
-    PEDESTRIAN,
-    VEHICLE,
-    Lane,
-    Recording,
-)
+from e2rl.scene.recording import AGENT_TYPES, DT, LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, Lane, Recording
 from e2rl.scene.smoothing import resample_uniform
+from e2rl.scene.source import Source, hash_files
 
-TYPES = {"VEHICLE": VEHICLE, "PEDESTRIAN": PEDESTRIAN, "CYCLIST": CYCLIST}
+TYPES = {name.upper(): index for index, name in enumerate(AGENT_TYPES)}
 LIGHTS = {  # by the last word of LANE_STATE_... (Waymo) or TRAFFIC_LIGHT_... (nuPlan)
-    "GO": LIGHT_GREEN,
-    "CAUTION": LIGHT_YELLOW,
-    "STOP": LIGHT_RED,
-    "GREEN": LIGHT_GREEN,
-    "YELLOW": LIGHT_YELLOW,
-    "RED": LIGHT_RED,
+    **dict.fromkeys(("GO", "GREEN"), LIGHT_GREEN),
+    **dict.fromkeys(("CAUTION", "YELLOW"), LIGHT_YELLOW),
+    **dict.fromkeys(("STOP", "RED"), LIGHT_RED),
 }
+INDEXES = ("dataset_summary.pkl", "dataset_mapping.pkl")  # pickles beside the scenarios that are none
 BUILTINS = {"set", "frozenset", "list", "dict", "tuple", "int", "float", "bool", "str", "bytes", "bytearray", "complex"}
 NUMPY = {  # what arrays and numbers of numpy 1 (numpy.core) and 2 (numpy._core) name
     "numpy": {"ndarray", "dtype"},
@@ -46,10 +37,60 @@ NUMPY = {  # what arrays and numbers of numpy 1 (numpy.core) and 2 (numpy._core)
 }
 
 
+@dataclass
+class ScenarioNetSource(Source):
+    """The ScenarioDescription pickles (*.pkl) in a folder or zip."""
+
+    holds = "ScenarioDescription pickles"
+
+    def logs(self) -> list[str]:
+        root = self.root()
+        if root.is_dir():
+            names = [str(file.relative_to(root)) for file in sorted(root.rglob("*.pkl"))]
+        elif zipfile.is_zipfile(root):
+            with zipfile.ZipFile(root) as archive:
+                names = [name for name in sorted(archive.namelist()) if name.endswith(".pkl")]
+        else:
+            raise InputError(f"data.path={root}: neither a folder nor a zip file")
+        names = [name for name in names if Path(name).name not in INDEXES]
+        if not names:
+            raise InputError(f"data.path={root}: holds no .pkl scenario; convert the logs with ScenarioNet first")
+        return names
+
+    def read(self, log: str) -> Iterator[Recording]:
+        yield read_recording(self.content(log), log, self.locations.get(Path(log).stem, ""))
+
+    def fingerprint(self) -> bytes:
+        root = self.root()
+        files = [root] if root.is_file() else [root / log for log in self.logs()]
+        return hash_files(files) + json.dumps(sorted(self.locations.items())).encode()
+
+    def content(self, log: str) -> bytes:
+        """The bytes of one pickle; raises InputError where they cannot be read."""
+        root = self.root()
+        try:
+            if root.is_dir():
+                return (root / log).read_bytes()
+            with zipfile.ZipFile(root) as archive:
+                return archive.read(log)
+        except (OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, lzma.LZMAError) as error:
+            raise InputError(f"{log} in {root}: cannot be read: {error}; copy or export it again") from error
+
+    @cached_property
+    def locations(self) -> dict[str, str]:
+        """Location by a log's name without ending, from `index.csv` (columns file, location_group) beside `path`."""
+        index = self.root().parent / "index.csv"
+        if not index.exists():
+            return {}
+        with index.open(newline="") as stream:
+            rows = [row for row in csv.DictReader(stream) if {"file", "location_group"} <= set(row)]
+        return {Path(row["file"]).stem: row["location_group"] for row in rows}
+
+
 class _Unpickler(pickle.Unpickler):
     """Admits numpy arrays, plain builtins and defaultdict; anything else is refused by name, before it is run."""
 
-    def find_class(self, module: str, name: str):
+    def find_class(self, module: str, name: str) -> Any:
         if module == "builtins" and name in BUILTINS:
             return super().find_class(module, name)
         if (module, name) == ("collections", "defaultdict"):
@@ -60,140 +101,80 @@ class _Unpickler(pickle.Unpickler):
         raise pickle.UnpicklingError(f"names the forbidden class {module}.{name}")
 
 
-def safe_load(stream, name: str) -> dict:
-    """The dict in a pickle stream; InputError naming the file where it is damaged or names a forbidden class."""
+def safe_load(content: bytes, name: str) -> dict:
+    """The dict in a pickle; raises InputError naming the file where it is damaged or names a forbidden class."""
     try:
-        content = _Unpickler(stream).load()
+        data = _Unpickler(io.BytesIO(content)).load()
     except Exception as error:  # damaged bytes raise anything, from EOFError to MemoryError
-        raise InputError(
-            f"{name}: cannot be read: {str(error) or type(error).__name__}; only numpy arrays and plain "
-            "containers are read, so export the scenario again"
-        ) from error
-    if not isinstance(content, dict):
-        raise InputError(f"{name}: holds a {type(content).__name__}, expected a ScenarioDescription dict")
-    return content
+        reason = str(error) or type(error).__name__
+        mend = "only numpy arrays and plain containers are read, so export the scenario again"
+        raise InputError(f"{name}: cannot be read: {reason}; {mend}") from error
+    if not isinstance(data, dict):
+        raise InputError(f"{name}: holds a {type(data).__name__}, expected a ScenarioDescription dict")
+    return data
 
 
-def list_files(path: str) -> list[tuple[str, str]]:
-    """(container, member) of every scenario pickle under a folder or in a zip, sorted by name.
-
-    InputError where the path is missing, is no folder or zip, or holds no scenario.
-    """
-    root = Path(path)
-    if not root.exists():
-        raise InputError(f"data.path={path}: no such file or folder; pass one that holds ScenarioDescription pickles")
-    if root.is_dir():
-        files = [(str(root), str(p.relative_to(root))) for p in sorted(root.rglob("*.pkl"))]
-    elif zipfile.is_zipfile(root):
-        with zipfile.ZipFile(root) as archive:
-            files = [(str(root), name) for name in sorted(archive.namelist()) if name.endswith(".pkl")]
-    else:
-        raise InputError(f"data.path={path}: neither a folder nor a zip file")
-    files = [
-        (root, name) for root, name in files if Path(name).name not in ("dataset_summary.pkl", "dataset_mapping.pkl")
-    ]
-    if not files:
-        raise InputError(f"data.path={path}: holds no .pkl scenario; convert the logs with ScenarioNet first")
-    return files
-
-
-def read_bytes(container: str, member: str) -> bytes:
-    """The content of one member of a folder or zip; InputError naming it where it cannot be read."""
+def read_recording(content: bytes, name: str, location: str = "") -> Recording:
+    """The whole log in a pickle, at 10 Hz, with its own start frame if it names one; raises InputError naming it."""
+    data = safe_load(content, name)
     try:
-        if Path(container).is_dir():
-            return (Path(container) / member).read_bytes()
-        with zipfile.ZipFile(container) as archive:
-            return archive.read(member)
-    except (OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, lzma.LZMAError) as error:
-        raise InputError(f"{member} in {container}: cannot be read: {error}; copy or export it again") from error
-
-
-def read_locations(path: str) -> dict[str, str]:
-    """Scene file stem -> place, from an `index.csv` (columns `file`, `location_group`) beside the data, if any."""
-    index = Path(path).parent / "index.csv"
-    if not index.exists():
-        return {}
-    with index.open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    if not rows or not {"file", "location_group"} <= set(rows[0]):
-        return {}
-    return {Path(row["file"]).stem: row["location_group"] for row in rows}
-
-
-def read_recordings(
-    content: bytes, name: str, location: str, starts: list[int] | None, window: int
-) -> Iterator[Recording]:
-    """The recordings in one scenario file: one at its current frame, or, for `starts` or a log without a current frame,
-    one for each start frame that leaves half a window of future.
-
-    content: the pickle; window: simulated steps. Raises InputError naming the file.
-    """
-    data = safe_load(io.BytesIO(content), name)
-    try:
-        recording, given = _parse(data, name, location)
+        return _recording(data, location)
     except InputError as error:
-        raise InputError(str(error) if str(error).startswith(name) else f"{name}: {error}") from error
+        raise InputError(f"{name}: {error}") from error
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(
-            f"{name}: not a ScenarioDescription: {type(error).__name__} {error}; export the scenario "
-            "again or leave it out"
-        ) from error
-    frames = len(recording.states)
-    if starts is None:
-        starts = [given] if given is not None else list(range(10, frames - window, window + 11)) or [10]
-        names = [recording.scene_id] if len(starts) == 1 else [f"{recording.scene_id}@{s}" for s in starts]
-    else:
-        starts = [s for s in starts if s <= frames - window // 2]
-        names = [f"{recording.scene_id}@{s}" for s in starts]
-    for start, scene_id in zip(starts, names, strict=True):
-        yield Recording(**{**vars(recording), "current": start, "scene_id": scene_id})
+        problem = f"{type(error).__name__} {error}; export the scenario again or leave it out"
+        raise InputError(f"{name}: not a ScenarioDescription: {problem}") from error
 
 
-def _parse(data: dict, name: str, location: str) -> tuple[Recording, int | None]:
-    """The whole log at 10 Hz and its own start frame, if it names one."""
-    metadata = data["metadata"]
-    tracks, sdc = list(data["tracks"].items()), metadata.get("sdc_id")
-    keys = [str(key) for key, _ in tracks]
-    if not tracks or str(sdc) not in keys:
-        raise InputError(f"{name}: no ego: metadata.sdc_id={sdc!r} is none of its {len(tracks)} tracks; leave it out")
-    frames = len(tracks[0][1]["state"]["position"])
-    states, valid, size = np.zeros((frames, len(tracks), 4)), np.zeros((frames, len(tracks)), bool), []
-    for index, (_, track) in enumerate(tracks):
-        state = track["state"]
-        known = np.asarray(state["valid"]).astype(bool).reshape(-1)
-        states[:, index, :2], states[:, index, 2] = np.asarray(state["position"])[:, :2], state["heading"]
-        states[:, index, 3] = np.linalg.norm(np.asarray(state["velocity"])[:, :2], axis=1)
-        valid[:, index] = known
-        box = [
-            np.median(np.asarray(state[key]).reshape(-1)[known]) if known.any() else 1.0 for key in ("length", "width")
-        ]
-        size.append(sorted(box, reverse=True) if track["type"] == "VEHICLE" else box)
-    bad = valid & ~np.isfinite(states).all(-1)
-    if bad.any():
-        frame, agent = np.argwhere(bad)[0]
-        raise InputError(f"{name}: track {keys[agent]} is NaN or infinite at frame {frame}, where it is marked valid")
-    states[~valid] = 0.0
+def _recording(data: dict, location: str) -> Recording:
+    metadata, tracks = data["metadata"], data["tracks"]
+    keys, ego = [str(key) for key in tracks], metadata.get("sdc_id")
+    if str(ego) not in keys:
+        raise InputError(f"no ego: metadata.sdc_id={ego!r} is none of its {len(tracks)} tracks; leave it out")
+    states, valid, size = _tracks(tracks)
+    frames = len(states)
     ts = np.asarray(metadata.get("ts", np.arange(frames) * DT), float)
     if len(ts) != frames:
-        raise InputError(f"{name}: {len(ts)} time stamps for {frames} frames; repair metadata.ts")
+        raise InputError(f"{len(ts)} time stamps for {frames} frames; repair metadata.ts")
     states, valid = resample_uniform(states, valid, ts)
-    seconds = ts - ts[0]
-    given = metadata.get("current_time_index")
+    seconds, current = ts - ts[0], metadata.get("current_time_index")
     lanes, drivable = _map(data["map_features"])
-    recording = Recording(
+    return Recording(
         scene_id=str(data.get("id") or metadata.get("scenario_id")),
         location=location or str(metadata.get("map", "")),
         dataset=str(metadata.get("dataset", "scenarionet")),
         states=states,
         valid=valid,
-        size=np.array(size),
-        agent_type=np.array([TYPES.get(track["type"], OTHER) for _, track in tracks]),
-        ego=keys.index(str(sdc)),
+        size=size,
+        agent_type=np.array([TYPES.get(track["type"], TYPES["OTHER"]) for track in tracks.values()]),
+        ego=keys.index(str(ego)),
         lanes=lanes,
         drivable=drivable,
         lights=_lights(data.get("dynamic_map_states", {}), lanes, seconds, len(states)),
+        current=None if current is None else int(round(seconds[int(current)] / DT)),
     )
-    return recording, None if given is None else int(round(seconds[int(given)] / DT))
+
+
+def _tracks(tracks: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States [F, A, 4], valid [F, A] and size [A, 2] of tracks; raises InputError where a valid state is not finite."""
+    frames = len(next(iter(tracks.values()))["state"]["position"])
+    states, valid = np.zeros((frames, len(tracks), 4)), np.zeros((frames, len(tracks)), bool)
+    size = np.ones((len(tracks), 2))
+    for index, (key, track) in enumerate(tracks.items()):
+        state = track["state"]
+        known = np.asarray(state["valid"]).astype(bool).reshape(-1)
+        states[:, index, :2], states[:, index, 2] = np.asarray(state["position"])[:, :2], state["heading"]
+        states[:, index, 3] = np.linalg.norm(np.asarray(state["velocity"])[:, :2], axis=1)
+        valid[:, index] = known
+        bad = known & ~np.isfinite(states[:, index]).all(-1)
+        if bad.any():
+            raise InputError(f"track {key} is NaN or infinite at frame {bad.argmax()}, where it is marked valid")
+        if known.any():
+            size[index] = [np.median(np.asarray(state[key]).reshape(-1)[known]) for key in ("length", "width")]
+        if track["type"] == "VEHICLE":  # some logs swap length and width
+            size[index] = sorted(size[index], reverse=True)
+    states[~valid] = 0.0
+    return states, valid, size
 
 
 def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
@@ -205,30 +186,27 @@ def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
             continue
         line = np.asarray(feature["polyline"], float)
         width = np.asarray(feature.get("width", ()), float)
-        ids = {
-            side: [
-                str(item["feature_id"] if isinstance(item, dict) else item)
-                for item in feature.get(f"{side}_neighbor", ())
-            ]
-            for side in ("left", "right")
-        }
-        heights = line[:, 2] if line.shape[1] > 2 and "polygon" not in feature else None
         lanes[str(key)] = Lane(
             points=line[:, :2],
             width=float(np.median(width.sum(-1))) if width.ndim == 2 and len(width) else 0.0,
             speed_limit=float(feature.get("speed_limit_kmh") or 0.0) / 3.6,
             exits=[str(other) for other in feature.get("exit_lanes", ())],
-            heights=heights,
-            **ids,
+            left=_ids(feature.get("left_neighbor", ())),
+            right=_ids(feature.get("right_neighbor", ())),
+            heights=line[:, 2] if line.shape[1] > 2 and "polygon" not in feature else None,
         )
-        if "polygon" in feature and len(feature["polygon"]) >= 3:
+        if len(feature.get("polygon", ())) >= 3:
             drivable.append(np.asarray(feature["polygon"], float)[:, :2])
     return lanes, drivable
 
 
+def _ids(items: Iterable) -> list[str]:
+    return [str(item["feature_id"] if isinstance(item, dict) else item) for item in items]
+
+
 def _lights(dynamic: dict, lanes: dict[str, Lane], seconds: np.ndarray, frames: int) -> dict[str, np.ndarray]:
-    """Light states [frames] at 10 Hz by the lane they control, from states stamped `seconds`; what is unknown keeps the
-    last known state."""
+    """Light states [frames] at 10 Hz by the lane they control, from states stamped `seconds`; where a state is unknown,
+    the last known one goes on."""
     now = np.searchsorted(seconds, np.arange(frames) * DT + DT / 2) - 1
     lights = {}
     for key, light in dynamic.items():
@@ -236,9 +214,9 @@ def _lights(dynamic: dict, lanes: dict[str, Lane], seconds: np.ndarray, frames: 
         if lane not in lanes:
             continue
         states, last = np.zeros(len(seconds), np.int8), LIGHT_UNKNOWN
-        given = list(light["state"].get("object_state", ()))
-        for frame in range(len(seconds)):
-            last = LIGHTS.get(str(given[frame]).rsplit("_", 1)[-1], last) if frame < len(given) else last
-            states[frame] = last
+        given = list(light["state"].get("object_state", ()))[: len(seconds)]
+        for frame, state in enumerate(given):
+            last = states[frame] = LIGHTS.get(str(state).rsplit("_", 1)[-1], last)
+        states[len(given) :] = last
         lights[lane] = states[now]
     return lights

@@ -7,25 +7,24 @@ from e2rl.errors import InputError
 from e2rl.scene.paths import wrap
 from e2rl.scene.recording import DT
 
-WINDOW, ORDER = 15, 2  # Savitzky-Golay: frames, polynomial order (design.md section 4)
+WINDOW, ORDER = 15, 2  # Savitzky-Golay: frames, polynomial order
 CAUSAL_WINDOW = 11  # frames: the current one and 1 s of history
 PAST = CAUSAL_WINDOW - 1  # frames of that history
-MAX_TURN, MAX_WAY = 1.0, 5.0  # rad, m in one frame; more is a jump
+MAX_TURN, MAX_STEP = 1.0, 5.0  # rad, m from one frame to the next; more is a jump
 MAX_GAP = 0.55  # s between time stamps that interpolation bridges (2 Hz annotations)
 TOP_SPEED = 45.0  # m/s; recorded speeds beyond it are glitches
 
 
 def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tracks [F, A, 4] stamped ts [F] s on a grid of DT from ts[0] on.
+    """Tracks [F, A, 4] and valid [F, A] stamped ts [F] s, interpolated on a grid of DT from ts[0] on.
 
-    A grid frame is valid where the frames on both its sides are, at most MAX_GAP apart, or one of them is as good as
-    simultaneous. Raises InputError for time stamps that do not increase or are not in seconds.
+    A grid frame is valid where the frames before and after it are, at most MAX_GAP apart; a frame within 20 ms of it
+    suffices. Raises InputError for time stamps that do not increase or are not in seconds.
     """
     step = np.diff(ts)
     if not (np.isfinite(ts).all() and (step > 0).all() and 0.01 < np.median(step) < 1.0 and step.max() < 60.0):
-        raise InputError(
-            f"time stamps do not increase in seconds (median step {np.median(step):g}); repair metadata.ts"
-        )
+        median = f"median step {np.median(step):g}"
+        raise InputError(f"time stamps do not increase in seconds ({median}); repair metadata.ts")
     ts = ts - ts[0]
     count = int(round(ts[-1] / DT)) + 1
     grid = np.arange(count) * DT
@@ -44,14 +43,15 @@ def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> t
 
 
 def drop_jumps(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """valid [F, A] without frames that jumps (over MAX_TURN or MAX_WAY in a step) divide from the track's longest run.
+    """valid [F, A] without the frames that jumps (over MAX_TURN or MAX_STEP in a frame) divide from a track's longest
+    run.
 
-    A run beyond a jump is kept where it agrees with the frames kept before it, so a glitch of a few frames costs these
-    frames only; a heading that flips for good costs the shorter side.
+    A run beyond a jump is kept where it fits the frames kept before it: a glitch of a few frames costs these frames
+    only, a heading that flips for good costs the shorter side.
     """
     valid = valid.copy()
     jump = np.abs(wrap(np.diff(states[..., 2], axis=0))) > MAX_TURN
-    jump |= np.linalg.norm(np.diff(states[..., :2], axis=0), axis=-1) > MAX_WAY
+    jump |= np.linalg.norm(np.diff(states[..., :2], axis=0), axis=-1) > MAX_STEP
     jump &= valid[1:] & valid[:-1]
     for agent in np.flatnonzero(jump.any(0)):
         run = np.concatenate([[0], np.cumsum(jump[:, agent])])
@@ -62,21 +62,22 @@ def drop_jumps(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
 def _consistent(track: np.ndarray, valid: np.ndarray, run: np.ndarray) -> np.ndarray:
     """Frames [F] of one track [F, 4] in its longest run (run [F]: number of jumps so far) and the runs that fit it."""
     count = np.bincount(run[valid])
-    keep = valid & (run == count.argmax())
-    for runs, inner, outer in ((range(count.argmax() + 1, len(count)), 0, -1), (range(count.argmax())[::-1], -1, 0)):
+    longest = count.argmax()
+    keep = valid & (run == longest)
+    for runs, inner, outer in ((range(longest + 1, len(count)), 0, -1), (range(longest)[::-1], -1, 0)):
         edge = np.flatnonzero(keep)[outer]
         for number in runs:
             frames = np.flatnonzero(valid & (run == number))
             if not len(frames):
                 continue
             change = track[frames[inner]] - track[edge]
-            if abs(wrap(change[2])) <= MAX_TURN and np.hypot(*change[:2]) <= MAX_WAY * abs(frames[inner] - edge):
+            if abs(wrap(change[2])) <= MAX_TURN and np.hypot(*change[:2]) <= MAX_STEP * abs(frames[inner] - edge):
                 keep[frames] = True
                 edge = frames[outer]
     return keep
 
 
-def pieces(valid: np.ndarray) -> list[tuple[int, int]]:
+def runs_of_true(valid: np.ndarray) -> list[tuple[int, int]]:
     """[start, end) of the runs of True in valid [F]."""
     edge = np.diff(np.concatenate([[False], valid, [False]]).astype(np.int8))
     return list(zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1), strict=True))
@@ -85,12 +86,12 @@ def pieces(valid: np.ndarray) -> list[tuple[int, int]]:
 def smooth(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Tracks [F, A, 4] with smoothed positions, and the speed along the heading from their derivative.
 
-    Savitzky-Golay per contiguous piece; a piece shorter than the window takes the longest odd window it can.
+    Savitzky-Golay per contiguous run of frames; a run shorter than WINDOW takes the longest odd window that it can.
     """
     out = states.copy()
     out[..., 3] = np.clip(out[..., 3], 0.0, TOP_SPEED)
     for agent in range(states.shape[1]):
-        for start, end in pieces(valid[:, agent]):
+        for start, end in runs_of_true(valid[:, agent]):
             window = min(WINDOW, (end - start - 1) // 2 * 2 + 1)
             if window <= ORDER:
                 continue
@@ -106,17 +107,17 @@ def smooth(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
 def causal_state(states: np.ndarray, valid: np.ndarray, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """State [A, 4], acceleration [A] and yaw rate [A] at `frame` from the frames up to it only.
 
-    Least squares over the contiguous trailing frames, at most CAUSAL_WINDOW: quadratic in position (linear below five
-    frames), linear in heading. The heading is the recorded one.
+    Least squares over the contiguous frames that end at `frame`, at most CAUSAL_WINDOW: quadratic in position (linear
+    below five frames), linear in heading. The heading itself is the recorded one.
     """
     first = max(frame - CAUSAL_WINDOW + 1, 0)
     time = (np.arange(first, frame + 1) - frame) * DT
     known = np.flip(np.logical_and.accumulate(np.flip(valid[first : frame + 1], 0), axis=0), 0).astype(float)
     count = known.sum(0)
-    way = states[first : frame + 1, :, :2] - states[frame, :, :2]  # small numbers, so that the fit is exact
+    shift = states[first : frame + 1, :, :2] - states[frame, :, :2]  # small numbers, so that the fit is exact
     turned = np.unwrap(np.where(known > 0, states[first : frame + 1, :, 2] - states[frame, :, 2], 0.0), axis=0)
     basis = np.stack([np.ones_like(time), time, time**2], 1)
-    position = _fit(basis, known, way, quadratic=count >= 5)
+    position = _fit(basis, known, shift, quadratic=count >= 5)
     turn = _fit(basis, known, turned[..., None], quadratic=np.zeros_like(count, bool))
     angle = states[frame, :, 2]
     unit = np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -125,39 +126,32 @@ def causal_state(states: np.ndarray, valid: np.ndarray, frame: int) -> tuple[np.
     single = count < 2
     speed = np.where(single, np.clip(states[frame, :, 3], 0.0, TOP_SPEED), speed)
     accel, yaw_rate = np.where(single | (speed < 0.1), 0.0, accel), np.where(single, 0.0, turn[:, 1, 0])
-    here = states[frame, :, :2] + position[:, 0]
-    return np.concatenate([here, angle[:, None], speed[:, None]], 1), accel, np.clip(yaw_rate, -1.0, 1.0)
+    fitted = states[frame, :, :2] + position[:, 0]
+    return np.concatenate([fitted, angle[:, None], speed[:, None]], 1), accel, np.clip(yaw_rate, -1.0, 1.0)
 
 
 def causal_past(states: np.ndarray, valid: np.ndarray, frame: int, speed: np.ndarray) -> np.ndarray:
-    """Where the agents were [A, PAST, 3] 0.1 s, 0.2 s, ... before `frame`, as recorded: m ahead and left, rad, all as
-    seen from the recorded pose at `frame`.
+    """Recorded poses [A, PAST, 3] of the agents 0.1 s, 0.2 s, ... before `frame`.
 
-    speed [A]: at `frame`. Before the contiguous trailing frames an agent counts as having come straight on at its
-    speed, which is how one is described of whom nothing is known.
+    m ahead, m left and rad relative to the recorded pose at `frame`; speed [A] m/s at `frame`. Before the contiguous
+    frames that end at `frame`, an agent counts as having driven straight at this speed.
     """
     back = np.arange(1, PAST + 1)
     frames = np.clip(frame - back, 0, None)
     known = np.logical_and.accumulate(valid[frames] & (frame >= back)[:, None] & valid[frame], axis=0)
-    way = states[frames, :, :2] - states[frame, :, :2]
+    dx, dy = np.moveaxis(states[frames, :, :2] - states[frame, :, :2], -1, 0)
     angle = states[frame, :, 2]
     cos, sin = np.cos(angle), np.sin(angle)
-    seen = np.stack(
-        [
-            way[..., 0] * cos + way[..., 1] * sin,
-            way[..., 1] * cos - way[..., 0] * sin,
-            wrap(states[frames, :, 2] - angle),
-        ],
-        -1,
-    )
-    first = np.concatenate([np.zeros_like(seen[:1]), seen])[known.sum(0), np.arange(len(angle))]  # the earliest known
+    pose = np.stack([dx * cos + dy * sin, dy * cos - dx * sin, wrap(states[frames, :, 2] - angle)], -1)
+    first = np.concatenate([np.zeros_like(pose[:1]), pose])[known.sum(0), np.arange(len(angle))]  # the earliest known
     since = np.maximum(back[:, None] - known.sum(0), 0) * DT
     straight = first - np.stack([since * speed, 0 * since, 0 * since], -1)
-    return np.where(known[..., None], seen, straight).swapaxes(0, 1)
+    return np.where(known[..., None], pose, straight).swapaxes(0, 1)
 
 
 def _fit(basis: np.ndarray, weight: np.ndarray, value: np.ndarray, quadratic: np.ndarray) -> np.ndarray:
-    """Weighted polynomial coefficients [A, 3, C] of value [W, A, C] on basis [W, 3]."""
+    """Weighted least squares coefficients [A, 3, C] of value [W, A, C] on basis [W, 3]; without the quadratic term
+    where `quadratic` [A] is False."""
     gram = np.einsum("wi,wa,wj->aij", basis, weight, basis)
     drop = np.where(quadratic, 0.0, 1e9)
     gram += 1e-9 * np.eye(3) + drop[:, None, None] * np.diag([0.0, 0.0, 1.0])

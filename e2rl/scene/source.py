@@ -1,187 +1,229 @@
-"""From the `data` config group to a SceneSet: parallel parsing, a cache keyed by content, invalid scenes counted."""
+"""Sources of scenes: from a group in conf/data to a SceneSet.
+
+A source is one dataclass and one YAML file in conf/data, whose `_target_` names the class; an outside package adds its
+own in the same way. The class says which logs there are and reads one log. `Source` does the rest: start frames,
+parallel building, a cache keyed by content, and the count of what is left out.
+"""
 
 import hashlib
 import json
 import multiprocessing
-import os
 import sys
+from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import ClassVar, NamedTuple
 
+import numpy as np
 import torch
+from hydra.utils import get_class
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from tensordict import TensorDict
 from tqdm import tqdm
 
 from e2rl.errors import InputError
-from e2rl.scene import bundled, procedural, scenarionet
+from e2rl.files import write_atomically
 from e2rl.scene.build import BuildSettings, build_scene, ego_overlaps
 from e2rl.scene.recording import Recording
 from e2rl.scene.scene import SceneSet, stack, validate
-from e2rl.settings import settings_of
+from e2rl.settings import check_range, settings_of
 
-OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are dropped
+OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are left out
 VERSION = 3  # of the scene builder: raise it when the same recording would make another scene
 
 
-def load_scenes(
-    data, num_scenes: int | None = None, split: str | None = None, starts: list[int] | None = None
-) -> SceneSet:
-    """The scenes that a `data` config names (conf/data/*.yaml), at most `num_scenes` of them.
+class _Row(NamedTuple):
+    """What one recording made: arrays of a scene, or why there is none."""
 
-    split: overrides data.split for the bundled and procedural sources. starts: several scenes a log, one from each of
-    these start frames; default: the log's own start frame, or data.starts. Raises InputError for a missing or empty
-    path and, unless data.skip_invalid, for the first invalid scene.
+    scene_id: str
+    location: str = ""
+    dataset: str = ""
+    scene: dict[str, np.ndarray] | None = None
+    reason: str = ""
+
+
+@dataclass
+class Source(ABC):
+    """Where recordings come from. A subclass is a dataclass whose fields are the keys of its YAML file.
+
+    It defines `logs` and `read`, and `fingerprint` where its scenes are to be cached.
+
+    path: file or folder of the logs, for sources that need one; split: train, tune or test where `has_splits`, else the
+    name of the split in tables (default: the stem of `path`); starts: start frames of the scenes that are cut from each
+    log (default: see `Recording.windows`); skip_invalid: leave invalid scenes out and count them, instead of raising
+    InputError for the first; cache: folder; workers: processes that build; build: sizes of a scene.
     """
-    settings = settings_of(BuildSettings, data.build, "data.build")
-    if num_scenes is not None and num_scenes < 1:
-        raise InputError(f"num_scenes={num_scenes}: expected at least 1, or null for all")
-    split = split or data.split
-    if data.source == "scenarionet":
-        if not data.path:
-            raise InputError("data.path is not set; pass data.path=FOLDER_OR_ZIP of ScenarioDescription pickles")
-        scenes = _scenarionet(data, settings, starts)
-    elif data.source == "bundled":
-        scenes = _cached(
-            _fingerprint(bundled.asset_bytes(split), settings, starts),
-            data,
-            lambda: _build_all(_from_starts(bundled.load_recordings(split), starts), settings, data, "bundled", split),
-        )
-    elif data.source == "procedural":
-        recordings = procedural.generate_recordings(data.count, data.seed, split)
-        scenes = _build_all(_from_starts(recordings, starts), settings, data, "procedural", split)
-    else:
-        raise InputError(f"data.source={data.source}: expected bundled, procedural or scenarionet")
-    return scenes.first(num_scenes)
 
+    path: str | None = None
+    split: str | None = None
+    starts: tuple[int, ...] | None = None
+    skip_invalid: bool = False
+    cache: str = ".cache"
+    workers: int = 2
+    build: BuildSettings = BuildSettings()
 
-def _fingerprint(content: bytes, settings: BuildSettings, extra) -> str:
-    head = json.dumps([VERSION, asdict(settings), extra], sort_keys=True)
-    return hashlib.sha256(head.encode() + content).hexdigest()[:24]
+    has_splits: ClassVar[bool] = False  # whether `split` chooses among the recordings
+    holds: ClassVar[str] = "recorded logs"  # what `path` holds, for messages
 
+    @abstractmethod
+    def logs(self) -> list[str]:
+        """Names of the logs, in order; they identify the logs in messages. Raises InputError where there is none."""
 
-def _from_starts(recordings: list[Recording], starts: list[int] | None) -> list[Recording]:
-    if starts is None:
-        return recordings
-    return [
-        replace(recording, current=start, scene_id=f"{recording.scene_id}@{start}")
-        for recording in recordings
-        for start in starts
-    ]
+    @abstractmethod
+    def read(self, log: str) -> Iterator[Recording]:
+        """The recordings of one log, called in a process that may be another one. Raises InputError for a bad log."""
 
+    def fingerprint(self) -> bytes | None:
+        """What changes whenever the recordings do (see `hash_files`); None: the scenes are not cached."""
+        return None
 
-def _scenarionet(data, settings: BuildSettings, starts: list[int] | None) -> SceneSet:
-    files = scenarionet.list_files(data.path)
-    starts = list(data.starts) if starts is None and data.starts else starts
-    digest = hashlib.sha256()
-    for path in sorted(
-        {container if Path(container).is_file() else os.path.join(container, member) for container, member in files}
-    ):
-        digest.update(Path(path).read_bytes())
-    locations = scenarionet.read_locations(data.path)
-    split = data.split or Path(data.path).stem
-    extra = [starts, bool(data.skip_invalid), sorted(locations.items()), split]
-    key = _fingerprint(digest.digest(), settings, extra)
+    @property
+    def split_name(self) -> str:
+        """Name of the split in tables."""
+        return self.split or Path(self.path or "").stem
 
-    def build() -> SceneSet:
-        tasks = [(c, m, locations.get(Path(m).stem, ""), starts, settings) for c, m in files]
-        return _assemble(_in_parallel(_read_file, tasks, data.workers), data, None, split)
+    def root(self) -> Path:
+        """`path`; raises InputError where it is not set or not there."""
+        if not self.path:
+            raise InputError(f"data.path is not set; pass data.path=FOLDER_OR_ZIP of {self.holds}")
+        if not Path(self.path).exists():
+            raise InputError(f"data.path={self.path}: no such file or folder; pass one that holds {self.holds}")
+        return Path(self.path)
 
-    return _cached(key, data, build)
+    def recordings(self) -> Iterator[Recording]:
+        """All recordings, one for each scene, read in this process."""
+        for log in self.logs():
+            yield from self._windows(log)
 
+    def load(self) -> SceneSet:
+        """All scenes, from the cache where they are there; raises InputError for bad input."""
+        content = self.fingerprint()
+        if content is None:
+            return self._build()
+        settings = asdict(self) | {"split": self.split_name, "source": type(self).__qualname__}
+        settings = {key: value for key, value in settings.items() if key not in ("path", "cache", "workers")}
+        key = hashlib.sha256(json.dumps([VERSION, settings], sort_keys=True).encode() + content).hexdigest()[:24]
+        return _cached(Path(self.cache) / f"scenes-{key}.safetensors", self._build)
 
-def _in_parallel(work, tasks: list, workers: int) -> Generator[tuple]:
-    """The rows of all tasks, worked off by several processes (by this one where there is work for one only)."""
-    show = partial(tqdm, desc="building scenes", total=len(tasks), unit="log")
-    if min(workers, len(tasks)) <= 1:
-        yield from (row for rows in show(map(work, tasks)) for row in rows)
-        return
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), torch.set_num_threads, (1,)) as pool:
+    def _windows(self, log: str) -> Iterator[Recording]:
+        for recording in self.read(log):
+            yield from recording.windows(self.starts, self.build.steps)
+
+    def _rows_of(self, log: str) -> list[_Row]:
+        """What the recordings of one log make."""
         try:
-            yield from (row for rows in show(pool.map(work, tasks, chunksize=4)) for row in rows)
-        finally:  # whoever stops at an invalid scene does not wait for the others
-            pool.shutdown(wait=False, cancel_futures=True)
+            rows = [self._row(log, recording) for recording in self._windows(log)]
+        except InputError as error:
+            return [_Row(log, reason=_naming(log, error))]
+        return rows or [_Row(log, reason=TOO_SHORT)]
+
+    def _row(self, log: str, recording: Recording) -> _Row:
+        row = _Row(recording.scene_id, recording.location, recording.dataset)
+        try:
+            scene = build_scene(recording, self.build)
+            validate(scene, recording.scene_id)
+        except InputError as error:
+            return row._replace(reason=_naming(log, error))
+        if ego_overlaps(scene):
+            return row._replace(reason=OVERLAP)
+        # Plain arrays cross the process border: tensors would each hold a shared-memory file open.
+        return row._replace(scene={key: value.numpy() for key, value in scene.items()})
+
+    def _rows(self) -> Generator[_Row]:
+        """The rows of all logs, built by `workers` processes (by this one where there is work for one only)."""
+        logs = self.logs()
+        show = partial(tqdm, desc="building scenes", total=len(logs), unit="log")
+        if min(self.workers, len(logs)) <= 1:
+            yield from (row for rows in show(map(self._rows_of, logs)) for row in rows)
+            return
+        spawn = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(self.workers, spawn, torch.set_num_threads, (1,)) as pool:
+            try:
+                yield from (row for rows in show(pool.map(self._rows_of, logs, chunksize=4)) for row in rows)
+            finally:  # stopping at an invalid scene, do not wait for the others
+                pool.shutdown(wait=False, cancel_futures=True)
+
+    def _build(self) -> SceneSet:
+        """The scenes of all logs; raises InputError for the first invalid one, unless `skip_invalid`."""
+        dropped: Counter[str] = Counter()
+        scenes, names = [], []
+        with closing(self._rows()) as rows:  # the progress bar ends before a message
+            for row in rows:
+                if row.scene is not None:
+                    scenes.append(row.scene)
+                    names.append(row[:3])
+                elif row.reason in (OVERLAP, TOO_SHORT):
+                    dropped[row.reason] += 1
+                elif self.skip_invalid:
+                    dropped["invalid"] += 1
+                    tqdm.write(f"left out {row.scene_id}: {row.reason}", sys.stderr)
+                else:
+                    raise InputError(f"{row.reason} (data.skip_invalid=true leaves such scenes out)")
+        if not scenes:
+            left_out = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
+            data = self.path or f"split {self.split_name}"
+            raise InputError(f"no valid scene in {data} ({left_out}); see the messages above, or pass other data")
+        tensors = [TensorDict({key: torch.from_numpy(value) for key, value in scene.items()}) for scene in scenes]
+        ids, locations, datasets = map(list, zip(*names, strict=True))
+        return SceneSet(stack(tensors), ids, locations, datasets[0], self.split_name, dict(dropped))
 
 
-def _read_file(task) -> list[tuple]:
-    """Rows (scene or None, id, location, dataset, reason it was left out) of one scenario file."""
-    container, member, location, starts, settings = task
+def load_scenes(
+    data: Mapping | Source, num_scenes: int | None = None, split: str | None = None, starts: list[int] | None = None
+) -> SceneSet:
+    """At most `num_scenes` scenes of a source, or of the source that a `data` group (conf/data/*.yaml) names.
+
+    split: overrides the source's own where `Source.has_splits`; starts: overrides its start frames. Raises InputError
+    for a source that cannot be built, for a missing or empty path and, unless data.skip_invalid, for an invalid scene.
+    """
+    if num_scenes is not None:
+        check_range("num_scenes", num_scenes, 1)
+    source = data if isinstance(data, Source) else _source(data)
+    if split and source.has_splits:
+        source = replace(source, split=split)
+    if starts is not None:
+        source = replace(source, starts=tuple(starts))
+    return source.load().first(num_scenes)
+
+
+def _source(data: Mapping) -> Source:
+    """The source that the `_target_` of a `data` group names, with the other keys as its settings."""
+    target = str(data.get("_target_"))
     try:
-        content = scenarionet.read_bytes(container, member)
-        recordings = list(scenarionet.read_recordings(content, member, location, starts, settings.steps))
-    except InputError as error:
-        return [(None, member, location, "", str(error))]
-    rows = [_build_row(recording, settings, f"{member}: ") for recording in recordings]
-    return rows or [(None, member, location, "", TOO_SHORT)]
+        kind = get_class(target)
+    except Exception as error:  # importing a module raises anything
+        reason = error.__cause__ or error
+        raise InputError(f"data={target}: cannot be built: {reason}; name a subclass of Source as _target_") from error
+    if not issubclass(kind, Source):
+        raise InputError(f"data={target}: is no e2rl.scene.source.Source; subclass it, and define logs() and read()")
+    build = settings_of(BuildSettings, data.get("build", {}), "data.build")
+    values = {key: value for key, value in data.items() if key not in ("_target_", "build")}
+    return replace(settings_of(kind, values, "data"), build=build)
 
 
-def _build_recording(task) -> list[tuple]:
-    """The row of one (recording, settings)."""
-    return [_build_row(*task)]
+def hash_files(paths: Iterable[Path]) -> bytes:
+    """SHA-256 of the names and contents of files, for `Source.fingerprint`."""
+    digest = hashlib.sha256()
+    for path in paths:
+        digest.update(path.name.encode())
+        with open(path, "rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.digest()
 
 
-def _tensors(scene: dict) -> TensorDict:
-    return TensorDict({key: torch.from_numpy(value) for key, value in scene.items()}, batch_size=[])
+def _naming(log: str, error: InputError) -> str:
+    """An error's message, with the log that it is about."""
+    return str(error) if str(error).startswith(log) else f"{log}: {error}"
 
 
-def _build_row(recording: Recording, settings: BuildSettings, file: str = "") -> tuple:
-    name = (recording.scene_id, recording.location, recording.dataset)
-    try:
-        scene = build_scene(recording, settings)
-        validate(scene, recording.scene_id)
-    except InputError as error:
-        return (None, *name, f"{file}{error}")
-    if ego_overlaps(scene):
-        return (None, *name, OVERLAP)
-    # Plain arrays cross the process border; tensors would each hold a shared-memory file open.
-    return ({key: value.numpy() for key, value in scene.items()}, *name, None)
-
-
-def _build_all(recordings, settings: BuildSettings, data, dataset: str, split: str) -> SceneSet:
-    tasks = [(recording, settings) for recording in recordings]
-    return _assemble(_in_parallel(_build_recording, tasks, data.workers), data, dataset, split)
-
-
-def _assemble(rows: Generator[tuple], data, dataset: str | None, split: str) -> SceneSet:
-    """Stack the good rows; raise the first invalid one's message unless data.skip_invalid."""
-    dropped, good = Counter(), []
-    with closing(rows):  # the bar ends before a message
-        for scene, name, location, source, reason in rows:
-            if scene is not None:
-                good.append((scene, name, location, source))
-            elif reason in (OVERLAP, TOO_SHORT):
-                dropped[reason] += 1
-            elif data.skip_invalid:
-                dropped["invalid"] += 1
-                tqdm.write(f"left out {name}: {reason}", sys.stderr)
-            else:
-                raise InputError(f"{reason} (data.skip_invalid=true leaves such scenes out)")
-    if not good:
-        left_out = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
-        raise InputError(
-            f"no valid scene in {data.get('path') or f'{dataset} {split}'} ({left_out}); see the messages "
-            "above, or pass other data"
-        )
-    scenes, names, locations, sources = zip(*good, strict=True)
-    return SceneSet(
-        stack([_tensors(scene) for scene in scenes]),
-        list(names),
-        list(locations),
-        dataset or sources[0],
-        split,
-        dict(dropped),
-    )
-
-
-def _cached(key: str, data, build) -> SceneSet:
-    """The SceneSet under a key of the cache folder, built and stored (atomically) where it is not there."""
-    path = Path(data.cache) / f"scenes-{key}.safetensors"
+def _cached(path: Path, build: Callable[[], SceneSet]) -> SceneSet:
+    """The scenes in a cache file; they are built and stored where it is not there or damaged."""
     if path.exists():
         try:
             return _load(path)
@@ -190,29 +232,15 @@ def _cached(key: str, data, build) -> SceneSet:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"data.cache={data.cache}: cannot be made ({error}); pass a writable folder") from error
+        raise InputError(f"data.cache={path.parent}: cannot be made ({error}); pass a writable folder") from error
     scenes = build()
-    names = {
-        "scene_id": scenes.scene_id,
-        "location": scenes.location,
-        "dataset": scenes.dataset,
-        "split": scenes.split,
-        "dropped": scenes.dropped,
-    }
-    part = path.with_suffix(f".{os.getpid()}.part")
+    columns = {key: value.contiguous() for key, value in scenes.scenes.items()}
+    names = {key: value for key, value in vars(scenes).items() if key != "scenes"}
     try:
-        save_file(
-            {key: value.contiguous() for key, value in scenes.scenes.items()},
-            part,
-            metadata={"scenes": json.dumps(names)},
-        )
-        part.replace(path)
-    except OSError as error:
-        raise InputError(
-            f"data.cache={data.cache}: cannot be written ({error}); free space, or pass another folder"
-        ) from error
-    finally:
-        part.unlink(missing_ok=True)
+        write_atomically(path, lambda part: save_file(columns, part, {"scenes": json.dumps(names)}))
+    except (OSError, SafetensorError) as error:
+        mend = "free space, or pass another folder"
+        raise InputError(f"data.cache={path.parent}: cannot be written ({error}); {mend}") from error
     return scenes
 
 

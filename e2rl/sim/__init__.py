@@ -1,1 +1,1 @@
-"""How it moves: dynamics, geometry, observation, reward, environment."""
+"""How it moves: dynamics, observation, reward, environment."""

@@ -5,9 +5,9 @@ import math
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from e2rl.scene.boxes import to_frame
 from e2rl.scene.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
 from e2rl.scene.route import SPACING, interpolate, project
-from e2rl.sim.geometry import to_frame
 from e2rl.sim.mission import mission_of
 from e2rl.sim.traffic_light import light_state_at
 from e2rl.sim.world import World

@@ -15,12 +15,12 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS
 from e2rl.prior.routed import take_route
+from e2rl.scene.boxes import overlap
 from e2rl.scene.recording import DT
 from e2rl.scene.route import SPACING
 from e2rl.settings import check_range
 from e2rl.sim.drivable import off_road
 from e2rl.sim.dynamics import wrap
-from e2rl.sim.geometry import overlap
 from e2rl.sim.world import World
 from e2rl.synthesizer.motion import direction, take
 

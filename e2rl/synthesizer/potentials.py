@@ -13,12 +13,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from e2rl.scene.boxes import to_frame
 from e2rl.scene.recording import DT
 from e2rl.scene.route import interpolate, project
 from e2rl.settings import check_range
 from e2rl.sim.drivable import off_road
 from e2rl.sim.dynamics import wrap
-from e2rl.sim.geometry import to_frame
 from e2rl.synthesizer.motion import direction
 
 STRIDE = 5  # steps between the states of a plan that the potentials look at

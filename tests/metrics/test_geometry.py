@@ -8,7 +8,7 @@ import torch
 
 from e2rl.metrics.contact import pair_overlap
 from e2rl.metrics.geometry import EDGES, edge_distances, edge_parts_inside, overlap_area
-from e2rl.sim.geometry import corners
+from e2rl.scene.boxes import corners
 
 shapely = pytest.importorskip("shapely")
 

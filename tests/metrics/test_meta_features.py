@@ -68,7 +68,7 @@ def test_central_differences_are_exact_for_parabolas_and_need_both_neighbours():
 def minkowski_distance(one, one_size, other, other_size):
     """Signed distance of two boxes: of the origin from the border of their Minkowski difference."""
     geometry = pytest.importorskip("shapely.geometry")
-    from e2rl.sim.geometry import corners
+    from e2rl.scene.boxes import corners
 
     differences = corners(one, one_size)[:, None] - corners(other, other_size)[None]
     hull = geometry.MultiPoint(differences.reshape(-1, 2).tolist()).convex_hull

@@ -3,7 +3,6 @@
 import pickle
 import zipfile
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 
@@ -122,27 +121,7 @@ class Malicious:
         return self.call
 
 
-class DataConfig(SimpleNamespace):
-    """Stands in for the `data` group: attributes and get()."""
-
-    def get(self, key, default=None):
-        return getattr(self, key, default)
-
-
-def data_config(path, cache, **options) -> DataConfig:
+def data_config(path, cache, **options) -> dict:
     """The scenarionet group with small fields."""
-    return DataConfig(
-        **(
-            {
-                "source": "scenarionet",
-                "path": str(path),
-                "split": None,
-                "starts": None,
-                "skip_invalid": False,
-                "cache": str(cache),
-                "workers": 1,
-                "build": {"field_cells": 64},
-            }
-            | options
-        )
-    )
+    group = {"_target_": "e2rl.scene.scenarionet.ScenarioNetSource", "path": str(path), "cache": str(cache)}
+    return group | {"workers": 1, "build": {"field_cells": 64}} | options

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from e2rl.errors import InputError
-from e2rl.scene import scenarionet
 from e2rl.scene.build import BuildSettings, build_scene, ego_overlaps
 from e2rl.scene.recording import PEDESTRIAN, VEHICLE
 from e2rl.scene.route import project
+from e2rl.scene.scenarionet import ScenarioNetSource, read_recording
 from e2rl.scene.scene import KEYS, validate
 from e2rl.sim.mission import mission_of
 from tests.scene.descriptions import ALL, FRAMES, description, fork, lane, straight, track
@@ -23,9 +23,7 @@ RECORDED = {"waymo": (DATA / "waymo" / "tune.zip", 7), "nuscenes": (DATA / "nusc
 
 
 def recorded(tracks=None, lanes=None, **metadata):
-    content = pickle.dumps(description(tracks, lanes, **metadata))
-    (recording,) = scenarionet.read_recordings(content, "made", "", None, 80)
-    return recording
+    return read_recording(pickle.dumps(description(tracks, lanes, **metadata)), "made")
 
 
 def build(tracks=None, lanes=None, settings: BuildSettings = SETTINGS, **metadata):
@@ -123,8 +121,7 @@ def test_limits_and_lights_lie_on_the_route():
     full = description({"ego": straight(40, 0, 8)})
     states = ["LANE_STATE_STOP"] * 50 + ["LANE_STATE_GO"] * 41
     full["dynamic_map_states"] = {"left": {"state": {"object_state": states}}}
-    (recording,) = scenarionet.read_recordings(pickle.dumps(full), "made", "", None, 80)
-    scene = build_scene(recording, SETTINGS)
+    scene = build_scene(read_recording(pickle.dumps(full), "made"), SETTINGS)
     turning = int((scene["route_light"][0, :, 0] == 0).nonzero())
     assert scene["route_valid"][0, turning] and (scene["route_light"][0] == 0).sum() == 1
     assert scene["route_light_s"][0, turning, 0].item() == pytest.approx(20 + 52, abs=0.5)  # the ego is at x = 48
@@ -145,8 +142,7 @@ def test_a_light_close_ahead_counts_where_the_map_begins_at_the_vehicle():
     full["map_features"]["next"] = full["map_features"]["on"] | {"polyline": np.array([[8.0, 0], [300, 0]])}
     del full["map_features"]["in"], full["map_features"]["near"]
     full["dynamic_map_states"] = {"next": {"state": {"object_state": ["LANE_STATE_STOP"]}}}
-    (recording,) = scenarionet.read_recordings(pickle.dumps(full), "made", "", None, 80)
-    scene = build_scene(recording, SETTINGS)
+    scene = build_scene(read_recording(pickle.dumps(full), "made"), SETTINGS)
     slot = int(scene["route_log"][0])
     own = project(scene["start"][None, 0, :2], scene["route_points"][0, slot])[0].item()
     assert own < 3 and scene["route_light"][0, slot, 0] == 0
@@ -210,12 +206,9 @@ def recorded_scenes(request):
     path, stride = RECORDED[request.param]
     if not path.exists():
         pytest.skip(f"needs {path.parent.name}/{path.name} in ../shared/data, which is not in the repository")
-    files = scenarionet.list_files(str(path))[::stride]
-    return [
-        build_scene(recording, SETTINGS)
-        for file in files
-        for recording in scenarionet.read_recordings(scenarionet.read_bytes(*file), file[1], "", None, 80)
-    ]
+    source = ScenarioNetSource(str(path))
+    logs = [recording for log in source.logs()[::stride] for recording in source.read(log)]
+    return [build_scene(window, SETTINGS) for log in logs for window in log.windows(None, SETTINGS.steps)]
 
 
 def test_recorded_scenes_keep_the_schema_and_their_parked_cars_stay(recorded_scenes):

@@ -1,17 +1,25 @@
 """The bundled scenes: what they promise to every other room, and what a damaged archive says."""
 
 import io
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from shapely.geometry import Polygon
 
 from e2rl.errors import InputError
 from e2rl.scene import bundled
-from e2rl.scene.bundled import CURRENT, FRAMES, SPLITS, SceneMap, load_maps, load_recordings, pack, read_recordings
-from e2rl.scene.interaction import corners, lateral_acceleration, overlap, overlapping_pairs
+from e2rl.scene.boxes import corners
+from e2rl.scene.bundled import CURRENT, FRAMES, SPLITS, SceneMap, load_maps, load_recordings, read_recordings
+from e2rl.scene.interaction import lateral_acceleration, overlap, overlapping_pairs
 from e2rl.scene.paths import WHEELBASE, arc_length
 from e2rl.scene.recording import DT, Lane, Recording
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+
+from scenegen.archive import pack  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -79,22 +87,22 @@ def test_overlap_agrees_with_shapely():
     pose = np.concatenate([rng.uniform(-4, 4, (2, 300, 2)), rng.uniform(-4, 4, (2, 300, 1))], -1)
     size = rng.uniform(1, 5, (2, 300, 2))
     ours = overlap(pose[0], size[0], pose[1], size[1])
-    boxes = [[Polygon(box) for box in corners(p, s)] for p, s in zip(pose, size, strict=True)]
+    boxes = [[Polygon(box) for box in row] for row in corners(torch.from_numpy(pose), torch.from_numpy(size)).numpy()]
     oracle = np.array([a.intersection(b).area > 1e-9 for a, b in zip(*boxes, strict=True)])
     assert (ours == oracle).all() and 0.2 < oracle.mean() < 0.9
 
 
 def test_lane_ends_meet():
     for split in SPLITS:
-        for place in load_maps(split):
-            for name, lane in place.lanes.items():
-                assert arc_length(lane.points)[-1] >= 1.0, (place.name, name)
+        for scene_map in load_maps(split):
+            for name, lane in scene_map.lanes.items():
+                assert arc_length(lane.points)[-1] >= 1.0, (scene_map.name, name)
                 assert 2.5 <= lane.width <= 6.0 and 2.0 < lane.speed_limit < 40.0
                 for other in lane.exits:
-                    gap = np.linalg.norm(place.lanes[other].points[0] - lane.points[-1])
-                    assert gap < 1.01, (place.name, name, other)
+                    gap = np.linalg.norm(scene_map.lanes[other].points[0] - lane.points[-1])
+                    assert gap < 1.01, (scene_map.name, name, other)
                 for other in lane.left:
-                    assert name in place.lanes[other].right
+                    assert name in scene_map.lanes[other].right
 
 
 def test_traffic_keeps_to_lanes_or_kerbs(recordings):
@@ -122,7 +130,7 @@ def small_set() -> tuple[SceneMap, Recording]:
         "b": Lane(np.eye(2), 3.5, 8.0),
         "c": Lane(np.array([[0.0, 3.4], [50.0, 5.0]]), 3.4, 13.9, right=["a"]),
     }
-    place = SceneMap(
+    scene_map = SceneMap(
         "here",
         lanes,
         [np.eye(3)[:, :2]],
@@ -135,15 +143,25 @@ def small_set() -> tuple[SceneMap, Recording]:
     valid = rng.random((FRAMES, 3)) < 0.8
     valid[:, 1] = True
     states = np.where(valid[..., None], states, 0.0)
-    lights = {"b": place.lights["b"][7 : 7 + FRAMES]}
-    return place, Recording(
-        "x", "here", "bundled", states, valid, np.full((3, 2), 2.5), np.zeros(3, int), 1, lanes, place.drivable, lights
+    lights = {"b": scene_map.lights["b"][7 : 7 + FRAMES]}
+    return scene_map, Recording(
+        "x",
+        "here",
+        "bundled",
+        states,
+        valid,
+        np.full((3, 2), 2.5),
+        np.zeros(3, int),
+        1,
+        lanes,
+        scene_map.drivable,
+        lights,
     )
 
 
 def test_round_trip():
-    place, made = small_set()
-    (read,) = read_recordings(pack([place], [(made, 7)]), "small")
+    scene_map, made = small_set()
+    (read,) = read_recordings(pack([scene_map], [(made, 7)]), "small")
     assert (read.valid == made.valid).all() and read.ego == 1 and read.scene_id == "x" and read.location == "here"
     error = np.abs(read.states - made.states)
     error[..., 2] = np.minimum(error[..., 2], 2 * np.pi - error[..., 2])
@@ -153,7 +171,7 @@ def test_round_trip():
         other = read.lanes[name]
         assert np.abs(other.points - lane.points).max() <= 5.1e-4
         assert (other.exits, other.left, other.right) == (lane.exits, lane.left, lane.right)
-    assert np.allclose(read.drivable[0], place.drivable[0])
+    assert np.allclose(read.drivable[0], scene_map.drivable[0])
 
 
 def test_damaged_and_missing_assets(tmp_path, monkeypatch):

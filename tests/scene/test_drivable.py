@@ -7,7 +7,7 @@ from shapely.geometry import LineString, Polygon
 from shapely.ops import unary_union
 
 from e2rl.scene.drivable import FAR, MARGIN, drivable_field
-from e2rl.scene.lane_graph import resample
+from e2rl.scene.paths import resample
 
 
 def bent(seed: int) -> np.ndarray:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from shapely.geometry import LineString, Point
 
-from e2rl.scene.lane_graph import LaneGraph, believed_width, infer_exits, resample
+from e2rl.scene.lane_graph import LaneGraph, infer_exits, plausible_width
 from e2rl.scene.log_route import MARGIN, route_from_log
+from e2rl.scene.paths import resample
 from e2rl.scene.recording import Lane
 from e2rl.scene.route import SPACING
 
@@ -40,7 +41,7 @@ def test_a_fork_beyond_the_reach_is_passed_straight():
     assert ways(LaneGraph(long), 80.0, speed=3.0) == [("in", "on"), ("in", "left")]
 
 
-def test_of_many_leaves_the_nearest_forks_come_first():
+def test_of_many_branches_those_of_the_nearest_forks_come_first():
     row, ids = {}, [f"s{k}" for k in range(7)]
     for k, name in enumerate(ids):
         start = np.array([30.0 * k, 0.0])
@@ -53,7 +54,7 @@ def test_of_many_leaves_the_nearest_forks_come_first():
 def test_a_route_follows_its_lanes_and_ends_where_the_map_does():
     graph = LaneGraph(lanes())
     on, left = graph.candidates(np.array([60.0, 0.5]), 0.05, 8.0, 6, 150)
-    assert on.here == left.here == 20.0 and on.length == 298.0 and not on.open
+    assert on.vehicle_s == left.vehicle_s == 20.0 and on.length == 298.0 and not on.open
     assert np.allclose(on.points[:, 1], 0, atol=1e-6) and np.allclose(np.diff(on.points[:, 0]), SPACING, atol=1e-6)
     true = LineString([(40, 0), (100, 0), *LEFT])
     inside = left.points[: int(left.length / SPACING) + 1]
@@ -130,7 +131,7 @@ def test_lanes_too_short_are_left_out_and_widths_doubted():
         "on",
         "left",
     ]
-    assert [believed_width(w) for w in (0.0, float("nan"), 2.5, 3.2, 6.0, 90.0)] == [3.7, 3.7, 2.5, 3.2, 6.0, 3.7]
+    assert [plausible_width(w) for w in (0.0, float("nan"), 2.5, 3.2, 6.0, 90.0)] == [3.7, 3.7, 2.5, 3.2, 6.0, 3.7]
     points = resample(np.array([[0.0, 0], [0, 3], [4, 3]]), 1.0)
     assert len(points) == 8 and np.allclose(points[3], [0, 3])
 
@@ -146,7 +147,7 @@ def test_a_recorded_way_goes_on_along_the_lane_at_its_end():
     graph = LaneGraph(lanes(beside=Lane(np.array([[0.0, 3.5], [100, 3.5], [200, 3.5]]), speed_limit=9.0)))
     route = route_from_log(graph, lane_change(), 150)
     line = LineString(route.points)
-    assert route.here == 20.0 and max(line.distance(Point(*point)) for point in lane_change()[:, :2]) < 0.1
+    assert route.vehicle_s == 20.0 and max(line.distance(Point(*point)) for point in lane_change()[:, :2]) < 0.1
     assert route.open and abs(route.length - 200.0) < 3.0 and np.allclose(route.points[60:, 1], 3.5, atol=1e-3)
     assert [name for name, _ in route.lanes] == ["in", "beside"] and route.limit[5] == 14.0 and route.limit[60] == 9.0
 

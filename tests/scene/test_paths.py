@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from e2rl.scene.paths import arc_length, offset, tractrix, whittaker
+from e2rl.scene.paths import arc_length, shift_left, tractrix, whittaker
 
 
 def circle(radius: float, step: float, turns: float = 2.0) -> np.ndarray:
@@ -41,7 +41,7 @@ def test_tractrix_on_a_line_stays_on_it():
     assert np.allclose(heading, 0) and np.allclose(centre[0, :, 0], front[:, 0] - 1.0)
 
 
-def test_offset_of_a_circle_is_a_circle():
-    moved = offset(circle(30.0, 0.2), 2.0)
+def test_a_circle_shifted_left_is_a_circle():
+    moved = shift_left(circle(30.0, 0.2), 2.0)
     assert np.allclose(np.linalg.norm(moved, axis=-1), 28.0, atol=0.02)
     assert arc_length(moved)[-1] == pytest.approx(arc_length(circle(30.0, 0.2))[-1] * 28 / 30, rel=1e-3)

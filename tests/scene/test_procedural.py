@@ -7,14 +7,18 @@ from e2rl.errors import InputError
 from e2rl.scene.bundled import CURRENT, load_maps
 from e2rl.scene.interaction import lateral_acceleration, overlapping_pairs
 from e2rl.scene.paths import WHEELBASE
-from e2rl.scene.procedural import generate_recordings
-from e2rl.scene.recording import DT, LIGHT_RED
+from e2rl.scene.procedural import ProceduralSource
+from e2rl.scene.recording import DT, LIGHT_RED, Recording
 from e2rl.scene.traffic_flow import Fleet, conflicts, roll
+
+
+def generate(count: int, seed: int, split: str) -> list[Recording]:
+    return list(ProceduralSource(split=split, count=count, seed=seed).recordings())
 
 
 @pytest.fixture(scope="module")
 def recordings():
-    return generate_recordings(20, 5, "tune")
+    return generate(20, 5, "tune")
 
 
 def straight(angle: float, start, limit: float = 12.0, steps: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -111,16 +115,16 @@ def test_hardly_a_vehicle_enters_on_red(recordings):
 
 
 def test_seed_and_split_decide():
-    first, again = generate_recordings(2, 9, "test"), generate_recordings(2, 9, "test")
-    other = generate_recordings(1, 10, "test")
+    first, again = generate(2, 9, "test"), generate(2, 9, "test")
+    other = generate(1, 10, "test")
     for a, b in zip(first, again, strict=True):
         assert np.array_equal(a.states, b.states) and a.location == b.location and a.ego == b.ego
     assert first[0].states.shape != other[0].states.shape or not np.array_equal(first[0].states, other[0].states)
-    assert {recording.location for recording in first} <= {place.name for place in load_maps("test")}
+    assert {recording.location for recording in first} <= {scene_map.name for scene_map in load_maps("test")}
 
 
 def test_bad_input():
     with pytest.raises(InputError, match="at least 1"):
-        generate_recordings(0, 0, "test")
+        generate(0, 0, "test")
     with pytest.raises(InputError, match="expected one of"):
-        generate_recordings(1, 0, "nowhere")
+        generate(1, 0, "nowhere")

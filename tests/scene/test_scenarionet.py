@@ -1,22 +1,27 @@
 """ScenarioDescription files: nothing in them is ever run, and what they say arrives in the Recording."""
 
 import collections
-import io
 import os
 import pickle
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from e2rl.errors import InputError
 from e2rl.scene.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, OTHER, PEDESTRIAN, VEHICLE
-from e2rl.scene.scenarionet import list_files, read_bytes, read_locations, read_recordings, safe_load
+from e2rl.scene.scenarionet import ScenarioNetSource, read_recording, safe_load
 from tests.scene.descriptions import ALL, FRAMES, Malicious, description, fork, straight, write_folder, write_zip
 
 
-def read(scene: dict, starts=None, location: str = "place") -> list:
-    return list(read_recordings(pickle.dumps(scene), "made.pkl", location, starts, 80))
+def read(scene: dict, starts=None) -> list:
+    return list(read_recording(pickle.dumps(scene), "made.pkl", "place").windows(starts, 80))
+
+
+def contents(path: Path) -> list[bytes]:
+    source = ScenarioNetSource(str(path))
+    return [source.content(log) for log in source.logs()]
 
 
 @pytest.mark.parametrize("protocol", [3, 4, 5])
@@ -37,7 +42,7 @@ def test_forbidden_classes_are_refused_by_name_and_never_run(tmp_path, call, pro
     mark = tmp_path / "ran.npy"
     content = pickle.dumps({"metadata": {"x": call(mark)}}, protocol)
     with pytest.raises(InputError, match=r"made\.pkl: cannot be read: names the forbidden class"):
-        safe_load(io.BytesIO(content), "made.pkl")
+        safe_load(content, "made.pkl")
     assert not mark.exists()
 
 
@@ -62,7 +67,7 @@ def test_dotted_names_and_other_modules_of_numpy_are_refused():
             + b"\x93."
         )
         with pytest.raises(InputError, match="forbidden class"):
-            safe_load(io.BytesIO(content), "made.pkl")
+            safe_load(content, "made.pkl")
 
 
 @pytest.mark.parametrize("protocol", [3, 4, 5])
@@ -84,7 +89,7 @@ def test_arrays_of_both_numpys_and_containers_are_read(protocol):
             old = old.replace(bytes([len(name)]) + name, bytes([len(name) - 1]) + name.replace(b"_core", b"core"))
         old = old[:2] + old[11:] if old[2:3] == b"\x95" else old  # without the frame, whose length changed
     for content in (new, old):
-        found = safe_load(io.BytesIO(content), "made.pkl")
+        found = safe_load(content, "made.pkl")
         assert found.keys() == held.keys() and found["d"]["k"] == {1} and found["d"]["new"] == {}
         assert all(np.array_equal(found[key], held[key]) for key in "abcfgh") and found["e"] == held["e"]
 
@@ -95,7 +100,7 @@ def test_arrays_of_both_numpys_and_containers_are_read(protocol):
 )
 def test_damaged_files_are_named(content):
     with pytest.raises(InputError, match=r"^made\.pkl: "):
-        safe_load(io.BytesIO(content), "made.pkl")
+        safe_load(content, "made.pkl")
 
 
 def test_folders_and_zips_hold_the_same_scenes(tmp_path):
@@ -103,11 +108,11 @@ def test_folders_and_zips_hold_the_same_scenes(tmp_path):
     folder = write_folder(tmp_path / "data" / "part", scenes).parent
     (folder / "dataset_summary.pkl").write_bytes(b"summary")
     (folder / "notes.txt").write_text("x")
-    contents = [read_bytes(*file) for file in list_files(str(folder))]
-    assert len(contents) == 2
+    expected = contents(folder)
+    assert len(expected) == 2
     for method in (zipfile.ZIP_LZMA, zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED):
         path = write_zip(tmp_path / f"{method}.zip", scenes, method)
-        assert [read_bytes(*file) for file in list_files(str(path))] == contents
+        assert contents(path) == expected
 
 
 def test_paths_that_hold_nothing_say_so(tmp_path):
@@ -119,7 +124,7 @@ def test_paths_that_hold_nothing_say_so(tmp_path):
         ("file.bin", "neither a folder nor a zip"),
     ):
         with pytest.raises(InputError, match=message) as caught:
-            list_files(str(tmp_path / name))
+            ScenarioNetSource(str(tmp_path / name)).logs()
         assert str(tmp_path / name) in str(caught.value)
 
 
@@ -128,9 +133,8 @@ def test_a_damaged_zip_member_is_named(tmp_path):
     content = bytearray(path.read_bytes())
     content[200:400] = bytes(200)
     path.write_bytes(content)
-    (file,) = list_files(str(path))
     with pytest.raises(InputError, match=r"sd_00\.pkl in .*x\.zip: cannot be read"):
-        read_bytes(*file)
+        contents(path)
 
 
 def test_tracks_types_sizes_and_the_map_arrive():
@@ -243,8 +247,8 @@ def test_what_is_wrong_is_named_with_the_file(change, message):
 
 def test_places_come_from_an_index_beside_the_data(tmp_path):
     path = write_zip(tmp_path / "x.zip", [description()])
-    assert read_locations(str(path)) == {}
+    assert ScenarioNetSource(str(path)).locations == {}
     (tmp_path / "index.csv").write_text("file,location_group\npart/sd_00.pkl,17\n")
-    assert read_locations(str(path)) == {"sd_00": "17"}
+    assert ScenarioNetSource(str(path)).locations == {"sd_00": "17"}
     (tmp_path / "index.csv").write_text("name\nx\n")
-    assert read_locations(str(path)) == {}
+    assert ScenarioNetSource(str(path)).locations == {}

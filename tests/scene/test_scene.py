@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from e2rl.errors import InputError
 from e2rl.scene.build import BuildSettings, build_scene
-from e2rl.scene.scenarionet import read_recordings
+from e2rl.scene.scenarionet import read_recording
 from e2rl.scene.scene import KEYS, RAGGED, SceneSet, stack, validate
 from tests.scene.descriptions import description, fork, lane
 
@@ -16,8 +16,7 @@ SETTINGS = BuildSettings(field_cells=64)
 
 
 def build(**options) -> TensorDict:
-    (recording,) = read_recordings(pickle.dumps(description(**options)), "made", "", None, 80)
-    return build_scene(recording, SETTINGS)
+    return build_scene(read_recording(pickle.dumps(description(**options)), "made"), SETTINGS)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +38,7 @@ def test_stacking_pads_ragged_keys_and_changes_nothing_else(scenes):
 
 
 def test_scenes_of_other_settings_are_no_set(scenes):
-    (recording,) = read_recordings(pickle.dumps(description()), "made", "", None, 80)
+    recording = read_recording(pickle.dumps(description()), "made")
     with pytest.raises(InputError, match="same settings"):
         stack([scenes[0], build_scene(recording, BuildSettings(field_cells=64, vehicles=8))])
 
@@ -50,10 +49,10 @@ def test_the_set_is_sliced(scenes):
     first = whole.first(1)
     assert len(first) == 1 and first.scene_id == ["a"] and first.location == ["p"] and first.dropped == {"invalid": 1}
     assert whole.batch([1, 0, 1])["scene_index"].tolist() == [1, 0, 1]
-    assert [whole.place(which) for which in (0, 1, "a", "b")] == [0, 1, 0, 1]
+    assert [whole.index(which) for which in (0, 1, "a", "b")] == [0, 1, 0, 1]
     for which in (2, -1, "c"):
-        with pytest.raises(InputError, match=f"scene={which}: expected a position below 2 or the id of a scene"):
-            whole.place(which)
+        with pytest.raises(InputError, match=f"scene={which}: expected an index below 2 or the id of a scene"):
+            whole.index(which)
     assert whole.to("cpu").scenes.device == torch.device("cpu")
 
 

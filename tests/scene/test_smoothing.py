@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from e2rl.errors import InputError
-from e2rl.scene.smoothing import causal_past, causal_state, drop_jumps, pieces, resample_uniform, smooth
+from e2rl.scene.smoothing import causal_past, causal_state, drop_jumps, resample_uniform, runs_of_true, smooth
 
 TIME = np.arange(40) * 0.1
 
@@ -83,7 +83,7 @@ def test_smoothing_keeps_quadratics_and_takes_speed_along_the_heading():
     assert np.allclose(out[:, 0, 3], 4.0 + 1.5 * TIME, atol=1e-9)
 
 
-def test_smoothing_works_piece_by_piece_and_removes_noise():
+def test_smoothing_works_run_by_run_and_removes_noise():
     states, valid = accelerating(), np.ones((40, 1), bool)
     valid[18:22] = False
     states[20:, :, :2] += 500.0
@@ -96,8 +96,8 @@ def test_smoothing_works_piece_by_piece_and_removes_noise():
     assert np.abs(error).mean() < 0.6 * np.abs(noise).mean()
 
 
-def test_pieces_are_the_runs():
-    assert pieces(np.array([1, 1, 0, 1, 0, 0, 1], bool)) == [(0, 2), (3, 4), (6, 7)]
+def test_runs_of_true():
+    assert runs_of_true(np.array([1, 1, 0, 1, 0, 0, 1], bool)) == [(0, 2), (3, 4), (6, 7)]
 
 
 def test_a_glitch_costs_its_own_frames_only():

@@ -2,6 +2,8 @@
 
 import os
 import pickle
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -10,7 +12,10 @@ from safetensors.torch import save_file
 
 from e2rl.errors import InputError
 from e2rl.scene import source
-from e2rl.scene.source import load_scenes
+from e2rl.scene.build import BuildSettings
+from e2rl.scene.bundled import BundledSource
+from e2rl.scene.recording import Lane, Recording
+from e2rl.scene.source import Source, hash_files, load_scenes
 from tests.scene.descriptions import (
     ALL,
     Malicious,
@@ -137,15 +142,16 @@ def test_places_of_an_index_reach_the_scenes(tmp_path):
     [
         ({"path": None}, r"data\.path is not set"),
         ({"path": "nowhere"}, "nowhere: no such file or folder"),
-        ({"source": "spreadsheet"}, r"data\.source=spreadsheet: expected bundled, procedural or scenarionet"),
-        ({"source": "bundled", "split": "best"}, "split 'best'"),
+        ({"workers": "many"}, r"data\.workers=many"),
+        ({"_target_": "no.such.Source"}, r"^data=no\.such\.Source: cannot be built: .*no"),
+        ({"_target_": "torch.nn.ReLU"}, r"^data=torch\.nn\.ReLU: is no e2rl\.scene\.source\.Source"),
+        ({"_target_": "e2rl.scene.bundled.BundledSource", "split": "best"}, "split 'best'"),
     ],
 )
 def test_configurations_that_name_nothing_say_so(tmp_path, change, message):
     config = data_config(tmp_path, tmp_path / "cache")
-    vars(config).update(change)
     with pytest.raises(InputError, match=message):
-        load_scenes(config)
+        load_scenes(config | change)
     with pytest.raises(InputError, match="num_scenes=0"):
         load_scenes(data_config(tmp_path, tmp_path / "cache"), num_scenes=0)
 
@@ -161,3 +167,53 @@ def test_scenes_with_unlike_maps_are_one_set(tmp_path):
     scenes = [*scenes_of(1), description(lanes=fork() | {"more": lane([[0, 30], [90, 30]])})]
     found = load_scenes(data_config(write_folder(tmp_path / "x", scenes), tmp_path / "cache"))
     assert found.scenes["lane_width"].shape == (2, 5) and found.scene_id == ["scene-0", "fork"]
+
+
+@dataclass
+class SpeedSource(Source):
+    """An outside source: each *.txt file below `path` holds the speed of a car on a straight road."""
+
+    lane_width: float = 3.5
+
+    holds = "text files"
+
+    def logs(self) -> list[str]:
+        return sorted(file.name for file in self.root().glob("*.txt"))
+
+    def read(self, log: str) -> Iterator[Recording]:
+        speed, frames = float((self.root() / log).read_text()), np.arange(200)
+        states = np.stack([0.1 * speed * frames, 0 * frames, 0 * frames, 0 * frames + speed], -1)[:, None]
+        road = {"road": Lane(np.array([[0.0, 0], [900, 0]]), self.lane_width)}
+        valid, size = np.ones((200, 1), bool), np.array([[4.5, 1.9]])
+        yield Recording(log, "road", "speeds", states, valid, size, np.zeros(1, int), 0, road, current=None)
+
+    def fingerprint(self) -> bytes:
+        return hash_files(sorted(self.root().glob("*.txt")))
+
+
+def test_an_outside_source_is_named_by_its_class_and_takes_part_in_all(tmp_path):
+    (tmp_path / "a.txt").write_text("5.0")
+    (tmp_path / "b.txt").write_text("9.0")
+    config = {"_target_": "tests.scene.test_source.SpeedSource", "path": str(tmp_path), "lane_width": 3.0}
+    config |= {"workers": 2, "cache": str(tmp_path / "cache"), "build": {"field_cells": 32, "steps": 80}}
+    found = load_scenes(config)
+    assert found.scene_id == ["a.txt@10", "a.txt@101", "b.txt@10", "b.txt@101"] and found.dataset == "speeds"
+    assert found.scenes["start"][:, 0, 3].tolist() == pytest.approx([5, 5, 9, 9], abs=1e-4)
+    assert (found.scenes["lane_width"] == 3.0).all() and found.split == tmp_path.name
+    same(found, load_scenes(config))
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+    assert load_scenes(config, split="train", starts=[20]).scene_id == ["a.txt@20", "b.txt@20"]
+    assert (load_scenes(config | {"lane_width": 4.0}).scenes["lane_width"] == 4.0).all()
+    (tmp_path / "c.txt").write_text("1.0")
+    assert len(load_scenes(config)) == 6
+    with pytest.raises(InputError, match="no such file or folder; pass one that holds text files"):
+        load_scenes(config | {"path": "nowhere"})
+    with pytest.raises(InputError, match="data.lane_width=wide"):
+        load_scenes(config | {"lane_width": "wide"})
+
+
+def test_split_chooses_only_where_a_source_has_splits(tmp_path):
+    bundled = BundledSource(cache=str(tmp_path / "cache"), workers=1, build=BuildSettings(field_cells=32, steps=20))
+    assert load_scenes(bundled, 1).split == "test" and load_scenes(bundled, 1, split="tune").split == "tune"
+    folder = write_folder(tmp_path / "x", scenes_of(1))
+    assert load_scenes(data_config(folder, tmp_path / "cache"), split="tune").split == "x"

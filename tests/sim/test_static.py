@@ -2,8 +2,8 @@
 
 import torch
 
+from e2rl.scene.boxes import separation, to_frame
 from e2rl.scene.route import SPACING, interpolate, project
-from e2rl.sim.geometry import separation, to_frame
 from e2rl.sim.mission import Mission, limit_at, mission_of
 from e2rl.sim.neighbours import neighbours_of, rotation_into
 from e2rl.sim.static import follow, look_along, static_scene, write_rows

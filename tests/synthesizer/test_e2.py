@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from e2rl.synthesizer.episode import noise_of, put_rows, take_rows
+from e2rl.synthesizer.synthesizer import Synthesizer, SynthesizerSettings
 
 from e2rl.ego.idm import IDMEgo
 from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState
 from e2rl.prior.prior import SamplerSettings
 from e2rl.sim.world import World
 from e2rl.synthesizer.control import ControlSettings
-from e2rl.synthesizer.episode import noise_of, put_rows, take_rows
-from e2rl.synthesizer.synthesizer import Synthesizer, SynthesizerSettings
 from tests.prior.small import curved_scenes, small_prior
 from tests.synthesizer.traffic_scenes import ROWS, scenes, synthesizer
 

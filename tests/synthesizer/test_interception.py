@@ -6,10 +6,10 @@ import torch
 
 from e2rl.errors import InputError
 from e2rl.prior.lane_relative import LaneState, speeds
+from e2rl.scene.boxes import overlap
 from e2rl.scene.drivable import CELL
 from e2rl.scene.recording import DT
 from e2rl.scene.route import SPACING, interpolate
-from e2rl.sim.geometry import overlap
 from e2rl.synthesizer.interception import InterceptionSettings, cubic, intercept
 from e2rl.synthesizer.motion import constant_speed_states
 from tests.synthesizer.crossing import make_world

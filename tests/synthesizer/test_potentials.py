@@ -6,7 +6,7 @@ import shapely
 import torch
 
 from e2rl.errors import InputError
-from e2rl.sim.geometry import corners
+from e2rl.scene.boxes import corners
 from e2rl.synthesizer import potentials
 from e2rl.synthesizer.motion import constant_speed_states
 from e2rl.synthesizer.potentials import (

@@ -8,12 +8,12 @@ import warnings
 
 import pytest
 import torch
+from e2rl.synthesizer.synthesizer import Synthesizer, SynthesizerSettings
 
 from e2rl.errors import InputError
 from e2rl.synthesizer.feasibility import FeasibilitySettings, feasible_vehicles
 from e2rl.synthesizer.prompt import CRITERIA, read_answer
 from e2rl.synthesizer.reasoner import LanguageReasoner, ReasonerSettings, build_reasoner
-from e2rl.synthesizer.synthesizer import Synthesizer, SynthesizerSettings
 from tests.prior.small import small_prior
 from tests.synthesizer.chat_server import chat_server, verdicts
 from tests.synthesizer.crossing import make_world

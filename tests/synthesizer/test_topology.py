@@ -5,7 +5,7 @@ import shapely
 import torch
 
 from e2rl.errors import InputError
-from e2rl.sim.geometry import corners
+from e2rl.scene.boxes import corners
 from e2rl.synthesizer.topology import (
     TopologySettings,
     maximal_cliques,

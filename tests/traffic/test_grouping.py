@@ -3,10 +3,10 @@
 from dataclasses import fields, is_dataclass
 
 import torch
+from e2rl.synthesizer.grouping import ROWS, SHRUNK, clone, crop_episode, crop_world, group_scenes, write_episode
 from tensordict import TensorDict
 
 from e2rl.sim.world import World
-from e2rl.synthesizer.grouping import ROWS, SHRUNK, clone, crop_episode, crop_world, group_scenes, write_episode
 from tests.synthesizer.test_synthesizer import begin, world_of
 from tests.synthesizer.traffic_scenes import scenes, synthesizer
 

@@ -1,11 +1,11 @@
 import torch
+from e2rl.synthesizer.grouping import group_scenes
+from e2rl.synthesizer.lookahead import Lookahead
 
 from e2rl.ego.idm import IDMEgo
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.scene.recording import DT
 from e2rl.synthesizer.control import ControlSettings
-from e2rl.synthesizer.grouping import group_scenes
-from e2rl.synthesizer.lookahead import Lookahead
 from e2rl.synthesizer.motion import constant_speed_states
 from tests.synthesizer.test_synthesizer import EGO, begin, world_of
 from tests.synthesizer.traffic_scenes import scenes, synthesizer

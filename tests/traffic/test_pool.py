@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from e2rl.learning.pool import RECORDED, TrafficPool
 
 from e2rl.errors import InputError
-from e2rl.learning.pool import RECORDED, TrafficPool
 from tests.learning.small import brake_check, small_scenes
 
 

@@ -1,13 +1,13 @@
 """Episodes are what the sampler drew: scenes by probability, one scene and one traffic per trajectory."""
 
 import torch
+from e2rl.learning.pool import TrafficPool
+from e2rl.learning.scene_sampler import SceneSampler
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from e2rl.ego.actor import ActorEgo
-from e2rl.learning.pool import TrafficPool
-from e2rl.learning.scene_sampler import SceneSampler
 from e2rl.sim.env import DrivingEnv, SimSettings
 from tests.learning.small import brake_check, small_scenes
 

@@ -6,8 +6,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from e2rl.scene.lane_graph import wrap
-from e2rl.scene.paths import arc_length, offset
+from e2rl.scene.paths import arc_length, shift_left, wrap
 
 STEP = 4.0  # m between the vertices of a road axis
 
@@ -111,12 +110,12 @@ class Layout:
         opens over `taper` m. The carriageways' left borders are explicit, so through lanes never shift sideways.
         """
         border = border or self.node(axis[-1], border=True)
-        outward = self.edge(node, border, offset(axis, -median / 2), lanes, speed, rank)
-        left = offset(axis, median / 2)
+        outward = self.edge(node, border, shift_left(axis, -median / 2), lanes, speed, rank)
+        left = shift_left(axis, median / 2)
         if pocket:
             joint = self.node(np.array(cut(left, pocket + taper / 2, 0)[0]))
             far = self.edge(border, joint, cut(left, pocket + taper, 0)[::-1], lanes, speed, rank)
-            near_left = offset(axis, median / 2 - self.lane_width)
+            near_left = shift_left(axis, median / 2 - self.lane_width)
             inward = self.edge(joint, node, cut(near_left, 0, pocket)[::-1], lanes + 1, speed, rank)
             self.connect(far, inward, [(k, k) for k in range(lanes)] + [(lanes - 1, lanes)])
             source = far

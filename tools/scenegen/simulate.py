@@ -9,8 +9,7 @@ import libsumo
 import numpy as np
 import sumo
 
-from e2rl.scene.lane_graph import resample
-from e2rl.scene.paths import arc_length, offset
+from e2rl.scene.paths import arc_length, resample, shift_left
 from e2rl.scene.recording import DT, LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, Lane
 from scenegen.layout import Layout
 from scenegen.traffic import write_demand
@@ -118,7 +117,7 @@ def read_net(root: ET.Element, layout: Layout) -> Net:
 
 def ribbon(points: np.ndarray, width: float) -> np.ndarray:
     """Polygon of a lane: its centreline widened to both sides."""
-    return np.concatenate([offset(points, width / 2), offset(points, -width / 2)[::-1]])
+    return np.concatenate([shift_left(points, width / 2), shift_left(points, -width / 2)[::-1]])
 
 
 def add_taper(lanes: dict[str, Lane], ending: str, target: str) -> Lane:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from e2rl.scene.interaction import overlap
-from e2rl.scene.paths import WHEELBASE, arc_length, offset, tractrix, whittaker
+from e2rl.scene.paths import WHEELBASE, arc_length, shift_left, tractrix, whittaker
 from e2rl.scene.recording import DT
 from scenegen.simulate import Net, Track
 
@@ -51,7 +51,8 @@ def smooth_track(track: Track, rng) -> np.ndarray:
     at = np.arange(0.0, total + PATH_STEP, PATH_STEP)
     path = np.stack([np.interp(at, way[keep], front[keep, axis]) for axis in (0, 1)], -1)
     path[at > total] = front[-1] + (at[at > total] - total)[:, None] * unit[-1]
-    path = whittaker(offset(path, smooth_noise(rng, total, WANDER_KNOTS, WANDER, WANDER_MEMORY)(at)), PATH_PENALTY)
+    drift = smooth_noise(rng, total, WANDER_KNOTS, WANDER, WANDER_MEMORY)
+    path = whittaker(shift_left(path, drift(at)), PATH_PENALTY)
     centre, angle = tractrix(path, np.array(WHEELBASE * length))
     time = np.arange(len(way)) * DT
     progress = whittaker(way, TIME_PENALTY)
@@ -113,7 +114,7 @@ def park(net: Net, states: np.ndarray, valid: np.ndarray, size: np.ndarray, rng)
 def kerb_strip(points: np.ndarray, arc: np.ndarray, edge: float) -> np.ndarray:
     """Polygon of the parking strip beside a lane's right edge."""
     inner = points[(arc > 15.0) & (arc < arc[-1] - 15.0)]
-    return np.concatenate([offset(inner, -edge + 0.1), offset(inner, -edge - 2.5)[::-1]])
+    return np.concatenate([shift_left(inner, -edge + 0.1), shift_left(inner, -edge - 2.5)[::-1]])
 
 
 def touched(pose: np.ndarray, body: np.ndarray, states: np.ndarray, valid: np.ndarray, size: np.ndarray) -> np.ndarray:

@@ -6,10 +6,10 @@ import numpy as np
 
 from e2rl.scene.bundled import CURRENT, FRAMES, SceneMap
 from e2rl.scene.interaction import interaction_score, lateral_acceleration, overlapping_pairs
-from e2rl.scene.recording import VEHICLE, Recording
+from e2rl.scene.recording import Recording
 
 STRIDE = 40  # frames between the windows that are looked at
-MOVED, BORDER, LATERAL = 20.0, 35.0, 5.0  # m the ego drives, m it keeps from the map's border, m/s^2
+TRAVEL, BORDER, LATERAL = 20.0, 35.0, 5.0  # m the ego drives, m it keeps from the map's border, m/s^2
 RADIUS, MOST, MOST_PARKED, LEAST = 110.0, 40, 14, 4  # m around the ego; vehicles, parked cars; moving vehicles needed
 ATTEMPTS = 12
 
@@ -22,9 +22,9 @@ def candidates(states, valid, border: np.ndarray, rng) -> list[tuple[float, int,
         here = np.flatnonzero(valid[span].any(0))
         part, known = states[span, here], valid[span, here]
         score = interaction_score(part, known)
-        way = np.linalg.norm(np.diff(part[CURRENT : CURRENT + 81, :, :2], axis=0), axis=-1).sum(0)
+        travelled = np.linalg.norm(np.diff(part[CURRENT : CURRENT + 81, :, :2], axis=0), axis=-1).sum(0)
         apart = np.linalg.norm(part[..., None, :2] - border, axis=-1).min(-1).min(0)
-        good = known.all(0) & (way > MOVED) & (part[..., 3].max(0) > 3.0) & (apart >= BORDER)
+        good = known.all(0) & (travelled > TRAVEL) & (part[..., 3].max(0) > 3.0) & (apart >= BORDER)
         noise = rng.gumbel(size=len(here))
         found += [(float(score[k] + noise[k]), first, int(here[k])) for k in np.flatnonzero(good)]
     return sorted(found, reverse=True)
@@ -57,11 +57,13 @@ def flaw(states, valid, size) -> str | None:
     return None
 
 
-def cut_windows(place: SceneMap, states, valid, size, border, most: int, rng) -> tuple[list, Counter]:
+def cut_windows(
+    scene_map: SceneMap, states, valid, size, border, most: int, rng
+) -> tuple[list[tuple[Recording, int]], Counter[str]]:
     """Up to `most` (Recording, first frame) of a simulation, of different egos and at least 5.5 s apart, and why others
     were refused."""
-    parked = np.zeros((len(states), len(place.parked), 4))
-    parked[..., :3] = place.parked
+    parked = np.zeros((len(states), len(scene_map.parked), 4))
+    parked[..., :3] = scene_map.parked
     kept, refused, egos = [], Counter(), set()
     for _, first, ego in candidates(states, valid, border, rng):
         if len(kept) == most or sum(refused.values()) >= ATTEMPTS:
@@ -70,32 +72,16 @@ def cut_windows(place: SceneMap, states, valid, size, border, most: int, rng) ->
             continue
         span = slice(first, first + FRAMES)
         traffic = np.concatenate([states[span], parked[span]], 1)
-        known = np.concatenate([valid[span], np.ones((FRAMES, len(place.parked)), bool)], 1)
-        bodies = np.concatenate([size, place.parked_size])
-        rows = participants(traffic, known, len(place.parked), ego)
+        known = np.concatenate([valid[span], np.ones((FRAMES, len(scene_map.parked)), bool)], 1)
+        bodies = np.concatenate([size, scene_map.parked_size])
+        rows = participants(traffic, known, len(scene_map.parked), ego)
         reason = flaw(traffic[:, rows], known[:, rows], bodies[rows])
         if reason:
             refused[reason] += 1
             continue
         egos.add(ego)
-        tracks = np.where(known[:, rows, None], traffic[:, rows], 0.0)
-        kept.append(
-            (
-                Recording(
-                    f"{place.name}_{first:04d}",
-                    place.name,
-                    "bundled",
-                    tracks,
-                    known[:, rows],
-                    bodies[rows],
-                    np.full(len(rows), VEHICLE),
-                    0,
-                    place.lanes,
-                    place.drivable,
-                    {lane: state[span] for lane, state in place.lights.items()},
-                    CURRENT,
-                ),
-                first,
-            )
-        )
+        known = known[:, rows]
+        tracks = np.where(known[..., None], traffic[:, rows], 0.0)
+        scene_id = f"{scene_map.name}_{first:04d}"
+        kept.append((scene_map.recording("bundled", scene_id, first, tracks, known, bodies[rows], 0), first))
     return kept, refused

@@ -33,10 +33,8 @@ def run_prior_stage(config: DictConfig, folder: Path) -> tuple[Path, list[dict]]
         folder = processes.from_leader(lambda: folder)
         prior = _untrained(config).to(device)
         begin = time.perf_counter()
-        # The bundled and procedural sources train on their train split; a path's split is the path's own.
-        split = None if config.data.source == "scenarionet" else "train"
         scenes = processes.leader_first(
-            lambda: load_scenes(config.data, config.num_scenes, split, list(settings.starts))
+            lambda: load_scenes(config.data, config.num_scenes, "train", list(settings.starts))
         )
         origin = {
             "data": f"{scenes.dataset}/{scenes.split}",

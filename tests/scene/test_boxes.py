@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from e2rl.sim import geometry
+from e2rl.scene.boxes import corners, distance, overlap, separation, signed_distance
 
 shapely = pytest.importorskip("shapely")
 
@@ -17,14 +17,14 @@ def boxes():
         return pose, 0.3 + torch.rand(10_000, 2, generator=generator, dtype=torch.float64) * torch.tensor([8.0, 3.0])
 
     first, second = draw(), draw()
-    polygons = [shapely.polygons(geometry.corners(*box).numpy()) for box in (first, second)]
+    polygons = [shapely.polygons(corners(*box).numpy()) for box in (first, second)]
     return first, second, polygons
 
 
 def test_overlap_agrees_with_shapely(boxes):
     first, second, (a, b) = boxes
     area = torch.from_numpy(shapely.area(shapely.intersection(a, b)))
-    found = geometry.overlap(*first, *second)
+    found = overlap(*first, *second)
     clear = (area == 0) | (area > 1e-9)
     assert 0.1 < found.float().mean() < 0.9
     assert torch.equal(found[clear], (area > 1e-9)[clear])
@@ -33,25 +33,25 @@ def test_overlap_agrees_with_shapely(boxes):
 def test_distance_agrees_with_shapely(boxes):
     first, second, (a, b) = boxes
     expected = torch.from_numpy(shapely.distance(a, b))
-    assert torch.allclose(geometry.distance(*first, *second), expected, atol=1e-9)
+    assert torch.allclose(distance(*first, *second), expected, atol=1e-9)
 
 
 def test_penetration_is_the_shortest_way_apart(boxes):
     """Moving one box by the penetration depth along the best axis just ends the overlap."""
     first, second, _ = boxes
-    depth = geometry.signed_distance(*first, *second)
+    depth = signed_distance(*first, *second)
     inside = depth < -1e-6
     moved = []
     for turn in (0.0, torch.pi / 2, torch.pi, -torch.pi / 2):
         for pose in (first[0], second[0]):
             way = torch.stack([(pose[:, 2] + turn).cos(), (pose[:, 2] + turn).sin(), torch.zeros(len(pose))], -1)
-            moved.append(geometry.separation(first[0], first[1], second[0] - way * depth[:, None], second[1]))
+            moved.append(separation(first[0], first[1], second[0] - way * depth[:, None], second[1]))
     assert torch.allclose(torch.stack(moved).amax(0)[inside].clamp(max=0), torch.zeros(()).double(), atol=1e-6)
 
 
 def test_rigid_motion_and_order_do_not_matter(boxes):
     first, second, _ = boxes
-    before = geometry.signed_distance(*first, *second)
+    before = signed_distance(*first, *second)
     cos, sin = torch.tensor([0.8, 0.6], dtype=torch.float64)
     rotation = torch.stack([torch.stack([cos, -sin]), torch.stack([sin, cos])])
 
@@ -59,12 +59,12 @@ def test_rigid_motion_and_order_do_not_matter(boxes):
         turned = pose[:, :2] @ rotation.T + torch.tensor([3.0, -7.0])
         return torch.cat([turned, pose[:, 2:] + torch.atan2(sin, cos)], 1)
 
-    assert torch.allclose(geometry.signed_distance(move(first[0]), first[1], move(second[0]), second[1]), before)
-    assert torch.allclose(geometry.signed_distance(*second, *first), before)
+    assert torch.allclose(signed_distance(move(first[0]), first[1], move(second[0]), second[1]), before)
+    assert torch.allclose(signed_distance(*second, *first), before)
 
 
 def test_pairs_broadcast(boxes):
     (pose, size), (other, other_size), _ = boxes
-    pairs = geometry.overlap(pose[:20, None], size[:20, None], other[None, :30], other_size[None, :30])
+    pairs = overlap(pose[:20, None], size[:20, None], other[None, :30], other_size[None, :30])
     assert pairs.shape == (20, 30)
-    assert torch.equal(pairs[3, 5], geometry.overlap(pose[3], size[3], other[5], other_size[5]))
+    assert torch.equal(pairs[3, 5], overlap(pose[3], size[3], other[5], other_size[5]))
