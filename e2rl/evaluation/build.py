@@ -13,7 +13,7 @@ from e2rl.ego.base import Ego
 from e2rl.errors import InputError
 from e2rl.evaluation.processes import cores
 from e2rl.evaluation.protocol import Method
-from e2rl.metrics.catalogue import CLOSED_LOOP
+from e2rl.metrics.catalogue import TABLES
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.checkpoint import load_prior
 from e2rl.prior.prior import Prior, SamplerSettings
@@ -193,8 +193,8 @@ def check_protocol(config: DictConfig) -> None:
     for key in ("open_loop_samples", "meta_rollouts"):
         if not isinstance(config[key], int) or config[key] < 0:
             raise InputError(f"{key}={config[key]}: expected a whole number of at least 0")
-    if config.metrics not in CLOSED_LOOP:
-        raise InputError(f"metrics={config.metrics}: choose one of {', '.join(CLOSED_LOOP)}")
+    if config.metrics not in TABLES:
+        raise InputError(f"metrics={config.metrics}: choose one of {', '.join(TABLES)}")
     if not all(isinstance(seed, int) for seed in config.seeds):
         raise InputError(f"seeds={list(config.seeds)}: sampling seeds are whole numbers")
     if config.num_scenes is not None and not (isinstance(config.num_scenes, int) and config.num_scenes > 0):
