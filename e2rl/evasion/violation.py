@@ -36,7 +36,7 @@ class EvasionScene(TensorClass):
 
     @staticmethod
     def after(moment: Tensor, scene: TensorDictBase, states: Tensor, valid: Tensor) -> "EvasionScene":
-        """After step moment [B] of scenes [B] with all agents at states [B, T+1, N, 4], valid [B, T+1, N], ego first."""
+        """After step moment [B] of scenes [B] with agents at states [B, T+1, N, 4], valid [B, T+1, N], ego first."""
         horizon = states.shape[1] - 1
         row = torch.arange(len(states), device=states.device)
         step = moment[:, None] + torch.arange(1, horizon + 1, device=states.device)
