@@ -23,10 +23,7 @@ Compute = Callable[[dict[str, Tensor]], Tensor | dict[str, Tensor]]
 class Metric:
     """What a metric is, how it is averaged over rollouts, and how it is printed.
 
-    By default it is the mean of its column over the rollouts that know it (that are not NaN). `weight` names a column
-    that weights this mean. `per` names a column by whose sum the sum of its own column is divided. `median` takes the
-    median instead. `samples` names the realism samples from which `metrics.realism` computes it: it has no mean.
-    `per_collision` tells that it is known for collisions only: a paired difference then compares each group's own ones.
+    It is the mean of its column over the rollouts that know it (that are not NaN), unless other fields say otherwise.
     """
 
     name: str
@@ -35,11 +32,11 @@ class Metric:
     share: bool = False  # in [0, 1], printed in per cent
     decimals: int | None = None  # printed; None: three significant digits
     column: str = ""  # of the rows, where it differs from the name
-    weight: str = ""
-    per: str = ""
-    median: bool = False
-    samples: str = ""
-    per_collision: bool = False
+    weight: str = ""  # column that weights the mean
+    per: str = ""  # column by whose sum the sum of its own column is divided, instead of the mean
+    median: bool = False  # instead of the mean
+    samples: str = ""  # of a metric that `metrics.realism` computes from pooled samples: those that it needs
+    per_collision: bool = False  # known for collisions only: paired differences compare each group's own collisions
     tables: tuple[str, ...] = ()  # closed-loop tables that `register` appends it to; a new name makes a new table
 
     @property
@@ -147,7 +144,7 @@ COMPUTE: dict[str, Compute] = {
     "off_road": off_road_columns,
     "standing": standing_columns,
     "transport": transport_columns,
-}  # functions of a batch of rollouts: a dict of columns, or the one column of the function's key
+}  # functions of a batch of rollouts: a dict of columns, or the column of the metric with the function's key
 
 
 def register(metric: Metric, compute: Compute | None = None) -> None:
@@ -161,11 +158,11 @@ def register(metric: Metric, compute: Compute | None = None) -> None:
 
     Raises ValueError for a name or column that is taken.
     """
-    if metric.name in METRICS or (compute is not None and metric.source in {*COMPUTE, *row_columns()}):
+    if metric.name in {*METRICS, *COMPUTE} or (compute is not None and metric.source in row_columns()):
         raise ValueError(f"metric {metric.name}: name or column is taken; choose another, or unregister it first")
     METRICS[metric.name] = metric
     if compute is not None:
-        COMPUTE[metric.source] = compute
+        COMPUTE[metric.name] = compute
     for table in metric.tables:
         TABLES.setdefault(table, []).append(metric.name)
 
@@ -173,7 +170,7 @@ def register(metric: Metric, compute: Compute | None = None) -> None:
 def unregister(name: str) -> None:
     """Take a registered metric out of the catalogue again."""
     metric = METRICS.pop(name)
-    COMPUTE.pop(metric.source, None)
+    COMPUTE.pop(name, None)
     for table in metric.tables:
         TABLES[table].remove(name)
 

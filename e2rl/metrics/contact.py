@@ -99,33 +99,30 @@ def kinds_at_stop(batch: Batch) -> Tensor:
 
 
 def contact_columns(batch: Batch) -> Batch:
-    """Metrics of the ego's first contact; NaN where the ego overlaps a vehicle at the start already."""
-    states, hit, stop = batch["states"], batch["hit"], batch["stop"]
+    """Metrics of the ego's first contact; NaN where the ego overlaps a vehicle at the start already.
+
+    relvel: |v_ego - v_partner| [m/s] at the step before contact.
+    """
+    states, hit, stop, unknown = (batch[key] for key in ("states", "hit", "stop", "start_overlap"))
     columns = {"cfr": hit, "cfr_adv": (batch["touching"] & batch["adversaries"]).any(-1)}
     for kind, (name, touched) in enumerate(zip(KINDS, kinds_at_stop(batch).unbind(1), strict=True)):
         columns |= {name: batch["kind"] == kind, f"{name}_any": touched}
-    unknown = batch["start_overlap"]
     columns = {name: value.to(states.dtype).masked_fill(unknown, torch.nan) for name, value in columns.items()}
     step = stop.to(states.dtype).masked_fill(~hit, torch.nan)
+    row = torch.arange(len(states))
+    before = velocity(states[row, batch["before"]])
+    relative = (before[:, 0] - before[row, batch["partner"].clamp(min=0)]).norm(dim=-1)
     vulnerable = (batch["area"] > 0) & (batch["agent_type"] != VEHICLE)[:, None]
     return columns | {
         "cfr_vru": (vulnerable.any(-1) & steps_until(stop, states.shape[1])).any(-1).to(states.dtype),
         "rir": columns["rear"].masked_fill(~hit, torch.nan),
-        "relvel": relative_speed(batch),
+        "relvel": relative.masked_fill(~hit, torch.nan),
         "contact_step": step,
         "contact_time": step * DT,
         "contact_type": batch["kind"],
         "partner": batch["partner"],
         "start_overlap_ego": unknown,
     }
-
-
-def relative_speed(batch: Batch) -> Tensor:
-    """|v_ego - v_partner| [B] [m/s] at the step before contact; NaN without contact."""
-    row = torch.arange(len(batch["states"]))
-    states = batch["states"][row, batch["before"]]
-    speed = (velocity(states[:, 0]) - velocity(states[row, batch["partner"].clamp(min=0)])).norm(dim=-1)
-    return speed.masked_fill(~batch["hit"], torch.nan)
 
 
 def traffic_contact_columns(batch: Batch) -> Batch:
@@ -144,11 +141,10 @@ def traffic_contact_columns(batch: Batch) -> Batch:
     later = (overlap & steps_until(batch["stop"], states.shape[1])[..., None]).any(1)
     meets = later & ~overlap[:, 0]
     touched = torch.zeros_like(traffic, dtype=torch.int64)
-    for agent in (one, two):
-        touched = touched.index_add(1, agent, meets.long())
+    touched = touched.index_add(1, torch.cat([one, two]), meets.long().repeat(1, 2)) > 0
     pairs = meets.sum(-1)
     columns = {"cfr_bg": (pairs > 0).to(states.dtype), "bg_pairs": pairs, "start_overlap_bg": overlap[:, 0].any(-1)}
-    return columns | touched_columns(batch, touched > 0)
+    return columns | touched_columns(batch, touched)
 
 
 def nearby(states: Tensor, size: Tensor, one: Tensor, two: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -48,7 +48,7 @@ def near_lane(points: Tensor, rollout: Tensor, lane_points: Tensor, lane_index: 
     point, segment = candidates(points, rollout, low, high, owner, LANE_CELL)
     start, along = ends[segment, 0], (ends[:, 1] - ends[:, 0])[segment]
     near = from_segment(points[point], start, along).square().sum(-1) <= reach[segment].square()
-    return mark(len(points), point[near])
+    return torch.zeros(len(points), dtype=torch.bool).index_fill(0, point[near], True)
 
 
 def inside_polygon(points: Tensor, rollout: Tensor, polygon_points: Tensor, polygon_index: Tensor) -> Tensor:
@@ -66,19 +66,12 @@ def inside_polygon(points: Tensor, rollout: Tensor, polygon_points: Tensor, poly
     crossed = straddles & (x < x0 + (height - y0) / rise * (x1 - x0))
     polygons = int(polygon_index.amax()) + 1 if polygon_index.numel() else 0
     key, count = (point * max(polygons, 1) + polygon[edge])[crossed].unique(return_counts=True)
-    return mark(len(points), key[count % 2 == 1] // max(polygons, 1))
+    return torch.zeros(len(points), dtype=torch.bool).index_fill(0, key[count % 2 == 1] // max(polygons, 1), True)
 
 
 def has_lines(index: Tensor) -> Tensor:
     """Bool [B]: some line of index [B, M] has at least two points."""
     return ((index[:, 1:] >= 0) & (index[:, 1:] == index[:, :-1])).any(-1)
-
-
-def mark(length: int, index: Tensor) -> Tensor:
-    """Bool [length], true at index."""
-    flags = torch.zeros(length, dtype=torch.bool, device=index.device)
-    flags[index] = True
-    return flags
 
 
 def on_road(points: Tensor, rollout: Tensor, batch: Batch) -> Tensor:

@@ -13,29 +13,21 @@ SMOOTHING = 0.5  # s, moving average of the ego's speed before its derivative
 
 
 def motion_columns(batch: Batch) -> Batch:
-    """min_dtc, ttc_c, ttc_c_all, macc and progress over the steps 1..stop."""
+    """min_dtc, ttc_c, ttc_c_all, macc and progress over the steps 1..stop; NaN without any agent to measure them on."""
     states, valid, stop = batch["states"], batch["valid"], batch["stop"]
     seen = valid & valid[..., :1] & steps_until(stop, states.shape[1])[..., None]
     seen[..., 0] = False
+    gap = distance(states[:, :, :1], batch["size"][:, None, :1], states, batch["size"][:, None])
+    gap = gap.masked_fill(~seen, torch.inf).flatten(1).amin(-1)
     cost = closest_approach_cost(states)
     path, count = ego_path(states, valid, stop)
     return {
-        "min_dtc": smallest_gap(states, batch["size"], seen).masked_fill(batch["hit"], 0.0),
+        "min_dtc": gap.masked_fill(gap.isinf(), torch.nan).masked_fill(batch["hit"], 0.0),
         "ttc_c": mean_worst_cost(cost, seen & batch["adversaries"][:, None]),
         "ttc_c_all": mean_worst_cost(cost, seen),
         "macc": mean_acceleration(path, count),
         "progress": progress(path, count),
     }
-
-
-def smallest_gap(states: Tensor, size: Tensor, seen: Tensor) -> Tensor:
-    """Smallest box distance [B] [m] of the ego to agents where seen [B, T+1, N]; NaN where there is none.
-
-    states [B, T+1, N, 4] with the ego in row 0, size [B, N, 2].
-    """
-    gap = distance(states[:, :, :1], size[:, None, :1], states, size[:, None])
-    smallest = gap.masked_fill(~seen, torch.inf).flatten(1).amin(-1)
-    return smallest.masked_fill(smallest.isinf(), torch.nan)
 
 
 def closest_approach_cost(states: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from e2rl.metrics.catalogue import COMPUTE, row_columns
+from e2rl.metrics.catalogue import COMPUTE, METRICS, row_columns
 from e2rl.metrics.contact import KINDS, first_contact
 from e2rl.metrics.realism import Samples, realism, traffic_samples
 
@@ -52,7 +52,7 @@ def score_batch(batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], list[Sampl
     columns: dict[str, Tensor] = {}
     for name, compute in COMPUTE.items():
         found = compute(batch)
-        columns |= found if isinstance(found, dict) else {name: found}
+        columns |= found if isinstance(found, dict) else {METRICS[name].source: found}
     wrong = [name for name, column in columns.items() if column.shape != batch["stop"].shape]
     if wrong:
         raise ValueError(f"{', '.join(wrong)}: a metric is one number per rollout, a tensor [{len(traffic)}] here")

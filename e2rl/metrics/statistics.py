@@ -81,15 +81,15 @@ def metric_table(rows: Sequence[Row], metrics: Sequence[Metric]) -> tuple[Tensor
     The total of a metric is its value times its weight; of a metric `per` another column, just its value.
     """
 
-    def table(names: list[str], absent: float) -> Tensor:
-        cells = [[float(row.get(name, torch.nan)) if name else absent for name in names] for row in rows]
-        return torch.tensor(cells, dtype=torch.float64).reshape(len(rows), len(names))
+    def column(name: str) -> Tensor:
+        return torch.tensor([float(row.get(name, torch.nan)) for row in rows], dtype=torch.float64)
 
-    values = table([metric.source for metric in metrics], torch.nan)
-    weights = table([metric.weight for metric in metrics], 1.0)
-    per = table([metric.per for metric in metrics], torch.nan)
-    quotient = torch.tensor([bool(metric.per) for metric in metrics])
-    return torch.where(quotient, values, values * weights), torch.where(quotient, per, weights)
+    totals, weights = [], []
+    for metric in metrics:
+        value, divisor = column(metric.source), metric.per or metric.weight
+        weights.append(column(divisor) if divisor else torch.ones_like(value))
+        totals.append(value if metric.per else value * weights[-1])
+    return torch.stack(totals, 1), torch.stack(weights, 1)
 
 
 class Bootstrap:
@@ -119,11 +119,11 @@ class Bootstrap:
 def known_rollouts(known: Tensor, samples: Sequence[Samples]) -> dict[str, Tensor]:
     """{metric: bool [R]}: rollouts that it uses, from known [R, M] of `row_metrics` and from the realism samples."""
     result = {metric.name: known[:, column] for column, metric in enumerate(row_metrics())}
-    pooled = {metric.name: metric.samples for metric in METRICS.values() if metric.samples}
-    return result | {
-        name: torch.tensor([bool(sample[key].numel()) for sample in samples], dtype=torch.bool)
-        for name, key in pooled.items()
-    }
+    for metric in METRICS.values():
+        if metric.samples:
+            counts = [sample[metric.samples].numel() for sample in samples]
+            result[metric.name] = torch.tensor(counts, dtype=torch.int64) > 0
+    return result
 
 
 def summarise(
