@@ -1,4 +1,4 @@
-"""The search for actions of the ego that avoid contact, given how everybody else moved (docs/method.md, section 11).
+"""The search for actions of the ego that avoid contact, given how everybody else moved (docs/method.md, section 10).
 
 The others are fixed: they do not react. Candidates are longitudinal profiles on lateral targets (the ego's routes, and
 shifts beside its mission). Where none is clean, an evolution strategy perturbs the knots of the best ones. What it

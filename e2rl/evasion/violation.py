@@ -44,20 +44,12 @@ class EvasionScene(TensorClass):
         present = valid[row[:, None], step, 1:] & inside[..., None]
         ever = present.any(1).any(0)  # columns without any agent cost as much as others
         start, mission = states[row, moment, 0], mission_of(scene)
-        return EvasionScene(
-            start=start,
-            ego_size=scene["size"][:, 0],
-            inside=inside,
-            others=states[row[:, None], step, 1:].masked_fill(~present[..., None], AWAY)[:, :, ever],
-            other_size=scene["size"][:, 1:][:, ever],
-            field=scene["field"],
-            origin=scene["field_origin"],
-            routes=scene["route_points"][:, 0],
-            mission=mission.points,
-            s=project(start[:, None, :2], mission.points)[0][:, 0],
-            end=mission.end,
-            batch_size=[len(states)],
-        )
+        others = states[row[:, None], step, 1:].masked_fill(~present[..., None], AWAY)[:, :, ever]
+        agents = {"ego_size": scene["size"][:, 0], "others": others, "other_size": scene["size"][:, 1:][:, ever]}
+        road = {"field": scene["field"], "origin": scene["field_origin"], "routes": scene["route_points"][:, 0]}
+        s = project(start[:, None, :2], mission.points)[0][:, 0]
+        road |= {"mission": mission.points, "s": s, "end": mission.end}
+        return EvasionScene(start=start, inside=inside, **agents, **road, batch_size=[len(states)])
 
 
 def violations(states: Tensor, scene: EvasionScene, clearance: float, road_margin: float) -> Tensor:

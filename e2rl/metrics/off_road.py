@@ -64,9 +64,9 @@ def inside_polygon(points: Tensor, rollout: Tensor, polygon_points: Tensor, poly
     straddles = (y0 > height) != (y1 > height)
     rise = torch.where(y1 == y0, torch.ones_like(y0), y1 - y0)
     crossed = straddles & (x < x0 + (height - y0) / rise * (x1 - x0))
-    polygons = int(polygon_index.amax()) + 1 if polygon_index.numel() else 0
-    key, count = (point * max(polygons, 1) + polygon[edge])[crossed].unique(return_counts=True)
-    return torch.zeros(len(points), dtype=torch.bool).index_fill(0, key[count % 2 == 1] // max(polygons, 1), True)
+    polygons = max(int(polygon_index.amax()) + 1, 1) if polygon_index.numel() else 1
+    key, count = (point * polygons + polygon[edge])[crossed].unique(return_counts=True)
+    return torch.zeros(len(points), dtype=torch.bool).index_fill(0, key[count % 2 == 1] // polygons, True)
 
 
 def has_lines(index: Tensor) -> Tensor:
