@@ -15,7 +15,6 @@ from e2rl.evaluation.ladders import intensity_ladder
 from e2rl.evaluation.open_loop import open_loop_rows
 from e2rl.evaluation.protocol import Setup, run_protocol
 from e2rl.evaluation.realism_meta import meta_rows
-from e2rl.metrics.catalogue import CLOSED_LOOP
 from e2rl.report.drawing import save_picture
 from e2rl.report.intensity import intensity_figure
 from e2rl.report.skeleton import skeleton_figure
@@ -42,8 +41,7 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     write_metrics(folder / METRICS_FILE, rows)
     dropped = "".join(f"; left out: {count} scenes ({reason})" for reason, count in scenes.dropped.items())
     effort = search_effort(scenes.scenes["logged"].shape[1] - 1)
-    caption = f"{build.caption(config, origin)}; {effort}{dropped}"
-    tables = metric_tables(rows, caption, CLOSED_LOOP[config.metrics])
+    tables = metric_tables(rows, f"{build.caption(config, origin)}; {effort}{dropped}", config.metrics)
     save_tables(folder / "tables.md", tables)
     print_tables(tables)
     if config.figure == "intensity":

@@ -18,7 +18,7 @@ from e2rl.ego.base import Ego
 from e2rl.errors import InputError
 from e2rl.evaluation.processes import cores
 from e2rl.evaluation.protocol import Method
-from e2rl.metrics.catalogue import CLOSED_LOOP
+from e2rl.metrics.catalogue import TABLES
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.checkpoint import load_prior
 from e2rl.prior.prior import Prior, SamplerSettings
@@ -188,7 +188,7 @@ def check_evaluation(config: DictConfig) -> None:
     """InputError for methods, seeds, an intensity, a figure or processes that evaluate.py cannot run."""
     processes_of(config)
     check_counts(config, open_loop_samples=0, meta_rollouts=0)
-    check_choice("metrics", config.metrics, CLOSED_LOOP)
+    check_choice("metrics", config.metrics, TABLES)
     if not (config.methods or config.variants) or not config.seeds:
         raise InputError(f"methods={list(config.methods)}, seeds={list(config.seeds)}: name at least one of each")
     if not all(isinstance(seed, int) for seed in config.seeds):

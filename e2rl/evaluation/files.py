@@ -12,7 +12,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 
@@ -22,13 +22,11 @@ from torch import Tensor
 import e2rl
 from e2rl.errors import InputError
 from e2rl.files import write_atomically
-from e2rl.metrics.catalogue import EVENT, IDENTITY, METRICS
+from e2rl.metrics.catalogue import row_columns
 from e2rl.scene.recording import AGENT_TYPES, DT
 
 FORMAT = "e2rl-rollout/1"
 ROLLOUTS, TABLE, METRICS_FILE = "rollouts", "rollouts.csv", "metrics.json"
-METRIC_COLUMNS = tuple(metric.source for metric in METRICS.values())
-COLUMNS = ("dataset", "split", "method", "ego_policy", *IDENTITY, *METRIC_COLUMNS, *EVENT)
 TEXT_COLUMNS = ("dataset", "split", "method", "ego_policy", "scene_id", "location", "contact_type")
 
 
@@ -118,6 +116,11 @@ def polylines(points: Tensor, index: Tensor, minimum: int) -> tuple[np.ndarray, 
 # --- rows
 
 
+def table_columns() -> tuple[str, ...]:
+    """Columns of rollouts.csv: a row's source, then `metrics.catalogue.row_columns`."""
+    return (*(field.name for field in fields(Source)), *row_columns())
+
+
 def write_rows(path: Path, rows: Sequence[dict]) -> None:
     """Write rollouts.csv: one line per rollout, NaN as an empty cell.
 
@@ -125,8 +128,9 @@ def write_rows(path: Path, rows: Sequence[dict]) -> None:
     """
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    writer.writerows([cell(row.get(column, math.nan)) for column in COLUMNS] for row in rows)
+    columns = table_columns()
+    writer.writerow(columns)
+    writer.writerows([cell(row.get(column, math.nan)) for column in columns] for row in rows)
     write_atomically(path, buffer.getvalue())
 
 

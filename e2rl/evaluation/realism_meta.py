@@ -25,10 +25,10 @@ from e2rl.metrics.meta_metric import (
     log_probability,
     meta_metric,
 )
-from e2rl.metrics.realism import motion_features, split_half
+from e2rl.metrics.realism import kinematic_samples, split_half
 from e2rl.metrics.statistics import LEVELS, bootstrap_draws, cluster_index, interval, resampled_means
 from e2rl.prior.routed import take_route
-from e2rl.scene.recording import DT, VEHICLE
+from e2rl.scene.recording import VEHICLE
 from e2rl.scene.scene import SceneSet
 
 TRACKS = 512  # vehicles of rollouts looked at at once: bounds the memory of the pairwise features
@@ -146,11 +146,11 @@ def log_split_half(scenes: SceneSet) -> dict[str, float]:
     simulated[:, 0] = False
     simulated[:, scene["route_log"].shape[1] :] = False
     log = scene["logged"].double(), scene["logged_valid"]
-    features = motion_features(*log, *log, simulated, torch.full((len(scene),), log[0].shape[1] - 1), DT)
+    samples = kinematic_samples(*log, *log, simulated, torch.full((len(scene),), log[0].shape[1] - 1))
     cluster, clusters = _clusters(scenes)
     generator = torch.Generator().manual_seed(0)
     order = torch.rand(SPLITS, clusters, generator=generator).argsort(1)
-    values = split_half(features, cluster, order < clusters // 2)
+    values = split_half(samples, cluster, order < clusters // 2)
     low, high = values.nanquantile(values.new_tensor(LEVELS)).tolist()
     return {"mean": values.nanmean().item(), "low": low, "high": high, "n": len(scenes)}
 

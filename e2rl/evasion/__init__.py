@@ -1,4 +1,4 @@
-"""Could the ego have avoided it: a search with full knowledge of the others' motion. Needs scene, sim and ego's paths.
+"""Could the ego have avoided the collision? A search that knows how everybody else moves.
 
-A room of its own because evaluation and learning both ask, and because no ego may know what this search knows.
+A room of its own because evaluation and learning both use it, and because no ego may use what this search knows.
 """

@@ -1,93 +1,66 @@
-"""Contacts: the ego's first one, its type and severity, and those of the simulated traffic (design.md section 5).
+"""Contacts of the ego, their type and severity, and contacts within the simulated traffic (docs/method.md, section 10).
 
-Names: B rollouts, N agents (the ego is row 0), T steps; tensors over time hold T + 1 states, step 0 the start frame.
-Contact is looked for at every step >= 1. `stop` is the step of the ego's first contact with a vehicle, else T.
+Shapes: B rollouts, N agents (the ego is row 0), T steps. Tensors over time hold T + 1 states; step 0 is the start. A
+contact counts at steps >= 1. `stop` is the step of the ego's first contact with a vehicle, T without one.
 """
-
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from e2rl.metrics.geometry import edge_distances, edge_parts_inside, overlap_area, velocity
+from e2rl.metrics.geometry import edge_distances, edge_parts_inside, pair_overlap, velocity
+from e2rl.metrics.realism import MOVING
 from e2rl.scene.boxes import separation
+from e2rl.scene.recording import DT, VEHICLE
 from e2rl.sim.dynamics import wrap
 
-MIN_AREA = 1e-6  # m2: a smaller overlap is the rounding of float32 positions
+Batch = dict[str, Tensor]
 FRONT, SIDE, REAR = 0, 1, 2
 KINDS = ("front", "side", "rear")
 EDGE_KIND = (SIDE, REAR, SIDE, FRONT)  # of geometry.EDGES
 BISECTIONS = 20
 
 
-@dataclass
-class EgoContact:
-    """The ego's first contact per rollout; `kind`, `partner` are -1 and `touched` is empty where there is none."""
-
-    overlaps_start: Tensor  # [B] bool, the ego overlaps a vehicle at step 0: its collision metrics are NaN
-    hit: Tensor  # [B] bool
-    stop: Tensor  # [B] int64, last step that counts
-    partner: Tensor  # [B] int64, the vehicle with the largest overlap at `stop`
-    touched: Tensor  # [B, N] bool, all vehicles that overlap the ego at `stop`
-    kind: Tensor  # [B] int64, index into KINDS, by the ego's edge that is hit
-    kinds_any: Tensor  # [B, 3] bool, every kind of edge with a part inside a touched vehicle at `stop`
-    before: Tensor  # [B] int64, the step before contact (contact itself if the partner was not there before)
+def steps_until(stop: Tensor, length: int) -> Tensor:
+    """Bool [B, length]: the steps 1..stop of rollouts that end at stop [B]."""
+    steps = torch.arange(length, device=stop.device)
+    return (steps >= 1) & (steps <= stop[:, None])
 
 
-def pair_overlap(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor, possible: Tensor) -> Tensor:
-    """Overlap area [...] [m2] of broadcastable boxes; 0 where `possible` [...] is false or it is <= MIN_AREA.
+def first_contact(batch: Batch) -> Batch:
+    """The ego's first contact with a vehicle in each rollout.
 
-    Bounding circles and then separating axes sort out pairs first; the exact area is computed for the rest only.
+    area [B, T+1, N] [m2]: overlap of the ego with every agent, 0 with itself. start_overlap [B] bool: the ego overlaps
+    a vehicle at step 0, so its collision metrics are unknown. hit [B] bool. stop [B]: step of the contact, else T.
+    touching [B, N] bool: vehicles that overlap the ego at `stop`. partner [B]: the one with the largest overlap. kind
+    [B]: index into KINDS, by the edge of the ego that is hit. Partner and kind are -1 without a contact. before [B]:
+    the step before the contact, or the contact's own where the partner was absent before.
     """
-    shape = possible.shape
-    boxes = [
-        first.expand(*shape, 4),
-        first_size.expand(*shape, 2),
-        second.expand(*shape, 4),
-        second_size.expand(*shape, 2),
-    ]
-    reach = (boxes[1].norm(dim=-1) + boxes[3].norm(dim=-1)) / 2
-    near = possible & ((boxes[0][..., :2] - boxes[2][..., :2]).square().sum(-1) <= reach.square())
-    index = near.nonzero(as_tuple=True)
-    chosen = [box[index] for box in boxes]
-    meet = separation(*chosen) <= 0
-    area = overlap_area(*(box[meet] for box in chosen))
-    result = torch.zeros(shape, dtype=first.dtype, device=first.device)
-    result[tuple(axis[meet] for axis in index)] = area.masked_fill(area <= MIN_AREA, 0.0)
-    return result
-
-
-def ego_overlap(states: Tensor, valid: Tensor, size: Tensor) -> Tensor:
-    """Overlap area [B, T+1, N] of the ego with every agent (0 with itself) from states [B, T+1, N, 4]."""
+    states, valid, size = batch["states"], batch["valid"], batch["size"]
+    row = torch.arange(len(states), device=states.device)
     possible = valid & valid[..., :1]
     possible[..., 0] = False
-    return pair_overlap(states[:, :, :1], size[:, None, :1], states, size[:, None], possible)
-
-
-def first_contact(states: Tensor, valid: Tensor, size: Tensor, area: Tensor) -> EgoContact:
-    """The ego's first contact from the vehicles' overlap areas [B, T+1, N] (0 for agents that do not count)."""
-    rollouts, steps = states.shape[0], states.shape[1] - 1
-    touches = (area > 0).any(-1)
-    overlaps_start = touches[:, 0]
-    hit = touches[:, 1:].any(-1) & ~overlaps_start
-    stop = torch.where(hit, touches[:, 1:].int().argmax(-1) + 1, steps)
-    at_stop = area[torch.arange(rollouts, device=area.device), stop] * hit[:, None]
+    area = pair_overlap(states[:, :, :1], size[:, None, :1], states, size[:, None], possible)
+    vehicle_area = area * (batch["agent_type"] == VEHICLE)[:, None]
+    overlaps = (vehicle_area > 0).any(-1)
+    hit = overlaps[:, 1:].any(-1) & ~overlaps[:, 0]
+    stop = torch.where(hit, overlaps[:, 1:].int().argmax(-1) + 1, states.shape[1] - 1)
+    at_stop = vehicle_area[row, stop] * hit[:, None]
     partner = at_stop.argmax(-1).masked_fill(~hit, -1)
-    before = stop - valid[torch.arange(rollouts, device=area.device), stop - 1, partner.clamp(min=0)].long()
+    before = stop - valid[row, stop - 1, partner.clamp(min=0)].long()
     kind = torch.full_like(stop, -1)
-    kinds_any = torch.zeros(rollouts, len(KINDS), dtype=torch.bool, device=area.device)
-    rows = hit.nonzero()[:, 0]
-    if len(rows):
-        kind[rows] = contact_kind(*contact_moment(states[rows], size[rows], partner[rows], before[rows], stop[rows]))
-        kinds_any[rows] = kinds_at_step(states[rows, stop[rows]], size[rows], at_stop[rows] > 0)
-    return EgoContact(overlaps_start, hit, stop, partner, at_stop > 0, kind, kinds_any, before)
+    if hit.any():
+        kind[hit] = contact_kind(*boxes_at_contact(states[hit], size[hit], partner[hit], before[hit], stop[hit]))
+    contact = {"area": area, "start_overlap": overlaps[:, 0], "hit": hit, "stop": stop, "touching": at_stop > 0}
+    return contact | {"partner": partner, "kind": kind, "before": before}
 
 
-def contact_moment(states: Tensor, size: Tensor, partner: Tensor, before: Tensor, stop: Tensor) -> tuple[Tensor, ...]:
-    """The ego's and its partner's boxes (state [C, 4], size [C, 2] each) when they first touch.
+def boxes_at_contact(
+    states: Tensor, size: Tensor, partner: Tensor, before: Tensor, stop: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """State [C, 4] and size [C, 2] of the ego and then of its partner at the moment when they first touch.
 
-    States are interpolated linearly between the steps `before` and `stop` and bisected: at 0.1 s steps alone, two fast
-    vehicles are already deep in each other, and the longest overlapped edge would be the side one.
+    The moment is found by bisection of states interpolated linearly between the steps `before` and `stop`. At the step
+    itself two fast vehicles are already deep in each other, and the longest edge inside would be a side.
     """
     rows = torch.arange(len(states), device=states.device)
     pair = torch.stack([torch.zeros_like(partner), partner], -1)
@@ -106,7 +79,7 @@ def contact_moment(states: Tensor, size: Tensor, partner: Tensor, before: Tensor
 
 
 def contact_kind(ego: Tensor, ego_size: Tensor, other: Tensor, other_size: Tensor) -> Tensor:
-    """Index [...] into KINDS: the ego's edge with the longest part inside the other box; left and right are `side`.
+    """Index [...] into KINDS of the ego's edge with the longest part inside the other box; left and right are `side`.
 
     Where no edge is inside (the other box lies wholly within the ego's) the edge nearest to its centre decides.
     """
@@ -116,67 +89,81 @@ def contact_kind(ego: Tensor, ego_size: Tensor, other: Tensor, other_size: Tenso
     return torch.tensor(EDGE_KIND, device=ego.device)[chosen]
 
 
-def kinds_at_step(states: Tensor, size: Tensor, touched: Tensor) -> Tensor:
-    """Bool [C, 3] per KINDS: an edge of this kind of the ego has a part inside any touched [C, N] vehicle."""
-    parts = edge_parts_inside(states[:, :1], size[:, :1], states, size)
-    inside = ((parts > 1e-9) & touched[..., None]).any(1)
+def kinds_at_stop(batch: Batch) -> Tensor:
+    """Bool [B, 3] per KINDS: an edge of this kind has a part inside any vehicle that the ego touches at `stop`."""
+    states = batch["states"][torch.arange(len(batch["stop"])), batch["stop"]]
+    parts = edge_parts_inside(states[:, :1], batch["size"][:, :1], states, batch["size"])
+    inside = ((parts > 1e-9) & batch["touching"][..., None]).any(1)
     left, rear, right, front = inside.unbind(-1)
     return torch.stack([front, right | left, rear], -1)
 
 
-def vulnerable_contact(area: Tensor, vehicle: Tensor, stop: Tensor) -> Tensor:
-    """Bool [B]: the ego overlaps an agent that is no vehicle at a step 1..stop; area [B, T+1, N], vehicle [B, N]."""
-    counts = ((area > 0) & ~vehicle[:, None]).any(-1)
-    return (counts & up_to(stop, area.shape[1])).any(-1)
+def contact_columns(batch: Batch) -> Batch:
+    """Metrics of the ego's first contact; NaN where the ego overlaps a vehicle at the start already.
 
-
-def background_pairs(states: Tensor, valid: Tensor, size: Tensor, traffic: Tensor, stop: Tensor) -> tuple[Tensor, ...]:
-    """Counts [B] of pairs of `traffic` [B, N] vehicles that overlap at a step 1..stop, and at step 0; and who is among
-    the first [B, N] bool.
-
-    Pairs that overlap at step 0 already are left out of the first count.
+    relvel: |v_ego - v_partner| [m/s] at the step before contact.
     """
+    states, hit, stop, unknown = (batch[key] for key in ("states", "hit", "stop", "start_overlap"))
+    columns = {"cfr": hit, "cfr_adv": (batch["touching"] & batch["adversaries"]).any(-1)}
+    for kind, (name, touched) in enumerate(zip(KINDS, kinds_at_stop(batch).unbind(1), strict=True)):
+        columns |= {name: batch["kind"] == kind, f"{name}_any": touched}
+    columns = {name: value.to(states.dtype).masked_fill(unknown, torch.nan) for name, value in columns.items()}
+    step = stop.to(states.dtype).masked_fill(~hit, torch.nan)
+    row = torch.arange(len(states))
+    before = velocity(states[row, batch["before"]])
+    relative = (before[:, 0] - before[row, batch["partner"].clamp(min=0)]).norm(dim=-1)
+    vulnerable = (batch["area"] > 0) & (batch["agent_type"] != VEHICLE)[:, None]
+    return columns | {
+        "cfr_vru": (vulnerable.any(-1) & steps_until(stop, states.shape[1])).any(-1).to(states.dtype),
+        "rir": columns["rear"].masked_fill(~hit, torch.nan),
+        "relvel": relative.masked_fill(~hit, torch.nan),
+        "contact_step": step,
+        "contact_time": step * DT,
+        "contact_type": batch["kind"],
+        "partner": batch["partner"],
+        "start_overlap_ego": unknown,
+    }
+
+
+def traffic_contact_columns(batch: Batch) -> Batch:
+    """Pairs of `traffic` vehicles that overlap at a step 1..stop, and the share of moving vehicles among them.
+
+    Pairs that overlap at step 0 already are counted apart and left out of the rest.
+    """
+    states, size, traffic = batch["states"], batch["size"], batch["traffic"]
     used = traffic.any(0).nonzero()[:, 0]
-    one, two = torch.triu_indices(len(used), len(used), 1, device=states.device)
-    one, two = used[one], used[two]
-    possible = (valid & traffic[:, None])[:, :, one] & (valid & traffic[:, None])[:, :, two]
-    index = nearby(states, size, one, two, possible)
-    batch, step, pair = index
-    overlap = torch.zeros(possible.shape, dtype=torch.bool, device=states.device)
-    first, second = one[pair], two[pair]
-    area = pair_overlap(
-        states[batch, step, first],
-        size[batch, first],
-        states[batch, step, second],
-        size[batch, second],
-        torch.ones_like(batch, dtype=torch.bool),
-    )
-    overlap[index] = area > 0
-    later = (overlap & up_to(stop, states.shape[1])[..., None]).any(1)
+    one, two = used[torch.triu_indices(len(used), len(used), 1, device=states.device)]
+    index = nearby(states, size, one, two, batch["valid"] & traffic[:, None])
+    row, step, pair = index
+    near = [box for agent in (one[pair], two[pair]) for box in (states[row, step, agent], size[row, agent])]
+    overlap = torch.zeros(*states.shape[:2], len(one), dtype=torch.bool, device=states.device)
+    overlap[index] = pair_overlap(*near, torch.ones_like(row, dtype=torch.bool)) > 0
+    later = (overlap & steps_until(batch["stop"], states.shape[1])[..., None]).any(1)
     meets = later & ~overlap[:, 0]
-    touched = torch.zeros_like(traffic, dtype=torch.int64).index_add(1, one, meets.long())
-    touched = touched.index_add(1, two, meets.long()) > 0
-    return meets.sum(-1), overlap[:, 0].sum(-1), touched
+    touched = torch.zeros_like(traffic, dtype=torch.int64)
+    touched = touched.index_add(1, torch.cat([one, two]), meets.long().repeat(1, 2)) > 0
+    pairs = meets.sum(-1)
+    columns = {"cfr_bg": (pairs > 0).to(states.dtype), "bg_pairs": pairs, "start_overlap_bg": overlap[:, 0].any(-1)}
+    return columns | touched_columns(batch, touched)
 
 
-def nearby(states: Tensor, size: Tensor, one: Tensor, two: Tensor, possible: Tensor) -> tuple[Tensor, ...]:
-    """Indices (rollout, step, pair) of possible [B, T+1, P] pairs of agents one [P], two [P] whose circles meet."""
+def nearby(states: Tensor, size: Tensor, one: Tensor, two: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Indices (rollout, step, pair) of pairs of agents one [P], two [P], both present [B, T+1, N], whose bounding
+    circles meet."""
     x, y = states[..., 0], states[..., 1]
     radius = size.norm(dim=-1) / 2
     square = (x[:, :, one] - x[:, :, two]).square_().add_((y[:, :, one] - y[:, :, two]).square_())
     reach = (radius[:, one] + radius[:, two]).square_()
-    return (possible & (square <= reach[:, None])).nonzero(as_tuple=True)
+    near = present[:, :, one] & present[:, :, two] & (square <= reach[:, None])
+    rollout, step, pair = near.nonzero(as_tuple=True)
+    return rollout, step, pair
 
 
-def up_to(stop: Tensor, length: int) -> Tensor:
-    """Bool [B, length]: the steps 1..stop of rollouts that end at stop [B]."""
-    steps = torch.arange(length, device=stop.device)
-    return (steps >= 1) & (steps <= stop[:, None])
-
-
-def relative_speed(states: Tensor, contact: EgoContact) -> Tensor:
-    """|v_ego - v_partner| [B] [m/s] at the step before contact; NaN without contact (section 8.3)."""
-    rows = torch.arange(len(states), device=states.device)
-    now = states[rows, contact.before]
-    speed = (velocity(now[:, 0]) - velocity(now[rows, contact.partner.clamp(min=0)])).norm(dim=-1)
-    return speed.masked_fill(~contact.hit, torch.nan)
+def touched_columns(batch: Batch, touched: Tensor) -> Batch:
+    """Share of the traffic's vehicles that move, in the rollout or its log, that are touched [B, N] by another one."""
+    pairs = (("states", "valid"), ("logged", "logged_valid"))
+    fastest = [(batch[track][..., 3] * batch[valid]).amax(1) for track, valid in pairs]
+    moving = batch["traffic"] & (torch.maximum(*fastest) > MOVING)
+    number = moving.sum(-1)
+    share = (touched & moving).sum(-1).to(batch["states"].dtype) / number  # 0 / 0 is NaN
+    return {"touched": share, "moving_vehicles": number}

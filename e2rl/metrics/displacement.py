@@ -10,9 +10,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from e2rl.metrics.realism import MOVING
 from e2rl.scene.recording import DT
-
-MOVING = 0.5  # m/s, logged speed at the start frame above which a vehicle counts
 
 
 def moving_vehicles(logged: Tensor, logged_valid: Tensor, simulated: Tensor, steps: int) -> Tensor:
@@ -26,7 +25,7 @@ def moving_vehicles(logged: Tensor, logged_valid: Tensor, simulated: Tensor, ste
 
 
 def displacement(plans: Tensor, logged: Tensor) -> Tensor:
-    """Running ADE [B, S, V, H] [m] of plans [B, S, V, H, >= 2] against the log [B, V, H, >= 2] of the same steps."""
+    """ADE [B, S, V, H] [m] up to each step of plans [B, S, V, H, >= 2] against the log [B, V, H, >= 2]."""
     gap = (plans[..., :2] - logged[:, None, ..., :2]).norm(dim=-1)
     return gap.cumsum(-1) / torch.arange(1, gap.shape[-1] + 1, device=gap.device)
 
@@ -40,18 +39,18 @@ def scene_displacements(
     Keys, with the horizon in s appended: min_ade_, mean_ade_, joint_ade_ (the best joint sample), cv_ade_, vehicles_.
     """
     steps = torch.arange(1, plans.shape[3] + 1, device=logged.device)
-    future = logged[:, steps.clamp(max=logged.shape[1] - 1)].transpose(1, 2)  # nobody counts after the log's end
-    planned, straight = displacement(plans, future), displacement(reference[:, None], future)[:, 0]
+    future = logged[:, steps.clamp(max=logged.shape[1] - 1)].transpose(1, 2)  # no vehicle counts after the log's end
+    planned, constant = displacement(plans, future), displacement(reference[:, None], future)[:, 0]
     columns = {}
     for horizon in horizons:
-        steps = round(horizon / DT)
-        counted = moving_vehicles(logged, logged_valid, simulated, steps)
-        ade = torch.where(counted[:, None], planned[..., steps - 1], 0.0)
+        last = round(horizon / DT)
+        counted = moving_vehicles(logged, logged_valid, simulated, last)
+        ade = torch.where(counted[:, None], planned[..., last - 1], 0.0)
         found = {
             "min_ade": ade.amin(1).sum(-1),
             "mean_ade": ade.mean(1).sum(-1),
             "joint_ade": ade.sum(-1).amin(1),
-            "cv_ade": torch.where(counted, straight[..., steps - 1], 0.0).sum(-1),
+            "cv_ade": torch.where(counted, constant[..., last - 1], 0.0).sum(-1),
             "vehicles": counted.sum(-1),
         }
         columns |= {f"{name}_{horizon:g}": value for name, value in found.items()}

@@ -1,15 +1,16 @@
-"""What scoring asks of oriented boxes beside `scene.boxes`: exact overlap area, the parts of edges inside another box.
+"""Exact overlap of oriented boxes, in addition to `scene.boxes`: its area, and the parts of edges inside another box.
 
-A box is a state (x, y, heading, speed) and a size (length, width); leading dimensions broadcast. float64 is advised
-where an overlap of 1e-6 m2 decides.
+A box is a state (x, y, heading, speed) and a size (length, width); leading dimensions broadcast. Use float64 where an
+overlap of 1e-6 m2 decides.
 """
 
 import torch
 from torch import Tensor
 
-from e2rl.scene.boxes import corners, to_frame
+from e2rl.scene.boxes import corners, overlap, to_frame
 
 EDGES = ("left", "rear", "right", "front")  # edge i runs from corner i to corner i + 1 of scene.boxes.corners
+MIN_AREA = 1e-6  # m2: a smaller overlap is the rounding of float32 positions
 
 
 def velocity(states: Tensor) -> Tensor:
@@ -17,18 +18,26 @@ def velocity(states: Tensor) -> Tensor:
     return states[..., 3:4] * torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)
 
 
+def pair_overlap(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor, possible: Tensor) -> Tensor:
+    """Overlap area [...] [m2] of pairs of boxes; 0 where `possible` [...] is false or the area is at most MIN_AREA.
+
+    The exact area is computed only for the pairs that `sim.geometry.overlap` finds.
+    """
+    boxes = (first, first_size, second, second_size)
+    meets = possible & overlap(*boxes)
+    area = overlap_area(*(box.expand(*meets.shape, box.shape[-1])[meets] for box in boxes))
+    result = torch.zeros(meets.shape, dtype=first.dtype, device=first.device)
+    return result.masked_scatter(meets, area.masked_fill(area <= MIN_AREA, 0.0))
+
+
 def overlap_area(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor) -> Tensor:
     """Exact area [...] [m2] of two boxes' intersection.
 
-    By Green's theorem in the second box's frame: the boundary of the first box, every point of it clamped into the
-    second box, encloses exactly the intersection, so area = sum over edges of the integral of clamp(x) d clamp(y).
-    The integrand is continuous in the boxes, hence shared or collinear edges need no special case.
+    Green's theorem in the second box's frame: the boundary of the first box, every point of it clamped into the second
+    box, encloses exactly the intersection, so area = sum over edges of the integral of clamp(x) d clamp(y). The
+    integrand is continuous in the boxes, hence shared or collinear edges need no special case.
     """
-    start = to_frame(corners(first, first_size), second[..., None, :])
-    change = start.roll(-1, -2) - start
-    half = (second_size / 2)[..., None, :]
-    safe = torch.where(change == 0, torch.ones_like(change), change)
-    bounds = torch.stack([(-half - start) / safe, (half - start) / safe]).sort(0).values
+    start, change, half, bounds = _edges_in_frame(first, first_size, second, second_size, 1.0)
     begin, end = bounds[..., 1].clamp(0, 1)  # where y is inside the second box's width
     knots = torch.stack([begin, *(bounds[..., 0].maximum(begin).minimum(end)), end], -1)
     x = start[..., 0, None] + knots * change[..., 0, None]
@@ -39,19 +48,32 @@ def overlap_area(first: Tensor, first_size: Tensor, second: Tensor, second_size:
 
 def edge_parts_inside(box: Tensor, size: Tensor, other: Tensor, other_size: Tensor) -> Tensor:
     """Length [..., 4] [m] of each of the box's edges (order `EDGES`) that lies inside the other box."""
-    start = to_frame(corners(box, size), other[..., None, :])
-    change = start.roll(-1, -2) - start
-    half = (other_size / 2)[..., None, :]
-    safe = torch.where(change == 0, torch.full_like(change, torch.finfo(change.dtype).tiny), change)
-    enter, leave = torch.stack([(-half - start) / safe, (half - start) / safe]).sort(0).values
+    _, change, _, (enter, leave) = _edges_in_frame(box, size, other, other_size, torch.finfo(box.dtype).tiny)
     part = (leave.amin(-1).clamp(0, 1) - enter.amax(-1).clamp(0, 1)).clamp(min=0)
     return part * change.norm(dim=-1)
 
 
+def _edges_in_frame(
+    box: Tensor, size: Tensor, other: Tensor, other_size: Tensor, zero: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Start and change [..., 4, 2] of the box's edges in the frame of the other box, that box's half size [..., 1, 2],
+    and the shares [2, ..., 4, 2] of each edge at which its x and y enter and leave the other box; a change of 0 counts
+    as `zero` in them."""
+    start = to_frame(corners(box, size), other[..., None, :])
+    change = start.roll(-1, -2) - start
+    half = (other_size / 2)[..., None, :]
+    divisor = torch.where(change == 0, torch.full_like(change, zero), change)
+    return start, change, half, torch.stack([(-half - start) / divisor, (half - start) / divisor]).sort(0).values
+
+
 def edge_distances(box: Tensor, size: Tensor, point: Tensor) -> Tensor:
     """Distance [..., 4] [m] from each of the box's edges (order `EDGES`) to a point [..., 2]."""
-    corner = corners(box, size)
-    along = corner.roll(-1, -2) - corner
-    offset = point[..., None, :] - corner
-    share = ((offset * along).sum(-1) / (along * along).sum(-1).clamp(min=1e-12)).clamp(0, 1)
-    return (offset - share[..., None] * along).norm(dim=-1)
+    start = corners(box, size)
+    return from_segment(point[..., None, :], start, start.roll(-1, -2) - start).norm(dim=-1)
+
+
+def from_segment(point: Tensor, start: Tensor, along: Tensor) -> Tensor:
+    """Vector [..., 2] [m] to a point from the nearest point of the segment from `start` to `start + along`."""
+    offset = point - start
+    share = ((offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-18)).clamp(0, 1)
+    return offset - share[..., None] * along

@@ -1,7 +1,8 @@
-"""What the realism meta-metric looks at: motion, nearest neighbour, time to collision, road and lights, per vehicle and
-step, of rollouts and of their logs alike (features of the Waymo Open Sim Agents Challenge, public description).
+"""Features of the realism meta-metric per vehicle and step: motion, nearest agent, time to collision, road and lights.
 
-Names: B rollouts, M tracks (one vehicle of one rollout each), N agents, T steps; time begins at step 1 of a rollout.
+They follow the public description of the Waymo Open Sim Agents Challenge (Montali et al. 2023) and are computed alike
+for rollouts and for their logs. Shapes: B rollouts, M tracks (one vehicle of one rollout each), N agents, T steps; time
+begins at step 1 of a rollout.
 """
 
 import torch
@@ -12,36 +13,35 @@ from e2rl.scene.recording import DT, LIGHT_RED
 from e2rl.scene.route import project
 from e2rl.sim.drivable import off_road
 from e2rl.sim.dynamics import wrap
+from e2rl.sim.traffic_light import light_state_at
 
 TTC_CAP = 5.0  # s
-AHEAD_ANGLE = 1.31  # rad (75 degrees) between headings beyond which nobody follows anybody
+AHEAD_ANGLE = 1.31  # rad (75 degrees) between headings beyond which no vehicle follows another
 BESIDE_ANGLE, BESIDE = 0.175, 0.5  # rad, m: an overlap in width below BESIDE counts for parallel headings only
-FAR = 1e3  # m, the distance of nobody
+FAR = 1e3  # m, the distance where there is no other agent
+Feature = tuple[Tensor, Tensor]  # values and where they are known, each [M, T]
 
 
 def track_features(
     batch: dict[str, Tensor], rollout: Tensor, agent: Tensor
-) -> tuple[dict[str, tuple[Tensor, Tensor]], dict[str, Tensor]]:
-    """(values and where they are known, each [M, T], of every histogram feature; indications [M] bool) of the tracks
-    (rollout [M], agent [M]) of B rollouts.
+) -> tuple[dict[str, Feature], dict[str, Tensor]]:
+    """Histogram features, and indications [M] bool, of the tracks of agents agent [M] in rollouts rollout [M].
 
     batch: states [B, T+1, N, 4], valid [B, T+1, N], size [B, N, 2], field [B, G, G], field_origin [B, 2], light_state
-    [B, T+1, L], and of the ways followed route_points [B, V, P, 2], route_light, route_light_s [B, V, K].
+    [B, T+1, L], and of the routes followed route_points [B, V, P, 2], route_light, route_light_s [B, V, K].
     """
     states, valid = batch["states"][:, 1:].float(), batch["valid"][:, 1:]
-    size, others = batch["size"][rollout].float(), states[rollout]
-    itself = torch.arange(states.shape[2], device=agent.device) == agent[:, None]
-    track, known = states[rollout, :, agent], valid[rollout, :, agent]
-    own = batch["size"][rollout, agent].float()
-    pairs = (track, own, others, size, valid[rollout] & ~itself[:, None])
+    size, others = batch["size"].float(), states[rollout]
+    is_track = torch.arange(states.shape[2], device=agent.device) == agent[:, None]
+    track, known, own = states[rollout, :, agent], valid[rollout, :, agent], size[rollout, agent]
+    pairs = (track, own, others, size[rollout], valid[rollout] & ~is_track[:, None])
     gap = nearest_object(*pairs)
     vehicles = batch["route_points"].shape[1]
-    beyond = beyond_road(
-        states[:, :, :vehicles], batch["size"][:, :vehicles].float(), batch["field"], batch["field_origin"]
-    )[rollout, :, agent]
-    ways = (batch[key][rollout, agent] for key in ("route_points", "route_light", "route_light_s"))
-    red = runs_red_light(track, known, own, *ways, batch["light_state"][rollout, 1:])
-    values = motion(track, known) | {
+    road = (batch["field"], batch["field_origin"])
+    beyond = beyond_road(states[:, :, :vehicles], size[:, :vehicles], *road)[rollout, :, agent]
+    route = [batch[key][rollout, agent] for key in ("route_points", "route_light", "route_light_s")]
+    red = runs_red_light(track, known, own, *route, batch["light_state"][rollout, 1:])
+    values = kinematics(track, known) | {
         "nearest_object": (gap, known),
         "time_to_collision": (time_to_collision(*pairs), known),
         "road_edge": (beyond, known),
@@ -49,33 +49,31 @@ def track_features(
     return values, {"collision": ((gap < 0) & known).any(1), "offroad": ((beyond > 0) & known).any(1), "red_light": red}
 
 
-def central(values: Tensor, known: Tensor, angle: bool = False) -> tuple[Tensor, Tensor]:
-    """Central difference per second of values [M, T(, C)] and where both neighbours are known [M, T]; 0 elsewhere."""
+def central(values: Tensor, known: Tensor, angle: bool = False) -> Feature:
+    """Central difference per second of values [M, T(, C)], known where both neighbours are [M, T]; 0 elsewhere."""
     change = values[:, 2:] - values[:, :-2]
     change = (wrap(change) if angle else change) / (2 * DT)
-    both = known[:, 2:] & known[:, :-2]
-    edge = torch.zeros_like(known[:, :1])
-    both = torch.cat([edge, both, edge], 1)
-    change = torch.cat([torch.zeros_like(values[:, :1]), change, torch.zeros_like(values[:, :1])], 1)
-    mask = both if change.ndim == both.ndim else both[..., None]
-    return torch.where(mask, change, 0.0), both
+    edge, no_change = torch.zeros_like(known[:, :1]), torch.zeros_like(values[:, :1])
+    both = torch.cat([edge, known[:, 2:] & known[:, :-2], edge], 1)
+    change = torch.cat([no_change, change, no_change], 1)
+    return torch.where(both if change.ndim == both.ndim else both[..., None], change, 0.0), both
 
 
-def motion(track: Tensor, known: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
-    """Speed [m/s], its rate, yaw rate [rad/s] and its rate: (values, known), each [M, T], of tracks [M, T, 4]."""
+def kinematics(track: Tensor, known: Tensor) -> dict[str, Feature]:
+    """Speed [m/s], its rate, yaw rate [rad/s] and its rate of tracks [M, T, 4]."""
     velocity, moved = central(track[..., :2], known)
     speed = velocity.norm(dim=-1)
-    turn, turned = central(track[..., 2], known, angle=True)
+    yaw_rate, turned = central(track[..., 2], known, angle=True)
     return {
         "linear_speed": (speed, moved),
         "linear_accel": central(speed, moved),
-        "angular_speed": (turn, turned),
-        "angular_accel": central(turn, turned),
+        "angular_speed": (yaw_rate, turned),
+        "angular_accel": central(yaw_rate, turned),
     }
 
 
 def nearest_object(track: Tensor, size: Tensor, others: Tensor, other_size: Tensor, seen: Tensor) -> Tensor:
-    """Signed box distance [M, T] [m] to the nearest other agent (minus the depth of an overlap), FAR for none.
+    """Signed box distance [M, T] [m] to the nearest other agent (minus the depth of an overlap), FAR without one.
 
     track [M, T, 4], size [M, 2]; others [M, T, N, 4], other_size [M, N, 2]; seen [M, T, N]: present, and not the track
     itself. Circles around and inside the boxes tell which pairs can be the nearest; only these are measured.
@@ -91,10 +89,10 @@ def nearest_object(track: Tensor, size: Tensor, others: Tensor, other_size: Tens
 
 
 def time_to_collision(track: Tensor, size: Tensor, others: Tensor, other_size: Tensor, seen: Tensor) -> Tensor:
-    """Seconds [M, T] until the track's front meets the tail of whoever is ahead of it at constant speeds, at most
-    TTC_CAP. Arguments as in nearest_object.
+    """Seconds [M, T], at most TTC_CAP, until the track's front meets the rear of the agent ahead at constant speeds.
 
-    Ahead is the nearest agent whose box lies in the track's own width, within AHEAD_ANGLE of its heading.
+    The agent ahead is the nearest one whose box lies in the track's own width, within AHEAD_ANGLE of its heading.
+    Arguments as in nearest_object.
     """
     cos, sin = track[..., 2].cos()[..., None], track[..., 2].sin()[..., None]
     dx, dy = (others[..., k] - track[..., None, k] for k in (0, 1))
@@ -114,9 +112,9 @@ def time_to_collision(track: Tensor, size: Tensor, others: Tensor, other_size: T
 
 
 def beyond_road(states: Tensor, size: Tensor, field: Tensor, origin: Tensor) -> Tensor:
-    """Metres [B, T, V] that each box's worst corner lies beyond the drivable border (< 0 inside).
+    """Metres [B, T, V] that the worst corner of boxes lies beyond the drivable border (< 0 inside).
 
-    states [B, T, V, 4], size [B, V, 2]; field [B, G, G], origin [B, 2] of `sim.drivable.off_road`.
+    states [B, T, V, 4], size [B, V, 2]; field [B, G, G], origin [B, 2] as in `sim.drivable.off_road`.
     """
     return off_road(corners(states, size[:, None]), field, origin).amax(-1)
 
@@ -124,13 +122,16 @@ def beyond_road(states: Tensor, size: Tensor, field: Tensor, origin: Tensor) -> 
 def runs_red_light(
     track: Tensor, known: Tensor, size: Tensor, route: Tensor, light: Tensor, light_s: Tensor, state: Tensor
 ) -> Tensor:
-    """Bool [M]: the front passes the stop line of one of its route's lights [M, K] between two steps while it is red.
+    """Bool [M]: the front passes the stop line of one of its route's lights between two steps while it is red.
 
-    route [M, P, 2]: way that the track follows; light [M, K] index (-1 none), light_s [M, K] m; state [M, T, L].
+    route [M, P, 2]: the route followed; light [M, K]: indices of its lights (-1 none), light_s [M, K]: arc length [m]
+    of their stop lines; state [M, T, L]: of all lights.
     """
-    if not state.shape[-1] or not light.numel():
+    if not state.shape[-1] or not (light >= 0).any():
         return torch.zeros(len(track), dtype=torch.bool, device=track.device)
     front = project(track[..., :2], route)[0][:, :, None] + size[:, None, :1] / 2 - light_s[:, None]
-    red = state.gather(-1, light.clamp(min=0)[:, None].expand(-1, state.shape[1], -1)) == LIGHT_RED
-    passes = (front[:, :-1] <= 0) & (front[:, 1:] > 0) & red[:, 1:] & (light >= 0)[:, None]
+    light = light[:, None].expand(*state.shape[:2], -1)  # [M, T, K]: each step is a row of its own in the look-up
+    first = torch.zeros_like(light[..., 0]).flatten()
+    red = light_state_at(state.flatten(0, 1)[:, None], light.flatten(0, 1), first).view(light.shape) == LIGHT_RED
+    passes = (front[:, :-1] <= 0) & (front[:, 1:] > 0) & red[:, 1:]
     return (passes & (known[:, 1:] & known[:, :-1])[..., None]).any(1).any(-1)

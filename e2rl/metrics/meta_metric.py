@@ -1,9 +1,9 @@
 """A realism meta-metric in the style of the Waymo Open Sim Agents Challenge (features and weights of its 2025 edition).
 
-For every vehicle a histogram of each feature over all rollouts and steps (steps taken as independent) tells how likely
-the logged values are: likelihood = exp(mean log p(logged value)) over a scene's vehicles and known steps. Indications
-(collision, off the road, red light) happen to a vehicle in a rollout or not: Bernoulli with the share of rollouts.
-Additive smoothing SMOOTHING per bin. The meta-metric is the weighted sum, in (0, 1].
+Each vehicle has a histogram of every feature over all its rollouts and steps (steps taken as independent). With it,
+likelihood = exp(mean log p(logged value)) over a scene's vehicles and known steps. Indications (collision, off the
+road, red light) happen to a vehicle in a rollout or not: their p is Bernoulli, the share of rollouts. Every bin has
+additive smoothing SMOOTHING. The meta-metric is the weighted sum of the likelihoods, in (0, 1].
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ SMOOTHING = 0.1
 
 @dataclass(frozen=True)
 class Feature:
-    """Weight in the meta-metric; range and number of bins of the histogram, or bins = 0 for an indication."""
+    """Its weight in the meta-metric; range and number of bins of its histogram, bins = 0 for an indication."""
 
     weight: float
     low: float = 0.0
@@ -41,9 +41,9 @@ INDICATIONS = tuple(name for name, feature in FEATURES.items() if not feature.bi
 
 
 def bin_index(values: Tensor, feature: Feature) -> Tensor:
-    """Bin [...] int64 of values [...]; what lies outside the range counts in the first or last bin."""
-    place = (values - feature.low) / (feature.high - feature.low) * feature.bins
-    return place.floor().long().clamp(0, feature.bins - 1)
+    """Bin [...] int64 of values [...]; values outside the range count in the first or last bin."""
+    position = (values - feature.low) / (feature.high - feature.low) * feature.bins
+    return position.floor().long().clamp(0, feature.bins - 1)
 
 
 def bin_counts(index: Tensor, known: Tensor, bins: int) -> Tensor:
@@ -59,13 +59,13 @@ def log_probability(counts: Tensor, index: Tensor) -> Tensor:
 
 
 def log_bernoulli(hits: Tensor, rollouts: Tensor | float, happened: Tensor) -> Tensor:
-    """log p [M] of whether it happened [M] bool in the log, given the number of rollouts and of hits [M] among them."""
+    """log p [M] of an indication that happened [M] bool in the log and in `hits` [M] of the rollouts."""
     p = (hits + SMOOTHING) / (rollouts + 2 * SMOOTHING)
     return torch.where(happened, p, 1 - p).log()
 
 
 def likelihood(log_p: Tensor, known: Tensor, scene: Tensor, scenes: int) -> Tensor:
-    """exp of the mean log_p [M, T] over each scene's known [M, T] values; scene [M] int64; NaN where it has none."""
+    """exp of the mean log_p [M, T] over the known [M, T] values of each scene [M] int64; NaN where it has none."""
     total = log_p.new_zeros(scenes).index_add(0, scene, (log_p * known).sum(-1))
     count = log_p.new_zeros(scenes).index_add(0, scene, known.to(log_p.dtype).sum(-1))
     return (total / count).exp()
@@ -73,4 +73,4 @@ def likelihood(log_p: Tensor, known: Tensor, scene: Tensor, scenes: int) -> Tens
 
 def meta_metric(likelihoods: dict[str, Tensor]) -> Tensor:
     """Weighted sum [...] of the features' likelihoods [...]."""
-    return sum(feature.weight * likelihoods[name] for name, feature in FEATURES.items())
+    return sum((feature.weight * likelihoods[name] for name, feature in FEATURES.items()), start=torch.zeros(()))

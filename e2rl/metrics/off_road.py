@@ -1,14 +1,15 @@
-"""Off the road: a vehicle's centre outside every drivable polygon and far from every lane (design.md section 5).
+"""Off the road: a vehicle's centre outside every drivable polygon and far from every lane (docs/method.md, section 10).
 
 On the road means inside a drivable polygon (even-odd rule) or within half the lane's width + 1.0 m of its centreline.
-Distances are exact, point to segment; a grid of buckets keeps the work near the number of points.
+Distances are exact, from point to segment; a grid of buckets keeps the work near the number of points.
 """
 
 import torch
 from torch import Tensor
 
 from e2rl.metrics.broad_phase import candidates
-from e2rl.metrics.contact import up_to
+from e2rl.metrics.contact import Batch, steps_until
+from e2rl.metrics.geometry import from_segment
 
 MARGIN = 1.0  # m beyond half the lane width
 LANE_CELL = 8.0  # m, grid of the lanes' segments
@@ -21,14 +22,14 @@ def line_segments(points: Tensor, index: Tensor, closed: bool = False) -> tuple[
     A line's points are adjacent rows. With `closed` a last segment joins each line's last point to its first.
     """
     known = index >= 0
-    joined = known[:, 1:] & (index[:, 1:] == index[:, :-1])
-    rollout, point = joined.nonzero(as_tuple=True)
+    same_line = known[:, 1:] & (index[:, 1:] == index[:, :-1])
+    rollout, point = same_line.nonzero(as_tuple=True)
     line = index[rollout, point]
     ends = torch.stack([points[rollout, point], points[rollout, point + 1]], 1)
     if closed and index.shape[1]:
         edge = torch.ones_like(known[:, :1])
-        first = known & torch.cat([edge, ~joined], 1)
-        last = known & torch.cat([~joined, edge], 1)
+        first = known & torch.cat([edge, ~same_line], 1)
+        last = known & torch.cat([~same_line, edge], 1)
         ring, start = first.nonzero(as_tuple=True)
         stop = last.nonzero(as_tuple=True)[1]
         rollout, line = torch.cat([rollout, ring]), torch.cat([line, index[ring, start]])
@@ -36,22 +37,18 @@ def line_segments(points: Tensor, index: Tensor, closed: bool = False) -> tuple[
     return rollout, line, ends
 
 
-def near_lane(
-    points: Tensor, rollout: Tensor, lane_points: Tensor, lane_index: Tensor, lane_width: Tensor, margin: float = MARGIN
-) -> Tensor:
-    """Bool [n]: points [n, 2] of rollouts [n] within width / 2 + margin of a lane's centreline.
+def near_lane(points: Tensor, rollout: Tensor, lane_points: Tensor, lane_index: Tensor, lane_width: Tensor) -> Tensor:
+    """Bool [n]: points [n, 2] of rollouts [n] within width / 2 + MARGIN of a lane's centreline.
 
     lane_points [B, M, 2], lane_index [B, M] (-1 padding), lane_width [B, L].
     """
     owner, lane, ends = line_segments(lane_points, lane_index)
-    reach = lane_width[owner, lane] / 2 + margin
+    reach = lane_width[owner, lane] / 2 + MARGIN
     low, high = ends.amin(1) - reach[:, None], ends.amax(1) + reach[:, None]
     point, segment = candidates(points, rollout, low, high, owner, LANE_CELL)
     start, along = ends[segment, 0], (ends[:, 1] - ends[:, 0])[segment]
-    offset = points[point] - start
-    share = ((offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-18)).clamp(0, 1)
-    near = (offset - share[:, None] * along).square().sum(-1) <= reach[segment].square()
-    return mark(len(points), point[near])
+    near = from_segment(points[point], start, along).square().sum(-1) <= reach[segment].square()
+    return torch.zeros(len(points), dtype=torch.bool).index_fill(0, point[near], True)
 
 
 def inside_polygon(points: Tensor, rollout: Tensor, polygon_points: Tensor, polygon_index: Tensor) -> Tensor:
@@ -67,9 +64,9 @@ def inside_polygon(points: Tensor, rollout: Tensor, polygon_points: Tensor, poly
     straddles = (y0 > height) != (y1 > height)
     rise = torch.where(y1 == y0, torch.ones_like(y0), y1 - y0)
     crossed = straddles & (x < x0 + (height - y0) / rise * (x1 - x0))
-    polygons = int(polygon_index.amax()) + 1 if polygon_index.numel() else 0
-    key, count = (point * max(polygons, 1) + polygon[edge])[crossed].unique(return_counts=True)
-    return mark(len(points), key[count % 2 == 1] // max(polygons, 1))
+    polygons = max(int(polygon_index.amax()) + 1, 1) if polygon_index.numel() else 1
+    key, count = (point * polygons + polygon[edge])[crossed].unique(return_counts=True)
+    return torch.zeros(len(points), dtype=torch.bool).index_fill(0, key[count % 2 == 1] // polygons, True)
 
 
 def has_lines(index: Tensor) -> Tensor:
@@ -77,40 +74,31 @@ def has_lines(index: Tensor) -> Tensor:
     return ((index[:, 1:] >= 0) & (index[:, 1:] == index[:, :-1])).any(-1)
 
 
-def mark(length: int, index: Tensor) -> Tensor:
-    """Bool [length], true at index."""
-    flags = torch.zeros(length, dtype=torch.bool, device=index.device)
-    flags[index] = True
-    return flags
-
-
-def on_road(points: Tensor, rollout: Tensor, road: dict[str, Tensor], margin: float = MARGIN) -> Tensor:
-    """Bool [n]: points [n, 2] of rollouts [n] int64 on the road; `road` holds the rollout dict's map tensors."""
-    near = near_lane(points, rollout, road["lane_points"], road["lane_index"], road["lane_width"], margin)
+def on_road(points: Tensor, rollout: Tensor, batch: Batch) -> Tensor:
+    """Bool [n]: points [n, 2] of rollouts [n] int64 are on the road of the batch's maps."""
+    near = near_lane(points, rollout, batch["lane_points"], batch["lane_index"], batch["lane_width"])
     rest = (~near).nonzero()[:, 0]
-    inside = inside_polygon(points[rest], rollout[rest], road["drivable_points"], road["drivable_index"])
-    near[rest] = inside
+    near[rest] = inside_polygon(points[rest], rollout[rest], batch["drivable_points"], batch["drivable_index"])
     return near
 
 
-def off_road(
-    states: Tensor, valid: Tensor, counted: Tensor, stop: Tensor, road: dict[str, Tensor], margin: float = MARGIN
-) -> dict[str, Tensor]:
-    """`aor_step`, `aor_any` [B] of the counted vehicles [B, N] at steps 1..stop, and the vehicle-steps they rest on.
+def off_road_columns(batch: Batch) -> Batch:
+    """`aor_step` and `aor_any` [B] of the traffic at steps 1..stop, and the vehicle-steps they rest on.
 
-    states [B, T+1, N, 4], valid [B, T+1, N]. Vehicles absent or off the road at step 0 are left out (`aor_left_out`
-    counts the latter); NaN where nothing is left to count or the rollout has no map.
+    Vehicles absent or off the road at step 0 are left out (`aor_left_out` counts the latter). NaN where no vehicle is
+    left or the rollout has no map.
     """
-    counted = counted & valid[:, 0]
+    states, stop = batch["states"], batch["stop"]
+    counted = batch["traffic"] & batch["valid"][:, 0]
     steps = torch.arange(states.shape[1], device=states.device)
-    asked = valid & counted[:, None] & (steps <= stop[:, None])[..., None]
+    asked = batch["valid"] & counted[:, None] & (steps <= stop[:, None])[..., None]
     index = asked.nonzero(as_tuple=True)
     road_here = torch.zeros_like(asked)
-    road_here[index] = on_road(states[index][:, :2], index[0], road, margin)
-    looked = asked & road_here[:, :1] & up_to(stop, states.shape[1])[..., None]
-    mapped = has_lines(road["lane_index"]) | has_lines(road["drivable_index"])
-    number = looked.sum((1, 2)) * mapped
-    off = (looked & ~road_here).sum((1, 2)).to(states.dtype)
+    road_here[index] = on_road(states[index][:, :2], index[0], batch)
+    seen = asked & road_here[:, :1] & steps_until(stop, states.shape[1])[..., None]
+    mapped = has_lines(batch["lane_index"]) | has_lines(batch["drivable_index"])
+    number = seen.sum((1, 2)) * mapped
+    off = (seen & ~road_here).sum((1, 2)).to(states.dtype)
     unknown = number == 0
     return {
         "aor_step": (off / number.clamp(min=1)).masked_fill(unknown, torch.nan),

@@ -1,33 +1,40 @@
-"""How close the ego comes, how hard it brakes and how far it gets, up to its first contact (design.md section 5)."""
+"""The ego's distance to others, acceleration and progress until its first contact (docs/method.md, section 10)."""
 
 import torch
 from torch import Tensor
 
-from e2rl.metrics.contact import up_to
+from e2rl.metrics.contact import Batch, steps_until
 from e2rl.metrics.geometry import velocity
 from e2rl.scene.boxes import distance
+from e2rl.scene.recording import DT
 from e2rl.sim.dynamics import wrap
 
 SMOOTHING = 0.5  # s, moving average of the ego's speed before its derivative
 
 
-def smallest_gap(states: Tensor, valid: Tensor, size: Tensor, stop: Tensor) -> Tensor:
-    """`min_dtc` [B] [m]: the smallest box distance to any other valid agent at steps 1..stop; NaN where there is none.
-
-    states [B, T+1, N, 4] with the ego in row 0, valid [B, T+1, N], size [B, N, 2].
-    """
-    seen = valid & valid[..., :1] & up_to(stop, states.shape[1])[..., None]
+def motion_columns(batch: Batch) -> Batch:
+    """min_dtc, ttc_c, ttc_c_all, macc and progress over the steps 1..stop; NaN without any agent to measure them on."""
+    states, valid, stop = batch["states"], batch["valid"], batch["stop"]
+    seen = valid & valid[..., :1] & steps_until(stop, states.shape[1])[..., None]
     seen[..., 0] = False
-    gap = distance(states[:, :, :1], size[:, None, :1], states, size[:, None])
-    smallest = gap.masked_fill(~seen, torch.inf).flatten(1).amin(-1)
-    return smallest.masked_fill(smallest.isinf(), torch.nan)
+    gap = distance(states[:, :, :1], batch["size"][:, None, :1], states, batch["size"][:, None])
+    gap = gap.masked_fill(~seen, torch.inf).flatten(1).amin(-1)
+    cost = closest_approach_cost(states)
+    path, count = ego_path(states, valid, stop)
+    return {
+        "min_dtc": gap.masked_fill(gap.isinf(), torch.nan).masked_fill(batch["hit"], 0.0),
+        "ttc_c": mean_worst_cost(cost, seen & batch["adversaries"][:, None]),
+        "ttc_c_all": mean_worst_cost(cost, seen),
+        "macc": mean_acceleration(path, count),
+        "progress": progress(path, count),
+    }
 
 
 def closest_approach_cost(states: Tensor) -> Tensor:
     """exp(-t*^2 / 2 - d*^2 / 2) [..., N] at the ego's and each agent's closest approach at constant velocity.
 
     t* = relu(-(p . v) / (|v|^2 + 1e-6)), d* = |p + v t*| for the relative position p and velocity v of states
-    [..., N, 4]; a pair at the same velocity keeps its distance, hence costs nearly nothing (section 8.5, corrected).
+    [..., N, 4]. A pair at the same velocity keeps its distance, hence costs nearly nothing.
     """
     moving = velocity(states)
     offset, closing = states[..., :2] - states[..., :1, :2], moving - moving[..., :1, :]
@@ -37,7 +44,7 @@ def closest_approach_cost(states: Tensor) -> Tensor:
 
 
 def mean_worst_cost(cost: Tensor, counted: Tensor) -> Tensor:
-    """`ttc_c` [B]: mean over steps of the largest counted cost [B, T+1, N] over the steps that have one, else NaN."""
+    """Mean [B] of each step's largest counted cost [B, T+1, N] over the steps that have one; NaN where none has."""
     known = counted.any(-1)
     worst = (cost * counted).amax(-1)
     return (worst * known).sum(-1) / known.sum(-1)  # 0 / 0 is NaN
@@ -51,25 +58,28 @@ def ego_path(states: Tensor, valid: Tensor, stop: Tensor) -> tuple[Tensor, Tenso
     return states[:, :, 0].gather(1, order[..., None].expand(-1, -1, 4)), counted.sum(-1)
 
 
-def mean_acceleration(path: Tensor, count: Tensor, dt: float) -> Tensor:
-    """`macc` [B] [m/s2]: mean |central difference| of the speed's moving average over full windows of 0.5 s.
+def mean_acceleration(path: Tensor, count: Tensor) -> Tensor:
+    """Mean |central difference| [B] [m/s2] of the speed's moving average over full windows of SMOOTHING seconds.
 
     path [B, T+1, 4] of `count` [B] states; NaN where it is shorter than a window and two steps.
     """
-    window = max(round(SMOOTHING / dt), 1)
+    window = round(SMOOTHING / DT)
     if path.shape[1] < window + 2:
         return torch.full_like(path[:, 0, 0], torch.nan)
     smooth = path[..., 3].unfold(1, window, 1).mean(-1)
-    change = (smooth[:, 2:] - smooth[:, :-2]).abs() / (2 * dt)
+    change = (smooth[:, 2:] - smooth[:, :-2]).abs() / (2 * DT)
     number = (count - window - 1).clamp(min=0)
     counted = torch.arange(change.shape[1], device=path.device) < number[:, None]
     return (change * counted).sum(-1) / number
 
 
 def progress(path: Tensor, count: Tensor) -> Tensor:
-    """[B] [m]: the ego's way along its own heading, each step along the mean of its two headings (backwards < 0)."""
+    """Distance [B] [m] driven along the ego's own heading, each step along the mean of its two headings.
+
+    path [B, T+1, 4] of `count` [B] states; driving backwards counts negative.
+    """
     step = path[:, 1:] - path[:, :-1]
     heading = path[:, :-1, 2] + wrap(step[..., 2]) / 2
-    way = step[..., 0] * heading.cos() + step[..., 1] * heading.sin()
-    counted = torch.arange(way.shape[1], device=path.device) < (count - 1)[:, None]
-    return (way * counted).sum(-1)
+    driven = step[..., 0] * heading.cos() + step[..., 1] * heading.sin()
+    counted = torch.arange(driven.shape[1], device=path.device) < (count - 1)[:, None]
+    return (driven * counted).sum(-1)

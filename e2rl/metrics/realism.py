@@ -1,87 +1,77 @@
-"""How like the recording the simulated traffic moves (design.md section 5, method_and_baselines.md section 8.8).
+"""How closely the motion of simulated traffic follows the recordings' distribution (docs/method.md, section 10).
 
-Longitudinal and lateral acceleration and |jerk| on means over blocks of 0.5 s, of the simulated vehicles other than the
-ego that move, in frames valid in both the rollout and its log; clipped (recorded tracks hold glitches), never dropped.
-real = 1 - mean_k min(1, W1_k) over the pooled samples of a set of rollouts; real_norm divides W1_k by the log's 5-95%
-range. real_adv is `real` of the adversaries alone, against the logs of the same vehicles.
+Longitudinal and lateral acceleration and |jerk|, from means over blocks of 0.5 s, of the simulated vehicles other than
+the ego that move, in frames valid both in the rollout and in its log. Values are clipped, never dropped, because
+recorded tracks hold glitches. With W1_k the Wasserstein-1 distance of quantity k between the pooled samples of a set of
+rollouts and of their logs: real = 1 - mean_k min(1, W1_k). real_norm divides each W1_k by the 5-95% range of the log.
+real_adv is `real` of the adversaries alone, against the logs of the same vehicles.
 """
 
 import torch
 from torch import Tensor
 
+from e2rl.scene.recording import DT
 from e2rl.sim.dynamics import wrap
 
-FEATURES = ("a_lon", "a_lat", "jerk")
-OF_ADVERSARIES = tuple(f"{name}_adversary" for name in FEATURES)
 CLIP = {"a_lon": 10.0, "a_lat": 10.0, "jerk": 20.0}  # m/s2, m/s2, m/s3
-BLOCK = 0.5  # s
+KINEMATICS = tuple(CLIP)
+OF_ADVERSARIES = tuple(f"{name}_adversary" for name in KINEMATICS)
+W1 = tuple(f"w1_{name}" for name in KINEMATICS)
+BLOCK = round(0.5 / DT)  # steps
 MOVING = 0.5  # m/s
 COLUMNS = 8192  # sorted samples handled at once: bounds the memory of the bootstrap
+Samples = dict[str, Tensor]
 
 
-def motion_features(
-    states: Tensor, valid: Tensor, logged: Tensor, logged_valid: Tensor, agents: Tensor, stop: Tensor, dt: float
-) -> list[dict[str, Tensor]]:
-    """Per rollout {feature: [2, n]}: samples of the rollout (row 0) and of its log (row 1), blocks of steps 1..stop.
+def kinematic_samples(
+    states: Tensor, valid: Tensor, logged: Tensor, logged_valid: Tensor, agents: Tensor, stop: Tensor
+) -> list[Samples]:
+    """{quantity: [2, n]} per rollout: samples of the rollout (row 0) and of its log (row 1), blocks of steps 1..stop.
 
     states, logged [B, T+1, N, 4], their validity [B, T+1, N], agents [B, N] bool (simulated, not the ego), stop [B].
     """
-    block = max(round(BLOCK / dt), 1)
-    blocks = (states.shape[1] - 1) // block
+    blocks = (states.shape[1] - 1) // BLOCK
     both = valid & logged_valid
     fastest = torch.maximum(*((track[..., 3] * both).abs().amax(1) for track in (states, logged)))
     agents = agents & (fastest > MOVING)
-    whole = torch.arange(blocks, device=stop.device) < (stop // block)[:, None]
-    known = by_block(both, block, blocks).all(2) & agents[:, None] & whole[..., None]
+    whole = torch.arange(blocks, device=stop.device) < (stop // BLOCK)[:, None]
+    known = by_block(both).all(2) & agents[:, None] & whole[..., None]
     twice = known[:, 1:] & known[:, :-1]
     thrice = twice[:, 1:] & twice[:, :-1]
-    pair = [block_motion(track, block, blocks, block * dt) for track in (states, logged)]
-    result = [{} for _ in range(len(states))]
-    for name, mask in zip(FEATURES, (twice, twice, thrice), strict=True):
-        sample = torch.stack([motion[name][mask] for motion in pair]).clamp(-CLIP[name], CLIP[name])
-        for features, part in zip(result, sample.split(mask.sum((1, 2)).tolist(), 1), strict=True):
-            features[name] = part.clone()
+    pair = [block_kinematics(track) for track in (states, logged)]
+    result: list[Samples] = [{} for _ in range(len(states))]
+    for name, mask in zip(KINEMATICS, (twice, twice, thrice), strict=True):
+        values = torch.stack([motion[name][mask] for motion in pair]).clamp(-CLIP[name], CLIP[name])
+        for samples, part in zip(result, values.split(mask.sum((1, 2)).tolist(), 1), strict=True):
+            samples[name] = part.clone()
     return result
 
 
-def traffic_features(
-    states: Tensor,
-    valid: Tensor,
-    logged: Tensor,
-    logged_valid: Tensor,
-    agents: Tensor,
-    adversaries: Tensor,
-    stop: Tensor,
-    dt: float,
-) -> list[dict[str, Tensor]]:
-    """`motion_features` of agents, and of those of them that are adversaries [B, N] under names of their own."""
-    tracks = states, valid, logged, logged_valid
-    everybody = motion_features(*tracks, agents, stop, dt)
-    theirs = motion_features(*tracks, agents & adversaries, stop, dt)
+def traffic_samples(batch: dict[str, Tensor]) -> list[Samples]:
+    """`kinematic_samples` per rollout of the traffic, and of the adversaries in it under names of their own."""
+    tracks = [batch[name] for name in ("states", "valid", "logged", "logged_valid")]
+    everybody = kinematic_samples(*tracks, batch["traffic"], batch["stop"])
+    adversaries = kinematic_samples(*tracks, batch["traffic"] & batch["adversaries"], batch["stop"])
     return [
-        sample | dict(zip(OF_ADVERSARIES, own.values(), strict=True))
-        for sample, own in zip(everybody, theirs, strict=True)
+        samples | dict(zip(OF_ADVERSARIES, theirs.values(), strict=True))
+        for samples, theirs in zip(everybody, adversaries, strict=True)
     ]
 
 
-def by_block(values: Tensor, block: int, blocks: int) -> Tensor:
-    """Steps 1.. of values [B, T+1, N] as [B, blocks, block, N]."""
-    return values[:, 1 : blocks * block + 1].unflatten(1, (blocks, block))
+def by_block(values: Tensor) -> Tensor:
+    """Steps 1.. of values [B, T+1, N] as [B, blocks, BLOCK, N]."""
+    blocks = (values.shape[1] - 1) // BLOCK
+    return values[:, 1 : blocks * BLOCK + 1].unflatten(1, (blocks, BLOCK))
 
 
-def block_motion(states: Tensor, block: int, blocks: int, period: float) -> dict[str, Tensor]:
-    """a_lon, a_lat [B, blocks - 1, N] [m/s2] and |jerk| [B, blocks - 2, N] [m/s3] between blocks `period` s apart."""
-    speed = by_block(states[..., 3], block, blocks).mean(2)
-    heading = torch.atan2(
-        by_block(states[..., 2].sin(), block, blocks).mean(2), by_block(states[..., 2].cos(), block, blocks).mean(2)
-    )
+def block_kinematics(states: Tensor) -> Samples:
+    """a_lon, a_lat [B, blocks - 1, N] [m/s2] and |jerk| [B, blocks - 2, N] [m/s3] between the means of blocks."""
+    period = BLOCK * DT
+    speed = by_block(states[..., 3]).mean(2)
+    heading = torch.atan2(by_block(states[..., 2].sin()).mean(2), by_block(states[..., 2].cos()).mean(2))
     a_lon = speed.diff(dim=1) / period
-    yaw_rate = wrap(heading.diff(dim=1)) / period
-    return {
-        "a_lon": a_lon,
-        "a_lat": (speed[:, 1:] + speed[:, :-1]) / 2 * yaw_rate,
-        "jerk": (a_lon.diff(dim=1) / period).abs(),
-    }
+    a_lat = (speed[:, 1:] + speed[:, :-1]) / 2 * (wrap(heading.diff(dim=1)) / period)
+    return {"a_lon": a_lon, "a_lat": a_lat, "jerk": (a_lon.diff(dim=1) / period).abs()}
 
 
 def wasserstein(pair: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
@@ -109,53 +99,49 @@ def wasserstein(pair: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
     return torch.where(count > 0, area / count, torch.nan)
 
 
-def realism(features: list[dict[str, Tensor]], cluster: Tensor, draws: Tensor) -> dict[str, Tensor]:
-    """real, real_norm, w1_a_lon, w1_a_lat, w1_jerk and real_adv [D] of the pooled samples of rollouts, per draw of
-    clusters [D, C].
+def realism(samples: list[Samples], cluster: Tensor, draws: Tensor) -> dict[str, Tensor]:
+    """real, real_norm, w1_a_lon, w1_a_lat, w1_jerk and real_adv [D] of the pooled samples of rollouts.
 
-    features as from `traffic_features`, one entry per rollout of cluster [R] int64. NaN where a feature has no sample.
+    samples: one entry of `traffic_samples` per rollout, cluster [R] int64: the rollouts' clusters, draws [D, C]: the
+    multiplicities of clusters in each draw. NaN where a quantity has no sample.
     """
-    adversaries = _pooled(features, cluster, draws, OF_ADVERSARIES)
-    return _pooled(features, cluster, draws, FEATURES) | {"real_adv": adversaries["real"]}
+    return _pooled(samples, cluster, draws, KINEMATICS) | {
+        "real_adv": _pooled(samples, cluster, draws, OF_ADVERSARIES)["real"]
+    }
 
 
-def _pooled(features: list[dict[str, Tensor]], cluster: Tensor, draws: Tensor, names: tuple[str, ...]):
-    """`realism` but for real_adv, of the samples of these names."""
-    parts, ranges = [], []
+def _pooled(samples: list[Samples], cluster: Tensor, draws: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]:
+    """`realism` without real_adv, of the samples of these names."""
+    distances, ranges = [], []
     for name in names:
-        pair = torch.cat([sample[name] for sample in features], 1) if features else draws.new_zeros(2, 0)
+        pair = torch.cat([sample[name] for sample in samples], 1) if samples else draws.new_zeros(2, 0)
         if not pair.shape[1]:
-            return {key: draws.new_full((len(draws),), torch.nan) for key in ("real", "real_norm", *w1_names())}
-        counts = torch.tensor([sample[name].shape[1] for sample in features], device=pair.device)
-        parts.append(wasserstein(pair, cluster.repeat_interleave(counts), draws.to(pair)))
+            return dict.fromkeys(("real", "real_norm", *W1), draws.new_full((len(draws),), torch.nan))
+        counts = torch.tensor([sample[name].shape[1] for sample in samples], device=pair.device)
+        distances.append(wasserstein(pair, cluster.repeat_interleave(counts), draws.to(pair)))
         log = pair[1].sort().values
         ranges.append((quantile_of_sorted(log, 0.95) - quantile_of_sorted(log, 0.05)).clamp(min=1e-9))
-    distance, spread = torch.stack(parts), torch.stack(ranges)[:, None]
-    table = {"real": 1 - distance.clamp(max=1).mean(0), "real_norm": 1 - (distance / spread).clamp(max=1).mean(0)}
-    return table | dict(zip(w1_names(), parts, strict=True))
+    distance, log_range = torch.stack(distances), torch.stack(ranges)[:, None]
+    table = {"real": 1 - distance.clamp(max=1).mean(0), "real_norm": 1 - (distance / log_range).clamp(max=1).mean(0)}
+    return table | dict(zip(W1, distances, strict=True))
 
 
-def split_half(features: list[dict[str, Tensor]], cluster: Tensor, halves: Tensor) -> Tensor:
+def split_half(samples: list[Samples], cluster: Tensor, halves: Tensor) -> Tensor:
     """`real` [S] of one half of the logs against the other: the ceiling that sampling and the scenes' variety set.
 
-    halves [S, C] bool: which clusters of rollouts (cluster [R]) are in the first half of each split; NaN where a half
-    is empty.
+    halves [S, C] bool: the clusters of rollouts (cluster [R]) in the first half of each split; NaN where a half is
+    empty.
     """
-    parts = []
-    for name in FEATURES:
-        log = torch.cat([sample[name][1] for sample in features])
-        counts = torch.tensor([sample[name].shape[1] for sample in features])
-        owner = cluster.repeat_interleave(counts)
+    distances = []
+    for name in KINEMATICS:
+        log = torch.cat([sample[name][1] for sample in samples])
+        owner = cluster.repeat_interleave(torch.tensor([sample[name].shape[1] for sample in samples]))
         values, order = log.sort()
         first = halves[:, owner[order]].to(log)
         share = [side.cumsum(1) / side.sum(1, keepdim=True) for side in (first, 1 - first)]
         known = (first > 0).any(1) & (first < 1).any(1)
-        parts.append(((share[0] - share[1]).abs()[:, :-1] @ values.diff()).where(known, torch.nan))
-    return 1 - torch.stack(parts).clamp(max=1).mean(0)
-
-
-def w1_names() -> list[str]:
-    return [f"w1_{name}" for name in FEATURES]
+        distances.append(((share[0] - share[1]).abs()[:, :-1] @ values.diff()).where(known, torch.nan))
+    return 1 - torch.stack(distances).clamp(max=1).mean(0)
 
 
 def quantile_of_sorted(values: Tensor, share: float) -> Tensor:

@@ -1,24 +1,23 @@
-"""Means and 95% intervals over rollouts, bootstrapped by cluster: whole locations (or scenes) are drawn, not rollouts.
+"""Means and 95% intervals over rollouts by a cluster bootstrap: whole locations (or scenes) are drawn, not rollouts.
 
-Rows are the dicts of `metrics.score.score_rollouts`, features those of `metrics.realism.traffic_features`, one of each
-per rollout. Every resampled mean is a quotient of two sums that are linear in the clusters' multiplicities, hence one
-matrix product serves all draws and metrics. Fewer than two clusters with known values give no interval: NaN.
+Rows and samples are the two results of `score.score_rollouts`, one of each per rollout. A draw holds each cluster with
+a multiplicity. Every resampled mean is a quotient of two sums that are linear in the multiplicities, hence one matrix
+product serves all draws and metrics. Fewer than two clusters with known values give no interval: NaN.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from e2rl.metrics.catalogue import METRICS, Metric
-from e2rl.metrics.realism import realism
+from e2rl.metrics.realism import Samples, realism
 
 DRAWS = 1000
 REALISM_DRAWS = 400  # each costs a pass over all samples
 LEVELS = (0.025, 0.975)
-PER_COLLISION = frozenset({"avoidable", "avoidable_1s", "evasion_accel", "rir", "at_fault", "relvel", "contact_time"})
-Row = dict[str, object]
-Features = dict[str, Tensor]
+Row = Mapping[str, Any]
 
 
 def cluster_index(rows: Sequence[Row]) -> tuple[Tensor, int]:
@@ -38,8 +37,10 @@ def bootstrap_draws(clusters: int, draws: int = DRAWS, seed: int = 0) -> Tensor:
 
 
 def resampled_means(totals: Tensor, weights: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
-    """Quotients [D, M] per draw [D, C] of the sums of totals, weights [R, M] of rollouts in cluster [R]; where either
-    is NaN the rollout is left out."""
+    """Quotients [D, M], per draw [D, C], of the sums of totals and weights [R, M] of rollouts in cluster [R].
+
+    A rollout is left out where either is NaN.
+    """
     unknown = totals.isnan() | weights.isnan()
     shape = (draws.shape[1], totals.shape[1])
     total = totals.new_zeros(shape).index_add(0, cluster, totals.masked_fill(unknown, 0.0))
@@ -48,8 +49,10 @@ def resampled_means(totals: Tensor, weights: Tensor, cluster: Tensor, draws: Ten
 
 
 def resampled_medians(values: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
-    """Median [D] of values [R] of rollouts in cluster [R], each as often as a draw [D, C] has its cluster; NaN ones are
-    left out, and a draw without any is NaN."""
+    """Median [D], per draw [D, C], of values [R] of rollouts in cluster [R], each as often as the draw has its cluster.
+
+    NaN values are left out; a draw without any value is NaN.
+    """
     known = ~values.isnan()
     values, order = values[known].sort()
     if not len(values):
@@ -60,109 +63,111 @@ def resampled_medians(values: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
     return ((values[low] + values[high]) / 2).where(half[:, 0] > 0, torch.nan)
 
 
-def resampled(totals: Tensor, weights: Tensor, cluster: Tensor, draws: Tensor, metrics: Sequence[Metric]) -> Tensor:
-    """The metrics [D, M] of each draw, from `metric_table`'s values and weights: quotients of sums, or medians."""
-    table = resampled_means(totals, weights, cluster, draws)
-    for column, metric in enumerate(metrics):
-        if metric.median:
-            table[:, column] = resampled_medians(totals[:, column], cluster, draws)
-    return table
+def interval(values: Tensor, known_clusters: int) -> dict[str, float]:
+    """{mean, low, high} of values [D], row 0 the estimate; the interval needs two clusters that know the value."""
+    values = values.where(values.isfinite(), torch.nan)
+    low, high = values[1:].nanquantile(values.new_tensor(LEVELS)).tolist() if known_clusters > 1 else (torch.nan,) * 2
+    return {"mean": values[0].item(), "low": low, "high": high}
 
 
-def interval(samples: Tensor, known_clusters: int) -> dict[str, float]:
-    """{mean, low, high} of samples [D], row 0 the estimate; the interval needs two clusters that know the value."""
-    samples = samples.where(samples.isfinite(), torch.nan)
-    low, high = samples[1:].nanquantile(samples.new_tensor(LEVELS)).tolist() if known_clusters > 1 else (torch.nan,) * 2
-    return {"mean": samples[0].item(), "low": low, "high": high}
+def row_metrics() -> list[Metric]:
+    """The metrics that are averaged over rows, not computed from pooled samples."""
+    return [metric for metric in METRICS.values() if not metric.samples]
 
 
 def metric_table(rows: Sequence[Row], metrics: Sequence[Metric]) -> tuple[Tensor, Tensor]:
-    """Weighted values and weights [R, M] float64 of the rows' metrics; NaN where a row lacks one. A metric `per`
-    another column is not weighted: it is summed and divided by the sum of that column."""
+    """Totals and weights [R, M] float64 of the rows' metrics, whose sums' quotient is the mean; NaN where unknown.
 
-    def table(names: list[str], absent: float) -> Tensor:
-        cells = [[float(row.get(name, torch.nan)) if name else absent for name in names] for row in rows]
-        return torch.tensor(cells, dtype=torch.float64).reshape(len(rows), len(names))
+    The total of a metric is its value times its weight; of a metric `per` another column, just its value.
+    """
 
-    values = table([metric.source for metric in metrics], torch.nan)
-    weights = table([metric.weight for metric in metrics], 1.0)
-    per = table([metric.per for metric in metrics], torch.nan)
-    quotient = torch.tensor([bool(metric.per) for metric in metrics])
-    return torch.where(quotient, values, values * weights), torch.where(quotient, per, weights)
+    def column(name: str) -> Tensor:
+        return torch.tensor([float(row.get(name, torch.nan)) for row in rows], dtype=torch.float64)
+
+    totals, weights = [], []
+    for metric in metrics:
+        value, divisor = column(metric.source), metric.per or metric.weight
+        weights.append(column(divisor) if divisor else torch.ones_like(value))
+        totals.append(value if metric.per else value * weights[-1])
+    return torch.stack(totals, 1), torch.stack(weights, 1)
+
+
+class Bootstrap:
+    """The resampling of rollouts that a group, or two groups that are compared, share."""
+
+    def __init__(self, rows: Sequence[Row], draws: int, realism_draws: int) -> None:
+        self.cluster, clusters = cluster_index(rows)
+        self.draws, self.realism_draws = bootstrap_draws(clusters, draws), bootstrap_draws(clusters, realism_draws)
+
+    def resampled(self, totals: Tensor, weights: Tensor, samples: Sequence[Samples]) -> dict[str, Tensor]:
+        """{metric: values [D] in each draw}, from the results of `metric_table` and the realism samples."""
+        means = resampled_means(totals, weights, self.cluster, self.draws)
+        for column, metric in enumerate(row_metrics()):
+            if metric.median:
+                means[:, column] = resampled_medians(totals[:, column], self.cluster, self.draws)
+        values = {metric.name: means[:, column] for column, metric in enumerate(row_metrics())}
+        return values | realism(list(samples), self.cluster, self.realism_draws)
+
+    def intervals(self, values: Mapping[str, Tensor], known: Mapping[str, Tensor]) -> dict[str, dict[str, float]]:
+        """{metric: {mean, low, high, n}} in the catalogue's order; known [R] bool: the n rollouts that a value uses."""
+        return {
+            name: interval(values[name], len(self.cluster[known[name]].unique())) | {"n": int(known[name].sum())}
+            for name in METRICS
+        }
+
+
+def known_rollouts(known: Tensor, samples: Sequence[Samples]) -> dict[str, Tensor]:
+    """{metric: bool [R]}: rollouts that it uses, from known [R, M] of `row_metrics` and from the realism samples."""
+    result = {metric.name: known[:, column] for column, metric in enumerate(row_metrics())}
+    for metric in METRICS.values():
+        if metric.samples:
+            counts = [sample[metric.samples].numel() for sample in samples]
+            result[metric.name] = torch.tensor(counts, dtype=torch.int64) > 0
+    return result
 
 
 def summarise(
-    rows: Sequence[Row], features: Sequence[Features], draws: int = DRAWS, realism_draws: int = REALISM_DRAWS
+    rows: Sequence[Row], samples: Sequence[Samples], draws: int = DRAWS, realism_draws: int = REALISM_DRAWS
 ) -> dict[str, dict[str, float]]:
     """{metric: {mean, low, high, n}} of one group of rollouts (one method, ego and eta), in the catalogue's order.
 
-    n is the number of rollouts that the value rests on; what cannot be computed is NaN with n = 0.
+    n is the number of rollouts that the value rests on; what cannot be computed is NaN with n = 0. Raises ValueError
+    unless there is one entry of samples per row.
     """
-    if len(rows) != len(features):
-        raise ValueError(f"{len(rows)} rows but {len(features)} features; they are made together by score_rollouts")
-    cluster, clusters = cluster_index(rows)
-    single = [metric for metric in METRICS.values() if not metric.pooled]
-    totals, weights = metric_table(rows, single)
-    means = resampled(totals, weights, cluster, bootstrap_draws(clusters, draws), single)
-    known = ~totals.isnan() & (weights > 0)
-    result = {
-        metric.name: interval(means[:, column], len(cluster[known[:, column]].unique()))
-        | {"n": int(known[:, column].sum())}
-        for column, metric in enumerate(single)
-    }
-    pooled = realism(list(features), cluster, bootstrap_draws(clusters, realism_draws))
-    for name, samples in pooled.items():
-        used = has_samples(features, name)
-        result[name] = interval(samples, len(cluster[used].unique())) | {"n": int(used.sum())}
-    return {name: result[name] for name in METRICS}
-
-
-def has_samples(features: Sequence[Features], name: str) -> Tensor:
-    """Bool [R]: rollouts with anything that the pooled metric `name` counts."""
-    key = "a_lon_adversary" if name == "real_adv" else "a_lon"
-    return torch.tensor([bool(sample[key].numel()) for sample in features], dtype=torch.bool)
+    if len(rows) != len(samples):
+        raise ValueError(f"{len(rows)} rows but {len(samples)} samples; they are made together by score_rollouts")
+    bootstrap = Bootstrap(rows, draws, realism_draws)
+    totals, weights = metric_table(rows, row_metrics())
+    known = known_rollouts(~totals.isnan() & (weights > 0), samples)
+    return bootstrap.intervals(bootstrap.resampled(totals, weights, samples), known)
 
 
 def paired_differences(
     rows: Sequence[Row],
-    features: Sequence[Features],
+    samples: Sequence[Samples],
     other_rows: Sequence[Row],
-    other_features: Sequence[Features],
+    other_samples: Sequence[Samples],
     draws: int = DRAWS,
     realism_draws: int = REALISM_DRAWS,
 ) -> dict[str, dict[str, float]]:
     """{metric: {difference, low, high, n}} of this group minus the other, over the n (scene, seed) both have.
 
-    Both groups are resampled with the same clusters. Metrics per collision (rir, relvel, ...) and weighted ones compare
-    the two groups' own quotients on these pairs; all other metrics use only the pairs in which both are known.
+    Both groups are resampled with the same clusters. A metric per collision compares the two groups' own collisions on
+    these pairs; all other metrics use only the pairs in which both groups know it.
     """
-    place = {(row["scene_id"], row["seed"]): index for index, row in enumerate(other_rows)}
-    pairs = [(index, place[key]) for index, row in enumerate(rows) if (key := (row["scene_id"], row["seed"])) in place]
-    ours, theirs = [rows[a] for a, _ in pairs], [other_rows[b] for _, b in pairs]
-    cluster, clusters = cluster_index(ours)
-    single = [metric for metric in METRICS.values() if not metric.pooled]
-    (first, first_weight), (second, second_weight) = metric_table(ours, single), metric_table(theirs, single)
-    matched = first.isnan() | second.isnan()
-    strict = torch.tensor([metric.name not in PER_COLLISION for metric in single]) & matched
-    first, second = first.masked_fill(strict, torch.nan), second.masked_fill(strict, torch.nan)
-    multiplicities = bootstrap_draws(clusters, draws)
-    means = resampled(first, first_weight, cluster, multiplicities, single)
-    means = means - resampled(second, second_weight, cluster, multiplicities, single)
-    result = {}
-    for column, metric in enumerate(single):
-        known = ~first[:, column].isnan() | ~second[:, column].isnan()
-        result[metric.name] = interval(means[:, column], len(cluster[known].unique())) | {"n": int(known.sum())}
-    multiplicities = bootstrap_draws(clusters, realism_draws)
-    samples = [
-        realism([group[pair[side]] for pair in pairs], cluster, multiplicities)
-        for side, group in enumerate((features, other_features))
-    ]
-    for name in samples[0]:
-        used = [
-            has_samples([group[pair[side]] for pair in pairs], name)
-            for side, group in enumerate((features, other_features))
-        ]
-        used = used[0] & used[1]
-        change = samples[0][name] - samples[1][name]
-        result[name] = interval(change, len(cluster[used].unique())) | {"n": int(used.sum())}
-    return {name: {"difference": result[name].pop("mean"), **result[name]} for name in METRICS}
+    index = {(row["scene_id"], row["seed"]): other for other, row in enumerate(other_rows)}
+    pairs = [(own, index[key]) for own, row in enumerate(rows) if (key := (row["scene_id"], row["seed"])) in index]
+    rows, samples = [rows[own] for own, _ in pairs], [samples[own] for own, _ in pairs]
+    other_rows, other_samples = [other_rows[other] for _, other in pairs], [other_samples[other] for _, other in pairs]
+    metrics = row_metrics()
+    (first, first_weights), (second, second_weights) = metric_table(rows, metrics), metric_table(other_rows, metrics)
+    unmatched = (first.isnan() | second.isnan()) & torch.tensor([not metric.per_collision for metric in metrics])
+    first, second = first.masked_fill(unmatched, torch.nan), second.masked_fill(unmatched, torch.nan)
+    bootstrap = Bootstrap(rows, draws, realism_draws)
+    ours = bootstrap.resampled(first, first_weights, samples)
+    theirs = bootstrap.resampled(second, second_weights, other_samples)
+    known = known_rollouts(~first.isnan() | ~second.isnan(), samples)
+    other_known = known_rollouts(~first.isnan() | ~second.isnan(), other_samples)
+    differences = {name: ours[name] - theirs[name] for name in METRICS}
+    result = bootstrap.intervals(differences, {name: known[name] & other_known[name] for name in METRICS})
+    return {name: {"difference": value.pop("mean"), **value} for name, value in result.items()}

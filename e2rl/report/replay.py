@@ -27,7 +27,7 @@ UNGUIDED = ("nominal", "replay")  # methods that look for no failure
 def load_replay(path: Path, metres: float = 70.0, pixels: int = 720, ghost: bool = False) -> Replay:
     """The replay of one rollout file; its contact is scored anew. InputError where the file is no rollout."""
     rollout = read_rollout(path)
-    rows, _ = score_rollouts(as_rollout_dict([rollout]), rollout["dt"])
+    rows, _ = score_rollouts(as_rollout_dict([rollout]))
     return Replay(rollout, rows[0], metres, pixels, ghost)
 
 

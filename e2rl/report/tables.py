@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from e2rl.files import write_atomically
-from e2rl.metrics.catalogue import MAIN, META_STAGE, METRICS, OPEN_LOOP_STAGE, STAGES, Metric
+from e2rl.metrics.catalogue import META_STAGE, METRICS, OPEN_LOOP_STAGE, STAGES, Metric, table_metrics
 
 RESTS_ON = {
     OPEN_LOOP_STAGE: "(n) vehicles: others than the ego, faster than 0.5 m/s in the log at the start, recorded "
@@ -50,13 +50,14 @@ class Table:
         return "\n".join([line(self.head), align, *map(line, self.rows), "", self.caption, ""])
 
 
-def metric_tables(rows: Sequence[dict], settings: str = "", metrics: Sequence[Metric] = MAIN) -> list[Table]:
+def metric_tables(rows: Sequence[dict], settings: str = "", table: str = "main") -> list[Table]:
     """Tables of rows as in metrics.json. `settings` (prior, samples, bounds, ...) joins every caption.
 
-    metrics: of the closed-loop tables; those that no column knows are left out, named in the caption. Rows of the
-    stages `open loop` and `meta-metric` have tables and metrics of their own.
+    table: of `catalogue.TABLES`, whose metrics the closed-loop tables show; those that no column knows are left out and
+    named in the caption. Rows of the stages `open loop` and `meta-metric` have tables and metrics of their own.
     """
     groups: dict[tuple, list[dict]] = {}
+    metrics = table_metrics(table)
     for row in rows:
         stage = row.get("stage") if row.get("stage") in STAGES else None
         groups.setdefault((row["dataset"], row["split"], row["ego"], stage), []).append(row)
@@ -85,7 +86,7 @@ def means_table(group: Sequence[dict], settings: str, metrics: Sequence[Metric])
     return Table(caption, ["", *names], body)
 
 
-def paired_table(group: Sequence[dict], metrics: Sequence[Metric] = MAIN) -> Table:
+def paired_table(group: Sequence[dict], metrics: Sequence[Metric]) -> Table:
     """Differences of every method to the first one over the same (scene, seed), per cent points for shares; where rows
     have stages, of each method after training to the same method before.
     """
@@ -188,10 +189,9 @@ def number(metric: Metric, value: float, signed: bool = False) -> str:
     sign = "+" if signed else ""
     if metric.share:
         return f"{value:{sign}.1f}" if abs(value) >= 1 or value == 0 else f"{value:{sign}.2f}"
-    if metric.name.startswith("real"):
-        return f"{value:{sign}.3f}"
-    magnitude = abs(value)
-    decimals = 0 if magnitude >= 1000 else 1 if magnitude >= 10 else 2 if magnitude >= 1 or value == 0 else 3
+    magnitude, decimals = abs(value), metric.decimals
+    if decimals is None:
+        decimals = 0 if magnitude >= 1000 else 1 if magnitude >= 10 else 2 if magnitude >= 1 or value == 0 else 3
     return f"{value:{sign}.{decimals}f}"
 
 

@@ -9,7 +9,7 @@ import torch
 
 from e2rl.errors import InputError
 from e2rl.evaluation import files
-from e2rl.evaluation.files import COLUMNS, Source, label_rows, read_metrics, read_rows, write_metrics, write_rollouts
+from e2rl.evaluation.files import Source, label_rows, read_metrics, read_rows, write_metrics, write_rollouts
 from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollout, read_rollouts
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
@@ -89,9 +89,9 @@ def test_rows_read_back_are_those_written(tmp_path, rollouts):
     rows = label_rows(score_rollouts(rollouts)[0], SOURCE)
     files.write_rows(tmp_path / "rollouts.csv", rows)
     read = read_rows(tmp_path / "rollouts.csv")
-    assert list(read[0]) == list(COLUMNS) and len(read) == 6
+    assert list(read[0]) == list(files.table_columns()) and len(read) == 6
     for row, other in zip(rows, read, strict=True):
-        for column in COLUMNS:
+        for column in files.table_columns():
             same = row[column] == other[column] or (math.isnan(row[column]) and math.isnan(other[column]))
             assert same, (column, row[column], other[column])
 

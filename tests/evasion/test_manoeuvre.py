@@ -2,11 +2,12 @@
 
 import torch
 
-from e2rl.evasion.manoeuvre import Limits, accelerations, drive, knot_count, knots_of, peak_acceleration, shifts
+from e2rl.evasion.manoeuvre import accelerations, execute, knot_count, knots_of, peak_acceleration, shifts
 from e2rl.scene.route import SPACING, project
 from e2rl.sim import dynamics
+from e2rl.sim.env import SimSettings
 
-LIMITS = Limits(5.0, 8.0, 1.6)
+LIMITS = SimSettings(max_acceleration=5.0, max_braking=8.0, max_yaw_rate=1.6)
 STEPS = 80
 KNOTS = knot_count(STEPS)
 START = torch.tensor([0.0, 0.0, 0.0, 8.0])
@@ -44,14 +45,14 @@ def test_a_bend_is_followed_at_the_shift_asked_for():
     route = arc(25.0).double()
     ramp = (torch.arange(KNOTS).double() / 4).clamp(max=1)
     for wanted in (0.0, 2.0, -3.0):
-        _, states = drive(start, route, 0 * ramp, wanted * ramp, STEPS, LIMITS)
+        _, states = execute(start, route, 0 * ramp, wanted * ramp, STEPS, LIMITS)
         offset = project(states[40:, :2], route)[1]
         assert (offset - wanted).abs().max() < 0.4, offset
 
 
 def test_who_starts_beside_and_turned_returns_to_the_route():
     start = torch.tensor([0.0, 1.5, 0.15, 10.0])
-    _, states = drive(start, straight(), torch.zeros(KNOTS), torch.zeros(KNOTS), STEPS, LIMITS)
+    _, states = execute(start, straight(), torch.zeros(KNOTS), torch.zeros(KNOTS), STEPS, LIMITS)
     assert states[-1, 1].abs() < 0.1 and (states[0, :2] - start[:2]).norm() < 1.1
 
 
@@ -59,14 +60,14 @@ def test_limits_hold_and_the_actions_give_the_states():
     generator = torch.Generator().manual_seed(1)
     accel, shift = 20 * torch.randn(2, 200, KNOTS, generator=generator)
     start = START.expand(200, 4)
-    actions, states = drive(start, arc(15.0), accel, shift, STEPS, LIMITS)
+    actions, states = execute(start, arc(15.0), accel, shift, STEPS, LIMITS)
     assert actions[..., 0].min() >= -8 and actions[..., 0].max() <= 5 and actions[..., 1].abs().max() <= 1.6
     torch.testing.assert_close(dynamics.rollout(start, actions), states)
-    assert peak_acceleration(start, states).max() < LIMITS.grip + 1e-2, "braking and turning share the grip"
+    assert peak_acceleration(start, states).max() < dynamics.MAX_LATERAL + 1e-2, "braking and turning share the grip"
     assert (states[..., 3] >= 0).all()
 
 
 def test_who_stands_stays():
     start = torch.zeros(4)
-    _, states = drive(start, straight(), torch.full((KNOTS,), -3.0), torch.full((KNOTS,), 3.0), STEPS, LIMITS)
+    _, states = execute(start, straight(), torch.full((KNOTS,), -3.0), torch.full((KNOTS,), 3.0), STEPS, LIMITS)
     torch.testing.assert_close(states, torch.zeros(STEPS, 4))

@@ -3,7 +3,7 @@
 import torch
 from tensordict import TensorDict
 
-from e2rl.evasion.search import SearchSettings, find_evasions, ways
+from e2rl.evasion.search import SearchSettings, find_evasions, lateral_targets
 from e2rl.sim.env import DrivingEnv, SimSettings
 from tests.synthetic import make_scenes
 
@@ -77,6 +77,6 @@ def test_a_rollout_s_result_does_not_depend_on_the_batch():
 
 def test_ways_are_the_mission_then_real_candidates_then_shifts():
     valid = torch.tensor([[True, True, False, True], [True, False, False, False]])
-    route, shift = ways(valid, torch.tensor([1, 0]))
+    route, shift = lateral_targets(valid, torch.tensor([1, 0]))
     assert route[0].tolist()[:5] == [1, 1, 1, 0, 3] and shift[0].tolist()[:5] == [0.0, 1.5, -1.5, 0.0, 0.0]
     assert route[1].tolist() == [0] * 8 and len(set(shift[1].tolist()[:7])) == 7

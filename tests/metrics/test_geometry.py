@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from e2rl.metrics.contact import pair_overlap
-from e2rl.metrics.geometry import EDGES, edge_distances, edge_parts_inside, overlap_area
+from e2rl.metrics.geometry import EDGES, edge_distances, edge_parts_inside, overlap_area, pair_overlap
 from e2rl.scene.boxes import corners
 
 shapely = pytest.importorskip("shapely")

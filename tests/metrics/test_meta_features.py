@@ -10,7 +10,7 @@ from e2rl.metrics.meta_features import (
     TTC_CAP,
     beyond_road,
     central,
-    motion,
+    kinematics,
     nearest_object,
     runs_red_light,
     time_to_collision,
@@ -46,7 +46,7 @@ def test_a_steady_turn_has_its_speed_and_yaw_rate_and_edges_are_unknown():
     heading = 3.0 + 0.3 * time  # over pi on the way: headings wrap
     xy = 10 / 0.3 * torch.stack([heading.sin(), -heading.cos()], -1)
     track = torch.cat([xy, ((heading + math.pi) % (2 * math.pi) - math.pi)[:, None], torch.zeros(20, 1)], -1)[None]
-    found = motion(track, torch.ones(1, 20, dtype=torch.bool))
+    found = kinematics(track, torch.ones(1, 20, dtype=torch.bool))
     expected = {"linear_speed": 10, "linear_accel": 0, "angular_speed": 0.3, "angular_accel": 0}
     for name, (values, known) in found.items():
         edge = 1 if name.endswith("speed") else 2

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from e2rl.metrics.broad_phase import candidates
-from e2rl.metrics.off_road import inside_polygon, near_lane, off_road
+from e2rl.metrics.off_road import inside_polygon, near_lane, off_road_columns
 from tests.metrics.random_rollouts import random_map
 from tests.metrics.test_contact import course, row
 
@@ -85,11 +85,17 @@ def test_a_vehicle_off_the_road_at_the_start_is_left_out():
     assert np.isnan(only_parked["aor_step"]) and only_parked["aor_vehicle_steps"] == 0
 
 
+def rollouts_on(road, states, valid):
+    """A batch of traffic at states [B, T+1, N, 4] throughout."""
+    stop = torch.full((len(states),), states.shape[1] - 1)
+    return {"states": states, "valid": valid, "traffic": valid[:, 0], "stop": stop, **road}
+
+
 def test_without_a_map_nothing_is_known():
     road = doubles(1, 5)
     road["lane_index"], road["drivable_index"] = road["lane_index"] * 0 - 1, road["drivable_index"] * 0 - 1
     states, valid = torch.zeros(1, 81, 3, 4, dtype=torch.float64), torch.ones(1, 81, 3, dtype=torch.bool)
-    result = off_road(states, valid, valid[:, 0], torch.tensor([80]), road)
+    result = off_road_columns(rollouts_on(road, states, valid))
     assert result["aor_step"].isnan().all() and result["aor_any"].isnan().all()
 
 
@@ -114,10 +120,10 @@ def test_a_rollout_on_a_map_of_ten_thousand_points_is_quick():
         for key, value in random_map(1, 150.0, generator, lanes=90).items()
     }
     states = torch.rand(1, 81, 32, 4, generator=generator, dtype=torch.float64) * 200 - 100
-    valid, stop = torch.ones(1, 81, 32, dtype=torch.bool), torch.tensor([80])
+    batch = rollouts_on(road, states, torch.ones(1, 81, 32, dtype=torch.bool))
     seconds = []
     for _ in range(5):
         begin = time.perf_counter()
-        off_road(states, valid, valid[:, 0], stop, road)
+        off_road_columns(batch)
         seconds.append(time.perf_counter() - begin)
     assert min(seconds) < 0.1, "about 0.02 s on a free core"

@@ -55,7 +55,7 @@ def test_constant_braking_has_its_own_mean_acceleration_and_way():
 def test_short_paths_have_no_acceleration():
     path = torch.zeros(2, 81, 4, dtype=torch.float64)
     path[..., 3] = torch.arange(81)
-    values = mean_acceleration(path, torch.tensor([6, 7]), 0.1)
+    values = mean_acceleration(path, torch.tensor([6, 7]))
     assert values[0].isnan() and values[1] == pytest.approx(10)
 
 

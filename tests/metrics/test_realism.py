@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.stats import wasserstein_distance
 
-from e2rl.metrics.realism import CLIP, FEATURES, motion_features, realism, split_half, wasserstein
+from e2rl.metrics.realism import CLIP, KINEMATICS, kinematic_samples, realism, split_half, wasserstein
 from e2rl.metrics.score import score_rollouts
 from tests.metrics.random_rollouts import random_rollouts
 
@@ -61,7 +61,7 @@ def test_pooled_figures_follow_the_definition():
     draws, cluster = once(8)
     table = realism(features, cluster, draws)
     distances, scaled = [], []
-    for name in FEATURES:
+    for name in KINEMATICS:
         simulated, log = np.concatenate([sample[name].numpy() for sample in features], 1)
         distances.append(wasserstein_distance(simulated, log))
         scaled.append(distances[-1] / np.subtract(*np.quantile(log, [0.95, 0.05])))
@@ -81,8 +81,8 @@ def test_the_ego_the_parked_and_what_happens_after_the_stop_do_not_count():
     states[:, :, 1, 3] = 5.0
     agents = torch.tensor([[False, True, True]])
     for stop, blocks in ((80, 16), (34, 6), (9, 1)):
-        sample = motion_features(states, valid, states, valid, agents, torch.tensor([stop]), 0.1)[0]
-        assert [sample[name].shape[1] for name in FEATURES] == [blocks - 1, blocks - 1, max(blocks - 2, 0)], stop
+        sample = kinematic_samples(states, valid, states, valid, agents, torch.tensor([stop]))[0]
+        assert [sample[name].shape[1] for name in KINEMATICS] == [blocks - 1, blocks - 1, max(blocks - 2, 0)], stop
 
 
 def test_real_adv_is_real_of_a_traffic_of_adversaries_alone():
@@ -101,7 +101,7 @@ def test_a_constant_turn_has_its_lateral_acceleration():
     time = torch.arange(81, dtype=torch.float64) * 0.1
     states = torch.stack([time, time, 3.0 + 0.2 * time, 4.0 + 0.5 * time], -1)[None, :, None].expand(1, 81, 2, 4)
     valid, agents = torch.ones(1, 81, 2, dtype=torch.bool), torch.tensor([[False, True]])
-    sample = motion_features(states, valid, states, valid, agents, torch.tensor([80]), 0.1)[0]
+    sample = kinematic_samples(states, valid, states, valid, agents, torch.tensor([80]))[0]
     middle = 4.0 + 0.5 * (0.55 + 0.5 * torch.arange(15))
     torch.testing.assert_close(sample["a_lat"][0], (0.2 * middle).double(), atol=1e-6, rtol=0)
     torch.testing.assert_close(sample["a_lon"][0], torch.full((15,), 0.5, dtype=torch.float64))
@@ -110,7 +110,7 @@ def test_a_constant_turn_has_its_lateral_acceleration():
 
 def logs(*samples):
     """Features of rollouts whose logs hold the samples, alike in every feature; the rollouts themselves are far off."""
-    return [{name: torch.stack([sample + 99, sample]) for name in FEATURES} for sample in samples]
+    return [{name: torch.stack([sample + 99, sample]) for name in KINEMATICS} for sample in samples]
 
 
 def test_halves_of_the_same_logs_are_wholly_alike_and_a_shift_is_its_own_distance():

@@ -2,7 +2,9 @@
 
 import torch
 
+from e2rl.metrics.score import score_rollouts
 from e2rl.metrics.standing import MOVED, moved, standing_columns
+from tests.metrics.random_rollouts import random_rollouts
 
 PARKED_STAYS, PARKED_MOVES, STANDS, STARTS, STARTS_IN_LOG, DRIVES, LATE = range(1, 8)
 ROWS = 8
@@ -31,17 +33,12 @@ def traffic():
 
 
 def values(batch, who=None):
-    return {name: value[0].item() for name, value in standing_columns(batch, traffic() if who is None else who).items()}
+    found = standing_columns(batch | {"traffic": traffic() if who is None else who})
+    return {name: value[0].item() for name, value in found.items()}
 
 
 def test_everybody_is_counted_once_and_where_it_belongs():
-    assert values(rollouts()) == {
-        "parked_moved": 0.5,
-        "parked_vehicles": 2,
-        "starters": 1,
-        "starters_log": 1,
-        "standing": 3,
-    }
+    assert values(rollouts()) == {"parked_moved": 0.5, "parked_vehicles": 2, "starters": 1, "starters_log": 1}
 
 
 def test_the_log_as_a_rollout_starts_as_many_as_the_log_and_moves_no_parked_vehicle():
@@ -53,13 +50,7 @@ def test_the_log_as_a_rollout_starts_as_many_as_the_log_and_moves_no_parked_vehi
 def test_who_is_no_traffic_is_not_counted():
     who = traffic()
     who[0, [PARKED_MOVES, STARTS]] = False
-    assert values(rollouts(), who) == {
-        "parked_moved": 0,
-        "parked_vehicles": 1,
-        "starters": 0,
-        "starters_log": 1,
-        "standing": 2,
-    }
+    assert values(rollouts(), who) == {"parked_moved": 0, "parked_vehicles": 1, "starters": 0, "starters_log": 1}
 
 
 def test_it_does_not_depend_on_place_or_order():
@@ -83,6 +74,6 @@ def test_moved_means_farther_than_the_limit_at_a_step_where_it_is_there():
 def test_without_parked_vehicles_the_share_is_unknown_and_without_the_key_everything_is():
     batch = rollouts()
     none = values(batch | {"parked": torch.zeros_like(batch["parked"])})
-    assert none["parked_moved"] != none["parked_moved"] and none["parked_vehicles"] == 0 and none["standing"] == 5
-    del batch["parked"]
-    assert all(value != value for value in values(batch).values())
+    assert none["parked_moved"] != none["parked_moved"] and none["parked_vehicles"] == 0
+    row = score_rollouts(random_rollouts(1))[0][0]  # its dict has no `parked`
+    assert all(row[name] != row[name] for name in none)

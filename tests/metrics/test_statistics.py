@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from e2rl.metrics.realism import FEATURES, OF_ADVERSARIES
+from e2rl.metrics.realism import KINEMATICS, OF_ADVERSARIES
 from e2rl.metrics.score import score_rollouts
 from e2rl.metrics.statistics import (
     bootstrap_draws,
@@ -20,7 +20,7 @@ from tests.metrics.random_rollouts import random_rollouts
 
 def rows_of(values, clusters=None, name="cfr", **columns):
     """Rows that know one metric, one scene each, and features without samples."""
-    empty = {key: torch.zeros(2, 0, dtype=torch.float64) for key in (*FEATURES, *OF_ADVERSARIES)}
+    empty = {key: torch.zeros(2, 0, dtype=torch.float64) for key in (*KINEMATICS, *OF_ADVERSARIES)}
     rows = [
         {"scene_id": f"s{index}", "location": str(clusters[index]) if clusters else "", "seed": 0, name: value}
         | {key: column[index] for key, column in columns.items()}
@@ -140,5 +140,5 @@ def test_the_order_of_rows_and_the_draws_seed_fix_the_interval():
 
 def test_rows_and_features_must_belong_together():
     rows, features = rows_of([1.0, 0.0])
-    with pytest.raises(ValueError, match="2 rows but 1 features"):
+    with pytest.raises(ValueError, match="2 rows but 1 samples"):
         summarise(rows, features[:1])

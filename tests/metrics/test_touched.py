@@ -2,7 +2,7 @@
 
 import torch
 
-from e2rl.metrics.score import touched_columns
+from e2rl.metrics.contact import touched_columns
 
 
 def columns(speeds, touched, logged=None, valid=None):
@@ -15,7 +15,8 @@ def columns(speeds, touched, logged=None, valid=None):
     there = torch.ones(1, 5, count, dtype=torch.bool)
     known = there if valid is None else there & torch.tensor(valid)
     batch = {"states": track, "valid": known, "logged": log, "logged_valid": known}
-    found = touched_columns(batch, torch.tensor([touched]), torch.arange(count)[None] > 0)
+    batch["traffic"] = torch.arange(count)[None] > 0
+    found = touched_columns(batch, torch.tensor([touched]))
     return found["touched"].item(), found["moving_vehicles"].item()
 
 

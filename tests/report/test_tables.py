@@ -6,7 +6,7 @@ import pytest
 
 from e2rl.evaluation.files import Source, label_rows
 from e2rl.evaluation.summary import metric_rows
-from e2rl.metrics.catalogue import MAIN, TRAFFIC
+from e2rl.metrics.catalogue import MAIN, TABLES
 from e2rl.metrics.score import score_rollouts
 from e2rl.report.tables import metric_tables, number, print_tables, save_tables
 from tests.metrics.random_rollouts import random_rollouts
@@ -26,8 +26,8 @@ def test_tables_list_known_metrics_in_the_design_s_order(rows):
     assert means.head == ["", "nominal", "e2 η=2"] and paired.head == ["", "e2 η=2"]
     names = [row[0].split(" [")[0] for row in means.rows]
     assert names == [metric.name for metric in MAIN if metric.name not in ("avoidable", "transport")]
-    traffic = [row[0].split(" [")[0] for row in metric_tables(rows, metrics=TRAFFIC)[0].rows]
-    assert traffic == [metric.name for metric in TRAFFIC if metric.name in traffic] and "w1_jerk" in traffic
+    traffic = [row[0].split(" [")[0] for row in metric_tables(rows, table="traffic")[0].rows]
+    assert traffic == [name for name in TABLES["traffic"] if name in traffic] and "w1_jerk" in traffic
 
 
 def test_a_sweep_names_every_intensity(rows):

@@ -1,0 +1,84 @@
+"""A metric that is registered from outside appears in rows, files and tables, and nothing else changes."""
+
+import pytest
+import torch
+
+from e2rl.evaluation.files import Source, label_rows, read_rows, table_columns, write_rows
+from e2rl.evaluation.summary import metric_rows
+from e2rl.metrics.catalogue import METRICS, TABLES, Metric, register, row_columns, table_metrics, unregister
+from e2rl.metrics.score import score_rollouts
+from e2rl.metrics.statistics import metric_table, paired_differences, summarise
+from e2rl.report.tables import legend, metric_tables
+from tests.metrics.random_rollouts import random_rollouts
+
+SOURCE = Source("synthetic", "test", "e2", "idm")
+
+
+def fast_traffic(batch):
+    """The share of vehicle-steps until the ego's contact above 10 m/s, and the steps it rests on."""
+    steps = torch.arange(batch["states"].shape[1])
+    counted = batch["valid"] & batch["traffic"][:, None] & (steps <= batch["stop"][:, None])[..., None]
+    number = counted.sum((1, 2))
+    return {"fast": ((batch["states"][..., 3] > 10) & counted).sum((1, 2)) / number, "fast_steps": number}
+
+
+@pytest.fixture
+def fast():
+    metric = Metric("fast", "vehicle-steps above 10 m/s", share=True, weight="fast_steps", tables=("traffic", "speeds"))
+    register(metric, fast_traffic)
+    yield metric
+    unregister("fast")
+    del TABLES["speeds"]
+
+
+def test_it_is_in_rows_files_summaries_and_its_tables(fast, tmp_path):
+    rollouts = random_rollouts(40)  # more than one batch
+    rows, samples = score_rollouts(rollouts)
+    assert all(0 < row["fast"] < 1 and row["fast_steps"] > 0 for row in rows)
+    values, weights = metric_table(rows, [fast])
+    assert torch.equal(values / weights, torch.tensor([[row["fast"]] for row in rows], dtype=torch.float64))
+    expected = sum(row["fast"] * row["fast_steps"] for row in rows) / sum(row["fast_steps"] for row in rows)
+    assert summarise(rows, samples, 20, 2)["fast"]["mean"] == pytest.approx(expected)
+    assert paired_differences(rows, samples, rows, samples, 20, 2)["fast"]["difference"] == 0
+    write_rows(tmp_path / "rollouts.csv", label_rows(rows, SOURCE))
+    assert read_rows(tmp_path / "rollouts.csv")[7]["fast"] == pytest.approx(rows[7]["fast"])
+    summaries = metric_rows(label_rows(rows, SOURCE), samples, "", draws=20, realism_draws=2)
+    (row,) = metric_tables(summaries, table="speeds")[0].rows
+    assert row[0] == "fast [%]" and row[1].startswith(f"{100 * expected:.1f} [")
+    assert metric_tables(summaries, table="traffic")[0].rows[-1] == row
+    assert "above 10 m/s" in legend() and fast not in table_metrics("main")
+
+
+def test_built_in_columns_stay_as_they_are():
+    before, columns, names = score_rollouts(random_rollouts(2))[0], table_columns(), list(METRICS)
+    register(Metric("one", "always 1"), lambda batch: torch.ones(len(batch["stop"])))
+    try:
+        rows = score_rollouts(random_rollouts(2))[0]
+        assert [name for name in table_columns() if name != "one"] == list(columns) and list(METRICS) == [*names, "one"]
+        for row, old in zip(rows, before, strict=True):
+            assert row.pop("one") == 1 and str(row) == str(old)
+    finally:
+        unregister("one")
+    assert table_columns() == columns and list(METRICS) == names
+
+
+def test_a_median_of_a_column_that_exists_needs_no_function():
+    register(Metric("median_progress", "", column="progress", median=True))
+    try:
+        rows, samples = score_rollouts(random_rollouts(5))
+        found = summarise(rows, samples, 20, 2)["median_progress"]["mean"]
+        assert found == sorted(row["progress"] for row in rows)[2] and "median_progress" not in row_columns()
+    finally:
+        unregister("median_progress")
+
+
+def test_taken_names_and_wrong_shapes_are_refused():
+    for name in ("cfr", "seed", "partner", "motion"):  # a metric, columns, the key of built-in functions
+        with pytest.raises(ValueError, match=f"metric {name}: .*taken"):
+            register(Metric(name, ""), fast_traffic)
+    register(Metric("wrong", ""), lambda batch: batch["valid"])
+    try:
+        with pytest.raises(ValueError, match="wrong: a metric is one number per rollout"):
+            score_rollouts(random_rollouts(2))
+    finally:
+        unregister("wrong")
