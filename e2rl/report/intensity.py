@@ -10,7 +10,7 @@ from e2rl.report import drawing
 from e2rl.report.picture import Replay
 from e2rl.report.replay import load_replay
 
-SIDE, METRES, GAP = 640, 60.0, 10  # of a panel in pixels and m, pixels between panels
+SIDE, METRES, GAP = 720, 60.0, 10  # of a panel in pixels and m, pixels between panels
 ACROSS = 2  # panels beside each other
 
 
