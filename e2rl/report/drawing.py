@@ -134,9 +134,7 @@ def disc(centre: np.ndarray, radius: float, fill: Colour, edge: Colour, width: f
 
 def new_figure(width: float, height: float, dpi: float = 72) -> Figure:
     """An empty figure of a size in points; at 72 dpi a point is a pixel."""
-    figure = Figure((width / 72, height / 72), dpi, facecolor=PANEL)
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure((width / 72, height / 72), dpi, facecolor=PANEL)
 
 
 def new_panels(count: int, side: float, gap: float, head: float, foot: float = 0) -> tuple[Figure, list[Axes]]:
@@ -144,7 +142,7 @@ def new_panels(count: int, side: float, gap: float, head: float, foot: float = 0
     height = head + side + foot
     figure = new_figure(count * (side + gap) - gap, height)
     grid = {"left": 0, "right": 1, "bottom": foot / height, "top": 1 - head / height, "wspace": gap / side}
-    return figure, list(figure.subplots(1, count, gridspec_kw=grid))
+    return figure, list(figure.subplots(1, count, squeeze=False, gridspec_kw=grid)[0])
 
 
 def add_legend(figure: Figure, colours: dict[str, Colour], size: float, ghost: bool = False) -> None:
@@ -158,8 +156,9 @@ def add_legend(figure: Figure, colours: dict[str, Colour], size: float, ghost: b
 
 def image_of(figure: Figure) -> Image.Image:
     """The figure drawn as it is now."""
-    figure.canvas.draw()
-    return Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3])
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
 
 def save_picture(path: Path, picture: Image.Image) -> None:

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -22,13 +21,8 @@ FREEZE = 14  # frames that hold the contact
 STRIP_TIMES = (-2.0, -1.0, -0.4, 0.0)  # s before contact
 SIDE, HEAD, FOOT = 720, 50, 30  # points: of a picture, of its header and of its legend
 STRIP_SIDE, STRIP_GAP, STRIP_HEAD = 420, 8, 34  # points: of a panel, between panels, above them
-LEGEND = {
-    "ego": drawing.EGO,
-    "adversary": drawing.ADVERSARY,
-    "traffic": drawing.BACKGROUND,
-    "replayed": drawing.REPLAYED,
-    "pedestrian, cyclist": drawing.VULNERABLE,
-}
+LEGEND = {"ego": drawing.EGO, "adversary": drawing.ADVERSARY, "traffic": drawing.BACKGROUND}
+LEGEND |= {"replayed": drawing.REPLAYED, "pedestrian, cyclist": drawing.VULNERABLE}
 
 
 @dataclass
@@ -50,15 +44,12 @@ class Replay:
         self.contact = None if math.isnan(self.row["contact_step"]) else int(self.row["contact_step"])
         self.last = len(self.rollout["states"]) - 1 if self.contact is None else self.contact
         self.centres = camera_path(self.rollout["states"][:, self.rollout["ego"], :2])
+        self.panel = Panel(self)
 
     def picture(self, time: float, phase: float | None = None) -> Image.Image:
         """The moment at `time` [steps, fractions interpolate]; `phase` from 0 to 1 marks the contact."""
         self.panel.show(time, phase)
         return image_of(self.panel.figure)
-
-    @cached_property
-    def panel(self) -> "Panel":
-        return Panel(self)
 
     def frames(self) -> list[Image.Image]:
         """All frames: real time, half speed just before contact, then the contact held."""

@@ -26,13 +26,8 @@ NODES = 10  # of the matrix at most
 MARGIN, SMALLEST, LARGEST = 30.0, 60.0, 140.0  # m: around the coalition, and a map's least and greatest side
 CANDIDATE, FEASIBLE = drawing.VULNERABLE, "#2e8b57"
 ON_TOP = 10  # drawing order of edges, arrows and names, above the map
-LEGEND = {
-    "ego": drawing.EGO,
-    "coalition C*": drawing.ADVERSARY,
-    "candidate of the topology": CANDIDATE,
-    "feasible, no candidate": FEASIBLE,
-    "others": drawing.BACKGROUND,
-}
+LEGEND = {"ego": drawing.EGO, "coalition C*": drawing.ADVERSARY, "candidate of the topology": CANDIDATE}
+LEGEND |= {"feasible, no candidate": FEASIBLE, "others": drawing.BACKGROUND}
 
 
 @dataclass
@@ -106,9 +101,9 @@ class SkeletonPicture:
         table, nodes = axes.inset_axes((0.09, 0.02, 0.89, 0.89)), self.nodes()
         weights = self.weights[np.ix_(nodes, nodes)]
         reds = LinearSegmentedColormap.from_list("risk", (drawing.GROUND, drawing.CONTACT))
-        reds.set_bad(drawing.BACKGROUND)
+        cells = {"cmap": reds.with_extremes(bad=drawing.BACKGROUND), "vmin": 0, "vmax": 1}
         others = np.ma.masked_where(np.eye(len(nodes), dtype=bool), weights)
-        table.pcolormesh(others, cmap=reds, vmin=0, vmax=1, edgecolors=drawing.PANEL, linewidth=1)
+        table.pcolormesh(others, edgecolors=drawing.PANEL, linewidth=1, **cells)
         style = {"fontsize": min(16, 180 / len(nodes)), "ha": "center", "va": "center"}
         for row, column in np.argwhere(others.filled(0) > 0):
             weight = float(weights[row, column])

@@ -89,6 +89,7 @@ def paired_table(group: Sequence[dict], metrics: Sequence[Metric]) -> Table:
     after training with itself before. The table has no rows where nothing is paired.
     """
     first, names = group[0], column_names(group)
+    # A method with several etas is named method@eta in `paired`.
     reference, keys = names[0], (f"{first['method']}@{first['eta']:g}", first["method"])
     if any(row.get("stage") == "after" for row in group):
         reference, keys = "before", ("before",)
