@@ -7,27 +7,24 @@ from pathlib import Path
 from PIL import Image
 
 from e2rl.report import drawing
-from e2rl.report.picture import Replay
 from e2rl.report.replay import load_replay
 
-SIDE, METRES, GAP = 640, 60.0, 10  # of a panel in pixels and m, pixels between panels
-ACROSS = 2  # panels beside each other
+SIDE, METRES, GAP = 720, 60.0, 10  # of a panel in pixels and m, pixels between panels
+COLUMNS = 2
 
 
 def intensity_figure(paths: Sequence[Path]) -> Image.Image:
-    """A panel for each rollout file: at its contact, or, where there is none, when the first of the others' contacts
-    at greater intensity happens (at the end where there is none)."""
+    """A panel for each rollout file, in the order of intensity: the moment of its contact.
+
+    A rollout without contact is shown when the next one that has a contact has it, else at its end.
+    """
     replays = [load_replay(path, METRES, SIDE) for path in paths]
-    down = math.ceil(len(replays) / ACROSS)
-    figure = Image.new("RGB", (ACROSS * (SIDE + GAP) - GAP, down * (SIDE + GAP) - GAP), drawing.PANEL)
+    rows = math.ceil(len(replays) / COLUMNS)
+    figure = Image.new("RGB", (COLUMNS * (SIDE + GAP) - GAP, rows * (SIDE + GAP) - GAP), drawing.PANEL)
     for index, replay in enumerate(replays):
-        place = ((index % ACROSS) * (SIDE + GAP), (index // ACROSS) * (SIDE + GAP))
-        figure.paste(panel(replay, replays[index + 1 :]), place)
+        row, column = divmod(index, COLUMNS)
+        contacts = [other.contact for other in replays[index:] if other.contact is not None]
+        phase = None if replay.contact is None else 0.25
+        panel = replay.picture(contacts[0] if contacts else replay.last, phase)
+        figure.paste(panel, (column * (SIDE + GAP), row * (SIDE + GAP)))
     return figure
-
-
-def panel(replay: Replay, stronger: Sequence[Replay]) -> Image.Image:
-    if replay.contact is not None:
-        return replay.picture(replay.contact, phase=0.25)
-    contacts = [other.contact for other in stronger if other.contact is not None]
-    return replay.picture(contacts[0] if contacts else replay.last)

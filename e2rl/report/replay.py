@@ -1,13 +1,14 @@
 """Replays: an animated GIF and a strip of four moments of a rollout, from its file alone.
 
-`python -m e2rl.report.replay RUN_DIR --failures 3` saves those of the first distinct failures that a run found.
+`python -m e2rl.report.replay RUN_DIR --failures 3` saves them for the first failures of different scenes in a run.
 """
 
 import argparse
-import io
 import sys
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
 
 from e2rl.errors import InputError
@@ -20,12 +21,11 @@ from e2rl.report.picture import Replay
 
 FRAME_MS = 100  # real time at 10 Hz
 LAST_MS = 1200  # the last frame stays a little before the film starts again
-COLOURS = 160  # one palette for all frames: nothing flickers
-UNGUIDED = ("nominal", "replay")  # methods that look for no failure
+COLOURS = 160  # of the GIF's palette
 
 
 def load_replay(path: Path, metres: float = 70.0, pixels: int = 720, ghost: bool = False) -> Replay:
-    """The replay of one rollout file; its contact is scored anew. InputError where the file is no rollout."""
+    """The replay of one rollout file; its contact is computed again. Raises InputError where the file is no rollout."""
     rollout = read_rollout(path)
     rows, _ = score_rollouts(as_rollout_dict([rollout]))
     return Replay(rollout, rows[0], metres, pixels, ghost)
@@ -35,47 +35,33 @@ def save_replay(replay: Replay, folder: Path) -> tuple[Path, Path]:
     """Write <name>.gif and <name>.png (the strip) into folder and return their paths."""
     name = rollout_name(replay.rollout).removesuffix(".npz")
     gif, png = Path(folder) / f"{name}.gif", Path(folder) / f"{name}.png"
-    write_atomically(gif, animation(replay.frames()))
+    save_animation(gif, replay.frames())
     drawing.save_picture(png, replay.strip())
     return gif, png
 
 
-def animation(frames: list[Image.Image]) -> bytes:
-    """An endless GIF at 10 Hz; one palette, made from its first, middle and last frame, serves all frames."""
-    width, height = frames[0].size
-    sample = Image.new("RGB", (width, 3 * height))
-    for index, frame in enumerate((frames[0], frames[len(frames) // 2], frames[-1])):
-        sample.paste(frame, (0, index * height))
+def save_animation(path: Path, frames: list[Image.Image]) -> None:
+    """Write an endless GIF at 10 Hz; all frames share a palette, from the first, middle and last frame."""
+    sample = Image.fromarray(np.concatenate([frames[index] for index in (0, len(frames) // 2, -1)]))
     palette = sample.quantize(COLOURS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    flat = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    buffer = io.BytesIO()
-    flat[0].save(
-        buffer,
-        "GIF",
-        save_all=True,
-        append_images=flat[1:],
-        loop=0,
-        optimize=False,
-        duration=[FRAME_MS] * (len(flat) - 1) + [LAST_MS],
-    )
-    return buffer.getvalue()
+    first, *others = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    duration = [FRAME_MS] * len(others) + [LAST_MS]
+    save = partial(first.save, format="GIF", save_all=True, append_images=others, loop=0, duration=duration)
+    write_atomically(path, save)
 
 
 def found_failures(rows: list[dict], count: int) -> list[dict]:
     """The first `count` rows, one per scene, in which the ego hits a vehicle.
 
-    New kinds of contact come first, then hits of adversaries.
-    Methods that look for failures come before `nominal` and `replay`, which serve where there are no others.
+    Adversarial rollouts (eta > 0) come first, then kinds of contact that are not among the chosen, then hits of
+    adversaries.
     """
-    hits = [row for row in rows if row["cfr"] == 1]
-    hits.sort(key=lambda row: (row["method"] in UNGUIDED, row["cfr_adv"] != 1))
+    hits = sorted((row for row in rows if row["cfr"] == 1), key=lambda row: row["cfr_adv"] != 1)
     chosen: list[dict] = []
     while hits and len(chosen) < count:
-        scenes = {row["scene_id"] for row in chosen}
-        hits = [row for row in hits if row["scene_id"] not in scenes]
         kinds = [row["contact_type"] for row in chosen]
-        if hits:
-            chosen.append(min(hits, key=lambda row: (row["method"] in UNGUIDED, kinds.count(row["contact_type"]))))
+        chosen.append(min(hits, key=lambda row: (row["eta"] <= 0, kinds.count(row["contact_type"]))))
+        hits = [row for row in hits if row["scene_id"] != chosen[-1]["scene_id"]]
     return chosen
 
 

@@ -1,23 +1,25 @@
-"""Metric tables from the rows of metrics.json: printed, and saved as markdown. Shares are in per cent.
+"""Metric tables from the rows of metrics.json, for a terminal and as markdown. Shares are in per cent.
 
-One table per (dataset, split, ego): metrics down, methods across, then each method's paired difference to the first.
+For each (dataset, split, ego), one table has a row per metric and a column per method. Where there are several methods,
+a second table has each method's paired difference to the first.
 """
 
 import math
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from e2rl.files import write_atomically
 from e2rl.metrics.catalogue import META_STAGE, METRICS, OPEN_LOOP_STAGE, STAGES, Metric, table_metrics
 
-RESTS_ON = {
+UNKNOWN = "–"
+COUNTED = {
     OPEN_LOOP_STAGE: "(n) vehicles: others than the ego, faster than 0.5 m/s in the log at the start, recorded "
     "throughout the horizon; causal start states, a route drawn per sample; samples without acceleration bounds.",
     META_STAGE: "(n) scenes. Likelihood of the log under each vehicle's histogram over all rollouts and steps; "
     "vehicles recorded throughout. A deterministic method's rollout stands for all.",
-}
+}  # what the count (n) of a stage's cells counts, and how its metrics are computed
 
 
 @dataclass
@@ -26,15 +28,15 @@ class Table:
 
     caption: str
     head: list[str]
-    rows: list[list[str]] = field(default_factory=list)
+    rows: list[list[str]]
 
     def text(self) -> str:
         """For a terminal: aligned columns, the caption above."""
         widths = [max(map(len, column)) for column in zip(self.head, *self.rows, strict=True)]
 
         def line(cells: list[str]) -> str:
-            aligned = [cell.rjust(width) for cell, width in zip(cells[1:], widths[1:], strict=True)]
-            return "  ".join([cells[0].ljust(widths[0]), *aligned]).rstrip()
+            numbers = [cell.rjust(width) for cell, width in zip(cells[1:], widths[1:], strict=True)]
+            return "  ".join([cells[0].ljust(widths[0]), *numbers]).rstrip()
 
         rule = "-" * (sum(widths) + 2 * len(widths) - 2)
         caption = textwrap.fill(self.caption, max(len(rule), 60))
@@ -51,10 +53,11 @@ class Table:
 
 
 def metric_tables(rows: Sequence[dict], settings: str = "", table: str = "main") -> list[Table]:
-    """Tables of rows as in metrics.json. `settings` (prior, samples, bounds, ...) joins every caption.
+    """Tables of rows as in metrics.json.
 
-    table: of `catalogue.TABLES`, whose metrics the closed-loop tables show; those that no column knows are left out and
-    named in the caption. Rows of the stages `open loop` and `meta-metric` have tables and metrics of their own.
+    settings: text for every caption, such as the prior and its sampler. table: of `catalogue.TABLES`, whose metrics the
+    closed-loop tables show; a caption names those that no row knows. Rows of the stages `open loop` and `meta-metric`
+    have their own tables and metrics.
     """
     groups: dict[tuple, list[dict]] = {}
     metrics = table_metrics(table)
@@ -63,95 +66,73 @@ def metric_tables(rows: Sequence[dict], settings: str = "", table: str = "main")
         groups.setdefault((row["dataset"], row["split"], row["ego"], stage), []).append(row)
     tables = []
     for (*_, stage), group in groups.items():
-        tables.append(means_table(group, settings, STAGES.get(stage, metrics)))
-        if len(group) > 1:
-            tables.append(paired_table(group, metrics))
+        tables += [means_table(group, settings, STAGES.get(stage, metrics)), paired_table(group, metrics)]
     return [table for table in tables if table.rows]
 
 
 def means_table(group: Sequence[dict], settings: str, metrics: Sequence[Metric]) -> Table:
-    """Mean [95% interval] of each metric, one column per row of metrics.json."""
-
-    def known(metric: Metric) -> bool:
-        return any(row["metrics"].get(metric.name, {}).get("n", 0) for row in group)
-
-    names = column_names(group)
-    rests_on = RESTS_ON.get(group[0].get("stage"), "(n) rollouts where fewer count.")
-    caption = f"{place(group[0])}. {counts(group, names)} "
-    caption += f"Mean [95% interval, bootstrap by location or scene]; {rests_on}"
-    unknown = [metric.name for metric in metrics if not known(metric)]
+    """Mean [95% interval] of each metric, with a column for each row of metrics.json."""
+    known = [metric for metric in metrics if any(row["metrics"].get(metric.name, {}).get("n", 0) for row in group)]
+    unknown = [metric.name for metric in metrics if metric not in known]
+    names, counted = column_names(group), COUNTED.get(group[0].get("stage"), "(n) rollouts where fewer count.")
+    caption = (
+        f"{origin(group[0])}. {counts(group, names)} Mean [95% interval, bootstrap by location or scene]; {counted}"
+    )
     caption += f" {settings.rstrip('.')}." if settings else ""
     caption += f" Not computable here: {', '.join(unknown)}." if unknown else ""
-    body = [[heading(metric), *(mean_cell(metric, row) for row in group)] for metric in metrics if known(metric)]
-    return Table(caption, ["", *names], body)
+    rows = [[heading(metric), *(mean_cell(metric, row) for row in group)] for metric in known]
+    return Table(caption, ["", *names], rows)
 
 
 def paired_table(group: Sequence[dict], metrics: Sequence[Metric]) -> Table:
-    """Differences of every method to the first one over the same (scene, seed), per cent points for shares; where rows
-    have stages, of each method after training to the same method before.
+    """Paired differences over the same (scene, seed), of shares in per cent points.
+
+    They compare each method with the first one or, where rows have the stages before and after training, each method
+    after training with itself before. The table has no rows where nothing is paired.
     """
     first, names = group[0], column_names(group)
-    reference = names[0]
+    # A method with several etas is named method@eta in `paired`.
+    reference, keys = names[0], (f"{first['method']}@{first['eta']:g}", first["method"])
     if any(row.get("stage") == "after" for row in group):
-        reference = "before"
-        columns = [(name, row["paired"].get("before")) for name, row in zip(names, group, strict=True)]
-    else:
-        columns = [(name, difference_to(row, first, group)) for name, row in zip(names[1:], group[1:], strict=True)]
-    columns = [(name, paired) for name, paired in columns if paired]
-    body = [
-        [heading(metric, points=True), *(difference_cell(metric, paired.get(metric.name)) for _, paired in columns)]
-        for metric in metrics
-        if any(not math.isnan(paired[metric.name]["difference"]) for _, paired in columns if metric.name in paired)
-    ]
-    caption = (
-        f"{place(first)}. Difference to {reference} [95% interval], paired by (scene, seed); * the interval "
-        "leaves out 0."
-    )
-    return Table(caption, ["", *(name for name, _ in columns)], body if columns else [])
+        reference, keys = "before", ("before",)
+    found = [(name, row["paired"].get(key)) for name, row in zip(names, group, strict=True) for key in keys]
+    columns = {name: paired for name, paired in found if paired}
+    rows = []
+    for metric in metrics:
+        cells = [difference_cell(metric, paired.get(metric.name)) for paired in columns.values()]
+        if any(cell != UNKNOWN for cell in cells):
+            rows.append([heading(metric, points=True), *cells])
+    caption = f"{origin(first)}. Difference to {reference} [95% interval], paired by (scene, seed); * the interval "
+    return Table(f"{caption}leaves out 0.", ["", *columns], rows)
 
 
-def difference_to(row: dict, first: dict, group: Sequence[dict]) -> dict | None:
-    """The row's paired block that compares it with `first`, under the name that evaluation.summary gives it."""
-    several = len({other["eta"] for other in group if other["method"] == first["method"]}) > 1
-    return row["paired"].get(f"{first['method']}@{first['eta']:g}" if several else first["method"])
-
-
-def place(row: dict) -> str:
+def origin(row: dict) -> str:
     return f"{row['dataset']}/{row['split']}, ego {row['ego']}"
 
 
 def counts(group: Sequence[dict], names: Sequence[str]) -> str:
-    """Scenes, seeds, rollouts: once if all columns agree, else per column."""
-    words = ("scene", "seed", "rollout")
-    texts = [
-        ", ".join(f"{row[f'n_{word}s']} {word}{'' if row[f'n_{word}s'] == 1 else 's'}" for word in words)
-        for row in group
-    ]
+    """Numbers of scenes, seeds and rollouts, once where all columns agree, else by column."""
+    texts = []
+    for row in group:
+        numbers = {word: row[f"n_{word}s"] for word in ("scene", "seed", "rollout")}
+        texts.append(", ".join(f"{n} {word}{'' if n == 1 else 's'}" for word, n in numbers.items()))
     if len(set(texts)) == 1:
         return f"{texts[0]} per method."
     return "; ".join(f"{name}: {text}" for name, text in zip(names, texts, strict=True)) + "."
 
 
 def column_names(group: Sequence[dict]) -> list[str]:
-    """method, with eta where it is not 0 or the method has several, and the stage where there is one."""
-    several = {
-        row["method"]
-        for row in group
-        if any(other["method"] == row["method"] and other["eta"] != row["eta"] for other in group)
-    }
-    return [
-        " ".join(
-            filter(
-                None,
-                (
-                    "" if row.get("stage") in STAGES else str(row.get("stage", "")),
-                    row["method"],
-                    f"η={row['eta']:g}" if row["eta"] or row["method"] in several else "",
-                ),
-            )
-        )
-        for row in group
-    ]
+    """The method, after its stage of training if any, with eta where it is not 0 or where the method has several."""
+    etas: dict[str, set[float]] = {}
+    for row in group:
+        etas.setdefault(row["method"], set()).add(row["eta"])
+    names = []
+    for row in group:
+        stage = row.get("stage")
+        before = "" if stage is None or stage in STAGES else f"{stage} "
+        eta = f" η={row['eta']:g}" if row["eta"] or len(etas[row["method"]]) > 1 else ""
+        names.append(f"{before}{row['method']}{eta}")
+    return names
 
 
 def heading(metric: Metric, points: bool = False) -> str:
@@ -160,45 +141,44 @@ def heading(metric: Metric, points: bool = False) -> str:
 
 
 def mean_cell(metric: Metric, row: dict) -> str:
-    """'12.3 [8.1, 16.4] (n)': n only where it is not all rollouts; '–' where nothing is known."""
+    """Such as `12.3 [8.1, 16.4] (n)`, where n is left out if all rollouts count."""
     value = row["metrics"].get(metric.name)
     if not value or not value["n"]:
-        return "–"
-    count = f" ({value['n']})" if value["n"] != row["n_rollouts"] else ""
-    return number(metric, value["mean"]) + bounds(metric, value) + count
+        return UNKNOWN
+    return estimate(metric, value, "mean") + (f" ({value['n']})" if value["n"] != row["n_rollouts"] else "")
 
 
 def difference_cell(metric: Metric, value: dict | None) -> str:
+    """Such as `+2.1 [+0.4, +3.9]*`, with a star where the interval leaves out 0."""
     if not value or math.isnan(value["difference"]):
-        return "–"
-    clear = value["low"] > 0 or value["high"] < 0
-    return (
-        number(metric, value["difference"], signed=True) + bounds(metric, value, signed=True) + ("*" if clear else "")
-    )
+        return UNKNOWN
+    return estimate(metric, value, "difference", "+") + ("*" if value["low"] > 0 or value["high"] < 0 else "")
 
 
-def bounds(metric: Metric, value: dict, signed: bool = False) -> str:
-    if math.isnan(value["low"]):
-        return ""
-    return f" [{number(metric, value['low'], signed)}, {number(metric, value['high'], signed)}]"
+def estimate(metric: Metric, value: dict, name: str, sign: str = "") -> str:
+    """The value called `name` and, where it is known, its interval."""
+    centre, low, high = (number(metric, value[key], sign) for key in (name, "low", "high"))
+    return centre if math.isnan(value["low"]) else f"{centre} [{low}, {high}]"
 
 
-def number(metric: Metric, value: float, signed: bool = False) -> str:
-    """Three significant digits, shares in per cent with one decimal (two below one per cent)."""
+def number(metric: Metric, value: float, sign: str = "") -> str:
+    """The value with the metric's own number of `decimals`, if it declares one; sign: "+" to write it always.
+
+    Without one, shares are in per cent with one decimal (two below one per cent), and others have three digits.
+    """
     value = 100 * value if metric.share else value
-    sign = "+" if signed else ""
-    if metric.share:
-        return f"{value:{sign}.1f}" if abs(value) >= 1 or value == 0 else f"{value:{sign}.2f}"
-    magnitude, decimals = abs(value), metric.decimals
-    if decimals is None:
-        decimals = 0 if magnitude >= 1000 else 1 if magnitude >= 10 else 2 if magnitude >= 1 or value == 0 else 3
+    size, decimals = abs(value), metric.decimals
+    if decimals is None and metric.share:
+        decimals = 1 if size >= 1 or size == 0 else 2
+    elif decimals is None:
+        decimals = 0 if size >= 1000 else 1 if size >= 10 else 2 if size >= 1 or size == 0 else 3
     return f"{value:{sign}.{decimals}f}"
 
 
 def save_tables(path: Path, tables: Sequence[Table]) -> None:
-    """Write the tables into one markdown file, whole, with what each metric says below them."""
+    """Write the tables into one markdown file, with a list of what each metric means."""
     parts = [*(table.markdown() for table in tables), f"```\n{legend()}\n```\n"]
-    write_atomically(Path(path), "\n".join(parts))
+    write_atomically(path, "\n".join(parts))
 
 
 def print_tables(tables: Sequence[Table]) -> None:
@@ -207,7 +187,7 @@ def print_tables(tables: Sequence[Table]) -> None:
 
 
 def legend() -> str:
-    """One line per metric: its name and what it says."""
+    """One line per metric: its name and what it means."""
     metrics = (*METRICS.values(), *(metric for stage in STAGES.values() for metric in stage))
     width = max(len(metric.name) for metric in metrics)
     return "\n".join(f"{metric.name.ljust(width)}  {metric.about}" for metric in metrics)

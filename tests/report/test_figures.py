@@ -1,4 +1,4 @@
-"""The figures of intensity and of a skeleton: what stands where, in pixels of the finished picture."""
+"""The figures of intensity and of a skeleton: what stands where, in pixels of the image."""
 
 import math
 
@@ -13,6 +13,7 @@ from e2rl.report.skeleton import SkeletonPicture, skeleton_figure
 from e2rl.synthesizer.selection import Selection
 from e2rl.synthesizer.topology import TopologySettings, pair_weights
 from tests.metrics.test_contact import course, scene
+from tests.report.pixels import pixel_at, rgb
 
 EGO, AHEAD, FAR, ASIDE = course(0, 0, 0, 10), course(25, 0, 0, 6), course(50, 0, 0, 4), course(0, 25, 1.0, 0)
 
@@ -35,7 +36,7 @@ def test_panels_stand_by_eta_at_their_contacts_and_without_one_at_the_first_of_t
         left, top = (index % 2) * (SIDE + GAP), (index // 2) * (SIDE + GAP)
         panel = figure.crop((left, top, left + SIDE, top + SIDE))
         assert panel.tobytes() == replays[index].picture(time, phase=phase).tobytes()
-    assert figure.getpixel((2 * SIDE, 2 * SIDE)) == drawing.rgb(drawing.PANEL), "three panels leave a place empty"
+    assert figure.getpixel((2 * SIDE, 2 * SIDE)) == rgb(drawing.PANEL), "three panels leave a place empty"
 
 
 @pytest.fixture(scope="module")
@@ -81,10 +82,10 @@ def test_vehicles_have_the_colour_of_their_part(shown):
         drawing.VULNERABLE,
     ]
     assert shown.colour(9) == drawing.BACKGROUND, "a pedestrian is in no risk graph"
-    image = shown.chain().reduce(drawing.SUPERSAMPLING)
+    figure, (axes,) = drawing.new_panels(1, 600, 0, 0)
+    shown.chain(axes)
     for agent in range(3):
-        column, line = shown.view.place(shown.now[agent, :2] - (1.5, 0.5)) / drawing.SUPERSAMPLING
-        assert image.getpixel((round(column), round(line))) == drawing.rgb(shown.colour(agent))
+        assert pixel_at(drawing.image_of(figure), axes, shown.now[agent, :2] - (1.5, 0.5)) == rgb(shown.colour(agent))
 
 
 def test_the_figure_has_three_panels(shown):

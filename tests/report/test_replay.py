@@ -7,9 +7,10 @@ from PIL import Image
 from e2rl.evaluation.files import Source, label_rows, write_rollouts, write_rows
 from e2rl.metrics.score import score_rollouts
 from e2rl.report import drawing, picture, replay
-from e2rl.report.drawing import View
+from e2rl.report.drawing import TrafficMap, image_of, new_panels
 from tests.metrics.random_rollouts import random_rollouts
 from tests.metrics.test_contact import course, scene
+from tests.report.pixels import pixel_at, rgb
 
 
 @pytest.fixture(scope="module")
@@ -27,13 +28,13 @@ def run(tmp_path_factory):
     return folder
 
 
-def row(scene_id, method="e2", cfr=1.0, cfr_adv=1.0, kind="front"):
-    return {"scene_id": scene_id, "method": method, "cfr": cfr, "cfr_adv": cfr_adv, "contact_type": kind}
+def row(scene_id, eta=2.0, cfr=1.0, cfr_adv=1.0, kind="front"):
+    return {"scene_id": scene_id, "eta": eta, "cfr": cfr, "cfr_adv": cfr_adv, "contact_type": kind}
 
 
 def test_failures_are_distinct_found_and_of_different_kinds():
     rows = [
-        row("a", method="nominal"),
+        row("a", eta=0.0),
         row("b"),
         row("b", kind="rear"),
         row("c", cfr=0.0),
@@ -89,18 +90,32 @@ def test_a_rollout_without_contact_plays_to_its_end(tmp_path):
 
 def test_the_ego_is_blue_and_the_adversary_red_where_they_are(tmp_path):
     shown = replay_of(tmp_path, course(0, 0, 0, 0), course(12, 0, 0, 0), course(-12, 0, 0, 0), adversaries=[1])
-    image = shown.picture(10, caption=False)
-    view = View((0.0, 0.0), shown.metres, shown.pixels)
+    image = shown.picture(10)
     for x, colour in ((0, drawing.EGO), (12, drawing.ADVERSARY), (-12, drawing.BACKGROUND)):
-        column, line = view.place(np.array([x - 0.8, 0.0])) / drawing.SUPERSAMPLING
-        assert image.getpixel((round(column), round(line))) == drawing.rgb(colour)
+        assert pixel_at(image, shown.panel.map.axes, np.array([x - 0.8, 0.0])) == rgb(colour)
 
 
-def test_y_is_up_and_the_centre_is_the_middle():
-    view = View((10.0, 20.0), 70.0, 700)
-    middle = 350 * drawing.SUPERSAMPLING
-    np.testing.assert_allclose(view.place(np.array([10.0, 20.0])), [middle, middle])
-    assert view.place(np.array([10.0, 25.0]))[1] < middle < view.place(np.array([15.0, 20.0]))[0]
+def test_a_picture_is_the_same_after_the_panel_showed_another_moment(tmp_path):
+    shown = replay_of(tmp_path, course(0, 0, 0, 12), course(30.5, 0, 0, 5), adversaries=[1])
+    first = shown.picture(5).tobytes()
+    assert shown.picture(37, phase=0.5).tobytes() != first == shown.picture(5).tobytes()
+
+
+def test_y_is_up_and_the_centre_is_the_middle(tmp_path):
+    shown = replay_of(tmp_path, course(0, 0, 0, 0))
+    _, (axes,) = new_panels(1, 700, 0, 0)
+    TrafficMap(axes, shown.rollout, 70.0).show(np.array([10.0, 20.0]), [], [])
+    middle, above, right = axes.transData.transform([(10.0, 20.0), (10.0, 25.0), (15.0, 20.0)])
+    np.testing.assert_allclose([middle, above, right], [(350, 350), (350, 400), (400, 350)])
+
+
+def test_a_lane_beside_the_map_shows_as_far_as_it_is_wide(tmp_path):
+    shown = replay_of(tmp_path, course(0, 0, 0, 0))
+    figure, (axes,) = new_panels(1, 700, 0, 0)
+    TrafficMap(axes, shown.rollout, 70.0).show(np.array([0.0, 36.0]), [], [])  # a lane 4 m wide at y = 0, 1 m below
+    image = image_of(figure)
+    assert pixel_at(image, axes, np.array([0.0, 1.3])) == rgb(drawing.ROAD)
+    assert pixel_at(image, axes, np.array([0.0, 4.0])) == rgb(drawing.GROUND)
 
 
 def test_the_camera_glides_along_the_ego_s_way():

@@ -1,6 +1,7 @@
-"""Tables: the design's order, per cent, what they rest on, and what is unknown."""
+"""Tables: the order of the metrics, per cent, what is counted, and what is unknown."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 
@@ -21,7 +22,7 @@ def rows():
     return metric_rows(labelled, more + features, "test", draws=50, realism_draws=5)
 
 
-def test_tables_list_known_metrics_in_the_design_s_order(rows):
+def test_tables_list_known_metrics_in_the_catalogue_s_order(rows):
     means, paired = metric_tables(rows)
     assert means.head == ["", "nominal", "e2 η=2"] and paired.head == ["", "e2 η=2"]
     names = [row[0].split(" [")[0] for row in means.rows]
@@ -47,7 +48,7 @@ def test_rates_are_per_cent_with_their_interval(rows):
     assert paired.rows[0][0] == "cfr [points]" and paired.rows[0][1][0] in "+-"
 
 
-def test_captions_say_what_a_table_rests_on(rows):
+def test_captions_say_how_much_a_table_is_computed_from(rows):
     caption = metric_tables(rows, settings="16 samples, 20 network passes.")[0].caption
     assert "4 scenes, 2 seeds, 8 rollouts per method" in caption and "16 samples, 20 network passes." in caption
     assert "Not computable here: avoidable, transport." in caption
@@ -75,7 +76,9 @@ def test_numbers_keep_three_digits():
     share, metres, real = (next(m for m in MAIN if m.name == name) for name in ("cfr", "progress", "real"))
     assert [number(share, value) for value in (0.1234, 0.0012, 0.0, 1.0)] == ["12.3", "0.12", "0.0", "100.0"]
     assert [number(metres, value) for value in (1234.4, 64.35, 3.14159, 0.01)] == ["1234", "64.3", "3.14", "0.010"]
-    assert number(real, 0.8764, signed=True) == "+0.876"
+    assert number(real, 0.8764, "+") == "+0.876"
+    declared = SimpleNamespace(share=False, decimals=3)
+    assert [number(declared, value) for value in (1.0, 12.34)] == ["1.000", "12.340"]
 
 
 def test_one_rollout_makes_a_table_without_intervals():
