@@ -1,13 +1,13 @@
-"""Small parts for the learning tests: a few agents, a trivial synthesizer, quick settings."""
+"""Small parts for the learning tests: a few agents, trivial attackers, quick settings."""
 
 import torch
 
 from e2rl.ego.actor import ActorEgo
-from e2rl.learning.curriculum import CurriculumScheduler, CurriculumSettings
+from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
 from e2rl.learning.evolution import Evolution, RoundSettings
-from e2rl.learning.improvement import CollectSettings, PolicyImprovement
-from e2rl.learning.update import UpdateSettings
+from e2rl.learning.policy import PolicyImprovement
 from e2rl.sim.env import SimSettings
+from e2rl.traffic.traffic import Traffic, TrafficPlan, keep_velocity
 from tests.synthetic import make_scenes
 
 
@@ -39,16 +39,37 @@ def brake_check(scenes):
     return synthesize
 
 
-def small_run(seed=0, hidden=(16,), nominal="log", rounds=4, scenes=None, collect=None, measure=None, **update):
+class Ambush(Traffic):
+    """A trivial reacting method: where eta is positive, vehicle 1 is put where the ego plans to be in 0.5 s; the others
+    keep their velocity."""
+
+    def reset(self, scenes, seed, eta):
+        return eta
+
+    def replan(self, state, world, ego_plan):
+        vehicles = world.scene["route_log"].shape[1]
+        states = keep_velocity(world.states[:, :vehicles])
+        attacked, acting = state > 0, torch.zeros_like(world.valid[:, :vehicles])
+        states[attacked, 1] = ego_plan[attacked, 4:5]
+        acting[:, 1] = attacked
+        present = world.valid[:, :vehicles, None].expand(states.shape[:-1])
+        return state, TrafficPlan(states, present, adversary=acting)
+
+
+def small_run(seed=0, hidden=(16,), nominal="log", rounds=4, scenes=None, collect=None, live=None, expert=None, **ppo):
+    """live: a method that drives the traffic against the learning policy; expert: settings of what is cloned."""
     torch.manual_seed(seed)
     scenes = scenes or small_scenes()
     improve = PolicyImprovement(
         ActorEgo(hidden=hidden),
         scenes,
         SimSettings(),
-        UpdateSettings(**({"minibatch": 64, "epochs": 2, "critic_warmup": 0, "target_kl": 1.0} | update)),
-        collect or CollectSettings(batch=4, steps=20, iterations=2),
-        seed=seed,
+        live,
+        seed,
+        collect={"batch": 4, "steps": 20, "iterations": 2} | (collect or {}),
+        ppo={"minibatch": 64, "epochs": 2, "critic_warmup": 0, "target_kl": 1.0} | ppo,
+        **(expert or {}),
     )
-    curriculum = CurriculumScheduler(len(scenes), rounds, CurriculumSettings(), seed)
-    return Evolution(curriculum, improve, brake_check(scenes), RoundSettings(scenes=3, nominal=nominal), seed, measure)
+    settings = RoundSettings(scenes=3, nominal=nominal, traffic="replay" if live is None else "live")
+    curriculum = AdaptiveCurriculum(len(scenes), rounds, seed)
+    return Evolution(curriculum, improve, brake_check(scenes), settings, seed)

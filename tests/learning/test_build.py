@@ -1,76 +1,125 @@
-"""Every configuration of learner, curriculum and logger builds and runs."""
-
-from pathlib import Path
+"""Every configuration of learner, curriculum and logger builds and runs, a curriculum of one's own among them."""
 
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
 from omegaconf import open_dict
 
+from e2rl.build import build_ego, load_config
 from e2rl.errors import InputError
 from e2rl.learning.build import build_evolution, build_logger, run_imitation
-from e2rl.learning.improvement import PlannerImprovement, PolicyImprovement
-from tests.learning.small import brake_check, small_scenes
+from e2rl.learning.checkpoint import load_checkpoint, save_checkpoint
+from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
+from e2rl.learning.curriculum.constant import ConstantCurriculum
+from e2rl.learning.curriculum.linear import LinearCurriculum
+from e2rl.learning.curriculum.scheduler import CurriculumScheduler
+from e2rl.learning.planner import PlannerImprovement
+from e2rl.learning.policy import PolicyImprovement
+from tests.learning.small import Ambush, brake_check, small_scenes
 
-CONF = str(Path(__file__).resolve().parents[2] / "conf")
-GROUPS = ("sim", "ego", "learner", "curriculum", "logger")
-
-
-def config_of(*choices):
-    """The groups of these rooms, as train.yaml composes them."""
-    chosen = {"sim": "default", "ego": "actor", "learner": "ppo_bc", "curriculum": "adaptive", "logger": "csv"}
-    chosen |= dict(choice.split("=") for choice in choices)
-    with initialize_config_dir(CONF, version_base="1.3"):
-        config = compose(overrides=[f"+{group}={chosen[group]}" for group in GROUPS])
-    with open_dict(config):
-        config.update({"seed": 0, "device": "cpu", "rounds": 2})
-    return config
+CURRICULA = {"adaptive": AdaptiveCurriculum, "linear": LinearCurriculum, "constant": ConstantCurriculum}
+POLICY = ["ego.hidden=[16]", "learner.imitation.batch=2", "learner.imitation.epochs=1"]
+POLICY += [f"learner.collect.{setting}" for setting in ("batch=4", "steps=20", "iterations=1")]
+PLANNER = ["learner=planner_tuning", "ego=lane_graph", "learner.batch=2"]
 
 
-def small(config):
-    config.learner.round.scenes = 2
-    if config.learner.kind == "policy":
-        config.learner.collect.update({"batch": 4, "steps": 20, "iterations": 1})
-        config.learner.imitation.update({"epochs": 1, "batch": 2})
-        config.ego.hidden = [16]
-    else:
-        config.learner.grid = {"risk_slope": [0.5]}
-        config.learner.batch = 2
-    return config
+class Doubling(CurriculumScheduler):
+    """A curriculum of one's own: the intensity doubles after every round that the ego has survived."""
+
+    def __init__(self, num_scenes, rounds, seed=0, first=1.0, **scenes):
+        super().__init__(num_scenes, rounds, seed, **scenes)
+        self._eta = first
+
+    @property
+    def eta(self):
+        return self._eta
+
+    @property
+    def share(self):
+        return 1.0
+
+    def advance(self, collision_rate=None):
+        super().advance(collision_rate)
+        self._eta *= 1 if collision_rate else 2
+
+    def extra_state(self):
+        return {"eta": self._eta}
+
+    def load_extra_state(self, state):
+        self._eta = state["eta"]
 
 
-@pytest.mark.parametrize("curriculum", ["adaptive", "linear", "constant"])
+def config_of(*overrides):
+    """train.yaml with two rounds of two scenes."""
+    return load_config("train", ["rounds=2", "learner.round.scenes=2", *overrides])
+
+
+def built(config):
+    scenes = small_scenes(3)
+    return build_evolution(config, scenes, build_ego(config), Ambush(), brake_check(scenes))
+
+
+@pytest.mark.parametrize("curriculum", CURRICULA)
 def test_policy_learner(curriculum):
-    config, scenes = small(config_of(f"curriculum={curriculum}")), small_scenes(3)
-    run = build_evolution(config, scenes, instantiate(config.sim), instantiate(config.ego), brake_check(scenes))
-    assert isinstance(run.improve, PolicyImprovement) and run.curriculum.settings.schedule == curriculum
+    run = built(config_of(f"curriculum={curriculum}", *POLICY))
+    assert isinstance(run.improve, PolicyImprovement) and type(run.curriculum) is CURRICULA[curriculum]
     assert run.run_round()["train/expert_pairs"] > 0
 
 
 def test_planner_learner():
-    config, scenes = small(config_of("learner=planner_tuning", "ego=lane_graph")), small_scenes(3)
-    run = build_evolution(config, scenes, instantiate(config.sim), instantiate(config.ego), brake_check(scenes))
+    config = config_of(*PLANNER)
+    config.learner.grid = {"risk_slope": [0.5]}
+    run = built(config)
     assert isinstance(run.improve, PlannerImprovement)
     assert run.run_round()["train/trials"] == 2
 
 
+def test_live_traffic_needs_no_stored_one():
+    config = config_of("learner.round.traffic=live", *POLICY)
+    run = build_evolution(config, small_scenes(3), build_ego(config), Ambush())
+    assert run.run_round()["synthesizer/contact"] > 0 and not run.traffic
+
+
+def test_without_a_synthesizer_given_the_traffic_method_attacks():
+    config = config_of("learner.round.nominal=log", "curriculum.solvable_only=false", *POLICY)
+    run = build_evolution(config, small_scenes(3), build_ego(config), Ambush())
+    metrics = run.run_round()
+    assert metrics["synthesizer/attacked"] == metrics["synthesizer/contact"] == 1.0
+    assert len(run.traffic["scene_index"]) == 2
+
+
+def test_a_curriculum_of_ones_own_is_built_and_resumed(tmp_path):
+    config = config_of(*POLICY)
+    with open_dict(config):
+        config.curriculum = {"_target_": f"{__name__}.Doubling", "first": 0.25, "staleness": 0.5}
+    run = built(config)
+    assert isinstance(run.curriculum, Doubling) and run.curriculum.staleness == 0.5
+    assert run.run_round()["curriculum/eta"] == 0.25
+    save_checkpoint(tmp_path, run, {})
+    again = built(config)
+    assert load_checkpoint(tmp_path, again) == 1
+    assert again.curriculum.eta == run.curriculum.eta == 0.5
+    assert again.run_round()["curriculum/eta"] == 0.5
+
+
 def test_imitation_stage(tmp_path):
-    config, scenes = small(config_of()), small_scenes(3)
-    row = run_imitation(
-        config, scenes, instantiate(config.sim), instantiate(config.ego), tmp_path, build_logger(config, tmp_path)
-    )
+    config, scenes = config_of(*POLICY), small_scenes(3)
+    row = run_imitation(config, scenes, build_ego(config), tmp_path, build_logger(config, tmp_path))
     assert row["epoch"] == 0.0 and (tmp_path / "actor.safetensors").is_file()
     assert (tmp_path / "logs/scalars/train/imitation_loss.csv").is_file()
 
 
 def test_mismatched_groups_are_refused(tmp_path):
-    config, scenes = small(config_of("learner=planner_tuning", "ego=lane_graph")), small_scenes(3)
+    config, scenes = config_of(*PLANNER), small_scenes(3)
     with pytest.raises(InputError, match="stage=imitation"):
-        run_imitation(config, scenes, instantiate(config.sim), instantiate(config.ego), tmp_path)
-    config = small(config_of())
-    config.learner.kind = "guess"
-    with pytest.raises(InputError, match="guess"):
-        build_evolution(config, scenes, instantiate(config.sim), instantiate(config.ego), brake_check(scenes))
+        run_imitation(config, scenes, build_ego(config), tmp_path)
+    with pytest.raises(InputError, match="improves ego=actor"):
+        built(config_of("ego=idm"))
+    for group, target in (("learner", "e2rl.ego.idm.IDMEgo"), ("curriculum", "e2rl.no.Such")):
+        with pytest.raises(InputError, match=f"{group}={target}"):
+            built(config_of(f"{group}._target_={target}", *POLICY))
+    with pytest.raises(InputError, match="curriculum"):
+        built(config_of("+curriculum.cosine=1", *POLICY))
+    with pytest.raises(InputError, match="learner.ppo.clipp"):
+        built(config_of("+learner.ppo.clipp=1", *POLICY))
 
 
 @pytest.mark.parametrize("kind", ["csv", "wandb", "none"])

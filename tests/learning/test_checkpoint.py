@@ -7,11 +7,11 @@ from e2rl.ego.actor import ActorEgo
 from e2rl.ego.idm import IDMEgo
 from e2rl.errors import InputError
 from e2rl.learning.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint, saved_config
-from e2rl.learning.curriculum import CurriculumScheduler
+from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
 from e2rl.learning.evolution import Evolution, RoundSettings
-from e2rl.learning.improvement import PlannerImprovement
+from e2rl.learning.planner import PlannerImprovement
 from e2rl.sim.env import SimSettings
-from tests.learning.small import brake_check, small_run, small_scenes
+from tests.learning.small import Ambush, brake_check, small_run, small_scenes
 
 CONFIG = {"seed": 0, "ego": {"hidden": [16]}}
 
@@ -22,13 +22,14 @@ def rounds(run, count):
     ]
 
 
-def test_resumed_rounds_are_those_of_one_run(tmp_path):
-    whole = small_run(seed=3)
+@pytest.mark.parametrize("live", [None, Ambush()], ids=["replay", "live"])
+def test_resumed_rounds_are_those_of_one_run(tmp_path, live):
+    whole = small_run(seed=3, live=live)
     expected = rounds(whole, 4)
-    first = small_run(seed=3)
+    first = small_run(seed=3, live=live)
     begun = rounds(first, 2)
     save_checkpoint(tmp_path, first, CONFIG)
-    second = small_run(seed=99)
+    second = small_run(seed=99, live=live)
     second.seed = 3
     assert load_checkpoint(tmp_path, second) == 2
     assert begun + rounds(second, 2) == expected
@@ -65,8 +66,8 @@ def test_a_planners_parameters_are_resumed(tmp_path):
     def make():
         scenes = small_scenes(3)
         present, grid = {"desired_speed": 10.0, "use_limits": False}, {"desired_speed": [11.0, 12.0]}
-        improve = PlannerImprovement(IDMEgo, present, grid, scenes, SimSettings(), batch=3)
-        return Evolution(CurriculumScheduler(3, 2), improve, brake_check(scenes), RoundSettings(3, "log"))
+        improve = PlannerImprovement(IDMEgo(**present), present, scenes, SimSettings(), grid, batch=3)
+        return Evolution(AdaptiveCurriculum(3, 2), improve, brake_check(scenes), RoundSettings(3, "log"))
 
     run = make()
     rounds(run, 1)

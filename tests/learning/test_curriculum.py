@@ -4,11 +4,14 @@ import pytest
 import torch
 
 from e2rl.errors import InputError
-from e2rl.learning.curriculum import CurriculumScheduler, CurriculumSettings, ranks
+from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
+from e2rl.learning.curriculum.constant import ConstantCurriculum
+from e2rl.learning.curriculum.linear import LinearCurriculum
+from e2rl.learning.curriculum.scheduler import ranks
 
 
-def scheduler(num_scenes=6, rounds=10, **settings):
-    return CurriculumScheduler(num_scenes, rounds, CurriculumSettings(**settings))
+def scheduler(kind=AdaptiveCurriculum, num_scenes=6, rounds=10, **settings):
+    return kind(num_scenes, rounds, **settings)
 
 
 def episodes(curriculum, scenes, returns, adversarial=True):
@@ -17,8 +20,8 @@ def episodes(curriculum, scenes, returns, adversarial=True):
 
 def test_constant_and_linear_intensity_and_share():
     constant, linear = (
-        scheduler(schedule="constant", eta=2.0),
-        scheduler(schedule="linear", eta=0.5, eta_final=2.5, ramp=0.5, share=0.0, share_final=0.9),
+        scheduler(ConstantCurriculum, eta=2.0),
+        scheduler(LinearCurriculum, eta=0.5, eta_final=2.5, ramp=0.5, share=0.0, share_final=0.9),
     )
     etas, shares = [], []
     for _ in range(10):
@@ -36,6 +39,8 @@ def test_adaptive_intensity_seeks_the_band_within_its_bounds():
         curriculum.advance(rate)
         seen.append(curriculum.eta)
     assert seen == [1.5, 1.5, 2.0, 2.0, 1.5, 1.0, 0.5, 0.5, 0.5]
+    curriculum.advance()
+    assert curriculum.eta == 0.5 and curriculum.round == 10, "no collision rate is known: it stays"
 
 
 def test_adaptive_intensity_settles_where_the_ego_collides_as_often_as_wanted():
@@ -110,10 +115,19 @@ def test_state_goes_on_exactly():
         scheduler(num_scenes=5).load_state_dict(first.state_dict())
 
 
-def test_wrong_settings_are_refused():
-    for settings in ({"schedule": "cosine"}, {"target_low": 0.6}, {"share": 1.5}, {"temperature": 0.0}):
+@pytest.mark.parametrize("kind", [AdaptiveCurriculum, LinearCurriculum, ConstantCurriculum])
+def test_wrong_settings_are_refused(kind):
+    own = [{"target_low": 0.6}] if kind is AdaptiveCurriculum else []
+    for settings in (*own, {"share": 1.5}, {"temperature": 0.0}, {"staleness": 2.0}, {"num_scenes": 0}):
         with pytest.raises(InputError, match="curriculum"):
-            CurriculumSettings(**settings)
+            scheduler(kind, **settings)
+
+
+def test_without_priorities_all_scenes_are_alike():
+    curriculum = scheduler(num_scenes=4, prioritised=False)
+    episodes(curriculum, [0, 1], [8.0, 8.0], adversarial=False)
+    episodes(curriculum, [0, 1], [0.0, 8.0])
+    assert curriculum.priority().tolist() == [0.25] * 4
 
 
 def test_scenes_left_out_are_not_drawn_first():

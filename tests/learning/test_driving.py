@@ -4,31 +4,32 @@ import pytest
 import torch
 
 from e2rl.ego.idm import IDMEgo
-from e2rl.learning.driving import drive, drive_all, episodes_of
-from e2rl.learning.pool import TrafficPool
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.learning.driving import PoolDriver, episodes_of
+from e2rl.sim.env import SimSettings
+from e2rl.traffic.pool import TrafficPool
 from tests.learning.small import brake_check, small_scenes
 
 
 def attacked(scenes, eta=1.0):
     index = torch.arange(len(scenes))
-    return TrafficPool.synthesized(brake_check(scenes)(None, index, eta, 0), True) + TrafficPool.recorded(index)
+    return TrafficPool.stored(brake_check(scenes)(None, index, eta, 0), eta) + TrafficPool.recorded(index)
 
 
 def test_outcomes_do_not_depend_on_the_batch():
     scenes = small_scenes(5, steps=40)
     pool = attacked(scenes)
-    parts = [drive_all(DrivingEnv(scenes, SimSettings(), batch), IDMEgo(), pool) for batch in (10, 4)]
+    parts = [PoolDriver(scenes, SimSettings(), batch).drive_all(IDMEgo(), pool) for batch in (10, 4, 16)]
     for name in ("row", "scene_index", "contact", "returns", "progress", "acceleration"):
-        assert torch.equal(getattr(parts[0], name), getattr(parts[1], name)), name
+        for part in parts[1:]:
+            assert torch.equal(getattr(parts[0], name), getattr(part, name)), name
     assert parts[0].row.tolist() == list(range(10)) and parts[0].adversarial.tolist() == [True] * 5 + [False] * 5
 
 
 def test_a_drive_counts_until_its_first_contact():
     scenes = small_scenes(2, steps=40)
     pool = attacked(scenes, eta=7.0)
-    env, rows = DrivingEnv(scenes, SimSettings(), 2), torch.tensor([0, 2])
-    frames = drive(env, IDMEgo(hardest_braking=0.1, braking=0.1), pool, rows)
+    rows = torch.tensor([0, 2])
+    frames = PoolDriver(scenes, SimSettings(), 2).drive(IDMEgo(hardest_braking=0.1, braking=0.1), pool, rows)
     episodes = episodes_of(frames, pool, rows)
     assert episodes.contact.tolist() == [True, False]
     assert frames["alive"][1].all() and frames["alive"][0].sum() < 40
@@ -37,14 +38,14 @@ def test_a_drive_counts_until_its_first_contact():
 
 def test_disturbances_are_executed_but_not_intended():
     scenes = small_scenes(2)
-    env, pool = DrivingEnv(scenes, SimSettings(), 2), TrafficPool.recorded(torch.arange(2))
-    frames = drive(env, IDMEgo(), pool, torch.arange(2), lambda action, step: action + torch.tensor([1.0, 0.0]))
+    driver, pool = PoolDriver(scenes, SimSettings(), 2), TrafficPool.recorded(torch.arange(2))
+    frames = driver.drive(IDMEgo(), pool, torch.arange(2), lambda action, step: action + torch.tensor([1.0, 0.0]))
     assert torch.allclose(frames["executed"][..., 0], frames["intended"][..., 0] + 1.0, atol=1e-3)
 
 
 def test_mean_acceleration_is_that_of_the_drive():
     scenes = small_scenes(2, num_vehicles=1, num_vrus=0, limit=30.0)
-    env, pool = DrivingEnv(scenes, SimSettings(), 2), TrafficPool.recorded(torch.arange(2))
-    episodes = drive_all(env, IDMEgo(acceleration=1.0), pool)
-    gained = env.world().states[:, 0, 3] - 10.0
+    driver, pool = PoolDriver(scenes, SimSettings(), 2), TrafficPool.recorded(torch.arange(2))
+    episodes = driver.drive_all(IDMEgo(acceleration=1.0), pool)
+    gained = driver.env.world().states[:, 0, 3] - 10.0
     assert episodes.acceleration.tolist() == pytest.approx((gained / 2.0).tolist(), abs=1e-3)

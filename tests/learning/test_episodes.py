@@ -5,7 +5,8 @@ import torch
 from tensordict import TensorDict
 
 from e2rl.learning.episodes import finished_episodes
-from tests.learning.small import small_run
+from e2rl.traffic.pool import TrafficPool
+from tests.learning.small import brake_check, small_run, small_scenes
 
 
 def frames(lengths, total, fail=()):
@@ -14,15 +15,15 @@ def frames(lengths, total, fail=()):
     number = torch.cat([torch.full((n,), k) for k, n in enumerate(lengths)])[:total]
     done = torch.tensor([t == lengths[k] for t, k in zip(timestep.tolist(), number.tolist(), strict=True)])
     contact = done & torch.tensor([k in fail for k in number.tolist()])
-    row = number[None, :, None]
+    row, returns = number[None, :, None], timestep.float()
     return TensorDict(
         {
-            "traffic_row": row,
+            "traffic": {"row": row},
             "scene_index": row + 10,
             "next": {
                 "timestep": timestep[None, :, None],
                 "done": done[None, :, None],
-                "reward": torch.ones(1, total, 1),
+                "episode_reward": returns[None, :, None],
                 "metrics": {
                     "contact": contact[None, :, None],
                     "contact_vru": torch.zeros(1, total, 1).bool(),
@@ -74,3 +75,20 @@ def test_a_rounds_episodes_are_those_of_its_pool():
     assert len(episodes) == 8 and set(episodes.row.tolist()) <= set(range(6))
     assert torch.equal(episodes.adversarial, episodes.row < 3)
     assert torch.isin(episodes.scene_index, run.traffic["scene_index"]).all()
+
+
+def test_the_episode_reward_is_the_sum_of_an_episode_s_rewards():
+    scenes = small_scenes(steps=40)
+    run = small_run(scenes=scenes, collect={"steps": 40})
+    index = torch.arange(4)
+    attack = TrafficPool.stored(brake_check(scenes)(None, index, 7.0, 0), 7.0)
+    run.improve.synthesizer.pool = attack + TrafficPool.recorded(index)
+    run.improve.draw.probability = torch.ones(8, dtype=torch.float64)
+    after = run.improve.env.rollout(90, break_when_any_done=False)["next"]
+    total, lengths = torch.zeros(4, 1), set()
+    for step in range(90):
+        total = total + after["reward"][:, step]
+        torch.testing.assert_close(after["episode_reward"][:, step], total)
+        lengths |= set(after["timestep"][:, step][after["done"][:, step]].tolist())
+        total = total * ~after["done"][:, step]
+    assert len(lengths) > 1, "episodes of several lengths in turn"

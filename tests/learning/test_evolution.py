@@ -1,31 +1,31 @@
 """A round of Algorithm 1: against whom, in what, what changes, and what it reports."""
 
+import math
+
 import pytest
 import torch
 
 from e2rl.ego.idm import IDMEgo
 from e2rl.ego.lane_graph import LaneGraphEgo
 from e2rl.errors import InputError
-from e2rl.learning.curriculum import CurriculumScheduler, CurriculumSettings
+from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
 from e2rl.learning.evolution import Evolution, RoundSettings
-from e2rl.learning.imitation import ImitationSettings, recorded_pairs
-from e2rl.learning.improvement import CollectSettings, PlannerImprovement, PolicyImprovement
 from e2rl.learning.logging import GROUPS
-from e2rl.learning.update import UpdateSettings
+from e2rl.learning.planner import PlannerImprovement
+from e2rl.learning.policy import PolicyImprovement
 from e2rl.sim.env import SimSettings
-from tests.learning.small import brake_check, small_run, small_scenes
+from e2rl.traffic.traffic import keep_velocity
+from tests.learning.small import Ambush, brake_check, small_run, small_scenes
 
 
 def test_a_round_improves_moves_on_and_reports():
-    seen = []
-    run = small_run(nominal="prior", measure=lambda ego, number: seen.append((ego, number)) or {"cfr": 0.5})
+    run = small_run(nominal="prior")
     attack, asked = run.synthesize, []
     run.synthesize = lambda ego, index, eta, seed: asked.append((ego, eta, seed)) or attack(ego, index, eta, seed)
     before = {key: value.clone() for key, value in run.ego.network.weights().items()}
     metrics = run.run_round()
     assert [eta for _, eta, _ in asked] == [1.0, 0.0], "the attack, then the same scenes by the prior alone"
     assert asked[0][0] is run.ego and asked[0][2] == asked[1][2]
-    assert seen == [(run.ego, 0)] * 2 and metrics["eval/before_cfr"] == metrics["eval/after_cfr"] == 0.5
     assert any(not torch.equal(value, before[key]) for key, value in run.ego.network.weights().items())
     assert run.round == 1 and all(name.split("/")[0] in GROUPS for name in metrics)
     assert metrics["curriculum/eta"] == 1.0 and run.curriculum.eta == 1.25, "no contact at eta 1: it rises"
@@ -47,23 +47,45 @@ def test_nominal_traffic_may_be_the_log_or_missing():
         assert set(run.episodes.adversarial.tolist()) == kinds
     with pytest.raises(InputError, match="nominal=zero"):
         RoundSettings(nominal="zero")
+    with pytest.raises(InputError, match="traffic=dead"):
+        RoundSettings(traffic="dead")
 
 
 def test_recorded_and_corrective_pairs_are_cloned():
-    scenes = small_scenes()
-    expert = recorded_pairs(scenes, SimSettings(), ImitationSettings(drives=0)).select("observation", "action")
-    run = small_run(scenes=scenes, cloning=0.5)
-    run.improve.expert, run.improve.teacher = expert, IDMEgo()
+    run = small_run(expert={"recorded": True, "imitation": {"drives": 0}, "teacher": IDMEgo()}, cloning=0.5)
+    recorded = len(run.improve.expert)
     metrics = run.run_round()
-    assert metrics["train/expert_pairs"] > len(expert) and "train/loss_cloning" in metrics
+    assert recorded == 4 * 20
+    assert metrics["train/expert_pairs"] > recorded and "train/loss_cloning" in metrics
 
 
-def planner_run(grid, scenes=None):
-    scenes = scenes or small_scenes(3, steps=40)
+def test_live_traffic_reacts_to_the_learning_policy():
+    told = []
+
+    class Watched(Ambush):
+        def replan(self, state, world, ego_plan):
+            if not world.step.any():
+                told.append((ego_plan.clone(), run.ego.plan(world), keep_velocity(world.states[:, 0])))
+            return super().replan(state, world, ego_plan)
+
+    run = small_run(nominal="prior", live=Watched())
+    run.synthesize = None
+    before = {key: value.clone() for key, value in run.ego.network.weights().items()}
+    metrics = run.run_round()
+    assert all(math.isfinite(value) for value in metrics.values())
+    given, planned, straight = told[0]
+    torch.testing.assert_close(given, planned)
+    assert (given - straight).abs().max() > 0.5, "the plan is the policy's own"
+    assert metrics["train/contact_adversarial"] == metrics["synthesizer/contact"] == 1.0
+    assert metrics["train/contact_nominal"] == 0.0 and run.curriculum.eta < 1.0
+    assert any(not torch.equal(value, before[key]) for key, value in run.ego.network.weights().items())
+
+
+def planner_run(grid, live=None):
+    scenes = small_scenes(3, steps=40)
     present = {"desired_speed": 10.0, "headway": 1.0, "use_limits": False}
-    improve = PlannerImprovement(IDMEgo, present, grid, scenes, SimSettings(), batch=3)
-    curriculum = CurriculumScheduler(3, 2, CurriculumSettings())
-    return Evolution(curriculum, improve, brake_check(scenes), RoundSettings(scenes=3, nominal="log"))
+    improve = PlannerImprovement(IDMEgo(**present), present, scenes, SimSettings(), grid, batch=3, traffic=live)
+    return Evolution(AdaptiveCurriculum(3, 2), improve, brake_check(scenes), RoundSettings(scenes=3, nominal="log"))
 
 
 def test_planners_are_tuned_and_attacked_as_tuned():
@@ -86,6 +108,8 @@ def test_unfit_combinations_are_refused():
     with pytest.raises(InputError, match="speeed"):
         planner_run({"speeed": [1.0]})
     with pytest.raises(InputError, match="improves ego=actor"):
-        PolicyImprovement(LaneGraphEgo(), scenes, SimSettings(), UpdateSettings(), CollectSettings())
+        PolicyImprovement(LaneGraphEgo(), scenes, SimSettings())
     with pytest.raises(InputError, match="cannot hold an episode"):
-        small_run(collect=CollectSettings(batch=4, steps=5, iterations=2))
+        small_run(collect={"steps": 5})
+    with pytest.raises(InputError, match="traffic=live"):
+        planner_run({"headway": [1.0]}, live=Ambush())

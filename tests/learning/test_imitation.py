@@ -7,10 +7,11 @@ from e2rl.ego.actor import ActorEgo
 from e2rl.ego.idm import IDMEgo
 from e2rl.ego.reference import executed_action
 from e2rl.errors import InputError
+from e2rl.learning.driving import PoolDriver
 from e2rl.learning.imitation import Imitation, ImitationSettings, corrective_pairs, imitate, recorded_pairs
-from e2rl.learning.pool import TrafficPool
 from e2rl.learning.update import clip_expert
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import SimSettings
+from e2rl.traffic.pool import TrafficPool
 from tests.learning.small import brake_check, small_scenes
 
 
@@ -64,11 +65,11 @@ def test_cloning_reduces_the_held_out_loss_and_keeps_the_best_weights(tmp_path):
 
 def test_corrective_pairs_are_those_of_survived_attacks():
     scenes = small_scenes(3, steps=40)
-    attack = TrafficPool.synthesized(brake_check(scenes)(None, torch.arange(3), 1.0, 0), True)
-    env = DrivingEnv(scenes, SimSettings(), 2)
-    careful = corrective_pairs(env, IDMEgo(), attack + TrafficPool.recorded(torch.arange(3)))
+    attack = TrafficPool.stored(brake_check(scenes)(None, torch.arange(3), 1.0, 0), 1.0)
+    driver = PoolDriver(scenes, SimSettings(), 2)
+    careful = corrective_pairs(driver, IDMEgo(), attack + TrafficPool.recorded(torch.arange(3)))
     assert careful["scene_index"].unique().tolist() == [0, 1, 2] and (careful["action"][:, 0] < -1).any()
-    blind = corrective_pairs(env, IDMEgo(hardest_braking=0.0, braking=0.01), attack)
+    blind = corrective_pairs(driver, IDMEgo(hardest_braking=0.0, braking=0.01), attack)
     assert len(blind) == 0
     with pytest.raises(InputError, match="no adversarial"):
-        corrective_pairs(env, IDMEgo(), TrafficPool.recorded(torch.arange(3)))
+        corrective_pairs(driver, IDMEgo(), TrafficPool.recorded(torch.arange(3)))

@@ -1,9 +1,9 @@
 """The best admissible trial wins, standing still does not, and the whole grid is reported."""
 
 import pytest
-from e2rl.learning.planner_tuning import TuningSettings, combinations, tune
 
 from e2rl.errors import InputError
+from e2rl.learning.planner import TuningSettings, combinations, tune
 
 PRESENT = {"speed": 10.0, "caution": 1.0, "other": "kept"}
 

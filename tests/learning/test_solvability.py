@@ -1,8 +1,10 @@
 """Only what some driver survives enters the curriculum, and what is left out is said."""
 
+from functools import partial
+
 import torch
 
-from e2rl.learning.solvability import solvability
+from e2rl.learning.solvability import solvable
 from e2rl.sim.env import SimSettings
 from tests.learning.small import brake_check, small_run, small_scenes
 
@@ -26,7 +28,7 @@ def ambush(scenes):
 def test_the_doomed_are_left_out_and_reported():
     scenes = small_scenes(4)
     run = small_run(scenes=scenes)
-    run.synthesize, run.solvable = ambush(scenes), solvability(scenes, SimSettings())
+    run.synthesize, run.solvable = ambush(scenes), partial(solvable, scenes=scenes, sim=SimSettings())
     run.settings = type(run.settings)(scenes=4, nominal="log")
     metrics = run.run_round()
     assert sorted(run.traffic["scene_index"].tolist()) == [0, 2] and metrics["synthesizer/left_out"] == 2.0
@@ -45,4 +47,4 @@ def test_a_round_goes_on_where_everything_is_left_out():
 def test_without_contact_nothing_is_searched():
     scenes = small_scenes(2)
     traffic = brake_check(scenes)(None, torch.arange(2), 0.0, 0)
-    assert solvability(scenes, SimSettings())(traffic).all()
+    assert solvable(traffic, scenes, SimSettings()).all()

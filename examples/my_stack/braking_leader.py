@@ -1,0 +1,48 @@
+"""A rival adversary: the vehicle ahead of the ego brakes on its recorded path, everybody else replays the log."""
+
+import torch
+from e2rl.scene.boxes import to_frame
+from e2rl.scene.recording import DT
+from e2rl.traffic.replay import Replay
+from e2rl.traffic.traffic import steps_ahead
+from tensordict import TensorDict
+
+
+class BrakingLeader(Replay):
+    """The nearest vehicle ahead, within `reach` m and half a lane beside, brakes at eta times `braking` m/s^2."""
+
+    replays_log, adversarial = False, True
+
+    def __init__(self, prior=None, reach: float = 40.0, braking: float = 1.0):
+        self.reach, self.braking = reach, braking
+
+    def reset(self, scenes, seed, eta):
+        """Who brakes, and how hard."""
+        vehicles = scenes["route_log"].shape[1]
+        start = scenes["start"][:, :vehicles]
+        x, y = to_frame(start[..., :2], start[:, :1]).unbind(-1)
+        ahead = scenes["valid"][:, :vehicles] & (start[..., 3] > 1) & (x > 0) & (x < self.reach) & (y.abs() < 1.8)
+        nearest = x == x.masked_fill(~ahead, torch.inf).amin(1, keepdim=True)
+        leader = ahead & nearest & (eta > 0)[:, None]
+        return TensorDict({"leader": leader, "braking": self.braking * eta}, batch_size=eta.shape)
+
+    def replan(self, state, world, ego_plan):
+        """The log, but for the leader: where its braked distance is on its recorded path."""
+        state, plan = super().replan(state, world, ego_plan)
+        vehicles, leader = plan.states.shape[1], state["leader"]
+        path = world.scene["logged"][:, :, :vehicles].transpose(1, 2).contiguous()  # [B, V, T+1, 4]
+        way = path[..., :2].diff(dim=2).norm(dim=-1).cumsum(-1)  # [B, V, T]
+        first = path[:, :, 0, 3].clamp(min=0.1)[..., None]
+        braking = state["braking"][:, None, None].clamp(min=1e-3)
+        time = torch.minimum(DT * steps_ahead(world)[:, None], first / braking)  # until the halt
+        gone = (first * time - braking * time**2 / 2).contiguous()
+        index = torch.searchsorted(way, gone).clamp(max=way.shape[-1] - 1)
+        before, after = (path.gather(2, (index + k)[..., None].expand(-1, -1, -1, 4)) for k in (0, 1))
+        length = (after - before)[..., :2].norm(dim=-1).clamp(min=1e-3)
+        share = 1 - (way.gather(-1, index) - gone) / length
+        xy = before[..., :2] + share[..., None] * (after - before)[..., :2]
+        braked = torch.cat([xy, before[..., 2:3], (first - braking * time)[..., None]], -1)
+        plan.states = torch.where(leader[..., None, None], braked, plan.states)
+        plan.present = plan.present | (leader & world.valid[:, :vehicles])[..., None]
+        plan.adversary = leader
+        return state, plan
