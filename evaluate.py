@@ -48,7 +48,7 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
         save_picture(folder / "intensity.png", intensity_figure(intensity_ladder(folder)))
     if chain:
         rollout = chain.rollout(scenes, name, folder)
-        save_picture(folder / "skeleton.png", skeleton_figure(rollout, chain.kept, methods[0].traffic.topology))
+        save_picture(folder / "skeleton.png", skeleton_figure(rollout, chain.selection, chain.topology))
     print(f"\nwritten to {folder}")
     return rows
 

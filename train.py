@@ -33,11 +33,13 @@ def evolve(config: DictConfig, folder: Path) -> None:
         metrics = run.run_round()
         logger.log(metrics, number)
         save_checkpoint(folder, run, resolved(config), config.keep_last)
+        speed = metrics.get("time/steps_per_second")
         print(
             f"round {number + 1}/{config.rounds}: eta {metrics['curriculum/eta']:.2f}, adversarial collisions "
             f"{metrics.get('synthesizer/contact', float('nan')):.0%} in {metrics['synthesizer/scenes']:.0f} scenes "
             f"({metrics['synthesizer/left_out']:.0f} left out: no way found to avoid them), "
-            f"{metrics['time/synthesize']:.0f} s synthesis, {metrics['time/improve']:.0f} s learning",
+            f"{metrics['time/synthesize']:.0f} s synthesis, {metrics['time/improve']:.0f} s learning"
+            + (f", collected at {speed:.0f} steps/s" if speed else ""),
             flush=True,
         )
     logger.close()

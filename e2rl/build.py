@@ -2,12 +2,14 @@
 
 import copy
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, InstantiationException
 from hydra.types import RunMode
 from hydra.utils import instantiate
@@ -58,11 +60,27 @@ def load_choice(group: str, name: str) -> DictConfig:
             return load_choice(group, name)
     loader = GlobalHydra.instance().config_loader()
     try:
-        config = loader.load_configuration(None, [f"+{group}={name}"], RunMode.RUN, validate_sweep_overrides=False)
+        changes = [f"+{group}={name}", *_search_path()]
+        config = loader.load_configuration(None, changes, RunMode.RUN, validate_sweep_overrides=False)
     except HydraException as error:
-        choices = ", ".join(loader.get_group_options(group))
-        raise InputError(f"{group}={name}: none of {choices}; add a file to the group in conf/") from error
+        known = ", ".join(choices(group))
+        raise InputError(f"{group}={name}: none of {known}; add a file to the group in conf/") from error
     return config[group]
+
+
+def choices(group: str) -> list[str]:
+    """The names of the files in conf/<group>, as `load_choice` finds them."""
+    if not GlobalHydra.instance().is_initialized():
+        with initialize_config_dir(str(conf_folder().resolve()), version_base="1.3"):
+            return choices(group)
+    return GlobalHydra.instance().config_loader().get_group_options(group)
+
+
+def _search_path() -> list[str]:
+    """The override by which the running script was given further folders, if it was."""
+    if not HydraConfig.initialized():
+        return []
+    return [change for change in HydraConfig.get().overrides.hydra if change.startswith("hydra.searchpath")]
 
 
 def resolved(config: DictConfig) -> dict[str, Any]:
@@ -135,8 +153,14 @@ def build_sim(config: DictConfig) -> SimSettings:
 
 
 def set_up(config: DictConfig) -> None:
-    """Threads, device and torch's seed; InputError where the device is not there or a size is impossible."""
+    """Plugins, threads, device and torch's seed; InputError for a plugin or device that is not there and a size that is
+    impossible."""
     check_counts(config, threads=1, batch=1)
+    for name in config.plugins:
+        try:
+            import_module(name)
+        except ImportError as error:
+            raise InputError(f"plugins: {name}: {error}; install it or put its folder on PYTHONPATH") from error
     torch.set_num_threads(config.threads)
     if str(config.device).startswith("cuda") and not torch.cuda.is_available():
         raise InputError(f"device={config.device}: no CUDA device is available; use device=cpu")
@@ -166,11 +190,11 @@ def varied(config: DictConfig, name: str) -> DictConfig:
     changed, changes = copy.deepcopy(config), config.variants[name]
     if not isinstance(changes, DictConfig):
         raise InputError(f"variants.{name}={changes}: expected changes, such as {{synthesizer.support: random}}")
-    for key, value in changes.items():
-        if str(key).split(".")[0] not in VARIED:
+    for key, value in ((str(key), value) for key, value in changes.items()):
+        if key.split(".")[0] not in VARIED:
             raise InputError(f"variants.{name}: {key} is none of {', '.join(VARIED)}, nor in one of them")
         try:
-            OmegaConf.update(changed, str(key), value, merge=True)
+            OmegaConf.update(changed, key, value, merge=True)
         except OmegaConfBaseException as error:
             reason = str(error).splitlines()[0]
             raise InputError(f"variants.{name}: {key}={value}: {reason}; compare it with conf/") from error
@@ -199,6 +223,8 @@ def check_evaluation(config: DictConfig) -> None:
         if name not in config.variants:
             method_config(config, name)
     for name in config.variants:
+        if name in (config.synthesizer.name, *choices("synthesizer")):
+            raise InputError(f"variants.{name}: {name} is a row already; choose another name")
         varied(config, name)
     several = len(intensities(config)) > 1
     if config.figure is None:

@@ -10,7 +10,7 @@ from e2rl.scene.route import SPACING
 from e2rl.scene.scene import SceneSet
 
 LANE_WIDTH = 3.5  # m; lane 0 at y = 0, lane 1 (its left neighbour) at y = 3.5, both towards +x
-MARGIN = 1.0  # m beyond a lane's half width that still counts as on the road (design.md section 5)
+MARGIN = 1.0  # m beyond a lane's half width that still counts as on the road (docs/method.md, section 1)
 BACK = 20.0  # m of route behind each vehicle
 
 
@@ -127,7 +127,7 @@ def _lights(num_scenes, steps, red_light_x):
 
 
 def _map(road):
-    """Two lanes, the rectangle they cover, and its exact distance field of design.md section 5."""
+    """Two lanes, the rectangle they cover, and its exact distance field of docs/method.md, section 1."""
     x = torch.arange(road[0], road[1] + 1e-6, SPACING)
     y = torch.tensor([0.0, LANE_WIDTH])
     lane = torch.stack([x.repeat(2), y.repeat_interleave(len(x))], -1)

@@ -191,11 +191,14 @@ def test_unknown_keys_and_choices(world, tmp_path, monkeypatch, capsys, script, 
         ("evaluate.py", ["scene=nowhere"], "scene=nowhere"),
         ("evaluate.py", ["figure=pie"], "figure=pie"),
         ("evaluate.py", ["+variants.x={synthesizer.control.depth: 3}"], "depth"),
-        ("evaluate.py", ["+variants.x={synthesizer.support: best}"], "support is 'best'"),
+        ("evaluate.py", ["+variants.x={synthesizer.support: best}"], "synthesizer.support=best: choose one of"),
         ("evaluate.py", ["eta=-1"], "eta"),
         ("evaluate.py", ["eta=abc"], "eta=abc"),
         ("evaluate.py", ["num_scenes=0"], "num_scenes=0"),
         ("evaluate.py", ["batch=0"], "batch=0"),
+        ("evaluate.py", ["plugins=[no.such]"], "plugins: no.such: "),
+        ("train.py", ["curriculum._target_=torch.nn.ReLU"], "curriculum=torch.nn.ReLU: cannot be built: "),
+        ("train.py", ["+learner.depth=3"], "depth"),
         ("evaluate.py", ["ego=actor", "ego.checkpoint=none.safetensors"], "none.safetensors"),
     ],
 )
@@ -322,6 +325,20 @@ def test_the_adversaries_experiments_have_their_rows_and_figures(
         assert known > 0 if row["eta"] else known == 0
     assert len(list((tmp_path / "run" / "rollouts").glob("*.npz"))) == 2 * len(methods)
     assert [path.name for path in (tmp_path / "run").glob("*.png")] == ([figure] if figure else [])
+
+
+def test_a_folder_of_somebody_else_adds_methods_to_the_table(world, tmp_path, monkeypatch, capsys):
+    (tmp_path / "conf" / "synthesizer").mkdir(parents=True)
+    text = "_target_: e2rl.traffic.constant_velocity.ConstantVelocity\nname: straight\n"
+    (tmp_path / "conf" / "synthesizer" / "straight.yaml").write_text(text)
+    overrides = [
+        f"--config-dir={tmp_path / 'conf'}",
+        *arguments(world, tmp_path, "good", "data.build.steps=20", "methods=[replay,straight]", "seeds=[0]"),
+    ]
+    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    assert status == 0, said
+    rows = read_metrics(tmp_path / "run" / "metrics.json")
+    assert [(row["method"], row["eta"]) for row in rows] == [("replay", 0), ("straight", 0)]
 
 
 def test_one_scene_is_driven_as_among_all(world, tmp_path, monkeypatch, capsys):

@@ -53,6 +53,7 @@ class ActorEgo(Ego):
         static, others = static_scene(world.scene, mission_of(world.scene)), expected_states(world)[:, 1:]
         config, horizon = observation_config(world.states.device), world.scene["logged"].shape[1] - 1
         state, present = world.states[:, 0], world.valid[:, 0]
+        assert world.yaw_rate is not None
         action = torch.stack([world.accel[:, 0], world.yaw_rate], -1)
         pieces = []
         for done in range(0, PLAN_STEPS, HOLD):

@@ -96,7 +96,7 @@ class EgoPlanner(TensorDictModuleBase):
     """
 
     in_keys = ["timestep", "agents"]
-    out_keys = [("ego", "plan")]
+    out_keys: list[str | tuple[str, str]] = [("ego", "plan")]
 
     def __init__(self, ego: Ego, env) -> None:
         """env: the DrivingEnv (or a TransformedEnv around it) whose running scenes the ego drives in."""

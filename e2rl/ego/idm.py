@@ -1,4 +1,4 @@
-"""Intelligent driver model on the mission route (Treiber et al. 2000; method_and_baselines.md 4.5, standard sign)."""
+"""Intelligent driver model on the mission route (Treiber et al. 2000, eqs. 3 and 4)."""
 
 import torch
 from torch import Tensor

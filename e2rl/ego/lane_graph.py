@@ -1,4 +1,4 @@
-"""The lane-graph planner of STRIVE (Rempe et al. 2022), by the behaviour in method_and_baselines.md 4.4.
+"""The lane-graph planner of STRIVE (Rempe et al. 2022) on the mission route.
 
 It samples speed profiles along the mission, predicts everyone else on every route that they may take, and drives the
 longest profile whose probability of collision is small enough. Vectorised over scenes, profiles, others, routes, time.
@@ -125,9 +125,9 @@ def targets(start: Tensor, top: Tensor, reach: float, count: int) -> Tensor:
 
 def approach(start: Tensor, aims: Tensor, slope: float, steps: int) -> Tensor:
     """Speeds [..., steps] moving from start [...] to aims [...] by at most `slope` a step, then holding."""
-    steps = torch.arange(1, steps + 1, device=start.device, dtype=start.dtype)
+    moved = slope * torch.arange(1, steps + 1, device=start.device, dtype=start.dtype)
     change = aims - start
-    return start[..., None] + change.sign()[..., None] * torch.minimum(change.abs()[..., None], slope * steps)
+    return start[..., None] + change.sign()[..., None] * torch.minimum(change.abs()[..., None], moved)
 
 
 def capped(wanted: Tensor, caps: Tensor, slope: float) -> Tensor:
@@ -149,7 +149,7 @@ def capped(wanted: Tensor, caps: Tensor, slope: float) -> Tensor:
 
 def upsample(speed: Tensor) -> Tensor:
     """Speeds [B, PLAN_STEPS + 1] every DT, linear between nodes [B, 26] every PLAN_DT."""
-    place = torch.arange(PLAN_STEPS + 1, device=speed.device) * (DT / PLAN_DT)
-    low = place.floor().long().clamp(max=speed.shape[1] - 2)
-    share = place - low
+    tick = torch.arange(PLAN_STEPS + 1, device=speed.device) * (DT / PLAN_DT)
+    low = tick.floor().long().clamp(max=speed.shape[1] - 2)
+    share = tick - low
     return speed[:, low] * (1 - share) + speed[:, low + 1] * share

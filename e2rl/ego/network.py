@@ -25,6 +25,10 @@ STEEPEST = 0.95  # reference actions are kept within this share of the bounds, s
 class Normaliser(nn.Module):
     """Running mean and variance of observations; they change in `observe` alone, so evaluation leaves them frozen."""
 
+    count: Tensor
+    mean: Tensor
+    variance: Tensor
+
     def __init__(self, size: int) -> None:
         super().__init__()
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
@@ -54,6 +58,9 @@ class ActorNetwork(nn.Module):
     the reference anywhere. It begins at zero: an untrained actor drives as the reference does, or as half-way between
     the action's bounds without one.
     """
+
+    middle: Tensor
+    reach: Tensor
 
     def __init__(
         self,
@@ -196,14 +203,12 @@ def find_weights(path: str | Path) -> Path:
 
 def perceptron(size: int, hidden: Sequence[int], out: int, last_gain: float) -> nn.Sequential:
     """Layers size -> hidden -> out with SiLU; orthogonal weights, the last ones scaled by last_gain."""
-    sizes, layers = [size, *hidden], []
-    for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
-        layers += [nn.Linear(fan_in, fan_out), nn.SiLU()]
-    layers.append(nn.Linear(sizes[-1], out))
-    for layer in layers[::2]:
+    sizes = [size, *hidden, out]
+    layers = [nn.Linear(fan_in, fan_out) for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True)]
+    for layer in layers:
         nn.init.orthogonal_(layer.weight, 2**0.5 if layer is not layers[-1] else last_gain)
         nn.init.zeros_(layer.bias)
-    return nn.Sequential(*layers)
+    return nn.Sequential(*(module for layer in layers[:-1] for module in (layer, nn.SiLU())), layers[-1])
 
 
 def _rounded(value: Tensor) -> list[float]:

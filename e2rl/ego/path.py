@@ -21,7 +21,7 @@ class RoutePath:
     Around the route's point at arc length s + a (a metres on) the lateral offset is
     d(a) = (d0 + (m + d0 / l) a) exp(-a / l), m the slope of the heading to the route, l = return_length(speed): the
     critically damped return. It solves a linear equation in a, so planning anew on the way gives the same curve, where
-    the usual offset * exp(-a^2 / 3.5^2) (STRIVE's, method_and_baselines.md 4.4) starts with a kink no car can drive.
+    the usual offset * exp(-a^2 / 3.5^2) (of STRIVE's planner, Rempe et al. 2022) starts with a kink no car can drive.
     """
 
     def __init__(self, state: Tensor, route: Tensor, hint: Tensor | None = None) -> None:
@@ -110,8 +110,8 @@ class MissionPath(RoutePath):
 
 def look_up(caps: Tensor, ahead: Tensor) -> Tensor:
     """Speeds [B, ...] of the squared caps of `speed_caps` at `ahead` [B, ...] metres, the last one held."""
-    place = (ahead / SPACING).clamp(0, caps.shape[-1] - 1.001)
-    index = place.detach().floor().long()
+    vertex = (ahead / SPACING).clamp(0, caps.shape[-1] - 1.001)
+    index = vertex.detach().floor().long()
     flat = index.view(len(caps), -1)
     low, high = (caps.gather(1, flat + shift).view(ahead.shape) for shift in (0, 1))
-    return (low + (place - index) * (high - low)).clamp(min=0).sqrt()
+    return (low + (vertex - index) * (high - low)).clamp(min=0).sqrt()

@@ -90,8 +90,8 @@ def _leaders(observation: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor]
     ego = observation[..., EGO]
     half_length, half_width = 2.5 * ego[..., 8, None], ego[..., 9, None]
     agents = observation[..., AGENTS].unflatten(-1, (NEAREST, 15))
-    place = torch.stack([agents[..., 1] * FAR, agents[..., 2] * NEAR], -1)
-    along, apart, direction = _on_path(place, path)
+    position = torch.stack([agents[..., 1] * FAR, agents[..., 2] * NEAR], -1)
+    along, apart, direction = _on_path(position, path)
     cos, sin = agents[..., 3], agents[..., 4]
     aligned = cos * direction[..., 0] + sin * direction[..., 1]
     across = (sin * direction[..., 0] - cos * direction[..., 1]).abs()
@@ -106,14 +106,14 @@ def _leaders(observation: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor]
     return torch.cat([gap, halt], -1), torch.cat([leading, still], -1), torch.cat([steady, still], -1)
 
 
-def _on_path(place: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Points place [..., A, 2] at the nearest segment of the ego's origin + path [..., K, 2]: metres along, metres
+def _on_path(position: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Points position [..., A, 2] at the nearest segment of the ego's origin + path [..., K, 2]: metres along, metres
     apart, each [..., A], and the segment's direction [..., A, 2]."""
     corner = torch.cat([torch.zeros_like(path[..., :1, :]), path], -2)
     leg = corner.diff(dim=-2)
     length = leg.norm(dim=-1).clamp(min=1e-3)
     unit = (leg / length[..., None])[..., None, :, :]
-    offset = place[..., :, None, :] - corner[..., None, :-1, :]
+    offset = position[..., :, None, :] - corner[..., None, :-1, :]
     t = torch.minimum((offset * unit).sum(-1).clamp(min=0), length[..., None, :])
     apart, index = (offset - t[..., None] * unit).norm(dim=-1).min(-1)
     begun = (length.cumsum(-1) - length)[..., None, :]

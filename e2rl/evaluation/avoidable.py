@@ -1,4 +1,4 @@
-"""Which of the collisions found an ego could have avoided: columns of the rollouts' rows (design.md section 5)."""
+"""Which of the collisions an ego could have avoided: columns of the rollouts' rows (docs/method.md, section 10)."""
 
 import time
 
@@ -30,12 +30,12 @@ def add_avoidable(rows: list[dict], rollouts: dict, scene: TensorDictBase, sim: 
     found = early.found | late.found  # who can avoid it late can do so early: by driving as recorded until then
     peak = torch.where(early.found, early.peak, torch.where(late.found, late.peak, torch.nan))
     spent = (time.perf_counter() - begin) / len(collided)
-    for place, index in enumerate(collided):
+    for row, index in enumerate(collided):
         rows[index] |= {
-            "avoidable": float(found[place]),
-            "avoidable_1s": float(late.found[place]),
-            "evasion_accel": peak[place].item(),
-            "evasion_tried": int(early.tried[place] + late.tried[place]),
+            "avoidable": float(found[row]),
+            "avoidable_1s": float(late.found[row]),
+            "evasion_accel": peak[row].item(),
+            "evasion_tried": int(early.tried[row] + late.tried[row]),
             "evasion_seconds": spent,
         }
 

@@ -13,6 +13,7 @@ from e2rl.evaluation.rollout_reader import read_rollout
 from e2rl.scene.scene import SceneSet
 from e2rl.synthesizer.selection import Selection
 from e2rl.synthesizer.skeleton import chain_depth
+from e2rl.synthesizer.topology import TopologySettings
 from e2rl.traffic.rows import take_rows
 
 
@@ -35,14 +36,26 @@ class LongestChain:
             if rank > self.rank:
                 self.kept, self.rank = take_rows(selection, torch.tensor([row])), rank
 
-    def rollout(self, scenes: SceneSet, ego_name: str, folder: Path) -> dict:
-        """The rollout that the kept selection belongs to, from its file; InputError where nobody was chosen."""
+    @property
+    def selection(self) -> Selection:
+        """The kept selection; InputError where nobody was chosen."""
         if self.kept is None:
             raise InputError(
                 f"figure=skeleton: {self.method.name} at eta={self.method.eta:g} chose no adversary in any scene; name "
                 "e2 first in methods, at an eta above 0, and evaluate more scenes, or name one with scene="
             )
-        seed, scene = divmod(int(self.kept.seed), SEEDS_APART)
+        return self.kept
+
+    @property
+    def topology(self) -> TopologySettings:
+        """Settings of the risk graphs that the method's selections rest on; InputError for a method without any."""
+        if self.method.traffic.topology is None:
+            raise InputError(f"figure=skeleton: needs a method of e2 first in methods, not {self.method.name}")
+        return self.method.traffic.topology
+
+    def rollout(self, scenes: SceneSet, ego_name: str, folder: Path) -> dict:
+        """The rollout that the kept selection belongs to, from its file; InputError where nobody was chosen."""
+        seed, scene = divmod(int(self.selection.seed), SEEDS_APART)
         identity = {"method": self.method.name, "ego_policy": ego_name, "eta": self.method.eta}
         name = rollout_name(identity | {"scene_id": scenes.scene_id[scene], "seed": seed})
         return read_rollout(Path(folder) / ROLLOUTS / name)

@@ -1,4 +1,4 @@
-"""What a run writes, and its tables read back: rollouts/*.npz, rollouts.csv, metrics.json (design.md section 6).
+"""What a run writes, and its tables read back: rollouts/*.npz, rollouts.csv, metrics.json (docs/method.md, section 11).
 
 Every file appears whole (`e2rl.files.write_atomically`).
 """
@@ -15,6 +15,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -49,7 +50,7 @@ def write_rollouts(folder: Path, rollouts: dict, source: Source) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for index in range(len(rollouts["states"])):
-        arrays = rollout_arrays(rollouts, index, source)
+        arrays: dict[str, Any] = rollout_arrays(rollouts, index, source)
         path = folder / rollout_name(arrays)
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **arrays)
@@ -105,12 +106,12 @@ def polylines(points: Tensor, index: Tensor, minimum: int) -> tuple[np.ndarray, 
 
     Lines of fewer than `minimum` points describe nothing and are left out.
     """
-    points, index = points.float().numpy(), index.numpy()
-    counts = np.bincount(index[index >= 0], minlength=1)
+    line = index.numpy()
+    counts = np.bincount(line[line >= 0], minlength=1)
     kept = np.flatnonzero(counts >= minimum)
-    chosen = np.isin(index, kept)
-    order = np.argsort(index[chosen], kind="stable")
-    return points[chosen][order], np.concatenate([[0], np.cumsum(counts[kept])]).astype(np.int64), kept
+    chosen = np.isin(line, kept)
+    order = np.argsort(line[chosen], kind="stable")
+    return points.float().numpy()[chosen][order], np.concatenate([[0], np.cumsum(counts[kept])]).astype(np.int64), kept
 
 
 # --- rows

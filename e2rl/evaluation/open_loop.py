@@ -56,7 +56,7 @@ def _summary(columns: dict[str, Tensor], scenes: SceneSet) -> dict[str, dict[str
     rows = [{"location": place, "scene_id": name} for place, name in zip(scenes.location, scenes.scene_id, strict=True)]
     cluster, clusters = cluster_index(rows)
     draws = bootstrap_draws(clusters)
-    result = {}
+    result: dict[str, dict[str, float]] = {}
     for at in (f"_{horizon:g}" for horizon in HORIZONS):
         vehicles, straight = columns[f"vehicles{at}"], columns[f"cv_ade{at}"]
         quotients = {

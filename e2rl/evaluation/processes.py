@@ -12,8 +12,9 @@ import torch
 
 from e2rl.errors import InputError
 
-Job, Result = TypeVar("Job"), TypeVar("Result")
-_function: Callable | None = None  # of a worker: what its pool was made for
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+_function: Callable  # of a worker: what its pool was made for
 
 
 def cores() -> int:

@@ -1,8 +1,9 @@
-"""The closed-loop protocol: methods x scenes x seeds with one ego, and the files of a run (docs/method.md, 11)."""
+"""The closed-loop protocol: methods x scenes x seeds with one ego, the files of a run (docs/method.md, section 11)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -86,7 +87,7 @@ def run_protocol(
     save_rollouts: bool = True,
     processes: int = 1,
     only: Sequence[int] | None = None,
-    **fields,
+    **fields: Any,
 ) -> list[dict]:
     """Roll out every method on every (scene, seed), score, and return the rows of metrics.json.
 

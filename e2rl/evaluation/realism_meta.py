@@ -59,7 +59,8 @@ class Tally:
 
     def likelihoods(self, rollouts: int) -> dict[str, Tensor]:
         """Likelihood [S] of each feature's logged values after `rollouts` rollouts of every scene; NaN without any."""
-        scenes, found = self.scenes, {name: [] for name in FEATURES}
+        scenes = self.scenes
+        found: dict[str, list[tuple[Tensor, Tensor]]] = {name: [] for name in FEATURES}
         batch = {
             "states": scenes["logged"],
             "valid": scenes["logged_valid"],
@@ -76,8 +77,8 @@ class Tally:
             for name, event in events.items():
                 log_p = log_bernoulli(self.hits[name][key], rollouts, event)[:, None]
                 found[name].append((log_p, torch.ones_like(log_p, dtype=torch.bool)))
-        joined = {name: [torch.cat(column) for column in zip(*parts, strict=True)] for name, parts in found.items()}
-        return {name: likelihood(*columns, scene, len(scenes)) for name, columns in joined.items()}
+        columns_of = {name: map(torch.cat, zip(*parts, strict=True)) for name, parts in found.items()}
+        return {name: likelihood(log_p, known, scene, len(scenes)) for name, (log_p, known) in columns_of.items()}
 
 
 def evaluated(scene: TensorDictBase) -> Tensor:

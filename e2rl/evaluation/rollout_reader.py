@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 from zlib import error as ZlibError
 
@@ -31,7 +32,7 @@ ARRAYS = (
 )
 
 
-def read_rollout(path: Path) -> dict[str, object]:
+def read_rollout(path: Path) -> dict[str, Any]:
     """The arrays of one npz, scalars as python values; InputError where it is no rollout."""
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -47,7 +48,7 @@ def read_rollout(path: Path) -> dict[str, object]:
     return {key: value.item() if key in SCALARS else value for key, value in data.items()}
 
 
-def read_rollouts(folder: Path) -> list[dict[str, object]]:
+def read_rollouts(folder: Path) -> list[dict[str, Any]]:
     """All rollouts of a folder (or of a run's folder), in the order of their names."""
     folder = Path(folder)
     paths = sorted((folder / ROLLOUTS if (folder / ROLLOUTS).is_dir() else folder).glob("*.npz"))
@@ -70,7 +71,7 @@ def as_rollout_dict(rollouts: Sequence[dict]) -> dict:
             row[tuple(slice(length) for length in array.shape)] = array
         return result
 
-    result = {
+    result: dict[str, Any] = {
         name: pad(name, 0)
         for name in (
             "states",

@@ -1,6 +1,7 @@
 """The rows of metrics.json: one per (dataset, split, method, ego, eta), with paired differences to other methods."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from torch import Tensor
 
@@ -11,7 +12,7 @@ GROUP = ("dataset", "split", "method", "ego_policy", "eta")
 Key = tuple  # values of GROUP
 
 
-def metric_row(key: Key, scenes: int, seeds: int, rollouts: int, metrics: Mapping, **fields: object) -> dict:
+def metric_row(key: Key, scenes: int, seeds: int, rollouts: int, metrics: Mapping, **fields: Any) -> dict:
     """One row of metrics.json; key: dataset, split, method, ego and eta; fields override or join it."""
     identity = dict(zip(("dataset", "split", "method", "ego", "eta"), key, strict=True))
     counts = {"n_scenes": scenes, "n_seeds": seeds, "n_rollouts": rollouts}
@@ -24,7 +25,7 @@ def metric_rows(
     features: Sequence[dict[str, Tensor]],
     draws: int = DRAWS,
     realism_draws: int = REALISM_DRAWS,
-    **fields: object,
+    **fields: Any,
 ) -> list[dict]:
     """Rows of metrics.json from the rows of rollouts, with their source's columns, and the features beside them.
 

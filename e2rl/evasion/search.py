@@ -97,7 +97,7 @@ def find_evasions(
     moment = torch.zeros(len(states), dtype=torch.int64, device=states.device) if moment is None else moment
     rows = torch.arange(len(states), device=states.device).split(CHUNK)
     parts = [_search(scene[row], states[row].float(), valid[row], moment[row], sim, settings) for row in rows]
-    return torch.cat(parts)
+    return Evasions.cat(parts)
 
 
 def _search(
@@ -117,7 +117,7 @@ def _search(
         if not len(row):
             break
         parents = pool.best(settings.survivors)
-        pool = torch.cat([parents, _try(task, *_mutated(parents, settings, generator), sim, settings)], 1)
+        pool = Trials.cat([parents, _try(task, *_mutated(parents, settings, generator), sim, settings)], 1)
         result[row] = pool.evasions(result.tried[row] + settings.samples)
     return result
 

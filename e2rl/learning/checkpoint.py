@@ -91,7 +91,9 @@ def load_checkpoint(path: str | Path, run: Evolution) -> int:
 
 def generator_states() -> dict:
     """States of the global generators of torch, CUDA, numpy and python, as plain values and tensors."""
-    name, keys, position, has_gauss, cached = np.random.get_state()
+    state = np.random.get_state()
+    assert isinstance(state, tuple)  # the global generator is a Mersenne Twister
+    name, keys, position, has_gauss, cached = state
     return {
         "torch": torch.get_rng_state(),
         "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],

@@ -23,12 +23,10 @@ Disturbance = Callable[[Tensor, Tensor], Tensor]  # (action [B, 2], step [B]) ->
 class Disturbed(TensorDictModuleBase):
     """An ego's policy whose action is disturbed; "intended" [B, 2] is what the ego wanted."""
 
-    in_keys = EgoPolicy.in_keys
-    out_keys = [*EgoPolicy.out_keys, "intended"]
-
     def __init__(self, policy: EgoPolicy, disturb: Disturbance | None) -> None:
         super().__init__()
         self.policy, self.disturb = policy, disturb
+        self.in_keys, self.out_keys = policy.in_keys, [*policy.out_keys, "intended"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = self.policy(tensordict)

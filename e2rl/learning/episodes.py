@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 OUTCOMES = ("contact", "contact_vru", "off_road", "progress")
@@ -63,7 +63,7 @@ def finished_episodes(batches: list[TensorDictBase], adversarial: Tensor, horizo
     Episodes that began less than `horizon` steps before the end of the data are left out: of these only the short ones,
     the failures, are finished. adversarial [R]: of the pool's rows.
     """
-    data = torch.cat([batch.select(*OUTCOME_KEYS).to("cpu") for batch in batches], 1)
+    data = TensorDict.cat([batch.select(*OUTCOME_KEYS).to("cpu") for batch in batches], 1)
     after, metrics = data["next"], data["next", "metrics"]
     begin = torch.arange(data.shape[1]) - after["timestep"][..., 0] + 1
     ended = after["done"][..., 0] & (begin + horizon <= data.shape[1])
@@ -72,6 +72,9 @@ def finished_episodes(batches: list[TensorDictBase], adversarial: Tensor, horizo
         row,
         data["scene_index"][ended][:, 0],
         adversarial[row],
-        *(value[ended][:, 0] for value in (contact, metrics["off_road"], after["episode_reward"], metrics["progress"])),
+        contact[ended][:, 0],
+        metrics["off_road"][ended][:, 0],
+        after["episode_reward"][ended][:, 0],
+        metrics["progress"][ended][:, 0],
         torch.full((len(row),), torch.nan),
     )

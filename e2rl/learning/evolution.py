@@ -85,6 +85,7 @@ class Evolution:
         synthesized = time.perf_counter()
         learned, self.episodes = self.improve(attack.pool, self.curriculum)
         spent = {"synthesize": synthesized - begin, "improve": time.perf_counter() - synthesized}
+        spent |= {name: learned.pop(name) for name in ("collect", "steps_per_second") if name in learned}
         self.curriculum.update(self.episodes.scene_index, self.episodes.returns, self.episodes.adversarial)
         self.curriculum.leave_out(attack.left_out)
         contact = learned.get("contact_adversarial") if attack.contact is None else attack.contact

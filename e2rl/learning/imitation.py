@@ -33,7 +33,7 @@ BURST, PAUSE = 10, 20  # steps: a disturbance lasts, and the time between the be
 
 @dataclass(frozen=True)
 class ImitationSettings:
-    """Fields: conf/learner/imitation.yaml."""
+    """Fields: `imitation` in conf/learner/ppo_bc.yaml."""
 
     epochs: int = 8
     minibatch: int = 512
@@ -112,7 +112,8 @@ class Imitation:
     """Behaviour cloning of an ActorCritic's actor from pairs, held-out scenes apart. `history` has a row per epoch."""
 
     def __init__(self, network: ActorCritic, pairs: TensorDictBase, settings: ImitationSettings) -> None:
-        self.network, self.settings, self.history = network, settings, []
+        self.network, self.settings = network, settings
+        self.history: list[dict[str, float]] = []
         self._generator = torch.Generator().manual_seed(settings.seed)
         scenes = pairs["scene_index"].unique()
         scenes = scenes[torch.randperm(len(scenes), generator=self._generator)]
@@ -171,7 +172,7 @@ def imitate(
             best, kept = row | {"epoch": float(epoch)}, {key: value.clone() for key, value in network.weights().items()}
             if folder is not None:
                 network.save(Path(folder) / WEIGHTS)
-    if kept is None:
+    if best is None or kept is None:
         raise InputError(f"learner.imitation.epochs={settings.epochs}: at least one epoch")
     network.set_weights(kept)
     return best

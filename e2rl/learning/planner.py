@@ -27,7 +27,7 @@ from e2rl.sim.env import SimSettings
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import Traffic
 
-Parameters = dict[str, object]
+Parameters = dict[str, Any]
 NEEDED = ("collision", "comfort", "progress")
 
 
@@ -116,7 +116,8 @@ class PlannerImprovement(Improvement):
             raise InputError("learner.round.traffic=live: a planner is tuned on stored traffic; set it to replay")
         self.ego, self.present, self.grid = ego, dict(parameters), {key: list(grid[key]) for key in grid}
         self.settings = settings_of(TuningSettings, tuning or {}, "learner.tuning")
-        self.driver, self.trials = PoolDriver(scenes, sim, batch, device), []
+        self.driver = PoolDriver(scenes, sim, batch, device)
+        self.trials: list[dict] = []
 
     def __call__(self, pool: TrafficPool, curriculum: CurriculumScheduler) -> tuple[dict[str, float], Episodes]:
         """Drive the pool once with every combination of the grid; the whole grid is left in `trials`."""

@@ -1,5 +1,6 @@
 """The update of a learned ego: PPO and behaviour cloning on episodes that the collector drives in the round's pool."""
 
+import time
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -119,9 +120,11 @@ class PolicyImprovement(Improvement):
         self.synthesizer.pool = pool
         self.draw.probability = pool.probabilities(curriculum.priority(), curriculum.share)
         self._collector.reset()
-        kept, rows = [], []
+        kept, rows, collecting = [], [], 0.0
         for _ in (bar := tqdm(range(self.settings.iterations), "collect and update", unit="batch", leave=False)):
+            begin = time.perf_counter()
             data = next(self._batches)
+            collecting += time.perf_counter() - begin
             self.frames += data.numel()
             kept.append(data.select(*OUTCOME_KEYS).cpu().clone())
             rows.append(self.learner.update(data, expert))
@@ -133,6 +136,7 @@ class PolicyImprovement(Improvement):
             columns[name].append(value)
         metrics = {name: sum(values) / len(values) for name, values in sorted(columns.items())}
         counts = {"frames": float(self.frames), "expert_pairs": float(0 if expert is None else len(expert))}
+        counts |= {"collect": collecting, "steps_per_second": sum(part.numel() for part in kept) / collecting}
         return metrics | episodes.summary() | counts, episodes
 
     def _expert(self, pool: TrafficPool) -> TensorDictBase | None:

@@ -22,6 +22,7 @@ def resumed(config: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
             "interrupted run printed"
         )
     saved = OmegaConf.load(file)
+    assert isinstance(saved, DictConfig)
     given = {item.split("=", 1)[0] for item in HydraConfig.get().overrides.task}
     for key in OVERRIDES:
         if key in given:

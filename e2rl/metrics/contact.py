@@ -135,9 +135,9 @@ def traffic_contact_columns(batch: Batch) -> Batch:
     one, two = used[torch.triu_indices(len(used), len(used), 1, device=states.device)]
     index = nearby(states, size, one, two, batch["valid"] & traffic[:, None])
     row, step, pair = index
-    near = [box for agent in (one[pair], two[pair]) for box in (states[row, step, agent], size[row, agent])]
+    first, second = ((states[row, step, agent], size[row, agent]) for agent in (one[pair], two[pair]))
     overlap = torch.zeros(*states.shape[:2], len(one), dtype=torch.bool, device=states.device)
-    overlap[index] = pair_overlap(*near, torch.ones_like(row, dtype=torch.bool)) > 0
+    overlap[index] = pair_overlap(*first, *second, torch.ones_like(row, dtype=torch.bool)) > 0
     later = (overlap & steps_until(batch["stop"], states.shape[1])[..., None]).any(1)
     meets = later & ~overlap[:, 0]
     touched = torch.zeros_like(traffic, dtype=torch.int64)

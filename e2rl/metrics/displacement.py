@@ -41,7 +41,7 @@ def scene_displacements(
     steps = torch.arange(1, plans.shape[3] + 1, device=logged.device)
     future = logged[:, steps.clamp(max=logged.shape[1] - 1)].transpose(1, 2)  # no vehicle counts after the log's end
     planned, constant = displacement(plans, future), displacement(reference[:, None], future)[:, 0]
-    columns = {}
+    columns: dict[str, Tensor] = {}
     for horizon in horizons:
         last = round(horizon / DT)
         counted = moving_vehicles(logged, logged_valid, simulated, last)

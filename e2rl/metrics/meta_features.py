@@ -39,8 +39,8 @@ def track_features(
     vehicles = batch["route_points"].shape[1]
     road = (batch["field"], batch["field_origin"])
     beyond = beyond_road(states[:, :, :vehicles], size[:, :vehicles], *road)[rollout, :, agent]
-    route = [batch[key][rollout, agent] for key in ("route_points", "route_light", "route_light_s")]
-    red = runs_red_light(track, known, own, *route, batch["light_state"][rollout, 1:])
+    route, light, light_s = (batch[key][rollout, agent] for key in ("route_points", "route_light", "route_light_s"))
+    red = runs_red_light(track, known, own, route, light, light_s, batch["light_state"][rollout, 1:])
     values = kinematics(track, known) | {
         "nearest_object": (gap, known),
         "time_to_collision": (time_to_collision(*pairs), known),

@@ -49,7 +49,7 @@ def kinematic_samples(
 
 def traffic_samples(batch: dict[str, Tensor]) -> list[Samples]:
     """`kinematic_samples` per rollout of the traffic, and of the adversaries in it under names of their own."""
-    tracks = [batch[name] for name in ("states", "valid", "logged", "logged_valid")]
+    tracks = batch["states"], batch["valid"], batch["logged"], batch["logged_valid"]
     everybody = kinematic_samples(*tracks, batch["traffic"], batch["stop"])
     adversaries = kinematic_samples(*tracks, batch["traffic"] & batch["adversaries"], batch["stop"])
     return [

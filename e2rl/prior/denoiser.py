@@ -1,7 +1,9 @@
 """The joint denoiser: vehicles attend to each other with pair features as attention biases and values."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -97,6 +99,11 @@ class Block(nn.Module):
 class Denoiser(nn.Module):
     """x0 = alpha x + sigma F(x, t | scene), jointly over vehicles. The noise level t may differ between them."""
 
+    node_mean: Tensor
+    node_std: Tensor
+    unit_scale: Tensor
+    frequencies: Tensor
+
     def __init__(self, settings: DenoiserSettings | None = None):
         super().__init__()
         self.settings = settings = settings or DenoiserSettings()
@@ -114,10 +121,11 @@ class Denoiser(nn.Module):
         self.register_buffer("unit_scale", scales, persistent=False)
         self.register_buffer("frequencies", torch.logspace(-0.3, 1.7, 16), persistent=False)
         sizes = (width, settings.heads, settings.pair, settings.dropout)
-        self.blocks = nn.ModuleList(Block(*sizes) for _ in range(settings.blocks))
-        self.head = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, SIZE))
-        nn.init.zeros_(self.head[1].weight)
-        nn.init.zeros_(self.head[1].bias)
+        self.blocks = cast(Iterable[Block], nn.ModuleList(Block(*sizes) for _ in range(settings.blocks)))
+        last = nn.Linear(width, SIZE)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.head = nn.Sequential(nn.LayerNorm(width), last)
 
     def encode(self, nodes: Tensor, pairs: Tensor, present: Tensor) -> Encoding:
         """Encoding of node features [B, V, NODE], pair features [B, V, V, EDGE] and presence [B, V]."""

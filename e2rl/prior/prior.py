@@ -185,10 +185,10 @@ class Prior(nn.Module):
                 with torch.no_grad():
                     x0 = nominal = self.denoise(x, high, context)
             else:
-                x, nominal, x0 = control(x, high, k, context, lambda y, t=high: self.denoise(y, t, context))
+                x, nominal, x0 = control(x, high, k, context, partial(self.denoise, level=high, context=context))
             if k > 1:  # the last step takes x0 itself
-                given = {"high": high, "low": low, "noise": noise[index + 1], "churn": settings.churn}
-                step = partial(reverse_step, settings.sampler, self.schedule, x, **given)
+                given = partial(reverse_step, settings.sampler, self.schedule, x, high=high, low=low)
+                step = partial(given, noise=noise[index + 1], churn=settings.churn)
                 x, variance = step(x0=x0, past=past)
                 if control is not None:  # against what the prior would do from the same visited states
                     plain = step(x0=nominal, past=nominal_past)[0]

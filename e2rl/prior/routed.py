@@ -1,6 +1,7 @@
 """RoutedScene: the static tensors of a scene once every vehicle has been assigned a route."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -65,10 +66,10 @@ def route_scene(scene: TensorDictBase, route: Tensor, free_space: bool = False) 
     pairs = [_conflicts(points, all_rows)[0] for points in assigned["points"]]
     conflict, conflict_s, crossing = (torch.stack(parts) for parts in zip(*pairs, strict=True))
     both = valid & ~parked & has_lane
-    given = (scene["size"], scene["light_state"], scene["past"][:, :vehicles], route)
+    given = {"size": scene["size"], "light_state": scene["light_state"], "past": scene["past"][:, :vehicles]}
     meet = {"conflict": conflict & both[:, :, None] & both[:, None, :], "conflict_s": conflict_s, "crossing": crossing}
     kind = {"modelled": valid & ~parked, "parked": parked, "has_lane": has_lane & (not free_space)}
-    return RoutedScene(*given, **assigned, **meet, **kind)
+    return RoutedScene(route=route, **given, **assigned, **meet, **kind)
 
 
 def start_state(scene: TensorDictBase, routed: RoutedScene) -> LaneState:
@@ -92,7 +93,7 @@ def reroute(
     off_lane_path [B, V, P, 2]. Such a path has no lights; its limit is the highest of the candidate's."""
     off_lane = off_lane & moved
     lane = {name: take_route(scene[f"route_{name}"], route) for name in (*ROUTE_FIELDS, "valid")}
-    path = {"points": off_lane_path, "length": SPACING * (off_lane_path.shape[2] - 1), "open": False}
+    path: dict[str, Any] = {"points": off_lane_path, "length": SPACING * (off_lane_path.shape[2] - 1), "open": False}
     path |= {"limit": lane["limit"].amax(-1, keepdim=True), "light": -1, "light_s": 0.0}
 
     def change(old: Tensor, on_lane: Tensor, on_path: Tensor | float) -> Tensor:

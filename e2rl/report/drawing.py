@@ -3,7 +3,7 @@
 World coordinates are metres with y up. A figure has 72 points per inch, so lengths of layouts are in points.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -145,7 +145,7 @@ def new_panels(count: int, side: float, gap: float, head: float, foot: float = 0
     return figure, list(figure.subplots(1, count, squeeze=False, gridspec_kw=grid)[0])
 
 
-def add_legend(figure: Figure, colours: dict[str, Colour], size: float, ghost: bool = False) -> None:
+def add_legend(figure: Figure, colours: Mapping[str, Colour], size: float, ghost: bool = False) -> None:
     """What the colours mean and, with `ghost`, an empty box, in one row at the figure's lower left; font of `size`."""
     handles = [Patch(facecolor=colour, label=text) for text, colour in colours.items()]
     if ghost:

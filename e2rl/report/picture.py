@@ -99,7 +99,7 @@ class Replay:
         if self.ghost and rollout["logged_valid"][step, ego]:
             logged = interpolated(rollout["logged"], rollout["logged_valid"], time)
             shapes.append(Shape(placed(drawing.BOX, logged[ego], size[ego]), "none", drawing.EGO, 0.14))
-        for agent in sorted(np.flatnonzero(rollout["valid"][step]), key=self.layer):
+        for agent in sorted(np.flatnonzero(rollout["valid"][step]).tolist(), key=self.layer):
             kind = rollout["agent_type"][agent]
             if kind in ("pedestrian", "cyclist"):
                 shapes += drawing.vulnerable(states[agent], size[agent], kind == "cyclist")

@@ -101,14 +101,14 @@ class SkeletonPicture:
         table, nodes = axes.inset_axes((0.09, 0.02, 0.89, 0.89)), self.nodes()
         weights = self.weights[np.ix_(nodes, nodes)]
         reds = LinearSegmentedColormap.from_list("risk", (drawing.GROUND, drawing.CONTACT))
-        cells = {"cmap": reds.with_extremes(bad=drawing.BACKGROUND), "vmin": 0, "vmax": 1}
+        colours = reds.with_extremes(bad=drawing.BACKGROUND)
         others = np.ma.masked_where(np.eye(len(nodes), dtype=bool), weights)
-        table.pcolormesh(others, edgecolors=drawing.PANEL, linewidth=1, **cells)
-        style = {"fontsize": min(16, 180 / len(nodes)), "ha": "center", "va": "center"}
+        table.pcolormesh(others, cmap=colours, vmin=0, vmax=1, edgecolors=drawing.PANEL, linewidth=1)
+        font = min(16, 180 / len(nodes))
         for row, column in np.argwhere(others.filled(0) > 0):
             weight = float(weights[row, column])
             ink, text = drawing.PANEL if weight > 0.6 else drawing.INK, f"{self.ttc(weight):.1f}"
-            table.text(column + 0.5, row + 0.5, text, color=ink, **style)
+            table.text(column + 0.5, row + 0.5, text, color=ink, fontsize=font, ha="center", va="center")
         for agent in self.members:
             corner = (nodes.index(self.target[agent]), nodes.index(agent))
             table.add_patch(Rectangle(corner, 1, 1, fill=False, edgecolor=drawing.INK, linewidth=4, zorder=3))
@@ -154,7 +154,8 @@ class SkeletonPicture:
         TrafficMap(axes, self.rollout, side).show((points.min(0) + points.max(0)) / 2, trails, shapes)
         outline = [withStroke(linewidth=4, foreground=drawing.PANEL)]
         for agent in self.nodes():
-            text = axes.annotate(name(agent), states[agent, :2], (13, 9), textcoords="offset points", fontsize=15)
+            x, y = states[agent, :2]
+            text = axes.annotate(name(agent), (x, y), (13, 9), textcoords="offset points", fontsize=15)
             text.set(color=drawing.INK, path_effects=outline, zorder=ON_TOP + 1, clip_on=True)
 
 

@@ -74,7 +74,7 @@ def means_table(group: Sequence[dict], settings: str, metrics: Sequence[Metric])
     """Mean [95% interval] of each metric, with a column for each row of metrics.json."""
     known = [metric for metric in metrics if any(row["metrics"].get(metric.name, {}).get("n", 0) for row in group)]
     unknown = [metric.name for metric in metrics if metric not in known]
-    names, counted = column_names(group), COUNTED.get(group[0].get("stage"), "(n) rollouts where fewer count.")
+    names, counted = column_names(group), COUNTED.get(group[0].get("stage", ""), "(n) rollouts where fewer count.")
     caption = (
         f"{origin(group[0])}. {counts(group, names)} Mean [95% interval, bootstrap by location or scene]; {counted}"
     )
@@ -92,9 +92,9 @@ def paired_table(group: Sequence[dict], metrics: Sequence[Metric]) -> Table:
     """
     first, names = group[0], column_names(group)
     # A method with several etas is named method@eta in `paired`.
-    reference, keys = names[0], (f"{first['method']}@{first['eta']:g}", first["method"])
+    reference, keys = names[0], [f"{first['method']}@{first['eta']:g}", first["method"]]
     if any(row.get("stage") == "after" for row in group):
-        reference, keys = "before", ("before",)
+        reference, keys = "before", ["before"]
     found = [(name, row["paired"].get(key)) for name, row in zip(names, group, strict=True) for key in keys]
     columns = {name: paired for name, paired in found if paired}
     rows = []

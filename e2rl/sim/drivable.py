@@ -1,4 +1,4 @@
-"""Look-up of the drivable field: metres beyond the border of the drivable area (design.md section 5)."""
+"""Look-up of the drivable field: metres beyond the border of the drivable area (docs/method.md, section 1)."""
 
 import torch
 from torch import Tensor
@@ -13,10 +13,10 @@ def off_road(points: Tensor, field: Tensor, origin: Tensor) -> Tensor:
     between cell centres, FAR outside the grid. Differentiable in the points; costs the same wherever they are.
     """
     batch, cells = field.shape[0], field.shape[-1]
-    place = (points - origin.view(batch, *[1] * (points.ndim - 2), 2)) / CELL
-    outside = ((place < 0) | (place > cells - 1)).any(-1)
-    low = place.detach().floor().clamp(0, cells - 2)
-    share = (place - low).clamp(0, 1)
+    cell = (points - origin.view(batch, *[1] * (points.ndim - 2), 2)) / CELL
+    outside = ((cell < 0) | (cell > cells - 1)).any(-1)
+    low = cell.detach().floor().clamp(0, cells - 2)
+    share = (cell - low).clamp(0, 1)
     index = (low[..., 0] * cells + low[..., 1]).long()
     four = index[..., None] + torch.arange(2, device=index.device) * cells  # rows x and x + 1 of the cell
     four = four[..., None] + torch.arange(2, device=index.device)

@@ -24,8 +24,9 @@ from e2rl.sim.step import Outcome, StepConfig, replay_step, step
 from e2rl.sim.trajectories import Trajectories
 from e2rl.sim.world import World
 
-AT_RESET = ("start", "start_accel", "start_yaw_rate", "size", "agent_type", "field", "field_origin", "light_state")
-AT_RESET += tuple(f"route_{name}" for name in ("points", "length", "open", "limit", "light", "light_s", "log"))
+OF_ROUTE = ("points", "length", "open", "limit", "light", "light_s", "log")
+OF_SCENE = ("start", "start_accel", "start_yaw_rate", "size", "agent_type", "field", "field_origin", "light_state")
+AT_RESET = (*OF_SCENE, *(f"route_{name}" for name in OF_ROUTE))
 FLAGS, METRICS = ("terminated", "truncated"), ("contact", "contact_vru", "off_road", "progress")
 
 
@@ -186,7 +187,7 @@ class DrivingEnv(EnvBase):
     @torch.no_grad()  # what an environment keeps must not grow a graph, step after step
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         replays, tracks = self.settings.replay_ego, (self._trajectories.states, self._trajectories.valid)
-        function = replay_step if replays else step
+        function: Callable[..., tuple[EgoState, Outcome]] = replay_step if replays else step
         function = compiled(function) if self.settings.compile else function
         given = (self.scene["logged"], self.scene["logged_valid"]) if replays else tensordict["action"]
         self._ego, outcome = function(self._ego, given, tracks, self._static, self._config)
@@ -206,7 +207,7 @@ class DrivingEnv(EnvBase):
         }
         if self.agents:
             now = self.world()
-            agents = {"states": now.states, "valid": now.valid, "accel": now.accel, "yaw_rate": now.yaw_rate[:, None]}
+            agents = {"states": now.states, "valid": now.valid, "accel": now.accel, "yaw_rate": self._ego.action[:, 1:]}
             result["agents"] = TensorDict(agents, shape, device=device)
         return TensorDict(result, shape, device=device)
 

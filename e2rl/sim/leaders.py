@@ -16,12 +16,9 @@ FREE_GAP = 200.0  # m: the gap of a vehicle without a leader
 STRETCH = 10  # vertices
 
 
-class Leaders(NamedTuple):
+# Called, because a field `index` of a class statement hides tuple.index for the type checker.
+class Leaders(NamedTuple("Leaders", [("gap", Tensor), ("speed", Tensor), ("index", Tensor)])):
     """Of each vehicle [B, V]: bumper-to-bumper gap [m], the leader's speed along the route [m/s], its index [B, V]."""
-
-    gap: Tensor
-    speed: Tensor
-    index: Tensor
 
 
 def leaders(

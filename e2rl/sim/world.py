@@ -30,8 +30,8 @@ class World:
     def at_start(cls, scene: TensorDictBase) -> "World":
         """Scenes [B] at their start frames."""
         step = torch.zeros(scene.batch_size[0], dtype=torch.int64, device=scene["start"].device)
-        start = (scene[key] for key in ("start", "valid", "start_accel"))
-        return cls(scene, step, *start, route=scene["route_log"], yaw_rate=scene["start_yaw_rate"][:, 0])
+        start, valid, accel = (scene[key] for key in ("start", "valid", "start_accel"))
+        return cls(scene, step, start, valid, accel, scene["route_log"], yaw_rate=scene["start_yaw_rate"][:, 0])
 
     @classmethod
     def of(cls, tensordict: TensorDictBase, scene: TensorDictBase) -> "World":
@@ -40,7 +40,9 @@ class World:
         return cls(
             scene,
             tensordict["timestep"][:, 0],
-            *(agents[key] for key in ("states", "valid", "accel")),
+            agents["states"],
+            agents["valid"],
+            agents["accel"],
             plan=tensordict.get(("traffic", "plan"), None),
             yaw_rate=agents["yaw_rate"][:, 0],
         )

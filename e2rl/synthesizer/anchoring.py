@@ -121,6 +121,7 @@ def _candidates(
 ) -> _Candidates:
     """The candidate routes of vehicles index [B, M]; keep_route: only the one that each follows."""
     vehicles, count = scene["route_points"].shape[1:3]
+    assert world.route is not None
     states, route = take(world.states[:, :vehicles], index), take(world.route, index)[..., None]
     number = route.clamp(min=0) if keep_route else torch.arange(count, device=index.device).expand(*index.shape, -1)
     at = (torch.arange(len(index), device=index.device)[:, None, None], index[..., None], number)
@@ -230,6 +231,7 @@ def propose(
     times = DT * torch.arange(1, HORIZON + 1, device=ego_plan.device)
     expected = constant_speed_states(scene, world, times)
     expected[:, 0] = ego_plan[:, :HORIZON].detach()
+    assert world.route is not None
     nobody, cost = torch.zeros_like(skeleton.coalition), expected.new_full(world.route.shape, torch.inf)
     knots, path = expected.new_zeros(*world.route.shape, KNOTS), torch.zeros_like(scene["route_points"][:, :, 0])
     anchor = Anchor(world.route.clone(), knots, nobody, cost, nobody, path)

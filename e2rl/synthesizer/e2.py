@@ -1,4 +1,4 @@
-"""e2, the adversarial synthesizer: Algorithm 1's inner part, scene by scene in batches (docs/method.md).
+"""e2, the adversarial synthesizer: Algorithm 1's inner part for batches of scenes (docs/method.md, sections 5 to 9).
 
 When a coalition is due: reference rollout, topology, feasibility, skeleton. At every replan: encode once, anchor,
 sample under sparse control. With eta = 0 nothing is controlled, and the traffic is the prior's, bit for bit.
@@ -7,6 +7,7 @@ sample under sparse control. With eta = 0 nothing is controlled, and the traffic
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -83,7 +84,9 @@ class E2(NominalTraffic):
         unknown = sorted(set(parts) - set(PARTS))
         if unknown:
             raise InputError(f"synthesizer.{unknown[0]}: no setting of e2; compare conf/synthesizer/e2.yaml")
-        settings = {name: settings_of(part, parts.get(name, {}), f"synthesizer.{name}") for name, part in PARTS.items()}
+        settings: dict[str, Any] = {
+            name: settings_of(part, parts.get(name, {}), f"synthesizer.{name}") for name, part in PARTS.items()
+        }
         self.topology: TopologySettings = settings["topology"]
         self.feasibility: FeasibilitySettings = settings["feasibility"]
         self.skeleton: SkeletonSettings = settings["skeleton"]
@@ -202,7 +205,7 @@ class E2(NominalTraffic):
         )
 
     def _support(self, state: E2State, world: World, candidates: Tensor, feasible: Tensor) -> tuple[Tensor, Tensor]:
-        """S [B, V] and who may take its place where it is empty, by `support` (eq. support_selection)."""
+        """S [B, V] and who may take its place where it is empty, by `support` (Sec. IV-A2)."""
         if self.support == "random":
             there = world.valid[:, : feasible.shape[1]] & ~state.routed.parked
             there = there & (torch.arange(feasible.shape[1], device=there.device) > 0)

@@ -78,6 +78,7 @@ def constant_speed_states(scene: TensorDictBase, world: World, times: Tensor) ->
     Vehicles without a route go straight on. Lateral offsets vanish as in the prior's plans.
     """
     states = world.states[:, : scene["route_points"].shape[1]]
+    assert world.route is not None
     chosen = world.route.clamp(min=0)
     has_route = take_route(scene["route_valid"], chosen) & (world.route >= 0)
     route = take_route(scene["route_points"], chosen)

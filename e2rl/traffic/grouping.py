@@ -4,13 +4,14 @@ Vehicles and other agents fill their rows from the front, so that a group is cro
 """
 
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
 from e2rl.sim.world import World
+from e2rl.traffic.rows import map_tensors
 
 ROWS = 160, 1024  # vehicle rows from which a group may end, and at most
 SHRUNK = 0.55  # share of its largest scene at which the next scene begins another group
@@ -71,9 +72,9 @@ def crop_world(world: World, group: Group) -> World:
     return World(TensorDict(scene, batch_size=[len(rows)]), world.step[rows], *now)
 
 
-def crop_state(value: Value, group: Group, width: int, name: str = "") -> Value:
+def crop_state(value: Any, group: Group, width: int, name: str = "") -> Any:
     """The group's part of a state (a nested dataclass of tensors) whose scenes have `width` vehicle rows."""
-    if is_dataclass(value):
+    if is_dataclass(value) and not isinstance(value, type):
         parts = {f.name: crop_state(getattr(value, f.name), group, width, f.name) for f in fields(value)}
         return replace(value, **parts)
     value = value[group.rows]
@@ -86,7 +87,7 @@ def crop_state(value: Value, group: Group, width: int, name: str = "") -> Value:
     return value[:, : group.vehicles]
 
 
-def write_state(full: Value, part: Value, group: Group, name: str = "") -> None:
+def write_state(full: Any, part: Any, group: Group, name: str = "") -> None:
     """Write the group's part of a state back, in place."""
     if is_dataclass(full):
         for field in fields(full):
@@ -104,6 +105,4 @@ def write_state(full: Value, part: Value, group: Group, name: str = "") -> None:
 
 def clone(value: Value) -> Value:
     """A nested dataclass with every tensor copied."""
-    if not is_dataclass(value):
-        return value.clone()
-    return replace(value, **{field.name: clone(getattr(value, field.name)) for field in fields(value)})
+    return map_tensors(lambda tensor: tensor.clone(), value)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -36,6 +37,12 @@ class TrafficPool:
         """Bool [R]: rows with an adversary."""
         return self.eta > 0
 
+    @property
+    def tracks(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The stored states, valid and adversaries, of a pool that has any."""
+        assert self.states is not None and self.valid is not None and self.adversaries is not None
+        return self.states, self.valid, self.adversaries
+
     @staticmethod
     def recorded(scene_index: Tensor) -> "TrafficPool":
         """Rows that replay the recordings of scenes [R]."""
@@ -66,7 +73,8 @@ class TrafficPool:
         source = torch.where(other.source >= 0, other.source + count, other.source)
         parts = {field.name: (getattr(self, field.name), getattr(other, field.name)) for field in fields(self)}
         parts["source"] = (self.source, source)
-        return TrafficPool(**{name: _joined(*pair) for name, pair in parts.items()})
+        joined: dict[str, Any] = {name: _joined(*pair) for name, pair in parts.items()}
+        return TrafficPool(**joined)
 
     def probabilities(self, priority: Tensor, share: float) -> Tensor:
         """Draw probability [R] of each row: adversarial rows make up `share`, rows of a kind go by the priority [S] of

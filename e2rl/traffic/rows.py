@@ -1,7 +1,8 @@
 """Rows of the states that traffic methods keep, and noise that depends on a scene's seed alone."""
 
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -12,23 +13,29 @@ Value = TypeVar("Value")  # a tensor, a TensorDict, a (nested) dataclass of them
 
 def take_rows(value: Value, rows: Tensor) -> Value:
     """Rows of every tensor; None stays None."""
-    if isinstance(value, Tensor | TensorDictBase):
-        return value[rows]
-    if not is_dataclass(value):
-        return value
-    return replace(value, **{field.name: take_rows(getattr(value, field.name), rows) for field in fields(value)})
+    return map_tensors(lambda tensor: tensor[rows], value)
 
 
 def put_rows(value: Value, rows: Tensor, new: Value) -> Value:
     """`value` with `rows` of every tensor replaced by those of `new`, out of place."""
-    if isinstance(value, Tensor | TensorDictBase):
-        out = value.clone()
-        out[rows] = new
+
+    def put(old: Any, fresh: Any) -> Any:
+        out = old.clone()
+        out[rows] = fresh
         return out
-    if not is_dataclass(value):
+
+    return map_tensors(put, value, new)
+
+
+def map_tensors(function: Callable, value: Any, *others: Any) -> Any:
+    """function of every tensor or TensorDict of a value, and of the same ones of others like it; the rest stays."""
+    if isinstance(value, Tensor | TensorDictBase):
+        return function(value, *others)
+    if not is_dataclass(value) or isinstance(value, type):
         return value
-    changed = {field.name: (getattr(value, field.name), getattr(new, field.name)) for field in fields(value)}
-    return replace(value, **{name: put_rows(old, rows, fresh) for name, (old, fresh) in changed.items()})
+    names = [field.name for field in fields(value)]
+    parts = {name: [getattr(each, name) for each in (value, *others)] for name in names}
+    return replace(value, **{name: map_tensors(function, *part) for name, part in parts.items()})
 
 
 def noise_of(seed: Tensor, draw: Tensor, shape: tuple[int, ...], uniform: bool = False) -> Tensor:

@@ -62,7 +62,8 @@ class Traffic(ABC):
     stochastic: seeds matter; adversarial: the intensity eta matters; predicts: plans can be compared with the log in
     open loop; replays_log: it is the recording itself; queries_ego: `replan` takes `react`, a function that asks the
     ego how it would drive against a plan: react(rows [G] of the batch, states [G, V, HORIZON, 4]) -> [G, HORIZON, 4];
-    figures: names of what its plans report; on_selection: told of every choice of adversaries, where it makes one.
+    figures: names of what its plans report; on_selection: told of every choice of adversaries, where it makes one;
+    topology: the TopologySettings that such choices rest on.
     """
 
     stochastic = True
@@ -72,6 +73,7 @@ class Traffic(ABC):
     queries_ego = False
     figures: tuple[str, ...] = ()
     on_selection: Callable[[Any], None] | None = None
+    topology: Any = None
 
     def __init__(self, prior: Prior | None = None) -> None:  # noqa: B027
         """prior: the frozen prior of the run; methods without one ignore it."""

@@ -35,14 +35,20 @@ class AdversarialSynthesizer(Transform):
         """traffic: drives LIVE rows; ego: whom a method that queries the ego asks."""
         super().__init__()
         self.pool, self.draw, self.traffic, self.ego = pool, draw, traffic, ego
-        self._drawn: Tensor | None = None  # [B] pool row of each episode
+        nothing = torch.zeros(0, dtype=torch.int64)  # before the first reset
+        self._drawn = nothing  # [B] pool row of each episode
         self._state: State = None
-        self._plan: TensorDict | None = None  # [B] the plan being driven
-        self._planned_at: Tensor | None = None  # [B] step of its planning
+        self._plan = TensorDict({}, batch_size=[0])  # [B] the plan being driven
+        self._planned_at = nothing  # [B] step of its planning
 
     @property
     def _env(self) -> DrivingEnv:
         return self.parent.base_env
+
+    @property
+    def _method(self) -> Traffic:
+        assert self.traffic is not None
+        return self.traffic
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         env = self._env
@@ -51,7 +57,7 @@ class AdversarialSynthesizer(Transform):
         mask = tensordict.get("_reset", None)
         mask = torch.ones(env.batch_size, dtype=torch.bool) if mask is None else mask.view(env.batch_size).cpu()
         rows = mask.nonzero()[:, 0]
-        if self._drawn is None:
+        if not len(self._drawn):
             self._drawn = torch.zeros(env.batch_size, dtype=torch.int64)
         self._drawn[rows] = self.draw(len(rows)).cpu()
         self._inject(rows)
@@ -64,7 +70,8 @@ class AdversarialSynthesizer(Transform):
         stored = source >= 0
         if bool(stored.any()):
             at = source[stored]
-            self._env.set_traffic(rows[stored].to(self._env.device), self.pool.states[at], self.pool.valid[at])
+            states, valid, _ = self.pool.tracks
+            self._env.set_traffic(rows[stored].to(self._env.device), states[at], valid[at])
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         if self.traffic is not None:
@@ -76,15 +83,16 @@ class AdversarialSynthesizer(Transform):
         env, rows = self._env, first.nonzero()[:, 0]
         world, drawn = env.world(), self._drawn[rows.cpu()]
         seed, eta = (getattr(self.pool, name)[drawn].to(env.device) for name in ("seed", "eta"))
-        whole = self._plan is None or len(rows) == len(first)
-        fresh = self.traffic.reset(world.scene if whole else world.scene[rows], seed, eta)
+        begins = not len(self._planned_at)
+        whole = begins or len(rows) == len(first)
+        fresh = self._method.reset(world.scene if whole else world.scene[rows], seed, eta)
         self._state = fresh if whole else put_rows(self._state, rows, fresh)
-        if self._plan is None:
+        if begins:
             self._plan, self._planned_at = self._empty_plan(), torch.zeros_like(world.step)
         vehicles = self._plan["states"].shape[1]
         self._plan["states"][rows] = keep_velocity(world.states[rows, :vehicles])
         self._plan["route"][rows] = world.scene["route_log"][rows].clamp(min=0)
-        for name in ("adversary", "path_kl", *self.traffic.figures):
+        for name in ("adversary", "path_kl", *self._method.figures):
             self._plan[name][rows] = 0
         self._planned_at[rows] = -REPLAN_STEPS
 
@@ -92,7 +100,7 @@ class AdversarialSynthesizer(Transform):
         shape, device = self._env.scene["route_log"].shape, self._env.device
         zero, none = torch.zeros(shape, device=device), torch.zeros(shape, dtype=torch.bool, device=device)
         plan = {"states": zero[..., None, None].repeat(1, 1, HORIZON, 4), "adversary": none, "path_kl": zero}
-        plan |= {"route": zero.long(), **{name: zero.clone() for name in self.traffic.figures}}
+        plan |= {"route": zero.long(), **{name: zero.clone() for name in self._method.figures}}
         return TensorDict(plan, batch_size=shape[:1], device=device)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -112,8 +120,8 @@ class AdversarialSynthesizer(Transform):
         ego_plan = keep_velocity(world.states[:, 0]) if ego_plan is None else ego_plan
         whole = len(rows) == len(world.step)
         state, now = (self._state, world) if whole else (take_rows(self._state, rows), take_rows(world, rows))
-        queries = {"react": Lookahead(self.ego, now)} if self.traffic.queries_ego and self.ego is not None else {}
-        state, plan = self.traffic.replan(state, now, ego_plan if whole else ego_plan[rows], **queries)
+        queries = {"react": Lookahead(self.ego, now)} if self._method.queries_ego and self.ego is not None else {}
+        state, plan = self._method.replan(state, now, ego_plan if whole else ego_plan[rows], **queries)
         self._state = state if whole else put_rows(self._state, rows, state)
         self._note(rows, plan)
         self._planned_at[rows] = world.step[rows]
@@ -159,8 +167,8 @@ class AdversarialSynthesizer(Transform):
         env, source = self._env, self.pool.source[self._drawn]
         vehicles = env.scene["route_log"].shape[1]
         none = torch.zeros(len(source), vehicles, dtype=torch.bool)
-        if self.pool.adversaries is not None:
-            stored = self.pool.adversaries[source.clamp(min=0), :vehicles]
+        if bool((source > RECORDED).any()):
+            stored = self.pool.tracks[2][source.clamp(min=0), :vehicles]
             none = torch.where((source > RECORDED)[:, None], stored, none)
         return none.to(env.device)
 

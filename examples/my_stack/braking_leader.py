@@ -1,11 +1,12 @@
 """A rival adversary: the vehicle ahead of the ego brakes on its recorded path, everybody else replays the log."""
 
 import torch
+from tensordict import TensorDict
+
 from e2rl.scene.boxes import to_frame
 from e2rl.scene.recording import DT
 from e2rl.traffic.replay import Replay
 from e2rl.traffic.traffic import steps_ahead
-from tensordict import TensorDict
 
 
 class BrakingLeader(Replay):

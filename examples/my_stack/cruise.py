@@ -1,6 +1,7 @@
 """An ego planner: it drives along its mission, holding its speed or braking for whoever is near on its path."""
 
 import torch
+
 from e2rl.ego.base import PLAN_STEPS, Ego
 from e2rl.ego.path import MissionPath
 from e2rl.scene.boxes import to_frame

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+
 from e2rl.errors import InputError
 from e2rl.scene.recording import Lane, Recording
 from e2rl.scene.source import Source, hash_files

@@ -1,8 +1,9 @@
 """A metric: in how many rollouts the ego brakes harder than a comfortable driver would."""
 
+from torch import Tensor
+
 from e2rl.metrics.catalogue import Metric, register
 from e2rl.scene.recording import DT
-from torch import Tensor
 
 LIMIT = 4.0  # m/s^2
 

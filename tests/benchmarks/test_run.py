@@ -23,8 +23,8 @@ SHORT = [
     "learner.collect.steps=80",
     "learner.collect.iterations=1",
     "learner.ppo.epochs=1",
-    "learner.expert.teacher=null",
-    "learner.expert.recorded=false",
+    "learner.teacher=null",
+    "learner.recorded=false",
     "measure.scenes=1",
 ]
 

@@ -20,15 +20,16 @@ def wild(ego, scale=0.3):
     return ego
 
 
-def test_own_observation_is_the_environments():
+def test_its_plan_begins_with_what_it_does_now():
+    """Planning sees what the environment observes: the first planned state is where the next action leads."""
     env, ego = DrivingEnv(make_scenes(3, num_vehicles=8), SimSettings(), 3), wild(ActorEgo(hidden=(16,)))
     td = env.reset()
     for _ in range(10):
         world = env.world()
-        seen = ego.act(world, td["observation"])
-        assert torch.allclose(ego.act(world), seen, atol=1e-5)
-        td["action"] = seen
+        plan = ego.plan(world)
+        td["action"] = ego.act(world, td["observation"], torch.cat([world.states[:, :1], plan], 1))
         td = env.step(td)["next"].exclude("reward")
+        assert torch.allclose(env.world().states[:, 0], plan[:, 0], atol=1e-4)
 
 
 def test_plan_is_what_it_does_on_a_lonely_road():
@@ -39,7 +40,7 @@ def test_plan_is_what_it_does_on_a_lonely_road():
     assert plan.shape == (2, PLAN_STEPS, 4) and torch.equal(plan, ego.plan(env.world()))
     for step in range(PLAN_STEPS):
         if step % 5 == 0:
-            action = ego.act(env.world(), td["observation"])
+            action = ego.act(env.world(), td["observation"], plan)
         td["action"] = action
         td = env.step(td)["next"].exclude("reward")
         if td["done"].any():
@@ -54,10 +55,9 @@ def test_plans_expect_the_others_plans():
     env.reset()
     ego, world = ActorEgo(hidden=(8,)), env.world()
     going_on = ego.plan(world)
-    future = world.states[:, None].repeat(1, PLAN_STEPS, 1, 1)
-    future[..., 3] = 0.0
-    env.write_traffic(0, future, world.valid[:, None].repeat(1, PLAN_STEPS, 1))
-    halting = ego.plan(env.world())
+    world.plan = world.states[:, : env.scene["route_log"].shape[1], None].repeat(1, 1, PLAN_STEPS, 1)
+    world.plan[..., 3] = 0.0
+    halting = ego.plan(world)
     assert (going_on[:, -1, 3] > 8).all() and (halting[:, -1, 3] < 3).all()
 
 
@@ -98,7 +98,7 @@ def test_file_round_trip(tmp_path):
     first.network.save(folder / "actor.safetensors")
     assert find_weights(tmp_path) == find_weights(folder) == folder / "actor.safetensors"
     second = ActorEgo(hidden=(8,), checkpoint=str(tmp_path))
-    env = DrivingEnv(make_scenes(2), SimSettings(), 2)
+    env = DrivingEnv(make_scenes(2), SimSettings(), 2, agents=True)
     policies = [EgoPolicy(ego, env)(env.reset().clone()) for ego in (first, second)]
     observation = policies[0]["observation"]
     acted, valued = [], []
@@ -125,7 +125,7 @@ def test_another_architecture_damage_and_absence_are_refused(tmp_path):
 def test_it_collects_and_survives_a_change_of_batch():
     ego = ActorEgo(hidden=(8,))
     for batch in (2, 3):
-        env = DrivingEnv(make_scenes(3, num_vehicles=2), SimSettings(), batch)
+        env = DrivingEnv(make_scenes(3, num_vehicles=2), SimSettings(), batch, agents=True)
         data = env.rollout(30, EgoPolicy(ego, env))
         assert torch.isfinite(data["action"]).all() and torch.isfinite(ego.plan(env.world())).all()
 

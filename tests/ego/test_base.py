@@ -4,7 +4,8 @@ import pytest
 import torch
 from torchrl.collectors import Collector
 
-from e2rl.ego.base import PLAN_STEPS, Ego, EgoPolicy, track
+from e2rl.ego.base import PLAN_STEPS, Ego, EgoPlanner, EgoPolicy, track
+from e2rl.ego.idm import IDMEgo
 from e2rl.ego.path import MissionPath
 from e2rl.ego.replay import ReplayEgo
 from e2rl.errors import InputError
@@ -44,9 +45,12 @@ def test_deviations_are_made_good():
     assert (state - plan[50])[:2].abs().max() < 0.05 and state[2].abs() < 0.02
 
 
+def make_env(scenes, batch):
+    return DrivingEnv(scenes, SimSettings(), batch, agents=True)
+
+
 def test_policy_collects_and_replans_at_its_own_rate():
-    env = DrivingEnv(make_scenes(2, num_vehicles=1), SimSettings(), 2)
-    ego = Cruise(replan_every=5)
+    env, ego = make_env(make_scenes(2, num_vehicles=1), 2), Cruise(replan_every=5)
     collector = Collector(
         env, EgoPolicy(ego, env), frames_per_batch=160, total_frames=160, auto_register_policy_transforms=False
     )
@@ -57,19 +61,32 @@ def test_policy_collects_and_replans_at_its_own_rate():
     assert ego.plans == 16
 
 
-def test_what_was_announced_is_driven_and_asked_for_once():
-    env = DrivingEnv(make_scenes(2, num_vehicles=1), SimSettings(), 2)
-    env.reset()
-    ego, world = Cruise(replan_every=5), env.world()
-    ego.announce(world)
-    ego.act(env.world())
-    assert ego.plans == 1, "the same moment"
-    moved = env.world()
-    moved.states = moved.states + 0.1
-    Cruise.reset(ego, moved)
-    moved.step = moved.step * 0
-    ego.act(moved)
-    assert ego.plans == 2, "another one"
+@pytest.mark.parametrize(("kind", "atol"), [(Cruise, 1e-3), (IDMEgo, 0.05)])
+def test_what_a_policy_writes_as_its_plan_is_what_it_then_drives(kind, atol):
+    """It plans once in each interval; in between, its plan is the rest of the last one."""
+    env, ego, made = make_env(make_scenes(2, num_vehicles=1, limit=12.0), 2), kind(replan_every=5), []
+    plan = ego.plan
+    ego.plan = lambda world: made.append(plan(world)) or made[-1]
+    data = env.rollout(30, EgoPolicy(ego, env))
+    told, driven = data["ego", "plan"], data["next", "agents", "states"][:, :, 0]
+    assert len(made) == 6 and told.shape[2] == PLAN_STEPS
+    for step in range(30):
+        fresh, age = made[step // 5], step % 5
+        assert torch.equal(told[:, step, : PLAN_STEPS - age], fresh[:, age:])
+        assert torch.equal(told[:, step, PLAN_STEPS - age :], fresh[:, -1:].expand(-1, age, -1)), "its end is held"
+    assert torch.allclose(driven, told[:, :, 0], atol=atol)
+    for step in range(0, 30, 5):
+        assert torch.allclose(driven[:, step : step + 5], told[:, step, :5], atol=atol), "the interval that follows"
+
+
+def test_a_planner_beside_another_policy_tells_the_plan_and_leaves_the_action():
+    env, ego = make_env(make_scenes(2, num_vehicles=1), 2), Cruise(replan_every=5)
+    constant = lambda td: td.set("action", torch.tensor([-1.0, 0.0]).repeat(2, 1))  # noqa: E731
+    planner = EgoPlanner(ego, env)
+    data = env.rollout(12, lambda td: constant(planner(td)))
+    assert ego.plans == 3 and (data["action"] == torch.tensor([-1.0, 0.0])).all()
+    speed = data["agents", "states"][:, ::5, 0, 3]
+    assert torch.allclose(data["ego", "plan"][:, ::5, -1, 3], speed, atol=1e-4), "each plan begins where the ego is"
 
 
 def test_a_reset_in_between_makes_a_new_plan_there():
@@ -77,7 +94,7 @@ def test_a_reset_in_between_makes_a_new_plan_there():
     scenes = make_scenes(2, vehicles=[(0.0, 0, 10.0), (23.0, 0, 0.0)])
     scenes.scenes["valid"][1, 1] = False
     scenes.scenes["logged_valid"][1, :, 1] = False
-    env = DrivingEnv(scenes, SimSettings(), 4)
+    env = make_env(scenes, 4)
     env.set_seed(1)
     data = env.rollout(70, EgoPolicy(Cruise(replan_every=5), env), break_when_any_done=False)
     done = data["next", "done"]
@@ -86,7 +103,7 @@ def test_a_reset_in_between_makes_a_new_plan_there():
 
 
 def test_replayed_log_is_tracked():
-    env = DrivingEnv(make_scenes(1, num_vehicles=2), SimSettings(), 1)
+    env = make_env(make_scenes(1, num_vehicles=2), 1)
     env.rollout(80, EgoPolicy(ReplayEgo(), env))
     assert torch.allclose(env.world().states[:, 0], env.scene["logged"][:, 80, 0], atol=0.01)
 

@@ -11,6 +11,7 @@ from e2rl.ego.base import PLAN_STEPS
 from e2rl.ego.idm import IDMEgo
 from e2rl.ego.lane_graph import LaneGraphEgo
 from e2rl.ego.replay import ReplayEgo
+from e2rl.settings import settings_of
 from e2rl.sim.env import DrivingEnv, SimSettings
 from tests.synthetic import make_scenes
 
@@ -28,5 +29,5 @@ def test_egos(name, kind):
 
 
 def test_sim():
-    settings = instantiate(OmegaConf.load(CONF / "sim" / "default.yaml"))
-    assert {**vars(settings), "reward": dict(settings.reward)} == vars(SimSettings())
+    settings = settings_of(SimSettings, OmegaConf.load(CONF / "sim" / "default.yaml"), "sim")
+    assert settings == SimSettings()

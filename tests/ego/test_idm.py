@@ -9,7 +9,7 @@ from tests.synthetic import make_scenes
 
 
 def drive(steps=80, ego=None, **scene):
-    env = DrivingEnv(make_scenes(1, **scene), SimSettings(), 1)
+    env = DrivingEnv(make_scenes(1, **scene), SimSettings(), 1, agents=True)
     data = env.rollout(steps, EgoPolicy(ego or IDMEgo(), env))
     return env, data
 
@@ -37,7 +37,7 @@ def test_stops_at_a_red_light_and_behind_a_parked_car():
 def test_returns_to_its_lane():
     scenes = make_scenes(1, num_vehicles=1)
     scenes.scenes["start"][0, 0, 1:3] = torch.tensor([0.8, -0.1])
-    env = DrivingEnv(scenes, SimSettings(), 1)
+    env = DrivingEnv(scenes, SimSettings(), 1, agents=True)
     data = env.rollout(60, EgoPolicy(IDMEgo(), env))
     assert env.world().states[0, 0, 1].abs() < 0.03
     assert data["action"][..., 1].abs().max() < 0.3

@@ -11,7 +11,7 @@ from tests.synthetic import make_scenes
 
 
 def world_of(**scene):
-    env = DrivingEnv(make_scenes(**{"num_scenes": 1} | scene), SimSettings(), scene.get("num_scenes", 1))
+    env = DrivingEnv(make_scenes(**{"num_scenes": 1} | scene), SimSettings(), scene.get("num_scenes", 1), agents=True)
     env.reset()
     return env, env.world()
 

@@ -11,7 +11,7 @@ from tests.synthetic import make_scenes
 
 def drive(scenes, batch=2):
     """The untrained actor drives as its reference does."""
-    env = DrivingEnv(scenes, SimSettings(end_on_contact=False), batch)
+    env = DrivingEnv(scenes, SimSettings(end_on_contact=False), batch, agents=True)
     return env.rollout(80, EgoPolicy(ActorEgo(hidden=(8,)), env)), env.world()
 
 

@@ -6,7 +6,7 @@ import torch
 from e2rl.ego.idm import IDMEgo
 from e2rl.errors import InputError
 from e2rl.evaluation.chains import LongestChain, link_risk
-from e2rl.evaluation.protocol import Method, run_protocol
+from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.sim.env import SimSettings
 from e2rl.synthesizer.selection import Selection
 from e2rl.traffic.replay import Replay
@@ -59,16 +59,18 @@ def test_the_risk_of_links_is_that_of_each_member_with_its_target():
 
 def test_the_kept_selection_is_of_a_rollout_of_the_run(tmp_path):
     chain, scene_set = listener(), scenes(3)
-    run_protocol(scene_set, [chain.method], IDMEgo(), "idm", [0, 4], SimSettings(), tmp_path, batch=2, only=[1, 2])
+    setup = Setup(scene_set, IDMEgo(), "idm", SimSettings(), batch=2)
+    run_protocol(setup, [chain.method], [0, 4], tmp_path, only=[1, 2])
     rollout = chain.rollout(scene_set, "idm", tmp_path)
     assert rollout["scene_id"] in scene_set.scene_id[1:] and rollout["seed"] in (0, 4)
     members = chain.kept.coalition[0].nonzero()[:, 0].tolist()
     assert members and rollout["adversaries"][members].all()
 
 
-def test_what_chooses_nobody_has_no_figure(tmp_path):
-    for method in (Method("nominal", synthesizer(), 0.0), Method("replay", Replay(), 0.0)):
-        with pytest.raises(InputError, match="figure=skeleton: .* chooses no coalition; name e2 first"):
-            LongestChain(method)
-    with pytest.raises(InputError, match="no vehicle was chosen in any scene"):
-        listener().rollout(scenes(1), "idm", tmp_path)
+def test_what_chooses_nobody_has_no_figure_and_says_so(tmp_path):
+    scene_set = scenes(1)
+    for method in (Method("e2", synthesizer(), 0.0), Method("replay", Replay())):
+        chain = LongestChain(method)
+        run_protocol(Setup(scene_set, IDMEgo(), "idm", SimSettings()), [method], [0])
+        with pytest.raises(InputError, match=f"figure=skeleton: {method.name} at eta=0 chose no adversary .*name e2"):
+            chain.rollout(scene_set, "idm", tmp_path)

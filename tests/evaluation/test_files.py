@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -96,11 +97,12 @@ def test_rows_read_back_are_those_written(tmp_path, rollouts):
             assert same, (column, row[column], other[column])
 
 
-def test_metrics_are_strict_json_with_counts_command_and_paired_differences(tmp_path, rollouts):
+def test_metrics_are_strict_json_with_counts_command_and_paired_differences(tmp_path, rollouts, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "eta=[1, 2]"])
     rows, features = score_rollouts(rollouts)
     both = label_rows(rows, SOURCE) + label_rows(rows, Source("synthetic", "test", "nominal", "idm"))
     both[6:] = [row | {"eta": 0.0} for row in both[6:]]
-    result = metric_rows(both, features * 2, "python evaluate.py", draws=50, realism_draws=5, stage="after")
+    result = metric_rows(both, features * 2, draws=50, realism_draws=5, stage="after")
     write_metrics(tmp_path / "metrics.json", result)
     text = (tmp_path / "metrics.json").read_text()
     assert "NaN" not in text
@@ -108,7 +110,7 @@ def test_metrics_are_strict_json_with_counts_command_and_paired_differences(tmp_
     assert [row["method"] for row in stored] == ["e2", "nominal"] and [row["eta"] for row in stored] == [2.0, 0.0]
     first = stored[0]
     assert (first["n_scenes"], first["n_seeds"], first["n_rollouts"]) == (3, 2, 6)
-    assert first["command"] == "python evaluate.py" and first["stage"] == "after" and "git" in first
+    assert first["command"] == "python evaluate.py 'eta=[1, 2]'" and first["stage"] == "after" and "git" in first
     assert first["metrics"]["transport"] == {"mean": None, "low": None, "high": None, "n": 0}
     assert (
         first["paired"].keys() == {"nominal"}
@@ -122,5 +124,5 @@ def test_several_intensities_of_one_method_are_told_apart(rollouts):
     many = [row | {"eta": eta} for eta in (1.0, 2.0) for row in label_rows(rows, SOURCE)]
     many += label_rows(rows, Source("synthetic", "test", "nominal", "idm"))
     many += label_rows(rows, Source("synthetic", "test", "nominal", "lane_graph"))
-    result = metric_rows(many, features * 4, "", draws=10, realism_draws=2)
+    result = metric_rows(many, features * 4, draws=10, realism_draws=2)
     assert [list(row["paired"]) for row in result] == [["e2@2", "nominal"], ["e2@1", "nominal"], ["e2@1", "e2@2"], []]

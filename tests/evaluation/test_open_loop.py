@@ -3,16 +3,22 @@
 import pytest
 import torch
 
-from e2rl.evaluation.open_loop import HORIZONS, open_loop_rows, sample_plans
+from e2rl.evaluation.open_loop import HORIZONS, open_loop_rows
 from e2rl.evaluation.protocol import Method
 from e2rl.metrics.catalogue import OPEN_LOOP, OPEN_LOOP_STAGE
-from e2rl.prior.bounds import BoundSettings
+from e2rl.prior.prior import SamplerSettings
 from e2rl.traffic.constant_velocity import ConstantVelocity
 from e2rl.traffic.idm import IDM
+from e2rl.traffic.nominal import NominalTraffic
 from e2rl.traffic.replay import Replay
+from tests.prior.small import small_prior
 from tests.synthesizer.traffic_scenes import scenes, synthesizer
 
-STRAIGHT = Method("constant_velocity", ConstantVelocity(), 0.0)
+STRAIGHT = Method("constant_velocity", ConstantVelocity())
+
+
+def nominal():
+    return NominalTraffic(small_prior(sampler=SamplerSettings(steps=4)))
 
 
 def places(count=4, acceleration=0.0, steps=60):
@@ -54,13 +60,12 @@ def test_a_log_too_short_for_a_horizon_leaves_it_unknown():
 
 
 def test_who_looks_the_future_up_or_attacks_has_no_row_and_baselines_have_one_sample():
-    on = synthesizer()
     methods = [
-        Method("replay", Replay(), 0.0),
+        Method("replay", Replay()),
         STRAIGHT,
-        Method("idm", IDM(BoundSettings()), 0.0),
-        Method("nominal", on, 0.0),
-        Method("e2", on, 2.0),
+        Method("idm", IDM(small_prior())),
+        Method("nominal", nominal()),
+        Method("e2", synthesizer(), 2.0),
     ]
     rows = open_loop_rows(places(2), methods, 3)
     assert [(row["method"], row["n_seeds"], row["n_rollouts"]) for row in rows] == [
@@ -72,7 +77,7 @@ def test_who_looks_the_future_up_or_attacks_has_no_row_and_baselines_have_one_sa
 
 
 def test_more_samples_find_better_ones_and_the_joint_choice_is_between():
-    scene_set, method = places(acceleration=0.5), Method("nominal", synthesizer(), 0.0)
+    scene_set, method = places(acceleration=0.5), Method("nominal", nominal())
     one, few, many = (metrics(scene_set, method, samples) for samples in (1, 2, 5))
     for at in ("_3", "_5"):
         best = [found[f"min_ade{at}"]["mean"] for found in (one, few, many)]
@@ -83,20 +88,20 @@ def test_more_samples_find_better_ones_and_the_joint_choice_is_between():
 
 
 def test_ratios_are_quotients_of_the_same_vehicles_errors():
-    found = metrics(places(acceleration=0.5), Method("nominal", synthesizer(), 0.0))
+    found = metrics(places(acceleration=0.5), Method("nominal", nominal()))
     for name in ("min_ade", "mean_ade"):
         quotient = found[f"{name}_5"]["mean"] / found["cv_ade_5"]["mean"]
         assert found[f"{name}_ratio_5"]["mean"] == pytest.approx(quotient)
 
 
 def test_plans_begin_at_the_start_do_not_know_the_future_and_are_the_same_in_any_batch():
-    scene, on, seed = scenes(3).scenes, synthesizer(), torch.tensor([[4, 5, 6], [7, 8, 9]])
-    plan = sample_plans(on, scene, seed)
+    scene, on, seed = scenes(3).scenes, nominal(), torch.tensor([[4, 5, 6], [7, 8, 9]])
+    plan = on.open_loop_plans(scene, seed)
     assert plan.shape == (3, 2, 8, 50, 4)
     assert (plan[:, :, :6, 0, :2] - scene["start"][:, None, :6, :2]).norm(dim=-1).max() < 1.5
     blind = scene.clone()
     blind["logged"][:, 1:] = 1e4
     blind["logged_valid"][:, 1:] = False
-    assert torch.equal(sample_plans(on, blind, seed), plan)
-    torch.testing.assert_close(sample_plans(on, scene[1:2], seed[:, 1:2]), plan[1:2], rtol=0, atol=5e-3)
-    assert not torch.allclose(sample_plans(on, scene, seed + 1), plan)
+    assert torch.equal(on.open_loop_plans(blind, seed), plan)
+    torch.testing.assert_close(on.open_loop_plans(scene[1:2], seed[:, 1:2]), plan[1:2], rtol=0, atol=5e-3)
+    assert not torch.allclose(on.open_loop_plans(scene, seed + 1), plan)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from e2rl.errors import InputError
-from e2rl.evaluation.processes import cores, spread
+from e2rl.evaluation.processes import cores, in_processes
 
 
 def square(job):
@@ -14,14 +14,14 @@ def square(job):
 
 
 def test_results_keep_the_order_of_the_jobs_whoever_does_them():
-    found = list(spread(square, range(7), 3, cost=float))
+    found = list(in_processes(square, range(7), 3, cost=float))
     assert [result["value"][0].item() for result in found] == [float(k**2) for k in range(7)]
     assert os.getpid() not in {result["process"] for result in found}
 
 
 @pytest.mark.parametrize(("jobs", "processes"), [(range(3), 1), ([5], 4)])
 def test_one_process_or_one_job_stays_here(jobs, processes):
-    assert {result["process"] for result in spread(square, jobs, processes, cost=float)} == {os.getpid()}
+    assert {result["process"] for result in in_processes(square, jobs, processes, cost=float)} == {os.getpid()}
 
 
 def refuse(job):
@@ -30,7 +30,7 @@ def refuse(job):
 
 def test_errors_of_the_children_arrive():
     with pytest.raises(InputError, match="refused"):
-        list(spread(refuse, range(4), 2, cost=float))
+        list(in_processes(refuse, range(4), 2, cost=float))
 
 
 def vanish(job):
@@ -39,7 +39,7 @@ def vanish(job):
 
 def test_a_child_that_dies_is_named():
     with pytest.raises(InputError, match="processes=2"):
-        list(spread(vanish, range(4), 2, cost=float))
+        list(in_processes(vanish, range(4), 2, cost=float))
 
 
 def test_cores():

@@ -10,7 +10,7 @@ import torch
 
 from e2rl.ego.idm import IDMEgo
 from e2rl.evaluation.files import METRICS_FILE, ROLLOUTS, TABLE, read_metrics, read_rows
-from e2rl.evaluation.protocol import Method, run_protocol, scene_seed
+from e2rl.evaluation.protocol import Method, Setup, run_protocol, scene_seed
 from e2rl.evaluation.rollout_reader import read_rollout
 from e2rl.sim.env import SimSettings
 from tests.synthesizer.traffic_scenes import scenes, synthesizer
@@ -19,14 +19,17 @@ SCORER = Path(__file__).parents[3] / "shared" / "tools" / "score_rollouts.py"
 SCENES, SEEDS = 2, [0, 1]
 
 
+def setup_of(scene_set, batch=64):
+    return Setup(scene_set, IDMEgo(), "idm", SimSettings(), batch)
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """(rows, folder) of two methods on two scenes and seeds, in batches that do not divide them evenly."""
     folder = tmp_path_factory.mktemp("run")
     on = synthesizer()
-    methods = [Method("nominal", on, 0.0), Method("e2", on, 3.0)]
-    scene_set = scenes(SCENES, steps=80)
-    rows = run_protocol(scene_set, methods, IDMEgo(), "idm", SEEDS, SimSettings(), folder, batch=3, stage="test")
+    methods = [Method("nominal", on), Method("e2", on, 3.0)]
+    rows = run_protocol(setup_of(scenes(SCENES, steps=80), 3), methods, SEEDS, folder, stage="test")
     return rows, folder
 
 
@@ -68,10 +71,8 @@ def test_the_independent_scorer_agrees(run):
 
 def test_methods_share_the_noise_of_a_scene_and_seed():
     assert scene_seed(3, 1) == scene_seed(3, 1) and len({scene_seed(i, j) for i in range(50) for j in range(5)}) == 250
-    scene_set, on = scenes(SCENES), synthesizer()
-    twice = run_protocol(
-        scene_set, [Method("one", on, 0.0), Method("two", synthesizer(), 0.0)], IDMEgo(), "idm", [4], SimSettings()
-    )
+    methods = [Method("one", synthesizer()), Method("two", synthesizer())]
+    twice = run_protocol(setup_of(scenes(SCENES)), methods, [4])
     one, two = (row["metrics"] for row in twice)
     for name in one:
         if not name.startswith("seconds"):
@@ -79,11 +80,20 @@ def test_methods_share_the_noise_of_a_scene_and_seed():
             torch.testing.assert_close(means[0], means[1], equal_nan=True, msg=name)
 
 
+def test_scenes_alone_have_the_noise_that_they_have_among_all(tmp_path):
+    setup, methods = setup_of(scenes(3, steps=20)), [Method("e2", synthesizer(), 3.0)]
+    for name, only in (("all", None), ("one", [2])):
+        run_protocol(setup, methods, SEEDS, tmp_path / name, only=only)
+    alone = sorted((tmp_path / "one" / ROLLOUTS).iterdir())
+    assert len(alone) == len(SEEDS)
+    for path in alone:
+        one, other = np.load(path), np.load(tmp_path / "all" / ROLLOUTS / path.name)
+        np.testing.assert_allclose(one["states"], other["states"], atol=5e-3)
+
+
 def test_nothing_is_written_without_a_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    rows = run_protocol(
-        scenes(1, steps=10), [Method("nominal", synthesizer(), 0.0)], IDMEgo(), "idm", [0], SimSettings()
-    )
+    rows = run_protocol(setup_of(scenes(1, steps=10)), [Method("nominal", synthesizer())], [0])
     assert len(rows) == 1 and not list(tmp_path.iterdir())
 
 
@@ -92,7 +102,7 @@ def test_processes_change_nothing_but_the_time(tmp_path):
     scene_set, folders = scenes(3, steps=20), (tmp_path / "one", tmp_path / "two")
     for processes, folder in enumerate(folders, 1):
         methods = [Method("nominal", synthesizer(), 0.0), Method("e2", synthesizer(), 3.0)]
-        run_protocol(scene_set, methods, IDMEgo(), "idm", SEEDS, SimSettings(), folder, batch=2, processes=processes)
+        run_protocol(setup_of(scene_set, 2), methods, SEEDS, folder, processes=processes)
     one, two = (read_rows(folder / TABLE) for folder in folders)
     timed = {"seconds_per_rollout", "seconds", "evasion_seconds"}
     for row, other in zip(one, two, strict=True):

@@ -6,17 +6,24 @@ import pytest
 import torch
 
 from e2rl.ego.replay import ReplayEgo
-from e2rl.evaluation.protocol import Method, roll_out_part
+from e2rl.evaluation.protocol import Method, Setup
 from e2rl.evaluation.realism_meta import Tally, evaluated, log_split_half, meta_rows, summarise_meta
 from e2rl.metrics.catalogue import META, META_STAGE
 from e2rl.metrics.meta_metric import FEATURES, HISTOGRAMS, SMOOTHING, meta_metric
+from e2rl.prior.prior import SamplerSettings
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.constant_velocity import ConstantVelocity
+from e2rl.traffic.nominal import NominalTraffic
 from e2rl.traffic.replay import Replay
-from tests.synthesizer.traffic_scenes import scenes, synthesizer
+from tests.prior.small import small_prior
+from tests.synthesizer.traffic_scenes import scenes
 
-SIM, STEPS = SimSettings(replay_ego=True), 30
+SIM, STEPS = SimSettings(), 30
 KNOWN = {"linear_speed": STEPS - 2, "angular_speed": STEPS - 2, "linear_accel": STEPS - 4, "angular_accel": STEPS - 4}
+
+
+def nominal():
+    return NominalTraffic(small_prior(sampler=SamplerSettings(steps=4)))
 
 
 def places(count=2, **options):
@@ -36,14 +43,14 @@ def logs_of(scene_set):
     }
 
 
-def sampled(scene_set, seeds, on=None):
+def setup_of(scene_set, batch=64):
+    return Setup(scene_set, ReplayEgo(), "replay", SIM, batch)
+
+
+def sampled(scene_set, seeds):
     """[(scene indices, rollouts)] of a random prior, one for each seed."""
-    method = Method("nominal", on or synthesizer(), 0.0)
-    index = torch.arange(len(scene_set))
-    return [
-        (index, roll_out_part(scene_set, [(k, seed) for k in range(len(scene_set))], method, ReplayEgo(), SIM))
-        for seed in seeds
-    ]
+    method, setup, index = Method("nominal", nominal()), setup_of(scene_set), torch.arange(len(scene_set))
+    return [(index, setup.roll_out(method, [(k, seed) for k in range(len(scene_set))])) for seed in seeds]
 
 
 def likelihoods(scene_set, parts, rollouts):
@@ -145,26 +152,26 @@ def test_lights_belong_to_ways_so_that_whoever_follows_none_runs_none():
 def test_the_rows_of_a_run():
     scene_set, rollouts = places(), 3
     methods = [
-        Method("replay", Replay(), 0.0),
-        Method("constant_velocity", ConstantVelocity(), 0.0),
-        Method("nominal", synthesizer(), 0.0),
+        Method("replay", Replay()),
+        Method("constant_velocity", ConstantVelocity()),
+        Method("nominal", nominal()),
     ]
-    rows = meta_rows(scene_set, methods, ReplayEgo(), "replay", SIM, rollouts, batch=4)
+    rows = meta_rows(setup_of(scene_set, 4), methods, rollouts)
     assert [row["method"] for row in rows] == ["replay", "constant_velocity", "nominal"]
     assert all((row["stage"], row["n_seeds"], row["n_rollouts"]) == (META_STAGE, 3, 6) for row in rows)
-    replay, straight, nominal = (row["metrics"] for row in rows)
+    replay, straight, sampling = (row["metrics"] for row in rows)
     assert set(replay) == {metric.name for metric in META}
-    assert set(straight) == set(replay) - {"real_split_half"} == set(nominal)
+    assert set(straight) == set(replay) - {"real_split_half"} == set(sampling)
     for name in HISTOGRAMS:  # in these scenes both are the log
         assert straight[name]["mean"] == pytest.approx(replay[name]["mean"], rel=1e-4), name
     expected = (rollouts * 28 + SMOOTHING) / (rollouts * 28 + 10 * SMOOTHING)
     assert replay["linear_speed"]["mean"] == pytest.approx(expected, rel=1e-5)
-    for row in (replay, straight, nominal):
+    for row in (replay, straight, sampling):
         total = sum(FEATURES[name].weight * row[name]["mean"] for name in FEATURES)
         assert row["meta_metric"]["mean"] == pytest.approx(total)
-    assert nominal["meta_metric"]["mean"] < replay["meta_metric"]["mean"] < 1
+    assert sampling["meta_metric"]["mean"] < replay["meta_metric"]["mean"] < 1
     counted = likelihoods(scene_set, sampled(scene_set, range(rollouts)), rollouts)
-    assert nominal["meta_metric"]["mean"] == pytest.approx(meta_metric(counted).mean().item(), rel=1e-6)
+    assert sampling["meta_metric"]["mean"] == pytest.approx(meta_metric(counted).mean().item(), rel=1e-6)
 
 
 def test_split_halves_part_whole_places():

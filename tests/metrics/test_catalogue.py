@@ -42,7 +42,7 @@ def test_it_is_in_rows_files_summaries_and_its_tables(fast, tmp_path):
     assert paired_differences(rows, samples, rows, samples, 20, 2)["fast"]["difference"] == 0
     write_rows(tmp_path / "rollouts.csv", label_rows(rows, SOURCE))
     assert read_rows(tmp_path / "rollouts.csv")[7]["fast"] == pytest.approx(rows[7]["fast"])
-    summaries = metric_rows(label_rows(rows, SOURCE), samples, "", draws=20, realism_draws=2)
+    summaries = metric_rows(label_rows(rows, SOURCE), samples, draws=20, realism_draws=2)
     (row,) = metric_tables(summaries, table="speeds")[0].rows
     assert row[0] == "fast [%]" and row[1].startswith(f"{100 * expected:.1f} [")
     assert metric_tables(summaries, table="traffic")[0].rows[-1] == row

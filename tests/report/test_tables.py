@@ -19,7 +19,7 @@ def rows():
     other, more = score_rollouts(random_rollouts(8, seed=4))
     labelled = label_rows(other, Source("synthetic", "test", "nominal", "idm"))
     labelled = [row | {"eta": 0.0} for row in labelled] + label_rows(scores, Source("synthetic", "test", "e2", "idm"))
-    return metric_rows(labelled, more + features, "test", draws=50, realism_draws=5)
+    return metric_rows(labelled, more + features, draws=50, realism_draws=5)
 
 
 def test_tables_list_known_metrics_in_the_catalogue_s_order(rows):
@@ -36,7 +36,7 @@ def test_a_sweep_names_every_intensity(rows):
     labelled = [
         row | {"eta": eta} for eta in (0.0, 2.0) for row in label_rows(scores, Source("synthetic", "test", "e2", "idm"))
     ]
-    means, paired = metric_tables(metric_rows(labelled, features * 2, "test", draws=5, realism_draws=2))
+    means, paired = metric_tables(metric_rows(labelled, features * 2, draws=5, realism_draws=2))
     assert means.head == ["", "e2 η=0", "e2 η=2"] and paired.head == ["", "e2 η=2"]
     assert "Difference to e2 η=0" in paired.caption
 
@@ -83,9 +83,7 @@ def test_numbers_keep_three_digits():
 
 def test_one_rollout_makes_a_table_without_intervals():
     scores, features = score_rollouts(random_rollouts(1, seed=3))
-    rows = metric_rows(
-        label_rows(scores, Source("synthetic", "test", "e2", "idm")), features, "", draws=5, realism_draws=2
-    )
+    rows = metric_rows(label_rows(scores, Source("synthetic", "test", "e2", "idm")), features, draws=5, realism_draws=2)
     (table,) = metric_tables(rows)
     assert "1 scene, 1 seed, 1 rollout per method" in table.caption
     assert math.isnan(rows[0]["metrics"]["progress"]["low"])

@@ -1,6 +1,7 @@
 """Small scenes with straight routes in any direction, all ground drivable, for the synthesizer's tests."""
 
 import math
+from dataclasses import replace
 
 import torch
 
@@ -32,14 +33,7 @@ def make_world(vehicles, copies: int = 1, rows: int = 8) -> World:
     scene["logged"][:, :, :count] = state
     scene["logged"][:, :, :count, :2] += (step[:, None, None] * state[:, 3:] * forward)[None]
     scene["field"] = torch.full_like(scene["field"], -5.0)
-    return World(
-        scene,
-        torch.zeros(copies, dtype=torch.int64),
-        scene["start"],
-        scene["valid"],
-        scene["start_accel"],
-        scene["route_log"].clamp(min=0),
-    )
+    return replace(World.at_start(scene), route=scene["route_log"].clamp(min=0))
 
 
 def add_route(world: World, vehicle: int, candidate: int, heading: float) -> None:

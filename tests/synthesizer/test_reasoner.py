@@ -8,15 +8,14 @@ import warnings
 
 import pytest
 import torch
-from e2rl.synthesizer.synthesizer import Synthesizer, SynthesizerSettings
 
 from e2rl.errors import InputError
 from e2rl.synthesizer.feasibility import FeasibilitySettings, feasible_vehicles
 from e2rl.synthesizer.prompt import CRITERIA, read_answer
 from e2rl.synthesizer.reasoner import LanguageReasoner, ReasonerSettings, build_reasoner
-from tests.prior.small import small_prior
 from tests.synthesizer.chat_server import chat_server, verdicts
 from tests.synthesizer.crossing import make_world
+from tests.synthesizer.traffic_scenes import synthesizer
 
 pytest.importorskip("openai")
 RULES = FeasibilitySettings()
@@ -151,12 +150,12 @@ def test_an_ego_alone_asks_nothing(tmp_path):
 def test_the_synthesizer_counts_and_the_rules_are_the_default(tmp_path):
     assert build_reasoner(ReasonerSettings(), {}) is feasible_vehicles
     with chat_server(verdicts) as (url, _):
-        settings = ReasonerSettings("lm", "small", url, cache=str(tmp_path))
-        made, synthesizer = world(), Synthesizer(small_prior(0), SynthesizerSettings(reasoner=settings))
+        settings = {"kind": "lm", "model": "small", "base_url": url, "cache": str(tmp_path)}
+        made, on = world(), synthesizer(reasoner=settings)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            synthesizer.feasible_vehicles(made.scene, made, RULES)
-    assert synthesizer.statistics["lm_requests"] == 1
+            on.feasible_vehicles(made.scene, made, RULES)
+    assert on.statistics["lm_requests"] == 1
 
 
 def test_what_is_missing_is_said(monkeypatch):

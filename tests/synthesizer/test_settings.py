@@ -1,35 +1,40 @@
+"""conf/synthesizer/e2.yaml lists every setting of e2 and what e2 does by default; what is no setting is refused."""
+
 from dataclasses import asdict
+from inspect import signature
 from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
 
-from e2rl.synthesizer.anchoring import AnchorSettings
-from e2rl.synthesizer.control import ControlSettings
-from e2rl.synthesizer.feasibility import FeasibilitySettings
-from e2rl.synthesizer.interception import InterceptionSettings
-from e2rl.synthesizer.potentials import PotentialSettings
-from e2rl.synthesizer.reasoner import ReasonerSettings
-from e2rl.synthesizer.skeleton import SkeletonSettings
-from e2rl.synthesizer.topology import TopologySettings
+from e2rl.errors import InputError
+from e2rl.synthesizer.e2 import E2, PARTS
+from tests.synthesizer.traffic_scenes import synthesizer
 
-CONFIG = Path(__file__).parents[2] / "conf" / "synthesizer" / "e2.yaml"
+CONFIG = OmegaConf.load(Path(__file__).parents[2] / "conf" / "synthesizer" / "e2.yaml")
+
+
+def test_the_file_lists_the_groups_of_settings_and_builds_e2():
+    own = set(signature(E2).parameters) - {"prior", "parts"}
+    assert set(CONFIG) == {"_target_", "name", *own, *PARTS}
+    on = synthesizer(**{key: CONFIG[key] for key in (*own, *PARTS)})
+    assert (on.support, on.reselect) == (CONFIG.support, CONFIG.reselect) and set(on.settings) == set(PARTS)
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_every_group_lists_every_setting(part):
+    assert set(CONFIG[part]) == set(asdict(PARTS[part]()))
 
 
 @pytest.mark.parametrize(
-    "key, settings",
+    ("wrong", "message"),
     [
-        ("topology", TopologySettings),
-        ("feasibility", FeasibilitySettings),
-        ("reasoner", ReasonerSettings),
-        ("skeleton", SkeletonSettings),
-        ("anchor", AnchorSettings),
-        ("interception", InterceptionSettings),
-        ("potentials", PotentialSettings),
-        ("control", ControlSettings),
+        ({"support": "everybody"}, "synthesizer.support=everybody"),
+        ({"samples": 4}, "synthesizer.samples"),
+        ({"control": {"strength": 2}}, "synthesizer.control.strength"),
+        ({"control": {"gradient": "none"}}, "synthesizer.control.gradient=none"),
     ],
 )
-def test_the_config_lists_every_setting(key, settings):
-    config = OmegaConf.load(CONFIG)[key]
-    assert set(config) == set(asdict(settings()))
-    settings(**config)
+def test_what_is_no_setting_is_refused_by_name(wrong, message):
+    with pytest.raises(InputError, match=message):
+        synthesizer(**wrong)

@@ -3,10 +3,10 @@
 import torch
 
 from e2rl.scene.recording import DT
-from e2rl.traffic.constant_velocity import ConstantVelocity, straight_on
+from e2rl.traffic.constant_velocity import ConstantVelocity
+from e2rl.traffic.traffic import keep_velocity
 from tests.prior.small import VEHICLES, curved_scenes, moved
-from tests.synthesizer.test_synthesizer import world_of
-from tests.synthesizer.traffic_scenes import drive, scenes
+from tests.synthesizer.traffic_scenes import drive, replanned, scenes
 
 
 def test_everybody_goes_straight_on_for_the_whole_rollout_and_nobody_leaves():
@@ -27,17 +27,15 @@ def test_everybody_goes_straight_on_for_the_whole_rollout_and_nobody_leaves():
 def test_parked_vehicles_stay_whatever_speed_was_estimated():
     scene = curved_scenes()
     scene["parked"][:, 2] = True
-    on, world = ConstantVelocity(), world_of(scene)
-    _, plan = on.replan(on.begin(scene, torch.zeros(1, dtype=torch.int64), torch.zeros(1)), world, world.states)
-    states = plan.states()[0]
+    states = replanned(ConstantVelocity(), scene)[1].states[0]
     assert torch.equal(states[2, :, :3], scene["start"][0, 2, :3].expand(50, 3)) and (states[2, :, 3] == 0).all()
     assert (states[1, -1, :2] - states[1, 0, :2]).norm().item() > 0.9 * 4.9 * VEHICLES[1][3]
 
 
 def test_it_turns_and_shifts_with_the_scene():
     start, there = (scene["start"][:, :6] for scene in (curved_scenes(), moved(curved_scenes(), 40.0, -7.0, 0.6)))
-    steps = torch.tensor([[1, 10, 50]])
-    one, other = straight_on(start, steps), straight_on(there, steps)
+    steps = torch.tensor([1, 10, 50])
+    one, other = keep_velocity(start, steps), keep_velocity(there, steps)
     distance = lambda track: torch.cdist(track[..., :2].flatten(1, 2), track[..., :2].flatten(1, 2))  # noqa: E731
     torch.testing.assert_close(distance(other), distance(one), rtol=1e-4, atol=1e-3)
     torch.testing.assert_close(other[..., 2:], one[..., 2:] + torch.tensor([0.6, 0.0]))

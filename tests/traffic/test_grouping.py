@@ -3,12 +3,11 @@
 from dataclasses import fields, is_dataclass
 
 import torch
-from e2rl.synthesizer.grouping import ROWS, SHRUNK, clone, crop_episode, crop_world, group_scenes, write_episode
 from tensordict import TensorDict
 
 from e2rl.sim.world import World
-from tests.synthesizer.test_synthesizer import begin, world_of
-from tests.synthesizer.traffic_scenes import scenes, synthesizer
+from e2rl.traffic.grouping import ROWS, SHRUNK, clone, crop_state, crop_world, group_scenes, write_state
+from tests.synthesizer.traffic_scenes import begin, scenes, synthesizer
 
 WIDTH, AGENTS = 32, 40
 
@@ -18,15 +17,9 @@ def sized(counts, others=0):
     valid = torch.arange(AGENTS) < torch.tensor(counts)[:, None]
     valid[:, WIDTH : WIDTH + others] = True
     empty = torch.zeros(len(counts), AGENTS)
-    scene = TensorDict({"valid": valid}, batch_size=[len(counts)])
-    return World(
-        scene,
-        empty[:, 0].long(),
-        empty[..., None].expand(-1, -1, 4),
-        valid,
-        empty,
-        torch.zeros(len(counts), WIDTH, dtype=torch.long),
-    )
+    route = torch.zeros(len(counts), WIDTH, dtype=torch.long)
+    scene = TensorDict({"valid": valid, "route_log": route}, batch_size=[len(counts)])
+    return World(scene, empty[:, 0].long(), empty[..., None].expand(-1, -1, 4), valid, empty)
 
 
 def test_every_scene_is_in_one_group_that_holds_its_vehicles_and_wastes_less_than_half():
@@ -51,27 +44,25 @@ def leaves(value):
 
 def test_writing_back_what_was_cropped_changes_nothing_and_what_changed_arrives():
     on, scene = synthesizer(), scenes(3).scenes
-    world, episode = world_of(scene), begin(on, scene, 1.0)
-    width = episode.routed.route.shape[1]
+    world, state = World.at_start(scene), begin(on, scene, 1.0)
+    width = state.routed.route.shape[1]
     (group,) = group_scenes(world)
     assert group.vehicles < width, "there is padding to crop"
-    part, whole = crop_episode(episode, group, width), clone(episode)
-    write_episode(whole, part, group)
-    for before, after in zip(leaves(episode), leaves(whole), strict=True):
+    part, whole = crop_state(state, group, width), clone(state)
+    write_state(whole, part, group)
+    for before, after in zip(leaves(state), leaves(whole), strict=True):
         torch.testing.assert_close(after, before)
     part.routed.conflict_s[0, 1, 2] += 7.0
-    part.kl[1, 3] += 1.0
-    write_episode(whole, part, group)
-    assert whole.routed.conflict_s[group.rows[0], 1, 2] == episode.routed.conflict_s[group.rows[0], 1, 2] + 7
-    assert whole.kl[group.rows[1], 3] == 1 and whole.kl.sum() == 1
+    part.path_kl[1, 3] += 1.0
+    write_state(whole, part, group)
+    assert whole.routed.conflict_s[group.rows[0], 1, 2] == state.routed.conflict_s[group.rows[0], 1, 2] + 7
+    assert whole.path_kl[group.rows[1], 3] == 1 and whole.path_kl.sum() == 1
 
 
 def test_a_cropped_world_holds_the_same_agents():
-    scene = scenes(3).scenes
-    world = world_of(scene)
+    world = World.at_start(scenes(3).scenes)
     (group,) = group_scenes(world)
     small = crop_world(world, group)
-    assert small.valid.sum() == world.valid.sum() and small.route.shape[1] == group.vehicles
+    assert small.valid.sum() == world.valid.sum() and small.scene["route_points"].shape[1] == group.vehicles
     torch.testing.assert_close(small.states[small.valid], world.states[group.rows][world.valid[group.rows]])
-    assert small.scene["route_points"].shape[1] == group.vehicles
     assert small.scene["size"].shape[1] == small.states.shape[1]

@@ -5,35 +5,47 @@ import math
 import pytest
 import torch
 
-from e2rl.prior.bounds import NO_CAP, BoundSettings, Obstacles, acceleration_caps
+from e2rl.prior import bounds as bounds_module
+from e2rl.prior.bounds import NO_CAP, BoundSettings, acceleration_caps
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.scene.recording import DT, LIGHT_RED, LIGHT_YELLOW
-from e2rl.traffic.idm import IDM, IDMSettings
-from tests.prior.small import curved_scenes
+from e2rl.sim.world import World
+from e2rl.traffic import idm as idm_module
+from e2rl.traffic.idm import IDM
+from tests.prior.small import curved_scenes, small_prior
 from tests.synthesizer.crossing import make_world
-from tests.synthesizer.test_synthesizer import world_of
-from tests.synthesizer.traffic_scenes import ROWS, drive
+from tests.synthesizer.traffic_scenes import ROWS, begin, drive
 from tests.synthetic import make_scenes
 
 NO_BOUNDS = BoundSettings(meeting=False, curve=False)
-OWN = IDMSettings()
+HEADWAY, STANDSTILL_GAP = 1.5, 2.0
 LIMIT, LENGTH = 15.0, 4.5
 AWAY = (-150, 1, 10.0)  # an ego that nobody meets
 
 
+def idm(bounds=NO_BOUNDS):
+    return IDM(small_prior(bounds=bounds))
+
+
 def plan_of(world, bounds=NO_BOUNDS):
-    """The plan [1, V, HORIZON] of the one scene's vehicles."""
-    on, scene = IDM(bounds), world.scene
-    episode = on.begin(scene, torch.zeros(len(scene), dtype=torch.int64), torch.zeros(len(scene)))
-    return on.replan(episode, world, world.states[:, :1].expand(-1, HORIZON, -1))[1]
+    """Planned states [V, HORIZON, 4] of the one scene's vehicles."""
+    on = idm(bounds)
+    return on.replan(begin(on, world.scene), world, world.states[:, :1].expand(-1, HORIZON, -1))[1].states[0]
+
+
+def acceleration_in(plan):
+    """Acceleration of vehicle 1 once the plan's first half second, over which it is taken up, has passed."""
+    return ((plan[1, 15, 3] - plan[1, 10, 3]) / (5 * DT)).item()
+
+
+def scenes_of(vehicles, **options):
+    """Scenes with these vehicles and nobody else."""
+    sizes = {"num_vrus": 0, "max_vehicles": ROWS, "max_agents": ROWS + 2, "road": (-200.0, 400.0)}
+    return make_scenes(**({"num_scenes": 1, "vehicles": vehicles} | sizes | options))
 
 
 def acceleration(vehicles, limit=LIMIT):
-    """Acceleration of vehicle 1 once the plan's first half second, over which it is taken up, has passed."""
-    scene = make_scenes(
-        1, vehicles=vehicles, num_vrus=0, max_vehicles=ROWS, max_agents=ROWS + 2, road=(-200.0, 400.0), limit=limit
-    ).scenes
-    return plan_of(world_of(scene)).motion.a[0, 1, 10].item()
+    return acceleration_in(plan_of(World.at_start(scenes_of(vehicles, limit=limit).scenes)))
 
 
 @pytest.mark.parametrize("speed", [3.0, 10.0, 14.0])
@@ -53,7 +65,7 @@ def test_where_no_limit_is_known_it_wants_its_start_speed_or_the_set_one():
 
 @pytest.mark.parametrize("speed", [3.0, 10.0])
 def test_at_the_equilibrium_gap_it_follows_at_its_leader_s_speed(speed):
-    gap = (OWN.standstill_gap + speed * OWN.headway) / math.sqrt(1 - (speed / LIMIT) ** 4)
+    gap = (STANDSTILL_GAP + speed * HEADWAY) / math.sqrt(1 - (speed / LIMIT) ** 4)
     for extra, sign in ((0.0, 0), (2.0, 1), (-2.0, -1)):
         found = acceleration([AWAY, (0, 0, speed), (gap + LENGTH + extra, 0, speed)])
         assert found == pytest.approx(0, abs=1e-3) if not sign else found * sign > 0.02
@@ -73,18 +85,10 @@ def test_nobody_beside_or_behind_is_followed_but_the_ego_is():
 
 
 def test_vehicles_drive_on_the_middle_of_their_lane_and_never_backwards():
-    scene_set = make_scenes(
-        2,
-        vehicles=[AWAY, (0, 0, 9), (18, 0, 2), (5, 1, 12)],
-        num_vrus=0,
-        steps=60,
-        max_vehicles=ROWS,
-        max_agents=ROWS + 2,
-        road=(-200.0, 400.0),
-    )
+    scene_set = scenes_of([AWAY, (0, 0, 9), (18, 0, 2), (5, 1, 12)], num_scenes=2, steps=60)
     for key in ("start", "logged"):
         scene_set.scenes[key][..., 1, 1] += 0.4
-    track = drive(scene_set, IDM(BoundSettings()), 0.0)["states"][:, :, 1:4]
+    track = drive(scene_set, idm(BoundSettings()), 0.0)["states"][:, :, 1:4]
     assert (track[..., 3] >= 0).all() and (track.diff(dim=1)[..., 0] >= -1e-4).all()
     aside = track[..., 1] - torch.tensor([0, 0, 3.5])
     assert aside[..., 1:].abs().max() < 1e-4 and aside[:, -1, 0].max() < 0.15 and aside[..., 0].min() > -0.01
@@ -94,19 +98,9 @@ def test_vehicles_drive_on_the_middle_of_their_lane_and_never_backwards():
 def test_it_stops_at_the_line_of_a_red_or_yellow_light_and_waits(colour):
     line = 60.0
     vehicles = [AWAY, (20, 0, 9), (5, 0, 9), (line - 0.5, 1, 9)]  # two in line, one that can no longer stop
-    scene_set = make_scenes(
-        1,
-        vehicles=vehicles,
-        num_vrus=0,
-        steps=200,
-        red_light_x=line,
-        max_vehicles=ROWS,
-        max_agents=ROWS + 2,
-        road=(-200.0, 400.0),
-        limit=LIMIT,
-    )
+    scene_set = scenes_of(vehicles, steps=200, red_light_x=line, limit=LIMIT)
     scene_set.scenes["light_state"][:] = colour
-    track = drive(scene_set, IDM(BoundSettings()), 0.0)["states"][0]
+    track = drive(scene_set, idm(BoundSettings()), 0.0)["states"][0]
     front = track[:, 1:4, 0] + LENGTH / 2
     assert (front[:, 0] < line).all() and front[-1, 0] > line - 3 and track[-1, 1, 3] < 0.3
     assert front[-1, 1] < front[-1, 0] - LENGTH and track[-1, 2, 3] < 0.5
@@ -116,41 +110,22 @@ def test_it_stops_at_the_line_of_a_red_or_yellow_light_and_waits(colour):
 def test_a_green_light_is_no_obstacle():
     found = {}
     for red in (True, False):
-        scene = make_scenes(
-            1,
-            vehicles=[AWAY, (0, 0, 10)],
-            num_vrus=0,
-            red_light_x=25.0,
-            max_vehicles=ROWS,
-            max_agents=ROWS + 2,
-            road=(-200.0, 400.0),
-            limit=LIMIT,
-        ).scenes
+        scene = scenes_of([AWAY, (0, 0, 10)], red_light_x=25.0, limit=LIMIT).scenes
         scene["light_state"][:] = LIGHT_RED if red else LIGHT_RED + 2
-        found[red] = plan_of(world_of(scene)).motion.a[0, 1, 10].item()
+        found[red] = acceleration_in(plan_of(World.at_start(scene)))
     assert found[True] < -1 and found[False] == pytest.approx(1 - (10 / LIMIT) ** 4, abs=1e-4)
 
 
 def test_who_stands_at_the_start_stands_for_good():
-    vehicles = [AWAY, (0, 0, 0.4), (30, 0, 0.0), (0, 1, 8.0)]
-    scene_set = make_scenes(1, vehicles=vehicles, num_vrus=0, steps=60, max_vehicles=ROWS, max_agents=ROWS + 2)
-    rollouts = drive(scene_set, IDM(BoundSettings()), 0.0)
-    states = rollouts["states"][0]
+    scene_set = scenes_of([AWAY, (0, 0, 0.4), (30, 0, 0.0), (0, 1, 8.0)], steps=60)
+    states = drive(scene_set, idm(BoundSettings()), 0.0)["states"][0]
     assert torch.equal(states[1:, 1:3, :2], scene_set.scenes["start"][0, 1:3, :2].expand(60, 2, 2))
     assert (states[1:, 1:3, 3] == 0).all() and states[-1, 3, 0] > 40
 
 
 def test_a_vehicle_is_gone_once_its_route_leaves_the_map():
-    scene_set = make_scenes(
-        1,
-        vehicles=[AWAY, (50, 0, 10), (0, 1, 10)],
-        num_vrus=0,
-        steps=60,
-        max_vehicles=ROWS,
-        max_agents=ROWS + 2,
-        road=(-200.0, 80.0),
-    )
-    rollouts = drive(scene_set, IDM(BoundSettings()), 0.0)
+    scene_set = scenes_of([AWAY, (50, 0, 10), (0, 1, 10)], steps=60, road=(-200.0, 80.0))
+    rollouts = drive(scene_set, idm(BoundSettings()), 0.0)
     x, there = rollouts["states"][0, :, 1:3, 0], rollouts["valid"][0, :, 1:3]
     assert there[:, 1].all() and not there[-1, 0] and (x[:, 0][there[:, 0]] <= 80.5).all()
     assert (there[1:, 0] <= there[:-1, 0]).all(), "nobody comes back"
@@ -158,49 +133,51 @@ def test_a_vehicle_is_gone_once_its_route_leaves_the_map():
 
 @pytest.mark.parametrize("floor", [-7.0, -4.0])
 def test_it_never_brakes_harder_than_the_bounds_do(floor):
-    scene_set = make_scenes(
-        1,
-        vehicles=[AWAY, (0, 0, 12), (9, 0, 2)],
-        num_vrus=0,
-        steps=40,
-        max_vehicles=ROWS,
-        max_agents=ROWS + 2,
-        road=(-200.0, 400.0),
-    )
-    speed = drive(scene_set, IDM(BoundSettings(floor=floor)), 0.0)["states"][0, :, 1, 3]
+    scene_set = scenes_of([AWAY, (0, 0, 12), (9, 0, 2)], steps=40)
+    speed = drive(scene_set, idm(BoundSettings(floor=floor)), 0.0)["states"][0, :, 1, 3]
     assert (speed.diff() / DT).min().item() == pytest.approx(floor, abs=1e-2)
+
+
+@pytest.fixture
+def motion_of(monkeypatch):
+    """A function (world, bounds) -> the motion that IDM drives, its lane state and who is in the way."""
+
+    def found(world, bounds):
+        seen = []
+
+        def bounded(settings, decoded, lane, obstacles):
+            seen.append((bounds_module.bounded(settings, decoded, lane, obstacles), lane, obstacles))
+            return seen[-1][0]
+
+        monkeypatch.setattr(idm_module, "bounded", bounded)
+        plan_of(world, bounds)
+        return seen[0]
+
+    return found
 
 
 CROSSING = [(-150, 40, 0, 10), (0, 0, 0, 10), (22, -22, math.pi / 2, 10)]  # two that reach (22, 0) together
 
 
-def caps_of(world, plan, settings):
-    on = IDM(NO_BOUNDS)
-    state = on.begin(world.scene, torch.zeros(1, dtype=torch.int64), torch.zeros(1)).state
-    obstacles = Obstacles(
-        world.states, world.scene["size"], world.valid, torch.zeros_like(world.valid[:, : state.v.shape[1]])
-    )
-    return acceleration_caps(settings, plan.motion, state, obstacles)[0]
-
-
-def test_it_is_under_the_bounds_of_the_prior():
+def test_it_is_under_the_bounds_of_the_prior(motion_of):
     """The first knot of whoever runs into a crossing car is the bound's cap; others drive as without bounds."""
     settings, world = BoundSettings(), make_world(CROSSING)
-    free, bounded = plan_of(world), plan_of(world, settings)
-    caps = caps_of(world, free, settings)
+    free, bounded = motion_of(world, NO_BOUNDS), motion_of(world, settings)
+    caps = acceleration_caps(settings, *free)[0]
     brakes = caps < NO_CAP
-    assert brakes.sum() == 1 and (caps_of(world, bounded, settings)[~brakes] == NO_CAP).all()
+    assert brakes.sum() == 1 and (acceleration_caps(settings, *bounded)[0, ~brakes] == NO_CAP).all()
     row = brakes.nonzero().item()
-    first, before = bounded.motion.v[0, row, 4].item(), world.states[0, row, 3].item()
+    first, before = bounded[0].v[0, row, 4].item(), world.states[0, row, 3].item()
     onset = max(caps[row].item(), -settings.onset)
     assert first == pytest.approx(before + 0.25 * (onset + caps[row].item()), abs=1e-3)
-    assert torch.equal(bounded.states()[0, ~brakes], free.states()[0, ~brakes])
+    assert torch.equal(plan_of(world, settings)[~brakes], plan_of(world)[~brakes])
 
 
-def test_curves_are_taken_no_faster_than_the_bounds_allow():
+def test_curves_are_taken_no_faster_than_the_bounds_allow(motion_of):
     scene = curved_scenes()
     scene["route_limit"][:] = 25.0
     scene["start"][:, 1:, 3] *= 2.5
-    speeds = [plan_of(world_of(scene), BoundSettings(meeting=False, lateral=lateral)).motion for lateral in (1.0, 5.0)]
-    slow, fast = ((motion.v**2 * motion.kappa.abs())[0, 1:5, 25].amax().item() for motion in speeds)
+    bounds = [BoundSettings(meeting=False, lateral=lateral) for lateral in (1.0, 5.0)]
+    motions = [motion_of(World.at_start(scene), settings)[0] for settings in bounds]
+    slow, fast = ((motion.v**2 * motion.kappa.abs())[0, 1:5, 25].amax().item() for motion in motions)
     assert slow < fast

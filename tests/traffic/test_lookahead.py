@@ -1,47 +1,54 @@
-import torch
-from e2rl.synthesizer.grouping import group_scenes
-from e2rl.synthesizer.lookahead import Lookahead
+"""The lookahead asks the real ego how it would drive against a plan."""
 
-from e2rl.ego.idm import IDMEgo
+import torch
+
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.scene.recording import DT
-from e2rl.synthesizer.control import ControlSettings
+from e2rl.sim.world import World
 from e2rl.synthesizer.motion import constant_speed_states
-from tests.synthesizer.test_synthesizer import EGO, begin, world_of
-from tests.synthesizer.traffic_scenes import scenes, synthesizer
+from e2rl.traffic.lookahead import Lookahead
+from tests.synthesizer.traffic_scenes import EGO, begin, scenes, synthesizer
 
 TIMES = DT * torch.arange(1, HORIZON + 1)
 
 
+def onward(world):
+    return constant_speed_states(world.scene, world, TIMES)
+
+
 def test_one_period_as_long_as_the_horizon_is_the_ego_s_plan():
-    world = world_of(scenes(3).scenes)
-    look, (group,) = Lookahead(EGO, world, HORIZON), group_scenes(world)
-    planned = constant_speed_states(world.scene, world, TIMES)[group.rows]
-    torch.testing.assert_close(look(group, planned), EGO.plan(world)[group.rows])
+    world = World.at_start(scenes(3).scenes)
+    for rows in (torch.tensor([2, 0]), torch.arange(3)):
+        found = Lookahead(EGO, world, HORIZON)(rows, onward(world)[rows])
+        torch.testing.assert_close(found, EGO.plan(world)[rows])
 
 
 def test_the_ego_reacts_to_what_the_others_plan():
-    world = world_of(scenes(2).scenes)
-    look, (group,) = Lookahead(IDMEgo(), world, 5), group_scenes(world)
-    onward = constant_speed_states(world.scene, world, TIMES)[group.rows]
-    halted = onward.clone()
-    halted[:, 1] = world.states[group.rows, 1, None]  # the vehicle ahead stands still from now on
+    world = World.at_start(scenes(2).scenes)
+    look, rows, halted = Lookahead(EGO, world, 5), torch.arange(2), onward(world)
+    halted[:, 1] = world.states[:, 1, None]  # the vehicle ahead stands still from now on
     halted[:, 1, :, 3] = 0.0
-    gone = lambda planned: (look(group, planned)[:, -1, :2] - world.states[group.rows, 0, :2]).norm(dim=-1)  # noqa: E731
-    assert (gone(halted) < gone(onward) - 5.0).all()
-    gap = world.states[group.rows, 1, 0] - world.states[group.rows, 0, 0]
-    assert (gone(halted) < gap).all()  # it does not drive through
+    gone = lambda planned: (look(rows, planned)[:, -1, :2] - world.states[:, 0, :2]).norm(dim=-1)  # noqa: E731
+    assert (gone(halted) < gone(onward(world)) - 5.0).all()
+    assert (gone(halted) < world.states[:, 1, 0] - world.states[:, 0, 0]).all(), "it does not drive through"
+
+
+def test_scenes_may_be_asked_about_in_any_order():
+    world = World.at_start(scenes(3).scenes)
+    look, planned, rows = Lookahead(EGO, world), onward(world), torch.tensor([2, 0, 1])
+    torch.testing.assert_close(look(rows, planned[rows]), look(torch.arange(3), planned)[rows])
 
 
 def test_lookahead_changes_the_attack_but_nothing_at_zero_intensity():
     scene = scenes(3).scenes
-    world = world_of(scene)
-    plan = EGO.plan(world)
-    plain, ahead = synthesizer(), synthesizer(control=ControlSettings(lookahead=2))
+    world = World.at_start(scene)
+    plan, react = EGO.plan(world), Lookahead(EGO, world)
+    plain, ahead = synthesizer(), synthesizer(control={"lookahead": 2})
+    assert ahead.queries_ego and not plain.queries_ego
 
-    def driven(on, eta, ego):
-        return on.replan(begin(on, scene, eta), world, plan, ego)[1].states()
+    def driven(on, eta, react):
+        return on.replan(begin(on, scene, eta), world, plan, react)[1].states
 
-    assert torch.equal(driven(plain, 0.0, None), driven(ahead, 0.0, EGO))
-    assert torch.equal(driven(plain, 2.0, EGO), driven(plain, 2.0, None))
-    assert not torch.equal(driven(ahead, 2.0, EGO), driven(plain, 2.0, EGO))
+    assert torch.equal(driven(plain, 0.0, None), driven(ahead, 0.0, react))
+    assert torch.equal(driven(plain, 2.0, react), driven(plain, 2.0, None))
+    assert not torch.equal(driven(ahead, 2.0, react), driven(plain, 2.0, react))

@@ -3,11 +3,9 @@
 import torch
 
 from e2rl.ego.replay import ReplayEgo
-from e2rl.sim.env import SimSettings
+from e2rl.sim.world import World
 from e2rl.traffic.replay import Replay
-from e2rl.traffic.rollout import roll_out
 from tests.prior.small import curved_scenes
-from tests.synthesizer.test_synthesizer import world_of
 from tests.synthesizer.traffic_scenes import ROWS, drive, scenes
 
 
@@ -31,13 +29,10 @@ def test_rollouts_are_the_log_bit_for_bit_with_its_gaps():
     assert not rollouts["adversaries"].any() and (rollouts["transport_others"] == 0).all()
 
 
-def test_with_a_replayed_ego_everybody_is_the_log_whatever_the_seed_and_how_often_it_replans():
+def test_with_a_replayed_ego_everybody_is_the_log_whatever_the_seed():
     scene_set = recorded()
-    index = torch.arange(3)
-    for seed, replan in ((0, 5), (9, 3), (4, 50)):
-        rollouts = roll_out(
-            scene_set, index, index + seed, torch.zeros(3), ReplayEgo(), Replay(), SimSettings(replay_ego=True), replan
-        )
+    for seeds in ([0, 1, 2], [9, 10, 11]):
+        rollouts = drive(scene_set, Replay(), 0.0, seeds, ReplayEgo())
         valid = scene_set.scenes["logged_valid"]
         assert torch.equal(rollouts["valid"], valid)
         assert torch.equal(rollouts["states"][valid], scene_set.scenes["logged"][valid])
@@ -45,11 +40,9 @@ def test_with_a_replayed_ego_everybody_is_the_log_whatever_the_seed_and_how_ofte
 
 def test_after_the_recording_s_end_nobody_is_there():
     scene = curved_scenes(steps=30)
-    on = Replay()
-    episode = on.begin(scene, torch.zeros(1, dtype=torch.int64), torch.zeros(1))
-    world = world_of(scene)
+    world = World.at_start(scene)
     world.step = torch.tensor([12])
-    _, plan = on.replan(episode, world, world.states[:, :1])
+    _, plan = Replay().replan(None, world, world.states[:, :1])
     here = scene["logged_valid"][:, 13:31, :ROWS].transpose(1, 2)
-    assert torch.equal(plan.on_map[..., :18], here) and not plan.on_map[..., 18:].any()
-    assert torch.equal(plan.states()[..., :18, :], scene["logged"][:, 13:31, :ROWS].transpose(1, 2))
+    assert torch.equal(plan.present[..., :18], here) and not plan.present[..., 18:].any()
+    assert torch.equal(plan.states[..., :18, :], scene["logged"][:, 13:31, :ROWS].transpose(1, 2))

@@ -1,31 +1,79 @@
-"""The transform and closed-loop rollouts: traffic is the plan, resets are partial, seeds decide, routes end."""
+"""The transform: episodes are the rows drawn, live traffic is what its method plans, resets are partial."""
 
 import pytest
 import torch
+from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import EgoPolicy
 from e2rl.ego.idm import IDMEgo
-from e2rl.ego.replay import ReplayEgo
+from e2rl.learning.policy import RowDraw
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.traffic.rollout import roll_out
+from e2rl.traffic.pool import TrafficPool
+from e2rl.traffic.traffic import Traffic, TrafficPlan, keep_velocity
 from e2rl.traffic.transform import AdversarialSynthesizer
-from tests.synthesizer.traffic_scenes import ROWS, VEHICLES, drive, scenes, synthesizer
+from tests.learning.small import brake_check, small_scenes
+from tests.synthesizer.traffic_scenes import EGO, ROWS, scenes, synthesizer
+
+ON = SimSettings(end_on_contact=False, end_off_road=False)
+SECOND = torch.tensor([[False], [True], [False]])  # environments that are reset
 
 
-def environment(count=3, eta=0.0, on=None, steps=20, sim=None):
-    """Environment of `count` scenes whose k-th scene ever drawn is k modulo their number, with seed k."""
+class March(Traffic):
+    """Everybody goes straight on at a speed that tells the seed and the replan: seed + replan / 10, in m/s."""
+
+    figures = ("hurry",)
+
+    def __init__(self):
+        self.calls = []
+
+    def reset(self, scenes, seed, eta):
+        return torch.stack([seed.float(), torch.zeros_like(eta)], 1)
+
+    def replan(self, state, world, ego_plan):
+        self.calls.append((world.step.tolist(), ego_plan))
+        states = world.states[:, : world.scene["route_log"].shape[1]].clone()
+        states[..., 3] = (state[:, 0] + state[:, 1] / 10)[:, None]
+        states = keep_velocity(states)
+        acting = torch.zeros(states.shape[:2], dtype=torch.bool)
+        acting[:, 1] = True
+        here = world.valid[:, : acting.shape[1], None].expand(states.shape[:-1])
+        plan = TrafficPlan(states, here, acting, figures={"hurry": states[:, :, 0, 3]})
+        return state + torch.tensor([0.0, 1.0]), plan
+
+
+def in_turn(pool):
+    """Rows of a pool one after another, from the start again after its end."""
     drawn = [0]
 
-    def draw(number):
-        index = torch.arange(drawn[0], drawn[0] + number)
-        drawn[0] += number
-        return index % count, index, torch.full((number,), eta)
+    def draw(count):
+        drawn[0] += count
+        return torch.arange(drawn[0] - count, drawn[0]) % len(pool)
 
-    transform = AdversarialSynthesizer(on or synthesizer(), IDMEgo(), draw)
-    base = DrivingEnv(scenes(count, steps), sim or SimSettings(end_on_contact=False, end_off_road=False), count)
-    return TransformedEnv(base, transform), transform
+    return draw
+
+
+def environment(pool, traffic=None, steps=20, batch=3, scene_set=None, ego=None):
+    base = DrivingEnv(scene_set or scenes(3, steps), ON, batch, agents=True)
+    return TransformedEnv(base, AdversarialSynthesizer(pool, in_turn(pool), traffic, ego))
+
+
+def live(eta=0.0, count=9):
+    """Rows of scenes 0, 1, 2, 0, ... whose seed is the row."""
+    row = torch.arange(count)
+    return TrafficPool.live(row % 3, torch.full((count,), eta), row)
+
+
+def replayed(scene_set, eta=4.0):
+    """Stored rows of all scenes, then recorded ones."""
+    index = torch.arange(len(scene_set))
+    return TrafficPool.stored(brake_check(scene_set)(None, index, eta, 0), eta) + TrafficPool.recorded(index)
+
+
+def mixed(scene_set, eta=1.0):
+    return live(eta, len(scene_set)) + replayed(scene_set)
 
 
 def advance(env, policy, tensordict, steps):
@@ -34,126 +82,259 @@ def advance(env, policy, tensordict, steps):
     return tensordict
 
 
-def test_the_specs_hold():
-    check_env_specs(environment()[0])
+def still(tensordict):
+    """A policy that says nothing about its plan."""
+    return tensordict.set("action", torch.zeros(len(tensordict), 2))
 
 
-def test_executed_traffic_is_the_plan_and_is_replanned_every_five_steps():
-    env, transform = environment(eta=1.0)
+@pytest.mark.parametrize("traffic", [None, March(), synthesizer()], ids=["none", "march", "e2"])
+def test_the_specs_hold(traffic):
+    scene_set = scenes(3)
+    pool = replayed(scene_set) if traffic is None else mixed(scene_set)
+    check_env_specs(environment(pool, traffic, batch=6, scene_set=scene_set), seed=0)
+
+
+# --- live rows
+
+
+def test_live_traffic_is_the_plan_and_is_replanned_every_half_second_before_the_step():
+    on = March()
+    env = environment(live(), on)
     policy, tensordict = EgoPolicy(IDMEgo(), env), env.reset()
     for step in range(12):
-        planned, seen = (value.clone() for value in transform._plan)
-        since = transform._planned.clone()
-        tensordict = env.step(policy(tensordict))["next"]
-        world = env.base_env.world()
-        at = step - int(since[0])
-        torch.testing.assert_close(world.states[:, 1:ROWS], planned[:, at, 1:ROWS])
-        assert torch.equal(world.valid[:, 1:ROWS], seen[:, at, 1:ROWS])
-        assert transform._planned.tolist() == [(step + 1) // 5 * 5] * 3
-    assert transform.episode.replans.tolist() == [3, 3, 3]
+        before = tensordict["agents", "states"].clone()
+        tensordict = policy(tensordict)
+        planned = tensordict["ego", "plan"].clone()
+        tensordict = env.step(tensordict)["next"]
+        steps, ego_plan = on.calls[-1]
+        assert len(on.calls) == 1 + step // 5 and steps == [step // 5 * 5] * 3
+        if step % 5 == 0:
+            assert torch.equal(ego_plan, planned), "what the policy has just written"
+        speed = torch.arange(3.0)[:, None] + (step // 5) / 10
+        expected = before[:, 1:ROWS].clone()
+        expected[..., 3] = speed
+        torch.testing.assert_close(tensordict["agents", "states"][:, 1:ROWS], keep_velocity(expected)[:, :, 0])
+        torch.testing.assert_close(tensordict["traffic", "hurry"], speed.expand(3, ROWS))
 
 
-def test_walkers_replay_their_log_and_the_others_plan_is_shown_to_the_ego():
-    env, _ = environment()
-    advance(env, EgoPolicy(IDMEgo(), env), env.reset(), 7)
-    world = env.base_env.world()
-    torch.testing.assert_close(world.states[:, ROWS:], world.scene["logged"][:, 7, ROWS:])
-    torch.testing.assert_close(world.plan[:, 1:ROWS, 0], env.base_env._traffic.states[:, 8, 1:ROWS])
+def test_the_ego_of_a_policy_that_writes_no_plan_is_expected_to_keep_its_velocity():
+    on = March()
+    env = environment(live(), on)
+    tensordict = advance(env, still, env.reset(), 6)
+    now = env.base_env.scene["start"][:, 0].clone()
+    torch.testing.assert_close(on.calls[0][1], keep_velocity(now))
+    assert on.calls[1][0] == [5, 5, 5] and tensordict["timestep"][:, 0].tolist() == [6, 6, 6]
+
+
+class Watching(IDMEgo):
+    """An ego that notes the plans of the others that it sees."""
+
+    def __init__(self):
+        super().__init__(replan_every=1)
+        self.seen = []
+
+    def plan(self, world):
+        self.seen.append(world.plan)
+        return super().plan(world)
+
+
+def test_walkers_replay_their_log_and_the_ego_sees_what_the_others_plan():
+    ego, env = Watching(), environment(live(), March())
+    tracks = env.rollout(8, EgoPolicy(ego, env))["next", "agents", "states"]
+    torch.testing.assert_close(tracks[:, 6, ROWS:], env.base_env.scene["logged"][:, 7, ROWS:])
+    for step in (1, 4, 6):
+        assert ego.seen[step].shape == (3, ROWS, 50, 4)
+        torch.testing.assert_close(ego.seen[step][:, 1:, 0], tracks[:, step, 1:ROWS])
+    torch.testing.assert_close(ego.seen[1][:, 1:, 3], tracks[:, 4, 1:ROWS])
+    assert torch.equal(ego.seen[5][:, 1:, :44], ego.seen[4][:, 1:, 1:45]), "until it is replanned, the old plan holds"
 
 
 def test_a_partial_reset_begins_those_rows_anew_and_leaves_the_others():
-    env, transform = environment()
+    on = March()
+    env = environment(live(), on)
     policy = EgoPolicy(IDMEgo(), env)
     tensordict = advance(env, policy, env.reset(), 7)
-    before, plan = transform.episode, transform._plan[0].clone()
-    tensordict = env.reset(tensordict.set("_reset", torch.tensor([[False], [True], [False]])))
-    after = transform.episode
-    assert after.seed.tolist() == [0, 3, 2] and after.replans.tolist() == [2, 1, 2]
+    tensordict = env.reset(tensordict.set("_reset", SECOND))
     assert tensordict["scene_index"][:, 0].tolist() == [0, 0, 2] and tensordict["timestep"][:, 0].tolist() == [7, 0, 7]
-    assert torch.equal(transform._plan[0][[0, 2]], plan[[0, 2]]) and not torch.equal(transform._plan[0][1], plan[1])
-    assert torch.equal(after.state.s[[0, 2]], before.state.s[[0, 2]])
-    advance(env, policy, tensordict, 3)
-    assert transform.episode.replans.tolist() == [3, 1, 3] and transform._planned.tolist() == [10, 0, 10]
+    assert tensordict["traffic", "row"][:, 0].tolist() == [0, 3, 2]
+    assert not tensordict["traffic", "adversary"][1].any() and tensordict["traffic", "adversary"][[0, 2], 1].all()
+    tensordict = advance(env, policy, tensordict, 4)
+    assert [steps for steps, _ in on.calls] == [[0, 0, 0], [5, 5, 5], [0], [10, 10]]
+    speed = tensordict["agents", "states"][:, 1, 3]
+    torch.testing.assert_close(speed, torch.tensor([0.2, 3.0, 2.2]))  # by seed, and replans of its own
 
 
 def test_other_rows_resets_do_not_change_a_row_s_traffic():
-    whole, _ = environment(eta=1.0)
-    advance(whole, EgoPolicy(IDMEgo(), whole), whole.reset(), 12)
-    env, _ = environment(eta=1.0)
-    policy = EgoPolicy(IDMEgo(), env)
-    tensordict = advance(env, policy, env.reset(), 7)
-    tensordict = env.reset(tensordict.set("_reset", torch.tensor([[False], [True], [False]])))
-    advance(env, policy, tensordict, 5)
-    here, there = (e.base_env._traffic.states[[0, 2], :13, 1:ROWS] for e in (env, whole))
-    torch.testing.assert_close(here, there, rtol=0, atol=2e-2)
+    tracks = []
+    for reset in (False, True):
+        env = environment(live(1.0), synthesizer())
+        policy = EgoPolicy(IDMEgo(), env)
+        tensordict = advance(env, policy, env.reset(), 7)
+        if reset:
+            tensordict = env.reset(tensordict.set("_reset", SECOND))
+        tensordict = advance(env, policy, tensordict, 5)
+        tracks.append(tensordict["agents", "states"][[0, 2], 1:ROWS])
+    torch.testing.assert_close(*tracks, rtol=0, atol=2e-2)
 
 
-def test_ended_episodes_are_reset_in_a_rollout():
-    env, transform = environment(steps=10)
+def test_ended_episodes_are_followed_by_the_next_rows():
+    env = environment(live(), synthesizer(), steps=10)
     out = env.rollout(25, EgoPolicy(IDMEgo(), env), break_when_any_done=False)
     assert out["next", "done"][:, :, 0].sum(1).tolist() == [2, 2, 2]
-    assert sorted(transform.episode.seed.tolist()) == [6, 7, 8]
+    assert out["traffic", "row"][:, ::10, 0].tolist() == [[0, 3, 6], [1, 4, 7], [2, 5, 8]]
 
 
-def test_rollouts_repeat_and_seeds_matter():
-    scene_set = scenes()
-    first, again = (drive(scene_set, synthesizer(), 1.0) for _ in range(2))
-    other = drive(scene_set, synthesizer(), 1.0, seeds=[10, 11, 12])
-    assert torch.equal(first["states"], again["states"]) and torch.equal(first["valid"], again["valid"])
-    assert not torch.equal(first["states"][:, :, 1:5], other["states"][:, :, 1:5])
+def test_a_method_that_asks_the_ego_can_where_there_is_one():
+    asked = []
+
+    class Asking(March):
+        queries_ego = True
+
+        def replan(self, state, world, ego_plan, react=None):
+            asked.append(react and react(torch.tensor([1]), keep_velocity(world.states[1:2, :ROWS])).shape)
+            return super().replan(state, world, ego_plan)
+
+    for ego in (EGO, None):
+        env = environment(live(), Asking(), ego=ego)
+        advance(env, still, env.reset(), 1)
+    assert asked == [(1, 50, 4), None]
 
 
-def test_zero_intensity_is_the_nominal_rollout_and_more_of_it_is_not():
-    scene_set = scenes()
-    nominal = drive(scene_set, synthesizer(reselect=0), 0.0)
-    zero, pushed = drive(scene_set, synthesizer(), 0.0), drive(scene_set, synthesizer(), 2.0)
-    assert torch.equal(nominal["states"], zero["states"]) and not zero["adversaries"].any()
-    assert (pushed["adversaries"].any(1)).all() and not pushed["adversaries"][:, 0].any()
-    assert (zero["transport_adversary"] == 0).all() and (pushed["transport_adversary"] > 0).all()
+# --- stored and recorded rows
 
 
-def test_the_start_is_the_scene_s_and_parked_vehicles_stay():
-    scene_set = scenes()
-    out = drive(scene_set, synthesizer(), 2.0)
-    assert out["states"].shape == (3, 21, ROWS + 2, 4)
-    torch.testing.assert_close(out["states"][:, 0], scene_set.scenes["start"])
-    assert torch.equal(out["valid"][:, 0], scene_set.scenes["valid"])
-    parked = len(VEHICLES) - 1
-    torch.testing.assert_close(out["states"][:, :, parked], out["states"][:, :1, parked].expand(-1, 21, -1))
-    assert out["simulated"][:, : len(VEHICLES)].all() and not out["simulated"][:, len(VEHICLES) :].any()
-    assert out["states"].isfinite().all()
+def test_specs_and_memory_know_no_plan_without_a_method():
+    env = environment(replayed(scenes(3)))
+    assert set(env.reset()["traffic"].keys()) == {"row", "eta", "adversary"}
 
 
-def test_vehicles_are_gone_once_their_route_has_ended_and_stay_away():
-    out = drive(scenes(2, steps=40, road=(-60.0, 60.0)), synthesizer(), 0.0)
-    x, valid = out["states"][:, :, 4, 0], out["valid"][:, :, 4]
-    assert not valid[:, -1].any()
-    assert (valid.int().diff(dim=1) <= 0).all()
-    assert (x[valid] < 60.0 + 1e-3).all()
+def small_environment(batch=16, num_scenes=4, probability=None, **scene):
+    scene_set = small_scenes(num_scenes, **scene)
+    pool = replayed(scene_set)
+    draw = RowDraw(torch.full((len(pool),), 1 / len(pool)) if probability is None else probability(pool))
+    env = TransformedEnv(DrivingEnv(scene_set, SimSettings(), batch), AdversarialSynthesizer(pool, draw))
+    return env, pool, scene_set, draw
 
 
-def test_traffic_drives_on_as_planned_after_the_ego_has_left():
-    """The recording would put everybody back by hundreds of metres once a plan of 50 steps is used up."""
-    scene_set = scenes(2, steps=80)
-    scene_set.scenes["logged_valid"][:, 4:, 0] = False
-    scene_set.scenes["logged"][:, 50:, 1:ROWS, :2] += 500.0
-    out = roll_out(
-        scene_set,
-        torch.arange(2),
-        torch.arange(2),
-        torch.zeros(2),
-        ReplayEgo(),
-        synthesizer(),
-        SimSettings(replay_ego=True),
+def collect(env, policy, steps):
+    torch.manual_seed(0)
+    batch = env.batch_size[0]
+    collector = Collector(
+        env,
+        policy,
+        frames_per_batch=batch * steps,
+        total_frames=-1,
+        trust_policy=True,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
     )
-    assert not out["valid"][:, 5:, 0].any()
-    there = out["valid"][:, 1:, 1:5] & out["valid"][:, :-1, 1:5]
-    jump = (out["states"][:, 1:, 1:5, :2] - out["states"][:, :-1, 1:5, :2]).norm(dim=-1)
-    assert there.any() and jump[there].max() < 4.0
+    data = next(iter(collector)).clone()
+    collector.shutdown()
+    return data
 
 
-@pytest.mark.parametrize("replan", [1, 10])
-def test_the_interval_between_replans_can_be_chosen(replan):
-    out = drive(scenes(1, steps=10), synthesizer(), 0.0, replan=replan)
-    speed = out["states"][:, :, 1:5, 3]
-    assert speed.diff(dim=1).abs().max() < 1.0
+def test_trajectories_never_mix_scenes_or_traffic():
+    env, pool, _, _ = small_environment()
+    data = collect(env, ActorEgo(hidden=(8,), initial_std=(0.9, 0.5)).network.actor, 60)
+    for key in ("scene_index", ("traffic", "row")):
+        assert torch.equal(data["next"][key], data[key])
+        changed = (data[key][:, 1:] != data[key][:, :-1]) & ~data["next", "done"][:, :-1]
+        assert not changed.any()
+    row, eta, adversary = (data["traffic", name] for name in ("row", "eta", "adversary"))
+    assert torch.equal(pool.scene_index[row], data["scene_index"]) and torch.equal(pool.eta[row], eta)
+    assert torch.equal(adversary[..., 1:2], row < 4) and not adversary[..., 2:].any()
+    assert torch.equal(data["next", "timestep"], data["timestep"] + 1)
+    assert len(row.unique()) == len(pool) and data["next", "done"].sum() > 16
+
+
+def test_the_traffic_driven_in_is_the_row_s():
+    """Vehicle 1 stands where its row of the pool says, at every moment of a batch of stored and recorded traffic."""
+    env, pool, scene_set, _ = small_environment(8)
+    stored = torch.cat([pool.states, scene_set.scenes["logged"][pool.scene_index[4:]]])
+    td = env.reset()
+    for _ in range(50):
+        td["action"] = torch.tensor([0.0, 0.3]).repeat(8, 1)
+        td = env.step_and_maybe_reset(td)[1]
+        world, row = env.base_env.world(), td["traffic", "row"][:, 0]
+        moving = world.step > 0
+        assert torch.equal(world.states[moving, 1], stored[row, world.step][moving, 1])
+
+
+def test_draws_follow_the_priorities():
+    priority = torch.tensor([0.1, 0.2, 0.3, 0.4])
+    env, pool, _, draw = small_environment(64, steps=1, probability=lambda pool: pool.probabilities(priority, 0.75))
+    rows = torch.cat([env.reset()["traffic", "row"][:, 0] for _ in range(60)])
+    share = torch.bincount(rows, minlength=8) / len(rows)
+    assert torch.allclose(share.double(), draw.probability, atol=0.03)
+
+
+def test_draws_go_on_from_a_state():
+    (env, _, _, draw), (other, _, _, second) = small_environment(8), small_environment(8)
+    env.reset()
+    second.generator.set_state(draw.generator.get_state())
+    assert torch.equal(env.reset()["traffic", "row"], other.reset()["traffic", "row"])
+
+
+# --- all kinds of rows at once
+
+
+def test_live_stored_and_recorded_rows_run_side_by_side():
+    scene_set = scenes(3)
+    pool, on = mixed(scene_set), March()
+    env = environment(pool, on, batch=9, scene_set=scene_set)
+    policy, tensordict = EgoPolicy(IDMEgo(), env), env.reset()
+    for step in range(1, 13):
+        tensordict = env.step(policy(tensordict))["next"]
+        states = tensordict["agents", "states"][:, 1:ROWS]
+        speed = (torch.arange(3.0) + (step - 1) // 5 / 10)[:, None]
+        torch.testing.assert_close(states[:3, :, 3], speed.expand(3, ROWS - 1))
+        assert torch.equal(states[3:6], pool.states[:, step, 1:ROWS])
+        assert torch.equal(states[6:], scene_set.scenes["logged"][:, step, 1:ROWS])
+        adversaries = tensordict["traffic", "adversary"].nonzero().tolist()
+        assert adversaries == [[row, 1] for row in range(6)], "nobody in recorded traffic"
+    assert [steps for steps, _ in on.calls] == [[0] * 3, [5] * 3, [10] * 3], "only live rows are replanned"
+    assert tensordict["traffic", "eta"][:, 0].tolist() == [1.0] * 3 + [4.0] * 3 + [0.0] * 3
+
+
+def test_a_live_row_drives_alike_beside_rows_of_other_kinds():
+    scene_set, tracks = scenes(3), []
+    for pool in (live(1.0, 3), mixed(scene_set)):
+        env = environment(pool, synthesizer(), batch=len(pool), scene_set=scene_set)
+        tensordict = advance(env, EgoPolicy(IDMEgo(), env), env.reset(), 12)
+        tracks.append(tensordict["agents", "states"][:3])
+    torch.testing.assert_close(*tracks, rtol=0, atol=2e-2)
+
+
+def test_an_environment_changes_between_kinds_of_rows_from_episode_to_episode():
+    scene_set = scenes(3, 10)
+    pool = mixed(scene_set)
+    env = environment(pool, March(), scene_set=scene_set)
+    out = env.rollout(30, EgoPolicy(IDMEgo(), env), break_when_any_done=False)
+    states, row = out["next", "agents", "states"][:, :, 1:ROWS], out["traffic", "row"][..., 0]
+    assert row[:, ::10].tolist() == [[0, 3, 6], [1, 4, 7], [2, 5, 8]]
+    assert torch.equal(states[:, 10:20], pool.states[:, 1:, 1:ROWS])
+    assert torch.equal(states[:, 20:], scene_set.scenes["logged"][:, 1:, 1:ROWS])
+    torch.testing.assert_close(states[:, 5:10, :, 3], (torch.arange(3.0) + 0.1)[:, None, None].expand(3, 5, ROWS - 1))
+
+
+def test_vehicles_of_replayed_rows_are_expected_to_keep_their_velocity():
+    """Nobody plans there, so that the ego foresees what it does in a pool without a method."""
+    scene_set = scenes(3)
+    scene_set.scenes["logged"][:, 3:, 1, 3] = 1.0
+    env = environment(mixed(scene_set), March(), batch=9, scene_set=scene_set)
+    tensordict = advance(env, still, env.reset(), 7)
+    straight = keep_velocity(tensordict["agents", "states"][:, :ROWS])
+    torch.testing.assert_close(tensordict["traffic", "plan"][3:, 1:], straight[3:, 1:])
+
+
+def test_plans_are_for_the_policy_alone_and_are_not_stacked_over_time():
+    def rolled(env, policy):
+        return env.rollout(12, policy, break_when_any_done=False)
+
+    for gather in (rolled, lambda env, policy: collect(env, policy, 12)):
+        ego, env = Watching(), environment(live(), March())
+        data = gather(env, EgoPolicy(ego, env))
+        kept = set(data.keys(True))
+        assert ("traffic", "plan") not in kept and ("next", "traffic", "plan") not in kept
+        assert {("traffic", "row"), ("next", "traffic", "adversary"), ("next", "traffic", "hurry")} <= kept
+        torch.testing.assert_close(ego.seen[-1][:, 1:, 0], data["next", "agents", "states"][:, -1, 1:ROWS])

@@ -93,7 +93,7 @@ class DenoisingLoss(nn.Module):
         scale = self.settings.feature_noise * net.node_std * ((net.node_std > MIN_STD) & (net.node_std < CONSTANT_STD))
         nodes = batch["nodes"] + scale * drawn["feature"]
         encoding = net.encode(nodes, batch["pairs"], batch["present"]).repeat(count)
-        weight, tiled = loss_weight(batch, drawn), torch.cat([batch] * count)
+        weight, tiled = loss_weight(batch, drawn), TensorDict.cat([batch] * count)
         level = drawn["level"].T.reshape(-1, 1).expand(-1, weight.shape[1]).clone()
         level[:, 0] = torch.where(drawn["clean"].T.reshape(-1), EGO_LEVEL, level[:, 0])
         x = net.schedule.noised(tiled["x0"], level[..., None], drawn["noise"].transpose(0, 1).flatten(0, 1))

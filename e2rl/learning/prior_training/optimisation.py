@@ -1,7 +1,7 @@
 """Optimisation of the denoiser: one run's state, its steps, the moving average of the weights, exact resume."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import torch
@@ -14,6 +14,7 @@ from e2rl.errors import InputError
 from e2rl.learning.prior_training.distributed import ALONE, Processes
 from e2rl.learning.prior_training.loss import CONSTANT_STD, MIN_STD, DenoisingLoss, augment, draw, loss_weight
 from e2rl.learning.prior_training.settings import TrainingSettings
+from e2rl.prior.denoiser import Denoiser
 from e2rl.prior.prior import Prior
 
 WARM_UP = 50  # steps
@@ -91,7 +92,7 @@ class PriorTraining:
         self.average.update_parameters(self.prior.denoiser)
         return torch.stack([action, trajectory])
 
-    def _average(self, average: list[Tensor], current: list[Tensor], _count: Tensor) -> None:
+    def _average(self, average: Sequence[Tensor], current: Sequence[Tensor], _count: Tensor | int) -> None:
         """Exponential moving average whose decay grows to `ema`; by the step here, `_count` may lie on the GPU."""
         decay = min(self.settings.ema, (1 + self.step) / (10 + self.step))
         for mean, value in zip(average, current, strict=True):
@@ -100,8 +101,9 @@ class PriorTraining:
     @contextmanager
     def averaged(self) -> Iterator[Prior]:
         """Within this context the prior has the averaged weights and is in evaluation mode."""
-        denoiser = self.prior.denoiser
-        self.prior.denoiser = self.average.module
+        denoiser, average = self.prior.denoiser, self.average.module
+        assert isinstance(average, Denoiser)
+        self.prior.denoiser = average
         self.prior.eval()
         try:
             yield self.prior

@@ -4,6 +4,7 @@ import hashlib
 import time
 from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 
@@ -53,12 +54,15 @@ def run_prior_stage(config: DictConfig, folder: Path) -> tuple[Path, list[dict]]
 
 def _untrained(config: DictConfig) -> Prior:
     """An untrained prior; its first weights follow the run's seed."""
-    groups = {"network": DenoiserSettings, "sampler": SamplerSettings, "bounds": BoundSettings}
-    parts = [settings_of(kind, config.prior[name], f"prior.{name}") for name, kind in groups.items()]
-    return Prior(*parts, free_space=config.prior.free_space)
+    return Prior(
+        settings_of(DenoiserSettings, config.prior.network, "prior.network"),
+        settings_of(SamplerSettings, config.prior.sampler, "prior.sampler"),
+        settings_of(BoundSettings, config.prior.bounds, "prior.bounds"),
+        config.prior.free_space,
+    )
 
 
-def _nominal(prior: Prior, scenes: SceneSet, device: str, folder: Path | None, **fields: str) -> list[dict]:
+def _nominal(prior: Prior, scenes: SceneSet, device: str, folder: Path | None, **fields: Any) -> list[dict]:
     """Metrics rows of the uncontrolled prior as traffic around the replayed ego."""
     setup = Setup(scenes, ReplayEgo(), "replay", SimSettings(), device=device)
     return run_protocol(setup, [Method("nominal", NominalTraffic(prior))], [0], folder, **fields)

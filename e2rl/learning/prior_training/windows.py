@@ -43,7 +43,7 @@ def make_windows(scenes: TensorDictBase, free: bool = False, chunk: int = 32) ->
         exact = [_window(scene, routed, offset, accel[:, offset], yaw_rate[:, offset], False) for offset in OFFSETS]
         observed = (scene["start_accel"][:, :vehicles], scene["start_yaw_rate"][:, :vehicles])
         parts += [*exact, _window(scene, routed, 0, *observed, True)]
-    windows = torch.cat(parts)
+    windows = TensorDict.cat(parts)
     return windows[windows["weight"].sum(-1) > 0]
 
 

@@ -1,0 +1,99 @@
+"""The examples do what they say, beside the methods of the package, by the commands that a user would run."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import e2rl
+from e2rl.scene.recording import DT
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples"
+
+
+def run(script, folder, *overrides):
+    """A script of the top level with the examples' configuration and modules, from an empty folder."""
+    command = [sys.executable, str(ROOT / script), "--config-dir", str(EXAMPLES / "conf"), f"hydra.run.dir={folder}"]
+    path = os.pathsep.join([str(EXAMPLES), str(ROOT)])
+    done = subprocess.run(
+        [*command, *overrides],
+        cwd=folder.parent,
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_rival_ego_source_and_metric_share_a_table_with_e2(tmp_path):
+    out = run(
+        "evaluate.py",
+        tmp_path / "run",
+        "data=csv_tracks",
+        f"data.path={EXAMPLES / 'logs'}",
+        "ego=cruise",
+        "methods=[replay,braking_leader,e2]",
+        "plugins=[my_stack.hard_braking]",
+        "seeds=[0]",
+        "data.workers=1",
+    )
+    rows = {row["method"]: row for row in json.loads((tmp_path / "run" / "metrics.json").read_text())}
+    assert set(rows) == {"replay", "braking_leader", "e2"} and rows["braking_leader"]["ego"] == "cruise"
+    assert rows["braking_leader"]["eta"] == 2 and "hard_braking" in out and "braking_leader" in out
+    with open(tmp_path / "run" / "rollouts.csv") as file:
+        assert {row["hard_braking"] for row in csv.DictReader(file)} <= {"0.0", "1.0", "0", "1"}
+
+
+def test_the_curriculum_runs_a_round(tmp_path):
+    out = run(
+        "train.py",
+        tmp_path / "run",
+        "curriculum=staircase",
+        "curriculum.stairs=[1.5]",
+        "rounds=1",
+        "num_scenes=2",
+        "learner.round.scenes=1",
+        "learner.collect.batch=2",
+        "learner.collect.iterations=1",
+        "learner.teacher=null",
+        "learner.recorded=false",
+        "measure.scenes=1",
+    )
+    assert "round 1/1: eta 1.50" in out
+
+
+@pytest.fixture
+def braking_leader(monkeypatch):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    from my_stack.braking_leader import BrakingLeader
+    from my_stack.csv_tracks import CsvTracks
+
+    scenes = CsvTracks(path=str(EXAMPLES / "logs"), workers=1).load()
+    return scenes, BrakingLeader()
+
+
+def test_the_leader_brakes_by_eta_on_its_path_and_nobody_else_does(braking_leader):
+    scenes, traffic = braking_leader
+    out = e2rl.roll_out(scenes, e2rl.make_ego("idm"), traffic, eta=2.0)
+    logged = scenes.scenes["logged"]
+    braked = out["adversaries"].nonzero()
+    assert len(braked) == 2, "one in each log"
+    for scene, agent in braked.tolist():
+        speed = out["states"][scene, :, agent, 3]
+        moving = speed[1:] > 0
+        assert torch.allclose((speed.diff() / DT)[moving], torch.tensor(-2.0), atol=0.02) and speed[-1] == 0
+        xy, path = out["states"][scene, :, agent, :2], logged[scene, :, agent, :2]
+        assert torch.cdist(xy, path).amin(1).max() < 0.8, "on its path, between recorded points"
+    others = out["valid"] & ~out["adversaries"][:, None]
+    others[:, :, 0] = False
+    assert torch.equal(out["states"][others], logged[others])
+    calm = e2rl.roll_out(scenes, e2rl.make_ego("idm"), traffic, eta=0.0)
+    assert not calm["adversaries"].any()

@@ -1,0 +1,66 @@
+"""Rooms import one way: a folder or file of e2rl knows only what comes before it."""
+
+import ast
+import runpy
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import e2rl
+from e2rl.ego.base import EgoPolicy
+from e2rl.ego.idm import IDMEgo
+from e2rl.sim.env import DrivingEnv, SimSettings
+from tests.synthetic import make_scenes
+
+PACKAGE = Path(e2rl.__file__).parent
+ORDER = (  # of the folders and files directly in e2rl
+    *("errors", "files", "settings"),
+    *("scene", "verdicts", "sim", "metrics", "prior", "ego", "evasion", "traffic", "synthesizer"),
+    *("evaluation", "build", "api", "learning", "report"),
+)
+
+
+def imports() -> list[tuple[str, str, str]]:
+    """(room, imported room, file:line) of every import between rooms, those inside functions included."""
+    found = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        room = path.relative_to(PACKAGE).with_suffix("").parts[0]
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [f"{'.' * node.level}{node.module or ''}.{alias.name}" for alias in node.names]
+            else:
+                continue
+            for first, *rest in (name.split(".") for name in names):
+                where = f"{path.relative_to(PACKAGE.parent)}:{node.lineno}"
+                assert first, f"{where}: a relative import; name the module in full"
+                if first == "e2rl" and rest and rest[0] != room:
+                    found.append((room, rest[0], where))
+    return found
+
+
+def test_every_room_has_its_place_in_the_order():
+    rooms = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or any(path.glob("*.py"))}
+    assert rooms - {"__init__", "commands"} == set(ORDER)  # commands: installed copies of train.py and evaluate.py
+
+
+def test_rooms_import_only_from_rooms_before_them():
+    backwards = [
+        f"{where}: {room} imports {other}"
+        for room, other, where in imports()
+        if ORDER.index(other) >= ORDER.index(room)
+    ]
+    assert not backwards, "\n".join(backwards)
+
+
+def test_rooms_have_no_cycle():
+    graph: dict[str, set[str]] = {}
+    for room, other, _ in imports():
+        graph.setdefault(room, set()).add(other)
+    assert set(TopologicalSorter(graph).static_order()) <= set(ORDER)  # raises CycleError where there is one
+
+
+def test_learning_can_be_imported_after_an_ego_was_built():
+    """TorchRL changes a module class when it is first built: other classes must not copy its attributes."""
+    EgoPolicy(IDMEgo(), DrivingEnv(make_scenes(1), SimSettings(), 1, agents=True))
+    assert "Disturbed" in runpy.run_path(str(PACKAGE / "learning" / "driving.py"))

@@ -1,0 +1,47 @@
+"""The package holds everything that its commands need, and its few names are what they say."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import e2rl
+from e2rl.errors import InputError
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_every_package_and_the_configuration_are_in_the_wheel():
+    setup = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    found = {".".join(file.parent.relative_to(ROOT).parts) for file in (ROOT / "e2rl").rglob("__init__.py")}
+    assert set(setup["packages"]) == found | {"e2rl.commands", "e2rl.commands.conf"}
+    assert (ROOT / setup["package-dir"]["e2rl.commands.conf"] / "evaluate.yaml").exists()
+    assert (ROOT / setup["package-dir"]["e2rl.commands"] / "train.py").exists()
+
+
+def test_a_notebook_rolls_out_what_the_command_does():
+    """The ten lines of e2rl.api: the rollouts do not depend on how they are asked for."""
+    from e2rl.build import build_prior, build_sim, build_traffic, load_config
+    from e2rl.evaluation.protocol import Method, Setup
+
+    scenes = e2rl.load_scenes("bundled", num_scenes=2)
+    ego, prior = e2rl.make_ego("lane_graph"), e2rl.load_prior()
+    ours = e2rl.roll_out(scenes, ego, e2rl.make_traffic("e2", prior), eta=2.0)
+    config = load_config("evaluate", ["num_scenes=2"])
+    setup = Setup(scenes, ego, "lane_graph", build_sim(config))
+    traffic = build_traffic(config.synthesizer, build_prior(config)[0])
+    theirs = setup.roll_out(Method("e2", traffic, 2.0), [(0, 0), (1, 0)])
+    assert (ours["states"] == theirs["states"]).all() and ours["adversaries"].any()
+    rows = e2rl.score(ours)
+    assert [row["scene_id"] for row in rows] == scenes.scene_id and {row["eta"] for row in rows} == {2.0}
+
+
+def test_settings_reach_the_objects_and_wrong_ones_are_named():
+    traffic = e2rl.make_traffic("e2", e2rl.load_prior(sampler={"steps": 4}), support="topology", topology={"beta": 2.0})
+    assert traffic.support == "topology" and traffic.topology.beta == 2.0 and traffic.prior.sampler.steps == 4
+    with pytest.raises(InputError, match="synthesizer=e2: .*suport"):
+        e2rl.make_traffic("e2", e2rl.load_prior(), suport="topology")
+    with pytest.raises(InputError, match="ego=nobody"):
+        e2rl.make_ego("nobody")
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = e2rl.nothing

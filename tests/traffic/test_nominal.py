@@ -1,0 +1,82 @@
+"""The prior as traffic: its plans are the prior's samples, continue each other, and see the ego as it drives."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from e2rl.prior.lane_relative import HORIZON, SIZE
+from e2rl.prior.prior import SamplerSettings
+from e2rl.sim.world import World
+from e2rl.traffic.nominal import NominalTraffic
+from e2rl.traffic.rows import noise_of, take_rows
+from tests.prior.small import curved_scenes, small_prior
+from tests.synthesizer.traffic_scenes import EGO, ROWS, begin, executed, scenes
+
+
+def nominal(**options):
+    return NominalTraffic(small_prior(0, sampler=SamplerSettings(steps=4), **options))
+
+
+def test_a_plan_is_the_prior_s_sample():
+    """Padding, which replan crops, changes the order of sums and nothing else."""
+    on, scene = nominal(), scenes(2).scenes
+    world, state = World.at_start(scene), begin(on, scene)
+    plan = EGO.plan(world)
+    after, found = on.replan(state, world, plan)
+    routed, lane = on.prior.start(scene, state.routed.route)
+    lane = on.lane_now(replace(state, routed=routed, lane=lane), world, plan)
+    context = on.prior.encode(routed, lane, world.states, world.valid, world.step, plan)
+    noise = noise_of(state.seed, torch.ones(2, dtype=torch.long), (4, ROWS, SIZE)).transpose(0, 1)
+    expected = on.prior.plan(on.prior.sample(context, noise).x0, context)
+    here = scene["valid"][:, :ROWS]
+    torch.testing.assert_close(found.states[here], expected.states()[here], rtol=1e-4, atol=1e-4)
+    assert torch.equal(found.present[here], expected.on_map[here]) and not found.present[~here].any()
+    assert found.adversary is None and after.replans.tolist() == [1, 1]
+
+
+def test_scenes_that_were_planned_differently_often_share_a_batch():
+    on, scene = nominal(), scenes(2).scenes
+    world, fresh = World.at_start(scene), begin(on, scene, seeds=[5, 6])
+    _, plan = on.replan(replace(fresh, replans=torch.tensor([0, 3])), world, EGO.plan(world))
+    for row, count in enumerate((0, 3)):
+        rows = torch.tensor([row])
+        one, there = replace(take_rows(fresh, rows), replans=torch.tensor([count])), take_rows(world, rows)
+        _, alone = on.replan(one, there, EGO.plan(there))
+        torch.testing.assert_close(alone.states, plan.states[rows], rtol=0, atol=5e-3)
+
+
+def test_plans_continue_where_the_last_one_was_left():
+    on, scene = nominal(), scenes(2).scenes
+    world = World.at_start(scene)
+    state, plan = on.replan(begin(on, scene), world, EGO.plan(world))
+    world = executed(world, plan, EGO.plan(world))
+    _, following = on.replan(state, world, EGO.plan(world))
+    end = plan.states[:, 1:5, 4]
+    step = following.states[:, 1:5, 0] - end
+    torch.testing.assert_close(step[..., 0], 0.1 * end[..., 3], rtol=0, atol=0.1)
+    assert step[..., 3].abs().max() < 0.6
+
+
+@pytest.mark.parametrize("free_space", [False, True])
+def test_the_ego_is_seen_as_it_drives_and_free_vehicles_beside_their_route(free_space):
+    scene = curved_scenes()
+    on, world = nominal(free_space=free_space), World.at_start(scene)
+    turning = scene["logged"][:, 1 : HORIZON + 1, 0].clone()
+    turning[..., 2] = 0.2 * 0.1 * torch.arange(1, HORIZON + 1)  # the ego turns at 0.2 rad/s
+    state = begin(on, scene)
+    state = replace(state, lane=state.lane.map(lambda value: value + 0.25))
+    seen = on.lane_now(state, world, turning)
+    assert seen.kappa[0, 0].item() == pytest.approx(0.2 / 8.0, rel=1e-3)
+    start = on.prior.start(scene, state.routed.route)[1]
+    torch.testing.assert_close(seen.d[:, 0], start.d[:, 0], rtol=0, atol=1e-3)
+    kept = seen.d[:, 1:6] - start.d[:, 1:6]
+    torch.testing.assert_close(kept, torch.full_like(kept, 0.0 if free_space else 0.25), rtol=0, atol=1e-3)
+    torch.testing.assert_close(seen.x[:, 1:], state.lane.x[:, 1:])
+
+
+def test_routes_and_noise_are_the_seed_s():
+    on, scene = nominal(), scenes(3).scenes
+    _, one = on.replan(begin(on, scene, seeds=[1, 2, 3]), World.at_start(scene), EGO.plan(World.at_start(scene)))
+    _, other = on.replan(begin(on, scene, seeds=[1, 2, 4]), World.at_start(scene), EGO.plan(World.at_start(scene)))
+    assert torch.equal(one.states[:2], other.states[:2]) and not torch.equal(one.states[2], other.states[2])
