@@ -98,7 +98,7 @@ class PolicyImprovement(Improvement):
             self.driver = PoolDriver(scenes, sim, batch, device)
         every = torch.arange(len(scenes))
         self.draw = RowDraw(torch.full((len(scenes),), 1 / len(scenes), dtype=torch.float64), seed)
-        self.synthesizer = AdversarialSynthesizer(TrafficPool.recorded(every), self.draw, traffic)
+        self.synthesizer = AdversarialSynthesizer(TrafficPool.recorded(every), self.draw, traffic, ego)
         base = DrivingEnv(scenes, sim, batch, device, agents=traffic is not None)
         self.env = TransformedEnv(base, Compose(self.synthesizer, RewardSum()))
         actor = ego.network.actor

@@ -21,7 +21,7 @@ def velocity(states: Tensor) -> Tensor:
 def pair_overlap(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor, possible: Tensor) -> Tensor:
     """Overlap area [...] [m2] of pairs of boxes; 0 where `possible` [...] is false or the area is at most MIN_AREA.
 
-    The exact area is computed only for the pairs that `sim.geometry.overlap` finds.
+    The exact area is computed only for the pairs that `scene.boxes.overlap` finds.
     """
     boxes = (first, first_size, second, second_size)
     meets = possible & overlap(*boxes)

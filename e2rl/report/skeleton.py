@@ -72,7 +72,7 @@ class SkeletonPicture:
         return drawing.BACKGROUND
 
     def ttc(self, weight: float) -> float:
-        """Time to collision [s] of a pair of this weight, eq. (ttc_weight) inverted."""
+        """Time to collision [s] of a pair of this weight, eq. (ttc_weight_t) inverted."""
         return max(0.0, self.settings.tau_max - self.settings.beta * math.log(weight / (1 - weight)))
 
     def figure(self) -> Image.Image:

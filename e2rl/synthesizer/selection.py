@@ -11,7 +11,7 @@ class Selection:
 
     seed [B]: of the scene's noise, which names the rollout; step [B]: of the choice; reference [B, T', V, 4]: states of
     the reference rollout at the steps looked at, moments [B, T'] s after the choice; weights [B, T', V, V]: pair risks
-    there, eq. (ttc_weight); candidates, feasible [B, V] bool: S_top and F; coalition, target [B, V]: C* and whom each
+    there, eq. (ttc_weight_t); candidates, feasible [B, V] bool: S_top and F; coalition, target [B, V]: C* and whom each
     of it acts on (0 the ego, -1: in no coalition).
     """
 

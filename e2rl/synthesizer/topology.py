@@ -90,7 +90,7 @@ def time_to_collision(states: Tensor, size: Tensor, horizon: float = 8.0) -> Ten
 
 
 def pair_weights(states: Tensor, valid: Tensor, size: Tensor, settings: TopologySettings) -> Tensor:
-    """Risk weights [..., N, N] of eq. (ttc_weight), 0 on the diagonal: states [..., N, 4], valid [..., N] bool."""
+    """Risk weights [..., N, N] of eq. (ttc_weight_t), 0 on the diagonal: states [..., N, 4], valid [..., N] bool."""
     ttc = time_to_collision(states, size + settings.clearance, settings.horizon)
     weight = torch.sigmoid((settings.tau_max - ttc) / settings.beta)
     both = valid[..., :, None] & valid[..., None, :]

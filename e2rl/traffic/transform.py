@@ -76,7 +76,11 @@ class AdversarialSynthesizer(Transform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         if self.traffic is not None:
             self._begin(tensordict_reset["timestep"][:, 0] == 0)
-        return self._write(tensordict_reset)
+        written = self._write(tensordict_reset)
+        known = tensordict is not None and ("traffic", "plan") in tensordict.keys(True)
+        if self.traffic is not None and not known:  # a collector would stack what the first reset returns
+            del written["traffic", "plan"]  # without a plan everybody is expected to keep its velocity, as it would say
+        return written
 
     def _begin(self, first: Tensor) -> None:
         """New states of the traffic method and no plan yet in environments first [B] bool that have just been reset."""
@@ -150,6 +154,8 @@ class AdversarialSynthesizer(Transform):
             keys["plan"] = self._plan_from(step)
             replayed = (self.pool.source[self._drawn] != LIVE).to(device)
             if bool(replayed.any()):
+                now = self._env.world().states[:, : self._plan["states"].shape[1]]
+                keys["plan"] = torch.where(replayed[:, None, None, None], keep_velocity(now), keys["plan"])
                 keys["adversary"] = torch.where(replayed[:, None], self._stored_adversaries(), keys["adversary"])
         tensordict["traffic"] = TensorDict(keys, batch_size=tensordict.batch_size, device=device)
         return tensordict
@@ -173,10 +179,12 @@ class AdversarialSynthesizer(Transform):
         return none.to(env.device)
 
     def _post_step_mdp_hooks(self, tensordict: TensorDictBase, tensordict_: TensorDictBase):
-        """Drop the plan from what is stacked over time: 0.8 kB a vehicle and step, of use to the policy alone."""
-        for key in (("traffic", "plan"), ("next", "traffic", "plan")):
-            if key in tensordict.keys(True):
-                del tensordict[key]
+        """The plan, 0.8 kB a vehicle and step, goes on to the policy; it is no spec and is not stacked over time."""
+        if self.traffic is not None:
+            tensordict_["traffic", "plan"] = tensordict["next", "traffic", "plan"]
+            for key in (("traffic", "plan"), ("next", "traffic", "plan")):
+                if key in tensordict.keys(True):
+                    del tensordict[key]
         return tensordict, tensordict_
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -190,7 +198,7 @@ class AdversarialSynthesizer(Transform):
         flags = Binary(vehicles, shape=(batch, vehicles), dtype=torch.bool, device=env.device)
         specs = {"row": number(1, dtype=torch.int64), "eta": number(1), "adversary": flags}
         if self.traffic is not None:
-            specs |= {"plan": number(vehicles, HORIZON, 4), "route": number(vehicles, dtype=torch.int64)}
+            specs["route"] = number(vehicles, dtype=torch.int64)
             specs |= {name: number(vehicles) for name in ("path_kl", *self.traffic.figures)}
         observation_spec["traffic"] = Composite(**specs, shape=[batch], device=env.device)
         return observation_spec
