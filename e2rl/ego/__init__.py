@@ -1,1 +1,1 @@
-"""Who drives: planners and the learned actor behind one interface."""
+"""Egos: planners and the learned actor behind one interface."""

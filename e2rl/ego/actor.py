@@ -1,4 +1,4 @@
-"""The learned ego: acts from the environment's observation, and plans what it expects itself to do."""
+"""The learned ego: acts on the environment's observation; its plan is a rollout of its own policy."""
 
 from collections.abc import Sequence
 
@@ -15,11 +15,11 @@ from e2rl.sim.observation import EgoState, observation_config, observe
 from e2rl.sim.static import FrenetPose, static_scene
 from e2rl.sim.world import World
 
-HOLD = 5  # steps for which a planned action is held: 10 evaluations of the network per plan
+HOLD = 5  # steps for which a planned action is held: 10 network evaluations per plan
 
 
 class ActorEgo(Ego):
-    """Drives by the actor's most central action; `network` is what the learner improves, in place."""
+    """Drives by the actor's most central action; the learner updates `network` in place."""
 
     def __init__(
         self,
@@ -32,7 +32,7 @@ class ActorEgo(Ego):
         checkpoint: str | None = None,
         device: str = "cpu",
     ) -> None:
-        """Fields: conf/ego/actor.yaml. Raises InputError where the checkpoint is missing or does not fit."""
+        """Fields: conf/ego/actor.yaml. Raises InputError if the checkpoint is missing or does not fit."""
         super().__init__(replan_every=HOLD)
         low, high = torch.tensor([-max_braking, -max_yaw_rate]), torch.tensor([max_acceleration, max_yaw_rate])
         self.network = ActorCritic(low, high, hidden, reference, initial_std, device)
@@ -41,14 +41,14 @@ class ActorEgo(Ego):
 
     @torch.no_grad()
     def act(self, world: World, observation: Tensor, plan: Tensor) -> Tensor:
-        """Most central action [B, 2] at the observation; the plan is not followed."""
+        """Most central action [B, 2] at the observation; the plan is ignored."""
         return self.network.network.deterministic(observation)
 
     @torch.no_grad()
     def plan(self, world: World) -> Tensor:
         """Planned states [B, PLAN_STEPS, 4]: the policy rolled forward, each action held HOLD steps.
 
-        Vehicles move as they plan to where their plans are known; everybody else keeps its velocity.
+        Vehicles follow their plans where these are known; all other agents keep their velocity.
         """
         static, others = static_scene(world.scene, mission_of(world.scene)), expected_states(world)[:, 1:]
         config, horizon = observation_config(world.states.device), world.scene["logged"].shape[1] - 1
@@ -70,7 +70,7 @@ class ActorEgo(Ego):
 
 
 def expected_states(world: World) -> Tensor:
-    """States [B, N, PLAN_STEPS + 1, 4] of everyone at steps 0.. from now: as planned, else at constant velocity."""
+    """States [B, N, PLAN_STEPS + 1, 4] of all agents at steps 0.. from now: as planned, else at constant velocity."""
     now = world.states[:, :, None]
     time = DT * torch.arange(PLAN_STEPS + 1, device=now.device, dtype=now.dtype)[:, None]
     velocity = now[..., 3:] * torch.stack([now[..., 2].cos(), now[..., 2].sin()], -1)

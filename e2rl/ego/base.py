@@ -1,7 +1,7 @@
-"""One interface for all egos: planners, learned actors and outside code, in collection and evaluation alike.
+"""One interface for all egos (planners, learned actors, outside code), for collection and evaluation.
 
-An outside planner plugs in by Hydra's `_target_`, in a YAML file of its own in conf/ego that lists its arguments. This
-one is whole: it holds the ego's speed along its mission for the coming five seconds.
+An outside planner is a class and a YAML file in conf/ego with its `_target_` and arguments. A complete example, which
+holds the ego's speed along its mission for the coming five seconds:
 
     import torch
     from e2rl.ego.base import PLAN_STEPS, Ego
@@ -18,8 +18,8 @@ one is whole: it holds the ego's speed along its mission for the coming five sec
             speed = world.states[:, 0, 3:] * self.gain                # [B, 1] m/s
             return path.drive(speed.expand(-1, PLAN_STEPS + 1))       # [B, 50, 4] x, y, heading, speed
 
-`plan` is all that it must have: `act` tracks the plan. An ego that maps observations to actions overrides `act`, and
-plans what it expects itself to do.
+Only `plan` is required: `act` tracks the plan. An ego that maps observations to actions overrides `act`; its `plan`
+returns its own predicted motion.
 """
 
 from abc import ABC, abstractmethod
@@ -36,7 +36,7 @@ from e2rl.sim.world import World
 
 PLAN_STEPS = 50  # H: planned steps of DT
 RETURN_TIME, RETURN_LENGTH = 0.7, 1.5  # s, m: a lateral error decays over max(RETURN_LENGTH, RETURN_TIME * v)
-CATCH_UP = 1.0  # 1/s: rate at which an error along the plan is made good
+CATCH_UP = 1.0  # 1/s: rate at which a longitudinal error is corrected
 
 
 class Ego(ABC):
@@ -54,7 +54,7 @@ class Ego(ABC):
         self.replan_every = int(replan_every)
 
     def reset(self, world: World) -> None:  # noqa: B027 - most egos have no memory
-        """Called before the first plan of new episodes, those with world.step 0. An ego with memory clears it here."""
+        """Called before the first plan of new episodes (world.step 0). An ego with memory clears it here."""
 
     @abstractmethod
     def plan(self, world: World) -> Tensor:
@@ -63,8 +63,8 @@ class Ego(ABC):
     def act(self, world: World, observation: Tensor, plan: Tensor) -> Tensor:
         """Action [B, 2] (acceleration [m/s^2], yaw rate [rad/s]) for the next step; by default it tracks the plan.
 
-        observation [B, D]: the environment's; plan [B, 1 + PLAN_STEPS, 4]: states now and at the coming steps, of the
-        last plan made.
+        observation [B, D]: the environment's; plan [B, 1 + PLAN_STEPS, 4]: states of the last plan, now and at the
+        coming steps.
         """
         return track(world.states[:, 0], plan[:, 0], plan[:, 1])
 
@@ -75,11 +75,11 @@ def return_length(speed: Tensor) -> Tensor:
 
 
 def track(state: Tensor, planned: Tensor, following: Tensor) -> Tensor:
-    """Action [..., 2] that leads a vehicle at state [..., 4] to follow a plan: `planned` now, `following` one step on.
+    """Action [..., 2] with which a vehicle at state [..., 4] tracks a plan: `planned` now, `following` one step later.
 
     Inverse dynamics to the following speed and heading, corrected by the deviation from the plan: a lateral error turns
-    the aimed heading towards the plan, an error along it changes the aimed speed. A plan that obeys the unicycle is
-    followed without error.
+    the target heading towards the plan, a longitudinal error changes the target speed. A plan that obeys the unicycle
+    is tracked without error.
     """
     error = to_frame(state[..., :2], planned)
     heading = following[..., 2] - torch.atan(error[..., 1] / return_length(state[..., 3]))
@@ -89,21 +89,21 @@ def track(state: Tensor, planned: Tensor, following: Tensor) -> Tensor:
 
 
 class EgoPlanner(TensorDictModuleBase):
-    """Writes what an Ego plans to do in a DrivingEnv with `agents=True`: ("ego", "plan") [B, PLAN_STEPS, 4].
+    """Writes the plan of an Ego in a DrivingEnv with `agents=True`: ("ego", "plan") [B, PLAN_STEPS, 4].
 
     Plans every `replan_every` steps; in between, the key holds the rest of the last plan, its last state held. Reads
-    timestep, agents and, where there is one, the traffic's plan.
+    timestep, agents and, if present, the traffic's plan.
     """
 
     in_keys = ["timestep", "agents"]
     out_keys: list[str | tuple[str, str]] = [("ego", "plan")]
 
     def __init__(self, ego: Ego, env) -> None:
-        """env: the DrivingEnv (or a TransformedEnv around it) whose running scenes the ego drives in."""
+        """env: the DrivingEnv (or a TransformedEnv around it) in which the ego drives."""
         super().__init__()
         base = getattr(env, "base_env", env)
         self.ego, self.scene, self.bounds = ego, base.scene, base.action_spec.space
-        self._plan: Tensor | None = None  # [B, 1 + PLAN_STEPS, 4] as planned, the state at the time of planning first
+        self._plan: Tensor | None = None  # [B, 1 + PLAN_STEPS, 4], the state at the time of planning first
         self._planned_at: Tensor | None = None  # [B] step of planning
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -111,7 +111,7 @@ class EgoPlanner(TensorDictModuleBase):
         return tensordict
 
     def plan(self, world: World) -> Tensor:
-        """States [B, 1 + PLAN_STEPS, 4] now and at the coming steps of the last plan, made anew where due."""
+        """States [B, 1 + PLAN_STEPS, 4] now and at the coming steps of the last plan; replans where due."""
         if bool((world.step == 0).any()):
             self.ego.reset(world)
         if self._plan is None or self._planned_at is None:

@@ -17,7 +17,7 @@ LINE_GAP = 1.0  # m kept to a stop line
 
 
 class IDMEgo(Ego):
-    """Keeps its mission lane and follows the nearest agent ahead within the lateral gate; never changes lanes."""
+    """Stays on its mission and follows the nearest agent ahead within the lateral gate; never changes lanes."""
 
     def __init__(
         self,
@@ -42,7 +42,7 @@ class IDMEgo(Ego):
         self.lateral_acceleration, self.use_limits, self.obey_lights = lateral_acceleration, use_limits, obey_lights
 
     def plan(self, world: World) -> Tensor:
-        """The present IDM acceleration held for the whole plan, within the path's speed caps."""
+        """The current IDM acceleration held for the whole plan, within the path's speed caps."""
         path, speed = MissionPath(world), world.states[:, 0, 3]
         caps = path.speed_caps(self.desired_speed, self.lateral_acceleration, self.braking, self.use_limits, False)
         gap, leading = self.leader(world, path)
@@ -57,7 +57,7 @@ class IDMEgo(Ego):
         return path.drive(torch.cat([speed[:, None], future], 1))
 
     def desired(self, path: MissionPath) -> Tensor:
-        """Desired speed [B]: the limit here where known and wanted, else the set one."""
+        """Desired speed [B]: the local speed limit if known and `use_limits`, else `desired_speed`."""
         set_speed = torch.full_like(path.s, self.desired_speed)
         if not self.use_limits:
             return set_speed
@@ -67,7 +67,7 @@ class IDMEgo(Ego):
     def leader(self, world: World, path: MissionPath) -> tuple[Tensor, Tensor]:
         """Free gap [B] m, inf for none, and speed [B] m/s along the route of the nearest agent or red light ahead.
 
-        An agent leads when its box comes laterally within half the ego's width + gate_margin of the route.
+        An agent is a leader if its box is laterally within half the ego's width + gate_margin of the route.
         """
         route, size = path.route[:, None], world.scene["size"]
         found = leaders(path.s[:, None], route, world.states, size, world.valid, None, self.gate_margin, torch.inf)

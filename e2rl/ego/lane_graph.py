@@ -1,7 +1,7 @@
 """The lane-graph planner of STRIVE (Rempe et al. 2022) on the mission route.
 
-It samples speed profiles along the mission, predicts everyone else on every route that they may take, and drives the
-longest profile whose probability of collision is small enough. Vectorised over scenes, profiles, others, routes, time.
+It samples speed profiles along the mission, predicts the other agents on their matched routes, and drives the
+longest profile whose probability of collision is below `max_risk`. Vectorised over scenes, profiles, agents, routes.
 """
 
 import math
@@ -18,7 +18,7 @@ from e2rl.sim.world import World
 
 PLAN_DT = 0.2  # s between nodes of a profile
 HALVES = (12, 13)  # nodes towards the first and the second speed target: 5 s in all
-EARLIER = 0.01  # weight of the mean way: of profiles halted at one point, as by a red light, the first there is longest
+EARLIER = 0.01  # weight of the mean distance: breaks ties of profiles that halt at one point in favour of the earliest
 
 
 class LaneGraphEgo(Ego):
@@ -72,8 +72,8 @@ class LaneGraphEgo(Ego):
     def profiles(self, world: World, path: MissionPath) -> Tensor:
         """Speeds [B, C, 26] every PLAN_DT s of the C = speeds^2 profiles.
 
-        Two halves of the horizon have a target each, evenly spaced over what max_acceleration reaches from the speed
-        at the half's begin; then the path's caps, as far as braking at max_acceleration attains them.
+        Each half of the horizon has a target speed, evenly spaced over the range that max_acceleration reaches from the
+        speed at its start. The path's speed caps apply as far as braking at max_acceleration attains them.
         """
         first, second = HALVES
         start, slope = world.states[:, 0, 3], self.max_acceleration * PLAN_DT
@@ -90,7 +90,7 @@ class LaneGraphEgo(Ego):
         return capped(wanted, caps, slope)
 
     def predict(self, world: World) -> Prediction:
-        """Everyone within interaction_distance on every matched route at every predicted speed."""
+        """Agents within interaction_distance, on every matched route at every predicted speed."""
         return predict(
             world,
             sum(HALVES),
@@ -108,12 +108,12 @@ class LaneGraphEgo(Ego):
         return (path.d.abs() < self.match_distance) & (path.turned.abs() < torch.pi * self.match_angle / 180)
 
     def choose(self, hazard: Tensor, driven: Tensor, matched: Tensor) -> Tensor:
-        """Profile [B] by hazard [B, C] = -log(1 - probability of collision) and way [B, C]: among those below max_risk
-        the longest (the shortest for an ego off its route that is not alone), if none the least hazardous."""
+        """Profile [B] by hazard [B, C] = -log(1 - probability of collision) and distance [B, C]: the longest below
+        max_risk (the shortest for an ego off its route with agents around), if none the least hazardous."""
         allowed = hazard < -math.log1p(-self.max_risk)
         longest = matched | (hazard == 0).all(1)
-        wish = torch.where(longest[:, None], driven, -driven).masked_fill(~allowed, -torch.inf)
-        return torch.where(allowed.any(1), wish.argmax(1), hazard.argmin(1))
+        score = torch.where(longest[:, None], driven, -driven).masked_fill(~allowed, -torch.inf)
+        return torch.where(allowed.any(1), score.argmax(1), hazard.argmin(1))
 
 
 def targets(start: Tensor, top: Tensor, reach: float, count: int) -> Tensor:
@@ -134,7 +134,7 @@ def capped(wanted: Tensor, caps: Tensor, slope: float) -> Tensor:
     """Speeds [B, C, 26] that follow wanted [B, C, 26] under the squared caps [B, K] of the path, braking by at most
     `slope` a node.
 
-    Where the caps bind depends on the way driven so far, so this steps through the 26 nodes, all profiles at once.
+    The caps depend on the distance driven so far, so this loops over the 26 nodes, for all profiles at once.
     """
     speed = wanted[..., 0]
     speeds, driven = [speed], torch.zeros_like(speed)

@@ -1,4 +1,4 @@
-"""The learned ego's network: observation normalisation, a squashed Gaussian actor and a critic, and its file."""
+"""The learned ego's network: observation normalisation, squashed Gaussian actor, critic, and their file."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,7 +23,7 @@ STEEPEST = 0.95  # reference actions are kept within this share of the bounds, s
 
 
 class Normaliser(nn.Module):
-    """Running mean and variance of observations; they change in `observe` alone, so evaluation leaves them frozen."""
+    """Running mean and variance of observations; only `observe` changes them, so evaluation leaves them frozen."""
 
     count: Tensor
     mean: Tensor
@@ -37,7 +37,7 @@ class Normaliser(nn.Module):
 
     @torch.no_grad()
     def observe(self, observation: Tensor) -> None:
-        """Take observations [..., D] into the statistics (Chan et al.'s pairwise update)."""
+        """Update the statistics with observations [..., D] (Chan et al.'s pairwise update)."""
         flat = observation.reshape(-1, observation.shape[-1])
         total = self.count + len(flat)
         share, delta = (len(flat) / total).float(), flat.mean(0) - self.mean
@@ -47,16 +47,16 @@ class Normaliser(nn.Module):
         self.count.copy_(total)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Observations of zero mean and unit variance, cut at 5."""
+        """Observations normalised to zero mean and unit variance, clipped to [-5, 5]."""
         return ((observation - self.mean) / self.variance.sqrt().clamp(min=0.05)).clamp(-5, 5)
 
 
 class ActorNetwork(nn.Module):
     """Mean and standard deviation of the action before squashing.
 
-    The mean is the reference's action (if `reference`) plus the network's; the latter is unbounded, so it can override
-    the reference anywhere. It begins at zero: an untrained actor drives as the reference does, or as half-way between
-    the action's bounds without one.
+    The mean is the reference's action (if `reference`) plus the network's output, which is unbounded and can override
+    the reference. The output starts at zero: an untrained actor executes the reference's action, or without a reference
+    the middle of the action's bounds.
     """
 
     middle: Tensor
@@ -153,12 +153,12 @@ class ActorCritic(nn.Module):
         self.critic = ValueOperator(values.to(device), in_keys=["observation"])
 
     def save(self, path: Path) -> None:
-        """Write weights and statistics to a safetensors file whose header tells the architecture."""
+        """Write weights and statistics to a safetensors file whose header holds the architecture."""
         weights = {key: value.detach().cpu().contiguous() for key, value in self.weights().items()}
         save_file(weights, path, metadata={"architecture": json.dumps(self.architecture, sort_keys=True)})
 
     def load(self, path: Path) -> None:
-        """Read a file of `save`; raises InputError for a damaged file or one of another architecture."""
+        """Read a file of `save`; raises InputError for a damaged file or another architecture."""
         try:
             with safe_open(path, "pt") as file:
                 saved = json.loads((file.metadata() or {}).get("architecture", "null"))
@@ -178,12 +178,12 @@ class ActorCritic(nn.Module):
 
     @torch.no_grad()
     def set_weights(self, weights: Mapping[str, Tensor]) -> None:
-        """Take over the values of `weights()`, in place."""
+        """Load the values of `weights()`, in place."""
         for key, value in self.weights().items():
             value.copy_(weights[key])
 
     def weights(self) -> dict[str, Tensor]:
-        """Every parameter and buffer once, though actor and critic share the normaliser."""
+        """Every parameter and buffer once (actor and critic share the normaliser)."""
         named = dict(self.named_parameters()) | dict(self.named_buffers())
         kept = {key: value for key, value in named.items() if not key.endswith((".middle", ".reach"))}
         return {key: value for key, value in kept.items() if not key.startswith("actor.")}
@@ -202,7 +202,7 @@ def find_weights(path: str | Path) -> Path:
 
 
 def perceptron(size: int, hidden: Sequence[int], out: int, last_gain: float) -> nn.Sequential:
-    """Layers size -> hidden -> out with SiLU; orthogonal weights, the last ones scaled by last_gain."""
+    """Layers size -> hidden -> out with SiLU; orthogonal weights, the last layer's scaled by last_gain."""
     sizes = [size, *hidden, out]
     layers = [nn.Linear(fan_in, fan_out) for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True)]
     for layer in layers:

@@ -1,5 +1,5 @@
-"""Paths along routes for planners: from the vehicle's pose smoothly onto the route, with the speeds that curves, limits
-and lights allow."""
+"""Paths along routes for planners: a smooth return from the vehicle's pose to the route, and speed caps by curves,
+limits and lights."""
 
 import torch
 from torch import Tensor
@@ -11,17 +11,17 @@ from e2rl.sim.dynamics import wrap
 from e2rl.sim.mission import limit_at, mission_of, stop_ahead
 from e2rl.sim.world import World
 
-MAX_SLOPE = 1.0  # rad between vehicle and route that a path takes over
+MAX_SLOPE = 1.0  # rad, bound of the angle between vehicle and route at the start of a path
 HORIZON = 200.0  # m of speed caps
 
 
 class RoutePath:
-    """Paths of vehicles [...] that leave their pose in their heading and return onto a route.
+    """Paths of vehicles [...] that start at their pose, along their heading, and return to a route.
 
-    Around the route's point at arc length s + a (a metres on) the lateral offset is
+    At arc length s + a of the route (a metres ahead) the lateral offset is
     d(a) = (d0 + (m + d0 / l) a) exp(-a / l), m the slope of the heading to the route, l = return_length(speed): the
-    critically damped return. It solves a linear equation in a, so planning anew on the way gives the same curve, where
-    the usual offset * exp(-a^2 / 3.5^2) (of STRIVE's planner, Rempe et al. 2022) starts with a kink no car can drive.
+    critically damped return. It solves a linear equation in a, so a replan on the curve gives the same curve. The
+    offset * exp(-a^2 / 3.5^2) of STRIVE's planner (Rempe et al. 2022) starts with a kink that no car can drive.
     """
 
     def __init__(self, state: Tensor, route: Tensor, hint: Tensor | None = None) -> None:
@@ -35,14 +35,14 @@ class RoutePath:
         self.residual = state[..., :2] - self.at(torch.zeros_like(s)[..., None])[..., 0, :2]
 
     def offset(self, ahead: Tensor) -> tuple[Tensor, Tensor]:
-        """Lateral offset and its slope at `ahead` [..., K] metres on along the route."""
+        """Lateral offset and its slope at `ahead` [..., K] metres along the route."""
         d, length = self.d[..., None], self.length[..., None]
         slope = torch.tan(self.turned.clamp(-MAX_SLOPE, MAX_SLOPE))[..., None]
         rate, decay = slope + d / length, torch.exp(-ahead.clamp(min=0) / length)
         return (d + rate * ahead) * decay, (slope - rate * ahead / length) * decay
 
     def at(self, ahead: Tensor) -> Tensor:
-        """Poses [..., K, 3] at `ahead` [..., K] metres on along the route."""
+        """Poses [..., K, 3] at `ahead` [..., K] metres along the route."""
         xy, heading, curvature = interpolate(self.route, self.s[..., None] + ahead)
         offset, slope = self.offset(ahead)
         normal = torch.stack([-heading.sin(), heading.cos()], -1)
@@ -81,7 +81,7 @@ class MissionPath(RoutePath):
         stop_gap: float = 1.0,
     ) -> Tensor:
         """Squares [B, HORIZON / SPACING] of the highest speeds, every SPACING metres ahead, from which `braking` m/s^2
-        still obeys: `desired` m/s, or the speed limit where it is known and `limits`; lateral acceleration `lateral`
+        meets all limits: `desired` m/s, or the speed limit if known and `limits`; lateral acceleration `lateral`
         m/s^2 in curves; a halt `stop_gap` m before a red light if `lights` (negative beyond it).
 
         c(a)^2 = min over b >= a of v(b)^2 + 2 braking (b - a), piecewise linear in a: read it by `look_up`.
@@ -100,8 +100,8 @@ class MissionPath(RoutePath):
         return potential - 2 * braking * grid
 
     def stop_distance(self, braking: float, stop_gap: float) -> Tensor:
-        """Metres [B] that the ego may go on before it must stand, stop_gap m before a red light; negative where it is
-        too near already, inf for no light."""
+        """Metres [B] until the ego's front is stop_gap m before the next stop line that binds; negative beyond that
+        point, inf for none."""
         world = self.world
         speed, half = world.states[:, 0, 3], world.scene["size"][:, 0, 0] / 2
         ahead = stop_ahead(self.mission, world.scene, world.step, self.s, speed, braking)
@@ -109,7 +109,7 @@ class MissionPath(RoutePath):
 
 
 def look_up(caps: Tensor, ahead: Tensor) -> Tensor:
-    """Speeds [B, ...] of the squared caps of `speed_caps` at `ahead` [B, ...] metres, the last one held."""
+    """Speeds [B, ...] of the squared caps of `speed_caps` at `ahead` [B, ...] metres; the last cap is held."""
     vertex = (ahead / SPACING).clamp(0, caps.shape[-1] - 1.001)
     index = vertex.detach().floor().long()
     flat = index.view(len(caps), -1)

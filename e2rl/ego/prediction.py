@@ -1,4 +1,4 @@
-"""Where the others may be over the coming seconds: on every matched route, at several speeds (STRIVE's planner)."""
+"""Predicted trajectories of the other agents: every matched route at several speeds (STRIVE's planner)."""
 
 from dataclasses import dataclass
 
@@ -29,11 +29,11 @@ def predict(
     match_angle: float,
     see_vrus: bool,
 ) -> Prediction:
-    """Trajectories of `steps` steps of dt of everyone within `reach` m of the ego.
+    """Trajectories of `steps` steps of dt of the agents within `reach` m of the ego.
 
-    A vehicle follows each route candidate that it is on (nearer than match_distance m, turned less than match_angle
-    degrees), straight on where it is on none; other agents go straight on (left out without see_vrus). Each is
-    predicted at each speed factor times its speed, approached at `acceleration` m/s^2.
+    A vehicle follows each matched route candidate (nearer than match_distance m, heading within match_angle degrees),
+    or its heading without a match; other agents keep their heading (omitted without see_vrus). Each agent is predicted
+    at each speed factor times its speed, approached at `acceleration` m/s^2.
     """
     states, vehicles = world.states, world.scene["route_log"].shape[1]
     near = (states[..., :2] - states[:, :1, :2]).norm(dim=-1) < reach
@@ -68,7 +68,7 @@ def predict(
 
 
 def ahead(speed: Tensor, steps: int, dt: float, factors: tuple[float, ...], acceleration: float) -> Tensor:
-    """Metres [J, F, steps + 1] driven from speed [J] when it approaches each factor times itself."""
+    """Metres [J, F, steps + 1] driven from speed [J] while it approaches each factor times speed."""
     aims = speed[:, None, None] * speed.new_tensor(factors)[:, None]
     change = acceleration * dt * torch.arange(1, steps + 1, device=speed.device, dtype=speed.dtype)
     start = speed[:, None, None]

@@ -1,7 +1,7 @@
-"""A route follower that reads only the observation: where the learned ego starts from, and what it corrects.
+"""A route follower that reads only the observation: the learned ego starts from it and corrects it.
 
-Steering is pure pursuit of the mission; the acceleration is the least of IDM's to every agent in the corridor and to a
-red light, and of what limits and curves ahead allow. Pure functions of the observation of e2rl.sim.observation.
+Steering is pure pursuit of the mission. The acceleration is the minimum over IDM behind every agent in the corridor,
+IDM behind stop lines that bind, and the speed caps by limits and curves. Pure functions of e2rl.sim.observation.
 """
 
 import torch
@@ -15,8 +15,8 @@ ROUTE = slice(11, 11 + 5 * len(LOOK_AHEAD))
 LIGHTS = slice(ROUTE.stop, ROUTE.stop + 8)
 AGENTS = slice(LIGHTS.stop + len(PROBE_X) * len(PROBE_Y), LIGHTS.stop + len(PROBE_X) * len(PROBE_Y) + 15 * NEAREST)
 
-DESIRED_SPEED = 12.0  # m/s where no limit is known
-PURSUIT_TIME, PURSUIT_MIN, PURSUIT_MAX = 1.5, 6.0, 30.0  # s, m, m: how far ahead steering aims
+DESIRED_SPEED = 12.0  # m/s without a known limit
+PURSUIT_TIME, PURSUIT_MIN, PURSUIT_MAX = 1.5, 6.0, 30.0  # s, m, m: look-ahead of the pursuit
 ACCELERATION, BRAKING, HARDEST_BRAKING = 1.5, 2.5, 7.0  # m/s^2
 HEADWAY, STANDSTILL_GAP, EXPONENT = 1.2, 3.0, 4.0  # s, m
 DRIVER = IDMParameters(HEADWAY, STANDSTILL_GAP, ACCELERATION, BRAKING, EXPONENT)
@@ -42,15 +42,15 @@ def reference_action(observation: Tensor) -> Tensor:
     desired = torch.where(limit > 0, limit, DESIRED_SPEED).clamp(min=1.0)
     follow = _following(speed[..., None], desired[..., None], *_leaders(observation, path)).amin(-1)
     accel = torch.minimum(follow, _capped(route, speed)).clamp(-HARDEST_BRAKING, ACCELERATION)
-    accel = torch.maximum(accel, -speed / REACTION)  # who stands has nothing to brake: 0, as in recordings
+    accel = torch.maximum(accel, -speed / REACTION)  # no braking at standstill, as in recordings
     return torch.stack([accel, speed * _pursuit(path, speed)], -1)
 
 
 def _following(speed: Tensor, desired: Tensor, gap: Tensor, leading: Tensor, acceleration: Tensor) -> Tensor:
     """Acceleration [..., K] of the ACC model (Kesting, Treiber and Helbing 2010) behind leaders [..., K].
 
-    IDM brakes at full strength where a gap is short though the leader pulls away, as after every cut-in. Where it asks
-    for less than the constant-acceleration heuristic, which only avoids the crash, it is softened towards the latter.
+    After a cut-in, IDM brakes fully for a short gap even if the leader pulls away. An IDM acceleration below that of
+    the constant-acceleration heuristic, which only avoids the crash, is therefore raised towards it.
     """
     own = idm_acceleration(speed, desired, gap, leading, DRIVER, improved=True)
     space, steady = gap.clamp(0.5, 1e3), acceleration.clamp(-HARDEST_BRAKING, ACCELERATION)
@@ -77,7 +77,7 @@ def _pursuit(path: Tensor, speed: Tensor) -> Tensor:
 
 
 def _capped(route: Tensor, speed: Tensor) -> Tensor:
-    """Acceleration [...] that meets, within REACTION, the speed from which limits and curves ahead can be obeyed."""
+    """Acceleration [...] that reaches the speed cap by limits and curves ahead within REACTION."""
     ahead, curvature, limit = route.new_tensor(LOOK_AHEAD), route[..., 3].abs() / 10, route[..., 4] * SPEED
     squared = torch.minimum(LATERAL / curvature.clamp(min=1e-3), torch.where(limit > 0, limit, torch.inf) ** 2)
     allowed = (squared + 2 * BRAKING * (ahead - speed[..., None] * REACTION).clamp(min=0)).amin(-1).sqrt()
@@ -123,7 +123,7 @@ def _on_path(position: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _halts(observation: Tensor, speed: Tensor) -> Tensor:
-    """Metres [..., 2] to the stop lines that bind: red if twice BRAKING still halts before it, yellow if BRAKING."""
+    """Metres [..., 2] to the stop lines that bind: red if twice BRAKING halts before it, yellow if BRAKING does."""
     light = observation[..., LIGHTS].unflatten(-1, (2, 4))
     ahead = -30 * light[..., 3].clamp(min=1e-4).log()
     needed = speed[..., None] ** 2 / (2 * ahead.clamp(min=1e-3))

@@ -1,4 +1,4 @@
-"""The ego as recorded. In the environment, `sim.replay_ego=true` follows the log exactly; this plans by it."""
+"""The recorded ego as a planner. With `sim.replay_ego=true` the environment follows the log exactly instead."""
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ from e2rl.sim.world import World
 
 
 class ReplayEgo(Ego):
-    """Plans the recording and, where the environment does not replay it, tracks it through the unicycle.
+    """Plans the recording; unless the environment replays it, the unicycle tracks this plan.
 
     After the recording's end the last speed and heading are held.
     """

@@ -1,4 +1,4 @@
-"""Which of the collisions an ego could have avoided: columns of the rollouts' rows (docs/method.md, section 10)."""
+"""Which collisions the ego could have avoided: columns of the rollouts' rows (docs/method.md, section 10)."""
 
 import time
 
@@ -9,13 +9,13 @@ from e2rl.evasion.search import SearchSettings, find_evasions
 from e2rl.scene.recording import DT
 from e2rl.sim.env import SimSettings
 
-LATE = 1.0  # s before contact: what acting only then still avoids is told apart
+LATE = 1.0  # s before contact at which the late search starts
 
 
 def add_avoidable(rows: list[dict], rollouts: dict, scene: TensorDictBase, sim: SimSettings) -> None:
     """Add to the rows (of score_rollouts, in place) of rollouts whose ego hit a vehicle: avoidable and avoidable_1s (0
     or 1: an evasion was found from the start frame, from LATE seconds before contact), evasion_accel [m/s^2] of the
-    mildest one from the start, evasion_tried (manoeuvres driven) and evasion_seconds. Others get nothing: NaN.
+    mildest one from the start, evasion_tried (manoeuvres driven) and evasion_seconds. Other rows: NaN.
 
     rollouts: the rollout dict [B] of the rows; scene: their scenes [B].
     """
@@ -27,7 +27,7 @@ def add_avoidable(rows: list[dict], rollouts: dict, scene: TensorDictBase, sim: 
     contact = torch.tensor([int(rows[index]["contact_step"]) for index in collided])
     early = find_evasions(*given, sim)
     late = find_evasions(*given, sim, moment=(contact - round(LATE / DT)).clamp(min=0))
-    found = early.found | late.found  # who can avoid it late can do so early: by driving as recorded until then
+    found = early.found | late.found  # avoidable late implies avoidable early: drive as in the rollout until then
     peak = torch.where(early.found, early.peak, torch.where(late.found, late.peak, torch.nan))
     spent = (time.perf_counter() - begin) / len(collided)
     for row, index in enumerate(collided):
@@ -41,5 +41,5 @@ def add_avoidable(rows: list[dict], rollouts: dict, scene: TensorDictBase, sim: 
 
 
 def search_effort(steps: int) -> str:
-    """What `avoidable` rests on, for captions: rollouts of `steps` steps."""
+    """Caption on the search behind `avoidable`, for rollouts of `steps` steps."""
     return f"avoidable: not found after {SearchSettings().effort(steps)} counts as no"

@@ -1,4 +1,4 @@
-"""The most telling choice of a coalition in a run: that of the skeleton figure."""
+"""The selection of a coalition shown in the skeleton figure."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +19,8 @@ from e2rl.traffic.rows import take_rows
 
 @dataclass
 class LongestChain:
-    """Listens to a method and keeps its selection of the longest chain, then of the largest coalition, then of the
-    greatest risk between its members; of equals the first. `kept`: that selection, B = 1."""
+    """Keeps a method's selection with the longest chain; ties go to the largest coalition, then to the greatest risk
+    between its members, then to the first. `kept`: that selection, B = 1."""
 
     method: Method
     kept: Selection | None = None
@@ -38,7 +38,7 @@ class LongestChain:
 
     @property
     def selection(self) -> Selection:
-        """The kept selection; InputError where nobody was chosen."""
+        """The kept selection; InputError if no adversary was chosen."""
         if self.kept is None:
             raise InputError(
                 f"figure=skeleton: {self.method.name} at eta={self.method.eta:g} chose no adversary in any scene; name "
@@ -48,13 +48,13 @@ class LongestChain:
 
     @property
     def topology(self) -> TopologySettings:
-        """Settings of the risk graphs that the method's selections rest on; InputError for a method without any."""
+        """Settings of the risk graphs of the method's selections; InputError for a method without them."""
         if self.method.traffic.topology is None:
             raise InputError(f"figure=skeleton: needs a method of e2 first in methods, not {self.method.name}")
         return self.method.traffic.topology
 
     def rollout(self, scenes: SceneSet, ego_name: str, folder: Path) -> dict:
-        """The rollout that the kept selection belongs to, from its file; InputError where nobody was chosen."""
+        """The rollout of the kept selection, from its file; InputError if no adversary was chosen."""
         seed, scene = divmod(int(self.selection.seed), SEEDS_APART)
         identity = {"method": self.method.name, "ego_policy": ego_name, "eta": self.method.eta}
         name = rollout_name(identity | {"scene_id": scenes.scene_id[scene], "seed": seed})
@@ -62,6 +62,6 @@ class LongestChain:
 
 
 def link_risk(selection: Selection) -> Tensor:
-    """Sum [B, T'] of the weights between each of the coalition and its target, by moment."""
+    """Sum [B, T'] of the weights between the coalition's members and their targets, at each time."""
     onto = selection.target.clamp(min=0)[:, None, :, None].expand(*selection.weights.shape[:3], 1)
     return (selection.weights.gather(3, onto)[..., 0] * selection.coalition[:, None]).sum(-1)

@@ -1,6 +1,6 @@
-"""What a run writes, and its tables read back: rollouts/*.npz, rollouts.csv, metrics.json (docs/method.md, section 11).
+"""Files of a run, written and read: rollouts/*.npz, rollouts.csv, metrics.json (docs/method.md, section 11).
 
-Every file appears whole (`e2rl.files.write_atomically`).
+Files are written atomically (`e2rl.files.write_atomically`).
 """
 
 import csv
@@ -33,7 +33,7 @@ TEXT_COLUMNS = ("dataset", "split", "method", "ego_policy", "scene_id", "locatio
 
 @dataclass(frozen=True)
 class Source:
-    """Where rollouts come from: the columns that a rollout dict does not hold."""
+    """The source of rollouts: the columns that a rollout dict lacks."""
 
     dataset: str
     split: str
@@ -60,13 +60,13 @@ def write_rollouts(folder: Path, rollouts: dict, source: Source) -> list[Path]:
 
 
 def rollout_name(arrays: dict) -> str:
-    """<method>__<ego>__<eta>__<scene_id>__<seed>.npz; characters that no file name bears become '-'."""
+    """<method>__<ego>__<eta>__<scene_id>__<seed>.npz; characters not allowed in file names become '-'."""
     parts = (arrays["method"], arrays["ego_policy"], f"{float(arrays['eta']):g}", arrays["scene_id"], arrays["seed"])
     return "__".join(re.sub(r"[^A-Za-z0-9._+-]", "-", str(part)) for part in parts) + ".npz"
 
 
 def rollout_arrays(rollouts: dict, index: int, source: Source) -> dict[str, np.ndarray]:
-    """The arrays of one rollout of a rollout dict, as format e2rl-rollout/1 wants them."""
+    """The arrays of one rollout of a rollout dict, in the format e2rl-rollout/1."""
     tensors = {key: value for key, value in rollouts.items() if isinstance(value, Tensor) and value.dim()}
     row = {key: value[index].detach().cpu() for key, value in tensors.items()}
     eta = row["eta"].item() if "eta" in row else float(rollouts["eta"])
@@ -104,7 +104,7 @@ def rollout_arrays(rollouts: dict, index: int, source: Source) -> dict[str, np.n
 def polylines(points: Tensor, index: Tensor, minimum: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(points [M, 2] float32, offsets [L + 1] int64, kept line numbers [L]) of padded points [P, 2], index [P].
 
-    Lines of fewer than `minimum` points describe nothing and are left out.
+    Lines of fewer than `minimum` points are omitted.
     """
     line = index.numpy()
     counts = np.bincount(line[line >= 0], minlength=1)
@@ -125,7 +125,7 @@ def table_columns() -> tuple[str, ...]:
 def write_rows(path: Path, rows: Sequence[dict]) -> None:
     """Write rollouts.csv: one line per rollout, NaN as an empty cell.
 
-    rows are those of score_rollouts with dataset, split, method and ego_policy added (`label_rows`).
+    rows: those of score_rollouts, with the columns of `label_rows`.
     """
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
@@ -136,7 +136,7 @@ def write_rows(path: Path, rows: Sequence[dict]) -> None:
 
 
 def label_rows(rows: Iterable[dict], source: Source) -> list[dict]:
-    """Rows with their source's columns."""
+    """Rows with the columns of their source: dataset, split, method, ego_policy."""
     return [vars(source) | row for row in rows]
 
 
@@ -147,7 +147,7 @@ def cell(value: object) -> object:
 
 
 def read_rows(path: Path) -> list[dict]:
-    """The rows of a rollouts.csv: text columns as text, seed and partner as int, all else as float (empty: NaN)."""
+    """The rows of a rollouts.csv: text columns as text, seed and partner as int, all others as float (empty: NaN)."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such table; give the folder of a run that evaluate.py wrote")
@@ -181,7 +181,7 @@ def read_metrics(path: Path) -> list[dict]:
 
 
 def nulls(value: object) -> object:
-    """The value with every float that is not finite replaced by None."""
+    """The value with every non-finite float replaced by None."""
     if isinstance(value, dict):
         return {key: nulls(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
@@ -215,5 +215,5 @@ def git_commit() -> str:
 
 
 def command_line() -> str:
-    """The command that runs, quoted for a shell."""
+    """The running command, quoted for a shell."""
     return shlex.join(["python", *sys.argv])

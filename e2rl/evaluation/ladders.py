@@ -1,4 +1,4 @@
-"""The rollout of a run that shows best what intensity does: that of the intensity figure."""
+"""The rollouts shown in the intensity figure: one scene and seed at every eta."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,8 +7,8 @@ from e2rl.evaluation.files import ROLLOUTS, TABLE, read_rows, rollout_name
 
 
 def intensity_ladder(folder: Path) -> list[Path]:
-    """The rollout files, by eta, of the one (method, scene, seed) of a run's folder that shows best what eta does:
-    unharmed at the lowest eta, hit at as many others as possible, earlier at greater ones, late at first."""
+    """The rollout files, by eta, of the one (method, scene, seed) of a run's folder that best shows the effect of eta:
+    no contact at the lowest eta, contact at as many others as possible, earlier at greater eta, late at first."""
     groups: dict[tuple, list[dict]] = {}
     for row in read_rows(Path(folder) / TABLE):
         groups.setdefault((row["method"], row["ego_policy"], row["scene_id"], row["seed"]), []).append(row)
@@ -19,7 +19,7 @@ def intensity_ladder(folder: Path) -> list[Path]:
 
 
 def worth(ladder: Sequence[dict]) -> tuple[float, ...]:
-    """How well rows of rollouts by eta show what it does; greater is better."""
+    """Score of rows of rollouts by eta for `intensity_ladder`; greater is better."""
     times = [row["contact_time"] for row in ladder if row["cfr"] == 1]
     falls = sum(later < earlier for earlier, later in zip(times, times[1:], strict=False))
     found = [row["cfr"] == 1 for row in ladder]

@@ -1,4 +1,4 @@
-"""Open-loop accuracy of traffic methods: plans from causal start states, the ego unknown, against the log."""
+"""Open-loop accuracy of traffic methods: plans from causal start states, without the ego's plan, against the log."""
 
 from collections.abc import Sequence
 
@@ -16,14 +16,14 @@ from e2rl.scene.scene import SceneSet
 from e2rl.traffic.traffic import keep_velocity
 
 HORIZONS = (3.0, 5.0)  # s
-EGO = "unknown"  # of the rows: nobody is told the ego's plan
+EGO = "unknown"  # `ego` column of the rows: no method receives the ego's plan
 BATCH = 32  # scenes planned at once
 
 
 @torch.no_grad()
 def open_loop_rows(scenes: SceneSet, methods: Sequence[Method], samples: int, device: str = "cpu") -> list[dict]:
     """Rows of metrics.json, stage `open loop`, of every uncontrolled method that predicts: minADE, mean and joint ADE
-    over `samples` and their ratios to constant velocity's ADE on the same vehicles, with intervals by place."""
+    over `samples` and their ratios to constant velocity's ADE on the same vehicles, with intervals over places."""
     rows = []
     for method in methods:
         if method.eta > 0 or not method.traffic.predicts:
@@ -52,7 +52,7 @@ def _displacements(scene: TensorDictBase, plans: Tensor) -> dict[str, Tensor]:
 
 
 def _summary(columns: dict[str, Tensor], scenes: SceneSet) -> dict[str, dict[str, float]]:
-    """{metric: {mean, low, high, n}}: quotients of sums over scenes, places resampled; n counts vehicles."""
+    """{metric: {mean, low, high, n}}: ratios of sums over scenes, places resampled; n counts vehicles."""
     rows = [{"location": place, "scene_id": name} for place, name in zip(scenes.location, scenes.scene_id, strict=True)]
     cluster, clusters = cluster_index(rows)
     draws = bootstrap_draws(clusters)

@@ -1,4 +1,4 @@
-"""Work spread over processes that share what was loaded before them."""
+"""Jobs spread over forked processes that share the parent's memory."""
 
 import io
 import multiprocessing
@@ -14,7 +14,7 @@ from e2rl.errors import InputError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-_function: Callable  # of a worker: what its pool was made for
+_function: Callable  # the function of a worker's pool
 
 
 def cores() -> int:
@@ -25,10 +25,10 @@ def cores() -> int:
 def in_processes(
     function: Callable[[Job], Result], jobs: Sequence[Job], processes: int, cost: Callable[[Job], float]
 ) -> Iterator[Result]:
-    """function(job) of each job, in their order, by so many forked processes of one thread each; the dearest begin
-    first. With one process, or one job, it is called here.
+    """function(job) of each job, in their order, by `processes` forked processes of one thread each; the jobs of
+    greatest cost start first. With one process or one job, no process is forked.
 
-    Forks share the parent's scenes and weights, and so the same function gives the same numbers everywhere.
+    Forks share the parent's scenes and weights, so results do not depend on `processes`.
     """
     processes = min(processes, len(jobs))
     if processes <= 1:
@@ -40,10 +40,10 @@ def in_processes(
         futures = {k: pool.submit(_call, jobs[k]) for k in order}
         try:
             for k in range(len(jobs)):
-                yield torch.load(io.BytesIO(futures[k].result()), weights_only=False)  # from a child of ours
+                yield torch.load(io.BytesIO(futures[k].result()), weights_only=False)  # trusted: from a child process
         except BrokenProcessPool as error:
             raise InputError(
-                f"processes={processes}: one of them was ended from outside, for want of memory perhaps; "
+                f"processes={processes}: a process was killed, perhaps for lack of memory; "
                 "use fewer, or a smaller batch"
             ) from error
         finally:
@@ -57,7 +57,7 @@ def _adopt(function: Callable) -> None:
 
 
 def _call(job) -> bytes:
-    """As bytes: tensors sent as they are would each hold a file of shared memory open."""
+    """The result as bytes: tensors sent directly would each hold a shared-memory file open."""
     buffer = io.BytesIO()
     torch.save(_function(job), buffer)
     return buffer.getvalue()

@@ -35,7 +35,7 @@ Task = tuple[int, int]  # position of a scene, sampling seed
 
 @dataclass
 class Method:
-    """A row of the table: its name, who drives the traffic, and at which intensity."""
+    """A row of the table: name, traffic and intensity."""
 
     name: str
     traffic: Traffic
@@ -44,7 +44,7 @@ class Method:
 
 @dataclass
 class Setup:
-    """What all methods of a table share: scenes, ego and its name in files, simulator, rollouts at once."""
+    """Shared by all methods of a table: scenes, ego and its name in files, simulator, batch of rollouts."""
 
     scenes: SceneSet
     ego: Ego
@@ -75,7 +75,7 @@ class Setup:
 
 
 def scene_seed(scene: int, seed: int) -> int:
-    """The noise seed of a rollout: the same for every method (paired)."""
+    """The noise seed of a rollout, the same for every method (paired)."""
     return seed * SEEDS_APART + scene
 
 
@@ -92,8 +92,8 @@ def run_protocol(
     """Roll out every method on every (scene, seed), score, and return the rows of metrics.json.
 
     folder: where rollouts/ (if save_rollouts), rollouts.csv and metrics.json are written (None: nowhere); processes:
-    over which the rollouts are spread, with the same rows; only: positions of the scenes to run, with the noise that
-    they have among all (None: all). fields join each row.
+    over which the rollouts are spread, with the same rows; only: positions of the scenes to run, with unchanged noise
+    (None: all). fields are added to each row.
     """
     tasks = [(scene, seed) for seed in seeds for scene in (range(len(setup.scenes)) if only is None else only)]
     count = -(-len(tasks) // setup.batch)

@@ -1,6 +1,6 @@
-"""The realism meta-metric of traffic models over many rollouts a scene, and the log's own split-half `real`.
+"""The realism meta-metric of traffic models over many rollouts per scene, and the log's own split-half `real`.
 
-Histograms are sums over rollouts, so batches of rollouts are counted as they come and memory stays flat.
+Histograms are sums over rollouts, so batches are counted one by one and memory stays constant.
 """
 
 from collections.abc import Sequence
@@ -31,8 +31,8 @@ from e2rl.prior.routed import take_route
 from e2rl.scene.recording import VEHICLE
 from e2rl.scene.scene import SceneSet
 
-TRACKS = 512  # vehicles of rollouts looked at at once: bounds the memory of the pairwise features
-SPLITS = 200  # of the logs into halves
+TRACKS = 512  # vehicles of rollouts processed at once: bounds the memory of the pairwise features
+SPLITS = 200  # random splits of the logs into halves
 
 
 class Tally:
@@ -82,14 +82,14 @@ class Tally:
 
 
 def evaluated(scene: TensorDictBase) -> Tensor:
-    """Bool [B, V]: vehicles other than the ego that are there at the start and recorded throughout."""
+    """Bool [B, V]: vehicles other than the ego that are present at the start and recorded throughout."""
     vehicles = scene["route_log"].shape[1]
     chosen = scene["valid"] & scene["logged_valid"].all(1) & (scene["agent_type"] == VEHICLE)
     return torch.cat([torch.zeros_like(chosen[:, :1]), chosen[:, 1:vehicles]], 1)
 
 
 def road_of(scene: TensorDictBase, route: Tensor) -> dict[str, Tensor]:
-    """Road, lights and ways of scenes [B] whose vehicles follow candidates route [B, V] (-1: no way, so no lights)."""
+    """Road, lights and routes of scenes [B] whose vehicles follow candidates route [B, V] (-1: no route, no lights)."""
     chosen = route.clamp(min=0)
     light = take_route(scene["route_light"], chosen)
     return {
@@ -104,9 +104,9 @@ def road_of(scene: TensorDictBase, route: Tensor) -> dict[str, Tensor]:
 
 def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int) -> list[dict]:
     """Rows of metrics.json, stage `meta-metric`: every feature's likelihood and their weighted sum over `rollouts`
-    rollouts of each scene, with intervals by place. The row of the log also has its split-half `real`.
+    rollouts of each scene, with intervals over places. The row of the log also has its split-half `real`.
 
-    One rollout of a deterministic method stands for all.
+    A deterministic method is rolled out once.
     """
     scenes, rows = setup.scenes, []
     seeds = [rollouts if method.traffic.stochastic else 1 for method in methods]
@@ -129,7 +129,7 @@ def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int) -> list[di
 
 
 def summarise_meta(likelihoods: dict[str, Tensor], scenes: SceneSet) -> dict[str, dict[str, float]]:
-    """{metric: {mean, low, high, n}} of likelihoods [S] a scene; n counts the scenes with a vehicle to look at."""
+    """{metric: {mean, low, high, n}} of likelihoods [S] per scene; n counts the scenes with an evaluated vehicle."""
     cluster, clusters = _clusters(scenes)
     table = torch.stack([meta_metric(likelihoods), *likelihoods.values()], -1)
     means = resampled_means(table, torch.ones_like(table), cluster, bootstrap_draws(clusters))
@@ -141,7 +141,7 @@ def summarise_meta(likelihoods: dict[str, Tensor], scenes: SceneSet) -> dict[str
 
 
 def log_split_half(scenes: SceneSet) -> dict[str, float]:
-    """Mean and 95% range of `real` between random halves of the logs, whole places apart; n counts scenes."""
+    """Mean and 95% range of `real` between random halves of the logs, split by place; n counts scenes."""
     scene = scenes.scenes
     simulated = scene["valid"] & (scene["agent_type"] == VEHICLE)
     simulated[:, 0] = False

@@ -1,4 +1,4 @@
-"""Rollout files read back: as arrays, and as the dict of tensors that the metrics take."""
+"""Rollout files read as arrays, and as the dict of tensors that the metrics take."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,12 +33,12 @@ ARRAYS = (
 
 
 def read_rollout(path: Path) -> dict[str, Any]:
-    """The arrays of one npz, scalars as python values; InputError where it is no rollout."""
+    """The arrays of one npz, scalars as python values; InputError if it is no rollout."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             data = {key: archive[key] for key in archive.files}
     except (OSError, ValueError, EOFError, BadZipFile, ZlibError) as error:
-        raise InputError(f"{path}: no readable rollout ({error}); run evaluate.py again to write it anew") from error
+        raise InputError(f"{path}: no readable rollout ({error}); run evaluate.py again to rewrite it") from error
     missing = [key for key in (*SCALARS, *ARRAYS) if key not in data]
     if missing or str(data["format"]) != FORMAT:
         raise InputError(
@@ -49,7 +49,7 @@ def read_rollout(path: Path) -> dict[str, Any]:
 
 
 def read_rollouts(folder: Path) -> list[dict[str, Any]]:
-    """All rollouts of a folder (or of a run's folder), in the order of their names."""
+    """All rollouts of a folder (or of a run's folder), sorted by name."""
     folder = Path(folder)
     paths = sorted((folder / ROLLOUTS if (folder / ROLLOUTS).is_dir() else folder).glob("*.npz"))
     if not paths:
@@ -58,7 +58,7 @@ def read_rollouts(folder: Path) -> list[dict[str, Any]]:
 
 
 def as_rollout_dict(rollouts: Sequence[dict]) -> dict:
-    """The rollout dict of tensors (leading B, padded) of rollouts as read from files, ready for score_rollouts.
+    """The rollout dict of tensors (leading B, padded) of rollouts read from files, ready for score_rollouts.
 
     `seconds` and transport are not in the files: seconds are NaN and transport is absent.
     """

@@ -13,7 +13,7 @@ Key = tuple  # values of GROUP
 
 
 def metric_row(key: Key, scenes: int, seeds: int, rollouts: int, metrics: Mapping, **fields: Any) -> dict:
-    """One row of metrics.json; key: dataset, split, method, ego and eta; fields override or join it."""
+    """One row of metrics.json; key: dataset, split, method, ego and eta; fields override or extend it."""
     identity = dict(zip(("dataset", "split", "method", "ego", "eta"), key, strict=True))
     counts = {"n_scenes": scenes, "n_seeds": seeds, "n_rollouts": rollouts}
     origin = {"git": git_commit(), "command": command_line()}
@@ -27,10 +27,10 @@ def metric_rows(
     realism_draws: int = REALISM_DRAWS,
     **fields: Any,
 ) -> list[dict]:
-    """Rows of metrics.json from the rows of rollouts, with their source's columns, and the features beside them.
+    """Rows of metrics.json from labelled rows of rollouts (`label_rows`) and their features.
 
     A row's `paired` compares it with every other method (or eta) on the same dataset, split and ego over the shared
-    (scene, seed); a method there with several etas is named method@eta. `fields` (e.g. stage="before") join each row.
+    (scene, seed); a method there with several etas is named method@eta. `fields` extend each row.
     """
     groups: dict[Key, list[int]] = {}
     for index, row in enumerate(rows):
@@ -55,6 +55,6 @@ def rivals(key: Key, keys: Sequence[Key]) -> list[Key]:
 
 
 def rival_name(key: Key, keys: Sequence[Key]) -> str:
-    """The group's method, with its eta where the method occurs with several beside the same ego."""
+    """The group's method, with its eta if the method occurs with several etas for the same ego."""
     etas = {other[4] for other in keys if other[:4] == key[:4]}
     return key[2] if len(etas) == 1 else f"{key[2]}@{key[4]:g}"

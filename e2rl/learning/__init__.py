@@ -1,1 +1,1 @@
-"""How it improves: updates, planner tuning, curriculum, the evolution round."""
+"""Learning: policy updates, planner tuning, curriculum, the evolution round."""

@@ -17,7 +17,7 @@ from e2rl.metrics.statistics import paired_differences
 
 @dataclass
 class BeforeAfter:
-    """Measures an ego and keeps the rows of both stages in folder/metrics.json."""
+    """Evaluates an ego and keeps the rows of both stages in folder/metrics.json."""
 
     setup: Setup
     methods: Sequence[Method]
@@ -25,7 +25,7 @@ class BeforeAfter:
     folder: Path
 
     def __call__(self, stage: str, ego: Ego) -> list[dict]:
-        """Measure an ego as `stage` (before or after); returns the rows of all stages so far.
+        """Evaluate an ego as `stage` (before or after); returns the rows of all stages so far.
 
         The rows of stage `after` are paired with the same method before, under the name `before`.
         """

@@ -1,4 +1,4 @@
-"""From a run's configuration to the parts of its evolution."""
+"""Builds the parts of an evolution from a run's configuration."""
 
 from functools import partial
 from pathlib import Path
@@ -54,10 +54,10 @@ def build_logger(config: DictConfig, folder: Path) -> RunLogger:
 def build_measure(
     config: DictConfig, ego: Ego, ego_name: str, traffic: Traffic, prior: Prior, folder: Path
 ) -> BeforeAfter:
-    """The before/after table: nominal traffic and the run's adversary on the scenes of `config.measure`.
+    """The before/after table: nominal and adversarial traffic on the scenes of `config.measure`.
 
-    Sources with splits of their own are measured on their tune split; a path's scenes on `measure.path`, or, where
-    there is none, on the first of the training scenes (the row's split says which).
+    Sources with splits are measured on their tune split; a path's scenes on `measure.path`, or without it on the first
+    training scenes (see `split` in the rows).
     """
     options, data = config.measure, config.data.copy()
     if options.path:
@@ -76,7 +76,7 @@ def run_imitation(
     """stage=imitation: clone the recorded egos of `scenes` into ego=actor, in place; writes folder/actor.safetensors
     and returns the losses of the epoch kept."""
     if "imitation" not in config.learner or not isinstance(ego, ActorEgo):
-        raise InputError("stage=imitation: it trains ego=actor with learner=ppo_bc; set both")
+        raise InputError("stage=imitation trains ego=actor with learner=ppo_bc; set both")
     settings = settings_of(ImitationSettings, {**config.learner.imitation, "seed": config.seed}, "learner.imitation")
     pairs = recorded_pairs(scenes, build_sim(config), settings)
     return imitate(ego.network, pairs, settings, folder, None if logger is None else logger.log)

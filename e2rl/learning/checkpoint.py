@@ -1,4 +1,4 @@
-"""Checkpoints of an evolution run: everything that the rounds to come depend on, written whole or not at all.
+"""Checkpoints of an evolution run: all state that later rounds depend on, written atomically.
 
 A checkpoint is a folder checkpoints/round-000002 of state.pt (optimiser, curriculum, sampler, counters, generators;
 read with weights_only), actor.safetensors (weights and observation statistics; also what `ego.checkpoint` takes),
@@ -24,7 +24,7 @@ STATE, TRAFFIC, CONFIG, FORMAT = "state.pt", "traffic.safetensors", "config.json
 
 
 def save_checkpoint(folder: Path, run: Evolution, config: dict, keep_last: int = 2) -> Path:
-    """Write checkpoints/round-<rounds done> under a run's folder; all but the keep_last newest are deleted."""
+    """Write checkpoints/round-<rounds done> under a run's folder; only the keep_last newest are kept."""
     parent = Path(folder) / "checkpoints"
     parent.mkdir(parents=True, exist_ok=True)
     target, partial = parent / f"round-{run.round:06d}", parent / f".partial-{os.getpid()}"
@@ -64,12 +64,12 @@ def saved_config(path: str | Path) -> dict:
 
 
 def load_checkpoint(path: str | Path, run: Evolution) -> int:
-    """Bring a run, built as the one that was saved, to its state, generators last; returns the rounds done."""
+    """Restore a run built from the same configuration, generators last; returns the rounds done."""
     folder = latest_checkpoint(path)
     file = folder / STATE
     try:
         state = torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # a damaged pickle raises whatever its bytes happen to mean
+    except Exception as error:  # a damaged pickle can raise any exception
         raise InputError(f"{file}: damaged ({type(error).__name__}); resume from an older checkpoint") from error
     if not isinstance(state, dict) or state.get("format") != FORMAT:
         raise InputError(f"{file}: not a checkpoint of this program ({FORMAT}); give a run's folder")

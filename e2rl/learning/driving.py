@@ -1,4 +1,4 @@
-"""One episode in each row of a pool with an ego at the wheel: for planners' tuning and for expert pairs."""
+"""Drives an ego through one episode per pool row, for planner tuning and for expert pairs."""
 
 from collections.abc import Callable
 
@@ -21,7 +21,7 @@ Disturbance = Callable[[Tensor, Tensor], Tensor]  # (action [B, 2], step [B]) ->
 
 
 class Disturbed(TensorDictModuleBase):
-    """An ego's policy whose action is disturbed; "intended" [B, 2] is what the ego wanted."""
+    """An ego's policy whose action is disturbed; "intended" [B, 2] is the undisturbed action."""
 
     def __init__(self, policy: EgoPolicy, disturb: Disturbance | None) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ class PoolDriver:
     """Environments in which egos drive rows of pools with recorded or stored traffic."""
 
     def __init__(self, scenes: SceneSet, sim: SimSettings, batch: int, device: str = "cpu") -> None:
-        """batch: environments, and rows driven at once."""
+        """batch: number of environments, i.e. of rows driven at once."""
         self.env = DrivingEnv(scenes, sim, batch, device, agents=True)
 
     def drive(self, ego: Ego, pool: TrafficPool, rows: Tensor, disturb: Disturbance | None = None) -> TensorDict:

@@ -1,4 +1,4 @@
-"""What collected episodes came to, one row per episode."""
+"""Outcomes of collected episodes, one row per episode."""
 
 from dataclasses import dataclass
 
@@ -17,8 +17,8 @@ OUTCOME_KEYS = (
 
 @dataclass
 class Episodes:
-    """E finished episodes, each field [E]: pool row and scene (int64), adversarial traffic, contact with anyone, off
-    the road (bool), return, progress [m] and mean |acceleration| [m/s^2] (NaN where it was not measured)."""
+    """E finished episodes, each field [E]: pool row and scene (int64), adversarial traffic, contact with any agent,
+    off the road (bool), return, progress [m] and mean |acceleration| [m/s^2] (NaN if not measured)."""
 
     row: Tensor
     scene_index: Tensor
@@ -60,8 +60,8 @@ def concatenated(parts: list[Episodes]) -> Episodes:
 def finished_episodes(batches: list[TensorDictBase], adversarial: Tensor, horizon: int) -> Episodes:
     """Episodes of a round's batches [B, T_i] in order (OUTCOME_KEYS), all environments reset at the first frame.
 
-    Episodes that began less than `horizon` steps before the end of the data are left out: of these only the short ones,
-    the failures, are finished. adversarial [R]: of the pool's rows.
+    Episodes that began less than `horizon` steps before the end of the data are omitted: only the failures among them
+    would be finished. adversarial [R]: of the pool's rows.
     """
     data = TensorDict.cat([batch.select(*OUTCOME_KEYS).to("cpu") for batch in batches], 1)
     after, metrics = data["next"], data["next", "metrics"]

@@ -15,7 +15,7 @@ from e2rl.settings import check_choice
 from e2rl.traffic.pool import TrafficPool
 
 NOMINAL, TRAFFIC = ("prior", "log", "none"), ("replay", "live")
-NOISES = 16  # rows with noise of their own that a scene has in live traffic
+NOISES = 16  # rows per scene in live traffic, each with its own noise
 Synthesize = Callable[[Ego, Tensor, float, int], Mapping[str, Tensor]]
 Solvable = Callable[[Mapping[str, Tensor]], Tensor]
 
@@ -35,8 +35,8 @@ class RoundSettings:
 
 @dataclass
 class Attack:
-    """What a round drives in: the pool, scenes [L] left out of it, and metrics; contact: the attacked ego's rate of
-    contacts, None where it is not known before the episodes are driven."""
+    """The traffic of a round: the pool, scenes [L] left out of it, and metrics; contact: the attacked ego's contact
+    rate, None if unknown before the episodes are driven."""
 
     pool: TrafficPool
     left_out: Tensor
@@ -48,8 +48,8 @@ class Evolution:
     """The state of a run: curriculum, improvement (which holds the ego) and the last round's D'.
 
     synthesize(ego, scene_index [S], eta, seed) -> {scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N],
-    adversaries [S, N] bool, contact [S] bool}: closed-loop traffic against that ego and whether it was hit.
-    solvable(traffic) -> bool [S]: rows that enter D'; all for None.
+    adversaries [S, N] bool, contact [S] bool}: closed-loop traffic against that ego; contact: it was hit.
+    solvable(traffic) -> bool [S]: rows that enter D' (None: all).
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Evolution:
         return {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
 
     def _synthesized(self, scenes: Tensor, seed: int) -> Attack:
-        """D' against the current ego, less what no driver survives, and nominal traffic."""
+        """D' against the current ego, without rows that no driver survives, and nominal traffic."""
         eta = self.curriculum.eta
         traffic = self.synthesize(self.ego, scenes, eta, seed)
         kept = torch.ones_like(traffic["contact"]) if self.solvable is None else self.solvable(traffic)
@@ -104,7 +104,7 @@ class Evolution:
         pool = TrafficPool.stored(self.traffic, eta)
         if self.settings.nominal == "prior":
             pool = pool + TrafficPool.stored(self.synthesize(self.ego, scenes, 0.0, seed), 0.0)
-        elif self.settings.nominal == "log" or not len(pool):  # without nominal traffic there may be nothing left
+        elif self.settings.nominal == "log" or not len(pool):  # without nominal traffic the pool may be empty
             pool = pool + TrafficPool.recorded(scenes)
         attacked = traffic["adversaries"].any(-1).float().mean().item()
         left_out, contact = traffic["scene_index"][~kept], traffic["contact"].float().mean().item()
@@ -122,10 +122,10 @@ class Evolution:
         return Attack(pool, scenes[:0], {})
 
     def state_dict(self) -> dict:
-        """Curriculum and improvement; weights, traffic and generators are the checkpoint's."""
+        """Curriculum and improvement; the checkpoint adds weights, traffic and generators."""
         return {"curriculum": self.curriculum.state_dict(), "improvement": self.improve.state_dict()}
 
     def load_state_dict(self, state: dict) -> None:
-        """Go on from a `state_dict`."""
+        """Restore a `state_dict`."""
         self.curriculum.load_state_dict(state["curriculum"])
         self.improve.load_state_dict(state["improvement"])

@@ -1,11 +1,11 @@
 """Expert pairs (observation, action) from recordings and planners, and the actor's warm start from them.
 
 Recorded pairs come in two kinds. Replayed: the ego follows its log exactly and the action is the inverse unicycle's.
-Disturbed: the ego tracks its log while its actions are perturbed for a second now and then (Laskey et al. 2017), so
-that the pairs show the way back; the label is the undisturbed action.
+Disturbed: the ego tracks its log while its actions are perturbed for a second at a time (Laskey et al. 2017), so the
+pairs show recoveries; the label is the undisturbed action.
 
-While it clones, the network's input carries noise, most on the last executed action: actions last, so an actor that
-saw it would copy it and never learn what it depends on (de Haan et al. 2019).
+During cloning, noise is added to the network's input, most to the last executed action: actions are strongly
+autocorrelated, so the actor would copy it instead of learning its causes (de Haan et al. 2019).
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ from e2rl.scene.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.traffic.pool import TrafficPool
 
-BURST, PAUSE = 10, 20  # steps: a disturbance lasts, and the time between the beginnings of two
+BURST, PAUSE = 10, 20  # steps: duration of a disturbance, and from the start of one to the next
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class ImitationSettings:
 def recorded_pairs(scenes: SceneSet, sim: SimSettings, settings: ImitationSettings) -> TensorDict:
     """Pairs [M] (observation, action, scene_index) of every recording, replayed once and disturbed `drives` times.
 
-    A disturbed episode counts until it touches something or leaves the road; actions are clipped to 0.99 of the bounds.
+    A disturbed episode counts until contact or off the road; actions are clipped to 0.99 of the bounds.
     """
     generator = torch.Generator().manual_seed(settings.seed)
     pool, parts = TrafficPool.recorded(torch.arange(len(scenes))), []
@@ -72,7 +72,7 @@ def recorded_pairs(scenes: SceneSet, sim: SimSettings, settings: ImitationSettin
 
 def corrective_pairs(driver: PoolDriver, teacher: Ego, pool: TrafficPool) -> TensorDict:
     """Pairs [M] of the teacher's episodes in the pool's adversarial rows that it survives (Algorithm 1's corrective
-    supervision: what another driver did where the ego is attacked); empty where it survives none."""
+    supervision); empty if it survives none."""
     adversarial = pool.adversarial.nonzero()[:, 0]
     parts = []
     for picked in filled_batches(len(adversarial), driver.env.batch_size[0]):
@@ -87,7 +87,7 @@ def corrective_pairs(driver: PoolDriver, teacher: Ego, pool: TrafficPool) -> Ten
 
 
 def _bursts(batch: int, settings: ImitationSettings, generator: torch.Generator) -> Disturbance:
-    """Constant offsets of random size for BURST steps out of every PAUSE, at another phase in each scene."""
+    """Constant offsets of random size for BURST steps out of every PAUSE, at a random phase per scene."""
     size = torch.tensor([settings.disturbed_acceleration, settings.disturbed_yaw_rate])
     offsets = torch.randn(batch, 100, 2, generator=generator) * size
     phase = torch.randint(PAUSE, (batch,), generator=generator)
@@ -109,7 +109,7 @@ def _pairs(frames: TensorDictBase, label: str, scene_index: Tensor, env: Driving
 
 
 class Imitation:
-    """Behaviour cloning of an ActorCritic's actor from pairs, held-out scenes apart. `history` has a row per epoch."""
+    """Behaviour cloning of an ActorCritic's actor from pairs, with held-out scenes. `history`: one row per epoch."""
 
     def __init__(self, network: ActorCritic, pairs: TensorDictBase, settings: ImitationSettings) -> None:
         self.network, self.settings = network, settings
@@ -140,7 +140,7 @@ class Imitation:
         return likelihood, miss.mean().item()
 
     def epoch(self) -> dict[str, float]:
-        """One pass over the training pairs; returns losses on both parts."""
+        """One pass over the training pairs; returns training and held-out losses."""
         order = torch.randperm(len(self.train), generator=self._generator).to(self.network.device)
         settings = self.settings
         for index in order.split(settings.minibatch):
@@ -160,8 +160,8 @@ def imitate(
     folder: Path | None = None,
     log: Callable[[dict[str, float], int], None] | None = None,
 ) -> dict[str, float]:
-    """Clone the pairs for settings.epochs and keep the weights of the least held-out loss (of the last epoch where no
-    scene is held out). They are written to folder / WEIGHTS whenever they improve; returns that epoch's row."""
+    """Clone the pairs for settings.epochs and keep the weights of the lowest held-out loss (of the last epoch if no
+    scene is held out). Improved weights are written to folder / WEIGHTS; returns the row of the epoch kept."""
     run, best, kept = Imitation(network, pairs, settings), None, None
     for epoch in (bar := tqdm(range(settings.epochs), "imitation", unit="epoch")):
         row = run.epoch()

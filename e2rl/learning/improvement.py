@@ -1,4 +1,4 @@
-"""The extension point for learners: what a round does to the ego."""
+"""The extension point for learners: the update of the ego in a round."""
 
 from abc import ABC, abstractmethod
 from pathlib import Path
@@ -12,7 +12,7 @@ from e2rl.traffic.pool import TrafficPool
 class Improvement(ABC):
     """Improves `ego` in the round's pool. A subclass is built as `_target_(ego=, parameters=, scenes=, sim=, traffic=,
     seed=, device=, **settings)`; parameters: those that the ego was built with; traffic: the method that drives live
-    rows, None where there are none."""
+    rows, None without live rows."""
 
     ego: Ego
 
@@ -22,11 +22,11 @@ class Improvement(ABC):
 
     @abstractmethod
     def outcome(self, folder: Path) -> str:
-        """How to evaluate the improved ego of a run's folder, in words."""
+        """A message that explains how to evaluate the improved ego of a run's folder."""
 
     def state_dict(self) -> dict:
-        """Everything that changes, but for an actor's weights, which have a file of their own."""
+        """All state but an actor's weights, which have their own file."""
         return {}
 
     def load_state_dict(self, state: dict) -> None:  # noqa: B027
-        """Go on from a `state_dict`."""
+        """Restore a `state_dict`."""

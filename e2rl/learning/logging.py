@@ -1,4 +1,4 @@
-"""Scalars of a run to CSV files or to an offline wandb run, in a few named groups."""
+"""Logs scalars of a run to CSV files or an offline wandb run, in named groups."""
 
 import math
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ KINDS = ("csv", "wandb", "none")
 
 
 class RunLogger:
-    """Writes {group/name: number} at steps; numbers that are NaN are left out."""
+    """Writes {group/name: number} at steps; NaN is omitted."""
 
     def __init__(self, kind: str, folder: Path, project: str = "e2rl", name: str | None = None) -> None:
         """kind: csv (folder/logs/scalars/<group>/<name>.csv), wandb (offline, folder/wandb), none."""

@@ -1,7 +1,7 @@
 """The update of a planner: grid search over its parameters on the round's adversarial and nominal scenes.
 
-The paper tunes its lane-graph planner so. Progress needs a guard: standing still is the trivial optimum of safety and
-comfort.
+The paper tunes its lane-graph planner in this way. Progress has a floor, because standing still is the trivial
+optimum of safety and comfort.
 """
 
 import itertools
@@ -66,8 +66,8 @@ def tune(
     """Try the present parameters, then the whole grid; keep the best admissible trial, the present one in a tie.
 
     evaluate(parameters) -> metrics with "collision" (rate), "comfort" (mean |acceleration|, m/s^2) and "progress" (m);
-    further ones are logged. Objective: collision + comfort weight * comfort + progress weight * share of the present
-    progress that is lost. Inadmissible: less than progress_floor of the present progress, or a metric that is NaN.
+    further ones are logged. Objective: collision + comfort weight * comfort + progress weight * lost share of the
+    present progress. Inadmissible: less than progress_floor of the present progress, or a NaN metric.
     """
     settings = settings or TuningSettings()
     trials, reference, tried = [], None, [present]
@@ -106,7 +106,7 @@ class PlannerImprovement(Improvement):
         seed: int = 0,
         device: str = "cpu",
     ) -> None:
-        """parameters: those that `ego` was built with; grid: values to try of some of them; others:
+        """parameters: those that `ego` was built with; grid: values to try for some of them; others:
         conf/learner/planner_tuning.yaml. Raises InputError for a grid that does not fit, or for live traffic."""
         unknown = sorted(set(grid) - set(parameters))
         if unknown:
@@ -120,7 +120,7 @@ class PlannerImprovement(Improvement):
         self.trials: list[dict] = []
 
     def __call__(self, pool: TrafficPool, curriculum: CurriculumScheduler) -> tuple[dict[str, float], Episodes]:
-        """Drive the pool once with every combination of the grid; the whole grid is left in `trials`."""
+        """Drive the pool once with every combination of the grid; `trials` keeps all results."""
         driven: dict[str, Episodes] = {}
 
         def evaluate(parameters: Parameters) -> dict[str, float]:
@@ -139,16 +139,16 @@ class PlannerImprovement(Improvement):
         return metrics | {"trials": float(len(tuning.trials))} | episodes.summary(), episodes
 
     def outcome(self, folder: Path) -> str:
-        """Write the last round's whole grid to tuning.json; how to evaluate the planner as tuned."""
+        """Write the trials of the last round to tuning.json; returns how to evaluate the tuned planner."""
         write_atomically(folder / "tuning.json", json.dumps({"best": self.present, "trials": self.trials}, indent=1))
         tuned = " ".join(f"ego.{key}={self.present[key]}" for key in self.grid)
-        return f"every trial of the last round is in tuning.json; evaluate the planner as tuned with: {tuned}"
+        return f"every trial of the last round is in tuning.json; evaluate the tuned planner with: {tuned}"
 
     def state_dict(self) -> dict:
         """The best parameters so far."""
         return {"present": dict(self.present)}
 
     def load_state_dict(self, state: dict) -> None:
-        """Go on from a `state_dict`."""
+        """Restore a `state_dict`."""
         self.present = dict(state["present"])
         self.ego = type(self.ego)(**self.present)

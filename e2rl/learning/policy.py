@@ -1,4 +1,4 @@
-"""The update of a learned ego: PPO and behaviour cloning on episodes that the collector drives in the round's pool."""
+"""The update of a learned ego: PPO and behaviour cloning on episodes collected in the round's pool."""
 
 import time
 from collections import defaultdict
@@ -74,10 +74,10 @@ class PolicyImprovement(Improvement):
         teacher: Ego | None = None,
         parameters: Mapping[str, Any] | None = None,
     ) -> None:
-        """recorded: clone what the recorded egos did all along; teacher: an ego whose survived episodes in the round's
-        adversarial traffic are cloned too; others: conf/learner/ppo_bc.yaml.
+        """recorded: clone the recorded egos in every round; teacher: also clone this ego's survived episodes in the
+        round's adversarial traffic; others: conf/learner/ppo_bc.yaml.
 
-        Raises InputError where the ego is no actor or a round cannot hold an episode.
+        Raises InputError if the ego is no actor or a round is shorter than an episode.
         """
         if not isinstance(ego, ActorEgo):
             raise InputError(f"learner=ppo_bc improves ego=actor, not {type(ego).__name__}; use learner=planner_tuning")
@@ -115,7 +115,7 @@ class PolicyImprovement(Improvement):
         self._batches = iter(self._collector)
 
     def __call__(self, pool: TrafficPool, curriculum: CurriculumScheduler) -> tuple[dict[str, float], Episodes]:
-        """Every environment begins anew; `iterations` times: collect [B, steps], update."""
+        """Reset every environment; `iterations` times: collect [B, steps], update."""
         expert = self._expert(pool)
         self.synthesizer.pool = pool
         self.draw.probability = pool.probabilities(curriculum.priority(), curriculum.share)
@@ -154,7 +154,7 @@ class PolicyImprovement(Improvement):
         return {"learner": self.learner.state_dict(), "frames": self.frames, "draws": self.draw.generator.get_state()}
 
     def load_state_dict(self, state: dict) -> None:
-        """Go on from a `state_dict`."""
+        """Restore a `state_dict`."""
         self.learner.load_state_dict(state["learner"])
         self.draw.generator.set_state(state["draws"].cpu())
         self.frames = state["frames"]

@@ -1,4 +1,4 @@
-"""`resume=RUN_DIR`: an interrupted run goes on in its own folder with its own configuration."""
+"""`resume=RUN_DIR`: an interrupted run continues in its own folder with its own configuration."""
 
 from pathlib import Path
 
@@ -7,18 +7,18 @@ from omegaconf import DictConfig, OmegaConf
 
 from e2rl.errors import InputError
 
-OVERRIDES = ("rounds", "device", "threads")  # what may change when a run goes on
+OVERRIDES = ("rounds", "device", "threads")  # keys that may change when a run is resumed
 
 
 def resumed(config: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
-    """(configuration, folder) to run: those of `config.resume`, but for the OVERRIDES given on the command line."""
+    """(configuration, folder) of the run `config.resume`, with the OVERRIDES of the command line."""
     if not config.resume:
         return config, folder
     saved_folder = Path(config.resume).resolve()
     file = saved_folder / ".hydra" / "config.yaml"
     if not file.exists():
         raise InputError(
-            f"resume={config.resume}: no run is there ({file} is missing); give the folder that the "
+            f"resume={config.resume}: no run found ({file} is missing); give the folder that the "
             "interrupted run printed"
         )
     saved = OmegaConf.load(file)

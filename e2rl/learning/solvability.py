@@ -1,4 +1,4 @@
-"""Which synthesized traffic is worth learning from: that in which some driver would not have been hit."""
+"""Solvability of synthesized traffic: some driver could have avoided the collision."""
 
 from collections.abc import Mapping
 
@@ -11,7 +11,7 @@ from e2rl.sim.env import SimSettings
 
 def solvable(traffic: Mapping[str, Tensor], scenes: SceneSet, sim: SimSettings) -> Tensor:
     """Bool [S] of synthesized traffic: the ego was not hit, or a search with full knowledge of the others' motion finds
-    how it would not have been (e2rl.evasion)."""
+    an evasion (e2rl.evasion)."""
     keep = ~traffic["contact"].cpu()
     hit = (~keep).nonzero()[:, 0]
     if len(hit):

@@ -12,7 +12,7 @@ from torchrl.objectives.value import GAE
 from e2rl.ego.network import ActorCritic
 from e2rl.errors import InputError
 
-EXPERT_SHARE = 0.99  # expert actions are kept within this share of the bounds: at them the squashed density is infinite
+EXPERT_SHARE = 0.99  # expert actions are clipped to this share of the bounds, where the squashed density is infinite
 PPO_KEYS = ("observation", "action", "action_log_prob", "advantage", "value_target", "state_value")
 
 
@@ -58,12 +58,12 @@ class Learner:
         """One PPO iteration on a Collector's batch [B, T], with behaviour cloning on expert pairs [M].
 
         Passes end early when the policy has moved by target_kl. The first `critic_warmup` calls fit the critic alone.
-        The observation statistics take in the batch at the end, so they are the same for collection and update.
+        The observation statistics are updated at the end, so they are equal in collection and update.
         Returns means of the losses and diagnostics.
         """
         settings, sums, stopped = self.settings, defaultdict(list), False
         seen_before = bool(self.network.normaliser.count > 0)
-        if not seen_before:  # its last layer still is zero, so statistics change no probability
+        if not seen_before:  # the last layer is still zero, so statistics change no probability
             self.network.normaliser.observe(data["observation"].to(self.network.device))
         flat = self._with_advantages(data)
         warming = self.updates < settings.critic_warmup
@@ -89,7 +89,7 @@ class Learner:
         }
 
     def _with_advantages(self, data: TensorDictBase) -> TensorDict:
-        """Frames [B T] of the keys PPO needs, advantages normalised over the whole batch."""
+        """Frames [B T] with PPO_KEYS; advantages are normalised over the whole batch."""
         with torch.no_grad():
             data = self.gae(data.to(self.network.device))
         flat = data.select(*PPO_KEYS).reshape(-1)
@@ -129,13 +129,13 @@ class Learner:
         return {"optimiser": self.optimiser.state_dict(), "updates": self.updates}
 
     def load_state_dict(self, state: dict) -> None:
-        """Go on from a `state_dict`."""
+        """Restore a `state_dict`."""
         self.optimiser.load_state_dict(state["optimiser"])
         self.updates = state["updates"]
 
 
 def take_step(optimiser: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:
-    """One step down the gradient of `loss`, its norm clipped; raises InputError where the loss is not finite."""
+    """One step down the gradient of `loss`, its norm clipped; raises InputError if the loss is not finite."""
     if not torch.isfinite(loss):
         raise InputError("learner: the loss is not finite; lower learner.*.learning_rate or check the observations")
     optimiser.zero_grad(set_to_none=True)

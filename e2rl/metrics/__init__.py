@@ -1,1 +1,1 @@
-"""How we tell: safety, realism and statistics as pure functions."""
+"""Metrics: safety, realism and statistics as pure functions."""

@@ -1,1 +1,1 @@
-"""What is likely: the frozen reverse-time SDE prior over joint traffic futures."""
+"""The prior: a frozen reverse-time SDE over joint traffic futures."""

@@ -1,1 +1,1 @@
-"""How we show it: tables, figures and replays."""
+"""Reports: tables, figures and replays."""

@@ -1,1 +1,1 @@
-"""What a situation is: recordings, scenes, lane graphs and their sources."""
+"""Scenes: recordings, lane graphs, routes and their sources."""

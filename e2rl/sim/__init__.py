@@ -1,1 +1,1 @@
-"""How it moves: dynamics, observation, reward, environment."""
+"""Simulator: dynamics, observation, reward and the environment."""

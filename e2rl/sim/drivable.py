@@ -10,7 +10,7 @@ def off_road(points: Tensor, field: Tensor, origin: Tensor) -> Tensor:
     """Metres [B, ...] that points [B, ..., 2] lie beyond the drivable border; negative inside.
 
     field [B, G, G]: value at cells of CELL m, first index along x; origin [B, 2]: centre of cell (0, 0). Bilinear
-    between cell centres, FAR outside the grid. Differentiable in the points; costs the same wherever they are.
+    between cell centres, FAR outside the grid. Differentiable in the points; the cost does not depend on them.
     """
     batch, cells = field.shape[0], field.shape[-1]
     cell = (points - origin.view(batch, *[1] * (points.ndim - 2), 2)) / CELL

@@ -1,8 +1,8 @@
 """Unicycle motion with actions (acceleration, yaw rate), forwards and backwards, whole horizons at once.
 
-A state is (x [m], y [m], heading [rad], speed [m/s]); a step lasts DT and moves at the mean of the two speeds along
-the mean of the two headings. Speeds are held in [0, MAX_SPEED]; yaw rates by the tightest turn and the lateral
-acceleration.
+A state is (x [m], y [m], heading [rad], speed [m/s]); a step lasts DT and moves at the mean of the old and the new
+speed along the mean of the two headings. Speeds are clamped to [0, MAX_SPEED], yaw rates by curvature and lateral
+acceleration (`yaw_rate_bound`).
 """
 
 import torch
@@ -11,8 +11,8 @@ from torch import Tensor
 from e2rl.scene.recording import DT
 
 MAX_SPEED = 40.0  # m/s
-MAX_LATERAL = 8.0  # m/s^2, about what tyres hold
-MAX_CURVATURE = 0.3  # 1/m, of the path of a car's centre at full lock
+MAX_LATERAL = 8.0  # m/s^2, about the grip of tyres
+MAX_CURVATURE = 0.3  # 1/m, path of a car's centre at full steering lock
 
 
 def wrap(angle: Tensor) -> Tensor:
@@ -28,7 +28,7 @@ def constant_velocity(states: Tensor, times: Tensor) -> Tensor:
 
 
 def yaw_rate_bound(speed: Tensor) -> Tensor:
-    """Largest |yaw rate| [rad/s] at speed [m/s]: MAX_CURVATURE * v at low speeds, MAX_LATERAL / v at high ones."""
+    """Largest |yaw rate| [rad/s] at speed [m/s]: MAX_CURVATURE * v at low speeds, MAX_LATERAL / v at high speeds."""
     return torch.minimum(MAX_CURVATURE * speed, MAX_LATERAL / speed.clamp(min=1e-3))
 
 
@@ -49,7 +49,7 @@ def rollout(start: Tensor, actions: Tensor) -> Tensor:
     """States [..., H, 4] at steps 1..H from start [..., 4] under actions [..., H, 2], without a loop over time.
 
     The speed recursion v' = clip(v + a DT, 0, MAX_SPEED) is a composition of shifted clips, which are closed under
-    composition, hence a parallel scan of log2 H levels; the rest are cumulative sums.
+    composition: a parallel scan of log2 H levels. Headings and positions are cumulative sums.
     """
     v0 = start[..., 3:4]
     speed = bounded_speed(v0, actions[..., 0] * DT)
@@ -88,9 +88,9 @@ def bounded_speed(v0: Tensor, change: Tensor, low: float = 0.0, high: float = MA
 
 
 def inverse(states: Tensor) -> Tensor:
-    """Actions [..., H, 2] that lead along states [..., H + 1, 4]: speed and heading differences over DT.
+    """Actions [..., H, 2] that reproduce states [..., H + 1, 4]: speed and heading differences over DT.
 
-    `rollout(states[..., 0, :], inverse(states))` returns the speeds and headings wherever these respect the bounds.
+    `rollout(states[..., 0, :], inverse(states))` returns the speeds and headings of states within the bounds.
     """
     change = states[..., 1:, 2:] - states[..., :-1, 2:]
     return torch.stack([change[..., 1], wrap(change[..., 0])], -1) / DT

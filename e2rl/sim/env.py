@@ -1,4 +1,4 @@
-"""DrivingEnv: B scenes at once, the ego driven by actions, the traffic by given trajectories."""
+"""DrivingEnv: a batch of B scenes; actions drive the ego, given trajectories drive the traffic."""
 
 import os
 import shutil
@@ -32,7 +32,7 @@ FLAGS, METRICS = ("terminated", "truncated"), ("contact", "contact_vru", "off_ro
 
 @dataclass
 class SimSettings:
-    """Bounds of the ego's action, what ends an episode early, and the reward weights (conf/sim/default.yaml)."""
+    """Bounds of the ego's action, termination settings and reward weights (conf/sim/default.yaml)."""
 
     max_acceleration: float = 5.0
     max_braking: float = 8.0
@@ -53,9 +53,9 @@ class DrivingEnv(EnvBase):
     progress [B, 1], m along the mission since the start. With agents=True also agents: states [B, N, 4], valid [B, N],
     accel [B, N] and yaw_rate [B, 1] of the ego, for policies that plan. Maps stay in `scene`.
 
-    An episode terminates at contact and off the road (settings) and is truncated after the scenes' T steps or where the
-    ego leaves the scene. A reset takes the scenes named by "scene_index" [B, 1] in its input, else draws them uniformly
-    from the environment's own generator (`set_seed`). Their traffic is what `set_traffic` gave, else the recording.
+    An episode terminates at contact and off the road (settings). It is truncated after the scenes' T steps or when the
+    ego leaves the scene. A reset takes the scenes "scene_index" [B, 1] of its input; without this key it draws them
+    uniformly (`set_seed`). The traffic is that of `set_traffic`, by default the recording.
     """
 
     def __init__(self, scenes: SceneSet, settings: SimSettings, batch_size: int, device="cpu", agents=False) -> None:
@@ -63,7 +63,7 @@ class DrivingEnv(EnvBase):
         self.scenes, self.settings, self.agents = scenes, settings, agents
         self._generator = torch.Generator()
         self.scene = scenes.batch(torch.zeros(batch_size, dtype=torch.long)).to(device)
-        """The running scenes, one storage for good: a reset overwrites its rows."""
+        """The running scenes, in one storage for the environment's lifetime: a reset overwrites its rows."""
         self.horizon = self.scene["logged"].shape[1] - 1
         low = torch.tensor([-settings.max_braking, -settings.max_yaw_rate], device=device)
         high = torch.tensor([settings.max_acceleration, settings.max_yaw_rate], device=device)
@@ -111,22 +111,22 @@ class DrivingEnv(EnvBase):
             self._generator.manual_seed(seed)
 
     def set_traffic(self, rows: Tensor, states: Tensor, valid: Tensor) -> None:
-        """Traffic of environments rows [b] int64 from their coming reset on, instead of the recording.
+        """Set the traffic of environments rows [b] int64 from their next reset on, instead of the recording.
 
-        states [b, T+1, N, 4], valid [b, T+1, N]; step 0 is taken to be the scene's start. The ego's row is ignored;
+        states [b, T+1, N, 4], valid [b, T+1, N]; step 0 must be the scene's start. The ego's row is ignored;
         pedestrians, cyclists and others keep replaying the log. Raises InputError on a wrong shape or NaN.
         """
         self._trajectories.schedule(rows, states, valid)
 
     def write_traffic(self, rows: Tensor, states: Tensor, valid: Tensor) -> None:
-        """Overwrite the vehicles' traffic of environments rows [b] at the coming steps; those beyond T are dropped.
+        """Overwrite the vehicles' traffic of environments rows [b] at the coming steps; steps beyond T are dropped.
 
         states [b, V, H, 4], valid [b, V, H].
         """
         self._trajectories.write(rows, self._ego.step[rows], states, valid)
 
     def world(self) -> World:
-        """The present moment. Its `scene` is the environment's own storage: overwritten at the next reset."""
+        """The current World. Its `scene` is the environment's own storage, which the next reset overwrites."""
         ego = self._ego
         states, valid, accel = self._trajectories.at(ego.step)
         first = (ego.step == 0)[:, None]
@@ -161,7 +161,7 @@ class DrivingEnv(EnvBase):
         return self._reset_output()
 
     def _restart(self, index: Tensor, scene: TensorDictBase, mission: Mission) -> None:
-        """Start states of environments index [b], whose scenes are scene [b]."""
+        """Write the start states of environments index [b] in scenes scene [b]."""
         state = scene["start"][:, 0]
         pose = FrenetPose(*(value[:, 0] for value in project(state[:, None, :2], mission.points)))
         on_road = off_road(state[:, None, :2], scene["field"], scene["field_origin"])[:, 0] <= 0
@@ -184,7 +184,7 @@ class DrivingEnv(EnvBase):
         outcome = dict.fromkeys((*FLAGS, *METRICS), none)
         return self._output(outcome | {"observation": features, "progress": ego.pose.s - ego.start_s})
 
-    @torch.no_grad()  # what an environment keeps must not grow a graph, step after step
+    @torch.no_grad()  # the stored state must not accumulate an autograd graph
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         replays, tracks = self.settings.replay_ego, (self._trajectories.states, self._trajectories.valid)
         function: Callable[..., tuple[EgoState, Outcome]] = replay_step if replays else step
@@ -194,7 +194,7 @@ class DrivingEnv(EnvBase):
         return self._output(outcome).set("reward", outcome["reward"][:, None])
 
     def _output(self, outcome: Outcome) -> TensorDict:
-        """What an environment returns of a step but the reward."""
+        """The step's output TensorDict without the reward."""
         shape, device = self.batch_size, self.device
         flags = {name: outcome[name][:, None] for name in FLAGS}
         result = {
@@ -214,7 +214,7 @@ class DrivingEnv(EnvBase):
 
 @cache
 def compiled(function: Callable) -> Callable:
-    """torch.compile of a step, one for all environments; raises InputError where nothing can compile C++."""
+    """torch.compile of a step, shared by all environments; raises InputError without a C++ compiler."""
     names = (os.environ.get("CXX", "c++"), "c++", "g++", "clang++")
     if not any(shutil.which(name) for name in names):
         raise InputError(

@@ -1,7 +1,7 @@
 """Leaders: the nearest agent ahead of each vehicle along its route.
 
-Most agents are far from most routes, so that only near pairs are projected: routes are cut into stretches with a
-bounding box each, and an agent is compared with the vertices of those stretches that it is near.
+Most agents are far from most routes, so only near pairs are projected: routes are cut into stretches with bounding
+boxes, and an agent is compared with the vertices of the stretches near it.
 """
 
 from typing import NamedTuple
@@ -11,14 +11,14 @@ from torch import Tensor
 
 from e2rl.scene.route import SPACING, onto_segments
 
-GATE_MARGIN = 0.3  # m of free space to either side within which an agent still is a leader
+GATE_MARGIN = 0.3  # m of lateral clearance within which an agent still is a leader
 FREE_GAP = 200.0  # m: the gap of a vehicle without a leader
 STRETCH = 10  # vertices
 
 
 # Called, because a field `index` of a class statement hides tuple.index for the type checker.
 class Leaders(NamedTuple("Leaders", [("gap", Tensor), ("speed", Tensor), ("index", Tensor)])):
-    """Of each vehicle [B, V]: bumper-to-bumper gap [m], the leader's speed along the route [m/s], its index [B, V]."""
+    """Per vehicle [B, V]: bumper-to-bumper gap [m], speed of the leader along the route [m/s], index of the leader."""
 
 
 def leaders(
@@ -31,12 +31,12 @@ def leaders(
     margin: float = GATE_MARGIN,
     free_gap: float = FREE_GAP,
 ) -> Leaders:
-    """The nearest agent ahead of each vehicle: one whose box comes within `margin` m of the vehicle's lateral range.
+    """The nearest agent ahead of each vehicle whose box is within `margin` m of the vehicle's lateral range.
 
     s [B, V]: arc lengths of the vehicles on their routes points [B, V, P, 2]; agents [B, M, 4], size [B, M, 2] and
     present [B, M]: of all agents, the vehicles in rows 0..V-1. A vehicle's lateral range is its width around the route;
-    with its offset d [B, V] given, the range from there to the route, through which it returns. Where there is no
-    leader nearer than `free_gap` m, the gap is `free_gap` and the speed the vehicle's own.
+    with offsets d [B, V] it also covers the way from the offset back to the route. Without a leader nearer than
+    `free_gap` m, the gap is `free_gap` and the speed is the vehicle's own.
     """
     length, width = size[:, : s.shape[1]].unbind(-1)
     reach = width / 2 + margin + (torch.zeros_like(s) if d is None else d.abs())
@@ -63,7 +63,7 @@ def leaders(
 
 def _near_pairs(points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Tensor) -> tuple[Tensor, ...]:
     """Pairs (scene, vehicle, agent, index of the nearest vertex; each [Q]) of present agents xy [B, M, 2] within room
-    [B, V, M] m of the vehicle's route and not behind it. Beyond its last vertex a route goes on straight."""
+    [B, V, M] m of the vehicle's route and not behind it. A route continues straight beyond its last vertex."""
     vehicles, count = points.shape[1:3]
     both = present[:, :vehicles, None] & present[:, None]
     itself = torch.eye(vehicles, xy.shape[1], dtype=torch.bool, device=s.device)

@@ -1,4 +1,4 @@
-"""The ego's mission: the route candidate that fits its recording, with speed limits, lights and its end."""
+"""The ego's mission: the route candidate that fits its recording, with speed limits, lights and end."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ class Mission(NamedTuple):
     """Mission routes of B scenes.
 
     points [B, P, 2]: vertices; limit [B, P]: speed limits [m/s], 0 unknown; end [B]: arc length [m] at which the map
-    ends, inf where it does not; light [B, 2]: indices of the lights, -1 none; light_s [B, 2]: arc lengths of their stop
+    ends, else inf; light [B, 2]: indices of the lights, -1: none; light_s [B, 2]: arc lengths of their stop
     lines.
     """
 
@@ -46,10 +46,10 @@ def limit_at(mission: Mission, s: Tensor) -> Tensor:
 def stop_ahead(
     mission: Mission, scene: TensorDictBase, step: Tensor, s: Tensor, speed: Tensor, braking: float
 ) -> Tensor:
-    """Metres [B] from arc length s [B] to the next stop line to halt at, inf for none.
+    """Metres [B] from arc length s [B] to the next stop line that binds, inf for none.
 
-    A yellow light binds where braking at `braking` m/s^2 from speed [B] halts before the line, a red one where twice
-    that does.
+    A yellow light binds if braking at `braking` m/s^2 from speed [B] halts before the line, a red light if braking at
+    twice that does.
     """
     state = light_state_at(scene["light_state"], mission.light, step)
     return stop_line_distance(state, mission.light_s - s[:, None], speed, 2 * braking, braking)

@@ -1,4 +1,4 @@
-"""The other agents in the ego's frame, all scenes of a batch in one pass; agents lie along the last axis."""
+"""The other agents in the ego's frame, for a batch of scenes in one pass; agents are on the last axis."""
 
 from typing import NamedTuple
 
@@ -33,7 +33,7 @@ def neighbours_of(
 ) -> Neighbours:
     """Neighbours of egos [B, 4] among agents with states [B, M, 4], present [B, M], accel [B, M].
 
-    rotation: `rotation_into(ego)`; size [B, 2]: length and width of the egos; half_size [B, 2, M]: of the others.
+    rotation: `rotation_into(ego)`; size [B, 2]: length and width of the egos; half_size [B, 2, M]: of the agents.
     """
     x, y, heading, speed = states.unbind(-1)
     poses = torch.stack([x - ego[:, :1], heading.cos(), y - ego[:, 1:2], heading.sin()], 1)

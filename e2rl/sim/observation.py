@@ -1,4 +1,4 @@
-"""What a learned ego sees: an ego-centred vector of OBSERVATION_SIZE numbers of order one.
+"""The observation of a learned ego: an ego-centred vector of OBSERVATION_SIZE numbers of order one.
 
 Blocks: ego (11), mission route ahead (12 x 5), lights (2 x 4), drivable border (5 x 5), nearest agents (12 x 15).
 """
@@ -23,11 +23,11 @@ OBSERVATION_SIZE = 11 + 5 * len(LOOK_AHEAD) + 8 + len(PROBE_X) * len(PROBE_Y) + 
 
 
 class EgoState(NamedTuple):
-    """The egos of B scenes now.
+    """The current egos of B scenes.
 
     step [B] int64; state [B, 4]: x, y, heading, speed; action [B, 2]: last executed acceleration and yaw rate; pose:
-    Frenet pose on the mission; present [B] bool: still in the scene; been_on_road [B] bool: being off the road counts
-    from then on; start_s [B]: arc length at the start.
+    Frenet pose on the mission; present [B] bool: still in the scene; been_on_road [B] bool: was on the road before,
+    so off_road counts; start_s [B]: arc length at the start.
     """
 
     step: Tensor
@@ -51,7 +51,7 @@ class ObservationConfig(NamedTuple):
 
 
 class Observed(NamedTuple):
-    """An observation and what it was made of: features [B, OBSERVATION_SIZE], neighbours, border [B, 25]: m beyond the
+    """An observation and its ingredients: features [B, OBSERVATION_SIZE], neighbours, border [B, 25]: m beyond the
     drivable border at the probes, limit [B]: speed limit at the ego [m/s], 0 unknown."""
 
     features: Tensor
@@ -62,7 +62,7 @@ class Observed(NamedTuple):
 
 @cache
 def observation_config(device: torch.device) -> ObservationConfig:
-    """The ObservationConfig on a device, made once."""
+    """The ObservationConfig on a device (cached)."""
 
     def numbers(*values: float) -> Tensor:
         return torch.tensor(values, device=device)
@@ -75,7 +75,7 @@ def observation_config(device: torch.device) -> ObservationConfig:
 def observe(
     config: ObservationConfig, static: StaticScene, ego: EgoState, agents: tuple[Tensor, Tensor, Tensor], horizon: int
 ) -> Observed:
-    """What egos see in scenes of `horizon` steps.
+    """The observation of egos in scenes of `horizon` steps.
 
     agents: states [B, M, 4], presence [B, M] and accelerations [B, M] of the others.
     """
@@ -95,8 +95,8 @@ def observe(
 
 
 def ego_features(static: StaticScene, ego: EgoState, limit: Tensor, time: Tensor) -> Tensor:
-    """[B, 11]: speed, last action (2), offset and heading to the mission (3), speed limit, way left before the map
-    ends, size (2), share of the time gone."""
+    """[B, 11]: speed, last action (2), offset and heading to the mission (3), speed limit, distance to the map's
+    end, size (2), elapsed share of the episode."""
     state, action, pose, size = ego.state, ego.action, ego.pose, static.size
     turned = state[:, 2] - pose.heading
     left = ((static.mission.end - pose.s) / 100).clamp(0, 1)
@@ -118,7 +118,7 @@ def route_features(
 
 
 def light_features(config: ObservationConfig, static: StaticScene, step: Tensor, s: Tensor) -> Tensor:
-    """[B, 2 * 4]: the mission's lights red, yellow, green (one-hot while ahead) and nearness (1 at hand, 0 far)."""
+    """[B, 2 * 4]: the mission's lights red, yellow, green (one-hot while ahead) and nearness (1 at the line, 0 far)."""
     if not static.light_state.shape[2]:
         return s.new_zeros(len(s), 8)
     light, ahead = static.mission.light, static.mission.light_s - s[:, None]
@@ -136,8 +136,8 @@ def agent_features(config: ObservationConfig, static: StaticScene, ego: EgoState
     count = min(NEAREST, apart.shape[1])
     index = apart.topk(count, dim=1, largest=False).indices
     scalars = torch.stack([others.gap, others.speed, others.accel, static.vehicle, others.present], 1)
-    everybody = torch.cat([others.position, others.direction, static.half_size, scalars], 1)
-    near = everybody.gather(2, index[:, None].expand(-1, everybody.shape[1], -1))
+    table = torch.cat([others.position, others.direction, static.half_size, scalars], 1)
+    near = table.gather(2, index[:, None].expand(-1, table.shape[1], -1))
     local, direction, half, gap, speed, accel, vehicle, present = near.split((2, 2, 2, 1, 1, 1, 1, 1), 1)
     velocity = speed * direction - torch.nn.functional.pad(ego.state[:, 3:, None], (0, 0, 0, 1))
     time = (-(local * velocity).sum(1, True) / (velocity.square().sum(1, True) + 1e-3)).clamp(0, 8)

@@ -23,7 +23,7 @@ def reward_terms(
     offset: Tensor,
     dt: float,
 ) -> dict[str, Tensor]:
-    """The TERMS, each [B], from what happened in one step of dt seconds.
+    """The TERMS, each [B], of one step of dt seconds.
 
     progress [B] m along the mission; contact, off_road [B] bool; action, last_action [B, 2]: executed acceleration and
     yaw rate; speed, limit [B] m/s (limit 0 unknown: never exceeded); offset [B] m from the mission route.
@@ -43,7 +43,7 @@ def reward_terms(
 
 
 def check_weights(weights: Mapping[str, float]) -> list[float]:
-    """The weights in the order of TERMS; raises InputError for a name that is no term or a term without weight."""
+    """The weights in the order of TERMS; raises InputError for an unknown name or a missing term."""
     wrong = set(weights) ^ set(TERMS)
     if wrong:
         raise InputError(f"sim.reward: {', '.join(sorted(wrong))} missing or unknown; give exactly {', '.join(TERMS)}")

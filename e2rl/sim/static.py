@@ -1,4 +1,4 @@
-"""What does not change while B scenes run, laid out so that each question of a simulation step is one table look-up."""
+"""The static part of B running scenes, as tables in which a simulation step needs one look-up per quantity."""
 
 from typing import NamedTuple
 
@@ -10,11 +10,11 @@ from e2rl.scene.recording import VEHICLE
 from e2rl.scene.route import SPACING, onto_nearer, segment
 from e2rl.sim.mission import Mission
 
-WINDOW = 20.0  # m of the mission on either side of where the ego is expected
+WINDOW = 20.0  # m of the mission on either side of the ego's expected arc length
 
 
 class FrenetPose(NamedTuple):
-    """Where egos are on their missions: arc length s [B] m, offset d [B] m (left positive), route heading [B] rad."""
+    """Frenet poses on the missions: arc length s [B] m, offset d [B] m (left positive), route heading [B] rad."""
 
     s: Tensor
     d: Tensor
@@ -26,7 +26,7 @@ class StaticScene(NamedTuple):
 
     mission; segments [B, P - 1, 12]: table of the mission's segments (`segment_table`); row [B, 1]: 0 .. B - 1;
     light_state [B, T + 1, S]; field [B, G, G], origin [B, 2]: the drivable field; size [B, 2]: length and width of the
-    ego; half_size [B, 2, M]: half lengths and widths of the others; vehicle [B, M]: which of them are vehicles.
+    ego; half_size [B, 2, M]: half lengths and widths of the others; vehicle [B, M] bool.
     """
 
     mission: Mission
@@ -58,7 +58,7 @@ def static_scene(scene: TensorDictBase, mission: Mission) -> StaticScene:
 
 
 def write_rows(static: StaticScene, rows: Tensor, new: StaticScene) -> None:
-    """Overwrite rows [b] of a StaticScene, in place; views of the scenes' storage follow their scenes by themselves."""
+    """Overwrite rows [b] of a StaticScene, in place; views of the scenes' storage need no copy."""
     for old, fresh in zip(static.mission, new.mission, strict=True):
         old[rows] = fresh
     for name in ("segments", "half_size", "vehicle"):
@@ -68,7 +68,7 @@ def write_rows(static: StaticScene, rows: Tensor, new: StaticScene) -> None:
 def segment_table(points: Tensor, limit: Tensor) -> Tensor:
     """Segments [B, P - 1, 12] of routes points [B, P, 2] with limits [B, P] m/s.
 
-    Columns: first vertex (2), difference to the next one (2), direction (2), length, heading, tangent angle at the
+    Columns: first vertex (2), difference to the next vertex (2), direction (2), length, heading, tangent angle at the
     first vertex, turn of the tangent to the next vertex (as `scene.route.interpolate` takes them), limits at both
     ends (2).
     """

@@ -1,6 +1,6 @@
 """One simulation step of B scenes, as a pure function of tensors.
 
-The others follow given trajectories, which are looked up; only the ego's motion is integrated step by step.
+Only the ego's motion is integrated; the other agents' states are looked up in given trajectories.
 """
 
 from typing import NamedTuple
@@ -16,11 +16,11 @@ from e2rl.sim.static import StaticScene, follow
 from e2rl.sim.trajectories import trajectories_at
 
 Tracks = tuple[Tensor, Tensor]  # states [B, T+1, N, 4] and presence [B, T+1, N] of all agents
-Outcome = dict[str, Tensor]  # of a step, each [B] but the observation: see `advance`
+Outcome = dict[str, Tensor]  # see `advance`
 
 
 class StepConfig(NamedTuple):
-    """horizon: steps of an episode; what ends it early: contact, leaving the road, the ego's departure; weights [6]: of
+    """horizon: steps of an episode; what ends it early: contact, off_road, departure of the ego; weights [6]: of
     reward.TERMS; low, high [2]: bounds of the action."""
 
     horizon: int
@@ -40,7 +40,7 @@ def step(ego: EgoState, action: Tensor, tracks: Tracks, static: StaticScene, con
 
 
 def replay_step(ego: EgoState, logged: Tracks, tracks: Tracks, static: StaticScene, config: StepConfig):
-    """`advance` of egos that follow their recording and leave the scene where it ends."""
+    """`advance` of egos that follow their recording and leave the scene at its end."""
     row, now = static.row[:, 0], (ego.step + 1).clamp(max=config.horizon)
     known = logged[1][row, now, 0]
     state = torch.where(known[:, None], logged[0][row, now, 0], ego.state)
@@ -50,7 +50,7 @@ def replay_step(ego: EgoState, logged: Tracks, tracks: Tracks, static: StaticSce
 def advance(
     ego: EgoState, state: Tensor, present: Tensor, tracks: Tracks, static: StaticScene, config: StepConfig
 ) -> tuple[EgoState, Outcome]:
-    """The egos after a step that leads them to state [B, 4], and its outcome; present [B]: egos still in the scene.
+    """The egos after a step to state [B, 4], and the outcome of the step; present [B]: egos still in the scene.
 
     Outcome: observation [B, D], reward, contact (with a vehicle), contact_vru (with another agent), off_road,
     terminated, truncated, progress (m along the mission since the start).

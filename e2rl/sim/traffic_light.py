@@ -1,4 +1,4 @@
-"""Traffic light states: the one look-up for planners, observations, features of the prior and metrics."""
+"""Traffic light states: one look-up for planners, observations, features of the prior and metrics."""
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ from e2rl.scene.recording import LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW
 def light_state_at(light_state: Tensor, light: Tensor, step: Tensor) -> Tensor:
     """States [B, ...] of the lights with indices light [B, ...] at steps [B]; LIGHT_UNKNOWN where the index is -1.
 
-    light_state [B, T + 1, S]: recorded states. Beyond the recording its last state holds.
+    light_state [B, T + 1, S]: recorded states; the last one is held beyond the recording.
     """
     if not light_state.shape[-1]:
         return torch.full_like(light, LIGHT_UNKNOWN)
@@ -22,10 +22,10 @@ def light_state_at(light_state: Tensor, light: Tensor, step: Tensor) -> Tensor:
 def stop_line_distance(
     state: Tensor, ahead: Tensor, speed: Tensor, red_braking: float, yellow_braking: float
 ) -> Tensor:
-    """Metres [...] to the next stop line to halt at, inf for none; state, ahead [..., K]: of K lights.
+    """Metres [...] to the next stop line that binds, inf for none; state, ahead [..., K]: of K lights.
 
-    A red light binds where braking at less than red_braking m/s^2 from speed [...] m/s halts before its line, a yellow
-    one at less than yellow_braking: a vehicle that cannot halt goes on rather than stand in the junction.
+    A red light binds if braking at less than red_braking m/s^2 from speed [...] m/s halts before its line, a yellow
+    light at less than yellow_braking. A vehicle that cannot halt in time continues.
     """
     needed = speed[..., None] ** 2 / (2 * ahead.clamp(min=1e-3))
     red, yellow = (state == LIGHT_RED) & (needed < red_braking), (state == LIGHT_YELLOW) & (needed < yellow_braking)

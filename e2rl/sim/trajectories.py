@@ -1,4 +1,4 @@
-"""The trajectories of everyone but the ego: the recording, stored ones, or plans that are written as they are made."""
+"""Trajectories of all agents but the ego: recorded, stored, or written plan by plan."""
 
 import torch
 from tensordict import TensorDictBase
@@ -20,7 +20,7 @@ class Trajectories:
         self._scheduled: list[tuple[Tensor, Tensor, Tensor]] = []
 
     def schedule(self, rows: Tensor, states: Tensor, valid: Tensor) -> None:
-        """Trajectories of scenes rows [b] from their coming reset on; raises InputError on a wrong shape or NaN."""
+        """Set trajectories of scenes rows [b] from their next reset on; raises InputError on a wrong shape or NaN."""
         expected = (len(rows), *self.states.shape[1:])
         if tuple(states.shape) != expected or tuple(valid.shape) != expected[:-1]:
             raise InputError(
@@ -33,7 +33,7 @@ class Trajectories:
         self._scheduled.append((rows.to(device), states.to(device), valid.to(device)))
 
     def reset(self, scene: TensorDictBase, index: Tensor) -> None:
-        """Scenes index [b] begin anew, with what was scheduled for them, else with their recording."""
+        """Restart scenes index [b] with their scheduled trajectories, by default with the recording."""
         if len(index) == len(self.states):
             self.states.copy_(scene["logged"]), self.valid.copy_(scene["logged_valid"])
         else:
@@ -47,7 +47,7 @@ class Trajectories:
                 self._scheduled.append((rows[~now], states[~now], valid[~now]))
 
     def write(self, rows: Tensor, step: Tensor, states: Tensor, valid: Tensor) -> None:
-        """Overwrite the vehicles of scenes rows [b] at steps step [b] + 1 .. + H; those beyond T are dropped.
+        """Overwrite the vehicles of scenes rows [b] at steps step [b] + 1 .. + H; steps beyond T are dropped.
 
         states [b, V, H, 4], valid [b, V, H].
         """
@@ -65,7 +65,7 @@ class Trajectories:
 def trajectories_at(states: Tensor, valid: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """States [B, N, 4], valid [B, N] and acceleration [B, N] of trajectories [B, T+1, N, 4], [B, T+1, N] at step [B].
 
-    The acceleration is the speed difference over the last step, 0 where there was none.
+    The acceleration is the speed difference over the last step, 0 without a last step.
     """
     row, before = torch.arange(len(step), device=step.device), (step - 1).clamp(min=0)
     now, there = states[row, step], valid[row, step]

@@ -1,4 +1,4 @@
-"""What a planner or a traffic method sees of a batch of running scenes."""
+"""The input of planners and traffic methods: the current state of a batch of running scenes."""
 
 from dataclasses import dataclass
 
@@ -9,11 +9,11 @@ from torch import Tensor
 
 @dataclass
 class World:
-    """The present moment of B scenes; agent 0 is the ego, agents [:V] are the vehicles.
+    """The current state of B scenes; agent 0 is the ego, agents [:V] are the vehicles.
 
     scene: Scene TensorDict [B]; step [B] int64: simulated steps since the start frame; states [B, N, 4]: x, y, heading,
     speed; valid [B, N]: present now; accel [B, N] m/s^2; yaw_rate [B] rad/s: the ego's last executed one; plan
-    [B, V, H, 4]: states at the coming steps that the vehicles plan (None: unknown); route [B, V] int64: the route
+    [B, V, H, 4]: the vehicles' planned states at the coming steps (None: unknown); route [B, V] int64: the route
     candidates that the vehicles follow (None: unknown).
     """
 
@@ -35,7 +35,7 @@ class World:
 
     @classmethod
     def of(cls, tensordict: TensorDictBase, scene: TensorDictBase) -> "World":
-        """The moment that a DrivingEnv with `agents=True` reports in a TensorDict [B]; scene: `DrivingEnv.scene`."""
+        """The World that a DrivingEnv with `agents=True` reports in a TensorDict [B]; scene: `DrivingEnv.scene`."""
         agents = tensordict["agents"]
         return cls(
             scene,

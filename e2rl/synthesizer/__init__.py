@@ -1,1 +1,1 @@
-"""What is dangerous: topology, feasibility, skeleton, anchoring, potentials, guided control."""
+"""e2, the adversary: topology, feasibility, skeleton, anchoring, potentials, guided control."""

@@ -1,1 +1,1 @@
-"""Who drives the other vehicles: one interface, the plain methods behind it, and its TorchRL transform."""
+"""Traffic: the interface of methods that drive the other vehicles, simple methods, and the TorchRL transform."""

@@ -1,4 +1,4 @@
-"""Constant velocity: everybody goes straight on from its causal start state."""
+"""Constant velocity from the causal start states."""
 
 from torch import Tensor
 
@@ -7,7 +7,7 @@ from e2rl.traffic.traffic import State, Traffic, TrafficPlan, keep_velocity, ste
 
 
 class ConstantVelocity(Traffic):
-    """Straight along the start heading at the start speed; parked vehicles stay parked, nobody ever leaves."""
+    """Start heading and start speed are kept; parked vehicles stay parked, and no vehicle leaves."""
 
     stochastic = False
 

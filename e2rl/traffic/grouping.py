@@ -1,6 +1,6 @@
-"""Scenes of like size are planned together: half of a batch is padding, and small groups are mostly overhead.
+"""Scenes of similar size are planned together: half of a batch is padding, and small groups are mostly overhead.
 
-Vehicles and other agents fill their rows from the front, so that a group is cropped by slices of the rows in use.
+Vehicles and other agents fill their rows from the front, so a group is cropped by slicing.
 """
 
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -13,8 +13,8 @@ from torch import Tensor
 from e2rl.sim.world import World
 from e2rl.traffic.rows import map_tensors
 
-ROWS = 160, 1024  # vehicle rows from which a group may end, and at most
-SHRUNK = 0.55  # share of its largest scene at which the next scene begins another group
+ROWS = 160, 1024  # vehicle rows of a group: SHRUNK applies from the first number on, the second is the maximum
+SHRUNK = 0.55  # a scene of at most this share of the group's largest scene starts a new group
 OF_ALL = {"size", "start", "start_accel", "start_yaw_rate", "valid", "agent_type", "parked"}  # keys with all agents
 OF_VEHICLES = {"past", "route_points", "route_length", "route_open", "route_valid", "route_limit"}
 OF_VEHICLES |= {"route_light", "route_light_s", "route_log"}
@@ -28,7 +28,7 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True)
 class Group:
-    """Scenes rows [G] int64 of a batch, with the numbers of vehicle rows and of other agents' rows in use."""
+    """Scenes rows [G] int64 of a batch, and their numbers of vehicle rows and other agents' rows in use."""
 
     rows: Tensor
     vehicles: int
@@ -57,7 +57,7 @@ def group_scenes(world: World) -> list[Group]:
 
 
 def crop_world(world: World, group: Group) -> World:
-    """The group's Worlds [G], with the scene keys that planning reads."""
+    """The group's World [G], with the scene keys that planning reads."""
     width, rows = world.scene["route_log"].shape[1], group.rows
     agents = torch.cat([torch.arange(group.vehicles), width + torch.arange(group.others)]).to(rows.device)
     scene = {}

@@ -1,4 +1,4 @@
-"""IDM lane-following under the prior's acceleration bounds, standing cars frozen: the traffic that a prior must beat.
+"""IDM lane-following under the prior's acceleration bounds, with standing vehicles frozen: the baseline of a prior.
 
 Every vehicle keeps the route candidate nearest to it, returns to its centreline, and accelerates by the Intelligent
 Driver Model (Treiber et al. 2000) behind the nearest agent or red light ahead. Bounds, decoder and the end of a vehicle
@@ -26,14 +26,14 @@ from e2rl.traffic.traffic import REPLAN_STEPS, Traffic, TrafficPlan
 
 @dataclass
 class IDMState:
-    """routed: the vehicles' routes; lane [B, V]: lane states to which the executed plans led."""
+    """routed: the vehicles' routes; lane [B, V]: lane states at the end of the executed plans."""
 
     routed: RoutedScene
     lane: LaneState
 
 
 class IDM(Traffic):
-    """Car-following on the nearest route candidate; vehicles that stand at the start stand for good."""
+    """Car-following on the nearest route candidate; vehicles that stand at the start never move."""
 
     stochastic = False
 
@@ -47,13 +47,13 @@ class IDM(Traffic):
         exponent: float = 4.0,
         speed: float = 10.0,
     ) -> None:
-        """prior: whose bounds apply; fields: conf/synthesizer/idm.yaml."""
+        """prior: source of the bounds; fields: conf/synthesizer/idm.yaml."""
         self.bounds, self.speed, self.standstill_gap, self.braking = prior.bounds, speed, standstill_gap, braking
         self.driver = IDMParameters(headway, standstill_gap, acceleration, braking, exponent)
 
     @torch.no_grad()
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> IDMState:
-        """Start states on the nearest candidate of everybody; the ego's is its mission."""
+        """Start states on each vehicle's nearest route candidate; the ego's route is its mission."""
         mission = scenes["route_log"][:, :1]
         routed = route_scene(scenes, torch.cat([mission, torch.zeros_like(scenes["route_log"][:, 1:])], 1))
         return IDMState(routed, start_state(scenes, routed))
@@ -73,8 +73,8 @@ class IDM(Traffic):
         def decoded(cap: Tensor | None) -> LaneState:
             return _held(decode(*apply_cap(cap, x, lane, self.bounds.onset), routed.points), lane, frozen)
 
-        everybody = Obstacles(world.states, routed.size, world.valid, torch.zeros_like(present))
-        motion = bounded(self.bounds, decoded, lane, everybody)
+        obstacles = Obstacles(world.states, routed.size, world.valid, torch.zeros_like(present))
+        motion = bounded(self.bounds, decoded, lane, obstacles)
         gone = routed.open[..., None] & (motion.s >= routed.length[..., None]) & routed.has_lane[..., None]
         plan = TrafficPlan(motion.states(), present[..., None] & ~(gone.cumsum(-1) > 0), route=routed.route)
         return IDMState(routed, motion.map(lambda value: value[..., REPLAN_STEPS - 1])), plan
@@ -98,14 +98,14 @@ class IDM(Traffic):
 
 
 def _with_ego(lane: LaneState, world: World, routed: RoutedScene) -> LaneState:
-    """The lane states with the ego where it really is."""
+    """The lane states with the ego's simulated state."""
     accel = world.accel[:, :1]
     now = locate(world.states[:, :1], accel, torch.zeros_like(accel), routed.points[:, :1])
     return LaneState(**{name: torch.cat([getattr(now, name), value[:, 1:]], 1) for name, value in vars(lane).items()})
 
 
 def _held(motion: LaneState, lane: LaneState, frozen: Tensor) -> LaneState:
-    """The motion [B, V, HORIZON] with frozen [B, V] vehicles standing where they are."""
+    """The motion [B, V, HORIZON] with frozen [B, V] vehicles at standstill."""
     still = lane.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
     zero = torch.zeros_like(still.v)
     return select(frozen, replace(still, v=zero, a=zero), motion)

@@ -1,4 +1,4 @@
-"""How the ego would react: its real policy rolled forward against a plan of the others, as a black box."""
+"""The ego's reaction to a plan of the other vehicles: its own policy, a black box, rolled forward against the plan."""
 
 from dataclasses import dataclass, replace
 
@@ -14,7 +14,7 @@ from e2rl.traffic.rows import take_rows
 
 @dataclass
 class Lookahead:
-    """Asks the egos of scenes [B] how they would drive; period: steps between two of their plans."""
+    """Rolls out the egos of scenes [B] against planned vehicles; period: steps between two ego plans."""
 
     ego: Ego
     world: World
@@ -24,7 +24,7 @@ class Lookahead:
     def __call__(self, rows: Tensor, planned: Tensor) -> Tensor:
         """The egos' states [G, HORIZON, 4] in scenes rows [G] against vehicles planned [G, V, HORIZON, 4].
 
-        The ego's row is not read; agents that are not planned keep their velocity.
+        The ego's row of `planned` is ignored; agents without a plan keep their velocity.
         """
         whole = len(rows) == len(self.world.step) and bool((rows.diff() > 0).all())
         world = self.world if whole else replace(take_rows(self.world, rows), plan=None)

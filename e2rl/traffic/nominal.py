@@ -17,7 +17,7 @@ from e2rl.traffic.grouping import Group, clone, crop_state, crop_world, group_sc
 from e2rl.traffic.rows import noise_of
 from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan
 
-LOOK = 5  # steps of the ego's plan over which its present yaw rate is taken
+LOOK = 5  # steps of the ego's plan over which its current yaw rate is estimated
 
 
 @dataclass
@@ -25,7 +25,7 @@ class PriorState:
     """B scenes driven by the prior; every tensor has the batch first.
 
     seed [B]: of the scene's noise; replans [B]: replans so far; routed: the vehicles' routes; lane [B, V]: lane states
-    to which the executed plans led.
+    at the end of the executed plans.
     """
 
     seed: Tensor
@@ -47,7 +47,7 @@ class NominalTraffic(Traffic):
         return PriorState(seed, torch.zeros_like(seed), routed, lane)
 
     def replan(self, state: State, world: World, ego_plan: Tensor) -> tuple[State, TrafficPlan]:
-        """States and plans of the coming HORIZON steps; scenes of like size are planned together."""
+        """States and plans of the coming HORIZON steps; scenes of similar size are planned together."""
         ego_plan, noise = ego_plan.detach(), self.noise(state)
         batch, width = state.routed.route.shape
         whole = clone(state)
@@ -66,8 +66,8 @@ class NominalTraffic(Traffic):
             part = replace(part, replans=part.replans + 1, lane=plan.after(REPLAN_STEPS))
             write_state(whole, part, group)
             states[rows, :vehicles] = plan.states()
-            there = world.valid[rows, :vehicles, None]  # a vehicle that has left does not come back
-            present[rows, :vehicles] = plan.on_map & there
+            valid = world.valid[rows, :vehicles, None]  # a vehicle that has left does not return
+            present[rows, :vehicles] = plan.on_map & valid
         return whole, TrafficPlan(states, present, route=whole.routed.route)
 
     def replan_group(
@@ -79,7 +79,7 @@ class NominalTraffic(Traffic):
         return state, self.prior.sample(context, noise).x0, context
 
     def noise(self, state: State) -> Tensor:
-        """Standard normal noise [K, B, V, SIZE] of the coming replan."""
+        """Standard normal noise [K, B, V, SIZE] of the next replan."""
         shape = (self.prior.sampler.steps, state.routed.route.shape[1], SIZE)
         return noise_of(state.seed, 1 + state.replans, shape).transpose(0, 1)
 
@@ -89,9 +89,9 @@ class NominalTraffic(Traffic):
         return self.prior.encode(state.routed, state.lane, *now, ego_plan, exempt)
 
     def lane_now(self, state: State, world: World, ego_plan: Tensor) -> LaneState:
-        """Lane states now: the ego as it really drove and is about to turn, the others where their plans led.
+        """Current lane states: the ego's from its simulated state and planned yaw rate, the others' from their plans.
 
-        Plans in free space do not know their routes, so that their arc lengths and offsets are projected.
+        Plans in free space have no route, so their arc lengths and offsets come from a projection.
         """
         lane, routed = state.lane, state.routed
         yaw_rate = wrap(ego_plan[:, LOOK - 1, 2] - world.states[:, 0, 2]) / (LOOK * DT)
@@ -112,7 +112,7 @@ class NominalTraffic(Traffic):
     def open_loop_plans(self, scene: TensorDictBase, seed: Tensor) -> Tensor:
         """Joint samples [B, S, V, HORIZON, 4] beside an ego whose plan is unknown, stratified over the S samples.
 
-        They stand as drawn: acceleration bounds belong to the executed half second; held over 5 s the present ones
+        No acceleration bounds are applied: they hold for the executed 0.5 s, and the current bounds applied over 5 s
         would make the samples a tenth less accurate.
         """
         prior, (count, batch), vehicles = self.prior, seed.shape, scene["route_log"].shape[1]

@@ -1,4 +1,4 @@
-"""What episodes are driven in: rows of scenes with recorded traffic, stored traffic (D'), or traffic that reacts."""
+"""The pool of episodes: scenes with recorded traffic, stored traffic (D'), or reactive traffic."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -9,15 +9,15 @@ from torch import Tensor
 
 from e2rl.errors import InputError
 
-RECORDED, LIVE = -1, -2  # sources of a row's traffic besides positions in the stored traffic
+RECORDED, LIVE = -1, -2  # sources of a row's traffic that is not a position in the stored traffic
 
 
 @dataclass
 class TrafficPool:
-    """R rows to drive in.
+    """R rows, each a scene with its traffic.
 
     scene_index [R] int64; source [R] int64: position in the stored traffic, RECORDED: the log is replayed, LIVE: a
-    traffic method replans it against the ego; eta [R]: intensity of the adversary, 0 none; seed [R] int64: of the noise
+    traffic method replans it against the ego; eta [R]: adversarial intensity, 0: none; seed [R] int64: of the noise
     of LIVE rows. Stored: states [D, T+1, N, 4], valid [D, T+1, N], adversaries [D, N] bool.
     """
 
@@ -39,7 +39,7 @@ class TrafficPool:
 
     @property
     def tracks(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The stored states, valid and adversaries, of a pool that has any."""
+        """The stored states, valid and adversaries of a pool with stored traffic."""
         assert self.states is not None and self.valid is not None and self.adversaries is not None
         return self.states, self.valid, self.adversaries
 
@@ -51,13 +51,13 @@ class TrafficPool:
 
     @staticmethod
     def live(scene_index: Tensor, eta: Tensor, seed: Tensor) -> "TrafficPool":
-        """Rows of scenes [R] whose traffic is replanned against the ego; eta [R], seed [R]: of each row."""
+        """Rows of scenes [R] whose traffic is replanned against the ego; eta [R], seed [R]."""
         return TrafficPool(scene_index, torch.full((len(scene_index),), LIVE), eta, seed)
 
     @staticmethod
     def stored(traffic: Mapping[str, Tensor], eta: float) -> "TrafficPool":
         """Rows of a synthesizer's traffic at one intensity: scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N]
-        and adversaries [S, N] bool. Raises InputError for a key that is missing."""
+        and adversaries [S, N] bool. Raises InputError for a missing key."""
         missing = {"scene_index", "states", "valid", "adversaries"} - set(traffic)
         if missing:
             raise InputError(f"synthesized traffic lacks {', '.join(sorted(missing))}; return them from synthesize()")
@@ -77,8 +77,8 @@ class TrafficPool:
         return TrafficPool(**joined)
 
     def probabilities(self, priority: Tensor, share: float) -> Tensor:
-        """Draw probability [R] of each row: adversarial rows make up `share`, rows of a kind go by the priority [S] of
-        their scene. A kind without rows leaves everything to the other."""
+        """Draw probability [R] of each row: adversarial rows have total probability `share`; within a kind, rows are
+        weighted by the priority [S] of their scene. If one kind has no rows, the other has probability 1."""
         weight = priority.cpu().double()[self.scene_index].clamp(min=1e-12)
         result = torch.zeros(len(self), dtype=torch.float64)
         for kind, part in ((True, share), (False, 1 - share)):

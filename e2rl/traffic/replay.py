@@ -1,4 +1,4 @@
-"""Log replay: everybody drives as recorded, and is there when recorded."""
+"""Log replay: vehicles follow their recording and are present where recorded."""
 
 import torch
 from torch import Tensor

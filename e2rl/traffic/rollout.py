@@ -1,4 +1,4 @@
-"""Closed-loop rollouts of scenes with an ego and live traffic: what evaluation measures and D' is made of."""
+"""Closed-loop rollouts of scenes with an ego and live traffic, for evaluation and for D'."""
 
 import time
 from dataclasses import replace
@@ -35,7 +35,7 @@ def roll_out(
     """Rollouts of scenes index [B] with seeds [B] and intensities eta [B] to their last step.
 
     The rollout dict that e2rl.metrics and e2rl.evaluation.files read: states [B, T+1, N, 4], valid, size, agent_type,
-    simulated, adversaries, logged, logged_valid, map keys, seed, scene_id, location, seconds (wall time a rollout),
+    simulated, adversaries, logged, logged_valid, map keys, seed, scene_id, location, seconds (wall time per rollout),
     transport (path KL of adversaries and others, anchor jump), routes [B, V] and contact [B] (the ego touched a
     vehicle).
     """

@@ -1,4 +1,4 @@
-"""Rows of the states that traffic methods keep, and noise that depends on a scene's seed alone."""
+"""Rows of the states of traffic methods, and noise that depends only on a scene's seed."""
 
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
@@ -28,7 +28,7 @@ def put_rows(value: Value, rows: Tensor, new: Value) -> Value:
 
 
 def map_tensors(function: Callable, value: Any, *others: Any) -> Any:
-    """function of every tensor or TensorDict of a value, and of the same ones of others like it; the rest stays."""
+    """Map function over every tensor or TensorDict of a value and its counterparts in others; the rest is kept."""
     if isinstance(value, Tensor | TensorDictBase):
         return function(value, *others)
     if not is_dataclass(value) or isinstance(value, type):
@@ -39,7 +39,7 @@ def map_tensors(function: Callable, value: Any, *others: Any) -> Any:
 
 
 def noise_of(seed: Tensor, draw: Tensor, shape: tuple[int, ...], uniform: bool = False) -> Tensor:
-    """Random numbers [B, *shape] that depend on each scene's seed [B] and number of the draw [B] only, not on the
+    """Random numbers [B, *shape] that depend only on each scene's seed [B] and draw number [B], not on the
     batch: standard normal, or uniform in [0, 1)."""
     rows = []
     for value, number in torch.stack([seed, draw], -1).tolist():

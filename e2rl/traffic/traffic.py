@@ -1,7 +1,7 @@
-"""The extension point for whatever drives the other vehicles: recordings, car-following, the prior, e2 and its rivals.
+"""The extension point for traffic: recordings, car-following, the prior, e2 and its rivals.
 
 A method is a class with one or two methods, and a YAML file in conf/synthesizer with its `_target_`, a `name` and its
-settings. This one is whole; it lets every vehicle brake to a halt:
+settings. A complete example, in which every vehicle brakes to a halt:
 
     class Halt(Traffic):
         stochastic = False
@@ -34,7 +34,7 @@ from e2rl.prior.prior import Prior
 from e2rl.scene.recording import DT
 from e2rl.sim.world import World
 
-REPLAN_STEPS = 5  # steps of DT between two replans: 0.5 s, the same for every method
+REPLAN_STEPS = 5  # steps of DT between two replans: 0.5 s, for every method
 State = Any  # of B running scenes: a tensor, a TensorDict or a (nested) dataclass of them, batch first; or None
 
 
@@ -43,9 +43,9 @@ class TrafficPlan:
     """Planned motion of the vehicles of B scenes over the coming HORIZON steps.
 
     states [B, V, HORIZON, 4] (the ego's row is ignored); present [B, V, HORIZON] bool: false from the step on at which
-    a vehicle has left; adversary [B, V] bool: under adversarial control now (None: nobody); path_kl [B, V]: discrete
+    a vehicle has left; adversary [B, V] bool: under adversarial control (None: no vehicle); path_kl [B, V]: discrete
     path KL of the control since the start (None: 0); route [B, V] int64: route candidates followed, -1 none (None: the
-    recorded ones); figures {name: [B, V]}: what else a method reports, written under ("traffic", name).
+    recorded ones); figures {name: [B, V]}: further outputs of a method, written under ("traffic", name).
     """
 
     states: Tensor
@@ -60,10 +60,10 @@ class Traffic(ABC):
     """Drives all vehicles but the ego of B scenes at once. Built as `_target_(prior=prior, **settings)`.
 
     stochastic: seeds matter; adversarial: the intensity eta matters; predicts: plans can be compared with the log in
-    open loop; replays_log: it is the recording itself; queries_ego: `replan` takes `react`, a function that asks the
-    ego how it would drive against a plan: react(rows [G] of the batch, states [G, V, HORIZON, 4]) -> [G, HORIZON, 4];
-    figures: names of what its plans report; on_selection: told of every choice of adversaries, where it makes one;
-    topology: the TopologySettings that such choices rest on.
+    open loop; replays_log: it is the recording itself; queries_ego: `replan` takes `react`, which returns the ego's
+    states against a plan: react(rows [G] of the batch, states [G, V, HORIZON, 4]) -> [G, HORIZON, 4];
+    figures: names of the further outputs of its plans; on_selection: called with every selection of adversaries;
+    topology: the TopologySettings of these selections.
     """
 
     stochastic = True
@@ -76,23 +76,23 @@ class Traffic(ABC):
     topology: Any = None
 
     def __init__(self, prior: Prior | None = None) -> None:  # noqa: B027
-        """prior: the frozen prior of the run; methods without one ignore it."""
+        """prior: the frozen prior of the run; methods without a prior ignore it."""
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> State:
-        """State of new episodes in scenes [B], with seeds [B] int64 of their noise and intensities eta [B]."""
+        """State of new episodes in scenes [B], with noise seeds [B] int64 and intensities eta [B]."""
         return None
 
     @abstractmethod
     def replan(self, state: State, world: World, ego_plan: Tensor) -> tuple[State, TrafficPlan]:
-        """State and plan at this moment, given the ego's planned states ego_plan [B, >= HORIZON, 4].
+        """New state and plan, given the ego's planned states ego_plan [B, >= HORIZON, 4].
 
-        Called every REPLAN_STEPS steps; the first REPLAN_STEPS steps of a plan are driven as they stand.
+        Called every REPLAN_STEPS steps; the first REPLAN_STEPS steps of a plan are executed unchanged.
         """
 
     def open_loop_plans(self, scene: TensorDictBase, seed: Tensor) -> Tensor:
-        """Joint plans [B, S, V, HORIZON, 4] of scenes [B] from their start frames; seed [S, B] int64: one per sample.
+        """Joint plans [B, S, V, HORIZON, 4] of scenes [B] from their start frames; seed [S, B] int64.
 
-        By default those of the first replan beside an ego that keeps its velocity.
+        By default those of the first replan, given an ego that keeps its velocity.
         """
         world = World.at_start(scene)
         ego_plan = keep_velocity(world.states[:, 0])

@@ -1,4 +1,4 @@
-"""AdversarialSynthesizer: the TorchRL transform that gives every episode its scene and its traffic."""
+"""AdversarialSynthesizer: the TorchRL transform that sets the scene and the traffic of every episode."""
 
 from collections.abc import Callable
 
@@ -16,30 +16,30 @@ from e2rl.traffic.pool import LIVE, RECORDED, TrafficPool
 from e2rl.traffic.rows import put_rows, take_rows
 from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan, keep_velocity
 
-Draw = Callable[[int], Tensor]  # count -> pool rows [count] of the episodes that begin
+Draw = Callable[[int], Tensor]  # count -> pool rows [count] of new episodes
 
 
 class AdversarialSynthesizer(Transform):
     """Draws a pool row for every new episode, injects its scene, and drives its traffic.
 
     Rows with recorded or stored traffic replay it. LIVE rows react: before a step at which a replan is due (every
-    REPLAN_STEPS steps) the traffic method plans against ("ego", "plan") [B, H, 4], which the policy has written at the
-    same moment; the ego of a policy that writes none is expected to keep its velocity.
+    REPLAN_STEPS steps) the traffic method plans against ("ego", "plan") [B, H, 4], which the policy has just written.
+    Without this key, the ego is predicted at constant velocity.
 
     Writes ("traffic", ...): row [B, 1] int64, eta [B, 1], adversary [B, V] bool (under control now) and, with a traffic
-    method, plan [B, V, H, 4] (states planned for the coming steps; for the policy alone, not stacked over time),
+    method, plan [B, V, H, 4] (states planned for the coming steps; only for the policy, not stacked over time),
     path_kl [B, V], route [B, V] int64 and the method's figures [B, V].
     """
 
     def __init__(self, pool: TrafficPool, draw: Draw, traffic: Traffic | None = None, ego: Ego | None = None) -> None:
-        """traffic: drives LIVE rows; ego: whom a method that queries the ego asks."""
+        """traffic: drives LIVE rows; ego: the ego that a method with `queries_ego` queries."""
         super().__init__()
         self.pool, self.draw, self.traffic, self.ego = pool, draw, traffic, ego
         nothing = torch.zeros(0, dtype=torch.int64)  # before the first reset
         self._drawn = nothing  # [B] pool row of each episode
         self._state: State = None
         self._plan = TensorDict({}, batch_size=[0])  # [B] the plan being driven
-        self._planned_at = nothing  # [B] step of its planning
+        self._planned_at = nothing  # [B] step of the last replan, per environment
 
     @property
     def _env(self) -> DrivingEnv:
@@ -65,7 +65,7 @@ class AdversarialSynthesizer(Transform):
         return tensordict
 
     def _inject(self, rows: Tensor) -> None:
-        """Schedule stored traffic for the coming reset of environments rows [b]."""
+        """Schedule stored traffic for the next reset of environments rows [b]."""
         source = self.pool.source[self._drawn[rows]]
         stored = source >= 0
         if bool(stored.any()):
@@ -79,11 +79,11 @@ class AdversarialSynthesizer(Transform):
         written = self._write(tensordict_reset)
         known = tensordict is not None and ("traffic", "plan") in tensordict.keys(True)
         if self.traffic is not None and not known:  # a collector would stack what the first reset returns
-            del written["traffic", "plan"]  # without a plan everybody is expected to keep its velocity, as it would say
+            del written["traffic", "plan"]  # it is constant velocity, which is also the default without a plan
         return written
 
     def _begin(self, first: Tensor) -> None:
-        """New states of the traffic method and no plan yet in environments first [B] bool that have just been reset."""
+        """Reset the traffic method's state and the plan in environments first [B] bool, which have just been reset."""
         env, rows = self._env, first.nonzero()[:, 0]
         world, drawn = env.world(), self._drawn[rows.cpu()]
         seed, eta = (getattr(self.pool, name)[drawn].to(env.device) for name in ("seed", "eta"))
@@ -108,7 +108,7 @@ class AdversarialSynthesizer(Transform):
         return TensorDict(plan, batch_size=shape[:1], device=device)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Before a step: replan the live traffic of environments in which that is due."""
+        """Before a step: replan the live traffic of environments in which a replan is due."""
         if self.traffic is not None:
             step = tensordict["timestep"][:, 0]
             live = (self.pool.source[self._drawn] == LIVE).to(step.device)
@@ -132,7 +132,7 @@ class AdversarialSynthesizer(Transform):
         self._env.write_traffic(rows, plan.states, plan.present)
 
     def _note(self, rows: Tensor, plan: TrafficPlan) -> None:
-        """Take over what a plan reports; what it does not stays as it is."""
+        """Store the outputs of a plan; outputs that are None keep their values."""
         given = {"states": plan.states, "adversary": plan.adversary, "path_kl": plan.path_kl, "route": plan.route}
         for name, value in (given | plan.figures).items():
             if value is not None:
@@ -142,7 +142,7 @@ class AdversarialSynthesizer(Transform):
         return self._write(next_tensordict)
 
     def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The transform's keys at the present moment."""
+        """Write the transform's keys."""
         device = self._env.device
         drawn = self._drawn[:, None]
         keys = {"row": drawn.to(device, copy=True), "eta": self.pool.eta[drawn].to(device)}
@@ -161,7 +161,7 @@ class AdversarialSynthesizer(Transform):
         return tensordict
 
     def _plan_from(self, step: Tensor) -> Tensor:
-        """States [B, V, H, 4] planned for the steps after `step` [B], the last one held."""
+        """States [B, V, H, 4] planned for the steps after `step` [B]; the last state is held."""
         states = self._plan["states"]
         age = (step - self._planned_at.clamp(min=0)).clamp(min=0)
         ahead = (age[:, None] + torch.arange(HORIZON, device=age.device)).clamp(max=HORIZON - 1)
@@ -169,17 +169,17 @@ class AdversarialSynthesizer(Transform):
         return states.transpose(1, 2)[row, ahead].transpose(1, 2)
 
     def _stored_adversaries(self) -> Tensor:
-        """Bool [B, V]: adversaries of stored traffic; nobody in recorded and live rows."""
+        """Bool [B, V]: adversaries of stored traffic; false in recorded and live rows."""
         env, source = self._env, self.pool.source[self._drawn]
         vehicles = env.scene["route_log"].shape[1]
-        none = torch.zeros(len(source), vehicles, dtype=torch.bool)
+        adversaries = torch.zeros(len(source), vehicles, dtype=torch.bool)
         if bool((source > RECORDED).any()):
             stored = self.pool.tracks[2][source.clamp(min=0), :vehicles]
-            none = torch.where((source > RECORDED)[:, None], stored, none)
-        return none.to(env.device)
+            adversaries = torch.where((source > RECORDED)[:, None], stored, adversaries)
+        return adversaries.to(env.device)
 
     def _post_step_mdp_hooks(self, tensordict: TensorDictBase, tensordict_: TensorDictBase):
-        """The plan, 0.8 kB a vehicle and step, goes on to the policy; it is no spec and is not stacked over time."""
+        """Pass the plan (0.8 kB per vehicle and step) to the policy only, without a spec and not stacked over time."""
         if self.traffic is not None:
             tensordict_["traffic", "plan"] = tensordict["next", "traffic", "plan"]
             for key in (("traffic", "plan"), ("next", "traffic", "plan")):

@@ -1,1 +1,1 @@
-"""The curriculum: which scenes are attacked, how strongly, and how often episodes meet an adversary."""
+"""The curriculum: priorities of scenes, adversarial intensity, and share of adversarial episodes."""

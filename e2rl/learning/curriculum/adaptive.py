@@ -1,11 +1,11 @@
-"""The intensity follows a band of collision rates: it rises while the ego copes and falls while it does not."""
+"""The intensity follows a target band of collision rates: it rises below the band and falls above it."""
 
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
 from e2rl.settings import check_range
 
 
 class AdaptiveCurriculum(CurriculumScheduler):
-    """Moves eta by eta_step a round, up below the target band of collision rates and down above it."""
+    """Raises eta by eta_step per round below the target band of collision rates; lowers it above the band."""
 
     def __init__(
         self,
@@ -31,7 +31,7 @@ class AdaptiveCurriculum(CurriculumScheduler):
 
     @property
     def eta(self) -> float:
-        """Intensity, following the band."""
+        """The current intensity."""
         return self._eta
 
     @property
@@ -40,7 +40,7 @@ class AdaptiveCurriculum(CurriculumScheduler):
         return self._share
 
     def advance(self, collision_rate: float | None = None) -> None:
-        """Go to the next round; without a collision rate the intensity stays."""
+        """Advance to the next round; without a collision rate the intensity stays."""
         super().advance(collision_rate)
         if collision_rate is not None:
             low, high = self._band
@@ -48,9 +48,9 @@ class AdaptiveCurriculum(CurriculumScheduler):
             self._eta = min(max(moved, self._bounds[0]), self._bounds[1])
 
     def extra_state(self) -> dict:
-        """The present intensity."""
+        """The current intensity, by name."""
         return {"eta": self._eta}
 
     def load_extra_state(self, state: dict) -> None:
-        """Go on from an `extra_state`."""
+        """Restore an `extra_state`."""
         self._eta = state["eta"]

@@ -1,4 +1,4 @@
-"""One intensity and one share of adversarial episodes throughout."""
+"""Constant intensity and share of adversarial episodes."""
 
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
 from e2rl.settings import check_range

@@ -5,7 +5,7 @@ from e2rl.settings import check_range
 
 
 class LinearCurriculum(CurriculumScheduler):
-    """From the first round's values to the final ones, which hold after the share `ramp` of the rounds."""
+    """From the first round's values to the final values, reached after the share `ramp` of the rounds."""
 
     def __init__(
         self,

@@ -1,9 +1,9 @@
 """The extension point for curricula: the intensity and share of adversarial episodes, and the priorities of scenes.
 
 Scenes are prioritised as in prioritised level replay (Jiang et al. 2021): by the rank of a regret estimate, mixed with
-staleness. The regret of a scene is the best return seen there, in any traffic, less the recent return in adversarial
-traffic: high where the ego is known to be able to drive and the adversary keeps it from it, low where the scene is
-solved, and low where nobody ever drove well.
+staleness. The regret of a scene is the best return in any traffic minus the recent return in adversarial traffic. It
+is high where the ego has driven well but not against the adversary, and low where the scene is solved or the ego has
+never driven well.
 """
 
 from abc import ABC, abstractmethod
@@ -18,8 +18,8 @@ from e2rl.settings import check_range
 class CurriculumScheduler(ABC):
     """State over S scenes. Per round: `draw` scenes, read `eta` and `share`, `update` with outcomes, `advance`.
 
-    A schedule is a subclass in a file of its own with the properties `eta` and `share`, and a YAML file in
-    conf/curriculum with its `_target_` and settings; what it keeps between rounds goes into `extra_state`.
+    A schedule is a subclass with the properties `eta` and `share`, and a YAML file in conf/curriculum with its
+    `_target_` and settings. State of its own between rounds belongs in `extra_state`.
     """
 
     def __init__(
@@ -57,11 +57,11 @@ class CurriculumScheduler(ABC):
         """Share of this round's episodes in adversarial traffic."""
 
     def extra_state(self) -> dict:
-        """What a schedule keeps between rounds besides the scenes' state."""
+        """State of a schedule between rounds, besides the scenes' state."""
         return {}
 
     def load_extra_state(self, state: dict) -> None:  # noqa: B027
-        """Go on from an `extra_state`."""
+        """Restore an `extra_state`."""
 
     def regret(self) -> Tensor:
         """Estimated regret [S], at least 0; NaN for scenes never driven in adversarial traffic."""
@@ -79,8 +79,7 @@ class CurriculumScheduler(ABC):
         return (1 - self.staleness) * weight / weight.sum() + self.staleness * old
 
     def draw(self, count: int) -> Tensor:
-        """Scenes [count] to synthesize for, by priority without replacement; all scenes once more for each full
-        round through them."""
+        """Scenes [count] to synthesize for: each scene count // S times, the rest by priority without replacement."""
         total = len(self._best)
         check_range("learner.round.scenes", count, 1)
         chosen = torch.arange(total).repeat(count // total)
@@ -91,7 +90,7 @@ class CurriculumScheduler(ABC):
         return chosen
 
     def update(self, scene_index: Tensor, returns: Tensor, adversarial: Tensor) -> None:
-        """Take in episodes [E]: scene, return, and whether the traffic was adversarial."""
+        """Update with episodes [E]: scene, return, and whether the traffic was adversarial."""
         scene_index, returns, adversarial = scene_index.cpu(), returns.cpu().float(), adversarial.cpu()
         self._best = self._best.scatter_reduce(0, scene_index, returns, "amax")
         scenes, inverse = scene_index[adversarial].unique(return_inverse=True)
@@ -102,29 +101,29 @@ class CurriculumScheduler(ABC):
         self._recent[scenes] = torch.where(before.isnan(), mean, moved)
 
     def leave_out(self, scene_index: Tensor) -> None:
-        """Scenes whose adversarial traffic was not driven because no driver survives it. They count as solved until
-        they are driven, or they would come first in every draw."""
+        """Mark scenes whose adversarial traffic was left out because no driver survives it. They count as solved until
+        they are driven; otherwise they would come first in every draw."""
         scene_index = scene_index.cpu()
         recent, best = self._recent[scene_index], self._best[scene_index]
         self._recent[scene_index] = torch.where(recent.isnan() & best.isfinite(), best, recent)
 
     def advance(self, collision_rate: float | None = None) -> None:
-        """Go to the next round. collision_rate: the ego's in this round's adversarial traffic."""
+        """Advance to the next round. collision_rate: the ego's in this round's adversarial traffic."""
         self.round += 1
 
     def summary(self) -> dict[str, float]:
-        """Figures to log."""
+        """Metrics to log."""
         regret, seen = self.regret(), ~self._recent.isnan()
         result = {"eta": self.eta, "share": self.share, "scenes_seen": seen.float().mean().item()}
         return result | ({"regret": regret[seen].mean().item()} if seen.any() else {})
 
     def state_dict(self) -> dict:
-        """Everything that changes."""
+        """All state."""
         scenes = {"best": self._best, "recent": self._recent, "drawn": self._drawn}
         return scenes | {"round": self.round, "generator": self._generator.get_state(), "extra": self.extra_state()}
 
     def load_state_dict(self, state: dict) -> None:
-        """Go on from a `state_dict`; raises InputError where the number of scenes differs."""
+        """Restore a `state_dict`; raises InputError if the number of scenes differs."""
         if len(state["best"]) != len(self._best):
             raise InputError(
                 f"the checkpoint's curriculum holds {len(state['best'])} scenes, the data {len(self._best)}; resume "

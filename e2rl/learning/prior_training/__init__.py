@@ -1,1 +1,1 @@
-"""How the prior is trained: windows of logs, loss, optimisation, one process or several."""
+"""Training of the prior: windows of logs, loss, optimisation, distributed processes."""

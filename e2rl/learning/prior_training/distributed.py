@@ -1,4 +1,4 @@
-"""One training process, or several started by torchrun: gradients and figures are averaged, one process writes."""
+"""One training process, or several started by torchrun: gradients and metrics are averaged, the leader writes."""
 
 import contextlib
 import os
@@ -23,7 +23,7 @@ TIMEOUT = timedelta(hours=6)  # the others wait while the leader parses logs or 
 class Processes:
     """This process, `rank`, among `count` that train together.
 
-    Every method but `leader` is collective: all processes call it in the same order. With count 1 none communicates.
+    Every method but `leader` is collective: all processes call it in the same order. With count 1 nothing is sent.
     """
 
     rank: int = 0
@@ -31,7 +31,7 @@ class Processes:
 
     @property
     def leader(self) -> bool:
-        """Whether this is the process that prints, validates and writes."""
+        """Whether this process prints, validates and writes (rank 0)."""
         return self.rank == 0
 
     def mean(self, value: Tensor) -> Tensor:
@@ -50,7 +50,7 @@ class Processes:
         return values
 
     def from_leader(self, work: Callable[[], Value]) -> Value:
-        """What `work()` returns in the leader, in every process; an InputError of the leader is raised in all."""
+        """The leader's result of `work()`, in every process; an InputError of the leader is raised in all."""
         if self.count == 1:
             return work()
         result: list = [None, None]
@@ -65,14 +65,14 @@ class Processes:
         return result[0]
 
     def leader_first(self, work: Callable[[], Value]) -> Value:
-        """`work()` of every process, first the leader's, whose cached files the others then read."""
+        """`work()` in every process, first in the leader, whose cached files the others then read."""
         own: list[Value] = []
         self.from_leader(lambda: own.append(work()))
         return own[0] if self.leader else work()
 
     def data_parallel(self, module: nn.Module) -> nn.Module:
-        """The module with the leader's parameters, whose gradients every backward pass averages over the processes."""
-        # Its buffers are statistics of the windows, which are the same everywhere.
+        """The module with the leader's parameters; every backward pass averages its gradients over the processes."""
+        # Its buffers are statistics of the windows, equal in all processes.
         return module if self.count == 1 else DistributedDataParallel(module, broadcast_buffers=False)
 
 
@@ -81,10 +81,10 @@ ALONE = Processes()
 
 @contextmanager
 def process_group(device: str) -> Iterator[tuple[Processes, str]]:
-    """(processes, this process's device): those that torchrun started, or this one alone.
+    """(processes, this process's device): the processes started by torchrun, or this process alone.
 
-    They communicate over gloo on the CPU and NCCL on GPUs, one GPU each. All but the leader are silent inside. Raises
-    InputError where there are more processes than GPUs.
+    They communicate over gloo on the CPU and NCCL on GPUs, one GPU each. Only the leader prints. Raises InputError for
+    more processes than GPUs.
     """
     if not started_by_torchrun():
         yield ALONE, device
@@ -101,9 +101,9 @@ def process_group(device: str) -> Iterator[tuple[Processes, str]]:
     try:
         with contextlib.ExitStack() as stack:
             if not processes.leader:
-                nowhere = stack.enter_context(open(os.devnull, "w"))
-                stack.enter_context(contextlib.redirect_stdout(nowhere))
-                stack.enter_context(contextlib.redirect_stderr(nowhere))
+                devnull = stack.enter_context(open(os.devnull, "w"))
+                stack.enter_context(contextlib.redirect_stdout(devnull))
+                stack.enter_context(contextlib.redirect_stderr(devnull))
             yield processes, device
     finally:
         dist.destroy_process_group()
@@ -115,7 +115,7 @@ def started_by_torchrun() -> bool:
 
 
 def follower_overrides() -> list[str]:
-    """Hydra overrides with which a process other than the leader makes no run folder and no log of its own."""
+    """Hydra overrides for processes other than the leader: no run folder, no log."""
     if not started_by_torchrun() or os.environ["RANK"] == "0":
         return []
     return ["hydra.run.dir=.", "hydra.output_subdir=null", f"hydra.job_logging.handlers.file.filename={os.devnull}"]

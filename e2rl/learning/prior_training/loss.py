@@ -25,7 +25,7 @@ from e2rl.prior.lane_relative import (
 from e2rl.prior.prior import EGO_LEVEL, Prior
 
 MIN_STD = 0.02  # smallest standard deviation that a feature is divided by
-CONSTANT_STD = 1e6  # of a feature that never varied, so that it has no effect
+CONSTANT_STD = 1e6  # for constant features, so that they have no effect
 SIDED = {"nodes": SIDED_NODE, "pairs": SIDED_EDGE, "x0": (KNOTS, KNOTS + 1)}  # columns whose sign a mirror flips
 
 
@@ -58,7 +58,7 @@ def draw(batch: TensorDictBase, settings: TrainingSettings, generator: torch.Gen
     """The random numbers of the loss of windows [W] at L = `levels` noise levels each.
 
     feature [W, R, NODE]: standard normal; level [W, L]: in (0.01, 0.99), stratified; clean [W, L] bool: the ego's row
-    is given nearly noise-free (in half); noise [W, L, R, SIZE]: standard normal.
+    is nearly noise-free (in half); noise [W, L, R, SIZE]: standard normal.
     """
     size, count, device = len(batch), settings.levels, batch["x0"].device
     feature = torch.randn(batch["nodes"].shape, generator=generator, device=device)
@@ -70,7 +70,7 @@ def draw(batch: TensorDictBase, settings: TrainingSettings, generator: torch.Gen
 
 
 def loss_weight(batch: TensorDictBase, drawn: TensorDictBase) -> Tensor:
-    """[L * W, R], level by level: the windows' weights, 0 for an ego that is given clean."""
+    """[L * W, R], level by level: the windows' weights, 0 for a clean ego row."""
     weight = batch["weight"].expand(drawn["level"].shape[1], *batch["weight"].shape).clone()
     weight[..., 0] *= ~drawn["clean"].T
     return weight.flatten(0, 1)
@@ -86,8 +86,8 @@ class DenoisingLoss(nn.Module):
     def forward(self, batch: TensorDictBase, drawn: TensorDictBase, total: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(loss, its action term, its trajectory term) of windows [W] with the random numbers of `draw`.
 
-        total: what the weighted sums are divided by, the sum of `loss_weight`; where several processes share a batch,
-        its mean over them, so that the mean of their gradients is the gradient of the whole batch.
+        total: divisor of the weighted sums, the sum of `loss_weight`, averaged over the processes that share a batch so
+        that the mean of their gradients is the gradient of the whole batch.
         """
         net, count = self.denoiser, drawn["level"].shape[1]
         scale = self.settings.feature_noise * net.node_std * ((net.node_std > MIN_STD) & (net.node_std < CONSTANT_STD))

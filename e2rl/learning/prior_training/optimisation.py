@@ -1,4 +1,4 @@
-"""Optimisation of the denoiser: one run's state, its steps, the moving average of the weights, exact resume."""
+"""Optimisation of the denoiser: training state, steps, moving average of the weights, exact resume."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -18,18 +18,18 @@ from e2rl.prior.denoiser import Denoiser
 from e2rl.prior.prior import Prior
 
 WARM_UP = 50  # steps
-RANK_SEED = 1_000_003  # between the generators' seeds of two processes
+RANK_SEED = 1_000_003  # difference of the generator seeds of consecutive ranks
 
 
 class PriorTraining:
     """The state of one training run: network, moving average of its weights, optimiser, progress and generator.
 
-    Each process draws its own share of a step's windows and noise, and their gradients are averaged. Hence weights and
-    averages are the same in all processes, and a run is determined by its seed and the number of processes.
+    Each process draws its share of a step's windows and noise; gradients are averaged. Hence weights and moving
+    averages are equal in all processes, and a run is determined by its seed and the number of processes.
     """
 
     def __init__(self, prior: Prior, windows: TensorDictBase, settings: TrainingSettings, processes: Processes = ALONE):
-        """Raises InputError where the processes cannot share a batch evenly."""
+        """Raises InputError if the processes cannot share a batch evenly."""
         if settings.batch % processes.count:
             text = f"prior.training.batch={settings.batch}: {processes.count} processes share the windows of a step"
             raise InputError(f"{text} evenly; choose a multiple of their number")
@@ -48,7 +48,7 @@ class PriorTraining:
             prior.denoiser.parameters(), settings.learning_rate, weight_decay=settings.weight_decay, fused=True
         )
         self.average = AveragedModel(prior.denoiser, multi_avg_fn=self._average)
-        self.average.update_parameters(prior.denoiser)  # the first one copies: the average starts at the first weights
+        self.average.update_parameters(prior.denoiser)  # the first call copies the initial weights
 
     def learning_rate(self) -> float:
         """Linear warm-up, then a cosine to 0."""
@@ -70,14 +70,14 @@ class PriorTraining:
         return running
 
     def pick(self) -> Tensor:
-        """Indices [share] of a step's windows: a share `causal` of them with estimated starts, where there are both."""
+        """Indices [share] of a step's windows: a share `causal` of them with estimated starts, if both kinds exist."""
         uniform = torch.rand(2, self.share, generator=self.generator, device=self.device).to(self.rows[0].device)
         picks = [rows[(uniform[1] * len(rows)).long()] for rows in self.rows]
         return torch.where(uniform[0] < self.settings.causal, picks[0], picks[-1])
 
     def update(self, batch: TensorDictBase, drawn: TensorDictBase) -> Tensor:
         """One step on this process's windows with the random numbers of `loss.draw`; returns the loss's terms [2]."""
-        # The seed of dropout follows from step and process, so that a resumed run repeats it.
+        # Dropout is seeded by step and rank, so a resumed run repeats it.
         torch.manual_seed(self.settings.seed + RANK_SEED * (self.step * self.processes.count + self.processes.rank))
         total = self.processes.mean(loss_weight(batch, drawn).sum()).clamp(min=1)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.settings.bf16):
@@ -93,14 +93,14 @@ class PriorTraining:
         return torch.stack([action, trajectory])
 
     def _average(self, average: Sequence[Tensor], current: Sequence[Tensor], _count: Tensor | int) -> None:
-        """Exponential moving average whose decay grows to `ema`; by the step here, `_count` may lie on the GPU."""
+        """Exponential moving average whose decay grows to `ema` with self.step (`_count` may be on the GPU)."""
         decay = min(self.settings.ema, (1 + self.step) / (10 + self.step))
         for mean, value in zip(average, current, strict=True):
             mean.lerp_(value, 1 - decay)
 
     @contextmanager
     def averaged(self) -> Iterator[Prior]:
-        """Within this context the prior has the averaged weights and is in evaluation mode."""
+        """Context in which the prior has the averaged weights and is in evaluation mode."""
         denoiser, average = self.prior.denoiser, self.average.module
         assert isinstance(average, Denoiser)
         self.prior.denoiser = average
@@ -111,7 +111,7 @@ class PriorTraining:
             self.prior.denoiser = denoiser
 
     def state_dict(self) -> dict:
-        """Everything that exact resumption needs. Collective: all processes call it at once."""
+        """All state for exact resumption. Collective: all processes must call it."""
         return {
             "denoiser": self.prior.denoiser.state_dict(),
             "route_choice": self.prior.route_choice.state_dict(),
@@ -122,11 +122,11 @@ class PriorTraining:
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """Go on from a `state_dict`. Raises InputError where another number of processes made it."""
+        """Restore a `state_dict`. Raises InputError if the number of processes differs."""
         count, generators = self.processes.count, state["generators"]
         if len(generators) != count:
             raise InputError(
-                f"the interrupted run had {len(generators)} processes, this one has {count}; go on with as many"
+                f"the interrupted run had {len(generators)} processes, this one has {count}; resume with as many"
             )
         self.prior.denoiser.load_state_dict(state["denoiser"])
         self.prior.route_choice.load_state_dict(state["route_choice"])

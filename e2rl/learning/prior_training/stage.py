@@ -28,7 +28,7 @@ FIGURES = ("real", "aor_step", "cfr_bg")  # metrics of the closed loop at a vali
 
 def run_prior_stage(config: DictConfig, folder: Path) -> tuple[Path, list[dict]] | None:
     """The checkpoint's path and the metrics rows of the nominal closed loop on held-out scenes, the ego replayed; None
-    in processes of torchrun other than the leader."""
+    in processes other than the leader."""
     settings = settings_of(TrainingSettings, {**config.prior.training, "seed": config.seed}, "prior.training")
     with process_group(config.device) as (processes, device):
         folder = processes.from_leader(lambda: folder)
@@ -71,7 +71,7 @@ def _nominal(prior: Prior, scenes: SceneSet, device: str, folder: Path | None, *
 def _closed_loop(scenes: SceneSet, settings: TrainingSettings, device: str) -> ClosedLoop:
     """FIGURES of a prior on at most `closed_loop_scenes` held-out scenes, evenly spaced over the places.
 
-    Scenes and noise are always the same, so that validations differ by the weights alone.
+    Scenes and noise are fixed, so validations differ only by the weights.
     """
     first = _first_starts(scenes)
     count = min(settings.closed_loop_scenes, len(first))
@@ -85,7 +85,7 @@ def _closed_loop(scenes: SceneSet, settings: TrainingSettings, device: str) -> C
 
 
 def _first_starts(scenes: SceneSet) -> SceneSet:
-    """The held-out scenes, of each log the one at its earliest start frame: with the most recorded seconds ahead."""
+    """Of each held-out log the scene with the earliest start frame, i.e. the longest recorded future."""
     first: dict[str, tuple[int, int]] = {}
     for index in held_out(scenes).nonzero()[:, 0].tolist():
         log, _, start = scenes.scene_id[index].rpartition("@")
@@ -100,7 +100,7 @@ def _chosen(scenes: SceneSet, keep: list[int]) -> SceneSet:
 
 
 def fingerprint(scenes: SceneSet) -> str:
-    """Hash of what the scenes hold, to tell checkpoints of different data apart."""
+    """Hash of the scenes' contents, to detect checkpoints of other data."""
     digest = hashlib.sha256("\n".join(scenes.scene_id).encode())
     digest.update(scenes.scenes["logged"].numpy().tobytes())
     return digest.hexdigest()[:16]

@@ -27,14 +27,14 @@ from e2rl.prior.prior import Prior
 from e2rl.prior.route_choice import candidate_features
 from e2rl.scene.scene import SceneSet
 
-HELD_OUT = 8  # one place in so many is held out for validation
+HELD_OUT = 8  # one in HELD_OUT places is held out for validation
 STATE, PROGRESS = "training.pt", "progress.jsonl"
 
 ClosedLoop = Callable[[Prior], dict[str, float]]  # metrics of a prior that drives held-out scenes
 
 
 def train_route_choice(prior: Prior, scenes: TensorDictBase, settings: TrainingSettings) -> float:
-    """Train by cross-entropy on the candidate driven, over vehicles with a choice; returns the training accuracy."""
+    """Train by cross-entropy on the driven candidate, over vehicles with several; returns the training accuracy."""
     device = next(prior.route_choice.parameters()).device
     features = torch.cat([candidate_features(part) for part in scenes.split(64)])
     valid, label = scenes["route_valid"], scenes["route_log"]
@@ -60,7 +60,7 @@ def train_route_choice(prior: Prior, scenes: TensorDictBase, settings: TrainingS
 
 
 def held_out(scenes: SceneSet) -> Tensor:
-    """[S] bool: scenes of held-out places (without places: of held-out logs). Raises InputError where all are."""
+    """[S] bool: scenes of held-out places (without places: of held-out logs). Raises InputError if all are."""
     names = zip(scenes.location, scenes.scene_id, strict=True)
     places = [location or scene_id.split("@")[0] for location, scene_id in names]
     chosen = set(sorted(set(places))[::HELD_OUT])
@@ -72,7 +72,7 @@ def held_out(scenes: SceneSet) -> Tensor:
 
 
 def window_sets(scenes: SceneSet, free_space: bool) -> tuple[TensorDictBase, TensorDictBase]:
-    """(training, held-out) windows. Raises InputError where there are none, or none in which a vehicle moves."""
+    """(training, held-out) windows. Raises InputError if either is empty or has no moving vehicle."""
     mask = held_out(scenes)
     windows, test = (make_windows(scenes.scenes[part], free_space) for part in (~mask, mask))
     if not len(windows) or not len(test):
@@ -88,8 +88,8 @@ def window_sets(scenes: SceneSet, free_space: bool) -> tuple[TensorDictBase, Ten
 
 @dataclass
 class Record:
-    """What a run knows besides its weights: the validations so far (lines of progress.jsonl), the best one's loss, step
-    and weights, the route choice's accuracy, and the wall seconds of each stage over all interruptions."""
+    """The record of a run: validations so far (lines of progress.jsonl), loss, step and weights of the best one,
+    accuracy of the route choice, and wall seconds of each stage over all interruptions."""
 
     lines: list[dict] = field(default_factory=list)
     best: dict = field(default_factory=lambda: {"held_out": float("inf"), "step": 0, "weights": None})
@@ -104,11 +104,10 @@ class Record:
         self.seconds[stage] = round(self.seconds.get(stage, 0.0) + time.perf_counter() - begin, 1)
 
     def add(self, line: dict, prior: Prior) -> None:
-        """Add a validation of `prior`, and keep its weights where its held-out loss is the lowest.
+        """Add a validation of `prior`; keep its weights if its held-out loss is the lowest.
 
-        The loss alone chooses: thousands of windows at fixed noise make it precise. Closed-loop metrics on a few scenes
-        scatter more between validations than the checkpoints differ (see conf/prior/default.yaml), so the best of
-        several would mostly be luck; they are reported only.
+        Only the loss selects: thousands of windows at fixed noise make it precise. Closed-loop metrics on a few scenes
+        are only reported: their noise exceeds the differences between checkpoints (conf/prior/default.yaml).
         """
         self.lines.append(line)
         if line["held_out"] < self.best["held_out"]:
@@ -125,7 +124,7 @@ class Record:
         return text + ("; closed loop " + ", ".join(figures) if figures else "")
 
     def write(self, folder: Path, run: dict, fingerprint: str) -> None:
-        """progress.jsonl, and training.pt with the run's state."""
+        """Write progress.jsonl, and training.pt with the run's state."""
         state = {"run": run, "record": vars(self), "fingerprint": fingerprint}
         write_atomically(folder / PROGRESS, "".join(json.dumps(line) + "\n" for line in self.lines))
         write_atomically(folder / STATE, partial(torch.save, state))
@@ -143,16 +142,16 @@ def train_prior(
     """Train `prior` on scenes and return the path of the best checkpoint (by held-out loss of the averaged weights);
     None in processes other than the leader.
 
-    folder: holds training.pt, from which an interrupted run goes on exactly, progress.jsonl and the checkpoint. origin:
-    what is known of data and command; the checkpoint's header holds it, with the results of the training. closed_loop:
-    metrics that every `closed_loop_every`-th validation and the last one report beside the held-out loss. Raises
-    InputError where an interrupted run had other data, or where scenes are too few.
+    folder: holds training.pt, from which an interrupted run resumes exactly, progress.jsonl and the checkpoint. origin:
+    data and command, for the checkpoint's header, which also holds the results of the training. closed_loop: metrics
+    that every `closed_loop_every`-th validation and the last one report beside the held-out loss. Raises InputError if
+    the interrupted run had other data, or for too few scenes.
     """
     record, state, data = Record(), None, origin.get("fingerprint", "")
     if (folder / STATE).exists():
         state = torch.load(folder / STATE, map_location="cpu", weights_only=True)
         if state.get("fingerprint") != data:
-            raise InputError(f"{folder / STATE}: the interrupted run had other data; go on with the same scenes")
+            raise InputError(f"{folder / STATE}: the interrupted run had other data; resume with the same scenes")
         record = Record(**state["record"])
     with record.timed("windows"):
         windows, test = window_sets(scenes, prior.free_space)
@@ -180,7 +179,7 @@ def train_prior(
 def _validate(
     run: PriorTraining, test: TensorDictBase, losses: dict[str, float], closed_loop: ClosedLoop | None
 ) -> dict[str, float]:
-    """Held-out loss, training losses and, where it is due, the closed loop's metrics."""
+    """Held-out loss, training losses and, if due, closed-loop metrics."""
     settings = run.settings
     line = {"step": run.step, "held_out": held_out_loss(run.prior, test, settings), **losses}
     number, last = -(-run.step // settings.validate_every), run.step == settings.steps
@@ -191,7 +190,7 @@ def _validate(
 
 
 def _checkpoint(run: PriorTraining, record: Record, folder: Path, origin: dict) -> Path:
-    """Write the best weights; the header says what made them."""
+    """Write the best weights, with their origin in the header."""
     best = record.best
     run.prior.load_state_dict(best["weights"])
     seconds = origin.get("seconds", {}) | record.seconds

@@ -1,4 +1,4 @@
-"""Training windows of the prior: a vehicle's situation at a frame, and the x that reproduces its next 5 s."""
+"""Training windows of the prior: the features of vehicles at a frame, and the x that reproduces their next 5 s."""
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,7 +15,7 @@ from e2rl.sim.dynamics import wrap
 
 OFFSETS = (0, 5, 10, 15)  # frames after a scene's start frame at which a window begins
 ROWS = 16  # vehicles of a window: the modelled ones nearest to the ego
-MAX_ERROR = 0.5  # m: windows that the representation fits worse are not trained on (wrong or self-crossing route)
+MAX_ERROR = 0.5  # m: vehicles with a larger representation error are not trained on (wrong or self-crossing route)
 STANDING_WEIGHT = 0.25
 
 
@@ -30,7 +30,7 @@ def derivative(values: Tensor, valid: Tensor) -> Tensor:
 
 
 def make_windows(scenes: TensorDictBase, free: bool = False, chunk: int = 32) -> TensorDict:
-    """Windows [W] of scenes [S] (see `_window` for the keys), without the empty ones; free: all in free space."""
+    """Windows [W] of scenes [S] (see `_window` for the keys), without empty ones; free: all in free space."""
     parts = []
     for scene in tqdm(scenes.split(chunk), "training windows"):
         vehicles = scene["route_log"].shape[1]
@@ -83,7 +83,7 @@ def _window(
         "known": at_knots,
     }
     distance = (logged[:, :vehicles, :2] - logged[:, :1, :2]).norm(dim=-1)
-    distance[:, 0] = -1e6  # the ego leads
+    distance[:, 0] = -1e6  # the ego comes first
     order = (distance + 1e3 * ~use + 1e4 * ~here).argsort(1)[:, :ROWS]
 
     def take(value: Tensor) -> Tensor:
@@ -96,7 +96,7 @@ def _window(
 
 
 def _future(scene: TensorDictBase, offset: int, vehicles: int) -> tuple[Tensor, Tensor]:
-    """States [B, V, HORIZON, 4] recorded after frame `offset`, and up to where they are known [B, V, HORIZON]."""
+    """States [B, V, HORIZON, 4] recorded after frame `offset`, and a mask [B, V, HORIZON] of the known ones."""
     future = slice(offset + 1, offset + 1 + HORIZON)
     tracks = scene["logged"][:, future, :vehicles].transpose(1, 2)
     known = scene["logged_valid"][:, future, :vehicles].transpose(1, 2)
