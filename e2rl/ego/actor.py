@@ -72,10 +72,8 @@ class ActorEgo(Ego):
 def expected_states(world: World) -> Tensor:
     """States [B, N, PLAN_STEPS + 1, 4] of all agents at steps 0.. from now: as planned, else at constant velocity."""
     now = world.states[:, :, None]
-    time = DT * torch.arange(PLAN_STEPS + 1, device=now.device, dtype=now.dtype)[:, None]
-    velocity = now[..., 3:] * torch.stack([now[..., 2].cos(), now[..., 2].sin()], -1)
-    straight = now[..., :2] + velocity * time
-    expected = torch.cat([straight, now[..., 2:].expand(*straight.shape[:-1], 2)], -1)
+    time = DT * torch.arange(PLAN_STEPS + 1, device=now.device, dtype=now.dtype)
+    expected = dynamics.constant_velocity(world.states, time)
     if world.plan is None:
         return expected
     vehicles = world.plan.shape[1]

@@ -21,9 +21,9 @@ def wrap(angle: Tensor) -> Tensor:
 
 
 def constant_velocity(states: Tensor, times: Tensor) -> Tensor:
-    """States [..., K, 4] at times [K] s ahead of states [..., 4] that keep their heading and speed."""
+    """States [..., K, 4] at times [K] or [..., K] s ahead of states [..., 4] that keep their heading and speed."""
     velocity = states[..., 3:] * torch.stack([torch.cos(states[..., 2]), torch.sin(states[..., 2])], -1)
-    xy = states[..., None, :2] + times[:, None] * velocity[..., None, :]
+    xy = states[..., None, :2] + times[..., None] * velocity[..., None, :]
     return torch.cat([xy, states[..., None, 2:].expand(*xy.shape[:-1], 2)], -1)
 
 

@@ -8,6 +8,7 @@ from torch import Tensor
 from e2rl.ego.base import Ego
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.scene.recording import DT
+from e2rl.sim.dynamics import constant_velocity
 from e2rl.sim.world import World
 from e2rl.traffic.rows import take_rows
 
@@ -29,12 +30,11 @@ class Lookahead:
         whole = len(rows) == len(self.world.step) and bool((rows.diff() > 0).all())
         world = self.world if whole else replace(take_rows(self.world, rows), plan=None)
         states, vehicles, pieces = world.states, planned.shape[1], []
-        velocity = states[..., 3:] * torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)
+        ends = torch.arange(self.period, HORIZON + self.period, self.period, device=states.device)
+        moved = constant_velocity(states[:, vehicles:], DT * ends)
         now = world
-        for done in range(0, HORIZON, self.period):
+        for number, after in enumerate(ends.tolist()):
             pieces.append(self.ego.plan(now)[:, : self.period])
-            after = done + self.period
-            moved = torch.cat([states[..., :2] + DT * after * velocity, states[..., 2:]], -1)
             ego, others = pieces[-1][:, -1:], planned[:, 1:, min(after, HORIZON) - 1]
-            now = replace(now, step=world.step + after, states=torch.cat([ego, others, moved[:, vehicles:]], 1))
+            now = replace(now, step=world.step + after, states=torch.cat([ego, others, moved[:, :, number]], 1))
         return torch.cat(pieces, 1)[:, :HORIZON]
