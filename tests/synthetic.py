@@ -50,7 +50,7 @@ def make_scenes(
     valid = torch.zeros(num_scenes, max_agents, dtype=torch.bool)
     valid[:, :n] = valid[:, max_vehicles:u] = True
     logged = start[:, None].repeat(1, steps + 1, 1, 1)
-    logged[..., 0] += start[:, None, :, 3] * (DT * torch.arange(steps + 1))[:, None]
+    logged[..., 0] += start[:, None, :, 3] * DT * torch.arange(steps + 1)[:, None]
     size = torch.tensor([4.5, 2.0]).repeat(num_scenes, max_agents, 1)
     size[:, max_vehicles:] = 0.7
     kind = torch.full((num_scenes, max_agents), VEHICLE)

@@ -1,4 +1,4 @@
-"""The commands as modules: train, evaluate and conf, which a wheel has in this folder and a checkout at its top level."""
+"""The commands as modules: train, evaluate and conf. A wheel has them in this folder, a checkout at its top level."""
 
 from pathlib import Path
 

@@ -32,7 +32,6 @@ from torch import Tensor
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.prior.prior import Prior
 from e2rl.scene.recording import DT
-from e2rl.sim.dynamics import constant_velocity
 from e2rl.sim.world import World
 
 REPLAN_STEPS = 5  # steps of DT between two replans: 0.5 s, for every method
@@ -106,7 +105,10 @@ def keep_velocity(states: Tensor, steps: Tensor | None = None) -> Tensor:
     """States [..., H, 4] of agents [..., 4] after `steps` [H] (or [..., H]) steps at constant velocity; default
     1..HORIZON."""
     steps = torch.arange(1, HORIZON + 1, device=states.device) if steps is None else steps
-    return constant_velocity(states, DT * steps)
+    way = states[..., 3, None] * DT * steps
+    direction = torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)[..., None, :]
+    xy = states[..., None, :2] + way[..., None] * direction
+    return torch.cat([xy, states[..., None, 2:].expand(*xy.shape[:-1], 2)], -1)
 
 
 def steps_ahead(world: World) -> Tensor:
