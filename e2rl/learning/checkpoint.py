@@ -54,15 +54,6 @@ def latest_checkpoint(path: str | Path) -> Path:
     return found[-1] if found[-1].is_dir() else found[-1].parent
 
 
-def saved_config(path: str | Path) -> dict:
-    """The configuration of the run that wrote the checkpoint `path` names."""
-    file = latest_checkpoint(path) / CONFIG
-    try:
-        return json.loads(file.read_text())
-    except (OSError, json.JSONDecodeError) as error:
-        raise InputError(f"{file}: not readable ({error}); resume from an older checkpoint") from None
-
-
 def load_checkpoint(path: str | Path, run: Evolution) -> int:
     """Restore a run built from the same configuration, generators last; returns the rounds done."""
     folder = latest_checkpoint(path)
