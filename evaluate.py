@@ -12,11 +12,13 @@ from e2rl.evaluation.avoidable import search_effort
 from e2rl.evaluation.chains import LongestChain
 from e2rl.evaluation.files import METRICS_FILE, write_metrics
 from e2rl.evaluation.ladders import intensity_ladder
+from e2rl.evaluation.modes import MODES_FILE, read_modes
 from e2rl.evaluation.open_loop import open_loop_rows
 from e2rl.evaluation.protocol import Setup, run_protocol
 from e2rl.evaluation.realism_meta import meta_rows
 from e2rl.report.drawing import save_picture
 from e2rl.report.intensity import intensity_figure
+from e2rl.report.modes import mode_tables
 from e2rl.report.skeleton import skeleton_figure
 from e2rl.report.tables import metric_tables, print_tables, save_tables
 from e2rl.scene.source import load_scenes
@@ -42,6 +44,7 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     dropped = "".join(f"; left out: {count} scenes ({reason})" for reason, count in scenes.dropped.items())
     effort = search_effort(scenes.scenes["logged"].shape[1] - 1)
     tables = metric_tables(rows, f"{build.caption(config, origin)}; {effort}{dropped}", config.metrics)
+    tables += mode_tables(read_modes(folder / MODES_FILE))
     save_tables(folder / "tables.md", tables)
     print_tables(tables)
     if config.figure == "intensity":

@@ -23,12 +23,13 @@ from torch import Tensor
 import e2rl
 from e2rl.errors import InputError
 from e2rl.files import write_atomically
-from e2rl.metrics.catalogue import row_columns
+from e2rl.metrics.catalogue import WORDS, row_columns
 from e2rl.scene.recording import AGENT_TYPES, DT
 
 FORMAT = "e2rl-rollout/1"
 ROLLOUTS, TABLE, METRICS_FILE = "rollouts", "rollouts.csv", "metrics.json"
-TEXT_COLUMNS = ("dataset", "split", "method", "ego_policy", "scene_id", "location", "contact_type")
+OPTIONAL = ("ran_light",)  # arrays of a rollout that verdicts use where they are known
+TEXT_COLUMNS = ("dataset", "split", "method", "ego_policy", "scene_id", "location", *WORDS)
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,7 @@ def rollout_arrays(rollouts: dict, index: int, source: Source) -> dict[str, np.n
         "lane_width": row["lane_width"].float().numpy()[lanes_kept],
         "drivable_points": rings,
         "drivable_offsets": ring_offsets,
+        **{name: row[name].numpy() for name in OPTIONAL if name in row},
     }
 
 

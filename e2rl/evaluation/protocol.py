@@ -21,6 +21,7 @@ from e2rl.evaluation.files import (
     write_rollouts,
     write_rows,
 )
+from e2rl.evaluation.modes import MODES_FILE, find_modes, write_modes
 from e2rl.evaluation.processes import in_processes
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
@@ -91,9 +92,9 @@ def run_protocol(
 ) -> list[dict]:
     """Roll out every method on every (scene, seed), score, and return the rows of metrics.json.
 
-    folder: where rollouts/ (if save_rollouts), rollouts.csv and metrics.json are written (None: nowhere); processes:
-    over which the rollouts are spread, with the same rows; only: positions of the scenes to run, with unchanged noise
-    (None: all). fields are added to each row.
+    folder: where rollouts/ (if save_rollouts), rollouts.csv, modes.json and metrics.json are written (None: nowhere);
+    processes: over which the rollouts are spread, with the same rows; only: positions of the scenes to run, with
+    unchanged noise (None: all). fields are added to each row.
     """
     tasks = [(scene, seed) for seed in seeds for scene in (range(len(setup.scenes)) if only is None else only)]
     count = -(-len(tasks) // setup.batch)
@@ -112,8 +113,10 @@ def run_protocol(
             features += samples
             bar.set_postfix(method=method.name, eta=method.eta)
             bar.update(len(part))
+    modes = find_modes(rows)
     result = metric_rows(rows, features, **fields)
     if folder is not None:
+        write_modes(folder / MODES_FILE, modes)
         write_rows(folder / TABLE, rows)
         write_metrics(folder / METRICS_FILE, result)
     return result

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from e2rl.errors import InputError
-from e2rl.evaluation.files import FORMAT, ROLLOUTS
+from e2rl.evaluation.files import FORMAT, OPTIONAL, ROLLOUTS
 from e2rl.scene.recording import AGENT_TYPES
 
 SCALARS = ("format", "scene_id", "location", "dataset", "split", "method", "ego_policy", "seed", "eta", "dt", "ego")
@@ -86,6 +86,7 @@ def as_rollout_dict(rollouts: Sequence[dict]) -> dict:
             "drivable_points",
         )
     }
+    result |= {name: pad(name, -1) for name in OPTIONAL if all(name in rollout for rollout in rollouts)}
     codes = [
         {
             "agent_type": np.array([AGENT_TYPES.index(kind) for kind in rollout["agent_type"]], np.int64),

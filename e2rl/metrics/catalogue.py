@@ -8,13 +8,15 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from e2rl.metrics.contact import contact_columns, traffic_contact_columns
-from e2rl.metrics.fault import at_fault
+from e2rl.metrics.contact import KINDS, contact_columns, traffic_contact_columns
+from e2rl.metrics.failure_features import APPROACHES, MANOEUVRES, failure_columns
 from e2rl.metrics.meta_metric import FEATURES
 from e2rl.metrics.off_road import off_road_columns
 from e2rl.metrics.proximity import motion_columns
 from e2rl.metrics.realism import W1
 from e2rl.metrics.standing import standing_columns
+from e2rl.metrics.verdicts import verdict_columns
+from e2rl.verdicts.duty import DUTIES
 
 Compute = Callable[[dict[str, Tensor]], Tensor | dict[str, Tensor]]
 
@@ -35,6 +37,7 @@ class Metric:
     weight: str = ""  # column that weights the mean
     per: str = ""  # column by whose sum the sum of its own column is divided, instead of the mean
     median: bool = False  # instead of the mean
+    places: int = 0  # of a column of labels: expected number of labels at so many places, instead of the mean
     samples: str = ""  # of a metric that `metrics.realism` computes from pooled samples: those that it needs
     per_collision: bool = False  # known for collisions only: paired differences compare each group's own collisions
     tables: tuple[str, ...] = ()  # closed-loop tables that `register` appends it to; a new name makes a new table
@@ -47,6 +50,8 @@ class Metric:
 
 MAIN = (
     Metric("cfr", "ego hits any vehicle", share=True),
+    Metric("cfr_counted", "a failure that counts: preventable, or the ego's fault", share=True),
+    Metric("cfr_preventable", "a failure that a competent driver prevents", share=True),
     Metric("cfr_adv", "ego hits an adversary", share=True),
     Metric("cfr_vru", "ego hits a pedestrian or cyclist", share=True),
     Metric("cfr_bg", "other simulated vehicles hit each other", share=True),
@@ -55,7 +60,9 @@ MAIN = (
     Metric("side", "first contact at the ego's side", share=True),
     Metric("rear", "first contact at the ego's rear", share=True),
     Metric("rir", "rear impacts per collision", share=True, per_collision=True),
+    Metric("counted", "collisions that count", share=True, per_collision=True),
     Metric("at_fault", "ego's fault, per collision", share=True, per_collision=True),
+    Metric("preventable", "prevented by UN R157's careful and competent driver", share=True, per_collision=True),
     Metric("relvel", "speed difference before contact", unit="m/s", per_collision=True),
     Metric("contact_time", "median time of the first contact", unit="s", median=True, per_collision=True),
     Metric("min_dtc", "smallest gap to another agent", unit="m"),
@@ -70,7 +77,23 @@ MAIN = (
     Metric("transport", "path KL of the control"),
     Metric("seconds_per_rollout", "wall time", unit="s", column="seconds"),
 )
+PLACES = 10  # at which `mode_coverage` looks: failures at fewer places give none
+COVERAGE = f"failure modes expected of collisions at {PLACES} places"
 EXTRA = (
+    Metric("mode_coverage", COVERAGE, decimals=1, column="mode", places=PLACES, per_collision=True),
+    Metric(
+        "mode_coverage_counted",
+        "the same, of collisions that count",
+        decimals=1,
+        column="mode",
+        weight="counted",
+        places=PLACES,
+        per_collision=True,
+    ),
+    Metric("preventable_fsm", "prevented by the fuzzy safety model", share=True, per_collision=True),
+    Metric("preventable_rss", "prevented by RSS", share=True, per_collision=True),
+    Metric("preventable_regulation", "prevented at UN R157's limit", share=True, per_collision=True),
+    Metric("preventable_chain", "prevented if a follower brakes, too", share=True, per_collision=True),
     Metric("avoidable_1s", "the same, acting only 1 s before contact", share=True, per_collision=True),
     Metric("evasion_accel", "peak acceleration of the mildest evasion found", unit="m/s²", per_collision=True),
     Metric("front_any", "ego's front in contact at first contact", share=True),
@@ -96,7 +119,8 @@ TABLES = {
         *("real", "real_norm", *W1, "parked_moved", "starts", "seconds_per_rollout"),
     ],
     "adversaries": [  # what tells adversaries apart: the failures they find, and what these cost
-        *("cfr", "cfr_adv", "avoidable", "contact_time", "front", "side", "rear", "rir", "relvel"),
+        *("cfr", "cfr_counted", "cfr_preventable", "counted", "at_fault", "preventable", "cfr_adv", "mode_coverage", "mode_coverage_counted"),
+        *("avoidable", "contact_time", "front", "side", "rear", "rir", "relvel"),
         *("ttc_c", "cfr_bg", "aor_step", "real", "real_adv", "transport"),
     ],
 }  # closed-loop tables (`metrics=...` of evaluate.py) and the metrics of each, in order
@@ -126,7 +150,15 @@ IDENTITY = ("scene_id", "location", "seed", "eta")  # of a row, before its metri
 EVENT = (
     *("contact_type", "partner", "contact_step", "aor_vehicle_steps", "moving_vehicles", "parked_vehicles"),
     *("starters_log", "aor_left_out", "start_overlap_ego", "start_overlap_bg", "evasion_tried", "evasion_seconds"),
+    *("duty", "approach", "ego_manoeuvre", "partner_manoeuvre", "ego_speed", "partner_speed"),
 )  # of a row, after its metrics
+WORDS = {
+    "contact_type": KINDS,
+    "duty": DUTIES,
+    "approach": APPROACHES,
+    "ego_manoeuvre": MANOEUVRES,
+    "partner_manoeuvre": MANOEUVRES,
+}  # columns of a row that hold one of these words, or "" where a function computes the index -1
 
 
 def transport_columns(batch: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -139,7 +171,8 @@ def transport_columns(batch: dict[str, Tensor]) -> dict[str, Tensor]:
 COMPUTE: dict[str, Compute] = {
     "contact": contact_columns,
     "traffic_contact": traffic_contact_columns,
-    "at_fault": at_fault,
+    "failure": failure_columns,
+    "verdicts": verdict_columns,
     "motion": motion_columns,
     "off_road": off_road_columns,
     "standing": standing_columns,

@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from e2rl.metrics.catalogue import COMPUTE, METRICS, row_columns
-from e2rl.metrics.contact import KINDS, first_contact
+from e2rl.metrics.catalogue import COMPUTE, METRICS, WORDS, row_columns
+from e2rl.metrics.contact import first_contact
 from e2rl.metrics.realism import Samples, realism, traffic_samples
 
 CHUNK = 32  # rollouts scored at once: bounds the memory of the pairwise steps
@@ -65,9 +65,10 @@ def score_batch(batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], list[Sampl
 def plain_rows(columns: dict[str, Tensor | list], count: int) -> list[dict]:
     """One dict of python values per rollout; NaN for columns of the catalogue that nothing computed.
 
-    contact_type becomes front, side, rear or "".
+    Columns of `catalogue.WORDS`, such as contact_type, become words; their index -1 becomes "".
     """
     lists = {name: value.tolist() if isinstance(value, Tensor) else value for name, value in columns.items()}
-    lists["contact_type"] = [KINDS[kind] if kind >= 0 else "" for kind in lists["contact_type"]]
+    for name, words in WORDS.items():
+        lists[name] = [words[index] if index >= 0 else "" for index in lists[name]]
     unknown = dict.fromkeys(row_columns(), math.nan)
     return [unknown | {name: values[index] for name, values in lists.items()} for index in range(count)]

@@ -63,6 +63,28 @@ def resampled_medians(values: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
     return ((values[low] + values[high]) / 2).where(half[:, 0] > 0, torch.nan)
 
 
+def resampled_labels(labels: Tensor, cluster: Tensor, draws: Tensor, places: int) -> Tensor:
+    """Expected number [D], per draw [D, C], of different labels among those of rollouts at `places` different clusters.
+
+    The clusters are picked at random from a draw, without picking one twice, and at each one of its rollouts with a
+    label [R] (NaN: none). So neither many rollouts nor many at one place raise the number. It is exact: the clusters
+    picked miss a label with the ratio of two elementary symmetric polynomials. NaN where a draw has fewer clusters.
+    """
+    known = ~labels.isnan()
+    values, index = labels[known].unique(return_inverse=True)
+    counts = draws.new_zeros(draws.shape[1], len(values))
+    counts.index_put_((cluster[known], index), draws.new_ones(len(index)), accumulate=True)
+    total = counts.sum(1, keepdim=True)
+    times = draws * (total[:, 0] > 0)
+    missed = 1 - counts / total.clamp(min=1)
+    parts = torch.cat([missed, torch.ones_like(total)], 1)  # the last column: of all picks
+    polynomial = draws.new_zeros(places + 1, len(draws), parts.shape[1])
+    polynomial[0] = 1
+    for one in total[:, 0].nonzero()[:, 0].tolist():
+        polynomial[1:] += (times[:, one, None] * parts[one]) * polynomial[:-1]
+    return (1 - polynomial[-1, :, :-1] / polynomial[-1, :, -1:]).sum(-1).where(polynomial[-1, :, -1] > 0, torch.nan)
+
+
 def interval(values: Tensor, known_clusters: int) -> dict[str, float]:
     """{mean, low, high} of values [D], row 0 the estimate; the interval needs two clusters that know the value."""
     values = values.where(values.isfinite(), torch.nan)
@@ -105,13 +127,17 @@ class Bootstrap:
         for column, metric in enumerate(row_metrics()):
             if metric.median:
                 means[:, column] = resampled_medians(totals[:, column], self.cluster, self.draws)
+            if metric.places:
+                labels = totals[:, column] / weights[:, column]  # 0 / 0 is NaN
+                means[:, column] = resampled_labels(labels, self.cluster, self.draws, metric.places)
         values = {metric.name: means[:, column] for column, metric in enumerate(row_metrics())}
         return values | realism(list(samples), self.cluster, self.realism_draws)
 
     def intervals(self, values: Mapping[str, Tensor], known: Mapping[str, Tensor]) -> dict[str, dict[str, float]]:
         """{metric: {mean, low, high, n}} in the catalogue's order; known [R] bool: the n rollouts that a value uses."""
+        counts = {name: 0 if values[name][0].isnan() else int(known[name].sum()) for name in METRICS}
         return {
-            name: interval(values[name], len(self.cluster[known[name]].unique())) | {"n": int(known[name].sum())}
+            name: interval(values[name], len(self.cluster[known[name]].unique())) | {"n": counts[name]}
             for name in METRICS
         }
 

@@ -18,6 +18,7 @@ from e2rl.sim.dynamics import constant_velocity
 
 NO_CAP = 20.0  # m/s^2: the cap of a vehicle whose plan is feasible
 STRIDE = 3  # steps between the times at which plans are compared
+WAIT = 0.5  # s until a vehicle that waits decides again
 MIN_BRAKING = 0.5  # m/s^2 of a vehicle that must give way
 
 
@@ -36,14 +37,29 @@ class BoundSettings:
 
 
 @dataclass
+class Duty:
+    """How adversaries [B, V] treat the ego where their plans meet its own.
+
+    exempt: they need not brake for it; yields: they give way wherever they meet it, whoever has the other ahead;
+    patience [m/s^2]: they wait while as much braking still suffices 0.5 s later (0: nobody waits); cap [m/s^2]: the
+    highest acceleration of a vehicle that brakes ahead of it, NO_CAP for others.
+    """
+
+    exempt: Tensor
+    yields: Tensor
+    patience: Tensor
+    cap: Tensor
+
+
+@dataclass
 class Obstacles:
-    """Every agent at the present moment, vehicles first: agents [B, N, 4], size [B, N, 2], present [B, N]; exempt
-    [B, V]: vehicles that may run into the ego (adversaries)."""
+    """Every agent at the present moment, vehicles first: agents [B, N, 4], size [B, N, 2], present [B, N]; duty: of
+    adversaries, None without any."""
 
     agents: Tensor
     size: Tensor
     present: Tensor
-    exempt: Tensor
+    duty: Duty | None = None
 
 
 def bounded(
@@ -54,7 +70,7 @@ def bounded(
     Braking may put a vehicle in the way of the one behind it, so plans are compared twice.
     """
     motion = decode(None)
-    cap = torch.full_like(state.v, NO_CAP)
+    cap = torch.full_like(state.v, NO_CAP) if obstacles.duty is None else obstacles.duty.cap
     for _ in range(2):
         cap = torch.minimum(cap, acceleration_caps(settings, motion, state, obstacles))
         motion = select(cap < NO_CAP, decode(cap), motion)
@@ -105,8 +121,22 @@ def _meeting_braking(
     u = (other[..., 3] * torch.cos(other[..., 2] - own[..., 2])).clamp(min=0)
     driven = (motion.s[..., steps] - state.s[..., None]).gather(-1, first)
     room = (driven - settings.gap - u * DT * (steps[first] + 1)).clamp(min=0.3)
-    braking = (state.v[..., None] - u).clamp(min=0) ** 2 / (2 * room)
+    closing = (state.v[..., None] - u).clamp(min=0)
+    if obstacles.duty is not None:
+        to_ego = _towards_ego(obstacles.duty, meet[..., 0], yields[..., 0], room[..., 0], closing[..., 0])
+        yields = torch.cat([to_ego[..., None], yields[..., 1:]], -1)
+    braking = closing**2 / (2 * room)
     return torch.where(yields, braking.clamp(min=MIN_BRAKING), -NO_CAP).amax(-1)
+
+
+def _towards_ego(duty: Duty, meets: Tensor, yields: Tensor, room: Tensor, closing: Tensor) -> Tensor:
+    """Bool [B, V]: vehicles brake for the ego now.
+
+    meets: plans meet; yields: the ordinary rule; room [m] until there, closing [m/s].
+    """
+    later = room - closing * WAIT
+    waits = (closing**2 < 2 * later * duty.patience) & (later > 0)
+    return meets & ~duty.exempt & (yields | duty.yields) & ~waits
 
 
 def _first_meeting(tracks: Tensor, obstacles: Obstacles, aside: float, vehicles: int) -> tuple[Tensor, Tensor]:
@@ -117,7 +147,6 @@ def _first_meeting(tracks: Tensor, obstacles: Obstacles, aside: float, vehicles:
     meets = overlap(tracks[:, :vehicles, None], wide[:, :, None, None], tracks[:, None], size[:, None, :, None])
     itself = torch.eye(vehicles, present.shape[1], dtype=torch.bool, device=meets.device)
     counts = present[:, None, :] & present[:, :vehicles, None] & ~itself
-    counts = torch.cat([counts[..., :1] & ~obstacles.exempt[..., None], counts[..., 1:]], -1)
     meets = meets & counts[..., None]
     return meets.int().argmax(-1), meets.any(-1)
 

@@ -130,17 +130,16 @@ class Prior(nn.Module):
         present: Tensor,
         step: Tensor,
         ego_plan: Tensor | None,
-        exempt: Tensor | None = None,
     ) -> Context:
         """The Context of a replan.
 
         agents [B, N, 4], present [B, N]: every agent now; step [B]: simulated steps; ego_plan [B, HORIZON, 4]: states
-        of the ego ahead, None (open loop) where unknown; exempt [B, V]: vehicles whose bounds ignore the ego.
+        of the ego ahead, None (open loop) where unknown.
         """
         here = present[:, : state.s.shape[1]]
         nodes = node_features(routed, state, agents, present, step, step == 0)
         encoding = self.denoiser.encode(nodes, edge_features(routed, state), here)
-        obstacles = Obstacles(agents, routed.size, present, torch.zeros_like(here) if exempt is None else exempt)
+        obstacles = Obstacles(agents, routed.size, present)
         active = here & routed.modelled
         active = torch.cat([torch.zeros_like(active[:, :1]), active[:, 1:]], 1)
         ego_x = None if ego_plan is None else plan_to_x(ego_plan, state, routed)

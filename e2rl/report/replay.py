@@ -1,6 +1,7 @@
 """Replays: an animated GIF and a strip of four moments of a rollout, from its file alone.
 
-`python -m e2rl.report.replay RUN_DIR --failures 3` saves them for the first failures of different scenes in a run.
+`python -m e2rl.report.replay RUN_DIR --failures 3` saves them for the first failures of different scenes in a run,
+`--modes` for the most typical failure of each of its modes.
 """
 
 import argparse
@@ -13,6 +14,7 @@ from PIL import Image
 
 from e2rl.errors import InputError
 from e2rl.evaluation.files import ROLLOUTS, TABLE, read_rows, rollout_name
+from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
 from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollout
 from e2rl.files import write_atomically
 from e2rl.metrics.score import score_rollouts
@@ -69,11 +71,23 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m e2rl.report.replay", description=__doc__.splitlines()[0])
     parser.add_argument("run", type=Path, metavar="RUN_DIR", help="a run's folder, or one rollout .npz")
     parser.add_argument("--failures", type=int, default=3, metavar="N", help="how many failures (default %(default)s)")
+    parser.add_argument("--modes", action="store_true", help="instead, a typical failure of each mode")
     parser.add_argument("--out", type=Path, help="folder to write to (default: RUN_DIR/replays)")
     parser.add_argument("--metres", type=float, default=70.0, help="side of the picture, m (default %(default)s)")
     parser.add_argument("--pixels", type=int, default=720, help="side of the picture, pixels (default %(default)s)")
     parser.add_argument("--ghost", action="store_true", help="outline where the recording has the ego")
     return parser.parse_args(arguments)
+
+
+def typical_failures(run: Path) -> dict[Path, str]:
+    """{rollout file: name of the mode} of the most typical failure of each mode of a run, without small modes."""
+    modes = [mode for mode in read_modes(run / MODES_FILE)["modes"] if mode["mode"] != OTHER]
+    if not modes:
+        raise InputError(f"{run / MODES_FILE}: no failure modes; raise eta or evaluate more scenes")
+    return {
+        run / ROLLOUTS / mode["typical"]["file"]: f"{mode['mode']}. {mode['name']} ({mode['count']} failures)"
+        for mode in modes
+    }
 
 
 def chosen_paths(run: Path, failures: int) -> list[Path]:
@@ -92,7 +106,10 @@ def main(arguments: list[str] | None = None) -> int:
     options = parse_arguments(arguments)
     folder = options.out or (options.run.parent if options.run.is_file() else options.run) / "replays"
     try:
-        for path in chosen_paths(options.run, options.failures):
+        modes = typical_failures(options.run) if options.modes else {}
+        for path in modes or chosen_paths(options.run, options.failures):
+            if path in modes:
+                print(modes[path])
             replay = load_replay(path, options.metres, options.pixels, options.ghost)
             for saved in save_replay(replay, folder):
                 print(saved)

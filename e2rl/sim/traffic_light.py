@@ -30,3 +30,18 @@ def stop_line_distance(
     needed = speed[..., None] ** 2 / (2 * ahead.clamp(min=1e-3))
     red, yellow = (state == LIGHT_RED) & (needed < red_braking), (state == LIGHT_YELLOW) & (needed < yellow_braking)
     return ahead.masked_fill(~((ahead > 0) & (red | yellow)), torch.inf).amin(-1)
+
+
+def ran_red(light_state: Tensor, light: Tensor, line: Tensor, front: Tensor) -> Tensor:
+    """Step [Q] int64 at which vehicles last crossed a stop line at red, -1 for never.
+
+    light_state [Q, T + 1, S]; light, line [Q, K]: indices of lights (-1 none) and arc lengths of their stop lines;
+    front [Q, T + 1]: arc length of the front bumper, on the same route.
+    """
+    if not light_state.shape[-1]:
+        return torch.full_like(light[:, 0], -1)
+    state = light_state.gather(2, light.clamp(min=0)[:, None].expand(-1, front.shape[1], -1))
+    crossed = (front[:, :-1, None] < line[:, None]) & (front[:, 1:, None] >= line[:, None])
+    wrong = crossed & (state[:, 1:] == LIGHT_RED) & (light >= 0)[:, None]
+    steps = torch.arange(1, front.shape[1], device=front.device)
+    return torch.where(wrong.any(-1), steps, -1).amax(1)

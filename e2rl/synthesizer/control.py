@@ -95,7 +95,8 @@ class SparseControl:
         self.anchor_step = steps - int((levels - self.settings.anchor_level).abs().argmin())
         self.feasibility_step = int((levels <= self.settings.feasibility_level).sum())
         self.jump = torch.zeros(self.coalition.shape, device=self.eta.device)
-        self.has_coalition = bool(self.coalition.any())  # asked once, on the host: without a coalition V_adv is 0
+        # Asked once, on the host: without a coalition V_adv is 0, and with a clip of 0 it has no effect.
+        self.has_coalition = self.settings.adversarial_clip > 0 and bool(self.coalition.any())
 
     def __call__(
         self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Callable[[Tensor], Tensor]

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.errors import InputError
-from e2rl.prior.lane_relative import HORIZON, SIZE, locate, select
+from e2rl.prior.lane_relative import HORIZON, KNOTS, SIZE, locate, select
 from e2rl.prior.prior import Context, Prior
 from e2rl.prior.routed import reroute
 from e2rl.scene.recording import DT
@@ -25,7 +25,9 @@ from e2rl.synthesizer.control import ControlSettings, SparseControl
 from e2rl.synthesizer.feasibility import FeasibilitySettings
 from e2rl.synthesizer.interception import InterceptionSettings
 from e2rl.synthesizer.potentials import PotentialContext, PotentialSettings
+from e2rl.synthesizer.provocation import ProvocationSettings
 from e2rl.synthesizer.reasoner import ReasonerSettings, build_reasoner
+from e2rl.synthesizer.responsibility import RESPONSIBILITIES, CareSettings, duty_of, place_of
 from e2rl.synthesizer.selection import Selection
 from e2rl.synthesizer.skeleton import Skeleton, SkeletonSettings, build_skeleton, chain_depth, direct
 from e2rl.synthesizer.topology import TopologySettings, topological_candidates
@@ -43,6 +45,8 @@ PARTS: dict[str, type] = {
     "skeleton": SkeletonSettings,
     "anchor": AnchorSettings,
     "interception": InterceptionSettings,
+    "provocation": ProvocationSettings,
+    "care": CareSettings,
     "potentials": PotentialSettings,
     "control": ControlSettings,
 }
@@ -54,7 +58,8 @@ class E2State(PriorState):
     """B attacked scenes.
 
     eta [B]; coalition [B, V]: C*; target [B, V] int64: whom each member acts on (0 the ego, -1 none); off_lane [B, V]:
-    on an interception instead of its lane; path_kl, anchor_jump [B, V]: path KL of the control and energy of anchoring
+    off its lane, on a path of its own; committed [B, V], knots [B, V, KNOTS]: with a proposal, and its accelerations
+    [m/s^2]; path_kl, anchor_jump [B, V]: path KL of the control and energy of anchoring
     since the start.
     """
 
@@ -64,6 +69,8 @@ class E2State(PriorState):
     off_lane: Tensor
     path_kl: Tensor
     anchor_jump: Tensor
+    committed: Tensor
+    knots: Tensor
 
 
 class E2(NominalTraffic):
@@ -72,15 +79,26 @@ class E2(NominalTraffic):
     adversarial = True
     figures = ("anchor_jump",)
 
-    def __init__(self, prior: Prior, support: str = "feasible", reselect: int = 2, **parts: Mapping) -> None:
-        """support: whom the coalition is chosen from: feasible (S = S_top and F), topology (S_top alone) or random (as
-        many as there are near agents), the ablations of table 2; reselect: replans after which a coalition that can no
+    def __init__(
+        self,
+        prior: Prior,
+        knowledge: str = "predicted",
+        prediction: str = "prior",
+        responsibility: str = "full",
+        support: str = "feasible",
+        reselect: int = 2,
+        **parts: Mapping,
+    ) -> None:
+        """knowledge, prediction: see NominalTraffic; responsibility: of RESPONSIBILITIES; support: whom the coalition is
+        chosen from: feasible (S = S_top and F), topology (S_top alone) or random (as many as there are near agents),
+        the ablations of table 2; reselect: replans after which a coalition that can no
         longer meet its targets is chosen anew, 0: never; parts: settings of PARTS (conf/synthesizer/e2.yaml).
 
         Raises InputError for settings that do not fit.
         """
-        super().__init__(prior)
+        super().__init__(prior, knowledge, prediction)
         check_choice("synthesizer.support", support, SUPPORTS)
+        check_choice("synthesizer.responsibility", responsibility, RESPONSIBILITIES)
         unknown = sorted(set(parts) - set(PARTS))
         if unknown:
             raise InputError(f"synthesizer.{unknown[0]}: no setting of e2; compare conf/synthesizer/e2.yaml")
@@ -92,9 +110,11 @@ class E2(NominalTraffic):
         self.skeleton: SkeletonSettings = settings["skeleton"]
         self.anchor: AnchorSettings = settings["anchor"]
         self.interception: InterceptionSettings = settings["interception"]
+        self.provocation: ProvocationSettings = settings["provocation"]
+        self.care: CareSettings = settings["care"]
         self.potentials: PotentialSettings = settings["potentials"]
         self.control: ControlSettings = settings["control"]
-        self.support, self.reselect, self.settings = support, reselect, settings
+        self.responsibility, self.support, self.reselect, self.settings = responsibility, support, reselect, settings
         self.statistics: dict[str, float] = {}  # of the language-model reasoner
         self.feasible_vehicles = build_reasoner(settings["reasoner"], self.statistics)
         self.queries_ego = self.control.lookahead > 0
@@ -112,6 +132,8 @@ class E2(NominalTraffic):
             off_lane=none,
             path_kl=zero,
             anchor_jump=zero,
+            committed=none,
+            knots=zero[..., None].repeat(1, 1, KNOTS),
         )
 
     def replan(
@@ -135,11 +157,23 @@ class E2(NominalTraffic):
         state, anchor = self._reselected(state, world, ego_plan, noise)
         off_lane = anchor.off_lane & state.coalition & (state.eta > 0)[:, None]
         state = self._onto(state, world, state.routed.route, off_lane, anchor.off_lane_path)
-        context = self.encode(state, world, ego_plan, state.coalition)
+        context = self.encode(state, world, ego_plan)
         control = self._control(state, self._potential_context(state, world, ego_plan), anchor, group)
         sample = self.prior.sample(context, noise, control, self._budget(state))
+        committed = anchor.feasible & state.coalition
         kl, jump = state.path_kl + sample.kl, state.anchor_jump + control.jump
-        return replace(state, path_kl=kl, anchor_jump=jump), sample.x0, context
+        state = replace(state, path_kl=kl, anchor_jump=jump, committed=committed, knots=anchor.knots)
+        return state, sample.x0, self._with_duty(state, world, ego_plan, sample.x0, context)
+
+    def _with_duty(
+        self, state: E2State, world: World, ego_plan: Tensor, x0: Tensor, context: Context
+    ) -> Context:
+        """The context whose bounds know what the coalition owes the ego."""
+        planned = self.prior.decode(x0, context).states()
+        proposed = torch.where(state.committed, state.knots[..., 0], 0.0)
+        known = ego_plan[:, :HORIZON]
+        duty = duty_of(self.responsibility, self.care, world, state.coalition, state.eta, planned, known, proposed)
+        return replace(context, obstacles=replace(context.obstacles, duty=duty))
 
     def _budget(self, state: E2State) -> Tensor | None:
         """Path KL [B] that control may still add to each scene."""
@@ -166,13 +200,29 @@ class E2(NominalTraffic):
         depth = chain_depth(state.target)
         count = state.replans  # chains and source of a skeleton, which proposals do not read
         skeleton = Skeleton(state.coalition, state.target, depth, depth == 1, depth > 1, count, count)
-        return self._propose(skeleton, state, world, ego_plan, keep_route=True)
+        anchor = self._propose(skeleton, state, world, ego_plan, keep_route=True)
+        return self._held(anchor, state, world) if self.responsibility == "full" else anchor
+
+    def _held(self, anchor: Anchor, state: E2State, world: World) -> Anchor:
+        """The anchor in which members without a lawful proposal go on with their last one while they are ahead."""
+        ahead = place_of(world, state.coalition.shape[1])[0][..., 0] > 0
+        hold = state.coalition & ~anchor.feasible & state.committed & ahead
+        later = torch.cat([state.knots[..., 1:], state.knots[..., -1:]], -1)
+        return replace(
+            anchor,
+            feasible=anchor.feasible | hold,
+            knots=torch.where(hold[..., None], later, anchor.knots),
+            route=torch.where(hold, state.routed.route, anchor.route),
+            off_lane=torch.where(hold, state.off_lane, anchor.off_lane),
+            off_lane_path=torch.where(hold[..., None, None], state.routed.points, anchor.off_lane_path),
+        )
 
     def _propose(
         self, skeleton: Skeleton, state: E2State, world: World, ego_plan: Tensor, keep_route: bool = False
     ) -> Anchor:
         settings = self.anchor, self.interception
-        return propose(world.scene, world, skeleton, ego_plan, *settings, state.eta, keep_route)
+        law = self.provocation if self.responsibility == "full" else None
+        return propose(world.scene, world, skeleton, ego_plan, *settings, state.eta, keep_route, law)
 
     def _select(self, state: E2State, world: World, ego_plan: Tensor, noise: Tensor) -> E2State:
         """Topology on a reference rollout, feasibility, skeleton; the coalition takes the routes that meet targets."""

@@ -11,9 +11,11 @@ from e2rl.prior.prior import Context, Prior
 from e2rl.prior.routed import RoutedScene
 from e2rl.prior.stratified_sampling import main_direction, stratified_noise, stratified_uniform
 from e2rl.scene.recording import DT
+from e2rl.settings import check_choice
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
 from e2rl.traffic.grouping import Group, clone, crop_state, crop_world, group_scenes, write_state
+from e2rl.traffic.knowledge import KNOWLEDGE, PREDICTIONS, turn_rate_and_acceleration
 from e2rl.traffic.rows import noise_of
 from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan
 
@@ -35,10 +37,17 @@ class PriorState:
 
 
 class NominalTraffic(Traffic):
-    """Unguided samples of the frozen prior; the ego's row of the joint state is its plan."""
+    """Unguided samples of the frozen prior; the ego's row of the joint state is what is known of its motion."""
 
-    def __init__(self, prior: Prior) -> None:
+    def __init__(self, prior: Prior, knowledge: str = "predicted", prediction: str = "prior") -> None:
+        """knowledge: of KNOWLEDGE; prediction: of PREDICTIONS, used where the ego's plan is not known.
+
+        Raises InputError for other choices.
+        """
+        check_choice("synthesizer.knowledge", knowledge, KNOWLEDGE)
+        check_choice("synthesizer.prediction", prediction, PREDICTIONS)
         self.prior = prior.requires_grad_(False).eval()
+        self.knowledge, self.prediction = knowledge, prediction
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> State:
         """States of scenes [B] with routes drawn from the prior."""
@@ -55,13 +64,9 @@ class NominalTraffic(Traffic):
         present = torch.zeros(batch, width, HORIZON, dtype=torch.bool, device=states.device)
         for group in group_scenes(world):
             rows, vehicles = group.rows, group.vehicles
-            part, x0, context = self.replan_group(
-                crop_state(state, group, width),
-                crop_world(world, group),
-                ego_plan[rows],
-                noise[:, rows, :vehicles],
-                group,
-            )
+            part, there = crop_state(state, group, width), crop_world(world, group)
+            known = ego_plan[rows] if self.knowledge == "plan" else self.predicted_ego(part, there)
+            part, x0, context = self.replan_group(part, there, known, noise[:, rows, :vehicles], group)
             plan = self.prior.plan(x0, context)
             part = replace(part, replans=part.replans + 1, lane=plan.after(REPLAN_STEPS))
             write_state(whole, part, group)
@@ -78,15 +83,32 @@ class NominalTraffic(Traffic):
         context = self.encode(state, world, ego_plan)
         return state, self.prior.sample(context, noise).x0, context
 
+    @torch.no_grad()
+    def predicted_ego(self, state: State, world: World) -> Tensor:
+        """States [G, HORIZON, 4] of the ego predicted from its state and past (PREDICTIONS).
+
+        `prior`: the ego's row of the joint clean estimate at the highest noise level without noise, one pass of the
+        network: nearly the mean of its samples, and nearer to what egos drive than one of them.
+        """
+        seen = turn_rate_and_acceleration(world)
+        predict = PREDICTIONS[self.prediction]
+        if predict is not None:
+            return predict(world)
+        lane = self.lane_now(state, world, seen)
+        context = self.prior.encode(state.routed, lane, world.states, world.valid, world.step, None)
+        level = self.prior.schedule.levels(1, seen.device)[0]
+        x0 = self.prior.denoise(seen.new_zeros(*lane.v.shape, SIZE), level, context)
+        return self.prior.decode(x0, context).states()[:, 0]
+
     def noise(self, state: State) -> Tensor:
         """Standard normal noise [K, B, V, SIZE] of the next replan."""
         shape = (self.prior.sampler.steps, state.routed.route.shape[1], SIZE)
         return noise_of(state.seed, 1 + state.replans, shape).transpose(0, 1)
 
-    def encode(self, state: State, world: World, ego_plan: Tensor, exempt: Tensor | None = None) -> Context:
-        """The prior's context of a replan; exempt [B, V]: vehicles whose bounds ignore the ego."""
+    def encode(self, state: State, world: World, ego_plan: Tensor) -> Context:
+        """The prior's context of a replan."""
         now = world.states, world.valid, world.step
-        return self.prior.encode(state.routed, state.lane, *now, ego_plan, exempt)
+        return self.prior.encode(state.routed, state.lane, *now, ego_plan)
 
     def lane_now(self, state: State, world: World, ego_plan: Tensor) -> LaneState:
         """Current lane states: the ego's from its simulated state and planned yaw rate, the others' from their plans.

@@ -10,9 +10,12 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from e2rl.ego.base import Ego, EgoPolicy
+from e2rl.prior.routed import take_route
 from e2rl.scene.recording import VEHICLE
+from e2rl.scene.route import project
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.traffic_light import ran_red
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import Traffic
 from e2rl.traffic.transform import AdversarialSynthesizer
@@ -35,7 +38,7 @@ def roll_out(
     """Rollouts of scenes index [B] with seeds [B] and intensities eta [B] to their last step.
 
     The rollout dict that e2rl.metrics and e2rl.evaluation.files read: states [B, T+1, N, 4], valid, size, agent_type,
-    simulated, adversaries, logged, logged_valid, map keys, seed, scene_id, location, seconds (wall time per rollout),
+    simulated, adversaries, logged, logged_valid, map keys, ran_light [B, N] (`red_lights`), seed, scene_id, location, seconds (wall time per rollout),
     transport (path KL of adversaries and others, anchor jump), routes [B, V] and contact [B] (the ego touched a
     vehicle).
     """
@@ -72,11 +75,26 @@ def _driven(steps: TensorDictBase, scene: TensorDictBase, replayed: bool) -> dic
         "simulated": simulated,
         "adversaries": torch.nn.functional.pad(acted, (0, count - vehicles)),
         "routes": last["route"],
+        "ran_light": red_lights(tracks, scene, last["route"]),
         "transport_adversary": (kl * acted).sum(-1),
         "transport_others": (kl * ~acted).sum(-1),
         "transport_anchor": jump.sum(-1),
         "contact": steps["next", "metrics", "contact"].any(1)[:, 0],
     }
+
+
+def red_lights(tracks: dict[str, Tensor], scene: TensorDictBase, route: Tensor) -> Tensor:
+    """Step [B, N] int64 at which each vehicle last crossed a stop line of its route [B, V] at red, -1 for never."""
+    result = torch.full_like(tracks["valid"][:, 0], -1, dtype=torch.int64)
+    lights = take_route(scene["route_light"], route.clamp(min=0))
+    b, v = (scene["valid"][:, : route.shape[1]] & (route >= 0) & (lights >= 0).any(-1)).nonzero(as_tuple=True)
+    if len(b):
+        chosen = b, v, route[b, v]
+        s, _, _ = project(tracks["states"][b, :, v, :2], scene["route_points"][chosen])
+        front = (s + scene["size"][b, v, :1] / 2).cummax(1).values
+        front = front.masked_fill(~tracks["valid"][b, :, v], -torch.inf)
+        result[b, v] = ran_red(scene["light_state"][b], lights[b, v], scene["route_light_s"][chosen], front)
+    return result
 
 
 def synthesize_traffic(scenes: SceneSet, traffic: Traffic, sim: SimSettings, batch: int = 64, device: str = "cpu"):

@@ -80,7 +80,8 @@ class HumanDriver(NamedTuple):
     """The careful and competent human driver of UN R157 (Annex 4, Appendix 3), as the reference study runs it.
 
     The driver perceives a risk when the other's side is within `perception_gap` and the time to collision falls to
-    `time_to_collision` by the end of the step; it releases the pedal for `delay`, then brakes ever harder.
+    `time_to_collision` by the end of the step; it releases the pedal for `delay`, then brakes ever harder. At high
+    closing speeds, for which this time is too short, it perceives the risk when it needs the way that is left.
     """
 
     perception_gap: float = 0.0  # m, between the sides; 1.225: the other leaves its wandering zone on 3.5 m lanes
@@ -93,10 +94,16 @@ class HumanDriver(NamedTuple):
     def init(self, like: Tensor) -> DriverState:
         return no_conflict(like)
 
+    def stopping_gap(self, closing: Tensor) -> Tensor:
+        """Gap [...] m that the driver needs from perception on to lose a closing speed [...] m/s."""
+        speed = closing.clamp(min=0)
+        return speed * (self.delay + self.braking / (2 * self.jerk)) + speed.square() / (2 * self.braking)
+
     def step(self, state: DriverState, observation: Observation) -> tuple[DriverState, Tensor]:
         o = observation
         intrudes = o.overlaps | (o.lateral_gap <= self.perception_gap)
-        reach = o.closing * (self.time_to_collision + DT) + GAP_TOLERANCE
+        needed = torch.maximum(o.closing * self.time_to_collision, self.stopping_gap(o.closing))
+        reach = needed + o.closing * DT + GAP_TOLERANCE
         risk = intrudes & (o.closing > 0) & (o.gap > 0) & (o.gap <= reach)
         since = elapsed(state.since, risk).masked_fill(~intrudes | o.resolved, -1)
         rising = (state.braking + self.jerk * DT).clamp(max=self.braking)

@@ -1,0 +1,108 @@
+"""The failure modes of a run: modes.json, and the column `mode` of rollouts.csv (docs/modes.md)."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from statistics import fmean
+
+from e2rl.errors import InputError
+from e2rl.evaluation.files import nulls, rollout_name
+from e2rl.evaluation.summary import GROUP
+from e2rl.files import write_atomically
+from e2rl.metrics.failure_modes import (
+    FEATURES,
+    Row,
+    cluster_failures,
+    is_failure,
+    known_features,
+    large_modes,
+    medoid,
+    mode_name,
+)
+
+MODES_FILE = "modes.json"
+OTHER = 0  # number of the small modes together
+VERDICTS = ("counted", "preventable", "at_fault", "avoidable")  # shares of a mode's failures
+MEANS = ("ego_speed", "partner_speed", "relvel")  # m/s
+TYPICAL = ("method", "eta", "scene_id", "seed")
+
+
+def find_modes(rows: Sequence[dict]) -> dict:
+    """Group the failures among all rows of a run into modes, and return the content of modes.json.
+
+    Adds `mode`, the number of the mode, to the rows of failures, in place. rows: labelled (`label_rows`). Modes that
+    are too small are gathered as `other`, number 0. Columns that no failure knows, such as `duty`, are named under
+    `unknown` and play no part.
+    """
+    failures = [row for row in rows if is_failure(row)]
+    numbers = cluster_failures(failures)
+    for row, number in zip(failures, numbers, strict=True):
+        row["mode"] = number
+    large, used = large_modes(numbers), [feature.column for feature in known_features(failures)]
+    members = {number: [row for row in failures if row["mode"] == number] for number in large}
+    if len(large) < len(set(numbers)):
+        members[OTHER] = [row for row in failures if row["mode"] not in large]
+    groups = [dict(zip(GROUP, key, strict=True)) for key in dict.fromkeys(group_key(row) for row in rows)]
+    counts = [group_counts(group, rows, members) for group in groups]
+    return {
+        "failures": len(failures),
+        "rollouts": len(rows),
+        "unknown": [feature.column for feature in FEATURES if failures and feature.column not in used],
+        "groups": counts,
+        "modes": [describe(number, ours, counts) for number, ours in members.items()],
+    }
+
+
+def group_counts(group: dict, rows: Sequence[Row], members: Mapping[int, Sequence[Row]]) -> dict:
+    """A group (dataset, split, method, ego_policy, eta) with its rollouts, failures, and modes other than the small
+    ones that have one of its failures."""
+    key = tuple(group.values())
+    ours = {number: sum(group_key(row) == key for row in failures) for number, failures in members.items()}
+    modes = sum(count > 0 for number, count in ours.items() if number != OTHER)
+    rollouts = sum(group_key(row) == key for row in rows)
+    return group | {"rollouts": rollouts, "failures": sum(ours.values()), "modes": modes}
+
+
+def group_key(row: Row) -> tuple:
+    return tuple(row[name] for name in GROUP)
+
+
+def describe(mode: int, members: Sequence[Row], groups: Sequence[dict]) -> dict:
+    """A mode of modes.json: its number, name, failures, their share of each group's, verdicts, mean speeds [m/s], and
+    its most typical rollout. Shares and means are over the members that know the value, None without any."""
+    keys = [group_key(row) for row in members]
+    by_group = [keys.count(tuple(group[name] for name in GROUP)) for group in groups]
+    total = sum(group["failures"] for group in groups)
+    typical = members[medoid(members)]
+    return {
+        "mode": mode,
+        "name": "other" if mode == OTHER else mode_name(members),
+        "count": len(members),
+        "share": len(members) / total,
+        "groups": [
+            {"method": group["method"], "ego_policy": group["ego_policy"], "eta": group["eta"], "count": count}
+            | {"share": count / group["failures"] if group["failures"] else None}
+            for group, count in zip(groups, by_group, strict=True)
+        ],
+        **{name: known_mean(members, name) for name in (*VERDICTS, *MEANS)},
+        "typical": {name: typical[name] for name in TYPICAL} | {"file": rollout_name(dict(typical))},
+    }
+
+
+def known_mean(rows: Iterable[Row], column: str) -> float | None:
+    """Mean of a column over the rows that know it."""
+    values = [float(row[column]) for row in rows if column in row and row[column] == row[column]]
+    return fmean(values) if values else None
+
+
+def write_modes(path: Path, found: dict) -> None:
+    """Write modes.json from the result of `find_modes`."""
+    write_atomically(path, json.dumps(nulls(found), indent=1, allow_nan=False))
+
+
+def read_modes(path: Path) -> dict:
+    """The content of a modes.json."""
+    try:
+        return json.loads(Path(path).read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: no readable modes ({error}); run evaluate.py again to write them") from error

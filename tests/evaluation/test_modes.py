@@ -1,0 +1,145 @@
+"""modes.json: shares, verdicts and typical rollouts of a run's modes, their table, and replays of them."""
+
+import json
+import math
+
+import pytest
+
+from e2rl.errors import InputError
+from e2rl.evaluation.files import ROLLOUTS, Source, label_rows, read_rows, write_rollouts, write_rows
+from e2rl.evaluation.modes import MODES_FILE, find_modes, read_modes, write_modes
+from e2rl.evaluation.protocol import Method, run_protocol
+from e2rl.evaluation.summary import metric_rows
+from e2rl.metrics.score import score_rollouts
+from e2rl.report import replay
+from e2rl.report.modes import mode_tables
+from e2rl.report.tables import metric_tables
+from tests.evaluation.test_protocol import setup_of
+from tests.metrics.random_rollouts import random_rollouts
+from tests.metrics.test_contact import course, scene
+from tests.metrics.test_failure_modes import CROSSING, REAR_END, failure
+from tests.synthesizer.traffic_scenes import scenes, synthesizer
+
+
+def labelled(kind, number, method="e2", eta=2.0, **changes):
+    source = {"dataset": "d", "split": "s", "method": method, "ego_policy": "idm", "eta": eta}
+    return [failure(kind, scene=f"{kind['approach']} {index}") | source | changes for index in range(number)]
+
+
+def run_rows():
+    rows = labelled(CROSSING, 6, counted=1.0, preventable=1.0, at_fault=0.0)
+    rows += labelled(CROSSING, 2, "random", counted=0.0, preventable=math.nan, at_fault=0.0)
+    rows += labelled(REAR_END, 4, "random", counted=1.0, preventable=0.0, at_fault=1.0)
+    return rows + labelled(CROSSING, 5, "nominal", 0.0, cfr=0.0, approach="")
+
+
+def test_modes_have_counts_shares_by_method_and_verdicts():
+    rows = run_rows()
+    found = find_modes(rows)
+    crossing, rear_end = found["modes"]
+    assert (found["failures"], found["rollouts"], found["unknown"]) == (12, 17, ["duty"])
+    assert crossing["name"] == "crossing from the right, partner turns left, ego keeps speed"
+    assert (crossing["count"], crossing["share"]) == (8, pytest.approx(8 / 12))
+    assert [group["count"] for group in crossing["groups"]] == [6, 2, 0]
+    assert [group["share"] for group in crossing["groups"]] == [1.0, pytest.approx(1 / 3), None]
+    assert (crossing["counted"], crossing["preventable"], crossing["at_fault"]) == (0.75, 1.0, 0.0)
+    assert rear_end["at_fault"] == 1 and rear_end["avoidable"] is None and rear_end["ego_speed"] == 10
+    assert [(group["failures"], group["modes"]) for group in found["groups"]] == [(6, 1), (6, 2), (0, 0)]
+    assert [row.get("mode") for row in rows] == [1] * 8 + [2] * 4 + [None] * 5
+
+
+def test_what_is_written_is_what_is_read_and_strict(tmp_path):
+    found = find_modes(run_rows())
+    write_modes(tmp_path / MODES_FILE, found)
+    assert read_modes(tmp_path / MODES_FILE) == json.loads(json.dumps(found))
+    with pytest.raises(InputError, match="modes"):
+        read_modes(tmp_path / "absent.json")
+
+
+def test_the_typical_rollout_is_one_of_its_mode():
+    rows = run_rows()
+    for mode in find_modes(rows)["modes"]:
+        typical = mode["typical"]
+        same = [row for row in rows if all(row[name] == typical[name] for name in ("method", "scene_id", "seed"))]
+        assert [row["mode"] for row in same] == [mode["mode"]]
+        assert typical["file"].startswith(f"{typical['method']}__idm__2__") and typical["file"].endswith("__0.npz")
+
+
+def test_a_run_without_failures_has_no_modes_and_no_table(tmp_path):
+    found = find_modes(labelled(CROSSING, 3, cfr=0.0, approach=""))
+    assert found["modes"] == [] and found["unknown"] == [] and found["groups"][0]["failures"] == 0
+    assert mode_tables(found) == [] and find_modes([])["modes"] == []
+    write_modes(tmp_path / MODES_FILE, found)
+    with pytest.raises(InputError, match="no failure modes"):
+        replay.typical_failures(tmp_path)
+
+
+def test_the_table_has_a_row_for_each_mode_and_says_what_is_missing():
+    (table,) = mode_tables(find_modes(run_rows()))
+    assert table.head[:5] == ["", "failures", "e2 η=2 [%]", "random η=2 [%]", "nominal [%]"]
+    assert table.head[5:] == ["counts [%]", "preventable [%]", "at fault [%]", "ego [m/s]", "partner [m/s]"]
+    first, second, last = table.rows
+    assert first[0].startswith("1. crossing") and first[1:6] == ["8", "100", "33", "–", "75"]
+    assert second[1:] == ["4", "0", "67", "–", "100", "0", "100", "10.0", "5.0"]
+    assert last[1:5] == ["12", "6 in 1", "6 in 2", "0 in 0"]
+    assert table.caption.startswith("Failure modes of idm:") and "without duty" in table.caption
+    assert "avoidable" in table.caption and len({len(row) for row in (table.head, *table.rows)}) == 1
+    assert table.text() and table.markdown()
+
+
+def test_small_modes_are_gathered_but_keep_their_numbers():
+    rows = labelled(CROSSING, 20) + labelled(REAR_END, 1) + labelled(REAR_END | {"approach": "oncoming"}, 1)
+    found = find_modes(rows)
+    assert [(mode["mode"], mode["name"], mode["count"]) for mode in found["modes"]][1:] == [(0, "other", 2)]
+    assert sorted(row["mode"] for row in rows)[-2:] == [2, 3] and found["groups"][0]["modes"] == 1
+
+
+def test_words_speeds_and_mode_survive_in_rollouts_csv(tmp_path):
+    rows = label_rows(score_rollouts(random_rollouts(12, seed=20))[0], Source("d", "s", "e2", "idm"))
+    modes = find_modes(rows)
+    assert modes["failures"] > 2
+    write_rows(tmp_path / "rollouts.csv", rows)
+    read = read_rows(tmp_path / "rollouts.csv")
+    for row, other in zip(rows, read, strict=True):
+        for name in ("approach", "ego_manoeuvre", "partner_manoeuvre"):
+            assert other[name] == row[name] and isinstance(other[name], str)
+        assert other["mode"] == row["mode"] or (math.isnan(other["mode"]) and math.isnan(row["mode"]))
+    again = find_modes(read)
+    assert again == json.loads(json.dumps(modes)), "the same from the file"
+
+
+def test_coverage_reaches_the_table_of_adversaries():
+    rollouts = random_rollouts(40, seed=3, vehicles=24, others=2, extent=25.0)
+    rollouts["location"] = [f"place {index}" for index in range(40)]
+    scores, samples = score_rollouts(rollouts)
+    rows = label_rows(scores, Source("d", "s", "e2", "idm"))
+    modes = find_modes(rows)
+    (summary,) = metric_rows(rows, samples, draws=100, realism_draws=2)
+    value = summary["metrics"]["mode_coverage"]
+    assert modes["failures"] == value["n"] >= 10 and 1 < value["low"] <= value["mean"] <= value["high"] <= 10
+    names = [row[0] for row in metric_tables([summary], table="adversaries")[0].rows]
+    assert "mode_coverage" in names and summary["metrics"]["mode_coverage_counted"]["n"] == 0
+
+
+def test_the_protocol_writes_the_modes_of_all_methods(tmp_path):
+    on = synthesizer()
+    methods = [Method("nominal", on), Method("e2", on, 3.0)]
+    run_protocol(setup_of(scenes(1, steps=40)), methods, [0], tmp_path)
+    found = read_modes(tmp_path / MODES_FILE)
+    assert [(group["method"], group["rollouts"]) for group in found["groups"]] == [("nominal", 1), ("e2", 1)]
+    assert found["failures"] == sum(mode["count"] for mode in found["modes"])
+
+
+def test_the_command_draws_a_typical_failure_of_each_mode(tmp_path, capsys):
+    source, rows = Source("d", "s", "e2", "idm"), []
+    for seed, partner in enumerate((course(30.5, 0, 0, 5), course(31, 0, 0, 5), course(40, 0.3, math.pi, 6))):
+        rollouts = scene(course(0, 0, 0, 12), partner) | {"scene_id": [f"scene {seed}"]}
+        write_rollouts(tmp_path / ROLLOUTS, rollouts, source)
+        rows += label_rows(score_rollouts(rollouts)[0], source)
+    write_modes(tmp_path / MODES_FILE, find_modes(rows))
+    assert replay.main([str(tmp_path), "--modes", "--pixels", "120"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "1. ahead, partner keeps speed, ego keeps speed (2 failures)" and lines[3].startswith(
+        "2. oncoming"
+    )
+    assert len(lines) == 6 and all((tmp_path / "replays" / line.split("/")[-1]).exists() for line in lines[1:3])

@@ -1,0 +1,177 @@
+"""What happens in a collision: known cases get their words, and the world's place, direction and hand do not matter."""
+
+import math
+
+import pytest
+import torch
+
+from e2rl.metrics.contact import first_contact
+from e2rl.metrics.failure_features import APPROACHES, LATE, MANOEUVRES, WINDOW, last_seconds, manoeuvre
+from e2rl.metrics.score import as_doubles, score_rollouts
+from e2rl.sim.dynamics import rollout
+from tests.metrics.random_rollouts import random_rollouts
+from tests.metrics.test_contact import course, row, scene
+
+EAST, NORTH, WEST, SOUTH = 0.0, math.pi / 2, math.pi, -math.pi / 2
+WORDS = ("approach", "ego_manoeuvre", "partner_manoeuvre")
+
+
+def drive(x, y, heading, speed, turn=lambda t: 0.0, accel=lambda t: 0.0, steps=80):
+    """A course [T+1, 4] of the simulator's unicycle under yaw rates [rad/s] and accelerations [m/s^2] of time."""
+    actions = torch.tensor([[accel(0.1 * step), turn(0.1 * step)] for step in range(steps)], dtype=torch.float64)
+    start = torch.tensor([x, y, heading, speed], dtype=torch.float64)
+    states = torch.cat([start[None], rollout(start[None], actions[None])[0]])
+    return states, torch.ones(steps + 1, dtype=torch.bool)
+
+
+def words(*courses):
+    result = row(*courses)
+    return tuple(result[name] for name in WORDS)
+
+
+def swerve(sign, begin, seconds=1.0, rate=0.2):
+    """Yaw rates of a lane change: out, then back."""
+    return lambda t: sign * rate * ((begin <= t < begin + seconds) - (begin + seconds <= t < begin + 2 * seconds))
+
+
+def mirrored(text):
+    return text.replace("left", "\0").replace("right", "left").replace("\0", "right")
+
+
+def test_running_into_a_slower_leader_and_into_one_that_brakes():
+    assert words(course(0, 0, EAST, 12), course(30.5, 0, EAST, 5)) == ("ahead", "keeps speed", "keeps speed")
+    braking = drive(20, 0, EAST, 12, accel=lambda t: -5.0 if t > 0.5 else 0.0)
+    assert words(course(0, 0, EAST, 12), braking) == ("ahead", "keeps speed", "brakes")
+    result = row(course(0, 0, EAST, 12), course(40, 0, EAST, 0))
+    assert (result["approach"], result["partner_manoeuvre"]) == ("ahead", "stands")
+    assert result["ego_speed"] == pytest.approx(12) and result["partner_speed"] == 0
+
+
+def test_a_standing_vehicle_across_the_way_is_ahead_whatever_its_heading():
+    for heading in (NORTH, WEST, 2.0):
+        assert words(course(0, 0, EAST, 10), course(40, 0, heading, 0)) == ("ahead", "keeps speed", "stands")
+
+
+@pytest.mark.parametrize("side, sign", [("left", 1), ("right", -1)])
+def test_a_lane_change_into_the_ego_s_front_is_a_cut_in_from_its_side(side, sign):
+    other = "right" if side == "left" else "left"
+    partner = drive(18, 3.5 * sign, EAST, 9, turn=swerve(-sign, 1.5))
+    assert words(course(0, 0, EAST, 13), partner) == (f"cut-in from the {side}", "keeps speed", f"veers {other}")
+
+
+@pytest.mark.parametrize("side, sign", [("left", 1), ("right", -1)])
+def test_a_vehicle_beside_that_comes_over_is_beside(side, sign):
+    other = "right" if side == "left" else "left"
+    partner = drive(0, 3.5 * sign, EAST, 12, turn=swerve(-sign, 2.0))
+    assert words(course(0, 0, EAST, 12), partner) == (f"beside on the {side}", "keeps speed", f"veers {other}")
+
+
+@pytest.mark.parametrize("side, y, heading", [("right", -24.0, NORTH), ("left", 24.0, SOUTH)])
+def test_crossing_traffic_has_the_side_that_it_comes_from(side, y, heading):
+    assert words(course(0, 0, EAST, 10), course(43.0, y, heading, 6)) == (
+        f"crossing from the {side}",
+        "keeps speed",
+        "keeps speed",
+    )
+
+
+def test_a_left_turn_across_oncoming_traffic():
+    ego = drive(-10, 0, EAST, 6, turn=lambda t: 0.4 if 2 < t < 5 else 0.0)
+    result = words(ego, course(47, 5, WEST, 9))
+    assert result == ("oncoming", "turns left", "keeps speed")
+    partner = drive(26, 3.5, WEST, 6, turn=lambda t: 0.5 if t > 0.5 else 0.0)
+    assert words(course(0, 0, EAST, 8), partner) == ("oncoming", "keeps speed", "turns left")
+
+
+def test_being_run_into_while_braking_for_something():
+    ego = drive(0, 0, EAST, 10, accel=lambda t: -4.0 if t > 1 else 0.0)
+    assert words(ego, course(-14, 0, EAST, 10)) == ("from behind", "brakes", "keeps speed")
+    assert words(course(0, 0, EAST, 0), course(-30, 0.5, EAST, 15)) == ("from behind", "stands", "keeps speed")
+
+
+def test_a_leader_in_a_sharp_bend_is_ahead_and_the_follower_is_behind():
+    """Both turn right by a quarter; two seconds before the contact they differ by more than 45 degrees."""
+
+    def bend(speed, begin):
+        return drive(0, 0, EAST, speed, turn=lambda t: -speed / 10 if begin <= t * speed < begin + 5 * math.pi else 0.0)
+
+    slow, fast = bend(5.0, 20), bend(9.0, 20)
+    slow = (slow[0][38:], slow[1][38:])  # 19 m on its way when the fast one starts
+    fast = (fast[0][: len(slow[0])], fast[1][: len(slow[0])])
+    assert words(fast, slow)[0] == "ahead" and words(slow, fast)[0] == "from behind"
+
+
+def test_along_a_bend_of_the_lane_nobody_veers():
+    """A curve of radius 150 m: 20 m of it bend by less than a turn, and lie 1.3 m beside the first heading."""
+    angle = torch.linspace(-0.5, 1.5, 200, dtype=torch.float64)
+    lane = torch.stack([150 * angle.sin(), 150 * (1 - angle.cos())], -1)
+    on_lane = drive(0, 0, EAST, 10, turn=lambda t: 10 / 150)
+    ahead = drive(150 * math.sin(0.2), 150 * (1 - math.cos(0.2)), 0.2, 4, turn=lambda t: 4 / 150)
+    given = scene(on_lane, ahead) | {"lane_points": lane[None], "lane_index": torch.zeros(1, 200, dtype=torch.int64)}
+    found = score_rollouts(given)[0][0]
+    assert [found[name] for name in WORDS] == ["ahead", "keeps speed", "keeps speed"]
+    straight = score_rollouts(scene(on_lane, ahead))[0][0]
+    assert straight["ego_manoeuvre"] == "veers left", "relative to a straight lane it does"
+
+
+def test_contacts_soon_after_the_start_use_what_is_known():
+    batch = as_doubles(scene(course(0, 0, EAST, 10), course(9, 0, EAST, 0, appears=2)), slice(0, 1))
+    batch |= first_contact(batch)
+    window, known, size = last_seconds(batch)
+    assert window.shape == (1, WINDOW + 1, 2, 4) and size.shape == (1, 2, 2)
+    assert known.tolist() == [int(batch["before"]) - 2] and window[0, 0, 0, 0] == pytest.approx(2.0)
+    late = course(5.5, 0, EAST, 5, appears=5)  # never seen before the contact
+    assert words(course(0, 0, EAST, 8), late)[1:] == ("keeps speed", "keeps speed")
+
+
+def test_speeds_just_above_and_below_the_thresholds():
+    still = torch.zeros(1, WINDOW + 1, 1, 4, dtype=torch.float64)
+    steps = torch.arange(WINDOW + 1, dtype=torch.float64)
+    for gain, word in ((1.2, "accelerates"), (0.8, "keeps speed"), (-0.8, "keeps speed"), (-1.2, "brakes")):
+        window = still.clone()
+        window[0, :, 0, 3] = 10 + gain * 0.1 * (steps - WINDOW + LATE).clamp(min=0)
+        found = manoeuvre(window, torch.tensor([WINDOW]), window[..., 2])
+        assert MANOEUVRES[found.item()] == word
+
+
+def changed(rollouts, change):
+    """The rollouts with every position and heading changed: change(points [..., 2], headings) -> both."""
+    result = dict(rollouts)
+    for name in ("states", "logged"):
+        xy, heading = change(rollouts[name][..., :2].double(), rollouts[name][..., 2].double())
+        result[name] = torch.cat([xy, heading[..., None], rollouts[name][..., 3:].double()], -1)
+    for name in ("lane_points", "drivable_points"):
+        result[name] = change(rollouts[name].double(), torch.zeros(rollouts[name].shape[:-1]))[0]
+    return result
+
+
+@pytest.fixture(scope="module")
+def crashes():
+    return random_rollouts(24, seed=5, vehicles=24, others=2, extent=30.0)
+
+
+def test_the_world_may_be_moved_and_turned(crashes):
+    turn = torch.tensor([[math.cos(1.1), -math.sin(1.1)], [math.sin(1.1), math.cos(1.1)]], dtype=torch.float64)
+    moved = changed(crashes, lambda xy, heading: (xy @ turn.T + torch.tensor([300.0, -80.0]), heading + 1.1))
+    before, after = score_rollouts(crashes)[0], score_rollouts(moved)[0]
+    assert sum(bool(one["approach"]) for one in before) > 10
+    for one, other in zip(before, after, strict=True):
+        assert [one[name] for name in WORDS] == [other[name] for name in WORDS]
+        for name in ("ego_speed", "partner_speed"):
+            assert one[name] == pytest.approx(other[name], nan_ok=True)
+
+
+def test_a_mirrored_world_has_mirrored_words(crashes):
+    flip = torch.tensor([1.0, -1.0], dtype=torch.float64)
+    before = score_rollouts(crashes)[0]
+    after = score_rollouts(changed(crashes, lambda xy, heading: (xy * flip, -heading)))[0]
+    assert len({one["approach"] for one in before}) > 4
+    for one, other in zip(before, after, strict=True):
+        assert [mirrored(one[name]) for name in WORDS] == [other[name] for name in WORDS]
+
+
+def test_only_collisions_have_words(crashes):
+    for found in score_rollouts(crashes)[0]:
+        hit = found["cfr"] == 1
+        assert (found["approach"] in APPROACHES) == hit and (found["ego_manoeuvre"] in MANOEUVRES) == hit
+        assert math.isnan(found["ego_speed"]) != hit

@@ -1,0 +1,193 @@
+"""Failure modes: what belongs together, how it is named, and that the order of the failures does not matter."""
+
+import random
+
+import pytest
+import torch
+
+from e2rl.metrics.failure_modes import (
+    cluster_failures,
+    feature_vectors,
+    is_failure,
+    known_features,
+    large_modes,
+    medoid,
+    mode_name,
+    split_side,
+)
+from e2rl.metrics.statistics import bootstrap_draws, interval, metric_table, resampled_labels, row_metrics, summarise
+
+REAR_END = {"approach": "ahead", "partner_manoeuvre": "brakes", "ego_manoeuvre": "keeps speed", "contact_type": "front"}
+CROSSING = {
+    "approach": "crossing from the right",
+    "partner_manoeuvre": "turns left",
+    "ego_manoeuvre": "keeps speed",
+    "contact_type": "side",
+}
+
+
+def failure(kind, scene="a", seed=0, ego=10.0, partner=5.0, **changes):
+    row = {"cfr": 1.0, "scene_id": scene, "seed": seed, "method": "e2", "eta": 2.0, "location": scene}
+    return row | {"ego_speed": ego, "partner_speed": partner} | kind | changes
+
+
+def crowd(number, seed=0):
+    """Failures of all kinds with random words and speeds."""
+    draw = random.Random(seed)
+    approaches = ("ahead", "oncoming", "from behind", "crossing from the left", "crossing from the right")
+    moves = ("keeps speed", "brakes", "turns left", "veers right")
+    return [
+        failure(
+            {"approach": draw.choice(approaches), "contact_type": draw.choice(("front", "side"))},
+            scene=f"scene {index}",
+            ego=draw.uniform(0, 20),
+            partner=draw.uniform(0, 20),
+            partner_manoeuvre=draw.choice(moves),
+            ego_manoeuvre=draw.choice(moves[:2]),
+        )
+        for index in range(number)
+    ]
+
+
+def test_identical_failures_are_one_mode_and_other_approaches_another():
+    assert cluster_failures([]) == [] and cluster_failures([failure(CROSSING)]) == [1]
+    rows = [failure(CROSSING, scene=str(index)) for index in range(7)]
+    assert cluster_failures(rows) == [1] * 7
+    rows += [failure(REAR_END, scene=str(index)) for index in range(3)]
+    assert cluster_failures(rows) == [1] * 7 + [2] * 3
+
+
+def test_one_manoeuvre_or_a_few_metres_per_second_make_no_mode_of_their_own():
+    rows = [failure(CROSSING, scene=str(index), ego=8 + index, partner=4 + index) for index in range(6)]
+    rows += [failure(CROSSING, scene="other", ego_manoeuvre="brakes", contact_type="front")]
+    assert set(cluster_failures(rows)) == {1}
+
+
+def test_the_order_of_the_failures_does_not_matter():
+    rows = crowd(60)
+    found = dict(zip((row["scene_id"] for row in rows), cluster_failures(rows), strict=True))
+    assert 4 < len(set(found.values())) < 30
+    for seed in range(3):
+        shuffled = random.Random(seed).sample(rows, len(rows))
+        assert [found[row["scene_id"]] for row in shuffled] == cluster_failures(shuffled)
+
+
+def test_distances_are_the_weights_of_what_differs():
+    def apart(**changes):
+        pair = [failure(CROSSING), failure(CROSSING, **changes)]
+        one, two = torch.tensor(feature_vectors(pair, known_features(pair)))
+        return (one - two).abs().sum().item()
+
+    assert apart() == 0
+    assert apart(approach="crossing from the left") == pytest.approx(0.5)
+    assert apart(approach="oncoming") == pytest.approx(2.5), "another kind, and no side"
+    assert apart(approach="cut-in from the right") == pytest.approx(2.0)
+    assert apart(partner_manoeuvre="veers left") == pytest.approx(0.5)
+    assert apart(ego_speed=14.0) == pytest.approx(0.1)
+
+
+def test_a_duty_splits_modes_where_it_is_known_and_plays_no_part_where_it_is_not():
+    rows = [failure(CROSSING, scene=str(index)) for index in range(6)]
+    assert "duty" not in [feature.column for feature in known_features(rows)]
+    for row in rows[:3]:
+        row["duty"] = "right_of_way"
+    for row in rows[3:]:
+        row["duty"] = "none"
+        row["ego_speed"] = 11.0
+    assert cluster_failures(rows) == [1, 1, 1, 2, 2, 2]
+    assert mode_name(rows[:3]) == "crossing from the right, partner turns left, ego keeps speed: right of way"
+    assert mode_name(rows[3:]).endswith(": no duty broken")
+
+
+def test_names_say_what_two_thirds_agree_on():
+    assert mode_name([failure(REAR_END)]) == "ahead, partner brakes, ego keeps speed"
+    two_sides = [failure(CROSSING), failure(CROSSING, approach="crossing from the left")]
+    assert mode_name(two_sides) == "crossing, partner turns left, ego keeps speed"
+    mixed = [failure(CROSSING, ego_manoeuvre=move) for move in ("brakes", "stands", "turns left")]
+    assert mode_name(mixed) == "crossing from the right, partner turns left"
+    assert mode_name([failure({"approach": word}) for word in ("ahead", "oncoming")]) == "various"
+    assert split_side("beside on the left") == ("beside", "left") and split_side("brakes") == ("brakes", "")
+
+
+def test_the_medoid_is_the_middle_one_of_the_members():
+    members = [failure(CROSSING, scene=str(index), ego=float(speed)) for index, speed in enumerate((3, 9, 10, 12, 40))]
+    assert members[medoid(members)]["ego_speed"] == 10
+    twins = [failure(CROSSING, scene=name) for name in "cab"]
+    assert twins[medoid(twins)]["scene_id"] == "a" == twins[::-1][medoid(twins[::-1])]["scene_id"]
+
+
+def test_small_modes_are_those_of_one_or_of_less_than_two_per_cent():
+    assert large_modes([1, 1, 2]) == [1, 2], "of few failures each may be one"
+    assert large_modes([1] * 8 + [2, 2, 3]) == [1, 2]
+    assert large_modes([1] * 200 + [2, 2, 2] + [3] * 5) == [1, 3] and large_modes([]) == []
+
+
+def test_rows_without_a_collision_or_its_words_are_no_failures():
+    assert is_failure(failure(CROSSING))
+    assert not is_failure(failure(CROSSING, cfr=0.0)) and not is_failure(failure(CROSSING, cfr=float("nan")))
+    assert not is_failure({"cfr": 1.0}) and not is_failure(failure(CROSSING, approach=float("nan")))
+
+
+def expected_labels(labels, places, count):
+    """The mean number of different labels, over all ways to pick places and one rollout at each."""
+    names = sorted(set(places))
+    total = []
+    for seed in range(20000):
+        draw = random.Random(seed)
+        chosen = draw.sample(names, count)
+        total.append(
+            len({draw.choice([x for x, place in zip(labels, places, strict=True) if place == one]) for one in chosen})
+        )
+    return sum(total) / len(total)
+
+
+def test_coverage_is_the_expected_number_of_modes_at_so_many_places():
+    labels, places = [1, 1, 2, 3, 1, 4, 2, 2, 5, 1], [0, 0, 0, 1, 2, 2, 3, 4, 5, 5]
+    given = torch.tensor(labels, dtype=torch.float64), torch.tensor(places)
+    for count in (1, 2, 4, 6):
+        found = resampled_labels(*given, bootstrap_draws(6, 3), count)
+        assert found[0].item() == pytest.approx(expected_labels(labels, places, count), abs=0.02)
+    assert resampled_labels(*given, bootstrap_draws(6, 3), 7).isnan().all(), "there are only six places"
+
+
+def test_coverage_rests_on_places_not_on_numbers():
+    """The same failures four times over, and more of them at one place, are no more modes."""
+    labels, places = torch.tensor([1.0, 1, 2, 3, 4, 4, 2, 1]).double(), torch.tensor([0, 1, 2, 3, 4, 5, 6, 7])
+    draws = bootstrap_draws(8, 200)
+    once = resampled_labels(labels, places, draws, 5)
+    torch.testing.assert_close(resampled_labels(labels.repeat(4), places.repeat(4), draws, 5), once, equal_nan=True)
+    more = torch.cat([labels, labels[2:3].expand(9)]), torch.cat([places, places[2:3].expand(9)])
+    torch.testing.assert_close(resampled_labels(*more, draws, 5), once, equal_nan=True)
+
+
+def test_coverage_is_unbiased_and_its_interval_covers():
+    """Twelve modes of frequencies 1/k at 40 places; three failures a place, most of them of the place's own mode."""
+    generator, places, trials = torch.Generator().manual_seed(1), 40, 60
+    share = 1 / torch.arange(1, 13.0)
+    share /= share.sum()
+    truth, covered, estimates = (1 - (1 - share) ** 10).sum().item(), 0, []
+    place = torch.arange(places).repeat_interleave(3)
+    for trial in range(trials):
+        own = torch.multinomial(share, places, True, generator=generator).repeat_interleave(3)
+        any_mode = torch.multinomial(share, 3 * places, True, generator=generator)
+        labels = torch.where(torch.rand(3 * places, generator=generator) < 0.6, own, any_mode).double()
+        value = interval(resampled_labels(labels, place, bootstrap_draws(places, 200, trial), 10), places)
+        estimates.append(value["mean"])
+        covered += value["low"] <= truth <= value["high"]
+    assert sum(estimates) / trials == pytest.approx(truth, rel=0.03) and covered / trials > 0.8
+
+
+def test_coverage_of_a_method_whose_failures_are_all_alike_is_one():
+    rows = [failure(CROSSING, scene=str(index), mode=3) | {"counted": float(index % 3 == 0)} for index in range(36)]
+    found = summarise(rows, [empty_samples()] * len(rows), 50, 2)
+    assert found["mode_coverage"] == {"mean": 1.0, "low": 1.0, "high": 1.0, "n": 36}
+    assert found["mode_coverage_counted"]["n"] == 12 and found["mode_coverage_counted"]["mean"] == 1
+    few = summarise(rows[:9], [empty_samples()] * 9, 50, 2)["mode_coverage"]
+    assert few["n"] == 0 and few["mean"] != few["mean"], "failures at nine places do not show ten"
+    coverage = [metric for metric in row_metrics() if metric.places]
+    assert not metric_table(rows, coverage)[0].isnan().any()
+
+
+def empty_samples():
+    names = ("a_lon", "a_lat", "jerk")
+    return {name: torch.zeros(2, 0, dtype=torch.float64) for name in (*names, *(f"{name}_adversary" for name in names))}
