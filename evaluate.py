@@ -43,7 +43,7 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     write_metrics(folder / METRICS_FILE, rows)
     dropped = "".join(f"; left out: {count} scenes ({reason})" for reason, count in scenes.dropped.items())
     effort = search_effort(scenes.scenes["logged"].shape[1] - 1)
-    tables = metric_tables(rows, f"{build.caption(config, origin)}; {effort}{dropped}", config.metrics)
+    tables = metric_tables(rows, f"{build.caption(config, origin, methods)}; {effort}{dropped}", config.metrics)
     tables += mode_tables(read_modes(folder / MODES_FILE))
     save_tables(folder / "tables.md", tables)
     print_tables(tables)

@@ -1,7 +1,7 @@
 """From a run's configuration to its objects: prior, traffic methods, ego, simulator settings."""
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -253,13 +253,26 @@ def processes_of(config: DictConfig) -> int:
     return given
 
 
-def caption(config: DictConfig, origin: dict) -> str:
-    """What stands in every table's caption: the settings that all methods share."""
+def caption(config: DictConfig, origin: dict, methods: Sequence[Method] = ()) -> str:
+    """What stands in every table's caption: the settings that all methods share, and what each knows of the ego and
+    owes it."""
     sampler, bounds = config.prior.sampler, config.prior.bounds
     on = [name for name in ("meeting", "curve") if bounds[name]]
     changes = "".join(f"; {name}: {what}".replace("'", "") for name, what in config.get("variants", {}).items())
     return (
         f"Prior {config.prior.checkpoint} ({origin.get('data', 'unknown data')}); {sampler.sampler}, K = "
         f"{sampler.steps}, temperature {sampler.temperature:g} (routes {sampler.route_temperature:g}), one sample "
-        f"a replan, replanned every 0.5 s; acceleration bounds: {', '.join(on) or 'none'}{changes}"
+        f"a replan, replanned every 0.5 s; acceleration bounds: {', '.join(on) or 'none'}{changes}{terms(methods)}"
     )
+
+
+def terms(methods: Sequence[Method]) -> str:
+    """What methods know of the ego and owe it, for a caption; "" for those that have no such settings."""
+    by_terms: dict[str, list[str]] = {}
+    for method in methods:
+        known, owed = method.traffic.knowledge, method.traffic.responsibility
+        text = f"the ego {'predicted' if known == 'predicted' else 'announces its plan'}" if known else ""
+        text += f", responsibility {owed}" if owed else ""
+        if text and method.name not in by_terms.setdefault(text, []):
+            by_terms[text].append(method.name)
+    return "".join(f"; {', '.join(names)}: {text}" for text, names in by_terms.items())

@@ -119,7 +119,17 @@ TABLES = {
         *("real", "real_norm", *W1, "parked_moved", "starts", "seconds_per_rollout"),
     ],
     "adversaries": [  # what tells adversaries apart: the failures they find, and what these cost
-        *("cfr", "cfr_counted", "cfr_preventable", "counted", "at_fault", "preventable", "cfr_adv", "mode_coverage", "mode_coverage_counted"),
+        *(
+            "cfr",
+            "cfr_counted",
+            "cfr_preventable",
+            "counted",
+            "at_fault",
+            "preventable",
+            "cfr_adv",
+            "mode_coverage",
+            "mode_coverage_counted",
+        ),
         *("avoidable", "contact_time", "front", "side", "rear", "rir", "relvel"),
         *("ttc_c", "cfr_bg", "aor_step", "real", "real_adv", "transport"),
     ],

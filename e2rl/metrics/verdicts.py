@@ -1,4 +1,4 @@
-"""The verdict on every collision of the ego: whose fault, preventable by whom, which duty was broken (docs/verdicts.md).
+"""The verdict on every collision of the ego: whose fault, preventable by whom, which duty broken (docs/verdicts.md).
 
 A collision counts if it is the ego's fault or a careful and competent driver in its place would have prevented it.
 """

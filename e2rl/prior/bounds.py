@@ -41,14 +41,12 @@ class Duty:
     """How adversaries [B, V] treat the ego where their plans meet its own.
 
     exempt: they need not brake for it; yields: they give way wherever they meet it, whoever has the other ahead;
-    patience [m/s^2]: they wait while as much braking still suffices 0.5 s later (0: nobody waits); cap [m/s^2]: the
-    highest acceleration of a vehicle that brakes ahead of it, NO_CAP for others.
+    patience [m/s^2]: they wait while as much braking still suffices 0.5 s later (0: nobody waits).
     """
 
     exempt: Tensor
     yields: Tensor
     patience: Tensor
-    cap: Tensor
 
 
 @dataclass
@@ -70,7 +68,7 @@ def bounded(
     Braking may put a vehicle in the way of the one behind it, so plans are compared twice.
     """
     motion = decode(None)
-    cap = torch.full_like(state.v, NO_CAP) if obstacles.duty is None else obstacles.duty.cap
+    cap = torch.full_like(state.v, NO_CAP)
     for _ in range(2):
         cap = torch.minimum(cap, acceleration_caps(settings, motion, state, obstacles))
         motion = select(cap < NO_CAP, decode(cap), motion)

@@ -29,7 +29,6 @@ from e2rl.synthesizer.motion import (
     states_on_route,
     take,
 )
-from e2rl.synthesizer.provocation import Provocation, ProvocationSettings, leading, provoke
 from e2rl.synthesizer.skeleton import Skeleton
 
 COARSE, FINE = 19, 9  # accelerations tried on each route: over the whole range, then around the best
@@ -222,7 +221,6 @@ def propose(
     interception: InterceptionSettings,
     eta: Tensor,
     keep_route: bool = False,
-    provocation: ProvocationSettings | None = None,
 ) -> Anchor:
     """The skeleton-consistent clean state of Sec. IV-A3 for scenes [B]; ego_plan [B, H >= 50, 4], eta [B].
 
@@ -239,10 +237,6 @@ def propose(
     anchor = Anchor(world.route.clone(), knots, nobody, cost, nobody, path)
     for depth in range(1, int(skeleton.depth.max()) + 1):
         index, present = compact(skeleton.depth == depth)
-        if depth == 1 and provocation is not None:
-            leads = present & take(leading(world, expected.shape[1]), index)
-            provoked = provoke(world, index, leads, expected, eta, provocation, keep_route)
-            anchor, present = _with_provocation(anchor, index, leads, provoked, world.route), present & ~leads
         target = skeleton.target.gather(1, index).clamp(min=0)
         candidates = _candidates(scene, world, index, settings, keep_route)
         pick, knots, cost = _on_lane(candidates, take(expected, target), take(scene["size"], target), settings)
@@ -258,14 +252,6 @@ def propose(
             rows = {"feasible": off_lane, "off_lane": off_lane, "cost": found.cost, "knots": found.knots}
             anchor = _updated(anchor, index, off_lane, off_lane_path=found.path, **rows)
     return anchor
-
-
-def _with_provocation(anchor: Anchor, index: Tensor, leads: Tensor, found: Provocation, route: Tensor) -> Anchor:
-    """The Anchor with the provocations of vehicles index [B, M] where leads [B, M]; route [B, V]: followed now."""
-    feasible, off_lane = leads & found.cost.isfinite(), found.route < 0
-    rows = {"cost": found.cost, "knots": found.knots, "off_lane_path": found.path, "off_lane": off_lane & feasible}
-    chosen = torch.where(off_lane, take(route, index), found.route)
-    return _updated(anchor, index, feasible, feasible=feasible, route=chosen, **rows)
 
 
 def _states(candidates: _Candidates, pick: Tensor, knots: Tensor) -> Tensor:

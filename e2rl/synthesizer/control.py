@@ -38,7 +38,7 @@ class ControlSettings:
 
     gradient: str = "denoiser"
     scaling: str = "sigma"
-    adversarial_clip: float = 0.5
+    adversarial_clip: float = 0.0
     feasibility: float = 4.0
     feasibility_clip: float = 1.0
     feasibility_level: float = 0.5

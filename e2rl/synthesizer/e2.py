@@ -25,9 +25,8 @@ from e2rl.synthesizer.control import ControlSettings, SparseControl
 from e2rl.synthesizer.feasibility import FeasibilitySettings
 from e2rl.synthesizer.interception import InterceptionSettings
 from e2rl.synthesizer.potentials import PotentialContext, PotentialSettings
-from e2rl.synthesizer.provocation import ProvocationSettings
 from e2rl.synthesizer.reasoner import ReasonerSettings, build_reasoner
-from e2rl.synthesizer.responsibility import RESPONSIBILITIES, CareSettings, duty_of, place_of
+from e2rl.synthesizer.responsibility import RESPONSIBILITIES, CareSettings, duty_of, leading, place_of
 from e2rl.synthesizer.selection import Selection
 from e2rl.synthesizer.skeleton import Skeleton, SkeletonSettings, build_skeleton, chain_depth, direct
 from e2rl.synthesizer.topology import TopologySettings, topological_candidates
@@ -45,7 +44,6 @@ PARTS: dict[str, type] = {
     "skeleton": SkeletonSettings,
     "anchor": AnchorSettings,
     "interception": InterceptionSettings,
-    "provocation": ProvocationSettings,
     "care": CareSettings,
     "potentials": PotentialSettings,
     "control": ControlSettings,
@@ -58,19 +56,18 @@ class E2State(PriorState):
     """B attacked scenes.
 
     eta [B]; coalition [B, V]: C*; target [B, V] int64: whom each member acts on (0 the ego, -1 none); off_lane [B, V]:
-    off its lane, on a path of its own; committed [B, V], knots [B, V, KNOTS]: with a proposal, and its accelerations
-    [m/s^2]; path_kl, anchor_jump [B, V]: path KL of the control and energy of anchoring
-    since the start.
+    on an interception instead of its lane; committed [B, V]: with a proposal, knots [B, V, KNOTS]: its accelerations
+    [m/s^2]; path_kl, anchor_jump [B, V]: path KL of the control and energy of anchoring since the start.
     """
 
     eta: Tensor
     coalition: Tensor
     target: Tensor
     off_lane: Tensor
-    path_kl: Tensor
-    anchor_jump: Tensor
     committed: Tensor
     knots: Tensor
+    path_kl: Tensor
+    anchor_jump: Tensor
 
 
 class E2(NominalTraffic):
@@ -89,10 +86,10 @@ class E2(NominalTraffic):
         reselect: int = 2,
         **parts: Mapping,
     ) -> None:
-        """knowledge, prediction: see NominalTraffic; responsibility: of RESPONSIBILITIES; support: whom the coalition is
-        chosen from: feasible (S = S_top and F), topology (S_top alone) or random (as many as there are near agents),
-        the ablations of table 2; reselect: replans after which a coalition that can no
-        longer meet its targets is chosen anew, 0: never; parts: settings of PARTS (conf/synthesizer/e2.yaml).
+        """knowledge, prediction: see NominalTraffic; responsibility: of RESPONSIBILITIES; support: whom the coalition
+        is chosen from: feasible (S = S_top and F), topology (S_top alone) or random (as many as there are near agents),
+        the ablations of table 2; reselect: replans after which a coalition that can no longer meet its targets is
+        chosen anew, 0: never; parts: settings of PARTS (conf/synthesizer/e2.yaml).
 
         Raises InputError for settings that do not fit.
         """
@@ -110,7 +107,6 @@ class E2(NominalTraffic):
         self.skeleton: SkeletonSettings = settings["skeleton"]
         self.anchor: AnchorSettings = settings["anchor"]
         self.interception: InterceptionSettings = settings["interception"]
-        self.provocation: ProvocationSettings = settings["provocation"]
         self.care: CareSettings = settings["care"]
         self.potentials: PotentialSettings = settings["potentials"]
         self.control: ControlSettings = settings["control"]
@@ -118,6 +114,11 @@ class E2(NominalTraffic):
         self.statistics: dict[str, float] = {}  # of the language-model reasoner
         self.feasible_vehicles = build_reasoner(settings["reasoner"], self.statistics)
         self.queries_ego = self.control.lookahead > 0
+        if self.queries_ego and knowledge != "plan":
+            raise InputError(
+                f"synthesizer.control.lookahead={self.control.lookahead}: it asks the ego's own policy, which a black "
+                "box does not answer; set synthesizer.knowledge=plan, or lookahead 0"
+            )
         self._react: Answer | None = None
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> E2State:
@@ -130,10 +131,10 @@ class E2(NominalTraffic):
             coalition=none,
             target=none.long() - 1,
             off_lane=none,
-            path_kl=zero,
-            anchor_jump=zero,
             committed=none,
             knots=zero[..., None].repeat(1, 1, KNOTS),
+            path_kl=zero,
+            anchor_jump=zero,
         )
 
     def replan(
@@ -151,7 +152,7 @@ class E2(NominalTraffic):
         """State, guided joint sample x0 [G, V, SIZE] and context of a group."""
         state = replace(state, lane=self.lane_now(state, world, ego_plan))
         if not bool((state.eta > 0).any()):
-            context = self.encode(state, world, ego_plan, state.coalition)
+            context = self.encode(state, world, ego_plan)
             return state, self.prior.sample(context, noise).x0, context
         world = replace(world, route=state.routed.route)
         state, anchor = self._reselected(state, world, ego_plan, noise)
@@ -160,19 +161,16 @@ class E2(NominalTraffic):
         context = self.encode(state, world, ego_plan)
         control = self._control(state, self._potential_context(state, world, ego_plan), anchor, group)
         sample = self.prior.sample(context, noise, control, self._budget(state))
-        committed = anchor.feasible & state.coalition
         kl, jump = state.path_kl + sample.kl, state.anchor_jump + control.jump
-        state = replace(state, path_kl=kl, anchor_jump=jump, committed=committed, knots=anchor.knots)
+        acts = anchor.feasible & state.coalition
+        state = replace(state, path_kl=kl, anchor_jump=jump, committed=acts, knots=anchor.knots)
         return state, sample.x0, self._with_duty(state, world, ego_plan, sample.x0, context)
 
-    def _with_duty(
-        self, state: E2State, world: World, ego_plan: Tensor, x0: Tensor, context: Context
-    ) -> Context:
+    def _with_duty(self, state: E2State, world: World, ego_plan: Tensor, x0: Tensor, context: Context) -> Context:
         """The context whose bounds know what the coalition owes the ego."""
         planned = self.prior.decode(x0, context).states()
-        proposed = torch.where(state.committed, state.knots[..., 0], 0.0)
         known = ego_plan[:, :HORIZON]
-        duty = duty_of(self.responsibility, self.care, world, state.coalition, state.eta, planned, known, proposed)
+        duty = duty_of(self.responsibility, self.care, world, state.coalition, state.eta, planned, known)
         return replace(context, obstacles=replace(context.obstacles, duty=duty))
 
     def _budget(self, state: E2State) -> Tensor | None:
@@ -196,15 +194,18 @@ class E2(NominalTraffic):
         return put_rows(state, rows, chosen), put_rows(anchor, rows, found)
 
     def _anchor(self, state: E2State, world: World, ego_plan: Tensor) -> Anchor:
-        """Proposals for the present coalition on its present routes."""
+        """Proposals for the present coalition on its present routes; whom the ego follows keeps its last one."""
         depth = chain_depth(state.target)
+        if self.responsibility == "full":
+            depth = depth.masked_fill(leading(world, depth.shape[1]), 0)
         count = state.replans  # chains and source of a skeleton, which proposals do not read
         skeleton = Skeleton(state.coalition, state.target, depth, depth == 1, depth > 1, count, count)
         anchor = self._propose(skeleton, state, world, ego_plan, keep_route=True)
         return self._held(anchor, state, world) if self.responsibility == "full" else anchor
 
     def _held(self, anchor: Anchor, state: E2State, world: World) -> Anchor:
-        """The anchor in which members without a lawful proposal go on with their last one while they are ahead."""
+        """The anchor in which members that can no longer meet the ego go on with their last proposal while they are
+        ahead of it: they have come into its way by then."""
         ahead = place_of(world, state.coalition.shape[1])[0][..., 0] > 0
         hold = state.coalition & ~anchor.feasible & state.committed & ahead
         later = torch.cat([state.knots[..., 1:], state.knots[..., -1:]], -1)
@@ -221,8 +222,7 @@ class E2(NominalTraffic):
         self, skeleton: Skeleton, state: E2State, world: World, ego_plan: Tensor, keep_route: bool = False
     ) -> Anchor:
         settings = self.anchor, self.interception
-        law = self.provocation if self.responsibility == "full" else None
-        return propose(world.scene, world, skeleton, ego_plan, *settings, state.eta, keep_route, law)
+        return propose(world.scene, world, skeleton, ego_plan, *settings, state.eta, keep_route)
 
     def _select(self, state: E2State, world: World, ego_plan: Tensor, noise: Tensor) -> E2State:
         """Topology on a reference rollout, feasibility, skeleton; the coalition takes the routes that meet targets."""
@@ -236,6 +236,8 @@ class E2(NominalTraffic):
         steps = round(self.skeleton.step / DT)
         expected = reference[:, steps - 1 :: steps].transpose(1, 2)
         support, fallback = self._support(state, world, found.candidates, feasible)
+        if self.responsibility == "full":  # planners know how to follow: leaders that brake hard find next to nothing
+            support, fallback = (chosen & ~leading(world, vehicles) for chosen in (support, fallback))
         anchor = self._propose(direct(support | fallback), state, world, ego_plan)  # its cost chooses the near agents
         skeleton = build_skeleton(scene, world, support, fallback, self.skeleton, expected, anchor.cost)
         if bool(skeleton.far.any()):  # otherwise everybody meets the ego, as just proposed

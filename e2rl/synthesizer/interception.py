@@ -61,7 +61,7 @@ class Interception(NamedTuple):
     cost: Tensor
 
 
-class Paths(NamedTuple):
+class _Paths(NamedTuple):
     """O paths of each vehicle: points and tangents [B, M, O, U, 2] at even parameters; length [B, M, O, U]: m to each
     point; bearing, turn [B, M, O]: angles from the heading to the target and to the end; end_heading [B, M, O].
     """
@@ -90,7 +90,7 @@ def cubic(start: Tensor, heading: Tensor, end: Tensor, end_heading: Tensor, u: T
     return points, tangents
 
 
-def paths_to(states: Tensor, meeting: Tensor) -> Paths:
+def _paths(states: Tensor, meeting: Tensor) -> _Paths:
     """Paths from states [B, M, 4] to meeting states [B, M, I, 4], ENDS to each: along an arc, straight at the target in
     the end, or into the target's direction.
     """
@@ -102,10 +102,10 @@ def paths_to(states: Tensor, meeting: Tensor) -> Paths:
     start, u = states[:, :, None, :2].expand_as(xy), torch.linspace(0, 1, SAMPLES, device=states.device)
     points, tangents = cubic(start, heading, xy, end_heading, u)
     length = torch.nn.functional.pad(points.diff(dim=3).norm(dim=-1).cumsum(-1), (1, 0))
-    return Paths(points, tangents, length, bearing, wrap(end_heading - heading), end_heading)
+    return _Paths(points, tangents, length, bearing, wrap(end_heading - heading), end_heading)
 
 
-def lateral_limits(paths: Paths, speed: Tensor, accel: Tensor) -> tuple[Tensor, Tensor]:
+def _lateral(paths: _Paths, speed: Tensor, accel: Tensor) -> tuple[Tensor, Tensor]:
     """Largest lateral acceleration [m/s^2] and curvature [1/m] (both [B, M, O]) on paths entered at speed [B, M, 1] and
     driven at accel [B, M, O].
     """
@@ -115,7 +115,7 @@ def lateral_limits(paths: Paths, speed: Tensor, accel: Tensor) -> tuple[Tensor, 
     return (squared * curvature).amax(-1), curvature.amax(-1)
 
 
-def _clear(paths: Paths, travelled: Tensor, size: Tensor, others: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+def _clear(paths: _Paths, travelled: Tensor, size: Tensor, others: tuple[Tensor, Tensor, Tensor]) -> Tensor:
     """Bool [B, M, O]: after `travelled` [B, M, O, W] m of their paths (< 0: arrived) vehicles touch none of the others.
 
     others: states [B, J, W, 4] at the same moments and sizes [B, J, 2] of everybody, and who counts [B, M, J] bool.
@@ -143,13 +143,13 @@ def intercept(
     size, target_size = take(scene["size"], index), take(scene["size"], target)
     steps = torch.arange(KNOT_STEPS, round(settings.reach / DT) + 1, KNOT_STEPS, device=states.device)
     meeting, times = target_states[:, :, steps - 1], DT * steps
-    paths, v = paths_to(states, meeting), states[:, :, None, 3]
+    paths, v = _paths(states, meeting), states[:, :, None, 3]
     time = times.repeat_interleave(ENDS).expand_as(paths.bearing)
     # Boxes that move alike touch before their centres meet.
     alike = wrap(paths.end_heading - meeting[..., 2].repeat_interleave(ENDS, -1)).cos().clamp(min=0) ** 2
     length = paths.length[..., -1] - 0.4 * (size[..., 0] + target_size[..., 0])[..., None] * alike
     accel = 2 * (length.clamp(min=0) - v * time) / time**2
-    lateral, curvature = lateral_limits(paths, v, accel)
+    lateral, curvature = _lateral(paths, v, accel)
     field, origin, dial = scene["field"], scene["field_origin"], eta[:, None, None]
     allowed = off_road(states[..., :2], field, origin).clamp(min=settings.shoulder)[..., None]
     ok = (accel <= settings.push * dial) & (accel >= -settings.brake * dial) & (v + accel * time >= 0)
@@ -166,10 +166,10 @@ def intercept(
     knot_times = DT * KNOT_STEPS * torch.arange(1, HORIZON // KNOT_STEPS + 1, device=cost.device)
     knots = take_route(accel, pick)[..., None] * (knot_times <= take_route(time, pick)[..., None])
     points, length, heading = (take_route(x, pick) for x in (paths.points, paths.length, paths.end_heading))
-    return Interception(resampled(points, length, heading, scene["route_points"].shape[3]), knots, cost)
+    return Interception(_resampled(points, length, heading, scene["route_points"].shape[3]), knots, cost)
 
 
-def resampled(points: Tensor, length: Tensor, heading: Tensor, count: int) -> Tensor:
+def _resampled(points: Tensor, length: Tensor, heading: Tensor, count: int) -> Tensor:
     """Vertices [B, M, count, 2] every SPACING m along polylines points [B, M, U, 2] of cumulative length [B, M, U],
     then straight on along heading [B, M].
     """

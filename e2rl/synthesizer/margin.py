@@ -14,7 +14,9 @@ from e2rl.verdicts.redrive import Tracks, along_way, contacts, driven_length, re
 ASIDE = 0.3  # m between the sides below which a gap counts
 
 
-def competent_margin(ego: Tensor, ego_size: Tensor, motion: Tensor, size: Tensor, driver: Driver = DRIVERS["human"]) -> Tensor:
+def competent_margin(
+    ego: Tensor, ego_size: Tensor, motion: Tensor, size: Tensor, driver: Driver = DRIVERS["human"]
+) -> Tensor:
     """Least gap [Q] m along its way that a competent driver keeps to motions [Q, H+1, 4] which begin now; at most 0
     where it does not avoid them, inf where it need not brake for them."""
     if not len(motion):

@@ -1,7 +1,7 @@
 """The duty of care of adversaries towards the ego (docs/adversaries.md).
 
-full: an adversary gives way to the ego unless its plan keeps the law (margin.py) or the ego follows it; rear: adversaries
-behind the ego brake for it like any driver; none: no adversary does.
+full: an adversary gives way to the ego unless its plan keeps the law (margin.py) or the ego follows it; rear:
+adversaries behind the ego brake for it like any driver; none: no adversary does.
 """
 
 from dataclasses import dataclass
@@ -9,15 +9,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from e2rl.prior.bounds import NO_CAP, Duty
+from e2rl.prior.bounds import Duty
 from e2rl.scene.boxes import to_frame
 from e2rl.settings import check_range
 from e2rl.sim.world import World
 from e2rl.synthesizer.margin import competent_margin
 
 RESPONSIBILITIES = ("full", "rear", "none")
+NEAR = 4.0  # m ahead of the ego's centre from which on a vehicle leads it
 SAME_WAY = 0.5  # cosine between the headings of vehicles that drive the same way
-HARD = 3.0  # m/s^2 of proposed braking from which on it is driven as a cap, which the prior cannot soften
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class CareSettings:
 
 
 def place_of(world: World, vehicles: int) -> tuple[Tensor, Tensor]:
-    """Where vehicles are seen from the ego: m ahead and to the left [B, V, 2], and whether they drive its way [B, V]."""
+    """Where the ego sees vehicles: m ahead and to the left [B, V, 2]; and whether they drive its way [B, V]."""
     states, ego = world.states[:, :vehicles], world.states[:, :1]
     return to_frame(states[..., :2], ego), (states[..., 2] - ego[..., 2]).cos() > SAME_WAY
 
@@ -43,6 +43,12 @@ def followed(world: World, vehicles: int) -> Tensor:
     place, along = place_of(world, vehicles)
     touch = (world.scene["size"][:, :vehicles] + world.scene["size"][:, :1]) / 2
     return along & (place[..., 0] > touch[..., 0]) & (place[..., 1].abs() < touch[..., 1])
+
+
+def leading(world: World, vehicles: int) -> Tensor:
+    """Bool [B, V]: vehicles that drive the ego's way ahead of it, in its lane or beside it."""
+    place, along = place_of(world, vehicles)
+    return along & (place[..., 0] > NEAR)
 
 
 def lawful(world: World, coalition: Tensor, planned: Tensor, ego_plan: Tensor) -> Tensor:
@@ -64,20 +70,17 @@ def duty_of(
     eta: Tensor,
     planned: Tensor,
     ego_plan: Tensor,
-    proposed: Tensor,
 ) -> Duty:
     """The Duty of a coalition [B, V] at intensities eta [B].
 
-    planned [B, V, H, 4]: states that adversaries are about to drive; proposed [B, V]: acceleration that is proposed to
-    them now; ego_plan [B, H, 4]: what is known of the ego.
+    planned [B, V, H, 4]: states that adversaries are about to drive; ego_plan [B, H, 4]: what is known of the ego.
     """
-    nobody, zero = torch.zeros_like(coalition), torch.zeros_like(proposed)
-    cap = torch.full_like(proposed, NO_CAP)
+    vehicles, nobody, zero = coalition.shape[1], torch.zeros_like(coalition), torch.zeros_like(planned[..., 0, 0])
     if responsibility == "none":
-        return Duty(coalition, nobody, zero, cap)
-    vehicles = coalition.shape[1]
+        return Duty(coalition, nobody, zero)
+    ahead = coalition & (place_of(world, vehicles)[0][..., 0] > 0)
     if responsibility == "rear":
-        return Duty(coalition & (place_of(world, vehicles)[0][..., 0] > 0), nobody, zero, cap)
+        return Duty(ahead, nobody, zero)
     free = coalition & (followed(world, vehicles) | lawful(world, coalition, planned, ego_plan))
-    patience = (settings.patience * eta).clamp(max=settings.max_patience)[:, None] * coalition
-    return Duty(free, coalition & ~free, patience, torch.where(coalition & (proposed < -HARD), proposed, cap))
+    patience = (settings.patience * eta).clamp(max=settings.max_patience)[:, None] * ahead
+    return Duty(free, coalition & ~free, patience)

@@ -23,7 +23,7 @@ SUPPORTED, NEAREST_FEASIBLE, NOBODY = range(3)  # where the near agents came fro
 class SkeletonSettings:
     """Settings of Algorithm 2; conf/synthesizer/e2.yaml explains each."""
 
-    near: int = 2
+    near: int = 3
     far: int = 1
     tau_dist: float = 15.0
     tau_long: float = 20.0

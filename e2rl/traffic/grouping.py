@@ -68,9 +68,10 @@ def crop_world(world: World, group: Group) -> World:
             scene[key] = world.scene[key][rows, : group.vehicles]
         elif key in WHOLE:
             scene[key] = world.scene[key][rows]
-    now = (getattr(world, name)[rows][:, agents] for name in ("states", "valid", "accel"))
+    states, valid, accel = (getattr(world, name)[rows][:, agents] for name in ("states", "valid", "accel"))
     yaw_rate = None if world.yaw_rate is None else world.yaw_rate[rows]
-    return World(TensorDict(scene, batch_size=[len(rows)]), world.step[rows], *now, yaw_rate=yaw_rate)
+    cropped = TensorDict(scene, batch_size=[len(rows)])
+    return World(cropped, world.step[rows], states, valid, accel, yaw_rate=yaw_rate)
 
 
 def crop_state(value: Any, group: Group, width: int, name: str = "") -> Any:

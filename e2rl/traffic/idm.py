@@ -73,7 +73,7 @@ class IDM(Traffic):
         def decoded(cap: Tensor | None) -> LaneState:
             return _held(decode(*apply_cap(cap, x, lane, self.bounds.onset), routed.points), lane, frozen)
 
-        obstacles = Obstacles(world.states, routed.size, world.valid, torch.zeros_like(present))
+        obstacles = Obstacles(world.states, routed.size, world.valid)
         motion = bounded(self.bounds, decoded, lane, obstacles)
         gone = routed.open[..., None] & (motion.s >= routed.length[..., None]) & routed.has_lane[..., None]
         plan = TrafficPlan(motion.states(), present[..., None] & ~(gone.cumsum(-1) > 0), route=routed.route)

@@ -38,9 +38,9 @@ def roll_out(
     """Rollouts of scenes index [B] with seeds [B] and intensities eta [B] to their last step.
 
     The rollout dict that e2rl.metrics and e2rl.evaluation.files read: states [B, T+1, N, 4], valid, size, agent_type,
-    simulated, adversaries, logged, logged_valid, map keys, ran_light [B, N] (`red_lights`), seed, scene_id, location, seconds (wall time per rollout),
-    transport (path KL of adversaries and others, anchor jump), routes [B, V] and contact [B] (the ego touched a
-    vehicle).
+    simulated, adversaries, logged, logged_valid, map keys, ran_light [B, N] (`red_lights`), seed, scene_id,
+    location, seconds (wall time per rollout), transport (path KL of adversaries and others, anchor jump), routes [B, V]
+    and contact [B] (the ego touched a vehicle).
     """
     begin = time.perf_counter()
     settings = replace(sim, end_on_contact=False, end_off_road=False, end_when_gone=False)

@@ -62,6 +62,7 @@ class Traffic(ABC):
     stochastic: seeds matter; adversarial: the intensity eta matters; predicts: plans can be compared with the log in
     open loop; replays_log: it is the recording itself; queries_ego: `replan` takes `react`, which returns the ego's
     states against a plan: react(rows [G] of the batch, states [G, V, HORIZON, 4]) -> [G, HORIZON, 4];
+    knowledge, responsibility: what it knows of the ego and owes it, in words for captions ("": nothing to say);
     figures: names of the further outputs of its plans; on_selection: called with every selection of adversaries;
     topology: the TopologySettings of these selections.
     """
@@ -71,6 +72,8 @@ class Traffic(ABC):
     predicts = True
     replays_log = False
     queries_ego = False
+    knowledge = ""
+    responsibility = ""
     figures: tuple[str, ...] = ()
     on_selection: Callable[[Any], None] | None = None
     topology: Any = None

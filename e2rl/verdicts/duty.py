@@ -25,10 +25,10 @@ TURN_STEPS = round(4.0 / DT)
 
 
 class Lanes(NamedTuple):
-    """The map's centrelines: points [B, M, 2], index [B, M] (-1: padding)."""
+    """The map's centrelines: points [B, M, 2], lane [B, M]: which one a point is of (-1: padding)."""
 
     points: Tensor
-    index: Tensor
+    lane: Tensor
 
 
 def duties(collision: Collision, rear: Tensor, red: Tensor, lanes: Lanes) -> Tensor:
@@ -94,7 +94,7 @@ def _against(track: Tensor, stop: Tensor, lanes: Lanes) -> Tensor:
     window = (stop[:, None] - torch.arange(1, WRONG_STEPS + 1, device=stop.device)).clamp(min=0)
     states = track[row, window]
     ahead = torch.nn.functional.normalize(lanes.points.diff(dim=1), dim=-1)
-    same = (lanes.index[:, 1:] == lanes.index[:, :-1]) & (lanes.index[:, 1:] >= 0)
+    same = (lanes.lane[:, 1:] == lanes.lane[:, :-1]) & (lanes.lane[:, 1:] >= 0)
     near = torch.cdist(states[..., :2], lanes.points[:, :-1]) < LANE_REACH
     heading = torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)
     along = torch.einsum("bkd,bmd->bkm", heading, ahead)

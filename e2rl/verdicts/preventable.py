@@ -22,8 +22,8 @@ SAME_WAY = 0.5  # cosine of the headings of a follower and its leader at least
 
 
 class Collision(NamedTuple):
-    """B collisions: states [B, T+1, N, 4] (the ego in row 0), present [B, T+1, N], size [B, N, 2], partner [B] int64 and
-    stop [B]: row of the vehicle that the ego hits, and the step."""
+    """B collisions: states [B, T+1, N, 4] (the ego in row 0), present [B, T+1, N], size [B, N, 2]; partner, stop [B]
+    int64: row of the vehicle that the ego hits, and the step."""
 
     states: Tensor
     present: Tensor

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from e2rl.prior import lane_relative
-from e2rl.prior.bounds import MIN_BRAKING, NO_CAP, STRIDE, BoundSettings, Obstacles, acceleration_caps, bounded
+from e2rl.prior.bounds import MIN_BRAKING, NO_CAP, STRIDE, BoundSettings, Duty, Obstacles, acceleration_caps, bounded
 from e2rl.prior.lane_relative import SIZE, locate
 from e2rl.scene.recording import DT
 from tests.prior.small import arc
@@ -14,15 +14,21 @@ from tests.prior.small import arc
 CAR = (4.0, 2.0)
 
 
-def traffic(*cars, turn=0.0, exempt=()):
-    """Vehicles (x, y, heading, speed) on routes of curvature `turn`: decode(cap) at constant speed, state, others."""
+def traffic(*cars, turn=0.0, exempt=(), yields=(), patience=0.0, cap=None):
+    """Vehicles (x, y, heading, speed) on routes of curvature `turn`: decode(cap) at constant speed, state, others.
+
+    exempt, yields: vehicles of such a duty; patience, cap {vehicle: m/s^2}: see Duty.
+    """
     agents = torch.tensor([cars], dtype=torch.float32)
     routes = torch.stack([arc(x, y, heading, turn) for x, y, heading, _ in cars])[None]
     zero = torch.zeros(1, len(cars))
     state = locate(agents, zero, zero + turn * agents[..., 3], routes, zero + 20.0)
     size = torch.tensor(CAR).expand(1, len(cars), 2)
-    ignores = torch.zeros(1, len(cars), dtype=torch.bool)
-    ignores[0, list(exempt)] = True
+    duty = Duty(*(torch.zeros(1, len(cars), dtype=torch.bool) for _ in range(2)), zero + patience, zero + NO_CAP)
+    duty.exempt[0, list(exempt)] = True
+    duty.yields[0, list(yields)] = True
+    for vehicle, value in (cap or {}).items():
+        duty.cap[0, vehicle] = value
 
     def decode(cap):
         x = torch.zeros(1, len(cars), SIZE)
@@ -30,7 +36,7 @@ def traffic(*cars, turn=0.0, exempt=()):
             x[..., 0] = torch.minimum(x[..., 0], cap)
         return lane_relative.decode(x, state, routes)
 
-    return decode, state, Obstacles(agents, size, torch.ones(1, len(cars), dtype=torch.bool), ignores)
+    return decode, state, Obstacles(agents, size, torch.ones(1, len(cars), dtype=torch.bool), duty)
 
 
 def caps(decode, state, obstacles, **settings):
@@ -76,6 +82,33 @@ def test_only_an_exempt_vehicle_may_meet_the_ego():
     assert shy[1] < 0 and bold[1] == NO_CAP and bold[2] == shy[2] < 0
 
 
+def test_who_yields_brakes_for_the_ego_even_where_the_ego_would_have_to():
+    crossing = (0, -23, math.pi / 2, 10), (-20, 0, 0, 10)  # the ego is later, so it would brake
+    assert caps(*traffic(*crossing))[1] == NO_CAP
+    assert caps(*traffic(*crossing, yields=[1]))[1] < -1
+
+
+def test_a_patient_vehicle_brakes_later_and_harder_and_still_in_time():
+    ego = (20.0, 0, 0, 0)
+    eager, patient = (caps(*traffic(ego, (0.0, 0, 0, 8), patience=value))[1] for value in (0.0, 6.0))
+    assert -6 < eager < 0 and patient == NO_CAP
+    closer = caps(*traffic(ego, (5.0, 0, 0, 8), patience=4.0))[1]
+    room = 20 - 5 - CAR[0] - 1.2
+    assert -(8**2) / (2 * (room - 2)) < closer < eager
+
+
+def test_patience_is_for_the_ego_alone():
+    cars = (100, 50, 0, 0), (20.0, 0, 0, 0), (0.0, 0, 0, 8)
+    assert caps(*traffic(*cars, patience=6.0))[2] == caps(*traffic(*cars))[2] < 0
+
+
+def test_a_cap_is_driven_and_others_react_to_it():
+    cars = (200, 0, 0, 0), (9, 0, 0, 10), (0, 0, 0, 10)
+    free, braking = (bounded(BoundSettings(), *traffic(*cars, cap=cap)) for cap in (None, {1: -6.0}))
+    assert (free.v[0, 1:] == 10).all()
+    assert braking.v[0, 1, 5] < 9 and braking.v[0, 2, 5] < 10
+
+
 def test_absent_vehicles_are_in_nobody_s_way():
     decode, state, obstacles = traffic((0, 0, 0, 10), (15, 0, 0, 0))
     obstacles.present[0, 1] = False
@@ -89,7 +122,6 @@ def test_a_pedestrian_without_a_plan_keeps_its_velocity():
         torch.cat([obstacles.agents, walker], 1),
         torch.cat([obstacles.size, torch.ones(1, 1, 2)], 1),
         torch.ones(1, 2, dtype=torch.bool),
-        obstacles.exempt,
     )
     assert caps(decode, state, obstacles)[0] < -1
     obstacles.agents[0, 1, 3] = 0.0

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from e2rl.prior.bounds import BoundSettings
+from e2rl.prior.bounds import NO_CAP, BoundSettings, Duty
 from e2rl.prior.lane_relative import HORIZON, SIZE, decode
 from e2rl.prior.prior import Prior, SamplerSettings, plan_to_x
 from e2rl.prior.route_choice import sample_route
@@ -13,13 +13,13 @@ FREE = BoundSettings(meeting=False, curve=False)
 MEAN, STD = 0.4, 0.6
 
 
-def context_of(prior, scene, **options):
+def context_of(prior, scene):
     vehicles = scene["route_log"].shape[1]
     routed, state = prior.start(scene, scene["route_log"].clamp(min=0))
     ego = scene["logged"][:, 1 : HORIZON + 1, 0]
     step = torch.zeros(len(scene), dtype=torch.long)
     assert state.s.shape[1] == vehicles
-    return prior.encode(routed, state, scene["start"], scene["valid"], step, ego, **options)
+    return prior.encode(routed, state, scene["start"], scene["valid"], step, ego)
 
 
 def noise_for(prior, scene, seed=0):
@@ -140,9 +140,11 @@ def test_bounds_change_what_is_executed_of_infeasible_plans_and_only_of_them():
     tight, loose = (small_prior(bounds=bounds) for bounds in (BoundSettings(curve=False), FREE))
     free = loose.plan(x0, context_of(loose, scene)).motion.v
     shy = tight.plan(x0, context_of(tight, scene)).motion.v
-    exempt = torch.zeros(scene["route_log"].shape, dtype=torch.bool)
+    context, nobody = context_of(tight, scene), torch.zeros(scene["route_log"].shape, dtype=torch.bool)
+    exempt = nobody.clone()
     exempt[:, 5] = True
-    bold = tight.plan(x0, context_of(tight, scene, exempt=exempt)).motion.v
+    context.obstacles.duty = Duty(exempt, nobody, torch.zeros_like(free[..., 0]), torch.full_like(free[..., 0], NO_CAP))
+    bold = tight.plan(x0, context).motion.v
     assert (shy[0, 5, 2:] < free[0, 5, 2:]).all()
     others = torch.arange(shy.shape[1]) != 5
     assert torch.equal(shy[:, others], free[:, others]) and torch.equal(bold[:, others], free[:, others])

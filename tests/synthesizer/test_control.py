@@ -33,9 +33,7 @@ class Case:
         step = torch.zeros(count, dtype=torch.long)
         self.coalition = torch.zeros(count, ROWS, dtype=torch.bool)
         self.coalition[:, MEMBER] = True
-        self.context = self.prior.encode(
-            routed, state, self.scene["start"], self.scene["valid"], step, plan, self.coalition
-        )
+        self.context = self.prior.encode(routed, state, self.scene["start"], self.scene["valid"], step, plan)
         target = torch.where(self.coalition, 0, -1)
         self.where = PotentialContext(
             self.scene,
@@ -63,7 +61,7 @@ class Case:
         extra = torch.randn(len(self.scene), ROWS, SIZE, generator=torch.Generator().manual_seed(7))
         return SparseControl(
             self.prior,
-            ControlSettings(**settings),
+            ControlSettings(**({"adversarial_clip": 0.5} | settings)),
             PotentialSettings(),
             self.where,
             self.coalition,

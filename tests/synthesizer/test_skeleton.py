@@ -18,7 +18,7 @@ COLUMN = [(30.0, -20.0 - 18 * k, UP, 8.0) for k in range(3)]  # one behind the o
 
 def test_near_vehicles_act_on_the_ego():
     world = make_world([EGO, (12.0, 3.5, 0.0, 10.0), (-14.0, 0.0, 0.0, 10.0), (60.0, 3.5, 0.0, 10.0)])
-    result = skeleton_of(world, mask(world, 1, 2, 3))
+    result = skeleton_of(world, mask(world, 1, 2, 3), near=2)
     assert result.coalition.nonzero().tolist() == [[0, 1], [0, 2]]
     assert result.target[0, :4].tolist() == [-1, 0, 0, -1] and result.depth[0, :4].tolist() == [0, 1, 1, 0]
     assert result.source.tolist() == [SUPPORTED] and result.chains.tolist() == [0]
@@ -77,7 +77,7 @@ def test_an_empty_support_falls_back_to_the_nearest_feasible_then_to_nobody():
     world = make_world([EGO, (40.0, -30.0, UP, 8.0), (12.0, 3.5, 0.0, 10.0), (20.0, 3.5, 0.0, 9.0)], copies=3)
     support, feasible = mask(world, 1), mask(world, 1, 2, 3)
     support[1:], feasible[2] = False, False
-    result = skeleton_of(world, support, feasible)
+    result = skeleton_of(world, support, feasible, near=2)
     assert result.source.tolist() == [SUPPORTED, NEAREST_FEASIBLE, NOBODY]
     assert result.coalition.nonzero().tolist() == [[0, 1], [1, 2], [1, 3]]
     assert result.counts() == {"supported": 1, "nearest_feasible": 1, "nobody": 1, "chains": 0}

@@ -1,7 +1,9 @@
 """The lookahead asks the real ego how it would drive against a plan."""
 
+import pytest
 import torch
 
+from e2rl.errors import InputError
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.scene.recording import DT
 from e2rl.sim.world import World
@@ -43,7 +45,8 @@ def test_lookahead_changes_the_attack_but_nothing_at_zero_intensity():
     scene = scenes(3).scenes
     world = World.at_start(scene)
     plan, react = EGO.plan(world), Lookahead(EGO, world)
-    plain, ahead = synthesizer(), synthesizer(control={"lookahead": 2})
+    told = {"knowledge": "plan", "responsibility": "none"}
+    plain, ahead = (synthesizer(**told, control={"adversarial_clip": 0.5, "lookahead": count}) for count in (0, 2))
     assert ahead.queries_ego and not plain.queries_ego
 
     def driven(on, eta, react):
@@ -52,3 +55,8 @@ def test_lookahead_changes_the_attack_but_nothing_at_zero_intensity():
     assert torch.equal(driven(plain, 0.0, None), driven(ahead, 0.0, react))
     assert torch.equal(driven(plain, 2.0, react), driven(plain, 2.0, None))
     assert not torch.equal(driven(ahead, 2.0, react), driven(plain, 2.0, react))
+
+
+def test_who_predicts_the_ego_cannot_ask_it():
+    with pytest.raises(InputError, match="lookahead.*knowledge=plan"):
+        synthesizer(control={"lookahead": 1})

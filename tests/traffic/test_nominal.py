@@ -8,22 +8,25 @@ import torch
 from e2rl.prior.lane_relative import HORIZON, SIZE
 from e2rl.prior.prior import SamplerSettings
 from e2rl.sim.world import World
+from e2rl.traffic.knowledge import KNOWLEDGE
 from e2rl.traffic.nominal import NominalTraffic
 from e2rl.traffic.rows import noise_of, take_rows
 from tests.prior.small import curved_scenes, small_prior
 from tests.synthesizer.traffic_scenes import EGO, ROWS, begin, executed, scenes
 
 
-def nominal(**options):
-    return NominalTraffic(small_prior(0, sampler=SamplerSettings(steps=4), **options))
+def nominal(knowledge="predicted", **options):
+    return NominalTraffic(small_prior(0, sampler=SamplerSettings(steps=4), **options), knowledge)
 
 
-def test_a_plan_is_the_prior_s_sample():
+@pytest.mark.parametrize("knowledge", KNOWLEDGE)
+def test_a_plan_is_the_prior_s_sample(knowledge):
     """Padding, which replan crops, changes the order of sums and nothing else."""
-    on, scene = nominal(), scenes(2).scenes
+    on, scene = nominal(knowledge), scenes(2).scenes
     world, state = World.at_start(scene), begin(on, scene)
     plan = EGO.plan(world)
     after, found = on.replan(state, world, plan)
+    plan = plan if knowledge == "plan" else on.predicted_ego(state, world)
     routed, lane = on.prior.start(scene, state.routed.route)
     lane = on.lane_now(replace(state, routed=routed, lane=lane), world, plan)
     context = on.prior.encode(routed, lane, world.states, world.valid, world.step, plan)
