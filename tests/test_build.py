@@ -142,7 +142,7 @@ def test_several_intensities_are_a_row_each_but_of_what_knows_none():
 
 
 @pytest.mark.parametrize(
-    ("experiment", "rows"), [("prior_ablation", 15), ("table2", 4), ("table3", 13), ("intensity", 4), ("skeleton", 1)]
+    ("experiment", "rows"), [("prior_ablation", 15), ("table2", 5), ("table3", 15), ("intensity", 4), ("skeleton", 1)]
 )
 def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(experiment, rows):
     config, methods = config_of(f"experiment={experiment}"), methods_of(f"experiment={experiment}")

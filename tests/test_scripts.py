@@ -251,21 +251,23 @@ SHORT = [
     "prior.sampler.steps=2",
 ]  # of the bundled scenes
 EXPERIMENTS = [
-    ("table2", [("random_k", 2), ("topology", 2), ("e2", 2), ("nominal", 0)], None),
+    ("table2", [("random_k", 2), ("topology", 2), ("e2", 2), ("e2_unbound", 2), ("nominal", 0)], None),
     (
         "table3",
         [
             ("e2", 2),
+            ("e2_unbound", 2),
             ("nominal", 0),
+            ("told the plan", 2),
+            ("duty behind only", 2),
+            ("no duty", 2),
+            ("no patience", 2),
+            ("with V_adv", 2),
             ("no V_feas", 2),
-            ("no V_adv", 2),
             ("no anchoring", 2),
             ("literal anchoring", 2),
             ("no interception", 2),
             ("no proposal", 2),
-            ("V_adv alone", 2),
-            ("V_adv alone x4", 2),
-            ("V_adv alone x16", 2),
             ("no bounds", 2),
             ("no bounds, no V_feas", 2),
         ],

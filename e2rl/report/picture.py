@@ -73,6 +73,8 @@ class Replay:
             text, colour, phase = f"{time * self.rollout['dt']:.1f} s", drawing.INK, None
             if time == self.contact:
                 text, colour, phase = f"{text}   {contact_text(self.row)}", drawing.CONTACT, 0.25
+            elif time == times[0] and self.contact is not None:
+                text = f"{text}   {verdict_text(self.row)}"
             axes.set_title(text, loc="left", x=4 / STRIP_SIDE, fontsize=15, color=colour)
             self.draw(TrafficMap(axes, self.rollout, self.metres), time, phase)
         return image_of(figure)
@@ -137,7 +139,8 @@ class Panel:
         self.clock = text(right, upper, "", fontsize=16, color=drawing.INK, ha="right")
         self.speed = text(right, lower, "", fontsize=11, color=drawing.MUTED, ha="right")
         box = {"boxstyle": "round,pad=0.5,rounding_size=1", "facecolor": drawing.CONTACT, "edgecolor": "none"}
-        self.badge = text(0.5, 640 / SIDE, contact_text(replay.row), fontsize=13, color="w", ha="center", bbox=box)
+        badge = f"{contact_text(replay.row)}\n{verdict_text(replay.row)}"
+        self.badge = text(0.5, 640 / SIDE, badge, fontsize=13, color="w", ha="center", bbox=box)
         add_legend(self.figure, LEGEND, 11, replay.ghost)
         bar = (right - 10 / replay.metres, right)
         self.figure.add_artist(Line2D(bar, (10 / SIDE, 10 / SIDE), color=drawing.INK, linewidth=2))
@@ -179,6 +182,13 @@ def contact_point(rollout: dict, step: int, partner: int) -> np.ndarray:
 
 def contact_text(row: dict) -> str:
     return f"contact at {row['contact_time']:.1f} s: {row['contact_type']}, {row['relvel']:.1f} m/s"
+
+
+def verdict_text(row: dict) -> str:
+    """Whether the collision counts and why, and the duty that the partner broke."""
+    reasons = {"ego's fault": row["at_fault"] == 1, "preventable": row["preventable"] == 1}
+    counts = " and ".join(name for name, holds in reasons.items() if holds)
+    return f"{counts or 'does not count'}; duty broken: {row['duty']}"
 
 
 def shorten(name: str, limit: int = 42) -> str:
