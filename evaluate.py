@@ -32,6 +32,8 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     prior, origin = build.build_prior(config, config.device)
     methods, name = build.build_methods(config, prior), HydraConfig.get().runtime.choices["ego"]
     setup = Setup(scenes, build.build_ego(config), name, build.build_sim(config), config.batch, config.device)
+    if config.tuning is not None:
+        return build.tune(config, setup, methods, folder)["trials"]
     only = None if config.scene is None else [scenes.index(config.scene)]
     chain = LongestChain(methods[0]) if config.figure == "skeleton" else None
     rows = []

@@ -6,12 +6,15 @@ from dataclasses import replace
 import torch
 from measure import Bench, Row
 
+from e2rl.api import make_ego
+
 ETA = 2.0
 
 
 def guided_replan(bench: Bench) -> Iterator[Row]:
     """Milliseconds a scene and replan in the middle of an episode, for the densest scenes and for the first ones, and
-    of the ego's plan beside it."""
+    of two egos' plans beside it."""
+    sampling = make_ego("sampling")
     for scenes, agents in (("densest scenes", bench.scenes.scenes["valid"].shape[1]), ("first scenes", None)):
         for batch in bench.batches(1, 8, 32):
             index = bench.pick(batch, agents)
@@ -24,6 +27,7 @@ def guided_replan(bench: Bench) -> Iterator[Row]:
                 "unguided": lambda s=calm, w=world, p=plan: bench.traffic.replan(s, w, p),
                 f"guided, eta {ETA:g}": lambda s=state, w=world, p=plan: bench.traffic.replan(s, w, p),
                 "plan of lane_graph": lambda w=world: bench.ego.plan(w),
+                "plan of sampling": lambda w=world: sampling.plan(w),
             }
             for variant, function in parts.items():
                 value = 1e3 * bench.best(function) / batch

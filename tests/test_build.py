@@ -148,7 +148,8 @@ def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(experimen
     config, methods = config_of(f"experiment={experiment}"), methods_of(f"experiment={experiment}")
     assert len(methods) == rows and len(set(named(methods))) == rows
     variants = [method.traffic for method in methods if method.name in config.variants]
-    settings = [(on.support, on.reselect, on.settings, on.prior.sampler, on.prior.bounds) for on in variants]
+    own = [(on.support, on.reselect, on.knowledge, on.responsibility, on.settings) for on in variants]
+    settings = [(*each, on.prior.sampler, on.prior.bounds) for each, on in zip(own, variants, strict=True)]
     assert all(settings.count(each) == 1 for each in settings), "no two variants are the same"
     assert all(name in build.caption(config, {}) for name in config.variants)
 
@@ -156,7 +157,7 @@ def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(experimen
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["methods=[e3]"], "synthesizer=e3: none of constant_velocity, e2, idm, nominal, replay; add a file"),
+        (["methods=[e3]"], "synthesizer=e3: none of constant_velocity, e2, e2_unbound, idm, nominal, replay; add a file"),
         (["methods=[]"], r"methods=\[\], seeds=\[0, 1\]: name at least one of each"),
         (["seeds=[]"], r"seeds=\[\]: name at least one"),
         (["seeds=[0.5]"], r"seeds=\[0.5\]: sampling seeds are whole numbers"),
@@ -198,12 +199,12 @@ def test_a_variant_of_impossible_temperature_says_so():
 
 def test_a_choice_is_its_file_and_an_unknown_one_lists_those_there_are():
     assert build.load_choice("synthesizer", "e2") == config_of("synthesizer=e2").synthesizer
-    with pytest.raises(InputError, match="ego=taxi: none of actor, idm, lane_graph, replay; add a file"):
+    with pytest.raises(InputError, match="ego=taxi: none of actor, idm, lane_graph, replay, sampling; add a file"):
         build.load_choice("ego", "taxi")
 
 
 def test_classes_from_outside_are_built_from_their_settings_alone():
-    config = config_of("synthesizer=nominal", f"synthesizer._target_={HERE}.Outside", "+synthesizer.braking=3")
+    config = config_of("synthesizer=replay", f"synthesizer._target_={HERE}.Outside", "+synthesizer.braking=3")
     traffic = build.build_traffic(config.synthesizer, small_prior())
     assert isinstance(traffic, Outside) and traffic.braking == 3
     ego = build.build_ego(config_of("ego=idm", "~ego", f"+ego._target_={HERE}.Cruise", "+ego.replan_every=2"))
@@ -225,7 +226,7 @@ def test_classes_from_outside_are_built_from_their_settings_alone():
 )
 def test_a_class_that_cannot_be_built_is_named_with_the_reason(overrides, message):
     changes = [f"++synthesizer.{override}" for override in overrides]
-    config = config_of("synthesizer=nominal", *changes)
+    config = config_of("synthesizer=replay", *changes)
     with pytest.raises(InputError, match=message):
         build.build_traffic(config.synthesizer, small_prior())
 

@@ -3,6 +3,7 @@
 Most cases run the scripts in this process, which spares seconds of imports each; one of each script is a real process.
 """
 
+import json
 import os
 import pickle
 import runpy
@@ -17,6 +18,7 @@ from hydra.core.global_hydra import GlobalHydra
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from e2rl.build import load_choice
 from e2rl.evaluation.files import read_metrics
 from e2rl.metrics.catalogue import META_STAGE, OPEN_LOOP_STAGE, STAGES
 from e2rl.prior.checkpoint import save_prior
@@ -327,6 +329,31 @@ def test_the_adversaries_experiments_have_their_rows_and_figures(
         assert known > 0 if row["eta"] else known == 0
     assert len(list((tmp_path / "run" / "rollouts").glob("*.npz"))) == 2 * len(methods)
     assert [path.name for path in (tmp_path / "run").glob("*.png")] == ([figure] if figure else [])
+
+
+def test_a_planner_is_tuned_and_the_study_goes_on(world, tmp_path, monkeypatch, capsys):
+    for trials in (1, 2):
+        overrides = [
+            "experiment=tune_planner",
+            "ego=sampling",
+            *SHORT,
+            f"data.cache={world / 'bundled'}",
+            f"tuning.trials={trials}",
+            f"tuning.study={tmp_path / 'study'}",
+            f"hydra.run.dir={tmp_path / 'run'}",
+        ]
+        status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+        assert status == 0, said
+    result = json.loads((tmp_path / "run" / "tuning.json").read_text())
+    assert len(result["trials"]) == 2 and set(result["best"]) <= set(load_choice("ego", "sampling"))
+    assert {"collision nominal@0", "collision e2@2"} <= set(result["trials"][0]["metrics"])
+    assert "margin: " in (tmp_path / "run" / "tuned.yaml").read_text()
+    overrides += ["tuning.spaces.sampling.margin=[2,3]", "tuning.study=null"]
+    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    assert status == 2 and "tuning.space.margin=[2, 3]: leaves out the present value" in error_line(said)
+    overrides = [each for each in overrides if "margin" not in each and not each.startswith("ego=")]
+    status, said = call("evaluate.py", [*overrides, "ego=idm"], monkeypatch, capsys)
+    assert status == 2 and "tuning.spaces: no ranges for this ego" in error_line(said)
 
 
 def test_a_folder_of_somebody_else_adds_methods_to_the_table(world, tmp_path, monkeypatch, capsys):

@@ -148,8 +148,8 @@ def capped(wanted: Tensor, caps: Tensor, slope: float) -> Tensor:
 
 
 def upsample(speed: Tensor) -> Tensor:
-    """Speeds [B, PLAN_STEPS + 1] every DT, linear between nodes [B, 26] every PLAN_DT."""
+    """Speeds [..., PLAN_STEPS + 1] every DT, linear between nodes [..., 26] every PLAN_DT."""
     tick = torch.arange(PLAN_STEPS + 1, device=speed.device) * (DT / PLAN_DT)
-    low = tick.floor().long().clamp(max=speed.shape[1] - 2)
+    low = tick.floor().long().clamp(max=speed.shape[-1] - 2)
     share = tick - low
-    return speed[:, low] * (1 - share) + speed[:, low + 1] * share
+    return speed[..., low] * (1 - share) + speed[..., low + 1] * share

@@ -36,10 +36,7 @@ class RoutePath:
 
     def offset(self, ahead: Tensor) -> tuple[Tensor, Tensor]:
         """Lateral offset and its slope at `ahead` [..., K] metres along the route."""
-        d, length = self.d[..., None], self.length[..., None]
-        slope = torch.tan(self.turned.clamp(-MAX_SLOPE, MAX_SLOPE))[..., None]
-        rate, decay = slope + d / length, torch.exp(-ahead.clamp(min=0) / length)
-        return (d + rate * ahead) * decay, (slope - rate * ahead / length) * decay
+        return fading(self.d[..., None], self.turned[..., None], self.length[..., None], ahead)
 
     def at(self, ahead: Tensor) -> Tensor:
         """Poses [..., K, 3] at `ahead` [..., K] metres along the route."""
@@ -62,6 +59,14 @@ class RoutePath:
         """States [..., H, 4] at steps 1..H of DT for speeds [..., H + 1] at steps 0..H (0: now)."""
         distance = ((speed[..., 1:] + speed[..., :-1]) / 2 * DT).cumsum(-1)
         return torch.cat([self.at(self.ahead(distance)), speed[..., 1:, None]], -1)
+
+
+def fading(d: Tensor, turned: Tensor, length: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
+    """Offset [m] and its slope, both of the shape that the arguments broadcast to, `ahead` m after an offset d m and a
+    heading `turned` rad off the route: the critically damped return over `length` m (`RoutePath`)."""
+    slope = torch.tan(turned.clamp(-MAX_SLOPE, MAX_SLOPE))
+    rate, decay = slope + d / length, torch.exp(-ahead.clamp(min=0) / length)
+    return (d + rate * ahead) * decay, (slope - rate * ahead / length) * decay
 
 
 class MissionPath(RoutePath):

@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError
+from e2rl.evaluation.objective import Objective
 from e2rl.files import write_atomically
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
 from e2rl.learning.driving import PoolDriver
@@ -28,16 +29,6 @@ from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import Traffic
 
 Parameters = dict[str, Any]
-NEEDED = ("collision", "comfort", "progress")
-
-
-@dataclass(frozen=True)
-class TuningSettings:
-    """Fields: conf/learner/planner_tuning.yaml."""
-
-    comfort: float = 0.1
-    progress: float = 0.1
-    progress_floor: float = 0.9
 
 
 @dataclass
@@ -61,29 +52,21 @@ def tune(
     evaluate: Callable[[Parameters], Mapping[str, float]],
     present: Parameters,
     grid: Mapping[str, Sequence],
-    settings: TuningSettings | None = None,
+    objective: Objective | None = None,
 ) -> Tuning:
     """Try the present parameters, then the whole grid; keep the best admissible trial, the present one in a tie.
 
     evaluate(parameters) -> metrics with "collision" (rate), "comfort" (mean |acceleration|, m/s^2) and "progress" (m);
-    further ones are logged. Objective: collision + comfort weight * comfort + progress weight * lost share of the
-    present progress. Inadmissible: less than progress_floor of the present progress, or a NaN metric.
+    further ones are logged. What is minimised and what is refused: `Objective`.
     """
-    settings = settings or TuningSettings()
-    trials, reference, tried = [], None, [present]
+    objective = objective or Objective()
+    trials: list[dict] = []
+    tried = [present]
     tried += [present | choice for choice in combinations(grid) if present | choice != present]
     for parameters in tqdm(tried, "planner tuning", unit="trial", leave=False):
         metrics = dict(evaluate(parameters))
-        missing = [name for name in NEEDED if name not in metrics]
-        if missing:
-            raise InputError(f"planner tuning: evaluate() returned no {', '.join(missing)}")
-        reference = metrics["progress"] if reference is None else reference
-        kept = metrics["progress"] / max(reference, 1e-6)
-        objective = (
-            metrics["collision"] + settings.comfort * metrics["comfort"] + settings.progress * max(0.0, 1 - kept)
-        )
-        admissible = not math.isnan(objective) and kept >= settings.progress_floor
-        trials.append({"parameters": parameters, **metrics, "objective": objective, "admissible": admissible})
+        value, excess = objective.judge(metrics, trials[0] if trials else metrics)
+        trials.append({"parameters": parameters, **metrics, "objective": value, "admissible": excess == 0})
     if math.isnan(trials[0]["objective"]):
         raise InputError("planner tuning: the present parameters yield NaN metrics; check the scenes")
     best = min((trial for trial in trials if trial["admissible"] or trial is trials[0]), key=lambda t: t["objective"])
@@ -115,7 +98,7 @@ class PlannerImprovement(Improvement):
         if traffic is not None:
             raise InputError("learner.round.traffic=live: a planner is tuned on stored traffic; set it to replay")
         self.ego, self.present, self.grid = ego, dict(parameters), {key: list(grid[key]) for key in grid}
-        self.settings = settings_of(TuningSettings, tuning or {}, "learner.tuning")
+        self.objective = settings_of(Objective, tuning or {}, "learner.tuning")
         self.driver = PoolDriver(scenes, sim, batch, device)
         self.trials: list[dict] = []
 
@@ -129,7 +112,7 @@ class PlannerImprovement(Improvement):
             summary = episodes.summary()
             return {"collision": summary["contact"], "comfort": summary["acceleration"]} | summary
 
-        tuning = tune(evaluate, self.present, self.grid, self.settings)
+        tuning = tune(evaluate, self.present, self.grid, self.objective)
         before, after = tuning.trials[0], next(t for t in tuning.trials if t["parameters"] == tuning.best)
         self.present, self.trials, self.ego = tuning.best, tuning.trials, type(self.ego)(**tuning.best)
         chosen = {key: value for key, value in self.present.items() if key in self.grid}

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from e2rl.errors import InputError
 from e2rl.scene.recording import DT
+from e2rl.sim.dynamics import wrap
 
 
 class Trajectories:
@@ -60,6 +61,12 @@ class Trajectories:
     def at(self, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """`trajectories_at` step [B]."""
         return trajectories_at(self.states, self.valid, step)
+
+    def turn_rate_at(self, step: Tensor) -> Tensor:
+        """Turn rates [B, N] rad/s over the last step before step [B], 0 without a last step."""
+        row, before = torch.arange(len(step), device=step.device), (step - 1).clamp(min=0)
+        turned = wrap(self.states[row, step, :, 2] - self.states[row, before, :, 2])
+        return turned / DT * (self.valid[row, step] & self.valid[row, before])
 
 
 def trajectories_at(states: Tensor, valid: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:

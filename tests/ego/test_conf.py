@@ -11,6 +11,7 @@ from e2rl.ego.base import PLAN_STEPS
 from e2rl.ego.idm import IDMEgo
 from e2rl.ego.lane_graph import LaneGraphEgo
 from e2rl.ego.replay import ReplayEgo
+from e2rl.ego.sampling import SamplingEgo
 from e2rl.settings import settings_of
 from e2rl.sim.env import DrivingEnv, SimSettings
 from tests.synthetic import make_scenes
@@ -18,7 +19,10 @@ from tests.synthetic import make_scenes
 CONF = Path(__file__).parents[2] / "conf"
 
 
-@pytest.mark.parametrize(("name", "kind"), [("idm", IDMEgo), ("lane_graph", LaneGraphEgo), ("replay", ReplayEgo)])
+EGOS = [("idm", IDMEgo), ("lane_graph", LaneGraphEgo), ("replay", ReplayEgo), ("sampling", SamplingEgo)]
+
+
+@pytest.mark.parametrize(("name", "kind"), EGOS)
 def test_egos(name, kind):
     ego = instantiate(OmegaConf.load(CONF / "ego" / f"{name}.yaml"))
     assert type(ego) is kind and vars(ego) == vars(kind())

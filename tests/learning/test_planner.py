@@ -3,7 +3,8 @@
 import pytest
 
 from e2rl.errors import InputError
-from e2rl.learning.planner import TuningSettings, combinations, tune
+from e2rl.evaluation.objective import Objective
+from e2rl.learning.planner import combinations, tune
 
 PRESENT = {"speed": 10.0, "caution": 1.0, "other": "kept"}
 
@@ -34,7 +35,7 @@ def test_every_combination_is_tried_once_the_present_one_first():
 
 
 def test_objective_is_collision_comfort_and_lost_progress():
-    trial = tune(road, PRESENT, {"speed": [5.0]}, TuningSettings(comfort=0.2, progress=0.4)).trials[1]
+    trial = tune(road, PRESENT, {"speed": [5.0]}, Objective(comfort=0.2, progress=0.4)).trials[1]
     assert trial["objective"] == pytest.approx(0.25 + 0.2 * 0.5 + 0.4 * 0.5)
 
 

@@ -46,7 +46,7 @@ def test_the_reported_agents_are_the_environments_world():
     env.reset()
     told = World.of(act(env, acceleration=1.0, yaw_rate=0.2), env.scene)
     now = env.world()
-    for name in ("step", "states", "valid", "accel", "yaw_rate"):
+    for name in ("step", "states", "valid", "accel", "yaw_rate", "turn_rate"):
         assert torch.equal(getattr(told, name), getattr(now, name)), name
     assert torch.allclose(told.yaw_rate, torch.tensor(0.2), atol=1e-4)
 
@@ -133,6 +133,18 @@ def test_written_traffic_is_executed():
     assert torch.allclose(world.states[:, 1:vehicles], future[:, 1:, 1])
     assert not world.valid[:, 2].any() and world.valid[:, 1].all(), "a vehicle whose traffic turns invalid is gone"
     assert torch.allclose(world.states[:, vehicles:], world.scene["logged"][:, 3, vehicles:])
+
+
+def test_turn_rates_of_traffic_and_ego():
+    """Everybody's heading difference over the last step; at the start the estimate of the recording."""
+    scenes = make_scenes(1, num_vehicles=3)
+    scenes.scenes["start_yaw_rate"][0, 1] = 0.3
+    scenes.scenes["logged"][0, :, 2, 2] = 3.1 + 0.02 * torch.arange(81)
+    env = DrivingEnv(scenes, SimSettings(), 1)
+    env.reset()
+    assert torch.allclose(env.world().turn_rate[0, :3], torch.tensor([0.0, 0.3, 0.0]))
+    act(env, yaw_rate=-0.1)
+    assert torch.allclose(env.world().turn_rate[0, :3], torch.tensor([-0.1, 0.0, 0.2]), atol=1e-4)
 
 
 def test_accelerations_of_traffic_and_ego():

@@ -1,0 +1,114 @@
+"""A sampling planner: hundreds of candidates, each driven by the unicycle and scored on a forecast of the others.
+
+Propose, simulate, score and take the best, in the manner of PDM-Closed (Dauner et al. 2023). It looks at nobody's plan.
+Vectorised over scenes, candidates and agents.
+"""
+
+import torch
+from torch import Tensor
+
+from e2rl.ego.base import Ego
+from e2rl.ego.candidates import Candidates, drive, speed_profiles
+from e2rl.ego.forecast import forecast, nearest
+from e2rl.ego.path import MissionPath
+from e2rl.ego.scoring import Weights, score
+from e2rl.scene.recording import DT
+from e2rl.sim.world import World
+
+STRIDE = 2  # steps between two scored states
+CHUNK = 8  # scenes at a time, to fit the processor's cache
+PROFILES = (
+    *((-8.0, -8.0), (-8.0, 0.0), (-6.0, -6.0), (-6.0, 0.0), (-6.0, 2.0), (-4.0, -4.0), (-4.0, 0.0)),
+    *((-2.5, -2.5), (-2.5, 0.0), (-1.2, -1.2), (-1.2, 0.0)),
+    *((0.0, 0.0), (0.0, -3.0), (0.0, -8.0), (0.0, 1.5), (1.2, 1.2), (1.2, 0.0), (1.2, -3.0)),
+    *((2.5, 2.5), (2.5, 0.0), (2.5, -4.0), (4.0, 4.0), (4.0, 0.0), (4.0, -6.0), (5.0, 5.0), (5.0, -8.0)),
+)  # m/s^2 in the first second and after it
+SHIFTS = (0.0, 1.0, -1.0, 2.0, -2.0, 3.5, -3.5, 5.0, -5.0)  # m beside the mission, left positive
+BRAKING_MORE = 1.0  # m/s^2 by which braking may exceed what the speed caps are made for
+SCENE_KEYS = (
+    *("size", "route_log", "route_points", "route_length", "route_open", "route_limit", "route_light", "route_light_s"),
+    *("light_state", "field", "field_origin"),
+)  # that it reads
+
+
+class SamplingEgo(Ego):
+    """26 speed profiles on 19 lateral moves: 9 shifts beside the mission, swift and calm, and the present one."""
+
+    def __init__(
+        self,
+        max_speed: float = 20.0,
+        horizon: float = 4.0,
+        agents: int = 10,
+        hold: float = 1.0,
+        turn: float = 1.5,
+        swift: float = 0.7,
+        calm: float = 1.4,
+        margin: float = 0.5,
+        margin_growth: float = 0.2,
+        headway: float = 1.5,
+        rear: float = 0.5,
+        fade: float = 0.15,
+        contact: float = 200.0,
+        near: float = 30.0,
+        border: float = 0.5,
+        off_road: float = 20.0,
+        progress: float = 0.2,
+        comfort: float = 1.0,
+        aside: float = 2.0,
+        lateral_acceleration: float = 3.0,
+        braking: float = 3.0,
+        max_acceleration: float = 5.0,
+        max_braking: float = 8.0,
+        max_yaw_rate: float = 1.6,
+        use_limits: bool = True,
+        obey_lights: bool = True,
+        see_vrus: bool = True,
+        replan_every: int = 1,
+    ) -> None:
+        """Fields: conf/ego/sampling.yaml."""
+        super().__init__(replan_every)
+        self.max_speed, self.horizon, self.agents = max_speed, horizon, int(agents)
+        self.hold, self.turn, self.swift, self.calm = hold, turn, swift, calm
+        self.weights = Weights(
+            margin, margin_growth, headway, rear, fade, contact, near, border, off_road, progress, comfort, aside
+        )
+        self.lateral_acceleration, self.braking = lateral_acceleration, braking
+        self.max_acceleration, self.max_braking, self.max_yaw_rate = max_acceleration, max_braking, max_yaw_rate
+        self.use_limits, self.obey_lights, self.see_vrus = use_limits, obey_lights, see_vrus
+
+    def plan(self, world: World) -> Tensor:
+        """The states [B, PLAN_STEPS, 4] of the candidate that costs least."""
+        rows = torch.arange(len(world.step), device=world.step.device).split(CHUNK)
+        return torch.cat([self._plan(take(world, part)) for part in rows])
+
+    def _plan(self, world: World) -> Tensor:
+        candidates = self.candidates(world)
+        best = self.costs(world, candidates).argmin(1)
+        return candidates.states[torch.arange(len(best), device=best.device), best]
+
+    def candidates(self, world: World) -> Candidates:
+        """Every speed profile on every lateral move."""
+        path, start = MissionPath(world), world.states[:, 0]
+        caps = path.speed_caps(
+            self.max_speed, self.lateral_acceleration, self.braking, self.use_limits, self.obey_lights
+        )
+        profiles = start.new_tensor(PROFILES).clamp(-self.max_braking, self.max_acceleration)
+        speed = speed_profiles(start[:, 3], profiles, caps, self.braking + BRAKING_MORE)
+        beside = start.new_tensor(SHIFTS).expand(len(start), -1)
+        shift = torch.cat([beside, beside, path.d[:, None]], 1)
+        time = start.new_tensor([self.swift] * len(SHIFTS) + [self.calm] * len(SHIFTS) + [self.swift])
+        return drive(start, path, speed, shift, time, self.max_yaw_rate)
+
+    def costs(self, world: World, candidates: Candidates) -> Tensor:
+        """Costs [B, C] of candidates."""
+        steps = torch.arange(STRIDE, round(self.horizon / DT) + 1, STRIDE, device=world.step.device)
+        agents, seen = nearest(world, self.agents, self.see_vrus)
+        others = forecast(world, agents, seen, steps * DT, self.hold, self.turn)
+        return score(world, candidates, others, steps, self.weights)
+
+
+def take(world: World, rows: Tensor) -> World:
+    """Scenes rows [b] of a World: what the planner reads, which is nobody's plan or route."""
+    turn = None if world.turn_rate is None else world.turn_rate[rows]
+    scene = world.scene.select(*SCENE_KEYS)[rows]
+    return World(scene, world.step[rows], world.states[rows], world.valid[rows], world.accel[rows], turn_rate=turn)
