@@ -157,7 +157,7 @@ def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(experimen
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["methods=[e3]"], "synthesizer=e3: none of constant_velocity, e2, e2_unbound, idm, nominal, replay; add a file"),
+        (["methods=[e3]"], "synthesizer=e3: none of constant_velocity, e2, e2_unbound, idm, nominal, replay; add a f"),
         (["methods=[]"], r"methods=\[\], seeds=\[0, 1\]: name at least one of each"),
         (["seeds=[]"], r"seeds=\[\]: name at least one"),
         (["seeds=[0.5]"], r"seeds=\[0.5\]: sampling seeds are whole numbers"),

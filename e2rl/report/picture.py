@@ -187,8 +187,8 @@ def contact_text(row: dict) -> str:
 def verdict_text(row: dict) -> str:
     """Whether the collision counts and why, and the duty that the partner broke."""
     reasons = {"ego's fault": row["at_fault"] == 1, "preventable": row["preventable"] == 1}
-    counts = " and ".join(name for name, holds in reasons.items() if holds)
-    return f"{counts or 'does not count'}; duty broken: {row['duty']}"
+    counts = ", ".join(name for name, holds in reasons.items() if holds)
+    return f"{counts or 'does not count'}; {row['duty']}".replace("; none", "; no duty broken")
 
 
 def shorten(name: str, limit: int = 42) -> str:

@@ -168,8 +168,7 @@ class E2(NominalTraffic):
 
     def _with_duty(self, state: E2State, world: World, ego_plan: Tensor, x0: Tensor, context: Context) -> Context:
         """The context whose bounds know what the coalition owes the ego."""
-        planned = self.prior.decode(x0, context).states()
-        known = ego_plan[:, :HORIZON]
+        planned, known = self.prior.decode(x0, context).states(), ego_plan[:, :HORIZON]
         duty = duty_of(self.responsibility, self.care, world, state.coalition, state.eta, planned, known)
         return replace(context, obstacles=replace(context.obstacles, duty=duty))
 

@@ -87,7 +87,8 @@ class Traffic(ABC):
 
     @abstractmethod
     def replan(self, state: State, world: World, ego_plan: Tensor) -> tuple[State, TrafficPlan]:
-        """New state and plan, given the ego's planned states ego_plan [B, >= HORIZON, 4].
+        """New state and plan; ego_plan [B, >= HORIZON, 4]: the states that the ego announces, for a method whose
+        knowledge is its plan.
 
         Called every REPLAN_STEPS steps; the first REPLAN_STEPS steps of a plan are executed unchanged.
         """

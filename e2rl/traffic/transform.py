@@ -23,8 +23,8 @@ class AdversarialSynthesizer(Transform):
     """Draws a pool row for every new episode, injects its scene, and drives its traffic.
 
     Rows with recorded or stored traffic replay it. LIVE rows react: before a step at which a replan is due (every
-    REPLAN_STEPS steps) the traffic method plans against ("ego", "plan") [B, H, 4], which the policy has just written.
-    Without this key, the ego is predicted at constant velocity.
+    REPLAN_STEPS steps) the traffic method plans. It is given ("ego", "plan") [B, H, 4], which the policy has just
+    written (without this key, constant velocity), and may not look at it (`Traffic.knowledge`).
 
     Writes ("traffic", ...): row [B, 1] int64, eta [B, 1], adversary [B, V] bool (under control now) and, with a traffic
     method, plan [B, V, H, 4] (states planned for the coming steps; only for the policy, not stacked over time),
