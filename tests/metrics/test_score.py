@@ -148,8 +148,10 @@ def test_moving_the_world_changes_no_metric():
 
 def test_every_metric_of_the_design_is_summarised_in_its_order():
     rows, features = score_rollouts(random_rollouts(4))
-    assert list(summarise(rows, features, draws=20, realism_draws=5))[:23] == [
+    assert list(summarise(rows, features, draws=20, realism_draws=5))[:27] == [
         "cfr",
+        "cfr_counted",
+        "cfr_preventable",
         "cfr_adv",
         "cfr_vru",
         "cfr_bg",
@@ -158,7 +160,9 @@ def test_every_metric_of_the_design_is_summarised_in_its_order():
         "side",
         "rear",
         "rir",
+        "counted",
         "at_fault",
+        "preventable",
         "relvel",
         "contact_time",
         "min_dtc",

@@ -14,21 +14,19 @@ from tests.prior.small import arc
 CAR = (4.0, 2.0)
 
 
-def traffic(*cars, turn=0.0, exempt=(), yields=(), patience=0.0, cap=None):
+def traffic(*cars, turn=0.0, exempt=(), yields=(), patience=0.0):
     """Vehicles (x, y, heading, speed) on routes of curvature `turn`: decode(cap) at constant speed, state, others.
 
-    exempt, yields: vehicles of such a duty; patience, cap {vehicle: m/s^2}: see Duty.
+    exempt, yields: vehicles of such a duty; patience [m/s^2]: see Duty.
     """
     agents = torch.tensor([cars], dtype=torch.float32)
     routes = torch.stack([arc(x, y, heading, turn) for x, y, heading, _ in cars])[None]
     zero = torch.zeros(1, len(cars))
     state = locate(agents, zero, zero + turn * agents[..., 3], routes, zero + 20.0)
     size = torch.tensor(CAR).expand(1, len(cars), 2)
-    duty = Duty(*(torch.zeros(1, len(cars), dtype=torch.bool) for _ in range(2)), zero + patience, zero + NO_CAP)
+    duty = Duty(*(torch.zeros(1, len(cars), dtype=torch.bool) for _ in range(2)), zero + patience)
     duty.exempt[0, list(exempt)] = True
     duty.yields[0, list(yields)] = True
-    for vehicle, value in (cap or {}).items():
-        duty.cap[0, vehicle] = value
 
     def decode(cap):
         x = torch.zeros(1, len(cars), SIZE)
@@ -100,13 +98,6 @@ def test_a_patient_vehicle_brakes_later_and_harder_and_still_in_time():
 def test_patience_is_for_the_ego_alone():
     cars = (100, 50, 0, 0), (20.0, 0, 0, 0), (0.0, 0, 0, 8)
     assert caps(*traffic(*cars, patience=6.0))[2] == caps(*traffic(*cars))[2] < 0
-
-
-def test_a_cap_is_driven_and_others_react_to_it():
-    cars = (200, 0, 0, 0), (9, 0, 0, 10), (0, 0, 0, 10)
-    free, braking = (bounded(BoundSettings(), *traffic(*cars, cap=cap)) for cap in (None, {1: -6.0}))
-    assert (free.v[0, 1:] == 10).all()
-    assert braking.v[0, 1, 5] < 9 and braking.v[0, 2, 5] < 10
 
 
 def test_absent_vehicles_are_in_nobody_s_way():

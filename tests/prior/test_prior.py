@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from e2rl.prior.bounds import NO_CAP, BoundSettings, Duty
+from e2rl.prior.bounds import BoundSettings, Duty
 from e2rl.prior.lane_relative import HORIZON, SIZE, decode
 from e2rl.prior.prior import Prior, SamplerSettings, plan_to_x
 from e2rl.prior.route_choice import sample_route
@@ -143,7 +143,7 @@ def test_bounds_change_what_is_executed_of_infeasible_plans_and_only_of_them():
     context, nobody = context_of(tight, scene), torch.zeros(scene["route_log"].shape, dtype=torch.bool)
     exempt = nobody.clone()
     exempt[:, 5] = True
-    context.obstacles.duty = Duty(exempt, nobody, torch.zeros_like(free[..., 0]), torch.full_like(free[..., 0], NO_CAP))
+    context.obstacles.duty = Duty(exempt, nobody, torch.zeros_like(free[..., 0]))
     bold = tight.plan(x0, context).motion.v
     assert (shy[0, 5, 2:] < free[0, 5, 2:]).all()
     others = torch.arange(shy.shape[1]) != 5
