@@ -159,18 +159,13 @@ class E2(NominalTraffic):
         off_lane = anchor.off_lane & state.coalition & (state.eta > 0)[:, None]
         state = self._onto(state, world, state.routed.route, off_lane, anchor.off_lane_path)
         context = self.encode(state, world, ego_plan)
+        context.obstacles.duty = duty_of(self.responsibility, self.care, world, state.coalition, state.eta)
         control = self._control(state, self._potential_context(state, world, ego_plan), anchor, group)
         sample = self.prior.sample(context, noise, control, self._budget(state))
         kl, jump = state.path_kl + sample.kl, state.anchor_jump + control.jump
         acts = anchor.feasible & state.coalition
         state = replace(state, path_kl=kl, anchor_jump=jump, committed=acts, knots=anchor.knots)
-        return state, sample.x0, self._with_duty(state, world, ego_plan, sample.x0, context)
-
-    def _with_duty(self, state: E2State, world: World, ego_plan: Tensor, x0: Tensor, context: Context) -> Context:
-        """The context whose bounds know what the coalition owes the ego."""
-        planned, known = self.prior.decode(x0, context).states(), ego_plan[:, :HORIZON]
-        duty = duty_of(self.responsibility, self.care, world, state.coalition, state.eta, planned, known)
-        return replace(context, obstacles=replace(context.obstacles, duty=duty))
+        return state, sample.x0, context
 
     def _budget(self, state: E2State) -> Tensor | None:
         """Path KL [B] that control may still add to each scene."""

@@ -1,7 +1,7 @@
 """The duty of care of adversaries towards the ego (docs/adversaries.md).
 
-full: an adversary gives way to the ego unless its plan keeps the law (margin.py) or the ego follows it; rear:
-adversaries behind the ego brake for it like any driver; none: no adversary does.
+full: an adversary gives way to the ego wherever its plan meets the ego's expected motion, late but in time, unless the
+ego follows it; rear: adversaries behind the ego brake for it like any driver; none: no adversary does.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,6 @@ from e2rl.prior.bounds import Duty
 from e2rl.scene.boxes import to_frame
 from e2rl.settings import check_range
 from e2rl.sim.world import World
-from e2rl.synthesizer.margin import competent_margin
 
 RESPONSIBILITIES = ("full", "rear", "none")
 NEAR = 4.0  # m ahead of the ego's centre from which on a vehicle leads it
@@ -51,36 +50,14 @@ def leading(world: World, vehicles: int) -> Tensor:
     return along & (place[..., 0] > NEAR)
 
 
-def lawful(world: World, coalition: Tensor, planned: Tensor, ego_plan: Tensor) -> Tensor:
-    """Bool [B, V]: members of the coalition whose planned states [B, V, H, 4] a competent driver in the ego's place
-    survives; ego_plan [B, H, 4]: what is known of the ego."""
-    b, v = coalition.nonzero(as_tuple=True)
-    ego = torch.cat([world.states[:, :1], ego_plan], 1)
-    motion = torch.cat([world.states[b, v][:, None], planned[b, v]], 1)
-    size = world.scene["size"]
-    margin = competent_margin(ego[b], size[b, 0], motion, size[b, v])
-    return torch.zeros_like(coalition).index_put((b, v), margin > 0)
-
-
-def duty_of(
-    responsibility: str,
-    settings: CareSettings,
-    world: World,
-    coalition: Tensor,
-    eta: Tensor,
-    planned: Tensor,
-    ego_plan: Tensor,
-) -> Duty:
-    """The Duty of a coalition [B, V] at intensities eta [B].
-
-    planned [B, V, H, 4]: states that adversaries are about to drive; ego_plan [B, H, 4]: what is known of the ego.
-    """
-    vehicles, nobody, zero = coalition.shape[1], torch.zeros_like(coalition), torch.zeros_like(planned[..., 0, 0])
+def duty_of(responsibility: str, settings: CareSettings, world: World, coalition: Tensor, eta: Tensor) -> Duty:
+    """The Duty of a coalition [B, V] at intensities eta [B]."""
+    vehicles, nobody, zero = coalition.shape[1], torch.zeros_like(coalition), torch.zeros_like(eta[:, None] * coalition)
     if responsibility == "none":
         return Duty(coalition, nobody, zero)
     ahead = coalition & (place_of(world, vehicles)[0][..., 0] > 0)
     if responsibility == "rear":
         return Duty(ahead, nobody, zero)
-    free = coalition & (followed(world, vehicles) | lawful(world, coalition, planned, ego_plan))
+    free = coalition & followed(world, vehicles)
     patience = (settings.patience * eta).clamp(max=settings.max_patience)[:, None] * ahead
     return Duty(free, coalition & ~free, patience)
