@@ -20,6 +20,7 @@ NO_CAP = 20.0  # m/s^2: the cap of a vehicle whose plan is feasible
 STRIDE = 3  # steps between the times at which plans are compared
 WAIT = 0.5  # s until a vehicle that waits decides again
 MIN_BRAKING = 0.5  # m/s^2 of a vehicle that must give way
+ALONGSIDE = 0.7  # cosine between the headings of vehicles that touch side by side rather than crossing
 
 
 @dataclass(frozen=True)
@@ -120,10 +121,14 @@ def _meeting_braking(
     driven = (motion.s[..., steps] - state.s[..., None]).gather(-1, first)
     room = (driven - settings.gap - u * DT * (steps[first] + 1)).clamp(min=0.3)
     closing = (state.v[..., None] - u).clamp(min=0)
+    braking = closing**2 / (2 * room)
     if obstacles.duty is not None:
         to_ego = _towards_ego(obstacles.duty, meet[..., 0], yields[..., 0], room[..., 0], closing[..., 0])
         yields = torch.cat([to_ego[..., None], yields[..., 1:]], -1)
-    braking = closing**2 / (2 * room)
+        length = (obstacles.size[:, :vehicles, 0] + obstacles.size[:, :1, 0]) / 2 + settings.gap
+        alike = torch.cos(other[:, :, 0, 2] - own[:, :, 0, 2]) > ALONGSIDE
+        back = falling_back(length - ahead[..., 0], DT * (steps[first[..., 0]] + 1)) * alike
+        braking = torch.cat([torch.maximum(braking[..., 0], back)[..., None], braking[..., 1:]], -1)
     return torch.where(yields, braking.clamp(min=MIN_BRAKING), -NO_CAP).amax(-1)
 
 
@@ -135,6 +140,11 @@ def _towards_ego(duty: Duty, meets: Tensor, yields: Tensor, room: Tensor, closin
     later = room - closing * WAIT
     waits = (closing**2 < 2 * later * duty.patience) & (later > 0)
     return meets & ~duty.exempt & (yields | duty.yields) & ~waits
+
+
+def falling_back(missing: Tensor, time: Tensor) -> Tensor:
+    """Braking by which a vehicle beside another one is `missing` m farther back in `time` s, and so behind it."""
+    return 2 * missing.clamp(min=0) / time**2
 
 
 def _first_meeting(tracks: Tensor, obstacles: Obstacles, aside: float, vehicles: int) -> tuple[Tensor, Tensor]:

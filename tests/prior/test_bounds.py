@@ -95,6 +95,15 @@ def test_a_patient_vehicle_brakes_later_and_harder_and_still_in_time():
     assert -(8**2) / (2 * (room - 2)) < closer < eager
 
 
+def test_who_drifts_into_the_ego_s_side_falls_behind_it_in_time():
+    ego, angle = (0, 0, 0, 10), 0.1
+    drifting = (2.0, -3.0, angle, 10 / math.cos(angle))  # keeps level with the ego and comes nearer at 1 m/s
+    time = contact_time((3.0 - CAR[1] - 0.1 - CAR[0] / 2 * math.sin(angle)) / (10 * math.tan(angle)))
+    cap = caps(*traffic(ego, drifting, yields=[1]), gap=1.0, floor=-50.0)[1]
+    assert cap == pytest.approx(-2 * (CAR[0] + 1.0 + 2.0) / time**2, rel=0.05)
+    assert caps(*traffic(ego, drifting, exempt=[1]))[1] == NO_CAP
+
+
 def test_patience_is_for_the_ego_alone():
     cars = (100, 50, 0, 0), (20.0, 0, 0, 0), (0.0, 0, 0, 8)
     assert caps(*traffic(*cars, patience=6.0))[2] == caps(*traffic(*cars))[2] < 0
