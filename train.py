@@ -23,7 +23,7 @@ def evolve(config: DictConfig, folder: Path) -> None:
     scenes = load_scenes(config.data, config.num_scenes, split="train")
     prior, origin = build_prior(config, config.device)
     traffic, ego = build_traffic(config.synthesizer, prior), build_ego(config)
-    run, logger = build_evolution(config, scenes, ego, traffic), build_logger(config, folder)
+    run, logger = build_evolution(config, scenes, ego, traffic, folder=folder), build_logger(config, folder)
     measure = build_measure(config, ego, HydraConfig.get().runtime.choices["ego"], traffic, prior, folder)
     done = load_checkpoint(config.resume, run) if config.resume else 0
     if done == 0:
@@ -33,12 +33,13 @@ def evolve(config: DictConfig, folder: Path) -> None:
         metrics = run.run_round()
         logger.log(metrics, number)
         save_checkpoint(folder, run, resolved(config), config.keep_last)
-        speed = metrics.get("time/steps_per_second")
+        speed, waiting = metrics.get("time/steps_per_second"), metrics.get("time/waiting")
         print(
-            f"round {number + 1}/{config.rounds}: eta {metrics['curriculum/eta']:.2f}, adversarial collisions "
+            f"round {number + 1}/{config.rounds}: eta {metrics['synthesizer/eta']:.2f}, adversarial collisions "
             f"{metrics.get('synthesizer/contact', float('nan')):.0%} in {metrics['synthesizer/scenes']:.0f} scenes "
             f"({metrics['synthesizer/left_out']:.0f} left out: no way found to avoid them), "
             f"{metrics['time/synthesize']:.0f} s synthesis, {metrics['time/improve']:.0f} s learning"
+            + (f", {waiting:.0f} s waiting" if waiting is not None else "")
             + (f", collected at {speed:.0f} steps/s" if speed else ""),
             flush=True,
         )

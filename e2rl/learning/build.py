@@ -10,12 +10,15 @@ from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError
 from e2rl.evaluation.protocol import Method, Setup
+from e2rl.learning.ahead import check_ahead
+from e2rl.learning.attack import Synthesize
 from e2rl.learning.before_after import BeforeAfter
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
-from e2rl.learning.evolution import Evolution, RoundSettings, Synthesize
+from e2rl.learning.evolution import Evolution, RoundSettings
 from e2rl.learning.imitation import ImitationSettings, imitate, recorded_pairs
 from e2rl.learning.improvement import Improvement
 from e2rl.learning.logging import RunLogger
+from e2rl.learning.memory import Memory
 from e2rl.learning.solvability import solvable
 from e2rl.prior.prior import Prior
 from e2rl.scene.scene import SceneSet
@@ -26,24 +29,32 @@ from e2rl.traffic.traffic import Traffic
 
 
 def build_evolution(
-    config: DictConfig, scenes: SceneSet, ego: Ego, traffic: Traffic, synthesize: Synthesize | None = None
+    config: DictConfig,
+    scenes: SceneSet,
+    ego: Ego,
+    traffic: Traffic,
+    synthesize: Synthesize | None = None,
+    folder: Path | None = None,
 ) -> Evolution:
     """An Evolution of `ego` against `traffic` by config.learner and config.curriculum over config.rounds rounds.
 
-    synthesize: makes D'; default: closed-loop rollouts with `traffic`.
+    synthesize: makes D'; default: closed-loop rollouts with `traffic`. folder: of the run, where D' is remembered;
+    default: a temporary one.
     """
     sim, seed = build_sim(config), config.seed
     synthesize = synthesize or synthesize_traffic(scenes, traffic, sim, config.batch, config.device)
     given = {"num_scenes": len(scenes), "rounds": config.rounds, "seed": seed}
     curriculum = built(config.curriculum, "curriculum", CurriculumScheduler, **given)
     settings = settings_of(RoundSettings, config.learner.round, "learner.round")
+    if settings.ahead:
+        check_ahead(str(config.device), config.threads)
     learner = OmegaConf.create({key: value for key, value in config.learner.items() if key != "round"})
     parameters = {key: value for key, value in resolved(config.ego).items() if key != "_target_"}
     live = traffic if settings.traffic == "live" else None
     given = {"ego": ego, "parameters": parameters, "scenes": scenes, "sim": sim, "traffic": live, "seed": seed}
     improve = built(learner, "learner", Improvement, device=config.device, **given)
     keep = partial(solvable, scenes=scenes, sim=sim) if curriculum.solvable_only else None
-    return Evolution(curriculum, improve, synthesize, settings, seed, keep)
+    return Evolution(curriculum, improve, synthesize, settings, seed, keep, Memory(folder, settings.memory))
 
 
 def build_logger(config: DictConfig, folder: Path) -> RunLogger:

@@ -2,7 +2,7 @@
 
 A checkpoint is a folder checkpoints/round-000002 of state.pt (optimiser, curriculum, sampler, counters, generators;
 read with weights_only), actor.safetensors (weights and observation statistics; also what `ego.checkpoint` takes),
-traffic.safetensors (the last D') and config.json.
+memory.json (the rounds in memory, whose traffic stays in memory/ beside checkpoints/) and config.json.
 """
 
 import json
@@ -13,18 +13,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
 
 from e2rl.ego.actor import ActorEgo
 from e2rl.ego.network import WEIGHTS
 from e2rl.errors import InputError
 from e2rl.learning.evolution import Evolution
 
-STATE, TRAFFIC, CONFIG, FORMAT = "state.pt", "traffic.safetensors", "config.json", "e2rl-checkpoint/1"
+STATE, MEMORY, CONFIG, FORMAT = "state.pt", "memory.json", "config.json", "e2rl-checkpoint/2"
 
 
 def save_checkpoint(folder: Path, run: Evolution, config: dict, keep_last: int = 2) -> Path:
-    """Write checkpoints/round-<rounds done> under a run's folder; only the keep_last newest are kept."""
+    """Write checkpoints/round-<rounds done> under a run's folder; only the keep_last newest are kept, and of the memory
+    the files that these name."""
     parent = Path(folder) / "checkpoints"
     parent.mkdir(parents=True, exist_ok=True)
     target, partial = parent / f"round-{run.round:06d}", parent / f".partial-{os.getpid()}"
@@ -35,14 +35,27 @@ def save_checkpoint(folder: Path, run: Evolution, config: dict, keep_last: int =
     torch.save(state, partial / STATE)
     if isinstance(run.ego, ActorEgo):
         run.ego.network.save(partial / WEIGHTS)
-    stored = {key: value.detach().cpu().contiguous() for key, value in run.traffic.items() if torch.is_tensor(value)}
-    save_file(stored, partial / TRAFFIC)
+    (partial / MEMORY).write_text(json.dumps(run.memory.index()))
     (partial / CONFIG).write_text(json.dumps(config, indent=1, sort_keys=True))
     shutil.rmtree(target, ignore_errors=True)
     partial.replace(target)
-    for old in sorted(parent.glob("round-*"))[: -max(1, keep_last)]:
+    *older, newest = sorted(parent.glob("round-*"))
+    kept = [*older, newest][-max(1, keep_last) :]
+    for old in set(older) - set(kept):
         shutil.rmtree(old)
+    first = [entry["round"] for folder in kept for entry in _memory_index(folder)]
+    run.memory.prune(min(first, default=0))  # a file goes when no checkpoint names it any more
     return target
+
+
+def _memory_index(folder: Path) -> list[dict[str, int]]:
+    """The rounds in memory by a checkpoint; InputError where its file is missing or damaged."""
+    file = folder / MEMORY
+    try:
+        index = json.loads(file.read_text())
+        return [{"round": int(entry["round"]), "crc32": int(entry["crc32"])} for entry in index]
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{file}: damaged ({type(error).__name__}); resume from an older checkpoint") from error
 
 
 def latest_checkpoint(path: str | Path) -> Path:
@@ -75,7 +88,7 @@ def load_checkpoint(path: str | Path, run: Evolution) -> int:
             f"{file}: its learner is of another kind or shape ({error}); resume with the configuration "
             f"in {folder / CONFIG}"
         ) from None
-    run.traffic = load_file(folder / TRAFFIC)
+    run.memory.restore(_memory_index(folder))
     restore_generators(state["generators"])
     return run.round
 

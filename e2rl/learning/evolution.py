@@ -1,23 +1,26 @@
 """Algorithm 1: rounds of drawing scenes, attacking the current ego in them, improving it, and moving the curriculum."""
 
+import copy
 import time
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import Ego
+from e2rl.errors import InputError
+from e2rl.learning.ahead import Ahead
+from e2rl.learning.attack import Order, Solvable, Synthesize, make_traffic
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
 from e2rl.learning.episodes import Episodes
 from e2rl.learning.improvement import Improvement
-from e2rl.settings import check_choice
+from e2rl.learning.memory import Memory
+from e2rl.settings import check_choice, check_range
 from e2rl.traffic.pool import TrafficPool
 
 NOMINAL, TRAFFIC = ("prior", "log", "none"), ("replay", "live")
 NOISES = 16  # rows per scene in live traffic, each with its own noise
-Synthesize = Callable[[Ego, Tensor, float, int], Mapping[str, Tensor]]
-Solvable = Callable[[Mapping[str, Tensor]], Tensor]
 
 
 @dataclass(frozen=True)
@@ -27,29 +30,39 @@ class RoundSettings:
     scenes: int = 64
     nominal: str = "prior"
     traffic: str = "replay"
+    memory: int = 4096
+    fresh: float = 3.0
+    ahead: bool = False
 
     def __post_init__(self) -> None:
         check_choice("learner.round.nominal", self.nominal, NOMINAL)
         check_choice("learner.round.traffic", self.traffic, TRAFFIC)
+        check_range("learner.round.fresh", self.fresh, 1)
+        if self.ahead and self.traffic == "live":
+            raise InputError("learner.round.ahead=true: live traffic is not synthesized beforehand; set it to false")
 
 
 @dataclass
 class Attack:
     """The traffic of a round: the pool, scenes [L] left out of it, and metrics; contact: the attacked ego's contact
-    rate, None if unknown before the episodes are driven."""
+    rate, None if unknown before the episodes are driven; spent: seconds."""
 
     pool: TrafficPool
     left_out: Tensor
     metrics: dict[str, float]
+    spent: dict[str, float]
     contact: float | None = None
 
 
 class Evolution:
-    """The state of a run: curriculum, improvement (which holds the ego) and the last round's D'.
+    """The state of a run: curriculum, improvement (which holds the ego) and the memory of D'.
 
-    synthesize(ego, scene_index [S], eta, seed) -> {scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N],
+    synthesize(ego, scene_index [S], eta [S], seed) -> {scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N],
     adversaries [S, N] bool, contact [S] bool}: closed-loop traffic against that ego; contact: it was hit.
-    solvable(traffic) -> bool [S]: rows that enter D' (None: all).
+    solvable(traffic) -> bool [S]: rows that enter D' (None: all). memory: None: in a temporary folder.
+
+    With `settings.ahead`, scenes, intensities and ego of the next round's D' are fixed just before a round's learning,
+    and it is made in another process meanwhile. What the curriculum learns from a round then acts two rounds later.
     """
 
     def __init__(
@@ -60,11 +73,19 @@ class Evolution:
         settings: RoundSettings,
         seed: int = 0,
         solvable: Solvable | None = None,
+        memory: Memory | None = None,
     ) -> None:
+        """Raises InputError for `settings.ahead` and an ego whose weights cannot be handed over."""
+        if settings.ahead and not isinstance(improve.ego, ActorEgo):
+            raise InputError(
+                f"learner.round.ahead=true: works with ego=actor, not {type(improve.ego).__name__}; set it to false"
+            )
         self.curriculum, self.improve, self.synthesize = curriculum, improve, synthesize
         self.settings, self.seed, self.solvable = settings, seed, solvable
-        self.traffic: dict[str, Tensor] = {}
+        self.memory = memory or Memory(None, settings.memory)
         self.episodes: Episodes | None = None
+        self._next: Order | None = None  # of the coming round, if fixed already
+        self._ahead: Ahead | None = None  # what makes it, if begun already
 
     @property
     def ego(self) -> Ego:
@@ -78,54 +99,93 @@ class Evolution:
 
     def run_round(self) -> dict[str, float]:
         """One round; returns its metrics, named by group (train/, curriculum/, synthesizer/, time/)."""
+        order, self._next = self._next or self._order(self.round), None
+        state = self.curriculum.summary()
+        attack = self._live(order) if self.settings.traffic == "live" else self._stored(order)
+        if self.settings.ahead:
+            self._begin_next()
         begin = time.perf_counter()
-        scenes = self.curriculum.draw(self.settings.scenes)
-        state, seed = self.curriculum.summary(), self.seed * 1_000_003 + self.round
-        attack = self._live(scenes, seed) if self.settings.traffic == "live" else self._synthesized(scenes, seed)
-        synthesized = time.perf_counter()
         learned, self.episodes = self.improve(attack.pool, self.curriculum)
-        spent = {"synthesize": synthesized - begin, "improve": time.perf_counter() - synthesized}
+        spent = attack.spent | {"improve": time.perf_counter() - begin}
         spent |= {name: learned.pop(name) for name in ("collect", "steps_per_second") if name in learned}
         self.curriculum.update(self.episodes.scene_index, self.episodes.returns, self.episodes.adversarial)
         self.curriculum.leave_out(attack.left_out)
         contact = learned.get("contact_adversarial") if attack.contact is None else attack.contact
         self.curriculum.advance(contact)
-        attacked = {"scenes": float(len(scenes)), "left_out": float(len(attack.left_out)), **attack.metrics}
+        attacked = {"scenes": float(len(order.scenes)), "eta": order.eta.mean().item()}
+        attacked |= {"left_out": float(len(attack.left_out)), "memory_rows": float(self.memory.rows)}
+        attacked |= {"fresh_draws": attack.pool.fresh[self.episodes.row].float().mean().item(), **attack.metrics}
         attacked |= {} if contact is None else {"contact": contact}
         groups = {"curriculum": state, "train": learned, "synthesizer": attacked, "time": spent}
         return {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
 
-    def _synthesized(self, scenes: Tensor, seed: int) -> Attack:
-        """D' against the current ego, without rows that no driver survives, and nominal traffic."""
-        eta = self.curriculum.eta
-        traffic = self.synthesize(self.ego, scenes, eta, seed)
-        kept = torch.ones_like(traffic["contact"]) if self.solvable is None else self.solvable(traffic)
-        self.traffic = {name: value[kept] for name, value in traffic.items()}
-        pool = TrafficPool.stored(self.traffic, eta)
-        if self.settings.nominal == "prior":
-            pool = pool + TrafficPool.stored(self.synthesize(self.ego, scenes, 0.0, seed), 0.0)
-        elif self.settings.nominal == "log" or not len(pool):  # without nominal traffic the pool may be empty
-            pool = pool + TrafficPool.recorded(scenes)
-        attacked = traffic["adversaries"].any(-1).float().mean().item()
-        left_out, contact = traffic["scene_index"][~kept], traffic["contact"].float().mean().item()
-        return Attack(pool, left_out, {"attacked": attacked}, contact)
+    def _order(self, number: int) -> Order:
+        """What is to be synthesized for a round, as the curriculum and the ego are now."""
+        scenes = self.curriculum.draw(self.settings.scenes)
+        ego = copy.deepcopy(self.ego) if self.settings.ahead else self.ego  # learning changes weights in place
+        return Order(number, scenes, self.curriculum.etas(scenes), self.seed * 1_000_003 + number, ego)
 
-    def _live(self, scenes: Tensor, seed: int) -> Attack:
+    def _begin_next(self) -> None:
+        """Fix the next round's order; begin on it if the run has such a round."""
+        self._next = self._order(self.round + 1)
+        if self.round + 1 < self.curriculum.rounds:
+            self._ahead = self._begin(self._next)
+
+    def _begin(self, order: Order) -> Ahead:
+        name = f"round {order.number + 1}: synthesis beside learning failed, checkpoints remain (resume=RUN_DIR)"
+        return Ahead(lambda: self._make(order), name)
+
+    def _make(self, order: Order) -> None:
+        """Write the traffic of an order into the memory's folder."""
+        traffic = make_traffic(order, self.synthesize, self.solvable, self.settings.nominal == "prior")
+        self.memory.write(order.number, traffic)
+
+    def _stored(self, order: Order) -> Attack:
+        """D' of an order joined with the memory, and nominal traffic."""
+        begin = time.perf_counter()
+        if self.settings.ahead:
+            at_work, self._ahead = self._ahead or self._begin(order), None
+            spent = {"synthesize": at_work.wait(), "waiting": time.perf_counter() - begin}
+        else:
+            self._make(order)
+            spent = {"synthesize": time.perf_counter() - begin}
+        traffic = self.memory.take(order.number)
+        pool = self.memory.pool(self.settings.fresh)
+        if self.settings.nominal == "log" or not len(pool):  # without nominal traffic the pool may be empty
+            pool = pool + TrafficPool.recorded(order.scenes)
+        metrics = {"attacked": traffic["attacked"].item()}
+        return Attack(pool, traffic["left_out"], metrics, spent, traffic["contact"].item())
+
+    def _live(self, order: Order) -> Attack:
         """Rows whose traffic is replanned against the learning ego, attacked and nominal."""
-        index = scenes.repeat(NOISES)
-        noise = index + (seed * NOISES + torch.arange(NOISES).repeat_interleave(len(scenes))) * 1_000_003
-        pool = TrafficPool.live(index, torch.full((len(index),), float(self.curriculum.eta)), noise)
+        index, eta = order.scenes.repeat(NOISES), order.eta.repeat(NOISES)
+        noise = index + (order.seed * NOISES + torch.arange(NOISES).repeat_interleave(len(order.scenes))) * 1_000_003
+        pool = TrafficPool.live(index, eta, noise)
         if self.settings.nominal == "prior":
-            pool = pool + TrafficPool.live(index, torch.zeros(len(index)), noise)
+            pool = pool + TrafficPool.live(index, torch.zeros_like(eta), noise)
         elif self.settings.nominal == "log":
-            pool = pool + TrafficPool.recorded(scenes)
-        return Attack(pool, scenes[:0], {})
+            pool = pool + TrafficPool.recorded(order.scenes)
+        return Attack(pool, order.scenes[:0], {}, {"synthesize": 0.0})
 
     def state_dict(self) -> dict:
-        """Curriculum and improvement; the checkpoint adds weights, traffic and generators."""
-        return {"curriculum": self.curriculum.state_dict(), "improvement": self.improve.state_dict()}
+        """Curriculum, improvement and the order of the coming round; the checkpoint adds weights, the memory's index
+        and generators."""
+        state = {"curriculum": self.curriculum.state_dict(), "improvement": self.improve.state_dict(), "next": None}
+        if self._next is not None:
+            order, ego = self._next, self._next.ego
+            assert isinstance(ego, ActorEgo)
+            weights = {name: value.detach().cpu() for name, value in ego.network.weights().items()}
+            given = {"number": order.number, "scenes": order.scenes, "eta": order.eta, "seed": order.seed}
+            state["next"] = given | {"weights": weights}
+        return state
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`."""
         self.curriculum.load_state_dict(state["curriculum"])
         self.improve.load_state_dict(state["improvement"])
+        self._next = self._ahead = None
+        if state["next"] is not None:
+            given, ego = dict(state["next"]), copy.deepcopy(self.ego)
+            assert isinstance(ego, ActorEgo)
+            ego.network.set_weights(given.pop("weights"))
+            self._next = Order(ego=ego, **given)

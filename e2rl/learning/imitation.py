@@ -71,9 +71,9 @@ def recorded_pairs(scenes: SceneSet, sim: SimSettings, settings: ImitationSettin
 
 
 def corrective_pairs(driver: PoolDriver, teacher: Ego, pool: TrafficPool) -> TensorDict:
-    """Pairs [M] of the teacher's episodes in the pool's adversarial rows that it survives (Algorithm 1's corrective
-    supervision); empty if it survives none."""
-    adversarial = pool.adversarial.nonzero()[:, 0]
+    """Pairs [M] of the teacher's episodes in the pool's fresh adversarial rows that it survives (Algorithm 1's
+    corrective supervision); empty if it survives none."""
+    adversarial = (pool.adversarial & pool.fresh).nonzero()[:, 0]
     parts = []
     for picked in filled_batches(len(adversarial), driver.env.batch_size[0]):
         rows = adversarial[picked]
@@ -82,7 +82,7 @@ def corrective_pairs(driver: PoolDriver, teacher: Ego, pool: TrafficPool) -> Ten
         frames["alive"] = frames["alive"] & survived[:, None]
         parts.append(_pairs(frames, "executed", pool.scene_index[rows], driver.env))
     if not parts:
-        raise InputError("corrective supervision: the pool holds no adversarial traffic")
+        raise InputError("corrective supervision: the pool holds no fresh adversarial traffic")
     return torch.cat(parts)
 
 

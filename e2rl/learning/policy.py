@@ -140,7 +140,7 @@ class PolicyImprovement(Improvement):
         return metrics | episodes.summary() | counts, episodes
 
     def _expert(self, pool: TrafficPool) -> TensorDictBase | None:
-        if self.teacher is None or not bool((pool.adversarial & (pool.source >= 0)).any()):
+        if self.teacher is None or not bool((pool.adversarial & pool.fresh & (pool.source >= 0)).any()):
             return self.expert
         pairs = corrective_pairs(self.driver, self.teacher, pool).select(*EXPERT_KEYS)
         return pairs if self.expert is None else torch.cat([self.expert, pairs.to(self.expert.device)])

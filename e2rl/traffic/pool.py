@@ -1,8 +1,9 @@
 """The pool of episodes: scenes with recorded traffic, stored traffic (D'), or reactive traffic."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,22 +13,31 @@ from e2rl.errors import InputError
 RECORDED, LIVE = -1, -2  # sources of a row's traffic that is not a position in the stored traffic
 
 
+class StoredTraffic(NamedTuple):
+    """Tracks in memory or mapped from a file: states [D, T+1, N, 4], valid [D, T+1, N], adversaries [D, N] bool."""
+
+    states: Tensor
+    valid: Tensor
+    adversaries: Tensor
+
+
 @dataclass
 class TrafficPool:
     """R rows, each a scene with its traffic.
 
     scene_index [R] int64; source [R] int64: position in the stored traffic, RECORDED: the log is replayed, LIVE: a
     traffic method replans it against the ego; eta [R]: adversarial intensity, 0: none; seed [R] int64: of the noise
-    of LIVE rows. Stored: states [D, T+1, N, 4], valid [D, T+1, N], adversaries [D, N] bool.
+    of LIVE rows; weight [R]: in draws; fresh [R] bool: made for this round, not remembered from an earlier one.
+    parts: the stored traffic, of equal T and N; positions count through all parts. Joined pools share the tracks.
     """
 
     scene_index: Tensor
     source: Tensor
     eta: Tensor
     seed: Tensor
-    states: Tensor | None = None
-    valid: Tensor | None = None
-    adversaries: Tensor | None = None
+    weight: Tensor
+    fresh: Tensor
+    parts: list[StoredTraffic] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.scene_index)
@@ -37,49 +47,62 @@ class TrafficPool:
         """Bool [R]: rows with an adversary."""
         return self.eta > 0
 
-    @property
-    def tracks(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The stored states, valid and adversaries of a pool with stored traffic."""
-        assert self.states is not None and self.valid is not None and self.adversaries is not None
-        return self.states, self.valid, self.adversaries
+    @cached_property
+    def adversaries(self) -> Tensor:
+        """Bool [D, N] of all stored traffic; unlike the tracks they are small, and every step reads them."""
+        return torch.cat([part.adversaries for part in self.parts])
+
+    @cached_property
+    def _ends(self) -> Tensor:
+        return torch.tensor([len(part.states) for part in self.parts]).cumsum(0)
+
+    def tracks(self, at: Tensor) -> tuple[Tensor, Tensor]:
+        """Stored states [b, T+1, N, 4] and valid [b, T+1, N] at positions [b]; only these are read."""
+        first, number = self.parts[0], torch.bucketize(at, self._ends, right=True)
+        states = first.states.new_empty(len(at), *first.states.shape[1:])
+        valid = first.valid.new_empty(len(at), *first.valid.shape[1:])
+        for k in number.unique().tolist():
+            part, rows = self.parts[k], (number == k).nonzero()[:, 0]
+            inside = at[rows] - (self._ends[k] - len(part.states))
+            states[rows], valid[rows] = part.states[inside], part.valid[inside]
+        return states, valid
 
     @staticmethod
     def recorded(scene_index: Tensor) -> "TrafficPool":
         """Rows that replay the recordings of scenes [R]."""
-        zero = torch.zeros(len(scene_index))
-        return TrafficPool(scene_index, torch.full((len(zero),), RECORDED), zero, zero.long())
+        return _rows(scene_index, RECORDED, torch.zeros(len(scene_index)))
 
     @staticmethod
     def live(scene_index: Tensor, eta: Tensor, seed: Tensor) -> "TrafficPool":
         """Rows of scenes [R] whose traffic is replanned against the ego; eta [R], seed [R]."""
-        return TrafficPool(scene_index, torch.full((len(scene_index),), LIVE), eta, seed)
+        return _rows(scene_index, LIVE, eta, seed)
 
     @staticmethod
-    def stored(traffic: Mapping[str, Tensor], eta: float) -> "TrafficPool":
-        """Rows of a synthesizer's traffic at one intensity: scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N]
-        and adversaries [S, N] bool. Raises InputError for a missing key."""
+    def stored(traffic: Mapping[str, Tensor], eta: Tensor | float) -> "TrafficPool":
+        """Rows of a synthesizer's traffic at intensities eta [S], or one for all: scene_index [S], states
+        [S, T+1, N, 4], valid [S, T+1, N] and adversaries [S, N] bool. Raises InputError for a missing key."""
         missing = {"scene_index", "states", "valid", "adversaries"} - set(traffic)
         if missing:
             raise InputError(f"synthesized traffic lacks {', '.join(sorted(missing))}; return them from synthesize()")
+        part = StoredTraffic(*(traffic[name].cpu() for name in StoredTraffic._fields))
         index = traffic["scene_index"].cpu()
-        count = len(index)
-        tracks = (traffic[name].cpu() for name in ("states", "valid", "adversaries"))
-        rows = torch.arange(count)
-        return TrafficPool(index, rows, torch.full((count,), float(eta)), torch.zeros_like(rows), *tracks)
+        pool = _rows(index, RECORDED, torch.as_tensor(eta, dtype=torch.float32).cpu().expand(len(index)))
+        pool.source, pool.parts = torch.arange(len(index)), [part]
+        return pool
 
     def __add__(self, other: "TrafficPool") -> "TrafficPool":
         """Both pools' rows, this one's first."""
-        count = 0 if self.states is None else len(self.states)
-        source = torch.where(other.source >= 0, other.source + count, other.source)
-        parts = {field.name: (getattr(self, field.name), getattr(other, field.name)) for field in fields(self)}
-        parts["source"] = (self.source, source)
-        joined: dict[str, Any] = {name: _joined(*pair) for name, pair in parts.items()}
-        return TrafficPool(**joined)
+        count = sum(len(part.states) for part in self.parts)
+        moved = torch.where(other.source >= 0, other.source + count, other.source)
+        names = ("scene_index", "eta", "seed", "weight", "fresh")
+        joined = {name: torch.cat([getattr(self, name), getattr(other, name)]) for name in names}
+        return TrafficPool(source=torch.cat([self.source, moved]), parts=self.parts + other.parts, **joined)
 
     def probabilities(self, priority: Tensor, share: float) -> Tensor:
-        """Draw probability [R] of each row: adversarial rows have total probability `share`; within a kind, rows are
-        weighted by the priority [S] of their scene. If one kind has no rows, the other has probability 1."""
-        weight = priority.cpu().double()[self.scene_index].clamp(min=1e-12)
+        """Draw probability [R] of each row: adversarial rows have total probability `share`; within a kind it is in
+        proportion to the row's weight times the priority [S] of its scene. If one kind has no rows, the other has
+        probability 1."""
+        weight = self.weight * priority.cpu().double()[self.scene_index].clamp(min=1e-12)
         result = torch.zeros(len(self), dtype=torch.float64)
         for kind, part in ((True, share), (False, 1 - share)):
             rows = self.adversarial == kind
@@ -88,7 +111,8 @@ class TrafficPool:
         return result
 
 
-def _joined(first: Tensor | None, second: Tensor | None) -> Tensor | None:
-    if first is None or second is None:
-        return second if first is None else first
-    return torch.cat([first, second])
+def _rows(scene_index: Tensor, source: int, eta: Tensor, seed: Tensor | None = None) -> TrafficPool:
+    """Fresh rows of weight 1 from one source."""
+    like = torch.zeros(len(scene_index), dtype=torch.int64)
+    seed = like if seed is None else seed
+    return TrafficPool(scene_index, like + source, eta, seed, torch.ones(len(like)), torch.ones_like(like).bool())

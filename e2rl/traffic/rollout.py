@@ -98,16 +98,16 @@ def red_lights(tracks: dict[str, Tensor], scene: TensorDictBase, route: Tensor) 
 
 
 def synthesize_traffic(scenes: SceneSet, traffic: Traffic, sim: SimSettings, batch: int = 64, device: str = "cpu"):
-    """A function (ego, scene_index [S], eta, seed) -> the D' of Algorithm 1 against that ego.
+    """A function (ego, scene_index [S], eta [S] or one for all, seed) -> the D' of Algorithm 1 against that ego.
 
     D': scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N], adversaries [S, N], contact [S] (the ego touched a
     vehicle).
     """
 
-    def synthesize(ego: Ego, scene_index: Tensor, eta: float, seed: int) -> dict[str, Tensor]:
-        parts = []
-        for rows in scene_index.split(batch):
-            noise, intensity = rows + seed * 1_000_003, torch.full((len(rows),), float(eta))
+    def synthesize(ego: Ego, scene_index: Tensor, eta: Tensor | float, seed: int) -> dict[str, Tensor]:
+        parts, etas = [], torch.as_tensor(eta, dtype=torch.float32).expand(len(scene_index))
+        for rows, intensity in zip(scene_index.split(batch), etas.split(batch), strict=True):
+            noise = rows + seed * 1_000_003
             parts.append(roll_out(scenes, rows, noise, intensity, ego, traffic, sim, device))
         names = ("states", "valid", "adversaries", "contact")
         return {"scene_index": scene_index} | {name: torch.cat([part[name] for part in parts]) for name in names}

@@ -69,9 +69,7 @@ class AdversarialSynthesizer(Transform):
         source = self.pool.source[self._drawn[rows]]
         stored = source >= 0
         if bool(stored.any()):
-            at = source[stored]
-            states, valid, _ = self.pool.tracks
-            self._env.set_traffic(rows[stored].to(self._env.device), states[at], valid[at])
+            self._env.set_traffic(rows[stored].to(self._env.device), *self.pool.tracks(source[stored]))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         if self.traffic is not None:
@@ -174,7 +172,7 @@ class AdversarialSynthesizer(Transform):
         vehicles = env.scene["route_log"].shape[1]
         adversaries = torch.zeros(len(source), vehicles, dtype=torch.bool)
         if bool((source > RECORDED).any()):
-            stored = self.pool.tracks[2][source.clamp(min=0), :vehicles]
+            stored = self.pool.adversaries[source.clamp(min=0), :vehicles]
             adversaries = torch.where((source > RECORDED)[:, None], stored, adversaries)
         return adversaries.to(env.device)
 

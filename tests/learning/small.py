@@ -5,6 +5,7 @@ import torch
 from e2rl.ego.actor import ActorEgo
 from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
 from e2rl.learning.evolution import Evolution, RoundSettings
+from e2rl.learning.memory import Memory
 from e2rl.learning.policy import PolicyImprovement
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.traffic import Traffic, TrafficPlan, keep_velocity
@@ -24,17 +25,12 @@ def brake_check(scenes):
         states, valid = scene["logged"].clone(), scene["logged_valid"].clone()
         time = 0.1 * torch.arange(states.shape[1])
         speed = states[:, :1, 0, 3] / 2
-        states[:, :, 1, 0] = states[:, :1, 0, 0] + 40 / (1 + eta) + speed * time
+        eta = torch.as_tensor(eta, dtype=torch.float32).expand(len(index))
+        states[:, :, 1, 0] = states[:, :1, 0, 0] + 40 / (1 + eta[:, None]) + speed * time
         states[:, :, 1, 1], states[:, :, 1, 3] = 0.0, speed
         adversaries = torch.zeros(len(index), states.shape[2], dtype=torch.bool)
         adversaries[:, 1] = eta > 0
-        return {
-            "scene_index": index,
-            "states": states,
-            "valid": valid,
-            "adversaries": adversaries,
-            "contact": torch.full((len(index),), eta > 1),
-        }
+        return {"scene_index": index, "states": states, "valid": valid, "adversaries": adversaries, "contact": eta > 1}
 
     return synthesize
 
@@ -56,8 +52,23 @@ class Ambush(Traffic):
         return state, TrafficPlan(states, present, adversary=acting)
 
 
-def small_run(seed=0, hidden=(16,), nominal="log", rounds=4, scenes=None, collect=None, live=None, expert=None, **ppo):
-    """live: a method that drives the traffic against the learning policy; expert: settings of what is cloned."""
+def small_run(
+    seed=0,
+    hidden=(16,),
+    nominal="log",
+    rounds=4,
+    scenes=None,
+    collect=None,
+    live=None,
+    expert=None,
+    spread=0.0,
+    folder=None,
+    memory=4096,
+    ahead=False,
+    **ppo,
+):
+    """live: a method that drives the traffic against the learning policy; expert: settings of what is cloned; folder:
+    of the run, where `memory` rows are remembered."""
     torch.manual_seed(seed)
     scenes = scenes or small_scenes()
     improve = PolicyImprovement(
@@ -70,6 +81,7 @@ def small_run(seed=0, hidden=(16,), nominal="log", rounds=4, scenes=None, collec
         ppo={"minibatch": 64, "epochs": 2, "critic_warmup": 0, "target_kl": 1.0} | ppo,
         **(expert or {}),
     )
-    settings = RoundSettings(scenes=3, nominal=nominal, traffic="replay" if live is None else "live")
-    curriculum = AdaptiveCurriculum(len(scenes), rounds, seed)
-    return Evolution(curriculum, improve, brake_check(scenes), settings, seed)
+    traffic = "replay" if live is None else "live"
+    settings = RoundSettings(scenes=3, nominal=nominal, traffic=traffic, memory=memory, ahead=ahead)
+    curriculum = AdaptiveCurriculum(len(scenes), rounds, seed, spread=spread)
+    return Evolution(curriculum, improve, brake_check(scenes), settings, seed, memory=Memory(folder, memory))

@@ -52,9 +52,9 @@ def config_of(*overrides):
     return load_config("train", ["rounds=2", "learner.round.scenes=2", *overrides])
 
 
-def built(config):
+def built(config, folder=None):
     scenes = small_scenes(3)
-    return build_evolution(config, scenes, build_ego(config), Ambush(), brake_check(scenes))
+    return build_evolution(config, scenes, build_ego(config), Ambush(), brake_check(scenes), folder)
 
 
 @pytest.mark.parametrize("curriculum", CURRICULA)
@@ -75,7 +75,7 @@ def test_planner_learner():
 def test_live_traffic_needs_no_stored_one():
     config = config_of("learner.round.traffic=live", *POLICY)
     run = build_evolution(config, small_scenes(3), build_ego(config), Ambush())
-    assert run.run_round()["synthesizer/contact"] > 0 and not run.traffic
+    assert run.run_round()["synthesizer/contact"] > 0 and not run.memory.rows
 
 
 def test_without_a_synthesizer_given_the_traffic_method_attacks():
@@ -83,18 +83,18 @@ def test_without_a_synthesizer_given_the_traffic_method_attacks():
     run = build_evolution(config, small_scenes(3), build_ego(config), Ambush())
     metrics = run.run_round()
     assert metrics["synthesizer/attacked"] == metrics["synthesizer/contact"] == 1.0
-    assert len(run.traffic["scene_index"]) == 2
+    assert run.memory.rows == 2
 
 
 def test_a_curriculum_of_ones_own_is_built_and_resumed(tmp_path):
     config = config_of(*POLICY)
     with open_dict(config):
         config.curriculum = {"_target_": f"{__name__}.Doubling", "first": 0.25, "staleness": 0.5}
-    run = built(config)
+    run = built(config, tmp_path)
     assert isinstance(run.curriculum, Doubling) and run.curriculum.staleness == 0.5
     assert run.run_round()["curriculum/eta"] == 0.25
     save_checkpoint(tmp_path, run, {})
-    again = built(config)
+    again = built(config, tmp_path)
     assert load_checkpoint(tmp_path, again) == 1
     assert again.curriculum.eta == run.curriculum.eta == 0.5
     assert again.run_round()["curriculum/eta"] == 0.5

@@ -11,6 +11,7 @@ from e2rl.errors import InputError
 from e2rl.learning.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
 from e2rl.learning.evolution import Evolution, RoundSettings
+from e2rl.learning.memory import Memory
 from e2rl.learning.planner import PlannerImprovement
 from e2rl.sim.env import SimSettings
 from tests.learning.small import Ambush, brake_check, small_run, small_scenes
@@ -24,44 +25,55 @@ def rounds(run, count):
     ]
 
 
-@pytest.mark.parametrize("live", [None, Ambush()], ids=["replay", "live"])
-def test_resumed_rounds_are_those_of_one_run(tmp_path, live):
-    whole = small_run(seed=3, live=live)
+KINDS = {"replay": (None, False), "ahead": (None, True), "live": (Ambush(), False)}
+
+
+@pytest.mark.parametrize(("live", "ahead"), KINDS.values(), ids=KINDS)
+def test_resumed_rounds_are_those_of_one_run(tmp_path, live, ahead):
+    whole = small_run(seed=3, live=live, spread=0.5, folder=tmp_path / "whole", ahead=ahead, memory=8)
     expected = rounds(whole, 4)
-    first = small_run(seed=3, live=live)
+    folder, shorter = tmp_path / "run", 2  # a run of two rounds, to which two are added
+    first = small_run(seed=3, live=live, spread=0.5, folder=folder, ahead=ahead, memory=8, rounds=shorter)
     begun = rounds(first, 2)
-    save_checkpoint(tmp_path, first, CONFIG)
-    second = small_run(seed=99, live=live)
+    save_checkpoint(folder, first, CONFIG)
+    second = small_run(seed=99, live=live, spread=0.5, folder=folder, ahead=ahead, memory=8)
     second.seed = 3
-    assert load_checkpoint(tmp_path, second) == 2
+    assert load_checkpoint(folder, second) == 2
     assert begun + rounds(second, 2) == expected
     for key, value in whole.ego.network.weights().items():
         assert torch.equal(value, second.ego.network.weights()[key]), key
     assert torch.equal(whole.curriculum.priority(), second.curriculum.priority())
     moments = [run.improve.learner.optimiser.state_dict()["state"] for run in (whole, second)]
     assert all(torch.equal(moments[0][k]["exp_avg"], moments[1][k]["exp_avg"]) for k in moments[0])
-    for key, value in whole.traffic.items():
-        assert torch.equal(value, second.traffic[key])
+    assert whole.memory.index() == second.memory.index() and len(whole.memory.rounds) == (0 if live else 2)
+    for one, other in zip(whole.memory.rounds, second.memory.rounds, strict=True):
+        assert all(torch.equal(value, other.traffic[key]) for key, value in one.traffic.items())
 
 
-def test_traffic_config_and_actor_are_in_the_checkpoint(tmp_path):
-    run = small_run()
+def test_config_and_actor_are_in_the_checkpoint_and_traffic_beside_it(tmp_path):
+    run = small_run(folder=tmp_path)
     rounds(run, 1)
     folder = save_checkpoint(tmp_path, run, CONFIG)
     assert folder == latest_checkpoint(tmp_path) == latest_checkpoint(folder)
     assert json.loads((folder / "config.json").read_text()) == CONFIG
-    other = small_run(seed=5)
+    other = small_run(seed=5, folder=tmp_path)
     load_checkpoint(folder, other)
-    assert torch.equal(run.traffic["states"], other.traffic["states"])
+    ours, theirs = (one.memory.rounds[0].traffic["states"] for one in (run, other))
+    assert torch.equal(ours, theirs)
+    files = {path.name: path.stat().st_size for path in folder.iterdir()}
+    assert set(files) == {"state.pt", "actor.safetensors", "memory.json", "config.json"}
+    assert files["memory.json"] < 1000, "the rounds are named, not copied"
     alone = ActorEgo(hidden=(16,), checkpoint=str(tmp_path))
     assert all(torch.equal(value, alone.network.weights()[key]) for key, value in run.ego.network.weights().items())
 
 
 def test_only_the_newest_are_kept_and_nothing_partial_is(tmp_path):
-    run = small_run()
+    run = small_run(folder=tmp_path, memory=6)
     for _ in range(4):
         rounds(run, 1)
         save_checkpoint(tmp_path, run, CONFIG, keep_last=2)
+    remembered = [path.name for path in sorted((tmp_path / "memory").iterdir())]
+    assert remembered == [f"round-00000{k}.safetensors" for k in (1, 2, 3)], "two rounds each of the two checkpoints"
     assert [path.name for path in sorted((tmp_path / "checkpoints").iterdir())] == ["round-000003", "round-000004"]
 
 
@@ -70,7 +82,8 @@ def test_a_planners_parameters_are_resumed(tmp_path):
         scenes = small_scenes(3)
         present, grid = {"desired_speed": 10.0, "use_limits": False}, {"desired_speed": [11.0, 12.0]}
         improve = PlannerImprovement(IDMEgo(**present), present, scenes, SimSettings(), grid, batch=3)
-        return Evolution(AdaptiveCurriculum(3, 2), improve, brake_check(scenes), RoundSettings(3, "log"))
+        settings, memory = RoundSettings(3, "log"), Memory(tmp_path, 0)
+        return Evolution(AdaptiveCurriculum(3, 2), improve, brake_check(scenes), settings, memory=memory)
 
     run = make()
     rounds(run, 1)
@@ -79,6 +92,26 @@ def test_a_planners_parameters_are_resumed(tmp_path):
     load_checkpoint(tmp_path, other)
     assert other.ego.desired_speed == run.ego.desired_speed != 10.0
     assert rounds(run, 1) == rounds(other, 1)
+
+
+def test_what_is_missing_or_damaged_in_the_memory_is_named(tmp_path):
+    run = small_run(folder=tmp_path)
+    rounds(run, 2)
+    folder = save_checkpoint(tmp_path, run, CONFIG)
+    file = run.memory.path(0)
+    whole = file.read_bytes()
+    flipped = whole[:-1] + bytes([whole[-1] ^ 1])
+    other = run.memory.path(1).read_bytes()
+    for content in (whole[:200], b"", flipped, other):
+        file.write_bytes(content)
+        with pytest.raises(InputError, match=f"{file}.*damaged"):
+            load_checkpoint(tmp_path, small_run(folder=tmp_path))
+    file.unlink()
+    with pytest.raises(InputError, match=f"{file}.*missing"):
+        load_checkpoint(tmp_path, small_run(folder=tmp_path))
+    (folder / "memory.json").write_text("[{")
+    with pytest.raises(InputError, match=r"memory\.json: damaged"):
+        load_checkpoint(tmp_path, small_run(folder=tmp_path))
 
 
 def test_what_does_not_fit_is_refused_and_named(tmp_path):

@@ -43,6 +43,31 @@ def test_adaptive_intensity_seeks_the_band_within_its_bounds():
     assert curriculum.eta == 0.5 and curriculum.round == 10, "no collision rate is known: it stays"
 
 
+def test_the_scenes_of_a_round_have_intensities_around_the_round_s():
+    """Uniform from eta - spread to eta + spread, cut at the bounds."""
+    scenes = torch.zeros(4000, dtype=torch.int64)
+    drawn = ((2.0, 1.0, 1.0, 3.0), (0.5, 1.0, 0.25, 1.5), (4.5, 1.0, 3.5, 5.0), (1.0, 0.0, 1.0, 1.0))
+    for eta, spread, low, high in drawn:
+        etas = scheduler(eta=eta, spread=spread, eta_min=0.25, eta_max=5.0).etas(scenes)
+        assert etas.min() >= low and etas.max() <= high
+        assert etas.mean().item() == pytest.approx((low + high) / 2, abs=0.05)
+        assert etas.std().item() == pytest.approx((high - low) / 12**0.5, abs=0.05)
+    rising = scheduler(LinearCurriculum, eta=0.5, eta_final=2.0, spread=1.0)
+    assert 0 <= rising.etas(scenes).min() < 0.05 and rising.etas(scenes).max() <= 1.5
+    assert scheduler(LinearCurriculum, eta=0.5).etas(scenes[:3]).tolist() == [0.5] * 3
+
+
+def test_constant_intensities_take_turns():
+    curriculum, seen = scheduler(ConstantCurriculum, eta=[1.0, 2.0, 3.0]), []
+    for _ in range(3):
+        seen.append(curriculum.etas(torch.arange(4)).tolist())
+        curriculum.advance()
+    assert seen == [[1.0, 2.0, 3.0, 1.0], [2.0, 3.0, 1.0, 2.0], [3.0, 1.0, 2.0, 3.0]] and curriculum.eta == 2.0
+    for wrong in ([], [1.0, -1.0]):
+        with pytest.raises(InputError, match=r"curriculum\.eta"):
+            scheduler(ConstantCurriculum, eta=wrong)
+
+
 def test_adaptive_intensity_settles_where_the_ego_collides_as_often_as_wanted():
     """An ego that collides at rate eta / 4 ends in the band."""
     curriculum = scheduler(eta=0.25, target_low=0.4, target_high=0.5, eta_step=0.25)
@@ -110,6 +135,7 @@ def test_state_goes_on_exactly():
     for curriculum in (first, second):
         curriculum.advance(0.9)
     assert torch.equal(first.draw(4), second.draw(4)) and first.eta == second.eta
+    assert torch.equal(first.etas(torch.arange(4)), second.etas(torch.arange(4)))
     assert torch.equal(first.priority(), second.priority())
     with pytest.raises(InputError, match="holds 6 scenes, the data 5"):
         scheduler(num_scenes=5).load_state_dict(first.state_dict())

@@ -74,7 +74,7 @@ def test_a_rounds_episodes_are_those_of_its_pool():
     episodes = run.episodes
     assert len(episodes) == 8 and set(episodes.row.tolist()) <= set(range(6))
     assert torch.equal(episodes.adversarial, episodes.row < 3)
-    assert torch.isin(episodes.scene_index, run.traffic["scene_index"]).all()
+    assert torch.isin(episodes.scene_index, run.memory.rounds[-1].traffic["scene_index"]).all()
 
 
 def test_the_episode_reward_is_the_sum_of_an_episode_s_rewards():

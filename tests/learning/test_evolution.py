@@ -24,7 +24,8 @@ def test_a_round_improves_moves_on_and_reports():
     run.synthesize = lambda ego, index, eta, seed: asked.append((ego, eta, seed)) or attack(ego, index, eta, seed)
     before = {key: value.clone() for key, value in run.ego.network.weights().items()}
     metrics = run.run_round()
-    assert [eta for _, eta, _ in asked] == [1.0, 0.0], "the attack, then the same scenes by the prior alone"
+    etas = [eta.tolist() for _, eta, _ in asked]
+    assert etas == [[1.0] * 3, [0.0] * 3], "the attack, then the same scenes by the prior alone"
     assert asked[0][0] is run.ego and asked[0][2] == asked[1][2]
     assert any(not torch.equal(value, before[key]) for key, value in run.ego.network.weights().items())
     assert run.round == 1 and all(name.split("/")[0] in GROUPS for name in metrics)
@@ -49,6 +50,8 @@ def test_nominal_traffic_may_be_the_log_or_missing():
         RoundSettings(nominal="zero")
     with pytest.raises(InputError, match="traffic=dead"):
         RoundSettings(traffic="dead")
+    with pytest.raises(InputError, match=r"learner\.round\.fresh"):
+        RoundSettings(fresh=0.5)
 
 
 def test_recorded_and_corrective_pairs_are_cloned():

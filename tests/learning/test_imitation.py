@@ -71,5 +71,5 @@ def test_corrective_pairs_are_those_of_survived_attacks():
     assert careful["scene_index"].unique().tolist() == [0, 1, 2] and (careful["action"][:, 0] < -1).any()
     blind = corrective_pairs(driver, IDMEgo(hardest_braking=0.0, braking=0.01), attack)
     assert len(blind) == 0
-    with pytest.raises(InputError, match="no adversarial"):
+    with pytest.raises(InputError, match="no fresh adversarial"):
         corrective_pairs(driver, IDMEgo(), TrafficPool.recorded(torch.arange(3)))

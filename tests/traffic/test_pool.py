@@ -1,5 +1,7 @@
 """Rows of recorded, stored and live traffic: joined pools, row probabilities, and what is refused."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -27,11 +29,34 @@ def test_joined_rows_keep_their_traffic():
     both, other_way, twice = attack + recorded() + live(), live() + recorded() + attack, attack + attack
     assert both.source.tolist() == [0, 1, 2] + [RECORDED] * 3 + [LIVE] * 3
     assert other_way.source.tolist() == [LIVE] * 3 + [RECORDED] * 3 + [0, 1, 2]
-    assert twice.source.tolist() == list(range(6)) and len(twice.states) == len(twice.adversaries) == 6
+    assert twice.source.tolist() == list(range(6)) and len(twice.parts) == 2 and len(twice.adversaries) == 6
     for pool in (both, other_way):
-        assert torch.equal(pool.states, attack.states) and len(pool) == 9
+        assert pool.parts[0] is attack.parts[0] and len(pool) == 9, "the tracks are shared"
         assert torch.equal(pool.scene_index, INDEX.repeat(3))
     assert both.seed.tolist() == [0] * 6 + [7, 8, 9] and both.eta.tolist() == [2.0] * 3 + [0.0] * 3 + [1.0] * 3
+
+
+def test_tracks_are_gathered_from_the_parts_as_from_one():
+    """In any order, with repetition."""
+    parts = [stored(eta) for eta in (0.5, 1.0, 2.0)]
+    pool = parts[0] + recorded() + parts[1] + live() + parts[2]
+    at = torch.tensor([8, 0, 4, 4, 3, 7, 2])
+    states, valid = pool.tracks(at)
+    assert torch.equal(states, torch.cat([part.parts[0].states for part in parts])[at])
+    assert torch.equal(valid, torch.cat([part.parts[0].valid for part in parts])[at])
+    assert torch.equal(pool.tracks(pool.source[7:8])[0], parts[1].parts[0].states[1:2])
+    assert torch.equal(pool.adversaries, torch.cat([part.adversaries for part in parts]))
+
+
+def test_weights_multiply_within_a_kind_and_leave_the_share():
+    """Scenes 2, 0, 1 by priorities 3, 1, 1, the first three rows of weight 3."""
+    priority = torch.tensor([0.2, 0.2, 0.6])
+    fresh, old = stored(), replace(stored(), fresh=torch.zeros(3, dtype=torch.bool))
+    pool = replace(fresh, weight=torch.full((3,), 3.0)) + old + recorded()
+    probability = pool.probabilities(priority, 0.8)
+    assert probability[:6].tolist() == pytest.approx([0.8 * w / 20 for w in (9, 3, 3, 3, 1, 1)])
+    assert probability[6:].sum().item() == pytest.approx(0.2)
+    assert probability[pool.fresh & pool.adversarial].sum().item() == pytest.approx(0.8 * 3 / 4)
 
 
 def test_rows_with_an_intensity_are_adversarial():

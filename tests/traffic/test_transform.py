@@ -250,7 +250,7 @@ def test_trajectories_never_mix_scenes_or_traffic():
 def test_the_traffic_driven_in_is_the_row_s():
     """Vehicle 1 stands where its row of the pool says, at every moment of a batch of stored and recorded traffic."""
     env, pool, scene_set, _ = small_environment(8)
-    stored = torch.cat([pool.states, scene_set.scenes["logged"][pool.scene_index[4:]]])
+    stored = torch.cat([pool.parts[0].states, scene_set.scenes["logged"][pool.scene_index[4:]]])
     td = env.reset()
     for _ in range(50):
         td["action"] = torch.tensor([0.0, 0.3]).repeat(8, 1)
@@ -288,7 +288,7 @@ def test_live_stored_and_recorded_rows_run_side_by_side():
         states = tensordict["agents", "states"][:, 1:ROWS]
         speed = (torch.arange(3.0) + (step - 1) // 5 / 10)[:, None]
         torch.testing.assert_close(states[:3, :, 3], speed.expand(3, ROWS - 1))
-        assert torch.equal(states[3:6], pool.states[:, step, 1:ROWS])
+        assert torch.equal(states[3:6], pool.parts[0].states[:, step, 1:ROWS])
         assert torch.equal(states[6:], scene_set.scenes["logged"][:, step, 1:ROWS])
         adversaries = tensordict["traffic", "adversary"].nonzero().tolist()
         assert adversaries == [[row, 1] for row in range(6)], "nobody in recorded traffic"
@@ -312,7 +312,7 @@ def test_an_environment_changes_between_kinds_of_rows_from_episode_to_episode():
     out = env.rollout(30, EgoPolicy(IDMEgo(), env), break_when_any_done=False)
     states, row = out["next", "agents", "states"][:, :, 1:ROWS], out["traffic", "row"][..., 0]
     assert row[:, ::10].tolist() == [[0, 3, 6], [1, 4, 7], [2, 5, 8]]
-    assert torch.equal(states[:, 10:20], pool.states[:, 1:, 1:ROWS])
+    assert torch.equal(states[:, 10:20], pool.parts[0].states[:, 1:, 1:ROWS])
     assert torch.equal(states[:, 20:], scene_set.scenes["logged"][:, 1:, 1:ROWS])
     torch.testing.assert_close(states[:, 5:10, :, 3], (torch.arange(3.0) + 0.1)[:, None, None].expand(3, 5, ROWS - 1))
 

@@ -1,5 +1,7 @@
 """The intensity follows a target band of collision rates: it rises below the band and falls above it."""
 
+from torch import Tensor
+
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
 from e2rl.settings import check_range
 
@@ -16,6 +18,7 @@ class AdaptiveCurriculum(CurriculumScheduler):
         eta_min: float = 0.25,
         eta_max: float = 5.0,
         eta_step: float = 0.25,
+        spread: float = 1.0,
         target_low: float = 0.25,
         target_high: float = 0.45,
         share: float = 0.5,
@@ -26,13 +29,18 @@ class AdaptiveCurriculum(CurriculumScheduler):
         check_range("curriculum.target_low", target_low, 0, target_high)
         check_range("curriculum.target_high", target_high, target_low, 1)
         check_range("curriculum.share", share, 0, 1)
+        check_range("curriculum.spread", spread, 0)
         self._eta, self._share, self._band = eta, share, (target_low, target_high)
-        self._bounds, self._step = (eta_min, eta_max), eta_step
+        self._bounds, self._step, self._spread = (eta_min, eta_max), eta_step, spread
 
     @property
     def eta(self) -> float:
-        """The current intensity."""
+        """The current intensity: the middle of the scenes' ones."""
         return self._eta
+
+    def etas(self, scenes: Tensor) -> Tensor:
+        """Drawn around the current intensity, within its bounds."""
+        return self.around(len(scenes), self._spread, *self._bounds)
 
     @property
     def share(self) -> float:

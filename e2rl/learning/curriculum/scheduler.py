@@ -16,10 +16,11 @@ from e2rl.settings import check_range
 
 
 class CurriculumScheduler(ABC):
-    """State over S scenes. Per round: `draw` scenes, read `eta` and `share`, `update` with outcomes, `advance`.
+    """State over S scenes. Per round: `draw` scenes and their `etas`, read `share`, `update` with outcomes, `advance`.
 
     A schedule is a subclass with the properties `eta` and `share`, and a YAML file in conf/curriculum with its
-    `_target_` and settings. State of its own between rounds belongs in `extra_state`.
+    `_target_` and settings; `etas` where the scenes of a round differ in intensity. State of its own between rounds
+    belongs in `extra_state`.
     """
 
     def __init__(
@@ -55,6 +56,15 @@ class CurriculumScheduler(ABC):
     @abstractmethod
     def share(self) -> float:
         """Share of this round's episodes in adversarial traffic."""
+
+    def etas(self, scenes: Tensor) -> Tensor:
+        """Intensities [S] for this round's scenes [S]; by default `eta` for all."""
+        return torch.full((len(scenes),), float(self.eta))
+
+    def around(self, count: int, spread: float, low: float = 0.0, high: float = float("inf")) -> Tensor:
+        """Intensities [count] drawn uniformly from [eta - spread, eta + spread], cut at `low` and `high`."""
+        first, last = max(self.eta - spread, low), min(self.eta + spread, high)
+        return first + (last - first) * torch.rand(count, generator=self._generator)
 
     def extra_state(self) -> dict:
         """State of a schedule between rounds, besides the scenes' state."""

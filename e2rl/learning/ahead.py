@@ -1,0 +1,68 @@
+"""Work in a forked process beside this one; its result is a file that it writes."""
+
+import multiprocessing
+import os
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+
+import torch
+
+from e2rl.errors import InputError
+
+DONE = b"done "  # begins a message of success, before the seconds
+
+
+class Ahead:
+    """`work()` in a process of its own, begun at once, with one thread. It sees what this process holds now; later
+    changes of either are not the other's."""
+
+    def __init__(self, work: Callable[[], None], name: str) -> None:
+        """name: of the work, in messages."""
+        context = multiprocessing.get_context("fork")
+        self._name, (self._receiver, sender) = name, context.Pipe(duplex=False)
+        sys.stdout.flush(), sys.stderr.flush()  # or the fork would write them once more
+        self._process = context.Process(target=_run, args=(work, sender), daemon=True)
+        self._process.start()
+        sender.close()
+
+    def wait(self) -> float:
+        """Wait for the end; returns the seconds that the work took. Raises InputError if it failed or was killed."""
+        try:
+            message = self._receiver.recv_bytes()
+        except EOFError:  # it died without a word
+            message = b""
+        self._process.join()
+        self._receiver.close()
+        if message.startswith(DONE):
+            return float(message.removeprefix(DONE))
+        reason = message.decode() or (
+            f"its process was killed (exit code {self._process.exitcode}), perhaps for lack of memory"
+        )
+        raise InputError(f"{self._name}: {reason}")
+
+
+def check_ahead(device: str, threads: int) -> None:
+    """InputError where synthesis cannot run beside learning."""
+    if device != "cpu" or threads > 1 or "fork" not in multiprocessing.get_all_start_methods():
+        raise InputError(
+            f"learner.round.ahead=true, device={device}, threads={threads}, {sys.platform}: synthesis beside learning "
+            "forks a process on the CPU; set threads=1 device=cpu on Linux, or learner.round.ahead=false"
+        )
+
+
+def _run(work: Callable[[], None], sender: Connection) -> None:
+    torch.set_num_threads(1)
+    begin = time.perf_counter()
+    try:
+        work()
+        sender.send_bytes(DONE + f"{time.perf_counter() - begin:.3f}".encode())
+    except InputError as error:
+        sender.send_bytes(str(error).encode())
+    except KeyboardInterrupt:
+        os._exit(1)  # the parent was interrupted too
+    except Exception as error:
+        traceback.print_exc()
+        sender.send_bytes(f"{type(error).__name__}: {error}".encode())

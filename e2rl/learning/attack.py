@@ -1,0 +1,47 @@
+"""The traffic of a round: what is ordered, and how it is made against an ego."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from e2rl.ego.base import Ego
+from e2rl.traffic.pool import StoredTraffic
+
+Synthesize = Callable[[Ego, Tensor, Tensor, int], Mapping[str, Tensor]]
+Solvable = Callable[[Mapping[str, Tensor]], Tensor]
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is to be synthesized: for round `number`, in scenes [S], at intensities eta [S], from a seed, against an ego
+    that nobody changes meanwhile."""
+
+    number: int
+    scenes: Tensor
+    eta: Tensor
+    seed: int
+    ego: Ego
+
+
+def make_traffic(
+    order: Order, synthesize: Synthesize, solvable: Solvable | None = None, nominal: bool = True
+) -> dict[str, Tensor]:
+    """Traffic [R] of an order: the attack, without rows that no driver survives, then, with `nominal`, the same scenes
+    at intensity 0.
+
+    scene_index [R], eta [R], states [R, T+1, N, 4], valid [R, T+1, N], adversaries [R, N]; of the attack left_out [L]
+    (scenes of the rows left out) and the shares of all its rows attacked [] (with an adversary) and contact [] (the ego
+    was hit). Equal orders yield equal traffic, in whichever process.
+    """
+    attack = synthesize(order.ego, order.scenes, order.eta, order.seed)
+    kept = torch.ones_like(attack["contact"]) if solvable is None else solvable(attack)
+    names = ("scene_index", *StoredTraffic._fields)
+    rows = {name: attack[name][kept] for name in names} | {"eta": order.eta[kept]}
+    if nominal:
+        none = torch.zeros_like(order.eta)
+        plain = {**synthesize(order.ego, order.scenes, none, order.seed), "eta": none}
+        rows = {name: torch.cat([value, plain[name]]) for name, value in rows.items()}
+    shares = {"attacked": attack["adversaries"].any(-1).float().mean(), "contact": attack["contact"].float().mean()}
+    return rows | shares | {"left_out": attack["scene_index"][~kept]}

@@ -1,0 +1,110 @@
+"""Synthesis beside learning: the same D' as here, whenever it is ready; a death has one message and loses nothing."""
+
+import os
+import signal
+import time
+
+import pytest
+import torch
+
+from e2rl.build import build_ego, load_config
+from e2rl.errors import InputError
+from e2rl.learning.attack import make_traffic
+from e2rl.learning.build import build_evolution
+from e2rl.learning.checkpoint import load_checkpoint, save_checkpoint
+from e2rl.sim.env import SimSettings
+from e2rl.traffic.rollout import synthesize_traffic
+from tests.learning.small import Ambush, brake_check, small_run, small_scenes
+
+
+def real(run, scenes):
+    """Closed-loop synthesis, in which the ego's weights matter."""
+    run.synthesize = synthesize_traffic(scenes, Ambush(), SimSettings())
+    return run
+
+
+def test_the_traffic_is_that_of_the_same_order_here():
+    """Made against the policy before learning, whatever the policy has become meanwhile."""
+    scenes = small_scenes()
+    run = real(small_run(scenes=scenes, nominal="prior", spread=0.5, ahead=True), scenes)
+    run.run_round()
+    order = run._next
+    kept = {name: value.clone() for name, value in order.ego.network.weights().items()}
+    now = run.ego.network.weights()
+    assert any(not torch.equal(value, now[name]) for name, value in kept.items())
+    expected = make_traffic(order, run.synthesize)
+    metrics = run.run_round()
+    found = run.memory.rounds[-1].traffic
+    assert set(found) == set(expected) and order.number == run.memory.rounds[-1].number == 1
+    assert all(torch.equal(found[name], expected[name]) for name in expected)
+    assert metrics["time/waiting"] >= 0 and metrics["synthesizer/eta"] == pytest.approx(order.eta.mean().item())
+    assert all(torch.equal(value, order.ego.network.weights()[name]) for name, value in kept.items())
+    against_now = run.synthesize(run.ego, order.scenes, order.eta, order.seed)["states"]
+    assert not torch.equal(against_now, found["states"][: len(order.scenes)])
+
+
+def test_results_do_not_depend_on_who_is_faster():
+    def driven(delay):
+        scenes = small_scenes()
+        run = small_run(scenes=scenes, ahead=True, spread=0.5)
+        attack = brake_check(scenes)
+        run.synthesize = lambda *given: time.sleep(delay) or attack(*given)
+        metrics = [run.run_round() for _ in range(3)]
+        return [{name: row[name] for name in row if not name.startswith("time/")} for row in metrics], metrics
+
+    (quick, _), (slow, timed) = driven(0.0), driven(1.0)
+    assert quick == slow and timed[0]["time/waiting"] >= 1.0
+
+
+def test_without_it_nothing_waits_and_learning_acts_at_once():
+    assert "time/waiting" not in small_run().run_round()
+
+
+def test_a_process_that_dies_is_named_and_the_run_goes_on_from_its_checkpoint(tmp_path):
+    def begun():
+        return small_run(folder=tmp_path, ahead=True)
+
+    run, attack = begun(), brake_check(small_scenes())
+    run.synthesize = lambda ego, index, eta, seed: (
+        os.kill(os.getpid(), signal.SIGKILL) if seed == 1 else attack(ego, index, eta, seed)
+    )
+    run.run_round()
+    save_checkpoint(tmp_path, run, {})
+    with pytest.raises(InputError, match=r"round 2: .*killed \(exit code -9\)"):
+        run.run_round()
+    again, whole = begun(), small_run(ahead=True)
+    assert load_checkpoint(tmp_path, again) == 1
+    again.run_round()
+    whole.run_round(), whole.run_round()
+    assert whole.memory.index() == again.memory.index()
+
+
+def test_errors_of_the_process_arrive():
+    def refuse(*_):
+        raise InputError("no prior")
+
+    def slip(*_):
+        raise RuntimeError("slipped")
+
+    for fault, match in ((refuse, "round 1: .*resume=RUN_DIR.*no prior"), (slip, "RuntimeError: slipped")):
+        run = small_run(ahead=True)
+        run.synthesize = fault
+        with pytest.raises(InputError, match=match):
+            run.run_round()
+
+
+WHERE = {"device=cuda": {"device": "cuda"}, "threads=2": {"threads": 2}, "planner": {}, "live": {}}
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_where_it_cannot_be_it_is_refused(where):
+    sizes = [f"learner.collect.{setting}" for setting in ("batch=4", "steps=20", "iterations=1")]
+    config = load_config("train", ["learner.round.ahead=true", "learner.recorded=false", *sizes])
+    if where == "planner":
+        config = load_config("train", ["learner=planner_tuning", "+learner.round.ahead=true", "ego=lane_graph"])
+    if where == "live":
+        config.learner.round.traffic = "live"
+    ego, scenes = build_ego(config), small_scenes()
+    config.merge_with(WHERE[where])
+    with pytest.raises(InputError, match=r"learner\.round\.ahead=true"):
+        build_evolution(config, scenes, ego, Ambush(), brake_check(scenes))
