@@ -7,9 +7,11 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from e2rl import build
+from e2rl.egos import build_egos, curve_runs
 from e2rl.errors import InputError, stop
 from e2rl.evaluation.avoidable import search_effort
 from e2rl.evaluation.chains import LongestChain
+from e2rl.evaluation.egos import EgoSet, recorded_acceleration, run_egos
 from e2rl.evaluation.files import METRICS_FILE, write_metrics
 from e2rl.evaluation.ladders import intensity_ladder
 from e2rl.evaluation.modes import MODES_FILE, read_modes
@@ -17,10 +19,13 @@ from e2rl.evaluation.open_loop import open_loop_rows
 from e2rl.evaluation.protocol import Setup, run_protocol
 from e2rl.evaluation.realism_meta import meta_rows
 from e2rl.report.drawing import save_picture
+from e2rl.report.egos import ego_tables, guard_table
 from e2rl.report.intensity import intensity_figure
 from e2rl.report.modes import mode_tables
+from e2rl.report.plots import collision_bars, learning_curves
 from e2rl.report.skeleton import skeleton_figure
-from e2rl.report.tables import metric_tables, print_tables, save_tables
+from e2rl.report.tables import Table, metric_tables, print_tables, save_tables
+from e2rl.scene.scene import SceneSet
 from e2rl.scene.source import load_scenes
 
 
@@ -28,10 +33,12 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     """Run the methods of a configuration and return the rows of metrics.json."""
     build.set_up(config)
     build.check_evaluation(config)
+    egos = build_egos(config)
     scenes = load_scenes(config.data, config.num_scenes)
     prior, origin = build.build_prior(config, config.device)
     methods, name = build.build_methods(config, prior), HydraConfig.get().runtime.choices["ego"]
-    setup = Setup(scenes, build.build_ego(config), name, build.build_sim(config), config.batch, config.device)
+    name, ego = next(iter(egos.egos.items())) if egos else (name, build.build_ego(config))
+    setup = Setup(scenes, ego, name, build.build_sim(config), config.batch, config.device)
     if config.tuning is not None:
         return build.tune(config, setup, methods, folder)["trials"]
     only = None if config.scene is None else [scenes.index(config.scene)]
@@ -39,14 +46,18 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     rows = []
     if config.open_loop_samples:
         rows += open_loop_rows(scenes, methods, config.open_loop_samples, config.device)
-    rows += run_protocol(setup, methods, config.seeds, folder, config.save_rollouts, build.processes_of(config), only)
+    how = (methods, config.seeds, folder, config.save_rollouts, build.processes_of(config), only)
+    rows += run_egos(setup, egos, *how) if egos else run_protocol(setup, *how)
     if config.meta_rollouts:
         rows += meta_rows(setup, methods, config.meta_rollouts)
     write_metrics(folder / METRICS_FILE, rows)
     dropped = "".join(f"; left out: {count} scenes ({reason})" for reason, count in scenes.dropped.items())
     effort = search_effort(scenes.scenes["logged"].shape[1] - 1)
-    tables = metric_tables(rows, f"{build.caption(config, origin, methods)}; {effort}{dropped}", config.metrics)
+    caption = f"{build.caption(config, origin, methods)}; {effort}{dropped}"
+    tables = metric_tables(rows, caption, config.metrics)
     tables += mode_tables(read_modes(folder / MODES_FILE))
+    if egos:
+        tables += report_egos(config, egos, rows, scenes, caption, folder)
     save_tables(folder / "tables.md", tables)
     print_tables(tables)
     if config.figure == "intensity":
@@ -56,6 +67,21 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
         save_picture(folder / "skeleton.png", skeleton_figure(rollout, chain.selection, chain.topology))
     print(f"\nwritten to {folder}")
     return rows
+
+
+def report_egos(
+    config: DictConfig, egos: EgoSet, rows: list[dict], scenes: SceneSet, caption: str, folder: Path
+) -> list[Table]:
+    """The tables that compare the egos; with `policy_learning` also its guards and figures."""
+    roles = config.policy_learning
+    if roles is None:
+        return ego_tables(rows, egos.names, egos.pairs, "Egos", caption)
+    tables = ego_tables(rows, egos.names, egos.pairs, "Policy learning", caption)
+    tables.append(guard_table(rows, roles.before, roles.after, roles.planner, recorded_acceleration(scenes)))
+    save_picture(folder / "policy_learning.png", collision_bars(rows, egos.names, config.synthesizer.name))
+    if runs := curve_runs(config):
+        save_picture(folder / "curves.png", learning_curves(runs))
+    return tables
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")

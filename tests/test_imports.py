@@ -15,7 +15,7 @@ PACKAGE = Path(e2rl.__file__).parent
 ORDER = (  # of the folders and files directly in e2rl
     *("errors", "files", "settings"),
     *("scene", "verdicts", "sim", "metrics", "prior", "ego", "evasion", "traffic", "synthesizer"),
-    *("evaluation", "build", "api", "learning", "report"),
+    *("evaluation", "build", "egos", "api", "learning", "report"),
 )
 
 

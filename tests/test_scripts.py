@@ -331,6 +331,34 @@ def test_the_adversaries_experiments_have_their_rows_and_figures(
     assert [path.name for path in (tmp_path / "run").glob("*.png")] == ([figure] if figure else [])
 
 
+def test_egos_before_and_after_are_rated_in_one_run(world, tmp_path, monkeypatch, capsys):
+    """An untrained actor and a planner in its place, with learning curves of a made run."""
+    logs = tmp_path / "trained" / "logs" / "scalars"
+    for name, value in (("train/frames", "100"), ("synthesizer/contact", "0.5")):
+        (logs / name).parent.mkdir(parents=True)
+        (logs / f"{name}.csv").write_text(f"0,{value}\n")
+    roles = f"{{before: before, after: after, planner: before, runs: ['{tmp_path / 'trained'}']}}"
+    overrides = [
+        *SHORT,
+        f"data.cache={world / 'bundled'}",
+        "seeds=[0]",
+        "+egos.before={ego: actor}",
+        "+egos.after={ego: lane_graph}",
+        f"policy_learning={roles}",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    ]
+    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    assert status == 0, said
+    rows = read_metrics(tmp_path / "run" / "metrics.json")
+    assert [(row["ego"], row["method"]) for row in rows] == [
+        (ego, method) for ego in ("before", "after") for method in ("nominal", "e2")
+    ]
+    assert {key for row in rows[2:] for key in row["paired"]} == {"e2", "nominal", "ego before"}
+    text = (tmp_path / "run" / "tables.md").read_text()
+    assert "## Policy learning" in text and "after − before [points]" in text and "Guards of after" in text
+    assert {path.name for path in (tmp_path / "run").glob("*.png")} == {"policy_learning.png", "curves.png"}
+
+
 def test_a_planner_is_tuned_and_the_study_goes_on(world, tmp_path, monkeypatch, capsys):
     for trials in (1, 2):
         overrides = [

@@ -1,7 +1,8 @@
 """The closed-loop protocol: methods x scenes x seeds with one ego, the files of a run (docs/method.md, section 11)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from e2rl.traffic.traffic import Traffic
 
 SEEDS_APART = 1_000_003
 Task = tuple[int, int]  # position of a scene, sampling seed
+Scored = tuple[list[dict], list[dict[str, Tensor]]]  # labelled rows and realism samples, one of each per rollout
 
 
 @dataclass
@@ -62,9 +64,7 @@ class Setup:
         rollouts = roll_out(self.scenes, index, noise, eta, self.ego, method.traffic, self.sim, self.device)
         return rollouts | {"seed": torch.tensor([seed for _, seed in tasks]), "eta": float(method.eta)}
 
-    def score(
-        self, method: Method, tasks: Sequence[Task], folder: Path | None = None
-    ) -> tuple[list[dict], list[dict[str, Tensor]]]:
+    def score(self, method: Method, tasks: Sequence[Task], folder: Path | None = None) -> Scored:
         """Rows and realism samples of (scene, seed) pairs under one method; folder: for the rollouts' files."""
         rollouts = self.roll_out(method, tasks)
         source = Source(self.scenes.dataset, self.scenes.split, method.name, self.ego_name)
@@ -96,25 +96,50 @@ def run_protocol(
     processes: over which the rollouts are spread, with the same rows; only: positions of the scenes to run, with
     unchanged noise (None: all). fields are added to each row.
     """
-    tasks = [(scene, seed) for seed in seeds for scene in (range(len(setup.scenes)) if only is None else only)]
-    count = -(-len(tasks) // setup.batch)
-    parts = [tasks[k * len(tasks) // count : (k + 1) * len(tasks) // count] for k in range(count)]
-    jobs = [(method, part) for method in methods for part in parts]
     into = folder / ROLLOUTS if folder is not None and save_rollouts else None
+    found = drive_all([setup], methods, seeds, into, processes, only)
+    return record(*found, folder, partial(metric_rows, **fields))
 
-    def work(job: tuple[Method, list[Task]]) -> tuple[list[dict], list[dict[str, Tensor]]]:
-        return setup.score(*job, into)
+
+def drive_all(
+    setups: Sequence[Setup],
+    methods: Sequence[Method],
+    seeds: Sequence[int],
+    into: Path | None = None,
+    processes: int = 1,
+    only: Sequence[int] | None = None,
+) -> Scored:
+    """Roll out and score every setup, which differ in their ego, under every method on every (scene, seed).
+
+    into: folder of the rollouts' files (None: none); others: as for `run_protocol`. The noise is the same for all.
+    """
+    first = setups[0]
+    tasks = [(scene, seed) for seed in seeds for scene in (range(len(first.scenes)) if only is None else only)]
+    count = -(-len(tasks) // first.batch)
+    parts = [tasks[k * len(tasks) // count : (k + 1) * len(tasks) // count] for k in range(count)]
+    jobs = [(setup, method, part) for setup in setups for method in methods for part in parts]
+
+    def work(job: tuple[Setup, Method, list[Task]]) -> Scored:
+        setup, method, part = job
+        return setup.score(method, part, into)
 
     rows, features = [], []
-    with tqdm(total=len(tasks) * len(methods), desc="rollouts", unit="rollout") as bar:
-        results = in_processes(work, jobs, processes, cost=lambda job: job[0].eta)
-        for (method, part), (found, samples) in zip(jobs, results, strict=True):
+    with tqdm(total=len(tasks) * len(methods) * len(setups), desc="rollouts", unit="rollout") as bar:
+        results = in_processes(work, jobs, processes, cost=lambda job: job[1].eta)
+        for (setup, method, part), (found, samples) in zip(jobs, results, strict=True):
             rows += found
             features += samples
-            bar.set_postfix(method=method.name, eta=method.eta)
+            bar.set_postfix(ego=setup.ego_name, method=method.name, eta=method.eta)
             bar.update(len(part))
+    return rows, features
+
+
+def record(
+    rows: list[dict], features: list[dict[str, Tensor]], folder: Path | None, summarise: Callable[..., list[dict]]
+) -> list[dict]:
+    """The rows of metrics.json, summarise(rows, features); writes rollouts.csv, modes.json and metrics.json."""
     modes = find_modes(rows)
-    result = metric_rows(rows, features, **fields)
+    result = summarise(rows, features)
     if folder is not None:
         write_modes(folder / MODES_FILE, modes)
         write_rows(folder / TABLE, rows)

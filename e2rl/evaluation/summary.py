@@ -1,6 +1,6 @@
 """The rows of metrics.json: one per (dataset, split, method, ego, eta), with paired differences to other methods."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from torch import Tensor
@@ -25,12 +25,15 @@ def metric_rows(
     features: Sequence[dict[str, Tensor]],
     draws: int = DRAWS,
     realism_draws: int = REALISM_DRAWS,
+    egos: Sequence[tuple[str, str]] = (),
     **fields: Any,
 ) -> list[dict]:
     """Rows of metrics.json from labelled rows of rollouts (`label_rows`) and their features.
 
     A row's `paired` compares it with every other method (or eta) on the same dataset, split and ego over the shared
-    (scene, seed); a method there with several etas is named method@eta. `fields` extend each row.
+    (scene, seed); a method there with several etas is named method@eta. egos: pairs of egos of which the first is also
+    compared with the second in the same traffic, under `ego SECOND`, realism without intervals; as these are many, a
+    method is then compared with the first other one of its ego only. `fields` extend each row.
     """
     groups: dict[Key, list[int]] = {}
     for index, row in enumerate(rows):
@@ -39,9 +42,11 @@ def metric_rows(
     result = []
     for key, ours in members.items():
         paired = {}
-        for other in rivals(key, list(members)):
+        for other in rivals(key, list(members))[: 1 if egos else None]:
             differences = paired_differences(*ours, *members[other], draws, realism_draws)
             paired[rival_name(other, list(members))] = differences
+        for name, other in same_traffic(key, egos, members):
+            paired[f"ego {name}"] = paired_differences(*ours, *members[other], draws, 0, relative=True)
         scenes, seeds = ({row[name] for row in ours[0]} for name in ("scene_id", "seed"))
         metrics = summarise(*ours, draws, realism_draws)
         result.append(metric_row(key, len(scenes), len(seeds), len(ours[0]), metrics, paired=paired, **fields))
@@ -52,6 +57,13 @@ def rivals(key: Key, keys: Sequence[Key]) -> list[Key]:
     """The other groups on the same dataset and split with the same ego."""
     shared = [GROUP.index(name) for name in ("dataset", "split", "ego_policy")]
     return [other for other in keys if other != key and all(other[i] == key[i] for i in shared)]
+
+
+def same_traffic(key: Key, egos: Sequence[tuple[str, str]], keys: Collection[Key]) -> list[tuple[str, Key]]:
+    """(ego, group) of the egos that the group's own is compared with, in the same traffic."""
+    dataset, split, method, ego, eta = key
+    others = [(name, (dataset, split, method, name, eta)) for first, name in egos if first == ego]
+    return [(name, other) for name, other in others if other in keys]
 
 
 def rival_name(key: Key, keys: Sequence[Key]) -> str:

@@ -110,6 +110,9 @@ EXTRA = (
     Metric("w1_a_lon", "W1 of longitudinal acceleration", unit="m/s²", samples="a_lon"),
     Metric("w1_a_lat", "W1 of lateral acceleration", unit="m/s²", samples="a_lon"),
     Metric("w1_jerk", "W1 of |jerk|", unit="m/s³", samples="a_lon"),
+    Metric("ego_off_road", "ego leaves the road", share=True),
+    Metric("failures_per_km", "`cfr`, of all that the ego drives", unit="1/km", column="cfr", per="driven_km"),
+    Metric("counted_per_km", "the same of `cfr_counted`", unit="1/km", column="cfr_counted", per="driven_km"),
 )
 METRICS = {metric.name: metric for metric in (*MAIN, *EXTRA)}  # of rollouts, in the order of rollouts.csv
 TABLES = {

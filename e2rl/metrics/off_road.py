@@ -83,7 +83,8 @@ def on_road(points: Tensor, rollout: Tensor, batch: Batch) -> Tensor:
 
 
 def off_road_columns(batch: Batch) -> Batch:
-    """`aor_step` and `aor_any` [B] of the traffic at steps 1..stop, and the vehicle-steps they rest on.
+    """`aor_step` and `aor_any` [B] of the traffic at steps 1..stop, and the vehicle-steps they rest on; `ego_off_road`
+    [B], 0 or 1: the ego leaves the road.
 
     Vehicles absent or off the road at step 0 are left out (`aor_left_out` counts the latter). NaN where no vehicle is
     left or the rollout has no map.
@@ -105,4 +106,15 @@ def off_road_columns(batch: Batch) -> Batch:
         "aor_any": (off > 0).to(states.dtype).masked_fill(unknown, torch.nan),
         "aor_left_out": (counted & ~road_here[:, 0]).sum(-1).to(states.dtype).masked_fill(~mapped, torch.nan),
         "aor_vehicle_steps": number,
+        "ego_off_road": ego_off_road(batch).masked_fill(~mapped, torch.nan),
     }
+
+
+def ego_off_road(batch: Batch) -> Tensor:
+    """1 where the ego is off the road at some of steps 1..stop, else 0 [B]; NaN where it is so at step 0, too."""
+    states, stop = batch["states"][:, :, 0], batch["stop"]
+    asked = batch["valid"][..., 0] & (torch.arange(states.shape[1], device=states.device) <= stop[:, None])
+    index = asked.nonzero(as_tuple=True)
+    off = torch.zeros_like(asked)
+    off[index] = ~on_road(states[index][:, :2], index[0], batch)
+    return off.any(1).to(states.dtype).masked_fill(off[:, 0] | ~asked[:, 0], torch.nan)

@@ -13,7 +13,8 @@ SMOOTHING = 0.5  # s, moving average of the ego's speed before its derivative
 
 
 def motion_columns(batch: Batch) -> Batch:
-    """min_dtc, ttc_c, ttc_c_all, macc and progress over the steps 1..stop; NaN without any agent to measure them on."""
+    """min_dtc, ttc_c, ttc_c_all, macc, progress and driven_km over the steps 1..stop; NaN without any agent to measure
+    them on."""
     states, valid, stop = batch["states"], batch["valid"], batch["stop"]
     seen = valid & valid[..., :1] & steps_until(stop, states.shape[1])[..., None]
     seen[..., 0] = False
@@ -21,12 +22,14 @@ def motion_columns(batch: Batch) -> Batch:
     gap = gap.masked_fill(~seen, torch.inf).flatten(1).amin(-1)
     cost = closest_approach_cost(states)
     path, count = ego_path(states, valid, stop)
+    driven = progress(path, count)
     return {
         "min_dtc": gap.masked_fill(gap.isinf(), torch.nan).masked_fill(batch["hit"], 0.0),
         "ttc_c": mean_worst_cost(cost, seen & batch["adversaries"][:, None]),
         "ttc_c_all": mean_worst_cost(cost, seen),
         "macc": mean_acceleration(path, count),
-        "progress": progress(path, count),
+        "progress": driven,
+        "driven_km": driven / 1000,
     }
 
 

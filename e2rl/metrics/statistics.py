@@ -3,6 +3,10 @@
 Rows and samples are the two results of `score.score_rollouts`, one of each per rollout. A draw holds each cluster with
 a multiplicity. Every resampled mean is a quotient of two sums that are linear in the multiplicities, hence one matrix
 product serves all draws and metrics. Fewer than two clusters with known values give no interval: NaN.
+
+Rows of several trainings of one policy say which in `training` (0, 1, ..). Trainings are then drawn with replacement
+as well as places, independently of them: a rollout counts as often as its place times its training was drawn (the
+pigeonhole bootstrap, Owen 2007). Few trainings still understate how much they vary.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,6 +38,11 @@ def bootstrap_draws(clusters: int, draws: int = DRAWS, seed: int = 0) -> Tensor:
     counts = torch.zeros(draws, clusters, dtype=torch.float64)
     counts.scatter_add_(1, chosen, torch.ones_like(chosen, dtype=torch.float64))
     return torch.cat([torch.ones(1, clusters, dtype=torch.float64), counts])
+
+
+def crossed(draws: Tensor, other: Tensor) -> Tensor:
+    """Multiplicities [D, C * K] of the pairs of C and K clusters that are drawn independently; pair c * K + k."""
+    return (draws[:, :, None] * other[:, None, :]).flatten(1)
 
 
 def resampled_means(totals: Tensor, weights: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
@@ -86,9 +95,13 @@ def resampled_labels(labels: Tensor, cluster: Tensor, draws: Tensor, places: int
 
 
 def interval(values: Tensor, known_clusters: int) -> dict[str, float]:
-    """{mean, low, high} of values [D], row 0 the estimate; the interval needs two clusters that know the value."""
+    """{mean, low, high} of values [D], row 0 the estimate; the interval needs draws, and two clusters that know it."""
     values = values.where(values.isfinite(), torch.nan)
-    low, high = values[1:].nanquantile(values.new_tensor(LEVELS)).tolist() if known_clusters > 1 else (torch.nan,) * 2
+    low, high = (
+        values[1:].nanquantile(values.new_tensor(LEVELS)).tolist()
+        if known_clusters > 1 < len(values)
+        else (torch.nan,) * 2
+    )
     return {"mean": values[0].item(), "low": low, "high": high}
 
 
@@ -118,8 +131,13 @@ class Bootstrap:
     """The resampling of rollouts that a group, or two groups that are compared, share."""
 
     def __init__(self, rows: Sequence[Row], draws: int, realism_draws: int) -> None:
-        self.cluster, clusters = cluster_index(rows)
-        self.draws, self.realism_draws = bootstrap_draws(clusters, draws), bootstrap_draws(clusters, realism_draws)
+        self.place, places = cluster_index(rows)
+        training = torch.tensor([row.get("training", 0) for row in rows], dtype=torch.int64)
+        trainings = int(training.amax()) + 1 if len(rows) else 1
+        self.cluster, self.place_draws = self.place * trainings + training, bootstrap_draws(places, draws)
+        self.draws = crossed(self.place_draws, bootstrap_draws(trainings, draws, seed=1))
+        other = bootstrap_draws(trainings, realism_draws, seed=1)
+        self.realism_draws = crossed(bootstrap_draws(places, realism_draws), other)
 
     def resampled(self, totals: Tensor, weights: Tensor, samples: Sequence[Samples]) -> dict[str, Tensor]:
         """{metric: values [D] in each draw}, from the results of `metric_table` and the realism samples."""
@@ -129,7 +147,7 @@ class Bootstrap:
                 means[:, column] = resampled_medians(totals[:, column], self.cluster, self.draws)
             if metric.places:
                 labels = totals[:, column] / weights[:, column]  # 0 / 0 is NaN
-                means[:, column] = resampled_labels(labels, self.cluster, self.draws, metric.places)
+                means[:, column] = resampled_labels(labels, self.place, self.place_draws, metric.places)
         values = {metric.name: means[:, column] for column, metric in enumerate(row_metrics())}
         return values | realism(list(samples), self.cluster, self.realism_draws)
 
@@ -137,7 +155,7 @@ class Bootstrap:
         """{metric: {mean, low, high, n}} in the catalogue's order; known [R] bool: the n rollouts that a value uses."""
         counts = {name: 0 if values[name][0].isnan() else int(known[name].sum()) for name in METRICS}
         return {
-            name: interval(values[name], len(self.cluster[known[name]].unique())) | {"n": counts[name]}
+            name: interval(values[name], len(self.place[known[name]].unique())) | {"n": counts[name]}
             for name in METRICS
         }
 
@@ -175,25 +193,52 @@ def paired_differences(
     other_samples: Sequence[Samples],
     draws: int = DRAWS,
     realism_draws: int = REALISM_DRAWS,
+    relative: bool = False,
 ) -> dict[str, dict[str, float]]:
     """{metric: {difference, low, high, n}} of this group minus the other, over the n (scene, seed) both have.
 
     Both groups are resampled with the same clusters. A metric per collision compares the two groups' own collisions on
-    these pairs; all other metrics use only the pairs in which both groups know it.
+    these pairs; all other metrics use only the pairs in which both groups know it. relative: also `relative`,
+    `relative_low` and `relative_high`, the difference over the other group's value.
     """
-    index = {(row["scene_id"], row["seed"]): other for other, row in enumerate(other_rows)}
-    pairs = [(own, index[key]) for own, row in enumerate(rows) if (key := (row["scene_id"], row["seed"])) in index]
+    pairs = matched(rows, other_rows)
     rows, samples = [rows[own] for own, _ in pairs], [samples[own] for own, _ in pairs]
     other_rows, other_samples = [other_rows[other] for _, other in pairs], [other_samples[other] for _, other in pairs]
     metrics = row_metrics()
     (first, first_weights), (second, second_weights) = metric_table(rows, metrics), metric_table(other_rows, metrics)
     unmatched = (first.isnan() | second.isnan()) & torch.tensor([not metric.per_collision for metric in metrics])
     first, second = first.masked_fill(unmatched, torch.nan), second.masked_fill(unmatched, torch.nan)
-    bootstrap = Bootstrap(rows, draws, realism_draws)
+    shared = [{**other, **own} for own, other in zip(rows, other_rows, strict=True)]  # either may tell the training
+    bootstrap = Bootstrap(shared, draws, realism_draws)
     ours = bootstrap.resampled(first, first_weights, samples)
     theirs = bootstrap.resampled(second, second_weights, other_samples)
     known = known_rollouts(~first.isnan() | ~second.isnan(), samples)
     other_known = known_rollouts(~first.isnan() | ~second.isnan(), other_samples)
     differences = {name: ours[name] - theirs[name] for name in METRICS}
-    result = bootstrap.intervals(differences, {name: known[name] & other_known[name] for name in METRICS})
-    return {name: {"difference": value.pop("mean"), **value} for name, value in result.items()}
+    both = {name: known[name] & other_known[name] for name in METRICS}
+    result = bootstrap.intervals(differences, both)
+    found = {name: {"difference": value.pop("mean"), **value} for name, value in result.items()}
+    if relative:
+        for name, value in bootstrap.intervals(ratios(differences, theirs), both).items():
+            found[name] |= {"relative": value["mean"], "relative_low": value["low"], "relative_high": value["high"]}
+    return found
+
+
+def ratios(differences: Mapping[str, Tensor], others: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Differences [D] over |others| [D], by name. Where a draw has none, the ratio has no bound: no draw is known."""
+    result = {}
+    for name, difference in differences.items():
+        ratio = difference / others[name].abs()
+        unbounded = bool((others[name][1:] == 0).any())
+        result[name] = torch.cat([ratio[:1], ratio[1:].masked_fill(torch.tensor(unbounded), torch.nan)])
+    return result
+
+
+def matched(rows: Sequence[Row], other_rows: Sequence[Row]) -> list[tuple[int, int]]:
+    """Positions (own, other) of rows of the same scene, seed and, where both groups tell it, training."""
+    index: dict[tuple, list[int]] = {}
+    for other, row in enumerate(other_rows):
+        index.setdefault((row["scene_id"], row["seed"]), []).append(other)
+    pairs = [(own, other) for own, row in enumerate(rows) for other in index.get((row["scene_id"], row["seed"]), [])]
+    told = [(rows[own].get("training"), other_rows[other].get("training")) for own, other in pairs]
+    return [pair for pair, (own, other) in zip(pairs, told, strict=True) if own == other or None in (own, other)]

@@ -24,11 +24,13 @@ COUNTED = {
 
 @dataclass
 class Table:
-    """A caption, column heads and rows of cells; the first column is text, the others are numbers."""
+    """A caption, column heads and rows of cells; the first column is text, the others are numbers. title: of the
+    section that begins with the table."""
 
     caption: str
     head: list[str]
     rows: list[list[str]]
+    title: str = ""
 
     def text(self) -> str:
         """For a terminal: aligned columns, the caption above."""
@@ -40,7 +42,8 @@ class Table:
 
         rule = "-" * (sum(widths) + 2 * len(widths) - 2)
         caption = textwrap.fill(self.caption, max(len(rule), 60))
-        return "\n".join([caption, rule, line(self.head), rule, *map(line, self.rows), rule])
+        title = [f"{self.title}\n"] if self.title else []
+        return "\n".join([*title, caption, rule, line(self.head), rule, *map(line, self.rows), rule])
 
     def markdown(self) -> str:
         """A markdown table, its caption beneath."""
@@ -49,7 +52,8 @@ class Table:
             return f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |"
 
         align = "| --- |" + " ---: |" * (len(self.head) - 1)
-        return "\n".join([line(self.head), align, *map(line, self.rows), "", self.caption, ""])
+        title = [f"## {self.title}\n"] if self.title else []
+        return "\n".join([*title, line(self.head), align, *map(line, self.rows), "", self.caption, ""])
 
 
 def metric_tables(rows: Sequence[dict], settings: str = "", table: str = "main") -> list[Table]:

@@ -85,6 +85,13 @@ def test_a_vehicle_off_the_road_at_the_start_is_left_out():
     assert np.isnan(only_parked["aor_step"]) and only_parked["aor_vehicle_steps"] == 0
 
 
+def test_the_ego_leaves_the_road_or_not_and_is_unknown_where_it_starts_beside_it():
+    other = course(50, 0, 0, 10)
+    leaves, stays, beside = course(0, 0, 0.5, 10), course(0, 0, 0, 10), course(0, 40, 0, 10)
+    assert (row(leaves, other)["ego_off_road"], row(stays, other)["ego_off_road"]) == (1, 0)
+    assert np.isnan(row(beside, other)["ego_off_road"])
+
+
 def rollouts_on(road, states, valid):
     """A batch of traffic at states [B, T+1, N, 4] throughout."""
     stop = torch.full((len(states),), states.shape[1] - 1)

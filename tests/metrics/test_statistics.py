@@ -96,6 +96,16 @@ def test_off_road_share_is_pooled_over_vehicle_steps():
     assert table["aor_step"]["mean"] == pytest.approx(0.05) and table["aor_step"]["n"] == 2
 
 
+def test_failures_per_kilometre_are_all_failures_over_all_kilometres():
+    ours = rows_of([1.0, 0.0, math.nan, 1.0], driven_km=[0.1, 0.3, 5.0, 0.1])
+    theirs = rows_of([0.0, 0.0, 1.0, 1.0], driven_km=[0.2, 0.2, 5.0, 0.6])
+    table = brief(*ours)["failures_per_km"]
+    assert table["mean"] == pytest.approx(2 / 0.5) and table["n"] == 3 and table["low"] <= 4 <= table["high"]
+    paired = paired_differences(*ours, *theirs, draws=300, realism_draws=2, relative=True)["failures_per_km"]
+    assert paired["difference"] == pytest.approx(4 - 1) and paired["n"] == 3
+    assert paired["relative"] == pytest.approx(3.0)
+
+
 def test_a_paired_difference_uses_shared_scenes_and_is_narrower_than_unpaired_ones():
     generator = torch.Generator().manual_seed(3)
     base = torch.rand(60, generator=generator) * 10

@@ -1,0 +1,40 @@
+"""Learning curves: which environment steps a value belongs to, and runs that have none."""
+
+import pytest
+
+from e2rl.errors import InputError
+from e2rl.learning.logging import RunLogger
+from e2rl.report.plots import learning_curves, read_curves
+
+
+def logged(folder, rounds):
+    logger = RunLogger("csv", folder)
+    for number, (frames, attacked, hit) in enumerate(rounds):
+        metrics = {"train/frames": frames, "synthesizer/contact": attacked, "train/contact_adversarial": hit}
+        logger.log(metrics, number)
+    logger.close()
+    return folder
+
+
+def test_what_was_measured_before_a_round_stands_at_the_steps_done_by_then(tmp_path):
+    found = read_curves(logged(tmp_path / "run", [(100, 0.7, 0.5), (250, 0.6, 0.4)]))
+    assert found["synthesizer/contact"] == ([0, 100], [0.7, 0.6])
+    assert found["train/contact_adversarial"] == ([100, 250], [0.5, 0.4]) and len(found) == 2
+
+
+def test_a_round_done_twice_counts_once(tmp_path):
+    folder = logged(tmp_path / "run", [(100, 0.7, 0.5)])
+    with (folder / "logs" / "scalars" / "train" / "contact_adversarial.csv").open("a") as file:
+        file.write("0,0.3\n")
+    assert read_curves(folder)["train/contact_adversarial"] == ([100], [0.3])
+
+
+def test_a_figure_has_a_panel_for_each_known_curve(tmp_path):
+    runs = [logged(tmp_path / name, [(100, 0.7, 0.5), (200, 0.6, 0.4)]) for name in ("one", "two")]
+    width, height = learning_curves(runs).size
+    assert width > 2 * height
+
+
+def test_a_folder_without_a_log_is_named(tmp_path):
+    with pytest.raises(InputError, match="nothing: no train/frames logged there; give the folder"):
+        learning_curves([tmp_path / "nothing"])
