@@ -2,9 +2,10 @@
 
 step and observation: what DrivingEnv does: the ego's dynamics, its contact with everybody, off-road, reward and
 observation; the others are looked up. everybody driven: the work that simulators of many egos report: dynamics of all
-agents, contact of all pairs, off-road of all, no observation.
+agents, contact of all pairs, off-road of all, no observation. vehicles re-aim: an episode with them by one without.
 """
 
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -12,11 +13,15 @@ import torch
 from measure import Bench, Row
 from tensordict import TensorDict
 from torch import Tensor
+from torchrl.envs import TransformedEnv
 
 from e2rl.scene.boxes import separation
 from e2rl.sim import dynamics
 from e2rl.sim.drivable import off_road
 from e2rl.sim.env import DrivingEnv, compiled
+from e2rl.synthesizer.reaiming import ReactSettings, Reaiming
+from e2rl.traffic.pool import TrafficPool
+from e2rl.traffic.transform import AdversarialSynthesizer
 
 STEPS = 80  # an episode, its reset included
 AGENTS = 32  # a scene, where the data have scenes of so many
@@ -43,6 +48,7 @@ def simulator(bench: Bench) -> Iterator[Row]:
             rates = all_driven(bench, index, function)
             for value, unit in zip(rates, ("agent-steps/s", "agent-steps/CPU s"), strict=True):
                 yield bench.row("simulator", f"everybody driven{name}", index, value, unit)
+    yield from reacting(bench)
     if bench.compile:
         index = bench.pick(*bench.batches(32), AGENTS)
         one, two = (
@@ -64,6 +70,33 @@ def run(env: DrivingEnv, index: Tensor) -> Tensor:
     for _ in range(STEPS):
         done = env._step(action)
     return done["observation"]
+
+
+def reacting(bench: Bench) -> Iterator[Row]:
+    """Time of an episode in which vehicles re-aim in 70% of the environments, by that of its replay."""
+    (batch,) = bench.batches(256)
+    index = bench.pick(batch)
+    scene, rows = bench.scenes.batch(index), torch.arange(batch)
+    adversaries = scene["valid"] & (torch.arange(scene["valid"].shape[1]) < 4)
+    traffic = {"scene_index": index, "states": scene["logged"], "valid": scene["logged_valid"]}
+    pool = TrafficPool.stored(traffic | {"adversaries": adversaries}, 2.0)
+    sim = replace(bench.sim, end_on_contact=False, end_off_road=False, end_when_gone=False)
+    action = TensorDict({"action": torch.zeros(batch, 2)}, batch_size=[batch])
+
+    def episode(reaction: Reaiming | None) -> None:
+        transform = AdversarialSynthesizer(pool, lambda _: rows, reaction=reaction)
+        env = TransformedEnv(DrivingEnv(bench.scenes, sim, batch), transform)
+        now = env.reset()
+        begin = time.process_time()
+        for _ in range(STEPS):
+            now = env.step(now.update(action))["next"]
+        times[reaction is not None].append(time.process_time() - begin)
+
+    times: dict[bool, list[float]] = {False: [], True: []}
+    for seed in range(bench.repeats):  # in turn, since the machine's load changes
+        episode(None), episode(Reaiming(ReactSettings(share=0.7), seed))
+    ratio = min(times[True]) / min(times[False])
+    yield bench.row("simulator", "vehicles re-aim, CPU time", index, ratio, "of the replay's")
 
 
 def everybody(

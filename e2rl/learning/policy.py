@@ -27,6 +27,7 @@ from e2rl.learning.update import Learner, UpdateSettings
 from e2rl.scene.scene import SceneSet
 from e2rl.settings import settings_of
 from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.synthesizer.reaiming import ReactSettings, Reaiming
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import Traffic
 from e2rl.traffic.transform import AdversarialSynthesizer
@@ -73,9 +74,11 @@ class PolicyImprovement(Improvement):
         recorded: bool = False,
         teacher: Ego | None = None,
         parameters: Mapping[str, Any] | None = None,
+        react: Mapping[str, Any] | None = None,
     ) -> None:
         """recorded: clone the recorded egos in every round; teacher: also clone this ego's survived episodes in the
-        round's adversarial traffic; others: conf/learner/ppo_bc.yaml.
+        round's adversarial traffic; react: vehicles that leave the replayed traffic (None: nobody); others:
+        conf/learner/ppo_bc.yaml.
 
         Raises InputError if the ego is no actor or a round is shorter than an episode.
         """
@@ -98,7 +101,10 @@ class PolicyImprovement(Improvement):
             self.driver = PoolDriver(scenes, sim, batch, device)
         every = torch.arange(len(scenes))
         self.draw = RowDraw(torch.full((len(scenes),), 1 / len(scenes), dtype=torch.float64), seed)
-        self.synthesizer = AdversarialSynthesizer(TrafficPool.recorded(every), self.draw, traffic, ego)
+        self.reaction = None
+        if react is not None:
+            self.reaction = Reaiming(settings_of(ReactSettings, react, "learner.react"), seed)
+        self.synthesizer = AdversarialSynthesizer(TrafficPool.recorded(every), self.draw, traffic, ego, self.reaction)
         base = DrivingEnv(scenes, sim, batch, device, agents=traffic is not None)
         self.env = TransformedEnv(base, Compose(self.synthesizer, RewardSum()))
         actor = ego.network.actor
@@ -151,10 +157,13 @@ class PolicyImprovement(Improvement):
 
     def state_dict(self) -> dict:
         """Learner, draws and frames; the weights are the network's."""
-        return {"learner": self.learner.state_dict(), "frames": self.frames, "draws": self.draw.generator.get_state()}
+        state = {"learner": self.learner.state_dict(), "frames": self.frames, "draws": self.draw.generator.get_state()}
+        return state | ({} if self.reaction is None else {"reaction": self.reaction.generator.get_state()})
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`."""
         self.learner.load_state_dict(state["learner"])
         self.draw.generator.set_state(state["draws"].cpu())
+        if self.reaction is not None and "reaction" in state:
+            self.reaction.generator.set_state(state["reaction"].cpu())
         self.frames = state["frames"]

@@ -7,6 +7,7 @@ just avoids it. A cap never accelerates a vehicle.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -101,11 +102,7 @@ def apply_cap(cap: Tensor | None, x0: Tensor, state: LaneState, onset: float) ->
 def _meeting_braking(
     settings: BoundSettings, motion: LaneState, state: LaneState, obstacles: Obstacles, steps: Tensor
 ) -> Tensor:
-    """Braking [B, V] (v - u)^2 / (2 room) that keeps a vehicle `gap` short of the agent that its plan runs into first.
-
-    u is that agent's speed along the vehicle's heading, 0 if it crosses or comes towards it. Of two that meet, the one
-    that has the other farther ahead of itself brakes.
-    """
+    """`meeting_braking` [B, V] of planned motions, towards the agent that each runs into first."""
     vehicles = state.v.shape[1]
     others = constant_velocity(obstacles.agents[:, vehicles:], DT * (steps + 1))
     tracks = torch.cat([motion.states()[:, :, steps], others], 1)  # [B, N, len(steps), 4]
@@ -113,21 +110,47 @@ def _meeting_braking(
     index = first[..., None, None].expand(*first.shape, 1, 4)
     other = tracks[:, None].expand(-1, vehicles, -1, -1, -1).gather(3, index)[..., 0, :]
     own = tracks[:, :vehicles, None].expand(-1, -1, first.shape[2], -1, -1).gather(3, index)[..., 0, :]
+    driven = (motion.s[..., steps] - state.s[..., None]).gather(-1, first)
+    meeting = Meeting(own, other, driven, steps[first] + 1, meet)
+    length = (obstacles.size[:, :vehicles, 0] + obstacles.size[:, :1, 0]) / 2
+    return meeting_braking(settings, meeting, state.v, length, obstacles.duty)
+
+
+class Meeting(NamedTuple):
+    """Vehicles and each of N agents, the ego first, when they first meet: own, other [B, V, N, 4] their states, after
+    the vehicle has driven `driven` [B, V, N] m in `steps` [B, V, N] steps; happens [B, V, N]: they do meet."""
+
+    own: Tensor
+    other: Tensor
+    driven: Tensor
+    steps: Tensor
+    happens: Tensor
+
+
+def meeting_braking(
+    settings: BoundSettings, meeting: Meeting, speed: Tensor, length: Tensor, duty: Duty | None = None
+) -> Tensor:
+    """Braking [B, V] (v - u)^2 / (2 room) that keeps vehicles of `speed` [B, V] `gap` short of what they meet, -NO_CAP
+    where nobody has to brake. u is the other's speed along the vehicle's heading, 0 if it crosses or comes towards it.
+    Of two that meet, the one that has the other farther ahead of itself brakes.
+
+    duty: of adversaries to the ego; those that come into its side, length [B, V] m between the centres if one were just
+    behind the other, fall behind it.
+    """
+    own, other, driven, steps, happens = meeting
     dx, dy = (other[..., :2] - own[..., :2]).unbind(-1)
     ahead = dx * torch.cos(own[..., 2]) + dy * torch.sin(own[..., 2])  # m, the other along the vehicle's heading
     ahead_of_other = -(dx * torch.cos(other[..., 2]) + dy * torch.sin(other[..., 2]))
-    yields = meet & (ahead > ahead_of_other)
-    u = (other[..., 3] * torch.cos(other[..., 2] - own[..., 2])).clamp(min=0)
-    driven = (motion.s[..., steps] - state.s[..., None]).gather(-1, first)
-    room = (driven - settings.gap - u * DT * (steps[first] + 1)).clamp(min=0.3)
-    closing = (state.v[..., None] - u).clamp(min=0)
+    yields = happens & (ahead > ahead_of_other)
+    along = torch.cos(other[..., 2] - own[..., 2])
+    u = (other[..., 3] * along).clamp(min=0)
+    room = (driven - settings.gap - u * DT * steps).clamp(min=0.3)
+    closing = (speed[..., None] - u).clamp(min=0)
     braking = closing**2 / (2 * room)
-    if obstacles.duty is not None:
-        to_ego = _towards_ego(obstacles.duty, meet[..., 0], yields[..., 0], room[..., 0], closing[..., 0])
+    if duty is not None:
+        to_ego = _towards_ego(duty, happens[..., 0], yields[..., 0], room[..., 0], closing[..., 0])
         yields = torch.cat([to_ego[..., None], yields[..., 1:]], -1)
-        length = (obstacles.size[:, :vehicles, 0] + obstacles.size[:, :1, 0]) / 2 + settings.gap
-        alike = torch.cos(other[:, :, 0, 2] - own[:, :, 0, 2]) > ALONGSIDE
-        back = falling_back(length - ahead[..., 0], DT * (steps[first[..., 0]] + 1)) * alike
+        back = falling_back(length + settings.gap - ahead[..., 0], DT * steps[..., 0]) * (along[..., 0] > ALONGSIDE)
         braking = torch.cat([torch.maximum(braking[..., 0], back)[..., None], braking[..., 1:]], -1)
     return torch.where(yields, braking.clamp(min=MIN_BRAKING), -NO_CAP).amax(-1)
 

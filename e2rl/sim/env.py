@@ -70,6 +70,8 @@ class DrivingEnv(EnvBase):
         weights = torch.tensor(check_weights(settings.reward), device=device)
         ends = settings.end_on_contact, settings.end_off_road, settings.end_when_gone
         self._config = StepConfig(self.horizon, *ends, weights, low, high, observation_config(self.device))
+        self.clock = 0
+        """Steps simulated so far, resets or not."""
         self._trajectories = Trajectories(self.scene)
         self._static = static_scene(self.scene, mission_of(self.scene))
         zeros = torch.zeros(batch_size, device=device)
@@ -124,6 +126,11 @@ class DrivingEnv(EnvBase):
         states [b, V, H, 4], valid [b, V, H].
         """
         self._trajectories.write(rows, self._ego.step[rows], states, valid)
+
+    def write_agents(self, rows: Tensor, agents: Tensor, states: Tensor) -> None:
+        """Overwrite the traffic of vehicles agents [K] of environments rows [K] at the coming steps; steps beyond T are
+        dropped. states [K, H, 4]; the others' traffic stays."""
+        self._trajectories.write_agents(rows, agents, self._ego.step[rows], states)
 
     def world(self) -> World:
         """The current World. Its `scene` is the environment's own storage, which the next reset overwrites."""
@@ -188,6 +195,7 @@ class DrivingEnv(EnvBase):
 
     @torch.no_grad()  # the stored state must not accumulate an autograd graph
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        self.clock += 1
         replays, tracks = self.settings.replay_ego, (self._trajectories.states, self._trajectories.valid)
         function: Callable[..., tuple[EgoState, Outcome]] = replay_step if replays else step
         function = compiled(function) if self.settings.compile else function

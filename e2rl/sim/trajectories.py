@@ -58,6 +58,15 @@ class Trajectories:
         self.states[row, at, : self.vehicles] = states.transpose(1, 2)[inside].to(self.states.dtype)
         self.valid[row, at, : self.vehicles] = valid.transpose(1, 2)[inside]
 
+    def write_agents(self, rows: Tensor, agents: Tensor, step: Tensor, states: Tensor) -> None:
+        """Put vehicles agents [K] of scenes rows [K] at states [K, H, 4] at steps step [K] + 1 .. + H, present; steps
+        beyond T are dropped."""
+        at = step[:, None] + torch.arange(1, states.shape[1] + 1, device=step.device)
+        inside = at < self.states.shape[1]
+        where = rows[:, None].expand_as(at)[inside], at[inside], agents[:, None].expand_as(at)[inside]
+        self.states[where] = states[inside].to(self.states.dtype)
+        self.valid[where] = True
+
     def at(self, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """`trajectories_at` step [B]."""
         return trajectories_at(self.states, self.valid, step)

@@ -13,6 +13,7 @@ from e2rl.prior.lane_relative import HORIZON
 from e2rl.sim.env import DrivingEnv
 from e2rl.traffic.lookahead import Lookahead
 from e2rl.traffic.pool import LIVE, RECORDED, TrafficPool
+from e2rl.traffic.reaction import NewEpisodes, Reaction
 from e2rl.traffic.rows import put_rows, take_rows
 from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan, keep_velocity
 
@@ -26,15 +27,27 @@ class AdversarialSynthesizer(Transform):
     REPLAN_STEPS steps) the traffic method plans. It is given ("ego", "plan") [B, H, 4], which the policy has just
     written (without this key, constant velocity), and may not look at it (`Traffic.knowledge`).
 
-    Writes ("traffic", ...): row [B, 1] int64, eta [B, 1], adversary [B, V] bool (under control now) and, with a traffic
-    method, plan [B, V, H, 4] (states planned for the coming steps; only for the policy, not stacked over time),
+    With a reaction, vehicles of replayed rows with an intensity may leave their trajectories and react to the ego. All
+    environments are asked at once, every REPLAN_STEPS simulated steps.
+
+    Writes ("traffic", ...): row [B, 1] int64, eta [B, 1], adversary [B, V] bool (under control or reacting) and, with a
+    traffic method, plan [B, V, H, 4] (states planned for the coming steps; only for the policy, not stacked over time),
     path_kl [B, V], route [B, V] int64 and the method's figures [B, V].
     """
 
-    def __init__(self, pool: TrafficPool, draw: Draw, traffic: Traffic | None = None, ego: Ego | None = None) -> None:
-        """traffic: drives LIVE rows; ego: the ego that a method with `queries_ego` queries."""
+    def __init__(
+        self,
+        pool: TrafficPool,
+        draw: Draw,
+        traffic: Traffic | None = None,
+        ego: Ego | None = None,
+        reaction: Reaction | None = None,
+    ) -> None:
+        """traffic: drives LIVE rows; ego: the ego that a method with `queries_ego` queries; reaction: None, nobody
+        leaves replayed traffic."""
         super().__init__()
-        self.pool, self.draw, self.traffic, self.ego = pool, draw, traffic, ego
+        self.pool, self.draw, self.traffic, self.ego, self.reaction = pool, draw, traffic, ego, reaction
+        self._next_reaction = 0  # the environment's clock at which vehicles react next
         nothing = torch.zeros(0, dtype=torch.int64)  # before the first reset
         self._drawn = nothing  # [B] pool row of each episode
         self._state: State = None
@@ -61,6 +74,8 @@ class AdversarialSynthesizer(Transform):
             self._drawn = torch.zeros(env.batch_size, dtype=torch.int64)
         self._drawn[rows] = self.draw(len(rows)).cpu()
         self._inject(rows)
+        if self.reaction is not None:
+            self._begin_reaction(self.reaction, rows)
         tensordict["scene_index"] = self.pool.scene_index[self._drawn][:, None].to(env.device)
         return tensordict
 
@@ -70,6 +85,15 @@ class AdversarialSynthesizer(Transform):
         stored = source >= 0
         if bool(stored.any()):
             self._env.set_traffic(rows[stored].to(self._env.device), *self.pool.tracks(source[stored]))
+
+    def _begin_reaction(self, reaction: Reaction, rows: Tensor) -> None:
+        """Who reacts in the new episodes of environments rows [b]."""
+        env, drawn = self._env, self._drawn[rows]
+        adversarial = self.pool.adversarial[drawn] & (self.pool.source[drawn] != LIVE)
+        given = rows.to(env.device), adversarial.to(env.device), self._stored_adversaries()[rows.to(env.device)]
+        if len(rows) == len(self._drawn):
+            self._next_reaction = env.clock
+        reaction.begin(NewEpisodes(*given, len(self._drawn), env.horizon))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         if self.traffic is not None:
@@ -106,13 +130,19 @@ class AdversarialSynthesizer(Transform):
         return TensorDict(plan, batch_size=shape[:1], device=device)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Before a step: replan the live traffic of environments in which a replan is due."""
+        """Before a step: replan the live traffic of environments in which a replan is due; let vehicles react."""
         if self.traffic is not None:
             step = tensordict["timestep"][:, 0]
             live = (self.pool.source[self._drawn] == LIVE).to(step.device)
             rows = (live & (step - self._planned_at >= REPLAN_STEPS)).nonzero()[:, 0]
             if len(rows):
                 self._replan(rows, tensordict.get(("ego", "plan"), None))
+        env = self._env
+        if self.reaction is not None and env.clock >= self._next_reaction:
+            self._next_reaction = env.clock + REPLAN_STEPS
+            motion = self.reaction.react(env.world())
+            if motion is not None:
+                env.write_agents(*motion)
         return tensordict
 
     @torch.no_grad()
@@ -155,6 +185,8 @@ class AdversarialSynthesizer(Transform):
                 now = self._env.world().states[:, : self._plan["states"].shape[1]]
                 keys["plan"] = torch.where(replayed[:, None, None, None], keep_velocity(now), keys["plan"])
                 keys["adversary"] = torch.where(replayed[:, None], self._stored_adversaries(), keys["adversary"])
+        if self.reaction is not None:
+            keys["adversary"] = keys["adversary"] | self.reaction.acting
         tensordict["traffic"] = TensorDict(keys, batch_size=tensordict.batch_size, device=device)
         return tensordict
 

@@ -116,3 +116,14 @@ def test_unfit_combinations_are_refused():
         small_run(collect={"steps": 5})
     with pytest.raises(InputError, match="traffic=live"):
         planner_run({"headway": [1.0]}, live=Ambush())
+
+
+def test_a_run_with_reacting_vehicles_goes_on_from_its_state():
+    settings = {"react": {"share": 1.0, "others": 0.0}}
+    run, other = (small_run(expert=settings) for _ in range(2))
+    run.run_round()
+    assert run.improve.synthesizer.reaction is run.improve.reaction
+    drawn = run.improve.reaction.generator.get_state()
+    other.improve.load_state_dict(run.improve.state_dict())
+    assert torch.equal(other.improve.reaction.generator.get_state(), drawn)
+    assert small_run().improve.reaction is None

@@ -27,3 +27,10 @@ def test_synthetic_road():
     points = torch.stack([torch.full_like(y, 30.0), y], -1)[None]
     value = off_road(points, scene["field"], scene["field_origin"])[0]
     assert (value[:3] < 0).all() and torch.allclose(value[3:], torch.tensor([2.0, 1.75]), atol=0.3)
+
+
+def test_points_may_name_the_row_of_their_field():
+    torch.manual_seed(0)
+    field, origin, row = torch.randn(3, 12, 12).half(), torch.randn(3, 2), torch.tensor([2, 0, 2, 1])
+    points = 12 * torch.rand(4, 7, 2)
+    assert torch.equal(off_road(points, field, origin, row), off_road(points, field[row], origin[row]))

@@ -135,6 +135,18 @@ def test_written_traffic_is_executed():
     assert torch.allclose(world.states[:, vehicles:], world.scene["logged"][:, 3, vehicles:])
 
 
+def test_traffic_written_for_some_vehicles_leaves_the_others():
+    env = make_env()
+    env.reset()
+    before = [value.clone() for value in (env._trajectories.states, env._trajectories.valid)]
+    states = torch.full((1, 100, 4), 7.0)
+    env.write_agents(torch.tensor([1]), torch.tensor([2]), states)
+    after = env._trajectories.states, env._trajectories.valid
+    assert (after[0][1, 1:, 2] == 7.0).all() and after[1][1, 1:, 2].all(), "up to the last step"
+    after[0][1, 1:, 2], after[1][1, 1:, 2] = before[0][1, 1:, 2], before[1][1, 1:, 2]
+    assert all(map(torch.equal, before, after))
+
+
 def test_turn_rates_of_traffic_and_ego():
     """Everybody's heading difference over the last step; at the start the estimate of the recording."""
     scenes = make_scenes(1, num_vehicles=3)
