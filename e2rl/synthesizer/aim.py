@@ -175,11 +175,13 @@ class Law:
     care: CareSettings = CareSettings()
     bounds: BoundSettings = BoundSettings()
 
-    def __call__(self, world: World, eta: Tensor, shift: Tensor, ground: Ground) -> Aim:
+    def __call__(
+        self, world: World, eta: Tensor, shift: Tensor, ground: Ground, reckless: Tensor | None = None
+    ) -> Aim:
         """The Aim of K vehicles in their `surroundings` at intensities eta [K].
 
-        shift [K, 2]: m by which they misjudge the ego's place. Without an aim they halve their curvature and brake
-        gently.
+        shift [K, 2]: m by which they misjudge the ego's place; reckless [K] bool: those that owe it nothing (None:
+        nobody). Without an aim they halve their curvature and brake gently.
         """
         states, motion, length = world.states[:, 1], present_motion(world), world.scene["size"][..., 0]
         its_motion = Aim(*(value[:, 0] for value in motion))
@@ -190,6 +192,7 @@ class Law:
         aim = Aim(aim.accel.masked_fill(none, -GENTLE), torch.where(none, motion.curvature[:, 1] / 2, aim.curvature))
         itself = torch.tensor([[False, True]], device=eta.device).expand(len(eta), -1)
         duty = duty_of(self.responsibility, self.care, world, itself, eta)
-        duty = Duty(duty.exempt[:, 1:], duty.yields[:, 1:], duty.patience[:, 1:])
+        exempt = duty.exempt[:, 1:] if reckless is None else duty.exempt[:, 1:] | reckless[:, None]
+        duty = Duty(exempt, duty.yields[:, 1:], duty.patience[:, 1:])
         braking = braking_for(world, aim, motion, duty, self.bounds)
         return aim._replace(accel=torch.minimum(aim.accel, (-braking).clamp(min=self.bounds.floor)))

@@ -34,10 +34,11 @@ class ReactSettings:
     eta: tuple[float, float] = (1.0, 3.0)
     scatter: float = 0.7
     responsibility: str = "full"
+    reckless: float = 0.3
 
     def __post_init__(self) -> None:
-        check_range("learner.react.share", self.share, 0, 1)
-        check_range("learner.react.others", self.others, 0, 1)
+        for name in ("share", "others", "reckless"):
+            check_range(f"learner.react.{name}", getattr(self, name), 0, 1)
         check_range("learner.react.scatter", self.scatter, 0)
         check_choice("learner.react.responsibility", self.responsibility, RESPONSIBILITIES)
         if not 0 <= self.eta[0] <= self.eta[1]:
@@ -46,11 +47,12 @@ class ReactSettings:
 
 def drawn(settings: ReactSettings, episodes: NewEpisodes, generator: torch.Generator) -> TensorDict:
     """The part of the traffic in b new episodes: start [b]: step from which on vehicles react (NEVER: they do not), eta
-    [b], count [b] of them, others [b] bool: not the traffic's own adversaries; rank [b, V]: random, the lowest react;
-    adversaries [b, V]; vehicle [b, MOST] and acts [b, MOST]: who they are, nobody yet; chosen [b]."""
+    [b], count [b] of them, others [b] bool: not the traffic's own adversaries; reckless [b] bool: they owe the ego
+    nothing; rank [b, V]: random, the lowest react; adversaries [b, V]; vehicle [b, MOST] and acts [b, MOST]: who they
+    are, nobody yet; chosen [b]."""
     size, device = episodes.adversaries.shape, episodes.adversaries.device
-    draws = torch.rand(size[0], 5 + size[1], generator=generator).to(device)
-    reacts, others, when, how, many = draws[:, :5].unbind(1)
+    draws = torch.rand(size[0], 6 + size[1], generator=generator).to(device)
+    reacts, others, when, how, many, reckless = draws[:, :6].unbind(1)
     start = (when * LATEST * episodes.horizon).long()
     low, high = settings.eta
     nobody = torch.zeros(size[0], MOST, dtype=torch.int64, device=device)
@@ -59,7 +61,8 @@ def drawn(settings: ReactSettings, episodes: NewEpisodes, generator: torch.Gener
         "eta": low + (high - low) * how,
         "count": 1 + (many * MOST).long(),
         "others": others < settings.others,
-        "rank": draws[:, 5:],
+        "reckless": reckless < settings.reckless,
+        "rank": draws[:, 6:],
         "adversaries": episodes.adversaries,
         "vehicle": nobody,
         "acts": nobody.bool(),
@@ -124,7 +127,7 @@ class Reaiming(Reaction):
         agents = part["vehicle"][row, slot]
         shift = self.settings.scatter * torch.randn(len(row), 2, generator=self.generator).to(row.device)
         ground, seen = Ground(world.scene["field"], world.scene["field_origin"], row), surroundings(world, row, agents)
-        aim = self.law(seen, part["eta"][row], shift, ground)
+        aim = self.law(seen, part["eta"][row], shift, ground, part["reckless"][row])
         times = DT * torch.arange(1, 2 * REPLAN_STEPS + 1, device=row.device)
         states, _ = along_arc(seen.states[:, 1], aim, times)
         return Motion(row, agents, states)

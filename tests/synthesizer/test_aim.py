@@ -138,11 +138,23 @@ def followed_for(seconds, responsibility, vehicles, steer=None):
     return touched
 
 
+BEHIND = [(0, 0, 0, 9.0), (-12, 0, 0, 14.0)]
+
+
 @pytest.mark.parametrize("speed", [10.0, 16.0])
 def test_from_behind_it_hits_a_steady_ego_without_responsibility_and_never_with_it(speed):
     vehicles = [(0, 0, 0, 9.0), (-25, 0, 0, speed)]
     assert followed_for(8, "none", vehicles)
     assert not followed_for(8, "full", vehicles) and not followed_for(8, "rear", vehicles)
+
+
+def test_a_reckless_vehicle_owes_the_ego_nothing_whatever_the_law():
+    seen, _ = aimed(BEHIND)
+    world = make_world(BEHIND)
+    eta, ground, reckless = torch.tensor([3.0]), ground_of(world), torch.tensor([True])
+    free, lawful = (Law(name)(seen, eta, STILL, ground) for name in ("none", "full"))
+    assert Law("full")(seen, eta, STILL, ground, reckless) == free
+    assert Law("full")(seen, eta, STILL, ground, ~reckless) == lawful and lawful.accel < free.accel
 
 
 def test_ahead_it_gives_way_late_but_in_time_under_full_responsibility():

@@ -145,7 +145,7 @@ def test_the_specs_hold(scene_set):
 
 def test_shares_of_episodes_are_as_set():
     count = 4000
-    reaction = Reaiming(ReactSettings(share=0.6, others=0.3, eta=(1.0, 3.0)))
+    reaction = Reaiming(ReactSettings(share=0.6, others=0.3, eta=(1.0, 3.0), reckless=0.2))
     some = torch.arange(count) % 4 > 0
     reaction.begin(NewEpisodes(torch.arange(count), some, torch.zeros(count, 5, dtype=torch.bool), count, 80))
     part = reaction._part
@@ -153,11 +153,12 @@ def test_shares_of_episodes_are_as_set():
     assert not reacts[~some].any() and reacts[some].float().mean() == pytest.approx(0.6, abs=0.03)
     assert part["others"].float().mean() == pytest.approx(0.3, abs=0.03)
     assert part["eta"].min() >= 1 and part["eta"].max() <= 3 and part["eta"].mean() == pytest.approx(2, abs=0.05)
+    assert part["reckless"].float().mean() == pytest.approx(0.2, abs=0.03)
     assert part["count"].unique().tolist() == [1, 2]
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"share": 1.2}, {"others": -0.1}, {"scatter": -1}, {"eta": [3.0, 1.0]}, {"responsibility": "some"}]
+    "wrong", [{"share": 1.2}, {"others": -0.1}, {"reckless": 2}, {"scatter": -1}, {"eta": [3.0, 1.0]}, {"responsibility": "some"}]
 )
 def test_settings_out_of_range_are_refused(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):
