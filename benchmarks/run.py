@@ -12,6 +12,7 @@ import torch
 from collector import collector
 from evolution_round import evolution_round
 from guided_replan import guided_replan
+from learning import learning
 from measure import Bench, Benchmark
 from memory import memory
 from peer import peer_benchmarks
@@ -22,7 +23,7 @@ from synthesized_rollout import synthesized_rollout
 
 from e2rl.errors import InputError, stop
 
-OWN = (simulator, collector, ppo_update, guided_replan, synthesized_rollout, evolution_round, memory, scaling)
+OWN = (simulator, collector, ppo_update, learning, guided_replan, synthesized_rollout, evolution_round, memory, scaling)
 BENCHMARKS: dict[str, Benchmark] = {function.__name__: function for function in OWN} | peer_benchmarks
 
 

@@ -25,7 +25,7 @@ class ActorEgo(Ego):
         self,
         hidden: Sequence[int] = (256, 256),
         reference: bool = True,
-        initial_std: Sequence[float] = (0.12, 0.04),
+        initial_std: Sequence[float] = (0.25, 0.12),
         max_acceleration: float = 5.0,
         max_braking: float = 8.0,
         max_yaw_rate: float = 1.6,

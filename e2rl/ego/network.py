@@ -84,10 +84,18 @@ class ActorNetwork(nn.Module):
         seen = self.normaliser(observation)
         if self.noise is not None:
             seen = seen + self.noise * torch.randn_like(seen)
-        loc = self.trunk(seen)
-        if self.reference:
-            share = (reference_action(observation) - self.middle) / self.reach
-            loc = loc + share.clamp(-STEEPEST, STEEPEST).atanh()
+        return self.head(seen, self.offset(observation))
+
+    def offset(self, observation: Tensor) -> Tensor:
+        """What the network's output [..., 2] is added to at observation [..., D]: no parameter changes it."""
+        if not self.reference:
+            return torch.zeros_like(observation[..., :2])
+        share = (reference_action(observation) - self.middle) / self.reach
+        return share.clamp(-STEEPEST, STEEPEST).atanh()
+
+    def head(self, seen: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+        """loc, scale [..., 2] from the normalised observation [..., D] and the `offset` [..., 2]."""
+        loc = self.trunk(seen) + offset
         return loc, self.std.expand_as(loc)
 
     @contextmanager
@@ -110,6 +118,18 @@ class ActorNetwork(nn.Module):
         return self.middle + self.reach * self(observation)[0].tanh()
 
 
+class Head(nn.Module):
+    """`ActorNetwork.head` as a module of its own."""
+
+    def __init__(self, network: ActorNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, seen: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+        """loc, scale [..., 2]."""
+        return self.network.head(seen, offset)
+
+
 class ActorCritic(nn.Module):
     """TorchRL actor and critic over one normaliser.
 
@@ -122,7 +142,7 @@ class ActorCritic(nn.Module):
         high: Tensor,
         hidden: Sequence[int] = (256, 256),
         reference: bool = True,
-        initial_std: Sequence[float] = (0.12, 0.04),
+        initial_std: Sequence[float] = (0.25, 0.12),
         device: str | torch.device = "cpu",
     ) -> None:
         """low, high [2]: bounds of (acceleration, yaw rate); other fields: conf/ego/actor.yaml."""
@@ -141,16 +161,30 @@ class ActorCritic(nn.Module):
         self.network = ActorNetwork(self.normaliser, hidden, reference, initial_std, low.cpu(), high.cpu())
         values = nn.Sequential(self.normaliser, perceptron(OBSERVATION_SIZE, hidden, 1, last_gain=1.0))
         self.to(device)
-        self.actor = ProbabilisticActor(
-            TensorDictModule(self.network, ["observation"], ["loc", "scale"]),
+        self.actor = self._sampler(TensorDictModule(self.network, ["observation"], ["loc", "scale"]))
+        self.critic = ValueOperator(values.to(device), in_keys=["observation"])
+
+    def heads(self) -> tuple[ProbabilisticActor, ValueOperator]:
+        """Actor and critic with the same parameters that read "seen" and "offset", which an update computes once for
+        all its passes (`prepared`), instead of the observation."""
+        head = TensorDictModule(Head(self.network), ["seen", "offset"], ["loc", "scale"])
+        return self._sampler(head), ValueOperator(self.critic.module[1], in_keys=["seen"])
+
+    @torch.no_grad()
+    def prepared(self, observation: Tensor) -> dict[str, Tensor]:
+        """What `heads` read, of observations [..., D]: seen [..., D] and offset [..., 2]."""
+        return {"seen": self.normaliser(observation), "offset": self.network.offset(observation)}
+
+    def _sampler(self, module: TensorDictModule) -> ProbabilisticActor:
+        return ProbabilisticActor(
+            module,
             in_keys=["loc", "scale"],
             out_keys=["action"],
             distribution_class=TanhNormal,
-            distribution_kwargs={"low": low, "high": high},
-            spec=Bounded(low, high, device=device),
+            distribution_kwargs={"low": self.low, "high": self.high},
+            spec=Bounded(self.low, self.high, device=self.device),
             return_log_prob=True,
         )
-        self.critic = ValueOperator(values.to(device), in_keys=["observation"])
 
     def save(self, path: Path) -> None:
         """Write weights and statistics to a safetensors file whose header holds the architecture."""

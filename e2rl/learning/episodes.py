@@ -57,16 +57,22 @@ def concatenated(parts: list[Episodes]) -> Episodes:
     return Episodes(*(torch.cat([getattr(part, name) for part in parts]) for name in Episodes.__dataclass_fields__))
 
 
-def finished_episodes(batches: list[TensorDictBase], adversarial: Tensor, horizon: int) -> Episodes:
+def decisions(steps, hold: int):
+    """Decisions (int or Tensor) in which an episode reaches so many steps; the last may be cut short."""
+    return (steps + hold - 1) // hold
+
+
+def finished_episodes(batches: list[TensorDictBase], adversarial: Tensor, horizon: int, hold: int = 1) -> Episodes:
     """Episodes of a round's batches [B, T_i] in order (OUTCOME_KEYS), all environments reset at the first frame.
 
-    Episodes that began less than `horizon` steps before the end of the data are omitted: only the failures among them
-    would be finished. adversarial [R]: of the pool's rows.
+    A frame is a decision, held for `hold` steps; an episode has at most `horizon` steps. Episodes that began too late
+    to last so long before the end of the data are omitted: only the failures among them would be finished. adversarial
+    [R]: of the pool's rows.
     """
     data = TensorDict.cat([batch.select(*OUTCOME_KEYS).to("cpu") for batch in batches], 1)
     after, metrics = data["next"], data["next", "metrics"]
-    begin = torch.arange(data.shape[1]) - after["timestep"][..., 0] + 1
-    ended = after["done"][..., 0] & (begin + horizon <= data.shape[1])
+    begin = torch.arange(data.shape[1]) + 1 - decisions(after["timestep"][..., 0], hold)
+    ended = after["done"][..., 0] & (begin + decisions(horizon, hold) <= data.shape[1])
     row, contact = data["traffic", "row"][ended][:, 0], metrics["contact"] | metrics["contact_vru"]
     return Episodes(
         row,

@@ -39,8 +39,9 @@ EXPERT_KEYS = ("observation", "action")
 class CollectSettings:
     """Fields: conf/learner/ppo_bc.yaml."""
 
-    batch: int = 64
-    steps: int = 80
+    batch: int = 256
+    steps: int = 40
+    hold: int = 2
     iterations: int = 20
 
 
@@ -53,6 +54,11 @@ class RowDraw:
     def __call__(self, count: int) -> Tensor:
         """Rows [count]."""
         return torch.multinomial(self.probability, count, replacement=True, generator=self.generator)
+
+
+def steps_of(data: TensorDictBase) -> int:
+    """Steps of 0.1 s that were driven in a batch of decisions."""
+    return int((data["next", "timestep"] - data["timestep"]).sum())
 
 
 class PolicyImprovement(Improvement):
@@ -75,10 +81,11 @@ class PolicyImprovement(Improvement):
         teacher: Ego | None = None,
         parameters: Mapping[str, Any] | None = None,
         react: Mapping[str, Any] | None = None,
+        rounds: int = 1,
     ) -> None:
         """recorded: clone the recorded egos in every round; teacher: also clone this ego's survived episodes in the
-        round's adversarial traffic; react: vehicles that leave the replayed traffic (None: nobody); others:
-        conf/learner/ppo_bc.yaml.
+        round's adversarial traffic; react: vehicles that leave the replayed traffic (None: nobody); rounds: of the run,
+        over which the learning rate falls; others: conf/learner/ppo_bc.yaml.
 
         Raises InputError if the ego is no actor or a round is shorter than an episode.
         """
@@ -87,12 +94,13 @@ class PolicyImprovement(Improvement):
         self.settings = settings_of(CollectSettings, collect or {}, "learner.collect")
         update = settings_of(UpdateSettings, ppo or {}, "learner.ppo")
         batch, self.horizon = self.settings.batch, scenes.scenes["logged"].shape[1] - 1
-        if self.settings.steps * self.settings.iterations < self.horizon:
+        hold, iterations = self.settings.hold, self.settings.iterations
+        if self.settings.steps * iterations * hold < self.horizon:
             raise InputError(
-                f"learner.collect: {self.settings.steps} x {self.settings.iterations} steps a round cannot hold an "
-                f"episode of {self.horizon}"
+                f"learner.collect: {self.settings.steps} x {iterations} decisions of {hold} steps a round cannot hold "
+                f"an episode of {self.horizon} steps"
             )
-        self.ego, self.learner, self.frames = ego, Learner(ego.network, update), 0
+        self.ego, self.learner, self.frames = ego, Learner(ego.network, update, rounds * iterations), 0
         self.expert, self.teacher = None, teacher if update.cloning > 0 else None
         if recorded and update.cloning > 0:
             pairs = settings_of(ImitationSettings, {"seed": seed, **(imitation or {})}, "learner.imitation")
@@ -105,7 +113,7 @@ class PolicyImprovement(Improvement):
         if react is not None:
             self.reaction = Reaiming(settings_of(ReactSettings, react, "learner.react"), seed)
         self.synthesizer = AdversarialSynthesizer(TrafficPool.recorded(every), self.draw, traffic, ego, self.reaction)
-        base = DrivingEnv(scenes, sim, batch, device, agents=traffic is not None)
+        base = DrivingEnv(scenes, sim, batch, device, agents=traffic is not None, hold=hold)
         self.env = TransformedEnv(base, Compose(self.synthesizer, RewardSum()))
         actor = ego.network.actor
         self._collector = Collector(
@@ -121,29 +129,34 @@ class PolicyImprovement(Improvement):
         self._batches = iter(self._collector)
 
     def __call__(self, pool: TrafficPool, curriculum: CurriculumScheduler) -> tuple[dict[str, float], Episodes]:
-        """Reset every environment; `iterations` times: collect [B, steps], update."""
+        """Reset every environment; `iterations` times: collect [B, steps] decisions, update. `frames` are steps of
+        0.1 s."""
         expert = self._expert(pool)
         self.synthesizer.pool = pool
         self.draw.probability = pool.probabilities(curriculum.priority(), curriculum.share)
         self._collector.reset()
-        kept, rows, collecting = [], [], 0.0
+        kept, rows, collecting, begun = [], [], 0.0, self.frames
         for _ in (bar := tqdm(range(self.settings.iterations), "collect and update", unit="batch", leave=False)):
             begin = time.perf_counter()
-            data = next(self._batches)
+            data = self.collected()
             collecting += time.perf_counter() - begin
-            self.frames += data.numel()
+            self.frames += steps_of(data)
             kept.append(data.select(*OUTCOME_KEYS).cpu().clone())
             rows.append(self.learner.update(data, expert))
-            self._collector.update_policy_weights_()
             bar.set_postfix(reward=f"{data['next', 'reward'].mean().item():.3f}", kl=f"{rows[-1]['kl']:.4f}")
-        episodes = finished_episodes(kept, pool.adversarial, self.horizon)
+        episodes = finished_episodes(kept, pool.adversarial, self.horizon, self.settings.hold)
         columns: dict[str, list[float]] = defaultdict(list)
         for name, value in (pair for row in rows for pair in row.items()):
             columns[name].append(value)
         metrics = {name: sum(values) / len(values) for name, values in sorted(columns.items())}
         counts = {"frames": float(self.frames), "expert_pairs": float(0 if expert is None else len(expert))}
-        counts |= {"collect": collecting, "steps_per_second": sum(part.numel() for part in kept) / collecting}
+        counts |= {"collect": collecting, "steps_per_second": (self.frames - begun) / collecting}
         return metrics | episodes.summary() | counts, episodes
+
+    def collected(self) -> TensorDictBase:
+        """The next batch [B, steps] of decisions, by the present policy."""
+        self._collector.update_policy_weights_()
+        return next(self._batches)
 
     def _expert(self, pool: TrafficPool) -> TensorDictBase | None:
         if self.teacher is None or not bool((pool.adversarial & pool.fresh & (pool.source >= 0)).any()):

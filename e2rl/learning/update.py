@@ -6,46 +6,55 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.modules import PopArtValueNorm
 from torchrl.objectives import BCLoss, ClipPPOLoss
-from torchrl.objectives.value import GAE
+from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from e2rl.ego.network import ActorCritic
 from e2rl.errors import InputError
 
 EXPERT_SHARE = 0.99  # expert actions are clipped to this share of the bounds, where the squashed density is infinite
-PPO_KEYS = ("observation", "action", "action_log_prob", "advantage", "value_target", "state_value")
+VALUE_MEMORY = 0.95  # weight of the past in the running mean and variance of the returns, per update
+PEAK_MEMORY = 0.75  # of the past in the running maximum of |advantage|, per update
 
 
 @dataclass(frozen=True)
 class UpdateSettings:
     """Fields: conf/learner/ppo_bc.yaml."""
 
-    learning_rate: float = 3e-4
-    gamma: float = 0.98
+    learning_rate: float = 7e-4
+    final_lr: float = 0.0
+    gamma: float = 0.97
     lmbda: float = 0.95
     clip: float = 0.2
-    entropy: float = 1e-3
+    entropy: float = 0.0
     critic: float = 0.5
-    epochs: int = 4
-    minibatch: int = 1024
+    epochs: int = 3
+    minibatch: int = 2560
     max_grad_norm: float = 0.5
-    target_kl: float = 0.02
+    target_kl: float = 0.04
+    advantage_filter: float = 0.01
     critic_warmup: int = 1
-    cloning: float = 0.1
+    cloning: float = 0.0
     cloning_minibatch: int = 256
     feature_noise: float = 0.3
     last_action_noise: float = 1.0
 
 
 class Learner:
-    """Improves an ActorCritic in place. `updates` counts the calls so far."""
+    """Improves an ActorCritic in place. `updates` counts the calls so far.
 
-    def __init__(self, network: ActorCritic, settings: UpdateSettings) -> None:
-        self.network, self.settings, self.updates = network, settings, 0
-        self.gae = GAE(gamma=settings.gamma, lmbda=settings.lmbda, value_network=network.critic, deactivate_vmap=True)
+    The critic predicts returns in units of their running mean and standard deviation (`returns`); advantages are
+    estimated from the values in units of the reward.
+    """
+
+    def __init__(self, network: ActorCritic, settings: UpdateSettings, total: int | None = None) -> None:
+        """total: updates of the whole run, over which the learning rate falls to its share final_lr; None: constant."""
+        self.network, self.settings, self.total, self.updates = network, settings, total, 0
+        self.returns = PopArtValueNorm(shape=1, beta=VALUE_MEMORY, device=network.device)
+        self.peak = torch.zeros((), device=network.device)  # running maximum of |advantage|
         self.ppo = ClipPPOLoss(
-            network.actor,
-            network.critic,
+            *network.heads(),
             clip_epsilon=settings.clip,
             entropy_coeff=settings.entropy,
             critic_coeff=settings.critic,
@@ -65,8 +74,9 @@ class Learner:
         seen_before = bool(self.network.normaliser.count > 0)
         if not seen_before:  # the last layer is still zero, so statistics change no probability
             self.network.normaliser.observe(data["observation"].to(self.network.device))
-        flat = self._with_advantages(data)
         warming = self.updates < settings.critic_warmup
+        flat = self._with_advantages(data, 0.0 if warming else settings.advantage_filter)
+        self.optimiser.param_groups[0]["lr"] = rate = self._learning_rate()
         for _ in range(settings.epochs):
             moved = []
             for index in torch.randperm(len(flat), device=flat.device).split(settings.minibatch):
@@ -78,7 +88,7 @@ class Learner:
             if stopped:
                 break
         if seen_before:
-            self.network.normaliser.observe(flat["observation"])
+            self.network.normaliser.observe(data["observation"].to(self.network.device))
         self.updates += 1
         result = {name: torch.stack(values).mean().item() for name, values in sums.items()}
         return result | {
@@ -86,16 +96,53 @@ class Learner:
             "std_acceleration": self._std()[0],
             "std_yaw_rate": self._std()[1],
             "steps": float(len(sums["kl"])),
+            "learning_rate": rate,
+            "kept": len(flat) / data.numel(),
         }
 
-    def _with_advantages(self, data: TensorDictBase) -> TensorDict:
-        """Frames [B T] with PPO_KEYS; advantages are normalised over the whole batch."""
-        with torch.no_grad():
-            data = self.gae(data.to(self.network.device))
-        flat = data.select(*PPO_KEYS).reshape(-1)
-        advantage = flat["advantage"]
-        flat["advantage"] = (advantage - advantage.mean()) / advantage.std().clamp(min=1e-6)
-        return flat
+    def _learning_rate(self) -> float:
+        done = 0.0 if self.total is None else min(self.updates / self.total, 1.0)
+        return self.settings.learning_rate * (1 - (1 - self.settings.final_lr) * done)
+
+    @torch.no_grad()
+    def _with_advantages(self, data: TensorDictBase, least: float) -> TensorDict:
+        """The frames [F] of a batch [B, T] with what the losses read; advantages are normalised over the whole batch.
+
+        Frames are left out whose |advantage| is below the share `least` of its running maximum: there is little to
+        learn from them.
+        """
+        data = data.select("observation", "action", "action_log_prob", "next").to(self.network.device)
+        inputs = self.network.prepared(data["observation"])
+        advantage, target = self.advantages(data, inputs["seen"])
+        self.returns.update(target)
+        size, highest = advantage.abs(), advantage.abs().max()
+        self.peak = highest if self.updates == 0 else torch.lerp(highest, self.peak, PEAK_MEMORY)
+        frames = data.select("action", "action_log_prob").update(inputs)
+        frames["advantage"] = (advantage - advantage.mean()) / advantage.std().clamp(min=1e-6)
+        frames["value_target"] = self.returns.normalize(target)
+        kept = (size >= least * self.peak)[..., 0]
+        return frames.reshape(-1) if least == 0 or not bool(kept.any()) else frames[kept]
+
+    @torch.no_grad()
+    def advantages(self, data: TensorDictBase, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """Generalised advantage estimates and returns [B, T, 1] of a batch; seen [B, T, D]: normalised observations.
+
+        The value of a next observation is that of the following frame, but at the batch's end and where an episode is
+        cut off.
+        """
+        after, settings = data["next"], self.settings
+        value = self._value(seen)
+        done, terminated = after["done"], after["terminated"]
+        cut = done & ~terminated
+        cut[:, -1] = True
+        following = torch.cat([value[:, 1:], value[:, -1:]], 1)
+        following[cut] = self._value(self.network.normaliser(after["observation"][cut[..., 0]]))[..., 0]
+        rewards = after["reward"], done, terminated
+        return generalized_advantage_estimate(settings.gamma, settings.lmbda, value, following, *rewards)
+
+    def _value(self, seen: Tensor) -> Tensor:
+        """Values [..., 1] in units of the reward."""
+        return self.returns.denormalize(self.network.critic.module[1](seen))
 
     def _step(self, minibatch: TensorDictBase, expert: TensorDictBase | None, warming: bool) -> dict[str, Tensor]:
         """One optimiser step; the losses and diagnostics, detached."""
@@ -125,12 +172,15 @@ class Learner:
         return self.network.network.std.tolist()
 
     def state_dict(self) -> dict:
-        """Optimiser and counter; the weights are the network's."""
-        return {"optimiser": self.optimiser.state_dict(), "updates": self.updates}
+        """Optimiser, counter and running statistics; the weights are the network's."""
+        statistics = {"returns": self.returns.state_dict(), "peak": self.peak}
+        return {"optimiser": self.optimiser.state_dict(), "updates": self.updates} | statistics
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`."""
         self.optimiser.load_state_dict(state["optimiser"])
+        self.returns.load_state_dict(state["returns"])
+        self.peak = state["peak"].to(self.network.device)
         self.updates = state["updates"]
 
 

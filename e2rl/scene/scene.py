@@ -41,6 +41,7 @@ KEYS_BY_DIMS = {  # number of dims of one scene: keys
     4: "route_points",
 }
 KEYS = {key: dims for dims, keys in KEYS_BY_DIMS.items() for key in keys.split()}
+LARGE = 4096  # numbers of a scene's tensor above which `copy_into` copies scene by scene
 RAGGED = {  # keys whose first dims differ between scenes: the value that pads them
     **dict.fromkeys(("light_state", "light_points", "lane_points", "lane_width", "drivable_points"), 0),
     **dict.fromkeys(("lane_index", "lane_exits", "lane_left", "lane_right", "drivable_index"), -1),
@@ -120,6 +121,9 @@ class SceneSet:
             source, target = self.scenes[key], batch[key]
             if whole and source.device == target.device:  # a second copy would cost more pages than the first
                 torch.index_select(source, 0, indices, out=target)
+            elif source.device == target.device and source[0].numel() > LARGE:  # scene by scene, without a copy between
+                for row, index in zip(rows.tolist(), indices.tolist(), strict=True):
+                    target[row].copy_(source[index])
             else:
                 target[rows] = source[indices].to(target.device)
 

@@ -20,13 +20,12 @@ from e2rl.sim.mission import Mission, mission_of
 from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, observation_config, observe
 from e2rl.sim.reward import DEFAULT_WEIGHTS, check_weights
 from e2rl.sim.static import FrenetPose, static_scene, write_rows
-from e2rl.sim.step import Outcome, StepConfig, replay_step, step
+from e2rl.sim.step import Outcome, StepConfig, hold_step, replay_step, step
 from e2rl.sim.trajectories import Trajectories
 from e2rl.sim.world import World
 
 OF_ROUTE = ("points", "length", "open", "limit", "light", "light_s", "log")
-OF_SCENE = ("start", "start_accel", "start_yaw_rate", "size", "agent_type", "field", "field_origin", "light_state")
-AT_RESET = (*OF_SCENE, *(f"route_{name}" for name in OF_ROUTE))
+OF_SCENE = ("start", "start_accel", "start_yaw_rate", "size", "agent_type", "field_origin")
 FLAGS, METRICS = ("terminated", "truncated"), ("contact", "contact_vru", "off_road", "progress")
 
 
@@ -56,11 +55,19 @@ class DrivingEnv(EnvBase):
     An episode terminates at contact and off the road (settings). It is truncated after the scenes' T steps or when the
     ego leaves the scene. A reset takes the scenes "scene_index" [B, 1] of its input; without this key it draws them
     uniformly (`set_seed`). The traffic is that of `set_traffic`, by default the recording.
+
+    With hold > 1 a step of the environment is so many steps of 0.1 s with the same action: rewards are summed, and an
+    episode that ends in between stays at that moment. `timestep` and T count steps of 0.1 s.
     """
 
-    def __init__(self, scenes: SceneSet, settings: SimSettings, batch_size: int, device="cpu", agents=False) -> None:
+    def __init__(
+        self, scenes: SceneSet, settings: SimSettings, batch_size: int, device="cpu", agents=False, hold: int = 1
+    ) -> None:
+        """Raises InputError if hold is below 1."""
+        if hold < 1:
+            raise InputError(f"DrivingEnv: hold={hold}; an action lasts at least one step")
         super().__init__(device=device, batch_size=[batch_size])
-        self.scenes, self.settings, self.agents = scenes, settings, agents
+        self.scenes, self.settings, self.agents, self.hold = scenes, settings, agents, hold
         self._generator = torch.Generator()
         self.scene = scenes.batch(torch.zeros(batch_size, dtype=torch.long)).to(device)
         """The running scenes, in one storage for the environment's lifetime: a reset overwrites its rows."""
@@ -162,18 +169,28 @@ class DrivingEnv(EnvBase):
         else:
             rows = chosen.view(batch)[index].cpu()
         self.scenes.copy_into(self.scene, index, rows)
-        fresh = self.scene if len(index) == batch else self.scene.select(*AT_RESET)[index]
+        fresh = self.scene if len(index) == batch else self._beginning(index)
         mission = mission_of(fresh)
         write_rows(self._static, index, static_scene(fresh, mission))
         self._trajectories.reset(self.scene, index)
         self._restart(index, fresh, mission)
         return self._reset_output()
 
+    def _beginning(self, index: Tensor) -> TensorDict:
+        """What a reset of environments index [b] needs of their scenes; of routes and recording, that of the ego."""
+        scene = {name: self.scene[name][index] for name in OF_SCENE}
+        scene |= {name: self.scene[name][:, :1][index] for name in (f"route_{key}" for key in OF_ROUTE)}
+        scene |= {name: self.scene[name][:, :, :1][index] for name in ("logged", "logged_valid")}
+        for name in ("field", "light_state"):  # views of the environment's storage, which write_rows leaves alone
+            scene[name] = self.scene[name][: len(index)]
+        return TensorDict(scene, batch_size=[len(index)], device=self.device)
+
     def _restart(self, index: Tensor, scene: TensorDictBase, mission: Mission) -> None:
         """Write the start states of environments index [b] in scenes scene [b]."""
         state = scene["start"][:, 0]
         pose = FrenetPose(*(value[:, 0] for value in project(state[:, None, :2], mission.points)))
-        on_road = off_road(state[:, None, :2], scene["field"], scene["field_origin"])[:, 0] <= 0
+        start = self.scene["start"][:, :1, :2]  # of all environments: the fields stay where they are
+        on_road = off_road(start, self.scene["field"], self.scene["field_origin"])[index, 0] <= 0
         action = torch.stack([scene["start_accel"][:, 0], scene["start_yaw_rate"][:, 0]], -1)
         fresh = EgoState(torch.zeros_like(index), state, action, pose, torch.ones_like(on_road), on_road, pose.s)
 
@@ -200,7 +217,7 @@ class DrivingEnv(EnvBase):
         function: Callable[..., tuple[EgoState, Outcome]] = replay_step if replays else step
         function = compiled(function) if self.settings.compile else function
         given = (self.scene["logged"], self.scene["logged_valid"]) if replays else tensordict["action"]
-        self._ego, outcome = function(self._ego, given, tracks, self._static, self._config)
+        self._ego, outcome = hold_step(function, self.hold, self._ego, given, tracks, self._static, self._config)
         return self._output(outcome).set("reward", outcome["reward"][:, None])
 
     def _output(self, outcome: Outcome) -> TensorDict:

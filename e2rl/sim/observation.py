@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from e2rl.sim.drivable import off_road
+from e2rl.sim.mission import limit_at
 from e2rl.sim.neighbours import Neighbours, neighbours_of, rotation_into
 from e2rl.sim.static import FrenetPose, StaticScene, look_along
 from e2rl.sim.traffic_light import light_state_at
@@ -51,13 +52,14 @@ class ObservationConfig(NamedTuple):
 
 
 class Observed(NamedTuple):
-    """An observation and its ingredients: features [B, OBSERVATION_SIZE], neighbours, border [B, 25]: m beyond the
-    drivable border at the probes, limit [B]: speed limit at the ego [m/s], 0 unknown."""
+    """An observation and what it shares with events and reward: neighbours, beyond [B]: m that the ego's centre is
+    beyond the drivable border, limit [B]: speed limit at the ego [m/s], 0 unknown; features [B, OBSERVATION_SIZE],
+    [B, 0] of a `glance`."""
 
-    features: Tensor
     neighbours: Neighbours
-    border: Tensor
+    beyond: Tensor
     limit: Tensor
+    features: Tensor
 
 
 @cache
@@ -91,7 +93,17 @@ def observe(
         (border / 4).clamp(-1, 1),
         agent_features(config, static, ego, neighbours),
     ]
-    return Observed(torch.cat(blocks, -1), neighbours, border, limit)
+    return Observed(neighbours, border[:, CENTRE], limit, torch.cat(blocks, -1))
+
+
+def glance(
+    config: ObservationConfig, static: StaticScene, ego: EgoState, agents: tuple[Tensor, Tensor, Tensor], horizon: int
+) -> Observed:
+    """`observe` without the features: what events and reward need, at a moment at which no policy looks."""
+    neighbours = neighbours_of(ego.state, rotation_into(ego.state), static.size, static.half_size, *agents)
+    beyond = off_road(ego.state[:, None, :2], static.field, static.origin)[:, 0]
+    nothing = ego.state[:, :0]
+    return Observed(neighbours, beyond, limit_at(static.mission, ego.pose.s), nothing)
 
 
 def ego_features(static: StaticScene, ego: EgoState, limit: Tensor, time: Tensor) -> Tensor:

@@ -7,9 +7,20 @@ from torch import Tensor
 
 from e2rl.errors import InputError
 
-DEFAULT_WEIGHTS = {"progress": 0.1, "contact": -10.0, "off_road": -5.0, "comfort": -0.02, "speeding": -0.1}
+DEFAULT_WEIGHTS = {"progress": 0.06, "contact": -20.0, "off_road": -5.0, "comfort": -0.02, "speeding": -0.1}
 DEFAULT_WEIGHTS["lane_offset"] = -0.02
 TERMS = tuple(DEFAULT_WEIGHTS)
+LEAST_TOP_SPEED = 5.0  # m/s: where no limit is known, progress at this speed is always rewarded
+
+
+def rewarded_progress(progress: Tensor, limit: Tensor, top_speed: Tensor, dt: float) -> Tensor:
+    """The part [B] m of a step's progress [B] m that is rewarded: driving faster than allowed does not pay.
+
+    Allowed is the speed limit [B] m/s, or where it is unknown (0) the recorded ego's top speed in the scene [B], which
+    counts as at least LEAST_TOP_SPEED.
+    """
+    allowed = torch.where(limit > 0, limit, top_speed.clamp(min=LEAST_TOP_SPEED))
+    return torch.minimum(progress, allowed * dt)
 
 
 def reward_terms(
@@ -25,8 +36,9 @@ def reward_terms(
 ) -> dict[str, Tensor]:
     """The TERMS, each [B], of one step of dt seconds.
 
-    progress [B] m along the mission; contact, off_road [B] bool; action, last_action [B, 2]: executed acceleration and
-    yaw rate; speed, limit [B] m/s (limit 0 unknown: never exceeded); offset [B] m from the mission route.
+    progress [B] m along the mission (`rewarded_progress`); contact, off_road [B] bool; action, last_action [B, 2]:
+    executed acceleration and yaw rate; speed, limit [B] m/s (limit 0 unknown: never exceeded); offset [B] m from the
+    mission route.
     """
     jerk = (action[:, 0] - last_action[:, 0]) / dt
     lateral = speed * action[:, 1]

@@ -26,7 +26,8 @@ class StaticScene(NamedTuple):
 
     mission; segments [B, P - 1, 12]: table of the mission's segments (`segment_table`); row [B, 1]: 0 .. B - 1;
     light_state [B, T + 1, S]; field [B, G, G], origin [B, 2]: the drivable field; size [B, 2]: length and width of the
-    ego; half_size [B, 2, M]: half lengths and widths of the others; vehicle [B, M] bool.
+    ego; half_size [B, 2, M]: half lengths and widths of the others; vehicle [B, M] bool; top_speed [B]: the recorded
+    ego's highest speed [m/s].
     """
 
     mission: Mission
@@ -38,6 +39,7 @@ class StaticScene(NamedTuple):
     size: Tensor
     half_size: Tensor
     vehicle: Tensor
+    top_speed: Tensor
 
 
 def static_scene(scene: TensorDictBase, mission: Mission) -> StaticScene:
@@ -54,6 +56,7 @@ def static_scene(scene: TensorDictBase, mission: Mission) -> StaticScene:
         scene["size"][:, 0],
         half_size,
         scene["agent_type"][:, 1:] == VEHICLE,
+        (scene["logged"][:, :, 0, 3] * scene["logged_valid"][:, :, 0]).amax(1),
     )
 
 
@@ -61,7 +64,7 @@ def write_rows(static: StaticScene, rows: Tensor, new: StaticScene) -> None:
     """Overwrite rows [b] of a StaticScene, in place; views of the scenes' storage need no copy."""
     for old, fresh in zip(static.mission, new.mission, strict=True):
         old[rows] = fresh
-    for name in ("segments", "half_size", "vehicle"):
+    for name in ("segments", "half_size", "vehicle", "top_speed"):
         getattr(static, name)[rows] = getattr(new, name)
 
 

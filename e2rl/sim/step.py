@@ -1,8 +1,9 @@
-"""One simulation step of B scenes, as a pure function of tensors.
+"""One simulation step of B scenes, as a pure function of tensors, and several under one action.
 
 Only the ego's motion is integrated; the other agents' states are looked up in given trajectories.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -10,13 +11,16 @@ from torch import Tensor
 
 from e2rl.scene.recording import DT
 from e2rl.sim import dynamics
-from e2rl.sim.observation import CENTRE, EgoState, ObservationConfig, observe
-from e2rl.sim.reward import reward_terms, weighted_sum
-from e2rl.sim.static import StaticScene, follow
+from e2rl.sim.observation import EgoState, ObservationConfig, Observed, glance, observe
+from e2rl.sim.reward import reward_terms, rewarded_progress, weighted_sum
+from e2rl.sim.static import FrenetPose, StaticScene, follow
 from e2rl.sim.trajectories import trajectories_at
 
 Tracks = tuple[Tensor, Tensor]  # states [B, T+1, N, 4] and presence [B, T+1, N] of all agents
 Outcome = dict[str, Tensor]  # see `advance`
+Sense = Callable[..., Observed]  # observe or glance
+FLAGS = ("contact", "contact_vru", "off_road", "terminated", "truncated")
+OF_EGO = tuple(name for name in EgoState._fields if name != "pose")
 
 
 class StepConfig(NamedTuple):
@@ -33,40 +37,84 @@ class StepConfig(NamedTuple):
     observation: ObservationConfig
 
 
-def step(ego: EgoState, action: Tensor, tracks: Tracks, static: StaticScene, config: StepConfig):
+def step(
+    ego: EgoState,
+    action: Tensor,
+    tracks: Tracks,
+    static: StaticScene,
+    config: StepConfig,
+    sense: Sense = observe,
+    ended: Tensor | None = None,
+) -> tuple[EgoState, Outcome]:
     """`advance` of egos that execute action [B, 2]: acceleration [m/s^2], yaw rate [rad/s], clamped to the bounds."""
     state = dynamics.step(ego.state, torch.clamp(action, config.low, config.high))
-    return advance(ego, state, ego.present, tracks, static, config)
+    return advance(ego, state, ego.present, tracks, static, config, sense, ended)
 
 
-def replay_step(ego: EgoState, logged: Tracks, tracks: Tracks, static: StaticScene, config: StepConfig):
+def replay_step(
+    ego: EgoState,
+    logged: Tracks,
+    tracks: Tracks,
+    static: StaticScene,
+    config: StepConfig,
+    sense: Sense = observe,
+    ended: Tensor | None = None,
+) -> tuple[EgoState, Outcome]:
     """`advance` of egos that follow their recording and leave the scene at its end."""
     row, now = static.row[:, 0], (ego.step + 1).clamp(max=config.horizon)
     known = logged[1][row, now, 0]
     state = torch.where(known[:, None], logged[0][row, now, 0], ego.state)
-    return advance(ego, state, ego.present & known, tracks, static, config)
+    return advance(ego, state, ego.present & known, tracks, static, config, sense, ended)
+
+
+def hold_step(
+    function: Callable[..., tuple[EgoState, Outcome]], hold: int, ego: EgoState, *given
+) -> tuple[EgoState, Outcome]:
+    """`hold` steps of function (`step` or `replay_step`) under one action: rewards are summed, flags are of any step.
+
+    Egos whose episode ends stay at that moment, which is also the one they observe; the others observe the last one.
+    """
+    ego, outcome = function(ego, *given, observe if hold == 1 else glance)
+    for last in range(2, hold + 1):
+        ended = outcome["terminated"] | outcome["truncated"]
+        ego, later = function(ego, *given, observe if last == hold else glance, ended)
+        flags = {name: outcome[name] | (later[name] & ~ended) for name in FLAGS}
+        outcome = later | flags | {"reward": outcome["reward"] + later["reward"].masked_fill(ended, 0)}
+    return ego, outcome
 
 
 def advance(
-    ego: EgoState, state: Tensor, present: Tensor, tracks: Tracks, static: StaticScene, config: StepConfig
+    ego: EgoState,
+    state: Tensor,
+    present: Tensor,
+    tracks: Tracks,
+    static: StaticScene,
+    config: StepConfig,
+    sense: Sense = observe,
+    ended: Tensor | None = None,
 ) -> tuple[EgoState, Outcome]:
     """The egos after a step to state [B, 4], and the outcome of the step; present [B]: egos still in the scene.
 
-    Outcome: observation [B, D], reward, contact (with a vehicle), contact_vru (with another agent), off_road,
-    terminated, truncated, progress (m along the mission since the start).
+    ended [B]: egos that stay where they are. Outcome: observation [B, D] ([B, 0] of a `glance`), reward, contact
+    (with a vehicle), contact_vru (with another agent), off_road, terminated, truncated, progress (m along the mission
+    since the start).
     """
     now = (ego.step + 1).clamp(max=config.horizon)
     action = dynamics.inverse(torch.stack([ego.state, state], 1))[:, 0]
     pose = follow(static, state[:, :2], ego.pose.s + ego.state[:, 3] * DT)
     moved = EgoState(now, state, action, pose, present, ego.been_on_road, ego.start_s)
+    if ended is not None:
+        moved = unless(ended, moved, ego)
+        now, state, action, pose, present, *_ = moved
     others, there, accel = (value[:, 1:] for value in trajectories_at(*tracks, now))
-    seen = observe(config.observation, static, moved, (others, there, accel), config.horizon)
+    seen = sense(config.observation, static, moved, (others, there, accel), config.horizon)
     hit = (seen.neighbours.gap < 0) & there & present[:, None]
     contact, contact_vru = (hit & static.vehicle).any(1), (hit & ~static.vehicle).any(1)
-    off = seen.border[:, CENTRE] > 0
+    off = seen.beyond > 0
     off_road = off & ego.been_on_road & present
     gone = ~present | (pose.s >= static.mission.end)
-    touched, way = contact | contact_vru, pose.s - ego.pose.s
+    touched = contact | contact_vru
+    way = rewarded_progress(pose.s - ego.pose.s, seen.limit, static.top_speed, DT)
     terms = reward_terms(way, touched, off_road, action, ego.action, state[:, 3], seen.limit, pose.d, DT)
     outcome = {
         "observation": seen.features,
@@ -79,3 +127,13 @@ def advance(
         "progress": pose.s - ego.start_s,
     }
     return moved._replace(present=~gone, been_on_road=ego.been_on_road | ~off), outcome
+
+
+def unless(flag: Tensor, new: EgoState, old: EgoState) -> EgoState:
+    """The new egos, but the old ones where flag [B]."""
+
+    def pick(after: Tensor, before: Tensor) -> Tensor:
+        return torch.where(flag.view(-1, *[1] * (after.ndim - 1)), before, after)
+
+    pose = FrenetPose(*map(pick, new.pose, old.pose))
+    return EgoState(pose=pose, **{name: pick(getattr(new, name), getattr(old, name)) for name in OF_EGO})

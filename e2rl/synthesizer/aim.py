@@ -175,9 +175,7 @@ class Law:
     care: CareSettings = CareSettings()
     bounds: BoundSettings = BoundSettings()
 
-    def __call__(
-        self, world: World, eta: Tensor, shift: Tensor, ground: Ground, reckless: Tensor | None = None
-    ) -> Aim:
+    def __call__(self, world: World, eta: Tensor, shift: Tensor, ground: Ground, reckless: Tensor | None = None) -> Aim:
         """The Aim of K vehicles in their `surroundings` at intensities eta [K].
 
         shift [K, 2]: m by which they misjudge the ego's place; reckless [K] bool: those that owe it nothing (None:

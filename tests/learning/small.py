@@ -77,8 +77,9 @@ def small_run(
         SimSettings(),
         live,
         seed,
-        collect={"batch": 4, "steps": 20, "iterations": 2} | (collect or {}),
+        collect={"batch": 4, "steps": 20, "hold": 1, "iterations": 2} | (collect or {}),
         ppo={"minibatch": 64, "epochs": 2, "critic_warmup": 0, "target_kl": 1.0} | ppo,
+        rounds=rounds,
         **(expert or {}),
     )
     traffic = "replay" if live is None else "live"

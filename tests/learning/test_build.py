@@ -17,6 +17,7 @@ from tests.learning.small import Ambush, brake_check, small_scenes
 
 CURRICULA = {"adaptive": AdaptiveCurriculum, "linear": LinearCurriculum, "constant": ConstantCurriculum}
 POLICY = ["ego.hidden=[16]", "learner.imitation.batch=2", "learner.imitation.epochs=1"]
+POLICY += ["learner.ppo.cloning=0.1"]
 POLICY += [f"learner.collect.{setting}" for setting in ("batch=4", "steps=20", "iterations=1")]
 PLANNER = ["learner=planner_tuning", "ego=lane_graph", "learner.batch=2"]
 

@@ -29,14 +29,16 @@ KINDS = {"replay": (None, False), "ahead": (None, True), "live": (Ambush(), Fals
 
 
 @pytest.mark.parametrize(("live", "ahead"), KINDS.values(), ids=KINDS)
-def test_resumed_rounds_are_those_of_one_run(tmp_path, live, ahead):
-    whole = small_run(seed=3, live=live, spread=0.5, folder=tmp_path / "whole", ahead=ahead, memory=8)
+@pytest.mark.parametrize("hold", [1, 2])
+def test_resumed_rounds_are_those_of_one_run(tmp_path, live, ahead, hold):
+    settings = {"live": live, "spread": 0.5, "ahead": ahead, "memory": 8, "collect": {"hold": hold}, "final_lr": 1.0}
+    whole = small_run(seed=3, folder=tmp_path / "whole", **settings)
     expected = rounds(whole, 4)
     folder, shorter = tmp_path / "run", 2  # a run of two rounds, to which two are added
-    first = small_run(seed=3, live=live, spread=0.5, folder=folder, ahead=ahead, memory=8, rounds=shorter)
+    first = small_run(seed=3, folder=folder, rounds=shorter, **settings)
     begun = rounds(first, 2)
     save_checkpoint(folder, first, CONFIG)
-    second = small_run(seed=99, live=live, spread=0.5, folder=folder, ahead=ahead, memory=8)
+    second = small_run(seed=99, folder=folder, **settings)
     second.seed = 3
     assert load_checkpoint(folder, second) == 2
     assert begun + rounds(second, 2) == expected
@@ -45,6 +47,9 @@ def test_resumed_rounds_are_those_of_one_run(tmp_path, live, ahead):
     assert torch.equal(whole.curriculum.priority(), second.curriculum.priority())
     moments = [run.improve.learner.optimiser.state_dict()["state"] for run in (whole, second)]
     assert all(torch.equal(moments[0][k]["exp_avg"], moments[1][k]["exp_avg"]) for k in moments[0])
+    assert torch.equal(whole.improve.learner.peak, second.improve.learner.peak) and whole.improve.learner.peak > 0
+    scales = [run.improve.learner.returns.scale() for run in (whole, second)]
+    assert torch.equal(*scales) and scales[0] != 1
     assert whole.memory.index() == second.memory.index() and len(whole.memory.rounds) == (0 if live else 2)
     for one, other in zip(whole.memory.rounds, second.memory.rounds, strict=True):
         assert all(torch.equal(value, other.traffic[key]) for key, value in one.traffic.items())

@@ -54,6 +54,18 @@ def test_episodes_that_could_not_have_lasted_do_not_count():
     assert finished_episodes([data], torch.zeros(3, dtype=torch.bool), 10).row.tolist() == [0]
 
 
+def test_decisions_of_several_steps_are_told_from_steps():
+    """Episodes of 5, 3 and 5 steps in decisions of 2 are 3, 2 and 3 frames, the last one of each cut short."""
+    steps, number = [2, 4, 5, 2, 3, 2, 4, 5], [0, 0, 0, 1, 1, 2, 2, 2]
+    data = frames([3, 2, 3], 8, fail=(1,))
+    assert data["traffic", "row"][0, :, 0].tolist() == number
+    data["next", "timestep"] = torch.tensor(steps)[None, :, None]
+    adversarial = torch.zeros(3, dtype=torch.bool)
+    assert finished_episodes([data], adversarial, 5, hold=2).row.tolist() == [0, 1, 2]
+    assert finished_episodes([data[:, :7]], adversarial, 5, hold=2).row.tolist() == [0, 1]
+    assert finished_episodes([data[:, :5]], adversarial, 5, hold=2).row.tolist() == [0], "the second might have lasted"
+
+
 def test_the_failure_rate_is_unbiased():
     """Half of the environments' episodes fail after 3 of 10 steps; counting every finished one would say more."""
     torch.manual_seed(0)

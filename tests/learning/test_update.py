@@ -3,12 +3,16 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives.value import GAE
 
 from e2rl.ego.actor import ActorEgo
 from e2rl.errors import InputError
 from e2rl.learning.update import Learner, UpdateSettings
 from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.observation import OBSERVATION_SIZE
 from tests.learning.small import small_scenes
 
 
@@ -89,6 +93,77 @@ def test_passes_stop_at_the_target_kl():
     settings = UpdateSettings(critic_warmup=0, learning_rate=0.05, minibatch=40, epochs=10, target_kl=0.01)
     row = Learner(ego.network, settings).update(batch_of(ego))
     assert row["stopped_by_kl"] == 1.0 and row["steps"] < 40
+
+
+def test_advantages_are_those_of_torchrl():
+    """Of one pass over the observations, where TorchRL takes two; with episodes that end and are cut off inside."""
+    torch.manual_seed(0)
+    ego = ActorEgo(hidden=(16,), initial_std=(0.9, 0.9))
+    learner, data = Learner(ego.network, UpdateSettings(gamma=0.9, lmbda=0.8)), batch_of(ego, 16, 50)
+    assert data["next", "terminated"].any() and data["next", "truncated"].any()
+    learner.returns.update(5 * torch.randn(100, 1) + 3)
+    learner.network.normaliser.observe(data["observation"])
+    values = TensorDictModule(
+        lambda seen: learner.returns.denormalize(ego.network.critic.module(seen)), ["observation"], ["state_value"]
+    )
+    expected = GAE(gamma=0.9, lmbda=0.8, value_network=values, deactivate_vmap=True)(data.clone())
+    found = learner.advantages(data, ego.network.prepared(data["observation"])["seen"])
+    for name, value in zip(("advantage", "value_target"), found, strict=True):
+        torch.testing.assert_close(value, expected[name], rtol=1e-4, atol=1e-4)
+
+
+def test_the_heads_act_and_value_as_the_network():
+    ego = ActorEgo(hidden=(16,))
+    torch.nn.init.normal_(ego.network.network.trunk[-1].weight)
+    observation = torch.randn(7, OBSERVATION_SIZE)
+    actor, critic = ego.network.heads()
+    inputs = TensorDict(ego.network.prepared(observation), [7])
+    whole = TensorDict({"observation": observation}, [7])
+    for part, of in ((actor, ego.network.actor), (critic, ego.network.critic)):
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            part(inputs), of(whole)
+    for key in ("loc", "scale", "action", "state_value"):
+        assert torch.equal(inputs[key], whole[key]), key
+
+
+def test_the_critic_learns_values_of_any_size():
+    """Its loss and error in units of the returns' spread do not depend on the reward's scale."""
+    errors = []
+    for scale in (1.0, 1000.0):
+        torch.manual_seed(0)
+        ego = ActorEgo(hidden=(16,))
+        data = batch_of(ego)
+        data["next", "reward"] *= scale
+        learner = Learner(ego.network, UpdateSettings(minibatch=40, critic_warmup=10, gamma=0.9))
+        errors.append([learner.update(data)["loss_critic"] for _ in range(4)])
+    assert errors[0][-1] < errors[0][0]
+    torch.testing.assert_close(torch.tensor(errors[0]), torch.tensor(errors[1]), rtol=0.02, atol=1e-3)
+
+
+def test_the_learning_rate_falls_to_its_share_over_the_run():
+    ego = ActorEgo(hidden=(16,))
+    settings, data = UpdateSettings(learning_rate=1e-3, final_lr=0.2, epochs=1), batch_of(ego)
+    learner = Learner(ego.network, settings, total=4)
+    rates = [learner.update(data)["learning_rate"] for _ in range(6)]
+    assert rates == pytest.approx([1e-3, 8e-4, 6e-4, 4e-4, 2e-4, 2e-4])
+    assert learner.optimiser.param_groups[0]["lr"] == rates[-1]
+    constant = Learner(ego.network, settings)
+    assert [constant.update(data)["learning_rate"] for _ in range(3)] == [1e-3] * 3
+
+
+def test_frames_with_little_to_learn_are_left_out():
+    """Those below the share of the running maximum of |advantage|; none while the critic warms up."""
+    torch.manual_seed(0)
+    ego = ActorEgo(hidden=(16,))
+    data = batch_of(ego)
+    learner = Learner(ego.network, UpdateSettings(advantage_filter=0.3, critic_warmup=1, epochs=1))
+    assert learner.update(data)["kept"] == 1.0
+    seen = ego.network.prepared(data["observation"])["seen"]
+    advantage, before = learner.advantages(data, seen)[0].abs(), learner.peak.clone()
+    expected = (advantage >= 0.3 * (0.75 * before + 0.25 * advantage.max())).float().mean().item()
+    assert learner.update(data)["kept"] == pytest.approx(expected) and 0 < expected < 1
+    every = Learner(ego.network, UpdateSettings(advantage_filter=0.0, critic_warmup=0, epochs=1))
+    assert every.update(data)["kept"] == 1.0
 
 
 def test_losses_share_the_networks_parameters():

@@ -15,6 +15,8 @@ from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.world import World
 from tests.synthetic import make_scenes
 
+METRIC_KEYS = [("metrics", name) for name in ("contact", "contact_vru", "off_road", "progress")]
+
 
 def make_env(batch=2, settings=None, **scene):
     return DrivingEnv(make_scenes(**{"num_scenes": 3} | scene), settings or SimSettings(), batch)
@@ -234,6 +236,73 @@ def test_observation_is_of_order_one():
     data = env.rollout(80, break_when_any_done=False)
     assert data["observation"].abs().max() <= 5 and torch.isfinite(data["observation"]).all()
     assert data["observation"].shape[-1] <= 300
+
+
+# --- held actions
+
+WAYS = {  # what may end an episode on the way: 80 is no multiple of 3, contact and border come between decisions
+    "horizon": {"num_scenes": 3, "num_vehicles": 1, "num_vrus": 0},
+    "contact": {"num_scenes": 3, "vehicles": [(0.0, 0, 10.0), (30.0, 0, 0.0)]},
+    "map end": {"num_scenes": 3, "num_vehicles": 1, "road": (-60.0, 40.0)},
+    "off road": {"num_scenes": 3, "num_vehicles": 1, "num_vrus": 0},
+}
+
+
+@pytest.mark.parametrize("hold", [1, 2, 3])
+@pytest.mark.parametrize("way", WAYS)
+def test_a_held_action_is_that_action_at_every_step_until_the_episode_ends(way, hold):
+    """Against an environment without holding: rewards add up, flags of any moment count, nobody runs on."""
+    once, held = (DrivingEnv(make_scenes(**WAYS[way]), SimSettings(), 4, hold=steps) for steps in (1, hold))
+    index = TensorDict({"scene_index": torch.tensor([[0], [1], [2], [0]])}, [4])
+    assert torch.equal(once.reset(index.clone())["observation"], held.reset(index.clone())["observation"])
+    action = torch.tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [3.0, 0.0]])
+    action[:, 1] = -0.2 if way == "off road" else 0.0
+    alive, rewards = torch.ones(4, dtype=torch.bool), []
+    last = None
+    while alive.any():
+        expected, reward = None, torch.zeros(4, 1)
+        for _ in range(hold):
+            now = once.step(TensorDict({"action": action}, [4]))["next"]
+            reward = reward + now["reward"] * alive[:, None]
+            expected = now.clone() if expected is None else torch.where(alive, now, expected)
+            alive = alive & ~now["done"][:, 0]
+        found = held.step(TensorDict({"action": action}, [4]))["next"]
+        running = torch.ones(4, dtype=torch.bool) if last is None else ~last
+        for key in ("observation", "timestep", "done", "terminated", "truncated", *METRIC_KEYS):
+            assert torch.equal(found[key][running], expected[key][running]), key
+        torch.testing.assert_close(found["reward"][running], reward[running])
+        last = found["done"][:, 0] if last is None else last | found["done"][:, 0]
+        rewards.append(reward)
+    assert last.all()
+
+
+def test_an_action_lasts_at_least_a_step():
+    with pytest.raises(InputError, match="hold=0"):
+        DrivingEnv(make_scenes(1), SimSettings(), 1, hold=0)
+
+
+def test_held_actions_keep_the_specs_and_the_resets():
+    env = DrivingEnv(make_scenes(5, num_vehicles=4), SimSettings(), 8, hold=3)
+    check_env_specs(env, seed=0)
+    torch.manual_seed(0)
+    data = env.rollout(80, break_when_any_done=False)
+    way, done = data["next", "timestep"] - data["timestep"], data["next", "done"]
+    assert (way[~done] == 3).all() and ((way >= 1) & (way <= 3)).all() and (way < 3).any()
+    assert data["next", "timestep"].max() <= 80 and (data["timestep"][:, 1:][done[:, :-1]] == 0).all()
+
+
+def test_what_a_reset_of_some_writes_is_what_a_reset_of_all_writes():
+    whole, some = (make_env(batch=4, num_vehicles=6, num_scenes=5) for _ in range(2))
+    index = torch.tensor([[4], [1], [3], [0]])
+    whole.reset(TensorDict({"scene_index": index}, [4]))
+    some.reset(TensorDict({"scene_index": torch.tensor([[0], [1], [2], [0]])}, [4]))
+    begun = torch.tensor([[True], [False], [True], [False]])
+    some.reset(TensorDict({"scene_index": index, "_reset": begun}, [4]))
+    assert torch.equal(act(whole, 1.0, 0.1)["observation"], act(some, 1.0, 0.1)["observation"])
+    for found, value in zip(
+        (*some._static.mission, *some._static[1:]), (*whole._static.mission, *whole._static[1:]), strict=True
+    ):
+        assert torch.equal(found, value)
 
 
 def test_unknown_reward_term_is_refused():

@@ -4,6 +4,7 @@ import torch
 
 from e2rl.scene.recording import LIGHT_GREEN, LIGHT_RED
 from e2rl.scene.scene import SceneSet
+from e2rl.sim import observation as sight
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.mission import mission_of
 from e2rl.sim.observation import light_features, observation_config
@@ -79,3 +80,17 @@ def test_beyond_the_recording_a_light_keeps_its_last_state_in_its_own_scene():
         for step in (last, last + 40)
     )
     assert torch.equal(beyond, at_the_end) and beyond[0, 0] == 1 and beyond[1, 2] == 1
+
+
+def test_a_glance_sees_what_events_and_reward_take_from_an_observation():
+    env = DrivingEnv(make_scenes(3, num_vehicles=9, limit=8.0), SimSettings(), 3)
+    env.reset()
+    world = env.world()
+    others = world.states[:, 1:], world.valid[:, 1:], world.accel[:, 1:]
+    full, short = (
+        sense(env._config.observation, env._static, env._ego, others, 80) for sense in (sight.observe, sight.glance)
+    )
+    assert (
+        not short.features.numel() and torch.equal(full.beyond, short.beyond) and torch.equal(full.limit, short.limit)
+    )
+    assert torch.equal(full.neighbours.gap, short.neighbours.gap) and (full.limit == 8).all()

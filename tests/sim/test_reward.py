@@ -2,7 +2,7 @@
 
 import torch
 
-from e2rl.sim.reward import TERMS, check_weights, reward_terms, weighted_sum
+from e2rl.sim.reward import TERMS, check_weights, reward_terms, rewarded_progress, weighted_sum
 
 QUIET = {
     "progress": torch.ones(1),
@@ -37,6 +37,15 @@ def test_terms_grow_with_what_they_name():
     turning = torch.tensor([[0.0, 0.4]])
     assert abs(term("comfort", action=turning) - 1) < 1e-6
     assert term("comfort", action=steady) > term("comfort", action=steady, last_action=steady)
+
+
+def test_progress_pays_up_to_what_is_allowed():
+    """The limit, where it is unknown the recorded top speed, and always 5 m/s; going back costs what it is."""
+    progress = torch.tensor([0.5, 2.0, 2.0, 2.0, 2.0, -1.0])
+    limit = torch.tensor([10.0, 10.0, 0.0, 0.0, 30.0, 10.0])
+    recorded = torch.tensor([3.0, 15.0, 15.0, 3.0, 3.0, 3.0])
+    paid = rewarded_progress(progress, limit, recorded, 0.1)
+    torch.testing.assert_close(paid, torch.tensor([0.5, 1.0, 1.5, 0.5, 2.0, -1.0]))
 
 
 def test_reward_is_linear_in_the_weights():

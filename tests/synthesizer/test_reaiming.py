@@ -158,7 +158,15 @@ def test_shares_of_episodes_are_as_set():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"share": 1.2}, {"others": -0.1}, {"reckless": 2}, {"scatter": -1}, {"eta": [3.0, 1.0]}, {"responsibility": "some"}]
+    "wrong",
+    [
+        {"share": 1.2},
+        {"others": -0.1},
+        {"reckless": 2},
+        {"scatter": -1},
+        {"eta": [3.0, 1.0]},
+        {"responsibility": "some"},
+    ],
 )
 def test_settings_out_of_range_are_refused(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):

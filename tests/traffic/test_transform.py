@@ -117,6 +117,22 @@ def test_live_traffic_is_the_plan_and_is_replanned_every_half_second_before_the_
         torch.testing.assert_close(tensordict["traffic", "hurry"], speed.expand(3, ROWS))
 
 
+def test_with_held_actions_a_replan_comes_at_the_first_decision_at_which_it_is_due():
+    """Decisions of 2 steps: replans at 0, 6, 12, ... and in between everybody drives the plan that was written."""
+    on = March()
+    base = DrivingEnv(scenes(3, 20), ON, 3, agents=True, hold=2)
+    env = TransformedEnv(base, AdversarialSynthesizer(live(), in_turn(live()), on))
+    policy, tensordict = EgoPolicy(IDMEgo(), env), env.reset()
+    for decision in range(10):
+        tensordict = env.step(policy(tensordict))["next"]
+        assert [steps for steps, _ in on.calls] == [[6 * k] * 3 for k in range(1 + decision // 3)]
+        speed = torch.arange(3.0)[:, None] + (decision // 3) / 10
+        torch.testing.assert_close(tensordict["agents", "states"][:, 1:ROWS, 3], speed.expand(3, ROWS - 1))
+        left = tensordict["traffic", "plan"][:, 1:, 0, :2] - tensordict["agents", "states"][:, 1:ROWS, :2]
+        torch.testing.assert_close(left.norm(dim=-1), (0.1 * speed).expand(3, ROWS - 1), rtol=0, atol=1e-3)
+    assert tensordict["timestep"].eq(20).all() and tensordict["done"].all()
+
+
 def test_the_ego_of_a_policy_that_writes_no_plan_is_expected_to_keep_its_velocity():
     on = March()
     env = environment(live(), on)

@@ -1,0 +1,36 @@
+"""Policy learning from collection to weights, in the default configuration, on recorded traffic."""
+
+import time
+from collections.abc import Iterator
+
+import torch
+from measure import Bench, Row
+
+from e2rl.build import build_ego, build_sim
+from e2rl.learning.policy import PolicyImprovement, steps_of
+
+WARM_UP = 2  # iterations that are not counted: the first updates fit the critic alone
+
+
+def learning(bench: Bench) -> Iterator[Row]:
+    """Simulator steps of 0.1 s per second of CPU: of collecting a batch, and of collecting and updating; the best of
+    the repeats, without cloning."""
+    config = bench.configured("train")
+    torch.manual_seed(0)
+    collect, ppo = dict(config.learner.collect), {**config.learner.ppo, "cloning": 0.0}
+    improve = PolicyImprovement(
+        build_ego(config), bench.scenes, build_sim(config), collect=collect, ppo=ppo, rounds=config.rounds
+    )
+    collected, whole = [], []
+    for number in range(WARM_UP + bench.repeats):
+        begin = time.process_time()
+        data = improve.collected()
+        between = time.process_time()
+        improve.learner.update(data)
+        if number >= WARM_UP:
+            steps = steps_of(data)
+            collected.append(steps / (between - begin))
+            whole.append(steps / (time.process_time() - begin))
+    index = bench.pick(config.learner.collect.batch)
+    yield bench.row("learning", "collect", index, max(collected), "simulator steps/CPU s")
+    yield bench.row("learning", "collect and update", index, max(whole), "simulator steps/CPU s")
