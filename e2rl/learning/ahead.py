@@ -10,6 +10,8 @@ from multiprocessing.connection import Connection
 
 import torch
 
+from e2rl.ego.actor import ActorEgo
+from e2rl.ego.base import Ego
 from e2rl.errors import InputError
 
 DONE = b"done "  # begins a message of success, before the seconds
@@ -44,13 +46,16 @@ class Ahead:
         raise InputError(f"{self._name}: {reason}")
 
 
-def check_ahead(device: str, threads: int) -> None:
-    """InputError where synthesis cannot run beside learning."""
+def why_not_ahead(device: str, threads: int, ego: Ego, traffic: str | None = None) -> str:
+    """Why the next round cannot be synthesized beside learning, or nothing."""
+    if traffic == "live":
+        return "learner.round.traffic=live is not synthesized beforehand"
+    if not isinstance(ego, ActorEgo):
+        return f"it hands over the weights of ego=actor, which {type(ego).__name__} has not"
     if device != "cpu" or threads > 1 or "fork" not in multiprocessing.get_all_start_methods():
-        raise InputError(
-            f"learner.round.ahead=true, device={device}, threads={threads}, {sys.platform}: synthesis beside learning "
-            "forks a process on the CPU; set threads=1 device=cpu on Linux, or learner.round.ahead=false"
-        )
+        here = f"device={device}, threads={threads}, {sys.platform}"
+        return f"it forks a process with one thread on the CPU; here are {here}"
+    return ""
 
 
 def _run(work: Callable[[], None], sender: Connection) -> None:

@@ -10,7 +10,7 @@ from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError
 from e2rl.evaluation.protocol import Method, Setup
-from e2rl.learning.ahead import check_ahead
+from e2rl.learning.ahead import why_not_ahead
 from e2rl.learning.attack import Synthesize
 from e2rl.learning.before_after import BeforeAfter
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
@@ -45,9 +45,7 @@ def build_evolution(
     synthesize = synthesize or synthesize_traffic(scenes, traffic, sim, config.batch, config.device)
     given = {"num_scenes": len(scenes), "rounds": config.rounds, "seed": seed}
     curriculum = built(config.curriculum, "curriculum", CurriculumScheduler, **given)
-    settings = settings_of(RoundSettings, config.learner.round, "learner.round")
-    if settings.ahead:
-        check_ahead(str(config.device), config.threads)
+    settings = settings_of(RoundSettings, _beside(config, ego), "learner.round")
     learner = OmegaConf.create({key: value for key, value in config.learner.items() if key != "round"})
     parameters = {key: value for key, value in resolved(config.ego).items() if key != "_target_"}
     live = traffic if settings.traffic == "live" else None
@@ -55,6 +53,15 @@ def build_evolution(
     improve = built(learner, "learner", Improvement, device=config.device, **given)
     keep = partial(solvable, scenes=scenes, sim=sim) if curriculum.solvable_only else None
     return Evolution(curriculum, improve, synthesize, settings, seed, keep, Memory(folder, settings.memory))
+
+
+def _beside(config: DictConfig, ego: Ego) -> dict:
+    """`config.learner.round`, with an `ahead` that is left open decided by what is possible."""
+    options = resolved(config.learner.round)
+    reason = why_not_ahead(str(config.device), config.threads, ego, options.get("traffic"))
+    if options.get("ahead") and reason:
+        raise InputError(f"learner.round.ahead=true: {reason}; set it to null or false")
+    return options | {"ahead": not reason} if options.get("ahead", False) is None else options
 
 
 def build_logger(config: DictConfig, folder: Path) -> RunLogger:

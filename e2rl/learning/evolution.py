@@ -9,7 +9,6 @@ from torch import Tensor
 
 from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import Ego
-from e2rl.errors import InputError
 from e2rl.learning.ahead import Ahead
 from e2rl.learning.attack import Order, Solvable, Synthesize, make_traffic
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
@@ -38,8 +37,6 @@ class RoundSettings:
         check_choice("learner.round.nominal", self.nominal, NOMINAL)
         check_choice("learner.round.traffic", self.traffic, TRAFFIC)
         check_range("learner.round.fresh", self.fresh, 1)
-        if self.ahead and self.traffic == "live":
-            raise InputError("learner.round.ahead=true: live traffic is not synthesized beforehand; set it to false")
 
 
 @dataclass
@@ -75,11 +72,6 @@ class Evolution:
         solvable: Solvable | None = None,
         memory: Memory | None = None,
     ) -> None:
-        """Raises InputError for `settings.ahead` and an ego whose weights cannot be handed over."""
-        if settings.ahead and not isinstance(improve.ego, ActorEgo):
-            raise InputError(
-                f"learner.round.ahead=true: works with ego=actor, not {type(improve.ego).__name__}; set it to false"
-            )
         self.curriculum, self.improve, self.synthesize = curriculum, improve, synthesize
         self.settings, self.seed, self.solvable = settings, seed, solvable
         self.memory = memory or Memory(None, settings.memory)

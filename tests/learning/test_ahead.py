@@ -106,5 +106,9 @@ def test_where_it_cannot_be_it_is_refused(where):
         config.learner.round.traffic = "live"
     ego, scenes = build_ego(config), small_scenes()
     config.merge_with(WHERE[where])
+    if where != "device=cuda" or torch.cuda.is_available():
+        left_open = config.copy()
+        left_open.learner.round.ahead = None
+        assert not build_evolution(left_open, scenes, ego, Ambush(), brake_check(scenes)).settings.ahead
     with pytest.raises(InputError, match=r"learner\.round\.ahead=true"):
         build_evolution(config, scenes, ego, Ambush(), brake_check(scenes))
