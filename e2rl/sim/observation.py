@@ -1,6 +1,7 @@
 """The observation of a learned ego: an ego-centred vector of OBSERVATION_SIZE numbers of order one.
 
-Blocks: ego (11), mission route ahead (12 x 5), lights (2 x 4), drivable border (5 x 5), nearest agents (12 x 15).
+Blocks: ego (11), mission route ahead (12 x 5), lights (2 x 4), drivable border (5 x 5), nearest agents (12 x 15),
+manoeuvres (15 x 2, see `prospects`).
 """
 
 from functools import cache
@@ -12,6 +13,7 @@ from torch import Tensor
 from e2rl.sim.drivable import off_road
 from e2rl.sim.mission import limit_at
 from e2rl.sim.neighbours import Neighbours, neighbours_of, rotation_into
+from e2rl.sim.prospects import PROSPECTS, Others, prospects
 from e2rl.sim.static import FrenetPose, StaticScene, look_along
 from e2rl.sim.traffic_light import light_state_at
 
@@ -20,7 +22,8 @@ PROBE_X, PROBE_Y = (-3.0, 0.0, 5.0, 11.0, 20.0), (-5.0, -2.5, 0.0, 2.5, 5.0)  # 
 CENTRE = PROBE_X.index(0.0) * len(PROBE_Y) + PROBE_Y.index(0.0)  # the probe at the ego itself
 NEAREST = 12  # agents
 SPEED, FAR, NEAR = 15.0, 40.0, 10.0  # scales: m/s, m, m
-OBSERVATION_SIZE = 11 + 5 * len(LOOK_AHEAD) + 8 + len(PROBE_X) * len(PROBE_Y) + 15 * NEAREST
+LOOKED_AT = 6  # of them, whose motion manoeuvres are held against
+OBSERVATION_SIZE = 11 + 5 * len(LOOK_AHEAD) + 8 + len(PROBE_X) * len(PROBE_Y) + 15 * NEAREST + PROSPECTS
 
 
 class EgoState(NamedTuple):
@@ -86,12 +89,14 @@ def observe(
     probes = torch.baddbmm(ego.state[:, None, :2], config.probes.expand(len(rotation), -1, -1), rotation)
     border = off_road(probes, static.field, static.origin)
     route, limit = route_features(config, static, ego, rotation)
+    near = nearest(static, neighbours)
     blocks = [
         ego_features(static, ego, limit, ego.step / horizon),
         route,
         light_features(config, static, ego.step, ego.pose.s),
         (border / 4).clamp(-1, 1),
-        agent_features(config, static, ego, neighbours),
+        agent_features(config, ego, near),
+        prospects(static, ego.state, ego.pose, rotation, others_of(near)),
     ]
     return Observed(neighbours, border[:, CENTRE], limit, torch.cat(blocks, -1))
 
@@ -140,16 +145,20 @@ def light_features(config: ObservationConfig, static: StaticScene, step: Tensor,
     return (torch.cat([colours.to(s.dtype), near[..., None]], -1) * seen[..., None]).flatten(1)
 
 
-def agent_features(config: ObservationConfig, static: StaticScene, ego: EgoState, others: Neighbours) -> Tensor:
-    """[B, 12 * 15]: of the nearest agents presence, relative pose (4) and velocity (2), speed, acceleration, size (2),
-    whether it is a vehicle, gap, and time and distance of the closest approach at constant velocities; absent agents
-    are zeros."""
+def nearest(static: StaticScene, others: Neighbours) -> Tensor:
+    """Table [B, 11, K] of the K <= NEAREST nearest agents: position (2), direction (2), half sizes (2), gap, speed,
+    acceleration, whether it is a vehicle, presence."""
     apart = others.position.square().sum(1).masked_fill(~others.present, torch.inf)
-    count = min(NEAREST, apart.shape[1])
-    index = apart.topk(count, dim=1, largest=False).indices
+    index = apart.topk(min(NEAREST, apart.shape[1]), dim=1, largest=False).indices
     scalars = torch.stack([others.gap, others.speed, others.accel, static.vehicle, others.present], 1)
     table = torch.cat([others.position, others.direction, static.half_size, scalars], 1)
-    near = table.gather(2, index[:, None].expand(-1, table.shape[1], -1))
+    return table.gather(2, index[:, None].expand(-1, table.shape[1], -1))
+
+
+def agent_features(config: ObservationConfig, ego: EgoState, near: Tensor) -> Tensor:
+    """[B, 12 * 15] of the table `nearest`: presence, relative pose (4) and velocity (2), speed, acceleration, size (2),
+    whether it is a vehicle, gap, and time and distance of the closest approach at constant velocities; absent agents
+    are zeros."""
     local, direction, half, gap, speed, accel, vehicle, present = near.split((2, 2, 2, 1, 1, 1, 1, 1), 1)
     velocity = speed * direction - torch.nn.functional.pad(ego.state[:, 3:, None], (0, 0, 0, 1))
     time = (-(local * velocity).sum(1, True) / (velocity.square().sum(1, True) + 1e-3)).clamp(0, 8)
@@ -158,4 +167,10 @@ def agent_features(config: ObservationConfig, static: StaticScene, ego: EgoState
     decay = torch.cat([-time / 2, -miss / 5], 1).exp()
     features = torch.cat([present, scaled.clamp(-5, 5), (gap / NEAR).clamp(-1, 2), decay], 1) * present
     features = features.transpose(1, 2).flatten(1)
-    return torch.nn.functional.pad(features, (0, 15 * (NEAREST - count)))
+    return torch.nn.functional.pad(features, (0, 15 * (NEAREST - near.shape[2])))
+
+
+def others_of(near: Tensor) -> Others:
+    """The LOOKED_AT nearest agents of the table `nearest`."""
+    local, direction, half, _, speed, accel, _, present = near[..., :LOOKED_AT].split((2, 2, 2, 1, 1, 1, 1, 1), 1)
+    return Others(local, direction, half, speed[:, 0], accel[:, 0], present[:, 0] > 0)

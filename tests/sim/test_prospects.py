@@ -1,0 +1,70 @@
+"""Prospects: gaps of short manoeuvres are those of the boxes but for rounded corners; others go on as they do."""
+
+import pytest
+import shapely
+import torch
+
+from e2rl.sim.prospects import TIGHT, TIMES, Others, gaps, travelled
+
+CAR = (4.6, 2.0)
+
+
+def others(*cars):
+    """Others of one ego: cars (x, y, heading, speed, acceleration)."""
+    x, y, heading, speed, accel = torch.tensor(cars, dtype=torch.float32).T[:, None]
+    half = (torch.tensor(CAR) / 2)[None, :, None].expand(1, 2, len(cars))
+    direction = torch.stack([heading.cos(), heading.sin()], 1)
+    return Others(torch.stack([x, y], 1), direction, half, speed, accel, torch.ones(1, len(cars), dtype=torch.bool))
+
+
+def straight_on(speed, accel=0.0):
+    """One manoeuvre of an ego that drives straight on: places, directions [1, 1, T, 2]."""
+    way = travelled(torch.tensor(speed), torch.tensor(accel), torch.tensor(TIMES))
+    place = torch.stack([way, torch.zeros_like(way)], -1)[None, None]
+    return place, torch.tensor([1.0, 0.0]).expand_as(place)
+
+
+def test_the_way_is_driven_to_the_halt_and_never_backwards():
+    speed, accel = torch.tensor([10.0, 10.0, 3.0]), torch.tensor([2.0, -5.0, -6.0])
+    way = travelled(speed, accel, torch.tensor(4.0))
+    assert way.tolist() == pytest.approx([40 + 16, 10**2 / 10, 3**2 / 12])
+
+
+def polygon(x, y, heading):
+    box = shapely.box(-CAR[0] / 2, -CAR[1] / 2, CAR[0] / 2, CAR[1] / 2)
+    return shapely.affinity.translate(shapely.affinity.rotate(box, heading, origin=(0, 0), use_radians=True), x, y)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_gaps_are_those_of_the_boxes_but_for_rounded_corners(seed):
+    generator = torch.Generator().manual_seed(seed)
+    poses = torch.rand(40, 3, generator=generator) * torch.tensor([30.0, 16.0, 6.3]) - torch.tensor([5.0, 8.0, 0.0])
+    place, along = straight_on(9.0)
+    rounded = 2 * (2**0.5 - 1) * CAR[1] / 2
+    for pose in poses.tolist():
+        found = gaps(place, along, torch.tensor([CAR]), others((*pose, 0.0, 0.0)))[0, 0]
+        boxes = [polygon(x, 0.0, 0.0) for x in place[0, 0, :, 0].tolist()]
+        exact = torch.tensor([box.distance(polygon(*pose)) for box in boxes], dtype=torch.float32)
+        apart = exact > 0
+        assert (found[apart] >= exact[apart] - 1e-3).all() and (found[apart] <= exact[apart] + rounded + 0.1).all()
+
+
+def test_others_keep_their_acceleration_for_a_second_then_their_speed():
+    place, along = straight_on(0.0)
+    size = torch.tensor([CAR])
+    found = gaps(place, along, size, others((20.0, 0.0, torch.pi, 5.0, -2.0)))[0, 0]
+    way = [5 * t - t**2 if t <= 1 else 4 + 3 * (t - 1) for t in TIMES]
+    assert found.tolist() == pytest.approx([20 - driven - CAR[0] for driven in way], abs=0.05)
+
+
+def test_nobody_is_near_without_agents():
+    place, along = straight_on(5.0)
+    nothing, nobody = torch.zeros(1, 0), torch.zeros(1, 0, dtype=torch.bool)
+    nobody = Others(*(torch.zeros(1, 2, 0) for _ in range(3)), nothing, nothing, nobody)
+    assert gaps(place, along, torch.tensor([CAR]), nobody).isinf().all()
+
+
+def test_braking_ends_before_a_car_ahead_and_driving_on_does_not():
+    ahead, size = others((22.0, 0.0, 0.0, 0.0, 0.0)), torch.tensor([CAR])
+    braking, going_on = (gaps(*straight_on(10.0, accel), size, ahead).amin() for accel in (-7.0, 1.0))
+    assert braking > 5 and going_on < TIGHT
