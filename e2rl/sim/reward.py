@@ -7,19 +7,20 @@ from torch import Tensor
 
 from e2rl.errors import InputError
 
-DEFAULT_WEIGHTS = {"progress": 0.06, "contact": -20.0, "off_road": -5.0, "comfort": -0.02, "speeding": -0.1}
+DEFAULT_WEIGHTS = {"progress": 0.03, "contact": -20.0, "off_road": -5.0, "comfort": -0.08, "speeding": -0.1}
 DEFAULT_WEIGHTS["lane_offset"] = -0.02
 TERMS = tuple(DEFAULT_WEIGHTS)
-LEAST_TOP_SPEED = 5.0  # m/s: where no limit is known, progress at this speed is always rewarded
+LEAST_TOP_SPEED = 5.0  # m/s: progress at this speed is rewarded even where the recorded ego stands
 
 
 def rewarded_progress(progress: Tensor, limit: Tensor, top_speed: Tensor, dt: float) -> Tensor:
     """The part [B] m of a step's progress [B] m that is rewarded: driving faster than allowed does not pay.
 
-    Allowed is the speed limit [B] m/s, or where it is unknown (0) the recorded ego's top speed in the scene [B], which
-    counts as at least LEAST_TOP_SPEED.
+    Allowed is the recorded ego's top speed in the scene [B] m/s, which counts as at least LEAST_TOP_SPEED, and no more
+    than the speed limit [B] where it is known (not 0).
     """
-    allowed = torch.where(limit > 0, limit, top_speed.clamp(min=LEAST_TOP_SPEED))
+    allowed = top_speed.clamp(min=LEAST_TOP_SPEED)
+    allowed = torch.where(limit > 0, torch.minimum(limit, allowed), allowed)
     return torch.minimum(progress, allowed * dt)
 
 

@@ -40,12 +40,12 @@ def test_terms_grow_with_what_they_name():
 
 
 def test_progress_pays_up_to_what_is_allowed():
-    """The limit, where it is unknown the recorded top speed, and always 5 m/s; going back costs what it is."""
+    """The recorded top speed, at least 5 m/s, and never more than a known limit; going back costs what it is."""
     progress = torch.tensor([0.5, 2.0, 2.0, 2.0, 2.0, -1.0])
     limit = torch.tensor([10.0, 10.0, 0.0, 0.0, 30.0, 10.0])
     recorded = torch.tensor([3.0, 15.0, 15.0, 3.0, 3.0, 3.0])
     paid = rewarded_progress(progress, limit, recorded, 0.1)
-    torch.testing.assert_close(paid, torch.tensor([0.5, 1.0, 1.5, 0.5, 2.0, -1.0]))
+    torch.testing.assert_close(paid, torch.tensor([0.5, 1.0, 1.5, 0.5, 0.5, -1.0]))
 
 
 def test_reward_is_linear_in_the_weights():
