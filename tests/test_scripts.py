@@ -294,12 +294,13 @@ def test_a_round_of_evolution_from_the_first_command_to_its_tables(world, tmp_pa
         "learner.collect.steps=20",
         "learner.collect.iterations=1",
         "measure.scenes=2",
+        "measure.seeds=[0]",
     )
     status, said = call("train.py", overrides, monkeypatch, capsys)
     assert status == 0, said
     rows = read_metrics(tmp_path / "run" / "metrics.json")
-    assert {(row["stage"], row["method"]) for row in rows} == {
-        (stage, method) for stage in ("before", "after") for method in ("nominal", "e2")
+    assert {(row["stage"], row["method"], row["eta"]) for row in rows} == {
+        (stage, *row) for stage in ("before", "after") for row in (("nominal", 0), ("e2", 1), ("e2", 2))
     }
     tables = (tmp_path / "run" / "tables.md").read_text()
     assert "cfr [%]" in tables and "cfr [points]" in tables and "after" in tables

@@ -23,13 +23,15 @@ class BeforeAfter:
     methods: Sequence[Method]
     seeds: Sequence[int]
     folder: Path
+    processes: int = 1
 
     def __call__(self, stage: str, ego: Ego) -> list[dict]:
         """Evaluate an ego as `stage` (before or after); returns the rows of all stages so far.
 
         The rows of stage `after` are paired with the same method before, under the name `before`.
         """
-        rows = run_protocol(replace(self.setup, ego=ego), self.methods, self.seeds, self.folder / stage, stage=stage)
+        setup, folder = replace(self.setup, ego=ego), self.folder / stage
+        rows = run_protocol(setup, self.methods, self.seeds, folder, processes=self.processes, stage=stage)
         if stage == "after":
             for row in rows:
                 row["paired"]["before"] = paired_differences(*self._scored("after", row), *self._scored("before", row))

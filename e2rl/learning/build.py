@@ -5,10 +5,11 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from e2rl.build import build_sim, built, load_choice, resolved
+from e2rl.build import build_sim, built, intensities, load_choice, resolved
 from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError
+from e2rl.evaluation.processes import cores
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.learning.ahead import why_not_ahead
 from e2rl.learning.attack import Synthesize
@@ -83,9 +84,13 @@ def build_measure(
             data.path, data.split = options.path, None
     scenes = load_scenes(data, options.scenes, split="tune")
     nominal = built(load_choice("synthesizer", "nominal"), "synthesizer", Traffic, prior=prior)
-    methods = [Method("nominal", nominal), Method(config.synthesizer.name, traffic, options.eta)]
+    methods = [
+        Method("nominal", nominal),
+        *(Method(config.synthesizer.name, traffic, eta) for eta in intensities(options)),
+    ]
     setup = Setup(scenes, ego, ego_name, build_sim(config), config.batch, config.device)
-    return BeforeAfter(setup, methods, list(options.seeds), folder)
+    processes = cores() if str(config.device) == "cpu" and config.threads == 1 else 1
+    return BeforeAfter(setup, methods, list(options.seeds), folder, processes)
 
 
 def run_imitation(
