@@ -34,7 +34,7 @@ class ReactSettings:
     eta: tuple[float, float] = (1.0, 3.0)
     scatter: float = 0.7
     responsibility: str = "full"
-    reckless: float = 0.3
+    reckless: float = 0.5
 
     def __post_init__(self) -> None:
         for name in ("share", "others", "reckless"):

@@ -21,7 +21,7 @@ class AdaptiveCurriculum(CurriculumScheduler):
         spread: float = 1.0,
         target_low: float = 0.25,
         target_high: float = 0.45,
-        share: float = 0.5,
+        share: float = 0.6,
         **scenes,
     ) -> None:
         """Fields: conf/curriculum/adaptive.yaml."""
