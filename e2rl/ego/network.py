@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.resources import files
 from pathlib import Path
 
 import torch
@@ -224,8 +225,9 @@ class ActorCritic(nn.Module):
 
 
 def find_weights(path: str | Path) -> Path:
-    """The actor file that `path` names: the file, a checkpoint folder, or the newest checkpoint of a run folder."""
-    path = Path(path)
+    """The actor file that `path` names: the file, a checkpoint folder, the newest checkpoint of a run folder, or with
+    "bundled" the package's own, trained on the bundled scenes."""
+    path = Path(str(files("e2rl") / "assets" / "actor" / WEIGHTS)) if path == "bundled" else Path(path)
     if path.is_dir():
         found = [path / WEIGHTS] if (path / WEIGHTS).is_file() else sorted(path.glob(f"checkpoints/round-*/{WEIGHTS}"))
         if found:
