@@ -139,3 +139,12 @@ def test_noise_is_the_networks_alone_and_ends_with_the_block():
         torch.nn.init.zeros_(network.trunk[-1].weight)
         assert torch.allclose(network.deterministic(observation), reference_action(observation), atol=1e-4)
     assert torch.equal(network.deterministic(observation), network.deterministic(observation))
+
+
+def test_the_bundled_policy_corrects_the_route_follower():
+    env = DrivingEnv(make_scenes(2, num_vehicles=6), SimSettings(), 2)
+    observation = env.reset()["observation"]
+    bundled, untrained = (
+        ego.network.network.deterministic(observation) for ego in (ActorEgo(checkpoint="bundled"), ActorEgo())
+    )
+    assert torch.isfinite(bundled).all() and (bundled - untrained).abs().amax() > 0.05
