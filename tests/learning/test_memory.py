@@ -82,7 +82,7 @@ def test_only_the_rows_drawn_are_read(tmp_path):
 
 
 def test_rounds_are_remembered_and_reported():
-    run = small_run(memory=9, rounds=6)
+    run = small_run(memory=9, rounds=6, collect={"batch": 16, "iterations": 4})  # enough episodes to meet every row
     reports = [run.run_round() for _ in range(5)]
     assert [report["synthesizer/memory_rows"] for report in reports] == [3.0, 6.0, 9.0, 9.0, 9.0]
     assert reports[0]["synthesizer/fresh_draws"] == 1.0
