@@ -177,6 +177,6 @@ class PolicyImprovement(Improvement):
         """Restore a `state_dict`."""
         self.learner.load_state_dict(state["learner"])
         self.draw.generator.set_state(state["draws"].cpu())
-        if self.reaction is not None and "reaction" in state:
+        if self.reaction is not None:
             self.reaction.generator.set_state(state["reaction"].cpu())
         self.frames = state["frames"]
