@@ -21,7 +21,7 @@ from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, observation_config,
 from e2rl.sim.reward import DEFAULT_WEIGHTS, check_weights
 from e2rl.sim.static import FrenetPose, static_scene, write_rows
 from e2rl.sim.step import Outcome, StepConfig, hold_step, replay_step, step
-from e2rl.sim.trajectories import Trajectories
+from e2rl.sim.trajectories import Agents, Trajectories
 from e2rl.sim.world import World
 
 OF_ROUTE = ("points", "length", "open", "limit", "light", "light_s", "log")
@@ -142,12 +142,12 @@ class DrivingEnv(EnvBase):
     def world(self) -> World:
         """The current World. Its `scene` is the environment's own storage, which the next reset overwrites."""
         ego = self._ego
-        states, valid, accel = self._trajectories.at(ego.step)
+        states, valid, accel, turn = self._trajectories.at(ego.step)
         first = (ego.step == 0)[:, None]
         states = torch.where(first[..., None], self.scene["start"], states)
         valid = torch.where(first, self.scene["valid"], valid)
         accel = torch.where(first, self.scene["start_accel"], accel)
-        turn = torch.where(first, self.scene["start_yaw_rate"], self._trajectories.turn_rate_at(ego.step))
+        turn = torch.where(first, self.scene["start_yaw_rate"], turn)
         return World(
             self.scene,
             ego.step,
@@ -204,7 +204,8 @@ class DrivingEnv(EnvBase):
 
     def _reset_output(self) -> TensorDict:
         ego, world = self._ego, self.world()
-        others = world.states[:, 1:], world.valid[:, 1:], world.accel[:, 1:]
+        assert world.turn_rate is not None
+        others = Agents(*(value[:, 1:] for value in (world.states, world.valid, world.accel, world.turn_rate)))
         features = observe(self._config.observation, self._static, ego, others, self.horizon).features
         none = torch.zeros_like(ego.present)
         outcome = dict.fromkeys((*FLAGS, *METRICS), none)

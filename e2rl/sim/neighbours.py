@@ -5,21 +5,20 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from e2rl.sim.trajectories import Agents
+
 
 class Neighbours(NamedTuple):
     """M other agents of B egos.
 
     position [B, 2, M]: m forward and left of the ego; direction [B, 2, M]: cosine and sine of the heading relative to
-    the ego's; gap [B, M]: box separation [m] (`separation` of two boxes); speed [B, M] m/s; accel [B, M] m/s^2;
-    present [B, M] bool.
+    the ego's; gap [B, M]: box separation [m] (`separation` of two boxes); agents: what they are in the world.
     """
 
     position: Tensor
     direction: Tensor
     gap: Tensor
-    speed: Tensor
-    accel: Tensor
-    present: Tensor
+    agents: Agents
 
 
 def rotation_into(ego: Tensor) -> Tensor:
@@ -28,19 +27,17 @@ def rotation_into(ego: Tensor) -> Tensor:
     return torch.stack([cos, sin, -sin, cos], -1).view(-1, 2, 2)
 
 
-def neighbours_of(
-    ego: Tensor, rotation: Tensor, size: Tensor, half_size: Tensor, states: Tensor, present: Tensor, accel: Tensor
-) -> Neighbours:
-    """Neighbours of egos [B, 4] among agents with states [B, M, 4], present [B, M], accel [B, M].
+def neighbours_of(ego: Tensor, rotation: Tensor, size: Tensor, half_size: Tensor, agents: Agents) -> Neighbours:
+    """Neighbours of egos [B, 4] among M agents.
 
     rotation: `rotation_into(ego)`; size [B, 2]: length and width of the egos; half_size [B, 2, M]: of the agents.
     """
-    x, y, heading, speed = states.unbind(-1)
+    x, y, heading, _ = agents.states.unbind(-1)
     poses = torch.stack([x - ego[:, :1], heading.cos(), y - ego[:, 1:2], heading.sin()], 1)
     seen = rotation.bmm(poses.view(len(ego), 2, -1)).view(len(ego), 2, 2, -1)
     position, direction = seen.unbind(2)
     gap = separation_in_frame(position, direction, size[..., None] / 2, half_size)
-    return Neighbours(position, direction, gap, speed, accel, present)
+    return Neighbours(position, direction, gap, agents)
 
 
 def separation_in_frame(position: Tensor, direction: Tensor, own: Tensor, half_size: Tensor) -> Tensor:

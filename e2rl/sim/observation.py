@@ -1,6 +1,6 @@
 """The observation of a learned ego: an ego-centred vector of OBSERVATION_SIZE numbers of order one.
 
-Blocks: ego (11), mission route ahead (12 x 5), lights (2 x 4), drivable border (5 x 5), nearest agents (12 x 15),
+Blocks: ego (11), mission route ahead (12 x 5), lights (2 x 4), drivable border (5 x 5), nearest agents (12 x 16),
 manoeuvres (15 x 2, see `prospects`).
 """
 
@@ -10,20 +10,24 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from e2rl.sim.arc import Arc, curvature_of
 from e2rl.sim.drivable import off_road
 from e2rl.sim.mission import limit_at
 from e2rl.sim.neighbours import Neighbours, neighbours_of, rotation_into
 from e2rl.sim.prospects import PROSPECTS, Others, prospects
 from e2rl.sim.static import FrenetPose, StaticScene, look_along
 from e2rl.sim.traffic_light import light_state_at
+from e2rl.sim.trajectories import Agents
 
 LOOK_AHEAD = (2.0, 4.0, 7.0, 10.0, 14.0, 19.0, 25.0, 32.0, 40.0, 50.0, 62.0, 75.0)  # m along the mission
 PROBE_X, PROBE_Y = (-3.0, 0.0, 5.0, 11.0, 20.0), (-5.0, -2.5, 0.0, 2.5, 5.0)  # m in the ego's frame
 CENTRE = PROBE_X.index(0.0) * len(PROBE_Y) + PROBE_Y.index(0.0)  # the probe at the ego itself
 NEAREST = 12  # agents
 SPEED, FAR, NEAR = 15.0, 40.0, 10.0  # scales: m/s, m, m
+PER_AGENT = 16  # numbers
 LOOKED_AT = 6  # of them, whose motion manoeuvres are held against
-OBSERVATION_SIZE = 11 + 5 * len(LOOK_AHEAD) + 8 + len(PROBE_X) * len(PROBE_Y) + 15 * NEAREST + PROSPECTS
+COLUMNS = (2, 2, 2, 1, 1, 1, 1, 1, 1)  # of the table `nearest`
+OBSERVATION_SIZE = 11 + 5 * len(LOOK_AHEAD) + 8 + len(PROBE_X) * len(PROBE_Y) + PER_AGENT * NEAREST + PROSPECTS
 
 
 class EgoState(NamedTuple):
@@ -45,7 +49,7 @@ class EgoState(NamedTuple):
 
 class ObservationConfig(NamedTuple):
     """The constants of the observation as tensors: arc lengths ahead [13] m, the last one 0; probes [25, 2] m; scales
-    of a route point [2] and of an agent's features [11, 1]; light colours [3]."""
+    of a route point [2] and of an agent's features [12, 1]; light colours [3]."""
 
     ahead: Tensor
     probes: Tensor
@@ -72,20 +76,15 @@ def observation_config(device: torch.device) -> ObservationConfig:
     def numbers(*values: float) -> Tensor:
         return torch.tensor(values, device=device)
 
-    scales = numbers(FAR, NEAR, 1.0, 1.0, SPEED, SPEED, SPEED, 4.0, 2.5, 1.0, 1.0)[:, None]
+    scales = numbers(FAR, NEAR, 1.0, 1.0, SPEED, SPEED, SPEED, 4.0, 0.5, 2.5, 1.0, 1.0)[:, None]
     probes = torch.cartesian_prod(numbers(*PROBE_X), numbers(*PROBE_Y))
     return ObservationConfig(numbers(*LOOK_AHEAD, 0.0), probes, numbers(FAR, NEAR), scales, numbers(1, 2, 3))
 
 
-def observe(
-    config: ObservationConfig, static: StaticScene, ego: EgoState, agents: tuple[Tensor, Tensor, Tensor], horizon: int
-) -> Observed:
-    """The observation of egos in scenes of `horizon` steps.
-
-    agents: states [B, M, 4], presence [B, M] and accelerations [B, M] of the others.
-    """
+def observe(config: ObservationConfig, static: StaticScene, ego: EgoState, agents: Agents, horizon: int) -> Observed:
+    """The observation of egos in scenes of `horizon` steps."""
     rotation = rotation_into(ego.state)
-    neighbours = neighbours_of(ego.state, rotation, static.size, static.half_size, *agents)
+    neighbours = neighbours_of(ego.state, rotation, static.size, static.half_size, agents)
     probes = torch.baddbmm(ego.state[:, None, :2], config.probes.expand(len(rotation), -1, -1), rotation)
     border = off_road(probes, static.field, static.origin)
     route, limit = route_features(config, static, ego, rotation)
@@ -101,11 +100,9 @@ def observe(
     return Observed(neighbours, border[:, CENTRE], limit, torch.cat(blocks, -1))
 
 
-def glance(
-    config: ObservationConfig, static: StaticScene, ego: EgoState, agents: tuple[Tensor, Tensor, Tensor], horizon: int
-) -> Observed:
+def glance(config: ObservationConfig, static: StaticScene, ego: EgoState, agents: Agents, horizon: int) -> Observed:
     """`observe` without the features: what events and reward need, at a moment at which no policy looks."""
-    neighbours = neighbours_of(ego.state, rotation_into(ego.state), static.size, static.half_size, *agents)
+    neighbours = neighbours_of(ego.state, rotation_into(ego.state), static.size, static.half_size, agents)
     beyond = off_road(ego.state[:, None, :2], static.field, static.origin)[:, 0]
     nothing = ego.state[:, :0]
     return Observed(neighbours, beyond, limit_at(static.mission, ego.pose.s), nothing)
@@ -146,31 +143,33 @@ def light_features(config: ObservationConfig, static: StaticScene, step: Tensor,
 
 
 def nearest(static: StaticScene, others: Neighbours) -> Tensor:
-    """Table [B, 11, K] of the K <= NEAREST nearest agents: position (2), direction (2), half sizes (2), gap, speed,
-    acceleration, whether it is a vehicle, presence."""
-    apart = others.position.square().sum(1).masked_fill(~others.present, torch.inf)
+    """Table [B, 12, K] of the K <= NEAREST nearest agents: position (2), direction (2), half sizes (2), gap, speed,
+    acceleration, turn rate, whether it is a vehicle, presence."""
+    states, present, accel, turn_rate = others.agents
+    apart = others.position.square().sum(1).masked_fill(~present, torch.inf)
     index = apart.topk(min(NEAREST, apart.shape[1]), dim=1, largest=False).indices
-    scalars = torch.stack([others.gap, others.speed, others.accel, static.vehicle, others.present], 1)
+    scalars = torch.stack([others.gap, states[..., 3], accel, turn_rate, static.vehicle, present], 1)
     table = torch.cat([others.position, others.direction, static.half_size, scalars], 1)
     return table.gather(2, index[:, None].expand(-1, table.shape[1], -1))
 
 
 def agent_features(config: ObservationConfig, ego: EgoState, near: Tensor) -> Tensor:
-    """[B, 12 * 15] of the table `nearest`: presence, relative pose (4) and velocity (2), speed, acceleration, size (2),
-    whether it is a vehicle, gap, and time and distance of the closest approach at constant velocities; absent agents
-    are zeros."""
-    local, direction, half, gap, speed, accel, vehicle, present = near.split((2, 2, 2, 1, 1, 1, 1, 1), 1)
+    """[B, 12 * PER_AGENT] of the table `nearest`: presence, relative pose (4) and velocity (2), speed, acceleration,
+    turn rate, size (2), whether it is a vehicle, gap, and time and distance of the closest approach at constant
+    velocities; absent agents are zeros."""
+    local, direction, half, gap, speed, accel, turn_rate, vehicle, present = near.split(COLUMNS, 1)
     velocity = speed * direction - torch.nn.functional.pad(ego.state[:, 3:, None], (0, 0, 0, 1))
     time = (-(local * velocity).sum(1, True) / (velocity.square().sum(1, True) + 1e-3)).clamp(0, 8)
     miss = (local + velocity * time).norm(dim=1, keepdim=True)
-    scaled = torch.cat([local, direction, velocity, speed, accel, half, vehicle], 1) / config.agent
+    scaled = torch.cat([local, direction, velocity, speed, accel, turn_rate, half, vehicle], 1) / config.agent
     decay = torch.cat([-time / 2, -miss / 5], 1).exp()
     features = torch.cat([present, scaled.clamp(-5, 5), (gap / NEAR).clamp(-1, 2), decay], 1) * present
     features = features.transpose(1, 2).flatten(1)
-    return torch.nn.functional.pad(features, (0, 15 * (NEAREST - near.shape[2])))
+    return torch.nn.functional.pad(features, (0, PER_AGENT * (NEAREST - near.shape[2])))
 
 
 def others_of(near: Tensor) -> Others:
     """The LOOKED_AT nearest agents of the table `nearest`."""
-    local, direction, half, _, speed, accel, _, present = near[..., :LOOKED_AT].split((2, 2, 2, 1, 1, 1, 1, 1), 1)
-    return Others(local, direction, half, speed[:, 0], accel[:, 0], present[:, 0] > 0)
+    near = near[..., :LOOKED_AT]
+    local, direction, half, _, speed, accel, turn_rate, _, present = (x.squeeze(1) for x in near.split(COLUMNS, 1))
+    return Others(local, direction, half, speed, Arc(accel, curvature_of(turn_rate, speed)), present > 0)

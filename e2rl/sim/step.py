@@ -14,7 +14,7 @@ from e2rl.sim import dynamics
 from e2rl.sim.observation import EgoState, ObservationConfig, Observed, glance, observe
 from e2rl.sim.reward import reward_terms, rewarded_progress, weighted_sum
 from e2rl.sim.static import FrenetPose, StaticScene, follow
-from e2rl.sim.trajectories import trajectories_at
+from e2rl.sim.trajectories import Agents, trajectories_at
 
 Tracks = tuple[Tensor, Tensor]  # states [B, T+1, N, 4] and presence [B, T+1, N] of all agents
 Outcome = dict[str, Tensor]  # see `advance`
@@ -106,9 +106,9 @@ def advance(
     if ended is not None:
         moved = unless(ended, moved, ego)
         now, state, action, pose, present, *_ = moved
-    others, there, accel = (value[:, 1:] for value in trajectories_at(*tracks, now))
-    seen = sense(config.observation, static, moved, (others, there, accel), config.horizon)
-    hit = (seen.neighbours.gap < 0) & there & present[:, None]
+    others = Agents(*(value[:, 1:] for value in trajectories_at(*tracks, now)))
+    seen = sense(config.observation, static, moved, others, config.horizon)
+    hit = (seen.neighbours.gap < 0) & others.present & present[:, None]
     contact, contact_vru = (hit & static.vehicle).any(1), (hit & ~static.vehicle).any(1)
     off = seen.beyond > 0
     off_road = off & ego.been_on_road & present

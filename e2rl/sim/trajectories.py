@@ -1,5 +1,7 @@
 """Trajectories of all agents but the ego: recorded, stored, or written plan by plan."""
 
+from typing import NamedTuple
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -7,6 +9,16 @@ from torch import Tensor
 from e2rl.errors import InputError
 from e2rl.scene.recording import DT
 from e2rl.sim.dynamics import wrap
+
+
+class Agents(NamedTuple):
+    """All agents of B scenes at a moment: states [B, N, 4], present [B, N] bool, accel [B, N] m/s^2, turn_rate [B, N]
+    rad/s."""
+
+    states: Tensor
+    present: Tensor
+    accel: Tensor
+    turn_rate: Tensor
 
 
 class Trajectories:
@@ -67,23 +79,18 @@ class Trajectories:
         self.states[where] = states[inside].to(self.states.dtype)
         self.valid[where] = True
 
-    def at(self, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def at(self, step: Tensor) -> Agents:
         """`trajectories_at` step [B]."""
         return trajectories_at(self.states, self.valid, step)
 
-    def turn_rate_at(self, step: Tensor) -> Tensor:
-        """Turn rates [B, N] rad/s over the last step before step [B], 0 without a last step."""
-        row, before = torch.arange(len(step), device=step.device), (step - 1).clamp(min=0)
-        turned = wrap(self.states[row, step, :, 2] - self.states[row, before, :, 2])
-        return turned / DT * (self.valid[row, step] & self.valid[row, before])
 
+def trajectories_at(states: Tensor, valid: Tensor, step: Tensor) -> Agents:
+    """The agents of trajectories [B, T+1, N, 4], [B, T+1, N] at step [B].
 
-def trajectories_at(states: Tensor, valid: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """States [B, N, 4], valid [B, N] and acceleration [B, N] of trajectories [B, T+1, N, 4], [B, T+1, N] at step [B].
-
-    The acceleration is the speed difference over the last step, 0 without a last step.
+    Acceleration and turn rate are differences of speed and heading over the last step, 0 without a last step.
     """
     row, before = torch.arange(len(step), device=step.device), (step - 1).clamp(min=0)
     now, there = states[row, step], valid[row, step]
-    accel = (now[..., 3] - states[row, before, :, 3]) / DT
-    return now, there, accel * (there & valid[row, before])
+    change = now[..., 2:] - states[row, before, :, 2:]
+    known = there & valid[row, before]
+    return Agents(now, there, change[..., 1] / DT * known, wrap(change[..., 0]) / DT * known)

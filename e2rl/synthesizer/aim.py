@@ -15,8 +15,8 @@ from torch import Tensor
 from e2rl.prior.bounds import STRIDE, WAIT, BoundSettings, Duty, Meeting, meeting_braking
 from e2rl.scene.boxes import separation, to_frame
 from e2rl.scene.recording import DT
+from e2rl.sim.arc import HOLD, TURN, Arc, along_arc, curvature_of
 from e2rl.sim.drivable import off_road
-from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
 from e2rl.synthesizer.interception import MAX_BEARING, MAX_CURVATURE, InterceptionSettings
 from e2rl.synthesizer.motion import TOP_SPEED
@@ -28,40 +28,8 @@ CHECKED, RUN_ON = 3, 2.0  # points of a path that must be drivable, evenly space
 TOUCH = 0.4  # share of both lengths by which boxes that move alike touch before their centres meet
 MISS_COST = 1.0  # s that 1 m by which the ego is missed weighs, against the costs of an interception
 GENTLE = 1.0  # m/s^2 of braking without an aim
-HOLD, TURN = 1.0, 2.0  # s for which a seen acceleration and a seen curvature are expected to last
-SLOW = 1.0  # m/s below which a turn rate says little of the path's curvature
 ALONG = 0.9  # cosine between headings from which on a vehicle follows the ego where they meet
 SEEN = 3  # nearest others that a vehicle brakes for
-
-
-class Aim(NamedTuple):
-    """Constant acceleration [K] m/s^2 and path curvature [K] 1/m (left positive) of K vehicles."""
-
-    accel: Tensor
-    curvature: Tensor
-
-
-def along_arc(
-    states: Tensor, aim: Aim, times: Tensor, hold: float = torch.inf, turn: float = torch.inf
-) -> tuple[Tensor, Tensor]:
-    """States [..., T, 4] and metres driven [..., T] at times [..., T] s ahead of states [..., 4], in closed form.
-
-    The acceleration [...] is held for `hold` s, never beyond a halt; the curvature [...] for the way that the present
-    speed drives in `turn` s; then speed and heading stay.
-    """
-    x, y, heading, v = (value[..., None] for value in states.unbind(-1))
-    accel, curvature = aim.accel[..., None], aim.curvature[..., None]
-    halt = torch.where(accel < 0, v / (-accel).clamp(min=1e-6), torch.inf)
-    held = torch.minimum(times.clamp(max=hold), halt)
-    speed = (v + accel * held).clamp(min=0)
-    driven = (v + speed) / 2 * held + speed * (times - held)
-    bent = driven if turn == torch.inf else torch.minimum(driven, turn * v.clamp(min=SLOW))
-    angle = curvature * bent
-    chord, middle, end = bent * torch.sinc(angle / (2 * torch.pi)), heading + angle / 2, heading + angle
-    x, y = x + chord * middle.cos(), y + chord * middle.sin()
-    if turn < torch.inf:
-        x, y = x + (driven - bent) * end.cos(), y + (driven - bent) * end.sin()
-    return torch.stack([x, y, wrap(end), speed.expand_as(x)], -1), driven
 
 
 def surroundings(world: World, rows: Tensor, agents: Tensor) -> World:
@@ -80,11 +48,10 @@ def surroundings(world: World, rows: Tensor, agents: Tensor) -> World:
     return World(scene, world.step[rows], world.states[at], valid, world.accel[at], turn_rate=world.turn_rate[at])
 
 
-def present_motion(world: World) -> Aim:
+def present_motion(world: World) -> Arc:
     """The present acceleration and path curvature [K, N] of everybody."""
     assert world.turn_rate is not None
-    curvature = world.turn_rate / world.states[..., 3].clamp(min=SLOW)
-    return Aim(world.accel, curvature.clamp(-MAX_CURVATURE, MAX_CURVATURE))
+    return Arc(world.accel, curvature_of(world.turn_rate, world.states[..., 3]))
 
 
 class Target(NamedTuple):
@@ -103,8 +70,8 @@ class Ground(NamedTuple):
     row: Tensor
 
 
-def best_aim(states: Tensor, target: Target, eta: Tensor, ground: Ground, limits: InterceptionSettings) -> Aim:
-    """The Aim of vehicles states [K, 4] that best meets the target within `limits` at intensities eta [K].
+def best_aim(states: Tensor, target: Target, eta: Tensor, ground: Ground, limits: InterceptionSettings) -> Arc:
+    """The Arc of vehicles states [K, 4] that best meets the target within `limits` at intensities eta [K].
 
     At each moment: the arc through the target, at the acceleration that arrives in time; both clamped to the limits.
     The cheapest of those with a drivable path is taken; NaN where there is none, or the target is not ahead.
@@ -123,7 +90,7 @@ def best_aim(states: Tensor, target: Target, eta: Tensor, ground: Ground, limits
     fastest = torch.maximum(v, v + accel * times)
     bound = (limits.lateral * dial / fastest.square().clamp(min=1e-3)).clamp(max=MAX_CURVATURE)
     curvature = torch.minimum((2 * bearing.sin() / chord.clamp(min=0.1)).maximum(-bound), bound)
-    aim, portions = Aim(accel, curvature), torch.arange(1, CHECKED + 1, device=times.device) / CHECKED
+    aim, portions = Arc(accel, curvature), torch.arange(1, CHECKED + 1, device=times.device) / CHECKED
     looked_at = torch.cat([times[:, None], times[:, None].clamp(min=RUN_ON) * portions], 1)
     path, _ = along_arc(states[:, None], aim, looked_at)
     miss = ((path[:, :, 0, :2] - target.states[..., :2]).norm(dim=-1) - touch).clamp(min=0)
@@ -134,7 +101,7 @@ def best_aim(states: Tensor, target: Target, eta: Tensor, ground: Ground, limits
     ok = (bearing.abs() < MAX_BEARING) & (furthest <= beyond[:, :1].clamp(min=limits.shoulder))
     cost, pick = cost.masked_fill(~ok, torch.inf).min(-1, keepdim=True)
     none = cost[:, 0].isinf()
-    return Aim(*(value.gather(1, pick)[:, 0].masked_fill(none, torch.nan) for value in aim))
+    return Arc(*(value.gather(1, pick)[:, 0].masked_fill(none, torch.nan) for value in aim))
 
 
 def moments(like: Tensor) -> Tensor:
@@ -142,13 +109,13 @@ def moments(like: Tensor) -> Tensor:
     return DT * REPLAN_STEPS * torch.arange(1, MOMENTS + 1, device=like.device)
 
 
-def braking_for(world: World, aim: Aim, motion: Aim, duty: Duty, bounds: BoundSettings) -> Tensor:
+def braking_for(world: World, aim: Arc, motion: Arc, duty: Duty, bounds: BoundSettings) -> Tensor:
     """Braking [K] (negative: none is needed) that vehicles owe the ego (duty, [K, 1]) and those near them, if they
     drive their aim [K] and the others go on as they do: motion [K, N] of `surroundings`."""
     steps = torch.arange(STRIDE, round(bounds.look / DT) + 1, STRIDE, device=aim.accel.device)
     own, driven = along_arc(world.states[:, 1], aim, DT * steps)
     index = [0, *range(2, world.states.shape[1])]
-    states, going_on = world.states[:, index], Aim(*(value[:, index] for value in motion))
+    states, going_on = world.states[:, index], Arc(*(value[:, index] for value in motion))
     tracks, _ = along_arc(states, going_on, DT * steps, HOLD, TURN)  # [K, J, T, 4]
     size = world.scene["size"]
     wide = size[:, 1] + size.new_tensor([0.0, 2 * bounds.aside])
@@ -175,19 +142,19 @@ class Law:
     care: CareSettings = CareSettings()
     bounds: BoundSettings = BoundSettings()
 
-    def __call__(self, world: World, eta: Tensor, shift: Tensor, ground: Ground, reckless: Tensor | None = None) -> Aim:
-        """The Aim of K vehicles in their `surroundings` at intensities eta [K].
+    def __call__(self, world: World, eta: Tensor, shift: Tensor, ground: Ground, reckless: Tensor | None = None) -> Arc:
+        """The Arc of K vehicles in their `surroundings` at intensities eta [K].
 
         shift [K, 2]: m by which they misjudge the ego's place; reckless [K] bool: those that owe it nothing (None:
         nobody). Without an aim they halve their curvature and brake gently.
         """
         states, motion, length = world.states[:, 1], present_motion(world), world.scene["size"][..., 0]
-        its_motion = Aim(*(value[:, 0] for value in motion))
+        its_motion = Arc(*(value[:, 0] for value in motion))
         expected, _ = along_arc(world.states[:, 0], its_motion, moments(states), HOLD, TURN)
         expected = expected + torch.nn.functional.pad(shift, (0, 2))[:, None]
         aim = best_aim(states, Target(expected, length[:, 0], length[:, 1]), eta, ground, self.limits)
         none = aim.accel.isnan()
-        aim = Aim(aim.accel.masked_fill(none, -GENTLE), torch.where(none, motion.curvature[:, 1] / 2, aim.curvature))
+        aim = Arc(aim.accel.masked_fill(none, -GENTLE), torch.where(none, motion.curvature[:, 1] / 2, aim.curvature))
         itself = torch.tensor([[False, True]], device=eta.device).expand(len(eta), -1)
         duty = duty_of(self.responsibility, self.care, world, itself, eta)
         exempt = duty.exempt[:, 1:] if reckless is None else duty.exempt[:, 1:] | reckless[:, None]

@@ -13,8 +13,9 @@ from torch import Tensor
 from e2rl.errors import InputError
 from e2rl.scene.recording import DT
 from e2rl.settings import check_choice, check_range
+from e2rl.sim.arc import along_arc
 from e2rl.sim.world import World
-from e2rl.synthesizer.aim import Ground, Law, along_arc, surroundings
+from e2rl.synthesizer.aim import Ground, Law, surroundings
 from e2rl.synthesizer.responsibility import RESPONSIBILITIES, leading
 from e2rl.traffic.reaction import Motion, NewEpisodes, Reaction
 from e2rl.traffic.traffic import REPLAN_STEPS

@@ -235,7 +235,7 @@ def test_observation_is_of_order_one():
     env = make_env(batch=4, num_vehicles=20, red_light_x=60.0)
     data = env.rollout(80, break_when_any_done=False)
     assert data["observation"].abs().max() <= 5 and torch.isfinite(data["observation"]).all()
-    assert data["observation"].shape[-1] <= 320
+    assert data["observation"].shape[-1] <= 330
 
 
 # --- held actions

@@ -9,6 +9,7 @@ from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.mission import mission_of
 from e2rl.sim.observation import light_features, observation_config
 from e2rl.sim.static import static_scene
+from e2rl.sim.trajectories import Agents
 from tests.synthetic import make_scenes
 
 
@@ -86,7 +87,7 @@ def test_a_glance_sees_what_events_and_reward_take_from_an_observation():
     env = DrivingEnv(make_scenes(3, num_vehicles=9, limit=8.0), SimSettings(), 3)
     env.reset()
     world = env.world()
-    others = world.states[:, 1:], world.valid[:, 1:], world.accel[:, 1:]
+    others = Agents(*(x[:, 1:] for x in (world.states, world.valid, world.accel, world.turn_rate)))
     full, short = (
         sense(env._config.observation, env._static, env._ego, others, 80) for sense in (sight.observe, sight.glance)
     )

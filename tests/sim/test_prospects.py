@@ -4,17 +4,20 @@ import pytest
 import shapely
 import torch
 
+from e2rl.sim.arc import Arc, along_arc
 from e2rl.sim.prospects import TIGHT, TIMES, Others, gaps, travelled
 
 CAR = (4.6, 2.0)
 
 
 def others(*cars):
-    """Others of one ego: cars (x, y, heading, speed, acceleration)."""
-    x, y, heading, speed, accel = torch.tensor(cars, dtype=torch.float32).T[:, None]
+    """Others of one ego: cars (x, y, heading, speed, acceleration, path curvature)."""
+    cars = [(*car, 0.0)[:6] for car in cars]
+    x, y, heading, speed, accel, curvature = torch.tensor(cars, dtype=torch.float32).T[:, None]
     half = (torch.tensor(CAR) / 2)[None, :, None].expand(1, 2, len(cars))
     direction = torch.stack([heading.cos(), heading.sin()], 1)
-    return Others(torch.stack([x, y], 1), direction, half, speed, accel, torch.ones(1, len(cars), dtype=torch.bool))
+    there = torch.ones(1, len(cars), dtype=torch.bool)
+    return Others(torch.stack([x, y], 1), direction, half, speed, Arc(accel, curvature), there)
 
 
 def straight_on(speed, accel=0.0):
@@ -57,10 +60,21 @@ def test_others_keep_their_acceleration_for_a_second_then_their_speed():
     assert found.tolist() == pytest.approx([20 - driven - CAR[0] for driven in way], abs=0.05)
 
 
+def test_who_turns_goes_on_turning():
+    """The gap to a car in a curve is the one to the same car placed where its arc leads."""
+    place, along = straight_on(0.0)
+    size, pose, speed, curvature = torch.tensor([CAR]), (12.0, -14.0, 1.4), 6.0, 0.06
+    found = gaps(place, along, size, others((*pose, speed, 0.0, curvature)))[0, 0]
+    arc = Arc(torch.tensor(0.0), torch.tensor(curvature))
+    path, _ = along_arc(torch.tensor([*pose, speed]), arc, torch.tensor(TIMES[:4]))
+    standing = [gaps(place, along, size, others((*state[:3], 0.0, 0.0)))[0, 0, 0] for state in path.tolist()]
+    torch.testing.assert_close(found[:4], torch.stack(standing))
+
+
 def test_nobody_is_near_without_agents():
     place, along = straight_on(5.0)
     nothing, nobody = torch.zeros(1, 0), torch.zeros(1, 0, dtype=torch.bool)
-    nobody = Others(*(torch.zeros(1, 2, 0) for _ in range(3)), nothing, nothing, nobody)
+    nobody = Others(*(torch.zeros(1, 2, 0) for _ in range(3)), nothing, Arc(nothing, nothing), nobody)
     assert gaps(place, along, torch.tensor([CAR]), nobody).isinf().all()
 
 

@@ -7,6 +7,7 @@ from e2rl.scene.route import SPACING, interpolate, project
 from e2rl.sim.mission import Mission, limit_at, mission_of
 from e2rl.sim.neighbours import neighbours_of, rotation_into
 from e2rl.sim.static import follow, look_along, static_scene, write_rows
+from e2rl.sim.trajectories import Agents
 from tests.synthetic import make_scenes
 
 BATCH, COUNT = 64, 60
@@ -50,7 +51,7 @@ def test_others_are_seen_in_the_ego_frame_with_their_gap():
     states = scale * torch.randn(BATCH, 48, 4, generator=draw)
     ego, others = states[:, 0], states[:, 1:]
     sizes, present = (static.size, static.half_size), scene["valid"][:, 1:]
-    seen = neighbours_of(ego, rotation_into(ego), *sizes, others, present, others[..., 0])
+    seen = neighbours_of(ego, rotation_into(ego), *sizes, Agents(others, present, others[..., 0], others[..., 1]))
     assert torch.allclose(seen.position.transpose(1, 2), to_frame(others[..., :2], ego[:, None]), atol=1e-5)
     turned = others[..., 2] - ego[:, None, 2]
     assert torch.allclose(seen.direction, torch.stack([turned.cos(), turned.sin()], 1), atol=1e-5)

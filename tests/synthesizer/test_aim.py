@@ -8,7 +8,8 @@ import torch
 from e2rl.scene.boxes import overlap
 from e2rl.scene.recording import DT
 from e2rl.sim import dynamics
-from e2rl.synthesizer.aim import Aim, Ground, Law, Target, along_arc, best_aim, moments, surroundings
+from e2rl.sim.arc import Arc, along_arc
+from e2rl.synthesizer.aim import Ground, Law, Target, best_aim, moments, surroundings
 from e2rl.synthesizer.interception import MAX_CURVATURE, InterceptionSettings
 from tests.synthesizer.crossing import make_world
 
@@ -30,27 +31,6 @@ def aimed(vehicles, eta=2.0, responsibility="none", shift=STILL):
     return seen, Law(responsibility)(seen, torch.tensor([eta]), shift, ground)
 
 
-def test_an_arc_is_the_unicycle_s_motion_at_constant_acceleration_and_curvature():
-    states, aim = torch.tensor([1.0, -2.0, 0.4, 9.0]), Aim(torch.tensor(-3.0), torch.tensor(0.04))
-    times = DT * torch.arange(1, 51)
-    arc, driven = along_arc(states, aim, times)
-    speed = torch.nn.functional.pad(arc[:, 3], (1, 0), value=9.0)
-    actions = torch.stack([torch.full((50,), -3.0), 0.04 * (speed[1:] + speed[:-1]) / 2], -1)
-    torch.testing.assert_close(arc, dynamics.rollout(states, actions), rtol=0, atol=0.02)
-    assert driven[-1].item() == pytest.approx(9.0**2 / 6, abs=1e-4), "to the halt, never backwards"
-    assert (driven.diff() >= 0).all() and (arc[31:, 3] == 0).all()
-
-
-def test_what_is_seen_lasts_a_while_then_speed_and_heading_stay():
-    aim, times = Aim(torch.tensor(2.0), torch.tensor(0.05)), torch.tensor([1.0, 2.0, 3.0, 4.0])
-    arc, driven = along_arc(torch.tensor([0.0, 0.0, 0.0, 10.0]), aim, times, hold=1.0, turn=2.0)
-    torch.testing.assert_close(arc[:, 3], torch.full((4,), 12.0))
-    torch.testing.assert_close(driven, torch.tensor([11.0, 23.0, 35.0, 47.0]))
-    torch.testing.assert_close(arc[1:, 2], torch.full((3,), 1.0))
-    assert arc[0, 2].item() == pytest.approx(0.55)
-    torch.testing.assert_close((arc[3, :2] - arc[2, :2]).norm(), torch.tensor(12.0))
-
-
 @pytest.mark.parametrize("distance, speed", [(30.0, 8.0), (12.0, 4.0), (45.0, 10.0), (20.0, 0.0)])
 def test_straight_ahead_of_a_standing_ego_it_touches_it_at_the_chosen_moment(distance, speed):
     """And is not there before, at the accelerations that are allowed."""
@@ -69,7 +49,7 @@ def test_aims_keep_the_limits_at_every_intensity():
     count = 400
     states = torch.stack([*(60 * torch.rand(3, count) - 30), 20 * torch.rand(count)], -1)
     ego = torch.stack([*(60 * torch.rand(3, count) - 30), 15 * torch.rand(count)], -1)
-    target = along_arc(ego, Aim(torch.zeros(count), torch.zeros(count)), moments(ego))[0]
+    target = along_arc(ego, Arc(torch.zeros(count), torch.zeros(count)), moments(ego))[0]
     eta, length = 1 + 2 * torch.rand(count), torch.full((count,), 4.5)
     ground = Ground(torch.full((1, 200, 200), -5.0), torch.tensor([[-100.0, -100.0]]), torch.zeros(count).long())
     aim = best_aim(states, Target(target, length, length), eta, ground, LIMITS)
@@ -127,7 +107,7 @@ def followed_for(seconds, responsibility, vehicles, steer=None):
         aim = law(seen, torch.tensor([3.0]), 0.7 * torch.randn(1, 2, generator=generator), ground_of(world))
         states = world.states.clone()
         path, _ = along_arc(states[:, 1], aim, DT * torch.arange(1, 6))
-        still = Aim(torch.zeros(1), torch.zeros(1))
+        still = Arc(torch.zeros(1), torch.zeros(1))
         ego, _ = along_arc(states[:, 0], still, DT * torch.arange(1, 6))
         size = world.scene["size"]
         touched |= overlap(path, size[:, 1, None], ego, size[:, :1]).any().item()

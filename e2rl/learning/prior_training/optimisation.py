@@ -21,6 +21,13 @@ WARM_UP = 50  # steps
 RANK_SEED = 1_000_003  # difference of the generator seeds of consecutive ranks
 
 
+def has_bf16(device: torch.device) -> bool:
+    """Whether the device computes in bf16; elsewhere it is emulated, on CPUs at a tenth of the speed of float32."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+
+
 class PriorTraining:
     """The state of one training run: network, moving average of its weights, optimiser, progress and generator.
 
@@ -36,6 +43,7 @@ class PriorTraining:
         self.prior, self.windows, self.settings, self.processes = prior, windows, settings, processes
         self.step, self.share = 0, settings.batch // processes.count
         self.device = next(prior.parameters()).device
+        self.bf16 = has_bf16(self.device) if settings.bf16 is None else settings.bf16
         self.generator = torch.Generator(self.device).manual_seed(settings.seed + RANK_SEED * processes.rank)
         nodes, causal = windows["nodes"][windows["present"]], windows["causal"]
         std = nodes.std(0)
@@ -80,7 +88,7 @@ class PriorTraining:
         # Dropout is seeded by step and rank, so a resumed run repeats it.
         torch.manual_seed(self.settings.seed + RANK_SEED * (self.step * self.processes.count + self.processes.rank))
         total = self.processes.mean(loss_weight(batch, drawn).sum()).clamp(min=1)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.settings.bf16):
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16):
             loss, action, trajectory = self.loss(batch, drawn, total)
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate()

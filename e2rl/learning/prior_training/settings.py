@@ -23,7 +23,7 @@ class TrainingSettings:
     accel_noise: float = 0.35
     mirror: float = 0.5
     causal: float = 0.4
-    bf16: bool = True
+    bf16: bool | None = None
     compile: bool = False
     route_steps: int = 600
     validate_every: int = 250
