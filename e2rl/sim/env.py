@@ -25,7 +25,7 @@ from e2rl.sim.trajectories import Agents, Trajectories
 from e2rl.sim.world import World
 
 OF_ROUTE = ("points", "length", "open", "limit", "light", "light_s", "log")
-OF_SCENE = ("start", "start_accel", "start_yaw_rate", "size", "agent_type", "field_origin")
+OF_SCENE = ("start", "valid", "start_accel", "start_yaw_rate", "size", "agent_type", "field_origin")
 FLAGS, METRICS = ("terminated", "truncated"), ("contact", "contact_vru", "off_road", "progress")
 
 
@@ -87,6 +87,7 @@ class DrivingEnv(EnvBase):
         self._ego = EgoState(
             zeros.long(), zeros[:, None].repeat(1, 4), zeros[:, None].repeat(1, 2), pose, flags, flags.clone(), zeros
         )
+        self._features = torch.zeros(batch_size, OBSERVATION_SIZE, device=device)  # as last observed
         self._make_specs(batch_size, self.scene["start"].shape[1])
 
     def _make_specs(self, batch: int, agents: int) -> None:
@@ -170,10 +171,15 @@ class DrivingEnv(EnvBase):
             rows = chosen.view(batch)[index].cpu()
         self.scenes.copy_into(self.scene, index, rows)
         fresh = self.scene if len(index) == batch else self._beginning(index)
-        mission = mission_of(fresh)
-        write_rows(self._static, index, static_scene(fresh, mission))
+        static = static_scene(fresh, mission_of(fresh))
+        write_rows(self._static, index, static)
         self._trajectories.reset(self.scene, index)
-        self._restart(index, fresh, mission)
+        begun = self._restart(index, fresh, static.mission)
+        if len(index) < batch:
+            static = static._replace(field=self.scene["field"][index], light_state=self.scene["light_state"][index])
+        others = Agents(*(fresh[name][:, 1:] for name in ("start", "valid", "start_accel", "start_yaw_rate")))
+        features = observe(self._config.observation, static, begun, others, self.horizon).features
+        self._features = self._features.index_copy(0, index, features)
         return self._reset_output()
 
     def _beginning(self, index: Tensor) -> TensorDict:
@@ -185,8 +191,8 @@ class DrivingEnv(EnvBase):
             scene[name] = self.scene[name][: len(index)]
         return TensorDict(scene, batch_size=[len(index)], device=self.device)
 
-    def _restart(self, index: Tensor, scene: TensorDictBase, mission: Mission) -> None:
-        """Write the start states of environments index [b] in scenes scene [b]."""
+    def _restart(self, index: Tensor, scene: TensorDictBase, mission: Mission) -> EgoState:
+        """Write, and return, the start states [b] of environments index [b] in scenes scene [b]."""
         state = scene["start"][:, 0]
         pose = FrenetPose(*(value[:, 0] for value in project(state[:, None, :2], mission.points)))
         start = self.scene["start"][:, :1, :2]  # of all environments: the fields stay where they are
@@ -201,15 +207,12 @@ class DrivingEnv(EnvBase):
         pose = FrenetPose(*map(put, old.pose, fresh.pose))
         values = {name: put(getattr(old, name), getattr(fresh, name)) for name in old._fields if name != "pose"}
         self._ego = EgoState(pose=pose, **values)
+        return fresh
 
     def _reset_output(self) -> TensorDict:
-        ego, world = self._ego, self.world()
-        assert world.turn_rate is not None
-        others = Agents(*(value[:, 1:] for value in (world.states, world.valid, world.accel, world.turn_rate)))
-        features = observe(self._config.observation, self._static, ego, others, self.horizon).features
-        none = torch.zeros_like(ego.present)
-        outcome = dict.fromkeys((*FLAGS, *METRICS), none)
-        return self._output(outcome | {"observation": features, "progress": ego.pose.s - ego.start_s})
+        ego = self._ego
+        outcome = dict.fromkeys((*FLAGS, *METRICS), torch.zeros_like(ego.present))
+        return self._output(outcome | {"observation": self._features, "progress": ego.pose.s - ego.start_s})
 
     @torch.no_grad()  # the stored state must not accumulate an autograd graph
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
@@ -219,6 +222,7 @@ class DrivingEnv(EnvBase):
         function = compiled(function) if self.settings.compile else function
         given = (self.scene["logged"], self.scene["logged_valid"]) if replays else tensordict["action"]
         self._ego, outcome = hold_step(function, self.hold, self._ego, given, tracks, self._static, self._config)
+        self._features = outcome["observation"]
         return self._output(outcome).set("reward", outcome["reward"][:, None])
 
     def _output(self, outcome: Outcome) -> TensorDict:

@@ -294,10 +294,11 @@ def test_held_actions_keep_the_specs_and_the_resets():
 def test_what_a_reset_of_some_writes_is_what_a_reset_of_all_writes():
     whole, some = (make_env(batch=4, num_vehicles=6, num_scenes=5) for _ in range(2))
     index = torch.tensor([[4], [1], [3], [0]])
-    whole.reset(TensorDict({"scene_index": index}, [4]))
+    seen = whole.reset(TensorDict({"scene_index": index}, [4]))["observation"]
     some.reset(TensorDict({"scene_index": torch.tensor([[0], [1], [2], [0]])}, [4]))
     begun = torch.tensor([[True], [False], [True], [False]])
-    some.reset(TensorDict({"scene_index": index, "_reset": begun}, [4]))
+    seen_anew = some.reset(TensorDict({"scene_index": index, "_reset": begun}, [4]))["observation"]
+    torch.testing.assert_close(seen_anew, seen)
     assert torch.equal(act(whole, 1.0, 0.1)["observation"], act(some, 1.0, 0.1)["observation"])
     for found, value in zip(
         (*some._static.mission, *some._static[1:]), (*whole._static.mission, *whole._static[1:]), strict=True
