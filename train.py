@@ -14,6 +14,7 @@ from e2rl.learning.checkpoint import load_checkpoint, save_checkpoint
 from e2rl.learning.prior_training.distributed import follower_overrides, started_by_torchrun
 from e2rl.learning.prior_training.stage import run_prior_stage
 from e2rl.learning.resume import resumed
+from e2rl.report.curriculum import draw_choices
 from e2rl.report.tables import metric_tables, print_tables, save_tables
 from e2rl.scene.source import load_scenes
 
@@ -31,7 +32,7 @@ def evolve(config: DictConfig, folder: Path) -> None:
         save_checkpoint(folder, run, resolved(config), config.keep_last)
     for number in range(done, config.rounds):
         metrics = run.run_round()
-        logger.log(metrics, number)
+        logger.log(metrics, number, run.choices)
         save_checkpoint(folder, run, resolved(config), config.keep_last)
         speed, waiting = metrics.get("time/steps_per_second"), metrics.get("time/waiting")
         print(
@@ -44,6 +45,7 @@ def evolve(config: DictConfig, folder: Path) -> None:
             flush=True,
         )
     logger.close()
+    draw_choices(folder)
     tables = metric_tables(measure("after", run.ego), caption(config, origin))
     save_tables(folder / "tables.md", tables)
     print_tables(tables)

@@ -15,15 +15,18 @@ import numpy as np
 import pytest
 import torch
 from hydra.core.global_hydra import GlobalHydra
+from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import save_file
 
 from e2rl.build import load_choice
 from e2rl.evaluation.files import read_metrics
+from e2rl.learning.logging import read_choices
 from e2rl.metrics.catalogue import META_STAGE, OPEN_LOOP_STAGE, STAGES
 from e2rl.prior.checkpoint import save_prior
 from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.prior import Prior
+from e2rl.traffic.template import TEMPLATES
 from tests.scene.descriptions import Malicious, description, lane, numbered, straight, write_folder
 
 ROOT = Path(__file__).parents[1]
@@ -201,6 +204,8 @@ def test_unknown_keys_and_choices(world, tmp_path, monkeypatch, capsys, script, 
         ("evaluate.py", ["plugins=[no.such]"], "plugins: no.such: "),
         ("train.py", ["curriculum._target_=torch.nn.ReLU"], "curriculum=torch.nn.ReLU: cannot be built: "),
         ("train.py", ["+learner.depth=3"], "depth"),
+        ("train.py", ["curriculum=bandit", "synthesizer=idm"], "synthesizer=idm has none; set synthesizer=e2"),
+        ("train.py", ["curriculum=bandit", "curriculum.templates=[trio]"], "curriculum.templates=trio: choose one of"),
         ("evaluate.py", ["ego=actor", "ego.checkpoint=none.safetensors"], "none.safetensors"),
     ],
 )
@@ -305,6 +310,44 @@ def test_a_round_of_evolution_from_the_first_command_to_its_tables(world, tmp_pa
     tables = (tmp_path / "run" / "tables.md").read_text()
     assert "cfr [%]" in tables and "cfr [points]" in tables and "after" in tables
     assert list((tmp_path / "run" / "checkpoints").iterdir())
+
+
+@pytest.mark.parametrize("curriculum", ["bandit", "constant"])
+def test_every_choice_of_a_curriculum_is_logged_and_drawn(world, tmp_path, monkeypatch, capsys, curriculum):
+    """Also those of rounds after a resume."""
+    overrides = arguments(
+        world,
+        tmp_path,
+        "good",
+        "data.build.steps=20",
+        "prior.sampler.steps=2",
+        f"curriculum={curriculum}",
+        "rounds=1",
+        "batch=2",
+        "learner.round.scenes=4",
+        "learner.collect.batch=2",
+        "learner.collect.steps=20",
+        "learner.collect.iterations=1",
+        "measure.scenes=1",
+        "measure.seeds=[0]",
+        "measure.eta=1",
+    )
+    run = tmp_path / "run"
+    status, said = call("train.py", overrides, monkeypatch, capsys)
+    assert status == 0, said
+    again = [f"resume={run}", "rounds=2", f"hydra.run.dir={tmp_path / 'again'}"]
+    status, said = call("train.py", again, monkeypatch, capsys)
+    assert status == 0, said
+    rows = read_choices(run / "curriculum.csv")
+    arms = 24 if curriculum == "bandit" else 1
+    assert [row["round"] for row in rows] == [0] * arms + [1] * arms
+    assert [sum(row["draws"] for row in rows if row["round"] == number) for number in (0, 1)] == [4, 4]
+    if curriculum == "constant":
+        assert all((row["eta"], row["template"]) == (2.0, "full") for row in rows)
+    else:
+        assert {row["template"] for row in rows} == set(TEMPLATES) and all(row["value"] > 0 for row in rows)
+    with Image.open(run / "curriculum.png") as picture:
+        assert picture.width > picture.height
 
 
 @pytest.mark.parametrize(("experiment", "methods", "figure"), EXPERIMENTS)

@@ -8,19 +8,21 @@ from torch import Tensor
 
 from e2rl.ego.base import Ego
 from e2rl.traffic.pool import StoredTraffic
+from e2rl.traffic.template import FULL
 
-Synthesize = Callable[[Ego, Tensor, Tensor, int], Mapping[str, Tensor]]
+Synthesize = Callable[..., Mapping[str, Tensor]]  # (ego, scene_index [S], eta [S], seed), or these and template [S]
 Solvable = Callable[[Mapping[str, Tensor]], Tensor]
 
 
 @dataclass(frozen=True)
 class Order:
-    """What is to be synthesized: for round `number`, in scenes [S], at intensities eta [S], from a seed, against an ego
-    that nobody changes meanwhile."""
+    """What is to be synthesized: for round `number`, in scenes [S], at intensities eta [S], by causal templates [S]
+    int64, from a seed, against an ego that nobody changes meanwhile."""
 
     number: int
     scenes: Tensor
     eta: Tensor
+    template: Tensor
     seed: int
     ego: Ego
 
@@ -31,17 +33,20 @@ def make_traffic(
     """Traffic [R] of an order: the attack, without rows that no driver survives, then, with `nominal`, the same scenes
     at intensity 0.
 
-    scene_index [R], eta [R], states [R, T+1, N, 4], valid [R, T+1, N], adversaries [R, N]; of the attack left_out [L]
-    (scenes of the rows left out) and the shares of all its rows attacked [] (with an adversary) and contact [] (the ego
-    was hit). Equal orders yield equal traffic, in whichever process.
+    scene_index [R], eta [R], template [R], states [R, T+1, N, 4], valid [R, T+1, N], adversaries [R, N]; of the attack
+    kept [S] bool (rows not left out) and the shares of all its rows attacked [] (with an adversary) and contact [] (the
+    ego was hit). Equal orders yield equal traffic, in whichever process. Templates are given to `synthesize` only where
+    one is not full.
     """
-    attack = synthesize(order.ego, order.scenes, order.eta, order.seed)
+    limits = () if bool((order.template == FULL).all()) else (order.template,)
+    attack = synthesize(order.ego, order.scenes, order.eta, order.seed, *limits)
     kept = torch.ones_like(attack["contact"]) if solvable is None else solvable(attack)
     names = ("scene_index", *StoredTraffic._fields)
-    rows = {name: attack[name][kept] for name in names} | {"eta": order.eta[kept]}
+    rows = {name: attack[name][kept] for name in names} | {"eta": order.eta[kept], "template": order.template[kept]}
     if nominal:
         none = torch.zeros_like(order.eta)
-        plain = {**synthesize(order.ego, order.scenes, none, order.seed), "eta": none}
+        every = {"eta": none, "template": torch.full_like(order.template, FULL)}
+        plain = {**synthesize(order.ego, order.scenes, none, order.seed), **every}
         rows = {name: torch.cat([value, plain[name]]) for name, value in rows.items()}
     shares = {"attacked": attack["adversaries"].any(-1).float().mean(), "contact": attack["contact"].float().mean()}
-    return rows | shares | {"left_out": attack["scene_index"][~kept]}
+    return rows | shares | {"kept": kept}

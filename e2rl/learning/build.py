@@ -46,6 +46,11 @@ def build_evolution(
     synthesize = synthesize or synthesize_traffic(scenes, traffic, sim, config.batch, config.device)
     given = {"num_scenes": len(scenes), "rounds": config.rounds, "seed": seed}
     curriculum = built(config.curriculum, "curriculum", CurriculumScheduler, **given)
+    if curriculum.templates != ("full",) and not traffic.follows_template:
+        raise InputError(
+            f"curriculum: it chooses causal templates ({', '.join(curriculum.templates)}), but "
+            f"synthesizer={config.synthesizer.name} has none; set synthesizer=e2 or curriculum.templates=[full]"
+        )
     settings = settings_of(RoundSettings, _beside(config, ego), "learner.round")
     learner = OmegaConf.create({key: value for key, value in config.learner.items() if key != "round"})
     parameters = {key: value for key, value in resolved(config.ego).items() if key != "_target_"}

@@ -19,7 +19,7 @@ from e2rl.ego.network import WEIGHTS
 from e2rl.errors import InputError
 from e2rl.learning.evolution import Evolution
 
-STATE, MEMORY, CONFIG, FORMAT = "state.pt", "memory.json", "config.json", "e2rl-checkpoint/2"
+STATE, MEMORY, CONFIG, FORMAT = "state.pt", "memory.json", "config.json", "e2rl-checkpoint/3"
 
 
 def save_checkpoint(folder: Path, run: Evolution, config: dict, keep_last: int = 2) -> Path:
@@ -75,7 +75,10 @@ def load_checkpoint(path: str | Path, run: Evolution) -> int:
         state = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged pickle can raise any exception
         raise InputError(f"{file}: damaged ({type(error).__name__}); resume from an older checkpoint") from error
-    if not isinstance(state, dict) or state.get("format") != FORMAT:
+    written = state.get("format") if isinstance(state, dict) else None
+    if written != FORMAT and str(written).startswith(FORMAT.split("/")[0]):
+        raise InputError(f"{file}: of another version of this program ({written}, not {FORMAT}); begin a new run")
+    if written != FORMAT:
         raise InputError(f"{file}: not a checkpoint of this program ({FORMAT}); give a run's folder")
     if isinstance(run.ego, ActorEgo):
         run.ego.network.load(folder / WEIGHTS)

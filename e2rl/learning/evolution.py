@@ -11,6 +11,7 @@ from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import Ego
 from e2rl.learning.ahead import Ahead
 from e2rl.learning.attack import Order, Solvable, Synthesize, make_traffic
+from e2rl.learning.curriculum.outcomes import Choice, outcomes_of, tally
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
 from e2rl.learning.episodes import Episodes
 from e2rl.learning.improvement import Improvement
@@ -41,21 +42,24 @@ class RoundSettings:
 
 @dataclass
 class Attack:
-    """The traffic of a round: the pool, scenes [L] left out of it, and metrics; contact: the attacked ego's contact
-    rate, None if unknown before the episodes are driven; spent: seconds."""
+    """The traffic of a round: the pool, which of the ordered attacks its first K rows are (drawn [K] int64; the others
+    were left out), and metrics; contact: the attacked ego's contact rate, None if unknown before the episodes are
+    driven; spent: seconds."""
 
     pool: TrafficPool
-    left_out: Tensor
+    drawn: Tensor
     metrics: dict[str, float]
     spent: dict[str, float]
     contact: float | None = None
 
 
 class Evolution:
-    """The state of a run: curriculum, improvement (which holds the ego) and the memory of D'.
+    """The state of a run: curriculum, improvement (which holds the ego) and the memory of D'; choices: what the
+    curriculum chose for the last round and what came of it, in rows (e2rl/learning/curriculum/outcomes.py).
 
     synthesize(ego, scene_index [S], eta [S], seed) -> {scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N],
-    adversaries [S, N] bool, contact [S] bool}: closed-loop traffic against that ego; contact: it was hit.
+    adversaries [S, N] bool, contact [S] bool}: closed-loop traffic against that ego; contact: it was hit. Of a
+    curriculum that chooses causal templates it also takes template [S].
     solvable(traffic) -> bool [S]: rows that enter D' (None: all). memory: None: in a temporary folder.
 
     With `settings.ahead`, scenes, intensities and ego of the next round's D' are fixed just before a round's learning,
@@ -76,6 +80,7 @@ class Evolution:
         self.settings, self.seed, self.solvable = settings, seed, solvable
         self.memory = memory or Memory(None, settings.memory)
         self.episodes: Episodes | None = None
+        self.choices: list[Choice] = []
         self._next: Order | None = None  # of the coming round, if fixed already
         self._ahead: Ahead | None = None  # what makes it, if begun already
 
@@ -101,11 +106,15 @@ class Evolution:
         spent = attack.spent | {"improve": time.perf_counter() - begin}
         spent |= {name: learned.pop(name) for name in ("collect", "steps_per_second") if name in learned}
         self.curriculum.update(self.episodes.scene_index, self.episodes.returns, self.episodes.adversarial)
-        self.curriculum.leave_out(attack.left_out)
+        outcomes = outcomes_of(order.eta, order.template, attack.drawn, self.episodes.row, self.episodes.failed)
+        self.curriculum.observe(outcomes)
+        self.curriculum.leave_out(order.scenes[outcomes.left_out])
+        level = self.curriculum.level(order.eta)
+        self.choices = tally(order.number, level, outcomes, self.curriculum.values())
         contact = learned.get("contact_adversarial") if attack.contact is None else attack.contact
         self.curriculum.advance(contact)
         attacked = {"scenes": float(len(order.scenes)), "eta": order.eta.mean().item()}
-        attacked |= {"left_out": float(len(attack.left_out)), "memory_rows": float(self.memory.rows)}
+        attacked |= {"left_out": float(outcomes.left_out.sum()), "memory_rows": float(self.memory.rows)}
         attacked |= {"fresh_draws": attack.pool.fresh[self.episodes.row].float().mean().item(), **attack.metrics}
         attacked |= {} if contact is None else {"contact": contact}
         groups = {"curriculum": state, "train": learned, "synthesizer": attacked, "time": spent}
@@ -115,7 +124,7 @@ class Evolution:
         """What is to be synthesized for a round, as the curriculum and the ego are now."""
         scenes = self.curriculum.draw(self.settings.scenes)
         ego = copy.deepcopy(self.ego) if self.settings.ahead else self.ego  # learning changes weights in place
-        return Order(number, scenes, self.curriculum.etas(scenes), self.seed * 1_000_003 + number, ego)
+        return Order(number, scenes, *self.curriculum.choices(scenes), self.seed * 1_000_003 + number, ego)
 
     def _begin_next(self) -> None:
         """Fix the next round's order; begin on it if the run has such a round."""
@@ -146,18 +155,18 @@ class Evolution:
         if self.settings.nominal == "log" or not len(pool):  # without nominal traffic the pool may be empty
             pool = pool + TrafficPool.recorded(order.scenes)
         metrics = {"attacked": traffic["attacked"].item()}
-        return Attack(pool, traffic["left_out"], metrics, spent, traffic["contact"].item())
+        return Attack(pool, traffic["kept"].nonzero()[:, 0], metrics, spent, traffic["contact"].item())
 
     def _live(self, order: Order) -> Attack:
         """Rows whose traffic is replanned against the learning ego, attacked and nominal."""
-        index, eta = order.scenes.repeat(NOISES), order.eta.repeat(NOISES)
+        index, eta, template = (each.repeat(NOISES) for each in (order.scenes, order.eta, order.template))
         noise = index + (order.seed * NOISES + torch.arange(NOISES).repeat_interleave(len(order.scenes))) * 1_000_003
-        pool = TrafficPool.live(index, eta, noise)
+        pool = TrafficPool.live(index, eta, noise, template)
         if self.settings.nominal == "prior":
             pool = pool + TrafficPool.live(index, torch.zeros_like(eta), noise)
         elif self.settings.nominal == "log":
             pool = pool + TrafficPool.recorded(order.scenes)
-        return Attack(pool, order.scenes[:0], {}, {"synthesize": 0.0})
+        return Attack(pool, torch.arange(len(order.scenes)).repeat(NOISES), {}, {"synthesize": 0.0})
 
     def state_dict(self) -> dict:
         """Curriculum, improvement and the order of the coming round; the checkpoint adds weights, the memory's index
@@ -167,7 +176,7 @@ class Evolution:
             order, ego = self._next, self._next.ego
             assert isinstance(ego, ActorEgo)
             weights = {name: value.detach().cpu() for name, value in ego.network.weights().items()}
-            given = {"number": order.number, "scenes": order.scenes, "eta": order.eta, "seed": order.seed}
+            given = {name: getattr(order, name) for name in ("number", "scenes", "eta", "template", "seed")}
             state["next"] = given | {"weights": weights}
         return state
 

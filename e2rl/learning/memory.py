@@ -38,9 +38,9 @@ class Remembered:
 class Memory:
     """The rounds from the newest one back, at most `bound` rows together; the newest round always stays.
 
-    A round's traffic {scene_index [R], eta [R], states [R, T+1, N, 4], valid [R, T+1, N], adversaries [R, N], ...} is
-    written by `write`, by any process, and enters by `take`. Files of rounds that have left go in `prune`: until then a
-    checkpoint may name them.
+    A round's traffic {scene_index [R], eta [R], template [R], states [R, T+1, N, 4], valid [R, T+1, N], adversaries
+    [R, N], ...} is written by `write`, by any process, and enters by `take`. Files of rounds that have left go in
+    `prune`: until then a checkpoint may name them.
     """
 
     def __init__(self, folder: Path | None, bound: int) -> None:
@@ -77,7 +77,7 @@ class Memory:
     def pool(self, fresh: float) -> TrafficPool:
         """Rows of all rounds, the newest first, whose rows weigh `fresh` times as much as the others'. The tracks stay
         in their files."""
-        *older, newest = (TrafficPool.stored(one.traffic, one.traffic["eta"]) for one in self.rounds)
+        *older, newest = (_pool(one.traffic) for one in self.rounds)
         joined = replace(newest, weight=newest.weight * fresh)
         for pool in reversed(older):
             joined = joined + replace(pool, fresh=torch.zeros_like(pool.fresh))
@@ -102,6 +102,10 @@ class Memory:
         for path in sorted(self.folder.glob("round-*.safetensors")):
             if path < self.path(first):
                 path.unlink()
+
+
+def _pool(traffic: Mapping[str, Tensor]) -> TrafficPool:
+    return TrafficPool.stored(traffic, traffic["eta"], traffic["template"])
 
 
 def _mapped(path: Path) -> dict[str, Tensor]:

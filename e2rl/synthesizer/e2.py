@@ -28,11 +28,12 @@ from e2rl.synthesizer.potentials import PotentialContext, PotentialSettings
 from e2rl.synthesizer.reasoner import ReasonerSettings, build_reasoner
 from e2rl.synthesizer.responsibility import RESPONSIBILITIES, CareSettings, duty_of, leading, place_of
 from e2rl.synthesizer.selection import Selection
-from e2rl.synthesizer.skeleton import Skeleton, SkeletonSettings, build_skeleton, chain_depth, direct
+from e2rl.synthesizer.skeleton import Skeleton, SkeletonSettings, build_skeleton, chain_depth, direct, limits_of
 from e2rl.synthesizer.topology import TopologySettings, topological_candidates
 from e2rl.traffic.grouping import Group
 from e2rl.traffic.nominal import NominalTraffic, PriorState
 from e2rl.traffic.rows import noise_of, put_rows, take_rows
+from e2rl.traffic.template import FULL
 from e2rl.traffic.traffic import TrafficPlan
 
 LITERAL, SUPPORT = 500, 750  # numbers of draws: the literal blend's noise, a random support's
@@ -55,12 +56,15 @@ Answer = Callable[[Tensor, Tensor], Tensor]  # Traffic.replan's `react`
 class E2State(PriorState):
     """B attacked scenes.
 
-    eta [B]; coalition [B, V]: C*; target [B, V] int64: whom each member acts on (0 the ego, -1 none); off_lane [B, V]:
-    on an interception instead of its lane; committed [B, V]: with a proposal, knots [B, V, KNOTS]: its accelerations
-    [m/s^2]; path_kl, anchor_jump [B, V]: path KL of the control and energy of anchoring since the start.
+    eta [B]; near, far [B] int64: the most near and far agents of a coalition; coalition [B, V]: C*; target [B, V]
+    int64: whom each member acts on (0 the ego, -1 none); off_lane [B, V]: on an interception instead of its lane;
+    committed [B, V]: with a proposal, knots [B, V, KNOTS]: its accelerations [m/s^2]; path_kl, anchor_jump [B, V]: path
+    KL of the control and energy of anchoring since the start.
     """
 
     eta: Tensor
+    near: Tensor
+    far: Tensor
     coalition: Tensor
     target: Tensor
     off_lane: Tensor
@@ -74,6 +78,7 @@ class E2(NominalTraffic):
     """The guided reverse SDE with a sparse coalition, on a frozen prior."""
 
     adversarial = True
+    follows_template = True
     figures = ("anchor_jump",)
 
     def __init__(
@@ -121,13 +126,17 @@ class E2(NominalTraffic):
             )
         self._react: Answer | None = None
 
-    def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> E2State:
-        """States of scenes [B] with routes drawn from the prior and nobody under control."""
+    def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor, template: Tensor | None = None) -> E2State:
+        """States of scenes [B] with routes drawn from the prior and nobody under control; template [B]: causal
+        templates that limit the coalitions, None: full for all."""
+        near, far = limits_of(torch.full_like(seed, FULL) if template is None else template, self.skeleton)
         nominal = super().reset(scenes, seed, eta)
         none, zero = torch.zeros_like(nominal.routed.parked), torch.zeros_like(nominal.routed.length)
         return E2State(
             **vars(nominal),
             eta=eta,
+            near=near,
+            far=far,
             coalition=none,
             target=none.long() - 1,
             off_lane=none,
@@ -233,7 +242,8 @@ class E2(NominalTraffic):
         if self.responsibility == "full":  # planners know how to follow: leaders that brake hard find next to nothing
             support, fallback = (chosen & ~leading(world, vehicles) for chosen in (support, fallback))
         anchor = self._propose(direct(support | fallback), state, world, ego_plan)  # its cost chooses the near agents
-        skeleton = build_skeleton(scene, world, support, fallback, self.skeleton, expected, anchor.cost)
+        limits = state.near, state.far
+        skeleton = build_skeleton(scene, world, support, fallback, self.skeleton, expected, anchor.cost, limits)
         if bool(skeleton.far.any()):  # otherwise everybody meets the ego, as just proposed
             anchor = self._propose(skeleton, state, world, ego_plan)
         # Infeasible configurations are pruned (Sec. IV-A3): members without a proposal, and whoever acts through them.
@@ -257,7 +267,7 @@ class E2(NominalTraffic):
             there = there & (torch.arange(feasible.shape[1], device=there.device) > 0)
             draw = noise_of(state.seed, SUPPORT + state.replans, tuple(feasible.shape[1:]), uniform=True)
             rank = draw.masked_fill(~there, torch.inf).argsort(-1).argsort(-1)
-            chosen = there & (rank < self.skeleton.near)
+            chosen = there & (rank < state.near[:, None])
             return chosen, chosen
         return (candidates, candidates) if self.support == "topology" else (candidates & feasible, feasible)
 

@@ -40,10 +40,10 @@ def put(values: Tensor, index: Tensor, mask: Tensor, rows: Tensor) -> Tensor:
     return values.scatter(1, at, torch.where(mask.view(*mask.shape, *ones), rows, values.gather(1, at)))
 
 
-def smallest(mask: Tensor, key: Tensor, count: int) -> Tensor:
-    """The `count` members of mask [..., V] of smallest key [..., V]; ties by index."""
+def smallest(mask: Tensor, key: Tensor, count: Tensor | int) -> Tensor:
+    """The `count` [...] (or one for all) members of mask [..., V] of smallest key [..., V]; ties by index."""
     order = key.masked_fill(~mask, torch.inf).argsort(dim=-1, stable=True)
-    return mask & (order.argsort(-1) < count)
+    return mask & (order.argsort(-1) < torch.as_tensor(count, device=key.device)[..., None])
 
 
 def direction(heading: Tensor) -> Tensor:

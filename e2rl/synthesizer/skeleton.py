@@ -17,6 +17,7 @@ from e2rl.sim.world import World
 from e2rl.synthesizer.motion import compact, direction, frenet_pose, put, reachable_distance, smallest, take
 
 SUPPORTED, NEAREST_FEASIBLE, NOBODY = range(3)  # where the near agents came from
+LIMITS = ((1, 0), (2, 0), (1, 1))  # near and far agents of the causal templates single, pair and chain
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,13 @@ class Skeleton:
         names = ("supported", "nearest_feasible", "nobody")
         counts = {name: int((self.source == code).sum()) for code, name in enumerate(names)}
         return counts | {"chains": int(self.chains.sum())}
+
+
+def limits_of(template: Tensor, settings: SkeletonSettings) -> tuple[Tensor, Tensor]:
+    """The most near and far agents [B] int64 that causal templates [B] allow (e2rl/traffic/template.py); those of
+    `full` are the settings'."""
+    near, far = torch.tensor([*LIMITS, (settings.near, settings.far)], device=template.device)[template].unbind(-1)
+    return near, far
 
 
 def direct(support: Tensor) -> Skeleton:
@@ -196,13 +204,15 @@ def build_skeleton(
     settings: SkeletonSettings,
     expected: Tensor,
     cost: Tensor,
+    limits: tuple[Tensor, Tensor] | None = None,
 ) -> Skeleton:
     """Algorithm 2 for scenes [B]: support [B, V] = S, feasible [B, V] = F.
 
     expected [B, V, K, 4]: states of everybody every `step` s from now; cost [B, V]: of meeting the ego, inf for
-    vehicles that cannot. The near agents are those of S with the least cost; where S has none, those of F; where F has
-    none either, nobody.
+    vehicles that cannot; limits: the most near and far agents [B], by default the settings'. The near agents are those
+    of S with the least cost; where S has none, those of F; where F has none either, nobody.
     """
+    most_near, most_far = (settings.near, settings.far) if limits is None else limits
     vehicles = support.shape[1]
     states = world.states[:, :vehicles].detach()
     expected = expected[:, :, : round(settings.horizon / settings.step)].detach()
@@ -211,12 +221,12 @@ def build_skeleton(
     support, feasible = (mask & world.valid[:, :vehicles] & ~ego for mask in (support, feasible))
     first, second = (mask & cost.isfinite() for mask in (support, feasible))
     source = torch.where(first.any(1), SUPPORTED, torch.where(second.any(1), NEAREST_FEASIBLE, NOBODY))
-    near = smallest(torch.where(first.any(1, keepdim=True), first, second), cost, settings.near)
+    near = smallest(torch.where(first.any(1, keepdim=True), first, second), cost, most_near)
     index, present = compact(support | near)
     distant = support & ~near & (distance > settings.tau_dist) & (distance <= settings.max_dist)
     distant = present & take(distant, index)
     distant &= ~_on_ego_lanes(torch.cat([states[:, :1], take(states, index)], 1), distant, scene)
-    far = smallest(distant, -take(distance, index), settings.far)
+    far = smallest(distant, -take(distance, index), most_far)
     linked = present & far.any(1, keepdim=True)  # no far agent, no chain to look for
     after = _first_after(influence(scene, world, (index, linked), expected, settings))
     slot_target, viable = _link_chains(after, present & take(near, index), far, settings.max_chain - 1)

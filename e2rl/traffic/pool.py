@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from e2rl.errors import InputError
+from e2rl.traffic.template import FULL
 
 RECORDED, LIVE = -1, -2  # sources of a row's traffic that is not a position in the stored traffic
 
@@ -26,14 +27,16 @@ class TrafficPool:
     """R rows, each a scene with its traffic.
 
     scene_index [R] int64; source [R] int64: position in the stored traffic, RECORDED: the log is replayed, LIVE: a
-    traffic method replans it against the ego; eta [R]: adversarial intensity, 0: none; seed [R] int64: of the noise
-    of LIVE rows; weight [R]: in draws; fresh [R] bool: made for this round, not remembered from an earlier one.
+    traffic method replans it against the ego; eta [R]: adversarial intensity, 0: none; template [R] int64: causal
+    template of the attack (e2rl/traffic/template.py); seed [R] int64: of the noise of LIVE rows; weight [R]: in draws;
+    fresh [R] bool: made for this round, not remembered from an earlier one.
     parts: the stored traffic, of equal T and N; positions count through all parts. Joined pools share the tracks.
     """
 
     scene_index: Tensor
     source: Tensor
     eta: Tensor
+    template: Tensor
     seed: Tensor
     weight: Tensor
     fresh: Tensor
@@ -73,20 +76,23 @@ class TrafficPool:
         return _rows(scene_index, RECORDED, torch.zeros(len(scene_index)))
 
     @staticmethod
-    def live(scene_index: Tensor, eta: Tensor, seed: Tensor) -> "TrafficPool":
-        """Rows of scenes [R] whose traffic is replanned against the ego; eta [R], seed [R]."""
-        return _rows(scene_index, LIVE, eta, seed)
+    def live(scene_index: Tensor, eta: Tensor, seed: Tensor, template: Tensor | None = None) -> "TrafficPool":
+        """Rows of scenes [R] whose traffic is replanned against the ego; eta [R], seed [R], template [R] (None: full
+        for all)."""
+        return _rows(scene_index, LIVE, eta, seed, template)
 
     @staticmethod
-    def stored(traffic: Mapping[str, Tensor], eta: Tensor | float) -> "TrafficPool":
-        """Rows of a synthesizer's traffic at intensities eta [S], or one for all: scene_index [S], states
-        [S, T+1, N, 4], valid [S, T+1, N] and adversaries [S, N] bool. Raises InputError for a missing key."""
+    def stored(traffic: Mapping[str, Tensor], eta: Tensor | float, template: Tensor | None = None) -> "TrafficPool":
+        """Rows of a synthesizer's traffic at intensities eta [S], or one for all, and templates [S] (None: full for
+        all): scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N] and adversaries [S, N] bool. Raises InputError
+        for a missing key."""
         missing = {"scene_index", "states", "valid", "adversaries"} - set(traffic)
         if missing:
             raise InputError(f"synthesized traffic lacks {', '.join(sorted(missing))}; return them from synthesize()")
         part = StoredTraffic(*(traffic[name].cpu() for name in StoredTraffic._fields))
         index = traffic["scene_index"].cpu()
-        pool = _rows(index, RECORDED, torch.as_tensor(eta, dtype=torch.float32).cpu().expand(len(index)))
+        eta = torch.as_tensor(eta, dtype=torch.float32).cpu().expand(len(index))
+        pool = _rows(index, RECORDED, eta, template=None if template is None else template.cpu())
         pool.source, pool.parts = torch.arange(len(index)), [part]
         return pool
 
@@ -94,7 +100,7 @@ class TrafficPool:
         """Both pools' rows, this one's first."""
         count = sum(len(part.states) for part in self.parts)
         moved = torch.where(other.source >= 0, other.source + count, other.source)
-        names = ("scene_index", "eta", "seed", "weight", "fresh")
+        names = ("scene_index", "eta", "template", "seed", "weight", "fresh")
         joined = {name: torch.cat([getattr(self, name), getattr(other, name)]) for name in names}
         return TrafficPool(source=torch.cat([self.source, moved]), parts=self.parts + other.parts, **joined)
 
@@ -111,8 +117,11 @@ class TrafficPool:
         return result
 
 
-def _rows(scene_index: Tensor, source: int, eta: Tensor, seed: Tensor | None = None) -> TrafficPool:
-    """Fresh rows of weight 1 from one source."""
+def _rows(
+    scene_index: Tensor, source: int, eta: Tensor, seed: Tensor | None = None, template: Tensor | None = None
+) -> TrafficPool:
+    """Fresh rows of weight 1 from one source; by default of seed 0 and template full."""
     like = torch.zeros(len(scene_index), dtype=torch.int64)
-    seed = like if seed is None else seed
-    return TrafficPool(scene_index, like + source, eta, seed, torch.ones(len(like)), torch.ones_like(like).bool())
+    seed, template = like if seed is None else seed, like + FULL if template is None else template
+    fresh, weight = torch.ones_like(like).bool(), torch.ones(len(like))
+    return TrafficPool(scene_index, like + source, eta, template, seed, weight, fresh)

@@ -17,6 +17,7 @@ from e2rl.scene.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.traffic_light import ran_red
 from e2rl.traffic.pool import TrafficPool
+from e2rl.traffic.template import FULL
 from e2rl.traffic.traffic import Traffic
 from e2rl.traffic.transform import AdversarialSynthesizer
 
@@ -34,8 +35,10 @@ def roll_out(
     traffic: Traffic,
     sim: SimSettings,
     device: str = "cpu",
+    template: Tensor | None = None,
 ) -> dict:
-    """Rollouts of scenes index [B] with seeds [B] and intensities eta [B] to their last step.
+    """Rollouts of scenes index [B] with seeds [B], intensities eta [B] and causal templates [B] (None: full for all) to
+    their last step.
 
     The rollout dict that e2rl.metrics and e2rl.evaluation.files read: states [B, T+1, N, 4], valid, size, agent_type,
     simulated, adversaries, logged, logged_valid, map keys, ran_light [B, N] (`red_lights`), seed, scene_id,
@@ -45,7 +48,7 @@ def roll_out(
     begin = time.perf_counter()
     settings = replace(sim, end_on_contact=False, end_off_road=False, end_when_gone=False)
     settings.replay_ego = sim.replay_ego or ego.replays_log
-    pool = TrafficPool.live(index.cpu(), eta.cpu().float(), seed.cpu())
+    pool = TrafficPool.live(index.cpu(), eta.cpu().float(), seed.cpu(), None if template is None else template.cpu())
     base = DrivingEnv(scenes, settings, len(index), device, agents=True)
     env = TransformedEnv(base, AdversarialSynthesizer(pool, torch.arange, traffic, ego))
     with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -98,17 +101,22 @@ def red_lights(tracks: dict[str, Tensor], scene: TensorDictBase, route: Tensor) 
 
 
 def synthesize_traffic(scenes: SceneSet, traffic: Traffic, sim: SimSettings, batch: int = 64, device: str = "cpu"):
-    """A function (ego, scene_index [S], eta [S] or one for all, seed) -> the D' of Algorithm 1 against that ego.
+    """A function (ego, scene_index [S], eta [S] or one for all, seed, template [S], by default full for all) -> the D'
+    of Algorithm 1 against that ego.
 
     D': scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N], adversaries [S, N], contact [S] (the ego touched a
     vehicle).
     """
 
-    def synthesize(ego: Ego, scene_index: Tensor, eta: Tensor | float, seed: int) -> dict[str, Tensor]:
+    def synthesize(
+        ego: Ego, scene_index: Tensor, eta: Tensor | float, seed: int, template: Tensor | None = None
+    ) -> dict[str, Tensor]:
         parts, etas = [], torch.as_tensor(eta, dtype=torch.float32).expand(len(scene_index))
-        for rows, intensity in zip(scene_index.split(batch), etas.split(batch), strict=True):
+        template = torch.full_like(scene_index, FULL) if template is None else template
+        every = (given.split(batch) for given in (scene_index, etas, template))
+        for rows, intensity, limits in zip(*every, strict=True):
             noise = rows + seed * 1_000_003
-            parts.append(roll_out(scenes, rows, noise, intensity, ego, traffic, sim, device))
+            parts.append(roll_out(scenes, rows, noise, intensity, ego, traffic, sim, device, limits))
         names = ("states", "valid", "adversaries", "contact")
         return {"scene_index": scene_index} | {name: torch.cat([part[name] for part in parts]) for name in names}
 

@@ -59,7 +59,8 @@ class TrafficPlan:
 class Traffic(ABC):
     """Drives all vehicles but the ego of B scenes at once. Built as `_target_(prior=prior, **settings)`.
 
-    stochastic: seeds matter; adversarial: the intensity eta matters; predicts: plans can be compared with the log in
+    stochastic: seeds matter; adversarial: the intensity eta matters; follows_template: `reset` takes causal templates,
+    template [B] int64 (e2rl/traffic/template.py; None: full for all); predicts: plans can be compared with the log in
     open loop; replays_log: it is the recording itself; queries_ego: `replan` takes `react`, which returns the ego's
     states against a plan: react(rows [G] of the batch, states [G, V, HORIZON, 4]) -> [G, HORIZON, 4];
     knowledge, responsibility: what it knows of the ego and owes it, in words for captions ("": nothing to say);
@@ -69,6 +70,7 @@ class Traffic(ABC):
 
     stochastic = True
     adversarial = False
+    follows_template = False
     predicts = True
     replays_log = False
     queries_ego = False

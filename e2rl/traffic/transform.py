@@ -111,7 +111,8 @@ class AdversarialSynthesizer(Transform):
         seed, eta = (getattr(self.pool, name)[drawn].to(env.device) for name in ("seed", "eta"))
         begins = not len(self._planned_at)
         whole = begins or len(rows) == len(first)
-        fresh = self._method.reset(world.scene if whole else world.scene[rows], seed, eta)
+        given = {"template": self.pool.template[drawn].to(env.device)} if self._method.follows_template else {}
+        fresh = self._method.reset(world.scene if whole else world.scene[rows], seed, eta, **given)
         self._state = fresh if whole else put_rows(self._state, rows, fresh)
         if begins:
             self._plan, self._planned_at = self._empty_plan(), torch.zeros_like(world.step)

@@ -8,6 +8,7 @@ from e2rl.errors import InputError
 from e2rl.learning.build import build_evolution, build_logger, run_imitation
 from e2rl.learning.checkpoint import load_checkpoint, save_checkpoint
 from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
+from e2rl.learning.curriculum.bandit import BanditCurriculum
 from e2rl.learning.curriculum.constant import ConstantCurriculum
 from e2rl.learning.curriculum.linear import LinearCurriculum
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
@@ -16,6 +17,8 @@ from e2rl.learning.policy import PolicyImprovement
 from tests.learning.small import Ambush, brake_check, small_scenes
 
 CURRICULA = {"adaptive": AdaptiveCurriculum, "linear": LinearCurriculum, "constant": ConstantCurriculum}
+CURRICULA |= {"bandit": BanditCurriculum}
+FULL_ONLY = {"bandit": ["curriculum.templates=[full]"]}  # Ambush knows no templates
 POLICY = ["ego.hidden=[16]", "learner.imitation.batch=2", "learner.imitation.epochs=1"]
 POLICY += ["learner.ppo.cloning=0.1"]
 POLICY += [f"learner.collect.{setting}" for setting in ("batch=4", "steps=20", "iterations=1")]
@@ -60,7 +63,7 @@ def built(config, folder=None):
 
 @pytest.mark.parametrize("curriculum", CURRICULA)
 def test_policy_learner(curriculum):
-    run = built(config_of(f"curriculum={curriculum}", *POLICY))
+    run = built(config_of(f"curriculum={curriculum}", *FULL_ONLY.get(curriculum, []), *POLICY))
     assert isinstance(run.improve, PolicyImprovement) and type(run.curriculum) is CURRICULA[curriculum]
     assert run.run_round()["train/expert_pairs"] > 0
 
@@ -99,6 +102,13 @@ def test_a_curriculum_of_ones_own_is_built_and_resumed(tmp_path):
     assert load_checkpoint(tmp_path, again) == 1
     assert again.curriculum.eta == run.curriculum.eta == 0.5
     assert again.run_round()["curriculum/eta"] == 0.5
+
+
+def test_templates_for_traffic_without_any_are_refused_at_the_start():
+    for name in ("nominal", "idm", "replay"):
+        config = config_of("curriculum=bandit", f"synthesizer={name}", *POLICY)
+        with pytest.raises(InputError, match=rf"curriculum: .*single.*synthesizer={name} has none; set .*\[full\]"):
+            built(config)
 
 
 def test_imitation_stage(tmp_path):

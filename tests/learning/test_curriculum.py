@@ -8,6 +8,7 @@ from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
 from e2rl.learning.curriculum.constant import ConstantCurriculum
 from e2rl.learning.curriculum.linear import LinearCurriculum
 from e2rl.learning.curriculum.scheduler import ranks
+from e2rl.traffic.template import FULL
 
 
 def scheduler(kind=AdaptiveCurriculum, num_scenes=6, rounds=10, **settings):
@@ -139,6 +140,15 @@ def test_state_goes_on_exactly():
     assert torch.equal(first.priority(), second.priority())
     with pytest.raises(InputError, match="holds 6 scenes, the data 5"):
         scheduler(num_scenes=5).load_state_dict(first.state_dict())
+
+
+@pytest.mark.parametrize("kind", [AdaptiveCurriculum, LinearCurriculum, ConstantCurriculum])
+def test_schedules_of_intensity_alone_leave_the_template_full(kind):
+    one, other = scheduler(kind), scheduler(kind)
+    etas, templates = one.choices(torch.arange(6))
+    assert torch.equal(etas, other.etas(torch.arange(6))) and templates.tolist() == [FULL] * 6
+    assert one.templates == ("full",) and one.values() == {}
+    assert one.level(torch.tensor([0.6, 1.2, 3.0])).tolist() == [0.5, 1.0, 3.0]
 
 
 @pytest.mark.parametrize("kind", [AdaptiveCurriculum, LinearCurriculum, ConstantCurriculum])

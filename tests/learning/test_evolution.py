@@ -9,11 +9,13 @@ from e2rl.ego.idm import IDMEgo
 from e2rl.ego.lane_graph import LaneGraphEgo
 from e2rl.errors import InputError
 from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
+from e2rl.learning.curriculum.bandit import BanditCurriculum
 from e2rl.learning.evolution import Evolution, RoundSettings
 from e2rl.learning.logging import GROUPS
 from e2rl.learning.planner import PlannerImprovement
 from e2rl.learning.policy import PolicyImprovement
 from e2rl.sim.env import SimSettings
+from e2rl.traffic.template import CHAIN, FULL, PAIR
 from e2rl.traffic.traffic import keep_velocity
 from tests.learning.small import Ambush, brake_check, small_run, small_scenes
 
@@ -33,6 +35,32 @@ def test_a_round_improves_moves_on_and_reports():
     assert all(isinstance(value, float) for value in metrics.values())
     run.run_round()
     assert asked[2][2] != asked[0][2], "another round, another seed"
+
+
+def test_templates_are_given_to_the_attack_only_where_one_is_not_full():
+    run = small_run(nominal="prior")
+    attack, asked = run.synthesize, []
+    run.synthesize = lambda ego, index, eta, seed, *limits: asked.append(limits) or attack(ego, index, eta, seed)
+    run.run_round()
+    run.curriculum = BanditCurriculum(4, 4, etas=[0.5, 2.0], templates=["pair", "chain"])
+    run.curriculum.round = 1
+    run.run_round()
+    assert asked[:2] == [(), ()] and asked[3] == (), "the nominal traffic has none"
+    assert set(asked[2][0].tolist()) <= {PAIR, CHAIN}
+    newest = run.memory.rounds[-1].traffic["template"].tolist()
+    assert newest == [*asked[2][0].tolist(), FULL, FULL, FULL]
+    assert run.memory.pool(1.0).template.tolist() == newest + [FULL] * 6
+
+
+@pytest.mark.parametrize("live", [None, Ambush()], ids=["replay", "live"])
+def test_a_round_s_choices_and_their_outcomes_are_counted(live):
+    run = small_run(live=live)
+    metrics = run.run_round()
+    (row,) = run.choices
+    assert (row["round"], row["eta"], row["template"], row["draws"]) == (0, 1.0, "full", 3)
+    own = run.episodes.adversarial
+    assert row["episodes"] == int(own.sum()) > 0 and row["failures"] == int(run.episodes.failed[own].sum())
+    assert row["left_out"] == metrics["synthesizer/left_out"] == 0
 
 
 def test_contacts_of_the_attack_lower_the_intensity():

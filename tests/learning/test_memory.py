@@ -9,16 +9,17 @@ from safetensors import safe_open
 
 from e2rl.errors import InputError
 from e2rl.learning.memory import Memory
+from e2rl.traffic.template import CHAIN, FULL, PAIR, SINGLE
 from tests.learning.small import brake_check, small_run, small_scenes
 
 STATUS = Path("/proc/self/status")
 
 
-def traffic(number, rows=4, eta=2.0):
+def traffic(number, rows=4, eta=2.0, template=FULL):
     index = torch.arange(rows)
     made = brake_check(small_scenes(rows))(None, index, eta, 0)
     made["states"] = made["states"] + number
-    return {**made, "eta": torch.full((rows,), eta)}
+    return {**made, "eta": torch.full((rows,), eta), "template": torch.full((rows,), template)}
 
 
 def filled(folder, bound, rounds=5):
@@ -50,10 +51,22 @@ def test_the_pool_holds_every_round_the_newest_first_and_heavier(tmp_path):
     assert torch.equal(states, expected)
 
 
+def test_remembered_rows_keep_their_intensity_and_template(tmp_path):
+    memory = Memory(tmp_path, 100)
+    for number, template in enumerate((SINGLE, CHAIN, PAIR)):
+        memory.write(number, traffic(number, eta=1.0 + number, template=template))
+        memory.take(number)
+    index = memory.index()
+    memory.restore(index)
+    pool = memory.pool(3.0)
+    assert pool.template.tolist() == [PAIR] * 4 + [CHAIN] * 4 + [SINGLE] * 4
+    assert pool.eta.tolist() == [3.0] * 4 + [2.0] * 4 + [1.0] * 4
+
+
 def test_files_hold_plain_arrays(tmp_path):
     path = filled(tmp_path, 100, rounds=1).path(0)
     with safe_open(path, "pt") as file:
-        assert {"states", "valid", "adversaries", "eta", "scene_index"} <= set(file.keys())
+        assert {"states", "valid", "adversaries", "eta", "template", "scene_index"} <= set(file.keys())
     with path.open("rb") as file, pytest.raises(pickle.UnpicklingError):
         pickle.load(file)
     assert not list(tmp_path.rglob("*.part"))
@@ -70,6 +83,7 @@ def test_only_the_rows_drawn_are_read(tmp_path):
     rows = 256
     states = torch.zeros(rows, 64, 256, 4)
     few = {"adversaries": torch.zeros(rows, 256, dtype=torch.bool), "eta": torch.ones(rows)}
+    few |= {"template": torch.full((rows,), FULL)}
     given = {"scene_index": torch.arange(rows), "states": states, "valid": torch.ones(rows, 64, 256).bool(), **few}
     memory = Memory(tmp_path, rows)
     memory.write(0, given)

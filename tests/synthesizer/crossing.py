@@ -52,11 +52,13 @@ def mask(world: World, *vehicles: int) -> torch.Tensor:
     return chosen
 
 
-def skeleton_of(world: World, support: torch.Tensor, feasible: torch.Tensor | None = None, **settings) -> Skeleton:
+def skeleton_of(
+    world: World, support: torch.Tensor, feasible: torch.Tensor | None = None, limits=None, **settings
+) -> Skeleton:
     """The skeleton if everybody keeps its speed and the nearest vehicles act on the ego."""
     chosen = SkeletonSettings(**settings)
     times = chosen.step * torch.arange(1, 11)
     distance = (world.states[:, : support.shape[1], :2] - world.states[:, :1, :2]).norm(dim=-1)
     expected = constant_speed_states(world.scene, world, times)
     feasible = support if feasible is None else feasible
-    return build_skeleton(world.scene, world, support, feasible, chosen, expected, distance)
+    return build_skeleton(world.scene, world, support, feasible, chosen, expected, distance, limits)

@@ -7,8 +7,17 @@ from e2rl.errors import InputError
 from e2rl.synthesizer.anchoring import AnchorSettings, propose
 from e2rl.synthesizer.feasibility import FeasibilitySettings, feasible_vehicles
 from e2rl.synthesizer.interception import InterceptionSettings
-from e2rl.synthesizer.skeleton import NEAREST_FEASIBLE, NOBODY, SUPPORTED, SkeletonSettings, chain_depth, lane_of
+from e2rl.synthesizer.skeleton import (
+    NEAREST_FEASIBLE,
+    NOBODY,
+    SUPPORTED,
+    SkeletonSettings,
+    chain_depth,
+    lane_of,
+    limits_of,
+)
 from e2rl.synthesizer.topology import TopologySettings, topological_candidates
+from e2rl.traffic.template import CHAIN, FULL, PAIR, SINGLE
 from tests.synthesizer.crossing import make_world, mask, skeleton_of
 
 UP = math.pi / 2
@@ -104,6 +113,26 @@ def test_every_link_leads_to_the_ego_and_absent_vehicles_take_no_part():
                 assert len(way) <= 5
             assert len(way) - 1 == result.depth[b, i]
     assert chains > 0
+
+
+def test_causal_templates_limit_each_scene_by_itself():
+    """A scene for each template, all alike: three vehicles in a column and one beside the ego."""
+    world = make_world([EGO, *COLUMN, (12.0, 3.5, 0.0, 10.0)], copies=4)
+    support, settings = mask(world, 1, 2, 3, 4), SkeletonSettings(near=3)
+    limits = limits_of(torch.tensor([SINGLE, PAIR, CHAIN, FULL]), settings)
+    result = skeleton_of(world, support, near=3, limits=limits)
+    assert result.near.sum(1).tolist() == [1, 2, 1, 3]
+    assert not result.far[:2].any() and (result.far.sum(1) <= 1).all()
+    assert torch.equal(result.coalition[:2], result.near[:2]) and (result.target[:3] == 0).sum(1).tolist() == [1, 2, 1]
+    alone = skeleton_of(world, support, near=3)
+    assert all(torch.equal(getattr(result, name)[3], getattr(alone, name)[3]) for name in vars(alone))
+
+
+def test_the_template_chain_finds_the_column_and_single_does_not():
+    world = make_world([EGO, *COLUMN], copies=2)
+    limits = limits_of(torch.tensor([CHAIN, SINGLE]), SkeletonSettings(far=0))
+    result = skeleton_of(world, mask(world, 1, 2, 3), near=3, far=0, limits=limits)
+    assert result.target[:, :4].tolist() == [[-1, 0, 1, 2], [-1, 0, -1, -1]]
 
 
 def test_bad_settings_are_refused():

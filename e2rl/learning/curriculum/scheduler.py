@@ -1,4 +1,4 @@
-"""The extension point for curricula: the intensity and share of adversarial episodes, and the priorities of scenes.
+"""The extension point for curricula: intensity, causal template, share of adversarial episodes, priorities of scenes.
 
 Scenes are prioritised as in prioritised level replay (Jiang et al. 2021): by the rank of a regret estimate, mixed with
 staleness. The regret of a scene is the best return in any traffic minus the recent return in adversarial traffic. It
@@ -12,16 +12,25 @@ import torch
 from torch import Tensor
 
 from e2rl.errors import InputError
+from e2rl.learning.curriculum.outcomes import Outcomes
 from e2rl.settings import check_range
+from e2rl.traffic.template import FULL, TEMPLATES
+
+BIN = 0.5  # intensities are counted under multiples of it
 
 
 class CurriculumScheduler(ABC):
-    """State over S scenes. Per round: `draw` scenes and their `etas`, read `share`, `update` with outcomes, `advance`.
+    """State over S scenes. Per round: `draw` scenes and `choices` for them, read `share`, `update` with episodes,
+    `observe` what became of the attacks, `advance`.
 
     A schedule is a subclass with the properties `eta` and `share`, and a YAML file in conf/curriculum with its
-    `_target_` and settings; `etas` where the scenes of a round differ in intensity. State of its own between rounds
-    belongs in `extra_state`.
+    `_target_` and settings; `etas` where the scenes of a round differ in intensity, `choices` and `templates` where
+    they differ in causal template as well. State of its own between rounds belongs in `extra_state`.
+
+    templates: the causal templates that it may choose (e2rl/traffic/template.py).
     """
+
+    templates: tuple[str, ...] = (TEMPLATES[FULL],)
 
     def __init__(
         self,
@@ -60,6 +69,11 @@ class CurriculumScheduler(ABC):
     def etas(self, scenes: Tensor) -> Tensor:
         """Intensities [S] for this round's scenes [S]; by default `eta` for all."""
         return torch.full((len(scenes),), float(self.eta))
+
+    def choices(self, scenes: Tensor) -> tuple[Tensor, Tensor]:
+        """Intensities [S] and causal templates [S] int64 for this round's scenes [S]; by default `etas`, full for
+        all."""
+        return self.etas(scenes), torch.full((len(scenes),), FULL)
 
     def around(self, count: int, spread: float, low: float = 0.0, high: float = float("inf")) -> Tensor:
         """Intensities [count] drawn uniformly from [eta - spread, eta + spread], cut at `low` and `high`."""
@@ -109,6 +123,17 @@ class CurriculumScheduler(ABC):
         before = self._recent[scenes]
         moved = before + self.smoothing * (mean - before)
         self._recent[scenes] = torch.where(before.isnan(), mean, moved)
+
+    def observe(self, outcomes: Outcomes) -> None:  # noqa: B027
+        """Learn from what became of the round's attacks; by default nothing."""
+
+    def level(self, eta: Tensor) -> Tensor:
+        """The intensities [S] under which those of attacks [S] are counted in curriculum.csv: multiples of BIN."""
+        return (eta / BIN).round() * BIN
+
+    def values(self) -> dict[tuple[float, str], float]:
+        """What is expected to be learned from attacks by (eta, template), where the schedule estimates it."""
+        return {}
 
     def leave_out(self, scene_index: Tensor) -> None:
         """Mark scenes whose adversarial traffic was left out because no driver survives it. They count as solved until

@@ -1,0 +1,122 @@
+"""The bandit draws what the policy fails in neither never nor always, and follows it as the policy hardens."""
+
+import pytest
+import torch
+
+from e2rl.errors import InputError
+from e2rl.learning.curriculum.bandit import BanditCurriculum
+from e2rl.learning.curriculum.outcomes import Outcomes, outcomes_of, tally
+from e2rl.traffic.template import FULL, PAIR, SINGLE, TEMPLATES
+
+ETAS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
+
+
+def told(curriculum, eta, template, rate, attacks=20, left_out=0):
+    """Attacks of one arm, each driven 10 times, that fail at a rate; `left_out` of them did not enter D'."""
+    gone = torch.arange(attacks) < left_out
+    episodes = torch.full((attacks,), 10).masked_fill(gone, 0)
+    arm = torch.full((attacks,), eta), torch.full((attacks,), template)
+    curriculum.observe(Outcomes(*arm, gone, episodes, (rate * episodes).long()))
+
+
+def probability(curriculum, eta, template):
+    names = list(curriculum.values())
+    return curriculum.probability()[names.index((eta, TEMPLATES[template]))].item()
+
+
+def test_arms_that_never_or_always_fail_are_drawn_less_than_those_in_between():
+    curriculum = BanditCurriculum(6, 10, etas=[1.0, 2.0, 3.0], templates=["single"], forgetting=0.0)
+    for eta, rate in ((1.0, 0.0), (2.0, 0.5), (3.0, 1.0)):
+        told(curriculum, eta, SINGLE, rate)
+    etas, _ = curriculum.choices(torch.zeros(4000, dtype=torch.int64))
+    never, half, always = ((etas == eta).float().mean().item() for eta in (1.0, 2.0, 3.0))
+    assert half > 0.8 and never == pytest.approx(always, abs=0.02) and never > 0.02
+    for eta, share in ((1.0, never), (2.0, half), (3.0, always)):
+        assert share == pytest.approx(probability(curriculum, eta, SINGLE), abs=0.03), "drawn as stated"
+
+
+def test_failures_that_nobody_prevents_teach_nothing():
+    curriculum = BanditCurriculum(6, 10, etas=[1.0, 2.0], templates=["full"], forgetting=0.0)
+    told(curriculum, 1.0, FULL, 0.5)
+    told(curriculum, 2.0, FULL, 0.5, attacks=40, left_out=20)
+    value = curriculum.values()
+    assert value[2.0, "full"] == pytest.approx(value[1.0, "full"] * (21 / 41), rel=1e-6)
+
+
+def test_the_value_is_the_expected_learnability_under_the_posterior():
+    curriculum = BanditCurriculum(6, 10, etas=[1.0], templates=["pair"], forgetting=0.0)
+    told(curriculum, 1.0, PAIR, 0.3)
+    posterior = torch.distributions.Beta(torch.tensor(7.0), torch.tensor(15.0))
+    torch.manual_seed(0)
+    p = posterior.sample((200_000,))
+    assert curriculum.values()[1.0, "pair"] == pytest.approx((p * (1 - p)).mean().item(), abs=1e-3)
+
+
+def test_what_is_not_drawn_any_more_is_forgotten_and_tried_again():
+    curriculum = BanditCurriculum(6, 10, etas=[1.0, 2.0], templates=["single"], forgetting=0.3)
+    fresh = curriculum.values()[1.0, "single"]
+    told(curriculum, 1.0, SINGLE, 0.0)
+    known = curriculum.values()[1.0, "single"]
+    for _ in range(10):
+        told(curriculum, 2.0, SINGLE, 0.5)
+    assert known < 0.3 * fresh and curriculum.values()[1.0, "single"] > 0.8 * fresh
+
+
+def test_as_the_policy_hardens_the_intensity_rises():
+    """A policy that fails at eta above its skill: the draws follow, past eta 2, without a schedule."""
+    torch.manual_seed(0)
+    curriculum, drawn, within = BanditCurriculum(64, 30), [], []
+    for number in range(30):
+        skill = 0.5 + 2.3 * number / 29
+        eta, template = curriculum.choices(curriculum.draw(64))
+        rate = torch.sigmoid(4 * (eta + torch.tensor([-0.4, -0.1, -0.3, 0.0])[template] - skill))
+        episodes = torch.full((64,), 10)
+        failures = torch.distributions.Binomial(10, rate).sample().long()
+        curriculum.observe(Outcomes(eta, template, torch.zeros(64, dtype=torch.bool), episodes, failures))
+        curriculum.advance()
+        drawn.append(eta.mean().item()), within.append(((rate > 0.15) & (rate < 0.85)).float().mean().item())
+    assert sum(drawn[3:8]) / 5 < 1.5 and min(drawn[-3:]) >= 2.0
+    assert sum(within[5:]) / 25 > 1.5 * within[0], "the first round draws all arms alike"
+
+
+def test_state_goes_on_exactly():
+    first, second = BanditCurriculum(6, 10, seed=1), BanditCurriculum(6, 10, seed=2)
+    for rate in (0.2, 0.6):
+        first.choices(first.draw(4))
+        told(first, 1.0, PAIR, rate)
+        first.advance(0.1)
+    second.load_state_dict(first.state_dict())
+    scenes = torch.arange(6)
+    for ours, theirs in zip(first.choices(scenes), second.choices(scenes), strict=True):
+        assert torch.equal(ours, theirs)
+    assert first.eta == second.eta and first.values() == second.values()
+
+
+def test_wrong_settings_are_refused():
+    wrong = ({"etas": []}, {"etas": [0.0, 1.0]}, {"templates": []}, {"templates": ["trio"]}, {"exploration": 2.0})
+    for settings in (*wrong, {"forgetting": -0.1}, {"share": 1.5}, {"sharpness": -1.0}, {"num_scenes": 0}):
+        with pytest.raises(InputError, match="curriculum"):
+            BanditCurriculum(**{"num_scenes": 6, "rounds": 10} | settings)
+
+
+def test_episodes_count_for_the_attack_whose_row_they_drove():
+    """Attacks 0 and 2 of three entered D'; rows beyond them are nominal or remembered."""
+    eta, template = torch.tensor([1.0, 2.0, 2.0]), torch.tensor([SINGLE, PAIR, PAIR])
+    row, failed = torch.tensor([0, 0, 1, 2, 5, 1]), torch.tensor([True, False, True, True, True, True])
+    outcomes = outcomes_of(eta, template, torch.tensor([0, 2]), row, failed)
+    assert outcomes.left_out.tolist() == [False, True, False]
+    assert outcomes.episodes.tolist() == [2, 0, 2] and outcomes.failures.tolist() == [1, 0, 2]
+    assert outcomes.failure_rate.nan_to_num(-1).tolist() == [0.5, -1.0, 1.0]
+
+
+def test_the_table_counts_draws_episodes_and_failures_by_arm():
+    eta, template = torch.tensor([1.0, 2.0, 2.0]), torch.tensor([SINGLE, PAIR, PAIR])
+    flags = torch.tensor([False, True, False])
+    outcomes = Outcomes(eta, template, flags, torch.tensor([2, 0, 2]), torch.tensor([1, 0, 2]))
+    rows = tally(4, eta, outcomes, {(0.5, "full"): 0.2, (1.0, "single"): 0.1})
+    plain = [tuple(-1 if value != value else value for value in row.values()) for row in rows]
+    assert plain == [
+        (4, 1.0, "single", 1, 0, 2, 1, 0.5, 0.1),
+        (4, 2.0, "pair", 2, 1, 2, 2, 1.0, -1),
+        (4, 0.5, "full", 0, 0, 0, 0, -1, 0.2),
+    ]

@@ -1,0 +1,48 @@
+"""The heat map of a curriculum's choices: what stands in its cells, and where it comes from."""
+
+import math
+
+import numpy as np
+import pytest
+
+from e2rl.errors import InputError
+from e2rl.learning.curriculum.outcomes import COLUMNS
+from e2rl.learning.logging import CHOICES, RunLogger, write_choices
+from e2rl.report.curriculum import PICTURE, choice_map, draw_choices, grids
+
+NAN = math.nan
+
+
+def row(number, eta, template, draws, episodes=0, failures=0):
+    rate = failures / episodes if episodes else NAN
+    return dict(zip(COLUMNS, (number, eta, template, draws, 0, episodes, failures, rate, NAN), strict=True))
+
+
+ROWS = [row(0, 1.0, "pair", 3, 4, 1), row(0, 0.5, "full", 1), row(1, 2.0, "single", 2, 5, 5), row(1, 1.0, "pair", 0)]
+
+
+def test_cells_are_shares_of_a_round_s_draws_and_of_failed_episodes():
+    rounds, arms, share, rate = grids(ROWS)
+    assert rounds == [0, 1] and arms == [("single", 2.0), ("pair", 1.0), ("full", 0.5)]
+    np.testing.assert_array_equal(share, [[NAN, 1.0], [0.75, NAN], [0.25, NAN]])
+    np.testing.assert_array_equal(rate, [[NAN, 1.0], [0.25, NAN], [NAN, NAN]])
+
+
+def test_the_picture_is_drawn_from_the_file_of_a_run(tmp_path):
+    draw_choices(tmp_path)
+    assert not list(tmp_path.iterdir()), "nothing was logged"
+    logger = RunLogger("csv", tmp_path)
+    for number in (0, 1, 1):  # the last round twice, as a resumed run may
+        logger.log({}, number, [each for each in ROWS if each["round"] == number])
+    lines = (tmp_path / CHOICES).read_text().splitlines()
+    assert lines[0] == ",".join(COLUMNS) and len(lines) == 5 and lines[1].startswith("0,1.0,pair,3,0,4,1,0.25,")
+    draw_choices(tmp_path)
+    assert (tmp_path / PICTURE).stat().st_size > 5000
+    assert choice_map(ROWS * 40).size == choice_map(ROWS).size
+
+
+def test_a_file_of_another_kind_is_named(tmp_path):
+    write_choices(tmp_path / CHOICES, ROWS)
+    (tmp_path / CHOICES).write_text("round,eta\n0,1\n")
+    with pytest.raises(InputError, match=r"curriculum\.csv: no table of a curriculum's choices"):
+        draw_choices(tmp_path)
