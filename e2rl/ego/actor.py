@@ -13,6 +13,7 @@ from e2rl.sim import dynamics
 from e2rl.sim.mission import mission_of
 from e2rl.sim.observation import EgoState, observation_config, observe
 from e2rl.sim.static import FrenetPose, static_scene
+from e2rl.sim.trajectories import Agents
 from e2rl.sim.world import World
 
 HOLD = 5  # steps for which a planned action is held: 10 network evaluations per plan
@@ -50,7 +51,7 @@ class ActorEgo(Ego):
 
         Vehicles follow their plans where these are known; all other agents keep their velocity.
         """
-        static, others = static_scene(world.scene, mission_of(world.scene)), expected_states(world)[:, 1:]
+        static, expected = static_scene(world.scene, mission_of(world.scene)), expected_states(world)
         config, horizon = observation_config(world.states.device), world.scene["logged"].shape[1] - 1
         state, present = world.states[:, 0], world.valid[:, 0]
         assert world.yaw_rate is not None
@@ -59,14 +60,23 @@ class ActorEgo(Ego):
         for done in range(0, PLAN_STEPS, HOLD):
             pose = FrenetPose(*(value[:, 0] for value in project(state[:, None, :2], static.mission.points)))
             ego = EgoState(world.step + done, state, action, pose, present, present, pose.s)
-            accel = world.accel[:, 1:] if done == 0 else others[:, :, done - 1 : done + 1, 3].diff(dim=-1)[..., 0] / DT
-            seen = observe(config, static, ego, (others[:, :, done], world.valid[:, 1:], accel), horizon)
+            seen = observe(config, static, ego, others_at(world, expected, done), horizon)
             action = self.network.network.deterministic(seen.features)
             driven = dynamics.rollout(state, action[:, None].expand(-1, HOLD, -1))
             last_two = torch.cat([state[:, None], driven], 1)[:, -2:]
             state, action = driven[:, -1], dynamics.inverse(last_two)[:, 0]
             pieces.append(driven)
         return torch.cat(pieces, 1)
+
+
+def others_at(world: World, expected: Tensor, step: int) -> Agents:
+    """All agents but the ego `step` steps from now, by their expected states [B, N, PLAN_STEPS + 1, 4]."""
+    present, states = world.valid[:, 1:], expected[:, 1:, step]
+    if step == 0:
+        assert world.turn_rate is not None
+        return Agents(states, present, world.accel[:, 1:], world.turn_rate[:, 1:])
+    change = states - expected[:, 1:, step - 1]
+    return Agents(states, present, change[..., 3] / DT, dynamics.wrap(change[..., 2]) / DT)
 
 
 def expected_states(world: World) -> Tensor:

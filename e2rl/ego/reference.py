@@ -8,12 +8,13 @@ import torch
 from torch import Tensor
 
 from e2rl.sim.car_following import IDMParameters, idm_acceleration
-from e2rl.sim.observation import FAR, LOOK_AHEAD, NEAR, NEAREST, PROBE_X, PROBE_Y, SPEED
+from e2rl.sim.observation import FAR, LOOK_AHEAD, NEAR, NEAREST, PER_AGENT, PROBE_X, PROBE_Y, SPEED
 
 EGO, LAST_ACTION = slice(0, 11), (1, 2)
 ROUTE = slice(11, 11 + 5 * len(LOOK_AHEAD))
 LIGHTS = slice(ROUTE.stop, ROUTE.stop + 8)
-AGENTS = slice(LIGHTS.stop + len(PROBE_X) * len(PROBE_Y), LIGHTS.stop + len(PROBE_X) * len(PROBE_Y) + 15 * NEAREST)
+PROBED = LIGHTS.stop + len(PROBE_X) * len(PROBE_Y)
+AGENTS = slice(PROBED, PROBED + PER_AGENT * NEAREST)
 
 DESIRED_SPEED = 12.0  # m/s without a known limit
 PURSUIT_TIME, PURSUIT_MIN, PURSUIT_MAX = 1.5, 6.0, 30.0  # s, m, m: look-ahead of the pursuit
@@ -89,7 +90,7 @@ def _leaders(observation: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor]
     and stop lines."""
     ego = observation[..., EGO]
     half_length, half_width = 2.5 * ego[..., 8, None], ego[..., 9, None]
-    agents = observation[..., AGENTS].unflatten(-1, (NEAREST, 15))
+    agents = observation[..., AGENTS].unflatten(-1, (NEAREST, PER_AGENT))
     position = torch.stack([agents[..., 1] * FAR, agents[..., 2] * NEAR], -1)
     along, apart, direction = _on_path(position, path)
     cos, sin = agents[..., 3], agents[..., 4]

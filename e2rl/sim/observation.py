@@ -23,7 +23,7 @@ LOOK_AHEAD = (2.0, 4.0, 7.0, 10.0, 14.0, 19.0, 25.0, 32.0, 40.0, 50.0, 62.0, 75.
 PROBE_X, PROBE_Y = (-3.0, 0.0, 5.0, 11.0, 20.0), (-5.0, -2.5, 0.0, 2.5, 5.0)  # m in the ego's frame
 CENTRE = PROBE_X.index(0.0) * len(PROBE_Y) + PROBE_Y.index(0.0)  # the probe at the ego itself
 NEAREST = 12  # agents
-SPEED, FAR, NEAR = 15.0, 40.0, 10.0  # scales: m/s, m, m
+SPEED, FAR, NEAR, TURNING = 15.0, 40.0, 10.0, 0.5  # scales: m/s, m, m, rad/s
 PER_AGENT = 16  # numbers
 LOOKED_AT = 6  # of them, whose motion manoeuvres are held against
 COLUMNS = (2, 2, 2, 1, 1, 1, 1, 1, 1)  # of the table `nearest`
@@ -49,7 +49,7 @@ class EgoState(NamedTuple):
 
 class ObservationConfig(NamedTuple):
     """The constants of the observation as tensors: arc lengths ahead [13] m, the last one 0; probes [25, 2] m; scales
-    of a route point [2] and of an agent's features [12, 1]; light colours [3]."""
+    of a route point [2] and of an agent's features [11, 1]; light colours [3]."""
 
     ahead: Tensor
     probes: Tensor
@@ -76,7 +76,7 @@ def observation_config(device: torch.device) -> ObservationConfig:
     def numbers(*values: float) -> Tensor:
         return torch.tensor(values, device=device)
 
-    scales = numbers(FAR, NEAR, 1.0, 1.0, SPEED, SPEED, SPEED, 4.0, 0.5, 2.5, 1.0, 1.0)[:, None]
+    scales = numbers(FAR, NEAR, 1.0, 1.0, SPEED, SPEED, SPEED, 4.0, 2.5, 1.0, 1.0)[:, None]
     probes = torch.cartesian_prod(numbers(*PROBE_X), numbers(*PROBE_Y))
     return ObservationConfig(numbers(*LOOK_AHEAD, 0.0), probes, numbers(FAR, NEAR), scales, numbers(1, 2, 3))
 
@@ -155,15 +155,15 @@ def nearest(static: StaticScene, others: Neighbours) -> Tensor:
 
 def agent_features(config: ObservationConfig, ego: EgoState, near: Tensor) -> Tensor:
     """[B, 12 * PER_AGENT] of the table `nearest`: presence, relative pose (4) and velocity (2), speed, acceleration,
-    turn rate, size (2), whether it is a vehicle, gap, and time and distance of the closest approach at constant
-    velocities; absent agents are zeros."""
+    size (2), whether it is a vehicle, gap, time and distance of the closest approach at constant velocities, and turn
+    rate; absent agents are zeros."""
     local, direction, half, gap, speed, accel, turn_rate, vehicle, present = near.split(COLUMNS, 1)
     velocity = speed * direction - torch.nn.functional.pad(ego.state[:, 3:, None], (0, 0, 0, 1))
     time = (-(local * velocity).sum(1, True) / (velocity.square().sum(1, True) + 1e-3)).clamp(0, 8)
     miss = (local + velocity * time).norm(dim=1, keepdim=True)
-    scaled = torch.cat([local, direction, velocity, speed, accel, turn_rate, half, vehicle], 1) / config.agent
-    decay = torch.cat([-time / 2, -miss / 5], 1).exp()
-    features = torch.cat([present, scaled.clamp(-5, 5), (gap / NEAR).clamp(-1, 2), decay], 1) * present
+    scaled = torch.cat([local, direction, velocity, speed, accel, half, vehicle], 1) / config.agent
+    decay, turning = torch.cat([-time / 2, -miss / 5], 1).exp(), (turn_rate / TURNING).clamp(-5, 5)
+    features = torch.cat([present, scaled.clamp(-5, 5), (gap / NEAR).clamp(-1, 2), decay, turning], 1) * present
     features = features.transpose(1, 2).flatten(1)
     return torch.nn.functional.pad(features, (0, PER_AGENT * (NEAREST - near.shape[2])))
 
