@@ -65,26 +65,40 @@ def _near_pairs(points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Te
     """Pairs (scene, vehicle, agent, index of the nearest vertex; each [Q]) of present agents xy [B, M, 2] within room
     [B, V, M] m of the vehicle's route and not behind it. A route continues straight beyond its last vertex."""
     vehicles, count = points.shape[1:3]
-    both = present[:, :vehicles, None] & present[:, None]
-    itself = torch.eye(vehicles, xy.shape[1], dtype=torch.bool, device=s.device)
-    b, v, m = (both & ~itself).nonzero(as_tuple=True)
-    starts = torch.arange(0, count - 1, STRETCH, device=s.device)
-    vertices = (starts[:, None] + torch.arange(STRETCH + 1, device=s.device)).clamp(max=count - 1)
-    stretches = points[:, :, vertices]  # [B, V, C, STRETCH + 1, 2]
-    low, high = stretches.amin(3), stretches.amax(3)
-    position, far = xy[b, m], room[b, v, m] + SPACING / 2
-    outside = torch.maximum(low[b, v] - position[:, None], position[:, None] - high[b, v]).clamp(min=0)  # [Q, C, 2]
-    near = outside.square().sum(-1) < far.square()[:, None]
+    far = room + SPACING / 2
+    stretches = _stretches(points)  # [B, V, C, 2, STRETCH + 1]
+    low, high = torch.aminmax(stretches, dim=-1)
+    squared = torch.zeros_like(room)[..., None]
+    for axis in range(2):
+        at = xy[:, None, :, None, axis]
+        beside = torch.maximum(low[:, :, None, :, axis] - at, at - high[:, :, None, :, axis]).clamp_(min=0)
+        squared = torch.addcmul(squared, beside, beside)
+    near = squared < far.square()[..., None]  # [B, V, M, C]
     tip = points[:, :, -1] - points[:, :, -2]
     tip = tip / tip.norm(dim=-1, keepdim=True).clamp(min=1e-6)
-    past, unit = position - points[b, v, -1], tip[b, v]
-    beyond = ((past * unit).sum(-1) > 0) & ((past[:, 1] * unit[:, 0] - past[:, 0] * unit[:, 1]).abs() < far)
-    near[:, -1] |= beyond
-    ahead = (near & (SPACING * vertices[:, -1] >= s[b, v][:, None] - SPACING)).any(-1) | beyond
-    b, v, m, position, near = b[ahead], v[ahead], m[ahead], position[ahead], near[ahead]
+    past, unit = xy[:, None] - points[:, :, None, -1], tip[:, :, None]
+    aside = past[..., 1] * unit[..., 0] - past[..., 0] * unit[..., 1]
+    beyond = ((past * unit).sum(-1) > 0) & (aside.abs() < far)
+    near[..., -1] |= beyond
+    ends = SPACING * (STRETCH * torch.arange(1, near.shape[-1] + 1, device=s.device)).clamp(max=count - 1)
+    to_come = (ends >= s[..., None] - SPACING)[:, :, None]
+    itself = torch.eye(vehicles, xy.shape[1], dtype=torch.bool, device=s.device)
+    counts = present[:, :vehicles, None] & present[:, None] & ~itself
+    counts = counts & ((near & to_come).any(-1) | beyond)
+    b, v, m = counts.nonzero(as_tuple=True)
+    near = near[counts]
     pair, stretch = near.nonzero(as_tuple=True)
-    squared = (stretches[b[pair], v[pair], stretch] - position[pair][:, None]).square().sum(-1)
-    nearest, within = squared.min(-1)
+    gap = stretches[b[pair], v[pair], stretch] - xy[b, m][pair][..., None]
+    nearest, within = gap.square().sum(1).min(-1)
     table = nearest.new_full(near.shape, torch.inf).index_put((pair, stretch), nearest)
-    vertex = torch.zeros_like(table, dtype=torch.long).index_put((pair, stretch), vertices[stretch, 0] + within)
+    vertex = torch.zeros_like(table, dtype=torch.long).index_put((pair, stretch), STRETCH * stretch + within)
     return b, v, m, vertex.gather(1, table.argmin(1, keepdim=True))[:, 0].clamp(max=count - 1)
+
+
+def _stretches(points: Tensor) -> Tensor:
+    """Stretches [B, V, C, 2, STRETCH + 1] of routes points [B, V, P, 2]; each begins with the last vertex of the one
+    before, and the last one is filled up with the route's end."""
+    missing = -(points.shape[2] - 1) % STRETCH
+    if missing:
+        points = torch.cat([points, points[:, :, -1:].expand(-1, -1, missing, -1)], 2)
+    return points.unfold(2, STRETCH + 1, STRETCH)
