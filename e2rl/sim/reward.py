@@ -7,7 +7,7 @@ from torch import Tensor
 
 from e2rl.errors import InputError
 
-DEFAULT_WEIGHTS = {"progress": 0.03, "contact": -20.0, "off_road": -5.0, "comfort": -0.08, "speeding": -0.1}
+DEFAULT_WEIGHTS = {"progress": 0.05, "contact": -20.0, "off_road": -5.0, "comfort": -0.08, "speeding": -0.1}
 DEFAULT_WEIGHTS["lane_offset"] = -0.02
 TERMS = tuple(DEFAULT_WEIGHTS)
 LEAST_TOP_SPEED = 5.0  # m/s: progress at this speed is rewarded even where the recorded ego stands
