@@ -19,6 +19,7 @@ OFFSETS = (-2.5, 0.0, 2.5)  # m to the left of the mission
 TIMES = (0.5, 1.0, 1.5, 2.0, 2.6, 3.2)  # s at which gaps are looked at
 MOVED_OVER = 1.5  # s until the offset is reached
 WIDEST, TIGHT = 3.0, 0.2  # m: larger gaps are alike; a gap that counts as none
+SHORTEST = 0.05  # m, half of a capsule's axis at least
 PROSPECTS = 2 * len(ACCELERATIONS) * len(OFFSETS)
 
 
@@ -95,17 +96,20 @@ def gaps(place: Tensor, along: Tensor, size: Tensor, others: Others) -> Tensor:
     position, direction = (x.flatten(0, 1) for x in later(others, plan.time))  # [B T, 2, K]
     length, width = others.half_size.repeat_interleave(steps, 0).unbind(1)
     shift = (length - width).clamp(min=0)[:, None, None] * plan.ends  # [B T, 1, 3, K]
-    centre = (position[:, :, None] + direction[:, :, None] * shift).flatten(2).transpose(1, 2)  # [B T, 3 K, 2]
+    centre = (position[:, :, None] + direction[:, :, None] * shift).flatten(2)
+    centre = torch.cat([centre, torch.ones_like(centre[:, :1])], 1).transpose(1, 2)  # [B T, 3 K, 3]
+    own = (size / 2).repeat_interleave(steps, 0)[..., None, None]
+    unit = (own[:, 0] - own[:, 1]).clamp(min=SHORTEST)  # half of the capsule's axis: lengths are in this unit below
     place, along = (x.permute(0, 2, 3, 1).flatten(0, 1) for x in (place, along))  # [B T, 2, C]
+    along = along / unit
     across = torch.stack([-along[:, 1], along[:, 0]], 1)
-    ahead, aside = (centre.bmm(axis) - (axis * place).sum(1, True) for axis in (along, across))  # [B T, 3 K, C]
-    half = (size / 2).repeat_interleave(steps, 0)[..., None, None]
-    beyond = ahead.abs_().sub_(half[:, 0] - half[:, 1]).clamp_(min=0)
+    axes = (torch.cat([axis, -(axis * place).sum(1, True)], 1) for axis in (along, across))  # [B T, 3, C]
+    ahead, aside = (centre.bmm(axis) for axis in axes)  # [B T, 3 K, C]
+    beyond = torch.nn.functional.softshrink(ahead, 1.0)
     front, middle, back = aside.square_().addcmul_(beyond, beyond).chunk(3, 1)
-    apart = torch.minimum(torch.minimum(front, middle), back).sqrt_()
-    reach = (half[:, 1] + width[..., None]).masked_fill(
-        ~others.present.repeat_interleave(steps, 0)[..., None], -torch.inf
-    )
+    apart = torch.minimum(torch.minimum(front, middle), back).sqrt_().mul_(unit)
+    absent = ~others.present.repeat_interleave(steps, 0)[..., None]
+    reach = (own[:, 1] + width[..., None]).masked_fill(absent, -torch.inf)
     return apart.sub_(reach).amin(1).unflatten(0, (-1, steps)).transpose(1, 2)
 
 
