@@ -7,16 +7,18 @@ Vectorised over scenes, candidates and agents.
 import torch
 from torch import Tensor
 
-from e2rl.ego.base import Ego
 from e2rl.ego.candidates import Candidates, drive, speed_profiles
 from e2rl.ego.forecast import forecast, nearest
 from e2rl.ego.path import MissionPath
+from e2rl.ego.ranking import RankingEgo
 from e2rl.ego.scoring import Weights, score
 from e2rl.scene.recording import DT
 from e2rl.sim.world import World
 
 STRIDE = 2  # steps between two scored states
 CHUNK = 8  # scenes at a time, to fit the processor's cache
+WIDER = 4  # times as many candidates are ranked as asked for, among which those driven alike are dropped
+ALIKE = 1e-4  # m, rad, m/s and cost below which two candidates are driven alike
 PROFILES = (
     *((-8.0, -8.0), (-8.0, 0.0), (-6.0, -6.0), (-6.0, 0.0), (-6.0, 2.0), (-4.0, -4.0), (-4.0, 0.0)),
     *((-2.5, -2.5), (-2.5, 0.0), (-1.2, -1.2), (-1.2, 0.0)),
@@ -31,7 +33,7 @@ SCENE_KEYS = (
 )  # that it reads
 
 
-class SamplingEgo(Ego):
+class SamplingEgo(RankingEgo):
     """26 speed profiles on 19 lateral moves: 9 shifts beside the mission, swift and calm, and the present one."""
 
     def __init__(
@@ -85,6 +87,24 @@ class SamplingEgo(Ego):
         candidates = self.candidates(world)
         best = self.costs(world, candidates).argmin(1)
         return candidates.states[torch.arange(len(best), device=best.device), best]
+
+    def ranked(self, world: World, count: int) -> tuple[Tensor, Tensor]:
+        """States [B, C, PLAN_STEPS, 4] and costs [B, C] of the cheapest candidates, the cheapest first; of those that
+        are driven alike (caps and bounds make many so) one counts, the others cost inf."""
+        rows = torch.arange(len(world.step), device=world.step.device).split(CHUNK)
+        states, costs = zip(*(self._ranked(take(world, part), count) for part in rows), strict=True)
+        return torch.cat(states), torch.cat(costs)
+
+    def _ranked(self, world: World, count: int) -> tuple[Tensor, Tensor]:
+        candidates = self.candidates(world)
+        every = self.costs(world, candidates)
+        costs, best = every.topk(min(WIDER * count, every.shape[1]), largest=False)
+        row = torch.arange(len(best), device=best.device)[:, None]
+        states = candidates.states[row, best]
+        alike = (states.diff(dim=1).abs().amax((2, 3)) < ALIKE) & (costs.diff(dim=1) < ALIKE)
+        costs = costs.masked_fill(torch.nn.functional.pad(alike, (1, 0)), torch.inf)
+        costs, best = costs.topk(count, largest=False)
+        return states[row, best], costs
 
     def candidates(self, world: World) -> Candidates:
         """Every speed profile on every lateral move."""

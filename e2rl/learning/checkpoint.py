@@ -19,7 +19,7 @@ from e2rl.ego.network import WEIGHTS
 from e2rl.errors import InputError
 from e2rl.learning.evolution import Evolution
 
-STATE, MEMORY, CONFIG, FORMAT = "state.pt", "memory.json", "config.json", "e2rl-checkpoint/3"
+STATE, MEMORY, CONFIG, FORMAT = "state.pt", "memory.json", "config.json", "e2rl-checkpoint/4"
 
 
 def save_checkpoint(folder: Path, run: Evolution, config: dict, keep_last: int = 2) -> Path:

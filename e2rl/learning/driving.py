@@ -10,9 +10,11 @@ from torchrl.envs import TransformedEnv
 from tqdm import tqdm
 
 from e2rl.ego.base import Ego, EgoPolicy
-from e2rl.ego.reference import executed_action
-from e2rl.learning.episodes import Episodes, concatenated
+from e2rl.ego.ranking import RankingEgo, RankingPolicy
+from e2rl.learning.episodes import Episodes, concatenated, decisions
+from e2rl.scene.recording import DT
 from e2rl.scene.scene import SceneSet
+from e2rl.sim.dynamics import wrap
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.transform import AdversarialSynthesizer
@@ -39,20 +41,27 @@ class Disturbed(TensorDictModuleBase):
 class PoolDriver:
     """Environments in which egos drive rows of pools with recorded or stored traffic."""
 
-    def __init__(self, scenes: SceneSet, sim: SimSettings, batch: int, device: str = "cpu") -> None:
-        """batch: number of environments, i.e. of rows driven at once."""
-        self.env = DrivingEnv(scenes, sim, batch, device, agents=True)
+    def __init__(self, scenes: SceneSet, sim: SimSettings, batch: int, device: str = "cpu", hold: int = 1) -> None:
+        """batch: number of environments, i.e. of rows driven at once; hold: steps of a decision."""
+        self.env = DrivingEnv(scenes, sim, batch, device, agents=True, hold=hold)
 
-    def drive(self, ego: Ego, pool: TrafficPool, rows: Tensor, disturb: Disturbance | None = None) -> TensorDict:
-        """One episode in each of pool rows [B]; B is the number of environments.
+    def drive(
+        self, ego: Ego, pool: TrafficPool, rows: Tensor, disturb: Disturbance | None = None, choices: int = 0
+    ) -> TensorDict:
+        """One episode of T decisions in each of pool rows [B]; B is the number of environments.
 
         Returns [B, T]: observation, intended (the ego's action), executed (after disturbance and bounds) [.., 2], alive
-        (the step belongs to the episode), reward, contact, off_road, progress.
+        (the decision belongs to the episode), reward, contact, off_road, progress. With `choices` = C > 0, of a
+        RankingEgo, also choices [.., C, 2] and costs [.., C] as in RankingPolicy.
         """
         transform = AdversarialSynthesizer(pool, lambda count: rows[:count])
         env = TransformedEnv(self.env, transform)
-        policy = Disturbed(EgoPolicy(ego, env), disturb)
-        steps = env.rollout(self.env.horizon, policy, break_when_any_done=False)
+        policy: EgoPolicy = EgoPolicy(ego, env)
+        if isinstance(ego, RankingEgo) and choices > 0:
+            policy = RankingPolicy(ego, env, choices)
+        disturbed = Disturbed(policy, disturb)
+        length = decisions(self.env.horizon, self.env.hold)
+        steps = env.rollout(length, disturbed, break_when_any_done=False)
         after, metrics = steps["next"], steps["next", "metrics"]
         done = after["done"][..., 0].int()
         alive = done.cumsum(1) - done == 0
@@ -60,13 +69,14 @@ class PoolDriver:
         frames = {
             "observation": steps["observation"],
             "intended": steps["intended"],
-            "executed": executed_action(after["observation"]),
+            "executed": executed(steps),
             "alive": alive,
             "reward": after["reward"][..., 0] * alive,
             "off_road": metrics["off_road"][..., 0] & alive,
             "contact": contact & alive,
             "progress": metrics["progress"][..., 0],
         }
+        frames |= {name: steps[name] for name in ("choices", "costs") if isinstance(policy, RankingPolicy)}
         return TensorDict(frames, batch_size=steps.batch_size, device=alive.device)
 
     def drive_all(self, ego: Ego, pool: TrafficPool, label: str = "") -> Episodes:
@@ -77,6 +87,13 @@ class PoolDriver:
             parts.append(episodes_of(self.drive(ego, pool, rows), pool, rows))
         every = concatenated(parts)
         return Episodes(*(getattr(every, name)[: len(pool)] for name in Episodes.__dataclass_fields__))
+
+
+def executed(steps: TensorDictBase) -> Tensor:
+    """Mean accelerations and yaw rates [B, T, 2] (m/s^2, rad/s) of the ego over each decision of a rollout."""
+    now, then = (each["agents", "states"][:, :, 0] for each in (steps, steps["next"]))
+    seconds = (steps["next", "timestep"] - steps["timestep"]).clamp(min=1) * DT
+    return torch.cat([then[..., 3:] - now[..., 3:], wrap(then[..., 2:3] - now[..., 2:3])], -1) / seconds
 
 
 def filled_batches(count: int, batch: int) -> list[Tensor]:

@@ -60,7 +60,8 @@ class Evolution:
     synthesize(ego, scene_index [S], eta [S], seed) -> {scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N],
     adversaries [S, N] bool, contact [S] bool}: closed-loop traffic against that ego; contact: it was hit. Of a
     curriculum that chooses causal templates it also takes template [S].
-    solvable(traffic) -> bool [S]: rows that enter D' (None: all). memory: None: in a temporary folder.
+    solvable(traffic) -> Solved: rows that enter D', and evasions (None: all, and none). memory: None: in a temporary
+    folder.
 
     With `settings.ahead`, scenes, intensities and ego of the next round's D' are fixed just before a round's learning,
     and it is made in another process meanwhile. What the curriculum learns from a round then acts two rounds later.
@@ -104,7 +105,7 @@ class Evolution:
         begin = time.perf_counter()
         learned, self.episodes = self.improve(attack.pool, self.curriculum)
         spent = attack.spent | {"improve": time.perf_counter() - begin}
-        spent |= {name: learned.pop(name) for name in ("collect", "steps_per_second") if name in learned}
+        spent |= {name: learned.pop(name) for name in ("collect", "pairs", "steps_per_second") if name in learned}
         self.curriculum.update(self.episodes.scene_index, self.episodes.returns, self.episodes.adversarial)
         outcomes = outcomes_of(order.eta, order.template, attack.drawn, self.episodes.row, self.episodes.failed)
         self.curriculum.observe(outcomes)

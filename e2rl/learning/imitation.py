@@ -1,4 +1,4 @@
-"""Expert pairs (observation, action) from recordings and planners, and the actor's warm start from them.
+"""Expert pairs (observation, action) from recordings, and the actor's warm start from them.
 
 Recorded pairs come in two kinds. Replayed: the ego follows its log exactly and the action is the inverse unicycle's.
 Disturbed: the ego tracks its log while its actions are perturbed for a second at a time (Laskey et al. 2017), so the
@@ -15,17 +15,16 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.objectives import BCLoss
 from tqdm import tqdm
 
-from e2rl.ego.base import Ego
 from e2rl.ego.network import WEIGHTS, ActorCritic
 from e2rl.ego.replay import ReplayEgo
 from e2rl.errors import InputError
-from e2rl.learning.driving import Disturbance, PoolDriver, episodes_of, filled_batches
-from e2rl.learning.update import clip_expert, take_step
+from e2rl.learning.cloning import cloning_loss, pairs_of
+from e2rl.learning.driving import Disturbance, PoolDriver, filled_batches
+from e2rl.learning.update import take_step
 from e2rl.scene.scene import SceneSet
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import SimSettings
 from e2rl.traffic.pool import TrafficPool
 
 BURST, PAUSE = 10, 20  # steps: duration of a disturbance, and from the start of one to the next
@@ -51,7 +50,7 @@ class ImitationSettings:
 
 
 def recorded_pairs(scenes: SceneSet, sim: SimSettings, settings: ImitationSettings) -> TensorDict:
-    """Pairs [M] (observation, action, scene_index) of every recording, replayed once and disturbed `drives` times.
+    """Pairs [M] with C = 1 (e2rl.learning.cloning) of every recording, replayed once and disturbed `drives` times.
 
     A disturbed episode counts until contact or off the road; actions are clipped to 0.99 of the bounds.
     """
@@ -66,23 +65,8 @@ def recorded_pairs(scenes: SceneSet, sim: SimSettings, settings: ImitationSettin
             (exact, "executed", None) if number == 0 else (free, "intended", _bursts(len(rows), settings, generator))
         )
         frames = driver.drive(ReplayEgo(), pool, rows, disturb)
-        parts.append(_pairs(frames, label, pool.scene_index[rows], driver.env))
-    return torch.cat(parts)
-
-
-def corrective_pairs(driver: PoolDriver, teacher: Ego, pool: TrafficPool) -> TensorDict:
-    """Pairs [M] of the teacher's episodes in the pool's fresh adversarial rows that it survives (Algorithm 1's
-    corrective supervision); empty if it survives none."""
-    adversarial = (pool.adversarial & pool.fresh).nonzero()[:, 0]
-    parts = []
-    for picked in filled_batches(len(adversarial), driver.env.batch_size[0]):
-        rows = adversarial[picked]
-        frames = driver.drive(teacher, pool, rows)
-        survived = ~episodes_of(frames, pool, rows).failed.to(frames.device)
-        frames["alive"] = frames["alive"] & survived[:, None]
-        parts.append(_pairs(frames, "executed", pool.scene_index[rows], driver.env))
-    if not parts:
-        raise InputError("corrective supervision: the pool holds no fresh adversarial traffic")
+        action = frames[label][:, :, None]
+        parts.append(pairs_of(frames, frames["alive"], pool.scene_index[rows], driver.env, action))
     return torch.cat(parts)
 
 
@@ -100,14 +84,6 @@ def _bursts(batch: int, settings: ImitationSettings, generator: torch.Generator)
     return disturb
 
 
-def _pairs(frames: TensorDictBase, label: str, scene_index: Tensor, env: DrivingEnv) -> TensorDict:
-    alive = frames["alive"]
-    action = clip_expert(frames[label], env.action_spec.space.low[0], env.action_spec.space.high[0])
-    scene = scene_index[:, None].to(alive.device).expand(alive.shape)
-    pairs = {"observation": frames["observation"][alive], "action": action[alive], "scene_index": scene[alive]}
-    return TensorDict(pairs, batch_size=[int(alive.sum())]).cpu()
-
-
 class Imitation:
     """Behaviour cloning of an ActorCritic's actor from pairs, with held-out scenes. `history`: one row per epoch."""
 
@@ -119,9 +95,8 @@ class Imitation:
         scenes = scenes[torch.randperm(len(scenes), generator=self._generator)]
         apart = scenes[: round(settings.held_out * len(scenes))]
         held_out = torch.isin(pairs["scene_index"], apart)
-        pairs = pairs.select("observation", "action").to(network.device)
+        pairs = pairs.select("observation", "action", "weight").to(network.device)
         self.train, self.held_out = pairs[~held_out.to(pairs.device)], pairs[held_out.to(pairs.device)]
-        self.loss = BCLoss(network.actor)
         self.optimiser = torch.optim.AdamW(
             network.network.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
         )
@@ -129,15 +104,15 @@ class Imitation:
 
     @torch.no_grad()
     def measure(self, pairs: TensorDictBase) -> tuple[float, float]:
-        """Mean negative log-likelihood of pairs, and mean distance of the deterministic action as a share of half the
-        range; NaN without pairs."""
+        """The cloning loss of pairs, and the mean distance of the deterministic action from the labels as a share of
+        half the range; NaN without pairs."""
         if not len(pairs):
             return float("nan"), float("nan")
-        with torch.random.fork_rng(devices=[]):  # the loss samples an action; measuring must not move the generator
-            likelihood = self.loss(pairs)["loss_bc"].item()
+        loss = cloning_loss(self.network.actor, pairs).item()
         reach = (self.network.high - self.network.low) / 2
-        miss = (self.network.network.deterministic(pairs["observation"]) - pairs["action"]).abs() / reach
-        return likelihood, miss.mean().item()
+        central = self.network.network.deterministic(pairs["observation"])
+        miss = ((central[:, None] - pairs["action"]).abs() / reach).mean(-1)
+        return loss, (miss * pairs["weight"]).sum(1).mean().item()
 
     def epoch(self) -> dict[str, float]:
         """One pass over the training pairs; returns training and held-out losses."""
@@ -145,7 +120,7 @@ class Imitation:
         settings = self.settings
         for index in order.split(settings.minibatch):
             with self.network.network.noisy(settings.feature_noise, settings.last_action_noise):
-                loss = self.loss(self.train[index])["loss_bc"]
+                loss = cloning_loss(self.network.actor, self.train[index])
             take_step(self.optimiser, loss, settings.max_grad_norm)
         (fit, miss), (held_fit, held_miss) = self.measure(self.train), self.measure(self.held_out)
         row = {"loss": fit, "miss": miss, "held_out_loss": held_fit, "held_out_miss": held_miss}

@@ -39,8 +39,8 @@ class Memory:
     """The rounds from the newest one back, at most `bound` rows together; the newest round always stays.
 
     A round's traffic {scene_index [R], eta [R], template [R], states [R, T+1, N, 4], valid [R, T+1, N], adversaries
-    [R, N], ...} is written by `write`, by any process, and enters by `take`. Files of rounds that have left go in
-    `prune`: until then a checkpoint may name them.
+    [R, N], evasion [R, T, 2], span [R, 2], ...} is written by `write`, by any process, and enters by `take`. Files of
+    rounds that have left go in `prune`: until then a checkpoint may name them.
     """
 
     def __init__(self, folder: Path | None, bound: int) -> None:

@@ -19,10 +19,10 @@ from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import Ego, EgoPlanner
 from e2rl.errors import InputError
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
-from e2rl.learning.driving import PoolDriver
 from e2rl.learning.episodes import OUTCOME_KEYS, Episodes, finished_episodes
-from e2rl.learning.imitation import ImitationSettings, corrective_pairs, recorded_pairs
+from e2rl.learning.imitation import ImitationSettings
 from e2rl.learning.improvement import Improvement
+from e2rl.learning.teachers import Teachers
 from e2rl.learning.update import Learner, UpdateSettings
 from e2rl.scene.scene import SceneSet
 from e2rl.settings import settings_of
@@ -31,8 +31,6 @@ from e2rl.synthesizer.reaiming import ReactSettings, Reaiming
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import Traffic
 from e2rl.traffic.transform import AdversarialSynthesizer
-
-EXPERT_KEYS = ("observation", "action")
 
 
 @dataclass(frozen=True)
@@ -78,14 +76,17 @@ class PolicyImprovement(Improvement):
         ppo: Mapping[str, Any] | None = None,
         imitation: Mapping[str, Any] | None = None,
         recorded: bool = False,
+        evasions: bool = False,
         teacher: Ego | None = None,
+        teaching: Mapping[str, Any] | None = None,
         parameters: Mapping[str, Any] | None = None,
         react: Mapping[str, Any] | None = None,
         rounds: int = 1,
     ) -> None:
-        """recorded: clone the recorded egos in every round; teacher: also clone this ego's survived episodes in the
-        round's adversarial traffic; react: vehicles that leave the replayed traffic (None: nobody); rounds: of the run,
-        over which the learning rate falls; others: conf/learner/ppo_bc.yaml.
+        """With ppo.cloning > 0, recorded: clone the recorded egos; evasions: clone the evasions in the pool's traffic;
+        teacher: clone this ego's survived episodes in the round's adversarial traffic, as `teaching` says. react:
+        vehicles that leave the replayed traffic (None: nobody); rounds: of the run, over which the learning rate falls;
+        others: conf/learner/ppo_bc.yaml.
 
         Raises InputError if the ego is no actor or a round is shorter than an episode.
         """
@@ -101,12 +102,11 @@ class PolicyImprovement(Improvement):
                 f"an episode of {self.horizon} steps"
             )
         self.ego, self.learner, self.frames = ego, Learner(ego.network, update, rounds * iterations), 0
-        self.expert, self.teacher = None, teacher if update.cloning > 0 else None
-        if recorded and update.cloning > 0:
+        self.teachers = None
+        if update.cloning > 0:
             pairs = settings_of(ImitationSettings, {"seed": seed, **(imitation or {})}, "learner.imitation")
-            self.expert = recorded_pairs(scenes, sim, pairs).select(*EXPERT_KEYS).to(device)
-        if self.teacher is not None:
-            self.driver = PoolDriver(scenes, sim, batch, device)
+            given = pairs if recorded else None, evasions, teacher, teaching
+            self.teachers = Teachers(scenes, sim, hold, device, *given)
         every = torch.arange(len(scenes))
         self.draw = RowDraw(torch.full((len(scenes),), 1 / len(scenes), dtype=torch.float64), seed)
         self.reaction = None
@@ -131,7 +131,10 @@ class PolicyImprovement(Improvement):
     def __call__(self, pool: TrafficPool, curriculum: CurriculumScheduler) -> tuple[dict[str, float], Episodes]:
         """Reset every environment; `iterations` times: collect [B, steps] decisions, update. `frames` are steps of
         0.1 s."""
-        expert = self._expert(pool)
+        begin = time.perf_counter()
+        experts = {} if self.teachers is None else self.teachers.pairs(pool)
+        counts = {"pairs": time.perf_counter() - begin, "expert_pairs": float(sum(map(len, experts.values())))}
+        counts |= {f"{kind}_pairs": float(len(pairs)) for kind, pairs in experts.items()}
         self.synthesizer.pool = pool
         self.draw.probability = pool.probabilities(curriculum.priority(), curriculum.share)
         self._collector.reset()
@@ -142,27 +145,21 @@ class PolicyImprovement(Improvement):
             collecting += time.perf_counter() - begin
             self.frames += steps_of(data)
             kept.append(data.select(*OUTCOME_KEYS).cpu().clone())
-            rows.append(self.learner.update(data, expert))
+            rows.append(self.learner.update(data, [*experts.values()]))
             bar.set_postfix(reward=f"{data['next', 'reward'].mean().item():.3f}", kl=f"{rows[-1]['kl']:.4f}")
         episodes = finished_episodes(kept, pool.adversarial, self.horizon, self.settings.hold)
         columns: dict[str, list[float]] = defaultdict(list)
         for name, value in (pair for row in rows for pair in row.items()):
             columns[name].append(value)
         metrics = {name: sum(values) / len(values) for name, values in sorted(columns.items())}
-        counts = {"frames": float(self.frames), "expert_pairs": float(0 if expert is None else len(expert))}
-        counts |= {"collect": collecting, "steps_per_second": (self.frames - begun) / collecting}
+        counts |= {"frames": float(self.frames), "collect": collecting}
+        counts["steps_per_second"] = (self.frames - begun) / collecting
         return metrics | episodes.summary() | counts, episodes
 
     def collected(self) -> TensorDictBase:
         """The next batch [B, steps] of decisions, by the present policy."""
         self._collector.update_policy_weights_()
         return next(self._batches)
-
-    def _expert(self, pool: TrafficPool) -> TensorDictBase | None:
-        if self.teacher is None or not bool((pool.adversarial & pool.fresh & (pool.source >= 0)).any()):
-            return self.expert
-        pairs = corrective_pairs(self.driver, self.teacher, pool).select(*EXPERT_KEYS)
-        return pairs if self.expert is None else torch.cat([self.expert, pairs.to(self.expert.device)])
 
     def outcome(self, folder: Path) -> str:
         """How to evaluate the improved ego of a run's folder."""

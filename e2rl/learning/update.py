@@ -1,19 +1,20 @@
 """The policy's update: PPO on collected episodes and behaviour cloning on expert pairs, one optimiser for both."""
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.modules import PopArtValueNorm
-from torchrl.objectives import BCLoss, ClipPPOLoss
+from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from e2rl.ego.network import ActorCritic
 from e2rl.errors import InputError
+from e2rl.learning.cloning import cloning_loss, drawn
 
-EXPERT_SHARE = 0.99  # expert actions are clipped to this share of the bounds, where the squashed density is infinite
 VALUE_MEMORY = 0.95  # weight of the past in the running mean and variance of the returns, per update
 PEAK_MEMORY = 0.75  # of the past in the running maximum of |advantage|, per update
 
@@ -60,11 +61,11 @@ class Learner:
             critic_coeff=settings.critic,
             normalize_advantage=False,
         )
-        self.cloning = BCLoss(network.actor)
         self.optimiser = torch.optim.Adam(network.parameters(), settings.learning_rate)
 
-    def update(self, data: TensorDictBase, expert: TensorDictBase | None = None) -> dict[str, float]:
-        """One PPO iteration on a Collector's batch [B, T], with behaviour cloning on expert pairs [M].
+    def update(self, data: TensorDictBase, experts: Sequence[TensorDictBase] = ()) -> dict[str, float]:
+        """One PPO iteration on a Collector's batch [B, T], with behaviour cloning on kinds of expert pairs, each [M]
+        with M >= 1 (e2rl.learning.cloning), that share a minibatch evenly.
 
         Passes end early when the policy has moved by target_kl. The first `critic_warmup` calls fit the critic alone.
         The observation statistics are updated at the end, so they are equal in collection and update.
@@ -80,7 +81,7 @@ class Learner:
         for _ in range(settings.epochs):
             moved = []
             for index in torch.randperm(len(flat), device=flat.device).split(settings.minibatch):
-                losses = self._step(flat[index], expert, warming)
+                losses = self._step(flat[index], experts, warming)
                 moved.append(losses["kl"])
                 for name, value in losses.items():
                     sums[name].append(value)
@@ -144,7 +145,7 @@ class Learner:
         """Values [..., 1] in units of the reward."""
         return self.returns.denormalize(self.network.critic.module[1](seen))
 
-    def _step(self, minibatch: TensorDictBase, expert: TensorDictBase | None, warming: bool) -> dict[str, Tensor]:
+    def _step(self, minibatch: TensorDictBase, experts: Sequence[TensorDictBase], warming: bool) -> dict[str, Tensor]:
         """One optimiser step; the losses and diagnostics, detached."""
         settings = self.settings
         out = self.ppo(minibatch)
@@ -159,10 +160,10 @@ class Learner:
             "entropy": out["entropy"],
             "explained_variance": out["explained_variance"].mean(),
         }
-        if expert is not None and len(expert) and settings.cloning > 0 and not warming:
-            pick = torch.randint(len(expert), (settings.cloning_minibatch,), device=expert.device)
+        if experts and settings.cloning > 0 and not warming:
+            pairs = drawn(experts, settings.cloning_minibatch).to(self.network.device)
             with self.network.network.noisy(settings.feature_noise, settings.last_action_noise):
-                losses["loss_cloning"] = self.cloning(expert[pick].to(self.network.device))["loss_bc"]
+                losses["loss_cloning"] = cloning_loss(self.network.actor, pairs)
             total = total + settings.cloning * losses["loss_cloning"]
         take_step(self.optimiser, total, settings.max_grad_norm)
         return {name: value.detach().mean() for name, value in losses.items()}
@@ -193,9 +194,3 @@ def take_step(optimiser: torch.optim.Optimizer, loss: Tensor, max_grad_norm: flo
     parameters = [value for group in optimiser.param_groups for value in group["params"]]
     torch.nn.utils.clip_grad_norm_(parameters, max_grad_norm)
     optimiser.step()
-
-
-def clip_expert(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Actions [..., 2] within EXPERT_SHARE of the bounds low, high [2]."""
-    middle, reach = (high + low) / 2, (high - low) / 2 * EXPERT_SHARE
-    return torch.maximum(torch.minimum(action, middle + reach), middle - reach)

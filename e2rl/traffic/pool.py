@@ -15,11 +15,18 @@ RECORDED, LIVE = -1, -2  # sources of a row's traffic that is not a position in 
 
 
 class StoredTraffic(NamedTuple):
-    """Tracks in memory or mapped from a file: states [D, T+1, N, 4], valid [D, T+1, N], adversaries [D, N] bool."""
+    """Tracks in memory or mapped from a file: states [D, T+1, N, 4], valid [D, T+1, N], adversaries [D, N] bool; and
+    where an evasion of the ego's contact is known, its actions evasion [D, T, 2] and the steps span [D, 2] int64 from
+    .. up to which it acts, (0, 0) where none is."""
 
     states: Tensor
     valid: Tensor
     adversaries: Tensor
+    evasion: Tensor
+    span: Tensor
+
+
+TRACKS, EVASIONS = StoredTraffic._fields[:3], StoredTraffic._fields[3:]
 
 
 @dataclass
@@ -70,6 +77,15 @@ class TrafficPool:
             states[rows], valid[rows] = part.states[inside], part.valid[inside]
         return states, valid
 
+    def evaded(self, number: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Rows [b] of the pool whose traffic is of parts[number] and has an evasion, its actions [b, T, 2] and its span
+        [b, 2]; of the actions only these are read."""
+        part = self.parts[number]
+        at = self.source - (self._ends[number] - len(part.states))
+        rows = ((at >= 0) & (at < len(part.states)) & (self.source >= 0)).nonzero()[:, 0]
+        rows = rows[part.span[at[rows], 1] > 0]
+        return rows, part.evasion[at[rows]], part.span[at[rows]]
+
     @staticmethod
     def recorded(scene_index: Tensor) -> "TrafficPool":
         """Rows that replay the recordings of scenes [R]."""
@@ -84,13 +100,15 @@ class TrafficPool:
     @staticmethod
     def stored(traffic: Mapping[str, Tensor], eta: Tensor | float, template: Tensor | None = None) -> "TrafficPool":
         """Rows of a synthesizer's traffic at intensities eta [S], or one for all, and templates [S] (None: full for
-        all): scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N] and adversaries [S, N] bool. Raises InputError
-        for a missing key."""
-        missing = {"scene_index", "states", "valid", "adversaries"} - set(traffic)
+        all): scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N] and adversaries [S, N] bool, and if known
+        evasion [S, T, 2] with span [S, 2]. Raises InputError for a missing key."""
+        missing = {"scene_index", *TRACKS} - set(traffic)
         if missing:
             raise InputError(f"synthesized traffic lacks {', '.join(sorted(missing))}; return them from synthesize()")
-        part = StoredTraffic(*(traffic[name].cpu() for name in StoredTraffic._fields))
-        index = traffic["scene_index"].cpu()
+        states, index = traffic["states"], traffic["scene_index"].cpu()
+        none = torch.zeros(1, 1, 2).expand(len(states), states.shape[1] - 1, 2), torch.zeros(len(states), 2).long()
+        given = dict(zip(EVASIONS, none, strict=True)) | dict(traffic)
+        part = StoredTraffic(*(given[name].cpu() for name in StoredTraffic._fields))
         eta = torch.as_tensor(eta, dtype=torch.float32).cpu().expand(len(index))
         pool = _rows(index, RECORDED, eta, template=None if template is None else template.cpu())
         pool.source, pool.parts = torch.arange(len(index)), [part]

@@ -204,3 +204,13 @@ def test_pair_costs_order_situations():
     assert cost(4.0, 0.0, 8.0) > cost(-4.0, 0.0, 12.0) > 0
     assert cost(10.0, 0.0, 0.0) > cost(10.0, 0.0, 8.0) == 0
     assert cost(0.0, 2.2, 10.0) > cost(0.0, 2.6, 10.0) > cost(0.0, 3.1, 10.0) == 0
+
+
+def test_the_ranked_begin_with_the_plan_and_are_driven_differently():
+    _, world = world_of(num_scenes=2)
+    ego = SamplingEgo()
+    states, costs = ego.ranked(world, 8)
+    assert states.shape == (2, 8, PLAN_STEPS, 4) and (costs.diff(dim=1) >= 0).all()
+    assert torch.equal(states[:, 0], ego.plan(world))
+    apart = (states[:, :, None] - states[:, None]).abs().amax((3, 4)) + torch.eye(8)
+    assert (apart > 1e-4).all()

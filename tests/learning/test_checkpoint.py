@@ -132,8 +132,8 @@ def test_what_does_not_fit_is_refused_and_named(tmp_path):
     (folder / "state.pt").write_bytes(b"half of it")
     with pytest.raises(InputError, match=r"state\.pt: damaged"):
         load_checkpoint(tmp_path, small_run())
-    torch.save({"format": "e2rl-checkpoint/2"}, folder / "state.pt")
-    with pytest.raises(InputError, match=r"of another version .*e2rl-checkpoint/2, not e2rl-checkpoint/3.*new run"):
+    torch.save({"format": "e2rl-checkpoint/3"}, folder / "state.pt")
+    with pytest.raises(InputError, match=r"of another version .*e2rl-checkpoint/3, not e2rl-checkpoint/4.*new run"):
         load_checkpoint(tmp_path, small_run())
     torch.save({"something": torch.zeros(1)}, folder / "state.pt")
     with pytest.raises(InputError, match="not a checkpoint"):

@@ -1,18 +1,13 @@
 """Expert pairs come from the log, cloning fits them, and disturbed ones lead back to the lane."""
 
-import pytest
 import torch
 
 from e2rl.ego.actor import ActorEgo
-from e2rl.ego.idm import IDMEgo
 from e2rl.ego.reference import executed_action
-from e2rl.errors import InputError
-from e2rl.learning.driving import PoolDriver
-from e2rl.learning.imitation import Imitation, ImitationSettings, corrective_pairs, imitate, recorded_pairs
-from e2rl.learning.update import clip_expert
+from e2rl.learning.cloning import clip_expert
+from e2rl.learning.imitation import Imitation, ImitationSettings, imitate, recorded_pairs
 from e2rl.sim.env import SimSettings
-from e2rl.traffic.pool import TrafficPool
-from tests.learning.small import brake_check, small_scenes
+from tests.learning.small import small_scenes
 
 
 def braking_log(num_scenes=4, steps=20, acceleration=-2.0):
@@ -32,7 +27,7 @@ def settings(**changes):
 def test_replayed_pairs_are_the_inverse_dynamics_of_the_log():
     pairs = recorded_pairs(braking_log(), SimSettings(), settings(drives=0))
     assert len(pairs) == 4 * 20 and pairs["scene_index"].unique().tolist() == [0, 1, 2, 3]
-    assert torch.allclose(pairs["action"], torch.tensor([-2.0, 0.0]).expand(80, 2), atol=2e-3)
+    assert torch.allclose(pairs["action"], torch.tensor([-2.0, 0.0]).expand(80, 1, 2), atol=2e-3)
     last = executed_action(pairs["observation"]).view(4, 20, 2)
     assert torch.allclose(last[:, 1:], pairs["action"].view(4, 20, 2)[:, :-1], atol=2e-3), "in order of time"
 
@@ -42,7 +37,7 @@ def test_disturbed_pairs_lead_back():
     pairs = recorded_pairs(braking_log(8), SimSettings(), settings(drives=3, disturbed_yaw_rate=0.2))
     sideways, turned = 3 * pairs["observation"][:, 3], pairs["observation"][:, 4]
     off = (sideways.abs() > 0.1) & (sideways * turned > 0)
-    assert off.sum() > 20 and (pairs["action"][off, 1].sign() == -sideways[off].sign()).float().mean() > 0.9
+    assert off.sum() > 20 and (pairs["action"][off, 0, 1].sign() == -sideways[off].sign()).float().mean() > 0.9
 
 
 def test_clipping_keeps_actions_off_the_bounds():
@@ -55,21 +50,9 @@ def test_cloning_reduces_the_held_out_loss_and_keeps_the_best_weights(tmp_path):
     torch.manual_seed(0)
     ego = ActorEgo(hidden=(32,))
     pairs = recorded_pairs(braking_log(), SimSettings(), settings(drives=1))
-    before = Imitation(ego.network, pairs, settings()).measure(pairs.select("observation", "action"))
+    before = Imitation(ego.network, pairs, settings()).measure(pairs)
     best = imitate(ego.network, pairs, settings(), tmp_path)
     assert best["held_out_loss"] < before[0] - 0.3 and best["held_out_miss"] < before[1] / 2
     again = ActorEgo(hidden=(32,), checkpoint=str(tmp_path))
     observation = pairs["observation"]
     assert torch.equal(again.network.network.deterministic(observation), ego.network.network.deterministic(observation))
-
-
-def test_corrective_pairs_are_those_of_survived_attacks():
-    scenes = small_scenes(3, steps=40)
-    attack = TrafficPool.stored(brake_check(scenes)(None, torch.arange(3), 1.0, 0), 1.0)
-    driver = PoolDriver(scenes, SimSettings(), 2)
-    careful = corrective_pairs(driver, IDMEgo(), attack + TrafficPool.recorded(torch.arange(3)))
-    assert careful["scene_index"].unique().tolist() == [0, 1, 2] and (careful["action"][:, 0] < -1).any()
-    blind = corrective_pairs(driver, IDMEgo(hardest_braking=0.0, braking=0.01), attack)
-    assert len(blind) == 0
-    with pytest.raises(InputError, match="no fresh adversarial"):
-        corrective_pairs(driver, IDMEgo(), TrafficPool.recorded(torch.arange(3)))

@@ -8,7 +8,9 @@ import torch
 from safetensors import safe_open
 
 from e2rl.errors import InputError
+from e2rl.learning.attack import Order, make_traffic
 from e2rl.learning.memory import Memory
+from e2rl.learning.solvability import Solved
 from e2rl.traffic.template import CHAIN, FULL, PAIR, SINGLE
 from tests.learning.small import brake_check, small_run, small_scenes
 
@@ -61,6 +63,26 @@ def test_remembered_rows_keep_their_intensity_and_template(tmp_path):
     pool = memory.pool(3.0)
     assert pool.template.tolist() == [PAIR] * 4 + [CHAIN] * 4 + [SINGLE] * 4
     assert pool.eta.tolist() == [3.0] * 4 + [2.0] * 4 + [1.0] * 4
+
+
+def test_evasions_make_the_round_trip(tmp_path):
+    """Through make_traffic, the file and the pool; rows that are left out and nominal ones have none."""
+    scenes, index = small_scenes(4), torch.arange(4)
+    actions = torch.arange(4 * 20 * 2).reshape(4, 20, 2).float()
+    span = torch.tensor([[3, 9], [0, 0], [2, 5], [1, 4]])
+    solved = Solved(torch.tensor([True, True, False, True]), actions, span)
+    memory = Memory(tmp_path, 100)
+    for number in range(2):
+        order = Order(number, index, torch.full((4,), 2.0), torch.full((4,), FULL), 0, None)
+        memory.write(number, make_traffic(order, brake_check(scenes), lambda traffic: solved))
+        memory.take(number)
+    memory.restore(memory.index())
+    pool = memory.pool(3.0)
+    for number, first in ((0, 0), (1, 7)):
+        rows, found, acts = pool.evaded(number)
+        assert rows.tolist() == [first, first + 2] and pool.scene_index[rows].tolist() == [0, 3]
+        assert torch.equal(found, actions[[0, 3]]) and torch.equal(acts, span[[0, 3]])
+    assert not pool.parts[0].evasion[3:].any() and len(pool) == 14
 
 
 def test_files_hold_plain_arrays(tmp_path):

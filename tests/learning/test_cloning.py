@@ -1,0 +1,86 @@
+"""The cloning loss: one label is the hard loss, many are its mean; every kind of expert has its share."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.objectives import BCLoss
+
+from e2rl.ego.actor import ActorEgo
+from e2rl.learning.cloning import cloning_loss, drawn
+from e2rl.sim.observation import OBSERVATION_SIZE
+
+
+def network():
+    torch.manual_seed(0)
+    ego = ActorEgo(hidden=(16,))
+    torch.nn.init.normal_(ego.network.network.trunk[-1].weight, std=0.1)
+    return ego.network
+
+
+def pairs(action, weight):
+    """Pairs [5] at random observations with labels action [C, 2] and weight [C]."""
+    action, weight = torch.tensor(action), torch.tensor(weight)
+    observation = torch.randn(5, OBSERVATION_SIZE, generator=torch.Generator().manual_seed(1))
+    labels = {"action": action.expand(5, -1, -1), "weight": weight.expand(5, -1)}
+    return TensorDict({"observation": observation, **labels}, [5])
+
+
+def gradient(actor, given):
+    """The loss and its gradient by all parameters."""
+    loss = cloning_loss(actor.actor, given)
+    parts = torch.autograd.grad(loss, list(actor.network.parameters()))
+    return loss.detach(), torch.cat([part.flatten() for part in parts])
+
+
+def test_one_label_is_the_hard_loss():
+    actor, given = network(), pairs([[-3.0, 0.2]], [1.0])
+    hard = TensorDict({"observation": given["observation"], "action": given["action"][:, 0]}, [5])
+    torch.testing.assert_close(cloning_loss(actor.actor, given), BCLoss(actor.actor)(hard)["loss_bc"])
+
+
+def test_loss_and_gradient_are_the_weighted_means_of_those_of_the_labels():
+    actor, actions, weights = network(), [[-3.0, 0.2], [1.0, -0.4], [2.0, 0.0]], [0.5, 0.3, 0.2]
+    soft = gradient(actor, pairs(actions, weights))
+    single = [gradient(actor, pairs([action], [1.0])) for action in actions]
+    for found, of_each in zip(soft, zip(*single, strict=True), strict=True):
+        expected = sum(weight * each for weight, each in zip(weights, of_each, strict=True))
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_label_without_weight_changes_nothing():
+    actor = network()
+    one, two = pairs([[-3.0, 0.2]], [1.0]), pairs([[-3.0, 0.2], [4.0, 1.0]], [1.0, 0.0])
+    assert cloning_loss(actor.actor, one) == cloning_loss(actor.actor, two)
+
+
+def test_the_minimum_between_two_labels_is_their_mean_before_squashing():
+    """A density of one mode cannot hold two: it stands between them, and as wide as they are apart."""
+    actor = network()
+    actions = torch.tensor([[-4.0, 0.5], [2.0, -0.1]])
+    at = ((actions - actor.network.middle) / actor.network.reach).atanh()
+
+    class Fixed(torch.nn.Module):
+        """A density with these parameters at every observation."""
+
+        def __init__(self, loc, scale):
+            super().__init__()
+            self.loc, self.scale = torch.nn.Parameter(loc), torch.nn.Parameter(scale)
+
+        def forward(self, observation):
+            return self.loc.expand(len(observation), 2), self.scale.expand(len(observation), 2)
+
+    fixed = Fixed(at.mean(0), at.std(0, correction=0))
+    actor.actor.module[0].module = fixed
+    loss = cloning_loss(actor.actor, pairs(actions.tolist(), [0.5, 0.5]))
+    for part in torch.autograd.grad(loss, list(fixed.parameters())):
+        torch.testing.assert_close(part, torch.zeros(2), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("count", [9, 10, 11])
+def test_kinds_share_a_minibatch_evenly_whatever_their_sizes(count):
+    few, many = pairs([[-3.0, 0.2]], [1.0])[:1], pairs([[1.0, 0.0], [2.0, 0.0]], [0.25, 0.75]).repeat(100)
+    found = drawn([few, many], count)
+    first = found["action"][:, 0, 0] == -3.0
+    assert len(found) == count and abs(int(first.sum()) - count / 2) < 1
+    assert torch.equal(found["weight"].sum(1), torch.ones(count))
+    assert not found["weight"][first, 1].any(), "filled up"

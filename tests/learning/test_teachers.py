@@ -1,0 +1,149 @@
+"""Teachers: evasions that avoid what hit the policy, planners that survive, soft labels of what they weighed."""
+
+import pytest
+import torch
+
+from e2rl.ego.actor import ActorEgo
+from e2rl.ego.idm import IDMEgo
+from e2rl.ego.sampling import SamplingEgo
+from e2rl.errors import InputError
+from e2rl.learning.attack import Order, make_traffic
+from e2rl.learning.checkpoint import load_checkpoint, save_checkpoint
+from e2rl.learning.cloning import clip_expert
+from e2rl.learning.driving import PoolDriver, episodes_of
+from e2rl.learning.solvability import Solved, solvable
+from e2rl.learning.teachers import GivenActions, Teachers, TeachingSettings, corrective_pairs, evasion_pairs
+from e2rl.sim.env import SimSettings
+from e2rl.traffic.pool import TrafficPool
+from tests.learning.small import brake_check, small_run, small_scenes
+
+SIM = SimSettings()
+
+
+def attacked(scenes, eta=2.0):
+    """The pool of an attack on every scene, with the evasions that the search finds."""
+    index = torch.arange(len(scenes))
+    traffic = brake_check(scenes)(None, index, eta, 0)
+    return TrafficPool.stored(traffic | solvable(traffic, scenes, SIM)._asdict(), eta)
+
+
+@pytest.mark.parametrize("hold", [1, 2, 3])
+def test_pairs_of_an_evasion_avoid_the_contact_when_replayed(hold):
+    """Its decisions, driven in the row's traffic; the logged drive there is hit."""
+    scenes = small_scenes(3, steps=40)
+    pool, rows = attacked(scenes), torch.arange(3)
+    pool.parts[0].span[:] = torch.tensor([0, 40])  # all decisions
+    driver = PoolDriver(scenes, SIM, 3, hold=hold)
+    pairs = evasion_pairs(driver, pool, 0)
+    actions = pairs["action"].view(3, -1, 2)
+    assert actions.shape[1] == -(-40 // hold) and torch.equal(pairs["scene_index"].unique(), rows)
+    again = driver.drive(GivenActions(actions.repeat_interleave(hold, 1), hold), pool, rows)
+    assert not episodes_of(again, pool, rows).failed.any()
+    assert torch.allclose(again["observation"].flatten(0, 1), pairs["observation"], atol=1e-2)
+    straight = driver.drive(GivenActions(torch.zeros(3, 40, 2), hold), pool, rows)
+    assert episodes_of(straight, pool, rows).contact.all()
+
+
+def test_only_the_decisions_in_the_span_are_cloned_and_each_row_once():
+    scenes = small_scenes(3, steps=40)
+    pool, driver = attacked(scenes), PoolDriver(scenes, SIM, 8, hold=2)
+    pool.parts[0].span[:] = torch.tensor([[10, 21], [0, 0], [3, 9]])
+    pairs = evasion_pairs(driver, pool, 0)
+    assert torch.bincount(pairs["scene_index"]).tolist() == [6, 0, 3], "steps 10..20 and 4..8"
+
+
+def test_evasions_that_fail_by_decisions_are_left_out():
+    scenes = small_scenes(2, steps=40)
+    pool, driver = attacked(scenes), PoolDriver(scenes, SIM, 2, hold=2)
+    pool.parts[0].evasion[0] = 0.0
+    assert evasion_pairs(driver, pool, 0)["scene_index"].unique().tolist() == [1]
+
+
+def test_rows_without_an_evasion_yield_no_pairs():
+    scenes = small_scenes(2)
+    index, driver = torch.arange(2), PoolDriver(scenes, SIM, 2)
+    pool = TrafficPool.stored(brake_check(scenes)(None, index, 2.0, 0), 2.0) + TrafficPool.recorded(index)
+    assert evasion_pairs(driver, pool, 0) is None
+    teachers = Teachers(scenes, SIM, 2, evasions=True)
+    assert teachers.pairs(pool) == {} == teachers.pairs(TrafficPool.recorded(index))
+
+
+def test_pairs_of_remembered_evasions_are_made_once_and_leave_with_their_rows():
+    scenes = small_scenes(2, steps=40)
+    older, newer = attacked(scenes), attacked(scenes, 3.0)
+    teachers, made = Teachers(scenes, SIM, 2, evasions=True), []
+    drive = teachers._by_decision.drive
+    teachers._by_decision.drive = lambda *given: made.append(1) or drive(*given)
+    first = teachers.pairs(older)["evasions"]
+    both = teachers.pairs(newer + older)["evasions"]
+    assert len(made) == 2 and torch.equal(both[-len(first) :]["action"], first["action"])
+    assert len(teachers.pairs(newer)["evasions"]) == len(both) - len(first) and len(made) == 2
+
+
+def test_corrective_pairs_are_those_of_survived_attacks():
+    scenes = small_scenes(3, steps=40)
+    attack = TrafficPool.stored(brake_check(scenes)(None, torch.arange(3), 1.0, 0), 1.0)
+    driver = PoolDriver(scenes, SIM, 2)
+    careful = corrective_pairs(driver, IDMEgo(), attack + TrafficPool.recorded(torch.arange(3)))
+    assert torch.bincount(careful["scene_index"]).tolist() == [40, 40, 40], "each row once"
+    assert (careful["action"][:, 0, 0] < -1).any() and torch.equal(careful["weight"], torch.ones(120, 1))
+    blind = corrective_pairs(driver, IDMEgo(hardest_braking=0.0, braking=0.01), attack)
+    assert len(blind) == 0
+    with pytest.raises(InputError, match="no fresh adversarial"):
+        corrective_pairs(driver, IDMEgo(), TrafficPool.recorded(torch.arange(3)))
+
+
+def test_soft_labels_are_what_the_planner_weighed():
+    """The first label is what it does, its weights are the softmax, and a low temperature leaves the first alone."""
+    scenes = small_scenes(2, steps=20)
+    pool = TrafficPool.stored(brake_check(scenes)(None, torch.arange(2), 1.0, 0), 1.0)
+    driver, teacher = PoolDriver(scenes, SIM, 2), SamplingEgo()
+    hard = corrective_pairs(driver, teacher, pool, TeachingSettings(candidates=1))
+    soft = corrective_pairs(driver, teacher, pool, TeachingSettings(candidates=8, temperature=2.0))
+    cold = corrective_pairs(driver, teacher, pool, TeachingSettings(candidates=8, temperature=1e-3))
+    assert hard["action"].shape == (40, 1, 2) and soft["action"].shape == (40, 8, 2)
+    frames = driver.drive(SamplingEgo(), pool, torch.arange(2))
+    torch.testing.assert_close(hard["observation"], frames["observation"].flatten(0, 1))
+    bounds = driver.env.action_spec.space
+    done = clip_expert(frames["executed"].flatten(0, 1), bounds.low[0], bounds.high[0])
+    torch.testing.assert_close(hard["action"][:, 0], done, atol=2e-3, rtol=0)
+    torch.testing.assert_close(soft["action"][:, :1], hard["action"], atol=1e-5, rtol=0)
+    weight = soft["weight"]
+    torch.testing.assert_close(weight.sum(1), torch.ones(40))
+    assert (weight.diff(dim=1) <= 0).all() and (weight[:, 0] < 0.9).any() and cold["weight"][:, 0].mean() > 0.9
+    with pytest.raises(InputError, match=r"learner\.teaching\.candidates"):
+        TeachingSettings(candidates=0)
+
+
+def test_a_round_clones_evasions_and_a_resumed_one_the_same(tmp_path):
+    scenes = small_scenes(steps=40)
+
+    def begun():
+        expert = {"evasions": True, "teacher": SamplingEgo()}
+        run = small_run(folder=tmp_path, scenes=scenes, expert=expert, cloning=0.5, collect={"hold": 2}, final_lr=1.0)
+        attack = brake_check(scenes)
+        run.synthesize = lambda ego, index, eta, seed: attack(ego, index, eta + 1.5 * (eta > 0), seed)
+        run.solvable = lambda traffic: solvable(traffic, scenes, SIM)
+        return run
+
+    run = begun()
+    one = run.run_round()
+    save_checkpoint(tmp_path, run, {})
+    two = run.run_round()
+    assert two["train/evasions_pairs"] > one["train/evasions_pairs"] > 0 and one["train/teacher_pairs"] > 0
+    again = begun()
+    assert load_checkpoint(tmp_path, again) == 1
+    resumed = again.run_round()
+    assert {name: value for name, value in resumed.items() if not name.startswith("time/")} == {
+        name: value for name, value in two.items() if not name.startswith("time/")
+    }
+
+
+def test_make_traffic_takes_evasions_of_kept_rows_only():
+    scenes = small_scenes(3)
+    order = Order(0, torch.arange(3), torch.ones(3), torch.zeros(3).long(), 0, ActorEgo(hidden=(4,)))
+    kept, span = torch.tensor([True, False, True]), torch.tensor([[1, 2], [3, 4], [5, 6]])
+    solved = Solved(kept, torch.ones(3, 20, 2), span)
+    rows = make_traffic(order, lambda *given: brake_check(scenes)(*given[:4]), lambda traffic: solved)
+    assert rows["span"].tolist() == [[1, 2], [5, 6], [0, 0], [0, 0], [0, 0]]
+    assert rows["kept"].tolist() == kept.tolist() and not rows["evasion"][2:].any()
