@@ -4,7 +4,7 @@ import io
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
@@ -23,24 +23,36 @@ def cores() -> int:
 
 
 def in_processes(
-    function: Callable[[Job], Result], jobs: Sequence[Job], processes: int, cost: Callable[[Job], float]
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    processes: int,
+    cost: Callable[[Job], float],
+    ended: Callable[[Job], object] = lambda job: None,
 ) -> Iterator[Result]:
     """function(job) of each job, in their order, by `processes` forked processes of one thread each; the jobs of
-    greatest cost start first. With one process or one job, no process is forked.
+    greatest cost start first. With one process or one job, no process is forked. ended(job): called when a job has
+    ended, in whatever order they do.
 
     Forks share the parent's scenes and weights, so results do not depend on `processes`.
     """
     processes = min(processes, len(jobs))
     if processes <= 1:
-        yield from map(function, jobs)
+        for job in jobs:
+            result = function(job)
+            ended(job)
+            yield result
         return
     context = multiprocessing.get_context("fork")
     with ProcessPoolExecutor(processes, context, _adopt, (function,)) as pool:
         order = sorted(range(len(jobs)), key=lambda k: -cost(jobs[k]))
-        futures = {k: pool.submit(_call, jobs[k]) for k in order}
+        futures, early, coming = {pool.submit(_call, jobs[k]): k for k in order}, {}, 0
         try:
-            for k in range(len(jobs)):
-                yield torch.load(io.BytesIO(futures[k].result()), weights_only=False)  # trusted: from a child process
+            for future in as_completed(futures):
+                early[futures[future]] = future.result()
+                ended(jobs[futures[future]])
+                while coming in early:
+                    yield torch.load(io.BytesIO(early.pop(coming)), weights_only=False)  # trusted: from a child process
+                    coming += 1
         except BrokenProcessPool as error:
             raise InputError(
                 f"processes={processes}: a process was killed, perhaps for lack of memory; "

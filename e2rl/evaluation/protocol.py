@@ -125,12 +125,15 @@ def drive_all(
 
     rows, features = [], []
     with tqdm(total=len(tasks) * len(methods) * len(setups), desc="rollouts", unit="rollout") as bar:
-        results = in_processes(work, jobs, processes, cost=lambda job: job[1].eta)
-        for (setup, method, part), (found, samples) in zip(jobs, results, strict=True):
+
+        def ended(job: tuple[Setup, Method, list[Task]]) -> None:
+            setup, method, part = job
+            bar.set_postfix(ego=setup.ego_name, method=method.name, eta=method.eta, refresh=False)
+            bar.update(len(part))
+
+        for found, samples in in_processes(work, jobs, processes, lambda job: job[1].eta, ended):
             rows += found
             features += samples
-            bar.set_postfix(ego=setup.ego_name, method=method.name, eta=method.eta)
-            bar.update(len(part))
     return rows, features
 
 

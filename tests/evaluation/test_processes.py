@@ -1,6 +1,7 @@
 """Work over processes: order, errors, and children that die."""
 
 import os
+import time
 
 import pytest
 import torch
@@ -22,6 +23,21 @@ def test_results_keep_the_order_of_the_jobs_whoever_does_them():
 @pytest.mark.parametrize(("jobs", "processes"), [(range(3), 1), ([5], 4)])
 def test_one_process_or_one_job_stays_here(jobs, processes):
     assert {result["process"] for result in in_processes(square, jobs, processes, cost=float)} == {os.getpid()}
+
+
+def linger(job):
+    if job == 0:
+        time.sleep(2.0)
+    return job
+
+
+def test_jobs_are_reported_when_they_end_not_when_their_turn_comes():
+    """While the first job lingers in one process, the other does the rest."""
+    reported = []
+    results = in_processes(linger, range(6), 2, cost=lambda job: -job, ended=reported.append)
+    assert next(results) == 0 and set(reported) >= {1, 2, 3, 4, 5}
+    assert list(results) == [1, 2, 3, 4, 5] and sorted(reported) == list(range(6))
+    assert list(in_processes(linger, [1, 2], 1, cost=float, ended=reported.append)) == reported[-2:] == [1, 2]
 
 
 def refuse(job):
