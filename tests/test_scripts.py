@@ -285,21 +285,15 @@ EXPERIMENTS = [
 ]
 
 
+TINY_ROUND = [
+    *("data.build.steps=20", "prior.sampler.steps=2", "rounds=1", "batch=2"),
+    *("learner.collect.batch=2", "learner.collect.steps=20", "learner.collect.iterations=1"),
+]
+
+
 def test_a_round_of_evolution_from_the_first_command_to_its_tables(world, tmp_path, monkeypatch, capsys):
     overrides = arguments(
-        world,
-        tmp_path,
-        "good",
-        "data.build.steps=20",
-        "prior.sampler.steps=2",
-        "rounds=1",
-        "batch=2",
-        "learner.round.scenes=2",
-        "learner.collect.batch=2",
-        "learner.collect.steps=20",
-        "learner.collect.iterations=1",
-        "measure.scenes=2",
-        "measure.seeds=[0]",
+        world, tmp_path, "good", *TINY_ROUND, "learner.round.scenes=2", "measure.scenes=2", "measure.seeds=[0]"
     )
     status, said = call("train.py", overrides, monkeypatch, capsys)
     assert status == 0, said
@@ -319,15 +313,9 @@ def test_every_choice_of_a_curriculum_is_logged_and_drawn(world, tmp_path, monke
         world,
         tmp_path,
         "good",
-        "data.build.steps=20",
-        "prior.sampler.steps=2",
+        *TINY_ROUND,
         f"curriculum={curriculum}",
-        "rounds=1",
-        "batch=2",
         "learner.round.scenes=4",
-        "learner.collect.batch=2",
-        "learner.collect.steps=20",
-        "learner.collect.iterations=1",
         "measure.scenes=1",
         "measure.seeds=[0]",
         "measure.eta=1",
