@@ -12,7 +12,7 @@ from e2rl.prior import free_space, lane_relative
 from e2rl.prior.bounds import BoundSettings, Obstacles, apply_cap, bounded
 from e2rl.prior.denoiser import Denoiser, DenoiserSettings, Encoding
 from e2rl.prior.features import edge_features, node_features
-from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, LaneState, select
+from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, select
 from e2rl.prior.route_choice import RouteChoice, sample_route
 from e2rl.prior.routed import RoutedScene, route_scene, start_state
 from e2rl.prior.sde import SAMPLERS, path_kl, reverse_step
@@ -154,6 +154,13 @@ class Prior(nn.Module):
         levels[:, 0] = EGO_LEVEL
         x0 = self.denoiser(x, levels, context.encoding)
         return torch.cat([context.ego_x[:, None], x0[:, 1:]], 1)
+
+    @torch.no_grad()
+    def estimate(self, context: Context) -> Tensor:
+        """x0 [B, V, SIZE] at the highest noise level without noise, one pass of the network: nearly the mean of the
+        samples."""
+        x = torch.zeros(*context.state.v.shape, SIZE, device=context.state.v.device)
+        return self.denoise(x, self.schedule.levels(1, x.device)[0], context)
 
     def decode(self, x0: Tensor, context: Context, cap: Tensor | None = None, steps: slice = slice(None)) -> LaneState:
         """Planned motion of x0, fields [B, V, HORIZON] or those `steps` of it; cap [B, V]: of the acceleration in the

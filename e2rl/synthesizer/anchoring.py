@@ -30,6 +30,7 @@ from e2rl.synthesizer.motion import (
     take,
 )
 from e2rl.synthesizer.skeleton import Skeleton
+from e2rl.synthesizer.stop_line import way_to_stop_line
 
 COARSE, FINE = 19, 9  # accelerations tried on each route: over the whole range, then around the best
 LATERAL_ACCEL = 4.0  # m/s^2 in bends
@@ -117,9 +118,10 @@ def _bend_bound(route: Tensor, s: Tensor) -> Tensor:
 
 
 def _candidates(
-    scene: TensorDictBase, world: World, index: Tensor, settings: AnchorSettings, keep_route: bool
+    scene: TensorDictBase, world: World, index: Tensor, settings: AnchorSettings, keep_route: bool, halt_at_red: bool
 ) -> _Candidates:
-    """The candidate routes of vehicles index [B, M]; keep_route: only the one that each follows."""
+    """The candidate routes of vehicles index [B, M]; keep_route: only the one that each follows; halt_at_red: up to the
+    stop line that binds the vehicle now."""
     vehicles, count = scene["route_points"].shape[1:3]
     assert world.route is not None
     states, route = take(world.states[:, :vehicles], index), take(world.route, index)[..., None]
@@ -132,6 +134,8 @@ def _candidates(
     usable = valid & (reachable | (number == route))
     if keep_route:
         usable = usable & (route >= 0)
+    if halt_at_red:
+        end = torch.minimum(end, s + way_to_stop_line(world, index, number))
     accel, size = take(world.accel[:, :vehicles], index), take(scene["size"], index)
     return _Candidates(number, points, usable, end, s, d, _bend_bound(points, s), states[..., 3], accel, size)
 
@@ -221,12 +225,14 @@ def propose(
     interception: InterceptionSettings,
     eta: Tensor,
     keep_route: bool = False,
+    halt_at_red: bool = False,
 ) -> Anchor:
     """The skeleton-consistent clean state of Sec. IV-A3 for scenes [B]; ego_plan [B, H >= 50, 4], eta [B].
 
     Proposals are made from the ego outwards. Vehicles that act on the ego meet its plan on a lane or, where that costs
     less, by an interception. The others meet their target's lane proposal; a target without one keeps its speed along
-    its route. keep_route: consider only the routes that vehicles follow now.
+    its route. keep_route: consider only the routes that vehicles follow now; halt_at_red: nobody passes a stop line
+    that binds it now.
     """
     times = DT * torch.arange(1, HORIZON + 1, device=ego_plan.device)
     expected = constant_speed_states(scene, world, times)
@@ -238,11 +244,11 @@ def propose(
     for depth in range(1, int(skeleton.depth.max()) + 1):
         index, present = compact(skeleton.depth == depth)
         target = skeleton.target.gather(1, index).clamp(min=0)
-        candidates = _candidates(scene, world, index, settings, keep_route)
+        candidates = _candidates(scene, world, index, settings, keep_route, halt_at_red)
         pick, knots, cost = _on_lane(candidates, take(expected, target), take(scene["size"], target), settings)
         cost, off_lane, found = cost.masked_fill(~present, torch.inf), torch.zeros_like(present), None
         if depth == 1 and interception.reach > 0:
-            found = intercept(world, index, target, expected, eta, interception)
+            found = intercept(world, index, target, expected, eta, interception, halt_at_red)
             off_lane = present & (found.cost < cost)
         on_lane = cost.isfinite() & ~off_lane
         expected = put(expected, index, on_lane, _states(candidates, pick, knots))

@@ -164,7 +164,7 @@ class E2(NominalTraffic):
             context = self.encode(state, world, ego_plan)
             return state, self.prior.sample(context, noise).x0, context
         world = replace(world, route=state.routed.route)
-        state, anchor = self._reselected(state, world, ego_plan, noise)
+        state, anchor = self._reselected(state, world, ego_plan)
         off_lane = anchor.off_lane & state.coalition & (state.eta > 0)[:, None]
         state = self._onto(state, world, state.routed.route, off_lane, anchor.off_lane_path)
         context = self.encode(state, world, ego_plan)
@@ -181,7 +181,7 @@ class E2(NominalTraffic):
         limit = self.control.transport_budget
         return None if limit is None else (limit - state.path_kl.sum(-1)).clamp(min=0)
 
-    def _reselected(self, state: E2State, world: World, ego_plan: Tensor, noise: Tensor) -> tuple[E2State, Anchor]:
+    def _reselected(self, state: E2State, world: World, ego_plan: Tensor) -> tuple[E2State, Anchor]:
         """States and anchors, with a new coalition in scenes whose choice is due and in which no member of the present
         coalition can meet its target any more."""
         due = state.replans == 0
@@ -192,7 +192,7 @@ class E2(NominalTraffic):
         if not len(rows):
             return state, anchor
         there = take_rows(world, rows)
-        chosen = self._select(take_rows(state, rows), there, ego_plan[rows], noise[:, rows])
+        chosen = self._select(take_rows(state, rows), there, ego_plan[rows])
         found = self._anchor(chosen, replace(there, route=chosen.routed.route), ego_plan[rows])
         return put_rows(state, rows, chosen), put_rows(anchor, rows, found)
 
@@ -225,13 +225,14 @@ class E2(NominalTraffic):
         self, skeleton: Skeleton, state: E2State, world: World, ego_plan: Tensor, keep_route: bool = False
     ) -> Anchor:
         settings = self.anchor, self.interception
-        return propose(world.scene, world, skeleton, ego_plan, *settings, state.eta, keep_route)
+        lawful = self.responsibility == "full"
+        return propose(world.scene, world, skeleton, ego_plan, *settings, state.eta, keep_route, lawful)
 
-    def _select(self, state: E2State, world: World, ego_plan: Tensor, noise: Tensor) -> E2State:
+    def _select(self, state: E2State, world: World, ego_plan: Tensor) -> E2State:
         """Topology on a reference rollout, feasibility, skeleton; the coalition takes the routes that meet targets."""
         scene, vehicles = world.scene, state.routed.route.shape[1]
         context = self.encode(state, world, ego_plan)
-        nominal = self.prior.plan(self.prior.sample(context, noise).x0, context)
+        nominal = self.prior.plan(self.prior.estimate(context), context)
         reference = torch.cat([ego_plan[:, None], nominal.states()[:, 1:]], 1).transpose(1, 2)
         valid = world.valid[:, None, :vehicles] & nominal.on_map.transpose(1, 2)
         found = topological_candidates(reference, valid, scene["size"][:, :vehicles], self.topology)

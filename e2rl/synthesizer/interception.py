@@ -11,11 +11,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS
 from e2rl.prior.routed import take_route
 from e2rl.scene.boxes import overlap
+from e2rl.scene.lane_direction import against_lanes
 from e2rl.scene.recording import DT
 from e2rl.scene.route import SPACING
 from e2rl.settings import check_range
@@ -23,6 +25,7 @@ from e2rl.sim.drivable import off_road
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
 from e2rl.synthesizer.motion import direction, take
+from e2rl.synthesizer.stop_line import way_to_stop_line
 
 ENDS = 3  # directions tried at the end of a path
 SAMPLES = 17  # points of a path that are checked
@@ -44,9 +47,10 @@ class InterceptionSettings:
     lateral_cost: float = 0.2
     time_cost: float = 0.1
     preference: float = 2.0
+    wrong_way: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("push", "brake", "lateral"):
+        for name in ("push", "brake", "lateral", "wrong_way"):
             check_range(f"synthesizer.interception.{name}", getattr(self, name), 0)
         check_range("synthesizer.interception.reach", self.reach, 0, HORIZON * DT)
 
@@ -115,6 +119,24 @@ def _lateral(paths: _Paths, speed: Tensor, accel: Tensor) -> tuple[Tensor, Tenso
     return (squared * curvature).amax(-1), curvature.amax(-1)
 
 
+def _within(
+    settings: InterceptionSettings, paths: _Paths, speed: Tensor, accel: Tensor, time: Tensor, eta: Tensor
+) -> Tensor:
+    """Bool [B, M, O]: paths entered at speed [B, M, 1] and driven at accel for time [B, M, O] keep the limits of
+    intensities eta [B, 1, 1]."""
+    lateral, curvature = _lateral(paths, speed, accel)
+    ok = (accel <= settings.push * eta) & (accel >= -settings.brake * eta) & (speed + accel * time >= 0)
+    ok &= (lateral <= settings.lateral * eta) & (curvature < MAX_CURVATURE)
+    return ok & (paths.bearing.abs() < MAX_BEARING) & (paths.turn.abs() < MAX_TURN)
+
+
+def _on_road(settings: InterceptionSettings, paths: _Paths, states: Tensor, scene: TensorDictBase) -> Tensor:
+    """Bool [B, M, O]: paths from states [B, M, 4] leave the drivable area by no more than the shoulder, or than now."""
+    field, origin = scene["field"], scene["field_origin"]
+    allowed = off_road(states[..., :2], field, origin).clamp(min=settings.shoulder)[..., None]
+    return off_road(paths.points, field, origin).amax(-1) <= allowed
+
+
 def _clear(paths: _Paths, travelled: Tensor, size: Tensor, others: tuple[Tensor, Tensor, Tensor]) -> Tensor:
     """Bool [B, M, O]: after `travelled` [B, M, O, W] m of their paths (< 0: arrived) vehicles touch none of the others.
 
@@ -132,11 +154,18 @@ def _clear(paths: _Paths, travelled: Tensor, size: Tensor, others: tuple[Tensor,
 
 
 def intercept(
-    world: World, index: Tensor, target: Tensor, expected: Tensor, eta: Tensor, settings: InterceptionSettings
+    world: World,
+    index: Tensor,
+    target: Tensor,
+    expected: Tensor,
+    eta: Tensor,
+    settings: InterceptionSettings,
+    halt_at_red: bool = False,
 ) -> Interception:
     """The cheapest interception by each of vehicles index [B, M] of its target [B, M], at intensities eta [B].
 
     expected [B, V, H, 4]: states of everybody at steps 1..H; on the way nobody but the target is touched.
+    halt_at_red: no path is longer than the way to a stop line that binds the vehicle now.
     """
     scene, vehicles = world.scene, expected.shape[1]
     states, target_states = take(world.states, index), take(expected, target)
@@ -149,24 +178,34 @@ def intercept(
     alike = wrap(paths.end_heading - meeting[..., 2].repeat_interleave(ENDS, -1)).cos().clamp(min=0) ** 2
     length = paths.length[..., -1] - 0.4 * (size[..., 0] + target_size[..., 0])[..., None] * alike
     accel = 2 * (length.clamp(min=0) - v * time) / time**2
-    lateral, curvature = _lateral(paths, v, accel)
-    field, origin, dial = scene["field"], scene["field_origin"], eta[:, None, None]
-    allowed = off_road(states[..., :2], field, origin).clamp(min=settings.shoulder)[..., None]
-    ok = (accel <= settings.push * dial) & (accel >= -settings.brake * dial) & (v + accel * time >= 0)
-    ok &= (lateral <= settings.lateral * dial) & (curvature < MAX_CURVATURE)
-    ok &= (paths.bearing.abs() < MAX_BEARING) & (paths.turn.abs() < MAX_TURN)
-    ok &= off_road(paths.points, field, origin).amax(-1) <= allowed
+    ok = _within(settings, paths, v, accel, time, eta[:, None, None])
+    ok &= _on_road(settings, paths, states, scene)
+    if halt_at_red:
+        assert world.route is not None
+        ok &= paths.length[..., -1] <= way_to_stop_line(world, index, take(world.route, index)[..., None].clamp(min=0))
     travelled = (v[..., None] * times + 0.5 * accel[..., None] * times**2).clamp(min=0)
     travelled = travelled.masked_fill(times >= time[..., None], -1.0)
     row = torch.arange(vehicles, device=index.device)
     counts = world.valid[:, None, :vehicles] & (row != index[..., None]) & (row != target[..., None])
     ok &= _clear(paths, travelled, size, (expected[:, :, steps - 1], scene["size"][:, :vehicles], counts))
-    cost = settings.accel_cost * accel.abs() + settings.lateral_cost * lateral + settings.time_cost * time
+    cost = settings.accel_cost * accel.abs() + settings.lateral_cost * _lateral(paths, v, accel)[0]
+    cost = cost + settings.time_cost * time
+    if settings.wrong_way > 0:
+        against = _against_lanes(scene, meeting, paths.end_heading)
+        cost = torch.where(against, cost + settings.wrong_way, cost)
     cost, pick = (cost - settings.preference).masked_fill(~ok, torch.inf).min(-1)
     knot_times = DT * KNOT_STEPS * torch.arange(1, HORIZON // KNOT_STEPS + 1, device=cost.device)
     knots = take_route(accel, pick)[..., None] * (knot_times <= take_route(time, pick)[..., None])
     points, length, heading = (take_route(x, pick) for x in (paths.points, paths.length, paths.end_heading))
     return Interception(_resampled(points, length, heading, scene["route_points"].shape[3]), knots, cost)
+
+
+def _against_lanes(scene: TensorDictBase, meeting: Tensor, end_heading: Tensor) -> Tensor:
+    """Bool [B, M, O]: paths end at meeting states [B, M, I, 4] with end_heading [B, M, O] against the lanes there."""
+    batch, count, moments = meeting.shape[:3]
+    heading = end_heading.reshape(batch, count * moments, ENDS)
+    xy = meeting[..., :2].flatten(1, 2)
+    return against_lanes(scene["lane_points"], scene["lane_index"], xy, heading).view_as(end_heading)
 
 
 def _resampled(points: Tensor, length: Tensor, heading: Tensor, count: int) -> Tensor:

@@ -12,10 +12,12 @@ from torch import Tensor
 from e2rl.prior.bounds import Duty
 from e2rl.scene.boxes import to_frame
 from e2rl.settings import check_range
+from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
 
 RESPONSIBILITIES = ("full", "rear", "none")
 NEAR = 4.0  # m ahead of the ego's centre from which on a vehicle leads it
+CROSSING = torch.pi / 6  # rad between headings above which a vehicle crosses the ego's way
 SAME_WAY = 0.5  # cosine between the headings of vehicles that drive the same way
 
 
@@ -50,6 +52,12 @@ def leading(world: World, vehicles: int) -> Tensor:
     return along & (place[..., 0] > NEAR)
 
 
+def owes_way(world: World, vehicles: int) -> Tensor:
+    """Bool [B, V]: vehicles that cross the ego's way from its left, and so give way where nothing else decides."""
+    angle = wrap(world.states[:, :vehicles, 2] - world.states[:, :1, 2])
+    return (angle < -CROSSING) & (angle > CROSSING - torch.pi)
+
+
 def duty_of(responsibility: str, settings: CareSettings, world: World, coalition: Tensor, eta: Tensor) -> Duty:
     """The Duty of a coalition [B, V] at intensities eta [B]."""
     vehicles, nobody, zero = coalition.shape[1], torch.zeros_like(coalition), torch.zeros_like(eta[:, None] * coalition)
@@ -59,5 +67,6 @@ def duty_of(responsibility: str, settings: CareSettings, world: World, coalition
     if responsibility == "rear":
         return Duty(ahead, nobody, zero)
     free = coalition & followed(world, vehicles)
-    patience = (settings.patience * eta).clamp(max=settings.max_patience)[:, None] * ahead
+    waits = ahead & ~owes_way(world, vehicles)
+    patience = (settings.patience * eta).clamp(max=settings.max_patience)[:, None] * waits
     return Duty(free, coalition & ~free, patience)

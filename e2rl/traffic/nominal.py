@@ -87,8 +87,7 @@ class NominalTraffic(Traffic):
     def predicted_ego(self, state: State, world: World) -> Tensor:
         """States [G, HORIZON, 4] of the ego predicted from its state and past (PREDICTIONS).
 
-        `prior`: the ego's row of the joint clean estimate at the highest noise level without noise, one pass of the
-        network: nearly the mean of its samples, and nearer to what egos drive than one of them.
+        `prior`: the ego's row of the joint clean estimate, nearer to what egos drive than a sample.
         """
         seen = turn_rate_and_acceleration(world)
         predict = PREDICTIONS[self.prediction]
@@ -96,9 +95,7 @@ class NominalTraffic(Traffic):
             return predict(world)
         lane = self.lane_now(state, world, seen)
         context = self.prior.encode(state.routed, lane, world.states, world.valid, world.step, None)
-        level = self.prior.schedule.levels(1, seen.device)[0]
-        x0 = self.prior.denoise(seen.new_zeros(*lane.v.shape, SIZE), level, context)
-        return self.prior.decode(x0, context).states()[:, 0]
+        return self.prior.decode(self.prior.estimate(context), context).states()[:, 0]
 
     def noise(self, state: State) -> Tensor:
         """Standard normal noise [K, B, V, SIZE] of the next replan."""

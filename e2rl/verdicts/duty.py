@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from e2rl.scene.lane_direction import against_lanes
 from e2rl.scene.recording import DT
 from e2rl.verdicts.drivers import HumanDriver
 from e2rl.verdicts.preventable import Collision, held
@@ -18,7 +19,6 @@ DUTIES = ("none", "rear-end", "light", "wrong way", "right of way", "entry")
 NONE, REAR_END, LIGHT, WRONG_WAY, RIGHT_OF_WAY, ENTRY = range(6)
 LIGHT_STEPS = round(5.0 / DT)  # before the contact in which a red light counts
 WRONG_STEPS = round(1.0 / DT)  # before the contact of which half must be against the lanes
-LANE_REACH = 2.5  # m from a lane's centreline within which a vehicle is on it
 SAME_WAY = torch.pi / 6  # rad between headings below which a vehicle enters the way rather than crosses it
 TURN = torch.pi / 7  # rad of heading within the last four seconds that make a turn
 TURN_STEPS = round(4.0 / DT)
@@ -93,11 +93,5 @@ def _against(track: Tensor, stop: Tensor, lanes: Lanes) -> Tensor:
     row = torch.arange(len(stop), device=stop.device)[:, None]
     window = (stop[:, None] - torch.arange(1, WRONG_STEPS + 1, device=stop.device)).clamp(min=0)
     states = track[row, window]
-    ahead = torch.nn.functional.normalize(lanes.points.diff(dim=1), dim=-1)
-    same = (lanes.lane[:, 1:] == lanes.lane[:, :-1]) & (lanes.lane[:, 1:] >= 0)
-    near = torch.cdist(states[..., :2], lanes.points[:, :-1]) < LANE_REACH
-    heading = torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)
-    along = torch.einsum("bkd,bmd->bkm", heading, ahead)
-    on = near & same[:, None]
-    with_it, against = (on & (along > 0.5)).any(-1), (on & (along < -0.5)).any(-1)
-    return (against & ~with_it).float().mean(-1) >= 0.5
+    against = against_lanes(lanes.points, lanes.lane, states[..., :2], states[..., 2, None])[..., 0]
+    return against.float().mean(-1) >= 0.5

@@ -8,7 +8,7 @@ from e2rl.errors import InputError
 from e2rl.prior.lane_relative import LaneState, speeds
 from e2rl.scene.boxes import overlap
 from e2rl.scene.drivable import CELL
-from e2rl.scene.recording import DT
+from e2rl.scene.recording import DT, LIGHT_GREEN, LIGHT_RED
 from e2rl.scene.route import SPACING, interpolate
 from e2rl.synthesizer.interception import InterceptionSettings, cubic, intercept
 from e2rl.synthesizer.motion import constant_speed_states
@@ -21,12 +21,12 @@ TIMES = DT * torch.arange(1, 51)
 FREE = replace(InterceptionSettings(), push=2.0, brake=2.0, lateral=2.0)
 
 
-def met(vehicles, eta=2.0, settings=FREE, world=None):
+def met(vehicles, eta=2.0, settings=FREE, world=None, halt_at_red=False):
     """Vehicle 1's interception of the ego among the others, all of which keep their speed."""
     world = world or make_world(vehicles)
     scene, expected = world.scene, constant_speed_states(world.scene, world, TIMES)
     index, target = (torch.full((len(scene), 1), vehicle) for vehicle in (1, 0))
-    found = intercept(world, index, target, expected, torch.full((len(scene),), eta), settings)
+    found = intercept(world, index, target, expected, torch.full((len(scene),), eta), settings, halt_at_red)
     return found, expected, scene["size"][:, :8]
 
 
@@ -119,3 +119,34 @@ def test_a_turned_and_moved_scene_has_the_turned_and_moved_way():
 def test_settings_that_make_no_sense_are_refused():
     with pytest.raises(InputError, match="reach"):
         InterceptionSettings(reach=9.0)
+
+
+def oncoming_world():
+    """A vehicle that comes towards the ego, whose lane runs with the ego."""
+    return make_world([EGO, (60.0, 3.5, math.pi, 8.0)])
+
+
+def test_a_path_that_ends_against_every_lane_costs_what_is_set_and_is_not_made_at_infinity():
+    free = met(None, world=oncoming_world())[0].cost
+    dear = met(None, settings=replace(FREE, wrong_way=1.5), world=oncoming_world())[0].cost
+    assert dear.item() == pytest.approx(free.item() + 1.5, abs=1e-5)
+    assert met(None, settings=replace(FREE, wrong_way=math.inf), world=oncoming_world())[0].cost.isinf()
+
+
+def test_whoever_drives_with_the_lanes_or_where_there_is_none_costs_no_more():
+    dear = replace(FREE, wrong_way=math.inf)
+    assert torch.equal(met([EGO, BESIDE], settings=dear)[0].cost, met([EGO, BESIDE])[0].cost)
+    world = oncoming_world()
+    world.scene["lane_index"][:] = -1
+    assert torch.equal(met(None, settings=dear, world=world)[0].cost, met(None, world=oncoming_world())[0].cost)
+
+
+@pytest.mark.parametrize("line, finite", [(40.0, False), (200.0, True)])
+def test_nobody_is_sent_past_its_own_red_light(line, finite):
+    world = make_world([EGO, BESIDE])
+    world.scene["light_state"] = torch.full((1, world.scene["logged"].shape[1], 1), LIGHT_RED)
+    world.scene["route_light"][:, 1, 0, 0], world.scene["route_light_s"][:, 1, 0, 0] = 0, line
+    assert bool(met(None, world=world, halt_at_red=True)[0].cost.isfinite()) == finite
+    assert met(None, world=world)[0].cost.isfinite().all()
+    world.scene["light_state"][:] = LIGHT_GREEN
+    assert met(None, world=world, halt_at_red=True)[0].cost.isfinite().all()

@@ -37,6 +37,13 @@ def test_all_but_those_that_the_ego_follows_give_way_and_only_those_ahead_of_it_
     assert duty.patience[0, :5].tolist() == [0.0, 2.0, 0.0, 0.0, 2.0], "who is not ahead of the ego brakes at once"
 
 
+def test_who_crosses_from_the_left_gives_way_at_once():
+    from_left, from_right, oncoming = (20, 20, -math.pi / 2, 8.0), (20, -20, math.pi / 2, 8.0), (40, 0, math.pi, 8.0)
+    world, coalition = world_of(from_left, from_right, oncoming)
+    duty = duty_of("full", CareSettings(), world, coalition, torch.tensor([2.0]))
+    assert duty.patience[0, 1:4].tolist() == [0.0, 2.0, 2.0]
+
+
 def test_patience_grows_with_intensity_up_to_its_bound():
     world, coalition = world_of((40.0, 0.0, math.pi, 8.0))
     settings = CareSettings(patience=1.5, max_patience=2.5)
