@@ -3,10 +3,9 @@
 from abc import abstractmethod
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.ego.base import Ego, EgoPolicy
+from e2rl.ego.base import Ego
 from e2rl.sim import dynamics
 from e2rl.sim.world import World
 
@@ -19,25 +18,14 @@ class RankingEgo(Ego):
         """Planned states [B, C, PLAN_STEPS, 4] and costs [B, C] of the C = `count` cheapest candidates, the cheapest
         first; inf where there are no more."""
 
+    @abstractmethod
+    def rated(self, world: World, states: Tensor) -> Tensor:
+        """Costs [B, C], in the same units, of driving along states [B, C, PLAN_STEPS, 4] that somebody else plans."""
 
-class RankingPolicy(EgoPolicy):
-    """A RankingEgo as a TorchRL policy that plans at every decision. Writes "choices" [B, C, 2], the actions of its C
-    cheapest candidates in the mean over the decision, their "costs" [B, C], and as "action" [B, 2] the first one."""
 
-    out_keys = ["action", "choices", "costs"]
-
-    def __init__(self, ego: RankingEgo, env, count: int) -> None:
-        """env: as of EgoPlanner; count: C."""
-        super().__init__(ego, env)
-        self.ranking, self.count, self.hold = ego, count, getattr(env, "base_env", env).hold
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        world = World.of(tensordict, self.scene)
-        if bool((world.step == 0).any()):
-            self.ego.reset(world)
-        states, tensordict["costs"] = self.ranking.ranked(world, self.count)
-        now, then = world.states[:, :1].expand_as(states[:, :, 0]), states[:, :, : self.hold]
-        choices = dynamics.inverse(torch.cat([now[:, :, None], then], 2)).mean(2)
-        tensordict["choices"] = choices.clamp(self.bounds.low[:, None], self.bounds.high[:, None])
-        tensordict["action"] = tensordict["choices"][:, 0]
-        return tensordict
+def ranked_actions(ego: RankingEgo, world: World, count: int, hold: int) -> tuple[Tensor, Tensor]:
+    """Actions [B, C, 2] (m/s^2, rad/s) of the C = `count` cheapest candidates, in the mean over the coming `hold`
+    steps, and their costs [B, C]."""
+    states, costs = ego.ranked(world, count)
+    now = world.states[:, None, :1].expand_as(states[:, :, :1])
+    return dynamics.inverse(torch.cat([now, states[:, :, :hold]], 2)).mean(2), costs

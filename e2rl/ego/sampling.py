@@ -13,6 +13,7 @@ from e2rl.ego.path import MissionPath
 from e2rl.ego.ranking import RankingEgo
 from e2rl.ego.scoring import Weights, score
 from e2rl.scene.recording import DT
+from e2rl.scene.route import project
 from e2rl.sim.world import World
 
 STRIDE = 2  # steps between two scored states
@@ -105,6 +106,12 @@ class SamplingEgo(RankingEgo):
         costs = costs.masked_fill(torch.nn.functional.pad(alike, (1, 0)), torch.inf)
         costs, best = costs.topk(count, largest=False)
         return states[row, best], costs
+
+    def rated(self, world: World, states: Tensor) -> Tensor:
+        """Costs [B, C] of driving along states [B, C, PLAN_STEPS, 4], which lead where they end."""
+        path = MissionPath(world)
+        end, shift, _ = project(states[:, :, -1, :2], path.route)
+        return self.costs(world, Candidates(states, end - path.s[:, None], shift))
 
     def candidates(self, world: World) -> Candidates:
         """Every speed profile on every lateral move."""

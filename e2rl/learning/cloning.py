@@ -11,8 +11,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.modules import ProbabilisticActor
 
+from e2rl.ego.network import ActorNetwork
 from e2rl.sim.env import DrivingEnv
 
+LABEL_WIDTH = (0.25, 0.12)  # of acceleration and yaw rate, in halves of the action's range
 EXPERT_SHARE = 0.99  # expert actions are clipped to this share of the bounds, where the squashed density is infinite
 
 
@@ -50,6 +52,18 @@ def cloning_loss(actor: ProbabilisticActor, pairs: TensorDictBase) -> Tensor:
     density = actor.get_dist(pairs.select("observation"))
     likelihood = density.log_prob(pairs["action"].transpose(0, 1)).transpose(0, 1)
     return -(pairs["weight"] * likelihood).sum(1).mean()
+
+
+def teaching_loss(network: ActorNetwork, pairs: TensorDictBase) -> Tensor:
+    """Cross-entropy [], up to a constant, of Gaussians of LABEL_WIDTH about the actor's most central actions under the
+    labels of pairs [M]: the mean of sum_c w_c |(a_c - a(o)) / width|^2 / 2, least where a(o) is the labels' mean.
+
+    `cloning_loss` fits the actor's own deviation too: late in a training, when that is a tenth, its gradient is a
+    hundred times as large as early, and it widens the exploration.
+    """
+    width = network.reach * network.reach.new_tensor(LABEL_WIDTH)
+    apart = (pairs["action"] - network.deterministic(pairs["observation"])[:, None]) / width
+    return (pairs["weight"] * apart.square().sum(-1)).sum(1).mean() / 2
 
 
 def drawn(experts: Sequence[TensorDictBase], count: int) -> TensorDict:

@@ -10,7 +10,6 @@ from torchrl.envs import TransformedEnv
 from tqdm import tqdm
 
 from e2rl.ego.base import Ego, EgoPolicy
-from e2rl.ego.ranking import RankingEgo, RankingPolicy
 from e2rl.learning.episodes import Episodes, concatenated, decisions
 from e2rl.scene.recording import DT
 from e2rl.scene.scene import SceneSet
@@ -45,21 +44,15 @@ class PoolDriver:
         """batch: number of environments, i.e. of rows driven at once; hold: steps of a decision."""
         self.env = DrivingEnv(scenes, sim, batch, device, agents=True, hold=hold)
 
-    def drive(
-        self, ego: Ego, pool: TrafficPool, rows: Tensor, disturb: Disturbance | None = None, choices: int = 0
-    ) -> TensorDict:
+    def drive(self, ego: Ego, pool: TrafficPool, rows: Tensor, disturb: Disturbance | None = None) -> TensorDict:
         """One episode of T decisions in each of pool rows [B]; B is the number of environments.
 
         Returns [B, T]: observation, intended (the ego's action), executed (after disturbance and bounds) [.., 2], alive
-        (the decision belongs to the episode), reward, contact, off_road, progress. With `choices` = C > 0, of a
-        RankingEgo, also choices [.., C, 2] and costs [.., C] as in RankingPolicy.
+        (the decision belongs to the episode), reward, contact, off_road, progress.
         """
         transform = AdversarialSynthesizer(pool, lambda count: rows[:count])
         env = TransformedEnv(self.env, transform)
-        policy: EgoPolicy = EgoPolicy(ego, env)
-        if isinstance(ego, RankingEgo) and choices > 0:
-            policy = RankingPolicy(ego, env, choices)
-        disturbed = Disturbed(policy, disturb)
+        disturbed = Disturbed(EgoPolicy(ego, env), disturb)
         length = decisions(self.env.horizon, self.env.hold)
         steps = env.rollout(length, disturbed, break_when_any_done=False)
         after, metrics = steps["next"], steps["next", "metrics"]
@@ -76,7 +69,6 @@ class PoolDriver:
             "contact": contact & alive,
             "progress": metrics["progress"][..., 0],
         }
-        frames |= {name: steps[name] for name in ("choices", "costs") if isinstance(policy, RankingPolicy)}
         return TensorDict(frames, batch_size=steps.batch_size, device=alive.device)
 
     def drive_all(self, ego: Ego, pool: TrafficPool, label: str = "") -> Episodes:

@@ -20,9 +20,10 @@ from e2rl.ego.base import Ego, EgoPlanner
 from e2rl.errors import InputError
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
 from e2rl.learning.episodes import OUTCOME_KEYS, Episodes, finished_episodes
+from e2rl.learning.experts import Experts
 from e2rl.learning.imitation import ImitationSettings
 from e2rl.learning.improvement import Improvement
-from e2rl.learning.teachers import Teachers
+from e2rl.learning.teaching import Teacher
 from e2rl.learning.update import Learner, UpdateSettings
 from e2rl.scene.scene import SceneSet
 from e2rl.settings import settings_of
@@ -83,12 +84,12 @@ class PolicyImprovement(Improvement):
         react: Mapping[str, Any] | None = None,
         rounds: int = 1,
     ) -> None:
-        """With ppo.cloning > 0, recorded: clone the recorded egos; evasions: clone the evasions in the pool's traffic;
-        teacher: clone this ego's survived episodes in the round's adversarial traffic, as `teaching` says. react:
-        vehicles that leave the replayed traffic (None: nobody); rounds: of the run, over which the learning rate falls;
-        others: conf/learner/ppo_bc.yaml.
+        """With ppo.cloning > 0, recorded: clone the recorded egos; evasions: clone the evasions in the pool's traffic.
+        With ppo.teaching > 0, teacher: a RankingEgo that labels states of the collected episodes, as `teaching` says.
+        react: vehicles that leave the replayed traffic (None: nobody); rounds: of the run, over which the learning rate
+        falls; others: conf/learner/ppo_bc.yaml.
 
-        Raises InputError if the ego is no actor or a round is shorter than an episode.
+        Raises InputError if the ego is no actor, the teacher no RankingEgo, or a round shorter than an episode.
         """
         if not isinstance(ego, ActorEgo):
             raise InputError(f"learner=ppo_bc improves ego=actor, not {type(ego).__name__}; use learner=planner_tuning")
@@ -102,18 +103,21 @@ class PolicyImprovement(Improvement):
                 f"an episode of {self.horizon} steps"
             )
         self.ego, self.learner, self.frames = ego, Learner(ego.network, update, rounds * iterations), 0
-        self.teachers = None
+        self.experts: Experts | None = None
+        self.teacher: Teacher | None = None
         if update.cloning > 0:
             pairs = settings_of(ImitationSettings, {"seed": seed, **(imitation or {})}, "learner.imitation")
-            given = pairs if recorded else None, evasions, teacher, teaching
-            self.teachers = Teachers(scenes, sim, hold, device, *given)
+            self.experts = Experts(scenes, sim, hold, device, pairs if recorded else None, evasions)
+        if update.teaching > 0:
+            self.teacher = Teacher(teacher, scenes, (ego.network.low, ego.network.high), hold, teaching)
         every = torch.arange(len(scenes))
         self.draw = RowDraw(torch.full((len(scenes),), 1 / len(scenes), dtype=torch.float64), seed)
         self.reaction = None
         if react is not None:
             self.reaction = Reaiming(settings_of(ReactSettings, react, "learner.react"), seed)
         self.synthesizer = AdversarialSynthesizer(TrafficPool.recorded(every), self.draw, traffic, ego, self.reaction)
-        base = DrivingEnv(scenes, sim, batch, device, agents=traffic is not None, hold=hold)
+        agents = traffic is not None or self.teacher is not None
+        base = DrivingEnv(scenes, sim, batch, device, agents=agents, hold=hold)
         self.env = TransformedEnv(base, Compose(self.synthesizer, RewardSum()))
         actor = ego.network.actor
         self._collector = Collector(
@@ -132,7 +136,7 @@ class PolicyImprovement(Improvement):
         """Reset every environment; `iterations` times: collect [B, steps] decisions, update. `frames` are steps of
         0.1 s."""
         begin = time.perf_counter()
-        experts = {} if self.teachers is None else self.teachers.pairs(pool)
+        experts = {} if self.experts is None else self.experts.pairs(pool)
         counts = {"pairs": time.perf_counter() - begin, "expert_pairs": float(sum(map(len, experts.values())))}
         counts |= {f"{kind}_pairs": float(len(pairs)) for kind, pairs in experts.items()}
         self.synthesizer.pool = pool
@@ -145,7 +149,8 @@ class PolicyImprovement(Improvement):
             collecting += time.perf_counter() - begin
             self.frames += steps_of(data)
             kept.append(data.select(*OUTCOME_KEYS).cpu().clone())
-            rows.append(self.learner.update(data, [*experts.values()]))
+            labels, made = self._labels(data, pool.adversarial)
+            rows.append(self.learner.update(data, [*experts.values()], labels) | made)
             bar.set_postfix(reward=f"{data['next', 'reward'].mean().item():.3f}", kl=f"{rows[-1]['kl']:.4f}")
         episodes = finished_episodes(kept, pool.adversarial, self.horizon, self.settings.hold)
         columns: dict[str, list[float]] = defaultdict(list)
@@ -161,6 +166,14 @@ class PolicyImprovement(Improvement):
         self._collector.update_policy_weights_()
         return next(self._batches)
 
+    def _labels(self, data: TensorDictBase, adversarial: Tensor) -> tuple[TensorDictBase | None, dict[str, float]]:
+        """The teacher's labels so far, those in a batch included, and what these were."""
+        if self.teacher is None:
+            return None, {}
+        begin, count = time.perf_counter(), -(-self.teacher.settings.states // self.settings.iterations)
+        made = self.teacher.watch(data, adversarial, self.ego, count)
+        return self.teacher.pairs, {**made, "label_seconds": time.perf_counter() - begin}
+
     def outcome(self, folder: Path) -> str:
         """How to evaluate the improved ego of a run's folder."""
         return f"evaluate the policy with: python evaluate.py ego=actor ego.checkpoint={folder}"
@@ -168,6 +181,7 @@ class PolicyImprovement(Improvement):
     def state_dict(self) -> dict:
         """Learner, draws and frames; the weights are the network's."""
         state = {"learner": self.learner.state_dict(), "frames": self.frames, "draws": self.draw.generator.get_state()}
+        state |= {} if self.teacher is None else {"labels": self.teacher.state_dict()}
         return state | ({} if self.reaction is None else {"reaction": self.reaction.generator.get_state()})
 
     def load_state_dict(self, state: dict) -> None:
@@ -176,4 +190,6 @@ class PolicyImprovement(Improvement):
         self.draw.generator.set_state(state["draws"].cpu())
         if self.reaction is not None:
             self.reaction.generator.set_state(state["reaction"].cpu())
+        if self.teacher is not None:
+            self.teacher.load_state_dict(state["labels"])
         self.frames = state["frames"]

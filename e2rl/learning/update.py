@@ -13,7 +13,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from e2rl.ego.network import ActorCritic
 from e2rl.errors import InputError
-from e2rl.learning.cloning import cloning_loss, drawn
+from e2rl.learning.cloning import cloning_loss, drawn, teaching_loss
 
 VALUE_MEMORY = 0.95  # weight of the past in the running mean and variance of the returns, per update
 PEAK_MEMORY = 0.75  # of the past in the running maximum of |advantage|, per update
@@ -36,6 +36,7 @@ class UpdateSettings:
     target_kl: float = 0.04
     advantage_filter: float = 0.01
     critic_warmup: int = 1
+    teaching: float = 0.0
     cloning: float = 0.0
     cloning_minibatch: int = 256
     feature_noise: float = 0.3
@@ -63,9 +64,11 @@ class Learner:
         )
         self.optimiser = torch.optim.Adam(network.parameters(), settings.learning_rate)
 
-    def update(self, data: TensorDictBase, experts: Sequence[TensorDictBase] = ()) -> dict[str, float]:
+    def update(
+        self, data: TensorDictBase, experts: Sequence[TensorDictBase] = (), labels: TensorDictBase | None = None
+    ) -> dict[str, float]:
         """One PPO iteration on a Collector's batch [B, T], with behaviour cloning on kinds of expert pairs, each [M]
-        with M >= 1 (e2rl.learning.cloning), that share a minibatch evenly.
+        with M >= 1 (e2rl.learning.cloning), that share a minibatch evenly, and on a teacher's labels [M].
 
         Passes end early when the policy has moved by target_kl. The first `critic_warmup` calls fit the critic alone.
         The observation statistics are updated at the end, so they are equal in collection and update.
@@ -81,7 +84,7 @@ class Learner:
         for _ in range(settings.epochs):
             moved = []
             for index in torch.randperm(len(flat), device=flat.device).split(settings.minibatch):
-                losses = self._step(flat[index], experts, warming)
+                losses = self._step(flat[index], experts, labels, warming)
                 moved.append(losses["kl"])
                 for name, value in losses.items():
                     sums[name].append(value)
@@ -145,7 +148,9 @@ class Learner:
         """Values [..., 1] in units of the reward."""
         return self.returns.denormalize(self.network.critic.module[1](seen))
 
-    def _step(self, minibatch: TensorDictBase, experts: Sequence[TensorDictBase], warming: bool) -> dict[str, Tensor]:
+    def _step(
+        self, minibatch: TensorDictBase, experts: Sequence[TensorDictBase], labels: TensorDictBase | None, warming: bool
+    ) -> dict[str, Tensor]:
         """One optimiser step; the losses and diagnostics, detached."""
         settings = self.settings
         out = self.ppo(minibatch)
@@ -165,6 +170,10 @@ class Learner:
             with self.network.network.noisy(settings.feature_noise, settings.last_action_noise):
                 losses["loss_cloning"] = cloning_loss(self.network.actor, pairs)
             total = total + settings.cloning * losses["loss_cloning"]
+        if labels is not None and settings.teaching > 0 and not warming:
+            pairs = drawn([labels], settings.cloning_minibatch).to(self.network.device)
+            losses["loss_teaching"] = teaching_loss(self.network.network, pairs)
+            total = total + settings.teaching * losses["loss_teaching"]
         take_step(self.optimiser, total, settings.max_grad_norm)
         return {name: value.detach().mean() for name, value in losses.items()}
 

@@ -118,3 +118,11 @@ def prospects(static: StaticScene, state: Tensor, pose: FrenetPose, rotation: Te
     gap, end = gaps(*manoeuvres(static, state, pose, rotation), static.size, others), TIMES[-1] + TIMES[0]
     first = torch.where(gap < TIGHT, plan_on(gap.device).time, end).amin(-1) / end
     return torch.cat([gap.amin(-1).clamp(-1, WIDEST) / WIDEST, first], -1)
+
+
+def time_to_contact(observation: Tensor) -> Tensor:
+    """Seconds [...] until the ego's first gap below TIGHT if it goes on along its mission, at no more than 1 m/s^2, by
+    the prospects at the end of observations [..., D]; more than TIMES[-1] where there is none."""
+    first = observation[..., -PROSPECTS // 2 :].unflatten(-1, (len(ACCELERATIONS), len(OFFSETS)))
+    mild = [index for index, accel in enumerate(ACCELERATIONS) if abs(accel) <= 1]
+    return first[..., mild, OFFSETS.index(0.0)].amax(-1) * (TIMES[-1] + TIMES[0])

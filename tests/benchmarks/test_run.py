@@ -23,7 +23,6 @@ SHORT = [
     "learner.collect.steps=80",
     "learner.collect.iterations=1",
     "learner.ppo.epochs=1",
-    "learner.teacher=null",
     "learner.recorded=false",
     "measure.scenes=1",
 ]

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torchrl.objectives import BCLoss
 
 from e2rl.ego.actor import ActorEgo
-from e2rl.learning.cloning import cloning_loss, drawn
+from e2rl.learning.cloning import LABEL_WIDTH, cloning_loss, drawn, teaching_loss
 from e2rl.sim.observation import OBSERVATION_SIZE
 
 
@@ -84,3 +84,28 @@ def test_kinds_share_a_minibatch_evenly_whatever_their_sizes(count):
     assert len(found) == count and abs(int(first.sum()) - count / 2) < 1
     assert torch.equal(found["weight"].sum(1), torch.ones(count))
     assert not found["weight"][first, 1].any(), "filled up"
+
+
+def test_what_a_teacher_teaches_is_learned_best_by_acting_as_its_labels():
+    """Nobody has a lower loss than who acts as their mean; the exploration's width is left alone."""
+    actor, actions, weights = network(), torch.tensor([[-3.0, 0.2], [1.0, -0.4], [2.0, 0.0]]), [0.5, 0.3, 0.2]
+    given = pairs(actions.tolist(), weights)
+    mean = (torch.tensor(weights)[:, None] * actions).sum(0)
+    acted = torch.nn.Parameter(mean.clone())
+    policy = actor.network
+    spread = policy.spread
+    loss = teaching_loss(policy, given)
+    assert torch.autograd.grad(loss, spread, allow_unused=True) == (None,)
+    policy.deterministic = lambda observation: acted.expand(len(observation), 2)
+    best = teaching_loss(policy, given)
+    torch.testing.assert_close(torch.autograd.grad(best, acted)[0], torch.zeros(2), atol=1e-4, rtol=0)
+    assert best < loss
+    certain = pairs([mean.tolist()], [1.0])
+    assert teaching_loss(policy, certain).abs() < 1e-6
+
+
+def test_a_teaching_error_of_the_labels_width_costs_one_half_each():
+    policy = network().network
+    wide = policy.reach * torch.tensor(LABEL_WIDTH)
+    policy.deterministic = lambda observation: torch.zeros(len(observation), 2)
+    assert teaching_loss(policy, pairs([wide.tolist()], [1.0])).item() == pytest.approx(1.0)

@@ -5,7 +5,9 @@ import shapely
 import torch
 
 from e2rl.sim.arc import Arc, along_arc
-from e2rl.sim.prospects import TIGHT, TIMES, Others, gaps, travelled
+from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.prospects import TIGHT, TIMES, Others, gaps, time_to_contact, travelled
+from tests.synthetic import make_scenes
 
 CAR = (4.6, 2.0)
 
@@ -82,3 +84,11 @@ def test_braking_ends_before_a_car_ahead_and_driving_on_does_not():
     ahead, size = others((22.0, 0.0, 0.0, 0.0, 0.0)), torch.tensor([CAR])
     braking, going_on = (gaps(*straight_on(10.0, accel), size, ahead).amin() for accel in (-7.0, 1.0))
     assert braking > 5 and going_on < TIGHT
+
+
+@pytest.mark.parametrize(("gap", "expected"), [(8.0, 1.0), (22.0, 2.6), (80.0, TIMES[0] + TIMES[-1])])
+def test_the_time_to_contact_is_that_of_going_on_behind_a_standing_car(gap, expected):
+    """The first moment looked at by which braking at 1 m/s^2 has used up the gap; swerving does not count."""
+    cars = [(0.0, 0, 10.0), (gap + 4.5, 0, 0.0)]
+    observation = DrivingEnv(make_scenes(1, vehicles=cars, num_vrus=0), SimSettings(), 1).reset()["observation"]
+    assert time_to_contact(observation).item() == pytest.approx(expected, abs=1e-3)

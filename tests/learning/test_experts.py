@@ -1,18 +1,14 @@
-"""Teachers: evasions that avoid what hit the policy, planners that survive, soft labels of what they weighed."""
+"""Experts: evasions that avoid what hit the policy."""
 
 import pytest
 import torch
 
 from e2rl.ego.actor import ActorEgo
-from e2rl.ego.idm import IDMEgo
-from e2rl.ego.sampling import SamplingEgo
-from e2rl.errors import InputError
 from e2rl.learning.attack import Order, make_traffic
 from e2rl.learning.checkpoint import load_checkpoint, save_checkpoint
-from e2rl.learning.cloning import clip_expert
 from e2rl.learning.driving import PoolDriver, episodes_of
+from e2rl.learning.experts import Experts, GivenActions, evasion_pairs
 from e2rl.learning.solvability import Solved, solvable
-from e2rl.learning.teachers import GivenActions, Teachers, TeachingSettings, corrective_pairs, evasion_pairs
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.pool import TrafficPool
 from tests.learning.small import brake_check, small_run, small_scenes
@@ -64,62 +60,27 @@ def test_rows_without_an_evasion_yield_no_pairs():
     index, driver = torch.arange(2), PoolDriver(scenes, SIM, 2)
     pool = TrafficPool.stored(brake_check(scenes)(None, index, 2.0, 0), 2.0) + TrafficPool.recorded(index)
     assert evasion_pairs(driver, pool, 0) is None
-    teachers = Teachers(scenes, SIM, 2, evasions=True)
-    assert teachers.pairs(pool) == {} == teachers.pairs(TrafficPool.recorded(index))
+    experts = Experts(scenes, SIM, 2, evasions=True)
+    assert experts.pairs(pool) == {} == experts.pairs(TrafficPool.recorded(index))
 
 
 def test_pairs_of_remembered_evasions_are_made_once_and_leave_with_their_rows():
     scenes = small_scenes(2, steps=40)
     older, newer = attacked(scenes), attacked(scenes, 3.0)
-    teachers, made = Teachers(scenes, SIM, 2, evasions=True), []
-    drive = teachers._by_decision.drive
-    teachers._by_decision.drive = lambda *given: made.append(1) or drive(*given)
-    first = teachers.pairs(older)["evasions"]
-    both = teachers.pairs(newer + older)["evasions"]
+    experts, made = Experts(scenes, SIM, 2, evasions=True), []
+    drive = experts._driver.drive
+    experts._driver.drive = lambda *given: made.append(1) or drive(*given)
+    first = experts.pairs(older)["evasions"]
+    both = experts.pairs(newer + older)["evasions"]
     assert len(made) == 2 and torch.equal(both[-len(first) :]["action"], first["action"])
-    assert len(teachers.pairs(newer)["evasions"]) == len(both) - len(first) and len(made) == 2
-
-
-def test_corrective_pairs_are_those_of_survived_attacks():
-    scenes = small_scenes(3, steps=40)
-    attack = TrafficPool.stored(brake_check(scenes)(None, torch.arange(3), 1.0, 0), 1.0)
-    driver = PoolDriver(scenes, SIM, 2)
-    careful = corrective_pairs(driver, IDMEgo(), attack + TrafficPool.recorded(torch.arange(3)))
-    assert torch.bincount(careful["scene_index"]).tolist() == [40, 40, 40], "each row once"
-    assert (careful["action"][:, 0, 0] < -1).any() and torch.equal(careful["weight"], torch.ones(120, 1))
-    blind = corrective_pairs(driver, IDMEgo(hardest_braking=0.0, braking=0.01), attack)
-    assert len(blind) == 0
-    with pytest.raises(InputError, match="no fresh adversarial"):
-        corrective_pairs(driver, IDMEgo(), TrafficPool.recorded(torch.arange(3)))
-
-
-def test_soft_labels_are_what_the_planner_weighed():
-    """The first label is what it does, its weights are the softmax, and a low temperature leaves the first alone."""
-    scenes = small_scenes(2, steps=20)
-    pool = TrafficPool.stored(brake_check(scenes)(None, torch.arange(2), 1.0, 0), 1.0)
-    driver, teacher = PoolDriver(scenes, SIM, 2), SamplingEgo()
-    hard = corrective_pairs(driver, teacher, pool, TeachingSettings(candidates=1))
-    soft = corrective_pairs(driver, teacher, pool, TeachingSettings(candidates=8, temperature=2.0))
-    cold = corrective_pairs(driver, teacher, pool, TeachingSettings(candidates=8, temperature=1e-3))
-    assert hard["action"].shape == (40, 1, 2) and soft["action"].shape == (40, 8, 2)
-    frames = driver.drive(SamplingEgo(), pool, torch.arange(2))
-    torch.testing.assert_close(hard["observation"], frames["observation"].flatten(0, 1))
-    bounds = driver.env.action_spec.space
-    done = clip_expert(frames["executed"].flatten(0, 1), bounds.low[0], bounds.high[0])
-    torch.testing.assert_close(hard["action"][:, 0], done, atol=2e-3, rtol=0)
-    torch.testing.assert_close(soft["action"][:, :1], hard["action"], atol=1e-5, rtol=0)
-    weight = soft["weight"]
-    torch.testing.assert_close(weight.sum(1), torch.ones(40))
-    assert (weight.diff(dim=1) <= 0).all() and (weight[:, 0] < 0.9).any() and cold["weight"][:, 0].mean() > 0.9
-    with pytest.raises(InputError, match=r"learner\.teaching\.candidates"):
-        TeachingSettings(candidates=0)
+    assert len(experts.pairs(newer)["evasions"]) == len(both) - len(first) and len(made) == 2
 
 
 def test_a_round_clones_evasions_and_a_resumed_one_the_same(tmp_path):
     scenes = small_scenes(steps=40)
 
     def begun():
-        expert = {"evasions": True, "teacher": SamplingEgo()}
+        expert = {"evasions": True}
         run = small_run(folder=tmp_path, scenes=scenes, expert=expert, cloning=0.5, collect={"hold": 2}, final_lr=1.0)
         attack = brake_check(scenes)
         run.synthesize = lambda ego, index, eta, seed: attack(ego, index, eta + 1.5 * (eta > 0), seed)
@@ -130,7 +91,7 @@ def test_a_round_clones_evasions_and_a_resumed_one_the_same(tmp_path):
     one = run.run_round()
     save_checkpoint(tmp_path, run, {})
     two = run.run_round()
-    assert two["train/evasions_pairs"] > one["train/evasions_pairs"] > 0 and one["train/teacher_pairs"] > 0
+    assert two["train/evasions_pairs"] > one["train/evasions_pairs"] > 0
     again = begun()
     assert load_checkpoint(tmp_path, again) == 1
     resumed = again.run_round()

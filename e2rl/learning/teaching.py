@@ -1,0 +1,120 @@
+"""A planner's labels in states that the policy comes to (DAgger, Ross, Gordon and Bagnell 2011), where they matter.
+
+A label of every state teaches the planner's speed: it would rather drive faster nearly everywhere. What it knows better
+is how to get away. So states are labelled shortly before a contact or a near miss, and of these only where, by the
+planner's costs, the policy's own plan is worse by far and the planner's is not a contact itself.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from e2rl.ego.base import Ego
+from e2rl.ego.ranking import RankingEgo, ranked_actions
+from e2rl.errors import InputError
+from e2rl.learning.cloning import clip_expert
+from e2rl.scene.recording import DT
+from e2rl.scene.scene import SceneSet
+from e2rl.settings import check_range, settings_of
+from e2rl.sim.prospects import time_to_contact
+from e2rl.sim.world import World
+
+BATCH = 32  # states that are labelled at once
+
+
+@dataclass(frozen=True)
+class TeachingSettings:
+    """Fields: `teaching` in conf/learner/ppo_bc.yaml."""
+
+    states: int = 4096
+    memory: int = 16384
+    window: float = 2.5
+    near: float = 1.2
+    regret: float = 20.0
+    survivable: float = 60.0
+    candidates: int = 16
+    temperature: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name, least in (("states", 1), ("memory", 1), ("window", 0), ("near", 0), ("candidates", 1)):
+            check_range(f"learner.teaching.{name}", getattr(self, name), least)
+        check_range("learner.teaching.temperature", self.temperature, 1e-6)
+
+
+def critical(data: TensorDictBase, window: float, near: float) -> Tensor:
+    """Bool [B, T]: decisions of a collected batch at most `window` s before a contact, or before a near miss: less than
+    `near` s to a contact if the ego goes on. Both in the same episode."""
+    metrics, length = data["next", "metrics"], data.shape[1]
+    contact = (metrics["contact"] | metrics["contact_vru"])[..., 0]
+    event = _coming(contact | (time_to_contact(data["observation"]) < near))
+    step = data["timestep"][..., 0]
+    wait = step.gather(1, event.clamp(max=length - 1)) - step
+    same = (event < length) & (event <= _coming(data["next", "done"][..., 0]))
+    return same & (wait * DT <= window)
+
+
+def _coming(flag: Tensor) -> Tensor:
+    """Index [B, T] of the next flag [B, T], this one included; T where there is none."""
+    index = torch.arange(flag.shape[1], device=flag.device)
+    return torch.where(flag, index, flag.shape[1]).flip(1).cummin(1).values.flip(1)
+
+
+class Teacher:
+    """Labels states of collected batches; `pairs` [M] (e2rl.learning.cloning) are the newest ones of all rounds."""
+
+    def __init__(
+        self,
+        planner: Ego | None,
+        scenes: SceneSet,
+        bounds: tuple[Tensor, Tensor],
+        hold: int,
+        settings: Mapping[str, Any] | None = None,
+    ) -> None:
+        """bounds: lowest and highest action [2]; hold: steps of a decision; settings: of TeachingSettings. Raises
+        InputError if the planner does not rank candidates."""
+        if not isinstance(planner, RankingEgo):
+            raise InputError(
+                f"learner.teacher={type(planner).__name__}: it cannot tell what its candidates cost; take an "
+                "e2rl.ego.ranking.RankingEgo such as e2rl.ego.sampling.SamplingEgo, or set learner.ppo.teaching=0"
+            )
+        self.settings = settings_of(TeachingSettings, settings or {}, "learner.teaching")
+        self.planner, self.scenes, self.bounds, self.hold = planner, scenes, bounds, hold
+        self.pairs: TensorDict | None = None
+
+    def watch(self, data: TensorDictBase, adversarial: Tensor, ego: Ego, count: int) -> dict[str, float]:
+        """Look at up to `count` critical decisions, drawn evenly, of adversarial episodes in a batch [B, T] that `ego`
+        drove. adversarial [R] bool: of the pool's rows. Returns how many there were, and the labels that they made."""
+        attacked = adversarial.to(data.device)[data["traffic", "row"][..., 0]]
+        places = (attacked & critical(data, self.settings.window, self.settings.near)).nonzero()
+        row, column = places[torch.randperm(len(places), device=places.device)[:count]].unbind(1)
+        frames = data.select("observation", "timestep", "scene_index", "agents")[row, column]
+        parts = [self.labels(part, ego) for part in frames.split(BATCH)] if len(frames) else []
+        known = [] if self.pairs is None else [self.pairs]
+        if parts:
+            self.pairs = torch.cat([*known, *parts])[-self.settings.memory :]
+        return {"critical": float(len(places)), "labels": float(sum(map(len, parts)))}
+
+    def labels(self, frames: TensorDictBase, ego: Ego) -> TensorDict:
+        """Pairs [K] of the states frames [M] of a DrivingEnv with `agents=True` in which ego's plan costs at least
+        `regret` more than the planner's, whose own cost is below `survivable`."""
+        settings = self.settings
+        world = World.of(frames, self.scenes.batch(frames["scene_index"][:, 0].cpu()).to(frames.device))
+        action, cost = ranked_actions(self.planner, world, settings.candidates, self.hold)
+        own = self.planner.rated(world, ego.plan(world)[:, None])[:, 0]
+        weight = torch.softmax(-cost / settings.temperature, -1)
+        pairs = {"observation": frames["observation"], "action": clip_expert(action, *self.bounds), "weight": weight}
+        kept = (own - cost[:, 0] >= settings.regret) & (cost[:, 0] < settings.survivable)
+        return TensorDict(pairs, batch_size=frames.batch_size)[kept]
+
+    def state_dict(self) -> dict:
+        """The pairs, of plain tensors."""
+        return {} if self.pairs is None else self.pairs.to_dict()
+
+    def load_state_dict(self, state: dict) -> None:
+        """Restore a `state_dict`."""
+        device = self.bounds[0].device
+        self.pairs = TensorDict(state, [len(state["weight"])]).to(device) if state else None
