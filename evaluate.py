@@ -20,6 +20,7 @@ from e2rl.evaluation.protocol import Setup, run_protocol
 from e2rl.evaluation.realism_meta import meta_rows
 from e2rl.report.drawing import save_picture
 from e2rl.report.egos import ego_tables, guard_table
+from e2rl.report.html import report_command
 from e2rl.report.intensity import intensity_figure
 from e2rl.report.modes import mode_tables
 from e2rl.report.plots import collision_bars, learning_curves
@@ -66,6 +67,8 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
         rollout = chain.rollout(scenes, name, folder)
         save_picture(folder / "skeleton.png", skeleton_figure(rollout, chain.selection, chain.topology))
     print(f"\nwritten to {folder}")
+    if command := report_command(folder):
+        print(f"watch its failures: {command}")
     return rows
 
 

@@ -100,7 +100,23 @@ def rollout_arrays(rollouts: dict, index: int, source: Source) -> dict[str, np.n
         "drivable_points": rings,
         "drivable_offsets": ring_offsets,
         **{name: row[name].numpy() for name in OPTIONAL if name in row},
+        **plan_arrays(row),
     }
+
+
+def plan_arrays(row: dict[str, Tensor]) -> dict[str, np.ndarray]:
+    """The evasion of the ego, where one was found, and the plans and targets of the ego and the adversaries, where the
+    rollout knows them."""
+    arrays = {}
+    if "evasion" in row and not row["evasion"].isnan().any():
+        arrays["evasion"] = row["evasion"].float().numpy()
+    if "plans" in row:
+        planners = row["adversaries"][: row["plans"].shape[1]].bool().clone()
+        planners[0] = True
+        arrays["planners"] = planners.nonzero()[:, 0].numpy()
+        arrays["plans"] = row["plans"][:, planners].float().numpy()
+        arrays["targets"] = row["targets"][:, planners].numpy()
+    return arrays
 
 
 def polylines(points: Tensor, index: Tensor, minimum: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -69,7 +69,8 @@ class Setup:
         rollouts = self.roll_out(method, tasks)
         source = Source(self.scenes.dataset, self.scenes.split, method.name, self.ego_name)
         rows, samples = score_rollouts(rollouts)
-        add_avoidable(rows, rollouts, self.scenes.batch([scene for scene, _ in tasks]), self.sim)
+        scene = self.scenes.batch([scene for scene, _ in tasks])
+        rollouts["evasion"] = add_avoidable(rows, rollouts, scene, self.sim)
         if folder is not None:
             write_rollouts(folder, rollouts, source)
         return label_rows(rows, source), samples

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from e2rl.errors import InputError
 from e2rl.files import write_atomically
 from e2rl.metrics.catalogue import META_STAGE, METRICS, OPEN_LOOP_STAGE, STAGES, Metric, table_metrics
 
@@ -183,6 +184,25 @@ def save_tables(path: Path, tables: Sequence[Table]) -> None:
     """Write the tables into one markdown file, with a list of what each metric means."""
     parts = [*(table.markdown() for table in tables), f"```\n{legend()}\n```\n"]
     write_atomically(path, "\n".join(parts))
+
+
+def read_tables(path: Path) -> list[Table]:
+    """The tables of a file that `save_tables` wrote; a caption is one line. InputError where there is no such file."""
+    try:
+        blocks = Path(path).read_text().split("\n\n")
+    except OSError as error:
+        raise InputError(f"{path}: no tables ({error}); give the folder of a run that evaluate.py wrote") from error
+    tables: list[Table] = []
+    title = ""
+    for block, caption in zip(blocks, [*blocks[1:], ""], strict=True):
+        lines = block.strip().splitlines()
+        if block.strip().startswith("## "):
+            title = block.strip()[3:]
+        elif lines and lines[0].startswith("| "):
+            head, _, *rows = [[cell.replace("&#124;", "|") for cell in row[2:-2].split(" | ")] for row in lines]
+            tables.append(Table(caption.strip(), head, rows, title))
+            title = ""
+    return tables
 
 
 def print_tables(tables: Sequence[Table]) -> None:

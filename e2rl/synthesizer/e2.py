@@ -153,7 +153,8 @@ class E2(NominalTraffic):
         self._react = react
         state, plan = super().replan(state, world, ego_plan)
         figures = {"anchor_jump": state.anchor_jump}
-        return state, replace(plan, adversary=state.coalition, path_kl=state.path_kl, figures=figures)
+        found = {"adversary": state.coalition, "target": state.target, "path_kl": state.path_kl}
+        return state, replace(plan, **found, figures=figures)
 
     def replan_group(
         self, state: E2State, world: World, ego_plan: Tensor, noise: Tensor, group: Group

@@ -45,7 +45,8 @@ class TrafficPlan:
     states [B, V, HORIZON, 4] (the ego's row is ignored); present [B, V, HORIZON] bool: false from the step on at which
     a vehicle has left; adversary [B, V] bool: under adversarial control (None: no vehicle); path_kl [B, V]: discrete
     path KL of the control since the start (None: 0); route [B, V] int64: route candidates followed, -1 none (None: the
-    recorded ones); figures {name: [B, V]}: further outputs of a method, written under ("traffic", name).
+    recorded ones); target [B, V] int64: whom each vehicle under control acts on, 0 the ego, -1 nobody (None: nobody);
+    figures {name: [B, V]}: further outputs of a method, written under ("traffic", name).
     """
 
     states: Tensor
@@ -53,6 +54,7 @@ class TrafficPlan:
     adversary: Tensor | None = None
     path_kl: Tensor | None = None
     route: Tensor | None = None
+    target: Tensor | None = None
     figures: dict[str, Tensor] = field(default_factory=dict)
 
 

@@ -47,6 +47,7 @@ class AdversarialSynthesizer(Transform):
         leaves replayed traffic."""
         super().__init__()
         self.pool, self.draw, self.traffic, self.ego, self.reaction = pool, draw, traffic, ego, reaction
+        self.on_plan: Callable[[TrafficPlan], None] | None = None  # called with every new plan
         self._next_reaction = 0  # the environment's clock at which vehicles react next
         nothing = torch.zeros(0, dtype=torch.int64)  # before the first reset
         self._drawn = nothing  # [B] pool row of each episode
@@ -157,6 +158,8 @@ class AdversarialSynthesizer(Transform):
         state, plan = self._method.replan(state, now, ego_plan if whole else ego_plan[rows], **queries)
         self._state = state if whole else put_rows(self._state, rows, state)
         self._note(rows, plan)
+        if self.on_plan is not None:
+            self.on_plan(plan)
         self._planned_at[rows] = world.step[rows]
         self._env.write_traffic(rows, plan.states, plan.present)
 

@@ -49,6 +49,21 @@ def test_rollouts_have_the_format_s_keys_types_and_names(tmp_path, rollouts):
         np.testing.assert_array_equal(data["states"], rollouts["states"][index].numpy())
 
 
+def test_plans_are_kept_of_the_ego_and_of_adversaries_and_evasions_where_there_are_any(tmp_path, rollouts):
+    rows = rollouts["states"].shape[2]
+    plans = torch.arange(6.0 * 16 * rows * 10 * 2).reshape(6, 16, rows, 10, 2)
+    targets = torch.where(rollouts["adversaries"], 0, -1)[:, None].expand(-1, 16, -1)
+    evasion = rollouts["states"][:, :, 0].clone()
+    evasion[1] = torch.nan
+    more = rollouts | {"plans": plans, "targets": targets, "evasion": evasion}
+    for index, path in enumerate(write_rollouts(tmp_path, more, SOURCE)):
+        data = read_rollout(path)
+        planners = [0, *rollouts["adversaries"][index].nonzero()[:, 0].tolist()]
+        assert data["planners"].tolist() == planners and ("evasion" in data) == (index != 1)
+        np.testing.assert_array_equal(data["plans"], plans[index][:, planners].numpy())
+        assert (data["targets"][:, 0] == -1).all() and (data["targets"][:, 1:] == 0).all()
+
+
 def test_lines_too_short_to_be_lines_are_left_out():
     points = torch.arange(12.0).reshape(6, 2)
     kept, offsets, numbers = files.polylines(points, torch.tensor([0, 0, 3, 4, 4, -1]), minimum=2)

@@ -1,0 +1,95 @@
+// The failure modes: each with its share, how many of it count, and a picture of its typical case at the contact.
+
+const OTHER = 0;
+
+/**
+ * Modes of some failures: {mode, name, failures, typical, counted}, those with the most failures that count first, the
+ * small groups last. A mode whose failures nobody holds against the ego says little about it.
+ */
+function groupByMode(failures, names) {
+  const members = new Map();
+  for (const failure of failures) {
+    if (!members.has(failure.mode)) members.set(failure.mode, []);
+    members.get(failure.mode).push(failure);
+  }
+  const modes = [...members].map(([mode, ours]) => ({
+    mode,
+    name: modeName(mode, names),
+    failures: ours,
+    typical: typicalOf(ours),
+    counted: ours.filter(({ counted }) => counted !== 0).length, // with an unknown verdict, too
+  }));
+  return modes.sort(
+    (first, second) =>
+      (first.mode === OTHER) - (second.mode === OTHER) ||
+      second.counted - first.counted ||
+      second.failures.length - first.failures.length,
+  );
+}
+
+const modeName = (mode, names) => (mode === OTHER ? "other: small groups" : names[mode]);
+
+/** The typical failure among them, else the first with a replay. */
+const typicalOf = (failures) =>
+  failures.find((failure) => failure.typical && failure.replay !== null) ??
+  failures.find((failure) => failure.replay !== null) ??
+  failures[0];
+
+/** The list of modes; `choose` is called with a mode. */
+function showModes(container, modes, total, store, choose) {
+  container.replaceChildren(
+    ...modes.map((mode) => {
+      const picture = element("canvas", { "aria-hidden": "true" });
+      const button = element(
+        "button",
+        { type: "button", class: "mode", "aria-pressed": "false" },
+        picture,
+        modeText(mode, total),
+      );
+      button.addEventListener("click", () => choose(mode));
+      if (mode.typical.replay !== null)
+        store.replay(mode.typical.replay).then((found) => drawTypical(picture, (mode.found = found)));
+      return element("li", {}, button);
+    }),
+  );
+}
+
+function modeText({ name, failures, counted }, total) {
+  const [what, duty] = name.split(": ");
+  const share = failures.length / total;
+  const bars = [
+    element("i", { class: "counts", style: `width: ${(100 * counted) / total}%` }),
+    element("i", { style: `width: ${(100 * (failures.length - counted)) / total}%` }),
+  ];
+  const facts = [`${percent(share)}, ${failures.length} failure${failures.length === 1 ? "" : "s"}`];
+  if (meanOf(failures, "counted") !== null) facts.push(counted ? `${counted} count` : "none counts");
+  return element(
+    "span",
+    {},
+    element("strong", {}, capital(what)),
+    element("small", {}, duty ?? ""),
+    element("span", { class: "share", "aria-hidden": "true" }, ...bars),
+    element("small", {}, facts.join(" · ")),
+  );
+}
+
+/** The typical case at its contact. */
+function drawTypical(canvas, { replay, paths }) {
+  canvas.width = 240;
+  canvas.height = 160;
+  drawScene(canvas, paths, replay, replay.contact, { centre: replay.point, metres: 26 }, new Set(), readPalette());
+}
+
+/** Draw the pictures of modes anew, in other colours. */
+function repaintModes(container, modes) {
+  const pictures = container.querySelectorAll("canvas");
+  modes.forEach(({ found }, index) => found && drawTypical(pictures[index], found));
+}
+
+function meanOf(failures, column) {
+  const known = failures.map((failure) => failure[column]).filter((value) => value !== null);
+  return known.length ? known.reduce((sum, value) => sum + value, 0) / known.length : null;
+}
+
+const percent = (share) => `${Math.round(100 * share)}%`;
+const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);

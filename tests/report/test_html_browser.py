@@ -1,0 +1,190 @@
+"""The failure report in Chromium: it loads without a complaint, shows what the files hold, and obeys."""
+
+import shutil
+
+import numpy as np
+import pytest
+from selenium import webdriver
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import Select, WebDriverWait
+
+from e2rl.evaluation.files import ROLLOUTS, TABLE, read_rows, rollout_name
+from e2rl.evaluation.rollout_reader import read_rollout
+from e2rl.metrics.failure_modes import is_failure
+from e2rl.report import html
+from tests.report.failed_run import SCENE, failed_run
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+DRIVER = shutil.which("chromedriver")
+FLAGS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"),
+    *("--no-first-run", "--window-size=1440,900"),
+)
+pytestmark = pytest.mark.skipif(not (CHROMIUM and DRIVER), reason="no chromium and chromedriver on the path")
+DECODE = """const done = arguments[1];
+page.store.replay(arguments[0]).then(({ replay }) => done(replay.tracks.map((track) =>
+  Object.fromEntries(Object.keys(page.report.channels).map((name) => [name, Array.from(track[name])])))));"""
+COLOUR_AT = """const { player } = page;
+player.shown.clear();
+player.draw();
+const { replay, time, metres, node: { scene } } = player;
+const [x, y] = cameraAt(replay, time);
+const scale = Math.min(scene.width, scene.height) / metres;
+const at = [scene.width / 2 + (arguments[0] - x) * scale, scene.height / 2 - (arguments[1] - y) * scale];
+return Array.from(scene.getContext("2d").getImageData(...at, 1, 1).data.slice(0, 3));"""
+POSE_OF_THE_EGO = """const ego = page.player.replay.tracks.find(({ role }) => role === "ego");
+const { x, y, speed } = poseAt(ego, arguments[0]);
+return [x, y, speed];"""
+EGO = [0x15, 0x65, 0xD8]  # page.css
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return failed_run(tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory):
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    browser = webdriver.Chrome(options, webdriver.ChromeService(DRIVER))
+    yield browser
+    browser.quit()
+
+
+@pytest.fixture
+def page(run, chromium):
+    """A browser with the report freshly open."""
+    html.main([str(run)])
+    chromium.get("about:blank")
+    chromium.get((run / html.PAGE).as_uri())
+    wait_for(chromium, "return page.player.replay !== null")
+    return chromium
+
+
+def wait_for(browser, condition):
+    WebDriverWait(browser, 20, 0.05).until(lambda _: browser.execute_script(condition))
+
+
+def press(browser, *keys):
+    ActionChains(browser).send_keys(*keys).perform()
+
+
+def choose(browser, label, text):
+    """Choose an option of the labelled filter."""
+    labels = browser.find_elements("css selector", "#filters label")
+    chosen = next(node for node in labels if node.text.splitlines()[0].strip() == label)
+    Select(chosen.find_element("tag name", "select")).select_by_visible_text(text)
+
+
+def rows_of(browser) -> list[list[str]]:
+    """The cells of the index."""
+    return browser.execute_script(
+        """const rows = document.querySelectorAll("#index tbody tr");
+        return [...rows].map((row) => [...row.cells].map((cell) => cell.textContent));"""
+    )
+
+
+def heads_of(browser) -> list[str]:
+    return [node.text.split(" ▲")[0].strip() for node in browser.find_elements("css selector", "#index thead th")]
+
+
+def failures_of(run) -> list[dict]:
+    return [row for row in read_rows(run / TABLE) if is_failure(row)]
+
+
+def test_it_opens_on_the_first_weakness_without_a_complaint(run, page):
+    failures = failures_of(run)
+    assert page.get_log("browser") == []
+    assert len(rows_of(page)) == len(failures)
+    assert page.find_element("id", "summary").text.startswith(f"{len(failures)} failures in 24 rollouts")
+    modes = page.execute_script("return page.report.failures.map(({ mode }) => mode)")
+    assert len(page.find_elements("css selector", ".mode")) == len(set(modes))
+    assert page.find_element("css selector", ".mode").get_attribute("aria-pressed") == "true"
+    assert len(page.find_elements("css selector", "#curves svg polyline")) >= 5  # ego, partner, driver; gaps of two
+
+
+def test_the_browser_decodes_what_the_files_hold(run, page):
+    numbers = page.execute_script("return page.report.failures.map((failure) => failure.replay)")
+    for row, number in zip(failures_of(run), numbers, strict=True):
+        rollout = read_rollout(run / ROLLOUTS / rollout_name(row))
+        tracks = page.execute_async_script(DECODE, number)
+        steps = len(tracks[0]["x"])
+        agents = np.flatnonzero(rollout["valid"][:steps].any(0))
+        for track, agent in zip(tracks, agents, strict=False):
+            present = np.array(track["present"]) == 1
+            assert (present == rollout["valid"][:steps, agent]).all()
+            for name, index, quantum in (("x", 0, 0.01), ("y", 1, 0.01), ("speed", 3, 0.01)):
+                found = np.array(track[name])[present]
+                assert np.abs(found - rollout["states"][:steps, agent, index][present]).max() < 0.51 * quantum + 1e-5
+
+
+def test_scrubbing_moves_the_ego_on_the_canvas(run, page):
+    row = failures_of(run)[page.execute_script("return page.player.failure.number")]
+    states = read_rollout(run / ROLLOUTS / rollout_name(row))["states"][:, 0]
+    between = (states[4] + states[5]) / 2
+    np.testing.assert_allclose(page.execute_script(POSE_OF_THE_EGO, 4.5), between[[0, 1, 3]], atol=0.011)
+    pictures = set()
+    for step in (0, 4, 8):
+        page.execute_script("page.player.seek(arguments[0])", step)
+        x, y, heading, _ = states[step].tolist()
+        assert page.execute_script(COLOUR_AT, x - np.cos(heading), y - np.sin(heading)) == EGO  # 1 m behind its middle
+        pictures.add(page.execute_script("return page.player.node.scene.toDataURL()"))
+        assert page.find_element("id", "clock").text.startswith(f"{step / 10:.1f} s")
+    assert len(pictures) == 3
+
+
+def test_keys_step_play_and_change_the_failure(page):
+    press(page, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_LEFT)
+    assert page.execute_script("return page.player.time") == 2
+    first = page.execute_script("return page.player.failure.number")
+    press(page, "n")
+    wait_for(page, f"return page.player.failure.number !== {first} && page.player.time === 0")
+    press(page, "p")
+    wait_for(page, f"return page.player.failure.number === {first} && page.player.time === 0")
+    page.execute_script("page.player.seek(page.player.replay.contact - 3)")
+    press(page, " ")
+    wait_for(page, "return !page.player.playing")
+    assert page.execute_script("return page.player.time === page.player.replay.contact")
+    assert page.find_element("id", "badge").text.startswith("contact at")
+
+
+def test_filters_keep_what_they_say_and_heads_sort(run, page):
+    heads = heads_of(page)
+    side = [row for row in failures_of(run) if row["contact_type"] == "side"]
+    choose(page, "Contact", "side")
+    shown = rows_of(page)
+    assert 0 < len(shown) == len(side) and {row[heads.index("Contact")] for row in shown} == {"side"}
+    choose(page, "Contact", "all")
+    for sign in (1, -1):
+        page.find_elements("css selector", "#index thead button")[heads.index("Ego [m/s]")].click()
+        speeds = [sign * float(row[heads.index("Ego [m/s]")]) for row in rows_of(page)]
+        assert speeds == sorted(speeds) and len(speeds) == len(failures_of(run))
+
+
+def test_names_from_files_are_text(page):
+    scenes = [row[heads_of(page).index("Scene")] for row in rows_of(page)]
+    assert scenes and all(name.startswith(SCENE) for name in scenes)
+    assert not page.find_elements("tag name", "img") and not page.find_elements("css selector", ".caption b")
+
+
+def test_a_click_on_a_mode_shows_its_typical_case_and_its_failures(page):
+    button = page.find_elements("css selector", ".mode")[1]
+    button.click()
+    wait_for(page, "return page.player.failure === page.modes[1].typical")
+    assert button.get_attribute("aria-pressed") == "true"
+    assert len(rows_of(page)) == page.execute_script("return page.modes[1].failures.length")
+
+
+def test_a_phone_needs_no_scrolling_to_the_side(page):
+    page.execute_cdp_cmd(
+        "Emulation.setDeviceMetricsOverride", {"width": 390, "height": 844, "deviceScaleFactor": 2, "mobile": True}
+    )
+    try:
+        assert page.execute_script("return document.documentElement.scrollWidth") == 390
+    finally:
+        page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})

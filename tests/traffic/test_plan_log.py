@@ -1,0 +1,39 @@
+"""Plans of a rollout: its traffic drives them, its ego's are the planner's, and adversaries aim at somebody."""
+
+import torch
+
+from e2rl.sim.world import World
+from e2rl.traffic.nominal import NominalTraffic
+from e2rl.traffic.plan_log import POINT_STEPS
+from e2rl.traffic.traffic import REPLAN_STEPS
+from tests.synthesizer.traffic_scenes import EGO, ROWS, drive, scenes, synthesizer
+
+
+def test_the_first_point_of_a_plan_is_where_its_vehicle_is_half_a_second_later():
+    out = drive(scenes(steps=40), synthesizer(), 2.0)
+    assert out["plans"].shape == (3, 40 // REPLAN_STEPS, ROWS, 50 // POINT_STEPS, 2)
+    later = out["states"][:, REPLAN_STEPS::REPLAN_STEPS, :ROWS, :2]
+    driven = (out["simulated"][:, None] & out["valid"][:, REPLAN_STEPS::REPLAN_STEPS])[:, :, :ROWS]
+    driven[:, :, 0] = False
+    assert POINT_STEPS == REPLAN_STEPS and driven.sum() > 50
+    torch.testing.assert_close(out["plans"][:, :, :, 0][driven], later[driven], rtol=0, atol=1e-4)
+
+
+def test_the_ego_s_first_plan_is_what_it_plans_at_the_start():
+    scene_set = scenes()
+    planned = EGO.plan(World.at_start(scene_set.scenes))[:, POINT_STEPS - 1 :: POINT_STEPS, :2]
+    torch.testing.assert_close(drive(scene_set, synthesizer(), 2.0)["plans"][:, 0, 0], planned)
+
+
+def test_whoever_aims_is_an_adversary_and_aims_at_the_ego_or_at_another_one():
+    out = drive(scenes(steps=40), synthesizer(), 2.0)
+    aims = out["targets"] >= 0
+    assert aims.any() and torch.equal(aims.any(1), out["adversaries"][:, :ROWS])
+    for scene, replan, vehicle in aims.nonzero().tolist():
+        target = out["targets"][scene, replan, vehicle]
+        assert target != vehicle and (target == 0 or aims[scene, replan, target])
+
+
+def test_traffic_without_adversaries_aims_at_nobody():
+    out = drive(scenes(), NominalTraffic(synthesizer().prior), 0.0)
+    assert (out["targets"] == -1).all() and out["plans"].isfinite().all()
