@@ -22,6 +22,7 @@ from e2rl.report.drawing import save_picture
 from e2rl.report.egos import ego_tables, guard_table
 from e2rl.report.html import report_command
 from e2rl.report.intensity import intensity_figure
+from e2rl.report.methods import method_tables, save_method_tables
 from e2rl.report.modes import mode_tables
 from e2rl.report.plots import collision_bars, learning_curves
 from e2rl.report.skeleton import skeleton_figure
@@ -56,6 +57,10 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     effort = search_effort(scenes.scenes["logged"].shape[1] - 1)
     caption = f"{build.caption(config, origin, methods)}; {effort}{dropped}"
     tables = metric_tables(rows, caption, config.metrics)
+    if config.compare is not None:
+        compared = method_tables(rows, build.terms_by_method(methods), config.compare, caption)
+        save_method_tables(folder, compared)
+        tables = compared
     tables += mode_tables(read_modes(folder / MODES_FILE))
     if egos:
         tables += report_egos(config, egos, rows, scenes, caption, folder)

@@ -216,10 +216,13 @@ def intensities(config: DictConfig) -> list[float]:
 
 def varied(config: DictConfig, name: str) -> DictConfig:
     """The configuration with the changes of `config.variants.NAME`, of dotted or nested keys; InputError for others
-    than those of VARIED."""
+    than those of VARIED. `synthesizer: METHOD` makes it a variant of another method than the run's."""
     changed, changes = copy.deepcopy(config), config.variants[name]
     if not isinstance(changes, DictConfig):
         raise InputError(f"variants.{name}={changes}: expected changes, such as {{synthesizer.support: random}}")
+    if isinstance(method := changes.get("synthesizer"), str):
+        changed.synthesizer = method_config(config, method)
+        changes = {key: value for key, value in changes.items() if key != "synthesizer"}
     for key, value in ((str(key), value) for key, value in changes.items()):
         if key.split(".")[0] not in VARIED:
             raise InputError(f"variants.{name}: {key} is none of {', '.join(VARIED)}, nor in one of them")
@@ -256,6 +259,7 @@ def check_evaluation(config: DictConfig) -> None:
         if name in (config.synthesizer.name, *choices("synthesizer")):
             raise InputError(f"variants.{name}: {name} is a row already; choose another name")
         varied(config, name)
+    check_compared(config)
     several = len(intensities(config)) > 1
     if config.figure is None:
         return
@@ -264,6 +268,18 @@ def check_evaluation(config: DictConfig) -> None:
         raise InputError(f"figure={config.figure}: drawn from the rollouts' files; set save_rollouts=true")
     if config.figure == "intensity" and not several:
         raise InputError(f"figure=intensity, eta={config.eta}: name several intensities, such as eta=[0,1,2,3]")
+
+
+def check_compared(config: DictConfig) -> None:
+    """InputError for a method of `config.compare` that is no row, or one of several intensities or egos."""
+    if config.compare is None:
+        return
+    if config.compare not in (*config.methods, *config.variants):
+        raise InputError(f"compare={config.compare}: no row of this name; add it to methods")
+    if len(intensities(config)) > 1 or config.egos:
+        raise InputError(
+            f"compare={config.compare}: a table with a row a method has one eta and one ego; name one each"
+        )
 
 
 def processes_of(config: DictConfig) -> int:
@@ -294,6 +310,11 @@ def caption(config: DictConfig, origin: dict, methods: Sequence[Method] = ()) ->
         f"{sampler.steps}, temperature {sampler.temperature:g} (routes {sampler.route_temperature:g}), one sample "
         f"a replan, replanned every 0.5 s; acceleration bounds: {', '.join(on) or 'none'}{changes}{terms(methods)}"
     )
+
+
+def terms_by_method(methods: Sequence[Method]) -> dict[str, tuple[str, str]]:
+    """What each method knows of the ego and owes it, for the table of methods."""
+    return {method.name: (method.traffic.knowledge, method.traffic.responsibility) for method in methods}
 
 
 def terms(methods: Sequence[Method]) -> str:

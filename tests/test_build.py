@@ -8,6 +8,7 @@ import torch
 from e2rl import build
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError
+from e2rl.rivals.ctg_adv import CTGAdv
 from e2rl.synthesizer.e2 import E2
 from e2rl.traffic.idm import IDM
 from e2rl.traffic.nominal import NominalTraffic
@@ -157,7 +158,7 @@ def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(experimen
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["methods=[e3]"], "synthesizer=e3: none of constant_velocity, e2, e2_unbound, idm, nominal, replay; add a f"),
+        (["methods=[e3]"], "synthesizer=e3: none of cat, ccdiff, constant_velocity, ctg, .*, strive; add a f"),
         (["methods=[]"], r"methods=\[\], seeds=\[0, 1\]: name at least one of each"),
         (["seeds=[]"], r"seeds=\[\]: name at least one"),
         (["seeds=[0.5]"], r"seeds=\[0.5\]: sampling seeds are whole numbers"),
@@ -234,3 +235,31 @@ def test_a_class_that_cannot_be_built_is_named_with_the_reason(overrides, messag
 def test_an_ego_that_is_none_is_refused():
     with pytest.raises(InputError, match="ego=torch.nn.ReLU: is no e2rl.ego.base.Ego; subclass it"):
         build.build_ego(config_of("ego=idm", "~ego", "+ego._target_=torch.nn.ReLU"))
+
+
+def test_a_variant_may_be_one_of_another_method():
+    rows = methods_of(
+        "methods=[nominal]",
+        "+variants.blind={synthesizer: ctg_adv, synthesizer.knowledge: predicted, synthesizer.responsibility: full}",
+    )
+    assert named(rows) == [("nominal", 0.0), ("blind", 2.0)]
+    assert isinstance(rows[1].traffic, CTGAdv) and rows[1].traffic.responsibility == "full"
+    assert build.terms_by_method(rows) == {"nominal": ("predicted", ""), "blind": ("predicted", "full")}
+    with pytest.raises(InputError, match="synthesizer=nobody"):
+        methods_of("+variants.blind={synthesizer: nobody}")
+
+
+def test_table_1_has_every_rival_on_both_terms():
+    rows = methods_of("experiment=table1")
+    rivals = {"ctg", "ctg_adv", "strive", "safe_sim_opt", "diffscene", "ccdiff", "cat"}
+    known = build.terms_by_method(rows)
+    assert rivals <= set(known) and all(known[name][0] == "plan" for name in rivals)
+    ours = build.terms_by_method(methods_of("experiment=table1_our_terms"))
+    for name in rivals:
+        assert ours[f"{name}, our terms"] == ("predicted", "" if name == "ctg" else "full")
+
+
+@pytest.mark.parametrize("more", [["compare=ctg"], ["compare=e2", "eta=[1,2]"], ["compare=e2", "+egos.a={ego: idm}"]])
+def test_a_table_of_methods_needs_its_reference_and_one_eta_and_ego(more):
+    with pytest.raises(InputError, match="compare="):
+        methods_of(*more)

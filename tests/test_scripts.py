@@ -363,6 +363,25 @@ def test_the_adversaries_experiments_have_their_rows_and_figures(
     assert [path.name for path in (tmp_path / "run").glob("*.png")] == ([figure] if figure else [])
 
 
+def test_table_1_is_written_in_three_formats(world, tmp_path, monkeypatch, capsys):
+    overrides = [
+        "experiment=table1",
+        *SHORT,
+        "methods=[e2,nominal,ctg_adv,cat]",
+        f"data.cache={world / 'bundled'}",
+        "seeds=[0]",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    ]
+    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    assert status == 0, said
+    head, *rows = (tmp_path / "run" / "methods.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in rows] == ["e2 η=2", "nominal", "ctg_adv η=2", "cat η=2"]
+    assert head.startswith("method,knowledge,duty,cfr [%]") and head.endswith("passes")
+    assert "Difference of each method to e2" in (tmp_path / "run" / "methods.md").read_text()
+    assert "Difference of each method to e2" in (tmp_path / "run" / "methods.tex").read_text()
+    assert len((tmp_path / "run" / "methods_differences.csv").read_text().splitlines()) == 4
+
+
 def test_egos_before_and_after_are_rated_in_one_run(world, tmp_path, monkeypatch, capsys):
     """An untrained actor and a planner in its place, with learning curves of a made run."""
     logs = tmp_path / "trained" / "logs" / "scalars"

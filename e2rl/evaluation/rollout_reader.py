@@ -60,7 +60,7 @@ def read_rollouts(folder: Path) -> list[dict[str, Any]]:
 def as_rollout_dict(rollouts: Sequence[dict]) -> dict:
     """The rollout dict of tensors (leading B, padded) of rollouts read from files, ready for score_rollouts.
 
-    `seconds` and transport are not in the files: seconds are NaN and transport is absent.
+    `seconds`, passes and transport are not in the files: seconds are NaN, the others absent.
     """
 
     def pad(name: str, fill: float) -> Tensor:

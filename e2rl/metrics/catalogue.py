@@ -76,6 +76,7 @@ MAIN = (
     Metric("real_norm", "realism, W1 over the log's range", decimals=3, samples="a_lon"),
     Metric("transport", "path KL of the control"),
     Metric("seconds_per_rollout", "wall time", unit="s", column="seconds"),
+    Metric("passes", "passes of the prior's network per rollout, a gradient's twice"),
 )
 PLACES = 10  # at which `mode_coverage` looks: failures at fewer places give none
 COVERAGE = f"failure modes expected of collisions at {PLACES} places"
@@ -136,6 +137,10 @@ TABLES = {
         *("avoidable", "contact_time", "front", "side", "rear", "rir", "relvel"),
         *("ttc_c", "cfr_bg", "aor_step", "real", "real_adv", "transport"),
     ],
+    "methods": [  # table 1: what each method finds, how real it is, what it costs
+        *("cfr", "cfr_counted", "cfr_preventable", "cfr_adv", "at_fault", "preventable", "relvel", "rir", "min_dtc"),
+        *("ttc_c", "cfr_bg", "aor_step", "aor_any", "real", "real_adv", "seconds_per_rollout", "passes"),
+    ],
 }  # closed-loop tables (`metrics=...` of evaluate.py) and the metrics of each, in order
 OPEN_LOOP = tuple(
     Metric(f"{name}_{horizon}", about.format(horizon), unit=unit)
@@ -181,6 +186,11 @@ def transport_columns(batch: dict[str, Tensor]) -> dict[str, Tensor]:
     return columns | ({"transport": columns[names[0]] + columns[names[1]]} if columns else {})
 
 
+def pass_columns(batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The passes of the prior's network, where known."""
+    return {"passes": batch["passes"].to(batch["states"].dtype)} if "passes" in batch else {}
+
+
 COMPUTE: dict[str, Compute] = {
     "contact": contact_columns,
     "traffic_contact": traffic_contact_columns,
@@ -190,6 +200,7 @@ COMPUTE: dict[str, Compute] = {
     "off_road": off_road_columns,
     "standing": standing_columns,
     "transport": transport_columns,
+    "passes": pass_columns,
 }  # functions of a batch of rollouts: a dict of columns, or the column of the metric with the function's key
 
 

@@ -4,6 +4,8 @@ For each (dataset, split, ego), one table has a row per metric and a column per 
 a second table has each method's paired difference to the first.
 """
 
+import csv
+import io
 import math
 import textwrap
 from collections.abc import Sequence
@@ -55,6 +57,23 @@ class Table:
         align = "| --- |" + " ---: |" * (len(self.head) - 1)
         title = [f"## {self.title}\n"] if self.title else []
         return "\n".join([*title, line(self.head), align, *map(line, self.rows), "", self.caption, ""])
+
+    def csv(self) -> str:
+        """Head and rows, without the caption."""
+        buffer = io.StringIO()
+        csv.writer(buffer, lineterminator="\n").writerows([self.head, *self.rows])
+        return buffer.getvalue()
+
+    def latex(self) -> str:
+        """A table environment with a tabular of package booktabs."""
+
+        def line(cells: list[str]) -> str:
+            return " & ".join(map(escaped, cells)) + r" \\"
+
+        columns = "l" + "r" * (len(self.head) - 1)
+        lines = [r"\begin{table}", rf"\begin{{tabular}}{{{columns}}}", r"\toprule", line(self.head), r"\midrule"]
+        lines += [*map(line, self.rows), r"\bottomrule", r"\end{tabular}"]
+        return "\n".join([*lines, rf"\caption{{{escaped(self.caption)}}}", r"\end{table}", ""])
 
 
 def metric_tables(rows: Sequence[dict], settings: str = "", table: str = "main") -> list[Table]:
@@ -178,6 +197,15 @@ def number(metric: Metric, value: float, sign: str = "") -> str:
     elif decimals is None:
         decimals = 0 if size >= 1000 else 1 if size >= 10 else 2 if size >= 1 or size == 0 else 3
     return f"{value:{sign}.{decimals}f}"
+
+
+LATEX = {"\\": r"\textbackslash{}", "–": "--", "−": "$-$", "η": r"$\eta$", "²": "$^2$", "³": "$^3$", "≤": r"$\le$"}
+LATEX |= {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}"} | {sign: rf"\{sign}" for sign in "&%$#_{}"}
+
+
+def escaped(text: str) -> str:
+    """The text for LaTeX."""
+    return "".join(LATEX.get(sign, sign) for sign in text)
 
 
 def save_tables(path: Path, tables: Sequence[Table]) -> None:

@@ -16,6 +16,7 @@ from e2rl.scene.route import project
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.traffic_light import ran_red
+from e2rl.traffic.passes import counted_passes
 from e2rl.traffic.plan_log import PlanLog
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.template import FULL
@@ -43,8 +44,9 @@ def roll_out(
 
     The rollout dict that e2rl.metrics and e2rl.evaluation.files read: states [B, T+1, N, 4], valid, size, agent_type,
     simulated, adversaries, logged, logged_valid, map keys, ran_light [B, N] (`red_lights`), seed, scene_id,
-    location, seconds (wall time per rollout), transport (path KL of adversaries and others, anchor jump), routes
-    [B, V], contact [B] (the ego touched a vehicle), plans and targets (`PlanLog.tensors`).
+    location, seconds (wall time per rollout), passes (of the prior's network per rollout), transport (path KL of
+    adversaries and others, anchor jump), routes [B, V], contact [B] (the ego touched a vehicle), plans and targets
+    (`PlanLog.tensors`).
     """
     begin = time.perf_counter()
     settings = replace(sim, end_on_contact=False, end_off_road=False, end_when_gone=False)
@@ -54,14 +56,14 @@ def roll_out(
     synthesizer, log = AdversarialSynthesizer(pool, torch.arange, traffic, ego), PlanLog()
     synthesizer.on_plan = log
     env = TransformedEnv(base, synthesizer)
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
+    with set_exploration_type(ExplorationType.DETERMINISTIC), counted_passes(traffic) as passes:
         steps = env.rollout(base.horizon, EgoPolicy(ego, env))
     names = {"scene_id": scenes.scene_id, "location": scenes.location}
     rollout = {name: [values[i] for i in index.tolist()] for name, values in names.items()} | {"seed": seed.cpu()}
     rollout |= {key: value.cpu() for key, value in _driven(steps, base.scene, settings.replay_ego).items()}
     rollout |= log.tensors(steps["ego", "plan"])
-    seconds = (time.perf_counter() - begin) / len(index)
-    return rollout | {"seconds": torch.full((len(index),), seconds)}
+    cost = {"seconds": time.perf_counter() - begin, "passes": float(passes.count)}
+    return rollout | {name: torch.full((len(index),), value / len(index)) for name, value in cost.items()}
 
 
 def _driven(steps: TensorDictBase, scene: TensorDictBase, replayed: bool) -> dict[str, Tensor]:

@@ -48,6 +48,7 @@ def random_rollouts(
         "scene_id": [f"scene_{index // 2}" for index in range(rollouts)],
         "location": [f"place_{index // 4}" if index % 8 < 6 else "" for index in range(rollouts)],
         "seconds": torch.rand(rollouts, generator=generator),
+        "passes": torch.full((rollouts,), 128.0),
     }
 
 
