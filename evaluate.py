@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 
 from e2rl import build
 from e2rl.egos import build_egos, curve_runs
-from e2rl.errors import InputError, stop
+from e2rl.ending import ending
 from e2rl.evaluation.avoidable import search_effort
 from e2rl.evaluation.chains import LongestChain
 from e2rl.evaluation.egos import EgoSet, recorded_acceleration, run_egos
@@ -36,11 +36,11 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     build.set_up(config)
     build.check_evaluation(config)
     egos = build_egos(config)
-    scenes = load_scenes(config.data, config.num_scenes)
-    prior, origin = build.build_prior(config, config.device)
+    prior, origin = build.build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
     methods, name = build.build_methods(config, prior), HydraConfig.get().runtime.choices["ego"]
     name, ego = next(iter(egos.egos.items())) if egos else (name, build.build_ego(config))
-    setup = Setup(scenes, ego, name, build.build_sim(config), config.batch, config.device)
+    sim, scenes = build.build_sim(config), load_scenes(config.data, config.num_scenes)
+    setup = Setup(scenes, ego, name, sim, config.batch, config.device)
     if config.tuning is not None:
         return build.tune(config, setup, methods, folder)["trials"]
     only = None if config.scene is None else [scenes.index(config.scene)]
@@ -95,10 +95,9 @@ def report_egos(
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
 def main(config: DictConfig) -> None:
     """The command."""
-    try:
-        evaluate(config, Path(HydraConfig.get().runtime.output_dir))
-    except InputError as error:
-        stop(error)
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    with ending(f"score the rollouts in {folder} with `python -m e2rl.report.score {folder}`, or start again"):
+        evaluate(config, folder)
 
 
 if __name__ == "__main__":

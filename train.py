@@ -8,9 +8,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from e2rl.build import build_ego, build_prior, build_traffic, caption, resolved, set_up
-from e2rl.errors import InputError, stop
-from e2rl.learning.build import build_evolution, build_logger, build_measure, run_imitation
-from e2rl.learning.checkpoint import load_checkpoint, save_checkpoint
+from e2rl.ending import ending
+from e2rl.errors import InputError
+from e2rl.learning.build import build_evolution, build_logger, build_measure, check_training, run_imitation
+from e2rl.learning.checkpoint import checkpoints, load_checkpoint, save_checkpoint
 from e2rl.learning.prior_training.distributed import follower_overrides, started_by_torchrun
 from e2rl.learning.prior_training.stage import run_prior_stage
 from e2rl.learning.resume import resumed
@@ -21,12 +22,13 @@ from e2rl.scene.source import load_scenes
 
 def evolve(config: DictConfig, folder: Path) -> None:
     """Rounds of Algorithm 1: synthesize D' against the current ego, improve the ego on it, move the curriculum."""
-    scenes = load_scenes(config.data, config.num_scenes, split="train")
-    prior, origin = build_prior(config, config.device)
+    prior, origin = build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
     traffic, ego = build_traffic(config.synthesizer, prior), build_ego(config)
+    scenes = load_scenes(config.data, config.num_scenes, split="train")
     run, logger = build_evolution(config, scenes, ego, traffic, folder=folder), build_logger(config, folder)
     measure = build_measure(config, ego, HydraConfig.get().runtime.choices["ego"], traffic, prior, folder)
-    done = load_checkpoint(config.resume, run) if config.resume else 0
+    begun = config.resume and checkpoints(config.resume)  # a run can be cut off in the measurement before
+    done = load_checkpoint(config.resume, run) if begun else 0
     if done == 0:
         measure("before", run.ego)
         save_checkpoint(folder, run, resolved(config), config.keep_last)
@@ -64,9 +66,10 @@ def train_prior(config: DictConfig, folder: Path) -> None:
 
 def imitate(config: DictConfig, folder: Path) -> None:
     """Warm-start the actor from the recorded egos."""
+    ego = build_ego(config)
     scenes = load_scenes(config.data, config.num_scenes, split="train")
-    losses = run_imitation(config, scenes, build_ego(config), folder, build_logger(config, folder))
-    print(", ".join(f"{name} {value:.4f}" for name, value in losses.items()))
+    losses = run_imitation(config, scenes, ego, folder, build_logger(config, folder))
+    print(", ".join(f"{name} {value:.4f}" for name, value in losses.items() if value == value))  # NaN: none held out
     print(f"start evolution rounds from it with ego.checkpoint={folder}")
 
 
@@ -76,16 +79,16 @@ STAGES = {"evolution": evolve, "prior": train_prior, "imitation": imitate}
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 def run(config: DictConfig) -> None:
     """One stage of training, as configured."""
-    try:
+    begun = config.resume or HydraConfig.get().runtime.output_dir
+    with ending(f"run `python train.py resume={begun}`"):
         config, folder = resumed(config, Path(HydraConfig.get().runtime.output_dir))
         if config.stage not in STAGES:
             raise InputError(f"stage={config.stage}: choose one of {', '.join(STAGES)}")
         if started_by_torchrun() and config.stage != "prior":
             raise InputError(f"torchrun: stage={config.stage} runs in one process, started with python")
         set_up(config)
+        check_training(config)
         STAGES[config.stage](config, folder)
-    except InputError as error:
-        stop(error)
 
 
 def main() -> None:

@@ -241,15 +241,20 @@ def check_counts(config: Mapping, **least: int) -> None:
             raise InputError(f"{key}={config[key]}: expected a whole number of at least {low}")
 
 
+def check_seeds(where: str, seeds: Any) -> None:
+    """InputError where sampling seeds are no list of whole numbers."""
+    if not isinstance(seeds, ListConfig) or not seeds or not all(type(seed) is int and seed >= 0 for seed in seeds):
+        raise InputError(f"{where}={seeds}: expected a list of whole numbers of at least 0, such as [0,1]")
+
+
 def check_evaluation(config: DictConfig) -> None:
     """InputError for methods, seeds, an intensity, a figure or processes that evaluate.py cannot run."""
     processes_of(config)
     check_counts(config, open_loop_samples=0, meta_rollouts=0)
     check_choice("metrics", config.metrics, TABLES)
-    if not (config.methods or config.variants) or not config.seeds:
-        raise InputError(f"methods={list(config.methods)}, seeds={list(config.seeds)}: name at least one of each")
-    if not all(isinstance(seed, int) for seed in config.seeds):
-        raise InputError(f"seeds={list(config.seeds)}: sampling seeds are whole numbers")
+    check_seeds("seeds", config.seeds)
+    if not isinstance(config.methods, ListConfig) or not (config.methods or config.variants):
+        raise InputError(f"methods={config.methods}: expected a list of at least one, such as [nominal,e2]")
     if config.num_scenes is not None:
         check_counts(config, num_scenes=1)
     for name in config.methods:

@@ -1,16 +1,29 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, and that tell whether they still are what was written."""
 
+import fcntl
+import hashlib
+import json
 import os
 import tempfile
-from collections.abc import Callable
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+MAX_ARRAYS = 1 << 30  # bytes of one npz, unpacked
+SEAL = "sha256.json"  # of a sealed folder: {file: hash}
+DAMAGED = (OSError, EOFError, LookupError, TypeError, ValueError, RuntimeError, MemoryError, SyntaxError)
 
 
 def write_atomically(path: Path, content: bytes | str | Callable[[Path], object]) -> None:
     """Write a file under a temporary name beside `path`, then rename it, so that no reader meets half a file.
 
     content: the bytes or text of the file, or a function that writes the file whose path it is given. Missing parent
-    folders are made. Raises OSError where the folder cannot be written; nothing is left behind then.
+    folders are made. Raises OSError, naming `path`, where it cannot be written; nothing is left behind then.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -24,6 +37,70 @@ def write_atomically(path: Path, content: bytes | str | Callable[[Path], object]
             part.write_bytes(content.encode() if isinstance(content, str) else content)
         part.chmod(0o644)
         part.replace(path)
-    except BaseException:
+    except BaseException as error:
         part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno is not None:
+            error.filename = str(path)
         raise
+
+
+def seal(folder: Path) -> None:
+    """Write the hashes of a folder's files into it, for `altered`."""
+    hashes = {path.name: _sha256(path) for path in sorted(folder.iterdir()) if path.name != SEAL}
+    write_atomically(folder / SEAL, json.dumps(hashes, indent=1))
+
+
+def altered(folder: Path) -> str | None:
+    """The name of the first file of a sealed folder that is not what was written; None: all are."""
+    try:
+        hashes = json.loads((folder / SEAL).read_text())
+        return next((name for name, known in hashes.items() if _sha256(folder / name) != known), None)
+    except FileNotFoundError as error:
+        return Path(error.filename).name
+    except (OSError, ValueError, AttributeError):
+        return SEAL
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold the lock of `path` among processes: others wait at the beginning of their block."""
+    name = path.with_name(f".{path.name}.lock")
+    while True:
+        handle = os.open(name, os.O_RDWR | os.O_CREAT, 0o644)
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        try:
+            if os.stat(name).st_ino == os.fstat(handle).st_ino:
+                break  # else its last holder has removed it in the meantime
+        except FileNotFoundError:
+            pass
+        os.close(handle)
+    try:
+        yield
+    finally:
+        name.unlink(missing_ok=True)
+        os.close(handle)
+
+
+def read_arrays(file: Path | IO[bytes]) -> dict[str, np.ndarray]:
+    """The arrays of an npz, none of them pickled; raises ValueError where it is damaged or claims MAX_ARRAYS bytes."""
+    if isinstance(file, Path) and not file.is_file():
+        raise ValueError("no regular file")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > MAX_ARRAYS:
+            raise ValueError(f"unpacks to {size / 1e6:.0f} MB, more than {MAX_ARRAYS / 1e6:.0f}")
+        with np.load(file, allow_pickle=False) as arrays:
+            return {key: _truth(np.asarray(arrays[key])) for key in arrays.files}
+    except (*DAMAGED, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(str(error).splitlines()[0] if str(error) else type(error).__name__) from error
+
+
+def _truth(array: np.ndarray) -> np.ndarray:
+    """The array; one of truth values with bytes 0 and 1 only, as numpy counts on."""
+    return array.view(np.uint8) != 0 if array.dtype.kind == "b" and array.shape else array

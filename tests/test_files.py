@@ -1,10 +1,12 @@
 """A file appears whole or not at all."""
 
+import multiprocessing
+import time
 from pathlib import Path
 
 import pytest
 
-from e2rl.files import write_atomically
+from e2rl.files import locked, write_atomically
 
 
 def test_text_bytes_and_writers_are_written(tmp_path):
@@ -28,3 +30,23 @@ def test_what_fails_on_the_way_leaves_the_old_file_and_no_other(tmp_path, monkey
     with pytest.raises(OSError, match="disk full"):
         write_atomically(path, b"new")
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+def hold(path, log):
+    with locked(path):
+        with log.open("a") as file:
+            file.write("in\n")
+        time.sleep(0.05)
+        with log.open("a") as file:
+            file.write("out\n")
+
+
+def test_one_process_at_a_time_holds_a_lock_and_it_leaves_no_file(tmp_path):
+    context = multiprocessing.get_context("fork")
+    workers = [context.Process(target=hold, args=(tmp_path / "x", tmp_path / "log")) for _ in range(8)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join(20)
+    assert (tmp_path / "log").read_text() == "in\nout\n" * 8
+    assert [path.name for path in tmp_path.iterdir()] == ["log"]

@@ -88,6 +88,17 @@ def track(state: Tensor, planned: Tensor, following: Tensor) -> Tensor:
     return dynamics.inverse(torch.stack([state, aimed], -2))[..., 0, :]
 
 
+class NotFinite(ArithmeticError):
+    """An ego planned or acted NaN or infinite."""
+
+
+def finite(values: Tensor, name: str) -> Tensor:
+    """The plans or actions [B, ...] of an ego; raises NotFinite where one is not finite."""
+    if not bool(values.isfinite().all()):
+        raise NotFinite(f"the ego's {name} is NaN or infinite")
+    return values
+
+
 class EgoPlanner(TensorDictModuleBase):
     """Writes the plan of an Ego in a DrivingEnv with `agents=True`: ("ego", "plan") [B, PLAN_STEPS, 4].
 
@@ -120,7 +131,7 @@ class EgoPlanner(TensorDictModuleBase):
         age = world.step - self._planned_at
         due = (age >= self.ego.replan_every) | (age < 0) | (world.step == 0)
         if bool(due.any()):
-            fresh = torch.cat([world.states[:, :1], self.ego.plan(world)], 1)
+            fresh = torch.cat([world.states[:, :1], finite(self.ego.plan(world), "plan")], 1)
             self._plan = torch.where(due[:, None, None], fresh, self._plan)
             self._planned_at = torch.where(due, world.step, self._planned_at)
         ahead = (world.step - self._planned_at)[:, None] + torch.arange(1 + PLAN_STEPS, device=world.step.device)
@@ -136,7 +147,7 @@ class EgoPolicy(EgoPlanner):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         world = World.of(tensordict, self.scene)
         plan = self.plan(world)
-        action = self.ego.act(world, tensordict["observation"], plan)
+        action = finite(self.ego.act(world, tensordict["observation"], plan), "action")
         tensordict["action"] = action.clamp(self.bounds.low, self.bounds.high)
         tensordict["ego", "plan"] = plan[:, 1:]
         return tensordict

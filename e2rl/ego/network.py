@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Bounded
@@ -16,6 +16,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
 from e2rl.ego.reference import LAST_ACTION, reference_action
 from e2rl.errors import InputError
+from e2rl.files import altered, write_atomically
 from e2rl.sim.observation import OBSERVATION_SIZE
 
 WEIGHTS = "actor.safetensors"  # file name of an ActorCritic inside a checkpoint
@@ -190,7 +191,7 @@ class ActorCritic(nn.Module):
     def save(self, path: Path) -> None:
         """Write weights and statistics to a safetensors file whose header holds the architecture."""
         weights = {key: value.detach().cpu().contiguous() for key, value in self.weights().items()}
-        save_file(weights, path, metadata={"architecture": json.dumps(self.architecture, sort_keys=True)})
+        write_atomically(path, save(weights, {"architecture": json.dumps(self.architecture, sort_keys=True)}))
 
     def load(self, path: Path) -> None:
         """Read a file of `save`; raises InputError for a damaged file or another architecture."""
@@ -225,13 +226,20 @@ class ActorCritic(nn.Module):
 
 
 def find_weights(path: str | Path) -> Path:
-    """The actor file that `path` names: the file, a checkpoint folder, the newest checkpoint of a run folder, or with
-    "bundled" the package's own, trained on the bundled scenes."""
+    """The actor file that `path` names: the file, a checkpoint folder, the newest whole checkpoint of a run folder, or
+    with "bundled" the package's own, trained on the bundled scenes."""
     path = Path(str(files("e2rl") / "assets" / "actor" / WEIGHTS)) if path == "bundled" else Path(path)
     if path.is_dir():
-        found = [path / WEIGHTS] if (path / WEIGHTS).is_file() else sorted(path.glob(f"checkpoints/round-*/{WEIGHTS}"))
-        if found:
-            return found[-1]
+        if (path / WEIGHTS).is_file():
+            return path / WEIGHTS
+        found = sorted(path.glob(f"checkpoints/round-*/{WEIGHTS}"))
+        whole = [file for file in found if altered(file.parent) is None]
+        if found and not whole:
+            raise InputError(
+                f"{found[-1].parent}: damaged ({altered(found[-1].parent)}), as all of {path}; train again"
+            )
+        if whole:
+            return whole[-1]
     if not path.is_file():
         raise InputError(f"{path}: no actor there; give an {WEIGHTS}, a checkpoint folder or a run folder")
     return path

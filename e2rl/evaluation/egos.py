@@ -14,7 +14,7 @@ import torch
 
 from e2rl.ego.base import Ego
 from e2rl.evaluation.files import ROLLOUTS
-from e2rl.evaluation.protocol import Method, Scored, Setup, drive_all, record
+from e2rl.evaluation.protocol import Method, Setup, drive_all, record
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.proximity import ego_path, mean_acceleration
 from e2rl.scene.scene import SceneSet
@@ -59,9 +59,11 @@ def run_egos(
     return record(*found, folder, summarise)
 
 
-def pool_trainings(rows: Sequence[dict], features: Sequence, trainings: Mapping[str, Sequence[str]]) -> Scored:
+def pool_trainings(
+    rows: Sequence[dict], features: Sequence, trainings: Mapping[str, Sequence[str]]
+) -> tuple[list[dict], list]:
     """Copies of the rows of several trainings under their common name, each with the number of its `training`."""
-    pooled: Scored = ([], [])
+    pooled: tuple[list[dict], list] = ([], [])
     for name, members in trainings.items():
         for row, feature in zip(rows, features, strict=True):
             if row["ego_policy"] in members:

@@ -1,16 +1,16 @@
 """Jobs spread over forked processes that share the parent's memory."""
 
 import io
-import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
 import torch
 
 from e2rl.errors import InputError
+from e2rl.workers import interrupts_held, worker_pool
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -42,30 +42,27 @@ def in_processes(
             ended(job)
             yield result
         return
-    context = multiprocessing.get_context("fork")
-    with ProcessPoolExecutor(processes, context, _adopt, (function,)) as pool:
-        order = sorted(range(len(jobs)), key=lambda k: -cost(jobs[k]))
-        futures, early, coming = {pool.submit(_call, jobs[k]): k for k in order}, {}, 0
-        try:
+    order = sorted(range(len(jobs)), key=lambda k: -cost(jobs[k]))
+    try:
+        with worker_pool(processes, "fork", _adopt, function) as pool:
+            with interrupts_held():
+                futures = {pool.submit(_call, jobs[k]): k for k in order}
+            early, coming = {}, 0
             for future in as_completed(futures):
                 early[futures[future]] = future.result()
                 ended(jobs[futures[future]])
                 while coming in early:
-                    yield torch.load(io.BytesIO(early.pop(coming)), weights_only=False)  # trusted: from a child process
+                    yield torch.load(io.BytesIO(early.pop(coming)), weights_only=True)
                     coming += 1
-        except BrokenProcessPool as error:
-            raise InputError(
-                f"processes={processes}: a process was killed, perhaps for lack of memory; "
-                "use fewer, or a smaller batch"
-            ) from error
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+    except BrokenProcessPool as error:
+        raise InputError(
+            f"processes={processes}: a process was killed, perhaps for lack of memory; use fewer, or a smaller batch"
+        ) from error
 
 
 def _adopt(function: Callable) -> None:
     global _function
     _function = function
-    torch.set_num_threads(1)
 
 
 def _call(job) -> bytes:

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from e2rl.ego.base import Ego
 from e2rl.evaluation.avoidable import add_avoidable
+from e2rl.evaluation.ended import ENDED_FILE, attempt, count_reasons, require_rows, write_ended
 from e2rl.evaluation.files import (
     METRICS_FILE,
     ROLLOUTS,
@@ -33,7 +34,8 @@ from e2rl.traffic.traffic import Traffic
 
 SEEDS_APART = 1_000_003
 Task = tuple[int, int]  # position of a scene, sampling seed
-Scored = tuple[list[dict], list[dict[str, Tensor]]]  # labelled rows and realism samples, one of each per rollout
+# Labelled rows and realism samples, one of each per rollout; and what the rollouts without a score ended by.
+Scored = tuple[list[dict], list[dict[str, Tensor]], list[dict]]
 
 
 @dataclass
@@ -65,15 +67,22 @@ class Setup:
         return rollouts | {"seed": torch.tensor([seed for _, seed in tasks]), "eta": float(method.eta)}
 
     def score(self, method: Method, tasks: Sequence[Task], folder: Path | None = None) -> Scored:
-        """Rows and realism samples of (scene, seed) pairs under one method; folder: for the rollouts' files."""
-        rollouts = self.roll_out(method, tasks)
+        """Rows and realism samples of (scene, seed) pairs under one method, and the pairs that ended without; folder:
+        for the rollouts' files."""
         source = Source(self.scenes.dataset, self.scenes.split, method.name, self.ego_name)
-        rows, samples = score_rollouts(rollouts)
-        scene = self.scenes.batch([scene for scene, _ in tasks])
-        rollouts["evasion"] = add_avoidable(rows, rollouts, scene, self.sim)
-        if folder is not None:
-            write_rollouts(folder, rollouts, source)
-        return label_rows(rows, source), samples
+        parts, lost = attempt(partial(self.roll_out, method), tasks)
+        rows, samples = [], []
+        for done, rollouts in parts:
+            found, features = score_rollouts(rollouts)
+            scene = self.scenes.batch([scene for scene, _ in done])
+            rollouts["evasion"] = add_avoidable(found, rollouts, scene, self.sim)
+            if folder is not None:
+                write_rollouts(folder, rollouts, source)
+            rows += label_rows(found, source)
+            samples += features
+        about = vars(source) | {"eta": float(method.eta)}
+        ended = [about | {"scene_id": self.scenes.scene_id[scene], "seed": seed} | why for (scene, seed), why in lost]
+        return rows, samples, ended
 
 
 def scene_seed(scene: int, seed: int) -> int:
@@ -124,7 +133,7 @@ def drive_all(
         setup, method, part = job
         return setup.score(method, part, into)
 
-    rows, features = [], []
+    rows, features, lost = [], [], []
     with tqdm(total=len(tasks) * len(methods) * len(setups), desc="rollouts", unit="rollout") as bar:
 
         def ended(job: tuple[Setup, Method, list[Task]]) -> None:
@@ -132,20 +141,38 @@ def drive_all(
             bar.set_postfix(ego=setup.ego_name, method=method.name, eta=method.eta, refresh=False)
             bar.update(len(part))
 
-        for found, samples in in_processes(work, jobs, processes, lambda job: job[1].eta, ended):
+        for found, samples, without in in_processes(work, jobs, processes, lambda job: job[1].eta, ended):
             rows += found
             features += samples
-    return rows, features
+            lost += without
+    return rows, features, lost
 
 
 def record(
-    rows: list[dict], features: list[dict[str, Tensor]], folder: Path | None, summarise: Callable[..., list[dict]]
+    rows: list[dict],
+    features: list[dict[str, Tensor]],
+    ended: list[dict],
+    folder: Path | None,
+    summarise: Callable[..., list[dict]],
 ) -> list[dict]:
-    """The rows of metrics.json, summarise(rows, features); writes rollouts.csv, modes.json and metrics.json."""
+    """The rows of metrics.json, summarise(rows, features), with the counts of what ended.
+
+    Writes rollouts.csv, modes.json, metrics.json and, where rollouts ended without a score, ended.json. Raises
+    InputError where all did.
+    """
+    if folder is not None:
+        write_ended(folder / ENDED_FILE, ended)
+    require_rows(rows, ended, folder)
     modes = find_modes(rows)
-    result = summarise(rows, features)
+    result = [row | {"ended": count_reasons(filter(_of_row(row), ended))} for row in summarise(rows, features)]
     if folder is not None:
         write_modes(folder / MODES_FILE, modes)
         write_rows(folder / TABLE, rows)
         write_metrics(folder / METRICS_FILE, result)
     return result
+
+
+def _of_row(row: dict) -> Callable[[dict], bool]:
+    """Whether an entry of ended.json is of the rollouts of a row of metrics.json."""
+    names = [("dataset", "dataset"), ("split", "split"), ("method", "method"), ("ego", "ego_policy"), ("eta", "eta")]
+    return lambda entry: all(row[name] == entry[other] for name, other in names)

@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
-from zlib import error as ZlibError
 
 import numpy as np
 import torch
@@ -12,40 +10,82 @@ from torch import Tensor
 
 from e2rl.errors import InputError
 from e2rl.evaluation.files import FORMAT, OPTIONAL, ROLLOUTS
+from e2rl.files import read_arrays
 from e2rl.scene.recording import AGENT_TYPES
 
-SCALARS = ("format", "scene_id", "location", "dataset", "split", "method", "ego_policy", "seed", "eta", "dt", "ego")
-ARRAYS = (
-    "states",
-    "valid",
-    "size",
-    "agent_type",
-    "simulated",
-    "adversaries",
-    "logged",
-    "logged_valid",
-    "lane_points",
-    "lane_offsets",
-    "lane_width",
-    "drivable_points",
-    "drivable_offsets",
-)
+TEXTS = ("format", "scene_id", "location", "dataset", "split", "method", "ego_policy")
+SCALARS = (*TEXTS, "seed", "eta", "dt", "ego")
+ARRAYS = {  # kinds of elements, and shape: a number, or a letter for a size that is the same wherever it stands
+    "states": ("f", "TN4"),
+    "valid": ("b", "TN"),
+    "size": ("f", "N2"),
+    "agent_type": ("U", "N"),
+    "simulated": ("b", "N"),
+    "adversaries": ("b", "N"),
+    "logged": ("f", "TN4"),
+    "logged_valid": ("b", "TN"),
+    "lane_points": ("f", "M2"),
+    "lane_offsets": ("iu", "L"),
+    "lane_width": ("f", "W"),
+    "drivable_points": ("f", "D2"),
+    "drivable_offsets": ("iu", "Q"),
+    "ran_light": ("iu", "N"),
+}
 
 
 def read_rollout(path: Path) -> dict[str, Any]:
     """The arrays of one npz, scalars as python values; InputError if it is no rollout."""
+    path = Path(path)
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            data = {key: archive[key] for key in archive.files}
-    except (OSError, ValueError, EOFError, BadZipFile, ZlibError) as error:
+        data = read_arrays(path)
+    except ValueError as error:
         raise InputError(f"{path}: no readable rollout ({error}); run evaluate.py again to rewrite it") from error
-    missing = [key for key in (*SCALARS, *ARRAYS) if key not in data]
+    missing = [key for key in (*SCALARS, *ARRAYS) if key not in data and key not in OPTIONAL]
     if missing or str(data["format"]) != FORMAT:
         raise InputError(
             f"{path}: not of format {FORMAT} (missing: {', '.join(missing) or 'nothing'}; format: "
             f"{data.get('format')}); give a folder that evaluate.py wrote"
         )
+    if wrong := _misfits(data):
+        raise InputError(f"{path}: damaged: {wrong}; run evaluate.py again to rewrite it")
     return {key: value.item() if key in SCALARS else value for key, value in data.items()}
+
+
+def _misfits(data: dict[str, np.ndarray]) -> str | None:
+    """What does not fit together in the arrays of a rollout; None: nothing."""
+    for key in SCALARS:
+        kind = "U" if key in TEXTS else "iuf"
+        if data[key].shape != () or data[key].dtype.kind not in kind:
+            return f"{key} is no single {'text' if key in TEXTS else 'number'}"
+    if not np.isfinite([data[key].item() for key in ("seed", "eta", "dt", "ego")]).all():
+        return "a number is NaN or infinite"
+    sizes: dict[str, int] = {}
+    for key, (kinds, shape) in ARRAYS.items():
+        if key not in data:
+            continue
+        array = data[key]
+        wrong = f"{key} has shape {array.shape} and type {array.dtype}"
+        if array.ndim != len(shape) or array.dtype.kind not in kinds:
+            return wrong
+        for name, size in zip(shape, array.shape, strict=True):
+            if sizes.setdefault(name, int(name) if name.isdigit() else size) != size:
+                return wrong
+    if min(sizes["T"], sizes["N"]) < 1 or sizes["L"] != sizes["W"] + 1:
+        return "it holds no agent, or as many lanes as borders between them"
+    if not set(data["agent_type"].tolist()) <= set(AGENT_TYPES):
+        return "agent_type names an unknown type"
+    if not all(
+        np.isfinite(data[name][data[known]]).all() for name, known in (("states", "valid"), ("logged", "logged_valid"))
+    ):
+        return "a valid state is NaN or infinite"
+    for name in ("lane", "drivable"):
+        offsets = data[f"{name}_offsets"].astype(np.int64)
+        ends = (offsets[:1].tolist(), offsets[-1:].tolist())
+        if ends != ([0], [len(data[f"{name}_points"])]) or (np.diff(offsets) < 0).any():
+            return f"{name}_offsets do not divide {name}_points"
+        if not np.isfinite(data[f"{name}_points"]).all():
+            return f"{name}_points are NaN or infinite"
+    return None
 
 
 def read_rollouts(folder: Path) -> list[dict[str, Any]]:

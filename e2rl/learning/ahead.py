@@ -13,6 +13,7 @@ import torch
 from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError
+from e2rl.workers import die_with_parent
 
 DONE = b"done "  # begins a message of success, before the seconds
 
@@ -26,7 +27,7 @@ class Ahead:
         context = multiprocessing.get_context("fork")
         self._name, (self._receiver, sender) = name, context.Pipe(duplex=False)
         sys.stdout.flush(), sys.stderr.flush()  # or the fork would write them once more
-        self._process = context.Process(target=_run, args=(work, sender), daemon=True)
+        self._process = context.Process(target=_run, args=(work, sender, os.getpid()), daemon=True)
         self._process.start()
         sender.close()
 
@@ -58,7 +59,8 @@ def why_not_ahead(device: str, threads: int, ego: Ego, traffic: str | None = Non
     return ""
 
 
-def _run(work: Callable[[], None], sender: Connection) -> None:
+def _run(work: Callable[[], None], sender: Connection, parent: int) -> None:
+    die_with_parent(parent)
     torch.set_num_threads(1)
     begin = time.perf_counter()
     try:

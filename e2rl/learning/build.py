@@ -5,7 +5,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from e2rl.build import build_sim, built, intensities, load_choice, resolved
+from e2rl.build import build_sim, built, check_counts, check_seeds, intensities, load_choice, resolved
 from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError
@@ -70,6 +70,18 @@ def _beside(config: DictConfig, ego: Ego) -> dict:
     return options | {"ahead": not reason} if options.get("ahead", False) is None else options
 
 
+def check_training(config: DictConfig) -> None:
+    """InputError for counts, seeds and intensities that train.py cannot run, before anything is built."""
+    check_counts(config, rounds=1, keep_last=1, seed=0)
+    if config.num_scenes is not None:
+        check_counts(config, num_scenes=1)
+    if type(config.measure.scenes) is not int or config.measure.scenes < 1:
+        raise InputError(f"measure.scenes={config.measure.scenes}: expected a whole number of at least 1")
+    check_seeds("measure.seeds", config.measure.seeds)
+    intensities(config.measure)
+    build_sim(config)
+
+
 def build_logger(config: DictConfig, folder: Path) -> RunLogger:
     """The logger of config.logger, writing under a run's folder."""
     return RunLogger(config.logger.kind, folder, config.logger.project, config.logger.name)
@@ -106,5 +118,8 @@ def run_imitation(
     if "imitation" not in config.learner or not isinstance(ego, ActorEgo):
         raise InputError("stage=imitation trains ego=actor with learner=ppo_bc; set both")
     settings = settings_of(ImitationSettings, {**config.learner.imitation, "seed": config.seed}, "learner.imitation")
+    if settings.held_out > 0 and len(scenes) < 2:
+        reason = "of one scene none can be held out"
+        raise InputError(f"learner.imitation.held_out={settings.held_out:g}: {reason}; pass more, or set it to 0")
     pairs = recorded_pairs(scenes, build_sim(config), settings)
     return imitate(ego.network, pairs, settings, folder, None if logger is None else logger.log)

@@ -93,7 +93,7 @@ class Imitation:
         self._generator = torch.Generator().manual_seed(settings.seed)
         scenes = pairs["scene_index"].unique()
         scenes = scenes[torch.randperm(len(scenes), generator=self._generator)]
-        apart = scenes[: round(settings.held_out * len(scenes))]
+        apart = scenes[: max(round(settings.held_out * len(scenes)), int(settings.held_out > 0))]
         held_out = torch.isin(pairs["scene_index"], apart)
         pairs = pairs.select("observation", "action", "weight").to(network.device)
         self.train, self.held_out = pairs[~held_out.to(pairs.device)], pairs[held_out.to(pairs.device)]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from e2rl.errors import InputError
@@ -64,7 +64,7 @@ class Memory:
     def write(self, number: int, traffic: Mapping[str, Tensor]) -> None:
         """Write the traffic of a round."""
         plain = {name: value.detach().cpu().contiguous() for name, value in traffic.items()}
-        write_atomically(self.path(number), lambda part: save_file(plain, part))
+        write_atomically(self.path(number), save(plain))
 
     def take(self, number: int) -> dict[str, Tensor]:
         """Map a written round as the newest; the oldest rounds beyond the bound leave. Returns its traffic."""

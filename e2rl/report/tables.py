@@ -135,11 +135,13 @@ def origin(row: dict) -> str:
 
 
 def counts(group: Sequence[dict], names: Sequence[str]) -> str:
-    """Numbers of scenes, seeds and rollouts, once where all columns agree, else by column."""
+    """Numbers of scenes, seeds and rollouts, and of rollouts without a score; once where all columns agree, else by
+    column."""
     texts = []
     for row in group:
         numbers = {word: row[f"n_{word}s"] for word in ("scene", "seed", "rollout")}
-        texts.append(", ".join(f"{n} {word}{'' if n == 1 else 's'}" for word, n in numbers.items()))
+        ended = [f"{count} without a score ({reason})" for reason, count in row.get("ended", {}).items()]
+        texts.append(", ".join([*(f"{n} {word}{'' if n == 1 else 's'}" for word, n in numbers.items()), *ended]))
     if len(set(texts)) == 1:
         return f"{texts[0]} per method."
     return "; ".join(f"{name}: {text}" for name, text in zip(names, texts, strict=True)) + "."

@@ -12,14 +12,17 @@ from e2rl.scene.drivable import drivable_field
 from e2rl.scene.lane_graph import BEHIND, LaneGraph, Route, plausible_width
 from e2rl.scene.log_route import route_from_log
 from e2rl.scene.paths import wrap
+from e2rl.scene.plausibility import check, extent, map_fit, motion
 from e2rl.scene.recording import VEHICLE, Recording
 from e2rl.scene.route import SPACING, project
 from e2rl.scene.smoothing import PAST, causal_past, causal_state, drop_jumps, smooth
+from e2rl.settings import check_range
 
 Arrays = dict[str, np.ndarray]
 STANDING = 0.5  # m/s
 FIT = 2.0  # m: mean distance of a recorded future from a candidate that still counts as the route driven
 PASSED = 1.0  # m behind the vehicle's centre beyond which a stop line no longer counts
+LEAST = {"steps": 1, "vehicles": 2, "others": 0, "routes": 1, "vertices": 20, "field_cells": 8}
 MAX_EXITS, MAX_LIGHTS = 6, 2  # successors of a lane, lights of a route that a scene keeps
 
 
@@ -35,19 +38,25 @@ class BuildSettings:
     vertices: int = 150
     field_cells: int = 320
 
+    def __post_init__(self) -> None:
+        for name, least in LEAST.items():
+            check_range(f"data.build.{name}", getattr(self, name), least)
+
 
 def build_scene(recording: Recording, settings: BuildSettings) -> TensorDict:
     """The Scene of a recording from its start frame (schema: e2rl/scene/scene.py).
 
-    Raises InputError where the recording makes none (no ego, no lanes, NaN states).
+    Raises InputError where the recording makes none (no ego, no lanes, NaN states), and where it is not plausible.
     """
     frame = recording.validate().current
     assert frame is not None
+    check(extent(recording) | motion(recording), recording.scene_id)
     valid = drop_jumps(recording.states, recording.valid)
     valid[:, recording.ego] = recording.valid[:, recording.ego]  # without the ego there is no scene
     graph = LaneGraph(recording.lanes)
     if not graph.ids:
         raise InputError(f"scene {recording.scene_id!r}: no lane is at least 0.5 m long; leave the scene out")
+    check(map_fit(recording, graph), recording.scene_id)
     scene, origin = _agents(recording, frame, valid, settings)
     lights = {name: index for index, name in enumerate(recording.lights)}
     scene |= _routes(scene, graph, origin, lights, settings)

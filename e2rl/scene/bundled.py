@@ -6,7 +6,6 @@ after another, with counts.
 """
 
 import io
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -15,6 +14,7 @@ from importlib.resources import files
 import numpy as np
 
 from e2rl.errors import InputError
+from e2rl.files import read_arrays
 from e2rl.scene.recording import VEHICLE, Lane, Recording
 from e2rl.scene.source import Source
 
@@ -82,9 +82,8 @@ def asset_bytes(split: str) -> bytes:
 def unpack(content: bytes, name: str) -> dict[str, np.ndarray]:
     """Arrays of an archive's bytes; raises InputError where they are damaged or of another format."""
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in archive.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        arrays = read_arrays(io.BytesIO(content))
+    except ValueError as error:
         raise InputError(f"bundled scenes {name}: damaged ({error}); {MEND}") from error
     if str(arrays.get("format")) != FORMAT:
         raise InputError(f"bundled scenes {name}: format {arrays.get('format')}, expected {FORMAT}; {MEND}")

@@ -2,22 +2,20 @@
 Argoverse 2 and Lyft. They are read without ever executing what a file names."""
 
 import csv
-import io
 import json
 import lzma
-import pickle
 import zipfile
 import zlib
-from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from e2rl.errors import InputError
+from e2rl.scene.plain_pickle import load_plain
+from e2rl.scene.plausibility import check
 from e2rl.scene.recording import AGENT_TYPES, DT, LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, Lane, Recording
 from e2rl.scene.smoothing import resample_uniform
 from e2rl.scene.source import Source, hash_files
@@ -29,12 +27,10 @@ LIGHTS = {  # by the last word of LANE_STATE_... (Waymo) or TRAFFIC_LIGHT_... (n
     **dict.fromkeys(("STOP", "RED"), LIGHT_RED),
 }
 INDEXES = ("dataset_summary.pkl", "dataset_mapping.pkl")  # pickles beside the scenarios that are none
-BUILTINS = {"set", "frozenset", "list", "dict", "tuple", "int", "float", "bool", "str", "bytes", "bytearray", "complex"}
-NUMPY = {  # what arrays and numbers of numpy 1 (numpy.core) and 2 (numpy._core) name
-    "numpy": {"ndarray", "dtype"},
-    "numpy._core.multiarray": {"_reconstruct", "scalar"},
-    "numpy._core.numeric": {"_frombuffer"},
-}
+MAX_BYTES = 1 << 26  # of one pickle; the largest of nuScenes v1.0-mini has 4 MB
+MAX_NAME = 128  # characters of a scene's id
+PIECE = 4096  # bytes of a zip unpacked at a time: at most 7,000 times as many come out
+DAMAGED_ZIP = (zipfile.BadZipFile, zlib.error, lzma.LZMAError)
 
 
 @dataclass
@@ -46,9 +42,9 @@ class ScenarioNetSource(Source):
     def logs(self) -> list[str]:
         root = self.root()
         if root.is_dir():
-            names = [str(file.relative_to(root)) for file in sorted(root.rglob("*.pkl"))]
-        elif zipfile.is_zipfile(root):
-            with zipfile.ZipFile(root) as archive:
+            names = [str(file.relative_to(root)) for file in sorted(root.rglob("*.pkl")) if not file.is_dir()]
+        elif root.is_file() and zipfile.is_zipfile(root):
+            with self.archive() as archive:
                 names = [name for name in sorted(archive.namelist()) if name.endswith(".pkl")]
         else:
             raise InputError(f"data.path={root}: neither a folder nor a zip file")
@@ -65,47 +61,60 @@ class ScenarioNetSource(Source):
         files = [root] if root.is_file() else [root / log for log in self.logs()]
         return hash_files(files) + json.dumps(sorted(self.locations.items())).encode()
 
+    def archive(self) -> zipfile.ZipFile:
+        """The zip at `path`; raises InputError where its directory is damaged."""
+        try:
+            return zipfile.ZipFile(self.root())
+        except (OSError, ValueError, RuntimeError, zipfile.BadZipFile) as error:
+            raise InputError(f"data.path={self.path}: damaged zip ({error}); copy or export it again") from error
+
     def content(self, log: str) -> bytes:
-        """The bytes of one pickle; raises InputError where they cannot be read."""
+        """The bytes of one pickle; raises InputError where they cannot be read or are more than MAX_BYTES."""
         root = self.root()
         try:
-            if root.is_dir():
-                return (root / log).read_bytes()
-            with zipfile.ZipFile(root) as archive:
-                return archive.read(log)
-        except (OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, lzma.LZMAError) as error:
+            if root.is_file():
+                with self.archive() as archive:
+                    return _member(archive, log)
+            if not (root / log).is_file():
+                raise InputError(f"{log} in {root}: no regular file (a pipe, or a link to nothing); remove it")
+            _check_size((root / log).stat().st_size)
+            return (root / log).read_bytes()
+        except (OSError, EOFError, KeyError, ValueError, RuntimeError, *DAMAGED_ZIP) as error:
+            if isinstance(error, InputError):
+                raise
             raise InputError(f"{log} in {root}: cannot be read: {error}; copy or export it again") from error
 
     @cached_property
     def locations(self) -> dict[str, str]:
         """Location by a log's name without ending, from `index.csv` (columns file, location_group) beside `path`."""
         index = self.root().parent / "index.csv"
-        if not index.exists():
+        if not index.is_file():
             return {}
-        with index.open(newline="") as stream:
-            rows = [row for row in csv.DictReader(stream) if {"file", "location_group"} <= set(row)]
+        try:
+            with index.open(newline="") as stream:
+                rows = [row for row in csv.DictReader(stream) if row.get("file") and row.get("location_group")]
+        except (OSError, ValueError, csv.Error) as error:
+            raise InputError(f"{index}: cannot be read: {error}; write it again, or remove it") from error
         return {Path(row["file"]).stem: row["location_group"] for row in rows}
 
 
-class _Unpickler(pickle.Unpickler):
-    """Admits numpy arrays, plain builtins and defaultdict; anything else is refused by name, before it is run."""
+def _member(archive: zipfile.ZipFile, name: str) -> bytes:
+    """A member of a zip. It is read piece by piece, so that little more is unpacked than the size it claims."""
+    _check_size(archive.getinfo(name).file_size)
+    with archive.open(name) as stream:
+        return b"".join(iter(lambda: stream.read(PIECE), b""))
 
-    def find_class(self, module: str, name: str) -> Any:
-        if module == "builtins" and name in BUILTINS:
-            return super().find_class(module, name)
-        if (module, name) == ("collections", "defaultdict"):
-            return defaultdict
-        array_module = module.replace("numpy.core.", "numpy._core.")
-        if name in NUMPY.get(array_module, ()):
-            return super().find_class(array_module, name)
-        raise pickle.UnpicklingError(f"names the forbidden class {module}.{name}")
+
+def _check_size(size: int) -> None:
+    if size > MAX_BYTES:
+        raise ValueError(f"{size / 1e6:.0f} MB, more than the {MAX_BYTES / 1e6:.0f} MB of a log; cut it into scenarios")
 
 
 def safe_load(content: bytes, name: str) -> dict:
-    """The dict in a pickle; raises InputError naming the file where it is damaged or names a forbidden class."""
+    """The dict in a pickle; raises InputError naming the file where it is damaged or holds more than plain data."""
     try:
-        data = _Unpickler(io.BytesIO(content)).load()
-    except Exception as error:  # damaged bytes raise anything, from EOFError to MemoryError
+        data = load_plain(content)
+    except Exception as error:  # damaged bytes raise anything
         reason = str(error) or type(error).__name__
         mend = "only numpy arrays and plain containers are read, so export the scenario again"
         raise InputError(f"{name}: cannot be read: {reason}; {mend}") from error
@@ -121,7 +130,7 @@ def read_recording(content: bytes, name: str, location: str = "") -> Recording:
         return _recording(data, location)
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
         problem = f"{type(error).__name__} {error}; export the scenario again or leave it out"
         raise InputError(f"{name}: not a ScenarioDescription: {problem}") from error
 
@@ -132,15 +141,20 @@ def _recording(data: dict, location: str) -> Recording:
     if str(ego) not in keys:
         raise InputError(f"no ego: metadata.sdc_id={ego!r} is none of its {len(tracks)} tracks; leave it out")
     states, valid, size = _tracks(tracks)
-    frames = len(states)
+    frames, scene_id = len(states), str(data.get("id") or metadata.get("scenario_id"))[: MAX_NAME + 1]
+    if len(scene_id) > MAX_NAME:
+        raise InputError(f"its id has more than {MAX_NAME} characters; shorten it, files are named by it")
     ts = np.asarray(metadata.get("ts", np.arange(frames) * DT), float)
     if len(ts) != frames:
         raise InputError(f"{len(ts)} time stamps for {frames} frames; repair metadata.ts")
+    check({"states": (ts.max() - ts.min()) / DT * len(keys)}, scene_id)  # of the grid, whose size they give
     states, valid = resample_uniform(states, valid, ts)
     seconds, current = ts - ts[0], metadata.get("current_time_index")
+    if current is not None and not (np.isreal(current) and 0 <= current < frames and current == int(current)):
+        raise InputError(f"current_time_index={current!r} is no frame of {frames}; repair it")
     lanes, drivable = _map(data["map_features"])
     return Recording(
-        scene_id=str(data.get("id") or metadata.get("scenario_id")),
+        scene_id=scene_id,
         location=location or str(metadata.get("map", "")),
         dataset=str(metadata.get("dataset", "scenarionet")),
         states=states,
@@ -158,6 +172,7 @@ def _recording(data: dict, location: str) -> Recording:
 def _tracks(tracks: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States [F, A, 4], valid [F, A] and size [A, 2] of tracks; raises InputError where a valid state is not finite."""
     frames = len(next(iter(tracks.values()))["state"]["position"])
+    check({"states": frames * len(tracks)}, "of this log")
     states, valid = np.zeros((frames, len(tracks), 4)), np.zeros((frames, len(tracks)), bool)
     size = np.ones((len(tracks), 2))
     for index, (key, track) in enumerate(tracks.items()):
@@ -184,7 +199,7 @@ def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
         kind = str(feature["type"])
         if not kind.startswith("LANE_") or "BIKE" in kind or len(feature.get("polyline", ())) < 2:
             continue
-        line = np.asarray(feature["polyline"], float)
+        line = np.array(feature["polyline"], float)
         width = np.asarray(feature.get("width", ()), float)
         lanes[str(key)] = Lane(
             points=line[:, :2],
@@ -196,7 +211,7 @@ def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
             heights=line[:, 2] if line.shape[1] > 2 and "polygon" not in feature else None,
         )
         if len(feature.get("polygon", ())) >= 3:
-            drivable.append(np.asarray(feature["polygon"], float)[:, :2])
+            drivable.append(np.array(feature["polygon"], float)[:, :2])
     return lanes, drivable
 
 

@@ -7,13 +7,12 @@ parallel building, a cache keyed by content, and the count of what is left out.
 
 import hashlib
 import json
-import multiprocessing
 import sys
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import closing
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -28,11 +27,12 @@ from tensordict import TensorDict
 from tqdm import tqdm
 
 from e2rl.errors import InputError
-from e2rl.files import write_atomically
+from e2rl.files import locked, write_atomically
 from e2rl.scene.build import BuildSettings, build_scene, ego_overlaps
 from e2rl.scene.recording import Recording
 from e2rl.scene.scene import SceneSet, stack, validate
 from e2rl.settings import check_range, settings_of
+from e2rl.workers import interrupts_held, without_main, worker_pool
 
 OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are left out
 VERSION = 3  # of the scene builder: raise it when the same recording would make another scene
@@ -101,15 +101,25 @@ class Source(ABC):
         for log in self.logs():
             yield from self._windows(log)
 
-    def load(self) -> SceneSet:
-        """All scenes, from the cache where they are there; raises InputError for bad input."""
+    def load(self, most: int | None = None) -> SceneSet:
+        """All scenes or the first `most`, from the cache where they are there; raises InputError for bad input.
+
+        For the first `most`, no more logs are built than they take, unless the cache has all.
+        """
+        if (
+            type(self).__module__ == "__mp_main__"
+        ):  # a worker that imports its script anew, and would wait for its parent
+            raise InputError('a script that defines its own source needs `if __name__ == "__main__":` around its calls')
         content = self.fingerprint()
         if content is None:
-            return self._build()
+            return self._build(most)
         settings = asdict(self) | {"split": self.split_name, "source": type(self).__qualname__}
         settings = {key: value for key, value in settings.items() if key not in ("path", "cache", "workers")}
         key = hashlib.sha256(json.dumps([VERSION, settings], sort_keys=True).encode() + content).hexdigest()[:24]
-        return _cached(Path(self.cache) / f"scenes-{key}.safetensors", self._build)
+        every = Path(self.cache) / f"scenes-{key}.safetensors"
+        if most is None or every.exists():
+            return _cached(every, self._build).first(most)
+        return _cached(every.with_stem(f"{every.stem}-{most}"), partial(self._build, most))
 
     def _windows(self, log: str) -> Iterator[Recording]:
         for recording in self.read(log):
@@ -142,19 +152,28 @@ class Source(ABC):
         if min(self.workers, len(logs)) <= 1:
             yield from (row for rows in show(map(self._rows_of, logs)) for row in rows)
             return
-        spawn = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(self.workers, spawn, torch.set_num_threads, (1,)) as pool:
-            try:
-                yield from (row for rows in show(pool.map(self._rows_of, logs, chunksize=4)) for row in rows)
-            finally:  # stopping at an invalid scene, do not wait for the others
-                pool.shutdown(wait=False, cancel_futures=True)
+        own = type(self).__module__ == "__main__"  # then the workers need the script that defines it
+        try:
+            with worker_pool(self.workers, "spawn") as pool:
+                with interrupts_held(), nullcontext() if own else without_main():
+                    waiting = [pool.submit(self._rows_of, log) for log in reversed(logs)]
+                found = (waiting.pop().result() for _ in logs)  # in the logs' order, none kept
+                yield from (row for rows in show(found) for row in rows)
+        except BrokenProcessPool as error:
+            raise InputError(
+                f"data.workers={self.workers}: a process that builds scenes was killed, perhaps for lack of memory, or "
+                'did not start, as in a script without `if __name__ == "__main__":`; set data.workers=1'
+            ) from error
 
-    def _build(self) -> SceneSet:
-        """The scenes of all logs; raises InputError for the first invalid one, unless `skip_invalid`."""
+    def _build(self, most: int | None = None) -> SceneSet:
+        """The scenes of all logs, or the first `most`; raises InputError for an invalid one, unless `skip_invalid`."""
         dropped: Counter[str] = Counter()
-        scenes, names = [], []
+        scenes: list[dict[str, np.ndarray]] = []
+        names: list[tuple[str, str, str]] = []
         with closing(self._rows()) as rows:  # the progress bar ends before a message
             for row in rows:
+                if most is not None and len(scenes) >= most:
+                    break
                 if row.scene is not None:
                     scenes.append(row.scene)
                     names.append(row[:3])
@@ -189,7 +208,7 @@ def load_scenes(
         source = replace(source, split=split)
     if starts is not None:
         source = replace(source, starts=tuple(starts))
-    return source.load().first(num_scenes)
+    return source.load(num_scenes)
 
 
 def _source(data: Mapping) -> Source:
@@ -208,12 +227,20 @@ def _source(data: Mapping) -> Source:
 
 
 def hash_files(paths: Iterable[Path]) -> bytes:
-    """SHA-256 of the names and contents of files, for `Source.fingerprint`."""
+    """SHA-256 of the names and contents of files, for `Source.fingerprint`; of a pipe or a link to nothing of its name.
+
+    Raises InputError for a file that cannot be read.
+    """
     digest = hashlib.sha256()
     for path in paths:
         digest.update(path.name.encode())
-        with open(path, "rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
+        if not path.is_file():
+            continue
+        try:
+            with open(path, "rb") as file:
+                digest.update(hashlib.file_digest(file, "sha256").digest())
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}; make it readable, or remove it") from error
     return digest.digest()
 
 
@@ -223,29 +250,49 @@ def _naming(log: str, error: InputError) -> str:
 
 
 def _cached(path: Path, build: Callable[[], SceneSet]) -> SceneSet:
-    """The scenes in a cache file; they are built and stored where it is not there or damaged."""
-    if path.exists():
-        try:
-            return _load(path)
-        except (SafetensorError, KeyError, ValueError, TypeError, OSError) as error:
-            tqdm.write(f"rebuilding the damaged cache file {path}: {error}")
+    """The scenes in a cache file; they are built and stored where it is not there or damaged. Of several processes, one
+    builds, and the others wait for it."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        with locked(path):
+            return _stored(path) or _store(path, build())
     except OSError as error:
-        raise InputError(f"data.cache={path.parent}: cannot be made ({error}); pass a writable folder") from error
-    scenes = build()
-    columns = {key: value.contiguous() for key, value in scenes.scenes.items()}
-    names = {key: value for key, value in vars(scenes).items() if key != "scenes"}
+        mend = "free space, or pass another, writable folder"
+        raise InputError(f"data.cache={path.parent}: cannot be made or written ({error}); {mend}") from error
+
+
+def _stored(path: Path) -> SceneSet | None:
+    """The scenes in a cache file, None where it is not there or not what was written."""
+    if not path.exists():
+        return None
     try:
-        write_atomically(path, lambda part: save_file(columns, part, {"scenes": json.dumps(names)}))
-    except (OSError, SafetensorError) as error:
-        mend = "free space, or pass another folder"
-        raise InputError(f"data.cache={path.parent}: cannot be written ({error}); {mend}") from error
+        with safe_open(path, "pt") as file:
+            header = file.metadata()
+            columns = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
+        if header["sha256"] != _digest(columns, header["scenes"]):
+            raise ValueError("its content is not what was written")
+        names = json.loads(header["scenes"])
+        return SceneSet(TensorDict(columns, batch_size=[len(names["scene_id"])]), **names)
+    except (SafetensorError, KeyError, ValueError, TypeError, OSError) as error:
+        tqdm.write(f"rebuilding the damaged cache file {path}: {error}", sys.stderr)
+        return None
+
+
+def _store(path: Path, scenes: SceneSet) -> SceneSet:
+    columns = {key: value.contiguous() for key, value in scenes.scenes.items()}
+    names = json.dumps({key: value for key, value in vars(scenes).items() if key != "scenes"})
+    header = {"scenes": names, "sha256": _digest(columns, names)}
+    try:
+        write_atomically(path, lambda part: save_file(columns, part, header))
+    except SafetensorError as error:
+        raise OSError(str(error)) from error
     return scenes
 
 
-def _load(path: Path) -> SceneSet:
-    with safe_open(path, "pt") as file:
-        names = json.loads(file.metadata()["scenes"])
-        columns = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
-    return SceneSet(TensorDict(columns, batch_size=[len(names["scene_id"])]), **names)
+def _digest(columns: Mapping[str, torch.Tensor], names: str) -> str:
+    """SHA-256 of scenes and of what is written about them."""
+    digest = hashlib.sha256(names.encode())
+    for key, value in sorted(columns.items()):
+        digest.update(f"{key} {value.dtype} {tuple(value.shape)}".encode())
+        digest.update(value.contiguous().numpy().reshape(-1).view(np.uint8).data)
+    return digest.hexdigest()

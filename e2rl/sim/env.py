@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 from e2rl.errors import InputError
 from e2rl.scene.route import project
 from e2rl.scene.scene import SceneSet
+from e2rl.settings import check_range
 from e2rl.sim.drivable import off_road
 from e2rl.sim.mission import Mission, mission_of
 from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, observation_config, observe
@@ -42,6 +43,10 @@ class SimSettings:
     replay_ego: bool = False
     compile: bool = False
     reward: dict[str, float] = field(default_factory=lambda: dict(DEFAULT_WEIGHTS))
+
+    def __post_init__(self) -> None:
+        for name in ("max_acceleration", "max_braking", "max_yaw_rate"):
+            check_range(f"sim.{name}", getattr(self, name), 0.1, 100.0)
 
 
 class DrivingEnv(EnvBase):

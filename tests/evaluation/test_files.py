@@ -1,12 +1,16 @@
 """Files of a run: exact keys and types, readable without pickle, whole or absent, the same when read back."""
 
+import io
 import json
 import math
 import sys
+import zipfile
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from e2rl.errors import InputError
 from e2rl.evaluation import files
@@ -87,6 +91,65 @@ def test_names_that_no_path_may_hold_are_mended(tmp_path, rollouts):
     path = write_rollouts(tmp_path, odd, SOURCE)[0]
     assert path.parent == tmp_path and path.name == "e2__idm__2__a-..-b-c__0.npz"
     assert read_rollout(path)["scene_id"] == "a/../b c"
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=6),
+    st.floats(0.3, 1),
+)
+def test_a_damaged_rollout_is_refused_by_name(tmp_path, rollouts, changes, kept):
+    """Only bytes that say nothing may be changed: then the arrays are the same."""
+    path = write_rollouts(tmp_path, rollouts, SOURCE)[0]
+    whole, content = read_rollout(path), path.read_bytes()
+    damaged = bytearray(content[: int(kept * len(content)) + 1])
+    for where, value in changes:
+        damaged[int(where * len(damaged))] = value
+    path.write_bytes(damaged)
+    try:
+        found = read_rollout(path)
+    except InputError as error:
+        assert str(error).startswith(str(path))
+    else:
+        assert all(np.array_equal(found[key], whole[key]) for key in whole)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "what"),
+    [
+        ("states", np.zeros((81, 48, 3), np.float32), "states has shape"),
+        ("valid", np.ones((80, 48), bool), "valid has shape"),
+        ("size", np.array(["a"]), "size has shape"),
+        ("seed", np.array([1, 2]), "seed is no single number"),
+        ("eta", np.array(np.nan), "NaN or infinite"),
+        ("states", np.full((81, 48, 4), np.nan, np.float32), "a valid state is NaN"),
+        ("agent_type", np.array(["horse"] * 48), "unknown type"),
+        ("lane_offsets", np.array([0, 9, 3]), "as many lanes as borders"),
+        ("drivable_offsets", np.array([0, 10**12]), "do not divide"),
+    ],
+)
+def test_arrays_that_do_not_fit_together_are_named(tmp_path, rollouts, name, value, what):
+    path = write_rollouts(tmp_path, rollouts, SOURCE)[0]
+    np.savez(path, **(dict(np.load(path)) | {name: value}))
+    with pytest.raises(InputError, match=rf"npz: damaged: .*{what}"):
+        read_rollout(path)
+
+
+def test_an_archive_that_claims_more_than_it_may_is_not_unpacked(tmp_path):
+    with (
+        zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("states.npy", "w") as one,
+    ):
+        for _ in range(1025):
+            one.write(bytes(1 << 20))
+    with pytest.raises(InputError, match=r"bomb\.npz: no readable rollout .unpacks to 1075 MB"):
+        read_rollout(tmp_path / "bomb.npz")
+    claim = io.BytesIO()
+    np.lib.format.write_array_header_1_0(claim, {"descr": "<f8", "fortran_order": False, "shape": (1 << 60,)})
+    with zipfile.ZipFile(tmp_path / "claim.npz", "w") as archive:
+        archive.writestr("states.npy", claim.getvalue())
+    with pytest.raises(InputError, match=r"claim\.npz: no readable rollout"):
+        read_rollout(tmp_path / "claim.npz")
 
 
 def test_bad_rollout_files_are_named(tmp_path, rollouts):

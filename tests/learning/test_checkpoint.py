@@ -1,6 +1,7 @@
 """r rounds and r more after a resume are 2r rounds, bit for bit; nothing half-written, nothing misread."""
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ import torch
 from e2rl.ego.actor import ActorEgo
 from e2rl.ego.idm import IDMEgo
 from e2rl.errors import InputError
+from e2rl.files import SEAL, altered, seal
 from e2rl.learning.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
 from e2rl.learning.evolution import Evolution, RoundSettings
@@ -66,7 +68,7 @@ def test_config_and_actor_are_in_the_checkpoint_and_traffic_beside_it(tmp_path):
     ours, theirs = (one.memory.rounds[0].traffic["states"] for one in (run, other))
     assert torch.equal(ours, theirs)
     files = {path.name: path.stat().st_size for path in folder.iterdir()}
-    assert set(files) == {"state.pt", "actor.safetensors", "memory.json", "config.json"}
+    assert set(files) == {"state.pt", "actor.safetensors", "memory.json", "config.json", "sha256.json"}
     assert files["memory.json"] < 1000, "the rounds are named, not copied"
     alone = ActorEgo(hidden=(16,), checkpoint=str(tmp_path))
     assert all(torch.equal(value, alone.network.weights()[key]) for key, value in run.ego.network.weights().items())
@@ -114,28 +116,35 @@ def test_what_is_missing_or_damaged_in_the_memory_is_named(tmp_path):
     file.unlink()
     with pytest.raises(InputError, match=f"{file}.*missing"):
         load_checkpoint(tmp_path, small_run(folder=tmp_path))
+    file.write_bytes(whole)
     (folder / "memory.json").write_text("[{")
-    with pytest.raises(InputError, match=r"memory\.json: damaged"):
+    with pytest.raises(InputError, match=r"memory\.json: missing or damaged"):
         load_checkpoint(tmp_path, small_run(folder=tmp_path))
 
 
 def test_what_does_not_fit_is_refused_and_named(tmp_path):
-    run = small_run()
+    run = small_run(folder=tmp_path)
     rounds(run, 1)
     folder = save_checkpoint(tmp_path, run, CONFIG)
     with pytest.raises(InputError, match=r"actor\.safetensors: an actor of another architecture: hidden"):
-        load_checkpoint(tmp_path, small_run(hidden=(8,)))
+        load_checkpoint(tmp_path, small_run(hidden=(8,), folder=tmp_path))
     with pytest.raises(InputError, match="holds 4 scenes, the data 5"):
-        load_checkpoint(tmp_path, small_run(scenes=small_scenes(5)))
+        load_checkpoint(tmp_path, small_run(scenes=small_scenes(5), folder=tmp_path))
     with pytest.raises(InputError, match="holds no checkpoint"):
         load_checkpoint(tmp_path / "elsewhere", run)
     (folder / "state.pt").write_bytes(b"half of it")
+    with pytest.raises(InputError, match=r"state\.pt: missing or damaged"):
+        load_checkpoint(tmp_path, small_run())
+    (folder / "state.pt").write_bytes(b"half of it")
+    seal(folder)
     with pytest.raises(InputError, match=r"state\.pt: damaged"):
         load_checkpoint(tmp_path, small_run())
     torch.save({"format": "e2rl-checkpoint/3"}, folder / "state.pt")
-    with pytest.raises(InputError, match=r"of another version .*e2rl-checkpoint/3, not e2rl-checkpoint/4.*new run"):
+    seal(folder)
+    with pytest.raises(InputError, match=r"of another version .*e2rl-checkpoint/3, not e2rl-checkpoint/5.*new run"):
         load_checkpoint(tmp_path, small_run())
     torch.save({"something": torch.zeros(1)}, folder / "state.pt")
+    seal(folder)
     with pytest.raises(InputError, match="not a checkpoint"):
         load_checkpoint(tmp_path, small_run())
 
@@ -147,4 +156,50 @@ def test_a_failed_write_leaves_the_last_checkpoint(tmp_path):
     rounds(run, 1)
     with pytest.raises(TypeError):
         save_checkpoint(tmp_path, run, {"not json": object()})
-    assert latest_checkpoint(tmp_path).name == "round-000001"
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["round-000001"]
+
+
+@pytest.mark.parametrize("file", ["state.pt", "actor.safetensors", "memory.json", "config.json", SEAL])
+@pytest.mark.parametrize("how", ["flipped", "torn", "missing"])
+def test_a_damaged_checkpoint_is_passed_over_for_the_one_before_it(tmp_path, capsys, file, how):
+    run = small_run(folder=tmp_path)
+    for _ in range(2):
+        rounds(run, 1)
+        save_checkpoint(tmp_path, run, CONFIG)
+    older, newer = sorted((tmp_path / "checkpoints").iterdir())
+    content = (newer / file).read_bytes()
+    middle = len(content) // 2
+    flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+    if how == "missing":
+        (newer / file).unlink()
+    else:
+        (newer / file).write_bytes(flipped if how == "flipped" else content[:middle])
+    assert altered(newer) and altered(older) is None
+    other = small_run(seed=5, folder=tmp_path)
+    assert load_checkpoint(tmp_path, other) == 1
+    assert "passed over: " in capsys.readouterr().err
+    saved = ActorEgo(hidden=(16,), checkpoint=str(older)).network.weights()
+    found = ActorEgo(hidden=(16,), checkpoint=str(tmp_path)).network.weights()
+    assert all(torch.equal(value, saved[key]) for key, value in found.items())
+    assert all(torch.equal(value, saved[key]) for key, value in other.ego.network.weights().items())
+    for left in older.iterdir():
+        left.write_bytes(b"")
+    with pytest.raises(InputError, match=f"{newer.name}.*damaged"):
+        load_checkpoint(tmp_path, small_run(folder=tmp_path))
+    with pytest.raises(InputError, match="round-00000.: damaged"):
+        ActorEgo(hidden=(16,), checkpoint=str(tmp_path))
+
+
+def test_a_full_disk_leaves_the_last_checkpoint_and_nothing_half_written(tmp_path, monkeypatch):
+    run = small_run(folder=tmp_path)
+    rounds(run, 1)
+    save_checkpoint(tmp_path, run, CONFIG)
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match="No space left"):
+        save_checkpoint(tmp_path, run, CONFIG)
+    assert altered(latest_checkpoint(tmp_path)) is None
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["round-000001"]
+
+
+def full(*_):
+    raise OSError(28, "No space left on device")

@@ -3,6 +3,8 @@
 import collections
 import os
 import pickle
+import struct
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -10,9 +12,12 @@ import numpy as np
 import pytest
 
 from e2rl.errors import InputError
+from e2rl.scene import scenarionet
 from e2rl.scene.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, OTHER, PEDESTRIAN, VEHICLE
 from e2rl.scene.scenarionet import ScenarioNetSource, read_recording, safe_load
 from tests.scene.descriptions import ALL, FRAMES, Malicious, description, fork, straight, write_folder, write_zip
+
+PROTOCOLS = range(6)
 
 
 def read(scene: dict, starts=None) -> list:
@@ -24,7 +29,7 @@ def contents(path: Path) -> list[bytes]:
     return [source.content(log) for log in source.logs()]
 
 
-@pytest.mark.parametrize("protocol", [3, 4, 5])
+@pytest.mark.parametrize("protocol", PROTOCOLS)
 @pytest.mark.parametrize(
     "call",
     [
@@ -90,7 +95,7 @@ def test_arrays_of_both_numpys_and_containers_are_read(protocol):
         old = old[:2] + old[11:] if old[2:3] == b"\x95" else old  # without the frame, whose length changed
     for content in (new, old):
         found = safe_load(content, "made.pkl")
-        assert found.keys() == held.keys() and found["d"]["k"] == {1} and found["d"]["new"] == {}
+        assert found.keys() == held.keys() and found["d"] == {"k": {1}}
         assert all(np.array_equal(found[key], held[key]) for key in "abcfgh") and found["e"] == held["e"]
 
 
@@ -113,6 +118,51 @@ def test_folders_and_zips_hold_the_same_scenes(tmp_path):
     for method in (zipfile.ZIP_LZMA, zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED):
         path = write_zip(tmp_path / f"{method}.zip", scenes, method)
         assert contents(path) == expected
+
+
+def test_what_is_no_regular_file_is_named_or_passed_over(tmp_path):
+    folder = write_folder(tmp_path / "x", [description()])
+    (folder / "folder.pkl").mkdir()
+    os.mkfifo(folder / "pipe.pkl")
+    (folder / "nothing.pkl").symlink_to(folder / "nowhere")
+    source = ScenarioNetSource(str(folder), cache=str(tmp_path / "cache"), workers=1, skip_invalid=True)
+    assert source.logs() == ["nothing.pkl", "pipe.pkl", "sd_00.pkl"]
+    for log in source.logs()[:2]:
+        with pytest.raises(InputError, match=f"{log} in .*no regular file"):
+            source.content(log)
+    assert source.load().dropped == {"invalid": 2}
+    with pytest.raises(InputError, match="neither a folder nor a zip file"):
+        ScenarioNetSource(str(folder / "pipe.pkl")).logs()
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2])
+@pytest.mark.parametrize("claimed", [None, 1000])
+def test_a_bomb_is_not_unpacked(tmp_path, method, claimed):
+    """Neither where the zip says how much would come out, nor where it lies."""
+    path, size = tmp_path / "bomb.zip", 3 * scenarionet.MAX_BYTES
+    with zipfile.ZipFile(path, "w", method) as archive:
+        archive.writestr("bomb.pkl", bytes(size))
+    if claimed:
+        path.write_bytes(path.read_bytes().replace(struct.pack("<I", size), struct.pack("<I", claimed)))
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"bomb\.pkl in .*bomb\.zip: cannot be read"):
+            ScenarioNetSource(str(path)).content("bomb.pkl")
+        assert tracemalloc.get_traced_memory()[1] < 2 * scenarionet.MAX_BYTES
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_zip_with_a_damaged_directory_and_an_index_that_is_no_table_are_named(tmp_path):
+    path = write_zip(tmp_path / "x.zip", [description()])
+    (tmp_path / "index.csv").write_bytes(b"file,location_group\n\xff\xfe,\x00\n")
+    with pytest.raises(InputError, match=r"index\.csv: cannot be read"):
+        _ = ScenarioNetSource(str(path)).locations
+    content = path.read_bytes()
+    place = content.index(b"PK\x01\x02")
+    path.write_bytes(content[:place] + b"XXXX" + content[place + 4 :])
+    with pytest.raises(InputError, match="damaged zip"):
+        ScenarioNetSource(str(path)).logs()
 
 
 def test_paths_that_hold_nothing_say_so(tmp_path):
@@ -233,7 +283,11 @@ def test_start_frames():
         (lambda s: s["tracks"]["7"]["state"]["position"].fill(np.nan), "track 7 is NaN or infinite at frame 0"),
         (lambda s: s["metadata"].update(ts=ALL[:5]), "5 time stamps for 91 frames"),
         (lambda s: s["metadata"].update(ts=ALL[::-1] * 0.1), "time stamps do not increase"),
-        (lambda s: s["metadata"].update(current_time_index="x"), "not a ScenarioDescription"),
+        (lambda s: s["metadata"].update(current_time_index="x"), "current_time_index='x' is no frame of 91"),
+        (lambda s: s["metadata"].update(current_time_index=np.inf), "current_time_index=inf is no frame of 91"),
+        (lambda s: s["metadata"].update(current_time_index=-80), "current_time_index=-80 is no frame of 91"),
+        (lambda s: s["metadata"].update(ts=np.append(ALL[:90] * 0.1, 1e9)), "scene 'fork': 3e.10 frames x agents"),
+        (lambda s: s.update(id="x" * 200), "its id has more than 128 characters"),
         (lambda s: s["tracks"]["7"]["state"].update(position=np.zeros((4, 3))), "not a ScenarioDescription"),
         (lambda s: s.update(map_features=[1]), "not a ScenarioDescription"),
     ],

@@ -2,12 +2,15 @@
 
 import os
 import pickle
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import save_file
 
 from e2rl.errors import InputError
@@ -68,6 +71,17 @@ def test_folder_zip_cache_and_workers_give_identical_scenes(tmp_path, monkeypatc
     assert limited.scene_id == first.scene_id[:2]
 
 
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_first_scenes_take_no_more_than_their_logs(tmp_path, workers):
+    """The rest is not even read: here it is damaged."""
+    folder = write_folder(tmp_path / "x", [*scenes_of(2), *[b"nonsense"] * 3])
+    config = data_config(folder, tmp_path / "cache", workers=workers)
+    assert load_scenes(config, num_scenes=2).scene_id == ["scene-0", "scene-1"]
+    assert load_scenes(config, num_scenes=1).scene_id == ["scene-0"]
+    with pytest.raises(InputError, match=r"sd_02\.pkl"):
+        load_scenes(config, num_scenes=3)
+
+
 def test_the_cache_is_keyed_by_content_and_settings(tmp_path):
     folder, cache = write_folder(tmp_path / "x", scenes_of(1)), tmp_path / "cache"
     load_scenes(data_config(folder, cache))
@@ -79,17 +93,26 @@ def test_the_cache_is_keyed_by_content_and_settings(tmp_path):
     assert len(list(cache.iterdir())) == 5
 
 
-@pytest.mark.parametrize("damage", ["truncated", "nonsense", "other", "empty"])
-def test_a_damaged_cache_is_rebuilt(tmp_path, damage):
+@pytest.mark.parametrize("damage", ["truncated", "nonsense", "other", "empty", "flipped", "NaN", "without a key"])
+def test_a_damaged_cache_is_rebuilt(tmp_path, capsys, damage):
     config = data_config(write_folder(tmp_path / "x", scenes_of(2)), tmp_path / "cache")
     first = load_scenes(config)
     (path,) = (tmp_path / "cache").iterdir()
     content = path.read_bytes()
+    with safe_open(path, "pt") as file:
+        header, columns = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     if damage == "other":
         save_file({"a": torch.zeros(1)}, path)
+    elif damage == "NaN":
+        save_file(columns | {"start": columns["start"] * torch.nan}, path, header)
+    elif damage == "without a key":
+        save_file({key: value for key, value in columns.items() if key != "past"}, path, header)
+    elif damage == "flipped":
+        path.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
     else:
         path.write_bytes({"truncated": content[: len(content) // 2], "nonsense": b"\xff" * 64, "empty": b""}[damage])
     same(first, load_scenes(config))
+    assert "rebuilding the damaged cache file" in capsys.readouterr().err
     assert path.read_bytes() == content or len(path.read_bytes()) == len(content)
     assert list((tmp_path / "cache").iterdir()) == [path]
 
@@ -217,3 +240,20 @@ def test_split_chooses_only_where_a_source_has_splits(tmp_path):
     assert load_scenes(bundled, 1).split == "test" and load_scenes(bundled, 1, split="tune").split == "tune"
     folder = write_folder(tmp_path / "x", scenes_of(1))
     assert load_scenes(data_config(folder, tmp_path / "cache"), split="tune").split == "x"
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_a_script_without_a_main_guard_works_or_is_told(tmp_path, own):
+    """Its workers import no script, unless the source is the script's own."""
+    folder = write_folder(tmp_path / "x", scenes_of(2))
+    source = "class Mine(ScenarioNetSource): pass" if own else "Mine = ScenarioNetSource"
+    (tmp_path / "script.py").write_text(
+        f"from e2rl.scene.scenarionet import ScenarioNetSource\n{source}\n"
+        f"found = Mine({str(folder)!r}, cache={str(tmp_path / 'cache')!r}, workers=2).load()\n"
+        "print(found.scene_id)\n"
+    )
+    done = subprocess.run([sys.executable, str(tmp_path / "script.py")], capture_output=True, text=True, timeout=100)
+    if own:
+        assert done.returncode == 1 and "InputError: data.workers=2: a process" in done.stderr.splitlines()[-1]
+    else:
+        assert done.returncode == 0 and done.stdout == "['scene-0', 'scene-1']\n" and "Traceback" not in done.stderr

@@ -1,12 +1,14 @@
 """Training the prior: windows over whole logs, validation on held-out places, best checkpoint kept, exact resume."""
 
+import io
 import json
 import platform
+import sys
 import time
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -28,7 +30,7 @@ from e2rl.prior.route_choice import candidate_features
 from e2rl.scene.scene import SceneSet
 
 HELD_OUT = 8  # one in HELD_OUT places is held out for validation
-STATE, PROGRESS = "training.pt", "progress.jsonl"
+STATE, PREVIOUS, PROGRESS = "training.pt", "training.previous.pt", "progress.jsonl"
 
 ClosedLoop = Callable[[Prior], dict[str, float]]  # metrics of a prior that drives held-out scenes
 
@@ -127,7 +129,30 @@ class Record:
         """Write progress.jsonl, and training.pt with the run's state."""
         state = {"run": run, "record": vars(self), "fingerprint": fingerprint}
         write_atomically(folder / PROGRESS, "".join(json.dumps(line) + "\n" for line in self.lines))
-        write_atomically(folder / STATE, partial(torch.save, state))
+        content = io.BytesIO()  # a full disk is an OSError then
+        torch.save(state, content)
+        if (folder / STATE).exists():
+            (folder / STATE).replace(folder / PREVIOUS)
+        write_atomically(folder / STATE, content.getvalue())
+
+
+def saved_state(folder: Path) -> dict | None:
+    """The newest whole state that an interrupted run has written, None where it has written none.
+
+    Raises InputError where all are damaged.
+    """
+    found = [folder / name for name in (STATE, PREVIOUS) if (folder / name).exists()]
+    for file in found:
+        try:
+            with zipfile.ZipFile(file) as archive:  # torch's format, with a checksum of each part
+                if archive.testzip() is None:
+                    return torch.load(file, map_location="cpu", weights_only=True)
+        except Exception as error:  # damaged bytes raise anything
+            tqdm.write(f"{file}: {error}", sys.stderr)
+        tqdm.write(f"passed over: {file} is damaged", sys.stderr)
+    if found:
+        raise InputError(f"{found[0]}: damaged, and no whole one before it; begin a new run")
+    return None
 
 
 def train_prior(
@@ -147,9 +172,9 @@ def train_prior(
     that every `closed_loop_every`-th validation and the last one report beside the held-out loss. Raises InputError if
     the interrupted run had other data, or for too few scenes.
     """
-    record, state, data = Record(), None, origin.get("fingerprint", "")
-    if (folder / STATE).exists():
-        state = torch.load(folder / STATE, map_location="cpu", weights_only=True)
+    record, data = Record(), origin.get("fingerprint", "")
+    state = saved_state(folder)
+    if state is not None:
         if state.get("fingerprint") != data:
             raise InputError(f"{folder / STATE}: the interrupted run had other data; resume with the same scenes")
         record = Record(**state["record"])

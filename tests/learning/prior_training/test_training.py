@@ -10,7 +10,7 @@ from e2rl.errors import InputError
 from e2rl.learning.prior_training.loss import denoising_loss
 from e2rl.learning.prior_training.optimisation import PriorTraining
 from e2rl.learning.prior_training.settings import TrainingSettings
-from e2rl.learning.prior_training.training import Record, held_out, train_prior, train_route_choice
+from e2rl.learning.prior_training.training import Record, held_out, saved_state, train_prior, train_route_choice
 from e2rl.learning.prior_training.windows import make_windows
 from e2rl.prior.checkpoint import load_prior
 from e2rl.prior.denoiser import DenoiserSettings
@@ -205,3 +205,20 @@ def test_logs_without_a_moving_vehicle_are_named(tmp_path):
     scenes.location[:] = ["a", "b"]
     with pytest.raises(InputError, match="no vehicle moves"):
         train_prior(untrained(), scenes, SETTINGS, tmp_path, {})
+
+
+@pytest.mark.parametrize("how", ["flipped", "torn", "empty"])
+def test_a_damaged_state_is_passed_over_for_the_one_before_it(tmp_path, how):
+    assert saved_state(tmp_path) is None
+    for step in (1, 2):
+        Record(lines=[{"step": step}]).write(tmp_path, {"weights": torch.full((64,), float(step))}, "data")
+    assert saved_state(tmp_path)["record"]["lines"] == [{"step": 2}]
+    content = (tmp_path / "training.pt").read_bytes()
+    where = content.index(torch.full((64,), 2.0).numpy().tobytes())
+    flipped = content[:where] + bytes([content[where] ^ 1]) + content[where + 1 :]
+    damaged = {"flipped": flipped, "torn": content[: len(content) // 2], "empty": b""}[how]
+    (tmp_path / "training.pt").write_bytes(damaged)
+    assert saved_state(tmp_path)["run"]["weights"].tolist() == [1.0] * 64
+    (tmp_path / "training.previous.pt").write_bytes(damaged)
+    with pytest.raises(InputError, match=r"training\.pt: damaged, and no whole one before it"):
+        saved_state(tmp_path)
