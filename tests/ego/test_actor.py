@@ -9,6 +9,7 @@ from e2rl.ego.base import PLAN_STEPS, EgoPolicy
 from e2rl.ego.network import Normaliser, find_weights
 from e2rl.ego.reference import reference_action
 from e2rl.errors import InputError
+from e2rl.files import seal
 from e2rl.sim.env import DrivingEnv, SimSettings
 from tests.synthetic import make_scenes
 
@@ -96,6 +97,7 @@ def test_file_round_trip(tmp_path):
     folder = tmp_path / "checkpoints" / "round-000001"
     folder.mkdir(parents=True)
     first.network.save(folder / "actor.safetensors")
+    seal(folder)
     assert find_weights(tmp_path) == find_weights(folder) == folder / "actor.safetensors"
     second = ActorEgo(hidden=(8,), checkpoint=str(tmp_path))
     env = DrivingEnv(make_scenes(2), SimSettings(), 2, agents=True)
