@@ -16,33 +16,38 @@ from e2rl.evaluation.files import METRICS_FILE, write_metrics
 from e2rl.evaluation.ladders import intensity_ladder
 from e2rl.evaluation.modes import MODES_FILE, read_modes
 from e2rl.evaluation.open_loop import open_loop_rows
-from e2rl.evaluation.protocol import Setup, run_protocol
+from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.evaluation.realism_meta import meta_rows
 from e2rl.report.drawing import save_picture
 from e2rl.report.egos import ego_tables, guard_table
 from e2rl.report.html import report_command
 from e2rl.report.intensity import intensity_figure
-from e2rl.report.methods import method_tables, save_method_tables
+from e2rl.report.methods import EGOS, METHODS, method_tables, planner_tables, save_compared
 from e2rl.report.modes import mode_tables
 from e2rl.report.plots import collision_bars, learning_curves
 from e2rl.report.skeleton import skeleton_figure
 from e2rl.report.tables import Table, metric_tables, print_tables, save_tables
+from e2rl.report.tuning import save_tuning_curve
 from e2rl.scene.scene import SceneSet
 from e2rl.scene.source import load_scenes
+from e2rl.tuning import run_tuning, tuning_of
 
 
 def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     """Run the methods of a configuration and return the rows of metrics.json."""
     build.set_up(config)
     build.check_evaluation(config)
-    egos = build_egos(config)
+    egos, task = build_egos(config), tuning_of(config)
     prior, origin = build.build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
     methods, name = build.build_methods(config, prior), HydraConfig.get().runtime.choices["ego"]
     name, ego = next(iter(egos.egos.items())) if egos else (name, build.build_ego(config))
     sim, scenes = build.build_sim(config), load_scenes(config.data, config.num_scenes)
     setup = Setup(scenes, ego, name, sim, config.batch, config.device)
-    if config.tuning is not None:
-        return build.tune(config, setup, methods, folder)["trials"]
+    if task is not None:
+        result = run_tuning(config, task, setup, methods, prior, folder)
+        if task.group == "synthesizer":
+            save_tuning_curve(folder, result["trials"], config.synthesizer.name)
+        return result["trials"]
     only = None if config.scene is None else [scenes.index(config.scene)]
     chain = LongestChain(methods[0]) if config.figure == "skeleton" else None
     rows = []
@@ -58,11 +63,9 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     caption = f"{build.caption(config, origin, methods)}; {effort}{dropped}"
     tables = metric_tables(rows, caption, config.metrics)
     if config.compare is not None:
-        compared = method_tables(rows, build.terms_by_method(methods), config.compare, caption)
-        save_method_tables(folder, compared)
-        tables = compared
+        tables = compared_tables(config, methods, egos, rows, caption, folder)
     tables += mode_tables(read_modes(folder / MODES_FILE))
-    if egos:
+    if egos and config.compare is None:
         tables += report_egos(config, egos, rows, scenes, caption, folder)
     save_tables(folder / "tables.md", tables)
     print_tables(tables)
@@ -75,6 +78,18 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     if command := report_command(folder):
         print(f"watch its failures: {command}")
     return rows
+
+
+def compared_tables(
+    config: DictConfig, methods: list[Method], egos: EgoSet | None, rows: list[dict], caption: str, folder: Path
+) -> list[Table]:
+    """The tables with a row a method, or where there are several egos a row an ego; also as files of their own."""
+    if egos:
+        tables = planner_tables(rows, egos.names, config.compare, caption)
+    else:
+        tables = method_tables(rows, build.terms_by_method(methods), config.compare, caption)
+    save_compared(folder, tables, EGOS if egos else METHODS)
+    return tables
 
 
 def report_egos(

@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError
-from e2rl.evaluation.objective import Objective
 from e2rl.evaluation.processes import cores
-from e2rl.evaluation.protocol import Method, Setup
-from e2rl.evaluation.tune_planner import Trials, TuneSettings, tune_planner, yaml_of
+from e2rl.evaluation.protocol import Method
 from e2rl.metrics.catalogue import TABLES
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.checkpoint import load_prior
@@ -150,33 +147,6 @@ def build_ego(config: DictConfig) -> Ego:
     return built(config.ego, "ego", Ego)
 
 
-def tune(config: DictConfig, setup: Setup, methods: list[Method], folder: Path) -> dict:
-    """Tune the parameters of the `ego` group on these methods, as `config.tuning` says; returns what tuning.json
-    holds."""
-    try:
-        plain = resolved(config.tuning)
-    except OmegaConfBaseException as error:
-        reason = "no ranges for this ego; add them, such as '+tuning.spaces.NAME={margin: [0.2, 1.5]}'"
-        raise InputError(f"tuning.spaces: {reason}") from error
-    space, _ = plain.pop("space"), plain.pop("spaces", None)
-    plain["objective"] = settings_of(Objective, plain.get("objective", {}), "tuning.objective")
-    unknown = sorted(set(plain) - {field.name for field in fields(TuneSettings)})
-    if unknown:
-        raise InputError(f"tuning: {', '.join(unknown)}: no such setting; compare it with conf/experiment")
-    check_counts(plain, trials=1, seed=0, startup=1)
-    present = {key: value for key, value in resolved(config.ego).items() if key != "_target_"}
-
-    def make(parameters: dict[str, Any]) -> Ego:
-        return build_ego(OmegaConf.create({"ego": {**config.ego, **parameters}}))
-
-    trials = Trials(setup, methods, list(config.seeds), make, processes_of(config))
-    rows = [f"{method.name}@{method.eta:g}" for method in methods]
-    about = {"rows": rows, "seeds": list(config.seeds), "scenes": setup.scenes.scene_id}
-    result = tune_planner(trials, present, space, TuneSettings(**plain), folder, about)
-    print(f"\nbest of {len(result['trials'])} trials, for conf/ego:\n{yaml_of(result['best'])}written to {folder}")
-    return result
-
-
 def build_sim(config: DictConfig) -> SimSettings:
     """The simulator's settings."""
     return settings_of(SimSettings, config.sim, "sim")
@@ -276,15 +246,19 @@ def check_evaluation(config: DictConfig) -> None:
 
 
 def check_compared(config: DictConfig) -> None:
-    """InputError for a method of `config.compare` that is no row, or one of several intensities or egos."""
+    """InputError where `config.compare` is no row: of `egos` where there are any, else a method of one intensity."""
     if config.compare is None:
+        return
+    if config.egos:
+        if config.policy_learning is not None:
+            raise InputError(f"compare={config.compare}: policy_learning has tables of its own; leave one of the two")
+        if config.compare not in config.egos:
+            raise InputError(f"compare={config.compare}: none of egos ({', '.join(map(str, config.egos))}); name one")
         return
     if config.compare not in (*config.methods, *config.variants):
         raise InputError(f"compare={config.compare}: no row of this name; add it to methods")
-    if len(intensities(config)) > 1 or config.egos:
-        raise InputError(
-            f"compare={config.compare}: a table with a row a method has one eta and one ego; name one each"
-        )
+    if len(intensities(config)) > 1:
+        raise InputError(f"compare={config.compare}: a table with a row a method has one eta; name one")
 
 
 def processes_of(config: DictConfig) -> int:

@@ -96,10 +96,11 @@ def one_ego(config: DictConfig, name: str, changes: Mapping[str, Any]) -> Ego:
 
 def compared(config: DictConfig) -> list[tuple[str, str]]:
     """Pairs of names whose difference is of interest: `policy_learning.after` with each other ego, `before` first; or
-    without `policy_learning` each ego with the first."""
+    without `policy_learning` each ego with `compare`, or with the first."""
     names = [str(name) for name in config.egos]
     if config.policy_learning is None:
-        return [(name, names[0]) for name in names[1:]]
+        reference = names[0] if config.compare is None else config.compare
+        return [(name, reference) for name in names if name != reference]
     for role in ROLES:
         given = config.policy_learning.get(role)
         if given not in names:

@@ -13,7 +13,7 @@ PATH = re.compile(rf"(?<![\w./<>-])(?:{FOLDERS})/[\w./<>*{{}}\[\]-]*")
 PLACEHOLDER = re.compile(r"[<>*{}\[\]]|\.\.\.|(?<![a-zA-Z])[A-Z]{3,}(?![a-zA-Z])")  # <name>, *, {a,b}, ..., NAME
 DOCUMENT = re.compile(r"(?<![\w/])[\w-]+\.md\b")
 SECTION = re.compile(r"docs/method\.md, sections? (\d+)(?: to (\d+))?")
-WRITTEN = {"tables.md", "methods.md"}  # documents that a run writes
+WRITTEN = {"tables.md", "methods.md", "egos.md"}  # documents that a run writes
 
 
 def docstrings(path: Path) -> Iterator[str]:

@@ -7,6 +7,7 @@ from e2rl.ego.actor import ActorEgo
 from e2rl.ego.lane_graph import LaneGraphEgo
 from e2rl.egos import build_egos, curve_runs
 from e2rl.errors import InputError
+from e2rl.files import seal
 from tests.prior.small import small_prior
 
 LEARNING = ["experiment=policy_learning"]
@@ -22,6 +23,7 @@ def checkpoint(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     (folder / "checkpoints" / "round-000001").mkdir(parents=True)
     build.build_ego(config_of("ego=actor")).network.save(folder / "checkpoints" / "round-000001" / "actor.safetensors")
+    seal(folder / "checkpoints" / "round-000001")
     return folder
 
 
@@ -33,6 +35,20 @@ def test_an_entry_is_a_file_with_changes_of_its_fields():
     chosen = build_egos(config_of("+egos.a={ego: lane_graph, max_risk: 0.3}", "+egos.b={ego: lane_graph}"))
     assert isinstance(chosen.egos["a"], LaneGraphEgo) and chosen.pairs == [("b", "a")]
     assert chosen.egos["a"].max_risk == 0.3 != chosen.egos["b"].max_risk
+
+
+def test_table_4_compares_every_ego_with_one_of_them():
+    config = config_of("experiment=table4")
+    build.check_evaluation(config)
+    chosen = build_egos(config)
+    names = ["replay", "idm", "lane_graph", "sampling", "actor_untrained", "actor"]
+    assert list(chosen.egos) == names
+    assert chosen.pairs == [(name, "lane_graph") for name in names if name != "lane_graph"]
+    trained, untrained = (chosen.egos[name].network.weights() for name in ("actor", "actor_untrained"))
+    assert any((trained[name] != untrained[name]).any() for name in trained)
+    for wrong in ("compare=taxi", "policy_learning={before: idm, after: replay, planner: lane_graph, runs: null}"):
+        with pytest.raises(InputError, match="compare="):
+            build.check_evaluation(config_of("experiment=table4", wrong))
 
 
 def test_first_weights_do_not_depend_on_the_other_egos():

@@ -35,3 +35,10 @@ class Objective:
         value = metrics["collision"] + self.comfort * metrics["comfort"] + lost
         excess = max(0.0, self.progress_floor - kept) + max(0.0, rougher - self.comfort_ceiling)
         return value, math.inf if math.isnan(value) else excess
+
+    def text(self, metrics: Mapping[str, float]) -> str:
+        """The metrics of a trial in a few words."""
+        shares = ", ".join(
+            f"{name.split()[1]} {100 * value:.1f}%" for name, value in metrics.items() if name.startswith("collision ")
+        )
+        return f"collisions {shares}; {metrics['comfort']:.2f} m/s^2, {metrics['progress']:.1f} m"

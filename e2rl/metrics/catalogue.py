@@ -141,6 +141,10 @@ TABLES = {
         *("cfr", "cfr_counted", "cfr_preventable", "cfr_adv", "at_fault", "preventable", "relvel", "rir", "min_dtc"),
         *("ttc_c", "cfr_bg", "aor_step", "aor_any", "real", "real_adv", "seconds_per_rollout", "passes"),
     ],
+    "egos": [  # table 4: how each ego fails, where it is hit, and whose failure it is
+        *("cfr", "cfr_counted", "cfr_preventable", "at_fault", "preventable", "front", "side", "rear"),
+        *("front_any", "side_any", "rear_any", "relvel", "contact_time", "progress", "macc", "ego_off_road"),
+    ],
 }  # closed-loop tables (`metrics=...` of evaluate.py) and the metrics of each, in order
 OPEN_LOOP = tuple(
     Metric(f"{name}_{horizon}", about.format(horizon), unit=unit)

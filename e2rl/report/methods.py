@@ -1,48 +1,85 @@
-"""The table of methods: a row for each, with what it knows and owes, its metrics, its differences to one of them."""
+"""Tables with a row a method or a row an ego: their metrics, and their differences to one of them (tables 1 and 4)."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from e2rl.files import write_atomically
 from e2rl.metrics.catalogue import STAGES, Metric, table_metrics
 from e2rl.report.tables import UNKNOWN, Table, column_names, counts, difference_cell, heading, mean_cell, origin
 
 Terms = Mapping[str, tuple[str, str]]  # by method: what it knows of the ego and owes it, "" for nothing to say
-NAME = "methods"
+METHODS, EGOS = "methods", "egos"  # tables of the catalogue, and names of the files
+
+
+class Line(NamedTuple):
+    """A row of a table: its first cells, its row of metrics.json, its paired differences to the reference if any."""
+
+    labels: list[str]
+    row: dict
+    paired: Mapping[str, dict] | None
 
 
 def method_tables(
-    rows: Sequence[dict], terms: Terms, reference: str, settings: str = "", table: str = NAME
+    rows: Sequence[dict], terms: Terms, reference: str, settings: str = "", table: str = METHODS
 ) -> list[Table]:
     """Means and paired differences of the closed-loop rows of metrics.json: a row a method, a column a metric.
 
     reference: method that each is compared with; it must be among the rows. settings: for the captions; table: of
     `catalogue.TABLES`, whose metrics are the columns, but for those that no row knows.
     """
-    group = [row for row in rows if row.get("stage") not in STAGES]
-    names, metrics = column_names(group), known_metrics(group, table)
-    text = f"{origin(group[0])}. {counts(group, names)}"
-    settings = f" {settings.rstrip('.')}." if settings else ""
-    head = ["method", "knowledge", "duty"]
-    labels = [[name, *terms_of(row["method"], terms)] for name, row in zip(names, group, strict=True)]
-    both = list(zip(labels, group, strict=True))
-    means = [[*label, *(mean_cell(metric, row) for metric in metrics)] for label, row in both]
-    caption = f"{text} Mean [95% interval, bootstrap by location or scene]; (n) rollouts where fewer count. Knowledge: "
-    caption += "the ego's plan, or its motion predicted; duty: what adversaries owe the ego."
-    tables = [Table(caption + settings, [*head, *map(heading, metrics)], means, "Methods")]
-    found = [(label, row["paired"].get(reference)) for label, row in both]
-    differences = [
-        [*label, *(difference_cell(metric, paired.get(metric.name)) for metric in metrics)]
-        for label, paired in found
-        if paired
+    group = closed_loop(rows)
+    names = column_names(group)
+    lines = [
+        Line([name, *terms_of(row["method"], terms)], row, row["paired"].get(reference))
+        for name, row in zip(names, group, strict=True)
     ]
-    caption = (
-        f"{text} Difference of each method to {reference} [95% interval], paired by (scene, seed); * the interval "
-    )
-    if differences:
-        points = [heading(metric, points=True) for metric in metrics]
-        tables.append(Table(f"{caption}leaves out 0.", [*head, *points], differences))
+    text = f"{origin(group[0])}. {counts(group, names)}"
+    note = "Knowledge: the ego's plan, or its motion predicted; duty: what adversaries owe the ego."
+    difference = f"Difference of each method to {reference}"
+    return two_tables("Methods", ["method", "knowledge", "duty"], lines, table, (text, note, difference), settings)
+
+
+def planner_tables(
+    rows: Sequence[dict], names: Sequence[str], reference: str, settings: str = "", table: str = EGOS
+) -> list[Table]:
+    """The same with a row for each ego of `names` and each traffic and intensity; reference: ego that each is compared
+    with in the same traffic."""
+    lines = []
+    for name in names:
+        own = [row for row in closed_loop(rows) if row["ego"] == name]
+        for traffic, row in zip(column_names(own), own, strict=True):
+            lines.append(Line([name, traffic], row, row["paired"].get(f"ego {reference}")))
+    first, labels = lines[0].row, [f"{ego} under {traffic}" for (ego, traffic), *_ in lines]
+    text = f"{first['dataset']}/{first['split']}. {counts([line.row for line in lines], labels, 'ego and traffic')}"
+    difference = f"Difference of each ego to {reference} in the same traffic"
+    return two_tables("Egos", ["ego", "traffic"], lines, table, (text, "", difference), settings)
+
+
+def two_tables(
+    title: str, head: list[str], lines: Sequence[Line], table: str, texts: tuple[str, str, str], settings: str
+) -> list[Table]:
+    """The means of all lines, and the differences of those that have some. texts: what was run, a note on the means,
+    what the differences are of."""
+    run, note, difference = texts
+    metrics = known_metrics([line.row for line in lines], table)
+    means = [[*line.labels, *(mean_cell(metric, line.row) for metric in metrics)] for line in lines]
+    caption = f"{run} Mean [95% interval, bootstrap by location or scene]; (n) rollouts where fewer count. {note}"
+    caption = f"{caption.rstrip()} {settings.rstrip('.')}." if settings else caption.rstrip()
+    tables = [Table(caption, [*head, *map(heading, metrics)], means, title)]
+    compared = [(line.labels, line.paired) for line in lines if line.paired]
+    if compared:
+        cells = [
+            [*labels, *(difference_cell(metric, paired.get(metric.name)) for metric in metrics)]
+            for labels, paired in compared
+        ]
+        caption = f"{run} {difference} [95% interval], paired by (scene, seed); * the interval leaves out 0."
+        tables.append(Table(caption, [*head, *(heading(metric, points=True) for metric in metrics)], cells))
     return tables
+
+
+def closed_loop(rows: Sequence[dict]) -> list[dict]:
+    return [row for row in rows if row.get("stage") not in STAGES]
 
 
 def known_metrics(group: Sequence[dict], table: str) -> list[Metric]:
@@ -58,9 +95,10 @@ def terms_of(method: str, terms: Terms) -> list[str]:
     return [term or UNKNOWN for term in terms.get(method, ("", ""))]
 
 
-def save_method_tables(folder: Path, tables: Sequence[Table]) -> None:
-    """Write methods.md and methods.tex, and a CSV file for each table: methods.csv, methods_differences.csv."""
-    write_atomically(folder / f"{NAME}.md", "\n".join(table.markdown() for table in tables))
-    write_atomically(folder / f"{NAME}.tex", "\n".join(table.latex() for table in tables))
+def save_compared(folder: Path, tables: Sequence[Table], name: str = METHODS) -> None:
+    """Write the tables into one file of Markdown and one of LaTeX, both called `name`, and into a CSV file each: `name`
+    and `name`_differences."""
+    write_atomically(folder / f"{name}.md", "\n".join(table.markdown() for table in tables))
+    write_atomically(folder / f"{name}.tex", "\n".join(table.latex() for table in tables))
     for table, suffix in zip(tables, ("", "_differences"), strict=False):
-        write_atomically(folder / f"{NAME}{suffix}.csv", table.csv())
+        write_atomically(folder / f"{name}{suffix}.csv", table.csv())

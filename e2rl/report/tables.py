@@ -134,7 +134,7 @@ def origin(row: dict) -> str:
     return f"{row['dataset']}/{row['split']}, ego {row['ego']}"
 
 
-def counts(group: Sequence[dict], names: Sequence[str]) -> str:
+def counts(group: Sequence[dict], names: Sequence[str], per: str = "method") -> str:
     """Numbers of scenes, seeds and rollouts, and of rollouts without a score; once where all columns agree, else by
     column."""
     texts = []
@@ -143,7 +143,7 @@ def counts(group: Sequence[dict], names: Sequence[str]) -> str:
         ended = [f"{count} without a score ({reason})" for reason, count in row.get("ended", {}).items()]
         texts.append(", ".join([*(f"{n} {word}{'' if n == 1 else 's'}" for word, n in numbers.items()), *ended]))
     if len(set(texts)) == 1:
-        return f"{texts[0]} per method."
+        return f"{texts[0]} per {per}."
     return "; ".join(f"{name}: {text}" for name, text in zip(names, texts, strict=True)) + "."
 
 

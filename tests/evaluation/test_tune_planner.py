@@ -1,7 +1,5 @@
-"""Tuning a planner: refused trials, studies that go on, what is written, and a small real run."""
+"""Tuning a planner: refused trials, and a small real run."""
 
-import builtins
-import json
 from dataclasses import replace
 
 import pytest
@@ -14,19 +12,12 @@ from e2rl.ego.path import MissionPath
 from e2rl.errors import InputError
 from e2rl.evaluation.objective import Objective
 from e2rl.evaluation.protocol import Method, Setup
-from e2rl.evaluation.tune_planner import Trials, TuneSettings, outcomes, tune_planner
+from e2rl.evaluation.tune_planner import Trials, outcomes
+from e2rl.evaluation.tuning import TuneSettings
 from e2rl.sim.env import SimSettings
+from e2rl.tuning import run_tuning, tuning_of
+from tests.evaluation.tuned_road import PRESENT, SPACE, quiet, road
 from tests.synthesizer.traffic_scenes import scenes, synthesizer
-
-SPACE = {"speed": [0.0, 20.0], "caution": [1.0, 3.0]}
-PRESENT = {"speed": 10.0, "caution": 1.0, "other": "kept"}
-
-
-def road(parameters):
-    """Faster collides more; caution helps and costs comfort; standing still is the safest of all."""
-    speed, caution = parameters["speed"], parameters["caution"]
-    assert parameters["other"] == "kept"
-    return {"collision": speed / 20 / caution, "comfort": caution, "progress": 8 * speed, "collision e2@2": speed / 20}
 
 
 class Cruise(Ego):
@@ -41,13 +32,9 @@ class Cruise(Ego):
         return MissionPath(world).drive(speed.expand(-1, PLAN_STEPS + 1))
 
 
-def quiet(*args, **kwargs):
-    return tune_planner(*args, **kwargs, say=lambda line: None)
-
-
 def test_standing_still_and_rough_driving_are_refused(tmp_path):
-    settings = TuneSettings(trials=25, startup=15, objective=Objective(comfort_ceiling=2.0))
-    result = quiet(road, PRESENT, SPACE, settings, tmp_path)
+    settings = TuneSettings(trials=25, startup=15)
+    result = quiet(road, PRESENT, SPACE, settings, tmp_path, Objective(comfort_ceiling=2.0))
     trials = result["trials"]
     assert len(trials) == 25 and trials[0]["parameters"] == {name: PRESENT[name] for name in SPACE}
     slow = [trial for trial in trials if trial["metrics"]["progress"] < 0.9 * 80]
@@ -57,61 +44,6 @@ def test_standing_still_and_rough_driving_are_refused(tmp_path):
     assert not least["admissible"] and least["metrics"]["progress"] < 0.9 * 80
     best = next(trial for trial in trials if trial["parameters"] == result["best"])
     assert best["admissible"] and best["objective"] < trials[0]["objective"]
-
-
-def test_a_study_goes_on_as_if_it_had_not_stopped(tmp_path):
-    def run(name, trials, space=SPACE):
-        settings = TuneSettings(trials=trials, startup=4, study=str(tmp_path / name / "study"))
-        return quiet(road, PRESENT, space, settings, tmp_path)
-
-    whole, part = run("whole", 9), run("parts", 5)
-    assert len(part["trials"]) == 5
-    assert run("parts", 9) == whole == run("whole", 9)
-    assert json.loads((tmp_path / "tuning.json").read_text())["best"] == whole["best"]
-    lines = OmegaConf.load(tmp_path / "tuned.yaml")
-    assert {name: pytest.approx(value, rel=1e-3) for name, value in whole["best"].items()} == dict(lines)
-    with pytest.raises(InputError, match="another planner, space or data"):
-        run("parts", 12, {"speed": [5.0, 20.0]})
-
-
-def test_ranges_are_checked(tmp_path):
-    for space, what in (
-        ({}, "empty"),
-        ({"depth": [1, 2]}, "depth is no parameter"),
-        ({"speed": [12.0, 20.0]}, "leaves out the present value, 10"),
-        ({"speed": [20.0, 0.0]}, r"expected \[low, high\]"),
-    ):
-        with pytest.raises(InputError, match=what):
-            quiet(road, PRESENT, space, TuneSettings(), tmp_path)
-
-
-def test_whole_numbers_stay_whole(tmp_path):
-    seen = []
-
-    def evaluate(parameters):
-        seen.append(parameters["speed"])
-        return road(parameters)
-
-    quiet(evaluate, PRESENT | {"speed": 10}, {"speed": [5, 15]}, TuneSettings(trials=4), tmp_path)
-    assert all(isinstance(value, int) for value in seen)
-
-
-def test_nan_stops(tmp_path):
-    with pytest.raises(InputError, match="NaN"):
-        quiet(lambda p: road(p) | {"comfort": float("nan")}, PRESENT, SPACE, TuneSettings(), tmp_path)
-
-
-def test_without_optuna_it_says_what_to_install(tmp_path, monkeypatch):
-    load = builtins.__import__
-
-    def refuse(name, *args, **kwargs):
-        if name == "optuna":
-            raise ImportError(name)
-        return load(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", refuse)
-    with pytest.raises(InputError, match=r"pip install 'e2rl\[tune\]'"):
-        quiet(road, PRESENT, SPACE, TuneSettings(), tmp_path)
 
 
 def test_every_trial_meets_traffic_made_against_it(tmp_path):
@@ -145,14 +77,18 @@ def test_leaving_the_road_counts_as_a_collision():
         assert outcomes(setup, method, [(0, 0)])[0]["collision"] == expected
 
 
+def tuned(config, *run):
+    return run_tuning(config, tuning_of(config), *run)
+
+
 def test_the_configuration_builds_the_planner_under_trial(tmp_path):
     config = build.load_config("evaluate", ["ego=lane_graph", "seeds=[0]", "processes=1"])
-    tuning = {"trials": 1, "seed": 0, "startup": 1, "study": None, "space": {"max_risk": [0.05, 0.2]}}
+    tuning = {"group": "ego", "trials": 1, "seed": 0, "startup": 1, "study": None, "space": {"max_risk": [0.05, 0.2]}}
     config.tuning = OmegaConf.create(tuning)
     on = synthesizer()
     setup = Setup(scenes(1, steps=10), Cruise(), "lane_graph", SimSettings())
-    result = build.tune(config, setup, [Method("nominal", on)], tmp_path)
+    result = tuned(config, setup, [Method("nominal", on)], on.prior, tmp_path)
     assert result["best"] == {"max_risk": 0.1} and (tmp_path / "tuned.yaml").read_text() == "max_risk: 0.1\n"
     config.tuning = OmegaConf.create(tuning | {"depth": 3})
     with pytest.raises(InputError, match="depth"):
-        build.tune(config, setup, [Method("nominal", on)], tmp_path)
+        tuned(config, setup, [Method("nominal", on)], on.prior, tmp_path)

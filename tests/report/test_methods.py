@@ -1,4 +1,4 @@
-"""The table of methods: a row each, what it knows and owes, differences to one, in markdown, CSV and LaTeX."""
+"""Tables of methods and of egos: a row each, differences to one of them, in markdown, CSV and LaTeX."""
 
 import csv
 
@@ -7,7 +7,7 @@ import pytest
 from e2rl.evaluation.files import Source, label_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
-from e2rl.report.methods import method_tables, save_method_tables
+from e2rl.report.methods import EGOS, method_tables, planner_tables, save_compared
 from e2rl.report.tables import escaped
 from tests.metrics.random_rollouts import random_rollouts
 
@@ -44,7 +44,7 @@ def test_differences_are_paired_to_the_reference(tables):
 
 
 def test_they_are_written_in_three_formats(tables, tmp_path):
-    save_method_tables(tmp_path, tables)
+    save_compared(tmp_path, tables)
     names = ["methods.csv", "methods.md", "methods.tex", "methods_differences.csv"]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
     with (tmp_path / "methods.csv").open(newline="") as file:
@@ -54,6 +54,47 @@ def test_they_are_written_in_three_formats(tables, tmp_path):
     body = [line for line in latex.splitlines() if line.endswith(r"\\")]
     assert len(body) == 2 + 3 + 2 and {line.count(" & ") for line in body} == {len(tables[0].head) - 1}
     assert r"cfr [\%]" in latex and r"seconds\_per\_rollout" in latex and r"$\eta$" in latex
+
+
+@pytest.fixture(scope="module")
+def egos():
+    """Table 4 of three egos under e2, of which the second is the reference."""
+    labelled, features = [], []
+    for number, ego in enumerate(("idm", "lane_graph", "actor")):
+        rows, samples = score_rollouts(random_rollouts(6, seed=number))
+        labelled += label_rows(rows, Source("synthetic", "test", "e2", ego))
+        features += samples
+    pairs = [("idm", "lane_graph"), ("actor", "lane_graph")]
+    rows = metric_rows(labelled, features, draws=50, realism_draws=5, egos=pairs)
+    return rows, planner_tables(rows, ["idm", "lane_graph", "actor"], "lane_graph")
+
+
+def test_every_ego_has_a_row_and_a_difference_to_the_reference(egos):
+    rows, (means, differences) = egos
+    assert [row[:2] for row in means.rows] == [[ego, "e2 η=2"] for ego in ("idm", "lane_graph", "actor")]
+    assert [row[0] for row in differences.rows] == ["idm", "actor"]
+    difference = rows[0]["paired"]["ego lane_graph"]["cfr"]["difference"]
+    assert differences.rows[0][differences.head.index("cfr [points]")].startswith(f"{100 * difference:+.1f}"[:4])
+
+
+def test_a_first_contact_is_counted_at_one_side_and_at_all_that_touch(egos):
+    """front, side and rear share the failures out; a contact at a corner is in two of front_any, side_any, rear_any."""
+    rows, (means, _) = egos
+    assert {f"{side}{of} [%]" for side in ("front", "side", "rear") for of in ("", "_any")} <= set(means.head)
+    for row in rows:
+        value = {name: found["mean"] for name, found in row["metrics"].items()}
+        assert value["cfr"] > 0 and value["front"] + value["side"] + value["rear"] == pytest.approx(value["cfr"])
+        assert all(value[f"{side}_any"] >= value[side] for side in ("front", "side", "rear"))
+
+
+def test_the_tables_of_egos_have_files_of_their_own(egos, tmp_path):
+    save_compared(tmp_path, egos[1], EGOS)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "egos.csv",
+        "egos.md",
+        "egos.tex",
+        "egos_differences.csv",
+    ]
 
 
 def test_latex_has_no_sign_that_it_would_read_as_a_command():

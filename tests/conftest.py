@@ -1,0 +1,54 @@
+"""Scenes and checkpoints, good and bad, that the tests of the scripts share."""
+
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from e2rl.prior.checkpoint import save_prior
+from e2rl.prior.denoiser import DenoiserSettings
+from e2rl.prior.prior import Prior
+from tests.scene.descriptions import Malicious, description, lane, numbered, straight, write_folder
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """Folders of good and bad scenes, checkpoints of several kinds."""
+    root = tmp_path_factory.mktemp("input")
+    good = numbered([description({"ego": straight(20 + k, 0, 8), "7": straight(50, 3.5, 6)}) for k in range(2)])
+    nan = description()
+    nan["tracks"]["7"]["state"]["position"][40] = np.nan
+    bad = {
+        "forbidden": pickle.dumps({"x": Malicious(os.system, f"touch {root / 'ran'}")}),
+        "no_ego": description(sdc_id="nobody"),
+        "no_lanes": description(lanes={"b": lane([[0, 0]])}),
+        "nan": nan,
+        "damaged": b"nonsense",
+    }
+    write_folder(root / "good", good)
+    for name, scene in bad.items():
+        write_folder(root / name, [good[0], scene])
+    (root / "empty").mkdir()
+    torch.manual_seed(0)
+    path = save_prior(Prior(DenoiserSettings(width=16, heads=2, blocks=1, pair=8)), root, {"data": "made"})
+    path.rename(root / "prior.safetensors")
+    _variants(root)
+    return root
+
+
+def _variants(root: Path) -> None:
+    """Checkpoints that are none: of another architecture, another format, cut off, not safetensors."""
+    with safe_open(root / "prior.safetensors", "pt") as file:
+        metadata, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    save_file(tensors, root / "plain.safetensors")
+    save_file(dict(list(tensors.items())[1:]), root / "other.safetensors", metadata)
+    save_file(tensors, root / "unknown.safetensors", metadata | {"architecture": '{"denoiser": {"depth": 3}}'})
+    save_file(tensors, root / "format.safetensors", metadata | {"format": "e2rl-prior/9"})
+    content = (root / "prior.safetensors").read_bytes()
+    (root / "cut.safetensors").write_bytes(content[: len(content) // 2])
+    (root / "text.safetensors").write_text("no checkpoint")

@@ -1,0 +1,267 @@
+"""The experiments of evaluate.py on tiny runs: their rows, tables, figures and files."""
+
+import json
+
+import pytest
+
+from e2rl.build import load_choice
+from e2rl.evaluation.files import read_metrics
+from e2rl.metrics.catalogue import META_STAGE, OPEN_LOOP_STAGE, STAGES
+from tests.scripts import SHORT, arguments, call, error_line
+
+EXPERIMENTS = [
+    ("table2", [("random_k", 2), ("topology", 2), ("e2", 2), ("e2_unbound", 2), ("nominal", 0)], None),
+    (
+        "table3",
+        [
+            ("e2", 2),
+            ("e2_unbound", 2),
+            ("nominal", 0),
+            ("told the plan", 2),
+            ("duty behind only", 2),
+            ("no duty", 2),
+            ("no patience", 2),
+            ("with V_adv", 2),
+            ("no V_feas", 2),
+            ("no anchoring", 2),
+            ("literal anchoring", 2),
+            ("no interception", 2),
+            ("no proposal", 2),
+            ("no bounds", 2),
+            ("no bounds, no V_feas", 2),
+        ],
+        None,
+    ),
+    ("intensity", [("e2", 0), ("e2", 1), ("e2", 2), ("e2", 3)], "intensity.png"),
+    ("skeleton", [("e2", 2)], "skeleton.png"),
+]
+
+
+@pytest.mark.parametrize(("experiment", "methods", "figure"), EXPERIMENTS)
+def test_the_adversaries_experiments_have_their_rows_and_figures(
+    world, tmp_path, monkeypatch, capsys, experiment, methods, figure
+):
+    """Two of the bundled scenes with the bundled prior; the paper's tables 2 and 3 and its figures."""
+    overrides = [
+        f"experiment={experiment}",
+        *SHORT,
+        f"data.cache={world / 'bundled'}",
+        "seeds=[0]",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    ]
+    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    assert status == 0, said
+    rows = read_metrics(tmp_path / "run" / "metrics.json")
+    assert [(row["method"], row["eta"]) for row in rows] == methods
+    assert all((row["n_scenes"], row["n_rollouts"]) == (2, 2) for row in rows)
+    assert all(len(row["paired"]) == len(methods) - 1 for row in rows)
+    for row in rows:
+        known = row["metrics"]["real_adv"]["n"]
+        assert known > 0 if row["eta"] else known == 0
+    assert len(list((tmp_path / "run" / "rollouts").glob("*.npz"))) == 2 * len(methods)
+    assert [path.name for path in (tmp_path / "run").glob("*.png")] == ([figure] if figure else [])
+
+
+def test_table_1_is_written_in_three_formats(world, tmp_path, monkeypatch, capsys):
+    overrides = [
+        "experiment=table1",
+        *SHORT,
+        "methods=[e2,nominal,ctg_adv,cat]",
+        f"data.cache={world / 'bundled'}",
+        "seeds=[0]",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    ]
+    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    assert status == 0, said
+    head, *rows = (tmp_path / "run" / "methods.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in rows] == ["e2 η=2", "nominal", "ctg_adv η=2", "cat η=2"]
+    assert head.startswith("method,knowledge,duty,cfr [%]") and head.endswith("passes")
+    assert "Difference of each method to e2" in (tmp_path / "run" / "methods.md").read_text()
+    assert "Difference of each method to e2" in (tmp_path / "run" / "methods.tex").read_text()
+    assert len((tmp_path / "run" / "methods_differences.csv").read_text().splitlines()) == 4
+
+
+def test_egos_before_and_after_are_rated_in_one_run(world, tmp_path, monkeypatch, capsys):
+    """An untrained actor and a planner in its place, with learning curves of a made run."""
+    logs = tmp_path / "trained" / "logs" / "scalars"
+    for name, value in (("train/frames", "100"), ("synthesizer/contact", "0.5")):
+        (logs / name).parent.mkdir(parents=True)
+        (logs / f"{name}.csv").write_text(f"0,{value}\n")
+    roles = f"{{before: before, after: after, planner: before, runs: ['{tmp_path / 'trained'}']}}"
+    overrides = [
+        *SHORT,
+        f"data.cache={world / 'bundled'}",
+        "seeds=[0]",
+        "+egos.before={ego: actor}",
+        "+egos.after={ego: lane_graph}",
+        f"policy_learning={roles}",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    ]
+    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    assert status == 0, said
+    rows = read_metrics(tmp_path / "run" / "metrics.json")
+    assert [(row["ego"], row["method"]) for row in rows] == [
+        (ego, method) for ego in ("before", "after") for method in ("nominal", "e2")
+    ]
+    assert {key for row in rows[2:] for key in row["paired"]} == {"e2", "nominal", "ego before"}
+    text = (tmp_path / "run" / "tables.md").read_text()
+    assert "## Policy learning" in text and "after − before [points]" in text and "Guards of after" in text
+    assert {path.name for path in (tmp_path / "run").glob("*.png")} == {"policy_learning.png", "curves.png"}
+
+
+def test_a_planner_is_tuned_and_the_study_goes_on(world, tmp_path, monkeypatch, capsys):
+    for trials in (1, 2):
+        overrides = [
+            "experiment=tune_planner",
+            "ego=sampling",
+            *SHORT,
+            f"data.cache={world / 'bundled'}",
+            f"tuning.trials={trials}",
+            f"tuning.study={tmp_path / 'study'}",
+            f"hydra.run.dir={tmp_path / 'run'}",
+        ]
+        status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+        assert status == 0, said
+    result = json.loads((tmp_path / "run" / "tuning.json").read_text())
+    assert len(result["trials"]) == 2 and set(result["best"]) <= set(load_choice("ego", "sampling"))
+    assert {"collision nominal@0", "collision e2@2"} <= set(result["trials"][0]["metrics"])
+    assert "margin: " in (tmp_path / "run" / "tuned.yaml").read_text()
+    overrides += ["tuning.spaces.sampling.margin=[2,3]", "tuning.study=null"]
+    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    assert status == 2 and "tuning.space.margin=[2, 3]: leaves out the present value" in error_line(said)
+    overrides = [each for each in overrides if "margin" not in each and not each.startswith("ego=")]
+    status, said = call("evaluate.py", [*overrides, "ego=idm"], monkeypatch, capsys)
+    assert status == 2 and "tuning.spaces: no ranges for this ego" in error_line(said)
+
+
+def test_table_4_has_a_row_for_every_ego_in_three_formats(world, tmp_path, monkeypatch, capsys):
+    overrides = [
+        "experiment=table4",
+        *SHORT,
+        f"data.cache={world / 'bundled'}",
+        "seeds=[0]",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    ]
+    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    assert status == 0, said
+    head, *rows = (tmp_path / "run" / "egos.csv").read_text().splitlines()
+    names = ["replay", "idm", "lane_graph", "sampling", "actor_untrained", "actor"]
+    assert [row.split(",")[:2] for row in rows] == [[name, "e2 η=2"] for name in names]
+    columns = ("cfr", "cfr_counted", "cfr_preventable", "front", "side", "rear", "front_any", "side_any", "rear_any")
+    assert head.startswith("ego,traffic,") and all(f"{name} [%]" in head.split(",") for name in columns)
+    for suffix in ("md", "tex"):
+        assert "Difference of each ego to lane" in (tmp_path / "run" / f"egos.{suffix}").read_text()
+    differences = (tmp_path / "run" / "egos_differences.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in differences[1:]] == [name for name in names if name != "lane_graph"]
+    assert "## Egos" in (tmp_path / "run" / "tables.md").read_text()
+
+
+def test_an_adversary_is_tuned_and_the_study_goes_on(world, tmp_path, monkeypatch, capsys):
+    """Rollouts are those of the method's own YAML; another budget or method is another study."""
+    for trials in (1, 3):
+        overrides = [
+            "experiment=tune",
+            "synthesizer=e2",
+            *SHORT,
+            f"data.cache={world / 'bundled'}",
+            f"tuning.trials={trials}",
+            "tuning.ladder=2",
+            f"tuning.study={tmp_path / 'study'}",
+            f"hydra.run.dir={tmp_path / 'run'}",
+        ]
+        status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+        assert status == 0, said
+    result = json.loads((tmp_path / "run" / "tuning.json").read_text())
+    tried = [trial["parameters"]["interception.lateral"] for trial in result["trials"]]
+    assert tried == pytest.approx([load_choice("synthesizer", "e2").interception.lateral, 0.5, 4.0])
+    assert {"cfr", "aor_step", "aor_step nominal", "real_adv"} <= set(result["trials"][0]["metrics"])
+    assert "interception:\n  lateral: " in (tmp_path / "run" / "tuned.yaml").read_text()
+    assert len((tmp_path / "run" / "tuning_curve.csv").read_text().splitlines()) == 4
+    assert (tmp_path / "run" / "tuning_curve.png").exists()
+    for more, what in (
+        (["tuning.objective.off_road=0.1"], "a study that differs in objective; name another file"),
+        (["synthesizer=cat"], "a study that differs in parameters, space; name another file"),
+        (["synthesizer=idm", "tuning.study=null"], "no ranges for this synthesizer"),
+        (["tuning.objective.seek=speed"], "tuning.objective.seek=speed: choose one of"),
+        (["tuning.group=prior"], "tuning.group=prior: choose one of"),
+    ):
+        kept = [each for each in overrides if each.split("=")[0] not in [one.split("=")[0] for one in more]]
+        status, said = call("evaluate.py", [*kept, *more], monkeypatch, capsys)
+        assert status == 2 and what in error_line(said)
+
+
+def test_a_folder_of_somebody_else_adds_methods_to_the_table(world, tmp_path, monkeypatch, capsys):
+    (tmp_path / "conf" / "synthesizer").mkdir(parents=True)
+    text = "_target_: e2rl.traffic.constant_velocity.ConstantVelocity\nname: straight\n"
+    (tmp_path / "conf" / "synthesizer" / "straight.yaml").write_text(text)
+    overrides = [
+        f"--config-dir={tmp_path / 'conf'}",
+        *arguments(world, tmp_path, "good", "data.build.steps=20", "methods=[replay,straight]", "seeds=[0]"),
+    ]
+    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    assert status == 0, said
+    rows = read_metrics(tmp_path / "run" / "metrics.json")
+    assert [(row["method"], row["eta"]) for row in rows] == [("replay", 0), ("straight", 0)]
+
+
+def test_one_scene_is_driven_as_among_all(world, tmp_path, monkeypatch, capsys):
+    found = []
+    for which in ("scene=null", "scene=1"):
+        folder = tmp_path / which
+        status, said = call(
+            "evaluate.py",
+            [
+                *SHORT,
+                f"data.cache={world / 'bundled'}",
+                "seeds=[1]",
+                "methods=[e2]",
+                which,
+                "batch=1",
+                f"hydra.run.dir='{folder}'",
+            ],
+            monkeypatch,
+            capsys,
+        )
+        assert status == 0, said
+        found.append({path.name: path.read_bytes() for path in (folder / "rollouts").glob("*.npz")})
+    assert len(found[0]) == 2 and len(found[1]) == 1 and found[1].items() <= found[0].items()
+
+
+def test_the_prior_s_experiment_has_rows_of_all_stages(world, tmp_path, monkeypatch, capsys):
+    """Open loop, closed loop and meta-metric of three procedural scenes with an untrained prior."""
+    overrides = [
+        "experiment=prior",
+        "data=procedural",
+        "data.count=3",
+        f"data.cache={tmp_path / 'cache'}",
+        "data.workers=1",
+        "data.build.vehicles=8",
+        "data.build.field_cells=128",
+        "seeds=[0]",
+        "open_loop_samples=2",
+        "meta_rollouts=2",
+        "prior.sampler.steps=2",
+        f"hydra.run.dir={tmp_path / 'run'}",
+        f"prior.checkpoint={world / 'prior.safetensors'}",
+    ]
+    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    assert status == 0, said
+    rows = read_metrics(tmp_path / "run" / "metrics.json")
+    found = {stage: [row for row in rows if row.get("stage") == stage] for stage in (*STAGES, None)}
+    assert sum(map(len, found.values())) == len(rows)
+    methods = ["replay", "constant_velocity", "idm", "nominal"]
+    assert {stage: [row["method"] for row in part] for stage, part in found.items()} == {
+        OPEN_LOOP_STAGE: methods[1:],
+        META_STAGE: methods,
+        None: methods,
+    }
+    for stage, metrics in STAGES.items():
+        known = [metric.name for metric in metrics if metric.name != "real_split_half"]
+        assert all(set(known) <= set(row["metrics"]) for row in found[stage])
+        assert all(row["metrics"][known[0]]["mean"] > 0 and row["n_scenes"] == 3 for row in found[stage])
+    meta = {row["method"]: row["metrics"]["meta_metric"]["mean"] for row in found[META_STAGE]}
+    assert max(meta, key=meta.get) == "replay" and "real_split_half" in found[META_STAGE][0]["metrics"]
+    assert found[None][0]["metrics"]["real"]["mean"] == 1, "the replayed log is wholly like itself"
+    text = (tmp_path / "run" / "tables.md").read_text()
+    assert all(word in text for word in ("min_ade_5", "meta_metric", "cfr_bg", "nominal", "constant_velocity"))
+    assert len(list((tmp_path / "run" / "rollouts").glob("*.npz"))) == 3 * len(methods)
