@@ -3,9 +3,6 @@ Argoverse 2 and Lyft. They are read without ever executing what a file names."""
 
 import csv
 import json
-import lzma
-import zipfile
-import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from e2rl.errors import InputError
+from e2rl.scene.log_files import LogFiles
 from e2rl.scene.plain_pickle import load_plain
 from e2rl.scene.plausibility import check
 from e2rl.scene.recording import AGENT_TYPES, DT, LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, Lane, Recording
 from e2rl.scene.smoothing import resample_uniform
-from e2rl.scene.source import Source, hash_files
 
 TYPES = {name.upper(): index for index, name in enumerate(AGENT_TYPES)}
 LIGHTS = {  # by the last word of LANE_STATE_... (Waymo) or TRAFFIC_LIGHT_... (nuPlan)
@@ -26,63 +23,23 @@ LIGHTS = {  # by the last word of LANE_STATE_... (Waymo) or TRAFFIC_LIGHT_... (n
     **dict.fromkeys(("CAUTION", "YELLOW"), LIGHT_YELLOW),
     **dict.fromkeys(("STOP", "RED"), LIGHT_RED),
 }
-INDEXES = ("dataset_summary.pkl", "dataset_mapping.pkl")  # pickles beside the scenarios that are none
-MAX_BYTES = 1 << 26  # of one pickle; the largest of nuScenes v1.0-mini has 4 MB
 MAX_NAME = 128  # characters of a scene's id
-PIECE = 4096  # bytes of a zip unpacked at a time: at most 7,000 times as many come out
-DAMAGED_ZIP = (zipfile.BadZipFile, zlib.error, lzma.LZMAError)
 
 
 @dataclass
-class ScenarioNetSource(Source):
+class ScenarioNetSource(LogFiles):
     """The ScenarioDescription pickles (*.pkl) in a folder or zip."""
 
     holds = "ScenarioDescription pickles"
-
-    def logs(self) -> list[str]:
-        root = self.root()
-        if root.is_dir():
-            names = [str(file.relative_to(root)) for file in sorted(root.rglob("*.pkl")) if not file.is_dir()]
-        elif root.is_file() and zipfile.is_zipfile(root):
-            with self.archive() as archive:
-                names = [name for name in sorted(archive.namelist()) if name.endswith(".pkl")]
-        else:
-            raise InputError(f"data.path={root}: neither a folder nor a zip file")
-        names = [name for name in names if Path(name).name not in INDEXES]
-        if not names:
-            raise InputError(f"data.path={root}: holds no .pkl scenario; convert the logs with ScenarioNet first")
-        return names
+    ending = ".pkl"
+    no_logs = "convert the logs with ScenarioNet first"
+    ignored = ("dataset_summary.pkl", "dataset_mapping.pkl")  # pickles beside the scenarios that are none
 
     def read(self, log: str) -> Iterator[Recording]:
         yield read_recording(self.content(log), log, self.locations.get(Path(log).stem, ""))
 
     def fingerprint(self) -> bytes:
-        root = self.root()
-        files = [root] if root.is_file() else [root / log for log in self.logs()]
-        return hash_files(files) + json.dumps(sorted(self.locations.items())).encode()
-
-    def archive(self) -> zipfile.ZipFile:
-        """The zip at `path`; raises InputError where its directory is damaged."""
-        try:
-            return zipfile.ZipFile(self.root())
-        except (OSError, ValueError, RuntimeError, zipfile.BadZipFile) as error:
-            raise InputError(f"data.path={self.path}: damaged zip ({error}); copy or export it again") from error
-
-    def content(self, log: str) -> bytes:
-        """The bytes of one pickle; raises InputError where they cannot be read or are more than MAX_BYTES."""
-        root = self.root()
-        try:
-            if root.is_file():
-                with self.archive() as archive:
-                    return _member(archive, log)
-            if not (root / log).is_file():
-                raise InputError(f"{log} in {root}: no regular file (a pipe, or a link to nothing); remove it")
-            _check_size((root / log).stat().st_size)
-            return (root / log).read_bytes()
-        except (OSError, EOFError, KeyError, ValueError, RuntimeError, *DAMAGED_ZIP) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(f"{log} in {root}: cannot be read: {error}; copy or export it again") from error
+        return super().fingerprint() + json.dumps(sorted(self.locations.items())).encode()
 
     @cached_property
     def locations(self) -> dict[str, str]:
@@ -96,18 +53,6 @@ class ScenarioNetSource(Source):
         except (OSError, ValueError, csv.Error) as error:
             raise InputError(f"{index}: cannot be read: {error}; write it again, or remove it") from error
         return {Path(row["file"]).stem: row["location_group"] for row in rows}
-
-
-def _member(archive: zipfile.ZipFile, name: str) -> bytes:
-    """A member of a zip. It is read piece by piece, so that little more is unpacked than the size it claims."""
-    _check_size(archive.getinfo(name).file_size)
-    with archive.open(name) as stream:
-        return b"".join(iter(lambda: stream.read(PIECE), b""))
-
-
-def _check_size(size: int) -> None:
-    if size > MAX_BYTES:
-        raise ValueError(f"{size / 1e6:.0f} MB, more than the {MAX_BYTES / 1e6:.0f} MB of a log; cut it into scenarios")
 
 
 def safe_load(content: bytes, name: str) -> dict:

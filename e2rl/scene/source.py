@@ -38,8 +38,8 @@ OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a sta
 VERSION = 3  # of the scene builder: raise it when the same recording would make another scene
 
 
-class _Row(NamedTuple):
-    """What one recording made: arrays of a scene, or why there is none."""
+class Row(NamedTuple):
+    """What one recording made: the arrays of a scene, or the reason why there is none."""
 
     scene_id: str
     location: str = ""
@@ -125,16 +125,16 @@ class Source(ABC):
         for recording in self.read(log):
             yield from recording.windows(self.starts, self.build.steps)
 
-    def _rows_of(self, log: str) -> list[_Row]:
+    def _rows_of(self, log: str) -> list[Row]:
         """What the recordings of one log make."""
         try:
             rows = [self._row(log, recording) for recording in self._windows(log)]
         except InputError as error:
-            return [_Row(log, reason=_naming(log, error))]
-        return rows or [_Row(log, reason=TOO_SHORT)]
+            return [Row(log, reason=_naming(log, error))]
+        return rows or [Row(log, reason=TOO_SHORT)]
 
-    def _row(self, log: str, recording: Recording) -> _Row:
-        row = _Row(recording.scene_id, recording.location, recording.dataset)
+    def _row(self, log: str, recording: Recording) -> Row:
+        row = Row(recording.scene_id, recording.location, recording.dataset)
         try:
             scene = build_scene(recording, self.build)
             validate(scene, recording.scene_id)
@@ -145,8 +145,8 @@ class Source(ABC):
         # Plain arrays cross the process border: tensors would each hold a shared-memory file open.
         return row._replace(scene={key: value.numpy() for key, value in scene.items()})
 
-    def _rows(self) -> Generator[_Row]:
-        """The rows of all logs, built by `workers` processes (by this one where there is work for one only)."""
+    def rows(self) -> Generator[Row]:
+        """What the logs make, in their order; `workers` processes build (this one where there is work for one)."""
         logs = self.logs()
         show = partial(tqdm, desc="building scenes", total=len(logs), unit="log")
         if min(self.workers, len(logs)) <= 1:
@@ -170,7 +170,7 @@ class Source(ABC):
         dropped: Counter[str] = Counter()
         scenes: list[dict[str, np.ndarray]] = []
         names: list[tuple[str, str, str]] = []
-        with closing(self._rows()) as rows:  # the progress bar ends before a message
+        with closing(self.rows()) as rows:  # the progress bar ends before a message
             for row in rows:
                 if most is not None and len(scenes) >= most:
                     break
@@ -203,7 +203,7 @@ def load_scenes(
     """
     if num_scenes is not None:
         check_range("num_scenes", num_scenes, 1)
-    source = data if isinstance(data, Source) else _source(data)
+    source = data if isinstance(data, Source) else source_of(data)
     if split and source.has_splits:
         source = replace(source, split=split)
     if starts is not None:
@@ -211,7 +211,7 @@ def load_scenes(
     return source.load(num_scenes)
 
 
-def _source(data: Mapping) -> Source:
+def source_of(data: Mapping) -> Source:
     """The source that the `_target_` of a `data` group names, with the other keys as its settings."""
     target = str(data.get("_target_"))
     try:

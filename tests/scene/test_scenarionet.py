@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from e2rl.errors import InputError
-from e2rl.scene import scenarionet
+from e2rl.scene.log_files import MAX_BYTES
 from e2rl.scene.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, OTHER, PEDESTRIAN, VEHICLE
 from e2rl.scene.scenarionet import ScenarioNetSource, read_recording, safe_load
 from tests.scene.descriptions import ALL, FRAMES, Malicious, description, fork, straight, write_folder, write_zip
@@ -139,7 +139,7 @@ def test_what_is_no_regular_file_is_named_or_passed_over(tmp_path):
 @pytest.mark.parametrize("claimed", [None, 1000])
 def test_a_bomb_is_not_unpacked(tmp_path, method, claimed):
     """Neither where the zip says how much would come out, nor where it lies."""
-    path, size = tmp_path / "bomb.zip", 3 * scenarionet.MAX_BYTES
+    path, size = tmp_path / "bomb.zip", 3 * MAX_BYTES
     with zipfile.ZipFile(path, "w", method) as archive:
         archive.writestr("bomb.pkl", bytes(size))
     if claimed:
@@ -148,7 +148,7 @@ def test_a_bomb_is_not_unpacked(tmp_path, method, claimed):
     try:
         with pytest.raises(InputError, match=r"bomb\.pkl in .*bomb\.zip: cannot be read"):
             ScenarioNetSource(str(path)).content("bomb.pkl")
-        assert tracemalloc.get_traced_memory()[1] < 2 * scenarionet.MAX_BYTES
+        assert tracemalloc.get_traced_memory()[1] < 2 * MAX_BYTES
     finally:
         tracemalloc.stop()
 

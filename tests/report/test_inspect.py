@@ -1,0 +1,77 @@
+"""The command that says what a data set holds: counts with known answers, reasons by log, a picture of a scene."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from e2rl.report import drawing
+from e2rl.report.inspect import main
+from tests.report.pixels import rgb
+from tests.scene.descriptions import ALL, description, straight, write_folder
+
+
+def run(*arguments, capsys) -> str:
+    main([str(argument) for argument in (*arguments, "--workers", 1)])
+    return capsys.readouterr().out
+
+
+def number(text: str, name: str) -> str:
+    """What stands behind a name in the report."""
+    (value,) = [
+        rest for first, _, rest in (line.strip().partition("  ") for line in text.splitlines()) if first == name
+    ]
+    return value.strip()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two scenes, the second with lights and three pedestrians more, one that is too short, and one in degrees."""
+    crowd = {f"p{index}": straight(60 + index, -6, 1, kind="PEDESTRIAN", size=(0.6, 0.6)) for index in range(3)}
+    lit = description(description()["tracks"] | crowd, scenario_id="lit") | {"id": "lit"}
+    lit["dynamic_map_states"] = {"on": {"state": {"object_state": ["LANE_STATE_STOP"] * len(ALL)}}}
+    turned = description(scenario_id="turned") | {"id": "turned"}
+    for track in turned["tracks"].values():
+        track["state"]["heading"] = track["state"]["heading"] + 57.0
+    absent = description(scenario_id="absent") | {"id": "absent"}
+    absent["tracks"]["ego"]["state"]["valid"] = np.zeros(len(ALL), bool)
+    return write_folder(tmp_path_factory.mktemp("data") / "made", [description(), lit, turned, absent])
+
+
+def test_a_data_set_is_counted_and_what_is_left_out_has_its_reason(folder, tmp_path, capsys):
+    text = run(folder, "--out", tmp_path / "x.png", capsys=capsys)
+    assert number(text, "data") == f"scenarionet, {folder}" and number(text, "logs") == "4"
+    assert number(text, "scenes") == "2, of 1 places" and number(text, "left out") == "2"
+    assert "1 x sd_02.pkl" in text and "rad lie between" in text and "1 x sd_03.pkl" in text
+    assert number(text, "vehicles") == "2 (2 to 2)" and number(text, "pedestrians") == "2 (1 to 4)"
+    assert number(text, "lanes") == "4 (4 to 4)" and number(text, "traffic lights") == "0 (0 to 1)"
+    assert number(text, "speed of the ego at the start, m/s") == "8.0 (8.0 to 8.0)"
+    assert number(text, "way of the ego, m") == "64 (64 to 64)"
+    assert number(text, "% of lanes with a successor") == "25 (25 to 25)"  # `in` alone goes on
+
+
+def test_the_chosen_scene_is_drawn_with_the_ego_in_the_middle(folder, tmp_path, capsys):
+    text = run(folder, "--scene", "lit", "--metres", 60, "--out", tmp_path / "lit.png", capsys=capsys)
+    assert text.endswith(f"lit: {tmp_path / 'lit.png'}\n")
+    with Image.open(tmp_path / "lit.png") as picture:
+        width, height = picture.size
+        assert width == 900 and height == 900 + 34 + 30
+        assert picture.getpixel((450 - 15, 34 + 450)) == rgb(drawing.EGO)  # 1 m behind its middle, at 15 pixels a m
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(("--scene", "nobody"), "--scene=nobody: name a scene of"), (("--data", "nothing"), "data=nothing: none of")],
+)
+def test_what_is_not_there_ends_with_one_line_and_writes_nothing(folder, tmp_path, capsys, arguments, message):
+    with pytest.raises(SystemExit) as ended:
+        run(folder, *arguments, "--out", tmp_path / "x.png", capsys=capsys)
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert ended.value.code == 2 and error.startswith("error: ") and message in error
+    assert not (tmp_path / "x.png").exists()
+
+
+def test_a_path_that_no_source_reads_names_what_each_of_them_reads(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        run(tmp_path, capsys=capsys)
+    error = capsys.readouterr().err
+    assert ".pkl" in error and ".xml" in error and "scenario_*.parquet" in error
