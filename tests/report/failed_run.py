@@ -36,7 +36,7 @@ def write_run(folder: Path, rollouts: dict[str, dict]) -> Path:
         scores, samples = score_rollouts(driven)
         rows += label_rows(scores, source)
         features += samples
-    result = record(rows, features, folder, lambda *found: metric_rows(*found, draws=20, realism_draws=2))
+    result = record(rows, features, [], folder, lambda *found: metric_rows(*found, draws=20, realism_draws=2))
     save_tables(folder / "tables.md", metric_tables(result, "A caption: with <b>markup</b>"))
     return folder
 
