@@ -4,10 +4,6 @@ import shutil
 
 import numpy as np
 import pytest
-from selenium import webdriver
-from selenium.webdriver.common.action_chains import ActionChains
-from selenium.webdriver.common.keys import Keys
-from selenium.webdriver.support.ui import Select, WebDriverWait
 
 from e2rl.evaluation.files import ROLLOUTS, TABLE, read_rows, rollout_name
 from e2rl.evaluation.rollout_reader import read_rollout
@@ -21,6 +17,11 @@ FLAGS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"),
     *("--no-first-run", "--window-size=1440,900"),
 )
+webdriver = pytest.importorskip("selenium.webdriver", reason="needs the extra browser")
+ActionChains = webdriver.ActionChains
+Keys = webdriver.Keys
+support = pytest.importorskip("selenium.webdriver.support.ui")
+Select, WebDriverWait = support.Select, support.WebDriverWait
 pytestmark = pytest.mark.skipif(not (CHROMIUM and DRIVER), reason="no chromium and chromedriver on the path")
 DECODE = """const done = arguments[1];
 page.store.replay(arguments[0]).then(({ replay }) => done(replay.tracks.map((track) =>
