@@ -21,6 +21,7 @@ EXPERIMENTS = [
             ("duty behind only", 2),
             ("no duty", 2),
             ("no patience", 2),
+            ("keeps to its side", 2),
             ("with V_adv", 2),
             ("no V_feas", 2),
             ("no anchoring", 2),
