@@ -1,5 +1,6 @@
 """What the rivals share: the common prior, an intensity, what they know of the ego and what they owe it."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -96,8 +97,8 @@ class Rival(NominalTraffic):
             context.obstacles.duty = duty_of(self.responsibility, self.care, world, state.adversary, state.eta)
         return state, x0, context
 
+    @abstractmethod
     def attack(
         self, state: State, world: World, ego_plan: Tensor, noise: Tensor, group: Group, context: Context
     ) -> tuple[RivalState, Tensor]:
         """State and joint sample x0 [G, V, SIZE] of a group of which some scene has strength above 0."""
-        raise NotImplementedError
