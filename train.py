@@ -1,11 +1,13 @@
 """Training: `python train.py` runs evolution rounds; `stage=prior` trains a prior, `stage=imitation` an actor."""
 
 import sys
+from math import nan
 from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
+from tqdm import tqdm
 
 from e2rl.build import build_ego, build_prior, build_traffic, caption, resolved, set_up
 from e2rl.ending import ending
@@ -15,7 +17,7 @@ from e2rl.learning.checkpoint import checkpoints, load_checkpoint, save_checkpoi
 from e2rl.learning.prior_training.distributed import follower_overrides, started_by_torchrun
 from e2rl.learning.prior_training.stage import run_prior_stage
 from e2rl.learning.resume import resumed
-from e2rl.report.curriculum import draw_choices
+from e2rl.report.rounds import draw_round, round_line
 from e2rl.report.tables import metric_tables, print_tables, save_tables
 from e2rl.scene.source import load_scenes
 
@@ -32,22 +34,16 @@ def evolve(config: DictConfig, folder: Path) -> None:
     if done == 0:
         measure("before", run.ego)
         save_checkpoint(folder, run, resolved(config), config.keep_last)
-    for number in range(done, config.rounds):
+    bar = tqdm(range(done, config.rounds), "evolution", config.rounds, initial=done, unit="round", disable=None)
+    for number in bar:
         metrics = run.run_round()
         logger.log(metrics, number, run.choices)
         save_checkpoint(folder, run, resolved(config), config.keep_last)
-        speed, waiting = metrics.get("time/steps_per_second"), metrics.get("time/waiting")
-        print(
-            f"round {number + 1}/{config.rounds}: eta {metrics['synthesizer/eta']:.2f}, adversarial collisions "
-            f"{metrics.get('synthesizer/contact', float('nan')):.0%} in {metrics['synthesizer/scenes']:.0f} scenes "
-            f"({metrics['synthesizer/left_out']:.0f} left out: no way found to avoid them), "
-            f"{metrics['time/synthesize']:.0f} s synthesis, {metrics['time/improve']:.0f} s learning"
-            + (f", {waiting:.0f} s waiting" if waiting is not None else "")
-            + (f", collected at {speed:.0f} steps/s" if speed else ""),
-            flush=True,
-        )
+        draw_round(run, scenes, config.synthesizer.name, folder, logger, config.logger.replays)
+        bar.set_postfix(eta=f"{metrics['synthesizer/eta']:.2f}", hit=f"{metrics.get('synthesizer/contact', nan):.0%}")
+        with tqdm.external_write_mode():
+            print(round_line(metrics, number + 1, config.rounds), flush=True)
     logger.close()
-    draw_choices(folder)
     tables = metric_tables(measure("after", run.ego), caption(config, origin))
     save_tables(folder / "tables.md", tables)
     print_tables(tables)

@@ -134,7 +134,7 @@ def drive_all(
         return setup.score(method, part, into)
 
     rows, features, lost = [], [], []
-    with tqdm(total=len(tasks) * len(methods) * len(setups), desc="rollouts", unit="rollout") as bar:
+    with tqdm(total=len(tasks) * len(methods) * len(setups), desc="rollouts", unit="rollout", disable=None) as bar:
 
         def ended(job: tuple[Setup, Method, list[Task]]) -> None:
             setup, method, part = job

@@ -110,7 +110,7 @@ def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int) -> list[di
     """
     scenes, rows = setup.scenes, []
     seeds = [rollouts if method.traffic.stochastic else 1 for method in methods]
-    with tqdm(total=sum(seeds) * len(scenes), desc="meta-metric", unit="rollout") as bar:
+    with tqdm(total=sum(seeds) * len(scenes), desc="meta-metric", unit="rollout", disable=None) as bar:
         for method, count in zip(methods, seeds, strict=True):
             tally, tasks = (
                 Tally(scenes.scenes),

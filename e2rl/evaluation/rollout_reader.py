@@ -48,7 +48,12 @@ def read_rollout(path: Path) -> dict[str, Any]:
         )
     if wrong := _misfits(data):
         raise InputError(f"{path}: damaged: {wrong}; run evaluate.py again to rewrite it")
-    return {key: value.item() if key in SCALARS else value for key, value in data.items()}
+    return plain(data)
+
+
+def plain(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The arrays of a rollout (`evaluation.files.rollout_arrays`), scalars as python values."""
+    return {key: value.item() if key in SCALARS else value for key, value in arrays.items()}
 
 
 def _misfits(data: dict[str, np.ndarray]) -> str | None:

@@ -75,7 +75,7 @@ class PoolDriver:
         """Outcomes of one episode in every row of the pool, in order; a progress bar is shown for a non-empty label."""
         parts = []
         batches = filled_batches(len(pool), self.env.batch_size[0])
-        for rows in tqdm(batches, label, disable=not label, unit="batch", leave=False):
+        for rows in tqdm(batches, label, disable=None if label else True, unit="batch", leave=False):
             parts.append(episodes_of(self.drive(ego, pool, rows), pool, rows))
         every = concatenated(parts)
         return Episodes(*(getattr(every, name)[: len(pool)] for name in Episodes.__dataclass_fields__))

@@ -60,7 +60,7 @@ def recorded_pairs(scenes: SceneSet, sim: SimSettings, settings: ImitationSettin
     exact = PoolDriver(scenes, replace(sim, replay_ego=True, end_on_contact=False, end_off_road=False), batch)
     free = PoolDriver(scenes, replace(sim, replay_ego=False), batch)
     todo = [(rows, number) for number in range(settings.drives + 1) for rows in filled_batches(len(pool), batch)]
-    for rows, number in tqdm(todo, "expert pairs", unit="batch", leave=False):
+    for rows, number in tqdm(todo, "expert pairs", unit="batch", leave=False, disable=None):
         driver, label, disturb = (
             (exact, "executed", None) if number == 0 else (free, "intended", _bursts(len(rows), settings, generator))
         )
@@ -138,7 +138,7 @@ def imitate(
     """Clone the pairs for settings.epochs and keep the weights of the lowest held-out loss (of the last epoch if no
     scene is held out). Improved weights are written to folder / WEIGHTS; returns the row of the epoch kept."""
     run, best, kept = Imitation(network, pairs, settings), None, None
-    for epoch in (bar := tqdm(range(settings.epochs), "imitation", unit="epoch")):
+    for epoch in (bar := tqdm(range(settings.epochs), "imitation", unit="epoch", disable=None)):
         row = run.epoch()
         bar.set_postfix({name: f"{value:.3f}" for name, value in row.items()})
         if log is not None:

@@ -63,7 +63,7 @@ def tune(
     trials: list[dict] = []
     tried = [present]
     tried += [present | choice for choice in combinations(grid) if present | choice != present]
-    for parameters in tqdm(tried, "planner tuning", unit="trial", leave=False):
+    for parameters in tqdm(tried, "planner tuning", unit="trial", leave=False, disable=None):
         metrics = dict(evaluate(parameters))
         value, excess = objective.judge(metrics, trials[0] if trials else metrics)
         trials.append({"parameters": parameters, **metrics, "objective": value, "admissible": excess == 0})

@@ -143,7 +143,8 @@ class PolicyImprovement(Improvement):
         self.draw.probability = pool.probabilities(curriculum.priority(), curriculum.share)
         self._collector.reset()
         kept, rows, collecting, begun = [], [], 0.0, self.frames
-        for _ in (bar := tqdm(range(self.settings.iterations), "collect and update", unit="batch", leave=False)):
+        bar = tqdm(range(self.settings.iterations), "collect and update", unit="batch", leave=False, disable=None)
+        for _ in bar:
             begin = time.perf_counter()
             data = self.collected()
             collecting += time.perf_counter() - begin

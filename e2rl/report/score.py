@@ -28,7 +28,7 @@ def score_saved(folder: Path) -> Scored:
     if not paths:
         raise InputError(f"{folder}: no {ROLLOUTS}/*.npz here; give the folder of a run of evaluate.py")
     rows, samples, ended = [], [], []
-    for path in tqdm(paths, "scoring", unit="rollout"):
+    for path in tqdm(paths, "scoring", unit="rollout", disable=None):
         try:
             rollout = read_rollout(path)
         except InputError as error:

@@ -148,7 +148,7 @@ class Source(ABC):
     def rows(self) -> Generator[Row]:
         """What the logs make, in their order; `workers` processes build (this one where there is work for one)."""
         logs = self.logs()
-        show = partial(tqdm, desc="building scenes", total=len(logs), unit="log")
+        show = partial(tqdm, desc="building scenes", total=len(logs), unit="log", disable=None)
         if min(self.workers, len(logs)) <= 1:
             yield from (row for rows in show(map(self._rows_of, logs)) for row in rows)
             return

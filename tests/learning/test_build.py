@@ -133,6 +133,6 @@ def test_mismatched_groups_are_refused(tmp_path):
         built(config_of("+learner.ppo.clipp=1", *POLICY))
 
 
-@pytest.mark.parametrize("kind", ["csv", "wandb", "none"])
+@pytest.mark.parametrize("kind", ["csv", "tensorboard", "wandb", "none"])
 def test_logger_groups_name_their_kind(kind):
     assert config_of(f"logger={kind}").logger.kind == kind

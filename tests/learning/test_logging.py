@@ -1,6 +1,7 @@
 """Scalars land in a file each, in the known groups, and go on after a resume."""
 
 import pytest
+from PIL import Image
 
 from e2rl.errors import InputError
 from e2rl.learning.logging import RunLogger
@@ -33,5 +34,17 @@ def test_wandb_is_offline(tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_SILENT", "true")
     logger = RunLogger("wandb", tmp_path, project="test")
     logger.log({"train/loss": 1.0}, 1)
+    for suffix in ("png", "gif"):
+        path = tmp_path / f"picture.{suffix}"
+        Image.new("RGB", (8, 6), "red").save(path)
+        logger.show("train/picture", path, 1)
     logger.close()
     assert list((tmp_path / "wandb").glob("offline-run-*/*.wandb"))
+    media = list((tmp_path / "wandb").glob("offline-run-*/files/media/*/train/*"))
+    assert {path.suffix for path in media} == {".png", ".gif"}
+
+
+def test_a_missing_dashboard_names_its_extra(tmp_path, monkeypatch):
+    monkeypatch.setattr("e2rl.learning.logging.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install 'e2rl\[tensorboard\]'"):
+        RunLogger("tensorboard", tmp_path)

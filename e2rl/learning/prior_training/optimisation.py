@@ -67,7 +67,9 @@ class PriorTraining:
         """Train up to step `until`; returns the running means of the loss's terms."""
         running: dict[str, float] = {}
         self.prior.train()
-        bar = tqdm(range(self.step, until), "prior", initial=self.step, total=self.settings.steps, unit="step")
+        bar = tqdm(
+            range(self.step, until), "prior", initial=self.step, total=self.settings.steps, unit="step", disable=None
+        )
         for _ in bar:
             batch = augment(self.windows[self.pick()].to(self.device), self.settings, self.generator)
             terms = self.update(batch, draw(batch, self.settings, self.generator))

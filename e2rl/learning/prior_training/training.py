@@ -47,7 +47,7 @@ def train_route_choice(prior: Prior, scenes: TensorDictBase, settings: TrainingS
         return float("nan")
     generator = torch.Generator().manual_seed(settings.seed)
     optimiser = torch.optim.AdamW(prior.route_choice.parameters(), 3e-3, weight_decay=0.05)
-    for _ in tqdm(range(settings.route_steps), "route choice"):
+    for _ in tqdm(range(settings.route_steps), "route choice", disable=None):
         pick = torch.randint(len(label), (512,), generator=generator).to(device)
         sample = features[pick]
         sample = sample + 0.05 * torch.randn(sample.shape, generator=generator).to(device)

@@ -32,7 +32,7 @@ def derivative(values: Tensor, valid: Tensor) -> Tensor:
 def make_windows(scenes: TensorDictBase, free: bool = False, chunk: int = 32) -> TensorDict:
     """Windows [W] of scenes [S] (see `_window` for the keys), without empty ones; free: all in free space."""
     parts = []
-    for scene in tqdm(scenes.split(chunk), "training windows"):
+    for scene in tqdm(scenes.split(chunk), "training windows", disable=None):
         vehicles = scene["route_log"].shape[1]
         routed = route_scene(scene, scene["route_log"].clamp(min=0), free)
         logged, valid = scene["logged"][:, :, :vehicles], scene["logged_valid"][:, :, :vehicles]
