@@ -23,7 +23,7 @@ from e2rl.errors import InputError
 from e2rl.files import altered, seal
 from e2rl.learning.evolution import Evolution
 
-STATE, MEMORY, CONFIG, FORMAT = "state.pt", "memory.json", "config.json", "e2rl-checkpoint/5"
+STATE, MEMORY, CONFIG, FORMAT = "state.pt", "memory.json", "config.json", "e2rl-checkpoint/6"
 
 
 def save_checkpoint(folder: Path, run: Evolution, config: dict, keep_last: int = 2) -> Path:

@@ -106,7 +106,7 @@ class Evolution:
         learned, self.episodes = self.improve(attack.pool, self.curriculum)
         spent = attack.spent | {"improve": time.perf_counter() - begin}
         spent |= {name: learned.pop(name) for name in ("collect", "pairs", "steps_per_second") if name in learned}
-        self.curriculum.update(self.episodes.scene_index, self.episodes.returns, self.episodes.adversarial)
+        self.curriculum.update(self.episodes.scene_index, self.episodes.failed, self.episodes.adversarial)
         outcomes = outcomes_of(order.eta, order.template, attack.drawn, self.episodes.row, self.episodes.failed)
         self.curriculum.observe(outcomes)
         self.curriculum.leave_out(order.scenes[outcomes.left_out])

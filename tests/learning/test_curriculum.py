@@ -1,4 +1,4 @@
-"""Schedules, regret and priorities as defined, and a state that goes on exactly."""
+"""Schedules, learnability and priorities as defined, and a state that goes on exactly."""
 
 import pytest
 import torch
@@ -15,8 +15,15 @@ def scheduler(kind=AdaptiveCurriculum, num_scenes=6, rounds=10, **settings):
     return kind(num_scenes, rounds, **settings)
 
 
-def episodes(curriculum, scenes, returns, adversarial=True):
-    curriculum.update(torch.tensor(scenes), torch.tensor(returns), torch.full((len(scenes),), adversarial))
+def episodes(curriculum, scenes, failed, adversarial=True):
+    """Episodes in scenes, each failed or not."""
+    curriculum.update(torch.tensor(scenes), torch.tensor(failed), torch.full((len(scenes),), adversarial))
+
+
+def failing(curriculum, *rates):
+    """Ten episodes in each of the first scenes, of which these shares fail."""
+    for scene, rate in enumerate(rates):
+        episodes(curriculum, [scene] * 10, [k < round(10 * rate) for k in range(10)])
 
 
 def test_constant_and_linear_intensity_and_share():
@@ -77,21 +84,20 @@ def test_adaptive_intensity_settles_where_the_ego_collides_as_often_as_wanted():
     assert 0.4 <= curriculum.eta / 4 <= 0.5
 
 
-def test_regret_is_best_return_less_recent_adversarial_return():
+def test_learnability_is_the_variance_of_recent_failures_in_adversarial_traffic():
     curriculum = scheduler(smoothing=0.5)
-    episodes(curriculum, [0, 1, 1], [8.0, 8.0, 4.0], adversarial=False)
-    assert curriculum.regret().isnan().all(), "nothing is known of adversarial traffic yet"
-    episodes(curriculum, [0, 0, 1], [1.0, 3.0, 8.0])
-    assert curriculum.regret()[:2].tolist() == [6.0, 0.0]
-    episodes(curriculum, [0], [8.0])
-    assert curriculum.regret()[0] == 3.0, "recent returns are smoothed"
+    episodes(curriculum, [0, 1, 1], [True, False, True], adversarial=False)
+    assert curriculum.learnability().isnan().all(), "nothing is known of adversarial traffic yet"
+    failing(curriculum, 0.5, 1.0, 0.0)
+    assert curriculum.learnability()[:3].tolist() == [0.25, 0.0, 0.0], "neither hopeless nor mastered scenes teach"
+    episodes(curriculum, [1], [False])
+    assert curriculum.learnability()[1] == 0.25, "shares are smoothed"
 
 
-def test_priorities_are_a_distribution_that_prefers_regret_unseen_and_stale_scenes():
+def test_priorities_are_a_distribution_that_prefers_learnable_unseen_and_stale_scenes():
     curriculum = scheduler(num_scenes=4, staleness=0.0)
     assert torch.allclose(curriculum.priority(), torch.full((4,), 0.25))
-    episodes(curriculum, [0, 1, 2], [8.0, 8.0, 8.0], adversarial=False)
-    episodes(curriculum, [0, 1, 2], [8.0, 4.0, 0.0])
+    failing(curriculum, 1.0, 0.9, 0.4)
     priority = curriculum.priority()
     assert priority.sum().item() == pytest.approx(1.0)
     assert priority[3] > priority[2] > priority[1] > priority[0] > 0
@@ -101,18 +107,17 @@ def test_priorities_are_a_distribution_that_prefers_regret_unseen_and_stale_scen
     assert torch.allclose(stale.priority(), torch.tensor([3.0, 2.0, 1.0, 0.0]) / 6)
 
 
-def test_priorities_do_not_depend_on_the_scale_of_returns():
-    first, second = scheduler(num_scenes=3), scheduler(num_scenes=3)
-    for curriculum, scale in ((first, 1.0), (second, 100.0)):
-        episodes(curriculum, [0, 1, 2], [5.0 * scale] * 3, adversarial=False)
-        episodes(curriculum, [0, 1, 2], [1.0 * scale, 2.0 * scale, 3.0 * scale])
-    assert torch.equal(first.priority(), second.priority())
+def test_no_scene_takes_the_round_once_all_have_been_seen():
+    """A round has thousands of episodes before priorities change, so that they must not all go to a few scenes."""
+    curriculum = scheduler(num_scenes=300)
+    failing(curriculum, *torch.linspace(0, 1, 300).tolist())
+    priority = curriculum.priority().sort(descending=True).values
+    assert priority[0] < 0.05 and 0.2 < priority[:30].sum() < 0.4
 
 
 def test_draws_follow_the_priorities_without_repetition_within_a_pass():
     curriculum = scheduler(num_scenes=5, staleness=0.0, temperature=1.0)
-    episodes(curriculum, list(range(5)), [9.0] * 5, adversarial=False)
-    episodes(curriculum, list(range(5)), [0.0, 1.0, 2.0, 3.0, 4.0])
+    failing(curriculum, 0.0, 0.1, 0.2, 0.3, 0.4)
     expected = curriculum.priority()
     counts = torch.bincount(torch.stack([curriculum.draw(1) for _ in range(4000)]).flatten(), minlength=5)
     assert torch.allclose(counts / 4000, expected, atol=0.03)
@@ -161,15 +166,13 @@ def test_wrong_settings_are_refused(kind):
 
 def test_without_priorities_all_scenes_are_alike():
     curriculum = scheduler(num_scenes=4, prioritised=False)
-    episodes(curriculum, [0, 1], [8.0, 8.0], adversarial=False)
-    episodes(curriculum, [0, 1], [0.0, 8.0])
+    failing(curriculum, 0.5, 0.0)
     assert curriculum.priority().tolist() == [0.25] * 4
 
 
 def test_scenes_left_out_are_not_drawn_first():
     curriculum = scheduler(num_scenes=4, staleness=0.0)
-    episodes(curriculum, [0, 1, 2, 3], [5.0] * 4, adversarial=False)
-    episodes(curriculum, [0], [1.0])
+    failing(curriculum, 0.5)
     curriculum.leave_out(torch.tensor([0, 1]))
-    assert curriculum.regret().nan_to_num(-1).tolist() == [4.0, 0.0, -1.0, -1.0]
-    assert curriculum.priority()[1] < curriculum.priority().min() + 1e-9, "the ones not yet driven come first"
+    assert curriculum.learnability().nan_to_num(-1).tolist() == [0.25, 0.0, -1.0, -1.0]
+    assert curriculum.priority()[1] == curriculum.priority().min(), "the ones not yet driven come first"

@@ -1,9 +1,8 @@
 """The extension point for curricula: intensity, causal template, share of adversarial episodes, priorities of scenes.
 
-Scenes are prioritised as in prioritised level replay (Jiang et al. 2021): by the rank of a regret estimate, mixed with
-staleness. The regret of a scene is the best return in any traffic minus the recent return in adversarial traffic. It
-is high where the ego has driven well but not against the adversary, and low where the scene is solved or the ego has
-never driven well.
+Scenes are prioritised by rank, mixed with staleness, as in prioritised level replay (Jiang et al. 2021). What is ranked
+is the learnability of Rutherford et al. ("No Regrets", 2024): p (1 - p), where p is the recent share of the ego's
+episodes in a scene's adversarial traffic that fail. It is 0 for a scene that is solved and for one that is hopeless.
 """
 
 from abc import ABC, abstractmethod
@@ -38,7 +37,7 @@ class CurriculumScheduler(ABC):
         rounds: int,
         seed: int = 0,
         prioritised: bool = True,
-        temperature: float = 0.3,
+        temperature: float = 2.0,
         staleness: float = 0.2,
         smoothing: float = 0.3,
         solvable_only: bool = True,
@@ -52,8 +51,7 @@ class CurriculumScheduler(ABC):
         self.rounds, self.round, self.prioritised, self.solvable_only = rounds, 0, prioritised, solvable_only
         self.temperature, self.staleness, self.smoothing = temperature, staleness, smoothing
         self._generator = torch.Generator().manual_seed(seed)
-        self._best = torch.full((num_scenes,), -torch.inf)
-        self._recent = torch.full((num_scenes,), torch.nan)
+        self._failing = torch.full((num_scenes,), torch.nan)
         self._drawn = torch.full((num_scenes,), -1, dtype=torch.int64)
 
     @property
@@ -87,24 +85,24 @@ class CurriculumScheduler(ABC):
     def load_extra_state(self, state: dict) -> None:  # noqa: B027
         """Restore an `extra_state`."""
 
-    def regret(self) -> Tensor:
-        """Estimated regret [S], at least 0; NaN for scenes never driven in adversarial traffic."""
-        return (self._best - self._recent).clamp(min=0)
+    def learnability(self) -> Tensor:
+        """p (1 - p) [S], of a recent share p of failures; NaN for scenes never driven in adversarial traffic."""
+        return self._failing * (1 - self._failing)
 
     def priority(self) -> Tensor:
-        """Probability [S] with which scenes are drawn: (1 - staleness) by rank of regret, scenes not yet driven in
-        adversarial traffic first, the rest by the rounds since they were last drawn."""
-        count = len(self._best)
+        """Probability [S] with which scenes are drawn: (1 - staleness) by rank of learnability, scenes not yet driven
+        in adversarial traffic first, the rest by the rounds since they were last drawn."""
+        count = len(self._failing)
         if not self.prioritised:
             return torch.full((count,), 1 / count)
-        weight = (1 / ranks(self.regret().nan_to_num(nan=torch.inf))) ** (1 / self.temperature)
+        weight = (1 / ranks(self.learnability().nan_to_num(nan=torch.inf))) ** (1 / self.temperature)
         age = (self.round - self._drawn).float()
         old = age / age.sum() if age.sum() > 0 else torch.full((count,), 1 / count)
         return (1 - self.staleness) * weight / weight.sum() + self.staleness * old
 
     def draw(self, count: int) -> Tensor:
         """Scenes [count] to synthesize for: each scene count // S times, the rest by priority without replacement."""
-        total = len(self._best)
+        total = len(self._failing)
         check_range("learner.round.scenes", count, 1)
         chosen = torch.arange(total).repeat(count // total)
         if count % total:
@@ -113,16 +111,15 @@ class CurriculumScheduler(ABC):
         self._drawn[chosen] = self.round
         return chosen
 
-    def update(self, scene_index: Tensor, returns: Tensor, adversarial: Tensor) -> None:
-        """Update with episodes [E]: scene, return, and whether the traffic was adversarial."""
-        scene_index, returns, adversarial = scene_index.cpu(), returns.cpu().float(), adversarial.cpu()
-        self._best = self._best.scatter_reduce(0, scene_index, returns, "amax")
+    def update(self, scene_index: Tensor, failed: Tensor, adversarial: Tensor) -> None:
+        """Update with episodes [E]: scene, whether the ego failed, and whether the traffic was adversarial."""
+        scene_index, adversarial = scene_index.cpu(), adversarial.cpu()
         scenes, inverse = scene_index[adversarial].unique(return_inverse=True)
-        total = torch.zeros(len(scenes)).index_add(0, inverse, returns[adversarial])
+        total = torch.zeros(len(scenes)).index_add(0, inverse, failed.cpu().float()[adversarial])
         mean = total / torch.bincount(inverse, minlength=len(scenes)).clamp(min=1)
-        before = self._recent[scenes]
+        before = self._failing[scenes]
         moved = before + self.smoothing * (mean - before)
-        self._recent[scenes] = torch.where(before.isnan(), mean, moved)
+        self._failing[scenes] = torch.where(before.isnan(), mean, moved)
 
     def observe(self, outcomes: Outcomes) -> None:  # noqa: B027
         """Learn from what became of the round's attacks; by default nothing."""
@@ -139,8 +136,7 @@ class CurriculumScheduler(ABC):
         """Mark scenes whose adversarial traffic was left out because no driver survives it. They count as solved until
         they are driven; otherwise they would come first in every draw."""
         scene_index = scene_index.cpu()
-        recent, best = self._recent[scene_index], self._best[scene_index]
-        self._recent[scene_index] = torch.where(recent.isnan() & best.isfinite(), best, recent)
+        self._failing[scene_index] = self._failing[scene_index].nan_to_num(nan=0.0)
 
     def advance(self, collision_rate: float | None = None) -> None:
         """Advance to the next round. collision_rate: the ego's in this round's adversarial traffic."""
@@ -148,23 +144,23 @@ class CurriculumScheduler(ABC):
 
     def summary(self) -> dict[str, float]:
         """Metrics to log."""
-        regret, seen = self.regret(), ~self._recent.isnan()
+        learnability, seen = self.learnability(), ~self._failing.isnan()
         result = {"eta": self.eta, "share": self.share, "scenes_seen": seen.float().mean().item()}
-        return result | ({"regret": regret[seen].mean().item()} if seen.any() else {})
+        return result | ({"learnability": learnability[seen].mean().item()} if seen.any() else {})
 
     def state_dict(self) -> dict:
         """All state."""
-        scenes = {"best": self._best, "recent": self._recent, "drawn": self._drawn}
+        scenes = {"failing": self._failing, "drawn": self._drawn}
         return scenes | {"round": self.round, "generator": self._generator.get_state(), "extra": self.extra_state()}
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`; raises InputError if the number of scenes differs."""
-        if len(state["best"]) != len(self._best):
+        if len(state["failing"]) != len(self._failing):
             raise InputError(
-                f"the checkpoint's curriculum holds {len(state['best'])} scenes, the data {len(self._best)}; resume "
-                "with the data of the run"
+                f"the checkpoint's curriculum holds {len(state['failing'])} scenes, the data {len(self._failing)}; "
+                "resume with the data of the run"
             )
-        self._best, self._recent, self._drawn = (state[key].clone() for key in ("best", "recent", "drawn"))
+        self._failing, self._drawn = (state[key].clone() for key in ("failing", "drawn"))
         self.round = state["round"]
         self._generator.set_state(state["generator"].cpu())
         self.load_extra_state(state["extra"])
