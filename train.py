@@ -1,4 +1,5 @@
-"""Training: `python train.py` runs evolution rounds; `stage=prior` trains a prior, `stage=imitation` an actor."""
+"""Training: `python train.py` runs evolution rounds; `stage=prior` trains a prior, `stage=imitation` an actor,
+`stage=bits` the ego bits."""
 
 import sys
 from math import nan
@@ -12,7 +13,7 @@ from tqdm import tqdm
 from e2rl.build import build_ego, build_prior, build_traffic, caption, resolved, set_up
 from e2rl.ending import ending
 from e2rl.errors import InputError
-from e2rl.learning.build import build_evolution, build_logger, build_measure, check_training, run_imitation
+from e2rl.learning.build import build_evolution, build_logger, build_measure, check_training, run_bits, run_imitation
 from e2rl.learning.checkpoint import checkpoints, load_checkpoint, save_checkpoint
 from e2rl.learning.prior_training.distributed import follower_overrides, started_by_torchrun
 from e2rl.learning.prior_training.stage import run_prior_stage
@@ -69,7 +70,15 @@ def imitate(config: DictConfig, folder: Path) -> None:
     print(f"start evolution rounds from it with ego.checkpoint={folder}")
 
 
-STAGES = {"evolution": evolve, "prior": train_prior, "imitation": imitate}
+def train_bits(config: DictConfig, folder: Path) -> None:
+    """Train the ego bits on recorded vehicles."""
+    scenes = load_scenes(config.data, config.num_scenes, split="train")
+    losses = run_bits(config, scenes, folder, build_logger(config, folder))
+    print(", ".join(f"{name} {value:.4f}" for name, value in losses.items() if value == value))  # NaN: none held out
+    print(f"drive with it by ego=bits ego.checkpoint={folder}")
+
+
+STAGES = {"evolution": evolve, "prior": train_prior, "imitation": imitate, "bits": train_bits}
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")

@@ -146,7 +146,7 @@ def test_table_4_has_a_row_for_every_ego_in_three_formats(world, tmp_path, monke
     status, said = call("evaluate.py", overrides, monkeypatch, capsys)
     assert status == 0, said
     head, *rows = (tmp_path / "run" / "egos.csv").read_text().splitlines()
-    names = ["replay", "idm", "lane_graph", "sampling", "actor_untrained", "actor"]
+    names = ["replay", "idm", "lane_graph", "sampling", "bits", "actor_untrained", "actor"]
     assert [row.split(",")[:2] for row in rows] == [[name, "e2 η=2"] for name in names]
     columns = ("cfr", "cfr_counted", "cfr_preventable", "front", "side", "rear", "front_any", "side_any", "rear_any")
     assert head.startswith("ego,traffic,") and all(f"{name} [%]" in head.split(",") for name in columns)

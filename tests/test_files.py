@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from e2rl.files import locked, write_atomically
+from e2rl.files import locked, write_atomically, written_whole
 
 
 def test_text_bytes_and_writers_are_written(tmp_path):
@@ -30,6 +30,17 @@ def test_what_fails_on_the_way_leaves_the_old_file_and_no_other(tmp_path, monkey
     with pytest.raises(OSError, match="disk full"):
         write_atomically(path, b"new")
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path):
+    with written_whole(tmp_path / "new" / "folder") as part:
+        (part / "a").write_text("text")
+        assert not (tmp_path / "new" / "folder").exists()
+    assert (tmp_path / "new" / "folder" / "a").read_text() == "text"
+    with pytest.raises(KeyboardInterrupt), written_whole(tmp_path / "new" / "other") as part:
+        (part / "a").write_text("text")
+        raise KeyboardInterrupt
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["folder"]
 
 
 def hold(path, log):

@@ -1,4 +1,4 @@
-"""Candidates of a sampling planner: speed profiles times lateral moves beside the mission, driven by the unicycle."""
+"""Candidates of a planner: speed profiles on lateral moves beside the mission, driven by the unicycle."""
 
 from typing import NamedTuple
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 from e2rl.ego.base import PLAN_STEPS, RETURN_LENGTH
 from e2rl.ego.lane_graph import HALVES, PLAN_DT, capped, upsample
-from e2rl.ego.path import MissionPath, fading
+from e2rl.ego.path import RoutePath, fading
 from e2rl.scene.recording import DT
 from e2rl.scene.route import interpolate
 from e2rl.sim import dynamics
@@ -42,20 +42,20 @@ def speed_profiles(speed: Tensor, accelerations: Tensor, caps: Tensor, braking: 
 
 
 def drive(
-    start: Tensor, path: MissionPath, speed: Tensor, shift: Tensor, time: Tensor, max_yaw_rate: float
+    start: Tensor, path: RoutePath, speed: Tensor, shift: Tensor, time: Tensor, max_yaw_rate: float
 ) -> Candidates:
-    """Every speed profile [B, L, PLAN_STEPS + 1] on every lateral move, from start [B, 4]: C = L S candidates.
+    """Speed profiles [B, L, PLAN_STEPS + 1] on S lateral moves each, from start [B, 4]: C = L S candidates.
 
-    A move leads shift [B, S] m beside the mission over max(RETURN_LENGTH, time v) m (time [S] s), as `RoutePath`
-    returns to its route. Its headings become yaw rates, within the simulator's bounds and the tyres' grip, which
-    braking shares; the states are what the unicycle makes of them.
+    A move leads shift m beside the mission over max(RETURN_LENGTH, time v) m (time in s), as `RoutePath` returns to its
+    route; shift and time: [B, L, S] or what broadcasts to it. Its headings become yaw rates, within the simulator's
+    bounds and the tyres' grip, which braking shares; the states are what the unicycle makes of them.
     """
-    profiles, moves = speed.shape[1], shift.shape[1]
+    shift, time = (value.expand(*speed.shape[:2], value.shape[-1]) for value in (shift, time))
     speed = speed[:, :, None]
     mean, accel = (speed[..., 1:] + speed[..., :-1]) / 2, speed.diff(dim=-1) / DT
     driven = torch.nn.functional.pad((mean * DT).cumsum(-1), (1, 0))
-    length = (time * start[:, 3:]).clamp(min=RETURN_LENGTH)[:, None, :, None]
-    beside, turned = shift[:, None, :, None], path.turned[:, None, None]
+    length = (time * start[:, 3, None, None]).clamp(min=RETURN_LENGTH)[..., None]
+    beside, turned = shift[..., None], path.turned[:, None, None]
     offset, slope = fading(path.d[:, None, None, None] - beside, turned[..., None], length, driven)
     table = heading_table(path)
     inner = (1 - curvature_at(table, driven) * (beside + offset)).clamp(min=0.2)
@@ -64,10 +64,10 @@ def drive(
     aimed = heading_at(table, way) + torch.atan(slope[..., 1:] / inner[..., 1:])
     grip = (dynamics.MAX_LATERAL**2 - accel.square()).clamp(min=0).sqrt() / mean.clamp(min=1e-3)
     bound = torch.minimum(grip, dynamics.yaw_rate_bound(mean)).clamp(max=max_yaw_rate)
-    yaw_rate = steer(turned.expand(-1, profiles, moves), aimed, bound * DT) / DT
+    yaw_rate = steer(turned.expand_as(shift), aimed, bound * DT) / DT
     actions = torch.stack([accel.expand_as(yaw_rate), yaw_rate], -1).flatten(1, 2)
-    states = dynamics.rollout(start[:, None].expand(-1, profiles * moves, 4), actions)
-    return Candidates(states, way[..., -1].flatten(1), shift.repeat(1, profiles))
+    states = dynamics.rollout(start[:, None].expand(-1, actions.shape[1], 4), actions)
+    return Candidates(states, way[..., -1].flatten(1), shift.flatten(1))
 
 
 def steer(heading: Tensor, aimed: Tensor, bound: Tensor) -> Tensor:
@@ -81,7 +81,7 @@ def steer(heading: Tensor, aimed: Tensor, bound: Tensor) -> Tensor:
     return torch.stack(turns, -1)
 
 
-def heading_table(path: MissionPath) -> Tensor:
+def heading_table(path: RoutePath) -> Tensor:
     """Headings [B, REACH] of the missions every CELL m ahead, relative to the heading at the ego's place, unwrapped."""
     grid = CELL * torch.arange(REACH, device=path.s.device, dtype=path.s.dtype)
     heading = interpolate(path.route, path.s[:, None] + grid)[1]

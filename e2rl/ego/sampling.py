@@ -5,21 +5,13 @@ Vectorised over scenes, candidates and agents.
 """
 
 import torch
-from torch import Tensor
 
 from e2rl.ego.candidates import Candidates, drive, speed_profiles
-from e2rl.ego.forecast import forecast, nearest
 from e2rl.ego.path import MissionPath
-from e2rl.ego.ranking import RankingEgo
-from e2rl.ego.scoring import Weights, score
-from e2rl.scene.recording import DT
-from e2rl.scene.route import project
+from e2rl.ego.ranking import Outlook, ScoringEgo
+from e2rl.ego.scoring import Weights
 from e2rl.sim.world import World
 
-STRIDE = 2  # steps between two scored states
-CHUNK = 8  # scenes at a time, to fit the processor's cache
-WIDER = 4  # times as many candidates are ranked as asked for, among which those driven alike are dropped
-ALIKE = 1e-4  # m, rad, m/s and cost below which two candidates are driven alike
 PROFILES = (
     *((-8.0, -8.0), (-8.0, 0.0), (-6.0, -6.0), (-6.0, 0.0), (-6.0, 2.0), (-4.0, -4.0), (-4.0, 0.0)),
     *((-2.5, -2.5), (-2.5, 0.0), (-1.2, -1.2), (-1.2, 0.0)),
@@ -28,14 +20,12 @@ PROFILES = (
 )  # m/s^2 in the first second and after it
 SHIFTS = (0.0, 1.0, -1.0, 2.0, -2.0, 3.5, -3.5, 5.0, -5.0)  # m beside the mission, left positive
 BRAKING_MORE = 1.0  # m/s^2 by which braking may exceed what the speed caps are made for
-SCENE_KEYS = (
-    *("size", "route_log", "route_points", "route_length", "route_open", "route_limit", "route_light", "route_light_s"),
-    *("light_state", "field", "field_origin"),
-)  # that it reads
 
 
-class SamplingEgo(RankingEgo):
+class SamplingEgo(ScoringEgo):
     """26 speed profiles on 19 lateral moves: 9 shifts beside the mission, swift and calm, and the present one."""
+
+    CHUNK = 8  # fits the processor's cache
 
     def __init__(
         self,
@@ -69,49 +59,14 @@ class SamplingEgo(RankingEgo):
         replan_every: int = 1,
     ) -> None:
         """Fields: conf/ego/sampling.yaml."""
-        super().__init__(replan_every)
-        self.max_speed, self.horizon, self.agents = max_speed, horizon, int(agents)
-        self.hold, self.turn, self.swift, self.calm = hold, turn, swift, calm
-        self.weights = Weights(
+        weights = Weights(
             margin, margin_growth, headway, rear, fade, contact, near, border, off_road, progress, comfort, aside
         )
+        super().__init__(Outlook(horizon, int(agents), hold, turn, see_vrus), weights, replan_every)
+        self.max_speed, self.swift, self.calm = max_speed, swift, calm
         self.lateral_acceleration, self.braking = lateral_acceleration, braking
         self.max_acceleration, self.max_braking, self.max_yaw_rate = max_acceleration, max_braking, max_yaw_rate
-        self.use_limits, self.obey_lights, self.see_vrus = use_limits, obey_lights, see_vrus
-
-    def plan(self, world: World) -> Tensor:
-        """The states [B, PLAN_STEPS, 4] of the candidate that costs least."""
-        rows = torch.arange(len(world.step), device=world.step.device).split(CHUNK)
-        return torch.cat([self._plan(take(world, part)) for part in rows])
-
-    def _plan(self, world: World) -> Tensor:
-        candidates = self.candidates(world)
-        best = self.costs(world, candidates).argmin(1)
-        return candidates.states[torch.arange(len(best), device=best.device), best]
-
-    def ranked(self, world: World, count: int) -> tuple[Tensor, Tensor]:
-        """States [B, C, PLAN_STEPS, 4] and costs [B, C] of the cheapest candidates, the cheapest first; of those that
-        are driven alike (caps and bounds make many so) one counts, the others cost inf."""
-        rows = torch.arange(len(world.step), device=world.step.device).split(CHUNK)
-        states, costs = zip(*(self._ranked(take(world, part), count) for part in rows), strict=True)
-        return torch.cat(states), torch.cat(costs)
-
-    def _ranked(self, world: World, count: int) -> tuple[Tensor, Tensor]:
-        candidates = self.candidates(world)
-        every = self.costs(world, candidates)
-        costs, best = every.topk(min(WIDER * count, every.shape[1]), largest=False)
-        row = torch.arange(len(best), device=best.device)[:, None]
-        states = candidates.states[row, best]
-        alike = (states.diff(dim=1).abs().amax((2, 3)) < ALIKE) & (costs.diff(dim=1) < ALIKE)
-        costs = costs.masked_fill(torch.nn.functional.pad(alike, (1, 0)), torch.inf)
-        costs, best = costs.topk(count, largest=False)
-        return states[row, best], costs
-
-    def rated(self, world: World, states: Tensor) -> Tensor:
-        """Costs [B, C] of driving along states [B, C, PLAN_STEPS, 4], which lead where they end."""
-        path = MissionPath(world)
-        end, shift, _ = project(states[:, :, -1, :2], path.route)
-        return self.costs(world, Candidates(states, end - path.s[:, None], shift))
+        self.use_limits, self.obey_lights = use_limits, obey_lights
 
     def candidates(self, world: World) -> Candidates:
         """Every speed profile on every lateral move."""
@@ -124,18 +79,4 @@ class SamplingEgo(RankingEgo):
         beside = start.new_tensor(SHIFTS).expand(len(start), -1)
         shift = torch.cat([beside, beside, path.d[:, None]], 1)
         time = start.new_tensor([self.swift] * len(SHIFTS) + [self.calm] * len(SHIFTS) + [self.swift])
-        return drive(start, path, speed, shift, time, self.max_yaw_rate)
-
-    def costs(self, world: World, candidates: Candidates) -> Tensor:
-        """Costs [B, C] of candidates."""
-        steps = torch.arange(STRIDE, round(self.horizon / DT) + 1, STRIDE, device=world.step.device)
-        agents, seen = nearest(world, self.agents, self.see_vrus)
-        others = forecast(world, agents, seen, steps * DT, self.hold, self.turn)
-        return score(world, candidates, others, steps, self.weights)
-
-
-def take(world: World, rows: Tensor) -> World:
-    """Scenes rows [b] of a World: what the planner reads, which is nobody's plan or route."""
-    turn = None if world.turn_rate is None else world.turn_rate[rows]
-    scene = world.scene.select(*SCENE_KEYS)[rows]
-    return World(scene, world.step[rows], world.states[rows], world.valid[rows], world.accel[rows], turn_rate=turn)
+        return drive(start, path, speed, shift[:, None], time, self.max_yaw_rate)

@@ -23,7 +23,7 @@ JERK_TIME = 0.1  # s: weight of the first change of acceleration against mean ac
 
 
 class Weights(NamedTuple):
-    """Fields: conf/ego/sampling.yaml."""
+    """Fields: conf/ego/sampling.yaml and bits.yaml."""
 
     margin: float
     margin_growth: float

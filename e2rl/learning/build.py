@@ -8,12 +8,15 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from e2rl.build import build_sim, built, check_counts, check_seeds, intensities, load_choice, resolved
 from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import Ego
+from e2rl.ego.bits_network import BitsNetwork
 from e2rl.errors import InputError
+from e2rl.evaluation.files import command_line, git_commit
 from e2rl.evaluation.processes import cores
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.learning.ahead import why_not_ahead
 from e2rl.learning.attack import Synthesize
 from e2rl.learning.before_after import BeforeAfter
+from e2rl.learning.bits import BitsSettings, train_bits
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
 from e2rl.learning.evolution import Evolution, RoundSettings
 from e2rl.learning.imitation import ImitationSettings, imitate, recorded_pairs
@@ -123,3 +126,13 @@ def run_imitation(
         raise InputError(f"learner.imitation.held_out={settings.held_out:g}: {reason}; pass more, or set it to 0")
     pairs = recorded_pairs(scenes, build_sim(config), settings)
     return imitate(ego.network, pairs, settings, folder, None if logger is None else logger.log)
+
+
+def run_bits(config: DictConfig, scenes: SceneSet, folder: Path, logger: RunLogger | None = None) -> dict[str, float]:
+    """stage=bits: train a new network of the ego bits on `scenes`; writes folder/bits.safetensors and returns the
+    losses of the epoch kept."""
+    settings = settings_of(BitsSettings, {**config.bits, "seed": config.seed}, "bits")
+    origin = {"data": f"{scenes.dataset}/{scenes.split}", "scenes": len(scenes)}
+    origin |= {"git": git_commit(), "command": command_line()}
+    network = BitsNetwork(settings.hidden, settings.dropout).to(config.device)
+    return train_bits(network, scenes, settings, folder, origin, None if logger is None else logger.log)

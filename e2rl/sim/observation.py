@@ -26,6 +26,7 @@ NEAREST = 12  # agents
 SPEED, FAR, NEAR, TURNING = 15.0, 40.0, 10.0, 0.5  # scales: m/s, m, m, rad/s
 PER_AGENT = 16  # numbers
 LOOKED_AT = 6  # of them, whose motion manoeuvres are held against
+ELAPSED = 10  # the number that tells the elapsed share of the episode
 COLUMNS = (2, 2, 2, 1, 1, 1, 1, 1, 1)  # of the table `nearest`
 OBSERVATION_SIZE = 11 + 5 * len(LOOK_AHEAD) + 8 + len(PROBE_X) * len(PROBE_Y) + PER_AGENT * NEAREST + PROSPECTS
 

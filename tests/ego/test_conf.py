@@ -8,10 +8,12 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from e2rl.ego.base import PLAN_STEPS
+from e2rl.ego.bits import BitsEgo
 from e2rl.ego.idm import IDMEgo
 from e2rl.ego.lane_graph import LaneGraphEgo
 from e2rl.ego.replay import ReplayEgo
 from e2rl.ego.sampling import SamplingEgo
+from e2rl.learning.bits import BitsSettings
 from e2rl.settings import settings_of
 from e2rl.sim.env import DrivingEnv, SimSettings
 from tests.synthetic import make_scenes
@@ -30,6 +32,16 @@ def test_egos(name, kind):
     env.reset()
     plan = ego.plan(env.world())
     assert plan.shape == (2, PLAN_STEPS, 4) and torch.isfinite(plan).all()
+
+
+def test_bits():
+    """The weights apart, which `vars` would compare by identity."""
+    built, default = (vars(ego) for ego in (instantiate(OmegaConf.load(CONF / "ego" / "bits.yaml")), BitsEgo()))
+    for own in (built, default):
+        own.pop("network")
+    assert torch.equal(built.pop("noise"), default.pop("noise")) and built == default
+    settings = settings_of(BitsSettings, OmegaConf.load(CONF / "train.yaml").bits, "bits")
+    assert settings == BitsSettings()
 
 
 def test_sim():

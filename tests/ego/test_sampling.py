@@ -9,7 +9,8 @@ from e2rl.ego.base import PLAN_STEPS, EgoPolicy
 from e2rl.ego.candidates import drive, heading_at, heading_table, speed_profiles, steer
 from e2rl.ego.forecast import forecast, nearest
 from e2rl.ego.path import MissionPath
-from e2rl.ego.sampling import PROFILES, SHIFTS, SamplingEgo, take
+from e2rl.ego.ranking import take
+from e2rl.ego.sampling import PROFILES, SHIFTS, SamplingEgo
 from e2rl.ego.scoring import pair_cost
 from e2rl.scene.boxes import separation
 from e2rl.scene.recording import DT

@@ -1,0 +1,41 @@
+"""Rollout files as they are, and their scenes (docs/export.md)."""
+
+import io
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from e2rl.evaluation.files import ROLLOUTS
+from e2rl.files import write_atomically
+from e2rl.report.export.episode import Episode
+from e2rl.scene.scene import KEYS
+
+SCENES = "scenes"  # the folder of scenes, beside the one of rollouts
+
+
+def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> Iterator[tuple[Episode, Path]]:
+    """Write rollouts/NAME.npz, a copy, and scenes/SCENE_ID.npz of each episode."""
+    for episode in episodes:
+        path = folder / ROLLOUTS / episode.path.name
+        write_atomically(path, episode.path.read_bytes())
+        if episode.scene is not None:
+            scene = folder / SCENES / f"{re.sub(r'[^A-Za-z0-9._+-]', '-', episode.rollout['scene_id'])}.npz"
+            buffer = io.BytesIO()
+            np.savez_compressed(buffer, **scene_arrays(episode))
+            write_atomically(scene, buffer.getvalue())
+        yield episode, path
+
+
+def scene_arrays(episode: Episode) -> dict[str, Any]:
+    """The arrays of a scene (e2rl/scene/scene.py), the ids and speed limits [m/s] of its lanes, and its origin [m] in
+    the recording's coordinates."""
+    assert episode.scene is not None and episode.origin is not None
+    return {
+        **{key: episode.scene[key].numpy() for key in KEYS},
+        "lane_id": np.array(list(episode.lanes)),
+        "lane_limit": np.array([lane.speed_limit for lane in episode.lanes.values()]),
+        "origin": episode.origin,
+    }

@@ -1,0 +1,157 @@
+"""An episode: one rollout of a run with its map and what is known of its failure, as every exporter takes it."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from e2rl.errors import InputError
+from e2rl.evaluation.files import ROLLOUTS, rollout_name
+from e2rl.evaluation.rollout_reader import read_rollout
+from e2rl.scene.build import BuildSettings, build_scene
+from e2rl.scene.lane_graph import LaneGraph
+from e2rl.scene.recording import Lane, Recording
+from e2rl.scene.smoothing import runs_of_true
+
+FACTS = (  # columns of rollouts.csv that go along; docs/verdicts.md and docs/modes.md say what they mean
+    *("dataset", "split", "location", "scene_id", "method", "ego_policy", "eta", "seed", "cfr"),
+    *("partner", "contact_step", "contact_type", "approach", "ego_manoeuvre", "partner_manoeuvre", "duty"),
+    *("counted", "at_fault", "preventable", "avoidable"),
+)
+SAME = 0.01  # m: a map or a start that differs by more is another one
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A rollout, its map and its facts. Positions are relative to the scene's origin, as in the rollout file.
+
+    path: the rollout file; rollout: its arrays; facts: FACTS that are known, and `adversaries`, rows of agents; lanes:
+    by id, with points every 1 m; lights: lane id -> [T + 1] light states. Where the scene is known: `scene`, with
+    `origin` [2] m, its place in the recording's coordinates, and `light_past`: lane id -> states of the frames before
+    the start, the last one 0.1 s before it.
+    """
+
+    path: Path
+    rollout: dict[str, Any]
+    facts: dict[str, Any]
+    lanes: dict[str, Lane]
+    lights: dict[str, np.ndarray] = field(default_factory=dict)
+    light_past: dict[str, np.ndarray] = field(default_factory=dict)
+    scene: TensorDict | None = None
+    origin: np.ndarray | None = None
+
+    @property
+    def steps(self) -> int:
+        """Simulated steps T; there are T + 1 states."""
+        return len(self.rollout["states"]) - 1
+
+    @property
+    def agents(self) -> list[int]:
+        """Rows of the agents that are there at any step; the ego is row 0."""
+        return np.flatnonzero(self.rollout["valid"].any(0)).tolist()
+
+    def appearances(self, row: int) -> list[tuple[int, int]]:
+        """[first, end) steps of each time that an agent is there."""
+        return [(int(first), int(end)) for first, end in runs_of_true(self.rollout["valid"][:, row])]
+
+    def size(self, row: int) -> tuple[float, float]:
+        """Length and width [m] of an agent."""
+        length, width = self.rollout["size"][row].tolist()
+        return length, width
+
+    def text(self) -> str:
+        """The facts in one line."""
+        return "; ".join(f"{name}: {value}" for name, value in self.facts.items())
+
+
+def recorded_episode(run: Path, row: Mapping, recording: Recording, build: BuildSettings) -> Episode:
+    """The episode of a row of rollouts.csv in the scene that a recording makes; InputError where it is another one."""
+    bare = rollout_episode(run, row)
+    scene, graph = build_scene(recording, build), LaneGraph(recording.lanes)
+    rollout = bare.rollout
+    same = len(graph.points) == len(rollout["lane_points"]) and len(scene["logged"]) == bare.steps + 1
+    origin = np.round(graph.points[0] - rollout["lane_points"][0]) if same else np.zeros(2)
+    if not same or not all(
+        np.allclose(ours, theirs, rtol=0, atol=SAME)
+        for ours, theirs in (
+            (graph.points - origin, rollout["lane_points"]),
+            (scene["start"][0, :2].numpy(), rollout["states"][0, 0, :2]),
+        )
+    ):
+        raise InputError(
+            f"{bare.path}: not driven in the scene {row['scene_id']!r} that the data make now; restore the data and "
+            "the `data` settings of the run, or pass --no-scene"
+        )
+    start = recording.current
+    assert start is not None
+    frames = np.minimum(start + np.arange(bare.steps + 1), len(recording.states) - 1)
+    return Episode(
+        path=bare.path,
+        rollout=rollout,
+        facts=bare.facts,
+        lanes={name: _linked(graph, name, lane) for name, lane in zip(graph.ids, bare.lanes.values(), strict=True)},
+        lights={name: states[frames] for name, states in recording.lights.items() if name in graph.lanes},
+        light_past={name: states[:start] for name, states in recording.lights.items() if name in graph.lanes},
+        scene=scene,
+        origin=origin,
+    )
+
+
+def rollout_episode(run: Path, row: Mapping) -> Episode:
+    """The episode of a row of rollouts.csv as its file alone has it: lanes without links, limits or lights."""
+    path = run / ROLLOUTS / rollout_name(dict(row))
+    rollout = read_rollout(path)
+    points, offsets = rollout["lane_points"].astype(float), rollout["lane_offsets"].tolist()
+    widths = rollout["lane_width"].tolist()
+    lanes = {str(index): Lane(points[offsets[index] : offsets[index + 1]], width) for index, width in enumerate(widths)}
+    adversaries = np.flatnonzero(rollout["adversaries"]).tolist()
+    return Episode(path, rollout, known_facts(row) | {"adversaries": adversaries}, lanes)
+
+
+def known_facts(row: Mapping) -> dict[str, Any]:
+    """The FACTS of a row that are known, as words and plain numbers."""
+    found = {name: row[name] for name in FACTS if name in row and row[name] != ""}
+    known = {name: value for name, value in found.items() if not (isinstance(value, float) and math.isnan(value))}
+    if known.get("partner", 0) < 0:  # nobody
+        del known["partner"]
+    return {
+        name: int(value) if isinstance(value, float) and value == int(value) else value for name, value in known.items()
+    }
+
+
+def _linked(graph: LaneGraph, name: str, lane: Lane) -> Lane:
+    """A lane of a rollout with the links and the limit that the recording's map has."""
+    recorded = graph.lanes[name]
+    return Lane(
+        points=lane.points,
+        width=lane.width,
+        speed_limit=recorded.speed_limit if math.isfinite(recorded.speed_limit) else 0.0,
+        exits=list(graph.graph.successors(name)),
+        left=[other for other in recorded.left if other in graph.lanes],
+        right=[other for other in recorded.right if other in graph.lanes],
+    )
+
+
+def past_of(episode: Episode) -> Iterator[tuple[int, np.ndarray]]:
+    """(row, states [PAST, 4]) of the vehicles before the start, oldest first, as traffic and ego were told them.
+
+    The speed is that of the displacement to the next frame.
+    """
+    if episode.scene is None:
+        return
+    start = episode.scene["start"].double()
+    for row, past in enumerate(episode.scene["past"].double()):
+        if not episode.rollout["valid"][0, row]:
+            continue
+        x, y, heading, _ = start[row]
+        ahead, left, turned = past.flip(0).T
+        cos, sin = heading.cos(), heading.sin()
+        pose = torch.stack([x + cos * ahead - sin * left, y + sin * ahead + cos * left, heading + turned], -1)
+        way = torch.cat([pose[1:], start[row, None, :3]])[:, :2] - pose[:, :2]
+        speed = way.norm(dim=-1, keepdim=True) / episode.rollout["dt"]
+        yield row, torch.cat([pose, speed], -1).numpy()

@@ -1,0 +1,104 @@
+"""Windows of the ego bits tell what recorded vehicles saw and did, and imitation lowers its losses on them."""
+
+import pytest
+import torch
+
+from e2rl.build import load_config
+from e2rl.ego.bits import observed
+from e2rl.ego.bits_network import BitsNetwork, drive_controls, load_bits
+from e2rl.ego.path import RoutePath
+from e2rl.errors import InputError
+from e2rl.learning.bits import BitsSettings, BitsTraining, as_ego, losses, train_bits, windows, world_at
+from e2rl.learning.build import build_logger, run_bits
+from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.observation import ELAPSED
+from tests.learning.small import small_scenes
+from tests.synthetic import LANE_WIDTH
+
+
+def settings(**changes):
+    return BitsSettings(**({"hidden": 32, "epochs": 10, "minibatch": 32, "learning_rate": 3e-3} | changes))
+
+
+def braking_scenes(num_scenes=4):
+    """Recorded egos halt within 2 s; the other vehicles keep their speed."""
+    scenes = small_scenes(num_scenes, steps=60)
+    time = (0.1 * torch.arange(61)).clamp(max=2.0)
+    logged = scenes.scenes["logged"]
+    logged[:, :, 0, 3] = 10.0 - 5.0 * time
+    logged[:, :, 0, 0] = logged[:, :1, 0, 0] + 10.0 * time - 2.5 * time**2
+    return scenes
+
+
+def test_a_window_sees_what_the_environment_shows_a_replayed_ego():
+    scenes = braking_scenes(2)
+    env = DrivingEnv(scenes, SimSettings(replay_ego=True, end_on_contact=False), 2, agents=True)
+    env.reset(env.reset().select("scene_index").set("scene_index", torch.arange(2)[:, None]))
+    frames = env.rollout(11, break_when_any_done=False)
+    own = as_ego(scenes.scenes, torch.arange(2), torch.zeros(2, dtype=torch.long))
+    for step in (0, 10):
+        expected = frames["observation"][:, step].clone()
+        expected[:, ELAPSED] = 0
+        torch.testing.assert_close(observed(world_at(own, step)), expected, atol=2e-3, rtol=0)
+
+
+def test_a_vehicle_that_plays_the_ego_sees_the_ego():
+    scenes = small_scenes(2, steps=60)
+    own = as_ego(scenes.scenes, torch.tensor([1]), torch.tensor([1]))
+    world = world_at(own, 3)
+    assert torch.equal(world.states[0, [1, 0, 2]], scenes.scenes["logged"][1, 3, :3])
+    assert torch.equal(own["route_points"][0, 0, 0], scenes.scenes["route_points"][1, 1, 0])
+
+
+def test_goals_are_where_the_recording_is_5_s_later():
+    data = windows(small_scenes(3, steps=60), settings())
+    assert len(data) == 2 * 3 * 3 * 3  # exact and disturbed, steps 0, 5 and 10, vehicles, scenes
+    exact, disturbed = data[data["start"][:, 2] == 0], data[data["start"][:, 2] != 0]
+    torch.testing.assert_close(exact["way"], torch.full((27,), 50.0), atol=1e-2, rtol=0)
+    assert exact["side"].abs().max() < 1e-3 and disturbed["side"].abs().max() < 1e-3, "each on its own route"
+    assert set((exact["start"][:, 1] / LANE_WIDTH).round().tolist()) == {0, 1}
+    moved = disturbed["start"][:, 1] - LANE_WIDTH * (disturbed["start"][:, 1] / LANE_WIDTH).round()
+    assert 0.2 < moved.std() < 1.0 and 0.3 < disturbed["start"][:, 3].std() < 2.0
+
+
+def test_training_lowers_the_losses_and_the_plan_halts_as_recorded():
+    torch.manual_seed(0)
+    data, network = windows(braking_scenes(), settings()), BitsNetwork(32)
+    run = BitsTraining(network, data, settings(held_out=0.0, epochs=40, feature_noise=0.05, last_action_noise=0.05))
+    before = run.measure(data)
+    for _ in range(40):
+        run.epoch()
+    after = run.measure(data)
+    assert after["trajectory"] < 0.4 < before["trajectory"] / 5 and after["goal"] < before["goal"] - 3
+    start = data[(data["start"][:, 3] == 10) & (data["way"] < 20)][:1]
+    path = RoutePath(start["start"], start["route"])
+    code = network.encode(start["observation"])
+    controls = network.controls(code, start["start"][:, 3], path.d, start["way"][:, None], start["side"][:, None])
+    driven = drive_controls(controls, start["start"], path)
+    assert driven.states[0, 0, -1, 3] < 1.0 and abs(driven.way.item() - 10.0) < 1.5
+
+
+def test_a_loss_of_zero_is_the_recording():
+    """A vehicle at constant speed on its goal: the untrained policy keeps its speed, so its plan is the recording."""
+    data = windows(small_scenes(2, steps=60), settings(aside=0.0, turned=0.0, faster=0.0))
+    found = losses(BitsNetwork(16).eval(), data)
+    assert found["trajectory"] < 1e-3 and found["goal"] > 5
+
+
+def test_the_stage_writes_the_weights_of_the_lowest_held_out_loss(tmp_path):
+    config = load_config("train", ["stage=bits", "bits.hidden=16", "bits.epochs=3", "bits.minibatch=16"])
+    row = run_bits(config, braking_scenes(), tmp_path, build_logger(config, tmp_path))
+    assert (tmp_path / "logs/scalars/train/bits_held_out_loss.csv").is_file()
+    logged = (tmp_path / "logs/scalars/train/bits_held_out_loss.csv").read_text().split()
+    assert min(float(line.split(",")[1]) for line in logged) == pytest.approx(row["held_out_loss"])
+    assert load_bits(str(tmp_path)).architecture["hidden"] == 16
+
+
+def test_scenes_without_recordings_to_learn_from_are_refused(tmp_path):
+    for scenes in (small_scenes(2, steps=20), small_scenes(2, steps=60, speed=0.1)):
+        with pytest.raises(InputError, match="synthetic: no vehicle moves and is recorded for 5 s"):
+            train_bits(BitsNetwork(16), scenes, settings(), tmp_path, {})
+    with pytest.raises(InputError, match="of one scene none can be held out"):
+        train_bits(BitsNetwork(16), small_scenes(1, steps=60), settings(), tmp_path, {})
+    with pytest.raises(InputError, match=r"bits\.dropout"):
+        settings(dropout=1.0)

@@ -1,0 +1,149 @@
+"""CommonRoad: commonroad-io's reader gets back every state, and the schema holds."""
+
+import copy
+import csv
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("commonroad", reason="--to commonroad needs the extra commonroad")
+import commonroad  # noqa: E402
+from commonroad.common.reader.file_reader_xml import XMLFileReader  # noqa: E402
+from lxml import etree  # noqa: E402
+
+from e2rl.report.export.__main__ import LIST, main  # noqa: E402
+from e2rl.scene.commonroad import read_scenario  # noqa: E402
+from e2rl.scene.recording import CYCLIST, OTHER, PEDESTRIAN  # noqa: E402
+from tests.report.export.small_run import CUT_IN, GAPS, LATE, TRUCK, rollout_of, row_of  # noqa: E402
+
+SCHEMA = Path(commonroad.__file__).parent / "common" / "xml_definition_files" / "XML_commonRoad_XSD.xsd"
+
+
+def written(run, out, *options):
+    """The files of all rollouts, in their order."""
+    main([str(run), "--to", "commonroad", "--all", "--out", str(out), *options])
+    with (out / LIST).open(newline="") as file:
+        return [out / line["file"] for line in csv.DictReader(file)]
+
+
+@pytest.fixture(scope="module")
+def files(run, tmp_path_factory):
+    return written(run, tmp_path_factory.mktemp("commonroad") / "out")
+
+
+@pytest.fixture(scope="module")
+def scenarios(files):
+    return [XMLFileReader(str(file)).open() for file in files]
+
+
+def states_of(obstacle):
+    return [obstacle.initial_state, *obstacle.prediction.trajectory.state_list]
+
+
+def test_every_state_comes_back_and_no_other(run, scenarios):
+    for index, (scenario, _) in enumerate(scenarios):
+        rollout = rollout_of(run, index)
+        count, seen = len(rollout["size"]), np.zeros(rollout["valid"].shape, bool)
+        for obstacle in scenario.dynamic_obstacles:
+            row = obstacle.obstacle_id - 1 if obstacle.obstacle_id <= count else LATE  # which alone comes back
+            for state in states_of(obstacle):
+                x, y, heading, speed = rollout["states"][state.time_step, row]
+                turned = (heading - state.orientation + np.pi) % (2 * np.pi) - np.pi
+                assert np.hypot(*(state.position - [x, y])) < 0.01 and abs(turned) < 1e-3
+                assert abs(speed - state.velocity) < 0.01
+                seen[state.time_step, row] = True
+            assert np.allclose([obstacle.obstacle_shape.length, obstacle.obstacle_shape.width], rollout["size"][row])
+        single = rollout["valid"].copy()
+        single[:, [row for row in range(count) if row != LATE]] = False
+        assert (seen == rollout["valid"] & ~(single & (np.arange(81) == GAPS[2][0])[:, None])).all()
+
+
+def test_who_comes_back_is_a_further_obstacle_and_nobody_is_there_before_he_appears(scenarios):
+    scenario, _ = scenarios[0]
+    first = scenario.obstacle_by_id(LATE + 1)
+    assert states_of(first)[0].time_step == GAPS[0][0] and first.occupancy_at_time(GAPS[0][0] - 1) is None
+    assert first.state_at_time(GAPS[0][1] - 1) is not None and first.state_at_time(GAPS[0][1]) is None
+    begins = [states_of(obstacle)[0].time_step for obstacle in scenario.dynamic_obstacles]
+    assert sorted(begin for begin in begins if begin) == [GAPS[0][0], GAPS[1][0]]
+
+
+def test_types_are_those_of_the_agents(run, scenarios):
+    kind = {o.obstacle_id - 1: o.obstacle_type.value for o in scenarios[0][0].dynamic_obstacles}
+    rollout = rollout_of(run, 0)
+    assert [kind[row] for row in (0, CUT_IN, TRUCK)] == ["car", "car", "truck"]
+    found = [kind[row_of(rollout, which)] for which in (PEDESTRIAN, CYCLIST, OTHER)]
+    assert found == ["pedestrian", "bicycle", "unknown"]
+
+
+def test_files_follow_the_schema_but_for_late_starts(files):
+    schema = etree.XMLSchema(etree.parse(str(SCHEMA)))
+    for file in files:
+        document = etree.parse(str(file))
+        begins = document.findall(".//dynamicObstacle/initialState/time/exact")
+        assert sorted(int(begin.text) for begin in begins)[-2:] == [GAPS[0][0], GAPS[1][0]]
+        prompt = copy.deepcopy(document)
+        for begin in prompt.iterfind(".//dynamicObstacle/initialState/time/exact"):
+            begin.text = "0"
+        schema.assertValid(prompt)
+
+
+def test_lanelets_lights_and_limits_come_back(scenarios):
+    network = scenarios[0][0].lanelet_network
+    lanes = {tuple(np.round(lane.center_vertices[-1] + [28, 0], 1).tolist()): lane for lane in network.lanelets}
+    assert lanes.keys() == {(100, 0), (400, 0), (120, 320), (100, 3.5)}
+    before, on, left = (lanes[end] for end in ((100, 0), (400, 0), (120, 320)))
+    assert set(before.successor) == {on.lanelet_id, left.lanelet_id} and on.predecessor == [before.lanelet_id]
+    width = np.linalg.norm(before.left_vertices - before.right_vertices, axis=1)
+    np.testing.assert_allclose(width, 3.6, atol=1e-3)
+    assert before.left_vertices[0, 1] > before.right_vertices[0, 1]  # driven along +x
+    lights = {light.direction.value: light for light in network.traffic_lights}
+    assert set(before.traffic_lights) == {light.traffic_light_id for light in lights.values()}
+    steps = {name: [light.get_state_at_time_step(k).value for k in range(81)] for name, light in lights.items()}
+    assert steps == {"straight": ["red"] * 30 + ["green"] * 51, "left": ["green"] * 81}
+    limit = {float(sign.traffic_sign_elements[0].additional_values[0]) for sign in network.traffic_signs}
+    np.testing.assert_allclose(sorted(limit), [50 / 3.6, 20], rtol=1e-4)
+
+
+def test_the_mission_leads_from_the_start_to_where_the_recording_ends(run, scenarios):
+    (problem,) = scenarios[0][1].planning_problem_dict.values()
+    rollout = rollout_of(run, 0)
+    np.testing.assert_allclose(problem.initial_state.position, rollout["states"][0, 0, :2], atol=1e-3)
+    (goal,) = problem.goal.state_list
+    np.testing.assert_allclose(goal.position.rect_center.xy, rollout["logged"][-1, 0, :2, None], atol=1e-3)
+    assert (goal.time_step.start, goal.time_step.end) == (1, 80)
+
+
+def test_the_project_s_own_reader_finds_the_ego_and_the_agents(run, files):
+    recording = read_scenario(files[1].read_bytes(), files[1].name)
+    rollout = rollout_of(run, 1)
+    ego = recording.states[:, recording.ego]
+    np.testing.assert_allclose(ego[:, :2], rollout["states"][:, 0, :2], atol=0.01)
+    assert len(recording.lanes) == 4 and recording.location == "ZAM_aplace"
+    assert not recording.lights  # two lights stand at the fork, and the reader leaves such lanelets out
+
+
+def test_an_open_ego_is_a_planning_problem_only(run, tmp_path):
+    scenario, problems = XMLFileReader(str(written(run, tmp_path / "out", "--open-ego")[0])).open()
+    assert 1 not in {obstacle.obstacle_id for obstacle in scenario.dynamic_obstacles}
+    assert scenario.obstacle_by_id(CUT_IN + 1) is not None and len(problems.planning_problem_dict) == 1
+
+
+def test_facts_and_origin_stand_in_the_file(files):
+    document = etree.parse(str(files[0]))
+    (comment,) = document.xpath("/commonRoad/comment()")
+    assert "scene_id: scene-0" in comment.text and f"adversaries: [{CUT_IN}]" in comment.text
+    assert [float(document.findtext(f".//{axis}Translation")) for axis in "xy"] == [28, 0]
+
+
+def test_a_missing_package_is_named_with_its_extra(run, tmp_path):
+    code = (
+        "import sys; sys.modules['commonroad'] = None\n"
+        "from e2rl.report.export.__main__ import main\n"
+        f"main([{str(run)!r}, '--to', 'commonroad', '--out', {str(tmp_path / 'out')!r}])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 2 and "pip install 'e2rl[commonroad]'" in done.stderr
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,121 @@
+"""The command: which rollouts it takes, from which scenes, and what it refuses; a folder is whole or not there."""
+
+import csv
+import shutil
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from e2rl.evaluation.files import read_rows, write_rows
+from e2rl.evaluation.rollout_reader import read_rollout
+from e2rl.report.export.__main__ import LIST, main
+from e2rl.scene.source import source_of
+from tests.report.export.small_run import CUT_IN, rollout_of
+
+
+def lines(folder):
+    with (folder / LIST).open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture
+def copy(run, tmp_path):
+    """The run's folder, to change; its data stay where they are."""
+    return shutil.copytree(run, tmp_path / "run")
+
+
+def refused(capsys, *arguments) -> str:
+    with pytest.raises(SystemExit) as end:
+        main([str(argument) for argument in arguments])
+    assert end.value.code == 2
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert message.startswith("error: ")
+    return message
+
+
+def test_failures_are_exported_with_their_facts_and_all_on_request(run, tmp_path):
+    main([str(run), "--to", "npz", "--out", str(tmp_path / "failures")])
+    (line,) = lines(tmp_path / "failures")
+    assert line["scene_id"] == "scene-0" and line["partner"] == line["adversaries"] == str(CUT_IN)
+    assert line["cfr"] == "1" and line["duty"] and line["contact_step"] and line["dataset"] == "made"
+    main([str(run), "--to", "npz", "--all", "--out", str(tmp_path / "all")])
+    assert [line["scene_id"] for line in lines(tmp_path / "all")] == ["scene-0", "scene-1"]
+
+
+def test_npz_are_the_rollouts_and_their_scenes(run, tmp_path):
+    main([str(run), "--to", "npz", "--all", "--out", str(tmp_path / "all")])
+    for index, line in enumerate(lines(tmp_path / "all")):
+        ours, theirs = rollout_of(run, index), read_rollout(tmp_path / "all" / line["file"])
+        assert ours.keys() == theirs.keys() and all(
+            np.array_equal(ours[key], theirs[key]) for key in ("states", "valid")
+        )
+        with np.load(tmp_path / "all" / "scenes" / f"scene-{index}.npz") as scene:
+            assert scene["lane_id"].tolist() == ["in", "on", "left", "near"]
+            np.testing.assert_allclose(scene["lane_limit"], [50 / 3.6, 20, 50 / 3.6, 50 / 3.6])
+            np.testing.assert_allclose(scene["origin"] + ours["states"][0, 0, :2], [28, 0], atol=1e-3)
+            np.testing.assert_allclose(scene["logged"], ours["logged"])
+
+
+def test_what_cannot_be_exported_is_named_and_nothing_is_left(run, copy, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert "did you mean openscenario?" in refused(capsys, run, "--to", "openscenaro", "--out", out)
+    assert "rollouts.csv: no such table" in refused(capsys, tmp_path / "nothing", "--to", "npz", "--out", out)
+    assert "--failures 0" in refused(capsys, run, "--to", "npz", "--failures", 0, "--out", out)
+    assert "choose among e2" in refused(capsys, run, "--to", "npz", "--method", "nobody", "--out", out)
+    assert "--open-ego: npz has no such form" in refused(capsys, run, "--to", "npz", "--open-ego", "--out", out)
+    write_rows(copy / "rollouts.csv", [row for row in read_rows(run / "rollouts.csv") if row["cfr"] == 0])
+    assert "no rollout in which the ego hits" in refused(capsys, copy, "--to", "npz", "--out", out)
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    out.mkdir()
+    (out / "kept").touch()
+    assert "is there already" in refused(capsys, run, "--to", "npz", "--out", out)
+    assert [path.name for path in out.iterdir()] == ["kept"]
+
+
+def test_a_damaged_rollout_leaves_no_folder(copy, tmp_path, capsys):
+    path = sorted((copy / "rollouts").iterdir())[1]
+    path.write_bytes(path.read_bytes()[:100])
+    assert path.name in refused(capsys, copy, "--to", "scenarionet", "--all", "--out", tmp_path / "out")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def edit(copy, **changes):
+    """Change keys of the `data` group that the run names."""
+    config = OmegaConf.load(copy / ".hydra" / "config.yaml")
+    config.data = OmegaConf.merge(config.data, changes)
+    OmegaConf.save(config, copy / ".hydra" / "config.yaml")
+
+
+def test_scenes_that_are_not_those_of_the_run_are_refused(copy, tmp_path, capsys):
+    arguments = (copy, "--to", "npz", "--out", tmp_path / "out")
+    edit(copy, starts=[15])
+    assert "hold no scene 'scene-0'" in refused(capsys, *arguments)
+    edit(copy, starts=None, build={"steps": 60})
+    assert "not driven in the scene 'scene-0'" in refused(capsys, *arguments)
+    edit(copy, path="elsewhere")
+    assert "elsewhere: no such file or folder" in refused(capsys, *arguments)
+    (copy / ".hydra" / "config.yaml").write_text("data: [")
+    assert "config.yaml: damaged" in refused(capsys, *arguments)
+    shutil.rmtree(copy / ".hydra")
+    assert "pass --no-scene" in refused(capsys, *arguments)
+    main([str(argument) for argument in (*arguments, "--no-scene")])
+    assert not (tmp_path / "out" / "scenes").exists() and len(lines(tmp_path / "out")) == 1
+
+
+def test_a_stranger_s_folder_runs_no_code_but_that_which_the_command_names(copy, tmp_path, capsys, monkeypatch):
+    (tmp_path / "theirs.py").write_text(
+        "from dataclasses import dataclass\nfrom e2rl.scene.scenarionet import ScenarioNetSource\n"
+        f"open({str(tmp_path / 'ran')!r}, 'w').close()\n@dataclass\nclass Theirs(ScenarioNetSource):\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    edit(copy, _target_="theirs.Theirs")
+    assert "runs code that is no extension" in refused(capsys, copy, "--to", "npz", "--out", tmp_path / "out")
+    assert not (tmp_path / "ran").exists()
+    main([str(copy), "--to", "npz", "--out", str(tmp_path / "out"), "--plugin", "theirs"])
+    assert (tmp_path / "ran").exists() and len(lines(tmp_path / "out")) == 1
+
+
+def test_the_run_s_scenes_are_made_from_its_own_settings(run):
+    data = OmegaConf.to_container(OmegaConf.load(run / ".hydra" / "config.yaml").data)
+    assert source_of(data).build.vehicles == 8

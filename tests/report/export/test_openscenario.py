@@ -1,0 +1,143 @@
+"""OpenSCENARIO: scenariogeneration's parser gets back every state, and the standard's schema holds."""
+
+import csv
+import subprocess
+import sys
+import warnings
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+pytest.importorskip("scenariogeneration", reason="--to openscenario needs the extra openscenario")
+from scenariogeneration import xosc  # noqa: E402
+
+from e2rl.report.export.__main__ import LIST, main  # noqa: E402
+from e2rl.report.export.openscenario import EGO  # noqa: E402
+from e2rl.scene.recording import CYCLIST, OTHER, PEDESTRIAN  # noqa: E402
+from tests.report.export.small_run import CUT_IN, GAPS, LATE, TRUCK, rollout_of, row_of  # noqa: E402
+
+
+def written(run, out, *options):
+    """The files of all rollouts, in their order."""
+    main([str(run), "--to", "openscenario", "--all", "--out", str(out), *options])
+    with (out / LIST).open(newline="") as file:
+        return [out / line["file"] for line in csv.DictReader(file)]
+
+
+def parsed(paths):
+    """The scenarios in files; an invalid one raises."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # ParseOpenScenario warns of what breaks the schema
+        return [xosc.ParseOpenScenario(str(path)) for path in paths]
+
+
+@pytest.fixture(scope="module")
+def paths(run, tmp_path_factory):
+    return written(run, tmp_path_factory.mktemp("openscenario") / "out")
+
+
+@pytest.fixture(scope="module")
+def scenarios(paths):
+    return parsed(paths)
+
+
+def entities_of(scenario):
+    """{row: entity object}"""
+    named = {item.name: item.entityobject for item in scenario.entities.scenario_objects}
+    return {0 if name == EGO else int(name.removeprefix("agent_")): found for name, found in named.items()}
+
+
+def events_of(scenario):
+    """(row, time of the trigger, actions) of every event"""
+    (story,) = scenario.storyboard.stories
+    (act,) = story.acts
+    for group in act.maneuvergroup:
+        name = group.actors.actors[0].entity
+        row = 0 if name == EGO else int(name.removeprefix("agent_"))
+        for event in group.maneuvers[0].events:
+            condition = event.trigger.conditiongroups[0].conditions[0].valuecondition
+            yield row, condition.value, [part.action for part in event.action]
+
+
+def test_every_state_comes_back_and_no_other(run, scenarios):
+    for index, scenario in enumerate(scenarios):
+        rollout, boxes = rollout_of(run, index), entities_of(scenario)
+        seen = np.zeros(rollout["valid"].shape, bool)
+        for row, start, actions in events_of(scenario):
+            ahead = boxes[row].boundingbox.center.x
+            for action in actions:
+                if not isinstance(action, xosc.FollowTrajectoryAction):
+                    continue
+                shape = action.trajectory.shapes
+                assert shape.time[0] == pytest.approx(start) and action.timeref.scale == 1
+                for time, place in zip(shape.time, shape.positions, strict=True):
+                    step = round(time / 0.1)
+                    middle = [place.x + ahead * np.cos(place.h), place.y + ahead * np.sin(place.h)]
+                    x, y, heading, _ = rollout["states"][step, row]
+                    turned = (heading - place.h + np.pi) % (2 * np.pi) - np.pi
+                    assert abs(step * 0.1 - time) < 1e-6 and np.hypot(*(np.array(middle) - [x, y])) < 0.01
+                    assert abs(turned) < 1e-3
+                    seen[step, row] = True
+                assert np.abs(np.diff([place.h for place in shape.positions])).max() < 0.5  # headings do not jump
+        seen[GAPS[2][0], LATE] = True  # a single step has no polyline
+        assert (seen == rollout["valid"]).all()
+
+
+def test_who_appears_late_is_added_then_and_deleted_when_gone(scenarios):
+    added = {(row, start) for row, start, actions in events_of(scenarios[0]) for a in actions if is_added(a)}
+    gone = {(row, start) for row, start, actions in events_of(scenarios[0]) for a in actions if is_deleted(a)}
+    assert sorted(added) == [(LATE, first / 10) for first, _ in GAPS]
+    assert sorted(gone) == [(LATE, end / 10) for _, end in GAPS]
+    placed = {entity for entity in scenarios[0].storyboard.init.initactions}
+    assert f"agent_{LATE}" not in placed and {EGO, f"agent_{CUT_IN}"} <= placed
+
+
+def is_added(action):
+    return isinstance(action, xosc.AddEntityAction)
+
+
+def is_deleted(action):
+    return isinstance(action, xosc.DeleteEntityAction)
+
+
+def test_boxes_types_and_reference_points(run, scenarios):
+    rollout, found = rollout_of(run, 0), entities_of(scenarios[0])
+    for row, entity in found.items():
+        sides = entity.boundingbox.boundingbox
+        assert [sides.length, sides.width] == pytest.approx(rollout["size"][row].tolist(), abs=1e-5)
+    assert {row: found[row].vehicle_type.get_name() for row in (0, CUT_IN, TRUCK, row_of(rollout, CYCLIST))} == {
+        0: "car",
+        CUT_IN: "car",
+        TRUCK: "truck",
+        row_of(rollout, CYCLIST): "bicycle",
+    }
+    walker, box = found[row_of(rollout, PEDESTRIAN)], found[row_of(rollout, OTHER)]
+    assert isinstance(walker, xosc.Pedestrian) and isinstance(box, xosc.MiscObject)
+    assert walker.boundingbox.center.x == box.boundingbox.center.x == 0
+    axles = found[0].axles
+    assert axles.rearaxle.xpos == 0 and axles.frontaxle.xpos == pytest.approx(2 * found[0].boundingbox.center.x)
+
+
+def test_an_open_ego_has_a_start_and_no_trajectory(run, tmp_path):
+    (scenario, _) = parsed(written(run, tmp_path / "out", "--open-ego"))
+    assert 0 not in {row for row, *_ in events_of(scenario)}
+    kinds = [type(action).__name__ for action in scenario.storyboard.init.initactions[EGO]]
+    assert kinds == ["TeleportAction", "AbsoluteSpeedAction"]
+
+
+def test_facts_stand_in_the_header(paths):
+    properties = ElementTree.parse(paths[0]).iterfind("FileHeader/Properties/Property")
+    facts = {item.get("name"): item.get("value") for item in properties}
+    assert facts["scene_id"] == "scene-0" and facts["adversaries"] == f"[{CUT_IN}]" and facts["duty"]
+
+
+def test_a_missing_package_is_named_with_its_extra(run, tmp_path):
+    code = (
+        "import sys; sys.modules['scenariogeneration'] = None\n"
+        "from e2rl.report.export.__main__ import main\n"
+        f"main([{str(run)!r}, '--to', 'openscenario', '--out', {str(tmp_path / 'out')!r}])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 2 and "pip install 'e2rl[openscenario]'" in done.stderr
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,89 @@
+"""ScenarioNet: the project's own reader gets back what was driven, where, and by what light."""
+
+import csv
+import pickle
+
+import numpy as np
+import pytest
+
+from e2rl.report.export.__main__ import LIST, main
+from e2rl.scene.recording import AGENT_TYPES, LIGHT_GREEN, LIGHT_RED
+from e2rl.scene.scenarionet import ScenarioNetSource
+from tests.report.export.small_run import CUT_IN, LATE, rollout_of
+
+
+@pytest.fixture(scope="module")
+def folder(run, tmp_path_factory):
+    out = tmp_path_factory.mktemp("scenarionet") / "out"
+    main([str(run), "--to", "scenarionet", "--all", "--out", str(out)])
+    return out
+
+
+@pytest.fixture(scope="module")
+def recordings(folder):
+    return list(ScenarioNetSource(str(folder)).recordings())
+
+
+def descriptions(folder):
+    with (folder / LIST).open(newline="") as file:
+        return [pickle.loads((folder / line["file"]).read_bytes()) for line in csv.DictReader(file)]
+
+
+def test_tracks_come_back_to_the_centimetre_with_their_types(run, recordings):
+    for index, recording in enumerate(recordings):
+        rollout = rollout_of(run, index)
+        rows = np.flatnonzero(rollout["valid"].any(0))
+        driven, valid = recording.states[recording.current :], recording.valid[recording.current :]
+        assert recording.current == 10 and recording.ego == 0 and (valid == rollout["valid"][:, rows]).all()
+        np.testing.assert_allclose(driven[valid], rollout["states"][:, rows][valid], atol=1e-4)
+        np.testing.assert_allclose(recording.size, rollout["size"][rows], atol=1e-4)
+        assert [AGENT_TYPES[kind] for kind in recording.agent_type] == rollout["agent_type"][rows].tolist()
+
+
+def test_the_past_is_the_recorded_one(recordings):
+    ego = recordings[0].states[:11, 0]
+    np.testing.assert_allclose(np.diff(ego[:, 0]), 0.8, atol=1e-3)
+    np.testing.assert_allclose(ego[:, 1:], [[0, 0, 8]] * 11, atol=1e-2)
+    assert recordings[0].valid[:10, CUT_IN].all() and not recordings[0].valid[:10, LATE].any()
+
+
+def test_map_and_lights_come_back(recordings):
+    lanes, lights = recordings[0].lanes, recordings[0].lights
+    assert lanes["in"].exits == ["on", "left"] and lanes["near"].exits == []
+    np.testing.assert_allclose([lanes["on"].speed_limit, lanes["on"].width], [20, 3.6], rtol=1e-5)
+    np.testing.assert_allclose(lanes["in"].points[[0, -1]], [[-28, 0], [72, 0]], atol=1e-3)  # from the ego's start
+    assert lights["on"].tolist() == [LIGHT_RED] * 40 + [LIGHT_GREEN] * 51 and set(lights["left"]) == {LIGHT_GREEN}
+
+
+def test_the_files_make_scenes(folder, tmp_path):
+    scenes = ScenarioNetSource(str(folder), cache=str(tmp_path), workers=1).load()
+    assert len(scenes) == 2 and not scenes.dropped and scenes.location == ["a place"] * 2
+
+
+def test_descriptions_are_plain_and_zero_where_nobody_is(folder):
+    """What MetaDrive's ScenarioDescription.sanity_check asks for."""
+
+    def check(value):
+        assert type(value) in (dict, list, str, int, float, bool, np.ndarray), type(value)
+        for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+            check(part)
+
+    for made in descriptions(folder):
+        check(made)
+        assert made["metadata"]["ts"].shape == (made["length"],)
+        for name, track in made["tracks"].items():
+            assert track["metadata"]["object_id"] == name and track["state"]["valid"].any()
+            for values in track["state"].values():
+                assert len(values) == made["length"] and not np.any(values[~track["state"]["valid"]])
+        facts = made["metadata"]["e2rl"]
+        assert facts["scene_id"] in made["id"] and facts["adversaries"] == [CUT_IN]
+    summary = pickle.loads((folder / "dataset_summary.pkl").read_bytes())
+    assert set(summary) == {path.name for path in folder.glob("sd_*.pkl")}
+    assert summary[min(summary)]["object_summary"]["0"]["valid_length"] == 91
+    assert pickle.loads((folder / "dataset_mapping.pkl").read_bytes()) == dict.fromkeys(summary, "")
+
+
+def test_without_the_scene_the_start_is_the_first_frame(run, tmp_path):
+    main([str(run), "--to", "scenarionet", "--no-scene", "--out", str(tmp_path / "out")])
+    (recording,) = ScenarioNetSource(str(tmp_path / "out")).recordings()
+    assert len(recording.states) == 81 and not recording.lights and not recording.lanes["0"].exits
