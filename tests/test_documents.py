@@ -1,19 +1,25 @@
-"""What documents and docstrings name is in the repository: paths, other documents, sections of docs/method.md."""
+"""What documents and docstrings name is there: paths, other documents, sections of docs/method.md, options."""
 
 import ast
 import re
+import shlex
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
+
+from e2rl.build import load_config
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = "benchmarks|conf|docs|e2rl|examples|tests|tools"
 PATH = re.compile(rf"(?<![\w./<>-])(?:{FOLDERS})/[\w./<>*{{}}\[\]-]*")
 PLACEHOLDER = re.compile(r"[<>*{}\[\]]|\.\.\.|(?<![a-zA-Z])[A-Z]{3,}(?![a-zA-Z])")  # <name>, *, {a,b}, ..., NAME
-DOCUMENT = re.compile(r"(?<![\w/])[\w-]+\.md\b")
+DOCUMENT = re.compile(r"(?<![\w/-])[\w-]+\.md\b")
 SECTION = re.compile(r"docs/method\.md, sections? (\d+)(?: to (\d+))?")
-WRITTEN = {"tables.md", "methods.md", "egos.md"}  # documents that a run writes
+WRITTEN = {"tables.md", "methods.md", "egos.md", "tutorial.md"}  # documents that a run writes, or the site's build
+COMMAND = re.compile(r"(?:python|torchrun[^`\n]*?) (evaluate|train)\.py((?:\\\n|[^`\n])*)")
+EXTENDED = "--config-dir"
 
 
 def docstrings(path: Path) -> Iterator[str]:
@@ -23,9 +29,10 @@ def docstrings(path: Path) -> Iterator[str]:
             yield ast.get_docstring(node) or ""
 
 
+@cache
 def texts() -> dict[str, str]:
     """Documents, docstrings and configuration files, by path."""
-    documents = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
+    documents = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
     found = {path: path.read_text() for path in documents if path.exists()}
     found |= {path: path.read_text() for path in (ROOT / "conf").rglob("*.yaml")}
     found |= {path: "\n".join(docstrings(path)) for path in (ROOT / "e2rl").rglob("*.py")}
@@ -48,7 +55,7 @@ def test_placeholders_are_no_paths_and_full_stops_end_sentences():
 def test_what_is_named_exists(name):
     text = texts()[name]
     missing = {path for path in named_paths(text) if not (ROOT / path).exists()}
-    known = {path.name for folder in (ROOT, ROOT / "docs") for path in folder.glob("*.md")} | WRITTEN
+    known = {path.name for path in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"))} | WRITTEN
     missing |= set(DOCUMENT.findall(text)) - known
     assert not missing, f"{name} names what is not there: {', '.join(sorted(missing))}"
 
@@ -58,3 +65,32 @@ def test_sections_of_the_method_are_numbered_and_those_cited_exist():
     assert headings == [str(number + 1) for number in range(len(headings))]
     cited = {number for text in texts().values() for pair in SECTION.findall(text) for number in pair if number}
     assert cited and cited <= set(headings)
+
+
+def is_choice(override: str) -> bool:
+    """Whether an override chooses a file of a group of the configuration."""
+    return (ROOT / "conf" / override.split("=")[0]).is_dir()
+
+
+def commands() -> list[tuple[str, tuple[str, ...]]]:
+    """The commands of the documents, each a configuration and its overrides; of those that differ in values, one."""
+    found = {}
+    for text in (text for name, text in texts().items() if name.endswith(".md")):
+        for name, rest in COMMAND.findall(text):
+            parts = shlex.split(rest.replace("\\\n", " "), comments=True)
+            if any(is_choice(part) and part.endswith("=NAME") for part in parts):
+                continue
+            parts = [part for part in parts if "..." not in part]
+            kinds = frozenset(part if is_choice(part) else part.split("=")[0] for part in parts)
+            found.setdefault((name, kinds), (name, tuple(parts)))
+    return sorted(found.values())
+
+
+@pytest.mark.parametrize(("name", "overrides"), commands())
+def test_the_options_of_a_command_exist(name, overrides):
+    """Hydra composes them: groups, files and keys are there, in conf/ or where --config-dir says."""
+    given = list(overrides)
+    if EXTENDED in given:
+        folder = given.pop(given.index(EXTENDED) + 1)
+        given.append(f"hydra.searchpath=[file://{ROOT / folder}]")
+    assert load_config(name, [part for part in given if not part.startswith("--")]).synthesizer._target_

@@ -1,0 +1,55 @@
+"""Hook of the documentation site (mkdocs.yml): docs/tutorial.ipynb as a page, in the site's own style.
+
+The repository holds the notebook without outputs. With E2RL_EXECUTE=true in the environment it is run first, which
+takes some two minutes, and the page shows what its cells print and draw.
+"""
+
+import json
+import os
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+NOTEBOOK, PAGE = "tutorial.ipynb", "tutorial.md"
+PICTURES = ("image/png", "image/gif")
+
+
+def on_files(files: Files, config: MkDocsConfig) -> None:
+    """Add the page to those of docs/; the notebook itself can be downloaded."""
+    path = Path(config.docs_dir) / NOTEBOOK
+    notebook = json.loads(path.read_text())
+    if os.environ.get("E2RL_EXECUTE", "").lower() in ("1", "true"):
+        notebook = executed(notebook, path.parent)
+    files.append(File.generated(config, PAGE, content=page(notebook)))
+
+
+def executed(notebook: dict, folder: Path) -> dict:
+    """The notebook with the outputs of its cells, run in a folder."""
+    import nbformat  # of the extra test, as nbclient is
+    from nbclient import NotebookClient
+
+    node = nbformat.from_dict(notebook)
+    NotebookClient(node, timeout=600, resources={"metadata": {"path": str(folder)}}).execute()
+    return node
+
+
+def page(notebook: dict) -> str:
+    """A notebook as Markdown: text, code and what it gave."""
+    parts = []
+    for number, cell in enumerate(notebook["cells"]):
+        source = "".join(cell["source"])
+        parts.append(f"```python\n{source}\n```" if cell["cell_type"] == "code" else source)
+        parts += [shown(output) for output in cell.get("outputs", [])]
+        if number == 0:
+            parts.append(f"[Download the notebook]({NOTEBOOK})")
+    return "\n\n".join(parts)
+
+
+def shown(output: dict) -> str:
+    """What a cell printed, or the picture that it drew."""
+    data = output.get("data", {})
+    for kind in PICTURES:
+        if kind in data:
+            return f"![output](data:{kind};base64,{''.join(data[kind].split())})"
+    return f"```text\n{''.join(output.get('text', data.get('text/plain', ''))).rstrip()}\n```"
