@@ -3,21 +3,22 @@
 from pathlib import Path
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from e2rl import build
+from e2rl import build, provenance
 from e2rl.egos import build_egos, curve_runs
 from e2rl.ending import ending
 from e2rl.evaluation.avoidable import search_effort
 from e2rl.evaluation.chains import LongestChain
 from e2rl.evaluation.egos import EgoSet, recorded_acceleration, run_egos
 from e2rl.evaluation.files import METRICS_FILE, write_metrics
+from e2rl.evaluation.kept import Kept
 from e2rl.evaluation.ladders import intensity_ladder
 from e2rl.evaluation.modes import MODES_FILE, read_modes
 from e2rl.evaluation.open_loop import open_loop_rows
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.evaluation.realism_meta import meta_rows
+from e2rl.files import alone_in
 from e2rl.report.drawing import save_picture
 from e2rl.report.egos import ego_tables, guard_table
 from e2rl.report.html import report_command
@@ -28,20 +29,26 @@ from e2rl.report.plots import collision_bars, learning_curves
 from e2rl.report.skeleton import skeleton_figure
 from e2rl.report.tables import Table, metric_tables, print_tables, save_tables
 from e2rl.report.tuning import save_tuning_curve
+from e2rl.resume import Run, resume_command, run_of
 from e2rl.scene.scene import SceneSet
 from e2rl.scene.source import load_scenes
 from e2rl.tuning import run_tuning, tuning_of
 
+MAY_CHANGE = ("processes",)  # when a run is resumed
 
-def evaluate(config: DictConfig, folder: Path) -> list[dict]:
+
+def evaluate(run: Run) -> list[dict]:
     """Run the methods of a configuration and return the rows of metrics.json."""
+    config, folder = run.config, run.folder
     build.set_up(config)
     build.check_evaluation(config)
     egos, task = build_egos(config), tuning_of(config)
     prior, origin = build.build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
-    methods, name = build.build_methods(config, prior), HydraConfig.get().runtime.choices["ego"]
+    methods, name = build.build_methods(config, prior), run.choices["ego"]
     name, ego = next(iter(egos.egos.items())) if egos else (name, build.build_ego(config))
     sim, scenes = build.build_sim(config), load_scenes(config.data, config.num_scenes)
+    provenance.begin_run(folder, config, MAY_CHANGE, {"scenes": scenes})
+    kept = Kept(None if config.figure == "skeleton" else folder)  # that figure listens to every rollout
     setup = Setup(scenes, ego, name, sim, config.batch, config.device)
     if task is not None:
         result = run_tuning(config, task, setup, methods, prior, folder)
@@ -52,11 +59,12 @@ def evaluate(config: DictConfig, folder: Path) -> list[dict]:
     chain = LongestChain(methods[0]) if config.figure == "skeleton" else None
     rows = []
     if config.open_loop_samples:
-        rows += open_loop_rows(scenes, methods, config.open_loop_samples, config.device)
-    how = (methods, config.seeds, folder, config.save_rollouts, build.processes_of(config), only)
+        rows += open_loop_rows(scenes, methods, config.open_loop_samples, config.device, kept)
+    how = (methods, config.seeds, folder, config.save_rollouts, build.processes_of(config), only, kept)
     rows += run_egos(setup, egos, *how) if egos else run_protocol(setup, *how)
     if config.meta_rollouts:
-        rows += meta_rows(setup, methods, config.meta_rollouts)
+        rows += meta_rows(setup, methods, config.meta_rollouts, kept)
+    rows = [row | provenance.origin_of(folder) for row in rows]
     write_metrics(folder / METRICS_FILE, rows)
     dropped = "".join(f"; left out: {count} scenes ({reason})" for reason, count in scenes.dropped.items())
     effort = search_effort(scenes.scenes["logged"].shape[1] - 1)
@@ -110,9 +118,10 @@ def report_egos(
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
 def main(config: DictConfig) -> None:
     """The command."""
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    with ending(f"score the rollouts in {folder} with `python -m e2rl.report.score {folder}`, or start again"):
-        evaluate(config, folder)
+    with ending(resume_command(config)):
+        run = run_of(config, MAY_CHANGE)
+        with alone_in(run.folder):
+            evaluate(run)
 
 
 if __name__ == "__main__":

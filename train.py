@@ -2,38 +2,45 @@
 `stage=bits` the ego bits."""
 
 import sys
+from contextlib import nullcontext
+from functools import partial
 from math import nan
-from pathlib import Path
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tqdm import tqdm
 
 from e2rl.build import build_ego, build_prior, build_traffic, caption, resolved, set_up
 from e2rl.ending import ending
 from e2rl.errors import InputError
+from e2rl.files import alone_in
 from e2rl.learning.build import build_evolution, build_logger, build_measure, check_training, run_bits, run_imitation
 from e2rl.learning.checkpoint import checkpoints, load_checkpoint, save_checkpoint
-from e2rl.learning.prior_training.distributed import follower_overrides, started_by_torchrun
+from e2rl.learning.prior_training.distributed import follower_overrides, follows, started_by_torchrun
 from e2rl.learning.prior_training.stage import run_prior_stage
-from e2rl.learning.resume import resumed
+from e2rl.provenance import begin_run
 from e2rl.report.rounds import draw_round, round_line
 from e2rl.report.tables import metric_tables, print_tables, save_tables
+from e2rl.resume import Run, resume_command, run_of
 from e2rl.scene.source import load_scenes
 
+MAY_CHANGE = ("rounds", "device", "threads")  # when a run is resumed
 
-def evolve(config: DictConfig, folder: Path) -> None:
+
+def evolve(task: Run) -> None:
     """Rounds of Algorithm 1: synthesize D' against the current ego, improve the ego on it, move the curriculum."""
+    config, folder = task.config, task.folder
     prior, origin = build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
     traffic, ego = build_traffic(config.synthesizer, prior), build_ego(config)
     scenes = load_scenes(config.data, config.num_scenes, split="train")
     run, logger = build_evolution(config, scenes, ego, traffic, folder=folder), build_logger(config, folder)
-    measure = build_measure(config, ego, HydraConfig.get().runtime.choices["ego"], traffic, prior, folder)
+    measure = build_measure(config, ego, task.choices["ego"], traffic, prior, folder)
+    begin_run(folder, config, MAY_CHANGE, {"scenes": scenes, "measured scenes": measure.setup.scenes})
     begun = config.resume and checkpoints(config.resume)  # a run can be cut off in the measurement before
     done = load_checkpoint(config.resume, run) if begun else 0
+    logger.forget(done)
     if done == 0:
-        measure("before", run.ego)
+        measure("before", run.ego, 0)
         save_checkpoint(folder, run, resolved(config), config.keep_last)
     bar = tqdm(range(done, config.rounds), "evolution", config.rounds, initial=done, unit="round", disable=None)
     for number in bar:
@@ -45,15 +52,15 @@ def evolve(config: DictConfig, folder: Path) -> None:
         with tqdm.external_write_mode():
             print(round_line(metrics, number + 1, config.rounds), flush=True)
     logger.close()
-    tables = metric_tables(measure("after", run.ego), caption(config, origin))
+    tables = metric_tables(measure("after", run.ego, run.round), caption(config, origin))
     save_tables(folder / "tables.md", tables)
     print_tables(tables)
     print(f"\nwritten to {folder}; {run.improve.outcome(folder)}")
 
 
-def train_prior(config: DictConfig, folder: Path) -> None:
+def train_prior(task: Run) -> None:
     """Train a prior and print its nominal closed loop on held-out logs."""
-    outcome = run_prior_stage(config, folder)
+    outcome = run_prior_stage(task.config, task.folder, partial(begin_run, task.folder, task.config, MAY_CHANGE))
     if outcome is None:
         return  # another process of torchrun is the leader and reports
     path, rows = outcome
@@ -61,18 +68,22 @@ def train_prior(config: DictConfig, folder: Path) -> None:
     print(f"\ncheckpoint: {path}\nuse it with prior.checkpoint={path}")
 
 
-def imitate(config: DictConfig, folder: Path) -> None:
+def imitate(task: Run) -> None:
     """Warm-start the actor from the recorded egos."""
+    config, folder = task.config, task.folder
     ego = build_ego(config)
     scenes = load_scenes(config.data, config.num_scenes, split="train")
+    begin_run(folder, config, MAY_CHANGE, {"scenes": scenes})
     losses = run_imitation(config, scenes, ego, folder, build_logger(config, folder))
     print(", ".join(f"{name} {value:.4f}" for name, value in losses.items() if value == value))  # NaN: none held out
     print(f"start evolution rounds from it with ego.checkpoint={folder}")
 
 
-def train_bits(config: DictConfig, folder: Path) -> None:
-    """Train the ego bits on recorded vehicles."""
+def train_bits(task: Run) -> None:
+    """Train the ego bits on recorded vehicles, in a minute or two: a resumed run begins anew."""
+    config, folder = task.config, task.folder
     scenes = load_scenes(config.data, config.num_scenes, split="train")
+    begin_run(folder, config, MAY_CHANGE, {"scenes": scenes})
     losses = run_bits(config, scenes, folder, build_logger(config, folder))
     print(", ".join(f"{name} {value:.4f}" for name, value in losses.items() if value == value))  # NaN: none held out
     print(f"drive with it by ego=bits ego.checkpoint={folder}")
@@ -84,16 +95,17 @@ STAGES = {"evolution": evolve, "prior": train_prior, "imitation": imitate, "bits
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 def run(config: DictConfig) -> None:
     """One stage of training, as configured."""
-    begun = config.resume or HydraConfig.get().runtime.output_dir
-    with ending(f"run `python train.py resume={begun}`"):
-        config, folder = resumed(config, Path(HydraConfig.get().runtime.output_dir))
+    with ending(resume_command(config)):
+        task = run_of(config, MAY_CHANGE)
+        config = task.config
         if config.stage not in STAGES:
             raise InputError(f"stage={config.stage}: choose one of {', '.join(STAGES)}")
         if started_by_torchrun() and config.stage != "prior":
             raise InputError(f"torchrun: stage={config.stage} runs in one process, started with python")
         set_up(config)
         check_training(config)
-        STAGES[config.stage](config, folder)
+        with nullcontext() if follows() else alone_in(task.folder):
+            STAGES[config.stage](task)
 
 
 def main() -> None:

@@ -1,11 +1,14 @@
 """From a run's configuration to its objects: prior, traffic methods, ego, simulator settings."""
 
 import copy
+import random
+import re
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -28,6 +31,7 @@ from e2rl.settings import check_choice, settings_of
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.traffic import Traffic
 
+CHOICE = re.compile(r"[\w+-][\w.+-]*(/[\w+-][\w.+-]*)*")  # a file's name in a group
 FIGURES = ("intensity", "skeleton")
 VARIED = ("prior", "synthesizer")  # groups that the variants of a table may change
 
@@ -55,6 +59,8 @@ def load_choice(group: str, name: str) -> DictConfig:
 
     Raises InputError listing the choices where there is none of this name.
     """
+    if not CHOICE.fullmatch(name):  # a path could lead out of conf/, into a stranger's folder
+        raise InputError(f"{group}={name}: no name of a file in conf/{group}")
     if not GlobalHydra.instance().is_initialized():
         with initialize_config_dir(str(conf_folder().resolve()), version_base="1.3"):
             return load_choice(group, name)
@@ -153,8 +159,8 @@ def build_sim(config: DictConfig) -> SimSettings:
 
 
 def set_up(config: DictConfig) -> None:
-    """Plugins, threads, device and torch's seed; InputError for a plugin or device that is not there and a size that is
-    impossible."""
+    """Plugins, threads, device and the seeds of torch, numpy and python; InputError for a plugin or device that is not
+    there and a size that is impossible."""
     check_counts(config, threads=1, batch=1)
     for name in config.plugins:
         try:
@@ -168,7 +174,10 @@ def set_up(config: DictConfig) -> None:
         torch.empty(1, device=config.device)
     except (RuntimeError, AssertionError) as error:
         raise InputError(f"device={config.device}: {str(error).splitlines()[0]}; use device=cpu or cuda") from error
-    torch.manual_seed(config.get("seed", 0))  # first weights and exploration; evaluation's noise has seeds of its own
+    seed = config.get("seed", 0)  # first weights and exploration; evaluation's noise has seeds of its own
+    torch.manual_seed(seed)
+    np.random.seed(seed % 2**32)
+    random.seed(seed)
 
 
 # --- what evaluate.py is asked for

@@ -18,9 +18,9 @@ class Terminated(KeyboardInterrupt):
 
 
 @contextmanager
-def ending(how_to_go_on: str) -> Iterator[None]:
+def ending(command: str) -> Iterator[None]:
     """End the process where the block ends early: status 2 for bad input, 1 for a disk that cannot be written, 130 for
-    Ctrl-C, 143 for SIGTERM."""
+    Ctrl-C, 143 for SIGTERM. command: goes on where this one ends."""
     before = signal.signal(signal.SIGTERM, _terminate)
     try:
         yield
@@ -30,10 +30,10 @@ def ending(how_to_go_on: str) -> Iterator[None]:
         if error.errno not in WRITING:
             raise
         reason = f"{error.filename}: cannot be written ({error.strerror}); what was written before is whole"
-        _end(f"error: {reason}. Free space, then {how_to_go_on}", 1)
+        _end(f"error: {reason}. Free space, then go on with: {command}", 1)
     except KeyboardInterrupt as error:
         number = signal.SIGTERM if isinstance(error, Terminated) else signal.SIGINT
-        _end(f"interrupted ({number.name}). To go on, {how_to_go_on}", 128 + number)
+        _end(f"interrupted ({number.name}); go on with: {command}", 128 + number)
     finally:
         signal.signal(signal.SIGTERM, before)
 

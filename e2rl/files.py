@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import tempfile
+import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -15,7 +16,10 @@ from typing import IO
 
 import numpy as np
 
+from e2rl.errors import InputError
+
 MAX_ARRAYS = 1 << 30  # bytes of one npz, unpacked
+WAIT = 5  # s that another run's workers have to end
 SEAL = "sha256.json"  # of a sealed folder: {file: hash}
 DAMAGED = (OSError, EOFError, LookupError, TypeError, ValueError, RuntimeError, MemoryError, SyntaxError)
 
@@ -99,6 +103,26 @@ def locked(path: Path) -> Iterator[None]:
         yield
     finally:
         name.unlink(missing_ok=True)
+        os.close(handle)
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Have a run's folder for oneself; raises InputError where another process is at work there."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        for remaining in reversed(range(WAIT)):
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if not remaining:
+                    raise InputError(
+                        f"{folder}: another process is at work in this run; wait for it, or end it"
+                    ) from None
+                time.sleep(1.0)  # workers of a process that was killed end soon, but not at once
+        yield
+    finally:
         os.close(handle)
 
 

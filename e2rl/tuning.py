@@ -12,6 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 from e2rl.build import build_ego, build_traffic, check_counts, intensities, processes_of, resolved
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError
+from e2rl.evaluation.kept import Kept
 from e2rl.evaluation.objective import Objective
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.evaluation.tune_planner import Trials
@@ -48,7 +49,8 @@ def run_tuning(config: DictConfig, task: Task, setup: Setup, methods: list[Metho
         **{name: OmegaConf.to_container(config[name], resolve=True) for name in ("ego", "prior", "sim")},
         "eta": intensities(config),
     }
-    result = tune(trials, present, task.space, task.settings, task.objective, folder, about)
+    how = (task.space, task.settings, task.objective, folder, about)
+    result = tune(trials, present, *how, kept=Kept(folder, "tuning"))
     print(f"\n{advice(result, group)}written to {folder}")
     return result
 

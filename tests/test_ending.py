@@ -62,7 +62,7 @@ def test_an_interrupted_command_leaves_no_process(tmp_path, method, how):
     assert run.returncode == {"Ctrl-C": 130, "SIGTERM": 143, "SIGKILL": -9}[how]
     if how != "SIGKILL":
         name = "SIGINT" if how == "Ctrl-C" else how
-        assert said.strip() == f"interrupted ({name}). To go on, do it again"
+        assert said.strip() == f"interrupted ({name}); go on with: do it again"
 
 
 def test_a_full_disk_ends_with_the_file_and_how_to_go_on(capsys):
@@ -70,7 +70,10 @@ def test_a_full_disk_ends_with_the_file_and_how_to_go_on(capsys):
         raise OSError(28, "No space left on device", "runs/1/file")
     assert stopped.value.code == 1
     said = capsys.readouterr().err
-    assert "error: runs/1/file: cannot be written (No space left on device)" in said and "then run x again" in said
+    assert (
+        "error: runs/1/file: cannot be written (No space left on device)" in said
+        and "then go on with: run x again" in said
+    )
 
 
 def test_bad_input_ends_with_its_message_and_other_errors_pass(capsys):

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from e2rl.files import locked, write_atomically, written_whole
+from e2rl import files
+from e2rl.errors import InputError
+from e2rl.files import alone_in, locked, write_atomically, written_whole
 
 
 def test_text_bytes_and_writers_are_written(tmp_path):
@@ -61,3 +63,25 @@ def test_one_process_at_a_time_holds_a_lock_and_it_leaves_no_file(tmp_path):
         worker.join(20)
     assert (tmp_path / "log").read_text() == "in\nout\n" * 8
     assert [path.name for path in tmp_path.iterdir()] == ["log"]
+
+
+def stay(folder, inside):
+    with alone_in(folder):
+        inside.set()
+        time.sleep(30)
+
+
+def test_one_run_at_a_time_is_at_work_in_a_folder_until_it_is_killed(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "WAIT", 1)
+    context = multiprocessing.get_context("fork")
+    inside = context.Event()
+    other = context.Process(target=stay, args=(tmp_path, inside))
+    other.start()
+    assert inside.wait(20)
+    with pytest.raises(InputError, match="another process is at work"), alone_in(tmp_path):
+        pass
+    other.kill()
+    other.join(20)
+    for _ in range(2):
+        with alone_in(tmp_path):
+            assert not list(tmp_path.iterdir())

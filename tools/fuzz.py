@@ -27,8 +27,8 @@ from omegaconf import OmegaConf
 from e2rl.api import load_config
 from e2rl.errors import InputError
 from e2rl.evaluation.rollout_reader import read_rollout
-from e2rl.learning.resume import check_code, read_configuration
 from e2rl.prior.checkpoint import bundled_checkpoint, load_prior
+from e2rl.resume import check_code, read_configuration
 from e2rl.scene.build import BuildSettings, build_scene
 from e2rl.scene.bundled import load_recordings
 from e2rl.scene.recording import AGENT_TYPES, Recording
@@ -172,7 +172,7 @@ class Readers:
         path = self.folder / "config.yaml"
         content = OmegaConf.to_yaml(OmegaConf.create(self.config)).encode()
         path.write_bytes(damaged(content, self.draw))
-        check_code(read_configuration("input", path), [], "input")
+        check_code(read_configuration(load_config("train"), path), [], "input")
 
 
 def outcome(read: Callable[[], None]) -> str:

@@ -14,6 +14,7 @@ import torch
 
 from e2rl.ego.base import Ego
 from e2rl.evaluation.files import ROLLOUTS
+from e2rl.evaluation.kept import NOTHING_KEPT, Kept
 from e2rl.evaluation.protocol import Method, Setup, drive_all, record
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.proximity import ego_path, mean_acceleration
@@ -40,6 +41,7 @@ def run_egos(
     save_rollouts: bool = True,
     processes: int = 1,
     only: Sequence[int] | None = None,
+    kept: Kept = NOTHING_KEPT,
     **fields: Any,
 ) -> list[dict]:
     """`run_protocol` for each of the egos instead of the setup's, into one folder; returns the rows of metrics.json.
@@ -49,7 +51,7 @@ def run_egos(
     """
     setups = [replace(setup, ego=ego, ego_name=name) for name, ego in egos.egos.items()]
     into = folder / ROLLOUTS if folder is not None and save_rollouts else None
-    found = drive_all(setups, methods, seeds, into, processes, only)
+    found = drive_all(setups, methods, seeds, into, processes, only, kept)
 
     def summarise(rows: list[dict], features: list) -> list[dict]:
         pooled, more = pool_trainings(rows, features, egos.trainings)

@@ -1,11 +1,13 @@
 """Open-loop accuracy of traffic methods: plans from causal start states, without the ego's plan, against the log."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from e2rl.evaluation.kept import NOTHING_KEPT, Kept
 from e2rl.evaluation.protocol import SEEDS_APART, Method
 from e2rl.evaluation.summary import metric_row
 from e2rl.metrics.catalogue import OPEN_LOOP_STAGE
@@ -21,24 +23,34 @@ BATCH = 32  # scenes planned at once
 
 
 @torch.no_grad()
-def open_loop_rows(scenes: SceneSet, methods: Sequence[Method], samples: int, device: str = "cpu") -> list[dict]:
+def open_loop_rows(
+    scenes: SceneSet, methods: Sequence[Method], samples: int, device: str = "cpu", kept: Kept = NOTHING_KEPT
+) -> list[dict]:
     """Rows of metrics.json, stage `open loop`, of every uncontrolled method that predicts: minADE, mean and joint ADE
-    over `samples` and their ratios to constant velocity's ADE on the same vehicles, with intervals over places."""
+    over `samples` and their ratios to constant velocity's ADE on the same vehicles, with intervals over places.
+
+    kept: methods that are finished.
+    """
     rows = []
-    for method in methods:
+    for number, method in enumerate(methods):
         if method.eta > 0 or not method.traffic.predicts:
             continue
         count = samples if method.traffic.stochastic else 1
-        parts = []
-        for index in torch.arange(len(scenes)).split(BATCH):
-            scene = scenes.batch(index).to(device)
-            seed = index.to(device) + SEEDS_APART * torch.arange(count, device=device)[:, None]
-            parts.append(_displacements(scene, method.traffic.open_loop_plans(scene, seed)))
-        columns = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        compute = partial(open_loop_metrics, scenes, method, count, device)
+        metrics = kept.result(f"open-loop-{number:03}", [method.name, count], compute)
         key = (scenes.dataset, scenes.split, method.name, EGO, method.eta)
-        metrics = _summary(columns, scenes)
         rows.append(metric_row(key, len(scenes), count, len(scenes) * count, metrics, stage=OPEN_LOOP_STAGE))
     return rows
+
+
+def open_loop_metrics(scenes: SceneSet, method: Method, count: int, device: str) -> dict[str, dict[str, float]]:
+    """The metrics of `count` open-loop samples of every scene."""
+    parts = []
+    for index in torch.arange(len(scenes)).split(BATCH):
+        scene = scenes.batch(index).to(device)
+        seed = index.to(device) + SEEDS_APART * torch.arange(count, device=device)[:, None]
+        parts.append(_displacements(scene, method.traffic.open_loop_plans(scene, seed)))
+    return _summary({name: torch.cat([part[name] for part in parts]) for name in parts[0]}, scenes)
 
 
 def _displacements(scene: TensorDictBase, plans: Tensor) -> dict[str, Tensor]:

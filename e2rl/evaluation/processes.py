@@ -56,7 +56,8 @@ def in_processes(
                     coming += 1
     except BrokenProcessPool as error:
         raise InputError(
-            f"processes={processes}: a process was killed, perhaps for lack of memory; use fewer, or a smaller batch"
+            f"processes={processes}: a process was killed, perhaps for lack of memory; use fewer "
+            "(a run that is resumed may, too), or a smaller batch"
         ) from error
 
 

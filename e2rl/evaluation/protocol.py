@@ -19,10 +19,12 @@ from e2rl.evaluation.files import (
     TABLE,
     Source,
     label_rows,
+    rollout_name,
     write_metrics,
     write_rollouts,
     write_rows,
 )
+from e2rl.evaluation.kept import NOTHING_KEPT, Kept
 from e2rl.evaluation.modes import MODES_FILE, find_modes, write_modes
 from e2rl.evaluation.processes import in_processes
 from e2rl.evaluation.summary import metric_rows
@@ -85,6 +87,9 @@ class Setup:
         return rows, samples, ended
 
 
+Job = tuple[int, tuple[Setup, Method, list[Task]]]  # with its number
+
+
 def scene_seed(scene: int, seed: int) -> int:
     """The noise seed of a rollout, the same for every method (paired)."""
     return seed * SEEDS_APART + scene
@@ -98,16 +103,17 @@ def run_protocol(
     save_rollouts: bool = True,
     processes: int = 1,
     only: Sequence[int] | None = None,
+    kept: Kept = NOTHING_KEPT,
     **fields: Any,
 ) -> list[dict]:
     """Roll out every method on every (scene, seed), score, and return the rows of metrics.json.
 
     folder: where rollouts/ (if save_rollouts), rollouts.csv, modes.json and metrics.json are written (None: nowhere);
     processes: over which the rollouts are spread, with the same rows; only: positions of the scenes to run, with
-    unchanged noise (None: all). fields are added to each row.
+    unchanged noise (None: all); kept: batches of rollouts that are finished. fields are added to each row.
     """
     into = folder / ROLLOUTS if folder is not None and save_rollouts else None
-    found = drive_all([setup], methods, seeds, into, processes, only)
+    found = drive_all([setup], methods, seeds, into, processes, only, kept)
     return record(*found, folder, partial(metric_rows, **fields))
 
 
@@ -118,34 +124,44 @@ def drive_all(
     into: Path | None = None,
     processes: int = 1,
     only: Sequence[int] | None = None,
+    kept: Kept = NOTHING_KEPT,
 ) -> Scored:
     """Roll out and score every setup, which differ in their ego, under every method on every (scene, seed).
 
     into: folder of the rollouts' files (None: none); others: as for `run_protocol`. The noise is the same for all.
+
+    A batch is the unit that is kept: rounding makes a rollout's last digits depend on the others of its batch.
     """
     first = setups[0]
     tasks = [(scene, seed) for seed in seeds for scene in (range(len(first.scenes)) if only is None else only)]
     count = -(-len(tasks) // first.batch)
     parts = [tasks[k * len(tasks) // count : (k + 1) * len(tasks) // count] for k in range(count)]
-    jobs = [(setup, method, part) for setup in setups for method in methods for part in parts]
+    jobs = list(enumerate((setup, method, part) for setup in setups for method in methods for part in parts))
 
-    def work(job: tuple[Setup, Method, list[Task]]) -> Scored:
-        setup, method, part = job
-        return setup.score(method, part, into)
+    def work(job: Job) -> Scored:
+        number, (setup, method, part) = job
+        identity = [setup.ego_name, method.name, float(method.eta), part]
+        compute = partial(setup.score, method, part, into)
+        return kept.result(f"rollouts-{number:06}", identity, compute, partial(has_files, into))
 
     rows, features, lost = [], [], []
     with tqdm(total=len(tasks) * len(methods) * len(setups), desc="rollouts", unit="rollout", disable=None) as bar:
 
-        def ended(job: tuple[Setup, Method, list[Task]]) -> None:
-            setup, method, part = job
+        def ended(job: Job) -> None:
+            _, (setup, method, part) = job
             bar.set_postfix(ego=setup.ego_name, method=method.name, eta=method.eta, refresh=False)
             bar.update(len(part))
 
-        for found, samples, without in in_processes(work, jobs, processes, lambda job: job[1].eta, ended):
+        for found, samples, without in in_processes(work, jobs, processes, lambda job: job[1][1].eta, ended):
             rows += found
             features += samples
             lost += without
     return rows, features, lost
+
+
+def has_files(into: Path | None, scored: Scored) -> bool:
+    """Whether the files of scored rollouts are in the folder `into`."""
+    return into is None or all((into / rollout_name(row)).is_file() for row in scored[0])
 
 
 def record(

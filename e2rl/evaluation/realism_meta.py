@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
+from e2rl.evaluation.kept import NOTHING_KEPT, Kept
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.evaluation.summary import metric_row
 from e2rl.metrics.catalogue import META_STAGE
@@ -102,23 +103,27 @@ def road_of(scene: TensorDictBase, route: Tensor) -> dict[str, Tensor]:
     }
 
 
-def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int) -> list[dict]:
+def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, kept: Kept = NOTHING_KEPT) -> list[dict]:
     """Rows of metrics.json, stage `meta-metric`: every feature's likelihood and their weighted sum over `rollouts`
     rollouts of each scene, with intervals over places. The row of the log also has its split-half `real`.
 
-    A deterministic method is rolled out once.
+    A deterministic method is rolled out once. kept: the counts of each method so far.
     """
     scenes, rows = setup.scenes, []
     seeds = [rollouts if method.traffic.stochastic else 1 for method in methods]
     with tqdm(total=sum(seeds) * len(scenes), desc="meta-metric", unit="rollout", disable=None) as bar:
-        for method, count in zip(methods, seeds, strict=True):
+        for number, (method, count) in enumerate(zip(methods, seeds, strict=True)):
+            name, identity = f"meta-{number:03}", [method.name, float(method.eta), rollouts]
             tally, tasks = (
                 Tally(scenes.scenes),
                 [(scene, seed) for seed in range(count) for scene in range(len(scenes))],
             )
-            for begin in range(0, len(tasks), setup.batch):
+            done, tally.counts, tally.hits = kept.load(name, identity) or (0, tally.counts, tally.hits)
+            bar.update(done)
+            for begin in range(done, len(tasks), setup.batch):
                 part = tasks[begin : begin + setup.batch]
                 tally.add(torch.tensor([scene for scene, _ in part]), setup.roll_out(method, part), rollouts // count)
+                kept.save(name, identity, (begin + len(part), tally.counts, tally.hits))
                 bar.update(len(part))
             metrics = summarise_meta(tally.likelihoods(rollouts), scenes)
             if method.traffic.replays_log:

@@ -5,8 +5,10 @@ What a trial is rolled out as, and what its metrics are worth, is the caller's: 
 
 import json
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,11 +16,13 @@ from omegaconf import OmegaConf
 
 from e2rl.errors import InputError
 from e2rl.evaluation.files import nulls
+from e2rl.evaluation.kept import NOTHING_KEPT, Kept
 from e2rl.files import write_atomically
 
 Parameters = dict[str, Any]
 REFUSED = 10.0  # added to the objective of refused trials, so that the sampler leaves their region
 STUDY = "trials"  # name of the study in its file
+LOCK_GRACE = 5  # s after which the lock of a writer that does nothing more is broken
 LOG = "log"  # third entry of a range that is searched on a logarithmic scale
 TUNING_FILE, TUNED_FILE = "tuning.json", "tuned.yaml"
 
@@ -54,6 +58,7 @@ def tune(
     folder: Path,
     about: Mapping | None = None,
     say: Callable[[str], None] = print,
+    kept: Kept = NOTHING_KEPT,
 ) -> dict:
     """Try the present parameters, a ladder over the space's first one, then optuna's proposals, `settings.trials` in
     all; returns what tuning.json holds.
@@ -62,7 +67,7 @@ def tune(
     numbers. The best is the admissible trial of the least objective, the first of equals; there may be none. After
     every trial tuning.json and, where there is a best, tuned.yaml are written into `folder`. With `settings.study` a
     study goes on where it stopped; its proposals are those of a study in one go. about: what else such a study must
-    agree in, such as its scenes.
+    agree in, such as its scenes. kept: trials of this run that are finished; they are told to the study again.
     """
     optuna = _optuna()
     ranges = distributions(optuna, present, space)
@@ -71,23 +76,15 @@ def tune(
     study = open_study(optuna, settings, task | {"objective": vars(objective)} | dict(about or {}))
     done = _finished(study)
     for number in range(len(done), settings.trials):
-        study.sampler = optuna.samplers.TPESampler(seed=settings.seed + number, n_startup_trials=settings.startup)
-        trial = study.ask(ranges) if number >= len(given) else None
-        parameters = trial.params if trial else given[number]
-        metrics = dict(evaluate(present | parameters))
+        parameters = given[number] if number < len(given) else proposal(optuna, done, ranges, settings)
+        measure = partial(evaluate, present | parameters)
+        metrics = dict(kept.result(f"trial-{number:05}", list(parameters.items()), measure))
         value, excess = objective.judge(metrics, done[0].user_attrs["metrics"] if done else metrics)
         if math.isinf(excess):
             raise InputError(f"tuning: {parameters} yield NaN metrics; check the scenes")
         outcome = {"metrics": metrics, "objective": value, "admissible": excess == 0}
         value += REFUSED + excess if excess else 0
-        if trial:
-            for name, item in outcome.items():
-                trial.set_user_attr(name, item)
-            study.tell(trial, value)
-        else:
-            study.add_trial(
-                optuna.create_trial(params=parameters, distributions=ranges, value=value, user_attrs=outcome)
-            )
+        study.add_trial(optuna.create_trial(params=parameters, distributions=ranges, value=value, user_attrs=outcome))
         done = _finished(study)
         say(line_of(number, parameters, outcome, objective))
         save(done, folder)
@@ -174,12 +171,17 @@ def distributions(optuna, present: Parameters, space: Mapping[str, Sequence]) ->
     return found
 
 
+def proposal(optuna, done: Sequence, ranges: Mapping, settings: TuneSettings) -> Parameters:
+    """optuna's next parameters after the finished trials. They depend on nothing else, as a study holds no others."""
+    sampler = optuna.samplers.TPESampler(seed=settings.seed + len(done), n_startup_trials=settings.startup)
+    study = optuna.create_study(sampler=sampler)
+    study.add_trials(done)
+    return study.ask(dict(ranges)).params
+
+
 def open_study(optuna, settings: TuneSettings, task: Mapping):
     """The study in the file `settings.study`, a new one where there is none; InputError for one of another task."""
-    storage = None
-    if settings.study is not None:
-        Path(settings.study).parent.mkdir(parents=True, exist_ok=True)
-        storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(settings.study))
+    storage = None if settings.study is None else journal(optuna, Path(settings.study))
     study = optuna.create_study(storage=storage, study_name=STUDY, load_if_exists=True)
     task = json.loads(json.dumps(nulls(dict(task))))
     known = study.user_attrs.get("task", task)
@@ -188,6 +190,22 @@ def open_study(optuna, settings: TuneSettings, task: Mapping):
         raise InputError(f"tuning.study={settings.study}: a study that differs in {differ}; name another file")
     study.set_user_attr("task", task)
     return study
+
+
+def journal(optuna, file: Path):
+    """optuna's storage in a file. The half line of a writer that was killed is cut off; its lock is broken after
+    LOCK_GRACE seconds."""
+    file = file.absolute()  # optuna's lock is a link to this path, from the file's own folder
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.touch()
+    lock = optuna.storages.journal.JournalFileSymlinkLock(str(file), LOCK_GRACE)
+    lock.acquire()
+    try:
+        if tail := len(file.read_bytes().rpartition(b"\n")[2]):
+            os.truncate(file, file.stat().st_size - tail)
+    finally:
+        lock.release()
+    return optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(file), lock))
 
 
 def _finished(study) -> list:

@@ -9,10 +9,12 @@ from torch import Tensor
 
 from e2rl.ego.base import Ego
 from e2rl.evaluation.files import METRICS_FILE, read_metrics, write_metrics
+from e2rl.evaluation.kept import Kept
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollouts
 from e2rl.metrics.score import score_rollouts
 from e2rl.metrics.statistics import paired_differences
+from e2rl.provenance import origin_of
 
 
 @dataclass
@@ -25,13 +27,16 @@ class BeforeAfter:
     folder: Path
     processes: int = 1
 
-    def __call__(self, stage: str, ego: Ego) -> list[dict]:
-        """Evaluate an ego as `stage` (before or after); returns the rows of all stages so far.
+    def __call__(self, stage: str, ego: Ego, rounds: int) -> list[dict]:
+        """Evaluate an ego as `stage` (before or after) that was trained for some rounds; returns the rows of all stages
+        so far. A measurement that was cut off goes on.
 
         The rows of stage `after` are paired with the same method before, under the name `before`.
         """
         setup, folder = replace(self.setup, ego=ego), self.folder / stage
-        rows = run_protocol(setup, self.methods, self.seeds, folder, processes=self.processes, stage=stage)
+        kept = Kept(self.folder, stage, f"after {rounds} rounds")
+        given = {"processes": self.processes, "kept": kept, "stage": stage, **origin_of(self.folder)}
+        rows = run_protocol(setup, self.methods, self.seeds, folder, **given)
         if stage == "after":
             for row in rows:
                 row["paired"]["before"] = paired_differences(*self._scored("after", row), *self._scored("before", row))

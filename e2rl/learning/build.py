@@ -11,6 +11,7 @@ from e2rl.ego.base import Ego
 from e2rl.ego.bits_network import BitsNetwork
 from e2rl.errors import InputError
 from e2rl.evaluation.files import command_line, git_commit
+from e2rl.evaluation.kept import Kept
 from e2rl.evaluation.processes import cores
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.learning.ahead import why_not_ahead
@@ -117,7 +118,7 @@ def run_imitation(
     config: DictConfig, scenes: SceneSet, ego: Ego, folder: Path, logger: RunLogger | None = None
 ) -> dict[str, float]:
     """stage=imitation: clone the recorded egos of `scenes` into ego=actor, in place; writes folder/actor.safetensors
-    and returns the losses of the epoch kept."""
+    and returns the losses of the epoch kept. Goes on after the epochs that the run in the folder has done."""
     if "imitation" not in config.learner or not isinstance(ego, ActorEgo):
         raise InputError("stage=imitation trains ego=actor with learner=ppo_bc; set both")
     settings = settings_of(ImitationSettings, {**config.learner.imitation, "seed": config.seed}, "learner.imitation")
@@ -125,7 +126,7 @@ def run_imitation(
         reason = "of one scene none can be held out"
         raise InputError(f"learner.imitation.held_out={settings.held_out:g}: {reason}; pass more, or set it to 0")
     pairs = recorded_pairs(scenes, build_sim(config), settings)
-    return imitate(ego.network, pairs, settings, folder, None if logger is None else logger.log)
+    return imitate(ego.network, pairs, settings, folder, logger, Kept(folder, "imitation"))
 
 
 def run_bits(config: DictConfig, scenes: SceneSet, folder: Path, logger: RunLogger | None = None) -> dict[str, float]:

@@ -8,7 +8,6 @@ During cloning, noise is added to the network's input, most to the last executed
 autocorrelated, so the actor would copy it instead of learning its causes (de Haan et al. 2019).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,13 +19,17 @@ from tqdm import tqdm
 from e2rl.ego.network import WEIGHTS, ActorCritic
 from e2rl.ego.replay import ReplayEgo
 from e2rl.errors import InputError
+from e2rl.evaluation.kept import NOTHING_KEPT, Kept
+from e2rl.learning.checkpoint import generator_states, restore_generators
 from e2rl.learning.cloning import cloning_loss, pairs_of
 from e2rl.learning.driving import Disturbance, PoolDriver, filled_batches
+from e2rl.learning.logging import RunLogger
 from e2rl.learning.update import take_step
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.pool import TrafficPool
 
+STATE, PROGRESS = "epochs", ("history", "best", "chosen")  # a part of the run; what it holds of a training
 BURST, PAUSE = 10, 20  # steps: duration of a disturbance, and from the start of one to the next
 
 
@@ -85,11 +88,16 @@ def _bursts(batch: int, settings: ImitationSettings, generator: torch.Generator)
 
 
 class Imitation:
-    """Behaviour cloning of an ActorCritic's actor from pairs, with held-out scenes. `history`: one row per epoch."""
+    """Behaviour cloning of an ActorCritic's actor from pairs, with held-out scenes.
+
+    history: one row per epoch; best, chosen: the row and the weights of the epoch of the lowest held-out loss.
+    """
 
     def __init__(self, network: ActorCritic, pairs: TensorDictBase, settings: ImitationSettings) -> None:
         self.network, self.settings = network, settings
         self.history: list[dict[str, float]] = []
+        self.best: dict[str, float] | None = None
+        self.chosen: dict[str, Tensor] = {}
         self._generator = torch.Generator().manual_seed(settings.seed)
         scenes = pairs["scene_index"].unique()
         scenes = scenes[torch.randperm(len(scenes), generator=self._generator)]
@@ -124,8 +132,29 @@ class Imitation:
             take_step(self.optimiser, loss, settings.max_grad_norm)
         (fit, miss), (held_fit, held_miss) = self.measure(self.train), self.measure(self.held_out)
         row = {"loss": fit, "miss": miss, "held_out_loss": held_fit, "held_out_miss": held_miss}
+        if self.best is None or not row["held_out_loss"] >= self.best["held_out_loss"]:
+            self.best = row | {"epoch": float(len(self.history))}
+            self.chosen = {key: value.clone() for key, value in self.network.weights().items()}
         self.history.append(row)
         return row
+
+    def state_dict(self) -> dict:
+        """All that later epochs depend on, the global generators included."""
+        return {
+            "weights": dict(self.network.weights()),
+            "optimiser": self.optimiser.state_dict(),
+            "generators": {"own": self._generator.get_state(), "global": generator_states()},
+            **{name: getattr(self, name) for name in PROGRESS},
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Restore a `state_dict`."""
+        self.network.set_weights(state["weights"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self._generator.set_state(state["generators"]["own"])
+        restore_generators(state["generators"]["global"])
+        for name in PROGRESS:
+            setattr(self, name, state[name])
 
 
 def imitate(
@@ -133,21 +162,27 @@ def imitate(
     pairs: TensorDictBase,
     settings: ImitationSettings,
     folder: Path | None = None,
-    log: Callable[[dict[str, float], int], None] | None = None,
+    logger: RunLogger | None = None,
+    kept: Kept = NOTHING_KEPT,
 ) -> dict[str, float]:
-    """Clone the pairs for settings.epochs and keep the weights of the lowest held-out loss (of the last epoch if no
-    scene is held out). Improved weights are written to folder / WEIGHTS; returns the row of the epoch kept."""
-    run, best, kept = Imitation(network, pairs, settings), None, None
-    for epoch in (bar := tqdm(range(settings.epochs), "imitation", unit="epoch", disable=None)):
+    """Clone the pairs for settings.epochs and choose the weights of the lowest held-out loss (of the last epoch if no
+    scene is held out). Improved weights are written to folder / WEIGHTS; returns the row of the chosen epoch. kept: the
+    state after each epoch."""
+    run, begin = Imitation(network, pairs, settings), 0
+    if (state := kept.load(STATE, vars(settings))) is not None:
+        run.load_state_dict(state)
+        begin = len(run.history)
+    if logger is not None:
+        logger.forget(begin)
+    for epoch in (bar := tqdm(range(begin, settings.epochs), "imitation", unit="epoch", disable=None)):
         row = run.epoch()
         bar.set_postfix({name: f"{value:.3f}" for name, value in row.items()})
-        if log is not None:
-            log({f"train/imitation_{name}": value for name, value in row.items()}, epoch)
-        if best is None or not row["held_out_loss"] >= best["held_out_loss"]:
-            best, kept = row | {"epoch": float(epoch)}, {key: value.clone() for key, value in network.weights().items()}
-            if folder is not None:
-                network.save(Path(folder) / WEIGHTS)
-    if best is None or kept is None:
+        if logger is not None:
+            logger.log({f"train/imitation_{name}": value for name, value in row.items()}, epoch)
+        if folder is not None and run.best is not None and run.best["epoch"] == epoch:
+            network.save(Path(folder) / WEIGHTS)
+        kept.save(STATE, vars(settings), run.state_dict())
+    if run.best is None:
         raise InputError(f"learner.imitation.epochs={settings.epochs}: at least one epoch")
-    network.set_weights(kept)
-    return best
+    network.set_weights(run.chosen)
+    return run.best

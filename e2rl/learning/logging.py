@@ -61,6 +61,13 @@ class RunLogger:
             value = Summary.Value(tag=name, image=Summary.Image(encoded_image_string=path.read_bytes(), **given))
             self._logger.experiment.file_writer.add_summary(Summary(value=[value]), step)
 
+    def forget(self, step: int) -> None:
+        """Remove the scalars of a step and of later ones from the CSV files, and a line that was cut off: a resumed run
+        logs them again."""
+        for file in sorted((self._folder / "logs").rglob("*.csv")):
+            whole = [line for line in file.read_text().splitlines(keepends=True) if line.endswith("\n")]
+            write_atomically(file, "".join(line for line in whole if int(line.split(",")[0]) < step))
+
     def close(self) -> None:
         """Finish the wandb run, and write what TensorBoard holds back."""
         if isinstance(self._logger, WandbLogger):

@@ -226,6 +226,12 @@ def source_of(data: Mapping) -> Source:
     return replace(settings_of(kind, values, "data"), build=build)
 
 
+def content_hash(scenes: SceneSet) -> str:
+    """SHA-256 of scenes and of what is known about them."""
+    names = {key: value for key, value in vars(scenes).items() if key != "scenes"}
+    return _digest(dict(scenes.scenes.items()), json.dumps(names))
+
+
 def hash_files(paths: Iterable[Path]) -> bytes:
     """SHA-256 of the names and contents of files, for `Source.fingerprint`; of a pipe or a link to nothing of its name.
 

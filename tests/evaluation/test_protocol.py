@@ -10,9 +10,12 @@ import torch
 
 from e2rl.ego.idm import IDMEgo
 from e2rl.evaluation.files import METRICS_FILE, ROLLOUTS, TABLE, read_metrics, read_rows
+from e2rl.evaluation.kept import Kept
 from e2rl.evaluation.protocol import Method, Setup, run_protocol, scene_seed
 from e2rl.evaluation.rollout_reader import read_rollout
 from e2rl.sim.env import SimSettings
+from e2rl.traffic.constant_velocity import ConstantVelocity
+from tests.learning.small import Ambush, small_scenes
 from tests.synthesizer.traffic_scenes import scenes, synthesizer
 
 SCORER = Path(__file__).parents[3] / "shared" / "tools" / "score_rollouts.py"
@@ -112,3 +115,68 @@ def test_processes_change_nothing_but_the_time(tmp_path):
     for path in sorted((folders[0] / ROLLOUTS).iterdir()):
         first, second = np.load(path), np.load(folders[1] / ROLLOUTS / path.name)
         assert all(np.array_equal(first[key], second[key]) for key in first.files), path.name
+
+
+class Stopped(Setup):
+    """A setup whose user presses Ctrl-C after so many batches; `done`: (method, scene, seed) that were rolled out."""
+
+    left = 0
+    done: list
+
+    def score(self, method, tasks, folder=None):
+        if self.left == 0:
+            raise KeyboardInterrupt
+        self.left -= 1
+        found = super().score(method, tasks, folder)
+        self.done += [(method.name, *task) for task in tasks]
+        return found
+
+
+def stopping_run(folder, stops, scene_set, save_rollouts=True):
+    """A run that is interrupted after so many batches each time, and then ends; returns what was rolled out."""
+    done = []
+    for left in (*stops, 100):
+        setup = Stopped(scene_set, IDMEgo(), "idm", SimSettings(), 2)
+        setup.left, setup.done = left, done
+        methods = [Method("nominal", ConstantVelocity()), Method("ambush", Ambush(), 2.0)]
+        try:
+            run_protocol(setup, methods, SEEDS, folder, save_rollouts, kept=Kept(folder))
+        except KeyboardInterrupt:
+            assert left < 100 and not (folder / TABLE).exists(), "no table of half a run"
+    return done
+
+
+def same_runs(one, other):
+    """Whether two folders have the same rows, metrics and rollouts, bit for bit, wall times apart."""
+    timed = {"seconds_per_rollout", "seconds", "evasion_seconds"}
+    tables = [read_rows(folder / TABLE) for folder in (one, other)]
+    rows = [[{k: str(v) for k, v in row.items() if k not in timed} for row in table] for table in tables]
+    assert rows[0] == rows[1]
+    metrics = [read_metrics(folder / METRICS_FILE) for folder in (one, other)]
+    for row, twin in zip(*metrics, strict=True):
+        known = [{k: str(v) for k, v in each["metrics"].items() if "seconds" not in k} for each in (row, twin)]
+        assert known[0] == known[1]
+    files = [{path.name: path.read_bytes() for path in (f / ROLLOUTS).glob("*.npz")} for f in (one, other)]
+    assert files[0] == files[1]
+
+
+@pytest.mark.parametrize("stops", [(0,), (1,), (3,), (5, 0), (1, 1, 1), (6,)])
+def test_a_run_that_was_interrupted_equals_one_that_was_not(tmp_path, stops):
+    """However often it stops; no rollout is done twice, and none has two rows."""
+    scene_set = small_scenes(3)
+    whole = stopping_run(tmp_path / "whole", (), scene_set)
+    done = stopping_run(tmp_path / "parts", stops, scene_set)
+    assert sorted(done) == sorted(set(done)) == sorted(whole)
+    same_runs(tmp_path / "whole", tmp_path / "parts")
+
+
+def test_a_batch_whose_rollout_file_was_lost_is_done_again(tmp_path):
+    scene_set, folder = small_scenes(2), tmp_path / "run"
+    stopping_run(folder, (), scene_set)
+    files = {path: path.read_bytes() for path in (folder / ROLLOUTS).glob("*.npz")}
+    lost = sorted(files)[-1]
+    lost.unlink()
+    done = stopping_run(folder, (), scene_set)
+    assert len(done) == 2 and {path: path.read_bytes() for path in (folder / ROLLOUTS).glob("*.npz")} == files
+    lost.unlink()
+    assert not stopping_run(folder, (), scene_set, save_rollouts=False)

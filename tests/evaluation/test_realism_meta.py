@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from e2rl.ego.replay import ReplayEgo
+from e2rl.evaluation.kept import Kept
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.evaluation.realism_meta import Tally, evaluated, log_split_half, meta_rows, summarise_meta
 from e2rl.metrics.catalogue import META, META_STAGE
@@ -183,3 +184,23 @@ def test_split_halves_part_whole_places():
     assert log_split_half(scene_set)["mean"] == pytest.approx(1 - 0.3 / 3, abs=0.01), "of three features one differs"
     scene_set.location[:] = ["p"] * 4
     assert log_split_half(scene_set)["mean"] != log_split_half(scene_set)["mean"], "one place has no halves"
+
+
+def test_a_meta_metric_that_was_interrupted_equals_one_that_was_not(tmp_path, monkeypatch):
+    """The counts so far are kept; batches that are counted are not rolled out again."""
+    methods = [Method("nominal", nominal()), Method("constant_velocity", ConstantVelocity())]
+    whole = meta_rows(setup_of(places(2), 3), methods, 4)
+    drive, driven = Setup.roll_out, []
+
+    def stopped(setup, method, tasks):
+        if len(driven) == 2:
+            driven.append(None)
+            raise KeyboardInterrupt
+        driven.append(method.name)
+        return drive(setup, method, tasks)
+
+    monkeypatch.setattr(Setup, "roll_out", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        meta_rows(setup_of(places(2), 3), methods, 4, Kept(tmp_path))
+    again = meta_rows(setup_of(places(2), 3), methods, 4, Kept(tmp_path))
+    assert again == whole and driven == ["nominal", "nominal", None, "nominal", "constant_velocity"]

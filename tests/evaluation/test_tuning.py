@@ -3,13 +3,16 @@
 import builtins
 import json
 import math
+import os
 
 import pytest
 from omegaconf import OmegaConf
 
 from e2rl.errors import InputError
+from e2rl.evaluation import tuning
+from e2rl.evaluation.kept import Kept
 from e2rl.evaluation.objective import Objective
-from e2rl.evaluation.tuning import TuneSettings, ladder, yaml_of
+from e2rl.evaluation.tuning import TuneSettings, ladder, tune, yaml_of
 from tests.evaluation.tuned_road import PRESENT, SPACE, quiet, road
 
 
@@ -119,3 +122,48 @@ def test_where_no_trial_is_admissible_nothing_is_kept(tmp_path):
 
 def test_dotted_names_are_written_as_groups():
     assert yaml_of({"gain": 1.23456, "care.patience": 2}) == "gain: 1.235\ncare:\n  patience: 2\n"
+
+
+@pytest.mark.parametrize("study", [None, "study"])
+@pytest.mark.parametrize("stops", [(0,), (3,), (6, 2)])
+def test_a_tuning_that_was_interrupted_equals_one_that_was_not(tmp_path, study, stops):
+    """In the midst of a trial; in a file of one's own the study even holds the trial that was begun."""
+
+    def run(name, stops):
+        folder, done = tmp_path / name, []
+        file = None if study is None else str(tmp_path / name / study)
+        for left in (*stops, 100):
+            begun = len(done)
+
+            def evaluate(parameters, most=begun + left):
+                if len(done) == most:
+                    raise KeyboardInterrupt
+                done.append(dict(parameters))
+                return road(parameters)
+
+            settings = TuneSettings(trials=9, startup=4, study=file)
+            try:
+                found = tune(
+                    evaluate, PRESENT, SPACE, settings, Objective(), folder, say=lambda line: None, kept=Kept(folder)
+                )
+            except KeyboardInterrupt:
+                assert left < 100
+        return found, done, (folder / "tuning.json").read_bytes()
+
+    whole, parts = run("whole", ()), run("parts", stops)
+    assert parts == whole and len(parts[1]) == 9
+
+
+def test_a_study_is_read_though_its_last_writer_was_killed(tmp_path, monkeypatch):
+    """Half a line is cut off, the lock of the dead is broken, also by a relative path."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tuning, "LOCK_GRACE", 3)
+    settings = [TuneSettings(trials=trials, startup=2, study="runs/study") for trials in (3, 4)]
+    first = quiet(road, PRESENT, SPACE, settings[0], tmp_path)
+    with (tmp_path / "runs" / "study").open("a") as file:
+        file.write('{"op_code":4,"worker')
+    os.symlink(tmp_path / "runs" / "study", tmp_path / "runs" / "study.lock")
+    found = quiet(road, PRESENT, SPACE, settings[1], tmp_path)
+    assert found["trials"][:3] == first["trials"] and len(found["trials"]) == 4
+    whole = TuneSettings(trials=4, startup=2, study=None)
+    assert quiet(road, PRESENT, SPACE, whole, tmp_path) == found

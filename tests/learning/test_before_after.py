@@ -1,5 +1,6 @@
 """The before/after table: both stages on the same scenes and seeds, the second one paired with the first."""
 
+import pytest
 import torch
 
 from e2rl.ego.idm import IDMEgo
@@ -17,9 +18,9 @@ def test_both_stages_are_kept_and_the_second_is_compared_with_the_first(tmp_path
     methods = [Method("nominal", ConstantVelocity()), Method("ambush", Ambush(), 2.0)]
     measure = BeforeAfter(setup, methods, [0], tmp_path)
     slow, fast = IDMEgo(desired_speed=3.0, use_limits=False), IDMEgo(desired_speed=12.0, use_limits=False)
-    measure("before", slow)
-    same = {row["method"]: row for row in measure("after", slow) if row["stage"] == "after"}
-    rows = measure("after", fast)
+    measure("before", slow, 0)
+    same = {row["method"]: row for row in measure("after", slow, 1) if row["stage"] == "after"}
+    rows = measure("after", fast, 2)
     assert rows == read_metrics(tmp_path / METRICS_FILE)
     stages = [(row["stage"], row["method"]) for row in rows]
     assert stages == [(stage, method) for stage in ("before", "after") for method in ("nominal", "ambush")]
@@ -28,3 +29,30 @@ def test_both_stages_are_kept_and_the_second_is_compared_with_the_first(tmp_path
         unchanged, changed = (stage[method]["paired"]["before"] for stage in (same, other))
         differences = [[e["difference"] for e in paired.values() if e["n"]] for paired in (unchanged, changed)]
         assert differences[0] and not any(differences[0]) and any(differences[1])
+
+
+def test_a_measurement_that_was_cut_off_goes_on_and_one_of_other_rounds_does_not(tmp_path, monkeypatch):
+    setup = Setup(small_scenes(3), IDMEgo(), "idm", SimSettings(), batch=1)
+    methods, score, driven = [Method("ambush", Ambush(), 2.0)], Setup.score, []
+
+    def stopped(setup, method, tasks, folder=None):
+        driven.append(tasks[0])
+        if len(driven) == 3:
+            raise KeyboardInterrupt
+        return score(setup, method, tasks, folder)
+
+    monkeypatch.setattr(Setup, "score", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        BeforeAfter(setup, methods, [0], tmp_path)("before", setup.ego, 0)
+    found = BeforeAfter(setup, methods, [0], tmp_path)("before", setup.ego, 0)
+    assert driven == [(0, 0), (1, 0), (2, 0), (2, 0)], "two were kept"
+    whole = BeforeAfter(setup, methods, [0], tmp_path / "whole")("before", setup.ego, 0)
+    assert without_times(found) == without_times(whole)
+    driven.clear()
+    driven += [None] * 3
+    BeforeAfter(setup, methods, [0], tmp_path)("before", setup.ego, 2)
+    assert len(driven) == 6
+
+
+def without_times(rows):
+    return [{k: str(v) for k, v in row["metrics"].items() if "seconds" not in k} for row in rows]

@@ -1,11 +1,14 @@
 """Expert pairs come from the log, cloning fits them, and disturbed ones lead back to the lane."""
 
+import pytest
 import torch
 
 from e2rl.ego.actor import ActorEgo
 from e2rl.ego.reference import executed_action
+from e2rl.evaluation.kept import Kept
 from e2rl.learning.cloning import clip_expert
 from e2rl.learning.imitation import Imitation, ImitationSettings, imitate, recorded_pairs
+from e2rl.learning.logging import RunLogger
 from e2rl.sim.env import SimSettings
 from tests.learning.small import small_scenes
 
@@ -56,3 +59,30 @@ def test_cloning_reduces_the_held_out_loss_and_keeps_the_best_weights(tmp_path):
     again = ActorEgo(hidden=(32,), checkpoint=str(tmp_path))
     observation = pairs["observation"]
     assert torch.equal(again.network.network.deterministic(observation), ego.network.network.deterministic(observation))
+
+
+@pytest.mark.parametrize("stop", [0, 1, 3])
+def test_cloning_that_was_interrupted_equals_one_that_was_not(tmp_path, monkeypatch, stop):
+    pairs, epoch = recorded_pairs(braking_log(), SimSettings(), settings(drives=1)), Imitation.epoch
+
+    def run(folder):
+        torch.manual_seed(0)
+        network = ActorEgo(hidden=(32,)).network
+        best = imitate(network, pairs, settings(epochs=5), folder, RunLogger("csv", folder), Kept(folder))
+        files = [
+            (folder / name).read_bytes() for name in ("actor.safetensors", "logs/scalars/train/imitation_loss.csv")
+        ]
+        return best, files, network.weights()
+
+    def stopped(training):
+        if len(training.history) == stop:
+            monkeypatch.undo()
+            raise KeyboardInterrupt
+        return epoch(training)
+
+    best, files, weights = run(tmp_path / "whole")
+    monkeypatch.setattr(Imitation, "epoch", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "parts")
+    again = run(tmp_path / "parts")
+    assert again[:2] == (best, files) and all(torch.equal(again[2][name], value) for name, value in weights.items())

@@ -114,8 +114,13 @@ def started_by_torchrun() -> bool:
     return dist.is_available() and dist.is_torchelastic_launched()
 
 
+def follows() -> bool:
+    """Whether this is one of torchrun's processes other than the leader."""
+    return started_by_torchrun() and os.environ["RANK"] != "0"
+
+
 def follower_overrides() -> list[str]:
     """Hydra overrides for processes other than the leader: no run folder, no log."""
-    if not started_by_torchrun() or os.environ["RANK"] == "0":
+    if not follows():
         return []
     return ["hydra.run.dir=.", "hydra.output_subdir=null", f"hydra.job_logging.handlers.file.filename={os.devnull}"]

@@ -2,6 +2,7 @@
 
 import hashlib
 import time
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from e2rl.ego.replay import ReplayEgo
-from e2rl.evaluation.files import command_line, git_commit
+from e2rl.evaluation.kept import Kept
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.learning.prior_training.distributed import process_group
 from e2rl.learning.prior_training.settings import TrainingSettings
@@ -17,6 +18,7 @@ from e2rl.learning.prior_training.training import ClosedLoop, held_out, train_pr
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.prior import Prior, SamplerSettings
+from e2rl.provenance import origin_of
 from e2rl.scene.scene import SceneSet
 from e2rl.scene.source import load_scenes
 from e2rl.settings import settings_of
@@ -26,9 +28,11 @@ from e2rl.traffic.nominal import NominalTraffic
 FIGURES = ("real", "aor_step", "cfr_bg")  # metrics of the closed loop at a validation
 
 
-def run_prior_stage(config: DictConfig, folder: Path) -> tuple[Path, list[dict]] | None:
+def run_prior_stage(
+    config: DictConfig, folder: Path, begin_run: Callable[[Mapping[str, SceneSet]], None]
+) -> tuple[Path, list[dict]] | None:
     """The checkpoint's path and the metrics rows of the nominal closed loop on held-out scenes, the ego replayed; None
-    in processes other than the leader."""
+    in processes other than the leader. begin_run: see `e2rl.provenance.begin_run`, of the scenes."""
     settings = settings_of(TrainingSettings, {**config.prior.training, "seed": config.seed}, "prior.training")
     with process_group(config.device) as (processes, device):
         folder = processes.from_leader(lambda: folder)
@@ -37,19 +41,20 @@ def run_prior_stage(config: DictConfig, folder: Path) -> tuple[Path, list[dict]]
         scenes = processes.leader_first(
             lambda: load_scenes(config.data, config.num_scenes, "train", list(settings.starts))
         )
+        processes.from_leader(lambda: begin_run({"scenes": scenes}))
         origin = {
             "data": f"{scenes.dataset}/{scenes.split}",
             "scenes": len(scenes),
             "fingerprint": fingerprint(scenes),
-            "git": git_commit(),
-            "command": command_line(),
+            **origin_of(folder),
             "settings": vars(settings),
             "seconds": {"scenes": round(time.perf_counter() - begin, 1)},
         }
         path = train_prior(prior, scenes, settings, folder, origin, _closed_loop(scenes, settings, device), processes)
         if path is None:
             return None
-        return path, _nominal(prior, _first_starts(scenes), device, folder, stage="prior")
+        fields = {"stage": "prior", "kept": Kept(folder, "prior", path.name), **origin_of(folder)}
+        return path, _nominal(prior, _first_starts(scenes), device, folder, **fields)
 
 
 def _untrained(config: DictConfig) -> Prior:

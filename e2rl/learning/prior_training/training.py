@@ -1,11 +1,9 @@
 """Training the prior: windows over whole logs, validation on held-out places, best checkpoint kept, exact resume."""
 
-import io
 import json
 import platform
 import sys
 import time
-import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -18,6 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from e2rl.errors import InputError
+from e2rl.evaluation.kept import read_state, state_bytes
 from e2rl.files import write_atomically
 from e2rl.learning.prior_training.distributed import ALONE, Processes
 from e2rl.learning.prior_training.loss import held_out_loss
@@ -129,11 +128,10 @@ class Record:
         """Write progress.jsonl, and training.pt with the run's state."""
         state = {"run": run, "record": vars(self), "fingerprint": fingerprint}
         write_atomically(folder / PROGRESS, "".join(json.dumps(line) + "\n" for line in self.lines))
-        content = io.BytesIO()  # a full disk is an OSError then
-        torch.save(state, content)
+        content = state_bytes(state)
         if (folder / STATE).exists():
             (folder / STATE).replace(folder / PREVIOUS)
-        write_atomically(folder / STATE, content.getvalue())
+        write_atomically(folder / STATE, content)
 
 
 def saved_state(folder: Path) -> dict | None:
@@ -144,12 +142,9 @@ def saved_state(folder: Path) -> dict | None:
     found = [folder / name for name in (STATE, PREVIOUS) if (folder / name).exists()]
     for file in found:
         try:
-            with zipfile.ZipFile(file) as archive:  # torch's format, with a checksum of each part
-                if archive.testzip() is None:
-                    return torch.load(file, map_location="cpu", weights_only=True)
-        except Exception as error:  # damaged bytes raise anything
-            tqdm.write(f"{file}: {error}", sys.stderr)
-        tqdm.write(f"passed over: {file} is damaged", sys.stderr)
+            return read_state(file)
+        except ValueError as error:
+            tqdm.write(f"passed over: {error}", sys.stderr)
     if found:
         raise InputError(f"{found[0]}: damaged, and no whole one before it; begin a new run")
     return None

@@ -11,8 +11,8 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from e2rl.errors import InputError
-from e2rl.learning.resume import check_code
 from e2rl.report.export.episode import Episode, recorded_episode, rollout_episode
+from e2rl.resume import check_code
 from e2rl.scene.recording import Recording
 from e2rl.scene.source import Source, source_of
 

@@ -31,7 +31,7 @@ def test_impossible_settings_are_named_before_anything_is_read(tmp_path, overrid
     with initialize_config_dir(CONF, version_base="1.3"):
         config = compose("train", ["stage=prior", "data=scenarionet", "data.path=nowhere", override])
     with pytest.raises(InputError, match=what):
-        run_prior_stage(config, tmp_path)
+        run_prior_stage(config, tmp_path, lambda scenes: None)
     assert not list(tmp_path.iterdir())
 
 

@@ -1,0 +1,91 @@
+"""Finished parts of a run are read, whole and of what is asked for, or done again; a stranger's file runs nothing."""
+
+import os
+
+import pytest
+import torch
+
+from e2rl.evaluation.kept import Kept, forget_parts
+
+VALUE = ([{"cfr": 1.0, "seed": 3, "duty": ""}], [{"speed": torch.arange(3.0)}], [])
+
+
+def fail():
+    raise AssertionError("done already")
+
+
+def counted(calls, value=VALUE):
+    def compute():
+        calls.append(1)
+        return value
+
+    return compute
+
+
+def test_a_part_is_computed_once_and_read_as_it_was(tmp_path):
+    Kept(tmp_path, "after").result("a", [("x", 1.5)], lambda: VALUE)
+    rows, samples, ended = Kept(tmp_path, "after").result("a", [("x", 1.5)], fail)
+    assert (rows, ended) == (VALUE[0], VALUE[2]) and torch.equal(samples[0]["speed"], VALUE[1][0]["speed"])
+
+
+@pytest.mark.parametrize(
+    ("stage", "about", "identity"), [("other", "", [1]), ("", "another round", [1]), ("", "", [2])]
+)
+def test_a_part_of_something_else_is_none(tmp_path, stage, about, identity):
+    Kept(tmp_path).save("a", [1], VALUE)
+    calls = []
+    Kept(tmp_path, stage, about).result("a", identity, counted(calls))
+    assert calls == [1]
+
+
+def test_every_damage_is_noticed_and_the_part_done_again(tmp_path):
+    Kept(tmp_path).save("a", [1], VALUE)
+    (file,) = tmp_path.rglob("*.pt")
+    whole = file.read_bytes()
+    for cut in (0, 1, len(whole) // 2, len(whole) - 1):
+        file.write_bytes(whole[:cut])
+        assert Kept(tmp_path).load("a", [1]) is None
+    for value in ([1, 2], {"format": "e2rl-part/1"}, "text"):  # whole, but no part
+        torch.save(value, file)
+        assert Kept(tmp_path).load("a", [1]) is None
+    calls = []
+    Kept(tmp_path).result("a", [1], counted(calls))
+    assert calls == [1] and Kept(tmp_path).load("a", [1]) is not None
+
+
+class Malicious:
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.mark),)
+
+
+def test_a_strangers_part_runs_nothing(tmp_path):
+    Kept(tmp_path).save("a", [1], VALUE)
+    (file,) = tmp_path.rglob("*.pt")
+    torch.save({"format": "e2rl-part/1", "about": "", "identity": [1], "value": Malicious(tmp_path / "ran")}, file)
+    assert Kept(tmp_path).load("a", [1]) is None and not (tmp_path / "ran").exists()
+
+
+def test_a_part_that_is_not_valid_any_more_is_done_again(tmp_path):
+    calls = []
+    for _ in range(2):
+        Kept(tmp_path).result("a", [1], counted(calls), lambda found: False)
+    assert len(calls) == 2
+
+
+def test_without_a_folder_nothing_is_kept(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    calls = []
+    for _ in range(2):
+        Kept().result("a", [1], counted(calls))
+    assert len(calls) == 2 and not list(tmp_path.iterdir())
+
+
+def test_parts_are_forgotten_in_all_stages(tmp_path):
+    for stage in ("", "before"):
+        Kept(tmp_path, stage).save("a", [1], VALUE)
+    (tmp_path / "metrics.json").write_text("[]")
+    forget_parts(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["metrics.json"]

@@ -1,0 +1,52 @@
+"""Runs are compared by all that they write, but for wall times."""
+
+import json
+
+import pytest
+
+from tools import kills
+
+FILES = {
+    "metrics.json": json.dumps([{"metrics": {"cfr": {"mean": 0.5}, "seconds_per_rollout": {"mean": 1.0}}}]),
+    "rollouts.csv": "scene_id,cfr,seconds\na,1,0.5\n",
+    "tables.md": "| | nominal |\n| --- | ---: |\n| cfr | 1 |\n| seconds_per_rollout [s] | 0.5 |\n",
+    "methods.tex": "method & cfr & seconds\\_per\\_rollout [s] & passes\n\\midrule\ne2 & 1 & 0.5 & 12\n\nx & 3\n",
+    "logs/scalars/train/loss.csv": "0,0.5\n",
+    "rollouts/a.npz": "bytes",
+}
+
+
+def run_of(folder, **changes):
+    for name, text in (FILES | changes).items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+def test_wall_times_and_what_a_run_keeps_for_itself_are_no_difference(tmp_path):
+    one = run_of(
+        tmp_path / "one", **{"parts/a.pt": "1", ".hydra/config.yaml": "1", "logs/scalars/time/improve.csv": "0,1"}
+    )
+    times = {name: text.replace("0.5\n", "0.7\n").replace("0.5 |", "0.7 |") for name, text in FILES.items()}
+    times["methods.tex"] = times["methods.tex"].replace("0.5 &", "0.7 &")
+    times |= {"metrics.json": FILES["metrics.json"].replace("1.0", "2.0")} | {"logs/scalars/train/loss.csv": "0,0.5\n"}
+    assert kills.differences(one, run_of(tmp_path / "other", **times)) == []
+
+
+CHANGED = {
+    "metrics.json": ("0.5", "0.6"),
+    "rollouts.csv": ("a,1", "a,2"),
+    "tables.md": ("| cfr | 1", "| cfr | 2"),
+    "methods.tex": ("& 12", "& 13"),
+    "logs/scalars/train/loss.csv": ("0.5", "0.6"),
+    "rollouts/a.npz": ("bytes", "other"),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_everything_else_is_one(tmp_path, name):
+    one, other = run_of(tmp_path / "one"), run_of(tmp_path / "other")
+    (other / name).write_text(FILES[name].replace(*CHANGED[name]))
+    assert kills.differences(one, other) == [name]
+    (other / name).unlink()
+    assert kills.differences(one, other) == [name]
