@@ -141,7 +141,7 @@ def test_what_does_not_fit_is_refused_and_named(tmp_path):
         load_checkpoint(tmp_path, small_run())
     torch.save({"format": "e2rl-checkpoint/3"}, folder / "state.pt")
     seal(folder)
-    with pytest.raises(InputError, match=r"of another version .*e2rl-checkpoint/3, not e2rl-checkpoint/5.*new run"):
+    with pytest.raises(InputError, match=r"of another version .*e2rl-checkpoint/3, not e2rl-checkpoint/6.*new run"):
         load_checkpoint(tmp_path, small_run())
     torch.save({"something": torch.zeros(1)}, folder / "state.pt")
     seal(folder)
