@@ -111,7 +111,7 @@ def windows(scenes: SceneSet, settings: BitsSettings) -> TensorDict:
     moved = (logged - logged[:, :1]).norm(dim=-1).masked_fill(~every["logged_valid"][:, :, :vehicles], 0).amax(1)
     moving = every["valid"][:, :vehicles] & ~every["parked"][:, :vehicles] & (every["route_log"] >= 0)
     rows, parts = (moving & (moved > MOVES)).nonzero(), []
-    for scene, vehicle in tqdm([part.unbind(1) for part in rows.split(CHUNK) if len(part)], "windows"):
+    for scene, vehicle in tqdm([part.unbind(1) for part in rows.split(CHUNK) if len(part)], "windows", disable=None):
         own = as_ego(every, scene, vehicle)
         for step in range(0, own["logged"].shape[1] - PLAN_STEPS, settings.every):
             exact = world_at(own, step)
@@ -236,7 +236,7 @@ def train_bits(
     held out), written to folder / WEIGHTS. Returns the row of the epoch kept."""
     data = windows(scenes, settings)
     run, best, kept = BitsTraining(network, data, settings), None, None
-    for epoch in (bar := tqdm(range(settings.epochs), "bits", unit="epoch")):
+    for epoch in (bar := tqdm(range(settings.epochs), "bits", unit="epoch", disable=None)):
         row = run.epoch()
         bar.set_postfix({name: f"{value:.3f}" for name, value in row.items()})
         if log is not None:
