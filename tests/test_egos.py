@@ -92,7 +92,7 @@ def test_several_checkpoints_are_trainings_of_one_name(checkpoint):
         ([*LEARNING, "egos.after.checkpoints=[a,nowhere]"], "egos.after: a: no actor there"),
         ([*LEARNING, "egos.after.checkpoints=nowhere"], "egos.after.checkpoints=nowhere: expected a list"),
         ([*LEARNING, "egos.after.checkpoint=a", "egos.after.checkpoints=[b]"], "egos.after: has a checkpoint and"),
-        (["+egos.a={ego: taxi}"], "egos.a: ego=taxi: none of actor, bits, idm"),
+        (["+egos.a={ego: taxi}"], "egos.a: ego=taxi: none of actor, bits, external, idm"),
         (["+egos.a={ego: idm, speed: 3}"], "egos.a: Key 'speed' .*compare it with conf/ego/idm"),
         (["+egos.a=idm"], "egos.a='idm': expected a file of conf/ego"),
         (["+egos.a={headway: 1}"], "egos.a=.*: expected a file of conf/ego"),

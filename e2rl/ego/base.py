@@ -23,6 +23,7 @@ returns its own predicted motion.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 
 import torch
 from tensordict import TensorDictBase
@@ -86,6 +87,17 @@ def track(state: Tensor, planned: Tensor, following: Tensor) -> Tensor:
     speed = (following[..., 3] - CATCH_UP * error[..., 0]).clamp(min=0)
     aimed = torch.cat([following[..., :2], torch.stack([heading, speed], -1)], -1)
     return dynamics.inverse(torch.stack([state, aimed], -2))[..., 0, :]
+
+
+class PlannerError(Exception):
+    """A planner has no plan for scenes of its batch; rows: why, by row of the batch, empty where it is not known which.
+
+    The rollouts of these rows end; the others of the batch are driven anew without them.
+    """
+
+    def __init__(self, message: str, rows: Mapping[int, str] | None = None) -> None:
+        super().__init__(message)
+        self.rows = dict(rows or {})
 
 
 class NotFinite(ArithmeticError):

@@ -1,6 +1,7 @@
 """Rollouts that end without a score: something raised in them, or a state became NaN or infinite.
 
-Each is counted by its reason, and the others go on. What raises for a batch is looked for by halving the batch.
+Each is counted by its reason, and the others go on. What raises for a batch is looked for by halving the batch, where a
+PlannerError does not name it.
 """
 
 import json
@@ -13,6 +14,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from e2rl.ego.base import PlannerError
 from e2rl.errors import InputError
 from e2rl.files import write_atomically
 
@@ -32,12 +34,17 @@ def attempt(
     except OF_THE_RUN:
         raise
     except Exception as error:  # a planner is outside code and raises anything
-        if len(tasks) > 1:
+        rows = error.rows if isinstance(error, PlannerError) else {}
+        if len(tasks) > 1 and not rows:
             half = len(tasks) // 2
             first, second = attempt(roll_out, tasks[:half]), attempt(roll_out, tasks[half:])
             return first[0] + second[0], first[1] + second[1]
         why = {"reason": f"raised {type(error).__name__}", "detail": str(error), "traceback": traceback.format_exc()}
-        return [], [(tasks[0], why)]
+        rows = rows or {0: str(error)}
+        others = [task for row, task in enumerate(tasks) if row not in rows]
+        own = [(tasks[row], why | {"detail": detail}) for row, detail in rows.items()]
+        parts, further = attempt(roll_out, others) if others else ([], [])
+        return parts, own + further
     finite = finite_rollouts(rollouts)
     kept = [task for task, good in zip(tasks, finite, strict=True) if good]
     lost = [task for task, good in zip(tasks, finite, strict=True) if not good]
