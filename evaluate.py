@@ -47,6 +47,7 @@ def evaluate(run: Run) -> list[dict]:
     methods, name = build.build_methods(config, prior), run.choices["ego"]
     name, ego = next(iter(egos.egos.items())) if egos else (name, build.build_ego(config))
     sim, scenes = build.build_sim(config), load_scenes(config.data, config.num_scenes)
+    only = None if config.scene is None else [scenes.index(config.scene)]
     provenance.begin_run(folder, config, MAY_CHANGE, {"scenes": scenes})
     kept = Kept(None if config.figure == "skeleton" else folder)  # that figure listens to every rollout
     setup = Setup(scenes, ego, name, sim, config.batch, config.device)
@@ -55,7 +56,6 @@ def evaluate(run: Run) -> list[dict]:
         if task.group == "synthesizer":
             save_tuning_curve(folder, result["trials"], config.synthesizer.name)
         return result["trials"]
-    only = None if config.scene is None else [scenes.index(config.scene)]
     chain = LongestChain(methods[0]) if config.figure == "skeleton" else None
     rows = []
     if config.open_loop_samples:

@@ -73,8 +73,8 @@ def imitate(task: Run) -> None:
     config, folder = task.config, task.folder
     ego = build_ego(config)
     scenes = load_scenes(config.data, config.num_scenes, split="train")
-    begin_run(folder, config, MAY_CHANGE, {"scenes": scenes})
-    losses = run_imitation(config, scenes, ego, folder, build_logger(config, folder))
+    begin = partial(begin_run, folder, config, MAY_CHANGE, {"scenes": scenes})
+    losses = run_imitation(config, scenes, ego, folder, build_logger(config, folder), begin)
     print(", ".join(f"{name} {value:.4f}" for name, value in losses.items() if value == value))  # NaN: none held out
     print(f"start evolution rounds from it with ego.checkpoint={folder}")
 

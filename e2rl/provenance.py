@@ -136,7 +136,7 @@ def inputs(config: DictConfig) -> Iterator[tuple[str, Any]]:
         if name not in config.variants and name != config.synthesizer.name:
             yield f"synthesizer={name}", resolved(method_config(config, name))
     for entry in config.get("egos", {}).values():
-        yield f"ego={entry.ego}", resolved(load_choice("ego", entry.ego))
+        yield f"ego={entry.ego}", OmegaConf.to_container(load_choice("ego", entry.ego))  # as written
 
 
 def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:

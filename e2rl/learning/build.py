@@ -1,5 +1,6 @@
 """Builds the parts of an evolution from a run's configuration."""
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -115,16 +116,24 @@ def build_measure(
 
 
 def run_imitation(
-    config: DictConfig, scenes: SceneSet, ego: Ego, folder: Path, logger: RunLogger | None = None
+    config: DictConfig,
+    scenes: SceneSet,
+    ego: Ego,
+    folder: Path,
+    logger: RunLogger | None = None,
+    begin: Callable[[], None] | None = None,
 ) -> dict[str, float]:
     """stage=imitation: clone the recorded egos of `scenes` into ego=actor, in place; writes folder/actor.safetensors
-    and returns the losses of the epoch kept. Goes on after the epochs that the run in the folder has done."""
+    and returns the losses of the epoch kept. Goes on after the epochs that the run in the folder has done. begin: is
+    called when the settings are known to be possible."""
     if "imitation" not in config.learner or not isinstance(ego, ActorEgo):
         raise InputError("stage=imitation trains ego=actor with learner=ppo_bc; set both")
     settings = settings_of(ImitationSettings, {**config.learner.imitation, "seed": config.seed}, "learner.imitation")
     if settings.held_out > 0 and len(scenes) < 2:
         reason = "of one scene none can be held out"
         raise InputError(f"learner.imitation.held_out={settings.held_out:g}: {reason}; pass more, or set it to 0")
+    if begin is not None:
+        begin()
     pairs = recorded_pairs(scenes, build_sim(config), settings)
     return imitate(ego.network, pairs, settings, folder, logger, Kept(folder, "imitation"))
 
