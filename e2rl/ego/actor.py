@@ -54,8 +54,8 @@ class ActorEgo(Ego):
         static, expected = static_scene(world.scene, mission_of(world.scene)), expected_states(world)
         config, horizon = observation_config(world.states.device), world.scene["logged"].shape[1] - 1
         state, present = world.states[:, 0], world.valid[:, 0]
-        assert world.yaw_rate is not None
-        action = torch.stack([world.accel[:, 0], world.yaw_rate], -1)
+        assert world.turn_rate is not None
+        action = torch.stack([world.accel[:, 0], world.turn_rate[:, 0]], -1)
         pieces = []
         for done in range(0, PLAN_STEPS, HOLD):
             pose = FrenetPose(*(value[:, 0] for value in project(state[:, None, :2], static.mission.points)))

@@ -93,8 +93,8 @@ def observed(world: World) -> Tensor:
     """The environment's observations [B, D] of Worlds, but for the elapsed time, which is 0."""
     static, state = static_scene(world.scene, mission_of(world.scene)), world.states[:, 0]
     pose = FrenetPose(*(value[:, 0] for value in project(state[:, None, :2], static.mission.points)))
-    assert world.yaw_rate is not None and world.turn_rate is not None
-    action, present = torch.stack([world.accel[:, 0], world.yaw_rate], -1), world.valid[:, 0]
+    assert world.turn_rate is not None
+    action, present = torch.stack([world.accel[:, 0], world.turn_rate[:, 0]], -1), world.valid[:, 0]
     ego = EgoState(world.step, state, action, pose, present, present, pose.s)
     others = Agents(*(value[:, 1:] for value in (world.states, world.valid, world.accel, world.turn_rate)))
     features = observe(observation_config(state.device), static, ego, others, 1).features

@@ -116,9 +116,9 @@ class ScoringEgo(RankingEgo):
 
 def take(world: World, rows: Tensor, keys: tuple[str, ...] = SCENE_KEYS) -> World:
     """Scenes rows [b] of a World with these keys of the scene, and nobody's plan or route."""
-    yaw, turn = (None if rate is None else rate[rows] for rate in (world.yaw_rate, world.turn_rate))
+    turn = None if world.turn_rate is None else world.turn_rate[rows]
     now = world.step[rows], world.states[rows], world.valid[rows], world.accel[rows]
-    return World(world.scene.select(*keys)[rows], *now, yaw_rate=yaw, turn_rate=turn)
+    return World(world.scene.select(*keys)[rows], *now, turn_rate=turn)
 
 
 def ranked_actions(ego: RankingEgo, world: World, count: int, hold: int) -> tuple[Tensor, Tensor]:

@@ -99,7 +99,7 @@ def world_at(scene: TensorDictBase, step: int) -> World:
     change = torch.where((valid & scene["logged_valid"][:, step - 1])[..., None], now - before, 0.0) / DT
     turn = wrap(change[..., 2] * DT) / DT
     steps = torch.full((len(now),), step)
-    return World(scene, steps, now, valid, change[..., 3], yaw_rate=turn[:, 0], turn_rate=turn)
+    return World(scene, steps, now, valid, change[..., 3], turn_rate=turn)
 
 
 def windows(scenes: SceneSet, settings: BitsSettings) -> TensorDict:

@@ -55,7 +55,7 @@ class DrivingEnv(EnvBase):
     Keys of a step: action [B, 2] (m/s^2, rad/s); observation [B, OBSERVATION_SIZE]; reward, done, terminated, truncated
     [B, 1]; scene_index, timestep [B, 1] int64; metrics: contact, contact_vru, off_road [B, 1] bool at this step and
     progress [B, 1], m along the mission since the start. With agents=True also agents: states [B, N, 4], valid [B, N],
-    accel and turn_rate [B, N], and yaw_rate [B, 1] of the ego, for policies that plan. Maps stay in `scene`.
+    accel and turn_rate [B, N], for policies that plan. Maps stay in `scene`.
 
     An episode terminates at contact and off the road (settings). It is truncated after the scenes' T steps or when the
     ego leaves the scene. A reset takes the scenes "scene_index" [B, 1] of its input; without this key it draws them
@@ -116,7 +116,7 @@ class DrivingEnv(EnvBase):
         }
         if self.agents:
             states, valid, accel, turn = number(agents, 4), flag(agents), number(agents), number(agents)
-            specs["agents"] = group(states=states, valid=valid, accel=accel, yaw_rate=number(), turn_rate=turn)
+            specs["agents"] = group(states=states, valid=valid, accel=accel, turn_rate=turn)
         self.observation_spec = group(**specs)
         self.reward_spec = number()
         self.full_done_spec = group(done=flag(), terminated=flag(), truncated=flag())
@@ -160,7 +160,6 @@ class DrivingEnv(EnvBase):
             torch.cat([ego.state[:, None], states[:, 1:]], 1),
             torch.cat([ego.present[:, None], valid[:, 1:]], 1),
             torch.cat([ego.action[:, :1], accel[:, 1:]], 1),
-            yaw_rate=ego.action[:, 1],
             turn_rate=torch.cat([ego.action[:, 1:], turn[:, 1:]], 1),
         )
 
@@ -245,8 +244,7 @@ class DrivingEnv(EnvBase):
         if self.agents:
             now = self.world()
             assert now.turn_rate is not None
-            agents = {"states": now.states, "valid": now.valid, "accel": now.accel}
-            agents |= {"yaw_rate": self._ego.action[:, 1:], "turn_rate": now.turn_rate}
+            agents = {"states": now.states, "valid": now.valid, "accel": now.accel, "turn_rate": now.turn_rate}
             result["agents"] = TensorDict(agents, shape, device=device)
         return TensorDict(result, shape, device=device)
 

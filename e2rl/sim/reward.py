@@ -7,8 +7,15 @@ from torch import Tensor
 
 from e2rl.errors import InputError
 
-DEFAULT_WEIGHTS = {"progress": 0.05, "contact": -20.0, "off_road": -5.0, "comfort": -0.08, "speeding": -0.1}
-DEFAULT_WEIGHTS["lane_offset"] = -0.02
+DEFAULT_WEIGHTS = {
+    "progress": 0.05,
+    "contact": -20.0,
+    "off_road": -5.0,
+    "comfort": -0.08,
+    "acceleration": 0.0,
+    "speeding": -0.1,
+    "lane_offset": -0.02,
+}
 TERMS = tuple(DEFAULT_WEIGHTS)
 LEAST_TOP_SPEED = 5.0  # m/s: progress at this speed is rewarded even where the recorded ego stands
 
@@ -50,6 +57,7 @@ def reward_terms(
         "contact": contact.float(),
         "off_road": off_road.float(),
         "comfort": comfort.clamp(max=3.0),
+        "acceleration": (action[:, 0].abs() / 4).clamp(max=1.0),
         "speeding": torch.where(limit > 0, excess, 0.0).clamp(max=1.0),
         "lane_offset": (offset.abs() / 2).clamp(max=1.0),
     }
@@ -64,5 +72,5 @@ def check_weights(weights: Mapping[str, float]) -> list[float]:
 
 
 def weighted_sum(terms: Mapping[str, Tensor], weights: Tensor) -> Tensor:
-    """Reward [B]; weights [6] in the order of TERMS."""
+    """Reward [B]; weights [7] in the order of TERMS."""
     return torch.stack([terms[name] for name in TERMS], -1) @ weights

@@ -12,10 +12,9 @@ class World:
     """The current state of B scenes; agent 0 is the ego, agents [:V] are the vehicles.
 
     scene: Scene TensorDict [B]; step [B] int64: simulated steps since the start frame; states [B, N, 4]: x, y, heading,
-    speed; valid [B, N]: present now; accel [B, N] m/s^2; yaw_rate [B] rad/s: the ego's last executed one; plan
-    [B, V, H, 4]: the vehicles' planned states at the coming steps (None: unknown); route [B, V] int64: the route
-    candidates that the vehicles follow (None: unknown); turn_rate [B, N] rad/s: of everybody over the last step (None:
-    unknown).
+    speed; valid [B, N]: present now; accel [B, N] m/s^2; plan [B, V, H, 4]: the vehicles' planned
+    states at the coming steps (None: unknown); route [B, V] int64: the route candidates that the vehicles follow (None:
+    unknown); turn_rate [B, N] rad/s: over the last step, the ego's as executed (None: unknown).
     """
 
     scene: TensorDictBase
@@ -25,7 +24,6 @@ class World:
     accel: Tensor
     route: Tensor | None = None
     plan: Tensor | None = None
-    yaw_rate: Tensor | None = None
     turn_rate: Tensor | None = None
 
     @classmethod
@@ -33,8 +31,7 @@ class World:
         """Scenes [B] at their start frames."""
         step = torch.zeros(scene.batch_size[0], dtype=torch.int64, device=scene["start"].device)
         start, valid, accel = (scene[key] for key in ("start", "valid", "start_accel"))
-        turn = scene["start_yaw_rate"]
-        return cls(scene, step, start, valid, accel, scene["route_log"], yaw_rate=turn[:, 0], turn_rate=turn)
+        return cls(scene, step, start, valid, accel, scene["route_log"], turn_rate=scene["start_yaw_rate"])
 
     @classmethod
     def of(cls, tensordict: TensorDictBase, scene: TensorDictBase) -> "World":
@@ -47,6 +44,5 @@ class World:
             agents["valid"],
             agents["accel"],
             plan=tensordict.get(("traffic", "plan"), None),
-            yaw_rate=agents["yaw_rate"][:, 0],
             turn_rate=agents["turn_rate"],
         )

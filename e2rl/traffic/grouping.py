@@ -69,9 +69,9 @@ def crop_world(world: World, group: Group) -> World:
         elif key in WHOLE:
             scene[key] = world.scene[key][rows]
     states, valid, accel = (getattr(world, name)[rows][:, agents] for name in ("states", "valid", "accel"))
-    yaw_rate = None if world.yaw_rate is None else world.yaw_rate[rows]
+    turn = None if world.turn_rate is None else world.turn_rate[rows][:, agents]
     cropped = TensorDict(scene, batch_size=[len(rows)])
-    return World(cropped, world.step[rows], states, valid, accel, yaw_rate=yaw_rate)
+    return World(cropped, world.step[rows], states, valid, accel, turn_rate=turn)
 
 
 def crop_state(value: Any, group: Group, width: int, name: str = "") -> Any:

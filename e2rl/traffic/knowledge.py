@@ -21,8 +21,8 @@ EASING = 0.5  # s in which a seen acceleration fades: of 0.5, 1 and 2 s that of 
 
 def turn_rate_and_acceleration(world: World) -> Tensor:
     """States [B, HORIZON, 4] of the ego at its present acceleration and yaw rate."""
-    assert world.yaw_rate is not None
-    action = torch.stack([world.accel[:, 0], world.yaw_rate], -1)
+    assert world.turn_rate is not None
+    action = torch.stack([world.accel[:, 0], world.turn_rate[:, 0]], -1)
     return dynamics.rollout(world.states[:, 0], action[:, None].expand(-1, HORIZON, -1))
 
 

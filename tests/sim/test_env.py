@@ -48,9 +48,9 @@ def test_the_reported_agents_are_the_environments_world():
     env.reset()
     told = World.of(act(env, acceleration=1.0, yaw_rate=0.2), env.scene)
     now = env.world()
-    for name in ("step", "states", "valid", "accel", "yaw_rate", "turn_rate"):
+    for name in ("step", "states", "valid", "accel", "turn_rate"):
         assert torch.equal(getattr(told, name), getattr(now, name)), name
-    assert torch.allclose(told.yaw_rate, torch.tensor(0.2), atol=1e-4)
+    assert torch.allclose(told.turn_rate[:, 0], torch.tensor(0.2), atol=1e-4)
 
 
 def test_partial_resets_keep_the_others_running():

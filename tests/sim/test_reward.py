@@ -36,6 +36,7 @@ def test_terms_grow_with_what_they_name():
     assert abs(term("comfort", action=steady, last_action=steady) - 1) < 1e-6
     turning = torch.tensor([[0.0, 0.4]])
     assert abs(term("comfort", action=turning) - 1) < 1e-6
+    assert term("acceleration", action=torch.tensor([[-1.0, 0.0]])) == 0.25  # linear: a small one has its price, too
     assert term("comfort", action=steady) > term("comfort", action=steady, last_action=steady)
 
 

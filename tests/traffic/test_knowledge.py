@@ -62,7 +62,7 @@ def test_predictions_begin_at_the_ego_and_know_only_its_world(prediction):
 def test_constant_turn_rate_and_acceleration_is_the_closed_form():
     world = World.at_start(scenes(1).scenes)
     world.accel = torch.full_like(world.accel, 0.5)
-    world.yaw_rate = torch.full_like(world.states[:, 0, 0], 0.1)
+    world.turn_rate = torch.full_like(world.accel, 0.1)
     v0, heading = world.states[0, 0, 3], world.states[0, 0, 2]
     time = DT * torch.arange(1, 51)
     found = turn_rate_and_acceleration(world)[0]
