@@ -77,6 +77,7 @@ MAIN = (
     Metric("transport", "path KL of the control"),
     Metric("seconds_per_rollout", "wall time", unit="s", column="seconds"),
     Metric("passes", "passes of the prior's network per rollout, a gradient's twice"),
+    Metric("ego_off_road", "ego leaves the road", share=True),
 )
 PLACES = 10  # at which `mode_coverage` looks: failures at fewer places give none
 COVERAGE = f"failure modes expected of collisions at {PLACES} places"
@@ -111,7 +112,6 @@ EXTRA = (
     Metric("w1_a_lon", "W1 of longitudinal acceleration", unit="m/s²", samples="a_lon"),
     Metric("w1_a_lat", "W1 of lateral acceleration", unit="m/s²", samples="a_lon"),
     Metric("w1_jerk", "W1 of |jerk|", unit="m/s³", samples="a_lon"),
-    Metric("ego_off_road", "ego leaves the road", share=True),
     Metric("failures_per_km", "`cfr`, of all that the ego drives", unit="1/km", column="cfr", per="driven_km"),
     Metric("counted_per_km", "the same of `cfr_counted`", unit="1/km", column="cfr_counted", per="driven_km"),
 )

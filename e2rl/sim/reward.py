@@ -10,7 +10,7 @@ from e2rl.errors import InputError
 DEFAULT_WEIGHTS = {
     "progress": 0.05,
     "contact": -20.0,
-    "off_road": -5.0,
+    "off_road": -20.0,
     "comfort": -0.08,
     "acceleration": 0.0,
     "speeding": -0.1,
