@@ -19,6 +19,7 @@ from e2rl.evaluation.open_loop import open_loop_rows
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.evaluation.realism_meta import meta_rows
 from e2rl.files import alone_in
+from e2rl.report.curves import points_of_rows, save_curves
 from e2rl.report.drawing import save_picture
 from e2rl.report.egos import ego_tables, guard_table
 from e2rl.report.html import report_command
@@ -35,6 +36,7 @@ from e2rl.scene.source import load_scenes
 from e2rl.tuning import run_tuning, tuning_of
 
 MAY_CHANGE = ("processes",)  # when a run is resumed
+NOMINAL = "nominal"  # traffic without an attack, which every attack is compared with
 
 
 def evaluate(run: Run) -> list[dict]:
@@ -61,7 +63,7 @@ def evaluate(run: Run) -> list[dict]:
     if config.open_loop_samples:
         rows += open_loop_rows(scenes, methods, config.open_loop_samples, config.device, kept)
     how = (methods, config.seeds, folder, config.save_rollouts, build.processes_of(config), only, kept)
-    rows += run_egos(setup, egos, *how) if egos else run_protocol(setup, *how)
+    rows += run_egos(setup, egos, *how) if egos else run_protocol(setup, *how, references=references(config))
     if config.meta_rollouts:
         rows += meta_rows(setup, methods, config.meta_rollouts, kept)
     rows = [row | provenance.origin_of(folder) for row in rows]
@@ -70,13 +72,15 @@ def evaluate(run: Run) -> list[dict]:
     effort = search_effort(scenes.scenes["logged"].shape[1] - 1)
     caption = f"{build.caption(config, origin, methods)}; {effort}{dropped}"
     tables = metric_tables(rows, caption, config.metrics)
-    if config.compare is not None:
+    if config.compare is not None or config.figure == "curves":
         tables = compared_tables(config, methods, egos, rows, caption, folder)
     tables += mode_tables(read_modes(folder / MODES_FILE))
     if egos and config.compare is None:
         tables += report_egos(config, egos, rows, scenes, caption, folder)
     save_tables(folder / "tables.md", tables)
     print_tables(tables)
+    if config.figure == "curves":
+        save_curves(folder, points_of_rows(rows))
     if config.figure == "intensity":
         save_picture(folder / "intensity.png", intensity_figure(intensity_ladder(folder)))
     if chain:
@@ -88,14 +92,22 @@ def evaluate(run: Run) -> list[dict]:
     return rows
 
 
+def references(config: DictConfig) -> tuple[str, ...] | None:
+    """The methods that all are compared with; None: each with every other."""
+    if config.compare is None and config.figure != "curves":
+        return None
+    return (NOMINAL,) if config.compare is None else (config.compare, NOMINAL)
+
+
 def compared_tables(
     config: DictConfig, methods: list[Method], egos: EgoSet | None, rows: list[dict], caption: str, folder: Path
 ) -> list[Table]:
     """The tables with a row a method, or where there are several egos a row an ego; also as files of their own."""
     if egos:
-        tables = planner_tables(rows, egos.names, config.compare, caption)
+        tables = planner_tables(rows, egos.names, config.compare, caption, config.metrics)
     else:
-        tables = method_tables(rows, build.terms_by_method(methods), config.compare, caption)
+        reference = config.compare or NOMINAL
+        tables = method_tables(rows, build.terms_by_method(methods), reference, caption, config.metrics)
     save_compared(folder, tables, EGOS if egos else METHODS)
     return tables
 

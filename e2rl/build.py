@@ -32,7 +32,7 @@ from e2rl.sim.env import SimSettings
 from e2rl.traffic.traffic import Traffic
 
 CHOICE = re.compile(r"[\w+-][\w.+-]*(/[\w+-][\w.+-]*)*")  # a file's name in a group
-FIGURES = ("intensity", "skeleton")
+FIGURES = ("intensity", "skeleton", "curves")
 VARIED = ("prior", "synthesizer")  # groups that the variants of a table may change
 
 
@@ -248,10 +248,12 @@ def check_evaluation(config: DictConfig) -> None:
     if config.figure is None:
         return
     check_choice("figure", config.figure, FIGURES)
-    if not config.save_rollouts:
+    if config.figure != "curves" and not config.save_rollouts:
         raise InputError(f"figure={config.figure}: drawn from the rollouts' files; set save_rollouts=true")
-    if config.figure == "intensity" and not several:
-        raise InputError(f"figure=intensity, eta={config.eta}: name several intensities, such as eta=[0,1,2,3]")
+    if config.figure == "curves" and config.egos:
+        raise InputError("figure=curves: of one ego; choose it with ego=NAME, and leave egos out")
+    if config.figure != "skeleton" and not several:
+        raise InputError(f"figure={config.figure}, eta={config.eta}: name several intensities, such as eta=[0,1,2,3]")
 
 
 def check_compared(config: DictConfig) -> None:

@@ -173,6 +173,8 @@ def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(experimen
         (["eta=.nan"], "eta=.nan: the intensity"),
         (["figure=pie"], "figure=pie: choose one of intensity, skeleton"),
         (["figure=intensity"], "figure=intensity, eta=2.0: name several"),
+        (["figure=curves"], "figure=curves, eta=2.0: name several"),
+        (["figure=curves", "eta=[1,2]", "+egos.one={ego: idm}"], "figure=curves: of one ego"),
         (["figure=skeleton", "save_rollouts=false"], "figure=skeleton: .*save_rollouts=true"),
         (["open_loop_samples=-1"], "open_loop_samples=-1: expected a whole number of at least 0"),
         (["open_loop_samples=many"], "open_loop_samples=many: expected a whole number"),

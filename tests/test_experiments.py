@@ -82,6 +82,51 @@ def test_table_1_is_written_in_three_formats(world, tmp_path, monkeypatch, capsy
     assert len((tmp_path / "run" / "methods_differences.csv").read_text().splitlines()) == 4
 
 
+def test_the_curves_have_a_line_for_every_method_and_eta(world, tmp_path, monkeypatch, capsys):
+    """Differences are to nominal traffic alone; the tables have a row for each."""
+    overrides = [
+        "experiment=curves",
+        *SHORT,
+        "methods=[nominal,ctg_adv,cat]",
+        "eta=[1,2]",
+        f"data.cache={world / 'bundled'}",
+        "seeds=[0]",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    ]
+    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    assert status == 0, said
+    lines = (tmp_path / "run" / "curves.csv").read_text().splitlines()[1:]
+    points = [("nominal", "0"), ("ctg_adv", "1"), ("ctg_adv", "2"), ("cat", "1"), ("cat", "2")]
+    assert [(line.split(",")[0], f"{float(line.split(',')[2]):g}") for line in lines] == points
+    rows = read_metrics(tmp_path / "run" / "metrics.json")
+    assert [list(row["paired"]) for row in rows] == [[], *[["nominal"]] * 4]
+    assert (tmp_path / "run" / "curves.png").exists() and not (tmp_path / "run" / "rollouts").exists()
+    assert "Difference of each method to nominal" in (tmp_path / "run" / "methods.md").read_text()
+
+
+def test_the_public_protocol_has_crash_rates_and_route_completion_of_every_ego(world, tmp_path, monkeypatch, capsys):
+    overrides = [
+        "experiment=public_protocol",
+        *SHORT,
+        "methods=[replay,cat]",
+        "egos.policy.checkpoint=bundled",
+        f"data.cache={world / 'bundled'}",
+        "seeds=[0]",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    ]
+    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    assert status == 0, said
+    head, *rows = (tmp_path / "run" / "egos.csv").read_text().splitlines()
+    names = ["replay", "idm", "lane_graph", "untrained", "policy"]
+    assert [row.split(",")[:2] for row in rows] == [[ego, name] for ego in names for name in ("replay", "cat η=2")]
+    assert head.startswith("ego,traffic,cfr [%],route_completion [%]")
+    log = rows[0].split(",")[head.split(",").index("route_completion [%]")]
+    assert float(log.split()[0]) > 99, "the recorded ego in recorded traffic drives all of its way"
+    missing = [each for each in overrides if "checkpoint" not in each]
+    status, said = call("evaluate.py", missing, monkeypatch, capsys)
+    assert status == 2 and "egos.policy.checkpoint: needed; give the folder" in error_line(said)
+
+
 def test_egos_before_and_after_are_rated_in_one_run(world, tmp_path, monkeypatch, capsys):
     """An untrained actor and a planner in its place, with learning curves of a made run."""
     logs = tmp_path / "trained" / "logs" / "scalars"

@@ -51,7 +51,8 @@ class Method:
 
 @dataclass
 class Setup:
-    """Shared by all methods of a table: scenes, ego and its name in files, simulator, batch of rollouts."""
+    """Shared by all methods of a table: scenes, ego and its name in files, simulator, batch of rollouts, whether the
+    collisions are searched for evasions."""
 
     scenes: SceneSet
     ego: Ego
@@ -59,6 +60,7 @@ class Setup:
     sim: SimSettings
     batch: int = 64
     device: str = "cpu"
+    evasions: bool = True
 
     def roll_out(self, method: Method, tasks: Sequence[Task]) -> dict:
         """The rollout dict of (scene, seed) pairs under one method."""
@@ -76,8 +78,9 @@ class Setup:
         rows, samples = [], []
         for done, rollouts in parts:
             found, features = score_rollouts(rollouts)
-            scene = self.scenes.batch([scene for scene, _ in done])
-            rollouts["evasion"] = add_avoidable(found, rollouts, scene, self.sim)
+            if self.evasions:
+                scene = self.scenes.batch([scene for scene, _ in done])
+                rollouts["evasion"] = add_avoidable(found, rollouts, scene, self.sim)
             if folder is not None:
                 write_rollouts(folder, rollouts, source)
             rows += label_rows(found, source)

@@ -26,6 +26,7 @@ def metric_rows(
     draws: int = DRAWS,
     realism_draws: int = REALISM_DRAWS,
     egos: Sequence[tuple[str, str]] = (),
+    references: Collection[str] | None = None,
     **fields: Any,
 ) -> list[dict]:
     """Rows of metrics.json from labelled rows of rollouts (`label_rows`) and their features.
@@ -33,7 +34,8 @@ def metric_rows(
     A row's `paired` compares it with every other method (or eta) on the same dataset, split and ego over the shared
     (scene, seed); a method there with several etas is named method@eta. egos: pairs of egos of which the first is also
     compared with the second in the same traffic, under `ego SECOND`, realism without intervals; as these are many, a
-    method is then compared with the first other one of its ego only. `fields` extend each row.
+    method is then compared with the first other one of its ego only. references: the methods that others are compared
+    with (None: all; of many rows, the differences cost more than the means). `fields` extend each row.
     """
     groups: dict[Key, list[int]] = {}
     for index, row in enumerate(rows):
@@ -42,7 +44,8 @@ def metric_rows(
     result = []
     for key, ours in members.items():
         paired = {}
-        for other in rivals(key, list(members))[: 1 if egos else None]:
+        others = [other for other in rivals(key, list(members)) if references is None or other[2] in references]
+        for other in others[: 1 if egos else None]:
             differences = paired_differences(*ours, *members[other], draws, realism_draws)
             paired[rival_name(other, list(members))] = differences
         for name, other in same_traffic(key, egos, members):

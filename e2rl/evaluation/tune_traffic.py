@@ -6,7 +6,7 @@ experiment=tune synthesizer=NAME` calls this.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from e2rl.errors import InputError
@@ -78,7 +78,8 @@ class AttackTrials:
     def measure(self, method: Method) -> dict[str, float]:
         """MEASURED of a method, with the intervals of SOUGHT. Raises InputError where rollouts ended without a score:
         trials would be compared on different scenes."""
-        rows, samples, ended = drive_all([self.setup], [method], self.seeds, None, self.processes)
+        setup = replace(self.setup, evasions=False)  # no trial is judged by them
+        rows, samples, ended = drive_all([setup], [method], self.seeds, None, self.processes)
         if ended:
             first = ended[0]
             raise InputError(

@@ -112,6 +112,7 @@ EXTRA = (
     Metric("w1_a_lon", "W1 of longitudinal acceleration", unit="m/s²", samples="a_lon"),
     Metric("w1_a_lat", "W1 of lateral acceleration", unit="m/s²", samples="a_lon"),
     Metric("w1_jerk", "W1 of |jerk|", unit="m/s³", samples="a_lon"),
+    Metric("route_completion", "share of the recorded ego's way driven until contact", share=True),
     Metric("failures_per_km", "`cfr`, of all that the ego drives", unit="1/km", column="cfr", per="driven_km"),
     Metric("counted_per_km", "the same of `cfr_counted`", unit="1/km", column="cfr_counted", per="driven_km"),
 )
@@ -144,6 +145,10 @@ TABLES = {
     "egos": [  # table 4: how each ego fails, where it is hit, and whose failure it is
         *("cfr", "cfr_counted", "cfr_preventable", "at_fault", "preventable", "front", "side", "rear"),
         *("front_any", "side_any", "rear_any", "relvel", "contact_time", "progress", "macc", "ego_off_road"),
+    ],
+    "public": [  # what papers on adversarial training report, and whose failures these are
+        *("cfr", "route_completion", "ego_off_road", "cfr_counted", "cfr_preventable", "at_fault", "cfr_vru"),
+        *("progress", "macc", "aor_step", "real_adv"),
     ],
 }  # closed-loop tables (`metrics=...` of evaluate.py) and the metrics of each, in order
 OPEN_LOOP = tuple(

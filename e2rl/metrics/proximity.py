@@ -1,4 +1,5 @@
-"""The ego's distance to others, acceleration and progress until its first contact (docs/method.md, section 10)."""
+"""The ego's distance to others, acceleration, progress and share of the recorded way until its first contact
+(docs/method.md, section 10)."""
 
 import torch
 from torch import Tensor
@@ -10,11 +11,12 @@ from e2rl.scene.recording import DT
 from e2rl.sim.dynamics import wrap
 
 SMOOTHING = 0.5  # s, moving average of the ego's speed before its derivative
+LEAST_WAY = 1.0  # m: of a shorter recorded way no share is known
 
 
 def motion_columns(batch: Batch) -> Batch:
-    """min_dtc, ttc_c, ttc_c_all, macc, progress and driven_km over the steps 1..stop; NaN without any agent to measure
-    them on."""
+    """min_dtc, ttc_c, ttc_c_all, macc, progress, driven_km and route_completion over the steps 1..stop; NaN without any
+    agent to measure them on."""
     states, valid, stop = batch["states"], batch["valid"], batch["stop"]
     seen = valid & valid[..., :1] & steps_until(stop, states.shape[1])[..., None]
     seen[..., 0] = False
@@ -30,6 +32,7 @@ def motion_columns(batch: Batch) -> Batch:
         "macc": mean_acceleration(path, count),
         "progress": driven,
         "driven_km": driven / 1000,
+        "route_completion": route_completion(path, count, batch["logged"], batch["logged_valid"]),
     }
 
 
@@ -86,3 +89,25 @@ def progress(path: Tensor, count: Tensor) -> Tensor:
     driven = step[..., 0] * heading.cos() + step[..., 1] * heading.sin()
     counted = torch.arange(driven.shape[1], device=path.device) < (count - 1)[:, None]
     return (driven * counted).sum(-1)
+
+
+def route_completion(path: Tensor, count: Tensor, logged: Tensor, logged_valid: Tensor) -> Tensor:
+    """Share [B] in [0, 1] of the recorded ego's way that lies behind the ego at the end of its path.
+
+    path [B, T+1, 4] of `count` [B] states; logged [B, T+1, N, 4], logged_valid [B, T+1, N]: the recording. The end is
+    projected onto the nearest piece of the recorded way, as MetaDrive does. NaN where the ego is in no step, or where
+    the recorded way is shorter than LEAST_WAY.
+    """
+    steps = torch.full_like(count, logged.shape[1] - 1)
+    recorded, known = ego_path(logged, logged_valid, steps)
+    piece = torch.arange(recorded.shape[1] - 1, device=path.device) < (known - 1)[:, None]
+    start, along = recorded[:, :-1, :2], recorded[:, 1:, :2] - recorded[:, :-1, :2]
+    length = along.norm(dim=-1) * piece
+    row = torch.arange(len(path), device=path.device)
+    offset = path[row, (count - 1).clamp(min=0), None, :2] - start
+    share = ((offset * along).sum(-1) / length.square().clamp(min=1e-12)).clamp(0, 1)
+    gap = (offset - share[..., None] * along).norm(dim=-1).masked_fill(~piece, torch.inf)
+    nearest = gap.argmin(-1)
+    whole = length.sum(-1)
+    behind = length.cumsum(-1)[row, nearest] - ((1 - share) * length)[row, nearest]
+    return (behind / whole).clamp(max=1).masked_fill((count == 0) | (whole < LEAST_WAY), torch.nan)

@@ -1,4 +1,4 @@
-"""Means and 95% intervals over rollouts by a cluster bootstrap: whole locations (or scenes) are drawn, not rollouts.
+"""Means and 95% intervals over rollouts by a cluster bootstrap: whole locations (or logs) are drawn, not rollouts.
 
 Rows and samples are the two results of `score.score_rollouts`, one of each per rollout. A draw holds each cluster with
 a multiplicity. Every resampled mean is a quotient of two sums that are linear in the multiplicities, hence one matrix
@@ -25,8 +25,10 @@ Row = Mapping[str, Any]
 
 
 def cluster_index(rows: Sequence[Row]) -> tuple[Tensor, int]:
-    """(cluster [R] int64, number of clusters) of rows: by location, by scene where there is none."""
-    names = [f"location {row['location']}" if row["location"] else f"scene {row['scene_id']}" for row in rows]
+    """(cluster [R] int64, number of clusters) of rows: by location; where there is none by log, of which a scene may be
+    one of several windows, LOG@START."""
+    places = [(row["location"], row["scene_id"].split("@")[0]) for row in rows]
+    names = [f"location {location}" if location else f"log {log}" for location, log in places]
     number = {name: index for index, name in enumerate(sorted(set(names)))}
     return torch.tensor([number[name] for name in names], dtype=torch.int64), len(number)
 

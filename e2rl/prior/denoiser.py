@@ -1,7 +1,7 @@
 """The joint denoiser: vehicles attend to each other with pair features as attention biases and values."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import cast
 
@@ -49,14 +49,14 @@ class Encoding:
     biases: list[Tensor]
     modulations: list[Tensor]
 
+    def map(self, function: Callable[[Tensor], Tensor]) -> "Encoding":
+        """An Encoding with `function` applied to every tensor."""
+        biases, modulations = ([function(value) for value in values] for values in (self.biases, self.modulations))
+        return Encoding(function(self.nodes), function(self.pairs), biases, modulations)
+
     def repeat(self, count: int) -> "Encoding":
         """The same scenes `count` times along the batch."""
-
-        def tile(value: Tensor) -> Tensor:
-            return value.repeat(count, *[1] * (value.ndim - 1))
-
-        biases, modulations = ([tile(value) for value in values] for values in (self.biases, self.modulations))
-        return Encoding(tile(self.nodes), tile(self.pairs), biases, modulations)
+        return self.map(lambda value: value.repeat(count, *[1] * (value.ndim - 1)))
 
 
 class Block(nn.Module):

@@ -1,6 +1,7 @@
 """What a data set holds: its scenes, agents and maps, what is left out and why; and a picture of a scene.
 
 `python -m e2rl.report.inspect PATH` finds out which data group of conf/data reads the files at PATH; `--data` names it.
+`--apart OTHER` also checks that no scene at PATH is at a place of the logs at OTHER, as a split needs it.
 """
 
 import argparse
@@ -96,9 +97,10 @@ def report(source: Source, rows: Sequence[Row], contents: Sequence[Content]) -> 
     """The lines about a data set: `rows` of all its logs, `contents` of those that made a scene."""
     scenes = [row for row in rows if not row.reason]
     reasons = Counter(row.reason for row in rows if row.reason)
+    places = {row.location for row in scenes}
     lines = [
         f"logs         {len(source.logs())}",
-        f"scenes       {len(scenes)}, of {len({row.location for row in scenes})} places",
+        f"scenes       {len(scenes)}, " + ("places not known" if places == {""} else f"of {len(places)} places"),
         f"left out     {sum(reasons.values())}",
         *(f"             {count} x {reason}" for reason, count in reasons.most_common()),
     ]
@@ -203,6 +205,21 @@ def inspect(source: Source, chosen: str | None) -> tuple[list[Row], list[Content
     return rows, contents, drawn
 
 
+def check_apart(rows: Sequence[Row], source: Source, other: Source) -> str:
+    """A line on the places of the scenes `rows` of a source and of another's recordings; InputError where they share
+    some, or where a place is not known."""
+    here = {row.location for row in rows if not row.reason}
+    there = {recording.location for recording in other.recordings()}
+    for path, places in ((source.path, here), (other.path, there)):
+        if "" in places:
+            raise InputError(f"{path}: the place of some logs is not known; name it in index.csv (docs/data.md)")
+    if shared := sorted(here & there):
+        names = ", ".join(shared[:5]) + (", ..." if len(shared) > 5 else "")
+        common = f"{len(shared)} places in common ({names})"
+        raise InputError(f"{source.path} and {other.path}: {common}; part them by place")
+    return f"apart        from the {len(there)} places of {other.path}"
+
+
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="python -m e2rl.report.inspect", description=__doc__.splitlines()[0])
@@ -210,6 +227,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--data", metavar="NAME", help="file of conf/data that reads them (default: the one that can)")
     parser.add_argument("--scene", metavar="ID", help="the scene that is drawn (default: the first)")
     parser.add_argument("--metres", type=float, default=140.0, help="width of the picture (default %(default)s)")
+    parser.add_argument("--apart", type=Path, metavar="OTHER", help="logs that must share no place with those at PATH")
     parser.add_argument("--workers", type=int, default=2, help="processes (default %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("scene.png"), help="picture to write (default %(default)s)")
     options = parser.parse_args(arguments)
@@ -217,6 +235,8 @@ def main(arguments: list[str] | None = None) -> None:
         name, source = open_source(options.path, options.data, options.workers)
         rows, contents, drawn = inspect(source, options.scene)
         print(f"data         {name}, {options.path}", *report(source, rows, contents), sep="\n")
+        if options.apart:
+            print(check_apart(rows, source, open_source(options.apart, name, options.workers)[1]))
         assert drawn.scene is not None
         save_picture(options.out, picture(drawn.scene, f"{drawn.scene_id}   {drawn.location}", options.metres))
     except InputError as error:

@@ -99,11 +99,11 @@ def read_scalar(path: Path) -> dict[int, float]:
         return {int(number): float(value) for number, value in csv.reader(file)}
 
 
-def plain_figure(width: float, height: float, panels: int) -> tuple[Figure, list[Axes]]:
-    """A figure of panels in a row, with light axes; size in points."""
+def plain_figure(width: float, height: float, panels: int, rows: int = 1) -> tuple[Figure, list[Axes]]:
+    """A figure of rows with so many panels each, row by row, with light axes; size in points."""
     figure = new_figure(width, height, DPI)
     figure.set_layout_engine("tight")
-    axes = list(figure.subplots(1, panels, squeeze=False)[0])
+    axes = list(figure.subplots(rows, panels, squeeze=False).flat)
     for each in axes:
         each.spines[["top", "right"]].set_visible(False)
         each.grid(axis="y", color=drawing.ROAD, linewidth=0.6)

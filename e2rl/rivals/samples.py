@@ -1,5 +1,6 @@
 """Several joint samples of the same scenes: S of them along the batch, and back to [S, B, ...]."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from torch import Tensor
@@ -18,7 +19,17 @@ def tiled(context: Context, count: int) -> Context:
     def tile(value: Tensor) -> Tensor:
         return value.repeat(count, *[1] * (value.ndim - 1))
 
-    return replace(map_tensors(tile, context), encoding=context.encoding.repeat(count))
+    return mapped(context, tile)
+
+
+def of_scenes(context: Context, rows: Tensor) -> Context:
+    """The Context of scenes rows [G] of those of a Context."""
+    return mapped(context, lambda value: value[rows])
+
+
+def mapped(context: Context, function: Callable[[Tensor], Tensor]) -> Context:
+    """A Context with `function` applied to every tensor."""
+    return replace(map_tensors(function, context), encoding=context.encoding.map(function))
 
 
 def folded(noise: Tensor) -> Tensor:

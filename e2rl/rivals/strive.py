@@ -13,7 +13,7 @@ from e2rl.prior.prior import Context, Prior, plan_to_x
 from e2rl.rivals.latent import decode_latent
 from e2rl.rivals.losses import disk_overlap, ego_distance, off_road_term, pair_term
 from e2rl.rivals.open_loop import OpenLoop, OpenLoopState, Scenario
-from e2rl.rivals.samples import motion_of
+from e2rl.rivals.samples import motion_of, of_scenes
 from e2rl.rivals.view import View
 from e2rl.scene.boxes import overlap, to_frame
 from e2rl.scene.recording import DT
@@ -21,6 +21,7 @@ from e2rl.settings import check_range
 from e2rl.sim.world import World
 from e2rl.synthesizer.potentials import SAMPLED_STEPS, STRIDE
 from e2rl.traffic.grouping import Group
+from e2rl.traffic.rows import take_rows
 
 FROM = 2.0  # s of the plan before which nobody is attacked
 COLLISION = 20.0  # weight of overlaps and of being off the road
@@ -138,9 +139,20 @@ class Strive(OpenLoop):
         return self.strength(state) * attack + ((calm + energy) * view.active).sum(-1)
 
     def solvable(self, first: Tensor, planned: LaneState, view: View, context: Context) -> Tensor:
-        """Bool [B]: the ego's own latent, optimised against the others' motion [1, B, V, T], finds a way that touches
+        """Bool [B]: there is a way of the ego that touches nobody of the others' motion [1, B, V, T]: that which it
+        drives already, or one that an optimisation of its own latent finds."""
+        others = planned.states()[0]
+        solved = ~touched(view.ego[:, None], others, view)
+        if not solved.all():
+            rows = (~solved).nonzero()[:, 0]
+            given = first[rows], others[rows], take_rows(view, rows), of_scenes(context, rows)
+            solved[rows] = self.evaded(*given)
+        return solved
+
+    def evaded(self, first: Tensor, others: Tensor, view: View, context: Context) -> Tensor:
+        """Bool [B]: the ego's own latent, optimised against the others' states [B, V, T, 4], finds a way that touches
         nobody."""
-        unknown, others = replace(context, ego_x=None), planned.states()[0]
+        unknown = replace(context, ego_x=None)
         view = replace(view, active=torch.zeros_like(view.active))
         view.active[:, 0] = True
 
@@ -155,9 +167,13 @@ class Strive(OpenLoop):
             return SOLUTION[0] * bump[0, :, 0] + SOLUTION[1] * 0.5 * ego.square().sum(-1)
 
         with torch.no_grad():
-            ego = driven(self.optimised(first[:, 0], loss))[0, :, :1]
-        touches = overlap(ego, view.size[:, :1, None], others[:, 1:], view.size[:, 1:, None]).any(-1)
-        return ~(touches & view.valid[:, 1:]).any(-1)
+            return ~touched(driven(self.optimised(first[:, 0], loss))[0, :, :1], others, view)
+
+
+def touched(ego: Tensor, others: Tensor, view: View) -> Tensor:
+    """Bool [B]: the ego's states [B, 1, T, 4] overlap some of the others' [B, V, T, 4], whose row 0 does not count."""
+    touches = overlap(ego, view.size[:, :1, None], others[:, 1:], view.size[:, 1:, None]).any(-1)
+    return (touches & view.valid[:, 1:]).any(-1)
 
 
 def blend(weights: tuple[float, float], share: Tensor) -> Tensor:

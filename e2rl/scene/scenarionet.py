@@ -39,11 +39,12 @@ class ScenarioNetSource(LogFiles):
         yield read_recording(self.content(log), log, self.locations.get(Path(log).stem, ""))
 
     def fingerprint(self) -> bytes:
-        return super().fingerprint() + json.dumps(sorted(self.locations.items())).encode()
+        return super().fingerprint() + json.dumps(sorted(self.locations.items()) or "places unknown").encode()
 
     @cached_property
     def locations(self) -> dict[str, str]:
-        """Location by a log's name without ending, from `index.csv` (columns file, location_group) beside `path`."""
+        """Location by a log's name without ending, from `index.csv` (columns file, location_group) beside `path`. The
+        name of a log's map is no place: it is a city's."""
         index = self.root().parent / "index.csv"
         if not index.is_file():
             return {}
@@ -100,7 +101,7 @@ def _recording(data: dict, location: str) -> Recording:
     lanes, drivable = _map(data["map_features"])
     return Recording(
         scene_id=scene_id,
-        location=location or str(metadata.get("map", "")),
+        location=location or str(metadata.get("e2rl", {}).get("location", "")),
         dataset=str(metadata.get("dataset", "scenarionet")),
         states=states,
         valid=valid,

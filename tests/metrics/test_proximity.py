@@ -5,8 +5,16 @@ import math
 import pytest
 import torch
 
-from e2rl.metrics.proximity import closest_approach_cost, ego_path, mean_acceleration, mean_worst_cost, progress
-from tests.metrics.test_contact import course, row
+from e2rl.metrics.proximity import (
+    closest_approach_cost,
+    ego_path,
+    mean_acceleration,
+    mean_worst_cost,
+    progress,
+    route_completion,
+)
+from e2rl.metrics.score import score_rollouts
+from tests.metrics.test_contact import course, row, scene
 
 
 def pair(offset, velocity):
@@ -64,3 +72,39 @@ def test_gaps_of_the_ego_s_track_are_closed_before_measuring():
     valid[3:6] = False
     path, count = ego_path(states[None, :, None], valid[None, :, None], torch.tensor([80]))
     assert count.item() == 78 and progress(path, count).item() == pytest.approx(80)
+
+
+def completion(ego, recorded, *others):
+    """Route completion of an ego on one course whose recording is on another."""
+    rollout = scene(ego, *others)
+    logged, valid = (value.clone() for value in (rollout["logged"], rollout["logged_valid"]))
+    logged[0, :, 0], valid[0, :, 0] = recorded[0].float(), recorded[1]
+    return score_rollouts(rollout | {"logged": logged, "logged_valid": valid})[0][0]["route_completion"]
+
+
+def test_the_share_of_the_recorded_way_is_what_lies_behind_the_ego():
+    """On it and beside it alike; more than the recording has drives no more than all of it."""
+    recorded = course(0, 0, 0.3, 10)
+    assert completion(recorded, recorded) == pytest.approx(1)
+    assert completion(course(0, 0, 0.3, 4), recorded) == pytest.approx(0.4, abs=1e-4)
+    assert completion(course(-math.sin(0.3), math.cos(0.3), 0.3, 4), recorded) == pytest.approx(0.4, abs=1e-4)
+    assert completion(course(0, 0, 0.3, 20), recorded) == 1
+    assert completion(course(0, 0, 0.3 + math.pi, 5), recorded) == 0
+
+
+def test_a_contact_ends_the_way():
+    result = completion(course(0, 0, 0, 10), course(0, 0, 0, 10), course(44.8, 0, 0, 0))
+    assert result == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_bent_way_counts_by_its_length_and_a_standing_ego_has_none():
+    angle = torch.linspace(0, math.pi, 81, dtype=torch.float64)
+    bent = torch.stack([20 * angle.sin(), 20 - 20 * angle.cos(), angle, torch.full_like(angle, 8)], -1)
+    everywhere = torch.ones(1, 81, 1, dtype=torch.bool)
+    for steps in (20, 40, 80):
+        found = route_completion(bent[None], torch.tensor([steps + 1]), bent[None, :, None], everywhere)
+        assert found.item() == pytest.approx(steps / 80, abs=1e-6)
+    gone = everywhere & (torch.arange(81) <= 40)[:, None]
+    found = route_completion(bent[None], torch.tensor([21]), bent[None, :, None], gone)
+    assert found.item() == pytest.approx(0.5, abs=1e-6), "of the way that is recorded"
+    assert math.isnan(completion(course(0, 0, 0, 5), course(0, 0, 0, 0.1)))

@@ -55,7 +55,7 @@ def test_intervals_cover_the_truth_in_about_95_of_100_cases_when_rollouts_come_i
     assert ((low <= 1 / 3) & (high >= 1 / 3)).double().mean().item() < covered - 0.08
 
 
-def test_locations_are_clusters_and_scenes_where_there_is_none():
+def test_locations_are_clusters_and_logs_where_there_is_none():
     rows = [
         {"location": place, "scene_id": name}
         for place, name in (("a", "1"), ("a", "2"), ("", "1"), ("", "1"), ("", "2"), ("1", "9"))
@@ -63,6 +63,9 @@ def test_locations_are_clusters_and_scenes_where_there_is_none():
     cluster, count = cluster_index(rows)
     assert count == 4 and cluster[0] == cluster[1] and cluster[2] == cluster[3] != cluster[4]
     assert cluster[5] not in cluster[:5].tolist(), "a location and a scene of the same name are different clusters"
+    windows = [{"location": "", "scene_id": name} for name in ("log@11", "log@102", "other@11")]
+    cluster, count = cluster_index(windows)
+    assert count == 2 and cluster[0] == cluster[1] != cluster[2], "the windows of a log are one"
 
 
 def test_unknown_values_are_left_out_and_counted_and_never_zero():

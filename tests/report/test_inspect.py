@@ -40,7 +40,7 @@ def folder(tmp_path_factory):
 def test_a_data_set_is_counted_and_what_is_left_out_has_its_reason(folder, tmp_path, capsys):
     text = run(folder, "--out", tmp_path / "x.png", capsys=capsys)
     assert number(text, "data") == f"scenarionet, {folder}" and number(text, "logs") == "4"
-    assert number(text, "scenes") == "2, of 1 places" and number(text, "left out") == "2"
+    assert number(text, "scenes") == "2, places not known" and number(text, "left out") == "2"
     assert "1 x sd_02.pkl" in text and "rad lie between" in text and "1 x sd_03.pkl" in text
     assert number(text, "vehicles") == "2 (2 to 2)" and number(text, "pedestrians") == "2 (1 to 4)"
     assert number(text, "lanes") == "4 (4 to 4)" and number(text, "traffic lights") == "0 (0 to 1)"
@@ -75,3 +75,25 @@ def test_a_path_that_no_source_reads_names_what_each_of_them_reads(tmp_path, cap
         run(tmp_path, capsys=capsys)
     error = capsys.readouterr().err
     assert ".pkl" in error and ".xml" in error and "scenario_*.parquet" in error
+
+
+def test_two_data_sets_are_apart_where_they_share_no_place(tmp_path, capsys):
+    """As a split into training and test scenes must be; what has no place cannot be told."""
+    index = "file,location_group\none/sd_00.pkl,a\none/sd_01.pkl,b\n"
+    for name, ids in (("one", ("x", "y")), ("two", ("z",)), ("three", ("v", "w"))):
+        write_folder(tmp_path / name, [description(scenario_id=each) | {"id": each} for each in ids])
+    for name, place in (("two", "c"), ("three", "b")):
+        for path in sorted((tmp_path / name).glob("*.pkl")):
+            path = path.rename(path.with_stem(f"{name}-{path.stem}"))
+            index += f"{name}/{path.name},{place}\n"
+    (tmp_path / "index.csv").write_text(index)
+    out = ("--out", tmp_path / "x.png")
+    text = run(tmp_path / "one", "--apart", tmp_path / "two", *out, capsys=capsys)
+    assert number(text, "apart") == f"from the 1 places of {tmp_path / 'two'}"
+    assert number(text, "scenes") == "2, of 2 places"
+    for other, message in (("three", "1 places in common (b); part them by place"), ("alone/four", "is not known")):
+        if other == "alone/four":
+            write_folder(tmp_path / other, [description()])
+        with pytest.raises(SystemExit):
+            run(tmp_path / "one", "--apart", tmp_path / other, *out, capsys=capsys)
+        assert message in capsys.readouterr().err

@@ -1,0 +1,187 @@
+"""Failures against realism and against verdicts over the gain of each adversary, as CSV and as a picture.
+
+The strength of an attack is its gain times eta. So its curve is a run of several intensities (`evaluate.py
+experiment=curves`), or the ladder of its tuning (`experiment=tune`). `python -m e2rl.report.curves RUN_DIR...` draws
+runs of either kind together.
+"""
+
+import argparse
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from matplotlib.axes import Axes
+from PIL import Image
+
+from e2rl.errors import InputError, stop
+from e2rl.evaluation.files import METRICS_FILE, cell, nans, read_metrics
+from e2rl.evaluation.tuning import TUNING_FILE
+from e2rl.files import write_atomically
+from e2rl.metrics.catalogue import METRICS
+from e2rl.provenance import read_provenance
+from e2rl.report import drawing
+from e2rl.report.drawing import image_of, save_picture
+from e2rl.report.methods import closed_loop
+from e2rl.report.plots import plain_figure
+from e2rl.report.tables import heading
+from e2rl.report.tuning import gain_of, on_curve
+
+PANELS = (  # (horizontal, vertical): failures over realism, then the share of them that counts
+    (("real", "cfr"), ("real_adv", "cfr"), ("aor_step", "cfr")),
+    (("cfr", "cfr_counted"), ("cfr", "cfr_preventable"), ("real_adv", "cfr_preventable")),
+)
+COLUMNS = ("cfr", "cfr_counted", "cfr_preventable", "real", "real_adv", "aor_step", "cfr_bg", "passes")
+OURS, NOMINAL = "e2", "nominal"
+KEPT_ETA = 2.0  # intensity of the tables
+SIDE, RISE = 380, 330  # points: width and height of a panel
+NAME = "curves"
+
+
+class Point(NamedTuple):
+    """Rollouts of a method at one value of its dial; metrics: {name: {mean, low, high}} of some of COLUMNS, NaN where
+    unknown; on_curve: nothing but the dial differs from the other points on the curve; kept: the setting of the tables.
+    """
+
+    method: str
+    dial: str
+    value: float
+    on_curve: bool
+    kept: bool
+    metrics: Mapping[str, Mapping[str, float]]
+
+
+def points_of_rows(rows: Sequence[dict]) -> list[Point]:
+    """The points of the closed-loop rows of metrics.json; the dial is eta, 0 for traffic without an adversary."""
+    return [
+        Point(row["method"], "eta", row["eta"], True, row["eta"] in (0, KEPT_ETA), row["metrics"])
+        for row in closed_loop(rows)
+    ]
+
+
+def points_of_tuning(result: Mapping, method: str) -> list[Point]:
+    """The points of tuning.json: those on the ladder, the best trial, and the nominal traffic beside them."""
+    trials, best = result["trials"], result["best"]
+    curve, dial = on_curve(trials), next(iter(trials[0]["parameters"]))
+    kept = [trial for trial in trials if trial["parameters"] == best][:1]
+    points = [
+        Point(method, dial, gain_of(trial), trial in curve, trial in kept, intervals(trial["metrics"]))
+        for trial in [*curve, *(trial for trial in kept if trial not in curve)]
+    ]
+    nominal = {name: trials[0]["metrics"].get(f"{name} {NOMINAL}", math.nan) for name in COLUMNS}
+    return [*points, Point(NOMINAL, dial, 0.0, True, True, intervals(nominal))]
+
+
+def intervals(metrics: Mapping[str, float]) -> dict[str, dict[str, float]]:
+    """{name: {mean, low, high}} of NAME, NAME_low and NAME_high of a trial."""
+    return {
+        name: {"mean": metrics[name], **{end: metrics.get(f"{name}_{end}", math.nan) for end in ("low", "high")}}
+        for name in COLUMNS
+        if name in metrics
+    }
+
+
+def read_points(run: Path) -> list[Point]:
+    """The points of a run's folder; InputError where it holds neither tuning.json nor metrics.json."""
+    file = Path(run) / TUNING_FILE
+    if not file.is_file():
+        return points_of_rows(read_metrics(Path(run) / METRICS_FILE))
+    known = read_provenance(run)
+    try:
+        result = json.loads(file.read_text())
+        trials = [trial | {"metrics": nans(trial["metrics"])} for trial in result["trials"]]
+        assert known is not None
+        return points_of_tuning(result | {"trials": trials}, known["settings"]["synthesizer"]["name"])
+    except (ValueError, LookupError, TypeError, AssertionError) as error:
+        raise InputError(f"{file}: no tuning of an adversary; give the folder of a run of experiment=tune") from error
+
+
+def curves_csv(points: Sequence[Point]) -> str:
+    """A line a point, by method and value: each of COLUMNS with its 95% interval; NaN is an empty cell."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    ends = ("mean", "low", "high")
+    names = [name if end == "mean" else f"{name}_{end}" for name in COLUMNS for end in ends]
+    writer.writerow(["method", "dial", "value", "on_curve", "kept", *names])
+    for points_of in by_method(points).values():
+        for point in points_of:
+            found = [point.metrics.get(name, {}).get(end, math.nan) for name in COLUMNS for end in ends]
+            writer.writerow(map(cell, [*point[:5], *found]))
+    return buffer.getvalue()
+
+
+def by_method(points: Sequence[Point]) -> dict[str, list[Point]]:
+    """Each method's points in the order of their values; of the nominal traffic of several tunings the first."""
+    found: dict[str, list[Point]] = {}
+    for point in points:
+        found.setdefault(point.method, []).append(point)
+    found[NOMINAL] = found.get(NOMINAL, [])[:1]
+    return {name: sorted(each, key=lambda point: point.value) for name, each in found.items() if each}
+
+
+def curves_figure(points: Sequence[Point]) -> Image.Image:
+    """PANELS, with a line a method: dots grow with the gain, the kept setting is filled and has its intervals."""
+    figure, panels = plain_figure(SIDE * len(PANELS[0]), RISE * len(PANELS), len(PANELS[0]), len(PANELS))
+    methods = by_method(points)
+    for axes, (across, up) in zip(panels, (pair for row in PANELS for pair in row), strict=True):
+        for number, (name, own) in enumerate(methods.items()):
+            draw_curve(axes, own, across, up, colour_of(name, number))
+        if up != "cfr" and across == "cfr":
+            most = max(axes.get_xlim()[1], axes.get_ylim()[1])
+            axes.plot([0, most], [0, most], color=drawing.MUTED, linewidth=0.8, linestyle="dotted")
+        axes.set_xlabel(heading(METRICS[across]))
+        axes.set_ylabel(heading(METRICS[up]))
+        axes.set_ylim(bottom=0)
+    panels[0].legend(frameon=False, fontsize=7)
+    figure.suptitle("A dot a gain, larger dots for larger gains; filled: the setting of the tables, with 95% intervals")
+    return image_of(figure)
+
+
+def colour_of(name: str, number: int) -> str:
+    """A method's colour: ours and no attack stand out."""
+    return {OURS: drawing.ADVERSARY, NOMINAL: drawing.INK}.get(name, f"C{number % 10}")
+
+
+def draw_curve(axes: Axes, points: Sequence[Point], across: str, up: str, colour: str) -> None:
+    """One method's line, dots and intervals."""
+
+    def at(point: Point, name: str, end: str = "mean") -> float:
+        return (100 if METRICS[name].share else 1) * point.metrics.get(name, {}).get(end, math.nan)
+
+    line = [point for point in points if point.on_curve]
+    places = [[at(point, name) for point in line] for name in (across, up)]
+    axes.plot(*places, color=colour, linewidth=1.8 if points[0].method == OURS else 1, label=points[0].method)
+    for rank, point in enumerate(points):
+        x, y, face = at(point, across), at(point, up), colour if point.kept else drawing.PANEL
+        axes.plot(x, y, "o", markersize=3 + 5 * (rank + 1) / len(points), color=colour, markerfacecolor=face, zorder=3)
+        if point.kept:
+            axes.vlines(x, at(point, up, "low"), at(point, up, "high"), color=colour, linewidth=0.7, alpha=0.6)
+            axes.hlines(y, at(point, across, "low"), at(point, across, "high"), color=colour, linewidth=0.7, alpha=0.6)
+
+
+def save_curves(folder: Path, points: Sequence[Point]) -> list[Path]:
+    """Write curves.csv and curves.png into a folder; returns their paths."""
+    table, picture = Path(folder) / f"{NAME}.csv", Path(folder) / f"{NAME}.png"
+    write_atomically(table, curves_csv(points))
+    save_picture(picture, curves_figure(points))
+    return [table, picture]
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(prog="python -m e2rl.report.curves", description=__doc__.splitlines()[0])
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN_DIR", help="of experiment=curves or experiment=tune")
+    parser.add_argument("--out", type=Path, default=Path(), help="folder to write to (default: the current one)")
+    options = parser.parse_args(arguments)
+    try:
+        points = [point for run in options.runs for point in read_points(run)]
+    except InputError as error:
+        stop(error)
+    print(*save_curves(options.out, points), sep="\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""Curves of failures over realism: which points are on them, from either kind of run, and files that hold them all."""
+
+import csv
+import json
+import math
+
+import pytest
+from PIL import Image
+
+from e2rl.errors import InputError
+from e2rl.evaluation.files import write_metrics
+from e2rl.report.curves import by_method, main, points_of_rows, points_of_tuning, read_points
+from tests.report.test_tuning import trial
+
+MEASURED = {"aor_step": 0.001, "cfr_bg": 0.02, "real": 0.9, "passes": 640.0}
+
+
+def tuning(best=None):
+    """Trials at gains 0.5 (as it is), 2.0 and 0.1, and one with another step size, in 12 rollouts' nominal traffic."""
+    trials = [trial(0.5, 0.3, 0.3), trial(2.0, 0.3, 0.5), trial(0.1, 0.3, 0.1, realism=math.nan), trial(1.0, 0.7, 0.4)]
+    for each in trials:
+        each["metrics"] |= MEASURED | {"cfr nominal": 0.05, "real nominal": 0.93, "real_adv nominal": math.nan}
+    return {"best": best and trials[best]["parameters"], "trials": trials}
+
+
+def row(method, eta, cfr):
+    metrics = {"cfr": cfr, "cfr_counted": cfr / 2, "real": 0.9 - cfr / 10, "aor_step": 0.001, "passes": 144.0}
+    return {"method": method, "eta": eta, "metrics": {name: interval(value) for name, value in metrics.items()}}
+
+
+def interval(value):
+    return {"mean": value, "low": value - 0.01, "high": value + 0.01, "n": 12}
+
+
+ROWS = [row("nominal", 0.0, 0.05), row("cat", 4.0, 0.2), row("cat", 1.0, 0.1), row("e2", 2.0, 0.4)]
+
+
+def test_a_run_s_points_stand_by_eta_and_the_tables_intensity_is_kept():
+    found = by_method(points_of_rows([*ROWS, ROWS[0] | {"stage": "open loop"}]))
+    assert {name: [point.value for point in own] for name, own in found.items()} == {
+        "nominal": [0],
+        "cat": [1, 4],
+        "e2": [2],
+    }
+    assert [point.kept for own in found.values() for point in own] == [True, False, False, True]
+
+
+@pytest.mark.parametrize(("best", "expected"), [(None, []), (1, [(2.0, True)]), (3, [(1.0, False)])])
+def test_a_tuning_s_points_are_its_ladder_and_its_best_trial(best, expected):
+    """A best trial that differs from the ladder in more than the gain is a dot beside the curve."""
+    *points, nominal = points_of_tuning(tuning(best), "ctg_adv")
+    assert sorted(point.value for point in points if point.on_curve) == [0.1, 0.5, 2.0]
+    assert [(point.value, point.on_curve) for point in points if point.kept] == expected
+    assert (nominal.method, nominal.metrics["cfr"]["mean"], nominal.metrics["real"]["mean"]) == ("nominal", 0.05, 0.93)
+    assert points[0].metrics["cfr"] == {"mean": 0.1, "low": 0.0, "high": 0.2}
+    assert math.isnan(points[0].metrics["real"]["low"])
+
+
+def folders(tmp_path):
+    """A run of several intensities, and a tuning."""
+    write_metrics(tmp_path / "run" / "metrics.json", ROWS)
+    found = tuning(1)
+    for each in found["trials"]:
+        each["metrics"] = {name: None if math.isnan(value) else value for name, value in each["metrics"].items()}
+    (tmp_path / "tuned").mkdir()
+    (tmp_path / "tuned" / "tuning.json").write_text(json.dumps(found))
+    known = {"command": "", "versions": [{}], "inputs": {}, "settings": {"synthesizer": {"name": "ctg_adv"}}}
+    (tmp_path / "tuned" / "provenance.json").write_text(json.dumps(known))
+    return [tmp_path / "run", tmp_path / "tuned"]
+
+
+def test_runs_of_both_kinds_are_drawn_together(tmp_path, capsys):
+    main([*map(str, folders(tmp_path)), "--out", str(tmp_path / "out")])
+    assert "curves.png" in capsys.readouterr().out
+    with (tmp_path / "out" / "curves.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(line["method"], line["dial"], float(line["value"]), line["kept"]) for line in rows] == [
+        ("nominal", "eta", 0, "1"),
+        ("cat", "eta", 1, "0"),
+        ("cat", "eta", 4, "0"),
+        ("e2", "eta", 2, "1"),
+        ("ctg_adv", "gain", 0.1, "0"),
+        ("ctg_adv", "gain", 0.5, "0"),
+        ("ctg_adv", "gain", 2, "1"),
+    ]
+    assert float(rows[1]["cfr_high"]) == pytest.approx(0.11) and rows[1]["real_adv"] == "" == rows[4]["real_adv"]
+    with Image.open(tmp_path / "out" / "curves.png") as picture:
+        assert picture.width > picture.height > 1000
+
+
+def test_a_folder_of_neither_kind_is_named(tmp_path):
+    with pytest.raises(InputError, match="metrics.json: no readable metrics"):
+        read_points(tmp_path)
+    _, tuned = folders(tmp_path)
+    (tuned / "tuning.json").write_text('{"best": null, "trials": []}')
+    with pytest.raises(InputError, match="no tuning of an adversary; give the folder of a run of experiment=tune"):
+        read_points(tuned)
