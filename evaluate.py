@@ -20,7 +20,7 @@ from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.evaluation.realism_meta import meta_rows
 from e2rl.files import alone_in
 from e2rl.report.curves import points_of_rows, save_curves
-from e2rl.report.drawing import save_picture
+from e2rl.report.drawing import save_figure
 from e2rl.report.egos import ego_tables, guard_table
 from e2rl.report.html import report_command
 from e2rl.report.intensity import intensity_figure
@@ -30,6 +30,7 @@ from e2rl.report.plots import collision_bars, learning_curves
 from e2rl.report.skeleton import skeleton_figure
 from e2rl.report.tables import Table, metric_tables, print_tables, save_tables
 from e2rl.report.tuning import save_tuning_curve
+from e2rl.reproduce import compared_with_run, files_of_run, reproduction_of
 from e2rl.resume import Run, resume_command, run_of
 from e2rl.scene.scene import SceneSet
 from e2rl.scene.source import load_scenes
@@ -48,7 +49,8 @@ def evaluate(run: Run) -> list[dict]:
     prior, origin = build.build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
     methods, name = build.build_methods(config, prior), run.choices["ego"]
     name, ego = next(iter(egos.egos.items())) if egos else (name, build.build_ego(config))
-    sim, scenes = build.build_sim(config), load_scenes(config.data, config.num_scenes)
+    sim = build.build_sim(config)
+    scenes = load_scenes(config.data, config.num_scenes, scenes=config.scenes, files=files_of_run(config))
     only = None if config.scene is None else [scenes.index(config.scene)]
     provenance.begin_run(folder, config, MAY_CHANGE, {"scenes": scenes})
     kept = Kept(None if config.figure == "skeleton" else folder)  # that figure listens to every rollout
@@ -82,11 +84,13 @@ def evaluate(run: Run) -> list[dict]:
     if config.figure == "curves":
         save_curves(folder, points_of_rows(rows))
     if config.figure == "intensity":
-        save_picture(folder / "intensity.png", intensity_figure(intensity_ladder(folder)))
+        save_figure(folder / "intensity.png", intensity_figure(intensity_ladder(folder)))
     if chain:
         rollout = chain.rollout(scenes, name, folder)
-        save_picture(folder / "skeleton.png", skeleton_figure(rollout, chain.selection, chain.topology))
+        save_figure(folder / "skeleton.png", skeleton_figure(rollout, chain.selection, chain.topology))
     print(f"\nwritten to {folder}")
+    if config.reproduce:
+        print(f"{config.reproduce}: {compared_with_run(config, folder).text()}")
     if command := report_command(folder):
         print(f"watch its failures: {command}")
     return rows
@@ -121,9 +125,9 @@ def report_egos(
         return ego_tables(rows, egos.names, egos.pairs, "Egos", caption)
     tables = ego_tables(rows, egos.names, egos.pairs, "Policy learning", caption)
     tables.append(guard_table(rows, roles.before, roles.after, roles.planner, recorded_acceleration(scenes)))
-    save_picture(folder / "policy_learning.png", collision_bars(rows, egos.names, config.synthesizer.name))
+    save_figure(folder / "policy_learning.png", collision_bars(rows, egos.names, config.synthesizer.name))
     if runs := curve_runs(config):
-        save_picture(folder / "curves.png", learning_curves(runs))
+        save_figure(folder / "curves.png", learning_curves(runs))
     return tables
 
 
@@ -131,7 +135,8 @@ def report_egos(
 def main(config: DictConfig) -> None:
     """The command."""
     with ending(resume_command(config)):
-        run = run_of(config, MAY_CHANGE)
+        anew = config.reproduce and not config.resume
+        run = reproduction_of(config) if anew else run_of(config, MAY_CHANGE)
         with alone_in(run.folder):
             evaluate(run)
 

@@ -32,7 +32,7 @@ def evolve(task: Run) -> None:
     config, folder = task.config, task.folder
     prior, origin = build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
     traffic, ego = build_traffic(config.synthesizer, prior), build_ego(config)
-    scenes = load_scenes(config.data, config.num_scenes, split="train")
+    scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
     run, logger = build_evolution(config, scenes, ego, traffic, folder=folder), build_logger(config, folder)
     measure = build_measure(config, ego, task.choices["ego"], traffic, prior, folder)
     begin_run(folder, config, MAY_CHANGE, {"scenes": scenes, "measured scenes": measure.setup.scenes})
@@ -72,7 +72,7 @@ def imitate(task: Run) -> None:
     """Warm-start the actor from the recorded egos."""
     config, folder = task.config, task.folder
     ego = build_ego(config)
-    scenes = load_scenes(config.data, config.num_scenes, split="train")
+    scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
     begin = partial(begin_run, folder, config, MAY_CHANGE, {"scenes": scenes})
     losses = run_imitation(config, scenes, ego, folder, build_logger(config, folder), begin)
     print(", ".join(f"{name} {value:.4f}" for name, value in losses.items() if value == value))  # NaN: none held out
@@ -82,7 +82,7 @@ def imitate(task: Run) -> None:
 def train_bits(task: Run) -> None:
     """Train the ego bits on recorded vehicles, in a minute or two: a resumed run begins anew."""
     config, folder = task.config, task.folder
-    scenes = load_scenes(config.data, config.num_scenes, split="train")
+    scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
     begin_run(folder, config, MAY_CHANGE, {"scenes": scenes})
     losses = run_bits(config, scenes, folder, build_logger(config, folder))
     print(", ".join(f"{name} {value:.4f}" for name, value in losses.items() if value == value))  # NaN: none held out

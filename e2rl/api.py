@@ -34,9 +34,12 @@ from e2rl.traffic import rollout
 from e2rl.traffic.traffic import Traffic
 
 
-def load_scenes(data: str = "bundled", num_scenes: int | None = None, **settings: Any) -> SceneSet:
-    """At most num_scenes scenes of conf/data/<data>.yaml, such as load_scenes("scenarionet", path="logs.zip")."""
-    return source.load_scenes(_choice("data", data, {"workers": 1} | settings), num_scenes)
+def load_scenes(
+    data: str = "bundled", num_scenes: int | None = None, scenes: str | None = None, **settings: Any
+) -> SceneSet:
+    """At most num_scenes scenes of conf/data/<data>.yaml, such as load_scenes("scenarionet", path="logs.zip"); scenes:
+    a list or the folder of a run, whose scenes are taken."""
+    return source.load_scenes(_choice("data", data, {"workers": 1} | settings), num_scenes, scenes=scenes)
 
 
 def load_prior(checkpoint: str = "bundled", device: str = "cpu", **settings: Any) -> Prior:
@@ -62,7 +65,8 @@ def roll_out(
     """The rollout dict of every scene under every sampling seed, as `python evaluate.py` rolls them out
     (e2rl.traffic.rollout); all are simulated at once."""
     tasks = [(scene, seed) for seed in seeds for scene in range(len(scenes))]
-    index, noise = torch.tensor([scene for scene, _ in tasks]), torch.tensor([scene_seed(*task) for task in tasks])
+    index = torch.tensor([scene for scene, _ in tasks])
+    noise = torch.tensor([scene_seed(scenes.number[scene], seed) for scene, seed in tasks])
     sim = build_sim(load_config("evaluate"))
     rollouts = rollout.roll_out(scenes, index, noise, torch.full((len(tasks),), float(eta)), ego, traffic, sim, device)
     return rollouts | {"seed": torch.tensor([seed for _, seed in tasks]), "eta": float(eta)}

@@ -66,7 +66,7 @@ def written_whole(folder: Path) -> Iterator[Path]:
 
 def seal(folder: Path) -> None:
     """Write the hashes of a folder's files into it, for `altered`."""
-    hashes = {path.name: _sha256(path) for path in sorted(folder.iterdir()) if path.name != SEAL}
+    hashes = {path.name: sha256_of(path) for path in sorted(folder.iterdir()) if path.name != SEAL}
     write_atomically(folder / SEAL, json.dumps(hashes, indent=1))
 
 
@@ -74,14 +74,15 @@ def altered(folder: Path) -> str | None:
     """The name of the first file of a sealed folder that is not what was written; None: all are."""
     try:
         hashes = json.loads((folder / SEAL).read_text())
-        return next((name for name, known in hashes.items() if _sha256(folder / name) != known), None)
+        return next((name for name, known in hashes.items() if sha256_of(folder / name) != known), None)
     except FileNotFoundError as error:
         return Path(error.filename).name
     except (OSError, ValueError, AttributeError):
         return SEAL
 
 
-def _sha256(path: Path) -> str:
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file's content, in hex."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

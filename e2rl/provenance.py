@@ -1,10 +1,12 @@
-"""What a run was begun with: its command, versions, configuration and the hashes of its inputs, in provenance.json.
+"""What a run was begun with: its command, versions, configuration and the hashes of its inputs, in provenance.json, and
+its scenes, in scenes.csv.
 
 A run that goes on must find the same inputs and configuration. Another version of the code is told, not refused: the
 user may have mended what ended the run.
 """
 
 import copy
+import hashlib
 import json
 import platform
 import sys
@@ -22,31 +24,39 @@ from e2rl.ego.network import find_weights
 from e2rl.errors import InputError
 from e2rl.evaluation.files import command_line, git_commit
 from e2rl.evaluation.kept import forget_parts
-from e2rl.files import write_atomically
+from e2rl.files import sha256_of, write_atomically
 from e2rl.scene.scene import SceneSet
-from e2rl.scene.source import content_hash, hash_files
+from e2rl.scene.scene_list import SCENES, list_text
+from e2rl.scene.source import hash_files
 
 PROVENANCE = "provenance.json"
 FREE = ("resume", "plugins")
+STARTING = {"command": "e2rl.ego.external", "address": "e2rl.ego.external"}  # by a part of the key that names it
+PROGRAM, ARITHMETIC = "e2rl.ego.policy_file", ".onnx"  # other files of policies are programs
 READ_OTHERWISE = ("data", "tuning")  # groups whose files are not hashed: scenes are, and a study is to grow
 
 
 def begin_run(folder: Path, config: DictConfig, free: Collection[str], scenes: Mapping[str, SceneSet]) -> None:
-    """Write provenance.json of a new run, whose parts of an earlier one in the same folder are removed; or where
-    `config.resume` goes on with a run, compare with the file.
+    """Write provenance.json of a new run and the lists of its scenes, scenes.csv for `scenes`; parts of an earlier one
+    in the same folder are removed. Or where `config.resume` goes on with a run, compare with provenance.json.
 
     free: keys of the configuration that may change; scenes: by name in messages. Raises InputError for other inputs or
     settings than those that the run was begun with; says on stderr where versions differ.
     """
+    lists = {name: list_text(each) for name, each in scenes.items()}
     now = {
         "command": command_line(),
         "versions": [versions(config)],
         "settings": settings(config, free),
-        "inputs": {name: content_hash(each) for name, each in scenes.items()} | dict(inputs(config)),
+        "inputs": {name: hashlib.sha256(text.encode()).hexdigest() for name, text in lists.items()}
+        | dict(inputs(config)),
+        "files": {name: each.files for name, each in scenes.items()},
     }
     known = read_provenance(folder) if config.resume else None
     if known is None:
         forget_parts(folder)
+        for name, text in lists.items():
+            write_atomically(folder / SCENES.replace("scenes", name.replace(" ", "_")), text)
         write_atomically(folder / PROVENANCE, json.dumps(now, indent=1))
         return
     now = json.loads(json.dumps(now))
@@ -104,11 +114,12 @@ def settings(config: DictConfig, free: Collection[str]) -> dict[str, Any]:
 
 
 def versions(config: DictConfig) -> dict[str, str]:
-    """Commit, versions of python and torch, and hashes of the code: of e2rl with its weights, and of modules outside of
-    it that the configuration names."""
+    """Commit, versions of python and torch, and hashes: of the code of e2rl, of the weights that come with it, and of
+    modules outside of it that the configuration names."""
     package = Path(e2rl.__file__).parent
     found = {"git": git_commit(), "python": platform.python_version(), "torch": torch.__version__}
-    found["e2rl"] = hash_files(sorted([*package.rglob("*.py"), *package.rglob("*.safetensors")])).hex()
+    found["e2rl"] = hash_files(sorted(package.rglob("*.py"))).hex()
+    found["bundled weights"] = hash_files(sorted(package.rglob("*.safetensors"))).hex()
     for name in sorted(outside_modules(config)):
         spec = find_spec(name)
         found[name] = hash_files([Path(spec.origin)]).hex() if spec is not None and spec.origin is not None else ""
@@ -116,10 +127,18 @@ def versions(config: DictConfig) -> dict[str, str]:
 
 
 def outside_modules(config: DictConfig) -> set[str]:
-    """Modules outside of e2rl that a configuration names: plugins, and those of `_target_`s."""
-    texts = [(key, str(value)) for key, value in leaves(OmegaConf.to_container(config))]
-    named = {value.rpartition(".")[0] for key, value in texts if key.endswith("_target_")}
-    return {str(name) for name in config.plugins} | {name for name in named if not name.startswith("e2rl.")} - {""}
+    """Modules outside of e2rl that a configuration names, plugins and those of `_target_`s, and `starting_modules`."""
+    plain = OmegaConf.to_container(config)
+    named = {str(value).rpartition(".")[0] for key, value in leaves(plain) if key.endswith("_target_")}
+    outside = {name for name in named if not name.startswith("e2rl.")} - {""}
+    return {str(name) for name in config.plugins} | outside | starting_modules(plain)
+
+
+def starting_modules(plain: Any) -> set[str]:
+    """Modules of e2rl that run a program or connect to an address that a configuration names; plain: containers."""
+    named = [(key, str(value)) for key, value in leaves(plain) if value]
+    found = {module for key, _ in named for part, module in STARTING.items() if part in key}
+    return found | {PROGRAM for key, value in named if "file" in key and not value.endswith(ARITHMETIC)}
 
 
 def inputs(config: DictConfig) -> Iterator[tuple[str, Any]]:
@@ -131,7 +150,7 @@ def inputs(config: DictConfig) -> Iterator[tuple[str, Any]]:
         if "checkpoint" in key and path.is_dir():
             path = find_weights(path)
         if path.is_file():
-            yield f"{key}={value}", hash_files([path]).hex()
+            yield f"{key}={value}", sha256_of(path)
     for name in config.get("methods", ()):
         if name not in config.variants and name != config.synthesizer.name:
             yield f"synthesizer={name}", resolved(method_config(config, name))

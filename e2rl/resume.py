@@ -1,7 +1,8 @@
 """`resume=RUN_DIR`: an interrupted run continues in its own folder with its own configuration.
 
-The folder may be a stranger's. So its configuration may name extensions of e2rl's own only; code from elsewhere, and an
-endpoint that would be sent the user's key, take part if the command line names them, too.
+The folder may be a stranger's. So its configuration may name extensions of e2rl's own only; code from elsewhere, a
+command to start, an address to connect to, and an endpoint that would be sent the user's key, take part if the command
+line names them, too.
 """
 
 import re
@@ -21,7 +22,7 @@ from e2rl.ego.base import Ego
 from e2rl.errors import InputError
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
 from e2rl.learning.improvement import Improvement
-from e2rl.provenance import leaves, outside_modules
+from e2rl.provenance import leaves, outside_modules, starting_modules
 from e2rl.scene.source import Source
 from e2rl.traffic.traffic import Traffic
 
@@ -48,15 +49,13 @@ def run_of(config: DictConfig, may_change: Collection[str]) -> Run:
     hydra = HydraConfig.get()
     if not config.resume:
         return Run(config, Path(hydra.runtime.output_dir), dict(hydra.runtime.choices))
-    folder = Path(config.resume).resolve()
-    choices = saved_choices(config.resume, folder)
-    saved = saved_configuration(config, folder, choices)
+    folder, where = Path(config.resume).resolve(), f"resume={config.resume}"
+    choices = saved_choices(where, folder)
+    saved = saved_configuration(config, folder, choices, where)
     given = {item.split("=", 1)[0].lstrip("+~") for item in hydra.overrides.task}
     if wrong := sorted(given - {*may_change, *ALWAYS}):
         free = ", ".join(may_change)
-        raise InputError(
-            f"resume={config.resume}: goes on as it was begun; leave out {', '.join(wrong)} (only {free} can change)"
-        )
+        raise InputError(f"{where}: goes on as it was begun; leave out {', '.join(wrong)} (only {free} can change)")
     for key in given.intersection(may_change):
         saved[key] = config[key]
     saved.plugins, saved.resume = config.plugins, str(folder)
@@ -65,26 +64,25 @@ def run_of(config: DictConfig, may_change: Collection[str]) -> Run:
     return Run(saved, folder, choices)
 
 
-def saved_configuration(config: DictConfig, folder: Path, choices: dict[str, str]) -> DictConfig:
-    """The configuration that the run in `folder` was begun with, checked; config: that of the command line."""
-    saved = read_configuration(config, folder / ".hydra" / "config.yaml")
+def saved_configuration(config: DictConfig, folder: Path, choices: dict[str, str], where: str) -> DictConfig:
+    """The configuration that the run in `folder` was begun with, checked; config: that of the command line; where: the
+    key that names the folder, for messages."""
+    saved = read_configuration(config, folder / ".hydra" / "config.yaml", where)
     saved = OmegaConf.create(_with_choices(OmegaConf.to_container(saved), choices))
-    check_code(saved, [str(name) for name in config.plugins], f"resume={config.resume}")
+    check_code(saved, [str(name) for name in config.plugins], where)
     named = {str(value) for key, value in leaves(OmegaConf.to_container(saved)) if key.endswith("base_url") and value}
     if unknown := sorted(named - {str(OmegaConf.select(config, ENDPOINT))}):
         raise InputError(
-            f"resume={config.resume}: its reasoner sends your API key to {', '.join(unknown)}; if that is right, add "
+            f"{where}: its reasoner sends your API key to {', '.join(unknown)}; if that is right, add "
             f"{ENDPOINT}={unknown[0]}"
         )
     return saved
 
 
-def read_configuration(config: DictConfig, file: Path) -> DictConfig:
+def read_configuration(config: DictConfig, file: Path, where: str) -> DictConfig:
     """The saved configuration of a run, with every key of this version's `config`; InputError for anything else."""
     if not file.is_file():
-        raise InputError(
-            f"resume={config.resume}: no run found ({file} is missing); give the folder that the run printed"
-        )
+        raise InputError(f"{where}: no run found ({file} is missing); give the folder that the run printed")
     saved = _yaml(file)
     plain = OmegaConf.to_container(saved)
     if not isinstance(saved, DictConfig) or not isinstance(plain, dict):
@@ -95,11 +93,11 @@ def read_configuration(config: DictConfig, file: Path) -> DictConfig:
     return saved
 
 
-def saved_choices(resume: str, folder: Path) -> dict[str, str]:
+def saved_choices(where: str, folder: Path) -> dict[str, str]:
     """The file of each group {group: name} that the run in `folder` was begun with."""
     file = folder / ".hydra" / "hydra.yaml"
     if not file.is_file():
-        raise InputError(f"resume={resume}: no run found ({file} is missing); give the folder that the run printed")
+        raise InputError(f"{where}: no run found ({file} is missing); give the folder that the run printed")
     plain = OmegaConf.to_container(_yaml(file))
     try:
         assert isinstance(plain, dict)
@@ -146,13 +144,14 @@ def resume_command(config: DictConfig) -> str:
 
 
 def check_code(config: DictConfig, allowed: list[str], where: str) -> None:
-    """InputError where a configuration names code: a `_target_` that is no extension in e2rl, or a plugin, other than
-    of the modules `allowed`."""
+    """InputError where a configuration names code: a `_target_` that is no extension in e2rl, a plugin, or a command or
+    an address for an extension, other than of the modules `allowed`."""
     plain = OmegaConf.to_container(config)
     assert isinstance(plain, dict)
     named = [str(name) for name in plain.get("plugins") or ()]
     named += [target for target in _targets(plain) if not _is_extension(target)]
     named += [text for text in _texts(plain) if "${" in text and ":" in text]  # a resolver: what it makes is unknown
+    named += starting_modules(plain)
     outside = [name for name in named if not any(name == own or name.startswith(f"{own}.") for own in allowed)]
     if outside:
         raise InputError(

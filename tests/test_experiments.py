@@ -33,8 +33,8 @@ EXPERIMENTS = [
         ],
         None,
     ),
-    ("intensity", [("e2", 0), ("e2", 1), ("e2", 2), ("e2", 3)], "intensity.png"),
-    ("skeleton", [("e2", 2)], "skeleton.png"),
+    ("intensity", [("e2", 0), ("e2", 1), ("e2", 2), ("e2", 3)], "intensity"),
+    ("skeleton", [("e2", 2)], "skeleton"),
 ]
 
 
@@ -60,7 +60,9 @@ def test_the_adversaries_experiments_have_their_rows_and_figures(
         known = row["metrics"]["real_adv"]["n"]
         assert known > 0 if row["eta"] else known == 0
     assert len(list((tmp_path / "run" / "rollouts").glob("*.npz"))) == 2 * len(methods)
-    assert [path.name for path in (tmp_path / "run").glob("*.png")] == ([figure] if figure else [])
+    for suffix in ("png", "pdf"):
+        drawn = [path.stem for path in (tmp_path / "run").glob(f"*.{suffix}")]
+        assert drawn == ([figure] if figure else [])
 
 
 def test_table_1_is_written_in_three_formats(world, tmp_path, monkeypatch, capsys):
@@ -152,7 +154,8 @@ def test_egos_before_and_after_are_rated_in_one_run(world, tmp_path, monkeypatch
     assert {key for row in rows[2:] for key in row["paired"]} == {"e2", "nominal", "ego before"}
     text = (tmp_path / "run" / "tables.md").read_text()
     assert "## Policy learning" in text and "after − before [points]" in text and "Guards of after" in text
-    assert {path.name for path in (tmp_path / "run").glob("*.png")} == {"policy_learning.png", "curves.png"}
+    for suffix in ("png", "pdf"):
+        assert {path.stem for path in (tmp_path / "run").glob(f"*.{suffix}")} == {"policy_learning", "curves"}
 
 
 def test_a_planner_is_tuned_and_the_study_goes_on(world, tmp_path, monkeypatch, capsys):

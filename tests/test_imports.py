@@ -15,7 +15,7 @@ PACKAGE = Path(e2rl.__file__).parent
 ORDER = (  # of the folders and files directly in e2rl
     *("errors", "files", "settings", "workers", "ending"),
     *("scene", "verdicts", "sim", "metrics", "prior", "ego", "evasion", "traffic", "synthesizer", "rivals"),
-    *("evaluation", "build", "egos", "tuning", "api", "provenance", "learning", "resume", "report"),
+    *("evaluation", "build", "egos", "tuning", "api", "provenance", "learning", "resume", "reproduce", "report"),
 )
 
 

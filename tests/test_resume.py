@@ -9,10 +9,12 @@ from e2rl.build import load_choice, load_config
 from e2rl.errors import InputError
 from e2rl.evaluation.files import read_metrics, read_rows
 from e2rl.evaluation.protocol import Setup
+from e2rl.provenance import outside_modules
 from e2rl.resume import check_code, saved_choices, saved_configuration
 from tests.scripts import ROOT, SHORT, call, error_line, left_behind
 
 OURS, THEIRS = (OmegaConf.create(OmegaConf.to_container(load_config(name))) for name in ("train", "evaluate"))
+POLICY_FILE = "e2rl.ego.policy_file.PolicyFileEgo"
 
 
 def stranger(**changes):
@@ -64,6 +66,16 @@ def test_code_from_elsewhere_needs_the_users_consent(changes):
         check_code(stranger(**changes), ["my_stack"], "resume=x")
 
 
+def test_an_external_planner_of_ones_own_goes_on_by_the_command_that_the_run_names():
+    config = OmegaConf.merge(THEIRS, {"ego": {**load_choice("ego", "external"), "command": "true"}})
+    assert outside_modules(config) == {"e2rl.ego.external"}
+    check_code(config, ["e2rl.ego.external"], "resume=x")
+
+
+def test_a_policy_that_holds_arithmetic_goes_on():
+    check_code(OmegaConf.merge(THEIRS, {"ego": {"_target_": POLICY_FILE, "file": "x.onnx"}}), [], "x")
+
+
 def test_modules_that_the_command_line_names_take_part():
     config = stranger(ego___target_="my_stack.cruise.Cruise", plugins=["my_stack.hard_braking"])
     check_code(config, ["my_stack"], "resume=x")
@@ -80,6 +92,14 @@ def test_modules_that_the_command_line_names_take_part():
         {"variants": {"x": {"synthesizer": {"reasoner": {"_target_": "os.system"}}}}},
         {"egos": {"x": {"ego": "idm", "_target_": "os.system"}}},
         {"egos": {"x": {"ego": "idm", "teacher._target_": ["os.system"]}}},
+        {"ego": {**load_choice("ego", "external"), "command": "true"}},  # a program of the stranger's
+        {"ego": {**load_choice("ego", "external"), "command": ["true"]}},
+        {"ego": {**load_choice("ego", "external"), "address": "else:1"}},
+        {"egos": {"x": {"ego": "external", "command": "true"}}},
+        {"ego": {"_target_": POLICY_FILE, "file": "policy.pt"}},  # a TorchScript file is a program
+        {"ego": {"_target_": POLICY_FILE, "file": "${seeds}"}},
+        {"egos": {"x": {"ego": "policy_file", "file": "policy.pt"}}},
+        {"egos": {"x": {"ego": "external", "[address]": "else:1"}}},
         {"tuning": {"space": "${oc.env:HOME}"}},
         {"methods": ["${hydra:job.name}"]},
     ],
@@ -121,13 +141,13 @@ def test_a_configuration_that_is_none_is_named(tmp_path, content, what):
     (tmp_path / ".hydra" / "config.yaml").write_bytes(content)
     config = OmegaConf.merge(OURS, {"resume": str(tmp_path)})
     with pytest.raises(InputError, match=rf"config\.yaml: .*{what}"):
-        saved_configuration(config, tmp_path, {})
+        saved_configuration(config, tmp_path, {}, "resume=x")
 
 
 def test_a_run_of_the_other_command_is_named(tmp_path):
     folder_of(tmp_path, OURS, {})
     with pytest.raises(InputError, match=r"of the other command.* methods"):
-        saved_configuration(OmegaConf.merge(THEIRS, {"resume": str(tmp_path)}), tmp_path, {})
+        saved_configuration(OmegaConf.merge(THEIRS, {"resume": str(tmp_path)}), tmp_path, {}, "resume=x")
 
 
 @pytest.mark.parametrize(
@@ -142,9 +162,9 @@ def test_an_endpoint_gets_no_key_unasked(tmp_path, changes):
     folder_of(tmp_path, OmegaConf.merge(THEIRS, changes), {})
     given = OmegaConf.merge(THEIRS, {"resume": str(tmp_path)})
     with pytest.raises(InputError, match="sends your API key to http://else"):
-        saved_configuration(given, tmp_path, {})
+        saved_configuration(given, tmp_path, {}, "resume=x")
     agreed = OmegaConf.merge(given, {"synthesizer": {"reasoner": {"base_url": "http://else"}}})
-    assert saved_configuration(agreed, tmp_path, {})
+    assert saved_configuration(agreed, tmp_path, {}, "resume=x")
 
 
 def test_a_run_goes_on_with_its_own_files_of_the_groups(tmp_path):
@@ -153,7 +173,7 @@ def test_a_run_goes_on_with_its_own_files_of_the_groups(tmp_path):
     config = OmegaConf.merge(THEIRS, {"tuning": {"space": space, "spaces": {"sampling": {"margin": [0, 1]}}}})
     folder_of(tmp_path, config, {"ego": "sampling", "experiment": None})
     choices = saved_choices("x", tmp_path)
-    saved = saved_configuration(OmegaConf.merge(THEIRS, {"resume": str(tmp_path)}), tmp_path, choices)
+    saved = saved_configuration(OmegaConf.merge(THEIRS, {"resume": str(tmp_path)}), tmp_path, choices, "resume=x")
     assert choices["ego"] == "sampling" and OmegaConf.to_container(saved.tuning.space) == {"margin": [0, 1]}
 
 

@@ -1,14 +1,15 @@
 """python tools/fuzz.py N [--data LOGS] [--seed S]: N malformed inputs for each reader, and counts by outcome.
 
 Inputs are damaged copies of whole files: scenario pickles (structures and bytes), zips of them, rollout files, prior
-checkpoints and configurations of runs. Outcomes: `refused` (InputError, naming the file), `read` (what is left is
-whole), `slow` (more than LIMIT seconds), and `escaped`: any other exception, which is a fault of the program. The exit
-status is 1 where something escaped or was slow.
+checkpoints, actors, configurations of runs, lists of scenes and tables. Outcomes: `refused` (InputError, naming the
+file), `read` (what is left is whole), `slow` (more than LIMIT seconds), and `escaped`: any other exception, which is a
+fault of the program. The exit status is 1 where something escaped or was slow.
 """
 
 import argparse
 import copy
 import io
+import json
 import pickle
 import random
 import sys
@@ -25,15 +26,21 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from e2rl.api import load_config
+from e2rl.ego.network import find_weights, read_actor
 from e2rl.errors import InputError
+from e2rl.evaluation.files import read_metrics
 from e2rl.evaluation.rollout_reader import read_rollout
+from e2rl.evaluation.table_comparison import compare_tables
 from e2rl.prior.checkpoint import bundled_checkpoint, load_prior
 from e2rl.resume import check_code, read_configuration
 from e2rl.scene.build import BuildSettings, build_scene
 from e2rl.scene.bundled import load_recordings
 from e2rl.scene.recording import AGENT_TYPES, Recording
 from e2rl.scene.scenarionet import ScenarioNetSource, read_recording, safe_load
+from e2rl.scene.scene_list import COLUMNS, read_list
 
+READERS = ("pickle_bytes", "structures", "archives", "rollouts", "checkpoints", "configurations")
+READERS += ("scene_lists", "tables", "actors")  # methods of Readers
 LIMIT = 20.0  # s for one input
 SMALL = BuildSettings(steps=20, vehicles=4, others=2, field_cells=32)
 ODD = [
@@ -116,6 +123,9 @@ class Readers:
         self.pickles = [pickle.dumps(scene, protocol) for scene in scenes[:3] for protocol in (0, 2, 4)]
         self.prior = bundled_checkpoint().read_bytes()
         self.rollout = self._rollout()
+        self.actor = find_weights("bundled").read_bytes()
+        value = {"mean": 0.25, "low": 0.1, "high": None, "n": 4}
+        self.table = [{"method": "e2", "eta": 2.0, "metrics": {"cfr": value}, "paired": {"nominal": {"cfr": value}}}]
         self.config = OmegaConf.to_container(load_config("train"))
 
     def _rollout(self) -> dict:
@@ -172,7 +182,26 @@ class Readers:
         path = self.folder / "config.yaml"
         content = OmegaConf.to_yaml(OmegaConf.create(self.config)).encode()
         path.write_bytes(damaged(content, self.draw))
-        check_code(read_configuration(load_config("train"), path), [], "input")
+        check_code(read_configuration(load_config("train"), path, "input"), [], "input")
+
+    def scene_lists(self) -> None:
+        path = self.folder / "input.csv"
+        lines = [f"scene-{k},place,{k},{k:064x}" for k in range(20)]
+        path.write_bytes(damaged("\n".join([",".join(COLUMNS), *lines]).encode(), self.draw))
+        read_list(path)
+
+    def tables(self) -> None:
+        path = self.folder / "metrics.json"
+        text = json.dumps(mutated(self.table, self.draw), default=str)
+        path.write_bytes(text.encode() if self.draw.random() < 0.6 else damaged(text.encode(), self.draw))
+        rows = read_metrics(path)
+        compare_tables(rows, rows)
+
+    def actors(self) -> None:
+        path = self.folder / "input.safetensors"
+        head = damaged(self.actor[:4000], self.draw) + self.actor[4000:]
+        path.write_bytes(head if self.draw.random() < 0.8 else head[: self.draw.randrange(len(head))])
+        read_actor(path)
 
 
 def outcome(read: Callable[[], None]) -> str:
@@ -203,7 +232,7 @@ def main() -> int:
     bad = 0
     with TemporaryDirectory() as folder:
         readers = Readers(scenes, Path(folder), random.Random(options.seed))
-        for name in ("pickle_bytes", "structures", "archives", "rollouts", "checkpoints", "configurations"):
+        for name in READERS:
             counts = Counter(outcome(getattr(readers, name)) for _ in range(options.count))
             bad += counts["escaped"] + counts["slow"]
             print(f"{name:15s}", ", ".join(f"{count} {what}" for what, count in sorted(counts.items())), flush=True)

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -19,6 +20,7 @@ from e2rl.errors import InputError
 from e2rl.files import altered, write_atomically
 from e2rl.sim.observation import OBSERVATION_SIZE
 
+DEEPEST, WIDEST = 16, 1 << 13  # layers, and units of a layer, that a file may ask for
 WEIGHTS = "actor.safetensors"  # file name of an ActorCritic inside a checkpoint
 NARROWEST = 0.01  # least standard deviation before squashing, as a share of half the action range
 STEEPEST = 0.95  # reference actions are kept within this share of the bounds, so that their atanh stays finite
@@ -195,12 +197,7 @@ class ActorCritic(nn.Module):
 
     def load(self, path: Path) -> None:
         """Read a file of `save`; raises InputError for a damaged file or another architecture."""
-        try:
-            with safe_open(path, "pt") as file:
-                saved = json.loads((file.metadata() or {}).get("architecture", "null"))
-                weights = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        except (SafetensorError, OSError, json.JSONDecodeError) as error:
-            raise InputError(f"{path}: not a readable actor file ({error}); give an {WEIGHTS} file") from None
+        saved, weights = _content(path)
         if saved != self.architecture:
             raise InputError(
                 f"{path}: an actor of another architecture: {_differences(saved, self.architecture)}; set "
@@ -223,6 +220,31 @@ class ActorCritic(nn.Module):
         named = dict(self.named_parameters()) | dict(self.named_buffers())
         kept = {key: value for key, value in named.items() if not key.endswith((".middle", ".reach"))}
         return {key: value for key, value in kept.items() if not key.startswith("actor.")}
+
+
+def _content(path: Path) -> tuple[Any, dict[str, Tensor]]:
+    """The architecture in the header of a file of `ActorCritic.save`, and its weights."""
+    try:
+        with safe_open(path, "pt") as file:
+            saved = json.loads((file.metadata() or {}).get("architecture", "null"))
+            return saved, {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, json.JSONDecodeError) as error:
+        raise InputError(f"{path}: not a readable actor file ({error}); give an {WEIGHTS} file") from None
+
+
+def read_actor(path: Path) -> ActorCritic:
+    """The actor of a file of `ActorCritic.save`, whatever its architecture; raises InputError."""
+    saved, _ = _content(path)
+    try:
+        low, high = (torch.tensor(saved[key], dtype=torch.float32).reshape(2) for key in ("low", "high"))
+        sizes = [int(size) for size in saved["hidden"]]
+        if saved["observation"] != OBSERVATION_SIZE or len(sizes) > DEEPEST or not all(0 < n <= WIDEST for n in sizes):
+            raise ValueError(f"of {saved['observation']} numbers and layers of {sizes} units")
+        actor = ActorCritic(low, high, sizes, bool(saved["reference"]))
+    except (TypeError, KeyError, ValueError, RuntimeError) as error:
+        raise InputError(f"{path}: an actor of another version ({error}); train it again") from None
+    actor.load(path)
+    return actor
 
 
 def find_weights(path: str | Path) -> Path:

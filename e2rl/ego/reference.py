@@ -67,7 +67,7 @@ def _pursuit(path: Tensor, speed: Tensor) -> Tensor:
     """Curvature [...] 1/m of the circle through the ego and the point of path [..., K, 2] PURSUIT_TIME ahead."""
     ahead = path.new_tensor(LOOK_AHEAD)
     reach = (PURSUIT_TIME * speed).clamp(PURSUIT_MIN, PURSUIT_MAX)
-    high = torch.searchsorted(ahead, reach.contiguous()).clamp(1, len(LOOK_AHEAD) - 1)
+    high = (ahead < reach[..., None]).sum(-1).clamp(1, len(LOOK_AHEAD) - 1)
     share = (reach - ahead[high - 1]) / (ahead[high] - ahead[high - 1])
 
     def point(index: Tensor) -> Tensor:

@@ -193,9 +193,11 @@ def read_metrics(path: Path) -> list[dict]:
     path = Path(path)
     try:
         rows = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        return [
+            {key: nans(part) if key in ("metrics", "paired") else part for key, part in row.items()} for row in rows
+        ]
+    except (OSError, ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: no readable metrics ({error}); give a metrics.json that a run wrote") from error
-    return [{key: nans(value) if key in ("metrics", "paired") else value for key, value in row.items()} for row in rows]
 
 
 def nulls(value: object) -> object:

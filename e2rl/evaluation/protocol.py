@@ -65,7 +65,7 @@ class Setup:
     def roll_out(self, method: Method, tasks: Sequence[Task]) -> dict:
         """The rollout dict of (scene, seed) pairs under one method."""
         index = torch.tensor([scene for scene, _ in tasks])
-        noise = torch.tensor([scene_seed(*task) for task in tasks])
+        noise = torch.tensor([scene_seed(self.scenes.number[scene], seed) for scene, seed in tasks])
         eta = torch.full((len(tasks),), float(method.eta))
         rollouts = roll_out(self.scenes, index, noise, eta, self.ego, method.traffic, self.sim, self.device)
         return rollouts | {"seed": torch.tensor([seed for _, seed in tasks]), "eta": float(method.eta)}
@@ -93,9 +93,9 @@ class Setup:
 Job = tuple[int, tuple[Setup, Method, list[Task]]]  # with its number
 
 
-def scene_seed(scene: int, seed: int) -> int:
-    """The noise seed of a rollout, the same for every method (paired)."""
-    return seed * SEEDS_APART + scene
+def scene_seed(number: int, seed: int) -> int:
+    """The noise seed of a rollout in a scene of this number, the same for every method (paired)."""
+    return seed * SEEDS_APART + number
 
 
 def run_protocol(

@@ -28,7 +28,7 @@ from e2rl.learning.memory import Memory
 from e2rl.learning.solvability import solvable
 from e2rl.prior.prior import Prior
 from e2rl.scene.scene import SceneSet
-from e2rl.scene.source import load_scenes
+from e2rl.scene.source import load_scenes, source_of
 from e2rl.settings import settings_of
 from e2rl.traffic.rollout import synthesize_traffic
 from e2rl.traffic.traffic import Traffic
@@ -104,7 +104,8 @@ def build_measure(
     if options.path:
         with open_dict(data):
             data.path, data.split = options.path, None
-    scenes = load_scenes(data, options.scenes, split="tune")
+    apart = options.path or source_of(data).has_splits
+    scenes = load_scenes(data, options.scenes, split="tune", scenes=None if apart else config.scenes)
     nominal = built(load_choice("synthesizer", "nominal"), "synthesizer", Traffic, prior=prior)
     methods = [
         Method("nominal", nominal),

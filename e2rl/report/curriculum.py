@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from PIL import Image
+from matplotlib.figure import Figure
 
 from e2rl.errors import InputError, stop
 from e2rl.learning.curriculum.outcomes import Choice
 from e2rl.learning.logging import CHOICES, read_choices
 from e2rl.report import drawing
-from e2rl.report.drawing import image_of, new_figure, save_picture
+from e2rl.report.drawing import new_figure, save_figure
 from e2rl.traffic.template import TEMPLATES
 
 PICTURE = "curriculum.png"
@@ -43,8 +43,8 @@ def _order(arm: tuple[str, float]) -> tuple[int, float]:
     return TEMPLATES.index(arm[0]), arm[1]
 
 
-def choice_map(rows: Sequence[Choice]) -> Image.Image:
-    """The heat map of a table of choices, as an image."""
+def choice_map(rows: Sequence[Choice]) -> Figure:
+    """The heat map of a table of choices."""
     rounds, arms, *tables = grids(rows)
     figure = new_figure(WIDTH, MARGIN + LINE * max(len(arms), 6), DPI)
     figure.set_layout_engine("constrained")
@@ -58,7 +58,7 @@ def choice_map(rows: Sequence[Choice]) -> Image.Image:
         axes.set_title(title, fontsize=10)
         _label(axes, rounds, arms)
     panels[0].set_ylabel("causal template, η")
-    return image_of(figure)
+    return figure
 
 
 def _label(axes: Axes, rounds: Sequence[int], arms: Sequence[tuple[str, float]]) -> None:
@@ -73,10 +73,10 @@ def _label(axes: Axes, rounds: Sequence[int], arms: Sequence[tuple[str, float]])
 
 
 def draw_choices(folder: Path) -> None:
-    """Draw curriculum.png from the curriculum.csv of a run's folder; nothing where the run has logged none."""
+    """Draw curriculum.png and .pdf from the curriculum.csv of a run's folder; nothing where the run has logged none."""
     rows = read_choices(folder / CHOICES)
     if rows:
-        save_picture(folder / PICTURE, choice_map(rows))
+        save_figure(folder / PICTURE, choice_map(rows))
 
 
 def main() -> None:

@@ -24,7 +24,7 @@ from e2rl.files import write_atomically
 from e2rl.metrics.catalogue import METRICS
 from e2rl.provenance import read_provenance
 from e2rl.report import drawing
-from e2rl.report.drawing import image_of, save_picture
+from e2rl.report.drawing import image_of, save_figure
 from e2rl.report.methods import closed_loop
 from e2rl.report.plots import plain_figure
 from e2rl.report.tables import heading
@@ -166,7 +166,7 @@ def save_curves(folder: Path, points: Sequence[Point]) -> list[Path]:
     """Write curves.csv and curves.png into a folder; returns their paths."""
     table, picture = Path(folder) / f"{NAME}.csv", Path(folder) / f"{NAME}.png"
     write_atomically(table, curves_csv(points))
-    save_picture(picture, curves_figure(points))
+    save_figure(picture, curves_figure(points))
     return [table, picture]
 
 

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Patch
 from PIL import Image
 
@@ -25,6 +26,7 @@ INK, MUTED, PANEL = "#1c2430", "#5d6877", "#ffffff"
 EGO, ADVERSARY, BACKGROUND, REPLAYED, VULNERABLE = "#1565d8", "#dc2f3c", "#8793a3", "#b3bcc8", "#f0950c"
 CONTACT = "#dc2f3c"
 CLEAR = (0, 0, 0, 0)
+UNDATED = {"CreationDate": None, "Producer": None, "Creator": None}  # of a PDF
 VERGE = 0.8  # m added to a lane's drawn width, because the gap between neighbouring lanes is road, too
 
 # Outlines in units of half the length and half the width, the front at x = 1.
@@ -145,7 +147,7 @@ def new_panels(count: int, side: float, gap: float, head: float, foot: float = 0
     return figure, list(figure.subplots(1, count, squeeze=False, gridspec_kw=grid)[0])
 
 
-def add_legend(figure: Figure, colours: Mapping[str, Colour], size: float, ghost: bool = False) -> None:
+def add_legend(figure: Figure | SubFigure, colours: Mapping[str, Colour], size: float, ghost: bool = False) -> None:
     """What the colours mean and, with `ghost`, an empty box, in one row at the figure's lower left; font of `size`."""
     handles = [Patch(facecolor=colour, label=text) for text, colour in colours.items()]
     if ghost:
@@ -161,6 +163,8 @@ def image_of(figure: Figure) -> Image.Image:
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
 
-def save_picture(path: Path, picture: Image.Image) -> None:
-    """Write a PNG atomically."""
-    write_atomically(path, partial(picture.save, format="PNG", optimize=True))
+def save_figure(path: Path, figure: Figure) -> None:
+    """Write a figure as PNG and, beside it, as PDF: vectors with their fonts. The same figure makes the same bytes."""
+    write_atomically(path, partial(image_of(figure).save, format="PNG", optimize=True))
+    with rc_context({"pdf.fonttype": 42}):  # TrueType, which journals ask for
+        write_atomically(path.with_suffix(".pdf"), partial(figure.savefig, format="pdf", metadata=UNDATED))

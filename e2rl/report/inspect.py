@@ -13,18 +13,18 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from PIL import Image
+from matplotlib.figure import Figure
 
 from e2rl.build import load_choice
 from e2rl.errors import InputError, stop
 from e2rl.evaluation.files import polylines
 from e2rl.report import drawing
-from e2rl.report.drawing import Shape, TrafficMap, Trail, image_of, new_figure, save_picture
+from e2rl.report.drawing import Shape, TrafficMap, Trail, new_figure, save_figure
 from e2rl.scene.paths import arc_length
 from e2rl.scene.recording import AGENT_TYPES, LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, VEHICLE
 from e2rl.scene.source import Row, Source, source_of
 
-FOUND = ("scenarionet", "commonroad", "argoverse2")  # groups of data that a path can belong to
+FOUND = ("scenarionet", "commonroad", "argoverse2", "py123d")  # groups of data that a path can belong to
 SIDE, HEAD, FOOT = 900, 34, 30  # points: of a picture, of its header and of its legend
 COLOURS = {"vehicle": drawing.BACKGROUND, "pedestrian": drawing.VULNERABLE, "cyclist": drawing.VULNERABLE}
 LIGHTS = {LIGHT_UNKNOWN: drawing.MUTED, LIGHT_RED: "#d62828", LIGHT_YELLOW: "#f2b705", LIGHT_GREEN: "#2a9d4a"}
@@ -121,7 +121,7 @@ def _line(name: str, values: Iterable[float], digits: int = 0) -> str:
     return f"  {name:<36}{middle:>8} ({low} to {high})"
 
 
-def picture(scene: dict[str, np.ndarray], title: str, metres: float) -> Image.Image:
+def picture(scene: dict[str, np.ndarray], title: str, metres: float) -> Figure:
     """A scene at its start frame, `metres` wide, with the ways that its agents were recorded to take."""
     figure = new_figure(SIDE, SIDE + HEAD + FOOT)
     height = SIDE + HEAD + FOOT
@@ -129,7 +129,7 @@ def picture(scene: dict[str, np.ndarray], title: str, metres: float) -> Image.Im
     figure.text(14 / SIDE, 1 - 22 / height, title, fontsize=13, color=drawing.INK)
     drawing.add_legend(figure, LEGEND, 11)
     TrafficMap(axes, _road(scene), metres).show(scene["start"][0, :2], _trails(scene), _shapes(scene))
-    return image_of(figure)
+    return figure
 
 
 def _road(scene: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -229,7 +229,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--metres", type=float, default=140.0, help="width of the picture (default %(default)s)")
     parser.add_argument("--apart", type=Path, metavar="OTHER", help="logs that must share no place with those at PATH")
     parser.add_argument("--workers", type=int, default=2, help="processes (default %(default)s)")
-    parser.add_argument("--out", type=Path, default=Path("scene.png"), help="picture to write (default %(default)s)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("scene.png"),
+        help="picture to write, with a PDF beside it (default %(default)s)",
+    )
     options = parser.parse_args(arguments)
     try:
         name, source = open_source(options.path, options.data, options.workers)
@@ -238,7 +243,7 @@ def main(arguments: list[str] | None = None) -> None:
         if options.apart:
             print(check_apart(rows, source, open_source(options.apart, name, options.workers)[1]))
         assert drawn.scene is not None
-        save_picture(options.out, picture(drawn.scene, f"{drawn.scene_id}   {drawn.location}", options.metres))
+        save_figure(options.out, picture(drawn.scene, f"{drawn.scene_id}   {drawn.location}", options.metres))
     except InputError as error:
         stop(error)
     print(f"drawn        {drawn.scene_id}: {options.out}")

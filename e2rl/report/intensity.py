@@ -4,27 +4,29 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from PIL import Image
+from matplotlib.figure import Figure
 
-from e2rl.report import drawing
+from e2rl.report.drawing import new_figure
+from e2rl.report.picture import SIDE, Panel
 from e2rl.report.replay import load_replay
 
-SIDE, METRES, GAP = 720, 60.0, 10  # of a panel in pixels and m, pixels between panels
+METRES, GAP = 60.0, 10  # side of a panel in m, points between panels
 COLUMNS = 2
 
 
-def intensity_figure(paths: Sequence[Path]) -> Image.Image:
+def intensity_figure(paths: Sequence[Path]) -> Figure:
     """A panel for each rollout file, in the order of intensity: the moment of its contact.
 
     A rollout without contact is shown when the next one that has a contact has it, else at its end.
     """
-    replays = [load_replay(path, METRES, SIDE) for path in paths]
+    replays = [load_replay(path, METRES) for path in paths]
     rows = math.ceil(len(replays) / COLUMNS)
-    figure = Image.new("RGB", (COLUMNS * (SIDE + GAP) - GAP, rows * (SIDE + GAP) - GAP), drawing.PANEL)
+    figure = new_figure(*(count * (SIDE + GAP) - GAP for count in (COLUMNS, rows)))
+    wide, high = ([SIDE, *[GAP, SIDE] * (count - 1)] for count in (COLUMNS, rows))
+    places = figure.add_gridspec(len(high), len(wide), width_ratios=wide, height_ratios=high)
     for index, replay in enumerate(replays):
-        row, column = divmod(index, COLUMNS)
         contacts = [other.contact for other in replays[index:] if other.contact is not None]
         phase = None if replay.contact is None else 0.25
-        panel = replay.picture(contacts[0] if contacts else replay.last, phase)
-        figure.paste(panel, (column * (SIDE + GAP), row * (SIDE + GAP)))
+        place = places[2 * (index // COLUMNS), 2 * (index % COLUMNS)]
+        Panel(replay, figure.add_subfigure(place)).show(contacts[0] if contacts else replay.last, phase)
     return figure

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from PIL import Image
 from scipy.signal import savgol_filter
@@ -44,11 +45,12 @@ class Replay:
         self.contact = None if math.isnan(self.row["contact_step"]) else int(self.row["contact_step"])
         self.last = len(self.rollout["states"]) - 1 if self.contact is None else self.contact
         self.centres = camera_path(self.rollout["states"][:, self.rollout["ego"], :2])
-        self.panel = Panel(self)
+        self.panel = Panel(self, new_figure(SIDE, SIDE, dpi=72 * self.pixels / SIDE))
 
     def picture(self, time: float, phase: float | None = None) -> Image.Image:
         """The moment at `time` [steps, fractions interpolate]; `phase` from 0 to 1 marks the contact."""
         self.panel.show(time, phase)
+        assert isinstance(self.panel.figure, Figure)
         return image_of(self.panel.figure)
 
     def frames(self) -> list[Image.Image]:
@@ -63,7 +65,7 @@ class Replay:
             pictures += [self.picture(self.contact, phase=(index % 7) / 6) for index in range(FREEZE)]
         return pictures
 
-    def strip(self) -> Image.Image:
+    def strip(self) -> Figure:
         """Four moments side by side: up to the contact, or spread over a rollout that has none."""
         times = np.linspace(0, self.last, 4)
         if self.contact is not None:
@@ -77,7 +79,7 @@ class Replay:
                 text = f"{text}   {verdict_text(self.row)}"
             axes.set_title(text, loc="left", x=4 / STRIP_SIDE, fontsize=15, color=colour)
             self.draw(TrafficMap(axes, self.rollout, self.metres), time, phase)
-        return image_of(figure)
+        return figure
 
     def draw(self, traffic_map: TrafficMap, time: float, phase: float | None) -> None:
         """Show a moment on a map of the rollout."""
@@ -125,11 +127,10 @@ class Replay:
 
 
 class Panel:
-    """A square figure of a replay, with a header, a map and a legend; `show` moves it to another moment."""
+    """A replay on a square figure of SIDE, with a header, a map and a legend; `show` moves it to another moment."""
 
-    def __init__(self, replay: Replay):
-        self.replay, rollout = replay, replay.rollout
-        self.figure = new_figure(SIDE, SIDE, dpi=72 * replay.pixels / SIDE)
+    def __init__(self, replay: Replay, figure: Figure | SubFigure):
+        self.replay, self.figure, rollout = replay, figure, replay.rollout
         axes = self.figure.add_axes((0, FOOT / SIDE, 1, 1 - (HEAD + FOOT) / SIDE))
         self.map = TrafficMap(axes, rollout, replay.metres)
         text, left, right, upper, lower = self.figure.text, 14 / SIDE, 706 / SIDE, 697 / SIDE, 679 / SIDE

@@ -7,12 +7,11 @@ from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from PIL import Image
 
 from e2rl.errors import InputError
 from e2rl.metrics.catalogue import METRICS
 from e2rl.report import drawing
-from e2rl.report.drawing import image_of, new_figure
+from e2rl.report.drawing import new_figure
 from e2rl.report.egos import by_ego
 
 COLOURS = (drawing.BACKGROUND, drawing.EGO, "#2e8b57", drawing.VULNERABLE, "#7a4fbf", drawing.ADVERSARY)
@@ -27,7 +26,7 @@ CURVES = (  # scalar, title, whether it was measured before the round's steps
 )
 
 
-def collision_bars(rows: Sequence[dict], names: Sequence[str], method: str) -> Image.Image:
+def collision_bars(rows: Sequence[dict], names: Sequence[str], method: str) -> Figure:
     """`cfr` with its 95% interval as bars: a group for nominal traffic and each intensity of `method`, in each group a
     bar for each ego of `names`. rows: of metrics.json."""
     chosen = [row for row in rows if row["method"] in ("nominal", method)]
@@ -48,10 +47,10 @@ def collision_bars(rows: Sequence[dict], names: Sequence[str], method: str) -> I
     axes[0].set_ylabel(f"{METRICS['cfr'].about} [%]")
     axes[0].set_ylim(bottom=0)
     axes[0].legend(frameon=False, ncols=len(names))
-    return image_of(figure)
+    return figure
 
 
-def learning_curves(runs: Sequence[Path]) -> Image.Image:
+def learning_curves(runs: Sequence[Path]) -> Figure:
     """Panels of CURVES that some run knows, over environment steps; a line for each run of train.py."""
     series = [read_curves(run) for run in runs]
     known = [curve for curve in CURVES if any(curve[0] in found for found in series)]
@@ -68,7 +67,7 @@ def learning_curves(runs: Sequence[Path]) -> Image.Image:
         axes.set_xlim(left=0)
         axes.set_ylim(bottom=0)
     panels[0].legend(frameon=False, fontsize=8)
-    return image_of(figure)
+    return figure
 
 
 def read_curves(run: Path) -> dict[str, tuple[list[float], list[float]]]:

@@ -18,7 +18,7 @@ from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
 from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollout
 from e2rl.files import write_atomically
 from e2rl.metrics.score import score_rollouts
-from e2rl.report import drawing
+from e2rl.report.drawing import save_figure
 from e2rl.report.picture import Replay
 
 FRAME_MS = 100  # real time at 10 Hz
@@ -34,11 +34,11 @@ def load_replay(path: Path, metres: float = 70.0, pixels: int = 720, ghost: bool
 
 
 def save_replay(replay: Replay, folder: Path) -> tuple[Path, Path]:
-    """Write <name>.gif and <name>.png (the strip) into folder and return their paths."""
+    """Write <name>.gif and <name>.png (the strip; also as <name>.pdf) into folder and return the first two paths."""
     name = rollout_name(replay.rollout).removesuffix(".npz")
     gif, png = Path(folder) / f"{name}.gif", Path(folder) / f"{name}.png"
     save_animation(gif, replay.frames())
-    drawing.save_picture(png, replay.strip())
+    save_figure(png, replay.strip())
     return gif, png
 
 

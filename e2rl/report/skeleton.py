@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
-from PIL import Image
 
 from e2rl.evaluation.chains import link_risk
 from e2rl.report import drawing
-from e2rl.report.drawing import TrafficMap, Trail, add_legend, image_of, new_panels
+from e2rl.report.drawing import TrafficMap, Trail, add_legend, new_panels
 from e2rl.report.picture import shorten
 from e2rl.synthesizer.selection import Selection
 from e2rl.synthesizer.topology import TopologySettings
@@ -75,7 +75,7 @@ class SkeletonPicture:
         """Time to collision [s] of a pair of this weight, eq. (ttc_weight_t) inverted."""
         return max(0.0, self.settings.tau_max - self.settings.beta * math.log(weight / (1 - weight)))
 
-    def figure(self) -> Image.Image:
+    def figure(self) -> Figure:
         """The three panels beside each other, under their titles."""
         (figure, axes), rollout = new_panels(3, SIDE, GAP, HEAD, FOOT), self.rollout
         title = (
@@ -93,7 +93,7 @@ class SkeletonPicture:
             panel.set_title(caption, loc="left", x=8 / SIDE, fontsize=14, color=drawing.MUTED)
             draw(panel)
         add_legend(figure, LEGEND, 13)
-        return image_of(figure)
+        return figure
 
     def matrix(self, axes: Axes) -> None:
         """TTC of every pair of nodes, red by weight; the links of the coalition are framed."""
@@ -159,7 +159,7 @@ class SkeletonPicture:
             text.set(color=drawing.INK, path_effects=outline, zorder=ON_TOP + 1, clip_on=True)
 
 
-def skeleton_figure(rollout: dict, selection: Selection, settings: TopologySettings) -> Image.Image:
+def skeleton_figure(rollout: dict, selection: Selection, settings: TopologySettings) -> Figure:
     """The figure of a selection (B = 1) and of the rollout that it belongs to."""
     return SkeletonPicture(rollout, selection, settings).figure()
 

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from matplotlib.axes import Axes
-from PIL import Image
+from matplotlib.figure import Figure
 
 from e2rl.evaluation.files import cell
 from e2rl.files import write_atomically
 from e2rl.report import drawing
-from e2rl.report.drawing import image_of, save_picture
+from e2rl.report.drawing import save_figure
 from e2rl.report.plots import plain_figure
 
 PANELS = (("cfr", "failures [%]"), ("cfr_counted", "failures that count [%]"))
@@ -22,9 +22,9 @@ NAME = "tuning_curve"
 
 
 def save_tuning_curve(folder: Path, trials: Sequence[dict], method: str) -> None:
-    """Write tuning_curve.csv, a line a trial in the order of the gain, and tuning_curve.png."""
+    """Write tuning_curve.csv, a line a trial in the order of the gain, and tuning_curve.png and .pdf."""
     write_atomically(folder / f"{NAME}.csv", curve_csv(trials))
-    save_picture(folder / f"{NAME}.png", curve_figure(trials, method))
+    save_figure(folder / f"{NAME}.png", curve_figure(trials, method))
 
 
 def gain_of(trial: dict) -> float:
@@ -50,7 +50,7 @@ def curve_csv(trials: Sequence[dict]) -> str:
     return buffer.getvalue()
 
 
-def curve_figure(trials: Sequence[dict], method: str) -> Image.Image:
+def curve_figure(trials: Sequence[dict], method: str) -> Figure:
     """A panel for each of PANELS: the curve over the gain with 95% intervals, the other trials as dots, refused ones
     hollow."""
     figure, panels = plain_figure(SIDE * len(PANELS), RISE, len(PANELS))
@@ -70,7 +70,7 @@ def curve_figure(trials: Sequence[dict], method: str) -> Image.Image:
     figure.suptitle(
         f"{method}: {next(iter(trials[0]['parameters']))} written at its points; hollow: refused", fontsize=9
     )
-    return image_of(figure)
+    return figure
 
 
 def dot(axes: Axes, trial: dict, metric: str, colour: str) -> None:

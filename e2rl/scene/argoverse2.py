@@ -15,8 +15,8 @@ import numpy as np
 from e2rl.errors import InputError
 from e2rl.scene.log_files import MAX_BYTES
 from e2rl.scene.plausibility import check
-from e2rl.scene.recording import CYCLIST, OTHER, PEDESTRIAN, VEHICLE, Lane, Recording
-from e2rl.scene.smoothing import resample_uniform
+from e2rl.scene.recording import CYCLIST, OTHER, PEDESTRIAN, VEHICLE, Lane, Recording, same_way
+from e2rl.scene.smoothing import resample_uniform, speeds
 from e2rl.scene.source import Source, hash_files
 
 FILES = ("scenario_*.parquet", "annotations*.feather")
@@ -152,7 +152,7 @@ def _sensor_log(path: Path) -> Recording:
     states[:, 0, :2], states[:, 0, 2] = (place + AHEAD * turn[..., 0])[:, :2], _heading(turn[..., 0])
     valid[frame, track + 1], valid[:, 0] = True, True
     seconds = (stamps - stamps[0]) / 1e9
-    states[..., 3] = _speed(states[..., :2], valid, seconds)
+    states[..., 3] = speeds(states[..., :2], valid, seconds)
     size = np.stack([EGO_SIZE, *table[["length_m", "width_m"]].to_numpy(float)[first]])
     kinds = ["regular_vehicle", *table["category"].to_numpy()[first]]
     code = _files(path)[-1].stem.split("____")[-1].split("_")[0]
@@ -183,18 +183,6 @@ def _heading(axis: np.ndarray) -> np.ndarray:
     return np.arctan2(axis[..., 1], axis[..., 0])
 
 
-def _speed(position: np.ndarray, valid: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """Speeds [F, A] m/s: the length of the mean of the velocities to the frames before and after, where these are
-    recorded; 0 for a track of one frame."""
-    velocity = np.diff(position, axis=0) / np.diff(seconds)[:, None, None]
-    known = (valid[1:] & valid[:-1])[..., None]
-    total, count = np.zeros_like(position), np.zeros((*valid.shape, 1))
-    for side in (slice(None, -1), slice(1, None)):
-        total[side] += velocity * known
-        count[side] += known
-    return np.linalg.norm(total / np.maximum(count, 1), axis=-1)
-
-
 def _map(static_map: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
     """Lanes for motor vehicles by segment id, and the drivable areas."""
     from av2.geometry.interpolate import compute_midpoint_line
@@ -210,15 +198,6 @@ def _map(static_map: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
         exits = [str(other) for other in segment.successors]
         lanes[key] = Lane(points[:, :2], float(width), exits=exits)
     for key, lane in lanes.items():
-        lane.left = _beside(lanes, lane, segments[key].left_neighbor_id)
-        lane.right = _beside(lanes, lane, segments[key].right_neighbor_id)
+        lane.left = same_way(lanes, lane, segments[key].left_neighbor_id)
+        lane.right = same_way(lanes, lane, segments[key].right_neighbor_id)
     return lanes, [area.xyz[:, :2] for area in static_map.vector_drivable_areas.values()]
-
-
-def _beside(lanes: dict[str, Lane], lane: Lane, neighbour: int | None) -> list[str]:
-    """The neighbour where it leads the same way; the map names oncoming lanes as well."""
-    other = lanes.get(str(neighbour))
-    if other is None:
-        return []
-    same = np.dot(lane.points[-1] - lane.points[0], other.points[-1] - other.points[0]) > 0
-    return [str(neighbour)] if same else []

@@ -1,6 +1,6 @@
 """What a source yields: one recorded or generated piece of traffic with its map, on the host, in numpy."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -29,6 +29,15 @@ class Lane:
     left: list[str] = field(default_factory=list)
     right: list[str] = field(default_factory=list)
     heights: np.ndarray | None = None
+
+
+def same_way(lanes: Mapping[str, Lane], lane: Lane, neighbour: object) -> list[str]:
+    """The id of a lane's neighbour, if it is one of `lanes` and leads the same way; maps name oncoming ones as well."""
+    other = lanes.get(str(neighbour))
+    if other is None:
+        return []
+    same = np.dot(lane.points[-1] - lane.points[0], other.points[-1] - other.points[0]) > 0
+    return [str(neighbour)] if same else []
 
 
 @dataclass

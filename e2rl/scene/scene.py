@@ -24,7 +24,7 @@ P vertices; S lights; M, D map points; L lanes. Positions are relative to the sc
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -89,7 +89,10 @@ def stack(scenes: Sequence[TensorDictBase]) -> TensorDict:
 
 @dataclass
 class SceneSet:
-    """Scenes [S] of one data set and split, with their names; `dropped` counts recordings left out, by reason."""
+    """Scenes [S] of one data set and split, with their names; `dropped` counts recordings left out, by reason.
+
+    number: of each scene's noise, by default its position; files: SHA-256 of the data's files, "" where unknown.
+    """
 
     scenes: TensorDict
     scene_id: list[str]
@@ -97,6 +100,11 @@ class SceneSet:
     dataset: str
     split: str
     dropped: dict[str, int]
+    number: list[int] = field(default_factory=list)
+    files: str = ""
+
+    def __post_init__(self) -> None:
+        self.number = self.number or list(range(len(self.scene_id)))
 
     def __len__(self) -> int:
         return len(self.scene_id)
@@ -131,8 +139,18 @@ class SceneSet:
         """The first `count` scenes (all for None)."""
         if count is None or count >= len(self):
             return self
-        names, places = self.scene_id[:count], self.location[:count]
-        return replace(self, scenes=self.scenes[:count], scene_id=names, location=places)
+        names, places, numbers = self.scene_id[:count], self.location[:count], self.number[:count]
+        return replace(self, scenes=self.scenes[:count], scene_id=names, location=places, number=numbers)
+
+    def chosen(self, indices: Sequence[int]) -> "SceneSet":
+        """The scenes at `indices`, which keep their noise."""
+        if list(indices) == list(range(len(self))):
+            return self
+        scenes = self.batch(indices)
+        scenes["scene_index"] = torch.arange(len(indices))
+        names, places = ([column[index] for index in indices] for column in (self.scene_id, self.location))
+        numbers = [self.number[index] for index in indices]
+        return replace(self, scenes=scenes, scene_id=names, location=places, number=numbers)
 
     def to(self, device: torch.device | str) -> "SceneSet":
         """The same scenes on a device."""

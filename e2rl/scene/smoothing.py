@@ -42,6 +42,18 @@ def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> t
     return out, (valid[left] | near_right) & (valid[right] | near_left) & bridged
 
 
+def speeds(position: np.ndarray, valid: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Speeds [F, A] m/s: the length of the mean of the velocities to the frames before and after, where these are
+    recorded; 0 for a track of one frame."""
+    velocity = np.diff(position, axis=0) / np.diff(seconds)[:, None, None]
+    known = (valid[1:] & valid[:-1])[..., None]
+    total, count = np.zeros_like(position), np.zeros((*valid.shape, 1))
+    for side in (slice(None, -1), slice(1, None)):
+        total[side] += velocity * known
+        count[side] += known
+    return np.linalg.norm(total / np.maximum(count, 1), axis=-1)
+
+
 def drop_jumps(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """valid [F, A] without the frames that jumps (over MAX_TURN or MAX_STEP in a frame) divide from a track's longest
     run.

@@ -31,10 +31,12 @@ from e2rl.files import locked, write_atomically
 from e2rl.scene.build import BuildSettings, build_scene, ego_overlaps
 from e2rl.scene.recording import Recording
 from e2rl.scene.scene import SceneSet, stack, validate
+from e2rl.scene.scene_list import listed_scenes
 from e2rl.settings import check_range, settings_of
 from e2rl.workers import interrupts_held, without_main, worker_pool
 
 OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are left out
+STORED = ("scene_id", "location", "dataset", "split", "dropped")  # of a SceneSet in a cache file, beside its scenes
 VERSION = 3  # of the scene builder: raise it when the same recording would make another scene
 
 
@@ -118,8 +120,10 @@ class Source(ABC):
         key = hashlib.sha256(json.dumps([VERSION, settings], sort_keys=True).encode() + content).hexdigest()[:24]
         every = Path(self.cache) / f"scenes-{key}.safetensors"
         if most is None or every.exists():
-            return _cached(every, self._build).first(most)
-        return _cached(every.with_stem(f"{every.stem}-{most}"), partial(self._build, most))
+            scenes = _cached(every, self._build).first(most)
+        else:
+            scenes = _cached(every.with_stem(f"{every.stem}-{most}"), partial(self._build, most))
+        return replace(scenes, files=hashlib.sha256(content).hexdigest())
 
     def _windows(self, log: str) -> Iterator[Recording]:
         for recording in self.read(log):
@@ -194,12 +198,19 @@ class Source(ABC):
 
 
 def load_scenes(
-    data: Mapping | Source, num_scenes: int | None = None, split: str | None = None, starts: list[int] | None = None
+    data: Mapping | Source,
+    num_scenes: int | None = None,
+    split: str | None = None,
+    starts: list[int] | None = None,
+    scenes: str | Path | None = None,
+    files: str = "",
 ) -> SceneSet:
     """At most `num_scenes` scenes of a source, or of the source that a `data` group (conf/data/*.yaml) names.
 
-    split: overrides the source's own where `Source.has_splits`; starts: overrides its start frames. Raises InputError
-    for a source that cannot be built, for a missing or empty path and, unless data.skip_invalid, for an invalid scene.
+    split: overrides the source's own where `Source.has_splits`; starts: overrides its start frames; scenes: a list
+    (e2rl/scene/scene_list.py), of which all or the first `num_scenes` are taken; files: see `listed_scenes`. Raises
+    InputError for a source that cannot be built, for a missing or empty path, for a scene of the list that is not there
+    and, unless data.skip_invalid, for an invalid scene.
     """
     if num_scenes is not None:
         check_range("num_scenes", num_scenes, 1)
@@ -208,6 +219,8 @@ def load_scenes(
         source = replace(source, split=split)
     if starts is not None:
         source = replace(source, starts=tuple(starts))
+    if scenes is not None:
+        return listed_scenes(scenes, source.load, num_scenes, files)
     return source.load(num_scenes)
 
 
@@ -224,12 +237,6 @@ def source_of(data: Mapping) -> Source:
     build = settings_of(BuildSettings, data.get("build", {}), "data.build")
     values = {key: value for key, value in data.items() if key not in ("_target_", "build")}
     return replace(settings_of(kind, values, "data"), build=build)
-
-
-def content_hash(scenes: SceneSet) -> str:
-    """SHA-256 of scenes and of what is known about them."""
-    names = {key: value for key, value in vars(scenes).items() if key != "scenes"}
-    return _digest(dict(scenes.scenes.items()), json.dumps(names))
 
 
 def hash_files(paths: Iterable[Path]) -> bytes:
@@ -286,7 +293,7 @@ def _stored(path: Path) -> SceneSet | None:
 
 def _store(path: Path, scenes: SceneSet) -> SceneSet:
     columns = {key: value.contiguous() for key, value in scenes.scenes.items()}
-    names = json.dumps({key: value for key, value in vars(scenes).items() if key != "scenes"})
+    names = json.dumps({key: getattr(scenes, key) for key in STORED})
     header = {"scenes": names, "sha256": _digest(columns, names)}
     try:
         write_atomically(path, lambda part: save_file(columns, part, header))

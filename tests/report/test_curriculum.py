@@ -9,6 +9,7 @@ from e2rl.errors import InputError
 from e2rl.learning.curriculum.outcomes import COLUMNS
 from e2rl.learning.logging import CHOICES, RunLogger, write_choices
 from e2rl.report.curriculum import PICTURE, choice_map, draw_choices, grids
+from e2rl.report.drawing import image_of
 
 NAN = math.nan
 
@@ -38,7 +39,7 @@ def test_the_picture_is_drawn_from_the_file_of_a_run(tmp_path):
     assert lines[0] == ",".join(COLUMNS) and len(lines) == 5 and lines[1].startswith("0,1.0,pair,3,0,4,1,0.25,")
     draw_choices(tmp_path)
     assert (tmp_path / PICTURE).stat().st_size > 5000
-    assert choice_map(ROWS * 40).size == choice_map(ROWS).size
+    assert image_of(choice_map(ROWS * 40)).size == image_of(choice_map(ROWS)).size
 
 
 def test_a_file_of_another_kind_is_named(tmp_path):

@@ -4,6 +4,7 @@ import pytest
 
 from e2rl.errors import InputError
 from e2rl.learning.logging import RunLogger
+from e2rl.report.drawing import image_of
 from e2rl.report.plots import learning_curves, read_curves
 
 
@@ -31,7 +32,7 @@ def test_a_round_done_twice_counts_once(tmp_path):
 
 def test_a_figure_has_a_panel_for_each_known_curve(tmp_path):
     runs = [logged(tmp_path / name, [(100, 0.7, 0.5), (200, 0.6, 0.4)]) for name in ("one", "two")]
-    width, height = learning_curves(runs).size
+    width, height = image_of(learning_curves(runs)).size
     assert width > 2 * height
 
 

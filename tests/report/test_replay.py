@@ -85,7 +85,7 @@ def test_frames_end_with_the_contact_held_and_marked(tmp_path):
 
 def test_a_rollout_without_contact_plays_to_its_end(tmp_path):
     shown = replay_of(tmp_path, course(0, 0, 0, 5), course(0, 10, 0, 5))
-    assert shown.contact is None and len(shown.frames()) == 81 and shown.strip().size[1] > 200
+    assert shown.contact is None and len(shown.frames()) == 81 and image_of(shown.strip()).size[1] > 200
 
 
 def test_the_ego_is_blue_and_the_adversary_red_where_they_are(tmp_path):

@@ -8,10 +8,8 @@ from e2rl.errors import InputError
 from e2rl.scene.bundled import load_recordings
 from tools import fuzz
 
-NAMES = ("pickle_bytes", "structures", "archives", "rollouts", "checkpoints", "configurations")
 
-
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", fuzz.READERS)
 def test_whole_inputs_are_read(tmp_path, monkeypatch, name):
     monkeypatch.setattr(fuzz, "damaged", lambda content, draw: content)
     monkeypatch.setattr(fuzz, "mutated", lambda data, draw: data)

@@ -39,7 +39,7 @@ def run_prior_stage(
         prior = _untrained(config).to(device)
         begin = time.perf_counter()
         scenes = processes.leader_first(
-            lambda: load_scenes(config.data, config.num_scenes, "train", list(settings.starts))
+            lambda: load_scenes(config.data, config.num_scenes, "train", list(settings.starts), config.scenes)
         )
         processes.from_leader(lambda: begin_run({"scenes": scenes}))
         origin = {

@@ -14,7 +14,7 @@ from e2rl.errors import InputError
 from e2rl.evaluation.files import TABLE, read_rows
 from e2rl.files import write_atomically, written_whole
 from e2rl.metrics.failure_modes import is_failure
-from e2rl.report.export import archive, commonroad, openscenario, scenarionet
+from e2rl.report.export import archive, commonroad, mcap, openscenario, scenarionet
 from e2rl.report.export.episode import FACTS, Episode
 from e2rl.report.export.scenes import episodes_of
 
@@ -22,6 +22,7 @@ FORMATS = {
     "commonroad": commonroad.write,
     "openscenario": openscenario.write,
     "scenarionet": scenarionet.write,
+    "mcap": mcap.write,
     "npz": archive.write,
 }
 OPEN_EGO = ("commonroad", "openscenario")  # formats in which the ego's place may be left open

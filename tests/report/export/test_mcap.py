@@ -1,0 +1,136 @@
+"""MCAP: the format's own reader gets back every state, the map and the facts."""
+
+import csv
+import json
+from collections import defaultdict
+from dataclasses import replace
+from math import atan2
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mcap_protobuf", reason="--to mcap needs the extra mcap")
+pytest.importorskip("foxglove_schemas_protobuf", reason="--to mcap needs the extra mcap")
+from mcap.reader import make_reader  # noqa: E402
+from mcap_protobuf.decoder import DecoderFactory  # noqa: E402
+
+from e2rl.evaluation.files import TABLE, read_rows  # noqa: E402
+from e2rl.report.export.__main__ import LIST, main  # noqa: E402
+from e2rl.report.export.episode import rollout_episode  # noqa: E402
+from e2rl.report.export.mcap import content  # noqa: E402
+from e2rl.scene.recording import PEDESTRIAN  # noqa: E402
+from tests.report.export.small_run import CUT_IN, LATE, rollout_of, row_of  # noqa: E402
+
+
+def read(file):
+    """{topic: [(seconds, message)]}, JSON ones decoded, and the metadata of a file."""
+    found = defaultdict(list)
+    reader = make_reader(file, decoder_factories=[DecoderFactory()])
+    for _, channel, message in reader.iter_messages():
+        decoded = json.loads(message.data) if channel.message_encoding == "json" else None
+        if decoded is None:
+            (schema,) = [each for each in reader.get_summary().schemas.values() if each.id == channel.schema_id]
+            decoded = DecoderFactory().decoder_for("protobuf", schema)(message.data)
+        found[channel.topic].append((message.log_time / 1e9, decoded))
+    return found, {record.name: record.metadata for record in reader.iter_metadata()}
+
+
+@pytest.fixture(scope="module")
+def written(run, tmp_path_factory):
+    """The content of the files of all rollouts, in their order."""
+    out = tmp_path_factory.mktemp("mcap") / "out"
+    main([str(run), "--to", "mcap", "--all", "--out", str(out)])
+    with (out / LIST).open(newline="") as lines:
+        files = [out / line["file"] for line in csv.DictReader(lines)]
+    found = []
+    for path in files:
+        with path.open("rb") as file:
+            found.append(read(file))
+    return found
+
+
+def boxes(update):
+    """{row: (x, y, heading, length, width, entity)} of the agents of a message."""
+    agents = {}
+    for entity in update.entities:
+        if entity.id.startswith("agent "):
+            (cube,) = entity.cubes
+            turn = cube.pose.orientation
+            heading = 2 * atan2(turn.z, turn.w)
+            place = cube.pose.position
+            agents[int(entity.id.split()[1])] = (place.x, place.y, heading, cube.size.x, cube.size.y, entity)
+    return agents
+
+
+def test_every_state_of_everybody_who_is_there_comes_back(run, written):
+    for scene, (topics, _) in enumerate(written):
+        rollout = rollout_of(run, scene)
+        assert len(topics["/traffic"]) == len(topics["/tf"]) == len(rollout["states"])
+        for step, (time, update) in enumerate(topics["/traffic"]):
+            agents = boxes(update)
+            assert time == pytest.approx(0.1 * step) and update.entities[0].timestamp.ToSeconds() == int(time)
+            assert sorted(agents) == np.flatnonzero(rollout["valid"][step]).tolist()
+            for row, (*place, heading, length, width, _) in agents.items():
+                x, y, turned, _ = rollout["states"][step, row]
+                assert place == pytest.approx([x, y], abs=1e-5)
+                assert abs((heading - turned + np.pi) % (2 * np.pi) - np.pi) < 1e-5
+                assert [length, width] == pytest.approx(rollout["size"][row].tolist())
+            assert [deleted.type for deleted in update.deletions] == [1], "each message replaces the one before"
+            frame = topics["/tf"][step][1]
+            assert [frame.translation.x, frame.translation.y] == pytest.approx(rollout["states"][step, 0, :2], abs=1e-5)
+        assert any(LATE not in boxes(update) for _, update in topics["/traffic"])
+
+
+def test_parts_differ_in_colour_and_name(run, written):
+    agents = boxes(written[0][0]["/traffic"][0][1])
+    walker = row_of(rollout_of(run, 0), PEDESTRIAN)
+    parts = {row: {pair.key: pair.value for pair in agents[row][-1].metadata} for row in (0, CUT_IN, walker)}
+    assert [parts[row]["part"] for row in parts] == ["ego", "adversary", "pedestrian"]
+    assert parts[0]["speed"] == "8.00 m/s"
+    assert len({tuple(agents[row][-1].cubes[0].color.SerializeToString() for _ in "x") for row in parts}) == 3
+
+
+def test_the_map_lights_contact_and_numbers(run, written):
+    topics, _ = written[0]
+    ((time, update),) = topics["/map"]
+    lanes, borders = update.entities
+    rollout = rollout_of(run, 0)
+    ends = np.array([(point.x, point.y) for point in lanes.lines[0].points]).reshape(-1, 2, 2)
+    assert time == 0 and len(ends) == len(rollout["lane_points"]) - (len(rollout["lane_offsets"]) - 1)
+    assert np.abs(ends[0] - rollout["lane_points"][:2]).max() < 1e-5
+    assert len(borders.lines[0].points) == 2 * len(rollout["drivable_points"]), "rings are closed"
+    lights = [entity for entity in topics["/traffic"][0][1].entities if entity.id == "lights"]
+    assert len(lights[0].spheres) == 2 and lights[0].spheres[0].color != lights[0].spheres[1].color
+    row = read_rows(run / TABLE)[0]
+    contacts = [time for time, update in topics["/traffic"] if any(part.id == "contact" for part in update.entities)]
+    assert contacts == [pytest.approx(0.1 * row["contact_step"])]
+    told = [numbers for _, numbers in topics["/ego"]]
+    assert told[0]["speed"] == pytest.approx(8, abs=1e-4) and told[-1]["acceleration"] is None
+    assert told[int(row["contact_step"])]["gap"] == 0 and told[5]["gap"] > 1
+    assert "gap" not in written[1][0]["/ego"][0][1], "the second has no contact"
+
+
+def test_the_facts_are_in_the_file(run, written):
+    row = read_rows(run / TABLE)[0]
+    facts = written[0][1]["e2rl"]
+    assert facts["method"] == "e2" and facts["duty"] == row["duty"] and facts["adversaries"] == f"[{CUT_IN}]"
+
+
+def test_plans_are_there_where_the_rollout_has_them_and_the_same_rollout_makes_the_same_file(run, tmp_path):
+    episode = rollout_episode(run, read_rows(run / TABLE)[0])
+    plans = np.cumsum(np.ones((3, 2, 10, 2), np.float32), 2)
+    plans[2, 1] = np.nan
+    ring = {"drivable_points": np.array([[0, 0], [9, 0], [9, 5.0]]), "drivable_offsets": np.array([0, 3])}
+    more = ring | {"plans": plans, "planners": np.array([0, CUT_IN])}
+    planned = replace(episode, rollout=episode.rollout | more)
+    (tmp_path / "x.mcap").write_bytes(content(planned))
+    with (tmp_path / "x.mcap").open("rb") as file:
+        topics, _ = read(file)
+    assert [round(time, 6) for time, _ in topics["/plans"]] == [0.0, 0.5, 1.0]
+    assert [len(update.entities) for _, update in topics["/plans"]] == [2, 2, 1]
+    border = topics["/map"][0][1].entities[1].lines[0].points
+    assert [(point.x, point.y) for point in border] == [(0, 0), (9, 0), (9, 0), (9, 5), (9, 5), (0, 0)]
+    points = topics["/plans"][1][1].entities[1].lines[0].points
+    start = episode.rollout["states"][5, CUT_IN, :2]
+    assert [points[0].x, points[0].y] == pytest.approx(start, abs=1e-5) and points[-1].x == 10
+    assert content(episode) == content(episode)
