@@ -10,13 +10,13 @@ from e2rl.egos import build_egos, curve_runs
 from e2rl.ending import ending
 from e2rl.evaluation.avoidable import search_effort
 from e2rl.evaluation.chains import LongestChain
-from e2rl.evaluation.egos import EgoSet, recorded_acceleration, run_egos
-from e2rl.evaluation.files import METRICS_FILE, write_metrics
+from e2rl.evaluation.egos import EgoSet, recorded_acceleration, run_egos, setups_of
+from e2rl.evaluation.files import METRICS_FILE, ROLLOUTS, write_metrics
 from e2rl.evaluation.kept import Kept
 from e2rl.evaluation.ladders import intensity_ladder
 from e2rl.evaluation.modes import MODES_FILE, read_modes
 from e2rl.evaluation.open_loop import open_loop_rows
-from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.evaluation.protocol import Method, Setup, drive_all, run_protocol
 from e2rl.evaluation.realism_meta import meta_rows
 from e2rl.files import alone_in
 from e2rl.report.curves import points_of_rows, save_curves
@@ -36,7 +36,7 @@ from e2rl.scene.scene import SceneSet
 from e2rl.scene.source import load_scenes
 from e2rl.tuning import run_tuning, tuning_of
 
-MAY_CHANGE = ("processes",)  # when a run is resumed
+MAY_CHANGE = ("processes", "launcher", "share")  # when a run is resumed
 NOMINAL = "nominal"  # traffic without an attack, which every attack is compared with
 
 
@@ -60,6 +60,11 @@ def evaluate(run: Run) -> list[dict]:
         if task.group == "synthesizer":
             save_tuning_curve(folder, result["trials"], config.synthesizer.name)
         return result["trials"]
+    if (share := build.share_of(config)) is not None:
+        setups, into = setups_of(setup, egos) if egos else [setup], folder / ROLLOUTS if config.save_rollouts else None
+        drive_all(setups, methods, config.seeds, into, build.processes_of(config), only, kept, share)
+        print(f"\nshare {share[0]} of {share[1]} written to {folder}; python -m e2rl.report.merge joins shares")
+        return []
     chain = LongestChain(methods[0]) if config.figure == "skeleton" else None
     rows = []
     if config.open_loop_samples:

@@ -24,7 +24,7 @@ from e2rl.report.tables import metric_tables, print_tables, save_tables
 from e2rl.resume import Run, resume_command, run_of
 from e2rl.scene.source import load_scenes
 
-MAY_CHANGE = ("rounds", "device", "threads")  # when a run is resumed
+MAY_CHANGE = ("rounds", "device", "threads", "launcher")  # when a run is resumed
 
 
 def evolve(task: Run) -> None:

@@ -21,18 +21,20 @@ from omegaconf.errors import OmegaConfBaseException
 
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError
-from e2rl.evaluation.processes import cores
+from e2rl.evaluation.processes import Processes, cores
 from e2rl.evaluation.protocol import Method
 from e2rl.metrics.catalogue import TABLES
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.checkpoint import load_prior
 from e2rl.prior.prior import Prior, SamplerSettings
+from e2rl.ray_workers import RayWorkers
 from e2rl.settings import check_choice, settings_of
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.traffic import Traffic
 
 CHOICE = re.compile(r"[\w+-][\w.+-]*(/[\w+-][\w.+-]*)*")  # a file's name in a group
 FIGURES = ("intensity", "skeleton", "curves")
+LAUNCHERS = ("processes", "ray")
 VARIED = ("prior", "synthesizer")  # groups that the variants of a table may change
 
 
@@ -229,6 +231,7 @@ def check_seeds(where: str, seeds: Any) -> None:
 def check_evaluation(config: DictConfig) -> None:
     """InputError for methods, seeds, an intensity, a figure or processes that evaluate.py cannot run."""
     processes_of(config)
+    share_of(config)
     check_counts(config, open_loop_samples=0, meta_rollouts=0)
     check_choice("metrics", config.metrics, TABLES)
     check_seeds("seeds", config.seeds)
@@ -272,21 +275,37 @@ def check_compared(config: DictConfig) -> None:
         raise InputError(f"compare={config.compare}: a table with a row a method has one eta; name one")
 
 
-def processes_of(config: DictConfig) -> int:
+def processes_of(config: DictConfig) -> Processes:
     """Processes that share the rollouts: one a core by default, one on a device that they would share, and one for the
-    skeleton figure, which listens to the traffic method."""
-    given, device = config.processes, str(config.device)
-    if config.figure == "skeleton":
+    skeleton figure, which listens to the traffic method; with launcher=ray, Ray workers."""
+    given, device = config.get("processes"), str(config.device)
+    check_choice("launcher", config.launcher, LAUNCHERS)
+    if given is not None:
+        check_counts(config, processes=1)
+    if config.get("figure") == "skeleton":
         return 1
-    if given is None:
-        return cores() if device == "cpu" and config.threads == 1 else 1
-    check_counts(config, processes=1)
-    if given > 1 and (device != "cpu" or config.threads > 1):
+    alone, several = device == "cpu" and config.threads == 1, config.launcher == "ray" or (given or 1) > 1
+    if several and not alone:
         raise InputError(
-            f"processes={given}, threads={config.threads}, device={device}: several processes have one thread each and "
-            "the CPU; set threads=1 device=cpu, or processes=1"
+            f"processes={given}, threads={config.threads}, device={device}, launcher={config.launcher}: several "
+            "processes have one thread each and the CPU; set threads=1 device=cpu, or processes=1 launcher=processes"
         )
-    return given
+    if config.launcher == "ray":
+        return RayWorkers(given, tuple(map(str, config.plugins)))
+    return given or (cores() if alone else 1)
+
+
+def share_of(config: DictConfig) -> tuple[int, int] | None:
+    """`config.share`, (k, n); None: all. InputError for what is no share, and for what has none."""
+    given = config.share
+    if given is None:
+        return None
+    plain = list(given) if isinstance(given, ListConfig) else []
+    if len(plain) != 2 or any(type(part) is not int for part in plain) or not 0 <= plain[0] < plain[1]:
+        raise InputError(f"share={given}: expected [k, n] with k from 0 to n - 1, such as share=[0,4]")
+    if config.tuning is not None or config.figure == "skeleton":
+        raise InputError(f"share={given}: tuning and figure=skeleton run as a whole; leave share out")
+    return plain[0], plain[1]
 
 
 def caption(config: DictConfig, origin: dict, methods: Sequence[Method] = ()) -> str:

@@ -182,7 +182,13 @@ def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(experimen
         (["metrics=all"], "metrics=all: choose one of main, traffic, adversaries"),
         (["num_scenes=0"], "num_scenes=0: expected a whole number of at least 1"),
         (["processes=0"], "processes=0: expected a whole number of at least 1"),
-        (["processes=2", "threads=2"], "processes=2, threads=2, device=cpu: .*processes=1"),
+        (["processes=2", "threads=2"], "processes=2, threads=2, device=cpu, .*: .*processes=1"),
+        (["launcher=ray", "threads=2"], "threads=2, device=cpu, launcher=ray: .*launcher=processes"),
+        (["launcher=grid"], "launcher=grid: choose one of processes, ray"),
+        (["share=2"], r"share=2: expected \[k, n\]"),
+        (["share=[4,4]"], r"share=\[4, 4\]: expected \[k, n\] with k from 0 to n - 1"),
+        (["share=[0,1.5]"], r"share=\[0, 1.5\]: expected"),
+        (["share=[0,2]", "figure=skeleton"], "share=.*run as a whole; leave share out"),
     ],
 )
 def test_what_cannot_run_is_named_with_its_remedy(overrides, message):
@@ -192,6 +198,7 @@ def test_what_cannot_run_is_named_with_its_remedy(overrides, message):
 
 def test_the_skeleton_figure_and_a_shared_device_keep_to_one_process():
     assert build.processes_of(config_of("figure=skeleton", "processes=3")) == 1
+    assert build.processes_of(config_of("figure=skeleton", "launcher=ray")) == 1
     assert build.processes_of(config_of("device=cuda")) == build.processes_of(config_of("threads=2")) == 1
 
 

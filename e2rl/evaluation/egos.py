@@ -15,6 +15,7 @@ import torch
 from e2rl.ego.base import Ego
 from e2rl.evaluation.files import ROLLOUTS
 from e2rl.evaluation.kept import NOTHING_KEPT, Kept
+from e2rl.evaluation.processes import Processes
 from e2rl.evaluation.protocol import Method, Setup, drive_all, record
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.proximity import ego_path, mean_acceleration
@@ -39,7 +40,7 @@ def run_egos(
     seeds: Sequence[int],
     folder: Path | None = None,
     save_rollouts: bool = True,
-    processes: int = 1,
+    processes: Processes = 1,
     only: Sequence[int] | None = None,
     kept: Kept = NOTHING_KEPT,
     **fields: Any,
@@ -49,9 +50,8 @@ def run_egos(
     Besides a row for each ego, method and intensity, there is one for each name of `egos.trainings`. Rows of the first
     name of a pair are compared with the second's under `ego SECOND` of their `paired`.
     """
-    setups = [replace(setup, ego=ego, ego_name=name) for name, ego in egos.egos.items()]
     into = folder / ROLLOUTS if folder is not None and save_rollouts else None
-    found = drive_all(setups, methods, seeds, into, processes, only, kept)
+    found = drive_all(setups_of(setup, egos), methods, seeds, into, processes, only, kept)
 
     def summarise(rows: list[dict], features: list) -> list[dict]:
         pooled, more = pool_trainings(rows, features, egos.trainings)
@@ -59,6 +59,11 @@ def run_egos(
         return [row | {"n_trainings": len(egos.trainings.get(row["ego"], [1]))} for row in result]
 
     return record(*found, folder, summarise)
+
+
+def setups_of(setup: Setup, egos: EgoSet) -> list[Setup]:
+    """The setup with each of the egos."""
+    return [replace(setup, ego=ego, ego_name=name) for name, ego in egos.egos.items()]
 
 
 def pool_trainings(

@@ -11,6 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from e2rl.ego.base import Ego
+from e2rl.errors import InputError
 from e2rl.evaluation.avoidable import add_avoidable
 from e2rl.evaluation.ended import ENDED_FILE, attempt, count_reasons, require_rows, write_ended
 from e2rl.evaluation.files import (
@@ -26,7 +27,7 @@ from e2rl.evaluation.files import (
 )
 from e2rl.evaluation.kept import NOTHING_KEPT, Kept
 from e2rl.evaluation.modes import MODES_FILE, find_modes, write_modes
-from e2rl.evaluation.processes import in_processes
+from e2rl.evaluation.processes import Processes, in_processes
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
 from e2rl.scene.scene import SceneSet
@@ -35,6 +36,7 @@ from e2rl.traffic.rollout import roll_out
 from e2rl.traffic.traffic import Traffic
 
 SEEDS_APART = 1_000_003
+WHOLE = (0, 1)  # the only share of a run
 Task = tuple[int, int]  # position of a scene, sampling seed
 # Labelled rows and realism samples, one of each per rollout; and what the rollouts without a score ended by.
 Scored = tuple[list[dict], list[dict[str, Tensor]], list[dict]]
@@ -104,7 +106,7 @@ def run_protocol(
     seeds: Sequence[int],
     folder: Path | None = None,
     save_rollouts: bool = True,
-    processes: int = 1,
+    processes: Processes = 1,
     only: Sequence[int] | None = None,
     kept: Kept = NOTHING_KEPT,
     **fields: Any,
@@ -125,13 +127,15 @@ def drive_all(
     methods: Sequence[Method],
     seeds: Sequence[int],
     into: Path | None = None,
-    processes: int = 1,
+    processes: Processes = 1,
     only: Sequence[int] | None = None,
     kept: Kept = NOTHING_KEPT,
+    share: tuple[int, int] = WHOLE,
 ) -> Scored:
     """Roll out and score every setup, which differ in their ego, under every method on every (scene, seed).
 
-    into: folder of the rollouts' files (None: none); others: as for `run_protocol`. The noise is the same for all.
+    into: folder of the rollouts' files (None: none); share (k, n): only every n-th batch from the k-th on; others: as
+    for `run_protocol`. The noise is the same for all. Raises InputError where files of a worker do not arrive.
 
     A batch is the unit that is kept: rounding makes a rollout's last digits depend on the others of its batch.
     """
@@ -140,6 +144,7 @@ def drive_all(
     count = -(-len(tasks) // first.batch)
     parts = [tasks[k * len(tasks) // count : (k + 1) * len(tasks) // count] for k in range(count)]
     jobs = list(enumerate((setup, method, part) for setup in setups for method in methods for part in parts))
+    jobs = jobs[share[0] :: share[1]]
 
     def work(job: Job) -> Scored:
         number, (setup, method, part) = job
@@ -148,7 +153,8 @@ def drive_all(
         return kept.result(f"rollouts-{number:06}", identity, compute, partial(has_files, into))
 
     rows, features, lost = [], [], []
-    with tqdm(total=len(tasks) * len(methods) * len(setups), desc="rollouts", unit="rollout", disable=None) as bar:
+    total = sum(len(part) for _, (_, _, part) in jobs)
+    with tqdm(total=total, desc="rollouts", unit="rollout", disable=None) as bar:
 
         def ended(job: Job) -> None:
             _, (setup, method, part) = job
@@ -156,6 +162,9 @@ def drive_all(
             bar.update(len(part))
 
         for found, samples, without in in_processes(work, jobs, processes, lambda job: job[1][1].eta, ended):
+            if not has_files(into, (found, samples, without)):
+                reason = "rollouts that a worker wrote are not here"
+                raise InputError(f"{into}: {reason}; put the run's folder where all machines have it (hydra.run.dir)")
             rows += found
             features += samples
             lost += without

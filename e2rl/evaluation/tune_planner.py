@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from e2rl.ego.base import Ego
-from e2rl.evaluation.processes import in_processes
+from e2rl.evaluation.processes import Processes, in_processes
 from e2rl.evaluation.protocol import Method, Setup, Task
 from e2rl.evaluation.tuning import Parameters
 from e2rl.metrics.score import score_rollouts
@@ -25,7 +25,7 @@ class Trials:
     methods: Sequence[Method]
     seeds: Sequence[int]
     make: Callable[[Parameters], Ego]
-    processes: int = 1
+    processes: Processes = 1
 
     def __call__(self, parameters: Parameters) -> dict[str, float]:
         """collision: share of rollouts with a contact of the ego, or with the ego off the road; comfort: mean

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from e2rl.errors import InputError
+from e2rl.evaluation.processes import Processes
 from e2rl.evaluation.protocol import Method, Setup, drive_all
 from e2rl.evaluation.tuning import Parameters
 from e2rl.metrics.statistics import summarise
@@ -63,7 +64,7 @@ class AttackTrials:
     eta: float
     seeds: Sequence[int]
     make: Callable[[Parameters], Traffic]
-    processes: int = 1
+    processes: Processes = 1
 
     def __call__(self, parameters: Parameters) -> dict[str, float]:
         """MEASURED of the adversary, NAME_low and NAME_high of the 95% interval of those of SOUGHT; `NAME nominal` of

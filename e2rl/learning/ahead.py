@@ -1,4 +1,4 @@
-"""Work in a forked process beside this one; its result is a file that it writes."""
+"""Work beside this process, in a forked one or by workers elsewhere; its result is a file that it writes."""
 
 import multiprocessing
 import os
@@ -6,7 +6,9 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from concurrent.futures import Future
 from multiprocessing.connection import Connection
+from threading import Thread
 
 import torch
 
@@ -45,6 +47,32 @@ class Ahead:
             f"its process was killed (exit code {self._process.exitcode}), perhaps for lack of memory"
         )
         raise InputError(f"{self._name}: {reason}")
+
+
+class AheadElsewhere:
+    """`work()` in a thread of this process, for work that waits for workers elsewhere. It may see later changes."""
+
+    def __init__(self, work: Callable[[], None], name: str) -> None:
+        """name: of the work, in messages."""
+        self._name, self._spent = name, Future[float]()
+        Thread(target=self._run, args=(work,), daemon=True).start()
+
+    def _run(self, work: Callable[[], None]) -> None:
+        begin = time.perf_counter()
+        try:
+            work()
+            self._spent.set_result(time.perf_counter() - begin)
+        except BaseException as error:
+            self._spent.set_exception(error)
+
+    def wait(self) -> float:
+        """Wait for the end; returns the seconds that the work took. Raises InputError if it failed."""
+        try:
+            return self._spent.result()
+        except InputError as error:
+            raise InputError(f"{self._name}: {error}") from error
+        except Exception as error:
+            raise InputError(f"{self._name}: {type(error).__name__}: {error}") from error
 
 
 def why_not_ahead(device: str, threads: int, ego: Ego, traffic: str | None = None) -> str:

@@ -10,6 +10,7 @@ from torch import Tensor
 from e2rl.ego.base import Ego
 from e2rl.evaluation.files import METRICS_FILE, read_metrics, write_metrics
 from e2rl.evaluation.kept import Kept
+from e2rl.evaluation.processes import Processes
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollouts
 from e2rl.metrics.score import score_rollouts
@@ -25,7 +26,7 @@ class BeforeAfter:
     methods: Sequence[Method]
     seeds: Sequence[int]
     folder: Path
-    processes: int = 1
+    processes: Processes = 1
 
     def __call__(self, stage: str, ego: Ego, rounds: int) -> list[dict]:
         """Evaluate an ego as `stage` (before or after) that was trained for some rounds; returns the rows of all stages

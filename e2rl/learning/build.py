@@ -6,14 +6,13 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from e2rl.build import build_sim, built, check_counts, check_seeds, intensities, load_choice, resolved
+from e2rl.build import build_sim, built, check_counts, check_seeds, intensities, load_choice, processes_of, resolved
 from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import Ego
 from e2rl.ego.bits_network import BitsNetwork
 from e2rl.errors import InputError
 from e2rl.evaluation.files import command_line, git_commit
 from e2rl.evaluation.kept import Kept
-from e2rl.evaluation.processes import cores
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.learning.ahead import why_not_ahead
 from e2rl.learning.attack import Synthesize
@@ -27,6 +26,7 @@ from e2rl.learning.logging import RunLogger
 from e2rl.learning.memory import Memory
 from e2rl.learning.solvability import solvable
 from e2rl.prior.prior import Prior
+from e2rl.ray_workers import RayWorkers
 from e2rl.scene.scene import SceneSet
 from e2rl.scene.source import load_scenes, source_of
 from e2rl.settings import settings_of
@@ -63,7 +63,9 @@ def build_evolution(
     given = {"ego": ego, "parameters": parameters, "scenes": scenes, "sim": sim, "traffic": live, "seed": seed}
     improve = built(learner, "learner", Improvement, device=config.device, **given)
     keep = partial(solvable, scenes=scenes, sim=sim) if curriculum.solvable_only else None
-    return Evolution(curriculum, improve, synthesize, settings, seed, keep, Memory(folder, settings.memory))
+    workers = processes_of(config)
+    how = (keep, Memory(folder, settings.memory), config.batch, workers if isinstance(workers, RayWorkers) else None)
+    return Evolution(curriculum, improve, synthesize, settings, seed, *how)
 
 
 def _beside(config: DictConfig, ego: Ego) -> dict:
@@ -82,6 +84,7 @@ def check_training(config: DictConfig) -> None:
         check_counts(config, num_scenes=1)
     if type(config.measure.scenes) is not int or config.measure.scenes < 1:
         raise InputError(f"measure.scenes={config.measure.scenes}: expected a whole number of at least 1")
+    processes_of(config)
     check_seeds("measure.seeds", config.measure.seeds)
     intensities(config.measure)
     build_sim(config)
@@ -112,8 +115,7 @@ def build_measure(
         *(Method(config.synthesizer.name, traffic, eta) for eta in intensities(options)),
     ]
     setup = Setup(scenes, ego, ego_name, build_sim(config), config.batch, config.device)
-    processes = cores() if str(config.device) == "cpu" and config.threads == 1 else 1
-    return BeforeAfter(setup, methods, list(options.seeds), folder, processes)
+    return BeforeAfter(setup, methods, list(options.seeds), folder, processes_of(config))
 
 
 def run_imitation(

@@ -9,13 +9,14 @@ from torch import Tensor
 
 from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import Ego
-from e2rl.learning.ahead import Ahead
+from e2rl.learning.ahead import Ahead, AheadElsewhere
 from e2rl.learning.attack import Order, Solvable, Synthesize, make_traffic
 from e2rl.learning.curriculum.outcomes import Choice, outcomes_of, tally
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
 from e2rl.learning.episodes import Episodes
 from e2rl.learning.improvement import Improvement
 from e2rl.learning.memory import Memory
+from e2rl.ray_workers import RayWorkers
 from e2rl.settings import check_choice, check_range
 from e2rl.traffic.pool import TrafficPool
 
@@ -61,10 +62,10 @@ class Evolution:
     adversaries [S, N] bool, contact [S] bool}: closed-loop traffic against that ego; contact: it was hit. Of a
     curriculum that chooses causal templates it also takes template [S].
     solvable(traffic) -> Solved: rows that enter D', and evasions (None: all, and none). memory: None: in a temporary
-    folder.
+    folder. batch: scenes that are synthesized at once; workers: that do it (None: a process here).
 
     With `settings.ahead`, scenes, intensities and ego of the next round's D' are fixed just before a round's learning,
-    and it is made in another process meanwhile. What the curriculum learns from a round then acts two rounds later.
+    and it is made in other processes meanwhile. What the curriculum learns from a round then acts two rounds later.
     """
 
     def __init__(
@@ -76,14 +77,16 @@ class Evolution:
         seed: int = 0,
         solvable: Solvable | None = None,
         memory: Memory | None = None,
+        batch: int = 64,
+        workers: RayWorkers | None = None,
     ) -> None:
         self.curriculum, self.improve, self.synthesize = curriculum, improve, synthesize
         self.settings, self.seed, self.solvable = settings, seed, solvable
-        self.memory = memory or Memory(None, settings.memory)
+        self.memory, self.batch, self.workers = memory or Memory(None, settings.memory), batch, workers
         self.episodes: Episodes | None = None
         self.choices: list[Choice] = []
         self._next: Order | None = None  # of the coming round, if fixed already
-        self._ahead: Ahead | None = None  # what makes it, if begun already
+        self._ahead: Ahead | AheadElsewhere | None = None  # what makes it, if begun already
 
     @property
     def ego(self) -> Ego:
@@ -133,13 +136,17 @@ class Evolution:
         if self.round + 1 < self.curriculum.rounds:
             self._ahead = self._begin(self._next)
 
-    def _begin(self, order: Order) -> Ahead:
+    def _begin(self, order: Order) -> Ahead | AheadElsewhere:
         name = f"round {order.number + 1}: synthesis beside learning failed, checkpoints remain (resume=RUN_DIR)"
-        return Ahead(lambda: self._make(order), name)
+        if self.workers is None:
+            return Ahead(lambda: self._make(order), name)
+        self.workers.connect()
+        return AheadElsewhere(lambda: self._make(order), name)
 
     def _make(self, order: Order) -> None:
         """Write the traffic of an order into the memory's folder."""
-        traffic = make_traffic(order, self.synthesize, self.solvable, self.settings.nominal == "prior")
+        how = (self.settings.nominal == "prior", self.batch, self.workers or 1)
+        traffic = make_traffic(order, self.synthesize, self.solvable, *how)
         self.memory.write(order.number, traffic)
 
     def _stored(self, order: Order) -> Attack:
