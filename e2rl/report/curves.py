@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from matplotlib.axes import Axes
-from PIL import Image
+from matplotlib.figure import Figure
 
 from e2rl.errors import InputError, stop
 from e2rl.evaluation.files import METRICS_FILE, cell, nans, read_metrics
@@ -24,7 +24,7 @@ from e2rl.files import write_atomically
 from e2rl.metrics.catalogue import METRICS
 from e2rl.provenance import read_provenance
 from e2rl.report import drawing
-from e2rl.report.drawing import image_of, save_figure
+from e2rl.report.drawing import save_figure
 from e2rl.report.methods import closed_loop
 from e2rl.report.plots import plain_figure
 from e2rl.report.tables import heading
@@ -122,7 +122,7 @@ def by_method(points: Sequence[Point]) -> dict[str, list[Point]]:
     return {name: sorted(each, key=lambda point: point.value) for name, each in found.items() if each}
 
 
-def curves_figure(points: Sequence[Point]) -> Image.Image:
+def curves_figure(points: Sequence[Point]) -> Figure:
     """PANELS, with a line a method: dots grow with the gain, the kept setting is filled and has its intervals."""
     figure, panels = plain_figure(SIDE * len(PANELS[0]), RISE * len(PANELS), len(PANELS[0]), len(PANELS))
     methods = by_method(points)
@@ -137,7 +137,7 @@ def curves_figure(points: Sequence[Point]) -> Image.Image:
         axes.set_ylim(bottom=0)
     panels[0].legend(frameon=False, fontsize=7)
     figure.suptitle("A dot a gain, larger dots for larger gains; filled: the setting of the tables, with 95% intervals")
-    return image_of(figure)
+    return figure
 
 
 def colour_of(name: str, number: int) -> str:
@@ -163,7 +163,7 @@ def draw_curve(axes: Axes, points: Sequence[Point], across: str, up: str, colour
 
 
 def save_curves(folder: Path, points: Sequence[Point]) -> list[Path]:
-    """Write curves.csv and curves.png into a folder; returns their paths."""
+    """Write curves.csv and curves.png (and .pdf) into a folder; returns their paths."""
     table, picture = Path(folder) / f"{NAME}.csv", Path(folder) / f"{NAME}.png"
     write_atomically(table, curves_csv(points))
     save_figure(picture, curves_figure(points))
