@@ -201,7 +201,7 @@ def test_an_evaluation_that_was_interrupted_goes_on_by_the_command_that_it_names
     left[0] = 1
     again = [f"resume={run}", f"hydra.run.dir={tmp_path / 'other'}"]
     status, said = call("evaluate.py", [*again, "seeds=[1]"], monkeypatch, capsys)
-    assert status == 2 and "leave out seeds (only processes can change)" in error_line(said)
+    assert status == 2 and "leave out seeds (only processes, launcher, share can change)" in error_line(said)
     status, said = call("evaluate.py", [*again, "processes=1"], monkeypatch, capsys)
     assert status == 0 and left == [0], said
     rows = [read_rows(folder / "rollouts.csv") for folder in (tmp_path / "whole", run)]

@@ -12,6 +12,7 @@ from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.score import score_rollouts
+from e2rl.report.drawing import image_of
 from e2rl.report.egos import ego_tables, guard_table
 from e2rl.report.plots import collision_bars
 from e2rl.sim.env import SimSettings
@@ -86,7 +87,7 @@ def test_tables_guards_and_bars_name_every_ego_and_a_missed_guard(run):
     strict, loose = (guard_table(rows, "one", "fast", "same", recorded) for recorded in (0.0, 100.0))
     verdicts = [{row[0].split(" ")[0]: row[-1] for row in table.rows} for table in (strict, loose)]
     assert [verdict["macc"] for verdict in verdicts] == ["missed", "met"] and verdicts[0]["progress"] == "met"
-    assert collision_bars(rows, names, "e2").size[0] > 0
+    assert image_of(collision_bars(rows, names, "e2")).size[0] > 0
 
 
 def rows_of(values, ego, training=None):
