@@ -149,7 +149,8 @@ class Drawn:
         from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 
         x, y, heading, _ = self.rollout["states"][step, 0].tolist()
-        made = FrameTransform(parent_frame_id=MAP, child_frame_id=EGO, translation={"x": x, "y": y})
+        made = FrameTransform(parent_frame_id=MAP, child_frame_id=EGO)
+        made.translation.x, made.translation.y = x, y
         made.rotation.z, made.rotation.w = math.sin(heading / 2), math.cos(heading / 2)
         made.timestamp.FromNanoseconds(self._time(step))
         return made.SerializeToString(deterministic=True)
