@@ -10,8 +10,8 @@ from torch import Tensor
 
 from e2rl.metrics.contact import FRONT, Batch
 from e2rl.scene.boxes import separation
+from e2rl.sim.fault import STANDING
 
-STANDING = 0.1  # m/s
 CUT_IN_STEPS = 10  # 1 s at 10 Hz
 AHEAD = 30.0  # m, straight on from the contact, that count as the ego's path
 

@@ -10,6 +10,7 @@ from e2rl.errors import InputError
 DEFAULT_WEIGHTS = {
     "progress": 0.05,
     "contact": -20.0,
+    "fault": 0.0,
     "off_road": -20.0,
     "comfort": -0.08,
     "acceleration": 0.0,
@@ -34,6 +35,7 @@ def rewarded_progress(progress: Tensor, limit: Tensor, top_speed: Tensor, dt: fl
 def reward_terms(
     progress: Tensor,
     contact: Tensor,
+    fault: Tensor,
     off_road: Tensor,
     action: Tensor,
     last_action: Tensor,
@@ -44,9 +46,9 @@ def reward_terms(
 ) -> dict[str, Tensor]:
     """The TERMS, each [B], of one step of dt seconds.
 
-    progress [B] m along the mission (`rewarded_progress`); contact, off_road [B] bool; action, last_action [B, 2]:
-    executed acceleration and yaw rate; speed, limit [B] m/s (limit 0 unknown: never exceeded); offset [B] m from the
-    mission route.
+    progress [B] m along the mission (`rewarded_progress`); contact, fault (a contact of the ego's own making), off_road
+    [B] bool; action, last_action [B, 2]: executed acceleration and yaw rate; speed, limit [B] m/s (limit 0 unknown:
+    never exceeded); offset [B] m from the mission route.
     """
     jerk = (action[:, 0] - last_action[:, 0]) / dt
     lateral = speed * action[:, 1]
@@ -55,6 +57,7 @@ def reward_terms(
     return {
         "progress": progress,
         "contact": contact.float(),
+        "fault": fault.float(),
         "off_road": off_road.float(),
         "comfort": comfort.clamp(max=3.0),
         "acceleration": (action[:, 0].abs() / 4).clamp(max=1.0),
@@ -72,5 +75,5 @@ def check_weights(weights: Mapping[str, float]) -> list[float]:
 
 
 def weighted_sum(terms: Mapping[str, Tensor], weights: Tensor) -> Tensor:
-    """Reward [B]; weights [7] in the order of TERMS."""
+    """Reward [B]; weights [8] in the order of TERMS."""
     return torch.stack([terms[name] for name in TERMS], -1) @ weights

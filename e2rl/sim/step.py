@@ -11,6 +11,7 @@ from torch import Tensor
 
 from e2rl.scene.recording import DT
 from e2rl.sim import dynamics
+from e2rl.sim.fault import own_fault
 from e2rl.sim.observation import EgoState, ObservationConfig, Observed, glance, observe
 from e2rl.sim.reward import reward_terms, rewarded_progress, weighted_sum
 from e2rl.sim.static import FrenetPose, StaticScene, follow
@@ -24,7 +25,7 @@ OF_EGO = tuple(name for name in EgoState._fields if name != "pose")
 
 
 class StepConfig(NamedTuple):
-    """horizon: steps of an episode; what ends it early: contact, off_road, departure of the ego; weights [6]: of
+    """horizon: steps of an episode; what ends it early: contact, off_road, departure of the ego; weights [8]: of
     reward.TERMS; low, high [2]: bounds of the action."""
 
     horizon: int
@@ -114,8 +115,9 @@ def advance(
     off_road = off & ego.been_on_road & present
     gone = ~present | (pose.s >= static.mission.end)
     touched = contact | contact_vru
+    fault = own_fault(ego.state[:, 3], seen.neighbours, hit, static.size, static.half_size)
     way = rewarded_progress(pose.s - ego.pose.s, seen.limit, static.top_speed, DT)
-    terms = reward_terms(way, touched, off_road, action, ego.action, state[:, 3], seen.limit, pose.d, DT)
+    terms = reward_terms(way, touched, fault, off_road, action, ego.action, state[:, 3], seen.limit, pose.d, DT)
     outcome = {
         "observation": seen.features,
         "reward": weighted_sum(terms, config.weights),

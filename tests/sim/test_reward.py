@@ -7,6 +7,7 @@ from e2rl.sim.reward import TERMS, check_weights, reward_terms, rewarded_progres
 QUIET = {
     "progress": torch.ones(1),
     "contact": torch.tensor([False]),
+    "fault": torch.tensor([False]),
     "off_road": torch.tensor([False]),
     "action": torch.zeros(1, 2),
     "last_action": torch.zeros(1, 2),
@@ -29,6 +30,7 @@ def test_quiet_driving_only_earns_progress():
 
 def test_terms_grow_with_what_they_name():
     assert term("contact", contact=torch.tensor([True])) == 1 and term("off_road", off_road=torch.tensor([True])) == 1
+    assert term("fault", fault=torch.tensor([True])) == 1
     assert abs(term("speeding", speed=torch.tensor([15.0])) - 0.25) < 1e-6
     assert term("speeding", speed=torch.tensor([15.0]), limit=torch.zeros(1)) == 0
     assert term("lane_offset", offset=torch.tensor([-1.0])) == 0.5

@@ -1,0 +1,79 @@
+"""A contact is of the ego's own making where it moves and its front, or a standing agent, is hit."""
+
+import pytest
+import torch
+
+from e2rl.metrics.contact import KINDS, first_contact
+from e2rl.metrics.fault import at_fault
+from e2rl.scene.recording import VEHICLE
+from e2rl.sim.fault import own_fault
+from e2rl.sim.neighbours import neighbours_of, rotation_into
+from e2rl.sim.trajectories import Agents
+
+SIZE = torch.tensor([[4.0, 2.0]])
+
+
+def judged(ego, others):
+    """Of egos [B, 4] among agents [B, M, 4], all of one size."""
+    half = SIZE.T[None].expand(len(ego), 2, others.shape[1]) / 2
+    still = torch.zeros(others.shape[:2])
+    agents = Agents(others, still == 0, still, still)
+    near = neighbours_of(ego, rotation_into(ego), SIZE.expand(len(ego), 2), half, agents)
+    return own_fault(ego[:, 3], near, near.gap < 0, SIZE.expand(len(ego), 2), half)
+
+
+@pytest.mark.parametrize(
+    ("place", "speed", "other_speed", "expected"),
+    [
+        ((3.8, 0.0), 5.0, 3.0, True),  # ahead
+        ((-3.8, 0.0), 5.0, 8.0, False),  # at the rear
+        ((0.0, 1.9), 5.0, 5.0, False),  # beside
+        ((0.0, 1.9), 5.0, 0.0, True),  # beside, and standing
+        ((3.8, 0.0), 0.05, 3.0, False),  # the ego stands
+        ((4.5, 0.0), 5.0, 3.0, False),  # no contact
+    ],
+)
+def test_own_fault_by_place_and_speed(place, speed, other_speed, expected):
+    for heading in (0.0, 2.0):  # whichever way the ego looks
+        turn = torch.tensor([[torch.tensor(heading).cos(), -torch.tensor(heading).sin()]])
+        turn = torch.cat([turn, turn.flip(1) * torch.tensor([[-1.0, 1.0]])])
+        there = turn @ torch.tensor(place) + torch.tensor([10.0, -5.0])
+        ego = torch.tensor([[10.0, -5.0, heading, speed]])
+        others = torch.tensor([[[*there.tolist(), heading, other_speed], [60.0, 60.0, 0.0, 5.0]]])
+        assert judged(ego, others).tolist() == [expected]
+
+
+def test_no_other_agent_no_fault():
+    assert judged(torch.tensor([[0.0, 0.0, 0.0, 5.0]]), torch.zeros(1, 0, 4)).tolist() == [False]
+
+
+def test_agrees_with_the_verdict_on_most_first_contacts():
+    """Against metrics/fault.py, which bisects the time of the contact: straight drives from all sides at 10 Hz."""
+    draw = torch.Generator().manual_seed(0)
+    count, steps = 400, 30
+    bearing = torch.rand(count, generator=draw) * 6.28
+    heading = bearing + 3.14 + (torch.rand(count, generator=draw) - 0.5) * 0.4
+    speed = torch.rand(count, 2, generator=draw) * 8 + 1
+    time = torch.arange(steps + 1) * 0.1
+    ego = torch.stack([speed[:, :1] * time, 0 * speed[:, :1] * time], -1)
+    meet = torch.stack([speed[:, 0] * 2, torch.zeros(count)], -1)
+    way = torch.stack([heading.cos(), heading.sin()], -1) * speed[:, 1:]
+    other = meet[:, None] + way[:, None] * (time[:, None] - 2)
+    states = torch.zeros(count, steps + 1, 2, 4)
+    states[..., 0, :2], states[..., 1, :2] = ego, other
+    states[..., 1, 2], states[..., 3] = heading[:, None], speed[:, None]
+    batch = {
+        "states": states,
+        "valid": torch.ones(count, steps + 1, 2, dtype=torch.bool),
+        "size": SIZE.expand(count, 2, 2),
+        "agent_type": torch.full((count, 2), VEHICLE),
+    }
+    batch |= first_contact(batch)
+    known = batch["hit"] & ~batch["start_overlap"]
+    at = states[torch.arange(count), batch["stop"]]
+    made = judged(at[:, 0], at[:, 1:])
+    assert known.sum() > 200 and {KINDS[k] for k in batch["kind"][known].tolist()} == set(KINDS)
+    share = {name: made[known & (batch["kind"] == k)].double().mean() for k, name in enumerate(KINDS)}
+    assert share["front"] > 0.9 and share["rear"] == 0
+    assert share["side"] < 0.4, "only near the corners"
+    assert (at_fault(batch) == 1)[known & ~made].double().mean() < 0.1, "what the verdict blames, the reward does too"
