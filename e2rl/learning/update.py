@@ -11,11 +11,12 @@ from torchrl.modules import PopArtValueNorm
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from e2rl.ego.network import ActorCritic
+from e2rl.ego.network import ActorCritic, ActorNetwork
 from e2rl.errors import InputError
 from e2rl.learning.cloning import cloning_loss, drawn, teaching_loss
 
 VALUE_MEMORY = 0.95  # weight of the past in the running mean and variance of the returns, per update
+GENTLE_FRAMES = 512  # of a minibatch, on which the policy's |acceleration| is measured
 PEAK_MEMORY = 0.75  # of the past in the running maximum of |advantage|, per update
 
 
@@ -36,6 +37,7 @@ class UpdateSettings:
     target_kl: float = 0.04
     advantage_filter: float = 0.01
     critic_warmup: int = 1
+    gentle: float = 0.0
     teaching: float = 0.0
     cloning: float = 0.0
     cloning_minibatch: int = 256
@@ -165,6 +167,9 @@ class Learner:
             "entropy": out["entropy"],
             "explained_variance": out["explained_variance"].mean(),
         }
+        if settings.gentle > 0 and not warming:
+            losses["loss_gentle"] = gentle_loss(self.network.network, minibatch[:GENTLE_FRAMES])
+            total = total + settings.gentle * losses["loss_gentle"]
         if experts and settings.cloning > 0 and not warming:
             pairs = drawn(experts, settings.cloning_minibatch).to(self.network.device)
             with self.network.network.noisy(settings.feature_noise, settings.last_action_noise):
@@ -192,6 +197,16 @@ class Learner:
         self.returns.load_state_dict(state["returns"])
         self.peak = state["peak"].to(self.network.device)
         self.updates = state["updates"]
+
+
+def gentle_loss(network: ActorNetwork, frames: TensorDictBase) -> Tensor:
+    """Mean |acceleration| [] in units of 4 m/s^2 of the actor's most central actions in frames [M] with `seen`, `offset`.
+
+    A price on what the policy means to do, not on what exploration makes of it: under a standard deviation above 1
+    m/s^2 the price of the action itself (`sim.reward.acceleration`) hardly tells small accelerations from none.
+    """
+    loc, _ = network.head(frames["seen"], frames["offset"])
+    return (network.middle[0] + network.reach[0] * loc[..., 0].tanh()).abs().mean() / 4
 
 
 def take_step(optimiser: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:

@@ -10,7 +10,7 @@ from torchrl.objectives.value import GAE
 
 from e2rl.ego.actor import ActorEgo
 from e2rl.errors import InputError
-from e2rl.learning.update import Learner, UpdateSettings
+from e2rl.learning.update import Learner, UpdateSettings, gentle_loss
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.observation import OBSERVATION_SIZE
 from tests.learning.small import small_scenes
@@ -73,6 +73,25 @@ def test_cloning_pulls_the_actor_towards_the_expert():
     for _ in range(4):
         losses.append(learner.update(batch_of(ego), expert)["loss_cloning"])
     assert losses[-1] < losses[0] - 1.0
+
+
+def test_a_gentle_learner_means_to_accelerate_less():
+    """At equal data the price on the policy's own mean makes its accelerations smaller, and 0 changes nothing."""
+    meant = {}
+    for gentle in (0.0, 5.0):
+        torch.manual_seed(0)
+        ego = ActorEgo(hidden=(16,))
+        learner = Learner(
+            ego.network, UpdateSettings(critic_warmup=0, gentle=gentle, minibatch=80, learning_rate=3e-3, target_kl=1e9)
+        )
+        data = batch_of(ego)
+        row = learner.update(data)
+        assert ("loss_gentle" in row) == (gentle > 0)
+        meant[gentle] = ego.network.network.deterministic(data["observation"])[..., 0].abs().mean().item()
+        if gentle > 0:
+            frames = TensorDict(ego.network.prepared(data["observation"]), data.shape)
+            assert gentle_loss(ego.network.network, frames).item() == pytest.approx(meant[gentle] / 4, rel=1e-4)
+    assert meant[5.0] < 0.9 * meant[0.0]
 
 
 def test_the_first_updates_fit_the_critic_alone():
