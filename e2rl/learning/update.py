@@ -200,7 +200,7 @@ class Learner:
 
 
 def gentle_loss(network: ActorNetwork, frames: TensorDictBase) -> Tensor:
-    """Mean |acceleration| [] in units of 4 m/s^2 of the actor's most central actions in frames [M] with `seen`, `offset`.
+    """Mean |acceleration| [] in units of 4 m/s^2 of the actor's most central actions in frames [M] (`seen`, `offset`).
 
     A price on what the policy means to do, not on what exploration makes of it: under a standard deviation above 1
     m/s^2 the price of the action itself (`sim.reward.acceleration`) hardly tells small accelerations from none.
