@@ -76,7 +76,7 @@ def evaluate(run: Run) -> list[dict]:
     rows = [row | provenance.origin_of(folder) for row in rows]
     write_metrics(folder / METRICS_FILE, rows)
     dropped = "".join(f"; left out: {count} scenes ({reason})" for reason, count in scenes.dropped.items())
-    effort = search_effort(scenes.scenes["logged"].shape[1] - 1)
+    effort = search_effort(scenes.steps)
     caption = f"{build.caption(config, origin, methods)}; {effort}{dropped}"
     tables = metric_tables(rows, caption, config.metrics)
     if config.compare is not None or config.figure == "curves":

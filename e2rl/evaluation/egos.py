@@ -81,6 +81,8 @@ def pool_trainings(
 
 def recorded_acceleration(scenes: SceneSet) -> float:
     """Mean |acceleration| [m/s^2] of the recorded egos, by the rule of the metric `macc`, over the scenes."""
-    logged, valid = scenes.scenes["logged"].double(), scenes.scenes["logged_valid"]
-    stop = torch.full((len(logged),), logged.shape[1] - 1)
-    return mean_acceleration(*ego_path(logged, valid, stop)).nanmean().item()
+    found = []
+    for part in scenes.parts():
+        stop = torch.full((len(part),), scenes.steps)
+        found.append(mean_acceleration(*ego_path(part["logged"].double(), part["logged_valid"], stop)))
+    return torch.cat(found).nanmean().item()

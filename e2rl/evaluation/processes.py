@@ -18,7 +18,8 @@ from e2rl.workers import interrupts_held, worker_pool
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 Processes = int | RayWorkers  # how many are forked here, or those elsewhere
-_function: Callable  # the function of a worker's pool
+_function: Callable  # the function of a worker's pool, and its jobs, which a fork has without being sent
+_jobs: Sequence
 
 
 def cores() -> int:
@@ -68,8 +69,8 @@ def _pool(function: Callable, jobs: Sequence, processes: Processes) -> AbstractC
 @contextmanager
 def _forked(function: Callable, jobs: Sequence, processes: int) -> Iterator[Submit]:
     try:
-        with worker_pool(min(processes, len(jobs)), "fork", _adopt, function) as pool:
-            yield lambda number: pool.submit(_call, jobs[number])
+        with worker_pool(min(processes, len(jobs)), "fork", _adopt, function, jobs) as pool:
+            yield lambda number: pool.submit(_call, number)
     except BrokenProcessPool as error:
         raise InputError(
             f"processes={processes}: a process was killed, perhaps for lack of memory; use fewer "
@@ -77,13 +78,13 @@ def _forked(function: Callable, jobs: Sequence, processes: int) -> Iterator[Subm
         ) from error
 
 
-def _adopt(function: Callable) -> None:
-    global _function
-    _function = function
+def _adopt(function: Callable, jobs: Sequence) -> None:
+    global _function, _jobs
+    _function, _jobs = function, jobs
 
 
-def _call(job) -> bytes:
-    return _packed(_function, job)
+def _call(number: int) -> bytes:
+    return _packed(_function, _jobs[number])
 
 
 def _packed(function: Callable[[Job], Result], job: Job) -> bytes:

@@ -39,16 +39,17 @@ SPLITS = 200  # random splits of the logs into halves
 class Tally:
     """Counts of the features' bins and of indications for every vehicle [S * V] of scenes [S], over rollouts."""
 
-    def __init__(self, scenes: TensorDictBase):
-        self.scenes, self.vehicles = scenes, scenes["route_log"].shape[1]
+    def __init__(self, scenes: SceneSet):
+        self.scenes, self.vehicles = scenes, scenes.rows.shape("route_log")[0]
         size = len(scenes) * self.vehicles
         self.counts = {name: torch.zeros(size, FEATURES[name].bins, dtype=torch.float64) for name in HISTOGRAMS}
         self.hits = {name: torch.zeros(size, dtype=torch.float64) for name in INDICATIONS}
 
     def add(self, index: Tensor, rollouts: dict, weight: int = 1) -> None:
         """Count rollouts of scenes index [B] int64, each as `weight` equal ones."""
-        batch = {**rollouts, **road_of(self.scenes[index], rollouts["routes"])}
-        rollout, agent = evaluated(self.scenes[index]).nonzero(as_tuple=True)
+        scenes = self.scenes.batch(index)
+        batch = {**rollouts, **road_of(scenes, rollouts["routes"])}
+        rollout, agent = evaluated(scenes).nonzero(as_tuple=True)
         for part in torch.arange(len(rollout)).split(TRACKS):
             key = index[rollout[part]] * self.vehicles + agent[part]
             values, events = track_features(batch, rollout[part], agent[part])
@@ -60,26 +61,25 @@ class Tally:
 
     def likelihoods(self, rollouts: int) -> dict[str, Tensor]:
         """Likelihood [S] of each feature's logged values after `rollouts` rollouts of every scene; NaN without any."""
-        scenes = self.scenes
-        found: dict[str, list[tuple[Tensor, Tensor]]] = {name: [] for name in FEATURES}
-        batch = {
-            "states": scenes["logged"],
-            "valid": scenes["logged_valid"],
-            "size": scenes["size"],
-            **road_of(scenes, scenes["route_log"]),
-        }
-        scene, agent = evaluated(scenes).nonzero(as_tuple=True)
-        for part in torch.arange(len(scene)).split(TRACKS):
-            key = scene[part] * self.vehicles + agent[part]
-            values, events = track_features(batch, scene[part], agent[part])
-            for name, (value, known) in values.items():
-                log_p = log_probability(self.counts[name][key], bin_index(value, FEATURES[name]))
-                found[name].append((log_p, known))
-            for name, event in events.items():
-                log_p = log_bernoulli(self.hits[name][key], rollouts, event)[:, None]
-                found[name].append((log_p, torch.ones_like(log_p, dtype=torch.bool)))
+        found: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {name: [] for name in FEATURES}
+        begin = 0  # of the part
+        for scenes in self.scenes.parts():
+            log = {"states": scenes["logged"], "valid": scenes["logged_valid"], "size": scenes["size"]}
+            batch = {**log, **road_of(scenes, scenes["route_log"])}
+            row, agent = evaluated(scenes).nonzero(as_tuple=True)
+            for part in torch.arange(len(row)).split(TRACKS):
+                scene = begin + row[part]
+                key = scene * self.vehicles + agent[part]
+                values, events = track_features(batch, row[part], agent[part])
+                for name, (value, known) in values.items():
+                    log_p = log_probability(self.counts[name][key], bin_index(value, FEATURES[name]))
+                    found[name].append((log_p, known, scene))
+                for name, event in events.items():
+                    log_p = log_bernoulli(self.hits[name][key], rollouts, event)[:, None]
+                    found[name].append((log_p, torch.ones_like(log_p, dtype=torch.bool), scene))
+            begin += len(scenes)
         columns_of = {name: map(torch.cat, zip(*parts, strict=True)) for name, parts in found.items()}
-        return {name: likelihood(log_p, known, scene, len(scenes)) for name, (log_p, known) in columns_of.items()}
+        return {name: likelihood(*columns, len(self.scenes)) for name, columns in columns_of.items()}
 
 
 def evaluated(scene: TensorDictBase) -> Tensor:
@@ -114,10 +114,7 @@ def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, kept: Kept
     with tqdm(total=sum(seeds) * len(scenes), desc="meta-metric", unit="rollout", disable=None) as bar:
         for number, (method, count) in enumerate(zip(methods, seeds, strict=True)):
             name, identity = f"meta-{number:03}", [method.name, float(method.eta), rollouts]
-            tally, tasks = (
-                Tally(scenes.scenes),
-                [(scene, seed) for seed in range(count) for scene in range(len(scenes))],
-            )
+            tally, tasks = (Tally(scenes), [(scene, seed) for seed in range(count) for scene in range(len(scenes))])
             done, tally.counts, tally.hits = kept.load(name, identity) or (0, tally.counts, tally.hits)
             bar.update(done)
             for begin in range(done, len(tasks), setup.batch):
@@ -147,12 +144,13 @@ def summarise_meta(likelihoods: dict[str, Tensor], scenes: SceneSet) -> dict[str
 
 def log_split_half(scenes: SceneSet) -> dict[str, float]:
     """Mean and 95% range of `real` between random halves of the logs, split by place; n counts scenes."""
-    scene = scenes.scenes
-    simulated = scene["valid"] & (scene["agent_type"] == VEHICLE)
-    simulated[:, 0] = False
-    simulated[:, scene["route_log"].shape[1] :] = False
-    log = scene["logged"].double(), scene["logged_valid"]
-    samples = kinematic_samples(*log, *log, simulated, torch.full((len(scene),), log[0].shape[1] - 1))
+    samples = []
+    for scene in scenes.parts():
+        simulated = scene["valid"] & (scene["agent_type"] == VEHICLE)
+        simulated[:, 0] = False
+        simulated[:, scene["route_log"].shape[1] :] = False
+        log = scene["logged"].double(), scene["logged_valid"]
+        samples += kinematic_samples(*log, *log, simulated, torch.full((len(scene),), scenes.steps))
     cluster, clusters = _clusters(scenes)
     generator = torch.Generator().manual_seed(0)
     order = torch.rand(SPLITS, clusters, generator=generator).argsort(1)

@@ -95,7 +95,7 @@ class PolicyImprovement(Improvement):
             raise InputError(f"learner=ppo_bc improves ego=actor, not {type(ego).__name__}; use learner=planner_tuning")
         self.settings = settings_of(CollectSettings, collect or {}, "learner.collect")
         update = settings_of(UpdateSettings, ppo or {}, "learner.ppo")
-        batch, self.horizon = self.settings.batch, scenes.scenes["logged"].shape[1] - 1
+        batch, self.horizon = self.settings.batch, scenes.steps
         hold, iterations = self.settings.hold, self.settings.iterations
         if self.settings.steps * iterations * hold < self.horizon:
             raise InputError(

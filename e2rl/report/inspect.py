@@ -20,6 +20,7 @@ from e2rl.errors import InputError, stop
 from e2rl.evaluation.files import polylines
 from e2rl.report import drawing
 from e2rl.report.drawing import Shape, TrafficMap, Trail, new_figure, save_figure
+from e2rl.scene.packed import unpack
 from e2rl.scene.paths import arc_length
 from e2rl.scene.recording import AGENT_TYPES, LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, VEHICLE
 from e2rl.scene.source import Row, Source, source_of
@@ -196,7 +197,7 @@ def inspect(source: Source, chosen: str | None) -> tuple[list[Row], list[Content
         for row in found:
             rows.append(row._replace(scene=None))
             if row.scene is not None:
-                contents.append(content(row.scene))
+                contents.append(content(unpack(row.scene.record)))
                 drawn = row if drawn is None and chosen in (None, row.scene_id) else drawn
     if drawn is None:
         names = [row.scene_id for row in rows if not row.reason][:1]
@@ -243,7 +244,8 @@ def main(arguments: list[str] | None = None) -> None:
         if options.apart:
             print(check_apart(rows, source, open_source(options.apart, name, options.workers)[1]))
         assert drawn.scene is not None
-        save_figure(options.out, picture(drawn.scene, f"{drawn.scene_id}   {drawn.location}", options.metres))
+        scene, title = unpack(drawn.scene.record), f"{drawn.scene_id}   {drawn.location}"
+        save_figure(options.out, picture(scene, title, options.metres))
     except InputError as error:
         stop(error)
     print(f"drawn        {drawn.scene_id}: {options.out}")

@@ -48,21 +48,36 @@ def build_scene(recording: Recording, settings: BuildSettings) -> TensorDict:
 
     Raises InputError where the recording makes none (no ego, no lanes, NaN states), and where it is not plausible.
     """
-    frame = recording.validate().current
-    assert frame is not None
-    check(extent(recording) | motion(recording), recording.scene_id)
-    valid = drop_jumps(recording.states, recording.valid)
-    valid[:, recording.ego] = recording.valid[:, recording.ego]  # without the ego there is no scene
-    graph = LaneGraph(recording.lanes)
-    if not graph.ids:
-        raise InputError(f"scene {recording.scene_id!r}: no lane is at least 0.5 m long; leave the scene out")
-    check(map_fit(recording, graph), recording.scene_id)
-    scene, origin = _agents(recording, frame, valid, settings)
-    lights = {name: index for index, name in enumerate(recording.lights)}
-    scene |= _routes(scene, graph, origin, lights, settings)
-    scene |= _lights(recording, frame, origin, settings.steps)
-    scene |= _map(recording, graph, scene, origin, settings)
-    return TensorDict({key: _tensor(value) for key, value in scene.items()}, batch_size=[])
+    return SceneBuilder(recording, settings).scene(recording)
+
+
+class SceneBuilder:
+    """The scenes of one log from whatever start frames: what does not depend on these is computed once."""
+
+    def __init__(self, recording: Recording, settings: BuildSettings) -> None:
+        """Raises InputError for what `build_scene` does, the start frame apart."""
+        recording.validate_log()
+        check(extent(recording) | motion(recording), recording.scene_id)
+        self.valid = drop_jumps(recording.states, recording.valid)
+        self.valid[:, recording.ego] = recording.valid[:, recording.ego]  # without the ego there is no scene
+        self.graph = LaneGraph(recording.lanes)
+        if not self.graph.ids:
+            raise InputError(f"scene {recording.scene_id!r}: no lane is at least 0.5 m long; leave the scene out")
+        check(map_fit(recording, self.graph), recording.scene_id)
+        self.states = smooth(recording.states, self.valid)
+        self.settings = settings
+
+    def scene(self, recording: Recording) -> TensorDict:
+        """The Scene of the log from the start frame of `recording`, one of its `windows`; raises InputError where it is
+        no start."""
+        frame = recording.validate_start().current
+        assert frame is not None
+        scene, origin = _agents(recording, frame, self.states, self.valid, self.settings)
+        lights = {name: index for index, name in enumerate(recording.lights)}
+        scene |= _routes(scene, self.graph, origin, lights, self.settings)
+        scene |= _lights(recording, frame, origin, self.settings.steps)
+        scene |= _map(recording, self.graph, scene, origin, self.settings)
+        return TensorDict({key: _tensor(value) for key, value in scene.items()}, batch_size=[])
 
 
 def _tensor(value: np.ndarray) -> torch.Tensor:
@@ -70,9 +85,11 @@ def _tensor(value: np.ndarray) -> torch.Tensor:
     return tensor.float() if tensor.dtype == torch.float64 else tensor
 
 
-def _agents(recording: Recording, frame: int, valid: np.ndarray, settings: BuildSettings) -> tuple[Arrays, np.ndarray]:
-    """Start states, past and recorded future of the agents that take part, and the scene's origin [2]."""
-    states = smooth(recording.states, valid)
+def _agents(
+    recording: Recording, frame: int, states: np.ndarray, valid: np.ndarray, settings: BuildSettings
+) -> tuple[Arrays, np.ndarray]:
+    """Start states, past and recorded future of the agents that take part, and the scene's origin [2]; states, valid:
+    the smoothed tracks."""
     start, accel, yaw_rate = causal_state(recording.states, valid, frame)
     start = np.where(valid[frame, :, None], start, 0.0)
     origin = np.round(start[recording.ego, :2])
@@ -103,7 +120,8 @@ def _agents(recording: Recording, frame: int, valid: np.ndarray, settings: Build
         "logged_valid": padded(known.T).T,
         "past": np.zeros((settings.vehicles, PAST, 3)),
     }
-    scene["past"][cars] = causal_past(recording.states, valid, frame, start[:, 3])[tracks[cars]]
+    past = causal_past(recording.states[:, tracks[cars]], valid[:, tracks[cars]], frame, start[tracks[cars], 3])
+    scene["past"][cars] = past
     return scene, origin
 
 
@@ -180,17 +198,22 @@ def _on_lane(graph: LaneGraph, route: Route, position: np.ndarray) -> bool:
 
 def _driven(scene: Arrays, routes: Arrays) -> np.ndarray:
     """The candidate [V] nearest to each vehicle's recorded future, -1 where none is near."""
-    route = {key: torch.from_numpy(value) for key, value in routes.items()}
-    cars = len(routes["route_points"])
-    track = torch.from_numpy(scene["logged"][:, :cars].swapaxes(0, 1).copy())
+    cars, candidates = routes["route_valid"].shape
     known = torch.from_numpy(scene["logged_valid"][:, :cars].T.copy())
-    s, d, heading = project(track[:, None, :, :2].contiguous(), route["route_points"])
-    turned = wrap(heading - track[:, None, :, 2])
-    over = (s - route["route_length"][..., None]).clamp(min=0) * ~route["route_open"][..., None]
-    weight = known[:, None].double()
-    mean = ((d.abs() + 2.0 * turned.abs() + over) * weight).sum(-1) / weight.sum(-1).clamp(min=1)
-    mean[~route["route_valid"]] = torch.inf
-    return torch.where((mean.min(1).values < FIT) & known.any(1), mean.argmin(1), -1).numpy()
+    valid = torch.from_numpy(routes["route_valid"]) & known.any(1, keepdim=True)
+    car = valid.nonzero()[:, 0]
+    track = torch.from_numpy(scene["logged"][:, :cars].swapaxes(0, 1).copy())[car]
+    points, length, closed = (
+        torch.from_numpy(value)[valid]
+        for value in (routes["route_points"], routes["route_length"], ~routes["route_open"])
+    )
+    s, d, heading = project(track[..., :2].contiguous(), points)
+    over = (s - length[:, None]).clamp(min=0) * closed[:, None]
+    weight = known[car].double()
+    distance = (d.abs() + 2.0 * wrap(heading - track[..., 2]).abs() + over) * weight
+    mean = torch.full((cars, candidates), torch.inf, dtype=torch.float64)
+    mean[valid] = distance.sum(-1) / weight.sum(-1).clamp(min=1)
+    return torch.where(mean.min(1).values < FIT, mean.argmin(1), -1).numpy()
 
 
 def _lights(recording: Recording, frame: int, origin: np.ndarray, steps: int) -> Arrays:

@@ -8,6 +8,7 @@ CELL = 1.0  # m
 MARGIN = 1.0  # m beyond half the lane width that still counts as on the road
 FAR = 10.0  # m, the field's largest value
 INSIDE = 1.0  # m: cells at least this deep inside one lane are not compared with others
+TILE = 8  # cells, the side of the squares that are searched first
 
 
 def drivable_field(
@@ -20,30 +21,52 @@ def drivable_field(
     0.1 m); inside it is at most the depth, since each shape is taken by itself.
     """
     origin = center - (cells - 1) / 2 * CELL
-    axis = np.arange(cells) * CELL
-    grid = np.stack(np.meshgrid(origin[0] + axis, origin[1] + axis, indexing="ij"), -1).reshape(-1, 2)
-    field = np.full(len(grid), FAR)
+    x, y = origin[:, None] + np.arange(cells) * CELL
+    field = np.full((cells, cells), FAR)
     if lines:
         # One search per width, the widest first: the nearest line is not always the one whose border is nearest.
         width = np.round(np.repeat(widths, [len(line) for line in lines]), 1)
         points = np.concatenate(lines)
         for each in np.unique(width)[::-1]:
-            reach, own = each / 2 + MARGIN, points[width == each]
-            unsettled = np.flatnonzero(_within(grid, own, FAR + reach) & (field > -INSIDE))
-            distance = cKDTree(own).query(grid[unsettled], distance_upper_bound=FAR + reach)[0]
-            field[unsettled] = np.minimum(field[unsettled], distance - reach)
+            _lower(field, x, y, points[width == each], each / 2 + MARGIN)
     for ring in polygons:
-        near = np.flatnonzero(_within(grid, ring, FAR))
-        if len(near):
-            inside = Path(ring).contains_points(grid[near])
-            border = _border_distance(ring, grid[near])
-            field[near] = np.minimum(field[near], np.where(inside, -border, border))
-    return field.reshape(cells, cells).astype(np.float16), origin
+        rows, columns = _near(x, y, ring, FAR)
+        near = np.stack(np.meshgrid(x[rows], y[columns], indexing="ij"), -1)
+        if near.size:
+            cell = near.reshape(-1, 2)
+            border = _border_distance(ring, cell)
+            signed = np.where(Path(ring).contains_points(cell), -border, border).reshape(near.shape[:2])
+            field[rows, columns] = np.minimum(field[rows, columns], signed)
+    return field.astype(np.float16), origin
 
 
-def _within(grid: np.ndarray, points: np.ndarray, reach: float) -> np.ndarray:
-    """Which grid points [Q, 2] lie within `reach` m of the bounding box of points [P, 2]."""
-    return (grid >= points.min(0) - reach).all(1) & (grid <= points.max(0) + reach).all(1)
+def _near(x: np.ndarray, y: np.ndarray, points: np.ndarray, reach: float) -> tuple[slice, slice]:
+    """The cells, at x [G] and y [G], within `reach` m of the bounding box of points [P, 2]."""
+    low, high = points.min(0) - reach, points.max(0) + reach
+    return (
+        slice(np.searchsorted(x, low[0], "left"), np.searchsorted(x, high[0], "right")),
+        slice(np.searchsorted(y, low[1], "left"), np.searchsorted(y, high[1], "right")),
+    )
+
+
+def _lower(field: np.ndarray, x: np.ndarray, y: np.ndarray, points: np.ndarray, reach: float) -> None:
+    """Lower the field [G, G] of cells at x [G], y [G] to the distance from points [P, 2] less `reach`, where that is
+    less; in place, without the cells that are at least INSIDE already.
+
+    The distance from a tile's middle bounds that of its cells, so cells which cannot change are not searched.
+    """
+    rows, columns = _near(x, y, points, FAR + reach)
+    part, x, y = field[rows, columns], x[rows], y[columns]
+    if not part.size:
+        return
+    tree = cKDTree(points, compact_nodes=False, balanced_tree=False)
+    middle, radius = (TILE - 1) / 2 * CELL, (TILE - 1) / 2 * CELL * np.sqrt(2) + 1e-6
+    tiles = np.stack(np.meshgrid(x[::TILE] + middle, y[::TILE] + middle, indexing="ij"), -1)
+    least = tree.query(tiles, distance_upper_bound=FAR + reach + radius)[0] - radius - reach
+    least = least.repeat(TILE, 0).repeat(TILE, 1)[: len(x), : len(y)]
+    i, j = ((part > -INSIDE) & (least < part)).nonzero()
+    distance = tree.query(np.stack([x[i], y[j]], -1), distance_upper_bound=FAR + reach)[0]
+    part[i, j] = np.minimum(part[i, j], distance - reach)
 
 
 def _border_distance(ring: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -21,8 +21,10 @@ def wrap(angle: Angle) -> Angle:
 
 def arc_length(points: np.ndarray) -> np.ndarray:
     """Cumulative length [..., P] of polylines [..., P, 2], starting at 0."""
-    steps = np.linalg.norm(np.diff(points, axis=-2), axis=-1)
-    return np.concatenate([np.zeros_like(steps[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
+    step = points[..., 1:, :] - points[..., :-1, :]
+    arc = np.zeros(points.shape[:-1])
+    np.cumsum(np.sqrt(step[..., 0] ** 2 + step[..., 1] ** 2), axis=-1, out=arc[..., 1:])
+    return arc
 
 
 def points_at(line: np.ndarray, arc: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -39,18 +41,28 @@ def resample(points: np.ndarray, spacing: float) -> np.ndarray:
     """Points [Q, 2] nearly every `spacing` m along points [P, 2]: the length is divided evenly."""
     arc = arc_length(points)
     count = max(int(np.ceil(arc[-1] / spacing)), 1) + 1
-    return points_at(points, arc, np.linspace(0.0, arc[-1], count))
+    at = np.arange(count) * (arc[-1] / (count - 1))
+    at[-1] = arc[-1]
+    return points_at(points, arc, at)
 
 
 def tangent_angle(points: np.ndarray) -> np.ndarray:
     """Direction [P] rad of a polyline [P, 2] at its points."""
-    tangent = np.gradient(points, axis=0)
+    tangent = tangents(points)
     return np.arctan2(tangent[:, 1], tangent[:, 0])
+
+
+def tangents(points: np.ndarray) -> np.ndarray:
+    """Central differences [P, 2] of a polyline [P, 2] over its index, at its ends one-sided."""
+    out = np.empty_like(points, float)
+    out[1:-1] = (points[2:] - points[:-2]) / 2
+    out[0], out[-1] = points[1] - points[0], points[-1] - points[-2]
+    return out
 
 
 def shift_left(points: np.ndarray, distance: np.ndarray | float) -> np.ndarray:
     """Polyline [P, 2] shifted `distance` m (scalar or [P]) to its left."""
-    tangent = np.gradient(points, axis=0)
+    tangent = tangents(points)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-9)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], -1)
     return points + np.broadcast_to(distance, len(points))[:, None] * normal

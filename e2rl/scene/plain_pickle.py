@@ -1,62 +1,32 @@
 """Pickles of plain data, read without running them: containers, numbers, text and numpy arrays.
 
-A pickle is a program for a stack machine, whose opcodes the standard library's `pickletools` documents and decodes. The
-machine here has the opcodes that plain data needs, of every protocol, and no others. A class or function that a file
+A pickle is a program for a stack machine, whose opcodes the standard library's `pickletools` documents. The machine
+here has the opcodes that plain data needs, of every protocol, and no others. A class or function that a file
 names is a name and no more: the few that arrays and sets are made of are carried out here, with checked arguments, and
 all others are refused. What the file may cost is bounded, too: depth, opcodes, and the items that a reader meets who
-follows every reference. A container is complete before another one holds it, so that nothing holds itself.
+follows every reference. A container is complete when it is referred to a second time, so that nothing holds itself.
 """
 
+import pickle
 import pickletools
 import re
-from collections.abc import Callable, Hashable, Iterable
-from dataclasses import dataclass
-from math import prod
-from typing import Any, Literal
+from collections.abc import Callable
+from io import BytesIO
+from struct import Struct
+from typing import Any
 
 import numpy as np
 
+from e2rl.scene.plain_objects import MAX_ITEMS, NAMES, RECONSTRUCT, Name, Unbuilt, array_of, as_keys, called, dtype_of
+
 MAX_OPCODES, MAX_CONTAINERS = 5_000_000, 500_000  # the longest genuine log known has 150,000 and 40,000
-MAX_DEPTH, MAX_ITEMS = 64, 20_000_000
+MAX_DEPTH = 64
 MAX_BITS = 64  # of a whole number
-DTYPE = re.compile(r"[?]|[biufc](1|2|4|8|16)|[SU][1-9]\d{0,4}|O[48]?")
-KEYS = (str, int, float, bytes, type(None), np.str_, np.integer, np.floating)  # hashed without recursion
-PLAIN = ("set", "frozenset", "list", "dict", "tuple", "int", "float", "bool", "str", "bytes", "bytearray", "complex")
-NAMES = {f"builtins.{name}" for name in PLAIN} | {
-    "collections.defaultdict",
-    "_codecs.encode",  # bytes in protocols 0 to 2
-    "numpy.ndarray",
-    "numpy.dtype",
-    "numpy._core.multiarray._reconstruct",
-    "numpy._core.multiarray.scalar",
-    "numpy._core.numeric._frombuffer",
-}
-
-
-@dataclass(frozen=True)
-class _Name:
-    """A class or function that a pickle names; it is never imported."""
-
-    path: str
-
-
-@dataclass
-class _Unbuilt:
-    """An array (dtype None) or a numpy type of which the pickle has yet to give the state."""
-
-    dtype: str | None = None
-    value: Any = None
-
-
-@dataclass(slots=True)
-class _Extent:
-    """Of a container: how deep it nests and how many items it holds if all references are followed; held: by another
-    container, hence complete."""
-
-    container: object
-    depth: int
-    items: int
-    held: bool = False
+HOLDING = frozenset([tuple, list, dict, set, frozenset, np.ndarray, Unbuilt])  # types that hold or stand for others
+NDARRAY = Name("numpy.ndarray")
+ARRAY = re.compile(  # the program of an array of one or two dimensions, after RECONSTRUCT and before the array's bytes
+    rb"h(.)K\x00\x85\x94h(.)\x87\x94R\x94\(K\x01(?:K(.)\x85|K(.)K(.)\x86)\x94h(.)\x89(?:C(.)|B(....))", re.DOTALL
+)
 
 
 def load_plain(content: bytes) -> Any:
@@ -72,19 +42,53 @@ class _Machine:
         self.stack: list[Any] = []
         self.marks: list[int] = []
         self.memo: dict[int, Any] = {}
-        self.extents: dict[int, _Extent] = {}  # by id; they keep their containers, so an id stays one container's
+        self.containers = 0
+        self.shared: dict[int, tuple[Any, int, int]] = {}  # by id: a container that is complete, its depth and items
 
     def run(self, content: bytes) -> Any:
-        for count, (opcode, argument, _) in enumerate(pickletools.genops(content)):
-            if count >= MAX_OPCODES:
-                raise ValueError(f"has more than {MAX_OPCODES} opcodes")
-            act = ACTIONS.get(opcode.name)
-            if act is None:
-                raise ValueError(f"holds more than plain data (opcode {opcode.name})")
-            act(self, argument)
-        if len(self.stack) != 1 or self.marks:
+        """The object that a pickle makes. The opcodes that three quarters of a log consist of are carried out here."""
+        stack, marks, memo, stream, position = self.stack, self.marks, self.memo, BytesIO(content), 0
+        for _ in range(MAX_OPCODES):
+            code = content[position]
+            position += 1
+            if code == 0x94:  # MEMOIZE
+                memo[len(memo)] = stack[-1]
+            elif code == 0x6A or code == 0x68:  # LONG_BINGET, BINGET
+                end = position + (4 if code == 0x6A else 1)
+                value = memo[int.from_bytes(content[position:end], "little")]
+                if value.__class__ in HOLDING:
+                    value = self.fetched(value)
+                elif value.__class__ is Name:
+                    value, end = self.array(content, end) if value.path == RECONSTRUCT else (value, end)
+                stack.append(value)
+                position = end
+            elif code == 0x8C:  # SHORT_BINUNICODE, and a MEMOIZE that follows
+                end = position + 1 + content[position]
+                value = content[position + 1 : end].decode("utf-8", "surrogatepass")
+                stack.append(value)
+                position = end
+                if content[end] == 0x94:
+                    memo[len(memo)] = value
+                    position += 1
+            elif code == 0x4B:  # BININT1
+                stack.append(content[position])
+                position += 1
+            elif code == 0x28:  # MARK
+                marks.append(len(stack))
+            elif code == STOP:
+                break
+            else:
+                read, act = ACTS[code]
+                argument = None
+                if read is not None:
+                    argument, position = read(content, position, stream)
+                act(self, argument)
+        else:
+            raise ValueError(f"has more than {MAX_OPCODES} opcodes")
+        if len(stack) != 1 or marks or position > len(content):
             raise ValueError("is not one object")
-        return self.stack[0]
+        self.measure(stack[0], 0)
+        return stack[0]
 
     # --- stack and memo
 
@@ -108,71 +112,80 @@ class _Machine:
         del self.stack[begin:]
         return taken
 
-    def mark(self, _: None) -> None:
-        self.marks.append(len(self.stack))
-
     def put(self, key: int | None) -> None:
         self.memo[len(self.memo) if key is None else key] = self.stack[-1]
 
     def get(self, key: int) -> None:
         value = self.memo[key]
-        self.stack.append(value.value if isinstance(value, _Unbuilt) else value)
+        self.stack.append(self.fetched(value) if type(value) in HOLDING else value)
+
+    def fetched(self, value: Any) -> Any:
+        """What a reference to an object of the memo stands for; if it is a container, it is complete from now on."""
+        value = value.value if type(value) is Unbuilt else value
+        if type(value) in HOLDING and id(value) not in self.shared:
+            self.shared[id(value)] = (value, *self.measure(value, 0))
+        return value
 
     # --- containers
 
-    def hold(self, parts: Iterable[Any]) -> tuple[int, int]:
-        """(depth, items) of objects that a container is about to hold; containers among them are complete from now."""
-        depth = items = 0
-        for part in parts:
-            extent = self.extents.get(id(part))
-            if extent is None:
-                items += 1
-            else:
-                extent.held, depth, items = True, max(depth, extent.depth), items + extent.items
+    def measure(self, value: Any, level: int) -> tuple[int, int]:
+        """(depth, items) of an object at `level` of another one: how deep it nests, and how many items it holds if all
+        references are followed. What is shared was measured before, so the walk is over a tree."""
+        kind, known = type(value), self.shared.get(id(value))
+        if known is not None:
+            depth, items = known[1:]
+        elif kind not in HOLDING:
+            return 0, 1
+        elif level >= MAX_DEPTH:
+            raise ValueError(f"nests deeper than {MAX_DEPTH} levels")
+        else:
+            depth, items = 1, 1 + (value.size if kind is np.ndarray else len(value))
+            if kind is dict:
+                items, value = items + len(value), value.values()
+            elif kind is np.ndarray:
+                value = value.ravel().tolist() if value.dtype.kind == "O" else ()
+            for part in () if HOLDING.isdisjoint(map(type, value)) else value:
+                if type(part) in HOLDING:
+                    below, more = self.measure(part, level + 1)
+                    depth, items = max(depth, below + 1), items + more - 1
+        if level + depth > MAX_DEPTH:
+            raise ValueError(f"nests deeper than {MAX_DEPTH} levels")
+        if items > MAX_ITEMS:
+            raise ValueError(f"stands for more than {MAX_ITEMS} items")
         return depth, items
 
-    def push(self, container: Any, depth: int = 0, items: int = 0) -> None:
-        """Push a new container that holds objects of these `hold`."""
-        if len(self.extents) >= MAX_CONTAINERS:
+    def count(self, containers: int) -> None:
+        self.containers += containers
+        if self.containers > MAX_CONTAINERS:
             raise ValueError(f"has more than {MAX_CONTAINERS} containers")
-        self.extents[id(container)] = _Extent(container, 0, 1)
-        self.stack.append(container)
-        self.grow(container, depth, items)
 
-    def grow(self, container: Any, depth: int, items: int) -> None:
-        extent = self.extents[id(container)]
-        if extent.held:
+    def push(self, container: Any) -> None:
+        """Push a new container."""
+        self.count(1)
+        self.stack.append(container)
+
+    def growing(self, kind: type) -> Any:
+        """The container on the top of the stack, which is about to take more."""
+        target = self.stack[-1]
+        if type(target) is not kind:
+            raise ValueError(f"adds items of a {kind.__name__} to a {type(target).__name__}")
+        if id(target) in self.shared:
             raise ValueError("adds to a container that is in use already")
-        extent.depth, extent.items = max(extent.depth, 1 + depth), extent.items + items
-        if extent.depth > MAX_DEPTH:
-            raise ValueError(f"nests deeper than {MAX_DEPTH} levels")
-        if extent.items > MAX_ITEMS:
-            raise ValueError(f"stands for more than {MAX_ITEMS} items")
+        return target
 
     def make_tuple(self, parts: list[Any]) -> None:
-        extent = self.hold(parts)
-        self.push(tuple(parts), *extent)
+        self.push(tuple(parts))
 
     def append(self, parts: list[Any]) -> None:
-        target, extent = self.stack[-1], self.hold(parts)
-        if type(target) is not list:
-            raise ValueError(f"appends to a {type(target).__name__}")
-        self.grow(target, *extent)
-        target += parts
+        self.growing(list).extend(parts)
 
     def add(self, parts: list[Any]) -> None:
-        target = self.stack[-1]
-        if type(target) is not set:
-            raise ValueError(f"adds items to a {type(target).__name__}")
-        self.grow(target, *self.hold(parts))
-        target.update(map(_key, parts))
+        self.growing(set).update(as_keys(parts))
 
     def set_items(self, parts: list[Any]) -> None:
-        target, extent = self.stack[-1], self.hold(parts)
-        if type(target) is not dict or len(parts) % 2:
-            raise ValueError(f"sets items of a {type(target).__name__}")
-        self.grow(target, *extent)
-        target.update(zip(map(_key, parts[::2]), parts[1::2], strict=True))
+        if len(parts) % 2:
+            raise ValueError("sets an item without a value")
+        self.growing(dict).update(zip(as_keys(parts[::2]), parts[1::2], strict=True))
 
     def make_list(self, parts: list[Any]) -> None:
         self.push([])
@@ -183,17 +196,39 @@ class _Machine:
         self.set_items(parts)
 
     def make_frozenset(self, parts: list[Any]) -> None:
-        made = frozenset(map(_key, parts))
-        self.push(made, 0, len(made))
+        self.push(frozenset(as_keys(parts)))
 
     # --- names and what they stand for
+
+    def array(self, content: bytes, position: int) -> tuple[Any, int]:
+        """What the name RECONSTRUCT, or the whole program of an array that begins with it, makes; and its end.
+
+        Of a log's opcodes nearly half make arrays, always by the same program; it is carried out here at once, and
+        leaves in the memo what it would opcode by opcode. Any other program is left to these.
+        """
+        found = ARRAY.match(content, position)
+        if found is None:
+            return Name(RECONSTRUCT), position
+        kind, letter, one, first, second, dtype, short, long = found.groups()
+        kind, letter = self.memo.get(kind[0]), self.memo.get(letter[0])
+        dtype = self.memo.get(dtype[0])
+        begin = found.end()
+        end = begin + (short[0] if short else int.from_bytes(long, "little"))
+        if kind != NDARRAY or not isinstance(dtype, Unbuilt) or content[end : end + 4] != b"\x94t\x94b":
+            return Name(RECONSTRUCT), position
+        shape, data = (one[0],) if one else (first[0], second[0]), content[begin:end]
+        made = array_of(data, dtype.value, shape, "C")
+        self.count(6)
+        for each in ((0,), (kind, (0,), letter), made, shape, data, (1, shape, dtype.value, False, data)):
+            self.memo[len(self.memo)] = each
+        return made, end + 4
 
     def name(self, path: str) -> None:
         path = path.replace("__builtin__.", "builtins.", 1) if path.startswith("__builtin__.") else path
         path = path.replace("numpy.core.", "numpy._core.", 1) if path.startswith("numpy.core.") else path
         if path not in NAMES:
             raise ValueError(f"names the forbidden class {path[:200]}")
-        self.stack.append(_Name(path))
+        self.stack.append(Name(path))
 
     def stack_global(self, _: None) -> None:
         module, name = self.pop(2)
@@ -203,28 +238,25 @@ class _Machine:
 
     def reduce(self, _: None) -> None:
         function, arguments = self.pop(2)
-        if not isinstance(function, _Name) or type(arguments) is not tuple:
+        if not isinstance(function, Name) or type(arguments) is not tuple:
             raise ValueError("calls what is no name")
-        made = _called(function.path, arguments)
-        if isinstance(made, dict | set | frozenset):
-            self.push(made, 0, len(made))
-        elif isinstance(made, np.ndarray):
-            self.push(made, 0, made.size)
+        made = called(function.path, arguments)
+        if type(made) in HOLDING:
+            self.push(made)
         else:
             self.stack.append(made)
 
     def build(self, _: None) -> None:
         target, state = self.pop(2)
-        if not isinstance(target, _Unbuilt) or target.value is not None:
+        if not isinstance(target, Unbuilt) or target.value is not None:
             raise ValueError("gives a state to what has none")
         if target.dtype is not None:
-            target.value = _dtype(target.dtype, state)
+            target.value = dtype_of(target.dtype, state)
             self.stack.append(target.value)
             return
         _, shape, dtype, fortran, data = state
-        depth, items = self.hold([data]) if type(data) is list else (0, 0)
-        target.value = _array(data, dtype, shape, "F" if fortran else "C")
-        self.push(target.value, depth, max(items, target.value.size))
+        target.value = array_of(data, dtype, shape, "F" if fortran else "C")
+        self.push(target.value)
 
 
 VALUES = (
@@ -237,10 +269,9 @@ ACTIONS: dict[str, Callable[[_Machine, Any], None]] = {
     "NONE": lambda machine, _: machine.push_value(None),
     "NEWTRUE": lambda machine, _: machine.push_value(True),
     "NEWFALSE": lambda machine, _: machine.push_value(False),
-    **dict.fromkeys(("PROTO", "FRAME", "STOP"), lambda machine, _: None),
+    **dict.fromkeys(("PROTO", "FRAME"), lambda machine, _: None),
     **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"), _Machine.put),
-    **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), _Machine.get),
-    "MARK": _Machine.mark,
+    "GET": _Machine.get,
     "EMPTY_LIST": lambda machine, _: machine.push([]),
     "EMPTY_DICT": lambda machine, _: machine.push({}),
     "EMPTY_SET": lambda machine, _: machine.push(set()),
@@ -264,76 +295,61 @@ ACTIONS: dict[str, Callable[[_Machine, Any], None]] = {
 }
 
 
-def _key(value: Any) -> Hashable:
-    """A key of a dict or an item of a set; refuses what could be hashed recursively or collide at will."""
-    if not isinstance(value, KEYS):
-        raise ValueError(f"has a {type(value).__name__} as key")
-    return value
+Read = Callable[[bytes, int, BytesIO], tuple[Any, int]]  # (pickle, position, the same as a stream) -> argument, its end
 
 
-def _called(path: str, arguments: tuple) -> Any:
-    """What a pickle gets for calling one of NAMES."""
-    match path.rpartition(".")[2], arguments:
-        case "_reconstruct", [_Name("numpy.ndarray"), (0,), _]:
-            return _Unbuilt()
-        case "dtype", [str(name), *_] if DTYPE.fullmatch(name):
-            return _Unbuilt(name)
-        case "scalar", [np.dtype(kind=kind) as dtype, bytes() | str() as data] if kind != "O":
-            return _array(data, dtype, (), "C")[()]
-        case "_frombuffer", [bytes() | bytearray() as data, np.dtype() as dtype, tuple(shape), "C" | "F" as order]:
-            return _array(data, dtype, shape, order)
-        case "_frombuffer", [bytes() | bytearray() as data, np.dtype() as dtype, tuple(shape), "K", tuple(axes)]:
-            return _array(data, dtype, shape, "C").transpose(axes)
-        case "encode", [str(text), "latin1" | "latin-1"]:
-            return text.encode("latin-1")
-        case "bytes" | "bytearray", []:
-            return b""
-        case "bytearray", [bytes(data)]:
-            return data
-        case "bytearray", [str(text), "latin-1"]:
-            return text.encode("latin-1")
-        case "set", [list(items)]:
-            return set(map(_key, items))
-        case "frozenset", [list(items)]:
-            return frozenset(map(_key, items))
-        case "complex", [float(real), float(imaginary)]:
-            return complex(real, imaginary)
-        case "defaultdict", [] | [_Name() | None]:
-            return {}
-    raise ValueError(f"calls {path} with other arguments than plain data has")
+def _number(layout: str) -> Read:
+    struct = Struct(layout)
+    return lambda content, position, stream: (struct.unpack_from(content, position)[0], position + struct.size)
 
 
-def _dtype(name: str, state: Any) -> np.dtype:
-    """A numpy type of plain elements; state: version, byte order, no parts and no fields, sizes, flags."""
-    version, order, *parts = state
-    if version != 3 or order not in ("<", ">", "|", "=") or parts[:3] != [None, None, None]:
-        raise ValueError(f"holds arrays of other elements than numbers and text ({name})")
-    return np.dtype(name) if order in "|=" else np.dtype(name).newbyteorder(order)
+def _counted(layout: str) -> Read:
+    """Bytes after their number."""
+    struct = Struct(layout)
+
+    def read(content: bytes, position: int, stream: BytesIO) -> tuple[bytes, int]:
+        begin = position + struct.size
+        end = begin + struct.unpack_from(content, position)[0]
+        if end > len(content):
+            raise ValueError(f"ends before the {end - begin} bytes that it announces")
+        return content[begin:end], end
+
+    return read
 
 
-def _array(data: Any, dtype: np.dtype, shape: tuple, order: Literal["C", "F"]) -> np.ndarray:
-    """An array of exactly the bytes (or, of objects, the list) that the pickle holds for it."""
-    if not isinstance(dtype, np.dtype) or type(shape) is not tuple or len(shape) > 8:
-        raise ValueError("holds an array without type or shape")
-    if not all(type(size) is int and 0 <= size <= MAX_ITEMS for size in shape):
-        raise ValueError(f"holds an array of the impossible shape {shape}")
-    count = prod(shape)
-    if dtype.kind == "O":
-        if type(data) is not list or len(data) != count:
-            raise ValueError(f"holds an array of shape {shape} without its objects")
-        objects = np.empty(count, object)
-        for index, value in enumerate(data):
-            objects[index] = value
-        return objects.reshape(shape)  # numpy lists them in C order always
-    if isinstance(data, str):  # written by Python 2
-        data = data.encode("latin-1")
-    if not isinstance(data, bytes | bytearray) or len(data) != count * dtype.itemsize:
-        raise ValueError(f"holds an array of shape {shape} and type {dtype} without its data")
-    if not count:
-        return np.zeros(shape, dtype.newbyteorder("="))
-    if dtype.kind == "b":  # a byte that is neither 0 nor 1 would miscount
-        return (np.frombuffer(data, np.uint8) != 0).reshape(shape, order=order)
-    flat = np.frombuffer(data, dtype)
-    if dtype.kind == "U" and flat.view(np.dtype("u4").newbyteorder(dtype.byteorder)).max() > 0x10FFFF:
-        raise ValueError("holds text that is no Unicode")
-    return flat.astype(dtype.newbyteorder("="), copy=False).reshape(shape, order=order)
+def _otherwise(opcode: pickletools.OpcodeInfo) -> Read:
+    """By pickletools."""
+    argument = opcode.arg
+    assert argument is not None
+
+    def read(content: bytes, position: int, stream: BytesIO) -> tuple[Any, int]:
+        stream.seek(position)
+        return argument.reader(stream), stream.tell()
+
+    return read
+
+
+def _refuse(name: str) -> Callable[[_Machine, Any], None]:
+    def act(machine: _Machine, _: Any) -> None:
+        raise ValueError(f"holds more than plain data ({name})")
+
+    return act
+
+
+READS: dict[str, Read] = {
+    "BINFLOAT": _number(">d"),
+    "BININT": _number("<i"),
+    "BININT2": _number("<H"),
+    "BINPUT": _number("<B"),
+    "LONG_BINPUT": _number("<I"),
+    "SHORT_BINBYTES": _counted("<B"),
+    "BINBYTES": _counted("<I"),
+    "BINBYTES8": _counted("<Q"),
+}
+ACTS: list[tuple[Read | None, Callable[[_Machine, Any], None]]] = [
+    (None, _refuse(f"the unknown opcode {code}")) for code in range(256)
+]  # by opcode
+for _opcode in pickletools.opcodes:
+    _read = READS.get(_opcode.name) or (_otherwise(_opcode) if _opcode.arg else None)
+    ACTS[ord(_opcode.code)] = _read, ACTIONS.get(_opcode.name) or _refuse(f"opcode {_opcode.name}")
+STOP = ord(pickle.STOP)

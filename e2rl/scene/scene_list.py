@@ -22,12 +22,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-from torch import Tensor
 from tqdm import tqdm
 
 from e2rl.errors import InputError
-from e2rl.scene.scene import KEYS, RAGGED, SceneSet
+from e2rl.scene.scene import SceneSet
 
 SCENES = "scenes.csv"  # of a run's folder
 COLUMNS = ("scene_id", "location", "number", "sha256")
@@ -46,26 +44,8 @@ class Listed(NamedTuple):
 def scene_hashes(scenes: SceneSet) -> list[str]:
     """SHA-256 of each scene [S]: of its tensors, id, place and data set. The other scenes of the set, to whose size
     some tensors are padded, do not matter; the recording, the builder and the sizes in data.build do."""
-    return [_scene_hash(scenes, index) for index in range(len(scenes))]
-
-
-def _scene_hash(scenes: SceneSet, index: int) -> str:
-    names = [scenes.scene_id[index], scenes.location[index], scenes.dataset]
-    digest = hashlib.sha256(json.dumps(names).encode())
-    for key in sorted(KEYS):
-        value = scenes.scenes[key][index]
-        value = unpadded(value, RAGGED[key]) if key in RAGGED else value
-        digest.update(f"{key} {value.dtype} {tuple(value.shape)}".encode())
-        digest.update(value.cpu().contiguous().numpy().reshape(-1).view(np.uint8).data)
-    return digest.hexdigest()
-
-
-def unpadded(value: Tensor, fill: float) -> Tensor:
-    """A tensor without the rows at the end of each dim that hold nothing but `fill`."""
-    for dim in range(value.ndim):
-        used = (value != fill).movedim(dim, 0).flatten(1).any(1) if value.ndim > 1 else value != fill
-        value = value.narrow(dim, 0, int(used.nonzero().max()) + 1 if bool(used.any()) else 0)
-    return value
+    about = zip(scenes.scene_id, scenes.location, scenes.rows.hashes(), strict=True)
+    return [hashlib.sha256(json.dumps([*names, scenes.dataset]).encode()).hexdigest() for names in about]
 
 
 def list_text(scenes: SceneSet) -> str:

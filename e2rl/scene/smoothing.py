@@ -1,7 +1,10 @@
 """Kinematics of recordings: one smoother for all logs, and what a causal observer knows at a frame."""
 
+from functools import lru_cache
+
 import numpy as np
-from scipy.signal import savgol_filter
+from scipy.ndimage import convolve1d
+from scipy.signal import savgol_coeffs
 
 from e2rl.errors import InputError
 from e2rl.scene.paths import wrap
@@ -98,22 +101,44 @@ def runs_of_true(valid: np.ndarray) -> list[tuple[int, int]]:
 def smooth(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Tracks [F, A, 4] with smoothed positions, and the speed along the heading from their derivative.
 
-    Savitzky-Golay per contiguous run of frames; a run shorter than WINDOW takes the longest odd window that it can.
+    Savitzky-Golay per contiguous run of frames; a run shorter than WINDOW takes the longest odd window that it can. At
+    both ends of a run the polynomials of its first and its last window go on.
     """
-    out = states.copy()
-    out[..., 3] = np.clip(out[..., 3], 0.0, TOP_SPEED)
-    for agent in range(states.shape[1]):
-        for start, end in runs_of_true(valid[:, agent]):
-            window = min(WINDOW, (end - start - 1) // 2 * 2 + 1)
-            if window <= ORDER:
-                continue
-            track = states[start:end, agent, :2]
-            out[start:end, agent, :2] = savgol_filter(track, window, ORDER, axis=0)
-            velocity = savgol_filter(track, window, ORDER, deriv=1, delta=DT, axis=0)
-            heading = states[start:end, agent, 2]
-            along = velocity[:, 0] * np.cos(heading) + velocity[:, 1] * np.sin(heading)
-            out[start:end, agent, 3] = np.clip(along, 0.0, TOP_SPEED)
+    out, velocity = states.copy(), np.full_like(states[..., :2], np.nan)
+    edge = np.diff(np.pad(valid.T, ((0, 0), (1, 1))).astype(np.int8))
+    (agent, start), end = np.nonzero(edge == 1), np.nonzero(edge == -1)[1]
+    windows = np.minimum(WINDOW, (end - start - 1) // 2 * 2 + 1)
+    for window in np.unique(windows[windows > ORDER]).tolist():
+        runs = agent[windows == window], start[windows == window], end[windows == window]
+        for order, into in ((0, out[..., :2]), (1, velocity)):
+            _fit_runs(states[..., :2], *runs, window, order, into)
+    along = velocity[..., 0] * np.cos(states[..., 2]) + velocity[..., 1] * np.sin(states[..., 2])
+    out[..., 3] = np.clip(np.where(np.isnan(along), states[..., 3], along), 0.0, TOP_SPEED)
     return out
+
+
+def _fit_runs(
+    track: np.ndarray, agent: np.ndarray, start: np.ndarray, end: np.ndarray, window: int, order: int, into: np.ndarray
+) -> None:
+    """Write the fit (order 0) or its slope (order 1) of runs [R] of a track [F, A, 2] into an array like it; agent,
+    start and end [R]: whose runs, from which frame to before which."""
+    half, (centre, weights) = window // 2, polynomial_weights(window, order)
+    middle = convolve1d(track[:, agent], centre, axis=0, mode="constant")
+    frame = np.arange(len(track))[:, None]
+    row, run = np.nonzero((frame >= start + half) & (frame < end - half))
+    into[row, agent[run]] = middle[row, run]
+    for first, rows in ((start, slice(half)), (end - window, slice(half + 1, window))):
+        frame = first + np.arange(window)[:, None]
+        into[frame[rows], agent] = np.einsum("kw,wrc->krc", weights[rows], track[frame, agent])
+
+
+@lru_cache
+def polynomial_weights(window: int, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of the polynomial that fits `window` samples at DT best, the value (order 0) or slope (order 1): at the middle
+    sample, for a convolution [window], and at all samples [window, window]: row k times the samples is that at k."""
+    time, power = np.arange(window)[:, None] - window // 2, np.arange(ORDER + 1)
+    basis = power * time ** np.maximum(power - 1, 0) / DT if order else time**power
+    return savgol_coeffs(window, ORDER, order, DT), basis @ np.linalg.pinv(time**power)
 
 
 def causal_state(states: np.ndarray, valid: np.ndarray, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -9,44 +9,43 @@ import hashlib
 import json
 import sys
 from abc import ABC, abstractmethod
-from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
-import numpy as np
-import torch
 from hydra.utils import get_class
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
-from tensordict import TensorDict
 from tqdm import tqdm
 
 from e2rl.errors import InputError
-from e2rl.files import locked, write_atomically
-from e2rl.scene.build import BuildSettings, build_scene, ego_overlaps
+from e2rl.scene.build import BuildSettings, SceneBuilder, ego_overlaps
+from e2rl.scene.cache import Index, Keep, cached
+from e2rl.scene.packed import Packed, pack
 from e2rl.scene.recording import Recording
-from e2rl.scene.scene import SceneSet, stack, validate
+from e2rl.scene.scene import SceneSet, validate
 from e2rl.scene.scene_list import listed_scenes
 from e2rl.settings import check_range, settings_of
 from e2rl.workers import interrupts_held, without_main, worker_pool
 
 OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are left out
-STORED = ("scene_id", "location", "dataset", "split", "dropped")  # of a SceneSet in a cache file, beside its scenes
-VERSION = 3  # of the scene builder: raise it when the same recording would make another scene
+VERSION = 4  # of the scene builder: raise it when the same recording would make another scene
+AHEAD = 4  # logs for each worker that are built before their scenes are asked for
+NO_MATTER = "path", "cache", "cache_gb", "unpacked", "workers"  # settings that do not change the scenes
 
 
 class Row(NamedTuple):
-    """What one recording made: the arrays of a scene, or the reason why there is none."""
+    """What one recording made: a scene, or the reason why there is none."""
 
     scene_id: str
     location: str = ""
     dataset: str = ""
-    scene: dict[str, np.ndarray] | None = None
+    scene: Packed | None = None
     reason: str = ""
 
 
@@ -58,15 +57,20 @@ class Source(ABC):
 
     path: file or folder of the logs, for sources that need one; split: train, tune or test where `has_splits`, else the
     name of the split in tables (default: the stem of `path`); starts: start frames of the scenes that are cut from each
-    log (default: see `Recording.windows`); skip_invalid: leave invalid scenes out and count them, instead of raising
-    InputError for the first; cache: folder; workers: processes that build; build: sizes of a scene.
+    log (default: see `Recording.windows`); mirror: also each log's mirror image, whose place is the log's;
+    skip_invalid: leave invalid scenes out and count them, instead of raising InputError for the first; cache: folder;
+    cache_gb: its size, in 10^9 bytes; unpacked: scenes that a process keeps unpacked at most, unless it asks for all;
+    workers: processes that build; build: sizes of a scene.
     """
 
     path: str | None = None
     split: str | None = None
     starts: tuple[int, ...] | None = None
+    mirror: bool = False
     skip_invalid: bool = False
     cache: str = ".cache"
+    cache_gb: float = 20.0
+    unpacked: int = 512
     workers: int = 2
     build: BuildSettings = BuildSettings()
 
@@ -101,7 +105,8 @@ class Source(ABC):
     def recordings(self) -> Iterator[Recording]:
         """All recordings, one for each scene, read in this process."""
         for log in self.logs():
-            yield from self._windows(log)
+            for windows in self._windows(log):
+                yield from windows
 
     def load(self, most: int | None = None) -> SceneSet:
         """All scenes or the first `most`, from the cache where they are there; raises InputError for bad input.
@@ -112,42 +117,46 @@ class Source(ABC):
             type(self).__module__ == "__mp_main__"
         ):  # a worker that imports its script anew, and would wait for its parent
             raise InputError('a script that defines its own source needs `if __name__ == "__main__":` around its calls')
+        check_range("data.unpacked", self.unpacked, 1)
+        check_range("data.cache_gb", self.cache_gb, 0.0)
         content = self.fingerprint()
         if content is None:
-            return self._build(most)
+            records: list[bytes] = []
+            return self._build(most, records.append).scenes(records, self.unpacked)
         settings = asdict(self) | {"split": self.split_name, "source": type(self).__qualname__}
-        settings = {key: value for key, value in settings.items() if key not in ("path", "cache", "workers")}
+        settings = {key: value for key, value in settings.items() if key not in NO_MATTER}
         key = hashlib.sha256(json.dumps([VERSION, settings], sort_keys=True).encode() + content).hexdigest()[:24]
-        every = Path(self.cache) / f"scenes-{key}.safetensors"
+        every = Path(self.cache) / f"scenes-{key}.packed"
+        how = self.unpacked, self.cache_gb
         if most is None or every.exists():
-            scenes = _cached(every, self._build).first(most)
+            scenes = cached(every, partial(self._build, None), *how).first(most)
         else:
-            scenes = _cached(every.with_stem(f"{every.stem}-{most}"), partial(self._build, most))
+            scenes = cached(every.with_stem(f"{every.stem}-{most}"), partial(self._build, most), *how)
         return replace(scenes, files=hashlib.sha256(content).hexdigest())
 
-    def _windows(self, log: str) -> Iterator[Recording]:
+    def _windows(self, log: str) -> Iterator[list[Recording]]:
+        """The recordings that one log makes, those of the same tracks and map together."""
         for recording in self.read(log):
-            yield from recording.windows(self.starts, self.build.steps)
+            if self.mirror:  # both are of one place, or else of one log
+                recording = replace(recording, location=recording.location or recording.scene_id)
+            for each in (recording, recording.mirrored()) if self.mirror else (recording,):
+                yield list(each.windows(self.starts, self.build.steps))
 
     def _rows_of(self, log: str) -> list[Row]:
         """What the recordings of one log make."""
         try:
-            rows = [self._row(log, recording) for recording in self._windows(log)]
+            rows = [row for windows in self._windows(log) for row in self._rows(log, windows)]
         except InputError as error:
             return [Row(log, reason=_naming(log, error))]
         return rows or [Row(log, reason=TOO_SHORT)]
 
-    def _row(self, log: str, recording: Recording) -> Row:
-        row = Row(recording.scene_id, recording.location, recording.dataset)
+    def _rows(self, log: str, windows: list[Recording]) -> list[Row]:
+        """What recordings of the same tracks and map make."""
         try:
-            scene = build_scene(recording, self.build)
-            validate(scene, recording.scene_id)
+            builder = SceneBuilder(windows[0], self.build) if windows else None
         except InputError as error:
-            return row._replace(reason=_naming(log, error))
-        if ego_overlaps(scene):
-            return row._replace(reason=OVERLAP)
-        # Plain arrays cross the process border: tensors would each hold a shared-memory file open.
-        return row._replace(scene={key: value.numpy() for key, value in scene.items()})
+            return [_row_of(window)._replace(reason=_naming(log, error)) for window in windows]
+        return [_row(log, window, builder) for window in windows if builder]
 
     def rows(self) -> Generator[Row]:
         """What the logs make, in their order; `workers` processes build (this one where there is work for one)."""
@@ -159,42 +168,63 @@ class Source(ABC):
         own = type(self).__module__ == "__main__"  # then the workers need the script that defines it
         try:
             with worker_pool(self.workers, "spawn") as pool:
-                with interrupts_held(), nullcontext() if own else without_main():
-                    waiting = [pool.submit(self._rows_of, log) for log in reversed(logs)]
-                found = (waiting.pop().result() for _ in logs)  # in the logs' order, none kept
-                yield from (row for rows in show(found) for row in rows)
+                coming = iter(logs)
+                waiting: deque[Future[list[Row]]] = deque()
+                for _ in show(logs):
+                    with interrupts_held(), nullcontext() if own else without_main():
+                        ahead = islice(coming, AHEAD * self.workers - len(waiting))
+                        waiting.extend(pool.submit(self._rows_of, log) for log in ahead)
+                    yield from waiting.popleft().result()
         except BrokenProcessPool as error:
             raise InputError(
                 f"data.workers={self.workers}: a process that builds scenes was killed, perhaps for lack of memory, or "
                 'did not start, as in a script without `if __name__ == "__main__":`; set data.workers=1'
             ) from error
 
-    def _build(self, most: int | None = None) -> SceneSet:
-        """The scenes of all logs, or the first `most`; raises InputError for an invalid one, unless `skip_invalid`."""
-        dropped: Counter[str] = Counter()
-        scenes: list[dict[str, np.ndarray]] = []
-        names: list[tuple[str, str, str]] = []
+    def _build(self, most: int | None, keep: Keep) -> Index:
+        """Give the records of all logs, or the first `most`, to `keep`, and return what is known of them.
+
+        Raises InputError for an invalid one, unless `skip_invalid`, and where there is none.
+        """
+        index = Index(split=self.split_name)
         with closing(self.rows()) as rows:  # the progress bar ends before a message
             for row in rows:
-                if most is not None and len(scenes) >= most:
+                if most is not None and len(index.scene_id) >= most:
                     break
                 if row.scene is not None:
-                    scenes.append(row.scene)
-                    names.append(row[:3])
+                    index.dataset = index.dataset or row.dataset
+                    index.add(row.scene_id, row.location, row.scene)
+                    keep(row.scene.record)
                 elif row.reason in (OVERLAP, TOO_SHORT):
-                    dropped[row.reason] += 1
+                    index.dropped[row.reason] += 1
                 elif self.skip_invalid:
-                    dropped["invalid"] += 1
+                    index.dropped["invalid"] += 1
                     tqdm.write(f"left out {row.scene_id}: {row.reason}", sys.stderr)
                 else:
                     raise InputError(f"{row.reason} (data.skip_invalid=true leaves such scenes out)")
-        if not scenes:
-            left_out = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
+        if not index.scene_id:
+            left_out = ", ".join(f"{count} {reason}" for reason, count in index.dropped.items())
             data = self.path or f"split {self.split_name}"
             raise InputError(f"no valid scene in {data} ({left_out}); see the messages above, or pass other data")
-        tensors = [TensorDict({key: torch.from_numpy(value) for key, value in scene.items()}) for scene in scenes]
-        ids, locations, datasets = map(list, zip(*names, strict=True))
-        return SceneSet(stack(tensors), ids, locations, datasets[0], self.split_name, dict(dropped))
+        return index
+
+
+def _row_of(recording: Recording) -> Row:
+    """A row without a scene."""
+    return Row(recording.scene_id, recording.location, recording.dataset)
+
+
+def _row(log: str, recording: Recording, builder: SceneBuilder) -> Row:
+    """What a recording makes, one of those of a builder."""
+    row = _row_of(recording)
+    try:
+        scene = builder.scene(recording)
+        validate(scene, recording.scene_id)
+    except InputError as error:
+        return row._replace(reason=_naming(log, error))
+    if ego_overlaps(scene):
+        return row._replace(reason=OVERLAP)
+    return row._replace(scene=pack({key: value.numpy() for key, value in scene.items()}))
 
 
 def load_scenes(
@@ -260,52 +290,3 @@ def hash_files(paths: Iterable[Path]) -> bytes:
 def _naming(log: str, error: InputError) -> str:
     """An error's message, with the log that it is about."""
     return str(error) if str(error).startswith(log) else f"{log}: {error}"
-
-
-def _cached(path: Path, build: Callable[[], SceneSet]) -> SceneSet:
-    """The scenes in a cache file; they are built and stored where it is not there or damaged. Of several processes, one
-    builds, and the others wait for it."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with locked(path):
-            return _stored(path) or _store(path, build())
-    except OSError as error:
-        mend = "free space, or pass another, writable folder"
-        raise InputError(f"data.cache={path.parent}: cannot be made or written ({error}); {mend}") from error
-
-
-def _stored(path: Path) -> SceneSet | None:
-    """The scenes in a cache file, None where it is not there or not what was written."""
-    if not path.exists():
-        return None
-    try:
-        with safe_open(path, "pt") as file:
-            header = file.metadata()
-            columns = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
-        if header["sha256"] != _digest(columns, header["scenes"]):
-            raise ValueError("its content is not what was written")
-        names = json.loads(header["scenes"])
-        return SceneSet(TensorDict(columns, batch_size=[len(names["scene_id"])]), **names)
-    except (SafetensorError, KeyError, ValueError, TypeError, OSError) as error:
-        tqdm.write(f"rebuilding the damaged cache file {path}: {error}", sys.stderr)
-        return None
-
-
-def _store(path: Path, scenes: SceneSet) -> SceneSet:
-    columns = {key: value.contiguous() for key, value in scenes.scenes.items()}
-    names = json.dumps({key: getattr(scenes, key) for key in STORED})
-    header = {"scenes": names, "sha256": _digest(columns, names)}
-    try:
-        write_atomically(path, lambda part: save_file(columns, part, header))
-    except SafetensorError as error:
-        raise OSError(str(error)) from error
-    return scenes
-
-
-def _digest(columns: Mapping[str, torch.Tensor], names: str) -> str:
-    """SHA-256 of scenes and of what is written about them."""
-    digest = hashlib.sha256(names.encode())
-    for key, value in sorted(columns.items()):
-        digest.update(f"{key} {value.dtype} {tuple(value.shape)}".encode())
-        digest.update(value.contiguous().numpy().reshape(-1).view(np.uint8).data)
-    return digest.hexdigest()

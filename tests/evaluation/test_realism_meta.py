@@ -55,7 +55,7 @@ def sampled(scene_set, seeds):
 
 
 def likelihoods(scene_set, parts, rollouts):
-    tally = Tally(scene_set.scenes)
+    tally = Tally(scene_set)
     for index, part in parts:
         tally.add(index, part)
     return tally.likelihoods(rollouts)
@@ -102,7 +102,7 @@ def test_neither_the_order_of_rollouts_nor_their_batches_matter_and_a_weight_is_
         for k in range(2)
     ]
     same(found, likelihoods(scene_set, rows, 3))
-    weighed, repeated = Tally(scene_set.scenes), likelihoods(scene_set, parts[:1] * 3, 3)
+    weighed, repeated = Tally(scene_set), likelihoods(scene_set, parts[:1] * 3, 3)
     weighed.add(*parts[0], weight=3)
     same(repeated, weighed.likelihoods(3))
 
@@ -144,7 +144,7 @@ def test_lights_belong_to_ways_so_that_whoever_follows_none_runs_none():
     scene_set = places(red_light_x=30.0)
     hits = []
     for routes in (scene_set.scenes["route_log"], torch.full_like(scene_set.scenes["route_log"], -1)):
-        tally = Tally(scene_set.scenes)
+        tally = Tally(scene_set)
         tally.add(torch.arange(2), logs_of(scene_set) | {"routes": routes})
         hits.append(tally.hits["red_light"].view(2, -1).sum(1).tolist())
     assert hits == [[2, 2], [0, 0]]  # those at 22 and 10 m pass 30 m within 3 s

@@ -14,6 +14,7 @@ from e2rl.evaluation.objective import Objective
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.evaluation.tune_planner import Trials, outcomes
 from e2rl.evaluation.tuning import TuneSettings
+from e2rl.scene.scene import Loaded
 from e2rl.sim.env import SimSettings
 from e2rl.tuning import run_tuning, tuning_of
 from tests.evaluation.tuned_road import PRESENT, SPACE, quiet, road
@@ -69,7 +70,7 @@ def test_every_trial_meets_traffic_made_against_it(tmp_path):
 
 def test_leaving_the_road_counts_as_a_collision():
     scene_set = scenes(1, steps=20)
-    off = replace(scene_set, scenes=scene_set.scenes.clone())
+    off = replace(scene_set, rows=Loaded(scene_set.scenes.clone()))
     off.scenes["field"][:] = torch.where(torch.arange(off.scenes["field"].shape[1])[:, None] < 85, -1.0, 1.0)
     method = Method("nominal", synthesizer())
     for each, expected in ((scene_set, 0.0), (off, 1.0)):

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
-from safetensors import safe_open
-from safetensors.torch import save_file
 
 from e2rl.errors import InputError
 from e2rl.scene import source
@@ -64,8 +62,8 @@ def test_folder_zip_cache_and_workers_give_identical_scenes(tmp_path, monkeypatc
     zipped = write_zip(tmp_path / "x.zip", scenes_of(3))
     same(first, load_scenes(data_config(zipped, tmp_path / "b")))
     same(first, load_scenes(data_config(folder, tmp_path / "c", workers=2)))
-    assert [path.suffix for path in (tmp_path / "a").iterdir()] == [".safetensors"]
-    monkeypatch.setattr(source, "build_scene", None)  # nothing is built again
+    assert [path.suffix for path in (tmp_path / "a").iterdir()] == [".packed"]
+    monkeypatch.setattr(source, "SceneBuilder", None)  # nothing is built again
     same(first, load_scenes(data_config(folder, tmp_path / "a")))
     limited = load_scenes(data_config(folder, tmp_path / "a"), num_scenes=2)
     assert limited.scene_id == first.scene_id[:2]
@@ -93,28 +91,35 @@ def test_the_cache_is_keyed_by_content_and_settings(tmp_path):
     assert len(list(cache.iterdir())) == 5
 
 
-@pytest.mark.parametrize("damage", ["truncated", "nonsense", "other", "empty", "flipped", "NaN", "without a key"])
-def test_a_damaged_cache_is_rebuilt(tmp_path, capsys, damage):
-    config = data_config(write_folder(tmp_path / "x", scenes_of(2)), tmp_path / "cache")
-    first = load_scenes(config)
-    (path,) = (tmp_path / "cache").iterdir()
-    content = path.read_bytes()
-    with safe_open(path, "pt") as file:
-        header, columns = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    if damage == "other":
-        save_file({"a": torch.zeros(1)}, path)
-    elif damage == "NaN":
-        save_file(columns | {"start": columns["start"] * torch.nan}, path, header)
-    elif damage == "without a key":
-        save_file({key: value for key, value in columns.items() if key != "past"}, path, header)
-    elif damage == "flipped":
-        path.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
-    else:
-        path.write_bytes({"truncated": content[: len(content) // 2], "nonsense": b"\xff" * 64, "empty": b""}[damage])
-    same(first, load_scenes(config))
-    assert "rebuilding the damaged cache file" in capsys.readouterr().err
-    assert path.read_bytes() == content or len(path.read_bytes()) == len(content)
-    assert list((tmp_path / "cache").iterdir()) == [path]
+def test_settings_of_the_memory_and_the_cache_do_not_change_the_scenes(tmp_path):
+    folder, cache = write_folder(tmp_path / "x", scenes_of(3)), tmp_path / "cache"
+    first = load_scenes(data_config(folder, cache))
+    little = load_scenes(data_config(folder, cache, unpacked=1, cache_gb=5))
+    assert little.rows.room == 1 and len(list(cache.iterdir())) == 1
+    assert all(torch.equal(value, first.scenes[key][[2, 0]]) for key, value in little.batch([2, 0]).items())
+    same(first, little)
+
+
+@pytest.mark.parametrize(("key", "value"), [("unpacked", 0), ("cache_gb", -1), ("cache_gb", "much")])
+def test_impossible_sizes_are_refused(tmp_path, key, value):
+    folder = write_folder(tmp_path / "x", scenes_of(1))
+    with pytest.raises(InputError, match=rf"data\.{key}"):
+        load_scenes(data_config(folder, tmp_path / "cache", **{key: value}))
+
+
+def test_mirror_images_are_scenes_of_the_same_place(tmp_path):
+    """Drawn in the mirror, a scene is the other one: states, lanes and what is drivable."""
+    turned = description({"ego": straight(20, 0, 8), "7": straight(50, 3.5, 6)}) | {"id": "turned"}
+    found = load_scenes(data_config(write_folder(tmp_path / "x", [turned]), tmp_path / "cache", mirror=True))
+    assert found.scene_id == ["turned", "turned~mirrored"] and found.location == ["turned", "turned"]
+    scene, other = found.scenes
+    sign = torch.tensor([1.0, -1.0, -1.0, 1.0])
+    assert torch.allclose(scene["start"] * sign, other["start"], atol=1e-5)
+    assert torch.allclose(scene["logged"] * sign, other["logged"], atol=1e-5)
+    assert torch.allclose(scene["lane_points"] * sign[:2], other["lane_points"], atol=1e-5)
+    assert torch.equal(scene["field"], other["field"].flip(1)) and torch.equal(scene["valid"], other["valid"])
+    cut = load_scenes(data_config(tmp_path / "x", tmp_path / "cache", mirror=True), starts=[10, 20])
+    assert cut.scene_id == ["turned@10", "turned@20", "turned~mirrored@10", "turned~mirrored@20"]
 
 
 @pytest.mark.parametrize("reason", bad_scenes())

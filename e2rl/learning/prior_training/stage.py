@@ -19,7 +19,7 @@ from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.prior import Prior, SamplerSettings
 from e2rl.provenance import origin_of
-from e2rl.scene.scene import SceneSet
+from e2rl.scene.scene import Loaded, SceneSet
 from e2rl.scene.source import load_scenes
 from e2rl.settings import settings_of
 from e2rl.sim.env import SimSettings
@@ -101,11 +101,12 @@ def _first_starts(scenes: SceneSet) -> SceneSet:
 def _chosen(scenes: SceneSet, keep: list[int]) -> SceneSet:
     """The scenes with indices `keep`."""
     names, places = ([values[i] for i in keep] for values in (scenes.scene_id, scenes.location))
-    return SceneSet(scenes.batch(keep), names, places, scenes.dataset, f"{scenes.split}-held-out", {})
+    return SceneSet(Loaded(scenes.batch(keep)), names, places, scenes.dataset, f"{scenes.split}-held-out", {})
 
 
 def fingerprint(scenes: SceneSet) -> str:
     """Hash of the scenes' contents, to detect checkpoints of other data."""
     digest = hashlib.sha256("\n".join(scenes.scene_id).encode())
-    digest.update(scenes.scenes["logged"].numpy().tobytes())
+    for part in scenes.parts():
+        digest.update(part["logged"].numpy().tobytes())
     return digest.hexdigest()[:16]

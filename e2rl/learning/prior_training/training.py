@@ -75,7 +75,7 @@ def held_out(scenes: SceneSet) -> Tensor:
 def window_sets(scenes: SceneSet, free_space: bool) -> tuple[TensorDictBase, TensorDictBase]:
     """(training, held-out) windows. Raises InputError if either is empty or has no moving vehicle."""
     mask = held_out(scenes)
-    windows, test = (make_windows(scenes.scenes[part], free_space) for part in (~mask, mask))
+    windows, test = (make_windows(scenes.batch(part.nonzero()[:, 0]), free_space) for part in (~mask, mask))
     if not len(windows) or not len(test):
         counts = f"{len(windows)} training and {len(test)} held-out windows of {len(scenes)} scenes"
         reason = "too few vehicles are recorded for a second on a known route"
@@ -177,7 +177,7 @@ def train_prior(
         windows, test = window_sets(scenes, prior.free_space)
     if state is None:
         with record.timed("routes"):
-            record.accuracy = train_route_choice(prior, scenes.scenes[~held_out(scenes)], settings)
+            record.accuracy = train_route_choice(prior, scenes.batch((~held_out(scenes)).nonzero()[:, 0]), settings)
     run = PriorTraining(prior, windows, settings, processes)
     if state is not None:
         run.load_state_dict(state["run"])
