@@ -52,8 +52,9 @@ def in_processes(
             futures = {submit(k): k for k in order}
         early, coming = {}, 0
         for future in as_completed(futures):
-            early[futures[future]] = future.result()
-            ended(jobs[futures[future]])
+            number = futures.pop(future)  # or all results would stay in memory
+            early[number] = future.result()
+            ended(jobs[number])
             while coming in early:
                 yield torch.load(io.BytesIO(early.pop(coming)), weights_only=True)
                 coming += 1

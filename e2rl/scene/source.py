@@ -36,6 +36,7 @@ from e2rl.workers import interrupts_held, without_main, worker_pool
 OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are left out
 VERSION = 4  # of the scene builder: raise it when the same recording would make another scene
 AHEAD = 4  # logs for each worker that are built before their scenes are asked for
+FEW = 16  # scenes that are built here before processes would have started
 NO_MATTER = "path", "cache", "cache_gb", "unpacked", "workers"  # settings that do not change the scenes
 
 
@@ -158,11 +159,12 @@ class Source(ABC):
             return [_row_of(window)._replace(reason=_naming(log, error)) for window in windows]
         return [_row(log, window, builder) for window in windows if builder]
 
-    def rows(self) -> Generator[Row]:
-        """What the logs make, in their order; `workers` processes build (this one where there is work for one)."""
+    def rows(self, most: int | None = None) -> Generator[Row]:
+        """What the logs make, in their order, of which `most` scenes are asked for (None: all). `workers` processes
+        build, never far ahead of what is asked for; this one where there is work for one, or for FEW scenes."""
         logs = self.logs()
         show = partial(tqdm, desc="building scenes", total=len(logs), unit="log", disable=None)
-        if min(self.workers, len(logs)) <= 1:
+        if min(self.workers, len(logs)) <= 1 or (most is not None and most <= FEW):
             yield from (row for rows in show(map(self._rows_of, logs)) for row in rows)
             return
         own = type(self).__module__ == "__main__"  # then the workers need the script that defines it
@@ -187,14 +189,14 @@ class Source(ABC):
         Raises InputError for an invalid one, unless `skip_invalid`, and where there is none.
         """
         index = Index(split=self.split_name)
-        with closing(self.rows()) as rows:  # the progress bar ends before a message
+        with closing(self.rows(most)) as rows:  # the progress bar ends before a message
             for row in rows:
-                if most is not None and len(index.scene_id) >= most:
-                    break
                 if row.scene is not None:
                     index.dataset = index.dataset or row.dataset
                     index.add(row.scene_id, row.location, row.scene)
                     keep(row.scene.record)
+                    if len(index.scene_id) == most:
+                        break
                 elif row.reason in (OVERLAP, TOO_SHORT):
                     index.dropped[row.reason] += 1
                 elif self.skip_invalid:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from e2rl.errors import InputError
+from e2rl.scene.packed import unpack
 from e2rl.scene.recording import OTHER, PEDESTRIAN, VEHICLE
 from e2rl.sim.drivable import off_road
 
@@ -214,7 +215,7 @@ def test_recorded_logs_make_scenes_in_which_the_ego_keeps_to_the_road():
     rows = list(Argoverse2Source(str(RECORDED), workers=1).rows())
     assert len(rows) == 7 and not [row.reason for row in rows if row.reason]
     for row in rows:
-        scene = {name: torch.from_numpy(value) for name, value in row.scene.items()}
+        scene = {name: torch.from_numpy(value) for name, value in unpack(row.scene.record).items()}
         driven = scene["logged"][scene["logged_valid"][:, 0], 0, :2]
         beyond = off_road(driven[None], scene["field"][None], scene["field_origin"][None])
         assert (beyond < 0).all(), row.scene_id

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from e2rl.errors import InputError
+from e2rl.scene.packed import unpack
 from e2rl.scene.recording import LIGHT_GREEN, LIGHT_RED, OTHER, PEDESTRIAN, VEHICLE
 
 pytest.importorskip("commonroad", reason="data=commonroad needs the extra commonroad")
@@ -203,4 +204,4 @@ def test_recorded_scenarios_make_scenes_and_the_ego_s_speed_is_that_of_its_displ
     moved = np.linalg.norm(np.diff(track[:, :2], axis=0), axis=1).sum()
     assert abs(moved - 0.1 * track[1:, 3].sum()) < 0.05 * moved + 1
     (row,) = source.rows()
-    assert row.scene is not None and row.scene["logged_valid"][:, 0].any()
+    assert row.scene is not None and unpack(row.scene.record)["logged_valid"][:, 0].any()

@@ -8,10 +8,10 @@ from tensordict import TensorDict
 
 from e2rl.errors import InputError
 from e2rl.scene.build import BuildSettings, build_scene
-from e2rl.scene.cache import Index
+from e2rl.scene.cache import Index, cached
 from e2rl.scene.packed import pack
 from e2rl.scene.scenarionet import read_recording
-from e2rl.scene.scene import KEYS, RAGGED, SceneSet
+from e2rl.scene.scene import KEYS, RAGGED, Loaded, SceneSet
 from tests.scene.descriptions import description, fork, lane, straight
 
 SETTINGS = BuildSettings(field_cells=64)
@@ -85,11 +85,36 @@ def test_all_scenes_are_in_their_order_and_stay(scenes):
     assert [part["scene_index"].tolist() for part in packed.parts(2)] == [[0, 1], [2, 3], [4]]
 
 
-def test_the_first_scenes_are_those_of_the_set(scenes):
-    first = packed_set(scenes, 9).first(2)
-    assert len(first) == 2 and first.scene_id == ["scene-0", "scene-1"]
-    assert first.rows.hashes() == packed_set(scenes, 9).rows.hashes()[:2]
-    for row, scene in zip(first.scenes, scenes[:2], strict=True):
+def test_chosen_scenes_are_those_of_the_set_and_hashed_alike(scenes):
+    every = packed_set(scenes, 9)
+    for room in (1, 9):
+        some = packed_set(scenes, room).chosen([3, 1, 2]).chosen([2, 0])
+        assert some.scene_id == ["scene-2", "scene-3"] and some.number == [2, 3]
+        assert some.batch([1, 0])["scene_index"].tolist() == [1, 0]
+        for row, scene in zip(some.scenes, (scenes[2], scenes[3]), strict=True):
+            equal(row, scene)
+        assert some.rows.hashes() == every.rows.hashes()[2:4] == Loaded(every.scenes).hashes()[2:4]
+    assert len(set(every.rows.hashes())) == 5 and every.first(2).scene_id == ["scene-0", "scene-1"]
+
+
+def test_what_is_sent_to_another_machine_is_the_set_alone(scenes, tmp_path):
+    """Of a file that is mapped here, only the records that are needed."""
+
+    def build(keep):
+        index = Index(split="test")
+        for number, scene in enumerate(scenes):
+            packed = pack({key: value.numpy() for key, value in scene.items()})
+            index.add(f"scene-{number}", "here", packed)
+            keep(packed.record)
+        return index
+
+    some = cached(tmp_path / "scenes-a.packed", build, 2, 1).chosen([4, 1])
+    some.batch([0, 1])
+    sent = pickle.dumps(some)
+    assert len(sent) < (tmp_path / "scenes-a.packed").stat().st_size / 2
+    found = pickle.loads(sent)
+    assert found.scene_id == some.scene_id and found.rows.hashes() == some.rows.hashes()
+    for row, scene in zip(found.batch([0, 1]), (scenes[4], scenes[1]), strict=True):
         equal(row, scene)
 
 

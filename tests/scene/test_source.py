@@ -5,6 +5,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,8 @@ from e2rl.scene import source
 from e2rl.scene.build import BuildSettings
 from e2rl.scene.bundled import BundledSource
 from e2rl.scene.recording import Lane, Recording
-from e2rl.scene.source import Source, hash_files, load_scenes
+from e2rl.scene.scenarionet import ScenarioNetSource
+from e2rl.scene.source import AHEAD, Source, hash_files, load_scenes
 from tests.scene.descriptions import (
     ALL,
     Malicious,
@@ -78,6 +80,29 @@ def test_the_first_scenes_take_no_more_than_their_logs(tmp_path, workers):
     assert load_scenes(config, num_scenes=1).scene_id == ["scene-0"]
     with pytest.raises(InputError, match=r"sd_02\.pkl"):
         load_scenes(config, num_scenes=3)
+
+
+class CountedSource(ScenarioNetSource):
+    """It tells which logs it read."""
+
+    def read(self, log):
+        self.asked.append(log)
+        return super().read(log)
+
+
+def test_no_more_logs_are_built_than_are_asked_for(tmp_path, monkeypatch):
+    """A few scenes in this process and without one log too many; many by a pool that is never far ahead."""
+    folder, build = write_folder(tmp_path / "x", scenes_of(20)), BuildSettings(field_cells=32)
+    counted = CountedSource(str(folder), cache=str(tmp_path / "cache"), workers=2, build=build)
+    monkeypatch.setattr(source, "worker_pool", lambda workers, method: ThreadPoolExecutor(workers))
+    counted.asked = []
+    first = counted.load(2)
+    assert len(first) == len(counted.asked) == 2
+    monkeypatch.setattr(source, "FEW", 0)
+    counted.asked = []
+    assert counted.load(3).scene_id[:2] == first.scene_id
+    assert sorted(counted.asked) == counted.logs()[: len(counted.asked)] and len(counted.asked) <= 3 + 2 * AHEAD
+    assert counted.load().scene_id == [f"scene-{k}" for k in range(20)]
 
 
 def test_the_cache_is_keyed_by_content_and_settings(tmp_path):
