@@ -78,8 +78,11 @@ class Tally:
                     log_p = log_bernoulli(self.hits[name][key], rollouts, event)[:, None]
                     found[name].append((log_p, torch.ones_like(log_p, dtype=torch.bool), scene))
             begin += len(scenes)
-        columns_of = {name: map(torch.cat, zip(*parts, strict=True)) for name, parts in found.items()}
-        return {name: likelihood(*columns, len(self.scenes)) for name, columns in columns_of.items()}
+        result = {}
+        for name, parts in found.items():
+            log_p, known, scene = map(torch.cat, zip(*parts, strict=True))
+            result[name] = likelihood(log_p, known, scene, len(self.scenes))
+        return result
 
 
 def evaluated(scene: TensorDictBase) -> Tensor:

@@ -50,7 +50,9 @@ class Index:
             if largest != shape and key not in RAGGED:
                 raise InputError(f"scenes of different {key} shapes cannot be one set; build them with equal settings")
             self.layout[key] = kind, tuple(map(max, largest, shape))
-        self.scene_id.append(scene_id), self.location.append(location), self.digest.append(scene.digest)
+        self.scene_id.append(scene_id)
+        self.location.append(location)
+        self.digest.append(scene.digest)
         self.end.append((self.end[-1] if self.end else 0) + len(scene.record))
 
     def scenes(self, records: Sequence[bytes | memoryview], room: int) -> SceneSet:
