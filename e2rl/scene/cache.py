@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from e2rl.errors import InputError
 from e2rl.files import locked, write_atomically
-from e2rl.scene.packed import Packed
+from e2rl.scene.packed import Packed, number_type
 from e2rl.scene.packed_rows import Layout, PackedRows
 from e2rl.scene.scene import RAGGED, SceneSet
 
@@ -107,7 +107,7 @@ def read(path: Path, room: int) -> SceneSet | None:
         with path.open("rb") as file:
             index = _index(file)
             return index.scenes(MappedRecords(file, index.end), room)
-    except (ValueError, TypeError, OSError) as error:
+    except (ValueError, TypeError, LookupError, AttributeError, OSError) as error:
         tqdm.write(f"rebuilding the damaged cache file {path}: {error}", sys.stderr)
         return None
 
@@ -126,7 +126,7 @@ def _index(file: IO[bytes]) -> Index:
         raise ValueError("its content is not what was written")
     file.seek(size - length)
     found = json.loads(file.read(length))
-    layout = {key: (kind, tuple(shape)) for key, (kind, shape) in found.pop("layout").items()}
+    layout = {key: (number_type(kind).str, tuple(shape)) for key, (kind, shape) in found.pop("layout").items()}
     return Index(**found, layout=layout)
 
 

@@ -43,12 +43,21 @@ def unpack(record: bytes | memoryview) -> dict[str, np.ndarray]:
         begin = LENGTH.size + LENGTH.unpack_from(content)[0]
         layout, scene = json.loads(content[LENGTH.size : begin]), {}
         for key, (name, shape) in layout.items():
-            end = begin + int(np.prod(shape)) * np.dtype(name).itemsize
-            scene[key] = _array(content[begin:end], np.dtype(name), shape)
+            dtype = number_type(name)
+            end = begin + int(np.prod(shape)) * dtype.itemsize
+            scene[key] = _array(content[begin:end], dtype, shape)
             begin = end
-    except (zlib.error, struct.error, TypeError, AttributeError) as error:
+    except (zlib.error, struct.error, TypeError, LookupError, AttributeError) as error:
         raise ValueError(f"a damaged scene ({error})") from error
     return scene
+
+
+def number_type(name: str) -> np.dtype:
+    """The type of numbers or truth values of this name; TypeError for objects and others."""
+    dtype = np.dtype(name)
+    if dtype.kind not in "biuf":
+        raise TypeError(f"{name} is no type of numbers")
+    return dtype
 
 
 def _inflated(record: bytes | memoryview) -> bytes:

@@ -1,5 +1,6 @@
 """Packed scenes: whatever their arrays are, they come back bit for bit; damaged records are refused."""
 
+import struct
 import zlib
 
 import numpy as np
@@ -21,6 +22,8 @@ DAMAGED = {
     "empty": b"",
     "changed": RECORD[:MIDDLE] + bytes([RECORD[MIDDLE] ^ 255]) + RECORD[MIDDLE + 1 :],
     "nonsense": b"nonsense",
+    "objects": zlib.compress(struct.pack("<I", 18) + b'{"x": ["|O", [1]]}' + bytes(8)),
+    "too few numbers": zlib.compress(struct.pack("<I", 19) + b'{"x": ["<f8", [2]]}' + bytes(8)),
     "another": zlib.compress(b"\x05\x00\x00\x00[1,2]"),
 }
 
@@ -50,5 +53,5 @@ def test_smooth_numbers_and_padding_take_little():
 
 @pytest.mark.parametrize("damage", DAMAGED)
 def test_damaged_records_are_refused(damage):
-    with pytest.raises(ValueError, match="a scene that is cut short|a damaged scene"):
+    with pytest.raises(ValueError, match="a scene that is cut short|a damaged scene|cannot reshape"):
         unpack(DAMAGED[damage])
