@@ -21,6 +21,7 @@ from e2rl import build
 from e2rl.evaluation.protocol import Setup, drive_all
 from e2rl.scene.scene import SceneSet
 from e2rl.scene.source import load_scenes
+from e2rl.workers import die_with_parent
 
 STARTS = list(range(10, 44, 2))  # frames of a log of 9.1 s: each leaves half of the steps recorded
 
@@ -69,6 +70,8 @@ def peak() -> str:
 
 
 def told(function: Callable[..., str], *arguments) -> None:
+    if (parent := multiprocessing.parent_process()) is not None and parent.pid is not None:
+        die_with_parent(parent.pid)
     print(function(*arguments), flush=True)
 
 
