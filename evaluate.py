@@ -6,6 +6,7 @@ import hydra
 from omegaconf import DictConfig
 
 from e2rl import build, provenance
+from e2rl.capacity import check_fits, evaluation_need
 from e2rl.egos import build_egos, curve_runs
 from e2rl.ending import ending
 from e2rl.evaluation.avoidable import search_effort
@@ -55,6 +56,9 @@ def evaluate(run: Run) -> list[dict]:
     provenance.begin_run(folder, config, MAY_CHANGE, {"scenes": scenes})
     kept = Kept(None if config.figure == "skeleton" else folder)  # that figure listens to every rollout
     setup = Setup(scenes, ego, name, sim, config.batch, config.device)
+    processes, count = build.processes_of(config), len(egos.egos) if egos else 1
+    if str(config.device) == "cpu" and isinstance(processes, int):
+        check_fits(evaluation_need(scenes, methods, len(config.seeds), count, config.batch, processes))
     if task is not None:
         result = run_tuning(config, task, setup, methods, prior, folder)
         if task.group == "synthesizer":
@@ -62,14 +66,14 @@ def evaluate(run: Run) -> list[dict]:
         return result["trials"]
     if (share := build.share_of(config)) is not None:
         setups, into = setups_of(setup, egos) if egos else [setup], folder / ROLLOUTS if config.save_rollouts else None
-        drive_all(setups, methods, config.seeds, into, build.processes_of(config), only, kept, share)
+        drive_all(setups, methods, config.seeds, into, processes, only, kept, share)
         print(f"\nshare {share[0]} of {share[1]} written to {folder}; python -m e2rl.report.merge joins shares")
         return []
     chain = LongestChain(methods[0]) if config.figure == "skeleton" else None
     rows = []
     if config.open_loop_samples:
         rows += open_loop_rows(scenes, methods, config.open_loop_samples, config.device, kept)
-    how = (methods, config.seeds, folder, config.save_rollouts, build.processes_of(config), only, kept)
+    how = (methods, config.seeds, folder, config.save_rollouts, processes, only, kept)
     rows += run_egos(setup, egos, *how) if egos else run_protocol(setup, *how, references=references(config))
     if config.meta_rollouts:
         rows += meta_rows(setup, methods, config.meta_rollouts, kept)

@@ -11,8 +11,10 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from e2rl.build import build_ego, build_prior, build_traffic, caption, resolved, set_up
+from e2rl.capacity import check_fits, training_need
 from e2rl.ending import ending
 from e2rl.errors import InputError
+from e2rl.evaluation.ended import ENDED_FILE, add_ended
 from e2rl.files import alone_in
 from e2rl.learning.build import build_evolution, build_logger, build_measure, check_training, run_bits, run_imitation
 from e2rl.learning.checkpoint import checkpoints, load_checkpoint, save_checkpoint
@@ -35,6 +37,8 @@ def evolve(task: Run) -> None:
     scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
     run, logger = build_evolution(config, scenes, ego, traffic, folder=folder), build_logger(config, folder)
     measure = build_measure(config, ego, task.choices["ego"], traffic, prior, folder)
+    if str(config.device) == "cpu" and isinstance(measure.processes, int):
+        check_fits(training_need(config, scenes, measure.setup.scenes, measure.processes))
     begin_run(folder, config, MAY_CHANGE, {"scenes": scenes, "measured scenes": measure.setup.scenes})
     begun = config.resume and checkpoints(config.resume)  # a run can be cut off in the measurement before
     done = load_checkpoint(config.resume, run) if begun else 0
@@ -46,6 +50,7 @@ def evolve(task: Run) -> None:
     for number in bar:
         metrics = run.run_round()
         logger.log(metrics, number, run.choices)
+        add_ended(folder / ENDED_FILE, number, run.ended)
         save_checkpoint(folder, run, resolved(config), config.keep_last)
         draw_round(run, scenes, config.synthesizer.name, folder, logger, config.logger.replays)
         bar.set_postfix(eta=f"{metrics['synthesizer/eta']:.2f}", hit=f"{metrics.get('synthesizer/contact', nan):.0%}")

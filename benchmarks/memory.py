@@ -1,4 +1,4 @@
-"""Peak memory of the other benchmarks' work, each in a process of its own."""
+"""Peak memory of the other benchmarks' work, each in a process of its own: what e2rl/capacity.py is made of."""
 
 import multiprocessing
 import resource
@@ -9,14 +9,23 @@ import torch
 from measure import Bench, Row
 from tensordict import TensorDict
 
+from e2rl.build import build_ego, build_prior, build_sim, build_traffic, load_choice
+from e2rl.learning.policy import PolicyImprovement
 from e2rl.traffic.rollout import roll_out
+
+WORK = (("simulator", 512), ("nominal rollout", 48), ("e2 rollout", 8), ("e2 rollout", 48), ("learning", 64))
 
 
 def memory(bench: Bench) -> Iterator[Row]:
-    """MiB at most resident: the scenes alone, 512 of them simulated, 32 rolled out against e2."""
-    context, alone = multiprocessing.get_context("spawn"), 0.0
-    for name, size in (("simulator", 512), ("e2 rollout", 32)):
+    """MiB at most resident: the scenes alone, 512 of them simulated, rollouts in nominal traffic and against e2, and
+    environments that a policy learns in."""
+    context, alone, done = multiprocessing.get_context("spawn"), 0.0, set()
+    bench.pick(1)  # the scenes are built: processes of a pool cannot
+    for name, size in WORK:
         (batch,) = bench.batches(size)
+        if (name, batch) in done:
+            continue
+        done.add((name, batch))
         with context.Pool(1) as pool:
             alone, value = pool.apply(_peak, (replace(bench), name, batch))  # without what is loaded
         yield bench.row("memory", name, bench.pick(batch), value, "MiB")
@@ -32,6 +41,21 @@ def _peak(bench: Bench, name: str, batch: int) -> tuple[float, float]:
         env = bench.environment(index)
         for _ in range(5):
             env._step(TensorDict({"action": torch.zeros(batch, 2)}, batch_size=[batch]))
+    elif name == "learning":
+        _learn(bench, batch)
     else:
-        roll_out(bench.scenes, index, index, torch.full((batch,), 2.0), bench.ego, bench.traffic, bench.sim)
+        nominal = name == "nominal rollout"
+        choice = load_choice("synthesizer", "nominal")
+        traffic = build_traffic(choice, build_prior(bench.config)[0]) if nominal else bench.traffic
+        eta = torch.full((batch,), 0.0 if nominal else 2.0)
+        roll_out(bench.scenes, index, index, eta, bench.ego, traffic, bench.sim)
     return alone, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _learn(bench: Bench, batch: int) -> None:
+    """Collect and update twice, in recorded traffic."""
+    config = bench.configured("train")
+    ppo, collect = {**config.learner.ppo, "cloning": 0.0}, {**config.learner.collect, "batch": batch}
+    improve = PolicyImprovement(build_ego(config), bench.scenes, build_sim(config), collect=collect, ppo=ppo)
+    for _ in range(2):
+        improve.learner.update(improve.collected())

@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
@@ -140,6 +140,29 @@ def read_arrays(file: Path | IO[bytes]) -> dict[str, np.ndarray]:
             return {key: _truth(np.asarray(arrays[key])) for key in arrays.files}
     except (*DAMAGED, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(str(error).splitlines()[0] if str(error) else type(error).__name__) from error
+
+
+def misfit(value: Any, shape: Any, where: str = "it") -> str | None:
+    """What in plain nested containers, as of JSON, has another shape than it must; None: nothing.
+
+    shape: a type or several; [shape] for a list of any length; {name: shape} for a dict with these keys and others; a
+    shape under the name ... is that of every other key.
+    """
+    if isinstance(shape, dict):
+        if not isinstance(value, dict):
+            return f"{where} is no object"
+        parts = [(f"{where}.{name}", name, each) for name, each in shape.items() if name is not ...]
+        missing = next((at for at, name, _ in parts if name not in value), None)
+        if missing:
+            return f"{missing} is missing"
+        others = [(f"{where}.{name}", name, shape[...]) for name in value if name not in shape] if ... in shape else []
+        return next((found for at, name, each in parts + others if (found := misfit(value[name], each, at))), None)
+    if isinstance(shape, list):
+        if not isinstance(value, list):
+            return f"{where} is no list"
+        each = (misfit(part, shape[0], f"{where}[{index}]") for index, part in enumerate(value))
+        return next((found for found in each if found), None)
+    return None if isinstance(value, shape) else f"{where} is {str(value)[:40]!r}"
 
 
 def _truth(array: np.ndarray) -> np.ndarray:

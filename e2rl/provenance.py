@@ -89,7 +89,7 @@ def read_provenance(folder: Path) -> dict[str, Any] | None:
         return None
     try:
         known = json.loads(file.read_text())
-        whole = isinstance(known["command"], str) and all(isinstance(each, dict) for each in known["versions"])
+        whole = isinstance(known["command"], str) and all(isinstance(each["git"], str) for each in known["versions"])
         if whole and known["versions"] and isinstance(known["inputs"], dict) and isinstance(known["settings"], dict):
             return known
     except (OSError, ValueError, KeyError, TypeError):

@@ -148,7 +148,10 @@ def check_code(config: DictConfig, allowed: list[str], where: str) -> None:
     an address for an extension, other than of the modules `allowed`."""
     plain = OmegaConf.to_container(config)
     assert isinstance(plain, dict)
-    named = [str(name) for name in plain.get("plugins") or ()]
+    plugins = plain.get("plugins") or []
+    if not isinstance(plugins, list):
+        raise InputError(f"{where}: its configuration is damaged (plugins: {str(plugins)[:40]}); restore it")
+    named = [str(name) for name in plugins]
     named += [target for target in _targets(plain) if not _is_extension(target)]
     named += [text for text in _texts(plain) if "${" in text and ":" in text]  # a resolver: what it makes is unknown
     named += starting_modules(plain)

@@ -13,9 +13,10 @@ from tests.synthetic import make_scenes
 
 PACKAGE = Path(e2rl.__file__).parent
 ORDER = (  # of the folders and files directly in e2rl
-    *("errors", "files", "settings", "workers", "ray_workers", "ending"),
+    *("errors", "files", "weights", "settings", "workers", "ray_workers", "ending"),
     *("scene", "verdicts", "sim", "metrics", "prior", "ego", "evasion", "traffic", "synthesizer", "rivals"),
-    *("evaluation", "build", "egos", "tuning", "api", "provenance", "learning", "resume", "reproduce", "report"),
+    *("evaluation", "capacity", "build", "egos", "tuning", "api", "provenance", "learning"),
+    *("resume", "reproduce", "report"),
 )
 
 

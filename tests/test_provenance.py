@@ -91,7 +91,12 @@ def test_a_new_run_in_an_old_folder_keeps_nothing_of_it(tmp_path):
     assert Kept(tmp_path, "before").load("a", []) is None
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"command": 1}', json.dumps({"command": "x", "versions": []})])
+NO_GIT = {"command": "x", "versions": [{}], "inputs": {}, "settings": {}}
+
+
+@pytest.mark.parametrize(
+    "content", ["", "{", "[]", '{"command": 1}', json.dumps({"command": "x", "versions": []}), json.dumps(NO_GIT)]
+)
 def test_a_damaged_file_is_named(tmp_path, content):
     (tmp_path / PROVENANCE).write_text(content)
     with pytest.raises(InputError, match=f"{PROVENANCE}: damaged"):

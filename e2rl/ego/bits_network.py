@@ -2,13 +2,12 @@
 
 import json
 import math
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from e2rl.ego.base import PLAN_STEPS
@@ -21,9 +20,11 @@ from e2rl.files import write_atomically
 from e2rl.scene.recording import DT
 from e2rl.sim import dynamics
 from e2rl.sim.observation import OBSERVATION_SIZE
+from e2rl.weights import read_weights, unlike, weight_bytes
 
 FORMAT = "e2rl-bits/1"
 WEIGHTS = "bits.safetensors"  # file name in a run's folder
+LARGEST = 1 << 12  # units of a layer
 KNOTS = 10  # accelerations of a plan, each held PLAN_STEPS / KNOTS steps
 GOAL_FEATURES = 6
 ACCELERATION = (-8.0, 5.0)  # m/s^2, the simulator's bounds
@@ -100,9 +101,8 @@ def drive_controls(controls: Controls, start: Tensor, path: RoutePath) -> Candid
 
 def save_bits(network: BitsNetwork, path: Path, origin: dict[str, Any]) -> None:
     """Write a network to a safetensors file; origin: what made it (data, command, settings), kept in the header."""
-    weights = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
     header = {"format": FORMAT, "architecture": json.dumps(network.architecture), "origin": json.dumps(origin)}
-    write_atomically(path, save(weights, header))
+    write_atomically(path, weight_bytes(network.state_dict(), header))
 
 
 def load_bits(checkpoint: str) -> BitsNetwork:
@@ -116,16 +116,19 @@ def load_bits(checkpoint: str) -> BitsNetwork:
             "ego.checkpoint=bundled"
         )
     try:
-        with safe_open(path, "pt") as file:
-            header = file.metadata() or {}
-            weights = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
-    except (SafetensorError, OSError) as error:
+        weights, header = read_weights(path)
+    except ValueError as error:
         raise InputError(f"{path}: not a readable safetensors file ({error}); train it again") from error
     if header.get("format") != FORMAT:
         raise InputError(f"{path}: format {header.get('format')!r}, expected {FORMAT!r}; give a {WEIGHTS} file")
     try:
         saved = json.loads(header["architecture"])
-        network = BitsNetwork(saved["hidden"])
+        hidden = saved["hidden"]
+        if type(hidden) is not int or not 0 < hidden <= LARGEST:
+            raise ValueError(f"hidden {hidden} instead of 1 to {LARGEST}")
+        if wrong := unlike(partial(BitsNetwork, hidden), weights):
+            raise ValueError(wrong)
+        network = BitsNetwork(hidden)
         if saved != network.architecture:
             raise ValueError(f"{saved} instead of {network.architecture}")
         network.load_state_dict(weights)

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Bounded
@@ -19,6 +17,7 @@ from e2rl.ego.reference import LAST_ACTION, reference_action
 from e2rl.errors import InputError
 from e2rl.files import altered, write_atomically
 from e2rl.sim.observation import OBSERVATION_SIZE
+from e2rl.weights import read_weights, weight_bytes
 
 DEEPEST, WIDEST = 16, 1 << 13  # layers, and units of a layer, that a file may ask for
 WEIGHTS = "actor.safetensors"  # file name of an ActorCritic inside a checkpoint
@@ -192,8 +191,8 @@ class ActorCritic(nn.Module):
 
     def save(self, path: Path) -> None:
         """Write weights and statistics to a safetensors file whose header holds the architecture."""
-        weights = {key: value.detach().cpu().contiguous() for key, value in self.weights().items()}
-        write_atomically(path, save(weights, {"architecture": json.dumps(self.architecture, sort_keys=True)}))
+        header = {"architecture": json.dumps(self.architecture, sort_keys=True)}
+        write_atomically(path, weight_bytes(self.weights(), header))
 
     def load(self, path: Path) -> None:
         """Read a file of `save`; raises InputError for a damaged file or another architecture."""
@@ -225,10 +224,9 @@ class ActorCritic(nn.Module):
 def _content(path: Path) -> tuple[Any, dict[str, Tensor]]:
     """The architecture in the header of a file of `ActorCritic.save`, and its weights."""
     try:
-        with safe_open(path, "pt") as file:
-            saved = json.loads((file.metadata() or {}).get("architecture", "null"))
-            return saved, {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError, json.JSONDecodeError) as error:
+        weights, header = read_weights(path)
+        return json.loads(header.get("architecture", "null")), weights
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a readable actor file ({error}); give an {WEIGHTS} file") from None
 
 

@@ -1,80 +1,14 @@
-"""Rollouts that end without a score: something raised in them, or a state became NaN or infinite.
-
-Each is counted by its reason, and the others go on. What raises for a batch is looked for by halving the batch, where a
-PlannerError does not name it.
-"""
+"""The rollouts of a run that ended without a score (e2rl/traffic/attempt.py): their file, and what they mean for it."""
 
 import json
-import traceback
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
 
-import torch
-from torch import Tensor
-
-from e2rl.ego.base import PlannerError
 from e2rl.errors import InputError
 from e2rl.files import write_atomically
+from e2rl.traffic.attempt import summary_of
 
 ENDED_FILE = "ended.json"
-NOT_FINITE = "a state was NaN or infinite"
-OF_THE_RUN = (InputError, OSError, MemoryError, torch.OutOfMemoryError)  # errors that are no single rollout's
-
-Task = TypeVar("Task")
-
-
-def attempt(
-    roll_out: Callable[[Sequence[Task]], dict], tasks: Sequence[Task]
-) -> tuple[list[tuple[list[Task], dict]], list[tuple[Task, dict]]]:
-    """(the tasks that could be rolled out, in parts with their rollout dicts; the others with what ended them)."""
-    try:
-        rollouts = roll_out(tasks)
-    except OF_THE_RUN:
-        raise
-    except Exception as error:  # a planner is outside code and raises anything
-        rows = error.rows if isinstance(error, PlannerError) else {}
-        if len(tasks) > 1 and not rows:
-            half = len(tasks) // 2
-            first, second = attempt(roll_out, tasks[:half]), attempt(roll_out, tasks[half:])
-            return first[0] + second[0], first[1] + second[1]
-        why = {"reason": f"raised {type(error).__name__}", "detail": str(error), "traceback": traceback.format_exc()}
-        rows = rows or {0: str(error)}
-        others = [task for row, task in enumerate(tasks) if row not in rows]
-        own = [(tasks[row], why | {"detail": detail}) for row, detail in rows.items()]
-        parts, further = attempt(roll_out, others) if others else ([], [])
-        return parts, own + further
-    finite = finite_rollouts(rollouts)
-    kept = [task for task, good in zip(tasks, finite, strict=True) if good]
-    lost = [task for task, good in zip(tasks, finite, strict=True) if not good]
-    ended = [(task, {"reason": NOT_FINITE, "detail": "", "traceback": ""}) for task in lost]
-    return ([(kept, chosen(rollouts, finite))] if kept else []), ended
-
-
-def finite_rollouts(rollouts: dict) -> list[bool]:
-    """Whether all states of agents that are there are finite, by rollout."""
-    known = rollouts["states"].isfinite().all(-1) | ~rollouts["valid"]
-    return known.flatten(1).all(1).tolist()
-
-
-def chosen(rollouts: dict, keep: Sequence[bool]) -> dict:
-    """A rollout dict of the rollouts to keep."""
-    if all(keep):
-        return rollouts
-    mask = torch.tensor(keep)
-
-    def part(value: Any) -> Any:
-        if isinstance(value, Tensor) and value.dim():
-            return value[mask]
-        return [item for item, good in zip(value, keep, strict=True) if good] if isinstance(value, list) else value
-
-    return {name: part(value) for name, value in rollouts.items()}
-
-
-def count_reasons(ended: Iterable[dict]) -> dict[str, int]:
-    """How many rollouts ended for each reason."""
-    return dict(Counter(entry["reason"] for entry in ended))
 
 
 def write_ended(path: Path, ended: Sequence[dict]) -> None:
@@ -85,10 +19,20 @@ def write_ended(path: Path, ended: Sequence[dict]) -> None:
         path.unlink(missing_ok=True)
 
 
+def add_ended(path: Path, number: int, ended: Sequence[dict]) -> None:
+    """Write the entries of round `number` of a training into its ended.json, after those of earlier rounds; a resumed
+    run repeats some. A damaged file is begun anew."""
+    try:
+        known = json.loads(path.read_text()) if path.is_file() else []
+        earlier = [entry for entry in known if entry["round"] < number]
+    except (OSError, ValueError, TypeError, KeyError):
+        earlier = []
+    write_ended(path, [*earlier, *ended])
+
+
 def require_rows(rows: Sequence[dict], ended: Sequence[dict], folder: Path | None) -> None:
     """InputError where all rollouts ended without a score."""
     if rows or not ended:
         return
-    reasons = ", ".join(f"{count} {reason}" for reason, count in count_reasons(ended).items())
-    detail, where = ended[0]["detail"], f"; {folder / ENDED_FILE} has the tracebacks" if folder is not None else ""
-    raise InputError(f"no rollout could be scored: {reasons} ({detail[:200]}){where}; mend the planner or the traffic")
+    where = f"; {folder / ENDED_FILE} has the tracebacks" if folder is not None else ""
+    raise InputError(f"no rollout could be scored: {summary_of(ended)}{where}; mend the planner or the traffic")

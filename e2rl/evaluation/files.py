@@ -15,6 +15,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -22,13 +23,23 @@ from torch import Tensor
 
 import e2rl
 from e2rl.errors import InputError
-from e2rl.files import write_atomically
+from e2rl.files import misfit, write_atomically
 from e2rl.metrics.catalogue import WORDS, row_columns
 from e2rl.scene.recording import AGENT_TYPES, DT
 
 FORMAT = "e2rl-rollout/1"
 ROLLOUTS, TABLE, METRICS_FILE = "rollouts", "rollouts.csv", "metrics.json"
 OPTIONAL = ("ran_light",)  # arrays of a rollout that verdicts use where they are known
+SCORE = "python -m e2rl.report.score"
+NEEDED = ("dataset", "split", "method", "ego_policy", "scene_id", "seed", "eta")
+ESTIMATES = {...: {...: (int, float, NoneType)}}
+METRICS_ROW = {  # what readers of metrics.json need
+    **dict.fromkeys(("dataset", "split", "method", "ego"), str),
+    **dict.fromkeys(("eta", "n_scenes", "n_seeds", "n_rollouts"), (int, float)),
+    "metrics": ESTIMATES,
+    "paired": {...: ESTIMATES},
+}
+SOMETIMES = {"ended": {...: int}, "stage": (str, NoneType), "git": str, "command": str, "n_trainings": int}
 TEXT_COLUMNS = ("dataset", "split", "method", "ego_policy", "scene_id", "location", *WORDS)
 
 
@@ -165,19 +176,34 @@ def cell(value: object) -> object:
 
 
 def read_rows(path: Path) -> list[dict]:
-    """The rows of a rollouts.csv: text columns as text, seed and partner as int, all others as float (empty: NaN)."""
+    """The rows of a rollouts.csv: text columns as text, seed and partner as int, all others as float (empty: NaN).
+
+    Raises InputError for a file that is no such table.
+    """
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such table; give the folder of a run that evaluate.py wrote")
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    return [
-        {
+    try:
+        with path.open(newline="") as file:
+            rows = csv.DictReader(file, strict=True)
+            if missing := [name for name in NEEDED if name not in (rows.fieldnames or ())]:
+                raise ValueError(f"no column {missing[0]}")
+            return [_row(rows.line_num, row) for row in rows]
+    except (OSError, ValueError, csv.Error) as error:
+        raise InputError(f"{path}: damaged ({error}); make it again from the rollouts: {SCORE} RUN_DIR") from error
+
+
+def _row(line: int, row: dict[str, Any]) -> dict:
+    """A line of the table with its values; ValueError where it has other cells than the head."""
+    if None in row or None in row.values():
+        raise ValueError(f"line {line} has other cells than the head")
+    try:
+        return {
             key: value if key in TEXT_COLUMNS else int(value) if key in ("seed", "partner") else float(value or "nan")
             for key, value in row.items()
         }
-        for row in rows
-    ]
+    except ValueError as error:
+        raise ValueError(f"line {line}: {error}") from error
 
 
 # --- metrics
@@ -193,11 +219,16 @@ def read_metrics(path: Path) -> list[dict]:
     path = Path(path)
     try:
         rows = json.loads(path.read_text())
-        return [
-            {key: nans(part) if key in ("metrics", "paired") else part for key, part in row.items()} for row in rows
-        ]
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+        if wrong := misfit(rows, [METRICS_ROW]) or next(filter(None, map(_other, rows)), None):
+            raise ValueError(wrong)
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: no readable metrics ({error}); give a metrics.json that a run wrote") from error
+    return [{key: nans(value) if key in ("metrics", "paired") else value for key, value in row.items()} for row in rows]
+
+
+def _other(row: dict) -> str | None:
+    """What has another shape in the entries that not every row of metrics.json has."""
+    return misfit(row, {name: shape for name, shape in SOMETIMES.items() if name in row})
 
 
 def nulls(value: object) -> object:

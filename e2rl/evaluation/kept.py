@@ -1,8 +1,8 @@
 """Finished parts of a run, kept on disk as they end: a run that was killed goes on from them (docs/robustness.md)."""
 
+import hashlib
 import io
 import shutil
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ import torch
 
 from e2rl.files import write_atomically
 
-PARTS, FORMAT = "parts", "e2rl-part/1"
+PARTS, FORMAT, HASHED = "parts", "e2rl-part/1", b"e2rl-sha256:"
 
 
 @dataclass(frozen=True)
@@ -69,19 +69,20 @@ def forget_parts(folder: Path) -> None:
 
 
 def state_bytes(state: Any) -> bytes:
-    """Plain values and tensors in torch's format. As bytes, because a full disk is an OSError then."""
+    """Plain values and tensors in torch's format, after its hash. As bytes, because a full disk is an OSError then."""
     content = io.BytesIO()
     torch.save(state, content)
-    return content.getvalue()
+    return HASHED + hashlib.sha256(content.getvalue()).digest() + content.getvalue()
 
 
 def read_state(file: Path) -> Any:
     """What `state_bytes` made, on the CPU; nothing but plain values and tensors is unpickled. ValueError where the file
     is damaged."""
     try:
-        with zipfile.ZipFile(file) as archive:  # torch's format, with a checksum of each member
-            if archive.testzip() is None:
-                return torch.load(file, map_location="cpu", weights_only=True)
+        content = file.read_bytes()
+        begin = len(HASHED) + hashlib.sha256().digest_size
+        if content[: len(HASHED)] != HASHED or hashlib.sha256(content[begin:]).digest() != content[len(HASHED) : begin]:
+            raise ValueError("not what was written, or of an earlier version")
+        return torch.load(io.BytesIO(content[begin:]), map_location="cpu", weights_only=True)
     except Exception as error:  # damaged bytes raise anything
         raise ValueError(f"{file}: damaged ({error})") from error
-    raise ValueError(f"{file}: damaged")

@@ -4,11 +4,12 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
+from types import NoneType
 
 from e2rl.errors import InputError
 from e2rl.evaluation.files import nulls, rollout_name
 from e2rl.evaluation.summary import GROUP
-from e2rl.files import write_atomically
+from e2rl.files import misfit, write_atomically
 from e2rl.metrics.failure_modes import (
     FEATURES,
     Row,
@@ -25,6 +26,21 @@ OTHER = 0  # number of the small modes together
 VERDICTS = ("counted", "preventable", "at_fault", "avoidable")  # shares of a mode's failures
 MEANS = ("ego_speed", "partner_speed", "relvel")  # m/s
 TYPICAL = ("method", "eta", "scene_id", "seed")
+NUMBER = (int, float)
+SHAPE = {  # what readers of modes.json need
+    "failures": int,
+    "rollouts": int,
+    "unknown": [str],
+    "groups": [
+        {**dict.fromkeys(("dataset", "split", "method", "ego_policy"), str), "eta": NUMBER}
+        | dict.fromkeys(("rollouts", "failures", "modes"), int)
+    ],
+    "modes": [
+        {"mode": int, "name": str, "count": int, "groups": [{"count": int, "share": (*NUMBER, NoneType)}]}
+        | dict.fromkeys((*VERDICTS, *MEANS), (*NUMBER, NoneType))
+        | {"typical": {"file": str}}
+    ],
+}
 
 
 def find_modes(rows: Sequence[dict]) -> dict:
@@ -95,14 +111,27 @@ def known_mean(rows: Iterable[Row], column: str) -> float | None:
     return fmean(values) if values else None
 
 
+def _mismatch(found: dict) -> str | None:
+    """Which mode does not say what it is of each group, or names a file elsewhere; None: none."""
+    for mode in found["modes"]:
+        if len(mode["groups"]) != len(found["groups"]):
+            return f"mode {mode['mode']} is not of the {len(found['groups'])} groups"
+        if Path(mode["typical"]["file"]).name != mode["typical"]["file"]:
+            return f"mode {mode['mode']} names the file {mode['typical']['file'][:60]!r}"
+    return None
+
+
 def write_modes(path: Path, found: dict) -> None:
     """Write modes.json from the result of `find_modes`."""
     write_atomically(path, json.dumps(nulls(found), indent=1, allow_nan=False))
 
 
 def read_modes(path: Path) -> dict:
-    """The content of a modes.json."""
+    """The content of a modes.json; raises InputError where it is none."""
     try:
-        return json.loads(Path(path).read_text())
-    except (OSError, ValueError) as error:
+        found = json.loads(Path(path).read_text())
+        if wrong := misfit(found, SHAPE) or _mismatch(found):
+            raise ValueError(wrong)
+        return found
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: no readable modes ({error}); run evaluate.py again to write them") from error

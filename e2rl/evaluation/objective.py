@@ -24,8 +24,10 @@ class Objective:
         """(objective, excess) of metrics "collision" (rate), "comfort" (mean |acceleration|, m/s^2) and "progress" (m).
 
         reference: metrics of the present parameters. excess: the share by which a guard is missed; 0 for an admissible
-        trial, inf for a metric that is NaN. Raises InputError where a metric is missing.
+        trial, inf for a metric that is NaN. A trial in which more rollouts ended for an error ("ended") than of the
+        reference is not admissible. Raises InputError where a metric is missing.
         """
+        ended = metrics.get("ended", 0.0) - reference.get("ended", 0.0)  # share or number, of both the same
         missing = [name for name in NEEDED if name not in metrics]
         if missing:
             raise InputError(f"planner tuning: evaluate() returned no {', '.join(missing)}")
@@ -33,7 +35,7 @@ class Objective:
         rougher = metrics["comfort"] / max(reference["comfort"], 1e-6)
         lost = self.progress * max(0.0, 1 - kept)
         value = metrics["collision"] + self.comfort * metrics["comfort"] + lost
-        excess = max(0.0, self.progress_floor - kept) + max(0.0, rougher - self.comfort_ceiling)
+        excess = max(0.0, self.progress_floor - kept) + max(0.0, rougher - self.comfort_ceiling) + max(0.0, ended)
         return value, math.inf if math.isnan(value) else excess
 
     def text(self, metrics: Mapping[str, float]) -> str:
@@ -41,4 +43,5 @@ class Objective:
         shares = ", ".join(
             f"{name.split()[1]} {100 * value:.1f}%" for name, value in metrics.items() if name.startswith("collision ")
         )
-        return f"collisions {shares}; {metrics['comfort']:.2f} m/s^2, {metrics['progress']:.1f} m"
+        lost = f"; {100 * metrics['ended']:.1f}% ended for an error" if metrics.get("ended") else ""
+        return f"collisions {shares}; {metrics['comfort']:.2f} m/s^2, {metrics['progress']:.1f} m{lost}"

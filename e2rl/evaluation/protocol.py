@@ -13,7 +13,7 @@ from tqdm import tqdm
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError
 from e2rl.evaluation.avoidable import add_avoidable
-from e2rl.evaluation.ended import ENDED_FILE, attempt, count_reasons, require_rows, write_ended
+from e2rl.evaluation.ended import ENDED_FILE, require_rows, write_ended
 from e2rl.evaluation.files import (
     METRICS_FILE,
     ROLLOUTS,
@@ -28,10 +28,11 @@ from e2rl.evaluation.files import (
 from e2rl.evaluation.kept import NOTHING_KEPT, Kept
 from e2rl.evaluation.modes import MODES_FILE, find_modes, write_modes
 from e2rl.evaluation.processes import Processes, in_processes
-from e2rl.evaluation.summary import metric_rows
+from e2rl.evaluation.summary import empty_rows, metric_rows
 from e2rl.metrics.score import score_rollouts
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.env import SimSettings
+from e2rl.traffic.attempt import attempt, count_reasons
 from e2rl.traffic.rollout import roll_out
 from e2rl.traffic.traffic import Traffic
 
@@ -186,13 +187,14 @@ def record(
     """The rows of metrics.json, summarise(rows, features), with the counts of what ended.
 
     Writes rollouts.csv, modes.json, metrics.json and, where rollouts ended without a score, ended.json. Raises
-    InputError where all did.
+    InputError where all did. A method of which all rollouts ended has a row too, without metrics.
     """
     if folder is not None:
         write_ended(folder / ENDED_FILE, ended)
     require_rows(rows, ended, folder)
-    modes = find_modes(rows)
-    result = [row | {"ended": count_reasons(filter(_of_row(row), ended))} for row in summarise(rows, features)]
+    modes, known = find_modes(rows), summarise(rows, features)
+    known += empty_rows(known, ended)
+    result = [row | {"ended": count_reasons(filter(_of_row(row), ended))} for row in known]
     if folder is not None:
         write_modes(folder / MODES_FILE, modes)
         write_rows(folder / TABLE, rows)

@@ -3,7 +3,9 @@
 Histograms are sums over rollouts, so batches are counted one by one and memory stays constant.
 """
 
+from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
@@ -31,6 +33,7 @@ from e2rl.metrics.statistics import LEVELS, bootstrap_draws, cluster_index, inte
 from e2rl.prior.routed import take_route
 from e2rl.scene.recording import VEHICLE
 from e2rl.scene.scene import SceneSet
+from e2rl.traffic.attempt import attempt
 
 TRACKS = 512  # vehicles of rollouts processed at once: bounds the memory of the pairwise features
 SPLITS = 200  # random splits of the logs into halves
@@ -44,11 +47,14 @@ class Tally:
         size = len(scenes) * self.vehicles
         self.counts = {name: torch.zeros(size, FEATURES[name].bins, dtype=torch.float64) for name in HISTOGRAMS}
         self.hits = {name: torch.zeros(size, dtype=torch.float64) for name in INDICATIONS}
+        self.rollouts = torch.zeros(size, dtype=torch.float64)
 
     def add(self, index: Tensor, rollouts: dict, weight: int = 1) -> None:
         """Count rollouts of scenes index [B] int64, each as `weight` equal ones."""
         scenes = self.scenes.batch(index)
         batch = {**rollouts, **road_of(scenes, rollouts["routes"])}
+        every = index[:, None] * self.vehicles + torch.arange(self.vehicles)
+        self.rollouts.index_add_(0, every.flatten(), torch.full((every.numel(),), float(weight), dtype=torch.float64))
         rollout, agent = evaluated(scenes).nonzero(as_tuple=True)
         for part in torch.arange(len(rollout)).split(TRACKS):
             key = index[rollout[part]] * self.vehicles + agent[part]
@@ -59,14 +65,15 @@ class Tally:
             for name, event in events.items():
                 self.hits[name].index_add_(0, key, event.double(), alpha=weight)
 
-    def likelihoods(self, rollouts: int) -> dict[str, Tensor]:
-        """Likelihood [S] of each feature's logged values after `rollouts` rollouts of every scene; NaN without any."""
+    def likelihoods(self) -> dict[str, Tensor]:
+        """Likelihood [S] of each feature's logged values after the rollouts counted; NaN for a scene without any."""
         found: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {name: [] for name in FEATURES}
+        driven = self.rollouts.view(len(self.scenes), self.vehicles) > 0
         begin = 0  # of the part
         for scenes in self.scenes.parts():
             log = {"states": scenes["logged"], "valid": scenes["logged_valid"], "size": scenes["size"]}
             batch = {**log, **road_of(scenes, scenes["route_log"])}
-            row, agent = evaluated(scenes).nonzero(as_tuple=True)
+            row, agent = (evaluated(scenes) & driven[begin : begin + len(scenes)]).nonzero(as_tuple=True)
             for part in torch.arange(len(row)).split(TRACKS):
                 scene = begin + row[part]
                 key = scene * self.vehicles + agent[part]
@@ -75,7 +82,7 @@ class Tally:
                     log_p = log_probability(self.counts[name][key], bin_index(value, FEATURES[name]))
                     found[name].append((log_p, known, scene))
                 for name, event in events.items():
-                    log_p = log_bernoulli(self.hits[name][key], rollouts, event)[:, None]
+                    log_p = log_bernoulli(self.hits[name][key], self.rollouts[key], event)[:, None]
                     found[name].append((log_p, torch.ones_like(log_p, dtype=torch.bool), scene))
             begin += len(scenes)
         result = {}
@@ -83,6 +90,17 @@ class Tally:
             log_p, known, scene = map(torch.cat, zip(*parts, strict=True))
             result[name] = likelihood(log_p, known, scene, len(self.scenes))
         return result
+
+    def state(self, done: int, lost: list[str]) -> tuple:
+        """The counts after so many tasks, of which `lost` ended for these reasons."""
+        return done, lost, self.rollouts, self.counts, self.hits
+
+    def goes_on(self, state: tuple | None) -> tuple[int, list[str]]:
+        """Go on from a `state`, None: from the beginning; returns the tasks done and the reasons so far."""
+        if state is None:
+            return 0, []
+        done, lost, self.rollouts, self.counts, self.hits = state
+        return done, lost
 
 
 def evaluated(scene: TensorDictBase) -> Tensor:
@@ -110,26 +128,32 @@ def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, kept: Kept
     """Rows of metrics.json, stage `meta-metric`: every feature's likelihood and their weighted sum over `rollouts`
     rollouts of each scene, with intervals over places. The row of the log also has its split-half `real`.
 
-    A deterministic method is rolled out once. kept: the counts of each method so far.
+    A deterministic method is rolled out once. Rollouts that end for an error are counted in `ended`, and in no
+    likelihood. kept: the counts of each method so far.
     """
     scenes, rows = setup.scenes, []
     seeds = [rollouts if method.traffic.stochastic else 1 for method in methods]
     with tqdm(total=sum(seeds) * len(scenes), desc="meta-metric", unit="rollout", disable=None) as bar:
         for number, (method, count) in enumerate(zip(methods, seeds, strict=True)):
-            name, identity = f"meta-{number:03}", [method.name, float(method.eta), rollouts]
+            name, identity = f"meta-{number:03}", [method.name, float(method.eta), rollouts, "with ended"]
             tally, tasks = (Tally(scenes), [(scene, seed) for seed in range(count) for scene in range(len(scenes))])
-            done, tally.counts, tally.hits = kept.load(name, identity) or (0, tally.counts, tally.hits)
+            done, lost = tally.goes_on(kept.load(name, identity))
             bar.update(done)
             for begin in range(done, len(tasks), setup.batch):
                 part = tasks[begin : begin + setup.batch]
-                tally.add(torch.tensor([scene for scene, _ in part]), setup.roll_out(method, part), rollouts // count)
-                kept.save(name, identity, (begin + len(part), tally.counts, tally.hits))
+                parts, ended = attempt(partial(setup.roll_out, method), part)
+                for driven, rolled_out in parts:
+                    tally.add(torch.tensor([scene for scene, _ in driven]), rolled_out, rollouts // count)
+                lost += [why["reason"] for _, why in ended]
+                kept.save(name, identity, tally.state(begin + len(part), lost))
                 bar.update(len(part))
-            metrics = summarise_meta(tally.likelihoods(rollouts), scenes)
+            metrics = summarise_meta(tally.likelihoods(), scenes)
             if method.traffic.replays_log:
                 metrics["real_split_half"] = log_split_half(scenes)
             key = (scenes.dataset, scenes.split, method.name, setup.ego_name, method.eta)
-            rows.append(metric_row(key, len(scenes), rollouts, rollouts * len(scenes), metrics, stage=META_STAGE))
+            fields = {"stage": META_STAGE, "ended": dict(Counter(lost))}
+            rolled = rollouts * len(scenes) - len(lost) * (rollouts // count)
+            rows.append(metric_row(key, len(scenes), rollouts, rolled, metrics, **fields))
     return rows
 
 

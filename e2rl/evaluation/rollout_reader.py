@@ -14,7 +14,9 @@ from e2rl.files import read_arrays
 from e2rl.scene.recording import AGENT_TYPES
 
 TEXTS = ("format", "scene_id", "location", "dataset", "split", "method", "ego_policy")
-SCALARS = (*TEXTS, "seed", "eta", "dt", "ego")
+WHOLE = ("seed", "ego")
+SCALARS = (*TEXTS, *WHOLE, "eta", "dt")
+MOST, FARTHEST, FASTEST, LONGEST = 1e6, 1e5, 150.0, 100.0  # intensity; m, m/s and m of an agent
 ARRAYS = {  # kinds of elements, and shape: a number, or a letter for a size that is the same wherever it stands
     "states": ("f", "TN4"),
     "valid": ("b", "TN"),
@@ -31,6 +33,8 @@ ARRAYS = {  # kinds of elements, and shape: a number, or a letter for a size tha
     "drivable_offsets": ("iu", "Q"),
     "ran_light": ("iu", "N"),
 }
+PLANS = {"planners": ("iu", "P"), "plans": ("f", "KPH2"), "targets": ("iu", "KP")}  # none or all of them
+EXTRAS = {"evasion": ("f", "T4"), **PLANS}
 
 
 def read_rollout(path: Path) -> dict[str, Any]:
@@ -59,13 +63,11 @@ def plain(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
 def _misfits(data: dict[str, np.ndarray]) -> str | None:
     """What does not fit together in the arrays of a rollout; None: nothing."""
     for key in SCALARS:
-        kind = "U" if key in TEXTS else "iuf"
+        kind = "U" if key in TEXTS else "iu" if key in WHOLE else "iuf"
         if data[key].shape != () or data[key].dtype.kind not in kind:
             return f"{key} is no single {'text' if key in TEXTS else 'number'}"
-    if not np.isfinite([data[key].item() for key in ("seed", "eta", "dt", "ego")]).all():
-        return "a number is NaN or infinite"
     sizes: dict[str, int] = {}
-    for key, (kinds, shape) in ARRAYS.items():
+    for key, (kinds, shape) in (ARRAYS | EXTRAS).items():
         if key not in data:
             continue
         array = data[key]
@@ -77,12 +79,39 @@ def _misfits(data: dict[str, np.ndarray]) -> str | None:
                 return wrong
     if min(sizes["T"], sizes["N"]) < 1 or sizes["L"] != sizes["W"] + 1:
         return "it holds no agent, or as many lanes as borders between them"
+    if len(data.keys() & PLANS) not in (0, len(PLANS)):
+        return f"of {', '.join(PLANS)} some are missing"
+    return _odd_numbers(data, sizes["N"]) or _odd_agents(data) or _odd_map(data)
+
+
+def _odd_numbers(data: dict[str, np.ndarray], agents: int) -> str | None:
+    """Which of the single numbers and of the agents' numbers is out of range."""
+    bounds = {"ego": (0, agents - 1), "seed": (0, np.inf), "eta": (0, MOST), "dt": (1e-3, 1)}
+    bounds |= {"planners": (0, agents - 1), "targets": (-1, agents - 1)}
+    for name, (low, high) in bounds.items():
+        if name in data and not ((data[name] >= low) & (data[name] <= high)).all():  # NaN is not, either
+            return f"{name} is out of range"
+    return None
+
+
+def _odd_agents(data: dict[str, np.ndarray]) -> str | None:
+    """Which agents are of no type, of no size, or where no agent can be."""
     if not set(data["agent_type"].tolist()) <= set(AGENT_TYPES):
         return "agent_type names an unknown type"
-    if not all(
-        np.isfinite(data[name][data[known]]).all() for name, known in (("states", "valid"), ("logged", "logged_valid"))
-    ):
-        return "a valid state is NaN or infinite"
+    size = data["size"][data["valid"].any(0)]
+    if not ((size > 0) & (size <= LONGEST)).all():
+        return f"an agent's size is not between 0 and {LONGEST:g} m"
+    for name, known in (("states", "valid"), ("logged", "logged_valid")):
+        states = data[name][data[known]]
+        if not np.isfinite(states).all():
+            return "a valid state is NaN or infinite"
+        if (np.abs(states[:, :2]) > FARTHEST).any() or (np.abs(states[:, 3]) > FASTEST).any():
+            return f"a valid state of {name} is beyond {FARTHEST:g} m or {FASTEST:g} m/s"
+    return None
+
+
+def _odd_map(data: dict[str, np.ndarray]) -> str | None:
+    """Which lines of the map are not divided, or are NaN or infinite."""
     for name in ("lane", "drivable"):
         offsets = data[f"{name}_offsets"].astype(np.int64)
         ends = (offsets[:1].tolist(), offsets[-1:].tolist())
@@ -90,7 +119,7 @@ def _misfits(data: dict[str, np.ndarray]) -> str | None:
             return f"{name}_offsets do not divide {name}_points"
         if not np.isfinite(data[f"{name}_points"]).all():
             return f"{name}_points are NaN or infinite"
-    return None
+    return None if np.isfinite(data["lane_width"]).all() else "lane_width is NaN or infinite"
 
 
 def read_rollouts(folder: Path) -> list[dict[str, Any]]:

@@ -1,11 +1,13 @@
 """The rows of metrics.json: one per (dataset, split, method, ego, eta), with paired differences to other methods."""
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from torch import Tensor
 
 from e2rl.evaluation.files import command_line, git_commit
+from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.statistics import DRAWS, REALISM_DRAWS, paired_differences, summarise
 
 GROUP = ("dataset", "split", "method", "ego_policy", "eta")
@@ -54,6 +56,16 @@ def metric_rows(
         metrics = summarise(*ours, draws, realism_draws)
         result.append(metric_row(key, len(scenes), len(seeds), len(ours[0]), metrics, paired=paired, **fields))
     return result
+
+
+def empty_rows(known: Sequence[dict], ended: Sequence[dict]) -> list[dict]:
+    """Rows of metrics.json of the groups of which every rollout ended without a score: no metric is known. known: the
+    rows of the others, of which the first lends the fields that all have."""
+    present = {tuple(row["ego" if name == "ego_policy" else name] for name in GROUP) for row in known}
+    lost = dict.fromkeys(tuple(entry[name] for name in GROUP) for entry in ended)
+    nothing = {"mean": math.nan, "low": math.nan, "high": math.nan, "n": 0}
+    shared = {name: known[0][name] for name in ("git", "command", "stage") if known and name in known[0]}
+    return [metric_row(key, 0, 0, 0, dict.fromkeys(METRICS, nothing), **shared) for key in lost if key not in present]
 
 
 def rivals(key: Key, keys: Sequence[Key]) -> list[Key]:

@@ -5,20 +5,25 @@ experiment=tune synthesizer=NAME` calls this.
 """
 
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from e2rl.errors import InputError
+from tqdm import tqdm
+
+from e2rl.evaluation.ended import require_rows
 from e2rl.evaluation.processes import Processes
 from e2rl.evaluation.protocol import Method, Setup, drive_all
 from e2rl.evaluation.tuning import Parameters
 from e2rl.metrics.statistics import summarise
 from e2rl.settings import check_choice, check_range
+from e2rl.traffic.attempt import summary_of
 from e2rl.traffic.traffic import Traffic
 
 SOUGHT = ("cfr", "cfr_counted", "cfr_preventable")
 MEASURED = (*SOUGHT, "aor_step", "cfr_bg", "real", "real_adv", "passes")
+LOST = 0.01  # share of rollouts that may end for an error of the planner or the traffic
 NOMINAL = "nominal"  # after a metric's name: its value in the traffic that the budget is held against
 
 
@@ -40,9 +45,12 @@ class AttackObjective:
 
     def judge(self, metrics: Mapping[str, float], reference: Mapping[str, float]) -> tuple[float, float]:
         """(-share of failures, excess) of a trial's metrics; excess: by how much the limits are missed, 0 for an
-        admissible trial, inf for a share that is NaN. reference is not used: each trial has its nominal metrics."""
+        admissible trial, inf for a share that is NaN. reference is not used: each trial has its nominal metrics. A
+        trial that loses more than LOST of its rollouts, beyond nominal traffic's, misses a limit: it would be compared
+        on other scenes."""
         over = metrics["aor_step"] - metrics[f"aor_step {NOMINAL}"] - self.off_road
-        excess = max(0.0, over)
+        lost = metrics.get("ended", 0.0) - metrics.get(f"ended {NOMINAL}", 0.0) - LOST
+        excess = max(0.0, over) + max(0.0, lost)
         if self.realism is not None and not math.isnan(metrics["real_adv"]):
             excess += max(0.0, self.realism - metrics["real_adv"])
         value = -metrics[self.seek]
@@ -51,8 +59,9 @@ class AttackObjective:
     def text(self, metrics: Mapping[str, float]) -> str:
         """The metrics of a trial in a few words."""
         over = 100 * (metrics["aor_step"] - metrics[f"aor_step {NOMINAL}"])
+        lost = f"; {100 * metrics['ended']:.1f}% ended for an error" if metrics.get("ended") else ""
         found = ", ".join(f"{name} {100 * metrics[name]:.1f}%" for name in dict.fromkeys((self.seek, "cfr_counted")))
-        return f"{found}; off the road {over:+.2f} points over nominal; real_adv {metrics['real_adv']:.3f}"
+        return f"{found}; off the road {over:+.2f} points over nominal; real_adv {metrics['real_adv']:.3f}{lost}"
 
 
 @dataclass
@@ -74,19 +83,17 @@ class AttackTrials:
 
     @cached_property
     def reference(self) -> dict[str, float]:
-        return {f"{name} {NOMINAL}": value for name, value in self.measure(self.nominal).items() if name in MEASURED}
+        known = (*MEASURED, "ended")
+        return {f"{name} {NOMINAL}": value for name, value in self.measure(self.nominal).items() if name in known}
 
     def measure(self, method: Method) -> dict[str, float]:
-        """MEASURED of a method, with the intervals of SOUGHT. Raises InputError where rollouts ended without a score:
-        trials would be compared on different scenes."""
+        """MEASURED of a method, with the intervals of SOUGHT, and `ended`, the share of rollouts without a score.
+        Raises InputError where none has one."""
         setup = replace(self.setup, evasions=False)  # no trial is judged by them
         rows, samples, ended = drive_all([setup], [method], self.seeds, None, self.processes)
+        require_rows(rows, ended, None)
         if ended:
-            first = ended[0]
-            raise InputError(
-                f"tuning: {len(ended)} rollouts ended without a score, first scene {first['scene_id']} seed "
-                f"{first['seed']} ({first['reason']}); mend the planner, or leave the scene out"
-            )
+            tqdm.write(f"{len(ended)} rollouts ended without a score: {summary_of(ended)}", sys.stderr)
         found = summarise(rows, samples, realism_draws=0)
-        metrics = {name: found[name]["mean"] for name in MEASURED}
+        metrics = {name: found[name]["mean"] for name in MEASURED} | {"ended": len(ended) / (len(rows) + len(ended))}
         return metrics | {f"{name}_{end}": found[name][end] for name in SOUGHT for end in ("low", "high")}

@@ -21,6 +21,7 @@ from e2rl.files import write_atomically
 
 Parameters = dict[str, Any]
 REFUSED = 10.0  # added to the objective of refused trials, so that the sampler leaves their region
+UNKNOWN = 2 * REFUSED  # of trials in which no rollout has a score
 STUDY = "trials"  # name of the study in its file
 LOCK_GRACE = 5  # s after which the lock of a writer that does nothing more is broken
 LOG = "log"  # third entry of a range that is searched on a logarithmic scale
@@ -80,10 +81,11 @@ def tune(
         measure = partial(evaluate, present | parameters)
         metrics = dict(kept.result(f"trial-{number:05}", list(parameters.items()), measure))
         value, excess = objective.judge(metrics, done[0].user_attrs["metrics"] if done else metrics)
-        if math.isinf(excess):
-            raise InputError(f"tuning: {parameters} yield NaN metrics; check the scenes")
+        if math.isinf(excess) and not done:
+            lost = [name for name, part in metrics.items() if name.startswith("ended: ") and part]
+            raise InputError(f"tuning: {parameters} yield NaN metrics ({', '.join(lost) or 'check the scenes'})")
         outcome = {"metrics": metrics, "objective": value, "admissible": excess == 0}
-        value += REFUSED + excess if excess else 0
+        value = UNKNOWN if math.isinf(excess) else value + (REFUSED + excess if excess else 0)
         study.add_trial(optuna.create_trial(params=parameters, distributions=ranges, value=value, user_attrs=outcome))
         done = _finished(study)
         say(line_of(number, parameters, outcome, objective))

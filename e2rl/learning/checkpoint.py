@@ -69,7 +69,7 @@ def _memory_index(folder: Path) -> list[dict[str, int]]:
     try:
         index = json.loads(file.read_text())
         return [{"round": int(entry["round"]), "crc32": int(entry["crc32"])} for entry in index]
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except (OSError, ValueError, TypeError, LookupError, ArithmeticError, RecursionError) as error:
         raise InputError(f"{file}: damaged ({type(error).__name__}); resume from an older checkpoint") from error
 
 
@@ -132,7 +132,7 @@ def _restore(folder: Path, state: dict, run: Evolution) -> None:
     try:
         run.load_state_dict(state["run"])
         restore_generators(state["generators"])
-    except (KeyError, ValueError, TypeError, IndexError, AttributeError, RuntimeError) as error:
+    except (LookupError, ValueError, TypeError, AttributeError, RuntimeError, ArithmeticError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(

@@ -1,20 +1,20 @@
 """Drives an ego through one episode per pool row, for planner tuning and for expert pairs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
-from tqdm import tqdm
 
-from e2rl.ego.base import Ego, EgoPolicy
+from e2rl.ego.base import Ego, EgoPolicy, PlannerError
 from e2rl.learning.episodes import Episodes, concatenated, decisions
 from e2rl.scene.recording import DT
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.traffic.attempt import attempt
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.transform import AdversarialSynthesizer
 
@@ -71,14 +71,28 @@ class PoolDriver:
         }
         return TensorDict(frames, batch_size=steps.batch_size, device=alive.device)
 
-    def drive_all(self, ego: Ego, pool: TrafficPool, label: str = "") -> Episodes:
-        """Outcomes of one episode in every row of the pool, in order; a progress bar is shown for a non-empty label."""
-        parts = []
-        batches = filled_batches(len(pool), self.env.batch_size[0])
-        for rows in tqdm(batches, label, disable=None if label else True, unit="batch", leave=False):
-            parts.append(episodes_of(self.drive(ego, pool, rows), pool, rows))
+    def drive_all(self, ego: Ego, pool: TrafficPool) -> tuple[Episodes, list[dict]]:
+        """Outcomes of one episode in every row of the pool, in their order, but for those in which the ego raises or
+        becomes NaN; and these, each with its row and reason."""
+        parts: list[Episodes] = []
+        ended: list[dict] = []
+        for rows in torch.arange(len(pool)).split(self.env.batch_size[0]):
+            found, lost = attempt(lambda tasks: self._frames(ego, pool, tasks), rows.tolist())
+            parts += [episodes_of(TensorDict(frames, [len(done)]), pool, torch.tensor(done)) for done, frames in found]
+            ended += [{"row": row, **why} for row, why in lost]
         every = concatenated(parts)
-        return Episodes(*(getattr(every, name)[: len(pool)] for name in Episodes.__dataclass_fields__))
+        order = every.row.argsort()
+        return Episodes(*(getattr(every, name)[order] for name in Episodes.__dataclass_fields__)), ended
+
+    def _frames(self, ego: Ego, pool: TrafficPool, rows: Sequence[int]) -> dict[str, Tensor]:
+        """Frames of `drive` of at most as many rows as there are environments, as `attempt` looks at them."""
+        every = torch.arange(self.env.batch_size[0]) % len(rows)  # the other environments drive them once more
+        try:
+            frames = self.drive(ego, pool, torch.tensor(rows)[every])[: len(rows)]
+        except PlannerError as error:
+            error.rows = {row % len(rows): why for row, why in error.rows.items()}
+            raise
+        return dict(frames.items()) | {"states": frames["executed"], "valid": frames["alive"]}
 
 
 def executed(steps: TensorDictBase) -> Tensor:

@@ -52,8 +52,13 @@ class Episodes:
         return result
 
 
+NONE, NEVER = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool)
+NO_EPISODES = Episodes(NONE, NONE, NEVER, NEVER, NEVER, *[torch.zeros(0)] * 3)
+
+
 def concatenated(parts: list[Episodes]) -> Episodes:
     """All episodes of the parts, in order."""
+    parts = parts or [NO_EPISODES]
     return Episodes(*(torch.cat([getattr(part, name) for part in parts]) for name in Episodes.__dataclass_fields__))
 
 

@@ -2,7 +2,7 @@
 
 import copy
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ from torch import Tensor
 from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import Ego
 from e2rl.learning.ahead import Ahead, AheadElsewhere
-from e2rl.learning.attack import Order, Solvable, Synthesize, make_traffic
+from e2rl.learning.attack import ATTACK, Order, Solvable, Synthesize, counted, ended_of, make_traffic
 from e2rl.learning.curriculum.outcomes import Choice, outcomes_of, tally
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
 from e2rl.learning.episodes import Episodes
@@ -45,22 +45,25 @@ class RoundSettings:
 class Attack:
     """The traffic of a round: the pool, which of the ordered attacks its first K rows are (drawn [K] int64; the others
     were left out), and metrics; contact: the attacked ego's contact rate, None if unknown before the episodes are
-    driven; spent: seconds."""
+    driven; spent: seconds; ended: rows that could not be made."""
 
     pool: TrafficPool
     drawn: Tensor
     metrics: dict[str, float]
     spent: dict[str, float]
     contact: float | None = None
+    ended: list[dict] = field(default_factory=list)
 
 
 class Evolution:
     """The state of a run: curriculum, improvement (which holds the ego) and the memory of D'; choices: what the
-    curriculum chose for the last round and what came of it, in rows (e2rl/learning/curriculum/outcomes.py).
+    curriculum chose for the last round and what came of it, in rows (e2rl/learning/curriculum/outcomes.py); ended: its
+    rollouts that ended for an error of the planner or the traffic, each with its reason.
 
     synthesize(ego, scene_index [S], eta [S], seed) -> {scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N],
-    adversaries [S, N] bool, contact [S] bool}: closed-loop traffic against that ego; contact: it was hit. Of a
-    curriculum that chooses causal templates it also takes template [S].
+    adversaries [S, N] bool, contact [S] bool}: closed-loop traffic against that ego; contact: it was hit. Rows that
+    cannot be made are left out, and ended {position in S: why} names them. Of a curriculum that chooses causal
+    templates it also takes template [S].
     solvable(traffic) -> Solved: rows that enter D', and evasions (None: all, and none). memory: None: in a temporary
     folder. batch: scenes that are synthesized at once; workers: that do it (None: a process here).
 
@@ -85,6 +88,7 @@ class Evolution:
         self.memory, self.batch, self.workers = memory or Memory(None, settings.memory), batch, workers
         self.episodes: Episodes | None = None
         self.choices: list[Choice] = []
+        self.ended: list[dict] = []
         self._next: Order | None = None  # of the coming round, if fixed already
         self._ahead: Ahead | AheadElsewhere | None = None  # what makes it, if begun already
 
@@ -118,7 +122,10 @@ class Evolution:
         contact = learned.get("contact_adversarial") if attack.contact is None else attack.contact
         self.curriculum.advance(contact)
         attacked = {"scenes": float(len(order.scenes)), "eta": order.eta.mean().item()}
-        attacked |= {"left_out": float(outcomes.left_out.sum()), "memory_rows": float(self.memory.rows)}
+        lost = sum(entry["during"] == ATTACK for entry in attack.ended)
+        attacked |= {"left_out": float(outcomes.left_out.sum() - lost), "memory_rows": float(self.memory.rows)}
+        attacked |= counted(attack.ended)
+        self.ended = [*attack.ended, *({"round": order.number, **entry} for entry in self.improve.ended)]
         attacked |= {"fresh_draws": attack.pool.fresh[self.episodes.row].float().mean().item(), **attack.metrics}
         attacked |= {} if contact is None else {"contact": contact}
         groups = {"curriculum": state, "train": learned, "synthesizer": attacked, "time": spent}
@@ -162,8 +169,8 @@ class Evolution:
         pool = self.memory.pool(self.settings.fresh)
         if self.settings.nominal == "log" or not len(pool):  # without nominal traffic the pool may be empty
             pool = pool + TrafficPool.recorded(order.scenes)
-        metrics = {"attacked": traffic["attacked"].item()}
-        return Attack(pool, traffic["kept"].nonzero()[:, 0], metrics, spent, traffic["contact"].item())
+        metrics, drawn = {"attacked": traffic["attacked"].item()}, traffic["kept"].nonzero()[:, 0]
+        return Attack(pool, drawn, metrics, spent, traffic["contact"].item(), ended_of(traffic))
 
     def _live(self, order: Order) -> Attack:
         """Rows whose traffic is replanned against the learning ego, attacked and nominal."""

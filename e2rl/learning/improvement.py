@@ -1,6 +1,7 @@
 """The extension point for learners: the update of the ego in a round."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 
 from e2rl.ego.base import Ego
@@ -15,6 +16,7 @@ class Improvement(ABC):
     rows, None without live rows."""
 
     ego: Ego
+    ended: Sequence[dict] = ()  # episodes of the last round that ended for an error, each with its reason
 
     @abstractmethod
     def __call__(self, pool: TrafficPool, curriculum: CurriculumScheduler) -> tuple[dict[str, float], Episodes]:

@@ -112,9 +112,9 @@ def read_choices(path: Path) -> list[Choice]:
     """
     if not path.is_file():
         return []
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
     try:
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file, strict=True))
         return [{name: kind(row[name] or "nan") for name, kind in COLUMNS.items()} for row in rows]
-    except (KeyError, ValueError, TypeError) as error:
+    except (KeyError, ValueError, TypeError, csv.Error) as error:
         raise InputError(f"{path}: no table of a curriculum's choices ({error}); remove it") from None

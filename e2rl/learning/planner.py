@@ -9,6 +9,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from e2rl.ego.base import Ego
 from e2rl.errors import InputError
 from e2rl.evaluation.objective import Objective
 from e2rl.files import write_atomically
+from e2rl.learning.attack import counted
 from e2rl.learning.curriculum.scheduler import CurriculumScheduler
 from e2rl.learning.driving import PoolDriver
 from e2rl.learning.episodes import Episodes
@@ -68,7 +70,8 @@ def tune(
         value, excess = objective.judge(metrics, trials[0] if trials else metrics)
         trials.append({"parameters": parameters, **metrics, "objective": value, "admissible": excess == 0})
     if math.isnan(trials[0]["objective"]):
-        raise InputError("planner tuning: the present parameters yield NaN metrics; check the scenes")
+        lost = f" ({trials[0]['ended']:.0f} episodes ended for an error)" if trials[0].get("ended") else ""
+        raise InputError(f"planner tuning: the present parameters yield NaN metrics{lost}; check planner and scenes")
     best = min((trial for trial in trials if trial["admissible"] or trial is trials[0]), key=lambda t: t["objective"])
     return Tuning(best["parameters"], trials)
 
@@ -105,12 +108,14 @@ class PlannerImprovement(Improvement):
     def __call__(self, pool: TrafficPool, curriculum: CurriculumScheduler) -> tuple[dict[str, float], Episodes]:
         """Drive the pool once with every combination of the grid; `trials` keeps all results."""
         driven: dict[str, Episodes] = {}
+        lost: dict[str, list[dict]] = {}
 
         def evaluate(parameters: Parameters) -> dict[str, float]:
-            episodes = self.driver.drive_all(type(self.ego)(**parameters), pool)
-            driven[repr(parameters)] = episodes
-            summary = episodes.summary()
-            return {"collision": summary["contact"], "comfort": summary["acceleration"]} | summary
+            key = repr(parameters)
+            driven[key], lost[key] = self.driver.drive_all(type(self.ego)(**parameters), pool)
+            summary = {"contact": nan, "acceleration": nan, "progress": nan} | driven[key].summary()
+            named = {"collision": summary["contact"], "comfort": summary["acceleration"]}
+            return named | summary | counted(lost[key])
 
         tuning = tune(evaluate, self.present, self.grid, self.objective)
         before, after = tuning.trials[0], next(t for t in tuning.trials if t["parameters"] == tuning.best)
@@ -118,8 +123,9 @@ class PlannerImprovement(Improvement):
         chosen = {key: value for key, value in self.present.items() if key in self.grid}
         metrics = {f"parameter_{key}": float(value) for key, value in chosen.items() if isinstance(value, int | float)}
         metrics |= {"objective_before": before["objective"], "objective": after["objective"]}
-        episodes = driven[repr(tuning.best)]
-        return metrics | {"trials": float(len(tuning.trials))} | episodes.summary(), episodes
+        episodes, ended = driven[repr(tuning.best)], lost[repr(tuning.best)]
+        self.ended = [{"during": "tuning", **entry} for entry in ended]
+        return metrics | {"trials": float(len(tuning.trials))} | episodes.summary() | counted(ended), episodes
 
     def outcome(self, folder: Path) -> str:
         """Write the trials of the last round to tuning.json; returns how to evaluate the tuned planner."""

@@ -3,10 +3,10 @@
 import hashlib
 import json
 from dataclasses import asdict
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from e2rl.errors import InputError
@@ -16,10 +16,13 @@ from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.features import EDGE, NODE
 from e2rl.prior.lane_relative import SIZE
 from e2rl.prior.prior import Prior, SamplerSettings
+from e2rl.settings import settings_of
+from e2rl.weights import read_weights, unlike, weight_bytes
 
 FORMAT = "e2rl-prior/1"
 BUNDLED = "bundled"
 FEATURES = [NODE, EDGE, SIZE]
+LARGEST = 1 << 12  # of a network's sizes
 
 
 def save_prior(prior: Prior, folder: Path, origin: dict) -> Path:
@@ -32,7 +35,7 @@ def save_prior(prior: Prior, folder: Path, origin: dict) -> Path:
     header = {"format": FORMAT, "architecture": json.dumps(architecture), "origin": json.dumps(origin)}
     tensors = {key: value.detach().cpu().contiguous() for key, value in prior.state_dict().items()}
     path = Path(folder) / f"prior-{hashlib.sha256(save(tensors)).hexdigest()[:12]}.safetensors"
-    write_atomically(path, save(tensors, header))
+    write_atomically(path, weight_bytes(tensors, header))
     return path
 
 
@@ -50,10 +53,8 @@ def load_prior(
             f"or use prior.checkpoint={BUNDLED}"
         )
     try:
-        with safe_open(path, "pt") as file:
-            header = file.metadata() or {}
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
-    except (SafetensorError, OSError) as error:
+        tensors, header = read_weights(path)
+    except ValueError as error:
         raise InputError(f"{path}: not a readable safetensors file ({error}); train the prior again") from error
     if header.get("format") != FORMAT:
         raise InputError(f"{path}: format {header.get('format')!r}, expected {FORMAT!r}; is it a prior checkpoint?")
@@ -61,9 +62,15 @@ def load_prior(
         architecture, origin = json.loads(header["architecture"]), json.loads(header["origin"])
         if architecture["features"] != FEATURES:
             raise ValueError(f"made for {architecture['features']} features, this version has {FEATURES}")
-        prior = Prior(DenoiserSettings(**architecture["denoiser"]), sampler, bounds, architecture["free_space"])
+        settings = settings_of(DenoiserSettings, architecture["denoiser"], "denoiser")
+        if max(settings.width, settings.blocks, settings.pair) > LARGEST:
+            raise ValueError(f"a size above {LARGEST} in {settings}")
+        make = partial(Prior, settings, sampler, bounds, bool(architecture["free_space"]))
+        if wrong := unlike(make, tensors):
+            raise ValueError(wrong)
+        prior = make()
         prior.load_state_dict(tensors)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (KeyError, TypeError, ValueError, RuntimeError, InputError) as error:
         reason = " ".join(str(error).split("\n\t")[:2])  # of torch's list of tensors that do not fit, the first
         raise InputError(f"{path}: another architecture ({reason}); train the prior again") from error
     return prior.requires_grad_(False).eval().to(device), origin

@@ -91,11 +91,17 @@ def read_curves(run: Path) -> dict[str, tuple[list[float], list[float]]]:
 
 
 def read_scalar(path: Path) -> dict[int, float]:
-    """{round: value} of a scalar's CSV file, the last value of a round that was done twice; {} without a file."""
+    """{round: value} of a scalar's CSV file, the last value of a round that was done twice; {} without a file.
+
+    Raises InputError for a file that is none.
+    """
     if not path.is_file():
         return {}
-    with path.open(newline="") as file:
-        return {int(number): float(value) for number, value in csv.reader(file)}
+    try:
+        with path.open(newline="") as file:
+            return {int(number): float(value) for number, value in csv.reader(file, strict=True)}
+    except (ValueError, csv.Error) as error:
+        raise InputError(f"{path}: no log of a scalar ({error}); remove it, or restore it") from error
 
 
 def plain_figure(width: float, height: float, panels: int, rows: int = 1) -> tuple[Figure, list[Axes]]:

@@ -53,8 +53,16 @@ def round_line(metrics: Mapping[str, float], number: int, rounds: int) -> str:
         f"({metrics['synthesizer/left_out']:.0f} left out: no way found to avoid them), "
         f"{metrics['time/synthesize']:.0f} s synthesis, {metrics['time/improve']:.0f} s learning"
         + (f", {waiting:.0f} s waiting" if waiting is not None else "")
+        + ended_text(metrics)
         + (f", collected at {speed:.0f} steps/s" if speed else "")
     )
+
+
+def ended_text(metrics: Mapping[str, float]) -> str:
+    """How many rollouts and episodes ended for an error, and why; "" for none."""
+    found = {name.rpartition("/ended_")[2]: count for name, count in metrics.items() if "/ended_" in name}
+    reasons = ", ".join(f"{count:.0f} {reason.replace('_', ' ')}" for reason, count in found.items())
+    return f", without a score: {reasons}" if reasons else ""
 
 
 def hits(traffic: Mapping[str, Tensor], scenes: SceneSet) -> Tensor:

@@ -217,10 +217,11 @@ def save_tables(path: Path, tables: Sequence[Table]) -> None:
 
 
 def read_tables(path: Path) -> list[Table]:
-    """The tables of a file that `save_tables` wrote; a caption is one line. InputError where there is no such file."""
+    """The tables of a file that `save_tables` wrote; a caption is one line. InputError where there is no such file, or
+    where a table has no line under its head."""
     try:
         blocks = Path(path).read_text().split("\n\n")
-    except OSError as error:
+    except (OSError, UnicodeError) as error:
         raise InputError(f"{path}: no tables ({error}); give the folder of a run that evaluate.py wrote") from error
     tables: list[Table] = []
     title = ""
@@ -229,6 +230,8 @@ def read_tables(path: Path) -> list[Table]:
         if block.strip().startswith("## "):
             title = block.strip()[3:]
         elif lines and lines[0].startswith("| "):
+            if len(lines) < 2:
+                raise InputError(f"{path}: damaged at {lines[0][:60]!r}; run evaluate.py again to write it")
             head, _, *rows = [[cell.replace("&#124;", "|") for cell in row[2:-2].split(" | ")] for row in lines]
             tables.append(Table(caption.strip(), head, rows, title))
             title = ""

@@ -117,6 +117,8 @@ def _scenario(path: Path) -> Recording:
     states, valid = np.zeros((frames, len(tracks), 4)), np.zeros((frames, len(tracks)), bool)
     for index, track in enumerate(tracks):
         for state in track.object_states:
+            if valid[state.timestep, index]:
+                raise InputError(f"track {track.track_id} is recorded twice at step {state.timestep}; leave one out")
             speed = np.hypot(*state.velocity)
             states[state.timestep, index] = [*state.position, state.heading, speed]
             valid[state.timestep, index] = True
@@ -140,6 +142,8 @@ def _sensor_log(path: Path) -> Recording:
     stamps, frame = np.unique(table["timestamp_ns"], return_inverse=True)
     names, first, track = np.unique(table["track_uuid"].astype(str), return_index=True, return_inverse=True)
     check({"states": len(stamps) * (len(names) + 1)}, path.parent.name)
+    if len(np.unique(np.stack([frame, track]), axis=1).T) < len(frame):
+        raise InputError("a track is annotated twice at one time stamp; leave one out")
     poses = read_city_SE3_ego(path.parent)
     turn = np.stack([poses[int(stamp)].rotation for stamp in stamps])
     place = np.stack([poses[int(stamp)].translation for stamp in stamps])

@@ -8,6 +8,7 @@ frames, of several the one that drives farthest.
 import io
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import inf, isfinite
 from types import SimpleNamespace
 from typing import Any
 from xml.parsers import expat
@@ -42,6 +43,8 @@ TYPES = {  # by the name of an ObstacleType
 LIGHTS = {"red": LIGHT_RED, "redYellow": LIGHT_RED, "yellow": LIGHT_YELLOW, "green": LIGHT_GREEN}
 FOR_OTHERS = {"sidewalk", "crosswalk", "bicycleLane", "busStop", "border", "parking", "restricted_area"}  # LaneletType
 MOVES, NEAR = 0.5, 1.0  # m/s, m: a vehicle that moves; from a planning problem's start
+NUMBERS = {"x", "y", "z", "exact", "intervalStart", "intervalEnd", "length", "width", "radius", "orientation"}
+MAX_DEPTH, LARGEST_ANGLE = 32, 1000.0  # elements; rad
 DURATION = (0.01, 1.0)  # s, of a time step
 
 
@@ -70,7 +73,7 @@ def read_scenario(content: bytes, name: str, start: int = HISTORY) -> Recording:
     """
     reader = _reader()
     try:
-        _refuse_entities(content)
+        _check_content(content)
         scenario, problems = reader(io.BytesIO(content)).open()
         return _recording(scenario, list(problems.planning_problem_dict.values()), start)
     except InputError as error:
@@ -92,14 +95,32 @@ def _reader() -> type:
     return XMLFileReader
 
 
-def _refuse_entities(content: bytes) -> None:
-    """Raise InputError for a document type: scenarios have none, and it may name files or grow when it is expanded."""
+def _check_content(content: bytes) -> None:
+    """Raise InputError for a document type, as scenarios have none, and it may name files or grow when it is expanded;
+    for deep nesting; and for numbers that are infinite, NaN, or no angles, with which commonroad-io would not end."""
+    opened: list[str] = []
 
     def refuse(*_: object) -> None:
         raise InputError("holds a document type declaration, which no CommonRoad scenario needs; remove it")
 
+    def begin(name: str, _: object) -> None:
+        opened.append(name)
+        if len(opened) > MAX_DEPTH:
+            raise InputError(f"nests deeper than {MAX_DEPTH} elements; export it again")
+
+    def text(value: str) -> None:
+        if opened[-1] in NUMBERS and value.strip():
+            most = LARGEST_ANGLE if "orientation" in opened[-2:] else inf
+            number = float(value)
+            if not (isfinite(number) and abs(number) <= most):
+                raise InputError(f"{'/'.join(opened[-3:])} is {value.strip()[:40]}; repair it")
+
     parser = expat.ParserCreate()
+    parser.buffer_text = True  # a text comes whole
     parser.StartDoctypeDeclHandler = refuse
+    parser.StartElementHandler = begin
+    parser.EndElementHandler = lambda _: opened.pop()
+    parser.CharacterDataHandler = text
     parser.Parse(content, True)
 
 

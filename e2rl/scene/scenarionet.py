@@ -3,6 +3,7 @@ Argoverse 2 and Lyft. They are read without ever executing what a file names."""
 
 import csv
 import json
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,6 +24,8 @@ LIGHTS = {  # by the last word of LANE_STATE_... (Waymo) or TRAFFIC_LIGHT_... (n
     **dict.fromkeys(("CAUTION", "YELLOW"), LIGHT_YELLOW),
     **dict.fromkeys(("STOP", "RED"), LIGHT_RED),
 }
+OBSTACLES = ("UNSET", "TRAFFIC_CONE", "TRAFFIC_BARRIER", "TRAFFIC_OBJECT", "TRAFFIC_LIGHT", "BUILDING", "GROUND")
+TYPES |= dict.fromkeys(OBSTACLES, TYPES["OTHER"])  # MetaDrive's further names of tracks
 MAX_NAME = 128  # characters of a scene's id
 
 
@@ -71,7 +74,11 @@ def safe_load(content: bytes, name: str) -> dict:
 
 def read_recording(content: bytes, name: str, location: str = "") -> Recording:
     """The whole log in a pickle, at 10 Hz, with its own start frame if it names one; raises InputError naming it."""
-    data = safe_load(content, name)
+    return recording_of(safe_load(content, name), name, location)
+
+
+def recording_of(data: dict, name: str, location: str = "") -> Recording:
+    """The same of a ScenarioDescription that was read already."""
     try:
         return _recording(data, location)
     except InputError as error:
@@ -86,6 +93,9 @@ def _recording(data: dict, location: str) -> Recording:
     keys, ego = [str(key) for key in tracks], metadata.get("sdc_id")
     if str(ego) not in keys:
         raise InputError(f"no ego: metadata.sdc_id={ego!r} is none of its {len(tracks)} tracks; leave it out")
+    if len(set(keys)) < len(keys):
+        twice = next(key for key, count in Counter(keys).items() if count > 1)
+        raise InputError(f"two of its tracks have the id {twice!r}; give each its own")
     states, valid, size = _tracks(tracks)
     frames, scene_id = len(states), str(data.get("id") or metadata.get("scenario_id"))[: MAX_NAME + 1]
     if len(scene_id) > MAX_NAME:
@@ -106,13 +116,20 @@ def _recording(data: dict, location: str) -> Recording:
         states=states,
         valid=valid,
         size=size,
-        agent_type=np.array([TYPES.get(track["type"], TYPES["OTHER"]) for track in tracks.values()]),
+        agent_type=np.array([_type(key, track["type"]) for key, track in tracks.items()]),
         ego=keys.index(str(ego)),
         lanes=lanes,
         drivable=drivable,
         lights=_lights(data.get("dynamic_map_states", {}), lanes, seconds, len(states)),
         current=None if current is None else int(round(seconds[int(current)] / DT)),
     )
+
+
+def _type(key: object, name: object) -> int:
+    """The agent type that a track's type stands for; InputError for one that is not known."""
+    if not isinstance(name, str) or name not in TYPES:
+        raise InputError(f"track {key} is of the unknown type {str(name)[:40]!r}; known are {', '.join(TYPES)}")
+    return TYPES[name]
 
 
 def _tracks(tracks: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -44,7 +44,7 @@ def read_answer(text: str, vehicles: list[int]) -> Verdicts:
     try:
         entries = json.loads(text)["vehicles"]
         verdicts = {entry["id"]: tuple(entry[name] for name in CRITERIA) for entry in entries}
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"the answer is not of the schema ({type(error).__name__}: {error})") from error
     if sorted(map(str, verdicts)) != sorted(map(str, vehicles)) or len(entries) != len(vehicles):
         raise ValueError(f"the answer is about vehicles {sorted(map(str, verdicts))}, asked was about {vehicles}")

@@ -1,7 +1,9 @@
 """Closed-loop rollouts of scenes with an ego and live traffic, for evaluation and for D'."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -16,6 +18,7 @@ from e2rl.scene.route import project
 from e2rl.scene.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.traffic_light import ran_red
+from e2rl.traffic.attempt import attempt
 from e2rl.traffic.passes import counted_passes
 from e2rl.traffic.plan_log import PlanLog
 from e2rl.traffic.pool import TrafficPool
@@ -110,20 +113,38 @@ def synthesize_traffic(scenes: SceneSet, traffic: Traffic, sim: SimSettings, bat
     """A function (ego, scene_index [S], eta [S] or one for all, seed, template [S], by default full for all) -> the D'
     of Algorithm 1 against that ego.
 
-    D': scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N], adversaries [S, N], contact [S] (the ego touched a
-    vehicle).
+    D': scene_index [K], states [K, T+1, N, 4], valid [K, T+1, N], adversaries [K, N], contact [K] (the ego touched a
+    vehicle), and ended {position in S: why} of the S - K rows in which the ego or the traffic raised or became NaN.
     """
 
     def synthesize(
         ego: Ego, scene_index: Tensor, eta: Tensor | float, seed: int, template: Tensor | None = None
-    ) -> dict[str, Tensor]:
-        parts, etas = [], torch.as_tensor(eta, dtype=torch.float32).expand(len(scene_index))
+    ) -> dict[str, Any]:
+        etas = torch.as_tensor(eta, dtype=torch.float32).expand(len(scene_index))
         template = torch.full_like(scene_index, FULL) if template is None else template
-        every = (given.split(batch) for given in (scene_index, etas, template))
-        for rows, intensity, limits in zip(*every, strict=True):
-            noise = rows + seed * 1_000_003
-            parts.append(roll_out(scenes, rows, noise, intensity, ego, traffic, sim, device, limits))
-        names = ("states", "valid", "adversaries", "contact")
-        return {"scene_index": scene_index} | {name: torch.cat([part[name] for part in parts]) for name in names}
+
+        def roll_out_rows(rows: Sequence[int]) -> dict:
+            index, at = scene_index[list(rows)], list(rows)
+            noise = index + seed * 1_000_003
+            return roll_out(scenes, index, noise, etas[at], ego, traffic, sim, device, template[at])
+
+        done: list[int] = []
+        parts, ended = [_nothing(scenes)], dict[int, dict]()
+        for rows in torch.arange(len(scene_index)).split(batch):
+            found, lost = attempt(roll_out_rows, rows.tolist())
+            done += [row for tasks, _ in found for row in tasks]
+            parts += [part for _, part in found]
+            ended |= dict(lost)
+        at = torch.tensor(done, dtype=torch.int64)
+        order = at.argsort()
+        made = {name: torch.cat([part[name] for part in parts])[order] for name in parts[0]}
+        return made | {"scene_index": scene_index[at[order]], "ended": ended}
 
     return synthesize
+
+
+def _nothing(scenes: SceneSet) -> dict[str, Tensor]:
+    """What D' holds of no rollout."""
+    scene = scenes.batch([0])[:0]
+    states, valid = scene["logged"], scene["logged_valid"]
+    return {"states": states, "valid": valid, "adversaries": valid[:, 0], "contact": valid[:, 0, 0]}

@@ -7,7 +7,7 @@ import torch
 
 from e2rl.ego.idm import IDMEgo
 from e2rl.errors import InputError
-from e2rl.evaluation.ended import ENDED_FILE, NOT_FINITE, attempt
+from e2rl.evaluation.ended import ENDED_FILE, add_ended
 from e2rl.evaluation.files import METRICS_FILE, ROLLOUTS, TABLE, read_metrics, read_rows
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.report.score import main as score
@@ -60,19 +60,6 @@ def test_the_others_are_scored_and_the_count_stands_everywhere(tmp_path, raises,
     assert whole["ended"] == {} and whole["n_rollouts"] == 8 and not (tmp_path / ENDED_FILE).exists()
 
 
-def test_states_that_are_not_finite_count_as_ended():
-    def roll_out(tasks):
-        states = torch.zeros(len(tasks), 2, 3, 4)
-        states[:, :, 2] = torch.nan  # of an agent that is not there
-        states[1, 1, 0, 3] = torch.inf
-        valid = torch.tensor([True, True, False]).expand(len(tasks), 2, 3)
-        return {"states": states, "valid": valid, "scene_id": [f"s{task}" for task in tasks], "eta": 2.0}
-
-    ((kept, rollouts),), ended = attempt(roll_out, [4, 5, 6])
-    assert kept == [4, 6] and rollouts["scene_id"] == ["s4", "s6"] and len(rollouts["states"]) == 2
-    assert rollouts["eta"] == 2.0 and [(task, why["reason"]) for task, why in ended] == [(5, NOT_FINITE)]
-
-
 def test_where_all_end_the_message_says_why(tmp_path):
     with pytest.raises(
         InputError, match="no rollout could be scored: 2 raised ZeroDivisionError .no way out.*tracebacks"
@@ -81,27 +68,32 @@ def test_where_all_end_the_message_says_why(tmp_path):
     assert len(json.loads((tmp_path / ENDED_FILE).read_text())) == 2
 
 
-@pytest.mark.parametrize("error", [InputError("bad"), OSError(28, "No space left on device"), MemoryError()])
-def test_errors_of_the_whole_run_end_it(error):
-    def roll_out(tasks):
-        raise error
+def test_a_method_of_which_all_rollouts_end_stays_in_the_table(tmp_path):
+    class Lost(Replay):
+        def replan(self, *rest):
+            raise ZeroDivisionError("no way out")
 
-    with pytest.raises(type(error)):
-        attempt(roll_out, [1, 2])
+    setup = Setup(scene_set(2), IDMEgo(), "idm", SimSettings(), 4)
+    rows = run_protocol(setup, [*METHODS, Method("lost", Lost(), 0.0)], [0], tmp_path, stage="before")
+    assert [(row["method"], row["n_rollouts"], row["stage"]) for row in rows] == [
+        ("replay", 2, "before"),
+        ("lost", 0, "before"),
+    ]
+    assert rows[1]["ended"] == {"raised ZeroDivisionError": 2} and rows[1]["metrics"]["cfr"]["n"] == 0
+    assert "lost: 0 scenes, 0 seeds, 0 rollouts, 2 without a score" in metric_tables(rows)[0].caption.replace(
+        "before ", ""
+    )
+    assert read_metrics(tmp_path / METRICS_FILE)[1]["method"] == "lost"
 
 
-def test_a_batch_is_halved_until_the_one_that_raises_is_alone():
-    asked = []
-
-    def roll_out(tasks):
-        asked.append(list(tasks))
-        if 5 in tasks:
-            raise KeyError(5)
-        return {"states": torch.zeros(len(tasks), 1, 1, 4), "valid": torch.ones(len(tasks), 1, 1, dtype=torch.bool)}
-
-    done, ended = attempt(roll_out, list(range(8)))
-    assert [task for tasks, _ in done for task in tasks] == [0, 1, 2, 3, 4, 6, 7]
-    assert [(task, why["reason"]) for task, why in ended] == [(5, "raised KeyError")] and len(asked) == 7
+def test_what_ended_in_a_training_is_kept_by_round_and_not_doubled_by_a_resumed_one(tmp_path):
+    path = tmp_path / ENDED_FILE
+    for number, reasons in ((0, "ab"), (1, ""), (2, "c"), (1, "d")):
+        add_ended(path, number, [{"round": number, "reason": reason} for reason in reasons])
+    assert [entry["reason"] for entry in json.loads(path.read_text())] == ["a", "b", "d"]
+    path.write_text("[")
+    add_ended(path, 3, [{"round": 3, "reason": "e"}])
+    assert len(json.loads(path.read_text())) == 1
 
 
 def test_rollouts_on_disk_are_scored_by_a_command(tmp_path, capsys):

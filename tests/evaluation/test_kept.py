@@ -1,11 +1,12 @@
 """Finished parts of a run are read, whole and of what is asked for, or done again; a stranger's file runs nothing."""
 
 import os
+import random
 
 import pytest
 import torch
 
-from e2rl.evaluation.kept import Kept, forget_parts
+from e2rl.evaluation.kept import Kept, forget_parts, state_bytes
 
 VALUE = ([{"cfr": 1.0, "seed": 3, "duty": ""}], [{"speed": torch.arange(3.0)}], [])
 
@@ -45,8 +46,14 @@ def test_every_damage_is_noticed_and_the_part_done_again(tmp_path):
     for cut in (0, 1, len(whole) // 2, len(whole) - 1):
         file.write_bytes(whole[:cut])
         assert Kept(tmp_path).load("a", [1]) is None
+    draw = random.Random(0)
+    for _ in range(200):
+        flipped = bytearray(whole)
+        flipped[draw.randrange(len(whole))] ^= 1 << draw.randrange(8)
+        file.write_bytes(flipped)
+        assert Kept(tmp_path).load("a", [1]) is None
     for value in ([1, 2], {"format": "e2rl-part/1"}, "text"):  # whole, but no part
-        torch.save(value, file)
+        file.write_bytes(state_bytes(value))
         assert Kept(tmp_path).load("a", [1]) is None
     calls = []
     Kept(tmp_path).result("a", [1], counted(calls))
@@ -64,7 +71,8 @@ class Malicious:
 def test_a_strangers_part_runs_nothing(tmp_path):
     Kept(tmp_path).save("a", [1], VALUE)
     (file,) = tmp_path.rglob("*.pt")
-    torch.save({"format": "e2rl-part/1", "about": "", "identity": [1], "value": Malicious(tmp_path / "ran")}, file)
+    part = {"format": "e2rl-part/1", "about": "", "identity": [1], "value": Malicious(tmp_path / "ran")}
+    file.write_bytes(state_bytes(part))
     assert Kept(tmp_path).load("a", [1]) is None and not (tmp_path / "ran").exists()
 
 

@@ -3,10 +3,12 @@
 import pytest
 import torch
 
+from e2rl.errors import InputError
 from e2rl.evaluation.open_loop import HORIZONS, open_loop_rows
 from e2rl.evaluation.protocol import Method
 from e2rl.metrics.catalogue import OPEN_LOOP, OPEN_LOOP_STAGE
 from e2rl.prior.prior import SamplerSettings
+from e2rl.report.tables import metric_tables
 from e2rl.traffic.constant_velocity import ConstantVelocity
 from e2rl.traffic.idm import IDM
 from e2rl.traffic.nominal import NominalTraffic
@@ -105,3 +107,30 @@ def test_plans_begin_at_the_start_do_not_know_the_future_and_are_the_same_in_any
     assert torch.equal(on.open_loop_plans(blind, seed), plan)
     torch.testing.assert_close(on.open_loop_plans(scene[1:2], seed[:, 1:2]), plan[1:2], rtol=0, atol=5e-3)
     assert not torch.allclose(on.open_loop_plans(scene, seed + 1), plan)
+
+
+class Stumbles(ConstantVelocity):
+    """Raises in scene 1, plans NaN in scene 3."""
+
+    def open_loop_plans(self, scene, seed):
+        if (scene["scene_index"] == 1).any():
+            raise ZeroDivisionError("no way out")
+        plans = super().open_loop_plans(scene, seed)
+        plans[scene["scene_index"] == 3] = torch.nan
+        return plans
+
+
+def test_scenes_without_a_plan_are_counted_and_the_others_keep_their_figures():
+    scene_set = places(acceleration=1.2)
+    (row,) = open_loop_rows(scene_set, [Method("stumbles", Stumbles())], 1)
+    assert row["ended"] == {"raised ZeroDivisionError": 1, "a state was NaN or infinite": 1}
+    assert row["n_scenes"] == row["n_rollouts"] == 2 and row["metrics"]["cv_ade_5"]["n"] == 2 * 4
+    assert row["metrics"]["min_ade_5"]["mean"] == pytest.approx(metrics(scene_set)["min_ade_5"]["mean"])
+    assert "2 scenes, 1 seed, 2 rollouts, 1 without a score" in metric_tables([row])[0].caption
+    with pytest.raises(InputError, match="no rollout could be scored"):
+        open_loop_rows(scene_set.first(2), [Method("lost", Lost())], 1)
+
+
+class Lost(ConstantVelocity):
+    def open_loop_plans(self, scene, seed):
+        raise ZeroDivisionError

@@ -54,11 +54,11 @@ def sampled(scene_set, seeds):
     return [(index, setup.roll_out(method, [(k, seed) for k in range(len(scene_set))])) for seed in seeds]
 
 
-def likelihoods(scene_set, parts, rollouts):
+def likelihoods(scene_set, parts):
     tally = Tally(scene_set)
     for index, part in parts:
         tally.add(index, part)
-    return tally.likelihoods(rollouts)
+    return tally.likelihoods()
 
 
 def same(one, other):
@@ -71,7 +71,7 @@ def test_a_log_that_equals_all_rollouts_is_as_likely_as_the_smoothing_lets_it_be
     """At constant velocity every feature of motion stays in one bin, so each likelihood has a closed form."""
     scene_set = places()
     index = torch.arange(2)
-    found = likelihoods(scene_set, [(index, logs_of(scene_set))] * rollouts, rollouts)
+    found = likelihoods(scene_set, [(index, logs_of(scene_set))] * rollouts)
     for name, steps in KNOWN.items():
         expected = (rollouts * steps + SMOOTHING) / (rollouts * steps + SMOOTHING * FEATURES[name].bins)
         assert found[name].tolist() == pytest.approx([expected] * 2, rel=1e-5), name
@@ -85,7 +85,7 @@ def test_more_rollouts_like_the_log_make_it_likelier_and_others_less_likely():
     index, logs = torch.arange(2), logs_of(scene_set)
     [(_, other)] = sampled(scene_set, [0])
     values = [
-        meta_metric(likelihoods(scene_set, [(index, part) for part in parts], len(parts))).mean().item()
+        meta_metric(likelihoods(scene_set, [(index, part) for part in parts])).mean().item()
         for parts in ([other] * 4, [logs, other, other, other], [logs] * 4, [logs] * 16)
     ]
     assert values == sorted(values) and values[0] > 0 and values[-1] < 1
@@ -94,23 +94,23 @@ def test_more_rollouts_like_the_log_make_it_likelier_and_others_less_likely():
 def test_neither_the_order_of_rollouts_nor_their_batches_matter_and_a_weight_is_a_number_of_rollouts():
     scene_set = places()
     parts = sampled(scene_set, [0, 1, 2])
-    found = likelihoods(scene_set, parts, 3)
-    same(found, likelihoods(scene_set, parts[::-1], 3))
+    found = likelihoods(scene_set, parts)
+    same(found, likelihoods(scene_set, parts[::-1]))
     rows = [
         (index[k : k + 1], {key: value[k : k + 1] for key, value in part.items() if isinstance(value, torch.Tensor)})
         for index, part in parts
         for k in range(2)
     ]
-    same(found, likelihoods(scene_set, rows, 3))
-    weighed, repeated = Tally(scene_set), likelihoods(scene_set, parts[:1] * 3, 3)
+    same(found, likelihoods(scene_set, rows))
+    weighed, repeated = Tally(scene_set), likelihoods(scene_set, parts[:1] * 3)
     weighed.add(*parts[0], weight=3)
-    same(repeated, weighed.likelihoods(3))
+    same(repeated, weighed.likelihoods())
 
 
 def test_the_order_of_vehicles_does_not_matter():
     scene_set = places()
     [(index, part)] = sampled(scene_set, [0])
-    found = likelihoods(scene_set, [(index, part)], 1)
+    found = likelihoods(scene_set, [(index, part)])
     order, all_rows = torch.tensor([0, 4, 2, 5, 1, 3, 7, 6]), torch.tensor([0, 4, 2, 5, 1, 3, 7, 6, 8, 9])
     other = copy.deepcopy(scene_set)
     scene = other.scenes
@@ -126,7 +126,7 @@ def test_the_order_of_vehicles_does_not_matter():
         "size": part["size"][:, all_rows],
         "routes": part["routes"][:, order],
     }
-    same(found, likelihoods(other, [(index, shuffled)], 1))
+    same(found, likelihoods(other, [(index, shuffled)]))
 
 
 def test_vehicles_recorded_throughout_are_looked_at_and_a_scene_without_any_is_unknown():
@@ -135,7 +135,7 @@ def test_vehicles_recorded_throughout_are_looked_at_and_a_scene_without_any_is_u
     scene_set.scenes["logged_valid"][1, 3, 2] = False
     chosen = evaluated(scene_set.scenes)
     assert chosen[0].sum() == 0 and chosen[1].nonzero()[:, 0].tolist() == [1, 3, 4, 5]
-    found = likelihoods(scene_set, [(torch.arange(2), logs_of(scene_set))], 1)
+    found = likelihoods(scene_set, [(torch.arange(2), logs_of(scene_set))])
     assert all(value.isnan().tolist() == [True, False] for value in found.values())
     assert {row["n"] for row in summarise_meta(found, scene_set).values()} == {1}
 
@@ -171,7 +171,7 @@ def test_the_rows_of_a_run():
         total = sum(FEATURES[name].weight * row[name]["mean"] for name in FEATURES)
         assert row["meta_metric"]["mean"] == pytest.approx(total)
     assert sampling["meta_metric"]["mean"] < replay["meta_metric"]["mean"] < 1
-    counted = likelihoods(scene_set, sampled(scene_set, range(rollouts)), rollouts)
+    counted = likelihoods(scene_set, sampled(scene_set, range(rollouts)))
     assert sampling["meta_metric"]["mean"] == pytest.approx(meta_metric(counted).mean().item(), rel=1e-6)
 
 
@@ -204,3 +204,22 @@ def test_a_meta_metric_that_was_interrupted_equals_one_that_was_not(tmp_path, mo
         meta_rows(setup_of(places(2), 3), methods, 4, Kept(tmp_path))
     again = meta_rows(setup_of(places(2), 3), methods, 4, Kept(tmp_path))
     assert again == whole and driven == ["nominal", "nominal", None, "nominal", "constant_velocity"]
+
+
+def test_rollouts_that_end_are_counted_and_weigh_nothing(tmp_path):
+    """A planner that raises in scene 1: scene 0 keeps its likelihoods, scene 1 has none."""
+
+    class Fails(ReplayEgo):
+        replays_log = False
+
+        def plan(self, world):
+            if (world.scene["scene_index"] == 1).any():
+                raise ZeroDivisionError
+            return super().plan(world)
+
+    scene_set, methods = places(2), [Method("nominal", nominal()), Method("replay", Replay())]
+    setup = Setup(scene_set, Fails(), "fails", SIM, 4)
+    for row, count in zip(meta_rows(setup, methods, 3, Kept(tmp_path)), (3, 1), strict=True):
+        assert row["ended"] == {"raised ZeroDivisionError": count} and row["n_rollouts"] == 3
+        assert {row["metrics"][name]["n"] for name in FEATURES} == {1}
+    assert meta_rows(setup, methods, 3, Kept(tmp_path))[0]["ended"] == {"raised ZeroDivisionError": 3}

@@ -16,6 +16,7 @@ from e2rl.evaluation.tune_planner import Trials, outcomes
 from e2rl.evaluation.tuning import TuneSettings
 from e2rl.scene.scene import Loaded
 from e2rl.sim.env import SimSettings
+from e2rl.traffic.replay import Replay
 from e2rl.tuning import run_tuning, tuning_of
 from tests.evaluation.tuned_road import PRESENT, SPACE, quiet, road
 from tests.synthesizer.traffic_scenes import scenes, synthesizer
@@ -76,6 +77,49 @@ def test_leaving_the_road_counts_as_a_collision():
     for each, expected in ((scene_set, 0.0), (off, 1.0)):
         setup = Setup(each, Cruise(0.9), "cruise", SimSettings())
         assert outcomes(setup, method, [(0, 0)])[0]["collision"] == expected
+
+
+class Frail(Cruise):
+    """Raises in scene 1 unless it holds its speed."""
+
+    def plan(self, world):
+        if self.gain < 1 and (world.scene["scene_index"] == 1).any():
+            raise KeyError("lost")
+        return super().plan(world)
+
+
+def test_a_trial_that_loses_rollouts_is_counted_and_refused_and_the_tuning_goes_on(tmp_path):
+    setup, methods = (
+        Setup(scenes(2, steps=20), Cruise(), "cruise", SimSettings(), batch=4),
+        [Method("replay", Replay())],
+    )
+    trials = Trials(setup, methods, [0], lambda parameters: Frail(**parameters))
+    settings, limits = TuneSettings(trials=3, startup=1), Objective(progress_floor=0.0)
+    result = quiet(trials, {"gain": 1.0}, {"gain": [0.9, 1.0]}, settings, tmp_path, limits)
+    first, *others = result["trials"]
+    assert first["metrics"]["ended"] == 0.0 and first["admissible"]
+    for trial in others:
+        assert trial["metrics"]["ended"] == 0.5 == trial["metrics"]["ended: raised KeyError"]
+        assert not trial["admissible"] and trial["metrics"]["progress"] > 0
+    assert "50.0% ended for an error" in Objective().text(others[0]["metrics"])
+
+
+def test_a_trial_without_any_score_is_refused_but_the_first_stops(tmp_path):
+    class Lost(Cruise):
+        def plan(self, world):
+            raise KeyError("lost") if self.gain < 1 else ValueError("lost")
+
+    setup, methods = Setup(scenes(1, steps=10), Cruise(), "cruise", SimSettings()), [Method("replay", Replay())]
+
+    def result(kinds):
+        make = lambda parameters: kinds[parameters["gain"] < 1](**parameters)  # noqa: E731
+        trials, settings = Trials(setup, methods, [0], make), TuneSettings(trials=2, startup=1)
+        return quiet(trials, {"gain": 1.0}, {"gain": [0.5, 1.0]}, settings, tmp_path, Objective())
+
+    first, second = result([Cruise, Lost])["trials"]
+    assert first["admissible"] and not second["admissible"] and second["metrics"]["ended"] == 1.0
+    with pytest.raises(InputError, match=r"NaN metrics .ended: raised ValueError"):
+        result([Lost, Lost])
 
 
 def tuned(config, *run):

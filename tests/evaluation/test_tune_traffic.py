@@ -106,14 +106,27 @@ def test_at_no_gain_a_trial_is_nominal_traffic(trials):
         assert found[name] == pytest.approx(found[f"{name} nominal"], nan_ok=True)
 
 
-def test_a_rollout_without_a_score_stops_the_tuning(trials):
+def test_rollouts_without_a_score_are_counted_and_only_their_whole_stops_the_tuning(trials, capsys):
     class Broken(type(EGO)):
         def plan(self, world):
-            raise RuntimeError("lost")
+            if (world.scene["scene_index"] >= first).any():
+                raise RuntimeError("lost")
+            return super().plan(world)
 
     setup = Setup(trials.setup.scenes, Broken(), "broken", SimSettings(), batch=4)
-    with pytest.raises(InputError, match=r"4 rollouts ended without a score.*raised RuntimeError"):
+    attack, first = AttackTrials(setup, trials.nominal, 2.0, [0, 1], trials.make), 1
+    found = attack({"gain": 0.5})
+    assert found["ended"] == found["ended nominal"] == 0.5
+    assert "2 rollouts ended without a score: 2 raised RuntimeError (lost)" in capsys.readouterr().err
+    first = 0
+    with pytest.raises(InputError, match=r"no rollout could be scored: 4 raised RuntimeError"):
         AttackTrials(setup, trials.nominal, 2.0, [0, 1], trials.make)({"gain": 0.5})
+
+
+def test_a_trial_that_loses_more_rollouts_than_nominal_traffic_is_refused():
+    metrics = attack({"gain": 1.0}) | {"ended": 0.03, "ended nominal": 0.025}
+    assert AttackObjective(off_road=1.0).judge(metrics, {})[1] == 0
+    assert AttackObjective(off_road=1.0).judge(metrics | {"ended": 0.045}, {})[1] == pytest.approx(0.01)
 
 
 def test_every_attack_has_a_range_round_its_present_values():

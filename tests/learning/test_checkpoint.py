@@ -122,6 +122,26 @@ def test_what_is_missing_or_damaged_in_the_memory_is_named(tmp_path):
         load_checkpoint(tmp_path, small_run(folder=tmp_path))
 
 
+@pytest.mark.parametrize("number", [-1, 1 << 40, "x"])
+def test_numbers_that_no_generator_has_are_refused(tmp_path, number):
+    folder = save_checkpoint(tmp_path, small_run(folder=tmp_path), CONFIG)
+    state = torch.load(folder / "state.pt", weights_only=True)
+    state["generators"]["numpy"][1][0] = number
+    torch.save(state, folder / "state.pt")
+    seal(folder)
+    with pytest.raises(InputError, match=r"state\.pt|round-"):
+        load_checkpoint(tmp_path, small_run(folder=tmp_path))
+
+
+@pytest.mark.parametrize("content", ["[{", '[{"round": 1e999, "crc32": 0}]', "[" * 100_000])
+def test_a_damaged_index_of_the_memory_that_was_sealed_anew_is_named(tmp_path, content):
+    folder = save_checkpoint(tmp_path, small_run(folder=tmp_path), CONFIG)
+    (folder / "memory.json").write_text(content)
+    seal(folder)
+    with pytest.raises(InputError, match=r"memory\.json: damaged"):
+        load_checkpoint(tmp_path, small_run(folder=tmp_path))
+
+
 def test_what_does_not_fit_is_refused_and_named(tmp_path):
     run = small_run(folder=tmp_path)
     rounds(run, 1)

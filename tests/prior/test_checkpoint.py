@@ -10,6 +10,7 @@ from safetensors.torch import save_file
 from e2rl.errors import InputError
 from e2rl.prior.checkpoint import load_prior, save_prior
 from e2rl.prior.prior import SamplerSettings
+from e2rl.weights import HASH
 from tests.prior.small import small_prior
 
 
@@ -32,9 +33,10 @@ def test_the_name_tells_weights_apart(tmp_path):
 
 
 def rewritten(path, change, drop=None):
-    """The checkpoint with its architecture passed through `change`, without tensor `drop`."""
+    """The checkpoint with its architecture passed through `change`, without tensor `drop` and without its hash."""
     with safe_open(path, "pt") as file:
         metadata = dict(file.metadata())
+        del metadata[HASH]
         tensors = {key: file.get_tensor(key) for key in file.keys() if key != drop}  # noqa: SIM118
     architecture = json.loads(metadata["architecture"])
     change(architecture)
@@ -48,11 +50,13 @@ def rewritten(path, change, drop=None):
         lambda a: a["denoiser"].update(width=16),
         lambda a: a["denoiser"].update(blocks=2),
         lambda a: a["denoiser"].update(layers=2),
+        lambda a: a["denoiser"].update(width=96 * 10**6),
+        lambda a: a["denoiser"].update(width="x"),
         lambda a: a.update(features=[1, 2, 3]),
         lambda a: a.pop("denoiser"),
         lambda a: a.pop("features"),
     ],
-    ids=["width", "blocks", "unknown-setting", "features", "no-network", "no-features"],
+    ids=["width", "blocks", "unknown-setting", "endless-width", "no-width", "features", "no-network", "no-features"],
 )
 def test_another_architecture_is_refused(tmp_path, change):
     path = rewritten(save_prior(small_prior(), tmp_path, {}), change)

@@ -25,7 +25,9 @@ def tuning(best=None):
 
 def row(method, eta, cfr):
     metrics = {"cfr": cfr, "cfr_counted": cfr / 2, "real": 0.9 - cfr / 10, "aor_step": 0.001, "passes": 144.0}
-    return {"method": method, "eta": eta, "metrics": {name: interval(value) for name, value in metrics.items()}}
+    about = {"dataset": "d", "split": "s", "ego": "idm", "n_scenes": 12, "n_seeds": 1, "n_rollouts": 12, "paired": {}}
+    known = {name: interval(value) for name, value in metrics.items()}
+    return {**about, "method": method, "eta": eta, "metrics": known}
 
 
 def interval(value):
@@ -64,7 +66,7 @@ def folders(tmp_path):
         each["metrics"] = {name: None if math.isnan(value) else value for name, value in each["metrics"].items()}
     (tmp_path / "tuned").mkdir()
     (tmp_path / "tuned" / "tuning.json").write_text(json.dumps(found))
-    known = {"command": "", "versions": [{}], "inputs": {}, "settings": {"synthesizer": {"name": "ctg_adv"}}}
+    known = {"command": "", "versions": [{"git": "0"}], "inputs": {}, "settings": {"synthesizer": {"name": "ctg_adv"}}}
     (tmp_path / "tuned" / "provenance.json").write_text(json.dumps(known))
     return [tmp_path / "run", tmp_path / "tuned"]
 

@@ -173,6 +173,12 @@ def no_json(folder):
     (folder / "log_map_archive_made.json").write_text("{")
 
 
+def twice(folder):
+    path = folder / "scenario_made.parquet"
+    table = pd.read_parquet(path)
+    pd.concat([table, table.tail(3)]).to_parquet(path)
+
+
 def no_ego(folder):
     write_scenario(folder.parent, [track("7", "vehicle", 40, 3.6, 6)])
 
@@ -183,6 +189,7 @@ def no_ego(folder):
         (no_map, "holds no log_map_archive"),
         (torn, "not an Argoverse 2 log"),
         (no_json, "not an Argoverse 2 log"),
+        (twice, "is recorded twice at step"),
         (no_ego, "no ego: none of its 1 tracks is 'AV'"),
     ],
 )

@@ -1,5 +1,6 @@
 """CommonRoad XML: what a scenario says arrives in the Recording, entities and nonsense are refused by name."""
 
+import re
 import subprocess
 import sys
 import zipfile
@@ -152,6 +153,11 @@ def test_folders_and_zips_make_the_same_scenes_and_short_scenarios_are_counted(t
         assert scenes.scenes["logged_valid"][0, :, 0].all()
 
 
+def turned(text: bytes, angle: bytes) -> bytes:
+    """With another first orientation, in which commonroad-io would turn round and round."""
+    return re.sub(rb"<orientation><exact>[^<]*", b"<orientation><exact>" + angle, text, count=1)
+
+
 ENTITY = b'<!DOCTYPE x [<!ENTITY e SYSTEM "file:///etc/hostname">]>'
 BOMB = b'<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
 
@@ -175,6 +181,11 @@ BOMB = b'<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
             "frames x agents|not a CommonRoad scenario",
         ),
         (lambda text: text.replace(b"<x>20.0</x>", b"<x>here</x>", 1), "not a CommonRoad scenario"),
+        (lambda text: text.replace(b"<x>20.0</x>", b"<x>1e400</x>", 1), "point/x is 1e400; repair it"),
+        (lambda text: turned(text, b"1e400"), "orientation/exact is 1e400"),
+        (lambda text: turned(text, b"nan"), "orientation/exact is nan"),
+        (lambda text: turned(text, b"99999999999"), "orientation/exact is 99999999999"),
+        (lambda text: text.replace(b"</commonRoad>", b"<a>" * 9999), "nests deeper than 32 elements"),
     ],
 )
 def test_what_is_wrong_is_named_with_the_file(change, message):

@@ -290,6 +290,9 @@ def test_start_frames():
         (lambda s: s.update(id="x" * 200), "its id has more than 128 characters"),
         (lambda s: s["tracks"]["7"]["state"].update(position=np.zeros((4, 3))), "not a ScenarioDescription"),
         (lambda s: s.update(map_features=[1]), "not a ScenarioDescription"),
+        (lambda s: s["tracks"].update({7: s["tracks"]["7"]}), "two of its tracks have the id '7'"),
+        (lambda s: s["tracks"]["7"].update(type="SPACESHIP"), "track 7 is of the unknown type 'SPACESHIP'; known are"),
+        (lambda s: s["tracks"]["7"].update(type=[1]), r"track 7 is of the unknown type '\[1\]'"),
     ],
 )
 def test_what_is_wrong_is_named_with_the_file(change, message):

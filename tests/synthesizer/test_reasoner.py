@@ -73,6 +73,7 @@ def test_the_conflict_table_stays_and_parked_vehicles_are_not_asked_about(tmp_pa
     [
         "no JSON at all",
         "[]",
+        "[" * 100_000,
         '{"vehicles": [{"id": 1}]}',
         json.dumps({"vehicles": [{"id": number} | dict.fromkeys(CRITERIA, True) for number in (1, 7)]}),
         json.dumps({"vehicles": [{"id": 1} | dict.fromkeys(CRITERIA, True)]}),

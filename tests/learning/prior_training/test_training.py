@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from e2rl.errors import InputError
+from e2rl.evaluation.kept import read_state
 from e2rl.learning.prior_training.loss import denoising_loss
 from e2rl.learning.prior_training.optimisation import PriorTraining
 from e2rl.learning.prior_training.settings import TrainingSettings
@@ -121,7 +122,7 @@ def four_places():
 def test_the_stage_writes_a_loadable_checkpoint_that_says_what_made_it(tmp_path):
     path = train_prior(untrained(), four_places(), SETTINGS, tmp_path, {"command": "test", "seconds": {"scenes": 1.0}})
     prior, origin = load_prior(str(path))
-    state = torch.load(tmp_path / "training.pt", weights_only=True)
+    state = read_state(tmp_path / "training.pt")
     best = state["record"]["best"]
     assert all(torch.equal(value, best["weights"][key]) for key, value in prior.state_dict().items())
     lines = [json.loads(line) for line in (tmp_path / "progress.jsonl").read_text().splitlines()]
@@ -175,7 +176,7 @@ def test_the_closed_loop_is_driven_by_the_averaged_weights_at_every_nth_validati
     train_prior(untrained(), four_places(), settings, tmp_path, {}, closed_loop)
     lines = [json.loads(line) for line in (tmp_path / "progress.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines if "real" in line] == [2, 4, 5]
-    average = torch.load(tmp_path / "training.pt", weights_only=True)["run"]["average"]
+    average = read_state(tmp_path / "training.pt")["run"]["average"]
     del average["n_averaged"]
     assert all(torch.equal(seen[-1][key.replace("module", "denoiser", 1)], value) for key, value in average.items())
 

@@ -1,0 +1,86 @@
+"""Rolling out what can be: where a planner or a traffic method raises, or a state becomes NaN or infinite, these
+rollouts end, each with its reason, and the others go on."""
+
+import errno
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from e2rl.ego.base import PlannerError
+from e2rl.errors import InputError
+
+NOT_FINITE = "a state was NaN or infinite"
+OF_THE_RUN = (InputError, MemoryError, torch.OutOfMemoryError)  # errors that are no single rollout's
+EXHAUSTED = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENOMEM, errno.EMFILE, errno.ENFILE)  # nor these
+
+Task = TypeVar("Task")
+
+
+def attempt(
+    roll_out: Callable[[Sequence[Task]], dict], tasks: Sequence[Task]
+) -> tuple[list[tuple[list[Task], dict]], list[tuple[Task, dict]]]:
+    """(the tasks that could be rolled out, in parts with their rollout dicts; the others with what ended them).
+
+    roll_out(tasks) -> rollout dict of tensors and lists with leading tasks, with states [B, ..., C] and valid [B, ...].
+    What raises for a batch is looked for by halving the batch, where a PlannerError does not name it.
+    """
+    try:
+        rollouts = roll_out(tasks)
+    except OF_THE_RUN:
+        raise
+    except Exception as error:  # a planner is outside code and raises anything
+        if isinstance(error, OSError) and error.errno in EXHAUSTED:
+            raise
+        named = error.rows if isinstance(error, PlannerError) else {}
+        rows = {row: why for row, why in named.items() if 0 <= row < len(tasks)}
+        if len(tasks) > 1 and not rows:
+            half = len(tasks) // 2
+            first, second = attempt(roll_out, tasks[:half]), attempt(roll_out, tasks[half:])
+            return first[0] + second[0], first[1] + second[1]
+        why = {"reason": f"raised {type(error).__name__}", "detail": str(error), "traceback": traceback.format_exc()}
+        rows = rows or {0: str(error)}
+        others = [task for row, task in enumerate(tasks) if row not in rows]
+        own = [(tasks[row], why | {"detail": detail}) for row, detail in rows.items()]
+        parts, further = attempt(roll_out, others) if others else ([], [])
+        return parts, own + further
+    finite = finite_rollouts(rollouts)
+    kept = [task for task, good in zip(tasks, finite, strict=True) if good]
+    lost = [task for task, good in zip(tasks, finite, strict=True) if not good]
+    ended = [(task, {"reason": NOT_FINITE, "detail": "", "traceback": ""}) for task in lost]
+    return ([(kept, chosen(rollouts, finite))] if kept else []), ended
+
+
+def finite_rollouts(rollouts: dict) -> list[bool]:
+    """Whether all states of agents that are there are finite, by rollout."""
+    known = rollouts["states"].isfinite().all(-1) | ~rollouts["valid"]
+    return known.flatten(1).all(1).tolist()
+
+
+def chosen(rollouts: dict, keep: Sequence[bool]) -> dict:
+    """A rollout dict of the rollouts to keep."""
+    if all(keep):
+        return rollouts
+    mask = torch.tensor(keep)
+
+    def part(value: Any) -> Any:
+        if isinstance(value, Tensor) and value.dim():
+            return value[mask]
+        return [item for item, good in zip(value, keep, strict=True) if good] if isinstance(value, list) else value
+
+    return {name: part(value) for name, value in rollouts.items()}
+
+
+def summary_of(ended: Iterable[dict]) -> str:
+    """The reasons with their counts, and the first one's own words, for a message."""
+    entries = list(ended)
+    counts = ", ".join(f"{count} {reason}" for reason, count in count_reasons(entries).items())
+    return f"{counts} ({entries[0]['detail'][:200]})"
+
+
+def count_reasons(ended: Iterable[dict]) -> dict[str, int]:
+    """How many rollouts ended for each reason."""
+    return dict(Counter(entry["reason"] for entry in ended))

@@ -1,0 +1,76 @@
+"""What raises or is not finite loses its own rollouts, however it is found."""
+
+import pytest
+import torch
+
+from e2rl.ego.base import PlannerError
+from e2rl.errors import InputError
+from e2rl.traffic.attempt import NOT_FINITE, attempt, summary_of
+
+
+def whole(tasks):
+    return {"states": torch.zeros(len(tasks), 1, 1, 4), "valid": torch.ones(len(tasks), 1, 1, dtype=torch.bool)}
+
+
+def test_states_that_are_not_finite_count_as_ended():
+    def roll_out(tasks):
+        states = torch.zeros(len(tasks), 2, 3, 4)
+        states[:, :, 2] = torch.nan  # of an agent that is not there
+        states[1, 1, 0, 3] = torch.inf
+        valid = torch.tensor([True, True, False]).expand(len(tasks), 2, 3)
+        return {"states": states, "valid": valid, "scene_id": [f"s{task}" for task in tasks], "eta": 2.0}
+
+    ((kept, rollouts),), ended = attempt(roll_out, [4, 5, 6])
+    assert kept == [4, 6] and rollouts["scene_id"] == ["s4", "s6"] and len(rollouts["states"]) == 2
+    assert rollouts["eta"] == 2.0 and [(task, why["reason"]) for task, why in ended] == [(5, NOT_FINITE)]
+
+
+@pytest.mark.parametrize("error", [InputError("bad"), OSError(28, "No space left on device"), MemoryError()])
+def test_errors_of_the_whole_run_end_it(error):
+    def roll_out(tasks):
+        raise error
+
+    with pytest.raises(type(error)):
+        attempt(roll_out, [1, 2])
+
+
+def test_a_batch_is_halved_until_the_one_that_raises_is_alone():
+    asked = []
+
+    def roll_out(tasks):
+        asked.append(list(tasks))
+        if 5 in tasks:
+            raise KeyError(5)
+        return {"states": torch.zeros(len(tasks), 1, 1, 4), "valid": torch.ones(len(tasks), 1, 1, dtype=torch.bool)}
+
+    done, ended = attempt(roll_out, list(range(8)))
+    assert [task for tasks, _ in done for task in tasks] == [0, 1, 2, 3, 4, 6, 7]
+    assert [(task, why["reason"]) for task, why in ended] == [(5, "raised KeyError")] and len(asked) == 7
+
+
+@pytest.mark.parametrize("error", [ConnectionRefusedError(111, "refused"), TimeoutError(), FileNotFoundError(2, "x")])
+def test_a_planner_s_own_files_and_connections_cost_its_rollouts_only(error):
+    def roll_out(tasks):
+        if 5 in tasks:
+            raise error
+        return whole(tasks)
+
+    done, ended = attempt(roll_out, [4, 5])
+    assert [tasks for tasks, _ in done] == [[4]] and [task for task, _ in ended] == [5]
+
+
+@pytest.mark.parametrize(("wrong", "detail"), [(None, "here"), (99, "lost"), (-1, "lost")])
+def test_rows_that_a_planner_names_are_believed_where_the_batch_has_them(wrong, detail):
+    def roll_out(tasks):
+        if 5 in tasks:
+            raise PlannerError("lost", {tasks.index(5): "here"} if wrong is None else {wrong: "there"})
+        return whole(tasks)
+
+    done, ended = attempt(roll_out, [4, 5, 6])
+    assert [task for tasks, _ in done for task in tasks] == [4, 6]
+    assert [(task, why["detail"]) for task, why in ended] == [(5, detail)]
+
+
+def test_the_summary_counts_the_reasons_and_quotes_the_first():
+    entries = [{"reason": reason, "detail": f"of {reason}"} for reason in "aab"]
+    assert summary_of(iter(entries)) == "2 a, 1 b (of a)"

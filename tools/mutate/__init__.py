@@ -1,0 +1,1 @@
+"""Mutated copies of recorded logs: `python -m tools.mutate`."""
