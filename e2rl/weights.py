@@ -4,6 +4,7 @@ Files of earlier versions have no hash; of those only the form is checked.
 """
 
 import hashlib
+import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -16,9 +17,9 @@ HASH = "sha256"  # key of the header
 
 
 def weight_bytes(weights: Mapping[str, Tensor], header: Mapping[str, str]) -> bytes:
-    """The content of a file with weights, header and hash."""
+    """The content of a file with weights, header and hash: equal weights make equal bytes."""
     plain = {key: value.detach().cpu().contiguous() for key, value in weights.items()}
-    return save(plain, {**header, HASH: _digest(plain, header)})
+    return _in_order(save(plain, {**header, HASH: _digest(plain, header)}))
 
 
 def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -49,6 +50,14 @@ def unlike(make: Callable[[], nn.Module], weights: Mapping[str, Tensor]) -> str 
     return next(
         (f"{name} has shape {tuple(weights[name].shape)}, not {tuple(own[name].shape)}" for name in wrong), None
     )
+
+
+def _in_order(content: bytes) -> bytes:
+    """A safetensors file with its header's keys in order, which safetensors shuffles."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    head = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
+    head += b" " * (-len(head) % 8)  # the tensors stay aligned
+    return len(head).to_bytes(8, "little") + head + content[end:]
 
 
 def _digest(weights: Mapping[str, Tensor], header: Mapping[str, str]) -> str:

@@ -24,6 +24,11 @@ def test_what_is_written_is_read_without_the_hash(tmp_path):
     assert all(torch.equal(value, WEIGHTS[key]) and value.dtype == WEIGHTS[key].dtype for key, value in weights.items())
 
 
+def test_equal_weights_make_equal_bytes():
+    header = {"architecture": "small", "kind": "actor", "version": "1"}
+    assert len({weight_bytes(dict(WEIGHTS), dict(header)) for _ in range(20)}) == 1
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_a_flipped_bit_changes_no_weight_in_silence(tmp_path, seed):
     """It is noticed wherever it is but in the name of the hash, where it changes nothing else."""

@@ -32,16 +32,16 @@ def scenes_of(config, most: int) -> SceneSet:
 
 def build_many(overrides: list[str], most: int) -> str:
     config = build.load_config("evaluate", overrides)
-    begin = time.perf_counter()
+    begin, before = time.perf_counter(), cpu()
     count = len(scenes_of(config, most))
-    spent, used = time.perf_counter() - begin, cpu()
+    spent, used = time.perf_counter() - begin, cpu() - before
     size = sum(file.stat().st_size for file in Path(config.data.cache).iterdir())
     each = f"{used / count:.3f} s of CPU and {size / count / 1e6:.3f} MB each"
     return f"built {count} scenes in {spent:.0f} s: {each}, cache {size / 1e6:.0f} MB, {peak()}"
 
 
 def drive_many(overrides: list[str], most: int, driven: int) -> str:
-    config = build.load_config("evaluate", overrides)
+    config, before = build.load_config("evaluate", overrides), cpu()
     build.set_up(config)
     build.check_evaluation(config)
     methods = build.build_methods(config, build.build_prior(config)[0])
@@ -55,7 +55,7 @@ def drive_many(overrides: list[str], most: int, driven: int) -> str:
     spent, failures = time.perf_counter() - begin, sum(row["cfr"] for row in rows)
     rate = f"{failures:.0f} failures, {3600 * failures / spent:.0f} an hour; {len(lost)} without a score"
     begun = f"opened {len(scenes)} scenes in {opened:.1f} s, drove {len(rows)} rollouts in {driven} of them"
-    return f"{begun} in {spent:.0f} s: {rate}; {cpu() / max(len(rows), 1):.2f} s of CPU a rollout, {peak()}"
+    return f"{begun} in {spent:.0f} s: {rate}; {(cpu() - before) / max(len(rows), 1):.2f} s of CPU a rollout, {peak()}"
 
 
 def cpu() -> float:

@@ -18,7 +18,7 @@ def attacked(scenes, eta=1.0):
 def test_outcomes_do_not_depend_on_the_batch():
     scenes = small_scenes(5, steps=40)
     pool = attacked(scenes)
-    parts = [PoolDriver(scenes, SimSettings(), batch).drive_all(IDMEgo(), pool) for batch in (10, 4, 16)]
+    parts = [PoolDriver(scenes, SimSettings(), batch).drive_all(IDMEgo(), pool)[0] for batch in (10, 4, 16)]
     for name in ("row", "scene_index", "contact", "returns", "progress", "acceleration"):
         for part in parts[1:]:
             assert torch.equal(getattr(parts[0], name), getattr(part, name)), name
@@ -46,6 +46,6 @@ def test_disturbances_are_executed_but_not_intended():
 def test_mean_acceleration_is_that_of_the_drive():
     scenes = small_scenes(2, num_vehicles=1, num_vrus=0, limit=30.0)
     driver, pool = PoolDriver(scenes, SimSettings(), 2), TrafficPool.recorded(torch.arange(2))
-    episodes = driver.drive_all(IDMEgo(acceleration=1.0), pool)
+    episodes, _ = driver.drive_all(IDMEgo(acceleration=1.0), pool)
     gained = driver.env.world().states[:, 0, 3] - 10.0
     assert episodes.acceleration.tolist() == pytest.approx((gained / 2.0).tolist(), abs=1e-3)

@@ -41,7 +41,7 @@ def test_a_data_set_is_counted_and_what_is_left_out_has_its_reason(folder, tmp_p
     text = run(folder, "--out", tmp_path / "x.png", capsys=capsys)
     assert number(text, "data") == f"scenarionet, {folder}" and number(text, "logs") == "4"
     assert number(text, "scenes") == "2, places not known" and number(text, "left out") == "2"
-    assert "1 x sd_02.pkl" in text and "rad lie between" in text and "1 x sd_03.pkl" in text
+    assert "1 x sd_02.pkl" in text and "57 rad is the largest heading" in text and "1 x sd_03.pkl" in text
     assert number(text, "vehicles") == "2 (2 to 2)" and number(text, "pedestrians") == "2 (1 to 4)"
     assert number(text, "lanes") == "4 (4 to 4)" and number(text, "traffic lights") == "0 (0 to 1)"
     assert number(text, "speed of the ego at the start, m/s") == "8.0 (8.0 to 8.0)"

@@ -83,7 +83,7 @@ def test_the_log_ends_where_the_recording_does():
 
 def test_the_nearest_take_part_the_ego_first():
     cars = {f"c{k}": straight(40 + 8.0 * k, 0 if k % 2 else 3.5, 8) for k in range(6)}
-    late = straight(40, 3.5, 8, valid=ALL > 30)
+    late = straight(48, 3.5, 8, valid=ALL > 30)
     people = {f"p{k}": straight(30, -5 - k, 8, kind="PEDESTRIAN", valid=5 * k < ALL) for k in range(4)}
     scene = build(
         cars | {"late": late, "ego": straight(20, 0, 8)} | people,
@@ -170,9 +170,9 @@ def test_overlap_with_the_ego_is_seen_and_only_that():
     far = {"ego": straight(20, 0, 8), "a": straight(24.6, 0, 8), "b": straight(50, 0, 8), "c": straight(51, 0.5, 8)}
     assert not ego_overlaps(build(far))
     assert ego_overlaps(build(far | {"a": straight(24.4, 0, 8)}))
-    aside = np.stack([20 + 0.8 * ALL + 2.5, np.full(FRAMES, 2.5)], 1)
-    assert not ego_overlaps(build({"ego": straight(20, 0, 8), "a": track(aside, -0.8, 8.0)}))
-    assert ego_overlaps(build({"ego": straight(20, 0, 8), "a": track(aside, 0.8, 8.0)}))
+    aside = np.stack([20 + 0.8 * ALL + 3.5, np.full(FRAMES, 2.1)], 1)
+    assert not ego_overlaps(build({"ego": straight(20, 0, 8), "a": track(aside, -0.4, 8.0)}))
+    assert ego_overlaps(build({"ego": straight(20, 0, 8), "a": track(aside, 0.4, 8.0)}))
     walker = straight(21, 0, 8, kind="PEDESTRIAN", size=(0.5, 0.5))
     assert not ego_overlaps(build({"ego": straight(20, 0, 8), "p": walker}))
 
