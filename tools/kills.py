@@ -31,6 +31,8 @@ import numpy as np
 import torch
 from safetensors import safe_open
 
+from e2rl.evaluation.kept import HASHED, read_state
+
 ROOT = Path(__file__).resolve().parents[1]
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 SCENES = [
@@ -208,7 +210,8 @@ def content(path: Path) -> Any:
     if path.name == "sha256.json":  # hashes of files that are compared themselves
         return None
     if path.suffix == ".pt":
-        return plain(torch.load(path, map_location="cpu", weights_only=True))
+        hashed = path.read_bytes().startswith(HASHED)
+        return plain(read_state(path) if hashed else torch.load(path, map_location="cpu", weights_only=True))
     if path.suffix == ".json":
         return plain(json.loads(path.read_text()))
     if path.suffix == ".safetensors":

@@ -3,7 +3,9 @@
 import json
 
 import pytest
+import torch
 
+from e2rl.evaluation.kept import state_bytes
 from tools import kills
 
 FILES = {
@@ -50,3 +52,14 @@ def test_everything_else_is_one(tmp_path, name):
     assert kills.differences(one, other) == [name]
     (other / name).unlink()
     assert kills.differences(one, other) == [name]
+
+
+def test_states_with_and_without_a_hash_are_read(tmp_path):
+    """A prior's training.pt has one before its content, a checkpoint's state.pt has it in a file beside."""
+    one, other, third = (tmp_path / name for name in ("one", "other", "third"))
+    for folder, value in ((one, 1.0), (other, 1.0), (third, 2.0)):
+        (folder / "checkpoints").mkdir(parents=True)
+        (folder / "training.pt").write_bytes(state_bytes({"a": torch.tensor(value), "seconds": id(folder)}))
+        torch.save({"a": torch.tensor(value)}, folder / "checkpoints" / "state.pt")
+    assert kills.differences(one, other) == []
+    assert kills.differences(one, third) == ["checkpoints/state.pt", "training.pt"]
