@@ -92,7 +92,8 @@ def check(measures: dict[str, float], scene_id: str) -> None:
 def extent(recording: Recording) -> dict[str, float]:
     """Sizes of a validated recording."""
     valid, points = recording.valid, recording.states[..., :2][recording.valid]
-    ego = np.median(recording.states[valid[:, recording.ego], recording.ego, :2], axis=0)
+    way = recording.states[valid[:, recording.ego], recording.ego, :2]
+    ego = np.median(way, axis=0) if len(way) else np.full(2, np.nan)
     rings = [lane.points for lane in recording.lanes.values()] + [ring[:, :2] for ring in recording.drivable]
     ground = np.concatenate([ring for ring in rings if len(ring)])
     lengths = [arc_length(lane.points)[-1] for lane in recording.lanes.values() if len(lane.points) > 1]

@@ -11,8 +11,10 @@ from e2rl.scene.scenarionet import ScenarioNetSource, recording_of
 from tests.scene.test_argoverse2 import write_scenario, write_sensor_log
 from tools.fuzz.corpus import description
 from tools.mutate import __main__ as mutate
-from tools.mutate.formats import ScenarioLog, ScenarioNetLog, SensorLog, map_lines, map_of, source_of
+from tools.mutate.argoverse2 import ScenarioLog, SensorLog, map_lines, map_of
+from tools.mutate.formats import source_of
 from tools.mutate.kinds import KINDS, READ, REFUSED
+from tools.mutate.scenarionet import ScenarioNetLog
 
 
 @pytest.fixture(scope="module")

@@ -25,8 +25,10 @@ from e2rl.scene.build import BuildSettings
 from e2rl.scene.recording import Recording
 from e2rl.scene.scenarionet import ScenarioNetSource, recording_of
 from e2rl.scene.source import OVERLAP, TOO_SHORT, Source
-from tools.mutate.formats import RecordedLog, ScenarioNetLog, opened, source_of
+from tools.mutate.formats import opened, source_of
 from tools.mutate.kinds import EITHER, KINDS, READ, REFUSED, Kind
+from tools.mutate.log import RecordedLog
+from tools.mutate.scenarionet import ScenarioNetLog
 
 LIMIT = 20.0  # s for one log
 SMALL = BuildSettings(steps=80, vehicles=4, others=2, vertices=60, field_cells=32)  # plausibility looks at all the log
