@@ -38,195 +38,143 @@ EXPERIMENTS = [
 ]
 
 
+@pytest.fixture
+def evaluate(world, tmp_path, monkeypatch, capsys):
+    """Runs evaluate.py with options on two short bundled scenes in tmp_path / "run": (exit status, what it said)."""
+
+    def run(*options):
+        given = [*SHORT, f"data.cache={world / 'bundled'}", "seeds=[0]", f"hydra.run.dir={tmp_path / 'run'}"]
+        named = {option.partition("=")[0] for option in options}
+        kept = [option for option in given if option.partition("=")[0] not in named]
+        return call("evaluate.py", [*kept, *options], monkeypatch, capsys)
+
+    return run
+
+
+@pytest.fixture
+def evaluated(evaluate, tmp_path):
+    """The same for options with which it succeeds: the run's folder."""
+
+    def run(*options):
+        status, said = evaluate(*options)
+        assert status == 0, said
+        return tmp_path / "run"
+
+    return run
+
+
 @pytest.mark.parametrize(("experiment", "methods", "figure"), EXPERIMENTS)
-def test_the_adversaries_experiments_have_their_rows_and_figures(
-    world, tmp_path, monkeypatch, capsys, experiment, methods, figure
-):
+def test_the_adversaries_experiments_have_their_rows_and_figures(evaluated, experiment, methods, figure):
     """Two of the bundled scenes with the bundled prior; the paper's tables 2 and 3 and its figures."""
-    overrides = [
-        f"experiment={experiment}",
-        *SHORT,
-        f"data.cache={world / 'bundled'}",
-        "seeds=[0]",
-        f"hydra.run.dir={tmp_path / 'run'}",
-    ]
-    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
-    assert status == 0, said
-    rows = read_metrics(tmp_path / "run" / "metrics.json")
+    run = evaluated(f"experiment={experiment}")
+    rows = read_metrics(run / "metrics.json")
     assert [(row["method"], row["eta"]) for row in rows] == methods
     assert all((row["n_scenes"], row["n_rollouts"]) == (2, 2) for row in rows)
     assert all(len(row["paired"]) == len(methods) - 1 for row in rows)
     for row in rows:
         known = row["metrics"]["real_adv"]["n"]
         assert known > 0 if row["eta"] else known == 0
-    assert len(list((tmp_path / "run" / "rollouts").glob("*.npz"))) == 2 * len(methods)
+    assert len(list((run / "rollouts").glob("*.npz"))) == 2 * len(methods)
     for suffix in ("png", "pdf"):
-        drawn = [path.stem for path in (tmp_path / "run").glob(f"*.{suffix}")]
+        drawn = [path.stem for path in run.glob(f"*.{suffix}")]
         assert drawn == ([figure] if figure else [])
 
 
-def test_table_1_is_written_in_three_formats(world, tmp_path, monkeypatch, capsys):
-    overrides = [
-        "experiment=table1",
-        *SHORT,
-        "methods=[e2,nominal,ctg_adv,cat]",
-        f"data.cache={world / 'bundled'}",
-        "seeds=[0]",
-        f"hydra.run.dir={tmp_path / 'run'}",
-    ]
-    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
-    assert status == 0, said
-    head, *rows = (tmp_path / "run" / "methods.csv").read_text().splitlines()
+def test_table_1_is_written_in_three_formats(evaluated):
+    run = evaluated("experiment=table1", "methods=[e2,nominal,ctg_adv,cat]")
+    head, *rows = (run / "methods.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in rows] == ["e2 η=2", "nominal", "ctg_adv η=2", "cat η=2"]
     assert head.startswith("method,knowledge,duty,cfr [%]") and head.endswith("passes")
-    assert "Difference of each method to e2" in (tmp_path / "run" / "methods.md").read_text()
-    assert "Difference of each method to e2" in (tmp_path / "run" / "methods.tex").read_text()
-    assert len((tmp_path / "run" / "methods_differences.csv").read_text().splitlines()) == 4
+    assert "Difference of each method to e2" in (run / "methods.md").read_text()
+    assert "Difference of each method to e2" in (run / "methods.tex").read_text()
+    assert len((run / "methods_differences.csv").read_text().splitlines()) == 4
 
 
-def test_the_curves_have_a_line_for_every_method_and_eta(world, tmp_path, monkeypatch, capsys):
+def test_the_curves_have_a_line_for_every_method_and_eta(evaluated):
     """Differences are to nominal traffic alone; the tables have a row for each."""
-    overrides = [
-        "experiment=curves",
-        *SHORT,
-        "methods=[nominal,ctg_adv,cat]",
-        "eta=[1,2]",
-        f"data.cache={world / 'bundled'}",
-        "seeds=[0]",
-        f"hydra.run.dir={tmp_path / 'run'}",
-    ]
-    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
-    assert status == 0, said
-    lines = (tmp_path / "run" / "curves.csv").read_text().splitlines()[1:]
+    run = evaluated("experiment=curves", "methods=[nominal,ctg_adv,cat]", "eta=[1,2]")
+    lines = (run / "curves.csv").read_text().splitlines()[1:]
     points = [("nominal", "0"), ("ctg_adv", "1"), ("ctg_adv", "2"), ("cat", "1"), ("cat", "2")]
     assert [(line.split(",")[0], f"{float(line.split(',')[2]):g}") for line in lines] == points
-    rows = read_metrics(tmp_path / "run" / "metrics.json")
+    rows = read_metrics(run / "metrics.json")
     assert [list(row["paired"]) for row in rows] == [[], *[["nominal"]] * 4]
-    assert (tmp_path / "run" / "curves.png").exists() and not (tmp_path / "run" / "rollouts").exists()
-    assert "Difference of each method to nominal" in (tmp_path / "run" / "methods.md").read_text()
+    assert (run / "curves.png").exists() and not (run / "rollouts").exists()
+    assert "Difference of each method to nominal" in (run / "methods.md").read_text()
 
 
-def test_the_public_protocol_has_crash_rates_and_route_completion_of_every_ego(world, tmp_path, monkeypatch, capsys):
-    overrides = [
-        "experiment=public_protocol",
-        *SHORT,
-        "methods=[replay,cat]",
-        "egos.policy.checkpoint=bundled",
-        f"data.cache={world / 'bundled'}",
-        "seeds=[0]",
-        f"hydra.run.dir={tmp_path / 'run'}",
-    ]
-    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
-    assert status == 0, said
-    head, *rows = (tmp_path / "run" / "egos.csv").read_text().splitlines()
+def test_the_public_protocol_has_crash_rates_and_route_completion_of_every_ego(evaluate, evaluated):
+    overrides = ["experiment=public_protocol", "methods=[replay,cat]", "egos.policy.checkpoint=bundled"]
+    run = evaluated(*overrides)
+    head, *rows = (run / "egos.csv").read_text().splitlines()
     names = ["replay", "idm", "lane_graph", "untrained", "policy"]
     assert [row.split(",")[:2] for row in rows] == [[ego, name] for ego in names for name in ("replay", "cat η=2")]
     assert head.startswith("ego,traffic,cfr [%],route_completion [%]")
     log = rows[0].split(",")[head.split(",").index("route_completion [%]")]
     assert float(log.split()[0]) > 99, "the recorded ego in recorded traffic drives all of its way"
     missing = [each for each in overrides if "checkpoint" not in each]
-    status, said = call("evaluate.py", missing, monkeypatch, capsys)
+    status, said = evaluate(*missing)
     assert status == 2 and "egos.policy.checkpoint: needed; give the folder" in error_line(said)
 
 
-def test_egos_before_and_after_are_rated_in_one_run(world, tmp_path, monkeypatch, capsys):
+def test_egos_before_and_after_are_rated_in_one_run(evaluated, tmp_path):
     """An untrained actor and a planner in its place, with learning curves of a made run."""
     logs = tmp_path / "trained" / "logs" / "scalars"
     for name, value in (("train/frames", "100"), ("synthesizer/contact", "0.5")):
         (logs / name).parent.mkdir(parents=True)
         (logs / f"{name}.csv").write_text(f"0,{value}\n")
     roles = f"{{before: before, after: after, planner: before, runs: ['{tmp_path / 'trained'}']}}"
-    overrides = [
-        *SHORT,
-        f"data.cache={world / 'bundled'}",
-        "seeds=[0]",
-        "+egos.before={ego: actor}",
-        "+egos.after={ego: lane_graph}",
-        f"policy_learning={roles}",
-        f"hydra.run.dir={tmp_path / 'run'}",
-    ]
-    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
-    assert status == 0, said
-    rows = read_metrics(tmp_path / "run" / "metrics.json")
+    run = evaluated("+egos.before={ego: actor}", "+egos.after={ego: lane_graph}", f"policy_learning={roles}")
+    rows = read_metrics(run / "metrics.json")
     assert [(row["ego"], row["method"]) for row in rows] == [
         (ego, method) for ego in ("before", "after") for method in ("nominal", "e2")
     ]
     assert {key for row in rows[2:] for key in row["paired"]} == {"e2", "nominal", "ego before"}
-    text = (tmp_path / "run" / "tables.md").read_text()
+    text = (run / "tables.md").read_text()
     assert "## Policy learning" in text and "after − before [points]" in text and "Guards of after" in text
     for suffix in ("png", "pdf"):
-        assert {path.stem for path in (tmp_path / "run").glob(f"*.{suffix}")} == {"policy_learning", "curves"}
+        assert {path.stem for path in run.glob(f"*.{suffix}")} == {"policy_learning", "curves"}
 
 
-def test_a_planner_is_tuned_and_the_study_goes_on(world, tmp_path, monkeypatch, capsys):
-    for trials in (1, 2):
-        overrides = [
-            "experiment=tune_planner",
-            "ego=sampling",
-            *SHORT,
-            f"data.cache={world / 'bundled'}",
-            f"tuning.trials={trials}",
-            f"tuning.study={tmp_path / 'study'}",
-            f"hydra.run.dir={tmp_path / 'run'}",
-        ]
-        status, said = call("evaluate.py", overrides, monkeypatch, capsys)
-        assert status == 0, said
-    result = json.loads((tmp_path / "run" / "tuning.json").read_text())
+def test_a_planner_is_tuned_and_the_study_goes_on(evaluate, evaluated, tmp_path):
+    study = ["experiment=tune_planner", "ego=sampling", f"tuning.study={tmp_path / 'study'}"]
+    evaluated(*study, "tuning.trials=1")
+    run = evaluated(*study, "tuning.trials=2")
+    result = json.loads((run / "tuning.json").read_text())
     assert len(result["trials"]) == 2 and set(result["best"]) <= set(load_choice("ego", "sampling"))
     assert {"collision nominal@0", "collision e2@2"} <= set(result["trials"][0]["metrics"])
-    assert "margin: " in (tmp_path / "run" / "tuned.yaml").read_text()
-    overrides += ["tuning.spaces.sampling.margin=[2,3]", "tuning.study=null"]
-    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    assert "margin: " in (run / "tuned.yaml").read_text()
+    status, said = evaluate(*study[:2], "tuning.spaces.sampling.margin=[2,3]")
     assert status == 2 and "tuning.space.margin=[2, 3]: leaves out the present value" in error_line(said)
-    overrides = [each for each in overrides if "margin" not in each and not each.startswith("ego=")]
-    status, said = call("evaluate.py", [*overrides, "ego=idm"], monkeypatch, capsys)
+    status, said = evaluate(study[0], "ego=idm")
     assert status == 2 and "tuning.spaces: no ranges for this ego" in error_line(said)
 
 
-def test_table_4_has_a_row_for_every_ego_in_three_formats(world, tmp_path, monkeypatch, capsys):
-    overrides = [
-        "experiment=table4",
-        *SHORT,
-        f"data.cache={world / 'bundled'}",
-        "seeds=[0]",
-        f"hydra.run.dir={tmp_path / 'run'}",
-    ]
-    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
-    assert status == 0, said
-    head, *rows = (tmp_path / "run" / "egos.csv").read_text().splitlines()
+def test_table_4_has_a_row_for_every_ego_in_three_formats(evaluated):
+    run = evaluated("experiment=table4")
+    head, *rows = (run / "egos.csv").read_text().splitlines()
     names = ["replay", "idm", "lane_graph", "sampling", "bits", "actor_untrained", "actor"]
     assert [row.split(",")[:2] for row in rows] == [[name, "e2 η=2"] for name in names]
     columns = ("cfr", "cfr_counted", "cfr_preventable", "front", "side", "rear", "front_any", "side_any", "rear_any")
     assert head.startswith("ego,traffic,") and all(f"{name} [%]" in head.split(",") for name in columns)
     for suffix in ("md", "tex"):
-        assert "Difference of each ego to lane" in (tmp_path / "run" / f"egos.{suffix}").read_text()
-    differences = (tmp_path / "run" / "egos_differences.csv").read_text().splitlines()
+        assert "Difference of each ego to lane" in (run / f"egos.{suffix}").read_text()
+    differences = (run / "egos_differences.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in differences[1:]] == [name for name in names if name != "lane_graph"]
-    assert "## Egos" in (tmp_path / "run" / "tables.md").read_text()
+    assert "## Egos" in (run / "tables.md").read_text()
 
 
-def test_an_adversary_is_tuned_and_the_study_goes_on(world, tmp_path, monkeypatch, capsys):
+def test_an_adversary_is_tuned_and_the_study_goes_on(evaluate, evaluated, tmp_path):
     """Rollouts are those of the method's own YAML; another budget or method is another study."""
-    for trials in (1, 3):
-        overrides = [
-            "experiment=tune",
-            "synthesizer=e2",
-            *SHORT,
-            f"data.cache={world / 'bundled'}",
-            f"tuning.trials={trials}",
-            "tuning.ladder=2",
-            f"tuning.study={tmp_path / 'study'}",
-            f"hydra.run.dir={tmp_path / 'run'}",
-        ]
-        status, said = call("evaluate.py", overrides, monkeypatch, capsys)
-        assert status == 0, said
-    result = json.loads((tmp_path / "run" / "tuning.json").read_text())
+    study = ["experiment=tune", "synthesizer=e2", "tuning.ladder=2", f"tuning.study={tmp_path / 'study'}"]
+    evaluated(*study, "tuning.trials=1")
+    run = evaluated(*study, "tuning.trials=3")
+    result = json.loads((run / "tuning.json").read_text())
     tried = [trial["parameters"]["interception.lateral"] for trial in result["trials"]]
     assert tried == pytest.approx([load_choice("synthesizer", "e2").interception.lateral, 0.5, 4.0])
     assert {"cfr", "aor_step", "aor_step nominal", "real_adv"} <= set(result["trials"][0]["metrics"])
-    assert "interception:\n  lateral: " in (tmp_path / "run" / "tuned.yaml").read_text()
-    assert len((tmp_path / "run" / "tuning_curve.csv").read_text().splitlines()) == 4
-    assert (tmp_path / "run" / "tuning_curve.png").exists()
+    assert "interception:\n  lateral: " in (run / "tuned.yaml").read_text()
+    assert len((run / "tuning_curve.csv").read_text().splitlines()) == 4
+    assert (run / "tuning_curve.png").exists()
     for more, what in (
         (["tuning.objective.off_road=0.1"], "a study that differs in objective; name another file"),
         (["synthesizer=cat"], "a study that differs in parameters, space; name another file"),
@@ -234,8 +182,8 @@ def test_an_adversary_is_tuned_and_the_study_goes_on(world, tmp_path, monkeypatc
         (["tuning.objective.seek=speed"], "tuning.objective.seek=speed: choose one of"),
         (["tuning.group=prior"], "tuning.group=prior: choose one of"),
     ):
-        kept = [each for each in overrides if each.split("=")[0] not in [one.split("=")[0] for one in more]]
-        status, said = call("evaluate.py", [*kept, *more], monkeypatch, capsys)
+        kept = [each for each in study if each.split("=")[0] not in [one.split("=")[0] for one in more]]
+        status, said = evaluate(*kept, "tuning.trials=3", *more)
         assert status == 2 and what in error_line(said)
 
 
@@ -253,24 +201,11 @@ def test_a_folder_of_somebody_else_adds_methods_to_the_table(world, tmp_path, mo
     assert [(row["method"], row["eta"]) for row in rows] == [("replay", 0), ("straight", 0)]
 
 
-def test_one_scene_is_driven_as_among_all(world, tmp_path, monkeypatch, capsys):
+def test_one_scene_is_driven_as_among_all(evaluate, tmp_path):
     found = []
     for which in ("scene=null", "scene=1"):
         folder = tmp_path / which
-        status, said = call(
-            "evaluate.py",
-            [
-                *SHORT,
-                f"data.cache={world / 'bundled'}",
-                "seeds=[1]",
-                "methods=[e2]",
-                which,
-                "batch=1",
-                f"hydra.run.dir='{folder}'",
-            ],
-            monkeypatch,
-            capsys,
-        )
+        status, said = evaluate("seeds=[1]", "methods=[e2]", which, "batch=1", f"hydra.run.dir='{folder}'")
         assert status == 0, said
         found.append({path.name: path.read_bytes() for path in (folder / "rollouts").glob("*.npz")})
     assert len(found[0]) == 2 and len(found[1]) == 1 and found[1].items() <= found[0].items()

@@ -32,6 +32,7 @@ import torch
 from safetensors import safe_open
 
 from e2rl.evaluation.kept import HASHED, read_state
+from e2rl.weights import HASH
 
 ROOT = Path(__file__).resolve().parents[1]
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
@@ -219,6 +220,7 @@ def content(path: Path) -> Any:
     if path.suffix == ".safetensors":
         with safe_open(path, "np") as file:
             header = {name: plain(_parsed(text)) for name, text in (file.metadata() or {}).items()}
+            header.pop(HASH, None)  # of wall times, too
             return header, {name: plain(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118 - not a dict
     if path.suffix == ".csv" and path.parent.name not in ("train", "eval", "curriculum", "synthesizer"):
         return [plain(row) for row in csv.DictReader(io.StringIO(path.read_text()))]

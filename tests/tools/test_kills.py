@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from e2rl.evaluation.kept import state_bytes
+from e2rl.weights import weight_bytes
 from tools import kills
 
 FILES = {
@@ -63,3 +64,19 @@ def test_states_with_and_without_a_hash_are_read(tmp_path):
         torch.save({"a": torch.tensor(value)}, folder / "checkpoints" / "state.pt")
     assert kills.differences(one, other) == []
     assert kills.differences(one, third) == ["checkpoints/state.pt", "training.pt"]
+
+
+def test_weights_are_compared_by_tensors_and_header_without_wall_times(tmp_path):
+    """Their hash is of the header, too, and so of the times in it."""
+    for name, value, seconds, step in (
+        ("one", 1.0, 5, 60),
+        ("timed", 1.0, 6, 60),
+        ("other", 2.0, 5, 60),
+        ("late", 1.0, 5, 61),
+    ):
+        header = {"origin": json.dumps({"seconds": {"total": seconds}, "step": step})}
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "prior.safetensors").write_bytes(weight_bytes({"a": torch.tensor([value])}, header))
+    assert kills.differences(tmp_path / "one", tmp_path / "timed") == []
+    assert kills.differences(tmp_path / "one", tmp_path / "other") == ["prior.safetensors"]
+    assert kills.differences(tmp_path / "one", tmp_path / "late") == ["prior.safetensors"]
