@@ -32,12 +32,13 @@ ROLLOUTS, TABLE, METRICS_FILE = "rollouts", "rollouts.csv", "metrics.json"
 OPTIONAL = ("ran_light",)  # arrays of a rollout that verdicts use where they are known
 SCORE = "python -m e2rl.report.score"
 NEEDED = ("dataset", "split", "method", "ego_policy", "scene_id", "seed", "eta")
-ESTIMATES = {...: {...: (int, float, NoneType)}}
+NUMBER = (int, float, NoneType)
+INTERVAL = {"low": NUMBER, "high": NUMBER, "n": NUMBER, ...: NUMBER}
 METRICS_ROW = {  # what readers of metrics.json need
     **dict.fromkeys(("dataset", "split", "method", "ego"), str),
     **dict.fromkeys(("eta", "n_scenes", "n_seeds", "n_rollouts"), (int, float)),
-    "metrics": ESTIMATES,
-    "paired": {...: ESTIMATES},
+    "metrics": {...: {"mean": NUMBER, **INTERVAL}},
+    "paired": {...: {...: {"difference": NUMBER, **INTERVAL}}},
 }
 SOMETIMES = {"ended": {...: int}, "stage": (str, NoneType), "git": str, "command": str, "n_trainings": int}
 TEXT_COLUMNS = ("dataset", "split", "method", "ego_policy", "scene_id", "location", *WORDS)

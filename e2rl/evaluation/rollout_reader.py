@@ -16,7 +16,8 @@ from e2rl.scene.recording import AGENT_TYPES
 TEXTS = ("format", "scene_id", "location", "dataset", "split", "method", "ego_policy")
 WHOLE = ("seed", "ego")
 SCALARS = (*TEXTS, *WHOLE, "eta", "dt")
-MOST, FARTHEST, FASTEST, LONGEST = 1e6, 1e5, 150.0, 100.0  # intensity; m, m/s and m of an agent
+MOST = 1e6  # intensity
+FARTHEST, FASTEST, LONGEST, TURNED = 1e5, 150.0, 100.0, 1e3  # m, m/s, m and rad of an agent
 ARRAYS = {  # kinds of elements, and shape: a number, or a letter for a size that is the same wherever it stands
     "states": ("f", "TN4"),
     "valid": ("b", "TN"),
@@ -105,8 +106,8 @@ def _odd_agents(data: dict[str, np.ndarray]) -> str | None:
         states = data[name][data[known]]
         if not np.isfinite(states).all():
             return "a valid state is NaN or infinite"
-        if (np.abs(states[:, :2]) > FARTHEST).any() or (np.abs(states[:, 3]) > FASTEST).any():
-            return f"a valid state of {name} is beyond {FARTHEST:g} m or {FASTEST:g} m/s"
+        if (np.abs(states) > [FARTHEST, FARTHEST, TURNED, FASTEST]).any():
+            return f"a valid state of {name} is beyond {FARTHEST:g} m, {TURNED:g} rad or {FASTEST:g} m/s"
     return None
 
 

@@ -5,6 +5,7 @@ import json
 import math
 import sys
 import zipfile
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -130,6 +131,7 @@ def test_a_damaged_rollout_is_refused_by_name(tmp_path, rollouts, changes, kept)
         ("states", np.full((81, 48, 4), np.nan, np.float32), "a valid state is NaN"),
         ("states", np.full((81, 48, 4), 1e6, np.float32), "a valid state of states is beyond"),
         ("logged", np.full((81, 48, 4), -1e6, np.float32), "a valid state of logged is beyond"),
+        ("states", np.full((81, 48, 4), [0, 0, 1e4, 0], np.float32), "beyond 100000 m, 1000 rad"),
         ("lane_width", np.full(3, np.nan, np.float32), "as many lanes as borders"),
         ("evasion", np.zeros((80, 4), np.float32), "evasion has shape"),
         ("plans", np.zeros((16, 1, 10, 2), np.float32), "some are missing"),
@@ -205,6 +207,12 @@ def test_metrics_are_strict_json_with_counts_command_and_paired_differences(tmp_
         and {"difference", "low", "high"} <= first["paired"]["nominal"]["cfr"].keys()
     )
     assert math.isnan(read_metrics(tmp_path / "metrics.json")[0]["metrics"]["transport"]["mean"])
+    for where, name in (("metrics", "mean"), ("metrics", "n"), ("paired.nominal", "difference")):
+        changed = json.loads(text)
+        del reduce(dict.get, where.split("."), changed[0])["cfr"][name]
+        (tmp_path / "metrics.json").write_text(json.dumps(changed))
+        with pytest.raises(InputError, match=rf"it\[0\]\.{where}\.cfr\.{name} is missing"):
+            read_metrics(tmp_path / "metrics.json")
 
 
 def test_several_intensities_of_one_method_are_told_apart(rollouts):
