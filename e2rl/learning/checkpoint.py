@@ -59,7 +59,8 @@ def _write(folder: Path, run: Evolution, config: dict) -> None:
     if isinstance(run.ego, ActorEgo):
         run.ego.network.save(folder / WEIGHTS)
     (folder / MEMORY).write_text(json.dumps(run.memory.index()))
-    (folder / CONFIG).write_text(json.dumps(config, indent=1, sort_keys=True))
+    own = {key: value for key, value in config.items() if key != "resume"}  # equal, whether the run was interrupted
+    (folder / CONFIG).write_text(json.dumps(own, indent=1, sort_keys=True))
     seal(folder)
 
 

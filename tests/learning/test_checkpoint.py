@@ -58,9 +58,10 @@ def test_resumed_rounds_are_those_of_one_run(tmp_path, live, ahead, hold):
 
 
 def test_config_and_actor_are_in_the_checkpoint_and_traffic_beside_it(tmp_path):
+    """The config is the same whether the run was interrupted."""
     run = small_run(folder=tmp_path)
     rounds(run, 1)
-    folder = save_checkpoint(tmp_path, run, CONFIG)
+    folder = save_checkpoint(tmp_path, run, {**CONFIG, "resume": "run"})
     assert folder == latest_checkpoint(tmp_path) == latest_checkpoint(folder)
     assert json.loads((folder / "config.json").read_text()) == CONFIG
     other = small_run(seed=5, folder=tmp_path)
