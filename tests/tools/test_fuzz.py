@@ -132,6 +132,14 @@ def test_a_child_that_dies_or_waits_forever_costs_one_input_and_a_record_goes_on
     assert fuzz.table(counts)[-1] == "| all | 7 | 0 | 5 | 0 | 0 | 1 | 1 | 0 | 0 |"
 
 
+def test_without_its_library_a_reader_is_not_fuzzed(monkeypatch, capsys):
+    monkeypatch.setattr(fuzz, "find_spec", lambda name: None)
+    monkeypatch.setattr(sys, "argv", ["fuzz", "3", "--readers", "argoverse2"])
+    with pytest.raises(SystemExit):
+        fuzz.main()
+    assert "the reader argoverse2 needs av2" in capsys.readouterr().err
+
+
 def test_what_no_reader_may_return_is_known():
     require_plain({"a": [1, "x", np.zeros(3), (None, {2.0})]}, 1 << 10)
     for bad in ({"a": object()}, [len], np.array([len], object)):

@@ -11,6 +11,7 @@ from e2rl.scene.scenarionet import ScenarioNetSource, recording_of
 from tests.scene.test_argoverse2 import write_scenario, write_sensor_log
 from tools.fuzz.corpus import description
 from tools.mutate import __main__ as mutate
+from tools.mutate import formats
 from tools.mutate.argoverse2 import ScenarioLog, SensorLog, map_lines, map_of
 from tools.mutate.formats import source_of
 from tools.mutate.kinds import KINDS, READ, REFUSED
@@ -109,3 +110,10 @@ def test_of_a_log_that_makes_no_scene_nothing_else_is_tried(tmp_path, log):
     short.write(tmp_path)
     (row,) = mutate.run([str(tmp_path)], 1, "", tmp_path / "record.csv")
     assert row["kind"] == mutate.GENUINE and row["outcome"] == REFUSED
+
+
+def test_without_its_library_no_log_of_a_format_counts_as_refused(tmp_path, monkeypatch):
+    (tmp_path / "log.xml").write_text("<commonRoad/>")
+    monkeypatch.setattr(formats, "find_spec", lambda name: None)
+    with pytest.raises(SystemExit, match="needs commonroad; install"):
+        source_of(str(tmp_path))

@@ -26,6 +26,7 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryFile
 
@@ -35,6 +36,7 @@ STUCK = 3 * LIMIT  # s of the processor after which a child that does not answer
 WAIT = 60.0  # s of the clock after which one is killed that waits for something
 COLUMNS = ("reader", "number", "outcome", "seconds", "note")
 GOOD = ("refused", "read")
+LIBRARIES = {"commonroad": "commonroad", "argoverse2": "av2"}  # that readers need
 BAD = ("escaped", "garbage", "hang", "crash", "memory", "executed")
 
 
@@ -149,7 +151,7 @@ def table(counts: Counter) -> list[str]:
 
 def available(options: argparse.Namespace) -> list[str]:
     """The readers that there are inputs for."""
-    absent = [name for name in ("commonroad", "argoverse2") if not getattr(options, name)]
+    absent = [name for name in LIBRARIES if not getattr(options, name)]
     return [name for name in READERS if name not in absent]
 
 
@@ -166,6 +168,9 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     readers = options.readers.split(",") if options.readers else available(options)
+    for name, library in LIBRARIES.items():
+        if name in readers and find_spec(library) is None:  # all its inputs would be refused for that
+            parser.error(f"the reader {name} needs {library}: pip install 'e2rl[{name}]'")
     counts = run(readers, options)
     print("\n".join(table(counts)))
     return 1 if any(counts[reader, result] for reader, result in counts if result in BAD) else 0

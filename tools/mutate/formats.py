@@ -1,6 +1,7 @@
 """Recorded logs of every format that can be mutated."""
 
 import zipfile
+from importlib.util import find_spec
 from pathlib import Path
 
 from e2rl.scene.argoverse2 import Argoverse2Source
@@ -15,14 +16,21 @@ from tools.mutate.scenarionet import ScenarioNetLog
 
 
 def source_of(path: str) -> Source:
-    """The source of the logs at a path, by their names."""
+    """The source of the logs at a path, by their names; exits where its library is missing."""
     root = Path(path)
     if root.is_dir() and list(root.rglob("log_map_archive_*.json")):
-        return Argoverse2Source(path)
+        return _needing("av2", Argoverse2Source(path))
     kinds: tuple[type[LogFiles], ...] = (ScenarioNetSource, CommonRoadSource)
     names = [file.name for file in root.rglob("*")] if root.is_dir() else _names(root)
     kind = next((kind for kind in kinds if any(name.endswith(kind.ending) for name in names)), ScenarioNetSource)
-    return kind(path)
+    return _needing("commonroad", kind(path)) if kind is CommonRoadSource else kind(path)
+
+
+def _needing(library: str, source: Source) -> Source:
+    """The source; without its library every log would be refused."""
+    if find_spec(library) is None:
+        raise SystemExit(f"{source.root()}: needs {library}; install e2rl with the extra of this data")
+    return source
 
 
 def _names(archive: Path) -> list[str]:
