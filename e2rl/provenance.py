@@ -9,6 +9,7 @@ import copy
 import hashlib
 import json
 import platform
+import shlex
 import sys
 from collections.abc import Collection, Iterator, Mapping
 from importlib.util import find_spec
@@ -45,7 +46,6 @@ def begin_run(folder: Path, config: DictConfig, free: Collection[str], scenes: M
     """
     lists = {name: list_text(each) for name, each in scenes.items()}
     now = {
-        "command": command_line(),
         "versions": [versions(config)],
         "settings": settings(config, free),
         "inputs": {name: hashlib.sha256(text.encode()).hexdigest() for name, text in lists.items()}
@@ -57,7 +57,8 @@ def begin_run(folder: Path, config: DictConfig, free: Collection[str], scenes: M
         forget_parts(folder)
         for name, text in lists.items():
             write_atomically(folder / SCENES.replace("scenes", name.replace(" ", "_")), text)
-        write_atomically(folder / PROVENANCE, json.dumps(now, indent=1))
+        command = begun_command(folder) if config.resume else command_line()
+        write_atomically(folder / PROVENANCE, json.dumps({"command": command, **now}, indent=1))
         return
     now = json.loads(json.dumps(now))
     for kind in ("inputs", "settings"):
@@ -74,6 +75,13 @@ def begin_run(folder: Path, config: DictConfig, free: Collection[str], scenes: M
         )
         known["versions"].append(here)
         write_atomically(folder / PROVENANCE, json.dumps(known, indent=1))
+
+
+def begun_command(folder: Path) -> str:
+    """The command that a run was begun with, by its overrides: it ended before provenance.json was written."""
+    overrides = OmegaConf.select(OmegaConf.load(folder / ".hydra" / "hydra.yaml"), "hydra.overrides") or {}
+    given = [*overrides.get("task", ()), *overrides.get("hydra", ())]
+    return shlex.join(["python", sys.argv[0], *(str(each) for each in given if each != "hydra.mode=RUN")])
 
 
 def changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

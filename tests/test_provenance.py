@@ -1,6 +1,7 @@
 """A run goes on with what it was begun with: changed scenes, weights and settings are refused, other code is told."""
 
 import json
+import sys
 
 import pytest
 from omegaconf import OmegaConf
@@ -39,6 +40,15 @@ def test_the_same_run_goes_on(tmp_path, prior, capsys):
     Kept(tmp_path).save("a", [], 1)
     begin(tmp_path, prior=prior, resume=True, processes=3, plugins=["json"])
     assert (tmp_path / PROVENANCE).read_bytes() == begun and Kept(tmp_path).load("a", []) == 1
+
+
+def test_a_run_that_ended_before_its_file_was_written_keeps_its_command(tmp_path, monkeypatch):
+    overrides = {"task": ["batch=4", "seeds=[0, 1]"], "hydra": ["hydra.run.dir=run", "hydra.mode=RUN"]}
+    (tmp_path / ".hydra").mkdir()
+    OmegaConf.save({"hydra": {"overrides": overrides}}, tmp_path / ".hydra" / "hydra.yaml")
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "resume=run"])
+    begin(tmp_path, resume=True)
+    assert origin_of(tmp_path)["command"] == "python evaluate.py batch=4 'seeds=[0, 1]' hydra.run.dir=run"
 
 
 def test_changed_weights_are_refused(tmp_path, prior):
