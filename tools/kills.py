@@ -307,7 +307,7 @@ def all_kills(given: argparse.Namespace, folder: Path) -> list[Kill]:
         if stage not in took:
             took[stage] = uninterrupted(stage, command, whole)
         kill = interrupted(stage, command, own, took[stage], draw, len(kills) % 3 == 2)
-        if kill.signals == [ENDED]:  # before the signal came: no kill
+        if set(kill.signals) == {ENDED}:  # before the signals came: no kill
             continue
         if not kill.outcome:
             wrong = differences(whole / "run", own / "run")
