@@ -83,7 +83,7 @@ class ExternalEgo(Ego):
         if bool(((step > 0) & (step <= self._asked)).any()):
             raise InputError(
                 "ego=external: asked about a moment that is not the next one of its scene; it drives in closed loop "
-                "only, and traffic cannot look ahead with it (synthesizer.control.lookahead=false)"
+                "only, and traffic cannot look ahead with it (synthesizer.control.lookahead=0)"
             )
         self._asked = step.clone()
         return (step == 0).nonzero()[:, 0].tolist()

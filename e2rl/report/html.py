@@ -56,6 +56,8 @@ def report(run: Path, replays: int, methods: Sequence[str] = ()) -> str:
 
 def page_content(run: Path, replays: int, methods: Sequence[str] = ()) -> dict[str, Any]:
     """The data block of the page. Raises InputError where files of the run are missing or no method has the name."""
+    if not run.is_dir():
+        raise InputError(f"{run}: no such folder; give the folder of a run of evaluate.py")
     found, rows, metrics = read_modes(run / MODES_FILE), read_rows(run / TABLE), read_metrics(run / METRICS_FILE)
     if not found["groups"]:
         raise InputError(f"{run / TABLE}: no closed-loop rollouts; give the folder of a run of evaluate.py with some")
