@@ -20,6 +20,7 @@ from e2rl.evaluation.open_loop import open_loop_rows
 from e2rl.evaluation.protocol import Method, Setup, drive_all, run_protocol
 from e2rl.evaluation.realism_meta import meta_rows
 from e2rl.files import alone_in
+from e2rl.options import run_command
 from e2rl.report.curves import points_of_rows, save_curves
 from e2rl.report.drawing import save_figure
 from e2rl.report.egos import ego_tables, guard_table
@@ -141,13 +142,18 @@ def report_egos(
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
-def main(config: DictConfig) -> None:
-    """The command."""
+def run(config: DictConfig) -> None:
+    """An evaluation, as configured."""
     with ending(resume_command(config)):
         anew = config.reproduce and not config.resume
-        run = reproduction_of(config) if anew else run_of(config, MAY_CHANGE)
-        with alone_in(run.folder):
-            evaluate(run)
+        task = reproduction_of(config) if anew else run_of(config, MAY_CHANGE)
+        with alone_in(task.folder):
+            evaluate(task)
+
+
+def main() -> None:
+    """The command."""
+    run_command(run, "evaluate")
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from e2rl.learning.build import build_evolution, build_logger, build_measure, ch
 from e2rl.learning.checkpoint import checkpoints, load_checkpoint, save_checkpoint
 from e2rl.learning.prior_training.distributed import follower_overrides, follows, started_by_torchrun
 from e2rl.learning.prior_training.stage import run_prior_stage
+from e2rl.options import run_command
 from e2rl.provenance import begin_run
 from e2rl.report.rounds import draw_round, round_line
 from e2rl.report.tables import metric_tables, print_tables, save_tables
@@ -116,7 +117,7 @@ def run(config: DictConfig) -> None:
 def main() -> None:
     """The command, in this process or in one of torchrun's."""
     sys.argv += follower_overrides()
-    run()
+    run_command(run, "train")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ PACKAGE = Path(e2rl.__file__).parent
 ORDER = (  # of the folders and files directly in e2rl
     *("errors", "files", "weights", "settings", "workers", "ray_workers", "ending"),
     *("scene", "verdicts", "sim", "metrics", "prior", "ego", "evasion", "traffic", "synthesizer", "rivals"),
-    *("evaluation", "capacity", "build", "egos", "tuning", "api", "provenance", "learning"),
+    *("evaluation", "capacity", "build", "egos", "tuning", "api", "options", "provenance", "learning"),
     *("resume", "reproduce", "report"),
 )
 

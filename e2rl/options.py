@@ -1,0 +1,137 @@
+"""The command line of the scripts: `--help` with every option's comment, and the nearest name of one that is none."""
+
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from e2rl.build import choices, conf_folder, load_config
+
+OPTION = re.compile(r"(?P<added>\+{0,2})(?P<key>[\w./-]+)=(?P<value>.*)", re.DOTALL)
+ALIKE = 0.8  # similarity from which an added key is taken for a mistyped one
+
+
+def run_command(main: Callable[[], None], name: str) -> None:
+    """Run a script that Hydra configures by conf/<name>.yaml.
+
+    `--help` prints the files of the configuration, with the files that the command line chooses. After Hydra's refusal
+    the nearest right name is told. A key added by + that looks like one there is ends the command, status 2.
+    """
+    arguments = sys.argv[1:]
+    if {"-h", "--help"} & set(arguments):
+        print(help_text(name, arguments))
+        return
+    if wrong := added_by_mistake(name, arguments):
+        print("error: " + "; ".join(wrong), file=sys.stderr)
+        sys.exit(2)
+    try:
+        main()
+    except SystemExit as end:
+        if end.code == 1 and (wrong := mistyped(name, arguments)):
+            print("error: " + "; ".join(wrong), file=sys.stderr)
+        raise
+
+
+# --- help
+
+
+def help_text(name: str, arguments: Sequence[str]) -> str:
+    """The configuration of a script as its files say it, comments included."""
+    folders = [conf_folder(), *_further(arguments)]
+    root = conf_folder() / f"{name}.yaml"
+    parts = [
+        f"python {name}.py [GROUP=FILE] [KEY=VALUE] [PART.KEY=VALUE]\n\nOptions by group, with what they are now; "
+        f"`GROUP=FILE --help` shows those of another file. hydra.run.dir=FOLDER: where the run is written.",
+        root.read_text(),
+    ]
+    chosen = {key: value for _, key, value in _options(arguments)}
+    for entry in _content(root)["defaults"]:
+        for group, file in entry.items() if isinstance(entry, dict) else ():
+            if file := chosen.get(group, file):
+                parts += _file_texts(folders, group, str(file))
+    return "\n\n".join(part.rstrip() for part in parts)
+
+
+def _file_texts(folders: Sequence[Path], group: str, name: str) -> Iterator[str]:
+    """A group's file under a heading, and those of the group that it builds on."""
+    file = next((each for folder in folders if (each := folder / group / f"{name}.yaml").is_file()), None)
+    if file is None:
+        yield f"### {group}={name}: none of {', '.join(choices(group))}"
+        return
+    others = ", ".join(sorted(path.stem for folder in folders for path in (folder / group).glob("*.yaml")))
+    yield f"### {group}={name} (of: {others})\n\n{file.read_text()}"
+    for base in _content(file).get("defaults", ()):
+        if isinstance(base, str) and base != "_self_":
+            yield from _file_texts(folders, group, base)
+
+
+def _content(file: Path) -> dict[str, Any]:
+    content = OmegaConf.to_container(OmegaConf.load(file))
+    return {str(key): value for key, value in content.items()} if isinstance(content, dict) else {}
+
+
+def _further(arguments: Sequence[str]) -> Iterator[Path]:
+    """Folders of configuration that the command line names."""
+    for position, argument in enumerate(arguments):
+        option, _, value = argument.partition("=")
+        if option in ("--config-dir", "-cd"):
+            yield Path(value or "".join(arguments[position + 1 : position + 2]))
+
+
+# --- names
+
+
+def mistyped(name: str, arguments: Sequence[str]) -> list[str]:
+    """What is wrong with options that no file of the configuration has, with the nearest name that one has."""
+    given = [option for option in _options(arguments) if not option[0]]
+    groups = _groups()
+    chosen = [f"{key}={value}" for _, key, value in given if key in groups and value in (*choices(key), "null")]
+    keys = list(_keys(OmegaConf.to_container(load_config(name, chosen))))
+    wrong = []
+    for _, key, value in given:
+        if key in groups:
+            known = choices(key)
+            if value not in (*known, "null"):
+                wrong.append(_told(f"{key}={value}", value, known))
+        elif key not in keys:
+            wrong.append(_told(key, key, keys))
+    return wrong
+
+
+def added_by_mistake(name: str, arguments: Sequence[str]) -> list[str]:
+    """The same for keys added by + at the top, where they look like one of the file's own: they would do nothing."""
+    added = [key for plus, key, _ in _options(arguments) if plus and "." not in key and "/" not in key]
+    if not added:
+        return []
+    known = [*_content(conf_folder() / f"{name}.yaml"), *_groups()]
+    return [_told(key, key, known) for key in added if key not in known and get_close_matches(key, known, 1, ALIKE)]
+
+
+def _told(option: str, given: str, known: Sequence[str]) -> str:
+    near = get_close_matches(given, known, 1, 0.5) or get_close_matches(
+        given.rpartition(".")[2], [key.rpartition(".")[2] for key in known], 1, 0.5
+    )
+    return f"{option}: there is no such option" + (f"; the nearest is {near[0]}" if near else "; see --help")
+
+
+def _options(arguments: Sequence[str]) -> list[tuple[str, str, str]]:
+    """(plus signs, key, value) of the options of a command line, Hydra's own apart."""
+    found = (OPTION.fullmatch(argument) for argument in arguments)
+    parts = [(each["added"], each["key"], each["value"]) for each in found if each]
+    return [part for part in parts if not part[1].startswith(("hydra.", "hydra/", "-"))]
+
+
+def _groups() -> list[str]:
+    return [folder.name for folder in conf_folder().iterdir() if folder.is_dir()]
+
+
+def _keys(config: Any, prefix: str = "") -> Iterator[str]:
+    """The dotted names of all entries of nested containers."""
+    if isinstance(config, dict):
+        for key, value in config.items():
+            yield f"{prefix}{key}"
+            yield from _keys(value, f"{prefix}{key}.")
