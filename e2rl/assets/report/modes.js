@@ -37,8 +37,9 @@ const typicalOf = (failures) =>
 
 /** The list of modes; `choose` is called with a mode. */
 function showModes(container, modes, total, store, choose) {
+  const first = modes.findIndex(({ mode, counted }) => mode !== OTHER && !counted);
   container.replaceChildren(
-    ...modes.map((mode) => {
+    ...modes.flatMap((mode, index) => {
       const picture = element("canvas", { "aria-hidden": "true" });
       const button = element(
         "button",
@@ -49,7 +50,8 @@ function showModes(container, modes, total, store, choose) {
       button.addEventListener("click", () => choose(mode));
       if (mode.typical.replay !== null)
         store.replay(mode.typical.replay).then((found) => drawTypical(picture, (mode.found = found)));
-      return element("li", {}, button);
+      const apart = index === first ? [element("li", { class: "apart" }, "None of these counts")] : [];
+      return [...apart, element("li", {}, button)];
     }),
   );
 }
