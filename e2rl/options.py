@@ -86,7 +86,12 @@ def _further(arguments: Sequence[str]) -> Iterator[Path]:
 
 
 def mistyped(name: str, arguments: Sequence[str]) -> list[str]:
-    """What is wrong with options that no file of the configuration has, with the nearest name that one has."""
+    """What is wrong with options that no file of the configuration has, with the nearest name that one has.
+
+    Nothing where the command line names further folders of configuration: Hydra alone knows what is in force then.
+    """
+    if any(_further(arguments)) or any(argument.startswith("hydra.searchpath") for argument in arguments):
+        return []
     given = [option for option in _options(arguments) if not option[0]]
     groups = _groups()
     chosen = [f"{key}={value}" for _, key, value in given if key in groups and value in (*choices(key), "null")]

@@ -41,7 +41,10 @@ def test_the_nearest_name_is_told(name, arguments, told):
     assert told in wrong
 
 
-@pytest.mark.parametrize("arguments", [["num_scenes=3", "ego=idm", "sim.max_acceleration=2"], ["hydra.run.dir=x"]])
+RIGHT = [["num_scenes=3", "ego=idm", "sim.max_acceleration=2"], ["hydra.run.dir=x"], ["--config-dir=mine", "ego=mine"]]
+
+
+@pytest.mark.parametrize("arguments", RIGHT)
 def test_right_options_are_no_mistake(arguments):
     assert mistyped("evaluate", arguments) == []
 
