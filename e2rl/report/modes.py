@@ -46,8 +46,8 @@ def mode_table(found: Mapping, ego: str, several: bool) -> Table:
 
 def summary(groups: Sequence[Mapping], failures: int, verdicts: int) -> list[str]:
     """The last row: failures and modes of each group."""
-    cells = [f"{group['failures']} failures in {group['modes']} modes" for group in groups]
-    return ["all", str(failures), *cells, *[""] * (verdicts + len(SPEEDS))]
+    cells = [f"{group['failures']} in {group['modes']} mode{'s'[: group['modes'] != 1]}" for group in groups]
+    return ["all failures", str(failures), *cells, *[""] * (verdicts + len(SPEEDS))]
 
 
 def caption(found: Mapping, ego: str, several: bool, absent: Sequence[str]) -> str:

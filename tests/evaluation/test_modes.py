@@ -81,7 +81,7 @@ def test_the_table_has_a_row_for_each_mode_and_says_what_is_missing():
     first, second, last = table.rows
     assert first[0].startswith("1. crossing") and first[1:6] == ["8", "100", "33", "–", "75"]
     assert second[1:] == ["4", "0", "67", "–", "100", "0", "100", "10.0", "5.0"]
-    assert last[1:5] == ["12", "6 in 1", "6 in 2", "0 in 0"]
+    assert last[1:5] == ["12", "6 in 1 mode", "6 in 2 modes", "0 in 0 modes"]
     assert table.caption.startswith("Failure modes of idm:") and "without duty" in table.caption
     assert "avoidable" in table.caption and len({len(row) for row in (table.head, *table.rows)}) == 1
     assert table.text() and table.markdown()
