@@ -79,9 +79,13 @@ def begin_run(folder: Path, config: DictConfig, free: Collection[str], scenes: M
 
 def begun_command(folder: Path) -> str:
     """The command that a run was begun with, by its overrides: it ended before provenance.json was written."""
-    overrides = OmegaConf.select(OmegaConf.load(folder / ".hydra" / "hydra.yaml"), "hydra.overrides") or {}
-    given = [*overrides.get("task", ()), *overrides.get("hydra", ())]
-    return shlex.join(["python", sys.argv[0], *(str(each) for each in given if each != "hydra.mode=RUN")])
+    saved: Any = OmegaConf.to_container(OmegaConf.load(folder / ".hydra" / "hydra.yaml"))  # ${..} in an override stays
+    try:
+        overrides = saved["hydra"]["overrides"]
+        given = [str(each) for each in (*overrides["task"], *overrides["hydra"]) if each != "hydra.mode=RUN"]
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{folder / '.hydra' / 'hydra.yaml'}: damaged; restore it, or begin a new run") from error
+    return shlex.join(["python", sys.argv[0], *given])
 
 
 def changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -43,12 +43,27 @@ def test_the_same_run_goes_on(tmp_path, prior, capsys):
 
 
 def test_a_run_that_ended_before_its_file_was_written_keeps_its_command(tmp_path, monkeypatch):
-    overrides = {"task": ["batch=4", "seeds=[0, 1]"], "hydra": ["hydra.run.dir=run", "hydra.mode=RUN"]}
+    overrides = {
+        "task": ["batch=4", "methods=[replay, ${synthesizer.name}]"],
+        "hydra": ["hydra.run.dir=run", "hydra.mode=RUN"],
+    }
     (tmp_path / ".hydra").mkdir()
     OmegaConf.save({"hydra": {"overrides": overrides}}, tmp_path / ".hydra" / "hydra.yaml")
     monkeypatch.setattr(sys, "argv", ["evaluate.py", "resume=run"])
     begin(tmp_path, resume=True)
-    assert origin_of(tmp_path)["command"] == "python evaluate.py batch=4 'seeds=[0, 1]' hydra.run.dir=run"
+    assert origin_of(tmp_path)["command"] == (
+        "python evaluate.py batch=4 'methods=[replay, ${synthesizer.name}]' hydra.run.dir=run"
+    )
+
+
+@pytest.mark.parametrize(
+    "saved", [{}, {"hydra": 1}, {"hydra": {"overrides": "x"}}, {"hydra": {"overrides": {"task": 3}}}]
+)
+def test_damaged_overrides_are_named(tmp_path, saved):
+    (tmp_path / ".hydra").mkdir()
+    OmegaConf.save(saved, tmp_path / ".hydra" / "hydra.yaml")
+    with pytest.raises(InputError, match=r"hydra\.yaml: damaged"):
+        begin(tmp_path, resume=True)
 
 
 def test_changed_weights_are_refused(tmp_path, prior):

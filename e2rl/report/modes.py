@@ -46,7 +46,7 @@ def mode_table(found: Mapping, ego: str, several: bool) -> Table:
 
 def summary(groups: Sequence[Mapping], failures: int, verdicts: int) -> list[str]:
     """The last row: failures and modes of each group."""
-    cells = [f"{group['failures']} in {group['modes']} mode{'s'[: group['modes'] != 1]}" for group in groups]
+    cells = [f"{each['failures']} in {each['modes']} mode{'' if each['modes'] == 1 else 's'}" for each in groups]
     return ["all failures", str(failures), *cells, *[""] * (verdicts + len(SPEEDS))]
 
 
