@@ -6,7 +6,18 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from e2rl.build import build_sim, built, check_counts, check_seeds, intensities, load_choice, processes_of, resolved
+from e2rl.build import (
+    build_prior,
+    build_sim,
+    build_traffic,
+    built,
+    check_counts,
+    check_seeds,
+    intensities,
+    load_choice,
+    processes_of,
+    resolved,
+)
 from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import Ego
 from e2rl.ego.bits_network import BitsNetwork
@@ -24,6 +35,7 @@ from e2rl.learning.imitation import ImitationSettings, imitate, recorded_pairs
 from e2rl.learning.improvement import Improvement
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.memory import Memory
+from e2rl.learning.mixture import mixture
 from e2rl.learning.solvability import solvable
 from e2rl.prior.prior import Prior
 from e2rl.ray_workers import RayWorkers
@@ -48,15 +60,16 @@ def build_evolution(
     default: a temporary one.
     """
     sim, seed = build_sim(config), config.seed
-    synthesize = synthesize or synthesize_traffic(scenes, traffic, sim, config.batch, config.device)
+    made_by = partial(synthesize_traffic, scenes, sim=sim, batch=config.batch, device=config.device)
+    synthesize = synthesize or made_by(traffic)
     given = {"num_scenes": len(scenes), "rounds": config.rounds, "seed": seed}
     curriculum = built(config.curriculum, "curriculum", CurriculumScheduler, **given)
-    if curriculum.templates != ("full",) and not traffic.follows_template:
-        raise InputError(
-            f"curriculum: it chooses causal templates ({', '.join(curriculum.templates)}), but "
-            f"synthesizer={config.synthesizer.name} has none; set synthesizer=e2 or curriculum.templates=[full]"
-        )
+    check_templates(curriculum, config.synthesizer.name, traffic)
     settings = settings_of(RoundSettings, _beside(config, ego), "learner.round")
+    if settings.second:
+        second = build_traffic(load_choice("synthesizer", settings.second), build_prior(config, config.device)[0])
+        check_templates(curriculum, settings.second, second)
+        synthesize = mixture(synthesize, made_by(second), settings.second_share)
     learner = OmegaConf.create({key: value for key, value in config.learner.items() if key != "round"})
     parameters = {key: value for key, value in resolved(config.ego).items() if key != "_target_"}
     live = traffic if settings.traffic == "live" else None
@@ -66,6 +79,15 @@ def build_evolution(
     workers = processes_of(config)
     how = (keep, Memory(folder, settings.memory), config.batch, workers if isinstance(workers, RayWorkers) else None)
     return Evolution(curriculum, improve, synthesize, settings, seed, *how)
+
+
+def check_templates(curriculum: CurriculumScheduler, name: str, traffic: Traffic) -> None:
+    """InputError for a curriculum that chooses causal templates for a traffic method that has none."""
+    if curriculum.templates != ("full",) and not traffic.follows_template:
+        raise InputError(
+            f"curriculum: it chooses causal templates ({', '.join(curriculum.templates)}), but "
+            f"synthesizer={name} has none; set synthesizer=e2 or curriculum.templates=[full]"
+        )
 
 
 def _beside(config: DictConfig, ego: Ego) -> dict:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from e2rl.ego.actor import ActorEgo
 from e2rl.ego.base import Ego
+from e2rl.errors import InputError
 from e2rl.learning.ahead import Ahead, AheadElsewhere
 from e2rl.learning.attack import ATTACK, Order, Solvable, Synthesize, counted, ended_of, make_traffic
 from e2rl.learning.curriculum.outcomes import Choice, outcomes_of, tally
@@ -34,11 +35,16 @@ class RoundSettings:
     memory: int = 4096
     fresh: float = 3.0
     ahead: bool = False
+    second: str | None = None
+    second_share: float = 0.5
 
     def __post_init__(self) -> None:
         check_choice("learner.round.nominal", self.nominal, NOMINAL)
         check_choice("learner.round.traffic", self.traffic, TRAFFIC)
         check_range("learner.round.fresh", self.fresh, 1)
+        check_range("learner.round.second_share", self.second_share, 0, 1)
+        if self.second and self.traffic == "live":
+            raise InputError("learner.round.second: live traffic is of one method; set learner.round.traffic=replay")
 
 
 @dataclass
