@@ -55,15 +55,16 @@ def cloning_loss(actor: ProbabilisticActor, pairs: TensorDictBase) -> Tensor:
 
 
 def teaching_loss(network: ActorNetwork, pairs: TensorDictBase) -> Tensor:
-    """Cross-entropy [], up to a constant, of Gaussians of LABEL_WIDTH about the actor's most central actions under the
-    labels of pairs [M]: the mean of sum_c w_c |(a_c - a(o)) / width|^2 / 2, least where a(o) is the labels' mean.
+    """Mean [] of -log sum_c w_c exp(-|a_c - a(o)|^2 / 2), distances in units of LABEL_WIDTH, of the most
+    central actions a(o) under the labels of pairs [M]: least where a(o) is near one label that much speaks for.
 
-    `cloning_loss` fits the actor's own deviation too: late in a training, when that is a tenth, its gradient is a
-    hundred times as large as early, and it widens the exploration.
+    Ways out differ: the mean of one to the left and one to the right is none. `cloning_loss` has such means, and fits
+    the actor's own deviation too: late in a training, when that is a tenth, its gradient is a hundred times as large as
+    early, and it widens the exploration.
     """
     width = network.reach * network.reach.new_tensor(LABEL_WIDTH)
     apart = (pairs["action"] - network.deterministic(pairs["observation"])[:, None]) / width
-    return (pairs["weight"] * apart.square().sum(-1)).sum(1).mean() / 2
+    return -(pairs["weight"].log() - apart.square().sum(-1) / 2).logsumexp(1).mean()
 
 
 def drawn(experts: Sequence[TensorDictBase], count: int) -> TensorDict:

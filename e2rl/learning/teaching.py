@@ -36,8 +36,8 @@ class TeachingSettings:
     near: float = 1.2
     regret: float = 20.0
     survivable: float = 60.0
-    candidates: int = 16
-    temperature: float = 0.5
+    candidates: int = 48
+    temperature: float = 5.0
 
     def __post_init__(self) -> None:
         for name, least in (("states", 1), ("memory", 1), ("window", 0), ("near", 0), ("candidates", 1)):

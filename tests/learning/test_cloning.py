@@ -86,22 +86,36 @@ def test_kinds_share_a_minibatch_evenly_whatever_their_sizes(count):
     assert not found["weight"][first, 1].any(), "filled up"
 
 
-def test_what_a_teacher_teaches_is_learned_best_by_acting_as_its_labels():
-    """Nobody has a lower loss than who acts as their mean; the exploration's width is left alone."""
-    actor, actions, weights = network(), torch.tensor([[-3.0, 0.2], [1.0, -0.4], [2.0, 0.0]]), [0.5, 0.3, 0.2]
-    given = pairs(actions.tolist(), weights)
-    mean = (torch.tensor(weights)[:, None] * actions).sum(0)
-    acted = torch.nn.Parameter(mean.clone())
-    policy = actor.network
-    spread = policy.spread
-    loss = teaching_loss(policy, given)
-    assert torch.autograd.grad(loss, spread, allow_unused=True) == (None,)
+def taught(actions, weights, acted):
+    """The teaching loss of a policy that acts as `acted` [2] everywhere, and its gradient there."""
+    policy, acted = network().network, torch.nn.Parameter(torch.tensor(acted))
     policy.deterministic = lambda observation: acted.expand(len(observation), 2)
-    best = teaching_loss(policy, given)
-    torch.testing.assert_close(torch.autograd.grad(best, acted)[0], torch.zeros(2), atol=1e-4, rtol=0)
-    assert best < loss
-    certain = pairs([mean.tolist()], [1.0])
-    assert teaching_loss(policy, certain).abs() < 1e-6
+    loss = teaching_loss(policy, pairs(actions, weights))
+    return loss.item(), torch.autograd.grad(loss, acted)[0]
+
+
+def test_of_two_ways_out_one_is_taken_and_not_their_mean():
+    left_and_right = [[0.0, 1.2], [0.0, -1.2]]
+    between, _ = taught(left_and_right, [0.5, 0.5], [0.0, 0.0])
+    for way in (1.2, -1.2):
+        loss, gradient = taught(left_and_right, [0.5, 0.5], [0.0, way])
+        assert loss < between - 5 and gradient.abs().max() < 1e-3
+    _, gradient = taught(left_and_right, [0.5, 0.5], [0.0, 0.3])
+    assert gradient[1] < 0, "to the nearer one: a step down the gradient turns further left"
+
+
+def test_what_speaks_for_a_label_counts():
+    left_and_right = [[0.0, 1.2], [0.0, -1.2]]
+    _, gradient = taught(left_and_right, [0.99, 0.01], [0.0, -0.05])
+    assert gradient[1] < 0, "towards the likely one, though the other is nearer"
+    assert taught([[-3.0, 0.2]], [1.0], [-3.0, 0.2])[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_teaching_leaves_the_explorations_width_alone():
+    policy = network().network
+    loss = teaching_loss(policy, pairs([[-3.0, 0.2], [1.0, -0.4]], [1.0, 0.0]))  # a weight of 0 fills up
+    assert torch.autograd.grad(loss, policy.spread, allow_unused=True, retain_graph=True) == (None,)
+    assert all(part.isfinite().all() for part in torch.autograd.grad(loss, list(policy.trunk.parameters())))
 
 
 def test_a_teaching_error_of_the_labels_width_costs_one_half_each():
