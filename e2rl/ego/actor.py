@@ -7,6 +7,8 @@ from torch import Tensor
 
 from e2rl.ego.network import ActorCritic, find_weights
 from e2rl.ego.observing import ObservingEgo
+from e2rl.errors import InputError
+from e2rl.settings import check_range
 
 
 class ActorEgo(ObservingEgo):
@@ -15,6 +17,7 @@ class ActorEgo(ObservingEgo):
     def __init__(
         self,
         hidden: Sequence[int] = (256, 256),
+        agent_units: int = 64,
         reference: bool = True,
         initial_std: Sequence[float] = (0.25, 0.12),
         max_acceleration: float = 5.0,
@@ -25,8 +28,11 @@ class ActorEgo(ObservingEgo):
     ) -> None:
         """Fields: conf/ego/actor.yaml. Raises InputError if the checkpoint is missing or does not fit."""
         super().__init__()
+        check_range("ego.agent_units", agent_units, 1)
+        if not hidden:
+            raise InputError("ego.hidden=[]: give the units of one layer at least")
         low, high = torch.tensor([-max_braking, -max_yaw_rate]), torch.tensor([max_acceleration, max_yaw_rate])
-        self.network = ActorCritic(low, high, hidden, reference, initial_std, device)
+        self.network = ActorCritic(low, high, hidden, agent_units, reference, initial_std, device)
         if checkpoint is not None:
             self.network.load(find_weights(checkpoint))
 

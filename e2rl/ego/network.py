@@ -14,6 +14,7 @@ from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
 from e2rl.ego.reference import LAST_ACTION, reference_action
+from e2rl.ego.trunk import Trunk
 from e2rl.errors import InputError
 from e2rl.files import altered, write_atomically
 from e2rl.sim.observation import OBSERVATION_SIZE
@@ -69,6 +70,7 @@ class ActorNetwork(nn.Module):
         self,
         normaliser: Normaliser,
         hidden: Sequence[int],
+        agent_units: int,
         reference: bool,
         initial_std: Sequence[float],
         low: Tensor,
@@ -76,7 +78,7 @@ class ActorNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.normaliser, self.reference = normaliser, reference
-        self.trunk = perceptron(OBSERVATION_SIZE, hidden, 2, last_gain=0.0)
+        self.trunk = Trunk(hidden, agent_units, 2, last_gain=0.0)
         self.spread = nn.Parameter((torch.tensor(initial_std) - NARROWEST).logit(1e-4))
         self.noise: Tensor | None = None  # [D], set by `noisy`
         self.register_buffer("middle", (high + low) / 2, persistent=False)
@@ -144,6 +146,7 @@ class ActorCritic(nn.Module):
         low: Tensor,
         high: Tensor,
         hidden: Sequence[int] = (256, 256),
+        agent_units: int = 64,
         reference: bool = True,
         initial_std: Sequence[float] = (0.25, 0.12),
         device: str | torch.device = "cpu",
@@ -156,13 +159,14 @@ class ActorCritic(nn.Module):
         self.architecture = {
             "observation": OBSERVATION_SIZE,
             "hidden": [int(size) for size in hidden],
+            "agent_units": int(agent_units),
             "reference": bool(reference),
             "low": _rounded(low),
             "high": _rounded(high),
         }
         self.normaliser = Normaliser(OBSERVATION_SIZE)
-        self.network = ActorNetwork(self.normaliser, hidden, reference, initial_std, low.cpu(), high.cpu())
-        values = nn.Sequential(self.normaliser, perceptron(OBSERVATION_SIZE, hidden, 1, last_gain=1.0))
+        self.network = ActorNetwork(self.normaliser, hidden, agent_units, reference, initial_std, low.cpu(), high.cpu())
+        values = nn.Sequential(self.normaliser, Trunk(hidden, agent_units, 1, last_gain=1.0))
         self.to(device)
         self.actor = self._sampler(TensorDictModule(self.network, ["observation"], ["loc", "scale"]))
         self.critic = ValueOperator(values.to(device), in_keys=["observation"])
@@ -235,10 +239,11 @@ def read_actor(path: Path) -> ActorCritic:
     saved, _ = _content(path)
     try:
         low, high = (torch.tensor(saved[key], dtype=torch.float32).reshape(2) for key in ("low", "high"))
-        sizes = [int(size) for size in saved["hidden"]]
-        if saved["observation"] != OBSERVATION_SIZE or len(sizes) > DEEPEST or not all(0 < n <= WIDEST for n in sizes):
-            raise ValueError(f"of {saved['observation']} numbers and layers of {sizes} units")
-        actor = ActorCritic(low, high, sizes, bool(saved["reference"]))
+        sizes, units = [int(size) for size in saved["hidden"]], int(saved["agent_units"])
+        fits = 0 < len(sizes) <= DEEPEST and all(0 < size <= WIDEST for size in [*sizes, units])
+        if saved["observation"] != OBSERVATION_SIZE or not fits:
+            raise ValueError(f"of {saved['observation']} numbers, {units} units an agent, layers of {sizes} units")
+        actor = ActorCritic(low, high, sizes, units, bool(saved["reference"]))
     except (TypeError, KeyError, ValueError, RuntimeError) as error:
         raise InputError(f"{path}: an actor of another version ({error}); train it again") from None
     actor.load(path)

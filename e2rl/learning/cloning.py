@@ -13,6 +13,7 @@ from torchrl.modules import ProbabilisticActor
 
 from e2rl.ego.network import ActorNetwork
 from e2rl.sim.env import DrivingEnv
+from e2rl.sim.mirror import mirrored
 
 LABEL_WIDTH = (0.25, 0.12)  # of acceleration and yaw rate, in halves of the action's range
 EXPERT_SHARE = 0.99  # expert actions are clipped to this share of the bounds, where the squashed density is infinite
@@ -65,6 +66,13 @@ def teaching_loss(network: ActorNetwork, pairs: TensorDictBase) -> Tensor:
     width = network.reach * network.reach.new_tensor(LABEL_WIDTH)
     apart = (pairs["action"] - network.deterministic(pairs["observation"])[:, None]) / width
     return -(pairs["weight"].log() - apart.square().sum(-1) / 2).logsumexp(1).mean()
+
+
+def mirrored_pairs(pairs: TensorDictBase) -> TensorDict:
+    """The pairs [M] in a mirror: what is right there is what is right here, with left and right exchanged."""
+    action = pairs["action"] * pairs["action"].new_tensor([1.0, -1.0])
+    found = {"observation": mirrored(pairs["observation"]), "action": action, "weight": pairs["weight"]}
+    return TensorDict(found, batch_size=pairs.batch_size)
 
 
 def drawn(experts: Sequence[TensorDictBase], count: int) -> TensorDict:

@@ -13,7 +13,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from e2rl.ego.network import ActorCritic, ActorNetwork
 from e2rl.errors import InputError
-from e2rl.learning.cloning import cloning_loss, drawn, teaching_loss
+from e2rl.learning.cloning import cloning_loss, drawn, mirrored_pairs, teaching_loss
 
 VALUE_MEMORY = 0.95  # weight of the past in the running mean and variance of the returns, per update
 GENTLE_FRAMES = 512  # of a minibatch, on which the policy's |acceleration| is measured
@@ -177,6 +177,7 @@ class Learner:
             total = total + settings.cloning * losses["loss_cloning"]
         if labels is not None and settings.teaching > 0 and not warming:
             pairs = drawn([labels], settings.cloning_minibatch).to(self.network.device)
+            pairs = torch.cat([mirrored_pairs(pairs[::2]), pairs[1::2]])  # what it teaches holds for both sides
             losses["loss_teaching"] = teaching_loss(self.network.network, pairs)
             total = total + settings.teaching * losses["loss_teaching"]
         take_step(self.optimiser, total, settings.max_grad_norm)

@@ -17,7 +17,7 @@ from tests.synthetic import make_scenes
 def wild(ego, scale=0.3):
     """Give the untrained network an opinion of its own."""
     torch.manual_seed(0)
-    torch.nn.init.normal_(ego.network.network.trunk[-1].weight, std=scale)
+    torch.nn.init.normal_(ego.network.network.trunk.last.weight, std=scale)
     return ego
 
 
@@ -68,7 +68,7 @@ def test_the_network_can_override_the_reference():
     observation = env.reset()["observation"]
     assert torch.allclose(ego.network.network.deterministic(observation), reference_action(observation), atol=1e-4)
     with torch.no_grad():
-        ego.network.network.trunk[-1].bias.copy_(torch.tensor([8.0, -8.0]))
+        ego.network.network.trunk.last.bias.copy_(torch.tensor([8.0, -8.0]))
     assert torch.allclose(ego.network.network.deterministic(observation), torch.tensor([5.0, -1.6]), atol=1e-2)
 
 
@@ -138,7 +138,7 @@ def test_noise_is_the_networks_alone_and_ends_with_the_block():
     clean = network.deterministic(observation)
     with network.noisy(0.3, 1.0):
         assert not torch.equal(network.deterministic(observation), clean)
-        torch.nn.init.zeros_(network.trunk[-1].weight)
+        torch.nn.init.zeros_(network.trunk.last.weight)
         assert torch.allclose(network.deterministic(observation), reference_action(observation), atol=1e-4)
     assert torch.equal(network.deterministic(observation), network.deterministic(observation))
 

@@ -64,6 +64,8 @@ def test_an_actor_s_file_tells_its_architecture(actor, tmp_path):
     [
         ({"observation": 12}, "of another version .of 12 numbers"),
         ({"hidden": [10**9]}, "another version"),
+        ({"hidden": []}, "another version"),
+        ({"agent_units": 0}, "another version"),
         ({"low": [1]}, "another"),
     ],
 )

@@ -6,14 +6,15 @@ from tensordict import TensorDict
 from torchrl.objectives import BCLoss
 
 from e2rl.ego.actor import ActorEgo
-from e2rl.learning.cloning import LABEL_WIDTH, cloning_loss, drawn, teaching_loss
+from e2rl.learning.cloning import LABEL_WIDTH, cloning_loss, drawn, mirrored_pairs, teaching_loss
+from e2rl.sim.mirror import mirrored
 from e2rl.sim.observation import OBSERVATION_SIZE
 
 
 def network():
     torch.manual_seed(0)
     ego = ActorEgo(hidden=(16,))
-    torch.nn.init.normal_(ego.network.network.trunk[-1].weight, std=0.1)
+    torch.nn.init.normal_(ego.network.network.trunk.last.weight, std=0.1)
     return ego.network
 
 
@@ -123,3 +124,11 @@ def test_a_teaching_error_of_the_labels_width_costs_one_half_each():
     wide = policy.reach * torch.tensor(LABEL_WIDTH)
     policy.deterministic = lambda observation: torch.zeros(len(observation), 2)
     assert teaching_loss(policy, pairs([wide.tolist()], [1.0])).item() == pytest.approx(1.0)
+
+
+def test_what_is_right_in_a_scene_is_right_in_its_mirror():
+    found = pairs([[-3.0, 0.2], [1.0, -0.4]], [0.75, 0.25])
+    other = mirrored_pairs(found)
+    assert torch.equal(other["action"], found["action"] * torch.tensor([1.0, -1.0]))
+    assert torch.equal(other["weight"], found["weight"])
+    assert torch.equal(other["observation"], mirrored(found["observation"]))
