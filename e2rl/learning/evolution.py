@@ -29,7 +29,7 @@ NOISES = 16  # rows per scene in live traffic, each with its own noise
 class RoundSettings:
     """Fields: `round` in conf/learner/*.yaml."""
 
-    scenes: int = 64
+    scenes: int = 48
     nominal: str = "prior"
     traffic: str = "replay"
     memory: int = 4096

@@ -25,7 +25,7 @@ class UpdateSettings:
     """Fields: conf/learner/ppo_bc.yaml."""
 
     learning_rate: float = 7e-4
-    final_lr: float = 0.0
+    final_lr: float = 0.2
     gamma: float = 0.97
     lmbda: float = 0.95
     clip: float = 0.2
@@ -37,7 +37,7 @@ class UpdateSettings:
     target_kl: float = 0.04
     advantage_filter: float = 0.01
     critic_warmup: int = 1
-    gentle: float = 0.0
+    gentle: float = 0.25
     teaching: float = 0.0
     cloning: float = 0.0
     cloning_minibatch: int = 256
