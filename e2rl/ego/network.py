@@ -14,7 +14,7 @@ from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
 from e2rl.ego.reference import LAST_ACTION, reference_action
-from e2rl.ego.trunk import Trunk
+from e2rl.ego.trunk import Trunk, linear
 from e2rl.errors import InputError
 from e2rl.files import altered, write_atomically
 from e2rl.sim.observation import OBSERVATION_SIZE
@@ -273,10 +273,8 @@ def find_weights(path: str | Path) -> Path:
 def perceptron(size: int, hidden: Sequence[int], out: int, last_gain: float) -> nn.Sequential:
     """Layers size -> hidden -> out with SiLU; orthogonal weights, the last layer's scaled by last_gain."""
     sizes = [size, *hidden, out]
-    layers = [nn.Linear(fan_in, fan_out) for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True)]
-    for layer in layers:
-        nn.init.orthogonal_(layer.weight, 2**0.5 if layer is not layers[-1] else last_gain)
-        nn.init.zeros_(layer.bias)
+    gains = [*[2**0.5] * len(hidden), last_gain]
+    layers = [linear(*shape) for shape in zip(sizes[:-1], sizes[1:], gains, strict=True)]
     return nn.Sequential(*(module for layer in layers[:-1] for module in (layer, nn.SiLU())), layers[-1])
 
 

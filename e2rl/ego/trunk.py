@@ -27,7 +27,7 @@ class Trunk(nn.Module):
         self.rest = nn.Sequential(*_layer(OBSERVATION_SIZE - PER_AGENT * NEAREST, rest))
         deeper = zip(sizes[:-1], sizes[1:], strict=True)
         self.joint = nn.Sequential(*(module for pair in deeper for module in _layer(*pair)))
-        self.last = _linear(sizes[-1], out, last_gain)
+        self.last = linear(sizes[-1], out, last_gain)
 
     def forward(self, seen: Tensor) -> Tensor:
         """[..., out]."""
@@ -37,10 +37,11 @@ class Trunk(nn.Module):
 
 
 def _layer(fan_in: int, fan_out: int, norm: bool = True) -> list[nn.Module]:
-    return [_linear(fan_in, fan_out, 2**0.5), *([nn.LayerNorm(fan_out)] if norm else []), nn.SiLU()]
+    return [linear(fan_in, fan_out, 2**0.5), *([nn.LayerNorm(fan_out)] if norm else []), nn.SiLU()]
 
 
-def _linear(fan_in: int, fan_out: int, gain: float) -> nn.Linear:
+def linear(fan_in: int, fan_out: int, gain: float) -> nn.Linear:
+    """A layer of orthogonal weights, scaled by gain, without bias at first."""
     layer = nn.Linear(fan_in, fan_out)
     nn.init.orthogonal_(layer.weight, gain)
     nn.init.zeros_(layer.bias)
