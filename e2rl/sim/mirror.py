@@ -9,15 +9,8 @@ from e2rl.sim.observation import PROBE_X, PROBE_Y
 from e2rl.sim.observation_layout import observation_layout
 from e2rl.sim.prospects import ACCELERATIONS, OFFSETS
 
-SIDED = (
-    "yaw_rate",
-    "offset",
-    "heading_sin",
-    "curvature",
-    "y",
-    "velocity_y",
-    "turn_rate",
-)  # quantities that change sign
+# quantities that change sign
+SIDED = ("yaw_rate", "offset", "heading_sin", "curvature", "y", "velocity_y", "turn_rate")
 
 
 @cache
