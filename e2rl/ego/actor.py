@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from e2rl.ego.network import ActorCritic, find_weights
+from e2rl.ego.network import ActorCritic, find_weights, read_actor
 from e2rl.ego.observing import ObservingEgo
 from e2rl.errors import InputError
 from e2rl.settings import check_range
@@ -16,8 +16,8 @@ class ActorEgo(ObservingEgo):
 
     def __init__(
         self,
-        hidden: Sequence[int] = (256, 256),
-        agent_units: int = 64,
+        hidden: Sequence[int] = (128, 128),
+        agent_units: int = 32,
         reference: bool = True,
         initial_std: Sequence[float] = (0.25, 0.12),
         max_acceleration: float = 5.0,
@@ -26,7 +26,8 @@ class ActorEgo(ObservingEgo):
         checkpoint: str | None = None,
         device: str = "cpu",
     ) -> None:
-        """Fields: conf/ego/actor.yaml. Raises InputError if the checkpoint is missing or does not fit."""
+        """Fields: conf/ego/actor.yaml; with a checkpoint, the network is the file's. Raises InputError if it is missing
+        or its actions have other bounds."""
         super().__init__()
         check_range("ego.agent_units", agent_units, 1)
         if not hidden:
@@ -34,8 +35,19 @@ class ActorEgo(ObservingEgo):
         low, high = torch.tensor([-max_braking, -max_yaw_rate]), torch.tensor([max_acceleration, max_yaw_rate])
         self.network = ActorCritic(low, high, hidden, agent_units, reference, initial_std, device)
         if checkpoint is not None:
-            self.network.load(find_weights(checkpoint))
+            bounds, path = bounds_of(self.network), find_weights(checkpoint)
+            self.network = read_actor(path, device)
+            if bounds_of(self.network) != bounds:
+                raise InputError(
+                    f"{path}: its actions have the bounds {bounds_of(self.network)}, not {bounds}; set sim.max_* as in "
+                    "the run that wrote it"
+                )
 
     def decide(self, observation: Tensor) -> Tensor:
         """Most central action [B, 2] at the observation."""
         return self.network.network.deterministic(observation)
+
+
+def bounds_of(network: ActorCritic) -> tuple[object, object]:
+    """Lowest and highest action (m/s^2, rad/s), as the network's file states them."""
+    return network.architecture["low"], network.architecture["high"]

@@ -145,8 +145,8 @@ class ActorCritic(nn.Module):
         self,
         low: Tensor,
         high: Tensor,
-        hidden: Sequence[int] = (256, 256),
-        agent_units: int = 64,
+        hidden: Sequence[int] = (128, 128),
+        agent_units: int = 32,
         reference: bool = True,
         initial_std: Sequence[float] = (0.25, 0.12),
         device: str | torch.device = "cpu",
@@ -234,7 +234,7 @@ def _content(path: Path) -> tuple[Any, dict[str, Tensor]]:
         raise InputError(f"{path}: not a readable actor file ({error}); give an {WEIGHTS} file") from None
 
 
-def read_actor(path: Path) -> ActorCritic:
+def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
     """The actor of a file of `ActorCritic.save`, whatever its architecture; raises InputError."""
     saved, _ = _content(path)
     try:
@@ -243,7 +243,7 @@ def read_actor(path: Path) -> ActorCritic:
         fits = 0 < len(sizes) <= DEEPEST and all(0 < size <= WIDEST for size in [*sizes, units])
         if saved["observation"] != OBSERVATION_SIZE or not fits:
             raise ValueError(f"of {saved['observation']} numbers, {units} units an agent, layers of {sizes} units")
-        actor = ActorCritic(low, high, sizes, units, bool(saved["reference"]))
+        actor = ActorCritic(low, high, sizes, units, bool(saved["reference"]), device=device)
     except (TypeError, KeyError, ValueError, RuntimeError) as error:
         raise InputError(f"{path}: an actor of another version ({error}); train it again") from None
     actor.load(path)

@@ -14,6 +14,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from e2rl.ego.network import ActorCritic, ActorNetwork
 from e2rl.errors import InputError
 from e2rl.learning.cloning import cloning_loss, drawn, mirrored_pairs, teaching_loss
+from e2rl.sim.prospects import TIMES, time_to_contact
 
 VALUE_MEMORY = 0.95  # weight of the past in the running mean and variance of the returns, per update
 GENTLE_FRAMES = 512  # of a minibatch, on which the policy's |acceleration| is measured
@@ -24,7 +25,7 @@ PEAK_MEMORY = 0.75  # of the past in the running maximum of |advantage|, per upd
 class UpdateSettings:
     """Fields: conf/learner/ppo_bc.yaml."""
 
-    learning_rate: float = 7e-4
+    learning_rate: float = 1e-3
     final_lr: float = 0.2
     gamma: float = 0.97
     lmbda: float = 0.95
@@ -37,7 +38,7 @@ class UpdateSettings:
     target_kl: float = 0.04
     advantage_filter: float = 0.01
     critic_warmup: int = 1
-    gentle: float = 0.25
+    gentle: float = 0.1
     teaching: float = 0.0
     cloning: float = 0.0
     cloning_minibatch: int = 256
@@ -124,6 +125,7 @@ class Learner:
         size, highest = advantage.abs(), advantage.abs().max()
         self.peak = highest if self.updates == 0 else torch.lerp(highest, self.peak, PEAK_MEMORY)
         frames = data.select("action", "action_log_prob").update(inputs)
+        frames["calm"] = time_to_contact(data["observation"]) > TIMES[-1]
         frames["advantage"] = (advantage - advantage.mean()) / advantage.std().clamp(min=1e-6)
         frames["value_target"] = self.returns.normalize(target)
         kept = (size >= least * self.peak)[..., 0]
@@ -201,13 +203,16 @@ class Learner:
 
 
 def gentle_loss(network: ActorNetwork, frames: TensorDictBase) -> Tensor:
-    """Mean |acceleration| [] in units of 4 m/s^2 of the actor's most central actions in frames [M] (`seen`, `offset`).
+    """Mean |acceleration| [] in units of 4 m/s^2 of the actor's most central actions in those of frames [M] (`seen`,
+    `offset`) that are `calm` [M]: no contact is in sight. Whoever is about to be hit may brake or accelerate as hard
+    as it helps.
 
     A price on what the policy means to do, not on what exploration makes of it: under a standard deviation above 1
     m/s^2 the price of the action itself (`sim.reward.acceleration`) hardly tells small accelerations from none.
     """
     loc, _ = network.head(frames["seen"], frames["offset"])
-    return (network.middle[0] + network.reach[0] * loc[..., 0].tanh()).abs().mean() / 4
+    acceleration = network.middle[0] + network.reach[0] * loc[..., 0].tanh()
+    return (acceleration.abs() * frames["calm"]).sum() / frames["calm"].sum().clamp(min=1) / 4
 
 
 def take_step(optimiser: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:

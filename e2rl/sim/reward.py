@@ -8,12 +8,12 @@ from torch import Tensor
 from e2rl.errors import InputError
 
 DEFAULT_WEIGHTS = {
-    "progress": 0.045,
+    "progress": 0.1,
     "contact": -20.0,
     "fault": -15.0,
     "off_road": -20.0,
     "comfort": -0.08,
-    "acceleration": -0.25,
+    "acceleration": -0.1,
     "speeding": -0.1,
     "lane_offset": -0.02,
 }

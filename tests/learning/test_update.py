@@ -106,10 +106,20 @@ def test_a_gentle_learner_means_to_accelerate_less():
         row = learner.update(data)
         assert ("loss_gentle" in row) == (gentle > 0)
         meant[gentle] = ego.network.network.deterministic(data["observation"])[..., 0].abs().mean().item()
-        if gentle > 0:
-            frames = TensorDict(ego.network.prepared(data["observation"]), data.shape)
-            assert gentle_loss(ego.network.network, frames).item() == pytest.approx(meant[gentle] / 4, rel=1e-4)
     assert meant[5.0] < 0.9 * meant[0.0]
+
+
+def test_gentleness_is_asked_of_calm_frames_alone():
+    """Who is about to be hit may brake or accelerate as hard as it helps."""
+    torch.manual_seed(0)
+    ego = ActorEgo(hidden=(16,))
+    data = batch_of(ego)
+    meant = ego.network.network.deterministic(data["observation"])[..., 0].abs()
+    inputs = TensorDict(ego.network.prepared(data["observation"]), data.shape)
+    for calm in (torch.rand(data.shape) < 0.5, torch.ones(data.shape, dtype=torch.bool)):
+        found = gentle_loss(ego.network.network, inputs.set("calm", calm)).item()
+        assert found == pytest.approx(meant[calm].mean().item() / 4, rel=1e-4)
+    assert gentle_loss(ego.network.network, inputs.set("calm", torch.zeros_like(calm))).item() == 0
 
 
 def test_the_first_updates_fit_the_critic_alone():
