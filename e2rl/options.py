@@ -93,7 +93,7 @@ def mistyped(name: str, arguments: Sequence[str]) -> list[str]:
     if any(_further(arguments)) or any(argument.startswith("hydra.searchpath") for argument in arguments):
         return []
     given = [option for option in _options(arguments) if not option[0]]
-    groups = _groups()
+    groups = _groups(name)
     chosen = [f"{key}={value}" for _, key, value in given if key in groups and value in (*choices(key), "null")]
     keys = list(_keys(OmegaConf.to_container(load_config(name, chosen))))
     wrong = []
@@ -112,7 +112,7 @@ def added_by_mistake(name: str, arguments: Sequence[str]) -> list[str]:
     added = [key for plus, key, _ in _options(arguments) if plus and "." not in key and "/" not in key]
     if not added:
         return []
-    known = [*_content(conf_folder() / f"{name}.yaml"), *_groups()]
+    known = [*_content(conf_folder() / f"{name}.yaml"), *_groups(name)]
     return [_told(key, key, known) for key in added if key not in known and get_close_matches(key, known, 1, ALIKE)]
 
 
@@ -130,8 +130,10 @@ def _options(arguments: Sequence[str]) -> list[tuple[str, str, str]]:
     return [part for part in parts if not part[1].startswith(("hydra.", "hydra/", "-"))]
 
 
-def _groups() -> list[str]:
-    return [folder.name for folder in conf_folder().iterdir() if folder.is_dir()]
+def _groups(name: str) -> list[str]:
+    """The groups that a script's configuration chooses from."""
+    entries = _content(conf_folder() / f"{name}.yaml")["defaults"]
+    return [group for entry in entries if isinstance(entry, dict) for group in entry]
 
 
 def _keys(config: Any, prefix: str = "") -> Iterator[str]:

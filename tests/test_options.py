@@ -15,6 +15,9 @@ MISTYPED = [
     ("evaluate", ["ego=lanegraph"], "ego=lanegraph: there is no such option; the nearest is lane_graph"),
     ("train", ["curriculum=adaptiv", "rounds=2"], "the nearest is adaptive"),
     ("train", ["learner.ppo.gentl=1"], "the nearest is learner.ppo.gentle"),
+    ("train", ["experiment=table1"], "experiment: there is no such option"),  # a group of evaluate.py alone
+    ("evaluate", ["curriculum=linear"], "curriculum: there is no such option"),
+    ("train", ["recipe=hardn"], "the nearest is harden"),
 ]
 
 

@@ -3,7 +3,7 @@
 import pytest
 from omegaconf import open_dict
 
-from e2rl.build import build_ego, load_config
+from e2rl.build import build_ego, choices, load_config
 from e2rl.errors import InputError
 from e2rl.learning.build import build_evolution, build_logger, run_imitation
 from e2rl.learning.checkpoint import load_checkpoint, save_checkpoint
@@ -66,6 +66,12 @@ def test_policy_learner(curriculum):
     run = built(config_of(f"curriculum={curriculum}", *FULL_ONLY.get(curriculum, []), *POLICY))
     assert isinstance(run.improve, PolicyImprovement) and type(run.curriculum) is CURRICULA[curriculum]
     assert run.run_round()["train/expert_pairs"] > 0
+
+
+def test_a_recipe_is_of_options_that_exist():
+    for recipe in choices("recipe"):
+        run = built(config_of(f"recipe={recipe}", *FULL_ONLY["bandit"], *POLICY))
+        assert isinstance(run.improve, PolicyImprovement) and run.improve.teacher is not None
 
 
 def test_planner_learner():

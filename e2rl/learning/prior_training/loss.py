@@ -77,7 +77,7 @@ def loss_weight(batch: TensorDictBase, drawn: TensorDictBase) -> Tensor:
 
 
 class DenoisingLoss(nn.Module):
-    """The denoiser's loss as a module, so that DistributedDataParallel and torch.compile can wrap it."""
+    """The denoiser's loss as a module, so that torch.compile can wrap it."""
 
     def __init__(self, denoiser: Denoiser, settings: TrainingSettings):
         super().__init__()

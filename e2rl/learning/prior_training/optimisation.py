@@ -50,7 +50,8 @@ class PriorTraining:
         prior.denoiser.node_mean.copy_(nodes.mean(0))
         prior.denoiser.node_std.copy_(torch.where(std < 1e-6, CONSTANT_STD, std.clamp(min=MIN_STD)))
         self.rows = [rows for rows in (causal.nonzero()[:, 0], (~causal).nonzero()[:, 0]) if len(rows)]
-        loss = processes.data_parallel(DenoisingLoss(prior.denoiser, settings))
+        processes.share(prior.denoiser)
+        loss = DenoisingLoss(prior.denoiser, settings)
         self.loss = torch.compile(loss) if settings.compile else loss
         self.optimiser = torch.optim.AdamW(
             prior.denoiser.parameters(), settings.learning_rate, weight_decay=settings.weight_decay, fused=True
@@ -96,6 +97,7 @@ class PriorTraining:
             group["lr"] = self.learning_rate()
         self.optimiser.zero_grad()
         loss.backward()
+        self.processes.average_gradients(self.prior.denoiser)
         torch.nn.utils.clip_grad_norm_(self.prior.denoiser.parameters(), 1.0)
         self.optimiser.step()
         self.step += 1

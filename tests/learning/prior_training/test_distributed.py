@@ -80,8 +80,10 @@ def _work(rank, folder, port):
             said = str(error)
         mean = processes.mean(torch.tensor([float(rank)]))
         order = processes.gather(rank), processes.from_leader(lambda: f"by {rank}")
+    threads = {name.read_text().strip() for name in Path("/proc/self/task").glob("*/comm")}
     torch.save(
         {
+            "threads": threads,
             "average": whole.average.state_dict(),
             "weights": dict(whole.prior.denoiser.state_dict()),
             "mean": mean.item(),
@@ -147,11 +149,17 @@ def test_the_leader_speaks_for_all(ranks):
     assert ranks[0]["overrides"] == [] and "hydra.output_subdir=null" in ranks[1]["overrides"]
 
 
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are listed where there is /proc")
+def test_no_thread_outlives_the_group(ranks):
+    """Those of gloo would run into the interpreter's end."""
+    for rank in ranks:
+        assert rank["threads"] and not any("gloo" in name for name in rank["threads"])
+
+
 def test_alone_nothing_is_communicated():
     value = torch.ones(2)
     assert torch.equal(ALONE.mean(value), value) and ALONE.gather(3) == [3] and ALONE.from_leader(lambda: 4) == 4
-    module = torch.nn.Linear(1, 1)
-    assert ALONE.data_parallel(module) is module and ALONE.leader
+    assert ALONE.leader
     with process_group("cpu") as alone:
         assert alone == (ALONE, "cpu")
 
