@@ -21,7 +21,7 @@ from e2rl.ray_workers import RayWorkers
 from e2rl.settings import check_choice, check_range
 from e2rl.traffic.pool import TrafficPool
 
-NOMINAL, TRAFFIC = ("prior", "log", "none"), ("replay", "live")
+NOMINAL, TRAFFIC, AGAINST = ("prior", "log", "none"), ("replay", "live"), ("current", "start")
 NOISES = 16  # rows per scene in live traffic, each with its own noise
 
 
@@ -32,6 +32,7 @@ class RoundSettings:
     scenes: int = 48
     nominal: str = "prior"
     traffic: str = "replay"
+    against: str = "current"
     memory: int = 4096
     fresh: float = 3.0
     ahead: bool = False
@@ -41,10 +42,13 @@ class RoundSettings:
     def __post_init__(self) -> None:
         check_choice("learner.round.nominal", self.nominal, NOMINAL)
         check_choice("learner.round.traffic", self.traffic, TRAFFIC)
+        check_choice("learner.round.against", self.against, AGAINST)
         check_range("learner.round.fresh", self.fresh, 1)
         check_range("learner.round.second_share", self.second_share, 0, 1)
         if self.second and self.traffic == "live":
             raise InputError("learner.round.second: live traffic is of one method; set learner.round.traffic=replay")
+        if self.against == "start" and self.traffic == "live":
+            raise InputError("learner.round.against=start: live traffic meets the learning policy; set it to current")
 
 
 @dataclass
@@ -92,6 +96,7 @@ class Evolution:
         self.curriculum, self.improve, self.synthesize = curriculum, improve, synthesize
         self.settings, self.seed, self.solvable = settings, seed, solvable
         self.memory, self.batch, self.workers = memory or Memory(None, settings.memory), batch, workers
+        self._start = copy.deepcopy(improve.ego) if settings.against == "start" else None
         self.episodes: Episodes | None = None
         self.choices: list[Choice] = []
         self.ended: list[dict] = []
@@ -140,7 +145,8 @@ class Evolution:
     def _order(self, number: int) -> Order:
         """What is to be synthesized for a round, as the curriculum and the ego are now."""
         scenes = self.curriculum.draw(self.settings.scenes)
-        ego = copy.deepcopy(self.ego) if self.settings.ahead else self.ego  # learning changes weights in place
+        ego = self._start or self.ego
+        ego = copy.deepcopy(ego) if self.settings.ahead else ego  # learning changes weights in place
         return Order(number, scenes, *self.curriculum.choices(scenes), self.seed * 1_000_003 + number, ego)
 
     def _begin_next(self) -> None:

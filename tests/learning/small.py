@@ -65,6 +65,7 @@ def small_run(
     folder=None,
     memory=4096,
     ahead=False,
+    against="current",
     **ppo,
 ):
     """live: a method that drives the traffic against the learning policy; expert: settings of what is cloned; folder:
@@ -83,6 +84,6 @@ def small_run(
         **(expert or {}),
     )
     traffic = "replay" if live is None else "live"
-    settings = RoundSettings(scenes=3, nominal=nominal, traffic=traffic, memory=memory, ahead=ahead)
+    settings = RoundSettings(scenes=3, nominal=nominal, traffic=traffic, against=against, memory=memory, ahead=ahead)
     curriculum = AdaptiveCurriculum(len(scenes), rounds, seed, spread=spread)
     return Evolution(curriculum, improve, brake_check(scenes), settings, seed, memory=Memory(folder, memory))

@@ -1,5 +1,6 @@
 """A round of Algorithm 1: against whom, in what, what changes, and what it reports."""
 
+import copy
 import math
 
 import pytest
@@ -35,6 +36,18 @@ def test_a_round_improves_moves_on_and_reports():
     assert all(isinstance(value, float) for value in metrics.values())
     run.run_round()
     assert asked[2][2] != asked[0][2], "another round, another seed"
+
+
+def test_a_data_set_made_once_meets_the_policy_that_the_run_began_with():
+    run, begun = small_run(against="start"), small_run().ego.network.weights()
+    attack, met = run.synthesize, []
+    run.synthesize = lambda ego, *given: met.append(copy.deepcopy(ego.network.weights())) or attack(ego, *given)
+    for _ in range(2):
+        run.run_round()
+    assert any(not torch.equal(value, begun[key]) for key, value in run.ego.network.weights().items())
+    assert all(torch.equal(value, begun[key]) for weights in met for key, value in weights.items())
+    with pytest.raises(InputError, match=r"against=start"):
+        RoundSettings(against="start", traffic="live")
 
 
 def test_templates_are_given_to_the_attack_only_where_one_is_not_full():
@@ -78,6 +91,8 @@ def test_nominal_traffic_may_be_the_log_or_missing():
         RoundSettings(nominal="zero")
     with pytest.raises(InputError, match="traffic=dead"):
         RoundSettings(traffic="dead")
+    with pytest.raises(InputError, match="against=both"):
+        RoundSettings(against="both")
     with pytest.raises(InputError, match=r"learner\.round\.fresh"):
         RoundSettings(fresh=0.5)
 
