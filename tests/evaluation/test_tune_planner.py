@@ -145,5 +145,5 @@ def test_every_planner_s_ranges_hold_its_present_values():
     assert set(spaces) == {"lane_graph", "sampling", "bits"}
     for name, space in spaces.items():
         present = build.load_choice("ego", name)
-        for parameter, (low, high) in space.items():
+        for parameter, (low, high, *_) in space.items():
             assert low <= present[parameter] <= high, f"{name}.{parameter}"
