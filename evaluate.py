@@ -110,18 +110,18 @@ def references(config: DictConfig) -> tuple[str, ...] | None:
     """The methods that all are compared with; None: each with every other."""
     if config.compare is None and config.figure != "curves":
         return None
-    return (NOMINAL,) if config.compare is None else (config.compare, NOMINAL)
+    return (*build.compare_names(config), NOMINAL)
 
 
 def compared_tables(
     config: DictConfig, methods: list[Method], egos: EgoSet | None, rows: list[dict], caption: str, folder: Path
 ) -> list[Table]:
     """The tables with a row a method, or where there are several egos a row an ego; also as files of their own."""
+    others = build.compare_names(config) or [NOMINAL]
     if egos:
-        tables = planner_tables(rows, egos.names, config.compare, caption, config.metrics)
+        tables = planner_tables(rows, egos.names, others[0], caption, config.metrics)
     else:
-        reference = config.compare or NOMINAL
-        tables = method_tables(rows, build.terms_by_method(methods), reference, caption, config.metrics)
+        tables = method_tables(rows, build.terms_by_method(methods), others, caption, config.metrics)
     save_compared(folder, tables, EGOS if egos else METHODS)
     return tables
 

@@ -259,20 +259,31 @@ def check_evaluation(config: DictConfig) -> None:
         raise InputError(f"figure={config.figure}, eta={config.eta}: name several intensities, such as eta=[0,1,2,3]")
 
 
+def compare_names(config: DictConfig) -> list[str]:
+    """The names of `config.compare`: none, one or several."""
+    if config.compare is None:
+        return []
+    return [config.compare] if isinstance(config.compare, str) else list(map(str, config.compare))
+
+
 def check_compared(config: DictConfig) -> None:
-    """InputError where `config.compare` is no row: of `egos` where there are any, else a method of one intensity."""
+    """InputError where a name of `config.compare` is no row: of `egos` where there are any, else a method of one
+    intensity."""
     if config.compare is None:
         return
+    where, names = f"compare={config.compare}", compare_names(config)
     if config.egos:
         if config.policy_learning is not None:
-            raise InputError(f"compare={config.compare}: policy_learning has tables of its own; leave one of the two")
-        if config.compare not in config.egos:
-            raise InputError(f"compare={config.compare}: none of egos ({', '.join(map(str, config.egos))}); name one")
+            raise InputError(f"{where}: policy_learning has tables of its own; leave one of the two")
+        if len(names) != 1 or names[0] not in config.egos:
+            raise InputError(f"{where}: expected one of egos, {', '.join(map(str, config.egos))}")
         return
-    if config.compare not in (*config.methods, *config.variants):
-        raise InputError(f"compare={config.compare}: no row of this name; add it to methods")
+    if unknown := [name for name in names if name not in (*config.methods, *config.variants)]:
+        raise InputError(f"{where}: no row of the name {unknown[0]}; add it to methods")
+    if not names:
+        raise InputError(f"{where}: name the methods that all are compared with, or null")
     if len(intensities(config)) > 1:
-        raise InputError(f"compare={config.compare}: a table with a row a method has one eta; name one")
+        raise InputError(f"{where}: a table with a row a method has one eta; name one")
 
 
 def processes_of(config: DictConfig) -> Processes:

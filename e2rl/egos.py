@@ -10,7 +10,7 @@ import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from e2rl.build import build_ego, load_choice
+from e2rl.build import build_ego, compare_names, load_choice
 from e2rl.ego.base import Ego
 from e2rl.errors import InputError
 from e2rl.evaluation.egos import EgoSet
@@ -99,7 +99,7 @@ def compared(config: DictConfig) -> list[tuple[str, str]]:
     without `policy_learning` each ego with `compare`, or with the first."""
     names = [str(name) for name in config.egos]
     if config.policy_learning is None:
-        reference = names[0] if config.compare is None else config.compare
+        reference = names[0] if config.compare is None else compare_names(config)[0]
         return [(name, reference) for name in names if name != reference]
     for role in ROLES:
         given = config.policy_learning.get(role)

@@ -269,7 +269,16 @@ def test_table_1_has_every_rival_on_both_terms():
         assert ours[f"{name}, our terms"] == ("predicted", "" if name == "ctg" else "full")
 
 
-@pytest.mark.parametrize("more", [["compare=ctg"], ["compare=e2", "eta=[1,2]"], ["compare=e2", "+egos.a={ego: idm}"]])
+@pytest.mark.parametrize(
+    "more",
+    [
+        ["compare=ctg"],
+        ["compare=[e2,ctg]"],
+        ["compare=[]"],
+        ["compare=e2", "eta=[1,2]"],
+        ["compare=e2", "+egos.a={ego: idm}"],
+    ],
+)
 def test_a_table_of_methods_needs_its_reference_and_one_eta_and_ego(more):
     with pytest.raises(InputError, match="compare="):
         methods_of(*more)

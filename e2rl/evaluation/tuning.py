@@ -95,7 +95,7 @@ def tune(
 
 def ladder(present: Parameters, space: Mapping[str, Sequence], count: int) -> list[Parameters]:
     """The present parameters with `count` values of the space's first one, evenly spaced over its range, both ends
-    included (on its scale)."""
+    included (on its scale); without the present value itself, which is the first trial."""
     name, (low, high, *scale) = next(iter(space.items()))
     ends = (math.log(low), math.log(high)) if scale else (low, high)
     shares = [step / max(count - 1, 1) for step in range(count)]
@@ -103,7 +103,8 @@ def ladder(present: Parameters, space: Mapping[str, Sequence], count: int) -> li
     values = [min(max(math.exp(value) if scale else value, low), high) for value in values]
     if isinstance(low, int) and isinstance(high, int) and not scale:
         values = [round(value) for value in values]
-    return [{each: present[each] for each in space} | {name: value} for value in values]
+    others = [value for value in values if not math.isclose(value, present[name], rel_tol=1e-9)]
+    return [{each: present[each] for each in space} | {name: value} for value in others]
 
 
 def save(done: Sequence, folder: Path) -> dict:

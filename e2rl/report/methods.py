@@ -10,34 +10,36 @@ from e2rl.report.tables import UNKNOWN, Table, column_names, counts, difference_
 
 Terms = Mapping[str, tuple[str, str]]  # by method: what it knows of the ego and owes it, "" for nothing to say
 METHODS, EGOS = "methods", "egos"  # tables of the catalogue, and names of the files
+MEANS = "Mean [95% interval, bootstrap by location or scene]; (n) rollouts where fewer count."
 
 
 class Line(NamedTuple):
-    """A row of a table: its first cells, its row of metrics.json, its paired differences to the reference if any."""
+    """A row of a table: its first cells, and its row of metrics.json."""
 
     labels: list[str]
     row: dict
-    paired: Mapping[str, dict] | None
 
 
 def method_tables(
-    rows: Sequence[dict], terms: Terms, reference: str, settings: str = "", table: str = METHODS
+    rows: Sequence[dict], terms: Terms, references: Sequence[str], settings: str = "", table: str = METHODS
 ) -> list[Table]:
     """Means and paired differences of the closed-loop rows of metrics.json: a row a method, a column a metric.
 
-    reference: method that each is compared with; it must be among the rows. settings: for the captions; table: of
+    references: methods that each is compared with; they must be among the rows. settings: for the captions; table: of
     `catalogue.TABLES`, whose metrics are the columns, but for those that no row knows.
     """
     group = closed_loop(rows)
     names = column_names(group)
-    lines = [
-        Line([name, *terms_of(row["method"], terms)], row, row["paired"].get(reference))
-        for name, row in zip(names, group, strict=True)
-    ]
+    lines = [Line([name, *terms_of(row["method"], terms)], row) for name, row in zip(names, group, strict=True)]
     text = f"{origin(group[0])}. {counts(group, names)}"
-    note = "Knowledge: the ego's plan, or its motion predicted; duty: what adversaries owe the ego."
-    difference = f"Difference of each method to {reference}"
-    return two_tables("Methods", ["method", "knowledge", "duty"], lines, table, (text, note, difference), settings)
+    note = f"Knowledge: the ego's plan, or its motion predicted; duty: what adversaries owe the ego. {settings}"
+    head, others = ["method", "knowledge", "duty"], {name: name for name in references}
+    return [
+        means_table("Methods", head, lines, table, f"{text} {MEANS} {note}"),
+        *differences_table(
+            head, lines, table, f"{text} Difference of each method to {' and to '.join(references)}", others
+        ),
+    ]
 
 
 def planner_tables(
@@ -49,33 +51,37 @@ def planner_tables(
     for name in names:
         own = [row for row in closed_loop(rows) if row["ego"] == name]
         for traffic, row in zip(column_names(own), own, strict=True):
-            lines.append(Line([name, traffic], row, row["paired"].get(f"ego {reference}")))
+            lines.append(Line([name, traffic], row))
     first, labels = lines[0].row, [f"{ego} under {traffic}" for (ego, traffic), *_ in lines]
     text = f"{first['dataset']}/{first['split']}. {counts([line.row for line in lines], labels, 'ego and traffic')}"
-    difference = f"Difference of each ego to {reference} in the same traffic"
-    return two_tables("Egos", ["ego", "traffic"], lines, table, (text, "", difference), settings)
+    head, difference = ["ego", "traffic"], f"{text} Difference of each ego to {reference} in the same traffic"
+    return [
+        means_table("Egos", head, lines, table, f"{text} {MEANS} {settings}"),
+        *differences_table(head, lines, table, difference, {reference: f"ego {reference}"}),
+    ]
 
 
-def two_tables(
-    title: str, head: list[str], lines: Sequence[Line], table: str, texts: tuple[str, str, str], settings: str
-) -> list[Table]:
-    """The means of all lines, and the differences of those that have some. texts: what was run, a note on the means,
-    what the differences are of."""
-    run, note, difference = texts
+def means_table(title: str, head: list[str], lines: Sequence[Line], table: str, caption: str) -> Table:
     metrics = known_metrics([line.row for line in lines], table)
-    means = [[*line.labels, *(mean_cell(metric, line.row) for metric in metrics)] for line in lines]
-    caption = f"{run} Mean [95% interval, bootstrap by location or scene]; (n) rollouts where fewer count. {note}"
-    caption = f"{caption.rstrip()} {settings.rstrip('.')}." if settings else caption.rstrip()
-    tables = [Table(caption, [*head, *map(heading, metrics)], means, title)]
-    compared = [(line.labels, line.paired) for line in lines if line.paired]
-    if compared:
-        cells = [
-            [*labels, *(difference_cell(metric, paired.get(metric.name)) for metric in metrics)]
-            for labels, paired in compared
-        ]
-        caption = f"{run} {difference} [95% interval], paired by (scene, seed); * the interval leaves out 0."
-        tables.append(Table(caption, [*head, *(heading(metric, points=True) for metric in metrics)], cells))
-    return tables
+    cells = [[*line.labels, *(mean_cell(metric, line.row) for metric in metrics)] for line in lines]
+    return Table(f"{caption.strip().rstrip('.')}.", [*head, *map(heading, metrics)], cells, title)
+
+
+def differences_table(
+    head: list[str], lines: Sequence[Line], table: str, caption: str, references: Mapping[str, str]
+) -> list[Table]:
+    """The differences of the lines that have some, to one reference after the other; no table where none has.
+    references: {name: its key in a row's `paired`}."""
+    metrics = known_metrics([line.row for line in lines], table)
+    cells = [
+        [*line.labels, name, *(difference_cell(metric, line.row["paired"][key].get(metric.name)) for metric in metrics)]
+        for name, key in references.items()
+        for line in lines
+        if key in line.row["paired"]
+    ]
+    caption = f"{caption} [95% interval], paired by (scene, seed); * the interval leaves out 0."
+    heads = [*head, "minus", *(heading(metric, points=True) for metric in metrics)]
+    return [Table(caption, heads, cells)] if cells else []
 
 
 def closed_loop(rows: Sequence[dict]) -> list[dict]:

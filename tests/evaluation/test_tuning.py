@@ -90,9 +90,16 @@ def test_a_ladder_is_even_on_its_scale_and_leaves_the_others_as_they_are():
     rungs = ladder(PRESENT, space, 5)
     assert [rung["speed"] for rung in rungs] == pytest.approx([0.5, 1, 2, 4, 8])
     assert {rung["caution"] for rung in rungs} == {PRESENT["caution"]}
-    assert [rung["speed"] for rung in ladder(PRESENT, SPACE, 3)] == [0.0, 10.0, 20.0]
+    assert [rung["speed"] for rung in ladder(PRESENT, SPACE, 2)] == [0.0, 20.0]
     assert ladder(PRESENT, {"speed": [1, 4]}, 4) == [{"speed": value} for value in (1, 2, 3, 4)]
     assert ladder(PRESENT, space, 0) == []
+
+
+def test_a_ladder_does_not_try_the_present_value_again():
+    """On a linear and on a logarithmic scale, where the middle of a range is not met to the last bit."""
+    assert [rung["speed"] for rung in ladder(PRESENT, SPACE, 3)] == [0.0, 20.0]
+    rungs = ladder(PRESENT, {"speed": [10 / 7.3, 10 * 7.3, "log"]}, 3)
+    assert [rung["speed"] for rung in rungs] == pytest.approx([10 / 7.3, 73])
 
 
 def test_the_ladder_comes_first_and_counts_as_trials(tmp_path):

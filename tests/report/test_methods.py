@@ -21,7 +21,9 @@ def tables():
         rows, samples = score_rollouts(random_rollouts(6, seed=number))
         labelled += label_rows(rows, Source("synthetic", "test", name, "idm"))
         features += samples
-    return method_tables(metric_rows(labelled, features, draws=50, realism_draws=5), TERMS, "e2", "The bundled prior.")
+    return method_tables(
+        metric_rows(labelled, features, draws=50, realism_draws=5), TERMS, ["e2", "replay"], "The bundled prior."
+    )
 
 
 def test_every_method_has_a_row_with_its_terms_and_its_cost(tables):
@@ -36,11 +38,16 @@ def test_every_method_has_a_row_with_its_terms_and_its_cost(tables):
     assert "The bundled prior." in means.caption and "6 rollouts per method" in means.caption
 
 
-def test_differences_are_paired_to_the_reference(tables):
+def test_differences_are_paired_to_each_reference(tables):
+    """A difference to the one is the opposite of the difference from it."""
     means, differences = tables
-    assert [row[0] for row in differences.rows] == ["ctg_adv η=2", "replay η=2"]
-    assert "Difference of each method to e2" in differences.caption and "cfr [points]" in differences.head
-    assert len(differences.head) == len(means.head)
+    cfr = differences.head.index("cfr [points]")
+    there, back = (differences.rows[place][cfr].split(" ")[0] for place in (1, 2))
+    assert float(there) == -float(back) != 0
+    pairs = [(row[0], row[3]) for row in differences.rows]
+    assert pairs == [("ctg_adv η=2", "e2"), ("replay η=2", "e2"), ("e2 η=2", "replay"), ("ctg_adv η=2", "replay")]
+    assert "Difference of each method to e2 and to replay" in differences.caption and "cfr [points]" in differences.head
+    assert len(differences.head) == len(means.head) + 1
 
 
 def test_they_are_written_in_three_formats(tables, tmp_path):
@@ -52,7 +59,8 @@ def test_they_are_written_in_three_formats(tables, tmp_path):
     latex = (tmp_path / "methods.tex").read_text()
     assert latex.count(r"\begin{tabular}") == latex.count(r"\bottomrule") == 2
     body = [line for line in latex.splitlines() if line.endswith(r"\\")]
-    assert len(body) == 2 + 3 + 2 and {line.count(" & ") for line in body} == {len(tables[0].head) - 1}
+    assert len(body) == 2 + 3 + 4
+    assert {line.count(" & ") for line in body} == {len(table.head) - 1 for table in tables}
     assert r"cfr [\%]" in latex and r"seconds\_per\_rollout" in latex and r"$\eta$" in latex
 
 
