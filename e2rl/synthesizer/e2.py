@@ -249,7 +249,10 @@ class E2(NominalTraffic):
         if bool(skeleton.far.any()):  # otherwise everybody meets the ego, as just proposed
             anchor = self._propose(skeleton, state, world, ego_plan)
         # Infeasible configurations are pruned (Sec. IV-A3): members without a proposal, and whoever acts through them.
-        acts = skeleton.coalition & anchor.feasible & (state.eta > 0)[:, None]
+        members = skeleton.coalition & (state.eta > 0)[:, None]
+        acts = members & anchor.feasible
+        if self.skeleton.pursuit:  # where nobody can meet its target yet, V_adv alone brings them nearer
+            acts = torch.where(acts.any(1, keepdim=True), acts, members)
         for _ in range(self.skeleton.max_chain - 1):
             acts = acts & ((skeleton.target <= 0) | acts.gather(1, skeleton.target.clamp(min=0)))
         state = replace(state, coalition=acts, target=torch.where(acts, skeleton.target, -1))

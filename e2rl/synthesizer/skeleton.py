@@ -33,6 +33,7 @@ class SkeletonSettings:
     horizon: float = 5.0
     step: float = 0.5
     corridor: float = 2.5
+    pursuit: bool = False
 
     def __post_init__(self) -> None:
         for name, low in (("near", 1), ("far", 0), ("max_chain", 1), ("step", 0.1), ("horizon", self.step)):
@@ -210,7 +211,8 @@ def build_skeleton(
 
     expected [B, V, K, 4]: states of everybody every `step` s from now; cost [B, V]: of meeting the ego, inf for
     vehicles that cannot; limits: the most near and far agents [B], by default the settings'. The near agents are those
-    of S with the least cost; where S has none, those of F; where F has none either, nobody.
+    of S with the least cost; where S has none, those of F; where F has none either, nobody, or with `pursuit` the
+    nearest of S, or of F where S is empty.
     """
     most_near, most_far = (settings.near, settings.far) if limits is None else limits
     vehicles = support.shape[1]
@@ -222,6 +224,9 @@ def build_skeleton(
     first, second = (mask & cost.isfinite() for mask in (support, feasible))
     source = torch.where(first.any(1), SUPPORTED, torch.where(second.any(1), NEAREST_FEASIBLE, NOBODY))
     near = smallest(torch.where(first.any(1, keepdim=True), first, second), cost, most_near)
+    if settings.pursuit:
+        nearest = smallest(torch.where(support.any(1, keepdim=True), support, feasible), distance, most_near)
+        near = torch.where(near.any(1, keepdim=True), near, nearest)
     index, present = compact(support | near)
     distant = support & ~near & (distance > settings.tau_dist) & (distance <= settings.max_dist)
     distant = present & take(distant, index)

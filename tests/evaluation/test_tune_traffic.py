@@ -18,7 +18,7 @@ from e2rl.tuning import changed, flat, run_tuning, tuning_of
 from tests.prior.small import small_prior
 from tests.synthesizer.traffic_scenes import EGO, scenes
 
-ATTACKS = ("e2", "e2_unbound", "ctg_adv", "safe_sim_opt", "ccdiff", "diffscene", "cat", "strive")
+ATTACKS = ("e2", "e2_unbound", "e2_pursuit", "ctg_adv", "safe_sim_opt", "ccdiff", "diffscene", "cat", "strive")
 
 
 def attack(parameters):

@@ -92,6 +92,20 @@ def test_an_empty_support_falls_back_to_the_nearest_feasible_then_to_nobody():
     assert result.counts() == {"supported": 1, "nearest_feasible": 1, "nobody": 1, "chains": 0}
 
 
+def test_pursuit_takes_the_nearest_of_the_support_where_nobody_can_meet_the_ego():
+    """Of S, or of F where S is empty, by distance; scenes in which somebody can are as without it."""
+    world = make_world([EGO, (40.0, -30.0, UP, 8.0), (12.0, 3.5, 0.0, 10.0), (20.0, 3.5, 0.0, 9.0)], copies=3)
+    support, feasible = mask(world, 1, 2), mask(world, 1, 2, 3)
+    support[1] = False
+    cost = torch.full(support.shape, torch.inf)
+    cost[2, 1] = 1.0
+    chosen = [
+        skeleton_of(world, support, feasible, cost, near=1, far=0, pursuit=pursuit).coalition.nonzero().tolist()
+        for pursuit in (False, True)
+    ]
+    assert chosen == [[[2, 1]], [[0, 2], [1, 2], [2, 1]]]
+
+
 def test_every_link_leads_to_the_ego_and_absent_vehicles_take_no_part():
     generator = torch.Generator().manual_seed(0)
     chains = 0
