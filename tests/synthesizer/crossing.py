@@ -53,12 +53,12 @@ def mask(world: World, *vehicles: int) -> torch.Tensor:
 
 
 def skeleton_of(
-    world: World, support: torch.Tensor, feasible: torch.Tensor | None = None, limits=None, **settings
+    world: World, support: torch.Tensor, feasible: torch.Tensor | None = None, limits=None, cost=None, **settings
 ) -> Skeleton:
-    """The skeleton if everybody keeps its speed and the nearest vehicles act on the ego."""
+    """The skeleton if everybody keeps its speed; cost: of meeting the ego, by default the distance to it."""
     chosen = SkeletonSettings(**settings)
     times = chosen.step * torch.arange(1, 11)
     distance = (world.states[:, : support.shape[1], :2] - world.states[:, :1, :2]).norm(dim=-1)
     expected = constant_speed_states(world.scene, world, times)
     feasible = support if feasible is None else feasible
-    return build_skeleton(world.scene, world, support, feasible, chosen, expected, distance, limits)
+    return build_skeleton(world.scene, world, support, feasible, chosen, expected, distance if cost is None else cost, limits)

@@ -62,6 +62,22 @@ def test_a_chain_over_a_pruned_member_is_pruned(monkeypatch):
     assert state.coalition.nonzero()[:, 1].tolist() == [3] and state.target[0].max() == 0
 
 
+def test_pursuit_draws_vehicles_where_nobody_has_a_proposal(monkeypatch):
+    """Without it nobody takes part then, and the plans are the prior's; with it V_adv alone moves the coalition."""
+    scene, propose = scenes(3).scenes, e2.propose
+
+    def nothing(*arguments, **options):
+        anchor = propose(*arguments, **options)
+        return replace(anchor, feasible=anchor.feasible & False, cost=anchor.cost + torch.inf)
+
+    monkeypatch.setattr(e2, "propose", nothing)
+    for pursuit in (False, True):
+        on = synthesizer(skeleton={"pursuit": pursuit}, control={"adversarial_clip": 2.0})
+        state, plan = replanned(on, scene, 2.0)
+        assert state.coalition.any(1).tolist() == [pursuit] * 3
+        assert (plan.path_kl[state.coalition] > 0).all() and not state.anchor_jump.any()
+
+
 def test_without_feasibility_guidance_only_adversaries_leave_the_prior():
     _, plan = replanned(synthesizer(control={"feasibility": 0.0, "adversarial_clip": 0.5}), scenes(3).scenes, 2.0)
     assert (plan.path_kl[~plan.adversary] == 0).all() and (plan.path_kl[plan.adversary] > 0).all()

@@ -100,7 +100,7 @@ def test_pursuit_takes_the_nearest_of_the_support_where_nobody_can_meet_the_ego(
     cost = torch.full(support.shape, torch.inf)
     cost[2, 1] = 1.0
     chosen = [
-        skeleton_of(world, support, feasible, cost, near=1, far=0, pursuit=pursuit).coalition.nonzero().tolist()
+        skeleton_of(world, support, feasible, cost=cost, near=1, far=0, pursuit=pursuit).coalition.nonzero().tolist()
         for pursuit in (False, True)
     ]
     assert chosen == [[[2, 1]], [[0, 2], [1, 2], [2, 1]]]
