@@ -264,9 +264,11 @@ def test_table_1_has_every_rival_on_both_terms():
     rivals = {"ctg", "ctg_adv", "strive", "safe_sim_opt", "diffscene", "ccdiff", "cat"}
     known = build.terms_by_method(rows)
     assert rivals <= set(known) and all(known[name][0] == "plan" for name in rivals)
+    assert known["e2_pursuit"] == ("plan", "none")  # the rivals' terms
     ours = build.terms_by_method(methods_of("experiment=table1_our_terms"))
     for name in rivals:
         assert ours[f"{name}, our terms"] == ("predicted", "" if name == "ctg" else "full")
+    assert ours["e2_pursuit, our terms"] == ours["e2"] == ("predicted", "full")
 
 
 @pytest.mark.parametrize(

@@ -61,4 +61,6 @@ def skeleton_of(
     distance = (world.states[:, : support.shape[1], :2] - world.states[:, :1, :2]).norm(dim=-1)
     expected = constant_speed_states(world.scene, world, times)
     feasible = support if feasible is None else feasible
-    return build_skeleton(world.scene, world, support, feasible, chosen, expected, distance if cost is None else cost, limits)
+    return build_skeleton(
+        world.scene, world, support, feasible, chosen, expected, distance if cost is None else cost, limits
+    )
