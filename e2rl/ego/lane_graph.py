@@ -43,6 +43,7 @@ class LaneGraphEgo(Ego):
         use_limits: bool = True,
         obey_lights: bool = True,
         see_vrus: bool = True,
+        brake_if_unsafe: bool = False,
         replan_every: int = 5,
     ) -> None:
         """Fields: conf/ego/lane_graph.yaml."""
@@ -54,6 +55,7 @@ class LaneGraphEgo(Ego):
         self.match_distance, self.match_angle = match_distance, match_angle
         self.lateral_acceleration, self.braking = lateral_acceleration, braking
         self.use_limits, self.obey_lights, self.see_vrus = use_limits, obey_lights, see_vrus
+        self.brake_if_unsafe = brake_if_unsafe
 
     def plan(self, world: World) -> Tensor:
         """The chosen profile as states [B, PLAN_STEPS, 4]."""
@@ -109,11 +111,17 @@ class LaneGraphEgo(Ego):
 
     def choose(self, hazard: Tensor, driven: Tensor, matched: Tensor) -> Tensor:
         """Profile [B] by hazard [B, C] = -log(1 - probability of collision) and distance [B, C]: the longest below
-        max_risk (the shortest for an ego off its route with agents around), if none the least hazardous."""
+        max_risk (the shortest for an ego off its route with agents around), if none the least hazardous, or with
+        `brake_if_unsafe` the shortest.
+
+        The hazard adds up over the time in contact, so the least hazardous of profiles that all end in a contact is
+        often the fastest.
+        """
         allowed = hazard < -math.log1p(-self.max_risk)
         longest = matched | (hazard == 0).all(1)
         score = torch.where(longest[:, None], driven, -driven).masked_fill(~allowed, -torch.inf)
-        return torch.where(allowed.any(1), score.argmax(1), hazard.argmin(1))
+        unsafe = driven.argmin(1) if self.brake_if_unsafe else hazard.argmin(1)
+        return torch.where(allowed.any(1), score.argmax(1), unsafe)
 
 
 def targets(start: Tensor, top: Tensor, reach: float, count: int) -> Tensor:

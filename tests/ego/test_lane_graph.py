@@ -48,6 +48,19 @@ def test_off_its_route_it_prefers_the_shortest():
     assert ego.choose(hazard + 1, driven, torch.tensor([True])).item() == 1
 
 
+def test_without_a_safe_profile_it_takes_the_least_hazardous_or_the_shortest():
+    hazard, driven = torch.tensor([[3.0, 2.0, 4.0], [3.0, 0.01, 4.0]]), torch.tensor([[0.0, 40.0, 20.0]]).expand(2, 3)
+    matched = torch.tensor([True, True])
+    assert LaneGraphEgo().choose(hazard, driven, matched).tolist() == [1, 1]
+    assert LaneGraphEgo(brake_if_unsafe=True).choose(hazard, driven, matched).tolist() == [0, 1]
+
+
+def test_too_near_to_stop_the_least_hazardous_profile_rams_and_the_shortest_brakes():
+    _, world = world_of(vehicles=[(0.0, 0, 12.0), (16.0, 0, 0.0)], num_vrus=0)
+    assert LaneGraphEgo().plan(world)[0, 9, 3] > 14.0
+    assert LaneGraphEgo(brake_if_unsafe=True).plan(world)[0, 9, 3] < 9.0
+
+
 def test_plan_is_a_drivable_continuation():
     _, world = world_of(num_scenes=3, num_vehicles=6)
     plan = LaneGraphEgo().plan(world)
