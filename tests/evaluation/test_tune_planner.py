@@ -142,7 +142,7 @@ def test_the_configuration_builds_the_planner_under_trial(tmp_path):
 def test_every_planner_s_ranges_hold_its_present_values():
     """A trial of the present parameters is the planner of conf/ego."""
     spaces = OmegaConf.load(build.conf_folder() / "experiment" / "tune_planner.yaml").tuning.spaces
-    assert set(spaces) == {"lane_graph", "sampling", "bits"}
+    assert set(spaces) == {"lane_graph", "lane_graph_tuned", "sampling", "bits"}
     for name, space in spaces.items():
         present = build.load_choice("ego", name)
         for parameter, (low, high, *_) in space.items():
