@@ -209,7 +209,7 @@ def test_a_variant_of_impossible_temperature_says_so():
 
 def test_a_choice_is_its_file_and_an_unknown_one_lists_those_there_are():
     assert build.load_choice("synthesizer", "e2") == config_of("synthesizer=e2").synthesizer
-    names = "actor, bits, external, idm, lane_graph, policy_file, replay, sampling"
+    names = "actor, bits, external, idm, lane_graph, lane_graph_tuned, policy_file, replay, sampling"
     with pytest.raises(InputError, match=f"ego=taxi: none of {names}; add"):
         build.load_choice("ego", "taxi")
 
