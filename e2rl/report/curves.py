@@ -36,6 +36,7 @@ PANELS = (  # (horizontal, vertical): failures over realism, then the share of t
 )
 COLUMNS = ("cfr", "cfr_counted", "cfr_preventable", "real", "real_adv", "aor_step", "cfr_bg", "passes")
 OURS, NOMINAL = "e2", "nominal"
+APART = (0, 1, 2, 4, 5, 6, 7, 8, 9)  # colours of the cycle for the others: its red is too near to ours
 KEPT_ETA = 2.0  # intensity of the tables
 SIDE, RISE = 380, 330  # points: width and height of a panel
 NAME = "curves"
@@ -142,7 +143,7 @@ def curves_figure(points: Sequence[Point]) -> Figure:
 
 def colour_of(name: str, number: int) -> str:
     """A method's colour: ours and no attack stand out."""
-    return {OURS: drawing.ADVERSARY, NOMINAL: drawing.INK}.get(name, f"C{number % 10}")
+    return {OURS: drawing.ADVERSARY, NOMINAL: drawing.INK}.get(name, f"C{APART[number % len(APART)]}")
 
 
 def draw_curve(axes: Axes, points: Sequence[Point], across: str, up: str, colour: str) -> None:
