@@ -5,11 +5,13 @@ import json
 import math
 
 import pytest
+import torch
+from matplotlib.colors import to_rgb
 from PIL import Image
 
 from e2rl.errors import InputError
 from e2rl.evaluation.files import write_metrics
-from e2rl.report.curves import by_method, main, points_of_rows, points_of_tuning, read_points
+from e2rl.report.curves import by_method, colour_of, main, points_of_rows, points_of_tuning, read_points
 from tests.report.test_tuning import trial
 
 MEASURED = {"aor_step": 0.001, "cfr_bg": 0.02, "real": 0.9, "passes": 640.0}
@@ -97,3 +99,9 @@ def test_a_folder_of_neither_kind_is_named(tmp_path):
     (tuned / "tuning.json").write_text('{"best": null, "trials": []}')
     with pytest.raises(InputError, match="no tuning of an adversary; give the folder of a run of experiment=tune"):
         read_points(tuned)
+
+
+def test_no_rival_is_drawn_in_a_colour_near_ours():
+    ours = torch.tensor(to_rgb(colour_of("e2", 1)))
+    others = torch.tensor([to_rgb(colour_of(f"rival {number}", number)) for number in range(20)])
+    assert float((others - ours).norm(dim=-1).min()) > 0.25
