@@ -5,38 +5,44 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 
-from e2rl import build, provenance
-from e2rl.capacity import check_fits, evaluation_need
-from e2rl.egos import build_egos, curve_runs
-from e2rl.ending import ending
-from e2rl.evaluation.avoidable import search_effort
-from e2rl.evaluation.chains import LongestChain
-from e2rl.evaluation.egos import EgoSet, recorded_acceleration, run_egos, setups_of
-from e2rl.evaluation.files import METRICS_FILE, ROLLOUTS, write_metrics
-from e2rl.evaluation.kept import Kept
-from e2rl.evaluation.ladders import intensity_ladder
+from e2rl.evaluation import methods as build_objects
+from e2rl.evaluation import provenance
+from e2rl.evaluation.capacity import check_fits, evaluation_need
+from e2rl.evaluation.displacement_table import open_loop_rows
+from e2rl.evaluation.ego_set import EgoSet, build_egos, curve_runs, recorded_acceleration, run_egos, setups_of
+from e2rl.evaluation.meta_table import meta_rows
 from e2rl.evaluation.modes import MODES_FILE, read_modes
-from e2rl.evaluation.open_loop import open_loop_rows
 from e2rl.evaluation.protocol import Method, Setup, drive_all, run_protocol
-from e2rl.evaluation.realism_meta import meta_rows
-from e2rl.files import alone_in
-from e2rl.options import run_command
+from e2rl.evaluation.reproduce import compared_with_run, files_of_run, reproduction_of
+from e2rl.evaluation.resume import Run, resume_command, run_of
+from e2rl.evaluation.rollout_files import METRICS_FILE, ROLLOUTS, write_metrics
+from e2rl.evaluation.tuning_run import run_tuning, tuning_of
+from e2rl.metrics.evasion import search_effort
+from e2rl.report.comparison_tables import (
+    EGOS,
+    METHODS,
+    ego_tables,
+    guard_table,
+    method_tables,
+    planner_tables,
+    save_compared,
+)
 from e2rl.report.curves import points_of_rows, save_curves
 from e2rl.report.drawing import save_figure
-from e2rl.report.egos import ego_tables, guard_table
 from e2rl.report.html import report_command
-from e2rl.report.intensity import intensity_figure
-from e2rl.report.methods import EGOS, METHODS, method_tables, planner_tables, save_compared
-from e2rl.report.modes import mode_tables
+from e2rl.report.intensity import intensity_figure, intensity_ladder
+from e2rl.report.mode_table import mode_tables
 from e2rl.report.plots import collision_bars, learning_curves
-from e2rl.report.skeleton import skeleton_figure
+from e2rl.report.skeleton_figure import LongestChain, skeleton_figure
 from e2rl.report.tables import Table, metric_tables, print_tables, save_tables
-from e2rl.report.tuning import save_tuning_curve
-from e2rl.reproduce import compared_with_run, files_of_run, reproduction_of
-from e2rl.resume import Run, resume_command, run_of
-from e2rl.scene.scene import SceneSet
-from e2rl.scene.source import load_scenes
-from e2rl.tuning import run_tuning, tuning_of
+from e2rl.report.tuning_curve import save_tuning_curve
+from e2rl.run import config as build_config
+from e2rl.run.config import run_command
+from e2rl.run.files import alone_in
+from e2rl.run.parts import Kept
+from e2rl.run.processes import ending
+from e2rl.scenes.scene import SceneSet
+from e2rl.scenes.source import load_scenes
 
 MAY_CHANGE = ("processes", "launcher", "share")  # when a run is resumed
 NOMINAL = "nominal"  # traffic without an attack, which every attack is compared with
@@ -45,19 +51,21 @@ NOMINAL = "nominal"  # traffic without an attack, which every attack is compared
 def evaluate(run: Run) -> list[dict]:
     """Run the methods of a configuration and return the rows of metrics.json."""
     config, folder = run.config, run.folder
-    build.set_up(config)
-    build.check_evaluation(config)
+    build_config.set_up(config)
+    build_objects.check_evaluation(config)
     egos, task = build_egos(config), tuning_of(config)
-    prior, origin = build.build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
-    methods, name = build.build_methods(config, prior), run.choices["ego"]
-    name, ego = next(iter(egos.egos.items())) if egos else (name, build.build_ego(config))
-    sim = build.build_sim(config)
+    prior, origin = build_objects.build_prior(
+        config, config.device
+    )  # before the scenes, which take longer than a wrong path
+    methods, name = build_objects.build_methods(config, prior), run.choices["ego"]
+    name, ego = next(iter(egos.egos.items())) if egos else (name, build_objects.build_ego(config))
+    sim = build_objects.build_sim(config)
     scenes = load_scenes(config.data, config.num_scenes, scenes=config.scenes, files=files_of_run(config))
     only = None if config.scene is None else [scenes.index(config.scene)]
     provenance.begin_run(folder, config, MAY_CHANGE, {"scenes": scenes})
     kept = Kept(None if config.figure == "skeleton" else folder)  # that figure listens to every rollout
     setup = Setup(scenes, ego, name, sim, config.batch, config.device)
-    processes, count = build.processes_of(config), len(egos.egos) if egos else 1
+    processes, count = build_objects.processes_of(config), len(egos.egos) if egos else 1
     if str(config.device) == "cpu" and isinstance(processes, int):
         check_fits(evaluation_need(scenes, methods, len(config.seeds), count, config.batch, processes))
     if task is not None:
@@ -65,7 +73,7 @@ def evaluate(run: Run) -> list[dict]:
         if task.group == "synthesizer":
             save_tuning_curve(folder, result["trials"], config.synthesizer.name)
         return result["trials"]
-    if (share := build.share_of(config)) is not None:
+    if (share := build_objects.share_of(config)) is not None:
         setups, into = setups_of(setup, egos) if egos else [setup], folder / ROLLOUTS if config.save_rollouts else None
         drive_all(setups, methods, config.seeds, into, processes, only, kept, share)
         print(f"\nshare {share[0]} of {share[1]} written to {folder}; python -m e2rl.report.merge joins shares")
@@ -82,7 +90,7 @@ def evaluate(run: Run) -> list[dict]:
     write_metrics(folder / METRICS_FILE, rows)
     dropped = "".join(f"; left out: {count} scenes ({reason})" for reason, count in scenes.dropped.items())
     effort = search_effort(scenes.steps)
-    caption = f"{build.caption(config, origin, methods)}; {effort}{dropped}"
+    caption = f"{build_objects.caption(config, origin, methods)}; {effort}{dropped}"
     tables = metric_tables(rows, caption, config.metrics)
     if config.compare is not None or config.figure == "curves":
         tables = compared_tables(config, methods, egos, rows, caption, folder)
@@ -110,18 +118,18 @@ def references(config: DictConfig) -> tuple[str, ...] | None:
     """The methods that all are compared with; None: each with every other."""
     if config.compare is None and config.figure != "curves":
         return None
-    return (*build.compare_names(config), NOMINAL)
+    return (*build_objects.compare_names(config), NOMINAL)
 
 
 def compared_tables(
     config: DictConfig, methods: list[Method], egos: EgoSet | None, rows: list[dict], caption: str, folder: Path
 ) -> list[Table]:
     """The tables with a row a method, or where there are several egos a row an ego; also as files of their own."""
-    others = build.compare_names(config) or [NOMINAL]
+    others = build_objects.compare_names(config) or [NOMINAL]
     if egos:
         tables = planner_tables(rows, egos.names, others[0], caption, config.metrics)
     else:
-        tables = method_tables(rows, build.terms_by_method(methods), others, caption, config.metrics)
+        tables = method_tables(rows, build_objects.terms_by_method(methods), others, caption, config.metrics)
     save_compared(folder, tables, EGOS if egos else METHODS)
     return tables
 

@@ -10,22 +10,22 @@ import hydra
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from e2rl.build import build_ego, build_prior, build_traffic, caption, resolved, set_up
-from e2rl.capacity import check_fits, training_need
-from e2rl.ending import ending
-from e2rl.errors import InputError
-from e2rl.evaluation.ended import ENDED_FILE, add_ended
-from e2rl.files import alone_in
+from e2rl.evaluation.capacity import check_fits, training_need
+from e2rl.evaluation.methods import build_ego, build_prior, build_traffic, caption
+from e2rl.evaluation.provenance import begin_run
+from e2rl.evaluation.resume import Run, resume_command, run_of
+from e2rl.evaluation.rollout_files import ENDED_FILE, add_ended
 from e2rl.learning.build import build_evolution, build_logger, build_measure, check_training, run_bits, run_imitation
-from e2rl.learning.checkpoint import checkpoints, load_checkpoint, save_checkpoint
 from e2rl.learning.prior_training.distributed import follower_overrides, follows, started_by_torchrun
 from e2rl.learning.prior_training.stage import run_prior_stage
-from e2rl.options import run_command
-from e2rl.provenance import begin_run
+from e2rl.learning.run_checkpoint import checkpoints, load_checkpoint, save_checkpoint
 from e2rl.report.rounds import draw_round, round_line
 from e2rl.report.tables import metric_tables, print_tables, save_tables
-from e2rl.resume import Run, resume_command, run_of
-from e2rl.scene.source import load_scenes
+from e2rl.run.config import resolved, run_command, set_up
+from e2rl.run.errors import InputError
+from e2rl.run.files import alone_in
+from e2rl.run.processes import ending
+from e2rl.scenes.source import load_scenes
 
 MAY_CHANGE = ("rounds", "device", "threads", "launcher")  # when a run is resumed
 

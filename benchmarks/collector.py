@@ -7,7 +7,7 @@ import torch
 from measure import Bench, Row
 from torchrl.collectors import Collector
 
-from e2rl.ego.actor import ActorEgo
+from e2rl.planners.actor import ActorEgo
 from e2rl.sim.env import DrivingEnv
 
 STEPS = 40

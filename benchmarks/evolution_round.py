@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import torch
 from measure import Bench, Row
 
-from e2rl.build import build_ego
+from e2rl.evaluation.methods import build_ego
 from e2rl.learning.build import build_evolution
 
 

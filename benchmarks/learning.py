@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import torch
 from measure import Bench, Row
 
-from e2rl.build import build_ego, build_sim
+from e2rl.evaluation.methods import build_ego, build_sim
 from e2rl.learning.policy import PolicyImprovement, steps_of
 
 WARM_UP = 2  # iterations that are not counted: the first updates fit the critic alone

@@ -14,10 +14,11 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 from torch import Tensor
 
-from e2rl.build import build_ego, build_prior, build_sim, build_traffic, load_config
-from e2rl.ego.base import Ego
-from e2rl.scene.scene import SceneSet
-from e2rl.scene.source import load_scenes
+from e2rl.evaluation.methods import build_ego, build_prior, build_sim, build_traffic
+from e2rl.planners.ego import Ego
+from e2rl.run.config import load_config
+from e2rl.scenes.scene import SceneSet
+from e2rl.scenes.source import load_scenes
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.traffic.traffic import Traffic
 

@@ -1,4 +1,4 @@
-"""Peak memory of the other benchmarks' work, each in a process of its own: what e2rl/capacity.py is made of."""
+"""Peak memory of the other benchmarks' work, each in a process of its own."""
 
 import multiprocessing
 import resource
@@ -9,8 +9,9 @@ import torch
 from measure import Bench, Row
 from tensordict import TensorDict
 
-from e2rl.build import build_ego, build_prior, build_sim, build_traffic, load_choice
+from e2rl.evaluation.methods import build_ego, build_prior, build_sim, build_traffic
 from e2rl.learning.policy import PolicyImprovement
+from e2rl.run.config import load_choice
 from e2rl.traffic.rollout import roll_out
 
 WORK = (("simulator", 512), ("nominal rollout", 48), ("e2 rollout", 8), ("e2 rollout", 48), ("learning", 64))

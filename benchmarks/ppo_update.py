@@ -6,8 +6,8 @@ from hydra.utils import instantiate
 from measure import Bench, Row
 from torchrl.collectors import Collector
 
-from e2rl.ego.actor import ActorEgo
 from e2rl.learning.update import Learner
+from e2rl.planners.actor import ActorEgo
 from e2rl.sim.env import DrivingEnv
 
 

@@ -21,7 +21,7 @@ from scaling import scaling
 from simulator import simulator
 from synthesized_rollout import synthesized_rollout
 
-from e2rl.errors import InputError, stop
+from e2rl.run.errors import InputError, stop
 
 OWN = (simulator, collector, ppo_update, learning, guided_replan, synthesized_rollout, evolution_round, memory, scaling)
 BENCHMARKS: dict[str, Benchmark] = {function.__name__: function for function in OWN} | peer_benchmarks

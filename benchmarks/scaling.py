@@ -10,7 +10,7 @@ import torch
 from measure import Bench, Row
 from tensordict import TensorDict
 
-from e2rl.evaluation.processes import in_processes
+from e2rl.run.processes import in_processes
 from e2rl.traffic.rollout import roll_out
 
 SCENES = 64, 512, 2048, 10_000

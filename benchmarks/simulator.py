@@ -15,11 +15,11 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from e2rl.scene.boxes import separation
+from e2rl.scenes.boxes import separation
+from e2rl.scenes.drivable_area import off_road
 from e2rl.sim import dynamics
-from e2rl.sim.drivable import off_road
 from e2rl.sim.env import DrivingEnv, compiled
-from e2rl.synthesizer.reaiming import ReactSettings, Reaiming
+from e2rl.traffic.e2.reaiming import ReactSettings, Reaiming
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.transform import AdversarialSynthesizer
 

@@ -10,8 +10,8 @@ from measure import Bench, Row
 
 from e2rl.prior.prior import Prior
 from e2rl.sim.env import DrivingEnv
-from e2rl.synthesizer.skeleton import build_skeleton
-from e2rl.synthesizer.topology import topological_candidates
+from e2rl.traffic.e2.skeleton import build_skeleton
+from e2rl.traffic.e2.topology import topological_candidates
 from e2rl.traffic.rollout import roll_out
 
 

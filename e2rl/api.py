@@ -19,17 +19,18 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from e2rl.build import build_ego, build_sim, build_traffic, load_choice, load_config
-from e2rl.ego.base import Ego
-from e2rl.errors import InputError
+from e2rl.evaluation.methods import build_ego, build_sim, build_traffic
 from e2rl.evaluation.protocol import scene_seed
 from e2rl.metrics.score import score_rollouts
+from e2rl.planners.ego import Ego
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.checkpoint import load_prior as _load_prior
 from e2rl.prior.prior import Prior, SamplerSettings
-from e2rl.scene import source
-from e2rl.scene.scene import SceneSet
-from e2rl.settings import settings_of
+from e2rl.run.config import load_choice, load_config
+from e2rl.run.errors import InputError
+from e2rl.run.settings import settings_of
+from e2rl.scenes import source
+from e2rl.scenes.scene import SceneSet
 from e2rl.traffic import rollout
 from e2rl.traffic.traffic import Traffic
 

@@ -13,8 +13,8 @@ from safetensors.torch import save_file
 from e2rl.prior.checkpoint import save_prior
 from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.prior import Prior
-from e2rl.weights import HASH
-from tests.scene.descriptions import Malicious, description, lane, numbered, straight, write_folder
+from e2rl.run.files import HASH
+from tests.scenes.descriptions import Malicious, description, lane, numbered, straight, write_folder
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,9 @@ import math
 import torch
 from tensordict import TensorDict
 
-from e2rl.scene.recording import DT, LIGHT_UNKNOWN, PEDESTRIAN, VEHICLE
-from e2rl.scene.route import SPACING
-from e2rl.scene.scene import Loaded, SceneSet
+from e2rl.scenes.recording import DT, LIGHT_UNKNOWN, PEDESTRIAN, VEHICLE
+from e2rl.scenes.route import SPACING
+from e2rl.scenes.scene import Loaded, SceneSet
 
 LANE_WIDTH = 3.5  # m; lane 0 at y = 0, lane 1 (its left neighbour) at y = 3.5, both towards +x
 MARGIN = 1.0  # m beyond a lane's half width that still counts as on the road (docs/method.md, section 1)

@@ -18,4 +18,4 @@ def test_a_console_command_shows_its_configuration_in_an_empty_folder(name, tmp_
     done = subprocess.run(
         [sys.executable, "-c", code, "--cfg", "job"], cwd=tmp_path, capture_output=True, text=True, timeout=300
     )
-    assert done.returncode == 0 and "_target_: e2rl.synthesizer.e2.E2" in done.stdout, done.stderr
+    assert done.returncode == 0 and "_target_: e2rl.traffic.e2.e2.E2" in done.stdout, done.stderr

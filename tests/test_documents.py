@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from e2rl.build import load_config
+from e2rl.run.config import load_config
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = "benchmarks|conf|docs|e2rl|examples|tests|tools"

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from e2rl.build import load_choice
-from e2rl.evaluation.files import read_metrics
+from e2rl.evaluation.rollout_files import read_metrics
 from e2rl.metrics.catalogue import META_STAGE, OPEN_LOOP_STAGE, STAGES
+from e2rl.run.config import load_choice
 from tests.scripts import SHORT, arguments, call, error_line
 
 EXPERIMENTS = [
@@ -189,7 +189,7 @@ def test_an_adversary_is_tuned_and_the_study_goes_on(evaluate, evaluated, tmp_pa
 
 def test_a_folder_of_somebody_else_adds_methods_to_the_table(world, tmp_path, monkeypatch, capsys):
     (tmp_path / "conf" / "synthesizer").mkdir(parents=True)
-    text = "_target_: e2rl.traffic.constant_velocity.ConstantVelocity\nname: straight\n"
+    text = "_target_: e2rl.traffic.rule_based.ConstantVelocity\nname: straight\n"
     (tmp_path / "conf" / "synthesizer" / "straight.yaml").write_text(text)
     overrides = [
         f"--config-dir={tmp_path / 'conf'}",

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import e2rl
-from e2rl.errors import InputError
+from e2rl.run.errors import InputError
 
 ROOT = Path(__file__).parents[1]
 
@@ -14,15 +14,16 @@ ROOT = Path(__file__).parents[1]
 def test_every_package_and_the_configuration_are_in_the_wheel():
     setup = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     found = {".".join(file.parent.relative_to(ROOT).parts) for file in (ROOT / "e2rl").rglob("__init__.py")}
-    assert set(setup["packages"]) == found | {"e2rl.commands", "e2rl.commands.conf"}
-    assert (ROOT / setup["package-dir"]["e2rl.commands.conf"] / "evaluate.yaml").exists()
-    assert (ROOT / setup["package-dir"]["e2rl.commands"] / "train.py").exists()
+    assert set(setup["packages"]) == found | {"e2rl.scripts", "e2rl.scripts.conf"}
+    assert (ROOT / setup["package-dir"]["e2rl.scripts.conf"] / "evaluate.yaml").exists()
+    assert (ROOT / setup["package-dir"]["e2rl.scripts"] / "train.py").exists()
 
 
 def test_a_notebook_rolls_out_what_the_command_does():
     """The ten lines of e2rl.api: the rollouts do not depend on how they are asked for."""
-    from e2rl.build import build_prior, build_sim, build_traffic, load_config
+    from e2rl.evaluation.methods import build_prior, build_sim, build_traffic
     from e2rl.evaluation.protocol import Method, Setup
+    from e2rl.run.config import load_config
 
     scenes = e2rl.load_scenes("bundled", num_scenes=2)
     ego, prior = e2rl.make_ego("lane_graph"), e2rl.load_prior()

@@ -10,9 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
-from e2rl.evaluation.files import read_metrics
+from e2rl.evaluation.rollout_files import read_metrics
 from e2rl.learning.logging import read_choices
-from e2rl.traffic.template import TEMPLATES
+from e2rl.traffic.traffic import TEMPLATES
 from tests.scripts import ROOT, arguments, call, error_line, left_behind
 
 DATA = [
@@ -76,7 +76,7 @@ def test_unknown_keys_and_choices(world, tmp_path, monkeypatch, capsys, script, 
     [
         ("train.py", ["stage=sleep"], "stage=sleep: choose one of"),
         ("evaluate.py", ["num_scenes=0"], "num_scenes=0"),
-        ("evaluate.py", ["data._target_=e2rl.scene.bundled.BundledSource", "data.split=best"], "split 'best'"),
+        ("evaluate.py", ["data._target_=e2rl.scenes.bundled.BundledSource", "data.split=best"], "split 'best'"),
         ("evaluate.py", ["data._target_=no.such.Source"], "data=no.such.Source: cannot be built: "),
         ("evaluate.py", ["data._target_=torch.nn.ReLU"], "data=torch.nn.ReLU: is no"),
         ("evaluate.py", ["+prior.sampler.speed=3"], "speed"),

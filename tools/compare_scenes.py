@@ -13,12 +13,12 @@ from scipy.stats import wasserstein_distance
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from e2rl.scene.bundled import SPLITS, BundledSource  # noqa: E402
-from e2rl.scene.interaction import lateral_acceleration, overlapping_pairs  # noqa: E402
-from e2rl.scene.procedural import ProceduralSource  # noqa: E402
-from e2rl.scene.recording import DT, VEHICLE, Recording  # noqa: E402
-from e2rl.scene.scenarionet import ScenarioNetSource  # noqa: E402
-from e2rl.scene.smoothing import drop_jumps, smooth  # noqa: E402
+from e2rl.scenes.bundled import SPLITS, BundledSource
+from e2rl.scenes.interaction import lateral_acceleration, overlapping_pairs
+from e2rl.scenes.procedural import ProceduralSource
+from e2rl.scenes.recording import DT, VEHICLE, Recording
+from e2rl.scenes.scenarionet import ScenarioNetSource
+from e2rl.scenes.smoothing import drop_jumps, smooth
 
 MOVING, STEPS = 0.5, 80
 ROWS = ("speed m/s", "a_lon m/s^2", "a_lat m/s^2")

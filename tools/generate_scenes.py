@@ -20,7 +20,7 @@ from scenegen.simulate import DT, RECORDED, convert, densify, run  # noqa: E402
 from scenegen.tracks import park, stack_tracks  # noqa: E402
 from scenegen.windows import cut_windows  # noqa: E402
 
-from e2rl.scene.bundled import SPLITS, SceneMap  # noqa: E402
+from e2rl.scenes.bundled import SPLITS, SceneMap
 
 PATTERN = ("train", "train", "tune", "train", "test")  # of every five nets: 60 / 20 / 20 per cent
 

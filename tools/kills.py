@@ -31,8 +31,8 @@ import numpy as np
 import torch
 from safetensors import safe_open
 
-from e2rl.evaluation.kept import HASHED, read_state
-from e2rl.weights import HASH
+from e2rl.run.files import HASH
+from e2rl.run.parts import HASHED, read_state
 
 ROOT = Path(__file__).resolve().parents[1]
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)

@@ -12,12 +12,13 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from e2rl import build
-from e2rl.evaluation.files import ROLLOUTS
-from e2rl.evaluation.kept import PARTS, Kept
+from e2rl.evaluation import methods as build_objects
 from e2rl.evaluation.protocol import Setup, run_protocol
-from e2rl.ray_workers import RayWorkers
-from e2rl.scene.source import load_scenes
+from e2rl.evaluation.rollout_files import ROLLOUTS
+from e2rl.run import config as build_config
+from e2rl.run.parts import PARTS, Kept
+from e2rl.run.processes import RayWorkers
+from e2rl.scenes.source import load_scenes
 from tools.kills import differences
 
 WORKERS = 2
@@ -37,13 +38,13 @@ class Mortal(Setup):
 
 
 def main(overrides: list[str]) -> int:
-    config = build.load_config("evaluate", overrides)
-    build.set_up(config)
-    build.check_evaluation(config)
-    prior, _ = build.build_prior(config)
-    methods, ego = build.build_methods(config, prior), build.build_ego(config)
+    config = build_config.load_config("evaluate", overrides)
+    build_config.set_up(config)
+    build_objects.check_evaluation(config)
+    prior, _ = build_objects.build_prior(config)
+    methods, ego = build_objects.build_methods(config, prior), build_objects.build_ego(config)
     scenes, ray = load_scenes(config.data, config.num_scenes), RayWorkers(WORKERS)
-    given = (scenes, ego, "ego", build.build_sim(config), config.batch)
+    given = (scenes, ego, "ego", build_objects.build_sim(config), config.batch)
     begin = time.perf_counter()
     ray.connect()
     print(f"Ray started in {time.perf_counter() - begin:.0f} s")

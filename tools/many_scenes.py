@@ -17,11 +17,12 @@ from tempfile import TemporaryDirectory
 
 import torch
 
-from e2rl import build
+from e2rl.evaluation import methods as build_objects
 from e2rl.evaluation.protocol import Setup, drive_all
-from e2rl.scene.scene import SceneSet
-from e2rl.scene.source import load_scenes
-from e2rl.workers import die_with_parent
+from e2rl.run import config as build_config
+from e2rl.run.processes import die_with_parent
+from e2rl.scenes.scene import SceneSet
+from e2rl.scenes.source import load_scenes
 
 STARTS = list(range(10, 44, 2))  # frames of a log of 9.1 s: each leaves half of the steps recorded
 
@@ -31,7 +32,7 @@ def scenes_of(config, most: int) -> SceneSet:
 
 
 def build_many(overrides: list[str], most: int) -> str:
-    config = build.load_config("evaluate", overrides)
+    config = build_config.load_config("evaluate", overrides)
     begin, before = time.perf_counter(), cpu()
     count = len(scenes_of(config, most))
     spent, used = time.perf_counter() - begin, cpu() - before
@@ -41,17 +42,17 @@ def build_many(overrides: list[str], most: int) -> str:
 
 
 def drive_many(overrides: list[str], most: int, driven: int) -> str:
-    config, before = build.load_config("evaluate", overrides), cpu()
-    build.set_up(config)
-    build.check_evaluation(config)
-    methods = build.build_methods(config, build.build_prior(config)[0])
-    ego, sim = build.build_ego(config), build.build_sim(config)
+    config, before = build_config.load_config("evaluate", overrides), cpu()
+    build_config.set_up(config)
+    build_objects.check_evaluation(config)
+    methods = build_objects.build_methods(config, build_objects.build_prior(config)[0])
+    ego, sim = build_objects.build_ego(config), build_objects.build_sim(config)
     begin = time.perf_counter()
     scenes = scenes_of(config, most)
     opened, only = time.perf_counter() - begin, torch.linspace(0, len(scenes) - 1, driven).long().tolist()
     begin = time.perf_counter()
     setup = Setup(scenes, ego, "ego", sim, config.batch)
-    rows, _, lost = drive_all([setup], methods, config.seeds, None, build.processes_of(config), only)
+    rows, _, lost = drive_all([setup], methods, config.seeds, None, build_objects.processes_of(config), only)
     spent, failures = time.perf_counter() - begin, sum(row["cfr"] for row in rows)
     rate = f"{failures:.0f} failures, {3600 * failures / spent:.0f} an hour; {len(lost)} without a score"
     begun = f"opened {len(scenes)} scenes in {opened:.1f} s, drove {len(rows)} rollouts in {driven} of them"

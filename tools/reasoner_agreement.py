@@ -17,14 +17,13 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from e2rl.errors import InputError, stop  # noqa: E402
-from e2rl.scene.scene import SceneSet  # noqa: E402
-from e2rl.scene.source import load_scenes  # noqa: E402
-from e2rl.settings import settings_of  # noqa: E402
-from e2rl.sim.world import World  # noqa: E402
-from e2rl.synthesizer.feasibility import FeasibilitySettings, feasible_vehicles  # noqa: E402
-from e2rl.synthesizer.prompt import CRITERIA  # noqa: E402
-from e2rl.synthesizer.reasoner import LanguageReasoner, ReasonerSettings  # noqa: E402
+from e2rl.run.errors import InputError, stop
+from e2rl.run.settings import settings_of
+from e2rl.scenes.scene import SceneSet
+from e2rl.scenes.source import load_scenes
+from e2rl.sim.world import World
+from e2rl.traffic.e2.feasibility import FeasibilitySettings, feasible_vehicles
+from e2rl.traffic.e2.reasoner import CRITERIA, LanguageReasoner, ReasonerSettings
 
 BATCH = 32  # scenes judged together
 

@@ -6,10 +6,8 @@ from pathlib import Path
 from statistics import fmean
 from types import NoneType
 
-from e2rl.errors import InputError
-from e2rl.evaluation.files import nulls, rollout_name
+from e2rl.evaluation.rollout_files import nulls, rollout_name
 from e2rl.evaluation.summary import GROUP
-from e2rl.files import misfit, write_atomically
 from e2rl.metrics.failure_modes import (
     FEATURES,
     Row,
@@ -20,6 +18,8 @@ from e2rl.metrics.failure_modes import (
     medoid,
     mode_name,
 )
+from e2rl.run.errors import InputError
+from e2rl.run.files import misfit, write_atomically
 
 MODES_FILE = "modes.json"
 OTHER = 0  # number of the small modes together

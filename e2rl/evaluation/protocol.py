@@ -10,27 +10,29 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from e2rl.ego.base import Ego
-from e2rl.errors import InputError
-from e2rl.evaluation.avoidable import add_avoidable
-from e2rl.evaluation.ended import ENDED_FILE, require_rows, write_ended
-from e2rl.evaluation.files import (
+from e2rl.evaluation.modes import MODES_FILE, find_modes, write_modes
+from e2rl.evaluation.rollout_files import (
+    ENDED_FILE,
     METRICS_FILE,
     ROLLOUTS,
     TABLE,
     Source,
     label_rows,
+    require_rows,
     rollout_name,
+    write_ended,
     write_metrics,
     write_rollouts,
     write_rows,
 )
-from e2rl.evaluation.kept import NOTHING_KEPT, Kept
-from e2rl.evaluation.modes import MODES_FILE, find_modes, write_modes
-from e2rl.evaluation.processes import Processes, in_processes
 from e2rl.evaluation.summary import empty_rows, metric_rows
+from e2rl.metrics.evasion import add_avoidable
 from e2rl.metrics.score import score_rollouts
-from e2rl.scene.scene import SceneSet
+from e2rl.planners.ego import Ego
+from e2rl.run.errors import InputError
+from e2rl.run.parts import NOTHING_KEPT, Kept
+from e2rl.run.processes import Processes, in_processes
+from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.attempt import attempt, count_reasons
 from e2rl.traffic.rollout import roll_out

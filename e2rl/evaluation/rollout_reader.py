@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from e2rl.errors import InputError
-from e2rl.evaluation.files import FORMAT, OPTIONAL, ROLLOUTS
-from e2rl.files import read_arrays
-from e2rl.scene.recording import AGENT_TYPES
+from e2rl.evaluation.rollout_files import FORMAT, OPTIONAL, ROLLOUTS
+from e2rl.run.errors import InputError
+from e2rl.run.files import read_arrays
+from e2rl.scenes.recording import AGENT_TYPES
 
 TEXTS = ("format", "scene_id", "location", "dataset", "split", "method", "ego_policy")
 WHOLE = ("seed", "ego")

@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import Tensor
 
-from e2rl.evaluation.files import command_line, git_commit
+from e2rl.evaluation.rollout_files import command_line, git_commit
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.statistics import DRAWS, REALISM_DRAWS, paired_differences, summarise
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from e2rl.errors import InputError
+from e2rl.run.errors import InputError
 
 IDENTITY = ("stage", "dataset", "split", "method", "ego", "eta", "training")  # of a row, as far as it has them
 COUNTS = ("n_scenes", "n_seeds", "n_rollouts", "ended")

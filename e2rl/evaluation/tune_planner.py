@@ -12,12 +12,12 @@ from typing import Any
 
 import torch
 
-from e2rl.ego.base import Ego
-from e2rl.evaluation.processes import Processes, in_processes
 from e2rl.evaluation.protocol import Method, Setup, Task
 from e2rl.evaluation.tuning import Parameters
 from e2rl.metrics.score import score_rollouts
-from e2rl.sim.drivable import off_road
+from e2rl.planners.ego import Ego
+from e2rl.run.processes import Processes, in_processes
+from e2rl.scenes.drivable_area import off_road
 from e2rl.traffic.attempt import attempt, count_reasons
 
 COLUMNS = ("collision", "comfort", "progress", "ended")

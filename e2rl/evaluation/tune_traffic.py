@@ -12,12 +12,12 @@ from functools import cached_property
 
 from tqdm import tqdm
 
-from e2rl.evaluation.ended import require_rows
-from e2rl.evaluation.processes import Processes
 from e2rl.evaluation.protocol import Method, Setup, drive_all
+from e2rl.evaluation.rollout_files import require_rows
 from e2rl.evaluation.tuning import Parameters
 from e2rl.metrics.statistics import summarise
-from e2rl.settings import check_choice, check_range
+from e2rl.run.processes import Processes
+from e2rl.run.settings import check_choice, check_range
 from e2rl.traffic.attempt import summary_of
 from e2rl.traffic.traffic import Traffic
 

@@ -1,20 +1,98 @@
-"""The traffic of a round: what is ordered, and how it is made against an ego."""
+"""The traffic of a round: what is ordered, and how it is made against an ego.
+
+Solvability of synthesized traffic: some driver could have avoided the collision, and how.
+
+D' of two traffic methods: each attacks its share of a round's scenes.
+
+An ego that meets only adversaries that owe it nothing learns to flee, and meets those that give way in the same way.
+"""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from e2rl.ego.base import Ego
-from e2rl.errors import InputError
-from e2rl.evaluation.processes import Processes, in_processes
-from e2rl.learning.solvability import Solved, unsearched
+from e2rl.metrics.contact import first_contact
+from e2rl.metrics.evasion import find_evasions
+from e2rl.planners.ego import Ego
+from e2rl.run.errors import InputError
+from e2rl.run.processes import Processes, in_processes
+from e2rl.scenes.scene import SceneSet
+from e2rl.sim import dynamics
+from e2rl.sim.env import SimSettings
 from e2rl.traffic.attempt import count_reasons, summary_of
-from e2rl.traffic.template import FULL
+from e2rl.traffic.traffic import FULL
+
+DEPARTURE = 0.5  # m from where the ego drove at which an evasion has departed: 1 m/s^2 more or less lead so far in 1 s
+LEAD = 10  # steps before its departure from which on an evasion acts
+AFTER = 5  # steps after the contact until which it acts
+LATE = 20  # steps before the contact at which an evasion is to begin: from its very start it would react to nothing
+
+
+class Solved(NamedTuple):
+    """Of synthesized traffic [S]: kept [S] bool: the ego was not hit, or there is an evasion; evasion [S, T, 2]: its
+    actions from the start, 0 without one; span [S, 2] int64: the steps from .. up to which it acts, (0, 0) without
+    one."""
+
+    kept: Tensor
+    evasion: Tensor
+    span: Tensor
+
+
+def unsearched(states: Tensor) -> Solved:
+    """Everything is kept and no evasion known, of traffic with states [S, T+1, N, 4]."""
+    rows, steps = states.shape[0], states.shape[1] - 1
+    span = torch.zeros(rows, 2, dtype=torch.int64)
+    return Solved(torch.ones(rows, dtype=torch.bool), torch.zeros(rows, steps, 2), span)
+
+
+def solvable(traffic: Mapping[str, Tensor], scenes: SceneSet, sim: SimSettings) -> Solved:
+    """A search with full knowledge of the others' motion (e2rl.metrics) where the ego was hit: for an evasion that
+    begins LATE steps before the contact, and where none is found, for one from the start."""
+    contact, solved = traffic["contact"].cpu(), unsearched(traffic["states"])
+    hit = contact.nonzero()[:, 0]
+    if len(hit):
+        scene = scenes.batch(traffic["scene_index"].cpu()[hit])
+        states, valid = (traffic[name].cpu()[hit] for name in ("states", "valid"))
+        first = first_contact({"states": states, "valid": valid, **{key: scene[key] for key in ("size", "agent_type")}})
+        late = (first["stop"] - LATE).clamp(min=0).masked_fill(~first["hit"], 0)
+        result, begin = find_evasions(scene, states, valid, sim, moment=late), late
+        again = (~result.found & (late > 0)).nonzero()[:, 0]
+        if len(again):
+            result[again] = find_evasions(scene[again], states[again], valid[again], sim)
+            begin = begin.index_fill(0, again, 0)
+        solved.kept[hit] = result.found
+        shown = (result.found & first["hit"]).nonzero()[:, 0]
+        actions = from_start(dynamics.inverse(states[shown, :, 0]), result.actions[shown], begin[shown])
+        evasion = dynamics.rollout(states[shown, 0, 0], actions)
+        solved.evasion[hit[shown]] = actions
+        solved.span[hit[shown]] = acting(evasion, states[shown, 1:, 0], begin[shown], first["stop"][shown])
+    return solved
+
+
+def from_start(driven: Tensor, evasion: Tensor, begin: Tensor) -> Tensor:
+    """Actions [S, T, 2]: those driven [S, T, 2] before step begin [S], then those of an evasion [S, T, 2] that begins
+    there."""
+    since = torch.arange(driven.shape[1]) - begin[:, None]
+    late = evasion.gather(1, since.clamp(min=0)[..., None].expand_as(evasion))
+    return torch.where((since >= 0)[..., None], late, driven)
+
+
+def acting(evasion: Tensor, driven: Tensor, begin: Tensor, stop: Tensor) -> Tensor:
+    """Steps [S, 2] from .. up to which evasions [S, T, 4] act instead of the drives driven [S, T, 4], both at steps
+    1..T; begin [S]: the step from which on they differ; stop [S]: of the drives' contacts.
+
+    From LEAD steps before the evasion has departed from the drive by DEPARTURE, until AFTER steps past the contact.
+    """
+    apart = (evasion[..., :2] - driven[..., :2]).norm(dim=-1) > DEPARTURE
+    departed = torch.where(apart.any(1), apart.int().argmax(1) + 1, stop)
+    first = (departed.minimum(stop) - LEAD).maximum(begin)
+    return torch.stack([first, (stop + AFTER).clamp(max=evasion.shape[1])], 1)
+
 
 Synthesize = Callable[..., Mapping[str, Any]]  # (ego, scene_index [S], eta [S], seed), or these and template [S]
 Solvable = Callable[[Mapping[str, Tensor]], Solved]
@@ -100,3 +178,38 @@ def counted(ended: Sequence[dict]) -> dict[str, float]:
     """Metrics of rollouts that ended for an error: how many, and how many for each reason."""
     reasons = {f"ended_{reason.replace(' ', '_')}": float(count) for reason, count in count_reasons(ended).items()}
     return {"ended": float(len(ended)), **reasons}
+
+
+DRAW = 7_919  # apart from the other generators of a round's seed
+
+
+def mixture(first: Synthesize, second: Synthesize, share: float) -> Synthesize:
+    """A Synthesize whose scenes are each given to `second` with probability `share`, else to `first`.
+
+    Who attacks a scene is drawn from the seed and the scene, so it is the same in whichever batch the scene lies.
+    Templates are given to both; rows come in the order of the scenes.
+    """
+
+    def synthesize(ego: Ego, scenes: Tensor, eta: Tensor, seed: int, *template: Tensor) -> dict[str, Any]:
+        other = drawn(scenes, seed, share)
+        parts, places, ended = [], [], dict[int, dict]()
+        for make, chosen in ((first, ~other), (second, other)):
+            rows = chosen.nonzero()[:, 0]
+            if not len(rows):
+                continue
+            made = dict(make(ego, scenes[rows], eta[rows], seed, *(each[rows] for each in template)))
+            lost = made.pop("ended", {})
+            ended |= {int(rows[place]): why for place, why in lost.items()}
+            places += [int(row) for place, row in enumerate(rows) if place not in lost]
+            parts.append(made)
+        order = torch.tensor(places, dtype=torch.int64).argsort()
+        return {name: torch.cat([part[name] for part in parts])[order] for name in parts[0]} | {"ended": ended}
+
+    return synthesize
+
+
+def drawn(scenes: Tensor, seed: int, share: float) -> Tensor:
+    """Bool [S]: scenes [S] that a draw of probability `share` chooses, each by the seed and its own number."""
+    largest = int(scenes.max()) + 1 if len(scenes) else 0
+    draws = torch.rand(largest, generator=torch.Generator().manual_seed(seed * DRAW + 1))
+    return draws[scenes] < share

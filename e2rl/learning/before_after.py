@@ -7,15 +7,15 @@ from pathlib import Path
 
 from torch import Tensor
 
-from e2rl.ego.base import Ego
-from e2rl.evaluation.files import METRICS_FILE, read_metrics, write_metrics
-from e2rl.evaluation.kept import Kept
-from e2rl.evaluation.processes import Processes
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.evaluation.provenance import origin_of
+from e2rl.evaluation.rollout_files import METRICS_FILE, read_metrics, write_metrics
 from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollouts
 from e2rl.metrics.score import score_rollouts
 from e2rl.metrics.statistics import paired_differences
-from e2rl.provenance import origin_of
+from e2rl.planners.ego import Ego
+from e2rl.run.parts import Kept
+from e2rl.run.processes import Processes
 
 
 @dataclass

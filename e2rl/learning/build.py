@@ -6,42 +6,30 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from e2rl.build import (
-    build_prior,
-    build_sim,
-    build_traffic,
-    built,
-    check_counts,
-    check_seeds,
-    intensities,
-    load_choice,
-    processes_of,
-    resolved,
-)
-from e2rl.ego.actor import ActorEgo
-from e2rl.ego.base import Ego
-from e2rl.ego.bits_network import BitsNetwork
-from e2rl.errors import InputError
-from e2rl.evaluation.files import command_line, git_commit
-from e2rl.evaluation.kept import Kept
+from e2rl.evaluation.methods import build_prior, build_sim, build_traffic, check_seeds, intensities, processes_of
 from e2rl.evaluation.protocol import Method, Setup
-from e2rl.learning.ahead import why_not_ahead
-from e2rl.learning.attack import Synthesize
+from e2rl.evaluation.rollout_files import command_line, git_commit
+from e2rl.learning.attack import Synthesize, mixture, solvable
 from e2rl.learning.before_after import BeforeAfter
-from e2rl.learning.bits import BitsSettings, train_bits
-from e2rl.learning.curriculum.scheduler import CurriculumScheduler
+from e2rl.learning.bits_training import BitsSettings, train_bits
 from e2rl.learning.evolution import Evolution, RoundSettings
 from e2rl.learning.imitation import ImitationSettings, imitate, recorded_pairs
 from e2rl.learning.improvement import Improvement
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.memory import Memory
-from e2rl.learning.mixture import mixture
-from e2rl.learning.solvability import solvable
+from e2rl.learning.prefetch import why_not_ahead
+from e2rl.learning.scheduler import CurriculumScheduler
+from e2rl.planners.actor import ActorEgo
+from e2rl.planners.bits_network import BitsNetwork
+from e2rl.planners.ego import Ego
 from e2rl.prior.prior import Prior
-from e2rl.ray_workers import RayWorkers
-from e2rl.scene.scene import SceneSet
-from e2rl.scene.source import load_scenes, source_of
-from e2rl.settings import settings_of
+from e2rl.run.config import built, check_counts, load_choice, resolved
+from e2rl.run.errors import InputError
+from e2rl.run.parts import Kept
+from e2rl.run.processes import RayWorkers
+from e2rl.run.settings import settings_of
+from e2rl.scenes.scene import SceneSet
+from e2rl.scenes.source import load_scenes, source_of
 from e2rl.traffic.rollout import synthesize_traffic
 from e2rl.traffic.traffic import Traffic
 

@@ -11,9 +11,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.modules import ProbabilisticActor
 
-from e2rl.ego.network import ActorNetwork
+from e2rl.planners.network import ActorNetwork
 from e2rl.sim.env import DrivingEnv
-from e2rl.sim.mirror import mirrored
+from e2rl.sim.observation import mirrored
 
 LABEL_WIDTH = (0.25, 0.12)  # of acceleration and yaw rate, in halves of the action's range
 EXPERT_SHARE = 0.99  # expert actions are clipped to this share of the bounds, where the squashed density is infinite

@@ -7,18 +7,17 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from e2rl.ego.actor import ActorEgo
-from e2rl.ego.base import Ego
-from e2rl.errors import InputError
-from e2rl.learning.ahead import Ahead, AheadElsewhere
 from e2rl.learning.attack import ATTACK, Order, Solvable, Synthesize, counted, ended_of, make_traffic
-from e2rl.learning.curriculum.outcomes import Choice, outcomes_of, tally
-from e2rl.learning.curriculum.scheduler import CurriculumScheduler
-from e2rl.learning.episodes import Episodes
+from e2rl.learning.driving import Episodes
 from e2rl.learning.improvement import Improvement
 from e2rl.learning.memory import Memory
-from e2rl.ray_workers import RayWorkers
-from e2rl.settings import check_choice, check_range
+from e2rl.learning.prefetch import Ahead, AheadElsewhere
+from e2rl.learning.scheduler import Choice, CurriculumScheduler, outcomes_of, tally
+from e2rl.planners.actor import ActorEgo
+from e2rl.planners.ego import Ego
+from e2rl.run.errors import InputError
+from e2rl.run.processes import RayWorkers
+from e2rl.run.settings import check_choice, check_range
 from e2rl.traffic.pool import TrafficPool
 
 NOMINAL, TRAFFIC, AGAINST = ("prior", "log", "none"), ("replay", "live"), ("current", "start")
@@ -67,7 +66,7 @@ class Attack:
 
 class Evolution:
     """The state of a run: curriculum, improvement (which holds the ego) and the memory of D'; choices: what the
-    curriculum chose for the last round and what came of it, in rows (e2rl/learning/curriculum/outcomes.py); ended: its
+    curriculum chose for the last round and what came of it, in rows (e2rl/learning/scheduler.py); ended: its
     rollouts that ended for an error of the planner or the traffic, each with its reason.
 
     synthesize(ego, scene_index [S], eta [S], seed) -> {scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N],

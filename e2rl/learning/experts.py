@@ -6,12 +6,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from e2rl.ego.base import PLAN_STEPS, Ego
 from e2rl.learning.cloning import pairs_of
 from e2rl.learning.driving import PoolDriver, episodes_of, filled_batches
 from e2rl.learning.imitation import ImitationSettings, recorded_pairs
-from e2rl.scene.recording import DT
-from e2rl.scene.scene import SceneSet
+from e2rl.planners.ego import PLAN_STEPS, Ego
+from e2rl.scenes.recording import DT
+from e2rl.scenes.scene import SceneSet
 from e2rl.sim import dynamics
 from e2rl.sim.env import SimSettings
 from e2rl.sim.world import World

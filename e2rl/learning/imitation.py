@@ -16,16 +16,16 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
-from e2rl.ego.network import WEIGHTS, ActorCritic
-from e2rl.ego.replay import ReplayEgo
-from e2rl.errors import InputError
-from e2rl.evaluation.kept import NOTHING_KEPT, Kept
-from e2rl.learning.checkpoint import generator_states, restore_generators
 from e2rl.learning.cloning import cloning_loss, pairs_of
 from e2rl.learning.driving import Disturbance, PoolDriver, filled_batches
 from e2rl.learning.logging import RunLogger
+from e2rl.learning.run_checkpoint import generator_states, restore_generators
 from e2rl.learning.update import take_step
-from e2rl.scene.scene import SceneSet
+from e2rl.planners.log_replay import ReplayEgo
+from e2rl.planners.network import WEIGHTS, ActorCritic
+from e2rl.run.errors import InputError
+from e2rl.run.parts import NOTHING_KEPT, Kept
+from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.pool import TrafficPool
 

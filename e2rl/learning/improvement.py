@@ -4,13 +4,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 
-from e2rl.ego.base import Ego
-from e2rl.learning.curriculum.scheduler import CurriculumScheduler
-from e2rl.learning.episodes import Episodes
+from e2rl.learning.driving import Episodes
+from e2rl.learning.scheduler import CurriculumScheduler
+from e2rl.planners.ego import Ego
+from e2rl.run.config import Extension
 from e2rl.traffic.pool import TrafficPool
 
 
-class Improvement(ABC):
+class Improvement(Extension, ABC):
     """Improves `ego` in the round's pool. A subclass is built as `_target_(ego=, parameters=, scenes=, sim=, traffic=,
     seed=, device=, **settings)`; parameters: those that the ego was built with; traffic: the method that drives live
     rows, None without live rows."""

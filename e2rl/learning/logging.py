@@ -1,5 +1,6 @@
 """Logs a run's scalars and pictures to CSV files, TensorBoard or an offline wandb run, in named groups, and its
-curriculum's choices to a CSV."""
+curriculum's choices to a CSV.
+"""
 
 import csv
 import io
@@ -12,9 +13,9 @@ from PIL import Image
 from torchrl.record.loggers import CSVLogger, TensorboardLogger, WandbLogger
 from torchrl.record.loggers.common import Logger
 
-from e2rl.errors import InputError
-from e2rl.files import write_atomically
-from e2rl.learning.curriculum.outcomes import COLUMNS, Choice
+from e2rl.learning.scheduler import COLUMNS, Choice
+from e2rl.run.errors import InputError
+from e2rl.run.files import write_atomically
 
 GROUPS = ("train", "eval", "curriculum", "synthesizer", "time")
 KINDS = ("csv", "tensorboard", "wandb", "none")

@@ -15,9 +15,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from e2rl.errors import InputError
-from e2rl.files import write_atomically
-from e2rl.settings import check_range
+from e2rl.run.errors import InputError
+from e2rl.run.files import write_atomically
+from e2rl.run.settings import check_range
 from e2rl.traffic.pool import TrafficPool
 
 FOLDER, CHUNK = "memory", 1 << 22  # bytes that are read at once for a checksum

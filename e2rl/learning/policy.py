@@ -15,20 +15,20 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 from tqdm import tqdm
 
-from e2rl.ego.actor import ActorEgo
-from e2rl.ego.base import Ego, EgoPlanner
-from e2rl.errors import InputError
-from e2rl.learning.curriculum.scheduler import CurriculumScheduler
-from e2rl.learning.episodes import OUTCOME_KEYS, Episodes, finished_episodes
+from e2rl.learning.driving import OUTCOME_KEYS, Episodes, finished_episodes
 from e2rl.learning.experts import Experts
 from e2rl.learning.imitation import ImitationSettings
 from e2rl.learning.improvement import Improvement
+from e2rl.learning.scheduler import CurriculumScheduler
 from e2rl.learning.teaching import Teacher
 from e2rl.learning.update import Learner, UpdateSettings
-from e2rl.scene.scene import SceneSet
-from e2rl.settings import settings_of
+from e2rl.planners.actor import ActorEgo
+from e2rl.planners.ego import Ego, EgoPlanner
+from e2rl.run.errors import InputError
+from e2rl.run.settings import settings_of
+from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.synthesizer.reaiming import ReactSettings, Reaiming
+from e2rl.traffic.e2.reaiming import ReactSettings, Reaiming
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import Traffic
 from e2rl.traffic.transform import AdversarialSynthesizer

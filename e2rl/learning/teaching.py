@@ -13,13 +13,13 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from e2rl.ego.base import Ego
-from e2rl.ego.ranking import RankingEgo, ranked_actions
-from e2rl.errors import InputError
 from e2rl.learning.cloning import clip_expert
-from e2rl.scene.recording import DT
-from e2rl.scene.scene import SceneSet
-from e2rl.settings import check_range, settings_of
+from e2rl.planners.ego import Ego
+from e2rl.planners.sampling import RankingEgo, ranked_actions
+from e2rl.run.errors import InputError
+from e2rl.run.settings import check_range, settings_of
+from e2rl.scenes.recording import DT
+from e2rl.scenes.scene import SceneSet
 from e2rl.sim.prospects import time_to_contact
 from e2rl.sim.world import World
 
@@ -79,7 +79,7 @@ class Teacher:
         if not isinstance(planner, RankingEgo):
             raise InputError(
                 f"learner.teacher={type(planner).__name__}: it cannot tell what its candidates cost; take an "
-                "e2rl.ego.ranking.RankingEgo such as e2rl.ego.sampling.SamplingEgo, or set learner.ppo.teaching=0"
+                "RankingEgo such as e2rl.planners.sampling.SamplingEgo, or set learner.ppo.teaching=0"
             )
         self.settings = settings_of(TeachingSettings, settings or {}, "learner.teaching")
         self.planner, self.scenes, self.bounds, self.hold = planner, scenes, bounds, hold

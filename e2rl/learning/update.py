@@ -11,9 +11,9 @@ from torchrl.modules import PopArtValueNorm
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from e2rl.ego.network import ActorCritic, ActorNetwork
-from e2rl.errors import InputError
 from e2rl.learning.cloning import cloning_loss, drawn, mirrored_pairs, teaching_loss
+from e2rl.planners.network import ActorCritic, ActorNetwork
+from e2rl.run.errors import InputError
 from e2rl.sim.prospects import TIMES, time_to_contact
 
 VALUE_MEMORY = 0.95  # weight of the past in the running mean and variance of the returns, per update

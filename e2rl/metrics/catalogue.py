@@ -12,11 +12,9 @@ from e2rl.metrics.contact import KINDS, contact_columns, traffic_contact_columns
 from e2rl.metrics.failure_features import APPROACHES, MANOEUVRES, failure_columns
 from e2rl.metrics.meta_metric import FEATURES
 from e2rl.metrics.off_road import off_road_columns
-from e2rl.metrics.proximity import motion_columns
+from e2rl.metrics.proximity import motion_columns, standing_columns
 from e2rl.metrics.realism import W1
-from e2rl.metrics.standing import standing_columns
-from e2rl.metrics.verdicts import verdict_columns
-from e2rl.verdicts.duty import DUTIES
+from e2rl.metrics.verdicts import DUTIES, verdict_columns
 
 Compute = Callable[[dict[str, Tensor]], Tensor | dict[str, Tensor]]
 

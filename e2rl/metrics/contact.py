@@ -9,8 +9,8 @@ from torch import Tensor
 
 from e2rl.metrics.geometry import edge_distances, edge_parts_inside, pair_overlap, velocity
 from e2rl.metrics.realism import MOVING
-from e2rl.scene.boxes import separation
-from e2rl.scene.recording import DT, VEHICLE
+from e2rl.scenes.boxes import separation
+from e2rl.scenes.recording import DT, VEHICLE
 from e2rl.sim.dynamics import wrap
 
 Batch = dict[str, Tensor]

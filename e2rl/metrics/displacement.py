@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from e2rl.metrics.realism import MOVING
-from e2rl.scene.recording import DT
+from e2rl.scenes.recording import DT
 
 
 def moving_vehicles(logged: Tensor, logged_valid: Tensor, simulated: Tensor, steps: int) -> Tensor:

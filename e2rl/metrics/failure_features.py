@@ -12,8 +12,8 @@ from torch import Tensor
 
 from e2rl.metrics.contact import Batch
 from e2rl.metrics.fault import ego_path_boxes
-from e2rl.scene.boxes import separation, to_frame
-from e2rl.scene.recording import DT
+from e2rl.scenes.boxes import separation, to_frame
+from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
 
 APPROACHES = (

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from e2rl.metrics.contact import FRONT, Batch
-from e2rl.scene.boxes import separation
-from e2rl.sim.fault import STANDING
+from e2rl.scenes.boxes import separation
+from e2rl.sim.neighbours import STANDING
 
 CUT_IN_STEPS = 10  # 1 s at 10 Hz
 AHEAD = 30.0  # m, straight on from the contact, that count as the ego's path

@@ -7,9 +7,8 @@ Distances are exact, from point to segment; a grid of buckets keeps the work nea
 import torch
 from torch import Tensor
 
-from e2rl.metrics.broad_phase import candidates
 from e2rl.metrics.contact import Batch, steps_until
-from e2rl.metrics.geometry import from_segment
+from e2rl.metrics.geometry import candidates, from_segment
 
 MARGIN = 1.0  # m beyond half the lane width
 LANE_CELL = 8.0  # m, grid of the lanes' segments

@@ -10,7 +10,7 @@ real_adv is `real` of the adversaries alone, against the logs of the same vehicl
 import torch
 from torch import Tensor
 
-from e2rl.scene.recording import DT
+from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
 
 CLIP = {"a_lon": 10.0, "a_lat": 10.0, "jerk": 20.0}  # m/s2, m/s2, m/s3

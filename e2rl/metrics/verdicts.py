@@ -1,17 +1,106 @@
 """The verdict on every collision of the ego: whose fault, preventable by whom, which duty broken (docs/verdicts.md).
 
 A collision counts if it is the ego's fault or a careful and competent driver in its place would have prevented it.
+
+Which duty the ego's partner broke in a collision (docs/verdicts.md).
+
+In this order: it ran into the ego from behind; it had crossed a stop line at red; it drove against its lane; it crossed
+the ego's way, or came into it, leaving less than a careful and competent driver needs to brake.
 """
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from e2rl.metrics.contact import REAR, Batch
+from e2rl.metrics.drivers import DRIVERS, HumanDriver
 from e2rl.metrics.fault import at_fault
-from e2rl.scene.recording import VEHICLE
-from e2rl.verdicts.drivers import DRIVERS
-from e2rl.verdicts.duty import Lanes, duties
-from e2rl.verdicts.preventable import Collision, preventions
+from e2rl.metrics.preventable import Collision, Tracks, along_way, driven_length, held, preventions
+from e2rl.scenes.lane_graph import against_lanes
+from e2rl.scenes.recording import DT, VEHICLE
+
+DUTIES = ("none", "rear-end", "light", "wrong way", "right of way", "entry")
+NONE, REAR_END, LIGHT, WRONG_WAY, RIGHT_OF_WAY, ENTRY = range(6)
+LIGHT_STEPS = round(5.0 / DT)  # before the contact in which a red light counts
+WRONG_STEPS = round(1.0 / DT)  # before the contact of which half must be against the lanes
+SAME_WAY = torch.pi / 6  # rad between headings below which a vehicle enters the way rather than crosses it
+TURN = torch.pi / 7  # rad of heading within the last four seconds that make a turn
+TURN_STEPS = round(4.0 / DT)
+
+
+class Lanes(NamedTuple):
+    """The map's centrelines: points [B, M, 2], lane [B, M]: which one a point is of (-1: padding)."""
+
+    points: Tensor
+    lane: Tensor
+
+
+def duties(collision: Collision, rear: Tensor, red: Tensor, lanes: Lanes) -> Tensor:
+    """Index [B] into DUTIES of collisions [B].
+
+    rear [B] bool: the ego is hit at its rear; red [B] int64: step at which the partner last crossed a stop line at red,
+    -1 for never.
+    """
+    row = torch.arange(len(rear), device=rear.device)
+    pair = torch.stack([torch.zeros_like(collision.partner), collision.partner], 1)
+    states = held(collision.states, collision.present)[row[:, None], :, pair]  # [B, 2, T+1, 4]
+    size = collision.size[row[:, None], pair]
+    ego, other = states.unbind(1)
+    stop = collision.stop
+    before = (stop - 1).clamp(min=0)
+    turned = torch.stack([_turn(track, stop) for track in (ego, other)])
+    angle = _wrap(other[row, before, 2] - ego[row, before, 2])
+    gap, closing, entered = _entry(ego, other, size, stop)
+    unsafe = entered & (gap < HumanDriver().stopping_gap(closing).clamp(min=0.0))
+    crosses = angle.abs() > SAME_WAY
+    priority = torch.where(turned[0] == turned[1], _from_left(ego, other, row, before), turned[1] & ~turned[0])
+    result = torch.full_like(stop, NONE)
+    result = torch.where(unsafe & ~crosses, ENTRY, result)
+    result = torch.where(unsafe & crosses & priority, RIGHT_OF_WAY, result)
+    result = torch.where(_against(other, stop, lanes), WRONG_WAY, result)
+    result = torch.where((red >= 0) & (stop - red <= LIGHT_STEPS) & (red <= stop), LIGHT, result)
+    faster = other[row, before, 3] * angle.cos() > ego[row, before, 3]
+    return torch.where(rear & (angle.abs() < torch.pi / 3) & faster, REAR_END, result)
+
+
+def _wrap(angle: Tensor) -> Tensor:
+    return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
+
+
+def _turn(track: Tensor, stop: Tensor) -> Tensor:
+    """Bool [B]: the vehicle at track [B, T+1, 4] turns by more than TURN in the TURN_STEPS before stop [B]."""
+    steps = torch.arange(track.shape[1] - 1, device=stop.device)
+    counted = (steps < stop[:, None]) & (steps >= stop[:, None] - TURN_STEPS)
+    return (_wrap(track[..., 2].diff(dim=1)) * counted).sum(1).abs() > TURN
+
+
+def _from_left(ego: Tensor, other: Tensor, row: Tensor, step: Tensor) -> Tensor:
+    """Bool [B]: the other comes from the ego's left, so that it gives way where nothing else decides."""
+    return _wrap(other[row, step, 2] - ego[row, step, 2]) < 0
+
+
+def _entry(ego: Tensor, other: Tensor, size: Tensor, stop: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Gap [B] m along the ego's way and closing speed [B] m/s when the other last came into it, and whether it did."""
+    tracks = Tracks(other[:, :, None], size[:, 1:], torch.ones_like(other[..., :1], dtype=torch.bool))
+    along = along_way(ego, size[:, 0, 1], tracks)
+    outside = along.lateral_gap[..., 0].T > 0
+    steps = torch.arange(ego.shape[1], device=stop.device)
+    last = torch.where(outside & (steps <= stop[:, None]), steps, -1).amax(1)
+    entered = (last >= 0) & (last < stop)
+    step, row = (last + 1).clamp(max=ego.shape[1] - 1), torch.arange(len(stop), device=stop.device)
+    gap = along.rear[step, row, 0] - driven_length(ego)[row, step] - size[:, 0, 0] / 2
+    return gap, ego[row, step, 3] - along.speed[step, row, 0], entered | (last == stop)
+
+
+def _against(track: Tensor, stop: Tensor, lanes: Lanes) -> Tensor:
+    """Bool [B]: in half of the WRONG_STEPS before stop [B] every lane that the vehicle is on runs against it."""
+    row = torch.arange(len(stop), device=stop.device)[:, None]
+    window = (stop[:, None] - torch.arange(1, WRONG_STEPS + 1, device=stop.device)).clamp(min=0)
+    states = track[row, window]
+    against = against_lanes(lanes.points, lanes.lane, states[..., :2], states[..., 2, None])[..., 0]
+    return against.float().mean(-1) >= 0.5
+
 
 COLUMNS = ("preventable", *(f"preventable_{name}" for name in DRIVERS if name != "human"), "preventable_chain")
 

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from e2rl.prior.lane_relative import ACCEL_SCALE, LaneState, select
-from e2rl.scene.boxes import overlap
-from e2rl.scene.recording import DT
+from e2rl.scenes.boxes import overlap
+from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import constant_velocity
 
 NO_CAP = 20.0  # m/s^2: the cap of a vehicle whose plan is feasible

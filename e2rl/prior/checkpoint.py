@@ -9,15 +9,14 @@ from pathlib import Path
 
 from safetensors.torch import save
 
-from e2rl.errors import InputError
-from e2rl.files import write_atomically
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.features import EDGE, NODE
 from e2rl.prior.lane_relative import SIZE
 from e2rl.prior.prior import Prior, SamplerSettings
-from e2rl.settings import settings_of
-from e2rl.weights import read_weights, unlike, weight_bytes
+from e2rl.run.errors import InputError
+from e2rl.run.files import read_weights, unlike, weight_bytes, write_atomically
+from e2rl.run.settings import settings_of
 
 FORMAT = "e2rl-prior/1"
 BUNDLED = "bundled"

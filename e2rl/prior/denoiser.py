@@ -8,11 +8,11 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from e2rl.errors import InputError
 from e2rl.prior.features import EDGE, NODE
 from e2rl.prior.lane_relative import SIZE
 from e2rl.prior.sde import NoiseSchedule
-from e2rl.settings import check_range
+from e2rl.run.errors import InputError
+from e2rl.run.settings import check_range
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,13 @@ import torch
 from torch import Tensor
 
 from e2rl.prior.lane_relative import LaneState
-from e2rl.prior.routed import RoutedScene
-from e2rl.scene.recording import DT, LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
-from e2rl.scene.route import SPACING, interpolate
-from e2rl.scene.smoothing import PAST
-from e2rl.sim.car_following import IDMParameters, idm_acceleration
+from e2rl.prior.routes import RoutedScene
+from e2rl.scenes.recording import DT, LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
+from e2rl.scenes.route import SPACING, interpolate
+from e2rl.scenes.smoothing import PAST
 from e2rl.sim.dynamics import constant_velocity
-from e2rl.sim.leaders import FREE_GAP, leaders
-from e2rl.sim.traffic_light import light_state_at
+from e2rl.sim.leaders import FREE_GAP, IDMParameters, idm_acceleration, leaders
+from e2rl.sim.mission import light_state_at
 
 CURVATURE_AT = (0.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)  # m ahead
 TURN_AT = (10.0, 20.0, 40.0, 60.0, 80.0)  # m ahead

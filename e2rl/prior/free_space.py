@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS, LaneState, lateral_horizon, ridge, speeds
-from e2rl.scene.recording import DT
+from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
 
 YAW_RATE_SCALE = 0.1  # rad/s a unit of x, at the current speed or 3 m/s

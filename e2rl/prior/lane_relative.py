@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from e2rl.scene.recording import DT
-from e2rl.scene.route import interpolate, project
+from e2rl.scenes.recording import DT
+from e2rl.scenes.route import interpolate, project
 from e2rl.sim.dynamics import wrap
 
 HORIZON = 50  # steps of DT

@@ -13,12 +13,11 @@ from e2rl.prior.bounds import BoundSettings, Obstacles, apply_cap, bounded
 from e2rl.prior.denoiser import Denoiser, DenoiserSettings, Encoding
 from e2rl.prior.features import edge_features, node_features
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, select
-from e2rl.prior.route_choice import RouteChoice, sample_route
-from e2rl.prior.routed import RoutedScene, route_scene, start_state
+from e2rl.prior.routes import RouteChoice, RoutedScene, route_scene, sample_route, start_state
 from e2rl.prior.sde import SAMPLERS, path_kl, reverse_step
-from e2rl.scene.recording import DT
-from e2rl.scene.route import project
-from e2rl.settings import check_choice, check_range
+from e2rl.run.settings import check_choice, check_range
+from e2rl.scenes.recording import DT
+from e2rl.scenes.route import project
 
 BUDGET_SPENT = 0.999  # share of a transport budget from which on it counts as used up
 EGO_LEVEL = 0.01  # noise level at which the network sees the ego's plan
@@ -85,7 +84,7 @@ class Plan:
         return self.motion.map(lambda value: value[..., steps - 1])
 
 
-# (x, level, step k, context, denoise) -> (x, x0 before and x0 after control); see e2rl/synthesizer/control.py.
+# (x, level, step k, context, denoise) -> (x, x0 before and x0 after control); see e2rl/traffic/e2/control.py.
 Control = Callable[[Tensor, Tensor, int, Context, Callable[[Tensor], Tensor]], tuple[Tensor, Tensor, Tensor]]
 
 

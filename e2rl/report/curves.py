@@ -17,18 +17,18 @@ from typing import NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from e2rl.errors import InputError, stop
-from e2rl.evaluation.files import METRICS_FILE, cell, nans, read_metrics
+from e2rl.evaluation.provenance import read_provenance
+from e2rl.evaluation.rollout_files import METRICS_FILE, cell, nans, read_metrics
 from e2rl.evaluation.tuning import TUNING_FILE
-from e2rl.files import write_atomically
 from e2rl.metrics.catalogue import METRICS
-from e2rl.provenance import read_provenance
 from e2rl.report import drawing
+from e2rl.report.comparison_tables import closed_loop
 from e2rl.report.drawing import save_figure
-from e2rl.report.methods import closed_loop
 from e2rl.report.plots import plain_figure
 from e2rl.report.tables import heading
-from e2rl.report.tuning import gain_of, on_curve
+from e2rl.report.tuning_curve import gain_of, on_curve
+from e2rl.run.errors import InputError, stop
+from e2rl.run.files import write_atomically
 
 PANELS = (  # (horizontal, vertical): failures over realism, then the share of them that counts
     (("real", "cfr"), ("real_adv", "cfr"), ("aor_step", "cfr")),

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Patch
 from PIL import Image
 
-from e2rl.files import write_atomically
+from e2rl.run.files import write_atomically
 
 Colour = str | tuple[str, float]  # of matplotlib: a name, or a name with its opacity
 

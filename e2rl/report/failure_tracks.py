@@ -1,18 +1,43 @@
 """The replay of a failure in the HTML report: the motion of all agents, of the competent driver in the ego's place and
-of the recorded ego."""
+of the recorded ego.
 
+Arrays of whole numbers as short text, which a browser decodes without a library (e2rl/assets/report/decode.js).
+
+Smooth motion has small second differences, whose upper bytes are zero; deflate makes next to nothing of them.
+"""
+
+import base64
+import zlib
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from e2rl.report.encoding import encode, quantised, second_difference
+from e2rl.metrics.drivers import DRIVERS
+from e2rl.metrics.preventable import AFTER, Collision, preventions
 from e2rl.report.picture import contact_point
-from e2rl.scene.boxes import separation
-from e2rl.traffic.plan_log import POINT_STEPS
-from e2rl.traffic.traffic import REPLAN_STEPS
-from e2rl.verdicts.drivers import DRIVERS
-from e2rl.verdicts.preventable import AFTER, Collision, preventions
+from e2rl.scenes.boxes import separation
+from e2rl.traffic.traffic import POINT_STEPS, REPLAN_STEPS
+
+
+def quantised(values: np.ndarray, quantum: float | np.ndarray) -> np.ndarray:
+    """Values as int64 multiples of a quantum; they must fit into 29 bits, so that second differences fit into 31."""
+    return np.rint(np.asarray(values, np.float64) / quantum).astype(np.int64)
+
+
+def second_difference(values: np.ndarray) -> np.ndarray:
+    """Second difference along the last axis, with zeros before the first value: two cumulative sums undo it."""
+    ahead = [(0, 0)] * (values.ndim - 1) + [(2, 0)]
+    return np.diff(np.pad(values, ahead), n=2, axis=-1)
+
+
+def encode(values: np.ndarray) -> str:
+    """Whole numbers in C order as base64 of zlib of their zigzag code, uint32, all lowest bytes first."""
+    flat = np.asarray(values, np.int64).ravel()
+    zigzag = ((flat << 1) ^ (flat >> 63)).astype("<u4")
+    planes = zigzag.view(np.uint8).reshape(-1, 4).T
+    return base64.b64encode(zlib.compress(planes.tobytes(), 9)).decode()
+
 
 KINDS = ("cyclist", "pedestrian")  # of agents, drawn as such whoever drives them
 CHANNELS = {"x": 0.01, "y": 0.01, "heading": 0.001, "speed": 0.01, "present": 1.0, "gap": 0.01}  # quanta: m, rad, m/s

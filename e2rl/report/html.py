@@ -17,15 +17,15 @@ from typing import Any
 from tqdm import tqdm
 
 import e2rl
-from e2rl.errors import InputError, stop
-from e2rl.evaluation.files import METRICS_FILE, ROLLOUTS, TABLE, nulls, read_metrics, read_rows, rollout_name
 from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
+from e2rl.evaluation.rollout_files import METRICS_FILE, ROLLOUTS, TABLE, nulls, read_metrics, read_rows, rollout_name
 from e2rl.evaluation.rollout_reader import read_rollout
-from e2rl.files import write_atomically
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.failure_tracks import CHANNELS, MAP_QUANTUM, encoded_map, failure_replay
 from e2rl.report.tables import column_names, read_tables
+from e2rl.run.errors import InputError, stop
+from e2rl.run.files import write_atomically
 
 PAGE = "failures.html"
 ASSETS = Path(e2rl.__file__).parent / "assets" / "report"

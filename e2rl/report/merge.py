@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from e2rl.errors import InputError
-from e2rl.evaluation.files import ROLLOUTS
-from e2rl.evaluation.kept import PARTS
-from e2rl.files import write_atomically, written_whole
-from e2rl.provenance import PROVENANCE, changed, read_provenance
+from e2rl.evaluation.provenance import PROVENANCE, changed, read_provenance
+from e2rl.evaluation.rollout_files import ROLLOUTS
+from e2rl.run.errors import InputError
+from e2rl.run.files import write_atomically, written_whole
+from e2rl.run.parts import PARTS
 
 KEPT = (f"{PARTS}/*.pt", f"{ROLLOUTS}/*.npz")  # a batch is finished when its part is there
 OWN = ("share=", "hydra.run.dir=")  # what the commands of shares differ in

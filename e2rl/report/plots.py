@@ -8,11 +8,11 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from e2rl.errors import InputError
 from e2rl.metrics.catalogue import METRICS
 from e2rl.report import drawing
+from e2rl.report.comparison_tables import by_ego
 from e2rl.report.drawing import new_figure
-from e2rl.report.egos import by_ego
+from e2rl.run.errors import InputError
 
 COLOURS = (drawing.BACKGROUND, drawing.EGO, "#2e8b57", drawing.VULNERABLE, "#7a4fbf", drawing.ADVERSARY)
 WIDTH, HEIGHT = 820, 440  # points, of the bars

@@ -10,17 +10,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from e2rl.evaluation.files import Source, rollout_arrays
+from e2rl.evaluation.rollout_files import Source, rollout_arrays
 from e2rl.evaluation.rollout_reader import plain
 from e2rl.learning.evolution import Evolution
 from e2rl.learning.logging import RunLogger
 from e2rl.metrics.contact import first_contact
 from e2rl.metrics.score import score_rollouts
-from e2rl.report.curriculum import PICTURE, draw_choices
+from e2rl.report.curriculum_figure import PICTURE, draw_choices
 from e2rl.report.picture import Replay
-from e2rl.report.replay import save_animation
-from e2rl.scene.recording import VEHICLE
-from e2rl.scene.scene import SceneSet
+from e2rl.report.videos import save_animation
+from e2rl.scenes.recording import VEHICLE
+from e2rl.scenes.scene import SceneSet
 from e2rl.traffic.rollout import SCENE_KEYS
 
 FILMS = "replays"

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from e2rl.errors import InputError
-from e2rl.files import write_atomically
 from e2rl.metrics.catalogue import META_STAGE, METRICS, OPEN_LOOP_STAGE, STAGES, Metric, table_metrics
+from e2rl.run.errors import InputError
+from e2rl.run.files import write_atomically
 
 UNKNOWN = "–"
 COUNTED = {

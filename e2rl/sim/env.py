@@ -12,18 +12,17 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from e2rl.errors import InputError
-from e2rl.scene.route import project
-from e2rl.scene.scene import SceneSet
-from e2rl.settings import check_range
-from e2rl.sim.drivable import off_road
+from e2rl.run.errors import InputError
+from e2rl.run.settings import check_range
+from e2rl.scenes.drivable_area import off_road
+from e2rl.scenes.route import project
+from e2rl.scenes.scene import SceneSet
 from e2rl.sim.mission import Mission, mission_of
 from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, observation_config, observe
 from e2rl.sim.reward import DEFAULT_WEIGHTS, check_weights
 from e2rl.sim.static import FrenetPose, static_scene, write_rows
 from e2rl.sim.step import Outcome, StepConfig, hold_step, replay_step, step
-from e2rl.sim.trajectories import Agents, Trajectories
-from e2rl.sim.world import World
+from e2rl.sim.world import Agents, Trajectories, World
 
 OF_ROUTE = ("points", "length", "open", "limit", "light", "light_s", "log")
 OF_SCENE = ("start", "valid", "start_accel", "start_yaw_rate", "size", "agent_type", "field_origin")

@@ -2,6 +2,10 @@
 
 Blocks: ego (11), mission route ahead (12 x 5), lights (2 x 4), drivable border (5 x 5), nearest agents (12 x 16),
 manoeuvres (15 x 2, see `prospects`).
+
+What each number of the observation is: names, units, scales, for policies from elsewhere (docs/observation.md).
+
+The observation of a mirrored scene, y to -y, from that of the scene: what was on the left is on the right.
 """
 
 from functools import cache
@@ -10,14 +14,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from e2rl.sim.arc import Arc, curvature_of
-from e2rl.sim.drivable import off_road
-from e2rl.sim.mission import limit_at
+from e2rl.scenes.drivable_area import off_road
+from e2rl.sim.dynamics import Arc, curvature_of
+from e2rl.sim.mission import light_state_at, limit_at
 from e2rl.sim.neighbours import Neighbours, neighbours_of, rotation_into
-from e2rl.sim.prospects import PROSPECTS, Others, prospects
+from e2rl.sim.prospects import ACCELERATIONS, OFFSETS, PROSPECTS, TIMES, WIDEST, Others, prospects
 from e2rl.sim.static import FrenetPose, StaticScene, look_along
-from e2rl.sim.traffic_light import light_state_at
-from e2rl.sim.trajectories import Agents
+from e2rl.sim.world import Agents
 
 LOOK_AHEAD = (2.0, 4.0, 7.0, 10.0, 14.0, 19.0, 25.0, 32.0, 40.0, 50.0, 62.0, 75.0)  # m along the mission
 PROBE_X, PROBE_Y = (-3.0, 0.0, 5.0, 11.0, 20.0), (-5.0, -2.5, 0.0, 2.5, 5.0)  # m in the ego's frame
@@ -174,3 +177,99 @@ def others_of(near: Tensor) -> Others:
     near = near[..., :LOOKED_AT]
     local, direction, half, _, speed, accel, turn_rate, _, present = (x.squeeze(1) for x in near.split(COLUMNS, 1))
     return Others(local, direction, half, speed, Arc(accel, curvature_of(turn_rate, speed)), present > 0)
+
+
+class Entry(NamedTuple):
+    """A number of the observation: its name; number times scale is in unit ("" for shares, sines and flags)."""
+
+    name: str
+    unit: str = ""
+    scale: float = 1.0
+
+
+EGO = (
+    Entry("speed", "m/s", SPEED),
+    Entry("acceleration", "m/s^2", 4.0),
+    Entry("yaw_rate", "rad/s"),
+    Entry("offset", "m", 3.0),
+    Entry("heading_sin"),
+    Entry("heading_cos"),
+    Entry("limit", "m/s", SPEED),
+    Entry("left", "m", 100.0),
+    Entry("length", "m", 5.0),
+    Entry("width", "m", 2.0),
+    Entry("elapsed"),
+)
+POINT = (
+    Entry("x", "m", FAR),
+    Entry("y", "m", NEAR),
+    Entry("heading_sin"),
+    Entry("curvature", "1/m", 0.1),
+    Entry("limit", "m/s", SPEED),
+)
+LIGHT = (Entry("red"), Entry("yellow"), Entry("green"), Entry("nearness"))
+AGENT = (
+    Entry("present"),
+    Entry("x", "m", FAR),
+    Entry("y", "m", NEAR),
+    Entry("heading_cos"),
+    Entry("heading_sin"),
+    Entry("velocity_x", "m/s", SPEED),
+    Entry("velocity_y", "m/s", SPEED),
+    Entry("speed", "m/s", SPEED),
+    Entry("acceleration", "m/s^2", 4.0),
+    Entry("half_length", "m", 2.5),
+    Entry("half_width", "m", 1.0),
+    Entry("vehicle"),
+    Entry("gap", "m", NEAR),
+    Entry("approach_time"),
+    Entry("approach_distance"),
+    Entry("turn_rate", "rad/s", TURNING),
+)
+
+
+def observation_layout() -> list[Entry]:
+    """The OBSERVATION_SIZE entries of an observation, in order, named `block.number.quantity`."""
+    manoeuvres = [f"{accel:+g}.{offset:+g}" for accel in ACCELERATIONS for offset in OFFSETS]
+    blocks = [
+        _named("ego", EGO),
+        *(_named(f"route.{k}", POINT) for k in range(len(LOOK_AHEAD))),
+        *(_named(f"light.{k}", LIGHT) for k in range(2)),
+        [Entry(f"border.{x:+g}.{y:+g}", "m", 4.0) for x in PROBE_X for y in PROBE_Y],
+        *(_named(f"agent.{k}", AGENT) for k in range(NEAREST)),
+        [Entry(f"manoeuvre.{name}.gap", "m", WIDEST) for name in manoeuvres],
+        [Entry(f"manoeuvre.{name}.contact", "s", TIMES[-1] + TIMES[0]) for name in manoeuvres],
+    ]
+    found = [entry for block in blocks for entry in block]
+    assert len(found) == OBSERVATION_SIZE
+    return found
+
+
+def _named(block: str, entries: tuple[Entry, ...]) -> list[Entry]:
+    return [entry._replace(name=f"{block}.{entry.name}") for entry in entries]
+
+
+# quantities that change sign
+SIDED = ("yaw_rate", "offset", "heading_sin", "curvature", "y", "velocity_y", "turn_rate")
+
+
+@cache
+def _mirror(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Whose number [D] each number becomes, and its sign [D]."""
+    names = [entry.name for entry in observation_layout()]
+    source = torch.arange(len(names))
+    for start, end, shape in (
+        ("border.", "", (len(PROBE_X), len(PROBE_Y))),
+        ("manoeuvre.", ".gap", (len(ACCELERATIONS), len(OFFSETS))),
+        ("manoeuvre.", ".contact", (len(ACCELERATIONS), len(OFFSETS))),
+    ):
+        block = [index for index, name in enumerate(names) if name.startswith(start) and name.endswith(end)]
+        source[block] = torch.tensor(block).reshape(shape).flip(1).flatten()
+    sign = torch.tensor([-1.0 if name.rsplit(".", 1)[1] in SIDED else 1.0 for name in names])
+    return source.to(device), sign.to(device)
+
+
+def mirrored(observation: Tensor) -> Tensor:
+    """Observations [..., D] in a mirror; twice is none."""
+    source, sign = _mirror(observation.device)
+    return observation[..., source] * sign

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from e2rl.sim.arc import HOLD, TURN, Arc, along_arc
+from e2rl.sim.dynamics import HOLD, TURN, Arc, along_arc
 from e2rl.sim.static import FrenetPose, StaticScene, look_along
 
 ACCELERATIONS = (-7.0, -3.5, -1.0, 1.0, 3.5)  # m/s^2, held, never backwards

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from e2rl.errors import InputError
+from e2rl.run.errors import InputError
 
 DEFAULT_WEIGHTS = {
     "progress": 0.1,

@@ -6,8 +6,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.scene.recording import VEHICLE
-from e2rl.scene.route import SPACING, onto_nearer, segment
+from e2rl.scenes.recording import VEHICLE
+from e2rl.scenes.route import SPACING, onto_nearer, segment
 from e2rl.sim.mission import Mission
 
 WINDOW = 20.0  # m of the mission on either side of the ego's expected arc length

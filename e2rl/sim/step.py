@@ -9,13 +9,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from e2rl.scene.recording import DT
+from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
-from e2rl.sim.fault import own_fault
+from e2rl.sim.neighbours import own_fault
 from e2rl.sim.observation import EgoState, ObservationConfig, Observed, glance, observe
 from e2rl.sim.reward import reward_terms, rewarded_progress, weighted_sum
 from e2rl.sim.static import FrenetPose, StaticScene, follow
-from e2rl.sim.trajectories import Agents, trajectories_at
+from e2rl.sim.world import Agents, trajectories_at
 
 Tracks = tuple[Tensor, Tensor]  # states [B, T+1, N, 4] and presence [B, T+1, N] of all agents
 Outcome = dict[str, Tensor]  # see `advance`

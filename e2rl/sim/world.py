@@ -1,10 +1,18 @@
-"""The input of planners and traffic methods: the current state of a batch of running scenes."""
+"""The input of planners and traffic methods: the current state of a batch of running scenes.
+
+Trajectories of all agents but the ego: recorded, stored, or written plan by plan.
+"""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+
+from e2rl.run.errors import InputError
+from e2rl.scenes.recording import DT
+from e2rl.sim.dynamics import wrap
 
 
 @dataclass
@@ -46,3 +54,88 @@ class World:
             plan=tensordict.get(("traffic", "plan"), None),
             turn_rate=agents["turn_rate"],
         )
+
+
+class Agents(NamedTuple):
+    """All agents of B scenes at a moment: states [B, N, 4], present [B, N] bool, accel [B, N] m/s^2, turn_rate [B, N]
+    rad/s."""
+
+    states: Tensor
+    present: Tensor
+    accel: Tensor
+    turn_rate: Tensor
+
+
+class Trajectories:
+    """Trajectories states [B, T+1, N, 4], valid [B, T+1, N] of B running scenes.
+
+    Vehicles (the first V rows) may be overwritten; pedestrians, cyclists and others always replay the recording.
+    """
+
+    def __init__(self, scene: TensorDictBase) -> None:
+        self.states, self.valid = scene["logged"].clone(), scene["logged_valid"].clone()
+        self.vehicles = scene["route_log"].shape[1]
+        self._scheduled: list[tuple[Tensor, Tensor, Tensor]] = []
+
+    def schedule(self, rows: Tensor, states: Tensor, valid: Tensor) -> None:
+        """Set trajectories of scenes rows [b] from their next reset on; raises InputError on a wrong shape or NaN."""
+        expected = (len(rows), *self.states.shape[1:])
+        if tuple(states.shape) != expected or tuple(valid.shape) != expected[:-1]:
+            raise InputError(
+                f"set_traffic: states {tuple(states.shape)} and valid {tuple(valid.shape)} for {len(rows)} rows; "
+                f"expected {expected} and {expected[:-1]}"
+            )
+        if not torch.isfinite(states[valid]).all():
+            raise InputError("set_traffic: NaN or infinite states marked valid; mark them invalid")
+        device = self.states.device
+        self._scheduled.append((rows.to(device), states.to(device), valid.to(device)))
+
+    def reset(self, scene: TensorDictBase, index: Tensor) -> None:
+        """Restart scenes index [b] with their scheduled trajectories, by default with the recording."""
+        if len(index) == len(self.states):
+            self.states.copy_(scene["logged"]), self.valid.copy_(scene["logged_valid"])
+        else:
+            self.states[index], self.valid[index] = scene["logged"][index], scene["logged_valid"][index]
+        waiting, self._scheduled = self._scheduled, []
+        for rows, states, valid in waiting:
+            now = torch.isin(rows, index)
+            self.states[rows[now], :, : self.vehicles] = states[now][:, :, : self.vehicles].to(self.states.dtype)
+            self.valid[rows[now], :, : self.vehicles] = valid[now][:, :, : self.vehicles]
+            if not bool(now.all()):
+                self._scheduled.append((rows[~now], states[~now], valid[~now]))
+
+    def write(self, rows: Tensor, step: Tensor, states: Tensor, valid: Tensor) -> None:
+        """Overwrite the vehicles of scenes rows [b] at steps step [b] + 1 .. + H; steps beyond T are dropped.
+
+        states [b, V, H, 4], valid [b, V, H].
+        """
+        at = step[:, None] + torch.arange(1, states.shape[2] + 1, device=step.device)
+        inside = at < self.states.shape[1]
+        row, at = rows[:, None].expand_as(at)[inside], at[inside]
+        self.states[row, at, : self.vehicles] = states.transpose(1, 2)[inside].to(self.states.dtype)
+        self.valid[row, at, : self.vehicles] = valid.transpose(1, 2)[inside]
+
+    def write_agents(self, rows: Tensor, agents: Tensor, step: Tensor, states: Tensor) -> None:
+        """Put vehicles agents [K] of scenes rows [K] at states [K, H, 4] at steps step [K] + 1 .. + H, present; steps
+        beyond T are dropped."""
+        at = step[:, None] + torch.arange(1, states.shape[1] + 1, device=step.device)
+        inside = at < self.states.shape[1]
+        where = rows[:, None].expand_as(at)[inside], at[inside], agents[:, None].expand_as(at)[inside]
+        self.states[where] = states[inside].to(self.states.dtype)
+        self.valid[where] = True
+
+    def at(self, step: Tensor) -> Agents:
+        """`trajectories_at` step [B]."""
+        return trajectories_at(self.states, self.valid, step)
+
+
+def trajectories_at(states: Tensor, valid: Tensor, step: Tensor) -> Agents:
+    """The agents of trajectories [B, T+1, N, 4], [B, T+1, N] at step [B].
+
+    Acceleration and turn rate are differences of speed and heading over the last step, 0 without a last step.
+    """
+    row, before = torch.arange(len(step), device=step.device), (step - 1).clamp(min=0)
+    now, there = states[row, step], valid[row, step]
+    change = now[..., 2:] - states[row, before, :, 2:]
+    known = there & valid[row, before]
+    return Agents(now, there, change[..., 1] / DT * known, wrap(change[..., 0]) / DT * known)

@@ -1,5 +1,6 @@
 """Rolling out what can be: where a planner or a traffic method raises, or a state becomes NaN or infinite, these
-rollouts end, each with its reason, and the others go on."""
+rollouts end, each with its reason, and the others go on.
+"""
 
 import errno
 import traceback
@@ -10,8 +11,8 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from e2rl.ego.base import PlannerError
-from e2rl.errors import InputError
+from e2rl.planners.ego import PlannerError
+from e2rl.run.errors import InputError
 
 NOT_FINITE = "a state was NaN or infinite"
 OF_THE_RUN = (InputError, MemoryError, torch.OutOfMemoryError)  # errors that are no single rollout's

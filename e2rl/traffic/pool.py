@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from e2rl.errors import InputError
-from e2rl.traffic.template import FULL
+from e2rl.run.errors import InputError
+from e2rl.traffic.traffic import FULL
 
 RECORDED, LIVE = -1, -2  # sources of a row's traffic that is not a position in the stored traffic
 
@@ -35,7 +35,7 @@ class TrafficPool:
 
     scene_index [R] int64; source [R] int64: position in the stored traffic, RECORDED: the log is replayed, LIVE: a
     traffic method replans it against the ego; eta [R]: adversarial intensity, 0: none; template [R] int64: causal
-    template of the attack (e2rl/traffic/template.py); seed [R] int64: of the noise of LIVE rows; weight [R]: in draws;
+    template of the attack (e2rl/traffic/traffic.py); seed [R] int64: of the noise of LIVE rows; weight [R]: in draws;
     fresh [R] bool: made for this round, not remembered from an earlier one.
     parts: the stored traffic, of equal T and N; positions count through all parts. Joined pools share the tracks.
     """

@@ -1,11 +1,21 @@
-"""The extension point for vehicles that leave replayed traffic and react to the ego."""
+"""The extension point for vehicles that leave replayed traffic and react to the ego.
+
+The ego's reaction to a plan of the other vehicles: its own policy, a black box, rolled forward against the plan.
+"""
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
+from e2rl.planners.ego import Ego
+from e2rl.prior.lane_relative import HORIZON
+from e2rl.scenes.recording import DT
+from e2rl.sim.dynamics import constant_velocity
 from e2rl.sim.world import World
+from e2rl.traffic.grouping import take_rows
 
 
 class NewEpisodes(NamedTuple):
@@ -45,3 +55,30 @@ class Reaction(ABC):
     @abstractmethod
     def react(self, world: World) -> Motion | None:
         """The reacting vehicles' motion for at least 1 s, asked every 0.5 s; None where nobody reacts."""
+
+
+@dataclass
+class Lookahead:
+    """Rolls out the egos of scenes [B] against planned vehicles; period: steps between two ego plans."""
+
+    ego: Ego
+    world: World
+    period: int = 10
+
+    @torch.no_grad()
+    def __call__(self, rows: Tensor, planned: Tensor) -> Tensor:
+        """The egos' states [G, HORIZON, 4] in scenes rows [G] against vehicles planned [G, V, HORIZON, 4].
+
+        The ego's row of `planned` is ignored; agents without a plan keep their velocity.
+        """
+        whole = len(rows) == len(self.world.step) and bool((rows.diff() > 0).all())
+        world = self.world if whole else replace(take_rows(self.world, rows), plan=None)
+        states, vehicles, pieces = world.states, planned.shape[1], []
+        ends = torch.arange(self.period, HORIZON + self.period, self.period, device=states.device)
+        moved = constant_velocity(states[:, vehicles:], DT * ends)
+        now = world
+        for number, after in enumerate(ends.tolist()):
+            pieces.append(self.ego.plan(now)[:, : self.period])
+            ego, others = pieces[-1][:, -1:], planned[:, 1:, min(after, HORIZON) - 1]
+            now = replace(now, step=world.step + after, states=torch.cat([ego, others, moved[:, :, number]], 1))
+        return torch.cat(pieces, 1)[:, :HORIZON]

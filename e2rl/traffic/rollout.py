@@ -11,19 +11,16 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from e2rl.ego.base import Ego, EgoPolicy
-from e2rl.prior.routed import take_route
-from e2rl.scene.recording import VEHICLE
-from e2rl.scene.route import project
-from e2rl.scene.scene import SceneSet
+from e2rl.planners.ego import Ego, EgoPolicy
+from e2rl.prior.routes import take_route
+from e2rl.scenes.recording import VEHICLE
+from e2rl.scenes.route import project
+from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.sim.traffic_light import ran_red
+from e2rl.sim.mission import ran_red
 from e2rl.traffic.attempt import attempt
-from e2rl.traffic.passes import counted_passes
-from e2rl.traffic.plan_log import PlanLog
 from e2rl.traffic.pool import TrafficPool
-from e2rl.traffic.template import FULL
-from e2rl.traffic.traffic import Traffic
+from e2rl.traffic.traffic import FULL, PlanLog, Traffic, counted_passes
 from e2rl.traffic.transform import AdversarialSynthesizer
 
 MAP_KEYS = ("lane_points", "lane_index", "lane_width", "drivable_points", "drivable_index")
@@ -45,7 +42,7 @@ def roll_out(
     """Rollouts of scenes index [B] with seeds [B], intensities eta [B] and causal templates [B] (None: full for all) to
     their last step.
 
-    The rollout dict that e2rl.metrics and e2rl.evaluation.files read: states [B, T+1, N, 4], valid, size, agent_type,
+    The rollout dict that metrics and files read: states [B, T+1, N, 4], valid, size, agent_type,
     simulated, adversaries, logged, logged_valid, map keys, ran_light [B, N] (`red_lights`), seed, scene_id,
     location, seconds (wall time per rollout), passes (of the prior's network per rollout), transport (path KL of
     adversaries and others, anchor jump), routes [B, V], contact [B] (the ego touched a vehicle), plans and targets

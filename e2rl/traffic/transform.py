@@ -8,13 +8,12 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import Transform
 
-from e2rl.ego.base import Ego
+from e2rl.planners.ego import Ego
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.sim.env import DrivingEnv
-from e2rl.traffic.lookahead import Lookahead
+from e2rl.traffic.grouping import put_rows, take_rows
 from e2rl.traffic.pool import LIVE, RECORDED, TrafficPool
-from e2rl.traffic.reaction import NewEpisodes, Reaction
-from e2rl.traffic.rows import put_rows, take_rows
+from e2rl.traffic.reaction import Lookahead, NewEpisodes, Reaction
 from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan, keep_velocity
 
 Draw = Callable[[int], Tensor]  # count -> pool rows [count] of new episodes

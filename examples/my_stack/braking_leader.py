@@ -3,9 +3,9 @@
 import torch
 from tensordict import TensorDict
 
-from e2rl.scene.boxes import to_frame
-from e2rl.scene.recording import DT
-from e2rl.traffic.replay import Replay
+from e2rl.scenes.boxes import to_frame
+from e2rl.scenes.recording import DT
+from e2rl.traffic.rule_based import Replay
 from e2rl.traffic.traffic import steps_ahead
 
 

@@ -2,10 +2,10 @@
 
 import torch
 
-from e2rl.ego.base import PLAN_STEPS, Ego
-from e2rl.ego.path import MissionPath
-from e2rl.scene.boxes import to_frame
-from e2rl.scene.recording import DT
+from e2rl.planners.ego import PLAN_STEPS, Ego
+from e2rl.planners.path import MissionPath
+from e2rl.scenes.boxes import to_frame
+from e2rl.scenes.recording import DT
 
 
 class Cruise(Ego):

@@ -3,7 +3,7 @@
 from torch import Tensor
 
 from e2rl.metrics.catalogue import Metric, register
-from e2rl.scene.recording import DT
+from e2rl.scenes.recording import DT
 
 LIMIT = 4.0  # m/s^2
 

@@ -1,6 +1,6 @@
 """A curriculum: the intensity climbs one stair whenever the ego has coped with the present one."""
 
-from e2rl.learning.curriculum.scheduler import CurriculumScheduler
+from e2rl.learning.scheduler import CurriculumScheduler
 
 
 class Staircase(CurriculumScheduler):

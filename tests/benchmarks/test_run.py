@@ -11,7 +11,7 @@ sys.path.insert(0, str(FOLDER))  # the benchmarks are scripts beside each other,
 
 import run  # noqa: E402
 
-from e2rl.errors import InputError  # noqa: E402
+from e2rl.run.errors import InputError  # noqa: E402
 
 SMALL = ["--repeats", "1", "--largest", "1", "--no-compile"]
 SHORT = [

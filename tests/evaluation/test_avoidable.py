@@ -2,8 +2,8 @@
 
 import torch
 
-from e2rl.evaluation.avoidable import add_avoidable, spliced
-from e2rl.scene.boxes import separation
+from e2rl.metrics.evasion import add_avoidable, spliced
+from e2rl.scenes.boxes import separation
 from e2rl.sim.env import SimSettings
 from tests.synthetic import make_scenes
 

@@ -3,14 +3,14 @@
 import pytest
 import torch
 
-from e2rl.ego.idm import IDMEgo
-from e2rl.errors import InputError
-from e2rl.evaluation.chains import LongestChain, link_risk
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.planners.idm_planner import IDMEgo
+from e2rl.report.skeleton_figure import LongestChain, link_risk
+from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings
-from e2rl.synthesizer.selection import Selection
-from e2rl.traffic.replay import Replay
-from tests.synthesizer.traffic_scenes import scenes, synthesizer
+from e2rl.traffic.e2.skeleton import Selection
+from e2rl.traffic.rule_based import Replay
+from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
 
 def selection(*targets, seed=0, risk=0.5):

@@ -5,18 +5,18 @@ import math
 import pytest
 import torch
 
-from e2rl.ego.idm import IDMEgo
-from e2rl.evaluation.egos import EgoSet, pool_trainings, recorded_acceleration, run_egos
-from e2rl.evaluation.files import ROLLOUTS, TABLE, Source, label_rows, read_rows
+from e2rl.evaluation.ego_set import EgoSet, pool_trainings, recorded_acceleration, run_egos
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.evaluation.rollout_files import ROLLOUTS, TABLE, Source, label_rows, read_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.score import score_rollouts
+from e2rl.planners.idm_planner import IDMEgo
+from e2rl.report.comparison_tables import ego_tables, guard_table
 from e2rl.report.drawing import image_of
-from e2rl.report.egos import ego_tables, guard_table
 from e2rl.report.plots import collision_bars
 from e2rl.sim.env import SimSettings
-from e2rl.traffic.constant_velocity import ConstantVelocity
+from e2rl.traffic.rule_based import ConstantVelocity
 from tests.learning.small import small_scenes
 from tests.metrics.random_rollouts import random_rollouts
 

@@ -5,16 +5,15 @@ import json
 import pytest
 import torch
 
-from e2rl.ego.idm import IDMEgo
-from e2rl.errors import InputError
-from e2rl.evaluation.ended import ENDED_FILE, add_ended
-from e2rl.evaluation.files import METRICS_FILE, ROLLOUTS, TABLE, read_metrics, read_rows
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
-from e2rl.report.score import main as score
+from e2rl.evaluation.rollout_files import ENDED_FILE, METRICS_FILE, ROLLOUTS, TABLE, add_ended, read_metrics, read_rows
+from e2rl.planners.idm_planner import IDMEgo
+from e2rl.report.score_files import main as score
 from e2rl.report.tables import metric_tables
+from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings
-from e2rl.traffic.replay import Replay
-from tests.synthesizer.traffic_scenes import scenes
+from e2rl.traffic.rule_based import Replay
+from tests.traffic.e2.traffic_scenes import scenes
 
 METHODS = [Method("replay", Replay())]
 

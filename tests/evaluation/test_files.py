@@ -13,12 +13,12 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from e2rl.errors import InputError
-from e2rl.evaluation import files
-from e2rl.evaluation.files import Source, label_rows, read_metrics, read_rows, write_metrics, write_rollouts
+from e2rl.evaluation import rollout_files as files
+from e2rl.evaluation.rollout_files import Source, label_rows, read_metrics, read_rows, write_metrics, write_rollouts
 from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollout, read_rollouts
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
+from e2rl.run.errors import InputError
 from tests.metrics.random_rollouts import random_rollouts
 
 SOURCE = Source("synthetic", "test", "e2", "idm")

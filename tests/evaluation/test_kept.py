@@ -6,7 +6,7 @@ import random
 import pytest
 import torch
 
-from e2rl.evaluation.kept import Kept, forget_parts, state_bytes
+from e2rl.run.parts import Kept, forget_parts, state_bytes
 
 VALUE = ([{"cfr": 1.0, "seed": 3, "duty": ""}], [{"speed": torch.arange(3.0)}], [])
 

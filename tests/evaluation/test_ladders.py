@@ -1,7 +1,7 @@
 """The rollout of the intensity figure: unharmed at first, then hit ever earlier."""
 
-from e2rl.evaluation.files import ROLLOUTS, TABLE, write_rows
-from e2rl.evaluation.ladders import intensity_ladder, worth
+from e2rl.evaluation.rollout_files import ROLLOUTS, TABLE, write_rows
+from e2rl.report.intensity import intensity_ladder, worth
 
 NAN = float("nan")
 

@@ -5,20 +5,20 @@ import math
 
 import pytest
 
-from e2rl.errors import InputError
-from e2rl.evaluation.files import ROLLOUTS, Source, label_rows, read_rows, write_rollouts, write_rows
 from e2rl.evaluation.modes import MODES_FILE, find_modes, read_modes, write_modes
 from e2rl.evaluation.protocol import Method, run_protocol
+from e2rl.evaluation.rollout_files import ROLLOUTS, Source, label_rows, read_rows, write_rollouts, write_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
-from e2rl.report import replay
-from e2rl.report.modes import mode_tables
+from e2rl.report import videos as replay
+from e2rl.report.mode_table import mode_tables
 from e2rl.report.tables import metric_tables
+from e2rl.run.errors import InputError
 from tests.evaluation.test_protocol import setup_of
 from tests.metrics.random_rollouts import random_rollouts
 from tests.metrics.test_contact import course, scene
 from tests.metrics.test_failure_modes import CROSSING, REAR_END, failure
-from tests.synthesizer.traffic_scenes import scenes, synthesizer
+from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
 
 def labelled(kind, number, method="e2", eta=2.0, **changes):

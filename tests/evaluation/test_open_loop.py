@@ -3,18 +3,16 @@
 import pytest
 import torch
 
-from e2rl.errors import InputError
-from e2rl.evaluation.open_loop import HORIZONS, open_loop_rows
+from e2rl.evaluation.displacement_table import HORIZONS, open_loop_rows
 from e2rl.evaluation.protocol import Method
 from e2rl.metrics.catalogue import OPEN_LOOP, OPEN_LOOP_STAGE
 from e2rl.prior.prior import SamplerSettings
 from e2rl.report.tables import metric_tables
-from e2rl.traffic.constant_velocity import ConstantVelocity
-from e2rl.traffic.idm import IDM
+from e2rl.run.errors import InputError
 from e2rl.traffic.nominal import NominalTraffic
-from e2rl.traffic.replay import Replay
+from e2rl.traffic.rule_based import IDM, ConstantVelocity, Replay
 from tests.prior.small import small_prior
-from tests.synthesizer.traffic_scenes import scenes, synthesizer
+from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
 STRAIGHT = Method("constant_velocity", ConstantVelocity())
 

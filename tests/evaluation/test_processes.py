@@ -6,8 +6,8 @@ import time
 import pytest
 import torch
 
-from e2rl.errors import InputError
-from e2rl.evaluation.processes import cores, in_processes
+from e2rl.run.errors import InputError
+from e2rl.run.processes import cores, in_processes
 
 
 def square(job):

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from e2rl.ego.idm import IDMEgo
-from e2rl.evaluation.files import METRICS_FILE, ROLLOUTS, TABLE, read_metrics, read_rows
-from e2rl.evaluation.kept import Kept
 from e2rl.evaluation.protocol import Method, Setup, run_protocol, scene_seed
+from e2rl.evaluation.rollout_files import METRICS_FILE, ROLLOUTS, TABLE, read_metrics, read_rows
 from e2rl.evaluation.rollout_reader import read_rollout
+from e2rl.planners.idm_planner import IDMEgo
+from e2rl.run.parts import Kept
 from e2rl.sim.env import SimSettings
-from e2rl.traffic.constant_velocity import ConstantVelocity
+from e2rl.traffic.rule_based import ConstantVelocity
 from tests.learning.small import Ambush, small_scenes
-from tests.synthesizer.traffic_scenes import scenes, synthesizer
+from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
 SCORER = Path(__file__).parents[3] / "shared" / "tools" / "score_rollouts.py"
 SCENES, SEEDS = 2, [0, 1]

@@ -5,19 +5,18 @@ import copy
 import pytest
 import torch
 
-from e2rl.ego.replay import ReplayEgo
-from e2rl.evaluation.kept import Kept
+from e2rl.evaluation.meta_table import Tally, evaluated, log_split_half, meta_rows, summarise_meta
 from e2rl.evaluation.protocol import Method, Setup
-from e2rl.evaluation.realism_meta import Tally, evaluated, log_split_half, meta_rows, summarise_meta
 from e2rl.metrics.catalogue import META, META_STAGE
 from e2rl.metrics.meta_metric import FEATURES, HISTOGRAMS, SMOOTHING, meta_metric
+from e2rl.planners.log_replay import ReplayEgo
 from e2rl.prior.prior import SamplerSettings
+from e2rl.run.parts import Kept
 from e2rl.sim.env import SimSettings
-from e2rl.traffic.constant_velocity import ConstantVelocity
 from e2rl.traffic.nominal import NominalTraffic
-from e2rl.traffic.replay import Replay
+from e2rl.traffic.rule_based import ConstantVelocity, Replay
 from tests.prior.small import small_prior
-from tests.synthesizer.traffic_scenes import scenes
+from tests.traffic.e2.traffic_scenes import scenes
 
 SIM, STEPS = SimSettings(), 30
 KNOWN = {"linear_speed": STEPS - 2, "angular_speed": STEPS - 2, "linear_accel": STEPS - 4, "angular_accel": STEPS - 4}

@@ -5,8 +5,8 @@ import math
 
 import pytest
 
-from e2rl.errors import InputError
 from e2rl.evaluation.table_comparison import compare_tables
+from e2rl.run.errors import InputError
 
 
 def table():

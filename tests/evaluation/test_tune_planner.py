@@ -6,20 +6,19 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from e2rl import build
-from e2rl.ego.base import PLAN_STEPS, Ego
-from e2rl.ego.path import MissionPath
-from e2rl.errors import InputError
-from e2rl.evaluation.objective import Objective
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.evaluation.tune_planner import Trials, outcomes
-from e2rl.evaluation.tuning import TuneSettings
-from e2rl.scene.scene import Loaded
+from e2rl.evaluation.tuning import Objective, TuneSettings
+from e2rl.evaluation.tuning_run import run_tuning, tuning_of
+from e2rl.planners.ego import PLAN_STEPS, Ego
+from e2rl.planners.path import MissionPath
+from e2rl.run import config as build_config
+from e2rl.run.errors import InputError
+from e2rl.scenes.scene import Loaded
 from e2rl.sim.env import SimSettings
-from e2rl.traffic.replay import Replay
-from e2rl.tuning import run_tuning, tuning_of
+from e2rl.traffic.rule_based import Replay
 from tests.evaluation.tuned_road import PRESENT, SPACE, quiet, road
-from tests.synthesizer.traffic_scenes import scenes, synthesizer
+from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
 
 class Cruise(Ego):
@@ -127,7 +126,7 @@ def tuned(config, *run):
 
 
 def test_the_configuration_builds_the_planner_under_trial(tmp_path):
-    config = build.load_config("evaluate", ["ego=lane_graph", "seeds=[0]", "processes=1"])
+    config = build_config.load_config("evaluate", ["ego=lane_graph", "seeds=[0]", "processes=1"])
     tuning = {"group": "ego", "trials": 1, "seed": 0, "startup": 1, "study": None, "space": {"max_risk": [0.05, 0.2]}}
     config.tuning = OmegaConf.create(tuning)
     on = synthesizer()
@@ -141,9 +140,9 @@ def test_the_configuration_builds_the_planner_under_trial(tmp_path):
 
 def test_every_planner_s_ranges_hold_its_present_values():
     """A trial of the present parameters is the planner of conf/ego."""
-    spaces = OmegaConf.load(build.conf_folder() / "experiment" / "tune_planner.yaml").tuning.spaces
+    spaces = OmegaConf.load(build_config.conf_folder() / "experiment" / "tune_planner.yaml").tuning.spaces
     assert set(spaces) == {"lane_graph", "lane_graph_tuned", "sampling", "bits"}
     for name, space in spaces.items():
-        present = build.load_choice("ego", name)
+        present = build_config.load_choice("ego", name)
         for parameter, (low, high, *_) in space.items():
             assert low <= present[parameter] <= high, f"{name}.{parameter}"

@@ -6,17 +6,17 @@ import math
 import pytest
 from omegaconf import OmegaConf
 
-from e2rl import build
-from e2rl.errors import InputError
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.evaluation.tune_traffic import MEASURED, SOUGHT, AttackObjective, AttackTrials
 from e2rl.evaluation.tuning import TuneSettings, tune
-from e2rl.rivals.ctg_adv import CTGAdv
+from e2rl.evaluation.tuning_run import changed, flat, run_tuning, tuning_of
+from e2rl.run import config as build_config
+from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings
+from e2rl.traffic.baselines.ctg import CTGAdv
 from e2rl.traffic.nominal import NominalTraffic
-from e2rl.tuning import changed, flat, run_tuning, tuning_of
 from tests.prior.small import small_prior
-from tests.synthesizer.traffic_scenes import EGO, scenes
+from tests.traffic.e2.traffic_scenes import EGO, scenes
 
 ATTACKS = ("e2", "e2_unbound", "e2_pursuit", "ctg_adv", "safe_sim_opt", "ccdiff", "diffscene", "cat", "strive")
 
@@ -131,10 +131,10 @@ def test_a_trial_that_loses_more_rollouts_than_nominal_traffic_is_refused():
 
 def test_every_attack_has_a_range_round_its_present_values():
     """Its first parameter is the gain; a trial of the present parameters is the method of conf/synthesizer."""
-    spaces = OmegaConf.load(build.conf_folder() / "experiment" / "tune.yaml").tuning.spaces
+    spaces = OmegaConf.load(build_config.conf_folder() / "experiment" / "tune.yaml").tuning.spaces
     assert set(spaces) == set(ATTACKS)
     for name in ATTACKS:
-        group = build.load_choice("synthesizer", name)
+        group = build_config.load_choice("synthesizer", name)
         present = flat(OmegaConf.to_container(group))
         for parameter, (low, high, *_) in spaces[name].items():
             assert low <= present[parameter] <= high, f"{name}.{parameter}"
@@ -142,7 +142,7 @@ def test_every_attack_has_a_range_round_its_present_values():
 
 
 def config_of(*overrides):
-    config = build.load_config("evaluate", ["seeds=[0]", "processes=1", "methods=[nominal]", *overrides])
+    config = build_config.load_config("evaluate", ["seeds=[0]", "processes=1", "methods=[nominal]", *overrides])
     tuning = {"group": "synthesizer", "trials": 2, "startup": 1, "seed": 0, "ladder": 1, "space": {"gain": [0.0, 1.0]}}
     config.tuning = OmegaConf.create(tuning)
     return config

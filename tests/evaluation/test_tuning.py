@@ -8,11 +8,10 @@ import os
 import pytest
 from omegaconf import OmegaConf
 
-from e2rl.errors import InputError
 from e2rl.evaluation import tuning
-from e2rl.evaluation.kept import Kept
-from e2rl.evaluation.objective import Objective
-from e2rl.evaluation.tuning import TuneSettings, ladder, tune, yaml_of
+from e2rl.evaluation.tuning import Objective, TuneSettings, ladder, tune, yaml_of
+from e2rl.run.errors import InputError
+from e2rl.run.parts import Kept
 from tests.evaluation.tuned_road import PRESENT, SPACE, quiet, road
 
 

@@ -1,7 +1,6 @@
 """A planner's tuning problem with a known answer, in closed form."""
 
-from e2rl.evaluation.objective import Objective
-from e2rl.evaluation.tuning import tune
+from e2rl.evaluation.tuning import Objective, tune
 
 SPACE = {"speed": [0.0, 20.0], "caution": [1.0, 3.0]}
 PRESENT = {"speed": 10.0, "caution": 1.0, "other": "kept"}

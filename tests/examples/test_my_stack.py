@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import e2rl
-from e2rl.scene.recording import DT
+from e2rl.scenes.recording import DT
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"

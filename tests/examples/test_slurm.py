@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from e2rl.errors import InputError
 from e2rl.report.merge import main, merge
+from e2rl.run.errors import InputError
 from tests.evaluation.test_protocol import same_runs
 from tests.scripts import SHORT, call
 

@@ -2,11 +2,11 @@
 
 import torch
 
-from e2rl.ego.actor import ActorEgo
-from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
 from e2rl.learning.evolution import Evolution, RoundSettings
 from e2rl.learning.memory import Memory
 from e2rl.learning.policy import PolicyImprovement
+from e2rl.learning.schedules import AdaptiveCurriculum
+from e2rl.planners.actor import ActorEgo
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.traffic import Traffic, TrafficPlan, keep_velocity
 from tests.synthetic import make_scenes

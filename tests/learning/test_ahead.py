@@ -7,11 +7,12 @@ import time
 import pytest
 import torch
 
-from e2rl.build import build_ego, load_config
-from e2rl.errors import InputError
+from e2rl.evaluation.methods import build_ego
 from e2rl.learning.attack import make_traffic
 from e2rl.learning.build import build_evolution
-from e2rl.learning.checkpoint import load_checkpoint, save_checkpoint
+from e2rl.learning.run_checkpoint import load_checkpoint, save_checkpoint
+from e2rl.run.config import load_config
+from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.rollout import synthesize_traffic
 from tests.learning.small import Ambush, brake_check, small_run, small_scenes

@@ -4,17 +4,16 @@ rows, the round goes on, and the reasons are counted."""
 import pytest
 import torch
 
-from e2rl.ego.idm import IDMEgo
-from e2rl.errors import InputError
-from e2rl.learning.attack import ATTACK, NOMINAL, Order, counted, ended_of, make_traffic
-from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
+from e2rl.learning.attack import ATTACK, NOMINAL, Order, counted, ended_of, make_traffic, unsearched
 from e2rl.learning.evolution import Evolution, RoundSettings
-from e2rl.learning.planner import PlannerImprovement
-from e2rl.learning.solvability import unsearched
+from e2rl.learning.planner_tuning import PlannerImprovement
+from e2rl.learning.schedules import AdaptiveCurriculum
+from e2rl.planners.idm_planner import IDMEgo
 from e2rl.report.rounds import round_line
+from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.rollout import synthesize_traffic
-from e2rl.traffic.template import FULL
+from e2rl.traffic.traffic import FULL
 from tests.learning.small import Ambush, brake_check, small_run, small_scenes
 
 SCENES = torch.tensor([3, 0, 4, 1, 2])

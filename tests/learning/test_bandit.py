@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from e2rl.errors import InputError
-from e2rl.learning.curriculum.bandit import BanditCurriculum
-from e2rl.learning.curriculum.outcomes import Outcomes, outcomes_of, tally
-from e2rl.traffic.template import FULL, PAIR, SINGLE, TEMPLATES
+from e2rl.learning.bandit import BanditCurriculum
+from e2rl.learning.scheduler import Outcomes, outcomes_of, tally
+from e2rl.run.errors import InputError
+from e2rl.traffic.traffic import FULL, PAIR, SINGLE, TEMPLATES
 
 ETAS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 

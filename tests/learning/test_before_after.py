@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from e2rl.ego.idm import IDMEgo
-from e2rl.evaluation.files import METRICS_FILE, read_metrics
 from e2rl.evaluation.protocol import Method, Setup
+from e2rl.evaluation.rollout_files import METRICS_FILE, read_metrics
 from e2rl.learning.before_after import BeforeAfter
+from e2rl.planners.idm_planner import IDMEgo
 from e2rl.sim.env import SimSettings
-from e2rl.traffic.constant_velocity import ConstantVelocity
+from e2rl.traffic.rule_based import ConstantVelocity
 from tests.learning.small import Ambush, small_scenes
 
 

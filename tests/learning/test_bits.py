@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from e2rl.build import load_config
-from e2rl.ego.bits import observed
-from e2rl.ego.bits_network import BitsNetwork, drive_controls, load_bits
-from e2rl.ego.path import RoutePath
-from e2rl.errors import InputError
-from e2rl.learning.bits import BitsSettings, BitsTraining, as_ego, losses, train_bits, windows, world_at
+from e2rl.learning.bits_training import BitsSettings, BitsTraining, as_ego, losses, train_bits, windows, world_at
 from e2rl.learning.build import build_logger, run_bits
+from e2rl.planners.bits import observed
+from e2rl.planners.bits_network import BitsNetwork, drive_controls, load_bits
+from e2rl.planners.path import RoutePath
+from e2rl.run.config import load_config
+from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.observation import ELAPSED
 from tests.learning.small import small_scenes

@@ -3,17 +3,16 @@
 import pytest
 from omegaconf import open_dict
 
-from e2rl.build import build_ego, choices, load_config
-from e2rl.errors import InputError
+from e2rl.evaluation.methods import build_ego
+from e2rl.learning.bandit import BanditCurriculum
 from e2rl.learning.build import build_evolution, build_logger, run_imitation
-from e2rl.learning.checkpoint import load_checkpoint, save_checkpoint
-from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
-from e2rl.learning.curriculum.bandit import BanditCurriculum
-from e2rl.learning.curriculum.constant import ConstantCurriculum
-from e2rl.learning.curriculum.linear import LinearCurriculum
-from e2rl.learning.curriculum.scheduler import CurriculumScheduler
-from e2rl.learning.planner import PlannerImprovement
+from e2rl.learning.planner_tuning import PlannerImprovement
 from e2rl.learning.policy import PolicyImprovement
+from e2rl.learning.run_checkpoint import load_checkpoint, save_checkpoint
+from e2rl.learning.scheduler import CurriculumScheduler
+from e2rl.learning.schedules import AdaptiveCurriculum, ConstantCurriculum, LinearCurriculum
+from e2rl.run.config import choices, load_config
+from e2rl.run.errors import InputError
 from tests.learning.small import Ambush, brake_check, small_scenes
 
 CURRICULA = {"adaptive": AdaptiveCurriculum, "linear": LinearCurriculum, "constant": ConstantCurriculum}
@@ -130,7 +129,7 @@ def test_mismatched_groups_are_refused(tmp_path):
         run_imitation(config, scenes, build_ego(config), tmp_path)
     with pytest.raises(InputError, match="improves ego=actor"):
         built(config_of("ego=idm"))
-    for group, target in (("learner", "e2rl.ego.idm.IDMEgo"), ("curriculum", "e2rl.no.Such")):
+    for group, target in (("learner", "e2rl.planners.idm_planner.IDMEgo"), ("curriculum", "e2rl.no.Such")):
         with pytest.raises(InputError, match=f"{group}={target}"):
             built(config_of(f"{group}._target_={target}", *POLICY))
     with pytest.raises(InputError, match="curriculum"):

@@ -6,15 +6,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from e2rl.ego.actor import ActorEgo
-from e2rl.ego.idm import IDMEgo
-from e2rl.errors import InputError
-from e2rl.files import SEAL, altered, seal
-from e2rl.learning.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
-from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
 from e2rl.learning.evolution import Evolution, RoundSettings
 from e2rl.learning.memory import Memory
-from e2rl.learning.planner import PlannerImprovement
+from e2rl.learning.planner_tuning import PlannerImprovement
+from e2rl.learning.run_checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
+from e2rl.learning.schedules import AdaptiveCurriculum
+from e2rl.planners.actor import ActorEgo
+from e2rl.planners.idm_planner import IDMEgo
+from e2rl.run.errors import InputError
+from e2rl.run.files import SEAL, altered, seal
 from e2rl.sim.env import SimSettings
 from tests.learning.small import Ambush, brake_check, small_run, small_scenes
 

@@ -5,10 +5,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import BCLoss
 
-from e2rl.ego.actor import ActorEgo
 from e2rl.learning.cloning import LABEL_WIDTH, cloning_loss, drawn, mirrored_pairs, teaching_loss
-from e2rl.sim.mirror import mirrored
-from e2rl.sim.observation import OBSERVATION_SIZE
+from e2rl.planners.actor import ActorEgo
+from e2rl.sim.observation import OBSERVATION_SIZE, mirrored
 
 
 def network():

@@ -3,12 +3,10 @@
 import pytest
 import torch
 
-from e2rl.errors import InputError
-from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
-from e2rl.learning.curriculum.constant import ConstantCurriculum
-from e2rl.learning.curriculum.linear import LinearCurriculum
-from e2rl.learning.curriculum.scheduler import ranks
-from e2rl.traffic.template import FULL
+from e2rl.learning.scheduler import ranks
+from e2rl.learning.schedules import AdaptiveCurriculum, ConstantCurriculum, LinearCurriculum
+from e2rl.run.errors import InputError
+from e2rl.traffic.traffic import FULL
 
 
 def scheduler(kind=AdaptiveCurriculum, num_scenes=6, rounds=10, **settings):

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from e2rl.ego.idm import IDMEgo
 from e2rl.learning.driving import PoolDriver, episodes_of
+from e2rl.planners.idm_planner import IDMEgo
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.pool import TrafficPool
 from tests.learning.small import brake_check, small_scenes

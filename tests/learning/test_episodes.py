@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from e2rl.learning.episodes import finished_episodes
+from e2rl.learning.driving import finished_episodes
 from e2rl.traffic.pool import TrafficPool
 from tests.learning.small import brake_check, small_run, small_scenes
 

@@ -6,18 +6,17 @@ import math
 import pytest
 import torch
 
-from e2rl.ego.idm import IDMEgo
-from e2rl.ego.lane_graph import LaneGraphEgo
-from e2rl.errors import InputError
-from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
-from e2rl.learning.curriculum.bandit import BanditCurriculum
+from e2rl.learning.bandit import BanditCurriculum
 from e2rl.learning.evolution import Evolution, RoundSettings
 from e2rl.learning.logging import GROUPS
-from e2rl.learning.planner import PlannerImprovement
+from e2rl.learning.planner_tuning import PlannerImprovement
 from e2rl.learning.policy import PolicyImprovement
+from e2rl.learning.schedules import AdaptiveCurriculum
+from e2rl.planners.idm_planner import IDMEgo
+from e2rl.planners.lane_graph_planner import LaneGraphEgo
+from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings
-from e2rl.traffic.template import CHAIN, FULL, PAIR
-from e2rl.traffic.traffic import keep_velocity
+from e2rl.traffic.traffic import CHAIN, FULL, PAIR, keep_velocity
 from tests.learning.small import Ambush, brake_check, small_run, small_scenes
 
 

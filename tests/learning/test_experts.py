@@ -3,12 +3,11 @@
 import pytest
 import torch
 
-from e2rl.ego.actor import ActorEgo
-from e2rl.learning.attack import Order, make_traffic
-from e2rl.learning.checkpoint import load_checkpoint, save_checkpoint
+from e2rl.learning.attack import Order, Solved, make_traffic, solvable
 from e2rl.learning.driving import PoolDriver, episodes_of
 from e2rl.learning.experts import Experts, GivenActions, evasion_pairs
-from e2rl.learning.solvability import Solved, solvable
+from e2rl.learning.run_checkpoint import load_checkpoint, save_checkpoint
+from e2rl.planners.actor import ActorEgo
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.pool import TrafficPool
 from tests.learning.small import brake_check, small_run, small_scenes

@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from e2rl.ego.actor import ActorEgo
-from e2rl.ego.reference import executed_action
-from e2rl.evaluation.kept import Kept
 from e2rl.learning.cloning import clip_expert
 from e2rl.learning.imitation import Imitation, ImitationSettings, imitate, recorded_pairs
 from e2rl.learning.logging import RunLogger
+from e2rl.planners.actor import ActorEgo
+from e2rl.planners.reference import executed_action
+from e2rl.run.parts import Kept
 from e2rl.sim.env import SimSettings
 from tests.learning.small import small_scenes
 

@@ -3,8 +3,8 @@
 import pytest
 from PIL import Image
 
-from e2rl.errors import InputError
 from e2rl.learning.logging import RunLogger
+from e2rl.run.errors import InputError
 
 
 def test_csv_rows_go_on_after_a_resume(tmp_path):

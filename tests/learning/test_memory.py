@@ -7,11 +7,10 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from e2rl.errors import InputError
-from e2rl.learning.attack import Order, make_traffic
+from e2rl.learning.attack import Order, Solved, make_traffic
 from e2rl.learning.memory import Memory
-from e2rl.learning.solvability import Solved
-from e2rl.traffic.template import CHAIN, FULL, PAIR, SINGLE
+from e2rl.run.errors import InputError
+from e2rl.traffic.traffic import CHAIN, FULL, PAIR, SINGLE
 from tests.learning.small import brake_check, small_run, small_scenes
 
 STATUS = Path("/proc/self/status")

@@ -2,7 +2,7 @@
 
 import torch
 
-from e2rl.learning.mixture import drawn, mixture
+from e2rl.learning.attack import drawn, mixture
 
 SCENES = torch.tensor([3, 0, 4, 1, 2, 9, 7])
 

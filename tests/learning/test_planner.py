@@ -2,9 +2,9 @@
 
 import pytest
 
-from e2rl.errors import InputError
-from e2rl.evaluation.objective import Objective
-from e2rl.learning.planner import combinations, tune
+from e2rl.evaluation.tuning import Objective
+from e2rl.learning.planner_tuning import combinations, tune
+from e2rl.run.errors import InputError
 
 PRESENT = {"speed": 10.0, "caution": 1.0, "other": "kept"}
 

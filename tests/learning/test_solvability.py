@@ -4,8 +4,8 @@ from functools import partial
 
 import torch
 
-from e2rl.learning.solvability import AFTER, LATE, acting, solvable, unsearched
-from e2rl.scene.boxes import separation
+from e2rl.learning.attack import AFTER, LATE, acting, solvable, unsearched
+from e2rl.scenes.boxes import separation
 from e2rl.sim import dynamics
 from e2rl.sim.env import SimSettings
 from tests.learning.small import brake_check, small_run, small_scenes

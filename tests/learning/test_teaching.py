@@ -4,15 +4,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from e2rl.ego.actor import ActorEgo
-from e2rl.ego.idm import IDMEgo
-from e2rl.ego.ranking import ranked_actions
-from e2rl.ego.sampling import SamplingEgo
-from e2rl.errors import InputError
-from e2rl.learning.checkpoint import load_checkpoint, save_checkpoint
 from e2rl.learning.cloning import clip_expert
-from e2rl.learning.curriculum.constant import ConstantCurriculum
+from e2rl.learning.run_checkpoint import load_checkpoint, save_checkpoint
+from e2rl.learning.schedules import ConstantCurriculum
 from e2rl.learning.teaching import Teacher, critical
+from e2rl.planners.actor import ActorEgo
+from e2rl.planners.idm_planner import IDMEgo
+from e2rl.planners.sampling import SamplingEgo, ranked_actions
+from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.observation import OBSERVATION_SIZE
 from e2rl.traffic.pool import TrafficPool

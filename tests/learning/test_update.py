@@ -8,12 +8,11 @@ from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives.value import GAE
 
-from e2rl.ego.actor import ActorEgo
-from e2rl.errors import InputError
 from e2rl.learning.update import Learner, UpdateSettings, gentle_loss
+from e2rl.planners.actor import ActorEgo
+from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.sim.mirror import mirrored
-from e2rl.sim.observation import OBSERVATION_SIZE
+from e2rl.sim.observation import OBSERVATION_SIZE, mirrored
 from tests.learning.small import small_scenes
 
 

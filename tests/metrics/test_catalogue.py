@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from e2rl.evaluation.files import Source, label_rows, read_rows, table_columns, write_rows
+from e2rl.evaluation.rollout_files import Source, label_rows, read_rows, table_columns, write_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.catalogue import METRICS, TABLES, Metric, register, row_columns, table_metrics, unregister
 from e2rl.metrics.score import score_rollouts

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from e2rl.metrics.geometry import EDGES, edge_distances, edge_parts_inside, overlap_area, pair_overlap
-from e2rl.scene.boxes import corners
+from e2rl.scenes.boxes import corners
 
 shapely = pytest.importorskip("shapely")
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from e2rl.metrics.meta_features import (
+from e2rl.metrics.meta_metric import (
     FAR,
     TTC_CAP,
     beyond_road,
@@ -16,7 +16,7 @@ from e2rl.metrics.meta_features import (
     time_to_collision,
     track_features,
 )
-from e2rl.scene.recording import DT, LIGHT_RED
+from e2rl.scenes.recording import DT, LIGHT_RED
 from tests.metrics.random_rollouts import random_rollouts
 
 CAR = (4.0, 2.0)
@@ -68,7 +68,7 @@ def test_central_differences_are_exact_for_parabolas_and_need_both_neighbours():
 def minkowski_distance(one, one_size, other, other_size):
     """Signed distance of two boxes: of the origin from the border of their Minkowski difference."""
     geometry = pytest.importorskip("shapely.geometry")
-    from e2rl.scene.boxes import corners
+    from e2rl.scenes.boxes import corners
 
     differences = corners(one, one_size)[:, None] - corners(other, other_size)[None]
     hull = geometry.MultiPoint(differences.reshape(-1, 2).tolist()).convex_hull

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from e2rl.metrics.broad_phase import candidates
+from e2rl.metrics.geometry import candidates
 from e2rl.metrics.off_road import LANE_CELL, MARGIN, inside_polygon, line_segments, near_lane, off_road_columns
 from tests.metrics.random_rollouts import random_map
 from tests.metrics.test_contact import course, row

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from e2rl.evaluation.files import Source, label_rows, write_rollouts, write_rows
+from e2rl.evaluation.rollout_files import Source, label_rows, write_rollouts, write_rows
 from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollouts
 from e2rl.metrics.catalogue import MAIN
 from e2rl.metrics.score import score_rollouts

@@ -2,8 +2,8 @@
 
 import torch
 
+from e2rl.metrics.proximity import MOVED, moved, standing_columns
 from e2rl.metrics.score import score_rollouts
-from e2rl.metrics.standing import MOVED, moved, standing_columns
 from tests.metrics.random_rollouts import random_rollouts
 
 PARKED_STAYS, PARKED_MOVES, STANDS, STARTS, STARTS_IN_LOG, DRIVES, LATE = range(1, 8)

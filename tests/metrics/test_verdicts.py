@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from e2rl.metrics.score import score_rollouts
-from e2rl.verdicts.duty import DUTIES
+from e2rl.metrics.verdicts import DUTIES
 from tests.metrics.random_rollouts import random_rollouts
 from tests.metrics.test_failure_features import course, scene
 

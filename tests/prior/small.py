@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.lane_relative import LaneState, locate
 from e2rl.prior.prior import Prior
-from e2rl.scene.route import SPACING, interpolate
+from e2rl.scenes.route import SPACING, interpolate
 from tests.synthetic import make_scenes
 
 

@@ -8,7 +8,7 @@ import torch
 from e2rl.prior import lane_relative
 from e2rl.prior.bounds import MIN_BRAKING, NO_CAP, STRIDE, BoundSettings, Duty, Obstacles, acceleration_caps, bounded
 from e2rl.prior.lane_relative import SIZE, locate
-from e2rl.scene.recording import DT
+from e2rl.scenes.recording import DT
 from tests.prior.small import arc
 
 CAR = (4.0, 2.0)

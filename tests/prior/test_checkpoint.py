@@ -7,10 +7,10 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from e2rl.errors import InputError
 from e2rl.prior.checkpoint import load_prior, save_prior
 from e2rl.prior.prior import SamplerSettings
-from e2rl.weights import HASH
+from e2rl.run.errors import InputError
+from e2rl.run.files import HASH
 from tests.prior.small import small_prior
 
 

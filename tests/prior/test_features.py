@@ -7,7 +7,7 @@ import torch
 
 from e2rl.prior.features import EDGE, NODE, SIDED_EDGE, SIDED_NODE, curve_speed, edge_features, node_features
 from e2rl.prior.lane_relative import locate
-from e2rl.prior.routed import route_scene
+from e2rl.prior.routes import route_scene
 from tests.prior.small import arc, curved_scenes, mirrored, moved
 
 

@@ -6,7 +6,7 @@ import torch
 from e2rl.prior.bounds import BoundSettings, Duty
 from e2rl.prior.lane_relative import HORIZON, SIZE, decode
 from e2rl.prior.prior import Prior, SamplerSettings, plan_to_x
-from e2rl.prior.route_choice import sample_route
+from e2rl.prior.routes import sample_route
 from tests.prior.small import VEHICLES, arc, curved_scenes, small_prior
 
 FREE = BoundSettings(meeting=False, curve=False)

@@ -4,8 +4,8 @@ from dataclasses import fields
 
 import torch
 
-from e2rl.prior.routed import reroute, route_scene
-from tests.synthesizer.crossing import add_route, make_world, mask
+from e2rl.prior.routes import reroute, route_scene
+from tests.traffic.e2.crossing import add_route, make_world, mask
 
 UP = 1.5708
 VEHICLES = [(0.0, 0.0, 0.0, 10.0), (40.0, -30.0, UP, 8.0), (20.0, 3.5, 0.0, 9.0), (-20.0, 0.0, 0.0, 9.0)]

@@ -5,10 +5,10 @@ import dataclasses
 import pytest
 import torch
 
-from e2rl.errors import InputError
 from e2rl.prior.prior import SamplerSettings
 from e2rl.prior.sde import SAMPLERS, path_kl, reverse_step
-from e2rl.synthesizer.control import gradient_weight
+from e2rl.run.errors import InputError
+from e2rl.traffic.e2.control import gradient_weight
 from tests.prior.gaussian import SCHEDULE, denoiser, flow, moments, run
 
 MEAN, STD, WEIGHT = 1.3, 0.4, 5.0  # data N(1.3, 0.4^2) and V = WEIGHT x^2 / 2

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import torch
 
-from e2rl.evaluation.files import ROLLOUTS, Source, label_rows, write_rollouts
 from e2rl.evaluation.protocol import record
+from e2rl.evaluation.rollout_files import ROLLOUTS, Source, label_rows, write_rollouts
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
 from e2rl.report.tables import metric_tables, save_tables

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from e2rl.errors import InputError
-from e2rl.learning.curriculum.outcomes import COLUMNS
 from e2rl.learning.logging import CHOICES, RunLogger, write_choices
-from e2rl.report.curriculum import PICTURE, choice_map, draw_choices, grids
+from e2rl.learning.scheduler import COLUMNS
+from e2rl.report.curriculum_figure import PICTURE, choice_map, draw_choices, grids
 from e2rl.report.drawing import image_of
+from e2rl.run.errors import InputError
 
 NAN = math.nan
 

@@ -9,9 +9,9 @@ import torch
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from e2rl.errors import InputError
-from e2rl.evaluation.files import write_metrics
+from e2rl.evaluation.rollout_files import write_metrics
 from e2rl.report.curves import by_method, colour_of, main, points_of_rows, points_of_tuning, read_points
+from e2rl.run.errors import InputError
 from tests.report.test_tuning import trial
 
 MEASURED = {"aor_step": 0.001, "cfr_bg": 0.02, "real": 0.9, "passes": 640.0}

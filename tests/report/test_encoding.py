@@ -5,7 +5,7 @@ import zlib
 
 import numpy as np
 
-from e2rl.report.encoding import encode, quantised, second_difference
+from e2rl.report.failure_tracks import encode, quantised, second_difference
 
 
 def decoded(text: str) -> np.ndarray:

@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from e2rl.evaluation.files import Source, write_rollouts
+from e2rl.evaluation.rollout_files import Source, write_rollouts
 from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollout
+from e2rl.metrics.preventable import AFTER
 from e2rl.metrics.score import score_rollouts
 from e2rl.report.failure_tracks import CHANNELS, encoded_map, failure_replay
-from e2rl.verdicts.preventable import AFTER
 from tests.metrics.random_rollouts import random_rollouts
 from tests.metrics.test_contact import course, scene
 from tests.report.failed_run import planned

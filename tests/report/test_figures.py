@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from e2rl.evaluation.files import Source, write_rollouts
+from e2rl.evaluation.rollout_files import Source, write_rollouts
 from e2rl.report import drawing
 from e2rl.report.intensity import GAP, intensity_figure
 from e2rl.report.picture import SIDE
-from e2rl.report.replay import load_replay
-from e2rl.report.skeleton import SkeletonPicture, skeleton_figure
-from e2rl.synthesizer.selection import Selection
-from e2rl.synthesizer.topology import TopologySettings, pair_weights
+from e2rl.report.skeleton_figure import SkeletonPicture, skeleton_figure
+from e2rl.report.videos import load_replay
+from e2rl.traffic.e2.skeleton import Selection
+from e2rl.traffic.e2.topology import TopologySettings, pair_weights
 from tests.metrics.test_contact import course, scene
 from tests.report.pixels import pixel_at, rgb
 

@@ -6,8 +6,8 @@ import shlex
 
 import pytest
 
-from e2rl.evaluation.files import read_rows
 from e2rl.evaluation.modes import read_modes
+from e2rl.evaluation.rollout_files import read_rows
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report import html
 from e2rl.report.tables import read_tables

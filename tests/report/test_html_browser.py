@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from e2rl.evaluation.files import ROLLOUTS, TABLE, read_rows, rollout_name
+from e2rl.evaluation.rollout_files import ROLLOUTS, TABLE, read_rows, rollout_name
 from e2rl.evaluation.rollout_reader import read_rollout
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report import html

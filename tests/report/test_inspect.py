@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from e2rl.scripts.inspect import main
 from PIL import Image
 
 from e2rl.report import drawing
-from e2rl.report.inspect import main
 from tests.report.pixels import rgb
-from tests.scene.descriptions import ALL, description, straight, write_folder
+from tests.scenes.descriptions import ALL, description, straight, write_folder
 
 
 def run(*arguments, capsys) -> str:

@@ -4,10 +4,10 @@ import csv
 
 import pytest
 
-from e2rl.evaluation.files import Source, label_rows
+from e2rl.evaluation.rollout_files import Source, label_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
-from e2rl.report.methods import EGOS, method_tables, planner_tables, save_compared
+from e2rl.report.comparison_tables import EGOS, method_tables, planner_tables, save_compared
 from e2rl.report.tables import escaped
 from tests.metrics.random_rollouts import random_rollouts
 

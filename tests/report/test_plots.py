@@ -2,10 +2,10 @@
 
 import pytest
 
-from e2rl.errors import InputError
 from e2rl.learning.logging import RunLogger
 from e2rl.report.drawing import image_of
 from e2rl.report.plots import learning_curves, read_curves
+from e2rl.run.errors import InputError
 
 
 def logged(folder, rounds):

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from e2rl.evaluation.files import Source, label_rows, write_rollouts, write_rows
+from e2rl.evaluation.rollout_files import Source, label_rows, write_rollouts, write_rows
 from e2rl.metrics.score import score_rollouts
-from e2rl.report import drawing, picture, replay
+from e2rl.report import drawing, picture
+from e2rl.report import videos as replay
 from e2rl.report.drawing import TrafficMap, image_of, new_panels
 from tests.metrics.random_rollouts import random_rollouts
 from tests.metrics.test_contact import course, scene

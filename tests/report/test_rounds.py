@@ -4,8 +4,8 @@ import pytest
 import torch
 from PIL import Image
 
-from e2rl.learning.curriculum.adaptive import AdaptiveCurriculum
 from e2rl.learning.logging import RunLogger
+from e2rl.learning.schedules import AdaptiveCurriculum
 from e2rl.metrics.contact import first_contact
 from e2rl.report.rounds import draw_round, hits, replay_of, round_line
 from tests.learning.small import small_run, small_scenes

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from e2rl.evaluation.files import Source, label_rows
+from e2rl.evaluation.rollout_files import Source, label_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.catalogue import MAIN, TABLES
 from e2rl.metrics.score import score_rollouts

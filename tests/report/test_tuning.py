@@ -5,7 +5,7 @@ import math
 
 from PIL import Image
 
-from e2rl.report.tuning import on_curve, save_tuning_curve
+from e2rl.report.tuning_curve import on_curve, save_tuning_curve
 
 
 def trial(gain, step, cfr, admissible=True, realism=0.8):

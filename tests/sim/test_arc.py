@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from e2rl.scene.recording import DT
+from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
-from e2rl.sim.arc import Arc, along_arc
+from e2rl.sim.dynamics import Arc, along_arc
 
 
 def test_an_arc_is_the_unicycle_s_motion_at_constant_acceleration_and_curvature():

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from e2rl.sim.car_following import IDMParameters, desired_gap, idm_acceleration
+from e2rl.sim.leaders import IDMParameters, desired_gap, idm_acceleration
 
 DRIVER = IDMParameters(headway=1.0, standstill_gap=5.0, acceleration=1.0, braking=3.0)
 

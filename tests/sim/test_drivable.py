@@ -2,7 +2,7 @@
 
 import torch
 
-from e2rl.sim.drivable import FAR, off_road
+from e2rl.scenes.drivable_area import FAR, off_road
 from tests.synthetic import LANE_WIDTH, make_scenes
 
 

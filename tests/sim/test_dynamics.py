@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from e2rl.scene.recording import DT
+from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
 
 

@@ -9,8 +9,8 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Transform
 from torchrl.envs.utils import check_env_specs
 
-from e2rl.errors import InputError
-from e2rl.scene.recording import DT
+from e2rl.run.errors import InputError
+from e2rl.scenes.recording import DT
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.world import World
 from tests.synthetic import make_scenes

@@ -5,10 +5,9 @@ import torch
 
 from e2rl.metrics.contact import KINDS, first_contact
 from e2rl.metrics.fault import at_fault
-from e2rl.scene.recording import VEHICLE
-from e2rl.sim.fault import own_fault
-from e2rl.sim.neighbours import neighbours_of, rotation_into
-from e2rl.sim.trajectories import Agents
+from e2rl.scenes.recording import VEHICLE
+from e2rl.sim.neighbours import neighbours_of, own_fault, rotation_into
+from e2rl.sim.world import Agents
 
 SIZE = torch.tensor([[4.0, 2.0]])
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from e2rl.scene.route import project
+from e2rl.scenes.route import project
 from e2rl.sim.leaders import FREE_GAP, leaders
 from tests.prior.small import arc
 

@@ -4,7 +4,7 @@ import torch
 
 import e2rl
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.sim.mirror import mirrored
+from e2rl.sim.observation import mirrored
 
 
 def observations(scenes, actions):

@@ -2,8 +2,7 @@
 
 import torch
 
-from e2rl.sim.mission import limit_at, mission_of, stop_ahead
-from e2rl.sim.traffic_light import light_state_at
+from e2rl.sim.mission import light_state_at, limit_at, mission_of, stop_ahead
 from tests.synthetic import BACK, make_scenes
 
 

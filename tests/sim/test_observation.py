@@ -2,14 +2,14 @@
 
 import torch
 
-from e2rl.scene.recording import LIGHT_GREEN, LIGHT_RED
-from e2rl.scene.scene import SceneSet
+from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED
+from e2rl.scenes.scene import SceneSet
 from e2rl.sim import observation as sight
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.mission import mission_of
 from e2rl.sim.observation import light_features, observation_config
 from e2rl.sim.static import static_scene
-from e2rl.sim.trajectories import Agents
+from e2rl.sim.world import Agents
 from tests.synthetic import make_scenes
 
 

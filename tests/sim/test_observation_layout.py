@@ -6,10 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from e2rl.ego import reference
+from e2rl.planners import reference
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.sim.observation import ELAPSED, OBSERVATION_SIZE
-from e2rl.sim.observation_layout import observation_layout
+from e2rl.sim.observation import ELAPSED, OBSERVATION_SIZE, observation_layout
 from tests.synthetic import LANE_WIDTH, make_scenes
 
 PAGE = Path(__file__).parents[2] / "docs" / "observation.md"

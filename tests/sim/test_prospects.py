@@ -4,7 +4,7 @@ import pytest
 import shapely
 import torch
 
-from e2rl.sim.arc import Arc, along_arc
+from e2rl.sim.dynamics import Arc, along_arc
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.prospects import TIGHT, TIMES, Others, gaps, time_to_contact, travelled
 from tests.synthetic import make_scenes

@@ -2,12 +2,12 @@
 
 import torch
 
-from e2rl.scene.boxes import separation, to_frame
-from e2rl.scene.route import SPACING, interpolate, project
+from e2rl.scenes.boxes import separation, to_frame
+from e2rl.scenes.route import SPACING, interpolate, project
 from e2rl.sim.mission import Mission, limit_at, mission_of
 from e2rl.sim.neighbours import neighbours_of, rotation_into
 from e2rl.sim.static import follow, look_along, static_scene, write_rows
-from e2rl.sim.trajectories import Agents
+from e2rl.sim.world import Agents
 from tests.synthetic import make_scenes
 
 BATCH, COUNT = 64, 60

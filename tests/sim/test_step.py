@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from e2rl.errors import InputError
+from e2rl.run.errors import InputError
 from e2rl.sim import env
 from e2rl.sim.env import DrivingEnv, SimSettings
 from tests.synthetic import make_scenes

@@ -2,8 +2,8 @@
 
 import torch
 
-from e2rl.scene.recording import LIGHT_GREEN, LIGHT_RED
-from e2rl.sim.traffic_light import ran_red
+from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED
+from e2rl.sim.mission import ran_red
 
 
 def test_a_line_is_run_at_the_step_at_which_the_front_passes_it_at_red():

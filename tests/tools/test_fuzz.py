@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from e2rl.errors import InputError
+from e2rl.run.errors import InputError
 from tools.fuzz import READERS as NAMES
 from tools.fuzz import __main__ as fuzz
 from tools.fuzz import child, damage, logs, messages, runs

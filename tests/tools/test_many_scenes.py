@@ -2,7 +2,7 @@
 
 import re
 
-from tests.scene.descriptions import description, numbered, straight, write_folder
+from tests.scenes.descriptions import description, numbered, straight, write_folder
 from tools import many_scenes
 
 

@@ -6,9 +6,9 @@ import warnings
 import numpy as np
 import pytest
 
-from e2rl.scene.bundled import load_recordings
-from e2rl.scene.scenarionet import ScenarioNetSource, recording_of
-from tests.scene.test_argoverse2 import write_scenario, write_sensor_log
+from e2rl.scenes.bundled import load_recordings
+from e2rl.scenes.scenarionet import ScenarioNetSource, recording_of
+from tests.scenes.test_argoverse2 import write_scenario, write_sensor_log
 from tools.fuzz.corpus import description
 from tools.mutate import __main__ as mutate
 from tools.mutate import formats
@@ -65,7 +65,7 @@ def test_what_must_be_refused_is_and_what_may_be_is_read(log, name, reason):
 
 @pytest.mark.parametrize("kind", [ScenarioLog, SensorLog])
 def test_argoverse_logs_are_written_in_their_own_form(tmp_path, kind):
-    from tests.scene.test_argoverse2 import Argoverse2Source
+    from tests.scenes.test_argoverse2 import Argoverse2Source
 
     root = write_scenario(tmp_path / "all") if kind is ScenarioLog else write_sensor_log(tmp_path / "all")
     source = source_of(str(root))

@@ -6,11 +6,10 @@ import math
 import pytest
 import torch
 
-from e2rl.synthesizer.feasibility import FeasibilitySettings
-from e2rl.synthesizer.prompt import CRITERIA
-from e2rl.synthesizer.reasoner import LanguageReasoner, ReasonerSettings
-from tests.synthesizer.chat_server import asked, chat_server
-from tests.synthesizer.traffic_scenes import scenes
+from e2rl.traffic.e2.feasibility import FeasibilitySettings
+from e2rl.traffic.e2.reasoner import CRITERIA, LanguageReasoner, ReasonerSettings
+from tests.traffic.e2.chat_server import asked, chat_server
+from tests.traffic.e2.traffic_scenes import scenes
 from tools.reasoner_agreement import Agreement, agreement_table, measure_agreement
 
 

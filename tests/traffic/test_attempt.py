@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from e2rl.ego.base import PlannerError
-from e2rl.errors import InputError
+from e2rl.planners.ego import PlannerError
+from e2rl.run.errors import InputError
 from e2rl.traffic.attempt import NOT_FINITE, attempt, summary_of
 
 

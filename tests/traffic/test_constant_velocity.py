@@ -2,11 +2,11 @@
 
 import torch
 
-from e2rl.scene.recording import DT
-from e2rl.traffic.constant_velocity import ConstantVelocity
+from e2rl.scenes.recording import DT
+from e2rl.traffic.rule_based import ConstantVelocity
 from e2rl.traffic.traffic import keep_velocity
 from tests.prior.small import VEHICLES, curved_scenes, moved
-from tests.synthesizer.traffic_scenes import drive, replanned, scenes
+from tests.traffic.e2.traffic_scenes import drive, replanned, scenes
 
 
 def test_everybody_goes_straight_on_for_the_whole_rollout_and_nobody_leaves():

@@ -7,7 +7,7 @@ from tensordict import TensorDict
 
 from e2rl.sim.world import World
 from e2rl.traffic.grouping import ROWS, SHRUNK, clone, crop_state, crop_world, group_scenes, write_state
-from tests.synthesizer.traffic_scenes import begin, scenes, synthesizer
+from tests.traffic.e2.traffic_scenes import begin, scenes, synthesizer
 
 WIDTH, AGENTS = 32, 40
 

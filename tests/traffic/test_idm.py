@@ -8,14 +8,14 @@ import torch
 from e2rl.prior import bounds as bounds_module
 from e2rl.prior.bounds import NO_CAP, BoundSettings, acceleration_caps
 from e2rl.prior.lane_relative import HORIZON
-from e2rl.scene.recording import DT, LIGHT_RED, LIGHT_YELLOW
+from e2rl.scenes.recording import DT, LIGHT_RED, LIGHT_YELLOW
 from e2rl.sim.world import World
-from e2rl.traffic import idm as idm_module
-from e2rl.traffic.idm import IDM
+from e2rl.traffic import rule_based as idm_module
+from e2rl.traffic.rule_based import IDM
 from tests.prior.small import curved_scenes, small_prior
-from tests.synthesizer.crossing import make_world
-from tests.synthesizer.traffic_scenes import ROWS, begin, drive
 from tests.synthetic import make_scenes
+from tests.traffic.e2.crossing import make_world
+from tests.traffic.e2.traffic_scenes import ROWS, begin, drive
 
 NO_BOUNDS = BoundSettings(meeting=False, curve=False)
 HEADWAY, STANDSTILL_GAP = 1.5, 2.0

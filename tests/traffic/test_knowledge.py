@@ -5,13 +5,12 @@ import math
 import pytest
 import torch
 
-from e2rl.ego.base import Ego, track
-from e2rl.errors import InputError
-from e2rl.scene.recording import DT
+from e2rl.planners.ego import Ego, track
+from e2rl.run.errors import InputError
+from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
-from e2rl.traffic.knowledge import PREDICTIONS, along_mission, turn_rate_and_acceleration
-from e2rl.traffic.nominal import NominalTraffic
-from tests.synthesizer.traffic_scenes import EGO, begin, drive, replanned, scenes, synthesizer
+from e2rl.traffic.nominal import PREDICTIONS, NominalTraffic, along_mission, turn_rate_and_acceleration
+from tests.traffic.e2.traffic_scenes import EGO, begin, drive, replanned, scenes, synthesizer
 
 
 class Liar(Ego):

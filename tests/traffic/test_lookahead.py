@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from e2rl.errors import InputError
 from e2rl.prior.lane_relative import HORIZON
-from e2rl.scene.recording import DT
+from e2rl.run.errors import InputError
+from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
-from e2rl.synthesizer.motion import constant_speed_states
-from e2rl.traffic.lookahead import Lookahead
-from tests.synthesizer.traffic_scenes import EGO, begin, scenes, synthesizer
+from e2rl.traffic.e2.motion import constant_speed_states
+from e2rl.traffic.reaction import Lookahead
+from tests.traffic.e2.traffic_scenes import EGO, begin, scenes, synthesizer
 
 TIMES = DT * torch.arange(1, HORIZON + 1)
 

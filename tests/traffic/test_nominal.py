@@ -8,11 +8,10 @@ import torch
 from e2rl.prior.lane_relative import HORIZON, SIZE
 from e2rl.prior.prior import SamplerSettings
 from e2rl.sim.world import World
-from e2rl.traffic.knowledge import KNOWLEDGE
-from e2rl.traffic.nominal import NominalTraffic
-from e2rl.traffic.rows import noise_of, take_rows
+from e2rl.traffic.grouping import noise_of, take_rows
+from e2rl.traffic.nominal import KNOWLEDGE, NominalTraffic
 from tests.prior.small import curved_scenes, small_prior
-from tests.synthesizer.traffic_scenes import EGO, ROWS, begin, executed, scenes
+from tests.traffic.e2.traffic_scenes import EGO, ROWS, begin, executed, scenes
 
 
 def nominal(knowledge="predicted", **options):

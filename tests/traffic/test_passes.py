@@ -2,12 +2,12 @@
 
 import torch
 
-from e2rl.rivals.ctg_adv import CTGAdv
-from e2rl.rivals.safe_sim_opt import SafeSimOpt
+from e2rl.traffic.baselines.ctg import CTGAdv
+from e2rl.traffic.baselines.safe_sim_opt import SafeSimOpt
 from e2rl.traffic.nominal import NominalTraffic
-from e2rl.traffic.replay import Replay
-from tests.rivals.attacks import rival
-from tests.synthesizer.traffic_scenes import drive, scenes
+from e2rl.traffic.rule_based import Replay
+from tests.traffic.baselines.attacks import rival
+from tests.traffic.e2.traffic_scenes import drive, scenes
 
 REPLANS, STEPS = 4, 4  # of two seconds; of the small prior
 

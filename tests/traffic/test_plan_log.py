@@ -4,9 +4,8 @@ import torch
 
 from e2rl.sim.world import World
 from e2rl.traffic.nominal import NominalTraffic
-from e2rl.traffic.plan_log import POINT_STEPS
-from e2rl.traffic.traffic import REPLAN_STEPS
-from tests.synthesizer.traffic_scenes import EGO, ROWS, drive, scenes, synthesizer
+from e2rl.traffic.traffic import POINT_STEPS, REPLAN_STEPS
+from tests.traffic.e2.traffic_scenes import EGO, ROWS, drive, scenes, synthesizer
 
 
 def test_the_first_point_of_a_plan_is_where_its_vehicle_is_half_a_second_later():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from e2rl.errors import InputError
+from e2rl.run.errors import InputError
 from e2rl.traffic.pool import LIVE, RECORDED, TrafficPool
 from tests.learning.small import brake_check, small_scenes
 

@@ -2,11 +2,11 @@
 
 import torch
 
-from e2rl.ego.replay import ReplayEgo
+from e2rl.planners.log_replay import ReplayEgo
 from e2rl.sim.world import World
-from e2rl.traffic.replay import Replay
+from e2rl.traffic.rule_based import Replay
 from tests.prior.small import curved_scenes
-from tests.synthesizer.traffic_scenes import ROWS, drive, scenes
+from tests.traffic.e2.traffic_scenes import ROWS, drive, scenes
 
 
 def recorded(steps=40):

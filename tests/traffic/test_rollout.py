@@ -6,15 +6,15 @@ import textwrap
 import pytest
 import torch
 
-from e2rl.ego.replay import ReplayEgo
+from e2rl.planners.log_replay import ReplayEgo
 from e2rl.prior.lane_relative import HORIZON
-from e2rl.scene.recording import DT
+from e2rl.scenes.recording import DT
 from e2rl.sim.env import SimSettings
 from e2rl.traffic import traffic
 from e2rl.traffic.nominal import NominalTraffic
 from e2rl.traffic.rollout import synthesize_traffic
 from e2rl.traffic.traffic import Traffic, TrafficPlan, keep_velocity
-from tests.synthesizer.traffic_scenes import EGO, ROWS, VEHICLES, drive, scenes, synthesizer
+from tests.traffic.e2.traffic_scenes import EGO, ROWS, VEHICLES, drive, scenes, synthesizer
 
 
 def test_the_method_of_a_few_lines_in_the_documentation_drives_everybody_as_it_says():

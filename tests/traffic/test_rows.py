@@ -4,8 +4,8 @@ import torch
 
 from e2rl.prior.lane_relative import LaneState
 from e2rl.sim.world import World
-from e2rl.traffic.rows import noise_of, put_rows, take_rows
-from tests.synthesizer.traffic_scenes import scenes
+from e2rl.traffic.grouping import noise_of, put_rows, take_rows
+from tests.traffic.e2.traffic_scenes import scenes
 
 
 def test_noise_is_standard_and_depends_on_seed_and_draw_only():

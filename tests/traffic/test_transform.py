@@ -6,16 +6,16 @@ from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from e2rl.ego.actor import ActorEgo
-from e2rl.ego.base import EgoPolicy
-from e2rl.ego.idm import IDMEgo
 from e2rl.learning.policy import RowDraw
+from e2rl.planners.actor import ActorEgo
+from e2rl.planners.ego import EgoPolicy
+from e2rl.planners.idm_planner import IDMEgo
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import Traffic, TrafficPlan, keep_velocity
 from e2rl.traffic.transform import AdversarialSynthesizer
 from tests.learning.small import brake_check, small_scenes
-from tests.synthesizer.traffic_scenes import EGO, ROWS, scenes, synthesizer
+from tests.traffic.e2.traffic_scenes import EGO, ROWS, scenes, synthesizer
 
 ON = SimSettings(end_on_contact=False, end_off_road=False)
 SECOND = torch.tensor([[False], [True], [False]])  # environments that are reset

@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from e2rl.errors import InputError
+from e2rl.run.errors import InputError
 from tools.fuzz import LIMIT
 from tools.fuzz.corpus import Corpus
 from tools.fuzz.garbage import Garbage

@@ -12,29 +12,29 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from e2rl.api import load_config
-from e2rl.build import build_ego, resolved
-from e2rl.ego.actor import ActorEgo
-from e2rl.ego.bits_network import BitsNetwork, load_bits, save_bits
-from e2rl.ego.idm import IDMEgo
-from e2rl.ego.network import ActorCritic
+from e2rl.evaluation.methods import build_ego
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.learning.build import build_evolution
-from e2rl.learning.checkpoint import save_checkpoint
 from e2rl.learning.evolution import Evolution
 from e2rl.learning.logging import write_choices
+from e2rl.learning.run_checkpoint import save_checkpoint
+from e2rl.planners.actor import ActorEgo
+from e2rl.planners.bits_network import BitsNetwork, load_bits, save_bits
+from e2rl.planners.idm_planner import IDMEgo
+from e2rl.planners.network import ActorCritic
 from e2rl.prior.checkpoint import load_prior, save_prior
 from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.prior import Prior
 from e2rl.report.tables import metric_tables, save_tables
-from e2rl.scene.build import BuildSettings
-from e2rl.scene.bundled import BundledSource, load_recordings
-from e2rl.scene.recording import AGENT_TYPES, Recording
-from e2rl.scene.scenarionet import ScenarioNetSource, safe_load
-from e2rl.scene.scene import SceneSet
-from e2rl.scene.scene_list import SCENES, list_text
+from e2rl.run.config import resolved
+from e2rl.scenes.builder import BuildSettings
+from e2rl.scenes.bundled import BundledSource, load_recordings
+from e2rl.scenes.recording import AGENT_TYPES, Recording
+from e2rl.scenes.scenarionet import ScenarioNetSource, safe_load
+from e2rl.scenes.scene import SceneSet
+from e2rl.scenes.scene_list import SCENES, list_text
 from e2rl.sim.env import SimSettings
-from e2rl.traffic.constant_velocity import ConstantVelocity
-from e2rl.traffic.replay import Replay
+from e2rl.traffic.rule_based import ConstantVelocity, Replay
 
 LASTS = re.compile(rb"<time>\s*<exact>6\d</exact>")  # a CommonRoad scenario of six seconds
 SMALL = BuildSettings(steps=20, vehicles=4, others=2, vertices=40, field_cells=32)
@@ -87,7 +87,7 @@ class Corpus:
 
     @cached_property
     def commonroad(self) -> list[bytes]:
-        from e2rl.scene.commonroad import CommonRoadSource
+        from e2rl.scenes.commonroad import CommonRoadSource
 
         source = CommonRoadSource(self._commonroad)
         contents = [source.content(log) for log in source.logs()]
@@ -96,7 +96,7 @@ class Corpus:
 
     @cached_property
     def argoverse2(self) -> list[Path]:
-        from e2rl.scene.argoverse2 import Argoverse2Source, _files
+        from e2rl.scenes.argoverse2 import Argoverse2Source, _files
 
         source = Argoverse2Source(self._argoverse2)
         return _files(source.root() / source.logs()[0])

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from e2rl.evaluation.kept import HASHED
+from e2rl.run.parts import HASHED
 
 ODD = [
     *(None, True, -1, 0, 2**63, 1e9, 1e300, float("nan"), float("inf"), "", "x" * 300, b"\0", [], {}, (), [[]], [None]),

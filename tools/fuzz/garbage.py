@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from e2rl.scene.scene import SceneSet
+from e2rl.scenes.scene import SceneSet
 
 CELLS = (int, float, bool, str, bytes, bytearray, complex, type(None), np.generic)
 MOST = 1 << 26  # bytes that a small pickle may become
@@ -42,7 +42,7 @@ def require_plain(data: Any, most: int) -> None:
 
 
 def require_plausible(scene: dict[str, torch.Tensor]) -> None:
-    """Garbage where a scene is none, measured without e2rl.scene.plausibility."""
+    """Garbage where a scene is none, measured without e2rl.scenes.plausibility."""
     for name, value in scene.items():
         require(not value.is_floating_point() or bool(value.isfinite().all()), f"{name} is not finite")
     logged, known = scene["logged"].double(), scene["logged_valid"]

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from e2rl.errors import InputError
-from e2rl.scene.packed import unpack
-from e2rl.scene.scenarionet import ScenarioNetSource, safe_load
+from e2rl.run.errors import InputError
+from e2rl.scenes.scenarionet import ScenarioNetSource, safe_load
+from e2rl.scenes.scene_cache import unpack
 from tools.fuzz.corpus import SMALL
 from tools.fuzz.damage import Calls, damaged, hostile_pickle, mutated, with_other_number
 from tools.fuzz.garbage import MOST, require, require_plain, require_plausible, require_same_scenes
@@ -87,7 +87,7 @@ class Logs(Inputs):
 
     def commonroad(self, draw: random.Random) -> None:
         """CommonRoad XML: damaged, with entities, or nested deep."""
-        from e2rl.scene.commonroad import CommonRoadSource
+        from e2rl.scenes.commonroad import CommonRoadSource
 
         content = draw.choice(self.corpus.commonroad)
         kind = draw.random()
@@ -105,7 +105,7 @@ class Logs(Inputs):
 
     def argoverse2(self, draw: random.Random) -> None:
         """Argoverse 2 scenarios: damaged tables and maps."""
-        from e2rl.scene.argoverse2 import Argoverse2Source
+        from e2rl.scenes.argoverse2 import Argoverse2Source
 
         folder = self.folder / "av2"
         for path in self.corpus.argoverse2:
@@ -129,7 +129,7 @@ class Logs(Inputs):
 
     def scene_caches(self, draw: random.Random) -> None:
         """Files of the scene cache: what is not what was written is built anew."""
-        from e2rl.scene.cache import read
+        from e2rl.scenes.scene_cache import read
 
         found = read(self.file("scenes.packed", damaged(self.corpus.cache, draw)), room=4)
         if found is None:

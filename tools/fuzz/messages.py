@@ -7,12 +7,11 @@ import struct
 
 import torch
 
-from e2rl.ego.base import PlannerError
-from e2rl.ego.external import ExternalEgo, drivable, plans_of
-from e2rl.ego.planner_link import PlannerLink
-from e2rl.ego.planner_messages import ACTION, FAILED, TRAJECTORY, message
-from e2rl.errors import InputError
-from e2rl.synthesizer.prompt import CRITERIA, read_answer
+from e2rl.planners.ego import PlannerError
+from e2rl.planners.external import ExternalEgo, drivable, plans_of
+from e2rl.planners.planner_link import ACTION, FAILED, TRAJECTORY, PlannerLink, message
+from e2rl.run.errors import InputError
+from e2rl.traffic.e2.reasoner import CRITERIA, read_answer
 from tools.fuzz.damage import PLAIN, damaged, mutated
 from tools.fuzz.garbage import require
 from tools.fuzz.inputs import Inputs

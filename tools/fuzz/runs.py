@@ -12,21 +12,21 @@ from typing import Any
 import numpy as np
 from omegaconf import OmegaConf
 
-from e2rl.errors import InputError
-from e2rl.evaluation.files import read_metrics, read_rows
-from e2rl.evaluation.kept import Kept
 from e2rl.evaluation.modes import read_modes
+from e2rl.evaluation.provenance import leaves, origin_of
+from e2rl.evaluation.resume import saved_choices, saved_configuration
+from e2rl.evaluation.rollout_files import read_metrics, read_rows
 from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollout
 from e2rl.evaluation.table_comparison import compare_tables
-from e2rl.files import seal
-from e2rl.learning.checkpoint import load_checkpoint
 from e2rl.learning.logging import read_choices
+from e2rl.learning.run_checkpoint import load_checkpoint
 from e2rl.metrics.score import score_rollouts
-from e2rl.provenance import leaves, origin_of
-from e2rl.report.modes import mode_tables
+from e2rl.report.mode_table import mode_tables
 from e2rl.report.tables import metric_tables, read_tables
-from e2rl.resume import saved_choices, saved_configuration
-from e2rl.scene.scene_list import read_list
+from e2rl.run.errors import InputError
+from e2rl.run.files import seal
+from e2rl.run.parts import Kept
+from e2rl.scenes.scene_list import read_list
 from tools.fuzz.damage import ARRAYS, PLAIN, damaged, mutated, sealed, torch_file, with_header
 from tools.fuzz.garbage import require, require_driven, same
 from tools.fuzz.inputs import Inputs
@@ -39,7 +39,7 @@ HOSTILE = [
     "hydra.utils.call",
     "${oc.env:HOME}",
 ]
-STARTS = {"_target_": "e2rl.ego.external.ExternalEgo", "command": "touch mark"}
+STARTS = {"_target_": "e2rl.planners.external.ExternalEgo", "command": "touch mark"}
 
 
 class Runs(Inputs):

@@ -21,10 +21,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from e2rl.scene.build import BuildSettings
-from e2rl.scene.recording import Recording
-from e2rl.scene.scenarionet import ScenarioNetSource, recording_of
-from e2rl.scene.source import OVERLAP, TOO_SHORT, Source
+from e2rl.scenes.builder import BuildSettings
+from e2rl.scenes.recording import Recording
+from e2rl.scenes.scenarionet import ScenarioNetSource, recording_of
+from e2rl.scenes.source import OVERLAP, TOO_SHORT, Source
 from tools.mutate.formats import opened, source_of
 from tools.mutate.kinds import EITHER, KINDS, READ, REFUSED, Kind
 from tools.mutate.log import RecordedLog

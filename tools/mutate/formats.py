@@ -4,11 +4,11 @@ import zipfile
 from importlib.util import find_spec
 from pathlib import Path
 
-from e2rl.scene.argoverse2 import Argoverse2Source
-from e2rl.scene.commonroad import CommonRoadSource
-from e2rl.scene.log_files import LogFiles
-from e2rl.scene.scenarionet import ScenarioNetSource, safe_load
-from e2rl.scene.source import Source
+from e2rl.scenes.argoverse2 import Argoverse2Source
+from e2rl.scenes.commonroad import CommonRoadSource
+from e2rl.scenes.log_files import LogFiles
+from e2rl.scenes.scenarionet import ScenarioNetSource, safe_load
+from e2rl.scenes.source import Source
 from tools.mutate.argoverse2 import ScenarioLog, SensorLog
 from tools.mutate.commonroad import CommonRoadLog
 from tools.mutate.log import RecordedLog

@@ -1,9 +1,9 @@
-"""Writes the archive of a split that e2rl/scene/bundled.py reads (format e2rl-scenes/1)."""
+"""Writes the archive of a split that e2rl/scenes/bundled.py reads (format e2rl-scenes/1)."""
 
 import numpy as np
 
-from e2rl.scene.bundled import FORMAT, MILLI, UNIT, SceneMap
-from e2rl.scene.recording import Recording
+from e2rl.scenes.bundled import FORMAT, MILLI, UNIT, SceneMap
+from e2rl.scenes.recording import Recording
 
 
 def pack(maps: list[SceneMap], scenes: list[tuple[Recording, int]]) -> dict[str, np.ndarray]:

@@ -6,7 +6,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from e2rl.scene.paths import arc_length, shift_left, wrap
+from e2rl.scenes.paths import arc_length, shift_left, wrap
 
 STEP = 4.0  # m between the vertices of a road axis
 

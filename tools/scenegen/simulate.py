@@ -9,8 +9,8 @@ import libsumo
 import numpy as np
 import sumo
 
-from e2rl.scene.paths import arc_length, resample, shift_left
-from e2rl.scene.recording import DT, LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, Lane
+from e2rl.scenes.paths import arc_length, resample, shift_left
+from e2rl.scenes.recording import DT, LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, Lane
 from scenegen.layout import Layout
 from scenegen.traffic import write_demand
 

@@ -1,4 +1,4 @@
-// The data block: arrays of whole numbers as e2rl/report/encoding.py writes them.
+// The data block: arrays of whole numbers as e2rl/report/failure_tracks.py writes them.
 
 /** Whole numbers of base64, zlib, four byte planes and zigzag code. */
 async function decodeIntegers(text) {

@@ -13,7 +13,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from e2rl.errors import InputError
+from e2rl.run.errors import InputError
 
 Value = TypeVar("Value")
 TIMEOUT = timedelta(hours=6)  # the others wait while the leader parses logs or validates

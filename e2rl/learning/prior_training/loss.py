@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from e2rl.learning.prior_training.settings import TrainingSettings
+from e2rl.learning.prior_training.training_settings import TrainingSettings
 from e2rl.prior.denoiser import Denoiser
 from e2rl.prior.features import SIDED_EDGE, SIDED_NODE
 from e2rl.prior.lane_relative import (

@@ -10,12 +10,12 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel
 from tqdm import tqdm
 
-from e2rl.errors import InputError
 from e2rl.learning.prior_training.distributed import ALONE, Processes
 from e2rl.learning.prior_training.loss import CONSTANT_STD, MIN_STD, DenoisingLoss, augment, draw, loss_weight
-from e2rl.learning.prior_training.settings import TrainingSettings
+from e2rl.learning.prior_training.training_settings import TrainingSettings
 from e2rl.prior.denoiser import Denoiser
 from e2rl.prior.prior import Prior
+from e2rl.run.errors import InputError
 
 WARM_UP = 50  # steps
 RANK_SEED = 1_000_003  # difference of the generator seeds of consecutive ranks

@@ -9,19 +9,19 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from e2rl.ego.replay import ReplayEgo
-from e2rl.evaluation.kept import Kept
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.evaluation.provenance import origin_of
 from e2rl.learning.prior_training.distributed import process_group
-from e2rl.learning.prior_training.settings import TrainingSettings
 from e2rl.learning.prior_training.training import ClosedLoop, held_out, train_prior
+from e2rl.learning.prior_training.training_settings import TrainingSettings
+from e2rl.planners.log_replay import ReplayEgo
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.prior import Prior, SamplerSettings
-from e2rl.provenance import origin_of
-from e2rl.scene.scene import Loaded, SceneSet
-from e2rl.scene.source import load_scenes
-from e2rl.settings import settings_of
+from e2rl.run.parts import Kept
+from e2rl.run.settings import settings_of
+from e2rl.scenes.scene import Loaded, SceneSet
+from e2rl.scenes.source import load_scenes
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.nominal import NominalTraffic
 
@@ -32,7 +32,7 @@ def run_prior_stage(
     config: DictConfig, folder: Path, begin_run: Callable[[Mapping[str, SceneSet]], None]
 ) -> tuple[Path, list[dict]] | None:
     """The checkpoint's path and the metrics rows of the nominal closed loop on held-out scenes, the ego replayed; None
-    in processes other than the leader. begin_run: see `e2rl.provenance.begin_run`, of the scenes."""
+    in processes other than the leader. begin_run: see `e2rl.evaluation.provenance.begin_run`, of the scenes."""
     settings = settings_of(TrainingSettings, {**config.prior.training, "seed": config.seed}, "prior.training")
     with process_group(config.device) as (processes, device):
         folder = processes.from_leader(lambda: folder)

@@ -15,18 +15,18 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
-from e2rl.errors import InputError
-from e2rl.evaluation.kept import read_state, state_bytes
-from e2rl.files import write_atomically
 from e2rl.learning.prior_training.distributed import ALONE, Processes
 from e2rl.learning.prior_training.loss import held_out_loss
 from e2rl.learning.prior_training.optimisation import PriorTraining
-from e2rl.learning.prior_training.settings import TrainingSettings
+from e2rl.learning.prior_training.training_settings import TrainingSettings
 from e2rl.learning.prior_training.windows import STANDING_WEIGHT, make_windows
 from e2rl.prior.checkpoint import save_prior
 from e2rl.prior.prior import Prior
-from e2rl.prior.route_choice import candidate_features
-from e2rl.scene.scene import SceneSet
+from e2rl.prior.routes import candidate_features
+from e2rl.run.errors import InputError
+from e2rl.run.files import write_atomically
+from e2rl.run.parts import read_state, state_bytes
+from e2rl.scenes.scene import SceneSet
 
 HELD_OUT = 8  # one in HELD_OUT places is held out for validation
 STATE, PREVIOUS, PROGRESS = "training.pt", "training.previous.pt", "progress.jsonl"

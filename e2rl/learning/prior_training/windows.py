@@ -8,9 +8,9 @@ from tqdm import tqdm
 from e2rl.prior import free_space, lane_relative
 from e2rl.prior.features import edge_features, node_features
 from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS, KNOTS, LaneState, locate
-from e2rl.prior.routed import RoutedScene, route_scene
-from e2rl.scene.recording import DT
-from e2rl.scene.route import project
+from e2rl.prior.routes import RoutedScene, route_scene
+from e2rl.scenes.recording import DT
+from e2rl.scenes.route import project
 from e2rl.sim.dynamics import wrap
 
 OFFSETS = (0, 5, 10, 15)  # frames after a scene's start frame at which a window begins

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from e2rl.evaluation.files import ROLLOUTS
-from e2rl.files import write_atomically
+from e2rl.evaluation.rollout_files import ROLLOUTS
 from e2rl.report.export.episode import Episode
-from e2rl.scene.scene import KEYS
+from e2rl.run.files import write_atomically
+from e2rl.scenes.scene import KEYS
 
 SCENES = "scenes"  # the folder of scenes, beside the one of rollouts
 
@@ -30,7 +30,7 @@ def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> 
 
 
 def scene_arrays(episode: Episode) -> dict[str, Any]:
-    """The arrays of a scene (e2rl/scene/scene.py), the ids and speed limits [m/s] of its lanes, and its origin [m] in
+    """The arrays of a scene (e2rl/scenes/scene.py), the ids and speed limits [m/s] of its lanes, and its origin [m] in
     the recording's coordinates."""
     assert episode.scene is not None and episode.origin is not None
     return {

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from e2rl.errors import InputError
-from e2rl.evaluation.files import ROLLOUTS, rollout_name
+from e2rl.evaluation.rollout_files import ROLLOUTS, rollout_name
 from e2rl.evaluation.rollout_reader import read_rollout
-from e2rl.scene.build import BuildSettings, build_scene
-from e2rl.scene.lane_graph import LaneGraph
-from e2rl.scene.recording import Lane, Recording
-from e2rl.scene.smoothing import runs_of_true
+from e2rl.run.errors import InputError
+from e2rl.scenes.builder import BuildSettings, build_scene
+from e2rl.scenes.lane_graph import LaneGraph
+from e2rl.scenes.recording import Lane, Recording
+from e2rl.scenes.smoothing import runs_of_true
 
 FACTS = (  # columns of rollouts.csv that go along; docs/verdicts.md and docs/modes.md say what they mean
     *("dataset", "split", "location", "scene_id", "method", "ego_policy", "eta", "seed", "cfr"),

@@ -23,14 +23,14 @@ import numpy as np
 import torch
 from matplotlib.colors import to_rgba
 
-from e2rl.errors import InputError
-from e2rl.files import write_atomically
 from e2rl.report import drawing
 from e2rl.report.export.episode import Episode
-from e2rl.report.export.scenarionet import HEIGHT
+from e2rl.report.export.scenarionet_writer import HEIGHT
 from e2rl.report.picture import contact_point
-from e2rl.scene.boxes import distance
-from e2rl.scene.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
+from e2rl.run.errors import InputError
+from e2rl.run.files import write_atomically
+from e2rl.scenes.boxes import distance
+from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
 from e2rl.traffic.traffic import REPLAN_STEPS
 
 MAP, EGO = "map", "ego"  # frames
@@ -70,7 +70,7 @@ def content(episode: Episode) -> bytes:
     writer = Writer(buffer, compression=CompressionType.ZSTD)
     writer.start(profile="", library="e2rl")
     update, frame = register_schema(writer, SceneUpdate), register_schema(writer, FrameTransform)
-    numbers = writer.register_schema("e2rl.ego", "jsonschema", json.dumps(NUMBERS).encode())
+    numbers = writer.register_schema("e2rl.planners", "jsonschema", json.dumps(NUMBERS).encode())
     topics = {"/map": update, "/traffic": update, "/plans": update, "/tf": frame}
     channels = {topic: writer.register_channel(topic, "protobuf", schema) for topic, schema in topics.items()}
     channels["/ego"] = writer.register_channel("/ego", "json", numbers)

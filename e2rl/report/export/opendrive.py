@@ -12,8 +12,8 @@ import networkx as nx
 import numpy as np
 
 from e2rl.report.export.episode import Episode
-from e2rl.scene.paths import resample, tangent_angle
-from e2rl.scene.recording import Lane
+from e2rl.scenes.paths import resample, tangent_angle
+from e2rl.scenes.recording import Lane
 
 FIT = 0.05  # m that the reference line may lie beside the centreline
 SHORT = 2.0  # m: pieces up to this length are fitted as they are

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from e2rl.errors import InputError
-from e2rl.report.export.commonroad import LONG
+from e2rl.report.export.commonroad_writer import LONG
 from e2rl.report.export.episode import Episode
 from e2rl.report.export.opendrive import write_roads
-from e2rl.scene.paths import WHEELBASE
+from e2rl.run.errors import InputError
+from e2rl.scenes.paths import WHEELBASE
 
 MINOR_VERSION = 2
 EGO = "Ego"

@@ -14,13 +14,13 @@ import pytest
 import torch
 from torch.multiprocessing import spawn
 
-from e2rl.errors import InputError
 from e2rl.learning.prior_training.distributed import ALONE, Processes, follower_overrides, process_group
 from e2rl.learning.prior_training.loss import draw
 from e2rl.learning.prior_training.optimisation import PriorTraining
-from e2rl.learning.prior_training.settings import TrainingSettings
+from e2rl.learning.prior_training.training_settings import TrainingSettings
 from e2rl.learning.prior_training.windows import make_windows
 from e2rl.prior.checkpoint import load_prior
+from e2rl.run.errors import InputError
 from tests.prior.small import curved_scenes, small_prior
 
 ROOT = Path(__file__).parents[3]

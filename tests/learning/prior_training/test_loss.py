@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from e2rl.learning.prior_training.loss import augment, denoising_loss, held_out_loss
-from e2rl.learning.prior_training.settings import TrainingSettings
+from e2rl.learning.prior_training.training_settings import TrainingSettings
 from e2rl.learning.prior_training.windows import make_windows
 from tests.prior.small import curved_scenes, small_prior
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from e2rl.errors import InputError
-from e2rl.learning.prior_training.settings import TrainingSettings
-from e2rl.settings import settings_of
+from e2rl.learning.prior_training.training_settings import TrainingSettings
+from e2rl.run.errors import InputError
+from e2rl.run.settings import settings_of
 
 
 def settings(**values):

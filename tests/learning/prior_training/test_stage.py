@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 
-from e2rl.errors import InputError
-from e2rl.learning.prior_training.settings import TrainingSettings
 from e2rl.learning.prior_training.stage import FIGURES, _closed_loop, _first_starts, run_prior_stage
+from e2rl.learning.prior_training.training_settings import TrainingSettings
+from e2rl.run.errors import InputError
 from tests.prior.small import small_prior
 from tests.synthetic import make_scenes
 

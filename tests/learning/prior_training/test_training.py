@@ -6,16 +6,22 @@ from dataclasses import replace
 import pytest
 import torch
 
-from e2rl.errors import InputError
-from e2rl.evaluation.kept import read_state
 from e2rl.learning.prior_training.loss import denoising_loss
 from e2rl.learning.prior_training.optimisation import PriorTraining
-from e2rl.learning.prior_training.settings import TrainingSettings
-from e2rl.learning.prior_training.training import Record, held_out, saved_state, train_prior, train_route_choice
+from e2rl.learning.prior_training.training import (
+    Record,
+    TrainingSettings,
+    held_out,
+    saved_state,
+    train_prior,
+    train_route_choice,
+)
 from e2rl.learning.prior_training.windows import make_windows
 from e2rl.prior.checkpoint import load_prior
 from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.prior import Prior
+from e2rl.run.errors import InputError
+from e2rl.run.parts import read_state
 from tests.prior.small import curved_scenes
 from tests.synthetic import make_scenes
 

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 from omegaconf import OmegaConf
 
-from e2rl.evaluation.files import ROLLOUTS, TABLE, Source, label_rows, rollout_name, write_rollouts, write_rows
+from e2rl.evaluation.rollout_files import ROLLOUTS, TABLE, Source, label_rows, rollout_name, write_rollouts, write_rows
 from e2rl.evaluation.rollout_reader import read_rollout
 from e2rl.metrics.score import score_rollouts
-from e2rl.scene.recording import CYCLIST, OTHER, PEDESTRIAN
-from e2rl.scene.source import load_scenes
-from tests.scene.descriptions import FRAMES, data_config, description, numbered, straight, track, write_folder
+from e2rl.scenes.recording import CYCLIST, OTHER, PEDESTRIAN
+from e2rl.scenes.source import load_scenes
+from tests.scenes.descriptions import FRAMES, data_config, description, numbered, straight, track, write_folder
 
 PHASES = ["LANE_STATE_STOP"] * 40 + ["LANE_STATE_GO"] * (FRAMES - 40)
 GAPS = ((12, 30), (33, 45), (50, 51))  # steps at which LATE is there

@@ -12,11 +12,11 @@ import pytest
 pytest.importorskip("commonroad", reason="--to commonroad needs the extra commonroad")
 import commonroad  # noqa: E402
 from commonroad.common.reader.file_reader_xml import XMLFileReader  # noqa: E402
+from e2rl.scripts.export import LIST, main
 from lxml import etree  # noqa: E402
 
-from e2rl.report.export.__main__ import LIST, main  # noqa: E402
-from e2rl.scene.commonroad import read_scenario  # noqa: E402
-from e2rl.scene.recording import CYCLIST, OTHER, PEDESTRIAN  # noqa: E402
+from e2rl.scenes.commonroad import read_scenario
+from e2rl.scenes.recording import CYCLIST, OTHER, PEDESTRIAN
 from tests.report.export.small_run import CUT_IN, GAPS, LATE, TRUCK, rollout_of, row_of  # noqa: E402
 
 SCHEMA = Path(commonroad.__file__).parent / "common" / "xml_definition_files" / "XML_commonRoad_XSD.xsd"
@@ -141,7 +141,7 @@ def test_facts_and_origin_stand_in_the_file(files):
 def test_a_missing_package_is_named_with_its_extra(run, tmp_path):
     code = (
         "import sys; sys.modules['commonroad'] = None\n"
-        "from e2rl.report.export.__main__ import main\n"
+        "from e2rl.commands.export import main\n"
         f"main([{str(run)!r}, '--to', 'commonroad', '--out', {str(tmp_path / 'out')!r}])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

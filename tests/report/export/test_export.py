@@ -5,12 +5,12 @@ import shutil
 
 import numpy as np
 import pytest
+from e2rl.scripts.export import LIST, main
 from omegaconf import OmegaConf
 
-from e2rl.evaluation.files import read_rows, write_rows
+from e2rl.evaluation.rollout_files import read_rows, write_rows
 from e2rl.evaluation.rollout_reader import read_rollout
-from e2rl.report.export.__main__ import LIST, main
-from e2rl.scene.source import source_of
+from e2rl.scenes.source import source_of
 from tests.report.export.small_run import CUT_IN, rollout_of
 
 
@@ -105,7 +105,7 @@ def test_scenes_that_are_not_those_of_the_run_are_refused(copy, tmp_path, capsys
 
 def test_a_stranger_s_folder_runs_no_code_but_that_which_the_command_names(copy, tmp_path, capsys, monkeypatch):
     (tmp_path / "theirs.py").write_text(
-        "from dataclasses import dataclass\nfrom e2rl.scene.scenarionet import ScenarioNetSource\n"
+        "from dataclasses import dataclass\nfrom e2rl.scenes.scenarionet import ScenarioNetSource\n"
         f"open({str(tmp_path / 'ran')!r}, 'w').close()\n@dataclass\nclass Theirs(ScenarioNetSource):\n    pass\n"
     )
     monkeypatch.syspath_prepend(tmp_path)

@@ -11,14 +11,14 @@ import pytest
 
 pytest.importorskip("mcap_protobuf", reason="--to mcap needs the extra mcap")
 pytest.importorskip("foxglove_schemas_protobuf", reason="--to mcap needs the extra mcap")
+from e2rl.scripts.export import LIST, main
 from mcap.reader import make_reader  # noqa: E402
 from mcap_protobuf.decoder import DecoderFactory  # noqa: E402
 
-from e2rl.evaluation.files import TABLE, read_rows  # noqa: E402
-from e2rl.report.export.__main__ import LIST, main  # noqa: E402
-from e2rl.report.export.episode import rollout_episode  # noqa: E402
-from e2rl.report.export.mcap import content  # noqa: E402
-from e2rl.scene.recording import PEDESTRIAN  # noqa: E402
+from e2rl.evaluation.rollout_files import TABLE, read_rows
+from e2rl.report.export.episode import rollout_episode
+from e2rl.report.export.mcap import content
+from e2rl.scenes.recording import PEDESTRIAN
 from tests.report.export.small_run import CUT_IN, LATE, rollout_of, row_of  # noqa: E402
 
 

@@ -6,13 +6,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from e2rl.scripts.export import LIST, main
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from e2rl.report.export.__main__ import LIST, main
 from e2rl.report.export.opendrive import FIT, junctions_of, left_out, links
-from e2rl.scene.paths import resample, tangent_angle
-from e2rl.scene.recording import Lane
+from e2rl.scenes.paths import resample, tangent_angle
+from e2rl.scenes.recording import Lane
 
 
 def graph(**exits: str) -> dict[str, Lane]:

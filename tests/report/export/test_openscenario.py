@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 pytest.importorskip("scenariogeneration", reason="--to openscenario needs the extra openscenario")
+from e2rl.scripts.export import LIST, main
 from scenariogeneration import xosc  # noqa: E402
 
-from e2rl.report.export.__main__ import LIST, main  # noqa: E402
-from e2rl.report.export.openscenario import EGO  # noqa: E402
-from e2rl.scene.recording import CYCLIST, OTHER, PEDESTRIAN  # noqa: E402
+from e2rl.report.export.openscenario import EGO
+from e2rl.scenes.recording import CYCLIST, OTHER, PEDESTRIAN
 from tests.report.export.small_run import CUT_IN, GAPS, LATE, TRUCK, rollout_of, row_of  # noqa: E402
 
 
@@ -135,7 +135,7 @@ def test_facts_stand_in_the_header(paths):
 def test_a_missing_package_is_named_with_its_extra(run, tmp_path):
     code = (
         "import sys; sys.modules['scenariogeneration'] = None\n"
-        "from e2rl.report.export.__main__ import main\n"
+        "from e2rl.commands.export import main\n"
         f"main([{str(run)!r}, '--to', 'openscenario', '--out', {str(tmp_path / 'out')!r}])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

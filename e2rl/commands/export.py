@@ -1,0 +1,119 @@
+"""`python -m e2rl.report.export RUN --to FORMAT`: failures of a run in the format of another tool (docs/export.md)."""
+
+import argparse
+import csv
+import io
+from collections.abc import Sequence
+from difflib import get_close_matches
+from pathlib import Path
+
+from tqdm import tqdm
+
+from e2rl.evaluation.rollout_files import TABLE, read_rows
+from e2rl.metrics.failure_modes import is_failure
+from e2rl.report.export import archive, mcap, openscenario
+from e2rl.report.export import commonroad_writer as commonroad
+from e2rl.report.export import scenarionet_writer as scenarionet
+from e2rl.report.export.episode import FACTS, Episode
+from e2rl.report.export.scene_files import episodes_of
+from e2rl.run.errors import InputError
+from e2rl.run.files import write_atomically, written_whole
+from e2rl.run.processes import ending
+
+FORMATS = {
+    "commonroad": commonroad.write,
+    "openscenario": openscenario.write,
+    "scenarionet": scenarionet.write,
+    "mcap": mcap.write,
+    "npz": archive.write,
+}
+OPEN_EGO = ("commonroad", "openscenario")  # formats in which the ego's place may be left open
+LIST = "exported.csv"
+
+
+def check_format(name: str, open_ego: bool) -> None:
+    """InputError for a format that there is not, and for an open ego in a format without one."""
+    if name not in FORMATS:
+        near = get_close_matches(name, FORMATS, 1, 0.0)[0]
+        raise InputError(f"--to {name}: no such format; did you mean {near}? There are {', '.join(FORMATS)}")
+    if open_ego and name not in OPEN_EGO:
+        raise InputError(f"--open-ego: {name} has no such form; leave it out, or pass --to {' or '.join(OPEN_EGO)}")
+
+
+def chosen_rows(run: Path, failures: int | None, every: bool, method: str | None) -> list[dict]:
+    """Rows of rollouts.csv: its failures, first those that count, at most `failures`; or every rollout of it."""
+    rows = read_rows(run / TABLE)
+    if method is not None:
+        known = dict.fromkeys(row["method"] for row in rows)
+        if method not in known:
+            raise InputError(f"--method {method}: not in {run / TABLE}; choose among {', '.join(known)}")
+        rows = [row for row in rows if row["method"] == method]
+    if every:
+        return rows
+    found = sorted((row for row in rows if is_failure(row)), key=lambda row: row["counted"] != 1)
+    if not found:
+        raise InputError(
+            f"{run / TABLE}: no rollout in which the ego hits a vehicle; raise eta, evaluate more scenes, or pass --all"
+        )
+    return found[:failures]
+
+
+def export(
+    run: Path,
+    target: str,
+    rows: Sequence[dict],
+    out: Path,
+    plugins: Sequence[str] = (),
+    scene: bool = True,
+    open_ego: bool = False,
+) -> int:
+    """Write the rollouts of rows of rollouts.csv into a new folder, and return how many."""
+    if out.exists():
+        raise InputError(f"{out}: is there already; remove it, or pass another folder with --out")
+    episodes = episodes_of(run, rows, plugins, scene)
+    shown = tqdm(episodes, "exporting", len(rows), unit="rollout", leave=False, disable=None)
+    with written_whole(out) as folder:
+        written = FORMATS[target](shown, folder, open_ego)
+        lines = [listed(episode, path.relative_to(folder)) for episode, path in written]
+        buffer = io.StringIO()
+        writer = csv.DictWriter(buffer, ("file", *FACTS, "adversaries"), restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(lines)
+        write_atomically(folder / LIST, buffer.getvalue())
+    return len(lines)
+
+
+def listed(episode: Episode, path: Path) -> dict[str, object]:
+    """The line of a file in the list of what was exported."""
+    return episode.facts | {"file": str(path), "adversaries": " ".join(map(str, episode.facts["adversaries"]))}
+
+
+def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m e2rl.report.export", description=__doc__)
+    parser.add_argument("run", type=Path, metavar="RUN_DIR", help="folder of a run of evaluate.py")
+    parser.add_argument("--to", required=True, metavar="FORMAT", help=", ".join(FORMATS))
+    parser.add_argument("--failures", type=int, metavar="N", help="at most so many failures (default: all)")
+    parser.add_argument("--all", action="store_true", help="every rollout, not only failures")
+    parser.add_argument("--method", metavar="NAME", help="rollouts in its traffic only")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="a new folder (default: RUN_DIR/export/FORMAT)")
+    parser.add_argument("--open-ego", action="store_true", help="leave the ego to a planner or controller of your own")
+    parser.add_argument("--no-scene", action="store_true", help="do without the data: lanes of the rollout files alone")
+    parser.add_argument("--plugin", action="append", default=[], metavar="MODULE", help="the data source's; repeatable")
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The command."""
+    options = parse_arguments(arguments)
+    out = options.out or options.run / "export" / options.to
+    with ending("run the same command again"):
+        check_format(options.to, options.open_ego)
+        if options.failures is not None and options.failures < 1:
+            raise InputError(f"--failures {options.failures}: expected at least 1")
+        rows = chosen_rows(options.run, options.failures, options.all, options.method)
+        count = export(options.run, options.to, rows, out, options.plugin, not options.no_scene, options.open_ego)
+        print(f"{count} rollouts written to {out}")
+
+
+if __name__ == "__main__":
+    main()

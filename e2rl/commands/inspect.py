@@ -1,0 +1,255 @@
+"""What a data set holds: its scenes, agents and maps, what is left out and why; and a picture of a scene.
+
+`python -m e2rl.commands.inspect PATH` finds out which data group reads the files at PATH; `--data` names it.
+`--apart OTHER` also checks that no scene at PATH is at a place of the logs at OTHER, as a split needs it.
+"""
+
+import argparse
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from e2rl.evaluation.rollout_files import polylines
+from e2rl.report import drawing
+from e2rl.report.drawing import Shape, TrafficMap, Trail, new_figure, save_figure
+from e2rl.run.config import load_choice
+from e2rl.run.errors import InputError, stop
+from e2rl.scenes.paths import arc_length
+from e2rl.scenes.recording import AGENT_TYPES, LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, VEHICLE
+from e2rl.scenes.scene_cache import unpack
+from e2rl.scenes.source import Row, Source, source_of
+
+FOUND = ("scenarionet", "commonroad", "argoverse2", "py123d")  # groups of data that a path can belong to
+SIDE, HEAD, FOOT = 900, 34, 30  # points: of a picture, of its header and of its legend
+COLOURS = {"vehicle": drawing.BACKGROUND, "pedestrian": drawing.VULNERABLE, "cyclist": drawing.VULNERABLE}
+LIGHTS = {LIGHT_UNKNOWN: drawing.MUTED, LIGHT_RED: "#d62828", LIGHT_YELLOW: "#f2b705", LIGHT_GREEN: "#2a9d4a"}
+LEGEND = {"ego": drawing.EGO, "vehicle": drawing.BACKGROUND, "pedestrian, cyclist": drawing.VULNERABLE}
+MOVES = 0.5  # m/s
+
+
+class Content(NamedTuple):
+    """What is counted in one scene; agents are those present at its start frame.
+
+    agents: how many by type; moving: vehicles beside the ego that move; ego_speed m/s at the start, ego_distance m that
+    it drives; vehicle_length m: the median; lanes, lane_length m; exits, neighbours, limits: share of lanes with a
+    successor, with a neighbour, and of route vertices with a speed limit; polygons; lights.
+    """
+
+    agents: list[int]
+    moving: int
+    ego_speed: float
+    ego_distance: float
+    vehicle_length: float
+    lanes: int
+    lane_length: float
+    exits: float
+    neighbours: float
+    limits: float
+    polygons: int
+    lights: int
+
+
+def content(scene: dict[str, np.ndarray]) -> Content:
+    """The counts of one scene, without a batch dimension."""
+    present, kinds = scene["valid"], scene["agent_type"]
+    vehicles = present & (kinds == VEHICLE)
+    ego = scene["logged"][scene["logged_valid"][:, 0], 0, :2]
+    index = scene["lane_index"]
+    lengths = [arc_length(scene["lane_points"][index == lane])[-1] for lane in range(len(scene["lane_width"]))]
+    beside = (scene["lane_left"] >= 0) | (scene["lane_right"] >= 0)
+    return Content(
+        agents=[int((present & (kinds == kind)).sum()) for kind in range(len(AGENT_TYPES))],
+        moving=int((vehicles & (scene["start"][:, 3] > MOVES))[1:].sum()),
+        ego_speed=float(scene["start"][0, 3]),
+        ego_distance=float(np.linalg.norm(np.diff(ego, axis=0), axis=1).sum()),
+        vehicle_length=float(np.median(scene["size"][vehicles, 0])),
+        lanes=len(lengths),
+        lane_length=float(sum(lengths)),
+        exits=float((scene["lane_exits"] >= 0).any(1).mean()),
+        neighbours=float(beside.mean()),
+        limits=float((scene["route_limit"][scene["route_valid"]] > 0).mean()),
+        polygons=len(np.unique(scene["drivable_index"])),
+        lights=len(scene["light_points"]),
+    )
+
+
+LINES: tuple[tuple[str, Callable[[Content], float], int], ...] = (  # what a line says, of which number, its decimals
+    ("vehicles that move, beside the ego", lambda part: part.moving, 0),
+    ("median length of vehicles, m", lambda part: part.vehicle_length, 1),
+    ("speed of the ego at the start, m/s", lambda part: part.ego_speed, 1),
+    ("way of the ego, m", lambda part: part.ego_distance, 0),
+    ("lanes", lambda part: part.lanes, 0),
+    ("km of lanes", lambda part: part.lane_length / 1000, 1),
+    ("% of lanes with a successor", lambda part: 100 * part.exits, 0),
+    ("% of lanes with a neighbour", lambda part: 100 * part.neighbours, 0),
+    ("% of routes with a speed limit", lambda part: 100 * part.limits, 0),
+    ("drivable polygons", lambda part: part.polygons, 0),
+    ("traffic lights", lambda part: part.lights, 0),
+)
+
+
+def report(source: Source, rows: Sequence[Row], contents: Sequence[Content]) -> list[str]:
+    """The lines about a data set: `rows` of all its logs, `contents` of those that made a scene."""
+    scenes = [row for row in rows if not row.reason]
+    reasons = Counter(row.reason for row in rows if row.reason)
+    places = {row.location for row in scenes}
+    lines = [
+        f"logs         {len(source.logs())}",
+        f"scenes       {len(scenes)}, " + ("places not known" if places == {""} else f"of {len(places)} places"),
+        f"left out     {sum(reasons.values())}",
+        *(f"             {count} x {reason}" for reason, count in reasons.most_common()),
+    ]
+    if not contents:
+        return lines
+    kinds = zip(AGENT_TYPES, zip(*(part.agents for part in contents), strict=True), strict=True)
+    return [
+        *lines,
+        "in a scene   median (least to most); of the agents that take part, those present at the start frame",
+        *(_line("others" if kind == "other" else f"{kind}s", counts) for kind, counts in kinds),
+        *(_line(name, (value(part) for part in contents), digits) for name, value, digits in LINES),
+    ]
+
+
+def _line(name: str, values: Iterable[float], digits: int = 0) -> str:
+    given = np.array(list(values), float)
+    middle, low, high = (f"{value:.{digits}f}" for value in (np.median(given), given.min(), given.max()))
+    return f"  {name:<36}{middle:>8} ({low} to {high})"
+
+
+def picture(scene: dict[str, np.ndarray], title: str, metres: float) -> Figure:
+    """A scene at its start frame, `metres` wide, with the ways that its agents were recorded to take."""
+    figure = new_figure(SIDE, SIDE + HEAD + FOOT)
+    height = SIDE + HEAD + FOOT
+    axes = figure.add_axes((0, FOOT / height, 1, SIDE / height))
+    figure.text(14 / SIDE, 1 - 22 / height, title, fontsize=13, color=drawing.INK)
+    drawing.add_legend(figure, LEGEND, 11)
+    TrafficMap(axes, _road(scene), metres).show(scene["start"][0, :2], _trails(scene), _shapes(scene))
+    return figure
+
+
+def _road(scene: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The map of a scene in the form of a rollout's."""
+    tensors = {name: torch.from_numpy(value) for name, value in scene.items()}
+    lanes, lane_offsets, kept = polylines(tensors["lane_points"], tensors["lane_index"], minimum=2)
+    rings, ring_offsets, _ = polylines(tensors["drivable_points"], tensors["drivable_index"], minimum=3)
+    return {
+        "lane_points": lanes,
+        "lane_offsets": lane_offsets,
+        "lane_width": scene["lane_width"][kept],
+        "drivable_points": rings,
+        "drivable_offsets": ring_offsets,
+    }
+
+
+def _trails(scene: dict[str, np.ndarray]) -> list[Trail]:
+    """The recorded ways, the ego's on top; each fades towards the start frame."""
+    trails = []
+    for agent in reversed(np.flatnonzero(scene["valid"]).tolist()):
+        path = scene["logged"][scene["logged_valid"][:, agent], agent, :2]
+        if len(path) > 1:
+            trails.append(Trail(path, _colour(scene, agent), 0.4))
+    return trails
+
+
+def _shapes(scene: dict[str, np.ndarray]) -> list[Shape]:
+    """Lights, then agents, the ego on top."""
+    states = scene["light_state"][0].tolist()
+    points = zip(scene["light_points"], states, strict=True)
+    shapes = [drawing.disc(point, 0.7, LIGHTS[state], drawing.INK) for point, state in points]
+    for agent in reversed(np.flatnonzero(scene["valid"]).tolist()):
+        state, size, kind = scene["start"][agent], scene["size"][agent], AGENT_TYPES[scene["agent_type"][agent]]
+        if kind in ("pedestrian", "cyclist"):
+            shapes += drawing.vulnerable(state, size, kind == "cyclist")
+        else:
+            shapes += drawing.vehicle(state, size, _colour(scene, agent))
+    return shapes
+
+
+def _colour(scene: dict[str, np.ndarray], agent: int) -> str:
+    return drawing.EGO if agent == 0 else COLOURS.get(AGENT_TYPES[scene["agent_type"][agent]], drawing.REPLAYED)
+
+
+def open_source(path: Path, data: str | None, workers: int) -> tuple[str, Source]:
+    """The data group that reads `path`, and its source; raises InputError where none does."""
+    refusals = []
+    for name in [data] if data else FOUND:
+        source = source_of({**load_choice("data", name), "path": str(path), "workers": workers})
+        try:
+            source.logs()
+        except InputError as error:
+            refusals.append(str(error))
+        else:
+            return name, source
+    raise InputError("; ".join(dict.fromkeys(refusals)))
+
+
+def inspect(source: Source, chosen: str | None) -> tuple[list[Row], list[Content], Row]:
+    """All rows of a source without their scenes, the contents of its scenes, and the row to draw: the scene `chosen`,
+    by default the first. Raises InputError where there is no such scene."""
+    rows, contents, drawn = [], [], None
+    with closing(source.rows()) as found:
+        for row in found:
+            rows.append(row._replace(scene=None))
+            if row.scene is not None:
+                contents.append(content(unpack(row.scene.record)))
+                drawn = row if drawn is None and chosen in (None, row.scene_id) else drawn
+    if drawn is None:
+        names = [row.scene_id for row in rows if not row.reason][:1]
+        example = f"such as {names[0]}" if names else f"but none is left: {rows[0].reason}"
+        raise InputError(f"--scene={chosen}: name a scene of {source.path}, {example}")
+    return rows, contents, drawn
+
+
+def check_apart(rows: Sequence[Row], source: Source, other: Source) -> str:
+    """A line on the places of the scenes `rows` of a source and of another's recordings; InputError where they share
+    some, or where a place is not known."""
+    here = {row.location for row in rows if not row.reason}
+    there = {recording.location for recording in other.recordings()}
+    for path, places in ((source.path, here), (other.path, there)):
+        if "" in places:
+            raise InputError(f"{path}: the place of some logs is not known; name it in index.csv (docs/data.md)")
+    if shared := sorted(here & there):
+        names = ", ".join(shared[:5]) + (", ..." if len(shared) > 5 else "")
+        common = f"{len(shared)} places in common ({names})"
+        raise InputError(f"{source.path} and {other.path}: {common}; part them by place")
+    return f"apart        from the {len(there)} places of {other.path}"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(prog="python -m e2rl.commands.inspect", description=__doc__.splitlines()[0])
+    parser.add_argument("path", type=Path, metavar="PATH", help="folder or zip of logs")
+    parser.add_argument("--data", metavar="NAME", help="file of conf/data that reads them (default: the one that can)")
+    parser.add_argument("--scene", metavar="ID", help="the scene that is drawn (default: the first)")
+    parser.add_argument("--metres", type=float, default=140.0, help="width of the picture (default %(default)s)")
+    parser.add_argument("--apart", type=Path, metavar="OTHER", help="logs that must share no place with those at PATH")
+    parser.add_argument("--workers", type=int, default=2, help="processes (default %(default)s)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("scene.png"),
+        help="picture to write, with a PDF beside it (default %(default)s)",
+    )
+    options = parser.parse_args(arguments)
+    try:
+        name, source = open_source(options.path, options.data, options.workers)
+        rows, contents, drawn = inspect(source, options.scene)
+        print(f"data         {name}, {options.path}", *report(source, rows, contents), sep="\n")
+        if options.apart:
+            print(check_apart(rows, source, open_source(options.apart, name, options.workers)[1]))
+        assert drawn.scene is not None
+        scene, title = unpack(drawn.scene.record), f"{drawn.scene_id}   {drawn.location}"
+        save_figure(options.out, picture(scene, title, options.metres))
+    except InputError as error:
+        stop(error)
+    print(f"drawn        {drawn.scene_id}: {options.out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,104 @@
+"""Open-loop accuracy of traffic methods: plans from causal start states, without the ego's plan, against the log."""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from e2rl.evaluation.protocol import SEEDS_APART, Method
+from e2rl.evaluation.rollout_files import require_rows
+from e2rl.evaluation.summary import metric_row
+from e2rl.metrics.catalogue import OPEN_LOOP_STAGE
+from e2rl.metrics.displacement import scene_displacements
+from e2rl.metrics.statistics import bootstrap_draws, cluster_index, interval, resampled_means
+from e2rl.run.parts import NOTHING_KEPT, Kept
+from e2rl.scenes.recording import VEHICLE
+from e2rl.scenes.scene import SceneSet
+from e2rl.traffic.attempt import attempt, count_reasons
+from e2rl.traffic.traffic import keep_velocity
+
+HORIZONS = (3.0, 5.0)  # s
+EGO = "unknown"  # `ego` column of the rows: no method receives the ego's plan
+BATCH = 32  # scenes planned at once
+
+
+@torch.no_grad()
+def open_loop_rows(
+    scenes: SceneSet, methods: Sequence[Method], samples: int, device: str = "cpu", kept: Kept = NOTHING_KEPT
+) -> list[dict]:
+    """Rows of metrics.json, stage `open loop`, of every uncontrolled method that predicts: minADE, mean and joint ADE
+    over `samples` and their ratios to constant velocity's ADE on the same vehicles, with intervals over places.
+
+    kept: methods that are finished.
+    """
+    rows = []
+    for number, method in enumerate(methods):
+        if method.eta > 0 or not method.traffic.predicts:
+            continue
+        count = samples if method.traffic.stochastic else 1
+        compute = partial(open_loop_metrics, scenes, method, count, device)
+        found = kept.result(f"open-loop-{number:03}", [method.name, count, "with ended"], compute)
+        done, key = found["scenes"], (scenes.dataset, scenes.split, method.name, EGO, method.eta)
+        fields = {"stage": OPEN_LOOP_STAGE, "ended": found["ended"]}
+        rows.append(metric_row(key, done, count, done * count, found["metrics"], **fields))
+    return rows
+
+
+def open_loop_metrics(scenes: SceneSet, method: Method, count: int, device: str) -> dict[str, Any]:
+    """The metrics of `count` open-loop samples of every scene, the number of scenes that they are of, and ended: how
+    many others there are, for each reason. Raises InputError where there are only these."""
+
+    def plan(tasks: Sequence[int]) -> dict:
+        index = torch.tensor(tasks)
+        scene = scenes.batch(index).to(device)
+        seed = index.to(device) + SEEDS_APART * torch.arange(count, device=device)[:, None]
+        plans = method.traffic.open_loop_plans(scene, seed)
+        there = _predicted(scene, plans.shape[2])[:, None, :, None].expand(plans.shape[:-1])
+        return {"states": plans.cpu(), "valid": there.cpu(), **_displacements(scene, plans)}
+
+    parts, lost = [], []
+    for batch in torch.arange(len(scenes)).split(BATCH):
+        found, ended = attempt(plan, batch.tolist())
+        parts += found
+        lost += [why for _, why in ended]
+    require_rows([part for _, part in parts], lost, None)
+    done = [scene for tasks, _ in parts for scene in tasks]
+    columns = {name: torch.cat([part[name] for _, part in parts]) for name in parts[0][1]}
+    return {"metrics": _summary(columns, scenes, done), "scenes": len(done), "ended": count_reasons(lost)}
+
+
+def _predicted(scene: TensorDictBase, vehicles: int) -> Tensor:
+    """Bool [B, V]: vehicles that are there at the start."""
+    return scene["valid"][:, :vehicles] & (scene["agent_type"][:, :vehicles] == VEHICLE)
+
+
+def _displacements(scene: TensorDictBase, plans: Tensor) -> dict[str, Tensor]:
+    """The columns of `scene_displacements` of simulated vehicles for plans [B, S, V, HORIZON, 4]."""
+    vehicles = plans.shape[2]
+    here = _predicted(scene, vehicles)
+    straight = keep_velocity(scene["start"][:, :vehicles])
+    logged, valid = scene["logged"][:, :, :vehicles], scene["logged_valid"][:, :, :vehicles]
+    columns = scene_displacements(plans, straight, logged, valid, here, HORIZONS)
+    return {name: value.cpu().double() for name, value in columns.items()}
+
+
+def _summary(columns: dict[str, Tensor], scenes: SceneSet, done: Sequence[int]) -> dict[str, dict[str, float]]:
+    """{metric: {mean, low, high, n}}: ratios of sums over the scenes `done`, places resampled; n counts vehicles."""
+    rows = [{"location": scenes.location[scene], "scene_id": scenes.scene_id[scene]} for scene in done]
+    cluster, clusters = cluster_index(rows)
+    draws = bootstrap_draws(clusters)
+    result: dict[str, dict[str, float]] = {}
+    for at in (f"_{horizon:g}" for horizon in HORIZONS):
+        vehicles, straight = columns[f"vehicles{at}"], columns[f"cv_ade{at}"]
+        quotients = {
+            f"{name}{at}": (columns[name + at], vehicles) for name in ("min_ade", "mean_ade", "joint_ade", "cv_ade")
+        }
+        quotients |= {f"{name}_ratio{at}": (columns[name + at], straight) for name in ("min_ade", "mean_ade")}
+        totals, weights = (torch.stack(column, -1) for column in zip(*quotients.values(), strict=True))
+        means = resampled_means(totals, weights, cluster, draws)
+        places = len(cluster[vehicles > 0].unique())
+        result |= {name: interval(means[:, k], places) | {"n": int(vehicles.sum())} for k, name in enumerate(quotients)}
+    return result

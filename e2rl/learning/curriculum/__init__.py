@@ -1,1 +1,0 @@
-"""The curriculum: priorities of scenes, adversarial intensity, and share of adversarial episodes."""

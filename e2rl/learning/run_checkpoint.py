@@ -1,0 +1,166 @@
+"""Checkpoints of an evolution run: all state that later rounds depend on, written atomically.
+
+A checkpoint is a folder checkpoints/round-000002 of state.pt (optimiser, curriculum, sampler, counters, generators;
+read with weights_only), actor.safetensors (weights and observation statistics; also what `ego.checkpoint` takes),
+memory.json (the rounds in memory, whose traffic stays in memory/ beside checkpoints/) and config.json. It is sealed by
+the hashes of these files: a torn or altered one is noticed, and the one before it is used.
+"""
+
+import io
+import json
+import os
+import random
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from e2rl.learning.evolution import Evolution
+from e2rl.planners.actor import ActorEgo
+from e2rl.planners.network import WEIGHTS
+from e2rl.run.errors import InputError
+from e2rl.run.files import altered, seal
+
+STATE, MEMORY, CONFIG, FORMAT = "state.pt", "memory.json", "config.json", "e2rl-checkpoint/6"
+
+
+def save_checkpoint(folder: Path, run: Evolution, config: dict, keep_last: int = 2) -> Path:
+    """Write checkpoints/round-<rounds done> under a run's folder; only the keep_last newest are kept, and of the memory
+    the files that these name."""
+    parent = Path(folder) / "checkpoints"
+    parent.mkdir(parents=True, exist_ok=True)
+    target, partial = parent / f"round-{run.round:06d}", parent / f".partial-{os.getpid()}"
+    for left in parent.glob(".partial-*"):
+        shutil.rmtree(left)
+    partial.mkdir()
+    try:
+        _write(partial, run, config)
+    except BaseException:
+        shutil.rmtree(partial)
+        raise
+    shutil.rmtree(target, ignore_errors=True)
+    partial.replace(target)
+    *older, newest = sorted(parent.glob("round-*"))
+    kept = [*older, newest][-max(1, keep_last) :]
+    for old in set(older) - set(kept):
+        shutil.rmtree(old)
+    first = [entry["round"] for folder in kept if altered(folder) is None for entry in _memory_index(folder)]
+    run.memory.prune(min(first, default=0))  # a file goes when no checkpoint names it any more
+    return target
+
+
+def _write(folder: Path, run: Evolution, config: dict) -> None:
+    """The files of a checkpoint, sealed."""
+    state = io.BytesIO()  # a full disk is an OSError then
+    torch.save({"format": FORMAT, "run": run.state_dict(), "generators": generator_states()}, state)
+    (folder / STATE).write_bytes(state.getbuffer())
+    if isinstance(run.ego, ActorEgo):
+        run.ego.network.save(folder / WEIGHTS)
+    (folder / MEMORY).write_text(json.dumps(run.memory.index()))
+    own = {key: value for key, value in config.items() if key != "resume"}  # equal, whether the run was interrupted
+    (folder / CONFIG).write_text(json.dumps(own, indent=1, sort_keys=True))
+    seal(folder)
+
+
+def _memory_index(folder: Path) -> list[dict[str, int]]:
+    """The rounds in memory by a checkpoint; InputError where its file is missing or damaged."""
+    file = folder / MEMORY
+    try:
+        index = json.loads(file.read_text())
+        return [{"round": int(entry["round"]), "crc32": int(entry["crc32"])} for entry in index]
+    except (OSError, ValueError, TypeError, LookupError, ArithmeticError, RecursionError) as error:
+        raise InputError(f"{file}: damaged ({type(error).__name__}); resume from an older checkpoint") from error
+
+
+def checkpoints(path: str | Path) -> list[Path]:
+    """The checkpoint folders that `path` names, the oldest first: itself, or those of a run's folder."""
+    path = Path(path)
+    return [path] if (path / STATE).is_file() else sorted(path.glob("checkpoints/round-*"))
+
+
+def latest_checkpoint(path: str | Path) -> Path:
+    """The checkpoint folder that `path` names: itself, or the newest of a run's folder."""
+    found = checkpoints(path)
+    if not found:
+        raise InputError(f"{path}: holds no checkpoint; give a run's folder or one of its checkpoints/round-*")
+    return found[-1]
+
+
+def load_checkpoint(path: str | Path, run: Evolution) -> int:
+    """Restore a run built from the same configuration, generators last; returns the rounds done.
+
+    Of a run's folder it is the newest checkpoint that is whole; those that are not are named on stderr. Raises
+    InputError where none is, and for one of another configuration or version.
+    """
+    latest_checkpoint(path)
+    damage = ""
+    for folder in reversed(checkpoints(path)):
+        try:
+            state = _whole(folder, run)
+        except InputError as error:
+            damage = damage or str(error)
+            print(f"passed over: {error}", file=sys.stderr)
+            continue
+        _restore(folder, state, run)
+        return run.round
+    raise InputError(damage)
+
+
+def _whole(folder: Path, run: Evolution) -> dict:
+    """The state in a checkpoint, and its memory restored; InputError where either is damaged."""
+    file = folder / STATE
+    if name := altered(folder):
+        raise InputError(f"{folder / name}: missing or damaged; resume from an older checkpoint")
+    try:
+        state = torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:  # a stranger's pickle can raise any exception
+        raise InputError(f"{file}: damaged ({type(error).__name__}); resume from an older checkpoint") from error
+    written = state.get("format") if isinstance(state, dict) else None
+    if written != FORMAT and str(written).startswith(FORMAT.split("/")[0]):
+        raise InputError(f"{file}: of another version of this program ({written}, not {FORMAT}); begin a new run")
+    if written != FORMAT:
+        raise InputError(f"{file}: not a checkpoint of this program ({FORMAT}); give a run's folder")
+    run.memory.restore(_memory_index(folder))
+    return state
+
+
+def _restore(folder: Path, state: dict, run: Evolution) -> None:
+    """Weights, learner, curriculum and generators of a whole checkpoint."""
+    if isinstance(run.ego, ActorEgo):
+        run.ego.network.load(folder / WEIGHTS)
+    try:
+        run.load_state_dict(state["run"])
+        restore_generators(state["generators"])
+    except (LookupError, ValueError, TypeError, AttributeError, RuntimeError, ArithmeticError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"{folder / STATE}: its learner is of another kind or shape ({error}); resume with the configuration "
+            f"in {folder / CONFIG}"
+        ) from None
+
+
+def generator_states() -> dict:
+    """States of the global generators of torch, CUDA, numpy and python, as plain values and tensors."""
+    state = np.random.get_state()
+    assert isinstance(state, tuple)  # the global generator is a Mersenne Twister
+    name, keys, position, has_gauss, cached = state
+    return {
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        "numpy": [name, keys.tolist(), position, has_gauss, cached],
+        "python": list(random.getstate()),
+    }
+
+
+def restore_generators(states: dict) -> None:
+    """Set the global generators to `generator_states`."""
+    torch.set_rng_state(states["torch"])
+    if torch.cuda.is_available() and states["cuda"]:
+        torch.cuda.set_rng_state_all(states["cuda"])
+    name, keys, position, has_gauss, cached = states["numpy"]
+    np.random.set_state((name, np.array(keys, dtype=np.uint32), position, has_gauss, cached))
+    version, internal, gauss = states["python"]
+    random.setstate((version, tuple(internal), gauss))

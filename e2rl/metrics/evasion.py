@@ -1,0 +1,252 @@
+"""Which collisions the ego could have avoided: columns of the rollouts' rows (docs/method.md, section 10).
+
+The search for actions of the ego that avoid contact, given how everybody else moved (docs/method.md, section 10).
+
+The others are fixed: they do not react. Candidates are longitudinal profiles on lateral targets (the ego's routes, and
+shifts beside its mission). Where none is clean, an evolution strategy perturbs the knots of the best ones. What it
+finds proves that a collision was avoidable; what it does not find proves nothing.
+"""
+
+import time
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorClass, TensorDictBase
+from torch import Tensor
+
+from e2rl.metrics.manoeuvre import (
+    KNOT_STEPS,
+    EvasionScene,
+    execute,
+    knot_count,
+    knots_of,
+    peak_acceleration,
+    violations,
+)
+from e2rl.scenes.recording import DT
+from e2rl.sim import dynamics
+from e2rl.sim.env import SimSettings
+
+BRAKES = (2.0, 4.0, 6.0, 8.0)  # m/s^2, held from a moment on
+PULSES = ((3.0, 1.0), (3.0, 2.0), (6.0, 1.0), (6.0, 2.0), (-2.0, 2.0), (-4.0, 2.0))  # m/s^2 of braking, s it lasts
+BEGINS = (0.0, 1.0, 2.0, 3.0, 4.0)  # s
+SHIFTS = (0.0, 1.5, -1.5, 3.5, -3.5, 2.5, -2.5)  # m beside the mission
+RAMP = 3  # knots that a shift takes
+TARGETS = 8  # lateral targets a profile is tried on
+CHUNK = 8  # rollouts searched at once: bounds the memory
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """clearance [m] that an evasion keeps to others, and road_margin [m] that its centre keeps inside the drivable
+    border, which lies 1 m beyond the lanes (recorded egos keep 0.8 m); the strategy's samples per round, survivors and
+    largest number of rounds, and its largest standard deviations of an acceleration [m/s^2] and of a shift [m]."""
+
+    clearance: float = 0.05
+    road_margin: float = 0.5
+    samples: int = 192
+    survivors: int = 24
+    rounds: int = 16
+    accel_std: float = 4.0
+    shift_std: float = 2.0
+
+    def effort(self, steps: int) -> str:
+        """What is tried before a collision counts as not avoided, in words."""
+        count = len(profiles(torch.zeros(1, steps))[0]) * TARGETS
+        return f"{count} manoeuvres, then {self.rounds} rounds of {self.samples}"
+
+
+class Evasions(TensorClass):
+    """The mildest evasion found of each rollout [B], else the manoeuvre that violates least."""
+
+    found: Tensor  # [B] bool
+    actions: Tensor  # [B, T, 2]
+    states: Tensor  # [B, T, 4], at steps 1..T
+    peak: Tensor  # [B] m/s^2, its largest acceleration
+    tried: Tensor  # [B], manoeuvres executed
+
+
+class Trials(TensorClass):
+    """C manoeuvres of each of B rollouts."""
+
+    route: Tensor  # [B, C], candidate
+    accel: Tensor  # [B, C, K], knots
+    shift: Tensor  # [B, C, K], knots
+    actions: Tensor  # [B, C, T, 2]
+    states: Tensor  # [B, C, T, 4]
+    violation: Tensor  # [B, C] m, summed over steps; 0 is clean
+    peak: Tensor  # [B, C] m/s^2
+
+    def best(self, count: int) -> "Trials":
+        """The best of each rollout: clean ones first, by their peak, then by their violation."""
+        rank = torch.where(self.violation > 0, 1e3 + self.violation, self.peak)
+        row = torch.arange(len(rank), device=rank.device)[:, None]
+        return self[row, rank.argsort(1)[:, :count]]
+
+    def evasions(self, tried: Tensor) -> Evasions:
+        """The best of each rollout as the result after `tried` [B] manoeuvres."""
+        best = self.best(1)[:, 0]
+        return Evasions(best.violation == 0, best.actions, best.states, best.peak, tried, batch_size=best.batch_size)
+
+
+def find_evasions(
+    scene: TensorDictBase,
+    states: Tensor,
+    valid: Tensor,
+    sim: SimSettings,
+    settings: SearchSettings | None = None,
+    moment: Tensor | None = None,
+) -> Evasions:
+    """Search for evasions in scenes [B >= 1] with agents at states [B, T+1, N, 4], valid [B, T+1, N], the ego first.
+
+    moment [B]: the step from which the ego may act otherwise (default 0, the start); an evasion holds the T steps from
+    there on and counts to the last recorded one. All rollouts draw the same numbers, so that a result does not depend
+    on the batch.
+    """
+    settings = settings or SearchSettings()
+    moment = torch.zeros(len(states), dtype=torch.int64, device=states.device) if moment is None else moment
+    rows = torch.arange(len(states), device=states.device).split(CHUNK)
+    parts = [_search(scene[row], states[row].float(), valid[row], moment[row], sim, settings) for row in rows]
+    return Evasions.cat(parts)
+
+
+def _search(
+    scene: TensorDictBase, states: Tensor, valid: Tensor, moment: Tensor, sim: SimSettings, settings: SearchSettings
+) -> Evasions:
+    steps = states.shape[1] - 1
+    driven = dynamics.inverse(states[:, :, 0])[..., 0].masked_fill(~valid[:, 1:, 0], 0.0)
+    driven = driven.gather(1, (moment[:, None] + torch.arange(steps, device=moment.device)).clamp(max=steps - 1))
+    task = EvasionScene.after(moment, scene, states, valid)
+    pool = _try(task, *grid(driven, scene["route_valid"][:, 0], scene["route_log"][:, 0]), sim, settings)
+    result = pool.evasions(torch.full_like(moment, pool.batch_size[1]))
+    row = torch.arange(len(states), device=states.device)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(settings.rounds):
+        left = ~result.found[row]
+        row, task, pool = row[left], task[left], pool[left]
+        if not len(row):
+            break
+        parents = pool.best(settings.survivors)
+        pool = Trials.cat([parents, _try(task, *_mutated(parents, settings, generator), sim, settings)], 1)
+        result[row] = pool.evasions(result.tried[row] + settings.samples)
+    return result
+
+
+def profiles(driven: Tensor) -> Tensor:
+    """Knots [B, L, K] of longitudinal profiles: constant speed, braking and accelerating from a moment on or for a
+    while, and the same on top of the acceleration driven [B, T] m/s^2."""
+    batch, steps = driven.shape
+    at = torch.arange(knot_count(steps), device=driven.device, dtype=driven.dtype) * KNOT_STEPS * DT
+    pulses = [torch.zeros_like(at)]
+    pulses += [-level * (at >= begin) for level in BRAKES for begin in BEGINS]
+    pulses += [-level * ((at >= begin) & (at < begin + time)) for level, time in PULSES for begin in BEGINS]
+    profile = torch.stack(pulses).expand(batch, -1, -1)
+    return torch.cat([profile, knots_of(driven)[:, None] + profile], 1)
+
+
+def lateral_targets(route_valid: Tensor, mission: Tensor) -> tuple[Tensor, Tensor]:
+    """Route candidate and shift [m] beside it, each [B, TARGETS], of the ego whose own candidate is mission [B].
+
+    In order: the mission, half a lane to either side, the other candidates (route_valid [B, R]), more shifts.
+    """
+    batch, count = route_valid.shape
+    shift = torch.tensor(SHIFTS, device=mission.device).expand(batch, -1)
+    own = mission[:, None].expand(-1, len(SHIFTS))
+    others = torch.arange(count, device=mission.device).expand(batch, -1)
+    route = torch.cat([own[:, :3], others, own[:, 3:]], 1)
+    shift = torch.cat([shift[:, :3], torch.zeros_like(others, dtype=shift.dtype), shift[:, 3:]], 1)
+    useful = torch.ones_like(route, dtype=torch.bool)
+    useful[:, 3 : 3 + count] = route_valid & (others != mission[:, None])
+    order = torch.argsort(~useful, dim=1, stable=True)[:, :TARGETS]
+    return route.gather(1, order), shift.gather(1, order)
+
+
+def grid(driven: Tensor, route_valid: Tensor, mission: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Route [B, C], acceleration and shift knots [B, C, K] of every profile on every lateral target."""
+    accel, (route, shift) = profiles(driven), lateral_targets(route_valid, mission)
+    shape, knots = (*accel.shape[:2], route.shape[1]), accel.shape[-1]
+    ramp = (torch.arange(-1, knots - 1, device=shift.device) / RAMP).clamp(0, 1)
+    accel, shift = accel[:, :, None], shift[:, None, :, None] * ramp
+    knots_each = [value.expand(*shape, knots).flatten(1, 2) for value in (accel, shift)]
+    return route[:, None].expand(shape).flatten(1), knots_each[0], knots_each[1]
+
+
+def _try(
+    task: EvasionScene, route: Tensor, accel: Tensor, shift: Tensor, sim: SimSettings, settings: SearchSettings
+) -> Trials:
+    row = torch.arange(len(route), device=route.device)[:, None]
+    start = task.start[:, None].expand(*route.shape, 4)
+    actions, states = execute(start, task.routes[row, route], accel, shift, task.inside.shape[1], sim)
+    violation = violations(states, task, settings.clearance, settings.road_margin).sum(-1)
+    peak = peak_acceleration(start, states)
+    return Trials(route, accel, shift, actions, states, violation, peak, batch_size=route.shape)
+
+
+def _mutated(parents: Trials, settings: SearchSettings, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    """Route, acceleration and shift knots of `samples` children of parents [B, C], better ones more often.
+
+    The disturbances of knots are smooth over about 1 s, and of a strength drawn for each child, so that small and large
+    changes are both tried.
+    """
+    count, knots, device = settings.samples, parents.accel.shape[-1], parents.accel.device
+    parent = torch.rand(count, generator=generator).to(device)
+    strength = torch.rand(count, 2, generator=generator).square() + 0.02
+    gap = torch.arange(knots)[:, None] - torch.arange(knots)
+    smooth = torch.exp(-((gap / 2.0) ** 2) / 2)
+    smooth = smooth / smooth.norm(dim=-1, keepdim=True)
+    white = torch.randn(2, count, knots, generator=generator)
+    accel, shift = (white @ smooth.T * strength.T[..., None]).to(device)
+    index = (parent.square() * parents.route.shape[1]).long()
+    parents = parents[:, index]
+    return parents.route, parents.accel + settings.accel_std * accel, parents.shift + settings.shift_std * shift
+
+
+LATE = 1.0  # s before contact at which the late search starts
+
+
+def add_avoidable(rows: list[dict], rollouts: dict, scene: TensorDictBase, sim: SimSettings) -> Tensor:
+    """Add to the rows (of score_rollouts, in place) of rollouts whose ego hit a vehicle: avoidable and avoidable_1s (0
+    or 1: an evasion was found from the start frame, from LATE seconds before contact), evasion_accel [m/s^2] of the
+    mildest one from the start, evasion_tried (manoeuvres driven) and evasion_seconds. Other rows: NaN.
+
+    rollouts: the rollout dict [B] of the rows; scene: their scenes [B]. Returns the evasions [B, T+1, 4] of the ego,
+    the mildest one from the start where there is one; NaN where none was found.
+    """
+    evasions = torch.full_like(rollouts["states"][:, :, 0], torch.nan)
+    collided = [index for index, row in enumerate(rows) if row["cfr"] == 1]
+    if not collided:
+        return evasions
+    begin, picked = time.perf_counter(), torch.tensor(collided)
+    given = scene[picked], rollouts["states"][picked], rollouts["valid"][picked]
+    contact = torch.tensor([int(rows[index]["contact_step"]) for index in collided])
+    early = find_evasions(*given, sim)
+    moment = (contact - round(LATE / DT)).clamp(min=0)
+    late = find_evasions(*given, sim, moment=moment)
+    found = early.found | late.found  # avoidable late implies avoidable early: drive as in the rollout until then
+    peak = torch.where(early.found, early.peak, torch.where(late.found, late.peak, torch.nan))
+    spent = (time.perf_counter() - begin) / len(collided)
+    for row, index in enumerate(collided):
+        rows[index] |= {
+            "avoidable": float(found[row]),
+            "avoidable_1s": float(late.found[row]),
+            "evasion_accel": peak[row].item(),
+            "evasion_tried": int(early.tried[row] + late.tried[row]),
+            "evasion_seconds": spent,
+        }
+    driven = given[1][:, :, 0]
+    evasions[picked[late.found]] = spliced(driven, late.states, moment)[late.found]
+    evasions[picked[early.found]] = spliced(driven, early.states, torch.zeros_like(moment))[early.found]
+    return evasions
+
+
+def spliced(driven: Tensor, states: Tensor, moment: Tensor) -> Tensor:
+    """States [B, T+1, 4] `driven` up to the step `moment` [B], then those of an evasion [B, T, 4] from there on."""
+    steps = torch.arange(driven.shape[1], device=driven.device)
+    since = (steps - 1 - moment[:, None]).clamp(min=0)
+    after = states.gather(1, since[..., None].expand(-1, -1, 4))
+    return torch.where((steps > moment[:, None])[..., None], after, driven)
+
+
+def search_effort(steps: int) -> str:
+    """Caption on the search behind `avoidable`, for rollouts of `steps` steps."""
+    return f"avoidable: not found after {SearchSettings().effort(steps)} counts as no"

@@ -1,0 +1,240 @@
+"""Would a competent driver in the ego's place have had the collision (docs/verdicts.md)?
+
+The ego is driven again along its own way; all others are replayed. A vehicle behind that is replayed into a driver who
+brakes earlier than the ego did is driven again, too: if its own competent braking avoids the contact, it does not
+count. Such chains are at most two vehicles long.
+
+A vehicle driven again along its own way by a competent driver, in traffic that is replayed (docs/verdicts.md).
+
+Shapes: B rollouts, T + 1 states of DT, N others. The way is the path that the vehicle drove, straight on from its end.
+The driver keeps the recorded acceleration until it reacts, then what it asks for; it never steers and never drives
+faster than recorded.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from e2rl.metrics.drivers import DRIVERS, Driver, Observation
+from e2rl.scenes.boxes import separation, to_frame
+from e2rl.scenes.recording import DT
+from e2rl.scenes.route import SPACING, project
+
+STRAIGHT = 60.0  # m by which a way goes on straight
+
+
+class Tracks(NamedTuple):
+    """Recorded motion of vehicles: states [B, T+1, N, 4], size [B, N, 2], present [B, T+1, N] bool."""
+
+    states: Tensor
+    size: Tensor
+    present: Tensor
+
+
+class Along(NamedTuple):
+    """Others seen along a way, each [T+1, B, N]: rear (arc length of its near end, m), speed and acceleration along the
+    way, lateral gap (m between the facing sides), lateral speed towards the way, length along the way.
+
+    Absent ones, and those that never enter the way, are at an infinite distance.
+    """
+
+    rear: Tensor
+    speed: Tensor
+    acceleration: Tensor
+    lateral_gap: Tensor
+    lateral_speed: Tensor
+    length: Tensor
+
+
+def driven_length(states: Tensor) -> Tensor:
+    """Arc length [B, T+1] m at each step of a way states [B, T+1, 4], 0 at its start."""
+    return torch.nn.functional.pad(states[..., :2].diff(dim=1).norm(dim=-1).cumsum(-1), (1, 0))
+
+
+def poses(states: Tensor, s: Tensor) -> Tensor:
+    """Poses [B, K, 3] at arc lengths s [B, K] of a way states [B, T+1, 4], straight on beyond its end."""
+    length = driven_length(states)
+    after = torch.searchsorted(length, s.contiguous(), right=True).clamp(1, length.shape[1] - 1)
+    low, high = length.gather(1, after - 1), length.gather(1, after)
+    share = ((s - low) / (high - low).clamp(min=1e-6)).clamp(0, 1)[..., None]
+    first, second = (states.gather(1, index[..., None].expand(-1, -1, 4)) for index in (after - 1, after))
+    turn = torch.remainder(second[..., 2] - first[..., 2] + torch.pi, 2 * torch.pi) - torch.pi
+    heading = first[..., 2] + share[..., 0] * turn
+    beyond = (s - length[:, -1:]).clamp(min=0)[..., None]
+    ahead = torch.stack([heading.cos(), heading.sin()], -1)
+    return torch.cat([torch.lerp(first[..., :2], second[..., :2], share) + beyond * ahead, heading[..., None]], -1)
+
+
+def along_way(states: Tensor, width: Tensor, others: Tracks) -> Along:
+    """Others seen along the way states [B, T+1, 4] of a vehicle of `width` [B] m."""
+    reach = STRAIGHT + (driven_length(states).amax().item() if len(states) else 0.0)
+    vertices = SPACING * torch.arange(int(reach / SPACING) + 2, device=states.device, dtype=states.dtype)
+    route = poses(states, vertices.expand(len(states), -1))[..., :2]
+    s, d, heading = project(others.states[..., :2].flatten(1, 2), route)
+    s, d, heading = (value.unflatten(1, others.present.shape[1:]) for value in (s, d, heading))
+    turn, speed = others.states[..., 2] - heading, others.states[..., 3]
+    cos, sin = turn.cos(), turn.sin()
+    half = others.size[:, None] / 2
+    extent = half[..., 0] * cos.abs() + half[..., 1] * sin.abs()
+    side = half[..., 0] * sin.abs() + half[..., 1] * cos.abs()
+    gap = d.abs() - side - width[:, None, None] / 2
+    enters = ((gap <= 0) & others.present).any(1, keepdim=True)
+    away = ~others.present | ~enters
+    change = torch.nn.functional.pad(speed.diff(dim=1) / DT, (0, 0, 1, 0)) * cos
+    values = (
+        (s - extent).masked_fill(away, torch.inf),
+        speed * cos,
+        change,
+        gap.masked_fill(away, torch.inf),
+        -d.sign() * speed * sin,
+        2 * extent,
+    )
+    return Along(*(value.transpose(0, 1) for value in values))
+
+
+def redrive(driver: Driver, states: Tensor, size: Tensor, others: Along) -> Tensor:
+    """States [B, T+1, 4] of a vehicle whose way is states [B, T+1, 4] and whose driver sees `others`; size [B, 2].
+
+    It reacts to each of the others as if that were alone, and brakes for the one that asks most.
+    """
+    recorded = states[..., 3].diff(dim=1) / DT
+    speed, s = states[:, 0, 3], torch.zeros_like(states[:, 0, 3])
+    acceleration, reacted = torch.zeros_like(speed), torch.zeros_like(speed, dtype=torch.bool)
+    memory = driver.init(others.rear[0])
+    length = size[:, :1].expand_as(others.rear[0])
+    way, speeds = [s], [speed]
+    for t in range(recorded.shape[1]):
+        gap = others.rear[t] - (s + size[:, 0] / 2)[:, None]
+        side = others.lateral_gap[t]
+        seen = Observation(
+            speed[:, None].expand_as(gap),
+            acceleration[:, None].expand_as(gap),
+            gap,
+            others.speed[t],
+            others.acceleration[t],
+            side,
+            others.lateral_speed[t],
+            side <= 0,
+            length,
+            others.length[t],
+        )
+        memory, wanted = driver.step(memory, seen)
+        asked = wanted.amin(1)
+        reacted = reacted | (asked < 0)
+        chosen = torch.where(reacted, torch.minimum(asked, recorded[:, t]), recorded[:, t])
+        after = (speed + chosen * DT).clamp(min=0)
+        acceleration, s, speed = (after - speed) / DT, s + (speed + after) / 2 * DT, after
+        way.append(s)
+        speeds.append(speed)
+    way_driven, speed_driven = torch.stack(way, 1), torch.stack(speeds, 1)
+    return torch.cat([poses(states, way_driven), speed_driven[..., None]], -1)
+
+
+def contacts(states: Tensor, size: Tensor, others: Tracks) -> Tensor:
+    """Bool [B, T+1, N]: a vehicle at states [B, T+1, 4] of size [B, 2] overlaps each of the others."""
+    apart = separation(states[:, :, None], size[:, None, None], others.states, others.size[:, None])
+    return (apart < 0) & others.present
+
+
+NEAREST = 16  # vehicles that come nearest to the ego are seen
+AFTER = round(3.0 / DT)  # steps beyond the ego's contact for which the driver must have none
+CHAIN = 2  # followers that may be driven again
+SAME_WAY = 0.5  # cosine of the headings of a follower and its leader at least
+
+
+class Collision(NamedTuple):
+    """B collisions: states [B, T+1, N, 4] (the ego in row 0), present [B, T+1, N], size [B, N, 2]; partner, stop [B]
+    int64: row of the vehicle that the ego hits, and the step."""
+
+    states: Tensor
+    present: Tensor
+    size: Tensor
+    partner: Tensor
+    stop: Tensor
+
+
+class Prevention(NamedTuple):
+    """Of B collisions: avoided [B] bool; followers [B] int64: vehicles behind the ego that had to brake for it; states
+    [B, T+1, 4]: of the driver."""
+
+    avoided: Tensor
+    followers: Tensor
+    states: Tensor
+
+
+def nearest_first(collision: Collision) -> Collision:
+    """The collision with the ego, its partner, then the other NEAREST - 1 vehicles by their least distance to it."""
+    states, present = collision.states, collision.present
+    gap = (states[..., :2] - states[:, :, :1, :2]).square().sum(-1).masked_fill(~present, torch.inf).amin(1)
+    gap[:, 0] = -2.0
+    gap = gap.scatter(1, collision.partner[:, None], -1.0)
+    order = gap.argsort(dim=1, stable=True)[:, : NEAREST + 1]
+    row = torch.arange(len(states), device=states.device)[:, None]
+    times = torch.arange(states.shape[1], device=states.device)[None, :, None]
+    at = row[..., None], times, order[:, None]
+    partner = torch.ones_like(collision.partner)
+    return Collision(held(states[at], present[at]), present[at], collision.size[row, order], partner, collision.stop)
+
+
+def held(states: Tensor, present: Tensor) -> Tensor:
+    """States [B, T+1, N, 4] with those of absent vehicles replaced by their last (else their first) present ones."""
+    steps = torch.arange(states.shape[1], device=states.device)[None, :, None].expand_as(present)
+    last = steps.masked_fill(~present, -1).cummax(1).values
+    first = present.int().argmax(1, keepdim=True)
+    index = torch.where(last >= 0, last, first)
+    return states.gather(1, index[..., None].expand_as(states))
+
+
+def prevention(driver: Driver, collision: Collision, along: Along) -> Prevention:
+    """What becomes of collisions sorted by `nearest_first` with a driver in the ego's place; along: the others seen
+    along the ego's way."""
+    states, present, size, _, stop = collision
+    others = Tracks(states[:, :, 1:], size[:, 1:], present[:, :, 1:])
+    driven = redrive(driver, states[:, :, 0], size[:, 0], along)
+    steps = torch.arange(states.shape[1], device=states.device)
+    counts = (steps >= 1) & (steps <= stop[:, None] + AFTER)
+    touched = contacts(driven, size[:, 0], others) & counts[..., None]
+    avoided, followers = ~touched[:, :, 0].any(1), torch.zeros_like(stop)
+    leader, leader_size = driven, size[:, 0]
+    blamed = touched.any(1)
+    blamed[:, 0] = False  # the partner
+    for _ in range(CHAIN):
+        hits = blamed.any(1) & avoided
+        if not bool(hits.any()):
+            break
+        first = touched.int().argmax(1).masked_fill(~blamed, len(steps)).argmin(1)
+        row = torch.arange(len(stop), device=stop.device)
+        follows = _follows(leader, others, touched, first) & (blamed.sum(1) == 1)
+        avoided = avoided & (~hits | follows)
+        track, track_size = others.states[row, :, first], others.size[row, first]
+        ahead = Tracks(leader[:, :, None], leader_size[:, None], torch.ones_like(touched[..., :1]))
+        braked = redrive(DRIVERS["human"], track, track_size, along_way(track, track_size[:, 1], ahead))
+        still = (contacts(braked, track_size, ahead)[..., 0] & counts).any(1)
+        avoided = avoided & (~hits | ~still)
+        followers = followers + (hits & avoided).long()
+        itself = torch.nn.functional.one_hot(first, blamed.shape[1]).bool()
+        before = contacts(track, track_size, others) & counts[..., None]
+        touched = contacts(braked, track_size, others) & counts[..., None] & ~before.any(1, keepdim=True)
+        blamed = touched.any(1) & ~itself & hits[:, None] & avoided[:, None]
+        touched = touched & ~itself[:, None]
+        leader, leader_size = braked, track_size
+    return Prevention(avoided, followers, driven)
+
+
+def _follows(leader: Tensor, others: Tracks, touched: Tensor, index: Tensor) -> Tensor:
+    """Bool [B]: others index [B] run into the rear of their leader at [B, T+1, 4]: they are behind it, along its
+    heading, when they first touch it."""
+    row = torch.arange(len(index), device=index.device)
+    step = touched[row, :, index].int().argmax(1)
+    other, ahead = others.states[row, step, index], leader[row, step]
+    behind = to_frame(other[:, :2], ahead)[:, 0] < 0
+    return behind & ((other[:, 2] - ahead[:, 2]).cos() > SAME_WAY)
+
+
+def preventions(collision: Collision, drivers: dict[str, Driver] = DRIVERS) -> dict[str, Prevention]:
+    """The Prevention of B collisions by each driver."""
+    collision = nearest_first(collision)
+    others = Tracks(collision.states[:, :, 1:], collision.size[:, 1:], collision.present[:, :, 1:])
+    along = along_way(collision.states[:, :, 0], collision.size[:, 0, 1], others)
+    return {name: prevention(driver, collision, along) for name, driver in drivers.items()}

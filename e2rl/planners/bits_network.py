@@ -1,0 +1,179 @@
+"""The networks of the ego `bits`: scene encoder, goal head and goal-conditioned policy, and their file.
+
+Goals beside a mission: a grid of the places that a vehicle may have reached at the end of its plan.
+
+A goal is a way [m] along the mission from the vehicle's present place and a side [m] beside the mission, left positive.
+The grid covers the ways up to `reach`, in cells whose length grows with the vehicle's speed.
+"""
+
+import json
+import math
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from e2rl.planners.candidates import Candidates, drive
+from e2rl.planners.ego import PLAN_STEPS
+from e2rl.planners.network import Normaliser, perceptron
+from e2rl.planners.path import RoutePath
+from e2rl.run.errors import InputError
+from e2rl.run.files import read_weights, unlike, weight_bytes, write_atomically
+from e2rl.scenes.recording import DT
+from e2rl.sim import dynamics
+from e2rl.sim.observation import OBSERVATION_SIZE
+
+HORIZON = PLAN_STEPS * DT  # s
+WAYS, SIDES = 32, 7  # cells along the mission and beside it
+CELLS = WAYS * SIDES  # G: cell w * SIDES + s
+SIDE = 1.0  # m, width of a cell
+FASTEST = 2.5  # m/s^2: acceleration over the horizon that leads to the grid's end
+
+
+def reach(speed: Tensor) -> Tensor:
+    """Ways [...] m to the end of the grid from speeds [...] m/s."""
+    return HORIZON * speed + FASTEST * HORIZON**2 / 2
+
+
+def place(speed: Tensor, cell: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+    """Ways and sides [B, K] m of the goals at `cell` [B, K] with residual [B, K, 2], in cells from the cell's centre;
+    speed [B] m/s. No way is negative."""
+    along = cell.div(SIDES, rounding_mode="floor") + 0.5 + residual[..., 0]
+    aside = cell % SIDES - (SIDES - 1) / 2 + residual[..., 1]
+    return (along * reach(speed)[:, None] / WAYS).clamp(min=0), aside * SIDE
+
+
+def cell_of(speed: Tensor, way: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
+    """The cells [W] of goals way, side [W] m, and their residuals [W, 2]: the inverse of `place`. A goal off the grid
+    counts to the nearest cell."""
+    along = way / reach(speed) * WAYS - 0.5
+    aside = side / SIDE + (SIDES - 1) / 2
+    w, s = along.round().clamp(0, WAYS - 1), aside.round().clamp(0, SIDES - 1)
+    return (w * SIDES + s).long(), torch.stack([along - w, aside - s], -1)
+
+
+def needed_acceleration(speed: Tensor, way: Tensor) -> Tensor:
+    """The constant acceleration [...] m/s^2 that drives `way` [...] m within the horizon from speed [...] m/s: to its
+    end, or to a halt before it."""
+    going = 2 * (way - HORIZON * speed) / HORIZON**2
+    halting = -speed.square() / (2 * way.clamp(min=0.1))
+    return torch.where(way < HORIZON * speed / 2, halting, going)
+
+
+FORMAT = "e2rl-bits/1"
+WEIGHTS = "bits.safetensors"  # file name in a run's folder
+LARGEST = 1 << 12  # units of a layer
+KNOTS = 10  # accelerations of a plan, each held PLAN_STEPS / KNOTS steps
+GOAL_FEATURES = 6
+ACCELERATION = (-8.0, 5.0)  # m/s^2, the simulator's bounds
+TIME = (0.5, 4.0)  # s that a lateral move takes (`candidates.drive`)
+AROUND = SIDE  # m: the move leads at most so far beside the goal
+MAX_YAW_RATE = 1.6  # rad/s, the simulator's bound
+
+
+class Controls(NamedTuple):
+    """What the policy decides of K plans in each of B scenes: acceleration [B, K, KNOTS] m/s^2, shift [B, K] m beside
+    the mission where the plan leads, over time [B, K] s."""
+
+    acceleration: Tensor
+    shift: Tensor
+    time: Tensor
+
+
+class BitsNetwork(nn.Module):
+    """Observation -> code; code -> distribution over goals; code and goal -> controls of a plan.
+
+    Outputs start at zero: untrained, all goals are equally likely and every plan keeps its speed. dropout: share of a
+    code's numbers that are left out in training mode.
+    """
+
+    def __init__(self, hidden: int = 64, dropout: float = 0.0) -> None:
+        super().__init__()
+        self.architecture = {"observation": OBSERVATION_SIZE, "hidden": int(hidden), "cells": CELLS, "knots": KNOTS}
+        self.normaliser = Normaliser(OBSERVATION_SIZE)
+        layers = perceptron(OBSERVATION_SIZE, [2 * hidden], hidden, last_gain=2**0.5)
+        self.encoder = nn.Sequential(layers, nn.SiLU(), nn.Dropout(dropout))
+        self.goal_head = perceptron(hidden, [hidden], 3 * CELLS, last_gain=0.0)
+        self.policy = perceptron(hidden + GOAL_FEATURES, [hidden, hidden], KNOTS + 2, last_gain=0.0)
+
+    def encode(self, observation: Tensor, noise: Tensor | None = None) -> Tensor:
+        """Codes [B, hidden] of observations [B, D]; noise [B, D] is added to the normalised ones, in training."""
+        seen = self.normaliser(observation)
+        return self.encoder(seen if noise is None else seen + noise)
+
+    def goals(self, code: Tensor) -> tuple[Tensor, Tensor]:
+        """Of every goal's cell the logit [B, CELLS], and the place in it: residual [B, CELLS, 2] in cells."""
+        logits, residual = self.goal_head(code).split([CELLS, 2 * CELLS], -1)
+        return logits, residual.unflatten(-1, (CELLS, 2))
+
+    def controls(self, code: Tensor, speed: Tensor, offset: Tensor, way: Tensor, side: Tensor) -> Controls:
+        """The policy's Controls of plans to the goals way, side [B, K] m, from codes [B, hidden], speeds [B] m/s and
+        offsets [B] m beside the mission."""
+        speed, offset = speed[:, None].expand_as(way), offset[:, None]
+        features = [way / reach(speed), way / 50, needed_acceleration(speed, way) / 4, side / 3]
+        features += [(side - offset) / 3, speed / 15]
+        code = code[:, None].expand(-1, way.shape[1], -1)
+        out = self.policy(torch.cat([code, torch.stack(features, -1)], -1))
+        shift = side + AROUND * out[..., KNOTS].tanh()
+        return Controls(between(out[..., :KNOTS], *ACCELERATION, 0.0), shift, between(out[..., -1], *TIME, 1.4))
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return self.normaliser.mean.device
+
+
+def between(value: Tensor, low: float, high: float, start: float) -> Tensor:
+    """Values squashed into (low, high) by a sigmoid; 0 becomes `start`."""
+    share = (start - low) / (high - low)
+    return low + (high - low) * (value + math.log(share / (1 - share))).sigmoid()
+
+
+def drive_controls(controls: Controls, start: Tensor, path: RoutePath) -> Candidates:
+    """The Candidates [B, K] that Controls make of states start [B, 4] on their paths, by the unicycle."""
+    held = controls.acceleration.repeat_interleave(PLAN_STEPS // KNOTS, -1)
+    now = start[:, None, 3:].expand(*held.shape[:2], 1)
+    speed = torch.cat([now, dynamics.bounded_speed(now, held * DT)], -1)
+    return drive(start, path, speed, controls.shift[..., None], controls.time[..., None], MAX_YAW_RATE)
+
+
+def save_bits(network: BitsNetwork, path: Path, origin: dict[str, Any]) -> None:
+    """Write a network to a safetensors file; origin: what made it (data, command, settings), kept in the header."""
+    header = {"format": FORMAT, "architecture": json.dumps(network.architecture), "origin": json.dumps(origin)}
+    write_atomically(path, weight_bytes(network.state_dict(), header))
+
+
+def load_bits(checkpoint: str) -> BitsNetwork:
+    """The network in a file of `save_bits`, in a folder with one, or with "bundled" the package's own, trained on the
+    bundled scenes. Raises InputError, naming the file, where it is missing, damaged or of another architecture."""
+    path = Path(str(files("e2rl") / "assets" / "bits")) if checkpoint == "bundled" else Path(checkpoint)
+    path = path / WEIGHTS if path.is_dir() else path
+    if not path.is_file():
+        raise InputError(
+            f"ego.checkpoint={checkpoint}: no {WEIGHTS} there; train one with `python train.py stage=bits`, or use "
+            "ego.checkpoint=bundled"
+        )
+    try:
+        weights, header = read_weights(path)
+    except ValueError as error:
+        raise InputError(f"{path}: not a readable safetensors file ({error}); train it again") from error
+    if header.get("format") != FORMAT:
+        raise InputError(f"{path}: format {header.get('format')!r}, expected {FORMAT!r}; give a {WEIGHTS} file")
+    try:
+        saved = json.loads(header["architecture"])
+        hidden = saved["hidden"]
+        if type(hidden) is not int or not 0 < hidden <= LARGEST:
+            raise ValueError(f"hidden {hidden} instead of 1 to {LARGEST}")
+        if wrong := unlike(partial(BitsNetwork, hidden), weights):
+            raise ValueError(wrong)
+        network = BitsNetwork(hidden)
+        if saved != network.architecture:
+            raise ValueError(f"{saved} instead of {network.architecture}")
+        network.load_state_dict(weights)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split("\n\t")[:2])
+        raise InputError(f"{path}: another architecture ({reason}); train it again") from error
+    return network.requires_grad_(False).eval()

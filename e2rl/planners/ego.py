@@ -1,0 +1,166 @@
+"""One interface for all egos (planners, learned actors, outside code), for collection and evaluation.
+
+An outside planner is a class and a YAML file in conf/ego with its `_target_` and arguments. A complete example, which
+holds the ego's speed along its mission for the coming five seconds:
+
+    import torch
+    from e2rl.planners.ego import PLAN_STEPS, Ego
+    from e2rl.planners.path import MissionPath
+
+
+    class Cruise(Ego):
+        def __init__(self, replan_every: int = 5, gain: float = 1.0) -> None:
+            super().__init__(replan_every)
+            self.gain = gain
+
+        def plan(self, world):
+            path = MissionPath(world)                                 # the ego's route, projected on
+            speed = world.states[:, 0, 3:] * self.gain                # [B, 1] m/s
+            return path.drive(speed.expand(-1, PLAN_STEPS + 1))       # [B, 50, 4] x, y, heading, speed
+
+Only `plan` is required: `act` tracks the plan. An ego that maps observations to actions overrides `act`; its `plan`
+returns its own predicted motion.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from e2rl.run.config import Extension
+from e2rl.run.errors import InputError
+from e2rl.scenes.boxes import to_frame
+from e2rl.sim import dynamics
+from e2rl.sim.world import World
+
+PLAN_STEPS = 50  # H: planned steps of DT
+RETURN_TIME, RETURN_LENGTH = 0.7, 1.5  # s, m: a lateral error decays over max(RETURN_LENGTH, RETURN_TIME * v)
+CATCH_UP = 1.0  # 1/s: rate at which a longitudinal error is corrected
+
+
+class Ego(Extension, ABC):
+    """Drives the ego of B scenes at once. `plan` is a pure function of the World; `act` follows it.
+
+    replays_log: the environment moves this ego along its recording (`SimSettings.replay_ego`) and ignores its actions.
+    """
+
+    replays_log = False
+
+    def __init__(self, replan_every: int = 5) -> None:
+        """replan_every: steps between two plans (5 is 2 Hz, 1 every step), at most PLAN_STEPS."""
+        if not 1 <= replan_every <= PLAN_STEPS:
+            raise InputError(f"ego.replan_every={replan_every}: choose 1 to {PLAN_STEPS} steps")
+        self.replan_every = int(replan_every)
+
+    def reset(self, world: World) -> None:  # noqa: B027 - most egos have no memory
+        """Called before the first plan of new episodes (world.step 0). An ego with memory clears it here."""
+
+    @abstractmethod
+    def plan(self, world: World) -> Tensor:
+        """Planned states [B, PLAN_STEPS, 4] of the egos at steps 1.. from now, 0.1 s apart, without side effects."""
+
+    def act(self, world: World, observation: Tensor, plan: Tensor) -> Tensor:
+        """Action [B, 2] (acceleration [m/s^2], yaw rate [rad/s]) for the next step; by default it tracks the plan.
+
+        observation [B, D]: the environment's; plan [B, 1 + PLAN_STEPS, 4]: states of the last plan, now and at the
+        coming steps.
+        """
+        return track(world.states[:, 0], plan[:, 0], plan[:, 1])
+
+
+def return_length(speed: Tensor) -> Tensor:
+    """Metres over which a lateral error decays at speed [...] m/s."""
+    return (RETURN_TIME * speed).clamp(min=RETURN_LENGTH)
+
+
+def track(state: Tensor, planned: Tensor, following: Tensor) -> Tensor:
+    """Action [..., 2] with which a vehicle at state [..., 4] tracks a plan: `planned` now, `following` one step later.
+
+    Inverse dynamics to the following speed and heading, corrected by the deviation from the plan: a lateral error turns
+    the target heading towards the plan, a longitudinal error changes the target speed. A plan that obeys the unicycle
+    is tracked without error.
+    """
+    error = to_frame(state[..., :2], planned)
+    heading = following[..., 2] - torch.atan(error[..., 1] / return_length(state[..., 3]))
+    speed = (following[..., 3] - CATCH_UP * error[..., 0]).clamp(min=0)
+    aimed = torch.cat([following[..., :2], torch.stack([heading, speed], -1)], -1)
+    return dynamics.inverse(torch.stack([state, aimed], -2))[..., 0, :]
+
+
+class PlannerError(Exception):
+    """A planner has no plan for scenes of its batch; rows: why, by row of the batch, empty where it is not known which.
+
+    The rollouts of these rows end; the others of the batch are driven anew without them.
+    """
+
+    def __init__(self, message: str, rows: Mapping[int, str] | None = None) -> None:
+        super().__init__(message)
+        self.rows = dict(rows or {})
+
+
+class NotFinite(ArithmeticError):
+    """An ego planned or acted NaN or infinite."""
+
+
+def finite(values: Tensor, name: str) -> Tensor:
+    """The plans or actions [B, ...] of an ego; raises NotFinite where one is not finite."""
+    if not bool(values.isfinite().all()):
+        raise NotFinite(f"the ego's {name} is NaN or infinite")
+    return values
+
+
+class EgoPlanner(TensorDictModuleBase):
+    """Writes the plan of an Ego in a DrivingEnv with `agents=True`: ("ego", "plan") [B, PLAN_STEPS, 4].
+
+    Plans every `replan_every` steps; in between, the key holds the rest of the last plan, its last state held. Reads
+    timestep, agents and, if present, the traffic's plan.
+    """
+
+    in_keys = ["timestep", "agents"]
+    out_keys: list[str | tuple[str, str]] = [("ego", "plan")]
+
+    def __init__(self, ego: Ego, env) -> None:
+        """env: the DrivingEnv (or a TransformedEnv around it) in which the ego drives."""
+        super().__init__()
+        base = getattr(env, "base_env", env)
+        self.ego, self.scene, self.bounds = ego, base.scene, base.action_spec.space
+        self._plan: Tensor | None = None  # [B, 1 + PLAN_STEPS, 4], the state at the time of planning first
+        self._planned_at: Tensor | None = None  # [B] step of planning
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict["ego", "plan"] = self.plan(World.of(tensordict, self.scene))[:, 1:]
+        return tensordict
+
+    def plan(self, world: World) -> Tensor:
+        """States [B, 1 + PLAN_STEPS, 4] now and at the coming steps of the last plan; replans where due."""
+        if bool((world.step == 0).any()):
+            self.ego.reset(world)
+        if self._plan is None or self._planned_at is None:
+            self._plan = torch.zeros(len(world.step), 1 + PLAN_STEPS, 4, device=world.states.device)
+            self._planned_at = torch.full_like(world.step, -PLAN_STEPS)
+        age = world.step - self._planned_at
+        due = (age >= self.ego.replan_every) | (age < 0) | (world.step == 0)
+        if bool(due.any()):
+            fresh = torch.cat([world.states[:, :1], finite(self.ego.plan(world), "plan")], 1)
+            self._plan = torch.where(due[:, None, None], fresh, self._plan)
+            self._planned_at = torch.where(due, world.step, self._planned_at)
+        ahead = (world.step - self._planned_at)[:, None] + torch.arange(1 + PLAN_STEPS, device=world.step.device)
+        return self._plan.gather(1, ahead.clamp(max=PLAN_STEPS)[..., None].expand(-1, -1, 4))
+
+
+class EgoPolicy(EgoPlanner):
+    """An Ego as a TorchRL policy: writes its plan and the "action" [B, 2], within the action's bounds."""
+
+    in_keys = ["observation", "timestep", "agents"]
+    out_keys = ["action", ("ego", "plan")]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        world = World.of(tensordict, self.scene)
+        plan = self.plan(world)
+        action = finite(self.ego.act(world, tensordict["observation"], plan), "action")
+        tensordict["action"] = action.clamp(self.bounds.low, self.bounds.high)
+        tensordict["ego", "plan"] = plan[:, 1:]
+        return tensordict

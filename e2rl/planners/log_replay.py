@@ -1,0 +1,33 @@
+"""The recorded ego as a planner. With `sim.replay_ego=true` the environment follows the log exactly instead."""
+
+import torch
+from torch import Tensor
+
+from e2rl.planners.ego import PLAN_STEPS, Ego
+from e2rl.scenes.recording import DT
+from e2rl.sim.world import World
+
+
+class ReplayEgo(Ego):
+    """Plans the recording; unless the environment replays it, the unicycle tracks this plan.
+
+    After the recording's end the last speed and heading are held.
+    """
+
+    replays_log = True
+
+    def __init__(self, replan_every: int = 1) -> None:
+        super().__init__(replan_every)
+
+    def plan(self, world: World) -> Tensor:
+        """Recorded states [B, PLAN_STEPS, 4] of the coming steps."""
+        track, known = world.scene["logged"][:, :, 0], world.scene["logged_valid"][:, :, 0]
+        steps = torch.arange(track.shape[1], device=track.device)
+        last = torch.where(known, steps, 0).amax(1)
+        want = world.step[:, None] + torch.arange(1, PLAN_STEPS + 1, device=track.device)
+        at = want.minimum(last[:, None])
+        row = torch.arange(len(track), device=track.device)[:, None]
+        state = track[row, at]
+        over = (want - at)[..., None] * DT * state[..., 3:]
+        direction = torch.stack([state[..., 2].cos(), state[..., 2].sin()], -1)
+        return torch.cat([state[..., :2] + over * direction, state[..., 2:]], -1)

@@ -1,0 +1,287 @@
+"""The learned ego's network: observation normalisation, squashed Gaussian actor, critic, and their file."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import Bounded
+from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+
+from e2rl.planners.reference import LAST_ACTION, Trunk, linear, reference_action
+from e2rl.run.errors import InputError
+from e2rl.run.files import altered, read_weights, weight_bytes, write_atomically
+from e2rl.sim.observation import OBSERVATION_SIZE
+
+DEEPEST, WIDEST = 16, 1 << 13  # layers, and units of a layer, that a file may ask for
+WEIGHTS = "actor.safetensors"  # file name of an ActorCritic inside a checkpoint
+NARROWEST = 0.01  # least standard deviation before squashing, as a share of half the action range
+STEEPEST = 0.95  # reference actions are kept within this share of the bounds, so that their atanh stays finite
+
+
+class Normaliser(nn.Module):
+    """Running mean and variance of observations; only `observe` changes them, so evaluation leaves them frozen."""
+
+    count: Tensor
+    mean: Tensor
+    variance: Tensor
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("variance", torch.ones(size))
+
+    @torch.no_grad()
+    def observe(self, observation: Tensor) -> None:
+        """Update the statistics with observations [..., D] (Chan et al.'s pairwise update)."""
+        flat = observation.reshape(-1, observation.shape[-1])
+        total = self.count + len(flat)
+        share, delta = (len(flat) / total).float(), flat.mean(0) - self.mean
+        spread = self.variance * (1 - share) + flat.var(0, correction=0) * share
+        self.variance.copy_(spread + delta**2 * share * (1 - share))
+        self.mean.add_(delta * share)
+        self.count.copy_(total)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Observations normalised to zero mean and unit variance, clipped to [-5, 5]."""
+        return ((observation - self.mean) / self.variance.sqrt().clamp(min=0.05)).clamp(-5, 5)
+
+
+class ActorNetwork(nn.Module):
+    """Mean and standard deviation of the action before squashing.
+
+    The mean is the reference's action (if `reference`) plus the network's output, which is unbounded and can override
+    the reference. The output starts at zero: an untrained actor executes the reference's action, or without a reference
+    the middle of the action's bounds.
+    """
+
+    middle: Tensor
+    reach: Tensor
+
+    def __init__(
+        self,
+        normaliser: Normaliser,
+        hidden: Sequence[int],
+        agent_units: int,
+        reference: bool,
+        initial_std: Sequence[float],
+        low: Tensor,
+        high: Tensor,
+    ) -> None:
+        super().__init__()
+        self.normaliser, self.reference = normaliser, reference
+        self.trunk = Trunk(hidden, agent_units, 2, last_gain=0.0)
+        self.spread = nn.Parameter((torch.tensor(initial_std) - NARROWEST).logit(1e-4))
+        self.noise: Tensor | None = None  # [D], set by `noisy`
+        self.register_buffer("middle", (high + low) / 2, persistent=False)
+        self.register_buffer("reach", (high - low) / 2, persistent=False)
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """loc, scale [..., 2] from observation [..., D]."""
+        seen = self.normaliser(observation)
+        if self.noise is not None:
+            seen = seen + self.noise * torch.randn_like(seen)
+        return self.head(seen, self.offset(observation))
+
+    def offset(self, observation: Tensor) -> Tensor:
+        """What the network's output [..., 2] is added to at observation [..., D]: no parameter changes it."""
+        if not self.reference:
+            return torch.zeros_like(observation[..., :2])
+        share = (reference_action(observation) - self.middle) / self.reach
+        return share.clamp(-STEEPEST, STEEPEST).atanh()
+
+    def head(self, seen: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+        """loc, scale [..., 2] from the normalised observation [..., D] and the `offset` [..., 2]."""
+        loc = self.trunk(seen) + offset
+        return loc, self.std.expand_as(loc)
+
+    @contextmanager
+    def noisy(self, features: float, last_action: float) -> Iterator[None]:
+        """While cloning: noise of these standard deviations on the network's normalised input, not the reference's."""
+        self.noise = torch.full_like(self.normaliser.mean, features)
+        self.noise[list(LAST_ACTION)] = last_action
+        try:
+            yield
+        finally:
+            self.noise = None
+
+    @property
+    def std(self) -> Tensor:
+        """Standard deviations [2] before squashing, in halves of the action's range."""
+        return NARROWEST + self.spread.sigmoid()
+
+    def deterministic(self, observation: Tensor) -> Tensor:
+        """Most central action [..., 2] (m/s^2, rad/s)."""
+        return self.middle + self.reach * self(observation)[0].tanh()
+
+
+class Head(nn.Module):
+    """`ActorNetwork.head` as a module of its own."""
+
+    def __init__(self, network: ActorNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, seen: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+        """loc, scale [..., 2]."""
+        return self.network.head(seen, offset)
+
+
+class ActorCritic(nn.Module):
+    """TorchRL actor and critic over one normaliser.
+
+    actor reads "observation", writes loc, scale, action, action_log_prob; critic writes state_value.
+    """
+
+    def __init__(
+        self,
+        low: Tensor,
+        high: Tensor,
+        hidden: Sequence[int] = (128, 128),
+        agent_units: int = 32,
+        reference: bool = True,
+        initial_std: Sequence[float] = (0.25, 0.12),
+        device: str | torch.device = "cpu",
+    ) -> None:
+        """low, high [2]: bounds of (acceleration, yaw rate); other fields: conf/ego/actor.yaml."""
+        super().__init__()
+        device = torch.device(device)
+        low, high = low.to(device, torch.float32), high.to(device, torch.float32)
+        self.low, self.high, self.device = low, high, device
+        self.architecture = {
+            "observation": OBSERVATION_SIZE,
+            "hidden": [int(size) for size in hidden],
+            "agent_units": int(agent_units),
+            "reference": bool(reference),
+            "low": _rounded(low),
+            "high": _rounded(high),
+        }
+        self.normaliser = Normaliser(OBSERVATION_SIZE)
+        self.network = ActorNetwork(self.normaliser, hidden, agent_units, reference, initial_std, low.cpu(), high.cpu())
+        values = nn.Sequential(self.normaliser, Trunk(hidden, agent_units, 1, last_gain=1.0))
+        self.to(device)
+        self.actor = self._sampler(TensorDictModule(self.network, ["observation"], ["loc", "scale"]))
+        self.critic = ValueOperator(values.to(device), in_keys=["observation"])
+
+    def heads(self) -> tuple[ProbabilisticActor, ValueOperator]:
+        """Actor and critic with the same parameters that read "seen" and "offset", which an update computes once for
+        all its passes (`prepared`), instead of the observation."""
+        head = TensorDictModule(Head(self.network), ["seen", "offset"], ["loc", "scale"])
+        return self._sampler(head), ValueOperator(self.critic.module[1], in_keys=["seen"])
+
+    @torch.no_grad()
+    def prepared(self, observation: Tensor) -> dict[str, Tensor]:
+        """What `heads` read, of observations [..., D]: seen [..., D] and offset [..., 2]."""
+        return {"seen": self.normaliser(observation), "offset": self.network.offset(observation)}
+
+    def _sampler(self, module: TensorDictModule) -> ProbabilisticActor:
+        return ProbabilisticActor(
+            module,
+            in_keys=["loc", "scale"],
+            out_keys=["action"],
+            distribution_class=TanhNormal,
+            distribution_kwargs={"low": self.low, "high": self.high},
+            spec=Bounded(self.low, self.high, device=self.device),
+            return_log_prob=True,
+        )
+
+    def save(self, path: Path) -> None:
+        """Write weights and statistics to a safetensors file whose header holds the architecture."""
+        header = {"architecture": json.dumps(self.architecture, sort_keys=True)}
+        write_atomically(path, weight_bytes(self.weights(), header))
+
+    def load(self, path: Path) -> None:
+        """Read a file of `save`; raises InputError for a damaged file or another architecture."""
+        saved, weights = _content(path)
+        if saved != self.architecture:
+            raise InputError(
+                f"{path}: an actor of another architecture: {_differences(saved, self.architecture)}; set "
+                "ego.* and sim.* as in the run that wrote it"
+            )
+        own = self.weights()
+        wrong = set(own) ^ set(weights) or {key for key in own if own[key].shape != weights[key].shape}
+        if wrong:
+            raise InputError(f"{path}: weights {', '.join(sorted(wrong))} do not fit; the file is damaged")
+        self.set_weights(weights)
+
+    @torch.no_grad()
+    def set_weights(self, weights: Mapping[str, Tensor]) -> None:
+        """Load the values of `weights()`, in place."""
+        for key, value in self.weights().items():
+            value.copy_(weights[key])
+
+    def weights(self) -> dict[str, Tensor]:
+        """Every parameter and buffer once (actor and critic share the normaliser)."""
+        named = dict(self.named_parameters()) | dict(self.named_buffers())
+        kept = {key: value for key, value in named.items() if not key.endswith((".middle", ".reach"))}
+        return {key: value for key, value in kept.items() if not key.startswith("actor.")}
+
+
+def _content(path: Path) -> tuple[Any, dict[str, Tensor]]:
+    """The architecture in the header of a file of `ActorCritic.save`, and its weights."""
+    try:
+        weights, header = read_weights(path)
+        return json.loads(header.get("architecture", "null")), weights
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not a readable actor file ({error}); give an {WEIGHTS} file") from None
+
+
+def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
+    """The actor of a file of `ActorCritic.save`, whatever its architecture; raises InputError."""
+    saved, _ = _content(path)
+    try:
+        low, high = (torch.tensor(saved[key], dtype=torch.float32).reshape(2) for key in ("low", "high"))
+        sizes, units = [int(size) for size in saved["hidden"]], int(saved["agent_units"])
+        fits = 0 < len(sizes) <= DEEPEST and all(0 < size <= WIDEST for size in [*sizes, units])
+        if saved["observation"] != OBSERVATION_SIZE or not fits:
+            raise ValueError(f"of {saved['observation']} numbers, {units} units an agent, layers of {sizes} units")
+        actor = ActorCritic(low, high, sizes, units, bool(saved["reference"]), device=device)
+    except (TypeError, KeyError, ValueError, RuntimeError) as error:
+        raise InputError(f"{path}: an actor of another version ({error}); train it again") from None
+    actor.load(path)
+    return actor
+
+
+def find_weights(path: str | Path) -> Path:
+    """The actor file that `path` names: the file, a checkpoint folder, the newest whole checkpoint of a run folder, or
+    with "bundled" the package's own, trained on the bundled scenes."""
+    path = Path(str(files("e2rl") / "assets" / "actor" / WEIGHTS)) if path == "bundled" else Path(path)
+    if path.is_dir():
+        if (path / WEIGHTS).is_file():
+            return path / WEIGHTS
+        found = sorted(path.glob(f"checkpoints/round-*/{WEIGHTS}"))
+        whole = [file for file in found if altered(file.parent) is None]
+        if found and not whole:
+            raise InputError(
+                f"{found[-1].parent}: damaged ({altered(found[-1].parent)}), as all of {path}; train again"
+            )
+        if whole:
+            return whole[-1]
+    if not path.is_file():
+        raise InputError(f"{path}: no actor there; give an {WEIGHTS}, a checkpoint folder or a run folder")
+    return path
+
+
+def perceptron(size: int, hidden: Sequence[int], out: int, last_gain: float) -> nn.Sequential:
+    """Layers size -> hidden -> out with SiLU; orthogonal weights, the last layer's scaled by last_gain."""
+    sizes = [size, *hidden, out]
+    gains = [*[2**0.5] * len(hidden), last_gain]
+    layers = [linear(*shape) for shape in zip(sizes[:-1], sizes[1:], gains, strict=True)]
+    return nn.Sequential(*(module for layer in layers[:-1] for module in (layer, nn.SiLU())), layers[-1])
+
+
+def _rounded(value: Tensor) -> list[float]:
+    return [round(number, 6) for number in value.tolist()]
+
+
+def _differences(saved: dict | None, own: dict) -> str:
+    if not isinstance(saved, dict):
+        return "its header names none"
+    keys = [key for key in own if saved.get(key) != own[key]]
+    return ", ".join(f"{key} {saved.get(key)} instead of {own[key]}" for key in keys) or "unknown fields"

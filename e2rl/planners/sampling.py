@@ -1,0 +1,204 @@
+"""A sampling planner: hundreds of candidates, each driven by the unicycle and scored on a forecast of the others.
+
+Propose, simulate, score and take the best, in the manner of PDM-Closed (Dauner et al. 2023). It looks at nobody's plan.
+Vectorised over scenes, candidates and agents.
+
+Egos that choose among candidates by their cost, and how the candidates rank: soft labels for an imitator.
+"""
+
+from abc import abstractmethod
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from e2rl.planners.candidates import Candidates, drive, speed_profiles
+from e2rl.planners.ego import Ego
+from e2rl.planners.path import MissionPath
+from e2rl.planners.scoring import Weights, forecast, nearest, score
+from e2rl.scenes.recording import DT
+from e2rl.scenes.route import project
+from e2rl.sim import dynamics
+from e2rl.sim.world import World
+
+STRIDE = 2  # steps between two scored states
+WIDER = 4  # times as many candidates are ranked as asked for, among which those driven alike are dropped
+ALIKE = 1e-4  # m, rad, m/s and cost below which two candidates are driven alike
+SCENE_KEYS = (
+    *("size", "route_log", "route_points", "route_length", "route_open", "route_limit", "route_light", "route_light_s"),
+    *("light_state", "field", "field_origin"),
+)  # that costs and paths need
+
+
+class RankingEgo(Ego):
+    """An ego that plans its cheapest candidate and can tell the others' costs."""
+
+    @abstractmethod
+    def ranked(self, world: World, count: int) -> tuple[Tensor, Tensor]:
+        """Planned states [B, C, PLAN_STEPS, 4] and costs [B, C] of the C = `count` cheapest candidates, the cheapest
+        first; inf where there are no more."""
+
+    @abstractmethod
+    def rated(self, world: World, states: Tensor) -> Tensor:
+        """Costs [B, C], in the same units, of driving along states [B, C, PLAN_STEPS, 4] that somebody else plans."""
+
+
+class Outlook(NamedTuple):
+    """Whom a ScoringEgo looks at, and how it forecasts them.
+
+    horizon [s] that is scored, at most 5; agents: as many, those that come nearest; hold, turn [s]: they hold their
+    acceleration and their path's curvature as long; see_vrus: others than vehicles are looked at, too.
+    """
+
+    horizon: float
+    agents: int
+    hold: float
+    turn: float
+    see_vrus: bool
+
+
+class ScoringEgo(RankingEgo):
+    """Plans the cheapest of its `candidates` by `scoring.score` on a forecast of the others. It looks at nobody's plan.
+
+    CHUNK: scenes that are planned for at a time; READS: keys of the scene that are looked at.
+    """
+
+    CHUNK = 64
+    READS: tuple[str, ...] = SCENE_KEYS
+
+    def __init__(self, outlook: Outlook, weights: Weights, replan_every: int) -> None:
+        super().__init__(replan_every)
+        self.outlook, self.weights = outlook, weights
+
+    @abstractmethod
+    def candidates(self, world: World) -> Candidates:
+        """The candidates [B, C] that it chooses among."""
+
+    def costs(self, world: World, candidates: Candidates) -> Tensor:
+        """Costs [B, C] of candidates."""
+        outlook = self.outlook
+        steps = torch.arange(STRIDE, round(outlook.horizon / DT) + 1, STRIDE, device=world.step.device)
+        agents, seen = nearest(world, outlook.agents, outlook.see_vrus)
+        others = forecast(world, agents, seen, steps * DT, outlook.hold, outlook.turn)
+        return score(world, candidates, others, steps, self.weights)
+
+    def plan(self, world: World) -> Tensor:
+        """The states [B, PLAN_STEPS, 4] of the candidate that costs least."""
+        return torch.cat([self._plan(part) for part in self._chunks(world)])
+
+    def _plan(self, world: World) -> Tensor:
+        candidates = self.candidates(world)
+        best = self.costs(world, candidates).argmin(1)
+        return candidates.states[torch.arange(len(best), device=best.device), best]
+
+    def ranked(self, world: World, count: int) -> tuple[Tensor, Tensor]:
+        """States [B, C, PLAN_STEPS, 4] and costs [B, C] of the cheapest candidates, the cheapest first; of those that
+        are driven alike (caps and bounds make many so) one counts, the others cost inf."""
+        states, costs = zip(*(self._ranked(part, count) for part in self._chunks(world)), strict=True)
+        return torch.cat(states), torch.cat(costs)
+
+    def _ranked(self, world: World, count: int) -> tuple[Tensor, Tensor]:
+        candidates = self.candidates(world)
+        every = self.costs(world, candidates)
+        costs, best = every.topk(min(WIDER * count, every.shape[1]), largest=False)
+        row = torch.arange(len(best), device=best.device)[:, None]
+        states = candidates.states[row, best]
+        alike = (states.diff(dim=1).abs().amax((2, 3)) < ALIKE) & (costs.diff(dim=1) < ALIKE)
+        costs = costs.masked_fill(torch.nn.functional.pad(alike, (1, 0)), torch.inf)
+        costs, best = costs.topk(count, largest=False)
+        return states[row, best], costs
+
+    def rated(self, world: World, states: Tensor) -> Tensor:
+        """Costs [B, C] of driving along states [B, C, PLAN_STEPS, 4], which lead where they end."""
+        path = MissionPath(world)
+        end, shift, _ = project(states[:, :, -1, :2], path.route)
+        return self.costs(world, Candidates(states, end - path.s[:, None], shift))
+
+    def _chunks(self, world: World) -> list[World]:
+        rows = torch.arange(len(world.step), device=world.step.device)
+        return [take(world, part, self.READS) for part in rows.split(self.CHUNK)]
+
+
+def take(world: World, rows: Tensor, keys: tuple[str, ...] = SCENE_KEYS) -> World:
+    """Scenes rows [b] of a World with these keys of the scene, and nobody's plan or route."""
+    turn = None if world.turn_rate is None else world.turn_rate[rows]
+    now = world.step[rows], world.states[rows], world.valid[rows], world.accel[rows]
+    return World(world.scene.select(*keys)[rows], *now, turn_rate=turn)
+
+
+def ranked_actions(ego: RankingEgo, world: World, count: int, hold: int) -> tuple[Tensor, Tensor]:
+    """Actions [B, C, 2] (m/s^2, rad/s) of the C = `count` cheapest candidates, in the mean over the coming `hold`
+    steps, and their costs [B, C]."""
+    states, costs = ego.ranked(world, count)
+    now = world.states[:, None, :1].expand_as(states[:, :, :1])
+    return dynamics.inverse(torch.cat([now, states[:, :, :hold]], 2)).mean(2), costs
+
+
+PROFILES = (
+    *((-8.0, -8.0), (-8.0, 0.0), (-6.0, -6.0), (-6.0, 0.0), (-6.0, 2.0), (-4.0, -4.0), (-4.0, 0.0)),
+    *((-2.5, -2.5), (-2.5, 0.0), (-1.2, -1.2), (-1.2, 0.0)),
+    *((0.0, 0.0), (0.0, -3.0), (0.0, -8.0), (0.0, 1.5), (1.2, 1.2), (1.2, 0.0), (1.2, -3.0)),
+    *((2.5, 2.5), (2.5, 0.0), (2.5, -4.0), (4.0, 4.0), (4.0, 0.0), (4.0, -6.0), (5.0, 5.0), (5.0, -8.0)),
+)  # m/s^2 in the first second and after it
+SHIFTS = (0.0, 1.0, -1.0, 2.0, -2.0, 3.5, -3.5, 5.0, -5.0)  # m beside the mission, left positive
+BRAKING_MORE = 1.0  # m/s^2 by which braking may exceed what the speed caps are made for
+
+
+class SamplingEgo(ScoringEgo):
+    """26 speed profiles on 19 lateral moves: 9 shifts beside the mission, swift and calm, and the present one."""
+
+    CHUNK = 8  # fits the processor's cache
+
+    def __init__(
+        self,
+        max_speed: float = 20.0,
+        horizon: float = 4.0,
+        agents: int = 10,
+        hold: float = 1.0,
+        turn: float = 1.5,
+        swift: float = 0.7,
+        calm: float = 1.4,
+        margin: float = 0.5,
+        margin_growth: float = 0.2,
+        headway: float = 1.5,
+        rear: float = 0.5,
+        fade: float = 0.15,
+        contact: float = 200.0,
+        near: float = 30.0,
+        border: float = 0.5,
+        off_road: float = 20.0,
+        progress: float = 0.2,
+        comfort: float = 1.0,
+        aside: float = 2.0,
+        lateral_acceleration: float = 3.0,
+        braking: float = 3.0,
+        max_acceleration: float = 5.0,
+        max_braking: float = 8.0,
+        max_yaw_rate: float = 1.6,
+        use_limits: bool = True,
+        obey_lights: bool = True,
+        see_vrus: bool = True,
+        replan_every: int = 1,
+    ) -> None:
+        """Fields: conf/ego/sampling.yaml."""
+        weights = Weights(
+            margin, margin_growth, headway, rear, fade, contact, near, border, off_road, progress, comfort, aside
+        )
+        super().__init__(Outlook(horizon, int(agents), hold, turn, see_vrus), weights, replan_every)
+        self.max_speed, self.swift, self.calm = max_speed, swift, calm
+        self.lateral_acceleration, self.braking = lateral_acceleration, braking
+        self.max_acceleration, self.max_braking, self.max_yaw_rate = max_acceleration, max_braking, max_yaw_rate
+        self.use_limits, self.obey_lights = use_limits, obey_lights
+
+    def candidates(self, world: World) -> Candidates:
+        """Every speed profile on every lateral move."""
+        path, start = MissionPath(world), world.states[:, 0]
+        caps = path.speed_caps(
+            self.max_speed, self.lateral_acceleration, self.braking, self.use_limits, self.obey_lights
+        )
+        profiles = start.new_tensor(PROFILES).clamp(-self.max_braking, self.max_acceleration)
+        speed = speed_profiles(start[:, 3], profiles, caps, self.braking + BRAKING_MORE)
+        beside = start.new_tensor(SHIFTS).expand(len(start), -1)
+        shift = torch.cat([beside, beside, path.d[:, None]], 1)
+        time = start.new_tensor([self.swift] * len(SHIFTS) + [self.calm] * len(SHIFTS) + [self.swift])
+        return drive(start, path, speed, shift[:, None], time, self.max_yaw_rate)

@@ -1,0 +1,196 @@
+"""Route choice: a distribution over each vehicle's route candidates.
+
+RoutedScene: the static tensors of a scene once every vehicle has been assigned a route.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from e2rl.prior.lane_relative import LaneState, locate
+from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED
+from e2rl.scenes.route import SPACING, interpolate, project
+from e2rl.sim.dynamics import wrap
+from e2rl.sim.mission import light_state_at
+
+CONFLICT_STRIDE = 2  # vertices: conflicts are looked for every 4 m
+CONFLICT_RANGE = 80  # vertices from the route's start on
+CONFLICT_GAP = 2.5  # m: routes nearer than this are in conflict
+START = 20.0  # m: arc length near which a route passes its vehicle's start
+ROUTE_FIELDS = ("points", "length", "open", "limit", "light", "light_s")  # scene["route_..."] of the assigned candidate
+
+
+@dataclass
+class RoutedScene:
+    """Tensors of B scenes that stay the same while these run. It holds no map, so that it is cheap to copy.
+
+    size [B, N, 2]; light_state [B, T+1, L]; past [B, V, 10, 3]: see the scene. Of the assigned route candidates: route
+    [B, V], their index; points [B, V, P, 2]; length [B, V]; open [B, V]: the route ends at the map's border; limit
+    [B, V, P]; light, light_s [B, V, 2]. conflict [B, V, V] bool: the routes of i and j meet; conflict_s [B, V, V]: arc
+    length on i's route where it first does; crossing [B, V, V]: angle between them there [rad]. modelled [B, V]: the
+    prior moves the vehicle or conditions on it; parked [B, V]; has_lane [B, V]: else it is represented in free space.
+    """
+
+    size: Tensor
+    light_state: Tensor
+    past: Tensor
+    route: Tensor
+    points: Tensor
+    length: Tensor
+    open: Tensor
+    limit: Tensor
+    light: Tensor
+    light_s: Tensor
+    conflict: Tensor
+    conflict_s: Tensor
+    crossing: Tensor
+    modelled: Tensor
+    parked: Tensor
+    has_lane: Tensor
+
+
+def take_route(values: Tensor, route: Tensor) -> Tensor:
+    """values [B, V, R, ...] at route [B, V] -> [B, V, ...]."""
+    index = route.reshape(*route.shape, *[1] * (values.ndim - 2)).expand(*route.shape, 1, *values.shape[3:])
+    return values.gather(2, index).squeeze(2)
+
+
+def route_scene(scene: TensorDictBase, route: Tensor, free_space: bool = False) -> RoutedScene:
+    """The RoutedScene of scenes [B] whose vehicles follow candidates route [B, V].
+
+    free_space: represent every vehicle without its lane (the ablation).
+    """
+    vehicles = route.shape[1]
+    assigned = {name: take_route(scene[f"route_{name}"], route) for name in ROUTE_FIELDS}
+    valid, parked = scene["valid"][:, :vehicles], scene["parked"][:, :vehicles]
+    has_lane = take_route(scene["route_valid"], route)
+    all_rows = torch.arange(vehicles, device=route.device)
+    pairs = [_conflicts(points, all_rows)[0] for points in assigned["points"]]
+    conflict, conflict_s, crossing = (torch.stack(parts) for parts in zip(*pairs, strict=True))
+    both = valid & ~parked & has_lane
+    given = {"size": scene["size"], "light_state": scene["light_state"], "past": scene["past"][:, :vehicles]}
+    meet = {"conflict": conflict & both[:, :, None] & both[:, None, :], "conflict_s": conflict_s, "crossing": crossing}
+    kind = {"modelled": valid & ~parked, "parked": parked, "has_lane": has_lane & (not free_space)}
+    return RoutedScene(route=route, **given, **assigned, **meet, **kind)
+
+
+def start_state(scene: TensorDictBase, routed: RoutedScene) -> LaneState:
+    """The lane states [B, V] of the vehicles at the start of scenes [B]."""
+    start, accel, yaw_rate = (
+        scene[key][:, : routed.route.shape[1]] for key in ("start", "start_accel", "start_yaw_rate")
+    )
+    return locate(start, accel, yaw_rate, routed.points, torch.full_like(routed.length, START))
+
+
+def reroute(
+    routed: RoutedScene,
+    scene: TensorDictBase,
+    route: Tensor,
+    moved: Tensor,
+    off_lane: Tensor,
+    off_lane_path: Tensor,
+    free_space: bool = False,
+) -> RoutedScene:
+    """`routed` with the vehicles `moved` [B, V] on new lines: candidates route [B, V] or, where off_lane [B, V], the
+    off_lane_path [B, V, P, 2]. Such a path has no lights; its limit is the highest of the candidate's."""
+    off_lane = off_lane & moved
+    lane = {name: take_route(scene[f"route_{name}"], route) for name in (*ROUTE_FIELDS, "valid")}
+    path: dict[str, Any] = {"points": off_lane_path, "length": SPACING * (off_lane_path.shape[2] - 1), "open": False}
+    path |= {"limit": lane["limit"].amax(-1, keepdim=True), "light": -1, "light_s": 0.0}
+
+    def change(old: Tensor, on_lane: Tensor, on_path: Tensor | float) -> Tensor:
+        extra = [1] * (old.dim() - 2)
+        on_path = torch.as_tensor(on_path, dtype=old.dtype, device=old.device)
+        new = torch.where(off_lane.view(*off_lane.shape, *extra), on_path, on_lane)
+        return torch.where(moved.view(*moved.shape, *extra), new, old)
+
+    changed = {name: change(getattr(routed, name), lane[name], path[name]) for name in ROUTE_FIELDS}
+    pairs = [value.clone() for value in (routed.conflict, routed.conflict_s, routed.crossing)]
+    for b in moved.any(1).nonzero()[:, 0].tolist():
+        rows = moved[b].nonzero()[:, 0]
+        for old, own, other in zip(pairs, *_conflicts(changed["points"][b], rows), strict=True):
+            old[b][:, rows], old[b][rows] = other.T, own
+    both = routed.modelled & lane["valid"]
+    changed |= {"conflict": pairs[0] & both[:, :, None] & both[:, None], "conflict_s": pairs[1], "crossing": pairs[2]}
+    has_lane = change(routed.has_lane, lane["valid"] & (not free_space), not free_space)
+    return replace(routed, route=torch.where(moved, route, routed.route), has_lane=has_lane, **changed)
+
+
+def _conflicts(points: Tensor, rows: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """Where the routes of vehicles rows [C] first meet every route of points [V, P, 2].
+
+    Returns conflict, conflict_s and crossing (see RoutedScene) [C, V] twice: of each of rows with each route, and of
+    each route with each of rows. One scene at a time, so that its pairs stay in the cache.
+    """
+    line = points[:, :CONFLICT_RANGE:CONFLICT_STRIDE]
+    vehicles, count, _ = line.shape
+    flat = line.reshape(-1, 2)
+    flat = flat - flat.mean(0)
+    near = torch.cdist(flat.view(vehicles, count, 2)[rows].flatten(0, 1), flat) < CONFLICT_GAP
+    near = near.view(len(rows), count, vehicles, count)
+    meets = near.any(3)  # [C, K, V]: this vertex of a row's route meets the other route somewhere
+    first, other = meets.float().argmax(1), near.any(1).float().argmax(2)  # one point, unless they share a stretch
+    conflict = meets.any(1) & (rows[:, None] != torch.arange(vehicles, device=rows.device))
+    tangent = torch.gradient(line, dim=1)[0]
+    angle = torch.atan2(tangent[..., 1], tangent[..., 0])
+    crossing = (angle.gather(1, other.T).T - angle[rows].gather(1, first) + torch.pi) % (2 * torch.pi) - torch.pi
+    spacing = SPACING * CONFLICT_STRIDE
+    return (conflict, first * spacing, crossing), (conflict, other * spacing, wrap(-crossing))
+
+
+FEATURES = 16
+TURN_AT = (10.0, 20.0, 35.0, 55.0, 80.0)  # m ahead
+
+
+def candidate_features(scene: TensorDictBase) -> Tensor:
+    """[B, V, R, FEATURES] of each route candidate as seen from the vehicle's start state."""
+    points = scene["route_points"]
+    vehicles = points.shape[1]
+    start = scene["start"][:, :vehicles]
+    s, d, heading = (value[..., 0] for value in project(start[:, :, None, None, :2], points))
+    v = start[..., 3][..., None].expand_as(s)
+    at = s[..., None] + torch.tensor((0.0, *TURN_AT), device=s.device)
+    angle = interpolate(points, at)[1]
+    turn = wrap(angle[..., 1:] - angle[..., :1])
+    curvature = turn.abs().diff(dim=-1, prepend=torch.zeros_like(turn[..., :1])).abs()
+    tight = (curvature / torch.tensor([10.0, 10.0, 15.0, 20.0, 25.0], device=s.device)).amax(-1)
+    excess = (v**2 * tight / 4 - 1).clamp(0, 4)
+    limit = scene["route_limit"].gather(-1, (s / SPACING).long().clamp(0, points.shape[3] - 1)[..., None])[..., 0]
+    light = scene["route_light"][..., 0]
+    colour = light_state_at(scene["light_state"], light, torch.zeros(len(light), dtype=torch.long, device=s.device))
+    green, red = ((light >= 0) & (colour == state) for state in (LIGHT_GREEN, LIGHT_RED))
+    rank = torch.arange(s.shape[-1], device=s.device).expand_as(s)
+    yaw_rate = scene["start_yaw_rate"][:, :vehicles, None].expand_as(s)
+    rest = (scene["route_length"] - s).clamp(0, 100) / 50
+    bend = (yaw_rate / v.clamp(min=2.0) - turn[..., 0] / 10.0) * 10
+    features = [d.abs(), d, wrap(start[..., 2][..., None] - heading) * 3, *turn.unbind(-1), rest, v / 10, excess, bend]
+    return torch.stack([*features, green.float(), red.float(), rank / 3, (v - limit) / 10], -1)
+
+
+class RouteChoice(nn.Module):
+    """Logits over a vehicle's route candidates from their features."""
+
+    def __init__(self, width: int = 64):
+        super().__init__()
+        hidden = [nn.Linear(FEATURES, width), nn.GELU(), nn.Linear(width, width), nn.GELU()]
+        self.net = nn.Sequential(*hidden, nn.Linear(width, 1))
+
+    def forward(self, scene: TensorDictBase) -> Tensor:
+        """Logits [B, V, R]; -inf where there is no candidate, except for candidate 0 of a vehicle without any."""
+        logits = self.net(candidate_features(scene))[..., 0]
+        valid = scene["route_valid"].clone()
+        valid[..., 0] |= ~valid.any(-1)
+        return logits.masked_fill(~valid, -torch.inf)
+
+
+def sample_route(logits: Tensor, temperature: float, uniform: Tensor) -> Tensor:
+    """A candidate [...] of logits [..., R] for each uniform number [...] in [0, 1), by inverting the distribution
+    function; temperature 0: the most likely."""
+    if temperature <= 0:
+        return logits.argmax(-1)
+    total = torch.softmax(logits / temperature, -1).cumsum(-1)
+    below = uniform.clamp(max=1 - 1e-6)[..., None] * total[..., -1:]  # never past the last possible one
+    return (total <= below).sum(-1)

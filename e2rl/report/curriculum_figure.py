@@ -1,0 +1,97 @@
+"""A heat map of what a curriculum chose: `python -m e2rl.report.curriculum_figure RUN_DIR`.
+
+Rounds run to the right, the arms (intensity within causal template) upwards. Left: the share of a round's draws; right:
+the share of the policy's episodes in these attacks that failed.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from e2rl.learning.logging import CHOICES, read_choices
+from e2rl.learning.scheduler import Choice
+from e2rl.report import drawing
+from e2rl.report.drawing import new_figure, save_figure
+from e2rl.run.errors import InputError, stop
+from e2rl.traffic.traffic import TEMPLATES
+
+PICTURE = "curriculum.png"
+LINE, MARGIN, WIDTH, DPI = 14, 90, 900, 144  # points: a line of an arm, the space around them, the width
+PANELS = (("share of the round's draws", "viridis"), ("share of failed episodes", "magma"))
+
+
+def grids(rows: Sequence[Choice]) -> tuple[list[int], list[tuple[str, float]], np.ndarray, np.ndarray]:
+    """Rounds [R], arms [A] as (template, eta), and by arm and round the share of the round's draws and the share of
+    failed episodes, both [A, R]; NaN where nobody was drawn, or no episode driven."""
+    rounds = sorted({int(row["round"]) for row in rows})
+    arms = sorted({(str(row["template"]), float(row["eta"])) for row in rows}, key=_order)
+    draws, episodes, failures = np.zeros((3, len(arms), len(rounds)))
+    for row in rows:
+        at = arms.index((str(row["template"]), float(row["eta"]))), rounds.index(int(row["round"]))
+        for table, name in ((draws, "draws"), (episodes, "episodes"), (failures, "failures")):
+            table[at] = float(row[name])
+    share = draws / draws.sum(0, keepdims=True).clip(min=1)
+    rate = np.where(episodes > 0, failures / episodes.clip(min=1), np.nan)
+    return rounds, arms, np.where(draws > 0, share, np.nan), rate
+
+
+def _order(arm: tuple[str, float]) -> tuple[int, float]:
+    return TEMPLATES.index(arm[0]), arm[1]
+
+
+def choice_map(rows: Sequence[Choice]) -> Figure:
+    """The heat map of a table of choices."""
+    rounds, arms, *tables = grids(rows)
+    figure = new_figure(WIDTH, MARGIN + LINE * max(len(arms), 6), DPI)
+    figure.set_layout_engine("constrained")
+    panels = list(figure.subplots(1, len(PANELS), sharey=True))
+    for axes, table, (title, colours) in zip(panels, tables, PANELS, strict=True):
+        axes.set_facecolor(drawing.GROUND)
+        edges = np.arange(len(rounds) + 1) - 0.5, np.arange(len(arms) + 1) - 0.5
+        top = 1.0 if table is tables[1] else max(np.nanmax(table, initial=0), 1e-6)
+        mesh = axes.pcolormesh(*edges, np.ma.masked_invalid(table), cmap=colours, vmin=0, vmax=top)
+        figure.colorbar(mesh, ax=axes)
+        axes.set_title(title, fontsize=10)
+        _label(axes, rounds, arms)
+    panels[0].set_ylabel("causal template, η")
+    return figure
+
+
+def _label(axes: Axes, rounds: Sequence[int], arms: Sequence[tuple[str, float]]) -> None:
+    """Names of the arms, at most a dozen rounds, and a line between templates."""
+    shown = range(0, len(rounds), -(-len(rounds) // 12))
+    axes.set_xticks(list(shown), [str(rounds[k]) for k in shown])
+    axes.set_yticks(range(len(arms)), [f"{name} {eta:g}" for name, eta in arms], fontsize=7)
+    axes.set_xlabel("round")
+    for k in range(1, len(arms)):
+        if arms[k][0] != arms[k - 1][0]:
+            axes.axhline(k - 0.5, color=drawing.INK, linewidth=0.8)
+
+
+def draw_choices(folder: Path) -> None:
+    """Draw curriculum.png and .pdf from the curriculum.csv of a run's folder; nothing where the run has logged none."""
+    rows = read_choices(folder / CHOICES)
+    if rows:
+        save_figure(folder / PICTURE, choice_map(rows))
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path, nargs="+", help="folder of a run of train.py")
+    for folder in parser.parse_args().run:
+        try:
+            if not (folder / CHOICES).is_file():
+                raise InputError(f"{folder}: no {CHOICES} there; give the folder of a train.py run with logger=csv")
+            draw_choices(folder)
+        except InputError as error:
+            stop(error)
+        print(folder / PICTURE)
+
+
+if __name__ == "__main__":
+    main()

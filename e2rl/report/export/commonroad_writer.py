@@ -1,0 +1,219 @@
+"""CommonRoad scenarios, format 2020a, by commonroad-io (extra `commonroad`; docs/export.md).
+
+Obstacle 1 is the ego, obstacle n + 1 the agent of row n. An agent that comes back after a gap is a further obstacle,
+since a CommonRoad trajectory has no gaps. Who appears late has a late initial state: commonroad-io and its tools read
+it, while the format's schema admits only obstacles that are there from the start.
+"""
+
+import re
+from collections.abc import Iterable, Iterator
+from itertools import count, groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from e2rl.report.export.episode import Episode
+from e2rl.run.errors import InputError
+from e2rl.scenes.paths import shift_left, tangent_angle, wrap
+from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW
+
+TYPES = {"vehicle": "CAR", "pedestrian": "PEDESTRIAN", "cyclist": "BICYCLE", "other": "UNKNOWN"}  # of ObstacleType
+LONG = 7.0  # m: longer vehicles are trucks
+LIGHTS = {LIGHT_RED: "RED", LIGHT_YELLOW: "YELLOW", LIGHT_GREEN: "GREEN", LIGHT_UNKNOWN: "INACTIVE"}
+GOAL_LENGTH, GOAL_WIDTH = 10.0, 4.0  # m
+STRAIGHT = 0.5  # rad that a lane may turn and still lead straight on
+MOST_CHARACTERS = 40  # of a map's name
+
+
+def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> Iterator[tuple[Episode, Path]]:
+    """Write ZAM_<place>-<n>_1_T-1.xml of each episode; open_ego: the ego is a planning problem only, no obstacle."""
+    _check_library()
+    from commonroad.common.writer.file_writer_interface import OverwriteExistingFile
+    from commonroad.common.writer.file_writer_xml import XMLFileWriter
+    from commonroad.scenario.scenario import Tag
+    from lxml import etree
+
+    for number, episode in enumerate(episodes, 1):
+        made, problems = scenario(episode, number, open_ego)
+        known = {"author": "", "affiliation": "", "source": "e2rl", "tags": {Tag.CRITICAL, Tag.SIMULATED}}
+        writer = XMLFileWriter(made, problems, **known, decimal_precision=6)
+        writer.root_node.append(etree.Comment(_comment(episode)))
+        path = folder / f"{made.scenario_id}.xml"
+        writer.write_to_file(str(path), OverwriteExistingFile.ALWAYS)
+        yield episode, path
+
+
+def _check_library() -> None:
+    try:
+        import commonroad.common.writer.file_writer_xml  # noqa: F401
+    except ImportError as error:
+        reason = f"commonroad-io cannot be imported ({error})"
+        raise InputError(
+            f"--to commonroad: {reason}; install e2rl with its extra: pip install 'e2rl[commonroad]'"
+        ) from error
+
+
+def _comment(episode: Episode) -> str:
+    """The facts as the text of an XML comment, which must not hold two dashes in a row."""
+    return re.sub("-(?=-)", "- ", f" {episode.text()} ")
+
+
+def scenario(episode: Episode, number: int, open_ego: bool) -> tuple[Any, Any]:
+    """The Scenario, whose map is called `number`, and the PlanningProblemSet of an episode."""
+    from commonroad.common.common_scenario import GeoTransformation, Location, ScenarioID
+    from commonroad.planning.planning_problem import PlanningProblemSet
+    from commonroad.scenario.scenario import Scenario
+
+    place = re.sub(r"[^A-Za-z0-9]", "", episode.rollout["location"])[:MOST_CHARACTERS] or "E2rl"
+    name = ScenarioID(map_name=place, map_id=number, configuration_id=1, obstacle_behavior="T", prediction_id=1)
+    made = Scenario(episode.rollout["dt"], name)
+    ids = count(len(episode.rollout["size"]) + 1)
+    made.add_objects(lanelets(episode, ids))
+    signs, lights = speed_limits(episode, made, ids), traffic_lights(episode, made, ids)
+    made.add_objects(signs + lights)
+    made.add_objects(obstacles(episode, ids, open_ego))
+    if episode.origin is not None:
+        shift = episode.origin.tolist()
+        made.lanelet_network.location = Location(geo_transformation=GeoTransformation("", *shift, 0.0, 1.0))
+    return made, PlanningProblemSet([planning_problem(episode, next(ids))])
+
+
+# --- map
+
+
+def lanelets(episode: Episode, ids: Iterator[int]) -> list:
+    """A lanelet for each lane, half its width to both sides of the centreline."""
+    from commonroad.scenario.lanelet import Lanelet, LaneletType
+
+    number = {name: next(ids) for name in episode.lanes}
+    entries: dict[str, list[int]] = {name: [] for name in episode.lanes}
+    for name, lane in episode.lanes.items():
+        for other in lane.exits:
+            entries[other].append(number[name])
+    made = []
+    for name, lane in episode.lanes.items():
+        left, right = next(iter(lane.left), None), next(iter(lane.right), None)
+        made.append(
+            Lanelet(
+                left_vertices=shift_left(lane.points, lane.width / 2),
+                center_vertices=lane.points,
+                right_vertices=shift_left(lane.points, -lane.width / 2),
+                lanelet_id=number[name],
+                predecessor=entries[name],
+                successor=[number[other] for other in lane.exits],
+                adjacent_left=number[left] if left else None,
+                adjacent_left_same_direction=True if left else None,
+                adjacent_right=number[right] if right else None,
+                adjacent_right_same_direction=True if right else None,
+                lanelet_type={LaneletType.UNKNOWN},
+            )
+        )
+    return made
+
+
+def speed_limits(episode: Episode, made: Any, ids: Iterator[int]) -> list:
+    """A virtual sign for each speed limit; lanelets refer to theirs."""
+    from commonroad.scenario.traffic_sign import TrafficSign, TrafficSignElement, TrafficSignIDZamunda
+
+    signs = {}
+    for lane, lanelet in zip(episode.lanes.values(), made.lanelet_network.lanelets, strict=True):
+        if lane.speed_limit <= 0:
+            continue
+        if lane.speed_limit not in signs:
+            element = TrafficSignElement(TrafficSignIDZamunda.MAX_SPEED, [f"{lane.speed_limit:.6g}"])
+            signs[lane.speed_limit] = TrafficSign(
+                next(ids), [element], {lanelet.lanelet_id}, lane.points[0], virtual=True
+            )
+        lanelet.add_traffic_sign_to_lanelet(signs[lane.speed_limit].traffic_sign_id)
+    return list(signs.values())
+
+
+def traffic_lights(episode: Episode, made: Any, ids: Iterator[int]) -> list:
+    """A light at the end of each lanelet before one with a light; where it leads to several, one for each direction."""
+    from commonroad.scenario.traffic_light import TrafficLight, TrafficLightDirection
+
+    number = dict(zip(episode.lanes, made.lanelet_network.lanelets, strict=True))
+    found = []
+    for name, lane in episode.lanes.items():
+        groups: dict[tuple[int, ...], list[str]] = {}  # lanes ahead by the states of their light
+        for other in lane.exits:
+            if other in episode.lights:
+                groups.setdefault(tuple(episode.lights[other].tolist()), []).append(other)
+        for states, others in groups.items():
+            turns = {"ALL"} if len(others) == len(lane.exits) else {turn(episode, other) for other in others}
+            for direction in sorted(turns):
+                light = TrafficLight(
+                    next(ids), lane.points[-1], cycle(states), direction=TrafficLightDirection[direction]
+                )
+                number[name].add_traffic_light_to_lanelet(light.traffic_light_id)
+                found.append(light)
+    return found
+
+
+def cycle(states: Iterable[int]) -> Any:
+    """Light states, one a time step, as a cycle."""
+    from commonroad.scenario.traffic_light import TrafficLightCycle, TrafficLightCycleElement, TrafficLightState
+
+    runs = [(state, len(list(group))) for state, group in groupby(states)]
+    return TrafficLightCycle(
+        [TrafficLightCycleElement(TrafficLightState[LIGHTS[state]], length) for state, length in runs]
+    )
+
+
+def turn(episode: Episode, name: str) -> str:
+    """The direction in which a lane leads."""
+    angle = tangent_angle(episode.lanes[name].points)
+    turned = float(wrap(angle[-1] - angle[0]))
+    return "STRAIGHT" if abs(turned) < STRAIGHT else "LEFT" if turned > 0 else "RIGHT"
+
+
+# --- agents
+
+
+def obstacles(episode: Episode, ids: Iterator[int], open_ego: bool) -> list:
+    """A dynamic obstacle for each appearance of an agent of at least two steps, which is the least of the format."""
+    from commonroad.geometry.obstacle_shapes.rect_obstacle_shape import RectObstacleShape
+    from commonroad.prediction.prediction import TrajectoryPrediction
+    from commonroad.scenario.obstacle import DynamicObstacle, ObstacleType
+    from commonroad.scenario.trajectory import Trajectory
+
+    made = []
+    for row in episode.agents[1:] if open_ego else episode.agents:
+        kind, (length, width) = str(episode.rollout["agent_type"][row]), episode.size(row)
+        name = "TRUCK" if kind == "vehicle" and length > LONG else TYPES[kind]
+        shape = RectObstacleShape(width=width, length=length)
+        spans = [span for span in episode.appearances(row) if span[1] - span[0] >= 2]
+        for index, (first, end) in enumerate(spans):
+            begin, *states = [state(episode, step, row) for step in range(first, end)]
+            prediction = TrajectoryPrediction(Trajectory(first + 1, states), shape)
+            number = row + 1 if index == 0 else next(ids)
+            made.append(DynamicObstacle(number, ObstacleType[name], shape, begin, prediction))
+    return made
+
+
+def state(episode: Episode, step: int, row: int, **more: float) -> Any:
+    """An agent's state at a step: the middle of its box, heading and speed."""
+    from commonroad.scenario.state import InitialState
+
+    x, y, heading, speed = episode.rollout["states"][step, row].astype(float).tolist()
+    position, turned = np.array([x, y]), float(wrap(heading))
+    return InitialState(time_step=step, position=position, orientation=turned, velocity=speed, **more)
+
+
+def planning_problem(episode: Episode, number: int) -> Any:
+    """From the ego's start to where its recording ends, at any time; the route between is the planner's."""
+    import shapely
+    from commonroad.common.util import Interval
+    from commonroad.geometry.occupancy.rect_occupancy import RectOccupancy
+    from commonroad.planning.goal import GoalRegion
+    from commonroad.planning.planning_problem import PlanningProblem
+    from commonroad.scenario.state import CustomState
+
+    last = int(np.flatnonzero(episode.rollout["logged_valid"][:, 0])[-1])
+    x, y, heading, _ = episode.rollout["logged"][last, 0].astype(float).tolist()
+    there = RectOccupancy(shapely.Point(x, y), GOAL_WIDTH, GOAL_LENGTH, float(wrap(heading)))
+    goal = CustomState(time_step=Interval(1, max(episode.steps, 1)), position=there)
+    turning = 0.0 if episode.scene is None else float(episode.scene["start_yaw_rate"][0])
+    begin = state(episode, 0, 0, yaw_rate=turning, slip_angle=0.0)
+    return PlanningProblem(number, begin, GoalRegion([goal]))

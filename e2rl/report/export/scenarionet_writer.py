@@ -1,0 +1,153 @@
+"""ScenarioNet: a ScenarioDescription pickle of each episode, and the summary of the folder (docs/export.md).
+
+Pickles hold python containers and numpy arrays only. Where the scene is known, the second before the start comes first,
+so the start is frame 10 as in Waymo's files.
+"""
+
+import pickle
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from e2rl.report.export.episode import Episode, past_of
+from e2rl.run.files import write_atomically
+from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW
+from e2rl.scenes.smoothing import PAST
+
+VERSION = "MetaDrive v0.3.0.1"  # of the format
+SUMMARY, MAPPING = "dataset_summary.pkl", "dataset_mapping.pkl"
+PROTOCOL = 4  # of pickle, which every Python 3 reads
+HEIGHT = {"vehicle": 1.6, "cyclist": 1.75, "pedestrian": 1.75, "other": 1.0}  # m; rollouts hold none
+LIGHTS = {
+    LIGHT_UNKNOWN: "LANE_STATE_UNKNOWN",
+    LIGHT_RED: "LANE_STATE_STOP",
+    LIGHT_YELLOW: "LANE_STATE_CAUTION",
+    LIGHT_GREEN: "LANE_STATE_GO",
+}
+
+
+def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> Iterator[tuple[Episode, Path]]:
+    """Write sd_NAME.pkl of each episode, then the summary and the mapping that MetaDrive reads a folder by."""
+    summary = {}
+    for episode in episodes:
+        path = folder / f"sd_{episode.path.stem}.pkl"
+        made = description(episode)
+        write_atomically(path, pickle.dumps(made, PROTOCOL))
+        summary[path.name] = made["metadata"]
+        yield episode, path
+    write_atomically(folder / SUMMARY, pickle.dumps(summary, PROTOCOL))
+    write_atomically(folder / MAPPING, pickle.dumps(dict.fromkeys(summary, ""), PROTOCOL))
+
+
+def description(episode: Episode) -> dict[str, Any]:
+    """The ScenarioDescription of an episode; track n is the agent of row n, and 0 the ego."""
+    history = 0 if episode.scene is None else PAST
+    frames = history + episode.steps + 1
+    known, scene_id = {row: states for row, states in past_of(episode)}, episode.path.stem
+    tracks = {str(row): track(episode, row, history, known.get(row)) for row in episode.agents}
+    metadata: dict[str, Any] = {
+        "scenario_id": scene_id,
+        "dataset": "e2rl",
+        "source_file": episode.path.name,
+        "map": episode.rollout["location"],
+        "coordinate": "metadrive",
+        "metadrive_processed": False,
+        "ts": np.arange(frames) * episode.rollout["dt"],
+        "track_length": frames,
+        "sdc_id": "0",
+        "sdc_track_index": 0,
+        "object_summary": {name: object_summary(name, entry) for name, entry in tracks.items()},
+        "e2rl": episode.facts,
+    }
+    if episode.origin is not None:
+        metadata |= {"current_time_index": history, "origin": episode.origin.tolist()}
+    return {
+        "id": scene_id,
+        "version": VERSION,
+        "length": frames,
+        "metadata": metadata,
+        "tracks": tracks,
+        "dynamic_map_states": {name: light(episode, name, history) for name in episode.lights},
+        "map_features": map_features(episode),
+    }
+
+
+def track(episode: Episode, row: int, history: int, past: np.ndarray | None) -> dict[str, Any]:
+    """The track of an agent, zero where it is absent. past [history, 4]: its states before the start, None for none."""
+    rollout, (length, width) = episode.rollout, episode.size(row)
+    frames, kind = history + episode.steps + 1, str(rollout["agent_type"][row])
+    states, valid = np.zeros((frames, 4)), np.zeros(frames, bool)
+    valid[history:] = rollout["valid"][:, row]
+    states[history:][valid[history:]] = rollout["states"][rollout["valid"][:, row], row]
+    if past is not None:
+        states[:history], valid[:history] = past, True
+    speed = states[:, 3:]
+    return {
+        "type": kind.upper(),
+        "state": {
+            "position": np.concatenate([states[:, :2], np.zeros((frames, 1))], 1),
+            "heading": states[:, 2],
+            "velocity": speed * np.stack([np.cos(states[:, 2]), np.sin(states[:, 2])], -1),
+            "valid": valid,
+            **{name: side * valid for name, side in (("length", length), ("width", width), ("height", HEIGHT[kind]))},
+        },
+        "metadata": {
+            "type": kind.upper(),
+            "object_id": str(row),
+            "track_length": frames,
+            "dataset": "e2rl",
+            "simulated": bool(rollout["simulated"][row]),
+            "adversary": bool(rollout["adversaries"][row]),
+        },
+    }
+
+
+def object_summary(name: str, entry: dict[str, Any]) -> dict[str, Any]:
+    """What ScenarioNet's filters know of a track: how long it is there, and how far it moves."""
+    valid = entry["state"]["valid"]
+    way = np.linalg.norm(np.diff(entry["state"]["position"][valid, :2], axis=0), axis=1).sum()
+    first = int(valid.argmax())
+    return {
+        "type": entry["type"],
+        "object_id": name,
+        "track_length": len(valid),
+        "moving_distance": float(way),
+        "valid_length": int(valid.sum()),
+        "continuous_valid_length": int(np.logical_and.accumulate(valid[first:]).sum()),
+    }
+
+
+def light(episode: Episode, name: str, history: int) -> dict[str, Any]:
+    """The light that lets into a lane; unknown before the recording begins."""
+    past = episode.light_past[name][-history:] if history else np.zeros(0, int)
+    states = np.concatenate([np.full(history - len(past), LIGHT_UNKNOWN), past, episode.lights[name]])
+    return {
+        "type": "TRAFFIC_LIGHT",
+        "lane": name,
+        "stop_point": np.array([*episode.lanes[name].points[0], 0.0]),
+        "state": {"object_state": [LIGHTS[int(state)] for state in states]},
+        "metadata": {"type": "TRAFFIC_LIGHT", "object_id": name, "track_length": len(states), "dataset": "e2rl"},
+    }
+
+
+def map_features(episode: Episode) -> dict[str, dict[str, Any]]:
+    """The lanes."""
+    entries: dict[str, list[str]] = {name: [] for name in episode.lanes}
+    for name, lane in episode.lanes.items():
+        for other in lane.exits:
+            entries[other].append(name)
+    return {
+        name: {
+            "type": "LANE_SURFACE_STREET",
+            "polyline": lane.points,
+            "width": np.full((len(lane.points), 2), lane.width / 2),
+            "entry_lanes": entries[name],
+            "exit_lanes": list(lane.exits),
+            "left_neighbor": [{"feature_id": other} for other in lane.left],
+            "right_neighbor": [{"feature_id": other} for other in lane.right],
+            **({"speed_limit_kmh": lane.speed_limit * 3.6} if lane.speed_limit > 0 else {}),
+        }
+        for name, lane in episode.lanes.items()
+    }

@@ -1,0 +1,228 @@
+"""The selection of a coalition shown in the skeleton figure.
+
+The skeleton figure: from pairwise risk to an active chain, for one coalition of a real rollout (Sec. IV-A).
+
+Three panels: the times to collision in the reference rollout, when the links of the coalition weigh most; the risk
+graph at that time; the chain when it was chosen, with the paths that were driven after it.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.patheffects import withStroke
+from torch import Tensor
+
+from e2rl.evaluation.protocol import SEEDS_APART, Method
+from e2rl.evaluation.rollout_files import ROLLOUTS, rollout_name
+from e2rl.evaluation.rollout_reader import read_rollout
+from e2rl.report import drawing
+from e2rl.report.drawing import TrafficMap, Trail, add_legend, new_panels
+from e2rl.report.picture import shorten
+from e2rl.run.errors import InputError
+from e2rl.scenes.scene import SceneSet
+from e2rl.traffic.e2.skeleton import Selection, chain_depth
+from e2rl.traffic.e2.topology import TopologySettings
+from e2rl.traffic.grouping import take_rows
+
+SIDE, GAP, HEAD, FOOT = 600, 12, 62, 34  # points: of a panel, between panels, above and below them
+NODES = 10  # of the matrix at most
+MARGIN, SMALLEST, LARGEST = 30.0, 60.0, 140.0  # m: around the coalition, and a map's least and greatest side
+CANDIDATE, FEASIBLE = drawing.VULNERABLE, "#2e8b57"
+ON_TOP = 10  # drawing order of edges, arrows and names, above the map
+LEGEND = {"ego": drawing.EGO, "coalition C*": drawing.ADVERSARY, "candidate of the topology": CANDIDATE}
+LEGEND |= {"feasible, no candidate": FEASIBLE, "others": drawing.BACKGROUND}
+
+
+@dataclass
+class SkeletonPicture:
+    """The figure of a selection (B = 1) in a rollout, as `read_rollout` returns it, with the topology's settings.
+
+    `time` [s] and `weights` [V, V] are those of the step of the reference rollout at which the coalition's links weigh
+    most, `risky` [V, 4] the states there; `now` [N, 4] are the rollout's states when the coalition was chosen.
+    """
+
+    rollout: dict
+    selection: Selection
+    settings: TopologySettings
+
+    def __post_init__(self):
+        chosen = self.selection
+        masks = (chosen.coalition, chosen.candidates, chosen.feasible)
+        self.coalition, self.candidates, self.feasible = (mask[0].cpu().numpy() for mask in masks)
+        self.target, self.step = chosen.target[0].tolist(), int(chosen.step)
+        # Among steps of equal risk of the links, the one with the greatest risk of all pairs.
+        moment = int((link_risk(chosen)[0] + 1e-6 * chosen.weights[0].sum((1, 2))).argmax())
+        self.time = float(chosen.moments[0, moment])
+        self.weights = chosen.weights[0, moment].cpu().numpy()
+        self.risky = chosen.reference[0, moment].cpu().numpy()
+        self.now = self.rollout["states"][self.step]
+        self.members = np.flatnonzero(self.coalition).tolist()
+
+    def nodes(self) -> list[int]:
+        """Vehicles of the matrix: the ego, the coalition, then those with the heaviest edges."""
+        own = [0, *self.members]
+        edges = self.weights * (self.weights >= self.settings.edge_threshold)
+        others = [i for i in np.argsort(-edges.sum(1), kind="stable").tolist() if edges[i].any() and i not in own]
+        return own + sorted(others[: max(NODES - len(own), 0)])
+
+    def colour(self, agent: int) -> str:
+        if agent == 0:
+            return drawing.EGO
+        masks = (self.coalition, self.candidates, self.feasible)
+        for mask, colour in zip(masks, (drawing.ADVERSARY, CANDIDATE, FEASIBLE), strict=True):
+            if agent < len(mask) and mask[agent]:
+                return colour
+        return drawing.BACKGROUND
+
+    def ttc(self, weight: float) -> float:
+        """Time to collision [s] of a pair of this weight, eq. (ttc_weight_t) inverted."""
+        return max(0.0, self.settings.tau_max - self.settings.beta * math.log(weight / (1 - weight)))
+
+    def figure(self) -> Figure:
+        """The three panels beside each other, under their titles."""
+        (figure, axes), rollout = new_panels(3, SIDE, GAP, HEAD, FOOT), self.rollout
+        title = (
+            f"{shorten(rollout['scene_id'])}   seed {rollout['seed']}   intensity {rollout['eta']:g}   "
+            f"{rollout['method']} vs {rollout['ego_policy']}   chosen at {self.step * rollout['dt']:.1f} s"
+        )
+        figure.suptitle(title, x=0.004, y=0.985, ha="left", fontsize=15, color=drawing.INK)
+        gap, longest = f"{self.settings.clearance:g} m", f"{self.ttc(self.settings.edge_threshold):.1f} s"
+        captions = (
+            f"time to a gap of {gap} [s], {self.time:.1f} s into the reference rollout",
+            f"risk graph at that time, edges of TTC < {longest}",
+            "active chain, and the paths driven after it",
+        )
+        for panel, caption, draw in zip(axes, captions, (self.matrix, self.graph, self.chain), strict=True):
+            panel.set_title(caption, loc="left", x=8 / SIDE, fontsize=14, color=drawing.MUTED)
+            draw(panel)
+        add_legend(figure, LEGEND, 13)
+        return figure
+
+    def matrix(self, axes: Axes) -> None:
+        """TTC of every pair of nodes, red by weight; the links of the coalition are framed."""
+        axes.set_axis_off()
+        table, nodes = axes.inset_axes((0.09, 0.02, 0.89, 0.89)), self.nodes()
+        weights = self.weights[np.ix_(nodes, nodes)]
+        reds = LinearSegmentedColormap.from_list("risk", (drawing.GROUND, drawing.CONTACT))
+        colours = reds.with_extremes(bad=drawing.BACKGROUND)
+        others = np.ma.masked_where(np.eye(len(nodes), dtype=bool), weights)
+        table.pcolormesh(others, cmap=colours, vmin=0, vmax=1, edgecolors=drawing.PANEL, linewidth=1)
+        font = min(16, 180 / len(nodes))
+        for row, column in np.argwhere(others.filled(0) > 0):
+            weight = float(weights[row, column])
+            ink, text = drawing.PANEL if weight > 0.6 else drawing.INK, f"{self.ttc(weight):.1f}"
+            table.text(column + 0.5, row + 0.5, text, color=ink, fontsize=font, ha="center", va="center")
+        for agent in self.members:
+            corner = (nodes.index(self.target[agent]), nodes.index(agent))
+            table.add_patch(Rectangle(corner, 1, 1, fill=False, edgecolor=drawing.INK, linewidth=4, zorder=3))
+        centres, names = np.arange(len(nodes)) + 0.5, [name(agent) for agent in nodes]
+        table.set(xticks=centres, xticklabels=names, yticks=centres, yticklabels=names, ylim=(len(nodes), 0))
+        table.tick_params(top=True, labeltop=True, labelbottom=False, length=0, labelsize=14)
+        table.spines[:].set_visible(False)
+        for labels in (table.get_xticklabels(), table.get_yticklabels()):
+            for agent, label in zip(nodes, labels, strict=True):
+                label.set_color(self.colour(agent))
+
+    def graph(self, axes: Axes) -> None:
+        """The reference rollout at the time of the risk, with the edges of the risk graph."""
+        self.draw_map(axes, self.risky, [])
+        for i, j in np.argwhere(np.tril(self.weights, -1) >= self.settings.edge_threshold):
+            ends, weight = self.risky[[i, j]], float(self.weights[i, j])
+            axes.plot(*ends[:, :2].T, color=drawing.INK, linewidth=1 + 4 * weight, zorder=ON_TOP)
+
+    def chain(self, axes: Axes) -> None:
+        """The moment of the choice: who acts on whom, and how the coalition and the ego drove from there."""
+        states, valid = self.rollout["states"][self.step :, :, :2], self.rollout["valid"][self.step :]
+        own = [*self.members, 0]
+        trails = [Trail(states[valid[:, agent], agent], self.colour(agent), 0.6) for agent in own]
+        self.draw_map(axes, self.now, trails)
+        head = {"arrowstyle": "-|>", "mutation_scale": 30, "color": drawing.INK, "shrinkA": 0, "shrinkB": 0}
+        for agent in self.members:
+            start, end = self.now[agent, :2], self.now[self.target[agent], :2]
+            axes.plot(*np.stack([start, end], 1), color=drawing.INK, linewidth=4, zorder=ON_TOP)
+            axes.annotate("", start + 0.8 * (end - start), start, arrowprops=head, zorder=ON_TOP)
+
+    def draw_map(self, axes: Axes, states: np.ndarray, trails: list[Trail]) -> None:
+        """Vehicles at their states, with numbers beside the nodes; the coalition and the ego lie on top.
+
+        Both maps show the square that holds the ego and the coalition at both times.
+        """
+        own = [0, *self.members]
+        points = np.concatenate([self.now[own, :2], self.risky[own, :2]])
+        side = float(np.clip(np.ptp(points, axis=0).max() + MARGIN, SMALLEST, LARGEST))
+        shown = [agent for agent in range(len(states)) if self.rollout["valid"][self.step, agent]]
+        shown.sort(key=lambda agent: (self.colour(agent) != drawing.BACKGROUND, -agent))
+        sizes = self.rollout["size"]
+        shapes = [shape for i in shown for shape in drawing.vehicle(states[i], sizes[i], self.colour(i))]
+        TrafficMap(axes, self.rollout, side).show((points.min(0) + points.max(0)) / 2, trails, shapes)
+        outline = [withStroke(linewidth=4, foreground=drawing.PANEL)]
+        for agent in self.nodes():
+            x, y = states[agent, :2]
+            text = axes.annotate(name(agent), (x, y), (13, 9), textcoords="offset points", fontsize=15)
+            text.set(color=drawing.INK, path_effects=outline, zorder=ON_TOP + 1, clip_on=True)
+
+
+def skeleton_figure(rollout: dict, selection: Selection, settings: TopologySettings) -> Figure:
+    """The figure of a selection (B = 1) and of the rollout that it belongs to."""
+    return SkeletonPicture(rollout, selection, settings).figure()
+
+
+def name(agent: int) -> str:
+    return "ego" if agent == 0 else str(agent)
+
+
+@dataclass
+class LongestChain:
+    """Keeps a method's selection with the longest chain; ties go to the largest coalition, then to the greatest risk
+    between its members, then to the first. `kept`: that selection, B = 1."""
+
+    method: Method
+    kept: Selection | None = None
+    rank: tuple[float, ...] = (0, 0, 0)
+
+    def __post_init__(self) -> None:
+        self.method.traffic.on_selection = self
+
+    def __call__(self, selection: Selection) -> None:
+        depth, size = chain_depth(selection.target).amax(1), selection.coalition.sum(1)
+        ranks = torch.stack([depth.double(), size.double(), link_risk(selection).amax(1).double()], 1)
+        for row, rank in enumerate(map(tuple, ranks.tolist())):
+            if rank > self.rank:
+                self.kept, self.rank = take_rows(selection, torch.tensor([row])), rank
+
+    @property
+    def selection(self) -> Selection:
+        """The kept selection; InputError if no adversary was chosen."""
+        if self.kept is None:
+            raise InputError(
+                f"figure=skeleton: {self.method.name} at eta={self.method.eta:g} chose no adversary in any scene; name "
+                "e2 first in methods, at an eta above 0, and evaluate more scenes, or name one with scene="
+            )
+        return self.kept
+
+    @property
+    def topology(self) -> TopologySettings:
+        """Settings of the risk graphs of the method's selections; InputError for a method without them."""
+        if self.method.traffic.topology is None:
+            raise InputError(f"figure=skeleton: needs a method of e2 first in methods, not {self.method.name}")
+        return self.method.traffic.topology
+
+    def rollout(self, scenes: SceneSet, ego_name: str, folder: Path) -> dict:
+        """The rollout of the kept selection, from its file; InputError if no adversary was chosen."""
+        seed, scene = divmod(int(self.selection.seed), SEEDS_APART)
+        identity = {"method": self.method.name, "ego_policy": ego_name, "eta": self.method.eta}
+        name = rollout_name(identity | {"scene_id": scenes.scene_id[scene], "seed": seed})
+        return read_rollout(Path(folder) / ROLLOUTS / name)
+
+
+def link_risk(selection: Selection) -> Tensor:
+    """Sum [B, T'] of the weights between the coalition's members and their targets, at each time."""
+    onto = selection.target.clamp(min=0)[:, None, :, None].expand(*selection.weights.shape[:3], 1)
+    return (selection.weights.gather(3, onto)[..., 0] * selection.coalition[:, None]).sum(-1)

@@ -1,0 +1,235 @@
+"""Files that appear whole or not at all, and that tell whether they still are what was written.
+
+Weights in safetensors files, with a hash of what was written in the header: an altered file is noticed.
+
+Files of earlier versions have no hash; of those only the form is checked.
+"""
+
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+import time
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from e2rl.run.errors import InputError
+
+MAX_ARRAYS = 1 << 30  # bytes of one npz, unpacked
+WAIT = 5  # s that another run's workers have to end
+SEAL = "sha256.json"  # of a sealed folder: {file: hash}
+DAMAGED = (OSError, EOFError, LookupError, TypeError, ValueError, RuntimeError, MemoryError, SyntaxError)
+
+
+def write_atomically(path: Path, content: bytes | str | Callable[[Path], object]) -> None:
+    """Write a file under a temporary name beside `path`, then rename it, so that no reader meets half a file.
+
+    content: the bytes or text of the file, or a function that writes the file whose path it is given. Missing parent
+    folders are made. Raises OSError, naming `path`, where it cannot be written; nothing is left behind then.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    os.close(handle)
+    part = Path(name)
+    try:
+        if callable(content):
+            content(part)
+        else:
+            part.write_bytes(content.encode() if isinstance(content, str) else content)
+        part.chmod(0o644)
+        part.replace(path)
+    except BaseException as error:
+        part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno is not None:
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
+def written_whole(folder: Path) -> Iterator[Path]:
+    """An empty folder under a temporary name beside `folder`, renamed to it where the block ends well, else removed."""
+    folder = Path(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    part = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}.", suffix=".part"))
+    try:
+        yield part
+        part.chmod(0o755)
+        part.rename(folder)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+
+
+def seal(folder: Path) -> None:
+    """Write the hashes of a folder's files into it, for `altered`."""
+    hashes = {path.name: sha256_of(path) for path in sorted(folder.iterdir()) if path.name != SEAL}
+    write_atomically(folder / SEAL, json.dumps(hashes, indent=1))
+
+
+def altered(folder: Path) -> str | None:
+    """The name of the first file of a sealed folder that is not what was written; None: all are."""
+    try:
+        hashes = json.loads((folder / SEAL).read_text())
+        return next((name for name, known in hashes.items() if sha256_of(folder / name) != known), None)
+    except FileNotFoundError as error:
+        return Path(error.filename).name
+    except (OSError, ValueError, AttributeError):
+        return SEAL
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file's content, in hex."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold the lock of `path` among processes: others wait at the beginning of their block."""
+    name = path.with_name(f".{path.name}.lock")
+    while True:
+        handle = os.open(name, os.O_RDWR | os.O_CREAT, 0o644)
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        try:
+            if os.stat(name).st_ino == os.fstat(handle).st_ino:
+                break  # else its last holder has removed it in the meantime
+        except FileNotFoundError:
+            pass
+        os.close(handle)
+    try:
+        yield
+    finally:
+        name.unlink(missing_ok=True)
+        os.close(handle)
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Have a run's folder for oneself; raises InputError where another process is at work there."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        for remaining in reversed(range(WAIT)):
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if not remaining:
+                    raise InputError(
+                        f"{folder}: another process is at work in this run; wait for it, or end it"
+                    ) from None
+                time.sleep(1.0)  # workers of a process that was killed end soon, but not at once
+        yield
+    finally:
+        os.close(handle)
+
+
+def read_arrays(file: Path | IO[bytes]) -> dict[str, np.ndarray]:
+    """The arrays of an npz, none of them pickled; raises ValueError where it is damaged or claims MAX_ARRAYS bytes."""
+    if isinstance(file, Path) and not file.is_file():
+        raise ValueError("no regular file")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > MAX_ARRAYS:
+            raise ValueError(f"unpacks to {size / 1e6:.0f} MB, more than {MAX_ARRAYS / 1e6:.0f}")
+        with np.load(file, allow_pickle=False) as arrays:
+            return {key: _truth(np.asarray(arrays[key])) for key in arrays.files}
+    except (*DAMAGED, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(str(error).splitlines()[0] if str(error) else type(error).__name__) from error
+
+
+def misfit(value: Any, shape: Any, where: str = "it") -> str | None:
+    """What in plain nested containers, as of JSON, has another shape than it must; None: nothing.
+
+    shape: a type or several; [shape] for a list of any length; {name: shape} for a dict with these keys and others; a
+    shape under the name ... is that of every other key.
+    """
+    if isinstance(shape, dict):
+        if not isinstance(value, dict):
+            return f"{where} is no object"
+        parts = [(f"{where}.{name}", name, each) for name, each in shape.items() if name is not ...]
+        missing = next((at for at, name, _ in parts if name not in value), None)
+        if missing:
+            return f"{missing} is missing"
+        others = [(f"{where}.{name}", name, shape[...]) for name in value if name not in shape] if ... in shape else []
+        return next((found for at, name, each in parts + others if (found := misfit(value[name], each, at))), None)
+    if isinstance(shape, list):
+        if not isinstance(value, list):
+            return f"{where} is no list"
+        each = (misfit(part, shape[0], f"{where}[{index}]") for index, part in enumerate(value))
+        return next((found for found in each if found), None)
+    return None if isinstance(value, shape) else f"{where} is {str(value)[:40]!r}"
+
+
+def _truth(array: np.ndarray) -> np.ndarray:
+    """The array; one of truth values with bytes 0 and 1 only, as numpy counts on."""
+    return array.view(np.uint8) != 0 if array.dtype.kind == "b" and array.shape else array
+
+
+HASH = "sha256"  # key of the header
+
+
+def weight_bytes(weights: Mapping[str, Tensor], header: Mapping[str, str]) -> bytes:
+    """The content of a file with weights, header and hash: equal weights make equal bytes."""
+    plain = {key: value.detach().cpu().contiguous() for key, value in weights.items()}
+    return _in_order(save(plain, {**header, HASH: _digest(plain, header)}))
+
+
+def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Weights and header, without the hash, of a safetensors file; ValueError where it is none, where it is not what
+    was written, and where a weight is NaN or infinite."""
+    try:
+        with safe_open(path, "pt") as file:
+            header = dict(file.metadata() or {})
+            weights = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
+    except (SafetensorError, OSError, UnicodeError) as error:
+        raise ValueError(str(error)) from error
+    written = header.pop(HASH, None)
+    if written is not None and written != _digest(weights, header):
+        raise ValueError("its content is not what was written")
+    bad = [key for key, value in weights.items() if value.is_floating_point() and not bool(value.isfinite().all())]
+    if bad:
+        raise ValueError(f"{bad[0]} holds NaN or infinite values")
+    return weights, header
+
+
+def unlike(make: Callable[[], nn.Module], weights: Mapping[str, Tensor]) -> str | None:
+    """What in the weights has another name or shape than in a network, of which nothing is allocated; None: nothing."""
+    with torch.device("meta"):
+        own = make().state_dict()
+    if other := sorted(set(own) ^ set(weights)):
+        return f"{other[0]} is {'missing' if other[0] in own else 'unknown'}"
+    wrong = (name for name, value in own.items() if value.shape != weights[name].shape)
+    return next(
+        (f"{name} has shape {tuple(weights[name].shape)}, not {tuple(own[name].shape)}" for name in wrong), None
+    )
+
+
+def _in_order(content: bytes) -> bytes:
+    """A safetensors file with its header's keys in order, which safetensors shuffles."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    head = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
+    head += b" " * (-len(head) % 8)  # the tensors stay aligned
+    return len(head).to_bytes(8, "little") + head + content[end:]
+
+
+def _digest(weights: Mapping[str, Tensor], header: Mapping[str, str]) -> str:
+    """SHA-256 of the header and of every tensor's name, type, shape and bytes."""
+    digest = hashlib.sha256(repr(sorted(header.items())).encode())
+    for key, value in sorted(weights.items()):
+        digest.update(f"{key} {value.dtype} {tuple(value.shape)}".encode())
+        digest.update(value.contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()

@@ -1,0 +1,88 @@
+"""Finished parts of a run, kept on disk as they end: a run that was killed goes on from them (docs/robustness.md)."""
+
+import hashlib
+import io
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from e2rl.run.files import write_atomically
+
+PARTS, FORMAT, HASHED = "parts", "e2rl-part/1", b"e2rl-sha256:"
+
+
+@dataclass(frozen=True)
+class Kept:
+    """The finished parts of a run's stage, in folder/parts/<stage>; folder None: nothing is kept.
+
+    A part holds plain values and tensors. It counts where its file is whole and its identity is the one asked for.
+    about: what all parts of the stage depend on besides the run's inputs, such as the weights of a round.
+    """
+
+    folder: Path | None = None
+    stage: str = ""
+    about: str = ""
+
+    def result(
+        self, name: str, identity: Any, compute: Callable[[], Any], valid: Callable[[Any], bool] = lambda found: True
+    ) -> Any:
+        """The part `name`, where it is there and valid; else compute(), which is kept."""
+        found = self.load(name, identity)
+        if found is None or not valid(found):
+            found = compute()
+            self.save(name, identity, found)
+        return found
+
+    def load(self, name: str, identity: Any) -> Any:
+        """The value of a part; None where it is not there, damaged, or of another identity."""
+        if self.folder is None or not self._file(name).is_file():
+            return None
+        try:
+            part = read_state(self._file(name))
+            known = [part[key] for key in ("format", "about", "identity")]
+            return part["value"] if known == [FORMAT, self.about, identity] else None
+        except (ValueError, TypeError, LookupError):  # damaged, or a stranger's: the part is done again
+            return None
+
+    def save(self, name: str, identity: Any, value: Any) -> None:
+        """Keep a part, in place of an older one of its name."""
+        if self.folder is not None:
+            part = {"format": FORMAT, "about": self.about, "identity": identity, "value": value}
+            write_atomically(self._file(name), state_bytes(part))
+
+    def _file(self, name: str) -> Path:
+        assert self.folder is not None
+        return self.folder / PARTS / self.stage / f"{name}.pt"
+
+
+NOTHING_KEPT = Kept()
+
+
+def forget_parts(folder: Path) -> None:
+    """Remove the parts of all stages of a run's folder."""
+    if (Path(folder) / PARTS).exists():
+        shutil.rmtree(Path(folder) / PARTS)
+
+
+def state_bytes(state: Any) -> bytes:
+    """Plain values and tensors in torch's format, after its hash. As bytes, because a full disk is an OSError then."""
+    content = io.BytesIO()
+    torch.save(state, content)
+    return HASHED + hashlib.sha256(content.getvalue()).digest() + content.getvalue()
+
+
+def read_state(file: Path) -> Any:
+    """What `state_bytes` made, on the CPU; nothing but plain values and tensors is unpickled. ValueError where the file
+    is damaged."""
+    try:
+        content = file.read_bytes()
+        begin = len(HASHED) + hashlib.sha256().digest_size
+        if content[: len(HASHED)] != HASHED or hashlib.sha256(content[begin:]).digest() != content[len(HASHED) : begin]:
+            raise ValueError("not what was written, or of an earlier version")
+        return torch.load(io.BytesIO(content[begin:]), map_location="cpu", weights_only=True)
+    except Exception as error:  # damaged bytes raise anything
+        raise ValueError(f"{file}: damaged ({error})") from error

@@ -1,0 +1,207 @@
+"""Source of Argoverse 2 in its own files, read by av2 (extra `argoverse2`): motion-forecasting scenarios (parquet) and
+annotated sensor logs (feather), each with its vector map (json).
+
+The ego is the recording vehicle: the track "AV" of a scenario, the vehicle's pose in a sensor log. Scenarios hold no
+sizes, so agents get the typical one of their type.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from e2rl.run.errors import InputError
+from e2rl.scenes.log_files import MAX_BYTES
+from e2rl.scenes.plausibility import check
+from e2rl.scenes.recording import CYCLIST, OTHER, PEDESTRIAN, VEHICLE, Lane, Recording, same_way
+from e2rl.scenes.smoothing import resample_uniform, speeds
+from e2rl.scenes.source import Source, hash_files
+
+FILES = ("scenario_*.parquet", "annotations*.feather")
+LEVELS = ("", "*/", "*/*/")  # of folders below `path` in which logs are looked for
+TYPES = {  # by the object types of scenarios and the categories of annotations, in lower case; others are OTHER
+    **dict.fromkeys(("vehicle", "bus", "motorcyclist"), VEHICLE),
+    **dict.fromkeys(
+        ("regular_vehicle", "large_vehicle", "box_truck", "truck", "truck_cab", "vehicular_trailer"), VEHICLE
+    ),
+    **dict.fromkeys(("school_bus", "articulated_bus", "motorcycle", "railed_vehicle"), VEHICLE),
+    **dict.fromkeys(("pedestrian", "official_signaler", "stroller", "wheelchair"), PEDESTRIAN),
+    **dict.fromkeys(("cyclist", "bicyclist", "wheeled_rider"), CYCLIST),
+}
+SIZES = {  # m, of the object types of scenarios, which hold no sizes
+    "vehicle": (4.7, 1.9),
+    "bus": (12.0, 2.7),
+    "motorcyclist": (2.2, 0.8),
+    "cyclist": (1.8, 0.7),
+    "riderless_bicycle": (1.8, 0.6),
+}
+SMALL = (0.7, 0.7)  # m, of a pedestrian and of every other type
+EGO, EGO_BOX = "AV", "EGO_VEHICLE"  # its track in a scenario; its annotation, which some logs have
+EGO_SIZE, AHEAD = (4.877, 2.0), 1.425  # m: the recording vehicle, and its middle ahead of its rear axle, its origin
+CITIES = {  # by the code in the name of a sensor log's map; scenarios have the name
+    "ATX": "austin",
+    "DTW": "dearborn",
+    "MIA": "miami",
+    "PAO": "palo-alto",
+    "PIT": "pittsburgh",
+    "WDC": "washington-dc",
+}
+MID_POINTS = 10  # of a lane segment's centreline
+
+
+@dataclass
+class Argoverse2Source(Source):
+    """The scenarios and sensor logs in the folder `path`, up to two folders below it."""
+
+    holds = "Argoverse 2 scenarios or sensor logs"
+
+    def logs(self) -> list[str]:
+        root = self.root()
+        found = {file.parent: file for level in LEVELS for kind in FILES for file in sorted(root.glob(level + kind))}
+        if not found:
+            raise InputError(
+                f"data.path={root}: holds neither {FILES[0]} nor {FILES[1]}; pass a folder of {self.holds}"
+            )
+        return sorted(str(file.relative_to(root)) for file in found.values())
+
+    def read(self, log: str) -> Iterator[Recording]:
+        yield read_log(self.root() / log, log)
+
+    def fingerprint(self) -> bytes:
+        return hash_files(file for log in self.logs() for file in _files(self.root() / log))
+
+
+def read_log(path: Path, name: str) -> Recording:
+    """The recording of a scenario's parquet or a sensor log's annotations, at 10 Hz; raises InputError naming it."""
+    try:
+        import av2  # noqa: F401
+        import av2.map.map_api
+    except ImportError as error:
+        reason = f"av2 cannot be imported ({error})"
+        raise InputError(
+            f"data=argoverse2: {reason}; install e2rl with its extra: pip install 'e2rl[argoverse2]'"
+        ) from error
+    try:
+        files = _files(path)
+        for file in files:
+            if file.stat().st_size > MAX_BYTES:
+                raise InputError(f"{file.name} has more than the {MAX_BYTES / 1e6:.0f} MB of a log; leave it out")
+        recording = _scenario(path) if path.suffix == ".parquet" else _sensor_log(path)
+        recording.lanes, recording.drivable = _map(av2.map.map_api.ArgoverseStaticMap.from_json(files[-1]))
+        return recording
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
+    except Exception as error:  # damaged files raise anything
+        reason = f"{type(error).__name__} {error}"
+        raise InputError(f"{name}: not an Argoverse 2 log: {reason}; download it again or leave it out") from error
+
+
+def _files(path: Path) -> list[Path]:
+    """The files of the log at `path`, its map last; raises InputError where there is no map."""
+    maps = [*path.parent.glob("log_map_archive_*.json"), *path.parent.glob("map/log_map_archive_*.json")]
+    if not maps:
+        raise InputError(f"{path.parent}: holds no log_map_archive_*.json; download the map beside the log")
+    poses = path.parent / "city_SE3_egovehicle.feather"
+    return [path, *([poses] if path.suffix == ".feather" else ()), sorted(maps)[0]]
+
+
+def _scenario(path: Path) -> Recording:
+    """A motion-forecasting scenario, still without a map."""
+    from av2.datasets.motion_forecasting.scenario_serialization import load_argoverse_scenario_parquet
+
+    scenario = load_argoverse_scenario_parquet(path)
+    frames, tracks = len(scenario.timestamps_ns), scenario.tracks
+    check({"states": frames * len(tracks)}, scenario.scenario_id)
+    states, valid = np.zeros((frames, len(tracks), 4)), np.zeros((frames, len(tracks)), bool)
+    for index, track in enumerate(tracks):
+        for state in track.object_states:
+            if valid[state.timestep, index]:
+                raise InputError(f"track {track.track_id} is recorded twice at step {state.timestep}; leave one out")
+            speed = np.hypot(*state.velocity)
+            states[state.timestep, index] = [*state.position, state.heading, speed]
+            valid[state.timestep, index] = True
+    kinds = [track.object_type.value for track in tracks]
+    names = [track.track_id for track in tracks]
+    if EGO not in names:
+        raise InputError(f"no ego: none of its {len(names)} tracks is {EGO!r}; leave it out")
+    ego = names.index(EGO)
+    size = np.array([SIZES.get(kind, SMALL) for kind in kinds])
+    size[ego] = EGO_SIZE
+    seconds = (np.asarray(scenario.timestamps_ns, float) - scenario.timestamps_ns[0]) / 1e9
+    return _recording(scenario.scenario_id, scenario.city_name, states, valid, size, kinds, ego, seconds)
+
+
+def _sensor_log(path: Path) -> Recording:
+    """An annotated sensor log, still without a map. Boxes are given from the ego's pose at their time stamp."""
+    from av2.utils.io import read_city_SE3_ego, read_feather
+
+    table = read_feather(path)
+    table = table[table["category"] != EGO_BOX]
+    stamps, frame = np.unique(table["timestamp_ns"], return_inverse=True)
+    names, first, track = np.unique(table["track_uuid"].astype(str), return_index=True, return_inverse=True)
+    check({"states": len(stamps) * (len(names) + 1)}, path.parent.name)
+    if len(np.unique(np.stack([frame, track]), axis=1).T) < len(frame):
+        raise InputError("a track is annotated twice at one time stamp; leave one out")
+    poses = read_city_SE3_ego(path.parent)
+    turn = np.stack([poses[int(stamp)].rotation for stamp in stamps])
+    place = np.stack([poses[int(stamp)].translation for stamp in stamps])
+    boxes = table[["tx_m", "ty_m", "tz_m"]].to_numpy(float)
+    axis = _forward(*table[["qw", "qx", "qy", "qz"]].to_numpy(float).T)
+    states = np.zeros((len(stamps), len(names) + 1, 4))
+    valid = np.zeros(states.shape[:2], bool)
+    states[frame, track + 1, :2] = (np.einsum("kij,kj->ki", turn[frame], boxes) + place[frame])[:, :2]
+    states[frame, track + 1, 2] = _heading(np.einsum("kij,kj->ki", turn[frame], axis))
+    states[:, 0, :2], states[:, 0, 2] = (place + AHEAD * turn[..., 0])[:, :2], _heading(turn[..., 0])
+    valid[frame, track + 1], valid[:, 0] = True, True
+    seconds = (stamps - stamps[0]) / 1e9
+    states[..., 3] = speeds(states[..., :2], valid, seconds)
+    size = np.stack([EGO_SIZE, *table[["length_m", "width_m"]].to_numpy(float)[first]])
+    kinds = ["regular_vehicle", *table["category"].to_numpy()[first]]
+    code = _files(path)[-1].stem.split("____")[-1].split("_")[0]
+    return _recording(path.parent.name, CITIES.get(code, code), states, valid, size, kinds, 0, seconds)
+
+
+def _recording(
+    scene_id: str,
+    city: str,
+    states: np.ndarray,
+    valid: np.ndarray,
+    size: np.ndarray,
+    kinds: list[str],
+    ego: int,
+    seconds: np.ndarray,
+) -> Recording:
+    states, valid = resample_uniform(states, valid, seconds)
+    types = np.array([TYPES.get(kind.lower(), OTHER) for kind in kinds])
+    return Recording(scene_id, city, "argoverse2", states, valid, size, types, ego, {}, current=None)
+
+
+def _forward(w: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """The x axis [K, 3] that unit quaternions [K] turn to."""
+    return np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)
+
+
+def _heading(axis: np.ndarray) -> np.ndarray:
+    return np.arctan2(axis[..., 1], axis[..., 0])
+
+
+def _map(static_map: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
+    """Lanes for motor vehicles by segment id, and the drivable areas."""
+    from av2.geometry.interpolate import compute_midpoint_line
+    from av2.map.lane_segment import LaneType
+
+    segments = {str(key): segment for key, segment in static_map.vector_lane_segments.items()}
+    lanes = {}
+    for key, segment in segments.items():
+        if segment.lane_type == LaneType.BIKE:
+            continue
+        left, right = segment.left_lane_boundary.xyz, segment.right_lane_boundary.xyz
+        points, width = compute_midpoint_line(left, right, MID_POINTS)
+        exits = [str(other) for other in segment.successors]
+        lanes[key] = Lane(points[:, :2], float(width), exits=exits)
+    for key, lane in lanes.items():
+        lane.left = same_way(lanes, lane, segments[key].left_neighbor_id)
+        lane.right = same_way(lanes, lane, segments[key].right_neighbor_id)
+    return lanes, [area.xyz[:, :2] for area in static_map.vector_drivable_areas.values()]

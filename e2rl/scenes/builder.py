@@ -1,0 +1,269 @@
+"""From a Recording to a Scene: who takes part, from which start state, on which routes, on which map."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from e2rl.run.errors import InputError
+from e2rl.run.settings import check_range
+from e2rl.scenes import boxes
+from e2rl.scenes.drivable_area import drivable_field
+from e2rl.scenes.lane_graph import BEHIND, LaneGraph, Route, plausible_width
+from e2rl.scenes.log_route import route_from_log
+from e2rl.scenes.paths import wrap
+from e2rl.scenes.plausibility import check, extent, map_fit, motion
+from e2rl.scenes.recording import VEHICLE, Recording
+from e2rl.scenes.route import SPACING, project
+from e2rl.scenes.smoothing import PAST, causal_past, causal_state, drop_jumps, smooth
+
+Arrays = dict[str, np.ndarray]
+STANDING = 0.5  # m/s
+FIT = 2.0  # m: mean distance of a recorded future from a candidate that still counts as the route driven
+PASSED = 1.0  # m behind the vehicle's centre beyond which a stop line no longer counts
+LEAST = {"steps": 1, "vehicles": 2, "others": 0, "routes": 1, "vertices": 20, "field_cells": 8}
+MAX_EXITS, MAX_LIGHTS = 6, 2  # successors of a lane, lights of a route that a scene keeps
+
+
+@dataclass(frozen=True)
+class BuildSettings:
+    """Sizes of a scene: simulated steps, vehicles (with the ego), other agents, route candidates and their vertices,
+    cells of the drivable field."""
+
+    steps: int = 80
+    vehicles: int = 32
+    others: int = 16
+    routes: int = 6
+    vertices: int = 150
+    field_cells: int = 320
+
+    def __post_init__(self) -> None:
+        for name, least in LEAST.items():
+            check_range(f"data.build.{name}", getattr(self, name), least)
+
+
+def build_scene(recording: Recording, settings: BuildSettings) -> TensorDict:
+    """The Scene of a recording from its start frame (schema: e2rl/scenes/scene.py).
+
+    Raises InputError where the recording makes none (no ego, no lanes, NaN states), and where it is not plausible.
+    """
+    return SceneBuilder(recording, settings).scene(recording)
+
+
+class SceneBuilder:
+    """The scenes of one log from whatever start frames: what does not depend on these is computed once."""
+
+    def __init__(self, recording: Recording, settings: BuildSettings) -> None:
+        """Raises InputError for what `build_scene` does, the start frame apart."""
+        recording.validate_log()
+        check(extent(recording) | motion(recording), recording.scene_id)
+        self.valid = drop_jumps(recording.states, recording.valid)
+        self.valid[:, recording.ego] = recording.valid[:, recording.ego]  # without the ego there is no scene
+        self.graph = LaneGraph(recording.lanes)
+        if not self.graph.ids:
+            raise InputError(f"scene {recording.scene_id!r}: no lane is at least 0.5 m long; leave the scene out")
+        check(map_fit(recording, self.graph), recording.scene_id)
+        self.states = smooth(recording.states, self.valid)
+        self.settings = settings
+
+    def scene(self, recording: Recording) -> TensorDict:
+        """The Scene of the log from the start frame of `recording`, one of its `windows`; raises InputError where it is
+        no start."""
+        frame = recording.validate_start().current
+        assert frame is not None
+        scene, origin = _agents(recording, frame, self.states, self.valid, self.settings)
+        lights = {name: index for index, name in enumerate(recording.lights)}
+        scene |= _routes(scene, self.graph, origin, lights, self.settings)
+        scene |= _lights(recording, frame, origin, self.settings.steps)
+        scene |= _map(recording, self.graph, scene, origin, self.settings)
+        return TensorDict({key: _tensor(value) for key, value in scene.items()}, batch_size=[])
+
+
+def _tensor(value: np.ndarray) -> torch.Tensor:
+    tensor = torch.from_numpy(np.ascontiguousarray(value))
+    return tensor.float() if tensor.dtype == torch.float64 else tensor
+
+
+def _agents(
+    recording: Recording, frame: int, states: np.ndarray, valid: np.ndarray, settings: BuildSettings
+) -> tuple[Arrays, np.ndarray]:
+    """Start states, past and recorded future of the agents that take part, and the scene's origin [2]; states, valid:
+    the smoothed tracks."""
+    start, accel, yaw_rate = causal_state(recording.states, valid, frame)
+    start = np.where(valid[frame, :, None], start, 0.0)
+    origin = np.round(start[recording.ego, :2])
+    shift = np.array([*origin, 0.0, 0.0])
+    tracks = _participants(recording, frame, states, valid, settings)
+    rows = np.flatnonzero(tracks >= 0)
+    chosen, cars = tracks[rows], rows[rows < settings.vehicles]
+    frames = frame + np.arange(settings.steps + 1)
+    recorded = np.minimum(frames, len(valid) - 1)
+    present = valid[frame, chosen]
+    known = valid[recorded][:, chosen] & (frames < len(valid))[:, None]
+    logged = np.where(known[..., None], states[recorded][:, chosen] - shift, 0.0)
+
+    def padded(values: np.ndarray, fill: float = 0) -> np.ndarray:
+        out = np.full((len(tracks), *values.shape[1:]), fill, values.dtype)
+        out[rows] = values
+        return out
+
+    scene = {
+        "start": padded((start[chosen] - shift) * present[:, None]),
+        "start_accel": padded(accel[chosen] * present),
+        "start_yaw_rate": padded(yaw_rate[chosen] * present),
+        "valid": padded(present),
+        "size": padded(recording.size[chosen].astype(float), 1),
+        "agent_type": padded(recording.agent_type[chosen].astype(np.int64)),
+        "parked": np.zeros(len(tracks), bool),
+        "logged": padded(logged.swapaxes(0, 1)).swapaxes(0, 1),
+        "logged_valid": padded(known.T).T,
+        "past": np.zeros((settings.vehicles, PAST, 3)),
+    }
+    past = causal_past(recording.states[:, tracks[cars]], valid[:, tracks[cars]], frame, start[tracks[cars], 3])
+    scene["past"][cars] = past
+    return scene, origin
+
+
+def _participants(
+    recording: Recording, frame: int, states: np.ndarray, valid: np.ndarray, settings: BuildSettings
+) -> np.ndarray:
+    """The track of each agent [N], -1 for padding: the ego, the vehicles nearest to it at the start frame, then the
+    other agents that come nearest to it."""
+    ego, vehicle = recording.ego, recording.agent_type == VEHICLE
+    distance = np.linalg.norm(states[:, :, :2] - states[:, [ego], :2], axis=-1)
+    now = np.where(valid[frame] & vehicle, distance[frame], np.inf)
+    now[ego] = -1.0
+    cars = np.argsort(now, kind="stable")[: settings.vehicles]
+    span = slice(frame, frame + settings.steps + 1)
+    nearest = np.where(valid[span] & valid[span, [ego]], distance[span], np.inf).min(0, initial=np.inf)
+    nearest[vehicle] = nearest[ego] = np.inf
+    others = np.argsort(nearest, kind="stable")[: settings.others]
+    tracks = np.full(settings.vehicles + settings.others, -1)
+    cars, others = cars[np.isfinite(now[cars])], others[np.isfinite(nearest[others])]
+    tracks[: len(cars)] = cars
+    tracks[settings.vehicles : settings.vehicles + len(others)] = others
+    return tracks
+
+
+def _routes(
+    scene: Arrays, graph: LaneGraph, origin: np.ndarray, lights: dict[str, int], settings: BuildSettings
+) -> Arrays:
+    """Route candidates of every vehicle and the one driven; sets scene["parked"]. lights: lane id -> index."""
+    shape, reach = (settings.vehicles, settings.routes), (settings.vertices - 1) * SPACING
+    out = {
+        "route_points": np.zeros((*shape, settings.vertices, 2)),
+        "route_length": np.full(shape, reach),
+        "route_open": np.zeros(shape, bool),
+        "route_valid": np.zeros(shape, bool),
+        "route_limit": np.zeros((*shape, settings.vertices), np.float32),
+        "route_light": np.full((*shape, MAX_LIGHTS), -1),
+        "route_light_s": np.zeros((*shape, MAX_LIGHTS)),
+    }
+    for row in range(settings.vehicles):
+        x, y, heading, speed = scene["start"][row]
+        ahead = np.arange(settings.vertices)[:, None] * SPACING - BEHIND
+        out["route_points"][row] = np.array([x, y]) + ahead * np.array([np.cos(heading), np.sin(heading)])
+        if not scene["valid"][row]:
+            continue
+        position = np.array([x, y]) + origin
+        found = graph.candidates(position, heading, speed, settings.routes, settings.vertices)
+        for index, route in enumerate(found):
+            _write_route(out, (row, index), route, origin, lights)
+        scene["parked"][row] = speed < STANDING and not any(_on_lane(graph, route, position) for route in found)
+    out["route_log"] = _driven(scene, out)
+    if out["route_log"][0] < 0:  # no lane route fits the ego's recorded path: it becomes the last candidate
+        slot = min(int(out["route_valid"][0].sum()), settings.routes - 1)
+        track = scene["logged"][scene["logged_valid"][:, 0], 0] + [*origin, 0.0, 0.0]
+        _write_route(out, (0, slot), route_from_log(graph, track, settings.vertices), origin, lights)
+        out["route_log"][0] = slot
+    return out
+
+
+def _write_route(out: Arrays, at: tuple[int, int], route: Route, origin: np.ndarray, lights: dict[str, int]) -> None:
+    out["route_points"][at], out["route_length"][at] = route.points - origin, route.length
+    out["route_open"][at], out["route_valid"][at], out["route_limit"][at] = route.open, True, route.limit
+    ahead = [(lights[name], s) for name, s in route.lanes if name in lights and s > route.vehicle_s - PASSED]
+    out["route_light"][at], out["route_light_s"][at] = -1, 0.0
+    for k, (index, s) in enumerate(ahead[:MAX_LIGHTS]):
+        out["route_light"][at][k], out["route_light_s"][at][k] = index, s
+
+
+def _on_lane(graph: LaneGraph, route: Route, position: np.ndarray) -> bool:
+    """Whether a position [2] on the map lies within the lane of a route there."""
+    s, d, _ = project(torch.from_numpy(position[None]), torch.from_numpy(route.points), torch.full((1,), BEHIND))
+    lane = [name for name, start in route.lanes if start <= s.item() + 1e-6][-1:] or [route.lanes[0][0]]
+    return abs(d.item()) < plausible_width(graph.lanes[lane[0]].width) / 2 + 0.3
+
+
+def _driven(scene: Arrays, routes: Arrays) -> np.ndarray:
+    """The candidate [V] nearest to each vehicle's recorded future, -1 where none is near."""
+    cars, candidates = routes["route_valid"].shape
+    known = torch.from_numpy(scene["logged_valid"][:, :cars].T.copy())
+    valid = torch.from_numpy(routes["route_valid"]) & known.any(1, keepdim=True)
+    car = valid.nonzero()[:, 0]
+    track = torch.from_numpy(scene["logged"][:, :cars].swapaxes(0, 1).copy())[car]
+    points, length, closed = (
+        torch.from_numpy(value)[valid]
+        for value in (routes["route_points"], routes["route_length"], ~routes["route_open"])
+    )
+    s, d, heading = project(track[..., :2].contiguous(), points)
+    over = (s - length[:, None]).clamp(min=0) * closed[:, None]
+    weight = known[car].double()
+    distance = (d.abs() + 2.0 * wrap(heading - track[..., 2]).abs() + over) * weight
+    mean = torch.full((cars, candidates), torch.inf, dtype=torch.float64)
+    mean[valid] = distance.sum(-1) / weight.sum(-1).clamp(min=1)
+    return torch.where(mean.min(1).values < FIT, mean.argmin(1), -1).numpy()
+
+
+def _lights(recording: Recording, frame: int, origin: np.ndarray, steps: int) -> Arrays:
+    """Light states over the simulated steps (the last known one goes on) and the points where their lanes begin."""
+    if not recording.lights:
+        return {"light_state": np.zeros((steps + 1, 0), np.int64), "light_points": np.zeros((0, 2))}
+    states = np.stack(list(recording.lights.values()), 1)
+    frames = np.minimum(frame + np.arange(steps + 1), len(states) - 1)
+    points = np.stack([recording.lanes[name].points[0] for name in recording.lights])
+    return {"light_state": states[frames].astype(np.int64), "light_points": points - origin}
+
+
+def _map(recording: Recording, graph: LaneGraph, scene: Arrays, origin: np.ndarray, settings: BuildSettings) -> Arrays:
+    """Lane centrelines at 1 m with widths and neighbours, polygons, and the drivable field."""
+    number = {name: index for index, name in enumerate(graph.ids)}
+    lanes = [graph.lanes[name] for name in graph.ids]
+    lines = [graph.line[name] - origin for name in graph.ids]
+    widths = np.array([plausible_width(lane.width) for lane in lanes])
+    exits = np.full((len(lines), MAX_EXITS), -1)
+    for index, name in enumerate(graph.ids):
+        nexts = [number[other] for other in graph.graph.successors(name)][:MAX_EXITS]
+        exits[index, : len(nexts)] = nexts
+    rings = [ring - origin for ring in recording.drivable if len(ring) >= 3]
+    ego = scene["logged"][scene["logged_valid"][:, 0], 0, :2]
+    field, field_origin = drivable_field(lines, widths, rings, (ego.min(0) + ego.max(0)) / 2, settings.field_cells)
+    lane_points, lane_index = _joined(lines)
+    drivable_points, drivable_index = _joined(rings)
+    return {
+        "lane_points": lane_points,
+        "lane_index": lane_index,
+        "lane_width": widths,
+        "lane_exits": exits,
+        "lane_left": np.array([next((number[n] for n in lane.left if n in number), -1) for lane in lanes]),
+        "lane_right": np.array([next((number[n] for n in lane.right if n in number), -1) for lane in lanes]),
+        "drivable_points": drivable_points,
+        "drivable_index": drivable_index,
+        "field": field,
+        "field_origin": field_origin,
+    }
+
+
+def _joined(parts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The points of polylines in a row [P, 2], and which polyline each belongs to [P]."""
+    index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    return np.concatenate([np.zeros((0, 2)), *parts]), index
+
+
+def ego_overlaps(scene: TensorDict) -> bool:
+    """Whether the ego's box overlaps another vehicle's at the start frame."""
+    others = scene["valid"] & (scene["agent_type"] == VEHICLE)
+    others[0] = False
+    pose, size = scene["start"].double(), scene["size"].double()
+    return bool((boxes.overlap(pose[:1], size[:1], pose, size) & others).any())

@@ -1,0 +1,158 @@
+"""Source of the scenes that come with the package: synthetic traffic on synthetic maps, one archive per split.
+
+Format e2rl-scenes/1 (npz, readable without pickle; written by tools/scenegen/archive.py): positions in mm, headings in
+1e-4 rad and speeds in mm/s as int32; states as second differences over time, which compress well; ragged parts one
+after another, with counts.
+"""
+
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import lru_cache
+from importlib.resources import files
+
+import numpy as np
+
+from e2rl.run.errors import InputError
+from e2rl.run.files import read_arrays
+from e2rl.scenes.recording import VEHICLE, Lane, Recording
+from e2rl.scenes.source import Source
+
+SPLITS = ("train", "tune", "test")
+FORMAT = "e2rl-scenes/1"
+FRAMES, CURRENT = 111, 10
+MILLI = 1e-3
+UNIT = np.array([MILLI, MILLI, 1e-4, MILLI])  # m, m, rad, m/s per stored step of x, y, heading, speed
+MEND = "restore the file from git, or write it again with tools/generate_scenes.py"
+
+
+@dataclass
+class SceneMap:
+    """The map of one synthetic place.
+
+    drivable: polygons; lights: lane id -> [T] states over the whole simulation of the place at 10 Hz; parked [Q, 3],
+    parked_size [Q, 2]: poses and sizes of the cars parked there.
+    """
+
+    name: str
+    lanes: dict[str, Lane]
+    drivable: list[np.ndarray]
+    lights: dict[str, np.ndarray]
+    parked: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    parked_size: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def recording(
+        self, dataset: str, scene_id: str, first: int, states: np.ndarray, valid: np.ndarray, size: np.ndarray, ego: int
+    ) -> Recording:
+        """A recording of vehicles on this map, whose first frame is frame `first` of the lights."""
+        lights = {lane: state[first : first + len(states)] for lane, state in self.lights.items()}
+        kind = np.full(len(size), VEHICLE)
+        where = (scene_id, self.name, dataset)
+        return Recording(*where, states, valid, size, kind, ego, self.lanes, self.drivable, lights, CURRENT)
+
+
+@dataclass
+class BundledSource(Source):
+    """The bundled scenes of split train, tune or test."""
+
+    split: str | None = "test"
+
+    has_splits = True
+
+    def logs(self) -> list[str]:
+        return list(_recordings_by_id(self.split_name))
+
+    def read(self, log: str) -> Iterator[Recording]:
+        yield _recordings_by_id(self.split_name)[log]
+
+    def fingerprint(self) -> bytes:
+        return asset_bytes(self.split_name)
+
+
+def asset_bytes(split: str) -> bytes:
+    """The archive of a split; raises InputError where the split is unknown or its file is missing."""
+    if split not in SPLITS:
+        raise InputError(f"split {split!r} of the bundled scenes: expected one of {', '.join(SPLITS)}")
+    path = files("e2rl") / "assets" / "scenes" / f"{split}.npz"
+    if not path.is_file():
+        raise InputError(f"bundled scenes: {path} is missing; reinstall the package or restore the file from git")
+    return path.read_bytes()
+
+
+def unpack(content: bytes, name: str) -> dict[str, np.ndarray]:
+    """Arrays of an archive's bytes; raises InputError where they are damaged or of another format."""
+    try:
+        arrays = read_arrays(io.BytesIO(content))
+    except ValueError as error:
+        raise InputError(f"bundled scenes {name}: damaged ({error}); {MEND}") from error
+    if str(arrays.get("format")) != FORMAT:
+        raise InputError(f"bundled scenes {name}: format {arrays.get('format')}, expected {FORMAT}; {MEND}")
+    return arrays
+
+
+def _split(values: np.ndarray, counts: np.ndarray) -> list[np.ndarray]:
+    return np.split(values, np.cumsum(counts)[:-1]) if len(counts) else []
+
+
+def read_maps(arrays: dict[str, np.ndarray]) -> list[SceneMap]:
+    """The maps of an archive."""
+    ids = [str(name) for name in arrays["lane_id"]]
+    centrelines = _split(arrays["lane_points"] * MILLI, arrays["lane_counts"])
+    rows = zip(centrelines, arrays["lane_width"] * MILLI, arrays["lane_speed"] * MILLI, strict=True)
+    lanes = [Lane(points, float(width), float(speed)) for points, width, speed in rows]
+    for kind in ("exits", "left", "right"):
+        for a, b in arrays[kind]:
+            getattr(lanes[a], kind).append(ids[b])
+    polygons = _split(arrays["polygon_points"] * MILLI, arrays["polygon_counts"])
+    own = {
+        key: _split(np.arange(arrays[f"map_{key}"].sum()), arrays[f"map_{key}"])
+        for key in ("lanes", "polygons", "lights", "parked")
+    }
+    return [
+        SceneMap(
+            str(name),
+            {ids[k]: lanes[k] for k in own["lanes"][m]},
+            [polygons[k] for k in own["polygons"][m]],
+            {ids[arrays["light_lane"][k]]: arrays["light_states"][k] for k in own["lights"][m]},
+            arrays["parked"][own["parked"][m]] * UNIT[:3],
+            arrays["parked_size"][own["parked"][m]] * MILLI,
+        )
+        for m, name in enumerate(arrays["map_name"])
+    ]
+
+
+def read_recordings(arrays: dict[str, np.ndarray], name: str) -> list[Recording]:
+    """The validated recordings of an archive; raises InputError where its arrays do not fit together."""
+    try:
+        maps, counts = read_maps(arrays), arrays["scene_agents"]
+        states = np.cumsum(np.cumsum(arrays["states"], axis=1), axis=1) * UNIT
+        states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
+        states[~arrays["valid"]] = 0.0
+        scenes = [arrays[key] for key in ("scene_id", "scene_map", "scene_first", "scene_ego")]
+        tracks = [_split(values, counts) for values in (states, arrays["valid"], arrays["size"] * MILLI)]
+        return [
+            maps[index]
+            .recording("bundled", str(scene_id), first, states.swapaxes(0, 1), valid.T, size, int(ego))
+            .validate()
+            for scene_id, index, first, ego, states, valid, size in zip(*scenes, *tracks, strict=True)
+        ]
+    except (KeyError, IndexError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"bundled scenes {name}: arrays do not fit together ({error!r}); {MEND}") from error
+
+
+@lru_cache(maxsize=3)
+def load_maps(split: str) -> list[SceneMap]:
+    """The maps of a split, read once."""
+    return read_maps(unpack(asset_bytes(split), split))
+
+
+def load_recordings(split: str) -> list[Recording]:
+    """The bundled recordings of split train, tune or test. Raises InputError for a missing or damaged asset."""
+    return read_recordings(unpack(asset_bytes(split), split), split)
+
+
+@lru_cache(maxsize=1)
+def _recordings_by_id(split: str) -> dict[str, Recording]:
+    return {recording.scene_id: recording for recording in load_recordings(split)}

@@ -1,0 +1,256 @@
+"""Source of CommonRoad scenarios: XML files of format 2018b and 2020a, read by commonroad-io (extra `commonroad`).
+
+The ego is the obstacle that stands where a planning problem starts. Most scenarios have none there, since their authors
+took the vehicle out to plan for it: then the ego is the vehicle, recorded at the start frame, that moves for the most
+frames, of several the one that drives farthest.
+"""
+
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import inf, isfinite
+from types import SimpleNamespace
+from typing import Any
+from xml.parsers import expat
+
+import numpy as np
+
+from e2rl.run.errors import InputError
+from e2rl.scenes.log_files import LogFiles
+from e2rl.scenes.plausibility import check
+from e2rl.scenes.recording import (
+    CYCLIST,
+    DT,
+    HISTORY,
+    LIGHT_GREEN,
+    LIGHT_RED,
+    LIGHT_UNKNOWN,
+    LIGHT_YELLOW,
+    OTHER,
+    PEDESTRIAN,
+    VEHICLE,
+    Lane,
+    Recording,
+)
+from e2rl.scenes.smoothing import resample_uniform
+
+TYPES = {  # by the name of an ObstacleType
+    **dict.fromkeys(
+        ("car", "truck", "bus", "motorcycle", "taxi", "priorityVehicle", "parkedVehicle", "vehicle"), VEHICLE
+    ),
+    **{"bicycle": CYCLIST, "pedestrian": PEDESTRIAN},
+}
+LIGHTS = {"red": LIGHT_RED, "redYellow": LIGHT_RED, "yellow": LIGHT_YELLOW, "green": LIGHT_GREEN}
+FOR_OTHERS = {"sidewalk", "crosswalk", "bicycleLane", "busStop", "border", "parking", "restricted_area"}  # LaneletType
+MOVES, NEAR = 0.5, 1.0  # m/s, m: a vehicle that moves; from a planning problem's start
+NUMBERS = {"x", "y", "z", "exact", "intervalStart", "intervalEnd", "length", "width", "radius", "orientation"}
+MAX_DEPTH, LARGEST_ANGLE = 32, 1000.0  # elements; rad
+DURATION = (0.01, 1.0)  # s, of a time step
+
+
+@dataclass
+class CommonRoadSource(LogFiles):
+    """The CommonRoad scenarios (*.xml) in a folder or zip.
+
+    A scenario that leaves less than half of the simulated steps after its start frame, the tenth, makes no scene.
+    """
+
+    holds = "CommonRoad scenarios"
+    ending = ".xml"
+    no_logs = "pass a folder or zip of CommonRoad XML scenarios"
+
+    def read(self, log: str) -> Iterator[Recording]:
+        start = min(self.starts or (HISTORY,))
+        recording = read_scenario(self.content(log), log, start)
+        if len(recording.states) - self.build.steps // 2 >= start:
+            yield recording
+
+
+def read_scenario(content: bytes, name: str, start: int = HISTORY) -> Recording:
+    """The recording in an XML file at 10 Hz, with an ego that is recorded at frame `start` where there is one.
+
+    Raises InputError naming the file.
+    """
+    reader = _reader()
+    try:
+        _check_content(content)
+        scenario, problems = reader(io.BytesIO(content)).open()
+        return _recording(scenario, list(problems.planning_problem_dict.values()), start)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
+    except Exception as error:  # damaged files raise anything
+        reason = f"{type(error).__name__} {error}"
+        raise InputError(f"{name}: not a CommonRoad scenario: {reason}; export it again or leave it out") from error
+
+
+def _reader() -> type:
+    """commonroad-io's reader of XML, imported beside its reader of protobuf, which needs a protobuf of its own."""
+    try:
+        from commonroad.common.reader.file_reader_xml import XMLFileReader
+    except ImportError as error:
+        reason = f"commonroad-io cannot be imported ({error})"
+        raise InputError(
+            f"data=commonroad: {reason}; install e2rl with its extra: pip install 'e2rl[commonroad]'"
+        ) from error
+    return XMLFileReader
+
+
+def _check_content(content: bytes) -> None:
+    """Raise InputError for a document type, as scenarios have none, and it may name files or grow when it is expanded;
+    for deep nesting; and for numbers that are infinite, NaN, or no angles, with which commonroad-io would not end."""
+    opened: list[str] = []
+
+    def refuse(*_: object) -> None:
+        raise InputError("holds a document type declaration, which no CommonRoad scenario needs; remove it")
+
+    def begin(name: str, _: object) -> None:
+        opened.append(name)
+        if len(opened) > MAX_DEPTH:
+            raise InputError(f"nests deeper than {MAX_DEPTH} elements; export it again")
+
+    def text(value: str) -> None:
+        if opened[-1] in NUMBERS and value.strip():
+            most = LARGEST_ANGLE if "orientation" in opened[-2:] else inf
+            number = float(value)
+            if not (isfinite(number) and abs(number) <= most):
+                raise InputError(f"{'/'.join(opened[-3:])} is {value.strip()[:40]}; repair it")
+
+    parser = expat.ParserCreate()
+    parser.buffer_text = True  # a text comes whole
+    parser.StartDoctypeDeclHandler = refuse
+    parser.StartElementHandler = begin
+    parser.EndElementHandler = lambda _: opened.pop()
+    parser.CharacterDataHandler = text
+    parser.Parse(content, True)
+
+
+def _recording(scenario: Any, problems: list, start: int) -> Recording:
+    if not DURATION[0] <= scenario.dt <= DURATION[1]:
+        raise InputError(f"timeStepSize={scenario.dt:g}: expected {DURATION[0]} to {DURATION[1]} s; repair it")
+    obstacles = [*scenario.dynamic_obstacles, *scenario.static_obstacles]
+    tracks = [_states(obstacle) for obstacle in scenario.dynamic_obstacles]
+    if not tracks:
+        raise InputError("no dynamic obstacle; leave it out")
+    steps = [state.time_step for track in tracks for state in track]
+    first, count = min(steps), max(steps) - min(steps) + 1
+    name = str(scenario.scenario_id)
+    check({"states": count * max(scenario.dt / DT, 1) * len(obstacles)}, name)
+    states, valid = np.zeros((count, len(obstacles), 4)), np.zeros((count, len(obstacles)), bool)
+    boxes = [_box(obstacle.obstacle_shape) for obstacle in obstacles]
+    for index, obstacle in enumerate(obstacles):
+        moves = index < len(tracks)
+        for state in tracks[index] if moves else [obstacle.initial_state]:
+            at = state.time_step - first if moves else slice(None)
+            states[at, index], valid[at, index] = _state(state, boxes[index][1]), True
+    kinds = np.array([TYPES.get(obstacle.obstacle_type.value, OTHER) for obstacle in obstacles])
+    started = [_started(problem.initial_state, states, valid, first) for problem in problems]
+    states, valid = resample_uniform(states, valid, np.arange(count) * scenario.dt)
+    lanes, drivable = _map(scenario.lanelet_network)
+    steps_at = first + np.round(np.arange(len(states)) * DT / scenario.dt).astype(int)
+    return Recording(
+        scene_id=name,
+        location=f"{scenario.scenario_id.country_id}_{scenario.scenario_id.map_name}",
+        dataset="commonroad",
+        states=states,
+        valid=valid,
+        size=np.array([size for size, _ in boxes]),
+        agent_type=kinds,
+        ego=_ego(states, valid & (kinds == VEHICLE), [track for track in started if track is not None], start),
+        lanes=lanes,
+        drivable=drivable,
+        lights=_lights(scenario.lanelet_network, lanes, steps_at),
+        current=None,
+    )
+
+
+def _states(obstacle: Any) -> list:
+    """The states of a dynamic obstacle in order; raises InputError where its motion is no trajectory."""
+    trajectory = getattr(obstacle.prediction, "trajectory", None)
+    if obstacle.prediction is not None and trajectory is None:
+        raise InputError(f"obstacle {obstacle.obstacle_id} has occupancy sets, no trajectory; leave it out")
+    return [obstacle.initial_state, *(trajectory.state_list if trajectory else ())]
+
+
+def _state(state: Any, offset: np.ndarray) -> list[float]:
+    """x, y of the box's middle, heading and speed; raises InputError where they are intervals."""
+    if state.is_uncertain_position or state.is_uncertain_orientation:
+        raise InputError(f"a state at time step {state.time_step} is uncertain; give exact positions and orientations")
+    cos, sin = np.cos(state.orientation), np.sin(state.orientation)
+    x, y = state.position[:2] + np.array([[cos, -sin], [sin, cos]]) @ offset
+    given = vars(state)  # of some kinds of state velocity_y is a second component, of others only derived
+    speed = np.hypot(given.get("velocity") or 0.0, given.get("velocity_y") or 0.0)
+    return [x, y, state.orientation, float(speed)]
+
+
+def _box(shape: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Length and width [2] of the box around a shape, and its middle [2] seen from the shape's origin."""
+    pose = SimpleNamespace(position=np.zeros(2), orientation=0.0, hitch=0.0)
+    left, low, right, high = shape.compute_occupancy_for_state(pose).shapely_object.bounds
+    return np.array([right - left, high - low]), np.array([(left + right) / 2, (low + high) / 2])
+
+
+def _started(begin: Any, states: np.ndarray, valid: np.ndarray, first: int) -> int | None:
+    """The track nearest to a planning problem's initial state, None where none is within NEAR."""
+    frame = begin.time_step - first
+    if not 0 <= frame < len(states):
+        return None
+    away = np.linalg.norm(states[frame, :, :2] - begin.position[:2], axis=-1)
+    away[~valid[frame]] = np.inf
+    return int(away.argmin()) if away.min() < NEAR else None
+
+
+def _ego(states: np.ndarray, present: np.ndarray, started: list[int], start: int) -> int:
+    """The ego's track, of vehicles `present` [F, A]; -1 where none is there at the start frame.
+
+    One of `started`, else the vehicle that moves for the most frames, of several the one that drives farthest.
+    """
+    there = present[min(start, len(present) - 1)]
+    chosen = [track for track in started if there[track]]
+    if chosen or not there.any():
+        return chosen[0] if chosen else -1
+    speed = states[..., 3] * present
+    return int(np.lexsort((speed.sum(0), (speed > MOVES).sum(0) * there, there))[-1])
+
+
+def _map(network: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
+    """Lanes for motor vehicles by lanelet id, and their polygons."""
+    lanes, drivable = {}, []
+    for lanelet in network.lanelets:
+        if FOR_OTHERS & {kind.value for kind in lanelet.lanelet_type or ()}:
+            continue
+        left, right = lanelet.left_vertices[:, :2], lanelet.right_vertices[:, :2]
+        lanes[str(lanelet.lanelet_id)] = Lane(
+            points=lanelet.center_vertices[:, :2],
+            width=float(np.median(np.linalg.norm(left - right, axis=1))),
+            speed_limit=_speed_limit(network, lanelet),
+            exits=[str(other) for other in lanelet.successor],
+            left=[str(lanelet.adj_left)] if lanelet.adj_left_same_direction else [],
+            right=[str(lanelet.adj_right)] if lanelet.adj_right_same_direction else [],
+        )
+        drivable.append(np.concatenate([left, right[::-1]]))
+    return lanes, drivable
+
+
+def _speed_limit(network: Any, lanelet: Any) -> float:
+    """The lowest limit [m/s] of a lanelet's traffic signs, 0 for none."""
+    signs = (network.find_traffic_sign_by_id(sign) for sign in lanelet.traffic_signs or ())
+    elements = (element for sign in signs if sign is not None for element in sign.traffic_sign_elements)
+    limits = [
+        float(element.additional_values[0])
+        for element in elements
+        if element.traffic_sign_element_id.name == "MAX_SPEED" and element.additional_values
+    ]
+    return min(limits, default=0.0)
+
+
+def _lights(network: Any, lanes: dict[str, Lane], steps: np.ndarray) -> dict[str, np.ndarray]:
+    """Light states [F] at time steps [F], by the lanes that the light lets in: the successors of the lanelet at whose
+    end it stands. A lanelet with several lights is left out, since each may be for another direction."""
+    lights: dict[str, np.ndarray] = {}
+    for lanelet in network.lanelets:
+        light = network.find_traffic_light_by_id(*lanelet.traffic_lights) if len(lanelet.traffic_lights) == 1 else None
+        if light is None or not light.active or light.traffic_light_cycle is None:
+            continue
+        cycle = [LIGHTS.get(light.get_state_at_time_step(int(step)).value, LIGHT_UNKNOWN) for step in steps]
+        lights |= {str(lane): np.array(cycle, np.int8) for lane in lanelet.successor if str(lane) in lanes}
+    return lights

@@ -1,0 +1,255 @@
+"""The lane graph of a recording on the host (networkx), and the route candidates of a vehicle on it.
+
+Who drives against the lanes of a map.
+"""
+
+from dataclasses import dataclass
+from heapq import heappop, heappush
+
+import networkx as nx
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from e2rl.scenes.paths import arc_length, points_at, resample, tangent_angle, wrap
+from e2rl.scenes.recording import Lane
+from e2rl.scenes.route import SPACING
+
+START_RADIUS, START_ANGLE = 5.0, 0.8  # m, rad: lanes this close may be a vehicle's own
+MAX_START_LANES, MAX_BRANCHES = 6, 4
+BEHIND, AHEAD = 20.0, 300.0  # m of route behind and ahead of the vehicle
+BUCKET = 20.0  # m to which distances on the start lane are rounded up, so that vehicles share a search
+SMOOTHING, SMOOTHED_ENDS = 1.3, 6  # vertices: standard deviation of the filter, odd extension beyond the ends
+JOIN_GAP, JOIN_ANGLE, JOIN_HEIGHT = 1.5, 0.6, 2.0  # where connectivity is inferred: m, rad, m
+SAME_GAP = 1.2  # m: routes closer than this at all probes are one
+PROBES = np.array([2, 8, 16, 28, 45])  # vertices ahead of the vehicle where routes are compared
+
+
+@dataclass
+class Route:
+    """A route along lanes.
+
+    points [P, 2] every SPACING m; length: usable m of it; open: whether the map ends before the points do; lanes: (id,
+    arc length where the lane begins); limit [P]: speed limit m/s at each vertex (0 unknown); vehicle_s: arc length of
+    the vehicle that it was made for.
+    """
+
+    points: np.ndarray
+    length: float
+    open: bool
+    lanes: list[tuple[str, float]]
+    limit: np.ndarray
+    vehicle_s: float = 0.0
+
+
+def plausible_width(width: float) -> float:
+    """A recorded lane width, or 3.7 m where it is outside 2.5-6 m: half of Waymo's connectors have 0, some 90 m."""
+    return float(width) if 2.5 <= width <= 6.0 else 3.7
+
+
+def infer_exits(lanes: dict[str, Lane]) -> dict[str, list[str]]:
+    """Successors by geometry, for files without connectivity.
+
+    A lane follows where another ends, in nearly the same direction and, where heights are known, on the same level.
+    """
+    if not lanes:
+        return {}
+    ids = list(lanes)
+    angle = {name: tangent_angle(resample(lane.points, 1.0)) for name, lane in lanes.items()}
+    tree = cKDTree(np.array([lane.points[0] for lane in lanes.values()]))
+
+    def follows(name: str, other: str) -> bool:
+        end, start = lanes[name].heights, lanes[other].heights
+        level = end is None or start is None or abs(start[0] - end[-1]) < JOIN_HEIGHT
+        return other != name and level and abs(wrap(angle[other][0] - angle[name][-1])) < JOIN_ANGLE
+
+    near = {name: [ids[j] for j in tree.query_ball_point(lane.points[-1], JOIN_GAP)] for name, lane in lanes.items()}
+    return {name: [other for other in others if follows(name, other)] for name, others in near.items()}
+
+
+class LaneGraph:
+    """Lanes of at least 0.5 m, connected, with a nearest-lane index.
+
+    `graph` is the networkx DiGraph (nodes: lane ids; edges: successors); `line` and `arc` are a lane's centreline with
+    points every 1 m and its length; `points`, `heading`, `lane_of` are the points of all centrelines, in order.
+    """
+
+    def __init__(self, lanes: dict[str, Lane]):
+        """lanes: by id; their connectivity is inferred where no lane has exits."""
+        self.lanes = {
+            name: lane for name, lane in lanes.items() if len(lane.points) >= 2 and arc_length(lane.points)[-1] >= 0.5
+        }
+        self.ids = list(self.lanes)
+        exits = {name: lane.exits for name, lane in self.lanes.items()}
+        if not any(exits.values()):
+            exits = infer_exits(self.lanes)
+        self.graph = nx.DiGraph()
+        self.graph.add_nodes_from(self.ids)
+        self.graph.add_edges_from((a, b) for a, nexts in exits.items() for b in nexts if b in self.lanes and b != a)
+        self.line = {name: resample(lane.points, 1.0) for name, lane in self.lanes.items()}
+        self.arc = {name: float(arc_length(line)[-1]) for name, line in self.line.items()}
+        counts = [len(line) for line in self.line.values()]
+        self.points = np.concatenate([np.zeros((0, 2)), *self.line.values()])
+        self.heading = np.concatenate([np.zeros(0), *(tangent_angle(line) for line in self.line.values())])
+        self.lane_of = np.repeat(np.arange(len(self.ids)), counts)
+        self.first_point = np.cumsum([0, *counts])
+        self.tree = cKDTree(self.points)
+        self.branches_of: dict[tuple[str, float, float], list[list[str]]] = {}
+        self.way_of: dict[tuple[str, ...], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+
+    def near_lanes(self, position: np.ndarray, heading: float) -> list[tuple[str, float]]:
+        """(lane, arc length of its nearest point) of the lanes near a pose, best first, each once."""
+        near = np.array(self.tree.query_ball_point(position, START_RADIUS), dtype=int)
+        angle = np.abs(wrap(self.heading[near] - heading))
+        near, angle = near[angle < START_ANGLE], angle[angle < START_ANGLE]
+        distance = np.linalg.norm(self.points[near] - position, axis=1)
+        found: dict[int, int] = {}
+        for _, point in sorted(zip(distance + 2.5 * angle, near, strict=True)):
+            found.setdefault(self.lane_of[point], point)
+        return [(self.ids[lane], self.arc_of(point)) for lane, point in list(found.items())[:MAX_START_LANES]]
+
+    def arc_of(self, point: int) -> float:
+        """Arc length [m] of one of `points` on its lane."""
+        lane = self.lane_of[point]
+        name = self.ids[lane]
+        return float(point - self.first_point[lane]) * (self.arc[name] / (len(self.line[name]) - 1))
+
+    def turn(self, a: str, b: str) -> float:
+        """Heading change [rad] from the end of lane a to the end of its successor b."""
+        first, second = self.line[a][-1] - self.line[a][-2], self.line[b][-1] - self.line[b][-2]
+        return abs(wrap(np.arctan2(second[1], second[0]) - np.arctan2(first[1], first[0])))
+
+    def bend(self, name: str) -> float:
+        """Heading change [rad] between both ends of a lane."""
+        angle = tangent_angle(self.line[name])
+        return abs(wrap(angle[-1] - angle[0]))
+
+    def branches(self, lane: str, begin: float, reach: float) -> list[list[str]]:
+        """Lane sequences for AHEAD m from arc length `begin` of `lane`, at most MAX_BRANCHES, the straightest first.
+
+        They branch at the forks within `reach` m of `begin` (up to BUCKET more). Sequences that leave the straightest
+        one least often come first, then those that leave it soonest. A lane is repeated only where no other follows.
+        """
+        fork_end, end = (BUCKET * np.ceil((begin + length) / BUCKET) for length in (reach, AHEAD))
+        key = (lane, fork_end, end)
+        if key not in self.branches_of:
+            found: list[list[str]] = []
+            queue, pushed = [(0, 0.0, 0, [lane], self.arc[lane])], 0
+            while queue and len(found) < MAX_BRANCHES:
+                turns, _, _, path, length = heappop(queue)
+                while length < end and (nexts := self._successors(path)):
+                    for other in nexts[1:] if length < fork_end else ():
+                        pushed += 1
+                        heappush(queue, (turns + 1, length, pushed, [*path, other], length + self.arc[other]))
+                    path, length = [*path, nexts[0]], length + self.arc[nexts[0]]
+                found.append(path)
+            self.branches_of[key] = found
+        return self.branches_of[key]
+
+    def _successors(self, path: list[str]) -> list[str]:
+        """Successors of a path's last lane, the straightest first; lanes of the path only where there is no other."""
+        nexts = list(self.graph.successors(path[-1]))
+        fresh = [name for name in nexts if name not in path] or nexts
+        return sorted(fresh, key=lambda name: self.turn(path[-1], name))
+
+    def behind(self, lane: str, length: float) -> list[str]:
+        """Lanes before `lane`, of several the straightest, until `length` m are covered."""
+        path: list[str] = []
+        while length > 0:
+            head = path[0] if path else lane
+            before = [name for name in self.graph.predecessors(head) if name not in path and name != lane]
+            if not before:
+                break
+            best = min(before, key=self.bend)
+            path.insert(0, best)
+            length -= self.arc[best]
+        return path
+
+    def centreline(self, lanes: list[str]) -> np.ndarray:
+        """The centrelines of lanes one after another [P, 2], without repeated points."""
+        line = np.concatenate([self.line[name] for name in lanes])
+        keep = np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=1) > 0.05])
+        return line[keep] if keep.sum() >= 2 else line
+
+    def lane_starts(self, lanes: list[str]) -> np.ndarray:
+        """Arc lengths [lanes + 1] where lanes one after another begin, and where the last one ends."""
+        return np.cumsum([0.0, *(self.arc[name] for name in lanes)])
+
+    def way(self, lanes: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The `centreline` of lanes, its arc lengths [P], and their `lane_starts`."""
+        key = tuple(lanes)
+        if key not in self.way_of:
+            line = self.centreline(lanes)
+            self.way_of[key] = line, arc_length(line), self.lane_starts(lanes)
+        return self.way_of[key]
+
+    def route(self, lanes: list[str], begin: float, vertices: int) -> Route:
+        """The smoothed route along `lanes` from arc length `begin` of the first lane, `vertices` points long."""
+        line, arc, starts = self.way(lanes)
+        scale = arc[-1] / max(starts[-1], 1e-6)
+        at = np.arange(vertices) * SPACING + begin * scale
+        length = min(arc[-1] - begin * scale, (vertices - 1) * SPACING)
+        limit, lane_s = np.zeros(vertices, np.float32), []
+        for name, start in zip(lanes, starts[:-1] - begin, strict=True):
+            limit[max(int(start // SPACING), 0) :] = self.lanes[name].speed_limit
+            lane_s.append((name, float(start * scale)))
+        return Route(smooth_vertices(points_at(line, arc, at)), float(length), bool(at[-1] > arc[-1]), lane_s, limit)
+
+    def candidates(self, position: np.ndarray, heading: float, speed: float, count: int, vertices: int) -> list[Route]:
+        """Up to `count` route candidates of a vehicle, those of the nearest lane first.
+
+        Along each lane near the vehicle, from BEHIND m before it to AHEAD m after it, on every branch of the forks that
+        it may reach in 5 s; routes that coincide are one.
+        """
+        reach = float(np.clip(5.0 * speed + 25.0, 40.0, 120.0))
+        found: list[Route] = []
+        for lane, s in self.near_lanes(position, heading):
+            behind = self.behind(lane, BEHIND - s)
+            before = sum(self.arc[name] for name in behind)
+            begin = max(before + s - BEHIND, 0.0)
+            for branch in self.branches(lane, s, reach):
+                route = self.route([*behind, *branch], begin, vertices)
+                route.vehicle_s = before + s - begin
+                probes = np.clip(PROBES + int(round(route.vehicle_s / SPACING)), 0, vertices - 1)
+                if not any(_coincide(route.points[probes], other.points) for other in found):
+                    found.append(route)
+                if len(found) == count:
+                    return found
+        return found
+
+
+def _coincide(probes: np.ndarray, points: np.ndarray) -> bool:
+    """Whether all probes [Q, 2] lie near one of the points [P, 2]."""
+    return np.linalg.norm(probes[:, None] - points[None], axis=-1).min(1).max() < SAME_GAP
+
+
+def smooth_vertices(points: np.ndarray) -> np.ndarray:
+    """Route vertices [P, 2], Gaussian smoothed with both ends in place (odd extension)."""
+    pad = SMOOTHED_ENDS
+    head = 2 * points[0] - points[pad:0:-1]
+    tail = 2 * points[-1] - points[-2 : -pad - 2 : -1]
+    return gaussian_filter1d(np.concatenate([head, points, tail]), SMOOTHING, axis=0)[pad:-pad]
+
+
+LANE_REACH = 2.5  # m from a lane's centreline within which a vehicle is on it
+ALONG = 0.5  # cosine between a heading and a lane above which a vehicle drives along it
+
+
+def against_lanes(points: Tensor, lane: Tensor, xy: Tensor, heading: Tensor) -> Tensor:
+    """Bool [B, K, H]: at xy [B, K, 2] a lane runs against vehicles of heading [B, K, H], and none runs with them.
+
+    points [B, M, 2]: of centrelines; lane [B, M]: which one each point is of (-1: padding).
+    """
+    ahead = torch.nn.functional.normalize(points.diff(dim=1), dim=-1)
+    same = (lane[:, 1:] == lane[:, :-1]) & (lane[:, 1:] >= 0)
+    near = (torch.cdist(xy, points[:, :-1]) < LANE_REACH) & same[:, None]
+    b, k, segment = near.nonzero(as_tuple=True)  # few of a map's segments are near
+    towards = torch.stack([heading[b, k].cos(), heading[b, k].sin()], -1)
+    cosine = (towards * ahead[b, segment][:, None]).sum(-1)
+
+    def any_of(which: Tensor) -> Tensor:
+        return torch.zeros_like(heading).index_put((b, k), which.to(heading.dtype), accumulate=True) > 0
+
+    return any_of(cosine < -ALONG) & ~any_of(cosine > ALONG)

@@ -1,0 +1,237 @@
+"""Whether a recording can be traffic in metres, seconds and radians, on the map that comes with it.
+
+A log in other units, mirrored, or beside its map would make a scene all the same, and a wrong one. `extent` bounds what
+a recording may cost to build; `motion` and `map_fit` measure it. LIMITS say what is plausible. The genuine logs
+measured (443 of Waymo, 10 of nuScenes, 239 bundled ones) stay far inside: their range stands beside each limit.
+"""
+
+from math import inf, isnan, pi
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from e2rl.run.errors import InputError
+from e2rl.scenes.lane_graph import LaneGraph
+from e2rl.scenes.paths import arc_length, wrap
+from e2rl.scenes.recording import DT, VEHICLE, Recording
+
+FRAMES = 5  # between the two poses of a displacement: half a second
+MOVED, DRIVES = 1.0, 2.0  # m, m/s: a vehicle that moves
+WAY, BACKWARDS = 15.0, 5.0  # m that a vehicle drives before it is looked at alone; m/s up to which it may reverse
+ENOUGH = 20  # displacements that a median needs
+TWIN = 0.5  # m between the centres of vehicles that are one
+LANE_RADIUS, LANE_ANGLE, LANES = 3.0, 0.6, 8  # m, rad, neighbours: a vehicle on a lane
+PARALLEL, BESIDE = 0.2, (1.5, 20.0)  # rad, m: lanes side by side
+SAMPLES = 300  # lane points at most whose neighbours are looked at
+
+
+class Limit(NamedTuple):
+    """The least and the most of a measure; what it is, and how a log outside of it is mended."""
+
+    low: float
+    high: float
+    what: str
+    mend: str
+
+
+LIMITS = {
+    # `extent`
+    "states": Limit(2, 4e6, "frames x agents", "cut the log"),  # 400 to 45,000
+    "coordinate": Limit(0, 2e7, "m is the largest coordinate", "give positions in m"),  # 44 to 40,000
+    "heading": Limit(0, 10 * pi, "rad is the largest heading", "give headings in rad"),  # 3 to 14
+    "reach": Limit(0, 10_000, "m is an agent from the ego", "give positions in m, or leave the agent out"),  # 31 to 323
+    "map_reach": Limit(0, 50_000, "m is a point of the map from the ego", "cut the map, or give it in m"),  # 126 to 770
+    "lane": Limit(0, 10_000, "m is the longest lane", "cut the map, or give it in m"),  # 72 to 676
+    "lanes": Limit(0, 500_000, "m are all lanes together", "cut the map"),  # 620 to 32,000
+    "length": Limit(0.05, 40, "m is an agent's length", "give sizes in m"),  # 0.2 to 17
+    "width": Limit(0.05, 15, "m is an agent's width", "give sizes in m"),  # 0.2 to 10, of a glitch
+    # `motion`
+    "vehicle_length": Limit(2.5, 9, "m is the median length of vehicles", "give sizes in m"),  # 3.9 to 5.9
+    "vehicle_width": Limit(1.0, 4, "m is the median width of vehicles", "give sizes in m"),  # 1.7 to 2.8
+    "speed": Limit(0, 45, "m/s is the median speed of moving vehicles", "give speeds in m/s"),  # 2.7 to 22
+    "speed_ratio": Limit(
+        0.7, 1.4, "times the displacement is what the recorded speeds make", "give m, m/s and s"
+    ),  # 0.99 to 1.01
+    "direction": Limit(
+        0,
+        0.4,
+        "rad lie between heading and displacement",
+        "give headings in rad from x to y, and do not mirror or swap axes",
+    ),  # 0.001 to 0.16
+    "ego_speed_ratio": Limit(0.7, 1.4, "times its displacement is what the ego's speeds make", "give m, m/s and s"),
+    "ego_direction": Limit(
+        0, 0.45, "rad lie between the ego's heading and displacement", "give headings in rad"
+    ),  # 0.28
+    "track_direction": Limit(
+        0, 0.45, "rad lie between the heading and the displacement of a vehicle", "give its heading in rad"
+    ),  # 0.20
+    "slow_direction": Limit(
+        0, 0.8, "rad lie between the heading and the displacement of a slow vehicle", "give its heading in rad"
+    ),  # 0.43
+    "twins": Limit(0, 2.0, "s are two vehicles that drive at the same place", "leave one of the two out"),  # 0 to 0.5
+    "track_speed": Limit(
+        1, 2.0, "is the factor between the speeds and the displacement of a vehicle", "give its speeds in m/s"
+    ),  # 1.5
+    # `map_fit`
+    "lane_distance": Limit(0, 10, "m is the ego from the nearest lane", "give the map of this place"),  # 0.2 to 3.5
+    "on_lanes": Limit(0.3, 1, "of the moving vehicles drive along a lane", "give the map of this place"),  # 0.36 to 1
+    "lane_spacing": Limit(0, 7.5, "m lie between lanes side by side", "give positions and map in m"),  # 2.8 to 5.7
+}
+
+
+def check(measures: dict[str, float], scene_id: str) -> None:
+    """InputError for the first measure outside of its limits; NaN, of what a log is too short to tell, passes."""
+    for name, value in measures.items():
+        low, high, what, mend = LIMITS[name]
+        if not isnan(value) and not low <= value <= high:
+            bound = f"at least {low:g}" if value < low else f"at most {high:g}"
+            raise InputError(f"scene {scene_id[:100]!r}: {value:.3g} {what}, plausible is {bound}; {mend}")
+
+
+def extent(recording: Recording) -> dict[str, float]:
+    """Sizes of a validated recording."""
+    valid, points = recording.valid, recording.states[..., :2][recording.valid]
+    way = recording.states[valid[:, recording.ego], recording.ego, :2]
+    ego = np.median(way, axis=0) if len(way) else np.full(2, np.nan)
+    rings = [lane.points for lane in recording.lanes.values()] + [ring[:, :2] for ring in recording.drivable]
+    ground = np.concatenate([ring for ring in rings if len(ring)])
+    lengths = [arc_length(lane.points)[-1] for lane in recording.lanes.values() if len(lane.points) > 1]
+    size = recording.size[valid.any(0)]
+    return {
+        "states": valid.size,
+        "coordinate": max(np.abs(points).max(), np.abs(ground).max()),
+        "heading": np.abs(recording.states[..., 2][valid]).max(),
+        "reach": np.linalg.norm(points - ego, axis=-1).max(),
+        "map_reach": np.linalg.norm(ground - ego, axis=-1).max(),
+        "lane": max(lengths, default=0.0),
+        "lanes": sum(lengths),
+        **_extremes(size[:, 0], "length"),
+        **_extremes(size[:, 1], "width"),
+    }
+
+
+def _extremes(sizes: np.ndarray, name: str) -> dict[str, float]:
+    """The size that is nearer to a limit."""
+    low, high, *_ = LIMITS[name]
+    return {name: float(sizes.min() if sizes.min() < low else sizes.max())}
+
+
+class Displacements(NamedTuple):
+    """Of vehicles that are recorded for FRAMES frames on end and drive: displacement [K, 2] m, the pose [K, 3] in its
+    middle, the mean recorded speed [K] m/s, whose it is [K], and whether it is the ego's [K]."""
+
+    moved: np.ndarray
+    pose: np.ndarray
+    speed: np.ndarray
+    track: np.ndarray
+    ego: np.ndarray
+
+
+def displacements(recording: Recording) -> Displacements:
+    """All displacements of a recording, overlapping ones included."""
+    states, valid = recording.states, recording.valid
+    count = len(states) - FRAMES
+    if count < 1:
+        return Displacements(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool))
+    known = np.logical_and.reduce([valid[k : count + k] for k in range(FRAMES + 1)])
+    speed = np.mean([states[k : count + k, :, 3] for k in range(FRAMES + 1)], axis=0)
+    moved = states[FRAMES:, :, :2] - states[:count, :, :2]
+    drives = (np.linalg.norm(moved, axis=-1) > MOVED) | (speed > DRIVES)
+    chosen = known & drives & (recording.agent_type == VEHICLE)
+    middle = states[FRAMES // 2 :][:count]
+    track = chosen.nonzero()[1]
+    return Displacements(moved[chosen], middle[chosen][:, :3], speed[chosen], track, track == recording.ego)
+
+
+def motion(recording: Recording) -> dict[str, float]:
+    """Sizes of vehicles, and whether headings and speeds are those of the displacements."""
+    moved, pose, speed, track, ego = displacements(recording)
+    distance = np.linalg.norm(moved, axis=-1)
+    ratio, far = (speed * FRAMES * DT + 0.05) / (distance + 0.05), distance > MOVED
+    turned = np.abs(wrap(np.arctan2(moved[:, 1], moved[:, 0]) - pose[:, 2]))
+    size = recording.size[recording.valid.any(0) & (recording.agent_type == VEHICLE)]
+    return {
+        "vehicle_length": float(np.median(size[:, 0])),
+        "vehicle_width": float(np.median(size[:, 1])),
+        "speed": _median(distance / (FRAMES * DT)),
+        "speed_ratio": _median(ratio),
+        "direction": _median(turned[far]),
+        "ego_speed_ratio": _median(ratio[ego]),
+        "ego_direction": _median(turned[far & ego]),
+        "twins": _together(recording, np.unique(track[far])),
+        **_worst(distance[far], turned[far], ratio[far], track[far]),
+    }
+
+
+def _together(recording: Recording, tracks: np.ndarray) -> float:
+    """The longest time [s] that two of these tracks [K] are at one place."""
+    place, valid = recording.states[::FRAMES, tracks, :2], recording.valid[::FRAMES, tracks]
+    pairs = [np.zeros((0, 2), int)]
+    for known, points in zip(valid, place, strict=True):
+        there = np.flatnonzero(known)
+        if len(there) > 1:
+            pairs.append(there[cKDTree(points[there]).query_pairs(TWIN, output_type="ndarray")])
+    _, count = np.unique(np.concatenate(pairs), axis=0, return_counts=True)
+    return float(count.max(initial=0) * FRAMES * DT)
+
+
+def _worst(distance: np.ndarray, turned: np.ndarray, ratio: np.ndarray, track: np.ndarray) -> dict[str, float]:
+    """The largest deviations of one vehicle, of those that drive WAY: of its heading and of its speeds. Who is slow may
+    drive backwards."""
+    drives = np.bincount(track, distance) / FRAMES > WAY if len(track) else np.zeros(0, bool)
+    aside, factor, way = (_medians(values, track) for values in (turned, np.abs(np.log(ratio)), distance))
+    fast = way > BACKWARDS * FRAMES * DT
+    return {
+        "track_direction": _largest(aside[drives & fast]),
+        "slow_direction": _largest(np.minimum(aside, np.pi - aside)[drives & ~fast]),
+        "track_speed": float(np.exp(_largest(factor[drives]))),
+    }
+
+
+def _largest(values: np.ndarray) -> float:
+    return float(values.max()) if len(values) else np.nan
+
+
+def _medians(values: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """The (lower) median of the values [K] of each group 0 .. G-1, of group [K]; NaN for a group without any."""
+    order = np.lexsort((values, group))
+    count = np.bincount(group)
+    middle = np.cumsum(count) - count + (count - 1) // 2
+    return np.where(count > 0, values[order][np.where(count > 0, middle, 0)], np.nan) if len(group) else np.zeros(0)
+
+
+def map_fit(recording: Recording, graph: LaneGraph) -> dict[str, float]:
+    """Whether the vehicles drive where the lanes are, and the lanes lie as far apart as lanes do."""
+    ego = recording.states[recording.valid[:, recording.ego], recording.ego, :2]
+    moved, pose, *_ = displacements(recording)
+    pose = pose[np.linalg.norm(moved, axis=-1) > MOVED]
+    _, near = graph.tree.query(pose[:, :2], k=LANES, distance_upper_bound=LANE_RADIUS)
+    found = near < len(graph.points)
+    aligned = np.abs(wrap(graph.heading[np.where(found, near, 0)] - pose[:, 2:])) < LANE_ANGLE
+    on = (found & aligned).any(-1)
+    return {
+        "lane_distance": float(np.median(graph.tree.query(ego)[0])),
+        "on_lanes": float(on.mean()) if len(on) >= ENOUGH else np.nan,
+        "lane_spacing": lane_spacing(graph),
+    }
+
+
+def lane_spacing(graph: LaneGraph) -> float:
+    """Median distance [m] from points of a lane, evenly chosen, to the nearest parallel lane beside (NaN: none)."""
+    chosen = np.unique(np.linspace(0, len(graph.points) - 1, SAMPLES).astype(int))
+    direction = np.stack([np.cos(graph.heading), np.sin(graph.heading)], -1)
+    nearest = np.full(len(chosen), inf)
+    pairs = cKDTree(graph.points[chosen]).sparse_distance_matrix(graph.tree, BESIDE[1], output_type="ndarray")
+    row, other = pairs["i"], pairs["j"]
+    away, ahead = graph.points[other] - graph.points[chosen][row], direction[chosen][row]
+    across = np.abs(away[:, 1] * ahead[:, 0] - away[:, 0] * ahead[:, 1])
+    along = np.abs((away * ahead).sum(-1))
+    parallel = np.abs((direction[other] * ahead).sum(-1)) > np.cos(PARALLEL)
+    kept = parallel & (along < 1.0) & (across > BESIDE[0])
+    np.minimum.at(nearest, row[kept], across[kept])
+    return _median(nearest[nearest < inf])
+
+
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values)) if len(values) >= ENOUGH else np.nan

@@ -1,0 +1,145 @@
+"""What a source yields: one recorded or generated piece of traffic with its map, on the host, in numpy."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from e2rl.run.errors import InputError
+
+VEHICLE, PEDESTRIAN, CYCLIST, OTHER = range(4)
+AGENT_TYPES = ("vehicle", "pedestrian", "cyclist", "other")
+LIGHT_UNKNOWN, LIGHT_RED, LIGHT_YELLOW, LIGHT_GREEN = range(4)
+DT = 0.1  # s, the time step of every recording, scene and simulation
+HISTORY = 10  # frames of history before a start frame that is chosen here
+MIRRORED = "~mirrored"  # ends the ids of logs in a mirror
+
+
+@dataclass
+class Lane:
+    """One lane's centreline, in driving direction.
+
+    points [P, 2] m; width m (0 or NaN: unknown); speed_limit m/s (0: unknown); exits, left, right: ids of successor and
+    neighbour lanes; heights [P] m or None (tells the levels of bridges apart where connectivity is inferred).
+    """
+
+    points: np.ndarray
+    width: float = 0.0
+    speed_limit: float = 0.0
+    exits: list[str] = field(default_factory=list)
+    left: list[str] = field(default_factory=list)
+    right: list[str] = field(default_factory=list)
+    heights: np.ndarray | None = None
+
+
+def same_way(lanes: Mapping[str, Lane], lane: Lane, neighbour: object) -> list[str]:
+    """The id of a lane's neighbour, if it is one of `lanes` and leads the same way; maps name oncoming ones as well."""
+    other = lanes.get(str(neighbour))
+    if other is None:
+        return []
+    same = np.dot(lane.points[-1] - lane.points[0], other.points[-1] - other.points[0]) > 0
+    return [str(neighbour)] if same else []
+
+
+@dataclass
+class Recording:
+    """Tracks and map of one log at 10 Hz.
+
+    states [F, A, 4]: x, y [m], heading [rad], speed [m/s]; valid [F, A]; size [A, 2]: length, width [m];
+    agent_type [A]; ego: index of the ego's track; lights: lane id -> [F] light state; drivable: polygons [P, 2];
+    current: the start frame, with at least one frame of history before it; None where the log names none.
+    """
+
+    scene_id: str
+    location: str
+    dataset: str
+    states: np.ndarray
+    valid: np.ndarray
+    size: np.ndarray
+    agent_type: np.ndarray
+    ego: int
+    lanes: dict[str, Lane]
+    drivable: list[np.ndarray] = field(default_factory=list)
+    lights: dict[str, np.ndarray] = field(default_factory=dict)
+    current: int | None = HISTORY
+
+    def windows(self, starts: Sequence[int] | None, steps: int) -> Iterator["Recording"]:
+        """The recordings of `steps` simulated steps that this log makes, with ids of the form `id@start`.
+
+        One from each of `starts` that leaves at least half of the steps recorded. Default: the log's own start frame,
+        or, where it names none, as many windows as fit one after another (at least one).
+        """
+        frames = len(self.states)
+        if starts:
+            starts = [start for start in starts if start <= frames - steps // 2]
+        else:
+            starts = range(HISTORY, frames - steps, steps + HISTORY + 1) if self.current is None else ()
+            if len(starts) < 2:
+                yield replace(self, current=HISTORY) if self.current is None else self
+                return
+        for start in starts:
+            yield replace(self, current=start, scene_id=f"{self.scene_id}@{start}")
+
+    def mirrored(self) -> "Recording":
+        """The same traffic in a mirror, y to -y: what turned left turns right, and left-hand traffic keeps right."""
+        states = self.states * np.array([1.0, -1.0, -1.0, 1.0])
+        mirror = np.array([1.0, -1.0])
+        lanes = {
+            name: replace(lane, points=lane.points * mirror, left=lane.right, right=lane.left)
+            for name, lane in self.lanes.items()
+        }
+        drivable = [ring * mirror for ring in self.drivable]
+        return replace(self, scene_id=f"{self.scene_id}{MIRRORED}", states=states, lanes=lanes, drivable=drivable)
+
+    def validate(self) -> "Recording":
+        """Return self; raise InputError naming the scene where tracks, ego, lanes or start cannot make a scene."""
+        return self.validate_log().validate_start()
+
+    def validate_log(self) -> "Recording":
+        """`validate` without the start frame."""
+        return self._refuse(self._log_problem())
+
+    def validate_start(self) -> "Recording":
+        """`validate` of the start frame alone."""
+        return self._refuse(self._start_problem())
+
+    def _refuse(self, problem: str | None) -> "Recording":
+        if problem:
+            raise InputError(f"scene {self.scene_id!r}: {problem}")
+        return self
+
+    def _start_problem(self) -> str | None:
+        """What is wrong with the start frame and how to mend it; None: nothing."""
+        frames = len(self.states)
+        if self.current is None or not 1 <= self.current < frames - 1:
+            return f"start frame {self.current} leaves no history or no future in {frames} frames"
+        if not self.valid[self.current, self.ego]:
+            return f"the ego is not recorded at the start frame {self.current}"
+        return None
+
+    def _log_problem(self) -> str | None:
+        """What is wrong with the log and how to mend it; None: nothing."""
+        frames, agents = self.valid.shape if self.valid.ndim == 2 else (0, 0)
+        if self.states.shape != (frames, agents, 4) or not frames or not agents:
+            shapes = f"states {self.states.shape} do not match valid {self.valid.shape}"
+            return f"{shapes}; expected [frames, agents, 4] and [frames, agents]"
+        if not 0 <= self.ego < agents:
+            return "no ego; name its track in metadata.sdc_id, or leave the scene out"
+        if not self.lanes:
+            return "no lanes; routes need lane centrelines, so leave the scene out"
+        if self.agent_type[self.ego] != VEHICLE:
+            kind = AGENT_TYPES[self.agent_type[self.ego]]
+            return f"the ego is a {kind}, expected a vehicle; name another track, or leave the scene out"
+        for name, lane in self.lanes.items():
+            if lane.points.ndim != 2 or lane.points.shape[1] != 2 or not np.isfinite(lane.points).all():
+                return f"the centreline of lane {name} is not a list of finite points; repair the map or drop the lane"
+        if not all(np.isfinite(ring).all() for ring in self.drivable):
+            return "a drivable polygon holds NaN or infinite points; repair the map"
+        bad = self.valid & ~np.isfinite(self.states).all(-1)
+        if bad.any():
+            frame, agent = np.argwhere(bad)[0]
+            return f"NaN or infinite state of agent {agent} at frame {frame}; mark it invalid or repair the log"
+        size = self.size[self.valid.any(0)]
+        if not (np.isfinite(size).all() and (size > 0).all()):
+            return "an agent's length or width is not positive; repair the log"
+        return None

@@ -1,0 +1,208 @@
+"""Source of ScenarioNet logs: ScenarioDescription pickles, which public converters make of Waymo, nuScenes, nuPlan,
+Argoverse 2 and Lyft. They are read without ever executing what a file names.
+"""
+
+import csv
+import json
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from e2rl.run.errors import InputError
+from e2rl.scenes.log_files import LogFiles
+from e2rl.scenes.plain_pickle import load_plain
+from e2rl.scenes.plausibility import check
+from e2rl.scenes.recording import AGENT_TYPES, DT, LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, Lane, Recording
+from e2rl.scenes.smoothing import resample_uniform
+
+TYPES = {name.upper(): index for index, name in enumerate(AGENT_TYPES)}
+LIGHTS = {  # by the last word of LANE_STATE_... (Waymo) or TRAFFIC_LIGHT_... (nuPlan)
+    **dict.fromkeys(("GO", "GREEN"), LIGHT_GREEN),
+    **dict.fromkeys(("CAUTION", "YELLOW"), LIGHT_YELLOW),
+    **dict.fromkeys(("STOP", "RED"), LIGHT_RED),
+}
+OBSTACLES = ("UNSET", "TRAFFIC_CONE", "TRAFFIC_BARRIER", "TRAFFIC_OBJECT", "TRAFFIC_LIGHT", "BUILDING", "GROUND")
+TYPES |= dict.fromkeys(OBSTACLES, TYPES["OTHER"])  # MetaDrive's further names of tracks
+MAX_NAME = 128  # characters of a scene's id
+
+
+@dataclass
+class ScenarioNetSource(LogFiles):
+    """The ScenarioDescription pickles (*.pkl) in a folder or zip."""
+
+    holds = "ScenarioDescription pickles"
+    ending = ".pkl"
+    no_logs = "convert the logs with ScenarioNet first"
+    ignored = ("dataset_summary.pkl", "dataset_mapping.pkl")  # pickles beside the scenarios that are none
+
+    def read(self, log: str) -> Iterator[Recording]:
+        yield read_recording(self.content(log), log, self.locations.get(Path(log).stem, ""))
+
+    def fingerprint(self) -> bytes:
+        return super().fingerprint() + json.dumps(sorted(self.locations.items()) or "places unknown").encode()
+
+    @cached_property
+    def locations(self) -> dict[str, str]:
+        """Location by a log's name without ending, from `index.csv` (columns file, location_group) beside `path`. The
+        name of a log's map is no place: it is a city's."""
+        index = self.root().parent / "index.csv"
+        if not index.is_file():
+            return {}
+        try:
+            with index.open(newline="") as stream:
+                rows = [row for row in csv.DictReader(stream) if row.get("file") and row.get("location_group")]
+        except (OSError, ValueError, csv.Error) as error:
+            raise InputError(f"{index}: cannot be read: {error}; write it again, or remove it") from error
+        return {Path(row["file"]).stem: row["location_group"] for row in rows}
+
+
+def safe_load(content: bytes, name: str) -> dict:
+    """The dict in a pickle; raises InputError naming the file where it is damaged or holds more than plain data."""
+    try:
+        data = load_plain(content)
+    except Exception as error:  # damaged bytes raise anything
+        reason = str(error) or type(error).__name__
+        mend = "only numpy arrays and plain containers are read, so export the scenario again"
+        raise InputError(f"{name}: cannot be read: {reason}; {mend}") from error
+    if not isinstance(data, dict):
+        raise InputError(f"{name}: holds a {type(data).__name__}, expected a ScenarioDescription dict")
+    return data
+
+
+def read_recording(content: bytes, name: str, location: str = "") -> Recording:
+    """The whole log in a pickle, at 10 Hz, with its own start frame if it names one; raises InputError naming it."""
+    return recording_of(safe_load(content, name), name, location)
+
+
+def recording_of(data: dict, name: str, location: str = "") -> Recording:
+    """The same of a ScenarioDescription that was read already."""
+    try:
+        return _recording(data, location)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
+        problem = f"{type(error).__name__} {error}; export the scenario again or leave it out"
+        raise InputError(f"{name}: not a ScenarioDescription: {problem}") from error
+
+
+def _recording(data: dict, location: str) -> Recording:
+    metadata, tracks = data["metadata"], data["tracks"]
+    keys, ego = [str(key) for key in tracks], metadata.get("sdc_id")
+    if str(ego) not in keys:
+        raise InputError(f"no ego: metadata.sdc_id={ego!r} is none of its {len(tracks)} tracks; leave it out")
+    if len(set(keys)) < len(keys):
+        twice = next(key for key, count in Counter(keys).items() if count > 1)
+        raise InputError(f"two of its tracks have the id {twice!r}; give each its own")
+    states, valid, size = _tracks(tracks)
+    frames, scene_id = len(states), str(data.get("id") or metadata.get("scenario_id"))[: MAX_NAME + 1]
+    if len(scene_id) > MAX_NAME:
+        raise InputError(f"its id has more than {MAX_NAME} characters; shorten it, files are named by it")
+    ts = np.asarray(metadata.get("ts", np.arange(frames) * DT), float)
+    if len(ts) != frames:
+        raise InputError(f"{len(ts)} time stamps for {frames} frames; repair metadata.ts")
+    check({"states": (ts.max() - ts.min()) / DT * len(keys)}, scene_id)  # of the grid, whose size they give
+    states, valid = resample_uniform(states, valid, ts)
+    seconds, current = ts - ts[0], metadata.get("current_time_index")
+    if current is not None and not (np.isreal(current) and 0 <= current < frames and current == int(current)):
+        raise InputError(f"current_time_index={current!r} is no frame of {frames}; repair it")
+    lanes, drivable = _map(data["map_features"])
+    return Recording(
+        scene_id=scene_id,
+        location=location or str(metadata.get("e2rl", {}).get("location", "")),
+        dataset=str(metadata.get("dataset", "scenarionet")),
+        states=states,
+        valid=valid,
+        size=size,
+        agent_type=np.array([_type(key, track["type"]) for key, track in tracks.items()]),
+        ego=keys.index(str(ego)),
+        lanes=lanes,
+        drivable=drivable,
+        lights=_lights(data.get("dynamic_map_states", {}), lanes, seconds, len(states)),
+        current=None if current is None else int(round(seconds[int(current)] / DT)),
+    )
+
+
+def _type(key: object, name: object) -> int:
+    """The agent type that a track's type stands for; InputError for one that is not known."""
+    if not isinstance(name, str) or name not in TYPES:
+        raise InputError(f"track {key} is of the unknown type {str(name)[:40]!r}; known are {', '.join(TYPES)}")
+    return TYPES[name]
+
+
+def _tracks(tracks: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States [F, A, 4], valid [F, A] and size [A, 2] of tracks; raises InputError where a valid state is not finite."""
+    frames = len(next(iter(tracks.values()))["state"]["position"])
+    check({"states": frames * len(tracks)}, "of this log")
+    states, valid = np.zeros((frames, len(tracks), 4)), np.zeros((frames, len(tracks)), bool)
+    size = np.ones((len(tracks), 2))
+    for index, (key, track) in enumerate(tracks.items()):
+        state = track["state"]
+        known = np.asarray(state["valid"]).astype(bool).reshape(-1)
+        states[:, index, :2], states[:, index, 2] = np.asarray(state["position"])[:, :2], state["heading"]
+        states[:, index, 3] = np.linalg.norm(np.asarray(state["velocity"])[:, :2], axis=1)
+        valid[:, index] = known
+        bad = known & ~np.isfinite(states[:, index]).all(-1)
+        if bad.any():
+            raise InputError(f"track {key} is NaN or infinite at frame {bad.argmax()}, where it is marked valid")
+        if known.any():
+            size[index] = [_median(np.asarray(state[key]).reshape(-1)[known]) for key in ("length", "width")]
+        if track["type"] == "VEHICLE":  # some logs swap length and width
+            size[index] = sorted(size[index], reverse=True)
+    states[~valid] = 0.0
+    return states, valid, size
+
+
+def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
+    """Lanes for motor vehicles by id, and the drivable polygons that belong to them."""
+    lanes, drivable = {}, []
+    for key, feature in features.items():
+        kind = str(feature["type"])
+        if not kind.startswith("LANE_") or "BIKE" in kind or len(feature.get("polyline", ())) < 2:
+            continue
+        line = np.array(feature["polyline"], float)
+        width = np.asarray(feature.get("width", ()), float)
+        lanes[str(key)] = Lane(
+            points=line[:, :2],
+            width=_median(width.sum(-1)) if width.ndim == 2 and len(width) else 0.0,
+            speed_limit=float(feature.get("speed_limit_kmh") or 0.0) / 3.6,
+            exits=[str(other) for other in feature.get("exit_lanes", ())],
+            left=_ids(feature.get("left_neighbor", ())),
+            right=_ids(feature.get("right_neighbor", ())),
+            heights=line[:, 2] if line.shape[1] > 2 and "polygon" not in feature else None,
+        )
+        if len(feature.get("polygon", ())) >= 3:
+            drivable.append(np.array(feature["polygon"], float)[:, :2])
+    return lanes, drivable
+
+
+def _median(values: np.ndarray) -> float:
+    """`np.median` of values [n], n > 0, in a tenth of its time; NaN where one of them is."""
+    ordered = np.sort(values)
+    middle = (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2
+    return float("nan") if np.isnan(ordered[-1]) else float(middle)
+
+
+def _ids(items: Iterable) -> list[str]:
+    return [str(item["feature_id"] if isinstance(item, dict) else item) for item in items]
+
+
+def _lights(dynamic: dict, lanes: dict[str, Lane], seconds: np.ndarray, frames: int) -> dict[str, np.ndarray]:
+    """Light states [frames] at 10 Hz by the lane they control, from states stamped `seconds`; where a state is unknown,
+    the last known one goes on."""
+    now = np.searchsorted(seconds, np.arange(frames) * DT + DT / 2) - 1
+    lights = {}
+    for key, light in dynamic.items():
+        lane = str(light.get("lane", key))
+        if lane not in lanes:
+            continue
+        states, last = np.zeros(len(seconds), np.int8), LIGHT_UNKNOWN
+        given = list(light["state"].get("object_state", ()))[: len(seconds)]
+        for frame, state in enumerate(given):
+            last = states[frame] = LIGHTS.get(str(state).rsplit("_", 1)[-1], last)
+        states[len(given) :] = last
+        lights[lane] = states[now]
+    return lights

@@ -1,0 +1,224 @@
+"""The Scene: a TensorDict of one situation, padded and masked, and the SceneSet that holds many.
+
+Shapes (leading batch omitted): N agents = V vehicles (the ego first) + others; T simulated steps; R route candidates of
+P vertices; S lights; M, D map points; L lanes. Positions are relative to the scene's origin, in m; angles in rad.
+
+| key | shape | |
+| --- | --- | --- |
+| start, start_accel, start_yaw_rate | [N, 4], [N], [N] | x, y, heading, speed; m/s^2; rad/s: causal estimates |
+| past | [V, 10, 3] | pose 0.1 s, 0.2 s, ... before the start frame, relative to it: m ahead, m left, rad |
+| valid, parked | [N] bool | present at the start frame; standing off the lanes |
+| size, agent_type | [N, 2], [N] int64 | length and width; index into AGENT_TYPES |
+| logged, logged_valid | [T+1, N, 4], [T+1, N] | smoothed recording; row 0 is the start frame |
+| route_points, route_length, route_valid | [V, R, P, 2], [V, R], [V, R] | candidates and their usable length |
+| route_open | [V, R] bool | the map ends where the route does |
+| route_limit | [V, R, P] | speed limit m/s, 0 unknown |
+| route_light, route_light_s | [V, R, 2] | next lights (-1 none) and the arc length of their stop lines |
+| route_log | [V] int64 | candidate nearest to the recorded future, -1 none; route_log[0] is the ego's mission |
+| light_state, light_points | [T+1, S] int64, [S, 2] | LIGHT_*; where the lane that it controls begins |
+| lane_points, lane_index, lane_width | [M, 2], [M], [L] | lane_index -1 is padding |
+| lane_exits, lane_left, lane_right | [L, 6], [L], [L] | lane indices, -1 none |
+| drivable_points, drivable_index | [D, 2], [D] | polygons |
+| field, field_origin | [G, G] float16, [2] | m beyond the drivable border (< 0 inside) at 1 m cells |
+| scene_index | [] int64 | index in its SceneSet |
+"""
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from e2rl.run.errors import InputError
+
+KEYS_BY_DIMS = {  # number of dims of one scene: keys
+    1: "start_accel start_yaw_rate valid parked agent_type route_log field_origin "
+    "lane_index lane_width lane_left lane_right drivable_index",
+    2: "start size logged_valid route_length route_open route_valid field "
+    "light_state light_points lane_points lane_exits drivable_points",
+    3: "past logged route_limit route_light route_light_s",
+    4: "route_points",
+}
+KEYS = {key: dims for dims, keys in KEYS_BY_DIMS.items() for key in keys.split()}
+PART = 64  # scenes at once, where all of a set are gone through
+LARGE = 4096  # numbers of a scene's tensor above which `copy_into` copies scene by scene
+RAGGED = {  # keys whose first dims differ between scenes: the value that pads them
+    **dict.fromkeys(("light_state", "light_points", "lane_points", "lane_width", "drivable_points"), 0),
+    **dict.fromkeys(("lane_index", "lane_exits", "lane_left", "lane_right", "drivable_index"), -1),
+}
+
+
+def validate(scene: TensorDictBase, name: str) -> None:
+    """Raise InputError naming the scene and the key that breaks the schema or is not finite."""
+    keys = set(scene.keys())
+    for key, dims in KEYS.items():
+        if key not in keys:
+            raise InputError(f"scene {name!r}: key {key!r} is missing; rebuild its cache")
+        value = scene[key]
+        if value.ndim != dims:
+            raise InputError(f"scene {name!r}: {key} has {value.ndim} dims, expected {dims}")
+        if value.is_floating_point() and not torch.isfinite(value).all():
+            raise InputError(f"scene {name!r}: {key} holds NaN or infinite values")
+    if not scene["valid"][0] or scene["route_log"][0] < 0:
+        raise InputError(f"scene {name!r}: the ego is absent or has no route")
+
+
+def content_hash(scene: Mapping[str, np.ndarray]) -> str:
+    """SHA-256 of the arrays of a scene; the size to which ragged ones are padded does not matter."""
+    digest = hashlib.sha256()
+    for key in sorted(scene):
+        value = unpadded(scene[key], RAGGED[key]) if key in RAGGED else scene[key]
+        digest.update(f"{key} {value.dtype} {value.shape}".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    return digest.hexdigest()
+
+
+def unpadded(value: np.ndarray, fill: float) -> np.ndarray:
+    """An array without the rows at the end of each axis that hold nothing but `fill`."""
+    for axis in range(value.ndim):
+        used = (value != fill).any(axis=tuple(other for other in range(value.ndim) if other != axis))
+        kept = int(np.flatnonzero(used)[-1]) + 1 if used.any() else 0
+        value = value[(slice(None),) * axis + (slice(kept),)]
+    return value
+
+
+class Rows(ABC):
+    """Where the scenes [S] of a set are."""
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """S."""
+
+    @abstractmethod
+    def shape(self, key: str) -> tuple[int, ...]:
+        """The shape of a key of one scene."""
+
+    @abstractmethod
+    def resident(self, index: Tensor) -> tuple[TensorDict, Tensor]:
+        """Scenes in memory, those at `index` [B] among them, and where these are [B]; not to be written."""
+
+    @abstractmethod
+    def whole(self) -> TensorDict:
+        """All scenes [S] in memory, in their order."""
+
+    @abstractmethod
+    def chosen(self, index: Sequence[int]) -> "Rows":
+        """Those at `index`, in this order."""
+
+    @abstractmethod
+    def hashes(self) -> list[str]:
+        """The `content_hash` of each scene."""
+
+
+@dataclass(frozen=True)
+class Loaded(Rows):
+    """Scenes [S] in memory."""
+
+    scenes: TensorDict
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def shape(self, key: str) -> tuple[int, ...]:
+        return tuple(self.scenes[key].shape[1:])
+
+    def resident(self, index: Tensor) -> tuple[TensorDict, Tensor]:
+        return self.scenes, index
+
+    def whole(self) -> TensorDict:
+        return self.scenes
+
+    def chosen(self, index: Sequence[int]) -> "Loaded":
+        scenes = self.scenes[torch.as_tensor(index)]
+        scenes["scene_index"] = torch.arange(len(index), device=scenes["scene_index"].device)
+        return Loaded(scenes)
+
+    def hashes(self) -> list[str]:
+        return [content_hash({key: scene[key].numpy() for key in KEYS}) for scene in self.scenes.cpu()]
+
+
+@dataclass
+class SceneSet:
+    """Scenes [S] of one data set and split, with their names; `dropped` counts recordings left out, by reason.
+
+    number: of each scene's noise, by default its position; files: SHA-256 of the data's files, "" where unknown.
+    """
+
+    rows: Rows
+    scene_id: list[str]
+    location: list[str]
+    dataset: str
+    split: str
+    dropped: dict[str, int]
+    number: list[int] = field(default_factory=list)
+    files: str = ""
+
+    def __post_init__(self) -> None:
+        self.number = self.number or list(range(len(self.scene_id)))
+
+    def __len__(self) -> int:
+        return len(self.scene_id)
+
+    @property
+    def scenes(self) -> TensorDict:
+        """All scenes [S], in memory from now on; `batch` has parts of a set that does not fit there."""
+        return self.rows.whole()
+
+    @property
+    def steps(self) -> int:
+        """Simulated steps T."""
+        return self.rows.shape("logged")[0] - 1
+
+    def batch(self, indices: Sequence[int] | Tensor) -> TensorDict:
+        """Scenes [B] at `indices`, as a copy."""
+        scenes, places = self.rows.resident(torch.as_tensor(indices))
+        return scenes[places]
+
+    def parts(self, size: int = PART) -> Iterator[TensorDict]:
+        """All scenes in their order, at most `size` at a time."""
+        return (self.batch(index) for index in torch.arange(len(self)).split(size))
+
+    def index(self, which: int | str) -> int:
+        """The index of a scene given by index or id; raises InputError where there is none."""
+        if isinstance(which, int) and 0 <= which < len(self):
+            return which
+        if which in self.scene_id:
+            return self.scene_id.index(which)
+        example = f"or the id of a scene, such as {self.scene_id[0]}"
+        raise InputError(f"scene={which}: expected an index below {len(self)} {example}")
+
+    def copy_into(self, batch: TensorDictBase, rows: Tensor, indices: Tensor) -> None:
+        """Overwrite rows [b] (ascending) of a batch of scenes by the scenes at `indices` [b], in place."""
+        whole = len(rows) == len(batch)
+        scenes, places = self.rows.resident(indices)
+        for key, source in scenes.items():
+            target = batch[key]
+            if whole and source.device == target.device:  # a second copy would cost more pages than the first
+                torch.index_select(source, 0, places, out=target)
+            elif source.device == target.device and source[0].numel() > LARGE:  # scene by scene, without a copy between
+                for row, place in zip(rows.tolist(), places.tolist(), strict=True):
+                    target[row].copy_(source[place])
+            else:
+                target[rows] = source[places].to(target.device)
+
+    def first(self, count: int | None) -> "SceneSet":
+        """The first `count` scenes (all for None)."""
+        if count is None or count >= len(self):
+            return self
+        return self.chosen(range(count))
+
+    def chosen(self, indices: Sequence[int]) -> "SceneSet":
+        """The scenes at `indices`, which keep their noise."""
+        if list(indices) == list(range(len(self))):
+            return self
+        names, places = ([column[index] for index in indices] for column in (self.scene_id, self.location))
+        numbers = [self.number[index] for index in indices]
+        return replace(self, rows=self.rows.chosen(indices), scene_id=names, location=places, number=numbers)
+
+    def to(self, device: torch.device | str) -> "SceneSet":
+        """The same scenes on a device."""
+        return replace(self, rows=Loaded(self.scenes.to(device)))

@@ -1,0 +1,195 @@
+"""Kinematics of recordings: one smoother for all logs, and what a causal observer knows at a frame."""
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.ndimage import convolve1d
+from scipy.signal import savgol_coeffs
+
+from e2rl.run.errors import InputError
+from e2rl.scenes.paths import wrap
+from e2rl.scenes.recording import DT
+
+WINDOW, ORDER = 15, 2  # Savitzky-Golay: frames, polynomial order
+CAUSAL_WINDOW = 11  # frames: the current one and 1 s of history
+PAST = CAUSAL_WINDOW - 1  # frames of that history
+MAX_TURN, MAX_STEP = 1.0, 5.0  # rad, m from one frame to the next; more is a jump
+MAX_GAP = 0.55  # s between time stamps that interpolation bridges (2 Hz annotations)
+TOP_SPEED = 45.0  # m/s; recorded speeds beyond it are glitches
+
+
+def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tracks [F, A, 4] and valid [F, A] stamped ts [F] s, interpolated on a grid of DT from ts[0] on.
+
+    A grid frame is valid where the frames before and after it are, at most MAX_GAP apart; a frame within 20 ms of it
+    suffices. Raises InputError for time stamps that do not increase or are not in seconds.
+    """
+    step = np.diff(ts)
+    if not (np.isfinite(ts).all() and (step > 0).all() and 0.01 < np.median(step) < 1.0 and step.max() < 60.0):
+        median = f"median step {np.median(step):g}"
+        raise InputError(f"time stamps do not increase in seconds ({median}); repair metadata.ts")
+    ts = ts - ts[0]
+    count = int(round(ts[-1] / DT)) + 1
+    grid = np.arange(count) * DT
+    if count == len(ts) and np.abs(ts - grid).max() < 0.02:
+        return states, valid
+    right = np.clip(np.searchsorted(ts, grid - 1e-6), 1, len(ts) - 1)
+    left = right - 1
+    weight = np.clip((grid - ts[left]) / np.maximum(ts[right] - ts[left], 1e-6), 0, 1)[:, None]
+    near_left, near_right = (grid - ts[left] < 0.02)[:, None], (ts[right] - grid < 0.02)[:, None]
+    weight = np.where(near_left & ~valid[right], 0.0, np.where(near_right & ~valid[left], 1.0, weight))
+    turn = wrap(states[right, :, 2] - states[left, :, 2])
+    out = states[left] + weight[..., None] * (states[right] - states[left])
+    out[..., 2] = states[left, :, 2] + weight * turn
+    bridged = (ts[right] - ts[left] < MAX_GAP)[:, None] | near_left | near_right
+    return out, (valid[left] | near_right) & (valid[right] | near_left) & bridged
+
+
+def speeds(position: np.ndarray, valid: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Speeds [F, A] m/s: the length of the mean of the velocities to the frames before and after, where these are
+    recorded; 0 for a track of one frame."""
+    velocity = np.diff(position, axis=0) / np.diff(seconds)[:, None, None]
+    known = (valid[1:] & valid[:-1])[..., None]
+    total, count = np.zeros_like(position), np.zeros((*valid.shape, 1))
+    for side in (slice(None, -1), slice(1, None)):
+        total[side] += velocity * known
+        count[side] += known
+    return np.linalg.norm(total / np.maximum(count, 1), axis=-1)
+
+
+def drop_jumps(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """valid [F, A] without the frames that jumps (over MAX_TURN or MAX_STEP in a frame) divide from a track's longest
+    run.
+
+    A run beyond a jump is kept where it fits the frames kept before it: a glitch of a few frames costs these frames
+    only, a heading that flips for good costs the shorter side.
+    """
+    valid = valid.copy()
+    jump = np.abs(wrap(np.diff(states[..., 2], axis=0))) > MAX_TURN
+    jump |= np.linalg.norm(np.diff(states[..., :2], axis=0), axis=-1) > MAX_STEP
+    jump &= valid[1:] & valid[:-1]
+    for agent in np.flatnonzero(jump.any(0)):
+        run = np.concatenate([[0], np.cumsum(jump[:, agent])])
+        valid[:, agent] = _consistent(states[:, agent], valid[:, agent], run)
+    return valid
+
+
+def _consistent(track: np.ndarray, valid: np.ndarray, run: np.ndarray) -> np.ndarray:
+    """Frames [F] of one track [F, 4] in its longest run (run [F]: number of jumps so far) and the runs that fit it."""
+    count = np.bincount(run[valid])
+    longest = count.argmax()
+    keep = valid & (run == longest)
+    for runs, inner, outer in ((range(longest + 1, len(count)), 0, -1), (range(longest)[::-1], -1, 0)):
+        edge = np.flatnonzero(keep)[outer]
+        for number in runs:
+            frames = np.flatnonzero(valid & (run == number))
+            if not len(frames):
+                continue
+            change = track[frames[inner]] - track[edge]
+            if abs(wrap(change[2])) <= MAX_TURN and np.hypot(*change[:2]) <= MAX_STEP * abs(frames[inner] - edge):
+                keep[frames] = True
+                edge = frames[outer]
+    return keep
+
+
+def runs_of_true(valid: np.ndarray) -> list[tuple[int, int]]:
+    """[start, end) of the runs of True in valid [F]."""
+    edge = np.diff(np.concatenate([[False], valid, [False]]).astype(np.int8))
+    return list(zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1), strict=True))
+
+
+def smooth(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Tracks [F, A, 4] with smoothed positions, and the speed along the heading from their derivative.
+
+    Savitzky-Golay per contiguous run of frames; a run shorter than WINDOW takes the longest odd window that it can. At
+    both ends of a run the polynomials of its first and its last window go on.
+    """
+    out, velocity = states.copy(), np.full_like(states[..., :2], np.nan)
+    edge = np.diff(np.pad(valid.T, ((0, 0), (1, 1))).astype(np.int8))
+    (agent, start), end = np.nonzero(edge == 1), np.nonzero(edge == -1)[1]
+    windows = np.minimum(WINDOW, (end - start - 1) // 2 * 2 + 1)
+    for window in np.unique(windows[windows > ORDER]).tolist():
+        runs = agent[windows == window], start[windows == window], end[windows == window]
+        for order, into in ((0, out[..., :2]), (1, velocity)):
+            _fit_runs(states[..., :2], *runs, window, order, into)
+    along = velocity[..., 0] * np.cos(states[..., 2]) + velocity[..., 1] * np.sin(states[..., 2])
+    out[..., 3] = np.clip(np.where(np.isnan(along), states[..., 3], along), 0.0, TOP_SPEED)
+    return out
+
+
+def _fit_runs(
+    track: np.ndarray, agent: np.ndarray, start: np.ndarray, end: np.ndarray, window: int, order: int, into: np.ndarray
+) -> None:
+    """Write the fit (order 0) or its slope (order 1) of runs [R] of a track [F, A, 2] into an array like it; agent,
+    start and end [R]: whose runs, from which frame to before which."""
+    half, (centre, weights) = window // 2, polynomial_weights(window, order)
+    middle = convolve1d(track[:, agent], centre, axis=0, mode="constant")
+    frame = np.arange(len(track))[:, None]
+    row, run = np.nonzero((frame >= start + half) & (frame < end - half))
+    into[row, agent[run]] = middle[row, run]
+    for first, rows in ((start, slice(half)), (end - window, slice(half + 1, window))):
+        frame = first + np.arange(window)[:, None]
+        into[frame[rows], agent] = np.einsum("kw,wrc->krc", weights[rows], track[frame, agent])
+
+
+@lru_cache
+def polynomial_weights(window: int, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of the polynomial that fits `window` samples at DT best, the value (order 0) or slope (order 1): at the middle
+    sample, for a convolution [window], and at all samples [window, window]: row k times the samples is that at k."""
+    time, power = np.arange(window)[:, None] - window // 2, np.arange(ORDER + 1)
+    basis = power * time ** np.maximum(power - 1, 0) / DT if order else time**power
+    return savgol_coeffs(window, ORDER, order, DT), basis @ np.linalg.pinv(time**power)
+
+
+def causal_state(states: np.ndarray, valid: np.ndarray, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """State [A, 4], acceleration [A] and yaw rate [A] at `frame` from the frames up to it only.
+
+    Least squares over the contiguous frames that end at `frame`, at most CAUSAL_WINDOW: quadratic in position (linear
+    below five frames), linear in heading. The heading itself is the recorded one.
+    """
+    first = max(frame - CAUSAL_WINDOW + 1, 0)
+    time = (np.arange(first, frame + 1) - frame) * DT
+    known = np.flip(np.logical_and.accumulate(np.flip(valid[first : frame + 1], 0), axis=0), 0).astype(float)
+    count = known.sum(0)
+    shift = states[first : frame + 1, :, :2] - states[frame, :, :2]  # small numbers, so that the fit is exact
+    turned = np.unwrap(np.where(known > 0, states[first : frame + 1, :, 2] - states[frame, :, 2], 0.0), axis=0)
+    basis = np.stack([np.ones_like(time), time, time**2], 1)
+    position = _fit(basis, known, shift, quadratic=count >= 5)
+    turn = _fit(basis, known, turned[..., None], quadratic=np.zeros_like(count, bool))
+    angle = states[frame, :, 2]
+    unit = np.stack([np.cos(angle), np.sin(angle)], -1)
+    speed = np.clip((position[:, 1] * unit).sum(-1), 0.0, TOP_SPEED)
+    accel = np.clip(2 * (position[:, 2] * unit).sum(-1), -6.0, 4.0)
+    single = count < 2
+    speed = np.where(single, np.clip(states[frame, :, 3], 0.0, TOP_SPEED), speed)
+    accel, yaw_rate = np.where(single | (speed < 0.1), 0.0, accel), np.where(single, 0.0, turn[:, 1, 0])
+    fitted = states[frame, :, :2] + position[:, 0]
+    return np.concatenate([fitted, angle[:, None], speed[:, None]], 1), accel, np.clip(yaw_rate, -1.0, 1.0)
+
+
+def causal_past(states: np.ndarray, valid: np.ndarray, frame: int, speed: np.ndarray) -> np.ndarray:
+    """Recorded poses [A, PAST, 3] of the agents 0.1 s, 0.2 s, ... before `frame`.
+
+    m ahead, m left and rad relative to the recorded pose at `frame`; speed [A] m/s at `frame`. Before the contiguous
+    frames that end at `frame`, an agent counts as having driven straight at this speed.
+    """
+    back = np.arange(1, PAST + 1)
+    frames = np.clip(frame - back, 0, None)
+    known = np.logical_and.accumulate(valid[frames] & (frame >= back)[:, None] & valid[frame], axis=0)
+    dx, dy = np.moveaxis(states[frames, :, :2] - states[frame, :, :2], -1, 0)
+    angle = states[frame, :, 2]
+    cos, sin = np.cos(angle), np.sin(angle)
+    pose = np.stack([dx * cos + dy * sin, dy * cos - dx * sin, wrap(states[frames, :, 2] - angle)], -1)
+    first = np.concatenate([np.zeros_like(pose[:1]), pose])[known.sum(0), np.arange(len(angle))]  # the earliest known
+    since = np.maximum(back[:, None] - known.sum(0), 0) * DT
+    straight = first - np.stack([since * speed, 0 * since, 0 * since], -1)
+    return np.where(known[..., None], pose, straight).swapaxes(0, 1)
+
+
+def _fit(basis: np.ndarray, weight: np.ndarray, value: np.ndarray, quadratic: np.ndarray) -> np.ndarray:
+    """Weighted least squares coefficients [A, 3, C] of value [W, A, C] on basis [W, 3]; without the quadratic term
+    where `quadratic` [A] is False."""
+    gram = np.einsum("wi,wa,wj->aij", basis, weight, basis)
+    drop = np.where(quadratic, 0.0, 1e9)
+    gram += 1e-9 * np.eye(3) + drop[:, None, None] * np.diag([0.0, 0.0, 1.0])
+    return np.linalg.solve(gram, np.einsum("wi,wa,wac->aic", basis, weight, np.nan_to_num(value)))

@@ -1,0 +1,172 @@
+"""CCDiff (Lin et al. 2025): a clique ranker on the recent past, guidance of those that it finds, all others replay.
+
+CCDiff's ranker (Lin et al. 2025): vehicles that stand in the heaviest cliques of the recent past's risk graphs.
+"""
+
+from dataclasses import dataclass
+from math import fsum
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from e2rl.prior.lane_relative import LaneState
+from e2rl.prior.prior import Prior
+from e2rl.run.settings import check_range
+from e2rl.scenes.recording import DT
+from e2rl.sim.world import World
+from e2rl.traffic.baselines.baseline import Answer, RivalState, replay_others
+from e2rl.traffic.baselines.guidance import Guided, Loss, MeanGuidance, check_noisy_sampler
+from e2rl.traffic.baselines.losses import discounts, disk_overlap, off_road_term, pair_term
+from e2rl.traffic.baselines.view import View
+from e2rl.traffic.e2.motion import direction, smallest
+from e2rl.traffic.e2.topology import maximal_cliques
+from e2rl.traffic.grouping import noise_of
+from e2rl.traffic.traffic import TrafficPlan
+
+FAR = 20.0  # s: times to contact are cut there
+EDGE = 0.5  # risk from which on a pair is an edge
+SMALLEST = 3  # vehicles in a clique that counts
+TOP = 3  # cliques a step that count
+NODES = 24  # vehicles nearest to the ego that a graph may have: enumeration is exponential at worst
+
+
+def recent_states(scene: TensorDictBase) -> Tensor:
+    """States [B, V, T, 4] of the second before the start, the start last; speed from differences of position."""
+    past = scene["past"].flip(2)  # [B, V, 10, 3] in the start's frame
+    start = scene["start"][:, : past.shape[1], None]
+    ahead = direction(start[..., 2])
+    left = torch.stack([-ahead[..., 1], ahead[..., 0]], -1)
+    xy = start[..., :2] + past[..., :1] * ahead + past[..., 1:2] * left
+    xy = torch.cat([xy, start[..., :2]], 2)
+    heading = torch.cat([start[..., 2] + past[..., 2], start[..., 2]], 2)
+    speed = xy.diff(dim=2).norm(dim=-1) / DT
+    speed = torch.cat([speed[..., :1], speed], 2)
+    return torch.cat([xy, heading[..., None], speed[..., None]], -1)
+
+
+def risk(states: Tensor, size: Tensor) -> Tensor:
+    """Risk [..., V, V] in [0, 1] of pairs of states [..., V, 4], size [..., V, 2]: (FAR - t) / FAR.
+
+    t is the larger of the times after which the gaps along x and along y are closed: 0 where they overlap on the axis,
+    FAR where they open.
+    """
+    along = direction(states[..., 2])
+    extent = (along.abs() * size[..., :1] + along.flip(-1).abs() * size[..., 1:]) / 2
+    velocity = states[..., 3:] * along
+    offset = states[..., None, :, :2] - states[..., :, None, :2]
+    closing = -(velocity[..., None, :, :] - velocity[..., :, None, :]) * offset.sign()
+    gap = offset.abs() - extent[..., None, :, :] - extent[..., :, None, :]
+    time = torch.where(closing > 0, gap / closing.clamp(min=1e-6), FAR).where(gap > 0, 0.0)
+    return (FAR - time.amax(-1).clamp(0, FAR)) / FAR
+
+
+def ranked(scene: TensorDictBase, count: int, draw: Tensor) -> Tensor:
+    """Bool [B, V]: the `count` vehicles, parked ones and the ego apart, that stand in the most of the TOP cliques of
+    each step; draw [B, V] in [0, 1) orders equals and those in none."""
+    states = recent_states(scene)
+    vehicles = states.shape[1]
+    there = scene["valid"][:, :vehicles] & ~scene["parked"][:, :vehicles]
+    distance = (states[:, :, -1, :2] - states[:, :1, -1, :2]).norm(dim=-1)
+    nodes = smallest(there, distance, NODES)
+    states = states.transpose(1, 2)
+    weight = risk(states, scene["size"][:, None, :vehicles].expand(*states.shape[:-1], 2))
+    edges = (weight > EDGE) & nodes[:, None, :, None] & nodes[:, None, None]
+    edges = edges & ~torch.eye(vehicles, dtype=torch.bool, device=edges.device)
+    host = edges.to(torch.uint8).cpu().numpy(), weight.cpu().numpy()
+    found = [[_top_cliques(*graph) for graph in zip(*steps, strict=True)] for steps in zip(*host, strict=True)]
+    score = torch.zeros(len(states), vehicles)
+    for row, steps in zip(score, found, strict=True):
+        for clique in (clique for step in steps for clique in step):
+            row[list(clique)] += 1
+    there = there & (torch.arange(vehicles, device=there.device) > 0)
+    return smallest(there, draw - score.to(draw.device), count)
+
+
+def _top_cliques(adjacency: np.ndarray, weight: np.ndarray) -> list[tuple[int, ...]]:
+    """The maximal cliques of SMALLEST or more of greatest total weight; adjacency, weight [V, V]."""
+    nodes = np.flatnonzero(adjacency.any(-1))
+    if len(nodes) < SMALLEST:
+        return []
+    found = maximal_cliques(np.ascontiguousarray(adjacency[np.ix_(nodes, nodes)]).tobytes(), len(nodes))
+    large = [tuple(int(nodes[i]) for i in clique) for clique in found if len(clique) >= SMALLEST]
+
+    def rank(clique: tuple[int, ...]) -> tuple[float, tuple[int, ...]]:
+        return -round(fsum(weight[i, j] for k, i in enumerate(clique) for j in clique[k + 1 :]), 6), clique
+
+    return sorted(large, key=rank)[:TOP]
+
+
+TIES = 900  # number of the draw that orders vehicles of equal rank
+
+
+@dataclass
+class CCDiffState(RivalState):
+    """top [B, V] bool: the vehicles that the ranker found, which the prior drives; all of a scene without strength."""
+
+    top: Tensor
+
+
+class CCDiff(Guided):
+    """Posterior-mean guidance by attraction to the ego and by the map, of the `controlled` top vehicles only."""
+
+    def __init__(
+        self,
+        prior: Prior,
+        knowledge: str = "plan",
+        prediction: str = "prior",
+        responsibility: str = "none",
+        gain: float = 0.5,
+        step_size: float = 0.3,
+        iterations: int = 1,
+        samples: int = 5,
+        controlled: int = 5,
+        collision: float = 50.0,
+        margin: float = 10.0,
+        off_road: float = 1.0,
+    ) -> None:
+        """Fields: conf/synthesizer/ccdiff.yaml."""
+        super().__init__(prior, knowledge, prediction, responsibility, gain, samples)
+        check_noisy_sampler(prior, "ccdiff")
+        check_range("synthesizer.iterations", iterations, 1)
+        check_range("synthesizer.controlled", controlled, 1)
+        self.step_size, self.iterations, self.controlled = step_size, iterations, controlled
+        self.collision, self.margin, self.off_road = collision, margin, off_road
+
+    def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> CCDiffState:
+        """States of scenes [B] with their top vehicles, which have routes of the prior; others have the recorded."""
+        state = super().reset(scenes, seed, eta)
+        draw = noise_of(seed, torch.full_like(seed, TIES), tuple(state.adversary.shape[1:]), uniform=True)
+        top = ranked(scenes, self.controlled, draw) | (self.strength(state) <= 0)[:, None]
+        logged = scenes["route_log"]
+        routed, lane = self.prior.start(scenes, torch.where(top | (logged < 0), state.routed.route, logged))
+        return CCDiffState(**(vars(state) | {"routed": routed, "lane": lane, "top": top}))
+
+    def replan(
+        self, state: CCDiffState, world: World, ego_plan: Tensor, react: Answer | None = None
+    ) -> tuple[CCDiffState, TrafficPlan]:
+        """States and plans of the coming HORIZON steps; who is not among the top replays."""
+        state, plan = super().replan(state, world, ego_plan, react)
+        return replay_others(state, plan, world, state.top)
+
+    def adversaries(self, state: CCDiffState, view: View) -> Tensor:
+        """The top vehicles."""
+        return state.top & view.active
+
+    def loss(self, state: CCDiffState, view: View) -> Loss:
+        """Minus the collision cost with the ego, and metres off the road."""
+        others = torch.ones_like(view.routed.conflict)
+        others[:, :, 0] = False
+
+        def value(motion: LaneState) -> Tensor:
+            states = view.with_ego(motion)
+            weights = torch.full_like(discounts(states), 1 / states.shape[-2])
+            near = pair_term(states, view, disk_overlap(self.margin), self.margin, weights, others)
+            return self.off_road * off_road_term(states, view, discounts(states)) - self.collision * near
+
+        return value
+
+    def guidance(self, loss: Loss, guided: Tensor, strength: Tensor) -> MeanGuidance:
+        """Clipped at `gain` times eta standard deviations."""
+        return MeanGuidance(self.prior, loss, guided, strength, self.samples, self.step_size, self.iterations)

@@ -1,0 +1,88 @@
+"""DiffScene (Xu et al. 2025): one adversary, generated once by three objectives and driven open loop."""
+
+import torch
+from torch import Tensor
+
+from e2rl.prior.lane_relative import LaneState
+from e2rl.prior.prior import Context, Prior
+from e2rl.run.settings import check_range
+from e2rl.scenes.route import project
+from e2rl.sim.world import World
+from e2rl.traffic.baselines.guidance import CleanGuidance, Loss
+from e2rl.traffic.baselines.losses import approach_term, comfort_term, off_road_term, off_route_term, speeding_term
+from e2rl.traffic.baselines.open_loop import OpenLoop, OpenLoopState, Scenario
+from e2rl.traffic.baselines.view import View, folded, motion_of, pick, tiled
+from e2rl.traffic.e2.motion import smallest
+from e2rl.traffic.grouping import Group
+
+LOW, HIGH, JERK = -3.5, 2.0, 2.0  # m/s^2, m/s^2, m/s^3: what the constraint lets pass
+CORRIDOR = 1.0  # m beside the ego's route in which an adversary obstructs it
+
+
+class DiffScene(OpenLoop):
+    """Clean guidance of the vehicle nearest to the ego by safety, functionality and constraint; others by the prior."""
+
+    def __init__(
+        self,
+        prior: Prior,
+        knowledge: str = "plan",
+        prediction: str = "prior",
+        responsibility: str = "none",
+        gain: float = 2.0,
+        step_size: float = 4.0,
+        clip: float = 2.0,
+        samples: int = 20,
+        safety: float = 1.0,
+        functionality: float = 0.5,
+        constraint: float = 0.5,
+        temperature: float = 2.0,
+    ) -> None:
+        """Fields: conf/synthesizer/diffscene.yaml."""
+        super().__init__(prior, knowledge, prediction, responsibility, gain, samples)
+        check_range("synthesizer.temperature", temperature, 1e-3)
+        self.step_size, self.clip, self.temperature = step_size, clip, temperature
+        self.safety, self.functionality, self.constraint = safety, functionality, constraint
+
+    def scenario(
+        self,
+        state: OpenLoopState,
+        world: World,
+        ego_plan: Tensor,
+        noise: Tensor,
+        group: Group,
+        context: Context,
+        nominal: Tensor,
+    ) -> Scenario:
+        """The guided joint sample of least loss; the adversary alone is held."""
+        view, count = View.of(world, context, ego_plan), noise.shape[3]
+        distance = view.distance_to_ego()
+        adversary = smallest(view.active, distance, 1) & (self.strength(state) > 0)[:, None]
+        loss, many = self.loss(state, view, adversary), tiled(context, count)
+        control = CleanGuidance(self.prior, loss, adversary.repeat(count, 1), count, self.step_size, self.clip)
+        sample = self.prior.sample(many, folded(noise), control)
+        index = loss(motion_of(self.prior, sample.x0, many, count)).sum(-1).argmin(0)
+        x0, kl = (pick(value.unflatten(0, (count, -1)), index) for value in (sample.x0, sample.kl))
+        return Scenario(x0, adversary, adversary, kl)
+
+    def loss(self, state: OpenLoopState, view: View, adversary: Tensor) -> Loss:
+        """The three objectives of the adversary [B, V]; 0 for others."""
+        strength = self.strength(state)[:, None]
+
+        def value(motion: LaneState) -> Tensor:
+            states = view.with_ego(motion)
+            attack = self.safety * approach_term(states, self.temperature)
+            attack = attack + self.functionality * corridor_term(states, view, adversary)
+            even = torch.full_like(states[0, 0, 0, :, 0], 1 / states.shape[-2])
+            lawful = off_route_term(motion, view) + comfort_term(motion, LOW, HIGH, JERK)
+            lawful = lawful + off_road_term(states, view, even) + speeding_term(motion, view)
+            return (strength * attack + self.constraint * lawful) * adversary
+
+        return value
+
+
+def corridor_term(states: Tensor, view: View, adversary: Tensor) -> Tensor:
+    """Metres [S, B, V] of the adversary beyond CORRIDOR from the ego's route, mean over time; 0 for others."""
+    row = adversary.long().argmax(-1)
+    at = row[None, :, None, None, None].expand(len(states), -1, 1, *states.shape[-2:])
+    _, offset, _ = project(states.gather(2, at)[:, :, 0, :, :2], view.routed.points[:, 0])
+    return (offset.abs() - CORRIDOR).clamp(min=0).mean(-1)[..., None] * adversary

@@ -1,0 +1,150 @@
+"""The two ways in which the rivals guide a diffusion prior by a loss of the decoded plan.
+
+`MeanGuidance` moves the posterior mean of a step (CTG, Zhong et al. 2023), `CleanGuidance` the clean estimate
+(Safe-Sim, Chang et al. 2024). Both are controls of `Prior.sample`, for S samples of B scenes at once.
+
+A rival that guides the prior in closed loop: whom, by which loss, and which of its samples it drives.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from e2rl.prior.lane_relative import LaneState
+from e2rl.prior.prior import Context, Control, Prior
+from e2rl.prior.sde import reverse_step
+from e2rl.run.errors import InputError
+from e2rl.sim.world import World
+from e2rl.traffic.baselines.baseline import Rival
+from e2rl.traffic.baselines.view import View, folded, motion_of, pick, tiled
+from e2rl.traffic.grouping import Group
+from e2rl.traffic.traffic import State
+
+Loss = Callable[[LaneState], Tensor]  # motion, fields [S, B, V, T] -> [S, B, V]; each row's own, others detached
+Denoise = Callable[[Tensor], Tensor]
+ROUNDING = 1e-3  # of Adam: its steps are as long for any gradient, so that rounding would decide where there is none
+
+
+def check_noisy_sampler(prior: Prior, method: str) -> None:
+    """InputError for samplers whose steps have no posterior mean and standard deviation."""
+    sampler = prior.sampler
+    if sampler.sampler == "dpm_solver_pp" or (sampler.sampler == "ddim" and sampler.churn == 0):
+        raise InputError(
+            f"prior.sampler.sampler={sampler.sampler}, churn={sampler.churn}: {method} moves the mean of ancestral "
+            "steps by a share of their noise; use ddim with churn above 0, or euler_maruyama"
+        )
+
+
+@dataclass
+class MeanGuidance:
+    """Adam steps on the posterior mean z of x at the next level, whose decoded plan the loss rates.
+
+    guided [S * B, V] bool: rows that move; limit [S * B]: largest change of an element, in standard deviations of the
+    step's noise. The last step, which has no noise, is not guided.
+    """
+
+    prior: Prior
+    loss: Loss
+    guided: Tensor
+    limit: Tensor
+    samples: int
+    step_size: float
+    iterations: int
+
+    def __call__(
+        self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Denoise
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """See `prior.Control`."""
+        with torch.no_grad():
+            x0 = denoise(x)
+        if k == 1:
+            return x, x0, x0
+        sampler, schedule = self.prior.sampler, self.prior.schedule
+        low, zero = schedule.levels(sampler.steps, x.device)[sampler.steps - k + 1], torch.zeros_like(level)
+        step = partial(reverse_step, sampler.sampler, schedule, high=level, low=low, noise=zero, past=None)
+        mean, variance = step(x=x, x0=x0, churn=sampler.churn)
+        per_x0, _ = step(x=zero, x0=zero + 1, churn=sampler.churn)  # a step is affine in x0
+        shift = self._shift(mean, self.limit[:, None, None] * variance.sqrt(), context)
+        return x, x0, x0 + shift / per_x0
+
+    def _shift(self, mean: Tensor, limit: Tensor, context: Context) -> Tensor:
+        with torch.enable_grad():
+            z = mean.detach().clone().requires_grad_(True)
+            adam = torch.optim.Adam([z], lr=self.step_size, eps=ROUNDING)
+            for _ in range(self.iterations):
+                value = self.loss(motion_of(self.prior, z, context, self.samples)).sum()
+                (z.grad,) = torch.autograd.grad(value, z)
+                adam.step()
+                z.data = mean + (z.data - mean).clamp(-limit, limit)
+        return torch.where(self.guided[..., None], z.detach() - mean, 0.0)
+
+
+@dataclass
+class CleanGuidance:
+    """A gradient step on the clean estimate, the gradient taken by the noisy x, through the network.
+
+    guided [S * B, V] bool: rows that move; clip: largest change of an element at a step, in x.
+    """
+
+    prior: Prior
+    loss: Loss
+    guided: Tensor
+    samples: int
+    step_size: float
+    clip: float
+
+    def __call__(
+        self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Denoise
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """See `prior.Control`."""
+        with torch.enable_grad():
+            variable = x.detach().requires_grad_(True)
+            x0 = denoise(variable)
+            value = self.loss(motion_of(self.prior, x0, context, self.samples)).sum()
+            (gradient,) = torch.autograd.grad(value, variable)
+        shift = (self.step_size * gradient).clamp(-self.clip, self.clip)
+        x0 = x0.detach()
+        return x, x0, x0 - torch.where(self.guided[..., None], shift, 0.0)
+
+
+class Guided(Rival):
+    """Every replan: guided joint samples, of which the one of least `rating` is driven."""
+
+    def attack(
+        self, state: State, world: World, ego_plan: Tensor, noise: Tensor, group: Group, context: Context
+    ) -> tuple[State, Tensor]:
+        """State and chosen joint sample x0 [G, V, SIZE]; scenes without strength keep the nominal one."""
+        view, acts, count = View.of(world, context, ego_plan), self.strength(state) > 0, noise.shape[3]
+        adversary = self.adversaries(state, view) & acts[:, None]
+        state = replace(state, adversary=adversary)
+        guided = (context.active if self.guides_everybody else adversary) & acts[:, None]
+        control = self.guidance(self.loss(state, view), guided.repeat(count, 1), self.strength(state).repeat(count))
+        many = tiled(context, count)
+        sample = self.prior.sample(many, folded(noise), control)
+        motion = motion_of(self.prior, sample.x0, many, count)
+        index = self.chosen(motion, state, view, guided)
+        index = index * acts if index.ndim == 1 else index * acts[:, None]
+        x0, kl = (pick(value.unflatten(0, (count, -1)), index) for value in (sample.x0, sample.kl))
+        return replace(state, path_kl=state.path_kl + kl), x0
+
+    guides_everybody = False  # or adversaries alone
+
+    def chosen(self, motion: LaneState, state: State, view: View, guided: Tensor) -> Tensor:
+        """Sample [B] of each scene that is driven: that of least loss over the guided vehicles."""
+        return torch.where(guided, self.loss(state, view)(motion), 0.0).sum(-1).argmin(0)
+
+    def adversaries(self, state: State, view: View) -> Tensor:
+        """Bool [B, V]: vehicles under adversarial control, all that the prior moves by default."""
+        return view.active
+
+    @abstractmethod
+    def loss(self, state: State, view: View) -> Loss:
+        """The loss of a replan."""
+
+    @abstractmethod
+    def guidance(self, loss: Loss, guided: Tensor, strength: Tensor) -> Control:
+        """The control of `Prior.sample`; guided [S * B, V] bool, strength [S * B]."""

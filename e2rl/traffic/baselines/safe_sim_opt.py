@@ -1,0 +1,97 @@
+"""Safe-Sim's adversarial guidance (Chang et al. 2024), given to several adversaries."""
+
+import torch
+from torch import Tensor
+
+from e2rl.prior.lane_relative import LaneState
+from e2rl.prior.prior import Prior
+from e2rl.run.settings import check_range
+from e2rl.scenes.recording import DT
+from e2rl.traffic.baselines.baseline import RivalState
+from e2rl.traffic.baselines.guidance import CleanGuidance, Guided, Loss
+from e2rl.traffic.baselines.losses import ego_distance, gaussian_overlap, off_route_term, pair_term, ttc_term
+from e2rl.traffic.baselines.view import View
+from e2rl.traffic.e2.motion import smallest
+from e2rl.traffic.e2.potentials import STRIDE
+
+GAUSSIAN_REACH = 3.0  # m beyond which the Gaussian of 1 m is below 0.4
+GAUSSIAN_TIME = 2.0  # s of the plan in which collisions cost
+MAX_COST = 30.0  # m, of the collision term
+CONFLICT_REACH = 100.0  # m within which a conflict counts
+
+
+class SafeSimOpt(Guided):
+    """Clean guidance: everybody keeps to its route and clear of others, adversaries also seek the ego. Each vehicle
+    takes the sample that suits it best, as in the source."""
+
+    guides_everybody = True
+
+    def __init__(
+        self,
+        prior: Prior,
+        knowledge: str = "plan",
+        prediction: str = "prior",
+        responsibility: str = "none",
+        gain: float = 2.0,
+        step_size: float = 4.0,
+        clip: float = 2.0,
+        samples: int = 20,
+        adversaries: int = 3,
+        reach: float = 50.0,
+        route: float = 0.5,
+        gaussian: float = 0.5,
+        ttc: float = 1.0,
+        collision: float = 0.5,
+    ) -> None:
+        """Fields: conf/synthesizer/safe_sim_opt.yaml."""
+        super().__init__(prior, knowledge, prediction, responsibility, gain, samples)
+        check_range("synthesizer.adversaries", adversaries, 1)
+        self.step_size, self.clip, self.count, self.reach = step_size, clip, adversaries, reach
+        self.route, self.gaussian, self.ttc, self.collision = route, gaussian, ttc, collision
+
+    def adversaries(self, state: RivalState, view: View) -> Tensor:
+        """Those nearest to the ego, within `reach`."""
+        distance = view.distance_to_ego()
+        return smallest(distance <= self.reach, distance, self.count)
+
+    def loss(self, state: RivalState, view: View) -> Loss:
+        """Route and Gaussian terms of all; collision and TTC terms of adversaries, by the strength."""
+        strength, meets = self.strength(state)[:, None] * state.adversary, in_conflict(view)
+
+        def value(motion: LaneState) -> Tensor:
+            states = view.with_ego(motion)
+            calm = self.route * off_route_term(motion, view) + self.gaussian * self._overlap(states, view, state)
+            attack = self.collision * collision_term(states) * meets + self.ttc * ttc_term(states)
+            return calm + strength * attack
+
+        return value
+
+    def _overlap(self, states: Tensor, view: View, state: RivalState) -> Tensor:
+        """Gaussian collision term [S, B, V] over the first GAUSSIAN_TIME; adversaries may come near the ego."""
+        early = states[..., : round(GAUSSIAN_TIME / (STRIDE * DT)), :]
+        pursued = state.adversary[:, :, None] & (torch.arange(states.shape[2], device=states.device) == 0)
+        weights = early.new_full(early.shape[-2:-1], 1 / early.shape[-2])
+        return pair_term(early, view, gaussian_overlap, GAUSSIAN_REACH, weights, pursued)
+
+    def chosen(self, motion: LaneState, state: RivalState, view: View, guided: Tensor) -> Tensor:
+        """Sample [B, V] of each vehicle: the least Gaussian term, for adversaries the least collision term."""
+        states = view.with_ego(motion)
+        calm, near = self._overlap(states, view, state), collision_term(states)
+        return torch.where(state.adversary, near, calm).argmin(0)
+
+    def guidance(self, loss: Loss, guided: Tensor, strength: Tensor) -> CleanGuidance:
+        """The strength is in the loss."""
+        return CleanGuidance(self.prior, loss, guided, self.samples, self.step_size, self.clip)
+
+
+def collision_term(states: Tensor) -> Tensor:
+    """Least distance to the ego and a tenth of the present one, at most MAX_COST m, mean over time [S, B, V]."""
+    distance = ego_distance(states)
+    return (distance.amin(-1, keepdim=True) + 0.1 * distance).clamp(max=MAX_COST).mean(-1)
+
+
+def in_conflict(view: View) -> Tensor:
+    """Bool [B, V]: the vehicle's route and the ego's meet, they are not both past that point, and near enough."""
+    routed, s = view.routed, view.lane.s
+    before = (s < routed.conflict_s[:, :, 0]) | (s[:, :1] < routed.conflict_s[:, 0])
+    return routed.conflict[:, :, 0] & before & (view.distance_to_ego() < CONFLICT_REACH)

@@ -1,0 +1,208 @@
+"""STRIVE (Rempe et al. 2022): the latents of a scenario are optimised until the planner, driven anew at every
+iteration, is hit; scenarios that no ego could survive are discarded.
+
+The prior as a decoder of latents: deterministic DDIM from pure noise, differentiable, in few steps.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from e2rl.prior.lane_relative import LaneState
+from e2rl.prior.prior import Context, Prior, plan_to_x
+from e2rl.prior.sde import ddim_step
+from e2rl.run.settings import check_range
+from e2rl.scenes.boxes import overlap, to_frame
+from e2rl.scenes.recording import DT
+from e2rl.sim.world import World
+from e2rl.traffic.baselines.losses import disk_overlap, ego_distance, off_road_term, pair_term
+from e2rl.traffic.baselines.open_loop import OpenLoop, OpenLoopState, Scenario
+from e2rl.traffic.baselines.view import View, motion_of, of_scenes
+from e2rl.traffic.e2.potentials import SAMPLED_STEPS, STRIDE
+from e2rl.traffic.grouping import Group, take_rows
+
+
+def decode_latent(prior: Prior, latent: Tensor, context: Context, steps: int) -> Tensor:
+    """x0 [B, V, SIZE] of latents [B, V, SIZE], the noise at the highest level, by `steps` passes of the network."""
+    levels, x = prior.schedule.levels(steps, latent.device), latent
+    zero = torch.zeros_like(levels[0])
+    for high, low in zip(levels[:-2], levels[1:-1], strict=True):
+        x = ddim_step(prior.schedule, x, prior.denoise(x, high, context), high, low, zero, 0.0)[0]
+    return prior.denoise(x, levels[-2], context)
+
+
+FROM = 2.0  # s of the plan before which nobody is attacked
+COLLISION = 20.0  # weight of overlaps and of being off the road
+PRIOR = 1.0, 0.005  # weight of a latent's energy: of bystanders, of the attacker
+START = 0.5, 0.05  # the same, of the distance to the first latent
+SOLUTION = 10.0, 0.005  # weights of collisions and of the latent's energy in the test for a solution
+CLEARANCE = 1.0  # m, below which a gap costs in that test
+NOBODY = 1e4  # m: distance of vehicles that cannot be the attacker
+Objective = Callable[[Tensor], Tensor]  # latents -> loss [B]
+
+
+@dataclass
+class Known:
+    """What network and loss know of the ego, while the planner is driven anew."""
+
+    context: Context
+    view: View
+
+    def drive(self, ego: Tensor) -> None:
+        """The ego as it has driven last, states [B, HORIZON, 4]."""
+        self.view = replace(self.view, ego=ego[:, SAMPLED_STEPS])
+        self.context = replace(self.context, ego_x=plan_to_x(ego, self.context.state, self.context.routed))
+
+
+class Strive(OpenLoop):
+    """Latents of all vehicles by Adam, for all scenes of a batch at once; the whole scenario is driven open loop."""
+
+    def __init__(
+        self,
+        prior: Prior,
+        knowledge: str = "plan",
+        prediction: str = "prior",
+        responsibility: str = "none",
+        gain: float = 4.0,
+        step_size: float = 0.2,
+        iterations: int = 50,
+        steps: int = 4,
+        solution: bool = True,
+    ) -> None:
+        """Fields: conf/synthesizer/strive.yaml."""
+        super().__init__(prior, knowledge, prediction, responsibility, gain)
+        check_range("synthesizer.iterations", iterations, 1)
+        check_range("synthesizer.steps", steps, 2)
+        self.step_size, self.iterations, self.steps, self.solution = step_size, iterations, steps, solution
+        self.queries_ego = knowledge == "plan"
+
+    def scenario(
+        self,
+        state: OpenLoopState,
+        world: World,
+        ego_plan: Tensor,
+        noise: Tensor,
+        group: Group,
+        context: Context,
+        nominal: Tensor,
+    ) -> Scenario:
+        """The optimised scenario, in which everybody is held; the nominal sample where it has no solution."""
+        first, acts = noise[0, :, :, 0].contiguous(), self.strength(state) > 0
+        x0, view = self.attacked(first, state, world, ego_plan, group, context)
+        motion = motion_of(self.prior, x0, context, 1)
+        weight = attacker_weight(view.with_ego(motion), view)
+        attacker = torch.nn.functional.one_hot(weight.argmax(-1), weight.shape[1]).bool()
+        keeps = acts & (weight.sum(-1) > 0)
+        if self.solution:
+            keeps = keeps & self.solvable(first, motion, view, context)
+        held, adversary = (rows & keeps[:, None] & context.active for rows in (torch.ones_like(attacker), attacker))
+        return Scenario(
+            torch.where(keeps[:, None, None], x0, nominal), held, adversary, torch.zeros_like(state.path_kl)
+        )
+
+    def attacked(
+        self, first: Tensor, state: OpenLoopState, world: World, ego_plan: Tensor, group: Group, context: Context
+    ) -> tuple[Tensor, View]:
+        """x0 [B, V, SIZE] of optimised latents that begin at `first`, and the View with the ego as it last drove."""
+        known = Known(context, View.of(world, context, ego_plan))
+
+        def decoded(latent: Tensor) -> Tensor:
+            x0 = decode_latent(self.prior, latent, known.context, self.steps)
+            if self._react is not None:
+                known.drive(self._react(group.rows, self.prior.decode(x0.detach(), context).states()))
+            return x0
+
+        def loss(latent: Tensor) -> Tensor:
+            motion = motion_of(self.prior, decoded(latent), known.context, 1)
+            return self.loss(motion, latent, first, state, known.view)
+
+        latent = self.optimised(first, loss)
+        with torch.no_grad():
+            x0 = decoded(latent)
+        return x0, known.view
+
+    def optimised(self, latent: Tensor, loss: Objective) -> Tensor:
+        """Latents after `iterations` steps of Adam."""
+        with torch.enable_grad():
+            variable = latent.detach().clone().requires_grad_(True)
+            adam = torch.optim.Adam([variable], lr=self.step_size)
+            for _ in range(self.iterations):
+                (variable.grad,) = torch.autograd.grad(loss(variable).sum(), variable)
+                adam.step()
+        return variable.detach()
+
+    def loss(self, motion: LaneState, latent: Tensor, first: Tensor, state: OpenLoopState, view: View) -> Tensor:
+        """STRIVE's objective [B] of a decoded motion [1, B, V, T], with weights between bystander and attacker."""
+        states = view.with_ego(motion)
+        distance, delta = ego_distance(states)[0], softmin(states, view)
+        attack = (delta * distance.square()).flatten(1).sum(-1)
+        share = delta.sum(-1)
+        even = torch.full_like(states[0, 0, 0, :, 0], 1 / states.shape[-2])
+        with_ego = torch.zeros_like(view.routed.conflict)
+        with_ego[:, :, 0] = True
+        bumps = [pair_term(states, view, disk_overlap(0.0), 0.0, even, rows)[0] for rows in (with_ego, ~with_ego)]
+        calm = COLLISION * (bumps[0] + (1 - share) * bumps[1] + off_road_term(states, view, even)[0])
+        energy = blend(PRIOR, share) * 0.5 * latent.square().sum(-1)
+        energy = energy + blend(START, share) * (latent - first).square().sum(-1)
+        return self.strength(state) * attack + ((calm + energy) * view.active).sum(-1)
+
+    def solvable(self, first: Tensor, planned: LaneState, view: View, context: Context) -> Tensor:
+        """Bool [B]: there is a way of the ego that touches nobody of the others' motion [1, B, V, T]: that which it
+        drives already, or one that an optimisation of its own latent finds."""
+        others = planned.states()[0]
+        solved = ~touched(view.ego[:, None], others, view)
+        if not solved.all():
+            rows = (~solved).nonzero()[:, 0]
+            given = first[rows], others[rows], take_rows(view, rows), of_scenes(context, rows)
+            solved[rows] = self.evaded(*given)
+        return solved
+
+    def evaded(self, first: Tensor, others: Tensor, view: View, context: Context) -> Tensor:
+        """Bool [B]: the ego's own latent, optimised against the others' states [B, V, T, 4], finds a way that touches
+        nobody."""
+        unknown = replace(context, ego_x=None)
+        view = replace(view, active=torch.zeros_like(view.active))
+        view.active[:, 0] = True
+
+        def driven(ego: Tensor) -> Tensor:
+            latent = torch.cat([ego[:, None], first[:, 1:]], 1)
+            return motion_of(self.prior, decode_latent(self.prior, latent, unknown, self.steps), unknown, 1).states()
+
+        def loss(ego: Tensor) -> Tensor:
+            states = torch.cat([driven(ego)[:, :, :1], others[None, :, 1:]], 2)
+            even = torch.full_like(states[0, 0, 0, :, 0], 1 / states.shape[-2])
+            bump = pair_term(states, view, disk_overlap(CLEARANCE), CLEARANCE, even) + off_road_term(states, view, even)
+            return SOLUTION[0] * bump[0, :, 0] + SOLUTION[1] * 0.5 * ego.square().sum(-1)
+
+        with torch.no_grad():
+            return ~touched(driven(self.optimised(first[:, 0], loss))[0, :, :1], others, view)
+
+
+def touched(ego: Tensor, others: Tensor, view: View) -> Tensor:
+    """Bool [B]: the ego's states [B, 1, T, 4] overlap some of the others' [B, V, T, 4], whose row 0 does not count."""
+    touches = overlap(ego, view.size[:, :1, None], others[:, 1:], view.size[:, 1:, None]).any(-1)
+    return (touches & view.valid[:, 1:]).any(-1)
+
+
+def blend(weights: tuple[float, float], share: Tensor) -> Tensor:
+    """Between the weight of a bystander (share 0) and that of the attacker (share 1)."""
+    return weights[0] + (weights[1] - weights[0]) * share
+
+
+def softmin(states: Tensor, view: View) -> Tensor:
+    """Weights [B, V, T], without gradient, that find attacker and moment: softmax of minus the distance to the ego over
+    all of a scene, from FROM s on. Vehicles that are behind the ego throughout take no part; 0 without any."""
+    with torch.no_grad():
+        distance = ego_distance(states)[0]
+        ahead = (to_frame(states[0, ..., :2], states[0, :, :1]) > 0)[..., 0]
+        late = STRIDE * DT * torch.arange(1, distance.shape[-1] + 1, device=distance.device) >= FROM - DT / 2
+        counts = (ahead.any(-1) & view.active)[..., None] & late
+        weight = torch.softmax(-distance.masked_fill(~counts, NOBODY).flatten(1), -1).view_as(distance)
+        return weight * counts
+
+
+def attacker_weight(states: Tensor, view: View) -> Tensor:
+    """Share [B, V] of `softmin` that each vehicle has."""
+    return softmin(states, view).sum(-1)

@@ -1,0 +1,273 @@
+"""Topological anchoring (Sec. IV-B1): a coarse lane-graph proposal for every link of the skeleton.
+
+A proposal is a candidate route and a constant acceleration, within limits of speed and curvature, with which a vehicle
+meets its target. The prior's own decoder turns it into motion, so arrival times are those that the prior would plan.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS, KNOTS, LaneState, lateral_horizon, speeds
+from e2rl.prior.routes import take_route
+from e2rl.run.settings import check_range
+from e2rl.scenes.recording import DT
+from e2rl.scenes.route import SPACING, interpolate, project
+from e2rl.sim.dynamics import wrap
+from e2rl.sim.world import World
+from e2rl.traffic.e2.interception import InterceptionSettings, intercept
+from e2rl.traffic.e2.motion import (
+    TOP_SPEED,
+    compact,
+    constant_speed_states,
+    frenet_pose,
+    put,
+    remaining_offset,
+    states_on_route,
+    take,
+    way_to_stop_line,
+)
+from e2rl.traffic.e2.skeleton import Skeleton
+
+COARSE, FINE = 19, 9  # accelerations tried on each route: over the whole range, then around the best
+LATERAL_ACCEL = 4.0  # m/s^2 in bends
+BEND_BRAKING = 3.0  # m/s^2 with which a vehicle slows down for a bend
+EXTRA = 2  # steps beyond the horizon, for the slope of the speed at the last knot
+SWING = 0.2  # peak of the lateral decoder's offset, per unit of slope and lateral horizon
+BEND_VERTICES = 64  # of a route ahead, whose curvature bounds the speed
+
+
+@dataclass(frozen=True)
+class AnchorSettings:
+    """Settings of the proposals and of the blend; conf/synthesizer/e2.yaml explains each."""
+
+    strength: float = 1.0
+    min_accel: float = -3.0
+    max_accel: float = 2.0
+    accel_cost: float = 0.2
+    lateral_cost: float = 0.05
+    max_offset: float = 1.0
+    max_shift: float = 4.5
+    max_swing: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_range("synthesizer.anchor.strength", self.strength, 0, 1)
+        check_range("synthesizer.anchor.max_accel", self.max_accel, self.min_accel + 0.1)
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """The proposals of a skeleton.
+
+    route [B, V] int64: candidate to follow (the present one where not feasible); knots [B, V, 10]: accelerations
+    [m/s^2] at 0.5 .. 5.0 s; feasible [B, V] bool: members of C* that can meet their target; cost [B, V] in s, inf where
+    not feasible; off_lane [B, V] bool: members that meet it on off_lane_path [B, V, P, 2] (a vertex every SPACING m)
+    instead of a lane.
+    """
+
+    route: Tensor
+    knots: Tensor
+    feasible: Tensor
+    cost: Tensor
+    off_lane: Tensor
+    off_lane_path: Tensor
+
+
+class _Candidates(NamedTuple):
+    """Vehicles [B, M] that need a proposal: speed, accel, size [B, M, 2], and their candidate routes [B, M, R]: number
+    in the scene, points [B, M, R, P, 2], usable (bool), end [m], Frenet pose s, d [m], and bend_bound [B, M, R, 64]:
+    squared speed allowed at the vertices ahead.
+    """
+
+    number: Tensor
+    points: Tensor
+    usable: Tensor
+    end: Tensor
+    s: Tensor
+    d: Tensor
+    bend_bound: Tensor
+    speed: Tensor
+    accel: Tensor
+    size: Tensor
+
+
+class _Target(NamedTuple):
+    """A target's path seen along each candidate, [B, M, R, H]: s, d [m]; slack [m] by which boxes that move alike touch
+    before their centres meet; crossing_time [s/m]: until a crossing target is over the centreline; corridor [B, M] m:
+    lateral distance at which the boxes touch.
+    """
+
+    s: Tensor
+    d: Tensor
+    slack: Tensor
+    crossing_time: Tensor
+    corridor: Tensor
+
+
+def _bend_bound(route: Tensor, s: Tensor) -> Tensor:
+    """Squared speed [..., BEND_VERTICES] allowed at arc lengths s + SPACING k of route [..., P, 2], s [...]: by the
+    curvature there, and by what BEND_BRAKING can still lose before the bends ahead.
+    """
+    distance = SPACING * torch.arange(BEND_VERTICES, device=s.device)
+    curvature = interpolate(route, s[..., None] + distance)[2]
+    bound = LATERAL_ACCEL / curvature.abs().clamp(min=1e-4) + 2 * BEND_BRAKING * distance
+    return bound.flip(-1).cummin(-1).values.flip(-1) - 2 * BEND_BRAKING * distance
+
+
+def _candidates(
+    scene: TensorDictBase, world: World, index: Tensor, settings: AnchorSettings, keep_route: bool, halt_at_red: bool
+) -> _Candidates:
+    """The candidate routes of vehicles index [B, M]; keep_route: only the one that each follows; halt_at_red: up to the
+    stop line that binds the vehicle now."""
+    vehicles, count = scene["route_points"].shape[1:3]
+    assert world.route is not None
+    states, route = take(world.states[:, :vehicles], index), take(world.route, index)[..., None]
+    number = route.clamp(min=0) if keep_route else torch.arange(count, device=index.device).expand(*index.shape, -1)
+    at = (torch.arange(len(index), device=index.device)[:, None, None], index[..., None], number)
+    points, end, valid = (scene[key][at] for key in ("route_points", "route_length", "route_valid"))
+    s, d, error = frenet_pose(states, points)
+    swing = SWING * error.clamp(-1.0, 1.0).tan().abs() * lateral_horizon(states[..., 3])[..., None]
+    reachable = (d.abs() <= settings.max_shift) & (swing <= settings.max_swing)
+    usable = valid & (reachable | (number == route))
+    if keep_route:
+        usable = usable & (route >= 0)
+    if halt_at_red:
+        end = torch.minimum(end, s + way_to_stop_line(world, index, number))
+    accel, size = take(world.accel[:, :vehicles], index), take(scene["size"], index)
+    return _Candidates(number, points, usable, end, s, d, _bend_bound(points, s), states[..., 3], accel, size)
+
+
+def _along(candidates: _Candidates, path: Tensor, size: Tensor) -> _Target:
+    """A target's path [B, M, H, 4] and size [B, M, 2] seen along each candidate."""
+    s, d, heading = project(path[:, :, None, :, :2], candidates.points)
+    cosine = wrap(path[:, :, None, :, 2] - heading).cos()
+    touch = (candidates.size + size) / 2
+    slack = 0.8 * touch[..., 0, None, None] * cosine.clamp(min=0) ** 2
+    crossing_time = (1 - cosine**2) / path[:, :, None, :, 3].clamp(min=1.0)
+    return _Target(s, d, slack, crossing_time, touch[..., 1])
+
+
+def _knots(candidates: _Candidates, accel: Tensor, settings: AnchorSettings) -> Tensor:
+    """Knots [B, M, R, A, 10] that hold accelerations accel [B, M, R, A] but for standstill, top speed and bends.
+
+    The bound on speed depends on the distance, which depends on speed: three fixed-point steps from the free motion.
+    """
+    time = DT * torch.arange(HORIZON + EXTRA + 1, device=accel.device)
+    v0 = candidates.speed[..., None, None, None]
+    free = v0 + accel[..., None] * time
+    free = torch.minimum(free.clamp(min=0), v0.clamp(min=TOP_SPEED))
+    braking = (v0 + settings.min_accel * time).clamp(min=0)  # nobody loses speed faster, bend or not
+    speed = free
+    for _ in range(3):
+        travelled = torch.nn.functional.pad(((speed[..., 1:] + speed[..., :-1]) / 2 * DT).cumsum(-1), (1, 0))
+        at = (travelled / SPACING).clamp(max=BEND_VERTICES - 1.001)
+        low = at.long()
+        table = candidates.bend_bound[..., None, :].expand(*travelled.shape[:-1], BEND_VERTICES)
+        bound = torch.lerp(table.gather(-1, low), table.gather(-1, low + 1), at - low)
+        speed = torch.maximum(torch.minimum(free, bound.clamp(min=0).sqrt()), braking)
+    knot = KNOT_STEPS * torch.arange(1, KNOTS + 1, device=accel.device)
+    slope = (speed[..., knot + EXTRA] - speed[..., knot - EXTRA]) / (2 * EXTRA * DT)
+    return slope.clamp(settings.min_accel, settings.max_accel)
+
+
+def _decode(candidates: _Candidates, knots: Tensor) -> tuple[Tensor, Tensor]:
+    """Speed and travelled distance [B, M, R, A, H] of knots [B, M, R, A, 10], by the prior's decoder."""
+    zero = knots.new_zeros(knots.shape[:-1])
+    v, a = (x[..., None, None].expand(zero.shape) for x in (candidates.speed, candidates.accel))
+    return speeds(LaneState(zero, zero, zero, zero, v, a, zero, zero, zero, zero), knots)
+
+
+def _score(
+    candidates: _Candidates, accel: Tensor, target: _Target, settings: AnchorSettings
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Cost and time gap [s] (both [B, M, R, A]) and knots [B, M, R, A, 10] of accelerations accel [B, M, R, A].
+
+    At each step at which the target is on a candidate, the vehicle's distance to that point over its speed is the gap
+    between the two arrival times; the smallest counts.
+    """
+    knots = _knots(candidates, accel, settings)
+    v, travelled = _decode(candidates, knots)
+    offset = candidates.d[..., None, None] * remaining_offset(travelled, candidates.speed[..., None, None, None])
+    lateral = (target.d[..., None, :] - offset).abs()
+    ahead = target.s[..., None, :]
+    missing = (ahead - candidates.s[..., None, None] - travelled).abs() - target.slack[..., None, :]
+    time_gap = missing.clamp(min=0) / v.clamp(min=1.0) + lateral * target.crossing_time[..., None, :]
+    met = (lateral <= target.corridor[..., None, None, None]) & (ahead <= candidates.end[..., None, None])
+    time_gap = time_gap.masked_fill(~met, torch.inf).amin(-1).masked_fill(~candidates.usable[..., None], torch.inf)
+    cost = time_gap + settings.accel_cost * accel.abs() + settings.lateral_cost * candidates.d.abs()[..., None]
+    return cost, time_gap, knots
+
+
+def _on_lane(
+    candidates: _Candidates, path: Tensor, size: Tensor, settings: AnchorSettings
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The proposal of least cost on the candidates: candidate [B, M], knots [B, M, 10], cost [B, M] (inf for none)."""
+    target = _along(candidates, path, size)
+    low, high = settings.min_accel, settings.max_accel
+    grid = torch.linspace(low, high, COARSE, device=path.device).expand(*candidates.s.shape, COARSE)
+    best = _score(candidates, grid, target, settings)[0].argmin(-1, keepdim=True)  # per candidate
+    fine = grid.gather(-1, best) + (high - low) / (COARSE - 1) * torch.linspace(-1, 1, FINE, device=path.device)
+    cost, time_gap, knots = _score(candidates, fine.clamp(low, high), target, settings)
+    pick = cost.flatten(2).argmin(-1)
+    cost, time_gap, knots = (take_route(value.flatten(2, 3), pick) for value in (cost, time_gap, knots))
+    return pick // FINE, knots, cost.masked_fill(time_gap > settings.max_offset, torch.inf)
+
+
+def propose(
+    scene: TensorDictBase,
+    world: World,
+    skeleton: Skeleton,
+    ego_plan: Tensor,
+    settings: AnchorSettings,
+    interception: InterceptionSettings,
+    eta: Tensor,
+    keep_route: bool = False,
+    halt_at_red: bool = False,
+) -> Anchor:
+    """The skeleton-consistent clean state of Sec. IV-A3 for scenes [B]; ego_plan [B, H >= 50, 4], eta [B].
+
+    Proposals are made from the ego outwards. Vehicles that act on the ego meet its plan on a lane or, where that costs
+    less, by an interception. The others meet their target's lane proposal; a target without one keeps its speed along
+    its route. keep_route: consider only the routes that vehicles follow now; halt_at_red: nobody passes a stop line
+    that binds it now.
+    """
+    times = DT * torch.arange(1, HORIZON + 1, device=ego_plan.device)
+    expected = constant_speed_states(scene, world, times)
+    expected[:, 0] = ego_plan[:, :HORIZON].detach()
+    assert world.route is not None
+    nobody, cost = torch.zeros_like(skeleton.coalition), expected.new_full(world.route.shape, torch.inf)
+    knots, path = expected.new_zeros(*world.route.shape, KNOTS), torch.zeros_like(scene["route_points"][:, :, 0])
+    anchor = Anchor(world.route.clone(), knots, nobody, cost, nobody, path)
+    for depth in range(1, int(skeleton.depth.max()) + 1):
+        index, present = compact(skeleton.depth == depth)
+        target = skeleton.target.gather(1, index).clamp(min=0)
+        candidates = _candidates(scene, world, index, settings, keep_route, halt_at_red)
+        pick, knots, cost = _on_lane(candidates, take(expected, target), take(scene["size"], target), settings)
+        cost, off_lane, found = cost.masked_fill(~present, torch.inf), torch.zeros_like(present), None
+        if depth == 1 and interception.reach > 0:
+            found = intercept(world, index, target, expected, eta, interception, halt_at_red)
+            off_lane = present & (found.cost < cost)
+        on_lane = cost.isfinite() & ~off_lane
+        expected = put(expected, index, on_lane, _states(candidates, pick, knots))
+        route = take_route(candidates.number, pick)
+        anchor = _updated(anchor, index, on_lane, feasible=on_lane, cost=cost, knots=knots, route=route)
+        if found is not None:
+            rows = {"feasible": off_lane, "off_lane": off_lane, "cost": found.cost, "knots": found.knots}
+            anchor = _updated(anchor, index, off_lane, off_lane_path=found.path, **rows)
+    return anchor
+
+
+def _states(candidates: _Candidates, pick: Tensor, knots: Tensor) -> Tensor:
+    """States [B, M, H, 4] of the vehicles on candidates pick [B, M] with knots [B, M, 10]."""
+    v, travelled = (x[:, :, 0, 0] for x in _decode(candidates, knots[:, :, None, None]))
+    route, s, d = (take_route(x, pick) for x in (candidates.points, candidates.s, candidates.d))
+    offset = d[..., None] * remaining_offset(travelled, candidates.speed[..., None])
+    return states_on_route(route, s[..., None] + travelled, offset, v)
+
+
+def _updated(anchor: Anchor, index: Tensor, mask: Tensor, **rows: Tensor) -> Anchor:
+    """The Anchor with rows [B, M, ...] of its fields written at vehicles index [B, M] where mask [B, M]."""
+    return replace(anchor, **{name: put(getattr(anchor, name), index, mask, new) for name, new in rows.items()})

@@ -1,0 +1,162 @@
+"""Sparse gradient control (Sec. IV-B2): the masked control of one replan, inside every step of the reverse SDE.
+
+Guidance replaces the score s by s - grad V (Dhariwal and Nichol 2021), which moves the clean estimate:
+x0 <- x0 - (sigma^2 / alpha) grad V. To keep eta a usable dial, each vehicle's gradient is scaled by the noise level and
+clipped before eta multiplies it; V_feas has a clip of its own. Only V_adv is pulled back through the network. V_feas
+acts on the clean estimate, and only once that has taken shape (`feasibility_level`): the same outcome at a fraction of
+the cost.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS
+from e2rl.prior.prior import Context, Prior
+from e2rl.prior.sde import NoiseSchedule
+from e2rl.run.settings import check_choice, check_range
+from e2rl.traffic.e2.anchoring import Anchor
+from e2rl.traffic.e2.potentials import (
+    SAMPLED_STEPS,
+    PotentialContext,
+    PotentialSettings,
+    adversarial_potential,
+    annealed_temperature,
+    feasibility_potential,
+)
+
+MIN_ALPHA = 0.05
+TINY = 1e-12  # keeps a clip of 0, which is no shift at all, from 0 / 0
+CHOICES = {"gradient": ("denoiser", "clean"), "scaling": ("score", "sigma"), "anchoring": ("clean", "literal", "off")}
+
+
+@dataclass(frozen=True)
+class ControlSettings:
+    """Settings of the guided reverse SDE; conf/synthesizer/e2.yaml explains each."""
+
+    gradient: str = "denoiser"
+    scaling: str = "sigma"
+    adversarial_clip: float = 0.0
+    feasibility: float = 4.0
+    feasibility_clip: float = 1.0
+    feasibility_level: float = 0.5
+    anchoring: str = "clean"
+    anchor_level: float = 0.2
+    lookahead: int = 0
+    transport_budget: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, choices in CHOICES.items():
+            check_choice(f"synthesizer.control.{name}", getattr(self, name), choices)
+        if self.transport_budget is not None:
+            check_range("synthesizer.control.transport_budget", self.transport_budget, 0)
+
+
+def clip_rows(gradient: Tensor, limit: float) -> Tensor:
+    """gradient [B, V, D] with each row's norm at most `limit`."""
+    return gradient * (limit / gradient.norm(dim=-1, keepdim=True).clamp(min=max(limit, TINY)))
+
+
+def gradient_weight(schedule: NoiseSchedule, level: Tensor, scaling: str) -> Tensor:
+    """Factor between grad V and the shift of x0 at a noise level: the exact sigma^2 / alpha (score), or sigma."""
+    sigma = schedule.sigma(level)
+    return sigma if scaling == "sigma" else sigma**2 / schedule.alpha(level).clamp(min=MIN_ALPHA)
+
+
+@dataclass
+class SparseControl:
+    """The control of one replan of B scenes; called by `Prior.sample` at every noise level.
+
+    conditions: what the potentials see; coalition [B, V] bool: C*; eta [B]: intensity; anchor: the skeleton's proposal,
+    blended in with `strength`; anchor_noise [B, V, SIZE]: for the literal blend; ego_response: from planned states
+    [B, V, HORIZON, 4] to the ego's states [B, HORIZON, 4] against them, asked at settings.lookahead of the noise levels
+    (None: the ego's plan stays what it is). After sampling, `jump` [B, V] is the energy of the anchor's shift,
+    ||shift||^2 / (2 sigma^2).
+    """
+
+    prior: Prior
+    settings: ControlSettings
+    potentials: PotentialSettings
+    conditions: PotentialContext
+    coalition: Tensor
+    eta: Tensor
+    anchor: Anchor
+    strength: float
+    anchor_noise: Tensor
+    ego_response: Callable[[Tensor], Tensor] | None = None
+
+    def __post_init__(self) -> None:
+        steps = self.prior.sampler.steps
+        asked = self.settings.lookahead if self.ego_response is not None else 0
+        self.response_steps = {round(steps * i / (asked + 1)) for i in range(1, asked + 1)}
+        levels = self.prior.schedule.levels(steps)[:-1]
+        self.anchor_step = steps - int((levels - self.settings.anchor_level).abs().argmin())
+        self.feasibility_step = int((levels <= self.settings.feasibility_level).sum())
+        self.jump = torch.zeros(self.coalition.shape, device=self.eta.device)
+        # Asked once, on the host: without a coalition V_adv is 0, and with a clip of 0 it has no effect.
+        self.has_coalition = self.settings.adversarial_clip > 0 and bool(self.coalition.any())
+
+    def __call__(
+        self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """x [B, V, SIZE] of step k and its noise level -> (x after anchoring, clean estimate x0, controlled x0)."""
+        settings = self.settings
+        if k == self.anchor_step and settings.anchoring != "off" and self.strength > 0:
+            x = self._anchored(x, level, context, denoise)
+        x0, adversarial, feasibility = self._gradients(x, level, k, context, denoise)
+        weight = gradient_weight(self.prior.schedule, level, settings.scaling)
+        adversarial = clip_rows(weight * adversarial, settings.adversarial_clip)
+        feasibility = clip_rows(settings.feasibility * weight * feasibility, settings.feasibility_clip)
+        shift = self.eta[:, None, None] * adversarial * self.coalition[..., None]
+        shift = shift + feasibility * context.active[..., None]
+        controlled = (context.active & (self.eta > 0)[:, None])[..., None]
+        return x, x0, x0 - torch.where(controlled, shift, 0.0)
+
+    def _gradients(
+        self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """(x0, grad V_adv by x or x0 as set, grad V_feas by x0)."""
+        adversarial = feasibility = torch.zeros_like(x)
+        with_feasibility = k <= self.feasibility_step
+        with torch.enable_grad():
+            variable = x.detach().requires_grad_(self.has_coalition and self.settings.gradient == "denoiser")
+            denoised = denoise(variable)
+            x0 = denoised.detach().requires_grad_(True)
+            if not self.has_coalition and not with_feasibility:
+                return x0.detach(), adversarial, feasibility
+            if k in self.response_steps and self.has_coalition and self.ego_response is not None:
+                planned = self.prior.decode(x0.detach(), context).states()
+                self.conditions = replace(self.conditions, ego_plan=self.ego_response(planned))
+            states = self.prior.decode(x0, context, steps=SAMPLED_STEPS).states()
+            if self.has_coalition:
+                temperature = annealed_temperature(level, self.potentials)
+                value = adversarial_potential(states, self.conditions, self.potentials, temperature)
+                (adversarial,) = torch.autograd.grad(value.sum(), x0, retain_graph=True)
+            if with_feasibility:
+                value = feasibility_potential(states, self.conditions, self.potentials)
+                (feasibility,) = torch.autograd.grad(value.sum(), x0)
+        if variable.requires_grad:
+            (adversarial,) = torch.autograd.grad(denoised, variable, adversarial)
+        return x0.detach(), adversarial, feasibility
+
+    def _anchored(self, x: Tensor, level: Tensor, context: Context, denoise: Callable[[Tensor], Tensor]) -> Tensor:
+        """x after topological anchoring of the coalition at this level; records the energy of the shift.
+
+        With x = alpha x0 + sigma e and proposal a, clean anchoring at strength w is alpha ((1 - w) x0 + w a) + sigma e.
+        The printed one, eq. (anchor_injection), is (1 - w) x + w (alpha a + sigma e'): with a noise e' of its own it
+        shrinks the noise variance by (1 - w)^2 + w^2. It is kept for the ablation.
+        """
+        with torch.no_grad():
+            x0 = denoise(x)
+        schedule, strength = self.prior.schedule, self.strength
+        proposal = torch.cat([self.anchor.knots / ACCEL_SCALE, x0[..., KNOTS:]], -1)
+        if self.settings.anchoring == "clean":
+            blend = x + schedule.alpha(level) * strength * (proposal - x0)
+        else:
+            blend = (1 - strength) * x + strength * schedule.noised(proposal, level, self.anchor_noise)
+        mask = self.anchor.feasible & self.coalition & context.active & (self.eta > 0)[:, None]
+        after = torch.where(mask[..., None], blend, x)
+        self.jump = ((after - x) ** 2).sum(-1) / (2 * schedule.sigma(level) ** 2)
+        return after

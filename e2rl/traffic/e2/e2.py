@@ -1,0 +1,314 @@
+"""e2, the adversarial synthesizer: Algorithm 1's inner part for batches of scenes (docs/method.md, sections 5 to 9).
+
+When a coalition is due: reference rollout, topology, feasibility, skeleton. At every replan: encode once, anchor,
+sample under sparse control. With eta = 0 nothing is controlled, and the traffic is the prior's, bit for bit.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from e2rl.prior.lane_relative import HORIZON, KNOTS, SIZE, locate, select
+from e2rl.prior.prior import Context, Prior
+from e2rl.prior.routes import reroute
+from e2rl.run.errors import InputError
+from e2rl.run.settings import check_choice, settings_of
+from e2rl.scenes.recording import DT
+from e2rl.sim.world import World
+from e2rl.traffic.e2.anchoring import Anchor, AnchorSettings, propose
+from e2rl.traffic.e2.control import ControlSettings, SparseControl
+from e2rl.traffic.e2.feasibility import FeasibilitySettings
+from e2rl.traffic.e2.interception import InterceptionSettings
+from e2rl.traffic.e2.potentials import PotentialContext, PotentialSettings
+from e2rl.traffic.e2.reasoner import ReasonerSettings, build_reasoner
+from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, CareSettings, duty_of, leading, place_of
+from e2rl.traffic.e2.skeleton import (
+    Selection,
+    Skeleton,
+    SkeletonSettings,
+    build_skeleton,
+    chain_depth,
+    direct,
+    limits_of,
+)
+from e2rl.traffic.e2.topology import TopologySettings, topological_candidates
+from e2rl.traffic.grouping import Group, noise_of, put_rows, take_rows
+from e2rl.traffic.nominal import NominalTraffic, PriorState
+from e2rl.traffic.traffic import FULL, TrafficPlan
+
+LITERAL, SUPPORT = 500, 750  # numbers of draws: the literal blend's noise, a random support's
+SUPPORTS = ("feasible", "topology", "random")
+PARTS: dict[str, type] = {
+    "topology": TopologySettings,
+    "feasibility": FeasibilitySettings,
+    "reasoner": ReasonerSettings,
+    "skeleton": SkeletonSettings,
+    "anchor": AnchorSettings,
+    "interception": InterceptionSettings,
+    "care": CareSettings,
+    "potentials": PotentialSettings,
+    "control": ControlSettings,
+}
+Answer = Callable[[Tensor, Tensor], Tensor]  # Traffic.replan's `react`
+
+
+@dataclass
+class E2State(PriorState):
+    """B attacked scenes.
+
+    eta [B]; near, far [B] int64: the most near and far agents of a coalition; coalition [B, V]: C*; target [B, V]
+    int64: whom each member acts on (0 the ego, -1 none); off_lane [B, V]: on an interception instead of its lane;
+    committed [B, V]: with a proposal, knots [B, V, KNOTS]: its accelerations [m/s^2]; path_kl, anchor_jump [B, V]: path
+    KL of the control and energy of anchoring since the start.
+    """
+
+    eta: Tensor
+    near: Tensor
+    far: Tensor
+    coalition: Tensor
+    target: Tensor
+    off_lane: Tensor
+    committed: Tensor
+    knots: Tensor
+    path_kl: Tensor
+    anchor_jump: Tensor
+
+
+class E2(NominalTraffic):
+    """The guided reverse SDE with a sparse coalition, on a frozen prior."""
+
+    adversarial = True
+    follows_template = True
+    figures = ("anchor_jump",)
+
+    def __init__(
+        self,
+        prior: Prior,
+        knowledge: str = "predicted",
+        prediction: str = "prior",
+        responsibility: str = "full",
+        support: str = "feasible",
+        reselect: int = 2,
+        **parts: Mapping,
+    ) -> None:
+        """knowledge, prediction: see NominalTraffic; responsibility: of RESPONSIBILITIES; support: whom the coalition
+        is chosen from: feasible (S = S_top and F), topology (S_top alone) or random (as many as there are near agents),
+        the ablations of table 2; reselect: replans after which a coalition that can no longer meet its targets is
+        chosen anew, 0: never; parts: settings of PARTS (conf/synthesizer/e2.yaml).
+
+        Raises InputError for settings that do not fit.
+        """
+        super().__init__(prior, knowledge, prediction)
+        check_choice("synthesizer.support", support, SUPPORTS)
+        check_choice("synthesizer.responsibility", responsibility, RESPONSIBILITIES)
+        unknown = sorted(set(parts) - set(PARTS))
+        if unknown:
+            raise InputError(f"synthesizer.{unknown[0]}: no setting of e2; compare conf/synthesizer/e2.yaml")
+        settings: dict[str, Any] = {
+            name: settings_of(part, parts.get(name, {}), f"synthesizer.{name}") for name, part in PARTS.items()
+        }
+        self.topology: TopologySettings = settings["topology"]
+        self.feasibility: FeasibilitySettings = settings["feasibility"]
+        self.skeleton: SkeletonSettings = settings["skeleton"]
+        self.anchor: AnchorSettings = settings["anchor"]
+        self.interception: InterceptionSettings = settings["interception"]
+        self.care: CareSettings = settings["care"]
+        self.potentials: PotentialSettings = settings["potentials"]
+        self.control: ControlSettings = settings["control"]
+        self.responsibility, self.support, self.reselect, self.settings = responsibility, support, reselect, settings
+        self.statistics: dict[str, float] = {}  # of the language-model reasoner
+        self.feasible_vehicles = build_reasoner(settings["reasoner"], self.statistics)
+        self.queries_ego = self.control.lookahead > 0
+        if self.queries_ego and knowledge != "plan":
+            raise InputError(
+                f"synthesizer.control.lookahead={self.control.lookahead}: it asks the ego's own policy, which a black "
+                "box does not answer; set synthesizer.knowledge=plan, or lookahead 0"
+            )
+        self._react: Answer | None = None
+
+    def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor, template: Tensor | None = None) -> E2State:
+        """States of scenes [B] with routes drawn from the prior and nobody under control; template [B]: causal
+        templates that limit the coalitions, None: full for all."""
+        near, far = limits_of(torch.full_like(seed, FULL) if template is None else template, self.skeleton)
+        nominal = super().reset(scenes, seed, eta)
+        none, zero = torch.zeros_like(nominal.routed.parked), torch.zeros_like(nominal.routed.length)
+        return E2State(
+            **vars(nominal),
+            eta=eta,
+            near=near,
+            far=far,
+            coalition=none,
+            target=none.long() - 1,
+            off_lane=none,
+            committed=none,
+            knots=zero[..., None].repeat(1, 1, KNOTS),
+            path_kl=zero,
+            anchor_jump=zero,
+        )
+
+    def replan(
+        self, state: E2State, world: World, ego_plan: Tensor, react: Answer | None = None
+    ) -> tuple[E2State, TrafficPlan]:
+        """States and plans of the coming HORIZON steps; react: see Traffic.queries_ego."""
+        self._react = react
+        state, plan = super().replan(state, world, ego_plan)
+        figures = {"anchor_jump": state.anchor_jump}
+        found = {"adversary": state.coalition, "target": state.target, "path_kl": state.path_kl}
+        return state, replace(plan, **found, figures=figures)
+
+    def replan_group(
+        self, state: E2State, world: World, ego_plan: Tensor, noise: Tensor, group: Group
+    ) -> tuple[E2State, Tensor, Context]:
+        """State, guided joint sample x0 [G, V, SIZE] and context of a group."""
+        state = replace(state, lane=self.lane_now(state, world, ego_plan))
+        if not bool((state.eta > 0).any()):
+            context = self.encode(state, world, ego_plan)
+            return state, self.prior.sample(context, noise).x0, context
+        world = replace(world, route=state.routed.route)
+        state, anchor = self._reselected(state, world, ego_plan)
+        off_lane = anchor.off_lane & state.coalition & (state.eta > 0)[:, None]
+        state = self._onto(state, world, state.routed.route, off_lane, anchor.off_lane_path)
+        context = self.encode(state, world, ego_plan)
+        context.obstacles.duty = duty_of(self.responsibility, self.care, world, state.coalition, state.eta)
+        control = self._control(state, self._potential_context(state, world, ego_plan), anchor, group)
+        sample = self.prior.sample(context, noise, control, self._budget(state))
+        kl, jump = state.path_kl + sample.kl, state.anchor_jump + control.jump
+        acts = anchor.feasible & state.coalition
+        state = replace(state, path_kl=kl, anchor_jump=jump, committed=acts, knots=anchor.knots)
+        return state, sample.x0, context
+
+    def _budget(self, state: E2State) -> Tensor | None:
+        """Path KL [B] that control may still add to each scene."""
+        limit = self.control.transport_budget
+        return None if limit is None else (limit - state.path_kl.sum(-1)).clamp(min=0)
+
+    def _reselected(self, state: E2State, world: World, ego_plan: Tensor) -> tuple[E2State, Anchor]:
+        """States and anchors, with a new coalition in scenes whose choice is due and in which no member of the present
+        coalition can meet its target any more."""
+        due = state.replans == 0
+        if self.reselect > 0:
+            due = due | (state.replans % self.reselect == 0)
+        anchor = self._anchor(state, world, ego_plan)
+        rows = (due & (state.eta > 0) & ~anchor.feasible.any(1)).nonzero().squeeze(-1)
+        if not len(rows):
+            return state, anchor
+        there = take_rows(world, rows)
+        chosen = self._select(take_rows(state, rows), there, ego_plan[rows])
+        found = self._anchor(chosen, replace(there, route=chosen.routed.route), ego_plan[rows])
+        return put_rows(state, rows, chosen), put_rows(anchor, rows, found)
+
+    def _anchor(self, state: E2State, world: World, ego_plan: Tensor) -> Anchor:
+        """Proposals for the present coalition on its present routes; whom the ego follows keeps its last one."""
+        depth = chain_depth(state.target)
+        if self.responsibility == "full":
+            depth = depth.masked_fill(leading(world, depth.shape[1]), 0)
+        count = state.replans  # chains and source of a skeleton, which proposals do not read
+        skeleton = Skeleton(state.coalition, state.target, depth, depth == 1, depth > 1, count, count)
+        anchor = self._propose(skeleton, state, world, ego_plan, keep_route=True)
+        return self._held(anchor, state, world) if self.responsibility == "full" else anchor
+
+    def _held(self, anchor: Anchor, state: E2State, world: World) -> Anchor:
+        """The anchor in which members that can no longer meet the ego go on with their last proposal while they are
+        ahead of it: they have come into its way by then."""
+        ahead = place_of(world, state.coalition.shape[1])[0][..., 0] > 0
+        hold = state.coalition & ~anchor.feasible & state.committed & ahead
+        later = torch.cat([state.knots[..., 1:], state.knots[..., -1:]], -1)
+        return replace(
+            anchor,
+            feasible=anchor.feasible | hold,
+            knots=torch.where(hold[..., None], later, anchor.knots),
+            route=torch.where(hold, state.routed.route, anchor.route),
+            off_lane=torch.where(hold, state.off_lane, anchor.off_lane),
+            off_lane_path=torch.where(hold[..., None, None], state.routed.points, anchor.off_lane_path),
+        )
+
+    def _propose(
+        self, skeleton: Skeleton, state: E2State, world: World, ego_plan: Tensor, keep_route: bool = False
+    ) -> Anchor:
+        settings = self.anchor, self.interception
+        lawful = self.responsibility == "full"
+        return propose(world.scene, world, skeleton, ego_plan, *settings, state.eta, keep_route, lawful)
+
+    def _select(self, state: E2State, world: World, ego_plan: Tensor) -> E2State:
+        """Topology on a reference rollout, feasibility, skeleton; the coalition takes the routes that meet targets."""
+        scene, vehicles = world.scene, state.routed.route.shape[1]
+        context = self.encode(state, world, ego_plan)
+        nominal = self.prior.plan(self.prior.estimate(context), context)
+        reference = torch.cat([ego_plan[:, None], nominal.states()[:, 1:]], 1).transpose(1, 2)
+        valid = world.valid[:, None, :vehicles] & nominal.on_map.transpose(1, 2)
+        found = topological_candidates(reference, valid, scene["size"][:, :vehicles], self.topology)
+        feasible = self.feasible_vehicles(scene, world, self.feasibility).mask
+        steps = round(self.skeleton.step / DT)
+        expected = reference[:, steps - 1 :: steps].transpose(1, 2)
+        support, fallback = self._support(state, world, found.candidates, feasible)
+        if self.responsibility == "full":  # planners know how to follow: leaders that brake hard find next to nothing
+            support, fallback = (chosen & ~leading(world, vehicles) for chosen in (support, fallback))
+        anchor = self._propose(direct(support | fallback), state, world, ego_plan)  # its cost chooses the near agents
+        limits = state.near, state.far
+        skeleton = build_skeleton(scene, world, support, fallback, self.skeleton, expected, anchor.cost, limits)
+        if bool(skeleton.far.any()):  # otherwise everybody meets the ego, as just proposed
+            anchor = self._propose(skeleton, state, world, ego_plan)
+        # Infeasible configurations are pruned (Sec. IV-A3): members without a proposal, and whoever acts through them.
+        members = skeleton.coalition & (state.eta > 0)[:, None]
+        acts = members & anchor.feasible
+        if self.skeleton.pursuit:  # where nobody can meet its target yet, V_adv alone brings them nearer
+            acts = torch.where(acts.any(1, keepdim=True), acts, members)
+        for _ in range(self.skeleton.max_chain - 1):
+            acts = acts & ((skeleton.target <= 0) | acts.gather(1, skeleton.target.clamp(min=0)))
+        state = replace(state, coalition=acts, target=torch.where(acts, skeleton.target, -1))
+        if self.on_selection:
+            moments = (DT * (found.steps + 1)).expand(len(reference), -1)
+            chosen = (found.candidates, feasible, state.coalition, state.target)
+            at = reference[:, found.steps]
+            self.on_selection(Selection(state.seed, world.step, at, moments, found.weights, *chosen))
+        return self._onto(
+            state, world, torch.where(acts, anchor.route, state.routed.route), acts & False, anchor.off_lane_path
+        )
+
+    def _support(self, state: E2State, world: World, candidates: Tensor, feasible: Tensor) -> tuple[Tensor, Tensor]:
+        """S [B, V] and who may take its place where it is empty, by `support` (Sec. IV-A2)."""
+        if self.support == "random":
+            there = world.valid[:, : feasible.shape[1]] & ~state.routed.parked
+            there = there & (torch.arange(feasible.shape[1], device=there.device) > 0)
+            draw = noise_of(state.seed, SUPPORT + state.replans, tuple(feasible.shape[1:]), uniform=True)
+            rank = draw.masked_fill(~there, torch.inf).argsort(-1).argsort(-1)
+            chosen = there & (rank < state.near[:, None])
+            return chosen, chosen
+        return (candidates, candidates) if self.support == "topology" else (candidates & feasible, feasible)
+
+    def _onto(self, state: E2State, world: World, route: Tensor, off_lane: Tensor, paths: Tensor) -> E2State:
+        """States with vehicles moved to candidates route [B, V], or, off_lane [B, V], to paths [B, V, P, 2], with their
+        poses on them; a vehicle that was off its lane and no longer is returns to its route."""
+        changed = (route != state.routed.route) | off_lane | state.off_lane
+        if not bool(changed.any()):
+            return state
+        routed = reroute(state.routed, world.scene, route, changed, off_lane, paths, self.prior.free_space)
+        old = state.lane
+        moved = locate(world.states[:, : route.shape[1]], old.a, old.kappa * old.v, routed.points)
+        return replace(state, routed=routed, lane=select(changed, moved, old), off_lane=off_lane)
+
+    def _potential_context(self, state: E2State, world: World, ego_plan: Tensor) -> PotentialContext:
+        vehicles, routed = state.routed.route.shape[1], state.routed
+        now = world.states[:, :vehicles], state.lane.a, world.valid[:, :vehicles]
+        return PotentialContext(world.scene, *now, routed.points, routed.has_lane, ego_plan[:, :HORIZON], state.target)
+
+    def _control(self, state: E2State, context: PotentialContext, anchor: Anchor, group: Group) -> SparseControl:
+        literal = noise_of(state.seed, LITERAL + state.replans, (*state.target.shape[1:], SIZE))
+        react = None if self._react is None else partial(self._react, group.rows)
+        return SparseControl(
+            self.prior,
+            self.control,
+            self.potentials,
+            context,
+            state.coalition,
+            state.eta,
+            anchor,
+            self.anchor.strength,
+            literal,
+            react,
+        )

@@ -1,0 +1,179 @@
+"""Semantic feasibility (Sec. IV-A2): the vehicles that could come into conflict with the ego, by rules on the scene."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from e2rl.run.settings import check_range
+from e2rl.scenes.drivable_area import off_road
+from e2rl.scenes.route import interpolate, project
+from e2rl.sim.mission import mission_of
+from e2rl.sim.world import World
+from e2rl.traffic.e2.motion import MAX_ACCELERATION, arrival_window, direction, frenet_pose
+
+EGO_ACCELERATION = 2.0  # m/s^2 that the ego is expected to use at most
+SAMPLE_SPACING = 3.0  # m between the points of two routes that are compared
+SAMPLE_REACH = 120.0  # m of route ahead that is sampled
+SEPARATION_COST = 10.0  # s of time gap that 1 m between the routes weighs: they meet where they touch, if they touch
+BLOCKING_MARGIN = 0.3  # m beside the ego's own width in which a standing vehicle still blocks it
+
+
+@dataclass(frozen=True)
+class FeasibilitySettings:
+    """Thresholds of the three criteria; conf/synthesizer/e2.yaml explains each."""
+
+    horizon: float = 5.0
+    lateral_bound: float = 2.0
+    heading_bound: float = 0.8
+    corridor: float = 6.0
+    moving_speed: float = 0.5
+    blocking_distance: float = 15.0
+
+    def __post_init__(self) -> None:
+        check_range("synthesizer.feasibility.horizon", self.horizon, 0.1)
+        # In a narrower corridor a crossing could fall between the samples of the two routes.
+        check_range("synthesizer.feasibility.corridor", self.corridor, 0.8 * SAMPLE_SPACING)
+
+
+@dataclass(frozen=True)
+class Conflicts:
+    """Conflict points of the candidate routes with the ego's mission route; each [B, V, R], 0 where `exists` is false.
+
+    exists: the routes meet, and both vehicles can be there at the same time within the horizon; s [m]: arc length of
+    the conflict point on the candidate; earliest, latest [s]: times at which both can be there; time_gap [s]: between
+    their arrivals at present speeds.
+    """
+
+    exists: Tensor
+    s: Tensor
+    earliest: Tensor
+    latest: Tensor
+    time_gap: Tensor
+
+
+@dataclass(frozen=True)
+class Feasibility:
+    """mask [B, V] = associated & conflicting & relevant, never the ego; conflicts: what `conflicting` rests on."""
+
+    mask: Tensor
+    associated: Tensor
+    conflicting: Tensor
+    relevant: Tensor
+    conflicts: Conflicts
+
+
+class _Samples(NamedTuple):
+    """K points ahead on each of Q routes: arc length s, xy [Q, K, 2], heading, arrival times [s] (earliest, latest, at
+    present speed), and whether the route reaches so far; each [Q, K] but xy.
+    """
+
+    s: Tensor
+    xy: Tensor
+    heading: Tensor
+    earliest: Tensor
+    latest: Tensor
+    nominal: Tensor
+    on_route: Tensor
+
+
+def _sample(route: Tensor, s: Tensor, end: Tensor, speed: Tensor, length: Tensor, acceleration: float) -> _Samples:
+    """Samples ahead of arc lengths s [Q] on routes [Q, P, 2] that end at arc lengths end [Q].
+
+    A vehicle of `length` [Q] m is at a point from when its front bumper arrives until its rear bumper has passed.
+    """
+    distance = torch.arange(0, SAMPLE_REACH + 1e-3, SAMPLE_SPACING, device=s.device)
+    arc, speed, half = s[:, None] + distance, speed[:, None], length[:, None] / 2
+    xy, heading, _ = interpolate(route, arc)
+    earliest, _ = arrival_window(distance - half, speed, acceleration)
+    _, latest = arrival_window(distance + half, speed, acceleration)
+    return _Samples(arc, xy, heading, earliest, latest, distance / speed.clamp(min=1.0), arc <= end[:, None])
+
+
+def _conflict_samples(own: _Samples, ego: _Samples, settings: FeasibilitySettings) -> tuple[Tensor, ...]:
+    """The pair of samples at which each candidate [Q] meets the mission: index on both, earliest, latest, time gap.
+
+    Of the pairs within the corridor that both vehicles can occupy at once, that of least time gap, where the routes
+    touch if they touch anywhere. The time gap is inf where there is none.
+    """
+    squared = torch.cdist(own.xy, ego.xy, compute_mode="use_mm_for_euclid_dist").square()
+    earliest = torch.maximum(own.earliest[:, :, None], ego.earliest[:, None])
+    latest = torch.minimum(own.latest[:, :, None], ego.latest[:, None]).clamp(max=settings.horizon)
+    time_gap = (own.nominal[:, :, None] - ego.nominal[:, None]).abs()
+    meets = (squared < settings.corridor**2) & (earliest <= latest)
+    meets &= own.on_route[:, :, None] & ego.on_route[:, None]
+    order = torch.arange(time_gap.shape[1], device=time_gap.device)[:, None] * 1e-3  # the first of equals
+    separation = (squared.sqrt() - SAMPLE_SPACING).clamp(min=0)
+    cost = (time_gap + order + SEPARATION_COST * separation).masked_fill(~meets, torch.inf).flatten(1)
+    pick, count = cost.argmin(-1, keepdim=True), ego.xy.shape[1]
+    values = (earliest, latest, time_gap.masked_fill(~meets, torch.inf))
+    return pick[:, 0] // count, pick[:, 0] % count, *(value.flatten(1).gather(1, pick)[:, 0] for value in values)
+
+
+def _to_intersection(points: Tensor, heading: Tensor, ego: Tensor, ego_heading: Tensor) -> Tensor:
+    """Shift [Q] in m along a route from points [Q, 2] to where its tangent crosses that of the ego's route at near
+    points `ego` [Q, 2]; 0 where they are near parallel.
+    """
+    u, w, gap = direction(heading), direction(ego_heading), ego - points
+    cross = u[..., 0] * w[..., 1] - u[..., 1] * w[..., 0]
+    crossing = cross.abs() > 0.3
+    shift = (gap[..., 0] * w[..., 1] - gap[..., 1] * w[..., 0]) / torch.where(crossing, cross, 1.0)
+    return torch.where(crossing, shift, 0.0).clamp(-SAMPLE_SPACING, SAMPLE_SPACING)
+
+
+def find_conflicts(scene: TensorDictBase, world: World, own_s: Tensor, settings: FeasibilitySettings) -> Conflicts:
+    """The conflict points of scenes [B]; own_s [B, V, R]: arc length of each vehicle on each of its candidates."""
+    vehicles = own_s.shape[1]
+    states, length, mission = world.states[:, :vehicles], scene["size"][..., 0], mission_of(scene)
+    asked = scene["route_valid"] & world.valid[:, :vehicles, None]
+    asked[:, 0] = False
+    at = b, v, r = asked.nonzero(as_tuple=True)  # padding would be most of the work
+    ego_s = project(states[:, :1, :2], mission.points)[0][:, 0]
+    ego = _sample(mission.points, ego_s, mission.end, states[:, 0, 3], length[:, 0], EGO_ACCELERATION)
+    ego = _Samples(*(value[b] for value in ego))
+    route, end = scene["route_points"][at], scene["route_length"][at]
+    own = _sample(route, own_s[at], end, states[b, v, 3], length[b, v], MAX_ACCELERATION)
+    i, j, earliest, latest, time_gap = _conflict_samples(own, ego, settings)
+    row = torch.arange(len(b), device=b.device)
+    mine, its = (row, i), (row, j)
+    conflict_s = own.s[mine] + _to_intersection(own.xy[mine], own.heading[mine], ego.xy[its], ego.heading[its])
+    found = time_gap.isfinite()
+
+    def table(value: Tensor) -> Tensor:
+        return torch.zeros_like(own_s).index_put(at, torch.where(found, value, 0.0).to(own_s.dtype))
+
+    exists = torch.zeros_like(asked).index_put(at, found)
+    return Conflicts(exists, *(table(value) for value in (conflict_s, earliest, latest, time_gap)))
+
+
+def blocks_ego(scene: TensorDictBase, world: World, settings: FeasibilitySettings) -> Tensor:
+    """Bool [B, V]: on the ego's mission route, at most blocking_distance m (bumper to bumper) ahead of it."""
+    mission = mission_of(scene)
+    vehicles = scene["route_points"].shape[1]
+    size = scene["size"][:, :vehicles]
+    s, d, _ = project(world.states[:, :vehicles, :2], mission.points)
+    gap = s - s[:, :1] - (size[..., 0] + size[:, :1, 0]) / 2
+    in_the_way = d.abs() <= (size[..., 1] + size[:, :1, 1]) / 2 + BLOCKING_MARGIN
+    return (s > s[:, :1]) & (gap <= settings.blocking_distance) & in_the_way
+
+
+def feasible_vehicles(scene: TensorDictBase, world: World, settings: FeasibilitySettings) -> Feasibility:
+    """The feasible set F of scenes [B] by the three criteria of Sec. IV-A2.
+
+    associated: on the drivable area, near and along one of its candidate routes; conflicting: a candidate has a
+    conflict point with the ego's mission; relevant: moving, or standing in the ego's way, and not parked.
+    """
+    vehicles = scene["route_points"].shape[1]
+    states = world.states[:, :vehicles].detach()
+    s, d, error = frenet_pose(states, scene["route_points"])
+    on_lane = (d.abs() <= settings.lateral_bound) & (error.abs() <= settings.heading_bound) & scene["route_valid"]
+    associated = on_lane.any(-1) & (off_road(states[..., :2], scene["field"], scene["field_origin"]) <= 0)
+    conflicts = find_conflicts(scene, world, s, settings)
+    conflicting = conflicts.exists.any(-1)
+    moving = states[..., 3] > settings.moving_speed
+    relevant = (moving | blocks_ego(scene, world, settings)) & ~scene["parked"][:, :vehicles]
+    mask = world.valid[:, :vehicles] & associated & conflicting & relevant
+    mask[:, 0] = False
+    return Feasibility(mask, associated, conflicting, relevant, conflicts)

@@ -1,0 +1,220 @@
+"""Interceptions: proposals off the lanes (Sec. IV-B1), a smooth path from a vehicle's pose to its target's path.
+
+A lane-graph proposal can only choose when a vehicle is where its lane leads, where every planner expects it. Vehicles
+that drift over, cut in or turn in early leave their lane for a few seconds. Such a path is proposed in closed form: a
+cubic from the pose to where the target will be at one of several moments, driven at one constant acceleration, on the
+drivable area, clear of everybody else, within limits of acceleration that are proportional to the intensity. The prior
+then plans along it as along any route, so what is driven stays a sample of the prior.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS
+from e2rl.prior.routes import take_route
+from e2rl.run.settings import check_range
+from e2rl.scenes.boxes import overlap
+from e2rl.scenes.drivable_area import off_road
+from e2rl.scenes.lane_graph import against_lanes
+from e2rl.scenes.recording import DT
+from e2rl.scenes.route import SPACING
+from e2rl.sim.dynamics import wrap
+from e2rl.sim.world import World
+from e2rl.traffic.e2.motion import direction, take, way_to_stop_line
+
+ENDS = 3  # directions tried at the end of a path
+SAMPLES = 17  # points of a path that are checked
+MAX_BEARING, MAX_TURN = 1.05, 1.4  # rad between heading and target, and between both ends of a path
+MAX_CURVATURE = 0.12  # 1/m, what a car's steering allows
+CLEARANCE = 0.3  # m kept to others on the path
+
+
+@dataclass(frozen=True)
+class InterceptionSettings:
+    """Limits per unit of intensity, and costs; conf/synthesizer/e2.yaml explains each."""
+
+    reach: float = 5.0
+    push: float = 1.5
+    brake: float = 1.2
+    lateral: float = 2.0
+    shoulder: float = 0.5
+    accel_cost: float = 0.2
+    lateral_cost: float = 0.2
+    time_cost: float = 0.1
+    preference: float = 2.0
+    wrong_way: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("push", "brake", "lateral", "wrong_way"):
+            check_range(f"synthesizer.interception.{name}", getattr(self, name), 0)
+        check_range("synthesizer.interception.reach", self.reach, 0, HORIZON * DT)
+
+
+class Interception(NamedTuple):
+    """path [B, M, P, 2]: a vertex every SPACING m; knots [B, M, 10]: accelerations in m/s^2; cost [B, M] in s, inf for
+    vehicles that have no interception within the limits.
+    """
+
+    path: Tensor
+    knots: Tensor
+    cost: Tensor
+
+
+class _Paths(NamedTuple):
+    """O paths of each vehicle: points and tangents [B, M, O, U, 2] at even parameters; length [B, M, O, U]: m to each
+    point; bearing, turn [B, M, O]: angles from the heading to the target and to the end; end_heading [B, M, O].
+    """
+
+    points: Tensor
+    tangents: Tensor
+    length: Tensor
+    bearing: Tensor
+    turn: Tensor
+    end_heading: Tensor
+
+
+def cubic(start: Tensor, heading: Tensor, end: Tensor, end_heading: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Points and derivatives [..., U, 2] at u [U] in [0, 1] of the cubic Hermite curve between poses [..., 2], [...].
+
+    Where one circle is tangent to both poses the curve is its arc, to a thousandth of the radius.
+    """
+    chord = end - start
+    bearing = wrap(torch.atan2(chord[..., 1], chord[..., 0]) - heading)
+    chord = chord.norm(dim=-1)[..., None] / (bearing / 2).cos().square().clamp(min=0.5)[..., None]
+    a, b = start[..., None, :], end[..., None, :]
+    m, n = (chord * direction(heading))[..., None, :], (chord * direction(end_heading))[..., None, :]
+    u = u[:, None]
+    points = (2 * u**3 - 3 * u**2 + 1) * a + (u**3 - 2 * u**2 + u) * m + (3 * u**2 - 2 * u**3) * b + (u**3 - u**2) * n
+    tangents = (6 * u**2 - 6 * u) * (a - b) + (3 * u**2 - 4 * u + 1) * m + (3 * u**2 - 2 * u) * n
+    return points, tangents
+
+
+def _paths(states: Tensor, meeting: Tensor) -> _Paths:
+    """Paths from states [B, M, 4] to meeting states [B, M, I, 4], ENDS to each: along an arc, straight at the target in
+    the end, or into the target's direction.
+    """
+    heading = states[:, :, None, 2].expand(meeting.shape[:3])
+    gap = meeting[..., :2] - states[:, :, None, :2]
+    bearing = wrap(torch.atan2(gap[..., 1], gap[..., 0]) - heading)
+    end_heading = torch.stack([heading + 2 * bearing, heading + bearing, meeting[..., 2]], -1).flatten(2)
+    heading, bearing, xy = (x.repeat_interleave(ENDS, 2) for x in (heading, bearing, meeting[..., :2]))
+    start, u = states[:, :, None, :2].expand_as(xy), torch.linspace(0, 1, SAMPLES, device=states.device)
+    points, tangents = cubic(start, heading, xy, end_heading, u)
+    length = torch.nn.functional.pad(points.diff(dim=3).norm(dim=-1).cumsum(-1), (1, 0))
+    return _Paths(points, tangents, length, bearing, wrap(end_heading - heading), end_heading)
+
+
+def _lateral(paths: _Paths, speed: Tensor, accel: Tensor) -> tuple[Tensor, Tensor]:
+    """Largest lateral acceleration [m/s^2] and curvature [1/m] (both [B, M, O]) on paths entered at speed [B, M, 1] and
+    driven at accel [B, M, O].
+    """
+    turn = wrap(torch.atan2(paths.tangents[..., 1], paths.tangents[..., 0]).diff(dim=-1))
+    curvature = (turn / paths.length.diff(dim=-1).clamp(min=0.1)).abs()
+    squared = (speed[..., None] ** 2 + 2 * accel[..., None] * paths.length[..., 1:]).clamp(min=0)
+    return (squared * curvature).amax(-1), curvature.amax(-1)
+
+
+def _within(
+    settings: InterceptionSettings, paths: _Paths, speed: Tensor, accel: Tensor, time: Tensor, eta: Tensor
+) -> Tensor:
+    """Bool [B, M, O]: paths entered at speed [B, M, 1] and driven at accel for time [B, M, O] keep the limits of
+    intensities eta [B, 1, 1]."""
+    lateral, curvature = _lateral(paths, speed, accel)
+    ok = (accel <= settings.push * eta) & (accel >= -settings.brake * eta) & (speed + accel * time >= 0)
+    ok &= (lateral <= settings.lateral * eta) & (curvature < MAX_CURVATURE)
+    return ok & (paths.bearing.abs() < MAX_BEARING) & (paths.turn.abs() < MAX_TURN)
+
+
+def _on_road(settings: InterceptionSettings, paths: _Paths, states: Tensor, scene: TensorDictBase) -> Tensor:
+    """Bool [B, M, O]: paths from states [B, M, 4] leave the drivable area by no more than the shoulder, or than now."""
+    field, origin = scene["field"], scene["field_origin"]
+    allowed = off_road(states[..., :2], field, origin).clamp(min=settings.shoulder)[..., None]
+    return off_road(paths.points, field, origin).amax(-1) <= allowed
+
+
+def _clear(paths: _Paths, travelled: Tensor, size: Tensor, others: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    """Bool [B, M, O]: after `travelled` [B, M, O, W] m of their paths (< 0: arrived) vehicles touch none of the others.
+
+    others: states [B, J, W, 4] at the same moments and sizes [B, J, 2] of everybody, and who counts [B, M, J] bool.
+    """
+    index = torch.searchsorted(paths.length.contiguous(), travelled.contiguous()).clamp(0, SAMPLES - 1)
+    index = index[..., None].expand(*index.shape, 2)
+    tangent = paths.tangents.gather(3, index)
+    heading = torch.atan2(tangent[..., 1:], tangent[..., :1])
+    pose = torch.cat([paths.points.gather(3, index), heading, torch.zeros_like(heading)], -1)
+    states, sizes, counts = others
+    boxes = (pose[:, :, :, None], (size + CLEARANCE)[:, :, None, None, None])
+    hit = overlap(*boxes, states[:, None, None], sizes[:, None, None, :, None])
+    return ~(hit & counts[:, :, None, :, None] & (travelled >= 0)[:, :, :, None]).flatten(3).any(-1)
+
+
+def intercept(
+    world: World,
+    index: Tensor,
+    target: Tensor,
+    expected: Tensor,
+    eta: Tensor,
+    settings: InterceptionSettings,
+    halt_at_red: bool = False,
+) -> Interception:
+    """The cheapest interception by each of vehicles index [B, M] of its target [B, M], at intensities eta [B].
+
+    expected [B, V, H, 4]: states of everybody at steps 1..H; on the way nobody but the target is touched.
+    halt_at_red: no path is longer than the way to a stop line that binds the vehicle now.
+    """
+    scene, vehicles = world.scene, expected.shape[1]
+    states, target_states = take(world.states, index), take(expected, target)
+    size, target_size = take(scene["size"], index), take(scene["size"], target)
+    steps = torch.arange(KNOT_STEPS, round(settings.reach / DT) + 1, KNOT_STEPS, device=states.device)
+    meeting, times = target_states[:, :, steps - 1], DT * steps
+    paths, v = _paths(states, meeting), states[:, :, None, 3]
+    time = times.repeat_interleave(ENDS).expand_as(paths.bearing)
+    # Boxes that move alike touch before their centres meet.
+    alike = wrap(paths.end_heading - meeting[..., 2].repeat_interleave(ENDS, -1)).cos().clamp(min=0) ** 2
+    length = paths.length[..., -1] - 0.4 * (size[..., 0] + target_size[..., 0])[..., None] * alike
+    accel = 2 * (length.clamp(min=0) - v * time) / time**2
+    ok = _within(settings, paths, v, accel, time, eta[:, None, None])
+    ok &= _on_road(settings, paths, states, scene)
+    if halt_at_red:
+        assert world.route is not None
+        ok &= paths.length[..., -1] <= way_to_stop_line(world, index, take(world.route, index)[..., None].clamp(min=0))
+    travelled = (v[..., None] * times + 0.5 * accel[..., None] * times**2).clamp(min=0)
+    travelled = travelled.masked_fill(times >= time[..., None], -1.0)
+    row = torch.arange(vehicles, device=index.device)
+    counts = world.valid[:, None, :vehicles] & (row != index[..., None]) & (row != target[..., None])
+    ok &= _clear(paths, travelled, size, (expected[:, :, steps - 1], scene["size"][:, :vehicles], counts))
+    cost = settings.accel_cost * accel.abs() + settings.lateral_cost * _lateral(paths, v, accel)[0]
+    cost = cost + settings.time_cost * time
+    if settings.wrong_way > 0:
+        against = _against_lanes(scene, meeting, paths.end_heading)
+        cost = torch.where(against, cost + settings.wrong_way, cost)
+    cost, pick = (cost - settings.preference).masked_fill(~ok, torch.inf).min(-1)
+    knot_times = DT * KNOT_STEPS * torch.arange(1, HORIZON // KNOT_STEPS + 1, device=cost.device)
+    knots = take_route(accel, pick)[..., None] * (knot_times <= take_route(time, pick)[..., None])
+    points, length, heading = (take_route(x, pick) for x in (paths.points, paths.length, paths.end_heading))
+    return Interception(_resampled(points, length, heading, scene["route_points"].shape[3]), knots, cost)
+
+
+def _against_lanes(scene: TensorDictBase, meeting: Tensor, end_heading: Tensor) -> Tensor:
+    """Bool [B, M, O]: paths end at meeting states [B, M, I, 4] with end_heading [B, M, O] against the lanes there."""
+    batch, count, moments = meeting.shape[:3]
+    heading = end_heading.reshape(batch, count * moments, ENDS)
+    xy = meeting[..., :2].flatten(1, 2)
+    return against_lanes(scene["lane_points"], scene["lane_index"], xy, heading).view_as(end_heading)
+
+
+def _resampled(points: Tensor, length: Tensor, heading: Tensor, count: int) -> Tensor:
+    """Vertices [B, M, count, 2] every SPACING m along polylines points [B, M, U, 2] of cumulative length [B, M, U],
+    then straight on along heading [B, M].
+    """
+    s = SPACING * torch.arange(count, device=points.device, dtype=points.dtype).expand(*length.shape[:2], count)
+    after = torch.searchsorted(length.contiguous(), s.contiguous(), right=True).clamp(1, SAMPLES - 1)
+    low, high = length.gather(-1, after - 1), length.gather(-1, after)
+    share = ((s - low) / (high - low).clamp(min=1e-6)).clamp(max=1.0)
+    a, b = (points.gather(2, i[..., None].expand(*i.shape, 2)) for i in (after - 1, after))
+    beyond = (s - length[..., -1:]).clamp(min=0)
+    return a + share[..., None] * (b - a) + beyond[..., None] * direction(heading)[:, :, None]

@@ -1,0 +1,243 @@
+"""The potentials of the control, eq. (potential_decomp): V_feas of every vehicle, V_adv of the coalition.
+
+Both take decoded states [B, V, H', 4] (x, y [m], heading [rad], speed [m/s]) at SAMPLED_STEPS of a plan and return one
+value per vehicle, [B, V]. In a vehicle's own term everybody else is detached: the ego is a black box, targets are not
+drawn to their pursuers, and the gradient of row i is that of V_i alone. Gradients are finite everywhere.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from e2rl.run.settings import check_range
+from e2rl.scenes.boxes import to_frame
+from e2rl.scenes.drivable_area import off_road
+from e2rl.scenes.recording import DT
+from e2rl.scenes.route import interpolate, project
+from e2rl.sim.dynamics import wrap
+from e2rl.traffic.e2.motion import direction
+
+STRIDE = 5  # steps between the states of a plan that the potentials look at
+SAMPLED_STEPS = slice(STRIDE - 1, None, STRIDE)
+LENGTH = 2.0  # m: unit of distances in V_adv, so that eta of 0 to 3 is a usable dial
+CLOSING = 10.0  # m/s: unit of the closing speed in V_adv
+DISKS = 3  # that stand for a vehicle against another's box
+NEIGHBOURS = 6  # nearest vehicles looked at
+NEAR = 5.0  # m: pairs that stay farther apart cost nothing
+MAX_EXCESS = 5.0  # m: excesses of offset and of distance off the road are cut there
+
+
+@dataclass(frozen=True)
+class PotentialSettings:
+    """Weights and shapes of the terms; conf/synthesizer/e2.yaml explains each."""
+
+    off_road: float = 1.0
+    off_road_margin: float = 0.3
+    lateral: float = 0.1
+    lateral_bound: float = 1.0
+    pair: float = 1.0
+    pair_margin: float = 0.3
+    accel: float = 0.5
+    min_accel: float = -3.5
+    max_accel: float = 2.0
+    max_lateral_accel: float = 4.0
+    jerk: float = 1.0
+    max_jerk: float = 2.0
+    wrong_way: float = 0.1
+    distance: float = 1.0
+    narrow: float = 0.5
+    wide: float = 3.0
+    ttc: float = 0.5
+    ttc_time: float = 1.0
+    ttc_miss: float = 1.0
+    impact_speed: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("narrow", "wide", "ttc_time", "ttc_miss"):
+            check_range(f"synthesizer.potentials.{name}", getattr(self, name), 1e-3)
+
+
+@dataclass(frozen=True)
+class PotentialContext:
+    """What stays fixed while a plan is denoised.
+
+    scene [B]; start [B, V, 4] and accel [B, V]: present states and accelerations; valid [B, V]; route [B, V, P, 2]: the
+    path each vehicle follows, on_route [B, V]: it has one; ego_plan [B, H, 4]; target [B, V] int64: the vehicle that
+    each of the coalition acts on, -1 for all others.
+    """
+
+    scene: TensorDictBase
+    start: Tensor
+    accel: Tensor
+    valid: Tensor
+    route: Tensor
+    on_route: Tensor
+    ego_plan: Tensor
+    target: Tensor
+
+    @cached_property
+    def start_frenet(self) -> tuple[Tensor, Tensor]:
+        """Arc length and lateral offset [B, V] of the present states on the route."""
+        s, d, _ = project(self.start[:, :, None, :2], self.route)
+        return s[..., 0], d[..., 0]
+
+    @cached_property
+    def start_off_road(self) -> Tensor:
+        """Metres [B, V] off the drivable area at present."""
+        return off_road(self.start[..., :2], self.scene["field"], self.scene["field_origin"])
+
+
+def annealed_temperature(noise_level: Tensor | float, settings: PotentialSettings) -> Tensor:
+    """Soft-min temperature [m] at a noise level in [0, 1]: geometric from `narrow` at 0 to `wide` at 1.
+
+    A wide soft-min is felt by adversaries that are still far away; a narrow one picks the moment of contact.
+    """
+    level = torch.as_tensor(noise_level, dtype=torch.float32).clamp(0, 1)
+    return settings.narrow * (settings.wide / settings.narrow) ** level
+
+
+def _length(vector: Tensor) -> Tensor:
+    """Length [...] of vector [..., 2] with a finite gradient (0) at 0."""
+    return (vector.square().sum(-1) + 1e-6).sqrt() - 1e-3
+
+
+def _velocity(states: Tensor) -> Tensor:
+    return states[..., 3:] * direction(states[..., 2])
+
+
+def box_gap(states: Tensor, size: Tensor, other: Tensor, other_size: Tensor, disks: int = DISKS) -> Tensor:
+    """Signed gap [...] [m] between a vehicle as `disks` disks and another as an oriented box; < 0 where they overlap.
+
+    states, other [..., 4], sizes [..., 2], leading dims broadcast. The disks are as wide as the vehicle and lie along
+    its centreline from bumper to bumper; the gap is that of the nearest one.
+    """
+    along = torch.linspace(-0.5, 0.5, disks, device=states.device)
+    shift = (size[..., :1] - size[..., 1:]).clamp(min=0) * along
+    centres = states[..., None, :2] + shift[..., None] * direction(states[..., 2])[..., None, :]
+    local = to_frame(centres, other[..., None, :]).abs() - other_size[..., None, :] / 2
+    outside = _length(local.clamp(min=0))
+    return (outside + local.amax(-1).clamp(max=0)).amin(-1) - size[..., 1] / 2
+
+
+def _neighbours(states: Tensor, context: PotentialContext, size: Tensor) -> tuple[Tensor, Tensor]:
+    """Index and mask [B, V, Q] of the vehicles that come nearest to each; adversary and target are no neighbours."""
+    xy = states[..., :2].detach().transpose(1, 2)
+    radius = size.norm(dim=-1) / 2
+    gap = torch.cdist(xy, xy).amin(1) - radius[:, :, None] - radius[:, None]
+    pursues = context.target[..., None] == torch.arange(gap.shape[-1], device=gap.device)
+    both = context.valid[:, :, None] & context.valid[:, None]
+    itself = torch.eye(gap.shape[-1], dtype=torch.bool, device=gap.device)
+    gap = gap.masked_fill(~both | pursues | pursues.transpose(1, 2) | itself, torch.inf)
+    count = min(NEIGHBOURS, max(int((gap < NEAR).sum(-1).max()), 1))
+    gap, index = gap.topk(count, largest=False)
+    return index, gap < NEAR
+
+
+def _overlap_term(states: Tensor, context: PotentialContext, settings: PotentialSettings) -> Tensor:
+    """Squared shortfall of the gap to each neighbour [m^2], mean over steps, summed over neighbours [B, V].
+
+    The gap that is asked for is at most the present one.
+    """
+    size = context.scene["size"][:, : states.shape[1]]
+    index, near = _neighbours(states, context, size)
+    scene, own, rank = near.nonzero(as_tuple=True)  # most of the nearest are too far to cost anything
+    mine, them = (scene, own), (scene, index[scene, own, rank])
+    gap = box_gap(states[mine], size[mine][:, None], states.detach()[them], size[them][:, None])
+    present = box_gap(context.start[mine], size[mine], context.start[them], size[them])
+    missing = (present.clamp(max=settings.pair_margin)[:, None] - gap).clamp(min=0).square().mean(-1)
+    return torch.zeros_like(states[..., 0, 0]).index_put(mine, missing, accumulate=True)
+
+
+def _road_terms(states: Tensor, context: PotentialContext, settings: PotentialSettings) -> Tensor:
+    """Weighted off-road, lateral and wrong-way terms [B, V]; what is no worse than at present costs nothing."""
+    scene = context.scene
+    beyond = off_road(states[..., :2], scene["field"], scene["field_origin"])
+    allowed = context.start_off_road.clamp(min=-settings.off_road_margin)[..., None]
+    off_road_term = (beyond - allowed).clamp(0, MAX_EXCESS).square().mean(-1)
+    s, d = context.start_frenet
+    with torch.no_grad():
+        track = torch.cat([context.start[:, :, None, :2], states[..., :2]], 2)
+        hint = s[..., None] + track.diff(dim=2).norm(dim=-1).cumsum(-1)
+        xy, heading, _ = interpolate(context.route, project(track[:, :, 1:], context.route, hint, 10.0)[0])
+    cos, sin = heading.cos(), heading.sin()
+    delta = states[..., :2] - xy
+    offset = (cos * delta[..., 1] - sin * delta[..., 0]).abs()
+    bound = d[..., None].abs().clamp(min=settings.lateral_bound)
+    lateral_term = (offset - bound).clamp(0, MAX_EXCESS).square().mean(-1)
+    wrong_way_term = ((-(states[..., 2] - heading).cos()).clamp(min=0) * states[..., 3]).mean(-1)
+    on_route = settings.lateral * lateral_term + settings.wrong_way * wrong_way_term
+    return settings.off_road * off_road_term + on_route * context.on_route
+
+
+def _motion_terms(states: Tensor, context: PotentialContext, settings: PotentialSettings) -> Tensor:
+    """Weighted squared excess of accelerations [m/s^2] and jerk [m/s^3] over their bounds [B, V]."""
+    step = STRIDE * DT
+    track = torch.cat([context.start[:, :, None], states], 2)
+    accel = torch.diff(track[..., 3], dim=-1) / step
+    yaw_rate = wrap(torch.diff(track[..., 2], dim=-1)) / step
+    lateral = yaw_rate.abs() * track[..., 1:, 3]
+    excess = (accel - settings.max_accel).clamp(min=0).square() + (settings.min_accel - accel).clamp(min=0).square()
+    excess = excess + (lateral - settings.max_lateral_accel).clamp(min=0).square()
+    jerk = torch.diff(torch.cat([context.accel[..., None], accel], -1), dim=-1) / step
+    rough = (jerk.abs() - settings.max_jerk).clamp(min=0).square()
+    return settings.accel * excess.mean(-1) + settings.jerk * rough.mean(-1)
+
+
+def _with_ego(states: Tensor, context: PotentialContext) -> Tensor:
+    """Sampled states [B, V, H', 4] with the ego's detached plan in row 0."""
+    ego = context.ego_plan[:, None, SAMPLED_STEPS].detach()
+    return torch.cat([ego[:, :, : states.shape[2]], states[:, 1:]], 1)
+
+
+def feasibility_potential(states: Tensor, context: PotentialContext, settings: PotentialSettings) -> Tensor:
+    """V_feas [B, V] of decoded states [B, V, H', 4] at SAMPLED_STEPS; 0 for the ego and for absent vehicles.
+
+    Terms: off-road, lateral offset, overlap with others (except between an adversary and its target), acceleration,
+    jerk, wrong way.
+    """
+    states = _with_ego(states, context)
+    road, motion = _road_terms(states, context, settings), _motion_terms(states, context, settings)
+    value = road + motion + settings.pair * _overlap_term(states, context, settings)
+    counted = context.valid.clone()
+    counted[:, 0] = False
+    return torch.where(counted, value, 0.0)
+
+
+def ttc_cost(offset: Tensor, closing: Tensor, time_scale: float = 1.0, miss_scale: float = 1.0) -> Tensor:
+    """exp(-t^2 / (2 time_scale^2) - d^2 / (2 miss_scale^2)) [...] of the closest approach, t s from now and d m apart.
+
+    offset, closing [..., 2]: relative position [m] and velocity [m/s], assumed constant. Near 0 for a stopped pair, 1
+    on contact at the centres.
+    """
+    time = (-(offset * closing).sum(-1) / (closing.square().sum(-1) + 1e-6)).clamp(min=0)
+    miss = offset + closing * time[..., None]
+    return torch.exp(-0.5 * (time / time_scale) ** 2 - 0.5 * miss.square().sum(-1) / miss_scale**2)
+
+
+def adversarial_potential(
+    states: Tensor, context: PotentialContext, settings: PotentialSettings, temperature: Tensor | float | None = None
+) -> Tensor:
+    """V_adv [B, V] of decoded states [B, V, H', 4] at SAMPLED_STEPS: low where a vehicle meets its own target.
+
+    Soft minimum over time of the distance between the centres (temperature in m, default `narrow`), TTC cost and
+    closing speed, all against the detached target. 0 outside the coalition.
+    """
+    states = _with_ego(states, context)
+    index = context.target.clamp(min=0)
+    target = states.detach().gather(1, index[..., None, None].expand_as(states))
+    offset, closing = target[..., :2] - states[..., :2], _velocity(target) - _velocity(states)
+    distance = _length(offset)
+    temperature = settings.narrow if temperature is None else temperature
+    nearest = -temperature * (torch.logsumexp(-distance / temperature, -1) - math.log(distance.shape[-1]))
+    cost = ttc_cost(offset, closing, settings.ttc_time, settings.ttc_miss).amax(-1)
+    moment = torch.softmax(-distance.detach() / temperature, -1)
+    bearing = offset.detach() / (_length(offset.detach()) + 0.1)[..., None]
+    impact = (-(closing * bearing).sum(-1).clamp(-2 * CLOSING, 2 * CLOSING) * moment).sum(-1) / CLOSING
+    value = settings.distance * nearest / LENGTH + settings.ttc * (1 - cost) - settings.impact_speed * impact
+    acts = context.valid & (context.target >= 0) & context.valid.gather(1, index)
+    acts[:, 0] = False
+    return torch.where(acts, value, 0.0)

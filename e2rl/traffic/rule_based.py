@@ -1,0 +1,142 @@
+"""IDM lane-following under the prior's acceleration bounds, with standing vehicles frozen: the baseline of a prior.
+
+Every vehicle keeps the route candidate nearest to it, returns to its centreline, and accelerates by the Intelligent
+Driver Model (Treiber et al. 2000) behind the nearest agent or red light ahead. Bounds, decoder and the end of a vehicle
+at the map's border are those of the prior (e2rl/prior/bounds.py, lane_relative.py).
+
+Log replay: vehicles follow their recording and are present where recorded.
+
+Constant velocity from the causal start states.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from e2rl.planners.idm_planner import LINE_GAP
+from e2rl.prior.bounds import Obstacles, apply_cap, bounded
+from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, decode, locate, select
+from e2rl.prior.prior import STANDING_SPEED, Prior
+from e2rl.prior.routes import RoutedScene, route_scene, start_state
+from e2rl.scenes.route import SPACING
+from e2rl.sim.leaders import FREE_GAP, IDMParameters, idm_acceleration, leaders
+from e2rl.sim.mission import light_state_at, stop_line_distance
+from e2rl.sim.world import World
+from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan, keep_velocity, steps_ahead
+
+
+class Replay(Traffic):
+    """The smoothed recording; a vehicle is absent in gaps of its track and after its end."""
+
+    stochastic, predicts, replays_log = False, False, True
+
+    def replan(self, state: State, world: World, ego_plan: Tensor) -> tuple[State, TrafficPlan]:
+        """Recorded states and presence of the coming steps."""
+        logged, valid = world.scene["logged"], world.scene["logged_valid"]
+        vehicles, step = world.scene["route_log"].shape[1], steps_ahead(world)
+        row, at = torch.arange(len(step), device=step.device)[:, None], step.clamp(max=logged.shape[1] - 1)
+        known = valid[row, at, :vehicles] & (step < logged.shape[1])[..., None]
+        return state, TrafficPlan(logged[row, at, :vehicles].transpose(1, 2), known.transpose(1, 2))
+
+
+class ConstantVelocity(Traffic):
+    """Start heading and start speed are kept; parked vehicles stay parked, and no vehicle leaves."""
+
+    stochastic = False
+
+    def replan(self, state: State, world: World, ego_plan: Tensor) -> tuple[State, TrafficPlan]:
+        """States at the coming steps, from the start frame on."""
+        scene, vehicles = world.scene, world.scene["route_log"].shape[1]
+        start = scene["start"][:, :vehicles].clone()
+        start[..., 3] = start[..., 3].masked_fill(scene["parked"][:, :vehicles], 0.0)
+        states = keep_velocity(start, steps_ahead(world)[:, None])
+        return state, TrafficPlan(states, world.valid[:, :vehicles, None].expand(states.shape[:-1]))
+
+
+@dataclass
+class IDMState:
+    """routed: the vehicles' routes; lane [B, V]: lane states at the end of the executed plans."""
+
+    routed: RoutedScene
+    lane: LaneState
+
+
+class IDM(Traffic):
+    """Car-following on the nearest route candidate; vehicles that stand at the start never move."""
+
+    stochastic = False
+
+    def __init__(
+        self,
+        prior: Prior,
+        headway: float = 1.5,
+        standstill_gap: float = 2.0,
+        acceleration: float = 1.0,
+        braking: float = 2.0,
+        exponent: float = 4.0,
+        speed: float = 10.0,
+    ) -> None:
+        """prior: source of the bounds; fields: conf/synthesizer/idm.yaml."""
+        self.bounds, self.speed, self.standstill_gap, self.braking = prior.bounds, speed, standstill_gap, braking
+        self.driver = IDMParameters(headway, standstill_gap, acceleration, braking, exponent)
+
+    @torch.no_grad()
+    def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> IDMState:
+        """Start states on each vehicle's nearest route candidate; the ego's route is its mission."""
+        mission = scenes["route_log"][:, :1]
+        routed = route_scene(scenes, torch.cat([mission, torch.zeros_like(scenes["route_log"][:, 1:])], 1))
+        return IDMState(routed, start_state(scenes, routed))
+
+    @torch.no_grad()
+    def replan(self, state: IDMState, world: World, ego_plan: Tensor) -> tuple[IDMState, TrafficPlan]:
+        """One acceleration for the whole plan, under the bounds of the executed part."""
+        routed = state.routed
+        vehicles = routed.route.shape[1]
+        present = world.valid[:, :vehicles]
+        lane = _with_ego(state.lane, world, routed)
+        wanted = self._wanted(routed, lane, world).clamp(min=self.bounds.floor)
+        x = (wanted / ACCEL_SCALE)[..., None].expand(*lane.v.shape, KNOTS)
+        x = torch.cat([x, x.new_zeros(*lane.v.shape, SIZE - KNOTS)], -1)
+        frozen = routed.parked | (world.scene["start"][:, :vehicles, 3] < STANDING_SPEED) | ~present
+
+        def decoded(cap: Tensor | None) -> LaneState:
+            return _held(decode(*apply_cap(cap, x, lane, self.bounds.onset), routed.points), lane, frozen)
+
+        obstacles = Obstacles(world.states, routed.size, world.valid)
+        motion = bounded(self.bounds, decoded, lane, obstacles)
+        gone = routed.open[..., None] & (motion.s >= routed.length[..., None]) & routed.has_lane[..., None]
+        plan = TrafficPlan(motion.states(), present[..., None] & ~(gone.cumsum(-1) > 0), route=routed.route)
+        return IDMState(routed, motion.map(lambda value: value[..., REPLAN_STEPS - 1])), plan
+
+    def _wanted(self, routed: RoutedScene, lane: LaneState, world: World) -> Tensor:
+        """IDM acceleration [B, V] behind the leader or the light, whichever brakes harder."""
+        vehicles = lane.v.shape[1]
+        length = routed.size[:, :vehicles, 0]
+        gap, speed, _ = leaders(lane.s, routed.points, world.states, routed.size, world.valid, lane.d)
+        gap = torch.where(gap < FREE_GAP, gap, torch.inf)
+        at = (lane.s / SPACING).round().long().clamp(0, routed.limit.shape[-1] - 1)
+        limit = routed.limit.gather(-1, at[..., None])[..., 0]
+        desired = torch.where(limit > 0, limit, world.scene["start"][:, :vehicles, 3].clamp(min=self.speed))
+        light = light_state_at(routed.light_state, routed.light, world.step)
+        brake = 2 * self.braking
+        line = stop_line_distance(light, routed.light_s - lane.s[..., None], lane.v, brake, brake)
+        line = line - length / 2 - LINE_GAP + self.standstill_gap
+        behind = idm_acceleration(lane.v, desired, gap.clamp(min=0.1), speed.clamp(min=0), self.driver, True)
+        halting = idm_acceleration(lane.v, desired, line.clamp(min=0.1), torch.zeros_like(line), self.driver, True)
+        return torch.minimum(behind, halting)
+
+
+def _with_ego(lane: LaneState, world: World, routed: RoutedScene) -> LaneState:
+    """The lane states with the ego's simulated state."""
+    accel = world.accel[:, :1]
+    now = locate(world.states[:, :1], accel, torch.zeros_like(accel), routed.points[:, :1])
+    return LaneState(**{name: torch.cat([getattr(now, name), value[:, 1:]], 1) for name, value in vars(lane).items()})
+
+
+def _held(motion: LaneState, lane: LaneState, frozen: Tensor) -> LaneState:
+    """The motion [B, V, HORIZON] with frozen [B, V] vehicles at standstill."""
+    still = lane.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
+    zero = torch.zeros_like(still.v)
+    return select(frozen, replace(still, v=zero, a=zero), motion)

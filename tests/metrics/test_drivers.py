@@ -1,0 +1,159 @@
+"""What every driver keeps to: its bounds, its delay, and no reaction where there is no conflict."""
+
+import pytest
+import torch
+
+from e2rl.metrics.drivers import (
+    DRIVERS,
+    MAX_JERK,
+    FuzzySafetyModel,
+    HumanDriver,
+    Observation,
+    RegulationLimit,
+    ResponsibilitySensitiveSafety,
+)
+from e2rl.scenes.recording import DT
+
+BOUNDS = {"human": 7.59, "regulation": 6.0, "rss": 7.59, "fsm": 6.0}
+EACH = pytest.mark.parametrize("name", DRIVERS)
+
+
+def observe(**fields):
+    """One conflict: an ego at 20 m/s, 5 m behind the overlapping rear of a vehicle at 10 m/s, unless said otherwise."""
+    values = {
+        "speed": 20.0,
+        "acceleration": 0.0,
+        "gap": 5.0,
+        "other_speed": 10.0,
+        "other_acceleration": 0.0,
+        "lateral_gap": -1.9,
+        "lateral_speed": 0.0,
+        "overlaps": True,
+        "length": 4.3,
+        "other_length": 4.3,
+    } | fields
+    values = {key: torch.as_tensor(value) for key, value in values.items()}
+    values = {k: v.double() if v.is_floating_point() else v for k, v in values.items()}
+    return Observation(**dict(zip(values, torch.broadcast_tensors(*values.values()), strict=True)))
+
+
+def nobody(**fields):
+    return observe(gap=torch.inf, lateral_gap=torch.inf, overlaps=False, **fields)
+
+
+def drive(driver, observations):
+    """Accelerations [T, ...] of a driver that sees one observation after the other."""
+    state, actions = driver.init(observations[0].speed), []
+    for observation in observations:
+        state, acceleration = driver.step(state, observation)
+        actions.append(acceleration)
+    return torch.stack(actions)
+
+
+@EACH
+def test_braking_keeps_its_bound_and_jerk_whatever_happens(name):
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(low, high):
+        return low + (high - low) * torch.rand(512, generator=generator, dtype=torch.float64)
+
+    slow = [draw(0, 30), draw(0, 20), draw(-5, 60), draw(-2, 2)]
+    observations = []
+    for _ in range(60):
+        speed, other, gap, side = (value + draw(-0.5, 0.5) for value in slow)
+        fields = {"speed": speed.clamp(min=0), "other_speed": other, "gap": gap, "lateral_gap": side}
+        observations.append(observe(**fields, acceleration=draw(-8, 3), lateral_speed=draw(-1, 2), overlaps=side <= 0))
+    action = drive(DRIVERS[name], observations)
+    assert action.isfinite().all() and (action <= 0).all()
+    assert action.min().item() == pytest.approx(-BOUNDS[name])
+    if name != "regulation":  # R157 5.2.5.2 has no build-up
+        assert (-action.diff(dim=0)).max() <= MAX_JERK * DT + 1e-9
+
+
+def test_the_human_driver_releases_the_pedal_then_brakes_ever_harder():
+    action = -drive(HumanDriver(), [observe()] * 20)
+    assert action[:8].tolist() == pytest.approx([0.4] * 8)  # 0.75 s, hence the first step from 0.8 s on
+    assert action[8:13].tolist() == pytest.approx([0.4 + 1.265 * n for n in range(1, 6)])
+    assert action[14:].tolist() == pytest.approx([7.59] * 6)
+
+
+@pytest.mark.parametrize("name, first", [("human", 8), ("regulation", 5), ("rss", 8), ("fsm", 8)])
+def test_brakes_come_after_the_delay(name, first):
+    action = -drive(DRIVERS[name], [nobody()] * 3 + [observe(gap=20.0)] * 20)[3:]
+    assert (action[:first] <= 0.4 + 1e-9).all() and (action[first:] > 1).all()
+
+
+@EACH
+def test_no_reaction_without_a_conflict(name):
+    calm = {
+        "nobody is there": nobody(),
+        "the other is faster and far": observe(other_speed=25.0, gap=60.0),
+        "the other keeps its lane": observe(lateral_gap=1.6, overlaps=False, gap=8.0),
+        "the other leaves": observe(lateral_gap=1.4, overlaps=False, lateral_speed=-0.5),
+        "the ego has passed": observe(gap=-8.0, lateral_gap=0.2, lateral_speed=0.5, overlaps=False),
+    }
+    for case, observation in calm.items():
+        assert not drive(DRIVERS[name], [observation] * 20).any(), case
+
+
+@EACH
+def test_a_reaction_ends_with_its_conflict(name):
+    action = drive(DRIVERS[name], [observe(gap=20.0)] * 15 + [nobody()] * 3)
+    assert action[14] < -1 and not action[15:].any()
+
+
+@EACH
+def test_a_batch_is_driven_as_each_of_it_alone(name):
+    gap = torch.tensor([[2.0, 9.0, 14.0], [20.0, 40.0, 90.0]])
+    together = drive(DRIVERS[name], [observe(gap=gap - t, acceleration=-0.1 * t) for t in range(20)])
+    assert together.shape == (20, 2, 3)
+    for i, j in torch.cartesian_prod(torch.arange(2), torch.arange(3)).tolist():
+        alone = drive(DRIVERS[name], [observe(gap=gap[i, j] - t, acceleration=-0.1 * t) for t in range(20)])
+        torch.testing.assert_close(together[:, i, j], alone, rtol=0, atol=1e-12)
+
+
+def test_the_human_driver_perceives_overlap_within_two_seconds_and_a_step():
+    gap = torch.tensor([20.9, 21.1])
+    assert drive(HumanDriver(), [observe(gap=gap)])[0].tolist() == pytest.approx([-0.4, 0])
+    aside = {"overlaps": False, "lateral_gap": torch.tensor([1.2, 1.3]), "lateral_speed": 0.5}
+    assert not drive(HumanDriver(), [observe(**aside)]).any()
+    assert drive(HumanDriver(perception_gap=1.225), [observe(**aside)])[0].tolist() == pytest.approx([-0.4, 0])
+
+
+def test_the_regulation_judges_once_at_the_intrusion():
+    limit = 10 * (10 / 12 + 0.35)
+    gap = torch.tensor([limit - 0.1, limit + 0.1])
+    steps = [observe(gap=gap, lateral_gap=0.4, lateral_speed=0.5, overlaps=False)] + [observe(gap=gap + 50)] * 10
+    assert drive(RegulationLimit(), steps)[-1].tolist() == pytest.approx([0, -6])
+
+
+def test_rss_brakes_within_both_safe_distances():
+    rss = ResponsibilitySensitiveSafety()
+    ahead = rss.safe_distance(torch.tensor(20.0), torch.tensor(10.0)).item()
+    assert ahead == pytest.approx(15 + 3 * 0.75**2 / 2 + 22.25**2 / 15.18 - 100 / 15.18, abs=1e-4)
+    aside = rss.safe_lateral_distance(torch.tensor([0.5, -2.0])).tolist()
+    assert aside == pytest.approx([0.3 + 0.375 + 0.75**2 / 2 + 1.25**2 / 2, 0.3])
+    gap, side = torch.tensor([ahead - 1, ahead - 1, ahead + 1]), torch.tensor([aside[0] - 0.1, aside[0] + 0.1, 0.0])
+    danger = observe(gap=gap, lateral_gap=side, lateral_speed=0.5, overlaps=False)
+    assert (drive(rss, [danger] * 10)[-1] < 0).tolist() == [True, False, False]
+
+
+def test_fuzzy_metrics_are_linear_between_unsafe_and_safe():
+    fsm = FuzzySafetyModel()
+    speed, other = torch.tensor(20.0), torch.tensor(10.0)
+    unsafe, safe = 15 - 100 / 14 + 400 / 12, 15 - 100 / 14 + 400 / 8 + 2
+    gap = 2 + torch.tensor([unsafe - 1, unsafe, (unsafe + safe) / 2, safe, safe + 1])
+    assert fsm.proactive(gap, speed, other).tolist() == pytest.approx([1, 1, 0.5, 0, 0], abs=1e-5)
+    unsafe, safe = 7.5 + 100 / 12, 7.5 + 100 / 8
+    gap = torch.tensor([unsafe - 1, unsafe, (unsafe + safe) / 2, safe, safe + 1])
+    assert fsm.critical(gap, speed, torch.tensor(0.0), other).tolist() == pytest.approx([1, 1, 0.5, 0, 0], abs=1e-5)
+    # Braking by 4 m/s^2 makes 12 m/s as slow as the other within the reaction: 2 m / 8 decide.
+    gap = torch.tensor([0.4, 0.6])
+    assert fsm.critical(gap, torch.tensor(12.0), torch.tensor(-9.0), other).tolist() == [1, 0]
+
+
+def test_fsm_anticipates_who_comes_over_before_the_ego_has_passed():
+    gap, side, sideways = torch.tensor([10.0, 10.0, 10.0]), torch.tensor([1.6, 1.6, 1.6]), torch.tensor([0.9, 0.8, 0.0])
+    observation = observe(gap=gap, lateral_gap=side, lateral_speed=sideways, overlaps=False)
+    # The ego needs 18.6 m / 10 m/s = 1.86 s to pass, with 0.1 s of margin 1.96 s; the other 1.78 s, 2 s or for ever.
+    assert (drive(FuzzySafetyModel(), [observation] * 10)[-1] < 0).tolist() == [True, False, False]

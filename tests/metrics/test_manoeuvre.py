@@ -1,0 +1,73 @@
+"""Manoeuvres obey the simulator's limits, follow routes and shift to where their knots say."""
+
+import torch
+
+from e2rl.metrics.manoeuvre import accelerations, execute, knot_count, knots_of, peak_acceleration, shifts
+from e2rl.scenes.route import SPACING, project
+from e2rl.sim import dynamics
+from e2rl.sim.env import SimSettings
+
+LIMITS = SimSettings(max_acceleration=5.0, max_braking=8.0, max_yaw_rate=1.6)
+STEPS = 80
+KNOTS = knot_count(STEPS)
+START = torch.tensor([0.0, 0.0, 0.0, 8.0])
+
+
+def arc(radius):
+    """A route [P, 2] that begins in the origin towards +x and bends left with a radius [m]."""
+    angle = SPACING * torch.arange(150) / radius
+    return radius * torch.stack([angle.sin(), 1 - angle.cos()], -1)
+
+
+def straight():
+    return torch.stack([SPACING * torch.arange(150.0) - 20, torch.zeros(150)], -1)
+
+
+def test_knots_are_interpolated_and_come_back():
+    ramp = torch.arange(KNOTS, dtype=torch.float32)
+    torch.testing.assert_close(accelerations(ramp, STEPS), (torch.arange(STEPS) + 0.5) / 5)
+    torch.testing.assert_close(knots_of(torch.full((2, STEPS), 1.5)), torch.full((2, KNOTS), 1.5))
+
+
+def test_shifts_begin_at_rest_hold_what_is_held_and_have_their_own_rate():
+    knots = torch.randn(3, KNOTS, generator=torch.Generator().manual_seed(0)).double()
+    value, rate = shifts(knots, STEPS)
+    assert value[:, 0].abs().max() < 1e-9 and rate[:, 0].abs().max() < 1e-9
+    simpson = (rate[:, :-2] + 4 * rate[:, 1:-1] + rate[:, 2:]) / 6 * 0.2
+    torch.testing.assert_close(value[:, 2:] - value[:, :-2], simpson, atol=0.01, rtol=0)
+    value, rate = shifts(torch.full((KNOTS,), 2.0), STEPS)
+    torch.testing.assert_close(value[20:], torch.full((61,), 2.0))
+    torch.testing.assert_close(rate[20:], torch.zeros(61), atol=1e-5, rtol=0)
+
+
+def test_a_bend_is_followed_at_the_shift_asked_for():
+    start = torch.tensor([0.0, 0.0, 0.0, 8.0]).double()
+    route = arc(25.0).double()
+    ramp = (torch.arange(KNOTS).double() / 4).clamp(max=1)
+    for wanted in (0.0, 2.0, -3.0):
+        _, states = execute(start, route, 0 * ramp, wanted * ramp, STEPS, LIMITS)
+        offset = project(states[40:, :2], route)[1]
+        assert (offset - wanted).abs().max() < 0.4, offset
+
+
+def test_who_starts_beside_and_turned_returns_to_the_route():
+    start = torch.tensor([0.0, 1.5, 0.15, 10.0])
+    _, states = execute(start, straight(), torch.zeros(KNOTS), torch.zeros(KNOTS), STEPS, LIMITS)
+    assert states[-1, 1].abs() < 0.1 and (states[0, :2] - start[:2]).norm() < 1.1
+
+
+def test_limits_hold_and_the_actions_give_the_states():
+    generator = torch.Generator().manual_seed(1)
+    accel, shift = 20 * torch.randn(2, 200, KNOTS, generator=generator)
+    start = START.expand(200, 4)
+    actions, states = execute(start, arc(15.0), accel, shift, STEPS, LIMITS)
+    assert actions[..., 0].min() >= -8 and actions[..., 0].max() <= 5 and actions[..., 1].abs().max() <= 1.6
+    torch.testing.assert_close(dynamics.rollout(start, actions), states)
+    assert peak_acceleration(start, states).max() < dynamics.MAX_LATERAL + 1e-2, "braking and turning share the grip"
+    assert (states[..., 3] >= 0).all()
+
+
+def test_who_stands_stays():
+    start = torch.zeros(4)
+    _, states = execute(start, straight(), torch.full((KNOTS,), -3.0), torch.full((KNOTS,), 3.0), STEPS, LIMITS)
+    torch.testing.assert_close(states, torch.zeros(STEPS, 4))

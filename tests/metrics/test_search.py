@@ -1,0 +1,82 @@
+"""Evasions found are real: DrivingEnv drives them without contact; where there is no way out none is found."""
+
+import torch
+from tensordict import TensorDict
+
+from e2rl.metrics.evasion import SearchSettings, find_evasions, lateral_targets
+from e2rl.sim.env import DrivingEnv, SimSettings
+from tests.synthetic import make_scenes
+
+SIZES = {"max_vehicles": 8, "max_agents": 10, "num_routes": 2, "num_points": 150}
+QUICK = SearchSettings(samples=64, rounds=4)
+BOXED = [(0, 0, 0.0), (-5, 0, 0.0), (5, 0, 0.0), (-5, 1, 0.0), (0, 1, 0.0), (5, 1, 0.0), (-30, 0, 12.0)]
+WALL = [(0, 0, 10.0), (40, 0, 0.0), (40, 1, 0.0)]  # both lanes are closed 40 m ahead
+CUT = [(0, 0, 10.0), (12, 0, 0.0), (-40, 1, 0.0)]  # 7.5 m of gap: nobody stops in it at 8 m/s^2 (6.3 m + clearance)
+
+
+def search(vehicles, moment=None, settings=QUICK, count=1, sim=None, width=2.0, **options):
+    scene_set = make_scenes(count, vehicles=vehicles, num_vrus=0, steps=60, **(SIZES | options))
+    scene = scene_set.scenes
+    scene["size"][:, 1:, 1] = width
+    found = find_evasions(scene, scene["logged"], scene["logged_valid"], sim or SimSettings(), settings, moment)
+    return found, scene_set
+
+
+def replay(scene_set, actions):
+    """(contact with anyone, off the road) [B] in DrivingEnv of actions [B, T, 2], and the final states [B, 4]."""
+    count = len(scene_set)
+    env = DrivingEnv(scene_set, SimSettings(end_on_contact=False, end_off_road=False), count)
+    td = env.reset(TensorDict({"scene_index": torch.arange(count)[:, None]}, [count]))
+    touched = torch.zeros(count, dtype=torch.bool)
+    for action in actions.unbind(1):
+        td["action"] = action
+        after = env.step(td)["next"]
+        metrics = after["metrics"]
+        touched = touched | (metrics["contact"] | metrics["contact_vru"] | metrics["off_road"])[:, 0]
+        td = after.exclude("reward")
+    return touched, env.world().states[:, 0]
+
+
+def test_what_is_found_is_driven_without_contact():
+    for vehicles in (WALL, CUT, [(0, 0, 10.0), (-12, 0, 14.0), (15, 0, 6.0)]):
+        result, scene_set = search(vehicles, count=3)
+        assert result.found.all()
+        touched, last = replay(scene_set, result.actions)
+        assert not touched.any()
+        torch.testing.assert_close(last, result.states[:, -1], atol=1e-3, rtol=0)
+
+
+def test_the_boxed_in_have_no_way_out_and_nothing_is_claimed():
+    scene_set = make_scenes(1, vehicles=BOXED, num_vrus=0, steps=60, **SIZES)
+    scene = scene_set.scenes
+    scene["logged"][:, :, 1, 0] += torch.linspace(0, 6, 61)  # the one behind pushes
+    result = find_evasions(scene, scene["logged"], scene["logged_valid"], SimSettings(), QUICK)
+    assert not result.found.any() and result.tried[0] > 4 * QUICK.samples
+
+
+def test_a_wall_is_a_matter_of_braking_distance():
+    far, _ = search(WALL, moment=torch.tensor([20]), width=3.4)  # 20 m on: 15.5 m of gap are left
+    assert far.found.all()
+    weak, _ = search(WALL, moment=torch.tensor([20]), width=3.4, sim=SimSettings(max_braking=2.0))
+    assert not weak.found.any(), "2 m/s^2 stop it after 25 m, and there is no way around"
+
+
+def test_the_strategy_finds_what_the_grid_does_not():
+    slalom = [(0, 0, 10.0), (25, 0, 0.0), (50, 1, 0.0), (-8, 0, 10.0), (-14, 1, 10.0)]  # pursued, two lane changes
+    coarse, _ = search(slalom, settings=SearchSettings(rounds=0))
+    fine, scene_set = search(slalom)
+    assert not coarse.found.any() and fine.found.all() and not replay(scene_set, fine.actions)[0].any()
+
+
+def test_a_rollout_s_result_does_not_depend_on_the_batch():
+    together, scene_set = search(CUT, count=3)
+    scene = scene_set.scenes[2:]
+    alone = find_evasions(scene, scene["logged"], scene["logged_valid"], SimSettings(), QUICK)
+    torch.testing.assert_close(together.states[2], alone.states[0], atol=1e-4, rtol=0)
+
+
+def test_ways_are_the_mission_then_real_candidates_then_shifts():
+    valid = torch.tensor([[True, True, False, True], [True, False, False, False]])
+    route, shift = lateral_targets(valid, torch.tensor([1, 0]))
+    assert route[0].tolist()[:5] == [1, 1, 1, 0, 3] and shift[0].tolist()[:5] == [0.0, 1.5, -1.5, 0.0, 0.0]
+    assert route[1].tolist() == [0] * 8 and len(set(shift[1].tolist()[:7])) == 7

@@ -1,0 +1,160 @@
+"""The learned ego: its observation is the environment's, its plan comes true, its file fits or is refused."""
+
+import pytest
+import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from e2rl.planners.actor import ActorEgo
+from e2rl.planners.ego import PLAN_STEPS, EgoPolicy
+from e2rl.planners.network import Normaliser, find_weights
+from e2rl.planners.reference import reference_action
+from e2rl.run.errors import InputError
+from e2rl.run.files import seal
+from e2rl.sim.env import DrivingEnv, SimSettings
+from tests.synthetic import make_scenes
+
+
+def wild(ego, scale=0.3):
+    """Give the untrained network an opinion of its own."""
+    torch.manual_seed(0)
+    torch.nn.init.normal_(ego.network.network.trunk.last.weight, std=scale)
+    return ego
+
+
+def test_its_plan_begins_with_what_it_does_now():
+    """Planning sees what the environment observes: the first planned state is where the next action leads."""
+    env, ego = DrivingEnv(make_scenes(3, num_vehicles=8), SimSettings(), 3), wild(ActorEgo(hidden=(16,)))
+    td = env.reset()
+    for _ in range(10):
+        world = env.world()
+        plan = ego.plan(world)
+        td["action"] = ego.act(world, td["observation"], torch.cat([world.states[:, :1], plan], 1))
+        td = env.step(td)["next"].exclude("reward")
+        assert torch.allclose(env.world().states[:, 0], plan[:, 0], atol=1e-4)
+
+
+def test_plan_is_what_it_does_on_a_lonely_road():
+    """Actions held as in the plan, alone on the road: the plan comes true exactly, and planning changes nothing."""
+    env = DrivingEnv(make_scenes(2, num_vehicles=1, num_vrus=0), SimSettings(), 2)
+    ego, td = wild(ActorEgo(hidden=(16,)), 0.1), env.reset()
+    plan = ego.plan(env.world())
+    assert plan.shape == (2, PLAN_STEPS, 4) and torch.equal(plan, ego.plan(env.world()))
+    for step in range(PLAN_STEPS):
+        if step % 5 == 0:
+            action = ego.act(env.world(), td["observation"], plan)
+        td["action"] = action
+        td = env.step(td)["next"].exclude("reward")
+        if td["done"].any():
+            break
+        assert torch.allclose(env.world().states[:, 0], plan[:, step], atol=1e-3), step
+    assert step > 15
+
+
+def test_plans_expect_the_others_plans():
+    """A leader that plans to halt makes the ego plan to halt; by its velocity alone it would go on."""
+    env = DrivingEnv(make_scenes(2, vehicles=[(0.0, 0, 10.0), (25.0, 0, 10.0)]), SimSettings(), 2)
+    env.reset()
+    ego, world = ActorEgo(hidden=(8,)), env.world()
+    going_on = ego.plan(world)
+    world.plan = world.states[:, : env.scene["route_log"].shape[1], None].repeat(1, 1, PLAN_STEPS, 1)
+    world.plan[..., 3] = 0.0
+    halting = ego.plan(world)
+    assert (going_on[:, -1, 3] > 8).all() and (halting[:, -1, 3] < 3).all()
+
+
+def test_the_network_can_override_the_reference():
+    ego = ActorEgo(hidden=(8,))
+    env = DrivingEnv(make_scenes(2), SimSettings(), 2)
+    observation = env.reset()["observation"]
+    assert torch.allclose(ego.network.network.deterministic(observation), reference_action(observation), atol=1e-4)
+    with torch.no_grad():
+        ego.network.network.trunk.last.bias.copy_(torch.tensor([8.0, -8.0]))
+    assert torch.allclose(ego.network.network.deterministic(observation), torch.tensor([5.0, -1.6]), atol=1e-2)
+
+
+def test_samples_stay_within_the_bounds_and_have_their_log_probability():
+    ego, env = ActorEgo(hidden=(8,), initial_std=(0.9, 0.9)), DrivingEnv(make_scenes(2), SimSettings(), 64)
+    with set_exploration_type(ExplorationType.RANDOM):
+        td = ego.network.actor(env.reset())
+    low, high = ego.network.low, ego.network.high
+    assert ((td["action"] >= low) & (td["action"] <= high)).all() and td["action"].std(0).min() > 0.1
+    assert torch.allclose(ego.network.actor.get_dist(td).log_prob(td["action"]), td["action_log_prob"], atol=1e-3)
+
+
+def test_normaliser_equals_the_statistics_of_all_it_saw_and_is_frozen_otherwise():
+    normaliser, parts = Normaliser(3), [2 + 3 * torch.randn(n, 3) for n in (5, 100, 31)]
+    for part in parts:
+        normaliser.observe(part)
+        normaliser(part)
+    everything = torch.cat(parts)
+    assert torch.allclose(normaliser.mean, everything.mean(0), atol=1e-5)
+    assert torch.allclose(normaliser.variance, everything.var(0, correction=0), rtol=1e-4)
+
+
+def test_file_round_trip(tmp_path):
+    first, second = wild(ActorEgo(hidden=(8,))), ActorEgo(hidden=(8,))
+    first.network.normaliser.observe(torch.randn(10, first.network.normaliser.mean.shape[0]))
+    folder = tmp_path / "checkpoints" / "round-000001"
+    folder.mkdir(parents=True)
+    first.network.save(folder / "actor.safetensors")
+    seal(folder)
+    assert find_weights(tmp_path) == find_weights(folder) == folder / "actor.safetensors"
+    second = ActorEgo(hidden=(8,), checkpoint=str(tmp_path))
+    env = DrivingEnv(make_scenes(2), SimSettings(), 2, agents=True)
+    policies = [EgoPolicy(ego, env)(env.reset().clone()) for ego in (first, second)]
+    observation = policies[0]["observation"]
+    acted, valued = [], []
+    for ego in (first, second):
+        acted.append(ego.network.network.deterministic(observation))
+        valued.append(ego.network.critic(policies[0])["state_value"])
+    assert torch.equal(*acted) and torch.equal(*valued)
+
+
+def test_the_file_says_how_its_network_is_made(tmp_path):
+    """Whoever drives with a trained actor need not know the sizes of its layers."""
+    file, written = tmp_path / "actor.safetensors", wild(ActorEgo(hidden=(8,), agent_units=4))
+    written.network.save(file)
+    read = ActorEgo(hidden=(16, 16), checkpoint=str(file))
+    assert read.network.architecture == written.network.architecture
+    observation = torch.randn(3, read.network.normaliser.mean.shape[0])
+    assert torch.equal(*(ego.network.network.deterministic(observation) for ego in (read, written)))
+
+
+def test_other_bounds_damage_and_absence_are_refused(tmp_path):
+    file = tmp_path / "actor.safetensors"
+    ActorEgo(hidden=(8,)).network.save(file)
+    with pytest.raises(InputError, match=r"actor\.safetensors: .*bounds .*5\.0, .* not .*2\.0.*set sim\.max_"):
+        ActorEgo(hidden=(8,), max_acceleration=2.0, checkpoint=str(file))
+    file.write_bytes(b"no weights")
+    with pytest.raises(InputError, match="not a readable actor file"):
+        ActorEgo(hidden=(8,), checkpoint=str(file))
+    with pytest.raises(InputError, match="no actor there"):
+        ActorEgo(checkpoint=str(tmp_path / "missing"))
+
+
+def test_it_collects_and_survives_a_change_of_batch():
+    ego = ActorEgo(hidden=(8,))
+    for batch in (2, 3):
+        env = DrivingEnv(make_scenes(3, num_vehicles=2), SimSettings(), batch, agents=True)
+        data = env.rollout(30, EgoPolicy(ego, env))
+        assert torch.isfinite(data["action"]).all() and torch.isfinite(ego.plan(env.world())).all()
+
+
+def test_noise_is_the_networks_alone_and_ends_with_the_block():
+    ego, env = wild(ActorEgo(hidden=(8,))), DrivingEnv(make_scenes(2), SimSettings(), 2)
+    observation, network = env.reset()["observation"], ego.network.network
+    clean = network.deterministic(observation)
+    with network.noisy(0.3, 1.0):
+        assert not torch.equal(network.deterministic(observation), clean)
+        torch.nn.init.zeros_(network.trunk.last.weight)
+        assert torch.allclose(network.deterministic(observation), reference_action(observation), atol=1e-4)
+    assert torch.equal(network.deterministic(observation), network.deterministic(observation))
+
+
+def test_the_bundled_policy_corrects_the_route_follower():
+    env = DrivingEnv(make_scenes(2, num_vehicles=6), SimSettings(), 2)
+    observation = env.reset()["observation"]
+    bundled, untrained = (
+        ego.network.network.deterministic(observation) for ego in (ActorEgo(checkpoint="bundled"), ActorEgo())
+    )
+    assert torch.isfinite(bundled).all() and (bundled - untrained).abs().amax() > 0.05

@@ -1,0 +1,148 @@
+"""The ego bits: cheapest candidate, bounds, symmetries, what it may not see, red lights, its files, its worth."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import e2rl
+from e2rl.planners.bits import BitsEgo
+from e2rl.planners.bits_network import CELLS, BitsNetwork, load_bits, save_bits
+from e2rl.planners.ego import PLAN_STEPS, EgoPolicy
+from e2rl.run.errors import InputError
+from e2rl.scenes.scene import Loaded
+from e2rl.sim import dynamics
+from e2rl.sim.env import DrivingEnv, SimSettings
+from tests.sim.test_observation import quarter_turn
+from tests.synthetic import make_scenes
+
+
+def worlds(scenes):
+    env = DrivingEnv(scenes, SimSettings(), len(scenes), agents=True)
+    env.reset(env.reset().select("scene_index").set("scene_index", torch.arange(len(scenes))[:, None]))
+    return env, env.world()
+
+
+def wild_ego(**changes):
+    """An ego with random weights, whose plans use the whole range of controls and of goals."""
+    ego = BitsEgo(checkpoint=None, **changes)
+    generator = torch.Generator().manual_seed(0)
+    for layer in (ego.network.goal_head[-1], ego.network.policy[-1]):
+        layer.weight.data = 0.5 * torch.randn(layer.weight.shape, generator=generator)
+    return ego
+
+
+def test_plans_the_cheapest_candidate():
+    _, world = worlds(make_scenes(3, vehicles=[(0.0, 0, 10.0), (22.0, 0, 6.0), (10.0, 1, 10.0)]))
+    ego = wild_ego()
+    candidates, plan = ego.candidates(world), ego.plan(world)
+    costs = ego.costs(world, candidates)
+    assert candidates.states.shape == (3, 40, PLAN_STEPS, 4) and costs.std(1).min() > 1
+    for k in range(3):
+        assert torch.equal(plan[k], candidates.states[k, costs[k].argmin()])
+    torch.testing.assert_close(ego.rated(world, plan[:, None])[:, 0], costs.amin(1), atol=8.0, rtol=0)
+
+
+def test_candidates_obey_the_simulator_s_bounds():
+    scenes = make_scenes(2, num_vehicles=6)
+    scenes.scenes["start"][1, 0, 1:3] = torch.tensor([1.5, 0.6])
+    _, world = worlds(scenes)
+    driven = wild_ego(goals=CELLS).candidates(world).states
+    assert driven.shape[:2] == (2, CELLS) and torch.isfinite(driven).all()
+    start = world.states[:, :1, None].expand(-1, CELLS, -1, -1)
+    states = torch.cat([start, driven], 2)
+    actions = dynamics.inverse(states)
+    assert (actions[..., 0] > -8 - 1e-3).all() and (actions[..., 0] < 5 + 1e-3).all()
+    mean = (states[..., 1:, 3] + states[..., :-1, 3]) / 2
+    assert (actions[..., 1].abs() <= torch.clamp(dynamics.yaw_rate_bound(mean), max=1.6) + 1e-3).all()
+    assert (torch.hypot(actions[..., 0], actions[..., 1] * mean) < dynamics.MAX_LATERAL + 0.05).all()
+    torch.testing.assert_close(dynamics.rollout(start[:, :, 0], actions), driven, atol=2e-3, rtol=0)
+
+
+def test_a_moved_scene_gets_the_moved_candidates():
+    make = {"num_scenes": 2, "num_vehicles": 9, "num_vrus": 3, "red_light_x": 70.0}
+    shift = torch.tensor([40.0, -25.0])
+    _, here = worlds(make_scenes(**make))
+    _, there = worlds(quarter_turn(make_scenes(**make), shift))
+    ego = wild_ego()
+    first, second = ego.candidates(here), ego.candidates(there)
+    x, y, heading, speed = first.states.unbind(-1)
+    moved = torch.stack([shift[0] - y, shift[1] + x, dynamics.wrap(heading + torch.pi / 2), speed], -1)
+    torch.testing.assert_close(second.states[..., :2], moved[..., :2], atol=2e-2, rtol=0)
+    torch.testing.assert_close(second.states[..., 3], speed, atol=1e-2, rtol=0)
+    torch.testing.assert_close(ego.costs(there, second), ego.costs(here, first), atol=0.5, rtol=1e-2)
+
+
+def test_scenes_of_a_batch_do_not_mix():
+    """Planned together, beyond a chunk, or alone, a scene gets the same plan."""
+    scenes = make_scenes(66, vehicles=[(0.0, 0, 10.0), (22.0, 0, 6.0), (10.0, 1, 10.0), (-15.0, 0, 11.0)])
+    scenes.scenes["start"][1, 1:4, 0] += 6.0
+    scenes.scenes["valid"][2, 1:] = False
+    _, world = worlds(scenes)
+    ego = wild_ego()
+    together = ego.plan(world)
+    for k in (0, 1, 2, 65):
+        one = replace(scenes, rows=Loaded(scenes.scenes[k : k + 1]), scene_id=["one"], location=["straight"])
+        torch.testing.assert_close(ego.plan(worlds(one)[1])[0], together[k], atol=1e-3, rtol=0)
+    assert not torch.allclose(together[1, :, 3], together[2, :, 3])
+
+
+def test_sees_neither_plans_nor_routes_nor_what_the_recording_goes_on_to_tell():
+    _, world = worlds(make_scenes(2, num_vehicles=6))
+    vehicles = world.scene["route_log"].shape[1]
+    plan, route = torch.randn(2, vehicles, PLAN_STEPS, 4), torch.ones(2, vehicles, dtype=torch.long)
+    later = world.scene.clone()
+    later["logged"][:, 1:] += 50.0
+    ego = wild_ego()
+    assert torch.equal(ego.plan(replace(world, scene=later, plan=plan, route=route)), ego.plan(world))
+
+
+def test_the_elapsed_time_is_no_input():
+    _, world = worlds(make_scenes(2, num_vehicles=6))
+    ego = wild_ego()
+    assert torch.equal(ego.plan(replace(world, step=world.step + 60)), ego.plan(world))
+
+
+@pytest.mark.parametrize(("x", "halts"), [(50.0, True), (None, False)])
+def test_halts_at_a_red_light(x, halts):
+    env, _ = worlds(make_scenes(1, num_vehicles=1, num_vrus=0, red_light_x=x))
+    env.rollout(80, EgoPolicy(BitsEgo(), env))
+    state = env.world().states[0, 0]
+    assert (state[3] < 2.0 and 35 < state[0] < 47.8) if halts else state[0] > 55
+
+
+def test_the_bundled_weights_hit_less_than_untrained_ones():
+    """On scenes that they did not train on, in recorded traffic."""
+    scenes = e2rl.load_scenes("bundled", num_scenes=8, split="tune")
+    traffic = e2rl.make_traffic("replay", e2rl.load_prior())
+    hit = {}
+    for checkpoint in ("bundled", None):
+        rollouts = e2rl.roll_out(scenes, BitsEgo(checkpoint), traffic)
+        hit[checkpoint] = sum(row["cfr"] for row in e2rl.score(rollouts))
+    assert hit["bundled"] == 0 and hit[None] >= 2
+
+
+def test_a_file_gives_the_network_back(tmp_path):
+    network = wild_ego().network
+    save_bits(network, tmp_path / "bits.safetensors", {"data": "made"})
+    again = load_bits(str(tmp_path))
+    seen = torch.randn(4, network.architecture["observation"])
+    for one, other in zip(network.goals(network.encode(seen)), again.goals(again.encode(seen)), strict=True):
+        assert torch.equal(one, other)
+    assert not any(value.requires_grad for value in again.parameters())
+
+
+def test_wrong_checkpoints_are_named(tmp_path):
+    with pytest.raises(InputError, match=r"ego\.checkpoint=.*no bits\.safetensors.*stage=bits"):
+        BitsEgo(checkpoint=str(tmp_path))
+    file = tmp_path / "bits.safetensors"
+    file.write_bytes(b"nonsense")
+    with pytest.raises(InputError, match="not a readable safetensors file"):
+        load_bits(str(file))
+    network = BitsNetwork(hidden=16)
+    network.architecture["cells"] = 9
+    save_bits(network, file, {})
+    with pytest.raises(InputError, match="another architecture"):
+        load_bits(str(file))
+    with pytest.raises(InputError, match=r"ego\.goals=0"):
+        BitsEgo(checkpoint=None, goals=0)

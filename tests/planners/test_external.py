@@ -1,0 +1,246 @@
+"""A planner in another process drives as the same law does inside, and what goes wrong in a scene costs that scene."""
+
+import json
+import multiprocessing
+import os
+import re
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from e2rl import roll_out
+from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.evaluation.rollout_files import ENDED_FILE
+from e2rl.planners.external import ExternalEgo
+from e2rl.planners.planner_link import plan_message, scene_messages
+from e2rl.run.errors import InputError
+from e2rl.run.processes import ending
+from e2rl.sim.env import SimSettings
+from e2rl.sim.mission import mission_of
+from e2rl.sim.world import World
+from e2rl.traffic.rule_based import Replay
+from tests.planners.planners import SameLaw, command_of, wrong_planner
+from tests.synthetic import make_scenes
+from tests.test_ending import alive
+
+BAD = 2  # the scene in which planners of these tests go wrong: its ego is at y = 3.5, in all others at 0
+ROAD = [(0.0, 0, 10.0), (25.0, 0, 6.0), (60.0, 1, 4.0)]
+linux = pytest.mark.skipif(sys.platform != "linux", reason="asks /proc")
+
+
+def scene_set(count=4, **about):
+    """Scenes with a slow leader; the ego of scene BAD is in the other lane, on its route."""
+    found = make_scenes(count, vehicles=ROAD, steps=12, **about)
+    found.scenes["start"][BAD : BAD + 1, 0, 1] = 3.5
+    found.scenes["logged"][BAD : BAD + 1, :, 0, 1] = 3.5
+    found.scenes["route_points"][BAD : BAD + 1, 0, :, :, 1] = 3.5
+    return found
+
+
+def run(ego, folder=None, processes=1, batch=4):
+    setup = Setup(scene_set(), ego, "external", SimSettings(), batch)
+    return run_protocol(setup, [Method("replay", Replay())], [0], folder, processes=processes)
+
+
+@pytest.mark.parametrize("replan_every", [1, 5])
+@pytest.mark.parametrize("red_light_x", [None, 45.0])
+def test_it_drives_as_the_same_law_inside(replan_every, red_light_x):
+    scenes = scene_set(red_light_x=red_light_x)
+    inside, outside = (
+        roll_out(scenes, ego, Replay())["states"]
+        for ego in (SameLaw(replan_every), ExternalEgo(command_of(), replan_every=replan_every))
+    )
+    assert torch.allclose(inside, outside, atol=1e-3)
+    speed, behind = outside[:, -1, 0, 3], torch.arange(4) != BAD
+    assert (speed[behind] < 9).all() and (speed[BAD] > 10) == (red_light_x is None)
+
+
+def test_one_that_runs_serves_several_connections():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    planner = subprocess.Popen([*command_of().split(), f"127.0.0.1:{port}"])
+    try:
+        (row,) = run(ExternalEgo(address=f"127.0.0.1:{port}"), processes=2, batch=2)
+        (inside,) = run(SameLaw())
+    finally:
+        planner.kill()
+        planner.wait()
+    assert row["metrics"]["progress"] == pytest.approx(inside["metrics"]["progress"], abs=1e-3, nan_ok=True)
+    assert row["n_rollouts"] == 4 and row["ended"] == {}
+
+
+TRAJECTORY = "return reply(self, 4, scene + struct.pack('<I{0}f', {1}, *[{2}] * {0}))"
+WRONGS = {
+    "raises": ({"act": "raise ValueError('no way out')"}, "PlannerFailed", "no way out"),
+    "dies": ({"act": "os._exit(3)"}, "PlannerDied", "ended with status 3"),
+    "dies before it answers any": ({"read": "os._exit(3)"}, "PlannerDied", "ended with status 3"),
+    "hangs": ({"act": "time.sleep(100)"}, "PlannerTimedOut", "no reply within 0.3 s a scene"),
+    "closes": ({"act": "self = 1; sys.exit()"}, "PlannerDied", "closed the connection|ended with status 0"),
+    "NaN": ({"act": "return math.nan, 0"}, "BadReply", "an ACTION that is not finite"),
+    "large": ({"act": "return 0, 1e6"}, "BadReply", "an ACTION that is not finite, or above 100"),
+    "jumps": ({"reply": TRAJECTORY.format(200, 50, 20.0)}, "BadReply", "jumps"),
+    "states of NaN": ({"reply": TRAJECTORY.format(200, 50, "math.nan")}, "BadReply", "a plan that is not finite"),
+    "short": ({"reply": TRAJECTORY.format(4, 1, 0.0)}, "BadReply", "fewer than the 5 steps until the next plan"),
+    "wrong shape": ({"reply": TRAJECTORY.format(200, 49, 0.0)}, "BadReply", "this one has 808 bytes for 49 states"),
+    "no reply": ({"reply": "return reply(self, 99, scene)"}, "BadReply", "kind 99 and 4 bytes is no reply"),
+    "long": ({"reply": "self.wfile.write(struct.pack('<2I', 4, 2**31))"}, "BadReply", "announces 2147483648 bytes"),
+    "another's": ({"reply": "return reply(self, 5, b'\\\\x09' + bytes(11))"}, "BadReply", "a reply for scene 9"),
+}
+
+
+@pytest.mark.parametrize("name", WRONGS)
+def test_what_goes_wrong_in_a_scene_costs_that_scene(tmp_path, name):
+    wrong, reason, detail = WRONGS[name]
+    ego = ExternalEgo(wrong_planner(tmp_path, 3.5, **wrong), timeout=0.3 if name == "hangs" else 5.0)
+    (row,) = run(ego, tmp_path)
+    (entry,) = json.loads((tmp_path / ENDED_FILE).read_text())
+    assert row["ended"] == {f"raised {reason}": 1} and row["n_rollouts"] == 3
+    assert entry["scene_id"] == scene_set().scene_id[BAD]
+    assert re.search(detail, entry["detail"]), entry["detail"]
+
+
+def test_it_is_restarted_as_often_as_allowed(tmp_path):
+    command = wrong_planner(tmp_path, 3.5, act="os._exit(3)")
+    (row,) = run(ExternalEgo(command, restarts=1))
+    assert row["n_rollouts"] == 3 and len(list((tmp_path / "marks").iterdir())) == 2
+    with pytest.raises(InputError, match="4 raised PlannerDied .its process ended with status 3"):
+        run(ExternalEgo(command, restarts=0), tmp_path)
+    details = [entry["detail"] for entry in json.loads((tmp_path / ENDED_FILE).read_text())]
+    assert sum("it was restarted 0 times; see ego.restarts" in detail for detail in details) == 3
+    assert len(list((tmp_path / "marks").iterdir())) == 3
+
+
+@linux
+def test_its_process_ends_with_its_ego(tmp_path):
+    ego = ExternalEgo(wrong_planner(tmp_path, 1e3))
+    run(ego)
+    (process,) = (int(mark.name) for mark in (tmp_path / "marks").iterdir())
+    assert alive(process)
+    del ego
+    assert not alive(process)
+
+
+@linux
+@pytest.mark.parametrize("how", ["SIGINT", "SIGTERM", "SIGKILL"])
+def test_no_process_is_left(tmp_path, how):
+    """Two workers wait for planners that hang."""
+    ego = ExternalEgo(wrong_planner(tmp_path, 0.0, act="time.sleep(100)"), timeout=100.0)
+
+    def command():
+        os.setsid()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        with ending("do it again"):
+            run(ego, processes=2, batch=2)
+
+    running = multiprocessing.get_context("fork").Process(target=command)
+    running.start()
+    marks, begin = tmp_path / "marks", time.monotonic()
+    while len(list(marks.iterdir())) < 2 and time.monotonic() - begin < 30:
+        time.sleep(0.02)
+    planners = [int(mark.name) for mark in marks.iterdir()]
+    assert len(planners) == 2 and all(map(alive, planners))
+    time.sleep(0.2)
+    if how == "SIGINT":
+        os.killpg(running.pid, signal.SIGINT)
+    else:
+        os.kill(running.pid, getattr(signal, how))
+    running.join(20)
+    while any(map(alive, planners)) and time.monotonic() - begin < 60:
+        time.sleep(0.02)
+    assert running.exitcode == {"SIGINT": 130, "SIGTERM": 143, "SIGKILL": -9}[how]
+    assert not any(map(alive, planners))
+
+
+def test_messages_hold_the_world_field_by_field():
+    scenes = scene_set(3, red_light_x=45.0).scenes
+    world = World.at_start(scenes)
+    mission, scene = mission_of(scenes), scenes[1]
+    content = scene_messages(world, [1])
+    kind, length, row, index, points, dots, lanes, lights = struct.unpack_from("<8I", content)
+    assert (kind, length, row, index) == (2, len(content) - 8, 1, 1)
+    take = partial(_take, content, [32])
+    assert take("3f", 1) == [(*scene["size"][0].tolist(), mission.end[1].item())]
+    assert torch.tensor(take("3f", points))[:, :2].equal(mission.points[1])
+    assert take("if", 2)[0] == (0, mission.light_s[1, 0].item())
+    found = take("i2f", dots)
+    assert torch.tensor([dot[1:] for dot in found]).equal(scene["lane_points"])
+    assert [dot[0] for dot in found] == scene["lane_index"].tolist()
+    exits = torch.cat([scene["lane_left"][:, None], scene["lane_right"][:, None], scene["lane_exits"]], 1).tolist()
+    assert take("f8i", lanes) == [(3.5, *exits[lane]) for lane in range(lanes)] and lanes == 2
+    assert take("2f", lights) == [(45.0, 0.0)] and take.args[1] == [len(content)]
+    content = plan_message(world)
+    take = partial(_take, content, [8])
+    assert take("I", 1) == [(3,)]
+    for row in range(3):
+        ((number, step, agents, lights),) = take("4I", 1)
+        assert (number, step, agents, lights) == (row, 0, 4, 1) and take("I", 1) == [(1,)]
+        present = scenes["valid"][row].nonzero()[:, 0].tolist()
+        for agent, record in zip(present, take("2I8f", agents), strict=True):
+            state, size = (scenes[key][row, agent].tolist() for key in ("start", "size"))
+            assert record == (agent, int(scenes["agent_type"][row, agent]), *state, *size, 0.0, 0.0)
+    assert take.args[1] == [len(content)]
+
+
+def _take(content, at, form, count):
+    """The next `count` records of a message; at: [position]."""
+    size = count * struct.calcsize("<" + form)
+    found = list(struct.iter_unpack("<" + form, content[at[0] : at[0] + size]))
+    at[0] += size
+    return found
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({}, "give one of ego.command"),
+        ({"command": "a", "address": "b:1"}, "give one of ego.command"),
+        ({"command": "a", "timeout": 0}, "ego.timeout=0, .* choose times above 0 s"),
+        ({"command": "./no_such_planner"}, "ego.command=./no_such_planner: cannot be started"),
+        ({"command": f"{sys.executable} -c 1/0"}, "ended with status 1 before it listened"),
+        ({"command": command_of().replace("external_planner", "cruise")}, "before it listened"),
+        ({"address": "nowhere"}, "ego.address=nowhere: is no address; give HOST:PORT or unix:PATH"),
+        ({"address": "unix:/no/planner", "start_timeout": 0.1}, "nothing listens at unix:/no/planner"),
+    ],
+)
+def test_what_cannot_be_is_named_with_its_remedy(fields, message):
+    with pytest.raises(InputError, match=message):
+        ExternalEgo(**fields).plan(World.at_start(scene_set().scenes))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [("example.VERSION = 7", "speaks version 7 of the protocol, e2rl 1"), ("example.HELLO = 5", "no planner answers")],
+)
+def test_a_stranger_is_refused(tmp_path, change, message):
+    command = wrong_planner(tmp_path, 0.0)
+    path = Path(command.split()[-1])
+    path.write_text(path.read_text().replace("example.main()", f"{change}\nexample.main()"))
+    with pytest.raises(InputError, match=message):
+        ExternalEgo(command, start_timeout=1.0).plan(World.at_start(scene_set().scenes))
+
+
+def test_its_file_has_the_defaults_of_the_class():
+    fields = OmegaConf.load(Path(__file__).parents[2] / "conf" / "ego" / "external.yaml")
+    one, two = (vars(ego) for ego in (instantiate(fields, command="planner"), ExternalEgo("planner")))
+    assert torch.equal(one.pop("_asked"), two.pop("_asked")) and one == two
+
+
+def test_it_is_asked_about_the_present_only():
+    """Traffic that looks ahead would give a planner with a memory moments that never come."""
+    ego, world = ExternalEgo(command_of()), World.at_start(scene_set().scenes)
+    ego.plan(world)
+    world.step += 10
+    ego.plan(world)
+    with pytest.raises(InputError, match="drives in closed loop only"):
+        ego.plan(world)

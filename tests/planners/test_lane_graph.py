@@ -1,0 +1,105 @@
+"""Lane-graph planner: parked cars, free roads, off-lane caution, hazards in closed form, nobody else, many scenes."""
+
+import torch
+
+from e2rl.planners.ego import PLAN_STEPS, EgoPolicy
+from e2rl.planners.lane_graph_planner import LaneGraphEgo, Prediction, circle_gap, circles, collision_hazard
+from e2rl.sim.env import DrivingEnv, SimSettings
+from tests.synthetic import make_scenes
+
+
+def world_of(**scene):
+    env = DrivingEnv(make_scenes(**{"num_scenes": 1} | scene), SimSettings(), scene.get("num_scenes", 1), agents=True)
+    env.reset()
+    return env, env.world()
+
+
+def test_free_road_accelerates_to_the_top_speed():
+    env, _ = world_of(num_vehicles=1, num_vrus=0, limit=0.0)
+    env.rollout(80, EgoPolicy(LaneGraphEgo(), env))
+    assert torch.allclose(env.world().states[0, 0, 3], torch.tensor(20.0), atol=0.3)
+    env, _ = world_of(num_vehicles=1, num_vrus=0, limit=12.0)
+    env.rollout(80, EgoPolicy(LaneGraphEgo(), env))
+    assert torch.allclose(env.world().states[0, 0, 3], torch.tensor(12.0), atol=0.1)
+
+
+def test_stops_behind_a_parked_car():
+    env, _ = world_of(vehicles=[(0.0, 0, 10.0), (50.0, 0, 0.0)], num_vrus=0)
+    data = env.rollout(80, EgoPolicy(LaneGraphEgo(), env))
+    state = env.world().states[0, 0]
+    assert not data["next", "terminated"].any() and state[3] < 1.0 and 20 < state[0] < 46
+
+
+def test_halts_at_a_red_light():
+    env, _ = world_of(num_vehicles=1, num_vrus=0, red_light_x=50.0)
+    env.rollout(80, EgoPolicy(LaneGraphEgo(), env))
+    state = env.world().states[0, 0]
+    assert state[3] < 0.5 and 44 < state[0] < 47.8
+
+
+def test_off_its_route_it_prefers_the_shortest():
+    env, world = world_of(num_vehicles=1, num_vrus=0)
+    ego = LaneGraphEgo()
+    hazard, driven = torch.tensor([[0.01, 0.0, 3.0]]), torch.tensor([[30.0, 10.0, 40.0]])
+    assert ego.choose(hazard, driven, torch.tensor([True])).item() == 0
+    assert ego.choose(hazard, driven, torch.tensor([False])).item() == 1
+    assert ego.choose(hazard + 1, driven, torch.tensor([True])).item() == 1
+
+
+def test_without_a_safe_profile_it_takes_the_least_hazardous_or_the_shortest():
+    hazard, driven = torch.tensor([[3.0, 2.0, 4.0], [3.0, 0.01, 4.0]]), torch.tensor([[0.0, 40.0, 20.0]]).expand(2, 3)
+    matched = torch.tensor([True, True])
+    assert LaneGraphEgo().choose(hazard, driven, matched).tolist() == [1, 1]
+    assert LaneGraphEgo(brake_if_unsafe=True).choose(hazard, driven, matched).tolist() == [0, 1]
+
+
+def test_too_near_to_stop_the_least_hazardous_profile_rams_and_the_shortest_brakes():
+    _, world = world_of(vehicles=[(0.0, 0, 12.0), (16.0, 0, 0.0)], num_vrus=0)
+    assert LaneGraphEgo().plan(world)[0, 9, 3] > 14.0
+    assert LaneGraphEgo(brake_if_unsafe=True).plan(world)[0, 9, 3] < 9.0
+
+
+def test_plan_is_a_drivable_continuation():
+    _, world = world_of(num_scenes=3, num_vehicles=6)
+    plan = LaneGraphEgo().plan(world)
+    assert plan.shape == (3, PLAN_STEPS, 4) and torch.isfinite(plan).all()
+    states = torch.cat([world.states[:, :1], plan], 1)
+    assert (states[..., 3].diff(dim=1).abs() <= 0.4 + 1e-4).all()
+    step = (states[:, 1:, :2] - states[:, :-1, :2]).norm(dim=-1)
+    assert torch.allclose(step, (states[:, 1:, 3] + states[:, :-1, 3]) / 20, atol=1e-3)
+
+
+def test_scenes_of_a_batch_do_not_mix():
+    """Planned together or alone, a scene gets the same plan."""
+    scenes = make_scenes(3, num_vehicles=8)
+    scenes.scenes["start"][1, 1:8, 0] += 6.0
+    scenes.scenes["valid"][2, 1:] = False
+    env = DrivingEnv(scenes, SimSettings(), 3)
+    index = torch.arange(3)[:, None]
+    env.reset(env.reset().select("scene_index").set("scene_index", index))
+    together = LaneGraphEgo().plan(env.world())
+    for k in range(3):
+        alone = DrivingEnv(scenes, SimSettings(), 1)
+        alone.reset(alone.reset().select("scene_index").set("scene_index", index[k : k + 1]))
+        assert torch.allclose(LaneGraphEgo().plan(alone.world())[0], together[k], atol=1e-4)
+    assert not torch.allclose(together[0], together[1])
+
+
+def test_hazard_equals_its_definition():
+    generator = torch.Generator().manual_seed(0)
+    ego = torch.rand(2, 3, 4, 3, generator=generator).double() * 20
+    poses, scene = torch.rand(5, 4, 3, generator=generator).double() * 20, torch.tensor([0, 1, 1, 0, 1])
+    size, ego_size = torch.tensor([4.0, 2.0]).double().repeat(5, 1), torch.tensor([4.5, 1.8]).double().repeat(2, 1)
+    found = collision_hazard(ego, ego_size, Prediction(poses, size, scene), 0.3, 0.02)
+    safe = torch.ones(2, 3).double()
+    for j in range(5):
+        for t in range(4):
+            gap = circle_gap(ego[scene[j], :, t], ego_size[0], poses[j, t], size[j])
+            safe[scene[j]] *= torch.tanh(gap.clamp(min=0) * (0.3 + 0.02 * t)).clamp(min=1e-6)
+    assert torch.allclose(found, -safe.log(), rtol=1e-3)
+
+
+def test_circles_lie_in_their_box():
+    centre, radius = circles(torch.zeros(1, 3), torch.tensor([[4.0, 2.0]]))
+    assert (centre[..., 0].abs() + radius <= 2.0 + 1e-6).all() and (centre[..., 1].abs() + radius <= 1.0 + 1e-6).all()
+    assert torch.allclose((centre[..., 0].abs() + radius).max(), torch.tensor(2.0))

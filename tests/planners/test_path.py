@@ -1,0 +1,68 @@
+"""Paths: pass through the pose, end on the route, stay the same when planned anew; caps of curves, limits, lights."""
+
+import torch
+
+from e2rl.planners.path import MissionPath, RoutePath, look_up
+from e2rl.sim.dynamics import inverse
+from e2rl.sim.env import DrivingEnv, SimSettings
+from tests.synthetic import make_scenes
+
+
+def arc_route(radius=40.0, points=60):
+    angle = 2.0 * torch.arange(points) / radius
+    return radius * torch.stack([angle.sin(), 1 - angle.cos()], -1)
+
+
+STATE = torch.tensor([[15.0, 4.0, 0.3, 8.0], [20.0, 4.5, 0.9, 3.0]])
+
+
+def test_passes_through_the_pose_and_ends_on_the_route():
+    path = RoutePath(STATE, arc_route().expand(2, -1, -1))
+    poses = path.at(torch.tensor([0.0, 70.0]).expand(2, 2))
+    assert torch.allclose(poses[:, 0], STATE[:, :3], atol=2e-2)
+    assert torch.allclose(poses[:, 0, :2], STATE[:, :2], atol=1e-5)
+    centre = torch.tensor([0.0, 40.0])
+    assert torch.allclose((poses[:, 1, :2] - centre).norm(dim=-1), torch.tensor(40.0), atol=0.05)
+
+
+def test_planning_anew_on_the_way_keeps_the_path():
+    route = arc_route(radius=1e5).expand(2, -1, -1)
+    path = RoutePath(STATE, route)
+    later = torch.cat([path.at(torch.full((2, 1), 5.0))[:, 0], STATE[:, 3:]], 1)
+    anew = RoutePath(later, route).at(torch.full((2, 1), 5.0))
+    assert torch.allclose(anew, path.at(torch.full((2, 1), 10.0)), atol=0.02)
+
+
+def test_drive_is_nearly_unicycle_motion():
+    """The planned positions advance as their speeds and headings say, also off the centreline and in a curve."""
+    path = RoutePath(STATE, arc_route().expand(2, -1, -1))
+    plan = path.drive(STATE[:, 3:].expand(2, 51))
+    states = torch.cat([STATE[:, None], plan], 1)
+    step = (states[:, 1:, :2] - states[:, :-1, :2]).norm(dim=-1)
+    assert torch.allclose(step, STATE[:, 3:] * 0.1, rtol=0.05)
+    assert (inverse(states)[..., 1].abs() * STATE[:, 3:] < 4.0).all()
+
+
+def test_caps_halt_at_red_lights_and_obey_limits():
+    env = DrivingEnv(make_scenes(1, num_vehicles=1, red_light_x=60.0, limit=8.0), SimSettings(), 1)
+    env.reset()
+    path = MissionPath(env.world())
+    caps = path.speed_caps(20.0, 3.0, 3.0)
+    stop = 60.0 - 4.5 / 2 - 1.0
+    assert torch.allclose(look_up(caps, torch.tensor([[0.0, 20.0]])), torch.tensor(8.0), atol=0.01)
+    at = torch.tensor([[stop - 6.0, stop - 1.5, stop, stop + 1.0]])
+    assert torch.allclose(look_up(caps, at), torch.tensor([36.0, 9.0, 0.0, 0.0]).sqrt(), atol=0.02)
+    assert torch.allclose(path.speed_caps(20.0, 3.0, 3.0, limits=False, lights=False), torch.tensor(400.0), atol=0.1)
+
+
+def test_caps_slow_down_for_curves():
+    scenes = make_scenes(1, num_vehicles=1)
+    angle = (torch.arange(150) * 2.0 - 80).clamp(0, 31.4) / 20
+    x = torch.cat([torch.zeros(1), (2 * angle.cos()).cumsum(0)[:-1]]) - 20
+    y = torch.cat([torch.zeros(1), (2 * angle.sin()).cumsum(0)[:-1]])
+    scenes.scenes["route_points"][0, 0] = torch.stack([x, y], -1)
+    env = DrivingEnv(scenes, SimSettings(), 1)
+    env.reset()
+    caps = MissionPath(env.world()).speed_caps(20.0, 3.0, 3.0, limits=False)[0]
+    assert torch.allclose(caps[32:44].min(), torch.tensor(3.0 * 20), rtol=0.05)
+    assert caps[15] < 399 and abs(caps[-5] - 400) < 1e-2

@@ -1,0 +1,165 @@
+"""A policy's file drives by what it returns, and is refused with one message where it is no policy."""
+
+import math
+import sys
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from e2rl.planners.ego import EgoPolicy, NotFinite
+from e2rl.planners.policy_file import PolicyFileEgo
+from e2rl.run.errors import InputError
+from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.observation import OBSERVATION_SIZE
+from tests.synthetic import make_scenes
+
+needs_onnx = pytest.mark.skipif(not (find_spec("onnxruntime") and find_spec("onnxscript")), reason="extra onnx")
+
+
+class Proportional(nn.Module):
+    """Accelerates towards 12 m/s, steers by nothing; `more` is added to both."""
+
+    def __init__(self, more: float = 0.0) -> None:
+        super().__init__()
+        self.more = more
+
+    def forward(self, observation):
+        accel = 12.0 - 15.0 * observation[:, :1]
+        return torch.cat([accel, torch.zeros_like(accel)], 1) + self.more
+
+
+class Shaped(nn.Module):
+    """Returns what is no action of a batch."""
+
+    def __init__(self, kind: str) -> None:
+        super().__init__()
+        self.kind = kind
+
+    def forward(self, observation):
+        if self.kind == "wide":
+            return observation[:, :3]
+        if self.kind == "flat":
+            return observation[:, 0]
+        if self.kind == "tuple":
+            return observation[:, :2], observation[:, :1]
+        if self.kind == "whole":
+            return (observation[:, :2] > 0).long()
+        return observation[:1, :2]  # one for all
+
+
+def scripted(folder, module, name="policy.pt"):
+    torch.jit.save(torch.jit.trace(module.eval(), torch.zeros(2, OBSERVATION_SIZE)), folder / name)
+    return str(folder / name)
+
+
+def onnx_file(folder, inputs=("observation",), outputs=("action",), rows="batch", numbers=OBSERVATION_SIZE):
+    """An ONNX model of the first two numbers of the (first) input."""
+    from onnx import TensorProto, checker, helper, save
+
+    given = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [rows, numbers]) for name in inputs]
+    made = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [rows, 2]) for name in outputs]
+    ends = [
+        helper.make_tensor(name, TensorProto.INT64, [1], np.array([value]))
+        for name, value in (("begin", 0), ("end", 2), ("axis", 1))
+    ]
+    nodes = [helper.make_node("Slice", [inputs[0], "begin", "end", "axis"], [name]) for name in outputs]
+    model = helper.make_model(helper.make_graph(nodes, "policy", given, made, ends))
+    model.ir_version = 10
+    checker.check_model(model)
+    save(model, folder / "policy.onnx")
+    return str(folder / "policy.onnx")
+
+
+def test_it_drives_by_its_actions_within_the_bounds(tmp_path):
+    env = DrivingEnv(make_scenes(2, speed=6.0), SimSettings(), 2, agents=True)
+    ego = PolicyFileEgo(scripted(tmp_path, Proportional()))
+    td = EgoPolicy(ego, env)(env.reset())
+    assert torch.equal(td["action"], torch.tensor([[5.0, 0.0]] * 2)), "6 m/s^2 are asked for"
+    assert td["ego", "plan"][:, 4, 3].tolist() == pytest.approx([8.5, 8.5])
+    assert td["ego", "plan"][:, -1, 3].tolist() == pytest.approx([12, 12], abs=0.1), "the plan is what it would do"
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_rollout_in_which_it_returns_nan_ends(tmp_path, value):
+    env = DrivingEnv(make_scenes(1), SimSettings(), 1, agents=True)
+    ego = PolicyFileEgo(scripted(tmp_path, Proportional(value)))
+    with pytest.raises(NotFinite):
+        EgoPolicy(ego, env)(env.reset())
+
+
+@pytest.mark.parametrize(
+    ("kind", "what"),
+    [
+        ("wide", r"maps observations \[1, 326\] to \[1, 3\]; it maps float32 observations"),
+        ("flat", r"maps observations \[1, 326\] to \[1\]; it maps"),
+        ("tuple", "returns a tuple; .*as one tensor"),
+        ("whole", "returns torch.int64; "),
+        ("one", r"maps observations \[3, 326\] to \[1, 2\]; .*for every B"),
+    ],
+)
+def test_other_shapes_are_refused(tmp_path, kind, what):
+    with pytest.raises(InputError, match=f"^ego.file=.*policy.pt: {what}"):
+        PolicyFileEgo(scripted(tmp_path, Shaped(kind)))
+
+
+def test_a_policy_for_other_observations_is_refused_with_its_own_reason(tmp_path):
+    torch.jit.save(torch.jit.trace(nn.Linear(12, 2), torch.zeros(2, 12)), tmp_path / "policy.pt")
+    with pytest.raises(
+        InputError, match=r"fails at observations \[1, 326\]: .*it maps float32 observations \[B, 326\]"
+    ):
+        PolicyFileEgo(str(tmp_path / "policy.pt"))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "what"),
+    [
+        (None, None, r"ego.file is not set; pass ego.file=POLICY.onnx"),
+        ("policy.pt", None, "no such file"),
+        ("policy.h5", b"x", "no kind of policy; pass .onnx, or .pt"),
+        ("policy.pt", b"nonsense", "no TorchScript archive"),
+        pytest.param("policy.onnx", b"nonsense", "cannot be read as ONNX", marks=needs_onnx),
+    ],
+)
+def test_what_is_no_policy_is_named(tmp_path, name, content, what):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=what):
+        PolicyFileEgo(name and str(tmp_path / name))
+
+
+def test_weights_without_a_program_are_no_policy(tmp_path):
+    torch.save(nn.Linear(OBSERVATION_SIZE, 2).state_dict(), tmp_path / "policy.pt")
+    with pytest.raises(InputError, match="no TorchScript archive .* write one by torch.jit.save"):
+        PolicyFileEgo(str(tmp_path / "policy.pt"))
+
+
+@needs_onnx
+def test_an_onnx_file_is_asked_for_a_batch_at_once(tmp_path):
+    ego = PolicyFileEgo(onnx_file(tmp_path))
+    observation = torch.rand(5, OBSERVATION_SIZE)
+    assert torch.equal(ego.decide(observation), observation[:, :2])
+
+
+@needs_onnx
+@pytest.mark.parametrize(
+    ("model", "what"),
+    [
+        ({"inputs": ("observation", "hidden")}, r"has 2 inputs \(observation, hidden\) instead of one"),
+        ({"outputs": ("action", "value")}, r"has 2 outputs \(action, value\) instead of one"),
+        ({"numbers": 12}, r"fails at observations \[1, 326\]: .*326"),
+        ({"rows": 1}, r"fails at observations \[3, 326\]: .*for every B"),
+    ],
+)
+def test_an_onnx_file_of_other_shapes_is_refused(tmp_path, model, what):
+    with pytest.raises(InputError, match=what):
+        PolicyFileEgo(onnx_file(tmp_path, **model))
+
+
+def test_without_onnxruntime_the_extra_is_named(tmp_path, monkeypatch):
+    (tmp_path / "policy.onnx").write_bytes(b"x")
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(InputError, match=r"pip install 'e2rl\[onnx\]'"):
+        PolicyFileEgo(str(tmp_path / "policy.onnx"))

@@ -1,0 +1,59 @@
+"""The reference follower: executed actions are read back, it keeps its lane, its distance and red lights."""
+
+import torch
+
+from e2rl.planners.actor import ActorEgo
+from e2rl.planners.ego import EgoPolicy
+from e2rl.planners.reference import executed_action, reference_action
+from e2rl.sim.env import DrivingEnv, SimSettings
+from tests.synthetic import make_scenes
+
+
+def drive(scenes, batch=2):
+    """The untrained actor drives as its reference does."""
+    env = DrivingEnv(scenes, SimSettings(end_on_contact=False), batch, agents=True)
+    return env.rollout(80, EgoPolicy(ActorEgo(hidden=(8,)), env)), env.world()
+
+
+def test_executed_action_is_read_from_the_observation():
+    env = DrivingEnv(make_scenes(2), SimSettings(), 2)
+    data = env.rollout(20)
+    done_to = data["action"].clone()
+    reported = executed_action(data["next", "observation"])
+    assert torch.allclose(reported[..., 0], done_to[..., 0], atol=1e-3)
+    assert (reported[..., 1].abs() <= done_to[..., 1].abs() + 1e-3).all(), "the unicycle bounds yaw rates further"
+
+
+def test_an_empty_road_is_driven_at_the_limit():
+    data, world = drive(make_scenes(2, num_vehicles=1, num_vrus=0, speed=10.0, limit=12.0, road=(-60.0, 600.0)))
+    assert ((world.states[:, 0, 3] > 11.0) & (world.states[:, 0, 3] < 12.0)).all()
+    assert data["action"][..., 1].abs().max() < 1e-3
+
+
+def test_a_standing_car_and_a_red_light_are_halted_at():
+    data, world = drive(make_scenes(2, vehicles=[(0.0, 0, 10.0), (45.0, 0, 0.0)]))
+    assert not data["next", "metrics", "contact"].any() and (world.states[:, 0, 3] < 1.0).all()
+    assert (world.states[:, 0, 0] > 30.0).all()
+    _, world = drive(make_scenes(2, num_vehicles=1, num_vrus=0, red_light_x=50.0))
+    front = world.states[:, 0, 0] + 2.25
+    assert (front < 50.0).all() and (front > 40.0).all()
+
+
+def test_a_car_in_the_other_lane_is_no_leader():
+    free, _ = drive(make_scenes(2, vehicles=[(0.0, 0, 10.0)]))
+    beside, _ = drive(make_scenes(2, vehicles=[(0.0, 0, 10.0), (45.0, 1, 0.0)]))
+    assert torch.allclose(free["action"], beside["action"])
+
+
+def test_an_offset_is_steered_back():
+    scenes = make_scenes(2, num_vehicles=1, num_vrus=0)
+    scenes.scenes["start"][:, 0, 1], scenes.scenes["start"][:, 0, 2] = 1.0, 0.1
+    _, world = drive(scenes)
+    assert world.states[:, 0, 1].abs().max() < 0.1
+
+
+def test_leading_dims_do_not_matter():
+    env = DrivingEnv(make_scenes(3, num_vehicles=12, red_light_x=60.0), SimSettings(), 3)
+    observation = env.rollout(10)["observation"]
+    one_by_one = torch.stack([reference_action(row) for row in observation.flatten(0, 1)])
+    assert torch.allclose(reference_action(observation).flatten(0, 1), one_by_one, atol=1e-5)

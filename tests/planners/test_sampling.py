@@ -1,0 +1,225 @@
+"""Sampling planner: standing cars, free roads, no way out, bounds, mirrors, batches, nobody's plan; its parts."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from e2rl.planners.candidates import drive, heading_at, heading_table, speed_profiles, steer
+from e2rl.planners.ego import PLAN_STEPS, EgoPolicy
+from e2rl.planners.path import MissionPath
+from e2rl.planners.sampling import PROFILES, SHIFTS, SamplingEgo, take
+from e2rl.planners.scoring import forecast, nearest, pair_cost
+from e2rl.scenes.boxes import separation
+from e2rl.scenes.recording import DT
+from e2rl.sim import dynamics
+from e2rl.sim.env import DrivingEnv, SimSettings
+from tests.synthetic import LANE_WIDTH, make_scenes
+
+TIMES = torch.arange(1, 21) * 0.2
+
+
+def world_of(**scene):
+    env = DrivingEnv(make_scenes(**{"num_scenes": 1} | scene), SimSettings(), scene.get("num_scenes", 1), agents=True)
+    env.reset()
+    return env, env.world()
+
+
+def test_keeps_its_mission_alone_and_reaches_its_speed():
+    for limit, speed in ((0.0, 20.0), (12.0, 12.0)):
+        env, _ = world_of(num_vehicles=1, num_vrus=0, limit=limit)
+        data = env.rollout(80, EgoPolicy(SamplingEgo(), env))
+        states = data["next", "agents", "states"][0, :, 0]
+        assert abs(states[-1, 3].item() - speed) < 0.3 and states[:, 1].abs().max() < 0.05
+
+
+def test_stops_behind_a_standing_car_where_there_is_no_way_past():
+    wall = [(0.0, 0, 10.0), (50.0, 0, 0.0), (50.0, 1, 0.0)]
+    env, _ = world_of(vehicles=wall, num_vrus=0)
+    data = env.rollout(80, EgoPolicy(SamplingEgo(), env))
+    state = env.world().states[0, 0]
+    assert not data["next", "terminated"].any() and state[3] < 2.0 and 20 < state[0] < 45.0
+
+
+def test_halts_at_a_red_light():
+    env, _ = world_of(num_vehicles=1, num_vrus=0, red_light_x=50.0)
+    env.rollout(80, EgoPolicy(SamplingEgo(), env))
+    state = env.world().states[0, 0]
+    assert state[3] < 2.0 and 40 < state[0] < 47.8
+
+
+def test_boxed_in_it_is_never_worse_than_hard_braking():
+    """Cars on both sides and one standing ahead, too near to stop: the plan hits no harder than braking would."""
+    box = [(0.0, 0, 12.0), (11.0, 0, 0.0), (0.0, 1, 12.0), (-25.0, 0, 12.0)]
+    _, world = world_of(vehicles=box, num_vrus=0)
+    plan = SamplingEgo().plan(world)[0]
+    size, wall = world.scene["size"][0, 0], world.states[0, 1]
+    braking = dynamics.rollout(world.states[0, 0], torch.tensor([-8.0, 0.0]).expand(PLAN_STEPS, 2))
+
+    def impact(states):
+        hit = (separation(states, size, wall, size) < 0).nonzero()
+        return states[hit[0, 0], 3].item() if len(hit) else 0.0
+
+    assert impact(braking) > 1 and impact(plan) <= impact(braking) + 0.5
+
+
+def test_candidates_obey_the_simulator_s_bounds():
+    scenes = make_scenes(2, num_vehicles=6)
+    scenes.scenes["start"][1, 0, 1:3] = torch.tensor([1.5, 0.6])
+    env = DrivingEnv(scenes, SimSettings(), 2)
+    env.reset(env.reset().select("scene_index").set("scene_index", torch.arange(2)[:, None]))
+    world, ego = env.world(), SamplingEgo()
+    candidates = ego.candidates(world)
+    count = len(PROFILES) * (2 * len(SHIFTS) + 1)
+    assert candidates.states.shape == (2, count, PLAN_STEPS, 4) and torch.isfinite(candidates.states).all()
+    start = world.states[:, :1].expand(-1, count, -1)[:, :, None]
+    states = torch.cat([start, candidates.states], 2)
+    actions = dynamics.inverse(states)
+    assert (actions[..., 0] > -8 - 1e-3).all() and (actions[..., 0] < 5 + 1e-3).all()
+    mean = (states[..., 1:, 3] + states[..., :-1, 3]) / 2
+    assert (actions[..., 1].abs() <= torch.clamp(dynamics.yaw_rate_bound(mean), max=1.6) + 1e-3).all()
+    assert (torch.hypot(actions[..., 0], actions[..., 1] * mean) < dynamics.MAX_LATERAL + 0.05).all()
+    torch.testing.assert_close(dynamics.rollout(start[:, :, 0], actions), candidates.states, atol=2e-3, rtol=0)
+
+
+def test_moves_lead_beside_the_mission():
+    _, world = world_of(num_vehicles=1, num_vrus=0, limit=0.0)
+    candidates = SamplingEgo().candidates(world)
+    cruise = PROFILES.index((0.0, 0.0)) * (2 * len(SHIFTS) + 1)
+    side = candidates.states[0, cruise : cruise + len(SHIFTS), -1, 1]
+    torch.testing.assert_close(side, torch.tensor(SHIFTS), atol=0.25, rtol=0)
+
+
+@pytest.mark.parametrize("beside", [1.0, -1.0])
+def test_a_mirrored_scene_gets_the_mirrored_plan(beside):
+    """Somebody comes over from one side; the road is as wide on both."""
+    plans = []
+    for sign in (beside, -beside):
+        scenes = make_scenes(1, vehicles=[(0.0, 0, 10.0), (3.0, 0, 10.0)], num_vrus=0)
+        start = scenes.scenes["start"]
+        start[0, 1, 1:3] = torch.tensor([2.6 * sign, -0.12 * sign])
+        scenes.scenes["field"].fill_(-10.0)
+        env = DrivingEnv(scenes, SimSettings(), 1, agents=True)
+        env.reset()
+        plans.append(SamplingEgo().plan(env.world()) * torch.tensor([1.0, sign, sign, 1.0]))
+    torch.testing.assert_close(*plans, atol=1e-3, rtol=0)
+    assert plans[0][..., 1].abs().max() > 0.3
+
+
+def test_scenes_of_a_batch_do_not_mix():
+    """Planned together or alone, a scene gets the same plan."""
+    count = 10  # more than a chunk
+    scenes = make_scenes(count, vehicles=[(0.0, 0, 10.0), (22.0, 0, 6.0), (10.0, 1, 10.0), (-15.0, 0, 11.0)])
+    scenes.scenes["start"][1, 1:4, 0] += 6.0
+    scenes.scenes["valid"][2, 1:] = False
+    env = DrivingEnv(scenes, SimSettings(), count)
+    index = torch.arange(count)[:, None]
+    env.reset(env.reset().select("scene_index").set("scene_index", index))
+    together = SamplingEgo().plan(env.world())
+    for k in range(count):
+        alone = DrivingEnv(scenes, SimSettings(), 1)
+        alone.reset(alone.reset().select("scene_index").set("scene_index", index[k : k + 1]))
+        assert torch.allclose(SamplingEgo().plan(alone.world())[0], together[k], atol=1e-3)
+    assert not torch.allclose(together[1, :, 3], together[2, :, 3])
+
+
+def test_takes_no_account_of_the_others_plans_and_routes():
+    _, world = world_of(num_vehicles=6)
+    vehicles = world.scene["route_log"].shape[1]
+    told = replace(world, plan=torch.randn(1, vehicles, PLAN_STEPS, 4), route=torch.ones(1, vehicles, dtype=torch.long))
+    assert torch.equal(SamplingEgo().plan(told), SamplingEgo().plan(world))
+    assert take(told, torch.arange(1)).plan is None
+
+
+def test_speed_profiles_keep_the_caps():
+    caps = (torch.tensor([[8.0]]).expand(1, 100)) ** 2
+    speed = speed_profiles(torch.tensor([10.0]), torch.tensor([[0.0, 0.0], [5.0, 5.0], [-8.0, -8.0]]), caps, 4.0)
+    assert speed.shape == (1, 3, PLAN_STEPS + 1) and (speed[..., 0] == 10).all()
+    assert torch.allclose(speed[0, :2, 10:], torch.tensor(8.0)) and (speed[0, 2, 15:] == 0).all()
+    assert (speed.diff(dim=-1) / DT > -8.001).all() and (speed[0, :2].diff(dim=-1) / DT > -4.001).all()
+
+
+def test_headings_along_the_mission():
+    _, world = world_of(num_vehicles=1)
+    path = MissionPath(world)
+    angle = torch.linspace(0, 3, 150)
+    path.route = torch.stack([20 * angle.sin(), 20 * (1 - angle.cos())], -1)[None]
+    table = heading_table(path)
+    ahead = torch.tensor([[0.0, 5.0, 20.0]])
+    per_arc = 3 / 149 / 2  # rad of the circle per metre of the route's index scale
+    torch.testing.assert_close(heading_at(table, ahead), ahead * per_arc, atol=1e-3, rtol=0)
+
+
+def test_steering_catches_up_with_what_a_bound_withheld():
+    aimed = torch.tensor([0.3, 0.3, 0.3, 0.3])
+    turns = steer(torch.tensor(0.0), aimed, torch.tensor(0.1).expand(4))
+    torch.testing.assert_close(turns, torch.tensor([0.1, 0.1, 0.1, 0.0]))
+
+
+def test_a_curve_is_driven_along_its_mission():
+    scenes = make_scenes(1, num_vehicles=1, num_vrus=0)
+    angle = torch.arange(150) * 2.0 / 40
+    scenes.scenes["route_points"][0, 0, 0] = torch.stack([40 * angle.sin() - 20, 40 * (1 - angle.cos())], -1)
+    scenes.scenes["start"][0, 0] = torch.tensor([-20.0, 0.0, 0.0, 8.0])
+    env = DrivingEnv(scenes, SimSettings(), 1)
+    env.reset()
+    world = env.world()
+    path = MissionPath(world)
+    steady = torch.full((1, 1, PLAN_STEPS + 1), 8.0)
+    driven = drive(world.states[:, 0], path, steady, torch.zeros(1, 1), torch.ones(1), 1.6).states[0, 0]
+    radius = (driven[:, :2] - torch.tensor([-20.0, 40.0])).norm(dim=-1)
+    assert (radius - 40).abs().max() < 0.5 and driven[-1, 2] > 0.9
+
+
+def test_forecasts_of_constant_acceleration_and_turn():
+    scenes = make_scenes(1, vehicles=[(0.0, 0, 10.0), (20.0, 0, 10.0), (40.0, 1, 10.0)], num_vrus=0)
+    scenes.scenes["start_accel"][0, 1], scenes.scenes["start_yaw_rate"][0, 2] = -8.0, 0.5
+    env = DrivingEnv(scenes, SimSettings(), 1)
+    env.reset()
+    world = env.world()
+    agents, seen = nearest(world, 5)
+    assert seen.tolist() == [[True, True, False, False, False]] and agents[0, :2].tolist() == [1, 2]
+    found = forecast(world, agents, seen, TIMES, 1.0, 2.0)
+    expected = 20 + 10 * TIMES - 4 * TIMES.clamp(max=1) ** 2 - 8 * (TIMES - 1).clamp(min=0)
+    torch.testing.assert_close(found.poses[0, 0, :, 0], expected, atol=1e-3, rtol=0)
+    torch.testing.assert_close(found.speed[0, 0], 10 - 8 * TIMES.clamp(max=1))
+    early = TIMES < 2
+    torch.testing.assert_close(found.poses[0, 1, early, 0], 40 + 20 * (0.5 * TIMES[early]).sin(), atol=0.02, rtol=0)
+    torch.testing.assert_close(
+        found.poses[0, 1, early, 1], LANE_WIDTH + 20 * (1 - (0.5 * TIMES[early]).cos()), atol=0.02, rtol=0
+    )
+    assert torch.allclose(found.poses[0, 1, -1, 2], torch.tensor(1.0), atol=1e-3)
+
+
+def test_pair_costs_order_situations():
+    """Contact costs more than nearness, faster contact more than slower, behind less than ahead, far nothing."""
+    weights, size = SamplingEgo().weights, torch.tensor([[4.5, 2.0]])
+
+    def cost(x, y, speed, ego_speed=10.0):
+        ego, other = torch.tensor([[0.0, 0.0, 0.0, ego_speed]]), torch.tensor([[x, y, 0.0, speed]])
+        return pair_cost(ego, size, other, size, torch.tensor([1.0]), weights)[0].item()
+
+    assert cost(4.0, 0.0, 0.0) > cost(4.0, 0.0, 8.0) > cost(5.0, 0.0, 8.0) > 0
+    assert cost(4.0, 0.0, 8.0) > cost(-4.0, 0.0, 12.0) > 0
+    assert cost(10.0, 0.0, 0.0) > cost(10.0, 0.0, 8.0) == 0
+    assert cost(0.0, 2.2, 10.0) > cost(0.0, 2.6, 10.0) > cost(0.0, 3.1, 10.0) == 0
+
+
+def test_the_ranked_begin_with_the_plan_and_are_driven_differently():
+    _, world = world_of(num_scenes=2)
+    ego = SamplingEgo()
+    states, costs = ego.ranked(world, 8)
+    assert states.shape == (2, 8, PLAN_STEPS, 4) and (costs.diff(dim=1) >= 0).all()
+    assert torch.equal(states[:, 0], ego.plan(world))
+    apart = (states[:, :, None] - states[:, None]).abs().amax((3, 4)) + torch.eye(8)
+    assert (apart > 1e-4).all()
+
+
+def test_a_plan_of_its_own_is_rated_as_it_was_ranked():
+    """But for where the plan ends beside the mission, which counts instead of where it led to."""
+    _, world = world_of(num_scenes=2)
+    ego = SamplingEgo(aside=0.0)
+    states, costs = ego.ranked(world, 8)
+    torch.testing.assert_close(ego.rated(world, states), costs, atol=0.2, rtol=0)
+    into = world.states[:, None, 1:2].expand(-1, 1, PLAN_STEPS, -1)
+    assert (ego.rated(world, into) > costs[:, :1] + 50).all(), "one that is where another agent is"

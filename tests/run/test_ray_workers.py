@@ -1,0 +1,127 @@
+"""Ray workers (extra `ray`): what processes here give, bit for bit, though a worker is killed; one clear message."""
+
+import os
+import signal
+import threading
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+import torch
+
+from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.evaluation.rollout_files import ROLLOUTS
+from e2rl.learning.attack import make_traffic
+from e2rl.planners.idm_planner import IDMEgo
+from e2rl.run import processes as ray_workers
+from e2rl.run.errors import InputError
+from e2rl.run.parts import Kept
+from e2rl.run.processes import RayWorkers, in_processes
+from e2rl.sim.env import SimSettings
+from e2rl.traffic.rollout import synthesize_traffic
+from tests.evaluation.test_protocol import SEEDS, same_runs
+from tests.learning.small import Ambush, small_run, small_scenes
+from tests.traffic.e2.traffic_scenes import scenes, synthesizer
+
+HERE = find_spec("ray") is not None
+needs_ray = pytest.mark.skipif(not HERE, reason="Ray is not installed")
+
+
+@pytest.fixture(scope="module")
+def workers():
+    """Two workers on this machine."""
+    found = RayWorkers(2)
+    before = signal.getsignal(signal.SIGTERM)
+    ray = found.connect()
+    assert signal.getsignal(signal.SIGTERM) is before, "a command still ends as e2rl.run.processes says"
+    yield found
+    ray.shutdown()
+
+
+class Mortal(Setup):
+    """A setup whose worker is killed once, after it has written the rollouts of a batch; mark: the file of that."""
+
+    mark = ""
+
+    def score(self, method, tasks, folder=None):
+        found = super().score(method, tasks, folder)
+        if method.name == "e2" and tasks[0] == (2, 1) and not os.path.exists(self.mark):
+            with open(self.mark, "w") as file:
+                file.write(str(os.getpid()))
+            os.kill(os.getpid(), signal.SIGKILL)
+        return found
+
+
+@needs_ray
+def test_two_workers_one_killed_on_the_way_give_what_two_processes_give(tmp_path, workers):
+    """Nothing is lost, nothing twice: rollouts, rows and metrics, bit for bit."""
+    scene_set, folders = scenes(3, steps=20), (tmp_path / "forked", tmp_path / "ray")
+    for processes, folder in zip((2, workers), folders, strict=True):
+        setup = Mortal(scene_set, IDMEgo(), "idm", SimSettings(), 1)
+        setup.mark = str(tmp_path / "killed")
+        if processes == 2:
+            setup.mark = os.devnull  # it is there: nobody is killed
+        methods = [Method("nominal", synthesizer(), 0.0), Method("e2", synthesizer(), 3.0)]
+        run_protocol(setup, methods, SEEDS, folder, processes=processes, kept=Kept(folder))
+    assert int((tmp_path / "killed").read_text()) != os.getpid()
+    same_runs(*folders)
+    parts = [sorted(path.name for path in (folder / "parts").iterdir()) for folder in folders]
+    assert parts[0] == parts[1] and len(parts[0]) == 2 * 3 * len(SEEDS)
+    for path in (folders[0] / ROLLOUTS).iterdir():
+        one, other = np.load(path), np.load(folders[1] / ROLLOUTS / path.name)
+        assert all(np.array_equal(one[key], other[key]) for key in one.files), path.name
+
+
+@needs_ray
+def test_workers_make_the_traffic_of_a_round_while_it_learns(workers):
+    """The same D' as of the same order here, made against the policy before learning."""
+    scene_set = small_scenes()
+    run = small_run(scenes=scene_set, nominal="prior", spread=0.5, ahead=True)
+    run.synthesize, run.batch, run.workers = synthesize_traffic(scene_set, Ambush(), SimSettings()), 2, workers
+    run.run_round()
+    order = run._next
+    expected = make_traffic(order, run.synthesize, batch=2)
+    run.run_round()
+    found = run.memory.rounds[-1].traffic
+    assert set(found) == set(expected) and order.number == run.memory.rounds[-1].number == 1
+    assert all(torch.equal(found[name], expected[name]) for name in expected)
+
+
+def refuse(job):
+    raise InputError(f"job {job}: refused")
+
+
+def vanish(job):
+    os._exit(9)
+
+
+@needs_ray
+def test_errors_of_workers_arrive_and_one_that_always_dies_is_named(workers, monkeypatch):
+    monkeypatch.setattr(ray_workers, "RETRIES", 1)
+    for fault, message in ((refuse, "^job 0: refused$"), (vanish, "launcher=ray: a job lost its worker 2 times")):
+        with pytest.raises(InputError, match=message):
+            list(in_processes(fault, range(1), workers, cost=float))
+
+
+@needs_ray
+def test_files_that_a_worker_wrote_elsewhere_are_missed(tmp_path, workers):
+    class Elsewhere(Setup):
+        def score(self, method, tasks, folder=None):
+            return super().score(method, tasks, tmp_path / "of another machine")
+
+    setup = Elsewhere(small_scenes(1), IDMEgo(), "idm", SimSettings())
+    with pytest.raises(InputError, match="put the run's folder where all machines have it"):
+        run_protocol(setup, [Method("ambush", Ambush(), 2.0)], [0], tmp_path / "run", processes=workers)
+
+
+@needs_ray
+def test_what_cannot_be_sent_is_named(workers):
+    lock = threading.Lock()
+    with pytest.raises(InputError, match="launcher=ray: cannot be sent to workers: .*launcher=processes"):
+        list(in_processes(lambda job: lock, range(2), workers, cost=float))
+
+
+def test_without_ray_the_extra_is_named(monkeypatch):
+    monkeypatch.setattr(ray_workers, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"launcher=ray: .*e2rl\[ray\]"):
+        RayWorkers()

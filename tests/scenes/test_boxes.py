@@ -1,0 +1,70 @@
+"""Boxes against shapely, and invariance under a common rigid motion."""
+
+import pytest
+import torch
+
+from e2rl.scenes.boxes import corners, distance, overlap, separation, signed_distance
+
+shapely = pytest.importorskip("shapely")
+
+
+@pytest.fixture(scope="module")
+def boxes():
+    generator = torch.Generator().manual_seed(0)
+
+    def draw():
+        pose = torch.rand(10_000, 3, generator=generator, dtype=torch.float64) * torch.tensor([12.0, 12.0, 6.3])
+        return pose, 0.3 + torch.rand(10_000, 2, generator=generator, dtype=torch.float64) * torch.tensor([8.0, 3.0])
+
+    first, second = draw(), draw()
+    polygons = [shapely.polygons(corners(*box).numpy()) for box in (first, second)]
+    return first, second, polygons
+
+
+def test_overlap_agrees_with_shapely(boxes):
+    first, second, (a, b) = boxes
+    area = torch.from_numpy(shapely.area(shapely.intersection(a, b)))
+    found = overlap(*first, *second)
+    clear = (area == 0) | (area > 1e-9)
+    assert 0.1 < found.float().mean() < 0.9
+    assert torch.equal(found[clear], (area > 1e-9)[clear])
+
+
+def test_distance_agrees_with_shapely(boxes):
+    first, second, (a, b) = boxes
+    expected = torch.from_numpy(shapely.distance(a, b))
+    assert torch.allclose(distance(*first, *second), expected, atol=1e-9)
+
+
+def test_penetration_is_the_shortest_way_apart(boxes):
+    """Moving one box by the penetration depth along the best axis just ends the overlap."""
+    first, second, _ = boxes
+    depth = signed_distance(*first, *second)
+    inside = depth < -1e-6
+    moved = []
+    for turn in (0.0, torch.pi / 2, torch.pi, -torch.pi / 2):
+        for pose in (first[0], second[0]):
+            way = torch.stack([(pose[:, 2] + turn).cos(), (pose[:, 2] + turn).sin(), torch.zeros(len(pose))], -1)
+            moved.append(separation(first[0], first[1], second[0] - way * depth[:, None], second[1]))
+    assert torch.allclose(torch.stack(moved).amax(0)[inside].clamp(max=0), torch.zeros(()).double(), atol=1e-6)
+
+
+def test_rigid_motion_and_order_do_not_matter(boxes):
+    first, second, _ = boxes
+    before = signed_distance(*first, *second)
+    cos, sin = torch.tensor([0.8, 0.6], dtype=torch.float64)
+    rotation = torch.stack([torch.stack([cos, -sin]), torch.stack([sin, cos])])
+
+    def move(pose):
+        turned = pose[:, :2] @ rotation.T + torch.tensor([3.0, -7.0])
+        return torch.cat([turned, pose[:, 2:] + torch.atan2(sin, cos)], 1)
+
+    assert torch.allclose(signed_distance(move(first[0]), first[1], move(second[0]), second[1]), before)
+    assert torch.allclose(signed_distance(*second, *first), before)
+
+
+def test_pairs_broadcast(boxes):
+    (pose, size), (other, other_size), _ = boxes
+    pairs = overlap(pose[:20, None], size[:20, None], other[None, :30], other_size[None, :30])
+    assert pairs.shape == (20, 30)
+    assert torch.equal(pairs[3, 5], overlap(pose[3], size[3], other[5], other_size[5]))

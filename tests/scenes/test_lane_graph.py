@@ -1,0 +1,163 @@
+"""Route candidates on a road that forks: every branch once, from where the vehicle is, to where the map ends."""
+
+import numpy as np
+import pytest
+from shapely.geometry import LineString, Point
+
+from e2rl.scenes.lane_graph import LaneGraph, infer_exits, plausible_width
+from e2rl.scenes.log_route import MARGIN, route_from_log
+from e2rl.scenes.paths import resample
+from e2rl.scenes.recording import Lane
+from e2rl.scenes.route import SPACING
+
+ARC = np.linspace(-np.pi / 2, 0, 16)
+LEFT = np.concatenate([np.stack([100 + 20 * np.cos(ARC), 20 + 20 * np.sin(ARC)], 1), [[120.0, 320.0]]])
+
+
+def lanes(**more) -> dict[str, Lane]:
+    """`in` along x = 0..100; `on` straight to 400 and `left`, an arc of 20 m radius up to y = 320, both after it."""
+    return {
+        "in": Lane(np.array([[0.0, 0], [50, 0], [100, 0]]), 3.5, 14.0, exits=["on", "left"]),
+        "on": Lane(np.array([[100.0, 0], [400, 0]]), 3.5, 20.0),
+        "left": Lane(LEFT, 3.5, 10.0),
+        **more,
+    }
+
+
+def ways(graph: LaneGraph, x: float, speed: float = 8.0, y: float = 0.0, heading: float = 0.0) -> list[tuple]:
+    """Lanes of the candidates of a vehicle."""
+    found = graph.candidates(np.array([x, y]), heading, speed, 6, 150)
+    return [tuple(name for name, _ in route.lanes) for route in found]
+
+
+@pytest.mark.parametrize("x", [40.0, 60.0, 95.0])
+def test_every_branch_is_a_candidate_from_anywhere_on_the_lane(x):
+    assert ways(LaneGraph(lanes()), x) == [("in", "on"), ("in", "left")]
+
+
+def test_a_fork_beyond_the_reach_is_passed_straight():
+    long = {**lanes(), "in": Lane(np.array([[-200.0, 0], [100, 0]]), exits=["left", "on"])}
+    assert ways(LaneGraph(long), -150.0, speed=3.0) == [("in", "on")]
+    assert ways(LaneGraph(long), 80.0, speed=3.0) == [("in", "on"), ("in", "left")]
+
+
+def test_of_many_branches_those_of_the_nearest_forks_come_first():
+    row, ids = {}, [f"s{k}" for k in range(7)]
+    for k, name in enumerate(ids):
+        start = np.array([30.0 * k, 0.0])
+        row[name] = Lane(np.array([start, start + [30, 0]]), exits=[f"t{k}", *ids[k + 1 : k + 2]])
+        row[f"t{k}"] = Lane(np.array([start + [30, 0], start + [40, 10 + k], start + [45, 300]]))
+    turns = [way[-1] for way in ways(LaneGraph(row), 5.0, speed=20.0)]
+    assert turns == ["t6", "t0", "t1", "t2"]  # the straightest way on, then the turns in the order of the road
+
+
+def test_a_route_follows_its_lanes_and_ends_where_the_map_does():
+    graph = LaneGraph(lanes())
+    on, left = graph.candidates(np.array([60.0, 0.5]), 0.05, 8.0, 6, 150)
+    assert on.vehicle_s == left.vehicle_s == 20.0 and on.length == 298.0 and not on.open
+    assert np.allclose(on.points[:, 1], 0, atol=1e-6) and np.allclose(np.diff(on.points[:, 0]), SPACING, atol=1e-6)
+    true = LineString([(40, 0), (100, 0), *LEFT])
+    inside = left.points[: int(left.length / SPACING) + 1]
+    assert max(true.distance(Point(*point)) for point in inside) < 0.25
+    assert [name for name, _ in left.lanes] == ["in", "left"] and abs(left.lanes[1][1] - 60.0) < 0.5
+    assert on.limit[10] == 14.0 and on.limit[40] == 20.0 and left.limit[40] == 10.0
+    late = graph.candidates(np.array([250.0, 0.0]), 0.0, 8.0, 6, 150)
+    assert len(late) == 1 and late[0].open and abs(late[0].length - 170.0) < 0.5
+    assert np.allclose(late[0].points[-1], [230 + 298, 0], atol=1e-6)  # beyond the end it goes on straight
+
+
+def test_the_map_does_not_end_where_a_long_lane_began_far_behind():
+    long = {
+        "a": Lane(np.array([[-400.0, 0], [0, 0]]), exits=["b"]),
+        "b": Lane(np.array([[0.0, 0], [400, 0]]), exits=[]),
+    }
+    (route,) = LaneGraph(long).candidates(np.array([-5.0, 0.0]), 0.0, 8.0, 6, 150)
+    assert not route.open and route.length == 298.0
+
+
+def test_twice_the_same_way_is_one_candidate_and_neighbours_are_more():
+    twin = lanes(
+        again=Lane(np.array([[0.0, 0.3], [100, 0.3]]), exits=["on"]), beside=Lane(np.array([[0.0, 3.5], [400, 3.5]]))
+    )
+    assert ways(LaneGraph(twin), 60.0) == [("in", "on"), ("in", "left"), ("beside",)]
+    assert ways(LaneGraph(twin), 60.0, heading=np.pi) == []
+    assert ways(LaneGraph(twin), 60.0, y=-30.0) == []
+
+
+def test_a_roundabout_is_left_and_a_ring_does_not_end():
+    quarter = [np.linspace(k * np.pi / 2, (k + 1) * np.pi / 2, 20) for k in range(4)]
+    ring = {
+        f"r{k}": Lane(np.stack([15 * np.cos(a), 15 * np.sin(a)], 1), exits=[f"r{(k + 1) % 4}"])
+        for k, a in enumerate(quarter)
+    }
+    (route,) = LaneGraph(ring).candidates(np.array([15.0, 0.5]), np.pi / 2, 5.0, 6, 150)
+    assert not route.open and np.abs(np.linalg.norm(route.points[:-8], axis=1) - 15).max() < 0.3
+    ring["r1"].exits.append("out")
+    ring["out"] = Lane(np.array([[-15.0, 0], [-16, -20], [-16, -320]]))
+    ends = [way[-1] for way in ways(LaneGraph(ring), 15.0, y=0.5, heading=np.pi / 2, speed=5.0)]
+    assert ends == ["out", "out"] or ends == ["out"]
+
+
+def test_connectivity_is_inferred_from_geometry_and_heights():
+    def flat(a, b, height):
+        return Lane(np.array([a, b], float), heights=np.full(2, height))
+
+    found = infer_exits(
+        {
+            "a": flat([0, 0], [50, 0], 5.0),
+            "b": flat([50.5, 0.3], [90, 0], 5.5),
+            "back": flat([50, 0], [0, 0], 5.0),
+            "bridge": flat([50, 0], [100, 10], 12.0),
+            "far": flat([54, 0], [90, 0], 5.0),
+            "side": flat([50, 0], [50, 50], 5.0),
+        }
+    )
+    assert found["a"] == ["b"] and found["bridge"] == [] and found["back"] == []
+    no_heights = infer_exits({"a": Lane(np.array([[0.0, 0], [50, 0]])), "b": flat([50, 0], [90, 0], 40.0)})
+    assert no_heights["a"] == ["b"]
+    doubled = {"a": Lane(np.array([[0.0, 5], [0, 50], [0, 50]])), "b": Lane(np.array([[0.0, 50], [0, 50], [0, 90]]))}
+    assert infer_exits(doubled) == {"a": ["b"], "b": []}
+
+
+def test_files_without_connectivity_give_the_same_candidates():
+    bare = lanes()
+    bare["in"].exits = []
+    assert ways(LaneGraph(bare), 60.0) == [("in", "on"), ("in", "left")]
+
+
+def test_lanes_too_short_are_left_out_and_widths_doubted():
+    assert LaneGraph(lanes(dot=Lane(np.zeros((1, 2))), stub=Lane(np.array([[0.0, 0], [0.3, 0]])))).ids == [
+        "in",
+        "on",
+        "left",
+    ]
+    assert [plausible_width(w) for w in (0.0, float("nan"), 2.5, 3.2, 6.0, 90.0)] == [3.7, 3.7, 2.5, 3.2, 6.0, 3.7]
+    points = resample(np.array([[0.0, 0], [0, 3], [4, 3]]), 1.0)
+    assert len(points) == 8 and np.allclose(points[3], [0, 3])
+
+
+def lane_change() -> np.ndarray:
+    """A track [81, 4] at 5 m/s from y = 0 to y = 3.5 between x = 20 and x = 60."""
+    x = 20 + 0.5 * np.arange(81)
+    y = 3.5 * (1 - np.cos(np.pi * (x - 20) / 40)) / 2
+    return np.stack([x, y, np.arctan2(np.gradient(y), np.gradient(x)), np.full(81, 5.0)], -1)
+
+
+def test_a_recorded_way_goes_on_along_the_lane_at_its_end():
+    graph = LaneGraph(lanes(beside=Lane(np.array([[0.0, 3.5], [100, 3.5], [200, 3.5]]), speed_limit=9.0)))
+    route = route_from_log(graph, lane_change(), 150)
+    line = LineString(route.points)
+    assert route.vehicle_s == 20.0 and max(line.distance(Point(*point)) for point in lane_change()[:, :2]) < 0.1
+    assert route.open and abs(route.length - 200.0) < 3.0 and np.allclose(route.points[60:, 1], 3.5, atol=1e-3)
+    assert [name for name, _ in route.lanes] == ["in", "beside"] and route.limit[5] == 14.0 and route.limit[60] == 9.0
+
+
+def test_a_recorded_way_off_the_map_ends_soon_after_the_recording():
+    track = lane_change() + [0, 100, 0, 0]
+    route = route_from_log(LaneGraph(lanes()), track, 150)
+    way = np.linalg.norm(np.diff(track[:, :2], axis=0), axis=1).sum()
+    assert route.open and abs(route.length - (20 + way + MARGIN)) < 0.5 and route.lanes == []
+    standing = np.tile([5.0, 100.0, 0.3, 0.0], (81, 1))
+    route = route_from_log(LaneGraph(lanes()), standing, 150)
+    assert route.open and abs(route.length - 30.0) < 1e-6 and np.isfinite(route.points).all()
+    assert np.allclose(route.points[10], [5, 100], atol=0.01)

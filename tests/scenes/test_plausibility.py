@@ -1,0 +1,182 @@
+"""Logs in other units, mirrored or beside their map are refused with the reason; logs like those recorded are not."""
+
+import copy
+
+import numpy as np
+import pytest
+
+from e2rl.run.errors import InputError
+from e2rl.scenes.builder import BuildSettings, build_scene
+from e2rl.scenes.bundled import load_recordings
+from e2rl.scenes.lane_graph import LaneGraph
+from e2rl.scenes.plausibility import LIMITS, extent, lane_spacing, map_fit, motion
+from e2rl.scenes.recording import VEHICLE, Lane
+
+SMALL = BuildSettings(steps=20, vehicles=4, others=2, field_cells=32)
+
+
+@pytest.fixture(scope="module")
+def genuine():
+    return load_recordings("tune")[0]
+
+
+def scaled(recording, factor, *parts):
+    """Parts of a recording in units that are `factor` times smaller."""
+    if "positions" in parts:
+        recording.states[..., :2] *= factor
+    if "speeds" in parts:
+        recording.states[..., 3] *= factor
+    if "sizes" in parts:
+        recording.size = recording.size * factor
+    if "map" in parts:
+        recording.lanes = {
+            name: Lane(lane.points * factor, lane.width * factor, exits=lane.exits)
+            for name, lane in recording.lanes.items()
+        }
+        recording.drivable = [ring * factor for ring in recording.drivable]
+
+
+def moved(recording, change):
+    """The map with every point [P, 2] changed."""
+    recording.lanes = {name: Lane(change(lane.points), exits=lane.exits) for name, lane in recording.lanes.items()}
+    recording.drivable = [change(ring) for ring in recording.drivable]
+
+
+def setting(where, value):
+    def change(recording):
+        recording.states[where] = value
+
+    return change
+
+
+def longer(recording):
+    recording.size = recording.size.copy()
+    recording.size[1, 0] = 200.0
+
+
+def turned(recording):
+    recording.states[:, recording.ego, 2] = np.degrees(recording.states[:, recording.ego, 2]) + 40.0
+
+
+def far_away(recording):
+    agent = 1 - recording.ego if recording.ego < 2 else 0
+    recording.states[:, agent, 0] += 1e9
+
+
+def long_lane(recording):
+    recording.lanes = recording.lanes | {"long": Lane(np.array([[0.0, 0.0], [1e7, 0.0]]))}
+
+
+def fastest(recording):
+    """The vehicle other than the ego that drives farthest."""
+    steps = np.linalg.norm(np.diff(recording.states[..., :2], axis=0), axis=-1)
+    way = (steps * (recording.valid[1:] & recording.valid[:-1])).sum(0) * (recording.agent_type == VEHICLE)
+    way[recording.ego] = 0
+    return int(way.argmax())
+
+
+def one_vehicle(part, change):
+    def apply(recording):
+        recording.states[:, fastest(recording), part] = change(recording.states[:, fastest(recording), part])
+
+    return apply
+
+
+def twice(recording):
+    every = [*range(recording.states.shape[1]), fastest(recording)]
+    recording.states, recording.valid = recording.states[:, every], recording.valid[:, every]
+    recording.size, recording.agent_type = recording.size[every], recording.agent_type[every]
+
+
+ALL = ("positions", "speeds", "sizes", "map")
+MUTATIONS = {
+    "degrees": (lambda r: setting((..., 2), np.degrees(r.states[..., 2]))(r), "rad lie between|rad is the largest"),
+    "the ego in degrees": (turned, "rad lie between|rad is the largest"),
+    "mirrored tracks": (lambda r: setting((..., 1), -r.states[..., 1])(r), "rad lie between"),
+    "tracks with swapped axes": (lambda r: setting((..., slice(0, 2)), r.states[..., [1, 0]])(r), "rad lie between"),
+    "reversed headings": (lambda r: setting((..., 2), r.states[..., 2] + np.pi)(r), "rad lie between"),
+    "mirrored map": (
+        lambda r: moved(r, lambda points: points * [1, -1] + [0, 17]),
+        "m is the ego from|drive along a lane",
+    ),
+    "map with swapped axes": (
+        lambda r: moved(r, lambda points: points[:, ::-1]),
+        "m is the ego from|drive along a lane",
+    ),
+    "map 5 km away": (lambda r: moved(r, lambda points: points + 5000), "from the nearest lane"),
+    "map of another place": (lambda r: moved(r, lambda points: points + [0, 13]), "drive along a lane"),
+    "feet": (lambda r: scaled(r, 3.28, *ALL), "median length of vehicles"),
+    "feet but for sizes": (lambda r: scaled(r, 3.28, *ALL[:2], "map"), "side by side"),
+    "positions and map in feet": (lambda r: scaled(r, 3.28, "positions", "map"), "is what the recorded speeds make"),
+    "one vehicle in feet": (
+        one_vehicle(slice(0, 2), lambda place: place * 3.28),
+        "displacement of a vehicle|from the ego",
+    ),
+    "one vehicle in degrees": (
+        one_vehicle(2, lambda angle: np.degrees(angle) + 40),
+        "displacement of a vehicle|rad is the largest",
+    ),
+    "one vehicle in km/h": (one_vehicle(3, lambda speed: speed * 3.6), "displacement of a vehicle"),
+    "one vehicle reversed": (one_vehicle(2, lambda angle: angle + np.pi), "displacement of a vehicle"),
+    "one vehicle twice": (twice, "at the same place"),
+    "millimetres": (lambda r: scaled(r, 1000.0, *ALL), "m is"),
+    "kilometres": (lambda r: scaled(r, 1e-3, *ALL), "m is an agent's"),
+    "km/h": (lambda r: scaled(r, 3.6, "speeds"), "is what the recorded speeds make"),
+    "a car of 200 m": (longer, "m is an agent's length"),
+    "coordinates of 1e9": (far_away, "m is the largest coordinate"),
+    "a lane of 10,000 km": (long_lane, "m is"),
+}
+
+
+@pytest.mark.parametrize("name", MUTATIONS)
+def test_what_is_no_traffic_in_metres_on_its_map_is_refused_with_the_reason(genuine, name):
+    change, reason = MUTATIONS[name]
+    recording = copy.deepcopy(genuine)
+    change(recording)
+    with pytest.raises(InputError, match=rf"^scene '.*({reason}).*, plausible is .*; "):
+        build_scene(recording, SMALL)
+
+
+def test_genuine_recordings_stay_well_inside_the_limits():
+    """At half of each limit and twice each least value they would still pass."""
+    for recording in load_recordings("tune")[::8]:
+        measures = extent(recording) | motion(recording) | map_fit(recording, LaneGraph(recording.lanes))
+        assert measures.keys() == LIMITS.keys()
+        for name, value in measures.items():
+            low, high, *_ = LIMITS[name]
+            assert not value < low and not value > high, name
+            if name not in ("speed_ratio", "ego_speed_ratio", "on_lanes", "lane_spacing", "vehicle_length"):
+                assert not value > high / 1.5, name
+
+
+def test_a_slow_vehicle_may_drive_backwards_and_a_short_way_tells_nothing(genuine):
+    recording = copy.deepcopy(genuine)
+    agent, frames = fastest(recording), np.arange(len(recording.states))
+    recording.valid[:], recording.valid[:, agent] = False, True
+    for speed, name, other in ((2.5, "slow_direction", "track_direction"), (7.0, "track_direction", "slow_direction")):
+        states = [0.1 * speed * frames, 0 * frames, 0 * frames + np.pi, 0 * frames + speed]
+        recording.states[:, agent] = np.stack(states, 1)
+        found = motion(recording)
+        assert found[name] == pytest.approx(0.0 if speed == 2.5 else np.pi) and np.isnan(found[other])
+    recording.valid[10:, agent] = False  # 6 m
+    assert np.isnan(motion(recording)["track_direction"])
+
+
+def test_the_same_traffic_elsewhere_and_turned_is_as_plausible(genuine):
+    recording = copy.deepcopy(genuine)
+    angle, away = 0.7, np.array([30_000.0, -4_000.0])
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    recording.states[..., :2] = recording.states[..., :2] @ turn + away
+    recording.states[..., 2] += angle
+    moved(recording, lambda points: points @ turn + away)
+    ours = motion(recording) | map_fit(recording, LaneGraph(recording.lanes))
+    theirs = motion(genuine) | map_fit(genuine, LaneGraph(genuine.lanes))
+    for name, value in theirs.items():
+        assert ours[name] == pytest.approx(value, rel=0.05, abs=0.02, nan_ok=True), name
+
+
+@pytest.mark.parametrize("apart", [3.0, 4.5])
+def test_lanes_side_by_side_lie_as_far_apart_as_they_do(apart):
+    lines = {str(k): Lane(np.array([[0.0, k * apart], [400.0, k * apart]])) for k in range(3)}
+    assert lane_spacing(LaneGraph(lines)) == pytest.approx(apart)
+    assert np.isnan(lane_spacing(LaneGraph({"0": lines["0"]})))

@@ -1,0 +1,311 @@
+"""ScenarioDescription files: nothing in them is ever run, and what they say arrives in the Recording."""
+
+import collections
+import os
+import pickle
+import struct
+import tracemalloc
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from e2rl.run.errors import InputError
+from e2rl.scenes.log_files import MAX_BYTES
+from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, OTHER, PEDESTRIAN, VEHICLE
+from e2rl.scenes.scenarionet import ScenarioNetSource, read_recording, safe_load
+from tests.scenes.descriptions import ALL, FRAMES, Malicious, description, fork, straight, write_folder, write_zip
+
+PROTOCOLS = range(6)
+
+
+def read(scene: dict, starts=None) -> list:
+    return list(read_recording(pickle.dumps(scene), "made.pkl", "place").windows(starts, 80))
+
+
+def contents(path: Path) -> list[bytes]:
+    source = ScenarioNetSource(str(path))
+    return [source.content(log) for log in source.logs()]
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda path: Malicious(os.system, f"touch {path}"),
+        lambda path: Malicious(open, str(path), "w"),
+        lambda path: Malicious(eval, f"open({str(path)!r}, 'w')"),
+        lambda path: Malicious(os.mkdir, str(path)),
+        lambda path: Malicious(np.save, str(path), 1),
+        lambda path: Malicious(getattr, "a", "upper"),
+        lambda path: Malicious(np.load, str(path)),
+        lambda path: collections.OrderedDict(a=1),
+    ],
+)
+def test_forbidden_classes_are_refused_by_name_and_never_run(tmp_path, call, protocol):
+    mark = tmp_path / "ran.npy"
+    content = pickle.dumps({"metadata": {"x": call(mark)}}, protocol)
+    with pytest.raises(InputError, match=r"made\.pkl: cannot be read: names the forbidden class"):
+        safe_load(content, "made.pkl")
+    assert not mark.exists()
+
+
+def test_dotted_names_and_other_modules_of_numpy_are_refused():
+    for module, name in (
+        ("numpy", "ndarray.tofile"),
+        ("numpy", "fromfile"),
+        ("numpy.core.multiarray", "fromfile"),
+        ("numpy.testing", "dtype"),
+        ("builtins", "eval"),
+        ("builtins", "getattr"),
+        ("collections", "namedtuple"),
+        ("numpy.core", "multiarray"),
+    ):
+        content = (
+            b"\x80\x04\x8c"
+            + bytes([len(module)])
+            + module.encode()
+            + b"\x8c"
+            + bytes([len(name)])
+            + name.encode()
+            + b"\x93."
+        )
+        with pytest.raises(InputError, match="forbidden class"):
+            safe_load(content, "made.pkl")
+
+
+@pytest.mark.parametrize("protocol", [3, 4, 5])
+def test_arrays_of_both_numpys_and_containers_are_read(protocol):
+    held = {
+        "a": np.arange(6.0).reshape(2, 3),
+        "b": np.float32(2.5),
+        "c": np.array(["x", None], object),
+        "d": collections.defaultdict(dict, {"k": {1}}),
+        "e": (frozenset({2}), 1j, b"z", bytearray(b"y")),
+        "f": np.asfortranarray(np.eye(3)),
+        "g": np.array(["LANE"]),
+        "h": np.bool_(True),
+    }
+    new = pickle.dumps(held, protocol)
+    old = new.replace(b"numpy._core.", b"numpy.core.") if protocol == 3 else new
+    if protocol > 3:  # lengths of names stand in the stream
+        for name in (b"numpy._core.multiarray", b"numpy._core.numeric"):
+            old = old.replace(bytes([len(name)]) + name, bytes([len(name) - 1]) + name.replace(b"_core", b"core"))
+        old = old[:2] + old[11:] if old[2:3] == b"\x95" else old  # without the frame, whose length changed
+    for content in (new, old):
+        found = safe_load(content, "made.pkl")
+        assert found.keys() == held.keys() and found["d"] == {"k": {1}}
+        assert all(np.array_equal(found[key], held[key]) for key in "abcfgh") and found["e"] == held["e"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"nonsense", pickle.dumps(description())[:5000], pickle.dumps([1]), b"\x80\x04\x95", b"\x80\x05}q\x00("],
+)
+def test_damaged_files_are_named(content):
+    with pytest.raises(InputError, match=r"^made\.pkl: "):
+        safe_load(content, "made.pkl")
+
+
+def test_folders_and_zips_hold_the_same_scenes(tmp_path):
+    scenes = [description(), description(scenario_id="other")]
+    folder = write_folder(tmp_path / "data" / "part", scenes).parent
+    (folder / "dataset_summary.pkl").write_bytes(b"summary")
+    (folder / "notes.txt").write_text("x")
+    expected = contents(folder)
+    assert len(expected) == 2
+    for method in (zipfile.ZIP_LZMA, zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED):
+        path = write_zip(tmp_path / f"{method}.zip", scenes, method)
+        assert contents(path) == expected
+
+
+def test_what_is_no_regular_file_is_named_or_passed_over(tmp_path):
+    folder = write_folder(tmp_path / "x", [description()])
+    (folder / "folder.pkl").mkdir()
+    os.mkfifo(folder / "pipe.pkl")
+    (folder / "nothing.pkl").symlink_to(folder / "nowhere")
+    source = ScenarioNetSource(str(folder), cache=str(tmp_path / "cache"), workers=1, skip_invalid=True)
+    assert source.logs() == ["nothing.pkl", "pipe.pkl", "sd_00.pkl"]
+    for log in source.logs()[:2]:
+        with pytest.raises(InputError, match=f"{log} in .*no regular file"):
+            source.content(log)
+    assert source.load().dropped == {"invalid": 2}
+    with pytest.raises(InputError, match="neither a folder nor a zip file"):
+        ScenarioNetSource(str(folder / "pipe.pkl")).logs()
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2])
+@pytest.mark.parametrize("claimed", [None, 1000])
+def test_a_bomb_is_not_unpacked(tmp_path, method, claimed):
+    """Neither where the zip says how much would come out, nor where it lies."""
+    path, size = tmp_path / "bomb.zip", 3 * MAX_BYTES
+    with zipfile.ZipFile(path, "w", method) as archive:
+        archive.writestr("bomb.pkl", bytes(size))
+    if claimed:
+        path.write_bytes(path.read_bytes().replace(struct.pack("<I", size), struct.pack("<I", claimed)))
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"bomb\.pkl in .*bomb\.zip: cannot be read"):
+            ScenarioNetSource(str(path)).content("bomb.pkl")
+        assert tracemalloc.get_traced_memory()[1] < 2 * MAX_BYTES
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_zip_with_a_damaged_directory_and_an_index_that_is_no_table_are_named(tmp_path):
+    path = write_zip(tmp_path / "x.zip", [description()])
+    (tmp_path / "index.csv").write_bytes(b"file,location_group\n\xff\xfe,\x00\n")
+    with pytest.raises(InputError, match=r"index\.csv: cannot be read"):
+        _ = ScenarioNetSource(str(path)).locations
+    content = path.read_bytes()
+    place = content.index(b"PK\x01\x02")
+    path.write_bytes(content[:place] + b"XXXX" + content[place + 4 :])
+    with pytest.raises(InputError, match="damaged zip"):
+        ScenarioNetSource(str(path)).logs()
+
+
+def test_paths_that_hold_nothing_say_so(tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file.bin").write_bytes(b"x" * 100)
+    for name, message in (
+        ("none", "no such file or folder"),
+        ("empty", r"no \.pkl scenario"),
+        ("file.bin", "neither a folder nor a zip"),
+    ):
+        with pytest.raises(InputError, match=message) as caught:
+            ScenarioNetSource(str(tmp_path / name)).logs()
+        assert str(tmp_path / name) in str(caught.value)
+
+
+def test_a_damaged_zip_member_is_named(tmp_path):
+    path = write_zip(tmp_path / "x.zip", [description()])
+    content = bytearray(path.read_bytes())
+    content[200:400] = bytes(200)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"sd_00\.pkl in .*x\.zip: cannot be read"):
+        contents(path)
+
+
+def test_tracks_types_sizes_and_the_map_arrive():
+    tracks = {
+        "ego": straight(20, 0, 8),
+        5: straight(40, 0, 6, size=(1.7, 4.1)),
+        "cone": straight(60, 0, 0, kind="TRAFFIC_CONE"),
+        "p": straight(0, 9, 1, kind="PEDESTRIAN", size=(0.5, 0.6)),
+    }
+    tracks["p"]["state"]["valid"] = np.where(ALL < 30, 1.0, 0.0)[:, None]  # as nuScenes files have it
+    tracks["p"]["state"]["length"] = tracks["p"]["state"]["length"][:, None]
+    tracks["p"]["state"]["position"][30:] = np.nan
+    (recording,) = read(description(tracks))
+    assert recording.validate() is recording and (recording.scene_id, recording.location) == ("fork", "place")
+    assert recording.dataset == "made" and recording.current == 10 and recording.ego == 0
+    assert recording.agent_type.tolist() == [VEHICLE, VEHICLE, OTHER, PEDESTRIAN]
+    assert recording.size.tolist() == [[4.5, 1.9], [4.1, 1.7], [4.5, 1.9], [0.5, 0.6]]  # a car is longer than wide
+    assert recording.valid.sum(0).tolist() == [91, 91, 91, 30] and np.isfinite(recording.states).all()
+    assert np.allclose(recording.states[:, 0], np.stack([20 + 0.8 * ALL, 0 * ALL, 0 * ALL, 0 * ALL + 8], 1))
+    assert set(recording.lanes) == {"in", "on", "left", "near"}  # no bike lane, no single point
+    assert recording.lanes["in"].exits == ["on", "left"] and recording.lanes["in"].width == 3.6
+    assert np.isclose(recording.lanes["on"].speed_limit, 20.0)
+
+
+def test_lane_polygons_are_drivable_and_neighbours_named():
+    lanes = fork()
+    lanes["in"] |= {
+        "polygon": np.array([[0, -2, 0], [100, -2, 0], [100, 2, 0]]),
+        "left_neighbor": [{"feature_id": "near"}],
+        "right_neighbor": ["bike"],
+    }
+    (recording,) = read(description(lanes=lanes))
+    assert [ring.tolist() for ring in recording.drivable] == [[[0, -2], [100, -2], [100, 2]]]
+    assert recording.lanes["in"].left == ["near"] and recording.lanes["in"].right == ["bike"]
+    assert recording.lanes["in"].heights is None and recording.lanes["on"].heights is not None
+
+
+def test_lights_keep_their_last_known_state():
+    states = ["LANE_STATE_UNKNOWN", "LANE_STATE_ARROW_STOP", None, "LANE_STATE_CAUTION", "LANE_STATE_GO"]
+    scene = description() | {
+        "dynamic_map_states": {
+            "a": {"lane": "on", "state": {"object_state": states}},
+            "left": {"state": {"object_state": ["TRAFFIC_LIGHT_RED"]}},
+            "b": {"lane": "nowhere", "state": {"object_state": states}},
+            "near": {"state": {}},
+        }
+    }
+    (recording,) = read(scene)
+    assert recording.lights.keys() == {"on", "left", "near"}
+    assert recording.lights["on"][:6].tolist() == [
+        LIGHT_UNKNOWN,
+        LIGHT_RED,
+        LIGHT_RED,
+        LIGHT_YELLOW,
+        LIGHT_GREEN,
+        LIGHT_GREEN,
+    ]
+    assert (recording.lights["left"] == LIGHT_RED).all() and (recording.lights["near"] == LIGHT_UNKNOWN).all()
+    assert all(len(light) == FRAMES for light in recording.lights.values())
+
+
+def test_skipped_time_stamps_move_start_frame_and_lights():
+    scene = description(ts=np.where(ALL > 4, ALL + 2, ALL) * 0.1 + 77.0)
+    tracks = scene["tracks"]["ego"]["state"]
+    tracks["position"][5:, 0] += 1.6  # 0.2 s at 8 m/s
+    scene["dynamic_map_states"] = {"on": {"state": {"object_state": ["LANE_STATE_GO"] * 5 + ["LANE_STATE_STOP"] * 86}}}
+    (recording,) = read(scene)
+    assert len(recording.states) == 93 and recording.current == 12 and recording.valid[:, 0].all()
+    assert np.allclose(recording.states[:, 0, 0], 20 + 0.8 * np.arange(93), atol=1e-6)
+    assert np.flatnonzero(np.diff(recording.lights["on"])).tolist() == [6] and len(recording.lights["on"]) == 93
+
+
+def test_start_frames():
+    assert [r.scene_id for r in read(description(), [10, 30, 50, 90])] == ["fork@10", "fork@30", "fork@50"]
+    (recording,) = read(description(current_time_index=12))
+    assert recording.current == 12 and recording.scene_id == "fork"
+    long = description()
+    del long["metadata"]["current_time_index"]
+    assert [r.current for r in read(long)] == [10]
+    repeat = lambda value: np.concatenate([value, value, value]) if isinstance(value, np.ndarray) else value  # noqa: E731
+    for track in long["tracks"].values():
+        track["state"] = {key: repeat(value) for key, value in track["state"].items()}
+    long["metadata"]["ts"] = np.arange(273) * 0.1
+    assert [r.current for r in read(long)] == [10, 101, 192]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: s["metadata"].update(sdc_id="nobody"), r"no ego: metadata\.sdc_id='nobody'"),
+        (lambda s: s["metadata"].pop("sdc_id"), "no ego"),
+        (lambda s: s.pop("metadata"), "not a ScenarioDescription"),
+        (lambda s: s.update(tracks={}), "no ego"),
+        (lambda s: s.update(metadata=3), "not a ScenarioDescription"),
+        (lambda s: s["tracks"]["7"].pop("state"), "not a ScenarioDescription.*state"),
+        (lambda s: s["tracks"]["7"]["state"]["position"].fill(np.nan), "track 7 is NaN or infinite at frame 0"),
+        (lambda s: s["metadata"].update(ts=ALL[:5]), "5 time stamps for 91 frames"),
+        (lambda s: s["metadata"].update(ts=ALL[::-1] * 0.1), "time stamps do not increase"),
+        (lambda s: s["metadata"].update(current_time_index="x"), "current_time_index='x' is no frame of 91"),
+        (lambda s: s["metadata"].update(current_time_index=np.inf), "current_time_index=inf is no frame of 91"),
+        (lambda s: s["metadata"].update(current_time_index=-80), "current_time_index=-80 is no frame of 91"),
+        (lambda s: s["metadata"].update(ts=np.append(ALL[:90] * 0.1, 1e9)), "scene 'fork': 3e.10 frames x agents"),
+        (lambda s: s.update(id="x" * 200), "its id has more than 128 characters"),
+        (lambda s: s["tracks"]["7"]["state"].update(position=np.zeros((4, 3))), "not a ScenarioDescription"),
+        (lambda s: s.update(map_features=[1]), "not a ScenarioDescription"),
+        (lambda s: s["tracks"].update({7: s["tracks"]["7"]}), "two of its tracks have the id '7'"),
+        (lambda s: s["tracks"]["7"].update(type="SPACESHIP"), "track 7 is of the unknown type 'SPACESHIP'; known are"),
+        (lambda s: s["tracks"]["7"].update(type=[1]), r"track 7 is of the unknown type '\[1\]'"),
+    ],
+)
+def test_what_is_wrong_is_named_with_the_file(change, message):
+    scene = description()
+    change(scene)
+    with pytest.raises(InputError, match=rf"^made\.pkl: {message}"):
+        read(scene)
+
+
+def test_places_come_from_an_index_beside_the_data(tmp_path):
+    path = write_zip(tmp_path / "x.zip", [description()])
+    assert ScenarioNetSource(str(path)).locations == {}
+    (tmp_path / "index.csv").write_text("file,location_group\npart/sd_00.pkl,17\n")
+    assert ScenarioNetSource(str(path)).locations == {"sd_00": "17"}
+    (tmp_path / "index.csv").write_text("name\nx\n")
+    assert ScenarioNetSource(str(path)).locations == {}

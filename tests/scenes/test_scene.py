@@ -1,0 +1,57 @@
+"""Sets of scenes in memory are sliced, and scenes are checked by key."""
+
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from e2rl.run.errors import InputError
+from e2rl.scenes.builder import BuildSettings, build_scene
+from e2rl.scenes.scenarionet import read_recording
+from e2rl.scenes.scene import Loaded, SceneSet, validate
+from tests.scenes.descriptions import description
+
+SETTINGS = BuildSettings(field_cells=64)
+
+
+def build(**options) -> TensorDict:
+    return build_scene(read_recording(pickle.dumps(description(**options)), "made"), SETTINGS)
+
+
+def test_the_set_is_sliced():
+    several = torch.stack([build(), build()])
+    several["scene_index"] = torch.arange(2)
+    whole = SceneSet(Loaded(several), ["a", "b"], ["p", "q"], "made", "test", {"invalid": 1})
+    assert len(whole) == 2 and whole.first(None) is whole and whole.first(9) is whole
+    first = whole.first(1)
+    assert len(first) == 1 and first.scene_id == ["a"] and first.location == ["p"] and first.dropped == {"invalid": 1}
+    assert whole.batch([1, 0, 1])["scene_index"].tolist() == [1, 0, 1] and whole.steps == 80
+    assert [part["scene_index"].tolist() for part in whole.parts(1)] == [[0], [1]]
+    assert [whole.index(which) for which in (0, 1, "a", "b")] == [0, 1, 0, 1]
+    for which in (2, -1, "c"):
+        with pytest.raises(InputError, match=f"scene={which}: expected an index below 2 or the id of a scene"):
+            whole.index(which)
+    assert whole.to("cpu").scenes.device == torch.device("cpu")
+    one, other = whole.rows.hashes()
+    several["start"][1, 0, 3] += 1e-3
+    assert one == other and whole.rows.hashes()[0] == one != whole.rows.hashes()[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda scene: scene.pop("field"), r"scene 'x'.*'field' is missing"),
+        (lambda scene: scene.set("start_accel", scene["start"]), "start_accel has 2 dims, expected 1"),
+        (lambda scene: scene["logged"].fill_(float("nan")), "logged holds NaN"),
+        (lambda scene: scene["field"].fill_(float("inf")), "field holds NaN or infinite"),
+        (lambda scene: scene["valid"].fill_(False), "the ego is absent or has no route"),
+        (lambda scene: scene["route_log"].fill_(-1), "the ego is absent or has no route"),
+    ],
+)
+def test_what_breaks_the_schema_is_named(change, message):
+    scene = build()
+    validate(scene, "x")
+    change(scene)
+    with pytest.raises(InputError, match=message):
+        validate(scene, "x")

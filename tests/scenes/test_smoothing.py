@@ -1,0 +1,155 @@
+"""Kinematics of logs: polynomial tracks come back exactly, and nothing of the future is seen."""
+
+import numpy as np
+import pytest
+
+from e2rl.run.errors import InputError
+from e2rl.scenes.smoothing import causal_past, causal_state, drop_jumps, resample_uniform, runs_of_true, smooth
+
+TIME = np.arange(40) * 0.1
+
+
+def accelerating(heading: float = 0.7, speed: float = 4.0, accel: float = 1.5) -> np.ndarray:
+    """States [40, 1, 4] under constant acceleration along a heading, with a false recorded speed."""
+    way = speed * TIME + accel * TIME**2 / 2
+    columns = [way * np.cos(heading) + 9, way * np.sin(heading) - 5, np.full(40, heading), np.full(40, 99.0)]
+    return np.stack(columns, -1)[:, None]
+
+
+def test_constant_acceleration_is_estimated_exactly():
+    states, valid = accelerating(), np.ones((40, 1), bool)
+    start, accel, yaw_rate = causal_state(states, valid, 20)
+    assert np.allclose(start[0, :3], states[20, 0, :3], atol=1e-6)
+    assert np.isclose(start[0, 3], 4.0 + 1.5 * 2.0, atol=1e-5) and np.isclose(accel[0], 1.5, atol=1e-4)
+    assert abs(yaw_rate[0]) < 1e-9
+
+
+def test_a_steady_turn_is_estimated():
+    heading = 0.3 * TIME
+    states = np.stack([np.sin(heading) * 20, (1 - np.cos(heading)) * 20, heading, np.full(40, 6.0)], -1)[:, None]
+    states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
+    start, _, yaw_rate = causal_state(states, np.ones((40, 1), bool), 20)
+    assert np.isclose(yaw_rate[0], 0.3, atol=1e-4) and np.isclose(start[0, 3], 6.0, atol=0.1)  # the fit is a chord's
+
+
+def test_the_start_state_is_blind_to_the_future_and_to_gaps_before():
+    states, valid = accelerating(), np.ones((40, 1), bool)
+    before = causal_state(states, valid, 20)
+    states[21:], valid[21:] = np.nan, False
+    states[:15], valid[:15] = 1e6, True
+    valid[14] = False
+    after = causal_state(states, valid, 20)
+    assert all(np.allclose(a, b, atol=1e-4) for a, b in zip(before, after, strict=True))
+
+
+@pytest.mark.parametrize("known", [1, 2, 3, 5])
+def test_short_histories_stay_finite(known):
+    states, valid = accelerating(), np.zeros((40, 1), bool)
+    valid[21 - known : 21] = True
+    start, accel, yaw_rate = causal_state(states, valid, 20)
+    assert np.isfinite(start).all() and np.isfinite(accel).all() and np.isfinite(yaw_rate).all()
+    if known > 1:
+        assert abs(start[0, 3] - 7.0) < 0.5
+
+
+def test_the_past_is_seen_from_the_present_and_blind_to_the_future_and_to_gaps_before():
+    states, valid, speed = accelerating(), np.ones((40, 1), bool), np.array([7.0])
+    back = np.arange(1, 11) * 0.1
+    past = causal_past(states, valid, 20, speed)
+    assert past.shape == (1, 10, 3)
+    assert np.allclose(past[0, :, 0], -7.0 * back + 1.5 * back**2 / 2) and np.allclose(past[0, :, 1:], 0)
+    states[21:], valid[21:], states[:15] = np.nan, False, 1e6
+    valid[14] = False
+    short = causal_past(states, valid, 20, speed)
+    assert np.allclose(short[0, :5], past[0, :5])
+    assert np.allclose(np.diff(short[0, 4:, 0]), -0.7) and np.allclose(short[0, :, 1:], 0)
+    assert np.allclose(causal_past(states, valid, 0, speed)[0, :, 0], -7.0 * back), "straight on where nothing is known"
+
+
+def test_a_turn_shows_in_the_past():
+    angle = np.linspace(3.0, 3.5, 20)  # across the cut
+    states = np.stack([10 * np.sin(angle), -10 * np.cos(angle), angle, np.zeros(20)], -1)[:, None]
+    states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
+    past = causal_past(states, np.ones((20, 1), bool), 19, np.array([1.0]))[0]
+    turned = -np.arange(1, 11) * 0.5 / 19
+    assert np.allclose(past[:, 2], turned)
+    assert np.allclose(past[:, 0], 10 * np.sin(turned)) and np.allclose(past[:, 1], 10 * (1 - np.cos(turned)))
+
+
+def test_smoothing_keeps_quadratics_and_takes_speed_along_the_heading():
+    states = accelerating()
+    out = smooth(states, np.ones((40, 1), bool))
+    assert np.allclose(out[..., :3], states[..., :3], atol=1e-9)
+    assert np.allclose(out[:, 0, 3], 4.0 + 1.5 * TIME, atol=1e-9)
+
+
+def test_smoothing_works_run_by_run_and_removes_noise():
+    states, valid = accelerating(), np.ones((40, 1), bool)
+    valid[18:22] = False
+    states[20:, :, :2] += 500.0
+    out = smooth(states, valid)
+    assert np.allclose(out[:18], smooth(states[:18], valid[:18])) and np.allclose(out[22:, 0, 3], 4 + 1.5 * TIME[22:])
+    noise = np.random.default_rng(0).normal(0, 0.05, (40, 1, 2))
+    noisy = accelerating()
+    noisy[..., :2] += noise
+    error = smooth(noisy, np.ones((40, 1), bool))[..., :2] - accelerating()[..., :2]
+    assert np.abs(error).mean() < 0.6 * np.abs(noise).mean()
+
+
+def test_runs_of_true():
+    assert runs_of_true(np.array([1, 1, 0, 1, 0, 0, 1], bool)) == [(0, 2), (3, 4), (6, 7)]
+
+
+def test_a_glitch_costs_its_own_frames_only():
+    states, valid = accelerating(accel=0.0), np.ones((40, 1), bool)
+    states[10, 0, 0] += 30.0  # one frame elsewhere
+    states[25:27, 0, 2] += np.pi  # two frames turned round
+    kept = drop_jumps(states, valid)
+    assert np.flatnonzero(~kept[:, 0]).tolist() == [10, 25, 26] and valid.all()
+
+
+def test_the_longer_side_of_a_lasting_jump_is_kept():
+    states, valid = accelerating(accel=0.0), np.ones((40, 1), bool)
+    states[30:, 0, 2] += np.pi
+    assert np.flatnonzero(drop_jumps(states, valid)[:, 0]).tolist() == list(range(30))
+    states[:, 0, 2] = 0.0
+    states[:15, 0, :2] += 100.0
+    assert np.flatnonzero(drop_jumps(states, valid)[:, 0]).tolist() == list(range(15, 40))
+    turning = accelerating()
+    turning[:, 0, 2] = np.linspace(3.0, 3.5, 40) % (2 * np.pi)
+    turning[:, 0, 2] = np.where(turning[:, 0, 2] > np.pi, turning[:, 0, 2] - 2 * np.pi, turning[:, 0, 2])
+    assert drop_jumps(turning, valid).all()  # crossing +-pi is no jump
+
+
+def test_gapped_time_stamps_are_resampled_linearly():
+    stamps = np.delete(TIME, [7, 8, 20])
+    full = accelerating(accel=0.0)
+    states = np.delete(full, [7, 8, 20], axis=0)
+    out, known = resample_uniform(states, np.ones((37, 1), bool), stamps + 1.6e9)
+    assert known.all() and np.allclose(out[..., :3], full[..., :3], atol=1e-5)
+
+
+def test_resampling_turns_the_short_way_and_respects_validity():
+    stamps = np.delete(TIME, 5)
+    states = np.delete(accelerating(accel=0.0), 5, axis=0)
+    states[:5, 0, 2], states[5:, 0, 2] = 3.1, -3.1
+    valid = np.ones((39, 1), bool)
+    valid[20] = False
+    out, known = resample_uniform(states, valid, stamps)
+    assert abs(abs(out[5, 0, 2]) - np.pi) < 1e-6
+    assert np.flatnonzero(~known[:, 0]).tolist() == [21]
+
+
+def test_long_gaps_are_not_invented_and_other_rates_are_brought_to_ten_hertz():
+    stamps = np.concatenate([TIME[:20], TIME[20:] + 1.0])
+    states, valid = accelerating(accel=0.0), np.ones((40, 1), bool)
+    _, known = resample_uniform(states, valid, stamps)
+    assert len(known) == 50 and not known[20:30].any() and known[:20].all() and known[30:].all()
+    out, known = resample_uniform(states, valid, TIME / 2)
+    assert len(out) == 21 and np.allclose(out[:20], states[:40:2], atol=1e-6) and known.all()
+
+
+@pytest.mark.parametrize("stamps", [TIME[::-1], TIME * 1e6, TIME * 0, np.where(TIME > 2, np.nan, TIME)])
+def test_impossible_time_stamps_are_refused(stamps):
+    with pytest.raises(InputError, match="time stamps"):
+        resample_uniform(accelerating(), np.ones((40, 1), bool), stamps)

@@ -1,0 +1,289 @@
+"""From configurations to scene sets: what is cached is what was built, what is left out is counted."""
+
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+
+from e2rl.run.errors import InputError
+from e2rl.scenes import source
+from e2rl.scenes.builder import BuildSettings
+from e2rl.scenes.bundled import BundledSource
+from e2rl.scenes.recording import Lane, Recording
+from e2rl.scenes.scenarionet import ScenarioNetSource
+from e2rl.scenes.source import AHEAD, Source, hash_files, load_scenes
+from tests.scenes.descriptions import (
+    ALL,
+    Malicious,
+    data_config,
+    description,
+    fork,
+    lane,
+    numbered,
+    straight,
+    write_folder,
+    write_zip,
+)
+
+
+def scenes_of(count: int) -> list[dict]:
+    return numbered([description({"ego": straight(20 + k, 0, 8), "7": straight(50, 3.5, 6)}) for k in range(count)])
+
+
+def bad_scenes() -> dict[str, dict | bytes]:
+    """Named ways to be no scene."""
+    nan = description()
+    nan["tracks"]["7"]["state"]["position"][40] = np.nan
+    return {
+        "forbidden class posix.system": pickle.dumps({"x": Malicious(os.system, "true")}),
+        "no ego": description(sdc_id="nobody"),
+        "no lanes": description(lanes={"b": lane([[0, 0]])}),
+        "NaN or infinite": nan,
+        "cannot be read": b"nonsense",
+    }
+
+
+def same(a, b) -> None:
+    assert a.scene_id == b.scene_id and a.location == b.location and a.dropped == b.dropped
+    assert (a.dataset, a.split) == (b.dataset, b.split) and set(a.scenes.keys()) == set(b.scenes.keys())
+    for key, value in a.scenes.items():
+        assert torch.equal(value, b.scenes[key]) and value.dtype == b.scenes[key].dtype, key
+
+
+def test_folder_zip_cache_and_workers_give_identical_scenes(tmp_path, monkeypatch):
+    folder = write_folder(tmp_path / "x", scenes_of(3))
+    first = load_scenes(data_config(folder, tmp_path / "a"))
+    assert first.scene_id == ["scene-0", "scene-1", "scene-2"] and first.dataset == "made" and first.split == "x"
+    zipped = write_zip(tmp_path / "x.zip", scenes_of(3))
+    same(first, load_scenes(data_config(zipped, tmp_path / "b")))
+    same(first, load_scenes(data_config(folder, tmp_path / "c", workers=2)))
+    assert [path.suffix for path in (tmp_path / "a").iterdir()] == [".packed"]
+    monkeypatch.setattr(source, "SceneBuilder", None)  # nothing is built again
+    same(first, load_scenes(data_config(folder, tmp_path / "a")))
+    limited = load_scenes(data_config(folder, tmp_path / "a"), num_scenes=2)
+    assert limited.scene_id == first.scene_id[:2]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_first_scenes_take_no_more_than_their_logs(tmp_path, workers):
+    """The rest is not even read: here it is damaged."""
+    folder = write_folder(tmp_path / "x", [*scenes_of(2), *[b"nonsense"] * 3])
+    config = data_config(folder, tmp_path / "cache", workers=workers)
+    assert load_scenes(config, num_scenes=2).scene_id == ["scene-0", "scene-1"]
+    assert load_scenes(config, num_scenes=1).scene_id == ["scene-0"]
+    with pytest.raises(InputError, match=r"sd_02\.pkl"):
+        load_scenes(config, num_scenes=3)
+
+
+class CountedSource(ScenarioNetSource):
+    """It tells which logs it read."""
+
+    def read(self, log):
+        self.asked.append(log)
+        return super().read(log)
+
+
+def test_no_more_logs_are_built_than_are_asked_for(tmp_path, monkeypatch):
+    """A few scenes in this process and without one log too many; many by a pool that is never far ahead."""
+    folder, build = write_folder(tmp_path / "x", scenes_of(20)), BuildSettings(field_cells=32)
+    counted = CountedSource(str(folder), cache=str(tmp_path / "cache"), workers=2, build=build)
+    monkeypatch.setattr(source, "worker_pool", lambda workers, method: ThreadPoolExecutor(workers))
+    counted.asked = []
+    first = counted.load(2)
+    assert len(first) == len(counted.asked) == 2
+    monkeypatch.setattr(source, "FEW", 0)
+    counted.asked = []
+    assert counted.load(3).scene_id[:2] == first.scene_id
+    assert sorted(counted.asked) == counted.logs()[: len(counted.asked)] and len(counted.asked) <= 3 + 2 * AHEAD
+    assert counted.load().scene_id == [f"scene-{k}" for k in range(20)]
+
+
+def test_the_cache_is_keyed_by_content_and_settings(tmp_path):
+    folder, cache = write_folder(tmp_path / "x", scenes_of(1)), tmp_path / "cache"
+    load_scenes(data_config(folder, cache))
+    write_folder(folder, numbered([description({"ego": straight(33, 0, 5)})]))
+    assert load_scenes(data_config(folder, cache)).scenes["start"][0, 0, 3].item() == pytest.approx(5.0, abs=1e-4)
+    assert load_scenes(data_config(folder, cache, build={"field_cells": 32})).scenes["field"].shape == (1, 32, 32)
+    assert load_scenes(data_config(folder, cache, split="mine")).split == "mine"
+    assert load_scenes(data_config(folder, cache), starts=[10, 30]).scene_id == ["scene-0@10", "scene-0@30"]
+    assert len(list(cache.iterdir())) == 5
+
+
+def test_settings_of_the_memory_and_the_cache_do_not_change_the_scenes(tmp_path):
+    folder, cache = write_folder(tmp_path / "x", scenes_of(3)), tmp_path / "cache"
+    first = load_scenes(data_config(folder, cache))
+    little = load_scenes(data_config(folder, cache, unpacked=1, cache_gb=5))
+    assert little.rows.room == 1 and len(list(cache.iterdir())) == 1
+    assert all(torch.equal(value, first.scenes[key][[2, 0]]) for key, value in little.batch([2, 0]).items())
+    same(first, little)
+
+
+@pytest.mark.parametrize(("key", "value"), [("unpacked", 0), ("cache_gb", -1), ("cache_gb", "much")])
+def test_impossible_sizes_are_refused(tmp_path, key, value):
+    folder = write_folder(tmp_path / "x", scenes_of(1))
+    with pytest.raises(InputError, match=rf"data\.{key}"):
+        load_scenes(data_config(folder, tmp_path / "cache", **{key: value}))
+
+
+def test_mirror_images_are_scenes_of_the_same_place(tmp_path):
+    """Drawn in the mirror, a scene is the other one: states, lanes and what is drivable."""
+    turned = description({"ego": straight(20, 0, 8), "7": straight(50, 3.5, 6)}) | {"id": "turned"}
+    found = load_scenes(data_config(write_folder(tmp_path / "x", [turned]), tmp_path / "cache", mirror=True))
+    assert found.scene_id == ["turned", "turned~mirrored"] and found.location == ["turned", "turned"]
+    scene, other = found.scenes
+    sign = torch.tensor([1.0, -1.0, -1.0, 1.0])
+    assert torch.allclose(scene["start"] * sign, other["start"], atol=1e-5)
+    assert torch.allclose(scene["logged"] * sign, other["logged"], atol=1e-5)
+    assert torch.allclose(scene["lane_points"] * sign[:2], other["lane_points"], atol=1e-5)
+    assert torch.equal(scene["field"], other["field"].flip(1)) and torch.equal(scene["valid"], other["valid"])
+    cut = load_scenes(data_config(tmp_path / "x", tmp_path / "cache", mirror=True), starts=[10, 20])
+    assert cut.scene_id == ["turned@10", "turned@20", "turned~mirrored@10", "turned~mirrored@20"]
+
+
+@pytest.mark.parametrize("reason", bad_scenes())
+def test_the_first_invalid_scene_stops_the_load_and_leaves_nothing(tmp_path, reason):
+    folder = write_folder(tmp_path / "x", [*scenes_of(1), bad_scenes()[reason]])
+    with pytest.raises(InputError, match=rf"(?s)sd_01\.pkl.*{reason}.*data\.skip_invalid=true") as caught:
+        load_scenes(data_config(folder, tmp_path / "cache"))
+    assert "\n" not in str(caught.value) and not list((tmp_path / "cache").iterdir())
+
+
+def test_invalid_scenes_are_skipped_and_counted_on_request(tmp_path):
+    folder = write_folder(tmp_path / "x", [*bad_scenes().values(), *scenes_of(2)])
+    config = data_config(folder, tmp_path / "cache", skip_invalid=True)
+    found = load_scenes(config)
+    assert found.scene_id == ["scene-0", "scene-1"] and found.dropped == {"invalid": 5}
+    assert load_scenes(config).dropped == {"invalid": 5}  # from the cache too
+    for name in ("sd_05.pkl", "sd_06.pkl"):
+        (folder / name).unlink()
+    with pytest.raises(InputError, match="no valid scene.*5 invalid"):
+        load_scenes(config)
+
+
+def test_overlaps_with_the_ego_and_logs_too_short_are_dropped_and_counted(tmp_path):
+    close = description({"ego": straight(20, 0, 8), "7": straight(23, 0.5, 8)})
+    folder = write_folder(tmp_path / "x", [close, *scenes_of(1)])
+    found = load_scenes(data_config(folder, tmp_path / "cache"))
+    assert len(found) == 1 and found.dropped == {source.OVERLAP: 1}
+    with pytest.raises(InputError, match=f"no valid scene in .*x .2 {source.TOO_SHORT}"):
+        load_scenes(data_config(folder, tmp_path / "cache"), starts=[80])
+
+
+def test_start_frames_of_the_config_make_windows(tmp_path):
+    folder = write_folder(tmp_path / "x", scenes_of(2))
+    found = load_scenes(data_config(folder, tmp_path / "cache", starts=[10, 40]))
+    assert found.scene_id == ["scene-0@10", "scene-0@40", "scene-1@10", "scene-1@40"]
+    ego = found.scenes["logged_valid"][:, :, 0].sum(1)
+    assert ego.tolist() == [81, 51, 81, 51] and len(ALL) == 91
+
+
+def test_places_of_an_index_reach_the_scenes(tmp_path):
+    write_folder(tmp_path / "x", scenes_of(2))
+    (tmp_path / "index.csv").write_text("file,location_group\nsd_00.pkl,a\nsd_01.pkl,b\n")
+    assert load_scenes(data_config(tmp_path / "x", tmp_path / "cache")).location == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"path": None}, r"data\.path is not set"),
+        ({"path": "nowhere"}, "nowhere: no such file or folder"),
+        ({"workers": "many"}, r"data\.workers=many"),
+        ({"_target_": "no.such.Source"}, r"^data=no\.such\.Source: cannot be built: .*no"),
+        ({"_target_": "torch.nn.ReLU"}, r"^data=torch\.nn\.ReLU: is no e2rl\.scene\.source\.Source"),
+        ({"_target_": "e2rl.scenes.bundled.BundledSource", "split": "best"}, "split 'best'"),
+    ],
+)
+def test_configurations_that_name_nothing_say_so(tmp_path, change, message):
+    config = data_config(tmp_path, tmp_path / "cache")
+    with pytest.raises(InputError, match=message):
+        load_scenes(config | change)
+    with pytest.raises(InputError, match="num_scenes=0"):
+        load_scenes(data_config(tmp_path, tmp_path / "cache"), num_scenes=0)
+
+
+def test_a_cache_that_cannot_be_made_is_named(tmp_path):
+    folder = write_folder(tmp_path / "x", scenes_of(1))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="data.cache=.*file.*cannot be made"):
+        load_scenes(data_config(folder, tmp_path / "file"))
+
+
+def test_scenes_with_unlike_maps_are_one_set(tmp_path):
+    scenes = [*scenes_of(1), description(lanes=fork() | {"more": lane([[0, 30], [90, 30]])})]
+    found = load_scenes(data_config(write_folder(tmp_path / "x", scenes), tmp_path / "cache"))
+    assert found.scenes["lane_width"].shape == (2, 5) and found.scene_id == ["scene-0", "fork"]
+
+
+@dataclass
+class SpeedSource(Source):
+    """An outside source: each *.txt file below `path` holds the speed of a car on a straight road."""
+
+    lane_width: float = 3.5
+
+    holds = "text files"
+
+    def logs(self) -> list[str]:
+        return sorted(file.name for file in self.root().glob("*.txt"))
+
+    def read(self, log: str) -> Iterator[Recording]:
+        speed, frames = float((self.root() / log).read_text()), np.arange(200)
+        states = np.stack([0.1 * speed * frames, 0 * frames, 0 * frames, 0 * frames + speed], -1)[:, None]
+        road = {"road": Lane(np.array([[0.0, 0], [900, 0]]), self.lane_width)}
+        valid, size = np.ones((200, 1), bool), np.array([[4.5, 1.9]])
+        yield Recording(log, "road", "speeds", states, valid, size, np.zeros(1, int), 0, road, current=None)
+
+    def fingerprint(self) -> bytes:
+        return hash_files(sorted(self.root().glob("*.txt")))
+
+
+def test_an_outside_source_is_named_by_its_class_and_takes_part_in_all(tmp_path):
+    (tmp_path / "a.txt").write_text("5.0")
+    (tmp_path / "b.txt").write_text("9.0")
+    config = {"_target_": "tests.scenes.test_source.SpeedSource", "path": str(tmp_path), "lane_width": 3.0}
+    config |= {"workers": 2, "cache": str(tmp_path / "cache"), "build": {"field_cells": 32, "steps": 80}}
+    found = load_scenes(config)
+    assert found.scene_id == ["a.txt@10", "a.txt@101", "b.txt@10", "b.txt@101"] and found.dataset == "speeds"
+    assert found.scenes["start"][:, 0, 3].tolist() == pytest.approx([5, 5, 9, 9], abs=1e-4)
+    assert (found.scenes["lane_width"] == 3.0).all() and found.split == tmp_path.name
+    same(found, load_scenes(config))
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+    assert load_scenes(config, split="train", starts=[20]).scene_id == ["a.txt@20", "b.txt@20"]
+    assert (load_scenes(config | {"lane_width": 4.0}).scenes["lane_width"] == 4.0).all()
+    (tmp_path / "c.txt").write_text("1.0")
+    assert len(load_scenes(config)) == 6
+    with pytest.raises(InputError, match="no such file or folder; pass one that holds text files"):
+        load_scenes(config | {"path": "nowhere"})
+    with pytest.raises(InputError, match="data.lane_width=wide"):
+        load_scenes(config | {"lane_width": "wide"})
+
+
+def test_split_chooses_only_where_a_source_has_splits(tmp_path):
+    bundled = BundledSource(cache=str(tmp_path / "cache"), workers=1, build=BuildSettings(field_cells=32, steps=20))
+    assert load_scenes(bundled, 1).split == "test" and load_scenes(bundled, 1, split="tune").split == "tune"
+    folder = write_folder(tmp_path / "x", scenes_of(1))
+    assert load_scenes(data_config(folder, tmp_path / "cache"), split="tune").split == "x"
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_a_script_without_a_main_guard_works_or_is_told(tmp_path, own):
+    """Its workers import no script, unless the source is the script's own."""
+    folder = write_folder(tmp_path / "x", scenes_of(2))
+    source = "class Mine(ScenarioNetSource): pass" if own else "Mine = ScenarioNetSource"
+    (tmp_path / "script.py").write_text(
+        f"from e2rl.scenes.scenarionet import ScenarioNetSource\n{source}\n"
+        f"found = Mine({str(folder)!r}, cache={str(tmp_path / 'cache')!r}, workers=2).load()\n"
+        "print(found.scene_id)\n"
+    )
+    done = subprocess.run([sys.executable, str(tmp_path / "script.py")], capture_output=True, text=True, timeout=100)
+    if own:
+        assert done.returncode == 1 and "InputError: data.workers=2: a process" in done.stderr.splitlines()[-1]
+    else:
+        assert done.returncode == 0 and done.stdout == "['scene-0', 'scene-1']\n" and "Traceback" not in done.stderr

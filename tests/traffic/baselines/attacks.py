@@ -1,0 +1,49 @@
+"""Rivals on a small random prior, and one replan of theirs taken apart."""
+
+from dataclasses import replace
+
+import torch
+
+from e2rl.prior.prior import SamplerSettings
+from e2rl.run.config import load_choice
+from e2rl.sim.world import World
+from e2rl.traffic.baselines.baseline import Rival
+from e2rl.traffic.baselines.cat import CAT
+from e2rl.traffic.baselines.ccdiff import CCDiff
+from e2rl.traffic.baselines.ctg import CTG, CTGAdv
+from e2rl.traffic.baselines.diffscene import DiffScene
+from e2rl.traffic.baselines.safe_sim_opt import SafeSimOpt
+from e2rl.traffic.baselines.strive import Strive
+from e2rl.traffic.baselines.view import View
+from e2rl.traffic.grouping import Group
+from tests.prior.small import small_prior
+from tests.traffic.e2.traffic_scenes import EGO, begin
+
+SMALL = {  # few samples and iterations, so that tests are fast
+    "ctg": (CTG, {"samples": 2}),
+    "ctg_adv": (CTGAdv, {"samples": 2}),
+    "safe_sim_opt": (SafeSimOpt, {"samples": 2}),
+    "ccdiff": (CCDiff, {"samples": 2, "controlled": 2}),
+    "diffscene": (DiffScene, {"samples": 2}),
+    "cat": (CAT, {"samples": 8, "ways": 2, "spread": 3.0}),
+    "strive": (Strive, {"iterations": 3}),
+}
+ADVERSARIES = [name for name in SMALL if name != "ctg"]
+
+
+def rival(name: str, steps: int = 4, **settings) -> Rival:
+    """A rival of SMALL with the settings of its file but for those given."""
+    kind, few = SMALL[name]
+    chosen = {key: value for key, value in load_choice("synthesizer", name).items() if key not in ("name", "_target_")}
+    return kind(small_prior(0, sampler=SamplerSettings(steps=steps)), **(chosen | few | settings))
+
+
+def first_replan(on: Rival, scene, eta: float = 2.0):
+    """The arguments of `attack` at the first replan of scenes [B], and their View."""
+    world, state = World.at_start(scene), begin(on, scene, eta)
+    ego_plan = EGO.plan(world)
+    state = replace(state, lane=on.lane_now(state, world, ego_plan))
+    context = on.encode(state, world, ego_plan)
+    vehicles = context.active.shape[1]
+    group = Group(torch.arange(len(scene)), vehicles, world.states.shape[1] - vehicles)
+    return (state, world, ego_plan, on.noise(state), group, context), View.of(world, context, ego_plan)

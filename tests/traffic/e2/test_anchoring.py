@@ -1,0 +1,148 @@
+import math
+
+import pytest
+import torch
+
+from e2rl.prior.lane_relative import LaneState, speeds
+from e2rl.run.errors import InputError
+from e2rl.scenes.recording import DT
+from e2rl.traffic.e2.anchoring import AnchorSettings, propose
+from e2rl.traffic.e2.interception import InterceptionSettings
+from e2rl.traffic.e2.motion import constant_speed_states
+from tests.traffic.e2.crossing import add_route, make_world, mask, skeleton_of
+
+UP = math.pi / 2
+EGO = (0.0, 0.0, 0.0, 10.0)
+TIMES = DT * torch.arange(1, 51)
+
+
+LANES = InterceptionSettings(reach=0.0)
+
+
+def proposed(world, skeleton, plan, settings=None, interception=LANES, eta=2.0, **options):
+    return propose(
+        world.scene,
+        world,
+        skeleton,
+        plan,
+        settings or AnchorSettings(),
+        interception,
+        torch.full((len(plan),), eta),
+        **options,
+    )
+
+
+def anchored(world, *vehicles, near=2, **settings):
+    support = mask(world, *vehicles)
+    skeleton = skeleton_of(world, support, near=near)
+    plan = constant_speed_states(world.scene, world, TIMES)[:, 0]
+    return proposed(world, skeleton, plan, AnchorSettings(**settings)), skeleton
+
+
+def travelled(knots, speed, accel=0.0):
+    """Way [50] of one vehicle's knots [10], by the prior's decoder."""
+    state = LaneState(*(torch.zeros(()) for _ in range(10)))
+    state.v, state.a = torch.tensor(speed), torch.tensor(accel)
+    return speeds(state, knots)[1]
+
+
+@pytest.mark.parametrize(
+    "ahead, way, speed",
+    [(40.0, 30.0, 10.0), (40.0, 45.0, 10.0), (30.0, 20.0, 4.0), (20.0, 25.0, 12.0), (45.0, 16.0, 0.5)],
+)
+def test_both_arrive_at_the_crossing_at_once(ahead, way, speed):
+    world = make_world([EGO, (ahead, -way, UP, speed)])
+    anchor, _ = anchored(world, 1)
+    assert anchor.feasible[0].tolist() == [False, True] + [False] * 6
+    gone = travelled(anchor.knots[0, 1], speed)
+    arrival = torch.searchsorted(gone, torch.tensor(way)).item() * DT
+    assert arrival == pytest.approx(ahead / 10, abs=0.25)
+    assert anchor.cost[0, 1] < 0.25 + 0.2 * anchor.knots[0, 1].abs().max() and not anchor.off_lane.any()
+
+
+def test_the_gentlest_of_equal_arrivals_wins():
+    world = make_world([EGO, (40.0, -40.0, UP, 10.0)])
+    anchor, _ = anchored(world, 1)
+    assert anchor.knots[0, 1].abs().max() < 0.3
+
+
+def test_a_leader_brakes_and_a_follower_speeds_up():
+    world = make_world([EGO, (25.0, 0.0, 0.0, 10.0), (-20.0, 0.0, 0.0, 10.0)])
+    anchor, _ = anchored(world, 1, 2)
+    assert anchor.feasible[0, 1:3].all()
+    assert anchor.knots[0, 1].mean() < -0.3 and anchor.knots[0, 2].mean() > 0.3
+
+
+def test_the_candidate_that_meets_the_target_is_chosen():
+    world = make_world([EGO, (40.0, -30.0, UP, 8.0)])
+    world.scene["route_points"][:, 1, 2] = world.scene["route_points"][:, 1, 0]
+    world.scene["route_valid"][:, 1, 2] = True
+    add_route(world, 1, 0, 0.0)  # the one it follows leads away from the ego's
+    assert anchored(world, 1)[0].route[0, 1] == 2
+
+
+def test_a_route_that_a_vehicle_would_swing_off_or_cannot_shift_to_is_not_taken():
+    world = make_world([EGO, (40.0, -30.0, 0.0, 8.0)])
+    add_route(world, 1, 2, UP)
+    assert not anchored(world, 1)[0].feasible.any()
+    assert anchored(world, 1, max_swing=100.0)[0].route[0, 1] == 2
+    beside = make_world([EGO, (30.0, -6.0, 0.0, 8.0)])
+    beside.scene["route_points"][:, 1, 2] = beside.scene["route_points"][:, 1, 0] + torch.tensor([0.0, 6.0])
+    beside.scene["route_valid"][:, 1, 2] = True
+    assert not anchored(beside, 1)[0].feasible.any()
+    assert anchored(beside, 1, max_shift=7.0)[0].route[0, 1] == 2
+
+
+def test_a_kept_route_is_the_only_one_looked_at():
+    world = make_world([EGO, (40.0, -30.0, 0.0, 8.0)])
+    add_route(world, 1, 2, UP)
+    support = mask(world, 1)
+    skeleton = skeleton_of(world, support)
+    plan = constant_speed_states(world.scene, world, TIMES)[:, 0]
+    assert not proposed(world, skeleton, plan, keep_route=True).feasible.any()
+    world.route[:, 1] = 2
+    kept = proposed(world, skeleton, plan, keep_route=True)
+    assert kept.feasible[0, 1] and torch.equal(kept.route, world.route)
+
+
+def test_who_cannot_meet_the_target_has_no_anchor_and_keeps_its_route():
+    world = make_world([EGO, (40.0, 30.0, UP, 8.0), (10.0, -90.0, UP, 5.0)])
+    anchor, skeleton = anchored(world, 1, 2)
+    assert skeleton.coalition[0, 1:3].all() and not anchor.feasible.any() and not anchor.knots.any()
+    assert torch.equal(anchor.route, world.route) and anchor.cost.isinf().all()
+
+
+def test_a_chain_s_first_link_meets_its_target_not_the_ego():
+    world = make_world([EGO, (30.0, -20.0, UP, 8.0), (30.0, -38.0, UP, 8.0)])
+    anchor, skeleton = anchored(world, 1, 2, near=1)
+    assert skeleton.target[0, 1:3].tolist() == [0, 1] and anchor.feasible[0, 1:3].all()
+    gap = (18 + travelled(anchor.knots[0, 1], 8.0) - travelled(anchor.knots[0, 2], 8.0)).abs().min()
+    assert gap < 4.5  # the boxes would touch
+
+
+def test_accelerations_are_bounded_and_bends_slow_down():
+    world = make_world([EGO, (60.0, -30.0, UP, 12.0)])
+    arc, radius = 2.0 * torch.arange(150) - 20, 15.0
+    bend = (arc - 15).clamp(0, radius * math.pi / 2)  # straight up, then left on to the ego's lane, against it
+    rest = (arc - 15 - radius * math.pi / 2).clamp(min=0)
+    line = torch.stack(
+        [
+            60 - radius * (1 - (bend / radius).cos()) - rest,
+            -15 + radius * (bend / radius).sin() + (arc - 15).clamp(max=0),
+        ],
+        -1,
+    )
+    world.scene["route_points"][:, 1, 0] = line
+    anchor, _ = anchored(world, 1, max_offset=10.0)
+    knots = anchor.knots[0, 1]
+    assert knots.min() >= -5.0 and knots.max() <= 4.0 and anchor.feasible[0, 1]
+    state = LaneState(*(torch.zeros(()) for _ in range(10)))
+    state.v = torch.tensor(12.0)
+    speed, way = speeds(state, knots)
+    inside = (way > 16) & (way < 34)
+    assert inside.any() and (speed[inside] < 1.1 * math.sqrt(4.0 * radius)).all()
+
+
+def test_bad_settings_are_refused():
+    with pytest.raises(InputError, match="strength"):
+        AnchorSettings(strength=1.5)

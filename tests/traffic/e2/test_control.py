@@ -1,0 +1,243 @@
+"""Sparse control: who may be moved and who may not, what moving does to V, anchoring and its noise."""
+
+import pytest
+import torch
+
+from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE
+from e2rl.run.errors import InputError
+from e2rl.traffic.e2.anchoring import Anchor
+from e2rl.traffic.e2.control import ControlSettings, SparseControl, clip_rows, gradient_weight
+from e2rl.traffic.e2.potentials import (
+    SAMPLED_STEPS,
+    PotentialContext,
+    PotentialSettings,
+    adversarial_potential,
+    feasibility_potential,
+)
+from tests.prior.small import small_prior
+from tests.traffic.e2.traffic_scenes import ROWS, scenes
+
+MEMBER = 1  # the coalition: the vehicle ahead of the ego
+
+
+class Case:
+    """One replan of `count` equal scenes, ready to be sampled under control."""
+
+    def __init__(self, count=4, prior=None):
+        self.prior = prior or small_prior()
+        self.scene = scenes(1).scenes[torch.zeros(count, dtype=torch.long)]
+        route = self.scene["route_log"].clamp(min=0)
+        routed, state = self.prior.start(self.scene, route)
+        plan = self.scene["logged"][:, 1:2, 0].repeat(1, HORIZON, 1)
+        plan[..., 0] += torch.arange(HORIZON)  # 10 m/s
+        step = torch.zeros(count, dtype=torch.long)
+        self.coalition = torch.zeros(count, ROWS, dtype=torch.bool)
+        self.coalition[:, MEMBER] = True
+        self.context = self.prior.encode(routed, state, self.scene["start"], self.scene["valid"], step, plan)
+        target = torch.where(self.coalition, 0, -1)
+        self.where = PotentialContext(
+            self.scene,
+            self.scene["start"][:, :ROWS],
+            state.a,
+            self.scene["valid"][:, :ROWS],
+            routed.points,
+            routed.has_lane,
+            plan,
+            target,
+        )
+        self.anchor = Anchor(
+            route,
+            torch.full((count, ROWS, KNOTS), -2.0),
+            self.coalition.clone(),
+            torch.zeros(count, ROWS),
+            self.coalition & False,
+            routed.points,
+        )
+        self.generator = torch.Generator().manual_seed(0)
+        self.noise = torch.randn(self.prior.sampler.steps, count, ROWS, SIZE, generator=self.generator)
+
+    def control(self, eta=1.0, strength=0.0, **settings):
+        eta = torch.full((len(self.scene),), eta) if isinstance(eta, float) else torch.tensor(eta)
+        extra = torch.randn(len(self.scene), ROWS, SIZE, generator=torch.Generator().manual_seed(7))
+        return SparseControl(
+            self.prior,
+            ControlSettings(**({"adversarial_clip": 0.5} | settings)),
+            PotentialSettings(),
+            self.where,
+            self.coalition,
+            eta,
+            self.anchor,
+            strength,
+            extra,
+        )
+
+    def shift(self, level=0.5, k=1, seed=0, **options):
+        """(x0 after - x0 before control, x after - x before anchoring) at one noise level."""
+        x = torch.randn(len(self.scene), ROWS, SIZE, generator=torch.Generator().manual_seed(seed))
+        level = torch.tensor(level)
+        control = self.control(**options)
+        after, nominal, x0 = control(x, level, k, self.context, lambda y: self.prior.denoise(y, level, self.context))
+        return x0 - nominal, after - x
+
+    def values(self, x0):
+        states = self.prior.decode(x0, self.context, steps=SAMPLED_STEPS).states()
+        return (
+            adversarial_potential(states, self.where, PotentialSettings())[:, MEMBER],
+            feasibility_potential(states, self.where, PotentialSettings())[:, 1:].sum(-1),
+        )
+
+
+OTHERS = [i for i in range(ROWS) if i != MEMBER]
+
+
+@pytest.mark.parametrize("gradient", ["denoiser", "clean"])
+def test_v_adv_moves_members_of_the_coalition_only(gradient):
+    shift, _ = Case().shift(feasibility=0.0, gradient=gradient)
+    assert (shift[:, OTHERS] == 0).all() and (shift[:, MEMBER] != 0).any()
+
+
+def test_feasibility_may_move_others_but_never_the_ego_parked_or_absent_ones():
+    case = Case()
+    case.scene["start"][:, 2, 1] = 2.2  # vehicle 2 laps over vehicle 1's lane
+    case.context.state.d[:, 2] = -1.3
+    shift, _ = case.shift(feasibility_clip=5.0)
+    assert (shift[:, [0, 5, 6, 7]] == 0).all()
+    assert (shift[:, [2, 3, 4]] != 0).any(), "feasibility acts beyond the support"
+
+
+def test_feasibility_acts_once_the_clean_estimate_has_taken_shape():
+    case = Case()
+    case.scene["start"][:, 2, 1] = 2.2
+    case.context.state.d[:, 2] = -1.3
+    levels = case.prior.schedule.levels(case.prior.sampler.steps)
+    for k in range(1, case.prior.sampler.steps + 1):
+        level = float(levels[case.prior.sampler.steps - k])
+        shift, _ = case.shift(level=level, k=k, feasibility_level=0.5, adversarial_clip=0.0)
+        assert bool((shift != 0).any()) == (level <= 0.5), level
+    first, _ = case.shift(level=1.0, k=case.prior.sampler.steps, feasibility_level=1.0, adversarial_clip=0.0)
+    assert (first != 0).any(), "at 1 it acts from the start"
+
+
+def test_without_intensity_nothing_moves_in_a_mixed_batch():
+    case = Case()
+    shift, jump = case.shift(eta=[0.0, 1.0, 0.0, 2.0], strength=1.0, k=case.control().anchor_step)
+    assert (shift[[0, 2]] == 0).all() and (jump[[0, 2]] == 0).all()
+    assert (shift[[1, 3]] != 0).any() and (jump[[1, 3], MEMBER] != 0).any()
+
+
+def test_shifts_are_bounded_per_vehicle_and_grow_with_intensity():
+    case = Case()
+    norms = []
+    for eta in (1.0, 2.0):
+        shift, _ = case.shift(eta=eta, feasibility=0.0, adversarial_clip=0.3)
+        norms.append(shift[:, MEMBER].norm(dim=-1))
+        assert (norms[-1] <= 0.3 * eta + 1e-6).all()
+    torch.testing.assert_close(norms[1], 2 * norms[0])
+
+
+def test_clipping_keeps_directions_and_short_rows():
+    rows = torch.tensor([[[3.0, 4.0], [0.3, 0.4], [0.0, 0.0]]])
+    torch.testing.assert_close(clip_rows(rows, 1.0), torch.tensor([[[0.6, 0.8], [0.3, 0.4], [0.0, 0.0]]]))
+    assert (clip_rows(rows, 0.0) == 0).all(), "a clip of 0 is no shift, also where there is no gradient"
+
+
+def test_the_weight_of_the_gradient():
+    case, level = Case(), torch.tensor(0.5)
+    score, sigma = (
+        case.shift(scaling=scaling, feasibility=0.0, adversarial_clip=1e6)[0] for scaling in ("score", "sigma")
+    )
+    assert gradient_weight(case.prior.schedule, level, "sigma") == case.prior.schedule.sigma(level)
+    torch.testing.assert_close(score, case.prior.schedule.sigma(level) / case.prior.schedule.alpha(level) * sigma)
+
+
+@pytest.mark.parametrize("gradient", ["denoiser", "clean"])
+def test_guidance_lowers_the_adversarial_potential_and_more_of_it_lowers_it_more(gradient):
+    case = Case(count=16)
+    values = []
+    for eta in (0.0, 1.0, 3.0):
+        control = case.control(eta=eta, gradient=gradient, feasibility=0.0)
+        values.append(case.values(case.prior.sample(case.context, case.noise, control).x0)[0].mean().item())
+    assert values[2] < values[1] < values[0]
+
+
+def test_feasibility_guidance_lowers_the_feasibility_potential():
+    case = Case(count=16)
+    case.where.start[:, 2, 1] = 2.0
+    case.context.state.d[:, 2], case.context.state.y[:, 2] = -1.5, 2.0
+    values = []
+    for weight in (0.0, 1.0):
+        control = case.control(eta=1e-6, feasibility=weight, feasibility_clip=2.0)
+        values.append(case.values(case.prior.sample(case.context, case.noise, control).x0)[1].mean().item())
+    assert values[1] < values[0]
+
+
+def test_zero_intensity_sampling_is_the_nominal_sample_bit_for_bit():
+    case = Case()
+    nominal = case.prior.sample(case.context, case.noise)
+    guided = case.prior.sample(case.context, case.noise, case.control(eta=0.0, strength=1.0))
+    assert torch.equal(guided.x0, nominal.x0) and (guided.kl == 0).all()
+
+
+def test_path_energy_is_booked_where_control_acts():
+    case = Case()
+    sample = case.prior.sample(case.context, case.noise, case.control())
+    assert (sample.kl[:, MEMBER] > 0).all() and (sample.kl[:, [0, 5, 6, 7]] == 0).all()
+
+
+def anchored(case, strength, **settings):
+    """x at the anchor's level before and after it, for x = alpha x0 + sigma e with the denoiser's own x0."""
+    control = case.control(strength=strength, **settings)
+    level = case.prior.schedule.levels(case.prior.sampler.steps)[case.prior.sampler.steps - control.anchor_step]
+    alpha, sigma = case.prior.schedule.alpha(level), case.prior.schedule.sigma(level)
+    x = alpha * 0.3 + sigma * torch.randn(len(case.scene), ROWS, SIZE, generator=case.generator)
+    x[:, 0] = case.context.ego_x
+    clean = torch.full_like(x, 0.3)
+    after, *_ = control(x, level, control.anchor_step, case.context, lambda y: clean + 0 * y)
+    return control, level, x, after
+
+
+@pytest.mark.parametrize(("anchoring", "variance"), [("clean", 1.0), ("literal", 0.5)])
+def test_anchoring_keeps_the_noise_and_the_printed_blend_halves_it(anchoring, variance):
+    case = Case(count=600)
+    _, level, x, after = anchored(case, 0.5, anchoring=anchoring, gradient="clean")
+    assert torch.equal(after[:, OTHERS], x[:, OTHERS])
+    alpha, sigma = case.prior.schedule.alpha(level), case.prior.schedule.sigma(level)
+    mean = alpha * (0.5 * 0.3 - 0.5 * 2.0 / ACCEL_SCALE)
+    knots = after[:, MEMBER, :KNOTS]
+    assert knots.mean().item() == pytest.approx(mean.item(), abs=0.04)
+    assert knots.var().item() == pytest.approx(variance * sigma.item() ** 2, rel=0.06)
+
+
+def test_a_full_anchor_is_the_proposal_with_the_same_noise_and_its_energy_is_booked():
+    case = Case()
+    control, level, x, after = anchored(case, 1.0)
+    schedule = case.prior.schedule
+    noise = schedule.noise(x, torch.full_like(x, 0.3), level)[:, MEMBER, :KNOTS]
+    torch.testing.assert_close(after[:, MEMBER, :KNOTS], schedule.noised(torch.tensor(-2.0), level, noise))
+    assert torch.equal(after[:, OTHERS], x[:, OTHERS])
+    expected = ((after - x) ** 2).sum(-1) / (2 * schedule.sigma(level) ** 2)
+    torch.testing.assert_close(control.jump, expected)
+    assert (control.jump[:, MEMBER] > 0).all() and (control.jump[:, OTHERS] == 0).all()
+
+
+def test_anchoring_happens_once_at_the_level_nearest_to_the_set_one_and_can_be_off():
+    case = Case()
+    levels = case.prior.schedule.levels(case.prior.sampler.steps)
+    for wanted in (0.1, 0.5, 0.9):
+        control = case.control(anchor_level=wanted)
+        at = levels[case.prior.sampler.steps - control.anchor_step]
+        assert (at - wanted).abs() == (levels[:-1] - wanted).abs().min()
+    step = case.control().anchor_step
+    moved = [bool((case.shift(k=k, strength=0.5)[1] != 0).any()) for k in range(1, case.prior.sampler.steps + 1)]
+    assert moved == [k == step for k in range(1, case.prior.sampler.steps + 1)]
+    assert (case.shift(k=step, strength=0.5, anchoring="off")[1] == 0).all()
+    case.anchor.feasible[:] = False
+    assert (case.shift(k=step, strength=0.5)[1] == 0).all(), "members that cannot meet their target are not anchored"
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"gradient": "x"}, {"scaling": "unit"}, {"anchoring": "x"}, {"transport_budget": -1.0}]
+)
+def test_settings_are_checked(wrong):
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        ControlSettings(**wrong)

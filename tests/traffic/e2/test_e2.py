@@ -1,0 +1,148 @@
+"""e2: the prior at eta = 0, else a coalition that is chosen, kept and accounted for."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from e2rl.sim.world import World
+from e2rl.traffic.e2 import e2
+from e2rl.traffic.nominal import NominalTraffic
+from tests.traffic.e2.traffic_scenes import EGO, begin, replanned, scenes, synthesizer
+
+
+def test_without_intensity_it_is_the_prior_bit_for_bit_and_nobody_is_controlled():
+    on, scene = synthesizer(), scenes(2).scenes
+    state, plan = replanned(on, scene, 0.0, times=3)
+    _, nominal = replanned(NominalTraffic(on.prior), scene, times=3)
+    assert torch.equal(plan.states, nominal.states) and torch.equal(plan.present, nominal.present)
+    assert torch.equal(plan.route, nominal.route) and not plan.adversary.any()
+    assert (plan.path_kl == 0).all() and (plan.figures["anchor_jump"] == 0).all()
+    assert not state.coalition.any() and (state.target == -1).all()
+
+
+def test_a_scene_is_planned_alike_alone_and_in_a_batch():
+    on, scene = synthesizer(), scenes(3).scenes
+    for eta in (0.0, 2.0):
+        _, whole = replanned(on, scene, eta, [5, 6, 7])
+        _, alone = replanned(on, scene[1:2], eta, [6])
+        torch.testing.assert_close(alone.states, whole.states[1:2], rtol=0, atol=5e-3)
+        assert torch.equal(alone.route, whole.route[1:2]) and torch.equal(alone.adversary, whole.adversary[1:2])
+
+
+def test_a_coalition_acts_on_the_ego_directly_or_through_members():
+    on, scene = synthesizer(), scenes(4).scenes
+    state, plan = replanned(on, scene, 2.0)
+    assert state.coalition.any(1).all() and not state.coalition[:, 0].any()
+    assert torch.equal(state.coalition, state.target >= 0) and torch.equal(plan.adversary, state.coalition)
+    members = state.coalition.clone()
+    members[:, 0] = True
+    assert members.gather(1, state.target.clamp(min=0)).all(), "no chain leads over somebody who is not controlled"
+    assert (plan.path_kl[plan.adversary] > 0).all()
+
+
+def test_a_chain_over_a_pruned_member_is_pruned(monkeypatch):
+    """Vehicle 4 acts on 2, which acts on 1, which has no proposal."""
+    on, scene = synthesizer(), scenes(1).scenes
+    target = torch.tensor([[-1, 0, 1, 0, 2, -1]])  # the rows in use
+    acts = target >= 0
+    build, propose = e2.build_skeleton, e2.propose
+
+    def chained(*arguments):
+        return replace(build(*arguments), coalition=acts, target=target, depth=torch.tensor([[0, 1, 2, 1, 3, 0]]))
+
+    def without_one(scene, world, skeleton, *arguments, **options):
+        feasible = skeleton.coalition.clone()
+        feasible[:, 1] = False
+        return replace(propose(scene, world, skeleton, *arguments, **options), feasible=feasible)
+
+    monkeypatch.setattr(e2, "build_skeleton", chained)
+    monkeypatch.setattr(e2, "propose", without_one)
+    state, _ = replanned(on, scene, 1.0)
+    assert state.coalition.nonzero()[:, 1].tolist() == [3] and state.target[0].max() == 0
+
+
+def test_pursuit_draws_vehicles_where_nobody_has_a_proposal(monkeypatch):
+    """Without it nobody takes part then, and the plans are the prior's; with it V_adv alone moves the coalition."""
+    scene, propose = scenes(3).scenes, e2.propose
+
+    def nothing(*arguments, **options):
+        anchor = propose(*arguments, **options)
+        return replace(anchor, feasible=anchor.feasible & False, cost=anchor.cost + torch.inf)
+
+    monkeypatch.setattr(e2, "propose", nothing)
+    for pursuit in (False, True):
+        on = synthesizer(skeleton={"pursuit": pursuit}, control={"adversarial_clip": 2.0})
+        state, plan = replanned(on, scene, 2.0)
+        assert state.coalition.any(1).tolist() == [pursuit] * 3
+        assert (plan.path_kl[state.coalition] > 0).all() and not state.anchor_jump.any()
+
+
+def test_without_feasibility_guidance_only_adversaries_leave_the_prior():
+    _, plan = replanned(synthesizer(control={"feasibility": 0.0, "adversarial_clip": 0.5}), scenes(3).scenes, 2.0)
+    assert (plan.path_kl[~plan.adversary] == 0).all() and (plan.path_kl[plan.adversary] > 0).all()
+
+
+def test_the_coalition_of_the_start_is_kept_where_it_is_not_reselected():
+    on, scene = synthesizer(reselect=0), scenes(3).scenes
+    first, _ = replanned(on, scene, 2.0)
+    later, plan = replanned(on, scene, 2.0, times=4)
+    assert torch.equal(first.coalition, later.coalition) and torch.equal(plan.adversary, later.coalition)
+    assert later.replans.tolist() == [4, 4, 4]
+
+
+def test_who_leaves_its_lane_returns_to_it_once_it_meets_nobody():
+    on, scene = synthesizer(reselect=0), scenes(3).scenes
+    world = World.at_start(scene)
+    lanes = begin(on, scene, 2.0)
+    state, _ = on.replan(lanes, world, EGO.plan(world))
+    assert state.off_lane.any() and not (state.off_lane & ~state.coalition).any()
+    moved = (state.routed.points != lanes.routed.points).flatten(2).any(-1)
+    assert torch.equal(moved, state.off_lane)
+    nobody = replace(state, coalition=state.coalition & False, target=state.target * 0 - 1)
+    calm, _ = on.replan(nobody, world, EGO.plan(world))
+    assert not calm.off_lane.any() and torch.equal(calm.routed.points, lanes.routed.points)
+
+
+def test_a_listener_hears_of_every_choice_and_changes_nothing():
+    heard, scene = [], scenes(3).scenes
+    for eta in (0.0, 2.0):
+        silent, listened = synthesizer(), synthesizer()
+        listened.on_selection = heard.append
+        state, plan = replanned(listened, scene, eta, [5, 6, 7])
+        assert torch.equal(plan.states, replanned(silent, scene, eta, [5, 6, 7])[1].states)
+        assert bool(heard) == (eta > 0)
+    (chosen,) = heard
+    assert chosen.seed.tolist() == [5, 6, 7] and chosen.step.tolist() == [0, 0, 0]
+    used = chosen.coalition.shape[1]
+    assert torch.equal(chosen.coalition, state.coalition[:, :used]) and chosen.weights.shape[2:] == (used, used)
+    assert torch.equal(chosen.target, state.target[:, :used]) and not (chosen.coalition & ~chosen.feasible).any()
+    assert chosen.reference.shape[:3] == chosen.weights.shape[:3] and chosen.moments[0, 0] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("support", ["topology", "random"])
+def test_the_other_supports_choose_a_coalition_too(support):
+    """The ablations: whoever topology finds, or anybody who is there and not parked, drawn by the scene's seed."""
+    scene = scenes(3).scenes
+    _, plan = replanned(synthesizer(support=support, responsibility="none"), scene, 2.0, [5, 6, 7])
+    _, again = replanned(synthesizer(support=support, responsibility="none"), scene, 2.0, [5, 6, 7])
+    assert plan.adversary.any() and torch.equal(plan.adversary, again.adversary)
+    vehicles = plan.adversary.shape[1]
+    assert not (plan.adversary & (scene["parked"] | ~scene["valid"])[:, :vehicles]).any()
+
+
+@pytest.mark.parametrize("sampler", ["ddim", "dpm_solver_pp", "euler_maruyama"])
+def test_the_transport_budget_of_a_rollout_holds_and_is_used(sampler):
+    scene = scenes(3).scenes
+
+    def spent(budget):
+        on = synthesizer(sampler=sampler, control={"transport_budget": budget})
+        return replanned(on, scene, 2.0, times=3)[1].path_kl.sum(-1)
+
+    free = spent(None)
+    limit = float(free.min()) / 3
+    assert limit > 0
+    capped = spent(limit)
+    assert (capped <= 1.001 * limit).all() and (capped > 0.99 * limit).all()
+    assert (spent(0.0) == 0).all()
+    torch.testing.assert_close(spent(2 * float(free.max())), free, rtol=1e-3, atol=1e-4)

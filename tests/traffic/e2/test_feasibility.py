@@ -1,0 +1,131 @@
+import math
+
+import pytest
+import torch
+
+from e2rl.run.errors import InputError
+from e2rl.traffic.e2.feasibility import EGO_ACCELERATION, FeasibilitySettings, feasible_vehicles
+from e2rl.traffic.e2.motion import MAX_BRAKING, arrival_window, compact, reachable_distance
+from e2rl.traffic.e2.reasoner import describe
+from tests.traffic.e2.crossing import add_route, make_world
+
+UP, LEFT = math.pi / 2, math.pi
+EGO = (0.0, 0.0, 0.0, 10.0)
+SETTINGS = FeasibilitySettings()
+
+
+def judge(*vehicles, settings=SETTINGS):
+    world = make_world([EGO, *vehicles])
+    return feasible_vehicles(world.scene, world, settings), world
+
+
+def test_routes_that_cross_meet_where_the_lines_do():
+    result, _ = judge((50.3, -41.7, UP, 10.0))
+    table = result.conflicts
+    assert result.mask[0].tolist() == [False, True] + [False] * 6
+    assert table.s[0, 1, 0] == pytest.approx(20 + 41.7, abs=0.05)
+    assert table.exists[0, 1].tolist() == [True] + [False] * 5 and not table.exists[0, 2].any()
+
+
+def test_an_oblique_crossing_is_found_too():
+    heading = 0.7
+    result, _ = judge((20.0, -30.0, heading, 12.0))
+    way = 30 / math.sin(heading)
+    assert result.conflicts.s[0, 1, 0] == pytest.approx(20 + way, abs=0.1)
+
+
+def test_windows_hold_what_both_can_reach():
+    table = judge((50.0, -40.0, UP, 10.0))[0].conflicts
+    earliest, latest = table.earliest[0, 1, 0], table.latest[0, 1, 0]
+    push = EGO_ACCELERATION
+    alone = (math.sqrt(100 + 2 * push * (50 - 4.5 / 2)) - 10) / push  # the ego flat out, to its front bumper
+    assert earliest == pytest.approx(alone, abs=0.15) and latest == SETTINGS.horizon
+
+
+@pytest.mark.parametrize(
+    "vehicle, conflicting",
+    [
+        ((-20.0, 0.0, 0.0, 12.0), True),  # behind in the same lane
+        ((25.0, 0.0, 0.0, 8.0), True),  # ahead in the same lane
+        ((0.0, 12.0, 0.0, 10.0), False),  # parallel
+        ((30.0, 20.0, UP, 10.0), False),  # has crossed already
+        ((110.0, -100.0, UP, 2.0), False),  # cannot be there in time
+        ((60.0, 0.0, LEFT, 10.0), True),  # head-on
+    ],
+)
+def test_who_can_meet_the_ego(vehicle, conflicting):
+    assert judge(vehicle)[0].conflicting[0, 1] == conflicting
+
+
+def test_only_the_candidate_that_crosses_is_listed():
+    world = make_world([EGO, (40.0, 20.0, 0.0, 8.0)])
+    add_route(world, 1, 3, -UP)
+    table = feasible_vehicles(world.scene, world, SETTINGS).conflicts
+    assert table.exists[0, 1].nonzero().tolist() == [[3]]
+
+
+@pytest.mark.parametrize(
+    "vehicle, parked, relevant",
+    [
+        ((14.0, 0.0, 0.0, 0.0), False, True),  # standing in the way
+        ((14.0, 0.0, 0.0, 0.0), True, False),  # the same, parked
+        ((40.0, 0.0, 0.0, 0.0), False, False),  # standing too far ahead
+        ((14.0, 4.0, 0.0, 0.0), False, False),  # standing beside
+        ((-14.0, 0.0, 0.0, 0.0), False, False),  # standing behind
+        ((40.0, -20.0, UP, 3.0), False, True),  # moving
+    ],
+)
+def test_who_is_relevant(vehicle, parked, relevant):
+    world = make_world([EGO, vehicle])
+    world.scene["parked"][:, 1] = parked
+    assert feasible_vehicles(world.scene, world, SETTINGS).relevant[0, 1] == relevant
+
+
+def test_off_lane_off_road_and_turned_vehicles_are_not_associated():
+    world = make_world([EGO] + [(30.0 + 10 * k, -20.0, UP, 5.0) for k in range(4)])
+    world.states[:, 1, 0] += 3.0
+    world.states[:, 2, 2] += 1.2
+    result = feasible_vehicles(world.scene, world, SETTINGS)
+    assert result.associated[0, 1:5].tolist() == [False, False, True, True]
+    world.scene["field"].fill_(2.0)
+    assert not feasible_vehicles(world.scene, world, SETTINGS).mask.any()
+
+
+def test_absent_vehicles_and_the_ego_are_never_feasible_and_scenes_do_not_mix():
+    alone = judge((50.0, -40.0, UP, 10.0))[0]
+    world = make_world([EGO, (50.0, -40.0, UP, 10.0)], copies=3)
+    world.valid[1, 1] = False
+    result = feasible_vehicles(world.scene, world, SETTINGS)
+    assert result.mask[:, 1].tolist() == [True, False, True] and not result.mask[:, 0].any()
+    torch.testing.assert_close(result.conflicts.s[2], alone.conflicts.s[0])
+
+
+def test_arrival_windows_solve_the_equations_of_motion():
+    speed, x = torch.tensor([0.0, 5.0, 10.0, 30.0]), torch.tensor([10.0, 40.0, 9.0, 60.0])
+    earliest, latest = arrival_window(x, speed)
+    for e, way, v in zip(earliest.tolist(), x.tolist(), speed.tolist(), strict=True):
+        most = reachable_distance(torch.tensor(v), torch.tensor(e))[1]
+        assert most == pytest.approx(way, abs=1e-3)
+    assert latest.tolist()[:2] == [torch.inf, torch.inf]
+    assert 10 * latest[2] - MAX_BRAKING / 2 * latest[2] ** 2 == pytest.approx(9.0, abs=1e-4)
+    assert arrival_window(torch.tensor(-3.0), torch.tensor(7.0))[1] == 0
+
+
+def test_compact_lists_true_entries_first():
+    index, present = compact(torch.tensor([[False, True, True], [False, False, False]]))
+    assert index[0].tolist() == [1, 2] and present.tolist() == [[True, True], [False, False]]
+
+
+def test_the_description_names_position_motion_and_conflict():
+    world = make_world([EGO, (50.0, -40.0, UP, 10.0)])
+    conflicts = feasible_vehicles(world.scene, world, SETTINGS).conflicts
+    ego, vehicles = describe(world.scene, world, conflicts, 0)
+    (text,) = vehicles.values()
+    assert ego.startswith("The ego drives at 10.0 m/s") and ego.endswith("goes straight on.")
+    for part in ("50 m ahead of it and 40 m to its right", "90 degrees to the left", "10.0 m/s", "in 40 m"):
+        assert part in text, text
+
+
+def test_a_corridor_narrower_than_the_sampling_is_refused():
+    with pytest.raises(InputError, match="corridor"):
+        FeasibilitySettings(corridor=2.0)

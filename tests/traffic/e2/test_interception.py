@@ -1,0 +1,152 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from e2rl.prior.lane_relative import LaneState, speeds
+from e2rl.run.errors import InputError
+from e2rl.scenes.boxes import overlap
+from e2rl.scenes.drivable_area import CELL
+from e2rl.scenes.recording import DT, LIGHT_GREEN, LIGHT_RED
+from e2rl.scenes.route import SPACING, interpolate
+from e2rl.traffic.e2.interception import InterceptionSettings, cubic, intercept
+from e2rl.traffic.e2.motion import constant_speed_states
+from tests.traffic.e2.crossing import make_world
+
+UP = math.pi / 2
+EGO = (0.0, 0.0, 0.0, 10.0)
+BESIDE = (-4.0, 3.5, 0.0, 11.0)  # in the next lane, a little behind
+TIMES = DT * torch.arange(1, 51)
+FREE = replace(InterceptionSettings(), push=2.0, brake=2.0, lateral=2.0)
+
+
+def met(vehicles, eta=2.0, settings=FREE, world=None, halt_at_red=False):
+    """Vehicle 1's interception of the ego among the others, all of which keep their speed."""
+    world = world or make_world(vehicles)
+    scene, expected = world.scene, constant_speed_states(world.scene, world, TIMES)
+    index, target = (torch.full((len(scene), 1), vehicle) for vehicle in (1, 0))
+    found = intercept(world, index, target, expected, torch.full((len(scene),), eta), settings, halt_at_red)
+    return found, expected, scene["size"][:, :8]
+
+
+def driven(found, speed):
+    """States [50, 4] of the vehicle on its way, by the prior's decoder of speeds."""
+    state = LaneState(*(torch.zeros(()) for _ in range(10)))
+    state.v, state.a = torch.tensor(speed), found.knots[0, 0, 0]
+    v, way = speeds(state, found.knots[0, 0])
+    xy, heading, _ = interpolate(found.path[0, 0], way)
+    return torch.cat([xy, heading[:, None], v[:, None]], -1)
+
+
+@pytest.mark.parametrize(
+    "vehicle", [BESIDE, (25.0, -20.0, UP, 9.0), (60.0, 3.5, math.pi, 8.0), (-15.0, 0.0, 0.0, 11.0)]
+)
+def test_the_boxes_touch_if_everybody_drives_as_expected(vehicle):
+    found, expected, size = met([EGO, vehicle])
+    assert found.cost.isfinite().all()
+    track = driven(found, vehicle[3])
+    assert overlap(track, size[0, 1].expand(50, 2), expected[0, 0], size[0, 0].expand(50, 2)).any()
+
+
+def test_a_way_begins_at_the_vehicle_in_its_direction_with_a_vertex_every_two_metres():
+    found, _, _ = met([EGO, BESIDE])
+    points = found.path[0, 0]
+    assert torch.allclose(points[0], torch.tensor(BESIDE[:2]), atol=1e-4)
+    step = points.diff(dim=0)
+    assert (step.norm(dim=-1) - SPACING).abs().max() < 0.02
+    assert torch.atan2(step[0, 1], step[0, 0]).abs() < 0.1
+
+
+@pytest.mark.parametrize("angle", [0.2, 0.8, 1.9])
+def test_the_cubic_between_two_poses_of_a_circle_is_its_arc(angle):
+    radius = 12.0
+    end = torch.tensor([radius * math.sin(angle), radius * (1 - math.cos(angle))])
+    points, _ = cubic(torch.zeros(2), torch.tensor(0.0), end, torch.tensor(angle), torch.linspace(0, 1, 21))
+    gap = (points - torch.tensor([0.0, radius])).norm(dim=-1) - radius
+    assert gap.abs().max() < 3e-3 * radius
+
+
+def test_limits_grow_with_intensity_and_nothing_is_proposed_at_zero():
+    vehicle = (-15.0, 0.0, 0.0, 10.0)  # behind at the same speed: it must speed up
+    feasible = [bool(met([EGO, vehicle], eta)[0].cost.isfinite()) for eta in (0.0, 0.2, 0.5, 1.0, 2.0, 3.0)]
+    assert feasible == sorted(feasible) and not feasible[0] and feasible[-1]
+    gentle, hard = (met([EGO, vehicle], settings=replace(FREE, push=push))[0].cost for push in (0.3, 2.0))
+    assert gentle.isinf() and hard.isfinite()
+
+
+@pytest.mark.parametrize("eta", [0.5, 1.0, 3.0])
+def test_what_is_proposed_keeps_the_limits(eta):
+    settings = InterceptionSettings()
+    world = make_world([EGO, BESIDE], copies=30)
+    generator = torch.Generator().manual_seed(0)
+    world.states[:, 1, 0] += 30 * torch.rand(30, generator=generator) - 10
+    world.states[:, 1, 3] += 6 * torch.rand(30, generator=generator) - 3
+    found, _, _ = met([EGO, BESIDE], eta, settings, world)
+    some = found.cost[:, 0].isfinite()
+    assert some.any()
+    knots = found.knots[some, 0]
+    assert (knots <= settings.push * eta + 1e-5).all() and (knots >= -settings.brake * eta - 1e-5).all()
+    v = world.states[some, 1, 3]
+    _, _, curvature = interpolate(found.path[some, 0], torch.arange(2.0, 20.0, 2.0).expand(int(some.sum()), -1))
+    slow = v[:, None] ** 2 - 2 * settings.brake * eta * torch.arange(2.0, 20.0, 2.0)
+    assert ((slow.clamp(min=0) * curvature.abs()).amax(-1) < 1.3 * settings.lateral * eta).all()
+
+
+def test_no_way_leads_off_the_road_or_through_another_vehicle():
+    world = make_world([EGO, BESIDE])
+    cells = world.scene["field"].shape[-1]
+    y = world.scene["field_origin"][0, 1] + CELL * torch.arange(cells)
+    world.scene["field"][:] = -5.0
+    assert met([EGO, BESIDE], world=world)[0].cost.isfinite()
+    world.scene["field"][:, :, (y > 0.8) & (y < 2.6)] = 2.0  # a kerb between the lanes
+    assert met([EGO, BESIDE], world=world)[0].cost.isinf()
+    between = (16.0, 0.0, 0.0, 10.0)
+    assert met([EGO, (30.0, 0.0, math.pi, 8.0)])[0].cost.isfinite()
+    assert met([EGO, (30.0, 0.0, math.pi, 8.0), between])[0].cost.isinf()
+
+
+def test_a_turned_and_moved_scene_has_the_turned_and_moved_way():
+    one = met([EGO, BESIDE])[0]
+    turn, shift = 0.7, torch.tensor([30.0, -12.0])
+    spin = torch.tensor([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    moved = [(*(spin @ torch.tensor(v[:2]) + shift).tolist(), v[2] + turn, v[3]) for v in (EGO, BESIDE)]
+    other = met(moved)[0]
+    torch.testing.assert_close(other.path[0, 0], one.path[0, 0] @ spin.T + shift, atol=2e-3, rtol=1e-4)
+    torch.testing.assert_close(other.cost, one.cost, atol=1e-3, rtol=1e-4)
+
+
+def test_settings_that_make_no_sense_are_refused():
+    with pytest.raises(InputError, match="reach"):
+        InterceptionSettings(reach=9.0)
+
+
+def oncoming_world():
+    """A vehicle that comes towards the ego, whose lane runs with the ego."""
+    return make_world([EGO, (60.0, 3.5, math.pi, 8.0)])
+
+
+def test_a_path_that_ends_against_every_lane_costs_what_is_set_and_is_not_made_at_infinity():
+    free = met(None, world=oncoming_world())[0].cost
+    dear = met(None, settings=replace(FREE, wrong_way=1.5), world=oncoming_world())[0].cost
+    assert dear.item() == pytest.approx(free.item() + 1.5, abs=1e-5)
+    assert met(None, settings=replace(FREE, wrong_way=math.inf), world=oncoming_world())[0].cost.isinf()
+
+
+def test_whoever_drives_with_the_lanes_or_where_there_is_none_costs_no_more():
+    dear = replace(FREE, wrong_way=math.inf)
+    assert torch.equal(met([EGO, BESIDE], settings=dear)[0].cost, met([EGO, BESIDE])[0].cost)
+    world = oncoming_world()
+    world.scene["lane_index"][:] = -1
+    assert torch.equal(met(None, settings=dear, world=world)[0].cost, met(None, world=oncoming_world())[0].cost)
+
+
+@pytest.mark.parametrize("line, finite", [(40.0, False), (200.0, True)])
+def test_nobody_is_sent_past_its_own_red_light(line, finite):
+    world = make_world([EGO, BESIDE])
+    world.scene["light_state"] = torch.full((1, world.scene["logged"].shape[1], 1), LIGHT_RED)
+    world.scene["route_light"][:, 1, 0, 0], world.scene["route_light_s"][:, 1, 0, 0] = 0, line
+    assert bool(met(None, world=world, halt_at_red=True)[0].cost.isfinite()) == finite
+    assert met(None, world=world)[0].cost.isfinite().all()
+    world.scene["light_state"][:] = LIGHT_GREEN
+    assert met(None, world=world, halt_at_red=True)[0].cost.isfinite().all()

@@ -1,0 +1,178 @@
+"""The language-model reasoner against a real HTTP server: answers count, failures leave it to the rules, audibly."""
+
+import json
+import math
+import sys
+import time
+import warnings
+
+import pytest
+import torch
+
+from e2rl.run.errors import InputError
+from e2rl.traffic.e2.feasibility import FeasibilitySettings, feasible_vehicles
+from e2rl.traffic.e2.reasoner import CRITERIA, LanguageReasoner, ReasonerSettings, build_reasoner, read_answer
+from tests.traffic.e2.chat_server import chat_server, verdicts
+from tests.traffic.e2.crossing import make_world
+from tests.traffic.e2.traffic_scenes import synthesizer
+
+pytest.importorskip("openai")
+RULES = FeasibilitySettings()
+UP = math.pi / 2
+
+
+@pytest.fixture(autouse=True)
+def key(monkeypatch):
+    monkeypatch.setenv("OPENAI_API_KEY", "any")
+
+
+def world(copies=1):
+    """The ego and two vehicles: the first crosses its way, the second never meets it."""
+    made = make_world([(0.0, 0.0, 0.0, 10.0), (50.0, -40.0, UP, 10.0), (0.0, 12.0, 0.0, 10.0)], copies=copies)
+    made.states[:, 1, 3] += torch.arange(copies)  # scenes that differ
+    return made
+
+
+def ask(url, tmp_path, made, statistics=None, **settings):
+    counts = {} if statistics is None else statistics
+    reasoner = LanguageReasoner(
+        ReasonerSettings(
+            **({"kind": "lm", "model": "small", "base_url": url, "retries": 0, "cache": str(tmp_path)} | settings)
+        ),
+        counts,
+    )
+    return reasoner(made.scene, made, RULES), counts
+
+
+def test_the_model_decides_and_is_asked_by_schema_at_temperature_zero(tmp_path):
+    with chat_server(verdicts) as (url, requests):
+        result, counts = ask(url, tmp_path, world())
+    assert result.mask[0].tolist() == [False, True, True] + [False] * 5, "the rules would take the first only"
+    request = requests[0]
+    assert request["path"] == "/v1/chat/completions" and request["temperature"] == 0 and request["model"] == "small"
+    schema = request["response_format"]["json_schema"]
+    assert schema["strict"] and schema["schema"]["properties"]["vehicles"]["items"]["required"] == ["id", *CRITERIA]
+    text = request["messages"][-1]["content"]
+    assert "50 m ahead of it and 40 m to its right" in text and "Feasible" not in text, "the rules' verdict is not told"
+    assert counts == {"lm_scenes": 1, "lm_requests": 1, "lm_cached": 0, "lm_fallbacks": 0}
+
+
+def test_the_conflict_table_stays_and_parked_vehicles_are_not_asked_about(tmp_path):
+    made = world()
+    made.scene["parked"][:, 2] = True
+    with chat_server(verdicts) as (url, requests):
+        result, _ = ask(url, tmp_path, made)
+    assert result.mask[0].tolist() == [False, True] + [False] * 6
+    assert "Vehicle 2" not in requests[0]["messages"][-1]["content"]
+    torch.testing.assert_close(result.conflicts.s, feasible_vehicles(made.scene, made, RULES).conflicts.s)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        "no JSON at all",
+        "[]",
+        "[" * 100_000,
+        '{"vehicles": [{"id": 1}]}',
+        json.dumps({"vehicles": [{"id": number} | dict.fromkeys(CRITERIA, True) for number in (1, 7)]}),
+        json.dumps({"vehicles": [{"id": 1} | dict.fromkeys(CRITERIA, True)]}),
+        json.dumps({"vehicles": [{"id": number} | dict.fromkeys(CRITERIA, "yes") for number in (1, 2)]}),
+        (500, "out of order"),
+        (404, "no such model"),
+        "",
+    ],
+)
+def test_the_rules_decide_where_the_model_fails(tmp_path, answer):
+    made = world(2)
+    with chat_server(lambda request: answer) as (url, _), pytest.warns(UserWarning, match="rules decided for 1 of"):
+        result, counts = ask(url, tmp_path, made)
+    assert torch.equal(result.mask, feasible_vehicles(made.scene, made, RULES).mask)
+    assert counts["lm_fallbacks"] == counts["lm_requests"] == 2
+    assert not list(tmp_path.iterdir()), "failures are not kept"
+
+
+def test_slow_and_absent_endpoints_are_given_up(tmp_path):
+    def slow(request):
+        time.sleep(1.0)
+        return verdicts(request)
+
+    begin = time.perf_counter()
+    with chat_server(slow) as (url, _):
+        with pytest.warns(UserWarning, match="APITimeoutError"):
+            _, counts = ask(url, tmp_path, world(), timeout=0.2)
+        assert counts["lm_fallbacks"] == 1 and time.perf_counter() - begin < 0.9
+    with pytest.warns(UserWarning, match="APIConnectionError"):
+        _, counts = ask(url, tmp_path, world())
+    assert counts["lm_fallbacks"] == 1
+
+
+def test_failed_requests_are_retried_as_often_as_set(tmp_path):
+    with chat_server(lambda request: (500, "busy")) as (url, requests), pytest.warns(UserWarning):
+        ask(url, tmp_path, world(), retries=1)
+    assert len(requests) == 2
+
+
+def test_answers_are_kept_by_content(tmp_path):
+    with chat_server(verdicts) as (url, requests):
+        first, _ = ask(url, tmp_path, world())
+        again, counts = ask(url, tmp_path, world())
+        assert len(requests) == 1 and counts["lm_cached"] == 1 and torch.equal(first.mask, again.mask)
+        ask(url, tmp_path, world(), model="other")
+        assert len(requests) == 2, "another model is asked anew"
+        moved = world()
+        moved.states[:, 1, 0] += 5
+        ask(url, tmp_path, moved)
+        assert len(requests) == 3, "and so is about another scene"
+        for path in tmp_path.iterdir():
+            path.write_text("{")
+        ask(url, tmp_path, world())
+        assert len(requests) == 4, "damaged answers are not believed"
+
+
+def test_scenes_do_not_wait_for_each_other_and_do_not_mix(tmp_path):
+    def half(request):
+        time.sleep(0.25)
+        return (500, "") if "13.0 m/s" in request["messages"][-1]["content"] else verdicts(request)
+
+    made, begin = world(6), time.perf_counter()
+    with chat_server(half) as (url, _), pytest.warns(UserWarning):
+        result, counts = ask(url, tmp_path, made)
+    assert time.perf_counter() - begin < 1.2, "six quarters of a second one after another"
+    assert result.mask[:, 2].tolist() == [True, True, True, False, True, True] and counts["lm_fallbacks"] == 1
+
+
+def test_an_ego_alone_asks_nothing(tmp_path):
+    with chat_server(verdicts) as (url, requests):
+        result, counts = ask(url, tmp_path, make_world([(0.0, 0.0, 0.0, 10.0)]))
+    assert not requests and not result.mask.any() and counts["lm_scenes"] == 0
+
+
+def test_the_synthesizer_counts_and_the_rules_are_the_default(tmp_path):
+    assert build_reasoner(ReasonerSettings(), {}) is feasible_vehicles
+    with chat_server(verdicts) as (url, _):
+        settings = {"kind": "lm", "model": "small", "base_url": url, "cache": str(tmp_path)}
+        made, on = world(), synthesizer(reasoner=settings)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            on.feasible_vehicles(made.scene, made, RULES)
+    assert on.statistics["lm_requests"] == 1
+
+
+def test_what_is_missing_is_said(monkeypatch):
+    with pytest.raises(InputError, match="name a model"):
+        ReasonerSettings(kind="lm")
+    with pytest.raises(InputError, match="kind=oracle"):
+        ReasonerSettings(kind="oracle")
+    monkeypatch.delenv("OPENAI_API_KEY")
+    with pytest.raises(InputError, match="OPENAI_API_KEY"):
+        LanguageReasoner(ReasonerSettings("lm", "small"), {})
+    monkeypatch.setitem(sys.modules, "openai", None)
+    with pytest.raises(InputError, match="pip install"):
+        LanguageReasoner(ReasonerSettings("lm", "small"), {})
+
+
+def test_answers_must_be_about_whom_was_asked():
+    entry = {"id": 3} | dict.fromkeys(CRITERIA, False)
+    assert read_answer(json.dumps({"vehicles": [entry]}), [3]) == {3: (False, False, False)}
+    with pytest.raises(ValueError, match="asked was about"):
+        read_answer(json.dumps({"vehicles": [entry, entry]}), [3])
