@@ -23,18 +23,12 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from e2rl.run.errors import InputError
+from e2rl.run.settings import conf_folder
 
 CHOICE = re.compile(r"[\w+-][\w.+-]*(/[\w+-][\w.+-]*)*")  # a file's name in a group
 
 
 # --- configuration
-
-
-def conf_folder() -> Path:
-    """The folder of the configuration: installed with the package, or conf/ of a checkout."""
-    package = Path(__file__).parents[1]
-    installed = package / "scripts" / "conf"
-    return installed if installed.is_dir() else package.parent / "conf"
 
 
 def load_config(name: str = "evaluate", overrides: tuple[str, ...] | list[str] = ()) -> DictConfig:

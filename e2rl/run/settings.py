@@ -1,7 +1,11 @@
-"""Typed settings: dataclasses filled from groups of the configuration; what does not fit has one clear message."""
+"""Typed settings: dataclasses and constructors whose default values stand once, in the YAML files of conf/."""
 
-from collections.abc import Collection, Mapping
-from typing import TypeVar
+import inspect
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import field, fields, is_dataclass
+from functools import cache, wraps
+from pathlib import Path
+from typing import Any, TypeVar
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -9,13 +13,82 @@ from omegaconf.errors import OmegaConfBaseException
 from e2rl.run.errors import InputError
 
 Settings = TypeVar("Settings")
+Kind = TypeVar("Kind", bound=type)
+
+
+def conf_folder() -> Path:
+    """Returns the folder of the configuration: installed with the package, or conf/ of a checkout."""
+    package = Path(__file__).parents[1]
+    installed = package / "scripts" / "conf"
+    return installed if installed.is_dir() else package.parent / "conf"
+
+
+def setting(
+    low: float = float("-inf"), high: float = float("inf"), choices: Collection[Any] = (), optional: bool = False
+) -> Any:
+    """Returns a dataclass field without default whose value `settings_of` and `configured` check.
+
+    Args:
+        low, high: the range of a number (of each number of a list).
+        choices: the only values allowed, where any are given.
+        optional: None is allowed, too.
+    """
+    return field(metadata={"low": low, "high": high, "choices": tuple(choices), "optional": optional})
+
+
+def configured(file: str, part: str = "") -> Callable[[Kind], Kind]:
+    """Returns a class decorator: arguments that are not given have the values of conf/<file>.yaml.
+
+    So a default stands in the YAML file only, and whoever builds the class gets what the command line gets.
+
+    Args:
+        file: such as "synthesizer/diffscene"; its `defaults` list is not followed.
+        part: dotted name of the mapping in it that holds the arguments, such as "control".
+    """
+
+    def decorate(kind: Kind) -> Kind:
+        build = kind.__init__  # type: ignore[misc]
+        signature = inspect.signature(build)
+
+        @wraps(build)
+        def filled(self: Any, *positional: Any, **named: Any) -> None:
+            given = signature.bind_partial(self, *positional, **named).arguments
+            values = file_values(file, part)
+            build(
+                self, *positional, **named, **{k: values[k] for k in signature.parameters if k in values.keys() - given}
+            )
+            if is_dataclass(kind):
+                check_settings(self, part or file.partition("/")[0])
+
+        kind.__init__ = filled  # type: ignore[misc]
+        kind.__configured__ = (file, part)  # type: ignore[attr-defined]
+        return kind
+
+    return decorate
+
+
+def file_values(file: str, part: str = "") -> dict[str, Any]:
+    """Returns the plain values of conf/<file>.yaml, or of one mapping in it; lists are tuples."""
+    found = _content(file)
+    for name in filter(None, part.split(".")):
+        found = found[name]
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in found.items()}
+
+
+@cache
+def _content(file: str) -> dict[str, Any]:
+    plain = OmegaConf.to_container(OmegaConf.load(conf_folder() / f"{file}.yaml"))
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
 
 
 def settings_of(kind: type[Settings], values: Mapping, where: str) -> Settings:
-    """An instance of the dataclass `kind` (fields of plain types) with the values of the group `where`.
+    """Returns an instance of the dataclass `kind` (fields of plain types) with the values of the group `where`.
 
-    Keys that are not given keep their defaults; lists become tuples. Raises InputError for a key that the dataclass
-    does not have and for a value of another type.
+    Keys that are not given keep their defaults; lists become tuples.
+
+    Raises:
+        InputError: for a key that the dataclass does not have, a value of another type, or one out of its range.
     """
     try:
         typed = OmegaConf.merge(OmegaConf.structured(kind), OmegaConf.create(dict(values)))
@@ -25,17 +98,33 @@ def settings_of(kind: type[Settings], values: Mapping, where: str) -> Settings:
         value = f"={values[key]}" if key in values else ""
         raise InputError(f"{where}.{key}{value}: {reason}; compare the group with its file in conf/") from error
     assert isinstance(plain, dict)
-    return kind(**{str(name): tuple(value) if isinstance(value, list) else value for name, value in plain.items()})
+    known = {str(key): value for key, value in plain.items() if not (isinstance(value, str) and value == "???")}
+    made = kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in known.items()})
+    check_settings(made, where)
+    return made
+
+
+def check_settings(made: Any, where: str) -> None:
+    """Raises InputError where a `setting` of a dataclass has a value that it must not have."""
+    for each in fields(made):
+        value, rule = getattr(made, each.name), each.metadata
+        if "low" not in rule or (value is None and rule["optional"]):
+            continue
+        if rule["choices"]:
+            check_choice(f"{where}.{each.name}", value, rule["choices"])
+        elif isinstance(value, int | float | tuple):
+            for number in value if isinstance(value, tuple) else (value,):
+                check_range(f"{where}.{each.name}", number, rule["low"], rule["high"])
 
 
 def check_choice(where: str, value: object, choices: Collection[str]) -> None:
-    """Raise InputError where the value of setting `where` is none of the choices."""
+    """Raises InputError where the value of setting `where` is none of the choices."""
     if value not in choices:
         raise InputError(f"{where}={value}: choose one of {', '.join(choices)}")
 
 
 def check_range(where: str, value: float, low: float = float("-inf"), high: float = float("inf")) -> None:
-    """Raise InputError where the number `where` is below `low`, above `high`, or NaN."""
+    """Raises InputError where the number `where` is below `low`, above `high`, or NaN."""
     if not low <= value <= high:
         bounds = [f"at least {low:g}"] if low > float("-inf") else []
         bounds += [f"at most {high:g}"] if high < float("inf") else []
