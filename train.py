@@ -10,10 +10,7 @@ import hydra
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from e2rl.evaluation.capacity import check_fits, training_need
 from e2rl.evaluation.methods import build_ego, build_prior, build_traffic, caption
-from e2rl.evaluation.provenance import begin_run
-from e2rl.evaluation.resume import Run, resume_command, run_of
 from e2rl.evaluation.rollout_files import ENDED_FILE, add_ended
 from e2rl.learning.build import build_evolution, build_logger, build_measure, check_training, run_bits, run_imitation
 from e2rl.learning.prior_training.distributed import follower_overrides, follows, started_by_torchrun
@@ -22,9 +19,11 @@ from e2rl.learning.run_checkpoint import checkpoints, load_checkpoint, save_chec
 from e2rl.report.rounds import draw_round, round_line
 from e2rl.report.tables import metric_tables, print_tables, save_tables
 from e2rl.run.config import resolved, run_command, set_up
+from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import alone_in
-from e2rl.run.processes import ending
+from e2rl.run.run import Run, how_to_go_on
+from e2rl.scenes.scene_list import listed
 from e2rl.scenes.source import load_scenes
 
 MAY_CHANGE = ("rounds", "device", "threads", "launcher")  # when a run is resumed
@@ -38,9 +37,7 @@ def evolve(task: Run) -> None:
     scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
     run, logger = build_evolution(config, scenes, ego, traffic, folder=folder), build_logger(config, folder)
     measure = build_measure(config, ego, task.choices["ego"], traffic, prior, folder)
-    if str(config.device) == "cpu" and isinstance(measure.processes, int):
-        check_fits(training_need(config, scenes, measure.setup.scenes, measure.processes))
-    begin_run(folder, config, MAY_CHANGE, {"scenes": scenes, "measured scenes": measure.setup.scenes})
+    task.begin({"scenes": listed(scenes), "measured scenes": listed(measure.setup.scenes)})
     begun = config.resume and checkpoints(config.resume)  # a run can be cut off in the measurement before
     done = load_checkpoint(config.resume, run) if begun else 0
     logger.forget(done)
@@ -66,7 +63,7 @@ def evolve(task: Run) -> None:
 
 def train_prior(task: Run) -> None:
     """Train a prior and print its nominal closed loop on held-out logs."""
-    outcome = run_prior_stage(task.config, task.folder, partial(begin_run, task.folder, task.config, MAY_CHANGE))
+    outcome = run_prior_stage(task.config, task.folder, task.begin)
     if outcome is None:
         return  # another process of torchrun is the leader and reports
     path, rows = outcome
@@ -79,7 +76,7 @@ def imitate(task: Run) -> None:
     config, folder = task.config, task.folder
     ego = build_ego(config)
     scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
-    begin = partial(begin_run, folder, config, MAY_CHANGE, {"scenes": scenes})
+    begin = partial(task.begin, {"scenes": listed(scenes)})
     losses = run_imitation(config, scenes, ego, folder, build_logger(config, folder), begin)
     print(", ".join(f"{name} {value:.4f}" for name, value in losses.items() if value == value))  # NaN: none held out
     print(f"start evolution rounds from it with ego.checkpoint={folder}")
@@ -89,7 +86,7 @@ def train_bits(task: Run) -> None:
     """Train the ego bits on recorded vehicles, in a minute or two: a resumed run begins anew."""
     config, folder = task.config, task.folder
     scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
-    begin_run(folder, config, MAY_CHANGE, {"scenes": scenes})
+    task.begin({"scenes": listed(scenes)})
     losses = run_bits(config, scenes, folder, build_logger(config, folder))
     print(", ".join(f"{name} {value:.4f}" for name, value in losses.items() if value == value))  # NaN: none held out
     print(f"drive with it by ego=bits ego.checkpoint={folder}")
@@ -101,8 +98,8 @@ STAGES = {"evolution": evolve, "prior": train_prior, "imitation": imitate, "bits
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 def run(config: DictConfig) -> None:
     """One stage of training, as configured."""
-    with ending(resume_command(config)):
-        task = run_of(config, MAY_CHANGE)
+    with ending(lambda: how_to_go_on(config)):
+        task = Run.of(config, MAY_CHANGE)
         config = task.config
         if config.stage not in STAGES:
             raise InputError(f"stage={config.stage}: choose one of {', '.join(STAGES)}")

@@ -25,12 +25,14 @@ from e2rl.metrics.score import score_rollouts
 from e2rl.planners.ego import Ego
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.checkpoint import load_prior as _load_prior
-from e2rl.prior.prior import Prior, SamplerSettings
+from e2rl.prior.prior import Prior
+from e2rl.prior.sde import SamplerSettings
 from e2rl.run.config import load_choice, load_config
 from e2rl.run.errors import InputError
 from e2rl.run.settings import settings_of
 from e2rl.scenes import source
 from e2rl.scenes.scene import SceneSet
+from e2rl.sim.rollouts import Rollouts
 from e2rl.traffic import rollout
 from e2rl.traffic.traffic import Traffic
 
@@ -62,18 +64,20 @@ def make_ego(name: str, **settings: Any) -> Ego:
 
 def roll_out(
     scenes: SceneSet, ego: Ego, traffic: Traffic, eta: float = 0.0, seeds: Sequence[int] = (0,), device: str = "cpu"
-) -> dict:
-    """The rollout dict of every scene under every sampling seed, as `python evaluate.py` rolls them out
-    (e2rl.traffic.rollout); all are simulated at once."""
+) -> Rollouts:
+    """The rollouts of every scene under every sampling seed, as `python evaluate.py` rolls them out; all are simulated
+    at once."""
     tasks = [(scene, seed) for seed in seeds for scene in range(len(scenes))]
     index = torch.tensor([scene for scene, _ in tasks])
     noise = torch.tensor([scene_seed(scenes.number[scene], seed) for scene, seed in tasks])
     sim = build_sim(load_config("evaluate"))
-    rollouts = rollout.roll_out(scenes, index, noise, torch.full((len(tasks),), float(eta)), ego, traffic, sim, device)
-    return rollouts | {"seed": torch.tensor([seed for _, seed in tasks]), "eta": float(eta)}
+    etas = torch.full((len(tasks),), float(eta), dtype=torch.float64)
+    rollouts = rollout.roll_out(scenes, index, noise, etas, ego, traffic, sim, device)
+    rollouts.seed = torch.tensor([seed for _, seed in tasks])
+    return rollouts
 
 
-def score(rollouts: dict) -> list[dict]:
+def score(rollouts: Rollouts) -> list[dict]:
     """One row of metrics per rollout (docs/method.md, section 10)."""
     return score_rollouts(rollouts)[0]
 

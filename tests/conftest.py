@@ -1,9 +1,13 @@
 """Scenes and checkpoints, good and bad, that the tests of the scripts share."""
 
+import atexit
 import os
 import pickle
+import shutil
+import tempfile
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pytest
 import torch
@@ -15,6 +19,12 @@ from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.prior import Prior
 from e2rl.run.files import HASH
 from tests.scenes.descriptions import Malicious, description, lane, numbered, straight, write_folder
+
+if "E2RL_TESTS" not in os.environ:  # the folder of caches of these tests and all processes that they start
+    os.environ["E2RL_TESTS"] = tempfile.mkdtemp(prefix="e2rl-tests-")
+    atexit.register(shutil.rmtree, os.environ["E2RL_TESTS"], ignore_errors=True)
+os.environ.setdefault("MPLCONFIGDIR", matplotlib.get_cachedir())  # its list of fonts takes long to make
+os.environ["XDG_CACHE_HOME"] = os.environ["E2RL_TESTS"]
 
 
 @pytest.fixture(scope="module")

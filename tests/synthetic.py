@@ -7,7 +7,7 @@ from tensordict import TensorDict
 
 from e2rl.scenes.recording import DT, LIGHT_UNKNOWN, PEDESTRIAN, VEHICLE
 from e2rl.scenes.route import SPACING
-from e2rl.scenes.scene import Loaded, SceneSet
+from e2rl.scenes.scene import SceneSet
 
 LANE_WIDTH = 3.5  # m; lane 0 at y = 0, lane 1 (its left neighbour) at y = 3.5, both towards +x
 MARGIN = 1.0  # m beyond a lane's half width that still counts as on the road (docs/method.md, section 1)
@@ -76,7 +76,7 @@ def make_scenes(
     scenes |= {key: value.expand(num_scenes, *value.shape).clone() for key, value in _map(road).items()}
     scenes |= _lights(num_scenes, steps, red_light_x)
     return SceneSet(
-        rows=Loaded(TensorDict(scenes, [num_scenes])),
+        scenes=TensorDict(scenes, [num_scenes]),
         scene_id=[f"synthetic-{k}" for k in range(num_scenes)],
         location=["straight"] * num_scenes,
         dataset="synthetic",

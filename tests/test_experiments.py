@@ -212,11 +212,11 @@ def test_one_scene_is_driven_as_among_all(evaluate, tmp_path):
 
 
 def test_the_prior_s_experiment_has_rows_of_all_stages(world, tmp_path, monkeypatch, capsys):
-    """Open loop, closed loop and meta-metric of three procedural scenes with an untrained prior."""
+    """Open loop, closed loop and meta-metric of three bundled scenes with an untrained prior."""
     overrides = [
         "experiment=prior",
-        "data=procedural",
-        "data.count=3",
+        "data=bundled",
+        "num_scenes=3",
         f"data.cache={tmp_path / 'cache'}",
         "data.workers=1",
         "data.build.vehicles=8",

@@ -13,9 +13,9 @@ from scipy.stats import wasserstein_distance
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from scenegen.interaction import lateral_acceleration, overlapping_pairs
+
 from e2rl.scenes.bundled import SPLITS, BundledSource
-from e2rl.scenes.interaction import lateral_acceleration, overlapping_pairs
-from e2rl.scenes.procedural import ProceduralSource
 from e2rl.scenes.recording import DT, VEHICLE, Recording
 from e2rl.scenes.scenarionet import ScenarioNetSource
 from e2rl.scenes.smoothing import drop_jumps, smooth
@@ -68,7 +68,6 @@ def main() -> None:
     logs = pool(ScenarioNetSource(options.logs).recordings())
     sets = {
         "bundled": pool(r for split in SPLITS for r in BundledSource(split=split).recordings()),
-        "procedural": pool(ProceduralSource(split="train", count=100).recordings()),
         "recorded": logs,
     }
     print("| | " + " | ".join(f"{name}, n = {part['n'][0]}" for name, part in sets.items()) + " |")

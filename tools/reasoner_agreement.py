@@ -101,11 +101,10 @@ def report(config: DictConfig) -> None:
     if settings.kind != "lm":
         raise InputError("the rules agree with themselves; give synthesizer.reasoner.kind=lm and its model")
     rules = settings_of(FeasibilitySettings, config.synthesizer.feasibility, "synthesizer.feasibility")
-    counts: dict[str, float] = {}
-    reasoner = LanguageReasoner(settings, counts)
+    reasoner = LanguageReasoner(settings)
     scenes = load_scenes(config.data, config.num_scenes)
     print(agreement_table(*measure_agreement(scenes, reasoner, rules), len(scenes)))
-    print(", ".join(f"{name} {value:.0f}" for name, value in counts.items()))
+    print(", ".join(f"{name} {value:.0f}" for name, value in reasoner.statistics.items()))
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="evaluate")

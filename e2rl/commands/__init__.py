@@ -1,1 +1,1 @@
-"""Commands beside train.py and evaluate.py: export, inspect, export of a policy."""
+"""The commands: `e2rl evaluate`, `train`, `report`, `export`, ... (cli.py)."""

@@ -16,9 +16,9 @@ from e2rl.report.export import commonroad_writer as commonroad
 from e2rl.report.export import scenarionet_writer as scenarionet
 from e2rl.report.export.episode import FACTS, Episode
 from e2rl.report.export.scene_files import episodes_of
+from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically, written_whole
-from e2rl.run.processes import ending
 
 FORMATS = {
     "commonroad": commonroad.write,

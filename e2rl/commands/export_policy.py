@@ -17,9 +17,9 @@ from torch import Tensor, nn
 
 from e2rl.planners.network import ActorNetwork, find_weights, read_actor
 from e2rl.planners.policy_file import ONNX, TORCHSCRIPT
+from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
-from e2rl.run.processes import ending
 from e2rl.sim.observation import OBSERVATION_SIZE
 
 EXAMPLE = 2  # observations that the network is traced with

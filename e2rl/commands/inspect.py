@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from e2rl.evaluation.rollout_files import polylines
 from e2rl.report import drawing
 from e2rl.report.drawing import Shape, TrafficMap, Trail, new_figure, save_figure
 from e2rl.run.config import load_choice
@@ -24,6 +23,7 @@ from e2rl.scenes.paths import arc_length
 from e2rl.scenes.recording import AGENT_TYPES, LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, VEHICLE
 from e2rl.scenes.scene_cache import unpack
 from e2rl.scenes.source import Row, Source, source_of
+from e2rl.sim.rollouts import road_of
 
 FOUND = ("scenarionet", "commonroad", "argoverse2", "py123d")  # groups of data that a path can belong to
 SIDE, HEAD, FOOT = 900, 34, 30  # points: of a picture, of its header and of its legend
@@ -129,22 +129,8 @@ def picture(scene: dict[str, np.ndarray], title: str, metres: float) -> Figure:
     axes = figure.add_axes((0, FOOT / height, 1, SIDE / height))
     figure.text(14 / SIDE, 1 - 22 / height, title, fontsize=13, color=drawing.INK)
     drawing.add_legend(figure, LEGEND, 11)
-    TrafficMap(axes, _road(scene), metres).show(scene["start"][0, :2], _trails(scene), _shapes(scene))
+    TrafficMap(axes, road_of(TensorDict(scene)), metres).show(scene["start"][0, :2], _trails(scene), _shapes(scene))
     return figure
-
-
-def _road(scene: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The map of a scene in the form of a rollout's."""
-    tensors = {name: torch.from_numpy(value) for name, value in scene.items()}
-    lanes, lane_offsets, kept = polylines(tensors["lane_points"], tensors["lane_index"], minimum=2)
-    rings, ring_offsets, _ = polylines(tensors["drivable_points"], tensors["drivable_index"], minimum=3)
-    return {
-        "lane_points": lanes,
-        "lane_offsets": lane_offsets,
-        "lane_width": scene["lane_width"][kept],
-        "drivable_points": rings,
-        "drivable_offsets": ring_offsets,
-    }
 
 
 def _trails(scene: dict[str, np.ndarray]) -> list[Trail]:

@@ -14,7 +14,7 @@ from e2rl.evaluation.summary import metric_row
 from e2rl.metrics.catalogue import OPEN_LOOP_STAGE
 from e2rl.metrics.displacement import scene_displacements
 from e2rl.metrics.statistics import bootstrap_draws, cluster_index, interval, resampled_means
-from e2rl.run.parts import NOTHING_KEPT, Kept
+from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.scenes.recording import VEHICLE
 from e2rl.scenes.scene import SceneSet
 from e2rl.traffic.attempt import attempt, count_reasons
@@ -27,7 +27,7 @@ BATCH = 32  # scenes planned at once
 
 @torch.no_grad()
 def open_loop_rows(
-    scenes: SceneSet, methods: Sequence[Method], samples: int, device: str = "cpu", kept: Kept = NOTHING_KEPT
+    scenes: SceneSet, methods: Sequence[Method], samples: int, device: str = "cpu", kept: Parts = NO_PARTS
 ) -> list[dict]:
     """Rows of metrics.json, stage `open loop`, of every uncontrolled method that predicts: minADE, mean and joint ADE
     over `samples` and their ratios to constant velocity's ADE on the same vehicles, with intervals over places.

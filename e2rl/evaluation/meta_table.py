@@ -30,7 +30,7 @@ from e2rl.metrics.meta_metric import (
 from e2rl.metrics.realism import kinematic_samples, split_half
 from e2rl.metrics.statistics import LEVELS, bootstrap_draws, cluster_index, interval, resampled_means
 from e2rl.prior.routes import take_route
-from e2rl.run.parts import NOTHING_KEPT, Kept
+from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.scenes.recording import VEHICLE
 from e2rl.scenes.scene import SceneSet
 from e2rl.traffic.attempt import attempt
@@ -43,7 +43,7 @@ class Tally:
     """Counts of the features' bins and of indications for every vehicle [S * V] of scenes [S], over rollouts."""
 
     def __init__(self, scenes: SceneSet):
-        self.scenes, self.vehicles = scenes, scenes.rows.shape("route_log")[0]
+        self.scenes, self.vehicles = scenes, scenes.scenes["route_log"].shape[1]
         size = len(scenes) * self.vehicles
         self.counts = {name: torch.zeros(size, FEATURES[name].bins, dtype=torch.float64) for name in HISTOGRAMS}
         self.hits = {name: torch.zeros(size, dtype=torch.float64) for name in INDICATIONS}
@@ -124,7 +124,7 @@ def road_of(scene: TensorDictBase, route: Tensor) -> dict[str, Tensor]:
     }
 
 
-def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, kept: Kept = NOTHING_KEPT) -> list[dict]:
+def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, kept: Parts = NO_PARTS) -> list[dict]:
     """Rows of metrics.json, stage `meta-metric`: every feature's likelihood and their weighted sum over `rollouts`
     rollouts of each scene, with intervals over places. The row of the log also has its split-half `real`.
 

@@ -2,27 +2,31 @@
 
 import copy
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from e2rl.evaluation.protocol import Method
-from e2rl.metrics.catalogue import TABLES
+from e2rl.evaluation.protocol import WHOLE, Method
+from e2rl.metrics.catalogue import table_names
 from e2rl.planners.ego import Ego
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.checkpoint import load_prior
-from e2rl.prior.prior import Prior, SamplerSettings
+from e2rl.prior.prior import Prior
+from e2rl.prior.sde import SamplerSettings
 from e2rl.run.config import built, check_counts, choices, load_choice
 from e2rl.run.errors import InputError
 from e2rl.run.processes import Processes, RayWorkers, cores
-from e2rl.run.settings import check_choice, settings_of
+from e2rl.run.settings import check_choice, check_range, setting, settings_of
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.traffic import Traffic
 
-FIGURES = ("intensity", "skeleton", "curves")
+FIGURES = ("intensity", "curves")
 LAUNCHERS = ("processes", "ray")
 VARIED = ("prior", "synthesizer")  # groups that the variants of a table may change
+ALL = "all"  # metrics
+MOST = 100.0  # of the intensity; 0 to 3 are sensible
 
 
 # --- objects
@@ -44,7 +48,7 @@ def build_methods(config: DictConfig, prior: Prior) -> list[Method]:
     """The rows of `config.methods` and of those `config.variants` that it does not name; methods with an intensity have
     a row for each `config.eta`."""
     methods = []
-    for name in dict.fromkeys([*config.methods, *config.variants]):
+    for name in dict.fromkeys([*as_list(config.methods), *config.variants]):
         if name in config.variants:
             changed = varied(config, name)
             own = prior if changed.prior == config.prior else build_prior(changed, config.device)[0]
@@ -74,19 +78,79 @@ def build_sim(config: DictConfig) -> SimSettings:
 # --- what evaluate.py is asked for
 
 
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """Keys of conf/evaluate.yaml, checked. shard: (k, n), only every n-th batch from the k-th on."""
+
+    methods: tuple[str, ...]
+    eta: tuple[float, ...] = setting(low=0.0, high=MOST)
+    seeds: tuple[int, ...] = setting(low=0)
+    num_scenes: int | None = setting(low=1, optional=True)
+    batch: int = setting(low=1)
+    shard: tuple[int, ...] = setting(low=0)
+    metrics: str
+    compare: tuple[str, ...]
+    figure: str | None = setting(choices=FIGURES, optional=True)
+    save_rollouts: bool
+    report: bool
+
+    def __post_init__(self) -> None:
+        check_choice("metrics", self.metrics, (*table_names(), ALL))
+        for name in ("eta", "seeds"):
+            if not getattr(self, name):
+                raise InputError(f"{name}=[]: name at least one")
+        if len(self.shard) != 2 or self.shard[0] >= self.shard[1]:
+            raise InputError(f"shard={list(self.shard)}: expected [k, n] with k from 0 to n - 1, such as shard=[0,4]")
+        if self.figure and len(self.eta) < 2:
+            raise InputError(f"figure={self.figure}: name several intensities, such as eta=[0,1,2,3]")
+        if self.figure == "intensity" and not self.save_rollouts:
+            raise InputError("figure=intensity: drawn from the rollouts' files; set save_rollouts=true")
+
+
+def evaluation_settings(config: DictConfig) -> EvaluationSettings:
+    """Returns what a configuration asks for; InputError for what cannot be run."""
+    given = {field.name: config[field.name] for field in fields(EvaluationSettings)}
+    given |= {name: as_list(given[name]) for name in ("methods", "eta", "seeds", "compare")}
+    settings = settings_of(EvaluationSettings, given | {"shard": config.shard or WHOLE})
+    if not (settings.methods or config.variants):
+        raise InputError("methods=[]: name at least one, such as [nominal,e2]")
+    for name in settings.methods:
+        if name not in config.variants:
+            method_config(config, name)
+    for name in config.variants:
+        if name in (config.synthesizer.name, *choices("synthesizer")):
+            raise InputError(f"variants.{name}: {name} is a row already; choose another name")
+        varied(config, name)
+    _check_compared(config, settings)
+    processes_of(config)
+    return settings
+
+
+def as_list(value: Any) -> list:
+    """Returns one or several values of a configuration as a list; null is none."""
+    if isinstance(value, ListConfig):
+        plain = OmegaConf.to_container(value, resolve=True)
+        assert isinstance(plain, list)
+        return list(dict.fromkeys(plain))
+    return [] if value is None else [value]
+
+
 def intensities(config: DictConfig) -> list[float]:
-    """`config.eta`, one or several; InputError for what is no intensity."""
-    etas = list(config.eta) if isinstance(config.eta, ListConfig) else [config.eta]
-    if not etas or not all(isinstance(eta, int | float) and 0 <= eta < float("inf") for eta in etas):
-        raise InputError(
-            f"eta={config.eta}: the intensity is a number of at least 0 (0 to 3 are sensible), or a list of them"
-        )
-    return [float(eta) for eta in dict.fromkeys(etas)]
+    """Returns `config.eta`, one or several; InputError for what is no intensity."""
+    etas = as_list(config.eta)
+    for eta in etas:
+        if not isinstance(eta, int | float):
+            raise InputError(f"eta={eta}: expected a number of at least 0, or a list of them")
+        check_range("eta", eta, 0, MOST)
+    return [float(eta) for eta in etas]
 
 
 def varied(config: DictConfig, name: str) -> DictConfig:
-    """The configuration with the changes of `config.variants.NAME`, of dotted or nested keys; InputError for others
-    than those of VARIED. `synthesizer: METHOD` makes it a variant of another method than the run's."""
+    """Returns the configuration with the changes of `config.variants.NAME`, of dotted or nested keys.
+
+    `synthesizer: METHOD` makes it a variant of another method than the run's. Raises InputError for changes of others
+    than VARIED.
+    """
     changed, changes = copy.deepcopy(config), config.variants[name]
     if not isinstance(changes, DictConfig):
         raise InputError(f"variants.{name}={changes}: expected changes, such as {{synthesizer.support: random}}")
@@ -104,79 +168,31 @@ def varied(config: DictConfig, name: str) -> DictConfig:
     return changed
 
 
-def check_seeds(where: str, seeds: Any) -> None:
-    """InputError where sampling seeds are no list of whole numbers."""
-    if not isinstance(seeds, ListConfig) or not seeds or not all(type(seed) is int and seed >= 0 for seed in seeds):
-        raise InputError(f"{where}={seeds}: expected a list of whole numbers of at least 0, such as [0,1]")
-
-
-def check_evaluation(config: DictConfig) -> None:
-    """InputError for methods, seeds, an intensity, a figure or processes that evaluate.py cannot run."""
-    processes_of(config)
-    share_of(config)
-    check_counts(config, open_loop_samples=0, meta_rollouts=0)
-    check_choice("metrics", config.metrics, TABLES)
-    check_seeds("seeds", config.seeds)
-    if not isinstance(config.methods, ListConfig) or not (config.methods or config.variants):
-        raise InputError(f"methods={config.methods}: expected a list of at least one, such as [nominal,e2]")
-    if config.num_scenes is not None:
-        check_counts(config, num_scenes=1)
-    for name in config.methods:
-        if name not in config.variants:
-            method_config(config, name)
-    for name in config.variants:
-        if name in (config.synthesizer.name, *choices("synthesizer")):
-            raise InputError(f"variants.{name}: {name} is a row already; choose another name")
-        varied(config, name)
-    check_compared(config)
-    several = len(intensities(config)) > 1
-    if config.figure is None:
-        return
-    check_choice("figure", config.figure, FIGURES)
-    if config.figure != "curves" and not config.save_rollouts:
-        raise InputError(f"figure={config.figure}: drawn from the rollouts' files; set save_rollouts=true")
-    if config.figure == "curves" and config.egos:
+def _check_compared(config: DictConfig, settings: EvaluationSettings) -> None:
+    """Raises InputError where a name of `compare` is no row: of `egos` where there are any, else a method."""
+    names = settings.compare
+    if config.egos and settings.figure == "curves":
         raise InputError("figure=curves: of one ego; choose it with ego=NAME, and leave egos out")
-    if config.figure != "skeleton" and not several:
-        raise InputError(f"figure={config.figure}, eta={config.eta}: name several intensities, such as eta=[0,1,2,3]")
-
-
-def compare_names(config: DictConfig) -> list[str]:
-    """The names of `config.compare`: none, one or several."""
-    if config.compare is None:
-        return []
-    return [config.compare] if isinstance(config.compare, str) else list(map(str, config.compare))
-
-
-def check_compared(config: DictConfig) -> None:
-    """InputError where a name of `config.compare` is no row: of `egos` where there are any, else a method of one
-    intensity."""
-    if config.compare is None:
-        return
-    where, names = f"compare={config.compare}", compare_names(config)
-    if config.egos:
-        if config.policy_learning is not None:
-            raise InputError(f"{where}: policy_learning has tables of its own; leave one of the two")
-        if len(names) != 1 or names[0] not in config.egos:
-            raise InputError(f"{where}: expected one of egos, {', '.join(map(str, config.egos))}")
-        return
-    if unknown := [name for name in names if name not in (*config.methods, *config.variants)]:
-        raise InputError(f"{where}: no row of the name {unknown[0]}; add it to methods")
     if not names:
-        raise InputError(f"{where}: name the methods that all are compared with, or null")
-    if len(intensities(config)) > 1:
+        return
+    where = f"compare=[{', '.join(names)}]"
+    if config.egos and config.policy_learning is not None:
+        raise InputError(f"{where}: policy_learning has tables of its own; leave one of the two")
+    if config.egos and (len(names) != 1 or names[0] not in config.egos):
+        raise InputError(f"{where}: expected one of egos, {', '.join(map(str, config.egos))}")
+    if not config.egos and (unknown := [name for name in names if name not in (*settings.methods, *config.variants)]):
+        raise InputError(f"{where}: no row of the name {unknown[0]}; add it to methods")
+    if not config.egos and len(settings.eta) > 1:
         raise InputError(f"{where}: a table with a row a method has one eta; name one")
 
 
 def processes_of(config: DictConfig) -> Processes:
-    """Processes that share the rollouts: one a core by default, one on a device that they would share, and one for the
-    skeleton figure, which listens to the traffic method; with launcher=ray, Ray workers."""
+    """Returns the processes that rollouts are spread over: one a core by default, one on a device that they would
+    share; with launcher=ray, Ray workers."""
     given, device = config.get("processes"), str(config.device)
     check_choice("launcher", config.launcher, LAUNCHERS)
     if given is not None:
         check_counts(config, processes=1)
-    if config.get("figure") == "skeleton":
-        return 1
     alone, several = device == "cpu" and config.threads == 1, config.launcher == "ray" or (given or 1) > 1
     if several and not alone:
         raise InputError(
@@ -186,19 +202,6 @@ def processes_of(config: DictConfig) -> Processes:
     if config.launcher == "ray":
         return RayWorkers(given, tuple(map(str, config.plugins)))
     return given or (cores() if alone else 1)
-
-
-def share_of(config: DictConfig) -> tuple[int, int] | None:
-    """`config.share`, (k, n); None: all. InputError for what is no share, and for what has none."""
-    given = config.share
-    if given is None:
-        return None
-    plain = list(given) if isinstance(given, ListConfig) else []
-    if len(plain) != 2 or any(type(part) is not int for part in plain) or not 0 <= plain[0] < plain[1]:
-        raise InputError(f"share={given}: expected [k, n] with k from 0 to n - 1, such as share=[0,4]")
-    if config.tuning is not None or config.figure == "skeleton":
-        raise InputError(f"share={given}: tuning and figure=skeleton run as a whole; leave share out")
-    return plain[0], plain[1]
 
 
 def caption(config: DictConfig, origin: dict, methods: Sequence[Method] = ()) -> str:

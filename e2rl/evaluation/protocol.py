@@ -14,15 +14,11 @@ from e2rl.evaluation.modes import MODES_FILE, find_modes, write_modes
 from e2rl.evaluation.rollout_files import (
     ENDED_FILE,
     METRICS_FILE,
-    ROLLOUTS,
+    SOURCE,
     TABLE,
-    Source,
-    label_rows,
     require_rows,
-    rollout_name,
     write_ended,
     write_metrics,
-    write_rollouts,
     write_rows,
 )
 from e2rl.evaluation.summary import empty_rows, metric_rows
@@ -30,18 +26,19 @@ from e2rl.metrics.evasion import add_avoidable
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.ego import Ego
 from e2rl.run.errors import InputError
-from e2rl.run.parts import NOTHING_KEPT, Kept
+from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.processes import Processes, in_processes
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import SimSettings
+from e2rl.sim.rollouts import ROLLOUTS, Rollouts, rollout_name
 from e2rl.traffic.attempt import attempt, count_reasons
 from e2rl.traffic.rollout import roll_out
 from e2rl.traffic.traffic import Traffic
 
 SEEDS_APART = 1_000_003
-WHOLE = (0, 1)  # the only share of a run
+WHOLE = (0, 1)  # the only shard of a run
 Task = tuple[int, int]  # position of a scene, sampling seed
-# Labelled rows and realism samples, one of each per rollout; and what the rollouts without a score ended by.
+# Rows and realism samples, one of each per rollout; and of rollouts without a score, which they are and what was raised.
 Scored = tuple[list[dict], list[dict[str, Tensor]], list[dict]]
 
 
@@ -56,8 +53,17 @@ class Method:
 
 @dataclass
 class Setup:
-    """Shared by all methods of a table: scenes, ego and its name in files, simulator, batch of rollouts, whether the
-    collisions are searched for evasions."""
+    """What all methods of a table share.
+
+    Args:
+        scenes: where to drive.
+        ego: the planner.
+        ego_name: its name in files.
+        sim: settings of the simulator.
+        batch: rollouts at once.
+        device: where to compute.
+        evasions: whether the collisions are searched for evasions.
+    """
 
     scenes: SceneSet
     ego: Ego
@@ -67,32 +73,36 @@ class Setup:
     device: str = "cpu"
     evasions: bool = True
 
-    def roll_out(self, method: Method, tasks: Sequence[Task]) -> dict:
-        """The rollout dict of (scene, seed) pairs under one method."""
+    def roll_out(self, method: Method, tasks: Sequence[Task]) -> Rollouts:
+        """The rollouts of (scene, seed) pairs under one method."""
         index = torch.tensor([scene for scene, _ in tasks])
         noise = torch.tensor([scene_seed(self.scenes.number[scene], seed) for scene, seed in tasks])
-        eta = torch.full((len(tasks),), float(method.eta))
+        eta = torch.full((len(tasks),), float(method.eta), dtype=torch.float64)
         rollouts = roll_out(self.scenes, index, noise, eta, self.ego, method.traffic, self.sim, self.device)
-        return rollouts | {"seed": torch.tensor([seed for _, seed in tasks]), "eta": float(method.eta)}
+        rollouts.seed = torch.tensor([seed for _, seed in tasks])
+        for name, text in zip(SOURCE, self.source(method), strict=True):
+            rollouts.set(name, [text] * len(tasks))
+        return rollouts
+
+    def source(self, method: Method) -> tuple[str, str, str, str]:
+        """Values of the columns SOURCE of a method's rollouts."""
+        return self.scenes.dataset, self.scenes.split, method.name, self.ego_name
 
     def score(self, method: Method, tasks: Sequence[Task], folder: Path | None = None) -> Scored:
-        """Rows and realism samples of (scene, seed) pairs under one method, and the pairs that ended without; folder:
-        for the rollouts' files."""
-        source = Source(self.scenes.dataset, self.scenes.split, method.name, self.ego_name)
-        parts, lost = attempt(partial(self.roll_out, method), tasks)
+        """What (scene, seed) pairs score under one method; folder: for the rollouts' files."""
+        parts, errored = attempt(partial(self.roll_out, method), tasks)
         rows, samples = [], []
         for done, rollouts in parts:
             found, features = score_rollouts(rollouts)
             if self.evasions:
-                scene = self.scenes.batch([scene for scene, _ in done])
-                rollouts["evasion"] = add_avoidable(found, rollouts, scene, self.sim)
+                add_avoidable(found, rollouts, self.scenes.batch([scene for scene, _ in done]), self.sim)
             if folder is not None:
-                write_rollouts(folder, rollouts, source)
-            rows += label_rows(found, source)
+                rollouts.to_npz(folder)
+            rows += found
             samples += features
-        about = vars(source) | {"eta": float(method.eta)}
-        ended = [about | {"scene_id": self.scenes.scene_id[scene], "seed": seed} | why for (scene, seed), why in lost]
-        return rows, samples, ended
+        about = dict(zip(SOURCE, self.source(method), strict=True)) | {"eta": float(method.eta)}
+        names = self.scenes.scene_id
+        return rows, samples, [about | {"scene_id": names[k], "seed": seed} | why for (k, seed), why in errored]
 
 
 Job = tuple[int, tuple[Setup, Method, list[Task]]]  # with its number
@@ -111,18 +121,18 @@ def run_protocol(
     save_rollouts: bool = True,
     processes: Processes = 1,
     only: Sequence[int] | None = None,
-    kept: Kept = NOTHING_KEPT,
+    parts: Parts = NO_PARTS,
     **fields: Any,
 ) -> list[dict]:
-    """Roll out every method on every (scene, seed), score, and return the rows of metrics.json.
+    """The rows of metrics.json of every method on every (scene, seed): `drive_all`, then `record`.
 
-    folder: where rollouts/ (if save_rollouts), rollouts.csv, modes.json and metrics.json are written (None: nowhere);
-    processes: over which the rollouts are spread, with the same rows; only: positions of the scenes to run, with
-    unchanged noise (None: all); kept: batches of rollouts that are finished. fields are added to each row.
+    Args:
+        folder: where rollouts/ (if save_rollouts) and the tables are written (None: nowhere).
+        fields: added to each row, or further arguments of `metric_rows`.
     """
     into = folder / ROLLOUTS if folder is not None and save_rollouts else None
-    found = drive_all([setup], methods, seeds, into, processes, only, kept)
-    return record(*found, folder, partial(metric_rows, **fields))
+    scored = drive_all([setup], methods, seeds, into, processes, only, parts)
+    return record(*scored, folder, partial(metric_rows, **fields))
 
 
 def drive_all(
@@ -132,46 +142,55 @@ def drive_all(
     into: Path | None = None,
     processes: Processes = 1,
     only: Sequence[int] | None = None,
-    kept: Kept = NOTHING_KEPT,
-    share: tuple[int, int] = WHOLE,
+    parts: Parts = NO_PARTS,
+    shard: tuple[int, int] = WHOLE,
 ) -> Scored:
-    """Roll out and score every setup, which differ in their ego, under every method on every (scene, seed).
+    """What every setup scores under every method on every (scene, seed); the noise is the same for all.
 
-    into: folder of the rollouts' files (None: none); share (k, n): only every n-th batch from the k-th on; others: as
-    for `run_protocol`. The noise is the same for all. Raises InputError where files of a worker do not arrive.
+    A batch is the unit that is checkpointed: rounding makes a rollout's last digits depend on the others of its batch.
 
-    A batch is the unit that is kept: rounding makes a rollout's last digits depend on the others of its batch.
+    Args:
+        setups: they differ in their ego.
+        methods: the traffic.
+        seeds: sampling seeds.
+        into: folder of the rollouts' files (None: none).
+        processes: over which the batches are spread, with the same result.
+        only: positions of the scenes to drive in (None: all), with unchanged noise.
+        parts: the batches that are done.
+        shard: (k, n), only every n-th batch from the k-th on.
+
+    Raises:
+        InputError: files of a worker do not arrive.
     """
     first = setups[0]
     tasks = [(scene, seed) for seed in seeds for scene in (range(len(first.scenes)) if only is None else only)]
     count = -(-len(tasks) // first.batch)
-    parts = [tasks[k * len(tasks) // count : (k + 1) * len(tasks) // count] for k in range(count)]
-    jobs = list(enumerate((setup, method, part) for setup in setups for method in methods for part in parts))
-    jobs = jobs[share[0] :: share[1]]
+    batches = [tasks[k * len(tasks) // count : (k + 1) * len(tasks) // count] for k in range(count)]
+    jobs = list(enumerate((setup, method, batch) for setup in setups for method in methods for batch in batches))
+    jobs = jobs[shard[0] :: shard[1]]
 
     def work(job: Job) -> Scored:
-        number, (setup, method, part) = job
-        identity = [setup.ego_name, method.name, float(method.eta), part]
-        compute = partial(setup.score, method, part, into)
-        return kept.result(f"rollouts-{number:06}", identity, compute, partial(has_files, into))
+        number, (setup, method, batch) = job
+        identity = [setup.ego_name, method.name, float(method.eta), batch]
+        compute = partial(setup.score, method, batch, into)
+        return parts.result(f"rollouts-{number:06}", identity, compute, partial(has_files, into))
 
-    rows, features, lost = [], [], []
-    total = sum(len(part) for _, (_, _, part) in jobs)
+    rows, samples, errored = [], [], []
+    total = sum(len(batch) for _, (_, _, batch) in jobs)
     with tqdm(total=total, desc="rollouts", unit="rollout", disable=None) as bar:
 
-        def ended(job: Job) -> None:
-            _, (setup, method, part) = job
+        def done(job: Job) -> None:
+            _, (setup, method, batch) = job
             bar.set_postfix(ego=setup.ego_name, method=method.name, eta=method.eta, refresh=False)
-            bar.update(len(part))
+            bar.update(len(batch))
 
-        for found, samples, without in in_processes(work, jobs, processes, lambda job: job[1][1].eta, ended):
-            if not has_files(into, (found, samples, without)):
+        for scored in in_processes(work, jobs, processes, lambda job: job[1][1].eta, done):
+            if not has_files(into, scored):
                 reason = "rollouts that a worker wrote are not here"
                 raise InputError(f"{into}: {reason}; put the run's folder where all machines have it (hydra.run.dir)")
-            rows += found
-            features += samples
-            lost += without
-    return rows, features, lost
+            for found, more in zip((rows, samples, errored), scored, strict=True):
+                found += more
+    return rows, samples, errored
 
 
 def has_files(into: Path | None, scored: Scored) -> bool:
@@ -181,22 +200,25 @@ def has_files(into: Path | None, scored: Scored) -> bool:
 
 def record(
     rows: list[dict],
-    features: list[dict[str, Tensor]],
-    ended: list[dict],
+    samples: list[dict[str, Tensor]],
+    errored: list[dict],
     folder: Path | None,
     summarise: Callable[..., list[dict]],
 ) -> list[dict]:
-    """The rows of metrics.json, summarise(rows, features), with the counts of what ended.
+    """The rows of metrics.json: summarise(rows, samples), with the counts of what errored.
 
-    Writes rollouts.csv, modes.json, metrics.json and, where rollouts ended without a score, ended.json. Raises
-    InputError where all did. A method of which all rollouts ended has a row too, without metrics.
+    Writes rollouts.csv, modes.json, metrics.json and, where rollouts errored, ended.json into a folder. A method of
+    which all rollouts errored has a row too, without metrics.
+
+    Raises:
+        InputError: no rollout could be scored.
     """
     if folder is not None:
-        write_ended(folder / ENDED_FILE, ended)
-    require_rows(rows, ended, folder)
-    modes, known = find_modes(rows), summarise(rows, features)
-    known += empty_rows(known, ended)
-    result = [row | {"ended": count_reasons(filter(_of_row(row), ended))} for row in known]
+        write_ended(folder / ENDED_FILE, errored)
+    require_rows(rows, errored, folder)
+    modes, known = find_modes(rows), summarise(rows, samples)
+    known += empty_rows(known, errored)
+    result = [row | {"ended": count_reasons(entry for entry in errored if _is_of(entry, row))} for row in known]
     if folder is not None:
         write_modes(folder / MODES_FILE, modes)
         write_rows(folder / TABLE, rows)
@@ -204,7 +226,7 @@ def record(
     return result
 
 
-def _of_row(row: dict) -> Callable[[dict], bool]:
+def _is_of(entry: dict, row: dict) -> bool:
     """Whether an entry of ended.json is of the rollouts of a row of metrics.json."""
-    names = [("dataset", "dataset"), ("split", "split"), ("method", "method"), ("ego", "ego_policy"), ("eta", "eta")]
-    return lambda entry: all(row[name] == entry[other] for name, other in names)
+    names = {"dataset": "dataset", "split": "split", "method": "method", "ego_policy": "ego", "eta": "eta"}
+    return all(entry[name] == row[other] for name, other in names.items())

@@ -1,59 +1,69 @@
 """`reproduce=RUN_DIR`: the table of a run made again in a new folder, with its configuration, scenes and weights.
 
-The folder may be a stranger's, so what holds for `resume` holds here, too: no code of its takes part
-that the command line does not name. Where data and weights lie, and what fits a machine, is the command line's own.
+The folder may be a stranger's, so what holds for `resume` holds here, too: no code of its takes part that the command
+line does not name. Where data and weights lie, and what fits a machine, is the command line's own.
 """
 
 import json
+import math
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from e2rl.evaluation.provenance import PROVENANCE, changed, inputs, read_provenance, versions
-from e2rl.evaluation.resume import ALWAYS, Run, saved_choices, saved_configuration
 from e2rl.evaluation.rollout_files import METRICS_FILE, nulls, read_metrics
-from e2rl.evaluation.table_comparison import Comparison, compare_tables
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
+from e2rl.run.run import ALWAYS, Run, changed, inputs, read_provenance, versions
+from e2rl.run.trust import saved_configuration
 from e2rl.scenes.scene_list import SCENES
 
 HERE = ("processes", "data.cache", "data.workers")  # always the command line's: of this machine, without influence
 MOVED = ("device", "data.path", *HERE)  # what the command line may set, besides files of weights
 RESULT = "reproduced.json"
 LISTED = "scenes"  # the name of the scenes in provenance.json
+IDENTITY = ("stage", "dataset", "split", "method", "ego", "eta", "training")  # of a row, as far as it has them
+COUNTS = ("n_scenes", "n_seeds", "n_rollouts", "ended")
+CLOSE = 1e-6  # relative difference: rounding of another machine
+TIMES = ("seconds_per_rollout",)  # metrics of wall time, which are never the same
+SHOWN = 10  # differences in a text
 
 
 def reproduction_of(config: DictConfig) -> Run:
-    """The run that `config.reproduce` asks for: the configuration and files of the groups of that run, in a new folder.
+    """Returns the run that `config.reproduce` asks for: the configuration of that run, in a new folder.
 
-    Raises InputError where there is no finished table, where its configuration names code as in `resume.run_of`, for
-    weights that are others or not there, and for settings that cannot change. Tells on stderr where versions differ.
+    Tells on stderr where versions differ.
+
+    Raises:
+        InputError: where there is no finished table, where its configuration names code (`e2rl.run.trust`), for weights
+            that are others or not there, and for settings that cannot change.
     """
     where, old = f"reproduce={config.reproduce}", Path(config.reproduce).resolve()
-    choices = saved_choices(where, old)
-    saved = saved_configuration(config, old, choices, where)
-    known, out = read_provenance(old), Path(HydraConfig.get().runtime.output_dir)
-    if known is None or not (old / METRICS_FILE).is_file() or not (old / SCENES).is_file():
-        missing = f"{METRICS_FILE}, {SCENES} or {PROVENANCE} is missing"
-        raise InputError(f"{where}: {missing}; give a finished run of evaluate.py that has tables")
-    if out == old:
-        raise InputError(f"{where}: is the folder of this run, too; leave out hydra.run.dir, or name a new folder")
+    saved, known = saved_configuration(config, old, where), read_provenance(old)
+    if missing := [name for name in (METRICS_FILE, SCENES) if not (old / name).is_file()]:
+        raise InputError(f"{where}: {missing[0]} is missing; give a finished run of evaluate.py that has tables")
     table = read_metrics(old / METRICS_FILE)
     compare_tables(table, table)  # what is damaged is told now, and not at the end
     files = {name: value for name, value in known["inputs"].items() if "=" in name and isinstance(value, str)}
-    _move(config, saved, [_key(name) for name in files], choices, where)
+    _move(config, saved, [_key(name) for name in files], known["choices"], where)
     saved.plugins, saved.resume, saved.reproduce, saved.scenes = config.plugins, None, str(old), str(old / SCENES)
-    check_weights(config, saved, files, where)
-    tell_versions(saved, known, where)
-    _remember(saved, choices, out)
-    return Run(saved, out, choices)
+    _check_weights(config, saved, files, where)
+    _tell_versions(saved, known, where)
+    return Run(saved, Run.of(config).folder, known["choices"])
 
 
-def _move(config: DictConfig, saved: DictConfig, files: Collection[str], choices: dict[str, str], where: str) -> None:
+def files_of_run(config: DictConfig) -> str:
+    """Returns the SHA-256 of the data files of the run that is reproduced, "" where it is not known."""
+    return str(read_provenance(Path(config.reproduce))["files"].get(LISTED, "")) if config.reproduce else ""
+
+
+def _move(
+    config: DictConfig, saved: DictConfig, files: Collection[str], choices: Mapping[str, str], where: str
+) -> None:
     """Set in `saved` what the command line may set anew."""
     given = [item.lstrip("+~").partition("=")[::2] for item in HydraConfig.get().overrides.task]
     names = [name for name, value in given if name not in ("reproduce", *ALWAYS) and choices.get(name) != value]
@@ -82,7 +92,7 @@ def _key(name: str) -> str:
     return parent if last.isdigit() else key
 
 
-def check_weights(config: DictConfig, saved: DictConfig, files: Mapping[str, str], where: str) -> None:
+def _check_weights(config: DictConfig, saved: DictConfig, files: Mapping[str, str], where: str) -> None:
     """InputError where a file that the run's configuration named is another one now, or not there; files: hash of each
     {key=path: SHA-256}."""
     now = {name.partition("=")[0]: value for name, value in inputs(saved)}
@@ -100,7 +110,7 @@ def check_weights(config: DictConfig, saved: DictConfig, files: Mapping[str, str
             )
 
 
-def tell_versions(saved: DictConfig, known: Mapping[str, Any], where: str) -> None:
+def _tell_versions(saved: DictConfig, known: Mapping[str, Any], where: str) -> None:
     """Tell on stderr which versions, and which files in conf/ of methods and egos, are others than the run's."""
     then, now = known["versions"][-1], versions(saved)
     told = [f"{name} {_short(then.get(name))} then, {_short(now.get(name))} now" for name in changed(then, now)]
@@ -115,26 +125,80 @@ def _short(value: Any) -> str:
     return str(value)[:12] if value else "none"
 
 
-def _remember(saved: DictConfig, choices: Mapping[str, str], out: Path) -> None:
-    """Write the configuration and the groups' files into the new folder, in place of the command line's: so that the
-    run can go on, and be reproduced itself."""
-    folder = out / ".hydra"
-    hydra = OmegaConf.load(folder / "hydra.yaml")
-    OmegaConf.update(hydra, "hydra.runtime.choices", dict(choices), merge=False)
-    write_atomically(folder / "config.yaml", OmegaConf.to_yaml(saved))
-    write_atomically(folder / "hydra.yaml", OmegaConf.to_yaml(hydra))
+# --- tables
 
 
-def files_of_run(config: DictConfig) -> str:
-    """SHA-256 of the data files of the run that is reproduced, "" where it is not known."""
-    known = read_provenance(Path(config.reproduce)) if config.reproduce else None
-    files = known.get("files") if known else None
-    return str(files.get(LISTED, "")) if isinstance(files, dict) else ""
+@dataclass(frozen=True)
+class Comparison:
+    """Numbers that are equal, that differ by CLOSE at most, and [name, then, now] of those that differ more."""
+
+    equal: int
+    close: int
+    different: list[tuple[str, Any, Any]]
+
+    def text(self) -> str:
+        """Returns what came of it, in a line for each of the first SHOWN differences."""
+        total = self.equal + self.close + len(self.different)
+        if self.equal == total:
+            return f"all {total:,} numbers of its tables are equal"
+        said = f"{self.equal:,} of {total:,} numbers of its tables are equal"
+        if self.close:
+            said += f", {self.close:,} but for a millionth of them (another machine's rounding)"
+        if not self.different:
+            return said
+        lines = [f"  {name}: {_shown(then)} then, {_shown(now)} now" for name, then, now in self.different[:SHOWN]]
+        more = len(self.different) - len(lines)
+        return "\n".join([f"{said}; {len(self.different):,} differ:", *lines, *([f"  and {more:,} more"] * (more > 0))])
 
 
 def compared_with_run(config: DictConfig, folder: Path) -> Comparison:
-    """The table in `folder` beside that of the run that it reproduces; also as reproduced.json in `folder`."""
+    """Returns the table in `folder` beside that of the run that it reproduces; also as reproduced.json in `folder`."""
     found = compare_tables(read_metrics(Path(config.reproduce) / METRICS_FILE), read_metrics(folder / METRICS_FILE))
     content = {"run": config.reproduce, "equal": found.equal, "close": found.close, "different": found.different}
     write_atomically(folder / RESULT, json.dumps(nulls(content), indent=1))
     return found
+
+
+def compare_tables(then: Sequence[Mapping], now: Sequence[Mapping]) -> Comparison:
+    """Returns how the rows of two metrics.json agree: counts, metrics and paired differences, wall times apart.
+
+    Raises:
+        InputError: for rows that are none of metrics.json.
+    """
+    try:
+        before, after = (dict(number for row in rows for number in _numbers(row)) for rows in (then, now))
+    except (TypeError, AttributeError, LookupError) as error:
+        raise InputError(f"metrics.json: damaged ({error}); give the folder of a run of evaluate.py") from error
+    equal = close = 0
+    different = []
+    for name in dict.fromkeys([*before, *after]):
+        old, new = before.get(name, "missing"), after.get(name, "missing")
+        both = all(isinstance(value, int | float) for value in (old, new))
+        if old == new or (both and math.isnan(old) and math.isnan(new)):
+            equal += 1
+        elif both and math.isclose(old, new, rel_tol=CLOSE, abs_tol=1e-12):
+            close += 1
+        else:
+            different.append((name, old, new))
+    return Comparison(equal, close, different)
+
+
+def _numbers(row: Mapping) -> Iterator[tuple[str, Any]]:
+    """(name, value) of every number of a row."""
+    named = " ".join(str(row[key]) for key in IDENTITY if key in row)
+    parts = {key: row[key] for key in COUNTS if key in row} | {"metrics": row["metrics"], "paired": row["paired"]}
+    for key, value in _leaves(parts):
+        if not set(key.split(": ")) & set(TIMES):
+            yield f"{named}: {key.removeprefix('metrics: ')}", value
+
+
+def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping):
+        for key, part in value.items():
+            yield from _leaves(part, f"{name}: {key}" if name else str(key))
+    else:
+        yield name, value
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -6,9 +6,10 @@ from typing import Any
 
 from torch import Tensor
 
-from e2rl.evaluation.rollout_files import command_line, git_commit
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.statistics import DRAWS, REALISM_DRAWS, paired_differences, summarise
+from e2rl.run.endings import command_line
+from e2rl.run.run import git_commit
 
 GROUP = ("dataset", "split", "method", "ego_policy", "eta")
 Key = tuple  # values of GROUP

@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from e2rl.evaluation.rollout_files import nulls
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
-from e2rl.run.parts import NOTHING_KEPT, Kept
+from e2rl.run.parts import NO_PARTS, Parts
 
 NEEDED = ("collision", "comfort", "progress")
 
@@ -102,7 +102,7 @@ def tune(
     folder: Path,
     about: Mapping | None = None,
     say: Callable[[str], None] = print,
-    kept: Kept = NOTHING_KEPT,
+    kept: Parts = NO_PARTS,
 ) -> dict:
     """Try the present parameters, a ladder over the space's first one, then optuna's proposals, `settings.trials` in
     all; returns what tuning.json holds.

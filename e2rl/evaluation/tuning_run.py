@@ -18,7 +18,7 @@ from e2rl.planners.ego import Ego
 from e2rl.prior.prior import Prior
 from e2rl.run.config import check_counts, resolved
 from e2rl.run.errors import InputError
-from e2rl.run.parts import Kept
+from e2rl.run.parts import Parts
 from e2rl.run.settings import check_choice, settings_of
 from e2rl.traffic.traffic import Traffic
 
@@ -50,7 +50,7 @@ def run_tuning(config: DictConfig, task: Task, setup: Setup, methods: list[Metho
         "eta": intensities(config),
     }
     how = (task.space, task.settings, task.objective, folder, about)
-    result = tune(trials, present, *how, kept=Kept(folder, "tuning"))
+    result = tune(trials, present, *how, kept=Parts(folder, "tuning"))
     print(f"\n{advice(result, group)}written to {folder}")
     return result
 

@@ -1,13 +1,5 @@
-"""The traffic of a round: what is ordered, and how it is made against an ego.
+"""The traffic of a round: what is ordered, how it is made against an ego, and which of it some driver avoids."""
 
-Solvability of synthesized traffic: some driver could have avoided the collision, and how.
-
-D' of two traffic methods: each attacks its share of a round's scenes.
-
-An ego that meets only adversaries that owe it nothing learns to flee, and meets those that give way in the same way.
-"""
-
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -121,42 +113,46 @@ def make_traffic(
     nominal: bool = True,
     batch: int = 64,
     processes: Processes = 1,
-) -> dict[str, Tensor]:
-    """Traffic [R] of an order: the attack, without rows that no driver survives, then, with `nominal`, the same scenes
-    at intensity 0; without rows that `synthesize` could not make. Raises InputError where no attack could be made.
+) -> tuple[dict[str, Tensor], list[dict]]:
+    """Returns the traffic [R] of an order, and its rows that errored (round, scene, eta, reason, detail, traceback).
 
-    scene_index [R], eta [R], template [R], states [R, T+1, N, 4], valid [R, T+1, N], adversaries [R, N]; evasion
-    [R, T, 2] and span [R, 2] as in `Solved`; of the attack kept [S] bool (rows that entered) and the shares of the rows
-    that were made attacked [] (with an adversary) and contact [] (the ego was hit); ended [E] uint8 (`ended_of`). Equal
-    orders yield equal traffic, in whichever processes: `batch` scenes are the unit that one makes. Templates are given
-    to `synthesize` only where one is not full.
+    The traffic is the attack without rows that no driver avoids, then, with `nominal`, the same scenes at intensity 0;
+    both without errored rows. Equal orders yield equal traffic, in whichever processes: `batch` scenes are the unit
+    that one makes. It has scene_index [R], eta [R], template [R], states [R, T+1, N, 4], valid [R, T+1, N], adversaries
+    [R, N]; evasion [R, T, 2] and span [R, 2] as in `Solved`; of the attack kept [S] bool (rows that entered) and the
+    fractions of the made rows that were attacked [] (have an adversary) and in contact [] (the ego was hit).
+
+    Args:
+        synthesize: see `Evolution`; templates are given to it only where one is not full.
+
+    Raises:
+        InputError: where no attack could be made.
     """
     rows = torch.arange(len(order.scenes)).split(batch)
     jobs = [(part, attack) for attack in ((True, False) if nominal else (True,)) for part in rows]
     work = partial(_make_part, order, synthesize, solvable)
     parts = list(in_processes(work, jobs, processes, cost=lambda job: job[1]))
-    ended = [entry for part in parts for entry in part.pop("ended")]
+    errored = [entry for part in parts for entry in part.pop("errored")]
     traffic = {name: torch.cat([part[name] for part in parts]) for name in parts[0] if name not in FLAGS}
     attack, contact, kept = (torch.cat([part[name] for part in parts[: len(rows)]]) for name in FLAGS)
     if not len(attack):
-        raise InputError(f"no traffic could be made: {summary_of(ended)}; mend the planner or the traffic")
-    text = torch.frombuffer(bytearray(json.dumps(ended).encode()), dtype=torch.uint8)
-    shares = {"attacked": attack.float().mean(), "contact": contact.float().mean()}
-    return traffic | shares | {"kept": kept, "ended": text}
+        raise InputError(f"no traffic could be made: {summary_of(errored)}; mend the planner or the traffic")
+    fractions = {"attacked": attack.float().mean(), "contact": contact.float().mean()}
+    return traffic | fractions | {"kept": kept}, errored
 
 
 def _make_part(
     order: Order, synthesize: Synthesize, solvable: Solvable | None, job: tuple[Tensor, bool]
 ) -> dict[str, Any]:
     """The traffic of an order's scenes rows [s], attacked or at intensity 0; FLAGS of them (kept [s], the others of the
-    rows that were made); and what ended the rest."""
+    rows that were made); and the errored rest."""
     rows, attack = job
     scenes, none = order.scenes[rows], torch.zeros_like(order.eta[rows])
     eta, template = (order.eta[rows], order.template[rows]) if attack else (none, torch.full_like(scenes, FULL))
     limits = () if not attack or bool((order.template == FULL).all()) else (template,)
     made = synthesize(order.ego, scenes, eta, order.seed, *limits)
-    lost: Mapping[int, dict] = made.get("ended", {})
-    there = torch.tensor([row for row in range(len(rows)) if row not in lost], dtype=torch.int64)
+    why: Mapping[int, dict] = made.get("ended", {})
+    there = torch.tensor([row for row in range(len(rows)) if row not in why], dtype=torch.int64)
     searching = solvable if attack and len(there) else None
     solved = unsearched(made["states"]) if searching is None else searching(made)
     every = {name: made[name] for name in TRACKS} | {"eta": eta[there], "template": template[there]}
@@ -164,52 +160,49 @@ def _make_part(
     kept = torch.zeros(len(rows), dtype=torch.bool).index_fill(0, there[solved.kept], True)
     flags = dict(zip(FLAGS, (made["adversaries"].any(-1), made["contact"], kept), strict=True))
     about = {"round": order.number, "during": ATTACK if attack else NOMINAL}
-    ended = [about | {"scene": int(scenes[row]), "eta": round(float(eta[row]), 4)} | why for row, why in lost.items()]
-    return {name: value[solved.kept] for name, value in every.items()} | flags | {"ended": ended}
+    errored = [
+        about | {"scene": int(scenes[row]), "eta": round(float(eta[row]), 4)} | reason for row, reason in why.items()
+    ]
+    return {name: value[solved.kept] for name, value in every.items()} | flags | {"errored": errored}
 
 
-def ended_of(traffic: Mapping[str, Tensor]) -> list[dict]:
-    """Of a round's traffic: the rows that ended while they were made (e2rl/traffic/attempt.py), each with its round,
-    scene, eta, reason, detail and traceback."""
-    return json.loads(traffic["ended"].numpy().tobytes())
-
-
-def counted(ended: Sequence[dict]) -> dict[str, float]:
-    """Metrics of rollouts that ended for an error: how many, and how many for each reason."""
-    reasons = {f"ended_{reason.replace(' ', '_')}": float(count) for reason, count in count_reasons(ended).items()}
-    return {"ended": float(len(ended)), **reasons}
+def counted(errored: Sequence[dict]) -> dict[str, float]:
+    """Metrics of errored rollouts: how many, and how many for each reason."""
+    reasons = {f"errored_{reason.replace(' ', '_')}": float(count) for reason, count in count_reasons(errored).items()}
+    return {"errored": float(len(errored)), **reasons}
 
 
 DRAW = 7_919  # apart from the other generators of a round's seed
 
 
-def mixture(first: Synthesize, second: Synthesize, share: float) -> Synthesize:
-    """A Synthesize whose scenes are each given to `second` with probability `share`, else to `first`.
+def mixture(first: Synthesize, second: Synthesize, fraction: float) -> Synthesize:
+    """A Synthesize that gives each scene to `second` with probability `fraction`, else to `first`.
 
-    Who attacks a scene is drawn from the seed and the scene, so it is the same in whichever batch the scene lies.
+    An ego that meets only adversaries that owe it nothing learns to flee, and meets those that give way in the same
+    way. Who attacks a scene is drawn from the seed and the scene, so it is the same in whichever batch the scene lies.
     Templates are given to both; rows come in the order of the scenes.
     """
 
     def synthesize(ego: Ego, scenes: Tensor, eta: Tensor, seed: int, *template: Tensor) -> dict[str, Any]:
-        other = drawn(scenes, seed, share)
-        parts, places, ended = [], [], dict[int, dict]()
+        other = drawn(scenes, seed, fraction)
+        parts, places, errored = [], [], dict[int, dict]()
         for make, chosen in ((first, ~other), (second, other)):
             rows = chosen.nonzero()[:, 0]
             if not len(rows):
                 continue
             made = dict(make(ego, scenes[rows], eta[rows], seed, *(each[rows] for each in template)))
-            lost = made.pop("ended", {})
-            ended |= {int(rows[place]): why for place, why in lost.items()}
-            places += [int(row) for place, row in enumerate(rows) if place not in lost]
+            own = made.pop("ended", {})
+            errored |= {int(rows[place]): why for place, why in own.items()}
+            places += [int(row) for place, row in enumerate(rows) if place not in own]
             parts.append(made)
         order = torch.tensor(places, dtype=torch.int64).argsort()
-        return {name: torch.cat([part[name] for part in parts])[order] for name in parts[0]} | {"ended": ended}
+        return {name: torch.cat([part[name] for part in parts])[order] for name in parts[0]} | {"ended": errored}
 
     return synthesize
 
 
-def drawn(scenes: Tensor, seed: int, share: float) -> Tensor:
-    """Bool [S]: scenes [S] that a draw of probability `share` chooses, each by the seed and its own number."""
+def drawn(scenes: Tensor, seed: int, fraction: float) -> Tensor:
+    """Bool [S]: scenes [S] that a draw of probability `fraction` chooses, each by the seed and its own number."""
     largest = int(scenes.max()) + 1 if len(scenes) else 0
     draws = torch.rand(largest, generator=torch.Generator().manual_seed(seed * DRAW + 1))
-    return draws[scenes] < share
+    return draws[scenes] < fraction

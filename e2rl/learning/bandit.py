@@ -12,63 +12,60 @@ import torch
 from torch import Tensor
 
 from e2rl.learning.scheduler import CurriculumScheduler, Outcomes
-from e2rl.run.settings import check_choice, check_range
+from e2rl.run.settings import check_choice, check_range, configured
 from e2rl.traffic.traffic import TEMPLATES
 
 MOST = 0.25  # of p (1 - p)
+SHARPNESS = 10.0  # of the softmax of the arms' values in units of MOST
+EXPLORATION = 0.1  # fraction of the draws that goes to all arms alike
 
 
+@configured("curriculum/bandit")
 class BanditCurriculum(CurriculumScheduler):
-    """Draws an arm for each scene of a round, by a softmax of the arms' values with a share of exploration.
+    """Draws an arm for each scene of a round, by a softmax of the arms' values and some exploration.
 
     State of A arms: counts [4, A] of failed, survived, kept and left-out attacks. An attack of this round counts once,
-    however many episodes are driven in it: they are alike.
+    however many episodes are driven in it: they are alike. Settings: conf/curriculum/bandit.yaml.
     """
+
+    lasting = ("_counts",)
 
     def __init__(
         self,
         num_scenes: int,
         rounds: int,
         seed: int = 0,
-        etas: Sequence[float] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0),
-        templates: Sequence[str] = TEMPLATES,
-        sharpness: float = 10.0,
-        exploration: float = 0.1,
-        forgetting: float = 0.3,
-        share: float = 0.6,
-        **scenes,
+        *,
+        etas: Sequence[float],
+        templates: Sequence[str],
+        forgetting: float,
+        fraction: float,
+        prioritised: bool,
+        solvable_only: bool,
     ) -> None:
-        """Fields: conf/curriculum/bandit.yaml."""
-        super().__init__(num_scenes, rounds, seed, **scenes)
+        super().__init__(num_scenes, rounds, seed, prioritised=prioritised, solvable_only=solvable_only)
         check_range("curriculum.etas: intensities", len(etas), 1)
         check_range("curriculum.etas", min(etas), 1e-6)
         check_range("curriculum.templates: names", len(templates), 1)
         for name in templates:
             check_choice("curriculum.templates", name, TEMPLATES)
-        check_range("curriculum.sharpness", sharpness, 0)
-        check_range("curriculum.exploration", exploration, 0, 1)
         check_range("curriculum.forgetting", forgetting, 0, 1)
-        check_range("curriculum.share", share, 0, 1)
+        check_range("curriculum.fraction", fraction, 0, 1)
         self.templates = tuple(dict.fromkeys(templates))
         levels = torch.tensor(sorted(set(etas)), dtype=torch.float32)
         codes = torch.tensor([TEMPLATES.index(name) for name in self.templates])
         self._eta, self._template = levels.repeat(len(codes)), codes.repeat_interleave(len(levels))
         self._counts = torch.zeros(4, len(self._eta), dtype=torch.float64)
-        self._sharpness, self._exploration, self._forgetting, self._share = sharpness, exploration, forgetting, share
+        self._forgetting, self.fraction = forgetting, fraction
 
     @property
-    def eta(self) -> float:
+    def eta(self) -> float:  # type: ignore[override]
         """The expected intensity of a draw."""
         return (self.probability() * self._eta).sum().item()
 
-    @property
-    def share(self) -> float:
-        """The share of adversarial episodes."""
-        return self._share
-
     def value(self) -> Tensor:
-        """What an attack of each arm [A] teaches, in expectation: the share of its attacks that enter D' times
-        p (1 - p) under the Beta posterior of its failure rate p, whose prior is uniform."""
+        """What an attack of each arm [A] teaches, in expectation: the fraction of its attacks that enter D'
+        times p (1 - p) under the Beta posterior of its failure rate p, whose prior is uniform."""
         failed, survived, kept, left_out = self._counts
         failed, survived = failed + 1, survived + 1
         total = failed + survived
@@ -76,8 +73,8 @@ class BanditCurriculum(CurriculumScheduler):
 
     def probability(self) -> Tensor:
         """Probability [A] with which an arm is drawn."""
-        greedy = (self._sharpness * self.value() / MOST).softmax(0)
-        return (1 - self._exploration) * greedy + self._exploration / len(greedy)
+        greedy = (SHARPNESS * self.value() / MOST).softmax(0)
+        return (1 - EXPLORATION) * greedy + EXPLORATION / len(greedy)
 
     def choices(self, scenes: Tensor) -> tuple[Tensor, Tensor]:
         """The intensity and the template of an arm for each scene."""
@@ -89,7 +86,7 @@ class BanditCurriculum(CurriculumScheduler):
         return self.choices(scenes)[0]
 
     def observe(self, outcomes: Outcomes) -> None:
-        """Forget a share of all counts, then count the round's attacks."""
+        """Forget a fraction of all counts, then count the round's attacks."""
         same = (outcomes.eta[:, None] == self._eta) & (outcomes.template[:, None] == self._template)
         driven, rate = outcomes.episodes > 0, outcomes.failure_rate.nan_to_num()
         left_out = outcomes.left_out
@@ -104,11 +101,3 @@ class BanditCurriculum(CurriculumScheduler):
         """The value of every arm."""
         names = [TEMPLATES[code] for code in self._template.tolist()]
         return dict(zip(zip(self._eta.tolist(), names, strict=True), self.value().tolist(), strict=True))
-
-    def extra_state(self) -> dict:
-        """The arms' counts, by name."""
-        return {"counts": self._counts}
-
-    def load_extra_state(self, state: dict) -> None:
-        """Restore an `extra_state`."""
-        self._counts = state["counts"].clone()

@@ -8,14 +8,14 @@ from pathlib import Path
 from torch import Tensor
 
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
-from e2rl.evaluation.provenance import origin_of
 from e2rl.evaluation.rollout_files import METRICS_FILE, read_metrics, write_metrics
 from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollouts
 from e2rl.metrics.score import score_rollouts
 from e2rl.metrics.statistics import paired_differences
 from e2rl.planners.ego import Ego
-from e2rl.run.parts import Kept
+from e2rl.run.parts import Parts
 from e2rl.run.processes import Processes
+from e2rl.run.run import origin_of
 
 
 @dataclass
@@ -35,8 +35,8 @@ class BeforeAfter:
         The rows of stage `after` are paired with the same method before, under the name `before`.
         """
         setup, folder = replace(self.setup, ego=ego), self.folder / stage
-        kept = Kept(self.folder, stage, f"after {rounds} rounds")
-        given = {"processes": self.processes, "kept": kept, "stage": stage, **origin_of(self.folder)}
+        kept = Parts(self.folder, stage, f"after {rounds} rounds")
+        given = {"processes": self.processes, "parts": kept, "stage": stage, **origin_of(self.folder)}
         rows = run_protocol(setup, self.methods, self.seeds, folder, **given)
         if stage == "after":
             for row in rows:

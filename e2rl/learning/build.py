@@ -8,7 +8,6 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from e2rl.evaluation.methods import build_prior, build_sim, build_traffic, check_seeds, intensities, processes_of
 from e2rl.evaluation.protocol import Method, Setup
-from e2rl.evaluation.rollout_files import command_line, git_commit
 from e2rl.learning.attack import Synthesize, mixture, solvable
 from e2rl.learning.before_after import BeforeAfter
 from e2rl.learning.bits_training import BitsSettings, train_bits
@@ -24,9 +23,11 @@ from e2rl.planners.bits_network import BitsNetwork
 from e2rl.planners.ego import Ego
 from e2rl.prior.prior import Prior
 from e2rl.run.config import built, check_counts, load_choice, resolved
+from e2rl.run.endings import command_line
 from e2rl.run.errors import InputError
-from e2rl.run.parts import Kept
+from e2rl.run.parts import Parts
 from e2rl.run.processes import RayWorkers
+from e2rl.run.run import git_commit
 from e2rl.run.settings import settings_of
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.source import load_scenes, source_of
@@ -148,7 +149,7 @@ def run_imitation(
     if begin is not None:
         begin()
     pairs = recorded_pairs(scenes, build_sim(config), settings)
-    return imitate(ego.network, pairs, settings, folder, logger, Kept(folder, "imitation"))
+    return imitate(ego.network, pairs, settings, folder, logger, Parts(folder, "imitation"))
 
 
 def run_bits(config: DictConfig, scenes: SceneSet, folder: Path, logger: RunLogger | None = None) -> dict[str, float]:

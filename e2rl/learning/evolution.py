@@ -1,4 +1,4 @@
-"""Algorithm 1: rounds of drawing scenes, attacking the current ego in them, improving it, and moving the curriculum."""
+"""The steps of a round of Algorithm 1, which `train.py` does in turn, and the state of a run between them."""
 
 import copy
 import time
@@ -7,43 +7,38 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from e2rl.learning.attack import ATTACK, Order, Solvable, Synthesize, counted, ended_of, make_traffic
+from e2rl.learning.attack import ATTACK, Order, Solvable, Synthesize, counted, make_traffic
 from e2rl.learning.driving import Episodes
 from e2rl.learning.improvement import Improvement
 from e2rl.learning.memory import Memory
-from e2rl.learning.prefetch import Ahead, AheadElsewhere
+from e2rl.learning.prefetch import Prefetch
 from e2rl.learning.scheduler import Choice, CurriculumScheduler, outcomes_of, tally
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import Ego
 from e2rl.run.errors import InputError
 from e2rl.run.processes import RayWorkers
-from e2rl.run.settings import check_choice, check_range
+from e2rl.run.settings import configured, setting
 from e2rl.traffic.pool import TrafficPool
 
-NOMINAL, TRAFFIC, AGAINST = ("prior", "log", "none"), ("replay", "live"), ("current", "start")
 NOISES = 16  # rows per scene in live traffic, each with its own noise
 
 
+@configured("learner/ppo_bc", "round")
 @dataclass(frozen=True)
 class RoundSettings:
-    """Fields: `round` in conf/learner/*.yaml."""
+    """Settings `learner.round`."""
 
-    scenes: int = 48
-    nominal: str = "prior"
-    traffic: str = "replay"
-    against: str = "current"
-    memory: int = 4096
-    fresh: float = 3.0
-    ahead: bool = False
-    second: str | None = None
-    second_share: float = 0.5
+    scenes: int = setting(low=1)
+    nominal: str = setting(choices=("prior", "log", "none"))
+    traffic: str = setting(choices=("replay", "live"))
+    against: str = setting(choices=("current", "start"))
+    memory: int = setting(low=0)
+    fresh: float = setting(low=1)
+    prefetch: bool | None = setting(optional=True)
+    second: str | None = setting(optional=True)
+    second_fraction: float = setting(low=0, high=1)
 
     def __post_init__(self) -> None:
-        check_choice("learner.round.nominal", self.nominal, NOMINAL)
-        check_choice("learner.round.traffic", self.traffic, TRAFFIC)
-        check_choice("learner.round.against", self.against, AGAINST)
-        check_range("learner.round.fresh", self.fresh, 1)
-        check_range("learner.round.second_share", self.second_share, 0, 1)
         if self.second and self.traffic == "live":
             raise InputError("learner.round.second: live traffic is of one method; set learner.round.traffic=replay")
         if self.against == "start" and self.traffic == "live":
@@ -54,30 +49,31 @@ class RoundSettings:
 class Attack:
     """The traffic of a round: the pool, which of the ordered attacks its first K rows are (drawn [K] int64; the others
     were left out), and metrics; contact: the attacked ego's contact rate, None if unknown before the episodes are
-    driven; spent: seconds; ended: rows that could not be made."""
+    driven; spent: seconds; errored: rows that could not be made."""
 
     pool: TrafficPool
     drawn: Tensor
     metrics: dict[str, float]
     spent: dict[str, float]
     contact: float | None = None
-    ended: list[dict] = field(default_factory=list)
+    errored: list[dict] = field(default_factory=list)
 
 
 class Evolution:
-    """The state of a run: curriculum, improvement (which holds the ego) and the memory of D'; choices: what the
-    curriculum chose for the last round and what came of it, in rows (e2rl/learning/scheduler.py); ended: its
-    rollouts that ended for an error of the planner or the traffic, each with its reason.
+    """The state of a run: curriculum, improvement (which holds the ego) and the memory of D'.
 
-    synthesize(ego, scene_index [S], eta [S], seed) -> {scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N],
-    adversaries [S, N] bool, contact [S] bool}: closed-loop traffic against that ego; contact: it was hit. Rows that
-    cannot be made are left out, and ended {position in S: why} names them. Of a curriculum that chooses causal
-    templates it also takes template [S].
-    solvable(traffic) -> Solved: rows that enter D', and evasions (None: all, and none). memory: None: in a temporary
-    folder. batch: scenes that are synthesized at once; workers: that do it (None: a process here).
+    choices: what the curriculum chose for the last round and what came of it (e2rl/learning/scheduler.py); errored: the
+    last round's rollouts that ended for an error of the planner or the traffic, each with its reason.
 
-    With `settings.ahead`, scenes, intensities and ego of the next round's D' are fixed just before a round's learning,
-    and it is made in other processes meanwhile. What the curriculum learns from a round then acts two rounds later.
+    Args:
+        synthesize: (ego, scene_index [S], eta [S], seed) -> {scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N],
+            adversaries [S, N] bool, contact [S] bool}: closed-loop traffic against that ego; contact: it was hit. Rows
+            that cannot be made are left out, and `ended` {position in S: why} names them. Of a curriculum that chooses
+            causal templates it also takes template [S].
+        solvable: traffic -> Solved: the rows that enter D', and evasions; None: all, and none.
+        memory: None: in a temporary folder.
+        batch: scenes that are synthesized at once.
+        workers: that do it; None: a process here.
     """
 
     def __init__(
@@ -98,9 +94,9 @@ class Evolution:
         self._start = copy.deepcopy(improve.ego) if settings.against == "start" else None
         self.episodes: Episodes | None = None
         self.choices: list[Choice] = []
-        self.ended: list[dict] = []
+        self.errored: list[dict] = []
         self._next: Order | None = None  # of the coming round, if fixed already
-        self._ahead: Ahead | AheadElsewhere | None = None  # what makes it, if begun already
+        self._prefetch: Prefetch | None = None  # what makes it, if begun already
 
     @property
     def ego(self) -> Ego:
@@ -112,76 +108,99 @@ class Evolution:
         """Rounds done."""
         return self.curriculum.round
 
-    def run_round(self) -> dict[str, float]:
-        """One round; returns its metrics, named by group (train/, curriculum/, synthesizer/, time/)."""
+    # --- the steps of a round, in their order
+
+    def draw(self) -> Order:
+        """Returns what is attacked: scenes, intensities and causal templates by the curriculum, and the current ego."""
         order, self._next = self._next or self._order(self.round), None
-        state = self.curriculum.summary()
-        attack = self._live(order) if self.settings.traffic == "live" else self._stored(order)
-        if self.settings.ahead:
-            self._begin_next()
+        return order
+
+    def roll_out(self, order: Order) -> Attack:
+        """Returns the attacks on the ordered ego, without those that no driver avoids, with remembered attacks and
+        nominal traffic; of live traffic the rows alone, whose attacks are rolled out while the policy drives."""
+        return self._live(order) if self.settings.traffic == "live" else self._stored(order)
+
+    def prefetch(self) -> None:
+        """With `settings.prefetch`, fix the next round's order, and begin to make it in another process.
+
+        What the curriculum learns from the present round then acts two rounds later.
+        """
+        if self.settings.prefetch:
+            self._next = self._order(self.round + 1)
+            if self.round + 1 < self.curriculum.rounds:
+                self._prefetch = self._begin(self._next)
+
+    def learn(self, attack: Attack) -> dict[str, float]:
+        """Improve the ego in the traffic of the round; returns the metrics of learning."""
         begin = time.perf_counter()
         learned, self.episodes = self.improve(attack.pool, self.curriculum)
-        spent = attack.spent | {"improve": time.perf_counter() - begin}
-        spent |= {name: learned.pop(name) for name in ("collect", "pairs", "steps_per_second") if name in learned}
-        self.curriculum.update(self.episodes.scene_index, self.episodes.failed, self.episodes.adversarial)
-        outcomes = outcomes_of(order.eta, order.template, attack.drawn, self.episodes.row, self.episodes.failed)
-        self.curriculum.observe(outcomes)
-        self.curriculum.leave_out(order.scenes[outcomes.left_out])
-        level = self.curriculum.level(order.eta)
-        self.choices = tally(order.number, level, outcomes, self.curriculum.values())
+        attack.spent["improve"] = time.perf_counter() - begin
+        timed = ("collect", "demonstrations", "steps_per_second")
+        attack.spent |= {name: learned.pop(name) for name in timed if name in learned}
+        return learned
+
+    def move_on(self, order: Order, attack: Attack, learned: dict[str, float]) -> dict[str, float]:
+        """Move the curriculum by what became of the attacks; returns all metrics of the round, named by group (train/,
+        curriculum/, synthesizer/, time/)."""
+        curriculum, episodes, state = self.curriculum, self.episodes, self.curriculum.summary()
+        assert episodes is not None
+        outcomes = outcomes_of(order.eta, order.template, attack.drawn, episodes.row, episodes.failed)
         contact = learned.get("contact_adversarial") if attack.contact is None else attack.contact
-        self.curriculum.advance(contact)
-        attacked = {"scenes": float(len(order.scenes)), "eta": order.eta.mean().item()}
-        lost = sum(entry["during"] == ATTACK for entry in attack.ended)
-        attacked |= {"left_out": float(outcomes.left_out.sum() - lost), "memory_rows": float(self.memory.rows)}
-        attacked |= counted(attack.ended)
-        self.ended = [*attack.ended, *({"round": order.number, **entry} for entry in self.improve.ended)]
-        attacked |= {"fresh_draws": attack.pool.fresh[self.episodes.row].float().mean().item(), **attack.metrics}
+        curriculum.update(episodes.scene_index, episodes.failed, episodes.adversarial)
+        curriculum.observe(outcomes)
+        curriculum.leave_out(order.scenes[outcomes.left_out])
+        self.choices = tally(order.number, curriculum.level(order.eta), outcomes, curriculum.values())
+        curriculum.advance(contact)
+        not_made = sum(entry["during"] == ATTACK for entry in attack.errored)
+        attacked = {
+            "scenes": float(len(order.scenes)),
+            "eta": order.eta.mean().item(),
+            "left_out": float(outcomes.left_out.sum() - not_made),
+            "memory_rows": float(self.memory.rows),
+            **counted(attack.errored),
+            "fresh_draws": attack.pool.fresh[episodes.row].float().mean().item(),
+            **attack.metrics,
+        }
         attacked |= {} if contact is None else {"contact": contact}
-        groups = {"curriculum": state, "train": learned, "synthesizer": attacked, "time": spent}
+        self.errored = [*attack.errored, *({"round": order.number, **entry} for entry in self.improve.ended)]
+        groups = {"curriculum": state, "train": learned, "synthesizer": attacked, "time": attack.spent}
         return {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
+
+    # --- their parts
 
     def _order(self, number: int) -> Order:
         """What is to be synthesized for a round, as the curriculum and the ego are now."""
         scenes = self.curriculum.draw(self.settings.scenes)
         ego = self._start or self.ego
-        ego = copy.deepcopy(ego) if self.settings.ahead else ego  # learning changes weights in place
+        ego = copy.deepcopy(ego) if self.settings.prefetch else ego  # learning changes weights in place
         return Order(number, scenes, *self.curriculum.choices(scenes), self.seed * 1_000_003 + number, ego)
 
-    def _begin_next(self) -> None:
-        """Fix the next round's order; begin on it if the run has such a round."""
-        self._next = self._order(self.round + 1)
-        if self.round + 1 < self.curriculum.rounds:
-            self._ahead = self._begin(self._next)
-
-    def _begin(self, order: Order) -> Ahead | AheadElsewhere:
+    def _begin(self, order: Order) -> Prefetch:
         name = f"round {order.number + 1}: synthesis beside learning failed, checkpoints remain (resume=RUN_DIR)"
-        if self.workers is None:
-            return Ahead(lambda: self._make(order), name)
-        self.workers.connect()
-        return AheadElsewhere(lambda: self._make(order), name)
+        if self.workers is not None:
+            self.workers.connect()
+        return Prefetch(lambda: self._make(order), name, forked=self.workers is None)
 
     def _make(self, order: Order) -> None:
         """Write the traffic of an order into the memory's folder."""
         how = (self.settings.nominal == "prior", self.batch, self.workers or 1)
-        traffic = make_traffic(order, self.synthesize, self.solvable, *how)
-        self.memory.write(order.number, traffic)
+        self.memory.write(order.number, *make_traffic(order, self.synthesize, self.solvable, *how))
 
     def _stored(self, order: Order) -> Attack:
         """D' of an order joined with the memory, and nominal traffic."""
         begin = time.perf_counter()
-        if self.settings.ahead:
-            at_work, self._ahead = self._ahead or self._begin(order), None
+        if self.settings.prefetch:
+            at_work, self._prefetch = self._prefetch or self._begin(order), None
             spent = {"synthesize": at_work.wait(), "waiting": time.perf_counter() - begin}
         else:
             self._make(order)
             spent = {"synthesize": time.perf_counter() - begin}
-        traffic = self.memory.take(order.number)
+        made = self.memory.take(order.number)
         pool = self.memory.pool(self.settings.fresh)
         if self.settings.nominal == "log" or not len(pool):  # without nominal traffic the pool may be empty
             pool = pool + TrafficPool.recorded(order.scenes)
-        metrics, drawn = {"attacked": traffic["attacked"].item()}, traffic["kept"].nonzero()[:, 0]
-        return Attack(pool, drawn, metrics, spent, traffic["contact"].item(), ended_of(traffic))
+        metrics, drawn = {"attacked": made.traffic["attacked"].item()}, made.traffic["kept"].nonzero()[:, 0]
+        return Attack(pool, drawn, metrics, spent, made.traffic["contact"].item(), made.errored)
 
     def _live(self, order: Order) -> Attack:
         """Rows whose traffic is replanned against the learning ego, attacked and nominal."""
@@ -210,7 +229,7 @@ class Evolution:
         """Restore a `state_dict`."""
         self.curriculum.load_state_dict(state["curriculum"])
         self.improve.load_state_dict(state["improvement"])
-        self._next = self._ahead = None
+        self._next = self._prefetch = None
         if state["next"] is not None:
             given, ego = dict(state["next"]), copy.deepcopy(self.ego)
             assert isinstance(ego, ActorEgo)

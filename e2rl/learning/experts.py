@@ -6,9 +6,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from e2rl.learning.cloning import pairs_of
+from e2rl.learning.cloning import demonstrations_of
 from e2rl.learning.driving import PoolDriver, episodes_of, filled_batches
-from e2rl.learning.imitation import ImitationSettings, recorded_pairs
 from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.scenes.recording import DT
 from e2rl.scenes.scene import SceneSet
@@ -40,8 +39,8 @@ class GivenActions(Ego):
         return actions[row, at.clamp(max=actions.shape[1] - 1)].mean(1)
 
 
-def evasion_pairs(driver: PoolDriver, pool: TrafficPool, number: int) -> TensorDict | None:
-    """Pairs [M] of the evasions in the traffic of pool.parts[number]; None without any.
+def evasion_demonstrations(driver: PoolDriver, pool: TrafficPool, number: int) -> TensorDict | None:
+    """Demonstrations [M] of the evasions in the traffic of pool.parts[number]; None without any.
 
     Each is driven from the start in its traffic, by decisions of the driver's environments. Of those that end without
     contact on the road, the decisions within their span are kept.
@@ -58,12 +57,12 @@ def evasion_pairs(driver: PoolDriver, pool: TrafficPool, number: int) -> TensorD
         survived = ~episodes_of(frames, pool, rows[picked]).failed
         kept = frames["alive"] & (acts & (survived & once)[:, None]).to(frames.device)
         action = frames["executed"][:, :, None]
-        parts.append(pairs_of(frames, kept, pool.scene_index[rows[picked]], driver.env, action))
+        parts.append(demonstrations_of(frames, kept, pool.scene_index[rows[picked]], driver.env, action))
     return torch.cat(parts) if parts else None
 
 
 class Experts:
-    """The pairs of a round by kind. Those of an evasion are made once and kept for as long as its row is remembered."""
+    """The demonstrations of a round by kind. Those of an evasion are made once and kept while its row is remembered."""
 
     def __init__(
         self,
@@ -71,29 +70,29 @@ class Experts:
         sim: SimSettings,
         hold: int,
         device: str = "cpu",
-        recorded: ImitationSettings | None = None,
+        recorded: TensorDict | None = None,
         evasions: bool = False,
     ) -> None:
-        """hold: steps of the policy's decisions, by which evasions are driven. recorded: how pairs of the recorded egos
-        are made, None: they are not cloned; evasions: clone those in the pool's traffic."""
-        self.recorded = None if recorded is None else recorded_pairs(scenes, sim, recorded)
+        """hold: steps of the policy's decisions, by which evasions are driven; recorded: demonstrations of the recorded
+        egos; evasions: clone those in the pool's traffic."""
+        self.recorded = recorded
         self._driver = PoolDriver(scenes, sim, BATCH, device, hold) if evasions else None
         self._evaded: list[tuple[weakref.ref[Tensor], TensorDict | None]] = []
 
-    def pairs(self, pool: TrafficPool) -> dict[str, TensorDictBase]:
-        """Pairs [M], M >= 1, by kind: recorded, evasions; kinds without any are left out."""
+    def demonstrations(self, pool: TrafficPool) -> dict[str, TensorDictBase]:
+        """Demonstrations [M], M >= 1, by kind: recorded, evasions; kinds without any are left out."""
         found: dict[str, TensorDictBase | None] = {"recorded": self.recorded, "evasions": self._of_evasions(pool)}
-        return {kind: pairs for kind, pairs in found.items() if pairs is not None and len(pairs)}
+        return {kind: shown for kind, shown in found.items() if shown is not None and len(shown)}
 
     def _of_evasions(self, pool: TrafficPool) -> TensorDictBase | None:
-        """Pairs of all evasions in the pool, remembered rows included."""
+        """Demonstrations of all evasions in the pool, remembered rows included."""
         if self._driver is None:
             return None
         now = []
         for number, part in enumerate(pool.parts):
-            made = [pairs for of, pairs in self._evaded if of() is part.evasion]
-            pairs = made[0] if made else evasion_pairs(self._driver, pool, number)
-            now.append((weakref.ref(part.evasion), pairs))
+            made = [shown for of, shown in self._evaded if of() is part.evasion]
+            shown = made[0] if made else evasion_demonstrations(self._driver, pool, number)
+            now.append((weakref.ref(part.evasion), shown))
         self._evaded = now
-        every = [pairs for _, pairs in now if pairs is not None]
+        every = [shown for _, shown in now if shown is not None]
         return torch.cat(every) if every else None

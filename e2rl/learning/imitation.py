@@ -24,7 +24,7 @@ from e2rl.learning.update import take_step
 from e2rl.planners.log_replay import ReplayEgo
 from e2rl.planners.network import WEIGHTS, ActorCritic
 from e2rl.run.errors import InputError
-from e2rl.run.parts import NOTHING_KEPT, Kept
+from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.pool import TrafficPool
@@ -163,7 +163,7 @@ def imitate(
     settings: ImitationSettings,
     folder: Path | None = None,
     logger: RunLogger | None = None,
-    kept: Kept = NOTHING_KEPT,
+    kept: Parts = NO_PARTS,
 ) -> dict[str, float]:
     """Clone the pairs for settings.epochs and choose the weights of the lowest held-out loss (of the last epoch if no
     scene is held out). Improved weights are written to folder / WEIGHTS; returns the row of the chosen epoch. kept: the

@@ -4,31 +4,33 @@ One file memory/round-000003.safetensors a round. Of a mapped file only the rows
 memory does not grow with the rounds.
 """
 
+import json
 import tempfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save
 from torch import Tensor
 
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
-from e2rl.run.settings import check_range
 from e2rl.traffic.pool import TrafficPool
 
-FOLDER, CHUNK = "memory", 1 << 22  # bytes that are read at once for a checksum
+FOLDER, ERRORED = "memory", "errored"  # of a run; the key of a file's metadata
+CHUNK = 1 << 22  # bytes that are read at once for a checksum
 
 
 @dataclass(frozen=True)
 class Remembered:
-    """The mapped traffic of a round: number, what the file holds, and the file's checksum."""
+    """The traffic of a round as its file holds it: number, mapped tensors, errored rows, and the file's checksum."""
 
     number: int
     traffic: dict[str, Tensor]
+    errored: list[dict]
     crc32: int
 
     def __len__(self) -> int:
@@ -38,14 +40,12 @@ class Remembered:
 class Memory:
     """The rounds from the newest one back, at most `bound` rows together; the newest round always stays.
 
-    A round's traffic {scene_index [R], eta [R], template [R], states [R, T+1, N, 4], valid [R, T+1, N], adversaries
-    [R, N], evasion [R, T, 2], span [R, 2], ...} is written by `write`, by any process, and enters by `take`. Files of
+    A round's traffic (`attack.make_traffic`) is written by `write`, by any process, and enters by `take`. Files of
     rounds that have left go in `prune`: until then a checkpoint may name them.
     """
 
     def __init__(self, folder: Path | None, bound: int) -> None:
-        """folder: of the run (None: a temporary one); bound: rows. Raises InputError for a negative bound."""
-        check_range("learner.round.memory", bound, 0)
+        """folder: of the run (None: a temporary one); bound: rows."""
         if folder is None:
             self._temporary = tempfile.TemporaryDirectory(prefix="e2rl-memory-")
             folder = Path(self._temporary.name)
@@ -61,18 +61,17 @@ class Memory:
         """The file of a round."""
         return self.folder / f"round-{number:06d}.safetensors"
 
-    def write(self, number: int, traffic: Mapping[str, Tensor]) -> None:
-        """Write the traffic of a round."""
+    def write(self, number: int, traffic: Mapping[str, Tensor], errored: Sequence[dict] = ()) -> None:
+        """Write the traffic of a round, and its errored rows."""
         plain = {name: value.detach().cpu().contiguous() for name, value in traffic.items()}
-        write_atomically(self.path(number), save(plain))
+        write_atomically(self.path(number), save(plain, {ERRORED: json.dumps(list(errored))}))
 
-    def take(self, number: int) -> dict[str, Tensor]:
-        """Map a written round as the newest; the oldest rounds beyond the bound leave. Returns its traffic."""
-        path = self.path(number)
-        self.rounds.append(Remembered(number, _mapped(path), _checksum(path)))
+    def take(self, number: int) -> Remembered:
+        """Map a written round as the newest; the oldest rounds beyond the bound leave. Returns it."""
+        self.rounds.append(self._mapped(number))
         while self.rows > self.bound and len(self.rounds) > 1:
             del self.rounds[0]
-        return self.rounds[-1].traffic
+        return self.rounds[-1]
 
     def pool(self, fresh: float) -> TrafficPool:
         """Rows of all rounds, the newest first, whose rows weigh `fresh` times as much as the others'. The tracks stay
@@ -89,13 +88,11 @@ class Memory:
 
     def restore(self, index: list[dict[str, int]]) -> None:
         """Map the rounds of an `index`; raises InputError for a missing, damaged or exchanged file."""
-        self.rounds = []
-        for entry in index:
-            path = self.path(entry["round"])
-            traffic, crc32 = _mapped(path), _checksum(path)
-            if crc32 != entry["crc32"]:
+        self.rounds = [self._mapped(entry["round"]) for entry in index]
+        for entry, found in zip(index, self.rounds, strict=True):
+            if found.crc32 != entry["crc32"]:
+                path = self.path(found.number)
                 raise InputError(f"{path}: damaged, or not of this run; restore it or begin a new run")
-            self.rounds.append(Remembered(entry["round"], traffic, crc32))
 
     def prune(self, first: int) -> None:
         """Delete the files of rounds before `first`."""
@@ -103,18 +100,21 @@ class Memory:
             if path < self.path(first):
                 path.unlink()
 
+    def _mapped(self, number: int) -> Remembered:
+        path = self.path(number)
+        if not path.is_file():
+            raise InputError(f"{path}: this file of the run's memory is missing; restore it or begin a new run")
+        try:
+            traffic = load_file(path)  # maps the file: its pages are read when they are used
+            with safe_open(path, "pt") as file:
+                errored = json.loads((file.metadata() or {}).get(ERRORED, "[]"))
+        except (SafetensorError, OSError, ValueError) as error:
+            raise InputError(f"{path}: damaged ({error}); restore it or begin a new run") from None
+        return Remembered(number, traffic, errored, _checksum(path))
+
 
 def _pool(traffic: Mapping[str, Tensor]) -> TrafficPool:
     return TrafficPool.stored(traffic, traffic["eta"], traffic["template"])
-
-
-def _mapped(path: Path) -> dict[str, Tensor]:
-    if not path.is_file():
-        raise InputError(f"{path}: this file of the run's memory is missing; restore it or begin a new run")
-    try:
-        return load_file(path)  # maps the file: its pages are read when they are used
-    except (SafetensorError, OSError) as error:
-        raise InputError(f"{path}: damaged ({error}); restore it or begin a new run") from None
 
 
 def _checksum(path: Path) -> int:

@@ -1,8 +1,7 @@
 """The update of a learned ego: PPO and behaviour cloning on episodes collected in the round's pool."""
 
 import time
-from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from tqdm import tqdm
 
 from e2rl.learning.driving import OUTCOME_KEYS, Episodes, finished_episodes
 from e2rl.learning.experts import Experts
-from e2rl.learning.imitation import ImitationSettings
+from e2rl.learning.imitation import recorded_demonstrations
 from e2rl.learning.improvement import Improvement
 from e2rl.learning.scheduler import CurriculumScheduler
 from e2rl.learning.teaching import Teacher
@@ -25,7 +24,7 @@ from e2rl.learning.update import Learner, UpdateSettings
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import Ego, EgoPlanner
 from e2rl.run.errors import InputError
-from e2rl.run.settings import settings_of
+from e2rl.run.settings import configured, setting, settings_of
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.traffic.e2.reaiming import ReactSettings, Reaiming
@@ -34,14 +33,15 @@ from e2rl.traffic.traffic import Traffic
 from e2rl.traffic.transform import AdversarialSynthesizer
 
 
+@configured("learner/ppo_bc", "collect")
 @dataclass(frozen=True)
 class CollectSettings:
-    """Fields: conf/learner/ppo_bc.yaml."""
+    """Settings `learner.collect`."""
 
-    batch: int = 256
-    steps: int = 40
-    hold: int = 2
-    iterations: int = 20
+    batch: int = setting(low=1)
+    steps: int = setting(low=1)
+    hold: int = setting(low=1)
+    iterations: int = setting(low=1)
 
 
 class RowDraw:
@@ -75,7 +75,6 @@ class PolicyImprovement(Improvement):
         device: str = "cpu",
         collect: Mapping[str, Any] | None = None,
         ppo: Mapping[str, Any] | None = None,
-        imitation: Mapping[str, Any] | None = None,
         recorded: bool = False,
         evasions: bool = False,
         teacher: Ego | None = None,
@@ -84,12 +83,17 @@ class PolicyImprovement(Improvement):
         react: Mapping[str, Any] | None = None,
         rounds: int = 1,
     ) -> None:
-        """With ppo.cloning > 0, recorded: clone the recorded egos; evasions: clone the evasions in the pool's traffic.
-        With ppo.teaching > 0, teacher: a RankingEgo that labels states of the collected episodes, as `teaching` says.
-        react: vehicles that leave the replayed traffic (None: nobody); rounds: of the run, over which the learning rate
-        falls; others: conf/learner/ppo_bc.yaml.
+        """Settings: conf/learner/ppo_bc.yaml.
 
-        Raises InputError if the ego is no actor, the teacher no RankingEgo, or a round shorter than an episode.
+        Args:
+            recorded, evasions: with ppo.cloning > 0, clone the recorded egos, and the evasions in the pool's traffic.
+            teacher: with ppo.teaching > 0, a RankingEgo that labels states of the collected episodes, as `teaching`
+                says.
+            react: vehicles that leave the replayed traffic; None: nobody.
+            rounds: of the run, over which the learning rate falls.
+
+        Raises:
+            InputError: if the ego is no actor, the teacher no RankingEgo, or a round shorter than an episode.
         """
         if not isinstance(ego, ActorEgo):
             raise InputError(f"learner=ppo_bc improves ego=actor, not {type(ego).__name__}; use learner=planner_tuning")
@@ -106,8 +110,8 @@ class PolicyImprovement(Improvement):
         self.experts: Experts | None = None
         self.teacher: Teacher | None = None
         if update.cloning > 0:
-            pairs = settings_of(ImitationSettings, {"seed": seed, **(imitation or {})}, "learner.imitation")
-            self.experts = Experts(scenes, sim, hold, device, pairs if recorded else None, evasions)
+            known = recorded_demonstrations(scenes, sim, seed) if recorded else None
+            self.experts = Experts(scenes, sim, hold, device, known, evasions)
         if update.teaching > 0:
             self.teacher = Teacher(teacher, scenes, (ego.network.low, ego.network.high), hold, teaching)
         every = torch.arange(len(scenes))
@@ -136,31 +140,27 @@ class PolicyImprovement(Improvement):
         """Reset every environment; `iterations` times: collect [B, steps] decisions, update. `frames` are steps of
         0.1 s."""
         begin = time.perf_counter()
-        experts = {} if self.experts is None else self.experts.pairs(pool)
-        counts = {"pairs": time.perf_counter() - begin, "expert_pairs": float(sum(map(len, experts.values())))}
-        counts |= {f"{kind}_pairs": float(len(pairs)) for kind, pairs in experts.items()}
+        experts = {} if self.experts is None else self.experts.demonstrations(pool)
+        counts = {f"{kind}_demonstrations": float(len(found)) for kind, found in experts.items()}
+        counts["demonstrations"] = time.perf_counter() - begin
         self.synthesizer.pool = pool
-        self.draw.probability = pool.probabilities(curriculum.priority(), curriculum.share)
+        self.draw.probability = pool.probabilities(curriculum.priority(), curriculum.fraction)
         self._collector.reset()
-        kept, rows, collecting, begun = [], [], 0.0, self.frames
+        outcomes, rows, collecting, begun = [], [], 0.0, self.frames
         bar = tqdm(range(self.settings.iterations), "collect and update", unit="batch", leave=False, disable=None)
         for _ in bar:
             begin = time.perf_counter()
             data = self.collected()
             collecting += time.perf_counter() - begin
             self.frames += steps_of(data)
-            kept.append(data.select(*OUTCOME_KEYS).cpu().clone())
+            outcomes.append(data.select(*OUTCOME_KEYS).cpu().clone())
             labels, made = self._labels(data, pool.adversarial)
             rows.append(self.learner.update(data, [*experts.values()], labels) | made)
             bar.set_postfix(reward=f"{data['next', 'reward'].mean().item():.3f}", kl=f"{rows[-1]['kl']:.4f}")
-        episodes = finished_episodes(kept, pool.adversarial, self.horizon, self.settings.hold)
-        columns: dict[str, list[float]] = defaultdict(list)
-        for name, value in (pair for row in rows for pair in row.items()):
-            columns[name].append(value)
-        metrics = {name: sum(values) / len(values) for name, values in sorted(columns.items())}
+        episodes = finished_episodes(outcomes, pool.adversarial, self.horizon, self.settings.hold)
         counts |= {"frames": float(self.frames), "collect": collecting}
         counts["steps_per_second"] = (self.frames - begun) / collecting
-        return metrics | episodes.summary() | counts, episodes
+        return _means(rows) | episodes.summary() | counts, episodes
 
     def collected(self) -> TensorDictBase:
         """The next batch [B, steps] of decisions, by the present policy."""
@@ -173,7 +173,7 @@ class PolicyImprovement(Improvement):
             return None, {}
         begin, count = time.perf_counter(), -(-self.teacher.settings.states // self.settings.iterations)
         made = self.teacher.watch(data, adversarial, self.ego, count)
-        return self.teacher.pairs, {**made, "label_seconds": time.perf_counter() - begin}
+        return self.teacher.labelled, {**made, "label_seconds": time.perf_counter() - begin}
 
     def outcome(self, folder: Path) -> str:
         """How to evaluate the improved ego of a run's folder."""
@@ -194,3 +194,10 @@ class PolicyImprovement(Improvement):
         if self.teacher is not None:
             self.teacher.load_state_dict(state["labels"])
         self.frames = state["frames"]
+
+
+def _means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """The mean of each metric over the updates that have it."""
+    names = sorted({name for row in rows for name in row})
+    known = {name: [row[name] for row in rows if name in row] for name in names}
+    return {name: sum(values) / len(values) for name, values in known.items()}

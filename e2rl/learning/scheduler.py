@@ -1,13 +1,10 @@
-"""The extension point for curricula: intensity, causal template, share of adversarial episodes, priorities of scenes.
+"""The extension point for curricula: intensity, causal template, fraction of adversarial episodes, scene priorities.
 
 Scenes are prioritised by rank, mixed with staleness, as in prioritised level replay (Jiang et al. 2021). What is ranked
-is the learnability of Rutherford et al. ("No Regrets", 2024): p (1 - p), where p is the recent share of the ego's
-episodes in a scene's adversarial traffic that fail. It is 0 for a scene that is solved and for one that is hopeless.
-
-What became of a round's attacks, and the table of a curriculum's choices (curriculum.csv).
+is the learnability of Rutherford et al. ("No Regrets", 2024): p (1 - p), where p is the recent failure rate of the ego
+in a scene's adversarial traffic. It is 0 for a scene that is solved and for one that is hopeless.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -16,19 +13,25 @@ from torch import Tensor
 
 from e2rl.run.config import Extension
 from e2rl.run.errors import InputError
-from e2rl.run.settings import check_range
+from e2rl.run.settings import check_range, configured
 from e2rl.traffic.traffic import FULL, TEMPLATES
 
 Choice = dict[str, int | float | str]  # a row of the table, by COLUMNS
 COLUMNS = {"round": int, "eta": float, "template": str, "draws": int, "left_out": int, "episodes": int, "failures": int}
 COLUMNS |= {"failure_rate": float, "value": float}
+TEMPERATURE = 2.0  # of the ranks of learnability: at 2 the first tenth of the scenes has a quarter of the draws
+STALENESS = 0.2  # fraction of the draws that goes by the rounds since a scene was last drawn
+SMOOTHING = 0.3  # weight of a round in a scene's moving failure rate
+BIN = 0.5  # intensities are counted under multiples of it
 
 
 @dataclass(frozen=True)
 class Outcomes:
-    """The S attacks of a round: eta [S]; template [S] int64; left_out [S] bool: no driver survives it, so it did not
-    enter D'; episodes [S] int64 that the learning policy drove in it; failures [S] int64: those among them that ended
-    by contact or off the road."""
+    """What became of the S attacks of a round.
+
+    eta [S]; template [S] int64; left_out [S] bool: no driver avoids it, so it did not enter D'; episodes [S] int64: how
+    many the learning policy drove in it; failures [S] int64: how many of these ended by contact or off the road.
+    """
 
     eta: Tensor
     template: Tensor
@@ -38,13 +41,15 @@ class Outcomes:
 
     @property
     def failure_rate(self) -> Tensor:
-        """The share of failures in the episodes [S]; NaN without an episode."""
+        """Failures per episode [S]; NaN without an episode."""
         return self.failures / self.episodes
 
 
 def outcomes_of(eta: Tensor, template: Tensor, drawn: Tensor, row: Tensor, failed: Tensor) -> Outcomes:
-    """Outcomes of attacks [S] of which drawn [K] int64 are the first K rows of the pool (several rows may be one's):
-    from episodes [E] with their pool row and whether they failed. Episodes in other rows do not count."""
+    """Returns the Outcomes of attacks [S], of episodes [E] in rows `row` of the pool that failed or not.
+
+    drawn [K] int64: the attack of each of the pool's first K rows; episodes in other rows do not count.
+    """
     count, known = len(eta), row < len(drawn)
     attack, failed = drawn[row[known]], failed[known]
     left_out = torch.ones(count, dtype=torch.bool).index_fill(0, drawn, False)
@@ -73,54 +78,33 @@ def tally(number: int, level: Tensor, outcomes: Outcomes, value: Mapping[tuple[f
     return rows
 
 
-BIN = 0.5  # intensities are counted under multiples of it
+@configured("curriculum/adaptive")
+class CurriculumScheduler(Extension):
+    """State over S scenes. Per round: `draw` scenes and `choices` for them, read `fraction`, then `learn` from the
+    outcomes and `advance`.
 
+    A curriculum is a subclass with `eta` and `fraction`, attributes or properties, and a YAML file in conf/curriculum with its
+    `_target_` and settings; it overrides `etas` where the scenes of a round differ in intensity, `choices` and
+    `templates` where they differ in causal template as well. `lasting` names
+    its attributes that change from round to round.
 
-class CurriculumScheduler(Extension, ABC):
-    """State over S scenes. Per round: `draw` scenes and `choices` for them, read `share`, `update` with episodes,
-    `observe` what became of the attacks, `advance`.
-
-    A schedule is a subclass with the properties `eta` and `share`, and a YAML file in conf/curriculum with its
-    `_target_` and settings; `etas` where the scenes of a round differ in intensity, `choices` and `templates` where
-    they differ in causal template as well. State of its own between rounds belongs in `extra_state`.
-
-    templates: the causal templates that it may choose (e2rl/traffic/traffic.py).
+    Args:
+        rounds: of the whole run.
+        prioritised, solvable_only: see conf/curriculum/adaptive.yaml.
     """
 
+    eta: float  # adversarial intensity of this round
+    fraction: float  # of this round's episodes that are in adversarial traffic
     templates: tuple[str, ...] = (TEMPLATES[FULL],)
+    lasting: tuple[str, ...] = ()  # names of a subclass's attributes (numbers and tensors) that checkpoints hold
 
-    def __init__(
-        self,
-        num_scenes: int,
-        rounds: int,
-        seed: int = 0,
-        prioritised: bool = True,
-        temperature: float = 2.0,
-        staleness: float = 0.2,
-        smoothing: float = 0.3,
-        solvable_only: bool = True,
-    ) -> None:
-        """rounds: of the whole run; other fields: conf/curriculum/adaptive.yaml. Raises InputError out of range."""
+    def __init__(self, num_scenes: int, rounds: int, seed: int = 0, *, prioritised: bool, solvable_only: bool) -> None:
         if num_scenes < 1:
             raise InputError("curriculum: no scenes; check data.path and data.split")
-        check_range("curriculum.temperature", temperature, 1e-6)
-        check_range("curriculum.staleness", staleness, 0, 1)
-        check_range("curriculum.smoothing", smoothing, 1e-6, 1)
         self.rounds, self.round, self.prioritised, self.solvable_only = rounds, 0, prioritised, solvable_only
-        self.temperature, self.staleness, self.smoothing = temperature, staleness, smoothing
         self._generator = torch.Generator().manual_seed(seed)
         self._failing = torch.full((num_scenes,), torch.nan)
         self._drawn = torch.full((num_scenes,), -1, dtype=torch.int64)
-
-    @property
-    @abstractmethod
-    def eta(self) -> float:
-        """Adversarial intensity of this round."""
-
-    @property
-    @abstractmethod
-    def share(self) -> float:
-        """Share of this round's episodes in adversarial traffic."""
 
     def etas(self, scenes: Tensor) -> Tensor:
         """Intensities [S] for this round's scenes [S]; by default `eta` for all."""
@@ -136,27 +120,20 @@ class CurriculumScheduler(Extension, ABC):
         first, last = max(self.eta - spread, low), min(self.eta + spread, high)
         return first + (last - first) * torch.rand(count, generator=self._generator)
 
-    def extra_state(self) -> dict:
-        """State of a schedule between rounds, besides the scenes' state."""
-        return {}
-
-    def load_extra_state(self, state: dict) -> None:  # noqa: B027
-        """Restore an `extra_state`."""
-
     def learnability(self) -> Tensor:
-        """p (1 - p) [S], of a recent share p of failures; NaN for scenes never driven in adversarial traffic."""
+        """p (1 - p) [S] of the recent failure rate p; NaN for scenes never driven in adversarial traffic."""
         return self._failing * (1 - self._failing)
 
     def priority(self) -> Tensor:
-        """Probability [S] with which scenes are drawn: (1 - staleness) by rank of learnability, scenes not yet driven
-        in adversarial traffic first, the rest by the rounds since they were last drawn."""
+        """Probability [S] with which scenes are drawn: 1 - STALENESS of it by rank of learnability, scenes not yet
+        driven in adversarial traffic first, the rest by the rounds since they were last drawn."""
         count = len(self._failing)
         if not self.prioritised:
             return torch.full((count,), 1 / count)
-        weight = (1 / ranks(self.learnability().nan_to_num(nan=torch.inf))) ** (1 / self.temperature)
+        weight = (1 / ranks(self.learnability().nan_to_num(nan=torch.inf))) ** (1 / TEMPERATURE)
         age = (self.round - self._drawn).float()
         old = age / age.sum() if age.sum() > 0 else torch.full((count,), 1 / count)
-        return (1 - self.staleness) * weight / weight.sum() + self.staleness * old
+        return (1 - STALENESS) * weight / weight.sum() + STALENESS * old
 
     def draw(self, count: int) -> Tensor:
         """Scenes [count] to synthesize for: each scene count // S times, the rest by priority without replacement."""
@@ -176,10 +153,10 @@ class CurriculumScheduler(Extension, ABC):
         total = torch.zeros(len(scenes)).index_add(0, inverse, failed.cpu().float()[adversarial])
         mean = total / torch.bincount(inverse, minlength=len(scenes)).clamp(min=1)
         before = self._failing[scenes]
-        moved = before + self.smoothing * (mean - before)
+        moved = before + SMOOTHING * (mean - before)
         self._failing[scenes] = torch.where(before.isnan(), mean, moved)
 
-    def observe(self, outcomes: Outcomes) -> None:  # noqa: B027
+    def observe(self, outcomes: Outcomes) -> None:
         """Learn from what became of the round's attacks; by default nothing."""
 
     def level(self, eta: Tensor) -> Tensor:
@@ -187,7 +164,7 @@ class CurriculumScheduler(Extension, ABC):
         return (eta / BIN).round() * BIN
 
     def values(self) -> dict[tuple[float, str], float]:
-        """What is expected to be learned from attacks by (eta, template), where the schedule estimates it."""
+        """What is expected to be learned from attacks by (eta, template), where the curriculum estimates it."""
         return {}
 
     def leave_out(self, scene_index: Tensor) -> None:
@@ -203,13 +180,14 @@ class CurriculumScheduler(Extension, ABC):
     def summary(self) -> dict[str, float]:
         """Metrics to log."""
         learnability, seen = self.learnability(), ~self._failing.isnan()
-        result = {"eta": self.eta, "share": self.share, "scenes_seen": seen.float().mean().item()}
+        result = {"eta": self.eta, "fraction": self.fraction, "scenes_seen": seen.float().mean().item()}
         return result | ({"learnability": learnability[seen].mean().item()} if seen.any() else {})
 
     def state_dict(self) -> dict:
         """All state."""
+        own = {name: getattr(self, name) for name in self.lasting}
         scenes = {"failing": self._failing, "drawn": self._drawn}
-        return scenes | {"round": self.round, "generator": self._generator.get_state(), "extra": self.extra_state()}
+        return scenes | {"round": self.round, "generator": self._generator.get_state(), "own": own}
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`; raises InputError if the number of scenes differs."""
@@ -221,7 +199,8 @@ class CurriculumScheduler(Extension, ABC):
         self._failing, self._drawn = (state[key].clone() for key in ("failing", "drawn"))
         self.round = state["round"]
         self._generator.set_state(state["generator"].cpu())
-        self.load_extra_state(state["extra"])
+        for name in self.lasting:
+            setattr(self, name, state["own"][name])
 
 
 def ranks(value: Tensor) -> Tensor:

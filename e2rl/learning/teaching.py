@@ -17,7 +17,7 @@ from e2rl.learning.cloning import clip_expert
 from e2rl.planners.ego import Ego
 from e2rl.planners.sampling import RankingEgo, ranked_actions
 from e2rl.run.errors import InputError
-from e2rl.run.settings import check_range, settings_of
+from e2rl.run.settings import configured, setting, settings_of
 from e2rl.scenes.recording import DT
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.prospects import time_to_contact
@@ -26,23 +26,21 @@ from e2rl.sim.world import World
 BATCH = 32  # states that are labelled at once
 
 
+CANDIDATES = 48  # soft labels: the teacher's cheapest candidates, of which the nearest ones draw
+TEMPERATURE = 5.0  # of their weights softmax(-cost / TEMPERATURE)
+
+
+@configured("learner/ppo_bc", "teaching")
 @dataclass(frozen=True)
 class TeachingSettings:
-    """Fields: `teaching` in conf/learner/ppo_bc.yaml."""
+    """Settings `learner.teaching`."""
 
-    states: int = 4096
-    memory: int = 16384
-    window: float = 2.5
-    near: float = 1.2
-    regret: float = 20.0
-    survivable: float = 60.0
-    candidates: int = 48
-    temperature: float = 5.0
-
-    def __post_init__(self) -> None:
-        for name, least in (("states", 1), ("memory", 1), ("window", 0), ("near", 0), ("candidates", 1)):
-            check_range(f"learner.teaching.{name}", getattr(self, name), least)
-        check_range("learner.teaching.temperature", self.temperature, 1e-6)
+    states: int = setting(low=1)
+    memory: int = setting(low=1)
+    window: float = setting(low=0)
+    near: float = setting(low=0)
+    regret: float = setting()
+    survivable: float = setting()
 
 
 def critical(data: TensorDictBase, window: float, near: float) -> Tensor:
@@ -64,7 +62,7 @@ def _coming(flag: Tensor) -> Tensor:
 
 
 class Teacher:
-    """Labels states of collected batches; `pairs` [M] (e2rl.learning.cloning) are the newest ones of all rounds."""
+    """Labels states of collected batches; `labelled` [M] (demonstrations, e2rl.learning.cloning) are the newest ones of all rounds."""
 
     def __init__(
         self,
@@ -83,7 +81,7 @@ class Teacher:
             )
         self.settings = settings_of(TeachingSettings, settings or {}, "learner.teaching")
         self.planner, self.scenes, self.bounds, self.hold = planner, scenes, bounds, hold
-        self.pairs: TensorDict | None = None
+        self.labelled: TensorDict | None = None
 
     def watch(self, data: TensorDictBase, adversarial: Tensor, ego: Ego, count: int) -> dict[str, float]:
         """Look at up to `count` critical decisions, drawn evenly, of adversarial episodes in a batch [B, T] that `ego`
@@ -93,28 +91,28 @@ class Teacher:
         row, column = places[torch.randperm(len(places), device=places.device)[:count]].unbind(1)
         frames = data.select("observation", "timestep", "scene_index", "agents")[row, column]
         parts = [self.labels(part, ego) for part in frames.split(BATCH)] if len(frames) else []
-        known = [] if self.pairs is None else [self.pairs]
+        known = [] if self.labelled is None else [self.labelled]
         if parts:
-            self.pairs = torch.cat([*known, *parts])[-self.settings.memory :]
+            self.labelled = torch.cat([*known, *parts])[-self.settings.memory :]
         return {"critical": float(len(places)), "labels": float(sum(map(len, parts)))}
 
     def labels(self, frames: TensorDictBase, ego: Ego) -> TensorDict:
-        """Pairs [K] of the states frames [M] of a DrivingEnv with `agents=True` in which ego's plan costs at least
+        """Demonstrations [K] of the states frames [M] of a DrivingEnv with `agents=True` in which ego's plan costs at least
         `regret` more than the planner's, whose own cost is below `survivable`."""
         settings = self.settings
         world = World.of(frames, self.scenes.batch(frames["scene_index"][:, 0].cpu()).to(frames.device))
-        action, cost = ranked_actions(self.planner, world, settings.candidates, self.hold)
+        action, cost = ranked_actions(self.planner, world, CANDIDATES, self.hold)
         own = self.planner.rated(world, ego.plan(world)[:, None])[:, 0]
-        weight = torch.softmax(-cost / settings.temperature, -1)
-        pairs = {"observation": frames["observation"], "action": clip_expert(action, *self.bounds), "weight": weight}
+        weight = torch.softmax(-cost / TEMPERATURE, -1)
+        found = {"observation": frames["observation"], "action": clip_expert(action, *self.bounds), "weight": weight}
         kept = (own - cost[:, 0] >= settings.regret) & (cost[:, 0] < settings.survivable)
-        return TensorDict(pairs, batch_size=frames.batch_size)[kept]
+        return TensorDict(found, batch_size=frames.batch_size)[kept]
 
     def state_dict(self) -> dict:
-        """The pairs, of plain tensors."""
-        return {} if self.pairs is None else self.pairs.to_dict()
+        """The labels, of plain tensors."""
+        return {} if self.labelled is None else self.labelled.to_dict()
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`."""
         device = self.bounds[0].device
-        self.pairs = TensorDict(state, [len(state["weight"])]).to(device) if state else None
+        self.labelled = TensorDict(state, [len(state["weight"])]).to(device) if state else None

@@ -1,4 +1,4 @@
-"""The policy's update: PPO on collected episodes and behaviour cloning on expert pairs, one optimiser for both."""
+"""The policy's update: PPO on collected episodes, behaviour cloning and a teacher's labels, by one optimiser."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -11,39 +11,46 @@ from torchrl.modules import PopArtValueNorm
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from e2rl.learning.cloning import cloning_loss, drawn, mirrored_pairs, teaching_loss
+from e2rl.learning.cloning import (
+    FEATURE_NOISE,
+    LAST_ACTION_NOISE,
+    cloning_loss,
+    drawn,
+    mirrored_demonstrations,
+    teaching_loss,
+)
 from e2rl.planners.network import ActorCritic, ActorNetwork
 from e2rl.run.errors import InputError
+from e2rl.run.settings import configured, setting
 from e2rl.sim.prospects import TIMES, time_to_contact
 
 VALUE_MEMORY = 0.95  # weight of the past in the running mean and variance of the returns, per update
-GENTLE_FRAMES = 512  # of a minibatch, on which the policy's |acceleration| is measured
+PRICED_FRAMES = 512  # of a minibatch, on which the policy's |acceleration| is measured
 PEAK_MEMORY = 0.75  # of the past in the running maximum of |advantage|, per update
+CRITIC = 0.5  # weight of the critic's loss
+MAX_GRAD_NORM = 0.5
+CLONED = 256  # demonstrations of an optimiser step, as many of each kind; also labels of a teacher
 
 
+@configured("learner/ppo_bc", "ppo")
 @dataclass(frozen=True)
 class UpdateSettings:
-    """Fields: conf/learner/ppo_bc.yaml."""
+    """Settings `learner.ppo`."""
 
-    learning_rate: float = 1e-3
-    final_lr: float = 0.2
-    gamma: float = 0.97
-    lmbda: float = 0.95
-    clip: float = 0.2
-    entropy: float = 0.0
-    critic: float = 0.5
-    epochs: int = 3
-    minibatch: int = 2560
-    max_grad_norm: float = 0.5
-    target_kl: float = 0.04
-    advantage_filter: float = 0.01
-    critic_warmup: int = 1
-    gentle: float = 0.1
-    teaching: float = 0.0
-    cloning: float = 0.0
-    cloning_minibatch: int = 256
-    feature_noise: float = 0.3
-    last_action_noise: float = 1.0
+    learning_rate: float = setting(low=0)
+    final_lr: float = setting(low=0)
+    gamma: float = setting(low=0, high=1)
+    lmbda: float = setting(low=0, high=1)
+    clip: float = setting(low=0)
+    entropy: float = setting()
+    epochs: int = setting(low=1)
+    minibatch: int = setting(low=1)
+    target_kl: float = setting(low=0)
+    advantage_filter: float = setting(low=0, high=1)
+    critic_warmup: int = setting(low=0)
+    action_penalty: float = setting(low=0)
+    teaching: float = setting(low=0)
+    cloning: float = setting(low=0)
 
 
 class Learner:
@@ -54,7 +61,7 @@ class Learner:
     """
 
     def __init__(self, network: ActorCritic, settings: UpdateSettings, total: int | None = None) -> None:
-        """total: updates of the whole run, over which the learning rate falls to its share final_lr; None: constant."""
+        """total: updates of the whole run, over which the learning rate falls to final_lr of it; None: constant."""
         self.network, self.settings, self.total, self.updates = network, settings, total, 0
         self.returns = PopArtValueNorm(shape=1, beta=VALUE_MEMORY, device=network.device)
         self.peak = torch.zeros((), device=network.device)  # running maximum of |advantage|
@@ -62,7 +69,7 @@ class Learner:
             *network.heads(),
             clip_epsilon=settings.clip,
             entropy_coeff=settings.entropy,
-            critic_coeff=settings.critic,
+            critic_coeff=CRITIC,
             normalize_advantage=False,
         )
         self.optimiser = torch.optim.Adam(network.parameters(), settings.learning_rate)
@@ -70,12 +77,15 @@ class Learner:
     def update(
         self, data: TensorDictBase, experts: Sequence[TensorDictBase] = (), labels: TensorDictBase | None = None
     ) -> dict[str, float]:
-        """One PPO iteration on a Collector's batch [B, T], with behaviour cloning on kinds of expert pairs, each [M]
-        with M >= 1 (e2rl.learning.cloning), that share a minibatch evenly, and on a teacher's labels [M].
+        """One PPO iteration on a Collector's batch [B, T]; returns means of the losses and diagnostics.
 
         Passes end early when the policy has moved by target_kl. The first `critic_warmup` calls fit the critic alone.
         The observation statistics are updated at the end, so they are equal in collection and update.
-        Returns means of the losses and diagnostics.
+
+        Args:
+            experts: kinds of demonstrations, each [M] with M >= 1 (e2rl.learning.cloning), that are cloned; a minibatch
+                has as many of each.
+            labels: a teacher's labels [M].
         """
         settings, sums, stopped = self.settings, defaultdict(list), False
         seen_before = bool(self.network.normaliser.count > 0)
@@ -104,7 +114,7 @@ class Learner:
             "std_yaw_rate": self._std()[1],
             "steps": float(len(sums["kl"])),
             "learning_rate": rate,
-            "kept": len(flat) / data.numel(),
+            "frames_used": len(flat) / data.numel(),
         }
 
     def _learning_rate(self) -> float:
@@ -115,8 +125,8 @@ class Learner:
     def _with_advantages(self, data: TensorDictBase, least: float) -> TensorDict:
         """The frames [F] of a batch [B, T] with what the losses read; advantages are normalised over the whole batch.
 
-        Frames are left out whose |advantage| is below the share `least` of its running maximum: there is little to
-        learn from them.
+        Frames are left out whose |advantage| is below `least` times its running maximum: there is little to learn from
+        them.
         """
         data = data.select("observation", "action", "action_log_prob", "next").to(self.network.device)
         inputs = self.network.prepared(data["observation"])
@@ -169,20 +179,20 @@ class Learner:
             "entropy": out["entropy"],
             "explained_variance": out["explained_variance"].mean(),
         }
-        if settings.gentle > 0 and not warming:
-            losses["loss_gentle"] = gentle_loss(self.network.network, minibatch[:GENTLE_FRAMES])
-            total = total + settings.gentle * losses["loss_gentle"]
+        if settings.action_penalty > 0 and not warming:
+            losses["action_penalty"] = action_penalty(self.network.network, minibatch[:PRICED_FRAMES])
+            total = total + settings.action_penalty * losses["action_penalty"]
         if experts and settings.cloning > 0 and not warming:
-            pairs = drawn(experts, settings.cloning_minibatch).to(self.network.device)
-            with self.network.network.noisy(settings.feature_noise, settings.last_action_noise):
-                losses["loss_cloning"] = cloning_loss(self.network.actor, pairs)
+            shown = drawn(experts, CLONED).to(self.network.device)
+            with self.network.network.noisy(FEATURE_NOISE, LAST_ACTION_NOISE):
+                losses["loss_cloning"] = cloning_loss(self.network.actor, shown)
             total = total + settings.cloning * losses["loss_cloning"]
         if labels is not None and settings.teaching > 0 and not warming:
-            pairs = drawn([labels], settings.cloning_minibatch).to(self.network.device)
-            pairs = torch.cat([mirrored_pairs(pairs[::2]), pairs[1::2]])  # what it teaches holds for both sides
-            losses["loss_teaching"] = teaching_loss(self.network.network, pairs)
+            shown = drawn([labels], CLONED).to(self.network.device)
+            shown = torch.cat([mirrored_demonstrations(shown[::2]), shown[1::2]])  # it holds for both sides
+            losses["loss_teaching"] = teaching_loss(self.network.network, shown)
             total = total + settings.teaching * losses["loss_teaching"]
-        take_step(self.optimiser, total, settings.max_grad_norm)
+        take_step(self.optimiser, total, MAX_GRAD_NORM)
         return {name: value.detach().mean() for name, value in losses.items()}
 
     @torch.no_grad()
@@ -202,12 +212,11 @@ class Learner:
         self.updates = state["updates"]
 
 
-def gentle_loss(network: ActorNetwork, frames: TensorDictBase) -> Tensor:
-    """Mean |acceleration| [] in units of 4 m/s^2 of the actor's most central actions in those of frames [M] (`seen`,
-    `offset`) that are `calm` [M]: no contact is in sight. Whoever is about to be hit may brake or accelerate as hard
-    as it helps.
+def action_penalty(network: ActorNetwork, frames: TensorDictBase) -> Tensor:
+    """Mean |acceleration| [] of the actor's most central actions, in units of 4 m/s^2.
 
-    A price on what the policy means to do, not on what exploration makes of it: under a standard deviation above 1
+    The mean is over those of frames [M] (`seen`, `offset`) that are `calm` [M], with no contact in sight: whoever is
+    about to be hit may brake or accelerate as hard as it helps. A price on what the policy means to do, not on what exploration makes of it: under a standard deviation above 1
     m/s^2 the price of the action itself (`sim.reward.acceleration`) hardly tells small accelerations from none.
     """
     loc, _ = network.head(frames["seen"], frames["offset"])

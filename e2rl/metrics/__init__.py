@@ -1,1 +1,15 @@
-"""Metrics: safety, realism and statistics as pure functions."""
+"""Verdicts, metrics and statistics of rollouts. The files imported here declare the package's own metrics."""
+
+from e2rl.metrics import (  # noqa: F401
+    contact,
+    displacement,
+    evasion,
+    failure_features,
+    failure_modes,
+    meta_metric,
+    off_road,
+    proximity,
+    realism,
+    score,
+    verdicts,
+)

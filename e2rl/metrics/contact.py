@@ -7,13 +7,13 @@ contact counts at steps >= 1. `stop` is the step of the ego's first contact with
 import torch
 from torch import Tensor
 
+from e2rl.metrics.catalogue import Batch, Metric, columns
 from e2rl.metrics.geometry import edge_distances, edge_parts_inside, pair_overlap, velocity
 from e2rl.metrics.realism import MOVING
 from e2rl.scenes.boxes import separation
 from e2rl.scenes.recording import DT, VEHICLE
 from e2rl.sim.dynamics import wrap
 
-Batch = dict[str, Tensor]
 FRONT, SIDE, REAR = 0, 1, 2
 KINDS = ("front", "side", "rear")
 EDGE_KIND = (SIDE, REAR, SIDE, FRONT)  # of geometry.EDGES
@@ -98,24 +98,64 @@ def kinds_at_stop(batch: Batch) -> Tensor:
     return torch.stack([front, right | left, rear], -1)
 
 
+@columns(
+    Metric(
+        "cfr",
+        "ego hits any vehicle",
+        fraction=True,
+        tables=("main", "traffic", "adversaries", "methods", "egos", "public"),
+    ),
+    Metric("cfr_adv", "ego hits an adversary", fraction=True, tables=("main", "adversaries", "methods")),
+    Metric("cfr_vru", "ego hits a pedestrian or cyclist", fraction=True, tables=("main", "public")),
+    Metric("front", "first contact at the ego's front", fraction=True, tables=("main", "adversaries", "egos")),
+    Metric("side", "first contact at the ego's side", fraction=True, tables=("main", "adversaries", "egos")),
+    Metric("rear", "first contact at the ego's rear", fraction=True, tables=("main", "adversaries", "egos")),
+    Metric("front_any", "ego's front in contact at first contact", fraction=True, tables=("egos",)),
+    Metric("side_any", "ego's side in contact at first contact", fraction=True, tables=("egos",)),
+    Metric("rear_any", "ego's rear in contact at first contact", fraction=True, tables=("egos",)),
+    Metric(
+        "rir",
+        "rear impacts per collision",
+        fraction=True,
+        per_collision=True,
+        tables=("main", "adversaries", "methods"),
+    ),
+    Metric(
+        "relvel",
+        "speed difference before contact",
+        unit="m/s",
+        per_collision=True,
+        tables=("main", "adversaries", "methods", "egos"),
+    ),
+    Metric(
+        "contact_time",
+        "median time of the first contact",
+        unit="s",
+        median=True,
+        per_collision=True,
+        tables=("main", "adversaries", "egos"),
+    ),
+    events=("contact_type", "partner", "contact_step", "start_overlap_ego"),
+    words={"contact_type": KINDS},
+)
 def contact_columns(batch: Batch) -> Batch:
     """Metrics of the ego's first contact; NaN where the ego overlaps a vehicle at the start already.
 
     relvel: |v_ego - v_partner| [m/s] at the step before contact.
     """
     states, hit, stop, unknown = (batch[key] for key in ("states", "hit", "stop", "start_overlap"))
-    columns = {"cfr": hit, "cfr_adv": (batch["touching"] & batch["adversaries"]).any(-1)}
+    found = {"cfr": hit, "cfr_adv": (batch["touching"] & batch["adversaries"]).any(-1)}
     for kind, (name, touched) in enumerate(zip(KINDS, kinds_at_stop(batch).unbind(1), strict=True)):
-        columns |= {name: batch["kind"] == kind, f"{name}_any": touched}
-    columns = {name: value.to(states.dtype).masked_fill(unknown, torch.nan) for name, value in columns.items()}
+        found |= {name: batch["kind"] == kind, f"{name}_any": touched}
+    found = {name: value.to(states.dtype).masked_fill(unknown, torch.nan) for name, value in found.items()}
     step = stop.to(states.dtype).masked_fill(~hit, torch.nan)
     row = torch.arange(len(states))
     before = velocity(states[row, batch["before"]])
     relative = (before[:, 0] - before[row, batch["partner"].clamp(min=0)]).norm(dim=-1)
     vulnerable = (batch["area"] > 0) & (batch["agent_type"] != VEHICLE)[:, None]
-    return columns | {
+    return found | {
         "cfr_vru": (vulnerable.any(-1) & steps_until(stop, states.shape[1])).any(-1).to(states.dtype),
-        "rir": columns["rear"].masked_fill(~hit, torch.nan),
+        "rir": found["rear"].masked_fill(~hit, torch.nan),
         "relvel": relative.masked_fill(~hit, torch.nan),
         "contact_step": step,
         "contact_time": step * DT,
@@ -125,6 +165,23 @@ def contact_columns(batch: Batch) -> Batch:
     }
 
 
+@columns(
+    Metric(
+        "cfr_bg",
+        "other simulated vehicles hit each other",
+        fraction=True,
+        tables=("main", "traffic", "adversaries", "methods"),
+    ),
+    Metric("bg_pairs", "pairs of other vehicles that hit each other"),
+    Metric(
+        "touched",
+        "moving vehicles that touch another simulated one",
+        fraction=True,
+        weight="moving_vehicles",
+        tables=("traffic",),
+    ),
+    events=("moving_vehicles", "start_overlap_bg"),
+)
 def traffic_contact_columns(batch: Batch) -> Batch:
     """Pairs of `traffic` vehicles that overlap at a step 1..stop, and the share of moving vehicles among them.
 
@@ -143,8 +200,8 @@ def traffic_contact_columns(batch: Batch) -> Batch:
     touched = torch.zeros_like(traffic, dtype=torch.int64)
     touched = touched.index_add(1, torch.cat([one, two]), meets.long().repeat(1, 2)) > 0
     pairs = meets.sum(-1)
-    columns = {"cfr_bg": (pairs > 0).to(states.dtype), "bg_pairs": pairs, "start_overlap_bg": overlap[:, 0].any(-1)}
-    return columns | touched_columns(batch, touched)
+    found = {"cfr_bg": (pairs > 0).to(states.dtype), "bg_pairs": pairs, "start_overlap_bg": overlap[:, 0].any(-1)}
+    return found | touched_columns(batch, touched)
 
 
 def nearby(states: Tensor, size: Tensor, one: Tensor, two: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -10,8 +10,22 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from e2rl.metrics.catalogue import OPEN_LOOP_STAGE, STAGES, Metric
 from e2rl.metrics.realism import MOVING
 from e2rl.scenes.recording import DT
+
+STAGES[OPEN_LOOP_STAGE] = tuple(
+    Metric(f"{name}_{horizon}", about.format(horizon), unit=unit)
+    for horizon in (3, 5)
+    for name, about, unit in (
+        ("min_ade", "mean displacement over {} s, each vehicle's best sample", "m"),
+        ("mean_ade", "the same, mean over samples", "m"),
+        ("joint_ade", "the same, the scene's best sample for all its vehicles", "m"),
+        ("cv_ade", "constant velocity's displacement over {} s, same vehicles", "m"),
+        ("min_ade_ratio", "min_ade over cv_ade at {} s", ""),
+        ("mean_ade_ratio", "mean_ade over cv_ade at {} s", ""),
+    )
+)
 
 
 def moving_vehicles(logged: Tensor, logged_valid: Tensor, simulated: Tensor, steps: int) -> Tensor:

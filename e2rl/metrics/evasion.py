@@ -1,19 +1,17 @@
-"""Which collisions the ego could have avoided: columns of the rollouts' rows (docs/method.md, section 10).
+"""Which collisions the ego could have avoided, found by search (docs/method.md, section 10).
 
-The search for actions of the ego that avoid contact, given how everybody else moved (docs/method.md, section 10).
-
-The others are fixed: they do not react. Candidates are longitudinal profiles on lateral targets (the ego's routes, and
-shifts beside its mission). Where none is clean, an evolution strategy perturbs the knots of the best ones. What it
-finds proves that a collision was avoidable; what it does not find proves nothing.
+The others move as they did: they do not react. Candidates are longitudinal profiles on lateral targets (the ego's
+routes, and shifts beside its mission). Where none is clean, an evolution strategy perturbs the knots of the best ones.
+What it finds proves that a collision was avoidable; what it does not find proves nothing.
 """
 
 import time
-from dataclasses import dataclass
 
 import torch
 from tensordict import TensorClass, TensorDictBase
 from torch import Tensor
 
+from e2rl.metrics.catalogue import Metric, declare
 from e2rl.metrics.manoeuvre import (
     KNOT_STEPS,
     EvasionScene,
@@ -26,6 +24,7 @@ from e2rl.metrics.manoeuvre import (
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
 from e2rl.sim.env import SimSettings
+from e2rl.sim.rollouts import Rollouts
 
 BRAKES = (2.0, 4.0, 6.0, 8.0)  # m/s^2, held from a moment on
 PULSES = ((3.0, 1.0), (3.0, 2.0), (6.0, 1.0), (6.0, 2.0), (-2.0, 2.0), (-4.0, 2.0))  # m/s^2 of braking, s it lasts
@@ -36,24 +35,24 @@ TARGETS = 8  # lateral targets a profile is tried on
 CHUNK = 8  # rollouts searched at once: bounds the memory
 
 
-@dataclass(frozen=True)
-class SearchSettings:
-    """clearance [m] that an evasion keeps to others, and road_margin [m] that its centre keeps inside the drivable
-    border, which lies 1 m beyond the lanes (recorded egos keep 0.8 m); the strategy's samples per round, survivors and
-    largest number of rounds, and its largest standard deviations of an acceleration [m/s^2] and of a shift [m]."""
+CLEARANCE = 0.05  # m that an evasion keeps to others
+ROAD_MARGIN = 0.5  # m inside the drivable border (1 m beyond the lanes) that its centre keeps; recorded egos keep 0.8
+SAMPLES, SURVIVORS, ROUNDS = 192, 24, 16  # of the strategy: per round, parents, at most
+ACCEL_STD, SHIFT_STD = 4.0, 2.0  # m/s^2, m: largest standard deviations of the strategy
+LATE = 1.0  # s before contact at which the late search starts
 
-    clearance: float = 0.05
-    road_margin: float = 0.5
-    samples: int = 192
-    survivors: int = 24
-    rounds: int = 16
-    accel_std: float = 4.0
-    shift_std: float = 2.0
-
-    def effort(self, steps: int) -> str:
-        """What is tried before a collision counts as not avoided, in words."""
-        count = len(profiles(torch.zeros(1, steps))[0]) * TARGETS
-        return f"{count} manoeuvres, then {self.rounds} rounds of {self.samples}"
+declare(
+    Metric(
+        "avoidable",
+        "collisions that some ego actions avoid, found by search",
+        fraction=True,
+        per_collision=True,
+        tables=("main", "adversaries"),
+    ),
+    Metric("avoidable_1s", "the same, acting only 1 s before contact", fraction=True, per_collision=True),
+    Metric("evasion_accel", "peak acceleration of the mildest evasion found", unit="m/s²", per_collision=True),
+    events=("evasion_tried", "evasion_seconds"),
+)
 
 
 class Evasions(TensorClass):
@@ -90,45 +89,40 @@ class Trials(TensorClass):
 
 
 def find_evasions(
-    scene: TensorDictBase,
-    states: Tensor,
-    valid: Tensor,
-    sim: SimSettings,
-    settings: SearchSettings | None = None,
-    moment: Tensor | None = None,
+    scene: TensorDictBase, states: Tensor, valid: Tensor, sim: SimSettings, moment: Tensor | None = None
 ) -> Evasions:
-    """Search for evasions in scenes [B >= 1] with agents at states [B, T+1, N, 4], valid [B, T+1, N], the ego first.
+    """The mildest evasion found of each rollout; all draw the same numbers, so a result does not depend on the batch.
 
-    moment [B]: the step from which the ego may act otherwise (default 0, the start); an evasion holds the T steps from
-    there on and counts to the last recorded one. All rollouts draw the same numbers, so that a result does not depend
-    on the batch.
+    Args:
+        scene: scenes [B >= 1].
+        states, valid: [B, T+1, N, 4] and [B, T+1, N], motion of the agents, the ego first.
+        sim: the ego's limits.
+        moment: [B] int64, the step from which the ego may act otherwise (None: the start). An evasion holds the T steps
+            from there on and counts to the last recorded one.
     """
-    settings = settings or SearchSettings()
     moment = torch.zeros(len(states), dtype=torch.int64, device=states.device) if moment is None else moment
     rows = torch.arange(len(states), device=states.device).split(CHUNK)
-    parts = [_search(scene[row], states[row].float(), valid[row], moment[row], sim, settings) for row in rows]
+    parts = [_search(scene[row], states[row].float(), valid[row], moment[row], sim) for row in rows]
     return Evasions.cat(parts)
 
 
-def _search(
-    scene: TensorDictBase, states: Tensor, valid: Tensor, moment: Tensor, sim: SimSettings, settings: SearchSettings
-) -> Evasions:
+def _search(scene: TensorDictBase, states: Tensor, valid: Tensor, moment: Tensor, sim: SimSettings) -> Evasions:
     steps = states.shape[1] - 1
     driven = dynamics.inverse(states[:, :, 0])[..., 0].masked_fill(~valid[:, 1:, 0], 0.0)
     driven = driven.gather(1, (moment[:, None] + torch.arange(steps, device=moment.device)).clamp(max=steps - 1))
     task = EvasionScene.after(moment, scene, states, valid)
-    pool = _try(task, *grid(driven, scene["route_valid"][:, 0], scene["route_log"][:, 0]), sim, settings)
+    pool = _try(task, *grid(driven, scene["route_valid"][:, 0], scene["route_log"][:, 0]), sim)
     result = pool.evasions(torch.full_like(moment, pool.batch_size[1]))
     row = torch.arange(len(states), device=states.device)
     generator = torch.Generator().manual_seed(0)
-    for _ in range(settings.rounds):
+    for _ in range(ROUNDS):
         left = ~result.found[row]
         row, task, pool = row[left], task[left], pool[left]
         if not len(row):
             break
-        parents = pool.best(settings.survivors)
-        pool = Trials.cat([parents, _try(task, *_mutated(parents, settings, generator), sim, settings)], 1)
-        result[row] = pool.evasions(result.tried[row] + settings.samples)
+        parents = pool.best(SURVIVORS)
+        pool = Trials.cat([parents, _try(task, *_mutated(parents, generator), sim)], 1)
+        result[row] = pool.evasions(result.tried[row] + SAMPLES)
     return result
 
 
@@ -171,24 +165,23 @@ def grid(driven: Tensor, route_valid: Tensor, mission: Tensor) -> tuple[Tensor, 
     return route[:, None].expand(shape).flatten(1), knots_each[0], knots_each[1]
 
 
-def _try(
-    task: EvasionScene, route: Tensor, accel: Tensor, shift: Tensor, sim: SimSettings, settings: SearchSettings
-) -> Trials:
+def _try(task: EvasionScene, route: Tensor, accel: Tensor, shift: Tensor, sim: SimSettings) -> Trials:
+    """The manoeuvres of these knots, executed and judged."""
     row = torch.arange(len(route), device=route.device)[:, None]
     start = task.start[:, None].expand(*route.shape, 4)
     actions, states = execute(start, task.routes[row, route], accel, shift, task.inside.shape[1], sim)
-    violation = violations(states, task, settings.clearance, settings.road_margin).sum(-1)
+    violation = violations(states, task, CLEARANCE, ROAD_MARGIN).sum(-1)
     peak = peak_acceleration(start, states)
     return Trials(route, accel, shift, actions, states, violation, peak, batch_size=route.shape)
 
 
-def _mutated(parents: Trials, settings: SearchSettings, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-    """Route, acceleration and shift knots of `samples` children of parents [B, C], better ones more often.
+def _mutated(parents: Trials, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    """Route, acceleration and shift knots of SAMPLES children of parents [B, C], better ones more often.
 
     The disturbances of knots are smooth over about 1 s, and of a strength drawn for each child, so that small and large
     changes are both tried.
     """
-    count, knots, device = settings.samples, parents.accel.shape[-1], parents.accel.device
+    count, knots, device = SAMPLES, parents.accel.shape[-1], parents.accel.device
     parent = torch.rand(count, generator=generator).to(device)
     strength = torch.rand(count, 2, generator=generator).square() + 0.02
     gap = torch.arange(knots)[:, None] - torch.arange(knots)
@@ -198,30 +191,31 @@ def _mutated(parents: Trials, settings: SearchSettings, generator: torch.Generat
     accel, shift = (white @ smooth.T * strength.T[..., None]).to(device)
     index = (parent.square() * parents.route.shape[1]).long()
     parents = parents[:, index]
-    return parents.route, parents.accel + settings.accel_std * accel, parents.shift + settings.shift_std * shift
+    return parents.route, parents.accel + ACCEL_STD * accel, parents.shift + SHIFT_STD * shift
 
 
-LATE = 1.0  # s before contact at which the late search starts
+def add_avoidable(rows: list[dict], rollouts: Rollouts, scene: TensorDictBase, sim: SimSettings) -> None:
+    """Search the collisions of the ego for evasions; what is found goes into the rows and into `rollouts.evasion`.
 
-
-def add_avoidable(rows: list[dict], rollouts: dict, scene: TensorDictBase, sim: SimSettings) -> Tensor:
-    """Add to the rows (of score_rollouts, in place) of rollouts whose ego hit a vehicle: avoidable and avoidable_1s (0
-    or 1: an evasion was found from the start frame, from LATE seconds before contact), evasion_accel [m/s^2] of the
-    mildest one from the start, evasion_tried (manoeuvres driven) and evasion_seconds. Other rows: NaN.
-
-    rollouts: the rollout dict [B] of the rows; scene: their scenes [B]. Returns the evasions [B, T+1, 4] of the ego,
-    the mildest one from the start where there is one; NaN where none was found.
+    Args:
+        rows: of `score_rollouts`. Those with a collision get avoidable and avoidable_1s (0 or 1: an evasion was found
+            from the start, from LATE seconds before contact), evasion_accel [m/s^2] of the mildest one from the start,
+            evasion_tried (manoeuvres driven) and evasion_seconds.
+        rollouts: [B], those of the rows. `evasion` [B, T+1, 4] is the ego's mildest one from the start where there is
+            one, else the late one; NaN where none was found.
+        scene: their scenes [B].
+        sim: the ego's limits.
     """
-    evasions = torch.full_like(rollouts["states"][:, :, 0], torch.nan)
+    rollouts.evasion = torch.full_like(rollouts.states[:, :, 0], torch.nan)
     collided = [index for index, row in enumerate(rows) if row["cfr"] == 1]
     if not collided:
-        return evasions
+        return
     begin, picked = time.perf_counter(), torch.tensor(collided)
-    given = scene[picked], rollouts["states"][picked], rollouts["valid"][picked]
+    given = scene[picked], rollouts.states[picked], rollouts.valid[picked]
     contact = torch.tensor([int(rows[index]["contact_step"]) for index in collided])
     early = find_evasions(*given, sim)
     moment = (contact - round(LATE / DT)).clamp(min=0)
-    late = find_evasions(*given, sim, moment=moment)
+    late = find_evasions(*given, sim, moment)
     found = early.found | late.found  # avoidable late implies avoidable early: drive as in the rollout until then
     peak = torch.where(early.found, early.peak, torch.where(late.found, late.peak, torch.nan))
     spent = (time.perf_counter() - begin) / len(collided)
@@ -234,9 +228,8 @@ def add_avoidable(rows: list[dict], rollouts: dict, scene: TensorDictBase, sim: 
             "evasion_seconds": spent,
         }
     driven = given[1][:, :, 0]
-    evasions[picked[late.found]] = spliced(driven, late.states, moment)[late.found]
-    evasions[picked[early.found]] = spliced(driven, early.states, torch.zeros_like(moment))[early.found]
-    return evasions
+    rollouts.evasion[picked[late.found]] = spliced(driven, late.states, moment)[late.found]
+    rollouts.evasion[picked[early.found]] = spliced(driven, early.states, torch.zeros_like(moment))[early.found]
 
 
 def spliced(driven: Tensor, states: Tensor, moment: Tensor) -> Tensor:
@@ -249,4 +242,5 @@ def spliced(driven: Tensor, states: Tensor, moment: Tensor) -> Tensor:
 
 def search_effort(steps: int) -> str:
     """Caption on the search behind `avoidable`, for rollouts of `steps` steps."""
-    return f"avoidable: not found after {SearchSettings().effort(steps)} counts as no"
+    count = len(profiles(torch.zeros(1, steps))[0]) * TARGETS
+    return f"avoidable: not found after {count} manoeuvres, then {ROUNDS} rounds of {SAMPLES} counts as no"

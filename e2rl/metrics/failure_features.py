@@ -10,7 +10,7 @@ import math
 import torch
 from torch import Tensor
 
-from e2rl.metrics.contact import Batch
+from e2rl.metrics.catalogue import Batch, columns
 from e2rl.metrics.fault import ego_path_boxes
 from e2rl.scenes.boxes import separation, to_frame
 from e2rl.scenes.recording import DT
@@ -37,6 +37,10 @@ LANE_REACH = 4.0  # m to the lane that runs a vehicle's way; farther, its own fi
 LANE_ANGLE = 4.0  # m/rad: of lanes that overlap, the one that runs as the vehicle does is preferred
 
 
+@columns(
+    events=("approach", "ego_manoeuvre", "partner_manoeuvre", "ego_speed", "partner_speed"),
+    words={"approach": APPROACHES, "ego_manoeuvre": MANOEUVRES, "partner_manoeuvre": MANOEUVRES},
+)
 def failure_columns(batch: Batch) -> Batch:
     """approach, ego_manoeuvre, partner_manoeuvre [B]: indices into APPROACHES and MANOEUVRES, -1 without a contact;
     ego_speed, partner_speed [B]: m/s at the step before the contact, NaN without one."""

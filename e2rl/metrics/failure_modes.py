@@ -18,6 +18,8 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import cdist, pdist
 
+from e2rl.metrics.catalogue import Metric, declare
+
 Row = Mapping[str, Any]
 THRESHOLD = 1.0  # mean distance of two groups of failures up to which they are one mode
 SPEED_WEIGHT = 0.025  # of a difference of 1 m/s
@@ -25,6 +27,29 @@ AGREED = 2 / 3  # share of a mode's failures that a word of its name is true of
 LEAST, MANY = 0.02, 10  # share of the failures that a mode has at least, and two of them where there are MANY failures
 SIDE = re.compile(r"(?: from the| on the)? (left|right)$")
 SPEEDS = ("ego_speed", "partner_speed")
+PLACES = 10  # at which `mode_coverage` looks: failures at fewer places give none
+
+declare(
+    Metric(
+        "mode_coverage",
+        f"failure modes expected of collisions at {PLACES} places",
+        decimals=1,
+        column="mode",
+        places=PLACES,
+        per_collision=True,
+        tables=("adversaries",),
+    ),
+    Metric(
+        "mode_coverage_counted",
+        "the same, of collisions that count",
+        decimals=1,
+        column="mode",
+        weight="counted",
+        places=PLACES,
+        per_collision=True,
+        tables=("adversaries",),
+    ),
+)
 
 
 @dataclass(frozen=True)

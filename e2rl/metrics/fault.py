@@ -8,7 +8,8 @@ that a moving vehicle hits at its rear or side, is not at fault.
 import torch
 from torch import Tensor
 
-from e2rl.metrics.contact import FRONT, Batch
+from e2rl.metrics.catalogue import Batch
+from e2rl.metrics.contact import FRONT
 from e2rl.scenes.boxes import separation
 from e2rl.sim.neighbours import STANDING
 

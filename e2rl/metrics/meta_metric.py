@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from e2rl.metrics.catalogue import META_STAGE, STAGES, Metric
 from e2rl.scenes.boxes import corners, signed_distance
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT, LIGHT_RED
@@ -171,6 +172,14 @@ FEATURES = {
     "offroad": Feature(0.25),
     "red_light": Feature(0.05),
 }
+STAGES[META_STAGE] = (
+    Metric("meta_metric", "realism meta-metric, weighted likelihood of the log"),
+    *(
+        Metric(name, f"likelihood of the logged {name.replace('_', ' ')}, weight {feature.weight:g}")
+        for name, feature in FEATURES.items()
+    ),
+    Metric("real_split_half", "`real` of one half of the logs against the other", decimals=3),
+)
 HISTOGRAMS = tuple(name for name, feature in FEATURES.items() if feature.bins)
 INDICATIONS = tuple(name for name, feature in FEATURES.items() if not feature.bins)
 

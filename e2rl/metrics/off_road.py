@@ -7,7 +7,8 @@ Distances are exact, from point to segment; a grid of buckets keeps the work nea
 import torch
 from torch import Tensor
 
-from e2rl.metrics.contact import Batch, steps_until
+from e2rl.metrics.catalogue import Batch, Metric, columns
+from e2rl.metrics.contact import steps_until
 from e2rl.metrics.geometry import candidates, from_segment
 
 MARGIN = 1.0  # m beyond half the lane width
@@ -81,6 +82,18 @@ def on_road(points: Tensor, rollout: Tensor, batch: Batch) -> Tensor:
     return near
 
 
+@columns(
+    Metric(
+        "aor_step",
+        "off the road, of vehicle-steps",
+        fraction=True,
+        weight="aor_vehicle_steps",
+        tables=("main", "traffic", "adversaries", "methods", "public"),
+    ),
+    Metric("aor_any", "off the road, of rollouts", fraction=True, tables=("main", "traffic", "methods")),
+    Metric("ego_off_road", "ego leaves the road", fraction=True, tables=("main", "egos", "public")),
+    events=("aor_vehicle_steps", "aor_left_out"),
+)
 def off_road_columns(batch: Batch) -> Batch:
     """`aor_step` and `aor_any` [B] of the traffic at steps 1..stop, and the vehicle-steps they rest on; `ego_off_road`
     [B], 0 or 1: the ego leaves the road.

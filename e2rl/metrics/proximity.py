@@ -7,7 +7,8 @@ Vehicles that stand at the start: parked ones should stay, some of those on a la
 import torch
 from torch import Tensor
 
-from e2rl.metrics.contact import Batch, steps_until
+from e2rl.metrics.catalogue import Batch, Metric, columns
+from e2rl.metrics.contact import steps_until
 from e2rl.metrics.geometry import velocity
 from e2rl.scenes.boxes import distance
 from e2rl.scenes.recording import DT
@@ -17,6 +18,21 @@ SMOOTHING = 0.5  # s, moving average of the ego's speed before its derivative
 LEAST_WAY = 1.0  # m: of a shorter recorded way no share is known
 
 
+@columns(
+    Metric("min_dtc", "smallest gap to another agent", unit="m", tables=("main", "methods")),
+    Metric("ttc_c", "time-to-collision cost, adversaries", tables=("main", "adversaries", "methods")),
+    Metric("ttc_c_all", "time-to-collision cost, all agents"),
+    Metric("macc", "ego's mean |acceleration|", unit="m/s²", tables=("main", "egos", "public")),
+    Metric("progress", "distance that the ego drives", unit="m", tables=("main", "egos", "public")),
+    Metric(
+        "route_completion",
+        "fraction of the recorded ego's path driven until contact",
+        fraction=True,
+        tables=("public",),
+    ),
+    Metric("failures_per_km", "`cfr`, of all that the ego drives", unit="1/km", column="cfr", per="driven_km"),
+    Metric("counted_per_km", "the same of `cfr_counted`", unit="1/km", column="cfr_counted", per="driven_km"),
+)
 def motion_columns(batch: Batch) -> Batch:
     """min_dtc, ttc_c, ttc_c_all, macc, progress, driven_km and route_completion over the steps 1..stop; NaN without any
     agent to measure them on."""
@@ -126,7 +142,21 @@ def moved(states: Tensor, valid: Tensor) -> Tensor:
     return ((distance > MOVED) & valid).any(1)
 
 
-def standing_columns(batch: dict[str, Tensor]) -> dict[str, Tensor]:
+@columns(
+    Metric(
+        "parked_moved", "parked vehicles that move > 2 m", fraction=True, weight="parked_vehicles", tables=("traffic",)
+    ),
+    Metric(
+        "starts",
+        "standing vehicles that start, over the log's",
+        fraction=True,
+        column="starters",
+        per="starters_log",
+        tables=("traffic",),
+    ),
+    events=("parked_vehicles", "starters_log"),
+)
+def standing_columns(batch: Batch) -> Batch:
     """parked_moved, starters and what they rest on, each [B], of `traffic` vehicles recorded throughout.
 
     parked_moved: share of the parked_vehicles that move. starters: vehicles slower than STANDING at the start, not
@@ -140,10 +170,10 @@ def standing_columns(batch: dict[str, Tensor]) -> dict[str, Tensor]:
     parked = counted & batch["parked"]
     standing = counted & ~batch["parked"] & (states[:, 0, :, 3] < STANDING)
     now, log = moved(states, batch["valid"]), moved(batch["logged"], batch["logged_valid"])
-    columns = {
+    found = {
         "parked_moved": (parked & now).sum(-1) / parked.sum(-1),
         "parked_vehicles": parked.sum(-1),
         "starters": (standing & now).sum(-1),
         "starters_log": (standing & log).sum(-1),
     }
-    return {name: value.to(states.dtype) for name, value in columns.items()}
+    return {name: value.to(states.dtype) for name, value in found.items()}

@@ -10,6 +10,7 @@ real_adv is `real` of the adversaries alone, against the logs of the same vehicl
 import torch
 from torch import Tensor
 
+from e2rl.metrics.catalogue import Metric, declare
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
 
@@ -21,6 +22,27 @@ BLOCK = round(0.5 / DT)  # steps
 MOVING = 0.5  # m/s
 COLUMNS = 8192  # sorted samples handled at once: bounds the memory of the bootstrap
 Samples = dict[str, Tensor]
+
+declare(
+    Metric(
+        "real",
+        "realism, 1 - mean capped W1",
+        decimals=3,
+        samples="a_lon",
+        tables=("main", "traffic", "adversaries", "methods"),
+    ),
+    Metric(
+        "real_adv",
+        "realism of the adversaries alone",
+        decimals=3,
+        samples="a_lon_adversary",
+        tables=("main", "adversaries", "methods", "public"),
+    ),
+    Metric("real_norm", "realism, W1 over the log's range", decimals=3, samples="a_lon", tables=("main", "traffic")),
+    Metric("w1_a_lon", "W1 of longitudinal acceleration", unit="m/s²", samples="a_lon", tables=("traffic",)),
+    Metric("w1_a_lat", "W1 of lateral acceleration", unit="m/s²", samples="a_lon", tables=("traffic",)),
+    Metric("w1_jerk", "W1 of |jerk|", unit="m/s³", samples="a_lon", tables=("traffic",)),
+)
 
 
 def kinematic_samples(

@@ -5,38 +5,66 @@ import math
 import torch
 from torch import Tensor
 
-from e2rl.metrics.catalogue import COMPUTE, METRICS, WORDS, row_columns
+from e2rl.metrics.catalogue import COMPUTE, METRICS, WORDS, Batch, Metric, columns, row_columns
 from e2rl.metrics.contact import first_contact
 from e2rl.metrics.realism import Samples, realism, traffic_samples
+from e2rl.metrics.verdicts import judge
+from e2rl.sim.rollouts import Rollouts
 
 CHUNK = 32  # rollouts scored at once: bounds the memory of the pairwise steps
 
 
-def score_rollouts(rollouts: dict) -> tuple[list[dict], list[Samples]]:
-    """(rows, samples): a dict of plain numbers and the realism samples of each of B rollouts.
+@columns(
+    Metric("transport", "path KL of the control", tables=("main", "adversaries")),
+    Metric("transport_adversary", "path KL of the control, adversaries"),
+    Metric("transport_others", "path KL of the control, other vehicles"),
+    Metric("transport_anchor", "anchor jump"),
+)
+def transport_columns(batch: Batch) -> Batch:
+    """The control's path KL of adversaries and others, their sum `transport`, and the anchor's jump, where known."""
+    names = ("transport_adversary", "transport_others", "transport_anchor")
+    known = {name: batch[name].to(batch["states"].dtype) for name in names if name in batch}
+    return known | ({"transport": known[names[0]] + known[names[1]]} if known else {})
 
-    `rollouts` holds tensors with leading B: states [B, T+1, N, 4] (ego in row 0), valid [B, T+1, N], size [B, N, 2],
-    agent_type [B, N] (0 vehicle), simulated, adversaries [B, N], logged, logged_valid as states and valid, lane_points
-    [B, M, 2], lane_index [B, M], lane_width [B, L], drivable_points [B, D, 2], drivable_index [B, D], seed [B], seconds
-    [B], eta (a number or [B]), lists scene_id, location, and where known parked [B, N], transport_adversary, _others,
-    _anchor [B]. Both results go to `statistics.summarise`. A row's own realism rests on few samples; sets of rollouts
-    pool them.
+
+@columns(
+    Metric(
+        "seconds_per_rollout", "wall time", unit="s", column="seconds", cost=True, tables=("main", "traffic", "methods")
+    ),
+    Metric(
+        "nfe",
+        "evaluations of the prior's network per rollout, one with a gradient twice",
+        cost=True,
+        tables=("main", "methods"),
+    ),
+)
+def cost_columns(batch: Batch) -> Batch:
+    """Wall time and evaluations of the prior's network, where known."""
+    return {name: batch[name].to(batch["states"].dtype) for name in ("seconds", "nfe") if name in batch}
+
+
+def score_rollouts(rollouts: Rollouts) -> tuple[list[dict], list[Samples]]:
+    """Rows and realism samples of B rollouts, both for `statistics.summarise`.
+
+    A row is a dict of plain numbers and words, one entry for each of `catalogue.row_columns`, NaN where it is unknown.
+    Its own realism rests on few samples; sets of rollouts pool them. Sets `rollouts.driver`: the way of the competent
+    driver of the verdict, NaN for rollouts without a collision.
     """
-    count = len(rollouts["states"])
-    identity = {name: rollouts[name] for name in ("scene_id", "location", "seed", "seconds")}
-    identity["eta"] = torch.as_tensor(rollouts["eta"], dtype=torch.float64).expand(count)
-    rows, samples = [], []
-    for begin in range(0, count, CHUNK):
-        part = slice(begin, begin + CHUNK)
-        columns, found = score_batch(as_doubles(rollouts, part))
-        rows += plain_rows(columns | {name: values[part] for name, values in identity.items()}, len(found))
-        samples += found
+    rows, samples, drivers = [], [], []
+    for begin in range(0, len(rollouts), CHUNK):
+        part = rollouts[begin : begin + CHUNK]
+        found, features, driver = score_batch(as_doubles(part))
+        identity = {"scene_id": part.scene_id, "location": part.location, "seed": part.seed, "eta": part.eta}
+        rows += plain_rows(found | identity, len(part))
+        samples += features
+        drivers.append(driver)
+    rollouts.driver = torch.cat(drivers).float()
     return rows, samples
 
 
-def as_doubles(rollouts: dict, part: slice) -> dict[str, Tensor]:
-    """The tensors of some rollouts on the CPU, positions in float64, absent states zero (they may hold anything)."""
-    batch = {key: value[part].cpu() for key, value in rollouts.items() if isinstance(value, Tensor) and value.dim()}
+def as_doubles(rollouts: Rollouts) -> Batch:
+    """The tensors of rollouts on the CPU, positions in float64, absent states zero (they may hold anything)."""
+    batch = {key: value.cpu() for key, value in rollouts.items() if isinstance(value, Tensor)}
     for key, mask in (("states", "valid"), ("logged", "logged_valid")):
         batch[key] = batch[key].double().masked_fill(~batch[mask][..., None], 0.0)
     for key in ("size", "lane_points", "lane_width", "drivable_points"):
@@ -44,30 +72,31 @@ def as_doubles(rollouts: dict, part: slice) -> dict[str, Tensor]:
     return batch
 
 
-def score_batch(batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], list[Samples]]:
-    """(columns {name: [B]}, realism samples per rollout) of a batch in float64."""
+def score_batch(batch: Batch) -> tuple[Batch, list[Samples], Tensor]:
+    """Columns {name: [B]}, realism samples per rollout, and the competent driver's states [B, T+1, 4] of a batch."""
     traffic = batch["simulated"].clone()
     traffic[:, 0] = False
     batch = batch | {"traffic": traffic} | first_contact(batch)
-    columns: dict[str, Tensor] = {}
+    verdicts, driver = judge(batch)
+    batch, result = batch | verdicts, verdicts
     for name, compute in COMPUTE.items():
         found = compute(batch)
-        columns |= found if isinstance(found, dict) else {METRICS[name].source: found}
-    wrong = [name for name, column in columns.items() if column.shape != batch["stop"].shape]
+        result |= found if isinstance(found, dict) else {METRICS[name].source: found}
+    wrong = [name for name, column in result.items() if column.shape != batch["stop"].shape]
     if wrong:
         raise ValueError(f"{', '.join(wrong)}: a metric is one number per rollout, a tensor [{len(traffic)}] here")
     samples = traffic_samples(batch)
     once, owner = torch.ones(1, 1, dtype=torch.float64), torch.zeros(1, dtype=torch.int64)
     single = [realism([sample], owner, once) for sample in samples]
-    return columns | {name: torch.cat([values[name] for values in single]) for name in single[0]}, samples
+    return result | {name: torch.cat([values[name] for values in single]) for name in single[0]}, samples, driver
 
 
-def plain_rows(columns: dict[str, Tensor | list], count: int) -> list[dict]:
+def plain_rows(found: dict[str, Tensor | list], count: int) -> list[dict]:
     """One dict of python values per rollout; NaN for columns of the catalogue that nothing computed.
 
     Columns of `catalogue.WORDS`, such as contact_type, become words; their index -1 becomes "".
     """
-    lists = {name: value.tolist() if isinstance(value, Tensor) else value for name, value in columns.items()}
+    lists = {name: value.tolist() if isinstance(value, Tensor) else value for name, value in found.items()}
     for name, words in WORDS.items():
         lists[name] = [words[index] if index >= 0 else "" for index in lists[name]]
     unknown = dict.fromkeys(row_columns(), math.nan)

@@ -2,10 +2,9 @@
 
 A collision counts if it is the ego's fault or a careful and competent driver in its place would have prevented it.
 
-Which duty the ego's partner broke in a collision (docs/verdicts.md).
-
-In this order: it ran into the ego from behind; it had crossed a stop line at red; it drove against its lane; it crossed
-the ego's way, or came into it, leaving less than a careful and competent driver needs to brake.
+The partner broke the first of these duties that applies: it ran into the ego from behind; it had crossed a stop line at
+red; it drove against its lane; it crossed the ego's way, or came into it, leaving less than a careful and competent
+driver needs to brake.
 """
 
 from typing import NamedTuple
@@ -13,7 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from e2rl.metrics.contact import REAR, Batch
+from e2rl.metrics.catalogue import Batch, Metric, declare
+from e2rl.metrics.contact import REAR
 from e2rl.metrics.drivers import DRIVERS, HumanDriver
 from e2rl.metrics.fault import at_fault
 from e2rl.metrics.preventable import Collision, Tracks, along_way, driven_length, held, preventions
@@ -102,29 +102,69 @@ def _against(track: Tensor, stop: Tensor, lanes: Lanes) -> Tensor:
     return against.float().mean(-1) >= 0.5
 
 
+declare(
+    Metric(
+        "cfr_counted",
+        "a failure that counts: preventable, or the ego's fault",
+        fraction=True,
+        tables=("main", "adversaries", "methods", "egos", "public"),
+    ),
+    Metric(
+        "cfr_preventable",
+        "a failure that a competent driver prevents",
+        fraction=True,
+        tables=("main", "adversaries", "methods", "egos", "public"),
+    ),
+    Metric("counted", "collisions that count", fraction=True, per_collision=True, tables=("main", "adversaries")),
+    Metric(
+        "at_fault",
+        "ego's fault, per collision",
+        fraction=True,
+        per_collision=True,
+        tables=("main", "adversaries", "methods", "egos", "public"),
+    ),
+    Metric(
+        "preventable",
+        "prevented by UN R157's careful and competent driver",
+        fraction=True,
+        per_collision=True,
+        tables=("main", "adversaries", "methods", "egos"),
+    ),
+    Metric("preventable_fsm", "prevented by the fuzzy safety model", fraction=True, per_collision=True),
+    Metric("preventable_rss", "prevented by RSS", fraction=True, per_collision=True),
+    Metric("preventable_regulation", "prevented at UN R157's limit", fraction=True, per_collision=True),
+    Metric("preventable_chain", "prevented if a follower brakes, too", fraction=True, per_collision=True),
+    events=("duty",),
+    words={"duty": DUTIES},
+)
 COLUMNS = ("preventable", *(f"preventable_{name}" for name in DRIVERS if name != "human"), "preventable_chain")
 
 
-def verdict_columns(batch: Batch) -> Batch:
-    """Of each collision: at_fault, preventable (by the human driver) and preventable_<model>, counted (0 or 1),
-    preventable_chain (a follower's braking was needed for it), duty (index into DUTIES, -1 without a collision). Of
-    each rollout: cfr_counted, cfr_preventable. Each [B], NaN where unknown."""
+def judge(batch: Batch) -> tuple[Batch, Tensor]:
+    """The verdicts on B rollouts, and the way of the driver that they rest on.
+
+    Returns:
+        columns: [B] each, NaN where unknown. Of each collision: at_fault, preventable (by the human driver) and
+            preventable_<model>, counted (0 or 1), preventable_chain (a follower's braking was needed for it), duty
+            (index into DUTIES, -1 without a collision). Of each rollout: cfr_counted, cfr_preventable.
+        driver: states [B, T+1, 4] of the human driver in the ego's place, NaN without a collision.
+    """
     hit, fault = batch["hit"], at_fault(batch)
-    columns = {name: torch.full_like(fault, torch.nan) for name in COLUMNS}
-    duty = torch.full_like(batch["stop"], -1)
+    found = {name: torch.full_like(fault, torch.nan) for name in COLUMNS}
+    duty, driver = torch.full_like(batch["stop"], -1), torch.full_like(batch["states"][:, :, 0], torch.nan)
     if hit.any():
-        found, duty[hit] = collision_verdicts(batch, hit)
-        for name, value in found.items():
-            columns[name][hit] = value
-    counted = torch.maximum(fault, columns["preventable"])
+        of_hits, duty[hit], driver[hit] = collision_verdicts(batch, hit)
+        for name, value in of_hits.items():
+            found[name][hit] = value
+    counted = torch.maximum(fault, found["preventable"])
     known = torch.zeros_like(fault).masked_fill(batch["start_overlap"], torch.nan)
-    shares = {"cfr_counted": counted, "cfr_preventable": columns["preventable"]}
-    shares = {name: torch.where(hit, value, known) for name, value in shares.items()}
-    return columns | shares | {"at_fault": fault, "counted": counted, "duty": duty}
+    rates = {"cfr_counted": counted, "cfr_preventable": found["preventable"]}
+    rates = {name: torch.where(hit, value, known) for name, value in rates.items()}
+    return found | rates | {"at_fault": fault, "counted": counted, "duty": duty}, driver
 
 
-def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor]:
-    """COLUMNS and duty of the collisions hit [B] bool."""
+def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor, Tensor]:
+    """COLUMNS, duty and driver's states [C, T+1, 4] of the C collisions hit [B] bool."""
     vehicles = (batch["valid"] & (batch["agent_type"] == VEHICLE)[:, None])[hit]
     collision = Collision(batch["states"][hit], vehicles, batch["size"][hit], batch["partner"][hit], batch["stop"][hit])
     row, ran = torch.arange(len(collision.stop)), batch.get("ran_light")
@@ -133,8 +173,8 @@ def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor]:
     duty = duties(collision, batch["kind"][hit] == REAR, red, lanes)
     result = preventions(collision)
     dtype = batch["states"].dtype
-    columns = {f"preventable_{name}": value.avoided.to(dtype) for name, value in result.items()}
+    found = {f"preventable_{name}": value.avoided.to(dtype) for name, value in result.items()}
     human = result["human"]
-    columns["preventable"] = columns.pop("preventable_human")
-    columns["preventable_chain"] = (human.avoided & (human.followers > 0)).to(dtype)
-    return columns, duty
+    found["preventable"] = found.pop("preventable_human")
+    found["preventable_chain"] = (human.avoided & (human.followers > 0)).to(dtype)
+    return found, duty, human.states

@@ -1,42 +1,111 @@
-"""The learned ego: acts on the environment's observation; its plan is a rollout of its own policy."""
+"""Egos that map the environment's observation to an action, the learned one among them.
 
+Their plan is a rollout of their own policy.
+"""
+
+from abc import abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.planners.network import ActorCritic, find_weights, read_actor
-from e2rl.planners.observing import ObservingEgo
 from e2rl.run.errors import InputError
-from e2rl.run.settings import check_range
+from e2rl.run.settings import configured, setting
+from e2rl.scenes.recording import DT
+from e2rl.sim import dynamics
+from e2rl.sim.mission import mission_of
+from e2rl.sim.observation import observation_config, observe, placed_ego
+from e2rl.sim.static import static_scene
+from e2rl.sim.world import Agents, World
+
+HOLD = 5  # steps for which a planned action is held: 10 evaluations of the policy per plan
 
 
+class ObservingEgo(Ego):
+    """Drives by `decide`, at every step."""
+
+    replan_every = HOLD
+
+    @abstractmethod
+    def decide(self, observation: Tensor) -> Tensor:
+        """Action [B, 2] (acceleration [m/s^2], yaw rate [rad/s]) at observations [B, OBSERVATION_SIZE]."""
+
+    @torch.no_grad()
+    def act(self, world: World, observation: Tensor, plan: Tensor) -> Tensor:
+        """The action [B, 2] at the observation; the plan is ignored."""
+        return self.decide(observation)
+
+    @torch.no_grad()
+    def plan(self, world: World) -> Tensor:
+        """Planned states [B, PLAN_STEPS, 4]: the policy rolled forward, each action held HOLD steps.
+
+        Vehicles follow their plans where these are known; all other agents keep their velocity.
+        """
+        static, expected = static_scene(world.scene, mission_of(world.scene)), expected_states(world)
+        config, horizon = observation_config(world.states.device), world.scene["logged"].shape[1] - 1
+        state, present, action = world.states[:, 0], world.valid[:, 0], world.ego_action()
+        pieces = []
+        for done in range(0, PLAN_STEPS, HOLD):
+            ego = placed_ego(static.mission, world.step + done, state, action, present, present)
+            seen = observe(config, static, ego, others_at(world, expected, done), horizon)
+            action = self.decide(seen.features)
+            driven = dynamics.rollout(state, action[:, None].expand(-1, HOLD, -1))
+            last_two = torch.cat([state[:, None], driven], 1)[:, -2:]
+            state, action = driven[:, -1], dynamics.inverse(last_two)[:, 0]
+            pieces.append(driven)
+        return torch.cat(pieces, 1)
+
+
+def others_at(world: World, expected: Tensor, step: int) -> Agents:
+    """All agents but the ego `step` steps from now, by their expected states [B, N, PLAN_STEPS + 1, 4]."""
+    if step == 0:
+        return world.others()
+    states = expected[:, 1:, step]
+    change = states - expected[:, 1:, step - 1]
+    return Agents(states, world.valid[:, 1:], change[..., 3] / DT, dynamics.wrap(change[..., 2]) / DT)
+
+
+def expected_states(world: World) -> Tensor:
+    """States [B, N, PLAN_STEPS + 1, 4] of all agents at steps 0.. from now: as planned, else at constant velocity."""
+    now = world.states[:, :, None]
+    time = DT * torch.arange(PLAN_STEPS + 1, device=now.device, dtype=now.dtype)
+    expected = dynamics.constant_velocity(world.states, time)
+    if world.plan is None:
+        return expected
+    vehicles = world.plan.shape[1]
+    planned = torch.cat([now[:, :vehicles], world.plan[:, :, :PLAN_STEPS]], 2)
+    return torch.cat([planned, expected[:, vehicles:]], 1)
+
+
+@configured("ego/actor")
+@dataclass(eq=False)
 class ActorEgo(ObservingEgo):
     """Drives by the actor's most central action; the learner updates `network` in place."""
 
-    def __init__(
-        self,
-        hidden: Sequence[int] = (128, 128),
-        agent_units: int = 32,
-        reference: bool = True,
-        initial_std: Sequence[float] = (0.25, 0.12),
-        max_acceleration: float = 5.0,
-        max_braking: float = 8.0,
-        max_yaw_rate: float = 1.6,
-        checkpoint: str | None = None,
-        device: str = "cpu",
-    ) -> None:
-        """Fields: conf/ego/actor.yaml; with a checkpoint, the network is the file's. Raises InputError if it is missing
-        or its actions have other bounds."""
-        super().__init__()
-        check_range("ego.agent_units", agent_units, 1)
-        if not hidden:
+    hidden: Sequence[int] = setting()
+    agent_units: int = setting(low=1)
+    reference: bool = setting()
+    initial_std: Sequence[float] = setting()
+    max_acceleration: float = setting()
+    max_braking: float = setting()
+    max_yaw_rate: float = setting()
+    checkpoint: str | None = setting()
+    device: str = setting()
+
+    def __post_init__(self) -> None:
+        """Raises InputError for a checkpoint that is missing or whose actions have other bounds."""
+        if not self.hidden:
             raise InputError("ego.hidden=[]: give the units of one layer at least")
-        low, high = torch.tensor([-max_braking, -max_yaw_rate]), torch.tensor([max_acceleration, max_yaw_rate])
-        self.network = ActorCritic(low, high, hidden, agent_units, reference, initial_std, device)
-        if checkpoint is not None:
-            bounds, path = bounds_of(self.network), find_weights(checkpoint)
-            self.network = read_actor(path, device)
+        low = torch.tensor([-self.max_braking, -self.max_yaw_rate])
+        high = torch.tensor([self.max_acceleration, self.max_yaw_rate])
+        sizes = self.hidden, self.agent_units, self.reference, self.initial_std
+        self.network = ActorCritic(low, high, *sizes, self.device)
+        if self.checkpoint is not None:
+            bounds, path = bounds_of(self.network), find_weights(self.checkpoint)
+            self.network = read_actor(path, self.device)
             if bounds_of(self.network) != bounds:
                 raise InputError(
                     f"{path}: its actions have the bounds {bounds_of(self.network)}, not {bounds}; set sim.max_* as in "

@@ -71,7 +71,6 @@ GOAL_FEATURES = 6
 ACCELERATION = (-8.0, 5.0)  # m/s^2, the simulator's bounds
 TIME = (0.5, 4.0)  # s that a lateral move takes (`candidates.drive`)
 AROUND = SIDE  # m: the move leads at most so far beside the goal
-MAX_YAW_RATE = 1.6  # rad/s, the simulator's bound
 
 
 class Controls(NamedTuple):
@@ -137,7 +136,7 @@ def drive_controls(controls: Controls, start: Tensor, path: RoutePath) -> Candid
     held = controls.acceleration.repeat_interleave(PLAN_STEPS // KNOTS, -1)
     now = start[:, None, 3:].expand(*held.shape[:2], 1)
     speed = torch.cat([now, dynamics.bounded_speed(now, held * DT)], -1)
-    return drive(start, path, speed, controls.shift[..., None], controls.time[..., None], MAX_YAW_RATE)
+    return drive(start, path, speed, controls.shift[..., None], controls.time[..., None])
 
 
 def save_bits(network: BitsNetwork, path: Path, origin: dict[str, Any]) -> None:

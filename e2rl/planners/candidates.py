@@ -15,16 +15,17 @@ from e2rl.sim.dynamics import wrap
 
 NODES = sum(HALVES)  # nodes of a speed profile, PLAN_DT apart: 5 s
 FIRST = round(1.0 / PLAN_DT)  # nodes of the first acceleration of a profile: 1 s
+MAX_YAW_RATE = 1.6  # rad/s, the simulator's bound
 CELL = 1.0  # m between entries of the table of a mission's headings
 REACH = int(dynamics.MAX_SPEED * PLAN_STEPS * DT / CELL) + 1  # entries of it
 
 
 class Candidates(NamedTuple):
-    """C candidates of each of B scenes: states [B, C, PLAN_STEPS, 4] at steps 1.., way [B, C]: m along the mission to
-    their end, shift [B, C]: m beside the mission where they lead."""
+    """C candidates of each of B scenes: states [B, C, PLAN_STEPS, 4] at steps 1..; distance [B, C] m along the mission
+    to their end; shift [B, C] m beside the mission where they lead."""
 
     states: Tensor
-    way: Tensor
+    distance: Tensor
     shift: Tensor
 
 
@@ -41,14 +42,17 @@ def speed_profiles(speed: Tensor, accelerations: Tensor, caps: Tensor, braking: 
     return upsample(capped(torch.cat([start, wanted], -1), caps, braking * PLAN_DT))
 
 
-def drive(
-    start: Tensor, path: RoutePath, speed: Tensor, shift: Tensor, time: Tensor, max_yaw_rate: float
-) -> Candidates:
-    """Speed profiles [B, L, PLAN_STEPS + 1] on S lateral moves each, from start [B, 4]: C = L S candidates.
+def drive(start: Tensor, path: RoutePath, speed: Tensor, shift: Tensor, time: Tensor) -> Candidates:
+    """The C = L S Candidates of L speed profiles on S lateral moves each.
 
-    A move leads shift m beside the mission over max(RETURN_LENGTH, time v) m (time in s), as `RoutePath` returns to its
-    route; shift and time: [B, L, S] or what broadcasts to it. Its headings become yaw rates, within the simulator's
-    bounds and the tyres' grip, which braking shares; the states are what the unicycle makes of them.
+    A move leads `shift` m beside the mission over max(RETURN_LENGTH, time v) m, as `RoutePath` returns to its route.
+    Its headings become yaw rates, within MAX_YAW_RATE and the tyres' grip, which braking shares; the unicycle makes
+    states of them.
+
+    Args:
+        start: states [B, 4].
+        speed: profiles [B, L, PLAN_STEPS + 1] m/s.
+        shift, time: m and s, [B, L, S] or what broadcasts to it.
     """
     shift, time = (value.expand(*speed.shape[:2], value.shape[-1]) for value in (shift, time))
     speed = speed[:, :, None]
@@ -60,14 +64,14 @@ def drive(
     table = heading_table(path)
     inner = (1 - curvature_at(table, driven) * (beside + offset)).clamp(min=0.2)
     stretch = torch.hypot(inner, slope)
-    way = (driven.diff(dim=-1) * 2 / (stretch[..., 1:] + stretch[..., :-1])).cumsum(-1)
-    aimed = heading_at(table, way) + torch.atan(slope[..., 1:] / inner[..., 1:])
+    along = (driven.diff(dim=-1) * 2 / (stretch[..., 1:] + stretch[..., :-1])).cumsum(-1)
+    aimed = heading_at(table, along) + torch.atan(slope[..., 1:] / inner[..., 1:])
     grip = (dynamics.MAX_LATERAL**2 - accel.square()).clamp(min=0).sqrt() / mean.clamp(min=1e-3)
-    bound = torch.minimum(grip, dynamics.yaw_rate_bound(mean)).clamp(max=max_yaw_rate)
+    bound = torch.minimum(grip, dynamics.yaw_rate_bound(mean)).clamp(max=MAX_YAW_RATE)
     yaw_rate = steer(turned.expand_as(shift), aimed, bound * DT) / DT
     actions = torch.stack([accel.expand_as(yaw_rate), yaw_rate], -1).flatten(1, 2)
     states = dynamics.rollout(start[:, None].expand(-1, actions.shape[1], 4), actions)
-    return Candidates(states, way[..., -1].flatten(1), shift.flatten(1))
+    return Candidates(states, along[..., -1].flatten(1), shift.flatten(1))
 
 
 def steer(heading: Tensor, aimed: Tensor, bound: Tensor) -> Tensor:
@@ -90,8 +94,8 @@ def heading_table(path: RoutePath) -> Tensor:
 
 def heading_at(table: Tensor, ahead: Tensor) -> Tensor:
     """Headings [B, ...] of a `heading_table` at `ahead` [B, ...] m."""
-    low, high, share = _between(table, ahead)
-    return torch.lerp(low, high, share)
+    low, high, fraction = _between(table, ahead)
+    return torch.lerp(low, high, fraction)
 
 
 def curvature_at(table: Tensor, ahead: Tensor) -> Tensor:
@@ -101,7 +105,7 @@ def curvature_at(table: Tensor, ahead: Tensor) -> Tensor:
 
 
 def _between(table: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The entries before and after `ahead` [B, ...] m, and the share of the way between them."""
+    """The entries before and after `ahead` [B, ...] m, and the fraction of the distance between them."""
     at = (ahead / CELL).clamp(0, REACH - 1.001)
     index = at.long()
     flat = index.flatten(1)

@@ -24,6 +24,7 @@ returns its own predicted motion.
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -31,7 +32,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from e2rl.run.config import Extension
-from e2rl.run.errors import InputError
+from e2rl.run.settings import check_range
 from e2rl.scenes.boxes import to_frame
 from e2rl.sim import dynamics
 from e2rl.sim.world import World
@@ -44,16 +45,17 @@ CATCH_UP = 1.0  # 1/s: rate at which a longitudinal error is corrected
 class Ego(Extension, ABC):
     """Drives the ego of B scenes at once. `plan` is a pure function of the World; `act` follows it.
 
-    replays_log: the environment moves this ego along its recording (`SimSettings.replay_ego`) and ignores its actions.
+    replan_every: steps between two plans (5 is 2 Hz, 1 every step), at most PLAN_STEPS; replays_log: the environment
+    moves this ego along its recording (`SimSettings.replay_ego`) and ignores its actions; tuned: what `e2rl tune`
+    searches, {argument: (low, high) or (low, high, "log")}.
     """
 
     replays_log = False
+    tuned: ClassVar[Mapping[str, tuple]] = {}
 
     def __init__(self, replan_every: int = 5) -> None:
-        """replan_every: steps between two plans (5 is 2 Hz, 1 every step), at most PLAN_STEPS."""
-        if not 1 <= replan_every <= PLAN_STEPS:
-            raise InputError(f"ego.replan_every={replan_every}: choose 1 to {PLAN_STEPS} steps")
-        self.replan_every = int(replan_every)
+        check_range("ego.replan_every", replan_every, 1, PLAN_STEPS)
+        self.replan_every = replan_every
 
     def reset(self, world: World) -> None:  # noqa: B027 - most egos have no memory
         """Called before the first plan of new episodes (world.step 0). An ego with memory clears it here."""

@@ -2,6 +2,7 @@
 
 import os
 import time
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from e2rl.planners.planner_link import (
     scene_messages,
 )
 from e2rl.run.errors import InputError
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
 from e2rl.sim.world import World
@@ -41,32 +43,26 @@ class PlannerDied(PlannerError):
     """The planner's process or the connection ended, or it may not be started again."""
 
 
+@configured("ego/external")
+@dataclass(eq=False)
 class ExternalEgo(Ego):
     """Asks a planner outside of e2rl for the plans of all scenes of a batch by one message.
 
     Each process that drives scenes starts, or connects to, a planner of its own at its first plan.
     """
 
-    def __init__(
-        self,
-        command: str | None = None,
-        address: str | None = None,
-        timeout: float = 2.0,
-        start_timeout: float = 60.0,
-        restarts: int = 20,
-        replan_every: int = 5,
-    ) -> None:
-        """Fields: conf/ego/external.yaml."""
-        super().__init__(replan_every)
-        if bool(command) == bool(address):
+    command: str | None = setting()
+    address: str | None = setting()
+    timeout: float = setting(low=1e-3)
+    start_timeout: float = setting(low=1e-3)
+    restarts: int = setting(low=0)
+    replan_every: int = setting(low=1, high=PLAN_STEPS)
+
+    def __post_init__(self) -> None:
+        if bool(self.command) == bool(self.address):
             raise InputError(
                 "ego=external: give one of ego.command, which starts the planner, and ego.address of one that runs"
             )
-        if timeout <= 0 or start_timeout <= 0 or restarts < 0:
-            given = f"ego.timeout={timeout}, ego.start_timeout={start_timeout}, ego.restarts={restarts}"
-            raise InputError(f"{given}: choose times above 0 s, and 0 restarts or more")
-        self.command, self.address = command, address
-        self.timeout, self.start_timeout, self.restarts = timeout, start_timeout, restarts
         self._owner, self._starts = os.getpid(), 0
         self._link: PlannerLink | None = None
         self._asked = torch.zeros(0, dtype=torch.int64)  # [B] step of the last request

@@ -1,10 +1,13 @@
 """Intelligent driver model on the mission route (Treiber et al. 2000, eqs. 3 and 4)."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.planners.path import MissionPath, look_up
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import MAX_SPEED, bounded_speed
 from e2rl.sim.leaders import IDMParameters, idm_acceleration, leaders
@@ -12,41 +15,29 @@ from e2rl.sim.mission import limit_at
 from e2rl.sim.world import World
 
 REACTION = 0.5  # s ahead at which the speed caps are met
-LINE_GAP = 1.0  # m kept to a stop line
 
 
+@configured("ego/idm")
+@dataclass(eq=False)
 class IDMEgo(Ego):
     """Stays on its mission and follows the nearest agent ahead within the lateral gate; never changes lanes."""
 
-    def __init__(
-        self,
-        desired_speed: float = 10.0,
-        headway: float = 1.0,
-        standstill_gap: float = 5.0,
-        acceleration: float = 1.0,
-        braking: float = 3.0,
-        exponent: float = 4.0,
-        hardest_braking: float = 8.0,
-        gate_margin: float = 0.3,
-        lateral_acceleration: float = 3.0,
-        use_limits: bool = True,
-        obey_lights: bool = True,
-        replan_every: int = 1,
-    ) -> None:
-        """Fields: conf/ego/idm.yaml."""
-        super().__init__(replan_every)
-        self.desired_speed, self.headway, self.standstill_gap = desired_speed, headway, standstill_gap
-        self.acceleration, self.braking, self.exponent = acceleration, braking, exponent
-        self.hardest_braking, self.gate_margin = hardest_braking, gate_margin
-        self.lateral_acceleration, self.use_limits, self.obey_lights = lateral_acceleration, use_limits, obey_lights
+    desired_speed: float = setting(low=0.1)
+    headway: float = setting(low=0)
+    standstill_gap: float = setting(low=0)
+    acceleration: float = setting(low=0.01)
+    braking: float = setting(low=0.01)
+    hardest_braking: float = setting(low=0)
+    use_limits: bool = setting()
+    replan_every: int = setting(low=1, high=PLAN_STEPS)
 
     def plan(self, world: World) -> Tensor:
         """The current IDM acceleration held for the whole plan, within the path's speed caps."""
         path, speed = MissionPath(world), world.states[:, 0, 3]
-        caps = path.speed_caps(self.desired_speed, self.lateral_acceleration, self.braking, self.use_limits, False)
+        caps = path.speed_caps(self.desired_speed, self.braking, self.use_limits, lights=False)
         gap, leading = self.leader(world, path)
         desired = self.desired(path)
-        driver = IDMParameters(self.headway, self.standstill_gap, self.acceleration, self.braking, self.exponent)
+        driver = IDMParameters(self.headway, self.standstill_gap, self.acceleration, self.braking)
         accel = idm_acceleration(speed, desired, gap, leading, driver, improved=True)
         allowed = look_up(caps, (REACTION * speed)[:, None])[:, 0]
         accel = torch.minimum(accel, ((allowed - speed) / REACTION).clamp(max=self.acceleration))
@@ -66,12 +57,10 @@ class IDMEgo(Ego):
     def leader(self, world: World, path: MissionPath) -> tuple[Tensor, Tensor]:
         """Free gap [B] m, inf for none, and speed [B] m/s along the route of the nearest agent or red light ahead.
 
-        An agent is a leader if its box is laterally within half the ego's width + gate_margin of the route.
+        An agent is a leader if its box is laterally within half the ego's width + GATE_MARGIN of the route.
         """
         route, size = path.route[:, None], world.scene["size"]
-        found = leaders(path.s[:, None], route, world.states, size, world.valid, None, self.gate_margin, torch.inf)
+        found = leaders(path.s[:, None], route, world.states, size, world.valid, free_gap=torch.inf)
         gap, leading = found.gap[:, 0], found.speed[:, 0].clamp(min=0)
-        if self.obey_lights:
-            light = path.stop_distance(self.braking, LINE_GAP) + self.standstill_gap
-            gap, leading = torch.minimum(gap, light), torch.where(light < gap, 0.0, leading)
-        return gap, leading
+        light = path.stop_distance(self.braking) + self.standstill_gap
+        return torch.minimum(gap, light), torch.where(light < gap, 0.0, leading)

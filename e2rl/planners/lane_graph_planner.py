@@ -1,14 +1,12 @@
 """The lane-graph planner of STRIVE (Rempe et al. 2022) on the mission route.
 
-It samples speed profiles along the mission, predicts the other agents on their matched routes, and drives the
-longest profile whose probability of collision is below `max_risk`. Vectorised over scenes, profiles, agents, routes.
-
-Predicted trajectories of the other agents: every matched route at several speeds (STRIVE's planner).
-
-Probability of collision of ego profiles with predicted traffic, by five-circle boxes (STRIVE's planner).
+It samples speed profiles along the mission, predicts the other agents on every matched route at several speeds, and
+drives the longest profile whose probability of collision (of five-circle boxes) is below `max_risk`. Vectorised over
+scenes, profiles, agents and routes.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,8 +14,15 @@ from torch import Tensor
 
 from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.planners.path import MissionPath, RoutePath, look_up
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
+
+PLAN_DT = 0.2  # s between nodes of a profile
+HALVES = (12, 13)  # nodes towards the first and the second speed target: 5 s in all
+EARLIER = 0.01  # weight of the mean distance: breaks ties of profiles that halt at one point in favour of the earliest
+INTERACTION_DISTANCE = 70.0  # m from the ego, others farther away are not looked at
+MATCH_DISTANCE, MATCH_ANGLE = 2.0, 20.0  # m, degrees between a vehicle and a route that it is on
 
 
 @dataclass
@@ -29,69 +34,52 @@ class Prediction:
     scene: Tensor
 
 
-def predict(
-    world: World,
-    steps: int,
-    dt: float,
-    speed_factors: tuple[float, ...],
-    acceleration: float,
-    reach: float,
-    match_distance: float,
-    match_angle: float,
-    see_vrus: bool,
-) -> Prediction:
-    """Trajectories of `steps` steps of dt of the agents within `reach` m of the ego.
+def predict(world: World, speed_factors: Sequence[float], acceleration: float) -> Prediction:
+    """The Prediction of the agents within INTERACTION_DISTANCE of the ego, sum(HALVES) steps of PLAN_DT.
 
-    A vehicle follows each matched route candidate (nearer than match_distance m, heading within match_angle degrees),
-    or its heading without a match; other agents keep their heading (omitted without see_vrus). Each agent is predicted
-    at each speed factor times its speed, approached at `acceleration` m/s^2.
+    A vehicle follows each matched route candidate (nearer than MATCH_DISTANCE, heading within MATCH_ANGLE), or its
+    heading without a match; other agents keep their heading. Each agent is predicted at each speed factor times its
+    speed, approached at `acceleration` m/s^2.
     """
     states, vehicles = world.states, world.scene["route_log"].shape[1]
-    near = (states[..., :2] - states[:, :1, :2]).norm(dim=-1) < reach
-    seen = world.valid & near
+    seen = world.valid & ((states[..., :2] - states[:, :1, :2]).norm(dim=-1) < INTERACTION_DISTANCE)
     seen[:, 0] = False
-    if not see_vrus:
-        seen[:, vehicles:] = False
     batch, agent, candidate = (seen[:, :vehicles, None] & world.scene["route_valid"]).nonzero(as_tuple=True)
-    path = RoutePath(states[batch, agent], world.scene["route_points"][batch, agent, candidate])
-    on = (path.d.abs() < match_distance) & (path.turned.abs() < torch.pi * match_angle / 180)
+    on = matched(RoutePath(states[batch, agent], world.scene["route_points"][batch, agent, candidate]))
     batch, agent, candidate = batch[on], agent[on], candidate[on]
     straight = seen.clone()
     straight[batch, agent] = False
-    lost_batch, lost_agent = straight.nonzero(as_tuple=True)
+    rest_batch, rest_agent = straight.nonzero(as_tuple=True)
     path = RoutePath(states[batch, agent], world.scene["route_points"][batch, agent, candidate])
-    poses = torch.cat(
-        [
-            path.at(ahead(states[batch, agent, 3], steps, dt, speed_factors, acceleration).flatten(1)),
-            straight_on(
-                states[lost_batch, lost_agent],
-                ahead(states[lost_batch, lost_agent, 3], steps, dt, speed_factors, acceleration).flatten(1),
-            ),
-        ]
-    )
-    batch, agent = torch.cat([batch, lost_batch]), torch.cat([agent, lost_agent])
+    rest = states[rest_batch, rest_agent]
+    on_route = path.at(ahead(states[batch, agent, 3], speed_factors, acceleration).flatten(1))
+    poses = torch.cat([on_route, straight_on(rest, ahead(rest[:, 3], speed_factors, acceleration).flatten(1))])
+    batch, agent = torch.cat([batch, rest_batch]), torch.cat([agent, rest_agent])
     count = len(speed_factors)
-    return Prediction(
-        poses.view(-1, steps + 1, 3),
-        world.scene["size"][batch, agent].repeat_interleave(count, 0),
-        batch.repeat_interleave(count),
-    )
+    size = world.scene["size"][batch, agent].repeat_interleave(count, 0)
+    return Prediction(poses.view(-1, sum(HALVES) + 1, 3), size, batch.repeat_interleave(count))
 
 
-def ahead(speed: Tensor, steps: int, dt: float, factors: tuple[float, ...], acceleration: float) -> Tensor:
-    """Metres [J, F, steps + 1] driven from speed [J] while it approaches each factor times speed."""
+def matched(path: RoutePath) -> Tensor:
+    """Bool [...]: the vehicle is on its route, near it and along it."""
+    return (path.d.abs() < MATCH_DISTANCE) & (path.turned.abs() < torch.pi * MATCH_ANGLE / 180)
+
+
+def ahead(speed: Tensor, factors: Sequence[float], acceleration: float) -> Tensor:
+    """Metres [J, F, sum(HALVES) + 1] driven from speed [J] while it approaches each factor times speed."""
+    steps = sum(HALVES)
     aims = speed[:, None, None] * speed.new_tensor(factors)[:, None]
-    change = acceleration * dt * torch.arange(1, steps + 1, device=speed.device, dtype=speed.dtype)
+    change = acceleration * PLAN_DT * torch.arange(1, steps + 1, device=speed.device, dtype=speed.dtype)
     start = speed[:, None, None]
     future = torch.where(aims < start, torch.maximum(aims, start - change), torch.minimum(aims, start + change))
-    return torch.nn.functional.pad((future * dt).cumsum(-1), (1, 0))
+    return torch.nn.functional.pad((future * PLAN_DT).cumsum(-1), (1, 0))
 
 
 def straight_on(state: Tensor, distance: Tensor) -> Tensor:
-    """Poses [J, K, 3] at distance [J, K] along the heading of state [J, 4]."""
+    """Poses [J, K, 3] at distance [J, K] m along the heading of state [J, 4]."""
     heading = state[:, 2:3]
-    way = torch.stack([heading.cos(), heading.sin()], -1) * distance[..., None]
-    return torch.cat([state[:, None, :2] + way, heading[..., None].expand(*distance.shape, 1)], -1)
+    moved = torch.stack([heading.cos(), heading.sin()], -1) * distance[..., None]
+    return torch.cat([state[:, None, :2] + moved, heading[..., None].expand(*distance.shape, 1)], -1)
 
 
 CERTAIN = 1e-6  # 1 - p of a pair in contact: p = 1 would make all colliding profiles equal
@@ -152,46 +140,34 @@ def circle_gap(first: Tensor, first_size: Tensor, second: Tensor, second_size: T
     return (apart - ra[..., :, None] - rb[..., None, :]).flatten(-2).amin(-1)
 
 
-PLAN_DT = 0.2  # s between nodes of a profile
-HALVES = (12, 13)  # nodes towards the first and the second speed target: 5 s in all
-EARLIER = 0.01  # weight of the mean distance: breaks ties of profiles that halt at one point in favour of the earliest
-
-
+@configured("ego/lane_graph")
+@dataclass(eq=False)
 class LaneGraphEgo(Ego):
-    """STRIVE's planner on our routes; differences: the ego takes its mission instead of the first branch of its lane,
-    obeys curve speeds, known limits and lights (its speeds are capped by them), and its plan is drivable by a car."""
+    """STRIVE's planner on our routes.
 
-    def __init__(
-        self,
-        max_speed: float = 20.0,
-        max_acceleration: float = 4.0,
-        speeds: int = 5,
-        max_risk: float = 0.1,
-        risk_slope: float = 0.3,
-        risk_growth: float = 0.02,
-        interaction_distance: float = 70.0,
-        predicted_speeds: tuple[float, ...] = (0.5, 1.0),
-        predicted_acceleration: float = 0.5,
-        match_distance: float = 2.0,
-        match_angle: float = 20.0,
-        lateral_acceleration: float = 3.0,
-        braking: float = 3.0,
-        use_limits: bool = True,
-        obey_lights: bool = True,
-        see_vrus: bool = True,
-        brake_if_unsafe: bool = False,
-        replan_every: int = 5,
-    ) -> None:
-        """Fields: conf/ego/lane_graph.yaml."""
-        super().__init__(replan_every)
-        self.max_speed, self.max_acceleration, self.speeds = max_speed, max_acceleration, int(speeds)
-        self.max_risk, self.risk_slope, self.risk_growth = max_risk, risk_slope, risk_growth
-        self.interaction_distance = interaction_distance
-        self.predicted_speeds, self.predicted_acceleration = tuple(predicted_speeds), predicted_acceleration
-        self.match_distance, self.match_angle = match_distance, match_angle
-        self.lateral_acceleration, self.braking = lateral_acceleration, braking
-        self.use_limits, self.obey_lights, self.see_vrus = use_limits, obey_lights, see_vrus
-        self.brake_if_unsafe = brake_if_unsafe
+    Differences: the ego takes its mission instead of the first branch of its lane; curves, known limits and lights cap
+    its speed; a car can drive its plan.
+    """
+
+    tuned = {
+        "risk_slope": (0.15, 6.0, "log"),
+        "max_risk": (0.02, 0.6),
+        "risk_growth": (0.0, 0.2),
+        "max_acceleration": (2.0, 7.0),
+        "predicted_acceleration": (0.1, 1.0),
+        "replan_every": (1, 5),
+    }
+
+    max_speed: float = setting(low=0.1)
+    max_acceleration: float = setting(low=0.01)
+    speeds: int = setting(low=1)
+    max_risk: float = setting(low=0, high=1)
+    risk_slope: float = setting(low=0)
+    risk_growth: float = setting(low=0)
+    predicted_speeds: Sequence[float] = setting(low=0)
+    predicted_acceleration: float = setting(low=0)
+    brake_if_unsafe: bool = setting()
+    replan_every: int = setting(low=1, high=PLAN_STEPS)
 
     def plan(self, world: World) -> Tensor:
         """The chosen profile as states [B, PLAN_STEPS, 4]."""
@@ -199,11 +175,10 @@ class LaneGraphEgo(Ego):
         speed = self.profiles(world, path)
         driven = torch.nn.functional.pad(((speed[..., 1:] + speed[..., :-1]) / 2 * PLAN_DT).cumsum(-1), (1, 0))
         poses = path.at(path.ahead(driven.transpose(0, 1))).transpose(0, 1)
-        hazard = collision_hazard(
-            poses, world.scene["size"][:, 0], self.predict(world), self.risk_slope, self.risk_growth
-        )
-        way = driven[..., -1] + EARLIER * driven.mean(-1)
-        best = self.choose(hazard, way, self.matched(path))
+        others = predict(world, self.predicted_speeds, self.predicted_acceleration * self.max_acceleration)
+        hazard = collision_hazard(poses, world.scene["size"][:, 0], others, self.risk_slope, self.risk_growth)
+        distance = driven[..., -1] + EARLIER * driven.mean(-1)
+        best = self.choose(hazard, distance, matched(path))
         chosen = speed[torch.arange(len(best), device=best.device), best]
         return path.drive(upsample(chosen))
 
@@ -215,9 +190,7 @@ class LaneGraphEgo(Ego):
         """
         first, second = HALVES
         start, slope = world.states[:, 0, 3], self.max_acceleration * PLAN_DT
-        caps = path.speed_caps(
-            self.max_speed, self.lateral_acceleration, self.braking, self.use_limits, self.obey_lights
-        )
+        caps = path.speed_caps(self.max_speed)
         top = caps.amax(1).clamp(min=0).sqrt()
         one = approach(start[:, None], targets(start, top, first * slope, self.speeds), slope, first)
         begin = one[..., -1]
@@ -226,24 +199,6 @@ class LaneGraphEgo(Ego):
         one = one[:, :, None].expand(-1, -1, self.speeds, -1)
         wanted = torch.cat([start[:, None, None, None].expand(*one.shape[:3], 1), one, two], -1).flatten(1, 2)
         return capped(wanted, caps, slope)
-
-    def predict(self, world: World) -> Prediction:
-        """Agents within interaction_distance, on every matched route at every predicted speed."""
-        return predict(
-            world,
-            sum(HALVES),
-            PLAN_DT,
-            self.predicted_speeds,
-            self.predicted_acceleration * self.max_acceleration,
-            self.interaction_distance,
-            self.match_distance,
-            self.match_angle,
-            self.see_vrus,
-        )
-
-    def matched(self, path: MissionPath) -> Tensor:
-        """Bool [B]: the ego is on its mission route, near it and along it."""
-        return (path.d.abs() < self.match_distance) & (path.turned.abs() < torch.pi * self.match_angle / 180)
 
     def choose(self, hazard: Tensor, driven: Tensor, matched: Tensor) -> Tensor:
         """Profile [B] by hazard [B, C] = -log(1 - probability of collision) and distance [B, C]: the longest below

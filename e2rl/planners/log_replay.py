@@ -1,13 +1,18 @@
 """The recorded ego as a planner. With `sim.replay_ego=true` the environment follows the log exactly instead."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from e2rl.planners.ego import PLAN_STEPS, Ego
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 
 
+@configured("ego/replay")
+@dataclass(eq=False)
 class ReplayEgo(Ego):
     """Plans the recording; unless the environment replays it, the unicycle tracks this plan.
 
@@ -15,9 +20,7 @@ class ReplayEgo(Ego):
     """
 
     replays_log = True
-
-    def __init__(self, replan_every: int = 1) -> None:
-        super().__init__(replan_every)
+    replan_every: int = setting(low=1, high=PLAN_STEPS)
 
     def plan(self, world: World) -> Tensor:
         """Recorded states [B, PLAN_STEPS, 4] of the coming steps."""

@@ -14,6 +14,9 @@ from e2rl.sim.world import World
 
 MAX_SLOPE = 1.0  # rad, bound of the angle between vehicle and route at the start of a path
 HORIZON = 200.0  # m of speed caps
+LATERAL_ACCELERATION = 3.0  # m/s^2 that curves are taken with
+BRAKING = 3.0  # m/s^2 ahead of curves, limits and lights
+STOP_GAP = 1.0  # m kept to a stop line
 
 
 class RoutePath:
@@ -77,41 +80,33 @@ class MissionPath(RoutePath):
         self.world, self.mission = world, mission_of(world.scene)
         super().__init__(world.states[:, 0], self.mission.points)
 
-    def speed_caps(
-        self,
-        desired: float,
-        lateral: float,
-        braking: float,
-        limits: bool = True,
-        lights: bool = True,
-        stop_gap: float = 1.0,
-    ) -> Tensor:
-        """Squares [B, HORIZON / SPACING] of the highest speeds, every SPACING metres ahead, from which `braking` m/s^2
-        meets all limits: `desired` m/s, or the speed limit if known and `limits`; lateral acceleration `lateral`
-        m/s^2 in curves; a halt `stop_gap` m before a red light if `lights` (negative beyond it).
+    def speed_caps(self, desired: float, braking: float = BRAKING, limits: bool = True, lights: bool = True) -> Tensor:
+        """Squares [B, HORIZON / SPACING] of the highest speeds every SPACING metres ahead; read them by `look_up`.
 
-        c(a)^2 = min over b >= a of v(b)^2 + 2 braking (b - a), piecewise linear in a: read it by `look_up`.
+        From these speeds, braking at `braking` m/s^2 meets all limits: `desired` m/s, or the speed limit where it is
+        known and `limits`; LATERAL_ACCELERATION in curves; with `lights` a halt before a light that binds (negative
+        beyond it). c(a)^2 = min over b >= a of v(b)^2 + 2 braking (b - a), which is piecewise linear in a.
         """
         count = int(HORIZON / SPACING)
         grid = SPACING * torch.arange(count, device=self.s.device, dtype=self.s.dtype)
         at = self.s[:, None] + grid
         curvature = torch.nn.functional.avg_pool1d(interpolate(self.mission.points, at)[2], 3, 1, 1)
-        speed = torch.sqrt(lateral / curvature.abs().clamp(min=1e-4)).clamp(max=1e3)
+        speed = torch.sqrt(LATERAL_ACCELERATION / curvature.abs().clamp(min=1e-4)).clamp(max=1e3)
         limit = limit_at(self.mission, at) if limits else torch.zeros_like(at)
         squared = torch.minimum(speed, torch.where(limit > 0, limit, desired)) ** 2
         potential = (squared + 2 * braking * grid).flip(-1).cummin(-1).values.flip(-1)
         if lights:
-            halt = self.stop_distance(braking, stop_gap)[:, None]
+            halt = self.stop_distance(braking)[:, None]
             potential = torch.minimum(potential, 2 * braking * halt)
         return potential - 2 * braking * grid
 
-    def stop_distance(self, braking: float, stop_gap: float) -> Tensor:
-        """Metres [B] until the ego's front is stop_gap m before the next stop line that binds; negative beyond that
+    def stop_distance(self, braking: float = BRAKING) -> Tensor:
+        """Metres [B] until the ego's front is STOP_GAP m before the next stop line that binds; negative beyond that
         point, inf for none."""
         world = self.world
         speed, half = world.states[:, 0, 3], world.scene["size"][:, 0, 0] / 2
         ahead = stop_ahead(self.mission, world.scene, world.step, self.s, speed, braking)
-        return ahead - half - stop_gap
+        return ahead - half - STOP_GAP
 
 
 def look_up(caps: Tensor, ahead: Tensor) -> Tensor:

@@ -85,10 +85,9 @@ def plan_message(world: World) -> bytes:
     scene, row = world.scene, torch.arange(count, device=world.step.device)
     lights = torch.arange(scene["light_state"].shape[-1], device=row.device).expand(count, -1)
     state = light_state_at(scene["light_state"], lights, world.step)
-    turn = torch.zeros_like(world.accel) if world.turn_rate is None else world.turn_rate
     number = torch.arange(agents, device=row.device).expand(count, -1)
     fields = [number[..., None], scene["agent_type"][..., None], world.states, scene["size"]]
-    fields += [world.accel[..., None], turn[..., None]]
+    fields += [world.accel[..., None], world.turn_rate[..., None]]
     record = torch.cat([_words(field) for field in fields], -1)  # [B, N, AGENT_WORDS]
     head = torch.stack([row, world.step, world.valid.sum(1), torch.full_like(row, lights.shape[1])], -1)
     body = torch.cat([_words(head), _words(state), record.flatten(1)], 1)

@@ -5,15 +5,17 @@ An ONNX file holds arithmetic. A TorchScript file is a program, which may write 
 
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from e2rl.planners.actor import ObservingEgo
 from e2rl.planners.ego import finite
-from e2rl.planners.observing import ObservingEgo
 from e2rl.run.errors import InputError
+from e2rl.run.settings import configured, setting
 from e2rl.sim.observation import OBSERVATION_SIZE
 
 ONNX, TORCHSCRIPT = ".onnx", ".pt"
@@ -21,27 +23,27 @@ MAPS = f"it maps float32 observations [B, {OBSERVATION_SIZE}] to actions [B, 2] 
 PROBED = (1, 3)  # batches that a file is tried with
 
 
+@configured("ego/policy_file")
+@dataclass(eq=False)
 class PolicyFileEgo(ObservingEgo):
     """Drives by the actions of a file, on the CPU; those beyond the bounds are clipped to them."""
 
-    def __init__(
-        self,
-        file: str | None = None,
-        max_acceleration: float = 5.0,
-        max_braking: float = 8.0,
-        max_yaw_rate: float = 1.6,
-    ) -> None:
-        """Fields: conf/ego/policy_file.yaml. Raises InputError where the file is none or maps other shapes."""
-        super().__init__()
-        if not file:
-            raise InputError(f"ego.file is not set; pass ego.file=POLICY{ONNX}, or POLICY{TORCHSCRIPT} of TorchScript")
-        if not Path(file).is_file():
-            raise InputError(f"ego.file={file}: no such file; pass a policy's {ONNX} or {TORCHSCRIPT} (TorchScript)")
-        self.low = torch.tensor([-max_braking, -max_yaw_rate])
-        self.high = torch.tensor([max_acceleration, max_yaw_rate])
-        self.policy = open_policy(Path(file))
+    file: str | None = setting()
+    max_acceleration: float = setting()
+    max_braking: float = setting()
+    max_yaw_rate: float = setting()
+
+    def __post_init__(self) -> None:
+        """Raises InputError where the file is none or maps other shapes."""
+        if not self.file or not Path(self.file).is_file():
+            raise InputError(
+                f"ego.file={self.file}: no such file; pass POLICY{ONNX}, or POLICY{TORCHSCRIPT} of TorchScript"
+            )
+        self.low = torch.tensor([-self.max_braking, -self.max_yaw_rate])
+        self.high = torch.tensor([self.max_acceleration, self.max_yaw_rate])
+        self.policy = open_policy(Path(self.file))
         for count in PROBED:
-            self._probe(f"ego.file={file}", count)
+            self._probe(f"ego.file={self.file}", count)
 
     def decide(self, observation: Tensor) -> Tensor:
         """The file's action [B, 2] at the observation; raises NotFinite where it is NaN or infinite."""

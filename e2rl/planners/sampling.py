@@ -1,25 +1,26 @@
 """A sampling planner: hundreds of candidates, each driven by the unicycle and scored on a forecast of the others.
 
-Propose, simulate, score and take the best, in the manner of PDM-Closed (Dauner et al. 2023). It looks at nobody's plan.
-Vectorised over scenes, candidates and agents.
-
-Egos that choose among candidates by their cost, and how the candidates rank: soft labels for an imitator.
+It proposes, simulates, scores and takes the best, in the manner of PDM-Closed (Dauner et al. 2023), and looks at
+nobody's plan. Vectorised over scenes, candidates and agents. What all egos share that choose among candidates by their
+cost: `ScoringEgo`; how its candidates rank are soft labels for an imitator.
 """
 
 from abc import abstractmethod
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from e2rl.planners.candidates import Candidates, drive, speed_profiles
-from e2rl.planners.ego import Ego
-from e2rl.planners.path import MissionPath
+from e2rl.planners.ego import PLAN_STEPS, Ego
+from e2rl.planners.path import BRAKING, MissionPath
 from e2rl.planners.scoring import Weights, forecast, nearest, score
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import project
 from e2rl.sim import dynamics
-from e2rl.sim.world import World
+from e2rl.sim.world import AGENT_KEYS, World
 
 STRIDE = 2  # steps between two scored states
 WIDER = 4  # times as many candidates are ranked as asked for, among which those driven alike are dropped
@@ -43,32 +44,34 @@ class RankingEgo(Ego):
         """Costs [B, C], in the same units, of driving along states [B, C, PLAN_STEPS, 4] that somebody else plans."""
 
 
-class Outlook(NamedTuple):
-    """Whom a ScoringEgo looks at, and how it forecasts them.
-
-    horizon [s] that is scored, at most 5; agents: as many, those that come nearest; hold, turn [s]: they hold their
-    acceleration and their path's curvature as long; see_vrus: others than vehicles are looked at, too.
-    """
-
-    horizon: float
-    agents: int
-    hold: float
-    turn: float
-    see_vrus: bool
-
-
-class ScoringEgo(RankingEgo):
+@dataclass(eq=False)
+class ScoringEgo(Weights, RankingEgo):
     """Plans the cheapest of its `candidates` by `scoring.score` on a forecast of the others. It looks at nobody's plan.
 
     CHUNK: scenes that are planned for at a time; READS: keys of the scene that are looked at.
     """
 
     CHUNK = 64
-    READS: tuple[str, ...] = SCENE_KEYS
+    READS: ClassVar[tuple[str, ...]] = SCENE_KEYS
+    tuned = {
+        "hold": (0.3, 2.5),
+        "turn": (0.3, 3.0),
+        "margin": (0.2, 1.5),
+        "margin_growth": (0.0, 0.6),
+        "headway": (0.5, 3.0),
+        "rear": (0.1, 1.0),
+        "fade": (0.0, 0.5),
+        "near": (5.0, 100.0),
+        "progress": (0.05, 0.6),
+        "comfort": (0.3, 4.0),
+        "lateral_offset": (0.3, 5.0),
+    }
 
-    def __init__(self, outlook: Outlook, weights: Weights, replan_every: int) -> None:
-        super().__init__(replan_every)
-        self.outlook, self.weights = outlook, weights
+    horizon: float = setting(low=0.2, high=5.0)
+    agents: int = setting(low=1)
+    hold: float = setting(low=0)
+    turn: float = setting(low=0)
+    replan_every: int = setting(low=1, high=PLAN_STEPS)
 
     @abstractmethod
     def candidates(self, world: World) -> Candidates:
@@ -76,11 +79,10 @@ class ScoringEgo(RankingEgo):
 
     def costs(self, world: World, candidates: Candidates) -> Tensor:
         """Costs [B, C] of candidates."""
-        outlook = self.outlook
-        steps = torch.arange(STRIDE, round(outlook.horizon / DT) + 1, STRIDE, device=world.step.device)
-        agents, seen = nearest(world, outlook.agents, outlook.see_vrus)
-        others = forecast(world, agents, seen, steps * DT, outlook.hold, outlook.turn)
-        return score(world, candidates, others, steps, self.weights)
+        steps = torch.arange(STRIDE, round(self.horizon / DT) + 1, STRIDE, device=world.step.device)
+        agents, seen = nearest(world, self.agents)
+        others = forecast(world, agents, seen, steps * DT, self.hold, self.turn)
+        return score(world, candidates, others, steps, self)
 
     def plan(self, world: World) -> Tensor:
         """The states [B, PLAN_STEPS, 4] of the candidate that costs least."""
@@ -121,9 +123,8 @@ class ScoringEgo(RankingEgo):
 
 def take(world: World, rows: Tensor, keys: tuple[str, ...] = SCENE_KEYS) -> World:
     """Scenes rows [b] of a World with these keys of the scene, and nobody's plan or route."""
-    turn = None if world.turn_rate is None else world.turn_rate[rows]
-    now = world.step[rows], world.states[rows], world.valid[rows], world.accel[rows]
-    return World(world.scene.select(*keys)[rows], *now, turn_rate=turn)
+    now = (getattr(world, key)[rows] for key in ("step", *AGENT_KEYS))
+    return World(world.scene.select(*keys)[rows], *now)
 
 
 def ranked_actions(ego: RankingEgo, world: World, count: int, hold: int) -> tuple[Tensor, Tensor]:
@@ -144,61 +145,25 @@ SHIFTS = (0.0, 1.0, -1.0, 2.0, -2.0, 3.5, -3.5, 5.0, -5.0)  # m beside the missi
 BRAKING_MORE = 1.0  # m/s^2 by which braking may exceed what the speed caps are made for
 
 
+@configured("ego/sampling")
+@dataclass(eq=False)
 class SamplingEgo(ScoringEgo):
     """26 speed profiles on 19 lateral moves: 9 shifts beside the mission, swift and calm, and the present one."""
 
     CHUNK = 8  # fits the processor's cache
 
-    def __init__(
-        self,
-        max_speed: float = 20.0,
-        horizon: float = 4.0,
-        agents: int = 10,
-        hold: float = 1.0,
-        turn: float = 1.5,
-        swift: float = 0.7,
-        calm: float = 1.4,
-        margin: float = 0.5,
-        margin_growth: float = 0.2,
-        headway: float = 1.5,
-        rear: float = 0.5,
-        fade: float = 0.15,
-        contact: float = 200.0,
-        near: float = 30.0,
-        border: float = 0.5,
-        off_road: float = 20.0,
-        progress: float = 0.2,
-        comfort: float = 1.0,
-        aside: float = 2.0,
-        lateral_acceleration: float = 3.0,
-        braking: float = 3.0,
-        max_acceleration: float = 5.0,
-        max_braking: float = 8.0,
-        max_yaw_rate: float = 1.6,
-        use_limits: bool = True,
-        obey_lights: bool = True,
-        see_vrus: bool = True,
-        replan_every: int = 1,
-    ) -> None:
-        """Fields: conf/ego/sampling.yaml."""
-        weights = Weights(
-            margin, margin_growth, headway, rear, fade, contact, near, border, off_road, progress, comfort, aside
-        )
-        super().__init__(Outlook(horizon, int(agents), hold, turn, see_vrus), weights, replan_every)
-        self.max_speed, self.swift, self.calm = max_speed, swift, calm
-        self.lateral_acceleration, self.braking = lateral_acceleration, braking
-        self.max_acceleration, self.max_braking, self.max_yaw_rate = max_acceleration, max_braking, max_yaw_rate
-        self.use_limits, self.obey_lights = use_limits, obey_lights
+    tuned = {"swift": (0.5, 1.0), "calm": (1.0, 2.5)} | ScoringEgo.tuned
+
+    max_speed: float = setting(low=0.1)
+    swift: float = setting(low=0)
+    calm: float = setting(low=0)
 
     def candidates(self, world: World) -> Candidates:
         """Every speed profile on every lateral move."""
         path, start = MissionPath(world), world.states[:, 0]
-        caps = path.speed_caps(
-            self.max_speed, self.lateral_acceleration, self.braking, self.use_limits, self.obey_lights
-        )
-        profiles = start.new_tensor(PROFILES).clamp(-self.max_braking, self.max_acceleration)
-        speed = speed_profiles(start[:, 3], profiles, caps, self.braking + BRAKING_MORE)
+        caps = path.speed_caps(self.max_speed)
+        speed = speed_profiles(start[:, 3], start.new_tensor(PROFILES), caps, BRAKING + BRAKING_MORE)
         beside = start.new_tensor(SHIFTS).expand(len(start), -1)
         shift = torch.cat([beside, beside, path.d[:, None]], 1)
         time = start.new_tensor([self.swift] * len(SHIFTS) + [self.calm] * len(SHIFTS) + [self.swift])
-        return drive(start, path, speed, shift[:, None], time, self.max_yaw_rate)
+        return drive(start, path, speed, shift[:, None], time)

@@ -4,12 +4,12 @@ Forecasts of the agents nearest to the ego: their present acceleration and turn,
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from e2rl.planners.candidates import Candidates
+from e2rl.run.settings import setting
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import MAX_CURVATURE, constant_velocity, wrap
@@ -30,7 +30,7 @@ class Forecast:
     seen: Tensor
 
 
-def nearest(world: World, count: int, see_vrus: bool = True) -> tuple[Tensor, Tensor]:
+def nearest(world: World, count: int) -> tuple[Tensor, Tensor]:
     """Agents [B, M] that come nearest to the ego within 3 s if everybody keeps its velocity, and whether they are there
     [B, M]; M: count, or fewer where a scene has no more rows."""
     times = torch.tensor(LOOK, device=world.states.device)
@@ -38,8 +38,6 @@ def nearest(world: World, count: int, see_vrus: bool = True) -> tuple[Tensor, Te
     gap = (xy - xy[:, :1]).square().sum(-1).amin(-1)
     there = world.valid.clone()
     there[:, 0] = False
-    if not see_vrus:
-        there[:, world.scene["route_log"].shape[1] :] = False
     found = gap.masked_fill(~there, torch.inf).topk(min(count, gap.shape[1]), largest=False)
     return found.indices, found.values < torch.inf
 
@@ -52,7 +50,7 @@ def forecast(world: World, agents: Tensor, seen: Tensor, times: Tensor, hold: fl
     """
     row = torch.arange(len(agents), device=agents.device)[:, None]
     state, accel = world.states[row, agents], world.accel[row, agents]
-    rate = torch.zeros_like(accel) if world.turn_rate is None else world.turn_rate[row, agents]
+    rate = world.turn_rate[row, agents]
     step = times[0]
     nodes = torch.nn.functional.pad(times, (1, 0))
     speed = (state[..., 3:] + accel[..., None] * nodes.clamp(max=hold)).clamp(min=0)
@@ -77,21 +75,22 @@ ROAD_STRIDE = 2  # scored states between two look-ups of the drivable field
 JERK_TIME = 0.1  # s: weight of the first change of acceleration against mean accelerations
 
 
-class Weights(NamedTuple):
-    """Fields: conf/ego/sampling.yaml and bits.yaml."""
+@dataclass(eq=False)
+class Weights:
+    """What costs how much (conf/ego/sampling.yaml and bits.yaml)."""
 
-    margin: float
-    margin_growth: float
-    headway: float
-    rear: float
-    fade: float
-    contact: float
-    near: float
-    border: float
-    off_road: float
-    progress: float
-    comfort: float
-    aside: float
+    margin: float = setting(low=1e-3)
+    margin_growth: float = setting(low=0)
+    headway: float = setting(low=0)
+    rear: float = setting(low=0)
+    fade: float = setting(low=0)
+    contact: float = setting(low=0)
+    near: float = setting(low=0)
+    border: float = setting(low=0)
+    off_road: float = setting(low=0)
+    progress: float = setting(low=0)
+    comfort: float = setting(low=0)
+    lateral_offset: float = setting(low=0)
 
 
 def score(world: World, candidates: Candidates, others: Forecast, steps: Tensor, weights: Weights) -> Tensor:
@@ -100,15 +99,15 @@ def score(world: World, candidates: Candidates, others: Forecast, steps: Tensor,
     cost = meeting_cost(states, world.scene["size"][:, 0], others, steps * DT, weights)
     cost = cost + weights.off_road * beyond_border(states[:, :, ::ROAD_STRIDE], world, weights.border)
     cost = cost + weights.comfort * discomfort(candidates.states, world)
-    return cost + weights.aside * candidates.shift.abs() - weights.progress * candidates.way
+    return cost + weights.lateral_offset * candidates.shift.abs() - weights.progress * candidates.distance
 
 
 def meeting_cost(ego: Tensor, ego_size: Tensor, others: Forecast, times: Tensor, weights: Weights) -> Tensor:
     """Costs [B, C] of candidates ego [B, C, T, 4] near others: the worst moment with each agent, summed over agents.
 
     A candidate ends at its first contact that is not from behind: what comes later costs nothing, or it would pay to
-    drive through somebody.
-    ego_size [B, 2]; times [T] s. Only pairs of poses that are near enough to cost something are compared as boxes.
+    drive through somebody. Only pairs of poses that are near enough to cost something are compared as boxes. ego_size
+    [B, 2]; times [T] s.
     """
     batch, count, steps, _ = ego.shape
     agents = others.seen.shape[1]
@@ -143,8 +142,8 @@ def pair_cost(
     and not from behind.
 
     Contact costs more at a higher relative velocity, and half where the ego stands. Without contact, what counts is the
-    share of `margin` [Q] m that is missing, or the share of `headway` s that is missing before the ego's own speed
-    closes the gap to whom it has ahead. An agent behind the ego counts `rear`: its driver is to keep the distance.
+    fraction of `margin` [Q] m or of `headway` s that is missing, the latter before the ego's own speed closes the gap
+    to whom it has ahead. An agent behind the ego counts `rear`: its driver is to keep the distance.
     """
     dx, dy = other[:, 0] - ego[:, 0], other[:, 1] - ego[:, 1]
     cos_a, sin_a = ego[:, 2].cos(), ego[:, 2].sin()

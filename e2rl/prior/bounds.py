@@ -13,29 +13,31 @@ import torch
 from torch import Tensor
 
 from e2rl.prior.lane_relative import ACCEL_SCALE, LaneState, select
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import overlap
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import constant_velocity
 
 NO_CAP = 20.0  # m/s^2: the cap of a vehicle whose plan is feasible
 STRIDE = 3  # steps between the times at which plans are compared
+GAP = 1.2  # m kept to the agent that a plan runs into
+LATERAL_MARGIN = 0.1  # m kept to either side
+ONSET = 2.0  # m/s^2 by which a bound lowers the acceleration at once; the rest follows over 0.5 s
 WAIT = 0.5  # s until a vehicle that waits decides again
 MIN_BRAKING = 0.5  # m/s^2 of a vehicle that must give way
 ALONGSIDE = 0.7  # cosine between the headings of vehicles that touch side by side rather than crossing
 
 
+@configured("prior/default", "bounds")
 @dataclass(frozen=True)
 class BoundSettings:
-    """Fields: conf/prior/default.yaml."""
+    """What the bounds allow (conf/prior/default.yaml)."""
 
-    meeting: bool = True
-    curve: bool = True
-    look: float = 3.0
-    gap: float = 1.2
-    aside: float = 0.1
-    lateral: float = 5.0
-    floor: float = -7.0
-    onset: float = 2.0
+    meeting: bool = setting()
+    curve: bool = setting()
+    look: float = setting(low=0.5, high=5.0)
+    lateral: float = setting(low=0.1)
+    floor: float = setting(high=0)
 
 
 @dataclass
@@ -83,37 +85,35 @@ def acceleration_caps(settings: BoundSettings, motion: LaneState, state: LaneSta
     steps = torch.arange(STRIDE - 1, round(settings.look / DT), STRIDE, device=state.v.device)
     braking = torch.full_like(state.v, -NO_CAP)
     if settings.meeting:
-        braking = torch.maximum(braking, _meeting_braking(settings, motion, state, obstacles, steps))
+        braking = torch.maximum(braking, _meeting_braking(motion, state, obstacles, steps))
     if settings.curve:
         braking = torch.maximum(braking, _curve_braking(settings, motion, state, steps))
     return (-braking).clamp(min=settings.floor)
 
 
-def apply_cap(cap: Tensor | None, x0: Tensor, state: LaneState, onset: float) -> tuple[Tensor, LaneState]:
-    """x0 [B, V, SIZE] and state [B, V] with the next and (by at most `onset`) the current acceleration under the cap
+def apply_cap(cap: Tensor | None, x0: Tensor, state: LaneState) -> tuple[Tensor, LaneState]:
+    """x0 [B, V, SIZE] and state [B, V] with the next and (by at most ONSET) the current acceleration under the cap
     [B, V]."""
     if cap is None:
         return x0, state
-    current = torch.minimum(state.a, torch.maximum(cap, state.a - onset))
+    current = torch.minimum(state.a, torch.maximum(cap, state.a - ONSET))
     first = torch.minimum(x0[..., :1], cap[..., None] / ACCEL_SCALE)
     return torch.cat([first, x0[..., 1:]], -1), replace(state, a=current)
 
 
-def _meeting_braking(
-    settings: BoundSettings, motion: LaneState, state: LaneState, obstacles: Obstacles, steps: Tensor
-) -> Tensor:
+def _meeting_braking(motion: LaneState, state: LaneState, obstacles: Obstacles, steps: Tensor) -> Tensor:
     """`meeting_braking` [B, V] of planned motions, towards the agent that each runs into first."""
     vehicles = state.v.shape[1]
     others = constant_velocity(obstacles.agents[:, vehicles:], DT * (steps + 1))
     tracks = torch.cat([motion.states()[:, :, steps], others], 1)  # [B, N, len(steps), 4]
-    first, meet = _first_meeting(tracks, obstacles, settings.aside, vehicles)
+    first, meet = _first_meeting(tracks, obstacles, vehicles)
     index = first[..., None, None].expand(*first.shape, 1, 4)
     other = tracks[:, None].expand(-1, vehicles, -1, -1, -1).gather(3, index)[..., 0, :]
     own = tracks[:, :vehicles, None].expand(-1, -1, first.shape[2], -1, -1).gather(3, index)[..., 0, :]
     driven = (motion.s[..., steps] - state.s[..., None]).gather(-1, first)
     meeting = Meeting(own, other, driven, steps[first] + 1, meet)
     length = (obstacles.size[:, :vehicles, 0] + obstacles.size[:, :1, 0]) / 2
-    return meeting_braking(settings, meeting, state.v, length, obstacles.duty)
+    return meeting_braking(meeting, state.v, length, obstacles.duty)
 
 
 class Meeting(NamedTuple):
@@ -127,15 +127,18 @@ class Meeting(NamedTuple):
     happens: Tensor
 
 
-def meeting_braking(
-    settings: BoundSettings, meeting: Meeting, speed: Tensor, length: Tensor, duty: Duty | None = None
-) -> Tensor:
-    """Braking [B, V] (v - u)^2 / (2 room) that keeps vehicles of `speed` [B, V] `gap` short of what they meet, -NO_CAP
-    where nobody has to brake. u is the other's speed along the vehicle's heading, 0 if it crosses or comes towards it.
-    Of two that meet, the one that has the other farther ahead of itself brakes.
+def meeting_braking(meeting: Meeting, speed: Tensor, length: Tensor, duty: Duty | None = None) -> Tensor:
+    """Braking [B, V] m/s^2 that keeps vehicles GAP short of what they meet, -NO_CAP where nobody has to brake.
 
-    duty: of adversaries to the ego; those that come into its side, length [B, V] m between the centres if one were just
-    behind the other, fall behind it.
+    It is (v - u)^2 / (2 room), u the other's speed along the vehicle's heading, 0 if it crosses or comes towards it. Of
+    two that meet, the one that has the other farther ahead of itself brakes. Adversaries that come into the ego's side
+    fall behind it.
+
+    Args:
+        meeting: with whom, and where.
+        speed: v [B, V] m/s.
+        length: [B, V] m between the centres if the vehicle were just behind the ego.
+        duty: of adversaries to the ego.
     """
     own, other, driven, steps, happens = meeting
     dx, dy = (other[..., :2] - own[..., :2]).unbind(-1)
@@ -144,13 +147,13 @@ def meeting_braking(
     yields = happens & (ahead > ahead_of_other)
     along = torch.cos(other[..., 2] - own[..., 2])
     u = (other[..., 3] * along).clamp(min=0)
-    room = (driven - settings.gap - u * DT * steps).clamp(min=0.3)
+    room = (driven - GAP - u * DT * steps).clamp(min=0.3)
     closing = (speed[..., None] - u).clamp(min=0)
     braking = closing**2 / (2 * room)
     if duty is not None:
         to_ego = _towards_ego(duty, happens[..., 0], yields[..., 0], room[..., 0], closing[..., 0])
         yields = torch.cat([to_ego[..., None], yields[..., 1:]], -1)
-        back = falling_back(length + settings.gap - ahead[..., 0], DT * steps[..., 0]) * (along[..., 0] > ALONGSIDE)
+        back = falling_back(length + GAP - ahead[..., 0], DT * steps[..., 0]) * (along[..., 0] > ALONGSIDE)
         braking = torch.cat([torch.maximum(braking[..., 0], back)[..., None], braking[..., 1:]], -1)
     return torch.where(yields, braking.clamp(min=MIN_BRAKING), -NO_CAP).amax(-1)
 
@@ -170,11 +173,11 @@ def falling_back(missing: Tensor, time: Tensor) -> Tensor:
     return 2 * missing.clamp(min=0) / time**2
 
 
-def _first_meeting(tracks: Tensor, obstacles: Obstacles, aside: float, vehicles: int) -> tuple[Tensor, Tensor]:
-    """Index of the time [B, V, N] at which i's box, wider by `aside` on both sides, first overlaps j's, and whether it
-    does at all."""
+def _first_meeting(tracks: Tensor, obstacles: Obstacles, vehicles: int) -> tuple[Tensor, Tensor]:
+    """Index of the time [B, V, N] at which i's box, wider by LATERAL_MARGIN on both sides, first overlaps j's, and
+    whether it does at all."""
     size, present = obstacles.size, obstacles.present
-    wide = size[:, :vehicles] + size.new_tensor([0.0, 2 * aside])
+    wide = size[:, :vehicles] + size.new_tensor([0.0, 2 * LATERAL_MARGIN])
     meets = overlap(tracks[:, :vehicles, None], wide[:, :, None, None], tracks[:, None], size[:, None, :, None])
     itself = torch.eye(vehicles, present.shape[1], dtype=torch.bool, device=meets.device)
     counts = present[:, None, :] & present[:, :vehicles, None] & ~itself

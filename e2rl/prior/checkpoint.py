@@ -13,7 +13,8 @@ from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.features import EDGE, NODE
 from e2rl.prior.lane_relative import SIZE
-from e2rl.prior.prior import Prior, SamplerSettings
+from e2rl.prior.prior import Prior
+from e2rl.prior.sde import SamplerSettings
 from e2rl.run.errors import InputError
 from e2rl.run.files import read_weights, unlike, weight_bytes, write_atomically
 from e2rl.run.settings import settings_of
@@ -30,7 +31,7 @@ def save_prior(prior: Prior, folder: Path, origin: dict) -> Path:
     origin: what made it (command, commit, data fingerprint, settings, validation), kept in the header as JSON.
     """
     network = asdict(prior.denoiser.settings)
-    architecture = {"denoiser": network, "free_space": prior.free_space, "features": FEATURES}
+    architecture = {"denoiser": network, "features": FEATURES}
     header = {"format": FORMAT, "architecture": json.dumps(architecture), "origin": json.dumps(origin)}
     tensors = {key: value.detach().cpu().contiguous() for key, value in prior.state_dict().items()}
     path = Path(folder) / f"prior-{hashlib.sha256(save(tensors)).hexdigest()[:12]}.safetensors"
@@ -64,7 +65,9 @@ def load_prior(
         settings = settings_of(DenoiserSettings, architecture["denoiser"], "denoiser")
         if max(settings.width, settings.blocks, settings.pair) > LARGEST:
             raise ValueError(f"a size above {LARGEST} in {settings}")
-        make = partial(Prior, settings, sampler, bounds, bool(architecture["free_space"]))
+        if architecture.get("free_space"):
+            raise ValueError("a prior without lanes, of an earlier version")
+        make = partial(Prior, settings, sampler, bounds)
         if wrong := unlike(make, tensors):
             raise ValueError(wrong)
         prior = make()

@@ -12,27 +12,22 @@ from e2rl.prior.features import EDGE, NODE
 from e2rl.prior.lane_relative import SIZE
 from e2rl.prior.sde import NoiseSchedule
 from e2rl.run.errors import InputError
-from e2rl.run.settings import check_range
+from e2rl.run.settings import configured, setting
 
 
+@configured("prior/default", "network")
 @dataclass(frozen=True)
 class DenoiserSettings:
-    """Width, attention heads, blocks, width of the pair embedding, share of activations dropped in training.
+    """Sizes of the network (conf/prior/default.yaml); the width is a multiple of the heads."""
 
-    Raises InputError for a size below 1, a width that is no multiple of the heads, or a share outside of [0, 1].
-    """
-
-    width: int = 96
-    heads: int = 4
-    blocks: int = 3
-    pair: int = 24
-    dropout: float = 0.1
+    width: int = setting(low=1)
+    heads: int = setting(low=1)
+    blocks: int = setting(low=1)
+    pair: int = setting(low=1)
+    dropout: float = setting(low=0, high=1)
 
     def __post_init__(self) -> None:
-        for name in ("width", "heads", "blocks", "pair"):
-            check_range(f"prior.network.{name}", getattr(self, name), 1)
-        check_range("prior.network.dropout", self.dropout, 0, 1)
-        if self.width % self.heads:
+        if self.heads and self.width % self.heads:
             raise InputError(f"prior.network.width={self.width}: expected a multiple of heads={self.heads}")
 
 

@@ -14,32 +14,13 @@ from e2rl.prior.denoiser import Denoiser, DenoiserSettings, Encoding
 from e2rl.prior.features import edge_features, node_features
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, select
 from e2rl.prior.routes import RouteChoice, RoutedScene, route_scene, sample_route, start_state
-from e2rl.prior.sde import SAMPLERS, path_kl, reverse_step
-from e2rl.run.settings import check_choice, check_range
+from e2rl.prior.sde import SamplerSettings, path_kl
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import project
 
-BUDGET_SPENT = 0.999  # share of a transport budget from which on it counts as used up
+BUDGET_SPENT = 0.999  # fraction of a transport budget from which on it counts as used up
 EGO_LEVEL = 0.01  # noise level at which the network sees the ego's plan
 STANDING_SPEED, HOLD_DISTANCE = 0.5, 2.0  # m/s, m: a vehicle slower than this with a 5-s plan shorter than this is held
-
-
-@dataclass(frozen=True)
-class SamplerSettings:
-    """Fields: conf/prior/default.yaml; churn is DDIM's eta. Raises InputError for a value out of range."""
-
-    sampler: str = "ddim"
-    steps: int = 8
-    churn: float = 1.0
-    temperature: float = 1.0
-    route_temperature: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_choice("prior.sampler.sampler", self.sampler, SAMPLERS)
-        check_range("prior.sampler.steps", self.steps, 1)
-        check_range("prior.sampler.churn", self.churn, 0, 1)
-        check_range("prior.sampler.temperature", self.temperature, 0)
-        check_range("prior.sampler.route_temperature", self.route_temperature, 0)
 
 
 @dataclass
@@ -99,14 +80,12 @@ class Prior(nn.Module):
         denoiser: DenoiserSettings | None = None,
         sampler: SamplerSettings | None = None,
         bounds: BoundSettings | None = None,
-        free_space: bool = False,
     ):
-        """free_space: represent every vehicle without its lane (the ablation)."""
         super().__init__()
         self.denoiser = Denoiser(denoiser)
         self.route_choice = RouteChoice()
         self.sampler, self.bounds = sampler or SamplerSettings(), bounds or BoundSettings()
-        self.schedule, self.free_space = self.denoiser.schedule, free_space
+        self.schedule = self.denoiser.schedule
 
     @torch.no_grad()
     def choose_routes(self, scene: TensorDictBase, uniform: Tensor) -> Tensor:
@@ -117,7 +96,7 @@ class Prior(nn.Module):
     @torch.no_grad()
     def start(self, scene: TensorDictBase, chosen: Tensor) -> tuple[RoutedScene, LaneState]:
         """RoutedScene and start states of scenes [B] whose vehicles follow candidates chosen [B, V]."""
-        routed = route_scene(scene, chosen, self.free_space)
+        routed = route_scene(scene, chosen)
         return routed, start_state(scene, routed)
 
     @torch.no_grad()
@@ -156,15 +135,15 @@ class Prior(nn.Module):
 
     @torch.no_grad()
     def estimate(self, context: Context) -> Tensor:
-        """x0 [B, V, SIZE] at the highest noise level without noise, one pass of the network: nearly the mean of the
-        samples."""
+        """x0 [B, V, SIZE] at the highest noise level without noise, by one evaluation of the network: nearly the mean of
+        the samples."""
         x = torch.zeros(*context.state.v.shape, SIZE, device=context.state.v.device)
         return self.denoise(x, self.schedule.levels(1, x.device)[0], context)
 
     def decode(self, x0: Tensor, context: Context, cap: Tensor | None = None, steps: slice = slice(None)) -> LaneState:
         """Planned motion of x0, fields [B, V, HORIZON] or those `steps` of it; cap [B, V]: of the acceleration in the
         executed part."""
-        x0, state = apply_cap(cap, x0, context.state, self.bounds.onset)
+        x0, state = apply_cap(cap, x0, context.state)
         lane = lane_relative.decode(x0, state, context.routed.points, steps)
         if context.all_on_lane:
             return lane
@@ -173,13 +152,16 @@ class Prior(nn.Module):
     def sample(
         self, context: Context, noise: Tensor, control: Control | None = None, budget: Tensor | None = None
     ) -> Sample:
-        """One joint sample by the reverse SDE from level `start` to 0, with the steps of `sde.reverse_step`.
+        """One joint sample by the reverse SDE, from level `start` to 0.
 
-        noise [steps, B, V, SIZE]: standard normal, the first slice starts the reverse SDE, the others drive it. budget
-        [B]: path KL that control may add to a scene, all vehicles together (None: any). A step that would exceed it
-        takes the share of its control that uses the budget up; no later step is controlled.
+        Args:
+            context: of the replan.
+            noise: [steps, B, V, SIZE], standard normal; the first slice starts the reverse SDE, the others drive it.
+            control: moves the clean estimates; None: the nominal prior.
+            budget: [B], path KL that control may add to a scene, all vehicles together (None: any). A step that would
+                exceed it takes the fraction of its control that uses the budget up; no later step is controlled.
         """
-        settings = self.sampler
+        settings, sampler = self.sampler, self.sampler.on(self.schedule)
         levels = self.schedule.levels(settings.steps, noise.device)
         noise = settings.temperature * noise
         x, kl, past, nominal_past = noise[0], torch.zeros(noise.shape[1:3], device=noise.device), None, None
@@ -192,16 +174,15 @@ class Prior(nn.Module):
             else:
                 x, nominal, x0 = control(x, high, k, context, partial(self.denoise, level=high, context=context))
             if k > 1:  # the last step takes x0 itself
-                given = partial(reverse_step, settings.sampler, self.schedule, x, high=high, low=low)
-                step = partial(given, noise=noise[index + 1], churn=settings.churn)
+                step = partial(sampler.step, x, high=high, low=low, noise=noise[index + 1])
                 x, variance = step(x0=x0, past=past)
                 if control is not None:  # against what the prior would do from the same visited states
                     plain = step(x0=nominal, past=nominal_past)[0]
                     added = path_kl(x - plain, variance * settings.temperature**2)
                     if budget is not None:
-                        share = budget_share(budget, kl, added)[:, None, None]
-                        x, x0 = plain + share * (x - plain), nominal + share * (x0 - nominal)
-                        added = share[..., 0] ** 2 * added
+                        fraction = within_budget(budget, kl, added)[:, None, None]
+                        x, x0 = plain + fraction * (x - plain), nominal + fraction * (x0 - nominal)
+                        added = fraction[..., 0] ** 2 * added
                     kl = kl + added
                 past, nominal_past = (x0, high), (nominal, high)
             elif budget is not None and control is not None:  # without noise there is no KL to count
@@ -230,8 +211,8 @@ class Prior(nn.Module):
         return select(((state.v < STANDING_SPEED) & short) | inactive, replace(held, v=zero, a=zero), motion)
 
 
-def budget_share(budget: Tensor, spent: Tensor, added: Tensor) -> Tensor:
-    """Share [B] of a step's shift that keeps the path KL within the budget [B]; spent, added [B, V]: path KL so far and
+def within_budget(budget: Tensor, spent: Tensor, added: Tensor) -> Tensor:
+    """Fraction [B] of a step's shift that keeps the path KL within the budget [B]; spent, added [B, V]: path KL so far and
     of the whole shift. KL grows with the square of the shift."""
     left = (budget - spent.sum(-1)).clamp(min=0)
     return (left / added.sum(-1).clamp(min=1e-12)).clamp(max=1.0).sqrt()

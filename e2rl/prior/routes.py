@@ -3,7 +3,7 @@
 RoutedScene: the static tensors of a scene once every vehicle has been assigned a route.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -27,6 +27,8 @@ ROUTE_FIELDS = ("points", "length", "open", "limit", "light", "light_s")  # scen
 class RoutedScene:
     """Tensors of B scenes that stay the same while these run. It holds no map, so that it is cheap to copy.
 
+    Metadata `vehicle_axes`: axes of length V, None for one of all agents; 1 where nothing is said.
+
     size [B, N, 2]; light_state [B, T+1, L]; past [B, V, 10, 3]: see the scene. Of the assigned route candidates: route
     [B, V], their index; points [B, V, P, 2]; length [B, V]; open [B, V]: the route ends at the map's border; limit
     [B, V, P]; light, light_s [B, V, 2]. conflict [B, V, V] bool: the routes of i and j meet; conflict_s [B, V, V]: arc
@@ -34,8 +36,8 @@ class RoutedScene:
     prior moves the vehicle or conditions on it; parked [B, V]; has_lane [B, V]: else it is represented in free space.
     """
 
-    size: Tensor
-    light_state: Tensor
+    size: Tensor = field(metadata={"vehicle_axes": None})
+    light_state: Tensor = field(metadata={"vehicle_axes": 0})
     past: Tensor
     route: Tensor
     points: Tensor
@@ -44,9 +46,9 @@ class RoutedScene:
     limit: Tensor
     light: Tensor
     light_s: Tensor
-    conflict: Tensor
-    conflict_s: Tensor
-    crossing: Tensor
+    conflict: Tensor = field(metadata={"vehicle_axes": 2})
+    conflict_s: Tensor = field(metadata={"vehicle_axes": 2})
+    crossing: Tensor = field(metadata={"vehicle_axes": 2})
     modelled: Tensor
     parked: Tensor
     has_lane: Tensor
@@ -58,11 +60,8 @@ def take_route(values: Tensor, route: Tensor) -> Tensor:
     return values.gather(2, index).squeeze(2)
 
 
-def route_scene(scene: TensorDictBase, route: Tensor, free_space: bool = False) -> RoutedScene:
-    """The RoutedScene of scenes [B] whose vehicles follow candidates route [B, V].
-
-    free_space: represent every vehicle without its lane (the ablation).
-    """
+def route_scene(scene: TensorDictBase, route: Tensor) -> RoutedScene:
+    """The RoutedScene of scenes [B] whose vehicles follow candidates route [B, V]."""
     vehicles = route.shape[1]
     assigned = {name: take_route(scene[f"route_{name}"], route) for name in ROUTE_FIELDS}
     valid, parked = scene["valid"][:, :vehicles], scene["parked"][:, :vehicles]
@@ -73,7 +72,7 @@ def route_scene(scene: TensorDictBase, route: Tensor, free_space: bool = False) 
     both = valid & ~parked & has_lane
     given = {"size": scene["size"], "light_state": scene["light_state"], "past": scene["past"][:, :vehicles]}
     meet = {"conflict": conflict & both[:, :, None] & both[:, None, :], "conflict_s": conflict_s, "crossing": crossing}
-    kind = {"modelled": valid & ~parked, "parked": parked, "has_lane": has_lane & (not free_space)}
+    kind = {"modelled": valid & ~parked, "parked": parked, "has_lane": has_lane}
     return RoutedScene(route=route, **given, **assigned, **meet, **kind)
 
 
@@ -86,13 +85,7 @@ def start_state(scene: TensorDictBase, routed: RoutedScene) -> LaneState:
 
 
 def reroute(
-    routed: RoutedScene,
-    scene: TensorDictBase,
-    route: Tensor,
-    moved: Tensor,
-    off_lane: Tensor,
-    off_lane_path: Tensor,
-    free_space: bool = False,
+    routed: RoutedScene, scene: TensorDictBase, route: Tensor, moved: Tensor, off_lane: Tensor, off_lane_path: Tensor
 ) -> RoutedScene:
     """`routed` with the vehicles `moved` [B, V] on new lines: candidates route [B, V] or, where off_lane [B, V], the
     off_lane_path [B, V, P, 2]. Such a path has no lights; its limit is the highest of the candidate's."""
@@ -115,7 +108,7 @@ def reroute(
             old[b][:, rows], old[b][rows] = other.T, own
     both = routed.modelled & lane["valid"]
     changed |= {"conflict": pairs[0] & both[:, :, None] & both[:, None], "conflict_s": pairs[1], "crossing": pairs[2]}
-    has_lane = change(routed.has_lane, lane["valid"] & (not free_space), not free_space)
+    has_lane = change(routed.has_lane, lane["valid"], True)
     return replace(routed, route=torch.where(moved, route, routed.route), has_lane=has_lane, **changed)
 
 

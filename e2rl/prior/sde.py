@@ -1,17 +1,22 @@
-"""The prior's variance-preserving SDE: noising, score from the clean estimate x0, sampler steps, discrete path KL.
+"""The prior's variance-preserving SDE: noising, score of a clean estimate x0, samplers, discrete path KL.
 
 Noise level t in [0, 1]: x_t = alpha(t) x_0 + sigma(t) eps with alpha = cos(pi t / 2), sigma = sin(pi t / 2); as an SDE
 dx = f dt + g dw with f = -beta(t) x / 2, g^2 = beta(t) = pi tan(pi t / 2). The paper's gamma-bar_t is alpha(t)^2.
 
-DDIM's parameter eta (Song et al. 2021, eq. 16: the share of ancestral noise in a step) is called `churn` everywhere in
-this repository: eta always means the adversarial intensity.
+DDIM's eta (Song et al. 2021, eq. 16: the fraction of ancestral noise in a step) is called `churn`: eta always means the
+adversarial intensity.
 """
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+from e2rl.run.settings import configured, setting
+
+Past = tuple[Tensor, Tensor]  # clean estimate and noise level of a step
 
 
 @dataclass(frozen=True)
@@ -61,71 +66,89 @@ class NoiseSchedule:
         return torch.linspace(self.start, 0.0, steps + 1, device=device)
 
 
-def euler_maruyama_step(
-    schedule: NoiseSchedule, x: Tensor, score: Tensor, high: Tensor, low: Tensor, noise: Tensor
-) -> tuple[Tensor, Tensor]:
-    """One step of the reverse SDE from level high to low: (x_low, g^2 |dt|).
+class Sampler(ABC):
+    """Steps of the reverse process from one noise level to a lower one.
 
-    x_low = x - (f - g^2 score) |dt| + g sqrt|dt| noise, with g^2 |dt| the exact integral of beta over the step.
+    Given `past`, a step is affine in x0, so that two steps with the same noise differ by the shift of their means.
+    churn (DDIM's eta): 1 is the reverse SDE, 0 deterministic.
     """
-    g2dt = schedule.beta_integral(high, low)
-    return x + 0.5 * g2dt * x + g2dt * score + torch.sqrt(g2dt) * noise, g2dt
+
+    def __init__(self, schedule: NoiseSchedule, churn: float = 1.0) -> None:
+        self.schedule, self.churn = schedule, churn
+
+    @abstractmethod
+    def step(
+        self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor, past: Past | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Returns x at level low, and the variance of the noise in it.
+
+        Args:
+            x, x0: at level high, and its clean estimate.
+            high, low: noise levels; low is above 0.
+            noise: standard normal, of the shape of x.
+            past: clean estimate and level of the previous step, None at the first.
+        """
 
 
-def ddim_step(
-    schedule: NoiseSchedule, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor, churn: float
-) -> tuple[Tensor, Tensor]:
-    """One step from level high to low (Song et al. 2021, eqs. 12 and 16): (x_low, standard deviation of its noise).
+class DDIM(Sampler):
+    """Song et al. 2021, eqs. 12 and 16; at churn 1 the ancestral sampler DDPM."""
 
-    churn (DDIM's eta): 1 is the ancestral sampler DDPM, 0 deterministic DDIM.
+    def step(
+        self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor, past: Past | None = None
+    ) -> tuple[Tensor, Tensor]:
+        schedule = self.schedule
+        alpha_high, alpha_low = schedule.alpha(high), schedule.alpha(low)
+        sigma_high, sigma_low = schedule.sigma(high), schedule.sigma(low)
+        ratio = (alpha_high / alpha_low) ** 2
+        scale = self.churn * sigma_low / sigma_high * torch.sqrt((1 - ratio).clamp(min=0))
+        eps = schedule.noise(x, x0, high)
+        rest = torch.sqrt((sigma_low**2 - scale**2).clamp(min=0))
+        return alpha_low * x0 + rest * eps + scale * noise, scale**2
+
+
+class DPMSolverPP(DDIM):
+    """DPM-Solver++(2M) (Lu et al. 2022, algorithm 2): second order at churn 0, its SDE variant at churn 1.
+
+    A DDIM step with the clean estimate extrapolated to the middle of the step in log(alpha / sigma).
     """
-    alpha_high, alpha_low = schedule.alpha(high), schedule.alpha(low)
-    sigma_high, sigma_low = schedule.sigma(high), schedule.sigma(low)
-    ratio = (alpha_high / alpha_low) ** 2
-    scale = churn * sigma_low / sigma_high * torch.sqrt((1 - ratio).clamp(min=0))
-    eps = schedule.noise(x, x0, high)
-    rest = torch.sqrt((sigma_low**2 - scale**2).clamp(min=0))
-    return alpha_low * x0 + rest * eps + scale * noise, scale
+
+    def step(
+        self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor, past: Past | None = None
+    ) -> tuple[Tensor, Tensor]:
+        if past is not None:
+            middle, last, end = (self.schedule.log_ratio(t) for t in (high, past[1], low))
+            x0 = x0 + 0.5 * (end - middle) / (middle - last) * (x0 - past[0])
+        return super().step(x, x0, high, low, noise)
 
 
-def multistep_estimate(
-    schedule: NoiseSchedule, x0: Tensor, past: Tensor, before: Tensor, high: Tensor, low: Tensor
-) -> Tensor:
-    """The clean estimate of a DPM-Solver++(2M) step (Lu et al. 2022, algorithm 2).
+class EulerMaruyama(Sampler):
+    """x_low = x - (f - g^2 score) |dt| + g sqrt|dt| noise, with g^2 |dt| the exact integral of beta over the step."""
 
-    x0 at level high is extrapolated to the middle of the step in log(alpha / sigma), with the estimate `past` of the
-    previous level `before`. A ddim_step with it is 2M: second order at churn 0, the SDE variant at churn 1. The level
-    low must be above 0.
-    """
-    middle, last, end = (schedule.log_ratio(t) for t in (high, before, low))
-    return x0 + 0.5 * (end - middle) / (middle - last) * (x0 - past)
+    def step(
+        self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor, past: Past | None = None
+    ) -> tuple[Tensor, Tensor]:
+        g2dt = self.schedule.beta_integral(high, low)
+        score = self.schedule.score(x, x0, high)
+        return x + 0.5 * g2dt * x + g2dt * score + torch.sqrt(g2dt) * noise, g2dt
 
 
-SAMPLERS = ("ddim", "dpm_solver_pp", "euler_maruyama")
+SAMPLERS: dict[str, type[Sampler]] = {"ddim": DDIM, "dpm_solver_pp": DPMSolverPP, "euler_maruyama": EulerMaruyama}
 
 
-def reverse_step(
-    sampler: str,
-    schedule: NoiseSchedule,
-    x: Tensor,
-    x0: Tensor,
-    high: Tensor,
-    low: Tensor,
-    noise: Tensor,
-    churn: float,
-    past: tuple[Tensor, Tensor] | None,
-) -> tuple[Tensor, Tensor]:
-    """One step of a sampler of SAMPLERS from level high to low > 0: (x_low, variance of the injected noise).
+@configured("prior/default", "sampler")
+@dataclass(frozen=True)
+class SamplerSettings:
+    """How the prior samples (conf/prior/default.yaml)."""
 
-    past: clean estimate and level of the previous step, None at the first; dpm_solver_pp alone uses it. Given past,
-    every step is affine in x0, so that two steps with the same noise differ by the shift of their means.
-    """
-    if sampler == "euler_maruyama":
-        return euler_maruyama_step(schedule, x, schedule.score(x, x0, high), high, low, noise)
-    if sampler == "dpm_solver_pp" and past is not None:
-        x0 = multistep_estimate(schedule, x0, *past, high, low)
-    after, scale = ddim_step(schedule, x, x0, high, low, noise, churn)
-    return after, scale**2
+    sampler: str = setting(choices=SAMPLERS)
+    steps: int = setting(low=1)
+    churn: float = setting(low=0, high=1)
+    temperature: float = setting(low=0)
+    route_temperature: float = setting(low=0)
+
+    def on(self, schedule: NoiseSchedule) -> Sampler:
+        """The Sampler of this name."""
+        return SAMPLERS[self.sampler](schedule, self.churn)
 
 
 def path_kl(shift: Tensor, variance: Tensor) -> Tensor:

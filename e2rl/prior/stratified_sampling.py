@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from e2rl.prior.lane_relative import SIZE, distance_weights
-from e2rl.prior.prior import SamplerSettings
-from e2rl.prior.sde import NoiseSchedule, reverse_step
+from e2rl.prior.sde import NoiseSchedule, Past, SamplerSettings
 
 
 def stratified_uniform(order: Tensor, position: Tensor) -> Tensor:
@@ -27,11 +26,12 @@ def impulse_response(schedule: NoiseSchedule, sampler: SamplerSettings, device: 
     The sampler is linear then, and the answers to unit impulses are read off.
     """
     levels, noise = schedule.levels(sampler.steps, device), torch.eye(sampler.steps, device=device)
-    x, past = noise[0], None
+    past: Past | None = None
+    x, step = noise[0], sampler.on(schedule).step
     for k in range(sampler.steps - 1):
         high, low = levels[k], levels[k + 1]
         x0 = schedule.alpha(high) * x  # the mean of a standard normal x0 given x_t
-        x, _ = reverse_step(sampler.sampler, schedule, x, x0, high, low, noise[k + 1], sampler.churn, past)
+        x, _ = step(x, x0, high, low, noise[k + 1], past)
         past = (x0, high)
     return x * schedule.alpha(levels[-2])
 

@@ -65,7 +65,7 @@ def line(metric: Metric, cells: Cells, label: str, names: Sequence[str], pairs: 
 
 
 def difference_heading(metric: Metric, first: str, second: str) -> str:
-    unit = "points" if metric.share else metric.unit
+    unit = "points" if metric.fraction else metric.unit
     return f"{first} − {second} [{unit}]" if unit else f"{first} − {second}"
 
 

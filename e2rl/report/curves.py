@@ -17,7 +17,6 @@ from typing import NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from e2rl.evaluation.provenance import read_provenance
 from e2rl.evaluation.rollout_files import METRICS_FILE, cell, nans, read_metrics
 from e2rl.evaluation.tuning import TUNING_FILE
 from e2rl.metrics.catalogue import METRICS
@@ -29,6 +28,7 @@ from e2rl.report.tables import heading
 from e2rl.report.tuning_curve import gain_of, on_curve
 from e2rl.run.errors import InputError, stop
 from e2rl.run.files import write_atomically
+from e2rl.run.run import read_provenance
 
 PANELS = (  # (horizontal, vertical): failures over realism, then the share of them that counts
     (("real", "cfr"), ("real_adv", "cfr"), ("aor_step", "cfr")),
@@ -90,13 +90,12 @@ def read_points(run: Path) -> list[Point]:
     file = Path(run) / TUNING_FILE
     if not file.is_file():
         return points_of_rows(read_metrics(Path(run) / METRICS_FILE))
-    known = read_provenance(run)
     try:
+        known = read_provenance(run)
         result = json.loads(file.read_text())
         trials = [trial | {"metrics": nans(trial["metrics"])} for trial in result["trials"]]
-        assert known is not None
         return points_of_tuning(result | {"trials": trials}, known["settings"]["synthesizer"]["name"])
-    except (ValueError, LookupError, TypeError, AssertionError) as error:
+    except (ValueError, LookupError, TypeError) as error:
         raise InputError(f"{file}: no tuning of an adversary; give the folder of a run of experiment=tune") from error
 
 
@@ -150,7 +149,7 @@ def draw_curve(axes: Axes, points: Sequence[Point], across: str, up: str, colour
     """One method's line, dots and intervals."""
 
     def at(point: Point, name: str, end: str = "mean") -> float:
-        return (100 if METRICS[name].share else 1) * point.metrics.get(name, {}).get(end, math.nan)
+        return (100 if METRICS[name].fraction else 1) * point.metrics.get(name, {}).get(end, math.nan)
 
     line = [point for point in points if point.on_curve]
     places = [[at(point, name) for point in line] for name in (across, up)]

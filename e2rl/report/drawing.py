@@ -18,6 +18,7 @@ from matplotlib.patches import Patch
 from PIL import Image
 
 from e2rl.run.files import write_atomically
+from e2rl.sim.rollouts import Road
 
 Colour = str | tuple[str, float]  # of matplotlib: a name, or a name with its opacity
 
@@ -54,24 +55,24 @@ class Trail(NamedTuple):
 
 
 class TrafficMap:
-    """The map of a rollout: its road, drawn once, and the traffic that each `show` replaces.
+    """A road, drawn once, and the traffic that each `show` replaces.
 
     axes: where to draw. metres: the world's length along the axes' width, which fixes the scale.
     `scale` is in points per metre.
     """
 
-    def __init__(self, axes: Axes, rollout: dict, metres: float):
+    def __init__(self, axes: Axes, road: Road, metres: float):
         box = axes.get_window_extent()
         self.axes, self.scale = axes, box.width / axes.figure.dpi * 72 / metres
         self.reach = metres / 2 * np.array([1, box.height / box.width])
         axes.set(facecolor=GROUND, xticks=(), yticks=())
         axes.spines[:].set_visible(False)
-        lanes, widths = lines(rollout, "lane"), (rollout["lane_width"] + VERGE) * self.scale
+        lanes, widths = road.lanes(), (road.lane_width + VERGE) * self.scale
         # Agg clips lines without a fill at the canvas by their middle, which would cut wide ones: hence a clear fill.
         surface = LineCollection(lanes, linewidths=widths, colors=ROAD, facecolors=CLEAR)
         surface.set(capstyle="round", joinstyle="round")
         self.trails, self.shapes = LineCollection([]), PolyCollection([], zorder=3)
-        axes.add_collection(PolyCollection(lines(rollout, "drivable"), facecolors=ROAD))
+        axes.add_collection(PolyCollection(road.polygons(), facecolors=ROAD))
         axes.add_collection(surface)
         axes.add_collection(LineCollection(lanes, linewidths=0.16 * self.scale, colors=CENTRELINE))
         axes.add_collection(self.trails)
@@ -94,12 +95,6 @@ class TrafficMap:
             edgecolor=[shape.edge for shape in shapes],
             linewidths=[shape.width * self.scale for shape in shapes],
         )
-
-
-def lines(rollout: dict, name: str) -> list[np.ndarray]:
-    """The polylines of `name`_points, each [P, 2] m."""
-    parts = np.split(rollout[f"{name}_points"], rollout[f"{name}_offsets"][1:-1])
-    return [part for part in parts if len(part)]
 
 
 def placed(outline: Sequence[tuple[float, float]], state: np.ndarray, size: np.ndarray) -> np.ndarray:

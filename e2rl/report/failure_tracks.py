@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from e2rl.metrics.drivers import DRIVERS
-from e2rl.metrics.preventable import AFTER, Collision, preventions
+from e2rl.metrics.preventable import AFTER
 from e2rl.report.picture import contact_point
 from e2rl.scenes.boxes import separation
+from e2rl.sim.rollouts import Failure, Rollout
 from e2rl.traffic.traffic import POINT_STEPS, REPLAN_STEPS
 
 
@@ -57,8 +57,8 @@ class Track(NamedTuple):
     present: np.ndarray
 
 
-def failure_replay(rollout: dict, contact: int, partner: int) -> dict[str, Any]:
-    """The replay of a rollout's failure, from the start to AFTER steps beyond the contact, for the data block of the
+def failure_replay(failure: Failure) -> dict[str, Any]:
+    """The replay of a failure, from the start to AFTER steps beyond the contact, for the data block of the
     page.
 
     `tracks` has the role, length and width [m] of each track, `partner` and `contact` are a track and a step,
@@ -66,10 +66,12 @@ def failure_replay(rollout: dict, contact: int, partner: int) -> dict[str, Any]:
     encodes the second differences over time of the CHANNELS [6, tracks, K] in their quanta; the gap [m] is that of the
     ego, and of those in its place, to the partner. `plans` is None where the file has none.
     """
-    steps = min(contact + AFTER + 1, len(rollout["states"]))
-    rows = np.flatnonzero(rollout["valid"][:steps].any(0))
+    rollout, contact, partner = failure.rollout, failure.contact, failure.partner
+    assert contact is not None
+    steps = min(contact + AFTER + 1, len(rollout.states))
+    rows = np.flatnonzero(rollout.valid[:steps].any(0))
     tracks = [driven_track(rollout, row, steps) for row in rows.tolist()]
-    tracks += [competent_driver(rollout, contact, partner, steps), *other_egos(rollout, steps)]
+    tracks += other_egos(rollout, steps)
     other = int(np.searchsorted(rows, partner))
     motion = np.stack([channels_of(track, tracks[other]) for track in tracks], 1)
     quanta = np.array(list(CHANNELS.values()))[:, None, None]
@@ -78,48 +80,41 @@ def failure_replay(rollout: dict, contact: int, partner: int) -> dict[str, Any]:
         "partner": other,
         "contact": contact,
         "point": [round(float(value), 2) for value in contact_point(rollout, contact, partner)],
-        "dt": rollout["dt"],
+        "dt": rollout.dt,
         "motion": encode(second_difference(quantised(motion, quanta))),
-        "plans": encoded_plans(rollout, rows) if "plans" in rollout else None,
+        "plans": encoded_plans(rollout, rows) if rollout.plans is not None else None,
     }
 
 
-def driven_track(rollout: dict, row: int, steps: int) -> Track:
+def driven_track(rollout: Rollout, row: int, steps: int) -> Track:
     """The track of an agent of the rollout."""
-    present = rollout["valid"][:steps, row]
-    return Track(role_of(rollout, row), rollout["size"][row], rollout["states"][:steps, row], present)
+    present = rollout.valid[:steps, row]
+    return Track(role_of(rollout, row), rollout.size[row], rollout.states[:steps, row], present)
 
 
-def role_of(rollout: dict, row: int) -> str:
+def role_of(rollout: Rollout, row: int) -> str:
     """The agent's role (`Track`)."""
-    if row == rollout["ego"]:
+    if row == rollout.ego:
         return "ego"
-    kind = str(rollout["agent_type"][row])
+    kind = str(rollout.agent_type[row])
     if kind in KINDS:
         return kind
-    if rollout["adversaries"][row]:
+    if rollout.adversaries[row]:
         return "adversary"
-    return "traffic" if rollout["simulated"][row] else "replayed"
+    return "traffic" if rollout.simulated[row] else "replayed"
 
 
-def other_egos(rollout: dict, steps: int) -> list[Track]:
-    """The ego as it was recorded and, where one is stored, the evasion that the search found."""
-    ego = rollout["ego"]
-    size, present = rollout["size"][ego], rollout["logged_valid"][:steps, ego]
-    tracks = [Track("recorded", size, rollout["logged"][:steps, ego], present)]
-    if "evasion" in rollout:
-        tracks.append(Track("evasion", size, rollout["evasion"][:steps], np.ones(steps, bool)))
-    return tracks
-
-
-def competent_driver(rollout: dict, contact: int, partner: int, steps: int) -> Track:
-    """The careful and competent driver of UN R157 in the ego's place, as the verdict has it (docs/verdicts.md)."""
-    vehicles = rollout["valid"] & (rollout["agent_type"] == "vehicle")
-    states = np.where(rollout["valid"][..., None], rollout["states"], 0.0).astype(np.float64)
-    arrays = states, vehicles, rollout["size"].astype(np.float64), np.array(partner), np.array(contact)
-    collision = Collision(*(torch.as_tensor(array)[None] for array in arrays))
-    driven = preventions(collision, {"human": DRIVERS["human"]})["human"].states[0, :steps].numpy()
-    return Track("driver", rollout["size"][rollout["ego"]], driven, np.ones(steps, bool))
+def other_egos(rollout: Rollout, steps: int) -> list[Track]:
+    """Others in the ego's place: the careful and competent driver of UN R157 as the verdict has it, the recording, and
+    the evasion that the search found; where the file has them."""
+    ego = rollout.ego
+    size, present = rollout.size[ego], rollout.logged_valid[:steps, ego]
+    recorded, always = Track("recorded", size, rollout.logged[:steps, ego], present), np.ones(steps, bool)
+    driver, evasion = (
+        [] if states is None else [Track(role, size, states[:steps], always)]
+        for role, states in (("driver", rollout.driver), ("evasion", rollout.evasion))
+    )
+    return [*driver, recorded, *evasion]
 
 
 def channels_of(track: Track, partner: Track) -> np.ndarray:
@@ -140,16 +135,16 @@ def held(states: np.ndarray, present: np.ndarray) -> np.ndarray:
     return states[np.where(step < 0, present.argmax(), step)].astype(np.float64)
 
 
-def encoded_plans(rollout: dict, rows: np.ndarray) -> dict[str, Any]:
+def encoded_plans(rollout: Rollout, rows: np.ndarray) -> dict[str, Any]:
     """Plans of the ego and the adversaries: `agents`, their tracks; `points` [A, R, 2, K] as second differences in the
     quantum of x; `targets` [A, R], the track that an adversary aims at, -1 for none. Steps between plans: `every`,
     between points: `spacing`."""
-    known = np.isin(rollout["planners"], rows)
-    points = rollout["plans"][:, known].transpose(1, 0, 3, 2)
-    targets = rollout["targets"][:, known].T
+    known = np.isin(rollout.planners, rows)
+    points = rollout.plans[:, known].transpose(1, 0, 3, 2)
+    targets = rollout.targets[:, known].T
     aimed = np.where(np.isin(targets, rows), np.searchsorted(rows, targets), -1)
     return {
-        "agents": np.searchsorted(rows, rollout["planners"][known]).tolist(),
+        "agents": np.searchsorted(rows, rollout.planners[known]).tolist(),
         "every": REPLAN_STEPS,
         "spacing": POINT_STEPS,
         "points": encode(second_difference(quantised(points, CHANNELS["x"]))),
@@ -157,12 +152,12 @@ def encoded_plans(rollout: dict, rows: np.ndarray) -> dict[str, Any]:
     }
 
 
-def encoded_map(rollout: dict) -> dict[str, str]:
+def encoded_map(rollout: Rollout) -> dict[str, str]:
     """The map of a rollout: of `lane` and `drivable` lines the points [M, 2], all x, then all y, as second differences
     in MAP_QUANTUM, and the number of points of each line; the lanes' widths in MAP_QUANTUM."""
-    result = {"lane_width": encode(quantised(rollout["lane_width"], MAP_QUANTUM))}
+    result = {"lane_width": encode(quantised(rollout.lane_width, MAP_QUANTUM))}
     for name in ("lane", "drivable"):
-        points = quantised(rollout[f"{name}_points"].T, MAP_QUANTUM)
+        points = quantised(getattr(rollout, f"{name}_points").T, MAP_QUANTUM)
         result[f"{name}_points"] = encode(second_difference(points))
-        result[f"{name}_counts"] = encode(np.diff(rollout[f"{name}_offsets"]))
+        result[f"{name}_counts"] = encode(np.diff(getattr(rollout, f"{name}_offsets")))
     return result

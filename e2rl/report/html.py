@@ -18,14 +18,14 @@ from tqdm import tqdm
 
 import e2rl
 from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
-from e2rl.evaluation.rollout_files import METRICS_FILE, ROLLOUTS, TABLE, nulls, read_metrics, read_rows, rollout_name
-from e2rl.evaluation.rollout_reader import read_rollout
+from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, nulls, read_metrics, read_rows
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.failure_tracks import CHANNELS, MAP_QUANTUM, encoded_map, failure_replay
 from e2rl.report.tables import column_names, read_tables
 from e2rl.run.errors import InputError, stop
 from e2rl.run.files import write_atomically
+from e2rl.sim.rollouts import ROLLOUTS, Failure, rollout_name
 
 PAGE = "failures.html"
 ASSETS = Path(e2rl.__file__).parent / "assets" / "report"
@@ -86,7 +86,7 @@ def page_content(run: Path, replays: int, methods: Sequence[str] = ()) -> dict[s
         "about": {metric.name: metric.about for metric in METRICS.values()},
         "channels": CHANNELS,
         "map_quantum": MAP_QUANTUM,
-    } | add_replays(run / ROLLOUTS, failures, index, replays)
+    } | add_replays(run, failures, index, replays)
 
 
 def group_key(row: Mapping) -> tuple:
@@ -97,7 +97,7 @@ def failure(row: Mapping, names: Mapping[int, str], typical: set[str]) -> dict[s
     """What the page's index knows of a failure: COLUMNS, its mode (OTHER for small ones), and whether it is typical."""
     mode = int(row["mode"]) if row["mode"] in names else OTHER
     values = {name: round(row[name], 4) if isinstance(row[name], float) else row[name] for name in COLUMNS}
-    return values | {"mode": mode, "typical": rollout_name(dict(row)) in typical}
+    return values | {"mode": mode, "typical": rollout_name(row) in typical}
 
 
 def plotted(row: Mapping) -> dict[str, Any]:
@@ -106,7 +106,7 @@ def plotted(row: Mapping) -> dict[str, Any]:
     return {"ego": row["ego"], "method": row["method"], "eta": row["eta"], "values": values}
 
 
-def add_replays(folder: Path, failures: Sequence[dict], index: Sequence[dict], count: int) -> dict[str, Any]:
+def add_replays(run: Path, failures: Sequence[dict], index: Sequence[dict], count: int) -> dict[str, Any]:
     """`maps` and `replays` of the data block, for `count` failures; writes the number of its replay, or None, into each
     of `index`. Scenes share their map."""
     maps: dict[str, dict] = {}
@@ -115,12 +115,11 @@ def add_replays(folder: Path, failures: Sequence[dict], index: Sequence[dict], c
         entry["replay"] = None
     for position in tqdm(replay_order(index)[:count], desc="replays", leave=False, disable=None):
         row = failures[position]
-        rollout = read_rollout(folder / rollout_name(row))
-        drawn = encoded_map(rollout)
+        failure = Failure.read(run, row)
+        drawn = encoded_map(failure.rollout)
         key = hashlib.sha256(json.dumps(drawn).encode()).hexdigest()
         maps.setdefault(key, drawn)
-        replay = failure_replay(rollout, int(row["contact_step"]), int(row["partner"]))
-        replays.append(replay | {"map": list(maps).index(key)})
+        replays.append(failure_replay(failure) | {"map": list(maps).index(key)})
         index[position]["replay"] = len(replays) - 1
     return {"maps": list(maps.values()), "replays": replays}
 

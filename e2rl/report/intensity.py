@@ -9,7 +9,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from e2rl.evaluation.rollout_files import ROLLOUTS, TABLE, read_rows, rollout_name
+from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.report.drawing import new_figure
 from e2rl.report.picture import SIDE, Panel
 from e2rl.report.videos import load_replay

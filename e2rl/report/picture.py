@@ -1,7 +1,9 @@
 """One rollout as pictures: any moment of it, all frames of its replay, and a strip of four moments."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +16,7 @@ from tqdm import tqdm
 from e2rl.report import drawing
 from e2rl.report.drawing import Shape, TrafficMap, Trail, add_legend, image_of, new_figure, new_panels, placed
 from e2rl.scenes.boxes import corners, to_frame
+from e2rl.sim.rollouts import Rollout
 
 TRAIL = 2.0  # s
 SMOOTHING = 41  # steps over which the camera's path is smoothed
@@ -30,21 +33,21 @@ LEGEND |= {"replayed": drawing.REPLAYED, "pedestrian, cyclist": drawing.VULNERAB
 class Replay:
     """The pictures of one rollout.
 
-    rollout: as `read_rollout` returns it. row: its row of metrics. metres: side of the square that is shown.
+    rollout, with its row of metrics. metres: side of the square that is shown.
     pixels: side of a picture. ghost: also outline the recorded ego. `contact` is the step of the ego's first contact,
     or None. `last` is the last step shown: the contact, or the rollout's end.
     """
 
-    rollout: dict
-    row: dict
+    rollout: Rollout
+    row: Mapping[str, Any]
     metres: float = 70.0
     pixels: int = 720
     ghost: bool = False
 
     def __post_init__(self):
         self.contact = None if math.isnan(self.row["contact_step"]) else int(self.row["contact_step"])
-        self.last = len(self.rollout["states"]) - 1 if self.contact is None else self.contact
-        self.centres = camera_path(self.rollout["states"][:, self.rollout["ego"], :2])
+        self.last = len(self.rollout.states) - 1 if self.contact is None else self.contact
+        self.centres = camera_path(self.rollout.states[:, self.rollout.ego, :2])
         self.panel = Panel(self, new_figure(SIDE, SIDE, dpi=72 * self.pixels / SIDE))
 
     def picture(self, time: float, phase: float | None = None) -> Image.Image:
@@ -58,7 +61,7 @@ class Replay:
         if self.contact is None:
             times = list(range(self.last + 1))
         else:
-            slow_from = max(0, self.contact - round(SLOW / self.rollout["dt"]))
+            slow_from = max(0, self.contact - round(SLOW / self.rollout.dt))
             times = [*range(slow_from), *np.arange(slow_from, self.contact, 0.5)]
         pictures = [self.picture(time) for time in tqdm(times, desc="frames", leave=False, disable=None)]
         if self.contact is not None:
@@ -69,7 +72,7 @@ class Replay:
         """Four moments side by side: up to the contact, or spread over a rollout that has none."""
         times = np.linspace(0, self.last, 4)
         if self.contact is not None:
-            times = np.maximum(0, self.contact + np.array(STRIP_TIMES) / self.rollout["dt"])
+            times = np.maximum(0, self.contact + np.array(STRIP_TIMES) / self.rollout.dt)
         figure, panels = new_panels(len(times), STRIP_SIDE, STRIP_GAP, STRIP_HEAD)
         for axes, time in zip(panels, times, strict=True):
             text, colour, phase = f"{time * self.rollout['dt']:.1f} s", drawing.INK, None
@@ -89,22 +92,22 @@ class Replay:
     def trails(self, time: float) -> list[Trail]:
         """The last two seconds of all agents that move, those of the adversaries and of the ego on top."""
         end, trails = math.floor(time) + 1, []
-        recent = slice(max(0, end - 1 - round(TRAIL / self.rollout["dt"])), end)
-        for agent in sorted(range(self.rollout["states"].shape[1]), key=self.layer):
-            path = self.rollout["states"][recent, agent, :2][self.rollout["valid"][recent, agent]]
+        recent = slice(max(0, end - 1 - round(TRAIL / self.rollout.dt)), end)
+        for agent in sorted(range(self.rollout.states.shape[1]), key=self.layer):
+            path = self.rollout.states[recent, agent, :2][self.rollout.valid[recent, agent]]
             if len(path) > 1 and np.ptp(path, axis=0).max() > 0.5:
                 trails.append(Trail(path, self.colour(agent), 0.5 if self.layer(agent) >= 2 else 0.3))
         return trails
 
     def shapes(self, time: float, phase: float | None) -> list[Shape]:
         """All agents, the recorded ego as an empty box and the mark of contact, from the lowest to the highest."""
-        rollout, step, ego, shapes = self.rollout, math.floor(time), self.rollout["ego"], []
-        states, size = interpolated(rollout["states"], rollout["valid"], time), rollout["size"]
-        if self.ghost and rollout["logged_valid"][step, ego]:
-            logged = interpolated(rollout["logged"], rollout["logged_valid"], time)
+        rollout, step, ego, shapes = self.rollout, math.floor(time), self.rollout.ego, []
+        states, size = interpolated(rollout.states, rollout.valid, time), rollout.size
+        if self.ghost and rollout.logged_valid[step, ego]:
+            logged = interpolated(rollout.logged, rollout.logged_valid, time)
             shapes.append(Shape(placed(drawing.BOX, logged[ego], size[ego]), "none", drawing.EGO, 0.14))
-        for agent in sorted(np.flatnonzero(rollout["valid"][step]).tolist(), key=self.layer):
-            kind = rollout["agent_type"][agent]
+        for agent in sorted(np.flatnonzero(rollout.valid[step]).tolist(), key=self.layer):
+            kind = rollout.agent_type[agent]
             if kind in ("pedestrian", "cyclist"):
                 shapes += drawing.vulnerable(states[agent], size[agent], kind == "cyclist")
             else:
@@ -115,14 +118,14 @@ class Replay:
 
     def layer(self, agent: int) -> int:
         """Higher layers lie on top: 0 other vehicles, 1 pedestrians and cyclists, 2 adversaries, 3 the ego."""
-        if agent == self.rollout["ego"]:
+        if agent == self.rollout.ego:
             return 3
-        if self.rollout["adversaries"][agent]:
+        if self.rollout.adversaries[agent]:
             return 2
-        return int(self.rollout["agent_type"][agent] in ("pedestrian", "cyclist"))
+        return int(self.rollout.agent_type[agent] in ("pedestrian", "cyclist"))
 
     def colour(self, agent: int) -> str:
-        others = drawing.BACKGROUND if self.rollout["simulated"][agent] else drawing.REPLAYED
+        others = drawing.BACKGROUND if self.rollout.simulated[agent] else drawing.REPLAYED
         return (others, drawing.VULNERABLE, drawing.ADVERSARY, drawing.EGO)[self.layer(agent)]
 
 
@@ -150,7 +153,7 @@ class Panel:
     def show(self, time: float, phase: float | None) -> None:
         replay, rollout = self.replay, self.replay.rollout
         replay.draw(self.map, time, phase)
-        speed = interpolated(rollout["states"], rollout["valid"], time)[rollout["ego"], 3]
+        speed = interpolated(rollout.states, rollout.valid, time)[rollout.ego, 3]
         self.clock.set_text(f"{time * rollout['dt']:.1f} s")
         self.speed.set_text(f"ego {speed:.1f} m/s")
         self.badge.set_visible(replay.contact is not None and time >= replay.contact)
@@ -171,21 +174,21 @@ def interpolated(states: np.ndarray, valid: np.ndarray, time: float) -> np.ndarr
     return states[low] + np.where(valid[high, :, None], (time - low) * change, 0)
 
 
-def contact_point(rollout: dict, step: int, partner: int) -> np.ndarray:
+def contact_point(rollout: Rollout, step: int, partner: int) -> np.ndarray:
     """Where the ego and its partner touch [2] m: the mean of the corners that lie inside the other box, or, where there
     are none, the middle between the two centres."""
-    pair = [rollout["ego"], partner]
-    pose, size = torch.tensor(rollout["states"][step, pair]).double(), torch.tensor(rollout["size"][pair]).double()
+    pair = [rollout.ego, partner]
+    pose, size = torch.tensor(rollout.states[step, pair]).double(), torch.tensor(rollout.size[pair]).double()
     others = corners(pose, size).flip(0)
     inside = (to_frame(others, pose[:, None]).abs() <= size[:, None] / 2 + 1e-6).all(-1)
     return (others[inside] if inside.any() else pose[:, :2]).mean(0).numpy()
 
 
-def contact_text(row: dict) -> str:
+def contact_text(row: Mapping[str, Any]) -> str:
     return f"contact at {row['contact_time']:.1f} s: {row['contact_type']}, {row['relvel']:.1f} m/s"
 
 
-def verdict_text(row: dict) -> str:
+def verdict_text(row: Mapping[str, Any]) -> str:
     """Whether the collision counts and why, and the duty that the partner broke."""
     reasons = {"ego's fault": row["at_fault"] == 1, "preventable": row["preventable"] == 1}
     counts = ", ".join(name for name, holds in reasons.items() if holds)

@@ -20,13 +20,12 @@ from matplotlib.patheffects import withStroke
 from torch import Tensor
 
 from e2rl.evaluation.protocol import SEEDS_APART, Method
-from e2rl.evaluation.rollout_files import ROLLOUTS, rollout_name
-from e2rl.evaluation.rollout_reader import read_rollout
 from e2rl.report import drawing
 from e2rl.report.drawing import TrafficMap, Trail, add_legend, new_panels
 from e2rl.report.picture import shorten
 from e2rl.run.errors import InputError
 from e2rl.scenes.scene import SceneSet
+from e2rl.sim.rollouts import ROLLOUTS, Rollout, rollout_name
 from e2rl.traffic.e2.skeleton import Selection, chain_depth
 from e2rl.traffic.e2.topology import TopologySettings
 from e2rl.traffic.grouping import take_rows
@@ -42,13 +41,13 @@ LEGEND |= {"feasible, no candidate": FEASIBLE, "others": drawing.BACKGROUND}
 
 @dataclass
 class SkeletonPicture:
-    """The figure of a selection (B = 1) in a rollout, as `read_rollout` returns it, with the topology's settings.
+    """The figure of a selection (B = 1) in a rollout, with the topology's settings.
 
     `time` [s] and `weights` [V, V] are those of the step of the reference rollout at which the coalition's links weigh
     most, `risky` [V, 4] the states there; `now` [N, 4] are the rollout's states when the coalition was chosen.
     """
 
-    rollout: dict
+    rollout: Rollout
     selection: Selection
     settings: TopologySettings
 
@@ -62,7 +61,7 @@ class SkeletonPicture:
         self.time = float(chosen.moments[0, moment])
         self.weights = chosen.weights[0, moment].cpu().numpy()
         self.risky = chosen.reference[0, moment].cpu().numpy()
-        self.now = self.rollout["states"][self.step]
+        self.now = self.rollout.states[self.step]
         self.members = np.flatnonzero(self.coalition).tolist()
 
     def nodes(self) -> list[int]:
@@ -139,7 +138,7 @@ class SkeletonPicture:
 
     def chain(self, axes: Axes) -> None:
         """The moment of the choice: who acts on whom, and how the coalition and the ego drove from there."""
-        states, valid = self.rollout["states"][self.step :, :, :2], self.rollout["valid"][self.step :]
+        states, valid = self.rollout.states[self.step :, :, :2], self.rollout.valid[self.step :]
         own = [*self.members, 0]
         trails = [Trail(states[valid[:, agent], agent], self.colour(agent), 0.6) for agent in own]
         self.draw_map(axes, self.now, trails)
@@ -157,9 +156,9 @@ class SkeletonPicture:
         own = [0, *self.members]
         points = np.concatenate([self.now[own, :2], self.risky[own, :2]])
         side = float(np.clip(np.ptp(points, axis=0).max() + MARGIN, SMALLEST, LARGEST))
-        shown = [agent for agent in range(len(states)) if self.rollout["valid"][self.step, agent]]
+        shown = [agent for agent in range(len(states)) if self.rollout.valid[self.step, agent]]
         shown.sort(key=lambda agent: (self.colour(agent) != drawing.BACKGROUND, -agent))
-        sizes = self.rollout["size"]
+        sizes = self.rollout.size
         shapes = [shape for i in shown for shape in drawing.vehicle(states[i], sizes[i], self.colour(i))]
         TrafficMap(axes, self.rollout, side).show((points.min(0) + points.max(0)) / 2, trails, shapes)
         outline = [withStroke(linewidth=4, foreground=drawing.PANEL)]
@@ -169,7 +168,7 @@ class SkeletonPicture:
             text.set(color=drawing.INK, path_effects=outline, zorder=ON_TOP + 1, clip_on=True)
 
 
-def skeleton_figure(rollout: dict, selection: Selection, settings: TopologySettings) -> Figure:
+def skeleton_figure(rollout: Rollout, selection: Selection, settings: TopologySettings) -> Figure:
     """The figure of a selection (B = 1) and of the rollout that it belongs to."""
     return SkeletonPicture(rollout, selection, settings).figure()
 
@@ -214,12 +213,12 @@ class LongestChain:
             raise InputError(f"figure=skeleton: needs a method of e2 first in methods, not {self.method.name}")
         return self.method.traffic.topology
 
-    def rollout(self, scenes: SceneSet, ego_name: str, folder: Path) -> dict:
+    def rollout(self, scenes: SceneSet, ego_name: str, folder: Path) -> Rollout:
         """The rollout of the kept selection, from its file; InputError if no adversary was chosen."""
         seed, scene = divmod(int(self.selection.seed), SEEDS_APART)
         identity = {"method": self.method.name, "ego_policy": ego_name, "eta": self.method.eta}
         name = rollout_name(identity | {"scene_id": scenes.scene_id[scene], "seed": seed})
-        return read_rollout(Path(folder) / ROLLOUTS / name)
+        return Rollout.read(Path(folder) / ROLLOUTS / name)
 
 
 def link_risk(selection: Selection) -> Tensor:

@@ -162,7 +162,7 @@ def column_names(group: Sequence[dict]) -> list[str]:
 
 
 def heading(metric: Metric, points: bool = False) -> str:
-    unit = ("points" if points else "%") if metric.share else metric.unit
+    unit = ("points" if points else "%") if metric.fraction else metric.unit
     return f"{metric.name} [{unit}]" if unit else metric.name
 
 
@@ -192,9 +192,9 @@ def number(metric: Metric, value: float, sign: str = "") -> str:
 
     Without one, shares are in per cent with one decimal (two below one per cent), and others have three digits.
     """
-    value = 100 * value if metric.share else value
+    value = 100 * value if metric.fraction else value
     size, decimals = abs(value), metric.decimals
-    if decimals is None and metric.share:
+    if decimals is None and metric.fraction:
         decimals = 1 if size >= 1 or size == 0 else 2
     elif decimals is None:
         decimals = 0 if size >= 1000 else 1 if size >= 10 else 2 if size >= 1 or size == 0 else 3

@@ -13,13 +13,13 @@ import numpy as np
 from PIL import Image
 
 from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
-from e2rl.evaluation.rollout_files import ROLLOUTS, TABLE, read_rows, rollout_name
-from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollout
+from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.metrics.score import score_rollouts
 from e2rl.report.drawing import save_figure
 from e2rl.report.picture import Replay
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
+from e2rl.sim.rollouts import ROLLOUTS, Rollout, Rollouts, rollout_name
 
 FRAME_MS = 100  # real time at 10 Hz
 LAST_MS = 1200  # the last frame stays a little before the film starts again
@@ -35,7 +35,7 @@ def load_replay(path: Path, metres: float = 70.0, pixels: int = 720, ghost: bool
 
 def save_replay(replay: Replay, folder: Path) -> tuple[Path, Path]:
     """Write <name>.gif and <name>.png (the strip; also as <name>.pdf) into folder and return the first two paths."""
-    name = rollout_name(replay.rollout).removesuffix(".npz")
+    name = rollout_name(XX(".npz")
     gif, png = Path(folder) / f"{name}.gif", Path(folder) / f"{name}.png"
     save_animation(gif, replay.frames())
     save_figure(png, replay.strip())

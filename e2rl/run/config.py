@@ -1,12 +1,11 @@
-"""The command line of the scripts: `--help` with every option's comment, and the nearest name of one that is none.
+"""The configuration: files of conf/, what they build, and a command line with `--help` and the nearest right name."""
 
-The configuration: files of conf/ and what they build.
-"""
-
+import os
 import random
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
@@ -22,60 +21,58 @@ from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from e2rl.run.endings import ending, program
 from e2rl.run.errors import InputError
 from e2rl.run.settings import conf_folder
 
 CHOICE = re.compile(r"[\w+-][\w.+-]*(/[\w+-][\w.+-]*)*")  # a file's name in a group
+OPTION = re.compile(r"(?P<added>\+{0,2})(?P<key>[\w./-]+)=(?P<value>.*)", re.DOTALL)
+ALIKE = 0.8  # similarity from which an added key is taken for a mistyped one
 
 
-# --- configuration
-
-
-def load_config(name: str = "evaluate", overrides: tuple[str, ...] | list[str] = ()) -> DictConfig:
-    """The configuration of train or evaluate with Hydra overrides, outside of the scripts."""
+@contextmanager
+def _hydra() -> Iterator[GlobalHydra]:
+    """Hydra of the running script, or else one that reads conf/."""
     if GlobalHydra.instance().is_initialized():
-        return compose(name, list(overrides))
+        yield GlobalHydra.instance()
+        return
     with initialize_config_dir(str(conf_folder().resolve()), version_base="1.3"):
+        yield GlobalHydra.instance()
+
+
+def load_config(name: str = "evaluate", overrides: Sequence[str] = ()) -> DictConfig:
+    """Returns the configuration conf/<name>.yaml with Hydra overrides, outside of the scripts."""
+    with _hydra():
         return compose(name, list(overrides))
 
 
 def load_choice(group: str, name: str) -> DictConfig:
-    """The file conf/<group>/<name>.yaml, of the running script's search path, where there is one.
+    """Returns the file conf/<group>/<name>.yaml, of the running script's search path where there is one.
 
-    Raises InputError listing the choices where there is none of this name.
+    Raises:
+        InputError: where there is none of this name; it lists the choices.
     """
     if not CHOICE.fullmatch(name):  # a path could lead out of conf/, into a stranger's folder
         raise InputError(f"{group}={name}: no name of a file in conf/{group}")
-    if not GlobalHydra.instance().is_initialized():
-        with initialize_config_dir(str(conf_folder().resolve()), version_base="1.3"):
-            return load_choice(group, name)
-    loader = GlobalHydra.instance().config_loader()
-    try:
-        changes = [f"+{group}={name}", *_search_path()]
-        config = loader.load_configuration(None, changes, RunMode.RUN, validate_sweep_overrides=False)
-    except HydraException as error:
-        known = ", ".join(choices(group))
-        raise InputError(f"{group}={name}: none of {known}; add a file to the group in conf/") from error
-    return config[group]
+    further = HydraConfig.get().overrides.hydra if HydraConfig.initialized() else ()
+    changes = [f"+{group}={name}", *(each for each in further if each.startswith("hydra.searchpath"))]
+    with _hydra() as hydra:
+        try:
+            loader = hydra.config_loader()
+            return loader.load_configuration(None, changes, RunMode.RUN, validate_sweep_overrides=False)[group]
+        except HydraException as error:
+            known = ", ".join(choices(group))
+            raise InputError(f"{group}={name}: none of {known}; add a file to the group in conf/") from error
 
 
 def choices(group: str) -> list[str]:
-    """The names of the files in conf/<group>, as `load_choice` finds them."""
-    if not GlobalHydra.instance().is_initialized():
-        with initialize_config_dir(str(conf_folder().resolve()), version_base="1.3"):
-            return choices(group)
-    return GlobalHydra.instance().config_loader().get_group_options(group)
-
-
-def _search_path() -> list[str]:
-    """The override by which the running script was given further folders, if it was."""
-    if not HydraConfig.initialized():
-        return []
-    return [change for change in HydraConfig.get().overrides.hydra if change.startswith("hydra.searchpath")]
+    """Returns the names of the files in conf/<group>, as `load_choice` finds them."""
+    with _hydra() as hydra:
+        return hydra.config_loader().get_group_options(group)
 
 
 def resolved(config: DictConfig) -> dict[str, Any]:
-    """The configuration as plain containers, for the files of a run."""
+    """Returns the configuration as plain containers, for the files of a run."""
     plain = OmegaConf.to_container(config, resolve=True)
     assert isinstance(plain, dict)
     return {str(key): value for key, value in plain.items()}
@@ -86,7 +83,11 @@ class Extension:
 
 
 def built(config: DictConfig, where: str, kind: type, **given: Any) -> Any:
-    """What `_target_` of a group builds, outside code included; InputError where it cannot be built or is no `kind`."""
+    """Returns what `_target_` of a group builds, outside code included.
+
+    Raises:
+        InputError: where it cannot be built or is no `kind`.
+    """
     settings = {key: value for key, value in config.items() if key != "name"}
     target = settings.get("_target_")
     try:
@@ -102,17 +103,14 @@ def built(config: DictConfig, where: str, kind: type, **given: Any) -> Any:
 
 
 def set_up(config: DictConfig) -> None:
-    """Plugins, threads, device and the seeds of torch, numpy and python; InputError for a plugin or device that is not
-    there and a size that is impossible."""
+    """Import the plugins; set the threads, the device and the seeds of torch, numpy and python.
+
+    Raises:
+        InputError: for a plugin or device that is not there, and a size that is impossible.
+    """
     check_counts(config, threads=1, batch=1)
-    for name in config.plugins:
-        try:
-            import_module(name)
-        except ImportError as error:
-            raise InputError(f"plugins: {name}: {error}; install it or put its folder on PYTHONPATH") from error
+    import_plugins(config.plugins, "plugins: ")
     torch.set_num_threads(config.threads)
-    if str(config.device).startswith("cuda") and not torch.cuda.is_available():
-        raise InputError(f"device={config.device}: no CUDA device is available; use device=cpu")
     try:
         torch.empty(1, device=config.device)
     except (RuntimeError, AssertionError) as error:
@@ -123,55 +121,57 @@ def set_up(config: DictConfig) -> None:
     random.seed(seed)
 
 
+def import_plugins(names: Sequence[str], option: str) -> None:
+    """Import modules; InputError, beginning with `option`, where one is not there."""
+    for name in names:
+        try:
+            import_module(name)
+        except ImportError as error:
+            raise InputError(f"{option}{name}: {error}; install it or put its folder on PYTHONPATH") from error
+
+
 def check_counts(config: Mapping, **least: int) -> None:
-    """InputError for settings that are no whole numbers of at least these."""
+    """Raises InputError for settings that are no whole numbers of at least these."""
     for key, low in least.items():
         if type(config[key]) is not int or config[key] < low:
             raise InputError(f"{key}={config[key]}: expected a whole number of at least {low}")
 
 
-OPTION = re.compile(r"(?P<added>\+{0,2})(?P<key>[\w./-]+)=(?P<value>.*)", re.DOTALL)
-ALIKE = 0.8  # similarity from which an added key is taken for a mistyped one
+# --- command line
 
 
 def run_command(main: Callable[[], None], name: str) -> None:
-    """Run a script that Hydra configures by conf/<name>.yaml.
+    """Run a command that Hydra configures by conf/<name>.yaml.
 
-    `--help` prints the files of the configuration, with the files that the command line chooses. After Hydra's refusal
-    the nearest right name is told. A key added by + that looks like one there is ends the command, status 2.
+    `--help` prints the files of the configuration, with the files that the command line chooses. An option that there
+    is not ends the command with the nearest one, status 2; so does a key added by + that looks like one there is.
     """
     arguments = sys.argv[1:]
     if {"-h", "--help"} & set(arguments):
         print(help_text(name, arguments))
         return
-    if wrong := added_by_mistake(name, arguments):
-        print("error: " + "; ".join(wrong), file=sys.stderr)
-        sys.exit(2)
-    try:
-        main()
-    except SystemExit as end:
-        if end.code == 1 and (wrong := mistyped(name, arguments)):
-            print("error: " + "; ".join(wrong), file=sys.stderr)
-        raise
-
-
-# --- help
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors arrive here as they are
+    with ending():
+        if wrong := added_by_mistake(name, arguments):
+            raise InputError("; ".join(wrong))
+        try:
+            main()
+        except HydraException as error:
+            raise InputError("; ".join(mistyped(name, arguments)) or str(error)) from error
 
 
 def help_text(name: str, arguments: Sequence[str]) -> str:
-    """The configuration of a script as its files say it, comments included."""
+    """Returns the configuration of a command as its files say it, comments included."""
     folders = [conf_folder(), *_further(arguments)]
-    root = conf_folder() / f"{name}.yaml"
     parts = [
-        f"python {name}.py [GROUP=FILE] [KEY=VALUE] [PART.KEY=VALUE]\n\nOptions by group, with what they are now; "
+        f"{' '.join(program())} [GROUP=FILE] [KEY=VALUE] [PART.KEY=VALUE]\n\nOptions by group, with what they are now; "
         f"`GROUP=FILE --help` shows those of another file. hydra.run.dir=FOLDER: where the run is written.",
-        root.read_text(),
+        (conf_folder() / f"{name}.yaml").read_text(),
     ]
     chosen = {key: value for _, key, value in _options(arguments)}
-    for entry in _content(root)["defaults"]:
-        for group, file in entry.items() if isinstance(entry, dict) else ():
-            if file := chosen.get(group, file):
-                parts += _file_texts(folders, group, str(file))
+    for group, file in _groups(name).items():
+        if file := chosen.get(group, file):
+            parts += _file_texts(folders, group, str(file))
     return "\n\n".join(part.rstrip() for part in parts)
 
 
@@ -188,50 +188,29 @@ def _file_texts(folders: Sequence[Path], group: str, name: str) -> Iterator[str]
             yield from _file_texts(folders, group, base)
 
 
-def _content(file: Path) -> dict[str, Any]:
-    content = OmegaConf.to_container(OmegaConf.load(file))
-    return {str(key): value for key, value in content.items()} if isinstance(content, dict) else {}
-
-
-def _further(arguments: Sequence[str]) -> Iterator[Path]:
-    """Folders of configuration that the command line names."""
-    for position, argument in enumerate(arguments):
-        option, _, value = argument.partition("=")
-        if option in ("--config-dir", "-cd"):
-            yield Path(value or "".join(arguments[position + 1 : position + 2]))
-
-
-# --- names
-
-
 def mistyped(name: str, arguments: Sequence[str]) -> list[str]:
-    """What is wrong with options that no file of the configuration has, with the nearest name that one has.
+    """Returns what is wrong with options that no file of the configuration has, with the nearest name that one has.
 
     Nothing where the command line names further folders of configuration: Hydra alone knows what is in force then.
     """
     if any(_further(arguments)) or any(argument.startswith("hydra.searchpath") for argument in arguments):
         return []
-    given = [option for option in _options(arguments) if not option[0]]
-    groups = _groups(name)
+    given, groups = [option for option in _options(arguments) if not option[0]], _groups(name)
     chosen = [f"{key}={value}" for _, key, value in given if key in groups and value in (*choices(key), "null")]
     keys = list(_keys(OmegaConf.to_container(load_config(name, chosen))))
     wrong = []
     for _, key, value in given:
-        if key in groups:
-            known = choices(key)
-            if value not in (*known, "null"):
-                wrong.append(_told(f"{key}={value}", value, known))
-        elif key not in keys:
+        if key in groups and value not in (*choices(key), "null"):
+            wrong.append(_told(f"{key}={value}", value, choices(key)))
+        elif key not in groups and key not in keys:
             wrong.append(_told(key, key, keys))
     return wrong
 
 
 def added_by_mistake(name: str, arguments: Sequence[str]) -> list[str]:
     """The same for keys added by + at the top, where they look like one of the file's own: they would do nothing."""
-    added = [key for plus, key, _ in _options(arguments) if plus and "." not in key and "/" not in key]
-    if not added:
-        return []
     known = [*_content(conf_folder() / f"{name}.yaml"), *_groups(name)]
+    added = [key for plus, key, _ in _options(arguments) if plus and "." not in key and "/" not in key]
     return [_told(key, key, known) for key in added if key not in known and get_close_matches(key, known, 1, ALIKE)]
 
 
@@ -242,6 +221,14 @@ def _told(option: str, given: str, known: Sequence[str]) -> str:
     return f"{option}: there is no such option" + (f"; the nearest is {near[0]}" if near else "; see --help")
 
 
+def _further(arguments: Sequence[str]) -> Iterator[Path]:
+    """Folders of configuration that the command line names."""
+    for position, argument in enumerate(arguments):
+        option, _, value = argument.partition("=")
+        if option in ("--config-dir", "-cd"):
+            yield Path(value or "".join(arguments[position + 1 : position + 2]))
+
+
 def _options(arguments: Sequence[str]) -> list[tuple[str, str, str]]:
     """(plus signs, key, value) of the options of a command line, Hydra's own apart."""
     found = (OPTION.fullmatch(argument) for argument in arguments)
@@ -249,10 +236,20 @@ def _options(arguments: Sequence[str]) -> list[tuple[str, str, str]]:
     return [part for part in parts if not part[1].startswith(("hydra.", "hydra/", "-"))]
 
 
-def _groups(name: str) -> list[str]:
-    """The groups that a script's configuration chooses from."""
-    entries = _content(conf_folder() / f"{name}.yaml")["defaults"]
-    return [group for entry in entries if isinstance(entry, dict) for group in entry]
+def _content(file: Path) -> dict[str, Any]:
+    content = OmegaConf.to_container(OmegaConf.load(file))
+    return {str(key): value for key, value in content.items()} if isinstance(content, dict) else {}
+
+
+def _groups(name: str) -> dict[str, str | None]:
+    """The groups that a command's configuration chooses from, with the file that it chooses."""
+    groups: dict[str, str | None] = {}
+    for entry in _content(conf_folder() / f"{name}.yaml")["defaults"]:
+        if isinstance(entry, dict):
+            groups |= {key.removeprefix("override ").removeprefix("/"): value for key, value in entry.items()}
+        elif entry != "_self_":  # the configuration that it builds on
+            groups |= _groups(entry)
+    return groups
 
 
 def _keys(config: Any, prefix: str = "") -> Iterator[str]:

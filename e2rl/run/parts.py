@@ -16,7 +16,7 @@ PARTS, FORMAT, HASHED = "parts", "e2rl-part/1", b"e2rl-sha256:"
 
 
 @dataclass(frozen=True)
-class Kept:
+class Parts:
     """The finished parts of a run's stage, in folder/parts/<stage>; folder None: nothing is kept.
 
     A part holds plain values and tensors. It counts where its file is whole and its identity is the one asked for.
@@ -59,7 +59,7 @@ class Kept:
         return self.folder / PARTS / self.stage / f"{name}.pt"
 
 
-NOTHING_KEPT = Kept()
+NO_PARTS = Parts()
 
 
 def forget_parts(folder: Path) -> None:

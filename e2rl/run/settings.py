@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Collection, Mapping
+from copy import deepcopy
 from dataclasses import field, fields, is_dataclass
 from functools import cache, wraps
 from pathlib import Path
@@ -58,7 +59,7 @@ def configured(file: str, part: str = "") -> Callable[[Kind], Kind]:
                 self, *positional, **named, **{k: values[k] for k in signature.parameters if k in values.keys() - given}
             )
             if is_dataclass(kind):
-                check_settings(self, part or file.partition("/")[0])
+                check_settings(self, ".".join(filter(None, (file.partition("/")[0], part))))
 
         kind.__init__ = filled  # type: ignore[misc]
         kind.__configured__ = (file, part)  # type: ignore[attr-defined]
@@ -69,7 +70,7 @@ def configured(file: str, part: str = "") -> Callable[[Kind], Kind]:
 
 def file_values(file: str, part: str = "") -> dict[str, Any]:
     """Returns the plain values of conf/<file>.yaml, or of one mapping in it; lists are tuples."""
-    found = _content(file)
+    found = deepcopy(_content(file))
     for name in filter(None, part.split(".")):
         found = found[name]
     return {key: tuple(value) if isinstance(value, list) else value for key, value in found.items()}
@@ -77,12 +78,15 @@ def file_values(file: str, part: str = "") -> dict[str, Any]:
 
 @cache
 def _content(file: str) -> dict[str, Any]:
-    plain = OmegaConf.to_container(OmegaConf.load(conf_folder() / f"{file}.yaml"))
+    root = OmegaConf.load(conf_folder() / "train.yaml")  # what the file's ${...} may refer to
+    OmegaConf.update(root, "sim", OmegaConf.load(conf_folder() / "sim" / "default.yaml"))
+    OmegaConf.update(root, "own", OmegaConf.load(conf_folder() / f"{file}.yaml"))
+    plain = OmegaConf.to_container(root.own, resolve=True)
     assert isinstance(plain, dict)
     return {str(key): value for key, value in plain.items()}
 
 
-def settings_of(kind: type[Settings], values: Mapping, where: str) -> Settings:
+def settings_of(kind: type[Settings], values: Mapping, where: str = "") -> Settings:
     """Returns an instance of the dataclass `kind` (fields of plain types) with the values of the group `where`.
 
     Keys that are not given keep their defaults; lists become tuples.
@@ -96,7 +100,7 @@ def settings_of(kind: type[Settings], values: Mapping, where: str) -> Settings:
     except OmegaConfBaseException as error:
         key, reason = error.full_key or error.key, str(error).splitlines()[0]
         value = f"={values[key]}" if key in values else ""
-        raise InputError(f"{where}.{key}{value}: {reason}; compare the group with its file in conf/") from error
+        raise InputError(f"{_dotted(where, key)}{value}: {reason}; compare it with its file in conf/") from error
     assert isinstance(plain, dict)
     known = {str(key): value for key, value in plain.items() if not (isinstance(value, str) and value == "???")}
     made = kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in known.items()})
@@ -111,10 +115,14 @@ def check_settings(made: Any, where: str) -> None:
         if "low" not in rule or (value is None and rule["optional"]):
             continue
         if rule["choices"]:
-            check_choice(f"{where}.{each.name}", value, rule["choices"])
+            check_choice(_dotted(where, each.name), value, rule["choices"])
         elif isinstance(value, int | float | tuple):
             for number in value if isinstance(value, tuple) else (value,):
-                check_range(f"{where}.{each.name}", number, rule["low"], rule["high"])
+                check_range(_dotted(where, each.name), number, rule["low"], rule["high"])
+
+
+def _dotted(where: str, key: object) -> str:
+    return f"{where}.{key}" if where else str(key)
 
 
 def check_choice(where: str, value: object, choices: Collection[str]) -> None:

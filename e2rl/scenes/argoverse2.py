@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from e2rl.run.errors import InputError
-from e2rl.scenes.log_files import MAX_BYTES
+from e2rl.run.files import hash_files
+from e2rl.scenes.log_files import check_size
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import CYCLIST, OTHER, PEDESTRIAN, VEHICLE, Lane, Recording, same_way
 from e2rl.scenes.smoothing import resample_uniform, speeds
-from e2rl.scenes.source import Source, hash_files
+from e2rl.scenes.source import Source
 
 FILES = ("scenario_*.parquet", "annotations*.feather")
 LEVELS = ("", "*/", "*/*/")  # of folders below `path` in which logs are looked for
@@ -56,46 +57,29 @@ class Argoverse2Source(Source):
     """The scenarios and sensor logs in the folder `path`, up to two folders below it."""
 
     holds = "Argoverse 2 scenarios or sensor logs"
+    mend = "download it again or leave it out"
+    extra = "argoverse2"
 
     def logs(self) -> list[str]:
         root = self.root()
         found = {file.parent: file for level in LEVELS for kind in FILES for file in sorted(root.glob(level + kind))}
         if not found:
-            raise InputError(
-                f"data.path={root}: holds neither {FILES[0]} nor {FILES[1]}; pass a folder of {self.holds}"
-            )
+            neither = f"holds neither {FILES[0]} nor {FILES[1]}"
+            raise InputError(f"data.path={root}: {neither}; pass a folder of {self.holds}")
         return sorted(str(file.relative_to(root)) for file in found.values())
 
     def read(self, log: str) -> Iterator[Recording]:
-        yield read_log(self.root() / log, log)
+        from av2.map.map_api import ArgoverseStaticMap
+
+        path = self.root() / log
+        for file in _files(path):
+            check_size(file)
+        recording = _scenario(path) if path.suffix == ".parquet" else _sensor_log(path)
+        recording.lanes, recording.drivable = _map(ArgoverseStaticMap.from_json(_files(path)[-1]))
+        yield recording
 
     def fingerprint(self) -> bytes:
         return hash_files(file for log in self.logs() for file in _files(self.root() / log))
-
-
-def read_log(path: Path, name: str) -> Recording:
-    """The recording of a scenario's parquet or a sensor log's annotations, at 10 Hz; raises InputError naming it."""
-    try:
-        import av2  # noqa: F401
-        import av2.map.map_api
-    except ImportError as error:
-        reason = f"av2 cannot be imported ({error})"
-        raise InputError(
-            f"data=argoverse2: {reason}; install e2rl with its extra: pip install 'e2rl[argoverse2]'"
-        ) from error
-    try:
-        files = _files(path)
-        for file in files:
-            if file.stat().st_size > MAX_BYTES:
-                raise InputError(f"{file.name} has more than the {MAX_BYTES / 1e6:.0f} MB of a log; leave it out")
-        recording = _scenario(path) if path.suffix == ".parquet" else _sensor_log(path)
-        recording.lanes, recording.drivable = _map(av2.map.map_api.ArgoverseStaticMap.from_json(files[-1]))
-        return recording
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from error
-    except Exception as error:  # damaged files raise anything
-        reason = f"{type(error).__name__} {error}"
-        raise InputError(f"{name}: not an Argoverse 2 log: {reason}; download it again or leave it out") from error
 
 
 def _files(path: Path) -> list[Path]:

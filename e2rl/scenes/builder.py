@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from e2rl.run.errors import InputError
-from e2rl.run.settings import check_range
+from e2rl.run.settings import configured, setting
 from e2rl.scenes import boxes
 from e2rl.scenes.drivable_area import drivable_field
 from e2rl.scenes.lane_graph import BEHIND, LaneGraph, Route, plausible_width
@@ -22,25 +22,21 @@ Arrays = dict[str, np.ndarray]
 STANDING = 0.5  # m/s
 FIT = 2.0  # m: mean distance of a recorded future from a candidate that still counts as the route driven
 PASSED = 1.0  # m behind the vehicle's centre beyond which a stop line no longer counts
-LEAST = {"steps": 1, "vehicles": 2, "others": 0, "routes": 1, "vertices": 20, "field_cells": 8}
 MAX_EXITS, MAX_LIGHTS = 6, 2  # successors of a lane, lights of a route that a scene keeps
 
 
-@dataclass(frozen=True)
+@configured("data/source", "build")
+@dataclass
 class BuildSettings:
     """Sizes of a scene: simulated steps, vehicles (with the ego), other agents, route candidates and their vertices,
     cells of the drivable field."""
 
-    steps: int = 80
-    vehicles: int = 32
-    others: int = 16
-    routes: int = 6
-    vertices: int = 150
-    field_cells: int = 320
-
-    def __post_init__(self) -> None:
-        for name, least in LEAST.items():
-            check_range(f"data.build.{name}", getattr(self, name), least)
+    steps: int = setting(low=1)
+    vehicles: int = setting(low=2)
+    others: int = setting(low=0)
+    routes: int = setting(low=1)
+    vertices: int = setting(low=20)
+    field_cells: int = setting(low=8)
 
 
 def build_scene(recording: Recording, settings: BuildSettings) -> TensorDict:

@@ -16,7 +16,7 @@ import numpy as np
 from e2rl.run.errors import InputError
 from e2rl.run.files import read_arrays
 from e2rl.scenes.recording import VEHICLE, Lane, Recording
-from e2rl.scenes.source import Source
+from e2rl.scenes.source import Source, default_of
 
 SPLITS = ("train", "tune", "test")
 FORMAT = "e2rl-scenes/1"
@@ -55,7 +55,7 @@ class SceneMap:
 class BundledSource(Source):
     """The bundled scenes of split train, tune or test."""
 
-    split: str | None = "test"
+    split: str | None = default_of("split", "data/bundled")
 
     has_splits = True
 

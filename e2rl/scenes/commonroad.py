@@ -57,42 +57,24 @@ class CommonRoadSource(LogFiles):
 
     holds = "CommonRoad scenarios"
     ending = ".xml"
-    no_logs = "pass a folder or zip of CommonRoad XML scenarios"
+    mend = "export it again or leave it out"
+    extra = "commonroad"
 
     def read(self, log: str) -> Iterator[Recording]:
         start = min(self.starts or (HISTORY,))
-        recording = read_scenario(self.content(log), log, start)
+        recording = read_scenario(self.content(log), start)
         if len(recording.states) - self.build.steps // 2 >= start:
             yield recording
 
 
-def read_scenario(content: bytes, name: str, start: int = HISTORY) -> Recording:
-    """The recording in an XML file at 10 Hz, with an ego that is recorded at frame `start` where there is one.
+def read_scenario(content: bytes, start: int = HISTORY) -> Recording:
+    """Returns the recording in an XML file at 10 Hz, with an ego that is there at frame `start` where there is one."""
+    # beside commonroad-io's reader of protobuf, which needs a protobuf of its own
+    from commonroad.common.reader.file_reader_xml import XMLFileReader
 
-    Raises InputError naming the file.
-    """
-    reader = _reader()
-    try:
-        _check_content(content)
-        scenario, problems = reader(io.BytesIO(content)).open()
-        return _recording(scenario, list(problems.planning_problem_dict.values()), start)
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from error
-    except Exception as error:  # damaged files raise anything
-        reason = f"{type(error).__name__} {error}"
-        raise InputError(f"{name}: not a CommonRoad scenario: {reason}; export it again or leave it out") from error
-
-
-def _reader() -> type:
-    """commonroad-io's reader of XML, imported beside its reader of protobuf, which needs a protobuf of its own."""
-    try:
-        from commonroad.common.reader.file_reader_xml import XMLFileReader
-    except ImportError as error:
-        reason = f"commonroad-io cannot be imported ({error})"
-        raise InputError(
-            f"data=commonroad: {reason}; install e2rl with its extra: pip install 'e2rl[commonroad]'"
-        ) from error
-    return XMLFileReader
+    _check_content(content)
+    scenario, problems = XMLFileReader(io.BytesIO(content)).open()
+    return _recording(scenario, list(problems.planning_problem_dict.values()), start)
 
 
 def _check_content(content: bytes) -> None:

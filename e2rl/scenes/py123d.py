@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from e2rl.run.errors import InputError
+from e2rl.run.files import hash_files
+from e2rl.scenes.log_files import check_size
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import (
     CYCLIST,
@@ -28,7 +30,7 @@ from e2rl.scenes.recording import (
     same_way,
 )
 from e2rl.scenes.smoothing import resample_uniform, speeds
-from e2rl.scenes.source import Source, hash_files
+from e2rl.scenes.source import Source
 
 SYNC = "sync.arrow"  # every log's folder holds one
 FILES = (SYNC, "ego_state_se3.arrow", "box_detections_se3.arrow", "traffic_light_detections.arrow", "map.arrow")
@@ -56,6 +58,8 @@ class Py123dSource(Source):
     """The converted logs below `path`: the folder with logs/ and maps/, or one inside of logs/, such as a split's."""
 
     holds = "logs converted by py123d, with logs/ and maps/"
+    mend = "convert it again or leave it out"
+    extra = "py123d"
 
     def logs(self) -> list[str]:
         root = self.root()
@@ -71,39 +75,26 @@ class Py123dSource(Source):
         return (above[0] if above else root) / "maps"
 
     def read(self, log: str) -> Iterator[Recording]:
-        yield from read_log(self.root() / log, self.maps(), log)
-
-    def fingerprint(self) -> bytes:
-        files = [self.root() / log / name for log in self.logs() for name in FILES]
-        return hash_files([file for file in files if file.is_file()] + sorted(self.maps().rglob("*.arrow")))
-
-
-def read_log(folder: Path, maps: Path, name: str) -> Iterator[Recording]:
-    """The recordings of a log's folder at 10 Hz, one for each piece; raises InputError naming it."""
-    try:
         from py123d.api.scene.arrow.arrow_scene_api import ArrowSceneAPI
-    except ImportError as error:
-        reason = f"py123d cannot be imported ({error})"
-        raise InputError(f"data=py123d: {reason}; install e2rl with its extra: pip install 'e2rl[py123d]'") from error
-    try:
+
+        folder = self.root() / log
         _check_files(folder)
-        scene = ArrowSceneAPI(folder, maps_root=maps)
+        scene = ArrowSceneAPI(folder, maps_root=self.maps())
         frames, about, land = _frames(scene), scene.log_metadata, scene.get_map_api()
         if len(frames) < 2:
             raise InputError("fewer than two frames with the ego and boxes; leave it out")
         if land is None:
-            raise InputError(f"no map, neither map.arrow beside it nor {maps}; convert the maps as well")
+            raise InputError(f"no map, neither map.arrow beside it nor {self.maps()}; convert the maps as well")
         for number, piece in enumerate(_pieces(frames)):
             scene_id = about.log_name if len(piece) == len(frames) else f"{about.log_name}#{number}"
             recording = _recording(scene_id, piece)
             recording.location, recording.dataset = about.location or "", about.dataset
             recording.lanes, recording.drivable = _map(land, recording.states[:, 0, :2])
             yield recording
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from error
-    except Exception as error:  # damaged files raise anything
-        reason = f"{type(error).__name__} {str(error).splitlines()[0] if str(error) else ''}"
-        raise InputError(f"{name}: not a log of py123d: {reason}; convert it again or leave it out") from error
+
+    def fingerprint(self) -> bytes:
+        files = [self.root() / log / name for log in self.logs() for name in FILES]
+        return hash_files([file for file in files if file.is_file()] + sorted(self.maps().rglob("*.arrow")))
 
 
 def _check_files(folder: Path) -> None:
@@ -112,8 +103,8 @@ def _check_files(folder: Path) -> None:
     import pyarrow as pa
 
     for name in FILES:
-        if (folder / name).is_file() and (folder / name).stat().st_size > MAX_BYTES:
-            raise InputError(f"{name} has more than the {MAX_BYTES / 1e6:.0f} MB of a log; leave it out")
+        if (folder / name).exists():
+            check_size(folder / name, MAX_BYTES)
     for file in sorted(folder.glob("*.arrow")):
         with pa.memory_map(str(file)) as source:
             about = (pa.ipc.open_file(source).schema.metadata or {}).get(b"metadata")

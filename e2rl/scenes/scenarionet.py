@@ -36,19 +36,21 @@ class ScenarioNetSource(LogFiles):
 
     holds = "ScenarioDescription pickles"
     ending = ".pkl"
-    no_logs = "convert the logs with ScenarioNet first"
+    mend = "export the scenario again or leave it out"
     ignored = ("dataset_summary.pkl", "dataset_mapping.pkl")  # pickles beside the scenarios that are none
 
     def read(self, log: str) -> Iterator[Recording]:
-        yield read_recording(self.content(log), log, self.locations.get(Path(log).stem, ""))
+        yield recording_of(safe_load(self.content(log), log), self.locations.get(Path(log).stem, ""))
 
     def fingerprint(self) -> bytes:
         return super().fingerprint() + json.dumps(sorted(self.locations.items()) or "places unknown").encode()
 
     @cached_property
     def locations(self) -> dict[str, str]:
-        """Location by a log's name without ending, from `index.csv` (columns file, location_group) beside `path`. The
-        name of a log's map is no place: it is a city's."""
+        """The place of each log by its name without ending: `index.csv` (columns file, location_group) beside `path`.
+
+        The name of a log's map is no place: it is a city's.
+        """
         index = self.root().parent / "index.csv"
         if not index.is_file():
             return {}
@@ -61,7 +63,7 @@ class ScenarioNetSource(LogFiles):
 
 
 def safe_load(content: bytes, name: str) -> dict:
-    """The dict in a pickle; raises InputError naming the file where it is damaged or holds more than plain data."""
+    """Returns the dict in a pickle; raises InputError where it is damaged or holds more than plain data."""
     try:
         data = load_plain(content)
     except Exception as error:  # damaged bytes raise anything
@@ -73,23 +75,8 @@ def safe_load(content: bytes, name: str) -> dict:
     return data
 
 
-def read_recording(content: bytes, name: str, location: str = "") -> Recording:
-    """The whole log in a pickle, at 10 Hz, with its own start frame if it names one; raises InputError naming it."""
-    return recording_of(safe_load(content, name), name, location)
-
-
-def recording_of(data: dict, name: str, location: str = "") -> Recording:
-    """The same of a ScenarioDescription that was read already."""
-    try:
-        return _recording(data, location)
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from error
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
-        problem = f"{type(error).__name__} {error}; export the scenario again or leave it out"
-        raise InputError(f"{name}: not a ScenarioDescription: {problem}") from error
-
-
-def _recording(data: dict, location: str) -> Recording:
+def recording_of(data: dict, location: str = "") -> Recording:
+    """Returns the whole log of a ScenarioDescription at 10 Hz, with its own start frame if it names one."""
     metadata, tracks = data["metadata"], data["tracks"]
     keys, ego = [str(key) for key in tracks], metadata.get("sdc_id")
     if str(ego) not in keys:

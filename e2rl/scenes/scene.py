@@ -24,9 +24,9 @@ P vertices; S lights; M, D map points; L lanes. Positions are relative to the sc
 """
 
 import hashlib
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -53,7 +53,7 @@ RAGGED = {  # keys whose first dims differ between scenes: the value that pads t
 
 
 def validate(scene: TensorDictBase, name: str) -> None:
-    """Raise InputError naming the scene and the key that breaks the schema or is not finite."""
+    """Raises InputError naming the scene and the key that breaks the schema or is not finite."""
     keys = set(scene.keys())
     for key, dims in KEYS.items():
         if key not in keys:
@@ -68,7 +68,7 @@ def validate(scene: TensorDictBase, name: str) -> None:
 
 
 def content_hash(scene: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 of the arrays of a scene; the size to which ragged ones are padded does not matter."""
+    """Returns the SHA-256 of the arrays of a scene; the size to which ragged ones are padded does not matter."""
     digest = hashlib.sha256()
     for key in sorted(scene):
         value = unpadded(scene[key], RAGGED[key]) if key in RAGGED else scene[key]
@@ -78,7 +78,7 @@ def content_hash(scene: Mapping[str, np.ndarray]) -> str:
 
 
 def unpadded(value: np.ndarray, fill: float) -> np.ndarray:
-    """An array without the rows at the end of each axis that hold nothing but `fill`."""
+    """Returns an array without the rows at the end of each axis that hold nothing but `fill`."""
     for axis in range(value.ndim):
         used = (value != fill).any(axis=tuple(other for other in range(value.ndim) if other != axis))
         kept = int(np.flatnonzero(used)[-1]) + 1 if used.any() else 0
@@ -86,69 +86,16 @@ def unpadded(value: np.ndarray, fill: float) -> np.ndarray:
     return value
 
 
-class Rows(ABC):
-    """Where the scenes [S] of a set are."""
-
-    @abstractmethod
-    def __len__(self) -> int:
-        """S."""
-
-    @abstractmethod
-    def shape(self, key: str) -> tuple[int, ...]:
-        """The shape of a key of one scene."""
-
-    @abstractmethod
-    def resident(self, index: Tensor) -> tuple[TensorDict, Tensor]:
-        """Scenes in memory, those at `index` [B] among them, and where these are [B]; not to be written."""
-
-    @abstractmethod
-    def whole(self) -> TensorDict:
-        """All scenes [S] in memory, in their order."""
-
-    @abstractmethod
-    def chosen(self, index: Sequence[int]) -> "Rows":
-        """Those at `index`, in this order."""
-
-    @abstractmethod
-    def hashes(self) -> list[str]:
-        """The `content_hash` of each scene."""
-
-
-@dataclass(frozen=True)
-class Loaded(Rows):
-    """Scenes [S] in memory."""
-
-    scenes: TensorDict
-
-    def __len__(self) -> int:
-        return len(self.scenes)
-
-    def shape(self, key: str) -> tuple[int, ...]:
-        return tuple(self.scenes[key].shape[1:])
-
-    def resident(self, index: Tensor) -> tuple[TensorDict, Tensor]:
-        return self.scenes, index
-
-    def whole(self) -> TensorDict:
-        return self.scenes
-
-    def chosen(self, index: Sequence[int]) -> "Loaded":
-        scenes = self.scenes[torch.as_tensor(index)]
-        scenes["scene_index"] = torch.arange(len(index), device=scenes["scene_index"].device)
-        return Loaded(scenes)
-
-    def hashes(self) -> list[str]:
-        return [content_hash({key: scene[key].numpy() for key in KEYS}) for scene in self.scenes.cpu()]
-
-
 @dataclass
 class SceneSet:
-    """Scenes [S] of one data set and split, with their names; `dropped` counts recordings left out, by reason.
+    """Scenes of one data set and split, with their names.
 
-    number: of each scene's noise, by default its position; files: SHA-256 of the data's files, "" where unknown.
+    scenes [S]: in memory, or mapped from the cache, in which case only what is used of them is read; dropped: counts
+    recordings left out, by reason; number: of each scene's noise, by default its position; files: SHA-256 of the data's
+    files, "" where unknown; digests: `content_hash` of each scene, where it is known.
     """
 
-    rows: Rows
+    scenes: TensorDict
     scene_id: list[str]
     location: list[str]
     dataset: str
@@ -156,34 +103,38 @@ class SceneSet:
     dropped: dict[str, int]
     number: list[int] = field(default_factory=list)
     files: str = ""
+    digests: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.number = self.number or list(range(len(self.scene_id)))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns what another process gets: these scenes alone, not the file or the tensors that they are part of."""
+        return vars(self) | {"scenes": self.scenes.clone()}
 
     def __len__(self) -> int:
         return len(self.scene_id)
 
     @property
-    def scenes(self) -> TensorDict:
-        """All scenes [S], in memory from now on; `batch` has parts of a set that does not fit there."""
-        return self.rows.whole()
-
-    @property
     def steps(self) -> int:
         """Simulated steps T."""
-        return self.rows.shape("logged")[0] - 1
+        return self.scenes["logged"].shape[1] - 1
+
+    def hashes(self) -> list[str]:
+        """Returns the `content_hash` of each scene."""
+        found = ({key: scene[key].cpu().numpy() for key in KEYS} for scene in self.scenes)
+        return self.digests or [content_hash(scene) for scene in found]
 
     def batch(self, indices: Sequence[int] | Tensor) -> TensorDict:
-        """Scenes [B] at `indices`, as a copy."""
-        scenes, places = self.rows.resident(torch.as_tensor(indices))
-        return scenes[places]
+        """Returns the scenes [B] at `indices`, as a copy."""
+        return self.scenes[torch.as_tensor(indices)]
 
     def parts(self, size: int = PART) -> Iterator[TensorDict]:
-        """All scenes in their order, at most `size` at a time."""
+        """Yields all scenes in their order, at most `size` at a time."""
         return (self.batch(index) for index in torch.arange(len(self)).split(size))
 
     def index(self, which: int | str) -> int:
-        """The index of a scene given by index or id; raises InputError where there is none."""
+        """Returns the index of a scene given by index or id; raises InputError where there is none."""
         if isinstance(which, int) and 0 <= which < len(self):
             return which
         if which in self.scene_id:
@@ -191,34 +142,34 @@ class SceneSet:
         example = f"or the id of a scene, such as {self.scene_id[0]}"
         raise InputError(f"scene={which}: expected an index below {len(self)} {example}")
 
-    def copy_into(self, batch: TensorDictBase, rows: Tensor, indices: Tensor) -> None:
-        """Overwrite rows [b] (ascending) of a batch of scenes by the scenes at `indices` [b], in place."""
+    def copy_into(self, batch: TensorDict, rows: Tensor, indices: Tensor) -> None:
+        """Overwrites rows [b] (ascending) of a batch of scenes by the scenes at `indices` [b], in place."""
         whole = len(rows) == len(batch)
-        scenes, places = self.rows.resident(indices)
-        for key, source in scenes.items():
+        for key, source in self.scenes.items():
             target = batch[key]
             if whole and source.device == target.device:  # a second copy would cost more pages than the first
-                torch.index_select(source, 0, places, out=target)
+                torch.index_select(source, 0, indices, out=target)
             elif source.device == target.device and source[0].numel() > LARGE:  # scene by scene, without a copy between
-                for row, place in zip(rows.tolist(), places.tolist(), strict=True):
-                    target[row].copy_(source[place])
+                for row, index in zip(rows.tolist(), indices.tolist(), strict=True):
+                    target[row].copy_(source[index])
             else:
-                target[rows] = source[places].to(target.device)
+                target[rows] = source[indices].to(target.device)
 
     def first(self, count: int | None) -> "SceneSet":
-        """The first `count` scenes (all for None)."""
-        if count is None or count >= len(self):
-            return self
-        return self.chosen(range(count))
+        """Returns the first `count` scenes (all for None)."""
+        return self if count is None else self.chosen(range(min(count, len(self))))
 
     def chosen(self, indices: Sequence[int]) -> "SceneSet":
-        """The scenes at `indices`, which keep their noise."""
+        """Returns the scenes at `indices`, which keep their noise; the first ones are not copied."""
+        count = len(indices)
         if list(indices) == list(range(len(self))):
             return self
-        names, places = ([column[index] for index in indices] for column in (self.scene_id, self.location))
-        numbers = [self.number[index] for index in indices]
-        return replace(self, rows=self.rows.chosen(indices), scene_id=names, location=places, number=numbers)
+        scenes = self.scenes[:count] if list(indices) == list(range(count)) else self.batch(indices)
+        scenes["scene_index"] = torch.arange(count, device=scenes["scene_index"].device)
+        lists = (self.scene_id, self.location, self.number, self.digests)
+        names, places, numbers, digests = ([column[index] for index in indices if column] for column in lists)
+        return replace(self, scenes=scenes, scene_id=names, location=places, number=numbers, digests=digests)
 
     def to(self, device: torch.device | str) -> "SceneSet":
-        """The same scenes on a device."""
-        return replace(self, rows=Loaded(self.scenes.to(device)))
+        """Returns the same scenes on a device."""
+        return replace(self, scenes=self.scenes.to(device))

@@ -48,6 +48,11 @@ def scene_hashes(scenes: SceneSet) -> list[str]:
     return [hashlib.sha256(json.dumps([*names, scenes.dataset]).encode()).hexdigest() for names in about]
 
 
+def listed(scenes: SceneSet) -> tuple[str, str]:
+    """Returns the list of scenes as the content of a file, and the hash of their data's files."""
+    return list_text(scenes), scenes.files
+
+
 def list_text(scenes: SceneSet) -> str:
     """The list of scenes as the content of a file."""
     buffer = io.StringIO()

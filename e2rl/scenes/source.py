@@ -10,93 +10,100 @@ import json
 import sys
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, nullcontext
-from dataclasses import asdict, dataclass, replace
+from contextlib import closing, contextmanager, nullcontext
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
 from hydra.utils import get_class
 from tqdm import tqdm
 
 from e2rl.run.config import Extension
 from e2rl.run.errors import InputError
 from e2rl.run.processes import interrupts_held, without_main, worker_pool
-from e2rl.run.settings import check_range, settings_of
+from e2rl.run.settings import check_range, check_settings, file_values, setting, settings_of
 from e2rl.scenes.builder import BuildSettings, SceneBuilder, ego_overlaps
 from e2rl.scenes.recording import Recording
 from e2rl.scenes.scene import SceneSet, validate
-from e2rl.scenes.scene_cache import Index, Keep, Packed, cached, pack
+from e2rl.scenes.scene_cache import Index, cache_folder, cached, uncached
 from e2rl.scenes.scene_list import listed_scenes
 
 OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are left out
 VERSION = 4  # of the scene builder: raise it when the same recording would make another scene
 AHEAD = 4  # logs for each worker that are built before their scenes are asked for
 FEW = 16  # scenes that are built here before processes would have started
-NO_MATTER = "path", "cache", "cache_gb", "unpacked", "workers"  # settings that do not change the scenes
+NO_MATTER = "path", "cache", "cache_gb", "workers"  # settings that do not change the scenes
 
 
 class Row(NamedTuple):
-    """What one recording made: a scene, or the reason why there is none."""
+    """What one recording made: a scene's arrays, or the reason why there is none."""
 
     scene_id: str
     location: str = ""
     dataset: str = ""
-    scene: Packed | None = None
+    scene: dict[str, np.ndarray] | None = None
     reason: str = ""
+
+
+def default_of(key: str, file: str = "data/source", **rule: Any) -> Any:
+    """Returns a dataclass field whose default is that of conf/<file>.yaml; rule: see `setting`."""
+    return field(default_factory=lambda: file_values(file)[key], metadata=setting(**rule).metadata)
 
 
 @dataclass
 class Source(Extension, ABC):
     """Where recordings come from. A subclass is a dataclass whose fields are the keys of its YAML file.
 
-    It defines `logs` and `read`, and `fingerprint` where its scenes are to be cached.
-
-    path: file or folder of the logs, for sources that need one; split: train, tune or test where `has_splits`, else the
-    name of the split in tables (default: the stem of `path`); starts: start frames of the scenes that are cut from each
-    log (default: see `Recording.windows`); mirror: also each log's mirror image, whose place is the log's;
-    skip_invalid: leave invalid scenes out and count them, instead of raising InputError for the first; cache: folder;
-    cache_gb: its size, in 10^9 bytes; unpacked: scenes that a process keeps unpacked at most, unless it asks for all;
-    workers: processes that build; build: sizes of a scene.
+    It defines `logs` and `read`, and `fingerprint` where its scenes are to be cached. path: file or folder of the logs,
+    for sources that need one; the other settings of every source: conf/data/source.yaml. Of a log in a mirror the place
+    is the log's.
     """
 
     path: str | None = None
-    split: str | None = None
-    starts: tuple[int, ...] | None = None
-    mirror: bool = False
-    skip_invalid: bool = False
-    cache: str = ".cache"
-    cache_gb: float = 20.0
-    unpacked: int = 512
-    workers: int = 2
-    build: BuildSettings = BuildSettings()
+    split: str | None = default_of("split")
+    starts: tuple[int, ...] | None = default_of("starts", optional=True)
+    mirror: bool = default_of("mirror")
+    skip_invalid: bool = default_of("skip_invalid")
+    cache: str | None = default_of("cache")
+    cache_gb: float = default_of("cache_gb", low=0.0)
+    workers: int = default_of("workers")
+    build: BuildSettings = field(default_factory=BuildSettings)
 
     has_splits: ClassVar[bool] = False  # whether `split` chooses among the recordings
     holds: ClassVar[str] = "recorded logs"  # what `path` holds, for messages
+    mend: ClassVar[str] = ""  # what to do with a damaged log; "": any error of `read` but InputError is the class's own
+    extra: ClassVar[str] = ""  # of e2rl, with the library that `read` imports
+
+    def __post_init__(self) -> None:
+        if isinstance(self.build, Mapping):
+            self.build = settings_of(BuildSettings, self.build, "data.build")
+        check_settings(self, "data")
 
     @abstractmethod
     def logs(self) -> list[str]:
-        """Names of the logs, in order; they identify the logs in messages. Raises InputError where there is none."""
+        """Returns the names of the logs, in order; messages name them. Raises InputError where there is none."""
 
     @abstractmethod
     def read(self, log: str) -> Iterator[Recording]:
-        """The recordings of one log, called in a process that may be another one. Raises InputError for a bad log."""
+        """Yields the recordings of one log, perhaps in another process. Raises InputError for a bad log."""
 
     def fingerprint(self) -> bytes | None:
-        """What changes whenever the recordings do (see `hash_files`); None: the scenes are not cached."""
+        """Returns what changes whenever the recordings do (see `hash_files`); None: the scenes are not cached."""
         return None
 
     @property
     def split_name(self) -> str:
-        """Name of the split in tables."""
+        """The name of the split in tables."""
         return self.split or Path(self.path or "").stem
 
     def root(self) -> Path:
-        """`path`; raises InputError where it is not set or not there."""
+        """Returns `path`; raises InputError where it is not set or not there."""
         if not self.path:
             raise InputError(f"data.path is not set; pass data.path=FOLDER_OR_ZIP of {self.holds}")
         if not Path(self.path).exists():
@@ -104,55 +111,73 @@ class Source(Extension, ABC):
         return Path(self.path)
 
     def recordings(self) -> Iterator[Recording]:
-        """All recordings, one for each scene, read in this process."""
+        """Yields all recordings, one for each scene, read in this process."""
         for log in self.logs():
             for windows in self._windows(log):
                 yield from windows
 
     def load(self, most: int | None = None) -> SceneSet:
-        """All scenes or the first `most`, from the cache where they are there; raises InputError for bad input.
+        """Returns all scenes or the first `most`, from the cache where they are there; raises InputError for bad input.
 
         For the first `most`, no more logs are built than they take, unless the cache has all.
         """
-        if (
-            type(self).__module__ == "__mp_main__"
-        ):  # a worker that imports its script anew, and would wait for its parent
+        if type(self).__module__ == "__mp_main__":  # a worker that imports its script anew would wait for its parent
             raise InputError('a script that defines its own source needs `if __name__ == "__main__":` around its calls')
-        check_range("data.unpacked", self.unpacked, 1)
-        check_range("data.cache_gb", self.cache_gb, 0.0)
         content = self.fingerprint()
         if content is None:
-            records: list[bytes] = []
-            return self._build(most, records.append).scenes(records, self.unpacked)
-        settings = asdict(self) | {"split": self.split_name, "source": type(self).__qualname__}
-        settings = {key: value for key, value in settings.items() if key not in NO_MATTER}
-        key = hashlib.sha256(json.dumps([VERSION, settings], sort_keys=True).encode() + content).hexdigest()[:24]
-        every = Path(self.cache) / f"scenes-{key}.packed"
-        how = self.unpacked, self.cache_gb
+            return uncached(partial(self._built, most))
+        folder = Path(self.cache) if self.cache else cache_folder()
+        every = folder / self._file(content, None)
         if most is None or every.exists():
-            scenes = cached(every, partial(self._build, None), *how).first(most)
+            scenes = cached(every, partial(self._built, None), self.cache_gb).first(most)
         else:
-            scenes = cached(every.with_stem(f"{every.stem}-{most}"), partial(self._build, most), *how)
+            scenes = cached(folder / self._file(content, most), partial(self._built, most), self.cache_gb)
         return replace(scenes, files=hashlib.sha256(content).hexdigest())
 
+    def _file(self, content: bytes, most: int | None) -> str:
+        """Returns the name of the cache file of the first `most` scenes."""
+        settings = asdict(self) | {"split": self.split_name, "source": type(self).__qualname__}
+        settings = {key: value for key, value in settings.items() if key not in NO_MATTER}
+        about = json.dumps([VERSION, settings, most], sort_keys=True).encode()
+        return f"scenes-{hashlib.sha256(about + content).hexdigest()}.map"
+
     def _windows(self, log: str) -> Iterator[list[Recording]]:
-        """The recordings that one log makes, those of the same tracks and map together."""
-        for recording in self.read(log):
-            if self.mirror:  # both are of one place, or else of one log
-                recording = replace(recording, location=recording.location or recording.scene_id)
-            for each in (recording, recording.mirrored()) if self.mirror else (recording,):
-                yield list(each.windows(self.starts, self.build.steps))
+        """Yields the recordings that one log makes, those of the same tracks and map together."""
+        with self._named(log):
+            for recording in self.read(log):
+                if self.mirror:  # both are of one place, or else of one log
+                    recording = replace(recording, location=recording.location or recording.scene_id)
+                for each in (recording, recording.mirrored()) if self.mirror else (recording,):
+                    yield list(each.windows(self.starts, self.build.steps))
+
+    @contextmanager
+    def _named(self, log: str) -> Iterator[None]:
+        """What `read` raises is an InputError that names the log."""
+        try:
+            yield
+        except InputError as error:
+            raise InputError(_naming(log, error)) from error
+        except ImportError as error:
+            if not self.extra:
+                raise
+            mend = f"install e2rl with its extra: pip install 'e2rl[{self.extra}]'"
+            raise InputError(f"{log}: a library of its reader cannot be imported ({error}); {mend}") from error
+        except Exception as error:  # damaged files raise anything
+            if not self.mend:
+                raise
+            reason = f"{type(error).__name__} {str(error).partition(chr(10))[0]}"
+            raise InputError(f"{log}: is none of {self.holds}: {reason}; {self.mend}") from error
 
     def _rows_of(self, log: str) -> list[Row]:
-        """What the recordings of one log make."""
+        """Returns what the recordings of one log make."""
         try:
             rows = [row for windows in self._windows(log) for row in self._rows(log, windows)]
         except InputError as error:
-            return [Row(log, reason=_naming(log, error))]
+            return [Row(log, reason=str(error))]
         return rows or [Row(log, reason=TOO_SHORT)]
 
     def _rows(self, log: str, windows: list[Recording]) -> list[Row]:
-        """What recordings of the same tracks and map make."""
+        """Returns what recordings of the same tracks and map make."""
         try:
             builder = SceneBuilder(windows[0], self.build) if windows else None
         except InputError as error:
@@ -160,8 +185,11 @@ class Source(Extension, ABC):
         return [_row(log, window, builder) for window in windows if builder]
 
     def rows(self, most: int | None = None) -> Generator[Row]:
-        """What the logs make, in their order, of which `most` scenes are asked for (None: all). `workers` processes
-        build, never far ahead of what is asked for; this one where there is work for one, or for FEW scenes."""
+        """Yields what the logs make, in their order, of which `most` scenes are asked for (None: all).
+
+        `workers` processes build, never far ahead of what is asked for; this one where there is work for one, or for
+        FEW scenes.
+        """
         logs = self.logs()
         show = partial(tqdm, desc="building scenes", total=len(logs), unit="log", disable=None)
         if min(self.workers, len(logs)) <= 1 or (most is not None and most <= FEW):
@@ -183,18 +211,18 @@ class Source(Extension, ABC):
                 'did not start, as in a script without `if __name__ == "__main__":`; set data.workers=1'
             ) from error
 
-    def _build(self, most: int | None, keep: Keep) -> Index:
-        """Give the records of all logs, or the first `most`, to `keep`, and return what is known of them.
+    def _built(self, most: int | None, index: Index) -> Iterator[dict[str, np.ndarray]]:
+        """Yields the scenes of all logs, or the first `most`, when they are in the index.
 
         Raises InputError for an invalid one, unless `skip_invalid`, and where there is none.
         """
-        index = Index(split=self.split_name)
+        index.split = self.split_name
         with closing(self.rows(most)) as rows:  # the progress bar ends before a message
             for row in rows:
                 if row.scene is not None:
                     index.dataset = index.dataset or row.dataset
                     index.add(row.scene_id, row.location, row.scene)
-                    keep(row.scene.record)
+                    yield row.scene
                     if len(index.scene_id) == most:
                         break
                 elif row.reason in (OVERLAP, TOO_SHORT):
@@ -208,16 +236,15 @@ class Source(Extension, ABC):
             left_out = ", ".join(f"{count} {reason}" for reason, count in index.dropped.items())
             data = self.path or f"split {self.split_name}"
             raise InputError(f"no valid scene in {data} ({left_out}); see the messages above, or pass other data")
-        return index
 
 
 def _row_of(recording: Recording) -> Row:
-    """A row without a scene."""
+    """Returns a row without a scene."""
     return Row(recording.scene_id, recording.location, recording.dataset)
 
 
 def _row(log: str, recording: Recording, builder: SceneBuilder) -> Row:
-    """What a recording makes, one of those of a builder."""
+    """Returns what a recording makes, one of those of a builder."""
     row = _row_of(recording)
     try:
         scene = builder.scene(recording)
@@ -226,7 +253,7 @@ def _row(log: str, recording: Recording, builder: SceneBuilder) -> Row:
         return row._replace(reason=_naming(log, error))
     if ego_overlaps(scene):
         return row._replace(reason=OVERLAP)
-    return row._replace(scene=pack({key: value.numpy() for key, value in scene.items()}))
+    return row._replace(scene={key: value.numpy() for key, value in scene.items()})
 
 
 def load_scenes(
@@ -237,12 +264,19 @@ def load_scenes(
     scenes: str | Path | None = None,
     files: str = "",
 ) -> SceneSet:
-    """At most `num_scenes` scenes of a source, or of the source that a `data` group (conf/data/*.yaml) names.
+    """Returns at most `num_scenes` scenes of a source, or of the source that a `data` group (conf/data/*.yaml) names.
 
-    split: overrides the source's own where `Source.has_splits`; starts: overrides its start frames; scenes: a list
-    (e2rl/scenes/scene_list.py), of which all or the first `num_scenes` are taken; files: see `listed_scenes`. Raises
-    InputError for a source that cannot be built, for a missing or empty path, for a scene of the list that is not there
-    and, unless data.skip_invalid, for an invalid scene.
+    Args:
+        data: a source, or a group.
+        num_scenes: None: all.
+        split: overrides the source's own where `Source.has_splits`.
+        starts: overrides the source's start frames.
+        scenes: a list (e2rl/scenes/scene_list.py), of which all or the first `num_scenes` are taken.
+        files: see `listed_scenes`.
+
+    Raises:
+        InputError: for a source that cannot be built, for a missing or empty path, for a scene of the list that is not
+            there and, unless data.skip_invalid, for an invalid scene.
     """
     if num_scenes is not None:
         check_range("num_scenes", num_scenes, 1)
@@ -257,7 +291,7 @@ def load_scenes(
 
 
 def source_of(data: Mapping) -> Source:
-    """The source that the `_target_` of a `data` group names, with the other keys as its settings."""
+    """Returns the source that the `_target_` of a `data` group names, with the other keys as its settings."""
     target = str(data.get("_target_"))
     try:
         kind = get_class(target)
@@ -266,29 +300,9 @@ def source_of(data: Mapping) -> Source:
         raise InputError(f"data={target}: cannot be built: {reason}; name a subclass of Source as _target_") from error
     if not issubclass(kind, Source):
         raise InputError(f"data={target}: is no e2rl.scenes.source.Source; subclass it, and define logs() and read()")
-    build = settings_of(BuildSettings, data.get("build", {}), "data.build")
-    values = {key: value for key, value in data.items() if key not in ("_target_", "build")}
-    return replace(settings_of(kind, values, "data"), build=build)
-
-
-def hash_files(paths: Iterable[Path]) -> bytes:
-    """SHA-256 of the names and contents of files, for `Source.fingerprint`; of a pipe or a link to nothing of its name.
-
-    Raises InputError for a file that cannot be read.
-    """
-    digest = hashlib.sha256()
-    for path in paths:
-        digest.update(path.name.encode())
-        if not path.is_file():
-            continue
-        try:
-            with open(path, "rb") as file:
-                digest.update(hashlib.file_digest(file, "sha256").digest())
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}; make it readable, or remove it") from error
-    return digest.digest()
+    return settings_of(kind, {key: value for key, value in data.items() if key != "_target_"}, "data")
 
 
 def _naming(log: str, error: InputError) -> str:
-    """An error's message, with the log that it is about."""
+    """Returns an error's message, with the log that it is about."""
     return str(error) if str(error).startswith(log) else f"{log}: {error}"

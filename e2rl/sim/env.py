@@ -3,7 +3,7 @@
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 
 import torch
@@ -13,39 +13,35 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from e2rl.run.errors import InputError
-from e2rl.run.settings import check_range
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.drivable_area import off_road
-from e2rl.scenes.route import project
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.mission import Mission, mission_of
-from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, observation_config, observe
-from e2rl.sim.reward import DEFAULT_WEIGHTS, check_weights
+from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, observation_config, observe, placed_ego
+from e2rl.sim.reward import check_weights
 from e2rl.sim.static import FrenetPose, static_scene, write_rows
-from e2rl.sim.step import Outcome, StepConfig, hold_step, replay_step, step
-from e2rl.sim.world import Agents, Trajectories, World
+from e2rl.sim.step import Outcome, StepConfig, hold_step, step
+from e2rl.sim.world import AGENT_KEYS, Agents, Trajectories, World
 
 OF_ROUTE = ("points", "length", "open", "limit", "light", "light_s", "log")
 OF_SCENE = ("start", "valid", "start_accel", "start_yaw_rate", "size", "agent_type", "field_origin")
 FLAGS, METRICS = ("terminated", "truncated"), ("contact", "contact_vru", "off_road", "progress")
 
 
+@configured("sim/default")
 @dataclass
 class SimSettings:
-    """Bounds of the ego's action, termination settings and reward weights (conf/sim/default.yaml)."""
+    """Bounds of the ego's action, what ends an episode, and the weights of the reward (conf/sim/default.yaml)."""
 
-    max_acceleration: float = 5.0
-    max_braking: float = 8.0
-    max_yaw_rate: float = 1.6
-    end_on_contact: bool = True
-    end_off_road: bool = True
-    end_when_gone: bool = True
-    replay_ego: bool = False
-    compile: bool = False
-    reward: dict[str, float] = field(default_factory=lambda: dict(DEFAULT_WEIGHTS))
-
-    def __post_init__(self) -> None:
-        for name in ("max_acceleration", "max_braking", "max_yaw_rate"):
-            check_range(f"sim.{name}", getattr(self, name), 0.1, 100.0)
+    max_acceleration: float = setting(low=0.1, high=100.0)
+    max_braking: float = setting(low=0.1, high=100.0)
+    max_yaw_rate: float = setting(low=0.1, high=100.0)
+    end_on_contact: bool = setting()
+    end_off_road: bool = setting()
+    end_when_gone: bool = setting()
+    replay_ego: bool = setting()
+    compile: bool = setting()
+    reward: dict[str, float] = setting()
 
 
 class DrivingEnv(EnvBase):
@@ -159,7 +155,7 @@ class DrivingEnv(EnvBase):
             torch.cat([ego.state[:, None], states[:, 1:]], 1),
             torch.cat([ego.present[:, None], valid[:, 1:]], 1),
             torch.cat([ego.action[:, :1], accel[:, 1:]], 1),
-            turn_rate=torch.cat([ego.action[:, 1:], turn[:, 1:]], 1),
+            torch.cat([ego.action[:, 1:], turn[:, 1:]], 1),
         )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_) -> TensorDict:
@@ -196,20 +192,13 @@ class DrivingEnv(EnvBase):
 
     def _restart(self, index: Tensor, scene: TensorDictBase, mission: Mission) -> EgoState:
         """Write, and return, the start states [b] of environments index [b] in scenes scene [b]."""
-        state = scene["start"][:, 0]
-        pose = FrenetPose(*(value[:, 0] for value in project(state[:, None, :2], mission.points)))
         start = self.scene["start"][:, :1, :2]  # of all environments: the fields stay where they are
         on_road = off_road(start, self.scene["field"], self.scene["field_origin"])[index, 0] <= 0
         action = torch.stack([scene["start_accel"][:, 0], scene["start_yaw_rate"][:, 0]], -1)
-        fresh = EgoState(torch.zeros_like(index), state, action, pose, torch.ones_like(on_road), on_road, pose.s)
+        flags = torch.ones_like(on_road), on_road
+        fresh = placed_ego(mission, torch.zeros_like(index), scene["start"][:, 0], action, *flags)
 
-        def put(old: Tensor, new: Tensor) -> Tensor:
-            return old.index_copy(0, index, new)
-
-        old = self._ego
-        pose = FrenetPose(*map(put, old.pose, fresh.pose))
-        values = {name: put(getattr(old, name), getattr(fresh, name)) for name in old._fields if name != "pose"}
-        self._ego = EgoState(pose=pose, **values)
+        self._ego = self._ego.merged(fresh, lambda old, new: old.index_copy(0, index, new))
         return fresh
 
     def _reset_output(self) -> TensorDict:
@@ -220,10 +209,12 @@ class DrivingEnv(EnvBase):
     @torch.no_grad()  # the stored state must not accumulate an autograd graph
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self.clock += 1
-        replays, tracks = self.settings.replay_ego, (self._trajectories.states, self._trajectories.valid)
-        function: Callable[..., tuple[EgoState, Outcome]] = replay_step if replays else step
-        function = compiled(function) if self.settings.compile else function
-        given = (self.scene["logged"], self.scene["logged_valid"]) if replays else tensordict["action"]
+        tracks, recording = (
+            (self._trajectories.states, self._trajectories.valid),
+            (self.scene["logged"], self.scene["logged_valid"]),
+        )
+        function = compiled(step) if self.settings.compile else step
+        given = recording if self.settings.replay_ego else tensordict["action"]
         self._ego, outcome = hold_step(function, self.hold, self._ego, given, tracks, self._static, self._config)
         self._features = outcome["observation"]
         return self._output(outcome).set("reward", outcome["reward"][:, None])
@@ -242,9 +233,7 @@ class DrivingEnv(EnvBase):
         }
         if self.agents:
             now = self.world()
-            assert now.turn_rate is not None
-            agents = {"states": now.states, "valid": now.valid, "accel": now.accel, "turn_rate": now.turn_rate}
-            result["agents"] = TensorDict(agents, shape, device=device)
+            result["agents"] = TensorDict({key: getattr(now, key) for key in AGENT_KEYS}, shape, device=device)
         return TensorDict(result, shape, device=device)
 
 

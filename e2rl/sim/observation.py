@@ -8,6 +8,7 @@ What each number of the observation is: names, units, scales, for policies from 
 The observation of a mirrored scene, y to -y, from that of the scene: what was on the left is on the right.
 """
 
+from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
@@ -15,8 +16,9 @@ import torch
 from torch import Tensor
 
 from e2rl.scenes.drivable_area import off_road
+from e2rl.scenes.route import project
 from e2rl.sim.dynamics import Arc, curvature_of
-from e2rl.sim.mission import light_state_at, limit_at
+from e2rl.sim.mission import Mission, light_state_at, limit_at
 from e2rl.sim.neighbours import Neighbours, neighbours_of, rotation_into
 from e2rl.sim.prospects import ACCELERATIONS, OFFSETS, PROSPECTS, TIMES, WIDEST, Others, prospects
 from e2rl.sim.static import FrenetPose, StaticScene, look_along
@@ -49,6 +51,20 @@ class EgoState(NamedTuple):
     present: Tensor
     been_on_road: Tensor
     start_s: Tensor
+
+    def merged(self, other: "EgoState", function: Callable[[Tensor, Tensor], Tensor]) -> "EgoState":
+        """An EgoState of function(own, other's) of every tensor."""
+        pose = FrenetPose(*map(function, self.pose, other.pose))
+        names = [name for name in self._fields if name != "pose"]
+        return EgoState(pose=pose, **{name: function(getattr(self, name), getattr(other, name)) for name in names})
+
+
+def placed_ego(
+    mission: Mission, step: Tensor, state: Tensor, action: Tensor, present: Tensor, on_road: Tensor
+) -> EgoState:
+    """The egos of B scenes at states [B, 4], projected on their missions, from which progress counts."""
+    pose = FrenetPose(*(value[:, 0] for value in project(state[:, None, :2], mission.points)))
+    return EgoState(step, state, action, pose, present, on_road, pose.s)
 
 
 class ObservationConfig(NamedTuple):

@@ -1,4 +1,4 @@
-"""Reward terms, pure and per step; the reward is their weighted sum (weights in conf/sim)."""
+"""The reward of a step: TERMS, and their weighted sum (weights in conf/sim/default.yaml)."""
 
 from collections.abc import Mapping
 
@@ -6,30 +6,21 @@ import torch
 from torch import Tensor
 
 from e2rl.run.errors import InputError
+from e2rl.scenes.recording import DT
 
-DEFAULT_WEIGHTS = {
-    "progress": 0.1,
-    "contact": -20.0,
-    "fault": -15.0,
-    "off_road": -20.0,
-    "comfort": -0.08,
-    "acceleration": -0.1,
-    "speeding": -0.1,
-    "lane_offset": -0.02,
-}
-TERMS = tuple(DEFAULT_WEIGHTS)
+TERMS = ("progress", "contact", "fault", "off_road", "comfort", "acceleration", "speeding", "lane_offset")
 LEAST_TOP_SPEED = 5.0  # m/s: progress at this speed is rewarded even where the recorded ego stands
 
 
-def rewarded_progress(progress: Tensor, limit: Tensor, top_speed: Tensor, dt: float) -> Tensor:
+def rewarded_progress(progress: Tensor, limit: Tensor, top_speed: Tensor) -> Tensor:
     """The part [B] m of a step's progress [B] m that is rewarded: driving faster than allowed does not pay.
 
-    Allowed is the recorded ego's top speed in the scene [B] m/s, which counts as at least LEAST_TOP_SPEED, and no more
-    than the speed limit [B] where it is known (not 0).
+    Allowed is the recorded ego's top_speed [B] m/s, which counts as at least LEAST_TOP_SPEED, and no more than the
+    speed limit [B] m/s where it is known (not 0).
     """
     allowed = top_speed.clamp(min=LEAST_TOP_SPEED)
     allowed = torch.where(limit > 0, torch.minimum(limit, allowed), allowed)
-    return torch.minimum(progress, allowed * dt)
+    return torch.minimum(progress, allowed * DT)
 
 
 def reward_terms(
@@ -42,15 +33,17 @@ def reward_terms(
     speed: Tensor,
     limit: Tensor,
     offset: Tensor,
-    dt: float,
 ) -> dict[str, Tensor]:
-    """The TERMS, each [B], of one step of dt seconds.
+    """The TERMS, each [B], of one step.
 
-    progress [B] m along the mission (`rewarded_progress`); contact, fault (a contact of the ego's own making), off_road
-    [B] bool; action, last_action [B, 2]: executed acceleration and yaw rate; speed, limit [B] m/s (limit 0 unknown:
-    never exceeded); offset [B] m from the mission route.
+    Args:
+        progress: [B] m along the mission (`rewarded_progress`).
+        contact, fault, off_road: [B] bool; fault: a contact of the ego's own making.
+        action, last_action: [B, 2], executed acceleration m/s^2 and yaw rate rad/s.
+        speed, limit: [B] m/s; limit 0: unknown, never exceeded.
+        offset: [B] m from the mission route.
     """
-    jerk = (action[:, 0] - last_action[:, 0]) / dt
+    jerk = (action[:, 0] - last_action[:, 0]) / DT
     lateral = speed * action[:, 1]
     comfort = (action[:, 0] / 4) ** 2 + (lateral / 4) ** 2 + (jerk / 20) ** 2
     excess = (speed - limit).clamp(min=0) / limit.clamp(min=1.0)

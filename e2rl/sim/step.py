@@ -14,19 +14,20 @@ from e2rl.sim import dynamics
 from e2rl.sim.neighbours import own_fault
 from e2rl.sim.observation import EgoState, ObservationConfig, Observed, glance, observe
 from e2rl.sim.reward import reward_terms, rewarded_progress, weighted_sum
-from e2rl.sim.static import FrenetPose, StaticScene, follow
+from e2rl.sim.static import StaticScene, follow
 from e2rl.sim.world import Agents, trajectories_at
 
 Tracks = tuple[Tensor, Tensor]  # states [B, T+1, N, 4] and presence [B, T+1, N] of all agents
-Outcome = dict[str, Tensor]  # see `advance`
-Sense = Callable[..., Observed]  # observe or glance
+Outcome = dict[str, Tensor]  # see `step`
 FLAGS = ("contact", "contact_vru", "off_road", "terminated", "truncated")
-OF_EGO = tuple(name for name in EgoState._fields if name != "pose")
 
 
 class StepConfig(NamedTuple):
-    """horizon: steps of an episode; what ends it early: contact, off_road, departure of the ego; weights [8]: of
-    reward.TERMS; low, high [2]: bounds of the action."""
+    """What a step needs to know of the settings.
+
+    horizon: steps of an episode; end_...: what ends it early; weights [8] of reward.TERMS; low, high [2]: bounds of the
+    action.
+    """
 
     horizon: int
     end_on_contact: bool
@@ -40,67 +41,34 @@ class StepConfig(NamedTuple):
 
 def step(
     ego: EgoState,
-    action: Tensor,
+    given: Tensor | Tracks,
     tracks: Tracks,
     static: StaticScene,
     config: StepConfig,
-    sense: Sense = observe,
+    sense: Callable[..., Observed] = observe,
     ended: Tensor | None = None,
 ) -> tuple[EgoState, Outcome]:
-    """`advance` of egos that execute action [B, 2]: acceleration [m/s^2], yaw rate [rad/s], clamped to the bounds."""
-    state = dynamics.step(ego.state, torch.clamp(action, config.low, config.high))
-    return advance(ego, state, ego.present, tracks, static, config, sense, ended)
+    """The egos after a step, and the outcome of the step.
 
+    Args:
+        ego: the egos of B scenes now.
+        given: their actions [B, 2] (acceleration m/s^2, yaw rate rad/s), which are clamped to the bounds; or the
+            recording, which they follow, and leave the scene at its end.
+        tracks: what all agents do.
+        sense: `observe`, or `glance` where no policy looks.
+        ended: [B] bool, egos that stay where they are.
 
-def replay_step(
-    ego: EgoState,
-    logged: Tracks,
-    tracks: Tracks,
-    static: StaticScene,
-    config: StepConfig,
-    sense: Sense = observe,
-    ended: Tensor | None = None,
-) -> tuple[EgoState, Outcome]:
-    """`advance` of egos that follow their recording and leave the scene at its end."""
-    row, now = static.row[:, 0], (ego.step + 1).clamp(max=config.horizon)
-    known = logged[1][row, now, 0]
-    state = torch.where(known[:, None], logged[0][row, now, 0], ego.state)
-    return advance(ego, state, ego.present & known, tracks, static, config, sense, ended)
-
-
-def hold_step(
-    function: Callable[..., tuple[EgoState, Outcome]], hold: int, ego: EgoState, *given
-) -> tuple[EgoState, Outcome]:
-    """`hold` steps of function (`step` or `replay_step`) under one action: rewards are summed, flags are of any step.
-
-    Egos whose episode ends stay at that moment, which is also the one they observe; the others observe the last one.
-    """
-    ego, outcome = function(ego, *given, observe if hold == 1 else glance)
-    for last in range(2, hold + 1):
-        ended = outcome["terminated"] | outcome["truncated"]
-        ego, later = function(ego, *given, observe if last == hold else glance, ended)
-        flags = {name: outcome[name] | (later[name] & ~ended) for name in FLAGS}
-        outcome = later | flags | {"reward": outcome["reward"] + later["reward"].masked_fill(ended, 0)}
-    return ego, outcome
-
-
-def advance(
-    ego: EgoState,
-    state: Tensor,
-    present: Tensor,
-    tracks: Tracks,
-    static: StaticScene,
-    config: StepConfig,
-    sense: Sense = observe,
-    ended: Tensor | None = None,
-) -> tuple[EgoState, Outcome]:
-    """The egos after a step to state [B, 4], and the outcome of the step; present [B]: egos still in the scene.
-
-    ended [B]: egos that stay where they are. Outcome: observation [B, D] ([B, 0] of a `glance`), reward, contact
-    (with a vehicle), contact_vru (with another agent), off_road, terminated, truncated, progress (m along the mission
-    since the start).
+    Returns:
+        The egos, and observation [B, D] ([B, 0] of a glance), reward, contact (with a vehicle), contact_vru (with
+        another agent), off_road, terminated, truncated and progress (m along the mission since the start), each [B].
     """
     now = (ego.step + 1).clamp(max=config.horizon)
+    if isinstance(given, Tensor):
+        state, present = dynamics.step(ego.state, torch.clamp(given, config.low, config.high)), ego.present
+    else:
+        row = static.row[:, 0]
+        known = given[1][row, now, 0]
+        state, present = torch.where(known[:, None], given[0][row, now, 0], ego.state), ego.present & known
     action = dynamics.inverse(torch.stack([ego.state, state], 1))[:, 0]
     pose = follow(static, state[:, :2], ego.pose.s + ego.state[:, 3] * DT)
     moved = EgoState(now, state, action, pose, present, ego.been_on_road, ego.start_s)
@@ -116,8 +84,8 @@ def advance(
     gone = ~present | (pose.s >= static.mission.end)
     touched = contact | contact_vru
     fault = own_fault(ego.state[:, 3], seen.neighbours, hit, static.size, static.half_size)
-    way = rewarded_progress(pose.s - ego.pose.s, seen.limit, static.top_speed, DT)
-    terms = reward_terms(way, touched, fault, off_road, action, ego.action, state[:, 3], seen.limit, pose.d, DT)
+    progress = rewarded_progress(pose.s - ego.pose.s, seen.limit, static.top_speed)
+    terms = reward_terms(progress, touched, fault, off_road, action, ego.action, state[:, 3], seen.limit, pose.d)
     outcome = {
         "observation": seen.features,
         "reward": weighted_sum(terms, config.weights),
@@ -131,11 +99,26 @@ def advance(
     return moved._replace(present=~gone, been_on_road=ego.been_on_road | ~off), outcome
 
 
+def hold_step(
+    function: Callable[..., tuple[EgoState, Outcome]], hold: int, ego: EgoState, *given
+) -> tuple[EgoState, Outcome]:
+    """`hold` steps of function (`step`) under one action: rewards are summed, flags are of any step.
+
+    Egos whose episode ends stay at that moment, which is also the one they observe; the others observe the last one.
+    """
+    ego, outcome = function(ego, *given, observe if hold == 1 else glance)
+    for last in range(2, hold + 1):
+        ended = outcome["terminated"] | outcome["truncated"]
+        ego, later = function(ego, *given, observe if last == hold else glance, ended)
+        flags = {name: outcome[name] | (later[name] & ~ended) for name in FLAGS}
+        outcome = later | flags | {"reward": outcome["reward"] + later["reward"].masked_fill(ended, 0)}
+    return ego, outcome
+
+
 def unless(flag: Tensor, new: EgoState, old: EgoState) -> EgoState:
     """The new egos, but the old ones where flag [B]."""
 
     def pick(after: Tensor, before: Tensor) -> Tensor:
         return torch.where(flag.view(-1, *[1] * (after.ndim - 1)), before, after)
 
-    pose = FrenetPose(*map(pick, new.pose, old.pose))
-    return EgoState(pose=pose, **{name: pick(getattr(new, name), getattr(old, name)) for name in OF_EGO})
+    return new.merged(old, pick)

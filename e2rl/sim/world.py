@@ -14,15 +14,17 @@ from e2rl.run.errors import InputError
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
 
+AGENT_KEYS = ("states", "valid", "accel", "turn_rate")  # of World, of the environment's `agents`, and of Agents
+
 
 @dataclass
 class World:
     """The current state of B scenes; agent 0 is the ego, agents [:V] are the vehicles.
 
-    scene: Scene TensorDict [B]; step [B] int64: simulated steps since the start frame; states [B, N, 4]: x, y, heading,
-    speed; valid [B, N]: present now; accel [B, N] m/s^2; plan [B, V, H, 4]: the vehicles' planned
-    states at the coming steps (None: unknown); route [B, V] int64: the route candidates that the vehicles follow (None:
-    unknown); turn_rate [B, N] rad/s: over the last step, the ego's as executed (None: unknown).
+    scene: Scene TensorDict [B]; step [B] int64: simulated steps since the start frame; states [B, N, 4]: x, y [m],
+    heading [rad], speed [m/s]; valid [B, N]: present now; accel [B, N] m/s^2 and turn_rate [B, N] rad/s: over the last
+    step, the ego's as executed; route [B, V] int64: the route candidates that the vehicles follow; plan [B, V, H, 4]:
+    their planned states at the coming steps (of both, None: unknown).
     """
 
     scene: TensorDictBase
@@ -30,30 +32,30 @@ class World:
     states: Tensor
     valid: Tensor
     accel: Tensor
+    turn_rate: Tensor
     route: Tensor | None = None
     plan: Tensor | None = None
-    turn_rate: Tensor | None = None
 
     @classmethod
     def at_start(cls, scene: TensorDictBase) -> "World":
         """Scenes [B] at their start frames."""
         step = torch.zeros(scene.batch_size[0], dtype=torch.int64, device=scene["start"].device)
-        start, valid, accel = (scene[key] for key in ("start", "valid", "start_accel"))
-        return cls(scene, step, start, valid, accel, scene["route_log"], turn_rate=scene["start_yaw_rate"])
+        now = (scene[key] for key in ("start", "valid", "start_accel", "start_yaw_rate"))
+        return cls(scene, step, *now, route=scene["route_log"])
 
     @classmethod
     def of(cls, tensordict: TensorDictBase, scene: TensorDictBase) -> "World":
         """The World that a DrivingEnv with `agents=True` reports in a TensorDict [B]; scene: `DrivingEnv.scene`."""
-        agents = tensordict["agents"]
-        return cls(
-            scene,
-            tensordict["timestep"][:, 0],
-            agents["states"],
-            agents["valid"],
-            agents["accel"],
-            plan=tensordict.get(("traffic", "plan"), None),
-            turn_rate=agents["turn_rate"],
-        )
+        now = (tensordict["agents"][key] for key in AGENT_KEYS)
+        return cls(scene, tensordict["timestep"][:, 0], *now, plan=tensordict.get(("traffic", "plan"), None))
+
+    def ego_action(self) -> Tensor:
+        """The egos' last executed acceleration and yaw rate [B, 2]."""
+        return torch.stack([self.accel[:, 0], self.turn_rate[:, 0]], -1)
+
+    def others(self) -> "Agents":
+        """All agents but the ego."""
+        return Agents(*(getattr(self, key)[:, 1:] for key in AGENT_KEYS))
 
 
 class Agents(NamedTuple):
@@ -81,10 +83,8 @@ class Trajectories:
         """Set trajectories of scenes rows [b] from their next reset on; raises InputError on a wrong shape or NaN."""
         expected = (len(rows), *self.states.shape[1:])
         if tuple(states.shape) != expected or tuple(valid.shape) != expected[:-1]:
-            raise InputError(
-                f"set_traffic: states {tuple(states.shape)} and valid {tuple(valid.shape)} for {len(rows)} rows; "
-                f"expected {expected} and {expected[:-1]}"
-            )
+            given = f"states {tuple(states.shape)} and valid {tuple(valid.shape)}"
+            raise InputError(f"set_traffic: {given} for {len(rows)} rows; expected {expected} and {expected[:-1]}")
         if not torch.isfinite(states[valid]).all():
             raise InputError("set_traffic: NaN or infinite states marked valid; mark them invalid")
         device = self.states.device

@@ -6,28 +6,30 @@ import errno
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
-from torch import Tensor
+from tensordict import TensorDictBase
 
 from e2rl.planners.ego import PlannerError
 from e2rl.run.errors import InputError
+from e2rl.sim.rollouts import Rollouts
 
 NOT_FINITE = "a state was NaN or infinite"
 OF_THE_RUN = (InputError, MemoryError, torch.OutOfMemoryError)  # errors that are no single rollout's
 EXHAUSTED = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENOMEM, errno.EMFILE, errno.ENFILE)  # nor these
 
 Task = TypeVar("Task")
+Batch = Rollouts | TensorDictBase
 
 
 def attempt(
-    roll_out: Callable[[Sequence[Task]], dict], tasks: Sequence[Task]
-) -> tuple[list[tuple[list[Task], dict]], list[tuple[Task, dict]]]:
-    """(the tasks that could be rolled out, in parts with their rollout dicts; the others with what ended them).
+    roll_out: Callable[[Sequence[Task]], Batch], tasks: Sequence[Task]
+) -> tuple[list[tuple[list[Task], Batch]], list[tuple[Task, dict]]]:
+    """(the tasks that could be rolled out, in parts with their rollouts; the others with what ended them).
 
-    roll_out(tasks) -> rollout dict of tensors and lists with leading tasks, with states [B, ..., C] and valid [B, ...].
-    What raises for a batch is looked for by halving the batch, where a PlannerError does not name it.
+    roll_out(tasks) returns Rollouts, or a TensorDict with states [B, ..., C] and valid [B, ...]. What raises for a
+    batch is looked for by halving the batch, where a PlannerError does not name it.
     """
     try:
         rollouts = roll_out(tasks)
@@ -49,30 +51,17 @@ def attempt(
         parts, further = attempt(roll_out, others) if others else ([], [])
         return parts, own + further
     finite = finite_rollouts(rollouts)
-    kept = [task for task, good in zip(tasks, finite, strict=True) if good]
-    lost = [task for task, good in zip(tasks, finite, strict=True) if not good]
+    kept = [task for task, known in zip(tasks, finite, strict=True) if known]
+    lost = [task for task, known in zip(tasks, finite, strict=True) if not known]
     ended = [(task, {"reason": NOT_FINITE, "detail": "", "traceback": ""}) for task in lost]
-    return ([(kept, chosen(rollouts, finite))] if kept else []), ended
+    good = rollouts if all(finite) else rollouts[torch.tensor(finite)]
+    return ([(kept, good)] if kept else []), ended
 
 
-def finite_rollouts(rollouts: dict) -> list[bool]:
+def finite_rollouts(rollouts: Batch) -> list[bool]:
     """Whether all states of agents that are there are finite, by rollout."""
-    known = rollouts["states"].isfinite().all(-1) | ~rollouts["valid"]
+    known = rollouts.get("states").isfinite().all(-1) | ~rollouts.get("valid")
     return known.flatten(1).all(1).tolist()
-
-
-def chosen(rollouts: dict, keep: Sequence[bool]) -> dict:
-    """A rollout dict of the rollouts to keep."""
-    if all(keep):
-        return rollouts
-    mask = torch.tensor(keep)
-
-    def part(value: Any) -> Any:
-        if isinstance(value, Tensor) and value.dim():
-            return value[mask]
-        return [item for item, good in zip(value, keep, strict=True) if good] if isinstance(value, list) else value
-
-    return {name: part(value) for name, value in rollouts.items()}
 
 
 def summary_of(ended: Iterable[dict]) -> str:

@@ -1,12 +1,11 @@
-"""Scenes of similar size are planned together: half of a batch is padding, and small groups are mostly overhead.
+"""Rows of the states of traffic methods, groups of scenes of similar size, and noise that depends on a seed alone.
 
+Half of a batch is padding, and small groups are mostly overhead: so scenes of similar size are planned together.
 Vehicles and other agents fill their rows from the front, so a group is cropped by slicing.
-
-Rows of the states of traffic methods, and noise that depends only on a scene's seed.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import torch
@@ -62,9 +61,14 @@ OF_VEHICLES = {"past", "route_points", "route_length", "route_open", "route_vali
 OF_VEHICLES |= {"route_light", "route_light_s", "route_log"}
 WHOLE = {"field", "field_origin", "light_state", "lane_points", "lane_index", "lane_exits", "lane_left", "lane_right"}
 WHOLE |= {"scene_index"}
-NO_VEHICLES = {"seed", "eta", "replans", "near", "far", "light_state"}  # fields of a state without a vehicle axis
-PAIRS = {"conflict", "conflict_s", "crossing"}  # fields [B, V, V]
-FIXED = {"size", "light_state"}  # fields that never change
+
+
+def no_vehicles() -> Any:
+    """Returns a dataclass field of a state whose tensor [B, ...] has no vehicle axis; others are [B, V, ...].
+
+    Metadata `vehicle_axes` says so: 0 here, 2 for pairs [B, V, V], None for a tensor of all agents that never changes.
+    """
+    return field(metadata={"vehicle_axes": 0})
 
 
 @dataclass(frozen=True)
@@ -110,40 +114,39 @@ def crop_world(world: World, group: Group) -> World:
         elif key in WHOLE:
             scene[key] = world.scene[key][rows]
     states, valid, accel = (getattr(world, name)[rows][:, agents] for name in ("states", "valid", "accel"))
-    turn = None if world.turn_rate is None else world.turn_rate[rows][:, agents]
     cropped = TensorDict(scene, batch_size=[len(rows)])
-    return World(cropped, world.step[rows], states, valid, accel, turn_rate=turn)
+    return World(cropped, world.step[rows], states, valid, accel, world.turn_rate[rows][:, agents])
 
 
-def crop_state(value: Any, group: Group, width: int, name: str = "") -> Any:
-    """The group's part of a state (a nested dataclass of tensors) whose scenes have `width` vehicle rows."""
+def crop_state(value: Any, group: Group, width: int, axes: int | None = 1) -> Any:
+    """Returns the group's part of a state, a nested dataclass of tensors whose scenes have `width` vehicle rows.
+
+    axes: of a tensor, see `no_vehicles`.
+    """
     if is_dataclass(value) and not isinstance(value, type):
-        parts = {f.name: crop_state(getattr(value, f.name), group, width, f.name) for f in fields(value)}
+        parts = {f.name: crop_state(getattr(value, f.name), group, width, axes_of(f)) for f in fields(value)}
         return replace(value, **parts)
     value = value[group.rows]
-    if name in NO_VEHICLES:
-        return value
-    if name in PAIRS:
-        return value[:, : group.vehicles, : group.vehicles]
-    if name == "size":
+    if axes is None:
         return torch.cat([value[:, : group.vehicles], value[:, width : width + group.others]], 1)
-    return value[:, : group.vehicles]
+    return value[(slice(None), *[slice(group.vehicles)] * axes)]
 
 
-def write_state(full: Any, part: Any, group: Group, name: str = "") -> None:
-    """Write the group's part of a state back, in place."""
+def write_state(full: Any, part: Any, group: Group, axes: int | None = 1) -> None:
+    """Writes the group's part of a state back, in place."""
     if is_dataclass(full):
-        for field in fields(full):
-            write_state(getattr(full, field.name), getattr(part, field.name), group, field.name)
-    elif name in FIXED:
-        return
-    elif name in PAIRS:
+        for each in fields(full):
+            write_state(getattr(full, each.name), getattr(part, each.name), group, axes_of(each))
+    elif axes == 2:
         index = torch.arange(group.vehicles)
         full[group.rows[:, None, None], index[:, None], index] = part
-    elif name in NO_VEHICLES:
-        full[group.rows] = part
-    else:
-        full[group.rows, : group.vehicles] = part
+    elif axes is not None:
+        full[(group.rows, *[slice(group.vehicles)] * axes)] = part
+
+
+def axes_of(declared: Field) -> int | None:
+    """Returns how many vehicle axes a field of a state has, 1 by default."""
+    return declared.metadata.get("vehicle_axes", 1)
 
 
 def clone(value: Value) -> Value:

@@ -1,58 +1,32 @@
 """The prior as background traffic: every 0.5 s a joint sample of the reverse SDE, given the ego's plan, no control.
 
-What traffic knows of the ego: what other drivers see, or the plan that it announces (docs/adversaries.md).
-
-A black box announces nothing. With `predicted`, the ego's motion is predicted from its state and past alone, so that no
-planner can mislead its adversaries by what it writes as its plan.
+Traffic predicts the ego from its state and past, as other drivers see it. So no planner can mislead its adversaries by
+what it announces as its plan (docs/adversaries.md). With `knowledge` "plan" it is told the plan.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.planners.path import MissionPath
 from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate
 from e2rl.prior.prior import Context, Prior
 from e2rl.prior.routes import RoutedScene
 from e2rl.prior.stratified_sampling import main_direction, stratified_noise, stratified_uniform
-from e2rl.run.settings import check_choice
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
-from e2rl.traffic.grouping import Group, clone, crop_state, crop_world, group_scenes, noise_of, write_state
+from e2rl.traffic.grouping import clone, crop_state, crop_world, group_scenes, no_vehicles, noise_of, write_state
 from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan
 
 KNOWLEDGE = ("predicted", "plan")
-EASING = 0.5  # s in which a seen acceleration fades: of 0.5, 1 and 2 s that of least error
-
-
-def turn_rate_and_acceleration(world: World) -> Tensor:
-    """States [B, HORIZON, 4] of the ego at its present acceleration and yaw rate."""
-    assert world.turn_rate is not None
-    action = torch.stack([world.accel[:, 0], world.turn_rate[:, 0]], -1)
-    return dynamics.rollout(world.states[:, 0], action[:, None].expand(-1, HORIZON, -1))
-
-
-def along_mission(world: World) -> Tensor:
-    """States [B, HORIZON, 4] of the ego along its mission, its acceleration fading over EASING s."""
-    time = DT * torch.arange(HORIZON + 1, device=world.states.device)
-    gained = EASING * (1 - torch.exp(-time / EASING))
-    return MissionPath(world).drive((world.states[:, 0, 3:] + world.accel[:, :1] * gained).clamp(min=0))
-
-
-# Predictions without a network; `prior` is NominalTraffic's own: the ego's row of the joint estimate.
-PREDICTIONS: dict[str, Callable[[World], Tensor] | None] = {
-    "prior": None,
-    "mission": along_mission,
-    "ctra": turn_rate_and_acceleration,
-}
-
-
 LOOK = 5  # steps of the ego's plan over which its current yaw rate is estimated
+React = Callable[[Tensor, Tensor], Tensor]  # rows [G], planned states [G, V, HORIZON, 4] -> the egos' [G, HORIZON, 4]
 
 
 @dataclass
@@ -63,33 +37,49 @@ class PriorState:
     at the end of the executed plans.
     """
 
-    seed: Tensor
-    replans: Tensor
+    seed: Tensor = no_vehicles()
+    replans: Tensor = no_vehicles()
     routed: RoutedScene
     lane: LaneState
 
 
+@dataclass
+class Replan:
+    """What a group of G scenes is replanned from.
+
+    state: the method's, its lane states now; world: the scenes now; ego_plan [G, HORIZON, 4]: the ego's motion, known
+    or predicted; noise [K, G, V, ..., SIZE]: standard normal; react: from planned states [G, V, HORIZON, 4] to
+    the ego's own answer [G, HORIZON, 4], None where it cannot be asked.
+    """
+
+    state: State
+    world: World
+    ego_plan: Tensor
+    noise: Tensor
+    react: Callable[[Tensor], Tensor] | None = None
+
+
+@configured("synthesizer/nominal")
+@dataclass(eq=False, repr=False)
 class NominalTraffic(Traffic):
-    """Unguided samples of the frozen prior; the ego's row of the joint state is what is known of its motion."""
+    """Unguided samples of the frozen prior. Settings: conf/synthesizer/nominal.yaml."""
 
-    def __init__(self, prior: Prior, knowledge: str = "predicted", prediction: str = "prior") -> None:
-        """knowledge: of KNOWLEDGE; prediction: of PREDICTIONS, used where the ego's plan is not known.
+    prior: Prior
+    knowledge: str = setting(choices=KNOWLEDGE)
 
-        Raises InputError for other choices.
-        """
-        check_choice("synthesizer.knowledge", knowledge, KNOWLEDGE)
-        check_choice("synthesizer.prediction", prediction, PREDICTIONS)
-        self.prior = prior.requires_grad_(False).eval()
-        self.knowledge, self.prediction = knowledge, prediction
+    def __post_init__(self) -> None:
+        self.prior = self.prior.requires_grad_(False).eval()
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> State:
-        """States of scenes [B] with routes drawn from the prior."""
+        """Returns the states of scenes [B] with routes drawn from the prior."""
         uniform = noise_of(seed, torch.zeros_like(seed), tuple(scenes["route_valid"].shape[1:2]), uniform=True)
         routed, lane = self.prior.start(scenes, self.prior.choose_routes(scenes, uniform))
         return PriorState(seed, torch.zeros_like(seed), routed, lane)
 
-    def replan(self, state: State, world: World, ego_plan: Tensor) -> tuple[State, TrafficPlan]:
-        """States and plans of the coming HORIZON steps; scenes of similar size are planned together."""
+    def replan(
+        self, state: State, world: World, ego_plan: Tensor, react: React | None = None
+    ) -> tuple[State, TrafficPlan]:
+        """Returns states and plans of the coming HORIZON steps; scenes of similar size are planned together."""
         ego_plan, noise = ego_plan.detach(), self.noise(state)
         batch, width = state.routed.route.shape
         whole = clone(state)
@@ -99,7 +89,9 @@ class NominalTraffic(Traffic):
             rows, vehicles = group.rows, group.vehicles
             part, there = crop_state(state, group, width), crop_world(world, group)
             known = ego_plan[rows] if self.knowledge == "plan" else self.predicted_ego(part, there)
-            part, x0, context = self.replan_group(part, there, known, noise[:, rows, :vehicles], group)
+            part = replace(part, lane=self.lane_now(part, there, known))
+            answer = None if react is None else partial(react, rows)
+            part, x0, context = self.replan_group(Replan(part, there, known, noise[:, rows, :vehicles], answer))
             plan = self.prior.plan(x0, context)
             part = replace(part, replans=part.replans + 1, lane=plan.after(REPLAN_STEPS))
             write_state(whole, part, group)
@@ -108,40 +100,33 @@ class NominalTraffic(Traffic):
             present[rows, :vehicles] = plan.on_map & valid
         return whole, TrafficPlan(states, present, route=whole.routed.route)
 
-    def replan_group(
-        self, state: State, world: World, ego_plan: Tensor, noise: Tensor, group: Group
-    ) -> tuple[State, Tensor, Context]:
-        """State, joint sample x0 [G, V, SIZE] and context of a group; noise [K, G, V, SIZE]."""
-        state = replace(state, lane=self.lane_now(state, world, ego_plan))
-        context = self.encode(state, world, ego_plan)
-        return state, self.prior.sample(context, noise).x0, context
+    def replan_group(self, now: Replan) -> tuple[State, Tensor, Context]:
+        """Returns state, joint sample x0 [G, V, SIZE] and context of a group."""
+        context = self.encode(now.state, now.world, now.ego_plan)
+        return now.state, self.prior.sample(context, now.noise).x0, context
 
     @torch.no_grad()
     def predicted_ego(self, state: State, world: World) -> Tensor:
-        """States [G, HORIZON, 4] of the ego predicted from its state and past (PREDICTIONS).
-
-        `prior`: the ego's row of the joint clean estimate, nearer to what egos drive than a sample.
-        """
-        seen = turn_rate_and_acceleration(world)
-        predict = PREDICTIONS[self.prediction]
-        if predict is not None:
-            return predict(world)
+        """Returns states [G, HORIZON, 4] of the ego, predicted from its state and past: its row of the joint clean
+        estimate, which is nearer to what egos drive than a sample."""
+        action = torch.stack([world.accel[:, 0], world.turn_rate[:, 0]], -1)
+        seen = dynamics.rollout(world.states[:, 0], action[:, None].expand(-1, HORIZON, -1))
         lane = self.lane_now(state, world, seen)
         context = self.prior.encode(state.routed, lane, world.states, world.valid, world.step, None)
         return self.prior.decode(self.prior.estimate(context), context).states()[:, 0]
 
     def noise(self, state: State) -> Tensor:
-        """Standard normal noise [K, B, V, SIZE] of the next replan."""
+        """Returns standard normal noise [K, B, V, SIZE] of the next replan."""
         shape = (self.prior.sampler.steps, state.routed.route.shape[1], SIZE)
         return noise_of(state.seed, 1 + state.replans, shape).transpose(0, 1)
 
     def encode(self, state: State, world: World, ego_plan: Tensor) -> Context:
-        """The prior's context of a replan."""
+        """Returns the prior's context of a replan."""
         now = world.states, world.valid, world.step
         return self.prior.encode(state.routed, state.lane, *now, ego_plan)
 
     def lane_now(self, state: State, world: World, ego_plan: Tensor) -> LaneState:
-        """Current lane states: the ego's from its simulated state and planned yaw rate, the others' from their plans.
+        """Returns the current lane states: the ego's from its state and planned yaw rate, the others' from their plans.
 
         Plans in free space have no route, so their arc lengths and offsets come from a projection.
         """
@@ -162,7 +147,7 @@ class NominalTraffic(Traffic):
 
     @torch.no_grad()
     def open_loop_plans(self, scene: TensorDictBase, seed: Tensor) -> Tensor:
-        """Joint samples [B, S, V, HORIZON, 4] beside an ego whose plan is unknown, stratified over the S samples.
+        """Returns joint samples [B, S, V, HORIZON, 4] beside an ego whose plan is unknown, stratified over S samples.
 
         No acceleration bounds are applied: they hold for the executed 0.5 s, and the current bounds applied over 5 s
         would make the samples a tenth less accurate.

@@ -13,18 +13,17 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from e2rl.planners.ego import Ego, EgoPolicy
 from e2rl.prior.routes import take_route
-from e2rl.scenes.recording import VEHICLE
 from e2rl.scenes.route import project
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.mission import ran_red
+from e2rl.sim.rollouts import Rollouts
 from e2rl.traffic.attempt import attempt
 from e2rl.traffic.pool import TrafficPool
-from e2rl.traffic.traffic import FULL, PlanLog, Traffic, counted_passes
+from e2rl.traffic.traffic import FULL, PlanLog, Traffic, counted_nfe
 from e2rl.traffic.transform import AdversarialSynthesizer
 
-MAP_KEYS = ("lane_points", "lane_index", "lane_width", "drivable_points", "drivable_index")
-SCENE_KEYS = ("size", "agent_type", "parked", "logged", *MAP_KEYS)
+MADE = ("states", "valid", "adversaries", "contact")  # what D' has of its rollouts
 
 
 @torch.no_grad()
@@ -38,15 +37,19 @@ def roll_out(
     sim: SimSettings,
     device: str = "cpu",
     template: Tensor | None = None,
-) -> dict:
-    """Rollouts of scenes index [B] with seeds [B], intensities eta [B] and causal templates [B] (None: full for all) to
-    their last step.
+) -> Rollouts:
+    """Rollouts of scenes to their last step.
 
-    The rollout dict that metrics and files read: states [B, T+1, N, 4], valid, size, agent_type,
-    simulated, adversaries, logged, logged_valid, map keys, ran_light [B, N] (`red_lights`), seed, scene_id,
-    location, seconds (wall time per rollout), passes (of the prior's network per rollout), transport (path KL of
-    adversaries and others, anchor jump), routes [B, V], contact [B] (the ego touched a vehicle), plans and targets
-    (`PlanLog.tensors`).
+    Args:
+        scenes: the scenes.
+        index: [B] int64, which of them.
+        seed: [B] int64, of the noise.
+        eta: [B], intensities.
+        ego: the planner.
+        traffic: drives the other vehicles.
+        sim: settings of the simulator; episodes go on after a contact and off the road.
+        device: where to compute.
+        template: [B] int64, causal templates (None: full for all).
     """
     begin = time.perf_counter()
     settings = replace(sim, end_on_contact=False, end_off_road=False, end_when_gone=False)
@@ -56,38 +59,25 @@ def roll_out(
     synthesizer, log = AdversarialSynthesizer(pool, torch.arange, traffic, ego), PlanLog()
     synthesizer.on_plan = log
     env = TransformedEnv(base, synthesizer)
-    with set_exploration_type(ExplorationType.DETERMINISTIC), counted_passes(traffic) as passes:
+    with set_exploration_type(ExplorationType.DETERMINISTIC), counted_nfe(traffic) as nfe:
         steps = env.rollout(base.horizon, EgoPolicy(ego, env))
-    names = {"scene_id": scenes.scene_id, "location": scenes.location}
-    rollout = {name: [values[i] for i in index.tolist()] for name, values in names.items()} | {"seed": seed.cpu()}
-    rollout |= {key: value.cpu() for key, value in _driven(steps, base.scene, settings.replay_ego).items()}
-    rollout |= log.tensors(steps["ego", "plan"])
-    cost = {"seconds": time.perf_counter() - begin, "passes": float(passes.count)}
-    return rollout | {name: torch.full((len(index),), value / len(index)) for name, value in cost.items()}
+    known = _driven(steps, base.scene, log) | log.plans(steps["ego", "plan"])
+    cost = {"seconds": time.perf_counter() - begin, "nfe": float(nfe.count)}
+    known |= {name: torch.full((len(index),), value / len(index)) for name, value in cost.items()}
+    known |= {"seed": seed, "eta": eta.double()}
+    return Rollouts.in_scenes(scenes, index, scene=base.scene, replays_ego=settings.replay_ego, **known)
 
 
-def _driven(steps: TensorDictBase, scene: TensorDictBase, replayed: bool) -> dict[str, Tensor]:
-    """The tensors of the rollout dict from the frames [B, T] of a rollout."""
-    agents, traffic = steps["next", "agents"], steps["next", "traffic"]
+def _driven(steps: TensorDictBase, scene: TensorDictBase, log: PlanLog) -> dict[str, Tensor]:
+    """Fields of Rollouts from the frames [B, T] of a rollout."""
+    agents, route = steps["next", "agents"], log.routes(scene)
     tracks = {name: torch.cat([steps["agents", name][:, :1], agents[name]], 1) for name in ("states", "valid")}
-    count, vehicles = tracks["states"].shape[2], traffic["adversary"].shape[2]
-    start = scene["valid"]
-    simulated = start & (torch.arange(count, device=start.device) < vehicles) & (scene["agent_type"] == VEHICLE)
-    simulated[:, 0] &= not replayed
-    acted = traffic["adversary"].any(1)
-    kl, last = traffic["path_kl"][:, -1], traffic[:, -1]
-    jump = last["anchor_jump"] if "anchor_jump" in last else torch.zeros_like(kl)
     return {
         **tracks,
-        **{key: scene[key] for key in SCENE_KEYS},
-        "logged_valid": scene["logged_valid"] & start[:, None],
-        "simulated": simulated,
-        "adversaries": torch.nn.functional.pad(acted, (0, count - vehicles)),
-        "routes": last["route"],
-        "ran_light": red_lights(tracks, scene, last["route"]),
-        "transport_adversary": (kl * acted).sum(-1),
-        "transport_others": (kl * ~acted).sum(-1),
-        "transport_anchor": jump.sum(-1),
+        "adversaries": torch.nn.functional.pad(log.acted, (0, tracks["states"].shape[2] - route.shape[1])),
+        "routes": route,
+        "ran_light": red_lights(tracks, scene, route),
+        **log.transport(),
         "contact": steps["next", "metrics", "contact"].any(1)[:, 0],
     }
 
@@ -114,19 +104,23 @@ def synthesize_traffic(scenes: SceneSet, traffic: Traffic, sim: SimSettings, bat
     vehicle), and ended {position in S: why} of the S - K rows in which the ego or the traffic raised or became NaN.
     """
 
+    scene = scenes.batch([0])[:0]
+    valid = scene["logged_valid"]
+    nothing = dict(zip(MADE, (scene["logged"], valid, valid[:, 0], valid[:, 0, 0]), strict=True))
+
     def synthesize(
         ego: Ego, scene_index: Tensor, eta: Tensor | float, seed: int, template: Tensor | None = None
     ) -> dict[str, Any]:
         etas = torch.as_tensor(eta, dtype=torch.float32).expand(len(scene_index))
         template = torch.full_like(scene_index, FULL) if template is None else template
 
-        def roll_out_rows(rows: Sequence[int]) -> dict:
+        def roll_out_rows(rows: Sequence[int]) -> Rollouts:
             index, at = scene_index[list(rows)], list(rows)
             noise = index + seed * 1_000_003
             return roll_out(scenes, index, noise, etas[at], ego, traffic, sim, device, template[at])
 
         done: list[int] = []
-        parts, ended = [_nothing(scenes)], dict[int, dict]()
+        parts, ended = list[Rollouts](), dict[int, dict]()
         for rows in torch.arange(len(scene_index)).split(batch):
             found, lost = attempt(roll_out_rows, rows.tolist())
             done += [row for tasks, _ in found for row in tasks]
@@ -134,14 +128,7 @@ def synthesize_traffic(scenes: SceneSet, traffic: Traffic, sim: SimSettings, bat
             ended |= dict(lost)
         at = torch.tensor(done, dtype=torch.int64)
         order = at.argsort()
-        made = {name: torch.cat([part[name] for part in parts])[order] for name in parts[0]}
+        made = {name: torch.cat([nothing[name], *(part.get(name) for part in parts)])[order] for name in MADE}
         return made | {"scene_index": scene_index[at[order]], "ended": ended}
 
     return synthesize
-
-
-def _nothing(scenes: SceneSet) -> dict[str, Tensor]:
-    """What D' holds of no rollout."""
-    scene = scenes.batch([0])[:0]
-    states, valid = scene["logged"], scene["logged_valid"]
-    return {"states": states, "valid": valid, "adversaries": valid[:, 0], "contact": valid[:, 0, 0]}

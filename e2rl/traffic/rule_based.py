@@ -1,12 +1,8 @@
-"""IDM lane-following under the prior's acceleration bounds, with standing vehicles frozen: the baseline of a prior.
+"""Traffic without a prior's samples: log replay, constant velocity, and lane-following by IDM.
 
-Every vehicle keeps the route candidate nearest to it, returns to its centreline, and accelerates by the Intelligent
-Driver Model (Treiber et al. 2000) behind the nearest agent or red light ahead. Bounds, decoder and the end of a vehicle
-at the map's border are those of the prior (e2rl/prior/bounds.py, lane_relative.py).
-
-Log replay: vehicles follow their recording and are present where recorded.
-
-Constant velocity from the causal start states.
+IDM: every vehicle keeps the route candidate nearest to it, returns to its centreline, and accelerates by the
+Intelligent Driver Model (Treiber et al. 2000) behind the nearest agent or red light ahead. Bounds, decoder and the end
+of a vehicle at the map's border are those of the prior (e2rl/prior/bounds.py, lane_relative.py).
 """
 
 from dataclasses import dataclass, replace
@@ -15,11 +11,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.planners.idm_planner import LINE_GAP
+from e2rl.planners.path import STOP_GAP
 from e2rl.prior.bounds import Obstacles, apply_cap, bounded
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, decode, locate, select
 from e2rl.prior.prior import STANDING_SPEED, Prior
 from e2rl.prior.routes import RoutedScene, route_scene, start_state
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.route import SPACING
 from e2rl.sim.leaders import FREE_GAP, IDMParameters, idm_acceleration, leaders
 from e2rl.sim.mission import light_state_at, stop_line_distance
@@ -63,24 +60,26 @@ class IDMState:
     lane: LaneState
 
 
+@configured("synthesizer/idm")
+@dataclass(eq=False, repr=False)
 class IDM(Traffic):
-    """Car-following on the nearest route candidate; vehicles that stand at the start never move."""
+    """Car-following on the nearest route candidate; vehicles that stand at the start never move. The prior is the
+    source of the bounds."""
+
+    prior: Prior
+    headway: float = setting()
+    standstill_gap: float = setting()
+    acceleration: float = setting()
+    braking: float = setting()
+    exponent: float = setting()
+    speed: float = setting()
 
     stochastic = False
 
-    def __init__(
-        self,
-        prior: Prior,
-        headway: float = 1.5,
-        standstill_gap: float = 2.0,
-        acceleration: float = 1.0,
-        braking: float = 2.0,
-        exponent: float = 4.0,
-        speed: float = 10.0,
-    ) -> None:
-        """prior: source of the bounds; fields: conf/synthesizer/idm.yaml."""
-        self.bounds, self.speed, self.standstill_gap, self.braking = prior.bounds, speed, standstill_gap, braking
-        self.driver = IDMParameters(headway, standstill_gap, acceleration, braking, exponent)
+    def __post_init__(self) -> None:
+        self.bounds = self.prior.bounds
+        settings = self.headway, self.standstill_gap, self.acceleration, self.braking, self.exponent
+        self.driver = IDMParameters(*settings)
 
     @torch.no_grad()
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> IDMState:
@@ -102,7 +101,7 @@ class IDM(Traffic):
         frozen = routed.parked | (world.scene["start"][:, :vehicles, 3] < STANDING_SPEED) | ~present
 
         def decoded(cap: Tensor | None) -> LaneState:
-            return _held(decode(*apply_cap(cap, x, lane, self.bounds.onset), routed.points), lane, frozen)
+            return _held(decode(*apply_cap(cap, x, lane), routed.points), lane, frozen)
 
         obstacles = Obstacles(world.states, routed.size, world.valid)
         motion = bounded(self.bounds, decoded, lane, obstacles)
@@ -122,7 +121,7 @@ class IDM(Traffic):
         light = light_state_at(routed.light_state, routed.light, world.step)
         brake = 2 * self.braking
         line = stop_line_distance(light, routed.light_s - lane.s[..., None], lane.v, brake, brake)
-        line = line - length / 2 - LINE_GAP + self.standstill_gap
+        line = line - length / 2 - STOP_GAP + self.standstill_gap
         behind = idm_acceleration(lane.v, desired, gap.clamp(min=0.1), speed.clamp(min=0), self.driver, True)
         halting = idm_acceleration(lane.v, desired, line.clamp(min=0.1), torch.zeros_like(line), self.driver, True)
         return torch.minimum(behind, halting)

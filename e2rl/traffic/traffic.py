@@ -1,4 +1,4 @@
-"""The extension point for traffic: recordings, car-following, the prior, e2 and its rivals.
+"""The extension point for traffic: recordings, car-following, the prior, e2 and the baselines.
 
 A method is a class with one or two methods, and a YAML file in conf/synthesizer with its `_target_`, a `name` and its
 settings. A complete example, in which every vehicle brakes to a halt:
@@ -13,27 +13,17 @@ settings. A complete example, in which every vehicle brakes to a halt:
             now = world.states[:, : world.scene["route_log"].shape[1], None]        # [B, V, 1, 4]
             time = DT * torch.arange(1, HORIZON + 1, device=now.device)              # [H]
             time = torch.minimum(time, now[..., 3] / self.braking)                   # [B, V, H], until the halt
-            way = now[..., 3] * time - self.braking * time**2 / 2
-            xy = now[..., :2] + way[..., None] * torch.stack([now[..., 2].cos(), now[..., 2].sin()], -1)
-            rest = torch.stack([now[..., 2].expand_as(way), now[..., 3] - self.braking * time], -1)
-            present = world.valid[:, : way.shape[1], None].expand_as(way)
+            distance = now[..., 3] * time - self.braking * time**2 / 2
+            xy = now[..., :2] + distance[..., None] * torch.stack([now[..., 2].cos(), now[..., 2].sin()], -1)
+            rest = torch.stack([now[..., 2].expand_as(distance), now[..., 3] - self.braking * time], -1)
+            present = world.valid[:, : distance.shape[1], None].expand_as(distance)
             return state, TrafficPlan(torch.cat([xy, rest], -1), present)
-
-Causal templates of an attack: who may act on the ego directly, and who from afar through others.
-
-`single`: one vehicle acts on the ego; `pair`: two do; `chain`: one does, and one more acts on it from afar, through
-others where need be; `full`: as many as the traffic method is set to. Tensors hold them as codes, the places in
-TEMPLATES.
-
-The plans of a rollout, thinned out for its file: where everybody meant to go, and whom adversaries aimed at.
-
-Passes of the prior's network: what a method costs, whatever the machine.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -46,23 +36,24 @@ from e2rl.run.config import Extension
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 
+# Causal templates of an attack, codes in tensors. single: one vehicle acts on the ego; pair: two do; chain: one does,
+# and one more acts on it from afar, through others if necessary; full: as many as the method is set to.
 TEMPLATES = ("single", "pair", "chain", "full")
 SINGLE, PAIR, CHAIN, FULL = range(len(TEMPLATES))
 
-
 REPLAN_STEPS = 5  # steps of DT between two replans: 0.5 s, for every method
+POINT_STEPS = 5  # steps between two points of a plan that are kept in a rollout's file: 0.5 s
 State = Any  # of B running scenes: a tensor, a TensorDict or a (nested) dataclass of them, batch first; or None
 
 
 @dataclass
 class TrafficPlan:
-    """Planned motion of the vehicles of B scenes over the coming HORIZON steps.
+    """Planned motion of the vehicles of B scenes over the coming HORIZON steps. Outputs that are None do not apply.
 
-    states [B, V, HORIZON, 4] (the ego's row is ignored); present [B, V, HORIZON] bool: false from the step on at which
-    a vehicle has left; adversary [B, V] bool: under adversarial control (None: no vehicle); path_kl [B, V]: discrete
-    path KL of the control since the start (None: 0); route [B, V] int64: route candidates followed, -1 none (None: the
-    recorded ones); target [B, V] int64: whom each vehicle under control acts on, 0 the ego, -1 nobody (None: nobody);
-    figures {name: [B, V]}: further outputs of a method, written under ("traffic", name).
+    states [B, V, HORIZON, 4]: the ego's row is ignored; present [B, V, HORIZON] bool: false from the step on at which a
+    vehicle has left; adversary [B, V] bool: under adversarial control; target [B, V] int64: whom each vehicle under
+    control acts on, 0 the ego, -1 nobody; route [B, V] int64: route candidates followed, -1 none (None: the recorded
+    ones); path_kl, anchor_jump [B, V]: discrete path KL of the control, and energy of the anchoring, since the start.
     """
 
     states: Tensor
@@ -71,19 +62,19 @@ class TrafficPlan:
     path_kl: Tensor | None = None
     route: Tensor | None = None
     target: Tensor | None = None
-    figures: dict[str, Tensor] = field(default_factory=dict)
+    anchor_jump: Tensor | None = None
 
 
 class Traffic(Extension, ABC):
     """Drives all vehicles but the ego of B scenes at once. Built as `_target_(prior=prior, **settings)`.
 
     stochastic: seeds matter; adversarial: the intensity eta matters; follows_template: `reset` takes causal templates,
-    template [B] int64 (e2rl/traffic/traffic.py; None: full for all); predicts: plans can be compared with the log in
-    open loop; replays_log: it is the recording itself; queries_ego: `replan` takes `react`, which returns the ego's
-    states against a plan: react(rows [G] of the batch, states [G, V, HORIZON, 4]) -> [G, HORIZON, 4];
-    knowledge, responsibility: what it knows of the ego and owes it, in words for captions ("": nothing to say);
-    figures: names of the further outputs of its plans; on_selection: called with every selection of adversaries;
-    topology: the TopologySettings of these selections.
+    template [B] int64 (None: full for all); predicts: plans can be compared with the log in open loop; replays_log: it
+    is the recording itself; queries_ego: `replan` takes `react`, which returns the ego's states against a plan:
+    react(rows [G] of the batch, states [G, V, HORIZON, 4]) -> [G, HORIZON, 4]; knowledge, responsibility: what it knows
+    of the ego and owes it, in words for captions ("": nothing to say); tuned: ranges (low, high[, "log"]) of the
+    settings that a tuning varies, by dotted name, the gain first; on_decision: called with what the method decides, if
+    it tells (e2: a `Selection` of adversaries).
     """
 
     stochastic = True
@@ -94,27 +85,30 @@ class Traffic(Extension, ABC):
     queries_ego = False
     knowledge = ""
     responsibility = ""
-    figures: tuple[str, ...] = ()
-    on_selection: Callable[[Any], None] | None = None
-    topology: Any = None
+    tuned: Mapping[str, tuple] = {}
+    on_decision: Callable[[Any], None] | None = None
 
     def __init__(self, prior: Prior | None = None) -> None:  # noqa: B027
         """prior: the frozen prior of the run; methods without a prior ignore it."""
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> State:
-        """State of new episodes in scenes [B], with noise seeds [B] int64 and intensities eta [B]."""
+        """Returns the state of new episodes in scenes [B], with noise seeds [B] int64 and intensities eta [B]."""
         return None
 
     @abstractmethod
     def replan(self, state: State, world: World, ego_plan: Tensor) -> tuple[State, TrafficPlan]:
-        """New state and plan; ego_plan [B, >= HORIZON, 4]: the states that the ego announces, for a method whose
-        knowledge is its plan.
+        """Returns the new state and plan.
 
         Called every REPLAN_STEPS steps; the first REPLAN_STEPS steps of a plan are executed unchanged.
+
+        Args:
+            state: what `reset` or the last replan returned.
+            world: the B scenes now.
+            ego_plan: [B, >= HORIZON, 4], states that the ego announces, for a method whose knowledge is its plan.
         """
 
     def open_loop_plans(self, scene: TensorDictBase, seed: Tensor) -> Tensor:
-        """Joint plans [B, S, V, HORIZON, 4] of scenes [B] from their start frames; seed [S, B] int64.
+        """Returns joint plans [B, S, V, HORIZON, 4] of scenes [B] from their start frames; seed [S, B] int64.
 
         By default those of the first replan, given an ego that keeps its velocity.
         """
@@ -126,52 +120,76 @@ class Traffic(Extension, ABC):
 
 
 def keep_velocity(states: Tensor, steps: Tensor | None = None) -> Tensor:
-    """States [..., H, 4] of agents [..., 4] after `steps` [H] (or [..., H]) steps at constant velocity; default
+    """Returns states [..., H, 4] of agents [..., 4] after `steps` [H] (or [..., H]) steps at constant velocity; default
     1..HORIZON."""
     steps = torch.arange(1, HORIZON + 1, device=states.device) if steps is None else steps
-    way = states[..., 3, None] * DT * steps
+    distance = states[..., 3, None] * DT * steps
     direction = torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)[..., None, :]
-    xy = states[..., None, :2] + way[..., None] * direction
+    xy = states[..., None, :2] + distance[..., None] * direction
     return torch.cat([xy, states[..., None, 2:].expand(*xy.shape[:-1], 2)], -1)
 
 
 def steps_ahead(world: World) -> Tensor:
-    """The coming simulated steps [B, HORIZON] int64."""
+    """Returns the coming simulated steps [B, HORIZON] int64."""
     return world.step[:, None] + torch.arange(1, HORIZON + 1, device=world.step.device)
 
 
-POINT_STEPS = 5  # steps between two kept points of a plan: 0.5 s
-
-
 class PlanLog:
-    """Collects the plans of B scenes that replan at the same steps, every REPLAN_STEPS from the start on."""
+    """Collects the plans of B scenes that replan at the same steps, every REPLAN_STEPS from the start on.
+
+    `last`: the plan that came last; `acted` [B, V] bool: who has been an adversary in any plan.
+    """
+
+    last: TrafficPlan
 
     def __init__(self) -> None:
         self.paths: list[Tensor] = []
         self.targets: list[Tensor] = []
+        self.acted = torch.zeros(1, 1, dtype=torch.bool)
 
     def __call__(self, plan: TrafficPlan) -> None:
-        """Note a plan of all scenes (`AdversarialSynthesizer.on_plan`)."""
+        """Notes a plan of all scenes (`AdversarialSynthesizer.on_plan`)."""
         nobody = torch.full(plan.states.shape[:2], -1, dtype=torch.int64)
         self.paths.append(points_of(plan.states).cpu())
         self.targets.append(nobody if plan.target is None else plan.target.cpu())
+        acts = nobody >= 0 if plan.adversary is None else plan.adversary.cpu()
+        self.acted, self.last = self.acted | acts, plan
 
-    def tensors(self, ego_plans: Tensor) -> dict[str, Tensor]:
-        """`plans` [B, R, V, K, 2] m, at POINT_STEPS, 2 POINT_STEPS .. steps after each of R replans, and `targets`
-        [B, R, V] (0 the ego, -1 nobody). Row 0 is the ego's plan, from ego_plans [B, T, H, 4] at every step."""
+    def plans(self, ego_plans: Tensor) -> dict[str, Tensor]:
+        """Returns the plans, thinned out for a rollout's file.
+
+        Args:
+            ego_plans: the ego's plan [B, T, H, 4] at every step; it becomes row 0.
+
+        Returns:
+            plans [B, R, V, K, 2] m, at POINT_STEPS, 2 POINT_STEPS .. steps after each of R replans, and targets
+            [B, R, V] (0 the ego, -1 nobody).
+        """
         plans = torch.stack(self.paths, 1)
         plans[:, :, 0] = points_of(ego_plans[:, ::REPLAN_STEPS]).cpu()
         return {"plans": plans, "targets": torch.stack(self.targets, 1)}
 
+    def routes(self, scene: TensorDictBase) -> Tensor:
+        """Returns the route candidates [B, V] int64 that were followed last; by default the recorded ones."""
+        return scene["route_log"].clamp(min=0) if self.last.route is None else self.last.route
+
+    def transport(self) -> dict[str, Tensor]:
+        """Returns what control cost each rollout [B]: path KL of adversaries and of others, energy of anchoring."""
+        zero, acted = torch.zeros(self.acted.shape), self.acted
+        kl, jump = (zero if value is None else value.cpu() for value in (self.last.path_kl, self.last.anchor_jump))
+        costs = {"adversary": kl * acted, "others": kl * ~acted, "anchor": jump}
+        return {f"transport_{name}": value.sum(-1) for name, value in costs.items()}
+
 
 def points_of(states: Tensor) -> Tensor:
-    """Positions [..., K, 2] of states [..., H, 4] at every POINT_STEPS-th planned step."""
+    """Returns the positions [..., K, 2] of states [..., H, 4] at every POINT_STEPS-th planned step."""
     return states[..., POINT_STEPS - 1 :: POINT_STEPS, :2]
 
 
 @dataclass
-class Passes:
-    """count: passes so far, of a joint sample each; one whose gradient is wanted counts twice."""
+class NFE:
+    """count: evaluations of the prior's network so far, of a joint sample each; one whose gradient is wanted counts
+    twice."""
 
     count: int = 0
 
@@ -181,14 +199,14 @@ class Passes:
 
 
 @contextmanager
-def counted_passes(traffic: Traffic) -> Iterator[Passes]:
-    """The Passes that a method makes within the block; none for a method without a prior."""
-    passes, prior = Passes(), getattr(traffic, "prior", None)
+def counted_nfe(traffic: Traffic) -> Iterator[NFE]:
+    """Yields the NFE of a method within the block, whatever the machine; 0 for a method without a prior."""
+    nfe, prior = NFE(), getattr(traffic, "prior", None)
     if not isinstance(prior, Prior):
-        yield passes
+        yield nfe
         return
-    hook = prior.denoiser.register_forward_hook(passes)
+    hook = prior.denoiser.register_forward_hook(nfe)
     try:
-        yield passes
+        yield nfe
     finally:
         hook.remove()

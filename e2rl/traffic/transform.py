@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Composite, Unbounded
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
 from e2rl.planners.ego import Ego
@@ -29,9 +29,8 @@ class AdversarialSynthesizer(Transform):
     With a reaction, vehicles of replayed rows with an intensity may leave their trajectories and react to the ego. All
     environments are asked at once, every REPLAN_STEPS simulated steps.
 
-    Writes ("traffic", ...): row [B, 1] int64, eta [B, 1], adversary [B, V] bool (under control or reacting) and, with a
-    traffic method, plan [B, V, H, 4] (states planned for the coming steps; only for the policy, not stacked over time),
-    path_kl [B, V], route [B, V] int64 and the method's figures [B, V].
+    Writes ("traffic", ...): row [B, 1] int64 and, with a traffic method, plan [B, V, H, 4]: states planned for the
+    coming steps, only for the policy, not stacked over time. Everything else about a plan is handed to `on_plan`.
     """
 
     def __init__(
@@ -51,7 +50,7 @@ class AdversarialSynthesizer(Transform):
         nothing = torch.zeros(0, dtype=torch.int64)  # before the first reset
         self._drawn = nothing  # [B] pool row of each episode
         self._state: State = None
-        self._plan = TensorDict({}, batch_size=[0])  # [B] the plan being driven
+        self._plan = torch.zeros(0)  # [B, V, HORIZON, 4] the plans being driven
         self._planned_at = nothing  # [B] step of the last replan, per environment
 
     @property
@@ -115,20 +114,10 @@ class AdversarialSynthesizer(Transform):
         fresh = self._method.reset(world.scene if whole else world.scene[rows], seed, eta, **given)
         self._state = fresh if whole else put_rows(self._state, rows, fresh)
         if begins:
-            self._plan, self._planned_at = self._empty_plan(), torch.zeros_like(world.step)
-        vehicles = self._plan["states"].shape[1]
-        self._plan["states"][rows] = keep_velocity(world.states[rows, :vehicles])
-        self._plan["route"][rows] = world.scene["route_log"][rows].clamp(min=0)
-        for name in ("adversary", "path_kl", *self._method.figures):
-            self._plan[name][rows] = 0
+            shape = (*world.scene["route_log"].shape, HORIZON, 4)
+            self._plan, self._planned_at = torch.zeros(shape, device=env.device), torch.zeros_like(world.step)
+        self._plan[rows] = keep_velocity(world.states[rows, : self._plan.shape[1]])
         self._planned_at[rows] = -REPLAN_STEPS
-
-    def _empty_plan(self) -> TensorDict:
-        shape, device = self._env.scene["route_log"].shape, self._env.device
-        zero, none = torch.zeros(shape, device=device), torch.zeros(shape, dtype=torch.bool, device=device)
-        plan = {"states": zero[..., None, None].repeat(1, 1, HORIZON, 4), "adversary": none, "path_kl": zero}
-        plan |= {"route": zero.long(), **{name: zero.clone() for name in self._method.figures}}
-        return TensorDict(plan, batch_size=shape[:1], device=device)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Before a step: replan the live traffic of environments in which a replan is due; let vehicles react."""
@@ -156,18 +145,11 @@ class AdversarialSynthesizer(Transform):
         queries = {"react": Lookahead(self.ego, now)} if self._method.queries_ego and self.ego is not None else {}
         state, plan = self._method.replan(state, now, ego_plan if whole else ego_plan[rows], **queries)
         self._state = state if whole else put_rows(self._state, rows, state)
-        self._note(rows, plan)
+        self._plan[rows] = plan.states.to(self._plan.dtype)
         if self.on_plan is not None:
             self.on_plan(plan)
         self._planned_at[rows] = world.step[rows]
         self._env.write_traffic(rows, plan.states, plan.present)
-
-    def _note(self, rows: Tensor, plan: TrafficPlan) -> None:
-        """Store the outputs of a plan; outputs that are None keep their values."""
-        given = {"states": plan.states, "adversary": plan.adversary, "path_kl": plan.path_kl, "route": plan.route}
-        for name, value in (given | plan.figures).items():
-            if value is not None:
-                self._plan[name][rows] = value.to(self._plan[name].dtype)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self._write(next_tensordict)
@@ -175,31 +157,22 @@ class AdversarialSynthesizer(Transform):
     def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the transform's keys."""
         device = self._env.device
-        drawn = self._drawn[:, None]
-        keys = {"row": drawn.to(device, copy=True), "eta": self.pool.eta[drawn].to(device)}
-        if self.traffic is None:
-            keys["adversary"] = self._stored_adversaries()
-        else:
-            step = tensordict["timestep"][:, 0]
-            keys |= self._plan.exclude("states").clone().to_dict()
-            keys["plan"] = self._plan_from(step)
+        keys = {"row": self._drawn[:, None].to(device, copy=True)}
+        if self.traffic is not None:
+            keys["plan"] = self._plan_from(tensordict["timestep"][:, 0])
             replayed = (self.pool.source[self._drawn] != LIVE).to(device)
             if bool(replayed.any()):
-                now = self._env.world().states[:, : self._plan["states"].shape[1]]
+                now = self._env.world().states[:, : self._plan.shape[1]]
                 keys["plan"] = torch.where(replayed[:, None, None, None], keep_velocity(now), keys["plan"])
-                keys["adversary"] = torch.where(replayed[:, None], self._stored_adversaries(), keys["adversary"])
-        if self.reaction is not None:
-            keys["adversary"] = keys["adversary"] | self.reaction.acting
         tensordict["traffic"] = TensorDict(keys, batch_size=tensordict.batch_size, device=device)
         return tensordict
 
     def _plan_from(self, step: Tensor) -> Tensor:
         """States [B, V, H, 4] planned for the steps after `step` [B]; the last state is held."""
-        states = self._plan["states"]
         age = (step - self._planned_at.clamp(min=0)).clamp(min=0)
         ahead = (age[:, None] + torch.arange(HORIZON, device=age.device)).clamp(max=HORIZON - 1)
         row = torch.arange(len(age), device=age.device)[:, None]
-        return states.transpose(1, 2)[row, ahead].transpose(1, 2)
+        return self._plan.transpose(1, 2)[row, ahead].transpose(1, 2)
 
     def _stored_adversaries(self) -> Tensor:
         """Bool [B, V]: adversaries of stored traffic; false in recorded and live rows."""
@@ -223,15 +196,6 @@ class AdversarialSynthesizer(Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Declares the ("traffic", ...) keys."""
         env = self._env
-        batch, vehicles = env.scene["route_log"].shape
-
-        def number(*size: int, dtype: torch.dtype = torch.float32) -> Unbounded:
-            return Unbounded((batch, *size), dtype=dtype, device=env.device)
-
-        flags = Binary(vehicles, shape=(batch, vehicles), dtype=torch.bool, device=env.device)
-        specs = {"row": number(1, dtype=torch.int64), "eta": number(1), "adversary": flags}
-        if self.traffic is not None:
-            specs["route"] = number(vehicles, dtype=torch.int64)
-            specs |= {name: number(vehicles) for name in ("path_kl", *self.traffic.figures)}
-        observation_spec["traffic"] = Composite(**specs, shape=[batch], device=env.device)
+        row = Unbounded((*env.batch_size, 1), dtype=torch.int64, device=env.device)
+        observation_spec["traffic"] = Composite(row=row, shape=env.batch_size, device=env.device)
         return observation_spec

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from e2rl.run.errors import InputError
+from e2rl.run.files import hash_files
 from e2rl.scenes.recording import Lane, Recording
-from e2rl.scenes.source import Source, hash_files
+from e2rl.scenes.source import Source
 
 COLUMNS = ["frame", "track", "x", "y", "heading", "speed"]
 

@@ -6,30 +6,19 @@ from e2rl.learning.scheduler import CurriculumScheduler
 class Staircase(CurriculumScheduler):
     """Starts on the first of `stairs`; goes up after a round with a collision rate of at most `coped`."""
 
-    def __init__(self, num_scenes, rounds, seed=0, stairs=(0.5, 1.0, 2.0, 3.0), coped=0.3, share=0.5, **scenes):
+    lasting = ("_level",)
+
+    def __init__(self, num_scenes, rounds, seed=0, stairs=(0.5, 1.0, 2.0, 3.0), coped=0.3, fraction=0.5, **scenes):
         super().__init__(num_scenes, rounds, seed, **scenes)
-        self._stairs, self._coped, self._share, self._level = list(stairs), coped, share, 0
+        self._stairs, self._coped, self.fraction, self._level = list(stairs), coped, fraction, 0
 
     @property
     def eta(self) -> float:
         """The present stair."""
         return self._stairs[self._level]
 
-    @property
-    def share(self) -> float:
-        """The share of adversarial episodes."""
-        return self._share
-
     def advance(self, collision_rate: float | None = None) -> None:
         """Climb, unless at the top."""
         super().advance(collision_rate)
         if collision_rate is not None and collision_rate <= self._coped:
             self._level = min(self._level + 1, len(self._stairs) - 1)
-
-    def extra_state(self) -> dict:
-        """The level."""
-        return {"level": self._level}
-
-    def load_extra_state(self, state: dict) -> None:
-        """Go on from an `extra_state`."""
-        self._level = state["level"]

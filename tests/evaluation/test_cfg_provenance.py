@@ -4,14 +4,14 @@ import json
 import sys
 
 import pytest
+from e2rl.evaluation.provenance import PROVENANCE, begin_run, origin_of, read_provenance
 from omegaconf import OmegaConf
 
 from e2rl.evaluation import provenance
-from e2rl.evaluation.provenance import PROVENANCE, begin_run, origin_of, read_provenance
 from e2rl.prior.checkpoint import save_prior
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
-from e2rl.run.parts import Kept
+from e2rl.run.parts import Parts
 from tests.learning.small import small_scenes
 from tests.prior.small import small_prior
 
@@ -37,9 +37,9 @@ def prior(tmp_path):
 def test_the_same_run_goes_on(tmp_path, prior, capsys):
     begin(tmp_path, prior=prior)
     begun = (tmp_path / PROVENANCE).read_bytes()
-    Kept(tmp_path).save("a", [], 1)
+    Parts(tmp_path).save("a", [], 1)
     begin(tmp_path, prior=prior, resume=True, processes=3, plugins=["json"])
-    assert (tmp_path / PROVENANCE).read_bytes() == begun and Kept(tmp_path).load("a", []) == 1
+    assert (tmp_path / PROVENANCE).read_bytes() == begun and Parts(tmp_path).load("a", []) == 1
 
 
 def test_a_run_that_ended_before_its_file_was_written_keeps_its_command(tmp_path, monkeypatch):
@@ -111,9 +111,9 @@ def test_other_code_is_told_and_named_in_the_rows(tmp_path, monkeypatch, capsys)
 
 def test_a_new_run_in_an_old_folder_keeps_nothing_of_it(tmp_path):
     begin(tmp_path)
-    Kept(tmp_path, "before").save("a", [], 1)
+    Parts(tmp_path, "before").save("a", [], 1)
     begin(tmp_path)
-    assert Kept(tmp_path, "before").load("a", []) is None
+    assert Parts(tmp_path, "before").load("a", []) is None
 
 
 NO_GIT = {"command": "x", "versions": [{}], "inputs": {}, "settings": {}}

@@ -3,11 +3,11 @@
 import json
 
 import pytest
+from e2rl.evaluation.provenance import outside_modules
+from e2rl.evaluation.resume import check_code, saved_choices, saved_configuration
 from omegaconf import OmegaConf
 
 from e2rl.evaluation.protocol import Setup
-from e2rl.evaluation.provenance import outside_modules
-from e2rl.evaluation.resume import check_code, saved_choices, saved_configuration
 from e2rl.evaluation.rollout_files import read_metrics, read_rows
 from e2rl.run.config import load_choice, load_config
 from e2rl.run.errors import InputError
@@ -30,7 +30,7 @@ def stranger(**changes):
     [
         *(("learner", name) for name in ("ppo_bc", "planner_tuning")),
         *(("ego", name) for name in ("actor", "lane_graph", "sampling", "idm", "replay")),
-        *(("data", name) for name in ("bundled", "scenarionet", "procedural")),
+        *(("data", name) for name in ("bundled", "scenarionet")),
         *(("curriculum", name) for name in ("adaptive", "bandit", "constant", "linear")),
         *(("synthesizer", name) for name in ("e2", "nominal", "replay", "idm", "constant_velocity")),
     ],

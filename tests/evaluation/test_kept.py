@@ -6,7 +6,7 @@ import random
 import pytest
 import torch
 
-from e2rl.run.parts import Kept, forget_parts, state_bytes
+from e2rl.run.parts import Parts, forget_parts, state_bytes
 
 VALUE = ([{"cfr": 1.0, "seed": 3, "duty": ""}], [{"speed": torch.arange(3.0)}], [])
 
@@ -24,8 +24,8 @@ def counted(calls, value=VALUE):
 
 
 def test_a_part_is_computed_once_and_read_as_it_was(tmp_path):
-    Kept(tmp_path, "after").result("a", [("x", 1.5)], lambda: VALUE)
-    rows, samples, ended = Kept(tmp_path, "after").result("a", [("x", 1.5)], fail)
+    Parts(tmp_path, "after").result("a", [("x", 1.5)], lambda: VALUE)
+    rows, samples, ended = Parts(tmp_path, "after").result("a", [("x", 1.5)], fail)
     assert (rows, ended) == (VALUE[0], VALUE[2]) and torch.equal(samples[0]["speed"], VALUE[1][0]["speed"])
 
 
@@ -33,31 +33,31 @@ def test_a_part_is_computed_once_and_read_as_it_was(tmp_path):
     ("stage", "about", "identity"), [("other", "", [1]), ("", "another round", [1]), ("", "", [2])]
 )
 def test_a_part_of_something_else_is_none(tmp_path, stage, about, identity):
-    Kept(tmp_path).save("a", [1], VALUE)
+    Parts(tmp_path).save("a", [1], VALUE)
     calls = []
-    Kept(tmp_path, stage, about).result("a", identity, counted(calls))
+    Parts(tmp_path, stage, about).result("a", identity, counted(calls))
     assert calls == [1]
 
 
 def test_every_damage_is_noticed_and_the_part_done_again(tmp_path):
-    Kept(tmp_path).save("a", [1], VALUE)
+    Parts(tmp_path).save("a", [1], VALUE)
     (file,) = tmp_path.rglob("*.pt")
     whole = file.read_bytes()
     for cut in (0, 1, len(whole) // 2, len(whole) - 1):
         file.write_bytes(whole[:cut])
-        assert Kept(tmp_path).load("a", [1]) is None
+        assert Parts(tmp_path).load("a", [1]) is None
     draw = random.Random(0)
     for _ in range(200):
         flipped = bytearray(whole)
         flipped[draw.randrange(len(whole))] ^= 1 << draw.randrange(8)
         file.write_bytes(flipped)
-        assert Kept(tmp_path).load("a", [1]) is None
+        assert Parts(tmp_path).load("a", [1]) is None
     for value in ([1, 2], {"format": "e2rl-part/1"}, "text"):  # whole, but no part
         file.write_bytes(state_bytes(value))
-        assert Kept(tmp_path).load("a", [1]) is None
+        assert Parts(tmp_path).load("a", [1]) is None
     calls = []
-    Kept(tmp_path).result("a", [1], counted(calls))
-    assert calls == [1] and Kept(tmp_path).load("a", [1]) is not None
+    Parts(tmp_path).result("a", [1], counted(calls))
+    assert calls == [1] and Parts(tmp_path).load("a", [1]) is not None
 
 
 class Malicious:
@@ -69,17 +69,17 @@ class Malicious:
 
 
 def test_a_strangers_part_runs_nothing(tmp_path):
-    Kept(tmp_path).save("a", [1], VALUE)
+    Parts(tmp_path).save("a", [1], VALUE)
     (file,) = tmp_path.rglob("*.pt")
     part = {"format": "e2rl-part/1", "about": "", "identity": [1], "value": Malicious(tmp_path / "ran")}
     file.write_bytes(state_bytes(part))
-    assert Kept(tmp_path).load("a", [1]) is None and not (tmp_path / "ran").exists()
+    assert Parts(tmp_path).load("a", [1]) is None and not (tmp_path / "ran").exists()
 
 
 def test_a_part_that_is_not_valid_any_more_is_done_again(tmp_path):
     calls = []
     for _ in range(2):
-        Kept(tmp_path).result("a", [1], counted(calls), lambda found: False)
+        Parts(tmp_path).result("a", [1], counted(calls), lambda found: False)
     assert len(calls) == 2
 
 
@@ -87,13 +87,13 @@ def test_without_a_folder_nothing_is_kept(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     calls = []
     for _ in range(2):
-        Kept().result("a", [1], counted(calls))
+        Parts().result("a", [1], counted(calls))
     assert len(calls) == 2 and not list(tmp_path.iterdir())
 
 
 def test_parts_are_forgotten_in_all_stages(tmp_path):
     for stage in ("", "before"):
-        Kept(tmp_path, stage).save("a", [1], VALUE)
+        Parts(tmp_path, stage).save("a", [1], VALUE)
     (tmp_path / "metrics.json").write_text("[]")
     forget_parts(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["metrics.json"]

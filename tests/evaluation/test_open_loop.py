@@ -6,7 +6,7 @@ import torch
 from e2rl.evaluation.displacement_table import HORIZONS, open_loop_rows
 from e2rl.evaluation.protocol import Method
 from e2rl.metrics.catalogue import OPEN_LOOP, OPEN_LOOP_STAGE
-from e2rl.prior.prior import SamplerSettings
+from e2rl.prior.sde import SamplerSettings
 from e2rl.report.tables import metric_tables
 from e2rl.run.errors import InputError
 from e2rl.traffic.nominal import NominalTraffic

@@ -12,7 +12,7 @@ from e2rl.evaluation.protocol import Method, Setup, run_protocol, scene_seed
 from e2rl.evaluation.rollout_files import METRICS_FILE, ROLLOUTS, TABLE, read_metrics, read_rows
 from e2rl.evaluation.rollout_reader import read_rollout
 from e2rl.planners.idm_planner import IDMEgo
-from e2rl.run.parts import Kept
+from e2rl.run.parts import Parts
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.rule_based import ConstantVelocity
 from tests.learning.small import Ambush, small_scenes
@@ -140,7 +140,7 @@ def stopping_run(folder, stops, scene_set, save_rollouts=True):
         setup.left, setup.done = left, done
         methods = [Method("nominal", ConstantVelocity()), Method("ambush", Ambush(), 2.0)]
         try:
-            run_protocol(setup, methods, SEEDS, folder, save_rollouts, kept=Kept(folder))
+            run_protocol(setup, methods, SEEDS, folder, save_rollouts, parts=Parts(folder))
         except KeyboardInterrupt:
             assert left < 100 and not (folder / TABLE).exists(), "no table of half a run"
     return done

@@ -10,8 +10,8 @@ from e2rl.evaluation.protocol import Method, Setup
 from e2rl.metrics.catalogue import META, META_STAGE
 from e2rl.metrics.meta_metric import FEATURES, HISTOGRAMS, SMOOTHING, meta_metric
 from e2rl.planners.log_replay import ReplayEgo
-from e2rl.prior.prior import SamplerSettings
-from e2rl.run.parts import Kept
+from e2rl.prior.sde import SamplerSettings
+from e2rl.run.parts import Parts
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.nominal import NominalTraffic
 from e2rl.traffic.rule_based import ConstantVelocity, Replay
@@ -200,8 +200,8 @@ def test_a_meta_metric_that_was_interrupted_equals_one_that_was_not(tmp_path, mo
 
     monkeypatch.setattr(Setup, "roll_out", stopped)
     with pytest.raises(KeyboardInterrupt):
-        meta_rows(setup_of(places(2), 3), methods, 4, Kept(tmp_path))
-    again = meta_rows(setup_of(places(2), 3), methods, 4, Kept(tmp_path))
+        meta_rows(setup_of(places(2), 3), methods, 4, Parts(tmp_path))
+    again = meta_rows(setup_of(places(2), 3), methods, 4, Parts(tmp_path))
     assert again == whole and driven == ["nominal", "nominal", None, "nominal", "constant_velocity"]
 
 
@@ -218,7 +218,7 @@ def test_rollouts_that_end_are_counted_and_weigh_nothing(tmp_path):
 
     scene_set, methods = places(2), [Method("nominal", nominal()), Method("replay", Replay())]
     setup = Setup(scene_set, Fails(), "fails", SIM, 4)
-    for row, count in zip(meta_rows(setup, methods, 3, Kept(tmp_path)), (3, 1), strict=True):
+    for row, count in zip(meta_rows(setup, methods, 3, Parts(tmp_path)), (3, 1), strict=True):
         assert row["ended"] == {"raised ZeroDivisionError": count} and row["n_rollouts"] == 3
         assert {row["metrics"][name]["n"] for name in FEATURES} == {1}
-    assert meta_rows(setup, methods, 3, Kept(tmp_path))[0]["ended"] == {"raised ZeroDivisionError": 3}
+    assert meta_rows(setup, methods, 3, Parts(tmp_path))[0]["ended"] == {"raised ZeroDivisionError": 3}

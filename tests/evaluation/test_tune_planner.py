@@ -14,7 +14,6 @@ from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.planners.path import MissionPath
 from e2rl.run import config as build_config
 from e2rl.run.errors import InputError
-from e2rl.scenes.scene import Loaded
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.rule_based import Replay
 from tests.evaluation.tuned_road import PRESENT, SPACE, quiet, road
@@ -70,7 +69,7 @@ def test_every_trial_meets_traffic_made_against_it(tmp_path):
 
 def test_leaving_the_road_counts_as_a_collision():
     scene_set = scenes(1, steps=20)
-    off = replace(scene_set, rows=Loaded(scene_set.scenes.clone()))
+    off = replace(scene_set, scenes=scene_set.scenes.clone())
     off.scenes["field"][:] = torch.where(torch.arange(off.scenes["field"].shape[1])[:, None] < 85, -1.0, 1.0)
     method = Method("nominal", synthesizer())
     for each, expected in ((scene_set, 0.0), (off, 1.0)):

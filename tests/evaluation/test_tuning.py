@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from e2rl.evaluation import tuning
 from e2rl.evaluation.tuning import Objective, TuneSettings, ladder, tune, yaml_of
 from e2rl.run.errors import InputError
-from e2rl.run.parts import Kept
+from e2rl.run.parts import Parts
 from tests.evaluation.tuned_road import PRESENT, SPACE, quiet, road
 
 
@@ -150,7 +150,7 @@ def test_a_tuning_that_was_interrupted_equals_one_that_was_not(tmp_path, study, 
             settings = TuneSettings(trials=9, startup=4, study=file)
             try:
                 found = tune(
-                    evaluate, PRESENT, SPACE, settings, Objective(), folder, say=lambda line: None, kept=Kept(folder)
+                    evaluate, PRESENT, SPACE, settings, Objective(), folder, say=lambda line: None, kept=Parts(folder)
                 )
             except KeyboardInterrupt:
                 assert left < 100

@@ -8,7 +8,7 @@ from e2rl.learning.imitation import Imitation, ImitationSettings, imitate, recor
 from e2rl.learning.logging import RunLogger
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.reference import executed_action
-from e2rl.run.parts import Kept
+from e2rl.run.parts import Parts
 from e2rl.sim.env import SimSettings
 from tests.learning.small import small_scenes
 
@@ -68,7 +68,7 @@ def test_cloning_that_was_interrupted_equals_one_that_was_not(tmp_path, monkeypa
     def run(folder):
         torch.manual_seed(0)
         network = ActorEgo(hidden=(32,)).network
-        best = imitate(network, pairs, settings(epochs=5), folder, RunLogger("csv", folder), Kept(folder))
+        best = imitate(network, pairs, settings(epochs=5), folder, RunLogger("csv", folder), Parts(folder))
         files = [
             (folder / name).read_bytes() for name in ("actor.safetensors", "logs/scalars/train/imitation_loss.csv")
         ]

@@ -4,6 +4,8 @@ import math
 
 import torch
 
+from e2rl.sim.rollouts import Rollouts
+
 STEPS, VEHICLES, OTHERS, DT = 80, 32, 16, 0.1
 
 
@@ -14,8 +16,8 @@ def random_rollouts(
     others: int = OTHERS,
     steps: int = STEPS,
     extent: float = 60.0,
-) -> dict:
-    """A rollout dict [B = rollouts, T = steps, N = vehicles + others] as evaluation produces it.
+) -> Rollouts:
+    """Rollouts [B = rollouts, T = steps, N = vehicles + others] as evaluation produces them.
 
     Agents drive constant turns with wavering speed inside +-extent m; some stand, some vanish and come back, a third of
     the rollouts has no polygon, one in eight no map. The log is the same tracks, distorted. Rows never valid hold NaN.
@@ -33,23 +35,28 @@ def random_rollouts(
     lengths = torch.where(kind == 0, 3.5 + 8 * torch.rand(rollouts, count, generator=generator).pow(4), 0.8)
     widths = torch.where(kind == 0, 1.6 + 0.9 * torch.rand(rollouts, count, generator=generator), 0.7)
     never = ~valid.any(1)[:, None]
-    return {
-        "states": states.masked_fill(~valid[..., None] & never[..., None], torch.nan),
-        "valid": valid,
-        "size": torch.stack([lengths, widths], -1),
-        "agent_type": kind,
-        "simulated": simulated,
-        "adversaries": adversaries,
-        "logged": logged,
-        "logged_valid": valid & (torch.rand(valid.shape, generator=generator) > 0.01),
+    return Rollouts(
+        states=states.masked_fill(~valid[..., None] & never[..., None], torch.nan),
+        valid=valid,
+        size=torch.stack([lengths, widths], -1),
+        agent_type=kind,
+        simulated=simulated,
+        adversaries=adversaries,
+        logged=logged,
+        logged_valid=valid & (torch.rand(valid.shape, generator=generator) > 0.01),
         **random_map(rollouts, extent, generator),
-        "seed": torch.arange(rollouts) % 2,
-        "eta": 2.0,
-        "scene_id": [f"scene_{index // 2}" for index in range(rollouts)],
-        "location": [f"place_{index // 4}" if index % 8 < 6 else "" for index in range(rollouts)],
-        "seconds": torch.rand(rollouts, generator=generator),
-        "passes": torch.full((rollouts,), 128.0),
-    }
+        seed=torch.arange(rollouts) % 2,
+        eta=torch.full((rollouts,), 2.0, dtype=torch.float64),
+        scene_id=[f"scene_{index // 2}" for index in range(rollouts)],
+        location=[f"place_{index // 4}" if index % 8 < 6 else "" for index in range(rollouts)],
+        dataset=["synthetic"] * rollouts,
+        split=["test"] * rollouts,
+        method=["e2"] * rollouts,
+        ego_policy=["idm"] * rollouts,
+        seconds=torch.rand(rollouts, generator=generator),
+        nfe=torch.full((rollouts,), 128.0),
+        batch_size=[rollouts],
+    )
 
 
 def random_tracks(rollouts, count, steps, extent, generator):

@@ -10,7 +10,6 @@ from e2rl.planners.bits import BitsEgo
 from e2rl.planners.bits_network import CELLS, BitsNetwork, load_bits, save_bits
 from e2rl.planners.ego import PLAN_STEPS, EgoPolicy
 from e2rl.run.errors import InputError
-from e2rl.scenes.scene import Loaded
 from e2rl.sim import dynamics
 from e2rl.sim.env import DrivingEnv, SimSettings
 from tests.sim.test_observation import quarter_turn
@@ -82,7 +81,7 @@ def test_scenes_of_a_batch_do_not_mix():
     ego = wild_ego()
     together = ego.plan(world)
     for k in (0, 1, 2, 65):
-        one = replace(scenes, rows=Loaded(scenes.scenes[k : k + 1]), scene_id=["one"], location=["straight"])
+        one = replace(scenes, scenes=scenes.scenes[k : k + 1], scene_id=["one"], location=["straight"])
         torch.testing.assert_close(ego.plan(worlds(one)[1])[0], together[k], atol=1e-3, rtol=0)
     assert not torch.allclose(together[1, :, 3], together[2, :, 3])
 

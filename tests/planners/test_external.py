@@ -23,8 +23,8 @@ from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.evaluation.rollout_files import ENDED_FILE
 from e2rl.planners.external import ExternalEgo
 from e2rl.planners.planner_link import plan_message, scene_messages
+from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
-from e2rl.run.processes import ending
 from e2rl.sim.env import SimSettings
 from e2rl.sim.mission import mission_of
 from e2rl.sim.world import World

@@ -8,7 +8,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from e2rl.prior.checkpoint import load_prior, save_prior
-from e2rl.prior.prior import SamplerSettings
+from e2rl.prior.sde import SamplerSettings
 from e2rl.run.errors import InputError
 from e2rl.run.files import HASH
 from tests.prior.small import small_prior

@@ -5,7 +5,8 @@ import torch
 
 from e2rl.prior.bounds import BoundSettings, Duty
 from e2rl.prior.lane_relative import HORIZON, SIZE, decode
-from e2rl.prior.prior import Prior, SamplerSettings, plan_to_x
+from e2rl.prior.prior import Prior, plan_to_x
+from e2rl.prior.sde import SamplerSettings
 from e2rl.prior.routes import sample_route
 from tests.prior.small import VEHICLES, arc, curved_scenes, small_prior
 

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from e2rl.prior.prior import SamplerSettings
+from e2rl.prior.sde import SamplerSettings
 from e2rl.prior.sde import SAMPLERS, path_kl, reverse_step
 from e2rl.run.errors import InputError
 from e2rl.traffic.e2.control import gradient_weight

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
+from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
-from e2rl.run.processes import ending
 
 SCRIPT = """
 import os, sys, time
 from pathlib import Path
-from e2rl.run.processes import ending
+from e2rl.run.endings import ending
 from e2rl.run.processes import interrupts_held, worker_pool
 
 def work(name):

@@ -15,7 +15,7 @@ from e2rl.learning.attack import make_traffic
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run import processes as ray_workers
 from e2rl.run.errors import InputError
-from e2rl.run.parts import Kept
+from e2rl.run.parts import Parts
 from e2rl.run.processes import RayWorkers, in_processes
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.rollout import synthesize_traffic
@@ -62,7 +62,7 @@ def test_two_workers_one_killed_on_the_way_give_what_two_processes_give(tmp_path
         if processes == 2:
             setup.mark = os.devnull  # it is there: nobody is killed
         methods = [Method("nominal", synthesizer(), 0.0), Method("e2", synthesizer(), 3.0)]
-        run_protocol(setup, methods, SEEDS, folder, processes=processes, kept=Kept(folder))
+        run_protocol(setup, methods, SEEDS, folder, processes=processes, parts=Parts(folder))
     assert int((tmp_path / "killed").read_text()) != os.getpid()
     same_runs(*folders)
     parts = [sorted(path.name for path in (folder / "parts").iterdir()) for folder in folders]

@@ -13,12 +13,13 @@ import pytest
 import torch
 
 from e2rl.run.errors import InputError
+from e2rl.run.files import hash_files
 from e2rl.scenes import source
 from e2rl.scenes.builder import BuildSettings
 from e2rl.scenes.bundled import BundledSource
 from e2rl.scenes.recording import Lane, Recording
 from e2rl.scenes.scenarionet import ScenarioNetSource
-from e2rl.scenes.source import AHEAD, Source, hash_files, load_scenes
+from e2rl.scenes.source import AHEAD, Source, load_scenes
 from tests.scenes.descriptions import (
     ALL,
     Malicious,

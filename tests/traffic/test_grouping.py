@@ -19,7 +19,7 @@ def sized(counts, others=0):
     empty = torch.zeros(len(counts), AGENTS)
     route = torch.zeros(len(counts), WIDTH, dtype=torch.long)
     scene = TensorDict({"valid": valid, "route_log": route}, batch_size=[len(counts)])
-    return World(scene, empty[:, 0].long(), empty[..., None].expand(-1, -1, 4), valid, empty)
+    return World(scene, empty[:, 0].long(), empty[..., None].expand(-1, -1, 4), valid, empty, empty)
 
 
 def test_every_scene_is_in_one_group_that_holds_its_vehicles_and_wastes_less_than_half():

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from e2rl.prior.lane_relative import HORIZON, SIZE
-from e2rl.prior.prior import SamplerSettings
+from e2rl.prior.sde import SamplerSettings
 from e2rl.sim.world import World
 from e2rl.traffic.grouping import noise_of, take_rows
 from e2rl.traffic.nominal import KNOWLEDGE, NominalTraffic

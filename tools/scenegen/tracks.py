@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from e2rl.scenes.interaction import overlap
 from e2rl.scenes.paths import WHEELBASE, arc_length, shift_left, tractrix, whittaker
 from e2rl.scenes.recording import DT
+from scenegen.interaction import overlap
 from scenegen.simulate import Net, Track
 
 PATH_STEP, PATH_PENALTY = 0.5, 300.0  # m; smooths over about 8 m of way

@@ -5,8 +5,8 @@ from collections import Counter
 import numpy as np
 
 from e2rl.scenes.bundled import CURRENT, FRAMES, SceneMap
-from e2rl.scenes.interaction import interaction_score, lateral_acceleration, overlapping_pairs
 from e2rl.scenes.recording import Recording
+from scenegen.interaction import interaction_score, lateral_acceleration, overlapping_pairs
 
 STRIDE = 40  # frames between the windows that are looked at
 TRAVEL, BORDER, LATERAL = 20.0, 35.0, 5.0  # m the ego drives, m it keeps from the map's border, m/s^2

@@ -10,17 +10,19 @@ from typing import Any
 from omegaconf import DictConfig
 
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
-from e2rl.evaluation.provenance import origin_of
 from e2rl.learning.prior_training.distributed import process_group
 from e2rl.learning.prior_training.training import ClosedLoop, held_out, train_prior
 from e2rl.learning.prior_training.training_settings import TrainingSettings
 from e2rl.planners.log_replay import ReplayEgo
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.denoiser import DenoiserSettings
-from e2rl.prior.prior import Prior, SamplerSettings
-from e2rl.run.parts import Kept
+from e2rl.prior.prior import Prior
+from e2rl.prior.sde import SamplerSettings
+from e2rl.run.parts import Parts
+from e2rl.run.run import origin_of
 from e2rl.run.settings import settings_of
-from e2rl.scenes.scene import Loaded, SceneSet
+from e2rl.scenes.scene import SceneSet
+from e2rl.scenes.scene_list import listed
 from e2rl.scenes.source import load_scenes
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.nominal import NominalTraffic
@@ -29,10 +31,10 @@ FIGURES = ("real", "aor_step", "cfr_bg")  # metrics of the closed loop at a vali
 
 
 def run_prior_stage(
-    config: DictConfig, folder: Path, begin_run: Callable[[Mapping[str, SceneSet]], None]
+    config: DictConfig, folder: Path, begin_run: Callable[[Mapping[str, tuple[str, str]]], None]
 ) -> tuple[Path, list[dict]] | None:
     """The checkpoint's path and the metrics rows of the nominal closed loop on held-out scenes, the ego replayed; None
-    in processes other than the leader. begin_run: see `e2rl.evaluation.provenance.begin_run`, of the scenes."""
+    in processes other than the leader. begin_run: see `e2rl.run.run.Run.begin`."""
     settings = settings_of(TrainingSettings, {**config.prior.training, "seed": config.seed}, "prior.training")
     with process_group(config.device) as (processes, device):
         folder = processes.from_leader(lambda: folder)
@@ -41,7 +43,7 @@ def run_prior_stage(
         scenes = processes.leader_first(
             lambda: load_scenes(config.data, config.num_scenes, "train", list(settings.starts), config.scenes)
         )
-        processes.from_leader(lambda: begin_run({"scenes": scenes}))
+        processes.from_leader(lambda: begin_run({"scenes": listed(scenes)}))
         origin = {
             "data": f"{scenes.dataset}/{scenes.split}",
             "scenes": len(scenes),
@@ -53,7 +55,7 @@ def run_prior_stage(
         path = train_prior(prior, scenes, settings, folder, origin, _closed_loop(scenes, settings, device), processes)
         if path is None:
             return None
-        fields = {"stage": "prior", "kept": Kept(folder, "prior", path.name), **origin_of(folder)}
+        fields = {"stage": "prior", "kept": Parts(folder, "prior", path.name), **origin_of(folder)}
         return path, _nominal(prior, _first_starts(scenes), device, folder, **fields)
 
 
@@ -63,7 +65,6 @@ def _untrained(config: DictConfig) -> Prior:
         settings_of(DenoiserSettings, config.prior.network, "prior.network"),
         settings_of(SamplerSettings, config.prior.sampler, "prior.sampler"),
         settings_of(BoundSettings, config.prior.bounds, "prior.bounds"),
-        config.prior.free_space,
     )
 
 
@@ -101,7 +102,7 @@ def _first_starts(scenes: SceneSet) -> SceneSet:
 def _chosen(scenes: SceneSet, keep: list[int]) -> SceneSet:
     """The scenes with indices `keep`."""
     names, places = ([values[i] for i in keep] for values in (scenes.scene_id, scenes.location))
-    return SceneSet(Loaded(scenes.batch(keep)), names, places, scenes.dataset, f"{scenes.split}-held-out", {})
+    return SceneSet(scenes.batch(keep), names, places, scenes.dataset, f"{scenes.split}-held-out", {})
 
 
 def fingerprint(scenes: SceneSet) -> str:

@@ -72,10 +72,10 @@ def held_out(scenes: SceneSet) -> Tensor:
     return mask
 
 
-def window_sets(scenes: SceneSet, free_space: bool) -> tuple[TensorDictBase, TensorDictBase]:
+def window_sets(scenes: SceneSet) -> tuple[TensorDictBase, TensorDictBase]:
     """(training, held-out) windows. Raises InputError if either is empty or has no moving vehicle."""
     mask = held_out(scenes)
-    windows, test = (make_windows(scenes.batch(part.nonzero()[:, 0]), free_space) for part in (~mask, mask))
+    windows, test = (make_windows(scenes.batch(part.nonzero()[:, 0])) for part in (~mask, mask))
     if not len(windows) or not len(test):
         counts = f"{len(windows)} training and {len(test)} held-out windows of {len(scenes)} scenes"
         reason = "too few vehicles are recorded for a second on a known route"
@@ -174,7 +174,7 @@ def train_prior(
             raise InputError(f"{folder / STATE}: the interrupted run had other data; resume with the same scenes")
         record = Record(**state["record"])
     with record.timed("windows"):
-        windows, test = window_sets(scenes, prior.free_space)
+        windows, test = window_sets(scenes)
     if state is None:
         with record.timed("routes"):
             record.accuracy = train_route_choice(prior, scenes.batch((~held_out(scenes)).nonzero()[:, 0]), settings)

@@ -29,12 +29,12 @@ def derivative(values: Tensor, valid: Tensor) -> Tensor:
     return (ahead + behind) / count.clamp(min=1) / DT
 
 
-def make_windows(scenes: TensorDictBase, free: bool = False, chunk: int = 32) -> TensorDict:
-    """Windows [W] of scenes [S] (see `_window` for the keys), without empty ones; free: all in free space."""
+def make_windows(scenes: TensorDictBase, chunk: int = 32) -> TensorDict:
+    """Windows [W] of scenes [S] (see `_window` for the keys), without empty ones."""
     parts = []
     for scene in tqdm(scenes.split(chunk), "training windows", disable=None):
         vehicles = scene["route_log"].shape[1]
-        routed = route_scene(scene, scene["route_log"].clamp(min=0), free)
+        routed = route_scene(scene, scene["route_log"].clamp(min=0))
         logged, valid = scene["logged"][:, :, :vehicles], scene["logged_valid"][:, :, :vehicles]
         accel = derivative(logged[..., 3], valid).clamp(-6.0, 4.0)
         heading = torch.where(valid, logged[..., 2], 0.0)

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from e2rl.evaluation.rollout_files import ROLLOUTS
 from e2rl.report.export.episode import Episode
 from e2rl.run.files import write_atomically
 from e2rl.scenes.scene import KEYS
+from e2rl.sim.rollouts import ROLLOUTS
 
 SCENES = "scenes"  # the folder of scenes, beside the one of rollouts
 

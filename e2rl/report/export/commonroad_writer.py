@@ -65,10 +65,10 @@ def scenario(episode: Episode, number: int, open_ego: bool) -> tuple[Any, Any]:
     from commonroad.planning.planning_problem import PlanningProblemSet
     from commonroad.scenario.scenario import Scenario
 
-    place = re.sub(r"[^A-Za-z0-9]", "", episode.rollout["location"])[:MOST_CHARACTERS] or "E2rl"
+    place = re.sub(r"[^A-Za-z0-9]", "", episode.rollout.location)[:MOST_CHARACTERS] or "E2rl"
     name = ScenarioID(map_name=place, map_id=number, configuration_id=1, obstacle_behavior="T", prediction_id=1)
-    made = Scenario(episode.rollout["dt"], name)
-    ids = count(len(episode.rollout["size"]) + 1)
+    made = Scenario(episode.rollout.dt, name)
+    ids = count(len(episode.rollout.size) + 1)
     made.add_objects(lanelets(episode, ids))
     signs, lights = speed_limits(episode, made, ids), traffic_lights(episode, made, ids)
     made.add_objects(signs + lights)
@@ -180,7 +180,7 @@ def obstacles(episode: Episode, ids: Iterator[int], open_ego: bool) -> list:
 
     made = []
     for row in episode.agents[1:] if open_ego else episode.agents:
-        kind, (length, width) = str(episode.rollout["agent_type"][row]), episode.size(row)
+        kind, (length, width) = str(episode.rollout.agent_type[row]), episode.size(row)
         name = "TRUCK" if kind == "vehicle" and length > LONG else TYPES[kind]
         shape = RectObstacleShape(width=width, length=length)
         spans = [span for span in episode.appearances(row) if span[1] - span[0] >= 2]
@@ -196,7 +196,7 @@ def state(episode: Episode, step: int, row: int, **more: float) -> Any:
     """An agent's state at a step: the middle of its box, heading and speed."""
     from commonroad.scenario.state import InitialState
 
-    x, y, heading, speed = episode.rollout["states"][step, row].astype(float).tolist()
+    x, y, heading, speed = episode.rollout.states[step, row].astype(float).tolist()
     position, turned = np.array([x, y]), float(wrap(heading))
     return InitialState(time_step=step, position=position, orientation=turned, velocity=speed, **more)
 
@@ -210,8 +210,8 @@ def planning_problem(episode: Episode, number: int) -> Any:
     from commonroad.planning.planning_problem import PlanningProblem
     from commonroad.scenario.state import CustomState
 
-    last = int(np.flatnonzero(episode.rollout["logged_valid"][:, 0])[-1])
-    x, y, heading, _ = episode.rollout["logged"][last, 0].astype(float).tolist()
+    last = int(np.flatnonzero(episode.rollout.logged_valid[:, 0])[-1])
+    x, y, heading, _ = episode.rollout.logged[last, 0].astype(float).tolist()
     there = RectOccupancy(shapely.Point(x, y), GOAL_WIDTH, GOAL_LENGTH, float(wrap(heading)))
     goal = CustomState(time_step=Interval(1, max(episode.steps, 1)), position=there)
     turning = 0.0 if episode.scene is None else float(episode.scene["start_yaw_rate"][0])

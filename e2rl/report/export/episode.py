@@ -10,13 +10,12 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from e2rl.evaluation.rollout_files import ROLLOUTS, rollout_name
-from e2rl.evaluation.rollout_reader import read_rollout
 from e2rl.run.errors import InputError
 from e2rl.scenes.builder import BuildSettings, build_scene
 from e2rl.scenes.lane_graph import LaneGraph
 from e2rl.scenes.recording import Lane, Recording
 from e2rl.scenes.smoothing import runs_of_true
+from e2rl.sim.rollouts import ROLLOUTS, Rollout, rollout_name
 
 FACTS = (  # columns of rollouts.csv that go along; docs/verdicts.md and docs/modes.md say what they mean
     *("dataset", "split", "location", "scene_id", "method", "ego_policy", "eta", "seed", "cfr"),
@@ -30,14 +29,14 @@ SAME = 0.01  # m: a map or a start that differs by more is another one
 class Episode:
     """A rollout, its map and its facts. Positions are relative to the scene's origin, as in the rollout file.
 
-    path: the rollout file; rollout: its arrays; facts: FACTS that are known, and `adversaries`, rows of agents; lanes:
+    path: the rollout file; rollout: its content; facts: FACTS that are known, and `adversaries`, rows of agents; lanes:
     by id, with points every 1 m; lights: lane id -> [T + 1] light states. Where the scene is known: `scene`, with
     `origin` [2] m, its place in the recording's coordinates, and `light_past`: lane id -> states of the frames before
     the start, the last one 0.1 s before it.
     """
 
     path: Path
-    rollout: dict[str, Any]
+    rollout: Rollout
     facts: dict[str, Any]
     lanes: dict[str, Lane]
     lights: dict[str, np.ndarray] = field(default_factory=dict)
@@ -48,20 +47,20 @@ class Episode:
     @property
     def steps(self) -> int:
         """Simulated steps T; there are T + 1 states."""
-        return len(self.rollout["states"]) - 1
+        return len(self.rollout.states) - 1
 
     @property
     def agents(self) -> list[int]:
         """Rows of the agents that are there at any step; the ego is row 0."""
-        return np.flatnonzero(self.rollout["valid"].any(0)).tolist()
+        return np.flatnonzero(self.rollout.valid.any(0)).tolist()
 
     def appearances(self, row: int) -> list[tuple[int, int]]:
         """[first, end) steps of each time that an agent is there."""
-        return [(int(first), int(end)) for first, end in runs_of_true(self.rollout["valid"][:, row])]
+        return [(int(first), int(end)) for first, end in runs_of_true(self.rollout.valid[:, row])]
 
     def size(self, row: int) -> tuple[float, float]:
         """Length and width [m] of an agent."""
-        length, width = self.rollout["size"][row].tolist()
+        length, width = self.rollout.size[row].tolist()
         return length, width
 
     def text(self) -> str:
@@ -74,13 +73,13 @@ def recorded_episode(run: Path, row: Mapping, recording: Recording, build: Build
     bare = rollout_episode(run, row)
     scene, graph = build_scene(recording, build), LaneGraph(recording.lanes)
     rollout = bare.rollout
-    same = len(graph.points) == len(rollout["lane_points"]) and len(scene["logged"]) == bare.steps + 1
-    origin = np.round(graph.points[0] - rollout["lane_points"][0]) if same else np.zeros(2)
+    same = len(graph.points) == len(rollout.lane_points) and len(scene["logged"]) == bare.steps + 1
+    origin = np.round(graph.points[0] - rollout.lane_points[0]) if same else np.zeros(2)
     if not same or not all(
         np.allclose(ours, theirs, rtol=0, atol=SAME)
         for ours, theirs in (
-            (graph.points - origin, rollout["lane_points"]),
-            (scene["start"][0, :2].numpy(), rollout["states"][0, 0, :2]),
+            (graph.points - origin, rollout.lane_points),
+            (scene["start"][0, :2].numpy(), rollout.states[0, 0, :2]),
         )
     ):
         raise InputError(
@@ -104,12 +103,11 @@ def recorded_episode(run: Path, row: Mapping, recording: Recording, build: Build
 
 def rollout_episode(run: Path, row: Mapping) -> Episode:
     """The episode of a row of rollouts.csv as its file alone has it: lanes without links, limits or lights."""
-    path = run / ROLLOUTS / rollout_name(dict(row))
-    rollout = read_rollout(path)
-    points, offsets = rollout["lane_points"].astype(float), rollout["lane_offsets"].tolist()
-    widths = rollout["lane_width"].tolist()
-    lanes = {str(index): Lane(points[offsets[index] : offsets[index + 1]], width) for index, width in enumerate(widths)}
-    adversaries = np.flatnonzero(rollout["adversaries"]).tolist()
+    path = run / ROLLOUTS / rollout_name(row)
+    rollout = Rollout.read(path)
+    pairs = zip(rollout.lanes(), rollout.lane_width.tolist(), strict=True)
+    lanes = {str(index): Lane(points.astype(float), width) for index, (points, width) in enumerate(pairs)}
+    adversaries = np.flatnonzero(rollout.adversaries).tolist()
     return Episode(path, rollout, known_facts(row) | {"adversaries": adversaries}, lanes)
 
 
@@ -146,12 +144,12 @@ def past_of(episode: Episode) -> Iterator[tuple[int, np.ndarray]]:
         return
     start = episode.scene["start"].double()
     for row, past in enumerate(episode.scene["past"].double()):
-        if not episode.rollout["valid"][0, row]:
+        if not episode.rollout.valid[0, row]:
             continue
         x, y, heading, _ = start[row]
         ahead, left, turned = past.flip(0).T
         cos, sin = heading.cos(), heading.sin()
         pose = torch.stack([x + cos * ahead - sin * left, y + sin * ahead + cos * left, heading + turned], -1)
         way = torch.cat([pose[1:], start[row, None, :3]])[:, :2] - pose[:, :2]
-        speed = way.norm(dim=-1, keepdim=True) / episode.rollout["dt"]
+        speed = way.norm(dim=-1, keepdim=True) / episode.rollout.dt
         yield row, torch.cat([pose, speed], -1).numpy()

@@ -75,7 +75,7 @@ def content(episode: Episode) -> bytes:
     channels = {topic: writer.register_channel(topic, "protobuf", schema) for topic, schema in topics.items()}
     channels["/ego"] = writer.register_channel("/ego", "json", numbers)
     for step, topic, message in messages(episode):
-        time = round(step * episode.rollout["dt"] * SECOND)
+        time = round(step * episode.rollout.dt * SECOND)
         writer.add_message(channels[topic], time, message, time, sequence=step)
     writer.add_metadata("e2rl", {name: str(value) for name, value in episode.facts.items()})
     writer.finish()
@@ -88,7 +88,7 @@ def messages(episode: Episode) -> Iterator[tuple[int, str, bytes]]:
     yield 0, "/map", drawn.road()
     for step in range(episode.steps + 1):
         yield step, "/traffic", drawn.traffic(step)
-        if "plans" in rollout and step % REPLAN_STEPS == 0 and step // REPLAN_STEPS < len(rollout["plans"]):
+        if rollout.plans is not None and step % REPLAN_STEPS == 0 and step // REPLAN_STEPS < len(rollout.plans):
             yield step, "/plans", drawn.plans(step // REPLAN_STEPS)
         yield step, "/tf", drawn.frame(step)
         yield step, "/ego", json.dumps({name: values[step] for name, values in told.items()}).encode()
@@ -98,13 +98,13 @@ def ego_numbers(episode: Episode) -> dict[str, list[float | None]]:
     """Speed and acceleration of the ego, and its gap to the partner where there is one, at every step; None where a
     number is not known."""
     rollout, partner = episode.rollout, episode.facts.get("partner")
-    speed = rollout["states"][:, 0, 3].astype(float)
-    found = {"speed": speed, "acceleration": np.append(np.diff(speed) / rollout["dt"], math.nan)}
+    speed = rollout.states[:, 0, 3].astype(float)
+    found = {"speed": speed, "acceleration": np.append(np.diff(speed) / rollout.dt, math.nan)}
     if partner is not None:
-        poses = torch.from_numpy(rollout["states"][:, [0, partner]]).double()
-        sizes = torch.from_numpy(rollout["size"][[0, partner]]).double().expand(len(poses), -1, -1)
+        poses = torch.from_numpy(rollout.states[:, [0, partner]]).double()
+        sizes = torch.from_numpy(rollout.size[[0, partner]]).double().expand(len(poses), -1, -1)
         gap = distance(poses[:, 0], sizes[:, 0], poses[:, 1], sizes[:, 1]).numpy()
-        found["gap"] = np.where(rollout["valid"][:, [0, partner]].all(1), gap, math.nan)
+        found["gap"] = np.where(rollout.valid[:, [0, partner]].all(1), gap, math.nan)
     return {name: [None if math.isnan(x) else x for x in values.tolist()] for name, values in found.items()}
 
 
@@ -116,7 +116,7 @@ class Drawn:
 
     def road(self) -> bytes:
         """Lanes, and borders of the drivable area."""
-        lanes, borders = drawing.lines(self.rollout, "lane"), drawing.lines(self.rollout, "drivable")
+        lanes, borders = self.rollout.lanes(), self.rollout.polygons()
         closed = [np.concatenate([ring, ring[:1]]) for ring in borders]
         return self._update(
             0, [self._lines("lanes", lanes, drawing.BACKGROUND), self._lines("borders", closed, "black")]
@@ -124,7 +124,7 @@ class Drawn:
 
     def traffic(self, step: int) -> bytes:
         """Everybody who is there at a step, the lights and the contact."""
-        present = np.flatnonzero(self.rollout["valid"][step]).tolist()
+        present = np.flatnonzero(self.rollout.valid[step]).tolist()
         entities = [self._agent(step, row) for row in present]
         if self.episode.lights:
             entities.append(self._lights(step))
@@ -135,12 +135,12 @@ class Drawn:
 
     def plans(self, number: int) -> bytes:
         """The plans of a replan."""
-        step, paths = number * REPLAN_STEPS, self.rollout["plans"][number]
+        step, paths = number * REPLAN_STEPS, self.rollout.plans[number]
         entities = []
-        for row, path in zip(self.rollout["planners"].tolist(), paths, strict=True):
-            start = self.rollout["states"][step, row, :2]
+        for row, path in zip(self.rollout.planners.tolist(), paths, strict=True):
+            start = self.rollout.states[step, row, :2]
             colour = drawing.EGO if row == 0 else drawing.ADVERSARY
-            if self.rollout["valid"][step, row] and np.isfinite(path).all():
+            if self.rollout.valid[step, row] and np.isfinite(path).all():
                 entities.append(self._lines(f"plan of {row}", [np.concatenate([start[None], path])], colour))
         return self._update(step, entities)
 
@@ -148,7 +148,7 @@ class Drawn:
         """Where the ego is."""
         from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 
-        x, y, heading, _ = self.rollout["states"][step, 0].tolist()
+        x, y, heading, _ = self.rollout.states[step, 0].tolist()
         made = FrameTransform(parent_frame_id=MAP, child_frame_id=EGO)
         made.translation.x, made.translation.y = x, y
         made.rotation.z, made.rotation.w = math.sin(heading / 2), math.cos(heading / 2)
@@ -156,7 +156,7 @@ class Drawn:
         return made.SerializeToString(deterministic=True)
 
     def _time(self, step: int) -> int:
-        return round(step * self.rollout["dt"] * SECOND)
+        return round(step * self.rollout.dt * SECOND)
 
     def _update(self, step: int, entities: list[Any]) -> bytes:
         """A message in place of the last one of its topic."""
@@ -171,23 +171,23 @@ class Drawn:
 
     def _agent(self, step: int, row: int) -> Any:
         """The box of an agent, with what it is."""
-        kind, (length, width) = self.rollout["agent_type"][row], self.episode.size(row)
-        x, y, heading, speed = self.rollout["states"][step, row].tolist()
+        kind, (length, width) = self.rollout.agent_type[row], self.episode.size(row)
+        x, y, heading, speed = self.rollout.states[step, row].tolist()
         made, height = self._entity(f"agent {row}"), HEIGHT[kind]
         pose = {"position": {"x": x, "y": y, "z": height / 2}}
         pose["orientation"] = {"z": math.sin(heading / 2), "w": math.cos(heading / 2)}
         made.cubes.add(pose=pose, size={"x": length, "y": width, "z": height}, color=rgba(self._colour(row)))
-        part = "ego" if row == 0 else "adversary" if self.rollout["adversaries"][row] else kind
+        part = "ego" if row == 0 else "adversary" if self.rollout.adversaries[row] else kind
         for key, value in (("part", part), ("speed", f"{speed:.2f} m/s")):
             made.metadata.add(key=key, value=value)
         return made
 
     def _colour(self, row: int) -> str:
-        if row == 0 or self.rollout["adversaries"][row]:
+        if row == 0 or self.rollout.adversaries[row]:
             return drawing.EGO if row == 0 else drawing.ADVERSARY
-        if self.rollout["agent_type"][row] in ("pedestrian", "cyclist"):
+        if self.rollout.agent_type[row] in ("pedestrian", "cyclist"):
             return drawing.VULNERABLE
-        return drawing.BACKGROUND if self.rollout["simulated"][row] else drawing.REPLAYED
+        return drawing.BACKGROUND if self.rollout.simulated[row] else drawing.REPLAYED
 
     def _lights(self, step: int) -> Any:
         """A sphere where each lane with a light begins."""

@@ -26,7 +26,7 @@ def write_roads(episode: Episode, path: Path) -> None:
     """Write the lanes of an episode; userData of the header tell the scene's origin and how many links are left out."""
     root = road_network(episode).get_element()
     header = root.find("header")
-    (west, south), (east, north) = (edge(episode.rollout["lane_points"], axis=0) for edge in (np.min, np.max))
+    (west, south), (east, north) = (edge(episode.rollout.lane_points, axis=0) for edge in (np.min, np.max))
     for name, side in (("north", north), ("south", south), ("east", east), ("west", west)):
         header.set(name, f"{side:.3f}")
     known = {"links_left_out": str(left_out(episode.lanes))}
@@ -42,7 +42,7 @@ def road_network(episode: Episode) -> Any:
     """The xodr.OpenDrive of an episode; road n + 1 is lane n."""
     from scenariogeneration import xodr
 
-    made = xodr.OpenDrive(episode.rollout["location"] or episode.rollout["scene_id"], revMinor="7")
+    made = xodr.OpenDrive(episode.rollout.location or episode.rollout.scene_id, revMinor="7")
     number = {name: index for index, name in enumerate(episode.lanes, 1)}
     plain, connecting = links(episode.lanes)
     junctions = junctions_of(connecting)

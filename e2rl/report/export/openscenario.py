@@ -56,9 +56,9 @@ def scenario(episode: Episode, road: str | None, open_ego: bool) -> Any:
     for row in episode.agents:
         name = name_of(row)
         entities.add_scenario_object(name, entity(episode, row))
-        if episode.rollout["valid"][0, row]:
+        if episode.rollout.valid[0, row]:
             init.add_init_action(name, xosc.TeleportAction(places(episode, row, 0, 1)[0]))
-            speed = float(episode.rollout["states"][0, row, 3])
+            speed = float(episode.rollout.states[0, row, 3])
             change = xosc.TransitionDynamics(xosc.DynamicsShapes.step, xosc.DynamicsDimension.time, 0)
             init.add_init_action(name, xosc.AbsoluteSpeedAction(speed, change))
         events = [] if row == 0 and open_ego else events_of(episode, row)
@@ -67,7 +67,7 @@ def scenario(episode: Episode, road: str | None, open_ego: bool) -> Any:
             for event in events:
                 manoeuvre.add_event(event)
             act.add_maneuver_group(xosc.ManeuverGroup(name).add_actor(name).add_maneuver(manoeuvre))
-    end = at(episode.steps * episode.rollout["dt"], "replay ends", "stop")
+    end = at(episode.steps * episode.rollout.dt, "replay ends", "stop")
     board = xosc.StoryBoard(init, end)
     board.add_story(xosc.Story("rollout").add_act(act))
     facts = xosc.Properties()
@@ -93,7 +93,7 @@ def name_of(row: int) -> str:
 
 def kind_of(episode: Episode, row: int) -> str:
     """car, truck, bicycle, pedestrian or other."""
-    kind = str(episode.rollout["agent_type"][row])
+    kind = str(episode.rollout.agent_type[row])
     if kind == "vehicle":
         return "truck" if episode.size(row)[0] > LONG else "car"
     return {"cyclist": "bicycle"}.get(kind, kind)
@@ -121,8 +121,8 @@ def entity(episode: Episode, row: int) -> Any:
         rear = xosc.Axle(0.0, WHEEL, TRACK * width, 0.0, WHEEL / 2)
         made = xosc.Vehicle(name, xosc.VehicleCategory[kind], box, front, rear, *PERFORMANCE, mass=MASS[kind])
     rollout = episode.rollout
-    role = "ego" if row == 0 else "adversary" if rollout["adversaries"][row] else "simulated"
-    made.add_property("role", role if row == 0 or rollout["simulated"][row] else "replayed")
+    role = "ego" if row == 0 else "adversary" if rollout.adversaries[row] else "simulated"
+    made.add_property("role", role if row == 0 or rollout.simulated[row] else "replayed")
     made.add_property("row", str(row))
     return made
 
@@ -133,13 +133,13 @@ def events_of(episode: Episode, row: int) -> list:
 
     name, events = name_of(row), []
     for first, end in episode.appearances(row):
-        begin, gone = (round(step * episode.rollout["dt"], 6) for step in (first, end))
+        begin, gone = (round(step * episode.rollout.dt, 6) for step in (first, end))
         path = places(episode, row, first, end)
         drives = xosc.Event(f"{name} from {begin:g} s", xosc.Priority.parallel)
         if first > 0:
             drives.add_action(f"{name} appears at {begin:g} s", xosc.AddEntityAction(name, path[0]))
         if end - first >= 2:  # a polyline needs two vertices
-            times = np.round(np.arange(first, end) * episode.rollout["dt"], 6).tolist()
+            times = np.round(np.arange(first, end) * episode.rollout.dt, 6).tolist()
             trajectory = xosc.Trajectory(f"{name} from {begin:g} s", False).add_shape(xosc.Polyline(times, path))
             how = (xosc.FollowingMode.position, xosc.ReferenceContext.absolute, 1, 0)
             drives.add_action(f"{name} drives from {begin:g} s", xosc.FollowTrajectoryAction(trajectory, *how))
@@ -156,7 +156,7 @@ def places(episode: Episode, row: int, first: int, end: int) -> list:
     """WorldPositions of an agent's reference point at steps first to end - 1; headings are continuous."""
     from scenariogeneration import xosc
 
-    states = episode.rollout["states"][first:end, row].astype(float)
+    states = episode.rollout.states[first:end, row].astype(float)
     heading = np.unwrap(states[:, 2])
     ahead = np.stack([np.cos(heading), np.sin(heading)], -1)
     points = states[:, :2] - rear_axle(episode, row) * ahead

@@ -51,10 +51,10 @@ def description(episode: Episode) -> dict[str, Any]:
         "scenario_id": scene_id,
         "dataset": "e2rl",
         "source_file": episode.path.name,
-        "map": episode.rollout["location"],
+        "map": episode.rollout.location,
         "coordinate": "metadrive",
         "metadrive_processed": False,
-        "ts": np.arange(frames) * episode.rollout["dt"],
+        "ts": np.arange(frames) * episode.rollout.dt,
         "track_length": frames,
         "sdc_id": "0",
         "sdc_track_index": 0,
@@ -77,10 +77,10 @@ def description(episode: Episode) -> dict[str, Any]:
 def track(episode: Episode, row: int, history: int, past: np.ndarray | None) -> dict[str, Any]:
     """The track of an agent, zero where it is absent. past [history, 4]: its states before the start, None for none."""
     rollout, (length, width) = episode.rollout, episode.size(row)
-    frames, kind = history + episode.steps + 1, str(rollout["agent_type"][row])
+    frames, kind = history + episode.steps + 1, str(rollout.agent_type[row])
     states, valid = np.zeros((frames, 4)), np.zeros(frames, bool)
-    valid[history:] = rollout["valid"][:, row]
-    states[history:][valid[history:]] = rollout["states"][rollout["valid"][:, row], row]
+    valid[history:] = rollout.valid[:, row]
+    states[history:][valid[history:]] = rollout.states[rollout.valid[:, row], row]
     if past is not None:
         states[:history], valid[:history] = past, True
     speed = states[:, 3:]
@@ -98,8 +98,8 @@ def track(episode: Episode, row: int, history: int, past: np.ndarray | None) -> 
             "object_id": str(row),
             "track_length": frames,
             "dataset": "e2rl",
-            "simulated": bool(rollout["simulated"][row]),
-            "adversary": bool(rollout["adversaries"][row]),
+            "simulated": bool(rollout.simulated[row]),
+            "adversary": bool(rollout.adversaries[row]),
         },
     }
 

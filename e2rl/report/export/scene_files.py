@@ -3,16 +3,16 @@
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
-from e2rl.evaluation.resume import check_code
 from e2rl.report.export.episode import Episode, recorded_episode, rollout_episode
+from e2rl.run.config import import_plugins, resolved
 from e2rl.run.errors import InputError
+from e2rl.run.run import PROVENANCE, read_provenance
+from e2rl.run.trust import CONFIG, check_code, read_yaml
 from e2rl.scenes.recording import Recording
 from e2rl.scenes.source import Source, source_of
 
@@ -39,29 +39,21 @@ def episodes_of(run: Path, rows: Sequence[Mapping], plugins: Sequence[str], scen
 def source_of_run(run: Path, split: str, plugins: Sequence[str]) -> Source:
     """The source that a run's configuration names, on `split`. The folder may be a stranger's: code of others takes
     part only where `plugins` names its modules."""
-    folder = next((folder for folder in (run, run.parent) if (folder / ".hydra" / "config.yaml").is_file()), None)
+    folder = next((folder for folder in (run, run.parent) if (folder / CONFIG).is_file()), None)
     if folder is None:
-        raise InputError(f"{run}: no .hydra/config.yaml says where its scenes come from; restore it, {WITHOUT}")
-    file = folder / ".hydra" / "config.yaml"
+        raise InputError(f"{run}: no {CONFIG} says where its scenes come from; restore it, {WITHOUT}")
+    config = read_yaml(folder / CONFIG)
     try:
-        data = OmegaConf.select(OmegaConf.load(file), "data")
-        where = OmegaConf.select(OmegaConf.load(file.with_name("hydra.yaml")), "hydra.runtime.cwd")
-        check_code(OmegaConf.create({"data": data}), list(plugins), f"{run} (pass --plugin MODULE for plugins=)")
-        plain = OmegaConf.to_container(data, resolve=True) if isinstance(data, DictConfig) else None
-    except (OSError, KeyError, TypeError, ValueError, RecursionError, YAMLError, OmegaConfBaseException) as error:
-        if isinstance(error, InputError):
-            raise
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{file}: damaged ({reason}); restore it, {WITHOUT}") from error
+        data = OmegaConf.create({"data": OmegaConf.select(config, "data")})
+        check_code(data, plugins, f"{run} (pass --plugin MODULE for plugins=)")
+        plain = resolved(data)["data"]
+    except OmegaConfBaseException as error:
+        raise InputError(f"{folder / CONFIG}: damaged ({str(error).splitlines()[0]}); restore it, {WITHOUT}") from error
     if not isinstance(plain, dict):
-        raise InputError(f"{file}: its `data` is no group of settings; restore it, {WITHOUT}")
-    for name in plugins:
-        try:
-            import_module(name)
-        except ImportError as error:
-            raise InputError(f"--plugin {name}: {error}; install it or put its folder on PYTHONPATH") from error
-    if plain.get("path") and where:
-        plain["path"] = str(Path(where) / str(plain["path"]))  # an absolute path stays as it is
+        raise InputError(f"{folder / CONFIG}: its `data` is no group of settings; restore it, {WITHOUT}")
+    import_plugins(plugins, "--plugin ")
+    if plain.get("path") and (folder / PROVENANCE).is_file():  # an absolute path stays as it is
+        plain["path"] = str(Path(read_provenance(folder)["cwd"]) / str(plain["path"]))
     source = source_of({str(key): value for key, value in plain.items()})
     return replace(source, split=split) if source.has_splits else source
 

@@ -1,1 +1,1 @@
-"""Rivals of e2: the adversaries of other works behind the traffic interface, on the common prior (docs/rivals.md)."""
+"""The adversaries of other works behind the traffic interface, on the common prior (docs/baselines.md)."""

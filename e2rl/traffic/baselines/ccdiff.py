@@ -1,6 +1,6 @@
 """CCDiff (Lin et al. 2025): a clique ranker on the recent past, guidance of those that it finds, all others replay.
 
-CCDiff's ranker (Lin et al. 2025): vehicles that stand in the heaviest cliques of the recent past's risk graphs.
+The ranker finds the vehicles that stand in the heaviest cliques of the recent past's risk graphs.
 """
 
 from dataclasses import dataclass
@@ -12,17 +12,17 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.prior.lane_relative import LaneState
-from e2rl.prior.prior import Prior
-from e2rl.run.settings import check_range
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
-from e2rl.traffic.baselines.baseline import Answer, RivalState, replay_others
-from e2rl.traffic.baselines.guidance import Guided, Loss, MeanGuidance, check_noisy_sampler
+from e2rl.traffic.baselines.baseline import BaselineState, replay_others
+from e2rl.traffic.baselines.guidance import Loss, MeanGuided
 from e2rl.traffic.baselines.losses import discounts, disk_overlap, off_road_term, pair_term
 from e2rl.traffic.baselines.view import View
 from e2rl.traffic.e2.motion import direction, smallest
 from e2rl.traffic.e2.topology import maximal_cliques
 from e2rl.traffic.grouping import noise_of
+from e2rl.traffic.nominal import React
 from e2rl.traffic.traffic import TrafficPlan
 
 FAR = 20.0  # s: times to contact are cut there
@@ -102,40 +102,26 @@ TIES = 900  # number of the draw that orders vehicles of equal rank
 
 
 @dataclass
-class CCDiffState(RivalState):
+class CCDiffState(BaselineState):
     """top [B, V] bool: the vehicles that the ranker found, which the prior drives; all of a scene without strength."""
 
     top: Tensor
 
 
-class CCDiff(Guided):
+@configured("synthesizer/ccdiff")
+@dataclass(eq=False, repr=False)
+class CCDiff(MeanGuided):
     """Posterior-mean guidance by attraction to the ego and by the map, of the `controlled` top vehicles only."""
 
-    def __init__(
-        self,
-        prior: Prior,
-        knowledge: str = "plan",
-        prediction: str = "prior",
-        responsibility: str = "none",
-        gain: float = 0.5,
-        step_size: float = 0.3,
-        iterations: int = 1,
-        samples: int = 5,
-        controlled: int = 5,
-        collision: float = 50.0,
-        margin: float = 10.0,
-        off_road: float = 1.0,
-    ) -> None:
-        """Fields: conf/synthesizer/ccdiff.yaml."""
-        super().__init__(prior, knowledge, prediction, responsibility, gain, samples)
-        check_noisy_sampler(prior, "ccdiff")
-        check_range("synthesizer.iterations", iterations, 1)
-        check_range("synthesizer.controlled", controlled, 1)
-        self.step_size, self.iterations, self.controlled = step_size, iterations, controlled
-        self.collision, self.margin, self.off_road = collision, margin, off_road
+    controlled: int = setting(low=1)
+    collision: float = setting()
+    margin: float = setting(low=0)
+    off_road: float = setting()
+
+    tuned = {"gain": (0.05, 4.0, "log"), "step_size": (0.03, 3.0, "log")}
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> CCDiffState:
-        """States of scenes [B] with their top vehicles, which have routes of the prior; others have the recorded."""
+        """Returns states of scenes [B] with their top vehicles, whose routes are the prior's; others' are recorded."""
         state = super().reset(scenes, seed, eta)
         draw = noise_of(seed, torch.full_like(seed, TIES), tuple(state.adversary.shape[1:]), uniform=True)
         top = ranked(scenes, self.controlled, draw) | (self.strength(state) <= 0)[:, None]
@@ -144,13 +130,13 @@ class CCDiff(Guided):
         return CCDiffState(**(vars(state) | {"routed": routed, "lane": lane, "top": top}))
 
     def replan(
-        self, state: CCDiffState, world: World, ego_plan: Tensor, react: Answer | None = None
+        self, state: CCDiffState, world: World, ego_plan: Tensor, react: React | None = None
     ) -> tuple[CCDiffState, TrafficPlan]:
-        """States and plans of the coming HORIZON steps; who is not among the top replays."""
+        """Returns states and plans of the coming HORIZON steps; who is not among the top replays."""
         state, plan = super().replan(state, world, ego_plan, react)
         return replay_others(state, plan, world, state.top)
 
-    def adversaries(self, state: CCDiffState, view: View) -> Tensor:
+    def attackers(self, state: CCDiffState, view: View) -> Tensor:
         """The top vehicles."""
         return state.top & view.active
 
@@ -166,7 +152,3 @@ class CCDiff(Guided):
             return self.off_road * off_road_term(states, view, discounts(states)) - self.collision * near
 
         return value
-
-    def guidance(self, loss: Loss, guided: Tensor, strength: Tensor) -> MeanGuidance:
-        """Clipped at `gain` times eta standard deviations."""
-        return MeanGuidance(self.prior, loss, guided, strength, self.samples, self.step_size, self.iterations)

@@ -1,65 +1,47 @@
 """DiffScene (Xu et al. 2025): one adversary, generated once by three objectives and driven open loop."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from e2rl.prior.lane_relative import LaneState
-from e2rl.prior.prior import Context, Prior
-from e2rl.run.settings import check_range
+from e2rl.prior.prior import Context
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.route import project
-from e2rl.sim.world import World
 from e2rl.traffic.baselines.guidance import CleanGuidance, Loss
 from e2rl.traffic.baselines.losses import approach_term, comfort_term, off_road_term, off_route_term, speeding_term
 from e2rl.traffic.baselines.open_loop import OpenLoop, OpenLoopState, Scenario
 from e2rl.traffic.baselines.view import View, folded, motion_of, pick, tiled
 from e2rl.traffic.e2.motion import smallest
-from e2rl.traffic.grouping import Group
+from e2rl.traffic.nominal import Replan
 
 LOW, HIGH, JERK = -3.5, 2.0, 2.0  # m/s^2, m/s^2, m/s^3: what the constraint lets pass
 CORRIDOR = 1.0  # m beside the ego's route in which an adversary obstructs it
 
 
+@configured("synthesizer/diffscene")
+@dataclass(eq=False, repr=False)
 class DiffScene(OpenLoop):
     """Clean guidance of the vehicle nearest to the ego by safety, functionality and constraint; others by the prior."""
 
-    def __init__(
-        self,
-        prior: Prior,
-        knowledge: str = "plan",
-        prediction: str = "prior",
-        responsibility: str = "none",
-        gain: float = 2.0,
-        step_size: float = 4.0,
-        clip: float = 2.0,
-        samples: int = 20,
-        safety: float = 1.0,
-        functionality: float = 0.5,
-        constraint: float = 0.5,
-        temperature: float = 2.0,
-    ) -> None:
-        """Fields: conf/synthesizer/diffscene.yaml."""
-        super().__init__(prior, knowledge, prediction, responsibility, gain, samples)
-        check_range("synthesizer.temperature", temperature, 1e-3)
-        self.step_size, self.clip, self.temperature = step_size, clip, temperature
-        self.safety, self.functionality, self.constraint = safety, functionality, constraint
+    step_size: float = setting(low=0)
+    clip: float = setting(low=0)
+    samples: int = setting(low=1)
+    safety: float = setting()
+    functionality: float = setting()
+    constraint: float = setting()
+    temperature: float = setting(low=1e-3)
 
-    def scenario(
-        self,
-        state: OpenLoopState,
-        world: World,
-        ego_plan: Tensor,
-        noise: Tensor,
-        group: Group,
-        context: Context,
-        nominal: Tensor,
-    ) -> Scenario:
+    tuned = {"gain": (0.2, 20.0, "log"), "step_size": (0.2, 20.0, "log")}
+
+    def scenario(self, now: Replan, context: Context, nominal: Tensor) -> Scenario:
         """The guided joint sample of least loss; the adversary alone is held."""
-        view, count = View.of(world, context, ego_plan), noise.shape[3]
-        distance = view.distance_to_ego()
-        adversary = smallest(view.active, distance, 1) & (self.strength(state) > 0)[:, None]
-        loss, many = self.loss(state, view, adversary), tiled(context, count)
+        view, count = View.of(now.world, context, now.ego_plan), now.noise.shape[3]
+        adversary = smallest(view.active, view.distance_to_ego(), 1) & (self.strength(now.state) > 0)[:, None]
+        loss, many = self.loss(now.state, view, adversary), tiled(context, count)
         control = CleanGuidance(self.prior, loss, adversary.repeat(count, 1), count, self.step_size, self.clip)
-        sample = self.prior.sample(many, folded(noise), control)
+        sample = self.prior.sample(many, folded(now.noise), control)
         index = loss(motion_of(self.prior, sample.x0, many, count)).sum(-1).argmin(0)
         x0, kl = (pick(value.unflatten(0, (count, -1)), index) for value in (sample.x0, sample.kl))
         return Scenario(x0, adversary, adversary, kl)

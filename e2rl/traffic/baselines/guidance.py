@@ -1,9 +1,8 @@
-"""The two ways in which the rivals guide a diffusion prior by a loss of the decoded plan.
+"""The two ways in which baselines guide a diffusion prior by a loss of the decoded plan.
 
 `MeanGuidance` moves the posterior mean of a step (CTG, Zhong et al. 2023), `CleanGuidance` the clean estimate
-(Safe-Sim, Chang et al. 2024). Both are controls of `Prior.sample`, for S samples of B scenes at once.
-
-A rival that guides the prior in closed loop: whom, by which loss, and which of its samples it drives.
+(Safe-Sim, Chang et al. 2024). Both are controls of `Prior.sample`, for S samples of B scenes at once. `Guided` says
+whom they guide in closed loop, by which loss, and which of the samples is driven.
 """
 
 from abc import abstractmethod
@@ -16,27 +15,16 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import LaneState
 from e2rl.prior.prior import Context, Control, Prior
-from e2rl.prior.sde import reverse_step
 from e2rl.run.errors import InputError
-from e2rl.sim.world import World
-from e2rl.traffic.baselines.baseline import Rival
+from e2rl.run.settings import setting
+from e2rl.traffic.baselines.baseline import Baseline
 from e2rl.traffic.baselines.view import View, folded, motion_of, pick, tiled
-from e2rl.traffic.grouping import Group
+from e2rl.traffic.nominal import Replan
 from e2rl.traffic.traffic import State
 
 Loss = Callable[[LaneState], Tensor]  # motion, fields [S, B, V, T] -> [S, B, V]; each row's own, others detached
 Denoise = Callable[[Tensor], Tensor]
 ROUNDING = 1e-3  # of Adam: its steps are as long for any gradient, so that rounding would decide where there is none
-
-
-def check_noisy_sampler(prior: Prior, method: str) -> None:
-    """InputError for samplers whose steps have no posterior mean and standard deviation."""
-    sampler = prior.sampler
-    if sampler.sampler == "dpm_solver_pp" or (sampler.sampler == "ddim" and sampler.churn == 0):
-        raise InputError(
-            f"prior.sampler.sampler={sampler.sampler}, churn={sampler.churn}: {method} moves the mean of ancestral "
-            "steps by a share of their noise; use ddim with churn above 0, or euler_maruyama"
-        )
 
 
 @dataclass
@@ -65,9 +53,9 @@ class MeanGuidance:
             return x, x0, x0
         sampler, schedule = self.prior.sampler, self.prior.schedule
         low, zero = schedule.levels(sampler.steps, x.device)[sampler.steps - k + 1], torch.zeros_like(level)
-        step = partial(reverse_step, sampler.sampler, schedule, high=level, low=low, noise=zero, past=None)
-        mean, variance = step(x=x, x0=x0, churn=sampler.churn)
-        per_x0, _ = step(x=zero, x0=zero + 1, churn=sampler.churn)  # a step is affine in x0
+        step = partial(sampler.on(schedule).step, high=level, low=low, noise=zero)
+        mean, variance = step(x=x, x0=x0)
+        per_x0, _ = step(x=zero, x0=zero + 1)  # a step is affine in x0
         shift = self._shift(mean, self.limit[:, None, None] * variance.sqrt(), context)
         return x, x0, x0 + shift / per_x0
 
@@ -111,33 +99,35 @@ class CleanGuidance:
         return x, x0, x0 - torch.where(self.guided[..., None], shift, 0.0)
 
 
-class Guided(Rival):
-    """Every replan: guided joint samples, of which the one of least `rating` is driven."""
+@dataclass(eq=False, repr=False)
+class Guided(Baseline):
+    """Every replan: guided joint samples, of which the one of least `loss` is driven."""
 
-    def attack(
-        self, state: State, world: World, ego_plan: Tensor, noise: Tensor, group: Group, context: Context
-    ) -> tuple[State, Tensor]:
-        """State and chosen joint sample x0 [G, V, SIZE]; scenes without strength keep the nominal one."""
-        view, acts, count = View.of(world, context, ego_plan), self.strength(state) > 0, noise.shape[3]
-        adversary = self.adversaries(state, view) & acts[:, None]
+    samples: int = setting(low=1)
+
+    guides_everybody = False  # or adversaries alone
+
+    def attack(self, now: Replan, context: Context) -> tuple[State, Tensor]:
+        """Returns state and chosen joint sample x0 [G, V, SIZE]; scenes without strength keep the nominal one."""
+        state, count = now.state, now.noise.shape[3]
+        view, acts = View.of(now.world, context, now.ego_plan), self.strength(state) > 0
+        adversary = self.attackers(state, view) & acts[:, None]
         state = replace(state, adversary=adversary)
         guided = (context.active if self.guides_everybody else adversary) & acts[:, None]
         control = self.guidance(self.loss(state, view), guided.repeat(count, 1), self.strength(state).repeat(count))
         many = tiled(context, count)
-        sample = self.prior.sample(many, folded(noise), control)
+        sample = self.prior.sample(many, folded(now.noise), control)
         motion = motion_of(self.prior, sample.x0, many, count)
         index = self.chosen(motion, state, view, guided)
         index = index * acts if index.ndim == 1 else index * acts[:, None]
         x0, kl = (pick(value.unflatten(0, (count, -1)), index) for value in (sample.x0, sample.kl))
         return replace(state, path_kl=state.path_kl + kl), x0
 
-    guides_everybody = False  # or adversaries alone
-
     def chosen(self, motion: LaneState, state: State, view: View, guided: Tensor) -> Tensor:
         """Sample [B] of each scene that is driven: that of least loss over the guided vehicles."""
         return torch.where(guided, self.loss(state, view)(motion), 0.0).sum(-1).argmin(0)
 
-    def adversaries(self, state: State, view: View) -> Tensor:
+    def attackers(self, state: State, view: View) -> Tensor:
         """Bool [B, V]: vehicles under adversarial control, all that the prior moves by default."""
         return view.active
 
@@ -148,3 +138,25 @@ class Guided(Rival):
     @abstractmethod
     def guidance(self, loss: Loss, guided: Tensor, strength: Tensor) -> Control:
         """The control of `Prior.sample`; guided [S * B, V] bool, strength [S * B]."""
+
+
+@dataclass(eq=False, repr=False)
+class MeanGuided(Guided):
+    """Guided by `MeanGuidance`, clipped at the strength in standard deviations of a step's noise."""
+
+    step_size: float = setting(low=0)
+    iterations: int = setting(low=1)
+
+    def __post_init__(self) -> None:
+        """Raises InputError for samplers whose steps have no posterior mean and standard deviation."""
+        super().__post_init__()
+        sampler = self.prior.sampler
+        if sampler.sampler == "dpm_solver_pp" or (sampler.sampler == "ddim" and sampler.churn == 0):
+            raise InputError(
+                f"prior.sampler.sampler={sampler.sampler}, churn={sampler.churn}: {type(self).__name__} moves the mean "
+                "of ancestral steps by a share of their noise; use ddim with churn above 0, or euler_maruyama"
+            )
+
+    def guidance(self, loss: Loss, guided: Tensor, strength: Tensor) -> MeanGuidance:
+        """The control of `Prior.sample`."""
+        return MeanGuidance(self.prior, loss, guided, strength, self.samples, self.step_size, self.iterations)

@@ -1,4 +1,4 @@
-"""Rivals that plan a whole horizon once and then drive it whatever happens: DiffScene, CAT, STRIVE."""
+"""Baselines that plan a whole horizon once and then drive it whatever happens: DiffScene, CAT, STRIVE."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
@@ -22,16 +22,15 @@ from e2rl.prior.lane_relative import (
     split,
 )
 from e2rl.prior.prior import Context
-from e2rl.sim.world import World
-from e2rl.traffic.baselines.baseline import Rival, RivalState
-from e2rl.traffic.grouping import Group
+from e2rl.traffic.baselines.baseline import Baseline, BaselineState
+from e2rl.traffic.nominal import Replan
 from e2rl.traffic.traffic import REPLAN_STEPS
 
 EVERY = HORIZON // REPLAN_STEPS  # replans that a plan lasts
 
 
 @dataclass
-class OpenLoopState(RivalState):
+class OpenLoopState(BaselineState):
     """held [B, V] bool: vehicles that drive the plan x [B, V, SIZE] whatever happens; begun [B, V]: lane states where
     it begins."""
 
@@ -49,7 +48,8 @@ class Scenario(NamedTuple):
     path_kl: Tensor
 
 
-class OpenLoop(Rival):
+@dataclass(eq=False, repr=False)
+class OpenLoop(Baseline):
     """A scenario is generated every EVERY replans, as long as a plan lasts; until then it is driven."""
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> OpenLoopState:
@@ -58,18 +58,18 @@ class OpenLoop(Rival):
         x = torch.zeros(*state.adversary.shape, SIZE, device=eta.device)
         return OpenLoopState(**vars(state), held=state.adversary.clone(), x=x, begun=state.lane)
 
-    def attack(
-        self, state: OpenLoopState, world: World, ego_plan: Tensor, noise: Tensor, group: Group, context: Context
-    ) -> tuple[OpenLoopState, Tensor]:
-        """State and joint sample [G, V, SIZE]: a new scenario's where one is due; else nominal, but for those held."""
+    def attack(self, now: Replan, context: Context) -> tuple[OpenLoopState, Tensor]:
+        """Returns state and joint sample [G, V, SIZE]: a new scenario's where one is due; else nominal, but for those
+        held."""
+        state = now.state
         age = state.replans % EVERY
         due = (age == 0) & (self.strength(state) > 0)
-        nominal = self.prior.sample(context, noise[..., 0, :]).x0
+        nominal = self.prior.sample(context, now.noise[..., 0, :]).x0
         rest = later(state.x, state.begun, state.lane, age, context.routed.has_lane)
         x0 = torch.where(state.held[..., None], rest, nominal)
         if not bool(due.any()):
             return state, x0
-        made, rows = self.scenario(state, world, ego_plan, noise, group, context, nominal), due[:, None]
+        made, rows = self.scenario(now, context, nominal), due[:, None]
         state = replace(
             state,
             held=torch.where(rows, made.held, state.held),
@@ -81,16 +81,7 @@ class OpenLoop(Rival):
         return state, torch.where(rows[..., None], made.x, x0)
 
     @abstractmethod
-    def scenario(
-        self,
-        state: OpenLoopState,
-        world: World,
-        ego_plan: Tensor,
-        noise: Tensor,
-        group: Group,
-        context: Context,
-        nominal: Tensor,
-    ) -> Scenario:
+    def scenario(self, now: Replan, context: Context, nominal: Tensor) -> Scenario:
         """The scenario of a group; nominal [G, V, SIZE]: its nominal joint sample."""
 
 

@@ -1,13 +1,14 @@
 """Safe-Sim's adversarial guidance (Chang et al. 2024), given to several adversaries."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from e2rl.prior.lane_relative import LaneState
-from e2rl.prior.prior import Prior
-from e2rl.run.settings import check_range
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
-from e2rl.traffic.baselines.baseline import RivalState
+from e2rl.traffic.baselines.baseline import BaselineState
 from e2rl.traffic.baselines.guidance import CleanGuidance, Guided, Loss
 from e2rl.traffic.baselines.losses import ego_distance, gaussian_overlap, off_route_term, pair_term, ttc_term
 from e2rl.traffic.baselines.view import View
@@ -20,41 +21,30 @@ MAX_COST = 30.0  # m, of the collision term
 CONFLICT_REACH = 100.0  # m within which a conflict counts
 
 
+@configured("synthesizer/safe_sim_opt")
+@dataclass(eq=False, repr=False)
 class SafeSimOpt(Guided):
     """Clean guidance: everybody keeps to its route and clear of others, adversaries also seek the ego. Each vehicle
     takes the sample that suits it best, as in the source."""
 
+    step_size: float = setting(low=0)
+    clip: float = setting(low=0)
+    adversaries: int = setting(low=1)
+    reach: float = setting(low=0)
+    route: float = setting()
+    gaussian: float = setting()
+    ttc: float = setting()
+    collision: float = setting()
+
     guides_everybody = True
+    tuned = {"gain": (0.2, 20.0, "log"), "step_size": (0.2, 20.0, "log")}
 
-    def __init__(
-        self,
-        prior: Prior,
-        knowledge: str = "plan",
-        prediction: str = "prior",
-        responsibility: str = "none",
-        gain: float = 2.0,
-        step_size: float = 4.0,
-        clip: float = 2.0,
-        samples: int = 20,
-        adversaries: int = 3,
-        reach: float = 50.0,
-        route: float = 0.5,
-        gaussian: float = 0.5,
-        ttc: float = 1.0,
-        collision: float = 0.5,
-    ) -> None:
-        """Fields: conf/synthesizer/safe_sim_opt.yaml."""
-        super().__init__(prior, knowledge, prediction, responsibility, gain, samples)
-        check_range("synthesizer.adversaries", adversaries, 1)
-        self.step_size, self.clip, self.count, self.reach = step_size, clip, adversaries, reach
-        self.route, self.gaussian, self.ttc, self.collision = route, gaussian, ttc, collision
-
-    def adversaries(self, state: RivalState, view: View) -> Tensor:
+    def attackers(self, state: BaselineState, view: View) -> Tensor:
         """Those nearest to the ego, within `reach`."""
         distance = view.distance_to_ego()
-        return smallest(distance <= self.reach, distance, self.count)
+        return smallest(distance <= self.reach, distance, self.adversaries)
 
-    def loss(self, state: RivalState, view: View) -> Loss:
+    def loss(self, state: BaselineState, view: View) -> Loss:
         """Route and Gaussian terms of all; collision and TTC terms of adversaries, by the strength."""
         strength, meets = self.strength(state)[:, None] * state.adversary, in_conflict(view)
 
@@ -66,14 +56,14 @@ class SafeSimOpt(Guided):
 
         return value
 
-    def _overlap(self, states: Tensor, view: View, state: RivalState) -> Tensor:
+    def _overlap(self, states: Tensor, view: View, state: BaselineState) -> Tensor:
         """Gaussian collision term [S, B, V] over the first GAUSSIAN_TIME; adversaries may come near the ego."""
         early = states[..., : round(GAUSSIAN_TIME / (STRIDE * DT)), :]
         pursued = state.adversary[:, :, None] & (torch.arange(states.shape[2], device=states.device) == 0)
         weights = early.new_full(early.shape[-2:-1], 1 / early.shape[-2])
         return pair_term(early, view, gaussian_overlap, GAUSSIAN_REACH, weights, pursued)
 
-    def chosen(self, motion: LaneState, state: RivalState, view: View, guided: Tensor) -> Tensor:
+    def chosen(self, motion: LaneState, state: BaselineState, view: View, guided: Tensor) -> Tensor:
         """Sample [B, V] of each vehicle: the least Gaussian term, for adversaries the least collision term."""
         states = view.with_ego(motion)
         calm, near = self._overlap(states, view, state), collision_term(states)

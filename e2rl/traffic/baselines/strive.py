@@ -12,24 +12,24 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import LaneState
 from e2rl.prior.prior import Context, Prior, plan_to_x
-from e2rl.prior.sde import ddim_step
-from e2rl.run.settings import check_range
+from e2rl.prior.sde import DDIM
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import overlap, to_frame
 from e2rl.scenes.recording import DT
-from e2rl.sim.world import World
 from e2rl.traffic.baselines.losses import disk_overlap, ego_distance, off_road_term, pair_term
 from e2rl.traffic.baselines.open_loop import OpenLoop, OpenLoopState, Scenario
 from e2rl.traffic.baselines.view import View, motion_of, of_scenes
 from e2rl.traffic.e2.potentials import SAMPLED_STEPS, STRIDE
-from e2rl.traffic.grouping import Group, take_rows
+from e2rl.traffic.grouping import take_rows
+from e2rl.traffic.nominal import Replan
 
 
 def decode_latent(prior: Prior, latent: Tensor, context: Context, steps: int) -> Tensor:
-    """x0 [B, V, SIZE] of latents [B, V, SIZE], the noise at the highest level, by `steps` passes of the network."""
+    """Returns x0 [B, V, SIZE] of latents [B, V, SIZE], the noise at the highest level, in `steps` evaluations of it."""
     levels, x = prior.schedule.levels(steps, latent.device), latent
     zero = torch.zeros_like(levels[0])
     for high, low in zip(levels[:-2], levels[1:-1], strict=True):
-        x = ddim_step(prior.schedule, x, prior.denoise(x, high, context), high, low, zero, 0.0)[0]
+        x = DDIM(prior.schedule, churn=0.0).step(x, prior.denoise(x, high, context), high, low, zero)[0]
     return prior.denoise(x, levels[-2], context)
 
 
@@ -56,67 +56,49 @@ class Known:
         self.context = replace(self.context, ego_x=plan_to_x(ego, self.context.state, self.context.routed))
 
 
+@configured("synthesizer/strive")
+@dataclass(eq=False, repr=False)
 class Strive(OpenLoop):
     """Latents of all vehicles by Adam, for all scenes of a batch at once; the whole scenario is driven open loop."""
 
-    def __init__(
-        self,
-        prior: Prior,
-        knowledge: str = "plan",
-        prediction: str = "prior",
-        responsibility: str = "none",
-        gain: float = 4.0,
-        step_size: float = 0.2,
-        iterations: int = 50,
-        steps: int = 4,
-        solution: bool = True,
-    ) -> None:
-        """Fields: conf/synthesizer/strive.yaml."""
-        super().__init__(prior, knowledge, prediction, responsibility, gain)
-        check_range("synthesizer.iterations", iterations, 1)
-        check_range("synthesizer.steps", steps, 2)
-        self.step_size, self.iterations, self.steps, self.solution = step_size, iterations, steps, solution
-        self.queries_ego = knowledge == "plan"
+    step_size: float = setting(low=0)
+    iterations: int = setting(low=1)
+    steps: int = setting(low=2)
+    solution: bool = setting()
 
-    def scenario(
-        self,
-        state: OpenLoopState,
-        world: World,
-        ego_plan: Tensor,
-        noise: Tensor,
-        group: Group,
-        context: Context,
-        nominal: Tensor,
-    ) -> Scenario:
+    tuned = {"gain": (0.4, 40.0, "log"), "step_size": (0.02, 1.0, "log")}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.queries_ego = self.knowledge == "plan"
+
+    def scenario(self, now: Replan, context: Context, nominal: Tensor) -> Scenario:
         """The optimised scenario, in which everybody is held; the nominal sample where it has no solution."""
-        first, acts = noise[0, :, :, 0].contiguous(), self.strength(state) > 0
-        x0, view = self.attacked(first, state, world, ego_plan, group, context)
+        first, acts = now.noise[0, :, :, 0].contiguous(), self.strength(now.state) > 0
+        x0, view = self.attacked(first, now, context)
         motion = motion_of(self.prior, x0, context, 1)
         weight = attacker_weight(view.with_ego(motion), view)
         attacker = torch.nn.functional.one_hot(weight.argmax(-1), weight.shape[1]).bool()
-        keeps = acts & (weight.sum(-1) > 0)
+        holds = acts & (weight.sum(-1) > 0)
         if self.solution:
-            keeps = keeps & self.solvable(first, motion, view, context)
-        held, adversary = (rows & keeps[:, None] & context.active for rows in (torch.ones_like(attacker), attacker))
-        return Scenario(
-            torch.where(keeps[:, None, None], x0, nominal), held, adversary, torch.zeros_like(state.path_kl)
-        )
+            holds = holds & self.solvable(first, motion, view, context)
+        held, adversary = (rows & holds[:, None] & context.active for rows in (torch.ones_like(attacker), attacker))
+        x = torch.where(holds[:, None, None], x0, nominal)
+        return Scenario(x, held, adversary, torch.zeros_like(now.state.path_kl))
 
-    def attacked(
-        self, first: Tensor, state: OpenLoopState, world: World, ego_plan: Tensor, group: Group, context: Context
-    ) -> tuple[Tensor, View]:
+    def attacked(self, first: Tensor, now: Replan, context: Context) -> tuple[Tensor, View]:
         """x0 [B, V, SIZE] of optimised latents that begin at `first`, and the View with the ego as it last drove."""
-        known = Known(context, View.of(world, context, ego_plan))
+        known = Known(context, View.of(now.world, context, now.ego_plan))
 
         def decoded(latent: Tensor) -> Tensor:
             x0 = decode_latent(self.prior, latent, known.context, self.steps)
-            if self._react is not None:
-                known.drive(self._react(group.rows, self.prior.decode(x0.detach(), context).states()))
+            if now.react is not None:
+                known.drive(now.react(self.prior.decode(x0.detach(), context).states()))
             return x0
 
         def loss(latent: Tensor) -> Tensor:
             motion = motion_of(self.prior, decoded(latent), known.context, 1)
-            return self.loss(motion, latent, first, state, known.view)
+            return self.loss(motion, latent, first, now.state, known.view)
 
         latent = self.optimised(first, loss)
         with torch.no_grad():
@@ -149,7 +131,7 @@ class Strive(OpenLoop):
         return self.strength(state) * attack + ((calm + energy) * view.active).sum(-1)
 
     def solvable(self, first: Tensor, planned: LaneState, view: View, context: Context) -> Tensor:
-        """Bool [B]: there is a way of the ego that touches nobody of the others' motion [1, B, V, T]: that which it
+        """Bool [B]: the ego has a motion that touches nobody in the others' motion [1, B, V, T]: that which it
         drives already, or one that an optimisation of its own latent finds."""
         others = planned.states()[0]
         solved = ~touched(view.ego[:, None], others, view)
@@ -160,8 +142,8 @@ class Strive(OpenLoop):
         return solved
 
     def evaded(self, first: Tensor, others: Tensor, view: View, context: Context) -> Tensor:
-        """Bool [B]: the ego's own latent, optimised against the others' states [B, V, T, 4], finds a way that touches
-        nobody."""
+        """Bool [B]: the ego's own latent, optimised against the others' states [B, V, T, 4], finds a motion that
+        touches nobody."""
         unknown = replace(context, ego_x=None)
         view = replace(view, active=torch.zeros_like(view.active))
         view.active[:, 0] = True

@@ -1,4 +1,4 @@
-"""What the losses of the rivals see besides a plan: the scene as it is at a replan, and the ego's known motion.
+"""What the losses of the baselines see besides a plan: the scene as it is at a replan, and the ego's known motion.
 
 Several joint samples of the same scenes: S of them along the batch, and back to [S, B, ...].
 """

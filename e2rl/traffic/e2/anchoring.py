@@ -13,7 +13,7 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS, KNOTS, LaneState, lateral_horizon, speeds
 from e2rl.prior.routes import take_route
-from e2rl.run.settings import check_range
+from e2rl.run.settings import check_range, configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING, interpolate, project
 from e2rl.sim.dynamics import wrap
@@ -40,21 +40,23 @@ SWING = 0.2  # peak of the lateral decoder's offset, per unit of slope and later
 BEND_VERTICES = 64  # of a route ahead, whose curvature bounds the speed
 
 
+ACCEL_COST = 0.2  # s of time gap that 1 m/s^2 weighs
+LATERAL_COST = 0.05  # s that 1 m of present offset from the route weighs
+MAX_OFFSET = 1.0  # s of time gap at most; links that cannot meet better have no anchor
+MAX_SHIFT = 4.5  # m of present offset from a route that a vehicle may take instead of its own: a lane change
+MAX_SWING = 1.0  # m that it may swing out while it turns in
+
+
+@configured("synthesizer/e2", "anchor")
 @dataclass(frozen=True)
 class AnchorSettings:
     """Settings of the proposals and of the blend; conf/synthesizer/e2.yaml explains each."""
 
-    strength: float = 1.0
-    min_accel: float = -3.0
-    max_accel: float = 2.0
-    accel_cost: float = 0.2
-    lateral_cost: float = 0.05
-    max_offset: float = 1.0
-    max_shift: float = 4.5
-    max_swing: float = 1.0
+    strength: float = setting(low=0, high=1)
+    min_accel: float = setting()
+    max_accel: float = setting()
 
     def __post_init__(self) -> None:
-        check_range("synthesizer.anchor.strength", self.strength, 0, 1)
         check_range("synthesizer.anchor.max_accel", self.max_accel, self.min_accel + 0.1)
 
 
@@ -117,9 +119,7 @@ def _bend_bound(route: Tensor, s: Tensor) -> Tensor:
     return bound.flip(-1).cummin(-1).values.flip(-1) - 2 * BEND_BRAKING * distance
 
 
-def _candidates(
-    scene: TensorDictBase, world: World, index: Tensor, settings: AnchorSettings, keep_route: bool, halt_at_red: bool
-) -> _Candidates:
+def _candidates(scene: TensorDictBase, world: World, index: Tensor, keep_route: bool, halt_at_red: bool) -> _Candidates:
     """The candidate routes of vehicles index [B, M]; keep_route: only the one that each follows; halt_at_red: up to the
     stop line that binds the vehicle now."""
     vehicles, count = scene["route_points"].shape[1:3]
@@ -130,7 +130,7 @@ def _candidates(
     points, end, valid = (scene[key][at] for key in ("route_points", "route_length", "route_valid"))
     s, d, error = frenet_pose(states, points)
     swing = SWING * error.clamp(-1.0, 1.0).tan().abs() * lateral_horizon(states[..., 3])[..., None]
-    reachable = (d.abs() <= settings.max_shift) & (swing <= settings.max_swing)
+    reachable = (d.abs() <= MAX_SHIFT) & (swing <= MAX_SWING)
     usable = valid & (reachable | (number == route))
     if keep_route:
         usable = usable & (route >= 0)
@@ -197,7 +197,7 @@ def _score(
     time_gap = missing.clamp(min=0) / v.clamp(min=1.0) + lateral * target.crossing_time[..., None, :]
     met = (lateral <= target.corridor[..., None, None, None]) & (ahead <= candidates.end[..., None, None])
     time_gap = time_gap.masked_fill(~met, torch.inf).amin(-1).masked_fill(~candidates.usable[..., None], torch.inf)
-    cost = time_gap + settings.accel_cost * accel.abs() + settings.lateral_cost * candidates.d.abs()[..., None]
+    cost = time_gap + ACCEL_COST * accel.abs() + LATERAL_COST * candidates.d.abs()[..., None]
     return cost, time_gap, knots
 
 
@@ -213,7 +213,7 @@ def _on_lane(
     cost, time_gap, knots = _score(candidates, fine.clamp(low, high), target, settings)
     pick = cost.flatten(2).argmin(-1)
     cost, time_gap, knots = (take_route(value.flatten(2, 3), pick) for value in (cost, time_gap, knots))
-    return pick // FINE, knots, cost.masked_fill(time_gap > settings.max_offset, torch.inf)
+    return pick // FINE, knots, cost.masked_fill(time_gap > MAX_OFFSET, torch.inf)
 
 
 def propose(
@@ -244,7 +244,7 @@ def propose(
     for depth in range(1, int(skeleton.depth.max()) + 1):
         index, present = compact(skeleton.depth == depth)
         target = skeleton.target.gather(1, index).clamp(min=0)
-        candidates = _candidates(scene, world, index, settings, keep_route, halt_at_red)
+        candidates = _candidates(scene, world, index, keep_route, halt_at_red)
         pick, knots, cost = _on_lane(candidates, take(expected, target), take(scene["size"], target), settings)
         cost, off_lane, found = cost.masked_fill(~present, torch.inf), torch.zeros_like(present), None
         if depth == 1 and interception.reach > 0:

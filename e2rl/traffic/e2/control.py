@@ -3,12 +3,12 @@
 Guidance replaces the score s by s - grad V (Dhariwal and Nichol 2021), which moves the clean estimate:
 x0 <- x0 - (sigma^2 / alpha) grad V. To keep eta a usable dial, each vehicle's gradient is scaled by the noise level and
 clipped before eta multiplies it; V_feas has a clip of its own. Only V_adv is pulled back through the network. V_feas
-acts on the clean estimate, and only once that has taken shape (`feasibility_level`): the same outcome at a fraction of
+acts on the clean estimate, and only once that has taken shape (FEASIBILITY_LEVEL): the same outcome at a fraction of
 the cost.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from torch import Tensor
 from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS
 from e2rl.prior.prior import Context, Prior
 from e2rl.prior.sde import NoiseSchedule
-from e2rl.run.settings import check_choice, check_range
+from e2rl.run.settings import configured, setting
 from e2rl.traffic.e2.anchoring import Anchor
 from e2rl.traffic.e2.potentials import (
     SAMPLED_STEPS,
@@ -29,29 +29,22 @@ from e2rl.traffic.e2.potentials import (
 
 MIN_ALPHA = 0.05
 TINY = 1e-12  # keeps a clip of 0, which is no shift at all, from 0 / 0
-CHOICES = {"gradient": ("denoiser", "clean"), "scaling": ("score", "sigma"), "anchoring": ("clean", "literal", "off")}
+FEASIBILITY_LEVEL = 0.5  # V_feas acts at and below this noise level; above it the clean estimate has no shape yet
 
 
+@configured("synthesizer/e2", "control")
 @dataclass(frozen=True)
 class ControlSettings:
     """Settings of the guided reverse SDE; conf/synthesizer/e2.yaml explains each."""
 
-    gradient: str = "denoiser"
-    scaling: str = "sigma"
-    adversarial_clip: float = 0.0
-    feasibility: float = 4.0
-    feasibility_clip: float = 1.0
-    feasibility_level: float = 0.5
-    anchoring: str = "clean"
-    anchor_level: float = 0.2
-    lookahead: int = 0
-    transport_budget: float | None = None
-
-    def __post_init__(self) -> None:
-        for name, choices in CHOICES.items():
-            check_choice(f"synthesizer.control.{name}", getattr(self, name), choices)
-        if self.transport_budget is not None:
-            check_range("synthesizer.control.transport_budget", self.transport_budget, 0)
+    gradient: str = setting(choices=("denoiser", "clean"))
+    scaling: str = setting(choices=("score", "sigma"))
+    adversarial_clip: float = setting(low=0)
+    feasibility: float = setting()
+    feasibility_clip: float = setting(low=0)
+    anchoring: str = setting(choices=("clean", "literal", "off"))
+    anchor_level: float = setting(low=0, high=1)
+    transport_budget: float | None = setting(low=0, optional=True)
 
 
 def clip_rows(gradient: Tensor, limit: float) -> Tensor:
@@ -70,10 +63,8 @@ class SparseControl:
     """The control of one replan of B scenes; called by `Prior.sample` at every noise level.
 
     conditions: what the potentials see; coalition [B, V] bool: C*; eta [B]: intensity; anchor: the skeleton's proposal,
-    blended in with `strength`; anchor_noise [B, V, SIZE]: for the literal blend; ego_response: from planned states
-    [B, V, HORIZON, 4] to the ego's states [B, HORIZON, 4] against them, asked at settings.lookahead of the noise levels
-    (None: the ego's plan stays what it is). After sampling, `jump` [B, V] is the energy of the anchor's shift,
-    ||shift||^2 / (2 sigma^2).
+    blended in with `strength`; anchor_noise [B, V, SIZE]: for the literal blend. After sampling, `jump` [B, V] is the
+    energy of the anchor's shift, ||shift||^2 / (2 sigma^2).
     """
 
     prior: Prior
@@ -85,15 +76,12 @@ class SparseControl:
     anchor: Anchor
     strength: float
     anchor_noise: Tensor
-    ego_response: Callable[[Tensor], Tensor] | None = None
 
     def __post_init__(self) -> None:
         steps = self.prior.sampler.steps
-        asked = self.settings.lookahead if self.ego_response is not None else 0
-        self.response_steps = {round(steps * i / (asked + 1)) for i in range(1, asked + 1)}
         levels = self.prior.schedule.levels(steps)[:-1]
         self.anchor_step = steps - int((levels - self.settings.anchor_level).abs().argmin())
-        self.feasibility_step = int((levels <= self.settings.feasibility_level).sum())
+        self.feasibility_step = int((levels <= FEASIBILITY_LEVEL).sum())
         self.jump = torch.zeros(self.coalition.shape, device=self.eta.device)
         # Asked once, on the host: without a coalition V_adv is 0, and with a clip of 0 it has no effect.
         self.has_coalition = self.settings.adversarial_clip > 0 and bool(self.coalition.any())
@@ -126,9 +114,6 @@ class SparseControl:
             x0 = denoised.detach().requires_grad_(True)
             if not self.has_coalition and not with_feasibility:
                 return x0.detach(), adversarial, feasibility
-            if k in self.response_steps and self.has_coalition and self.ego_response is not None:
-                planned = self.prior.decode(x0.detach(), context).states()
-                self.conditions = replace(self.conditions, ego_plan=self.ego_response(planned))
             states = self.prior.decode(x0, context, steps=SAMPLED_STEPS).states()
             if self.has_coalition:
                 temperature = annealed_temperature(level, self.potentials)

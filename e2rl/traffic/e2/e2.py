@@ -4,20 +4,17 @@ When a coalition is due: reference rollout, topology, feasibility, skeleton. At 
 sample under sparse control. With eta = 0 nothing is controlled, and the traffic is the prior's, bit for bit.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.prior.lane_relative import HORIZON, KNOTS, SIZE, locate, select
-from e2rl.prior.prior import Context, Prior
+from e2rl.prior.prior import Context
 from e2rl.prior.routes import reroute
-from e2rl.run.errors import InputError
-from e2rl.run.settings import check_choice, settings_of
+from e2rl.run.settings import configured, setting, settings_of
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 from e2rl.traffic.e2.anchoring import Anchor, AnchorSettings, propose
@@ -26,8 +23,9 @@ from e2rl.traffic.e2.feasibility import FeasibilitySettings
 from e2rl.traffic.e2.interception import InterceptionSettings
 from e2rl.traffic.e2.potentials import PotentialContext, PotentialSettings
 from e2rl.traffic.e2.reasoner import ReasonerSettings, build_reasoner
-from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, CareSettings, duty_of, leading, place_of
+from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, YieldingSettings, duty_of, leading, place_of
 from e2rl.traffic.e2.skeleton import (
+    STEP,
     Selection,
     Skeleton,
     SkeletonSettings,
@@ -37,24 +35,12 @@ from e2rl.traffic.e2.skeleton import (
     limits_of,
 )
 from e2rl.traffic.e2.topology import TopologySettings, topological_candidates
-from e2rl.traffic.grouping import Group, noise_of, put_rows, take_rows
-from e2rl.traffic.nominal import NominalTraffic, PriorState
+from e2rl.traffic.grouping import no_vehicles, noise_of, put_rows, take_rows
+from e2rl.traffic.nominal import NominalTraffic, PriorState, React, Replan
 from e2rl.traffic.traffic import FULL, TrafficPlan
 
 LITERAL, SUPPORT = 500, 750  # numbers of draws: the literal blend's noise, a random support's
 SUPPORTS = ("feasible", "topology", "random")
-PARTS: dict[str, type] = {
-    "topology": TopologySettings,
-    "feasibility": FeasibilitySettings,
-    "reasoner": ReasonerSettings,
-    "skeleton": SkeletonSettings,
-    "anchor": AnchorSettings,
-    "interception": InterceptionSettings,
-    "care": CareSettings,
-    "potentials": PotentialSettings,
-    "control": ControlSettings,
-}
-Answer = Callable[[Tensor, Tensor], Tensor]  # Traffic.replan's `react`
 
 
 @dataclass
@@ -67,9 +53,9 @@ class E2State(PriorState):
     KL of the control and energy of anchoring since the start.
     """
 
-    eta: Tensor
-    near: Tensor
-    far: Tensor
+    eta: Tensor = no_vehicles()
+    near: Tensor = no_vehicles()
+    far: Tensor = no_vehicles()
     coalition: Tensor
     target: Tensor
     off_lane: Tensor
@@ -79,60 +65,51 @@ class E2State(PriorState):
     anchor_jump: Tensor
 
 
+@configured("synthesizer/e2")
+@dataclass(eq=False, repr=False)
 class E2(NominalTraffic):
-    """The guided reverse SDE with a sparse coalition, on a frozen prior."""
+    """The guided reverse SDE with a sparse coalition, on a frozen prior. Settings: conf/synthesizer/e2.yaml.
+
+    support: whom the coalition is chosen from: feasible (S = S_top and F), topology (S_top alone) or random (as many as
+    there are near agents), the ablations of table 2. The groups of settings may be given as mappings.
+    """
+
+    responsibility: str = setting(choices=RESPONSIBILITIES)
+    support: str = setting(choices=SUPPORTS)
+    reselect: int = setting(low=0)
+    topology: TopologySettings
+    feasibility: FeasibilitySettings
+    reasoner: ReasonerSettings
+    skeleton: SkeletonSettings
+    anchor: AnchorSettings
+    interception: InterceptionSettings
+    yielding: YieldingSettings
+    potentials: PotentialSettings
+    control: ControlSettings
 
     adversarial = True
     follows_template = True
-    figures = ("anchor_jump",)
 
-    def __init__(
-        self,
-        prior: Prior,
-        knowledge: str = "predicted",
-        prediction: str = "prior",
-        responsibility: str = "full",
-        support: str = "feasible",
-        reselect: int = 2,
-        **parts: Mapping,
-    ) -> None:
-        """knowledge, prediction: see NominalTraffic; responsibility: of RESPONSIBILITIES; support: whom the coalition
-        is chosen from: feasible (S = S_top and F), topology (S_top alone) or random (as many as there are near agents),
-        the ablations of table 2; reselect: replans after which a coalition that can no longer meet its targets is
-        chosen anew, 0: never; parts: settings of PARTS (conf/synthesizer/e2.yaml).
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for part in fields(self):
+            given = getattr(self, part.name)
+            if isinstance(given, Mapping):
+                setattr(self, part.name, settings_of(part.type, given, f"synthesizer.{part.name}"))
+        self.feasible_vehicles = build_reasoner(self.reasoner)
 
-        Raises InputError for settings that do not fit.
-        """
-        super().__init__(prior, knowledge, prediction)
-        check_choice("synthesizer.support", support, SUPPORTS)
-        check_choice("synthesizer.responsibility", responsibility, RESPONSIBILITIES)
-        unknown = sorted(set(parts) - set(PARTS))
-        if unknown:
-            raise InputError(f"synthesizer.{unknown[0]}: no setting of e2; compare conf/synthesizer/e2.yaml")
-        settings: dict[str, Any] = {
-            name: settings_of(part, parts.get(name, {}), f"synthesizer.{name}") for name, part in PARTS.items()
-        }
-        self.topology: TopologySettings = settings["topology"]
-        self.feasibility: FeasibilitySettings = settings["feasibility"]
-        self.skeleton: SkeletonSettings = settings["skeleton"]
-        self.anchor: AnchorSettings = settings["anchor"]
-        self.interception: InterceptionSettings = settings["interception"]
-        self.care: CareSettings = settings["care"]
-        self.potentials: PotentialSettings = settings["potentials"]
-        self.control: ControlSettings = settings["control"]
-        self.responsibility, self.support, self.reselect, self.settings = responsibility, support, reselect, settings
-        self.statistics: dict[str, float] = {}  # of the language-model reasoner
-        self.feasible_vehicles = build_reasoner(settings["reasoner"], self.statistics)
-        self.queries_ego = self.control.lookahead > 0
-        if self.queries_ego and knowledge != "plan":
-            raise InputError(
-                f"synthesizer.control.lookahead={self.control.lookahead}: it asks the ego's own policy, which a black "
-                "box does not answer; set synthesizer.knowledge=plan, or lookahead 0"
-            )
-        self._react: Answer | None = None
+    @property
+    def tuned(self) -> Mapping[str, tuple]:  # type: ignore[override]
+        """e2 has no gain: eta multiplies the limits of its interceptions. Where V_adv acts, its clip is the gain."""
+        lateral, clip = {"interception.lateral": (0.5, 4.0, "log")}, {"control.adversarial_clip": (0.05, 4.0, "log")}
+        if self.skeleton.pursuit:
+            return clip | {"potentials.distance": (1.0, 40.0, "log")}
+        if self.control.adversarial_clip > 0:
+            return clip | lateral
+        return lateral | {"interception.push": (0.5, 3.0, "log")}
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor, template: Tensor | None = None) -> E2State:
-        """States of scenes [B] with routes drawn from the prior and nobody under control; template [B]: causal
+        """Returns states of scenes [B] with routes drawn from the prior and nobody under control; template [B]: causal
         templates that limit the coalitions, None: full for all."""
         near, far = limits_of(torch.full_like(seed, FULL) if template is None else template, self.skeleton)
         nominal = super().reset(scenes, seed, eta)
@@ -152,31 +129,26 @@ class E2(NominalTraffic):
         )
 
     def replan(
-        self, state: E2State, world: World, ego_plan: Tensor, react: Answer | None = None
+        self, state: E2State, world: World, ego_plan: Tensor, react: React | None = None
     ) -> tuple[E2State, TrafficPlan]:
-        """States and plans of the coming HORIZON steps; react: see Traffic.queries_ego."""
-        self._react = react
-        state, plan = super().replan(state, world, ego_plan)
-        figures = {"anchor_jump": state.anchor_jump}
-        found = {"adversary": state.coalition, "target": state.target, "path_kl": state.path_kl}
-        return state, replace(plan, **found, figures=figures)
+        """Returns states and plans of the coming HORIZON steps."""
+        state, plan = super().replan(state, world, ego_plan, react)
+        costs = {"path_kl": state.path_kl, "anchor_jump": state.anchor_jump}
+        return state, replace(plan, adversary=state.coalition, target=state.target, **costs)
 
-    def replan_group(
-        self, state: E2State, world: World, ego_plan: Tensor, noise: Tensor, group: Group
-    ) -> tuple[E2State, Tensor, Context]:
-        """State, guided joint sample x0 [G, V, SIZE] and context of a group."""
-        state = replace(state, lane=self.lane_now(state, world, ego_plan))
+    def replan_group(self, now: Replan) -> tuple[E2State, Tensor, Context]:
+        """Returns state, guided joint sample x0 [G, V, SIZE] and context of a group."""
+        state, ego_plan = now.state, now.ego_plan
         if not bool((state.eta > 0).any()):
-            context = self.encode(state, world, ego_plan)
-            return state, self.prior.sample(context, noise).x0, context
-        world = replace(world, route=state.routed.route)
+            return super().replan_group(now)
+        world = replace(now.world, route=state.routed.route)
         state, anchor = self._reselected(state, world, ego_plan)
         off_lane = anchor.off_lane & state.coalition & (state.eta > 0)[:, None]
         state = self._onto(state, world, state.routed.route, off_lane, anchor.off_lane_path)
         context = self.encode(state, world, ego_plan)
-        context.obstacles.duty = duty_of(self.responsibility, self.care, world, state.coalition, state.eta)
-        control = self._control(state, self._potential_context(state, world, ego_plan), anchor, group)
-        sample = self.prior.sample(context, noise, control, self._budget(state))
+        context.obstacles.duty = duty_of(self.responsibility, self.yielding, world, state.coalition, state.eta)
+        control = self._control(state, world, ego_plan, anchor)
+        sample = self.prior.sample(context, now.noise, control, self._budget(state))
         kl, jump = state.path_kl + sample.kl, state.anchor_jump + control.jump
         acts = anchor.feasible & state.coalition
         state = replace(state, path_kl=kl, anchor_jump=jump, committed=acts, knots=anchor.knots)
@@ -207,14 +179,13 @@ class E2(NominalTraffic):
         depth = chain_depth(state.target)
         if self.responsibility == "full":
             depth = depth.masked_fill(leading(world, depth.shape[1]), 0)
-        count = state.replans  # chains and source of a skeleton, which proposals do not read
-        skeleton = Skeleton(state.coalition, state.target, depth, depth == 1, depth > 1, count, count)
+        skeleton = Skeleton(state.coalition, state.target, depth, depth == 1, depth > 1)
         anchor = self._propose(skeleton, state, world, ego_plan, keep_route=True)
         return self._held(anchor, state, world) if self.responsibility == "full" else anchor
 
     def _held(self, anchor: Anchor, state: E2State, world: World) -> Anchor:
         """The anchor in which members that can no longer meet the ego go on with their last proposal while they are
-        ahead of it: they have come into its way by then."""
+        ahead of it: they have come into its path by then."""
         ahead = place_of(world, state.coalition.shape[1])[0][..., 0] > 0
         hold = state.coalition & ~anchor.feasible & state.committed & ahead
         later = torch.cat([state.knots[..., 1:], state.knots[..., -1:]], -1)
@@ -243,7 +214,7 @@ class E2(NominalTraffic):
         valid = world.valid[:, None, :vehicles] & nominal.on_map.transpose(1, 2)
         found = topological_candidates(reference, valid, scene["size"][:, :vehicles], self.topology)
         feasible = self.feasible_vehicles(scene, world, self.feasibility).mask
-        steps = round(self.skeleton.step / DT)
+        steps = round(STEP / DT)
         expected = reference[:, steps - 1 :: steps].transpose(1, 2)
         support, fallback = self._support(state, world, found.candidates, feasible)
         if self.responsibility == "full":  # planners know how to follow: leaders that brake hard find next to nothing
@@ -261,11 +232,12 @@ class E2(NominalTraffic):
         for _ in range(self.skeleton.max_chain - 1):
             acts = acts & ((skeleton.target <= 0) | acts.gather(1, skeleton.target.clamp(min=0)))
         state = replace(state, coalition=acts, target=torch.where(acts, skeleton.target, -1))
-        if self.on_selection:
+        if self.on_decision:
             moments = (DT * (found.steps + 1)).expand(len(reference), -1)
             chosen = (found.candidates, feasible, state.coalition, state.target)
             at = reference[:, found.steps]
-            self.on_selection(Selection(state.seed, world.step, at, moments, found.weights, *chosen))
+            selection = Selection(state.seed, world.step, at, moments, found.weights, *chosen, self.topology)
+            self.on_decision(selection)
         return self._onto(
             state, world, torch.where(acts, anchor.route, state.routed.route), acts & False, anchor.off_lane_path
         )
@@ -287,28 +259,15 @@ class E2(NominalTraffic):
         changed = (route != state.routed.route) | off_lane | state.off_lane
         if not bool(changed.any()):
             return state
-        routed = reroute(state.routed, world.scene, route, changed, off_lane, paths, self.prior.free_space)
+        routed = reroute(state.routed, world.scene, route, changed, off_lane, paths)
         old = state.lane
         moved = locate(world.states[:, : route.shape[1]], old.a, old.kappa * old.v, routed.points)
         return replace(state, routed=routed, lane=select(changed, moved, old), off_lane=off_lane)
 
-    def _potential_context(self, state: E2State, world: World, ego_plan: Tensor) -> PotentialContext:
+    def _control(self, state: E2State, world: World, ego_plan: Tensor, anchor: Anchor) -> SparseControl:
         vehicles, routed = state.routed.route.shape[1], state.routed
         now = world.states[:, :vehicles], state.lane.a, world.valid[:, :vehicles]
-        return PotentialContext(world.scene, *now, routed.points, routed.has_lane, ego_plan[:, :HORIZON], state.target)
-
-    def _control(self, state: E2State, context: PotentialContext, anchor: Anchor, group: Group) -> SparseControl:
+        seen = PotentialContext(world.scene, *now, routed.points, routed.has_lane, ego_plan[:, :HORIZON], state.target)
         literal = noise_of(state.seed, LITERAL + state.replans, (*state.target.shape[1:], SIZE))
-        react = None if self._react is None else partial(self._react, group.rows)
-        return SparseControl(
-            self.prior,
-            self.control,
-            self.potentials,
-            context,
-            state.coalition,
-            state.eta,
-            anchor,
-            self.anchor.strength,
-            literal,
-            react,
-        )
+        given = self.prior, self.control, self.potentials, seen, state.coalition, state.eta
+        return SparseControl(*given, anchor, self.anchor.strength, literal)

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.run.settings import check_range
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.route import interpolate, project
 from e2rl.sim.mission import mission_of
@@ -18,24 +18,20 @@ EGO_ACCELERATION = 2.0  # m/s^2 that the ego is expected to use at most
 SAMPLE_SPACING = 3.0  # m between the points of two routes that are compared
 SAMPLE_REACH = 120.0  # m of route ahead that is sampled
 SEPARATION_COST = 10.0  # s of time gap that 1 m between the routes weighs: they meet where they touch, if they touch
+LATERAL_BOUND = 2.0  # m from a lane's centreline that still counts as on the lane
+HEADING_BOUND = 0.8  # rad, the same for the heading
+MOVING_SPEED = 0.5  # m/s above which a vehicle counts as moving
+BLOCKING_DISTANCE = 15.0  # m ahead of the ego, bumper to bumper, within which a standing vehicle blocks it
 BLOCKING_MARGIN = 0.3  # m beside the ego's own width in which a standing vehicle still blocks it
 
 
+@configured("synthesizer/e2", "feasibility")
 @dataclass(frozen=True)
 class FeasibilitySettings:
     """Thresholds of the three criteria; conf/synthesizer/e2.yaml explains each."""
 
-    horizon: float = 5.0
-    lateral_bound: float = 2.0
-    heading_bound: float = 0.8
-    corridor: float = 6.0
-    moving_speed: float = 0.5
-    blocking_distance: float = 15.0
-
-    def __post_init__(self) -> None:
-        check_range("synthesizer.feasibility.horizon", self.horizon, 0.1)
-        # In a narrower corridor a crossing could fall between the samples of the two routes.
-        check_range("synthesizer.feasibility.corridor", self.corridor, 0.8 * SAMPLE_SPACING)
+    horizon: float = setting(low=0.1)
+    corridor: float = setting(low=0.8 * SAMPLE_SPACING)  # in a narrower one a crossing could fall between the samples
 
 
 @dataclass(frozen=True)
@@ -124,7 +120,7 @@ def _to_intersection(points: Tensor, heading: Tensor, ego: Tensor, ego_heading: 
 
 
 def find_conflicts(scene: TensorDictBase, world: World, own_s: Tensor, settings: FeasibilitySettings) -> Conflicts:
-    """The conflict points of scenes [B]; own_s [B, V, R]: arc length of each vehicle on each of its candidates."""
+    """Returns the conflict points of scenes [B]; own_s [B, V, R]: arc length of vehicles on their candidates."""
     vehicles = own_s.shape[1]
     states, length, mission = world.states[:, :vehicles], scene["size"][..., 0], mission_of(scene)
     asked = scene["route_valid"] & world.valid[:, :vehicles, None]
@@ -148,19 +144,19 @@ def find_conflicts(scene: TensorDictBase, world: World, own_s: Tensor, settings:
     return Conflicts(exists, *(table(value) for value in (conflict_s, earliest, latest, time_gap)))
 
 
-def blocks_ego(scene: TensorDictBase, world: World, settings: FeasibilitySettings) -> Tensor:
-    """Bool [B, V]: on the ego's mission route, at most blocking_distance m (bumper to bumper) ahead of it."""
+def blocks_ego(scene: TensorDictBase, world: World) -> Tensor:
+    """Returns bool [B, V]: on the ego's mission route, at most BLOCKING_DISTANCE m (bumper to bumper) ahead of it."""
     mission = mission_of(scene)
     vehicles = scene["route_points"].shape[1]
     size = scene["size"][:, :vehicles]
     s, d, _ = project(world.states[:, :vehicles, :2], mission.points)
     gap = s - s[:, :1] - (size[..., 0] + size[:, :1, 0]) / 2
     in_the_way = d.abs() <= (size[..., 1] + size[:, :1, 1]) / 2 + BLOCKING_MARGIN
-    return (s > s[:, :1]) & (gap <= settings.blocking_distance) & in_the_way
+    return (s > s[:, :1]) & (gap <= BLOCKING_DISTANCE) & in_the_way
 
 
 def feasible_vehicles(scene: TensorDictBase, world: World, settings: FeasibilitySettings) -> Feasibility:
-    """The feasible set F of scenes [B] by the three criteria of Sec. IV-A2.
+    """Returns the feasible set F of scenes [B] by the three criteria of Sec. IV-A2.
 
     associated: on the drivable area, near and along one of its candidate routes; conflicting: a candidate has a
     conflict point with the ego's mission; relevant: moving, or standing in the ego's way, and not parked.
@@ -168,12 +164,12 @@ def feasible_vehicles(scene: TensorDictBase, world: World, settings: Feasibility
     vehicles = scene["route_points"].shape[1]
     states = world.states[:, :vehicles].detach()
     s, d, error = frenet_pose(states, scene["route_points"])
-    on_lane = (d.abs() <= settings.lateral_bound) & (error.abs() <= settings.heading_bound) & scene["route_valid"]
+    on_lane = (d.abs() <= LATERAL_BOUND) & (error.abs() <= HEADING_BOUND) & scene["route_valid"]
     associated = on_lane.any(-1) & (off_road(states[..., :2], scene["field"], scene["field_origin"]) <= 0)
     conflicts = find_conflicts(scene, world, s, settings)
     conflicting = conflicts.exists.any(-1)
-    moving = states[..., 3] > settings.moving_speed
-    relevant = (moving | blocks_ego(scene, world, settings)) & ~scene["parked"][:, :vehicles]
+    moving = states[..., 3] > MOVING_SPEED
+    relevant = (moving | blocks_ego(scene, world)) & ~scene["parked"][:, :vehicles]
     mask = world.valid[:, :vehicles] & associated & conflicting & relevant
     mask[:, 0] = False
     return Feasibility(mask, associated, conflicting, relevant, conflicts)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS
 from e2rl.prior.routes import take_route
-from e2rl.run.settings import check_range
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import overlap
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.lane_graph import against_lanes
@@ -33,25 +33,22 @@ MAX_CURVATURE = 0.12  # 1/m, what a car's steering allows
 CLEARANCE = 0.3  # m kept to others on the path
 
 
+SHOULDER = 0.5  # m that its centre may leave the drivable area by
+ACCEL_COST, LATERAL_COST = 0.2, 0.2  # s that 1 m/s^2 of acceleration, and of lateral acceleration, weighs
+TIME_COST = 0.1  # s that 1 s until the meeting weighs
+
+
+@configured("synthesizer/e2", "interception")
 @dataclass(frozen=True)
 class InterceptionSettings:
-    """Limits per unit of intensity, and costs; conf/synthesizer/e2.yaml explains each."""
+    """Limits per unit of intensity; conf/synthesizer/e2.yaml explains each."""
 
-    reach: float = 5.0
-    push: float = 1.5
-    brake: float = 1.2
-    lateral: float = 2.0
-    shoulder: float = 0.5
-    accel_cost: float = 0.2
-    lateral_cost: float = 0.2
-    time_cost: float = 0.1
-    preference: float = 2.0
-    wrong_way: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("push", "brake", "lateral", "wrong_way"):
-            check_range(f"synthesizer.interception.{name}", getattr(self, name), 0)
-        check_range("synthesizer.interception.reach", self.reach, 0, HORIZON * DT)
+    reach: float = setting(low=0, high=HORIZON * DT)
+    push: float = setting(low=0)
+    brake: float = setting(low=0)
+    lateral: float = setting(low=0)
+    wrong_way: float = setting(low=0)
+    preference: float = setting()
 
 
 class Interception(NamedTuple):
@@ -129,10 +126,10 @@ def _within(
     return ok & (paths.bearing.abs() < MAX_BEARING) & (paths.turn.abs() < MAX_TURN)
 
 
-def _on_road(settings: InterceptionSettings, paths: _Paths, states: Tensor, scene: TensorDictBase) -> Tensor:
+def _on_road(paths: _Paths, states: Tensor, scene: TensorDictBase) -> Tensor:
     """Bool [B, M, O]: paths from states [B, M, 4] leave the drivable area by no more than the shoulder, or than now."""
     field, origin = scene["field"], scene["field_origin"]
-    allowed = off_road(states[..., :2], field, origin).clamp(min=settings.shoulder)[..., None]
+    allowed = off_road(states[..., :2], field, origin).clamp(min=SHOULDER)[..., None]
     return off_road(paths.points, field, origin).amax(-1) <= allowed
 
 
@@ -178,7 +175,7 @@ def intercept(
     length = paths.length[..., -1] - 0.4 * (size[..., 0] + target_size[..., 0])[..., None] * alike
     accel = 2 * (length.clamp(min=0) - v * time) / time**2
     ok = _within(settings, paths, v, accel, time, eta[:, None, None])
-    ok &= _on_road(settings, paths, states, scene)
+    ok &= _on_road(paths, states, scene)
     if halt_at_red:
         assert world.route is not None
         ok &= paths.length[..., -1] <= way_to_stop_line(world, index, take(world.route, index)[..., None].clamp(min=0))
@@ -187,8 +184,8 @@ def intercept(
     row = torch.arange(vehicles, device=index.device)
     counts = world.valid[:, None, :vehicles] & (row != index[..., None]) & (row != target[..., None])
     ok &= _clear(paths, travelled, size, (expected[:, :, steps - 1], scene["size"][:, :vehicles], counts))
-    cost = settings.accel_cost * accel.abs() + settings.lateral_cost * _lateral(paths, v, accel)[0]
-    cost = cost + settings.time_cost * time
+    cost = ACCEL_COST * accel.abs() + LATERAL_COST * _lateral(paths, v, accel)[0]
+    cost = cost + TIME_COST * time
     if settings.wrong_way > 0:
         against = _against_lanes(scene, meeting, paths.end_heading)
         cost = torch.where(against, cost + settings.wrong_way, cost)

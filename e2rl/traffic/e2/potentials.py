@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.run.settings import check_range
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import to_frame
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT
@@ -31,34 +31,30 @@ NEAR = 5.0  # m: pairs that stay farther apart cost nothing
 MAX_EXCESS = 5.0  # m: excesses of offset and of distance off the road are cut there
 
 
+OFF_ROAD_MARGIN = 0.3  # m inside the border of the drivable area where its term begins
+LATERAL_BOUND = 1.0  # m of offset that cost nothing
+PAIR_MARGIN = 0.3  # m of gap that is wanted
+MIN_ACCEL, MAX_ACCEL, MAX_LATERAL_ACCEL = -3.5, 2.0, 4.0  # m/s^2: what is beyond them costs
+MAX_JERK = 2.0  # m/s^3
+TTC_TIME, TTC_MISS = 1.0, 1.0  # s, m: scales of the time to the closest approach, and of the distance there
+
+
+@configured("synthesizer/e2", "potentials")
 @dataclass(frozen=True)
 class PotentialSettings:
-    """Weights and shapes of the terms; conf/synthesizer/e2.yaml explains each."""
+    """Weights of the terms, and temperatures [m]; conf/synthesizer/e2.yaml explains each."""
 
-    off_road: float = 1.0
-    off_road_margin: float = 0.3
-    lateral: float = 0.1
-    lateral_bound: float = 1.0
-    pair: float = 1.0
-    pair_margin: float = 0.3
-    accel: float = 0.5
-    min_accel: float = -3.5
-    max_accel: float = 2.0
-    max_lateral_accel: float = 4.0
-    jerk: float = 1.0
-    max_jerk: float = 2.0
-    wrong_way: float = 0.1
-    distance: float = 1.0
-    narrow: float = 0.5
-    wide: float = 3.0
-    ttc: float = 0.5
-    ttc_time: float = 1.0
-    ttc_miss: float = 1.0
-    impact_speed: float = 0.1
-
-    def __post_init__(self) -> None:
-        for name in ("narrow", "wide", "ttc_time", "ttc_miss"):
-            check_range(f"synthesizer.potentials.{name}", getattr(self, name), 1e-3)
+    off_road: float = setting()
+    lateral: float = setting()
+    pair: float = setting()
+    accel: float = setting()
+    jerk: float = setting()
+    wrong_way: float = setting()
+    distance: float = setting()
+    narrow: float = setting(low=1e-3)
+    wide: float = setting(low=1e-3)
+    ttc: float = setting()
+    impact_speed: float = setting()
 
 
 @dataclass(frozen=True)
@@ -92,7 +88,7 @@ class PotentialContext:
 
 
 def annealed_temperature(noise_level: Tensor | float, settings: PotentialSettings) -> Tensor:
-    """Soft-min temperature [m] at a noise level in [0, 1]: geometric from `narrow` at 0 to `wide` at 1.
+    """Returns the soft-min temperature [m] at a noise level in [0, 1]: geometric from `narrow` at 0 to `wide` at 1.
 
     A wide soft-min is felt by adversaries that are still far away; a narrow one picks the moment of contact.
     """
@@ -110,7 +106,8 @@ def _velocity(states: Tensor) -> Tensor:
 
 
 def box_gap(states: Tensor, size: Tensor, other: Tensor, other_size: Tensor, disks: int = DISKS) -> Tensor:
-    """Signed gap [...] [m] between a vehicle as `disks` disks and another as an oriented box; < 0 where they overlap.
+    """Returns the signed gap [...] m between a vehicle as `disks` disks and another as an oriented box, < 0 where they
+    overlap.
 
     states, other [..., 4], sizes [..., 2], leading dims broadcast. The disks are as wide as the vehicle and lie along
     its centreline from bumper to bumper; the gap is that of the nearest one.
@@ -137,7 +134,7 @@ def _neighbours(states: Tensor, context: PotentialContext, size: Tensor) -> tupl
     return index, gap < NEAR
 
 
-def _overlap_term(states: Tensor, context: PotentialContext, settings: PotentialSettings) -> Tensor:
+def _overlap_term(states: Tensor, context: PotentialContext) -> Tensor:
     """Squared shortfall of the gap to each neighbour [m^2], mean over steps, summed over neighbours [B, V].
 
     The gap that is asked for is at most the present one.
@@ -148,7 +145,7 @@ def _overlap_term(states: Tensor, context: PotentialContext, settings: Potential
     mine, them = (scene, own), (scene, index[scene, own, rank])
     gap = box_gap(states[mine], size[mine][:, None], states.detach()[them], size[them][:, None])
     present = box_gap(context.start[mine], size[mine], context.start[them], size[them])
-    missing = (present.clamp(max=settings.pair_margin)[:, None] - gap).clamp(min=0).square().mean(-1)
+    missing = (present.clamp(max=PAIR_MARGIN)[:, None] - gap).clamp(min=0).square().mean(-1)
     return torch.zeros_like(states[..., 0, 0]).index_put(mine, missing, accumulate=True)
 
 
@@ -156,7 +153,7 @@ def _road_terms(states: Tensor, context: PotentialContext, settings: PotentialSe
     """Weighted off-road, lateral and wrong-way terms [B, V]; what is no worse than at present costs nothing."""
     scene = context.scene
     beyond = off_road(states[..., :2], scene["field"], scene["field_origin"])
-    allowed = context.start_off_road.clamp(min=-settings.off_road_margin)[..., None]
+    allowed = context.start_off_road.clamp(min=-OFF_ROAD_MARGIN)[..., None]
     off_road_term = (beyond - allowed).clamp(0, MAX_EXCESS).square().mean(-1)
     s, d = context.start_frenet
     with torch.no_grad():
@@ -166,7 +163,7 @@ def _road_terms(states: Tensor, context: PotentialContext, settings: PotentialSe
     cos, sin = heading.cos(), heading.sin()
     delta = states[..., :2] - xy
     offset = (cos * delta[..., 1] - sin * delta[..., 0]).abs()
-    bound = d[..., None].abs().clamp(min=settings.lateral_bound)
+    bound = d[..., None].abs().clamp(min=LATERAL_BOUND)
     lateral_term = (offset - bound).clamp(0, MAX_EXCESS).square().mean(-1)
     wrong_way_term = ((-(states[..., 2] - heading).cos()).clamp(min=0) * states[..., 3]).mean(-1)
     on_route = settings.lateral * lateral_term + settings.wrong_way * wrong_way_term
@@ -180,10 +177,10 @@ def _motion_terms(states: Tensor, context: PotentialContext, settings: Potential
     accel = torch.diff(track[..., 3], dim=-1) / step
     yaw_rate = wrap(torch.diff(track[..., 2], dim=-1)) / step
     lateral = yaw_rate.abs() * track[..., 1:, 3]
-    excess = (accel - settings.max_accel).clamp(min=0).square() + (settings.min_accel - accel).clamp(min=0).square()
-    excess = excess + (lateral - settings.max_lateral_accel).clamp(min=0).square()
+    excess = (accel - MAX_ACCEL).clamp(min=0).square() + (MIN_ACCEL - accel).clamp(min=0).square()
+    excess = excess + (lateral - MAX_LATERAL_ACCEL).clamp(min=0).square()
     jerk = torch.diff(torch.cat([context.accel[..., None], accel], -1), dim=-1) / step
-    rough = (jerk.abs() - settings.max_jerk).clamp(min=0).square()
+    rough = (jerk.abs() - MAX_JERK).clamp(min=0).square()
     return settings.accel * excess.mean(-1) + settings.jerk * rough.mean(-1)
 
 
@@ -194,34 +191,34 @@ def _with_ego(states: Tensor, context: PotentialContext) -> Tensor:
 
 
 def feasibility_potential(states: Tensor, context: PotentialContext, settings: PotentialSettings) -> Tensor:
-    """V_feas [B, V] of decoded states [B, V, H', 4] at SAMPLED_STEPS; 0 for the ego and for absent vehicles.
+    """Returns V_feas [B, V] of decoded states [B, V, H', 4] at SAMPLED_STEPS; 0 for the ego and for absent vehicles.
 
     Terms: off-road, lateral offset, overlap with others (except between an adversary and its target), acceleration,
     jerk, wrong way.
     """
     states = _with_ego(states, context)
     road, motion = _road_terms(states, context, settings), _motion_terms(states, context, settings)
-    value = road + motion + settings.pair * _overlap_term(states, context, settings)
+    value = road + motion + settings.pair * _overlap_term(states, context)
     counted = context.valid.clone()
     counted[:, 0] = False
     return torch.where(counted, value, 0.0)
 
 
-def ttc_cost(offset: Tensor, closing: Tensor, time_scale: float = 1.0, miss_scale: float = 1.0) -> Tensor:
-    """exp(-t^2 / (2 time_scale^2) - d^2 / (2 miss_scale^2)) [...] of the closest approach, t s from now and d m apart.
+def ttc_cost(offset: Tensor, closing: Tensor) -> Tensor:
+    """Returns exp(-t^2 / (2 TTC_TIME^2) - d^2 / (2 TTC_MISS^2)) [...] of the closest approach, in t s and d m apart.
 
     offset, closing [..., 2]: relative position [m] and velocity [m/s], assumed constant. Near 0 for a stopped pair, 1
     on contact at the centres.
     """
     time = (-(offset * closing).sum(-1) / (closing.square().sum(-1) + 1e-6)).clamp(min=0)
     miss = offset + closing * time[..., None]
-    return torch.exp(-0.5 * (time / time_scale) ** 2 - 0.5 * miss.square().sum(-1) / miss_scale**2)
+    return torch.exp(-0.5 * (time / TTC_TIME) ** 2 - 0.5 * miss.square().sum(-1) / TTC_MISS**2)
 
 
 def adversarial_potential(
     states: Tensor, context: PotentialContext, settings: PotentialSettings, temperature: Tensor | float | None = None
 ) -> Tensor:
-    """V_adv [B, V] of decoded states [B, V, H', 4] at SAMPLED_STEPS: low where a vehicle meets its own target.
+    """Returns V_adv [B, V] of decoded states [B, V, H', 4] at SAMPLED_STEPS: low where a vehicle meets its own target.
 
     Soft minimum over time of the distance between the centres (temperature in m, default `narrow`), TTC cost and
     closing speed, all against the detached target. 0 outside the coalition.
@@ -233,7 +230,7 @@ def adversarial_potential(
     distance = _length(offset)
     temperature = settings.narrow if temperature is None else temperature
     nearest = -temperature * (torch.logsumexp(-distance / temperature, -1) - math.log(distance.shape[-1]))
-    cost = ttc_cost(offset, closing, settings.ttc_time, settings.ttc_miss).amax(-1)
+    cost = ttc_cost(offset, closing).amax(-1)
     moment = torch.softmax(-distance.detach() / temperature, -1)
     bearing = offset.detach() / (_length(offset.detach()) + 0.1)[..., None]
     impact = (-(closing * bearing).sum(-1).clamp(-2 * CLOSING, 2 * CLOSING) * moment).sum(-1) / CLOSING

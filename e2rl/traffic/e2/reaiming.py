@@ -10,24 +10,32 @@ within the limits of an interception (`InterceptionSettings`). It knows of the e
 do: it predicts it from its present motion, and gives way by the same rules (`responsibility`, `prior.bounds`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from e2rl.prior.bounds import STRIDE, WAIT, BoundSettings, Duty, Meeting, meeting_braking
+from e2rl.prior.bounds import LATERAL_MARGIN, STRIDE, WAIT, BoundSettings, Duty, Meeting, meeting_braking
 from e2rl.run.errors import InputError
-from e2rl.run.settings import check_choice, check_range
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import separation, to_frame
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import HOLD, TURN, Arc, along_arc, curvature_of
 from e2rl.sim.world import World
-from e2rl.traffic.e2.interception import MAX_BEARING, MAX_CURVATURE, InterceptionSettings
+from e2rl.traffic.e2.interception import (
+    ACCEL_COST,
+    LATERAL_COST,
+    MAX_BEARING,
+    MAX_CURVATURE,
+    SHOULDER,
+    TIME_COST,
+    InterceptionSettings,
+)
 from e2rl.traffic.e2.motion import TOP_SPEED
-from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, CareSettings, duty_of, leading
+from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, YieldingSettings, duty_of, leading
 from e2rl.traffic.reaction import Motion, NewEpisodes, Reaction
 from e2rl.traffic.traffic import REPLAN_STEPS
 
@@ -35,7 +43,7 @@ MOMENTS = 10  # at which the ego may be met, one every 0.5 s
 CHECKED, RUN_ON = 3, 2.0  # points of a path that must be drivable, evenly spaced in time, for at least so many s
 TOUCH = 0.4  # share of both lengths by which boxes that move alike touch before their centres meet
 MISS_COST = 1.0  # s that 1 m by which the ego is missed weighs, against the costs of an interception
-GENTLE = 1.0  # m/s^2 of braking without an aim
+UNAIMED = 1.0  # m/s^2 of braking without an aim
 ALONG = 0.9  # cosine between headings from which on a vehicle follows the ego where they meet
 SEEN = 3  # nearest others that a vehicle brakes for
 
@@ -51,14 +59,12 @@ def surroundings(world: World, rows: Tensor, agents: Tensor) -> World:
     near = gap.masked_fill(~counts, torch.inf).topk(min(SEEN, gap.shape[1]), largest=False)
     at = rows[:, None], torch.cat([torch.zeros_like(agents)[:, None], agents[:, None], near.indices], 1)
     valid = torch.cat([world.valid[rows, :1], torch.ones_like(agents)[:, None].bool(), near.values < torch.inf], 1)
-    assert world.turn_rate is not None
     scene = TensorDict({"size": world.scene["size"][at]}, batch_size=rows.shape)
     return World(scene, world.step[rows], world.states[at], valid, world.accel[at], turn_rate=world.turn_rate[at])
 
 
 def present_motion(world: World) -> Arc:
     """The present acceleration and path curvature [K, N] of everybody."""
-    assert world.turn_rate is not None
     return Arc(world.accel, curvature_of(world.turn_rate, world.states[..., 3]))
 
 
@@ -102,11 +108,11 @@ def best_aim(states: Tensor, target: Target, eta: Tensor, ground: Ground, limits
     looked_at = torch.cat([times[:, None], times[:, None].clamp(min=RUN_ON) * portions], 1)
     path, _ = along_arc(states[:, None], aim, looked_at)
     miss = ((path[:, :, 0, :2] - target.states[..., :2]).norm(dim=-1) - touch).clamp(min=0)
-    cost = MISS_COST * miss + limits.accel_cost * accel.abs() + limits.time_cost * times
-    cost = cost + limits.lateral_cost * fastest.square() * curvature.abs()
+    cost = MISS_COST * miss + ACCEL_COST * accel.abs() + TIME_COST * times
+    cost = cost + LATERAL_COST * fastest.square() * curvature.abs()
     beyond = off_road(torch.cat([states[:, None, :2], path[..., :2].flatten(1, 2)], 1), *ground)
     furthest = beyond[:, 1:].view(path.shape[:-1]).amax(-1)
-    ok = (bearing.abs() < MAX_BEARING) & (furthest <= beyond[:, :1].clamp(min=limits.shoulder))
+    ok = (bearing.abs() < MAX_BEARING) & (furthest <= beyond[:, :1].clamp(min=SHOULDER))
     cost, pick = cost.masked_fill(~ok, torch.inf).min(-1, keepdim=True)
     none = cost[:, 0].isinf()
     return Arc(*(value.gather(1, pick)[:, 0].masked_fill(none, torch.nan) for value in aim))
@@ -126,7 +132,7 @@ def braking_for(world: World, aim: Arc, motion: Arc, duty: Duty, bounds: BoundSe
     states, going_on = world.states[:, index], Arc(*(value[:, index] for value in motion))
     tracks, _ = along_arc(states, going_on, DT * steps, HOLD, TURN)  # [K, J, T, 4]
     size = world.scene["size"]
-    wide = size[:, 1] + size.new_tensor([0.0, 2 * bounds.aside])
+    wide = size[:, 1] + size.new_tensor([0.0, 2 * LATERAL_MARGIN])
     meets = separation(own[:, None], wide[:, None, None], tracks, size[:, index][:, :, None]) < 0
     meets = meets & world.valid[:, index][..., None]
     first = meets.int().argmax(-1)
@@ -138,7 +144,7 @@ def braking_for(world: World, aim: Arc, motion: Arc, duty: Duty, bounds: BoundSe
     speed = world.states[:, 1, 3] + aim.accel.clamp(min=0) * WAIT  # if it does not brake before it decides again
     meeting = Meeting(own, other, driven.gather(1, first)[:, None], steps[first][:, None], meets.any(-1)[:, None])
     length = (size[:, :1, 0] + size[:, 1:2, 0]) / 2
-    return meeting_braking(bounds, meeting, speed[:, None], length, duty)[:, 0]
+    return meeting_braking(meeting, speed[:, None], length, duty)[:, 0]
 
 
 @dataclass(frozen=True)
@@ -146,9 +152,9 @@ class Law:
     """How vehicles re-aim: limits of the aims, how late they give way, bounds of their braking, what they owe."""
 
     responsibility: str = "full"
-    limits: InterceptionSettings = InterceptionSettings()
-    care: CareSettings = CareSettings()
-    bounds: BoundSettings = BoundSettings()
+    limits: InterceptionSettings = field(default_factory=InterceptionSettings)
+    yielding: YieldingSettings = field(default_factory=YieldingSettings)
+    bounds: BoundSettings = field(default_factory=BoundSettings)
 
     def __call__(self, world: World, eta: Tensor, shift: Tensor, ground: Ground, reckless: Tensor | None = None) -> Arc:
         """The Arc of K vehicles in their `surroundings` at intensities eta [K].
@@ -162,9 +168,9 @@ class Law:
         expected = expected + torch.nn.functional.pad(shift, (0, 2))[:, None]
         aim = best_aim(states, Target(expected, length[:, 0], length[:, 1]), eta, ground, self.limits)
         none = aim.accel.isnan()
-        aim = Arc(aim.accel.masked_fill(none, -GENTLE), torch.where(none, motion.curvature[:, 1] / 2, aim.curvature))
+        aim = Arc(aim.accel.masked_fill(none, -UNAIMED), torch.where(none, motion.curvature[:, 1] / 2, aim.curvature))
         itself = torch.tensor([[False, True]], device=eta.device).expand(len(eta), -1)
-        duty = duty_of(self.responsibility, self.care, world, itself, eta)
+        duty = duty_of(self.responsibility, self.yielding, world, itself, eta)
         exempt = duty.exempt[:, 1:] if reckless is None else duty.exempt[:, 1:] | reckless[:, None]
         duty = Duty(exempt, duty.yields[:, 1:], duty.patience[:, 1:])
         braking = braking_for(world, aim, motion, duty, self.bounds)
@@ -177,23 +183,20 @@ MOST = 2  # vehicles that react in an episode
 NEVER = 1 << 30
 
 
+@configured("learner/ppo_bc", "react")
 @dataclass(frozen=True)
 class ReactSettings:
     """Fields: `react` in conf/learner/ppo_bc.yaml."""
 
-    share: float = 0.75
-    others: float = 0.35
-    eta: tuple[float, float] = (1.0, 3.0)
-    scatter: float = 0.7
-    responsibility: str = "full"
-    reckless: float = 0.5
+    share: float = setting(low=0, high=1)
+    others: float = setting(low=0, high=1)
+    eta: tuple[float, float] = setting(low=0)
+    scatter: float = setting(low=0)
+    responsibility: str = setting(choices=RESPONSIBILITIES)
+    reckless: float = setting(low=0, high=1)
 
     def __post_init__(self) -> None:
-        for name in ("share", "others", "reckless"):
-            check_range(f"learner.react.{name}", getattr(self, name), 0, 1)
-        check_range("learner.react.scatter", self.scatter, 0)
-        check_choice("learner.react.responsibility", self.responsibility, RESPONSIBILITIES)
-        if not 0 <= self.eta[0] <= self.eta[1]:
+        if not self.eta[0] <= self.eta[1]:
             raise InputError(f"learner.react.eta={list(self.eta)}: expected the lowest and the highest intensity")
 
 

@@ -2,10 +2,6 @@
 
 The model is asked about all vehicles of a scene in one request, and about the scenes of a batch in parallel. Answers
 are cached on disk by content. Where a request fails, the rules decide for that scene, and this is counted.
-
-What the language model is told and asked, and how its answer is read (Sec. IV-A2).
-
-A scene in words, seen from the ego: what a language-model reasoner is asked about (Sec. IV-A2).
 """
 
 import hashlib
@@ -26,7 +22,7 @@ from torch import Tensor
 
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
-from e2rl.run.settings import check_choice, check_range
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import to_frame
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
 from e2rl.scenes.route import SPACING, interpolate, project
@@ -172,29 +168,27 @@ COUNTS = ("lm_scenes", "lm_requests", "lm_cached", "lm_fallbacks")
 Reasoner = Callable[[TensorDictBase, World, FeasibilitySettings], Feasibility]
 
 
+@configured("synthesizer/e2", "reasoner")
 @dataclass(frozen=True)
 class ReasonerSettings:
     """Settings of the reasoner; conf/synthesizer/e2.yaml explains each."""
 
-    kind: str = "rules"
-    model: str | None = None
-    base_url: str | None = None
-    timeout: float = 30.0
-    retries: int = 1
-    workers: int = 8
-    cache: str = ".cache/reasoner"
+    kind: str = setting(choices=("rules", "lm"))
+    model: str | None = setting(optional=True)
+    base_url: str | None = setting(optional=True)
+    timeout: float = setting(low=1e-3)
+    retries: int = setting(low=0)
+    workers: int = setting(low=1)
+    cache: str = setting()
 
     def __post_init__(self) -> None:
-        check_choice("synthesizer.reasoner.kind", self.kind, ("rules", "lm"))
-        for name, low in (("timeout", 1e-3), ("retries", 0), ("workers", 1)):
-            check_range(f"synthesizer.reasoner.{name}", getattr(self, name), low)
         if self.kind == "lm" and not self.model:
             raise InputError("synthesizer.reasoner.kind=lm: name a model with synthesizer.reasoner.model=NAME")
 
 
-def build_reasoner(settings: ReasonerSettings, statistics: dict[str, float]) -> Reasoner:
-    """The rules, or a LanguageReasoner that counts in `statistics`."""
-    return feasible_vehicles if settings.kind == "rules" else LanguageReasoner(settings, statistics)
+def build_reasoner(settings: ReasonerSettings) -> Reasoner:
+    """Returns the rules or a LanguageReasoner."""
+    return feasible_vehicles if settings.kind == "rules" else LanguageReasoner(settings)
 
 
 class LanguageReasoner:
@@ -204,7 +198,7 @@ class LanguageReasoner:
     Warns of the 1st, 10th, 100th, ... fallback. Raises InputError without the client, a key or a writable cache.
     """
 
-    def __init__(self, settings: ReasonerSettings, statistics: dict[str, float]) -> None:
+    def __init__(self, settings: ReasonerSettings) -> None:
         where = "synthesizer.reasoner.kind=lm"
         try:
             import openai
@@ -218,8 +212,8 @@ class LanguageReasoner:
             reason = f"{str(error).splitlines()[0]} (for an endpoint without keys any OPENAI_API_KEY will do)"
             raise InputError(f"{where}: {reason}") from error
         self._failures = (openai.OpenAIError, ValueError)
-        self.settings, self.statistics, self._lock = settings, statistics, threading.Lock()
-        statistics.update({name: statistics.get(name, 0) for name in COUNTS})
+        self.settings, self._lock = settings, threading.Lock()
+        self.statistics = dict.fromkeys(COUNTS, 0)
 
     def __call__(self, scene: TensorDictBase, world: World, settings: FeasibilitySettings) -> Feasibility:
         """Feasible vehicles of scenes [B]: by the model's verdicts on the three criteria, or the rules' where it fails.
@@ -284,7 +278,7 @@ class LanguageReasoner:
     def _count(self, name: str) -> int:
         with self._lock:
             self.statistics[name] += 1
-            return int(self.statistics[name])
+            return self.statistics[name]
 
     def _fell_back(self, error: Exception) -> None:
         count = self._count("lm_fallbacks")

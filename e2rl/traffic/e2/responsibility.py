@@ -1,4 +1,4 @@
-"""The duty of care of adversaries towards the ego (docs/adversaries.md).
+"""The yielding rule: what adversaries owe the ego (docs/adversaries.md).
 
 full: an adversary gives way to the ego wherever its plan meets the ego's expected motion, late but in time, unless the
 ego follows it; rear: adversaries behind the ego brake for it like any driver; none: no adversary does.
@@ -10,33 +10,30 @@ import torch
 from torch import Tensor
 
 from e2rl.prior.bounds import Duty
-from e2rl.run.settings import check_range
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import to_frame
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
 
 RESPONSIBILITIES = ("full", "rear", "none")
 NEAR = 4.0  # m ahead of the ego's centre from which on a vehicle leads it
-CROSSING = torch.pi / 6  # rad between headings above which a vehicle crosses the ego's way
-SAME_WAY = 0.5  # cosine between the headings of vehicles that drive the same way
+CROSSING = torch.pi / 6  # rad between headings above which a vehicle crosses the ego's path
+SAME_DIRECTION = 0.5  # cosine between the headings of vehicles that drive in the same direction
 
 
+@configured("synthesizer/e2", "yielding")
 @dataclass(frozen=True)
-class CareSettings:
+class YieldingSettings:
     """How late adversaries give way; conf/synthesizer/e2.yaml explains each."""
 
-    patience: float = 1.0
-    max_patience: float = 2.0
-
-    def __post_init__(self) -> None:
-        check_range("synthesizer.care.patience", self.patience, 0)
-        check_range("synthesizer.care.max_patience", self.max_patience, 0)
+    patience: float = setting(low=0)
+    max_patience: float = setting(low=0)
 
 
 def place_of(world: World, vehicles: int) -> tuple[Tensor, Tensor]:
-    """Where the ego sees vehicles: m ahead and to the left [B, V, 2]; and whether they drive its way [B, V]."""
+    """Where the ego sees vehicles, m ahead and to the left [B, V, 2]; whether they drive in its direction [B, V]."""
     states, ego = world.states[:, :vehicles], world.states[:, :1]
-    return to_frame(states[..., :2], ego), (states[..., 2] - ego[..., 2]).cos() > SAME_WAY
+    return to_frame(states[..., :2], ego), (states[..., 2] - ego[..., 2]).cos() > SAME_DIRECTION
 
 
 def followed(world: World, vehicles: int) -> Tensor:
@@ -47,18 +44,18 @@ def followed(world: World, vehicles: int) -> Tensor:
 
 
 def leading(world: World, vehicles: int) -> Tensor:
-    """Bool [B, V]: vehicles that drive the ego's way ahead of it, in its lane or beside it."""
+    """Bool [B, V]: vehicles that drive in the ego's direction ahead of it, in its lane or beside it."""
     place, along = place_of(world, vehicles)
     return along & (place[..., 0] > NEAR)
 
 
 def owes_way(world: World, vehicles: int) -> Tensor:
-    """Bool [B, V]: vehicles that cross the ego's way from its left, and so give way where nothing else decides."""
+    """Bool [B, V]: vehicles that cross the ego's path from its left, and so give way where nothing else decides."""
     angle = wrap(world.states[:, :vehicles, 2] - world.states[:, :1, 2])
     return (angle < -CROSSING) & (angle > CROSSING - torch.pi)
 
 
-def duty_of(responsibility: str, settings: CareSettings, world: World, coalition: Tensor, eta: Tensor) -> Duty:
+def duty_of(responsibility: str, settings: YieldingSettings, world: World, coalition: Tensor, eta: Tensor) -> Duty:
     """The Duty of a coalition [B, V] at intensities eta [B]."""
     vehicles, nobody, zero = coalition.shape[1], torch.zeros_like(coalition), torch.zeros_like(eta[:, None] * coalition)
     if responsibility == "none":

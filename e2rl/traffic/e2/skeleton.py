@@ -1,10 +1,10 @@
 """Interaction skeleton (Algorithm 2): near agents act on the ego, a distant one acts on them through a causal chain.
 
 The arg min / arg max over subsets of a sum of distances are the K nearest / farthest agents. Intermediate members of a
-chain are taken from S and join the coalition C*. The far agent is sought within `max_dist`: the influence of the
+chain are taken from S and join the coalition C*. The far agent is sought within MAX_DIST: the influence of the
 farthest of all would arrive last.
 
-What a choice of coalitions rested on: handed to whoever listens to a synthesizer (`Synthesizer.on_selection`).
+`Selection` is what a choice of coalitions rested on, for whoever listens (`Traffic.on_decision`).
 """
 
 from dataclasses import dataclass
@@ -13,40 +13,39 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.run.settings import check_range
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.route import project
 from e2rl.sim.world import World
 from e2rl.traffic.e2.motion import compact, direction, frenet_pose, put, reachable_distance, smallest, take
+from e2rl.traffic.e2.topology import TopologySettings
 
-SUPPORTED, NEAREST_FEASIBLE, NOBODY = range(3)  # where the near agents came from
 LIMITS = ((1, 0), (2, 0), (1, 1))  # near and far agents of the causal templates single, pair and chain
 
 
+MAX_DIST = 80.0  # m; farther vehicles start no chain
+STEP = 0.5  # s between the moments that are looked at
+CORRIDOR = 2.5  # m from a route within which a vehicle is on it
+
+
+@configured("synthesizer/e2", "skeleton")
 @dataclass(frozen=True)
 class SkeletonSettings:
     """Settings of Algorithm 2; conf/synthesizer/e2.yaml explains each."""
 
-    near: int = 3
-    far: int = 1
-    tau_dist: float = 15.0
-    tau_long: float = 20.0
-    max_dist: float = 80.0
-    max_chain: int = 4
-    horizon: float = 5.0
-    step: float = 0.5
-    corridor: float = 2.5
-    pursuit: bool = False
-
-    def __post_init__(self) -> None:
-        for name, low in (("near", 1), ("far", 0), ("max_chain", 1), ("step", 0.1), ("horizon", self.step)):
-            check_range(f"synthesizer.skeleton.{name}", getattr(self, name), low)
+    near: int = setting(low=1)
+    far: int = setting(low=0)
+    tau_dist: float = setting(low=0)
+    tau_long: float = setting(low=0)
+    max_chain: int = setting(low=1)
+    horizon: float = setting(low=STEP)
+    pursuit: bool = setting()
 
 
 @dataclass(frozen=True)
 class Skeleton:
     """coalition [B, V] bool: C*; target [B, V] int64: the vehicle that each of C* acts on (0 the ego), -1 for all
-    others; depth [B, V] int64: links to the ego (1 acts on it directly, 0 not in C*); near, far [B, V] bool; chains [B]
-    int64: far agents with a viable chain; source [B] int64: SUPPORTED, NEAREST_FEASIBLE (S was empty) or NOBODY.
+    others; depth [B, V] int64: links to the ego (1 acts on it directly, 0 not in C*); near [B, V] bool; far [B, V]
+    bool: far agents with a viable chain.
     """
 
     coalition: Tensor
@@ -54,14 +53,6 @@ class Skeleton:
     depth: Tensor
     near: Tensor
     far: Tensor
-    chains: Tensor
-    source: Tensor
-
-    def counts(self) -> dict[str, int]:
-        """Numbers of scenes by source, and of viable chains, for logging."""
-        names = ("supported", "nearest_feasible", "nobody")
-        counts = {name: int((self.source == code).sum()) for code, name in enumerate(names)}
-        return counts | {"chains": int(self.chains.sum())}
 
 
 def limits_of(template: Tensor, settings: SkeletonSettings) -> tuple[Tensor, Tensor]:
@@ -73,8 +64,7 @@ def limits_of(template: Tensor, settings: SkeletonSettings) -> tuple[Tensor, Ten
 
 def direct(support: Tensor) -> Skeleton:
     """The skeleton in which all of support [B, V] act on the ego directly."""
-    nobody, zero = torch.zeros_like(support), torch.zeros_like(support[:, 0], dtype=torch.int64)
-    return Skeleton(support, torch.where(support, 0, -1), support.long(), support, nobody, zero, zero)
+    return Skeleton(support, torch.where(support, 0, -1), support.long(), support, torch.zeros_like(support))
 
 
 def chain_depth(target: Tensor) -> Tensor:
@@ -120,12 +110,12 @@ def influence(
     """When each slot can act on each other slot and on the ego: bool [B, M, M + 1, K], the last target is the ego.
 
     slots: index and presence [B, M] of the vehicles (see `compact`); expected [B, V, K, 4]: states of everybody every
-    `step` s. Slot i can act on j at a time when j is on one of i's candidate routes, i can be there by then, and the
+    STEP s. Slot i can act on j at a time when j is on one of i's candidate routes, i can be there by then, and the
     longitudinal headway between them would be at most tau_long if i kept its speed.
     """
     index, present = slots
     count, width = expected.shape[2], index.shape[1] + 1
-    times = settings.step * torch.arange(1, count + 1, device=index.device)
+    times = STEP * torch.arange(1, count + 1, device=index.device)
     states = take(world.states[:, : expected.shape[1]], index)
     s, _, _ = frenet_pose(states, take(scene["route_points"], index))
     b, m, r = (take(scene["route_valid"], index) & present[..., None]).nonzero(as_tuple=True)  # most is padding
@@ -135,7 +125,7 @@ def influence(
     speed, length = states[b, m, 3, None, None], scene["size"][b, index[b, m], 0, None, None]
     distance = target_s - s[b, m, r, None, None]
     least, most = reachable_distance(speed, times)
-    can_act = (target_d.abs() <= settings.corridor) & (distance >= least - length) & (distance <= most + length)
+    can_act = (target_d.abs() <= CORRIDOR) & (distance >= least - length) & (distance <= most + length)
     can_act &= ((distance - speed * times).abs() <= settings.tau_long) & (distance > -length)
     by_slot = torch.zeros(*index.shape, width, count, device=index.device)
     by_slot = by_slot.index_put((b, m), can_act.float(), accumulate=True) > 0
@@ -211,7 +201,7 @@ def build_skeleton(
 ) -> Skeleton:
     """Algorithm 2 for scenes [B]: support [B, V] = S, feasible [B, V] = F.
 
-    expected [B, V, K, 4]: states of everybody every `step` s from now; cost [B, V]: of meeting the ego, inf for
+    expected [B, V, K, 4]: states of everybody every STEP s from now; cost [B, V]: of meeting the ego, inf for
     vehicles that cannot; limits: the most near and far agents [B], by default the settings'. The near agents are those
     of S with the least cost; where S has none, those of F; where F has none either, nobody, or with `pursuit` the
     nearest of S, or of F where S is empty.
@@ -219,18 +209,17 @@ def build_skeleton(
     most_near, most_far = (settings.near, settings.far) if limits is None else limits
     vehicles = support.shape[1]
     states = world.states[:, :vehicles].detach()
-    expected = expected[:, :, : round(settings.horizon / settings.step)].detach()
+    expected = expected[:, :, : round(settings.horizon / STEP)].detach()
     distance = (states[..., :2] - states[:, :1, :2]).norm(dim=-1)
     ego = torch.arange(vehicles, device=states.device) == 0
     support, feasible = (mask & world.valid[:, :vehicles] & ~ego for mask in (support, feasible))
     first, second = (mask & cost.isfinite() for mask in (support, feasible))
-    source = torch.where(first.any(1), SUPPORTED, torch.where(second.any(1), NEAREST_FEASIBLE, NOBODY))
     near = smallest(torch.where(first.any(1, keepdim=True), first, second), cost, most_near)
     if settings.pursuit:
         nearest = smallest(torch.where(support.any(1, keepdim=True), support, feasible), distance, most_near)
         near = torch.where(near.any(1, keepdim=True), near, nearest)
     index, present = compact(support | near)
-    distant = support & ~near & (distance > settings.tau_dist) & (distance <= settings.max_dist)
+    distant = support & ~near & (distance > settings.tau_dist) & (distance <= MAX_DIST)
     distant = present & take(distant, index)
     distant &= ~_on_ego_lanes(torch.cat([states[:, :1], take(states, index)], 1), distant, scene)
     far = smallest(distant, -take(distance, index), most_far)
@@ -241,7 +230,7 @@ def build_skeleton(
     target = torch.full_like(support, -1, dtype=torch.int64)
     target = put(target, index, slot_target >= 0, vehicle.gather(1, slot_target.clamp(min=0)))
     far = put(torch.zeros_like(support), index, present, viable)
-    return Skeleton(target >= 0, target, chain_depth(target), near, far, far.sum(1), source)
+    return Skeleton(target >= 0, target, chain_depth(target), near, far)
 
 
 @dataclass(frozen=True)
@@ -251,7 +240,7 @@ class Selection:
     seed [B]: of the scene's noise, which names the rollout; step [B]: of the choice; reference [B, T', V, 4]: states of
     the reference rollout at the steps looked at, moments [B, T'] s after the choice; weights [B, T', V, V]: pair risks
     there, eq. (ttc_weight_t); candidates, feasible [B, V] bool: S_top and F; coalition, target [B, V]: C* and whom each
-    of it acts on (0 the ego, -1: in no coalition).
+    of it acts on (0 the ego, -1: in no coalition); settings: of the risk graphs.
     """
 
     seed: Tensor
@@ -263,3 +252,4 @@ class Selection:
     feasible: Tensor
     coalition: Tensor
     target: Tensor
+    settings: TopologySettings

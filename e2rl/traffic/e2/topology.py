@@ -18,30 +18,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from e2rl.run.settings import check_range
+from e2rl.run.settings import configured, setting
 from e2rl.traffic.e2.motion import smallest
 
+STRIDE = 5  # steps between the graphs (0.5 s)
+HORIZON = 8.0  # s; no contact within it at constant velocity is no risk
+NODES = 24  # vehicles nearest to the ego that a graph may have: enumeration is exponential at worst
+HOPS = 2  # edges from the ego within which a clique must have a member (or the ego): a far queue is no candidate
 
+
+@configured("synthesizer/e2", "topology")
 @dataclass(frozen=True)
 class TopologySettings:
     """Settings of the bifurcation analysis; conf/synthesizer/e2.yaml explains each."""
 
-    stride: int = 5
-    horizon: float = 8.0
-    clearance: float = 3.0
-    tau_max: float = 3.0
-    beta: float = 1.0
-    edge_threshold: float = 0.1
-    max_nodes: int = 24
-    max_clique: int = 4
-    max_hops: int = 2
-    top_cliques: int = 3
-    candidates: int = 10
-
-    def __post_init__(self) -> None:
-        for name, low in (("stride", 1), ("clearance", 0), ("max_nodes", 2), ("max_clique", 2), ("beta", 1e-3)):
-            check_range(f"synthesizer.topology.{name}", getattr(self, name), low)
-        check_range("synthesizer.topology.edge_threshold", self.edge_threshold, 1e-6, 1 - 1e-6)
+    clearance: float = setting(low=0)
+    tau_max: float = setting()
+    beta: float = setting(low=1e-3)
+    edge_threshold: float = setting(low=1e-6, high=1 - 1e-6)
+    max_clique: int = setting(low=2)
+    top_cliques: int = setting(low=1)
+    candidates: int = setting(low=0)
 
 
 @dataclass(frozen=True)
@@ -67,7 +64,7 @@ def _overlap_interval(offset: Tensor, closing: Tensor, extent: Tensor) -> tuple[
     return middle - half, middle + half
 
 
-def time_to_collision(states: Tensor, size: Tensor, horizon: float = 8.0) -> Tensor:
+def time_to_collision(states: Tensor, size: Tensor, horizon: float = HORIZON) -> Tensor:
     """Time [s] to the first contact of oriented boxes at constant velocity and heading: states [..., N, 4], size
     [..., N, 2] -> [..., N, N].
 
@@ -91,7 +88,7 @@ def time_to_collision(states: Tensor, size: Tensor, horizon: float = 8.0) -> Ten
 
 def pair_weights(states: Tensor, valid: Tensor, size: Tensor, settings: TopologySettings) -> Tensor:
     """Risk weights [..., N, N] of eq. (ttc_weight_t), 0 on the diagonal: states [..., N, 4], valid [..., N] bool."""
-    ttc = time_to_collision(states, size + settings.clearance, settings.horizon)
+    ttc = time_to_collision(states, size + settings.clearance)
     weight = torch.sigmoid((settings.tau_max - ttc) / settings.beta)
     both = valid[..., :, None] & valid[..., None, :]
     return weight * (both & ~torch.eye(both.shape[-1], dtype=torch.bool, device=both.device))
@@ -146,18 +143,18 @@ def topological_candidates(states: Tensor, valid: Tensor, size: Tensor, settings
     """Candidates S_top of a reference rollout (Sec. IV-A1, eqs. ttc_weight and temporal_scoring).
 
     states [B, T, V, 4], valid [B, T, V] bool, size [B, V, 2] m; row 0 is the ego, which is a node of the graphs but
-    never a candidate. Every `stride`-th step is analysed and counts once.
+    never a candidate. Every STRIDE-th step is analysed and counts once.
     """
-    steps = torch.arange(0, states.shape[1], settings.stride, device=states.device)
+    steps = torch.arange(0, states.shape[1], STRIDE, device=states.device)
     states, valid = states[:, steps].detach(), valid[:, steps]
     weights = pair_weights(states, valid, size[:, None].expand(*states.shape[:-1], 2), settings)
     distance = (states[..., :2] - states[..., :1, :2]).norm(dim=-1)
     distance = distance.masked_fill(~valid | ~valid[..., :1], torch.inf)
-    nodes = smallest(valid, distance, settings.max_nodes)
+    nodes = smallest(valid, distance, NODES)
     adjacency = (weights >= settings.edge_threshold) & nodes[..., :, None] & nodes[..., None, :]
-    # Only cliques with a member within max_hops of the ego count; all their members lie within one hop more.
-    relevant = _within_hops(adjacency, settings.max_hops)
-    nodes = _within_hops(adjacency, settings.max_hops + 1)
+    # Only cliques with a member within HOPS of the ego count; all their members lie within one hop more.
+    relevant = _within_hops(adjacency, HOPS)
+    nodes = _within_hops(adjacency, HOPS + 1)
     adjacency = adjacency & nodes[..., :, None] & nodes[..., None, :]
     host = [x.cpu().numpy() for x in (adjacency.to(torch.uint8), relevant, weights, distance)]
     score = torch.zeros(states.shape[0], states.shape[2])

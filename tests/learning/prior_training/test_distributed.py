@@ -176,8 +176,8 @@ def test_a_batch_that_cannot_be_shared_and_another_number_of_processes_are_refus
 @pytest.mark.skipif(torch.cuda.is_available(), reason="one process a GPU: tests the CPU's way")
 def test_torchrun_trains_with_the_real_command(tmp_path):
     small = [
-        "data=procedural",
-        "data.count=4",
+        "data=bundled",
+        "num_scenes=4",
         "data.workers=1",
         "data.build.field_cells=64",
         "data.build.vehicles=4",

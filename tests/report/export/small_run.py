@@ -1,5 +1,6 @@
 """A run's folder on two scenes of a fork with lights: in the first a car cuts in on the ego, which hits it."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +76,8 @@ def write_run(folder: Path) -> Path:
     write_rows(run / TABLE, label_rows(score_rollouts(rollouts)[0], source))
     (run / ".hydra").mkdir()
     OmegaConf.save({"data": data}, run / ".hydra" / "config.yaml")
-    OmegaConf.save({"hydra": {"runtime": {"cwd": str(folder)}}}, run / ".hydra" / "hydra.yaml")
+    begun = {"command": "", "cwd": str(folder), "choices": {}, "inputs": {}, "settings": {}, "files": {}}
+    (run / "provenance.json").write_text(json.dumps(begun | {"versions": [{"git": ""}]}))
     return run
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from e2rl.prior.prior import SamplerSettings
+from e2rl.prior.sde import SamplerSettings
 from e2rl.run.config import load_choice
 from e2rl.sim.world import World
 from e2rl.traffic.baselines.baseline import Rival

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from e2rl.prior.prior import SamplerSettings
+from e2rl.prior.sde import SamplerSettings
 from e2rl.run.errors import InputError
 from e2rl.sim.world import World
 from e2rl.traffic.baselines.ctg import CTGAdv

@@ -7,7 +7,7 @@ from tensordict import TensorDictBase
 
 from e2rl.planners.ego import Ego
 from e2rl.planners.idm_planner import IDMEgo
-from e2rl.prior.prior import SamplerSettings
+from e2rl.prior.sde import SamplerSettings
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import SimSettings
 from e2rl.sim.world import World

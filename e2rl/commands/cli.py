@@ -1,0 +1,60 @@
+"""`e2rl COMMAND ...`: all commands under one name."""
+
+import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
+
+# isort: split
+import sys
+from difflib import get_close_matches
+from importlib import import_module
+from importlib.metadata import version
+
+COMMANDS = {  # module, and what the command does
+    "evaluate": ("e2rl.scripts.evaluate", "how often, and how, an ego fails in attacked traffic"),
+    "train": ("e2rl.scripts.train", "improve a policy on the failures that are found; train a prior"),
+    "tune": ("e2rl.commands.tune", "tune the parameters of an adversary or a planner"),
+    "report": ("e2rl.report.html", "the page with a replay of every failure of a run"),
+    "replay": ("e2rl.report.videos", "videos and pictures of rollouts of a run"),
+    "export": ("e2rl.commands.export", "failures of a run in the format of another tool"),
+    "export-policy": ("e2rl.commands.export_policy", "a trained actor as ONNX or TorchScript"),
+    "inspect": ("e2rl.commands.inspect", "what a data set holds, and a picture of a scene"),
+    "merge": ("e2rl.commands.merge", "join the shards of an evaluation"),
+    "curves": ("e2rl.report.curves", "failures over realism, of one or several runs"),
+    "prior-tables": ("e2rl.commands.prior_tables", "the prior as traffic: open loop, closed loop, meta-metric"),
+    "skeleton": ("e2rl.commands.draw_skeleton", "the figure of risks, skeleton and chain"),
+}
+EXAMPLES = """examples:
+  e2rl evaluate num_scenes=12                    the lane-graph planner on twelve bundled scenes
+  e2rl evaluate ego=idm eta=[1,2] metrics=all    another ego, two intensities, all tables
+  e2rl report runs/evaluate/DATE/TIME            watch its failures
+  e2rl export runs/evaluate/DATE/TIME --to openscenario
+  e2rl train rounds=4                            four rounds of evolution
+  e2rl evaluate --help                           every option, with its comment
+
+Ctrl-C ends a command in one line, which says how to go on with it."""
+
+
+def help_text() -> str:
+    """Returns what there is, with examples."""
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name.ljust(width)}  {about}" for name, (_, about) in COMMANDS.items()]
+    return "\n".join(["usage: e2rl COMMAND ... | --version", "", *lines, "", EXAMPLES])
+
+
+def main() -> None:
+    """The command."""
+    name, arguments = (sys.argv[1] if len(sys.argv) > 1 else "--help"), sys.argv[2:]
+    if name in ("-h", "--help", "help"):
+        print(help_text())
+    elif name in ("-V", "--version", "version"):
+        print(f"e2rl {version('e2rl')}")
+    elif name in COMMANDS:
+        sys.argv = [f"e2rl {name}", *arguments]
+        import_module(COMMANDS[name][0]).main()
+    else:
+        near = get_close_matches(name, COMMANDS, 1, 0.4)
+        print(f"error: e2rl {name}: no such command; {f'did you mean {near[0]}?' if near else 'see e2rl --help'}")
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,60 @@
+"""What an evaluation does, built from its configuration: every ego under every method in every scene and seed."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from e2rl.evaluation.ego_set import EgoSet, build_egos
+from e2rl.evaluation.methods import EvaluationSettings, build_methods, build_prior, build_sim, evaluation_settings
+from e2rl.evaluation.protocol import Method, Setup
+from e2rl.evaluation.reproduce import files_of_run
+from e2rl.prior.prior import Prior
+from e2rl.run.config import set_up
+from e2rl.run.run import Run
+from e2rl.scenes.scene import SceneSet
+from e2rl.scenes.scene_list import listed
+from e2rl.scenes.source import load_scenes
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The objects of an evaluation.
+
+    Args:
+        asked: the checked settings.
+        origin: of the prior, from its checkpoint.
+        setup: scenes, simulator and the first of `egos`.
+        only: positions of the scenes to drive (None: all).
+    """
+
+    asked: EvaluationSettings
+    egos: EgoSet
+    prior: Prior
+    origin: Mapping[str, Any]
+    methods: list[Method]
+    setup: Setup
+    only: list[int] | None
+
+    @property
+    def scenes(self) -> SceneSet:
+        """The scenes, of which `only` may be a part."""
+        return self.setup.scenes
+
+
+def begin(run: Run) -> Plan:
+    """Returns the plan of a run, which begins or goes on with it.
+
+    Raises:
+        InputError: for a configuration that cannot be run, and for inputs that changed since the run began.
+    """
+    config = run.config
+    set_up(config)
+    asked, egos = evaluation_settings(config), build_egos(config, run.choices["ego"])
+    prior, origin = build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
+    methods = build_methods(config, prior)
+    scenes = load_scenes(config.data, asked.num_scenes, scenes=config.scenes, files=files_of_run(config))
+    only = None if config.scene is None else [scenes.index(config.scene)]
+    name, ego = next(iter(egos.egos.items()))
+    setup = Setup(scenes, ego, name, build_sim(config), asked.batch, config.device)
+    run.begin({"scenes": listed(scenes)})
+    return Plan(asked, egos, prior, origin, methods, setup, only)

@@ -1,0 +1,111 @@
+"""What an evaluation leaves behind: tables.md, figures, the failure report, and the lines that answer it."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from e2rl.evaluation.ego_set import recorded_acceleration, trainings_of
+from e2rl.evaluation.methods import ALL, EvaluationSettings, caption, terms_by_method
+from e2rl.evaluation.modes import MODES_FILE, read_modes
+from e2rl.evaluation.plan import Plan
+from e2rl.metrics.evasion import search_effort
+from e2rl.report.answer import answer_lines
+from e2rl.report.comparison_tables import (
+    EGOS,
+    METHODS,
+    ego_tables,
+    guard_table,
+    method_tables,
+    planner_tables,
+    save_compared,
+)
+from e2rl.report.curves import points_of_rows, save_curves
+from e2rl.report.drawing import save_figure
+from e2rl.report.html import PAGE, report
+from e2rl.report.intensity import intensity_figure, intensity_ladder
+from e2rl.report.mode_table import mode_tables
+from e2rl.report.plots import collision_bars, learning_curves
+from e2rl.report.tables import Table, metric_tables, print_tables, save_tables
+from e2rl.run.files import write_atomically
+from e2rl.run.run import Run
+
+NOMINAL = "nominal"  # traffic without an attack, which every attack is compared with
+MAIN = "main"  # table of metrics
+REPLAYS = 300  # in the failure report at most
+FIGURES: Mapping[str, Callable[[Path, Sequence[dict]], object]] = {
+    "intensity": lambda folder, rows: save_figure(folder / "intensity.png", intensity_figure(intensity_ladder(folder))),
+    "curves": lambda folder, rows: save_curves(folder, points_of_rows(rows)),
+}
+
+
+def write_results(run: Run, plan: Plan, rows: Sequence[dict]) -> list[str]:
+    """Writes the tables, figures and failure report of an evaluation; returns the lines that answer it.
+
+    Args:
+        rows: of metrics.json.
+    """
+    folder, asked, modes = run.folder, plan.asked, read_modes(run.folder / MODES_FILE)
+    dropped = [f"left out: {count} scenes ({reason})" for reason, count in plan.scenes.dropped.items()]
+    text = "; ".join([caption(run.config, plan.origin, plan.methods), search_effort(plan.scenes.steps), *dropped])
+    tables = [*tables_of(plan, rows, text, folder), *mode_tables(modes), *egos_tables(run, plan, rows, text)]
+    save_tables(folder / "tables.md", tables)
+    if asked.metrics == ALL:
+        print_tables(tables)
+    if asked.figure:
+        FIGURES[asked.figure](folder, rows)
+    page = folder / PAGE if asked.report and asked.save_rollouts and modes["failures"] else None
+    if page:
+        write_atomically(page, report(folder, REPLAYS))
+    return answer_lines(rows, modes, folder, page, dropped)
+
+
+def references(plan: Plan) -> tuple[str, ...] | None:
+    """Returns the methods that all are compared with; None: each with every other."""
+    return (*plan.asked.compare, NOMINAL) if compares(plan.asked) and not plan.egos.pairs else None
+
+
+def compares(asked: EvaluationSettings) -> bool:
+    """Whether the tables have a row a method, or where there are several egos a row an ego."""
+    return bool(asked.compare) or asked.figure == "curves"
+
+
+def tables_of(plan: Plan, rows: Sequence[dict], text: str, folder: Path) -> list[Table]:
+    """Returns the tables of metrics; those with a row a method or an ego also become files of their own."""
+    metrics = MAIN if plan.asked.metrics == ALL else plan.asked.metrics
+    if not compares(plan.asked):
+        return metric_tables(rows, text, metrics)
+    others, egos = plan.asked.compare or (NOMINAL,), plan.egos
+    if egos.pairs:
+        tables = planner_tables(rows, egos.names, others[0], text, metrics)
+    else:
+        tables = method_tables(rows, terms_by_method(plan.methods), others, text, metrics)
+    save_compared(folder, tables, EGOS if egos.pairs else METHODS)
+    return tables
+
+
+def egos_tables(run: Run, plan: Plan, rows: Sequence[dict], text: str) -> list[Table]:
+    """Returns the tables that compare several egos; with `policy_learning` also its guards, and draws its figures."""
+    roles, egos = run.config.policy_learning, plan.egos
+    if not egos.pairs or plan.asked.compare:
+        return []
+    tables = ego_tables(rows, egos.names, egos.pairs, "Egos" if roles is None else "Policy learning", text)
+    if roles is None:
+        return tables
+    bars = collision_bars(rows, egos.names, run.config.synthesizer.name)
+    save_figure(run.folder / "policy_learning.png", bars)
+    if runs := list(curve_runs(run.config)):
+        save_figure(run.folder / "curves.png", learning_curves(runs))
+    recorded = recorded_acceleration(plan.scenes)
+    return [*tables, guard_table(rows, roles.before, roles.after, roles.planner, recorded)]
+
+
+def curve_runs(config: DictConfig) -> Iterator[Path]:
+    """The run folders whose learning curves are drawn: `policy_learning.runs`, or null: those among the checkpoints of
+    `policy_learning.after` that have logged scalars."""
+    if config.policy_learning.runs is not None:
+        yield from map(Path, config.policy_learning.runs)
+        return
+    for entry in trainings_of(config, config.policy_learning.after).values():
+        if entry.get("checkpoint") and (Path(entry["checkpoint"]) / "logs").is_dir():
+            yield Path(entry["checkpoint"])

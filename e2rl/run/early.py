@@ -1,0 +1,17 @@
+"""Import this first in a command: Ctrl-C ends it in one line from then on, also while heavy libraries load.
+
+`e2rl.run.endings.ending` takes over once the command knows how it can go on.
+"""
+
+import os
+import signal
+from types import FrameType
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    os.write(2, b"\ninterrupted before it began; run the same command again\n")
+    os._exit(128 + number)
+
+
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not in the background, which is deaf to it
+    signal.signal(signal.SIGINT, _leave)

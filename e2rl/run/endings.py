@@ -1,0 +1,82 @@
+"""How a command ends that cannot go on: one line on stderr says why and how to go on; no process is left behind."""
+
+import errno
+import multiprocessing
+import shlex
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import NoReturn
+
+from e2rl.run.errors import InputError
+
+WRITING = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM}
+
+
+@contextmanager
+def ending(go_on: str | Callable[[], str] = "") -> Iterator[None]:
+    """End the process where the block ends early, with one line on stderr.
+
+    The status is 2 for bad input, 1 for a file that cannot be written, 130 for Ctrl-C, 143 for SIGTERM. Libraries may
+    turn the interrupt into an error of their own, or lose it on the way; what counts is that the signal arrived.
+
+    Args:
+        go_on: the command that goes on where this one ends, or a function that returns it; by default the same again.
+    """
+    arrived: list[int] = []
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        arrived.append(number)
+        raise KeyboardInterrupt
+
+    heeded = [each for each in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(each) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, interrupt) for number in heeded}
+    try:
+        yield
+    except (Exception, KeyboardInterrupt) as error:
+        if arrived or isinstance(error, KeyboardInterrupt):
+            number = signal.Signals(arrived[0] if arrived else signal.SIGINT)
+            _end(f"\ninterrupted ({number.name}); go on with: {_command(go_on)}", 128 + number)
+        if isinstance(error, InputError):
+            _end(f"error: {' '.join(str(error).split())}", 2)
+        if isinstance(error, OSError) and error.errno in WRITING:
+            reason = f"{error.filename}: cannot be written ({error.strerror}); what was written before is whole"
+            _end(f"\nerror: {reason}. Mend that, then go on with: {_command(go_on)}", 1)
+        raise
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def program() -> list[str]:
+    """Returns the words that start the running command: `python evaluate.py`, `e2rl evaluate`, `python -m MODULE`."""
+    script, package = Path(sys.argv[0]), Path(__file__).parents[1]
+    if script.suffix != ".py":
+        return sys.argv[0].split()
+    if package not in script.resolve().parents:
+        return ["python", sys.argv[0]]
+    return ["python", "-m", ".".join(script.resolve().relative_to(package.parent).with_suffix("").parts)]
+
+
+def command_line() -> str:
+    """Returns the running command, quoted for a shell."""
+    return shlex.join([*program(), *sys.argv[1:]])
+
+
+def kill_workers(others: set | None = None) -> None:
+    """Kill the worker processes of this process, but for `others`."""
+    for child in set(multiprocessing.active_children()) - (others or set()):
+        child.kill()
+
+
+def _command(go_on: str | Callable[[], str]) -> str:
+    return (go_on() if callable(go_on) else go_on) or command_line()
+
+
+def _end(message: str, status: int) -> NoReturn:
+    kill_workers()
+    print(message, file=sys.stderr)
+    sys.exit(status)

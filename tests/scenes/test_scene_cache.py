@@ -1,0 +1,238 @@
+"""The cache of scenes: what is read is what was built, bit for bit; damage is mended; the folder keeps its size."""
+
+import multiprocessing
+import os
+import pickle
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from e2rl.run.errors import InputError
+from e2rl.scenes import scene_cache as cache
+from e2rl.scenes.scene import RAGGED
+from e2rl.scenes.scene_cache import cached, uncached
+
+KINDS = st.sampled_from(("<f4", "<f2", "<i8", "|b1")).map(np.dtype)
+SHAPES = arrays.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=4)
+SCENES = st.tuples(KINDS, SHAPES).flatmap(
+    lambda like: st.lists(
+        st.fixed_dictionaries(
+            {"logged": arrays.arrays(*like), "lane_exits": arrays.arrays("<i8", st.tuples(*[st.integers(0, 4)] * 2))}
+        ),
+        min_size=1,
+        max_size=4,
+    )
+)
+
+
+def yielding(scenes, index):
+    index.dataset, index.split = "made", "test"
+    index.dropped["invalid"] = 2
+    for number, scene in enumerate(scenes):
+        index.add(f"scene-{number}", f"place-{number}", scene)
+        yield scene
+
+
+def build(index, seed: int = 0, count: int = 5):
+    """Scenes with random content, of which each has one lane more than the last."""
+    draw = np.random.default_rng(seed)
+    rows = [np.arange(2 * number + 2, dtype=float).reshape(-1, 2) for number in range(count)]
+    scenes = [{"logged": draw.normal(size=(5, 3, 4)).astype("<f4"), "lane_points": row} for row in rows]
+    return yielding(scenes, index)
+
+
+def never(index):
+    raise AssertionError("it is built again")
+
+
+def file_of(folder, letter: str = "a"):
+    return folder / f"scenes-{letter * 64}.map"
+
+
+def same(one, other) -> None:
+    assert all(vars(one)[key] == vars(other)[key] for key in vars(one) if key != "scenes")
+    assert one.hashes() == other.hashes() and one.scenes.keys() == other.scenes.keys()
+    assert all(torch.equal(value, other.scenes[key]) for key, value in one.scenes.items())
+
+
+@settings(max_examples=100, deadline=None)
+@given(SCENES)
+def test_scenes_come_back_bit_for_bit_and_padded(scenes):
+    found = uncached(partial(yielding, scenes))
+    assert found.scenes["scene_index"].tolist() == list(range(len(scenes))) == found.number
+    for scene, row in zip(scenes, found.scenes, strict=True):
+        for key, value in scene.items():
+            inner = row[key].numpy()[tuple(map(slice, value.shape))]
+            assert inner.tobytes() == value.tobytes() and inner.dtype == value.dtype
+            assert (row[key] == RAGGED.get(key, 0)).sum() >= row[key].numel() - value.size
+    assert found.scenes["lane_exits"].shape[1:] == tuple(np.max([scene["lane_exits"].shape for scene in scenes], 0))
+
+
+def test_a_set_is_built_once_and_read_from_its_file(tmp_path):
+    path = file_of(tmp_path / "cache")
+    first = cached(path, build, 1)
+    same(uncached(build), first)
+    same(cached(path, never, 1), first)
+    assert list(path.parent.iterdir()) == [path]
+
+
+DAMAGES = {
+    "truncated": lambda content: content[: len(content) // 2],
+    "nonsense": lambda content: b"\xff" * 640,
+    "empty": lambda content: b"",
+    "a bit of a scene": lambda content: content[:20] + bytes([content[20] ^ 1]) + content[21:],
+    "a bit of the index": lambda content: content[:-90] + bytes([content[-90] ^ 1]) + content[-89:],
+    "a bit of the hash": lambda content: content[:-1] + bytes([content[-1] ^ 1]),
+    "another format": lambda content: content.replace(cache.FORMAT, b"e2rl-scenes-cache/0"),
+    "more at its end": lambda content: content + b"x",
+    "more at its beginning": lambda content: b"x" + content,
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_file_is_rebuilt_and_a_set_in_use_survives_it(tmp_path, capsys, damage):
+    path = file_of(tmp_path)
+    first, content = cached(path, build, 1), path.read_bytes()
+    path.unlink()
+    path.write_bytes(DAMAGES[damage](content))
+    same(cached(path, build, 1), first)
+    assert "rebuilding the damaged cache file" in capsys.readouterr().err
+    assert path.read_bytes() == content and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("kind", ["|O", "|V8", "<U2", "no type"])
+def test_a_file_that_asks_for_other_arrays_than_numbers_runs_nothing(tmp_path, kind):
+    """Its hash is right: somebody wrote it so."""
+    path = file_of(tmp_path)
+
+    def hostile(index):
+        yield from build(index)
+        index.layout["logged"] = kind, (1,)
+
+    with pytest.raises((TypeError, ValueError, OSError, InputError, AssertionError)):
+        found = uncached(hostile)
+        assert found is None or "logged" not in found.scenes
+        cached(path, hostile, 1)
+
+
+def test_what_is_changed_in_memory_does_not_reach_the_file(tmp_path):
+    path = file_of(tmp_path)
+    before = cached(path, build, 1)
+    mine = cached(path, never, 1)
+    mine.scenes["logged"].fill_(7.0)
+    same(cached(path, never, 1), before)
+
+
+def test_batches_are_copies_in_the_order_asked_for(tmp_path):
+    found = uncached(build)
+    for wanted in ([0], [1, 0], [4, 1, 4], [2, 3, 0, 1, 4]):
+        batch = found.batch(wanted)
+        assert batch["scene_index"].tolist() == wanted
+        assert torch.equal(batch["lane_points"], found.scenes["lane_points"][wanted])
+    batch = found.batch([0, 0, 0])
+    found.copy_into(batch, torch.tensor([0, 2]), torch.tensor([4, 1]))
+    assert batch["scene_index"].tolist() == [4, 0, 1] and torch.equal(batch["logged"], found.batch([4, 0, 1])["logged"])
+    found.copy_into(batch, torch.arange(3), torch.tensor([2, 3, 2]))
+    assert torch.equal(batch["lane_points"], found.scenes["lane_points"][[2, 3, 2]])
+    found.batch([0])["logged"].fill_(7.0)
+    assert not (found.scenes["logged"][0] == 7.0).any()
+
+
+def test_chosen_scenes_keep_names_noise_and_hashes():
+    every = uncached(build)
+    some = every.chosen([3, 1, 2]).chosen([2, 0])
+    assert some.scene_id == ["scene-2", "scene-3"] and some.number == [2, 3] and some.location[1] == "place-3"
+    assert some.batch([1, 0])["scene_index"].tolist() == [1, 0] == some.scenes["scene_index"].flip(0).tolist()
+    assert torch.equal(some.scenes["logged"], every.scenes["logged"][2:4])
+    assert some.hashes() == every.hashes()[2:4] and len(set(every.hashes())) == 5
+    first = every.first(2)
+    assert first.scene_id == every.scene_id[:2] and every.first(9) is every.first(None) is every
+    assert first.scenes["logged"].data_ptr() == every.scenes["logged"].data_ptr()  # not copied
+
+
+def test_what_is_sent_to_another_process_is_the_set_alone(tmp_path):
+    every = cached(file_of(tmp_path), partial(build, count=50), 1)
+    for some in (every.first(2), every.chosen([41, 7])):
+        sent = pickle.dumps(some)
+        assert len(sent) < file_of(tmp_path).stat().st_size / 5
+        same(pickle.loads(sent), some)
+
+
+def test_hashes_are_of_the_content_without_padding():
+    several = uncached(partial(build, count=3))
+    alone = replace(uncached(partial(build, count=1)), digests=[])
+    assert replace(several, digests=[]).scenes["lane_points"].shape[1] == 3
+    assert (
+        cache.content_hash({key: alone.scenes[key][0].numpy() for key in ("logged", "lane_points")})
+        == (several.hashes()[0])
+    )
+
+
+def test_scenes_of_other_settings_are_no_set():
+    scenes = [{"logged": np.zeros((5, count, 4))} for count in (3, 4)]
+    with pytest.raises(InputError, match="different logged shapes cannot be one set"):
+        uncached(partial(yielding, scenes))
+
+
+def test_what_a_killed_process_left_is_removed_and_an_error_leaves_nothing(tmp_path):
+    left, other = (tmp_path / f".{file_of(tmp_path, letter).name}.x.part" for letter in "ab")
+    left.write_bytes(b"half"), other.write_bytes(b"half")
+    cached(file_of(tmp_path), build, 1)
+    assert not left.exists() and other.exists()  # the other may be at work
+    before = sorted(tmp_path.iterdir())
+
+    def fails(index, error):
+        yield from build(index)
+        raise error
+
+    with pytest.raises(InputError, match="no"):
+        cached(file_of(tmp_path, "c"), partial(fails, error=InputError("no")), 1)
+    with pytest.raises(InputError, match=r"data\.cache=.*No space left.*free space"):
+        cached(file_of(tmp_path, "c"), partial(fails, error=OSError(28, "No space left on device")), 1)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_sets_not_used_for_longest_make_room_and_nothing_else_does(tmp_path, capsys):
+    others = [tmp_path / name for name in ("scenes-abc.map", f"scenes-{'a' * 64}.map.old", f"{'a' * 64}", "scenes.csv")]
+    for path in others:
+        path.write_bytes(bytes(10**6))
+    names = [file_of(tmp_path, letter) for letter in "abc"]
+    for number, path in enumerate(names):
+        cached(path, partial(build, seed=number), 1)
+        os.utime(path, (0, 100 * number))
+    cached(names[0], never, 1)  # used now
+    size = names[0].stat().st_size
+    new = file_of(tmp_path, "d")
+    cached(new, partial(build, seed=9), 3.5 * size / 1e9)
+    assert [path for path in [*names, new] if path.exists()] == [names[0], names[2], new]
+    assert f"removed {names[1]}" in capsys.readouterr().err
+    cached(file_of(tmp_path, "e"), build, 0)  # what is used stays, however small the limit
+    assert sorted(tmp_path.iterdir()) == sorted([*others, file_of(tmp_path, "e")])
+
+
+def test_the_folder_is_the_users(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache.cache_folder() == tmp_path / "e2rl"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert cache.cache_folder() == tmp_path / ".cache" / "e2rl"
+
+
+def _counted(folder, _: int) -> list[str]:
+    def build_and_tell(index):
+        (folder / f"built-{os.getpid()}").touch()
+        return build(index)
+
+    return cached(file_of(folder), build_and_tell, 1).hashes()
+
+
+def test_of_several_processes_one_builds(tmp_path):
+    with multiprocessing.get_context("fork").Pool(4) as pool:
+        found = pool.map(partial(_counted, tmp_path), range(8), chunksize=1)
+    assert len(list(tmp_path.glob("built-*"))) == 1 and all(hashes == found[0] for hashes in found)

@@ -1,1 +1,0 @@
-"""Mutated copies of recorded logs: `python -m tools.mutate`."""
