@@ -12,12 +12,12 @@ from e2rl.evaluation.methods import processes_of
 from e2rl.evaluation.plan import begin
 from e2rl.evaluation.protocol import WHOLE, drive_all, record
 from e2rl.evaluation.reproduce import compared_with_run, reproduction_of
-from e2rl.evaluation.rollout_files import ROLLOUTS
 from e2rl.report.results import references, write_results
 from e2rl.run.config import run_command
 from e2rl.run.endings import ending
 from e2rl.run.files import alone_in
 from e2rl.run.run import Run, how_to_go_on
+from e2rl.sim.rollouts import ROLLOUTS
 
 MAY_CHANGE = ("processes", "launcher", "shard")  # when a run is resumed
 

@@ -1,22 +1,29 @@
-"""Training: `python train.py` runs evolution rounds; `stage=prior` trains a prior, `stage=imitation` an actor,
-`stage=bits` the ego bits."""
+"""Training: `python train.py [data=...] [synthesizer=...] [learner=...]` hardens an ego in rounds of Algorithm 1.
 
+`stage=prior` trains a prior, `stage=imitation` the start of an actor, `stage=bits` the driver bits.
+"""
+
+import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
+
+# isort: split
 import sys
 from contextlib import nullcontext
-from functools import partial
-from math import nan
 
 import hydra
 from omegaconf import DictConfig
-from tqdm import tqdm
 
 from e2rl.evaluation.methods import build_ego, build_prior, build_traffic, caption
 from e2rl.evaluation.rollout_files import ENDED_FILE, add_ended
-from e2rl.learning.build import build_evolution, build_logger, build_measure, check_training, run_bits, run_imitation
+from e2rl.learning.bits_training import run_bits_stage
+from e2rl.learning.build import build_evolution, build_logger, build_measure, build_progress, check_training
+from e2rl.learning.evolution import Evolution
+from e2rl.learning.imitation import run_imitation_stage
 from e2rl.learning.prior_training.distributed import follower_overrides, follows, started_by_torchrun
 from e2rl.learning.prior_training.stage import run_prior_stage
-from e2rl.learning.run_checkpoint import checkpoints, load_checkpoint, save_checkpoint
-from e2rl.report.rounds import draw_round, round_line
+from e2rl.learning.run_checkpoint import load_checkpoint, rounds_done, save_checkpoint
+from e2rl.report.answer import compared_answer
+from e2rl.report.curriculum_figure import draw_choices
+from e2rl.report.rounds import round_line, save_videos
 from e2rl.report.tables import metric_tables, print_tables, save_tables
 from e2rl.run.config import resolved, run_command, set_up
 from e2rl.run.endings import ending
@@ -29,41 +36,60 @@ from e2rl.scenes.source import load_scenes
 MAY_CHANGE = ("rounds", "device", "threads", "launcher")  # when a run is resumed
 
 
+def train_round(run: Evolution) -> dict[str, float]:
+    """One round of Algorithm 1; returns its metrics."""
+    order = run.draw()  # scenes, and for each an intensity and a causal template, by the curriculum
+    attack = run.roll_out(order)  # the attack on the current policy; what no driver avoids does not enter D'
+    run.prefetch()  # the next round's attack, in another process meanwhile
+    learned = run.learn(attack)  # episodes in D', by TorchRL's collector, and updates of the policy, in turn
+    return run.move_on(order, attack, learned)  # the curriculum, by what the policy failed in
+
+
 def evolve(task: Run) -> None:
-    """Rounds of Algorithm 1: synthesize D' against the current ego, improve the ego on it, move the curriculum."""
-    config, folder = task.config, task.folder
-    prior, origin = build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
-    traffic, ego = build_traffic(config.synthesizer, prior), build_ego(config)
-    scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
-    run, logger = build_evolution(config, scenes, ego, traffic, folder=folder), build_logger(config, folder)
-    measure = build_measure(config, ego, task.choices["ego"], traffic, prior, folder)
-    task.begin({"scenes": listed(scenes), "measured scenes": listed(measure.setup.scenes)})
-    begun = config.resume and checkpoints(config.resume)  # a run can be cut off in the measurement before
-    done = load_checkpoint(config.resume, run) if begun else 0
-    logger.forget(done)
-    if done == 0:
-        measure("before", run.ego, 0)
+    """Harden an ego: measure it, train it for `rounds` rounds, measure it again."""
+    config, folder, done = task.config, task.folder, rounds_done(task.config.resume)
+    progress = build_progress(config, done)
+    progress.say(
+        f"{task.choices['ego']} against {config.synthesizer.name}: measure, {config.rounds} rounds, measure again"
+    )
+    with progress.phase("begin"):
+        prior, origin = build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
+        traffic, ego = build_traffic(config.synthesizer, prior), build_ego(config)
+        scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
+        run, logger = build_evolution(config, scenes, ego, traffic, folder=folder), build_logger(config, folder)
+        measure = build_measure(config, ego, task.choices["ego"], traffic, prior, folder)
+        task.begin({"scenes": listed(scenes), "measured scenes": listed(measure.setup.scenes)})
+        logger.forget(load_checkpoint(config.resume, run) if done else 0)
+    progress.say(f"{len(scenes)} scenes to train on, {len(measure.setup.scenes)} to measure on, in {folder}")
+    if not done:
+        with progress.phase("measurement"):
+            measure("before", run.ego, 0)
+        progress.say("measured before training")
         save_checkpoint(folder, run, resolved(config), config.keep_last)
-    bar = tqdm(range(done, config.rounds), "evolution", config.rounds, initial=done, unit="round", disable=None)
-    for number in bar:
-        metrics = run.run_round()
-        logger.log(metrics, number, run.choices)
-        add_ended(folder / ENDED_FILE, number, run.ended)
-        save_checkpoint(folder, run, resolved(config), config.keep_last)
-        draw_round(run, scenes, config.synthesizer.name, folder, logger, config.logger.replays)
-        bar.set_postfix(eta=f"{metrics['synthesizer/eta']:.2f}", hit=f"{metrics.get('synthesizer/contact', nan):.0%}")
-        with tqdm.external_write_mode():
-            print(round_line(metrics, number + 1, config.rounds), flush=True)
+    for number in range(run.round, config.rounds):
+        with progress.phase("round"):
+            metrics = train_round(run)
+            logger.log(metrics, number, run.choices)
+            add_ended(folder / ENDED_FILE, number, run.errored)
+            save_checkpoint(folder, run, resolved(config), config.keep_last)
+            if picture := draw_choices(folder):
+                logger.show("curriculum/choices", picture, number)
+            if config.logger.videos and run.memory.rounds:
+                attacks = run.memory.rounds[-1].traffic, scenes, number + 1, config.synthesizer.name
+                for k, video in enumerate(save_videos(*attacks, folder, config.logger.videos)):
+                    logger.show(f"synthesizer/video_{k + 1}", video, number)
+        progress.say(round_line(metrics, number + 1, config.rounds))
     logger.close()
-    tables = metric_tables(measure("after", run.ego, run.round), caption(config, origin))
-    save_tables(folder / "tables.md", tables)
-    print_tables(tables)
-    print(f"\nwritten to {folder}; {run.improve.outcome(folder)}")
+    with progress.phase("measurement"):
+        rows = measure("after", run.ego, run.round)
+    save_tables(folder / "tables.md", metric_tables(rows, caption(config, origin)))
+    before, after = ([row for row in rows if row["stage"] == stage] for stage in ("before", "after"))
+    print("", *compared_answer(before, after, folder=folder), run.improve.outcome(folder), sep="\n")
 
 
 def train_prior(task: Run) -> None:
     """Train a prior and print its nominal closed loop on held-out logs."""
-    outcome = run_prior_stage(task.config, task.folder, task.begin)
+    outcome = run_prior_stage(task, build_logger(task.config, task.folder))
     if outcome is None:
         return  # another process of torchrun is the leader and reports
     path, rows = outcome
@@ -73,48 +99,42 @@ def train_prior(task: Run) -> None:
 
 def imitate(task: Run) -> None:
     """Warm-start the actor from the recorded egos."""
-    config, folder = task.config, task.folder
-    ego = build_ego(config)
-    scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
-    begin = partial(task.begin, {"scenes": listed(scenes)})
-    losses = run_imitation(config, scenes, ego, folder, build_logger(config, folder), begin)
-    print(", ".join(f"{name} {value:.4f}" for name, value in losses.items() if value == value))  # NaN: none held out
-    print(f"start evolution rounds from it with ego.checkpoint={folder}")
+    print(losses_line(run_imitation_stage(task, build_logger(task.config, task.folder))))
+    print(f"start evolution rounds from it with ego.checkpoint={task.folder}")
 
 
 def train_bits(task: Run) -> None:
-    """Train the ego bits on recorded vehicles, in a minute or two: a resumed run begins anew."""
-    config, folder = task.config, task.folder
-    scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
-    task.begin({"scenes": listed(scenes)})
-    losses = run_bits(config, scenes, folder, build_logger(config, folder))
-    print(", ".join(f"{name} {value:.4f}" for name, value in losses.items() if value == value))  # NaN: none held out
-    print(f"drive with it by ego=bits ego.checkpoint={folder}")
+    """Train the driver bits on recorded vehicles."""
+    print(losses_line(run_bits_stage(task, build_logger(task.config, task.folder))))
+    print(f"drive with it by ego=bits ego.checkpoint={task.folder}")
+
+
+def losses_line(row: dict[str, float]) -> str:
+    """The losses of a training's chosen turn."""
+    return ", ".join(f"{name} {value:.4f}" for name, value in row.items() if value == value)  # NaN: none held out
 
 
 STAGES = {"evolution": evolve, "prior": train_prior, "imitation": imitate, "bits": train_bits}
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
-def run(config: DictConfig) -> None:
+def command(config: DictConfig) -> None:
     """One stage of training, as configured."""
     with ending(lambda: how_to_go_on(config)):
         task = Run.of(config, MAY_CHANGE)
         config = task.config
-        if config.stage not in STAGES:
-            raise InputError(f"stage={config.stage}: choose one of {', '.join(STAGES)}")
-        if started_by_torchrun() and config.stage != "prior":
-            raise InputError(f"torchrun: stage={config.stage} runs in one process, started with python")
+        if started_by_torchrun() and config.stage.name != "prior":
+            raise InputError(f"torchrun: stage={config.stage.name} runs in one process, started with python")
         set_up(config)
         check_training(config)
         with nullcontext() if follows() else alone_in(task.folder):
-            STAGES[config.stage](task)
+            STAGES[config.stage.name](task)
 
 
 def main() -> None:
     """The command, in this process or in one of torchrun's."""
     sys.argv += follower_overrides()
-    run_command(run, "train")
+    run_command(command, "train")
 
 
 if __name__ == "__main__":

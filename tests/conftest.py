@@ -1,7 +1,10 @@
 """Scenes and checkpoints, good and bad, that the tests of the scripts share."""
 
-import atexit
 import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: each of xdist's processes has one core
+
+import atexit
 import pickle
 import shutil
 import tempfile

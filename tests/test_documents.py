@@ -18,7 +18,8 @@ PLACEHOLDER = re.compile(r"[<>*{}\[\]]|\.\.\.|(?<![a-zA-Z])[A-Z]{3,}(?![a-zA-Z])
 DOCUMENT = re.compile(r"(?<![\w/-])[\w-]+\.md\b")
 SECTION = re.compile(r"docs/method\.md, sections? (\d+)(?: to (\d+))?")
 WRITTEN = {"tables.md", "methods.md", "egos.md", "tutorial.md"}  # documents that a run writes, or the site's build
-COMMAND = re.compile(r"(?:python|torchrun[^`\n]*?) (evaluate|train)\.py((?:\\\n|[^`\n])*)")
+COMMANDS = r"python (?:evaluate|train)\.py|torchrun[^`\n]*? train\.py|e2rl (?:evaluate|train|tune|prior-tables|skeleton)"
+COMMAND = re.compile(rf"({COMMANDS})(?![\w-])((?:\\\n|[^`\n])*)")
 EXTENDED = "--config-dir"
 
 
@@ -76,7 +77,8 @@ def commands() -> list[tuple[str, tuple[str, ...]]]:
     """The commands of the documents, each a configuration and its overrides; of those that differ in values, one."""
     found = {}
     for text in (text for name, text in texts().items() if name.endswith(".md")):
-        for name, rest in COMMAND.findall(text):
+        for command, rest in COMMAND.findall(text):
+            name = command.split()[-1].removesuffix(".py").replace("-", "_")
             parts = shlex.split(rest.replace("\\\n", " "), comments=True)
             if any(is_choice(part) and part.endswith("=NAME") for part in parts):
                 continue

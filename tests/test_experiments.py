@@ -1,12 +1,10 @@
 """The experiments of evaluate.py on tiny runs: their rows, tables, figures and files."""
 
-import json
 
 import pytest
 
 from e2rl.evaluation.rollout_files import read_metrics
 from e2rl.metrics.catalogue import META_STAGE, OPEN_LOOP_STAGE, STAGES
-from e2rl.run.config import load_choice
 from tests.scripts import SHORT, arguments, call, error_line
 
 EXPERIMENTS = [
@@ -135,20 +133,6 @@ def test_egos_before_and_after_are_rated_in_one_run(evaluated, tmp_path):
         assert {path.stem for path in run.glob(f"*.{suffix}")} == {"policy_learning", "curves"}
 
 
-def test_a_planner_is_tuned_and_the_study_goes_on(evaluate, evaluated, tmp_path):
-    study = ["experiment=tune_planner", "ego=sampling", f"tuning.study={tmp_path / 'study'}"]
-    evaluated(*study, "tuning.trials=1")
-    run = evaluated(*study, "tuning.trials=2")
-    result = json.loads((run / "tuning.json").read_text())
-    assert len(result["trials"]) == 2 and set(result["best"]) <= set(load_choice("ego", "sampling"))
-    assert {"collision nominal@0", "collision e2@2"} <= set(result["trials"][0]["metrics"])
-    assert "margin: " in (run / "tuned.yaml").read_text()
-    status, said = evaluate(*study[:2], "tuning.spaces.sampling.margin=[2,3]")
-    assert status == 2 and "tuning.space.margin=[2, 3]: leaves out the present value" in error_line(said)
-    status, said = evaluate(study[0], "ego=idm")
-    assert status == 2 and "tuning.spaces: no ranges for this ego" in error_line(said)
-
-
 def test_table_4_has_a_row_for_every_ego_in_three_formats(evaluated):
     run = evaluated("experiment=table4")
     head, *rows = (run / "egos.csv").read_text().splitlines()
@@ -161,30 +145,6 @@ def test_table_4_has_a_row_for_every_ego_in_three_formats(evaluated):
     differences = (run / "egos_differences.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in differences[1:]] == [name for name in names if name != "lane_graph"]
     assert "## Egos" in (run / "tables.md").read_text()
-
-
-def test_an_adversary_is_tuned_and_the_study_goes_on(evaluate, evaluated, tmp_path):
-    """Rollouts are those of the method's own YAML; another budget or method is another study."""
-    study = ["experiment=tune", "synthesizer=e2", "tuning.ladder=2", f"tuning.study={tmp_path / 'study'}"]
-    evaluated(*study, "tuning.trials=1")
-    run = evaluated(*study, "tuning.trials=3")
-    result = json.loads((run / "tuning.json").read_text())
-    tried = [trial["parameters"]["interception.lateral"] for trial in result["trials"]]
-    assert tried == pytest.approx([load_choice("synthesizer", "e2").interception.lateral, 0.5, 4.0])
-    assert {"cfr", "aor_step", "aor_step nominal", "real_adv"} <= set(result["trials"][0]["metrics"])
-    assert "interception:\n  lateral: " in (run / "tuned.yaml").read_text()
-    assert len((run / "tuning_curve.csv").read_text().splitlines()) == 4
-    assert (run / "tuning_curve.png").exists()
-    for more, what in (
-        (["tuning.objective.off_road=0.1"], "a study that differs in objective; name another file"),
-        (["synthesizer=cat"], "a study that differs in parameters, space; name another file"),
-        (["synthesizer=idm", "tuning.study=null"], "no ranges for this synthesizer"),
-        (["tuning.objective.seek=speed"], "tuning.objective.seek=speed: choose one of"),
-        (["tuning.group=prior"], "tuning.group=prior: choose one of"),
-    ):
-        kept = [each for each in study if each.split("=")[0] not in [one.split("=")[0] for one in more]]
-        status, said = evaluate(*kept, "tuning.trials=3", *more)
-        assert status == 2 and what in error_line(said)
 
 
 def test_a_folder_of_somebody_else_adds_methods_to_the_table(world, tmp_path, monkeypatch, capsys):

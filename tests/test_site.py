@@ -14,6 +14,7 @@ import pytest
 for module in ("mkdocs", "material", "mkdocstrings_handlers.python", "latex2mathml"):
     pytest.importorskip(module, reason="needs the extra docs")
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
 LOADED = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src"}
 
@@ -92,7 +93,6 @@ def test_the_search_finds_pages_docstrings_and_the_notebook(site):
     entries = json.loads((site[1] / "search" / "search_index.json").read_text())["docs"]
     for page, words in (
         ("concepts/synthesizer.html", "maximal cliques"),
-        ("reference/traffic.html", "the extension point for traffic"),
-        ("tutorial.html", "which duty did the other vehicle break"),
+                ("tutorial.html", "which duty did the other vehicle break"),
     ):
         assert any(entry["location"].startswith(page) and words in entry["text"].lower() for entry in entries), page

@@ -15,6 +15,7 @@ def test_no_outputs_are_stored():
     assert cells and not [cell for cell in cells if cell["outputs"] or cell["execution_count"]]
 
 
+@pytest.mark.slow
 def test_the_notebook_runs_and_shows_a_failure(tmp_path, monkeypatch):
     pytest.importorskip("ipykernel", reason="needs ipykernel, of the extra test")
     nbclient = pytest.importorskip("nbclient", reason="needs nbclient, of the extra test")

@@ -23,7 +23,7 @@ def draw(run: Run) -> None:
     chain = LongestChain(plan.methods[0])
     run_protocol(plan.setup, plan.methods, plan.asked.seeds, run.folder, only=plan.only)
     rollout = chain.rollout(plan.scenes, plan.setup.ego_name, run.folder)
-    save_figure(run.folder / "skeleton.png", skeleton_figure(rollout, chain.selection, chain.topology))
+    save_figure(run.folder / "skeleton.png", skeleton_figure(rollout, chain.selection))
     print(f"\ndrawn: {run.folder / 'skeleton.png'}")
 
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
+from tensordict import TensorDict
 
 from e2rl.report import drawing
 from e2rl.report.drawing import Shape, TrafficMap, Trail, new_figure, save_figure

@@ -32,7 +32,9 @@ def merge(runs: Sequence[Path], into: Path) -> int:
     first = known[runs[0]]
     for run in runs[1:]:
         if names := [name for kind in ("inputs", "settings") for name in changed(first[kind], known[run][kind])]:
-            raise InputError(f"{run}: began with another {', '.join(names)} than {runs[0]}; merge the shards of one run")
+            raise InputError(
+                f"{run}: began with another {', '.join(names)} than {runs[0]}; merge the shards of one run"
+            )
     if into.exists():
         raise InputError(f"{into}: is there already; name a new folder")
     with written_whole(into) as folder:

@@ -13,14 +13,15 @@ from e2rl.evaluation.displacement_table import open_loop_rows
 from e2rl.evaluation.meta_table import meta_rows
 from e2rl.evaluation.methods import processes_of
 from e2rl.evaluation.plan import begin
-from e2rl.evaluation.protocol import run_protocol
-from e2rl.evaluation.rollout_files import METRICS_FILE, write_metrics
+from e2rl.evaluation.protocol import drive_all, record
+from e2rl.evaluation.summary import metric_rows
 from e2rl.report.results import write_results
 from e2rl.run.config import check_counts, run_command
 from e2rl.run.endings import ending
 from e2rl.run.files import alone_in
 from e2rl.run.run import Run, how_to_go_on
 from e2rl.run.settings import conf_folder
+from e2rl.sim.rollouts import ROLLOUTS
 
 MAY_CHANGE = ("processes", "launcher")  # when a run is resumed
 
@@ -30,15 +31,19 @@ def prior_tables(run: Run) -> None:
     config, folder = run.config, run.folder
     check_counts(config, open_loop_samples=0, meta_rollouts=0)
     plan = begin(run)
-    methods, setup, parts, rows = plan.methods, plan.setup, run.parts(), []
+    methods, setup, parts = plan.methods, plan.setup, run.parts()
+    before, after = [], []
     if config.open_loop_samples:
-        rows += open_loop_rows(plan.scenes, methods, config.open_loop_samples, config.device, parts)
-    how = (plan.asked.seeds, folder, plan.asked.save_rollouts, processes_of(config), plan.only, parts)
-    rows += run_protocol(setup, methods, *how)
+        before = open_loop_rows(plan.scenes, methods, config.open_loop_samples, config.device, parts)
+    into = folder / ROLLOUTS if plan.asked.save_rollouts else None
+    scored = drive_all([setup], methods, plan.asked.seeds, into, processes_of(config), plan.only, parts)
     if config.meta_rollouts:
-        rows += meta_rows(setup, methods, config.meta_rollouts, parts)
-    rows = [row | run.origin() for row in rows]
-    write_metrics(folder / METRICS_FILE, rows)
+        after = meta_rows(setup, methods, config.meta_rollouts, parts)
+
+    def summarise(*found: list) -> list[dict]:
+        return [row | run.origin() for row in (*before, *metric_rows(*found), *after)]
+
+    rows = record(*scored, folder, summarise)
     print("", *write_results(run, plan, rows), sep="\n")
 
 

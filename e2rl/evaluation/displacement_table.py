@@ -5,7 +5,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from e2rl.evaluation.protocol import SEEDS_APART, Method
@@ -27,12 +27,12 @@ BATCH = 32  # scenes planned at once
 
 @torch.no_grad()
 def open_loop_rows(
-    scenes: SceneSet, methods: Sequence[Method], samples: int, device: str = "cpu", kept: Parts = NO_PARTS
+    scenes: SceneSet, methods: Sequence[Method], samples: int, device: str = "cpu", parts: Parts = NO_PARTS
 ) -> list[dict]:
-    """Rows of metrics.json, stage `open loop`, of every uncontrolled method that predicts: minADE, mean and joint ADE
-    over `samples` and their ratios to constant velocity's ADE on the same vehicles, with intervals over places.
+    """Rows of metrics.json, stage `open loop`, of every uncontrolled method that predicts.
 
-    kept: methods that are finished.
+    They hold minADE, mean and joint ADE over `samples` plans of each scene, and their ratios to constant velocity's ADE
+    on the same vehicles, with intervals over places. parts: the methods that are done.
     """
     rows = []
     for number, method in enumerate(methods):
@@ -40,7 +40,7 @@ def open_loop_rows(
             continue
         count = samples if method.traffic.stochastic else 1
         compute = partial(open_loop_metrics, scenes, method, count, device)
-        found = kept.result(f"open-loop-{number:03}", [method.name, count, "with ended"], compute)
+        found = parts.result(f"open-loop-{number:03}", [method.name, count, "with ended"], compute)
         done, key = found["scenes"], (scenes.dataset, scenes.split, method.name, EGO, method.eta)
         fields = {"stage": OPEN_LOOP_STAGE, "ended": found["ended"]}
         rows.append(metric_row(key, done, count, done * count, found["metrics"], **fields))
@@ -48,26 +48,31 @@ def open_loop_rows(
 
 
 def open_loop_metrics(scenes: SceneSet, method: Method, count: int, device: str) -> dict[str, Any]:
-    """The metrics of `count` open-loop samples of every scene, the number of scenes that they are of, and ended: how
-    many others there are, for each reason. Raises InputError where there are only these."""
+    """`metrics` of `count` open-loop samples of every scene, the number of `scenes` that they are of, and `ended`: how
+    many others errored, for each reason.
 
-    def plan(tasks: Sequence[int]) -> dict:
+    Raises:
+        InputError: all errored.
+    """
+
+    def plan(tasks: Sequence[int]) -> TensorDict:
         index = torch.tensor(tasks)
         scene = scenes.batch(index).to(device)
         seed = index.to(device) + SEEDS_APART * torch.arange(count, device=device)[:, None]
         plans = method.traffic.open_loop_plans(scene, seed)
         there = _predicted(scene, plans.shape[2])[:, None, :, None].expand(plans.shape[:-1])
-        return {"states": plans.cpu(), "valid": there.cpu(), **_displacements(scene, plans)}
+        found = {"states": plans, "valid": there, **_displacements(scene, plans)}
+        return TensorDict(found, [len(tasks)]).cpu()
 
-    parts, lost = [], []
+    planned, errored = [], []
     for batch in torch.arange(len(scenes)).split(BATCH):
-        found, ended = attempt(plan, batch.tolist())
-        parts += found
-        lost += [why for _, why in ended]
-    require_rows([part for _, part in parts], lost, None)
-    done = [scene for tasks, _ in parts for scene in tasks]
-    columns = {name: torch.cat([part[name] for _, part in parts]) for name in parts[0][1]}
-    return {"metrics": _summary(columns, scenes, done), "scenes": len(done), "ended": count_reasons(lost)}
+        found, others = attempt(plan, batch.tolist())
+        planned += found
+        errored += [why for _, why in others]
+    require_rows(planned, errored, None)
+    done = [scene for tasks, _ in planned for scene in tasks]
+    columns = torch.cat([part.exclude("states", "valid") for _, part in planned])
+    return {"metrics": _summary(columns, scenes, done), "scenes": len(done), "ended": count_reasons(errored)}
 
 
 def _predicted(scene: TensorDictBase, vehicles: int) -> Tensor:
@@ -82,10 +87,10 @@ def _displacements(scene: TensorDictBase, plans: Tensor) -> dict[str, Tensor]:
     straight = keep_velocity(scene["start"][:, :vehicles])
     logged, valid = scene["logged"][:, :, :vehicles], scene["logged_valid"][:, :, :vehicles]
     columns = scene_displacements(plans, straight, logged, valid, here, HORIZONS)
-    return {name: value.cpu().double() for name, value in columns.items()}
+    return {name: value.double() for name, value in columns.items()}
 
 
-def _summary(columns: dict[str, Tensor], scenes: SceneSet, done: Sequence[int]) -> dict[str, dict[str, float]]:
+def _summary(columns: TensorDict, scenes: SceneSet, done: Sequence[int]) -> dict[str, dict[str, float]]:
     """{metric: {mean, low, high, n}}: ratios of sums over the scenes `done`, places resampled; n counts vehicles."""
     rows = [{"location": scenes.location[scene], "scene_id": scenes.scene_id[scene]} for scene in done]
     cluster, clusters = cluster_index(rows)

@@ -33,6 +33,7 @@ from e2rl.prior.routes import take_route
 from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.scenes.recording import VEHICLE
 from e2rl.scenes.scene import SceneSet
+from e2rl.sim.rollouts import Rollouts
 from e2rl.traffic.attempt import attempt
 
 TRACKS = 512  # vehicles of rollouts processed at once: bounds the memory of the pairwise features
@@ -49,10 +50,11 @@ class Tally:
         self.hits = {name: torch.zeros(size, dtype=torch.float64) for name in INDICATIONS}
         self.rollouts = torch.zeros(size, dtype=torch.float64)
 
-    def add(self, index: Tensor, rollouts: dict, weight: int = 1) -> None:
+    def add(self, index: Tensor, rollouts: Rollouts, weight: int = 1) -> None:
         """Count rollouts of scenes index [B] int64, each as `weight` equal ones."""
         scenes = self.scenes.batch(index)
-        batch = {**rollouts, **road_of(scenes, rollouts["routes"])}
+        tracks = {"states": rollouts.states, "valid": rollouts.valid, "size": rollouts.size}
+        batch = {**tracks, **roads_of(scenes, rollouts.routes)}
         every = index[:, None] * self.vehicles + torch.arange(self.vehicles)
         self.rollouts.index_add_(0, every.flatten(), torch.full((every.numel(),), float(weight), dtype=torch.float64))
         rollout, agent = evaluated(scenes).nonzero(as_tuple=True)
@@ -72,7 +74,7 @@ class Tally:
         begin = 0  # of the part
         for scenes in self.scenes.parts():
             log = {"states": scenes["logged"], "valid": scenes["logged_valid"], "size": scenes["size"]}
-            batch = {**log, **road_of(scenes, scenes["route_log"])}
+            batch = {**log, **roads_of(scenes, scenes["route_log"])}
             row, agent = (evaluated(scenes) & driven[begin : begin + len(scenes)]).nonzero(as_tuple=True)
             for part in torch.arange(len(row)).split(TRACKS):
                 scene = begin + row[part]
@@ -91,16 +93,16 @@ class Tally:
             result[name] = likelihood(log_p, known, scene, len(self.scenes))
         return result
 
-    def state(self, done: int, lost: list[str]) -> tuple:
-        """The counts after so many tasks, of which `lost` ended for these reasons."""
-        return done, lost, self.rollouts, self.counts, self.hits
+    def state(self, done: int, errored: list[str]) -> tuple:
+        """The counts after so many tasks, of which some errored for these reasons."""
+        return done, errored, self.rollouts, self.counts, self.hits
 
     def goes_on(self, state: tuple | None) -> tuple[int, list[str]]:
         """Go on from a `state`, None: from the beginning; returns the tasks done and the reasons so far."""
         if state is None:
             return 0, []
-        done, lost, self.rollouts, self.counts, self.hits = state
-        return done, lost
+        done, errored, self.rollouts, self.counts, self.hits = state
+        return done, errored
 
 
 def evaluated(scene: TensorDictBase) -> Tensor:
@@ -110,7 +112,7 @@ def evaluated(scene: TensorDictBase) -> Tensor:
     return torch.cat([torch.zeros_like(chosen[:, :1]), chosen[:, 1:vehicles]], 1)
 
 
-def road_of(scene: TensorDictBase, route: Tensor) -> dict[str, Tensor]:
+def roads_of(scene: TensorDictBase, route: Tensor) -> dict[str, Tensor]:
     """Road, lights and routes of scenes [B] whose vehicles follow candidates route [B, V] (-1: no route, no lights)."""
     chosen = route.clamp(min=0)
     light = take_route(scene["route_light"], chosen)
@@ -124,12 +126,12 @@ def road_of(scene: TensorDictBase, route: Tensor) -> dict[str, Tensor]:
     }
 
 
-def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, kept: Parts = NO_PARTS) -> list[dict]:
-    """Rows of metrics.json, stage `meta-metric`: every feature's likelihood and their weighted sum over `rollouts`
-    rollouts of each scene, with intervals over places. The row of the log also has its split-half `real`.
+def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, parts: Parts = NO_PARTS) -> list[dict]:
+    """Rows of metrics.json, stage `meta-metric`: every feature's likelihood and their weighted sum.
 
-    A deterministic method is rolled out once. Rollouts that end for an error are counted in `ended`, and in no
-    likelihood. kept: the counts of each method so far.
+    They are over `rollouts` rollouts of each scene, with intervals over places; a deterministic method is rolled out
+    once. The row of the log also has its split-half `real`. Rollouts that error are counted in `ended`, and in no
+    likelihood. parts: the counts of each method so far.
     """
     scenes, rows = setup.scenes, []
     seeds = [rollouts if method.traffic.stochastic else 1 for method in methods]
@@ -137,22 +139,22 @@ def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, kept: Part
         for number, (method, count) in enumerate(zip(methods, seeds, strict=True)):
             name, identity = f"meta-{number:03}", [method.name, float(method.eta), rollouts, "with ended"]
             tally, tasks = (Tally(scenes), [(scene, seed) for seed in range(count) for scene in range(len(scenes))])
-            done, lost = tally.goes_on(kept.load(name, identity))
+            done, errored = tally.goes_on(parts.load(name, identity))
             bar.update(done)
             for begin in range(done, len(tasks), setup.batch):
-                part = tasks[begin : begin + setup.batch]
-                parts, ended = attempt(partial(setup.roll_out, method), part)
-                for driven, rolled_out in parts:
-                    tally.add(torch.tensor([scene for scene, _ in driven]), rolled_out, rollouts // count)
-                lost += [why["reason"] for _, why in ended]
-                kept.save(name, identity, tally.state(begin + len(part), lost))
-                bar.update(len(part))
+                batch = tasks[begin : begin + setup.batch]
+                driven, others = attempt(partial(setup.roll_out, method), batch)
+                for pairs, rolled_out in driven:
+                    tally.add(torch.tensor([scene for scene, _ in pairs]), rolled_out, rollouts // count)
+                errored += [why["reason"] for _, why in others]
+                parts.save(name, identity, tally.state(begin + len(batch), errored))
+                bar.update(len(batch))
             metrics = summarise_meta(tally.likelihoods(), scenes)
             if method.traffic.replays_log:
                 metrics["real_split_half"] = log_split_half(scenes)
             key = (scenes.dataset, scenes.split, method.name, setup.ego_name, method.eta)
-            fields = {"stage": META_STAGE, "ended": dict(Counter(lost))}
-            rolled = rollouts * len(scenes) - len(lost) * (rollouts // count)
+            fields = {"stage": META_STAGE, "ended": dict(Counter(errored))}
+            rolled = rollouts * len(scenes) - len(errored) * (rollouts // count)
             rows.append(metric_row(key, len(scenes), rollouts, rolled, metrics, **fields))
     return rows
 

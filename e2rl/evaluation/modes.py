@@ -6,7 +6,7 @@ from pathlib import Path
 from statistics import fmean
 from types import NoneType
 
-from e2rl.evaluation.rollout_files import nulls, rollout_name
+from e2rl.evaluation.rollout_files import nulls
 from e2rl.evaluation.summary import GROUP
 from e2rl.metrics.failure_modes import (
     FEATURES,
@@ -20,6 +20,7 @@ from e2rl.metrics.failure_modes import (
 )
 from e2rl.run.errors import InputError
 from e2rl.run.files import misfit, write_atomically
+from e2rl.sim.rollouts import rollout_name
 
 MODES_FILE = "modes.json"
 OTHER = 0  # number of the small modes together
@@ -101,7 +102,7 @@ def describe(mode: int, members: Sequence[Row], groups: Sequence[dict]) -> dict:
             for group, count in zip(groups, by_group, strict=True)
         ],
         **{name: known_mean(members, name) for name in (*VERDICTS, *MEANS)},
-        "typical": {name: typical[name] for name in TYPICAL} | {"file": rollout_name(dict(typical))},
+        "typical": {name: typical[name] for name in TYPICAL} | {"file": rollout_name(typical)},
     }
 
 

@@ -14,7 +14,6 @@ from e2rl.evaluation.modes import MODES_FILE, find_modes, write_modes
 from e2rl.evaluation.rollout_files import (
     ENDED_FILE,
     METRICS_FILE,
-    SOURCE,
     TABLE,
     require_rows,
     write_ended,
@@ -22,6 +21,7 @@ from e2rl.evaluation.rollout_files import (
     write_rows,
 )
 from e2rl.evaluation.summary import empty_rows, metric_rows
+from e2rl.metrics.catalogue import SOURCE
 from e2rl.metrics.evasion import add_avoidable
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.ego import Ego
@@ -38,7 +38,7 @@ from e2rl.traffic.traffic import Traffic
 SEEDS_APART = 1_000_003
 WHOLE = (0, 1)  # the only shard of a run
 Task = tuple[int, int]  # position of a scene, sampling seed
-# Rows and realism samples, one of each per rollout; and of rollouts without a score, which they are and what was raised.
+# Rows and realism samples, one of each per rollout; and the entries of ended.json of rollouts that errored.
 Scored = tuple[list[dict], list[dict[str, Tensor]], list[dict]]
 
 
@@ -205,7 +205,7 @@ def record(
     folder: Path | None,
     summarise: Callable[..., list[dict]],
 ) -> list[dict]:
-    """The rows of metrics.json: summarise(rows, samples), with the counts of what errored.
+    """The rows of metrics.json: summarise(rows, samples), with the counts of what errored where they have none.
 
     Writes rollouts.csv, modes.json, metrics.json and, where rollouts errored, ended.json into a folder. A method of
     which all rollouts errored has a row too, without metrics.
@@ -218,7 +218,7 @@ def record(
     require_rows(rows, errored, folder)
     modes, known = find_modes(rows), summarise(rows, samples)
     known += empty_rows(known, errored)
-    result = [row | {"ended": count_reasons(entry for entry in errored if _is_of(entry, row))} for row in known]
+    result = [{"ended": count_reasons(entry for entry in errored if _is_of(entry, row))} | row for row in known]
     if folder is not None:
         write_modes(folder / MODES_FILE, modes)
         write_rows(folder / TABLE, rows)

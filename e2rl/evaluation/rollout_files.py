@@ -9,13 +9,12 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
-from e2rl.metrics.catalogue import WORDS, row_columns
+from e2rl.metrics.catalogue import SOURCE, WORDS, row_columns
 from e2rl.run.errors import InputError
 from e2rl.run.files import misfit, write_atomically
 from e2rl.traffic.attempt import summary_of
 
 TABLE, METRICS_FILE, ENDED_FILE = "rollouts.csv", "metrics.json", "ended.json"
-SOURCE = ("dataset", "split", "method", "ego_policy")  # columns of a row before `catalogue.row_columns`
 NEEDED = (*SOURCE, "scene_id", "seed", "eta")
 NUMBER = (int, float, NoneType)
 INTERVAL = {"low": NUMBER, "high": NUMBER, "n": NUMBER, ...: NUMBER}

@@ -1,21 +1,20 @@
 """The before/after table of an evolution run: the same scenes and seeds, nominal and adversarial, for both policies."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
-from torch import Tensor
-
-from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.evaluation.protocol import Method, Setup, drive_all, record
 from e2rl.evaluation.rollout_files import METRICS_FILE, read_metrics, write_metrics
-from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollouts
-from e2rl.metrics.score import score_rollouts
+from e2rl.evaluation.summary import metric_rows
+from e2rl.metrics.realism import Samples
 from e2rl.metrics.statistics import paired_differences
 from e2rl.planners.ego import Ego
 from e2rl.run.parts import Parts
 from e2rl.run.processes import Processes
 from e2rl.run.run import origin_of
+from e2rl.sim.rollouts import ROLLOUTS
 
 
 @dataclass
@@ -35,22 +34,22 @@ class BeforeAfter:
         The rows of stage `after` are paired with the same method before, under the name `before`.
         """
         setup, folder = replace(self.setup, ego=ego), self.folder / stage
-        kept = Parts(self.folder, stage, f"after {rounds} rounds")
-        given = {"processes": self.processes, "parts": kept, "stage": stage, **origin_of(self.folder)}
-        rows = run_protocol(setup, self.methods, self.seeds, folder, **given)
-        if stage == "after":
+        parts, measured = Parts(self.folder, stage, f"after {rounds} rounds"), Parts(self.folder, "measured")
+        scored = drive_all([setup], self.methods, self.seeds, folder / ROLLOUTS, processes=self.processes, parts=parts)
+        rows = record(*scored, folder, partial(metric_rows, stage=stage, **origin_of(self.folder)))
+        if stage == "before":
+            measured.save(stage, None, scored[:2])
+        elif (before := measured.load("before", None)) is not None:
             for row in rows:
-                row["paired"]["before"] = paired_differences(*self._scored("after", row), *self._scored("before", row))
+                row["paired"]["before"] = paired_differences(*_of_row(row, scored[:2]), *_of_row(row, before))
         file = self.folder / METRICS_FILE
         earlier = [row for row in (read_metrics(file) if file.exists() else []) if row.get("stage") != stage]
         write_metrics(file, earlier + rows)
-        return read_metrics(file)
+        return earlier + rows
 
-    def _scored(self, stage: str, row: dict) -> tuple[list[dict], list[dict[str, Tensor]]]:
-        """Rows and realism samples of a stage's rollouts of a row's method, from their files."""
-        found = [
-            rollout
-            for rollout in read_rollouts(self.folder / stage)
-            if rollout["method"] == row["method"] and math.isclose(rollout["eta"], row["eta"])
-        ]
-        return score_rollouts(as_rollout_dict(found))
+
+def _of_row(row: dict, scored: tuple[list[dict], list[Samples]]) -> tuple[list[dict], list[Samples]]:
+    """What the rollouts of a row of metrics.json scored."""
+    rows, samples = scored
+    own = [k for k, one in enumerate(rows) if (one["method"], one["eta"]) == (row["method"], row["eta"])]
+    return [rows[k] for k in own], [samples[k] for k in own]

@@ -5,11 +5,8 @@ the policy, told the goal, learns the way there through the unicycle. Half of th
 that the policy learns to come back.
 """
 
-from collections.abc import Callable, Iterator
-from copy import deepcopy
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -17,17 +14,21 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
-from e2rl.learning.update import take_step
+from e2rl.learning.logging import RunLogger
+from e2rl.learning.supervised import Epochs, stage_settings
 from e2rl.planners.bits import observed
 from e2rl.planners.bits_network import WEIGHTS, BitsNetwork, cell_of, drive_controls, save_bits
 from e2rl.planners.ego import PLAN_STEPS
 from e2rl.planners.path import RoutePath
 from e2rl.planners.reference import LAST_ACTION
 from e2rl.run.errors import InputError
-from e2rl.run.settings import check_range
+from e2rl.run.run import Run
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import project
 from e2rl.scenes.scene import SceneSet
+from e2rl.scenes.scene_list import listed
+from e2rl.scenes.source import load_scenes
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.mission import mission_of
 from e2rl.sim.world import World
@@ -41,35 +42,24 @@ MOVES = 2.0  # m that a vehicle moves in the recording, at least
 FARTHEST = 6.0  # m beside its route from which on a vehicle does not follow it
 
 
+EVERY = 5  # frames of 0.1 s between the windows of a vehicle
+DISTURBED = (0.5, 0.06, 1.0)  # m beside the recording, rad, m/s: standard deviations of the start of disturbed windows
+DROPOUT = 0.2  # fraction of the scene's code that is left out in training
+WEIGHT_DECAY = 0.1
+FEATURE_NOISE, LAST_ACTION_NOISE = 0.5, 1.0  # standard deviations on the network's normalised input
+
+
+@configured("stage/bits")
 @dataclass(frozen=True)
 class BitsSettings:
-    """Fields: `bits` in conf/train.yaml; seed: the run's. Raises InputError for a value out of range."""
+    """Settings of stage=bits; seed: the run's."""
 
-    hidden: int = 64
-    dropout: float = 0.2
-    epochs: int = 20
-    minibatch: int = 256
-    learning_rate: float = 1e-3
-    weight_decay: float = 0.1
-    max_grad_norm: float = 1.0
-    held_out: float = 0.1
-    every: int = 5
-    aside: float = 0.5
-    turned: float = 0.06
-    faster: float = 1.0
-    feature_noise: float = 0.5
-    last_action_noise: float = 1.0
+    hidden: int = setting(low=1)
+    epochs: int = setting(low=1)
+    minibatch: int = setting(low=1)
+    learning_rate: float = setting(low=0)
+    held_out: float = setting(low=0, high=0.9)
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("hidden", "epochs", "minibatch", "every"):
-            check_range(f"bits.{name}", getattr(self, name), low=1)
-        for name in ("learning_rate", "weight_decay", "max_grad_norm", "aside", "turned", "faster"):
-            check_range(f"bits.{name}", getattr(self, name), low=0)
-        for name in ("feature_noise", "last_action_noise"):
-            check_range(f"bits.{name}", getattr(self, name), low=0)
-        for name in ("held_out", "dropout"):
-            check_range(f"bits.{name}", getattr(self, name), low=0, high=0.9)
 
 
 # --- windows
@@ -101,10 +91,10 @@ def world_at(scene: TensorDictBase, step: int) -> World:
     return World(scene, steps, now, valid, change[..., 3], turn_rate=turn)
 
 
-def windows(scenes: SceneSet, settings: BitsSettings) -> TensorDict:
-    """Windows [W] of all moving vehicles: observation [D], start [4], route [P, 2], future [PLAN_STEPS, 4], way and
-    side: the goal, scene_index. Raises InputError where there are none."""
-    every, generator = scenes.scenes, torch.Generator().manual_seed(settings.seed)
+def windows(scenes: SceneSet, seed: int, disturbed: Sequence[float] = DISTURBED) -> TensorDict:
+    """Returns windows [W] of all moving vehicles: observation [D], start [4], route [P, 2], future [PLAN_STEPS, 4],
+    scene_index, and the goal: distance along the route and lateral offset. Raises InputError where there are none."""
+    every, generator = scenes.scenes, torch.Generator().manual_seed(seed)
     vehicles = every["route_log"].shape[1]
     logged = every["logged"][:, :, :vehicles, :2]
     moved = (logged - logged[:, :1]).norm(dim=-1).masked_fill(~every["logged_valid"][:, :, :vehicles], 0).amax(1)
@@ -112,24 +102,24 @@ def windows(scenes: SceneSet, settings: BitsSettings) -> TensorDict:
     rows, parts = (moving & (moved > MOVES)).nonzero(), []
     for scene, vehicle in tqdm([part.unbind(1) for part in rows.split(CHUNK) if len(part)], "windows", disable=None):
         own = as_ego(every, scene, vehicle)
-        for step in range(0, own["logged"].shape[1] - PLAN_STEPS, settings.every):
+        for step in range(0, own["logged"].shape[1] - PLAN_STEPS, EVERY):
             exact = world_at(own, step)
-            parts += [_windows(world, scene) for world in (exact, _disturbed(exact, settings, generator))]
+            parts += [_windows(world, scene) for world in (exact, _disturbed(exact, disturbed, generator))]
     found = torch.cat(parts) if parts else TensorDict({}, [0])
     if not len(found):
         raise InputError(f"{scenes.dataset}: no vehicle moves and is recorded for {PLAN_STEPS * DT:g} s; pass others")
     return found
 
 
-def _disturbed(world: World, settings: BitsSettings, generator: torch.Generator) -> World:
+def _disturbed(world: World, size: Sequence[float], generator: torch.Generator) -> World:
     """Worlds whose egos are beside their recording, turned, and faster or slower; who stands stays."""
-    size = torch.tensor([settings.aside, settings.turned, settings.faster])
-    aside, turned, faster = (torch.randn(len(world.step), 3, generator=generator) * size).unbind(1)
+    draws = torch.randn(len(world.step), 3, generator=generator) * torch.tensor(size)
+    aside, turned, faster = draws.unbind(1)
     states = world.states.clone()
     x, y, heading, speed = states[:, 0].unbind(-1)
-    share = (speed / 5).clamp(max=1)
-    moved = [x - aside * share * heading.sin(), y + aside * share * heading.cos(), wrap(heading + turned * share)]
-    states[:, 0] = torch.stack([*moved, (speed + faster * share).clamp(min=0)], -1)
+    part = (speed / 5).clamp(max=1)
+    moved = [x - aside * part * heading.sin(), y + aside * part * heading.cos(), wrap(heading + turned * part)]
+    states[:, 0] = torch.stack([*moved, (speed + faster * part).clamp(min=0)], -1)
     return replace(world, states=states)
 
 
@@ -168,30 +158,26 @@ def losses(network: BitsNetwork, batch: TensorDictBase, noise: Tensor | None = N
     }
 
 
-class BitsTraining:
-    """Imitation by a BitsNetwork of windows, with held-out scenes. `history`: one row an epoch."""
+class BitsTraining(Epochs):
+    """Imitation by a BitsNetwork of windows; the learning rate falls to 0 along a cosine."""
 
     def __init__(self, network: BitsNetwork, data: TensorDictBase, settings: BitsSettings) -> None:
-        self.network, self.settings = network, settings
-        self.history: list[dict[str, float]] = []
-        self._generator = torch.Generator().manual_seed(settings.seed)
-        scenes = data["scene_index"].unique()
-        scenes = scenes[torch.randperm(len(scenes), generator=self._generator)]
-        count = max(round(settings.held_out * len(scenes)), int(settings.held_out > 0))
-        if count == len(scenes):
-            raise InputError(
-                f"bits.held_out={settings.held_out:g}: of one scene none can be held out; pass more, or set it to 0"
-            )
-        apart = torch.isin(data["scene_index"], scenes[:count])
-        self.train, self.held_out = (data[rows].to(network.device) for rows in (~apart, apart))
-        network.normaliser.observe(self.train["observation"])
-        self.optimiser = torch.optim.AdamW(
-            network.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
-        )
+        super().__init__(network, data, settings, network, WEIGHT_DECAY)
         total = settings.epochs * -(-len(self.train) // settings.minibatch)
         self.schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self.optimiser, total)
-        self.noise = torch.full_like(network.normaliser.mean, settings.feature_noise)
-        self.noise[list(LAST_ACTION)] = settings.last_action_noise
+        self.noise = torch.full_like(network.normaliser.mean, FEATURE_NOISE)
+        self.noise[list(LAST_ACTION)] = LAST_ACTION_NOISE
+
+    def loss(self, batch: TensorDictBase) -> Tensor:
+        """The sum [] of the losses under noise on the input."""
+        self.network.train()
+        parts = losses(self.network, batch, self.noise * torch.randn_like(batch["observation"]))
+        return torch.stack(list(parts.values())).sum()
+
+    def step(self, loss: Tensor) -> None:
+        """One step of the optimiser and of its schedule."""
+        super().step(loss)
+        self.schedule.step()
 
     @torch.no_grad()
     def measure(self, data: TensorDictBase) -> dict[str, float]:
@@ -203,47 +189,34 @@ class BitsTraining:
         mean = {name: float(sum(count * row[name] for count, row in rows)) / len(data) for name in rows[0][1]}
         return mean | {"loss": sum(mean.values())}
 
-    def epoch(self) -> dict[str, float]:
-        """One pass over the training windows; returns its mean losses and the held-out ones."""
-        self.network.train()
-        seen: list[Tensor] = []
-        for batch in self._batches():
-            parts = losses(self.network, batch, self.noise * torch.randn_like(batch["observation"]))
-            loss = torch.stack(list(parts.values())).sum()
-            take_step(self.optimiser, loss, self.settings.max_grad_norm)
-            self.schedule.step()
-            seen.append(loss.detach())
-        row = {"loss": torch.stack(seen).mean().item()}
-        row |= {f"held_out_{name}": value for name, value in self.measure(self.held_out).items()}
-        self.history.append(row)
-        return row
+    def weights(self) -> dict[str, Tensor]:
+        """Those of the network."""
+        return dict(self.network.state_dict())
 
-    def _batches(self) -> Iterator[TensorDictBase]:
-        order = torch.randperm(len(self.train), generator=self._generator).to(self.network.device)
-        return (self.train[index] for index in order.split(self.settings.minibatch))
+    def set_weights(self, weights: Mapping[str, Tensor]) -> None:
+        """Take chosen weights."""
+        self.network.load_state_dict(weights)
+
+    def state_dict(self) -> dict:
+        """All that later turns depend on."""
+        return super().state_dict() | {"schedule": self.schedule.state_dict()}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Restore a `state_dict`."""
+        super().load_state_dict(state)
+        self.schedule.load_state_dict(state["schedule"])
 
 
-def train_bits(
-    network: BitsNetwork,
-    scenes: SceneSet,
-    settings: BitsSettings,
-    folder: Path,
-    origin: dict[str, Any],
-    log: Callable[[dict[str, float], int], None] | None = None,
-) -> dict[str, float]:
-    """Train a network, in place, and keep the weights of the lowest held-out loss (of the last epoch if no scene is
-    held out), written to folder / WEIGHTS. Returns the row of the epoch kept."""
-    data = windows(scenes, settings)
-    run, best, kept = BitsTraining(network, data, settings), None, None
-    for epoch in (bar := tqdm(range(settings.epochs), "bits", unit="epoch", disable=None)):
-        row = run.epoch()
-        bar.set_postfix({name: f"{value:.3f}" for name, value in row.items()})
-        if log is not None:
-            log({f"train/bits_{name}": value for name, value in row.items()}, epoch)
-        if best is None or not row["held_out_loss"] >= best["held_out_loss"]:
-            best, kept = row | {"epoch": float(epoch)}, deepcopy(network.state_dict())
-    assert best is not None and kept is not None
-    network.load_state_dict(kept)
-    result = {"windows": len(data), "settings": asdict(settings), "result": best}
-    save_bits(network, Path(folder) / WEIGHTS, origin | result)
-    return best
+def run_bits_stage(run: Run, logger: RunLogger) -> dict[str, float]:
+    """stage=bits: a new network of ego=bits learns from the training scenes, and its weights are written to the run's
+    folder. Returns the losses of the chosen epoch."""
+    config, settings = run.config, stage_settings(run.config, BitsSettings)
+    scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
+    run.begin({"scenes": listed(scenes)})
+    network, data = BitsNetwork(settings.hidden, DROPOUT).to(config.device), windows(scenes, settings.seed)
+    training = BitsTraining(network, data, settings)
+    row = training.fit("bits", settings.epochs, run.parts("bits"), vars(settings), logger)
+    origin = {"data": f"{scenes.dataset}/{scenes.split}", "scenes": len(scenes), **run.origin()}
+    given = {"windows": len(data), "settings": vars(settings), "result": row}
+    save_bits(network, run.folder / WEIGHTS, origin | given)
+    return row

@@ -1,7 +1,7 @@
 """Behaviour cloning: demonstrations with soft labels, and their losses.
 
-Demonstrations are a TensorDict [M] of observation [M, D], action [M, C, 2] and weight [M, C] >= 0 that sums to 1: what a teacher
-might do there, and how much speaks for each. One certain action is C = 1 with weight 1.
+Demonstrations are a TensorDict [M] of observation [M, D], action [M, C, 2] and weight [M, C] >= 0 that sums to 1: what
+a teacher might do there, and how much speaks for each. One certain action is C = 1 with weight 1.
 """
 
 from collections.abc import Sequence
@@ -47,7 +47,8 @@ def demonstrations_of(
 
 
 def cloning_loss(actor: ProbabilisticActor, shown: TensorDictBase) -> Tensor:
-    """Cross-entropy [] of the actor's density under the labels of demonstrations [M]: the mean of -sum_c w_c log pi(a_c | o).
+    """Cross-entropy [] of the actor's density under the labels of demonstrations [M]: the mean of
+    -sum_c w_c log pi(a_c | o).
 
     Its gradient is the weighted mean of the gradients of the single actions. A squashed Gaussian has one mode: at the
     minimum its mean before squashing is the weighted mean of the actions there, and its variance theirs.
@@ -58,8 +59,8 @@ def cloning_loss(actor: ProbabilisticActor, shown: TensorDictBase) -> Tensor:
 
 
 def teaching_loss(network: ActorNetwork, shown: TensorDictBase) -> Tensor:
-    """Mean [] of -log sum_c w_c exp(-|a_c - a(o)|^2 / 2), distances in units of LABEL_WIDTH, of the most
-    central actions a(o) under the labels of demonstrations [M]: least where a(o) is near one label that much speaks for.
+    """Mean [] of -log sum_c w_c exp(-|a_c - a(o)|^2 / 2), distances in units of LABEL_WIDTH, of the most central
+    actions a(o) under the labels of demonstrations [M]: least where a(o) is near one label that much speaks for.
 
     Ways out differ: the mean of one to the left and one to the right is none. `cloning_loss` has such means, and fits
     the actor's own deviation too: late in a training, when that is a tenth, its gradient is a hundred times as large as

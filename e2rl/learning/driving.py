@@ -1,7 +1,4 @@
-"""Drives an ego through one episode per pool row, for planner tuning and for expert pairs.
-
-Outcomes of collected episodes, one row per episode.
-"""
+"""Drives an ego through one episode per pool row, for planner tuning and demonstrations; outcomes of episodes."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -163,16 +160,16 @@ class PoolDriver:
         """Outcomes of one episode in every row of the pool, in their order, but for those in which the ego raises or
         becomes NaN; and these, each with its row and reason."""
         parts: list[Episodes] = []
-        ended: list[dict] = []
+        errored: list[dict] = []
         for rows in torch.arange(len(pool)).split(self.env.batch_size[0]):
-            found, lost = attempt(lambda tasks: self._frames(ego, pool, tasks), rows.tolist())
-            parts += [episodes_of(TensorDict(frames, [len(done)]), pool, torch.tensor(done)) for done, frames in found]
-            ended += [{"row": row, **why} for row, why in lost]
+            found, failed = attempt(lambda tasks: self._frames(ego, pool, tasks), rows.tolist())
+            parts += [episodes_of(frames, pool, torch.tensor(done)) for done, frames in found]
+            errored += [{"row": row, **why} for row, why in failed]
         every = concatenated(parts)
         order = every.row.argsort()
-        return Episodes(*(getattr(every, name)[order] for name in Episodes.__dataclass_fields__)), ended
+        return Episodes(*(getattr(every, name)[order] for name in Episodes.__dataclass_fields__)), errored
 
-    def _frames(self, ego: Ego, pool: TrafficPool, rows: Sequence[int]) -> dict[str, Tensor]:
+    def _frames(self, ego: Ego, pool: TrafficPool, rows: Sequence[int]) -> TensorDict:
         """Frames of `drive` of at most as many rows as there are environments, as `attempt` looks at them."""
         every = torch.arange(self.env.batch_size[0]) % len(rows)  # the other environments drive them once more
         try:
@@ -180,7 +177,7 @@ class PoolDriver:
         except PlannerError as error:
             error.rows = {row % len(rows): why for row, why in error.rows.items()}
             raise
-        return dict(frames.items()) | {"states": frames["executed"], "valid": frames["alive"]}
+        return frames.update({"states": frames["executed"], "valid": frames["alive"]})
 
 
 def executed(steps: TensorDictBase) -> Tensor:

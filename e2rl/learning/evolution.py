@@ -16,7 +16,7 @@ from e2rl.learning.scheduler import Choice, CurriculumScheduler, outcomes_of, ta
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import Ego
 from e2rl.run.errors import InputError
-from e2rl.run.processes import RayWorkers
+from e2rl.run.ray_workers import RayWorkers
 from e2rl.run.settings import configured, setting
 from e2rl.traffic.pool import TrafficPool
 

@@ -1,6 +1,4 @@
-"""Logs a run's scalars and pictures to CSV files, TensorBoard or an offline wandb run, in named groups, and its
-curriculum's choices to a CSV.
-"""
+"""Logs a run's scalars and pictures to CSV files, TensorBoard or offline wandb, and a curriculum's choices."""
 
 import csv
 import io
@@ -42,22 +40,29 @@ class RunLogger:
                 if not math.isnan(value):
                     self._logger.log_scalar(name, float(value), step=step)
             if choices:
-                path = self._folder / CHOICES
-                earlier = [row for row in read_choices(path) if int(row["round"]) < step]  # a resumed run repeats some
-                write_choices(path, [*earlier, *choices])
+                self._write_choices(choices, step)
+
+    def _write_choices(self, rows: Sequence[Choice], step: int) -> None:
+        """Write the rows of a round below those of earlier rounds; unknown numbers stay empty."""
+        path, text = self._folder / CHOICES, io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        for row in rows:
+            writer.writerow(["" if row[name] != row[name] else row[name] for name in COLUMNS])
+        earlier = lines_before(path, step) if path.is_file() else []
+        write_atomically(path, "".join([",".join(COLUMNS) + "\n", *earlier, text.getvalue()]))
 
     def show(self, name: str, path: Path, step: int) -> None:
-        """Put a picture (PNG) or film (GIF) on the dashboard, if there is one; name: as of a scalar."""
+        """Put a picture (PNG) or video (GIF) on the dashboard, if there is one; name: as of a scalar."""
         if isinstance(self._logger, WandbLogger):
             import wandb
 
-            film = path.suffix == ".gif"
-            shown = wandb.Video(str(path), format="gif") if film else wandb.Image(str(path))
+            moving = path.suffix == ".gif"
+            shown = wandb.Video(str(path), format="gif") if moving else wandb.Image(str(path))
             self._logger.experiment.log({name: shown}, step=step)
         elif isinstance(self._logger, TensorboardLogger):
             from tensorboard.compat.proto.summary_pb2 import Summary
 
-            with Image.open(path) as image:  # its bytes as they are, since a film moves there, too
+            with Image.open(path) as image:  # its bytes as they are, since a video moves there, too
                 given = {"width": image.width, "height": image.height, "colorspace": 3}
             value = Summary.Value(tag=name, image=Summary.Image(encoded_image_string=path.read_bytes(), **given))
             self._logger.experiment.file_writer.add_summary(Summary(value=[value]), step)
@@ -66,8 +71,7 @@ class RunLogger:
         """Remove the scalars of a step and of later ones from the CSV files, and a line that was cut off: a resumed run
         logs them again."""
         for file in sorted((self._folder / "logs").rglob("*.csv")):
-            whole = [line for line in file.read_text().splitlines(keepends=True) if line.endswith("\n")]
-            write_atomically(file, "".join(line for line in whole if int(line.split(",")[0]) < step))
+            write_atomically(file, "".join(lines_before(file, step)))
 
     def close(self) -> None:
         """Finish the wandb run, and write what TensorBoard holds back."""
@@ -96,26 +100,8 @@ def _logger(kind: str, folder: Path, project: str, name: str | None) -> Logger |
     return None
 
 
-def write_choices(path: Path, rows: Sequence[Choice]) -> None:
-    """Write the table of a curriculum's choices; unknown numbers stay empty."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for row in rows:
-        writer.writerow(["" if row[name] != row[name] else row[name] for name in COLUMNS])
-    write_atomically(path, text.getvalue())
-
-
-def read_choices(path: Path) -> list[Choice]:
-    """The rows of a curriculum's choices, numbers but for the template; [] without the file.
-
-    Raises InputError for a file that is no such table.
-    """
-    if not path.is_file():
-        return []
-    try:
-        with path.open(newline="") as file:
-            rows = list(csv.DictReader(file, strict=True))
-        return [{name: kind(row[name] or "nan") for name, kind in COLUMNS.items()} for row in rows]
-    except (KeyError, ValueError, TypeError, csv.Error) as error:
-        raise InputError(f"{path}: no table of a curriculum's choices ({error}); remove it") from None
+def lines_before(file: Path, step: int) -> list[str]:
+    """The whole lines of a CSV file whose first cell is a step before `step`."""
+    lines = file.read_text().splitlines(keepends=True)
+    whole = [(line.split(",")[0], line) for line in lines if line.endswith("\n")]
+    return [line for first, line in whole if first.isdecimal() and int(first) < step]

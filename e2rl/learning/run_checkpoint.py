@@ -23,7 +23,7 @@ from e2rl.planners.network import WEIGHTS
 from e2rl.run.errors import InputError
 from e2rl.run.files import altered, seal
 
-STATE, MEMORY, CONFIG, FORMAT = "state.pt", "memory.json", "config.json", "e2rl-checkpoint/6"
+STATE, MEMORY, CONFIG, FORMAT = "state.pt", "memory.json", "config.json", "e2rl-checkpoint/7"
 
 
 def save_checkpoint(folder: Path, run: Evolution, config: dict, keep_last: int = 2) -> Path:
@@ -80,12 +80,10 @@ def checkpoints(path: str | Path) -> list[Path]:
     return [path] if (path / STATE).is_file() else sorted(path.glob("checkpoints/round-*"))
 
 
-def latest_checkpoint(path: str | Path) -> Path:
-    """The checkpoint folder that `path` names: itself, or the newest of a run's folder."""
-    found = checkpoints(path)
-    if not found:
-        raise InputError(f"{path}: holds no checkpoint; give a run's folder or one of its checkpoints/round-*")
-    return found[-1]
+def rounds_done(path: str | Path | None) -> int:
+    """Rounds of the newest checkpoint that `path` names; 0 without one."""
+    found = checkpoints(path) if path else []
+    return int(found[-1].name.rpartition("-")[2]) if found else 0
 
 
 def load_checkpoint(path: str | Path, run: Evolution) -> int:
@@ -94,18 +92,18 @@ def load_checkpoint(path: str | Path, run: Evolution) -> int:
     Of a run's folder it is the newest checkpoint that is whole; those that are not are named on stderr. Raises
     InputError where none is, and for one of another configuration or version.
     """
-    latest_checkpoint(path)
-    damage = ""
+    damages = []
     for folder in reversed(checkpoints(path)):
         try:
             state = _whole(folder, run)
         except InputError as error:
-            damage = damage or str(error)
+            damages.append(str(error))
             print(f"passed over: {error}", file=sys.stderr)
             continue
         _restore(folder, state, run)
         return run.round
-    raise InputError(damage)
+    missing = f"{path}: holds no checkpoint; give a run's folder or one of its checkpoints/round-*"
+    raise InputError(damages[0] if damages else missing)
 
 
 def _whole(folder: Path, run: Evolution) -> dict:

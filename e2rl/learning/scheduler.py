@@ -83,10 +83,9 @@ class CurriculumScheduler(Extension):
     """State over S scenes. Per round: `draw` scenes and `choices` for them, read `fraction`, then `learn` from the
     outcomes and `advance`.
 
-    A curriculum is a subclass with `eta` and `fraction`, attributes or properties, and a YAML file in conf/curriculum with its
-    `_target_` and settings; it overrides `etas` where the scenes of a round differ in intensity, `choices` and
-    `templates` where they differ in causal template as well. `lasting` names
-    its attributes that change from round to round.
+    A curriculum is a subclass with `eta` and `fraction`, attributes or properties, and a YAML file in conf/curriculum
+    with its `_target_` and settings. It overrides `etas` where the scenes of a round differ in intensity, `choices` and
+    `templates` where they differ in causal template as well.
 
     Args:
         rounds: of the whole run.

@@ -60,7 +60,12 @@ class LinearCurriculum(CurriculumScheduler):
         check_range("curriculum.fraction", fraction, 0, 1)
         check_range("curriculum.fraction_final", fraction_final, 0, 1)
         check_range("curriculum.spread", spread, 0)
-        self._etas, self._fractions, self._ramp, self._spread = (eta, eta_final), (fraction, fraction_final), ramp, spread
+        self._etas, self._fractions, self._ramp, self._spread = (
+            (eta, eta_final),
+            (fraction, fraction_final),
+            ramp,
+            spread,
+        )
 
     def _between(self, first: float, last: float) -> float:
         return first + min(1.0, self.round / max(1.0, self._ramp * self.rounds)) * (last - first)

@@ -62,7 +62,7 @@ def _coming(flag: Tensor) -> Tensor:
 
 
 class Teacher:
-    """Labels states of collected batches; `labelled` [M] (demonstrations, e2rl.learning.cloning) are the newest ones of all rounds."""
+    """Labels states of collected batches; `labelled` [M] (e2rl.learning.cloning) are the newest ones of all rounds."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class Teacher:
         return {"critical": float(len(places)), "labels": float(sum(map(len, parts)))}
 
     def labels(self, frames: TensorDictBase, ego: Ego) -> TensorDict:
-        """Demonstrations [K] of the states frames [M] of a DrivingEnv with `agents=True` in which ego's plan costs at least
+        """Labels [K] of the states frames [M] of a DrivingEnv with `agents=True` in which ego's plan costs at least
         `regret` more than the planner's, whose own cost is below `survivable`."""
         settings = self.settings
         world = World.of(frames, self.scenes.batch(frames["scene_index"][:, 0].cpu()).to(frames.device))

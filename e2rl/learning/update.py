@@ -19,8 +19,8 @@ from e2rl.learning.cloning import (
     mirrored_demonstrations,
     teaching_loss,
 )
+from e2rl.learning.supervised import take_step
 from e2rl.planners.network import ActorCritic, ActorNetwork
-from e2rl.run.errors import InputError
 from e2rl.run.settings import configured, setting
 from e2rl.sim.prospects import TIMES, time_to_contact
 
@@ -216,20 +216,10 @@ def action_penalty(network: ActorNetwork, frames: TensorDictBase) -> Tensor:
     """Mean |acceleration| [] of the actor's most central actions, in units of 4 m/s^2.
 
     The mean is over those of frames [M] (`seen`, `offset`) that are `calm` [M], with no contact in sight: whoever is
-    about to be hit may brake or accelerate as hard as it helps. A price on what the policy means to do, not on what exploration makes of it: under a standard deviation above 1
-    m/s^2 the price of the action itself (`sim.reward.acceleration`) hardly tells small accelerations from none.
+    about to be hit may brake or accelerate as hard as it helps. A price on what the policy means to do, not on what
+    exploration makes of it: under a standard deviation above 1 m/s^2 the price of the action itself
+    (`sim.reward.acceleration`) hardly tells small accelerations from none.
     """
     loc, _ = network.head(frames["seen"], frames["offset"])
     acceleration = network.middle[0] + network.reach[0] * loc[..., 0].tanh()
     return (acceleration.abs() * frames["calm"]).sum() / frames["calm"].sum().clamp(min=1) / 4
-
-
-def take_step(optimiser: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:
-    """One step down the gradient of `loss`, its norm clipped; raises InputError if the loss is not finite."""
-    if not torch.isfinite(loss):
-        raise InputError("learner: the loss is not finite; lower learner.*.learning_rate or check the observations")
-    optimiser.zero_grad(set_to_none=True)
-    loss.backward()
-    parameters = [value for group in optimiser.param_groups for value in group["params"]]
-    torch.nn.utils.clip_grad_norm_(parameters, max_grad_norm)
-    optimiser.step()

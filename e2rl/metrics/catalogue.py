@@ -50,6 +50,7 @@ METRICS: dict[str, Metric] = {}  # of rollouts, in ORDER
 COMPUTE: dict[str, Compute] = {}  # functions of a batch: a dict of columns, or the column of the metric of that name
 EVENTS: list[str] = []  # columns of a row after its metrics: what happened, and what metrics rest on
 WORDS: dict[str, tuple[str, ...]] = {}  # columns that hold one of these words, or "" where the computed index is -1
+SOURCE = ("dataset", "split", "method", "ego_policy")  # columns of a row of a run
 IDENTITY = ("scene_id", "location", "seed", "eta")  # columns of a row before its metrics
 OPEN_LOOP_STAGE, META_STAGE = "open loop", "meta-metric"
 STAGES: dict[str, tuple[Metric, ...]] = {}  # parts of a run with metrics of their own

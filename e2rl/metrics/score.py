@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from e2rl.metrics.catalogue import COMPUTE, METRICS, WORDS, Batch, Metric, columns, row_columns
+from e2rl.metrics.catalogue import COMPUTE, IDENTITY, METRICS, SOURCE, WORDS, Batch, Metric, columns, row_columns
 from e2rl.metrics.contact import first_contact
 from e2rl.metrics.realism import Samples, realism, traffic_samples
 from e2rl.metrics.verdicts import judge
@@ -46,16 +46,16 @@ def cost_columns(batch: Batch) -> Batch:
 def score_rollouts(rollouts: Rollouts) -> tuple[list[dict], list[Samples]]:
     """Rows and realism samples of B rollouts, both for `statistics.summarise`.
 
-    A row is a dict of plain numbers and words, one entry for each of `catalogue.row_columns`, NaN where it is unknown.
-    Its own realism rests on few samples; sets of rollouts pool them. Sets `rollouts.driver`: the way of the competent
+    A row is a dict of plain numbers and words, one entry for each of `catalogue.row_columns`, NaN where it is unknown,
+    and of SOURCE where the rollouts tell it. Its own realism rests on few samples; sets of rollouts pool them. Sets `rollouts.driver`: the way of the competent
     driver of the verdict, NaN for rollouts without a collision.
     """
     rows, samples, drivers = [], [], []
     for begin in range(0, len(rollouts), CHUNK):
         part = rollouts[begin : begin + CHUNK]
         found, features, driver = score_batch(as_doubles(part))
-        identity = {"scene_id": part.scene_id, "location": part.location, "seed": part.seed, "eta": part.eta}
-        rows += plain_rows(found | identity, len(part))
+        identity = {name: part.get(name) for name in (*SOURCE, *IDENTITY)}
+        rows += plain_rows(found | {name: value for name, value in identity.items() if value is not None}, len(part))
         samples += features
         drivers.append(driver)
     rollouts.driver = torch.cat(drivers).float()

@@ -1,8 +1,14 @@
-"""Means and 95% intervals over rollouts by a cluster bootstrap: whole locations (or logs) are drawn, not rollouts.
+"""Means and 95% intervals over rollouts (docs/method.md, section 10).
 
-Rows and samples are the two results of `score.score_rollouts`, one of each per rollout. A draw holds each cluster with
-a multiplicity. Every resampled mean is a quotient of two sums that are linear in the multiplicities, hence one matrix
-product serves all draws and metrics. Fewer than two clusters with known values give no interval: NaN.
+The interval is a cluster bootstrap: whole locations (or logs) are drawn, not rollouts. A draw holds each cluster with a
+multiplicity. Every resampled mean is a quotient of two sums that are linear in the multiplicities, hence one matrix
+product serves all draws and metrics. Where the bootstrap would lie:
+
+- fewer than LEAST places that know a metric give no interval;
+- a fraction with fewer than LEAST places at which the event occurs, or at which it does not, has the exact interval of
+  Clopper and Pearson (1934), with the places as the sample. A difference of such fractions lies between the differences
+  of their exact bounds at 97.5% each (Bonferroni);
+- a ratio per kilometre with fewer than LEAST places at which the event occurs, and draws that all agree, give none.
 
 Rows of several trainings of one policy say which in `training` (0, 1, ..). Trainings are then drawn with replacement
 as well as places, independently of them: a rollout counts as often as its place times its training was drawn (the
@@ -13,6 +19,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from scipy.special import betaincinv
 from torch import Tensor
 
 from e2rl.metrics.catalogue import METRICS, Metric
@@ -20,7 +27,9 @@ from e2rl.metrics.realism import Samples, realism
 
 DRAWS = 1000
 REALISM_DRAWS = 400  # each costs a pass over all samples
-LEVELS = (0.025, 0.975)
+LEVEL = 0.95
+LEVELS = ((1 - LEVEL) / 2, (1 + LEVEL) / 2)
+LEAST = 10  # places
 Row = Mapping[str, Any]
 
 
@@ -96,15 +105,26 @@ def resampled_labels(labels: Tensor, cluster: Tensor, draws: Tensor, places: int
     return (1 - polynomial[-1, :, :-1] / polynomial[-1, :, -1:]).sum(-1).where(polynomial[-1, :, -1] > 0, torch.nan)
 
 
-def interval(values: Tensor, known_clusters: int) -> dict[str, float]:
-    """{mean, low, high} of values [D], row 0 the estimate; the interval needs draws, and two clusters that know it."""
+def interval(values: Tensor, places: int) -> dict[str, float]:
+    """{mean, low, high} of values [D], row 0 the estimate; no interval (NaN) from fewer than LEAST places that know it,
+    or where all draws agree."""
     values = values.where(values.isfinite(), torch.nan)
-    low, high = (
-        values[1:].nanquantile(values.new_tensor(LEVELS)).tolist()
-        if known_clusters > 1 < len(values)
-        else (torch.nan,) * 2
-    )
-    return {"mean": values[0].item(), "low": low, "high": high}
+    low = high = torch.nan
+    if places >= LEAST and len(values) > 1:
+        low, high = values[1:].nanquantile(values.new_tensor(LEVELS)).tolist()
+    return {"mean": values[0].item()} | (_nothing() if low == high else {"low": low, "high": high})
+
+
+def exact_interval(fraction: float, places: int, level: float = LEVEL) -> tuple[float, float]:
+    """Bounds of Clopper and Pearson for a fraction in [0, 1] of so many independent places, a whole number or not."""
+    events, tail = fraction * places, (1 - level) / 2
+    low = float(betaincinv(events, places - events + 1, tail)) if events > 0 else 0.0
+    high = float(betaincinv(events + 1, places - events, 1 - tail)) if events < places else 1.0
+    return low, high
+
+
+def _nothing() -> dict[str, float]:
+    return {"low": torch.nan, "high": torch.nan}
 
 
 def row_metrics() -> list[Metric]:
@@ -153,13 +173,43 @@ class Bootstrap:
         values = {metric.name: means[:, column] for column, metric in enumerate(row_metrics())}
         return values | realism(list(samples), self.cluster, self.realism_draws)
 
+    def places(self, chosen: Tensor) -> int:
+        """Number of places of the rollouts chosen [R] bool."""
+        return len(self.place[chosen].unique())
+
+    def rare(self, totals: Tensor, weights: Tensor) -> set[str]:
+        """Names of the fractions and of the ratios for which the bootstrap has too few places with, or without, an
+        event; from the results of `metric_table`."""
+        found = set()
+        for metric, total, weight in zip(row_metrics(), totals.T, weights.T, strict=True):
+            known = weight > 0
+            if metric.per and not metric.fraction:
+                few = self.places(known & (total > 0)) < LEAST
+            else:
+                few = min(self.places(known & side) for side in (total > 0, total < weight)) < LEAST
+                few = few and metric.fraction and not metric.per
+            if few:
+                found.add(metric.name)
+        return found
+
+    def exact(
+        self, names: set[str], totals: Tensor, weights: Tensor, values: Mapping[str, Tensor], level: float
+    ) -> dict[str, tuple[float, float]]:
+        """Exact bounds of these metrics, whose estimates are row 0 of `values`; NaN from too few places, and for what
+        is no fraction of places."""
+        found = {}
+        for metric, total, weight in zip(row_metrics(), totals.T, weights.T, strict=True):
+            if metric.name in names:
+                places = self.places(~total.isnan() & (weight > 0))
+                known = places >= LEAST and not metric.per
+                mean = values[metric.name][0].item()
+                found[metric.name] = exact_interval(mean, places, level) if known else (torch.nan, torch.nan)
+        return found
+
     def intervals(self, values: Mapping[str, Tensor], known: Mapping[str, Tensor]) -> dict[str, dict[str, float]]:
         """{metric: {mean, low, high, n}} in the catalogue's order; known [R] bool: the n rollouts that a value uses."""
         counts = {name: 0 if values[name][0].isnan() else int(known[name].sum()) for name in METRICS}
-        return {
-            name: interval(values[name], len(self.place[known[name]].unique())) | {"n": counts[name]}
-            for name in METRICS
-        }
+        return {name: interval(values[name], self.places(known[name])) | {"n": counts[name]} for name in METRICS}
 
 
 def known_rollouts(known: Tensor, samples: Sequence[Samples]) -> dict[str, Tensor]:
@@ -177,15 +227,21 @@ def summarise(
 ) -> dict[str, dict[str, float]]:
     """{metric: {mean, low, high, n}} of one group of rollouts (one method, ego and eta), in the catalogue's order.
 
-    n is the number of rollouts that the value rests on; what cannot be computed is NaN with n = 0. Raises ValueError
-    unless there is one entry of samples per row.
+    n is the number of rollouts that the value rests on; what cannot be computed is NaN with n = 0.
+
+    Raises:
+        ValueError: there is not one entry of samples per row.
     """
     if len(rows) != len(samples):
         raise ValueError(f"{len(rows)} rows but {len(samples)} samples; they are made together by score_rollouts")
     bootstrap = Bootstrap(rows, draws, realism_draws)
     totals, weights = metric_table(rows, row_metrics())
     known = known_rollouts(~totals.isnan() & (weights > 0), samples)
-    return bootstrap.intervals(bootstrap.resampled(totals, weights, samples), known)
+    values = bootstrap.resampled(totals, weights, samples)
+    result = bootstrap.intervals(values, known)
+    for name, bounds in bootstrap.exact(bootstrap.rare(totals, weights), totals, weights, values, LEVEL).items():
+        result[name] |= dict(zip(("low", "high"), bounds, strict=True))
+    return result
 
 
 def paired_differences(
@@ -200,8 +256,10 @@ def paired_differences(
     """{metric: {difference, low, high, n}} of this group minus the other, over the n (scene, seed) both have.
 
     Both groups are resampled with the same clusters. A metric per collision compares the two groups' own collisions on
-    these pairs; all other metrics use only the pairs in which both groups know it. relative: also `relative`,
-    `relative_low` and `relative_high`, the difference over the other group's value.
+    these pairs; all other metrics use only the pairs in which both groups know it.
+
+    Args:
+        relative: also give `relative`, `relative_low` and `relative_high`, the difference over the other's value.
     """
     pairs = matched(rows, other_rows)
     rows, samples = [rows[own] for own, _ in pairs], [samples[own] for own, _ in pairs]
@@ -219,6 +277,11 @@ def paired_differences(
     differences = {name: ours[name] - theirs[name] for name in METRICS}
     both = {name: known[name] & other_known[name] for name in METRICS}
     result = bootstrap.intervals(differences, both)
+    rare = bootstrap.rare(first, first_weights) | bootstrap.rare(second, second_weights)
+    own = bootstrap.exact(rare, first, first_weights, ours, (1 + LEVEL) / 2)
+    other = bootstrap.exact(rare, second, second_weights, theirs, (1 + LEVEL) / 2)
+    for name in rare:
+        result[name] |= {"low": own[name][0] - other[name][1], "high": own[name][1] - other[name][0]}
     found = {name: {"difference": value.pop("mean"), **value} for name, value in result.items()}
     if relative:
         for name, value in bootstrap.intervals(ratios(differences, theirs), both).items():

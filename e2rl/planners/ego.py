@@ -1,25 +1,8 @@
-"""One interface for all egos (planners, learned actors, outside code), for collection and evaluation.
+"""One interface for all egos: planners, the learned actor, outside code.
 
-An outside planner is a class and a YAML file in conf/ego with its `_target_` and arguments. A complete example, which
-holds the ego's speed along its mission for the coming five seconds:
-
-    import torch
-    from e2rl.planners.ego import PLAN_STEPS, Ego
-    from e2rl.planners.path import MissionPath
-
-
-    class Cruise(Ego):
-        def __init__(self, replan_every: int = 5, gain: float = 1.0) -> None:
-            super().__init__(replan_every)
-            self.gain = gain
-
-        def plan(self, world):
-            path = MissionPath(world)                                 # the ego's route, projected on
-            speed = world.states[:, 0, 3:] * self.gain                # [B, 1] m/s
-            return path.drive(speed.expand(-1, PLAN_STEPS + 1))       # [B, 50, 4] x, y, heading, speed
-
-Only `plan` is required: `act` tracks the plan. An ego that maps observations to actions overrides `act`; its `plan`
-returns its own predicted motion.
+An outside planner is a class and a YAML file in conf/ego with its `_target_` and arguments (docs/how-to/planner.md,
+examples/). Only `plan` is required: `act` tracks the plan. An ego that maps observations to actions overrides `act`;
+its `plan` returns its own predicted motion.
 """
 
 from abc import ABC, abstractmethod

@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -198,17 +197,15 @@ class ActorCritic(nn.Module):
 
     def load(self, path: Path) -> None:
         """Read a file of `save`; raises InputError for a damaged file or another architecture."""
-        saved, weights = _content(path)
-        if saved != self.architecture:
+        with torch.random.fork_rng(devices=[]):  # building it draws its first weights
+            other = read_actor(path, self.device)
+        keys = [key for key, value in self.architecture.items() if other.architecture[key] != value]
+        if keys:
+            differ = ", ".join(f"{key} {other.architecture[key]} instead of {self.architecture[key]}" for key in keys)
             raise InputError(
-                f"{path}: an actor of another architecture: {_differences(saved, self.architecture)}; set "
-                "ego.* and sim.* as in the run that wrote it"
+                f"{path}: an actor of another architecture: {differ}; set ego.* and sim.* as in the run that wrote it"
             )
-        own = self.weights()
-        wrong = set(own) ^ set(weights) or {key for key in own if own[key].shape != weights[key].shape}
-        if wrong:
-            raise InputError(f"{path}: weights {', '.join(sorted(wrong))} do not fit; the file is damaged")
-        self.set_weights(weights)
+        self.set_weights(other.weights())
 
     @torch.no_grad()
     def set_weights(self, weights: Mapping[str, Tensor]) -> None:
@@ -223,18 +220,13 @@ class ActorCritic(nn.Module):
         return {key: value for key, value in kept.items() if not key.startswith("actor.")}
 
 
-def _content(path: Path) -> tuple[Any, dict[str, Tensor]]:
-    """The architecture in the header of a file of `ActorCritic.save`, and its weights."""
-    try:
-        weights, header = read_weights(path)
-        return json.loads(header.get("architecture", "null")), weights
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not a readable actor file ({error}); give an {WEIGHTS} file") from None
-
-
 def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
     """The actor of a file of `ActorCritic.save`, whatever its architecture; raises InputError."""
-    saved, _ = _content(path)
+    try:
+        weights, header = read_weights(path)
+        saved = json.loads(header.get("architecture", "null"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not a readable actor file ({error}); give an {WEIGHTS} file") from None
     try:
         low, high = (torch.tensor(saved[key], dtype=torch.float32).reshape(2) for key in ("low", "high"))
         sizes, units = [int(size) for size in saved["hidden"]], int(saved["agent_units"])
@@ -242,9 +234,13 @@ def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
         if saved["observation"] != OBSERVATION_SIZE or not fits:
             raise ValueError(f"of {saved['observation']} numbers, {units} units an agent, layers of {sizes} units")
         actor = ActorCritic(low, high, sizes, units, bool(saved["reference"]), device=device)
+        own = actor.weights()
+        wrong = set(own) ^ set(weights) or {key for key in own if own[key].shape != weights[key].shape}
+        if wrong:
+            raise ValueError(f"weights {', '.join(sorted(wrong))} do not fit")
     except (TypeError, KeyError, ValueError, RuntimeError) as error:
         raise InputError(f"{path}: an actor of another version ({error}); train it again") from None
-    actor.load(path)
+    actor.set_weights(weights)
     return actor
 
 
@@ -278,10 +274,3 @@ def perceptron(size: int, hidden: Sequence[int], out: int, last_gain: float) -> 
 
 def _rounded(value: Tensor) -> list[float]:
     return [round(number, 6) for number in value.tolist()]
-
-
-def _differences(saved: dict | None, own: dict) -> str:
-    if not isinstance(saved, dict):
-        return "its header names none"
-    keys = [key for key in own if saved.get(key) != own[key]]
-    return ", ".join(f"{key} {saved.get(key)} instead of {own[key]}" for key in keys) or "unknown fields"

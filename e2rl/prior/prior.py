@@ -135,8 +135,7 @@ class Prior(nn.Module):
 
     @torch.no_grad()
     def estimate(self, context: Context) -> Tensor:
-        """x0 [B, V, SIZE] at the highest noise level without noise, by one evaluation of the network: nearly the mean of
-        the samples."""
+        """x0 [B, V, SIZE] at the highest noise level without noise (one NFE): nearly the mean of the samples."""
         x = torch.zeros(*context.state.v.shape, SIZE, device=context.state.v.device)
         return self.denoise(x, self.schedule.levels(1, x.device)[0], context)
 
@@ -212,8 +211,8 @@ class Prior(nn.Module):
 
 
 def within_budget(budget: Tensor, spent: Tensor, added: Tensor) -> Tensor:
-    """Fraction [B] of a step's shift that keeps the path KL within the budget [B]; spent, added [B, V]: path KL so far and
-    of the whole shift. KL grows with the square of the shift."""
+    """Fraction [B] of a step's shift that keeps the path KL within the budget [B]; spent, added [B, V]: path KL so far
+    and of the whole shift. KL grows with the square of the shift."""
     left = (budget - spent.sum(-1)).clamp(min=0)
     return (left / added.sum(-1).clamp(min=1e-12)).clamp(max=1.0).sqrt()
 

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from e2rl.run.settings import configured, setting
 
-Past = tuple[Tensor, Tensor]  # clean estimate and noise level of a step
+Past = tuple[Tensor, Tensor] | None  # clean estimate and noise level of a step
+Stepped = tuple[Tensor, Tensor]  # x at the lower level, and the variance of the noise in it
 
 
 @dataclass(frozen=True)
@@ -77,9 +78,7 @@ class Sampler(ABC):
         self.schedule, self.churn = schedule, churn
 
     @abstractmethod
-    def step(
-        self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor, past: Past | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def step(self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor, past: Past = None) -> Stepped:
         """Returns x at level low, and the variance of the noise in it.
 
         Args:
@@ -93,9 +92,7 @@ class Sampler(ABC):
 class DDIM(Sampler):
     """Song et al. 2021, eqs. 12 and 16; at churn 1 the ancestral sampler DDPM."""
 
-    def step(
-        self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor, past: Past | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def step(self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor, past: Past = None) -> Stepped:
         schedule = self.schedule
         alpha_high, alpha_low = schedule.alpha(high), schedule.alpha(low)
         sigma_high, sigma_low = schedule.sigma(high), schedule.sigma(low)
@@ -112,9 +109,7 @@ class DPMSolverPP(DDIM):
     A DDIM step with the clean estimate extrapolated to the middle of the step in log(alpha / sigma).
     """
 
-    def step(
-        self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor, past: Past | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def step(self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor, past: Past = None) -> Stepped:
         if past is not None:
             middle, last, end = (self.schedule.log_ratio(t) for t in (high, past[1], low))
             x0 = x0 + 0.5 * (end - middle) / (middle - last) * (x0 - past[0])
@@ -124,9 +119,7 @@ class DPMSolverPP(DDIM):
 class EulerMaruyama(Sampler):
     """x_low = x - (f - g^2 score) |dt| + g sqrt|dt| noise, with g^2 |dt| the exact integral of beta over the step."""
 
-    def step(
-        self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor, past: Past | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def step(self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor, past: Past = None) -> Stepped:
         g2dt = self.schedule.beta_integral(high, low)
         score = self.schedule.score(x, x0, high)
         return x + 0.5 * g2dt * x + g2dt * score + torch.sqrt(g2dt) * noise, g2dt

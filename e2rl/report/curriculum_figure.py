@@ -1,32 +1,33 @@
 """A heat map of what a curriculum chose: `python -m e2rl.report.curriculum_figure RUN_DIR`.
 
-Rounds run to the right, the arms (intensity within causal template) upwards. Left: the share of a round's draws; right:
-the share of the policy's episodes in these attacks that failed.
+Rounds run to the right, the arms (intensity within causal template) upwards. Left: the fraction of a round's draws;
+right: the fraction of the policy's episodes in these attacks that failed.
 """
 
 import argparse
-from collections.abc import Sequence
+import csv
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from e2rl.learning.logging import CHOICES, read_choices
-from e2rl.learning.scheduler import Choice
 from e2rl.report import drawing
 from e2rl.report.drawing import new_figure, save_figure
 from e2rl.run.errors import InputError, stop
 from e2rl.traffic.traffic import TEMPLATES
 
-PICTURE = "curriculum.png"
+CHOICES, PICTURE = "curriculum.csv", "curriculum.png"  # of a run's folder
+Choice = Mapping[str, float | str]  # a row of curriculum.csv
+NUMBERS = ("round", "eta", "draws", "episodes", "failures")
 LINE, MARGIN, WIDTH, DPI = 14, 90, 900, 144  # points: a line of an arm, the space around them, the width
-PANELS = (("share of the round's draws", "viridis"), ("share of failed episodes", "magma"))
+PANELS = (("fraction of the round's draws", "viridis"), ("fraction of failed episodes", "magma"))
 
 
 def grids(rows: Sequence[Choice]) -> tuple[list[int], list[tuple[str, float]], np.ndarray, np.ndarray]:
-    """Rounds [R], arms [A] as (template, eta), and by arm and round the share of the round's draws and the share of
-    failed episodes, both [A, R]; NaN where nobody was drawn, or no episode driven."""
+    """Rounds [R], arms [A] as (template, eta), and by arm and round the fraction of the round's draws and the
+    fraction of failed episodes, both [A, R]; NaN where nobody was drawn, or no episode driven."""
     rounds = sorted({int(row["round"]) for row in rows})
     arms = sorted({(str(row["template"]), float(row["eta"])) for row in rows}, key=_order)
     draws, episodes, failures = np.zeros((3, len(arms), len(rounds)))
@@ -34,9 +35,9 @@ def grids(rows: Sequence[Choice]) -> tuple[list[int], list[tuple[str, float]], n
         at = arms.index((str(row["template"]), float(row["eta"]))), rounds.index(int(row["round"]))
         for table, name in ((draws, "draws"), (episodes, "episodes"), (failures, "failures")):
             table[at] = float(row[name])
-    share = draws / draws.sum(0, keepdims=True).clip(min=1)
+    drawn = draws / draws.sum(0, keepdims=True).clip(min=1)
     rate = np.where(episodes > 0, failures / episodes.clip(min=1), np.nan)
-    return rounds, arms, np.where(draws > 0, share, np.nan), rate
+    return rounds, arms, np.where(draws > 0, drawn, np.nan), rate
 
 
 def _order(arm: tuple[str, float]) -> tuple[int, float]:
@@ -72,11 +73,31 @@ def _label(axes: Axes, rounds: Sequence[int], arms: Sequence[tuple[str, float]])
             axes.axhline(k - 0.5, color=drawing.INK, linewidth=0.8)
 
 
-def draw_choices(folder: Path) -> None:
-    """Draw curriculum.png and .pdf from the curriculum.csv of a run's folder; nothing where the run has logged none."""
-    rows = read_choices(folder / CHOICES)
-    if rows:
-        save_figure(folder / PICTURE, choice_map(rows))
+def read_choices(path: Path) -> list[Choice]:
+    """The rows of a curriculum.csv, with a number in each of NUMBERS; InputError for a file that is no such table."""
+    try:
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file, strict=True))
+        return [
+            row | {name: float(row[name]) for name in NUMBERS} | {"template": _known(row["template"])} for row in rows
+        ]
+    except (KeyError, ValueError, TypeError, csv.Error) as error:
+        raise InputError(f"{path}: no table of a curriculum's choices ({error}); remove it") from None
+
+
+def _known(template: str) -> str:
+    if template not in TEMPLATES:
+        raise ValueError(f"template {template}")
+    return template
+
+
+def draw_choices(folder: Path) -> Path | None:
+    """Draw curriculum.png and .pdf from the curriculum.csv of a run's folder; returns the picture, None where the run
+    has logged none."""
+    if not (folder / CHOICES).is_file():
+        return None
+    save_figure(folder / PICTURE, choice_map(read_choices(folder / CHOICES)))
+    return folder / PICTURE
 
 
 def main() -> None:

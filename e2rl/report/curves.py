@@ -1,7 +1,7 @@
 """Failures against realism and against verdicts over the gain of each adversary, as CSV and as a picture.
 
 The strength of an attack is its gain times eta. So its curve is a run of several intensities (`evaluate.py
-experiment=curves`), or the ladder of its tuning (`experiment=tune`). `python -m e2rl.report.curves RUN_DIR...` draws
+experiment=curves`), or the ladder of its tuning (`e2rl tune`). `python -m e2rl.report.curves RUN_DIR...` draws
 runs of either kind together.
 """
 
@@ -34,7 +34,7 @@ PANELS = (  # (horizontal, vertical): failures over realism, then the share of t
     (("real", "cfr"), ("real_adv", "cfr"), ("aor_step", "cfr")),
     (("cfr", "cfr_counted"), ("cfr", "cfr_preventable"), ("real_adv", "cfr_preventable")),
 )
-COLUMNS = ("cfr", "cfr_counted", "cfr_preventable", "real", "real_adv", "aor_step", "cfr_bg", "passes")
+COLUMNS = ("cfr", "cfr_counted", "cfr_preventable", "real", "real_adv", "aor_step", "cfr_bg", "nfe")
 OURS, NOMINAL = "e2", "nominal"
 APART = (0, 1, 2, 4, 5, 6, 7, 8, 9)  # colours of the cycle for the others: its red is too near to ours
 KEPT_ETA = 2.0  # intensity of the tables
@@ -96,7 +96,7 @@ def read_points(run: Path) -> list[Point]:
         trials = [trial | {"metrics": nans(trial["metrics"])} for trial in result["trials"]]
         return points_of_tuning(result | {"trials": trials}, known["settings"]["synthesizer"]["name"])
     except (ValueError, LookupError, TypeError) as error:
-        raise InputError(f"{file}: no tuning of an adversary; give the folder of a run of experiment=tune") from error
+        raise InputError(f"{file}: no tuning of an adversary; give the folder of a run of e2rl tune") from error
 
 
 def curves_csv(points: Sequence[Point]) -> str:
@@ -173,7 +173,7 @@ def save_curves(folder: Path, points: Sequence[Point]) -> list[Path]:
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="python -m e2rl.report.curves", description=__doc__.splitlines()[0])
-    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN_DIR", help="of experiment=curves or experiment=tune")
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN_DIR", help="of experiment=curves or of e2rl tune")
     parser.add_argument("--out", type=Path, default=Path(), help="folder to write to (default: the current one)")
     options = parser.parse_args(arguments)
     try:

@@ -1,7 +1,4 @@
-"""The intensity figure: one scene and seed at several intensities, each at its contact.
-
-The rollouts shown in the intensity figure: one scene and seed at every eta.
-"""
+"""The intensity figure: one scene and seed at several intensities, each at its contact."""
 
 import math
 from collections.abc import Sequence
@@ -11,19 +8,16 @@ from matplotlib.figure import Figure
 
 from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.report.drawing import new_figure
-from e2rl.report.picture import SIDE, Panel
-from e2rl.report.videos import load_replay
+from e2rl.report.picture import SIDE, Panel, Replay
+from e2rl.sim.rollouts import Failure
 
-METRES, GAP = 60.0, 10  # side of a panel in m, points between panels
-COLUMNS = 2
+METRES, GAP, COLUMNS = 60.0, 10, 2  # side of a panel in m, points between panels, panels in a row
 
 
-def intensity_figure(paths: Sequence[Path]) -> Figure:
-    """A panel for each rollout file, in the order of intensity: the moment of its contact.
-
-    A rollout without contact is shown when the next one that has a contact has it, else at its end.
-    """
-    replays = [load_replay(path, METRES) for path in paths]
+def intensity_figure(sweep: Sequence[Failure]) -> Figure:
+    """Returns a panel for each rollout, in the order of intensity, at the moment of its contact; one without contact is
+    shown when the next one that has a contact has it, else at its end."""
+    replays = [Replay(each.rollout, each.row, METRES) for each in sweep]
     rows = math.ceil(len(replays) / COLUMNS)
     figure = new_figure(*(count * (SIDE + GAP) - GAP for count in (COLUMNS, rows)))
     wide, high = ([SIDE, *[GAP, SIDE] * (count - 1)] for count in (COLUMNS, rows))
@@ -36,22 +30,26 @@ def intensity_figure(paths: Sequence[Path]) -> Figure:
     return figure
 
 
-def intensity_ladder(folder: Path) -> list[Path]:
-    """The rollout files, by eta, of the one (method, scene, seed) of a run's folder that best shows the effect of eta:
-    no contact at the lowest eta, contact at as many others as possible, earlier at greater eta, late at first."""
+def intensity_sweep(folder: Path) -> list[Failure]:
+    """Returns the rollouts of `best_sweep` of a run's folder."""
+    return [Failure.read(folder, row) for row in best_sweep(read_rows(Path(folder) / TABLE))]
+
+
+def best_sweep(rows: Sequence[dict]) -> list[dict]:
+    """Returns the rows, by eta, of the one (method, scene, seed) that best shows the effect of eta: no contact at the
+    lowest eta, contact at as many others as possible, earlier at greater eta, late at first."""
     groups: dict[tuple, list[dict]] = {}
-    for row in read_rows(Path(folder) / TABLE):
+    for row in rows:
         groups.setdefault((row["method"], row["ego_policy"], row["scene_id"], row["seed"]), []).append(row)
-    ladders = [sorted(group, key=lambda row: row["eta"]) for group in groups.values()]
-    most = max(map(len, ladders))
-    best = max((ladder for ladder in ladders if len(ladder) == most), key=worth)
-    return [Path(folder) / ROLLOUTS / rollout_name(row) for row in best]
+    sweeps = [sorted(group, key=lambda row: row["eta"]) for group in groups.values()]
+    most = max(map(len, sweeps))
+    return max((sweep for sweep in sweeps if len(sweep) == most), key=worth)
 
 
-def worth(ladder: Sequence[dict]) -> tuple[float, ...]:
-    """Score of rows of rollouts by eta for `intensity_ladder`; greater is better."""
-    times = [row["contact_time"] for row in ladder if row["cfr"] == 1]
+def worth(sweep: Sequence[dict]) -> tuple[float, ...]:
+    """Score of rows of rollouts by eta for `best_sweep`; greater is better."""
+    times = [row["contact_time"] for row in sweep if row["cfr"] == 1]
     falls = sum(later < earlier for earlier, later in zip(times, times[1:], strict=False))
-    found = [row["cfr"] == 1 for row in ladder]
+    found = [row["cfr"] == 1 for row in sweep]
     monotone = found == sorted(found)
-    return (not found[0], monotone, len(times), falls, times[0] - times[-1] if times else -ladder[-1]["min_dtc"])
+    return (not found[0], monotone, len(times), falls, times[0] - times[-1] if times else -sweep[-1]["min_dtc"])

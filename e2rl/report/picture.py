@@ -24,6 +24,7 @@ SLOW = 0.6  # s before contact that are played at half speed
 FREEZE = 14  # frames that hold the contact
 STRIP_TIMES = (-2.0, -1.0, -0.4, 0.0)  # s before contact
 SIDE, HEAD, FOOT = 720, 50, 30  # points: of a picture, of its header and of its legend
+LARGE_HEAD, LARGE_FOOT = 86, 48  # the same with large letters
 STRIP_SIDE, STRIP_GAP, STRIP_HEAD = 420, 8, 34  # points: of a panel, between panels, above them
 LEGEND = {"ego": drawing.EGO, "adversary": drawing.ADVERSARY, "traffic": drawing.BACKGROUND}
 LEGEND |= {"replayed": drawing.REPLAYED, "pedestrian, cyclist": drawing.VULNERABLE}
@@ -31,11 +32,15 @@ LEGEND |= {"replayed": drawing.REPLAYED, "pedestrian, cyclist": drawing.VULNERAB
 
 @dataclass
 class Replay:
-    """The pictures of one rollout.
+    """The pictures of one rollout. `contact` is the step of the ego's first contact, or None; `last` is the last step
+    shown: the contact, or the rollout's end.
 
-    rollout, with its row of metrics. metres: side of the square that is shown.
-    pixels: side of a picture. ghost: also outline the recorded ego. `contact` is the step of the ego's first contact,
-    or None. `last` is the last step shown: the contact, or the rollout's end.
+    Args:
+        rollout, row: the rollout and its row of metrics.
+        metres: side of the square that is shown.
+        pixels: side of a picture.
+        ghost: also outline the recorded ego.
+        caption: two lines to show in large letters; by default the method, ego, scene, seed and intensity.
     """
 
     rollout: Rollout
@@ -43,6 +48,7 @@ class Replay:
     metres: float = 70.0
     pixels: int = 720
     ghost: bool = False
+    caption: tuple[str, str] | None = None
 
     def __post_init__(self):
         self.contact = None if math.isnan(self.row["contact_step"]) else int(self.row["contact_step"])
@@ -75,7 +81,7 @@ class Replay:
             times = np.maximum(0, self.contact + np.array(STRIP_TIMES) / self.rollout.dt)
         figure, panels = new_panels(len(times), STRIP_SIDE, STRIP_GAP, STRIP_HEAD)
         for axes, time in zip(panels, times, strict=True):
-            text, colour, phase = f"{time * self.rollout['dt']:.1f} s", drawing.INK, None
+            text, colour, phase = f"{time * self.rollout.dt:.1f} s", drawing.INK, None
             if time == self.contact:
                 text, colour, phase = f"{text}   {contact_text(self.row)}", drawing.CONTACT, 0.25
             elif time == times[0] and self.contact is not None:
@@ -134,27 +140,35 @@ class Panel:
 
     def __init__(self, replay: Replay, figure: Figure | SubFigure):
         self.replay, self.figure, rollout = replay, figure, replay.rollout
-        axes = self.figure.add_axes((0, FOOT / SIDE, 1, 1 - (HEAD + FOOT) / SIDE))
+        large = replay.caption is not None
+        head, foot = (LARGE_HEAD, LARGE_FOOT) if large else (HEAD, FOOT)
+        title, detail = replay.caption or (
+            f"{rollout.method}  vs  {rollout.ego_policy}",
+            f"{shorten(rollout.scene_id)}   seed {rollout.seed}   intensity {rollout.eta:g}",
+        )
+        axes = self.figure.add_axes((0, foot / SIDE, 1, 1 - (head + foot) / SIDE))
         self.map = TrafficMap(axes, rollout, replay.metres)
-        text, left, right, upper, lower = self.figure.text, 14 / SIDE, 706 / SIDE, 697 / SIDE, 679 / SIDE
-        detail = f"{shorten(rollout['scene_id'])}   seed {rollout['seed']}   intensity {rollout['eta']:g}"
-        text(left, upper, f"{rollout['method']}  vs  {rollout['ego_policy']}", fontsize=16, color=drawing.INK)
-        text(left, lower, detail, fontsize=11, color=drawing.MUTED)
-        self.clock = text(right, upper, "", fontsize=16, color=drawing.INK, ha="right")
-        self.speed = text(right, lower, "", fontsize=11, color=drawing.MUTED, ha="right")
+        first, second = (26, 20) if large else (16, 11)  # points, of the letters
+        left, right, upper, lower = 14 / SIDE, 706 / SIDE, 1 - 0.46 * head / SIDE, 1 - 0.82 * head / SIDE
+        text = self.figure.text
+        text(left, upper, title, fontsize=first, color=drawing.INK)
+        text(left, lower, detail, fontsize=second, color=drawing.MUTED)
+        self.clock = text(right, upper, "", fontsize=first, color=drawing.INK, ha="right")
+        self.speed = text(right, lower, "", fontsize=second, color=drawing.MUTED, ha="right")
         box = {"boxstyle": "round,pad=0.5,rounding_size=1", "facecolor": drawing.CONTACT, "edgecolor": "none"}
-        badge = f"{contact_text(replay.row)}\n{verdict_text(replay.row)}"
-        self.badge = text(0.5, 640 / SIDE, badge, fontsize=13, color="w", ha="center", bbox=box)
-        add_legend(self.figure, LEGEND, 11, replay.ghost)
+        badge = contact_text(replay.row) if large else f"{contact_text(replay.row)}\n{verdict_text(replay.row)}"
+        self.badge = text(0.5, 1 - (head + 40) / SIDE, badge, fontsize=22 if large else 13, color="w", bbox=box)
+        self.badge.set(ha="center", va="center")
+        add_legend(self.figure, dict(list(LEGEND.items())[:3]) if large else LEGEND, 20 if large else 11, replay.ghost)
         bar = (right - 10 / replay.metres, right)
         self.figure.add_artist(Line2D(bar, (10 / SIDE, 10 / SIDE), color=drawing.INK, linewidth=2))
-        text(sum(bar) / 2, 14 / SIDE, "10 m", fontsize=10, color=drawing.MUTED, ha="center")
+        text(sum(bar) / 2, 14 / SIDE, "10 m", fontsize=second - 1, color=drawing.MUTED, ha="center")
 
     def show(self, time: float, phase: float | None) -> None:
         replay, rollout = self.replay, self.replay.rollout
         replay.draw(self.map, time, phase)
         speed = interpolated(rollout.states, rollout.valid, time)[rollout.ego, 3]
-        self.clock.set_text(f"{time * rollout['dt']:.1f} s")
+        self.clock.set_text(f"{time * rollout.dt:.1f} s")
         self.speed.set_text(f"ego {speed:.1f} m/s")
         self.badge.set_visible(replay.contact is not None and time >= replay.contact)
 

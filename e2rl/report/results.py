@@ -22,19 +22,17 @@ from e2rl.report.comparison_tables import (
 )
 from e2rl.report.curves import points_of_rows, save_curves
 from e2rl.report.drawing import save_figure
-from e2rl.report.html import PAGE, report
-from e2rl.report.intensity import intensity_figure, intensity_ladder
+from e2rl.report.html import write_report
+from e2rl.report.intensity import intensity_figure, intensity_sweep
 from e2rl.report.mode_table import mode_tables
 from e2rl.report.plots import collision_bars, learning_curves
 from e2rl.report.tables import Table, metric_tables, print_tables, save_tables
-from e2rl.run.files import write_atomically
 from e2rl.run.run import Run
 
 NOMINAL = "nominal"  # traffic without an attack, which every attack is compared with
 MAIN = "main"  # table of metrics
-REPLAYS = 300  # in the failure report at most
 FIGURES: Mapping[str, Callable[[Path, Sequence[dict]], object]] = {
-    "intensity": lambda folder, rows: save_figure(folder / "intensity.png", intensity_figure(intensity_ladder(folder))),
+    "intensity": lambda folder, rows: save_figure(folder / "intensity.png", intensity_figure(intensity_sweep(folder))),
     "curves": lambda folder, rows: save_curves(folder, points_of_rows(rows)),
 }
 
@@ -54,9 +52,8 @@ def write_results(run: Run, plan: Plan, rows: Sequence[dict]) -> list[str]:
         print_tables(tables)
     if asked.figure:
         FIGURES[asked.figure](folder, rows)
-    page = folder / PAGE if asked.report and asked.save_rollouts and modes["failures"] else None
-    if page:
-        write_atomically(page, report(folder, REPLAYS))
+    shown = asked.report and asked.save_rollouts and modes["failures"]
+    page = write_report(folder, rows, modes, tables) if shown else None
     return answer_lines(rows, modes, folder, page, dropped)
 
 

@@ -1,68 +1,57 @@
-"""What a round of evolution looked like: films of attacks that hit the ego, and the curriculum's choices so far.
+"""What a round of evolution looked like: one line, videos of attacks that hit the ego, and the curriculum's choices."""
 
-`train.py` draws them after every round; conf/logger says how many films, and on which dashboard they appear.
-"""
-
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from e2rl.evaluation.rollout_files import Source, rollout_arrays
-from e2rl.evaluation.rollout_reader import plain
-from e2rl.learning.evolution import Evolution
-from e2rl.learning.logging import RunLogger
 from e2rl.metrics.contact import first_contact
 from e2rl.metrics.score import score_rollouts
-from e2rl.report.curriculum_figure import PICTURE, draw_choices
 from e2rl.report.picture import Replay
 from e2rl.report.videos import save_animation
-from e2rl.scenes.recording import VEHICLE
 from e2rl.scenes.scene import SceneSet
-from e2rl.traffic.rollout import SCENE_KEYS
+from e2rl.sim.rollouts import Rollouts
 
-FILMS = "replays"
-METRES, PIXELS = 60.0, 360  # side of a film's picture
-
-
-def draw_round(run: Evolution, scenes: SceneSet, method: str, folder: Path, logger: RunLogger, replays: int) -> None:
-    """Draw and log curriculum.png, and `replays` films of the attacks of the round just done: files
-    replays/round-<number>-<k>.gif. Live traffic is not kept, so that there are none of it."""
-    number = run.round
-    draw_choices(folder)
-    if (folder / PICTURE).is_file():
-        logger.show("curriculum/choices", folder / PICTURE, number - 1)
-    if not replays or not run.memory.rounds:
-        return
-    traffic = run.memory.rounds[-1].traffic
-    for k, row in enumerate(hits(traffic, scenes)[:replays].tolist()):
-        path = folder / FILMS / f"round-{number:03d}-{k + 1}.gif"
-        path.parent.mkdir(exist_ok=True)
-        save_animation(path, replay_of(traffic, row, scenes, method).frames())
-        logger.show(f"synthesizer/replay_{k + 1}", path, number - 1)
+VIDEOS = "videos"
+METRES, PIXELS = 60.0, 360  # side of a video's picture
 
 
 def round_line(metrics: Mapping[str, float], number: int, rounds: int) -> str:
-    """A round in one line."""
-    speed, waiting = metrics.get("time/steps_per_second"), metrics.get("time/waiting")
+    """A round in one line of at most 100 characters, errored rollouts apart."""
+    hit, left_out = metrics.get("synthesizer/contact", float("nan")), metrics["synthesizer/left_out"]
+    left = f", {left_out:.0f} left out" if left_out else ""
     return (
-        f"round {number}/{rounds}: eta {metrics['synthesizer/eta']:.2f}, adversarial collisions "
-        f"{metrics.get('synthesizer/contact', float('nan')):.0%} in {metrics['synthesizer/scenes']:.0f} scenes "
-        f"({metrics['synthesizer/left_out']:.0f} left out: no way found to avoid them), "
-        f"{metrics['time/synthesize']:.0f} s synthesis, {metrics['time/improve']:.0f} s learning"
-        + (f", {waiting:.0f} s waiting" if waiting is not None else "")
-        + ended_text(metrics)
-        + (f", collected at {speed:.0f} steps/s" if speed else "")
+        f"round {number}/{rounds}: the attacks hit in {hit:.0%} of {metrics['synthesizer/scenes']:.0f} scenes{left} "
+        f"(eta {metrics['synthesizer/eta']:.2f}); {metrics['time/improve']:.0f} s learning{errored_text(metrics)}"
     )
 
 
-def ended_text(metrics: Mapping[str, float]) -> str:
-    """How many rollouts and episodes ended for an error, and why; "" for none."""
-    found = {name.rpartition("/ended_")[2]: count for name, count in metrics.items() if "/ended_" in name}
+def errored_text(metrics: Mapping[str, float]) -> str:
+    """How many rollouts and episodes errored, and why; "" for none."""
+    found = {name.rpartition("/errored_")[2]: count for name, count in metrics.items() if "/errored_" in name}
     reasons = ", ".join(f"{count:.0f} {reason.replace('_', ' ')}" for reason, count in found.items())
     return f", without a score: {reasons}" if reasons else ""
+
+
+def save_videos(
+    traffic: Mapping[str, Tensor], scenes: SceneSet, number: int, method: str, folder: Path, count: int
+) -> Iterator[Path]:
+    """Write at most `count` videos of attacks in a round's traffic that hit the ego, videos/round-<number>-<k>.gif.
+
+    Args:
+        traffic: of the memory: scene_index [R], states [R, T+1, N, 4], valid, adversaries, eta.
+        number: of the round, from 1.
+        method: name of the attack, for the captions.
+
+    Yields:
+        The path of each video.
+    """
+    for k, row in enumerate(hits(traffic, scenes)[:count].tolist()):
+        path = folder / VIDEOS / f"round-{number:03d}-{k + 1}.gif"
+        path.parent.mkdir(exist_ok=True)
+        save_animation(path, replay_of(traffic, row, scenes, method).frames())
+        yield path
 
 
 def hits(traffic: Mapping[str, Tensor], scenes: SceneSet) -> Tensor:
@@ -79,19 +68,10 @@ def hits(traffic: Mapping[str, Tensor], scenes: SceneSet) -> Tensor:
 
 def replay_of(traffic: Mapping[str, Tensor], row: int, scenes: SceneSet, method: str) -> Replay:
     """The replay of one row of a round's traffic."""
-    index = traffic["scene_index"][row : row + 1]
-    scene = scenes.batch(index)
-    rollout: dict[str, Any] = {name: traffic[name][row : row + 1] for name in ("states", "valid", "adversaries")}
-    rollout |= {name: scene[name] for name in SCENE_KEYS}
-    slots = torch.arange(scene["valid"].shape[1]) < scene["route_points"].shape[1]
-    rollout |= {
-        "logged_valid": scene["logged_valid"] & scene["valid"][:, None],
-        "simulated": scene["valid"] & (scene["agent_type"] == VEHICLE) & slots,
-        "eta": traffic["eta"][row : row + 1].double().round(decimals=2),
-        "seed": index,
-        "seconds": torch.zeros(1),
-        "scene_id": [scenes.scene_id[int(index)]],
-        "location": [scenes.location[int(index)]],
-    }
-    rows, _ = score_rollouts(rollout)
-    return Replay(plain(rollout_arrays(rollout, 0, Source("", "train", method, "actor"))), rows[0], METRES, PIXELS)
+    own = {name: traffic[name][row : row + 1] for name in ("scene_index", "states", "valid", "adversaries")}
+    index, about = own.pop("scene_index"), {"dataset": "", "split": "train", "method": method, "ego_policy": "actor"}
+    eta = traffic["eta"][row : row + 1].double().round(decimals=2)
+    names = {name: [value] for name, value in about.items()}
+    rollouts = Rollouts.in_scenes(scenes, index, **own, seed=index, eta=eta, seconds=torch.zeros(1), **names)
+    rows, _ = score_rollouts(rollouts)
+    return Replay(rollouts.rollout(0), rows[0], METRES, PIXELS)

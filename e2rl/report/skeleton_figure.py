@@ -27,7 +27,6 @@ from e2rl.run.errors import InputError
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.rollouts import ROLLOUTS, Rollout, rollout_name
 from e2rl.traffic.e2.skeleton import Selection, chain_depth
-from e2rl.traffic.e2.topology import TopologySettings
 from e2rl.traffic.grouping import take_rows
 
 SIDE, GAP, HEAD, FOOT = 600, 12, 62, 34  # points: of a panel, between panels, above and below them
@@ -41,7 +40,7 @@ LEGEND |= {"feasible, no candidate": FEASIBLE, "others": drawing.BACKGROUND}
 
 @dataclass
 class SkeletonPicture:
-    """The figure of a selection (B = 1) in a rollout, with the topology's settings.
+    """The figure of a selection (B = 1) in a rollout.
 
     `time` [s] and `weights` [V, V] are those of the step of the reference rollout at which the coalition's links weigh
     most, `risky` [V, 4] the states there; `now` [N, 4] are the rollout's states when the coalition was chosen.
@@ -49,10 +48,10 @@ class SkeletonPicture:
 
     rollout: Rollout
     selection: Selection
-    settings: TopologySettings
 
     def __post_init__(self):
         chosen = self.selection
+        self.settings = chosen.settings
         masks = (chosen.coalition, chosen.candidates, chosen.feasible)
         self.coalition, self.candidates, self.feasible = (mask[0].cpu().numpy() for mask in masks)
         self.target, self.step = chosen.target[0].tolist(), int(chosen.step)
@@ -168,9 +167,9 @@ class SkeletonPicture:
             text.set(color=drawing.INK, path_effects=outline, zorder=ON_TOP + 1, clip_on=True)
 
 
-def skeleton_figure(rollout: Rollout, selection: Selection, settings: TopologySettings) -> Figure:
+def skeleton_figure(rollout: Rollout, selection: Selection) -> Figure:
     """The figure of a selection (B = 1) and of the rollout that it belongs to."""
-    return SkeletonPicture(rollout, selection, settings).figure()
+    return SkeletonPicture(rollout, selection).figure()
 
 
 def name(agent: int) -> str:
@@ -187,7 +186,7 @@ class LongestChain:
     rank: tuple[float, ...] = (0, 0, 0)
 
     def __post_init__(self) -> None:
-        self.method.traffic.on_selection = self
+        self.method.traffic.on_decision = self
 
     def __call__(self, selection: Selection) -> None:
         depth, size = chain_depth(selection.target).amax(1), selection.coalition.sum(1)
@@ -205,13 +204,6 @@ class LongestChain:
                 "e2 first in methods, at an eta above 0, and evaluate more scenes, or name one with scene="
             )
         return self.kept
-
-    @property
-    def topology(self) -> TopologySettings:
-        """Settings of the risk graphs of the method's selections; InputError for a method without them."""
-        if self.method.traffic.topology is None:
-            raise InputError(f"figure=skeleton: needs a method of e2 first in methods, not {self.method.name}")
-        return self.method.traffic.topology
 
     def rollout(self, scenes: SceneSet, ego_name: str, folder: Path) -> Rollout:
         """The rollout of the kept selection, from its file; InputError if no adversary was chosen."""

@@ -1,28 +1,31 @@
-"""Metric tables from the rows of metrics.json, for a terminal and as markdown. Shares are in per cent.
+"""Tables of metrics from the rows of metrics.json, for a terminal, Markdown, LaTeX and CSV. Shares are in per cent.
 
-For each (dataset, split, ego), one table has a row per metric and a column per method. Where there are several methods,
-a second table has each method's paired difference to the first.
+A run has a table with a row for each metric and a column for each method, and one with the differences to the first.
 """
 
 import csv
 import io
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from tabulate import LATEX_ESCAPE_RULES, tabulate
+
 from e2rl.metrics.catalogue import META_STAGE, METRICS, OPEN_LOOP_STAGE, STAGES, Metric, table_metrics
-from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
 
 UNKNOWN = "–"
-COUNTED = {
+COUNTED = {  # what the count (n) of a stage's cells counts, and how its metrics are computed
     OPEN_LOOP_STAGE: "(n) vehicles: others than the ego, faster than 0.5 m/s in the log at the start, recorded "
     "throughout the horizon; causal start states, a route drawn per sample; samples without acceleration bounds.",
     META_STAGE: "(n) scenes. Likelihood of the log under each vehicle's histogram over all rollouts and steps; "
     "vehicles recorded throughout. A deterministic method's rollout stands for all.",
-}  # what the count (n) of a stage's cells counts, and how its metrics are computed
+}
+MEANS = "Mean [95% interval, by location or scene]; (n) rollouts where fewer count."
+PAIRED = "[95% interval], paired by (scene, seed); * the interval leaves out 0."
+SYMBOLS = str.maketrans({"–": "--", "−": "$-$", "η": r"$\eta$", "²": "$^2$", "³": "$^3$", "≤": r"$\le$", "≥": r"$\ge$"})
 
 
 @dataclass
@@ -35,28 +38,22 @@ class Table:
     rows: list[list[str]]
     title: str = ""
 
+    def grid(self, kind: str) -> str:
+        """Head and rows in a format of tabulate."""
+        align = ["left"] + ["right"] * (len(self.head) - 1)
+        return tabulate(self.rows, self.head, kind, disable_numparse=True, colalign=align)
+
     def text(self) -> str:
         """For a terminal: aligned columns, the caption above."""
-        widths = [max(map(len, column)) for column in zip(self.head, *self.rows, strict=True)]
-
-        def line(cells: list[str]) -> str:
-            numbers = [cell.rjust(width) for cell, width in zip(cells[1:], widths[1:], strict=True)]
-            return "  ".join([cells[0].ljust(widths[0]), *numbers]).rstrip()
-
-        rule = "-" * (sum(widths) + 2 * len(widths) - 2)
-        caption = textwrap.fill(self.caption, max(len(rule), 60))
-        title = [f"{self.title}\n"] if self.title else []
-        return "\n".join([*title, caption, rule, line(self.head), rule, *map(line, self.rows), rule])
+        grid = self.grid("simple")
+        caption = textwrap.fill(self.caption, max(len(grid.partition("\n")[0]), 60))
+        return "\n".join([*([self.title] if self.title else []), caption, grid])
 
     def markdown(self) -> str:
-        """A markdown table, its caption beneath."""
-
-        def line(cells: list[str]) -> str:
-            return f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |"
-
-        align = "| --- |" + " ---: |" * (len(self.head) - 1)
-        title = [f"## {self.title}\n"] if self.title else []
-        return "\n".join([*title, line(self.head), align, *map(line, self.rows), "", self.caption, ""])
+        """A Markdown table, its caption beneath."""
+        head, *rows = [[cell.replace("|", "&#124;") for cell in line] for line in (self.head, *self.rows)]
+        title = f"## {self.title}\n\n" if self.title else ""
+        return f"{title}{Table('', head, rows).grid('pipe')}\n\n{self.caption}\n"
 
     def csv(self) -> str:
         """Head and rows, without the caption."""
@@ -66,42 +63,42 @@ class Table:
 
     def latex(self) -> str:
         """A table environment with a tabular of package booktabs."""
+        grid, caption = self.grid("latex_booktabs").translate(SYMBOLS), escaped(self.caption)
+        return f"\\begin{{table}}\n{grid}\n\\caption{{{caption}}}\n\\end{{table}}\n"
 
-        def line(cells: list[str]) -> str:
-            return " & ".join(map(escaped, cells)) + r" \\"
 
-        columns = "l" + "r" * (len(self.head) - 1)
-        lines = [r"\begin{table}", rf"\begin{{tabular}}{{{columns}}}", r"\toprule", line(self.head), r"\midrule"]
-        lines += [*map(line, self.rows), r"\bottomrule", r"\end{tabular}"]
-        return "\n".join([*lines, rf"\caption{{{escaped(self.caption)}}}", r"\end{table}", ""])
+def escaped(text: str) -> str:
+    """The text for LaTeX."""
+    return "".join(LATEX_ESCAPE_RULES.get(sign, sign) for sign in text).translate(SYMBOLS)
 
 
 def metric_tables(rows: Sequence[dict], settings: str = "", table: str = "main") -> list[Table]:
-    """Tables of rows as in metrics.json.
+    """Returns the tables of rows of metrics.json: for each data set, split and ego the means of each method, and their
+    differences where there are several.
 
-    settings: text for every caption, such as the prior and its sampler. table: of `catalogue.TABLES`, whose metrics the
-    closed-loop tables show; a caption names those that no row knows. Rows of the stages `open loop` and `meta-metric`
-    have their own tables and metrics.
+    Args:
+        rows: of metrics.json; those of the stages `open loop` and `meta-metric` have their own tables and metrics.
+        settings: text for every caption, such as the prior and its sampler.
+        table: of the catalogue, whose metrics the closed-loop tables show; a caption names those that no row knows.
     """
     groups: dict[tuple, list[dict]] = {}
-    metrics = table_metrics(table)
     for row in rows:
         stage = row.get("stage") if row.get("stage") in STAGES else None
         groups.setdefault((row["dataset"], row["split"], row["ego"], stage), []).append(row)
     tables = []
     for (*_, stage), group in groups.items():
-        tables += [means_table(group, settings, STAGES.get(stage, metrics)), paired_table(group, metrics)]
+        metrics = STAGES.get(stage, table_metrics(table))
+        tables += [means_table(group, settings, metrics), paired_table(group, metrics)]
     return [table for table in tables if table.rows]
 
 
 def means_table(group: Sequence[dict], settings: str, metrics: Sequence[Metric]) -> Table:
-    """Mean [95% interval] of each metric, with a column for each row of metrics.json."""
-    known = [metric for metric in metrics if any(row["metrics"].get(metric.name, {}).get("n", 0) for row in group)]
+    """The mean and interval of each metric, with a column for each row of metrics.json."""
+    known, names = known_metrics(group, metrics), column_names(group)
     unknown = [metric.name for metric in metrics if metric not in known]
-    names, counted = column_names(group), COUNTED.get(group[0].get("stage", ""), "(n) rollouts where fewer count.")
-    caption = (
-        f"{origin(group[0])}. {counts(group, names)} Mean [95% interval, bootstrap by location or scene]; {counted}"
-    )
+    counted = COUNTED.get(group[0].get("stage", ""))
+    caption = f"{origin(group[0])}. {counts(group, names)} "
+    caption += f"{MEANS.partition(';')[0]}; {counted}" if counted else MEANS
     caption += f" {settings.rstrip('.')}." if settings else ""
     caption += f" Not computable here: {', '.join(unknown)}." if unknown else ""
     rows = [[heading(metric), *(mean_cell(metric, row) for row in group)] for metric in known]
@@ -109,11 +106,8 @@ def means_table(group: Sequence[dict], settings: str, metrics: Sequence[Metric])
 
 
 def paired_table(group: Sequence[dict], metrics: Sequence[Metric]) -> Table:
-    """Paired differences over the same (scene, seed), of shares in per cent points.
-
-    They compare each method with the first one or, where rows have the stages before and after training, each method
-    after training with itself before. The table has no rows where nothing is paired.
-    """
+    """Paired differences, of shares in per cent points: of each method to the first one or, where rows have the stages
+    before and after training, of each method after training to itself before. No rows where nothing is paired."""
     first, names = group[0], column_names(group)
     # A method with several etas is named method@eta in `paired`.
     reference, keys = names[0], [f"{first['method']}@{first['eta']:g}", first["method"]]
@@ -121,13 +115,17 @@ def paired_table(group: Sequence[dict], metrics: Sequence[Metric]) -> Table:
         reference, keys = "before", ["before"]
     found = [(name, row["paired"].get(key)) for name, row in zip(names, group, strict=True) for key in keys]
     columns = {name: paired for name, paired in found if paired}
-    rows = []
-    for metric in metrics:
-        cells = [difference_cell(metric, paired.get(metric.name)) for paired in columns.values()]
-        if any(cell != UNKNOWN for cell in cells):
-            rows.append([heading(metric, points=True), *cells])
-    caption = f"{origin(first)}. Difference to {reference} [95% interval], paired by (scene, seed); * the interval "
-    return Table(f"{caption}leaves out 0.", ["", *columns], rows)
+    cells = {
+        heading(metric, points=True): [difference_cell(metric, paired.get(metric.name)) for paired in columns.values()]
+        for metric in metrics
+    }
+    rows = [[name, *line] for name, line in cells.items() if any(cell != UNKNOWN for cell in line)]
+    return Table(f"{origin(first)}. Difference to {reference} {PAIRED}", ["", *columns], rows)
+
+
+def known_metrics(group: Sequence[dict], metrics: Iterable[Metric]) -> list[Metric]:
+    """The metrics that some row knows."""
+    return [metric for metric in metrics if any(row["metrics"].get(metric.name, {}).get("n", 0) for row in group)]
 
 
 def origin(row: dict) -> str:
@@ -139,15 +137,17 @@ def counts(group: Sequence[dict], names: Sequence[str], per: str = "method") -> 
     column."""
     texts = []
     for row in group:
-        numbers = {word: row[f"n_{word}s"] for word in ("scene", "seed", "rollout")}
-        ended = [f"{count} without a score ({reason})" for reason, count in row.get("ended", {}).items()]
-        texts.append(", ".join([*(f"{n} {word}{'' if n == 1 else 's'}" for word, n in numbers.items()), *ended]))
+        numbers = {"scene": row["n_scenes"], "seed": row["n_seeds"], "rollout": row["n_rollouts"]}
+        if row.get("n_trainings", 1) > 1:
+            numbers["training"] = row["n_trainings"]
+        failed = [f"{count} rollouts without a score ({reason})" for reason, count in row.get("ended", {}).items()]
+        texts.append(", ".join([*(f"{n} {word}{'' if n == 1 else 's'}" for word, n in numbers.items()), *failed]))
     if len(set(texts)) == 1:
         return f"{texts[0]} per {per}."
     return "; ".join(f"{name}: {text}" for name, text in zip(names, texts, strict=True)) + "."
 
 
-def column_names(group: Sequence[dict]) -> list[str]:
+def column_names(group: Sequence[Mapping]) -> list[str]:
     """The method, after its stage of training if any, with eta where it is not 0 or where the method has several."""
     etas: dict[str, set[float]] = {}
     for row in group:
@@ -159,6 +159,9 @@ def column_names(group: Sequence[dict]) -> list[str]:
         eta = f" η={row['eta']:g}" if row["eta"] or len(etas[row["method"]]) > 1 else ""
         names.append(f"{before}{row['method']}{eta}")
     return names
+
+
+# --- cells
 
 
 def heading(metric: Metric, points: bool = False) -> str:
@@ -175,10 +178,11 @@ def mean_cell(metric: Metric, row: dict) -> str:
 
 
 def difference_cell(metric: Metric, value: dict | None) -> str:
-    """Such as `+2.1 [+0.4, +3.9]*`, with a star where the interval leaves out 0."""
+    """Such as `+2.1 [+0.4, +3.9]*`, with a star where the interval leaves out 0, but for costs of the computation."""
     if not value or math.isnan(value["difference"]):
         return UNKNOWN
-    return estimate(metric, value, "difference", "+") + ("*" if value["low"] > 0 or value["high"] < 0 else "")
+    certain = not metric.cost and (value["low"] > 0 or value["high"] < 0)
+    return estimate(metric, value, "difference", "+") + ("*" if certain else "")
 
 
 def estimate(metric: Metric, value: dict, name: str, sign: str = "") -> str:
@@ -201,41 +205,12 @@ def number(metric: Metric, value: float, sign: str = "") -> str:
     return f"{value:{sign}.{decimals}f}"
 
 
-LATEX = {"\\": r"\textbackslash{}", "–": "--", "−": "$-$", "η": r"$\eta$", "²": "$^2$", "³": "$^3$", "≤": r"$\le$"}
-LATEX |= {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}"} | {sign: rf"\{sign}" for sign in "&%$#_{}"}
-
-
-def escaped(text: str) -> str:
-    """The text for LaTeX."""
-    return "".join(LATEX.get(sign, sign) for sign in text)
+# --- files
 
 
 def save_tables(path: Path, tables: Sequence[Table]) -> None:
-    """Write the tables into one markdown file, with a list of what each metric means."""
-    parts = [*(table.markdown() for table in tables), f"```\n{legend()}\n```\n"]
-    write_atomically(path, "\n".join(parts))
-
-
-def read_tables(path: Path) -> list[Table]:
-    """The tables of a file that `save_tables` wrote; a caption is one line. InputError where there is no such file, or
-    where a table has no line under its head."""
-    try:
-        blocks = Path(path).read_text().split("\n\n")
-    except (OSError, UnicodeError) as error:
-        raise InputError(f"{path}: no tables ({error}); give the folder of a run that evaluate.py wrote") from error
-    tables: list[Table] = []
-    title = ""
-    for block, caption in zip(blocks, [*blocks[1:], ""], strict=True):
-        lines = block.strip().splitlines()
-        if block.strip().startswith("## "):
-            title = block.strip()[3:]
-        elif lines and lines[0].startswith("| "):
-            if len(lines) < 2:
-                raise InputError(f"{path}: damaged at {lines[0][:60]!r}; run evaluate.py again to write it")
-            head, _, *rows = [[cell.replace("&#124;", "|") for cell in row[2:-2].split(" | ")] for row in lines]
-            tables.append(Table(caption.strip(), head, rows, title))
-            title = ""
-    return tables
+    """Write the tables into one Markdown file, with a list of what each metric means."""
+    write_atomically(path, "\n".join([*(table.markdown() for table in tables), f"```\n{legend()}\n```\n"]))
 
 
 def print_tables(tables: Sequence[Table]) -> None:

@@ -18,28 +18,27 @@ from e2rl.run.files import write_atomically
 PANELS = (("cfr", "failures [%]"), ("cfr_counted", "failures that count [%]"))
 REALISM = "real_adv"
 SIDE, RISE = 420, 340  # points: width and height of a panel
-NAME = "tuning_curve"
 
 
 def save_tuning_curve(folder: Path, trials: Sequence[dict], method: str) -> None:
     """Write tuning_curve.csv, a line a trial in the order of the gain, and tuning_curve.png and .pdf."""
-    write_atomically(folder / f"{NAME}.csv", curve_csv(trials))
-    save_figure(folder / f"{NAME}.png", curve_figure(trials, method))
+    write_atomically(folder / "tuning_curve.csv", curve_csv(trials))
+    save_figure(folder / "tuning_curve.png", curve_figure(trials, method))
 
 
 def gain_of(trial: dict) -> float:
-    """The first of the parameters: that whose curve is drawn."""
+    """Returns the first of the parameters: that whose curve is drawn."""
     return next(iter(trial["parameters"].values()))
 
 
 def on_curve(trials: Sequence[dict]) -> list[dict]:
-    """The trials with all parameters but the gain as in the first, in the order of the gain."""
+    """Returns the trials with all parameters but the gain as in the first, in the order of the gain."""
     others = [list(trial["parameters"].values())[1:] for trial in trials]
     return sorted((trial for trial, own in zip(trials, others, strict=True) if own == others[0]), key=gain_of)
 
 
 def curve_csv(trials: Sequence[dict]) -> str:
-    """Trial, parameters, whether it is on the curve and admissible, then its metrics; NaN is an empty cell."""
+    """Returns trial, parameters, whether it is on the curve and admissible, then its metrics; NaN is an empty cell."""
     drawn = on_curve(trials)
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
@@ -51,39 +50,30 @@ def curve_csv(trials: Sequence[dict]) -> str:
 
 
 def curve_figure(trials: Sequence[dict], method: str) -> Figure:
-    """A panel for each of PANELS: the curve over the gain with 95% intervals, the other trials as dots, refused ones
-    hollow."""
+    """Returns a panel for each of PANELS: the curve over the gain with 95% intervals, the other trials as dots."""
     figure, panels = plain_figure(SIDE * len(PANELS), RISE, len(PANELS))
     curve = on_curve(trials)
-    others = [trial for trial in trials if trial not in curve]
     for axes, (metric, title) in zip(panels, PANELS, strict=True):
-        places = [trial["metrics"][REALISM] for trial in curve]
-        axes.plot(places, [100 * trial["metrics"][metric] for trial in curve], color=drawing.EGO, linewidth=1)
-        for trial in others:
-            dot(axes, trial, metric, drawing.BACKGROUND)
-        for trial in curve:
-            dot(axes, trial, metric, drawing.EGO)
-            bar(axes, trial, metric)
+        points = [(trial["metrics"][REALISM], 100 * trial["metrics"][metric]) for trial in curve]
+        axes.plot(*zip(*points, strict=True), color=drawing.EGO, linewidth=1)
+        for trial in trials:
+            _draw(axes, trial, metric, trial in curve)
         axes.set_title(title, fontsize=10)
         axes.set_xlabel(f"realism of the adversaries ({REALISM})")
         axes.set_ylim(bottom=0)
-    figure.suptitle(
-        f"{method}: {next(iter(trials[0]['parameters']))} written at its points; hollow: refused", fontsize=9
-    )
+    gain = next(iter(trials[0]["parameters"]))
+    figure.suptitle(f"{method}: {gain} written at its points; hollow: refused", fontsize=9)
     return figure
 
 
-def dot(axes: Axes, trial: dict, metric: str, colour: str) -> None:
-    face = colour if trial["admissible"] else drawing.PANEL
-    place = trial["metrics"][REALISM], 100 * trial["metrics"][metric]
-    axes.plot(*place, marker="o", markersize=5, color=colour, markerfacecolor=face, linestyle="none", zorder=3)
-
-
-def bar(axes: Axes, trial: dict, metric: str) -> None:
-    """The interval of a point of the curve, and its gain."""
-    low, high = (100 * trial["metrics"][f"{metric}_{end}"] for end in ("low", "high"))
+def _draw(axes: Axes, trial: dict, metric: str, on: bool) -> None:
+    """Draw a trial, hollow where it is refused; on the curve also its interval and its gain."""
     x, y = trial["metrics"][REALISM], 100 * trial["metrics"][metric]
-    if not math.isnan(low):
+    colour = drawing.EGO if on else drawing.BACKGROUND
+    face = colour if trial["admissible"] else drawing.PANEL
+    axes.plot(x, y, marker="o", markersize=5, color=colour, markerfacecolor=face, linestyle="none", zorder=2 + on)
+    low, high = (100 * trial["metrics"][f"{metric}_{end}"] for end in ("low", "high"))
+    if on and not math.isnan(low):
         axes.vlines(x, low, high, color=drawing.EGO, linewidth=0.8, alpha=0.5)
-    if not math.isnan(x):
+    if on and not math.isnan(x):
         axes.annotate(f"{gain_of(trial):.2g}", (x, y), xytext=(4, 4), textcoords="offset points", fontsize=7)

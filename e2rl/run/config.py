@@ -139,6 +139,8 @@ def check_counts(config: Mapping, **least: int) -> None:
 
 # --- command line
 
+SCRIPTS = ("evaluate", "train")  # that choose from conf/experiment
+
 
 def run_command(main: Callable[[], None], name: str) -> None:
     """Run a command that Hydra configures by conf/<name>.yaml.
@@ -152,7 +154,7 @@ def run_command(main: Callable[[], None], name: str) -> None:
         return
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors arrive here as they are
     with ending():
-        if wrong := added_by_mistake(name, arguments):
+        if wrong := added_by_mistake(name, arguments) + of_another_command(name, arguments):
             raise InputError("; ".join(wrong))
         try:
             main()
@@ -212,6 +214,24 @@ def added_by_mistake(name: str, arguments: Sequence[str]) -> list[str]:
     known = [*_content(conf_folder() / f"{name}.yaml"), *_groups(name)]
     added = [key for plus, key, _ in _options(arguments) if plus and "." not in key and "/" not in key]
     return [_told(key, key, known) for key in added if key not in known and get_close_matches(key, known, 1, ALIKE)]
+
+
+def of_another_command(name: str, arguments: Sequence[str]) -> list[str]:
+    """What is wrong with an `experiment` whose file sets options that the command does not have."""
+
+    def fits(command: str) -> bool:
+        return sets <= {*_content(conf_folder() / f"{command}.yaml"), *_groups(command)}
+
+    for _, key, value in _options(arguments):
+        file = conf_folder() / key / f"{value}.yaml"
+        if key == "experiment" and name in SCRIPTS and file.is_file():
+            content = _content(file)
+            changed = {word for entry in content.pop("defaults", []) if isinstance(entry, dict) for word in entry}
+            sets = {*content, *(word.removeprefix("override ").removeprefix("/") for word in changed)}
+            if not fits(name):
+                right = next((other for other in SCRIPTS if fits(other)), None)
+                return [f"experiment={value}: " + (f"of {right}.py, not {name}.py" if right else "of another command")]
+    return []
 
 
 def _told(option: str, given: str, known: Sequence[str]) -> str:

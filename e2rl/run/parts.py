@@ -1,8 +1,7 @@
-"""Finished parts of a run, kept on disk as they end: a run that was killed goes on from them (docs/robustness.md)."""
+"""The parts of a run that are done, each on disk as it ends: a run that was killed goes on from them."""
 
 import hashlib
 import io
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,10 +16,13 @@ PARTS, FORMAT, HASHED = "parts", "e2rl-part/1", b"e2rl-sha256:"
 
 @dataclass(frozen=True)
 class Parts:
-    """The finished parts of a run's stage, in folder/parts/<stage>; folder None: nothing is kept.
+    """The parts of a run's stage that are done, in folder/parts/<stage>.
 
     A part holds plain values and tensors. It counts where its file is whole and its identity is the one asked for.
-    about: what all parts of the stage depend on besides the run's inputs, such as the weights of a round.
+
+    Args:
+        folder: of the run; None: nothing is written.
+        about: what all parts of the stage depend on besides the run's inputs, such as the weights of a round.
     """
 
     folder: Path | None = None
@@ -30,7 +32,7 @@ class Parts:
     def result(
         self, name: str, identity: Any, compute: Callable[[], Any], valid: Callable[[Any], bool] = lambda found: True
     ) -> Any:
-        """The part `name`, where it is there and valid; else compute(), which is kept."""
+        """Returns the part `name`, where it is there and valid; else compute(), which is written."""
         found = self.load(name, identity)
         if found is None or not valid(found):
             found = compute()
@@ -38,7 +40,7 @@ class Parts:
         return found
 
     def load(self, name: str, identity: Any) -> Any:
-        """The value of a part; None where it is not there, damaged, or of another identity."""
+        """Returns the value of a part; None where it is not there, damaged, or of another identity."""
         if self.folder is None or not self._file(name).is_file():
             return None
         try:
@@ -49,7 +51,7 @@ class Parts:
             return None
 
     def save(self, name: str, identity: Any, value: Any) -> None:
-        """Keep a part, in place of an older one of its name."""
+        """Write a part, in place of an older one of its name."""
         if self.folder is not None:
             part = {"format": FORMAT, "about": self.about, "identity": identity, "value": value}
             write_atomically(self._file(name), state_bytes(part))
@@ -62,22 +64,19 @@ class Parts:
 NO_PARTS = Parts()
 
 
-def forget_parts(folder: Path) -> None:
-    """Remove the parts of all stages of a run's folder."""
-    if (Path(folder) / PARTS).exists():
-        shutil.rmtree(Path(folder) / PARTS)
-
-
 def state_bytes(state: Any) -> bytes:
-    """Plain values and tensors in torch's format, after its hash. As bytes, because a full disk is an OSError then."""
+    """Returns plain values and tensors in torch's format, after its hash: as bytes, a full disk is an OSError."""
     content = io.BytesIO()
     torch.save(state, content)
     return HASHED + hashlib.sha256(content.getvalue()).digest() + content.getvalue()
 
 
 def read_state(file: Path) -> Any:
-    """What `state_bytes` made, on the CPU; nothing but plain values and tensors is unpickled. ValueError where the file
-    is damaged."""
+    """Returns what `state_bytes` made, on the CPU; nothing but plain values and tensors is unpickled.
+
+    Raises:
+        ValueError: where the file is damaged.
+    """
     try:
         content = file.read_bytes()
         begin = len(HASHED) + hashlib.sha256().digest_size

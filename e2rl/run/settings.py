@@ -70,18 +70,17 @@ def configured(file: str, part: str = "") -> Callable[[Kind], Kind]:
 
 def file_values(file: str, part: str = "") -> dict[str, Any]:
     """Returns the plain values of conf/<file>.yaml, or of one mapping in it; lists are tuples."""
-    found = deepcopy(_content(file))
-    for name in filter(None, part.split(".")):
-        found = found[name]
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in found.items()}
+    return {
+        key: tuple(value) if isinstance(value, list) else value for key, value in deepcopy(_plain(file, part)).items()
+    }
 
 
 @cache
-def _content(file: str) -> dict[str, Any]:
+def _plain(file: str, part: str) -> dict[str, Any]:
     root = OmegaConf.load(conf_folder() / "train.yaml")  # what the file's ${...} may refer to
     OmegaConf.update(root, "sim", OmegaConf.load(conf_folder() / "sim" / "default.yaml"))
     OmegaConf.update(root, "own", OmegaConf.load(conf_folder() / f"{file}.yaml"))
-    plain = OmegaConf.to_container(root.own, resolve=True)
+    plain = OmegaConf.to_container(OmegaConf.select(root, f"own.{part}" if part else "own"), resolve=True)
     assert isinstance(plain, dict)
     return {str(key): value for key, value in plain.items()}
 

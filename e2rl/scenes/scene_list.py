@@ -44,7 +44,7 @@ class Listed(NamedTuple):
 def scene_hashes(scenes: SceneSet) -> list[str]:
     """SHA-256 of each scene [S]: of its tensors, id, place and data set. The other scenes of the set, to whose size
     some tensors are padded, do not matter; the recording, the builder and the sizes in data.build do."""
-    about = zip(scenes.scene_id, scenes.location, scenes.rows.hashes(), strict=True)
+    about = zip(scenes.scene_id, scenes.location, scenes.hashes(), strict=True)
     return [hashlib.sha256(json.dumps([*names, scenes.dataset]).encode()).hexdigest() for names in about]
 
 

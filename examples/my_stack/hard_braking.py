@@ -15,4 +15,4 @@ def hard_braking(batch: dict[str, Tensor]) -> Tensor:
     return ((speed.diff(dim=1) / DT < -LIMIT) & both).any(1).double()
 
 
-register(Metric("hard_braking", "ego brakes by more than 4 m/s²", share=True, tables=("main",)), hard_braking)
+register(Metric("hard_braking", "ego brakes by more than 4 m/s²", fraction=True, tables=("main",)), hard_braking)

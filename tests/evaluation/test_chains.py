@@ -9,6 +9,7 @@ from e2rl.report.skeleton_figure import LongestChain, link_risk
 from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.e2.skeleton import Selection
+from e2rl.traffic.e2.topology import TopologySettings
 from e2rl.traffic.rule_based import Replay
 from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
@@ -29,6 +30,7 @@ def selection(*targets, seed=0, risk=0.5):
         acts,
         acts,
         target,
+        TopologySettings(),
     )
 
 

@@ -1,7 +1,7 @@
 """The rollout of the intensity figure: unharmed at first, then hit ever earlier."""
 
 from e2rl.evaluation.rollout_files import ROLLOUTS, TABLE, write_rows
-from e2rl.report.intensity import intensity_ladder, worth
+from e2rl.report.intensity import intensity_sweep, worth
 
 NAN = float("nan")
 
@@ -40,4 +40,4 @@ def test_what_eta_does_shows_best_where_contacts_come_and_then_come_earlier():
 def test_the_files_are_those_of_one_scene_and_seed_by_eta(tmp_path):
     rows = [*ladder(NAN, 4.0, 3.0, seed=1), *ladder(NAN, 4.0, 1.0, scene="b", seed=2), *ladder(NAN, 4.0, scene="c")]
     write_rows(tmp_path / TABLE, [dict(row, dataset="made", split="test") for row in rows[::-1]])
-    assert intensity_ladder(tmp_path) == [tmp_path / ROLLOUTS / f"e2__idm__{eta}__b__2.npz" for eta in (0, 1, 2)]
+    assert intensity_sweep(tmp_path) == [tmp_path / ROLLOUTS / f"e2__idm__{eta}__b__2.npz" for eta in (0, 1, 2)]

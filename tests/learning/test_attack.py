@@ -123,23 +123,24 @@ class Fragile(IDMEgo):
         return super().plan(world)
 
 
-def tuned(present, grid):
+def tuned(present, space):
     scenes = small_scenes(3, steps=40)
     scenes.scenes["start"][:, 0, 3] = 6.0 + torch.arange(3)
-    improve = PlannerImprovement(Fragile(**present), present, scenes, SimSettings(), grid, batch=2)
+    search = {"trials": 2, "startup": 10}
+    improve = PlannerImprovement(Fragile(**present), present, scenes, SimSettings(), search, space, batch=2)
     return Evolution(AdaptiveCurriculum(3, 2), improve, brake_check(scenes), RoundSettings(scenes=3, nominal="log"))
 
 
 def test_a_planner_that_raises_in_tuning_loses_these_episodes_and_does_not_win():
-    run = tuned({"desired_speed": 10.0, "headway": 1.0, "bad": 7.0}, {"desired_speed": [12.0]})
+    run = tuned({"desired_speed": 10.0, "headway": 1.0, "bad": 7.0}, {"desired_speed": [10.0, 200.0]})
     metrics = run.run_round()
-    assert [trial["ended"] for trial in run.improve.trials] == [0.0, 2.0], "attacked and recorded"
+    assert [trial["metrics"]["ended"] for trial in run.improve.trials] == [0.0, 2.0], "attacked and recorded"
     assert not run.improve.trials[1]["admissible"] and run.ego.desired_speed == 10.0
     assert metrics["train/ended"] == 0.0 and run.ended == []
 
 
 def test_a_planner_that_always_raised_there_is_tuned_on_the_rest():
-    run = tuned({"desired_speed": 12.0, "headway": 1.0, "bad": 7.0}, {"headway": [1.5]})
+    run = tuned({"desired_speed": 12.0, "headway": 1.0, "bad": 7.0}, {"headway": [1.0, 1.5]})
     metrics = run.run_round()
     assert metrics["train/ended"] == 2.0 == metrics["train/ended_raised_KeyError"] and metrics["train/episodes"] == 4.0
     assert {entry["during"] for entry in run.ended} == {"tuning"} and len(run.ended) == 2
@@ -147,11 +148,11 @@ def test_a_planner_that_always_raised_there_is_tuned_on_the_rest():
 
 
 def test_a_trial_without_any_episode_is_refused_and_the_present_parameters_have_a_message():
-    run = tuned({"desired_speed": 10.0, "headway": 1.0, "bad": 0.0}, {"desired_speed": [12.0]})
+    run = tuned({"desired_speed": 10.0, "headway": 1.0, "bad": 0.0}, {"desired_speed": [10.0, 200.0]})
     run.run_round()
-    assert run.improve.trials[1]["ended"] == 6.0 and not run.improve.trials[1]["admissible"]
-    with pytest.raises(InputError, match=r"NaN metrics .6 episodes ended for an error."):
-        tuned({"desired_speed": 12.0, "headway": 1.0, "bad": 0.0}, {"headway": [1.5]}).run_round()
+    assert run.improve.trials[1]["metrics"]["ended"] == 6.0 and not run.improve.trials[1]["admissible"]
+    with pytest.raises(InputError, match=r"NaN metrics .ended_raised_KeyError"):
+        tuned({"desired_speed": 12.0, "headway": 1.0, "bad": 0.0}, {"headway": [1.0, 1.5]}).run_round()
 
 
 def test_counts_are_metrics():

@@ -75,7 +75,7 @@ def test_a_recipe_is_of_options_that_exist():
 
 def test_planner_learner():
     config = config_of(*PLANNER)
-    config.learner.grid = {"risk_slope": [0.5]}
+    config.learner.space, config.learner.search.trials = {"risk_slope": [0.2, 0.5]}, 2
     run = built(config)
     assert isinstance(run.improve, PlannerImprovement)
     assert run.run_round()["train/trials"] == 2

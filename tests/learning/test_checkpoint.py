@@ -88,8 +88,9 @@ def test_only_the_newest_are_kept_and_nothing_partial_is(tmp_path):
 def test_a_planners_parameters_are_resumed(tmp_path):
     def make():
         scenes = small_scenes(3)
-        present, grid = {"desired_speed": 10.0, "use_limits": False}, {"desired_speed": [11.0, 12.0]}
-        improve = PlannerImprovement(IDMEgo(**present), present, scenes, SimSettings(), grid, batch=3)
+        present, search = {"desired_speed": 10.0, "use_limits": False}, {"trials": 3, "startup": 3}
+        given = {"search": search, "space": {"desired_speed": [10.0, 12.0]}, "batch": 3}
+        improve = PlannerImprovement(IDMEgo(**present), present, scenes, SimSettings(), **given)
         settings, memory = RoundSettings(3, "log"), Memory(tmp_path, 0)
         return Evolution(AdaptiveCurriculum(3, 2), improve, brake_check(scenes), settings, memory=memory)
 

@@ -3,15 +3,13 @@
 import pytest
 import torch
 
-from e2rl.evaluation.rollout_files import Source, label_rows, read_rows, table_columns, write_rows
+from e2rl.evaluation.rollout_files import read_rows, table_columns, write_rows
 from e2rl.evaluation.summary import metric_rows
-from e2rl.metrics.catalogue import METRICS, TABLES, Metric, register, row_columns, table_metrics, unregister
+from e2rl.metrics.catalogue import METRICS, Metric, register, row_columns, table_metrics, unregister
 from e2rl.metrics.score import score_rollouts
 from e2rl.metrics.statistics import metric_table, paired_differences, summarise
 from e2rl.report.tables import legend, metric_tables
 from tests.metrics.random_rollouts import random_rollouts
-
-SOURCE = Source("synthetic", "test", "e2", "idm")
 
 
 def fast_traffic(batch):
@@ -24,11 +22,12 @@ def fast_traffic(batch):
 
 @pytest.fixture
 def fast():
-    metric = Metric("fast", "vehicle-steps above 10 m/s", share=True, weight="fast_steps", tables=("traffic", "speeds"))
+    metric = Metric(
+        "fast", "vehicle-steps above 10 m/s", fraction=True, weight="fast_steps", tables=("traffic", "speeds")
+    )
     register(metric, fast_traffic)
     yield metric
     unregister("fast")
-    del TABLES["speeds"]
 
 
 def test_it_is_in_rows_files_summaries_and_its_tables(fast, tmp_path):
@@ -40,13 +39,13 @@ def test_it_is_in_rows_files_summaries_and_its_tables(fast, tmp_path):
     expected = sum(row["fast"] * row["fast_steps"] for row in rows) / sum(row["fast_steps"] for row in rows)
     assert summarise(rows, samples, 20, 2)["fast"]["mean"] == pytest.approx(expected)
     assert paired_differences(rows, samples, rows, samples, 20, 2)["fast"]["difference"] == 0
-    write_rows(tmp_path / "rollouts.csv", label_rows(rows, SOURCE))
+    write_rows(tmp_path / "rollouts.csv", rows)
     assert read_rows(tmp_path / "rollouts.csv")[7]["fast"] == pytest.approx(rows[7]["fast"])
-    summaries = metric_rows(label_rows(rows, SOURCE), samples, draws=20, realism_draws=2)
+    summaries = metric_rows(rows, samples, draws=20, realism_draws=2)
     (row,) = metric_tables(summaries, table="speeds")[0].rows
     assert row[0] == "fast [%]" and row[1].startswith(f"{100 * expected:.1f} [")
-    assert metric_tables(summaries, table="traffic")[0].rows[-1] == row
-    assert "above 10 m/s" in legend() and fast not in table_metrics("main")
+    assert metric_tables(summaries, table="main")[0].rows[-1] == row
+    assert "above 10 m/s" in legend() and fast not in table_metrics("traffic")
 
 
 def test_built_in_columns_stay_as_they_are():
@@ -73,7 +72,7 @@ def test_a_median_of_a_column_that_exists_needs_no_function():
 
 
 def test_taken_names_and_wrong_shapes_are_refused():
-    for name in ("cfr", "seed", "partner", "motion"):  # a metric, columns, the key of built-in functions
+    for name in ("cfr", "seed", "partner", "motion_columns"):  # a metric, columns, the name of a built-in function
         with pytest.raises(ValueError, match=f"metric {name}: .*taken"):
             register(Metric(name, ""), fast_traffic)
     register(Metric("wrong", ""), lambda batch: batch["valid"])

@@ -5,7 +5,9 @@ import math
 import pytest
 import torch
 
+from e2rl.metrics.contact import touched_columns
 from e2rl.metrics.score import score_rollouts
+from e2rl.sim.rollouts import Rollouts
 from tests.metrics.random_rollouts import random_rollouts
 
 SIZE = (4.8, 2.0)
@@ -21,32 +23,36 @@ def course(x, y, heading, speed, steps=80, appears=0, accel=0.0):
 
 
 def scene(*courses, kinds=None, adversaries=()):
-    """A rollout dict of one rollout; the first course is the ego's."""
+    """One rollout; the first course is the ego's."""
     states = torch.stack([states for states, _ in courses], 1)[None].float()
     valid = torch.stack([valid for _, valid in courses], 1)[None]
     count = len(courses)
     simulated = torch.ones(1, count, dtype=torch.bool)
     simulated[:, 0] = False
-    return {
-        "states": states,
-        "valid": valid,
-        "size": torch.tensor(SIZE).expand(1, count, 2),
-        "agent_type": torch.tensor([kinds or [0] * count]),
-        "simulated": simulated,
-        "adversaries": torch.tensor([[index in adversaries for index in range(count)]]),
-        "logged": states,
-        "logged_valid": valid,
-        "lane_points": torch.tensor([[[-500.0, 0], [500.0, 0]]]),
-        "lane_index": torch.zeros(1, 2, dtype=torch.int64),
-        "lane_width": torch.tensor([[4.0]]),
-        "drivable_points": torch.zeros(1, 0, 2),
-        "drivable_index": torch.zeros(1, 0, dtype=torch.int64),
-        "seed": torch.zeros(1, dtype=torch.int64),
-        "seconds": torch.ones(1),
-        "eta": 0.0,
-        "scene_id": ["scene"],
-        "location": [""],
-    }
+    return Rollouts(
+        states=states,
+        valid=valid,
+        size=torch.tensor(SIZE).expand(1, count, 2),
+        agent_type=torch.tensor([kinds or [0] * count]),
+        simulated=simulated,
+        adversaries=torch.tensor([[index in adversaries for index in range(count)]]),
+        logged=states,
+        logged_valid=valid,
+        lane_points=torch.tensor([[[-500.0, 0], [500.0, 0]]]),
+        lane_index=torch.zeros(1, 2, dtype=torch.int64),
+        lane_width=torch.tensor([[4.0]]),
+        drivable_points=torch.zeros(1, 0, 2),
+        drivable_index=torch.zeros(1, 0, dtype=torch.int64),
+        seed=torch.zeros(1, dtype=torch.int64),
+        eta=torch.zeros(1, dtype=torch.float64),
+        scene_id=["scene"],
+        location=[""],
+        dataset=["d"],
+        split=["s"],
+        method=["e2"],
+        ego_policy=["idm"],
+        batch_size=[1],
+    )
 
 
 def row(*courses, **options):
@@ -138,3 +144,33 @@ def test_types_are_exclusive_and_partner_was_touched():
             assert result[result["contact_type"]] == 1 and result["partner"] > 0
         elif result["cfr"] == 0:
             assert result["front"] + result["side"] + result["rear"] == 0 and math.isnan(result["rir"])
+
+
+def touched(speeds, hit, logged=None, valid=None):
+    """touched and moving_vehicles of one rollout of vehicles at speeds [N] throughout; the ego is no traffic."""
+    speed = torch.tensor(speeds, dtype=torch.float64)
+    count = len(speeds)
+    track = torch.zeros(1, 5, count, 4, dtype=torch.float64)
+    log = track.clone()
+    track[..., 3], log[..., 3] = speed, speed if logged is None else torch.tensor(logged, dtype=torch.float64)
+    there = torch.ones(1, 5, count, dtype=torch.bool)
+    known = there if valid is None else there & torch.tensor(valid)
+    batch = {"states": track, "valid": known, "logged": log, "logged_valid": known}
+    batch["traffic"] = torch.arange(count)[None] > 0
+    found = touched_columns(batch, torch.tensor([hit]))
+    return found["touched"].item(), found["moving_vehicles"].item()
+
+
+def test_it_is_a_share_of_those_that_move():
+    assert touched([9, 5, 5, 5, 0], [False, True, True, False, True]) == (2 / 3, 3)
+    assert touched([9, 5, 5], [True, False, False]) == (0, 2), "the ego is no traffic"
+
+
+def test_whoever_moves_in_the_log_alone_counts_but_not_while_absent():
+    assert touched([9, 0, 5], [False, True, False], logged=[9, 5, 5]) == (0.5, 2)
+    assert touched([9, 5, 5], [False, True, False], valid=[True, False, True]) == (0, 1)
+
+
+def test_nobody_moving_is_unknown():
+    share, number = touched([9, 0, 0.4], [False, True, True])
+    assert share != share and number == 0

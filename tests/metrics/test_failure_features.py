@@ -107,7 +107,7 @@ def test_along_a_bend_of_the_lane_nobody_veers():
     lane = torch.stack([150 * angle.sin(), 150 * (1 - angle.cos())], -1)
     on_lane = drive(0, 0, EAST, 10, turn=lambda t: 10 / 150)
     ahead = drive(150 * math.sin(0.2), 150 * (1 - math.cos(0.2)), 0.2, 4, turn=lambda t: 4 / 150)
-    given = scene(on_lane, ahead) | {"lane_points": lane[None], "lane_index": torch.zeros(1, 200, dtype=torch.int64)}
+    given = scene(on_lane, ahead).replace(lane_points=lane[None], lane_index=torch.zeros(1, 200, dtype=torch.int64))
     found = score_rollouts(given)[0][0]
     assert [found[name] for name in WORDS] == ["ahead", "keeps speed", "keeps speed"]
     straight = score_rollouts(scene(on_lane, ahead))[0][0]
@@ -115,7 +115,7 @@ def test_along_a_bend_of_the_lane_nobody_veers():
 
 
 def test_contacts_soon_after_the_start_use_what_is_known():
-    batch = as_doubles(scene(course(0, 0, EAST, 10), course(9, 0, EAST, 0, appears=2)), slice(0, 1))
+    batch = as_doubles(scene(course(0, 0, EAST, 10), course(9, 0, EAST, 0, appears=2)))
     batch |= first_contact(batch)
     window, known, size = last_seconds(batch)
     assert window.shape == (1, WINDOW + 1, 2, 4) and size.shape == (1, 2, 2)
@@ -136,13 +136,15 @@ def test_speeds_just_above_and_below_the_thresholds():
 
 def changed(rollouts, change):
     """The rollouts with every position and heading changed: change(points [..., 2], headings) -> both."""
-    result = dict(rollouts)
+    result = {}
     for name in ("states", "logged"):
-        xy, heading = change(rollouts[name][..., :2].double(), rollouts[name][..., 2].double())
-        result[name] = torch.cat([xy, heading[..., None], rollouts[name][..., 3:].double()], -1)
+        track = rollouts.get(name).double()
+        xy, heading = change(track[..., :2], track[..., 2])
+        result[name] = torch.cat([xy, heading[..., None], track[..., 3:]], -1)
     for name in ("lane_points", "drivable_points"):
-        result[name] = change(rollouts[name].double(), torch.zeros(rollouts[name].shape[:-1]))[0]
-    return result
+        points = rollouts.get(name).double()
+        result[name] = change(points, torch.zeros(points.shape[:-1]))[0]
+    return rollouts.replace(**result)
 
 
 @pytest.fixture(scope="module")

@@ -171,14 +171,14 @@ def random_batch(seed=0):
     """A batch of random rollouts on a road field that is the same everywhere, with a route and a light each."""
     rollouts = random_rollouts(3, seed=seed, vehicles=8, others=3, steps=30, extent=25.0)
     generator = torch.Generator().manual_seed(seed)
-    heading = rollouts["states"][:, 0, :8, 2].nan_to_num()
+    heading = rollouts.states[:, 0, :8, 2].nan_to_num()
     forward = torch.stack([heading.cos(), heading.sin()], -1)[:, :, None]
-    points = rollouts["states"][:, 0, :8, None, :2].nan_to_num() + 2.0 * torch.arange(40)[:, None] * forward
+    points = rollouts.states[:, 0, :8, None, :2].nan_to_num() + 2.0 * torch.arange(40)[:, None] * forward
     light = torch.randint(-1, 2, (3, 8, 2), generator=generator)
     return {
-        "states": rollouts["states"].nan_to_num(),
-        "valid": rollouts["valid"],
-        "size": rollouts["size"],
+        "states": rollouts.states.nan_to_num(),
+        "valid": rollouts.valid,
+        "size": rollouts.size,
         "field": torch.full((3, 400, 400), -1.5),
         "field_origin": torch.full((3, 2), -200.0),
         "light_state": torch.full((3, 31, 2), LIGHT_RED),

@@ -77,9 +77,9 @@ def test_gaps_of_the_ego_s_track_are_closed_before_measuring():
 def completion(ego, recorded, *others):
     """Route completion of an ego on one course whose recording is on another."""
     rollout = scene(ego, *others)
-    logged, valid = (value.clone() for value in (rollout["logged"], rollout["logged_valid"]))
+    logged, valid = rollout.logged.clone(), rollout.logged_valid.clone()
     logged[0, :, 0], valid[0, :, 0] = recorded[0].float(), recorded[1]
-    return score_rollouts(rollout | {"logged": logged, "logged_valid": valid})[0][0]["route_completion"]
+    return score_rollouts(rollout.replace(logged=logged, logged_valid=valid))[0][0]["route_completion"]
 
 
 def test_the_share_of_the_recorded_way_is_what_lies_behind_the_ego():

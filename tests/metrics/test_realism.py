@@ -20,7 +20,7 @@ def once(clusters):
 
 def test_the_recording_is_wholly_like_itself():
     rollouts = random_rollouts(6)
-    features = features_of(rollouts | {"logged": rollouts["states"]})
+    features = features_of(rollouts.replace(logged=rollouts.states))
     draws, cluster = once(6)
     table = realism(features, cluster, draws)
     assert table["real"].item() == 1 and table["real_norm"].item() == 1
@@ -74,8 +74,8 @@ def test_pooled_figures_follow_the_definition():
 def test_the_ego_the_parked_and_what_happens_after_the_stop_do_not_count():
     rollouts = random_rollouts(4, seed=6)
     before = features_of(rollouts)
-    changed = {key: value.clone() if isinstance(value, torch.Tensor) else value for key, value in rollouts.items()}
-    changed["logged"][:, :, 0] += 5 * torch.rand(changed["logged"][:, :, 0].shape)  # the ego's own log
+    changed = rollouts.clone()
+    changed.logged[:, :, 0] += 5 * torch.rand(changed.logged[:, :, 0].shape)  # the ego's own log
     assert all(torch.equal(a[name], b[name]) for a, b in zip(before, features_of(changed), strict=True) for name in a)
     states, valid = torch.zeros(1, 81, 3, 4, dtype=torch.float64), torch.ones(1, 81, 3, dtype=torch.bool)
     states[:, :, 1, 3] = 5.0
@@ -87,11 +87,11 @@ def test_the_ego_the_parked_and_what_happens_after_the_stop_do_not_count():
 
 def test_real_adv_is_real_of_a_traffic_of_adversaries_alone():
     rollouts = random_rollouts(6, seed=3)
-    alone = rollouts | {"simulated": rollouts["simulated"] & rollouts["adversaries"]}
+    alone = rollouts.replace(simulated=rollouts.simulated & rollouts.adversaries)
     draws, cluster = once(6)
     ours, theirs = (realism(features_of(given), cluster, draws) for given in (rollouts, alone))
     assert ours["real_adv"] == theirs["real"] == theirs["real_adv"] and ours["real_adv"] != ours["real"]
-    nobody = rollouts | {"adversaries": torch.zeros_like(rollouts["adversaries"])}
+    nobody = rollouts.replace(adversaries=torch.zeros_like(rollouts.adversaries))
     rows, features = score_rollouts(nobody)
     table = realism(features, cluster, draws)
     assert table["real_adv"].isnan() and table["real"] == ours["real"] and rows[0]["real_adv"] != rows[0]["real_adv"]

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from e2rl.evaluation.rollout_files import Source, label_rows, write_rollouts, write_rows
-from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollouts
-from e2rl.metrics.catalogue import MAIN
+from e2rl.evaluation.rollout_files import write_rows
+from e2rl.metrics.catalogue import table_metrics
 from e2rl.metrics.score import score_rollouts
 from e2rl.metrics.statistics import summarise
+from e2rl.sim.rollouts import Rollouts
 from tests.metrics.random_rollouts import random_rollouts
 
 SCORER = Path(__file__).resolve().parents[3] / "shared" / "tools" / "score_rollouts.py"
@@ -27,9 +27,8 @@ def test_rows_and_summary_agree_with_the_independent_scorer(tmp_path):
     rollouts = random_rollouts(48, seed=3)
     rows, features = score_rollouts(rollouts)
     assert sum(row["cfr"] == 1 for row in rows) >= 12, "the generator must produce contacts"
-    source = Source("synthetic", "test", "e2", "idm")
-    write_rollouts(tmp_path / "rollouts", rollouts, source)
-    write_rows(tmp_path / "rollouts.csv", label_rows(rows, source))
+    rollouts.to_npz(tmp_path / "rollouts")
+    write_rows(tmp_path / "rollouts.csv", rows)
     tight = ("relvel=1e-5", "min_dtc=1e-5", "ttc_c=1e-6", "aor_step=1e-9", "macc=1e-6", "contact_time=1e-9")
     done = subprocess.run(
         [
@@ -109,16 +108,9 @@ def compare_summary(ours, theirs):
 
 def test_scores_survive_the_files(tmp_path):
     rollouts = random_rollouts(6, seed=8)
-    write_rollouts(tmp_path, rollouts, Source("synthetic", "test", "e2", "idm"))
-    read = as_rollout_dict(read_rollouts(tmp_path))
-    place = {
-        (scene, seed): index
-        for index, (scene, seed) in enumerate(zip(read["scene_id"], read["seed"].tolist(), strict=True))
-    }
-    before, after = score_rollouts(rollouts)[0], score_rollouts(read)[0]
-    for row in before:
-        other = after[place[row["scene_id"], row["seed"]]]
-        for name in row.keys() - {"seconds", "passes"}:
+    read = Rollouts.from_npz(rollouts.to_npz(tmp_path))
+    for row, other in zip(score_rollouts(rollouts)[0], score_rollouts(read)[0], strict=True):
+        for name in row.keys() - {"seconds", "nfe"}:
             assert row[name] == other[name] or (math.isnan(row[name]) and math.isnan(other[name])), name
 
 
@@ -126,21 +118,15 @@ def test_rows_do_not_depend_on_the_batch_they_are_scored_in():
     rollouts = random_rollouts(5, seed=2)
     together, _ = score_rollouts(rollouts)
     for index in range(5):
-        alone = {
-            key: value[index : index + 1] if isinstance(value, torch.Tensor | list) else value
-            for key, value in rollouts.items()
-        }
-        assert str(score_rollouts(alone)[0][0]) == str(together[index])
+        assert str(score_rollouts(rollouts[index : index + 1])[0][0]) == str(together[index])
 
 
 def test_moving_the_world_changes_no_metric():
     rollouts = random_rollouts(4, seed=5)
-    moved = dict(rollouts)
     shift = torch.tensor([64.0, -32.0])  # exact in float32 at this size, up to the last bits of small coordinates
-    for key in ("states", "logged"):
-        moved[key] = torch.cat([rollouts[key][..., :2] + shift, rollouts[key][..., 2:]], -1)
-    for key in ("lane_points", "drivable_points"):
-        moved[key] = rollouts[key] + shift
+    moved = {key: rollouts.get(key) + torch.nn.functional.pad(shift, (0, 2)) for key in ("states", "logged")}
+    moved |= {key: rollouts.get(key) + shift for key in ("lane_points", "drivable_points")}
+    moved = rollouts.replace(**moved)
     for before, after in zip(score_rollouts(rollouts)[0], score_rollouts(moved)[0], strict=True):
         for name in ("cfr", "min_dtc", "ttc_c", "aor_step", "progress", "real"):
             assert after[name] == pytest.approx(before[name], abs=2e-3, nan_ok=True), name
@@ -177,15 +163,12 @@ def test_every_metric_of_the_design_is_summarised_in_its_order():
         "transport",
         "seconds_per_rollout",
     ]
-    assert all(metric.source in rows[0] for metric in MAIN)
+    assert all(metric.source in rows[0] for metric in table_metrics("main"))
 
 
 def test_transport_is_the_control_s_energy_and_unknown_without_control():
     rollouts = random_rollouts(3)
     assert all(math.isnan(row["transport"]) for row in score_rollouts(rollouts)[0])
-    rollouts |= {
-        "transport_adversary": torch.tensor([1.0, 2, 3]),
-        "transport_others": torch.tensor([0.5, 0, 1]),
-        "transport_anchor": torch.zeros(3),
-    }
+    rollouts.transport_adversary = torch.tensor([1.0, 2, 3])
+    rollouts.transport_others, rollouts.transport_anchor = torch.tensor([0.5, 0, 1]), torch.zeros(3)
     assert [row["transport"] for row in score_rollouts(rollouts)[0]] == [1.5, 2.0, 4.0]

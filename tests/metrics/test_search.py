@@ -1,24 +1,31 @@
 """Evasions found are real: DrivingEnv drives them without contact; where there is no way out none is found."""
 
+import pytest
 import torch
 from tensordict import TensorDict
 
-from e2rl.metrics.evasion import SearchSettings, find_evasions, lateral_targets
+from e2rl.metrics import evasion
+from e2rl.metrics.evasion import find_evasions, lateral_targets
 from e2rl.sim.env import DrivingEnv, SimSettings
 from tests.synthetic import make_scenes
 
 SIZES = {"max_vehicles": 8, "max_agents": 10, "num_routes": 2, "num_points": 150}
-QUICK = SearchSettings(samples=64, rounds=4)
 BOXED = [(0, 0, 0.0), (-5, 0, 0.0), (5, 0, 0.0), (-5, 1, 0.0), (0, 1, 0.0), (5, 1, 0.0), (-30, 0, 12.0)]
 WALL = [(0, 0, 10.0), (40, 0, 0.0), (40, 1, 0.0)]  # both lanes are closed 40 m ahead
 CUT = [(0, 0, 10.0), (12, 0, 0.0), (-40, 1, 0.0)]  # 7.5 m of gap: nobody stops in it at 8 m/s^2 (6.3 m + clearance)
 
 
-def search(vehicles, moment=None, settings=QUICK, count=1, sim=None, width=2.0, **options):
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(evasion, "SAMPLES", 64)
+    monkeypatch.setattr(evasion, "ROUNDS", 4)
+
+
+def search(vehicles, moment=None, count=1, sim=None, width=2.0, **options):
     scene_set = make_scenes(count, vehicles=vehicles, num_vrus=0, steps=60, **(SIZES | options))
     scene = scene_set.scenes
     scene["size"][:, 1:, 1] = width
-    found = find_evasions(scene, scene["logged"], scene["logged_valid"], sim or SimSettings(), settings, moment)
+    found = find_evasions(scene, scene["logged"], scene["logged_valid"], sim or SimSettings(), moment)
     return found, scene_set
 
 
@@ -50,8 +57,8 @@ def test_the_boxed_in_have_no_way_out_and_nothing_is_claimed():
     scene_set = make_scenes(1, vehicles=BOXED, num_vrus=0, steps=60, **SIZES)
     scene = scene_set.scenes
     scene["logged"][:, :, 1, 0] += torch.linspace(0, 6, 61)  # the one behind pushes
-    result = find_evasions(scene, scene["logged"], scene["logged_valid"], SimSettings(), QUICK)
-    assert not result.found.any() and result.tried[0] > 4 * QUICK.samples
+    result = find_evasions(scene, scene["logged"], scene["logged_valid"], SimSettings())
+    assert not result.found.any() and result.tried[0] > 4 * evasion.SAMPLES
 
 
 def test_a_wall_is_a_matter_of_braking_distance():
@@ -61,17 +68,18 @@ def test_a_wall_is_a_matter_of_braking_distance():
     assert not weak.found.any(), "2 m/s^2 stop it after 25 m, and there is no way around"
 
 
-def test_the_strategy_finds_what_the_grid_does_not():
+def test_the_strategy_finds_what_the_grid_does_not(monkeypatch):
     slalom = [(0, 0, 10.0), (25, 0, 0.0), (50, 1, 0.0), (-8, 0, 10.0), (-14, 1, 10.0)]  # pursued, two lane changes
-    coarse, _ = search(slalom, settings=SearchSettings(rounds=0))
     fine, scene_set = search(slalom)
+    monkeypatch.setattr(evasion, "ROUNDS", 0)
+    coarse, _ = search(slalom)
     assert not coarse.found.any() and fine.found.all() and not replay(scene_set, fine.actions)[0].any()
 
 
 def test_a_rollout_s_result_does_not_depend_on_the_batch():
     together, scene_set = search(CUT, count=3)
     scene = scene_set.scenes[2:]
-    alone = find_evasions(scene, scene["logged"], scene["logged_valid"], SimSettings(), QUICK)
+    alone = find_evasions(scene, scene["logged"], scene["logged_valid"], SimSettings())
     torch.testing.assert_close(together.states[2], alone.states[0], atol=1e-4, rtol=0)
 
 

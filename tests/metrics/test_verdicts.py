@@ -12,7 +12,7 @@ from tests.metrics.test_failure_features import course, scene
 
 
 def row_of(ego, partner, **extra):
-    return score_rollouts(scene(ego, partner) | extra)[0][0]
+    return score_rollouts(scene(ego, partner).replace(**extra))[0][0]
 
 
 @pytest.fixture(scope="module")

@@ -97,7 +97,7 @@ def test_a_folder_of_neither_kind_is_named(tmp_path):
         read_points(tmp_path)
     _, tuned = folders(tmp_path)
     (tuned / "tuning.json").write_text('{"best": null, "trials": []}')
-    with pytest.raises(InputError, match="no tuning of an adversary; give the folder of a run of experiment=tune"):
+    with pytest.raises(InputError, match="no tuning of an adversary; give the folder of a run of e2rl tune"):
         read_points(tuned)
 
 

@@ -66,8 +66,9 @@ def shown(tmp_path_factory):
         coalition,
         coalition,
         torch.tensor([[-1, 0, 1, -1]]),
+        settings,
     )
-    return SkeletonPicture(rollout, chosen, settings)
+    return SkeletonPicture(rollout, chosen)
 
 
 def test_the_moment_is_that_of_the_greatest_risk_of_the_links(shown):
@@ -97,6 +98,6 @@ def test_vehicles_have_the_colour_of_their_part(shown):
 
 
 def test_the_figure_has_three_panels(shown):
-    figure = drawing.image_of(skeleton_figure(shown.rollout, shown.selection, shown.settings))
+    figure = drawing.image_of(skeleton_figure(shown.rollout, shown.selection))
     assert figure.size[0] > 2.5 * figure.size[1]
     assert len(figure.getcolors(1 << 20)) > 50

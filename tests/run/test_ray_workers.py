@@ -10,14 +10,15 @@ import pytest
 import torch
 
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
-from e2rl.evaluation.rollout_files import ROLLOUTS
 from e2rl.learning.attack import make_traffic
 from e2rl.planners.idm_planner import IDMEgo
-from e2rl.run import processes as ray_workers
+from e2rl.run import ray_workers
 from e2rl.run.errors import InputError
 from e2rl.run.parts import Parts
-from e2rl.run.processes import RayWorkers, in_processes
+from e2rl.run.processes import in_processes
+from e2rl.run.ray_workers import RayWorkers
 from e2rl.sim.env import SimSettings
+from e2rl.sim.rollouts import ROLLOUTS
 from e2rl.traffic.rollout import synthesize_traffic
 from tests.evaluation.test_protocol import SEEDS, same_runs
 from tests.learning.small import Ambush, small_run, small_scenes
@@ -25,6 +26,7 @@ from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
 HERE = find_spec("ray") is not None
 needs_ray = pytest.mark.skipif(not HERE, reason="Ray is not installed")
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +35,7 @@ def workers():
     found = RayWorkers(2)
     before = signal.getsignal(signal.SIGTERM)
     ray = found.connect()
-    assert signal.getsignal(signal.SIGTERM) is before, "a command still ends as e2rl.run.processes says"
+    assert signal.getsignal(signal.SIGTERM) is before, "a command still ends as e2rl.run.endings says"
     yield found
     ray.shutdown()
 

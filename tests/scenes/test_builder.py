@@ -1,6 +1,5 @@
 """From recordings to scenes: causal, complete, on routes that fit, with what stands still marked so."""
 
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from e2rl.run.errors import InputError
 from e2rl.scenes.builder import BuildSettings, build_scene, ego_overlaps
 from e2rl.scenes.recording import PEDESTRIAN, VEHICLE
 from e2rl.scenes.route import project
-from e2rl.scenes.scenarionet import ScenarioNetSource, read_recording
+from e2rl.scenes.scenarionet import ScenarioNetSource, recording_of
 from e2rl.scenes.scene import KEYS, validate
 from e2rl.sim.mission import mission_of
 from tests.scenes.descriptions import ALL, FRAMES, description, fork, lane, straight, track
@@ -23,7 +22,7 @@ RECORDED = {"waymo": (DATA / "waymo" / "tune.zip", 7), "nuscenes": (DATA / "nusc
 
 
 def recorded(tracks=None, lanes=None, **metadata):
-    return read_recording(pickle.dumps(description(tracks, lanes, **metadata)), "made")
+    return recording_of(description(tracks, lanes, **metadata))
 
 
 def build(tracks=None, lanes=None, settings: BuildSettings = SETTINGS, **metadata):
@@ -121,7 +120,7 @@ def test_limits_and_lights_lie_on_the_route():
     full = description({"ego": straight(40, 0, 8)})
     states = ["LANE_STATE_STOP"] * 50 + ["LANE_STATE_GO"] * 41
     full["dynamic_map_states"] = {"left": {"state": {"object_state": states}}}
-    scene = build_scene(read_recording(pickle.dumps(full), "made"), SETTINGS)
+    scene = build_scene(recording_of(full), SETTINGS)
     turning = int((scene["route_light"][0, :, 0] == 0).nonzero())
     assert scene["route_valid"][0, turning] and (scene["route_light"][0] == 0).sum() == 1
     assert scene["route_light_s"][0, turning, 0].item() == pytest.approx(20 + 52, abs=0.5)  # the ego is at x = 48
@@ -142,7 +141,7 @@ def test_a_light_close_ahead_counts_where_the_map_begins_at_the_vehicle():
     full["map_features"]["next"] = full["map_features"]["on"] | {"polyline": np.array([[8.0, 0], [300, 0]])}
     del full["map_features"]["in"], full["map_features"]["near"]
     full["dynamic_map_states"] = {"next": {"state": {"object_state": ["LANE_STATE_STOP"]}}}
-    scene = build_scene(read_recording(pickle.dumps(full), "made"), SETTINGS)
+    scene = build_scene(recording_of(full), SETTINGS)
     slot = int(scene["route_log"][0])
     own = project(scene["start"][None, 0, :2], scene["route_points"][0, slot])[0].item()
     assert own < 3 and scene["route_light"][0, slot, 0] == 0

@@ -1,28 +1,26 @@
 """Sets of scenes in memory are sliced, and scenes are checked by key."""
 
-import pickle
-
 import pytest
 import torch
 from tensordict import TensorDict
 
 from e2rl.run.errors import InputError
 from e2rl.scenes.builder import BuildSettings, build_scene
-from e2rl.scenes.scenarionet import read_recording
-from e2rl.scenes.scene import Loaded, SceneSet, validate
+from e2rl.scenes.scenarionet import recording_of
+from e2rl.scenes.scene import SceneSet, validate
 from tests.scenes.descriptions import description
 
 SETTINGS = BuildSettings(field_cells=64)
 
 
 def build(**options) -> TensorDict:
-    return build_scene(read_recording(pickle.dumps(description(**options)), "made"), SETTINGS)
+    return build_scene(recording_of(description(**options)), SETTINGS)
 
 
 def test_the_set_is_sliced():
     several = torch.stack([build(), build()])
     several["scene_index"] = torch.arange(2)
-    whole = SceneSet(Loaded(several), ["a", "b"], ["p", "q"], "made", "test", {"invalid": 1})
+    whole = SceneSet(several, ["a", "b"], ["p", "q"], "made", "test", {"invalid": 1})
     assert len(whole) == 2 and whole.first(None) is whole and whole.first(9) is whole
     first = whole.first(1)
     assert len(first) == 1 and first.scene_id == ["a"] and first.location == ["p"] and first.dropped == {"invalid": 1}
@@ -33,9 +31,9 @@ def test_the_set_is_sliced():
         with pytest.raises(InputError, match=f"scene={which}: expected an index below 2 or the id of a scene"):
             whole.index(which)
     assert whole.to("cpu").scenes.device == torch.device("cpu")
-    one, other = whole.rows.hashes()
+    one, other = whole.hashes()
     several["start"][1, 0, 3] += 1e-3
-    assert one == other and whole.rows.hashes()[0] == one != whole.rows.hashes()[1]
+    assert one == other and whole.hashes()[0] == one != whole.hashes()[1]
 
 
 @pytest.mark.parametrize(

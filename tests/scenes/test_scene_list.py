@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from e2rl.run.errors import InputError
-from e2rl.scenes.scene import Loaded, SceneSet
-from e2rl.scenes.scene_cache import Index, pack
+from e2rl.scenes.scene import SceneSet
+from e2rl.scenes.scene_cache import uncached
 from e2rl.scenes.scene_list import SCENES, Listed, list_text, listed_scenes, read_list, scene_hashes
 from e2rl.scenes.source import load_scenes
 from tests.scenes.descriptions import data_config, description, lane, numbered, straight, write_folder
@@ -18,17 +18,19 @@ SMALL = {"num_vehicles": 3, "max_vehicles": 4, "max_agents": 5, "num_routes": 1,
 
 
 def scenes_of(count=4):
-    """Scenes that differ, of which the last has a larger map than the others."""
-    index, records = Index(dataset="made", split="test"), []
-    for k in range(count):
-        scene = {key: value.numpy() for key, value in make_scenes(1, speed=8 + k, **SMALL).scenes[0].items()}
-        del scene["scene_index"]
-        for key, value in (("lane_points", 7.0), ("lane_index", 1)) if k == count - 1 else ():
-            scene[key] = np.concatenate([scene[key], np.full_like(scene[key][:9], value)])
-        index.add(f"s{k}", "place", packed := pack(scene))
-        records.append(packed.record)
-    found = index.scenes(records, room=2)
-    return replace(found, rows=Loaded(found.scenes), files="f" * 64)
+    """Scenes that differ, of which the last has a larger map than the others; changes to them change their hashes."""
+
+    def build(index):
+        index.dataset, index.split = "made", "test"
+        for k in range(count):
+            scene = {key: value.numpy() for key, value in make_scenes(1, speed=8 + k, **SMALL).scenes[0].items()}
+            del scene["scene_index"]
+            for key, value in (("lane_points", 7.0), ("lane_index", 1)) if k == count - 1 else ():
+                scene[key] = np.concatenate([scene[key], np.full_like(scene[key][:9], value)])
+            index.add(f"s{k}", "place", scene)
+            yield scene
+
+    return replace(uncached(build), digests=[], files="f" * 64)
 
 
 def written(folder, text):
@@ -49,8 +51,7 @@ def test_a_hash_is_of_the_scene_alone_and_of_all_of_it():
     scenes = scenes_of()
     hashes = scene_hashes(scenes)
     assert len(set(hashes)) == 4
-    rows = make_scenes(1, speed=8, **SMALL).rows
-    alone = SceneSet(rows, ["s0"], ["place"], "made", "other", {"too short": 1})
+    alone = SceneSet(make_scenes(1, speed=8, **SMALL).scenes, ["s0"], ["place"], "made", "other", {"too short": 1})
     assert scenes.scenes["lane_points"].shape[1] == alone.scenes["lane_points"].shape[1] + 9, "the first is padded"
     assert scene_hashes(alone) == hashes[:1] and scene_hashes(scenes.chosen([2, 1])) == [hashes[2], hashes[1]]
     for key, value in scenes.scenes.items():

@@ -6,12 +6,13 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 import pytest
 import torch
 
+from e2rl.run.config import load_choice
 from e2rl.run.errors import InputError
 from e2rl.run.files import hash_files
 from e2rl.scenes import source
@@ -65,7 +66,7 @@ def test_folder_zip_cache_and_workers_give_identical_scenes(tmp_path, monkeypatc
     zipped = write_zip(tmp_path / "x.zip", scenes_of(3))
     same(first, load_scenes(data_config(zipped, tmp_path / "b")))
     same(first, load_scenes(data_config(folder, tmp_path / "c", workers=2)))
-    assert [path.suffix for path in (tmp_path / "a").iterdir()] == [".packed"]
+    assert [path.suffix for path in (tmp_path / "a").iterdir()] == [".map"]
     monkeypatch.setattr(source, "SceneBuilder", None)  # nothing is built again
     same(first, load_scenes(data_config(folder, tmp_path / "a")))
     limited = load_scenes(data_config(folder, tmp_path / "a"), num_scenes=2)
@@ -117,20 +118,38 @@ def test_the_cache_is_keyed_by_content_and_settings(tmp_path):
     assert len(list(cache.iterdir())) == 5
 
 
-def test_settings_of_the_memory_and_the_cache_do_not_change_the_scenes(tmp_path):
+def test_settings_of_the_cache_do_not_change_the_scenes(tmp_path):
     folder, cache = write_folder(tmp_path / "x", scenes_of(3)), tmp_path / "cache"
     first = load_scenes(data_config(folder, cache))
-    little = load_scenes(data_config(folder, cache, unpacked=1, cache_gb=5))
-    assert little.rows.room == 1 and len(list(cache.iterdir())) == 1
-    assert all(torch.equal(value, first.scenes[key][[2, 0]]) for key, value in little.batch([2, 0]).items())
-    same(first, little)
+    same(first, load_scenes(data_config(folder, cache, cache_gb=5, workers=2)))
+    assert len(list(cache.iterdir())) == 1
+    moved = write_folder(tmp_path / "moved" / "x", scenes_of(3))
+    same(first, load_scenes(data_config(moved, cache)))
+    assert len(list(cache.iterdir())) == 1  # wherever the same logs lie
 
 
-@pytest.mark.parametrize(("key", "value"), [("unpacked", 0), ("cache_gb", -1), ("cache_gb", "much")])
-def test_impossible_sizes_are_refused(tmp_path, key, value):
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"cache_gb": -1}, r"data\.cache_gb=-1.*at least 0"),
+        ({"cache_gb": "much"}, r"data\.cache_gb=much"),
+        ({"build": {"steps": 0}}, r"build\.steps=0.*at least 1"),
+        ({"build": {"wheels": 4}}, r"data\.build\.wheels"),
+        ({"unknown": 1}, r"data\.unknown"),
+    ],
+)
+def test_impossible_settings_are_refused(tmp_path, settings, message):
     folder = write_folder(tmp_path / "x", scenes_of(1))
-    with pytest.raises(InputError, match=rf"data\.{key}"):
-        load_scenes(data_config(folder, tmp_path / "cache", **{key: value}))
+    with pytest.raises(InputError, match=message):
+        load_scenes(data_config(folder, tmp_path / "cache", **settings))
+
+
+def test_settings_that_are_not_given_are_those_of_the_files(tmp_path):
+    built, given = BundledSource(), load_choice("data", "bundled")
+    assert asdict(built) == {key: value for key, value in given.items() if key != "_target_"} | {"path": None}
+    assert SpeedSource("x").build == built.build == BuildSettings() and SpeedSource("x").split_name == "x"
+    with pytest.raises(InputError, match=r"build\.vehicles=1"):
+        BuildSettings(vehicles=1)
 
 
 def test_mirror_images_are_scenes_of_the_same_place(tmp_path):
@@ -198,7 +217,7 @@ def test_places_of_an_index_reach_the_scenes(tmp_path):
         ({"path": "nowhere"}, "nowhere: no such file or folder"),
         ({"workers": "many"}, r"data\.workers=many"),
         ({"_target_": "no.such.Source"}, r"^data=no\.such\.Source: cannot be built: .*no"),
-        ({"_target_": "torch.nn.ReLU"}, r"^data=torch\.nn\.ReLU: is no e2rl\.scene\.source\.Source"),
+        ({"_target_": "torch.nn.ReLU"}, r"^data=torch\.nn\.ReLU: is no e2rl\.scenes\.source\.Source"),
         ({"_target_": "e2rl.scenes.bundled.BundledSource", "split": "best"}, "split 'best'"),
     ],
 )
@@ -264,6 +283,41 @@ def test_an_outside_source_is_named_by_its_class_and_takes_part_in_all(tmp_path)
         load_scenes(config | {"path": "nowhere"})
     with pytest.raises(InputError, match="data.lane_width=wide"):
         load_scenes(config | {"lane_width": "wide"})
+
+
+class Torn(SpeedSource):
+    """Its logs cannot be read."""
+
+    def read(self, log):
+        raise ZeroDivisionError("of a file\nby zero")
+
+
+class Mended(Torn):
+    mend = "write it again"
+
+
+def test_what_reading_a_log_raises_is_told_where_the_source_knows_what_to_do(tmp_path):
+    (tmp_path / "a.txt").write_text("5.0")
+    with pytest.raises(ZeroDivisionError):  # a mistake in the class, with its traceback
+        Torn(str(tmp_path), cache=str(tmp_path), workers=1).load()
+    told = r"a\.txt: is none of text files: ZeroDivisionError of a file; write it again \(data\.skip_invalid"
+    with pytest.raises(InputError, match=told):
+        Mended(str(tmp_path), cache=str(tmp_path), workers=1).load()
+
+
+class Uncached(SpeedSource):
+    def fingerprint(self):
+        return None
+
+
+def test_a_source_without_fingerprint_leaves_no_file(tmp_path):
+    (tmp_path / "a.txt").write_text("5.0")
+    made = [
+        kind(str(tmp_path), cache=str(tmp_path / "cache"), workers=1).load(1)
+        for kind in (Uncached, Uncached, SpeedSource)
+    ]
+    assert made[0].hashes() == made[1].hashes() == made[2].hashes() and made[0].files == "" != made[2].files
+    assert len(list((tmp_path / "cache").iterdir())) == 1
 
 
 def test_split_chooses_only_where_a_source_has_splits(tmp_path):

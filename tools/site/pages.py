@@ -22,7 +22,7 @@ INCLUDE = re.compile(r"^<!-- include (\S+):(?: (.+?))? -->$", re.MULTILINE)
 SECTION = re.compile(r"^## (.+)$", re.MULTILINE)
 VERBATIM = re.compile(r"(<pre.*?</pre>|<h\d.*?</h\d>|<a .*?</a>)", re.DOTALL)  # no links in code, headings and links
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
-DOCUMENT = re.compile(r"(?:<code>)?\bdocs/([\w-]+)\.md(?:</code>)?(?:, sections? (\d+))?(?! to \d)")
+DOCUMENT = re.compile(r"(?:<code>)?\bdocs/((?:notes/|how-to/)?[\w-]+)\.md(?:</code>)?(?:, sections? (\d+))?(?! to \d)")
 METHOD = "concepts/index.md"  # stands for docs/method.md as a whole
 NUMBER = re.compile(r"\bsection (\d+)")
 MODULE = re.compile(r"<code>(e2rl(?:/\w+)+)(?:\.py|/)</code>")

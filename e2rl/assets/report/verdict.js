@@ -30,6 +30,7 @@ function driverText({ preventable }, replay) {
   if (preventable === null) return null;
   if (preventable === 0) return "has the collision, or another one";
   const driver = replay.tracks.find((track) => track.role === "driver");
+  if (!driver) return "prevents it";
   const least = Math.min(...driver.gap);
   return `prevents it, at least ${fixed(least)} m from the partner`;
 }

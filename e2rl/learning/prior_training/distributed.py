@@ -1,4 +1,4 @@
-"""One training process, or several started by torchrun: gradients and metrics are averaged, the leader writes."""
+"""One training process, or several started by torchrun, of which the leader validates and writes."""
 
 import contextlib
 import os
@@ -11,7 +11,7 @@ from typing import TypeVar
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
+from torch.nn.parallel import DistributedDataParallel
 
 from e2rl.run.errors import InputError
 
@@ -70,21 +70,11 @@ class Processes:
         self.from_leader(lambda: own.append(work()))
         return own[0] if self.leader else work()
 
-    def share(self, module: nn.Module) -> None:
-        """Give the module the leader's parameters."""
-        if self.count > 1:
-            for parameter in module.parameters():
-                dist.broadcast(parameter.detach(), 0)
-
-    def average_gradients(self, module: nn.Module) -> None:
-        """Replace the gradients by their means over the processes, in one message.
-
-        Not DistributedDataParallel: torch 2.13 keeps references to the process group for it, so that gloo's threads
-        outlive the group and can end the process with SIGABRT while the interpreter closes.
-        """
-        if self.count > 1:
-            gradients = [parameter.grad for parameter in module.parameters() if parameter.grad is not None]
-            vector_to_parameters(self.mean(parameters_to_vector(gradients)), gradients)
+    def averaging(self, module: nn.Module) -> nn.Module:
+        """The module with the leader's parameters, whose gradients are averaged over the processes in `backward`."""
+        if self.count == 1:
+            return module
+        return DistributedDataParallel(module, broadcast_buffers=False)
 
 
 ALONE = Processes()

@@ -1,13 +1,10 @@
 """The prior's training loss: denoising of x plus a small trajectory term, on augmented windows."""
 
-from dataclasses import replace
-
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from e2rl.learning.prior_training.training_settings import TrainingSettings
 from e2rl.prior.denoiser import Denoiser
 from e2rl.prior.features import SIDED_EDGE, SIDED_NODE
 from e2rl.prior.lane_relative import (
@@ -24,43 +21,48 @@ from e2rl.prior.lane_relative import (
 )
 from e2rl.prior.prior import EGO_LEVEL, Prior
 
+LEVELS = 4  # noise levels a window
+TRAJECTORY = 0.15  # weight of the trajectory term beside the denoising loss
+MIRROR, DROP = 0.5, 0.1  # fractions of mirrored windows and of hidden other vehicles
+ACCEL_NOISE = 0.35  # m/s^2 on the current acceleration, in half of the windows
+FEATURE_NOISE = 0.1  # on the features, in units of their standard deviations
 MIN_STD = 0.02  # smallest standard deviation that a feature is divided by
 CONSTANT_STD = 1e6  # for constant features, so that they have no effect
 SIDED = {"nodes": SIDED_NODE, "pairs": SIDED_EDGE, "x0": (KNOTS, KNOTS + 1)}  # columns whose sign a mirror flips
 
 
-def augment(batch: TensorDictBase, settings: TrainingSettings, generator: torch.Generator) -> TensorDictBase:
+def augment(batch: TensorDictBase, generator: torch.Generator) -> TensorDictBase:
     """Windows [W] mirrored, with noise on the accelerations and some of the other vehicles hidden."""
     batch, size, device = batch.clone(), batch.shape[0], batch["x0"].device
 
     def uniform(*shape: int) -> Tensor:
         return torch.rand(shape, generator=generator, device=device)
 
-    flip = torch.where(uniform(size) < settings.mirror, -1.0, 1.0)
+    flip = torch.where(uniform(size) < MIRROR, -1.0, 1.0)
     for key, columns in SIDED.items():
         sign = torch.ones(size, batch[key].shape[-1], device=device)
         sign[:, list(columns)] = flip[:, None]
         batch[key] = batch[key] * sign.reshape(size, *[1] * (batch[key].ndim - 2), -1)
     for key in ("d", "d1", "d2", "aside"):
         batch[key] = batch[key] * flip.reshape(size, *[1] * (batch[key].ndim - 1))
-    hidden = uniform(*batch["present"].shape) < settings.drop
+    hidden = uniform(*batch["present"].shape) < DROP
     hidden[:, 0] = False
     batch["present"] = batch["present"] & ~hidden
     batch["weight"] = batch["weight"] * ~hidden
-    noisy = (uniform(*batch["a"].shape) < 0.5) * settings.accel_noise
+    noisy = (uniform(*batch["a"].shape) < 0.5) * ACCEL_NOISE
     noise = noisy * torch.randn(batch["a"].shape, generator=generator, device=device)
     batch["a"] = batch["a"] + noise
     batch["nodes"][..., 1] += noise / 2
     return batch
 
 
-def draw(batch: TensorDictBase, settings: TrainingSettings, generator: torch.Generator) -> TensorDict:
-    """The random numbers of the loss of windows [W] at L = `levels` noise levels each.
+def draw(batch: TensorDictBase, generator: torch.Generator) -> TensorDict:
+    """The random numbers of the loss of windows [W] at L = LEVELS noise levels each.
 
     feature [W, R, NODE]: standard normal; level [W, L]: in (0.01, 0.99), stratified; clean [W, L] bool: the ego's row
     is nearly noise-free (in half); noise [W, L, R, SIZE]: standard normal.
     """
-    size, count, device = len(batch), settings.levels, batch["x0"].device
+    size, count, device = len(batch), LEVELS, batch["x0"].device
     feature = torch.randn(batch["nodes"].shape, generator=generator, device=device)
     u = torch.rand(count, size, generator=generator, device=device)
     level = (torch.arange(count, device=device)[:, None] + u) / count * 0.98 + 0.01
@@ -77,11 +79,11 @@ def loss_weight(batch: TensorDictBase, drawn: TensorDictBase) -> Tensor:
 
 
 class DenoisingLoss(nn.Module):
-    """The denoiser's loss as a module, so that torch.compile can wrap it."""
+    """The denoiser's loss as a module, so that DistributedDataParallel and torch.compile can wrap it."""
 
-    def __init__(self, denoiser: Denoiser, settings: TrainingSettings):
+    def __init__(self, denoiser: Denoiser, feature_noise: float = FEATURE_NOISE):
         super().__init__()
-        self.denoiser, self.settings = denoiser, settings
+        self.denoiser, self.feature_noise = denoiser, feature_noise
 
     def forward(self, batch: TensorDictBase, drawn: TensorDictBase, total: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(loss, its action term, its trajectory term) of windows [W] with the random numbers of `draw`.
@@ -90,7 +92,7 @@ class DenoisingLoss(nn.Module):
         that the mean of their gradients is the gradient of the whole batch.
         """
         net, count = self.denoiser, drawn["level"].shape[1]
-        scale = self.settings.feature_noise * net.node_std * ((net.node_std > MIN_STD) & (net.node_std < CONSTANT_STD))
+        scale = self.feature_noise * net.node_std * ((net.node_std > MIN_STD) & (net.node_std < CONSTANT_STD))
         nodes = batch["nodes"] + scale * drawn["feature"]
         encoding = net.encode(nodes, batch["pairs"], batch["present"]).repeat(count)
         weight, tiled = loss_weight(batch, drawn), TensorDict.cat([batch] * count)
@@ -101,17 +103,7 @@ class DenoisingLoss(nn.Module):
         squared = (x0 - tiled["x0"]) ** 2 * tiled["knot_weight"]
         action = (squared.sum(-1) / SIZE * weight).sum() / total
         trajectory = (_trajectory_error(x0, tiled) * weight).sum() / total
-        return action + self.settings.trajectory * trajectory, action.detach(), trajectory.detach()
-
-
-def denoising_loss(
-    prior: Prior, batch: TensorDictBase, settings: TrainingSettings, generator: torch.Generator
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """Loss of a batch of windows [W] at `levels` noise levels each, and its two terms."""
-    drawn = draw(batch, settings, generator)
-    total = loss_weight(batch, drawn).sum().clamp(min=1)
-    loss, action, trajectory = DenoisingLoss(prior.denoiser, settings)(batch, drawn, total)
-    return loss, {"action": action, "trajectory": trajectory}
+        return action + TRAJECTORY * trajectory, action.detach(), trajectory.detach()
 
 
 def _trajectory_error(x0: Tensor, batch: TensorDictBase) -> Tensor:
@@ -128,11 +120,13 @@ def _trajectory_error(x0: Tensor, batch: TensorDictBase) -> Tensor:
 
 
 @torch.no_grad()
-def held_out_loss(prior: Prior, windows: TensorDictBase, settings: TrainingSettings, batches: int = 20) -> float:
+def held_out_loss(prior: Prior, windows: TensorDictBase, batch: int, batches: int = 20) -> float:
     """Denoising loss on at most `batches` batches of windows, with a fixed seed and without augmentation."""
     device = next(prior.parameters()).device
-    generator = torch.Generator(device).manual_seed(1)
-    plain = replace(settings, feature_noise=0.0)
-    parts = windows[: batches * settings.batch].split(settings.batch)
-    losses = [denoising_loss(prior, part.to(device), plain, generator)[0].item() for part in parts]
+    generator, measure = torch.Generator(device).manual_seed(1), DenoisingLoss(prior.denoiser, feature_noise=0.0)
+    losses = []
+    for part in windows[: batches * batch].split(batch):
+        part = part.to(device)
+        drawn = draw(part, generator)
+        losses.append(measure(part, drawn, loss_weight(part, drawn).sum().clamp(min=1))[0].item())
     return sum(losses) / len(losses)

@@ -1,8 +1,6 @@
 """`python train.py stage=prior`: train a prior on the user's data and measure its closed loop on held-out logs."""
 
 import hashlib
-import time
-from collections.abc import Callable, Mapping
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -10,16 +8,17 @@ from typing import Any
 from omegaconf import DictConfig
 
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.learning.logging import RunLogger
 from e2rl.learning.prior_training.distributed import process_group
-from e2rl.learning.prior_training.training import ClosedLoop, held_out, train_prior
-from e2rl.learning.prior_training.training_settings import TrainingSettings
+from e2rl.learning.prior_training.training import ClosedLoop, TrainingSettings, held_out, train_prior
+from e2rl.learning.supervised import stage_settings
 from e2rl.planners.log_replay import ReplayEgo
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.prior import Prior
 from e2rl.prior.sde import SamplerSettings
 from e2rl.run.parts import Parts
-from e2rl.run.run import origin_of
+from e2rl.run.run import Run, origin_of
 from e2rl.run.settings import settings_of
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.scene_list import listed
@@ -30,29 +29,28 @@ from e2rl.traffic.nominal import NominalTraffic
 FIGURES = ("real", "aor_step", "cfr_bg")  # metrics of the closed loop at a validation
 
 
-def run_prior_stage(
-    config: DictConfig, folder: Path, begin_run: Callable[[Mapping[str, tuple[str, str]]], None]
-) -> tuple[Path, list[dict]] | None:
-    """The checkpoint's path and the metrics rows of the nominal closed loop on held-out scenes, the ego replayed; None
-    in processes other than the leader. begin_run: see `e2rl.run.run.Run.begin`."""
-    settings = settings_of(TrainingSettings, {**config.prior.training, "seed": config.seed}, "prior.training")
+def run_prior_stage(run: Run, logger: RunLogger) -> tuple[Path, list[dict]] | None:
+    """Train a prior; returns its checkpoint's path and the metrics rows of the nominal closed loop on held-out scenes,
+    the ego replayed. None in processes other than the leader."""
+    config = run.config
+    settings = stage_settings(config, TrainingSettings)
     with process_group(config.device) as (processes, device):
-        folder = processes.from_leader(lambda: folder)
+        folder = processes.from_leader(lambda: run.folder)
         prior = _untrained(config).to(device)
-        begin = time.perf_counter()
         scenes = processes.leader_first(
             lambda: load_scenes(config.data, config.num_scenes, "train", list(settings.starts), config.scenes)
         )
-        processes.from_leader(lambda: begin_run({"scenes": listed(scenes)}))
+        processes.from_leader(lambda: run.begin({"scenes": listed(scenes)}))
+        data = fingerprint(scenes)
         origin = {
             "data": f"{scenes.dataset}/{scenes.split}",
             "scenes": len(scenes),
-            "fingerprint": fingerprint(scenes),
+            "fingerprint": data,
             **origin_of(folder),
             "settings": vars(settings),
-            "seconds": {"scenes": round(time.perf_counter() - begin, 1)},
         }
-        path = train_prior(prior, scenes, settings, folder, origin, _closed_loop(scenes, settings, device), processes)
+        how = (processes, logger, Parts(folder, "training", data))
+        path = train_prior(prior, scenes, settings, folder, origin, _closed_loop(scenes, settings, device), *how)
         if path is None:
             return None
         fields = {"stage": "prior", "kept": Parts(folder, "prior", path.name), **origin_of(folder)}

@@ -1,37 +1,243 @@
-"""Training the prior: windows over whole logs, validation on held-out places, best checkpoint kept, exact resume."""
+"""Training the prior: steps on windows of logs, a moving average of the weights, validation on held-out places."""
 
-import json
+import math
 import platform
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.optim.swa_utils import AveragedModel
 from tqdm import tqdm
 
+from e2rl.learning.logging import RunLogger
 from e2rl.learning.prior_training.distributed import ALONE, Processes
-from e2rl.learning.prior_training.loss import held_out_loss
-from e2rl.learning.prior_training.optimisation import PriorTraining
-from e2rl.learning.prior_training.training_settings import TrainingSettings
+from e2rl.learning.prior_training.loss import (
+    CONSTANT_STD,
+    MIN_STD,
+    DenoisingLoss,
+    augment,
+    draw,
+    held_out_loss,
+    loss_weight,
+)
 from e2rl.learning.prior_training.windows import STANDING_WEIGHT, make_windows
+from e2rl.learning.supervised import MAX_GRAD_NORM, Supervised
 from e2rl.prior.checkpoint import save_prior
+from e2rl.prior.denoiser import Denoiser
 from e2rl.prior.prior import Prior
 from e2rl.prior.routes import candidate_features
 from e2rl.run.errors import InputError
-from e2rl.run.files import write_atomically
-from e2rl.run.parts import read_state, state_bytes
+from e2rl.run.parts import NO_PARTS, Parts
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.scene import SceneSet
 
 HELD_OUT = 8  # one in HELD_OUT places is held out for validation
-STATE, PREVIOUS, PROGRESS = "training.pt", "training.previous.pt", "progress.jsonl"
+WARM_UP = 50  # steps
+WEIGHT_DECAY = 0.1
+EMA = 0.998  # decay of the weights' moving average at most; (1 + step) / (10 + step) up to step 4500
+CAUSAL = 0.4  # fraction of windows whose start states are a causal observer's estimates
+RANK_SEED = 1_000_003  # difference of the generator seeds of consecutive ranks
 
 ClosedLoop = Callable[[Prior], dict[str, float]]  # metrics of a prior that drives held-out scenes
+
+
+@configured("stage/prior")
+@dataclass(frozen=True)
+class TrainingSettings:
+    """Settings of stage=prior; seed: the run's."""
+
+    starts: tuple[int, ...] = setting(low=0)
+    steps: int = setting(low=1)
+    batch: int = setting(low=1)
+    learning_rate: float = setting(low=0)
+    bf16: bool | None = setting(optional=True)
+    compile: bool = setting()
+    route_steps: int = setting(low=0)
+    validate_every: int = setting(low=1)
+    closed_loop_every: int = setting(low=0)
+    closed_loop_scenes: int = setting(low=1)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.starts:
+            raise InputError("stage.starts=[]: expected frame numbers, e.g. [10,30,50]")
+        object.__setattr__(self, "starts", tuple(sorted(set(self.starts))))
+
+    @property
+    def turns(self) -> int:
+        """Validations of the whole training."""
+        return -(-self.steps // self.validate_every)
+
+
+class PriorTraining(Supervised):
+    """The training of a prior: a turn is `validate_every` steps and a validation of the averaged weights.
+
+    Each process draws its part of a step's windows and noise, and gradients are averaged. Hence weights and moving
+    averages are equal in all processes, and a run is determined by its seed and the number of processes.
+
+    Only the held-out loss selects: thousands of windows at fixed noise make it precise. Closed-loop metrics on a few
+    scenes are only reported: their noise exceeds the differences between turns (conf/stage/prior.yaml).
+    """
+
+    def __init__(
+        self,
+        prior: Prior,
+        windows: TensorDictBase,
+        test: TensorDictBase,
+        settings: TrainingSettings,
+        processes: Processes = ALONE,
+        closed_loop: ClosedLoop | None = None,
+    ):
+        """windows, test: to train on and held out. Raises InputError if the processes cannot share a batch evenly."""
+        super().__init__()
+        if settings.batch % processes.count:
+            text = f"stage.batch={settings.batch}: {processes.count} processes share the windows of a step"
+            raise InputError(f"{text} evenly; choose a multiple of their number")
+        self.prior, self.windows, self.test, self.settings = prior, windows, test, settings
+        self.processes, self.closed_loop, self.writes = processes, closed_loop, processes.leader
+        self.done, self.part = 0, settings.batch // processes.count
+        self.routes: TensorDictBase | None = None  # scenes that the first turn trains the route choice on
+        self.accuracy = math.nan  # of the route choice
+        self.device = next(prior.parameters()).device
+        self.bf16 = has_bf16(self.device) if settings.bf16 is None else settings.bf16
+        self.generator = torch.Generator(self.device).manual_seed(settings.seed + RANK_SEED * processes.rank)
+        nodes, causal = windows["nodes"][windows["present"]], windows["causal"]
+        std = nodes.std(0)
+        prior.denoiser.node_mean.copy_(nodes.mean(0))
+        prior.denoiser.node_std.copy_(torch.where(std < 1e-6, CONSTANT_STD, std.clamp(min=MIN_STD)))
+        self.rows = [rows for rows in (causal.nonzero()[:, 0], (~causal).nonzero()[:, 0]) if len(rows)]
+        loss = processes.averaging(DenoisingLoss(prior.denoiser))
+        self.loss = torch.compile(loss) if settings.compile else loss
+        self.optimiser = torch.optim.AdamW(
+            prior.denoiser.parameters(), settings.learning_rate, weight_decay=WEIGHT_DECAY, fused=True
+        )
+        self.average = AveragedModel(prior.denoiser, multi_avg_fn=self._average)
+        self.average.update_parameters(prior.denoiser)  # the first call copies the initial weights
+
+    def learning_rate(self) -> float:
+        """Linear warm-up, then a cosine to 0."""
+        warm = min(1.0, (self.done + 1) / WARM_UP)
+        return self.settings.learning_rate * warm * 0.5 * (1 + math.cos(self.done / self.settings.steps * math.pi))
+
+    def turn(self) -> dict[str, float]:
+        """Steps up to the next validation, and that; followers return no losses."""
+        if self.routes is not None and not self.done:
+            self.accuracy = train_route_choice(self.prior, self.routes, self.settings)
+        row = self.train(min(self.done + self.settings.validate_every, self.settings.steps))
+        with self.averaged():
+            return row | self._validate() if self.processes.leader else row | {"held_out_loss": math.nan}
+
+    def train(self, until: int) -> dict[str, float]:
+        """Train up to step `until`; returns the running means of the loss's terms."""
+        running: dict[str, float] = {}
+        self.prior.train()
+        for _ in (bar := tqdm(range(self.done, until), "steps", unit="step", leave=False, disable=None)):
+            batch = augment(self.windows[self.pick()].to(self.device), self.generator)
+            terms = self.update(batch, draw(batch, self.generator))
+            if self.done % 20 == 0:
+                for key, value in zip(("action", "trajectory"), self.processes.mean(terms).tolist(), strict=True):
+                    running[key] = 0.9 * running.get(key, value) + 0.1 * value
+                bar.set_postfix({key: f"{value:.3f}" for key, value in running.items()})
+        return running
+
+    def _validate(self) -> dict[str, float]:
+        """Held-out loss and, if due, closed-loop metrics."""
+        settings, number = self.settings, len(self.history) + 1
+        row = {"step": float(self.done), "held_out_loss": held_out_loss(self.prior, self.test, settings.batch)}
+        every = settings.closed_loop_every
+        if self.closed_loop is not None and every and (number == settings.turns or number % every == 0):
+            row |= self.closed_loop(self.prior)
+        return row
+
+    def pick(self) -> Tensor:
+        """Indices [part] of a step's windows: a fraction CAUSAL of them with estimated starts, if both kinds exist."""
+        uniform = torch.rand(2, self.part, generator=self.generator, device=self.device).to(self.rows[0].device)
+        picks = [rows[(uniform[1] * len(rows)).long()] for rows in self.rows]
+        return torch.where(uniform[0] < CAUSAL, picks[0], picks[-1])
+
+    def update(self, batch: TensorDictBase, drawn: TensorDictBase) -> Tensor:
+        """One step on this process's windows with the random numbers of `loss.draw`; returns the loss's terms [2]."""
+        # Dropout is seeded by step and rank, so a resumed run repeats it.
+        torch.manual_seed(self.settings.seed + RANK_SEED * (self.done * self.processes.count + self.processes.rank))
+        total = self.processes.mean(loss_weight(batch, drawn).sum()).clamp(min=1)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16):
+            loss, action, trajectory = self.loss(batch, drawn, total)
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.learning_rate()
+        self.optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.prior.denoiser.parameters(), MAX_GRAD_NORM)
+        self.optimiser.step()
+        self.done += 1
+        self.average.update_parameters(self.prior.denoiser)
+        return torch.stack([action, trajectory])
+
+    def _average(self, average: Sequence[Tensor], current: Sequence[Tensor], _count: Tensor | int) -> None:
+        """Exponential moving average whose decay grows to EMA with the steps (`_count` may be on the GPU)."""
+        decay = min(EMA, (1 + self.done) / (10 + self.done))
+        for mean, value in zip(average, current, strict=True):
+            mean.lerp_(value, 1 - decay)
+
+    @contextmanager
+    def averaged(self) -> Iterator[Prior]:
+        """Context in which the prior has the averaged weights and is in evaluation mode."""
+        denoiser, average = self.prior.denoiser, self.average.module
+        assert isinstance(average, Denoiser)
+        self.prior.denoiser = average
+        self.prior.eval()
+        try:
+            yield self.prior
+        finally:
+            self.prior.denoiser = denoiser
+
+    def weights(self) -> dict[str, Tensor]:
+        """The averaged weights, on the CPU."""
+        with self.averaged() as prior:
+            return {key: value.cpu() for key, value in prior.state_dict().items()}
+
+    def set_weights(self, weights: Mapping[str, Tensor]) -> None:
+        """Take chosen weights."""
+        self.prior.load_state_dict(weights)
+
+    def state_dict(self) -> dict:
+        """All that later turns depend on. Collective: all processes must call it."""
+        return super().state_dict() | {
+            "denoiser": self.prior.denoiser.state_dict(),
+            "route_choice": self.prior.route_choice.state_dict(),
+            "average": self.average.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "done": self.done,
+            "accuracy": self.accuracy,
+            "draws": self.processes.gather(self.generator.get_state().cpu()),
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Restore a `state_dict`. Raises InputError if the number of processes differs."""
+        count, draws = self.processes.count, state["draws"]
+        if len(draws) != count:
+            raise InputError(
+                f"the interrupted run had {len(draws)} processes, this one has {count}; resume with as many"
+            )
+        super().load_state_dict(state)
+        self.prior.denoiser.load_state_dict(state["denoiser"])
+        self.prior.route_choice.load_state_dict(state["route_choice"])
+        self.average.load_state_dict(state["average"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.done, self.accuracy = state["done"], state["accuracy"]
+        self.generator.set_state(draws[self.processes.rank].cpu())
+
+
+def has_bf16(device: torch.device) -> bool:
+    """Whether the device computes in bf16; elsewhere it is emulated, on CPUs at a tenth of the speed of float32."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
 
 
 def train_route_choice(prior: Prior, scenes: TensorDictBase, settings: TrainingSettings) -> float:
@@ -76,78 +282,14 @@ def window_sets(scenes: SceneSet) -> tuple[TensorDictBase, TensorDictBase]:
     """(training, held-out) windows. Raises InputError if either is empty or has no moving vehicle."""
     mask = held_out(scenes)
     windows, test = (make_windows(scenes.batch(part.nonzero()[:, 0])) for part in (~mask, mask))
-    if not len(windows) or not len(test):
-        counts = f"{len(windows)} training and {len(test)} held-out windows of {len(scenes)} scenes"
-        reason = "too few vehicles are recorded for a second on a known route"
-        raise InputError(f"{counts}: {reason}; train on more or longer logs")
     for name, part in (("training", windows), ("held-out", test)):
+        if not len(part):
+            reason = "too few vehicles are recorded for a second on a known route"
+            raise InputError(f"no {name} windows in {len(scenes)} scenes: {reason}; train on more or longer logs")
         if not bool((part["weight"] > STANDING_WEIGHT).any()):
             where = f"in the {len(part)} {name} windows of {len(scenes)} scenes"
             raise InputError(f"no vehicle moves {where}; train on logs with moving traffic")
     return windows, test
-
-
-@dataclass
-class Record:
-    """The record of a run: validations so far (lines of progress.jsonl), loss, step and weights of the best one,
-    accuracy of the route choice, and wall seconds of each stage over all interruptions."""
-
-    lines: list[dict] = field(default_factory=list)
-    best: dict = field(default_factory=lambda: {"held_out": float("inf"), "step": 0, "weights": None})
-    accuracy: float = float("nan")
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
-        """Add the wall seconds of the block to those of a stage."""
-        begin = time.perf_counter()
-        yield
-        self.seconds[stage] = round(self.seconds.get(stage, 0.0) + time.perf_counter() - begin, 1)
-
-    def add(self, line: dict, prior: Prior) -> None:
-        """Add a validation of `prior`; keep its weights if its held-out loss is the lowest.
-
-        Only the loss selects: thousands of windows at fixed noise make it precise. Closed-loop metrics on a few scenes
-        are only reported: their noise exceeds the differences between checkpoints (conf/prior/default.yaml).
-        """
-        self.lines.append(line)
-        if line["held_out"] < self.best["held_out"]:
-            weights = {key: value.detach().cpu().clone() for key, value in prior.state_dict().items()}
-            self.best = {"held_out": line["held_out"], "step": line["step"], "weights": weights}
-
-    def summary(self) -> str:
-        """The last validation in one line."""
-        line, best = self.lines[-1], self.best
-        text = f"step {line['step']}: held-out loss {line['held_out']:.4f} "
-        text += f"(best {best['held_out']:.4f} at {best['step']})"
-        losses = ("step", "held_out", "action", "trajectory")
-        figures = [f"{key} {value:.4f}" for key, value in line.items() if key not in losses]
-        return text + ("; closed loop " + ", ".join(figures) if figures else "")
-
-    def write(self, folder: Path, run: dict, fingerprint: str) -> None:
-        """Write progress.jsonl, and training.pt with the run's state."""
-        state = {"run": run, "record": vars(self), "fingerprint": fingerprint}
-        write_atomically(folder / PROGRESS, "".join(json.dumps(line) + "\n" for line in self.lines))
-        content = state_bytes(state)
-        if (folder / STATE).exists():
-            (folder / STATE).replace(folder / PREVIOUS)
-        write_atomically(folder / STATE, content)
-
-
-def saved_state(folder: Path) -> dict | None:
-    """The newest whole state that an interrupted run has written, None where it has written none.
-
-    Raises InputError where all are damaged.
-    """
-    found = [folder / name for name in (STATE, PREVIOUS) if (folder / name).exists()]
-    for file in found:
-        try:
-            return read_state(file)
-        except ValueError as error:
-            tqdm.write(f"passed over: {error}", sys.stderr)
-    if found:
-        raise InputError(f"{found[0]}: damaged, and no whole one before it; begin a new run")
-    return None
 
 
 def train_prior(
@@ -158,72 +300,37 @@ def train_prior(
     origin: dict,
     closed_loop: ClosedLoop | None = None,
     processes: Processes = ALONE,
+    logger: RunLogger | None = None,
+    parts: Parts = NO_PARTS,
 ) -> Path | None:
-    """Train `prior` on scenes and return the path of the best checkpoint (by held-out loss of the averaged weights);
-    None in processes other than the leader.
+    """Train `prior` on scenes; returns the path of the checkpoint, None in processes other than the leader.
 
-    folder: holds training.pt, from which an interrupted run resumes exactly, progress.jsonl and the checkpoint. origin:
-    data and command, for the checkpoint's header, which also holds the results of the training. closed_loop: metrics
-    that every `closed_loop_every`-th validation and the last one report beside the held-out loss. Raises InputError if
-    the interrupted run had other data, or for too few scenes.
+    Args:
+        folder: for the checkpoint, which has the averaged weights of the lowest held-out loss.
+        origin: data and command, for the checkpoint's header, which also has the results of the training.
+        closed_loop: metrics that every `closed_loop_every`-th validation and the last one report.
+        parts: of the run, from which an interrupted training goes on exactly.
+
+    Raises:
+        InputError: for too few scenes.
     """
-    record, data = Record(), origin.get("fingerprint", "")
-    state = saved_state(folder)
-    if state is not None:
-        if state.get("fingerprint") != data:
-            raise InputError(f"{folder / STATE}: the interrupted run had other data; resume with the same scenes")
-        record = Record(**state["record"])
-    with record.timed("windows"):
-        windows, test = window_sets(scenes)
-    if state is None:
-        with record.timed("routes"):
-            record.accuracy = train_route_choice(prior, scenes.batch((~held_out(scenes)).nonzero()[:, 0]), settings)
-    run = PriorTraining(prior, windows, settings, processes)
-    if state is not None:
-        run.load_state_dict(state["run"])
-    while run.step < settings.steps:
-        with record.timed("steps"):
-            losses = run.run(min(run.step + settings.validate_every, settings.steps))
-        with record.timed("validation"), run.averaged():
-            if processes.leader:
-                record.add(_validate(run, test, losses, closed_loop), prior)
-                tqdm.write(record.summary())
-        state = run.state_dict()
-        if processes.leader:
-            record.write(folder, state, data)
+    begin = time.perf_counter()
+    windows, test = window_sets(scenes)
+    run = PriorTraining(prior, windows, test, settings, processes, closed_loop)
+    run.routes = scenes.batch((~held_out(scenes)).nonzero()[:, 0])
+    best = run.fit("prior", settings.turns, parts, vars(settings), logger)
     if not processes.leader:
         return None
-    return _checkpoint(run, record, folder, origin | {"windows": len(windows), "held_out_windows": len(test)})
-
-
-def _validate(
-    run: PriorTraining, test: TensorDictBase, losses: dict[str, float], closed_loop: ClosedLoop | None
-) -> dict[str, float]:
-    """Held-out loss, training losses and, if due, closed-loop metrics."""
-    settings = run.settings
-    line = {"step": run.step, "held_out": held_out_loss(run.prior, test, settings), **losses}
-    number, last = -(-run.step // settings.validate_every), run.step == settings.steps
-    every = settings.closed_loop_every
-    if closed_loop is not None and every and (last or number % every == 0):
-        line |= closed_loop(run.prior)
-    return line
-
-
-def _checkpoint(run: PriorTraining, record: Record, folder: Path, origin: dict) -> Path:
-    """Write the best weights, with their origin in the header."""
-    best = record.best
-    run.prior.load_state_dict(best["weights"])
-    seconds = origin.get("seconds", {}) | record.seconds
-    seconds["total"] = round(sum(seconds.values()), 1)
-    tqdm.write("seconds: " + ", ".join(f"{stage} {value:.0f}" for stage, value in seconds.items()))
     results = {
-        "validation": next(line for line in record.lines if line["step"] == best["step"]),
-        "held_out_loss": best["held_out"],
-        "step": best["step"],
-        "route_accuracy": record.accuracy,
-        "processes": run.processes.count,
+        "windows": len(windows),
+        "held_out_windows": len(test),
+        "validation": best,
+        "held_out_loss": best["held_out_loss"],
+        "step": int(best["step"]),
+        "route_accuracy": run.accuracy,
+        "processes": processes.count,
         "device": str(run.device),
         "versions": {"python": platform.python_version(), "torch": torch.__version__},
-        "seconds": seconds,
+        "seconds": {"training": round(time.perf_counter() - begin, 1)},
     }
-    return save_prior(run.prior.eval(), folder, origin | results)
+    return save_prior(prior.eval(), folder, origin | results)

@@ -188,7 +188,7 @@ NEVER = 1 << 30
 class ReactSettings:
     """Fields: `react` in conf/learner/ppo_bc.yaml."""
 
-    share: float = setting(low=0, high=1)
+    fraction: float = setting(low=0, high=1)
     others: float = setting(low=0, high=1)
     eta: tuple[float, float] = setting(low=0)
     scatter: float = setting(low=0)
@@ -212,7 +212,7 @@ def drawn(settings: ReactSettings, episodes: NewEpisodes, generator: torch.Gener
     low, high = settings.eta
     nobody = torch.zeros(size[0], MOST, dtype=torch.int64, device=device)
     part = {
-        "start": torch.where(episodes.adversarial & (reacts < settings.share), start, NEVER),
+        "start": torch.where(episodes.adversarial & (reacts < settings.fraction), start, NEVER),
         "eta": low + (high - low) * how,
         "count": 1 + (many * MOST).long(),
         "others": others < settings.others,

@@ -8,7 +8,7 @@ import torch
 from e2rl.scenes.route import SPACING
 from e2rl.sim.world import World
 from e2rl.traffic.e2.motion import constant_speed_states
-from e2rl.traffic.e2.skeleton import Skeleton, SkeletonSettings, build_skeleton
+from e2rl.traffic.e2.skeleton import STEP, Skeleton, SkeletonSettings, build_skeleton
 from tests.synthetic import BACK, make_scenes
 
 
@@ -57,7 +57,7 @@ def skeleton_of(
 ) -> Skeleton:
     """The skeleton if everybody keeps its speed; cost: of meeting the ego, by default the distance to it."""
     chosen = SkeletonSettings(**settings)
-    times = chosen.step * torch.arange(1, 11)
+    times = STEP * torch.arange(1, 11)
     distance = (world.states[:, : support.shape[1], :2] - world.states[:, :1, :2]).norm(dim=-1)
     expected = constant_speed_states(world.scene, world, times)
     feasible = support if feasible is None else feasible

@@ -1,42 +1,40 @@
+"""Algorithm 2: near agents by cost, who can act on whom when, and the shortest causal chain, against plain Python."""
+
 import math
+from itertools import permutations
 
 import pytest
 import torch
 
 from e2rl.run.errors import InputError
+from e2rl.traffic.e2 import skeleton
 from e2rl.traffic.e2.anchoring import AnchorSettings, propose
 from e2rl.traffic.e2.feasibility import FeasibilitySettings, feasible_vehicles
 from e2rl.traffic.e2.interception import InterceptionSettings
-from e2rl.traffic.e2.skeleton import (
-    NEAREST_FEASIBLE,
-    NOBODY,
-    SUPPORTED,
-    SkeletonSettings,
-    chain_depth,
-    lane_of,
-    limits_of,
-)
+from e2rl.traffic.e2.motion import constant_speed_states
+from e2rl.traffic.e2.skeleton import STEP, SkeletonSettings, chain_depth, influence, lane_of, limits_of
 from e2rl.traffic.e2.topology import TopologySettings, topological_candidates
 from e2rl.traffic.traffic import CHAIN, FULL, PAIR, SINGLE
-from tests.traffic.e2.crossing import make_world, mask, skeleton_of
+from tests.traffic.e2.crossing import add_route, make_world, mask, skeleton_of
 
 UP = math.pi / 2
 EGO = (0.0, 0.0, 0.0, 10.0)
-COLUMN = [(30.0, -20.0 - 18 * k, UP, 8.0) for k in range(3)]  # one behind the other, towards the ego's way
+COLUMN = [(30.0, -20.0 - 18 * k, UP, 8.0) for k in range(3)]  # one behind the other, towards the ego's path
+LENGTH = 4.5
 
 
-def test_near_vehicles_act_on_the_ego():
+def members(result):
+    return result.coalition.nonzero().tolist()
+
+
+def test_the_near_agents_are_those_of_least_cost_and_act_on_the_ego():
     world = make_world([EGO, (12.0, 3.5, 0.0, 10.0), (-14.0, 0.0, 0.0, 10.0), (60.0, 3.5, 0.0, 10.0)])
-    result = skeleton_of(world, mask(world, 1, 2, 3), near=2)
-    assert result.coalition.nonzero().tolist() == [[0, 1], [0, 2]]
-    assert result.target[0, :4].tolist() == [-1, 0, 0, -1] and result.depth[0, :4].tolist() == [0, 1, 1, 0]
-    assert result.source.tolist() == [SUPPORTED] and result.chains.tolist() == [0]
-
-
-def test_a_support_smaller_than_its_capacity_is_used_whole():
-    world = make_world([EGO, (12.0, 3.5, 0.0, 10.0)])
-    result = skeleton_of(world, mask(world, 1), near=3, far=2)
-    assert result.coalition.nonzero().tolist() == [[0, 1]]
+    cost = torch.tensor([[0.0, 3.0, 2.0, 1.0, torch.inf, 0.0, 0.0, 0.0]])
+    result = skeleton_of(world, mask(world, 1, 2, 3), near=2, cost=cost)
+    assert members(result) == [[0, 2], [0, 3]] and torch.equal(result.near, result.coalition)
+    assert result.target[0, :4].tolist() == [-1, -1, 0, 0] and result.depth[0, :4].tolist() == [0, 0, 1, 1]
+    assert not result.far.any()
+    assert members(skeleton_of(world, mask(world, 1), near=3, far=2)) == [[0, 1]], "a small support is used whole"
 
 
 def test_a_column_forms_a_chain_and_its_intermediate_is_controlled():
@@ -45,51 +43,59 @@ def test_a_column_forms_a_chain_and_its_intermediate_is_controlled():
     assert result.target[0, :4].tolist() == [-1, 0, 1, 2]
     assert result.depth[0, :4].tolist() == [0, 1, 2, 3]
     assert result.near[0].nonzero().tolist() == [[1]] and result.far[0].nonzero().tolist() == [[3]]
-    assert result.chains.tolist() == [1]
+    assert members(skeleton_of(world, mask(world, 1, 3), near=1)) == [[0, 1]], "it must be in the support"
 
 
 @pytest.mark.parametrize(
-    "change",
-    [{"max_chain": 2}, {"tau_long": 10.0}, {"horizon": 1.0}, {"max_dist": 40.0}, {"far": 0}, {"tau_dist": 90.0}],
+    ("change", "near", "linked"),
+    [
+        ({}, 1, True),
+        ({"max_chain": 3}, 1, True),
+        ({"max_chain": 2}, 1, False),
+        ({"tau_long": 10.0}, 1, False),
+        ({"horizon": 1.0}, 1, False),
+        ({"far": 0}, 1, False),
+        ({"tau_dist": 63.0}, 1, True),  # the last of the column is 63.5 m away
+        ({"tau_dist": 64.0}, 1, False),
+    ],
 )
-def test_chains_beyond_the_limits_are_pruned_to_the_near(change):
+def test_chains_beyond_the_limits_are_pruned_to_the_near(change, near, linked):
     world = make_world([EGO, *COLUMN])
-    result = skeleton_of(world, mask(world, 1, 2, 3), near=1, **change)
-    assert result.coalition.nonzero().tolist() == [[0, 1]] and result.chains.tolist() == [0]
+    result = skeleton_of(world, mask(world, 1, 2, 3), near=near, **change)
+    assert members(result) == ([[0, 1], [0, 2], [0, 3]] if linked else [[0, 1]]) and bool(result.far.any()) == linked
 
 
-def test_without_the_intermediate_in_the_support_there_is_no_chain():
+@pytest.mark.parametrize(("limit", "far"), [(64.0, 3), (63.0, 2)])
+def test_the_far_agent_is_the_farthest_within_reach(limit, far, monkeypatch):
+    monkeypatch.setattr(skeleton, "MAX_DIST", limit)
     world = make_world([EGO, *COLUMN])
-    assert skeleton_of(world, mask(world, 1, 3), near=1).coalition.nonzero().tolist() == [[0, 1]]
+    assert skeleton_of(world, mask(world, 1, 2, 3), near=1).far.nonzero().tolist() == [[0, far]]
 
 
-def test_a_vehicle_that_drives_away_starts_no_chain():
-    world = make_world([EGO, COLUMN[0], (30.0, -38.0, -UP, 8.0)])
-    assert skeleton_of(world, mask(world, 1, 2), near=1).chains.tolist() == [0]
-
-
-def test_effects_may_not_precede_their_causes():
-    # 2 can act on 1 only once 1 has passed the ego's corridor: the link to the ego is over by then.
-    world = make_world([EGO, (30.0, -20.0, UP, 12.0), (75.0, 30.0, math.pi, 9.0)])
-    late = skeleton_of(world, mask(world, 1, 2), near=1)
-    assert late.chains.tolist() == [0]
-
-
-def test_the_ego_s_own_and_neighbour_lanes_hold_no_initiator():
+def test_the_ego_s_own_neighbour_and_following_lanes_hold_no_initiator():
     world = make_world([EGO, (12.0, -10.0, UP, 8.0), (-30.0, 3.5, 0.0, 12.0), (-20.0, 0.0, 0.0, 12.0)])
     result = skeleton_of(world, mask(world, 1, 2, 3), near=1)
-    assert result.coalition.nonzero().tolist() == [[0, 1]] and not result.far.any()
+    assert members(result) == [[0, 1]] and not result.far.any()
     assert lane_of(world.states[:, :4], world.scene).tolist() == [[0, -1, 1, 0]]
+    turned = world.states[:, :4].clone()
+    turned[0, :, 2] += torch.tensor([1.0, -1.0, 1.1, -1.1])  # 60 degrees are 1.047
+    assert lane_of(turned, world.scene).tolist() == [[0, 0, -1, -1]]
+    chain = [EGO, (20.0, -10.0, UP, 8.0), (-2.0, 3.5, 0.0, 0.0), (-25.0, -10.0, 0.0, 10.0)]
+    for lane, counts in ((None, True), ("lane_left", False), ("lane_right", False), ("lane_exits", False)):
+        world = make_world(chain)
+        world.scene["lane_left"][:] = world.scene["lane_right"][:] = -1
+        world.scene["lane_exits"][:] = -1
+        if lane is not None:
+            world.scene[lane][:, 0] = 1
+        states, asked = world.states[:, [0, 2]], torch.tensor([[True]])
+        assert skeleton._on_ego_lanes(states, asked, world.scene).item() != counts, lane
 
 
 def test_an_empty_support_falls_back_to_the_nearest_feasible_then_to_nobody():
     world = make_world([EGO, (40.0, -30.0, UP, 8.0), (12.0, 3.5, 0.0, 10.0), (20.0, 3.5, 0.0, 9.0)], copies=3)
     support, feasible = mask(world, 1), mask(world, 1, 2, 3)
     support[1:], feasible[2] = False, False
-    result = skeleton_of(world, support, feasible, near=2)
-    assert result.source.tolist() == [SUPPORTED, NEAREST_FEASIBLE, NOBODY]
-    assert result.coalition.nonzero().tolist() == [[0, 1], [1, 2], [1, 3]]
-    assert result.counts() == {"supported": 1, "nearest_feasible": 1, "nobody": 1, "chains": 0}
+    assert members(skeleton_of(world, support, feasible, near=2)) == [[0, 1], [1, 2], [1, 3]]
 
 
 def test_pursuit_takes_the_nearest_of_the_support_where_nobody_can_meet_the_ego():
@@ -100,10 +106,102 @@ def test_pursuit_takes_the_nearest_of_the_support_where_nobody_can_meet_the_ego(
     cost = torch.full(support.shape, torch.inf)
     cost[2, 1] = 1.0
     chosen = [
-        skeleton_of(world, support, feasible, cost=cost, near=1, far=0, pursuit=pursuit).coalition.nonzero().tolist()
+        members(skeleton_of(world, support, feasible, cost=cost, near=1, far=0, pursuit=pursuit))
         for pursuit in (False, True)
     ]
     assert chosen == [[[2, 1]], [[0, 2], [1, 2], [2, 1]]]
+
+
+def random_world(seed, count=7):
+    """Two loose columns of vehicles that drive towards the ego's path, each on one straight route."""
+    x, y, heading, speed = torch.rand(4, count, generator=torch.Generator().manual_seed(seed))
+    x = torch.where(torch.arange(count) < 4, 25.0, 32.0) + 4 * x - 2
+    return make_world([EGO, *torch.stack([x, -15 - 45 * y, UP + 0.2 * heading - 0.1, 5 + 6 * speed], -1).tolist()])
+
+
+def acts(own, other, time, tau_long):
+    """Whether vehicle `own` can act on `other` in `time` s, both states [4], on straight routes (Sec. IV-A3)."""
+    there = other[:2] + other[3] * time * torch.stack([other[2].cos(), other[2].sin()])
+    gap, v = there - own[:2], own[3].item()
+    along = (own[2].cos() * gap[0] + own[2].sin() * gap[1]).item()
+    across = (own[2].cos() * gap[1] - own[2].sin() * gap[0]).item()
+    braking = min(time, v / 5.0)
+    ramp = min(time, (25.0 - v) / 4.0)
+    least, most = v * braking - 2.5 * braking**2, v * ramp + 2.0 * ramp**2 + 25.0 * (time - ramp)
+    reachable = least - LENGTH <= along <= most + LENGTH and along > -LENGTH
+    return reachable and abs(across) <= 2.5 and abs(along - v * time) <= tau_long
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_influence_is_that_of_the_equations_of_motion(seed):
+    world, settings = random_world(seed), SkeletonSettings(tau_long=12.0)
+    times = STEP * torch.arange(1, 11)
+    expected = constant_speed_states(world.scene, world, times)
+    slots = torch.arange(1, 8)[None], torch.ones(1, 7, dtype=torch.bool)
+    found = influence(world.scene, world, slots, expected, settings)[0]
+    states, wanted = world.states[0], torch.zeros_like(found)
+    for i in range(7):
+        for j in range(8):
+            if i != j:
+                other = states[0] if j == 7 else states[j + 1]
+                wanted[i, j] = torch.tensor([acts(states[i + 1], other, t, 12.0) for t in times.tolist()])
+    assert wanted.any() and torch.equal(found, wanted)
+
+
+def earliest(link, path):
+    """The step at which the last link of a path of slots is over, each no earlier than the one before; None: never."""
+    step = 0
+    for one, next_one in zip(path, path[1:], strict=False):
+        later = link[one, next_one, step:].nonzero()
+        if not len(later):
+            return None
+        step += int(later[0, 0])
+    return step
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_chain_is_a_shortest_one_whose_effects_never_precede_their_causes(seed):
+    """Against all orders of all vehicles between the far agent and a near one."""
+    world = random_world(seed)
+    settings = {"near": 2, "far": 1, "tau_long": 25.0, "max_chain": 4}
+    result = skeleton_of(world, mask(world, *range(1, 8)), **settings)
+    expected = constant_speed_states(world.scene, world, STEP * torch.arange(1, 11))
+    slots = torch.arange(1, 8)[None], torch.ones(1, 7, dtype=torch.bool)
+    link = influence(world.scene, world, slots, expected, SkeletonSettings(**settings))[0]
+    near = (result.near[0, 1:].nonzero()[:, 0]).tolist()
+    distance = (world.states[0, 1:8, :2] - world.states[0, :1, :2]).norm(dim=-1)
+    others = [i for i in range(7) if i not in near]
+    far = max((i for i in others if 15.0 < distance[i] <= 80.0), key=lambda i: distance[i])
+    between = [i for i in others if i != far]
+    paths = [(far, *some, last, 7) for n in range(3) for some in permutations(between, n) for last in near]
+    viable = [path for path in paths if earliest(link, path) is not None]
+    target = result.target[0].tolist()
+    if not viable:
+        assert not result.far.any() and torch.equal(result.coalition, result.near)
+        return
+    way = [far + 1]
+    while way[-1] != 0:
+        way.append(target[way[-1]])
+    path = tuple(7 if i == 0 else i - 1 for i in way)
+    assert path in viable and len(path) == min(map(len, viable))
+    assert result.far.nonzero().tolist() == [[0, far + 1]]
+    assert set(result.coalition[0].nonzero()[:, 0].tolist()) == {i + 1 for i in near} | set(way[:-1])
+
+
+def test_some_of_the_random_worlds_have_a_chain_and_some_have_none():
+    depths = []
+    for seed in range(12):
+        world = random_world(seed)
+        result = skeleton_of(world, mask(world, *range(1, 8)), near=2, far=1, tau_long=25.0, max_chain=4)
+        depths.append(int(result.depth.max()))
+    assert set(depths) >= {1, 2, 3}
+
+
+def test_any_candidate_route_may_lead_to_the_target():
+    world = make_world([EGO, COLUMN[0], (10.0, -40.0, UP, 20.0)])
+    assert not skeleton_of(world, mask(world, 1, 2), near=1).far.any()
+    add_route(world, 2, 3, math.atan2(32.0, 20.0))  # towards where the first will be
+    assert skeleton_of(world, mask(world, 1, 2), near=1, tau_long=60.0).far.any()
 
 
 def test_every_link_leads_to_the_ego_and_absent_vehicles_take_no_part():
@@ -116,7 +214,7 @@ def test_every_link_leads_to_the_ego_and_absent_vehicles_take_no_part():
         world.valid[:, 1:8] &= torch.rand(4, 7, generator=generator) < 0.9
         support = torch.rand(4, 8, generator=generator) < 0.8
         result = skeleton_of(world, support, near=1, far=2, tau_long=40.0)
-        chains += int(result.chains.sum())
+        chains += int(result.far.sum())
         assert not (result.coalition & ~(support & world.valid[:, :8])).any() and not result.coalition[:, 0].any()
         assert torch.equal(result.coalition, result.target >= 0) and torch.equal(result.coalition, result.depth > 0)
         assert torch.equal(chain_depth(result.target), result.depth)
@@ -134,6 +232,7 @@ def test_causal_templates_limit_each_scene_by_itself():
     world = make_world([EGO, *COLUMN, (12.0, 3.5, 0.0, 10.0)], copies=4)
     support, settings = mask(world, 1, 2, 3, 4), SkeletonSettings(near=3)
     limits = limits_of(torch.tensor([SINGLE, PAIR, CHAIN, FULL]), settings)
+    assert limits[0].tolist() == [1, 2, 1, 3] and limits[1].tolist() == [0, 0, 1, settings.far]
     result = skeleton_of(world, support, near=3, limits=limits)
     assert result.near.sum(1).tolist() == [1, 2, 1, 3]
     assert not result.far[:2].any() and (result.far.sum(1) <= 1).all()
@@ -142,15 +241,8 @@ def test_causal_templates_limit_each_scene_by_itself():
     assert all(torch.equal(getattr(result, name)[3], getattr(alone, name)[3]) for name in vars(alone))
 
 
-def test_the_template_chain_finds_the_column_and_single_does_not():
-    world = make_world([EGO, *COLUMN], copies=2)
-    limits = limits_of(torch.tensor([CHAIN, SINGLE]), SkeletonSettings(far=0))
-    result = skeleton_of(world, mask(world, 1, 2, 3), near=3, far=0, limits=limits)
-    assert result.target[:, :4].tolist() == [[-1, 0, 1, 2], [-1, 0, -1, -1]]
-
-
 def test_bad_settings_are_refused():
-    with pytest.raises(InputError, match="near"):
+    with pytest.raises(InputError, match="synthesizer.skeleton.near"):
         SkeletonSettings(near=0)
 
 
@@ -164,4 +256,3 @@ def test_an_ego_alone_passes_through_every_room():
     result = skeleton_of(world, found.candidates & feasible, feasible)
     anchor = propose(scene, world, result, plan, AnchorSettings(), InterceptionSettings(), torch.full((2,), 2.0))
     assert not (found.candidates | feasible | result.coalition | anchor.feasible).any()
-    assert result.source.tolist() == [NOBODY, NOBODY]

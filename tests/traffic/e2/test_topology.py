@@ -1,3 +1,8 @@
+"""Time to collision against stepped polygons; cliques, scores and candidates against the definitions, in plain Python."""
+
+import math
+from itertools import combinations
+
 import networkx
 import numpy as np
 import pytest
@@ -6,7 +11,11 @@ import torch
 
 from e2rl.run.errors import InputError
 from e2rl.scenes.boxes import corners
+from e2rl.traffic.e2 import topology
 from e2rl.traffic.e2.topology import (
+    HOPS,
+    HORIZON,
+    STRIDE,
     TopologySettings,
     maximal_cliques,
     pair_weights,
@@ -56,17 +65,21 @@ def test_first_contact_is_that_of_stepped_polygons():
     assert set(kinds) == {"now", "later", "never"}
 
 
-def test_ttc_of_a_follower_and_of_equal_speeds():
-    states = torch.tensor([[0.0, 0, 0, 10], [24, 0, 0, 5], [-30, 0, 0, 10]])
-    ttc = time_to_collision(states, torch.tensor([4.0, 2.0]).expand(3, 2))
-    assert ttc[0, 1] == pytest.approx(4.0) and ttc[0, 2] == torch.inf and ttc[0, 0] == 0
+@pytest.mark.parametrize(("gap", "ttc"), [(79.9, 7.99), (80.1, math.inf)])
+def test_ttc_of_a_follower_of_equal_speeds_and_at_the_horizon(gap, ttc):
+    states = torch.tensor([[0.0, 0, 0, 10], [4 + gap, 0, 0, 0], [-30, 0, 0, 10]])
+    found = time_to_collision(states, torch.tensor([4.0, 2.0]).expand(3, 2))
+    assert HORIZON == 8.0 and found[0, 1].item() == pytest.approx(ttc)
+    assert found[0, 2] == torch.inf and found[0, 0] == 0
 
 
-def test_weight_is_half_at_tau_max_and_nothing_for_the_absent():
-    settings = TopologySettings(clearance=0.0)
+def test_weights_are_the_sigmoid_of_the_ttc_and_nothing_for_the_absent():
+    """Boxes grown by the clearance: a gap of 34 - 4 - 1 m closes at 10 m/s."""
+    settings = TopologySettings(clearance=1.0, tau_max=2.5, beta=0.5)
     states = torch.tensor([[0.0, 0, 0, 10], [34, 0, 0, 0], [30, 0, 0, 0]])
     weight = pair_weights(states, torch.tensor([True, True, False]), torch.tensor([4.0, 2.0]).expand(3, 2), settings)
-    assert weight[0, 1] == pytest.approx(0.5) and weight[2].sum() == 0 and weight.diagonal().sum() == 0
+    assert weight[0, 1].item() == pytest.approx(1 / (1 + math.exp((2.9 - 2.5) / 0.5)))
+    assert weight[1, 0] == weight[0, 1] and weight[2].sum() == 0 and weight.diagonal().sum() == 0
 
 
 def test_cliques_are_those_of_networkx():
@@ -77,13 +90,69 @@ def test_cliques_are_those_of_networkx():
     assert set(maximal_cliques(adjacency.tobytes(), 9)) == expected
 
 
-def test_permuting_vehicles_permutes_scores_and_candidates():
-    states, size = random_boxes(4, 14, 30.0, 1)
-    track, valid = rollout(states), torch.rand(4, 81, 14) < 0.95
-    valid[:, 0] = True
-    settings = TopologySettings(candidates=4, max_nodes=10)
+def cliques_by_definition(weight, distance, valid, settings):
+    """The top cliques of one graph, by Sec. IV-A1: brute force over all subsets."""
+    present = sorted((i for i in range(len(weight)) if valid[i]), key=lambda i: (distance[i], i))[: topology.NODES]
+    edges = {(i, j) for i in present for j in present if i != j and weight[i, j] >= settings.edge_threshold}
+    hops = {0: 0}
+    for hop in range(1, HOPS + 2):
+        hops |= {j: hop for i, j in edges if i in hops and j not in hops and hops[i] == hop - 1}
+    graph = {(i, j) for i, j in edges if i in hops and j in hops}
+    nodes = sorted({i for i, _ in graph})
+    complete = [
+        set(some)
+        for size in range(2, len(nodes) + 1)
+        for some in combinations(nodes, size)
+        if all((i, j) in graph for i, j in combinations(some, 2))
+    ]
+    found = set()
+    for clique in (some for some in complete if not any(some < other for other in complete)):
+        total = {i: round(math.fsum(weight[i, j] for j in clique if j != i), 6) for i in clique}
+        order = sorted(clique, key=lambda i: (i != 0, -total[i], distance[i], i))
+        found.add(tuple(sorted(order[: settings.max_clique])))
+    found = [clique for clique in found if min(hops[i] for i in clique) <= HOPS]
+
+    def rank(clique):
+        pairs = [weight[i, j] for i, j in combinations(clique, 2)]
+        return -round(math.fsum(pairs) / len(pairs), 6), math.fsum(distance[i] for i in clique) / len(clique), clique
+
+    return sorted(found, key=rank)[: settings.top_cliques]
+
+
+@pytest.mark.parametrize(("seed", "nodes"), [(3, 24), (5, 24), (8, 24), (9, 7)])
+def test_scores_and_candidates_are_those_of_the_definition(seed, nodes, monkeypatch):
+    """Eqs. (ttc_weight_t) and (temporal_scoring): a point for each top clique of each analysed step."""
+    monkeypatch.setattr(topology, "NODES", nodes)
+    states, size = random_boxes(1, 11, 20.0, seed)
+    states[:, 0, :2] *= 0.3
+    track = rollout(states)
+    valid = torch.rand(1, 81, 11, generator=torch.Generator().manual_seed(seed)) < 0.9
+    valid[:, :, 0] = valid[:, 0] = True
+    settings = TopologySettings(candidates=3, max_clique=3, top_cliques=2)
     result = topological_candidates(track, valid, size, settings)
-    order = torch.cat([torch.zeros(1, dtype=torch.int64), 1 + torch.randperm(13)])
+    assert result.steps.tolist() == list(range(0, 81, STRIDE)) and STRIDE == 5
+    score, nearest = [0] * 11, [math.inf] * 11
+    for number, step in enumerate(result.steps.tolist()):
+        distance = (track[0, step, :, :2] - track[0, step, :1, :2]).norm(dim=-1)
+        distance = distance.masked_fill(~valid[0, step], math.inf).tolist()
+        nearest = [min(pair) for pair in zip(nearest, distance, strict=True)]
+        weight = result.weights[0, number].numpy()
+        expected = cliques_by_definition(weight, distance, valid[0, step].tolist(), settings)
+        assert result.cliques[0][number] == expected
+        for i in (i for clique in expected for i in clique):
+            score[i] += 1
+    assert result.score[0].tolist() == score
+    order = sorted((i for i in range(1, 11) if score[i] > 0), key=lambda i: (-score[i], nearest[i], i))
+    assert len(order) > 3 and result.candidates[0].nonzero()[:, 0].tolist() == sorted(order[:3])
+
+
+def test_permuting_vehicles_permutes_scores_and_candidates():
+    states, size = random_boxes(4, 30, 40.0, 1)
+    track, valid = rollout(states), torch.rand(4, 81, 30) < 0.95
+    valid[:, 0] = True
+    settings = TopologySettings(candidates=4)
+    result = topological_candidates(track, valid, size, settings)
+    order = torch.cat([torch.zeros(1, dtype=torch.int64), 1 + torch.randperm(29)])
     permuted = topological_candidates(track[:, :, order], valid[:, :, order], size[:, order], settings)
     assert torch.equal(permuted.score, result.score[:, order])
     assert torch.equal(permuted.candidates, result.candidates[:, order])
@@ -99,24 +168,12 @@ def test_the_ego_is_never_a_candidate_whatever_the_number_of_vehicles(count):
     assert (result.candidates.sum(1) <= 10).all() and (result.score[result.candidates] > 0).all()
 
 
-def test_two_vehicles_head_on_are_one_clique():
-    states = torch.tensor([[[0.0, 0, 0, 10], [70, 0, torch.pi, 10]]])
-    result = topological_candidates(
-        rollout(states),
-        torch.ones(1, 81, 2, dtype=torch.bool),
-        torch.tensor([[[4.0, 2.0]]]).expand(1, 2, 2),
-        TopologySettings(),
-    )
-    assert result.candidates.tolist() == [[False, True]]
-    assert (0, 1) in result.cliques[0][0] and result.weights[0, 0, 0, 1] >= TopologySettings().edge_threshold
-
-
-def test_absent_vehicles_are_left_out():
+def test_who_is_absent_at_the_start_is_no_candidate():
     states = torch.tensor([[[0.0, 0, 0, 10], [40, 0, torch.pi, 10], [45, 1, torch.pi, 10]]])
     valid = torch.ones(1, 81, 3, dtype=torch.bool)
-    valid[..., 1] = False
+    valid[:, 0, 1] = False
     result = topological_candidates(rollout(states), valid, torch.full((1, 3, 2), 2.0), TopologySettings())
-    assert result.candidates.tolist() == [[False, False, True]]
+    assert result.candidates.tolist() == [[False, False, True]] and result.score[0, 1] > 0
 
 
 @pytest.mark.parametrize(("x", "y", "counts"), [(200.0, 50.0, False), (40.0, 0.0, True)])
@@ -127,16 +184,7 @@ def test_a_queue_counts_only_where_the_ego_is_entangled_with_it(x, y, counts):
     assert topological_candidates(rollout(states), present, size, TopologySettings()).candidates.any() == counts
 
 
-def test_large_cliques_are_cut_down_and_keep_the_ego():
-    states, size = random_boxes(1, 8, 1.0, 3)
-    result = topological_candidates(
-        states[:, None], torch.ones(1, 1, 8, dtype=torch.bool), size, TopologySettings(max_clique=3)
-    )
-    assert all(len(clique) == 3 and clique[0] == 0 for clique in result.cliques[0][0])
-
-
 def test_bad_settings_name_their_key():
-    with pytest.raises(InputError, match="max_clique"):
-        TopologySettings(max_clique=1)
-    with pytest.raises(InputError, match="edge_threshold"):
-        TopologySettings(edge_threshold=1.5)
+    for wrong in ({"max_clique": 1}, {"edge_threshold": 1.5}):
+        with pytest.raises(InputError, match=f"synthesizer.topology.{next(iter(wrong))}"):
+            TopologySettings(**wrong)

@@ -1,0 +1,47 @@
+"""`python -m e2rl.commands.showcase`: the three moving pictures of the README, from a bundled scene and bundled weights.
+
+The same scene and seed: nominal traffic around the untrained actor; the same actor attacked by e2; the trained actor,
+which e2 attacks anew.
+"""
+
+import argparse
+from pathlib import Path
+
+from e2rl.evaluation.methods import build_sim
+from e2rl.evaluation.protocol import Method, Setup
+from e2rl.api import load_prior, load_scenes, make_ego, make_traffic
+from e2rl.metrics.score import score_rollouts
+from e2rl.report.picture import Replay
+from e2rl.report.videos import save_animation
+from e2rl.run.config import load_config
+from e2rl.run.endings import ending
+
+SCENE, SEED, ETA = "arterial_065_0440", 0, 2.0  # of the bundled test scenes
+METRES, PIXELS, COLOURS = 60.0, 400, 48
+PICTURES = {  # file: the ego's checkpoint, traffic, two lines of the picture
+    "nominal": (None, "nominal", ("Nominal traffic", "untrained policy")),
+    "attacked": (None, "e2", ("Attacked by e2", "untrained policy")),
+    "trained": ("bundled", "e2", ("After training", "e2 attacks it anew")),
+}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(prog="python -m e2rl.commands.showcase", description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("docs/assets"), help="folder (default %(default)s)")
+    parser.add_argument("--scene", default=SCENE, metavar="ID", help="a bundled test scene (default %(default)s)")
+    options = parser.parse_args(arguments)
+    with ending():
+        scenes, prior, sim = load_scenes("bundled"), load_prior(), build_sim(load_config("evaluate"))
+        for name, (checkpoint, traffic, caption) in PICTURES.items():
+            setup = Setup(scenes, make_ego("actor", checkpoint=checkpoint), "actor", sim)
+            method = Method(traffic, make_traffic(traffic, prior), ETA if traffic == "e2" else 0.0)
+            rollouts = setup.roll_out(method, [(scenes.index(options.scene), SEED)])
+            row = score_rollouts(rollouts)[0][0]
+            frames = Replay(rollouts.rollout(0), row, METRES, PIXELS, caption=caption).frames()
+            save_animation(options.out / f"{name}.gif", frames, COLOURS)
+            print(f"{options.out / name}.gif: {'hit' if row['cfr'] else 'no collision'}, {row['progress']:.0f} m driven")
+
+
+if __name__ == "__main__":
+    main()

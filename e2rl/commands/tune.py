@@ -1,0 +1,146 @@
+"""`e2rl tune synthesizer=NAME`, or `e2rl tune tuning.group=ego ego=NAME`: the parameters that find, or avoid, most.
+
+Writes tuning.json, tuned.yaml (the lines to keep in conf/) and of an adversary the curve over its gain. The ranges are
+those of the class (`tuned`), or tuning.space (docs/adversaries.md, docs/how-to/planner.md).
+"""
+
+import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
+
+# isort: split
+import copy
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import hydra
+from omegaconf import DictConfig, OmegaConf
+
+from e2rl.evaluation.methods import build_ego, build_traffic, intensities, method_config, processes_of
+from e2rl.evaluation.plan import Plan, begin
+from e2rl.evaluation.protocol import Method
+from e2rl.evaluation.trials import NOMINAL, AttackObjective, AttackTrials, PlannerObjective, PlannerTrials
+from e2rl.evaluation.tuning import (
+    STUDY_FILE,
+    TUNING_FILE,
+    Objective,
+    Parameters,
+    SearchSettings,
+    line_of,
+    save,
+    search,
+    yaml_of,
+)
+from e2rl.report.tuning_curve import save_tuning_curve
+from e2rl.run.config import resolved, run_command
+from e2rl.run.endings import ending
+from e2rl.run.errors import InputError
+from e2rl.run.files import alone_in
+from e2rl.run.run import Run, how_to_go_on
+from e2rl.run.settings import check_choice, conf_folder, settings_of
+
+MAY_CHANGE = ("processes", "launcher")  # when a run is resumed
+GROUPS = ("synthesizer", "ego")
+
+
+def tune(run: Run) -> dict:
+    """Do the trials that are left; returns what tuning.json holds."""
+    config, folder, group = run.config, run.folder, run.config.tuning.group
+    check_choice("tuning.group", group, GROUPS)
+    given = {each.name: config.tuning[each.name] for each in fields(SearchSettings)}
+    settings = settings_of(SearchSettings, given, "tuning")
+    plan = begin(run)
+    objective: Objective
+    if group == "ego":
+        objective = settings_of(PlannerObjective, config.tuning.planner, "tuning.planner")
+        trials, ranges = planner_trials(config, plan), plan.setup.ego.tuned
+    else:
+        objective = settings_of(AttackObjective, config.tuning.attack, "tuning.attack")
+        trials, ranges = attack_trials(config, plan)
+
+    def told(rows: list[dict]) -> None:
+        save(rows, folder)
+        print(line_of(rows, objective))
+
+    about = {name: resolved(config[name]) for name in ("ego", "prior", "sim")} | {
+        "rows": [f"{method.name}@{method.eta:g}" for method in plan.methods] if group == "ego" else [NOMINAL],
+        "seeds": list(plan.asked.seeds),
+        "scenes": plan.scenes.scene_id,
+        "eta": intensities(config),
+    }
+    space = resolved(config.tuning.space) or ranges
+    file = folder / STUDY_FILE if config.tuning.study is None else Path(config.tuning.study)
+    rows = search(trials, flat(resolved(config[group])), space, settings, objective, file, about, told)
+    result = save(rows, folder)
+    if group == "synthesizer":
+        save_tuning_curve(folder, rows, config.synthesizer.name)
+    print(f"\n{advice(result, group)}written to {folder}")
+    return result
+
+
+def advice(result: Mapping, group: str) -> str:
+    """Returns what to keep of a tuning's result."""
+    count = len(result["trials"])
+    if result["best"] is None:
+        return f"none of {count} trials keeps within the limits; {TUNING_FILE} has their metrics\n"
+    return f"best of {count} trials, for conf/{group}:\n{yaml_of(result['best'])}"
+
+
+def planner_trials(config: DictConfig, plan: Plan) -> PlannerTrials:
+    """Returns trials of the group `ego` against all of `config.methods`."""
+
+    def make(parameters: Parameters) -> Any:
+        return build_ego(OmegaConf.create({"ego": changed(config.ego, parameters)}))
+
+    return PlannerTrials(plan.setup, plan.methods, plan.asked.seeds, make, processes_of(config))
+
+
+def attack_trials(config: DictConfig, plan: Plan) -> tuple[AttackTrials, Mapping]:
+    """Returns trials of the group `synthesizer` at `config.eta` beside nominal traffic, and the ranges of its class."""
+    etas = intensities(config)
+    if len(etas) != 1 or not etas[0]:
+        raise InputError(f"eta={config.eta}: an adversary is tuned at one intensity above 0")
+
+    def make(parameters: Parameters) -> Any:
+        return build_traffic(changed(config.synthesizer, parameters), plan.prior)
+
+    present = make({})
+    if not present.adversarial:
+        raise InputError(f"synthesizer={config.synthesizer.name}: no adversary, so there is no attack to tune")
+    nominal = Method(NOMINAL, build_traffic(method_config(config, NOMINAL), plan.prior))
+    trials = AttackTrials(plan.setup, nominal, etas[0], plan.asked.seeds, make, processes_of(config))
+    return trials, present.tuned
+
+
+def flat(group: Mapping[str, Any], before: str = "") -> Parameters:
+    """Returns {dotted name: value} of nested settings."""
+    found: Parameters = {}
+    for name, value in group.items():
+        found |= flat(value, f"{before}{name}.") if isinstance(value, dict) else {f"{before}{name}": value}
+    return found
+
+
+def changed(group: DictConfig, parameters: Parameters) -> DictConfig:
+    """Returns a copy of a group with parameters of dotted names."""
+    copied = copy.deepcopy(group)
+    for name, value in parameters.items():
+        OmegaConf.update(copied, name, value)
+    return copied
+
+
+@hydra.main(version_base="1.3", config_path=str(conf_folder().resolve()), config_name="tune")
+def command(config: DictConfig) -> None:
+    """A tuning, as configured."""
+    with ending(lambda: how_to_go_on(config)):
+        run = Run.of(config, MAY_CHANGE)
+        with alone_in(run.folder):
+            tune(run)
+
+
+def main() -> None:
+    """The command."""
+    run_command(command, "tune")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,166 @@
+"""What a trial of a tuning is: rollouts made anew with its parameters; and what their metrics are worth.
+
+A replay of stored attacks would not do: it does not react to the planner under trial.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+
+from e2rl.evaluation.protocol import Method, Setup, drive_all
+from e2rl.evaluation.rollout_files import require_rows
+from e2rl.evaluation.tuning import Parameters
+from e2rl.metrics.statistics import summarise
+from e2rl.planners.ego import Ego
+from e2rl.run.errors import InputError
+from e2rl.run.processes import Processes
+from e2rl.run.settings import configured, setting
+from e2rl.traffic.attempt import count_reasons
+from e2rl.traffic.traffic import Traffic
+
+SOUGHT = ("cfr", "cfr_counted", "cfr_preventable")
+MEASURED = (*SOUGHT, "aor_step", "cfr_bg", "real", "real_adv", "nfe")
+LOST = 0.01  # fraction of rollouts that may end for an error of the planner or the traffic
+NOMINAL = "nominal"  # after a metric's name: its value in the traffic that the budget is held against
+DRIVING = ("collision", "comfort", "progress")
+
+
+@configured("tune", "tuning.planner")
+@dataclass(frozen=True)
+class PlannerObjective:
+    """Minimised are collisions, and by their weights mean |acceleration| in m/s^2 and the lost fraction of progress.
+
+    progress_floor: fraction of the present progress below which a trial is refused, as standing still is the trivial
+    optimum of safety; comfort_ceiling: multiple of the present |acceleration| above which it is.
+    """
+
+    comfort: float = setting(low=0)
+    progress: float = setting(low=0)
+    progress_floor: float = setting(low=0)
+    comfort_ceiling: float = setting(low=0)
+
+    def judge(self, metrics: Mapping[str, float], reference: Mapping[str, float]) -> tuple[float, float]:
+        """See `Objective`. A trial in which more rollouts ended for an error than of the reference is refused."""
+        if missing := [name for name in DRIVING if name not in metrics]:
+            raise InputError(f"tuning: evaluate() returned no {', '.join(missing)}")
+        ended = metrics.get("ended", 0.0) - reference.get("ended", 0.0)
+        progress = metrics["progress"] / max(reference["progress"], 1e-6)
+        rougher = metrics["comfort"] / max(reference["comfort"], 1e-6)
+        lost = self.progress * max(0.0, 1 - progress)
+        value = metrics["collision"] + self.comfort * metrics["comfort"] + lost
+        excess = max(0.0, self.progress_floor - progress) + max(0.0, rougher - self.comfort_ceiling) + max(0.0, ended)
+        return value, math.inf if math.isnan(value) else excess
+
+    def text(self, metrics: Mapping[str, float]) -> str:
+        """See `Objective`."""
+        each = (name for name in metrics if name.startswith("collision "))
+        rates = ", ".join(f"{name.split()[1]} {100 * metrics[name]:.1f}%" for name in each)
+        return f"collisions {rates}; {metrics['comfort']:.2f} m/s^2, {metrics['progress']:.1f} m{_ended(metrics)}"
+
+
+@configured("tune", "tuning.attack")
+@dataclass(frozen=True)
+class AttackObjective:
+    """Maximised is the fraction of failures `seek`, within limits.
+
+    off_road: the most `aor_step` above nominal traffic; realism: the least `real_adv`. A method that has no adversary
+    in any rollout has no `real_adv`, and keeps every such limit.
+    """
+
+    seek: str = setting(choices=SOUGHT)
+    off_road: float = setting(low=0, high=1)
+    realism: float | None = setting(low=0, high=1, optional=True)
+
+    def judge(self, metrics: Mapping[str, float], reference: Mapping[str, float]) -> tuple[float, float]:
+        """See `Objective`; each trial has its nominal metrics. One that loses more than LOST of its rollouts beyond
+        nominal traffic's is refused: it would be compared on other scenes."""
+        over = metrics["aor_step"] - metrics[f"aor_step {NOMINAL}"] - self.off_road
+        lost = metrics.get("ended", 0.0) - metrics.get(f"ended {NOMINAL}", 0.0) - LOST
+        excess = max(0.0, over) + max(0.0, lost)
+        if self.realism is not None and not math.isnan(metrics["real_adv"]):
+            excess += max(0.0, self.realism - metrics["real_adv"])
+        value = -metrics[self.seek]
+        return value, math.inf if math.isnan(value) or math.isnan(over) else excess
+
+    def text(self, metrics: Mapping[str, float]) -> str:
+        """See `Objective`."""
+        over = 100 * (metrics["aor_step"] - metrics[f"aor_step {NOMINAL}"])
+        found = ", ".join(f"{name} {100 * metrics[name]:.1f}%" for name in dict.fromkeys((self.seek, "cfr_counted")))
+        realism = f"real_adv {metrics['real_adv']:.3f}{_ended(metrics)}"
+        return f"{found}; off the road {over:+.2f} points over nominal; {realism}"
+
+
+def _ended(metrics: Mapping[str, float]) -> str:
+    return f"; {100 * metrics['ended']:.1f}% ended for an error" if metrics.get("ended") else ""
+
+
+@dataclass
+class PlannerTrials:
+    """The metrics of a planner in all scenes, seeds and methods; make: the planner of some parameters."""
+
+    setup: Setup
+    methods: Sequence[Method]
+    seeds: Sequence[int]
+    make: Callable[[Parameters], Ego]
+    processes: Processes = 1
+
+    def __call__(self, parameters: Parameters) -> dict[str, float]:
+        """Returns the means of DRIVING, also of every method alone as `NAME METHOD@ETA`, and `ended`.
+
+        collision: fraction of rollouts in which the ego touches something or leaves the road; comfort: mean
+        |acceleration| [m/s^2]; progress [m]; ended: fraction without a score, `ended: REASON` for each reason.
+        """
+        setup = replace(self.setup, ego=self.make(parameters), evasions=False)
+        rows, _, ended = drive_all([setup], self.methods, self.seeds, processes=self.processes)
+        metrics = driving(rows)
+        for method in self.methods:
+            own = [row for row in rows if row["method"] == method.name and row["eta"] == method.eta]
+            metrics |= {f"{name} {method.name}@{method.eta:g}": value for name, value in driving(own).items()}
+        count = len(rows) + len(ended)
+        metrics |= {f"ended: {reason}": number / count for reason, number in count_reasons(ended).items()}
+        return metrics | {"ended": len(ended) / count}
+
+
+def driving(rows: Sequence[Mapping]) -> dict[str, float]:
+    """Returns the means of DRIVING over the rollouts that know them."""
+    values = [
+        (float(row["cfr"] == 1 or row["cfr_vru"] == 1 or row["ego_off_road"] == 1), row["macc"], row["progress"])
+        for row in rows
+    ]
+    means = torch.tensor(values, dtype=torch.float64).view(-1, len(DRIVING)).nanmean(0)
+    return dict(zip(DRIVING, means.tolist(), strict=True))
+
+
+@dataclass
+class AttackTrials:
+    """The metrics of an adversary in all scenes and seeds, and nominal traffic's; make: the adversary of some
+    parameters."""
+
+    setup: Setup
+    nominal: Method
+    eta: float
+    seeds: Sequence[int]
+    make: Callable[[Parameters], Traffic]
+    processes: Processes = 1
+
+    def __call__(self, parameters: Parameters) -> dict[str, float]:
+        """Returns the means of MEASURED, NAME_low and NAME_high of the 95% intervals of SOUGHT, and `ended`; and all
+        of them as `NAME nominal` in nominal traffic."""
+        return self.measure(Method("trial", self.make(parameters), self.eta)) | self.reference
+
+    @cached_property
+    def reference(self) -> dict[str, float]:
+        known = (*MEASURED, "ended")
+        return {f"{name} {NOMINAL}": value for name, value in self.measure(self.nominal).items() if name in known}
+
+    def measure(self, method: Method) -> dict[str, float]:
+        """Returns the metrics of a method; InputError where no rollout has a score."""
+        setup = replace(self.setup, evasions=False)  # no trial is judged by them
+        rows, samples, ended = drive_all([setup], [method], self.seeds, processes=self.processes)
+        require_rows(rows, ended, None)
+        found = summarise(rows, samples, realism_draws=0)
+        metrics = {name: found[name]["mean"] for name in MEASURED} | {"ended": len(ended) / (len(rows) + len(ended))}
+        return metrics | {f"{name}_{end}": found[name][end] for name in SOUGHT for end in ("low", "high")}

@@ -1,0 +1,65 @@
+"""`e2rl tune` on two short bundled scenes: what it writes, and a study that goes on in another run."""
+
+import json
+
+import pytest
+
+from e2rl.run.config import load_choice
+from tests.scripts import SHORT, call, error_line
+
+
+@pytest.fixture
+def tune(tmp_path, monkeypatch, capsys):
+    """Runs the command in a folder of its own; returns it, or with `wrong` the error."""
+    runs = []
+
+    def run(*options, wrong=False):
+        folder = tmp_path / f"run-{len(runs)}"
+        runs.append(folder)
+        study = (
+            [] if any(option.startswith("tuning.study=") for option in options) else [f"tuning.study={tmp_path / 's'}"]
+        )
+        given = [*SHORT, *study, "prior.sampler.steps=2", "processes=1", f"hydra.run.dir={folder}", *options]
+        status, said = call("e2rl/commands/tune.py", given, monkeypatch, capsys)
+        assert status == (2 if wrong else 0), said
+        return error_line(said) if wrong else folder
+
+    return run
+
+
+def test_an_adversary_is_tuned_and_the_study_goes_on(tune):
+    """Rollouts are those of the method's own YAML; another budget or method is another study."""
+    e2 = ["synthesizer=e2", "tuning.ladder=2"]
+    tune(*e2, "tuning.trials=1")
+    run = tune(*e2, "tuning.trials=3")
+    result = json.loads((run / "tuning.json").read_text())
+    tried = [trial["parameters"]["interception.lateral"] for trial in result["trials"]]
+    assert tried == pytest.approx([load_choice("synthesizer", "e2").interception.lateral, 0.5, 4.0])
+    assert {"cfr", "aor_step", "aor_step nominal", "real_adv"} <= set(result["trials"][0]["metrics"])
+    assert "interception:\n  lateral: " in (run / "tuned.yaml").read_text()
+    assert len((run / "tuning_curve.csv").read_text().splitlines()) == 4 and (run / "tuning_curve.png").exists()
+    assert "differs in objective; name another file" in tune(*e2, "tuning.attack.off_road=0.1", wrong=True)
+    assert "differs in parameters, space; name another" in tune("synthesizer=cat", "tuning.ladder=2", wrong=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        (["synthesizer=idm"], "synthesizer=idm: no adversary"),
+        (["eta=[1,2]"], "tuned at one intensity above 0"),
+        (["tuning.attack.seek=speed"], "tuning.attack.seek=speed: choose one of"),
+        (["tuning.group=prior"], "tuning.group=prior: choose one of"),
+        (["tuning.group=ego", "ego=idm"], "no ranges"),
+        (["tuning.group=ego", "+tuning.space.max_risk=[0.2,0.3]"], "leaves out the present value"),
+    ],
+)
+def test_what_cannot_be_tuned_is_told(tune, options, what):
+    assert what in tune(*options, "tuning.study=null", wrong=True)
+
+
+def test_a_planner_is_tuned_in_the_traffic_of_all_methods(tune):
+    run = tune("tuning.group=ego", "ego=sampling", "tuning.trials=2", "tuning.ladder=0")
+    result = json.loads((run / "tuning.json").read_text())
+    assert len(result["trials"]) == 2 and set(result["best"]) <= set(load_choice("ego", "sampling"))
+    assert {"collision nominal@0", "collision e2@2"} <= set(result["trials"][0]["metrics"])
+    assert "margin: " in (run / "tuned.yaml").read_text() and not (run / "tuning_curve.csv").exists()

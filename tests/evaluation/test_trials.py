@@ -1,0 +1,181 @@
+"""Trials: what they are measured by, what refuses them, and small real runs of a planner and an adversary."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from e2rl.commands.tune import changed, flat
+from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.evaluation.trials import (
+    DRIVING,
+    MEASURED,
+    SOUGHT,
+    AttackObjective,
+    AttackTrials,
+    PlannerObjective,
+    PlannerTrials,
+)
+from e2rl.evaluation.tuning import SearchSettings, best_of, search
+from e2rl.planners.ego import PLAN_STEPS, Ego
+from e2rl.planners.path import MissionPath
+from e2rl.run.config import load_choice, resolved
+from e2rl.run.errors import InputError
+from e2rl.sim.env import SimSettings
+from e2rl.traffic.baselines.ctg import CTGAdv
+from e2rl.traffic.nominal import NominalTraffic
+from e2rl.traffic.rule_based import Replay
+from tests.prior.small import small_prior
+from tests.traffic.e2.traffic_scenes import EGO, scenes, synthesizer
+
+ATTACKS = ("e2", "e2_unbound", "e2_pursuit", "ctg_adv", "safe_sim_opt", "ccdiff", "diffscene", "cat", "strive")
+
+
+class Cruise(Ego):
+    """Holds a fraction of its speed; raises in scene 1 unless it holds all of it, where it is frail."""
+
+    def __init__(self, gain: float = 1.0, frail: bool = False) -> None:
+        super().__init__()
+        self.gain, self.frail = gain, frail
+
+    def plan(self, world):
+        if self.frail and self.gain < 1 and (world.scene["scene_index"] == 1).any():
+            raise KeyError("lost")
+        speed = self.gain * world.states[:, 0, 3:]
+        return MissionPath(world).drive(speed.expand(-1, PLAN_STEPS + 1))
+
+
+def planner_trials(methods, make=Cruise, scene_set=None):
+    setup = Setup(scene_set or scenes(2, steps=20), Cruise(), "cruise", SimSettings(), batch=4)
+    return PlannerTrials(setup, methods, [0], lambda parameters: make(**parameters))
+
+
+def test_a_planner_s_objective_is_collisions_comfort_and_lost_progress_within_guards():
+    objective = PlannerObjective(comfort=0.2, progress=0.4, progress_floor=0.9, comfort_ceiling=1.5)
+    reference = {"collision": 0.5, "comfort": 1.0, "progress": 80.0, "ended": 0.1}
+    trial = {"collision": 0.25, "comfort": 2.0, "progress": 60.0, "ended": 0.3}
+    value, excess = objective.judge(trial, reference)
+    assert value == pytest.approx(0.25 + 0.2 * 2.0 + 0.4 * 0.25)
+    assert excess == pytest.approx((0.9 - 0.75) + (2.0 - 1.5) + (0.3 - 0.1))
+    assert objective.judge(trial | {"comfort": 1.5, "progress": 72.0, "ended": 0.1}, reference)[1] == 0
+    faster = objective.judge(trial | {"progress": 100.0}, reference)[0]
+    assert faster == pytest.approx(0.25 + 0.2 * 2.0), "more progress earns nothing"
+    with pytest.raises(InputError, match="returned no progress"):
+        objective.judge({"collision": 0.0, "comfort": 0.0}, reference)
+
+
+def test_every_trial_meets_traffic_made_against_it():
+    """Real rollouts: the present planner, then others; an ego that stands is refused, and no attack is replayed."""
+    made = []
+
+    class Watched(type(synthesizer())):
+        def replan(self, state, world, ego_plan):
+            made.append(ego_plan[:, -1, :2].clone())
+            return super().replan(state, world, ego_plan)
+
+    on = Watched(synthesizer().prior)
+    trials = planner_trials([Method("nominal", on), Method("e2", on, 2.0)])
+    settings = SearchSettings(trials=3, startup=1, ladder=0)
+    first, *others = search(trials, {"gain": 1.0}, {"gain": [0.0, 1.0]}, settings, PlannerObjective())
+    assert {*DRIVING, "collision nominal@0", "collision e2@2", "ended"} <= set(first["metrics"])
+    assert first["admissible"] and first["metrics"]["progress"] > 15
+    both = [first["metrics"][f"progress {label}"] for label in ("nominal@0", "e2@2")]
+    assert first["metrics"]["progress"] == pytest.approx(sum(both) / 2)
+    assert not any(trial["admissible"] for trial in others if trial["parameters"]["gain"] < 0.5)
+    assert len(made) >= 3 * 2 and not torch.allclose(made[0], made[-1])
+
+
+def test_leaving_the_road_counts_as_a_collision():
+    """A road of the ego's own lane is left by none; one that ends ahead is left."""
+    whole = scenes(1, steps=20)
+    ended = replace(whole, scenes=whole.scenes.clone())
+    ahead = ended.scenes["start"][0, 0, 0] + 3.0
+    ended.scenes["drivable_points"][..., 0] = ended.scenes["drivable_points"][..., 0].clamp(max=ahead)
+    for scene_set, expected in ((whole, 0.0), (ended, 1.0)):
+        found = planner_trials([Method("replay", Replay())], scene_set=scene_set)({"gain": 1.0})
+        assert found["collision"] == expected
+
+
+def test_a_trial_that_loses_rollouts_is_counted_and_refused():
+    trials = planner_trials([Method("replay", Replay())])
+    settings, limits = SearchSettings(trials=2, startup=1, ladder=0), PlannerObjective(progress_floor=0.0)
+    frail = {"gain": 1.0, "frail": True}
+    first, second = search(trials, frail, {"gain": [0.9, 1.0]}, settings, limits)
+    assert first["metrics"]["ended"] == 0.0 and first["admissible"]
+    assert second["metrics"]["ended"] == 0.5 == second["metrics"]["ended: raised KeyError"]
+    assert not second["admissible"] and second["metrics"]["progress"] > 0
+    assert "50.0% ended for an error" in limits.text(second["metrics"])
+
+
+def attack(parameters):
+    """More gain finds more failures, leaves the road more often (1 point a unit, 0.2 nominal) and is less real."""
+    gain = parameters["gain"]
+    found = dict.fromkeys(MEASURED, 0.0) | {"cfr": gain / 10, "cfr_counted": gain / 20, "real_adv": 1 - gain / 10}
+    nominal = {f"{name} nominal": 0.0 for name in MEASURED} | {"aor_step nominal": 0.002}
+    return found | {"aor_step": 0.01 * gain + 0.002} | nominal
+
+
+@pytest.mark.parametrize(
+    ("limits", "low", "high"),
+    [({"off_road": 0.03}, 2.0, 3.0), ({"off_road": 1.0}, 7.99, 8.0), ({"off_road": 0.03, "realism": 0.8}, 1.4, 2.0)],
+)
+def test_the_most_failures_within_the_budget_are_found(limits, low, high):
+    """Failures and the price both rise with the gain: the best trial is the largest gain that the limits allow."""
+    settings = SearchSettings(trials=30, startup=10, ladder=9)
+    present, space = {"gain": 0.1, "step_size": 1.0}, {"gain": [0.1, 8.0, "log"]}
+    trials = search(attack, present, space, settings, AttackObjective(**limits))
+    best = best_of(trials)["parameters"]["gain"]
+    assert low < best <= high + 1e-9
+    assert all(trial["admissible"] == (trial["parameters"]["gain"] <= best) for trial in trials)
+
+
+def test_the_limits_of_an_attack_belong_to_it():
+    metrics = attack({"gain": 3.0})
+    assert AttackObjective(off_road=0.031).judge(metrics, {})[1] == 0
+    assert AttackObjective(off_road=0.01).judge(metrics, {})[1] == pytest.approx(0.02)
+    assert AttackObjective(off_road=0.01).judge(metrics | {"aor_step nominal": 0.022}, {})[1] == pytest.approx(0)
+    wide = AttackObjective(off_road=1.0)
+    assert wide.judge(metrics | {"ended": 0.035, "ended nominal": 0.025}, {})[1] == pytest.approx(0)
+    assert wide.judge(metrics | {"ended": 0.045, "ended nominal": 0.025}, {})[1] == pytest.approx(0.01)
+    assert AttackObjective(realism=0.9, off_road=1.0).judge(metrics, {})[1] == pytest.approx(0.2)
+    assert AttackObjective(realism=0.9, off_road=1.0).judge(metrics | {"real_adv": math.nan}, {})[1] == 0
+    assert math.isinf(AttackObjective().judge(metrics | {"cfr": math.nan}, {})[1])
+    assert [AttackObjective(seek).judge(metrics, {})[0] for seek in SOUGHT] == pytest.approx([-0.3, -0.15, 0.0])
+
+
+@pytest.fixture(scope="module")
+def trials():
+    """Real rollouts of a dense attack on a small random prior."""
+    prior = small_prior(0)
+    setup = Setup(scenes(2, steps=20), EGO, "idm", SimSettings(), batch=4)
+    nominal = Method("nominal", NominalTraffic(prior, "plan"))
+    make = lambda own: CTGAdv(prior, samples=2, **own)  # noqa: E731
+    return AttackTrials(setup, nominal, 2.0, [0, 1], make)
+
+
+def test_a_trial_is_measured_as_the_protocol_measures_the_method(trials):
+    found = trials({"gain": 0.5})
+    (row,) = run_protocol(trials.setup, [Method("same", trials.make({"gain": 0.5}), 2.0)], trials.seeds)
+    for name in MEASURED:
+        assert found[name] == pytest.approx(row["metrics"][name]["mean"], nan_ok=True)
+    for name in SOUGHT:
+        assert found[f"{name}_high"] == pytest.approx(row["metrics"][name]["high"], nan_ok=True)
+    quiet = trials({"gain": 0.0})
+    for name in ("cfr", "aor_step", "cfr_bg", "real"):
+        assert quiet[name] == pytest.approx(quiet[f"{name} nominal"], nan_ok=True), "of the same knowledge of the ego"
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_every_attack_has_ranges_round_its_present_values(name):
+    """Its first parameter is the gain; a trial of the present parameters is the method of conf/synthesizer."""
+    group = load_choice("synthesizer", name)
+    present, ranges = flat(resolved(group)), built_traffic(group).tuned
+    assert ranges and all(low <= present[parameter] <= high for parameter, (low, high, *_) in ranges.items())
+    assert changed(group, {parameter: present[parameter] for parameter in ranges}) == group
+
+
+def built_traffic(group):
+    from e2rl.evaluation.methods import build_traffic
+
+    return build_traffic(group, small_prior(0))

@@ -1,0 +1,109 @@
+"""A command that is interrupted, killed or out of disk ends soon, leaves no process, and says how to go on."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from e2rl.run.endings import ending
+from e2rl.run.errors import InputError
+
+SCRIPT = """
+import os, sys, time
+from pathlib import Path
+from e2rl.run.endings import ending
+from e2rl.run.processes import interrupts_held, worker_pool
+
+def work(name):
+    Path(name).write_text(str(os.getpid()))
+    time.sleep(120)
+
+if __name__ == "__main__":
+    with ending("do it again"), worker_pool(2, sys.argv[1]) as pool:
+        with interrupts_held():
+            found = pool.map(work, sys.argv[2:])
+        list(found)
+"""
+
+
+def alive(process: int) -> bool:
+    try:
+        return "Z" not in Path(f"/proc/{process}/stat").read_text().split(") ")[1][:1]
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks /proc")
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.parametrize("how", ["Ctrl-C", "SIGTERM", "SIGKILL"])
+def test_an_interrupted_command_leaves_no_process(tmp_path, method, how):
+    marks = [tmp_path / name for name in "ab"]
+    (tmp_path / "script.py").write_text(SCRIPT)
+    command = [sys.executable, str(tmp_path / "script.py"), method, *map(str, marks)]
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # tests in the background are started deaf to it
+    run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=heed)
+    while not all(mark.exists() and mark.read_text() for mark in marks):
+        assert run.poll() is None, run.stderr.read()
+        time.sleep(0.05)
+    begin, workers = time.monotonic(), [int(mark.read_text()) for mark in marks]
+    if how == "Ctrl-C":
+        os.killpg(run.pid, signal.SIGINT)  # a terminal sends it to all
+    else:
+        run.send_signal(getattr(signal, how))
+    said = run.communicate(timeout=20)[1]
+    while any(map(alive, workers)) and time.monotonic() - begin < 20:
+        time.sleep(0.05)
+    assert not any(map(alive, workers)) and time.monotonic() - begin < 20
+    assert run.returncode == {"Ctrl-C": 130, "SIGTERM": 143, "SIGKILL": -9}[how]
+    if how != "SIGKILL":
+        name = "SIGINT" if how == "Ctrl-C" else how
+        assert said.strip() == f"interrupted ({name}); go on with: do it again"
+
+
+def test_a_full_disk_ends_with_the_file_and_how_to_go_on(capsys):
+    with pytest.raises(SystemExit) as stopped, ending(lambda: "run x again"):
+        raise OSError(28, "No space left on device", "runs/1/file")
+    assert stopped.value.code == 1
+    said = capsys.readouterr().err.strip()
+    assert said.startswith("error: runs/1/file: cannot be written (No space left on device)") and "\n" not in said
+    assert said.endswith("then go on with: run x again")
+
+
+def test_bad_input_ends_with_its_message_and_other_errors_pass(capsys):
+    before = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
+    with pytest.raises(SystemExit) as stopped, ending("run x again"):
+        raise InputError("x=3: no")
+    assert stopped.value.code == 2 and capsys.readouterr().err == "error: x=3: no\n"
+    for error in (ValueError("a bug"), FileNotFoundError(2, "none")):
+        with pytest.raises(type(error)), ending("run x again"):
+            raise error
+    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupt_that_a_library_turns_into_an_error_of_its_own_is_one(capsys, monkeypatch, number, status):
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "a=$(touch x)"])
+    with pytest.raises(SystemExit) as stopped, ending():
+        try:
+            os.kill(os.getpid(), number)
+            time.sleep(5)
+        except KeyboardInterrupt as error:
+            raise RuntimeError("Converting a tensordict to boolean value is not permitted") from error
+    assert stopped.value.code == status
+    told = f"interrupted ({number.name}); go on with: python evaluate.py 'a=$(touch x)'"
+    assert capsys.readouterr().err.strip() == told
+
+
+@pytest.mark.parametrize("module", ["e2rl.run.early", "e2rl.commands.cli"])
+def test_before_a_command_begins_an_interrupt_is_one_line(module):
+    code = f"import {module}, os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(5)"
+    heed = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    done = subprocess.run([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, preexec_fn=heed, timeout=60)
+    assert (
+        done.returncode == 130 and done.stderr.strip().count("\n") == 0 and "run the same command again" in done.stderr
+    )
