@@ -17,7 +17,7 @@ from e2rl.run.config import run_command
 from e2rl.run.endings import ending
 from e2rl.run.files import alone_in
 from e2rl.run.run import Run, how_to_go_on
-from e2rl.sim.rollouts import ROLLOUTS
+from e2rl.sim.rollout_file import ROLLOUTS
 
 MAY_CHANGE = ("processes", "launcher", "shard")  # when a run is resumed
 

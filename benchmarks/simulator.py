@@ -94,7 +94,7 @@ def reacting(bench: Bench) -> Iterator[Row]:
 
     times: dict[bool, list[float]] = {False: [], True: []}
     for seed in range(bench.repeats):  # in turn, since the machine's load changes
-        episode(None), episode(Reaiming(ReactSettings(share=0.7), seed))
+        episode(None), episode(Reaiming(ReactSettings(fraction=0.7), seed))
     ratio = min(times[True]) / min(times[False])
     yield bench.row("simulator", "vehicles re-aim, CPU time", index, ratio, "of the replay's")
 

@@ -59,7 +59,8 @@ def make_traffic(name: str, prior: Prior, **settings: Any) -> Traffic:
 
 def make_ego(name: str, **settings: Any) -> Ego:
     """The ego of conf/ego/<name>.yaml."""
-    return build_ego(OmegaConf.create({"ego": _choice("ego", name, settings)}))
+    shared = {"sim": load_choice("sim", "default"), "device": "cpu"}  # that some egos refer to
+    return build_ego(OmegaConf.create(shared | {"ego": _choice("ego", name, settings)}))
 
 
 def roll_out(

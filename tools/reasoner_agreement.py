@@ -1,4 +1,4 @@
-"""Agreement of the feasibility rules with a language model: raw share, Cohen's kappa, n.
+"""Agreement of the feasibility rules with a language model: raw agreement, Cohen's kappa, n.
 
 python tools/reasoner_agreement.py synthesizer.reasoner.kind=lm synthesizer.reasoner.model=NAME
     [synthesizer.reasoner.base_url=URL] [data=scenarionet data.path=LOGS] [num_scenes=N]
@@ -6,17 +6,14 @@ python tools/reasoner_agreement.py synthesizer.reasoner.kind=lm synthesizer.reas
 
 import math
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
-import hydra
 import torch
-from omegaconf import DictConfig
 from torch import Tensor
-from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from e2rl.run.config import load_config
 from e2rl.run.errors import InputError, stop
 from e2rl.run.settings import settings_of
 from e2rl.scenes.scene import SceneSet
@@ -28,49 +25,23 @@ from e2rl.traffic.e2.reasoner import CRITERIA, LanguageReasoner, ReasonerSetting
 BATCH = 32  # scenes judged together
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """Two judges on n vehicles: both say yes, both no, only the first yes, only the second."""
-
-    both: int
-    neither: int
-    first: int
-    second: int
-
-    @staticmethod
-    def of(first: Tensor, second: Tensor) -> "Agreement":
-        """Of judgements [n] bool each."""
-        counts = (first & second, ~first & ~second, first & ~second, ~first & second)
-        return Agreement(*(int(count.sum()) for count in counts))
-
-    @property
-    def n(self) -> int:
-        return self.both + self.neither + self.first + self.second
-
-    @property
-    def raw(self) -> float:
-        """Share of the vehicles on which both say the same; NaN without any."""
-        return (self.both + self.neither) / self.n if self.n else math.nan
-
-    @property
-    def kappa(self) -> float:
-        """Cohen's kappa: agreement beyond what both judges' rates of yes give by chance; NaN where chance is all."""
-        if not self.n:
-            return math.nan
-        one, two = (self.both + self.first) / self.n, (self.both + self.second) / self.n
-        chance = one * two + (1 - one) * (1 - two)
-        return (self.raw - chance) / (1 - chance) if chance < 1 else math.nan
+def agreement(first: Tensor, second: Tensor) -> tuple[float, float]:
+    """Returns the fraction of n on which two judges [n] bool agree, and Cohen's kappa: the agreement beyond what their
+    rates of yes give by chance. NaN without any, and where chance is all."""
+    if not len(first):
+        return math.nan, math.nan
+    one, two = first.double().mean().item(), second.double().mean().item()
+    raw, chance = (first == second).double().mean().item(), one * two + (1 - one) * (1 - two)
+    return raw, (raw - chance) / (1 - chance) if chance < 1 else math.nan
 
 
-def measure_agreement(
-    scenes: SceneSet, reasoner: LanguageReasoner, settings: FeasibilitySettings
-) -> tuple[dict[str, Agreement], int]:
-    """({feasible and each criterion: rules against the model}, scenes compared) at the scenes' start frames.
+def judged(scenes: SceneSet, reasoner: LanguageReasoner, settings: FeasibilitySettings) -> tuple[Tensor, Tensor, int]:
+    """Returns the criteria [n, 3] by the rules and by the model, and the scenes compared, at the scenes' start frames.
 
-    Compares vehicles that are present, not parked and not the ego; scenes that the rules had to decide are left out.
+    Vehicles are present, not parked and not the ego. Scenes that the rules had to decide are left out.
     """
-    ours, theirs, compared = [], [], 0
-    for rows in tqdm(torch.arange(len(scenes)).split(BATCH), "scenes", unit="batch"):
+    ours, theirs, compared = [torch.zeros(0, len(CRITERIA), dtype=torch.bool)], [], 0
+    for rows in torch.arange(len(scenes)).split(BATCH):
         scene = scenes.batch(rows)
         world = World.at_start(scene)
         rules = feasible_vehicles(scene, world, settings)
@@ -80,40 +51,29 @@ def measure_agreement(
             if verdicts:
                 ours.append(criteria[row, list(verdicts)])
                 theirs.append(torch.tensor(list(verdicts.values())))
-    one, two = (torch.cat(part) if part else torch.zeros(0, len(CRITERIA), dtype=torch.bool) for part in (ours, theirs))
-    names = {"feasible": Agreement.of(one.all(-1), two.all(-1))}
-    return names | {name: Agreement.of(one[:, k], two[:, k]) for k, name in enumerate(CRITERIA)}, compared
+    return torch.cat(ours), torch.cat(theirs) if theirs else ours[0], compared
 
 
-def agreement_table(found: dict[str, Agreement], compared: int, scenes: int) -> str:
-    """Raw agreement, Cohen's kappa and counts, as text."""
-    head = f"{'':<20}{'agree':>8}{'kappa':>8}{'n':>7}{'both':>7}{'neither':>9}{'rules only':>12}{'model only':>12}"
-    lines = [
-        f"{name:<20}{100 * a.raw:>7.1f}%{a.kappa:>8.3f}{a.n:>7}{a.both:>7}{a.neither:>9}{a.first:>12}{a.second:>12}"
-        for name, a in found.items()
-    ]
-    return "\n".join([head, *lines, f"{compared} of {scenes} scenes; in the others the model gave no usable answer"])
-
-
-def report(config: DictConfig) -> None:
-    """Ask about the start frames of the configured scenes and print the table."""
+def main() -> None:
+    config = load_config("evaluate", sys.argv[1:])
     settings = settings_of(ReasonerSettings, config.synthesizer.reasoner, "synthesizer.reasoner")
     if settings.kind != "lm":
         raise InputError("the rules agree with themselves; give synthesizer.reasoner.kind=lm and its model")
-    rules = settings_of(FeasibilitySettings, config.synthesizer.feasibility, "synthesizer.feasibility")
     reasoner = LanguageReasoner(settings)
     scenes = load_scenes(config.data, config.num_scenes)
-    print(agreement_table(*measure_agreement(scenes, reasoner, rules), len(scenes)))
+    rules = settings_of(FeasibilitySettings, config.synthesizer.feasibility, "synthesizer.feasibility")
+    one, two, compared = judged(scenes, reasoner, rules)
+    pairs = {"feasible": (one.all(-1), two.all(-1))} | {name: (one[:, k], two[:, k]) for k, name in enumerate(CRITERIA)}
+    print(f"{'':<20}{'agree':>8}{'kappa':>8}{'n':>7}")
+    for name, pair in pairs.items():
+        raw, kappa = agreement(*pair)
+        print(f"{name:<20}{100 * raw:>7.1f}%{kappa:>8.3f}{len(one):>7}")
+    print(f"{compared} of {len(scenes)} scenes; in the others the model gave no usable answer")
     print(", ".join(f"{name} {value:.0f}" for name, value in reasoner.statistics.items()))
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="evaluate")
-def main(config: DictConfig) -> None:
+if __name__ == "__main__":
     try:
-        report(config)
+        main()
     except InputError as error:
         stop(error)
-
-
-if __name__ == "__main__":
-    main()

@@ -6,10 +6,9 @@
 
 import argparse
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -21,7 +20,6 @@ from e2rl.run.config import load_choice
 from e2rl.run.errors import InputError, stop
 from e2rl.scenes.paths import arc_length
 from e2rl.scenes.recording import AGENT_TYPES, LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, VEHICLE
-from e2rl.scenes.scene_cache import unpack
 from e2rl.scenes.source import Row, Source, source_of
 from e2rl.sim.rollouts import road_of
 
@@ -31,71 +29,35 @@ COLOURS = {"vehicle": drawing.BACKGROUND, "pedestrian": drawing.VULNERABLE, "cyc
 LIGHTS = {LIGHT_UNKNOWN: drawing.MUTED, LIGHT_RED: "#d62828", LIGHT_YELLOW: "#f2b705", LIGHT_GREEN: "#2a9d4a"}
 LEGEND = {"ego": drawing.EGO, "vehicle": drawing.BACKGROUND, "pedestrian, cyclist": drawing.VULNERABLE}
 MOVES = 0.5  # m/s
+TENTHS = ("median length of vehicles, m", "speed of the ego at the start, m/s", "km of lanes")  # told to one decimal
 
 
-class Content(NamedTuple):
-    """What is counted in one scene; agents are those present at its start frame.
-
-    agents: how many by type; moving: vehicles beside the ego that move; ego_speed m/s at the start, ego_distance m that
-    it drives; vehicle_length m: the median; lanes, lane_length m; exits, neighbours, limits: share of lanes with a
-    successor, with a neighbour, and of route vertices with a speed limit; polygons; lights.
-    """
-
-    agents: list[int]
-    moving: int
-    ego_speed: float
-    ego_distance: float
-    vehicle_length: float
-    lanes: int
-    lane_length: float
-    exits: float
-    neighbours: float
-    limits: float
-    polygons: int
-    lights: int
+Counts = dict[str, float]  # of one scene, by what a line of the report says
 
 
-def content(scene: dict[str, np.ndarray]) -> Content:
-    """The counts of one scene, without a batch dimension."""
-    present, kinds = scene["valid"], scene["agent_type"]
-    vehicles = present & (kinds == VEHICLE)
-    ego = scene["logged"][scene["logged_valid"][:, 0], 0, :2]
-    index = scene["lane_index"]
-    lengths = [arc_length(scene["lane_points"][index == lane])[-1] for lane in range(len(scene["lane_width"]))]
+def content(scene: dict[str, np.ndarray]) -> Counts:
+    """Returns the counts of one scene; agents are those present at its start frame."""
+    present, kinds, ego = scene["valid"], scene["agent_type"], scene["logged"][scene["logged_valid"][:, 0], 0, :2]
+    vehicles, index, count = present & (kinds == VEHICLE), scene["lane_index"], len(scene["lane_width"])
     beside = (scene["lane_left"] >= 0) | (scene["lane_right"] >= 0)
-    return Content(
-        agents=[int((present & (kinds == kind)).sum()) for kind in range(len(AGENT_TYPES))],
-        moving=int((vehicles & (scene["start"][:, 3] > MOVES))[1:].sum()),
-        ego_speed=float(scene["start"][0, 3]),
-        ego_distance=float(np.linalg.norm(np.diff(ego, axis=0), axis=1).sum()),
-        vehicle_length=float(np.median(scene["size"][vehicles, 0])),
-        lanes=len(lengths),
-        lane_length=float(sum(lengths)),
-        exits=float((scene["lane_exits"] >= 0).any(1).mean()),
-        neighbours=float(beside.mean()),
-        limits=float((scene["route_limit"][scene["route_valid"]] > 0).mean()),
-        polygons=len(np.unique(scene["drivable_index"])),
-        lights=len(scene["light_points"]),
-    )
+    agents = {f"{name}s": (present & (kinds == kind)).sum() for kind, name in enumerate(AGENT_TYPES)}
+    return agents | {
+        "vehicles that move, beside the ego": (vehicles & (scene["start"][:, 3] > MOVES))[1:].sum(),
+        "median length of vehicles, m": np.median(scene["size"][vehicles, 0]),
+        "speed of the ego at the start, m/s": scene["start"][0, 3],
+        "distance driven by the ego, m": np.linalg.norm(np.diff(ego, axis=0), axis=1).sum(),
+        "lanes": count,
+        "km of lanes": sum(arc_length(scene["lane_points"][index == lane])[-1] for lane in range(count)) / 1000,
+        "% of lanes with a successor": 100 * (scene["lane_exits"] >= 0).any(1).mean(),
+        "% of lanes with a neighbour": 100 * beside.mean(),
+        "% of routes with a speed limit": 100 * (scene["route_limit"][scene["route_valid"]] > 0).mean(),
+        "drivable polygons": len(np.unique(scene["drivable_index"])),
+        "traffic lights": len(scene["light_points"]),
+    }
 
 
-LINES: tuple[tuple[str, Callable[[Content], float], int], ...] = (  # what a line says, of which number, its decimals
-    ("vehicles that move, beside the ego", lambda part: part.moving, 0),
-    ("median length of vehicles, m", lambda part: part.vehicle_length, 1),
-    ("speed of the ego at the start, m/s", lambda part: part.ego_speed, 1),
-    ("way of the ego, m", lambda part: part.ego_distance, 0),
-    ("lanes", lambda part: part.lanes, 0),
-    ("km of lanes", lambda part: part.lane_length / 1000, 1),
-    ("% of lanes with a successor", lambda part: 100 * part.exits, 0),
-    ("% of lanes with a neighbour", lambda part: 100 * part.neighbours, 0),
-    ("% of routes with a speed limit", lambda part: 100 * part.limits, 0),
-    ("drivable polygons", lambda part: part.polygons, 0),
-    ("traffic lights", lambda part: part.lights, 0),
-)
-
-
-def report(source: Source, rows: Sequence[Row], contents: Sequence[Content]) -> list[str]:
-    """The lines about a data set: `rows` of all its logs, `contents` of those that made a scene."""
+def report(source: Source, rows: Sequence[Row], contents: Sequence[Counts]) -> list[str]:
+    """Returns the lines about a data set: `rows` of all its logs, `contents` of those that made a scene."""
     scenes = [row for row in rows if not row.reason]
     reasons = Counter(row.reason for row in rows if row.reason)
     places = {row.location for row in scenes}
@@ -105,25 +67,19 @@ def report(source: Source, rows: Sequence[Row], contents: Sequence[Content]) -> 
         f"left out     {sum(reasons.values())}",
         *(f"             {count} x {reason}" for reason, count in reasons.most_common()),
     ]
-    if not contents:
-        return lines
-    kinds = zip(AGENT_TYPES, zip(*(part.agents for part in contents), strict=True), strict=True)
-    return [
-        *lines,
-        "in a scene   median (least to most); of the agents that take part, those present at the start frame",
-        *(_line("others" if kind == "other" else f"{kind}s", counts) for kind, counts in kinds),
-        *(_line(name, (value(part) for part in contents), digits) for name, value, digits in LINES),
-    ]
-
-
-def _line(name: str, values: Iterable[float], digits: int = 0) -> str:
-    given = np.array(list(values), float)
-    middle, low, high = (f"{value:.{digits}f}" for value in (np.median(given), given.min(), given.max()))
-    return f"  {name:<36}{middle:>8} ({low} to {high})"
+    if contents:
+        about = "of the agents that take part, those present at the start frame"
+        lines.append(f"in a scene   median (least to most); {about}")
+    for name in contents[0] if contents else ():
+        values = [float(counts[name]) for counts in contents]
+        digits = 1 if name in TENTHS else 0
+        middle, low, high = (f"{value:.{digits}f}" for value in (np.median(values), min(values), max(values)))
+        lines.append(f"  {name:<36}{middle:>8} ({low} to {high})")
+    return lines
 
 
 def picture(scene: dict[str, np.ndarray], title: str, metres: float) -> Figure:
-    """A scene at its start frame, `metres` wide, with the ways that its agents were recorded to take."""
+    """Returns a picture of a scene at its start frame, `metres` wide, with the recorded paths of its agents."""
     figure = new_figure(SIDE, SIDE + HEAD + FOOT)
     height = SIDE + HEAD + FOOT
     axes = figure.add_axes((0, FOOT / height, 1, SIDE / height))
@@ -134,7 +90,7 @@ def picture(scene: dict[str, np.ndarray], title: str, metres: float) -> Figure:
 
 
 def _trails(scene: dict[str, np.ndarray]) -> list[Trail]:
-    """The recorded ways, the ego's on top; each fades towards the start frame."""
+    """The recorded paths, the ego's on top; each fades towards the start frame."""
     trails = []
     for agent in reversed(np.flatnonzero(scene["valid"]).tolist()):
         path = scene["logged"][scene["logged_valid"][:, agent], agent, :2]
@@ -162,7 +118,7 @@ def _colour(scene: dict[str, np.ndarray], agent: int) -> str:
 
 
 def open_source(path: Path, data: str | None, workers: int) -> tuple[str, Source]:
-    """The data group that reads `path`, and its source; raises InputError where none does."""
+    """Returns the data group that reads `path`, and its source; raises InputError where none does."""
     refusals = []
     for name in [data] if data else FOUND:
         source = source_of({**load_choice("data", name), "path": str(path), "workers": workers})
@@ -175,15 +131,17 @@ def open_source(path: Path, data: str | None, workers: int) -> tuple[str, Source
     raise InputError("; ".join(dict.fromkeys(refusals)))
 
 
-def inspect(source: Source, chosen: str | None) -> tuple[list[Row], list[Content], Row]:
-    """All rows of a source without their scenes, the contents of its scenes, and the row to draw: the scene `chosen`,
-    by default the first. Raises InputError where there is no such scene."""
+def inspect(source: Source, chosen: str | None) -> tuple[list[Row], list[Counts], Row]:
+    """Returns all rows of a source without their scenes, the counts of its scenes, and the row to draw.
+
+    That is the scene `chosen`, by default the first. Raises InputError where there is no such scene.
+    """
     rows, contents, drawn = [], [], None
     with closing(source.rows()) as found:
         for row in found:
             rows.append(row._replace(scene=None))
             if row.scene is not None:
-                contents.append(content(unpack(row.scene.record)))
+                contents.append(content(row.scene))
                 drawn = row if drawn is None and chosen in (None, row.scene_id) else drawn
     if drawn is None:
         names = [row.scene_id for row in rows if not row.reason][:1]
@@ -193,8 +151,10 @@ def inspect(source: Source, chosen: str | None) -> tuple[list[Row], list[Content
 
 
 def check_apart(rows: Sequence[Row], source: Source, other: Source) -> str:
-    """A line on the places of the scenes `rows` of a source and of another's recordings; InputError where they share
-    some, or where a place is not known."""
+    """Returns a line on the places of the scenes `rows` of a source and of another's recordings.
+
+    Raises InputError where they share some, or where a place is not known.
+    """
     here = {row.location for row in rows if not row.reason}
     there = {recording.location for recording in other.recordings()}
     for path, places in ((source.path, here), (other.path, there)):
@@ -230,7 +190,7 @@ def main(arguments: list[str] | None = None) -> None:
         if options.apart:
             print(check_apart(rows, source, open_source(options.apart, name, options.workers)[1]))
         assert drawn.scene is not None
-        scene, title = unpack(drawn.scene.record), f"{drawn.scene_id}   {drawn.location}"
+        scene, title = drawn.scene, f"{drawn.scene_id}   {drawn.location}"
         save_figure(options.out, picture(scene, title, options.metres))
     except InputError as error:
         stop(error)

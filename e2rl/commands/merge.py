@@ -16,7 +16,7 @@ from e2rl.run.files import write_atomically, written_whole
 from e2rl.run.parts import PARTS
 from e2rl.run.run import PROVENANCE, assigned, changed, read_provenance
 from e2rl.run.trust import CONFIG
-from e2rl.sim.rollouts import ROLLOUTS
+from e2rl.sim.rollout_file import ROLLOUTS
 
 COPIED = (f"{PARTS}/*.pt", f"{ROLLOUTS}/*.npz", "*.csv", str(CONFIG))  # a batch is done when its part is there
 OWN = ("shard=", "hydra.run.dir=")  # what the commands of shards differ in

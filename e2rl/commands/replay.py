@@ -11,7 +11,8 @@ from e2rl.report.picture import Replay
 from e2rl.report.videos import found_failures, save_replay
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
-from e2rl.sim.rollouts import Failure, Rollout, Rollouts, rollout_name
+from e2rl.sim.rollout_file import Failure, Rollout, rollout_name
+from e2rl.sim.rollouts import Rollouts
 
 
 def chosen(run: Path, failures: int, modes: bool) -> Iterator[tuple[str, Failure]]:

@@ -17,7 +17,7 @@ from e2rl.run.config import load_config
 from e2rl.run.endings import ending
 
 SCENE, SEED, ETA = "arterial_065_0440", 0, 2.0  # of the bundled test scenes
-METRES, PIXELS, COLOURS = 60.0, 400, 48
+METRES, PIXELS, COLOURS = 60.0, 400, 32
 PICTURES = {  # file: the ego's checkpoint, traffic, two lines of the picture
     "nominal": (None, "nominal", ("Nominal traffic", "untrained policy")),
     "attacked": (None, "e2", ("Attacked by e2", "untrained policy")),

@@ -63,7 +63,8 @@ class EgoSet:
         """
         pooled, more = pool_trainings(rows, features, self.trainings)
         result = metric_rows(rows + pooled, features + more, egos=self.pairs, references=references, **fields)
-        return [row | {"n_trainings": len(self.trainings.get(row["ego"], [1]))} for row in result]
+        counts = {name: len(members) for name, members in self.trainings.items()}
+        return [row | {"n_trainings": counts[row["ego"]]} if row["ego"] in counts else row for row in result]
 
 
 def pool_trainings(

@@ -18,7 +18,7 @@ from e2rl.prior.sde import SamplerSettings
 from e2rl.run.config import built, check_counts, choices, load_choice
 from e2rl.run.errors import InputError
 from e2rl.run.processes import Processes, RayWorkers, cores
-from e2rl.run.settings import check_choice, check_range, setting, settings_of
+from e2rl.run.settings import check_choice, check_range, check_settings, setting, settings_of
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.traffic import Traffic
 
@@ -95,6 +95,7 @@ class EvaluationSettings:
     report: bool
 
     def __post_init__(self) -> None:
+        check_settings(self, "")
         check_choice("metrics", self.metrics, (*table_names(), ALL))
         for name in ("eta", "seeds"):
             if not getattr(self, name):

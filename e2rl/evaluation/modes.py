@@ -20,7 +20,7 @@ from e2rl.metrics.failure_modes import (
 )
 from e2rl.run.errors import InputError
 from e2rl.run.files import misfit, write_atomically
-from e2rl.sim.rollouts import rollout_name
+from e2rl.sim.rollout_file import rollout_name
 
 MODES_FILE = "modes.json"
 OTHER = 0  # number of the small modes together

@@ -30,7 +30,8 @@ from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.processes import Processes, in_processes
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import SimSettings
-from e2rl.sim.rollouts import ROLLOUTS, Rollouts, rollout_name
+from e2rl.sim.rollout_file import ROLLOUTS, rollout_name
+from e2rl.sim.rollouts import Rollouts
 from e2rl.traffic.attempt import attempt, count_reasons
 from e2rl.traffic.rollout import roll_out
 from e2rl.traffic.traffic import Traffic

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 
@@ -37,6 +38,8 @@ class PlannerObjective:
     optimum of safety; comfort_ceiling: multiple of the present |acceleration| above which it is.
     """
 
+    shown: ClassVar[tuple[str, ...]] = (*DRIVING, "ended")
+
     comfort: float = setting(low=0)
     progress: float = setting(low=0)
     progress_floor: float = setting(low=0)
@@ -54,12 +57,6 @@ class PlannerObjective:
         excess = max(0.0, self.progress_floor - progress) + max(0.0, rougher - self.comfort_ceiling) + max(0.0, ended)
         return value, math.inf if math.isnan(value) else excess
 
-    def text(self, metrics: Mapping[str, float]) -> str:
-        """See `Objective`."""
-        each = (name for name in metrics if name.startswith("collision "))
-        rates = ", ".join(f"{name.split()[1]} {100 * metrics[name]:.1f}%" for name in each)
-        return f"collisions {rates}; {metrics['comfort']:.2f} m/s^2, {metrics['progress']:.1f} m{_ended(metrics)}"
-
 
 @configured("tune", "tuning.attack")
 @dataclass(frozen=True)
@@ -69,6 +66,8 @@ class AttackObjective:
     off_road: the most `aor_step` above nominal traffic; realism: the least `real_adv`. A method that has no adversary
     in any rollout has no `real_adv`, and keeps every such limit.
     """
+
+    shown: ClassVar[tuple[str, ...]] = ("cfr", "cfr_counted", "aor_step", f"aor_step {NOMINAL}", "real_adv", "ended")
 
     seek: str = setting(choices=SOUGHT)
     off_road: float = setting(low=0, high=1)
@@ -84,17 +83,6 @@ class AttackObjective:
             excess += max(0.0, self.realism - metrics["real_adv"])
         value = -metrics[self.seek]
         return value, math.inf if math.isnan(value) or math.isnan(over) else excess
-
-    def text(self, metrics: Mapping[str, float]) -> str:
-        """See `Objective`."""
-        over = 100 * (metrics["aor_step"] - metrics[f"aor_step {NOMINAL}"])
-        found = ", ".join(f"{name} {100 * metrics[name]:.1f}%" for name in dict.fromkeys((self.seek, "cfr_counted")))
-        realism = f"real_adv {metrics['real_adv']:.3f}{_ended(metrics)}"
-        return f"{found}; off the road {over:+.2f} points over nominal; {realism}"
-
-
-def _ended(metrics: Mapping[str, float]) -> str:
-    return f"; {100 * metrics['ended']:.1f}% ended for an error" if metrics.get("ended") else ""
 
 
 @dataclass

@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from omegaconf import OmegaConf
 
@@ -29,7 +29,9 @@ STUDY_FILE, TUNING_FILE, TUNED_FILE = "study.log", "tuning.json", "tuned.yaml"
 
 
 class Objective(Protocol):
-    """What metrics are worth."""
+    """What metrics are worth; shown: names of those that a trial's line tells."""
+
+    shown: ClassVar[tuple[str, ...]]
 
     def judge(self, metrics: Mapping[str, float], reference: Mapping[str, float]) -> tuple[float, float]:
         """Returns (objective, excess) of a trial's metrics.
@@ -37,9 +39,6 @@ class Objective(Protocol):
         reference: metrics of the present parameters; excess: by how much limits are missed, 0 for an admissible trial,
         inf for metrics that are NaN.
         """
-
-    def text(self, metrics: Mapping[str, float]) -> str:
-        """Returns the metrics in a few words."""
 
 
 @configured("tune", "tuning")
@@ -50,7 +49,7 @@ class SearchSettings:
     trials: int = setting(low=1)
     seed: int = setting(low=0)
     startup: int = setting(low=1)
-    ladder: int = setting(low=0)
+    sweep: int = setting(low=0)
 
 
 def search(
@@ -65,7 +64,7 @@ def search(
 ) -> list[dict]:
     """Returns a row a trial: parameters, metrics, objective, admissible.
 
-    The present parameters come first, then a ladder over the first one of the space, then optuna's proposals.
+    The present parameters come first, then a sweep over the first one of the space, then optuna's proposals.
 
     Args:
         file: of the study; one that is there goes on, as it would have gone on without the interruption.
@@ -78,8 +77,8 @@ def search(
     """
     optuna = _optuna()
     ranges = distributions(optuna, present, space)
-    given = [{name: present[name] for name in space}, *ladder(present, space, settings.ladder)]
-    task = {"space": {name: list(space[name]) for name in space}, "parameters": present, "ladder": settings.ladder}
+    given = [{name: present[name] for name in space}, *sweep(present, space, settings.sweep)]
+    task = {"space": {name: list(space[name]) for name in space}, "parameters": present, "sweep": settings.sweep}
     study = open_study(optuna, file, task | {"objective": vars(objective)} | dict(about or {}))
     done = _finished(study)
     for number in range(len(done), settings.trials):
@@ -125,10 +124,11 @@ def line_of(rows: Sequence[dict], objective: Objective) -> str:
     row = rows[-1]
     values = " ".join(f"{name}={value:.3g}" for name, value in row["parameters"].items())
     verdict = f"{row['objective']:.3f}{'' if row['admissible'] else ', refused'}"
-    return f"trial {len(rows) - 1}: objective {verdict}; {objective.text(row['metrics'])}; {values}"
+    metrics = ", ".join(f"{name} {row['metrics'].get(name, math.nan):.3g}" for name in objective.shown)
+    return f"trial {len(rows) - 1}: objective {verdict}; {metrics}; {values}"
 
 
-def ladder(present: Parameters, space: Space, count: int) -> list[Parameters]:
+def sweep(present: Parameters, space: Space, count: int) -> list[Parameters]:
     """Returns the present parameters with `count` values of the space's first one, evenly spaced over its range (on its
     scale), both ends included; without the present value itself, which is the first trial."""
     name, (low, high, *scale) = next(iter(space.items()))

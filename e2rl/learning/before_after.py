@@ -14,7 +14,7 @@ from e2rl.planners.ego import Ego
 from e2rl.run.parts import Parts
 from e2rl.run.processes import Processes
 from e2rl.run.run import origin_of
-from e2rl.sim.rollouts import ROLLOUTS
+from e2rl.sim.rollout_file import ROLLOUTS
 
 
 @dataclass

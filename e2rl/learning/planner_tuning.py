@@ -49,7 +49,7 @@ class PlannerImprovement(Improvement):
         if traffic is not None:
             raise InputError("learner.round.traffic=live: a planner is tuned on stored traffic; set it to replay")
         self.ego, self.present, self.space = ego, dict(parameters), dict(space) or dict(ego.tuned)
-        self.search = settings_of(SearchSettings, {"seed": seed, "ladder": 0} | dict(search), "learner.search")
+        self.search = settings_of(SearchSettings, {"seed": seed, "sweep": 0} | dict(search), "learner.search")
         self.objective = settings_of(PlannerObjective, objective, "learner.objective")
         self.driver = PoolDriver(scenes, sim, batch, device)
         self.trials: list[dict] = []

@@ -5,6 +5,7 @@ A metric is declared beside the function that computes it, by `columns`, or in a
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor
 
@@ -32,12 +33,17 @@ class Metric:
     samples: str = ""  # of a metric that `metrics.realism` computes from pooled samples: those that it needs
     per_collision: bool = False  # known for collisions only: paired differences compare each group's own collisions
     cost: bool = False  # of the computation: a difference in it is not marked as significant
-    tables: tuple[str, ...] = ()  # closed-loop tables (`metrics=...` of evaluate.py) that show it; a new name makes one
+    tables: str = ""  # closed-loop tables (`metrics=...` of evaluate.py) that show it, such as "main egos"; or new ones
 
     @property
     def source(self) -> str:
         """The rows' column that holds it."""
         return self.column or self.name
+
+
+def rate(name: str, about: str, **options: Any) -> Metric:
+    """A metric in [0, 1]."""
+    return Metric(name, about, fraction=True, **options)
 
 
 TABLES = ("main", "traffic", "adversaries", "methods", "egos", "public")  # of the package
@@ -125,7 +131,7 @@ def table_names() -> tuple[str, ...]:
 
 def table_metrics(table: str) -> tuple[Metric, ...]:
     """The metrics of a closed-loop table, in its order."""
-    return tuple(metric for metric in METRICS.values() if table in metric.tables)
+    return tuple(metric for metric in METRICS.values() if table in metric.tables.split())
 
 
 def row_columns() -> tuple[str, ...]:

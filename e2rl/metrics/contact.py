@@ -7,7 +7,7 @@ contact counts at steps >= 1. `stop` is the step of the ego's first contact with
 import torch
 from torch import Tensor
 
-from e2rl.metrics.catalogue import Batch, Metric, columns
+from e2rl.metrics.catalogue import Batch, Metric, columns, rate
 from e2rl.metrics.geometry import edge_distances, edge_parts_inside, pair_overlap, velocity
 from e2rl.metrics.realism import MOVING
 from e2rl.scenes.boxes import separation
@@ -99,33 +99,22 @@ def kinds_at_stop(batch: Batch) -> Tensor:
 
 
 @columns(
-    Metric(
-        "cfr",
-        "ego hits any vehicle",
-        fraction=True,
-        tables=("main", "traffic", "adversaries", "methods", "egos", "public"),
-    ),
-    Metric("cfr_adv", "ego hits an adversary", fraction=True, tables=("main", "adversaries", "methods")),
-    Metric("cfr_vru", "ego hits a pedestrian or cyclist", fraction=True, tables=("main", "public")),
-    Metric("front", "first contact at the ego's front", fraction=True, tables=("main", "adversaries", "egos")),
-    Metric("side", "first contact at the ego's side", fraction=True, tables=("main", "adversaries", "egos")),
-    Metric("rear", "first contact at the ego's rear", fraction=True, tables=("main", "adversaries", "egos")),
-    Metric("front_any", "ego's front in contact at first contact", fraction=True, tables=("egos",)),
-    Metric("side_any", "ego's side in contact at first contact", fraction=True, tables=("egos",)),
-    Metric("rear_any", "ego's rear in contact at first contact", fraction=True, tables=("egos",)),
-    Metric(
-        "rir",
-        "rear impacts per collision",
-        fraction=True,
-        per_collision=True,
-        tables=("main", "adversaries", "methods"),
-    ),
+    rate("cfr", "ego hits any vehicle", tables="main traffic adversaries methods egos public"),
+    rate("cfr_adv", "ego hits an adversary", tables="main adversaries methods"),
+    rate("cfr_vru", "ego hits a pedestrian or cyclist", tables="main public"),
+    rate("front", "first contact at the ego's front", tables="main adversaries egos"),
+    rate("side", "first contact at the ego's side", tables="main adversaries egos"),
+    rate("rear", "first contact at the ego's rear", tables="main adversaries egos"),
+    rate("front_any", "ego's front in contact at first contact", tables="egos"),
+    rate("side_any", "ego's side in contact at first contact", tables="egos"),
+    rate("rear_any", "ego's rear in contact at first contact", tables="egos"),
+    rate("rir", "rear impacts per collision", per_collision=True, tables="main adversaries methods"),
     Metric(
         "relvel",
         "speed difference before contact",
         unit="m/s",
         per_collision=True,
-        tables=("main", "adversaries", "methods", "egos"),
+        tables="main adversaries methods egos",
     ),
     Metric(
         "contact_time",
@@ -133,7 +122,7 @@ def kinds_at_stop(batch: Batch) -> Tensor:
         unit="s",
         median=True,
         per_collision=True,
-        tables=("main", "adversaries", "egos"),
+        tables="main adversaries egos",
     ),
     events=("contact_type", "partner", "contact_step", "start_overlap_ego"),
     words={"contact_type": KINDS},
@@ -166,20 +155,9 @@ def contact_columns(batch: Batch) -> Batch:
 
 
 @columns(
-    Metric(
-        "cfr_bg",
-        "other simulated vehicles hit each other",
-        fraction=True,
-        tables=("main", "traffic", "adversaries", "methods"),
-    ),
+    rate("cfr_bg", "other simulated vehicles hit each other", tables="main traffic adversaries methods"),
     Metric("bg_pairs", "pairs of other vehicles that hit each other"),
-    Metric(
-        "touched",
-        "moving vehicles that touch another simulated one",
-        fraction=True,
-        weight="moving_vehicles",
-        tables=("traffic",),
-    ),
+    rate("touched", "moving vehicles that touch another simulated one", weight="moving_vehicles", tables="traffic"),
     events=("moving_vehicles", "start_overlap_bg"),
 )
 def traffic_contact_columns(batch: Batch) -> Batch:

@@ -1,10 +1,8 @@
 """Four drivers who meet one other vehicle: R157's human driver, R157's limit, RSS and FSM (docs/verdicts.md).
 
-Each driver is a NamedTuple of parameters with `init(like)`, its state before the first step, and
-`step(state, observation)`, which gives the next state and the longitudinal acceleration [...] m/s^2 for the coming step
-of DT. The acceleration is 0 where the driver does not react. All tensors share their leading dimensions [...].
-
-Concrete cut-ins on a straight road, all of a batch at once: does a driver model survive them (docs/verdicts.md).
+Each driver is a NamedTuple of parameters with `step(state, observation)`, which gives the next state (at first
+`no_conflict`) and the longitudinal acceleration [...] m/s^2 for the coming step of DT, 0 where the driver does not
+react. All tensors share their leading dimensions [...].
 """
 
 from typing import NamedTuple, Protocol
@@ -59,10 +57,6 @@ class DriverState(NamedTuple):
 class Driver(Protocol):
     """Anything that reacts to one other vehicle."""
 
-    def init(self, like: Tensor) -> DriverState:
-        """State before the first step, of the shape, dtype and device of `like` [...]."""
-        ...
-
     def step(self, state: DriverState, observation: Observation) -> tuple[DriverState, Tensor]:
         """(next state, acceleration [...] m/s^2 for the coming step)."""
         ...
@@ -92,9 +86,6 @@ class HumanDriver(NamedTuple):
     release: float = 0.4  # m/s^2
     braking: float = 7.59  # m/s^2, 0.774 g
     jerk: float = MAX_JERK
-
-    def init(self, like: Tensor) -> DriverState:
-        return no_conflict(like)
 
     def stopping_gap(self, closing: Tensor) -> Tensor:
         """Gap [...] m that the driver needs from perception on to lose a closing speed [...] m/s."""
@@ -128,9 +119,6 @@ class RegulationLimit(NamedTuple):
     lag: float = DT  # s, what the study's program takes longer
     braking: float = 6.0  # m/s^2
 
-    def init(self, like: Tensor) -> DriverState:
-        return no_conflict(like)
-
     def step(self, state: DriverState, observation: Observation) -> tuple[DriverState, Tensor]:
         o = observation
         intrudes = o.overlaps | (o.lateral_gap <= self.intrusion_gap)
@@ -159,9 +147,6 @@ class ResponsibilitySensitiveSafety(NamedTuple):
     lateral_margin: float = 0.3  # m
     lateral_acceleration: float = 1.0  # m/s^2
     lateral_braking: float = 1.0  # m/s^2
-
-    def init(self, like: Tensor) -> DriverState:
-        return no_conflict(like)
 
     def safe_distance(self, speed: Tensor, other_speed: Tensor) -> Tensor:
         """Longitudinal safe distance [...] m of an ego behind a vehicle that drives the same way."""
@@ -201,9 +186,6 @@ class FuzzySafetyModel(NamedTuple):
     safe_margin: float = 2.0  # m, more than that to be safe
     jerk: float = MAX_JERK
     lateral_margin: float = 0.1  # s
-
-    def init(self, like: Tensor) -> DriverState:
-        return no_conflict(like)
 
     def proactive(self, gap: Tensor, speed: Tensor, other_speed: Tensor) -> Tensor:
         """PFS [...]: what if the other brakes fully now."""
@@ -245,57 +227,3 @@ DRIVERS: dict[str, Driver] = {
     "rss": ResponsibilitySensitiveSafety(),
     "fsm": FuzzySafetyModel(),
 }
-
-
-LENGTH, WIDTH = 4.3, 1.9  # m, of both vehicles
-LATERAL_GAP = 1.6  # m between the sides of two vehicles in the middle of neighbouring lanes of 3.5 m
-LATERAL_ACCELERATION = 1.5  # m/s^2
-DURATION = 40.0  # s after the lateral speed has been reached
-NO_CRASH, SIDE, FRONT = range(3)  # SIDE: the ego's front has passed the other's front; FRONT: it has not
-
-
-class CutIn(NamedTuple):
-    """Concrete cut-ins, each field [B]; gap and the lateral gap of 1.6 m hold when the lateral speed is reached."""
-
-    speed: Tensor  # m/s, the ego's
-    other_speed: Tensor  # m/s
-    gap: Tensor  # m, bumper to bumper
-    lateral_speed: Tensor  # m/s
-
-
-def lateral_motion(cut_in: CutIn) -> tuple[Tensor, Tensor, int]:
-    """(lateral speed, gap between the sides) of the other, each [T, B], and the step at which the gap is 1.6 m.
-
-    Explicit Euler steps: the speed grows by 1.5 m/s^2, then is constant until the other is centred before the ego.
-    """
-    target = cut_in.lateral_speed
-    start = -int((target.max() / (LATERAL_ACCELERATION * DT)).ceil())
-    time = torch.arange(start, round(DURATION / DT), dtype=target.dtype, device=target.device)[:, None] * DT
-    speed = torch.minimum((target + LATERAL_ACCELERATION * time).clamp(min=0), target)
-    way = (speed * DT).cumsum(0) - speed * DT
-    gap = LATERAL_GAP + way[-start] - way
-    centred = gap <= -WIDTH
-    return speed.masked_fill(centred, 0), gap.clamp(min=-WIDTH), -start
-
-
-def simulate_cut_ins(driver: Driver, cut_in: CutIn) -> Tensor:
-    """Kind of crash [B]: NO_CRASH, SIDE or FRONT, with the driver in the ego. Both speeds are constant but for it.
-
-    Semi-implicit Euler steps of DT along the road: v' = max(v + a DT, 0), x' = x + v' DT.
-    """
-    lateral_speed, lateral_gap, start = lateral_motion(cut_in)
-    speed, other = cut_in.speed, cut_in.other_speed
-    gap = cut_in.gap + (speed - other) * start * DT
-    kind, length = torch.zeros_like(speed, dtype=torch.long), torch.full_like(speed, LENGTH)
-    still = torch.zeros_like(speed)
-    state, acceleration = driver.init(speed), still
-    for lateral, side in zip(lateral_speed, lateral_gap, strict=True):
-        overlaps = side <= 0
-        hit = overlaps & (gap <= 0) & (gap >= -2 * LENGTH) & (kind == NO_CRASH)
-        kind = torch.where(hit, torch.where(gap < -LENGTH, SIDE, FRONT), kind)
-        seen = Observation(speed, acceleration, gap, other, still, side, lateral, overlaps, length, length)
-        state, wanted = driver.step(state, seen)
-        after = (speed + wanted * DT).clamp(min=0)
-        acceleration = (after - speed) / DT
-        speed, gap = after, gap + (other - after) * DT
-    return kind

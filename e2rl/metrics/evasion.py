@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorClass, TensorDictBase
 from torch import Tensor
 
-from e2rl.metrics.catalogue import Metric, declare
+from e2rl.metrics.catalogue import Metric, declare, rate
 from e2rl.metrics.manoeuvre import (
     KNOT_STEPS,
     EvasionScene,
@@ -42,14 +42,13 @@ ACCEL_STD, SHIFT_STD = 4.0, 2.0  # m/s^2, m: largest standard deviations of the 
 LATE = 1.0  # s before contact at which the late search starts
 
 declare(
-    Metric(
+    rate(
         "avoidable",
         "collisions that some ego actions avoid, found by search",
-        fraction=True,
         per_collision=True,
-        tables=("main", "adversaries"),
+        tables="main adversaries",
     ),
-    Metric("avoidable_1s", "the same, acting only 1 s before contact", fraction=True, per_collision=True),
+    rate("avoidable_1s", "the same, acting only 1 s before contact", per_collision=True),
     Metric("evasion_accel", "peak acceleration of the mildest evasion found", unit="m/s²", per_collision=True),
     events=("evasion_tried", "evasion_seconds"),
 )

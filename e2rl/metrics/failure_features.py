@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from e2rl.metrics.catalogue import Batch, columns
-from e2rl.metrics.fault import ego_path_boxes
+from e2rl.metrics.verdicts import ego_path_boxes
 from e2rl.scenes.boxes import separation, to_frame
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap

@@ -37,7 +37,7 @@ declare(
         column="mode",
         places=PLACES,
         per_collision=True,
-        tables=("adversaries",),
+        tables="adversaries",
     ),
     Metric(
         "mode_coverage_counted",
@@ -47,7 +47,7 @@ declare(
         weight="counted",
         places=PLACES,
         per_collision=True,
-        tables=("adversaries",),
+        tables="adversaries",
     ),
 )
 

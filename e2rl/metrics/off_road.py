@@ -7,7 +7,7 @@ Distances are exact, from point to segment; a grid of buckets keeps the work nea
 import torch
 from torch import Tensor
 
-from e2rl.metrics.catalogue import Batch, Metric, columns
+from e2rl.metrics.catalogue import Batch, columns, rate
 from e2rl.metrics.contact import steps_until
 from e2rl.metrics.geometry import candidates, from_segment
 
@@ -83,15 +83,14 @@ def on_road(points: Tensor, rollout: Tensor, batch: Batch) -> Tensor:
 
 
 @columns(
-    Metric(
+    rate(
         "aor_step",
         "off the road, of vehicle-steps",
-        fraction=True,
         weight="aor_vehicle_steps",
-        tables=("main", "traffic", "adversaries", "methods", "public"),
+        tables="main traffic adversaries methods public",
     ),
-    Metric("aor_any", "off the road, of rollouts", fraction=True, tables=("main", "traffic", "methods")),
-    Metric("ego_off_road", "ego leaves the road", fraction=True, tables=("main", "egos", "public")),
+    rate("aor_any", "off the road, of rollouts", tables="main traffic methods"),
+    rate("ego_off_road", "ego leaves the road", tables="main egos public"),
     events=("aor_vehicle_steps", "aor_left_out"),
 )
 def off_road_columns(batch: Batch) -> Batch:

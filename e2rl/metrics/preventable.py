@@ -4,9 +4,7 @@ The ego is driven again along its own way; all others are replayed. A vehicle be
 brakes earlier than the ego did is driven again, too: if its own competent braking avoids the contact, it does not
 count. Such chains are at most two vehicles long.
 
-A vehicle driven again along its own way by a competent driver, in traffic that is replayed (docs/verdicts.md).
-
-Shapes: B rollouts, T + 1 states of DT, N others. The way is the path that the vehicle drove, straight on from its end.
+Shapes: B rollouts, T + 1 states of DT, N others. A vehicle's way is the path that it drove, straight on from its end.
 The driver keeps the recorded acceleration until it reacts, then what it asks for; it never steers and never drives
 faster than recorded.
 """
@@ -16,10 +14,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from e2rl.metrics.drivers import DRIVERS, Driver, Observation
+from e2rl.metrics.drivers import DRIVERS, Driver, Observation, no_conflict
 from e2rl.scenes.boxes import separation, to_frame
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING, project
+from e2rl.sim.dynamics import wrap
 
 STRAIGHT = 60.0  # m by which a way goes on straight
 
@@ -59,8 +58,7 @@ def poses(states: Tensor, s: Tensor) -> Tensor:
     low, high = length.gather(1, after - 1), length.gather(1, after)
     share = ((s - low) / (high - low).clamp(min=1e-6)).clamp(0, 1)[..., None]
     first, second = (states.gather(1, index[..., None].expand(-1, -1, 4)) for index in (after - 1, after))
-    turn = torch.remainder(second[..., 2] - first[..., 2] + torch.pi, 2 * torch.pi) - torch.pi
-    heading = first[..., 2] + share[..., 0] * turn
+    heading = first[..., 2] + share[..., 0] * wrap(second[..., 2] - first[..., 2])
     beyond = (s - length[:, -1:]).clamp(min=0)[..., None]
     ahead = torch.stack([heading.cos(), heading.sin()], -1)
     return torch.cat([torch.lerp(first[..., :2], second[..., :2], share) + beyond * ahead, heading[..., None]], -1)
@@ -101,7 +99,7 @@ def redrive(driver: Driver, states: Tensor, size: Tensor, others: Along) -> Tens
     recorded = states[..., 3].diff(dim=1) / DT
     speed, s = states[:, 0, 3], torch.zeros_like(states[:, 0, 3])
     acceleration, reacted = torch.zeros_like(speed), torch.zeros_like(speed, dtype=torch.bool)
-    memory = driver.init(others.rear[0])
+    memory = no_conflict(others.rear[0])
     length = size[:, :1].expand_as(others.rear[0])
     way, speeds = [s], [speed]
     for t in range(recorded.shape[1]):

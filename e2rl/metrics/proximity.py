@@ -7,7 +7,7 @@ Vehicles that stand at the start: parked ones should stay, some of those on a la
 import torch
 from torch import Tensor
 
-from e2rl.metrics.catalogue import Batch, Metric, columns
+from e2rl.metrics.catalogue import Batch, Metric, columns, rate
 from e2rl.metrics.contact import steps_until
 from e2rl.metrics.geometry import velocity
 from e2rl.scenes.boxes import distance
@@ -19,17 +19,12 @@ LEAST_WAY = 1.0  # m: of a shorter recorded way no share is known
 
 
 @columns(
-    Metric("min_dtc", "smallest gap to another agent", unit="m", tables=("main", "methods")),
-    Metric("ttc_c", "time-to-collision cost, adversaries", tables=("main", "adversaries", "methods")),
+    Metric("min_dtc", "smallest gap to another agent", unit="m", tables="main methods"),
+    Metric("ttc_c", "time-to-collision cost, adversaries", tables="main adversaries methods"),
     Metric("ttc_c_all", "time-to-collision cost, all agents"),
-    Metric("macc", "ego's mean |acceleration|", unit="m/s²", tables=("main", "egos", "public")),
-    Metric("progress", "distance that the ego drives", unit="m", tables=("main", "egos", "public")),
-    Metric(
-        "route_completion",
-        "fraction of the recorded ego's path driven until contact",
-        fraction=True,
-        tables=("public",),
-    ),
+    Metric("macc", "ego's mean |acceleration|", unit="m/s²", tables="main egos public"),
+    Metric("progress", "distance that the ego drives", unit="m", tables="main egos public"),
+    rate("route_completion", "fraction of the recorded ego's path driven until contact", tables="public"),
     Metric("failures_per_km", "`cfr`, of all that the ego drives", unit="1/km", column="cfr", per="driven_km"),
     Metric("counted_per_km", "the same of `cfr_counted`", unit="1/km", column="cfr_counted", per="driven_km"),
 )
@@ -143,16 +138,13 @@ def moved(states: Tensor, valid: Tensor) -> Tensor:
 
 
 @columns(
-    Metric(
-        "parked_moved", "parked vehicles that move > 2 m", fraction=True, weight="parked_vehicles", tables=("traffic",)
-    ),
-    Metric(
+    rate("parked_moved", "parked vehicles that move > 2 m", weight="parked_vehicles", tables="traffic"),
+    rate(
         "starts",
         "standing vehicles that start, over the log's",
-        fraction=True,
         column="starters",
         per="starters_log",
-        tables=("traffic",),
+        tables="traffic",
     ),
     events=("parked_vehicles", "starters_log"),
 )

@@ -25,23 +25,19 @@ Samples = dict[str, Tensor]
 
 declare(
     Metric(
-        "real",
-        "realism, 1 - mean capped W1",
-        decimals=3,
-        samples="a_lon",
-        tables=("main", "traffic", "adversaries", "methods"),
+        "real", "realism, 1 - mean capped W1", decimals=3, samples="a_lon", tables="main traffic adversaries methods"
     ),
     Metric(
         "real_adv",
         "realism of the adversaries alone",
         decimals=3,
         samples="a_lon_adversary",
-        tables=("main", "adversaries", "methods", "public"),
+        tables="main adversaries methods public",
     ),
-    Metric("real_norm", "realism, W1 over the log's range", decimals=3, samples="a_lon", tables=("main", "traffic")),
-    Metric("w1_a_lon", "W1 of longitudinal acceleration", unit="m/s²", samples="a_lon", tables=("traffic",)),
-    Metric("w1_a_lat", "W1 of lateral acceleration", unit="m/s²", samples="a_lon", tables=("traffic",)),
-    Metric("w1_jerk", "W1 of |jerk|", unit="m/s³", samples="a_lon", tables=("traffic",)),
+    Metric("real_norm", "realism, W1 over the log's range", decimals=3, samples="a_lon", tables="main traffic"),
+    Metric("w1_a_lon", "W1 of longitudinal acceleration", unit="m/s²", samples="a_lon", tables="traffic"),
+    Metric("w1_a_lat", "W1 of lateral acceleration", unit="m/s²", samples="a_lon", tables="traffic"),
+    Metric("w1_jerk", "W1 of |jerk|", unit="m/s³", samples="a_lon", tables="traffic"),
 )
 
 

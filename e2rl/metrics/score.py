@@ -15,7 +15,7 @@ CHUNK = 32  # rollouts scored at once: bounds the memory of the pairwise steps
 
 
 @columns(
-    Metric("transport", "path KL of the control", tables=("main", "adversaries")),
+    Metric("transport", "path KL of the control", tables="main adversaries"),
     Metric("transport_adversary", "path KL of the control, adversaries"),
     Metric("transport_others", "path KL of the control, other vehicles"),
     Metric("transport_anchor", "anchor jump"),
@@ -28,14 +28,12 @@ def transport_columns(batch: Batch) -> Batch:
 
 
 @columns(
-    Metric(
-        "seconds_per_rollout", "wall time", unit="s", column="seconds", cost=True, tables=("main", "traffic", "methods")
-    ),
+    Metric("seconds_per_rollout", "wall time", unit="s", column="seconds", cost=True, tables="main traffic methods"),
     Metric(
         "nfe",
         "evaluations of the prior's network per rollout, one with a gradient twice",
         cost=True,
-        tables=("main", "methods"),
+        tables="main methods",
     ),
 )
 def cost_columns(batch: Batch) -> Batch:
@@ -46,9 +44,9 @@ def cost_columns(batch: Batch) -> Batch:
 def score_rollouts(rollouts: Rollouts) -> tuple[list[dict], list[Samples]]:
     """Rows and realism samples of B rollouts, both for `statistics.summarise`.
 
-    A row is a dict of plain numbers and words, one entry for each of `catalogue.row_columns`, NaN where it is unknown,
-    and of SOURCE where the rollouts tell it. Its own realism rests on few samples; sets of rollouts pool them. Sets `rollouts.driver`: the way of the competent
-    driver of the verdict, NaN for rollouts without a collision.
+    A row is a dict of plain numbers and words: the columns `catalogue.row_columns`, NaN where unknown, and those of
+    SOURCE that the rollouts tell. Its own realism rests on few samples; sets of rollouts pool them. Sets
+    `rollouts.driver`: the competent driver of the verdict in the ego's place, NaN without a collision.
     """
     rows, samples, drivers = [], [], []
     for begin in range(0, len(rollouts), CHUNK):

@@ -12,13 +12,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from e2rl.metrics.catalogue import Batch, Metric, declare
-from e2rl.metrics.contact import REAR
+from e2rl.metrics.catalogue import Batch, declare, rate
+from e2rl.metrics.contact import FRONT, REAR
 from e2rl.metrics.drivers import DRIVERS, HumanDriver
-from e2rl.metrics.fault import at_fault
 from e2rl.metrics.preventable import Collision, Tracks, along_way, driven_length, held, preventions
+from e2rl.scenes.boxes import separation
 from e2rl.scenes.lane_graph import against_lanes
 from e2rl.scenes.recording import DT, VEHICLE
+from e2rl.sim.dynamics import wrap
+from e2rl.sim.neighbours import STANDING
 
 DUTIES = ("none", "rear-end", "light", "wrong way", "right of way", "entry")
 NONE, REAR_END, LIGHT, WRONG_WAY, RIGHT_OF_WAY, ENTRY = range(6)
@@ -27,6 +29,8 @@ WRONG_STEPS = round(1.0 / DT)  # before the contact of which half must be agains
 SAME_WAY = torch.pi / 6  # rad between headings below which a vehicle enters the way rather than crosses it
 TURN = torch.pi / 7  # rad of heading within the last four seconds that make a turn
 TURN_STEPS = round(4.0 / DT)
+CUT_IN_STEPS = 10  # 1 s at 10 Hz
+AHEAD = 30.0  # m, straight on from the contact, that count as the ego's path
 
 
 class Lanes(NamedTuple):
@@ -50,7 +54,7 @@ def duties(collision: Collision, rear: Tensor, red: Tensor, lanes: Lanes) -> Ten
     stop = collision.stop
     before = (stop - 1).clamp(min=0)
     turned = torch.stack([_turn(track, stop) for track in (ego, other)])
-    angle = _wrap(other[row, before, 2] - ego[row, before, 2])
+    angle = wrap(other[row, before, 2] - ego[row, before, 2])
     gap, closing, entered = _entry(ego, other, size, stop)
     unsafe = entered & (gap < HumanDriver().stopping_gap(closing).clamp(min=0.0))
     crosses = angle.abs() > SAME_WAY
@@ -64,20 +68,16 @@ def duties(collision: Collision, rear: Tensor, red: Tensor, lanes: Lanes) -> Ten
     return torch.where(rear & (angle.abs() < torch.pi / 3) & faster, REAR_END, result)
 
 
-def _wrap(angle: Tensor) -> Tensor:
-    return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
-
-
 def _turn(track: Tensor, stop: Tensor) -> Tensor:
     """Bool [B]: the vehicle at track [B, T+1, 4] turns by more than TURN in the TURN_STEPS before stop [B]."""
     steps = torch.arange(track.shape[1] - 1, device=stop.device)
     counted = (steps < stop[:, None]) & (steps >= stop[:, None] - TURN_STEPS)
-    return (_wrap(track[..., 2].diff(dim=1)) * counted).sum(1).abs() > TURN
+    return (wrap(track[..., 2].diff(dim=1)) * counted).sum(1).abs() > TURN
 
 
 def _from_left(ego: Tensor, other: Tensor, row: Tensor, step: Tensor) -> Tensor:
     """Bool [B]: the other comes from the ego's left, so that it gives way where nothing else decides."""
-    return _wrap(other[row, step, 2] - ego[row, step, 2]) < 0
+    return wrap(other[row, step, 2] - ego[row, step, 2]) < 0
 
 
 def _entry(ego: Tensor, other: Tensor, size: Tensor, stop: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -102,38 +102,68 @@ def _against(track: Tensor, stop: Tensor, lanes: Lanes) -> Tensor:
     return against.float().mean(-1) >= 0.5
 
 
+def at_fault(batch: Batch) -> Tensor:
+    """Whether the ego is at fault [B]: 1 or 0, NaN without contact.
+
+    It is if it moves and either its partner stands still, or its front hits a partner that did not cut in: one that
+    enters the ego's path less than a second before the contact.
+    """
+    row = torch.arange(len(batch["states"]))
+    speed = batch["states"][row, batch["before"], :, 3].abs()
+    moving, partner_stands = speed[:, 0] > STANDING, speed[row, batch["partner"].clamp(min=0)] <= STANDING
+    fault = moving & (partner_stands | ((batch["kind"] == FRONT) & ~cuts_in(batch)))
+    return fault.to(speed.dtype).masked_fill(~batch["hit"], torch.nan)
+
+
+def cuts_in(batch: Batch) -> Tensor:
+    """Bool [B]: at some step of the last second the partner touches no part of the ego's path from that step on.
+
+    The path is the ego's own boxes until the contact, and a straight strip of its width ahead of the last of them.
+    """
+    states, size, stop, partner = batch["states"], batch["size"], batch["stop"], batch["partner"].clamp(min=0)[:, None]
+    row = torch.arange(len(states), device=states.device)[:, None]
+    window = stop[:, None] + torch.arange(-CUT_IN_STEPS, 1, device=states.device)
+    known, window = (window >= 0) & (window < stop[:, None]), window.clamp(min=0)
+    other, other_size = states[row, window, partner], size[row, partner]
+    known = known & batch["valid"][row, window, partner]
+    path, path_size = ego_path_boxes(states[row, window, 0], size[:, 0])
+    meet = separation(other[:, :, None], other_size[:, :, None], path[:, None], path_size[:, None]) <= 0
+    later = torch.ones(meet.shape[-2:], dtype=torch.bool, device=meet.device).triu()
+    return (known & ~(meet & later).any(-1)).any(-1)
+
+
+def ego_path_boxes(states: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
+    """Boxes [B, W+1, 4] and sizes [B, W+1, 2] of an ego at states [B, W, 4] and of the strip ahead of the last one."""
+    last = states[:, -1:]
+    direction = torch.stack([last[..., 2].cos(), last[..., 2].sin()], -1)
+    shift = (size[:, :1] + AHEAD)[..., None] / 2
+    strip = torch.cat([last[..., :2] + shift * direction, last[..., 2:]], -1)
+    strip_size = torch.stack([torch.full_like(size[:, 0], AHEAD), size[:, 1]], -1)[:, None]
+    sizes = torch.cat([size[:, None].expand(-1, states.shape[1], -1), strip_size], 1)
+    return torch.cat([states, strip], 1), sizes
+
+
 declare(
-    Metric(
+    rate(
         "cfr_counted",
         "a failure that counts: preventable, or the ego's fault",
-        fraction=True,
-        tables=("main", "adversaries", "methods", "egos", "public"),
+        tables="main adversaries methods egos public",
     ),
-    Metric(
-        "cfr_preventable",
-        "a failure that a competent driver prevents",
-        fraction=True,
-        tables=("main", "adversaries", "methods", "egos", "public"),
+    rate(
+        "cfr_preventable", "a failure that a competent driver prevents", tables="main adversaries methods egos public"
     ),
-    Metric("counted", "collisions that count", fraction=True, per_collision=True, tables=("main", "adversaries")),
-    Metric(
-        "at_fault",
-        "ego's fault, per collision",
-        fraction=True,
-        per_collision=True,
-        tables=("main", "adversaries", "methods", "egos", "public"),
-    ),
-    Metric(
+    rate("counted", "collisions that count", per_collision=True, tables="main adversaries"),
+    rate("at_fault", "ego's fault, per collision", per_collision=True, tables="main adversaries methods egos public"),
+    rate(
         "preventable",
         "prevented by UN R157's careful and competent driver",
-        fraction=True,
         per_collision=True,
-        tables=("main", "adversaries", "methods", "egos"),
+        tables="main adversaries methods egos",
     ),
-    Metric("preventable_fsm", "prevented by the fuzzy safety model", fraction=True, per_collision=True),
-    Metric("preventable_rss", "prevented by RSS", fraction=True, per_collision=True),
-    Metric("preventable_regulation", "prevented at UN R157's limit", fraction=True, per_collision=True),
-    Metric("preventable_chain", "prevented if a follower brakes, too", fraction=True, per_collision=True),
+    rate("preventable_fsm", "prevented by the fuzzy safety model", per_collision=True),
+    rate("preventable_rss", "prevented by RSS", per_collision=True),
+    rate("preventable_regulation", "prevented at UN R157's limit", per_collision=True),
+    rate("preventable_chain", "prevented if a follower brakes, too", per_collision=True),
     events=("duty",),
     words={"duty": DUTIES},
 )

@@ -2,8 +2,8 @@
 
 Goals beside a mission: a grid of the places that a vehicle may have reached at the end of its plan.
 
-A goal is a way [m] along the mission from the vehicle's present place and a side [m] beside the mission, left positive.
-The grid covers the ways up to `reach`, in cells whose length grows with the vehicle's speed.
+A goal is a distance [m] along the mission from the vehicle's present place and a side [m] beside the mission (left
+positive). The grid covers the distances up to `reach`, in cells whose length grows with the vehicle's speed.
 """
 
 import json
@@ -27,40 +27,40 @@ from e2rl.sim import dynamics
 from e2rl.sim.observation import OBSERVATION_SIZE
 
 HORIZON = PLAN_STEPS * DT  # s
-WAYS, SIDES = 32, 7  # cells along the mission and beside it
-CELLS = WAYS * SIDES  # G: cell w * SIDES + s
+DISTANCES, SIDES = 32, 7  # cells along the mission and beside it
+CELLS = DISTANCES * SIDES  # G: cell w * SIDES + s
 SIDE = 1.0  # m, width of a cell
 FASTEST = 2.5  # m/s^2: acceleration over the horizon that leads to the grid's end
 
 
 def reach(speed: Tensor) -> Tensor:
-    """Ways [...] m to the end of the grid from speeds [...] m/s."""
+    """Distances [...] m to the end of the grid from speeds [...] m/s."""
     return HORIZON * speed + FASTEST * HORIZON**2 / 2
 
 
 def place(speed: Tensor, cell: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
-    """Ways and sides [B, K] m of the goals at `cell` [B, K] with residual [B, K, 2], in cells from the cell's centre;
-    speed [B] m/s. No way is negative."""
+    """Distances and sides [B, K] m of the goals at `cell` [B, K] with residual [B, K, 2], in cells from the cell's
+    centre; speed [B] m/s. No distance is negative."""
     along = cell.div(SIDES, rounding_mode="floor") + 0.5 + residual[..., 0]
-    aside = cell % SIDES - (SIDES - 1) / 2 + residual[..., 1]
-    return (along * reach(speed)[:, None] / WAYS).clamp(min=0), aside * SIDE
+    across = cell % SIDES - (SIDES - 1) / 2 + residual[..., 1]
+    return (along * reach(speed)[:, None] / DISTANCES).clamp(min=0), across * SIDE
 
 
-def cell_of(speed: Tensor, way: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
-    """The cells [W] of goals way, side [W] m, and their residuals [W, 2]: the inverse of `place`. A goal off the grid
-    counts to the nearest cell."""
-    along = way / reach(speed) * WAYS - 0.5
-    aside = side / SIDE + (SIDES - 1) / 2
-    w, s = along.round().clamp(0, WAYS - 1), aside.round().clamp(0, SIDES - 1)
-    return (w * SIDES + s).long(), torch.stack([along - w, aside - s], -1)
+def cell_of(speed: Tensor, distance: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
+    """The cells [W] of goals distance, side [W] m, and their residuals [W, 2]: the inverse of `place`. A goal off the
+    grid counts to the nearest cell."""
+    along = distance / reach(speed) * DISTANCES - 0.5
+    across = side / SIDE + (SIDES - 1) / 2
+    w, s = along.round().clamp(0, DISTANCES - 1), across.round().clamp(0, SIDES - 1)
+    return (w * SIDES + s).long(), torch.stack([along - w, across - s], -1)
 
 
-def needed_acceleration(speed: Tensor, way: Tensor) -> Tensor:
-    """The constant acceleration [...] m/s^2 that drives `way` [...] m within the horizon from speed [...] m/s: to its
-    end, or to a halt before it."""
-    going = 2 * (way - HORIZON * speed) / HORIZON**2
-    halting = -speed.square() / (2 * way.clamp(min=0.1))
-    return torch.where(way < HORIZON * speed / 2, halting, going)
+def needed_acceleration(speed: Tensor, distance: Tensor) -> Tensor:
+    """The constant acceleration [...] m/s^2 that drives `distance` [...] m within the horizon from speed [...] m/s: to
+    its end, or to a halt before it."""
+    going = 2 * (distance - HORIZON * speed) / HORIZON**2
+    halting = -speed.square() / (2 * distance.clamp(min=0.1))
+    return torch.where(distance < HORIZON * speed / 2, halting, going)
 
 
 FORMAT = "e2rl-bits/1"
@@ -85,8 +85,8 @@ class Controls(NamedTuple):
 class BitsNetwork(nn.Module):
     """Observation -> code; code -> distribution over goals; code and goal -> controls of a plan.
 
-    Outputs start at zero: untrained, all goals are equally likely and every plan keeps its speed. dropout: share of a
-    code's numbers that are left out in training mode.
+    Outputs start at zero: untrained, all goals are equally likely and every plan keeps its speed. dropout: fraction
+    of a code's numbers that are left out in training mode.
     """
 
     def __init__(self, hidden: int = 64, dropout: float = 0.0) -> None:
@@ -108,13 +108,13 @@ class BitsNetwork(nn.Module):
         logits, residual = self.goal_head(code).split([CELLS, 2 * CELLS], -1)
         return logits, residual.unflatten(-1, (CELLS, 2))
 
-    def controls(self, code: Tensor, speed: Tensor, offset: Tensor, way: Tensor, side: Tensor) -> Controls:
-        """The policy's Controls of plans to the goals way, side [B, K] m, from codes [B, hidden], speeds [B] m/s and
-        offsets [B] m beside the mission."""
-        speed, offset = speed[:, None].expand_as(way), offset[:, None]
-        features = [way / reach(speed), way / 50, needed_acceleration(speed, way) / 4, side / 3]
+    def controls(self, code: Tensor, speed: Tensor, offset: Tensor, distance: Tensor, side: Tensor) -> Controls:
+        """The policy's Controls of plans to the goals distance, side [B, K] m, from codes [B, hidden], speeds [B] m/s
+        and offsets [B] m beside the mission."""
+        speed, offset = speed[:, None].expand_as(distance), offset[:, None]
+        features = [distance / reach(speed), distance / 50, needed_acceleration(speed, distance) / 4, side / 3]
         features += [(side - offset) / 3, speed / 15]
-        code = code[:, None].expand(-1, way.shape[1], -1)
+        code = code[:, None].expand(-1, distance.shape[1], -1)
         out = self.policy(torch.cat([code, torch.stack(features, -1)], -1))
         shift = side + AROUND * out[..., KNOTS].tanh()
         return Controls(between(out[..., :KNOTS], *ACCELERATION, 0.0), shift, between(out[..., -1], *TIME, 1.4))
@@ -127,8 +127,8 @@ class BitsNetwork(nn.Module):
 
 def between(value: Tensor, low: float, high: float, start: float) -> Tensor:
     """Values squashed into (low, high) by a sigmoid; 0 becomes `start`."""
-    share = (start - low) / (high - low)
-    return low + (high - low) * (value + math.log(share / (1 - share))).sigmoid()
+    fraction = (start - low) / (high - low)
+    return low + (high - low) * (value + math.log(fraction / (1 - fraction))).sigmoid()
 
 
 def drive_controls(controls: Controls, start: Tensor, path: RoutePath) -> Candidates:

@@ -184,8 +184,8 @@ def plans_of(now: Tensor, replies: list[tuple[int, bytes]], steps: int) -> Tenso
 def drivable(now: Tensor, given: Tensor, known: Tensor) -> Tensor:
     """Bool [B]: the first `known` [B] states of given [B, H, 4] are finite and no faster than FASTEST, in their speeds
     and from pose to pose, beginning at states now [B, 4]."""
-    way = torch.cat([now[:, None, :2], given[..., :2]], 1).diff(dim=1).norm(dim=-1)
-    fine = (way <= FASTEST * DT) & (given[..., 3].abs() <= FASTEST) & given.isfinite().all(-1)
+    moved = torch.cat([now[:, None, :2], given[..., :2]], 1).diff(dim=1).norm(dim=-1)
+    fine = (moved <= FASTEST * DT) & (given[..., 3].abs() <= FASTEST) & given.isfinite().all(-1)
     return (fine | (torch.arange(given.shape[1]) >= known[:, None])).all(1)
 
 

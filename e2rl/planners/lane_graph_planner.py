@@ -218,8 +218,8 @@ class LaneGraphEgo(Ego):
 def targets(start: Tensor, top: Tensor, reach: float, count: int) -> Tensor:
     """Target speeds [..., count], evenly from max(0, start - reach) to min(top, start + reach); start, top [...]."""
     low, high = (start - reach).clamp(min=0), torch.minimum(top, start + reach)
-    share = torch.linspace(0, 1, count, device=start.device, dtype=start.dtype)
-    return low[..., None] + share * (high - low)[..., None]
+    fraction = torch.linspace(0, 1, count, device=start.device, dtype=start.dtype)
+    return low[..., None] + fraction * (high - low)[..., None]
 
 
 def approach(start: Tensor, aims: Tensor, slope: float, steps: int) -> Tensor:
@@ -250,5 +250,5 @@ def upsample(speed: Tensor) -> Tensor:
     """Speeds [..., PLAN_STEPS + 1] every DT, linear between nodes [..., 26] every PLAN_DT."""
     tick = torch.arange(PLAN_STEPS + 1, device=speed.device) * (DT / PLAN_DT)
     low = tick.floor().long().clamp(max=speed.shape[-1] - 2)
-    share = tick - low
-    return speed[..., low] * (1 - share) + speed[..., low + 1] * share
+    fraction = tick - low
+    return speed[..., low] * (1 - fraction) + speed[..., low + 1] * fraction

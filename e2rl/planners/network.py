@@ -19,8 +19,8 @@ from e2rl.sim.observation import OBSERVATION_SIZE
 
 DEEPEST, WIDEST = 16, 1 << 13  # layers, and units of a layer, that a file may ask for
 WEIGHTS = "actor.safetensors"  # file name of an ActorCritic inside a checkpoint
-NARROWEST = 0.01  # least standard deviation before squashing, as a share of half the action range
-STEEPEST = 0.95  # reference actions are kept within this share of the bounds, so that their atanh stays finite
+NARROWEST = 0.01  # least standard deviation before squashing, as a fraction of half the action range
+STEEPEST = 0.95  # reference actions are kept within this fraction of the bounds, so that their atanh stays finite
 
 
 class Normaliser(nn.Module):
@@ -41,10 +41,10 @@ class Normaliser(nn.Module):
         """Update the statistics with observations [..., D] (Chan et al.'s pairwise update)."""
         flat = observation.reshape(-1, observation.shape[-1])
         total = self.count + len(flat)
-        share, delta = (len(flat) / total).float(), flat.mean(0) - self.mean
-        spread = self.variance * (1 - share) + flat.var(0, correction=0) * share
-        self.variance.copy_(spread + delta**2 * share * (1 - share))
-        self.mean.add_(delta * share)
+        weight, delta = (len(flat) / total).float(), flat.mean(0) - self.mean
+        spread = self.variance * (1 - weight) + flat.var(0, correction=0) * weight
+        self.variance.copy_(spread + delta**2 * weight * (1 - weight))
+        self.mean.add_(delta * weight)
         self.count.copy_(total)
 
     def forward(self, observation: Tensor) -> Tensor:
@@ -92,8 +92,8 @@ class ActorNetwork(nn.Module):
         """What the network's output [..., 2] is added to at observation [..., D]: no parameter changes it."""
         if not self.reference:
             return torch.zeros_like(observation[..., :2])
-        share = (reference_action(observation) - self.middle) / self.reach
-        return share.clamp(-STEEPEST, STEEPEST).atanh()
+        part = (reference_action(observation) - self.middle) / self.reach
+        return part.clamp(-STEEPEST, STEEPEST).atanh()
 
     def head(self, seen: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
         """loc, scale [..., 2] from the normalised observation [..., D] and the `offset` [..., 2]."""
@@ -170,7 +170,7 @@ class ActorCritic(nn.Module):
 
     def heads(self) -> tuple[ProbabilisticActor, ValueOperator]:
         """Actor and critic with the same parameters that read "seen" and "offset", which an update computes once for
-        all its passes (`prepared`), instead of the observation."""
+        all its epochs (`prepared`), instead of the observation."""
         head = TensorDictModule(Head(self.network), ["seen", "offset"], ["loc", "scale"])
         return self._sampler(head), ValueOperator(self.critic.module[1], in_keys=["seen"])
 

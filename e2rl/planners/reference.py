@@ -3,7 +3,7 @@
 Steering is pure pursuit of the mission. The acceleration is the minimum over IDM behind every agent in the corridor,
 IDM behind stop lines that bind, and the speed caps by limits and curves. Pure functions of e2rl.sim.observation.
 
-The network of the learned ego: every nearby agent passes the same layers, and the largest of each unit over the
+The network of the learned ego: every nearby agent goes through the same layers, and the largest of each unit over the
 agents joins the rest of the scene.
 
 A flat network learns anew in each of the observation's twelve places what an agent there means. Which place one takes
@@ -77,12 +77,12 @@ def _pursuit(path: Tensor, speed: Tensor) -> Tensor:
     ahead = path.new_tensor(LOOK_AHEAD)
     reach = (PURSUIT_TIME * speed).clamp(PURSUIT_MIN, PURSUIT_MAX)
     high = (ahead < reach[..., None]).sum(-1).clamp(1, len(LOOK_AHEAD) - 1)
-    share = (reach - ahead[high - 1]) / (ahead[high] - ahead[high - 1])
+    fraction = (reach - ahead[high - 1]) / (ahead[high] - ahead[high - 1])
 
     def point(index: Tensor) -> Tensor:
         return path.gather(-2, index[..., None, None].expand(*index.shape, 1, 2))[..., 0, :]
 
-    aim = torch.lerp(point(high - 1), point(high), share[..., None])
+    aim = torch.lerp(point(high - 1), point(high), fraction[..., None])
     return 2 * aim[..., 1] / aim.square().sum(-1).clamp(min=1.0)
 
 

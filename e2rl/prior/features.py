@@ -109,16 +109,16 @@ def edge_features(routed: RoutedScene, state: LaneState) -> Tensor:
     x, y, heading, v = state.x, state.y, state.heading, state.v
     cos, sin = torch.cos(heading)[..., None], torch.sin(heading)[..., None]
     dx, dy = x[:, None, :] - x[..., None], y[:, None, :] - y[..., None]
-    along, aside = cos * dx + sin * dy, cos * dy - sin * dx
+    along, across = cos * dx + sin * dy, cos * dy - sin * dx
     turn = heading[:, None, :] - heading[..., None]
     vx, vy = v[:, None, :] * torch.cos(turn) - v[..., None], v[:, None, :] * torch.sin(turn)
     distance = torch.sqrt(dx**2 + dy**2 + 0.01)
-    closing = -(along * vx + aside * vy) / distance
+    closing = -(along * vx + across * vy) / distance
     own = routed.conflict_s - state.s[..., None]
     other = own.transpose(1, 2)
     meet = routed.conflict & (own > -3) & (other > -3)
     arrival = own / v[..., None].clamp(min=1.0) - other / v[:, None, :].clamp(min=1.0)
-    position = [along / 30, aside / 10, torch.cos(turn), torch.sin(turn), vx / 10, vy / 10]
+    position = [along / 30, across / 10, torch.cos(turn), torch.sin(turn), vx / 10, vy / 10]
     nearness = [torch.exp(-distance / 20), closing / 10, torch.exp(-distance / 5), meet.float()]
     meeting = [torch.exp(-own.clamp(min=0) / 30), torch.exp(-other.clamp(min=0) / 30)]
     meeting += [torch.cos(routed.crossing), torch.sin(routed.crossing), torch.tanh(arrival / 3)]

@@ -18,7 +18,7 @@ from matplotlib.patches import Patch
 from PIL import Image
 
 from e2rl.run.files import write_atomically
-from e2rl.sim.rollouts import Road
+from e2rl.sim.rollout_file import Road
 
 Colour = str | tuple[str, float]  # of matplotlib: a name, or a name with its opacity
 

@@ -16,7 +16,7 @@ import torch
 from e2rl.metrics.preventable import AFTER
 from e2rl.report.picture import contact_point
 from e2rl.scenes.boxes import separation
-from e2rl.sim.rollouts import Failure, Rollout
+from e2rl.sim.rollout_file import Failure, Rollout
 from e2rl.traffic.traffic import POINT_STEPS, REPLAN_STEPS
 
 

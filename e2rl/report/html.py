@@ -24,7 +24,7 @@ from e2rl.report.mode_table import mode_tables
 from e2rl.report.tables import Table, column_names, metric_tables
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
-from e2rl.sim.rollouts import Failure, rollout_name
+from e2rl.sim.rollout_file import Failure, rollout_name
 
 PAGE = "failures.html"
 REPLAYS = 300  # in the page at most

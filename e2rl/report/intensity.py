@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.report.drawing import new_figure
 from e2rl.report.picture import SIDE, Panel, Replay
-from e2rl.sim.rollouts import Failure
+from e2rl.sim.rollout_file import Failure
 
 METRES, GAP, COLUMNS = 60.0, 10, 2  # side of a panel in m, points between panels, panels in a row
 

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from e2rl.report import drawing
 from e2rl.report.drawing import Shape, TrafficMap, Trail, add_legend, image_of, new_figure, new_panels, placed
 from e2rl.scenes.boxes import corners, to_frame
-from e2rl.sim.rollouts import Rollout
+from e2rl.sim.rollout_file import Rollout
 
 TRAIL = 2.0  # s
 SMOOTHING = 41  # steps over which the camera's path is smoothed

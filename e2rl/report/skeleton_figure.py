@@ -25,7 +25,7 @@ from e2rl.report.drawing import TrafficMap, Trail, add_legend, new_panels
 from e2rl.report.picture import shorten
 from e2rl.run.errors import InputError
 from e2rl.scenes.scene import SceneSet
-from e2rl.sim.rollouts import ROLLOUTS, Rollout, rollout_name
+from e2rl.sim.rollout_file import ROLLOUTS, Rollout, rollout_name
 from e2rl.traffic.e2.skeleton import Selection, chain_depth
 from e2rl.traffic.grouping import take_rows
 

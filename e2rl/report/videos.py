@@ -5,8 +5,10 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from matplotlib.colors import to_rgb
 from PIL import Image
 
+from e2rl.report import drawing
 from e2rl.report.drawing import save_figure
 from e2rl.report.picture import Replay
 from e2rl.run.files import write_atomically
@@ -14,6 +16,7 @@ from e2rl.run.files import write_atomically
 FRAME_MS = 100  # real time at 10 Hz
 LAST_MS = 1200  # the last frame stays a little before the video starts again
 COLOURS = 160  # of the GIF's palette
+KEYS = (drawing.EGO, drawing.ADVERSARY, drawing.BACKGROUND, drawing.VULNERABLE, drawing.INK)  # always in the palette
 
 
 def save_replay(replay: Replay, folder: Path) -> tuple[Path, Path]:
@@ -27,9 +30,11 @@ def save_replay(replay: Replay, folder: Path) -> tuple[Path, Path]:
 
 def save_animation(path: Path, frames: Sequence[Image.Image], colours: int = COLOURS, every: int = 1) -> None:
     """Write an endless GIF at 10 Hz, or of every n-th frame; all frames share a palette, from the first, middle and
-    last frame."""
+    last frame and the KEYS."""
     frames = [*frames[:-1:every], frames[-1]]
-    sample = Image.fromarray(np.concatenate([frames[index] for index in (0, len(frames) // 2, -1)]))
+    swatch = np.tile(np.repeat([[255 * part for part in to_rgb(each)] for each in KEYS], 8, 0), (frames[0].width, 1, 1))
+    parts = [*(np.asarray(frames[index]) for index in (0, len(frames) // 2, -1)), swatch.transpose(1, 0, 2)]
+    sample = Image.fromarray(np.concatenate(parts).astype(np.uint8))
     palette = sample.quantize(colours, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     first, *others = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     duration = [every * FRAME_MS] * len(others) + [LAST_MS]

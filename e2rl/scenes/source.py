@@ -143,7 +143,7 @@ class Source(Extension, ABC):
 
     def _windows(self, log: str) -> Iterator[list[Recording]]:
         """Yields the recordings that one log makes, those of the same tracks and map together."""
-        with self._named(log):
+        with self.named(log):
             for recording in self.read(log):
                 if self.mirror:  # both are of one place, or else of one log
                     recording = replace(recording, location=recording.location or recording.scene_id)
@@ -151,8 +151,8 @@ class Source(Extension, ABC):
                     yield list(each.windows(self.starts, self.build.steps))
 
     @contextmanager
-    def _named(self, log: str) -> Iterator[None]:
-        """What `read` raises is an InputError that names the log."""
+    def named(self, log: str) -> Iterator[None]:
+        """What `read` raises in the block is an InputError that names the log."""
         try:
             yield
         except InputError as error:

@@ -122,8 +122,8 @@ def along_arc(
 ) -> tuple[Tensor, Tensor]:
     """States [..., T, 4] and metres driven [..., T] at times [..., T] s ahead of states [..., 4].
 
-    The acceleration [...] is held for `hold` s, never beyond a halt; the curvature [...] for the way that the present
-    speed drives in `turn` s; then speed and heading stay.
+    The acceleration [...] is held for `hold` s, never beyond a halt; the curvature [...] for the distance that the
+    present speed drives in `turn` s; then speed and heading stay.
     """
     x, y, heading, v = (value[..., None] for value in states.unbind(-1))
     accel, curvature = arc.accel[..., None], arc.curvature[..., None]

@@ -37,7 +37,7 @@ def leaders(
 
     s [B, V]: arc lengths of the vehicles on their routes points [B, V, P, 2]; agents [B, M, 4], size [B, M, 2] and
     present [B, M]: of all agents, the vehicles in rows 0..V-1. A vehicle's lateral range is its width around the route;
-    with offsets d [B, V] it also covers the way from the offset back to the route. Without a leader nearer than
+    with offsets d [B, V] it also covers the distance from the offset back to the route. Without a leader nearer than
     `free_gap` m, the gap is `free_gap` and the speed is the vehicle's own.
     """
     length, width = size[:, : s.shape[1]].unbind(-1)
@@ -79,8 +79,8 @@ def _near_pairs(points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Te
     tip = points[:, :, -1] - points[:, :, -2]
     tip = tip / tip.norm(dim=-1, keepdim=True).clamp(min=1e-6)
     past, unit = xy[:, None] - points[:, :, None, -1], tip[:, :, None]
-    aside = past[..., 1] * unit[..., 0] - past[..., 0] * unit[..., 1]
-    beyond = ((past * unit).sum(-1) > 0) & (aside.abs() < far)
+    across = past[..., 1] * unit[..., 0] - past[..., 0] * unit[..., 1]
+    beyond = ((past * unit).sum(-1) > 0) & (across.abs() < far)
     near[..., -1] |= beyond
     ends = SPACING * (STRETCH * torch.arange(1, near.shape[-1] + 1, device=s.device)).clamp(max=count - 1)
     to_come = (ends >= s[..., None] - SPACING)[:, :, None]

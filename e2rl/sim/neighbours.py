@@ -1,6 +1,6 @@
 """The other agents in the ego's frame, for a batch of scenes in one pass; agents are on the last axis.
 
-Which contacts are of the ego's own making, by their step alone; metrics/fault.py judges whole rollouts.
+Which contacts are of the ego's own making, by their step alone; metrics/verdicts.py judges whole rollouts.
 """
 
 from typing import NamedTuple
@@ -52,8 +52,8 @@ def separation_in_frame(position: Tensor, direction: Tensor, own: Tensor, half_s
     size = torch.stack([size, size.flip(1)], 1)  # rows: extent of a box's length and width along the other's axes
     from_own = position.abs() - own - (size * half_size[:, None]).sum(2)
     ahead = (position * direction).sum(1)
-    aside = position[:, 1] * direction[:, 0] - position[:, 0] * direction[:, 1]
-    from_other = torch.stack([ahead, aside], 1).abs() - half_size - (size * own[:, None]).sum(2)
+    across = position[:, 1] * direction[:, 0] - position[:, 0] * direction[:, 1]
+    from_other = torch.stack([ahead, across], 1).abs() - half_size - (size * own[:, None]).sum(2)
     return torch.maximum(from_own, from_other).amax(1)
 
 
@@ -75,7 +75,7 @@ def own_fault(speed: Tensor, near: Neighbours, hit: Tensor, size: Tensor, half_s
     position, turn, half = (value.gather(2, pick)[..., 0] for value in (near.position, near.direction, half_size))
     turn = turn.abs()
     extent = torch.stack([(turn * half).sum(1), (turn.flip(1) * half).sum(1)], 1)
-    ahead, aside = (position.abs() - size / 2 - extent).unbind(1)
-    front = (position[:, 0] > 0) & (ahead > aside)
+    ahead, across = (position.abs() - size / 2 - extent).unbind(1)
+    front = (position[:, 0] > 0) & (ahead > across)
     stands = near.agents.states[..., 3].gather(1, deepest)[:, 0].abs() <= STANDING
     return hit.any(1) & (speed.abs() > STANDING) & (front | stands)

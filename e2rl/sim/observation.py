@@ -31,7 +31,7 @@ NEAREST = 12  # agents
 SPEED, FAR, NEAR, TURNING = 15.0, 40.0, 10.0, 0.5  # scales: m/s, m, m, rad/s
 PER_AGENT = 16  # numbers
 LOOKED_AT = 6  # of them, whose motion manoeuvres are held against
-ELAPSED = 10  # the number that tells the elapsed share of the episode
+ELAPSED = 10  # the number that tells the elapsed fraction of the episode
 COLUMNS = (2, 2, 2, 1, 1, 1, 1, 1, 1)  # of the table `nearest`
 OBSERVATION_SIZE = 11 + 5 * len(LOOK_AHEAD) + 8 + len(PROBE_X) * len(PROBE_Y) + PER_AGENT * NEAREST + PROSPECTS
 
@@ -130,7 +130,7 @@ def glance(config: ObservationConfig, static: StaticScene, ego: EgoState, agents
 
 def ego_features(static: StaticScene, ego: EgoState, limit: Tensor, time: Tensor) -> Tensor:
     """[B, 11]: speed, last action (2), offset and heading to the mission (3), speed limit, distance to the map's
-    end, size (2), elapsed share of the episode."""
+    end, size (2), elapsed fraction of the episode."""
     state, action, pose, size = ego.state, ego.action, ego.pose, static.size
     turned = state[:, 2] - pose.heading
     left = ((static.mission.end - pose.s) / 100).clamp(0, 1)
@@ -196,7 +196,7 @@ def others_of(near: Tensor) -> Others:
 
 
 class Entry(NamedTuple):
-    """A number of the observation: its name; number times scale is in unit ("" for shares, sines and flags)."""
+    """A number of the observation: its name; number times scale is in unit ("" for fractions, sines and flags)."""
 
     name: str
     unit: str = ""

@@ -36,13 +36,13 @@ class Others(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """The manoeuvres as tensors: accelerations [A] m/s^2, offsets [O, 1] m, times [T] s, share [T] of the offset that
-    is reached then, ends [3, 1]: circles of a box along its length."""
+    """The manoeuvres as tensors: accelerations [A] m/s^2, offsets [O, 1] m, times [T] s, fraction [T] of the offset
+    that is reached then, ends [3, 1]: circles of a box along its length."""
 
     accel: Tensor
     offset: Tensor
     time: Tensor
-    share: Tensor
+    fraction: Tensor
     ends: Tensor
 
 
@@ -52,12 +52,12 @@ def plan_on(device: torch.device) -> Plan:
     accel, offset, time, ends = (
         torch.tensor(x, device=device) for x in (ACCELERATIONS, OFFSETS, TIMES, (-1.0, 0.0, 1.0))
     )
-    share = (time / MOVED_OVER).clamp(max=1)
-    return Plan(accel, offset[:, None], time, share**2 * (3 - 2 * share), ends[:, None])
+    fraction = (time / MOVED_OVER).clamp(max=1)
+    return Plan(accel, offset[:, None], time, fraction**2 * (3 - 2 * fraction), ends[:, None])
 
 
 def travelled(speed: Tensor, accel: Tensor, time: Tensor) -> Tensor:
-    """Way [m] after `time` at constant acceleration, to the halt at most; broadcast."""
+    """Distance [m] after `time` at constant acceleration, to the halt at most; broadcast."""
     moving = torch.where(accel < 0, torch.minimum(time, speed / (-accel).clamp(min=1e-3)), time)
     return speed * moving + accel * moving**2 / 2
 
@@ -65,14 +65,14 @@ def travelled(speed: Tensor, accel: Tensor, time: Tensor) -> Tensor:
 def manoeuvres(static: StaticScene, state: Tensor, pose: FrenetPose, rotation: Tensor) -> tuple[Tensor, Tensor]:
     """Places and directions [B, C, T, 2] of egos [B, 4] in their own frames; C: accelerations x offsets."""
     plan = plan_on(state.device)
-    way = travelled(state[:, 3, None, None], plan.accel[:, None], plan.time)
-    xy, heading, *_ = look_along(static, pose.s[:, None] + way.flatten(1))
-    local = (xy - state[:, None, :2]).bmm(rotation.transpose(1, 2)).unflatten(1, way.shape[1:])[:, :, None]
-    turned = (heading - state[:, 2:3]).unflatten(1, way.shape[1:])[:, :, None]
+    distance = travelled(state[:, 3, None, None], plan.accel[:, None], plan.time)
+    xy, heading, *_ = look_along(static, pose.s[:, None] + distance.flatten(1))
+    local = (xy - state[:, None, :2]).bmm(rotation.transpose(1, 2)).unflatten(1, distance.shape[1:])[:, :, None]
+    turned = (heading - state[:, 2:3]).unflatten(1, distance.shape[1:])[:, :, None]
     along = torch.stack([turned.cos(), turned.sin()], -1)
-    aside = pose.d[:, None, None] * (1 - plan.share) + plan.offset * plan.share
+    across = pose.d[:, None, None] * (1 - plan.fraction) + plan.offset * plan.fraction
     left = torch.stack([-along[..., 1], along[..., 0]], -1)
-    place = local + aside[:, None, ..., None] * left
+    place = local + across[:, None, ..., None] * left
     return place.flatten(1, 2), along.expand_as(place).flatten(1, 2)
 
 
@@ -80,10 +80,10 @@ def later(others: Others, time: Tensor) -> tuple[Tensor, Tensor]:
     """Places and directions [B, T, 2, K] of the others at times [T] s, if they go on along their arcs."""
     speed, none = others.speed, torch.zeros_like(others.speed)
     own, _ = along_arc(torch.stack([none, none, none, speed], -1), others.arc, time, HOLD, TURN)  # [B, K, T, 4]
-    ahead, aside, heading, _ = own.permute(3, 0, 2, 1)
+    ahead, across, heading, _ = own.permute(3, 0, 2, 1)
     cos, sin = heading.cos(), heading.sin()
     x, y = others.direction[:, 0, None], others.direction[:, 1, None]
-    moved = torch.stack([x * ahead - y * aside, y * ahead + x * aside], 2)
+    moved = torch.stack([x * ahead - y * across, y * ahead + x * across], 2)
     return others.position[:, None] + moved, torch.stack([x * cos - y * sin, y * cos + x * sin], 2)
 
 
@@ -104,9 +104,9 @@ def gaps(place: Tensor, along: Tensor, size: Tensor, others: Others) -> Tensor:
     along = along / unit
     across = torch.stack([-along[:, 1], along[:, 0]], 1)
     axes = (torch.cat([axis, -(axis * place).sum(1, True)], 1) for axis in (along, across))  # [B T, 3, C]
-    ahead, aside = (centre.bmm(axis) for axis in axes)  # [B T, 3 K, C]
+    ahead, across = (centre.bmm(axis) for axis in axes)  # [B T, 3 K, C]
     beyond = torch.nn.functional.softshrink(ahead, 1.0)
-    front, middle, back = aside.square_().addcmul_(beyond, beyond).chunk(3, 1)
+    front, middle, back = across.square_().addcmul_(beyond, beyond).chunk(3, 1)
     apart = torch.minimum(torch.minimum(front, middle), back).sqrt_().mul_(unit)
     absent = ~others.present.repeat_interleave(steps, 0)[..., None]
     reach = (own[:, 1] + width[..., None]).masked_fill(absent, -torch.inf)

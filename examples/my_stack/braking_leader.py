@@ -1,4 +1,4 @@
-"""A rival adversary: the vehicle ahead of the ego brakes on its recorded path, everybody else replays the log."""
+"""An adversary: the vehicle ahead of the ego brakes on its recorded path, everybody else replays the log."""
 
 import torch
 from tensordict import TensorDict

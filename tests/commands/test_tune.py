@@ -29,7 +29,7 @@ def tune(tmp_path, monkeypatch, capsys):
 
 def test_an_adversary_is_tuned_and_the_study_goes_on(tune):
     """Rollouts are those of the method's own YAML; another budget or method is another study."""
-    e2 = ["synthesizer=e2", "tuning.ladder=2"]
+    e2 = ["synthesizer=e2", "tuning.sweep=2"]
     tune(*e2, "tuning.trials=1")
     run = tune(*e2, "tuning.trials=3")
     result = json.loads((run / "tuning.json").read_text())
@@ -39,7 +39,7 @@ def test_an_adversary_is_tuned_and_the_study_goes_on(tune):
     assert "interception:\n  lateral: " in (run / "tuned.yaml").read_text()
     assert len((run / "tuning_curve.csv").read_text().splitlines()) == 4 and (run / "tuning_curve.png").exists()
     assert "differs in objective; name another file" in tune(*e2, "tuning.attack.off_road=0.1", wrong=True)
-    assert "differs in parameters, space; name another" in tune("synthesizer=cat", "tuning.ladder=2", wrong=True)
+    assert "differs in parameters, space; name another" in tune("synthesizer=cat", "tuning.sweep=2", wrong=True)
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_what_cannot_be_tuned_is_told(tune, options, what):
 
 
 def test_a_planner_is_tuned_in_the_traffic_of_all_methods(tune):
-    run = tune("tuning.group=ego", "ego=sampling", "tuning.trials=2", "tuning.ladder=0")
+    run = tune("tuning.group=ego", "ego=sampling", "tuning.trials=2", "tuning.sweep=0")
     result = json.loads((run / "tuning.json").read_text())
     assert len(result["trials"]) == 2 and set(result["best"]) <= set(load_choice("ego", "sampling"))
     assert {"collision nominal@0", "collision e2@2"} <= set(result["trials"][0]["metrics"])

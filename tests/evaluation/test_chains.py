@@ -64,9 +64,9 @@ def test_the_kept_selection_is_of_a_rollout_of_the_run(tmp_path):
     setup = Setup(scene_set, IDMEgo(), "idm", SimSettings(), batch=2)
     run_protocol(setup, [chain.method], [0, 4], tmp_path, only=[1, 2])
     rollout = chain.rollout(scene_set, "idm", tmp_path)
-    assert rollout["scene_id"] in scene_set.scene_id[1:] and rollout["seed"] in (0, 4)
+    assert rollout.scene_id in scene_set.scene_id[1:] and rollout.seed in (0, 4)
     members = chain.kept.coalition[0].nonzero()[:, 0].tolist()
-    assert members and rollout["adversaries"][members].all()
+    assert members and rollout.adversaries[members].all()
 
 
 def test_what_chooses_nobody_has_no_figure_and_says_so(tmp_path):

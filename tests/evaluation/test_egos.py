@@ -7,7 +7,7 @@ import torch
 
 from e2rl.evaluation.ego_set import EgoSet, pool_trainings, recorded_acceleration, run_egos
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
-from e2rl.evaluation.rollout_files import ROLLOUTS, TABLE, Source, label_rows, read_rows
+from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.score import score_rollouts
@@ -16,9 +16,10 @@ from e2rl.report.comparison_tables import ego_tables, guard_table
 from e2rl.report.drawing import image_of
 from e2rl.report.plots import collision_bars
 from e2rl.sim.env import SimSettings
+from e2rl.sim.rollout_file import ROLLOUTS
 from e2rl.traffic.rule_based import ConstantVelocity
 from tests.learning.small import small_scenes
-from tests.metrics.random_rollouts import random_rollouts
+from tests.metrics.random_rollouts import labelled, random_rollouts
 
 METHODS = [Method("nominal", ConstantVelocity())]
 
@@ -97,7 +98,7 @@ def rows_of(values, ego, training=None):
         row | {"progress": value, "scene_id": str(index), "location": "", "seed": 0}
         for index, (row, value) in enumerate(zip(scored, values, strict=True))
     ]
-    rows = label_rows(rows, Source("made", "test", "nominal", ego))
+    rows = labelled(rows, "made", "test", "nominal", ego)
     return [row | ({} if training is None else {"training": training}) for row in rows], features
 
 

@@ -4,14 +4,15 @@ import json
 
 import pytest
 import torch
+from e2rl.report.score_files import main as score
 
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
-from e2rl.evaluation.rollout_files import ENDED_FILE, METRICS_FILE, ROLLOUTS, TABLE, add_ended, read_metrics, read_rows
+from e2rl.evaluation.rollout_files import ENDED_FILE, METRICS_FILE, TABLE, add_ended, read_metrics, read_rows
 from e2rl.planners.idm_planner import IDMEgo
-from e2rl.report.score_files import main as score
 from e2rl.report.tables import metric_tables
 from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings
+from e2rl.sim.rollout_file import ROLLOUTS
 from e2rl.traffic.rule_based import Replay
 from tests.traffic.e2.traffic_scenes import scenes
 

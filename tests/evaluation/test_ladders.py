@@ -1,7 +1,8 @@
 """The rollout of the intensity figure: unharmed at first, then hit ever earlier."""
 
-from e2rl.evaluation.rollout_files import ROLLOUTS, TABLE, write_rows
+from e2rl.evaluation.rollout_files import TABLE, write_rows
 from e2rl.report.intensity import intensity_sweep, worth
+from e2rl.sim.rollout_file import ROLLOUTS
 
 NAN = float("nan")
 

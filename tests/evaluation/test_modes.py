@@ -7,30 +7,31 @@ import pytest
 
 from e2rl.evaluation.modes import MODES_FILE, find_modes, read_modes, write_modes
 from e2rl.evaluation.protocol import Method, run_protocol
-from e2rl.evaluation.rollout_files import ROLLOUTS, Source, label_rows, read_rows, write_rollouts, write_rows
+from e2rl.evaluation.rollout_files import read_rows, write_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
 from e2rl.report import videos as replay
 from e2rl.report.mode_table import mode_tables
 from e2rl.report.tables import metric_tables
 from e2rl.run.errors import InputError
+from e2rl.sim.rollout_file import ROLLOUTS
 from tests.evaluation.test_protocol import setup_of
-from tests.metrics.random_rollouts import random_rollouts
+from tests.metrics.random_rollouts import labelled, random_rollouts
 from tests.metrics.test_contact import course, scene
 from tests.metrics.test_failure_modes import CROSSING, REAR_END, failure
 from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
 
-def labelled(kind, number, method="e2", eta=2.0, **changes):
+def crashes(kind, number, method="e2", eta=2.0, **changes):
     source = {"dataset": "d", "split": "s", "method": method, "ego_policy": "idm", "eta": eta}
     return [failure(kind, scene=f"{kind['approach']} {index}") | source | changes for index in range(number)]
 
 
 def run_rows():
-    rows = labelled(CROSSING, 6, counted=1.0, preventable=1.0, at_fault=0.0)
-    rows += labelled(CROSSING, 2, "random", counted=0.0, preventable=math.nan, at_fault=0.0)
-    rows += labelled(REAR_END, 4, "random", counted=1.0, preventable=0.0, at_fault=1.0)
-    return rows + labelled(CROSSING, 5, "nominal", 0.0, cfr=0.0, approach="")
+    rows = crashes(CROSSING, 6, counted=1.0, preventable=1.0, at_fault=0.0)
+    rows += crashes(CROSSING, 2, "random", counted=0.0, preventable=math.nan, at_fault=0.0)
+    rows += crashes(REAR_END, 4, "random", counted=1.0, preventable=0.0, at_fault=1.0)
+    return rows + crashes(CROSSING, 5, "nominal", 0.0, cfr=0.0, approach="")
 
 
 def test_modes_have_counts_shares_by_method_and_verdicts():
@@ -66,7 +67,7 @@ def test_the_typical_rollout_is_one_of_its_mode():
 
 
 def test_a_run_without_failures_has_no_modes_and_no_table(tmp_path):
-    found = find_modes(labelled(CROSSING, 3, cfr=0.0, approach=""))
+    found = find_modes(crashes(CROSSING, 3, cfr=0.0, approach=""))
     assert found["modes"] == [] and found["unknown"] == [] and found["groups"][0]["failures"] == 0
     assert mode_tables(found) == [] and find_modes([])["modes"] == []
     write_modes(tmp_path / MODES_FILE, found)
@@ -88,14 +89,14 @@ def test_the_table_has_a_row_for_each_mode_and_says_what_is_missing():
 
 
 def test_small_modes_are_gathered_but_keep_their_numbers():
-    rows = labelled(CROSSING, 20) + labelled(REAR_END, 1) + labelled(REAR_END | {"approach": "oncoming"}, 1)
+    rows = crashes(CROSSING, 20) + crashes(REAR_END, 1) + crashes(REAR_END | {"approach": "oncoming"}, 1)
     found = find_modes(rows)
     assert [(mode["mode"], mode["name"], mode["count"]) for mode in found["modes"]][1:] == [(0, "other", 2)]
     assert sorted(row["mode"] for row in rows)[-2:] == [2, 3] and found["groups"][0]["modes"] == 1
 
 
 def test_words_speeds_and_mode_survive_in_rollouts_csv(tmp_path):
-    rows = label_rows(score_rollouts(random_rollouts(12, seed=20))[0], Source("d", "s", "e2", "idm"))
+    rows = labelled(score_rollouts(random_rollouts(12, seed=20))[0], "d", "s", "e2", "idm")
     modes = find_modes(rows)
     assert modes["failures"] > 2
     write_rows(tmp_path / "rollouts.csv", rows)
@@ -110,9 +111,9 @@ def test_words_speeds_and_mode_survive_in_rollouts_csv(tmp_path):
 
 def test_coverage_reaches_the_table_of_adversaries():
     rollouts = random_rollouts(40, seed=3, vehicles=24, others=2, extent=25.0)
-    rollouts["location"] = [f"place {index}" for index in range(40)]
+    rollouts.location = [f"place {index}" for index in range(40)]
     scores, samples = score_rollouts(rollouts)
-    rows = label_rows(scores, Source("d", "s", "e2", "idm"))
+    rows = labelled(scores, "d", "s", "e2", "idm")
     modes = find_modes(rows)
     (summary,) = metric_rows(rows, samples, draws=100, realism_draws=2)
     value = summary["metrics"]["mode_coverage"]
@@ -133,11 +134,11 @@ def test_the_protocol_writes_the_modes_of_all_methods(tmp_path):
 
 
 def test_the_command_draws_a_typical_failure_of_each_mode(tmp_path, capsys):
-    source, rows = Source("d", "s", "e2", "idm"), []
+    rows = []
     for seed, partner in enumerate((course(30.5, 0, 0, 5), course(31, 0, 0, 5), course(40, 0.3, math.pi, 6))):
-        rollouts = scene(course(0, 0, 0, 12), partner) | {"scene_id": [f"scene {seed}"]}
-        write_rollouts(tmp_path / ROLLOUTS, rollouts, source)
-        rows += label_rows(score_rollouts(rollouts)[0], source)
+        rollouts = scene(course(0, 0, 0, 12), partner).replace(scene_id=[f"scene {seed}"])
+        rollouts.to_npz(tmp_path / ROLLOUTS)
+        rows += score_rollouts(rollouts)[0]
     write_modes(tmp_path / MODES_FILE, find_modes(rows))
     assert replay.main([str(tmp_path), "--modes", "--pixels", "120"]) == 0
     lines = capsys.readouterr().out.splitlines()

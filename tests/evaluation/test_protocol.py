@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from e2rl.evaluation.protocol import Method, Setup, run_protocol, scene_seed
-from e2rl.evaluation.rollout_files import METRICS_FILE, ROLLOUTS, TABLE, read_metrics, read_rows
-from e2rl.evaluation.rollout_reader import read_rollout
+from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, read_metrics, read_rows
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.parts import Parts
 from e2rl.sim.env import SimSettings
+from e2rl.sim.rollout_file import ROLLOUTS, Rollout
 from e2rl.traffic.rule_based import ConstantVelocity
 from tests.learning.small import Ambush, small_scenes
 from tests.traffic.e2.traffic_scenes import scenes, synthesizer
@@ -52,7 +52,7 @@ def test_a_row_for_each_method_and_a_line_and_a_file_for_each_rollout(run):
 def test_files_hold_the_seed_of_the_protocol_and_who_was_controlled(run):
     _, folder = run
     for path in (folder / ROLLOUTS).glob("*.npz"):
-        data = read_rollout(path)
+        data = Rollout.read(path)
         assert data["seed"] in SEEDS and data["ego_policy"] == "idm" and data["dt"] == pytest.approx(0.1)
         assert data["adversaries"].any() == (data["method"] == "e2") and not data["adversaries"][0]
         assert data["states"].shape[0] == 81

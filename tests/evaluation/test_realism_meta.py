@@ -7,12 +7,13 @@ import torch
 
 from e2rl.evaluation.meta_table import Tally, evaluated, log_split_half, meta_rows, summarise_meta
 from e2rl.evaluation.protocol import Method, Setup
-from e2rl.metrics.catalogue import META, META_STAGE
+from e2rl.metrics.catalogue import META_STAGE, STAGES
 from e2rl.metrics.meta_metric import FEATURES, HISTOGRAMS, SMOOTHING, meta_metric
 from e2rl.planners.log_replay import ReplayEgo
 from e2rl.prior.sde import SamplerSettings
 from e2rl.run.parts import Parts
 from e2rl.sim.env import SimSettings
+from e2rl.sim.rollouts import Rollouts
 from e2rl.traffic.nominal import NominalTraffic
 from e2rl.traffic.rule_based import ConstantVelocity, Replay
 from tests.prior.small import small_prior
@@ -35,12 +36,9 @@ def places(count=2, **options):
 def logs_of(scene_set):
     """The logs as rollouts."""
     scene = scene_set.scenes
-    return {
-        "states": scene["logged"],
-        "valid": scene["logged_valid"],
-        "size": scene["size"],
-        "routes": scene["route_log"],
-    }
+    tracks = {"states": scene["logged"], "valid": scene["logged_valid"]}
+    known = {"adversaries": scene["valid"] & False, "seed": torch.zeros(len(scene)), "eta": torch.zeros(len(scene))}
+    return Rollouts.in_scenes(scene_set, torch.arange(len(scene)), **tracks, **known, routes=scene["route_log"])
 
 
 def setup_of(scene_set, batch=64):
@@ -95,11 +93,7 @@ def test_neither_the_order_of_rollouts_nor_their_batches_matter_and_a_weight_is_
     parts = sampled(scene_set, [0, 1, 2])
     found = likelihoods(scene_set, parts)
     same(found, likelihoods(scene_set, parts[::-1]))
-    rows = [
-        (index[k : k + 1], {key: value[k : k + 1] for key, value in part.items() if isinstance(value, torch.Tensor)})
-        for index, part in parts
-        for k in range(2)
-    ]
+    rows = [(index[k : k + 1], part[k : k + 1]) for index, part in parts for k in range(2)]
     same(found, likelihoods(scene_set, rows))
     weighed, repeated = Tally(scene_set), likelihoods(scene_set, parts[:1] * 3)
     weighed.add(*parts[0], weight=3)
@@ -119,12 +113,12 @@ def test_the_order_of_vehicles_does_not_matter():
         scene[key] = scene[key][:, :, all_rows]
     for key in ("route_points", "route_light", "route_light_s", "route_log"):
         scene[key] = scene[key][:, order]
-    shuffled = {
-        "states": part["states"][:, :, all_rows],
-        "valid": part["valid"][:, :, all_rows],
-        "size": part["size"][:, all_rows],
-        "routes": part["routes"][:, order],
-    }
+    shuffled = part.replace(
+        states=part.states[:, :, all_rows],
+        valid=part.valid[:, :, all_rows],
+        size=part.size[:, all_rows],
+        routes=part.routes[:, order],
+    )
     same(found, likelihoods(other, [(index, shuffled)]))
 
 
@@ -144,7 +138,7 @@ def test_lights_belong_to_ways_so_that_whoever_follows_none_runs_none():
     hits = []
     for routes in (scene_set.scenes["route_log"], torch.full_like(scene_set.scenes["route_log"], -1)):
         tally = Tally(scene_set)
-        tally.add(torch.arange(2), logs_of(scene_set) | {"routes": routes})
+        tally.add(torch.arange(2), logs_of(scene_set).replace(routes=routes))
         hits.append(tally.hits["red_light"].view(2, -1).sum(1).tolist())
     assert hits == [[2, 2], [0, 0]]  # those at 22 and 10 m pass 30 m within 3 s
 
@@ -160,7 +154,7 @@ def test_the_rows_of_a_run():
     assert [row["method"] for row in rows] == ["replay", "constant_velocity", "nominal"]
     assert all((row["stage"], row["n_seeds"], row["n_rollouts"]) == (META_STAGE, 3, 6) for row in rows)
     replay, straight, sampling = (row["metrics"] for row in rows)
-    assert set(replay) == {metric.name for metric in META}
+    assert set(replay) == {metric.name for metric in STAGES[META_STAGE]}
     assert set(straight) == set(replay) - {"real_split_half"} == set(sampling)
     for name in HISTOGRAMS:  # in these scenes both are the log
         assert straight[name]["mean"] == pytest.approx(replay[name]["mean"], rel=1e-4), name

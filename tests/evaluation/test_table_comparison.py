@@ -4,8 +4,8 @@ import copy
 import math
 
 import pytest
-
 from e2rl.evaluation.table_comparison import compare_tables
+
 from e2rl.run.errors import InputError
 
 

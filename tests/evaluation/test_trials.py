@@ -17,7 +17,7 @@ from e2rl.evaluation.trials import (
     PlannerObjective,
     PlannerTrials,
 )
-from e2rl.evaluation.tuning import SearchSettings, best_of, search
+from e2rl.evaluation.tuning import SearchSettings, best_of, line_of, search
 from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.planners.path import MissionPath
 from e2rl.run.config import load_choice, resolved
@@ -76,7 +76,7 @@ def test_every_trial_meets_traffic_made_against_it():
 
     on = Watched(synthesizer().prior)
     trials = planner_trials([Method("nominal", on), Method("e2", on, 2.0)])
-    settings = SearchSettings(trials=3, startup=1, ladder=0)
+    settings = SearchSettings(trials=3, startup=1, sweep=0)
     first, *others = search(trials, {"gain": 1.0}, {"gain": [0.0, 1.0]}, settings, PlannerObjective())
     assert {*DRIVING, "collision nominal@0", "collision e2@2", "ended"} <= set(first["metrics"])
     assert first["admissible"] and first["metrics"]["progress"] > 15
@@ -99,13 +99,13 @@ def test_leaving_the_road_counts_as_a_collision():
 
 def test_a_trial_that_loses_rollouts_is_counted_and_refused():
     trials = planner_trials([Method("replay", Replay())])
-    settings, limits = SearchSettings(trials=2, startup=1, ladder=0), PlannerObjective(progress_floor=0.0)
+    settings, limits = SearchSettings(trials=2, startup=1, sweep=0), PlannerObjective(progress_floor=0.0)
     frail = {"gain": 1.0, "frail": True}
     first, second = search(trials, frail, {"gain": [0.9, 1.0]}, settings, limits)
     assert first["metrics"]["ended"] == 0.0 and first["admissible"]
     assert second["metrics"]["ended"] == 0.5 == second["metrics"]["ended: raised KeyError"]
     assert not second["admissible"] and second["metrics"]["progress"] > 0
-    assert "50.0% ended for an error" in limits.text(second["metrics"])
+    assert "ended 0.5; gain=" in line_of([first, second], limits)
 
 
 def attack(parameters):
@@ -122,7 +122,7 @@ def attack(parameters):
 )
 def test_the_most_failures_within_the_budget_are_found(limits, low, high):
     """Failures and the price both rise with the gain: the best trial is the largest gain that the limits allow."""
-    settings = SearchSettings(trials=30, startup=10, ladder=9)
+    settings = SearchSettings(trials=30, startup=10, sweep=9)
     present, space = {"gain": 0.1, "step_size": 1.0}, {"gain": [0.1, 8.0, "log"]}
     trials = search(attack, present, space, settings, AttackObjective(**limits))
     best = best_of(trials)["parameters"]["gain"]

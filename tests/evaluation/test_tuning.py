@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 from e2rl.evaluation import tuning
 from e2rl.evaluation.trials import PlannerObjective
-from e2rl.evaluation.tuning import SearchSettings, best_of, ladder, save, search, yaml_of
+from e2rl.evaluation.tuning import SearchSettings, best_of, save, search, sweep, yaml_of
 from e2rl.run.config import choices, load_choice
 from e2rl.run.errors import InputError
 
@@ -26,7 +26,7 @@ def road(parameters):
 
 
 def tried(space=SPACE, evaluate=road, present=PRESENT, objective=OBJECTIVE, file=None, about=None, **settings):
-    settings = SearchSettings(**{"trials": 2, "startup": 10, "ladder": 0} | settings)
+    settings = SearchSettings(**{"trials": 2, "startup": 10, "sweep": 0} | settings)
     return search(evaluate, present, space, settings, objective, file, about)
 
 
@@ -123,22 +123,22 @@ def test_nan_of_the_present_parameters_stops_and_that_of_others_is_refused():
 
 
 def test_a_ladder_is_even_on_its_scale_and_leaves_the_others_as_they_are():
-    """Ratios of a logarithmic ladder and differences of a linear one are constant; both ends are on it, the present
+    """Ratios of a logarithmic sweep and differences of a linear one are constant; both ends are on it, the present
     value is not tried again."""
     space = {"speed": [0.5, 8.0, "log"], "caution": [1.0, 3.0]}
-    rungs = ladder(PRESENT, space, 5)
+    rungs = sweep(PRESENT, space, 5)
     assert [rung["speed"] for rung in rungs] == pytest.approx([0.5, 1, 2, 4, 8])
     assert {rung["caution"] for rung in rungs} == {PRESENT["caution"]}
-    assert ladder(PRESENT, {"speed": [1, 4]}, 4) == [{"speed": value} for value in (1, 2, 3, 4)]
-    assert ladder(PRESENT, space, 0) == []
-    assert [rung["speed"] for rung in ladder(PRESENT, SPACE, 3)] == [0.0, 20.0]
-    rungs = ladder(PRESENT, {"speed": [10 / 7.3, 10 * 7.3, "log"]}, 3)
+    assert sweep(PRESENT, {"speed": [1, 4]}, 4) == [{"speed": value} for value in (1, 2, 3, 4)]
+    assert sweep(PRESENT, space, 0) == []
+    assert [rung["speed"] for rung in sweep(PRESENT, SPACE, 3)] == [0.0, 20.0]
+    rungs = sweep(PRESENT, {"speed": [10 / 7.3, 10 * 7.3, "log"]}, 3)
     assert [rung["speed"] for rung in rungs] == pytest.approx([10 / 7.3, 73])
 
 
 def test_the_ladder_comes_first_and_counts_as_trials():
     space = {"speed": [1.0, 16.0, "log"], "caution": [1.0, 3.0]}
-    trials = tried(space, trials=7, startup=7, ladder=5)
+    trials = tried(space, trials=7, startup=7, sweep=5)
     assert [trial["parameters"]["speed"] for trial in trials[:6]] == pytest.approx([10, 1, 2, 4, 8, 16])
     assert len(trials) == 7 and trials[6]["parameters"]["caution"] != PRESENT["caution"]
 

@@ -33,25 +33,27 @@ def run(script, folder, *overrides):
     return done.stdout
 
 
-def test_rival_ego_source_and_metric_share_a_table_with_e2(tmp_path):
-    out = run(
+@pytest.mark.slow
+def test_adversary_ego_source_and_metric_share_a_table_with_e2(tmp_path):
+    run(
         "evaluate.py",
         tmp_path / "run",
         "data=csv_tracks",
         f"data.path={EXAMPLES / 'logs'}",
         "ego=cruise",
         "methods=[replay,braking_leader,e2]",
-        "plugins=[my_stack.hard_braking]",
+        "experiment=hard_braking",
         "seeds=[0]",
         "data.workers=1",
     )
     rows = {row["method"]: row for row in json.loads((tmp_path / "run" / "metrics.json").read_text())}
     assert set(rows) == {"replay", "braking_leader", "e2"} and rows["braking_leader"]["ego"] == "cruise"
-    assert rows["braking_leader"]["eta"] == 2 and "hard_braking" in out and "braking_leader" in out
+    assert rows["braking_leader"]["eta"] == 2 and "hard_braking" in rows["e2"]["metrics"]
     with open(tmp_path / "run" / "rollouts.csv") as file:
         assert {row["hard_braking"] for row in csv.DictReader(file)} <= {"0.0", "1.0", "0", "1"}
 
 
+@pytest.mark.slow
 def test_the_curriculum_runs_a_round(tmp_path):
     out = run(
         "train.py",

@@ -16,6 +16,7 @@ ROOT = Path(__file__).parents[2]
 OPTIONS = [*SHORT, "methods=[constant_velocity,idm]", "seeds=[0,1]", "batch=2", "processes=1"]
 
 
+@pytest.mark.slow
 def test_jobs_of_submitit_give_the_run_of_one_machine(tmp_path, monkeypatch, capsys):
     """Two local jobs with two of four batches each. Then the tables, bit for bit; and a shard that another run's is
     added to is refused."""

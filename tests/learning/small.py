@@ -1,6 +1,7 @@
 """Small parts for the learning tests: a few agents, trivial attackers, quick settings."""
 
 import torch
+from e2rl.scripts.train import train_round
 
 from e2rl.learning.evolution import Evolution, RoundSettings
 from e2rl.learning.memory import Memory
@@ -64,7 +65,7 @@ def small_run(
     spread=0.0,
     folder=None,
     memory=4096,
-    ahead=False,
+    prefetch=False,
     against="current",
     **ppo,
 ):
@@ -84,6 +85,17 @@ def small_run(
         **(expert or {}),
     )
     traffic = "replay" if live is None else "live"
-    settings = RoundSettings(scenes=3, nominal=nominal, traffic=traffic, against=against, memory=memory, ahead=ahead)
+    given = {"traffic": traffic, "against": against, "memory": memory, "prefetch": prefetch}
+    settings = RoundSettings(scenes=3, nominal=nominal, **given)
     curriculum = AdaptiveCurriculum(len(scenes), rounds, seed, spread=spread)
     return Evolution(curriculum, improve, brake_check(scenes), settings, seed, memory=Memory(folder, memory))
+
+
+def steady(metrics):
+    """The metrics of a round that do not depend on the machine."""
+    return {name: value for name, value in metrics.items() if "time/" not in name and "seconds" not in name}
+
+
+def rounds(run, count):
+    """The steady metrics of so many rounds."""
+    return [steady(train_round(run)) for _ in range(count)]

@@ -1,16 +1,32 @@
-"""The traffic of a round: whoever makes which part of it, it is the same; what cannot be made or driven costs its own
-rows, the round goes on, and the reasons are counted."""
+"""The traffic of a round: the same whoever makes which part of it; only what some driver avoids enters; what cannot be
+made costs its own rows, the round goes on, and the reasons are counted."""
+
+from functools import partial
 
 import pytest
 import torch
+from e2rl.scripts.train import train_round
 
-from e2rl.learning.attack import ATTACK, NOMINAL, Order, counted, ended_of, make_traffic, unsearched
-from e2rl.learning.evolution import Evolution, RoundSettings
-from e2rl.learning.planner_tuning import PlannerImprovement
-from e2rl.learning.schedules import AdaptiveCurriculum
+from e2rl.learning.attack import (
+    AFTER,
+    ATTACK,
+    LATE,
+    Order,
+    Solved,
+    acting,
+    counted,
+    drawn,
+    from_start,
+    make_traffic,
+    mixture,
+    solvable,
+    unsearched,
+)
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.report.rounds import round_line
 from e2rl.run.errors import InputError
+from e2rl.scenes.boxes import separation
+from e2rl.sim import dynamics
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.rollout import synthesize_traffic
 from e2rl.traffic.traffic import FULL
@@ -29,14 +45,14 @@ def odd_ones_left_out(traffic):
 @pytest.mark.parametrize("batch", [1, 2, 5])
 def test_batches_are_joined_in_the_order_of_the_scenes(nominal, batch):
     order = Order(0, SCENES, ETA, torch.full_like(SCENES, FULL), 7, None)
-    traffic = make_traffic(order, brake_check(small_scenes(5)), odd_ones_left_out, nominal, batch)
+    traffic, _ = make_traffic(order, brake_check(small_scenes(5)), odd_ones_left_out, nominal, batch)
     kept = [0, 4, 2]
     every = kept + SCENES.tolist() * nominal
     assert traffic["scene_index"].tolist() == every and traffic["kept"].tolist() == (SCENES % 2 == 0).tolist()
     assert traffic["eta"].tolist() == [2.0, 0.0, 1.5] + [0.0] * (len(every) - 3)
     assert traffic["span"][:3, 0].tolist() == kept and not traffic["span"][3:].any()
     assert traffic["attacked"] == 4 / 5 and traffic["contact"] == 3 / 5  # of all that were attacked
-    whole = make_traffic(order, brake_check(small_scenes(5)), odd_ones_left_out, nominal)
+    whole, _ = make_traffic(order, brake_check(small_scenes(5)), odd_ones_left_out, nominal)
     assert all(torch.equal(traffic[name], whole[name]) for name in whole) and set(traffic) == set(whole)
 
 
@@ -78,10 +94,10 @@ def order_of(count, number=2):
 )
 def test_rows_that_raise_are_left_out_and_named_and_the_others_are_as_without_them(raises, reason):
     scenes = small_scenes(4)
-    made = make_traffic(order_of(4), synthesize_traffic(scenes, Stumbles([2], raises), SimSettings(), batch=3))
-    whole = make_traffic(order_of(4), synthesize_traffic(scenes, Ambush(), SimSettings(), batch=3))
-    assert made["kept"].tolist() == [True, True, False, True] and whole["kept"].all() and not ended_of(whole)
-    (entry,) = ended_of(made)
+    made, errored = make_traffic(order_of(4), synthesize_traffic(scenes, Stumbles([2], raises), SimSettings(), batch=3))
+    whole, none = make_traffic(order_of(4), synthesize_traffic(scenes, Ambush(), SimSettings(), batch=3))
+    assert made["kept"].tolist() == [True, True, False, True] and whole["kept"].all() and not none
+    (entry,) = errored
     assert (entry["round"], entry["during"], entry["scene"], entry["eta"]) == (2, ATTACK, 2, 2.0)
     assert entry["reason"] == reason and ("no way out" in entry["traceback"]) == raises
     assert made["scene_index"].tolist() == [0, 1, 3, 0, 1, 2, 3] and made["eta"].tolist() == [2.0] * 3 + [0.0] * 4
@@ -96,66 +112,157 @@ def test_where_nothing_can_be_made_the_message_says_why():
         make_traffic(order_of(2), synthesize)
 
 
-@pytest.mark.parametrize("ahead", [False, True])
-def test_the_round_goes_on_and_counts_them_apart_from_the_doomed(ahead):
+@pytest.mark.parametrize("prefetch", [False, True])
+def test_the_round_goes_on_and_counts_them_apart_from_the_doomed(prefetch):
     scenes = small_scenes(3)
-    run = small_run(scenes=scenes, nominal="prior", ahead=ahead)
+    run = small_run(scenes=scenes, nominal="prior", prefetch=prefetch)
     run.synthesize = synthesize_traffic(scenes, Stumbles([1]), SimSettings())
-    metrics = run.run_round()
-    assert metrics["synthesizer/ended"] == 1.0 == metrics["synthesizer/ended_raised_ZeroDivisionError"]
-    assert metrics["synthesizer/left_out"] == 0.0 and [entry["scene"] for entry in run.ended] == [1]
+    metrics = train_round(run)
+    assert metrics["synthesizer/errored"] == 1.0 == metrics["synthesizer/errored_raised_ZeroDivisionError"]
+    assert metrics["synthesizer/left_out"] == 0.0 and [entry["scene"] for entry in run.errored] == [1]
     assert "1 raised ZeroDivisionError" in round_line(metrics, 1, 4)
     assert 1 not in run.episodes.scene_index[run.episodes.adversarial].tolist()
-    assert run.run_round()["synthesizer/ended"] == 1.0 and run.ended[0]["round"] == 1
-
-
-class Fragile(IDMEgo):
-    """Raises in the scene whose ego starts at `bad` m/s, or everywhere, while it desires more than 11 m/s."""
-
-    def __init__(self, desired_speed: float = 10.0, headway: float = 1.0, bad: float = -1.0) -> None:
-        super().__init__(desired_speed=desired_speed, headway=headway, use_limits=False)
-        self.bad = bad
-
-    def plan(self, world):
-        ill = (world.scene["start"][:, 0, 3] - self.bad).abs() < 1e-6
-        if self.desired_speed > 11 and (self.bad == 0 or ill.any()):
-            raise KeyError("lost")
-        return super().plan(world)
-
-
-def tuned(present, space):
-    scenes = small_scenes(3, steps=40)
-    scenes.scenes["start"][:, 0, 3] = 6.0 + torch.arange(3)
-    search = {"trials": 2, "startup": 10}
-    improve = PlannerImprovement(Fragile(**present), present, scenes, SimSettings(), search, space, batch=2)
-    return Evolution(AdaptiveCurriculum(3, 2), improve, brake_check(scenes), RoundSettings(scenes=3, nominal="log"))
-
-
-def test_a_planner_that_raises_in_tuning_loses_these_episodes_and_does_not_win():
-    run = tuned({"desired_speed": 10.0, "headway": 1.0, "bad": 7.0}, {"desired_speed": [10.0, 200.0]})
-    metrics = run.run_round()
-    assert [trial["metrics"]["ended"] for trial in run.improve.trials] == [0.0, 2.0], "attacked and recorded"
-    assert not run.improve.trials[1]["admissible"] and run.ego.desired_speed == 10.0
-    assert metrics["train/ended"] == 0.0 and run.ended == []
-
-
-def test_a_planner_that_always_raised_there_is_tuned_on_the_rest():
-    run = tuned({"desired_speed": 12.0, "headway": 1.0, "bad": 7.0}, {"headway": [1.0, 1.5]})
-    metrics = run.run_round()
-    assert metrics["train/ended"] == 2.0 == metrics["train/ended_raised_KeyError"] and metrics["train/episodes"] == 4.0
-    assert {entry["during"] for entry in run.ended} == {"tuning"} and len(run.ended) == 2
-    assert set(run.episodes.scene_index.tolist()) == {0, 2}
-
-
-def test_a_trial_without_any_episode_is_refused_and_the_present_parameters_have_a_message():
-    run = tuned({"desired_speed": 10.0, "headway": 1.0, "bad": 0.0}, {"desired_speed": [10.0, 200.0]})
-    run.run_round()
-    assert run.improve.trials[1]["metrics"]["ended"] == 6.0 and not run.improve.trials[1]["admissible"]
-    with pytest.raises(InputError, match=r"NaN metrics .ended_raised_KeyError"):
-        tuned({"desired_speed": 12.0, "headway": 1.0, "bad": 0.0}, {"headway": [1.0, 1.5]}).run_round()
+    assert train_round(run)["synthesizer/errored"] == 1.0 and run.errored[0]["round"] == 1
 
 
 def test_counts_are_metrics():
-    assert counted([]) == {"ended": 0.0}
-    assert counted([{"reason": "raised A"}] * 2) == {"ended": 2.0, "ended_raised_A": 2.0}
-    assert NOMINAL != ATTACK
+    assert counted([]) == {"errored": 0.0}
+    assert counted([{"reason": "raised A"}] * 2) == {"errored": 2.0, "errored_raised_A": 2.0}
+
+
+# --- what some driver avoids
+
+
+def ambush(scenes):
+    """Vehicle 1 stands on the ego from the second step on in odd scenes; in even ones it is where `brake_check` puts
+    it."""
+    attack = brake_check(scenes)
+
+    def synthesize(ego, index, eta, seed):
+        traffic = attack(ego, index, eta, seed)
+        doomed = (index % 2 == 1) & (eta > 0)
+        at = scenes.batch(index)["start"][:, None, 0, :2].expand(-1, traffic["states"].shape[1], 2)
+        spread = 1.0 + torch.arange(traffic["states"].shape[1])[:, None]  # wherever the ego gets to
+        traffic["states"][doomed, :, 1, :2] = (at + spread * torch.tensor([1.0, 0.0]))[doomed]
+        return traffic | {"contact": eta > 0}
+
+    return synthesize
+
+
+def test_the_doomed_are_left_out_and_reported():
+    scenes = small_scenes(4)
+    run = small_run(scenes=scenes)
+    run.synthesize, run.solvable = ambush(scenes), partial(solvable, scenes=scenes, sim=SimSettings())
+    run.settings = type(run.settings)(scenes=4, nominal="log")
+    metrics = train_round(run)
+    kept = run.memory.rounds[-1].traffic["scene_index"]
+    assert sorted(kept.tolist()) == [0, 2] and metrics["synthesizer/left_out"] == 2.0
+    assert metrics["synthesizer/contact"] == 1.0, "the intensity follows all of them"
+    assert set(run.episodes.scene_index[run.episodes.adversarial].tolist()) <= {0, 2}
+
+
+def test_a_round_goes_on_where_everything_is_left_out():
+    scenes = small_scenes(4)
+    run = small_run(scenes=scenes, nominal="none")
+    run.solvable = lambda traffic: unsearched(traffic["states"])._replace(kept=torch.zeros_like(traffic["contact"]))
+    metrics = train_round(run)
+    assert metrics["synthesizer/left_out"] == 3.0 and not run.episodes.adversarial.any()
+
+
+def test_an_evasion_that_begins_late_is_preceded_by_the_drive():
+    driven, evasion = torch.arange(12.0).view(1, 6, 2).repeat(2, 1, 1), -1 - torch.arange(12.0).view(1, 6, 2).repeat(2, 1, 1)
+    found = from_start(driven, evasion, torch.tensor([0, 4]))
+    assert torch.equal(found[0], evasion[0])
+    assert torch.equal(found[1], torch.cat([driven[1, :4], evasion[1, :2]]))
+
+
+def test_without_contact_nothing_is_searched():
+    scenes = small_scenes(2)
+    traffic = brake_check(scenes)(None, torch.arange(2), 0.0, 0)
+    solved = solvable(traffic, scenes, SimSettings())
+    assert solved.kept.all() and not solved.span.any()
+
+
+def test_evasions_are_kept_with_what_they_avoid():
+    """Driven without contact by their actions; marked by the steps in which they act, around the contact."""
+    scenes, index = small_scenes(3, steps=40), torch.arange(3)
+    traffic = brake_check(scenes)(None, index, torch.tensor([1.2, 0.5, 3.0]), 0)
+    solved = solvable(traffic, scenes, SimSettings())
+    assert solved.kept.all() and not solved.span[1].any() and not solved.evasion[1].any(), "not hit, so not searched"
+    begin, end = solved.span[[0, 2]].unbind(1)
+    assert (end - AFTER > 10).all() and (end[1] < end[0]), "the nearer car is met earlier"
+    assert (begin < end - AFTER).all()
+    found = dynamics.rollout(traffic["states"][:, 0, 0], solved.evasion)
+    size, other = scenes.scenes["size"][index], traffic["states"][:, 1:, 1]
+    clear = separation(found, size[:, None, 0], other, size[:, None, 1]) > 0
+    hit = separation(traffic["states"][:, 1:, 0], size[:, None, 0], other, size[:, None, 1]) < 0
+    assert clear[[0, 2]].all() and hit[[0, 2]].any(1).all()
+    stop = hit.int().argmax(1) + 1
+    assert torch.equal(end, stop[[0, 2]] + AFTER) and (begin >= stop[[0, 2]] - LATE).all()
+    late = int(stop[0]) - LATE
+    torch.testing.assert_close(found[0, :late], traffic["states"][0, 1 : late + 1, 0], atol=1e-3, rtol=0)
+    assert late > 2, "it drives as it did until then"
+
+
+def test_an_evasion_acts_from_before_it_departs_until_after_the_contact():
+    steps = torch.arange(1, 41)
+    driven = torch.zeros(3, 40, 4)
+    driven[..., 0] = steps.float()
+    evasion = driven.clone()
+    evasion[0, 19:, 1] = 1.0  # beside the drive from step 20 on
+    evasion[1, 4:, 1] = 1.0
+    begin, stop = torch.tensor([0, 2, 0]), torch.tensor([30, 38, 15])
+    assert acting(evasion, driven, begin, stop).tolist() == [[10, 35], [2, 40], [5, 20]]
+
+
+def test_make_traffic_takes_evasions_of_kept_rows_only():
+    scenes = small_scenes(3)
+    order = Order(0, torch.arange(3), torch.ones(3), torch.zeros(3).long(), 0, None)
+    kept, span = torch.tensor([True, False, True]), torch.tensor([[1, 2], [3, 4], [5, 6]])
+    solved = Solved(kept, torch.ones(3, 20, 2), span)
+    rows, _ = make_traffic(order, lambda *given: brake_check(scenes)(*given[:4]), lambda traffic: solved)
+    assert rows["span"].tolist() == [[1, 2], [5, 6], [0, 0], [0, 0], [0, 0]]
+    assert rows["kept"].tolist() == kept.tolist() and not rows["evasion"][2:].any()
+
+
+# --- two attackers
+
+
+MIXED = torch.tensor([3, 0, 4, 1, 2, 9, 7])
+
+
+def marked(mark, lost=()):
+    """A method that marks its rows, and cannot make the scenes `lost`."""
+
+    def synthesize(ego, scenes, eta, seed, *template):
+        there = [row for row, scene in enumerate(scenes.tolist()) if scene not in lost]
+        made = {"scene_index": scenes[there], "eta": eta[there], "mark": torch.full((len(there),), mark)}
+        made |= {"template": template[0][there]} if template else {}
+        return made | {"ended": {row: {"reason": mark} for row in range(len(scenes)) if row not in there}}
+
+    return synthesize
+
+
+def test_rows_come_in_the_order_of_the_scenes_each_by_its_own_method():
+    eta, template = torch.arange(7.0), torch.arange(7)
+    made = mixture(marked(1), marked(2), 0.5)(None, MIXED, eta, 5, template)
+    assert torch.equal(made["scene_index"], MIXED) and torch.equal(made["eta"], eta)
+    assert torch.equal(made["template"], template) and not made["ended"]
+    assert torch.equal(made["mark"] == 2, drawn(MIXED, 5, 0.5)) and set(made["mark"].tolist()) == {1, 2}
+
+
+def test_who_attacks_a_scene_does_not_depend_on_its_batch():
+    whole = drawn(MIXED, 5, 0.5)
+    assert torch.equal(whole, torch.cat([drawn(part, 5, 0.5) for part in MIXED.split(2)]))
+    assert any(not torch.equal(whole, drawn(MIXED, seed, 0.5)) for seed in range(6, 12))
+
+
+def test_the_fraction_is_that_of_the_scenes():
+    scenes = torch.arange(4000)
+    assert abs(drawn(scenes, 1, 0.3).float().mean() - 0.3) < 0.03
+    assert not drawn(scenes, 1, 0.0).any() and drawn(scenes, 1, 1.0).all()
+
+
+def test_rows_that_a_method_cannot_make_are_named_by_their_place():
+    made = mixture(marked(1, lost=[4]), marked(2, lost=[4]), 0.5)(None, MIXED, torch.ones(7), 5)
+    assert made["scene_index"].tolist() == [3, 0, 1, 2, 9, 7] and set(made["ended"]) == {2}

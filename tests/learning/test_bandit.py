@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from e2rl.learning.bandit import BanditCurriculum
-from e2rl.learning.scheduler import Outcomes, outcomes_of, tally
+from e2rl.learning.scheduler import Outcomes
 from e2rl.run.errors import InputError
 from e2rl.traffic.traffic import FULL, PAIR, SINGLE, TEMPLATES
 
@@ -33,6 +33,26 @@ def test_arms_that_never_or_always_fail_are_drawn_less_than_those_in_between():
     assert half > 0.8 and never == pytest.approx(always, abs=0.02) and never > 0.02
     for eta, share in ((1.0, never), (2.0, half), (3.0, always)):
         assert share == pytest.approx(probability(curriculum, eta, SINGLE), abs=0.03), "drawn as stated"
+
+
+def test_the_probability_is_a_softmax_of_values_with_exploration():
+    curriculum = BanditCurriculum(6, 10, etas=[1.0, 2.0], templates=["pair"], forgetting=0.0)
+    told(curriculum, 1.0, PAIR, 0.5)
+    value = curriculum.value()
+    expected = 0.9 * (10 * value / 0.25).softmax(0) + 0.1 / 2
+    torch.testing.assert_close(curriculum.probability(), expected)
+    assert curriculum.eta == pytest.approx((expected * torch.tensor([1.0, 2.0])).sum().item())
+
+
+def test_an_attack_counts_once_however_many_episodes_are_driven_in_it():
+    """Failed, survived, kept and left out; an attack that nobody drove is kept, but neither failed nor survived."""
+    curriculum = BanditCurriculum(6, 10, etas=[1.0, 2.0], templates=["pair", "full"], forgetting=0.25)
+    eta, template = torch.tensor([1.0, 1.0, 1.0, 2.0]), torch.tensor([PAIR, PAIR, PAIR, FULL])
+    gone, episodes = torch.tensor([False, True, False, False]), torch.tensor([4, 0, 0, 10])
+    for _ in range(2):
+        curriculum.observe(Outcomes(eta, template, gone, episodes, torch.tensor([1, 0, 0, 10])))
+    counts = 1.75 * torch.tensor([[0.25, 0, 0, 1], [0.75, 0, 0, 0], [2, 0, 0, 1], [1, 0, 0, 0]])
+    torch.testing.assert_close(curriculum._counts, counts.double())
 
 
 def test_failures_that_nobody_prevents_teach_nothing():
@@ -93,30 +113,7 @@ def test_state_goes_on_exactly():
 
 
 def test_wrong_settings_are_refused():
-    wrong = ({"etas": []}, {"etas": [0.0, 1.0]}, {"templates": []}, {"templates": ["trio"]}, {"exploration": 2.0})
-    for settings in (*wrong, {"forgetting": -0.1}, {"share": 1.5}, {"sharpness": -1.0}, {"num_scenes": 0}):
+    wrong = ({"etas": []}, {"etas": [0.0, 1.0]}, {"templates": []}, {"templates": ["trio"]}, {"num_scenes": 0})
+    for settings in (*wrong, {"forgetting": -0.1}, {"fraction": 1.5}):
         with pytest.raises(InputError, match="curriculum"):
             BanditCurriculum(**{"num_scenes": 6, "rounds": 10} | settings)
-
-
-def test_episodes_count_for_the_attack_whose_row_they_drove():
-    """Attacks 0 and 2 of three entered D'; rows beyond them are nominal or remembered."""
-    eta, template = torch.tensor([1.0, 2.0, 2.0]), torch.tensor([SINGLE, PAIR, PAIR])
-    row, failed = torch.tensor([0, 0, 1, 2, 5, 1]), torch.tensor([True, False, True, True, True, True])
-    outcomes = outcomes_of(eta, template, torch.tensor([0, 2]), row, failed)
-    assert outcomes.left_out.tolist() == [False, True, False]
-    assert outcomes.episodes.tolist() == [2, 0, 2] and outcomes.failures.tolist() == [1, 0, 2]
-    assert outcomes.failure_rate.nan_to_num(-1).tolist() == [0.5, -1.0, 1.0]
-
-
-def test_the_table_counts_draws_episodes_and_failures_by_arm():
-    eta, template = torch.tensor([1.0, 2.0, 2.0]), torch.tensor([SINGLE, PAIR, PAIR])
-    flags = torch.tensor([False, True, False])
-    outcomes = Outcomes(eta, template, flags, torch.tensor([2, 0, 2]), torch.tensor([1, 0, 2]))
-    rows = tally(4, eta, outcomes, {(0.5, "full"): 0.2, (1.0, "single"): 0.1})
-    plain = [tuple(-1 if value != value else value for value in row.values()) for row in rows]
-    assert plain == [
-        (4, 1.0, "single", 1, 0, 2, 1, 0.5, 0.1),
-        (4, 2.0, "pair", 2, 1, 2, 2, 1.0, -1),
-        (4, 0.5, "full", 0, 0, 0, 0, -1, 0.2),
-    ]

@@ -1,13 +1,15 @@
-"""One drive per row of a pool: in order, whatever the batch, counted to its first failure."""
+"""One drive per row of a pool, counted to its first failure; finished episodes without the bias towards short ones."""
 
 import pytest
 import torch
+from e2rl.scripts.train import train_round
+from tensordict import TensorDict
 
-from e2rl.learning.driving import PoolDriver, episodes_of
+from e2rl.learning.driving import PoolDriver, episodes_of, finished_episodes
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.pool import TrafficPool
-from tests.learning.small import brake_check, small_scenes
+from tests.learning.small import brake_check, small_run, small_scenes
 
 
 def attacked(scenes, eta=1.0):
@@ -49,3 +51,103 @@ def test_mean_acceleration_is_that_of_the_drive():
     episodes, _ = driver.drive_all(IDMEgo(acceleration=1.0), pool)
     gained = driver.env.world().states[:, 0, 3] - 10.0
     assert episodes.acceleration.tolist() == pytest.approx((gained / 2.0).tolist(), abs=1e-3)
+
+
+# --- episodes of collected frames
+
+
+def frames(lengths, total, fail=()):
+    """One environment: episodes of these lengths in turn, reward 1 a step; those in `fail` end by contact."""
+    timestep = torch.cat([torch.arange(1, n + 1) for n in lengths])[:total]
+    number = torch.cat([torch.full((n,), k) for k, n in enumerate(lengths)])[:total]
+    done = torch.tensor([t == lengths[k] for t, k in zip(timestep.tolist(), number.tolist(), strict=True)])
+    contact = done & torch.tensor([k in fail for k in number.tolist()])
+    row, returns = number[None, :, None], timestep.float()
+    return TensorDict(
+        {
+            "traffic": {"row": row},
+            "scene_index": row + 10,
+            "next": {
+                "timestep": timestep[None, :, None],
+                "done": done[None, :, None],
+                "episode_reward": returns[None, :, None],
+                "metrics": {
+                    "contact": contact[None, :, None],
+                    "contact_vru": torch.zeros(1, total, 1).bool(),
+                    "off_road": torch.zeros(1, total, 1).bool(),
+                    "progress": 2.0 * timestep[None, :, None],
+                },
+            },
+        },
+        [1, total],
+    )
+
+
+def test_returns_outcomes_and_scenes_of_episodes_across_batches():
+    data = frames([10, 4, 10, 10], 34, fail=(1,))
+    episodes = finished_episodes([data[:, :12], data[:, 12:]], torch.tensor([False, True, True, False]), 10)
+    assert episodes.row.tolist() == [0, 1, 2, 3] and episodes.scene_index.tolist() == [10, 11, 12, 13]
+    assert episodes.returns.tolist() == [10.0, 4.0, 10.0, 10.0]
+    assert episodes.progress.tolist() == [20.0, 8.0, 20.0, 20.0]
+    assert episodes.failed.tolist() == [False, True, False, False]
+    summary = episodes.summary()
+    assert summary["contact"] == 0.25 and summary["contact_adversarial"] == 0.5 and summary["contact_nominal"] == 0.0
+    assert "acceleration" not in summary, "what was not measured is left out"
+
+
+def test_episodes_that_could_not_have_lasted_do_not_count():
+    """The second begins 5 steps before the end: only a failure could be finished by then."""
+    data = frames([10, 3, 10], 15, fail=(1,))
+    assert finished_episodes([data], torch.zeros(3, dtype=torch.bool), 10).row.tolist() == [0]
+
+
+def test_decisions_of_several_steps_are_told_from_steps():
+    """Episodes of 5, 3 and 5 steps in decisions of 2 are 3, 2 and 3 frames, the last one of each cut short."""
+    steps, number = [2, 4, 5, 2, 3, 2, 4, 5], [0, 0, 0, 1, 1, 2, 2, 2]
+    data = frames([3, 2, 3], 8, fail=(1,))
+    assert data["traffic", "row"][0, :, 0].tolist() == number
+    data["next", "timestep"] = torch.tensor(steps)[None, :, None]
+    adversarial = torch.zeros(3, dtype=torch.bool)
+    assert finished_episodes([data], adversarial, 5, hold=2).row.tolist() == [0, 1, 2]
+    assert finished_episodes([data[:, :7]], adversarial, 5, hold=2).row.tolist() == [0, 1]
+    assert finished_episodes([data[:, :5]], adversarial, 5, hold=2).row.tolist() == [0], "the second might have lasted"
+
+
+def test_the_failure_rate_is_unbiased():
+    """Half of the environments' episodes fail after 3 of 10 steps; counting every finished one would say more."""
+    torch.manual_seed(0)
+    batches, total = [], 20
+    for _ in range(300):
+        fails = torch.rand(12) < 0.5
+        lengths = torch.where(fails, 3, 10).tolist()
+        batches.append(frames(lengths, total, fail=fails.nonzero()[:, 0].tolist()))
+    data = torch.cat(batches, 0)
+    fair = finished_episodes([data], torch.zeros(12, dtype=torch.bool), 10).failed.float().mean().item()
+    naive = data["next", "metrics", "contact"].sum() / data["next", "done"].sum()
+    assert fair == pytest.approx(0.5, abs=0.04) and naive > fair + 0.07
+
+
+def test_a_rounds_episodes_are_those_of_its_pool():
+    run = small_run()
+    train_round(run)
+    episodes = run.episodes
+    assert len(episodes) == 8 and set(episodes.row.tolist()) <= set(range(6))
+    assert torch.equal(episodes.adversarial, episodes.row < 3)
+    assert torch.isin(episodes.scene_index, run.memory.rounds[-1].traffic["scene_index"]).all()
+
+
+def test_the_episode_reward_is_the_sum_of_an_episode_s_rewards():
+    scenes = small_scenes(steps=40)
+    run = small_run(scenes=scenes, collect={"steps": 40})
+    index = torch.arange(4)
+    attack = TrafficPool.stored(brake_check(scenes)(None, index, 7.0, 0), 7.0)
+    run.improve.synthesizer.pool = attack + TrafficPool.recorded(index)
+    run.improve.draw.probability = torch.ones(8, dtype=torch.float64)
+    after = run.improve.env.rollout(90, break_when_any_done=False)["next"]
+    total, lengths = torch.zeros(4, 1), set()
+    for step in range(90):
+        total = total + after["reward"][:, step]
+        torch.testing.assert_close(after["episode_reward"][:, step], total)
+        lengths |= set(after["timestep"][:, step][after["done"][:, step]].tolist())
+        total = total * ~after["done"][:, step]
+    assert len(lengths) > 1, "episodes of several lengths in turn"

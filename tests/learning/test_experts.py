@@ -3,11 +3,10 @@
 import pytest
 import torch
 
-from e2rl.learning.attack import Order, Solved, make_traffic, solvable
+from e2rl.learning.attack import solvable
 from e2rl.learning.driving import PoolDriver, episodes_of
 from e2rl.learning.experts import Experts, GivenActions, evasion_pairs
 from e2rl.learning.run_checkpoint import load_checkpoint, save_checkpoint
-from e2rl.planners.actor import ActorEgo
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.pool import TrafficPool
 from tests.learning.small import brake_check, small_run, small_scenes
@@ -97,13 +96,3 @@ def test_a_round_clones_evasions_and_a_resumed_one_the_same(tmp_path):
     assert {name: value for name, value in resumed.items() if not name.startswith("time/")} == {
         name: value for name, value in two.items() if not name.startswith("time/")
     }
-
-
-def test_make_traffic_takes_evasions_of_kept_rows_only():
-    scenes = small_scenes(3)
-    order = Order(0, torch.arange(3), torch.ones(3), torch.zeros(3).long(), 0, ActorEgo(hidden=(4,)))
-    kept, span = torch.tensor([True, False, True]), torch.tensor([[1, 2], [3, 4], [5, 6]])
-    solved = Solved(kept, torch.ones(3, 20, 2), span)
-    rows = make_traffic(order, lambda *given: brake_check(scenes)(*given[:4]), lambda traffic: solved)
-    assert rows["span"].tolist() == [[1, 2], [5, 6], [0, 0], [0, 0], [0, 0]]
-    assert rows["kept"].tolist() == kept.tolist() and not rows["evasion"][2:].any()

@@ -59,6 +59,17 @@ def random_rollouts(
     )
 
 
+def sourced(rollouts: Rollouts, dataset: str, split: str, method: str, ego: str) -> Rollouts:
+    """The rollouts as those of another source."""
+    names = {"dataset": dataset, "split": split, "method": method, "ego_policy": ego}
+    return rollouts.replace(**{name: [text] * len(rollouts) for name, text in names.items()})
+
+
+def labelled(rows: list[dict], dataset: str, split: str, method: str, ego: str) -> list[dict]:
+    """The rows as those of another source."""
+    return [row | {"dataset": dataset, "split": split, "method": method, "ego_policy": ego} for row in rows]
+
+
 def random_tracks(rollouts, count, steps, extent, generator):
     def draw(*shape):
         return torch.rand(rollouts, count, *shape, generator=generator)

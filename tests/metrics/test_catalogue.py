@@ -22,9 +22,7 @@ def fast_traffic(batch):
 
 @pytest.fixture
 def fast():
-    metric = Metric(
-        "fast", "vehicle-steps above 10 m/s", fraction=True, weight="fast_steps", tables=("traffic", "speeds")
-    )
+    metric = Metric("fast", "vehicle-steps above 10 m/s", fraction=True, weight="fast_steps", tables="main speeds")
     register(metric, fast_traffic)
     yield metric
     unregister("fast")

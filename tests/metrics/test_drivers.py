@@ -11,6 +11,7 @@ from e2rl.metrics.drivers import (
     Observation,
     RegulationLimit,
     ResponsibilitySensitiveSafety,
+    no_conflict,
 )
 from e2rl.scenes.recording import DT
 
@@ -43,7 +44,7 @@ def nobody(**fields):
 
 def drive(driver, observations):
     """Accelerations [T, ...] of a driver that sees one observation after the other."""
-    state, actions = driver.init(observations[0].speed), []
+    state, actions = no_conflict(observations[0].speed), []
     for observation in observations:
         state, acceleration = driver.step(state, observation)
         actions.append(acceleration)

@@ -110,16 +110,6 @@ def test_file_round_trip(tmp_path):
     assert torch.equal(*acted) and torch.equal(*valued)
 
 
-def test_the_file_says_how_its_network_is_made(tmp_path):
-    """Whoever drives with a trained actor need not know the sizes of its layers."""
-    file, written = tmp_path / "actor.safetensors", wild(ActorEgo(hidden=(8,), agent_units=4))
-    written.network.save(file)
-    read = ActorEgo(hidden=(16, 16), checkpoint=str(file))
-    assert read.network.architecture == written.network.architecture
-    observation = torch.randn(3, read.network.normaliser.mean.shape[0])
-    assert torch.equal(*(ego.network.network.deterministic(observation) for ego in (read, written)))
-
-
 def test_other_bounds_damage_and_absence_are_refused(tmp_path):
     file = tmp_path / "actor.safetensors"
     ActorEgo(hidden=(8,)).network.save(file)

@@ -7,7 +7,18 @@ import torch
 
 import e2rl
 from e2rl.planners.bits import BitsEgo
-from e2rl.planners.bits_network import CELLS, BitsNetwork, load_bits, save_bits
+from e2rl.planners.bits_network import (
+    CELLS,
+    HORIZON,
+    SIDES,
+    BitsNetwork,
+    cell_of,
+    load_bits,
+    needed_acceleration,
+    place,
+    reach,
+    save_bits,
+)
 from e2rl.planners.ego import PLAN_STEPS, EgoPolicy
 from e2rl.run.errors import InputError
 from e2rl.sim import dynamics
@@ -40,22 +51,6 @@ def test_plans_the_cheapest_candidate():
     for k in range(3):
         assert torch.equal(plan[k], candidates.states[k, costs[k].argmin()])
     torch.testing.assert_close(ego.rated(world, plan[:, None])[:, 0], costs.amin(1), atol=8.0, rtol=0)
-
-
-def test_candidates_obey_the_simulator_s_bounds():
-    scenes = make_scenes(2, num_vehicles=6)
-    scenes.scenes["start"][1, 0, 1:3] = torch.tensor([1.5, 0.6])
-    _, world = worlds(scenes)
-    driven = wild_ego(goals=CELLS).candidates(world).states
-    assert driven.shape[:2] == (2, CELLS) and torch.isfinite(driven).all()
-    start = world.states[:, :1, None].expand(-1, CELLS, -1, -1)
-    states = torch.cat([start, driven], 2)
-    actions = dynamics.inverse(states)
-    assert (actions[..., 0] > -8 - 1e-3).all() and (actions[..., 0] < 5 + 1e-3).all()
-    mean = (states[..., 1:, 3] + states[..., :-1, 3]) / 2
-    assert (actions[..., 1].abs() <= torch.clamp(dynamics.yaw_rate_bound(mean), max=1.6) + 1e-3).all()
-    assert (torch.hypot(actions[..., 0], actions[..., 1] * mean) < dynamics.MAX_LATERAL + 0.05).all()
-    torch.testing.assert_close(dynamics.rollout(start[:, :, 0], actions), driven, atol=2e-3, rtol=0)
 
 
 def test_a_moved_scene_gets_the_moved_candidates():
@@ -93,13 +88,8 @@ def test_sees_neither_plans_nor_routes_nor_what_the_recording_goes_on_to_tell():
     later = world.scene.clone()
     later["logged"][:, 1:] += 50.0
     ego = wild_ego()
-    assert torch.equal(ego.plan(replace(world, scene=later, plan=plan, route=route)), ego.plan(world))
-
-
-def test_the_elapsed_time_is_no_input():
-    _, world = worlds(make_scenes(2, num_vehicles=6))
-    ego = wild_ego()
-    assert torch.equal(ego.plan(replace(world, step=world.step + 60)), ego.plan(world))
+    told = replace(world, scene=later, plan=plan, route=route, step=world.step + 60)
+    assert torch.equal(ego.plan(told), ego.plan(world)), "nor the time"
 
 
 @pytest.mark.parametrize(("x", "halts"), [(50.0, True), (None, False)])
@@ -116,7 +106,7 @@ def test_the_bundled_weights_hit_less_than_untrained_ones():
     traffic = e2rl.make_traffic("replay", e2rl.load_prior())
     hit = {}
     for checkpoint in ("bundled", None):
-        rollouts = e2rl.roll_out(scenes, BitsEgo(checkpoint), traffic)
+        rollouts = e2rl.roll_out(scenes, BitsEgo(checkpoint=checkpoint), traffic)
         hit[checkpoint] = sum(row["cfr"] for row in e2rl.score(rollouts))
     assert hit["bundled"] == 0 and hit[None] >= 2
 
@@ -145,3 +135,24 @@ def test_wrong_checkpoints_are_named(tmp_path):
         load_bits(str(file))
     with pytest.raises(InputError, match=r"ego\.goals=0"):
         BitsEgo(checkpoint=None, goals=0)
+
+
+def test_cells_and_places_are_inverses():
+    generator = torch.Generator().manual_seed(0)
+    speed = 20 * torch.rand(1000, generator=generator)
+    way = 1.1 * reach(speed) * torch.rand(1000, generator=generator)
+    side = 10 * torch.rand(1000, generator=generator) - 5
+    cell, residual = cell_of(speed, way, side)
+    again = place(speed, cell[:, None], residual[:, None])
+    torch.testing.assert_close(again[0][:, 0], way, atol=1e-3, rtol=0)
+    torch.testing.assert_close(again[1][:, 0], side, atol=1e-4, rtol=0)
+    on_grid = (way < reach(speed)) & (side.abs() < SIDES / 2)
+    assert (residual[on_grid].abs() <= 0.5001).all() and cell.min() >= 0 and cell.max() < CELLS
+
+
+def test_the_needed_acceleration_drives_the_distance():
+    speed, way = torch.tensor([10.0, 10.0, 10.0, 0.0]), torch.tensor([50.0, 75.0, 20.0, 5.0])
+    accel = needed_acceleration(speed, way)
+    torch.testing.assert_close(accel, torch.tensor([0.0, 2.0, -2.5, 0.4]))
+    time = torch.where(accel < 0, speed / -accel, HORIZON).clamp(max=HORIZON)  # to the halt
+    torch.testing.assert_close(speed * time + accel * time**2 / 2, way)

@@ -1,8 +1,11 @@
 """Paths: pass through the pose, end on the route, stay the same when planned anew; caps of curves, limits, lights."""
 
+import math
+
+import pytest
 import torch
 
-from e2rl.planners.path import MissionPath, RoutePath, look_up
+from e2rl.planners.path import MissionPath, RoutePath, fading, look_up
 from e2rl.sim.dynamics import inverse
 from e2rl.sim.env import DrivingEnv, SimSettings
 from tests.synthetic import make_scenes
@@ -47,12 +50,26 @@ def test_caps_halt_at_red_lights_and_obey_limits():
     env = DrivingEnv(make_scenes(1, num_vehicles=1, red_light_x=60.0, limit=8.0), SimSettings(), 1)
     env.reset()
     path = MissionPath(env.world())
-    caps = path.speed_caps(20.0, 3.0, 3.0)
+    caps = path.speed_caps(20.0)
     stop = 60.0 - 4.5 / 2 - 1.0
     assert torch.allclose(look_up(caps, torch.tensor([[0.0, 20.0]])), torch.tensor(8.0), atol=0.01)
     at = torch.tensor([[stop - 6.0, stop - 1.5, stop, stop + 1.0]])
     assert torch.allclose(look_up(caps, at), torch.tensor([36.0, 9.0, 0.0, 0.0]).sqrt(), atol=0.02)
-    assert torch.allclose(path.speed_caps(20.0, 3.0, 3.0, limits=False, lights=False), torch.tensor(400.0), atol=0.1)
+    assert torch.allclose(path.speed_caps(20.0, limits=False, lights=False), torch.tensor(400.0), atol=0.1)
+
+
+@pytest.mark.parametrize(("d", "turned", "length"), [(1.5, 0.2, 8.0), (-0.7, -0.4, 1.5)])
+def test_a_deviation_fades_as_a_critically_damped_return(d, turned, length):
+    """l^2 d'' + 2 l d' + d = 0 from (d, tan(turned)); the slope is the derivative of the offset."""
+    ahead = torch.linspace(0, 20, 2001, dtype=torch.float64)
+    given = (torch.tensor(value, dtype=torch.float64) for value in (d, turned, length))
+    offset, slope = fading(*given, ahead)
+    assert offset[0].item() == pytest.approx(d) and slope[0].item() == pytest.approx(math.tan(turned))
+    (first,), (bend,) = torch.gradient(offset, spacing=0.01), torch.gradient(slope, spacing=0.01)
+    inner = slice(2, -2)
+    torch.testing.assert_close(first[inner], slope[inner], atol=1e-4, rtol=0)
+    balance = length**2 * bend + 2 * length * slope + offset
+    torch.testing.assert_close(balance[inner], torch.zeros_like(balance[inner]), atol=2e-2, rtol=0)
 
 
 def test_caps_slow_down_for_curves():
@@ -63,6 +80,6 @@ def test_caps_slow_down_for_curves():
     scenes.scenes["route_points"][0, 0] = torch.stack([x, y], -1)
     env = DrivingEnv(scenes, SimSettings(), 1)
     env.reset()
-    caps = MissionPath(env.world()).speed_caps(20.0, 3.0, 3.0, limits=False)[0]
+    caps = MissionPath(env.world()).speed_caps(20.0, limits=False)[0]
     assert torch.allclose(caps[32:44].min(), torch.tensor(3.0 * 20), rtol=0.05)
     assert caps[15] < 399 and abs(caps[-5] - 400) < 1e-2

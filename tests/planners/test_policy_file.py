@@ -9,11 +9,15 @@ import pytest
 import torch
 from torch import nn
 
+from e2rl.commands.export_policy import export_actor, main
+from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import EgoPolicy, NotFinite
+from e2rl.planners.network import read_actor
 from e2rl.planners.policy_file import PolicyFileEgo
 from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.observation import OBSERVATION_SIZE
+from tests.planners.test_actor import wild
 from tests.synthetic import make_scenes
 
 needs_onnx = pytest.mark.skipif(not (find_spec("onnxruntime") and find_spec("onnxscript")), reason="extra onnx")
@@ -93,11 +97,11 @@ def test_a_rollout_in_which_it_returns_nan_ends(tmp_path, value):
 @pytest.mark.parametrize(
     ("kind", "what"),
     [
-        ("wide", r"maps observations \[1, 326\] to \[1, 3\]; it maps float32 observations"),
-        ("flat", r"maps observations \[1, 326\] to \[1\]; it maps"),
-        ("tuple", "returns a tuple; .*as one tensor"),
-        ("whole", "returns torch.int64; "),
-        ("one", r"maps observations \[3, 326\] to \[1, 2\]; .*for every B"),
+        ("wide", r"fails at observations \[1, 326\]: maps them to torch.float32 \[1, 3\]; it maps float32"),
+        ("flat", r"fails at observations \[1, 326\]: maps them to torch.float32 \[1\]; it maps"),
+        ("tuple", "fails at .*: <class 'tuple'>; it maps"),
+        ("whole", "fails at .*: maps them to torch.int64"),
+        ("one", r"fails at observations \[3, 326\]: maps them to .* \[1, 2\]; .*for every B"),
     ],
 )
 def test_other_shapes_are_refused(tmp_path, kind, what):
@@ -105,18 +109,10 @@ def test_other_shapes_are_refused(tmp_path, kind, what):
         PolicyFileEgo(scripted(tmp_path, Shaped(kind)))
 
 
-def test_a_policy_for_other_observations_is_refused_with_its_own_reason(tmp_path):
-    torch.jit.save(torch.jit.trace(nn.Linear(12, 2), torch.zeros(2, 12)), tmp_path / "policy.pt")
-    with pytest.raises(
-        InputError, match=r"fails at observations \[1, 326\]: .*it maps float32 observations \[B, 326\]"
-    ):
-        PolicyFileEgo(str(tmp_path / "policy.pt"))
-
-
 @pytest.mark.parametrize(
     ("name", "content", "what"),
     [
-        (None, None, r"ego.file is not set; pass ego.file=POLICY.onnx"),
+        (None, None, "no such file"),
         ("policy.pt", None, "no such file"),
         ("policy.h5", b"x", "no kind of policy; pass .onnx, or .pt"),
         ("policy.pt", b"nonsense", "no TorchScript archive"),
@@ -130,25 +126,12 @@ def test_what_is_no_policy_is_named(tmp_path, name, content, what):
         PolicyFileEgo(name and str(tmp_path / name))
 
 
-def test_weights_without_a_program_are_no_policy(tmp_path):
-    torch.save(nn.Linear(OBSERVATION_SIZE, 2).state_dict(), tmp_path / "policy.pt")
-    with pytest.raises(InputError, match="no TorchScript archive .* write one by torch.jit.save"):
-        PolicyFileEgo(str(tmp_path / "policy.pt"))
-
-
-@needs_onnx
-def test_an_onnx_file_is_asked_for_a_batch_at_once(tmp_path):
-    ego = PolicyFileEgo(onnx_file(tmp_path))
-    observation = torch.rand(5, OBSERVATION_SIZE)
-    assert torch.equal(ego.decide(observation), observation[:, :2])
-
-
 @needs_onnx
 @pytest.mark.parametrize(
     ("model", "what"),
     [
-        ({"inputs": ("observation", "hidden")}, r"has 2 inputs \(observation, hidden\) instead of one"),
-        ({"outputs": ("action", "value")}, r"has 2 outputs \(action, value\) instead of one"),
+        ({"inputs": ("observation", "hidden")}, r"fails at observations \[1, 326\]"),
+        ({"outputs": ("action", "value")}, r"fails at observations \[1, 326\]"),
         ({"numbers": 12}, r"fails at observations \[1, 326\]: .*326"),
         ({"rows": 1}, r"fails at observations \[3, 326\]: .*for every B"),
     ],
@@ -163,3 +146,63 @@ def test_without_onnxruntime_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(InputError, match=r"pip install 'e2rl\[onnx\]'"):
         PolicyFileEgo(str(tmp_path / "policy.onnx"))
+
+
+def drive(ego, **options):
+    """States [30, 3, 4] of the egos of three scenes with others around."""
+    env = DrivingEnv(make_scenes(3, num_vehicles=6, red_light_x=60.0), SimSettings(), 3, agents=True, **options)
+    env.reset()
+    td = env.reset(env.reset().select("scene_index").set("scene_index", torch.arange(3)[:, None]))
+    policy, states = EgoPolicy(ego, env), []
+    for _ in range(30):
+        td = env.step(policy(td))["next"].exclude("reward")
+        states.append(env.world().states[:, 0].clone())
+    return torch.stack(states)
+
+
+@pytest.fixture(scope="module")
+def actor():
+    """With an opinion, and statistics of observations of its own."""
+    torch.manual_seed(1)
+    ego = wild(ActorEgo(hidden=(16, 8)), 0.1)
+    ego.network.normaliser.observe(torch.randn(50, OBSERVATION_SIZE))
+    return ego
+
+
+@pytest.mark.parametrize("name", ["policy.pt", pytest.param("policy.onnx", marks=needs_onnx)])
+def test_the_same_rollouts(actor, tmp_path, name):
+    actor.network.save(tmp_path / "actor.safetensors")
+    export_actor(str(tmp_path), tmp_path / name)
+    ego = PolicyFileEgo(str(tmp_path / name))
+    observation = 2 * torch.randn(200, OBSERVATION_SIZE)
+    expected = actor.act(None, observation, None)
+    assert torch.allclose(ego.decide(observation), expected, atol=1e-5) and expected.std(0).min() > 0.05
+    driven, own = drive(ego), drive(actor)
+    assert torch.allclose(driven, own, atol=1e-3) and (own[-1, :, 0] - own[0, :, 0]).min() > 5
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"observation": 12}, "of another version .of 12 numbers"),
+        ({"hidden": [10**9]}, "another version"),
+        ({"hidden": []}, "another version"),
+        ({"agent_units": 0}, "another version"),
+        ({"low": [1]}, "another"),
+    ],
+)
+def test_an_actor_of_another_version_is_refused(actor, tmp_path, monkeypatch, change, what):
+    monkeypatch.setattr(actor.network, "architecture", actor.network.architecture | change)
+    actor.network.save(tmp_path / "actor.safetensors")
+    with pytest.raises(InputError, match=what):
+        read_actor(tmp_path / "actor.safetensors")
+
+
+def test_the_command_says_how_to_drive_and_refuses_other_kinds(actor, tmp_path, capsys):
+    actor.network.save(tmp_path / "actor.safetensors")
+    main([str(tmp_path), str(tmp_path / "out" / "p.pt")])
+    assert f"ego=policy_file ego.file={tmp_path / 'out' / 'p.pt'}" in capsys.readouterr().out
+    for given, what in (([str(tmp_path), "p.h5"], "name it .onnx"), ([str(tmp_path / "no"), "p.pt"], "no actor there")):
+        with pytest.raises(SystemExit):
+            main(given)
+        assert what in capsys.readouterr().err

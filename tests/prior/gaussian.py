@@ -2,7 +2,7 @@
 
 import torch
 
-from e2rl.prior.sde import NoiseSchedule, reverse_step
+from e2rl.prior.sde import SAMPLERS, NoiseSchedule
 
 SCHEDULE = NoiseSchedule()
 
@@ -25,12 +25,12 @@ def flow(x, mean, std, high, low):
 
 def run(estimate, sampler, churn, levels, noise):
     """The sampler's x at the last of levels, or x0 where that is 0; noise [len(levels) - 1, ...]."""
-    x, past = noise[0], None
+    x, past, step = noise[0], None, SAMPLERS[sampler](SCHEDULE, churn).step
     for k, (high, low) in enumerate(zip(levels[:-1], levels[1:], strict=True)):
         x0 = estimate(x, high)
         if low == 0:
             return x0
-        x, _ = reverse_step(sampler, SCHEDULE, x, x0, high, low, noise[min(k + 1, len(noise) - 1)], churn, past)
+        x, _ = step(x, x0, high, low, noise[min(k + 1, len(noise) - 1)], past)
         past = x0, high
     return x
 

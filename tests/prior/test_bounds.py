@@ -6,7 +6,20 @@ import pytest
 import torch
 
 from e2rl.prior import lane_relative
-from e2rl.prior.bounds import MIN_BRAKING, NO_CAP, STRIDE, BoundSettings, Duty, Obstacles, acceleration_caps, bounded
+from e2rl.prior.bounds import (
+    GAP,
+    LATERAL_MARGIN,
+    MIN_BRAKING,
+    NO_CAP,
+    ONSET,
+    STRIDE,
+    BoundSettings,
+    Duty,
+    Obstacles,
+    acceleration_caps,
+    apply_cap,
+    bounded,
+)
 from e2rl.prior.lane_relative import SIZE, locate
 from e2rl.scenes.recording import DT
 from tests.prior.small import arc
@@ -56,9 +69,9 @@ def test_plans_that_meet_nobody_are_free():
 @pytest.mark.parametrize("speed", [0.0, 4.0])
 def test_a_follower_brakes_to_its_leader_s_speed_in_the_room_there_is(speed):
     decode, state, obstacles = traffic((0, 0, 0, 10), (15, 0, 0, speed))
-    cap = caps(decode, state, obstacles, gap=1.0)
+    cap = caps(decode, state, obstacles)
     time = contact_time((15 - CAR[0]) / (10 - speed))
-    room = 10 * time - 1.0 - speed * time
+    room = 10 * time - GAP - speed * time
     assert cap.tolist() == pytest.approx([-((10 - speed) ** 2) / (2 * room), NO_CAP], rel=2e-2)
 
 
@@ -91,16 +104,16 @@ def test_a_patient_vehicle_brakes_later_and_harder_and_still_in_time():
     eager, patient = (caps(*traffic(ego, (0.0, 0, 0, 8), patience=value))[1] for value in (0.0, 6.0))
     assert -6 < eager < 0 and patient == NO_CAP
     closer = caps(*traffic(ego, (5.0, 0, 0, 8), patience=4.0))[1]
-    room = 20 - 5 - CAR[0] - 1.2
+    room = 20 - 5 - CAR[0] - GAP
     assert -(8**2) / (2 * (room - 2)) < closer < eager
 
 
 def test_who_drifts_into_the_ego_s_side_falls_behind_it_in_time():
     ego, angle = (0, 0, 0, 10), 0.1
     drifting = (2.0, -3.0, angle, 10 / math.cos(angle))  # keeps level with the ego and comes nearer at 1 m/s
-    time = contact_time((3.0 - CAR[1] - 0.1 - CAR[0] / 2 * math.sin(angle)) / (10 * math.tan(angle)))
-    cap = caps(*traffic(ego, drifting, yields=[1]), gap=1.0, floor=-50.0)[1]
-    assert cap == pytest.approx(-2 * (CAR[0] + 1.0 + 2.0) / time**2, rel=0.05)
+    time = contact_time((3.0 - CAR[1] - LATERAL_MARGIN - CAR[0] / 2 * math.sin(angle)) / (10 * math.tan(angle)))
+    cap = caps(*traffic(ego, drifting, yields=[1]), floor=-50.0)[1]
+    assert cap == pytest.approx(-2 * (CAR[0] + GAP + 2.0) / time**2, rel=0.05)
     assert caps(*traffic(ego, drifting, exempt=[1]))[1] == NO_CAP
 
 
@@ -141,3 +154,12 @@ def test_whoever_follows_a_braking_vehicle_brakes_too():
     assert caps(decode, state, obstacles, look=1.6)[2] == NO_CAP, "its plan meets nobody's as they stand"
     motion = bounded(BoundSettings(look=1.6), decode, state, obstacles)
     assert (motion.v <= decode(None).v + 1e-5).all() and motion.v[0, 2, 10] < 12 - 0.2
+
+
+def test_a_cap_lowers_the_next_knot_and_at_most_by_its_onset_the_present_acceleration():
+    _, state, _ = traffic((0, 0, 0, 10), (0, 8, 0, 10), (0, 16, 0, 10))
+    state.a = torch.tensor([[1.0, -1.5, -6.0]])
+    x0 = torch.tensor([[[0.5] * SIZE, [-3.0] * SIZE, [0.0] * SIZE]])
+    capped, after = apply_cap(torch.tensor([[-4.0, -2.0, -5.0]]), x0, state)
+    assert after.a.tolist() == [[1.0 - ONSET, -2.0, -6.0]] and capped[0, :, 0].tolist() == [-4.0, -3.0, -5.0]
+    assert torch.equal(capped[..., 1:], x0[..., 1:]) and apply_cap(None, x0, state) == (x0, state)

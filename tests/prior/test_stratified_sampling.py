@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from e2rl.prior.lane_relative import KNOTS, SIZE
-from e2rl.prior.sde import SamplerSettings
-from e2rl.prior.sde import NoiseSchedule
+from e2rl.prior.sde import NoiseSchedule, SamplerSettings
 from e2rl.prior.stratified_sampling import impulse_response, main_direction, stratified_noise, stratified_uniform
 
 SCHEDULE, COUNT, SCENES = NoiseSchedule(), 4, 30_000

@@ -5,39 +5,38 @@ from pathlib import Path
 import torch
 
 from e2rl.evaluation.protocol import record
-from e2rl.evaluation.rollout_files import ROLLOUTS, Source, label_rows, write_rollouts
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
-from e2rl.report.tables import metric_tables, save_tables
+from e2rl.sim.rollout_file import ROLLOUTS
+from e2rl.sim.rollouts import Rollouts
 from tests.metrics.random_rollouts import random_rollouts
 
 SCENE = "<img src=x onerror=alert(1)></script>&"  # the name of a stranger's scene
 
 
-def planned(rollouts: dict) -> dict:
+def planned(rollouts: Rollouts) -> Rollouts:
     """The rollouts with straight plans of everybody, adversaries that aim at the ego, and an evasion of the ego."""
-    replans = torch.arange(0, rollouts["states"].shape[1] - 1, 5)
-    now = rollouts["states"][:, replans].nan_to_num()
-    ahead = now[..., 2:3].cos(), now[..., 2:3].sin()
-    way = now[..., 3:] * 0.5 * torch.arange(1, 11)
-    plans = now[..., None, :2] + torch.stack([way * part for part in ahead], -1)
-    targets = torch.where(rollouts["adversaries"], 0, -1)[:, None].expand(-1, len(replans), -1)
-    evasion = rollouts["states"][:, :, 0] + torch.tensor([0.0, 3.0, 0.0, 0.0])
-    return rollouts | {"plans": plans, "targets": targets, "evasion": evasion}
+    replans = torch.arange(0, rollouts.states.shape[1] - 1, 5)
+    now = rollouts.states[:, replans].nan_to_num()
+    ahead = torch.stack([now[..., 2:3].cos(), now[..., 2:3].sin()], -1)
+    distance = now[..., 3:] * 0.5 * torch.arange(1, 11)
+    rollouts.plans = now[..., None, :2] + distance[..., None] * ahead
+    rollouts.targets = torch.where(rollouts.adversaries, 0, -1)[:, None].expand(-1, len(replans), -1)
+    rollouts.evasion = rollouts.states[:, :, 0] + torch.tensor([0.0, 3.0, 0.0, 0.0])
+    return rollouts
 
 
-def write_run(folder: Path, rollouts: dict[str, dict]) -> Path:
-    """Write all files of a run of {method: rollout dict} into a folder."""
+def write_run(folder: Path, rollouts: dict[str, Rollouts]) -> Path:
+    """Write all files of a run of {method: rollouts} into a folder."""
     rows, features = [], []
     for method, driven in rollouts.items():
-        driven["scene_id"] = [f"{SCENE}{index}" for index in range(len(driven["states"]))]
-        source = Source("synthetic", "test", method, "idm")
-        write_rollouts(folder / ROLLOUTS, driven, source)
+        driven.scene_id = [f"{SCENE}{index}" for index in range(len(driven))]
+        driven.method = [method] * len(driven)
         scores, samples = score_rollouts(driven)
-        rows += label_rows(scores, source)
+        driven.to_npz(folder / ROLLOUTS)
+        rows += scores
         features += samples
-    result = record(rows, features, [], folder, lambda *found: metric_rows(*found, draws=20, realism_draws=2))
-    save_tables(folder / "tables.md", metric_tables(result, "A caption: with <b>markup</b>"))
+    record(rows, features, [], folder, lambda *found: metric_rows(*found, draws=20, realism_draws=2))
     return folder
 
 

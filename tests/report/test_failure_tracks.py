@@ -1,31 +1,34 @@
-"""Replays of failures: everybody where the rollout has them, the competent driver as its verdict says, small."""
+"""Replays of failures: everybody where the rollout has them, the competent driver as its verdict says, small; whole
+numbers come back from their text."""
 
+import base64
 import json
+import zlib
 
 import numpy as np
 import pytest
 
-from e2rl.evaluation.rollout_files import Source, write_rollouts
-from e2rl.evaluation.rollout_reader import as_rollout_dict, read_rollout
 from e2rl.metrics.preventable import AFTER
 from e2rl.metrics.score import score_rollouts
-from e2rl.report.failure_tracks import CHANNELS, encoded_map, failure_replay
+from e2rl.report.failure_tracks import CHANNELS, encode, encoded_map, failure_replay, quantised, second_difference
+from e2rl.sim.rollout_file import Failure
 from tests.metrics.random_rollouts import random_rollouts
 from tests.metrics.test_contact import course, scene
 from tests.report.failed_run import planned
-from tests.report.test_encoding import decoded
 
 
-def replay_of(folder, rollouts):
-    """[(rollout, its row, its replay)] of the failures among rollouts, by way of their files."""
-    paths = write_rollouts(folder, rollouts, Source("s", "t", "e2", "idm"))
-    read = [read_rollout(path) for path in paths]
-    rows, _ = score_rollouts(as_rollout_dict(read))
-    return [
-        (rollout, row, failure_replay(rollout, int(row["contact_step"]), row["partner"]))
-        for rollout, row in zip(read, rows, strict=True)
-        if row["cfr"] == 1
-    ]
+def decoded(text: str) -> np.ndarray:
+    """What decode.js does."""
+    planes = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8).reshape(4, -1).astype(np.uint32)
+    code = sum(plane << 8 * k for k, plane in enumerate(planes))
+    return (code >> 1).astype(np.int64) ^ -(code & 1).astype(np.int64)
+
+
+def replays_of(rollouts):
+    """[(rollout, its row, its replay)] of the failures among rollouts."""
+    rows = score_rollouts(rollouts)[0]
+    found = [Failure(rollouts.rollout(index), row) for index, row in enumerate(rows) if row["cfr"] == 1]
+    return [(failure.rollout, failure.row, failure_replay(failure)) for failure in found]
 
 
 def motion_of(replay) -> dict[str, np.ndarray]:
@@ -38,28 +41,28 @@ def track_of(replay, role) -> int:
     return [track[0] for track in replay["tracks"]].index(role)
 
 
-def test_everybody_is_where_the_rollout_has_them(tmp_path):
-    found = replay_of(tmp_path, random_rollouts(8, seed=21))
+def test_everybody_is_where_the_rollout_has_them():
+    found = replays_of(random_rollouts(8, seed=21))
     assert len(found) > 2
     for rollout, row, replay in found:
         motion = motion_of(replay)
         steps = motion["x"].shape[1]
-        assert steps == min(int(row["contact_step"]) + AFTER + 1, len(rollout["states"]))
-        agents = np.flatnonzero(rollout["valid"][:steps].any(0))
-        present = rollout["valid"][:steps, agents].T
+        assert steps == min(int(row["contact_step"]) + AFTER + 1, len(rollout.states))
+        agents = np.flatnonzero(rollout.valid[:steps].any(0))
+        present = rollout.valid[:steps, agents].T
         np.testing.assert_array_equal(motion["present"][: len(agents)], present)
         for index, name in enumerate(("x", "y")):
-            there = rollout["states"][:steps, agents, index].T
+            there = rollout.states[:steps, agents, index].T
             np.testing.assert_allclose(motion[name][: len(agents)][present], there[present], atol=0.0051)
-        turn = motion["heading"][: len(agents)] - rollout["states"][:steps, agents, 2].T
+        turn = motion["heading"][: len(agents)] - rollout.states[:steps, agents, 2].T
         assert np.abs(np.sin(turn / 2)[present]).max() < 0.001
         assert agents[replay["partner"]] == row["partner"]
 
 
 @pytest.mark.parametrize(("gap", "preventable"), [(30.5, 1), (6.0, 0)])
-def test_the_competent_driver_does_what_the_verdict_says(tmp_path, gap, preventable):
+def test_the_competent_driver_does_what_the_verdict_says(gap, preventable):
     """It brakes for a slower vehicle 30 m ahead; 1 m of gap is too late for it."""
-    ((_, row, replay),) = replay_of(tmp_path, scene(course(0, 0, 0, 12), course(gap, 0, 0, 5), adversaries=[1]))
+    ((_, row, replay),) = replays_of(scene(course(0, 0, 0, 12), course(gap, 0, 0, 5), adversaries=[1]))
     motion, driver, ego = motion_of(replay), track_of(replay, "driver"), track_of(replay, "ego")
     assert row["preventable"] == preventable
     assert (motion["gap"][driver].min() > 0) == (preventable == 1)
@@ -67,33 +70,34 @@ def test_the_competent_driver_does_what_the_verdict_says(tmp_path, gap, preventa
     np.testing.assert_allclose(motion["gap"][ego, 0], gap - 4.8, atol=0.01)
 
 
-def test_roles_say_who_drives(tmp_path):
+def test_roles_say_who_drives():
     courses = course(0, 0, 0, 12), course(30.5, 0, 0, 5), course(-30, 8, 0, 0), course(5, 20, 0, 1)
     rollouts = scene(*courses, kinds=[0, 0, 0, 1], adversaries=[1])
-    rollouts["simulated"][0, 2:] = False
-    ((_, _, replay),) = replay_of(tmp_path, rollouts)
+    rollouts.simulated[0, 2:] = False
+    ((_, _, replay),) = replays_of(rollouts)
     roles = [track[0] for track in replay["tracks"]]
     assert roles == ["ego", "adversary", "replayed", "pedestrian", "driver", "recorded"]
 
 
-def test_plans_and_the_evasion_are_those_of_the_file(tmp_path):
+def test_plans_and_the_evasion_are_those_of_the_file():
     rollouts = planned(random_rollouts(8, seed=20))
-    for rollout, _, replay in replay_of(tmp_path, rollouts):
+    for rollout, _, replay in replays_of(rollouts):
         motion, plans = motion_of(replay), replay["plans"]
         steps = motion["x"].shape[1]
-        np.testing.assert_allclose(motion["y"][track_of(replay, "evasion")], rollout["evasion"][:steps, 1], atol=0.0051)
-        agents = np.flatnonzero(rollout["valid"][:steps].any(0))
-        known = np.isin(rollout["planners"], agents)
-        assert agents[plans["agents"]].tolist() == rollout["planners"][known].tolist()
+        np.testing.assert_allclose(motion["y"][track_of(replay, "evasion")], rollout.evasion[:steps, 1], atol=0.0051)
+        agents = np.flatnonzero(rollout.valid[:steps].any(0))
+        known = np.isin(rollout.planners, agents)
+        assert agents[plans["agents"]].tolist() == rollout.planners[known].tolist()
         points = decoded(plans["points"]).reshape(known.sum(), -1, 2, 10).cumsum(-1).cumsum(-1) * CHANNELS["x"]
-        np.testing.assert_allclose(points.transpose(1, 0, 3, 2), rollout["plans"][:, known], atol=0.0051)
+        np.testing.assert_allclose(points.transpose(1, 0, 3, 2), rollout.plans[:, known], atol=0.0051)
         targets = decoded(plans["targets"]).reshape(known.sum(), -1)
         assert (targets[0] == -1).all() and (targets[1:] == track_of(replay, "ego")).all()
 
 
-def test_the_map_is_the_rollout_s(tmp_path):
-    for path in write_rollouts(tmp_path, random_rollouts(4), Source("s", "t", "e2", "idm")):
-        rollout = read_rollout(path)
+def test_the_map_is_the_rollout_s():
+    rollouts = random_rollouts(4)
+    for index in range(len(rollouts)):
+        rollout = rollouts.rollout(index)
         drawn = encoded_map(rollout)
         for name in ("lane", "drivable"):
             points = decoded(drawn[f"{name}_points"]).reshape(2, -1).cumsum(-1).cumsum(-1) * 0.05
@@ -101,6 +105,29 @@ def test_the_map_is_the_rollout_s(tmp_path):
             np.testing.assert_array_equal(decoded(drawn[f"{name}_counts"]), np.diff(rollout[f"{name}_offsets"]))
 
 
-def test_a_replay_of_48_agents_takes_less_than_25_kb(tmp_path):
-    sizes = [len(json.dumps(replay)) for *_, replay in replay_of(tmp_path, planned(random_rollouts(8, seed=20)))]
+def test_a_replay_of_48_agents_takes_less_than_25_kb():
+    sizes = [len(json.dumps(replay)) for *_, replay in replays_of(planned(random_rollouts(8, seed=20)))]
     assert sizes and max(sizes) < 25_000
+
+
+def test_numbers_of_31_bits_come_back_whatever_their_sign():
+    values = np.random.default_rng(0).integers(-(2**30), 2**30, 5000)
+    edges = np.array([0, -1, 1, 2**30, -(2**30), 2**31 - 1, -(2**31)])
+    for numbers in (values, edges, np.zeros(0, int)):
+        np.testing.assert_array_equal(decoded(encode(numbers)), numbers)
+
+
+def test_two_sums_undo_second_differences():
+    values = np.random.default_rng(1).integers(-1000, 1000, (3, 4, 50))
+    np.testing.assert_array_equal(second_difference(values).cumsum(-1).cumsum(-1), values)
+
+
+def test_a_quantum_rounds_by_half_of_itself():
+    values = np.random.default_rng(2).normal(0, 500, 1000)
+    assert np.abs(quantised(values, 0.01) * 0.01 - values).max() <= 0.005 + 1e-9
+
+
+def test_constant_acceleration_takes_next_to_no_bytes():
+    time = np.arange(81) * 0.1
+    path = quantised(1000 + 12 * time - time**2, 0.01)
+    assert len(encode(second_difference(path))) < 90 < 4 * len(path)

@@ -2,17 +2,18 @@
 
 import json
 import re
-import shlex
 
 import pytest
 
+from e2rl.commands.report import main
 from e2rl.evaluation.modes import read_modes
 from e2rl.evaluation.rollout_files import read_rows
 from e2rl.metrics.failure_modes import is_failure
-from e2rl.report import html
-from e2rl.report.tables import read_tables
+from e2rl.report.html import PAGE, replay_order, write_report
 from tests.metrics.test_contact import course, scene
 from tests.report.failed_run import SCENE, failed_run, write_run
+
+CRASH = course(0, 0, 0, 12), course(30.5, 0, 0, 5)
 
 
 @pytest.fixture(scope="module")
@@ -20,12 +21,21 @@ def run(tmp_path_factory):
     return failed_run(tmp_path_factory.mktemp("run"))
 
 
+@pytest.fixture(scope="module")
+def page(run):
+    return write_report(run).read_text()
+
+
 def data_of(page: str) -> dict:
     return json.loads(re.search(r'<script type="application/json" id="report">(.*?)</script>', page, re.DOTALL)[1])
 
 
-def test_every_failure_is_in_the_index_with_its_replay(run):
-    data = data_of(html.report(run, 300))
+def report(run, **options) -> dict:
+    return data_of(write_report(run, **options).read_text())
+
+
+def test_every_failure_is_in_the_index_with_its_replay(run, page):
+    data = data_of(page)
     failures = [row for row in read_rows(run / "rollouts.csv") if is_failure(row)]
     assert len(data["failures"]) == len(failures) == read_modes(run / "modes.json")["failures"] > 5
     for entry, row in zip(data["failures"], failures, strict=True):
@@ -34,14 +44,17 @@ def test_every_failure_is_in_the_index_with_its_replay(run):
         replay = data["replays"][entry["replay"]]
         assert replay["contact"] == row["contact_step"] and 0 <= replay["map"] < len(data["maps"])
     assert sum(group["failures"] for group in data["groups"]) == len(failures)
+    assert data["tables"][0]["head"] == ["", "e2 η=2", "planned η=2"]
 
 
-def test_a_limit_keeps_the_typical_failures_and_spreads_the_others_over_the_modes(run):
-    whole = data_of(html.report(run, 300))
+def test_a_limit_keeps_the_typical_failures_and_a_method_its_own(run, page, tmp_path):
+    whole = data_of(page)
     typical = [entry["scene_id"] for entry in whole["failures"] if entry["typical"]]
-    few = data_of(html.report(run, len(typical)))
+    few = report(run, replays=len(typical), path=tmp_path / "few.html")
     assert [entry["scene_id"] for entry in few["failures"] if entry["replay"] is not None] == typical
     assert len(few["replays"]) == len(typical) < len(whole["replays"])
+    one = report(run, replays=0, methods=["e2"], path=tmp_path / "one.html")
+    assert {entry["method"] for entry in one["failures"]} == {group["method"] for group in one["groups"]} == {"e2"}
 
 
 def test_a_mode_s_second_failure_comes_after_the_first_of_all_others():
@@ -49,63 +62,32 @@ def test_a_mode_s_second_failure_comes_after_the_first_of_all_others():
         {"ego_policy": "idm", "method": "e2", "eta": 2.0, "mode": mode, "typical": typical}
         for mode, typical in ((1, False), (1, True), (1, False), (2, False), (3, False))
     ]
-    assert html.replay_order(entries) == [1, 0, 3, 4, 2]
+    assert replay_order(entries) == [1, 0, 3, 4, 2]
 
 
-def test_one_method_s_failures_only(run):
-    data = data_of(html.report(run, 300, ["e2"]))
-    assert {entry["method"] for entry in data["failures"]} == {group["method"] for group in data["groups"]} == {"e2"}
-
-
-def test_the_page_loads_nothing_and_files_cannot_add_markup(run):
-    page = html.report(run, 300)
+def test_the_page_loads_nothing_and_files_cannot_add_markup(page):
     assert page.count("</script") == 2 and SCENE not in page and "<img" not in page
     outside = re.sub(r"http://www\.w3\.org/2000/svg", "", page)
     assert not re.search(r"https?://|@import|url\(|\bsrc=(?!x onerror)|<link", outside)
 
 
 def test_scenes_that_share_a_map_share_it_in_the_file(tmp_path):
-    driven = scene(course(0, 0, 0, 12), course(30.5, 0, 0, 5), adversaries=[1])
-    run = write_run(tmp_path, {"e2": driven, "e3": dict(driven)})
-    data = data_of(html.report(run, 300))
+    run = write_run(tmp_path, {name: scene(*CRASH, adversaries=[1]) for name in ("e2", "e3")})
+    data = report(run)
     assert len(data["replays"]) == 2 and len(data["maps"]) == 1
 
 
 def test_a_run_without_failures_has_a_page_too(tmp_path):
-    run = write_run(tmp_path, {"e2": scene(course(0, 0, 0, 5), course(0, 30, 0, 5))})
-    data = data_of(html.report(run, 300))
+    data = report(write_run(tmp_path, {"e2": scene(course(0, 0, 0, 5), course(0, 30, 0, 5))}))
     assert data["failures"] == data["replays"] == [] and data["groups"][0]["rollouts"] == 1
 
 
-def test_the_tables_are_those_of_the_run(run):
-    tables = data_of(html.report(run, 0))["tables"]
-    assert tables == [vars(table) for table in read_tables(run / "tables.md")] and len(tables) >= 1
-    assert "A caption: with <b>markup</b>." in tables[0]["caption"]
-
-
-@pytest.mark.parametrize("missing", ["modes.json", "rollouts.csv", "metrics.json", "tables.md", "rollouts"])
+@pytest.mark.parametrize("missing", ["modes.json", "rollouts.csv", "metrics.json", "rollouts"])
 def test_what_a_run_lacks_is_named_and_nothing_is_written(tmp_path, capsys, missing):
-    run = write_run(tmp_path / "run", {"e2": scene(course(0, 0, 0, 12), course(30.5, 0, 0, 5), adversaries=[1])})
+    run = write_run(tmp_path / "run", {"e2": scene(*CRASH, adversaries=[1])})
     (run / missing).rename(tmp_path / "away")
     with pytest.raises(SystemExit) as stop:
-        html.main([str(run)])
+        main([str(run)])
     said = capsys.readouterr().err
     assert stop.value.code == 2 and said.startswith("error: ") and missing in said and len(said.splitlines()) == 1
-    assert not (run / html.PAGE).exists()
-
-
-def test_an_unknown_method_is_told_the_known_ones(run, capsys):
-    with pytest.raises(SystemExit):
-        html.main([str(run), "--method", "e3"])
-    assert "--method e3" in (said := capsys.readouterr().err) and "e2, planned" in said
-
-
-def test_the_command_that_a_run_names_writes_the_page(tmp_path, capsys):
-    crash = scene(course(0, 0, 0, 12), course(30.5, 0, 0, 5), adversaries=[1])
-    run = write_run(tmp_path / "a run", {"e2": crash})
-    python, m, module, *arguments = shlex.split(html.report_command(run))
-    assert (python, m, module) == ("python", "-m", html.__name__)
-    html.main(arguments)
-    assert capsys.readouterr().out.strip() == str(run / html.PAGE)
-    assert (run / html.PAGE).read_text().startswith("<!doctype html>")
-    assert html.report_command(write_run(tmp_path / "clean", {"e2": scene(course(0, 0, 0, 5))})) == ""
+    assert not (run / PAGE).exists()

@@ -5,10 +5,10 @@ import shutil
 import numpy as np
 import pytest
 
-from e2rl.evaluation.rollout_files import ROLLOUTS, TABLE, read_rows, rollout_name
-from e2rl.evaluation.rollout_reader import read_rollout
+from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report import html
+from e2rl.sim.rollout_file import ROLLOUTS, Rollout, rollout_name
 from tests.report.failed_run import SCENE, failed_run
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -112,21 +112,21 @@ def test_it_opens_on_the_first_weakness_without_a_complaint(run, page):
 def test_the_browser_decodes_what_the_files_hold(run, page):
     numbers = page.execute_script("return page.report.failures.map((failure) => failure.replay)")
     for row, number in zip(failures_of(run), numbers, strict=True):
-        rollout = read_rollout(run / ROLLOUTS / rollout_name(row))
+        rollout = Rollout.read(run / ROLLOUTS / rollout_name(row))
         tracks = page.execute_async_script(DECODE, number)
         steps = len(tracks[0]["x"])
-        agents = np.flatnonzero(rollout["valid"][:steps].any(0))
+        agents = np.flatnonzero(rollout.valid[:steps].any(0))
         for track, agent in zip(tracks, agents, strict=False):
             present = np.array(track["present"]) == 1
-            assert (present == rollout["valid"][:steps, agent]).all()
+            assert (present == rollout.valid[:steps, agent]).all()
             for name, index, quantum in (("x", 0, 0.01), ("y", 1, 0.01), ("speed", 3, 0.01)):
                 found = np.array(track[name])[present]
-                assert np.abs(found - rollout["states"][:steps, agent, index][present]).max() < 0.51 * quantum + 1e-5
+                assert np.abs(found - rollout.states[:steps, agent, index][present]).max() < 0.51 * quantum + 1e-5
 
 
 def test_scrubbing_moves_the_ego_on_the_canvas(run, page):
     row = failures_of(run)[page.execute_script("return page.player.failure.number")]
-    states = read_rollout(run / ROLLOUTS / rollout_name(row))["states"][:, 0]
+    states = Rollout.read(run / ROLLOUTS / rollout_name(row))["states"][:, 0]
     between = (states[4] + states[5]) / 2
     np.testing.assert_allclose(page.execute_script(POSE_OF_THE_EGO, 4.5), between[[0, 1, 3]], atol=0.011)
     pictures = set()

@@ -1,69 +1,81 @@
-"""Tables: the order of the metrics, per cent, what is counted, and what is unknown."""
+"""Tables: the order of the metrics, per cent, what is counted, what is unknown; in Markdown, CSV and LaTeX."""
 
+import csv
 import math
 from types import SimpleNamespace
 
 import pytest
 
-from e2rl.evaluation.rollout_files import Source, label_rows
 from e2rl.evaluation.summary import metric_rows
-from e2rl.metrics.catalogue import MAIN, TABLES
+from e2rl.metrics.catalogue import METRICS, table_metrics
 from e2rl.metrics.score import score_rollouts
-from e2rl.report.tables import metric_tables, number, print_tables, save_tables
+from e2rl.report.comparison_tables import EGOS, method_tables, planner_tables, save_compared
+from e2rl.report.tables import Table, escaped, metric_tables, number, print_tables, save_tables
 from tests.metrics.random_rollouts import random_rollouts
+
+TERMS = {"e2": ("predicted", "full"), "ctg_adv": ("plan", "none"), "replay": ("", "")}
+
+
+def rows_of(*drawn, rollouts=6, draws=50, **options):
+    """Rows of metrics.json of (method, ego, eta), each of rollouts of its own."""
+    rows, samples = [], []
+    for number_, (method, ego, eta) in enumerate(drawn):
+        found, features = score_rollouts(random_rollouts(rollouts, seed=3 + number_))
+        rows += [row | {"method": method, "ego_policy": ego, "eta": eta} for row in found]
+        samples += features
+    return metric_rows(rows, samples, draws=draws, realism_draws=5, **options)
 
 
 @pytest.fixture(scope="module")
 def rows():
-    scores, features = score_rollouts(random_rollouts(8, seed=3))
-    other, more = score_rollouts(random_rollouts(8, seed=4))
-    labelled = label_rows(other, Source("synthetic", "test", "nominal", "idm"))
-    labelled = [row | {"eta": 0.0} for row in labelled] + label_rows(scores, Source("synthetic", "test", "e2", "idm"))
-    return metric_rows(labelled, more + features, draws=50, realism_draws=5)
+    return rows_of(("nominal", "idm", 0.0), ("e2", "idm", 2.0), rollouts=8)
 
 
 def test_tables_list_known_metrics_in_the_catalogue_s_order(rows):
     means, paired = metric_tables(rows)
     assert means.head == ["", "nominal", "e2 η=2"] and paired.head == ["", "e2 η=2"]
     names = [row[0].split(" [")[0] for row in means.rows]
-    assert names == [metric.name for metric in MAIN if metric.name not in ("avoidable", "transport")]
+    main = [metric.name for metric in table_metrics("main")]
+    assert names == [name for name in main if name not in ("avoidable", "transport")]
     traffic = [row[0].split(" [")[0] for row in metric_tables(rows, table="traffic")[0].rows]
-    assert traffic == [name for name in TABLES["traffic"] if name in traffic] and "w1_jerk" in traffic
+    assert traffic == [metric.name for metric in table_metrics("traffic") if metric.name in traffic]
 
 
-def test_a_sweep_names_every_intensity(rows):
-    scores, features = score_rollouts(random_rollouts(4, seed=5))
-    labelled = [
-        row | {"eta": eta} for eta in (0.0, 2.0) for row in label_rows(scores, Source("synthetic", "test", "e2", "idm"))
-    ]
-    means, paired = metric_tables(metric_rows(labelled, features * 2, draws=5, realism_draws=2))
+def test_a_sweep_names_every_intensity():
+    means, paired = metric_tables(rows_of(("e2", "idm", 0.0), ("e2", "idm", 2.0), rollouts=4, draws=5))
     assert means.head == ["", "e2 η=0", "e2 η=2"] and paired.head == ["", "e2 η=2"]
     assert "Difference to e2 η=0" in paired.caption
 
 
-def test_rates_are_per_cent_with_their_interval(rows):
+def test_rates_are_per_cent_and_what_rests_on_fewer_rollouts_says_so(rows):
     means, paired = metric_tables(rows)
-    value = rows[1]["metrics"]["cfr_bg"]
-    (row,) = (row for row in means.rows if row[0] == "cfr_bg [%]")
-    assert row[2].startswith(f"{100 * value['mean']:.1f} [")
+    cells = {row[0].split(" [")[0]: row[1:] for row in means.rows}
+    assert cells["cfr_bg"][1].startswith(f"{100 * rows[1]['metrics']['cfr_bg']['mean']:.1f}")
     assert paired.rows[0][0] == "cfr [points]" and paired.rows[0][1][0] in "+-"
-
-
-def test_captions_say_how_much_a_table_is_computed_from(rows):
-    caption = metric_tables(rows, settings="16 samples, 20 network passes.")[0].caption
-    assert "4 scenes, 2 seeds, 8 rollouts per method" in caption and "16 samples, 20 network passes." in caption
-    assert "Not computable here: avoidable, transport." in caption
-
-
-def test_values_on_fewer_rollouts_carry_their_count(rows):
-    cells = {row[0].split(" [")[0]: row[1:] for row in metric_tables(rows)[0].rows}
     for column, row in enumerate(rows):
         known = row["metrics"]["relvel"]["n"]
         assert cells["relvel"][column].endswith(f"({known})") if known else cells["relvel"][column] == "–"
 
 
+def test_captions_say_how_much_a_table_is_computed_from(rows):
+    caption = metric_tables(rows, settings="16 samples.")[0].caption
+    assert "4 scenes, 2 seeds, 8 rollouts per method" in caption and "16 samples." in caption
+    assert "Not computable here: avoidable, transport." in caption
+
+
+def test_a_star_marks_an_interval_without_0_but_not_of_a_cost():
+    paired = {"difference": 3.0, "low": 1.0, "high": 5.0, "n": 9}
+    rows = [
+        {"method": name, "eta": 0.0, "dataset": "d", "split": "s", "ego": "idm", "n_scenes": 1, "n_seeds": 1}
+        | {"n_rollouts": 9, "metrics": {}, "paired": {"a": {"progress": paired, "nfe": paired}} if name == "b" else {}}
+        for name in "ab"
+    ]
+    (table,) = metric_tables(rows)
+    assert {row[0].split(" [")[0]: row[1][-1] for row in table.rows} == {"progress": "*", "nfe": "]"}
+
+
 def test_tables_are_printed_and_saved_as_markdown(rows, tmp_path, capsys):
-    tables = metric_tables(rows)
+    tables = [*metric_tables(rows), Table("C.", ["", "x"], [["a|b", "1"]], "Title")]
     print_tables(tables)
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith("cfr [%]") for line in lines)
@@ -71,21 +83,85 @@ def test_tables_are_printed_and_saved_as_markdown(rows, tmp_path, capsys):
     text = (tmp_path / "tables.md").read_text()
     table = [line for line in text.splitlines() if line.startswith("|")]
     assert {line.count("|") for line in table[: len(tables[0].rows) + 2]} == {4}
+    assert "## Title" in text and "a&#124;b" in text
 
 
 def test_numbers_keep_three_digits():
-    share, metres, real = (next(m for m in MAIN if m.name == name) for name in ("cfr", "progress", "real"))
+    share, metres, real = (METRICS[name] for name in ("cfr", "progress", "real"))
     assert [number(share, value) for value in (0.1234, 0.0012, 0.0, 1.0)] == ["12.3", "0.12", "0.0", "100.0"]
     assert [number(metres, value) for value in (1234.4, 64.35, 3.14159, 0.01)] == ["1234", "64.3", "3.14", "0.010"]
     assert number(real, 0.8764, "+") == "+0.876"
-    declared = SimpleNamespace(share=False, decimals=3)
+    declared = SimpleNamespace(fraction=False, decimals=3)
     assert [number(declared, value) for value in (1.0, 12.34)] == ["1.000", "12.340"]
 
 
 def test_one_rollout_makes_a_table_without_intervals():
-    scores, features = score_rollouts(random_rollouts(1, seed=3))
-    rows = metric_rows(label_rows(scores, Source("synthetic", "test", "e2", "idm")), features, draws=5, realism_draws=2)
+    rows = rows_of(("e2", "idm", 2.0), rollouts=1, draws=5)
     (table,) = metric_tables(rows)
     assert "1 scene, 1 seed, 1 rollout per method" in table.caption
     assert math.isnan(rows[0]["metrics"]["progress"]["low"])
     assert "[" not in next(row for row in table.rows if row[0].startswith("progress"))[1]
+
+
+# --- a row a method, a row an ego
+
+
+@pytest.fixture(scope="module")
+def methods():
+    return method_tables(rows_of(*((name, "idm", 2.0) for name in TERMS)), TERMS, ["e2", "replay"], "The prior.")
+
+
+def test_every_method_has_a_row_with_its_terms_and_its_cost(methods):
+    means = methods[0]
+    assert [row[:3] for row in means.rows] == [
+        ["e2 η=2", "predicted", "full"],
+        ["ctg_adv η=2", "plan", "none"],
+        ["replay η=2", "–", "–"],
+    ]
+    cost = {head: means.rows[0][place] for place, head in enumerate(means.head)}
+    assert cost["nfe"].startswith("128") and "seconds_per_rollout [s]" in cost
+    assert "The prior." in means.caption and "6 rollouts per method" in means.caption
+
+
+def test_differences_are_paired_to_each_reference(methods):
+    """A difference to the one is the opposite of the difference from it."""
+    means, differences = methods
+    cfr = differences.head.index("cfr [points]")
+    there, back = (differences.rows[place][cfr].split(" ")[0] for place in (1, 2))
+    assert float(there) == -float(back) != 0
+    pairs = [(row[0], row[3]) for row in differences.rows]
+    assert pairs == [("ctg_adv η=2", "e2"), ("replay η=2", "e2"), ("e2 η=2", "replay"), ("ctg_adv η=2", "replay")]
+    assert "Difference of each method to e2 and to replay" in differences.caption
+    assert len(differences.head) == len(means.head) + 1
+
+
+def test_they_are_written_in_three_formats(methods, tmp_path):
+    save_compared(tmp_path, methods)
+    with (tmp_path / "methods.csv").open(newline="") as file:
+        assert list(csv.reader(file)) == [methods[0].head, *methods[0].rows]
+    latex = (tmp_path / "methods.tex").read_text()
+    assert latex.count(r"\begin{tabular}") == latex.count(r"\bottomrule") == 2
+    body = [line for line in latex.splitlines() if line.endswith(r"\\")]
+    assert len(body) == 2 + 3 + 4
+    assert {line.count(" & ") for line in body} == {len(table.head) - 1 for table in methods}
+    assert r"cfr [\%]" in latex and r"seconds\_per\_rollout" in latex and r"$\eta$" in latex
+    assert escaped("a_b & 5% {x} \\ 3 m/s²") == r"a\_b \& 5\% \{x\} \textbackslash{} 3 m/s$^2$"
+
+
+def test_every_ego_has_a_row_and_a_difference_to_the_reference(tmp_path):
+    names = ["idm", "lane_graph", "actor"]
+    pairs = [("idm", "lane_graph"), ("actor", "lane_graph")]
+    rows = rows_of(*(("e2", name, 2.0) for name in names), egos=pairs)
+    means, differences = tables = planner_tables(rows, names, "lane_graph")
+    assert [row[:2] for row in means.rows] == [[ego, "e2 η=2"] for ego in names]
+    assert [row[0] for row in differences.rows] == ["idm", "actor"]
+    difference = rows[0]["paired"]["ego lane_graph"]["cfr"]["difference"]
+    assert differences.rows[0][differences.head.index("cfr [points]")].startswith(f"{100 * difference:+.1f}"[:4])
+    assert {f"{side}{of} [%]" for side in ("front", "side", "rear") for of in ("", "_any")} <= set(means.head)
+    save_compared(tmp_path, tables, EGOS)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "egos.csv",
+        "egos.md",
+        "egos.tex",
+        "egos_differences.csv",
+    ]

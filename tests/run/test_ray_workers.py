@@ -18,7 +18,7 @@ from e2rl.run.parts import Parts
 from e2rl.run.processes import in_processes
 from e2rl.run.ray_workers import RayWorkers
 from e2rl.sim.env import SimSettings
-from e2rl.sim.rollouts import ROLLOUTS
+from e2rl.sim.rollout_file import ROLLOUTS
 from e2rl.traffic.rollout import synthesize_traffic
 from tests.evaluation.test_protocol import SEEDS, same_runs
 from tests.learning.small import Ambush, small_run, small_scenes

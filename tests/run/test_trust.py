@@ -12,7 +12,7 @@ POLICY_FILE = "e2rl.planners.policy_file.PolicyFileEgo"
 
 
 def with_choice(group, name, **changes):
-    return {group: {**load_choice(group, name), **changes}}
+    return {group: OmegaConf.merge(OmegaConf.create(OmegaConf.to_container(load_choice(group, name))), changes)}
 
 
 @pytest.mark.parametrize("config", [TRAIN, EVALUATE])

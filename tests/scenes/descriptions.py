@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from e2rl.scenes.log_files import LogFiles
+
 FRAMES = 91
 ALL = np.arange(FRAMES)
 
@@ -119,6 +121,15 @@ class Malicious:
 
     def __reduce__(self):
         return self.call
+
+
+def recordings_in(
+    kind: type[LogFiles], content: bytes, log: str = "made.pkl", place: str = "place", **settings
+) -> list:
+    """What a source makes of one log."""
+    source = kind("nowhere", **settings)
+    vars(source).update(logs=lambda: [log], content=lambda _: content, locations={Path(log).stem: place})
+    return list(source.recordings())
 
 
 def data_config(path, cache, **options) -> dict:

@@ -1,7 +1,6 @@
 """CommonRoad XML: what a scenario says arrives in the Recording, entities and nonsense are refused by name."""
 
 import re
-import subprocess
 import sys
 import zipfile
 from pathlib import Path
@@ -11,10 +10,10 @@ import pytest
 
 from e2rl.run.errors import InputError
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, OTHER, PEDESTRIAN, VEHICLE
-from e2rl.scenes.scene_cache import unpack
 
 pytest.importorskip("commonroad", reason="data=commonroad needs the extra commonroad")
 from e2rl.scenes.commonroad import CommonRoadSource, read_scenario
+from tests.scenes.descriptions import recordings_in
 
 RECORDED = Path(__file__).parents[3] / "shared" / "data" / "commonroad_ngsim" / "scenarios.zip"
 
@@ -99,7 +98,7 @@ def begin(x: float, y: float) -> str:
 
 
 def test_tracks_map_and_lights_arrive():
-    recording = read_scenario(scenario(), "made.xml")
+    recording = read_scenario(scenario())
     assert (recording.scene_id, recording.location, recording.dataset) == ("DEU_Made-7_1_T-1", "DEU_Made", "commonroad")
     assert recording.agent_type.tolist() == [VEHICLE, VEHICLE, PEDESTRIAN, OTHER]
     assert recording.size.tolist() == [[4.5, 1.9], [8.0, 2.5], [0.5, 0.5], [2.0, 1.0]]
@@ -122,21 +121,21 @@ def test_tracks_map_and_lights_arrive():
 
 @pytest.mark.parametrize(("dt", "steps"), [(0.2, 46), (0.04, 226), (0.1, 91)])
 def test_every_time_step_makes_the_same_recording_at_10_hz(dt, steps):
-    recording = read_scenario(scenario(dt=dt, steps=steps), "made.xml")
+    recording = read_scenario(scenario(dt=dt, steps=steps))
     assert recording.states.shape[0] == 91 and recording.valid[:, 0].all()
     assert np.allclose(recording.states[:, 0, 0], 20 + 0.6 * np.arange(91))
 
 
 def test_the_ego_is_who_starts_where_the_planning_problem_does_else_who_moves_longest():
-    assert read_scenario(scenario(problem=begin(20.3, 0.2)), "made.xml").ego == 0
-    assert read_scenario(scenario(problem=begin(35, 0)), "made.xml").ego == 1  # nobody near: both move, 1 is faster
-    assert read_scenario(scenario(), "made.xml").ego == 1
+    assert read_scenario(scenario(problem=begin(20.3, 0.2))).ego == 0
+    assert read_scenario(scenario(problem=begin(35, 0))).ego == 1  # nobody near: both move, 1 is faster
+    assert read_scenario(scenario()).ego == 1
     shorter = [obstacle(10, 0, 6, 91, 0.1), obstacle(11, 3.6, 20, 60, 0.1), obstacle(12, -5, 9, 91, 0.1, "bicycle")]
-    assert read_scenario(scenario(shorter), "made.xml").ego == 0
+    assert read_scenario(scenario(shorter)).ego == 0
     gone = [obstacle(10, 0, 6, 5, 0.1), obstacle(11, 3.6, 1, 60, 0.1)]
-    assert read_scenario(scenario(gone), "made.xml").ego == 1  # who is there at the start frame
+    assert read_scenario(scenario(gone)).ego == 1  # who is there at the start frame
     with pytest.raises(InputError, match="no ego"):
-        read_scenario(scenario([obstacle(12, -5, 1, 91, 0.1, kind="pedestrian")]), "made.xml").validate()
+        read_scenario(scenario([obstacle(12, -5, 1, 91, 0.1, kind="pedestrian")])).validate()
 
 
 def test_folders_and_zips_make_the_same_scenes_and_short_scenarios_are_counted(tmp_path):
@@ -171,16 +170,16 @@ BOMB = b'<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
             lambda text: text.decode().replace("<commonRoad", BOMB.decode() + "<commonRoad", 1).encode("utf-16"),
             "document type",
         ),
-        (lambda text: text[: len(text) // 2], "not a CommonRoad scenario"),
-        (lambda text: b"", "not a CommonRoad scenario"),
-        (lambda text: b"<commonRoad/>", "not a CommonRoad scenario"),
+        (lambda text: text[: len(text) // 2], "is none of CommonRoad scenarios"),
+        (lambda text: b"", "is none of CommonRoad scenarios"),
+        (lambda text: b"<commonRoad/>", "is none of CommonRoad scenarios"),
         (lambda text: text.replace(b'timeStepSize="0.1"', b'timeStepSize="7"'), "timeStepSize=7"),
         (lambda text: text.replace(b'timeStepSize="0.1"', b'timeStepSize="nan"'), "timeStepSize=nan"),
         (
             lambda text: text.replace(b"<time><exact>90</exact>", b"<time><exact>9000000000</exact>", 1),
-            "frames x agents|not a CommonRoad scenario",
+            "frames x agents|is none of CommonRoad scenarios",
         ),
-        (lambda text: text.replace(b"<x>20.0</x>", b"<x>here</x>", 1), "not a CommonRoad scenario"),
+        (lambda text: text.replace(b"<x>20.0</x>", b"<x>here</x>", 1), "is none of CommonRoad scenarios"),
         (lambda text: text.replace(b"<x>20.0</x>", b"<x>1e400</x>", 1), "point/x is 1e400; repair it"),
         (lambda text: turned(text, b"1e400"), "orientation/exact is 1e400"),
         (lambda text: turned(text, b"nan"), "orientation/exact is nan"),
@@ -190,18 +189,13 @@ BOMB = b'<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
 )
 def test_what_is_wrong_is_named_with_the_file(change, message):
     with pytest.raises(InputError, match=rf"^made\.xml: .*({message})"):
-        read_scenario(change(scenario()), "made.xml")
+        recordings_in(CommonRoadSource, change(scenario()), "made.xml")
 
 
-def test_a_missing_package_is_named_with_its_extra():
-    code = (
-        "import sys; sys.modules['commonroad'] = None\n"
-        "from e2rl.scenes.commonroad import read_scenario\n"
-        "read_scenario(b'<commonRoad/>', 'made.xml')"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert "InputError: data=commonroad: commonroad-io cannot be imported" in done.stderr
-    assert "pip install 'e2rl[commonroad]'" in done.stderr
+def test_a_missing_package_is_named_with_its_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "commonroad.common.reader.file_reader_xml", None)
+    with pytest.raises(InputError, match=r"made\.xml: a library .*commonroad.*pip install 'e2rl\[commonroad\]'"):
+        recordings_in(CommonRoadSource, scenario(), "made.xml")
 
 
 @pytest.mark.skipif(not RECORDED.is_file(), reason=f"recorded scenarios are missing: {RECORDED}")
@@ -215,4 +209,4 @@ def test_recorded_scenarios_make_scenes_and_the_ego_s_speed_is_that_of_its_displ
     moved = np.linalg.norm(np.diff(track[:, :2], axis=0), axis=1).sum()
     assert abs(moved - 0.1 * track[1:, 3].sum()) < 0.05 * moved + 1
     (row,) = source.rows()
-    assert row.scene is not None and unpack(row.scene.record)["logged_valid"][:, 0].any()
+    assert row.scene is not None and row.scene["logged_valid"][:, 0].any()

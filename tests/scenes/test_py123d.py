@@ -77,7 +77,7 @@ def write_log(root, name="log", seconds=12.0, rate=10.0, location="town", about=
         stamp = d.Timestamp.from_us(1_000_000_000 + round(1e6 * time))
         ego = d.EgoStateSE3.from_imu(turned(20 + 8 * time - 1.5, 0, 0), EGO, stamp)
         found = [
-            box("truck", Label.VEHICLE, 60 + 6 * time, 3.6, 0.1 * time, (9.0, 2.5)),
+            box("truck", Label.VEHICLE, 60 + 6 * time, 3.6, 0.02 * time, (9.0, 2.5)),
             box("rider", Label.BICYCLE, 30 + 4 * time, -4, 0, (1.8, 0.7)),
             box("cone", Label.TRAFFIC_CONE, 70, -5, 0, (0.4, 0.4)),
             box("sign", Label.CZONE_SIGN, 80, -5, 0, (0.4, 0.4)),
@@ -94,7 +94,11 @@ def write_log(root, name="log", seconds=12.0, rate=10.0, location="town", about=
 
 def recordings(root, path=None):
     source = Py123dSource(path=str(path or root))
-    return [recording for log in source.logs() for recording in source.read(log)]
+    found = []
+    for log in source.logs():
+        with source.named(log):
+            found += source.read(log)
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +123,7 @@ def test_tracks_arrive_as_they_were_written(made):
         recording.states[:, 0], np.stack([20 + 8 * time, 0 * time, 0 * time, 0 * time + 8], 1), atol=1e-6
     )
     truck = recording.states[:, row[VEHICLE]]
-    assert np.allclose(truck[:, 0], 60 + 6 * time) and np.allclose(truck[:, 2], 0.1 * time, atol=1e-6)
+    assert np.allclose(truck[:, 0], 60 + 6 * time) and np.allclose(truck[:, 2], 0.02 * time, atol=1e-6)
     assert recording.size[[0, row[VEHICLE], row[CYCLIST]]].tolist() == [[5, 2], [9, 2.5], [1.8, 0.7]]
     assert recording.valid[:, row[PEDESTRIAN]].sum() == 20 and recording.valid[:, :3].all()
 
@@ -189,7 +193,10 @@ def test_what_is_no_log_is_named(made, tmp_path):
     folder = tmp_path / "bad" / "logs" / "made_val" / "log"
     folder.mkdir(parents=True)
     (folder / "sync.arrow").write_bytes(b"nonsense")
-    with pytest.raises(InputError, match="logs/made_val/log: not a log of py123d: .*convert it again"):
+    with pytest.raises(
+        InputError,
+        match="logs/made_val/log: is none of logs converted by py123d, with logs/ and maps/: .*convert it again",
+    ):
         recordings(tmp_path / "bad")
 
 
@@ -216,7 +223,7 @@ def test_a_stranger_s_log_imports_no_code(tmp_path, file, monkeypatch):
 
 def test_without_the_library_the_extra_is_named(made, monkeypatch):
     monkeypatch.setitem(sys.modules, "py123d.api.scene.arrow.arrow_scene_api", None)
-    with pytest.raises(InputError, match=r"data=py123d: py123d cannot be imported .*pip install 'e2rl\[py123d\]'"):
+    with pytest.raises(InputError, match=r"a library .*py123d.*pip install 'e2rl\[py123d\]'"):
         recordings(made)
 
 
@@ -224,7 +231,7 @@ def test_without_the_library_the_extra_is_named(made, monkeypatch):
 def test_recorded_logs_through_py123d_are_those_of_our_own_reader(tmp_path):
     """An Argoverse 2 sensor log, converted by py123d's own parser, beside data=argoverse2. Its parser wants camera and
     lidar files for whole frames; poses, boxes and map it reads without."""
-    pytest.importorskip("av2")
+    pytest.importorskip("av2"), pytest.importorskip("geopandas")
     from av2.utils.io import read_city_SE3_ego, read_feather
     from py123d.parser.av2.av2_map_parser import Av2MapParser
     from py123d.parser.av2.av2_sensor_parser import Av2SensorLogParser

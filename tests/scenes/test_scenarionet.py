@@ -1,6 +1,5 @@
 """ScenarioDescription files: nothing in them is ever run, and what they say arrives in the Recording."""
 
-import collections
 import os
 import pickle
 import struct
@@ -14,14 +13,12 @@ import pytest
 from e2rl.run.errors import InputError
 from e2rl.scenes.log_files import MAX_BYTES
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, OTHER, PEDESTRIAN, VEHICLE
-from e2rl.scenes.scenarionet import ScenarioNetSource, read_recording, safe_load
-from tests.scenes.descriptions import ALL, FRAMES, Malicious, description, fork, straight, write_folder, write_zip
-
-PROTOCOLS = range(6)
+from e2rl.scenes.scenarionet import ScenarioNetSource
+from tests.scenes.descriptions import ALL, FRAMES, description, fork, recordings_in, straight, write_folder, write_zip
 
 
 def read(scene: dict, starts=None) -> list:
-    return list(read_recording(pickle.dumps(scene), "made.pkl", "place").windows(starts, 80))
+    return recordings_in(ScenarioNetSource, pickle.dumps(scene), starts=starts)
 
 
 def contents(path: Path) -> list[bytes]:
@@ -29,86 +26,7 @@ def contents(path: Path) -> list[bytes]:
     return [source.content(log) for log in source.logs()]
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda path: Malicious(os.system, f"touch {path}"),
-        lambda path: Malicious(open, str(path), "w"),
-        lambda path: Malicious(eval, f"open({str(path)!r}, 'w')"),
-        lambda path: Malicious(os.mkdir, str(path)),
-        lambda path: Malicious(np.save, str(path), 1),
-        lambda path: Malicious(getattr, "a", "upper"),
-        lambda path: Malicious(np.load, str(path)),
-        lambda path: collections.OrderedDict(a=1),
-    ],
-)
-def test_forbidden_classes_are_refused_by_name_and_never_run(tmp_path, call, protocol):
-    mark = tmp_path / "ran.npy"
-    content = pickle.dumps({"metadata": {"x": call(mark)}}, protocol)
-    with pytest.raises(InputError, match=r"made\.pkl: cannot be read: names the forbidden class"):
-        safe_load(content, "made.pkl")
-    assert not mark.exists()
-
-
-def test_dotted_names_and_other_modules_of_numpy_are_refused():
-    for module, name in (
-        ("numpy", "ndarray.tofile"),
-        ("numpy", "fromfile"),
-        ("numpy.core.multiarray", "fromfile"),
-        ("numpy.testing", "dtype"),
-        ("builtins", "eval"),
-        ("builtins", "getattr"),
-        ("collections", "namedtuple"),
-        ("numpy.core", "multiarray"),
-    ):
-        content = (
-            b"\x80\x04\x8c"
-            + bytes([len(module)])
-            + module.encode()
-            + b"\x8c"
-            + bytes([len(name)])
-            + name.encode()
-            + b"\x93."
-        )
-        with pytest.raises(InputError, match="forbidden class"):
-            safe_load(content, "made.pkl")
-
-
-@pytest.mark.parametrize("protocol", [3, 4, 5])
-def test_arrays_of_both_numpys_and_containers_are_read(protocol):
-    held = {
-        "a": np.arange(6.0).reshape(2, 3),
-        "b": np.float32(2.5),
-        "c": np.array(["x", None], object),
-        "d": collections.defaultdict(dict, {"k": {1}}),
-        "e": (frozenset({2}), 1j, b"z", bytearray(b"y")),
-        "f": np.asfortranarray(np.eye(3)),
-        "g": np.array(["LANE"]),
-        "h": np.bool_(True),
-    }
-    new = pickle.dumps(held, protocol)
-    old = new.replace(b"numpy._core.", b"numpy.core.") if protocol == 3 else new
-    if protocol > 3:  # lengths of names stand in the stream
-        for name in (b"numpy._core.multiarray", b"numpy._core.numeric"):
-            old = old.replace(bytes([len(name)]) + name, bytes([len(name) - 1]) + name.replace(b"_core", b"core"))
-        old = old[:2] + old[11:] if old[2:3] == b"\x95" else old  # without the frame, whose length changed
-    for content in (new, old):
-        found = safe_load(content, "made.pkl")
-        assert found.keys() == held.keys() and found["d"] == {"k": {1}}
-        assert all(np.array_equal(found[key], held[key]) for key in "abcfgh") and found["e"] == held["e"]
-
-
-@pytest.mark.parametrize(
-    "content",
-    [b"", b"nonsense", pickle.dumps(description())[:5000], pickle.dumps([1]), b"\x80\x04\x95", b"\x80\x05}q\x00("],
-)
-def test_damaged_files_are_named(content):
-    with pytest.raises(InputError, match=r"^made\.pkl: "):
-        safe_load(content, "made.pkl")
-
-
-def test_folders_and_zips_hold_the_same_scenes(tmp_path):
+def test_folders_and_zips_hold_the_same_scenes_and_an_index_beside_them_their_places(tmp_path):
     scenes = [description(), description(scenario_id="other")]
     folder = write_folder(tmp_path / "data" / "part", scenes).parent
     (folder / "dataset_summary.pkl").write_bytes(b"summary")
@@ -118,6 +36,12 @@ def test_folders_and_zips_hold_the_same_scenes(tmp_path):
     for method in (zipfile.ZIP_LZMA, zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED):
         path = write_zip(tmp_path / f"{method}.zip", scenes, method)
         assert contents(path) == expected
+    assert ScenarioNetSource(str(path)).locations == {}
+    (tmp_path / "index.csv").write_text("file,location_group\npart/sd_00.pkl,17\n")
+    assert ScenarioNetSource(str(path)).locations == {"sd_00": "17"}
+    assert [recording.location for recording in ScenarioNetSource(str(path)).recordings()] == ["17", ""]
+    (tmp_path / "index.csv").write_text("name\nx\n")
+    assert ScenarioNetSource(str(path)).locations == {}
 
 
 def test_what_is_no_regular_file_is_named_or_passed_over(tmp_path):
@@ -128,15 +52,16 @@ def test_what_is_no_regular_file_is_named_or_passed_over(tmp_path):
     source = ScenarioNetSource(str(folder), cache=str(tmp_path / "cache"), workers=1, skip_invalid=True)
     assert source.logs() == ["nothing.pkl", "pipe.pkl", "sd_00.pkl"]
     for log in source.logs()[:2]:
-        with pytest.raises(InputError, match=f"{log} in .*no regular file"):
+        with pytest.raises(InputError, match=f"{log}: no regular file"):
             source.content(log)
     assert source.load().dropped == {"invalid": 2}
     with pytest.raises(InputError, match="neither a folder nor a zip file"):
         ScenarioNetSource(str(folder / "pipe.pkl")).logs()
 
 
-@pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2])
-@pytest.mark.parametrize("claimed", [None, 1000])
+@pytest.mark.parametrize(
+    ("method", "claimed"), [(zipfile.ZIP_LZMA, 1000), (zipfile.ZIP_BZIP2, 1000), (zipfile.ZIP_DEFLATED, None)]
+)
 def test_a_bomb_is_not_unpacked(tmp_path, method, claimed):
     """Neither where the zip says how much would come out, nor where it lies."""
     path, size = tmp_path / "bomb.zip", 3 * MAX_BYTES
@@ -153,8 +78,13 @@ def test_a_bomb_is_not_unpacked(tmp_path, method, claimed):
         tracemalloc.stop()
 
 
-def test_a_zip_with_a_damaged_directory_and_an_index_that_is_no_table_are_named(tmp_path):
+def test_a_damaged_zip_and_an_index_that_is_no_table_are_named(tmp_path):
     path = write_zip(tmp_path / "x.zip", [description()])
+    torn = bytearray(path.read_bytes())
+    torn[200:400] = bytes(200)
+    (tmp_path / "torn.zip").write_bytes(torn)
+    with pytest.raises(InputError, match=r"sd_00\.pkl in .*torn\.zip: cannot be read"):
+        contents(tmp_path / "torn.zip")
     (tmp_path / "index.csv").write_bytes(b"file,location_group\n\xff\xfe,\x00\n")
     with pytest.raises(InputError, match=r"index\.csv: cannot be read"):
         _ = ScenarioNetSource(str(path)).locations
@@ -176,15 +106,6 @@ def test_paths_that_hold_nothing_say_so(tmp_path):
         with pytest.raises(InputError, match=message) as caught:
             ScenarioNetSource(str(tmp_path / name)).logs()
         assert str(tmp_path / name) in str(caught.value)
-
-
-def test_a_damaged_zip_member_is_named(tmp_path):
-    path = write_zip(tmp_path / "x.zip", [description()])
-    content = bytearray(path.read_bytes())
-    content[200:400] = bytes(200)
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=r"sd_00\.pkl in .*x\.zip: cannot be read"):
-        contents(path)
 
 
 def test_tracks_types_sizes_and_the_map_arrive():
@@ -276,10 +197,10 @@ def test_start_frames():
     [
         (lambda s: s["metadata"].update(sdc_id="nobody"), r"no ego: metadata\.sdc_id='nobody'"),
         (lambda s: s["metadata"].pop("sdc_id"), "no ego"),
-        (lambda s: s.pop("metadata"), "not a ScenarioDescription"),
+        (lambda s: s.pop("metadata"), "is none of ScenarioDescription pickles"),
         (lambda s: s.update(tracks={}), "no ego"),
-        (lambda s: s.update(metadata=3), "not a ScenarioDescription"),
-        (lambda s: s["tracks"]["7"].pop("state"), "not a ScenarioDescription.*state"),
+        (lambda s: s.update(metadata=3), "is none of ScenarioDescription pickles"),
+        (lambda s: s["tracks"]["7"].pop("state"), "is none of ScenarioDescription pickles: KeyError .state"),
         (lambda s: s["tracks"]["7"]["state"]["position"].fill(np.nan), "track 7 is NaN or infinite at frame 0"),
         (lambda s: s["metadata"].update(ts=ALL[:5]), "5 time stamps for 91 frames"),
         (lambda s: s["metadata"].update(ts=ALL[::-1] * 0.1), "time stamps do not increase"),
@@ -288,8 +209,11 @@ def test_start_frames():
         (lambda s: s["metadata"].update(current_time_index=-80), "current_time_index=-80 is no frame of 91"),
         (lambda s: s["metadata"].update(ts=np.append(ALL[:90] * 0.1, 1e9)), "scene 'fork': 3e.10 frames x agents"),
         (lambda s: s.update(id="x" * 200), "its id has more than 128 characters"),
-        (lambda s: s["tracks"]["7"]["state"].update(position=np.zeros((4, 3))), "not a ScenarioDescription"),
-        (lambda s: s.update(map_features=[1]), "not a ScenarioDescription"),
+        (
+            lambda s: s["tracks"]["7"]["state"].update(position=np.zeros((4, 3))),
+            "is none of ScenarioDescription pickles",
+        ),
+        (lambda s: s.update(map_features=[1]), "is none of ScenarioDescription pickles"),
         (lambda s: s["tracks"].update({7: s["tracks"]["7"]}), "two of its tracks have the id '7'"),
         (lambda s: s["tracks"]["7"].update(type="SPACESHIP"), "track 7 is of the unknown type 'SPACESHIP'; known are"),
         (lambda s: s["tracks"]["7"].update(type=[1]), r"track 7 is of the unknown type '\[1\]'"),
@@ -300,12 +224,3 @@ def test_what_is_wrong_is_named_with_the_file(change, message):
     change(scene)
     with pytest.raises(InputError, match=rf"^made\.pkl: {message}"):
         read(scene)
-
-
-def test_places_come_from_an_index_beside_the_data(tmp_path):
-    path = write_zip(tmp_path / "x.zip", [description()])
-    assert ScenarioNetSource(str(path)).locations == {}
-    (tmp_path / "index.csv").write_text("file,location_group\npart/sd_00.pkl,17\n")
-    assert ScenarioNetSource(str(path)).locations == {"sd_00": "17"}
-    (tmp_path / "index.csv").write_text("name\nx\n")
-    assert ScenarioNetSource(str(path)).locations == {}

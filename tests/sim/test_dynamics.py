@@ -7,6 +7,7 @@ import torch
 
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
+from e2rl.sim.dynamics import Arc, along_arc
 
 
 def random_case(batch=64, horizon=50, seed=0):
@@ -55,8 +56,10 @@ def test_turns_respect_curvature_and_lateral_acceleration():
     states = torch.cat([start[:, None], dynamics.rollout(start, 10 * actions)], 1)
     rate = dynamics.wrap(states[:, 1:, 2] - states[:, :-1, 2]).abs() / DT
     speed = (states[:, 1:, 3] + states[:, :-1, 3]) / 2
-    assert (rate <= dynamics.MAX_CURVATURE * speed + 1e-9).all()
-    assert (rate * speed <= dynamics.MAX_LATERAL + 1e-9).all()
+    asked = (10 * actions[..., 1]).abs()
+    allowed = torch.minimum(dynamics.MAX_CURVATURE * speed, dynamics.MAX_LATERAL / speed.clamp(min=1e-3))
+    torch.testing.assert_close(rate, torch.minimum(asked, allowed))
+    assert (asked < allowed).any() and (speed > 6).any() and (speed < 4).any(), "by steering lock, grip, or neither"
 
 
 def test_inverse_returns_the_actions():
@@ -76,6 +79,12 @@ def test_gradients_flow(horizon):
     assert torch.autograd.gradcheck(lambda a: dynamics.rollout(start, a), actions)
 
 
+def test_the_curvature_that_is_expected_of_a_turn():
+    rate, speed = torch.tensor([0.5, -0.3, 0.05, 2.0]), torch.tensor([10.0, 6.0, 0.2, 5.0])
+    found = dynamics.curvature_of(rate, speed)
+    torch.testing.assert_close(found, torch.tensor([0.05, -0.05, 0.05, dynamics.SHARPEST]))
+
+
 def test_constant_velocity_is_a_rollout_without_actions():
     start, _ = random_case()
     actions = torch.zeros(len(start), 20, 2, dtype=torch.float64)
@@ -83,3 +92,24 @@ def test_constant_velocity_is_a_rollout_without_actions():
     found, expected = dynamics.constant_velocity(start, times), dynamics.rollout(start, actions)
     torch.testing.assert_close(found[..., :2], expected[..., :2])
     assert torch.equal(found[..., 2:], start[:, None, 2:].expand(-1, 20, -1))
+
+
+def test_an_arc_is_the_unicycle_s_motion_at_constant_acceleration_and_curvature():
+    states, given = torch.tensor([1.0, -2.0, 0.4, 9.0]), Arc(torch.tensor(-3.0), torch.tensor(0.04))
+    times = DT * torch.arange(1, 51)
+    arc, driven = along_arc(states, given, times)
+    speed = torch.nn.functional.pad(arc[:, 3], (1, 0), value=9.0)
+    actions = torch.stack([torch.full((50,), -3.0), 0.04 * (speed[1:] + speed[:-1]) / 2], -1)
+    torch.testing.assert_close(arc, dynamics.rollout(states, actions), rtol=0, atol=0.02)
+    assert driven[-1].item() == pytest.approx(9.0**2 / 6, abs=1e-4), "to the halt, never backwards"
+    assert (driven.diff() >= 0).all() and (arc[31:, 3] == 0).all()
+
+
+def test_what_is_seen_lasts_a_while_then_speed_and_heading_stay():
+    given, times = Arc(torch.tensor(2.0), torch.tensor(0.05)), torch.tensor([1.0, 2.0, 3.0, 4.0])
+    arc, driven = along_arc(torch.tensor([0.0, 0.0, 0.0, 10.0]), given, times, hold=1.0, turn=2.0)
+    torch.testing.assert_close(arc[:, 3], torch.full((4,), 12.0))
+    torch.testing.assert_close(driven, torch.tensor([11.0, 23.0, 35.0, 47.0]))
+    torch.testing.assert_close(arc[1:, 2], torch.full((3,), 1.0))
+    assert arc[0, 2].item() == pytest.approx(0.55)
+    torch.testing.assert_close((arc[3, :2] - arc[2, :2]).norm(), torch.tensor(12.0))

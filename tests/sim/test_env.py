@@ -161,16 +161,6 @@ def test_turn_rates_of_traffic_and_ego():
     assert torch.allclose(env.world().turn_rate[0, :3], torch.tensor([-0.1, 0.0, 0.2]), atol=1e-4)
 
 
-def test_accelerations_of_traffic_and_ego():
-    env = make_env()
-    env.reset()
-    env.world()
-    act(env, acceleration=1.5)
-    world = env.world()
-    assert torch.allclose(world.accel[:, 0], torch.tensor(1.5), atol=1e-4)
-    assert torch.allclose(world.accel[:, 1:], torch.zeros(()), atol=1e-4)
-
-
 def test_running_into_a_parked_car_terminates_at_the_first_overlap():
     env = make_env(num_scenes=1, vehicles=[(0.0, 0, 10.0), (30.0, 0, 0.0)])
     env.reset()
@@ -186,6 +176,17 @@ def test_leaving_the_road_terminates():
     env.reset()
     td = drive(env, 80, yaw_rate=-0.3)
     assert td["metrics", "off_road"].all() and td["terminated"].all() and not td["metrics", "contact"].any()
+
+
+def test_an_ego_that_begins_off_the_road_leaves_it_only_once_it_was_there():
+    """The border comes back to it after 20 m, and ends behind it after 40 m more."""
+    env = make_env(num_scenes=1, num_vehicles=1, num_vrus=0)
+    field = env.scenes.scenes["field"]
+    x = env.scenes.scenes["field_origin"][0, 0] + torch.arange(field.shape[1])
+    field[:] = torch.where((x > 20) & (x < 60), -2.0, 2.0)[None, :, None].to(field.dtype)
+    env.reset()
+    off = [bool(act(env)["metrics", "off_road"].any()) for _ in range(62)]
+    assert not any(off[:59]) and any(off[59:])
 
 
 def test_pedestrian_contact_is_its_own_metric():
@@ -231,13 +232,6 @@ def test_lonely_ego_and_no_lights():
     assert torch.isfinite(drive(env, 80)["observation"]).all()
 
 
-def test_observation_is_of_order_one():
-    env = make_env(batch=4, num_vehicles=20, red_light_x=60.0)
-    data = env.rollout(80, break_when_any_done=False)
-    assert data["observation"].abs().max() <= 5 and torch.isfinite(data["observation"]).all()
-    assert data["observation"].shape[-1] <= 330
-
-
 # --- held actions
 
 WAYS = {  # what may end an episode on the way: 80 is no multiple of 3, contact and border come between decisions
@@ -276,11 +270,6 @@ def test_a_held_action_is_that_action_at_every_step_until_the_episode_ends(way, 
     assert last.all()
 
 
-def test_an_action_lasts_at_least_a_step():
-    with pytest.raises(InputError, match="hold=0"):
-        DrivingEnv(make_scenes(1), SimSettings(), 1, hold=0)
-
-
 def test_held_actions_keep_the_specs_and_the_resets():
     env = DrivingEnv(make_scenes(5, num_vehicles=4), SimSettings(), 8, hold=3)
     check_env_specs(env, seed=0)
@@ -304,8 +293,3 @@ def test_what_a_reset_of_some_writes_is_what_a_reset_of_all_writes():
         (*some._static.mission, *some._static[1:]), (*whole._static.mission, *whole._static[1:]), strict=True
     ):
         assert torch.equal(found, value)
-
-
-def test_unknown_reward_term_is_refused():
-    with pytest.raises(InputError, match="speeding"):
-        make_env(settings=SimSettings(reward={"progress": 1.0}))

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from e2rl.metrics.contact import KINDS, first_contact
-from e2rl.metrics.fault import at_fault
+from e2rl.metrics.verdicts import at_fault
 from e2rl.scenes.recording import VEHICLE
 from e2rl.sim.neighbours import neighbours_of, own_fault, rotation_into
 from e2rl.sim.world import Agents
@@ -47,7 +47,7 @@ def test_no_other_agent_no_fault():
 
 
 def test_agrees_with_the_verdict_on_most_first_contacts():
-    """Against metrics/fault.py, which bisects the time of the contact: straight drives from all sides at 10 Hz."""
+    """Against metrics/verdicts.py, which bisects the time of the contact: straight drives from all sides at 10 Hz."""
     draw = torch.Generator().manual_seed(0)
     count, steps = 400, 30
     bearing = torch.rand(count, generator=draw) * 6.28

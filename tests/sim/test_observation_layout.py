@@ -1,5 +1,6 @@
 """The names of the observation's numbers are those of what stands there, and the page about them says the same."""
 
+import math
 import re
 from pathlib import Path
 
@@ -58,6 +59,16 @@ def test_the_nearest_agents(seen):
     assert agent["heading_cos"] == pytest.approx(1) and agent["half_length"] == pytest.approx(2.25, abs=0.15)
     assert agent["gap"] == pytest.approx(agent["x"] - 2 * agent["half_length"], abs=0.3)
     assert seen["agent.11.present"] == 0
+
+
+def test_the_closest_approach_at_constant_velocities(seen):
+    """Of the car ahead, which the ego catches up with: the time that the gap lasts, and no distance then."""
+    ahead = next(k for k in range(12) if seen[f"agent.{k}.x"] > 15 and seen[f"agent.{k}.vehicle"])
+    agent = {name.split(".")[2]: value for name, value in seen.items() if name.startswith(f"agent.{ahead}.")}
+    time = agent["x"] / (10.1 - 8)
+    assert agent["approach_time"] == pytest.approx(math.exp(-min(time, 8) / 2), abs=2e-3)
+    miss = max(agent["x"] - 8 * (10.1 - 8), 0)
+    assert agent["approach_distance"] == pytest.approx(math.exp(-miss / 5), abs=2e-2)
 
 
 def test_manoeuvres(seen):

@@ -41,6 +41,17 @@ def test_terms_grow_with_what_they_name():
     assert term("comfort", action=steady) > term("comfort", action=steady, last_action=steady)
 
 
+def test_terms_are_capped_and_squares_of_what_is_felt():
+    """Comfort: acceleration / 4, lateral acceleration / 4 and jerk / 20, each squared."""
+    action, before = torch.tensor([[1.0, 0.2]]), torch.tensor([[0.5, 0.0]])
+    expected = (1 / 4) ** 2 + (10 * 0.2 / 4) ** 2 + (0.5 / 0.1 / 20) ** 2
+    assert abs(term("comfort", action=action, last_action=before) - expected) < 1e-6
+    hard = {"action": torch.tensor([[-8.0, 1.6]]), "speed": torch.tensor([40.0]), "offset": torch.tensor([5.0])}
+    capped = {name: term(name, **hard) for name in ("comfort", "acceleration", "speeding", "lane_offset")}
+    assert capped == {"comfort": 3.0, "acceleration": 1.0, "speeding": 1.0, "lane_offset": 1.0}
+    assert abs(term("speeding", speed=torch.tensor([0.8]), limit=torch.tensor([0.5])) - 0.3) < 1e-6, "of 1 m/s at least"
+
+
 def test_progress_pays_up_to_what_is_allowed():
     """The recorded top speed, at least 5 m/s, and never more than a known limit; going back costs what it is."""
     progress = torch.tensor([0.5, 2.0, 2.0, 2.0, 2.0, -1.0])

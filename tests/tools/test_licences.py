@@ -58,6 +58,7 @@ def test_a_licence_is_the_shortest_that_the_metadata_says(fields, licence):
     assert licence_of(Package(**fields)) == licence
 
 
+@pytest.mark.slow
 def test_what_dependencies_need_is_in_the_list(capsys):
     core, missing = closure()
     assert {"torch", "sympy", "omegaconf"} <= set(core) and not missing, "sympy is torch's, omegaconf Hydra's"

@@ -10,16 +10,15 @@ from e2rl.traffic.e2.feasibility import FeasibilitySettings
 from e2rl.traffic.e2.reasoner import CRITERIA, LanguageReasoner, ReasonerSettings
 from tests.traffic.e2.chat_server import asked, chat_server
 from tests.traffic.e2.traffic_scenes import scenes
-from tools.reasoner_agreement import Agreement, agreement_table, measure_agreement
+from tools.reasoner_agreement import agreement, judged
 
 
 def test_kappa_is_cohen_s():
-    found = Agreement(both=20, neither=15, first=5, second=10)  # the textbook example: 0.7 raw, 0.5 by chance
-    assert found.raw == pytest.approx(0.7) and found.kappa == pytest.approx(0.4) and found.n == 50
-    assert Agreement(4, 6, 0, 0).kappa == 1.0 and math.isnan(Agreement(0, 9, 0, 0).kappa)
-    assert math.isnan(Agreement(0, 0, 0, 0).raw)
-    yes = torch.tensor([True, True, False, False, True])
-    assert Agreement.of(yes, ~yes) == Agreement(0, 0, 3, 2)
+    first = torch.tensor([True] * 25 + [False] * 25)  # the textbook example: 20 both, 15 neither, 5 and 10 one only
+    second = torch.tensor([True] * 20 + [False] * 5 + [True] * 10 + [False] * 15)
+    assert agreement(first, second) == (pytest.approx(0.7), pytest.approx(0.4))
+    assert agreement(first, first)[1] == 1.0 and math.isnan(agreement(first[:9], first[:9])[1])
+    assert math.isnan(agreement(first[:0], first[:0])[0])
 
 
 def test_a_contrary_model_and_scenes_without_an_answer(tmp_path, monkeypatch):
@@ -34,8 +33,7 @@ def test_a_contrary_model_and_scenes_without_an_answer(tmp_path, monkeypatch):
         return json.dumps({"vehicles": [{"id": number} | dict.fromkeys(CRITERIA, False) for number in asked(request)]})
 
     with chat_server(answer) as (url, _), pytest.warns(UserWarning):
-        reasoner = LanguageReasoner(ReasonerSettings("lm", "small", url, workers=1, cache=str(tmp_path)), {})
-        found, compared = measure_agreement(scenes(3), reasoner, FeasibilitySettings())
-    assert compared == 2 and set(found) == {"feasible", *CRITERIA} and found["feasible"].n == 8
-    assert found["on_lane"].raw == 0.0 and found["on_lane"].first == 8 and found["feasible"].second == 0
-    assert "2 of 3 scenes" in agreement_table(found, compared, 3)
+        settings = ReasonerSettings(kind="lm", model="small", base_url=url, workers=1, cache=str(tmp_path))
+        ours, theirs, compared = judged(scenes(3), LanguageReasoner(settings), FeasibilitySettings())
+    assert compared == 2 and len(ours) == 8 and not theirs.any()
+    assert ours[:, 0].all() and agreement(ours[:, 0], theirs[:, 0])[0] == 0.0

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from e2rl.planners.ego import PlannerError
 from e2rl.run.errors import InputError
@@ -9,7 +10,8 @@ from e2rl.traffic.attempt import NOT_FINITE, attempt, summary_of
 
 
 def whole(tasks):
-    return {"states": torch.zeros(len(tasks), 1, 1, 4), "valid": torch.ones(len(tasks), 1, 1, dtype=torch.bool)}
+    states, valid = torch.zeros(len(tasks), 1, 1, 4), torch.ones(len(tasks), 1, 1, dtype=torch.bool)
+    return TensorDict({"states": states, "valid": valid}, [len(tasks)])
 
 
 def test_states_that_are_not_finite_count_as_ended():
@@ -18,11 +20,11 @@ def test_states_that_are_not_finite_count_as_ended():
         states[:, :, 2] = torch.nan  # of an agent that is not there
         states[1, 1, 0, 3] = torch.inf
         valid = torch.tensor([True, True, False]).expand(len(tasks), 2, 3)
-        return {"states": states, "valid": valid, "scene_id": [f"s{task}" for task in tasks], "eta": 2.0}
+        return TensorDict({"states": states, "valid": valid, "task": torch.tensor(tasks)}, [len(tasks)])
 
     ((kept, rollouts),), ended = attempt(roll_out, [4, 5, 6])
-    assert kept == [4, 6] and rollouts["scene_id"] == ["s4", "s6"] and len(rollouts["states"]) == 2
-    assert rollouts["eta"] == 2.0 and [(task, why["reason"]) for task, why in ended] == [(5, NOT_FINITE)]
+    assert kept == [4, 6] == rollouts["task"].tolist()
+    assert [(task, why["reason"]) for task, why in ended] == [(5, NOT_FINITE)]
 
 
 @pytest.mark.parametrize("error", [InputError("bad"), OSError(28, "No space left on device"), MemoryError()])
@@ -41,7 +43,7 @@ def test_a_batch_is_halved_until_the_one_that_raises_is_alone():
         asked.append(list(tasks))
         if 5 in tasks:
             raise KeyError(5)
-        return {"states": torch.zeros(len(tasks), 1, 1, 4), "valid": torch.ones(len(tasks), 1, 1, dtype=torch.bool)}
+        return whole(tasks)
 
     done, ended = attempt(roll_out, list(range(8)))
     assert [task for tasks, _ in done for task in tasks] == [0, 1, 2, 3, 4, 6, 7]

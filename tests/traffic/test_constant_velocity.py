@@ -17,11 +17,11 @@ def test_everybody_goes_straight_on_for_the_whole_rollout_and_nobody_leaves():
     rollouts = drive(scene_set, ConstantVelocity(), 0.0)
     start = scene_set.scenes["start"][:, None, 1:6]
     velocity = start[..., 3:] * torch.stack([start[..., 2].cos(), start[..., 2].sin()], -1)
-    track = rollouts["states"][:, :, 1:6]
+    track = rollouts.states[:, :, 1:6]
     expected = start[..., :2] + velocity * DT * torch.arange(41)[:, None, None]
     torch.testing.assert_close(track[..., :2], expected, rtol=0, atol=1e-4)
     assert torch.equal(track[..., 2:], start[..., 2:].expand_as(track[..., 2:]))
-    assert rollouts["valid"][:, :, 1:6].all() and (rollouts["states"][:, :, 5, 3] == 0).all()
+    assert rollouts.valid[:, :, 1:6].all() and (rollouts.states[:, :, 5, 3] == 0).all()
 
 
 def test_parked_vehicles_stay_whatever_speed_was_estimated():

@@ -126,7 +126,7 @@ def test_who_stands_at_the_start_stands_for_good():
 def test_a_vehicle_is_gone_once_its_route_leaves_the_map():
     scene_set = scenes_of([AWAY, (50, 0, 10), (0, 1, 10)], steps=60, road=(-200.0, 80.0))
     rollouts = drive(scene_set, idm(BoundSettings()), 0.0)
-    x, there = rollouts["states"][0, :, 1:3, 0], rollouts["valid"][0, :, 1:3]
+    x, there = rollouts.states[0, :, 1:3, 0], rollouts.valid[0, :, 1:3]
     assert there[:, 1].all() and not there[-1, 0] and (x[:, 0][there[:, 0]] <= 80.5).all()
     assert (there[1:, 0] <= there[:-1, 0]).all(), "nobody comes back"
 

@@ -24,9 +24,9 @@ def test_rollouts_are_the_log_bit_for_bit_with_its_gaps():
     scene_set = recorded()
     rollouts = drive(scene_set, Replay(), 0.0)
     logged, valid = scene_set.scenes["logged"][:, :, 1:], scene_set.scenes["logged_valid"][:, :, 1:]
-    assert torch.equal(rollouts["valid"][:, :, 1:], valid)
-    assert torch.equal(rollouts["states"][:, :, 1:][valid], logged[valid])
-    assert not rollouts["adversaries"].any() and (rollouts["transport_others"] == 0).all()
+    assert torch.equal(rollouts.valid[:, :, 1:], valid)
+    assert torch.equal(rollouts.states[:, :, 1:][valid], logged[valid])
+    assert not rollouts.adversaries.any() and (rollouts.transport_others == 0).all()
 
 
 def test_with_a_replayed_ego_everybody_is_the_log_whatever_the_seed():
@@ -34,8 +34,8 @@ def test_with_a_replayed_ego_everybody_is_the_log_whatever_the_seed():
     for seeds in ([0, 1, 2], [9, 10, 11]):
         rollouts = drive(scene_set, Replay(), 0.0, seeds, ReplayEgo())
         valid = scene_set.scenes["logged_valid"]
-        assert torch.equal(rollouts["valid"], valid)
-        assert torch.equal(rollouts["states"][valid], scene_set.scenes["logged"][valid])
+        assert torch.equal(rollouts.valid, valid)
+        assert torch.equal(rollouts.states[valid], scene_set.scenes["logged"][valid])
 
 
 def test_after_the_recording_s_end_nobody_is_there():

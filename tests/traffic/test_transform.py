@@ -24,8 +24,6 @@ SECOND = torch.tensor([[False], [True], [False]])  # environments that are reset
 class March(Traffic):
     """Everybody goes straight on at a speed that tells the seed and the replan: seed + replan / 10, in m/s."""
 
-    figures = ("hurry",)
-
     def __init__(self):
         self.calls = []
 
@@ -40,8 +38,7 @@ class March(Traffic):
         acting = torch.zeros(states.shape[:2], dtype=torch.bool)
         acting[:, 1] = True
         here = world.valid[:, : acting.shape[1], None].expand(states.shape[:-1])
-        plan = TrafficPlan(states, here, acting, figures={"hurry": states[:, :, 0, 3]})
-        return state + torch.tensor([0.0, 1.0]), plan
+        return state + torch.tensor([0.0, 1.0]), TrafficPlan(states, here, acting)
 
 
 def in_turn(pool):
@@ -114,7 +111,6 @@ def test_live_traffic_is_the_plan_and_is_replanned_every_half_second_before_the_
         expected = before[:, 1:ROWS].clone()
         expected[..., 3] = speed
         torch.testing.assert_close(tensordict["agents", "states"][:, 1:ROWS], keep_velocity(expected)[:, :, 0])
-        torch.testing.assert_close(tensordict["traffic", "hurry"], speed.expand(3, ROWS))
 
 
 def test_with_held_actions_a_replan_comes_at_the_first_decision_at_which_it_is_due():
@@ -173,7 +169,6 @@ def test_a_partial_reset_begins_those_rows_anew_and_leaves_the_others():
     tensordict = env.reset(tensordict.set("_reset", SECOND))
     assert tensordict["scene_index"][:, 0].tolist() == [0, 0, 2] and tensordict["timestep"][:, 0].tolist() == [7, 0, 7]
     assert tensordict["traffic", "row"][:, 0].tolist() == [0, 3, 2]
-    assert not tensordict["traffic", "adversary"][1].any() and tensordict["traffic", "adversary"][[0, 2], 1].all()
     tensordict = advance(env, policy, tensordict, 4)
     assert [steps for steps, _ in on.calls] == [[0, 0, 0], [5, 5, 5], [0], [10, 10]]
     speed = tensordict["agents", "states"][:, 1, 3]
@@ -221,7 +216,7 @@ def test_a_method_that_asks_the_ego_can_where_there_is_one():
 
 def test_specs_and_memory_know_no_plan_without_a_method():
     env = environment(replayed(scenes(3)))
-    assert set(env.reset()["traffic"].keys()) == {"row", "eta", "adversary"}
+    assert set(env.reset()["traffic"].keys()) == {"row"}
 
 
 def small_environment(batch=16, num_scenes=4, probability=None, **scene):
@@ -256,9 +251,8 @@ def test_trajectories_never_mix_scenes_or_traffic():
         assert torch.equal(data["next"][key], data[key])
         changed = (data[key][:, 1:] != data[key][:, :-1]) & ~data["next", "done"][:, :-1]
         assert not changed.any()
-    row, eta, adversary = (data["traffic", name] for name in ("row", "eta", "adversary"))
-    assert torch.equal(pool.scene_index[row], data["scene_index"]) and torch.equal(pool.eta[row], eta)
-    assert torch.equal(adversary[..., 1:2], row < 4) and not adversary[..., 2:].any()
+    row = data["traffic", "row"]
+    assert torch.equal(pool.scene_index[row], data["scene_index"])
     assert torch.equal(data["next", "timestep"], data["timestep"] + 1)
     assert len(row.unique()) == len(pool) and data["next", "done"].sum() > 16
 
@@ -306,10 +300,7 @@ def test_live_stored_and_recorded_rows_run_side_by_side():
         torch.testing.assert_close(states[:3, :, 3], speed.expand(3, ROWS - 1))
         assert torch.equal(states[3:6], pool.parts[0].states[:, step, 1:ROWS])
         assert torch.equal(states[6:], scene_set.scenes["logged"][:, step, 1:ROWS])
-        adversaries = tensordict["traffic", "adversary"].nonzero().tolist()
-        assert adversaries == [[row, 1] for row in range(6)], "nobody in recorded traffic"
     assert [steps for steps, _ in on.calls] == [[0] * 3, [5] * 3, [10] * 3], "only live rows are replanned"
-    assert tensordict["traffic", "eta"][:, 0].tolist() == [1.0] * 3 + [4.0] * 3 + [0.0] * 3
 
 
 def test_a_live_row_drives_alike_beside_rows_of_other_kinds():
@@ -352,5 +343,5 @@ def test_plans_are_for_the_policy_alone_and_are_not_stacked_over_time():
         data = gather(env, EgoPolicy(ego, env))
         kept = set(data.keys(True))
         assert ("traffic", "plan") not in kept and ("next", "traffic", "plan") not in kept
-        assert {("traffic", "row"), ("next", "traffic", "adversary"), ("next", "traffic", "hurry")} <= kept
+        assert {("traffic", "row"), ("next", "traffic", "row")} <= kept
         torch.testing.assert_close(ego.seen[-1][:, 1:, 0], data["next", "agents", "states"][:, -1, 1:ROWS])

@@ -11,7 +11,7 @@ import numpy as np
 from e2rl.report.export.episode import Episode
 from e2rl.run.files import write_atomically
 from e2rl.scenes.scene import KEYS
-from e2rl.sim.rollouts import ROLLOUTS
+from e2rl.sim.rollout_file import ROLLOUTS
 
 SCENES = "scenes"  # the folder of scenes, beside the one of rollouts
 

@@ -15,7 +15,7 @@ from e2rl.scenes.builder import BuildSettings, build_scene
 from e2rl.scenes.lane_graph import LaneGraph
 from e2rl.scenes.recording import Lane, Recording
 from e2rl.scenes.smoothing import runs_of_true
-from e2rl.sim.rollouts import ROLLOUTS, Rollout, rollout_name
+from e2rl.sim.rollout_file import ROLLOUTS, Rollout, rollout_name
 
 FACTS = (  # columns of rollouts.csv that go along; docs/verdicts.md and docs/modes.md say what they mean
     *("dataset", "split", "location", "scene_id", "method", "ego_policy", "eta", "seed", "cfr"),

@@ -7,11 +7,11 @@ import numpy as np
 import torch
 from omegaconf import OmegaConf
 
-from e2rl.evaluation.rollout_files import ROLLOUTS, TABLE, Source, label_rows, rollout_name, write_rollouts, write_rows
-from e2rl.evaluation.rollout_reader import read_rollout
+from e2rl.evaluation.rollout_files import TABLE, write_rows
 from e2rl.metrics.score import score_rollouts
 from e2rl.scenes.recording import CYCLIST, OTHER, PEDESTRIAN
 from e2rl.scenes.source import load_scenes
+from e2rl.sim.rollout_file import ROLLOUTS, Rollout, rollout_name
 from tests.scenes.descriptions import FRAMES, data_config, description, numbered, straight, track, write_folder
 
 PHASES = ["LANE_STATE_STOP"] * 40 + ["LANE_STATE_GO"] * (FRAMES - 40)
@@ -60,20 +60,20 @@ def write_run(folder: Path) -> Path:
     for first, end in GAPS:
         late[first:end] = True
     valid[:, :, LATE] = late[:, None].T
-    rollouts = batch | {
-        "states": states,
-        "valid": valid,
-        "simulated": torch.arange(valid.shape[-1])[None].expand(2, -1) < 3,
-        "adversaries": torch.arange(valid.shape[-1])[None].expand(2, -1) == CUT_IN,
-        "seed": torch.zeros(2, dtype=torch.int64),
-        "eta": 2.0,
-        "seconds": torch.zeros(2),
-        "scene_id": found.scene_id,
-        "location": ["a place"] * 2,
-    }
-    source, run = Source("made", "data", "e2", "idm"), folder / "run"
-    write_rollouts(run / ROLLOUTS, rollouts, source)
-    write_rows(run / TABLE, label_rows(score_rollouts(rollouts)[0], source))
+    rollouts = Rollouts.in_scenes(
+        found,
+        torch.arange(2),
+        states,
+        valid,
+        adversaries=torch.arange(valid.shape[-1])[None].expand(2, -1) == CUT_IN,
+        seed=torch.zeros(2, dtype=torch.int64),
+        eta=torch.full((2,), 2.0, dtype=torch.float64),
+    )
+    simulated = torch.arange(valid.shape[-1])[None].expand(2, -1) < 3
+    rollouts = sourced(rollouts.replace(simulated=simulated, location=["a place"] * 2), "made", "data", "e2", "idm")
+    run = folder / "run"
+    write_rows(run / TABLE, score_rollouts(rollouts)[0])
+    rollouts.to_npz(run / ROLLOUTS)
     (run / ".hydra").mkdir()
     OmegaConf.save({"data": data}, run / ".hydra" / "config.yaml")
     begun = {"command": "", "cwd": str(folder), "choices": {}, "inputs": {}, "settings": {}, "files": {}}
@@ -81,14 +81,14 @@ def write_run(folder: Path) -> Path:
     return run
 
 
-def rollout_of(run: Path, scene: int) -> dict:
-    """The arrays of the rollout file of a scene."""
+def rollout_of(run: Path, scene: int) -> Rollout:
+    """The rollout file of a scene."""
     row = {"method": "e2", "ego_policy": "idm", "eta": 2.0, "scene_id": f"scene-{scene}", "seed": 0}
-    return read_rollout(run / ROLLOUTS / rollout_name(row))
+    return Rollout.read(run / ROLLOUTS / rollout_name(row))
 
 
-def row_of(rollout: dict, kind: int) -> int:
+def row_of(rollout: Rollout, kind: int) -> int:
     """The row of the only pedestrian, cyclist or other agent."""
     name = {PEDESTRIAN: "pedestrian", CYCLIST: "cyclist", OTHER: "other"}[kind]
-    (row,) = np.flatnonzero((rollout["agent_type"] == name) & rollout["valid"].any(0))
+    (row,) = np.flatnonzero((rollout.agent_type == name) & rollout.valid.any(0))
     return int(row)

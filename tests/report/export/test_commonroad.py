@@ -46,19 +46,19 @@ def states_of(obstacle):
 def test_every_state_comes_back_and_no_other(run, scenarios):
     for index, (scenario, _) in enumerate(scenarios):
         rollout = rollout_of(run, index)
-        count, seen = len(rollout["size"]), np.zeros(rollout["valid"].shape, bool)
+        count, seen = len(rollout.size), np.zeros(rollout.valid.shape, bool)
         for obstacle in scenario.dynamic_obstacles:
             row = obstacle.obstacle_id - 1 if obstacle.obstacle_id <= count else LATE  # which alone comes back
             for state in states_of(obstacle):
-                x, y, heading, speed = rollout["states"][state.time_step, row]
+                x, y, heading, speed = rollout.states[state.time_step, row]
                 turned = (heading - state.orientation + np.pi) % (2 * np.pi) - np.pi
                 assert np.hypot(*(state.position - [x, y])) < 0.01 and abs(turned) < 1e-3
                 assert abs(speed - state.velocity) < 0.01
                 seen[state.time_step, row] = True
-            assert np.allclose([obstacle.obstacle_shape.length, obstacle.obstacle_shape.width], rollout["size"][row])
-        single = rollout["valid"].copy()
+            assert np.allclose([obstacle.obstacle_shape.length, obstacle.obstacle_shape.width], rollout.size[row])
+        single = rollout.valid.copy()
         single[:, [row for row in range(count) if row != LATE]] = False
-        assert (seen == rollout["valid"] & ~(single & (np.arange(81) == GAPS[2][0])[:, None])).all()
+        assert (seen == rollout.valid & ~(single & (np.arange(81) == GAPS[2][0])[:, None])).all()
 
 
 def test_who_comes_back_is_a_further_obstacle_and_nobody_is_there_before_he_appears(scenarios):
@@ -110,17 +110,17 @@ def test_lanelets_lights_and_limits_come_back(scenarios):
 def test_the_mission_leads_from_the_start_to_where_the_recording_ends(run, scenarios):
     (problem,) = scenarios[0][1].planning_problem_dict.values()
     rollout = rollout_of(run, 0)
-    np.testing.assert_allclose(problem.initial_state.position, rollout["states"][0, 0, :2], atol=1e-3)
+    np.testing.assert_allclose(problem.initial_state.position, rollout.states[0, 0, :2], atol=1e-3)
     (goal,) = problem.goal.state_list
-    np.testing.assert_allclose(goal.position.rect_center.xy, rollout["logged"][-1, 0, :2, None], atol=1e-3)
+    np.testing.assert_allclose(goal.position.rect_center.xy, rollout.logged[-1, 0, :2, None], atol=1e-3)
     assert (goal.time_step.start, goal.time_step.end) == (1, 80)
 
 
 def test_the_project_s_own_reader_finds_the_ego_and_the_agents(run, files):
-    recording = read_scenario(files[1].read_bytes(), files[1].name)
+    recording = read_scenario(files[1].read_bytes())
     rollout = rollout_of(run, 1)
     ego = recording.states[:, recording.ego]
-    np.testing.assert_allclose(ego[:, :2], rollout["states"][:, 0, :2], atol=0.01)
+    np.testing.assert_allclose(ego[:, :2], rollout.states[:, 0, :2], atol=0.01)
     assert len(recording.lanes) == 4 and recording.location == "ZAM_aplace"
     assert not recording.lights  # two lights stand at the fork, and the reader leaves such lanelets out
 

@@ -9,8 +9,8 @@ from e2rl.scripts.export import LIST, main
 from omegaconf import OmegaConf
 
 from e2rl.evaluation.rollout_files import read_rows, write_rows
-from e2rl.evaluation.rollout_reader import read_rollout
 from e2rl.scenes.source import source_of
+from e2rl.sim.rollout_file import Rollout
 from tests.report.export.small_run import CUT_IN, rollout_of
 
 
@@ -46,7 +46,7 @@ def test_failures_are_exported_with_their_facts_and_all_on_request(run, tmp_path
 def test_npz_are_the_rollouts_and_their_scenes(run, tmp_path):
     main([str(run), "--to", "npz", "--all", "--out", str(tmp_path / "all")])
     for index, line in enumerate(lines(tmp_path / "all")):
-        ours, theirs = rollout_of(run, index), read_rollout(tmp_path / "all" / line["file"])
+        ours, theirs = rollout_of(run, index), Rollout.read(tmp_path / "all" / line["file"])
         assert ours.keys() == theirs.keys() and all(
             np.array_equal(ours[key], theirs[key]) for key in ("states", "valid")
         )

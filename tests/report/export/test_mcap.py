@@ -65,19 +65,19 @@ def boxes(update):
 def test_every_state_of_everybody_who_is_there_comes_back(run, written):
     for scene, (topics, _) in enumerate(written):
         rollout = rollout_of(run, scene)
-        assert len(topics["/traffic"]) == len(topics["/tf"]) == len(rollout["states"])
+        assert len(topics["/traffic"]) == len(topics["/tf"]) == len(rollout.states)
         for step, (time, update) in enumerate(topics["/traffic"]):
             agents = boxes(update)
             assert time == pytest.approx(0.1 * step) and update.entities[0].timestamp.ToSeconds() == int(time)
-            assert sorted(agents) == np.flatnonzero(rollout["valid"][step]).tolist()
+            assert sorted(agents) == np.flatnonzero(rollout.valid[step]).tolist()
             for row, (*place, heading, length, width, _) in agents.items():
-                x, y, turned, _ = rollout["states"][step, row]
+                x, y, turned, _ = rollout.states[step, row]
                 assert place == pytest.approx([x, y], abs=1e-5)
                 assert abs((heading - turned + np.pi) % (2 * np.pi) - np.pi) < 1e-5
-                assert [length, width] == pytest.approx(rollout["size"][row].tolist())
+                assert [length, width] == pytest.approx(rollout.size[row].tolist())
             assert [deleted.type for deleted in update.deletions] == [1], "each message replaces the one before"
             frame = topics["/tf"][step][1]
-            assert [frame.translation.x, frame.translation.y] == pytest.approx(rollout["states"][step, 0, :2], abs=1e-5)
+            assert [frame.translation.x, frame.translation.y] == pytest.approx(rollout.states[step, 0, :2], abs=1e-5)
         assert any(LATE not in boxes(update) for _, update in topics["/traffic"])
 
 
@@ -96,9 +96,9 @@ def test_the_map_lights_contact_and_numbers(run, written):
     lanes, borders = update.entities
     rollout = rollout_of(run, 0)
     ends = np.array([(point.x, point.y) for point in lanes.lines[0].points]).reshape(-1, 2, 2)
-    assert time == 0 and len(ends) == len(rollout["lane_points"]) - (len(rollout["lane_offsets"]) - 1)
-    assert np.abs(ends[0] - rollout["lane_points"][:2]).max() < 1e-5
-    assert len(borders.lines[0].points) == 2 * len(rollout["drivable_points"]), "rings are closed"
+    assert time == 0 and len(ends) == len(rollout.lane_points) - (len(rollout.lane_offsets) - 1)
+    assert np.abs(ends[0] - rollout.lane_points[:2]).max() < 1e-5
+    assert len(borders.lines[0].points) == 2 * len(rollout.drivable_points), "rings are closed"
     lights = [entity for entity in topics["/traffic"][0][1].entities if entity.id == "lights"]
     assert len(lights[0].spheres) == 2 and lights[0].spheres[0].color != lights[0].spheres[1].color
     row = read_rows(run / TABLE)[0]
@@ -131,6 +131,6 @@ def test_plans_are_there_where_the_rollout_has_them_and_the_same_rollout_makes_t
     border = topics["/map"][0][1].entities[1].lines[0].points
     assert [(point.x, point.y) for point in border] == [(0, 0), (9, 0), (9, 0), (9, 5), (9, 5), (0, 0)]
     points = topics["/plans"][1][1].entities[1].lines[0].points
-    start = episode.rollout["states"][5, CUT_IN, :2]
+    start = episode.rollout.states[5, CUT_IN, :2]
     assert [points[0].x, points[0].y] == pytest.approx(start, abs=1e-5) and points[-1].x == 10
     assert content(episode) == content(episode)

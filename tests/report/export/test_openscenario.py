@@ -63,7 +63,7 @@ def events_of(scenario):
 def test_every_state_comes_back_and_no_other(run, scenarios):
     for index, scenario in enumerate(scenarios):
         rollout, boxes = rollout_of(run, index), entities_of(scenario)
-        seen = np.zeros(rollout["valid"].shape, bool)
+        seen = np.zeros(rollout.valid.shape, bool)
         for row, start, actions in events_of(scenario):
             ahead = boxes[row].boundingbox.center.x
             for action in actions:
@@ -74,14 +74,14 @@ def test_every_state_comes_back_and_no_other(run, scenarios):
                 for time, place in zip(shape.time, shape.positions, strict=True):
                     step = round(time / 0.1)
                     middle = [place.x + ahead * np.cos(place.h), place.y + ahead * np.sin(place.h)]
-                    x, y, heading, _ = rollout["states"][step, row]
+                    x, y, heading, _ = rollout.states[step, row]
                     turned = (heading - place.h + np.pi) % (2 * np.pi) - np.pi
                     assert abs(step * 0.1 - time) < 1e-6 and np.hypot(*(np.array(middle) - [x, y])) < 0.01
                     assert abs(turned) < 1e-3
                     seen[step, row] = True
                 assert np.abs(np.diff([place.h for place in shape.positions])).max() < 0.5  # headings do not jump
         seen[GAPS[2][0], LATE] = True  # a single step has no polyline
-        assert (seen == rollout["valid"]).all()
+        assert (seen == rollout.valid).all()
 
 
 def test_who_appears_late_is_added_then_and_deleted_when_gone(scenarios):
@@ -105,7 +105,7 @@ def test_boxes_types_and_reference_points(run, scenarios):
     rollout, found = rollout_of(run, 0), entities_of(scenarios[0])
     for row, entity in found.items():
         sides = entity.boundingbox.boundingbox
-        assert [sides.length, sides.width] == pytest.approx(rollout["size"][row].tolist(), abs=1e-5)
+        assert [sides.length, sides.width] == pytest.approx(rollout.size[row].tolist(), abs=1e-5)
     assert {row: found[row].vehicle_type.get_name() for row in (0, CUT_IN, TRUCK, row_of(rollout, CYCLIST))} == {
         0: "car",
         CUT_IN: "car",

@@ -32,12 +32,12 @@ def descriptions(folder):
 def test_tracks_come_back_to_the_centimetre_with_their_types(run, recordings):
     for index, recording in enumerate(recordings):
         rollout = rollout_of(run, index)
-        rows = np.flatnonzero(rollout["valid"].any(0))
+        rows = np.flatnonzero(rollout.valid.any(0))
         driven, valid = recording.states[recording.current :], recording.valid[recording.current :]
-        assert recording.current == 10 and recording.ego == 0 and (valid == rollout["valid"][:, rows]).all()
-        np.testing.assert_allclose(driven[valid], rollout["states"][:, rows][valid], atol=1e-4)
-        np.testing.assert_allclose(recording.size, rollout["size"][rows], atol=1e-4)
-        assert [AGENT_TYPES[kind] for kind in recording.agent_type] == rollout["agent_type"][rows].tolist()
+        assert recording.current == 10 and recording.ego == 0 and (valid == rollout.valid[:, rows]).all()
+        np.testing.assert_allclose(driven[valid], rollout.states[:, rows][valid], atol=1e-4)
+        np.testing.assert_allclose(recording.size, rollout.size[rows], atol=1e-4)
+        assert [AGENT_TYPES[kind] for kind in recording.agent_type] == rollout.agent_type[rows].tolist()
 
 
 def test_the_past_is_the_recorded_one(recordings):

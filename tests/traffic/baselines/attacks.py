@@ -1,13 +1,10 @@
-"""Rivals on a small random prior, and one replan of theirs taken apart."""
+"""Baselines on a small random prior, and one replan of theirs taken apart."""
 
 from dataclasses import replace
 
-import torch
-
 from e2rl.prior.sde import SamplerSettings
-from e2rl.run.config import load_choice
 from e2rl.sim.world import World
-from e2rl.traffic.baselines.baseline import Rival
+from e2rl.traffic.baselines.baseline import Baseline
 from e2rl.traffic.baselines.cat import CAT
 from e2rl.traffic.baselines.ccdiff import CCDiff
 from e2rl.traffic.baselines.ctg import CTG, CTGAdv
@@ -15,7 +12,7 @@ from e2rl.traffic.baselines.diffscene import DiffScene
 from e2rl.traffic.baselines.safe_sim_opt import SafeSimOpt
 from e2rl.traffic.baselines.strive import Strive
 from e2rl.traffic.baselines.view import View
-from e2rl.traffic.grouping import Group
+from e2rl.traffic.nominal import Replan
 from tests.prior.small import small_prior
 from tests.traffic.e2.traffic_scenes import EGO, begin
 
@@ -25,25 +22,22 @@ SMALL = {  # few samples and iterations, so that tests are fast
     "safe_sim_opt": (SafeSimOpt, {"samples": 2}),
     "ccdiff": (CCDiff, {"samples": 2, "controlled": 2}),
     "diffscene": (DiffScene, {"samples": 2}),
-    "cat": (CAT, {"samples": 8, "ways": 2, "spread": 3.0}),
+    "cat": (CAT, {"samples": 8, "tracks": 2, "spread": 3.0}),
     "strive": (Strive, {"iterations": 3}),
 }
 ADVERSARIES = [name for name in SMALL if name != "ctg"]
 
 
-def rival(name: str, steps: int = 4, **settings) -> Rival:
-    """A rival of SMALL with the settings of its file but for those given."""
+def baseline(name: str, steps: int = 4, **settings) -> Baseline:
+    """A baseline of SMALL with the settings of its file but for those given."""
     kind, few = SMALL[name]
-    chosen = {key: value for key, value in load_choice("synthesizer", name).items() if key not in ("name", "_target_")}
-    return kind(small_prior(0, sampler=SamplerSettings(steps=steps)), **(chosen | few | settings))
+    return kind(small_prior(0, sampler=SamplerSettings(steps=steps)), **(few | settings))
 
 
-def first_replan(on: Rival, scene, eta: float = 2.0):
-    """The arguments of `attack` at the first replan of scenes [B], and their View."""
+def first_replan(on: Baseline, scene, eta: float = 2.0):
+    """The arguments of `attack` at the first replan of scenes [B] (a Replan and its Context), and their View."""
     world, state = World.at_start(scene), begin(on, scene, eta)
     ego_plan = EGO.plan(world)
     state = replace(state, lane=on.lane_now(state, world, ego_plan))
     context = on.encode(state, world, ego_plan)
-    vehicles = context.active.shape[1]
-    group = Group(torch.arange(len(scene)), vehicles, world.states.shape[1] - vehicles)
-    return (state, world, ego_plan, on.noise(state), group, context), View.of(world, context, ego_plan)
+    return (Replan(state, world, ego_plan, on.noise(state)), context), View.of(world, context, ego_plan)

@@ -1,11 +1,11 @@
-"""CAT picks the future of greatest overlap with the ego's ways."""
+"""CAT picks the future of greatest overlap with the ego's tracks."""
 
 import pytest
 import torch
 
 from e2rl.traffic.baselines import cat
 from e2rl.traffic.baselines.cat import DECAY, overlap_value
-from tests.traffic.baselines.attacks import first_replan, rival
+from tests.traffic.baselines.attacks import baseline, first_replan
 from tests.traffic.e2.traffic_scenes import scenes
 
 SIZE = torch.tensor([[[4.0, 2.0], [4.0, 2.0]]])
@@ -33,27 +33,27 @@ def test_overlap_is_worth_more_the_sooner_and_the_more_often_it_comes():
 
 
 def test_the_vehicle_and_the_future_of_greatest_value_are_driven(monkeypatch):
-    on = rival("cat", ways=1, gain=2.0)  # four candidates at eta = 2
-    arguments, view = first_replan(on, scenes(2).scenes)
+    on = baseline("cat", tracks=1, gain=2.0)  # four candidates at eta = 2
+    (now, context), _ = first_replan(on, scenes(2).scenes)
     values = torch.zeros(8, 2, 8)
     values[2, 0, 3], values[1, 0, 1], values[6, 0, 2] = 0.5, 0.4, 0.9  # the seventh is not tried
     values[1, 1, 5] = 0.9  # a parked vehicle
     monkeypatch.setattr(cat, "overlap_value", lambda *_: values)
-    state, x0 = on.attack(*arguments)
+    state, x0 = on.attack(now, context)
     assert state.adversary.nonzero().tolist() == [[0, 3]] and torch.equal(state.held, state.adversary)
-    nominal = on.prior.sample(arguments[5], arguments[3][..., 0, :].contiguous()).x0
+    nominal = on.prior.sample(context, now.noise[..., 0, :].contiguous()).x0
     same = (x0 == nominal).all(-1)
     assert not same[0, 3] and same[1].all() and same[0].sum() == 7
 
 
 def test_only_candidates_that_differ_from_the_nominal_one_are_spread():
-    narrow, wide = (rival("cat", spread=spread, ways=1) for spread in (1.0, 3.0))
+    narrow, wide = (baseline("cat", spread=spread, tracks=1) for spread in (1.0, 3.0))
     seen = []
     for on in (narrow, wide):
-        arguments, _ = first_replan(on, scenes(1).scenes)
+        (now, context), _ = first_replan(on, scenes(1).scenes)
         sample = on.prior.sample
         on.prior.sample = lambda context, noise, sample=sample: seen.append(noise[0]) or sample(context, noise)
-        on.attack(*arguments)
+        on.attack(now, context)
     first, second = seen[1], seen[3]  # after each one's nominal sample
     assert torch.equal(first[0], second[0])
     torch.testing.assert_close(3 * first[1:], second[1:])

@@ -4,19 +4,18 @@ import pytest
 import torch
 
 import e2rl
-from e2rl.prior.sde import reverse_step
 from e2rl.traffic.baselines.guidance import CleanGuidance, MeanGuidance
 from e2rl.traffic.baselines.view import folded, motion_of, pick, tiled
-from tests.traffic.baselines.attacks import first_replan, rival
+from tests.traffic.baselines.attacks import baseline, first_replan
 from tests.traffic.e2.traffic_scenes import scenes
 
 
 def control_inputs():
-    """A rival's first replan, a noisy x at the third of four levels, and the denoiser there."""
-    on = rival("ctg_adv")
-    (state, _, _, noise, _, context), view = first_replan(on, scenes(2).scenes)
+    """A baseline's first replan, a noisy x at the third of four levels, and the denoiser there."""
+    on = baseline("ctg_adv")
+    (now, context), view = first_replan(on, scenes(2).scenes)
     level, low = on.prior.schedule.levels(4)[1:3]
-    return on, state, view, context, noise[0, :, :, 0], level, low
+    return on, now.state, view, context, now.noise[0, :, :, 0], level, low
 
 
 def test_the_mean_of_a_step_moves_by_adam_s_step_within_the_limit():
@@ -27,8 +26,7 @@ def test_the_mean_of_a_step_moves_by_adam_s_step_within_the_limit():
     _, nominal, x0 = control(x, level, 3, context, lambda value: on.prior.denoise(value, level, context))
 
     def mean(clean):
-        given = (level, low, torch.zeros(()), 1.0, None)
-        return reverse_step("ddim", on.prior.schedule, x, clean, *given)
+        return on.prior.sampler.on(on.prior.schedule).step(x, clean, level, low, torch.zeros(()))
 
     variance = mean(nominal)[1]
     shift = (mean(x0)[0] - mean(nominal)[0]).abs()
@@ -56,16 +54,16 @@ def test_clean_guidance_is_clipped_and_leaves_masked_rows_alone():
 
 
 def test_samples_go_along_the_batch_and_back():
-    on = rival("ctg_adv", samples=3)
-    (state, _, _, noise, _, context), _ = first_replan(on, scenes(2).scenes)
-    many = on.prior.sample(tiled(context, 3), folded(noise)).x0.unflatten(0, (3, 2))
+    on = baseline("ctg_adv", samples=3)
+    (now, context), _ = first_replan(on, scenes(2).scenes)
+    many = on.prior.sample(tiled(context, 3), folded(now.noise)).x0.unflatten(0, (3, 2))
     for number in range(3):
-        one = on.prior.sample(context, noise[..., number, :].contiguous()).x0
+        one = on.prior.sample(context, now.noise[..., number, :].contiguous()).x0
         torch.testing.assert_close(many[number], one, rtol=1e-4, atol=1e-4)
     by_scene, by_vehicle = torch.tensor([2, 0]), torch.arange(8).expand(2, -1) % 3
     assert torch.equal(pick(many, by_scene)[0], many[2, 0]) and torch.equal(pick(many, by_scene)[1], many[0, 1])
     assert torch.equal(pick(many, by_vehicle)[1, 4], many[1, 1, 4])
-    assert torch.equal(state.lane.v, context.state.v)
+    assert torch.equal(now.state.lane.v, context.state.v)
 
 
 @pytest.fixture(scope="module")
@@ -77,10 +75,9 @@ def bundled():
 def test_guidance_lowers_the_loss_of_bundled_scenes(name, bundled):
     scene, prior = bundled
     on = e2rl.make_traffic(name, prior, samples=1)
-    arguments, view = first_replan(on, scene)
-    state, _, _, noise, _, context = arguments
-    state, x0 = on.attack(*arguments)
-    nominal = prior.sample(context, noise[..., 0, :].contiguous()).x0
+    (now, context), view = first_replan(on, scene)
+    state, x0 = on.attack(now, context)
+    nominal = prior.sample(context, now.noise[..., 0, :].contiguous()).x0
     loss = on.loss(state, view, state.adversary) if name == "diffscene" else on.loss(state, view)
     values = [loss(motion_of(prior, value, context, 1)) for value in (x0, nominal)]
     guided = state.adversary if on.adversarial else context.active

@@ -16,7 +16,7 @@ from e2rl.traffic.baselines.losses import (
     off_road_term,
     pair_term,
 )
-from tests.traffic.baselines.attacks import first_replan, rival
+from tests.traffic.baselines.attacks import baseline, first_replan
 from tests.traffic.e2.traffic_scenes import scenes
 
 SIZE = torch.tensor([[4.0, 2.0]])
@@ -48,7 +48,7 @@ def test_the_soft_minimum_lies_between_least_and_mean_distance():
 
 
 def test_pairs_cost_what_all_pairs_computed_one_by_one_cost():
-    _, view = first_replan(rival("ctg"), scenes(2).scenes)
+    _, view = first_replan(baseline("ctg"), scenes(2).scenes)
     generator = torch.Generator().manual_seed(0)
     states = view.states[None, :, :, None].repeat(2, 1, 1, 3, 1)
     states[..., :2] = 0.3 * states[..., :2] + torch.rand(states[..., :2].shape, generator=generator)
@@ -74,7 +74,7 @@ def test_pairs_cost_what_all_pairs_computed_one_by_one_cost():
 
 
 def test_leaving_the_road_costs_and_the_gradient_leads_back():
-    _, view = first_replan(rival("ctg"), scenes(1).scenes)
+    _, view = first_replan(baseline("ctg"), scenes(1).scenes)
     states = view.states[None, :, :, None].clone()
     weights = torch.ones(1)
     assert (off_road_term(states, view, weights)[0, 0, :6] == 0).all()

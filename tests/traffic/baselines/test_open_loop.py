@@ -6,7 +6,7 @@ from e2rl.prior.lane_relative import HORIZON, SIZE, decode
 from e2rl.sim.world import World
 from e2rl.traffic.baselines.open_loop import EVERY, later
 from tests.prior.small import arc, random_state
-from tests.traffic.baselines.attacks import rival
+from tests.traffic.baselines.attacks import baseline
 from tests.traffic.e2.traffic_scenes import EGO, begin, executed, scenes
 
 
@@ -34,7 +34,7 @@ def test_after_the_plan_speed_is_kept():
 
 
 def test_a_scenario_is_made_once_and_again_when_its_plan_is_over():
-    on, scene, made = rival("diffscene"), scenes(2).scenes, []
+    on, scene, made = baseline("diffscene"), scenes(2).scenes, []
     scenario = on.scenario
     on.scenario = lambda state, *rest: made.append(state.replans.tolist()) or scenario(state, *rest)
     state, world = begin(on, scene, 2.0), World.at_start(scene)
@@ -46,7 +46,7 @@ def test_a_scenario_is_made_once_and_again_when_its_plan_is_over():
 
 
 def test_who_is_held_does_not_react_to_the_ego():
-    on, scene = rival("diffscene"), scenes(2).scenes
+    on, scene = baseline("diffscene"), scenes(2).scenes
     world = World.at_start(scene)
     plan = EGO.plan(world)
     state, first = on.replan(begin(on, scene, 2.0), world, plan)

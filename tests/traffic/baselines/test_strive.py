@@ -10,27 +10,27 @@ from e2rl.traffic.baselines.strive import attacker_weight, blend, decode_latent
 from e2rl.traffic.baselines.view import motion_of
 from e2rl.traffic.reaction import Lookahead
 from tests.prior.small import small_prior
-from tests.traffic.baselines.attacks import first_replan, rival
+from tests.traffic.baselines.attacks import baseline, first_replan
 from tests.traffic.e2.traffic_scenes import EGO, begin, scenes
 
 
 def test_latents_are_decoded_as_by_ddim_without_noise():
-    on = rival("strive")
-    (_, _, _, noise, _, context), _ = first_replan(on, scenes(2).scenes)
+    on = baseline("strive")
+    (now, context), _ = first_replan(on, scenes(2).scenes)
     prior = small_prior(0, sampler=SamplerSettings(steps=4, churn=0.0))
-    expected = prior.sample(context, noise[..., 0, :]).x0
-    torch.testing.assert_close(decode_latent(on.prior, noise[0, ..., 0, :], context, 4), expected)
+    expected = prior.sample(context, now.noise[..., 0, :]).x0
+    torch.testing.assert_close(decode_latent(on.prior, now.noise[0, ..., 0, :], context, 4), expected)
 
 
 def test_the_objective_falls_over_the_iterations():
-    on = rival("strive", iterations=12, knowledge="predicted")
-    (state, world, ego_plan, noise, group, context), view = first_replan(on, scenes(3).scenes)
-    first, values = noise[0, :, :, 0], []
+    on = baseline("strive", iterations=12, knowledge="predicted")
+    (now, context), view = first_replan(on, scenes(3).scenes)
+    first, values = now.noise[0, :, :, 0], []
 
     def loss(latent):
         motion = motion_of(on.prior, decode_latent(on.prior, latent, context, on.steps), context, 1)
-        values.append(on.loss(motion, latent, first, state, view).detach())
-        return on.loss(motion, latent, first, state, view)
+        values.append(on.loss(motion, latent, first, now.state, view).detach())
+        return on.loss(motion, latent, first, now.state, view)
 
     on.optimised(first, loss)
     assert (values[-1] < values[0]).all() and values[-1].sum() < 0.9 * values[0].sum()
@@ -41,14 +41,14 @@ def test_the_planner_is_driven_anew_at_every_iteration_and_not_without_its_plan(
     world = World.at_start(scene)
     look = Lookahead(EGO, world)
     react = lambda rows, planned: asked.append(planned) or look(rows, planned)  # noqa: E731
-    on = rival("strive", iterations=3)
-    assert on.queries_ego and not rival("strive", knowledge="predicted").queries_ego
+    on = baseline("strive", iterations=3)
+    assert on.queries_ego and not baseline("strive", knowledge="predicted").queries_ego
     on.replan(begin(on, scene, 2.0), world, EGO.plan(world), react)
     assert len(asked) == 4 and not torch.equal(asked[0], asked[3])
 
 
 def test_nobody_behind_the_ego_is_the_attacker():
-    on = rival("strive")
+    on = baseline("strive")
     _, view = first_replan(on, scenes(1).scenes)
     states = view.states[None, :, :, None].repeat(1, 1, 1, 10, 1)
     weight = attacker_weight(states, view)[0]
@@ -60,9 +60,9 @@ def test_nobody_behind_the_ego_is_the_attacker():
 
 
 def test_an_ego_that_is_boxed_in_has_no_solution():
-    on = rival("strive", iterations=10)
-    (_, _, _, noise, _, context), view = first_replan(on, scenes(1).scenes)
-    first, far = noise[0, ..., 0, :], view.states[None, :, :, None].repeat(1, 1, 1, 10, 1)
+    on = baseline("strive", iterations=10)
+    (now, context), view = first_replan(on, scenes(1).scenes)
+    first, far = now.noise[0, ..., 0, :], view.states[None, :, :, None].repeat(1, 1, 1, 10, 1)
     far[..., 1] += 100.0 * (torch.arange(far.shape[2]) > 0)[:, None]
     walled = far.clone()
     walled[:, :, 1, :, :2] = torch.tensor([8.0, 0.0])  # stands a box's length ahead, at 10 m/s
@@ -75,10 +75,10 @@ def test_an_ego_that_is_boxed_in_has_no_solution():
 
 
 def test_a_solution_is_searched_for_where_the_planner_is_hit_alone():
-    """Elsewhere its own way is one; a scene that is searched alone has the answer that it has among others."""
-    on = rival("strive", iterations=10)
-    (_, _, _, noise, _, context), view = first_replan(on, scenes(3).scenes)
-    first, states = noise[0, ..., 0, :], view.states[None, :, :, None].repeat(1, 1, 1, 10, 1)
+    """Elsewhere its own motion is one; a scene that is searched alone has the answer that it has among others."""
+    on = baseline("strive", iterations=10)
+    (now, context), view = first_replan(on, scenes(3).scenes)
+    first, states = now.noise[0, ..., 0, :], view.states[None, :, :, None].repeat(1, 1, 1, 10, 1)
     states[..., 1] += 100.0 * (torch.arange(states.shape[2]) > 0)[:, None]
     states[:, 1, 1] = view.ego[1]  # who drives where the planner of the second scene does
     motion = motion_of(on.prior, torch.zeros_like(first), context, 1)

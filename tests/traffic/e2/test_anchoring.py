@@ -6,6 +6,7 @@ import torch
 from e2rl.prior.lane_relative import LaneState, speeds
 from e2rl.run.errors import InputError
 from e2rl.scenes.recording import DT
+from e2rl.traffic.e2 import anchoring
 from e2rl.traffic.e2.anchoring import AnchorSettings, propose
 from e2rl.traffic.e2.interception import InterceptionSettings
 from e2rl.traffic.e2.motion import constant_speed_states
@@ -81,16 +82,18 @@ def test_the_candidate_that_meets_the_target_is_chosen():
     assert anchored(world, 1)[0].route[0, 1] == 2
 
 
-def test_a_route_that_a_vehicle_would_swing_off_or_cannot_shift_to_is_not_taken():
+def test_a_route_that_a_vehicle_would_swing_off_or_cannot_shift_to_is_not_taken(monkeypatch):
     world = make_world([EGO, (40.0, -30.0, 0.0, 8.0)])
     add_route(world, 1, 2, UP)
     assert not anchored(world, 1)[0].feasible.any()
-    assert anchored(world, 1, max_swing=100.0)[0].route[0, 1] == 2
+    monkeypatch.setattr(anchoring, "MAX_SWING", 100.0)
+    assert anchored(world, 1)[0].route[0, 1] == 2
     beside = make_world([EGO, (30.0, -6.0, 0.0, 8.0)])
     beside.scene["route_points"][:, 1, 2] = beside.scene["route_points"][:, 1, 0] + torch.tensor([0.0, 6.0])
     beside.scene["route_valid"][:, 1, 2] = True
     assert not anchored(beside, 1)[0].feasible.any()
-    assert anchored(beside, 1, max_shift=7.0)[0].route[0, 1] == 2
+    monkeypatch.setattr(anchoring, "MAX_SHIFT", 7.0)
+    assert anchored(beside, 1)[0].route[0, 1] == 2
 
 
 def test_a_kept_route_is_the_only_one_looked_at():
@@ -120,7 +123,7 @@ def test_a_chain_s_first_link_meets_its_target_not_the_ego():
     assert gap < 4.5  # the boxes would touch
 
 
-def test_accelerations_are_bounded_and_bends_slow_down():
+def test_accelerations_are_bounded_and_bends_slow_down(monkeypatch):
     world = make_world([EGO, (60.0, -30.0, UP, 12.0)])
     arc, radius = 2.0 * torch.arange(150) - 20, 15.0
     bend = (arc - 15).clamp(0, radius * math.pi / 2)  # straight up, then left on to the ego's lane, against it
@@ -133,7 +136,8 @@ def test_accelerations_are_bounded_and_bends_slow_down():
         -1,
     )
     world.scene["route_points"][:, 1, 0] = line
-    anchor, _ = anchored(world, 1, max_offset=10.0)
+    monkeypatch.setattr(anchoring, "MAX_OFFSET", 10.0)
+    anchor, _ = anchored(world, 1)
     knots = anchor.knots[0, 1]
     assert knots.min() >= -5.0 and knots.max() <= 4.0 and anchor.feasible[0, 1]
     state = LaneState(*(torch.zeros(()) for _ in range(10)))

@@ -5,8 +5,9 @@ import torch
 
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE
 from e2rl.run.errors import InputError
+from e2rl.traffic.e2 import control as control_module
 from e2rl.traffic.e2.anchoring import Anchor
-from e2rl.traffic.e2.control import ControlSettings, SparseControl, clip_rows, gradient_weight
+from e2rl.traffic.e2.control import ControlSettings, SparseControl, clip_rows
 from e2rl.traffic.e2.potentials import (
     SAMPLED_STEPS,
     PotentialContext,
@@ -96,26 +97,62 @@ def test_v_adv_moves_members_of_the_coalition_only(gradient):
     assert (shift[:, OTHERS] == 0).all() and (shift[:, MEMBER] != 0).any()
 
 
-def test_feasibility_may_move_others_but_never_the_ego_parked_or_absent_ones():
+def crowded():
+    """Vehicle 2 laps over vehicle 1's lane, so that V_feas moves both."""
     case = Case()
-    case.scene["start"][:, 2, 1] = 2.2  # vehicle 2 laps over vehicle 1's lane
+    case.scene["start"][:, 2, 1] = 2.2
     case.context.state.d[:, 2] = -1.3
-    shift, _ = case.shift(feasibility_clip=5.0)
+    return case
+
+
+def test_feasibility_may_move_others_but_never_the_ego_parked_or_absent_ones():
+    shift, _ = crowded().shift(feasibility_clip=5.0)
     assert (shift[:, [0, 5, 6, 7]] == 0).all()
     assert (shift[:, [2, 3, 4]] != 0).any(), "feasibility acts beyond the support"
 
 
-def test_feasibility_acts_once_the_clean_estimate_has_taken_shape():
-    case = Case()
-    case.scene["start"][:, 2, 1] = 2.2
-    case.context.state.d[:, 2] = -1.3
+@pytest.mark.parametrize("level", [0.5, 1.0])
+def test_feasibility_acts_once_the_clean_estimate_has_taken_shape(level, monkeypatch):
+    monkeypatch.setattr(control_module, "FEASIBILITY_LEVEL", level)
+    case = crowded()
     levels = case.prior.schedule.levels(case.prior.sampler.steps)
     for k in range(1, case.prior.sampler.steps + 1):
-        level = float(levels[case.prior.sampler.steps - k])
-        shift, _ = case.shift(level=level, k=k, feasibility_level=0.5, adversarial_clip=0.0)
-        assert bool((shift != 0).any()) == (level <= 0.5), level
-    first, _ = case.shift(level=1.0, k=case.prior.sampler.steps, feasibility_level=1.0, adversarial_clip=0.0)
-    assert (first != 0).any(), "at 1 it acts from the start"
+        at = float(levels[case.prior.sampler.steps - k])
+        shift, _ = case.shift(level=at, k=k, adversarial_clip=0.0)
+        assert bool((shift != 0).any()) == (at <= level), at
+
+
+@pytest.mark.parametrize("gradient", ["denoiser", "clean"])
+@pytest.mark.parametrize(("scaling", "clips"), [("sigma", (0.02, 0.03)), ("score", (1e6, 1e6))])
+def test_the_shift_is_that_of_the_gradients_scaled_clipped_and_masked(gradient, scaling, clips):
+    """x0 - eta M clip(w grad V_adv) - clip(lambda w grad V_feas), w = sigma or sigma^2 / alpha."""
+    case, level = crowded(), torch.tensor(0.4)
+    eta = torch.tensor([0.0, 0.5, 1.0, 2.0])
+    x = torch.randn(4, ROWS, SIZE, generator=torch.Generator().manual_seed(3)).requires_grad_(True)
+    x0 = case.prior.denoise(x, level, case.context)
+    states = case.prior.decode(x0, case.context, steps=SAMPLED_STEPS).states()
+    narrow, wide = PotentialSettings().narrow, PotentialSettings().wide
+    temperature = narrow * (wide / narrow) ** 0.4
+    adversarial = adversarial_potential(states, case.where, PotentialSettings(), temperature).sum()
+    feasible = feasibility_potential(states, case.where, PotentialSettings()).sum()
+    (by_clean,) = torch.autograd.grad(feasible, x0, retain_graph=True)
+    (by_adversary,) = torch.autograd.grad(adversarial, x if gradient == "denoiser" else x0)
+    alpha, sigma = case.prior.schedule.alpha(level), case.prior.schedule.sigma(level)
+    weight = sigma if scaling == "sigma" else sigma**2 / alpha
+
+    def clipped(rows, limit):
+        norm = rows.norm(dim=-1, keepdim=True)
+        return torch.where(norm > limit, rows * limit / norm, rows)
+
+    expected = eta[:, None, None] * clipped(weight * by_adversary, clips[0]) * case.coalition[..., None]
+    expected = expected + clipped(3.0 * weight * by_clean, clips[1]) * case.context.active[..., None]
+    expected[0] = 0.0
+    options = {"adversarial_clip": clips[0], "feasibility": 3.0, "feasibility_clip": clips[1]}
+    made = case.control(eta=eta.tolist(), gradient=gradient, scaling=scaling, **options)
+    after, nominal, controlled = made(x, level, 1, case.context, lambda y: case.prior.denoise(y, level, case.context))
+    torch.testing.assert_close(nominal, x0.detach())
+    torch.testing.assert_close(nominal - controlled, expected, rtol=2e-3, atol=1e-5)
+    assert torch.equal(after, x) and (expected[1:, [MEMBER, 2]] != 0).any(-1).any(0).all()
 
 
 def test_without_intensity_nothing_moves_in_a_mixed_batch():
@@ -125,29 +162,10 @@ def test_without_intensity_nothing_moves_in_a_mixed_batch():
     assert (shift[[1, 3]] != 0).any() and (jump[[1, 3], MEMBER] != 0).any()
 
 
-def test_shifts_are_bounded_per_vehicle_and_grow_with_intensity():
-    case = Case()
-    norms = []
-    for eta in (1.0, 2.0):
-        shift, _ = case.shift(eta=eta, feasibility=0.0, adversarial_clip=0.3)
-        norms.append(shift[:, MEMBER].norm(dim=-1))
-        assert (norms[-1] <= 0.3 * eta + 1e-6).all()
-    torch.testing.assert_close(norms[1], 2 * norms[0])
-
-
 def test_clipping_keeps_directions_and_short_rows():
     rows = torch.tensor([[[3.0, 4.0], [0.3, 0.4], [0.0, 0.0]]])
     torch.testing.assert_close(clip_rows(rows, 1.0), torch.tensor([[[0.6, 0.8], [0.3, 0.4], [0.0, 0.0]]]))
     assert (clip_rows(rows, 0.0) == 0).all(), "a clip of 0 is no shift, also where there is no gradient"
-
-
-def test_the_weight_of_the_gradient():
-    case, level = Case(), torch.tensor(0.5)
-    score, sigma = (
-        case.shift(scaling=scaling, feasibility=0.0, adversarial_clip=1e6)[0] for scaling in ("score", "sigma")
-    )
-    assert gradient_weight(case.prior.schedule, level, "sigma") == case.prior.schedule.sigma(level)
-    torch.testing.assert_close(score, case.prior.schedule.sigma(level) / case.prior.schedule.alpha(level) * sigma)
 
 
 @pytest.mark.parametrize("gradient", ["denoiser", "clean"])
@@ -235,9 +253,8 @@ def test_anchoring_happens_once_at_the_level_nearest_to_the_set_one_and_can_be_o
     assert (case.shift(k=step, strength=0.5)[1] == 0).all(), "members that cannot meet their target are not anchored"
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"gradient": "x"}, {"scaling": "unit"}, {"anchoring": "x"}, {"transport_budget": -1.0}]
-)
-def test_settings_are_checked(wrong):
-    with pytest.raises(InputError, match=next(iter(wrong))):
-        ControlSettings(**wrong)
+def test_settings_are_checked():
+    for wrong in ({"gradient": "x"}, {"scaling": "unit"}, {"anchoring": "x"}, {"transport_budget": -1.0}):
+        with pytest.raises(InputError, match=f"synthesizer.control.{next(iter(wrong))}"):
+            ControlSettings(**wrong)
+    assert ControlSettings().transport_budget is None

@@ -77,10 +77,12 @@ def busy(copies=1):
 
 
 @pytest.mark.parametrize("potential", POTENTIALS)
-def test_gradients_are_those_of_finite_differences(potential):
+def test_gradients_are_those_of_finite_differences(potential, monkeypatch):
     states, context = busy()
     # The impact term is left out: the moment of the impact is detached in it, by design.
-    settings = replace(SETTINGS, max_jerk=0.5, max_lateral_accel=0.5, impact_speed=0.0)
+    monkeypatch.setattr(potentials, "MAX_JERK", 0.5)
+    monkeypatch.setattr(potentials, "MAX_LATERAL_ACCEL", 0.5)
+    settings = replace(SETTINGS, impact_speed=0.0)
     states.requires_grad_()
     value = potential(states, context, settings)
     gradient = torch.autograd.grad(value.sum(), states)[0]

@@ -1,5 +1,7 @@
 """Vehicles that leave replayed traffic: who, from when on, what stays as it was, and that seeds decide."""
 
+import math
+
 import pytest
 import torch
 from torchrl.envs import TransformedEnv
@@ -9,16 +11,32 @@ from e2rl.planners.ego import EgoPolicy
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.errors import InputError
 from e2rl.run.settings import settings_of
+from e2rl.scenes.boxes import overlap
+from e2rl.scenes.recording import DT
+from e2rl.sim import dynamics
+from e2rl.sim.dynamics import Arc, along_arc
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.traffic.e2.reaiming import LATEST, ReactSettings, Reaiming
+from e2rl.traffic.e2.interception import MAX_CURVATURE, InterceptionSettings
+from e2rl.traffic.e2.reaiming import (
+    LATEST,
+    Ground,
+    Law,
+    ReactSettings,
+    Reaiming,
+    Target,
+    best_aim,
+    moments,
+    surroundings,
+)
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.reaction import NewEpisodes
 from e2rl.traffic.transform import AdversarialSynthesizer
-from tests.traffic.e2.traffic_scenes import ROWS, scenes
+from tests.traffic.e2.crossing import make_world
+from tests.traffic.e2.traffic_scenes import scenes
 from tests.traffic.test_transform import March, in_turn
 
 ON = SimSettings(end_on_contact=False, end_off_road=False)
-EVERYBODY = ReactSettings(share=1.0, others=0.0)
+EVERYBODY = ReactSettings(fraction=1.0, others=0.0)
 STEPS = 40
 
 
@@ -51,7 +69,7 @@ def scene_set():
 def test_traffic_in_which_nobody_reacts_is_today_s_bit_for_bit(scene_set):
     pool = stored(scene_set) + stored(scene_set, 0.0) + TrafficPool.recorded(torch.arange(4))
     today = driven(pool, scene_set, None)
-    nobody = driven(pool, scene_set, ReactSettings(share=0.0))
+    nobody = driven(pool, scene_set, ReactSettings(fraction=0.0))
     for key in today.keys(True, True):
         assert torch.equal(today[key], nobody[key]), key
     reacting = driven(pool, scene_set, EVERYBODY)
@@ -71,20 +89,16 @@ def test_the_row_s_adversaries_leave_the_replay_and_everybody_else_stays(scene_s
     moved = (tracks(frames) != pool.parts[0].states[:, 1:]).any(-1)
     others = [1, *range(4, moved.shape[2])]
     assert moved[:, :, 2:4].any(2).any(1).all() and not moved[:, :, others].any()
-    marked = frames["next", "traffic", "adversary"]
-    assert marked[..., 2:4].all() and not marked[..., [0, 1, *range(4, ROWS)]].any()
     first = moved[:, :, 2:4].any(2).int().argmax(1)
     assert (first <= LATEST * STEPS + 5).all() and len(first.unique()) > 1, "at random moments"
 
 
-def test_other_vehicles_that_move_near_the_ego_react_and_are_marked(scene_set):
+def test_other_vehicles_that_move_near_the_ego_react(scene_set):
     pool = stored(scene_set)
-    frames = driven(pool, scene_set, ReactSettings(share=1.0, others=1.0, responsibility="none"))
+    frames = driven(pool, scene_set, ReactSettings(fraction=1.0, others=1.0, responsibility="none"))
     moved = (tracks(frames) != pool.parts[0].states[:, 1:]).any(-1)
-    marked = frames["next", "traffic", "adversary"]
     assert moved[:, :, [1, 4]].any(2).any(1).all() and not moved[:, :, [2, 3, 5]].any(), "5 is parked"
-    assert torch.equal(marked[..., [1, 4]].any(1), moved[..., [1, 4]].any(1))
-    full = driven(pool, scene_set, ReactSettings(share=1.0, others=1.0))
+    full = driven(pool, scene_set, ReactSettings(fraction=1.0, others=1.0))
     leads = (tracks(full) != pool.parts[0].states[:, 1:]).any(-1)[..., 4]
     assert not leads.any(), "under full responsibility none that leads the ego's way"
 
@@ -145,7 +159,7 @@ def test_the_specs_hold(scene_set):
 
 def test_shares_of_episodes_are_as_set():
     count = 4000
-    reaction = Reaiming(ReactSettings(share=0.6, others=0.3, eta=(1.0, 3.0), reckless=0.2))
+    reaction = Reaiming(ReactSettings(fraction=0.6, others=0.3, eta=(1.0, 3.0), reckless=0.2))
     some = torch.arange(count) % 4 > 0
     reaction.begin(NewEpisodes(torch.arange(count), some, torch.zeros(count, 5, dtype=torch.bool), count, 80))
     part = reaction._part
@@ -157,17 +171,159 @@ def test_shares_of_episodes_are_as_set():
     assert part["count"].unique().tolist() == [1, 2]
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"share": 1.2},
-        {"others": -0.1},
-        {"reckless": 2},
-        {"scatter": -1},
-        {"eta": [3.0, 1.0]},
-        {"responsibility": "some"},
-    ],
-)
-def test_settings_out_of_range_are_refused(wrong):
-    with pytest.raises(InputError, match=next(iter(wrong))):
-        settings_of(ReactSettings, wrong, "learner.react")
+def test_settings_out_of_range_are_refused():
+    for wrong in ({"fraction": 1.2}, {"scatter": -1}, {"eta": [3.0, 1.0]}, {"responsibility": "some"}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            settings_of(ReactSettings, wrong, "learner.react")
+
+
+# --- the law: closed forms, its limits, the drivable area, and what it owes the ego and others
+
+STILL = torch.zeros(1, 2)
+
+
+def ground_of(world, depth=-5.0):
+    return Ground(torch.full_like(world.scene["field"], depth), world.scene["field_origin"], torch.tensor([0]))
+
+
+def seen_by(vehicles, index=1):
+    world = make_world(vehicles)
+    return surroundings(world, torch.tensor([0]), torch.tensor([index])), ground_of(world)
+
+
+def aimed(vehicles, eta=2.0, responsibility="none", shift=STILL):
+    seen, ground = seen_by(vehicles)
+    return seen, Law(responsibility)(seen, torch.tensor([eta]), shift, ground)
+
+
+@pytest.mark.parametrize("distance, speed", [(30.0, 8.0), (12.0, 4.0), (45.0, 10.0), (20.0, 0.0)])
+def test_straight_ahead_of_a_standing_ego_it_touches_it_at_the_chosen_moment(distance, speed):
+    """And is not there before, at the accelerations that are allowed."""
+    seen, aim = aimed([(0, 0, 0, 0.0), (distance, 0, math.pi, speed)])
+    assert aim.curvature.abs().item() < 1e-3 and -2.4 <= aim.accel.item() <= 3.0
+    times = torch.arange(1, 501) / 100
+    path, driven = along_arc(seen.states[:, 1], aim, times)
+    met = overlap(path, seen.scene["size"][:, 1, None], seen.states[:, :1], seen.scene["size"][:, :1])[0]
+    arrival = times[driven[0] >= distance - 0.4 * 2 * 4.5 - 1e-3]
+    assert met.any() and len(arrival), "it comes there"
+    assert (arrival[0] / 0.5 - (arrival[0] / 0.5).round()).abs() < 0.021, "at one of the ten moments"
+
+
+def test_aims_keep_the_limits_at_every_intensity():
+    torch.manual_seed(0)
+    count = 400
+    states = torch.stack([*(60 * torch.rand(3, count) - 30), 20 * torch.rand(count)], -1)
+    ego = torch.stack([*(60 * torch.rand(3, count) - 30), 15 * torch.rand(count)], -1)
+    target = along_arc(ego, Arc(torch.zeros(count), torch.zeros(count)), moments(ego))[0]
+    eta, length = 1 + 2 * torch.rand(count), torch.full((count,), 4.5)
+    ground = Ground(torch.full((1, 200, 200), -5.0), torch.tensor([[-100.0, -100.0]]), torch.zeros(count).long())
+    aim = best_aim(states, Target(target, length, length), eta, ground, InterceptionSettings())
+    some = ~aim.accel.isnan()
+    assert 0.2 < some.float().mean() < 0.8, "not where the ego is behind"
+    accel, curvature, eta, v = aim.accel[some], aim.curvature[some].abs(), eta[some], states[some, 3]
+    assert (accel <= 1.5 * eta + 1e-4).all() and (accel >= -1.2 * eta - 1e-4).all()
+    assert (curvature <= MAX_CURVATURE + 1e-6).all() and (v**2 * curvature <= 2 * eta + 1e-3).all()
+
+
+def test_it_aims_where_the_ego_is_expected_by_its_motion():
+    """To the left of a turning ego's way straight on; and the nearer the misjudged place, the more to that side."""
+    seen, ground = seen_by([(0, 0, 0, 8.0), (40, 0, math.pi, 8.0)])
+    straight = Law("none")(seen, torch.tensor([2.0]), STILL, ground)
+    seen.turn_rate[:, 0] = 0.2
+    turning = Law("none")(seen, torch.tensor([2.0]), STILL, ground)
+    assert straight.curvature.abs() < 1e-3 and turning.curvature < -1e-2
+    _, misjudged = aimed([(0, 0, 0, 8.0), (40, 0, math.pi, 8.0)], shift=torch.tensor([[0.0, 2.0]]))
+    assert -0.05 < misjudged.curvature < -1e-3
+
+
+def test_without_a_drivable_aim_it_unwinds_its_curvature_and_brakes_gently():
+    """Off the road on all sides but its own place; or with the ego behind."""
+    world = make_world([(0, 0, 0, 5.0), (30, 20, -1.6, 8.0)])
+    seen = surroundings(world, torch.tensor([0]), torch.tensor([1]))
+    seen.turn_rate[:, 1] = 0.8
+    field = torch.full_like(world.scene["field"], 5.0)
+    column, row = (seen.states[0, 1, :2] - world.scene["field_origin"][0]).round().long()
+    field[:, column - 1 : column + 2, row - 1 : row + 2] = -1.0
+    ground = Ground(field, world.scene["field_origin"], torch.tensor([0]))
+    aim = Law("none")(seen, torch.tensor([2.0]), STILL, ground)
+    assert aim.curvature.item() == pytest.approx(0.05) and aim.accel.item() == pytest.approx(-1.0)
+    _, away = aimed([(0, 0, 0, 5.0), (10, 0, 0, 20.0)], eta=0.1)
+    assert away.accel.item() <= 0
+
+
+def test_only_paths_on_the_drivable_area_are_taken():
+    world = make_world([(0, 20, 0, 5.0), (-20, 0, 0, 8.0)])
+    seen = surroundings(world, torch.tensor([0]), torch.tensor([1]))
+    free = Law("none")(seen, torch.tensor([2.0]), STILL, ground_of(world))
+    y = torch.arange(world.scene["field"].shape[-1]) + world.scene["field_origin"][0, 1]
+    field = (y - 3.0).clamp(-5, 5).expand_as(world.scene["field"])
+    kerb = Law("none")(seen, torch.tensor([2.0]), STILL, Ground(field.contiguous(), *ground_of(world)[1:]))
+    assert free.curvature > 0.01
+    end = along_arc(seen.states[:, 1], kerb, torch.tensor([2.0]))[0]
+    assert end[0, 0, 1] < 3.6
+
+
+def followed_for(seconds, responsibility, vehicles, steer=None):
+    """Whether vehicle 1, re-aiming every 0.5 s, touches an ego that keeps its velocity, and their least gap [m]."""
+    world = make_world(vehicles)
+    law, generator, touched = Law(responsibility), torch.Generator().manual_seed(0), False
+    for _ in range(round(seconds / 0.5)):
+        seen = surroundings(world, torch.tensor([0]), torch.tensor([1]))
+        aim = law(seen, torch.tensor([3.0]), 0.7 * torch.randn(1, 2, generator=generator), ground_of(world))
+        states = world.states.clone()
+        path, _ = along_arc(states[:, 1], aim, DT * torch.arange(1, 6))
+        still = Arc(torch.zeros(1), torch.zeros(1))
+        ego, _ = along_arc(states[:, 0], still, DT * torch.arange(1, 6))
+        size = world.scene["size"]
+        touched |= overlap(path, size[:, 1, None], ego, size[:, :1]).any().item()
+        world.turn_rate[:, 1] = dynamics.wrap(path[:, -1, 2] - states[:, 1, 2]) / 0.5
+        world.accel[:, 1] = aim.accel
+        states[:, 0], states[:, 1] = ego[:, -1], path[:, -1]
+        world.states = states
+    return touched
+
+
+BEHIND = [(0, 0, 0, 9.0), (-12, 0, 0, 14.0)]
+
+
+@pytest.mark.parametrize("speed", [10.0, 16.0])
+def test_from_behind_it_hits_a_steady_ego_without_responsibility_and_never_with_it(speed):
+    vehicles = [(0, 0, 0, 9.0), (-25, 0, 0, speed)]
+    assert followed_for(8, "none", vehicles)
+    assert not followed_for(8, "full", vehicles) and not followed_for(8, "rear", vehicles)
+
+
+def test_a_reckless_vehicle_owes_the_ego_nothing_whatever_the_law():
+    seen, _ = aimed(BEHIND)
+    world = make_world(BEHIND)
+    eta, ground, reckless = torch.tensor([3.0]), ground_of(world), torch.tensor([True])
+    free, lawful = (Law(name)(seen, eta, STILL, ground) for name in ("none", "full"))
+    assert Law("full")(seen, eta, STILL, ground, reckless) == free
+    assert Law("full")(seen, eta, STILL, ground, ~reckless) == lawful and lawful.accel < free.accel
+
+
+def test_ahead_it_gives_way_late_but_in_time_under_full_responsibility():
+    crossing = [(0, 0, 0, 9.0), (30, -25, math.pi / 2, 8.0)]
+    assert followed_for(6, "none", crossing) and not followed_for(6, "full", crossing)
+    near, far = (aimed([(0, 0, 0, 9.0), (x, 0, math.pi, 8.0)], responsibility="full")[1].accel for x in (20.0, 60.0))
+    free = aimed([(0, 0, 0, 9.0), (60.0, 0, math.pi, 8.0)])[1].accel
+    assert near < -2.4 and far == free, "it waits while little braking still suffices"
+
+
+def test_it_brakes_for_the_vehicle_ahead_of_it():
+    way = [(60, 0, 0, 9.0), (0, 0, 0, 12.0)]
+    _, free = aimed(way)
+    _, behind = aimed([*way, (12, 0, 0, 4.0)])
+    _, beside = aimed([*way, (12, 4.0, 0, 4.0)])
+    assert behind.accel < -3 and beside.accel == free.accel
+
+
+def test_it_knows_the_ego_s_motion_but_not_its_plan():
+    world = make_world([(0, 0, 0, 9.0), (-25, 0, 0, 12.0)])
+    told = make_world([(0, 0, 0, 9.0), (-25, 0, 0, 12.0)])
+    told.plan = torch.randn(1, 8, 50, 4)
+    aims = []
+    for each in (world, told):
+        seen = surroundings(each, torch.tensor([0]), torch.tensor([1]))
+        aims.append(Law()(seen, torch.tensor([2.0]), STILL, ground_of(world)))
+    assert torch.equal(aims[0].accel, aims[1].accel) and torch.equal(aims[0].curvature, aims[1].curvature)

@@ -33,15 +33,13 @@ def world(copies=1):
     return made
 
 
-def ask(url, tmp_path, made, statistics=None, **settings):
-    counts = {} if statistics is None else statistics
+def ask(url, tmp_path, made, **settings):
     reasoner = LanguageReasoner(
         ReasonerSettings(
             **({"kind": "lm", "model": "small", "base_url": url, "retries": 0, "cache": str(tmp_path)} | settings)
-        ),
-        counts,
+        )
     )
-    return reasoner(made.scene, made, RULES), counts
+    return reasoner(made.scene, made, RULES), reasoner.statistics
 
 
 def test_the_model_decides_and_is_asked_by_schema_at_temperature_zero(tmp_path):
@@ -148,14 +146,14 @@ def test_an_ego_alone_asks_nothing(tmp_path):
 
 
 def test_the_synthesizer_counts_and_the_rules_are_the_default(tmp_path):
-    assert build_reasoner(ReasonerSettings(), {}) is feasible_vehicles
+    assert build_reasoner(ReasonerSettings()) is feasible_vehicles
     with chat_server(verdicts) as (url, _):
         settings = {"kind": "lm", "model": "small", "base_url": url, "cache": str(tmp_path)}
         made, on = world(), synthesizer(reasoner=settings)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             on.feasible_vehicles(made.scene, made, RULES)
-    assert on.statistics["lm_requests"] == 1
+    assert on.feasible_vehicles.statistics["lm_requests"] == 1
 
 
 def test_what_is_missing_is_said(monkeypatch):
@@ -165,10 +163,10 @@ def test_what_is_missing_is_said(monkeypatch):
         ReasonerSettings(kind="oracle")
     monkeypatch.delenv("OPENAI_API_KEY")
     with pytest.raises(InputError, match="OPENAI_API_KEY"):
-        LanguageReasoner(ReasonerSettings("lm", "small"), {})
+        LanguageReasoner(ReasonerSettings("lm", "small"))
     monkeypatch.setitem(sys.modules, "openai", None)
     with pytest.raises(InputError, match="pip install"):
-        LanguageReasoner(ReasonerSettings("lm", "small"), {})
+        LanguageReasoner(ReasonerSettings("lm", "small"))
 
 
 def test_answers_must_be_about_whom_was_asked():

@@ -1,4 +1,4 @@
-"""Time to collision against stepped polygons; cliques, scores and candidates against the definitions, in plain Python."""
+"""Time to collision against stepped polygons; cliques, scores, candidates against the definitions in plain Python."""
 
 import math
 from itertools import combinations

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from e2rl.scripts.inspect import main
+from e2rl.commands.inspect import main
 from PIL import Image
 
 from e2rl.report import drawing
@@ -45,7 +45,7 @@ def test_a_data_set_is_counted_and_what_is_left_out_has_its_reason(folder, tmp_p
     assert number(text, "vehicles") == "2 (2 to 2)" and number(text, "pedestrians") == "2 (1 to 4)"
     assert number(text, "lanes") == "4 (4 to 4)" and number(text, "traffic lights") == "0 (0 to 1)"
     assert number(text, "speed of the ego at the start, m/s") == "8.0 (8.0 to 8.0)"
-    assert number(text, "way of the ego, m") == "64 (64 to 64)"
+    assert number(text, "distance driven by the ego, m") == "64 (64 to 64)"
     assert number(text, "% of lanes with a successor") == "25 (25 to 25)"  # `in` alone goes on
 
 

@@ -1,22 +1,24 @@
-"""Every rival: the prior where it has no gain, the same alone and in a batch, on its authors' terms and on ours."""
+"""Every baseline: the prior where it has no gain, the same alone and in a batch, on its authors' terms and on ours."""
 
 import pytest
 import torch
 
 from e2rl.prior.sde import SamplerSettings
 from e2rl.run.errors import InputError
+from e2rl.run.settings import file_values
 from e2rl.sim.world import World
 from e2rl.traffic.baselines.ctg import CTGAdv
 from e2rl.traffic.nominal import NominalTraffic
+from e2rl.traffic.rule_based import Replay
 from tests.prior.small import small_prior
-from tests.traffic.baselines.attacks import ADVERSARIES, SMALL, first_replan, rival
-from tests.traffic.e2.traffic_scenes import EGO, begin, replanned, scenes
+from tests.traffic.baselines.attacks import ADVERSARIES, SMALL, baseline, first_replan
+from tests.traffic.e2.traffic_scenes import EGO, begin, executed, replanned, scenes
 
 
 @pytest.mark.parametrize("knowledge", ["plan", "predicted"])
 @pytest.mark.parametrize("name", SMALL)
 def test_without_gain_it_is_the_prior_bit_for_bit(name, knowledge):
-    on, scene = rival(name, gain=0.0, knowledge=knowledge), scenes(2).scenes
+    on, scene = baseline(name, gain=0.0, knowledge=knowledge), scenes(2).scenes
     _, plan = replanned(on, scene, 2.0, times=3)
     _, nominal = replanned(NominalTraffic(on.prior, knowledge), scene, times=3)
     assert torch.equal(plan.states, nominal.states) and torch.equal(plan.present, nominal.present)
@@ -25,7 +27,7 @@ def test_without_gain_it_is_the_prior_bit_for_bit(name, knowledge):
 
 @pytest.mark.parametrize("name", ADVERSARIES)
 def test_without_intensity_it_is_the_prior_bit_for_bit_also_beside_scenes_with_one(name):
-    on, scene = rival(name), scenes(2).scenes
+    on, scene = baseline(name), scenes(2).scenes
     world, eta = World.at_start(scene), torch.tensor([0.0, 2.0])
     _, plan = on.replan(on.reset(scene, torch.arange(2), eta), world, EGO.plan(world))
     _, nominal = replanned(NominalTraffic(on.prior, on.knowledge), scene)
@@ -37,7 +39,7 @@ def test_without_intensity_it_is_the_prior_bit_for_bit_also_beside_scenes_with_o
 
 @pytest.mark.parametrize("name", SMALL)
 def test_a_scene_is_planned_alike_alone_and_in_a_batch(name):
-    on, scene = rival(name), scenes(3).scenes
+    on, scene = baseline(name), scenes(3).scenes
     _, whole = replanned(on, scene, 2.0, [5, 6, 7], times=2)
     _, alone = replanned(on, scene[1:2], 2.0, [6], times=2)
     torch.testing.assert_close(alone.states, whole.states[1:2], rtol=0, atol=2e-2)
@@ -48,8 +50,8 @@ def test_a_scene_is_planned_alike_alone_and_in_a_batch(name):
 def test_it_attacks_on_the_authors_terms_and_on_ours(name):
     scene = scenes(3).scenes
     for terms in ({}, {"knowledge": "predicted", "responsibility": "full"}):
-        _, plan = replanned(rival(name, **terms), scene, 2.0)
-        _, nominal = replanned(rival(name, **terms), scene, 0.0)
+        _, plan = replanned(baseline(name, **terms), scene, 2.0)
+        _, nominal = replanned(baseline(name, **terms), scene, 0.0)
         assert plan.adversary.any() and not plan.adversary[:, 0].any()
         assert not torch.equal(plan.states[plan.adversary], nominal.states[plan.adversary])
         assert plan.states.isfinite().all()
@@ -57,34 +59,58 @@ def test_it_attacks_on_the_authors_terms_and_on_ours(name):
 
 @pytest.mark.parametrize("name", SMALL)
 def test_who_predicts_the_ego_does_not_look_at_its_plan(name):
-    on, scene = rival(name, knowledge="predicted"), scenes(2).scenes
+    on, scene = baseline(name, knowledge="predicted"), scenes(2).scenes
     world = World.at_start(scene)
     plans = [on.replan(begin(on, scene, 2.0), world, EGO.plan(world) + shift)[1].states for shift in (0.0, 50.0)]
     assert torch.equal(*plans)
 
 
-def test_the_duty_of_care_binds_the_adversaries():
+def test_the_yielding_rule_binds_the_adversaries():
     """On the authors' terms nobody brakes for the ego; with ours who meets it does."""
     scene, duties = scenes(2).scenes, []
-    world = World.at_start(scene)
     for responsibility in ("none", "full"):
-        bound = rival("ctg_adv", responsibility=responsibility)
-        (state, _, ego_plan, noise, group, _), _ = first_replan(bound, scene)
-        state, _, context = bound.replan_group(state, world, ego_plan, noise, group)
+        bound = baseline("ctg_adv", responsibility=responsibility)
+        (now, _), _ = first_replan(bound, scene)
+        state, _, context = bound.replan_group(now)
         duties.append(context.obstacles.duty)
         assert torch.equal(duties[-1].exempt | duties[-1].yields, state.adversary)
     assert not duties[0].yields.any() and duties[1].yields.any()
+
+
+@pytest.mark.parametrize("name", ["ccdiff", "cat"])
+def test_who_is_left_alone_replays_and_the_prior_sees_where_they_are(name):
+    on, scene = baseline(name), scenes(3).scenes
+    state, world = begin(on, scene, 2.0), World.at_start(scene)
+    for _ in range(2):
+        plan = EGO.plan(world)
+        state, traffic = on.replan(state, world, plan)
+        logged = Replay().replan(None, world, plan)[1]
+        driven = state.top if name == "ccdiff" else state.held
+        assert torch.equal(traffic.states[~driven], logged.states[~driven])
+        assert torch.equal(traffic.present[~driven], logged.present[~driven])
+        world = executed(world, traffic, plan)
+        here = scene["valid"][:, :8] & ~driven
+        torch.testing.assert_close(state.lane.states()[here][:, :3], logged.states[here][:, 4, :3])
+    assert traffic.adversary.any() and not (traffic.adversary & ~driven).any()
 
 
 def test_settings_that_cannot_be_are_named():
     for name, settings, word in (
         ("ctg_adv", {"gain": -1.0}, "synthesizer.gain"),
         ("strive", {"iterations": 0}, "synthesizer.iterations"),
-        ("cat", {"ways": 99}, "synthesizer.ways"),
+        ("cat", {"tracks": 99}, "synthesizer.tracks"),
         ("diffscene", {"responsibility": "some"}, "synthesizer.responsibility"),
     ):
         with pytest.raises(InputError, match=word):
-            rival(name, **settings)
+            baseline(name, **settings)
     for sampler in (SamplerSettings("dpm_solver_pp"), SamplerSettings(churn=0.0)):
-        with pytest.raises(InputError, match="ctg_adv moves the mean"):
+        with pytest.raises(InputError, match="CTGAdv moves the mean"):
             CTGAdv(small_prior(0, sampler=sampler))
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_class_has_the_values_of_its_file_and_a_tuning_space_of_its_settings(name):
+    kind, values = SMALL[name][0], file_values(f"synthesizer/{name}")
+    on = kind(small_prior(0, sampler=SamplerSettings(steps=2)))
+    assert all(getattr(on, key) == value for key, value in values.items() if key not in ("name", "_target_"))
+    assert bool(on.tuned) == on.adversarial and set(on.tuned) <= set(values)

@@ -1,4 +1,4 @@
-"""Synthesis beside learning: the same D' as here, whenever it is ready; a death has one message and loses nothing."""
+"""The next round made beside learning: the same D' as here, whenever it is ready; a death has one message."""
 
 import os
 import signal
@@ -6,6 +6,7 @@ import time
 
 import pytest
 import torch
+from e2rl.scripts.train import train_round
 
 from e2rl.evaluation.methods import build_ego
 from e2rl.learning.attack import make_traffic
@@ -27,14 +28,14 @@ def real(run, scenes):
 def test_the_traffic_is_that_of_the_same_order_here():
     """Made against the policy before learning, whatever the policy has become meanwhile."""
     scenes = small_scenes()
-    run = real(small_run(scenes=scenes, nominal="prior", spread=0.5, ahead=True), scenes)
-    run.run_round()
+    run = real(small_run(scenes=scenes, nominal="prior", spread=0.5, prefetch=True), scenes)
+    train_round(run)
     order = run._next
     kept = {name: value.clone() for name, value in order.ego.network.weights().items()}
     now = run.ego.network.weights()
     assert any(not torch.equal(value, now[name]) for name, value in kept.items())
-    expected = make_traffic(order, run.synthesize)
-    metrics = run.run_round()
+    expected, _ = make_traffic(order, run.synthesize)
+    metrics = train_round(run)
     found = run.memory.rounds[-1].traffic
     assert set(found) == set(expected) and order.number == run.memory.rounds[-1].number == 1
     assert all(torch.equal(found[name], expected[name]) for name in expected)
@@ -47,10 +48,10 @@ def test_the_traffic_is_that_of_the_same_order_here():
 def test_results_do_not_depend_on_who_is_faster():
     def driven(delay):
         scenes = small_scenes()
-        run = small_run(scenes=scenes, ahead=True, spread=0.5)
+        run = small_run(scenes=scenes, prefetch=True, spread=0.5)
         attack = brake_check(scenes)
         run.synthesize = lambda *given: time.sleep(delay) or attack(*given)
-        metrics = [run.run_round() for _ in range(3)]
+        metrics = [train_round(run) for _ in range(3)]
         return [{name: row[name] for name in row if not name.startswith("time/")} for row in metrics], metrics
 
     (quick, _), (slow, timed) = driven(0.0), driven(1.0)
@@ -58,25 +59,25 @@ def test_results_do_not_depend_on_who_is_faster():
 
 
 def test_without_it_nothing_waits_and_learning_acts_at_once():
-    assert "time/waiting" not in small_run().run_round()
+    assert "time/waiting" not in train_round(small_run())
 
 
 def test_a_process_that_dies_is_named_and_the_run_goes_on_from_its_checkpoint(tmp_path):
     def begun():
-        return small_run(folder=tmp_path, ahead=True)
+        return small_run(folder=tmp_path, prefetch=True)
 
     run, attack = begun(), brake_check(small_scenes())
     run.synthesize = lambda ego, index, eta, seed: (
         os.kill(os.getpid(), signal.SIGKILL) if seed == 1 else attack(ego, index, eta, seed)
     )
-    run.run_round()
+    train_round(run)
     save_checkpoint(tmp_path, run, {})
-    with pytest.raises(InputError, match=r"round 2: .*killed \(exit code -9\)"):
-        run.run_round()
-    again, whole = begun(), small_run(ahead=True)
+    with pytest.raises(InputError, match=r"round 2: .*killed"):
+        train_round(run)
+    again, whole = begun(), small_run(prefetch=True)
     assert load_checkpoint(tmp_path, again) == 1
-    again.run_round()
-    whole.run_round(), whole.run_round()
+    train_round(again)
+    train_round(whole), train_round(whole)
     assert whole.memory.index() == again.memory.index()
 
 
@@ -88,10 +89,10 @@ def test_errors_of_the_process_arrive():
         raise RuntimeError("slipped")
 
     for fault, match in ((refuse, "round 1: .*resume=RUN_DIR.*no prior"), (slip, "RuntimeError: slipped")):
-        run = small_run(ahead=True)
+        run = small_run(prefetch=True)
         run.synthesize = fault
         with pytest.raises(InputError, match=match):
-            run.run_round()
+            train_round(run)
 
 
 WHERE = {"device=cuda": {"device": "cuda"}, "threads=2": {"threads": 2}, "planner": {}, "live": {}}
@@ -100,16 +101,16 @@ WHERE = {"device=cuda": {"device": "cuda"}, "threads=2": {"threads": 2}, "planne
 @pytest.mark.parametrize("where", WHERE)
 def test_where_it_cannot_be_it_is_refused(where):
     sizes = [f"learner.collect.{setting}" for setting in ("batch=4", "steps=20", "iterations=1")]
-    config = load_config("train", ["learner.round.ahead=true", "learner.recorded=false", *sizes])
+    config = load_config("train", ["learner.round.prefetch=true", *sizes])
     if where == "planner":
-        config = load_config("train", ["learner=planner_tuning", "+learner.round.ahead=true", "ego=lane_graph"])
+        config = load_config("train", ["learner=planner_tuning", "+learner.round.prefetch=true", "ego=lane_graph"])
     if where == "live":
         config.learner.round.traffic = "live"
     ego, scenes = build_ego(config), small_scenes()
     config.merge_with(WHERE[where])
     if where != "device=cuda" or torch.cuda.is_available():
         left_open = config.copy()
-        left_open.learner.round.ahead = None
-        assert not build_evolution(left_open, scenes, ego, Ambush(), brake_check(scenes)).settings.ahead
-    with pytest.raises(InputError, match=r"learner\.round\.ahead=true"):
+        left_open.learner.round.prefetch = None
+        assert not build_evolution(left_open, scenes, ego, Ambush(), brake_check(scenes)).settings.prefetch
+    with pytest.raises(InputError, match=r"learner\.round\.prefetch=true"):
         build_evolution(config, scenes, ego, Ambush(), brake_check(scenes))

@@ -8,6 +8,7 @@ from e2rl.planners.ego import PLAN_STEPS, Ego, EgoPlanner, EgoPolicy, track
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.planners.log_replay import ReplayEgo
 from e2rl.planners.path import MissionPath
+from e2rl.run.config import built, load_choice
 from e2rl.run.errors import InputError
 from e2rl.sim import dynamics
 from e2rl.sim.env import DrivingEnv, SimSettings
@@ -15,7 +16,7 @@ from tests.synthetic import make_scenes
 
 
 class Cruise(Ego):
-    """The example of e2rl.planners.ego, counting its plans."""
+    """Holds its speed along its mission, and counts its plans."""
 
     plans = 0
 
@@ -108,6 +109,17 @@ def test_replayed_log_is_tracked():
     assert torch.allclose(env.world().states[:, 0], env.scene["logged"][:, 80, 0], atol=0.01)
 
 
-def test_replan_rate_is_checked():
-    with pytest.raises(InputError, match="replan_every"):
-        Cruise(replan_every=0)
+@pytest.mark.parametrize("name", ["idm", "lane_graph", "lane_graph_tuned", "replay", "sampling", "bits"])
+def test_a_file_of_the_configuration_builds_its_ego(name):
+    """The class alone has the values of its file; each value is checked."""
+    group = load_choice("ego", name)
+    ego = built(group, "ego", Ego)
+    for key in set(group) - {"_target_", "predicted_speeds"}:
+        assert getattr(ego, key) == group[key]
+        assert name == "lane_graph_tuned" or getattr(type(ego)(), key) == group[key]
+    env = make_env(make_scenes(2), 2)
+    env.reset()
+    plan = ego.plan(env.world())
+    assert plan.shape == (2, PLAN_STEPS, 4) and torch.isfinite(plan).all()
+    with pytest.raises(InputError, match=r"ego\.replan_every=0"):
+        type(ego)(replan_every=0)

@@ -1,0 +1,135 @@
+"""Learnability, priorities and draws of scenes as defined; what counts for which attack; a state that goes on exactly."""
+
+import pytest
+import torch
+
+from e2rl.learning import scheduler
+from e2rl.learning.scheduler import Outcomes, outcomes_of, ranks, tally
+from e2rl.learning.schedules import AdaptiveCurriculum
+from e2rl.run.errors import InputError
+from e2rl.traffic.traffic import PAIR, SINGLE
+
+
+def curriculum_of(num_scenes=6, **settings):
+    return AdaptiveCurriculum(num_scenes, 10, **settings)
+
+
+def episodes(curriculum, scenes, failed, adversarial=True):
+    """Episodes in scenes, each failed or not."""
+    curriculum.update(torch.tensor(scenes), torch.tensor(failed), torch.full((len(scenes),), adversarial))
+
+
+def failing(curriculum, *rates):
+    """Ten episodes in each of the first scenes, which fail at these rates."""
+    for scene, rate in enumerate(rates):
+        episodes(curriculum, [scene] * 10, [k < round(10 * rate) for k in range(10)])
+
+
+def test_learnability_is_the_variance_of_recent_failures_in_adversarial_traffic(monkeypatch):
+    monkeypatch.setattr(scheduler, "SMOOTHING", 0.25)
+    curriculum = curriculum_of()
+    episodes(curriculum, [0, 1, 1], [True, False, True], adversarial=False)
+    assert curriculum.learnability().isnan().all(), "nothing is known of adversarial traffic yet"
+    failing(curriculum, 0.2, 1.0, 0.0)
+    torch.testing.assert_close(curriculum.learnability()[:3], torch.tensor([0.16, 0.0, 0.0]))
+    episodes(curriculum, [1], [False])
+    assert curriculum.learnability()[1] == pytest.approx(0.75 * 0.25), "the rate is a moving average"
+
+
+def test_priorities_are_by_rank_of_learnability_and_by_staleness(monkeypatch):
+    monkeypatch.setattr(scheduler, "STALENESS", 0.0)
+    curriculum = curriculum_of(4)
+    assert curriculum.priority().tolist() == [0.25] * 4
+    failing(curriculum, 1.0, 0.9, 0.4)  # the last scene is unseen and comes first
+    weight = torch.tensor([4.0, 3.0, 2.0, 1.0]) ** -0.5
+    torch.testing.assert_close(curriculum.priority(), weight / weight.sum())
+    monkeypatch.setattr(scheduler, "STALENESS", 0.5)
+    curriculum._drawn, curriculum.round = torch.tensor([0, 1, 2, 3]), 3
+    stale = torch.tensor([3.0, 2.0, 1.0, 0.0]) / 6
+    torch.testing.assert_close(curriculum.priority(), (weight / weight.sum() + stale) / 2)
+    assert curriculum_of(4, prioritised=False).priority().tolist() == [0.25] * 4
+
+
+def test_no_scene_takes_the_round_once_all_have_been_seen():
+    """A round has thousands of episodes before priorities change, so that they must not all go to a few scenes."""
+    curriculum = curriculum_of(300)
+    failing(curriculum, *torch.linspace(0, 1, 300).tolist())
+    priority = curriculum.priority().sort(descending=True).values
+    assert priority[0] < 0.05 and 0.2 < priority[:30].sum() < 0.4
+
+
+def test_draws_follow_the_priorities_without_repetition_within_a_pass(monkeypatch):
+    monkeypatch.setattr(scheduler, "STALENESS", 0.0)
+    curriculum = curriculum_of(5)
+    failing(curriculum, 0.0, 0.1, 0.2, 0.3, 0.4)
+    counts = torch.bincount(torch.stack([curriculum.draw(1) for _ in range(4000)]).flatten(), minlength=5)
+    assert torch.allclose(counts / 4000, curriculum.priority(), atol=0.03)
+    chosen = curriculum.draw(13)
+    assert sorted(torch.bincount(chosen, minlength=5).tolist()) == [2, 2, 3, 3, 3]
+    assert len(curriculum.draw(4).unique()) == 4
+
+
+def test_a_drawn_scene_is_not_stale():
+    curriculum = curriculum_of(4)
+    curriculum.round = 5
+    drawn = curriculum.draw(2)
+    assert (curriculum._drawn == 5).nonzero()[:, 0].tolist() == sorted(drawn.tolist())
+
+
+def test_ranks_share_ties():
+    assert ranks(torch.tensor([5.0, 1.0, 5.0, torch.inf, 0.0])).tolist() == [2.5, 4.0, 2.5, 1.0, 5.0]
+
+
+def test_scenes_left_out_are_not_drawn_first():
+    curriculum = curriculum_of(4)
+    failing(curriculum, 0.5)
+    curriculum.leave_out(torch.tensor([0, 1]))
+    assert curriculum.learnability().nan_to_num(-1).tolist() == [0.25, 0.0, -1.0, -1.0]
+
+
+def test_the_summary_tells_what_is_known():
+    curriculum = curriculum_of(4, eta=2.0, fraction=0.7)
+    assert curriculum.summary() == {"eta": 2.0, "fraction": 0.7, "scenes_seen": 0.0}
+    failing(curriculum, 0.5, 0.0)
+    assert curriculum.summary() == {"eta": 2.0, "fraction": 0.7, "scenes_seen": 0.5, "learnability": 0.125}
+
+
+def test_state_goes_on_exactly():
+    first, second = curriculum_of(), curriculum_of(seed=4)
+    for _ in range(3):
+        first.draw(2)
+        episodes(first, [0, 3], [True, False])
+        first.advance(0.1)
+    second.load_state_dict(first.state_dict())
+    for curriculum in (first, second):
+        curriculum.advance(0.9)
+    assert torch.equal(first.draw(4), second.draw(4)) and first.eta == second.eta and first.round == second.round
+    assert torch.equal(first.etas(torch.arange(4)), second.etas(torch.arange(4)))
+    assert torch.equal(first.priority(), second.priority())
+    with pytest.raises(InputError, match="holds 6 scenes, the data 5"):
+        curriculum_of(5).load_state_dict(first.state_dict())
+    with pytest.raises(InputError, match="no scenes"):
+        curriculum_of(0)
+
+
+def test_episodes_count_for_the_attack_whose_row_they_drove():
+    """Attacks 0 and 2 of three entered D'; rows beyond them are nominal or remembered."""
+    eta, template = torch.tensor([1.0, 2.0, 2.0]), torch.tensor([SINGLE, PAIR, PAIR])
+    row, failed = torch.tensor([0, 0, 1, 2, 5, 1]), torch.tensor([True, False, True, True, True, True])
+    outcomes = outcomes_of(eta, template, torch.tensor([0, 2]), row, failed)
+    assert outcomes.left_out.tolist() == [False, True, False]
+    assert outcomes.episodes.tolist() == [2, 0, 2] and outcomes.failures.tolist() == [1, 0, 2]
+    assert outcomes.failure_rate.nan_to_num(-1).tolist() == [0.5, -1.0, 1.0]
+
+
+def test_the_table_counts_draws_episodes_and_failures_by_arm():
+    eta, template = torch.tensor([1.0, 2.0, 2.0]), torch.tensor([SINGLE, PAIR, PAIR])
+    flags = torch.tensor([False, True, False])
+    outcomes = Outcomes(eta, template, flags, torch.tensor([2, 0, 2]), torch.tensor([1, 0, 2]))
+    rows = tally(4, eta, outcomes, {(0.5, "full"): 0.2, (1.0, "single"): 0.1})
+    plain = [tuple(-1 if value != value else value for value in row.values()) for row in rows]
+    assert plain == [
+        (4, 1.0, "single", 1, 0, 2, 1, 0.5, 0.1),
+        (4, 2.0, "pair", 2, 1, 2, 2, 1.0, -1),
+        (4, 0.5, "full", 0, 0, 0, 0, -1, 0.2),
+    ]

@@ -1,0 +1,62 @@
+"""Concrete cut-ins on a straight road, all of a batch at once: does a driver survive them (docs/verdicts.md)."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from e2rl.metrics.drivers import Driver, Observation, no_conflict
+from e2rl.scenes.recording import DT
+
+LENGTH, WIDTH = 4.3, 1.9  # m, of both vehicles
+LATERAL_GAP = 1.6  # m between the sides of two vehicles in the middle of neighbouring lanes of 3.5 m
+LATERAL_ACCELERATION = 1.5  # m/s^2
+DURATION = 40.0  # s after the lateral speed has been reached
+NO_CRASH, SIDE, FRONT = range(3)  # SIDE: the ego's front has passed the other's front; FRONT: it has not
+
+
+class CutIn(NamedTuple):
+    """Concrete cut-ins, each field [B]; gap and the lateral gap of 1.6 m hold when the lateral speed is reached."""
+
+    speed: Tensor  # m/s, the ego's
+    other_speed: Tensor  # m/s
+    gap: Tensor  # m, bumper to bumper
+    lateral_speed: Tensor  # m/s
+
+
+def lateral_motion(cut_in: CutIn) -> tuple[Tensor, Tensor, int]:
+    """(lateral speed, gap between the sides) of the other, each [T, B], and the step at which the gap is 1.6 m.
+
+    Explicit Euler steps: the speed grows by 1.5 m/s^2, then is constant until the other is centred before the ego.
+    """
+    target = cut_in.lateral_speed
+    start = -int((target.max() / (LATERAL_ACCELERATION * DT)).ceil())
+    time = torch.arange(start, round(DURATION / DT), dtype=target.dtype, device=target.device)[:, None] * DT
+    speed = torch.minimum((target + LATERAL_ACCELERATION * time).clamp(min=0), target)
+    way = (speed * DT).cumsum(0) - speed * DT
+    gap = LATERAL_GAP + way[-start] - way
+    centred = gap <= -WIDTH
+    return speed.masked_fill(centred, 0), gap.clamp(min=-WIDTH), -start
+
+
+def simulate_cut_ins(driver: Driver, cut_in: CutIn) -> Tensor:
+    """Kind of crash [B]: NO_CRASH, SIDE or FRONT, with the driver in the ego. Both speeds are constant but for it.
+
+    Semi-implicit Euler steps of DT along the road: v' = max(v + a DT, 0), x' = x + v' DT.
+    """
+    lateral_speed, lateral_gap, start = lateral_motion(cut_in)
+    speed, other = cut_in.speed, cut_in.other_speed
+    gap = cut_in.gap + (speed - other) * start * DT
+    kind, length = torch.zeros_like(speed, dtype=torch.long), torch.full_like(speed, LENGTH)
+    still = torch.zeros_like(speed)
+    state, acceleration = no_conflict(speed), still
+    for lateral, side in zip(lateral_speed, lateral_gap, strict=True):
+        overlaps = side <= 0
+        hit = overlaps & (gap <= 0) & (gap >= -2 * LENGTH) & (kind == NO_CRASH)
+        kind = torch.where(hit, torch.where(gap < -LENGTH, SIDE, FRONT), kind)
+        seen = Observation(speed, acceleration, gap, other, still, side, lateral, overlaps, length, length)
+        state, wanted = driver.step(state, seen)
+        after = (speed + wanted * DT).clamp(min=0)
+        acceleration = (after - speed) / DT
+        speed, gap = after, gap + (other - after) * DT
+    return kind

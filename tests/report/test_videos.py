@@ -1,0 +1,112 @@
+"""Videos: the right failures, the contact where it is, animations that play, one line for bad input."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from e2rl.commands.replay import main
+from e2rl.metrics.score import score_rollouts
+from e2rl.report import drawing, picture
+from e2rl.report.drawing import TrafficMap, image_of, new_panels
+from e2rl.report.picture import Replay
+from e2rl.report.videos import found_failures, save_animation
+from tests.metrics.random_rollouts import random_rollouts
+from tests.metrics.test_contact import course, scene
+from tests.report.failed_run import write_run
+from tests.report.pixels import pixel_at, rgb
+
+CRASH = course(0, 0, 0, 12), course(30.5, 0, 0, 5)
+
+
+def replay_of(*courses, **options):
+    rollouts = scene(*courses, **options)
+    return Replay(rollouts.rollout(0), score_rollouts(rollouts)[0][0], pixels=200)
+
+
+def row(scene_id, eta=2.0, cfr=1.0, cfr_adv=1.0, kind="front"):
+    return {"scene_id": scene_id, "eta": eta, "cfr": cfr, "cfr_adv": cfr_adv, "contact_type": kind}
+
+
+def test_failures_are_distinct_found_and_of_different_kinds():
+    rows = [row("a", eta=0.0), row("b"), row("b", kind="rear"), row("c", cfr=0.0), row("d")]
+    rows += [row("e", kind="side", cfr_adv=0.0), row("f")]
+    assert [part["scene_id"] for part in found_failures(rows, 3)] == ["b", "e", "d"]
+    assert [part["scene_id"] for part in found_failures(rows, 9)] == ["b", "e", "d", "f", "a"]
+    assert found_failures([row("c", cfr=0.0), row("n", cfr=float("nan"))], 3) == []
+
+
+def test_the_command_saves_animations_and_strips_of_a_run_s_failures(tmp_path, capsys):
+    run = write_run(tmp_path / "run", {"e2": random_rollouts(6, seed=21)})
+    for option, count in (("--failures=1", 1), ("--modes", None)):
+        main([str(run), option, "--pixels", "120", "--out", str(tmp_path / option)])
+        gif, png = [line for line in capsys.readouterr().out.splitlines() if line.startswith("/")][:2]
+        with Image.open(gif) as animation:
+            assert animation.size == (120, 120) and animation.n_frames > picture.FREEZE and animation.info["loop"] == 0
+            assert animation.info["duration"] == 100
+        assert count is None or len(list((tmp_path / option).glob("*.gif"))) == count
+        assert "/e2__idm__2__" in gif and Image.open(png).width > 3 * Image.open(png).height
+
+
+def test_bad_input_is_one_line_and_exit_two(tmp_path, capsys):
+    (tmp_path / "text.npz").write_text("no archive")
+    for path in (tmp_path, tmp_path / "text.npz"):
+        with pytest.raises(SystemExit) as end:
+            main([str(path)])
+        assert end.value.code == 2 and capsys.readouterr().err.startswith(f"error: {path}")
+
+
+def test_a_palette_keeps_the_colours_that_mean_something(tmp_path):
+    frames = [Image.new("RGB", (50, 50), rgb(drawing.ROAD))] * 3
+    last = frames[0].copy()
+    last.putpixel((1, 1), rgb(drawing.ADVERSARY))
+    save_animation(tmp_path / "x.gif", [frames[0], last, *frames], 16, every=2)
+    with Image.open(tmp_path / "x.gif") as animation:
+        assert animation.info["duration"] == 200
+        assert np.abs(np.subtract(animation.convert("RGB").getpixel((9, 9)), rgb(drawing.ROAD))).max() < 12
+
+
+def test_frames_end_with_the_contact_held_and_marked():
+    shown = replay_of(*CRASH, adversaries=[1])
+    assert shown.contact == 37
+    frames = shown.frames()
+    slow = round(picture.SLOW / 0.1)
+    assert len(frames) == 37 - slow + 2 * slow + picture.FREEZE
+    middle = 0.5 * (37 * 1.2 + 2.4 + 30.5 + 37 * 0.5 - 2.4)
+    np.testing.assert_allclose(picture.contact_point(shown.rollout, 37, 1), [middle, 0], atol=0.3)
+    first = shown.picture(5).tobytes()
+    assert shown.picture(37, phase=0.5).tobytes() != first == shown.picture(5).tobytes()
+
+
+def test_a_rollout_without_contact_plays_to_its_end():
+    shown = replay_of(course(0, 0, 0, 5), course(0, 10, 0, 5))
+    assert shown.contact is None and len(shown.frames()) == 81 and image_of(shown.strip()).size[1] > 200
+
+
+def test_the_ego_is_blue_and_the_adversary_red_where_they_are():
+    shown = replay_of(course(0, 0, 0, 0), course(12, 0, 0, 0), course(-12, 0, 0, 0), adversaries=[1])
+    image = shown.picture(10)
+    for x, colour in ((0, drawing.EGO), (12, drawing.ADVERSARY), (-12, drawing.BACKGROUND)):
+        assert pixel_at(image, shown.panel.map.axes, np.array([x - 0.8, 0.0])) == rgb(colour)
+
+
+def test_y_is_up_and_the_centre_is_the_middle():
+    shown = replay_of(course(0, 0, 0, 0))
+    _, (axes,) = new_panels(1, 700, 0, 0)
+    TrafficMap(axes, shown.rollout, 70.0).show(np.array([10.0, 20.0]), [], [])
+    middle, above, right = axes.transData.transform([(10.0, 20.0), (10.0, 25.0), (15.0, 20.0)])
+    np.testing.assert_allclose([middle, above, right], [(350, 350), (350, 400), (400, 350)])
+
+
+def test_a_lane_beside_the_map_shows_as_far_as_it_is_wide():
+    shown = replay_of(course(0, 0, 0, 0))
+    figure, (axes,) = new_panels(1, 700, 0, 0)
+    TrafficMap(axes, shown.rollout, 70.0).show(np.array([0.0, 36.0]), [], [])  # a lane 4 m wide at y = 0, 1 m below
+    image = image_of(figure)
+    assert pixel_at(image, axes, np.array([0.0, 1.3])) == rgb(drawing.ROAD)
+    assert pixel_at(image, axes, np.array([0.0, 4.0])) == rgb(drawing.GROUND)
+
+
+def test_the_camera_glides_along_the_path_of_the_ego():
+    path = np.stack([np.linspace(0, 100, 81), np.zeros(81)], -1)
+    np.testing.assert_allclose(picture.camera_path(path), path, atol=1e-6)
+    assert picture.camera_path(path[:5]).shape == (5, 2)

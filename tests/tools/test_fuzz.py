@@ -1,0 +1,76 @@
+"""The fuzzer reads whole inputs, so that what it counts as refused is refused for the damage, and knows what is bad."""
+
+import pickle
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from e2rl.run.errors import InputError
+from tests.scenes.descriptions import description
+from tools import fuzz
+from tools.fuzz import Garbage, Readers, Watch, outcome, require_plain
+
+
+@pytest.fixture(scope="module")
+def watch(tmp_path_factory):
+    return Watch(tmp_path_factory.mktemp("watched"))
+
+
+def raises(error):
+    def read(content):
+        raise error
+
+    return read
+
+
+@pytest.mark.parametrize(
+    ("read", "expected"),
+    [
+        (lambda content: None, "read"),
+        (raises(InputError("x")), "refused"),
+        (raises(InputError("")), "escaped"),
+        (raises(KeyError("x")), "escaped"),
+        (raises(Garbage("x")), "garbage"),
+        (raises(MemoryError()), "memory"),
+        (raises(fuzz.Hang()), "hang"),
+        (lambda content: pickle.loads(pickle.dumps(len)), "executed"),
+    ],
+)
+def test_outcomes_are_what_happened(watch, tmp_path, read, expected):
+    assert outcome(read, b"", watch, tmp_path / "mark")[0] == expected
+
+
+def test_what_an_input_leaves_behind_counts_as_executed(watch, tmp_path):
+    (tmp_path / "mark").touch()
+    assert outcome(lambda content: None, b"", watch, tmp_path / "mark")[0] == "executed"
+    assert not (tmp_path / "mark").exists()
+
+
+def test_whole_inputs_are_read_and_hostile_ones_run_nothing(tmp_path, watch):
+    readers = Readers(tmp_path, None)
+    for name in ("pickles", "descriptions"):
+        _, read = getattr(readers, name)()
+        read(pickle.dumps(description()))
+    found = Counter()
+
+    @settings(max_examples=40, database=None, deadline=None)
+    @given(fuzz.hostile(str(readers.mark)))
+    def each(content):
+        found[outcome(readers.pickles()[1], content, watch, readers.mark)[0]] += 1
+
+    each()
+    assert found["refused"] > 20 and not set(found) - set(fuzz.GOOD)
+
+
+def test_what_no_reader_may_return_is_known():
+    require_plain({"a": [1, "x", np.zeros(3), (None, {2.0})]}, 1 << 10)
+    for bad in ({"a": object()}, [len], np.array([len], object), np.zeros(1000)):
+        with pytest.raises(Garbage):
+            require_plain(bad, 1 << 10)
+
+
+def test_a_table_counts_readers_and_all():
+    counts = Counter({("a", "read"): 2, ("a", "crash"): 1, ("b", "refused"): 3})
+    assert fuzz.table(counts)[-1] == "| all | 6 | 3 | 2 | 0 | 0 | 0 | 1 | 0 | 0 |"
