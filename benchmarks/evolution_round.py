@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator
 
 import torch
+from e2rl.scripts.train import train_round
 from measure import Bench, Row
 
 from e2rl.evaluation.methods import build_ego
@@ -16,17 +17,17 @@ def evolution_round(bench: Bench) -> Iterator[Row]:
     With synthesis beside learning it is the second of three rounds, which waits for what was begun during the first and
     learns while the third's D' is made.
     """
-    for ahead in (False, True):
+    for prefetch in (False, True):
         config = bench.configured("train")
-        config.learner.round.ahead = ahead
+        config.learner.round.prefetch = prefetch
         torch.manual_seed(0)
         run = build_evolution(config, bench.scenes, build_ego(config), bench.traffic)
-        if ahead:
-            run.run_round()
+        if prefetch:
+            train_round(run)
         begin = time.perf_counter()
-        metrics = run.run_round()
+        metrics = train_round(run)
         total = time.perf_counter() - begin
-        index, where = bench.pick(config.learner.round.scenes), ", ahead" if ahead else ""
+        index, where = bench.pick(config.learner.round.scenes), ", prefetch" if prefetch else ""
         yield bench.row("evolution_round", f"whole{where}", index, total, "s")
-        for part in ("synthesize", "improve", *(["waiting"] if ahead else [])):
+        for part in ("synthesize", "improve", *(["waiting"] if prefetch else [])):
             yield bench.row("evolution_round", f"{part}{where}", index, metrics[f"time/{part}"], "s")

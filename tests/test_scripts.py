@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from e2rl.evaluation.rollout_files import read_metrics
-from e2rl.learning.logging import read_choices
+from e2rl.report.curriculum_figure import read_choices
 from e2rl.traffic.traffic import TEMPLATES
 from tests.scripts import ROOT, arguments, call, error_line, left_behind
 
@@ -74,7 +74,7 @@ def test_unknown_keys_and_choices(world, tmp_path, monkeypatch, capsys, script, 
 @pytest.mark.parametrize(
     ("script", "overrides", "what"),
     [
-        ("train.py", ["stage=sleep"], "stage=sleep: choose one of"),
+        ("train.py", ["stage=sleep"], "stage=sleep: there is no such option"),
         ("evaluate.py", ["num_scenes=0"], "num_scenes=0"),
         ("evaluate.py", ["data._target_=e2rl.scenes.bundled.BundledSource", "data.split=best"], "split 'best'"),
         ("evaluate.py", ["data._target_=no.such.Source"], "data=no.such.Source: cannot be built: "),

@@ -78,7 +78,7 @@ def test_torchrl_calls_the_hooks_of_a_transform_in_their_order():
 
 @pytest.mark.parametrize("name", ["_is_avx512_bf16_supported", "_is_amx_tile_supported"])
 def test_torch_says_whether_the_processor_has_bf16(name):
-    """e2rl/learning/prior_training/optimisation.py asks it where prior.training.bf16 is null."""
+    """e2rl/learning/prior_training/training.py asks it where stage.bf16 is null."""
     assert isinstance(getattr(torch.cpu, name)(), bool), f"torch {torch.__version__} has no torch.cpu.{name}"
 
 

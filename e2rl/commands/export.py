@@ -1,10 +1,11 @@
-"""`python -m e2rl.report.export RUN --to FORMAT`: failures of a run in the format of another tool (docs/export.md)."""
+"""`e2rl export RUN_DIR --to FORMAT`: failures of a run in the format of another tool (docs/export.md)."""
 
 import argparse
 import csv
 import io
 from collections.abc import Sequence
 from difflib import get_close_matches
+from importlib import import_module
 from pathlib import Path
 
 from tqdm import tqdm
@@ -29,15 +30,27 @@ FORMATS = {
 }
 OPEN_EGO = ("commonroad", "openscenario")  # formats in which the ego's place may be left open
 LIST = "exported.csv"
+LIBRARIES = {  # modules that a format needs, from the extra of its name
+    "commonroad": ("commonroad.common.writer.file_writer_xml",),
+    "openscenario": ("scenariogeneration",),
+    "mcap": ("mcap.writer", "mcap_protobuf.schema", "foxglove_schemas_protobuf.SceneUpdate_pb2"),
+}
 
 
 def check_format(name: str, open_ego: bool) -> None:
-    """InputError for a format that there is not, and for an open ego in a format without one."""
+    """InputError for a format that there is not or whose library is missing, and for an open ego in a format without
+    one."""
     if name not in FORMATS:
         near = get_close_matches(name, FORMATS, 1, 0.0)[0]
         raise InputError(f"--to {name}: no such format; did you mean {near}? There are {', '.join(FORMATS)}")
     if open_ego and name not in OPEN_EGO:
         raise InputError(f"--open-ego: {name} has no such form; leave it out, or pass --to {' or '.join(OPEN_EGO)}")
+    for module in LIBRARIES.get(name, ()):
+        try:
+            import_module(module)
+        except ImportError as error:
+            reason = f"{module} cannot be imported ({error}); install e2rl with its extra: pip install 'e2rl[{name}]'"
+            raise InputError(f"--to {name}: {reason}") from error
 
 
 def chosen_rows(run: Path, failures: int | None, every: bool, method: str | None) -> list[dict]:
@@ -89,7 +102,7 @@ def listed(episode: Episode, path: Path) -> dict[str, object]:
 
 
 def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m e2rl.report.export", description=__doc__)
+    parser = argparse.ArgumentParser(prog="e2rl export", description=__doc__)
     parser.add_argument("run", type=Path, metavar="RUN_DIR", help="folder of a run of evaluate.py")
     parser.add_argument("--to", required=True, metavar="FORMAT", help=", ".join(FORMATS))
     parser.add_argument("--failures", type=int, metavar="N", help="at most so many failures (default: all)")

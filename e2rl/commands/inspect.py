@@ -1,6 +1,6 @@
 """What a data set holds: its scenes, agents and maps, what is left out and why; and a picture of a scene.
 
-`python -m e2rl.commands.inspect PATH` finds out which data group reads the files at PATH; `--data` names it.
+`e2rl inspect PATH` finds out which data group reads the files at PATH; `--data` names it.
 `--apart OTHER` also checks that no scene at PATH is at a place of the logs at OTHER, as a split needs it.
 """
 
@@ -169,7 +169,7 @@ def check_apart(rows: Sequence[Row], source: Source, other: Source) -> str:
 
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m e2rl.commands.inspect", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="e2rl inspect", description=__doc__.splitlines()[0])
     parser.add_argument("path", type=Path, metavar="PATH", help="folder or zip of logs")
     parser.add_argument("--data", metavar="NAME", help="file of conf/data that reads them (default: the one that can)")
     parser.add_argument("--scene", metavar="ID", help="the scene that is drawn (default: the first)")

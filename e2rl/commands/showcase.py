@@ -1,4 +1,4 @@
-"""`python -m e2rl.commands.showcase`: the three moving pictures of the README, from a bundled scene and bundled weights.
+"""`python -m e2rl.commands.showcase`: the moving pictures of the README, from a bundled scene and weights.
 
 The same scene and seed: nominal traffic around the untrained actor; the same actor attacked by e2; the trained actor,
 which e2 attacks anew.
@@ -7,9 +7,9 @@ which e2 attacks anew.
 import argparse
 from pathlib import Path
 
+from e2rl.api import load_prior, load_scenes, make_ego, make_traffic
 from e2rl.evaluation.methods import build_sim
 from e2rl.evaluation.protocol import Method, Setup
-from e2rl.api import load_prior, load_scenes, make_ego, make_traffic
 from e2rl.metrics.score import score_rollouts
 from e2rl.report.picture import Replay
 from e2rl.report.videos import save_animation
@@ -40,7 +40,8 @@ def main(arguments: list[str] | None = None) -> None:
             row = score_rollouts(rollouts)[0][0]
             frames = Replay(rollouts.rollout(0), row, METRES, PIXELS, caption=caption).frames()
             save_animation(options.out / f"{name}.gif", frames, COLOURS)
-            print(f"{options.out / name}.gif: {'hit' if row['cfr'] else 'no collision'}, {row['progress']:.0f} m driven")
+            outcome = "hit" if row["cfr"] else "no collision"
+            print(f"{options.out / name}.gif: {outcome}, {row['progress']:.0f} m driven")
 
 
 if __name__ == "__main__":

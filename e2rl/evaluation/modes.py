@@ -24,7 +24,7 @@ from e2rl.sim.rollout_file import rollout_name
 
 MODES_FILE = "modes.json"
 OTHER = 0  # number of the small modes together
-VERDICTS = ("counted", "preventable", "at_fault", "avoidable")  # shares of a mode's failures
+VERDICTS = ("counted", "preventable", "at_fault", "avoidable")  # fractions of a mode's failures
 MEANS = ("ego_speed", "partner_speed", "relvel")  # m/s
 TYPICAL = ("method", "eta", "scene_id", "seed")
 NUMBER = (int, float)
@@ -85,8 +85,8 @@ def group_key(row: Row) -> tuple:
 
 
 def describe(mode: int, members: Sequence[Row], groups: Sequence[dict]) -> dict:
-    """A mode of modes.json: its number, name, failures, their share of each group's, verdicts, mean speeds [m/s], and
-    its most typical rollout. Shares and means are over the members that know the value, None without any."""
+    """A mode of modes.json: its number, name, failures, their fraction of each group's, verdicts, mean speeds [m/s], and
+    its most typical rollout. Fractions and means are over the members that know the value, None without any."""
     keys = [group_key(row) for row in members]
     by_group = [keys.count(tuple(group[name] for name in GROUP)) for group in groups]
     total = sum(group["failures"] for group in groups)

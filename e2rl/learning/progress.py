@@ -29,16 +29,13 @@ class Progress:
     def left(self) -> str:
         """Returns the time left in words: "about 12 min left", "done"."""
         done = {kind: len(seconds) for kind, seconds in self._spent.items()}
-        expected = dict(self._phases)
-        spent = sum(map(sum, self._spent.values()))
-        slower = spent / sum(count * expected[kind] for kind, count in done.items()) if spent else 1.0
         seconds = 0.0
         for kind, guess in self._phases:
             if done.get(kind, 0) > 0:
                 done[kind] -= 1
                 continue
             known = self._spent[kind]
-            seconds += sum(known) / len(known) if known else guess * slower
+            seconds += sum(known) / len(known) if known else guess
         return f"about {duration(seconds)} left" if seconds else "done"
 
     def say(self, text: str) -> None:

@@ -161,7 +161,7 @@ def contact_columns(batch: Batch) -> Batch:
     events=("moving_vehicles", "start_overlap_bg"),
 )
 def traffic_contact_columns(batch: Batch) -> Batch:
-    """Pairs of `traffic` vehicles that overlap at a step 1..stop, and the share of moving vehicles among them.
+    """Pairs of `traffic` vehicles that overlap at a step 1..stop, and the fraction of moving vehicles among them.
 
     Pairs that overlap at step 0 already are counted apart and left out of the rest.
     """
@@ -195,10 +195,10 @@ def nearby(states: Tensor, size: Tensor, one: Tensor, two: Tensor, present: Tens
 
 
 def touched_columns(batch: Batch, touched: Tensor) -> Batch:
-    """Share of the traffic's vehicles that move, in the rollout or its log, that are touched [B, N] by another one."""
+    """Fraction of the traffic that moves, in the rollout or its log, that is touched [B, N] by another vehicle."""
     pairs = (("states", "valid"), ("logged", "logged_valid"))
     fastest = [(batch[track][..., 3] * batch[valid]).amax(1) for track, valid in pairs]
     moving = batch["traffic"] & (torch.maximum(*fastest) > MOVING)
     number = moving.sum(-1)
-    share = (touched & moving).sum(-1).to(batch["states"].dtype) / number  # 0 / 0 is NaN
-    return {"touched": share, "moving_vehicles": number}
+    fraction = (touched & moving).sum(-1).to(batch["states"].dtype) / number  # 0 / 0 is NaN
+    return {"touched": fraction, "moving_vehicles": number}

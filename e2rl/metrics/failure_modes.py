@@ -23,8 +23,8 @@ from e2rl.metrics.catalogue import Metric, declare
 Row = Mapping[str, Any]
 THRESHOLD = 1.0  # mean distance of two groups of failures up to which they are one mode
 SPEED_WEIGHT = 0.025  # of a difference of 1 m/s
-AGREED = 2 / 3  # share of a mode's failures that a word of its name is true of
-LEAST, MANY = 0.02, 10  # share of the failures that a mode has at least, and two of them where there are MANY failures
+AGREED = 2 / 3  # fraction of a mode's failures that a word of its name is true of
+LEAST, MANY = 0.02, 10  # fraction of the failures that a mode has at least, and two where there are MANY failures
 SIDE = re.compile(r"(?: from the| on the)? (left|right)$")
 SPEEDS = ("ego_speed", "partner_speed")
 PLACES = 10  # at which `mode_coverage` looks: failures at fewer places give none

@@ -62,8 +62,8 @@ def _edges_in_frame(
     box: Tensor, size: Tensor, other: Tensor, other_size: Tensor, zero: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Start and change [..., 4, 2] of the box's edges in the frame of the other box, that box's half size [..., 1, 2],
-    and the shares [2, ..., 4, 2] of each edge at which its x and y enter and leave the other box; a change of 0 counts
-    as `zero` in them."""
+    and the fractions [2, ..., 4, 2] of each edge at which its x and y enter and leave that box; a change of 0 counts as
+    `zero` in them."""
     start = to_frame(corners(box, size), other[..., None, :])
     change = start.roll(-1, -2) - start
     half = (other_size / 2)[..., None, :]
@@ -80,8 +80,8 @@ def edge_distances(box: Tensor, size: Tensor, point: Tensor) -> Tensor:
 def from_segment(point: Tensor, start: Tensor, along: Tensor) -> Tensor:
     """Vector [..., 2] [m] to a point from the nearest point of the segment from `start` to `start + along`."""
     offset = point - start
-    share = ((offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-18)).clamp(0, 1)
-    return offset - share[..., None] * along
+    fraction = ((offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-18)).clamp(0, 1)
+    return offset - fraction[..., None] * along
 
 
 def ragged(counts: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,7 +2,7 @@
 
 Each vehicle has a histogram of every feature over all its rollouts and steps (steps taken as independent). With it,
 likelihood = exp(mean log p(logged value)) over a scene's vehicles and known steps. Indications (collision, off the
-road, red light) happen to a vehicle in a rollout or not: their p is Bernoulli, the share of rollouts. Every bin has
+road, red light) happen to a vehicle in a rollout or not: their p is Bernoulli, the fraction of rollouts. Every bin has
 additive smoothing SMOOTHING. The meta-metric is the weighted sum of the likelihoods, in (0, 1].
 
 Features of the realism meta-metric per vehicle and step: motion, nearest agent, time to collision, road and lights.

@@ -56,12 +56,12 @@ def poses(states: Tensor, s: Tensor) -> Tensor:
     length = driven_length(states)
     after = torch.searchsorted(length, s.contiguous(), right=True).clamp(1, length.shape[1] - 1)
     low, high = length.gather(1, after - 1), length.gather(1, after)
-    share = ((s - low) / (high - low).clamp(min=1e-6)).clamp(0, 1)[..., None]
+    fraction = ((s - low) / (high - low).clamp(min=1e-6)).clamp(0, 1)[..., None]
     first, second = (states.gather(1, index[..., None].expand(-1, -1, 4)) for index in (after - 1, after))
-    heading = first[..., 2] + share[..., 0] * wrap(second[..., 2] - first[..., 2])
+    heading = first[..., 2] + fraction[..., 0] * wrap(second[..., 2] - first[..., 2])
     beyond = (s - length[:, -1:]).clamp(min=0)[..., None]
     ahead = torch.stack([heading.cos(), heading.sin()], -1)
-    return torch.cat([torch.lerp(first[..., :2], second[..., :2], share) + beyond * ahead, heading[..., None]], -1)
+    return torch.cat([torch.lerp(first[..., :2], second[..., :2], fraction) + beyond * ahead, heading[..., None]], -1)
 
 
 def along_way(states: Tensor, width: Tensor, others: Tracks) -> Along:

@@ -1,4 +1,4 @@
-"""The ego's distance to others, acceleration, progress and share of the recorded way until its first contact
+"""The ego's distance to others, acceleration, progress and fraction of the recorded way until its first contact
 (docs/method.md, section 10).
 
 Vehicles that stand at the start: parked ones should stay, some of those on a lane should start.
@@ -15,7 +15,7 @@ from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
 
 SMOOTHING = 0.5  # s, moving average of the ego's speed before its derivative
-LEAST_WAY = 1.0  # m: of a shorter recorded way no share is known
+LEAST_WAY = 1.0  # m: of a shorter recorded way no fraction is known
 
 
 @columns(
@@ -106,7 +106,7 @@ def progress(path: Tensor, count: Tensor) -> Tensor:
 
 
 def route_completion(path: Tensor, count: Tensor, logged: Tensor, logged_valid: Tensor) -> Tensor:
-    """Share [B] in [0, 1] of the recorded ego's way that lies behind the ego at the end of its path.
+    """Fraction [B] in [0, 1] of the recorded ego's way that lies behind the ego at the end of its path.
 
     path [B, T+1, 4] of `count` [B] states; logged [B, T+1, N, 4], logged_valid [B, T+1, N]: the recording. The end is
     projected onto the nearest piece of the recorded way, as MetaDrive does. NaN where the ego is in no step, or where
@@ -119,11 +119,11 @@ def route_completion(path: Tensor, count: Tensor, logged: Tensor, logged_valid: 
     length = along.norm(dim=-1) * piece
     row = torch.arange(len(path), device=path.device)
     offset = path[row, (count - 1).clamp(min=0), None, :2] - start
-    share = ((offset * along).sum(-1) / length.square().clamp(min=1e-12)).clamp(0, 1)
-    gap = (offset - share[..., None] * along).norm(dim=-1).masked_fill(~piece, torch.inf)
+    fraction = ((offset * along).sum(-1) / length.square().clamp(min=1e-12)).clamp(0, 1)
+    gap = (offset - fraction[..., None] * along).norm(dim=-1).masked_fill(~piece, torch.inf)
     nearest = gap.argmin(-1)
     whole = length.sum(-1)
-    behind = length.cumsum(-1)[row, nearest] - ((1 - share) * length)[row, nearest]
+    behind = length.cumsum(-1)[row, nearest] - ((1 - fraction) * length)[row, nearest]
     return (behind / whole).clamp(max=1).masked_fill((count == 0) | (whole < LEAST_WAY), torch.nan)
 
 
@@ -151,7 +151,7 @@ def moved(states: Tensor, valid: Tensor) -> Tensor:
 def standing_columns(batch: Batch) -> Batch:
     """parked_moved, starters and what they rest on, each [B], of `traffic` vehicles recorded throughout.
 
-    parked_moved: share of the parked_vehicles that move. starters: vehicles slower than STANDING at the start, not
+    parked_moved: fraction of the parked_vehicles that move. starters: vehicles slower than STANDING at the start, not
     parked, that move; starters_log: those that move in the log. Unlike safety metrics these look at the whole rollout.
     Nothing is known without `parked`, which rollouts read from files lack.
     """

@@ -156,14 +156,14 @@ def split_half(samples: list[Samples], cluster: Tensor, halves: Tensor) -> Tenso
         owner = cluster.repeat_interleave(torch.tensor([sample[name].shape[1] for sample in samples]))
         values, order = log.sort()
         first = halves[:, owner[order]].to(log)
-        share = [side.cumsum(1) / side.sum(1, keepdim=True) for side in (first, 1 - first)]
+        fraction = [side.cumsum(1) / side.sum(1, keepdim=True) for side in (first, 1 - first)]
         known = (first > 0).any(1) & (first < 1).any(1)
-        distances.append(((share[0] - share[1]).abs()[:, :-1] @ values.diff()).where(known, torch.nan))
+        distances.append(((fraction[0] - fraction[1]).abs()[:, :-1] @ values.diff()).where(known, torch.nan))
     return 1 - torch.stack(distances).clamp(max=1).mean(0)
 
 
-def quantile_of_sorted(values: Tensor, share: float) -> Tensor:
+def quantile_of_sorted(values: Tensor, fraction: float) -> Tensor:
     """Linear quantile of sorted values [n]; torch.quantile refuses more than 16 million of them."""
-    position = share * (len(values) - 1)
+    position = fraction * (len(values) - 1)
     low = int(position)
     return torch.lerp(values[low], values[min(low + 1, len(values) - 1)], position - low)

@@ -182,13 +182,10 @@ class Bootstrap:
         event; from the results of `metric_table`."""
         found = set()
         for metric, total, weight in zip(row_metrics(), totals.T, weights.T, strict=True):
-            known = weight > 0
-            if metric.per and not metric.fraction:
-                few = self.places(known & (total > 0)) < LEAST
-            else:
-                few = min(self.places(known & side) for side in (total > 0, total < weight)) < LEAST
-                few = few and metric.fraction and not metric.per
-            if few:
+            if bool(metric.per) == metric.fraction:
+                continue
+            sides = (total > 0,) if metric.per else (total > 0, total < weight)
+            if min(self.places((weight > 0) & side) for side in sides) < LEAST:
                 found.add(metric.name)
         return found
 

@@ -86,7 +86,7 @@ class ExternalEgo(Ego):
         if bool(((step > 0) & (step <= self._asked)).any()):
             raise InputError(
                 "ego=external: asked about a moment that is not the next one of its scene; it drives in closed loop "
-                "only, and traffic cannot look ahead with it (synthesizer.control.lookahead=0)"
+                "only, and traffic cannot query it (synthesizer=strive and cat need synthesizer.knowledge=predicted)"
             )
         self._asked = step.clone()
         return (step == 0).nonzero()[:, 0].tolist()

@@ -84,8 +84,8 @@ def compared_answer(
     if pairs:
         old, new = max(pairs, key=lambda pair: pair[1]["eta"])
         lines += wrapped(
-            f"After training, {new['ego']} was hit in {of(new, 'cfr')} rollouts {traffic(new)} ({share(new, 'cfr')}); "
-            f"before it in {of(old, 'cfr')} ({share(old, 'cfr')}).",
+            f"After training, {new['ego']} was hit in {of(new, 'cfr')} rollouts {traffic(new)} ({rate(new, 'cfr')}); "
+            f"before it in {of(old, 'cfr')} ({rate(old, 'cfr')}).",
             width,
         )
     kinds = {"hit": "cfr", "count": "cfr_counted", "count per 1,000 km": "counted_per_km", "progress [m]": "progress"}
@@ -107,7 +107,7 @@ def compared_answer(
 def told(row: dict, nominal: dict | None, width: int) -> list[str]:
     """Sentences about one row of metrics.json, beside the nominal traffic where that was driven."""
     kind = "attacked " if row["eta"] else ""
-    text = f"{row['ego']} was hit in {of(row, 'cfr')} {kind}rollouts ({share(row, 'cfr')})"
+    text = f"{row['ego']} was hit in {of(row, 'cfr')} {kind}rollouts ({rate(row, 'cfr')})"
     sentences = [f"{text}, {of(nominal, 'cfr')} nominal." if nominal else f"{text}.", verdict(row), rates(row, nominal)]
     sentences += [effect(row, nominal), cost(row, nominal)] if nominal else []
     return [line for sentence in sentences for line in wrapped(sentence, width, "  ")]
@@ -270,7 +270,7 @@ def closed_loop(rows: Sequence[dict]) -> list[dict]:
 
 
 def tally(row: dict, name: str) -> int:
-    """How many rollouts a share stands for."""
+    """How many rollouts a rate stands for."""
     found = row["metrics"].get(name) or {"mean": math.nan, "n": 0}
     return 0 if math.isnan(found["mean"]) else round(found["mean"] * found["n"])
 
@@ -281,7 +281,7 @@ def of(row: dict, name: str) -> str:
     return f"{tally(row, name)} of {found['n']}" if found and found["n"] else UNKNOWN
 
 
-def share(row: dict, name: str) -> str:
+def rate(row: dict, name: str) -> str:
     """Such as `25%, 95% interval 9 to 53%`."""
     found = row["metrics"][name]
     if math.isnan(found["low"]):
@@ -290,7 +290,7 @@ def share(row: dict, name: str) -> str:
 
 
 def cell(row: dict, name: str) -> str:
-    """Such as `25% (3 of 12)` for a share of rollouts, a rate per 1,000 km, or the mean of another metric."""
+    """Such as `25% (3 of 12)` for a rate of rollouts, a number per 1,000 km, or the mean of another metric."""
     if METRICS[name].fraction:
         return UNKNOWN if of(row, name) == UNKNOWN else f"{per_cent(row['metrics'][name]['mean'])} ({of(row, name)})"
     return per_thousand(row, name) if METRICS[name].per else value(row, name)

@@ -74,21 +74,20 @@ def _label(axes: Axes, rounds: Sequence[int], arms: Sequence[tuple[str, float]])
 
 
 def read_choices(path: Path) -> list[Choice]:
-    """The rows of a curriculum.csv, with a number in each of NUMBERS; InputError for a file that is no such table."""
+    """The rows of a curriculum.csv, all but the template numbers; InputError for a file that is no such table."""
     try:
         with path.open(newline="") as file:
             rows = list(csv.DictReader(file, strict=True))
-        return [
-            row | {name: float(row[name]) for name in NUMBERS} | {"template": _known(row["template"])} for row in rows
-        ]
+        return [_typed(row) for row in rows]
     except (KeyError, ValueError, TypeError, csv.Error) as error:
         raise InputError(f"{path}: no table of a curriculum's choices ({error}); remove it") from None
 
 
-def _known(template: str) -> str:
-    if template not in TEMPLATES:
-        raise ValueError(f"template {template}")
-    return template
+def _typed(row: Mapping[str, str]) -> Choice:
+    if row["template"] not in TEMPLATES:
+        raise ValueError(f"template {row['template']}")
+    numbers = {name: float(value or "nan") for name, value in row.items() if name != "template"}
+    return {name: numbers[name] for name in NUMBERS} | numbers | {"template": row["template"]}
 
 
 def draw_choices(folder: Path) -> Path | None:

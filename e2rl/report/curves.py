@@ -1,7 +1,7 @@
 """Failures against realism and against verdicts over the gain of each adversary, as CSV and as a picture.
 
 The strength of an attack is its gain times eta. So its curve is a run of several intensities (`evaluate.py
-experiment=curves`), or the ladder of its tuning (`e2rl tune`). `python -m e2rl.report.curves RUN_DIR...` draws
+experiment=curves`), or the sweep of its tuning (`e2rl tune`). `e2rl curves RUN_DIR...` draws
 runs of either kind together.
 """
 
@@ -37,40 +37,40 @@ PANELS = (  # (horizontal, vertical): failures over realism, then the share of t
 COLUMNS = ("cfr", "cfr_counted", "cfr_preventable", "real", "real_adv", "aor_step", "cfr_bg", "nfe")
 OURS, NOMINAL = "e2", "nominal"
 APART = (0, 1, 2, 4, 5, 6, 7, 8, 9)  # colours of the cycle for the others: its red is too near to ours
-KEPT_ETA = 2.0  # intensity of the tables
+TABLES_ETA = 2.0  # intensity of the tables
 SIDE, RISE = 380, 330  # points: width and height of a panel
 NAME = "curves"
 
 
 class Point(NamedTuple):
     """Rollouts of a method at one value of its dial; metrics: {name: {mean, low, high}} of some of COLUMNS, NaN where
-    unknown; on_curve: nothing but the dial differs from the other points on the curve; kept: the setting of the tables.
+    unknown; on_curve: nothing but the dial differs from the other points on the curve; chosen: the setting of the tables.
     """
 
     method: str
     dial: str
     value: float
     on_curve: bool
-    kept: bool
+    chosen: bool
     metrics: Mapping[str, Mapping[str, float]]
 
 
 def points_of_rows(rows: Sequence[dict]) -> list[Point]:
     """The points of the closed-loop rows of metrics.json; the dial is eta, 0 for traffic without an adversary."""
     return [
-        Point(row["method"], "eta", row["eta"], True, row["eta"] in (0, KEPT_ETA), row["metrics"])
+        Point(row["method"], "eta", row["eta"], True, row["eta"] in (0, TABLES_ETA), row["metrics"])
         for row in closed_loop(rows)
     ]
 
 
 def points_of_tuning(result: Mapping, method: str) -> list[Point]:
-    """The points of tuning.json: those on the ladder, the best trial, and the nominal traffic beside them."""
+    """The points of tuning.json: those on the sweep, the best trial, and the nominal traffic beside them."""
     trials, best = result["trials"], result["best"]
     curve, dial = on_curve(trials), next(iter(trials[0]["parameters"]))
-    kept = [trial for trial in trials if trial["parameters"] == best][:1]
+    best_ones = [trial for trial in trials if trial["parameters"] == best][:1]
     points = [
-        Point(method, dial, gain_of(trial), trial in curve, trial in kept, intervals(trial["metrics"]))
-        for trial in [*curve, *(trial for trial in kept if trial not in curve)]
+        Point(method, dial, gain_of(trial), trial in curve, trial in best_ones, intervals(trial["metrics"]))
+        for trial in [*curve, *(trial for trial in best_ones if trial not in curve)]
     ]
     nominal = {name: trials[0]["metrics"].get(f"{name} {NOMINAL}", math.nan) for name in COLUMNS}
     return [*points, Point(NOMINAL, dial, 0.0, True, True, intervals(nominal))]
@@ -105,7 +105,7 @@ def curves_csv(points: Sequence[Point]) -> str:
     writer = csv.writer(buffer, lineterminator="\n")
     ends = ("mean", "low", "high")
     names = [name if end == "mean" else f"{name}_{end}" for name in COLUMNS for end in ends]
-    writer.writerow(["method", "dial", "value", "on_curve", "kept", *names])
+    writer.writerow(["method", "dial", "value", "on_curve", "chosen", *names])
     for points_of in by_method(points).values():
         for point in points_of:
             found = [point.metrics.get(name, {}).get(end, math.nan) for name in COLUMNS for end in ends]
@@ -123,7 +123,7 @@ def by_method(points: Sequence[Point]) -> dict[str, list[Point]]:
 
 
 def curves_figure(points: Sequence[Point]) -> Figure:
-    """PANELS, with a line a method: dots grow with the gain, the kept setting is filled and has its intervals."""
+    """PANELS, with a line a method: dots grow with the gain, the chosen setting is filled and has its intervals."""
     figure, panels = plain_figure(SIDE * len(PANELS[0]), RISE * len(PANELS), len(PANELS[0]), len(PANELS))
     methods = by_method(points)
     for axes, (across, up) in zip(panels, (pair for row in PANELS for pair in row), strict=True):
@@ -155,9 +155,9 @@ def draw_curve(axes: Axes, points: Sequence[Point], across: str, up: str, colour
     places = [[at(point, name) for point in line] for name in (across, up)]
     axes.plot(*places, color=colour, linewidth=1.8 if points[0].method == OURS else 1, label=points[0].method)
     for rank, point in enumerate(points):
-        x, y, face = at(point, across), at(point, up), colour if point.kept else drawing.PANEL
+        x, y, face = at(point, across), at(point, up), colour if point.chosen else drawing.PANEL
         axes.plot(x, y, "o", markersize=3 + 5 * (rank + 1) / len(points), color=colour, markerfacecolor=face, zorder=3)
-        if point.kept:
+        if point.chosen:
             axes.vlines(x, at(point, up, "low"), at(point, up, "high"), color=colour, linewidth=0.7, alpha=0.6)
             axes.hlines(y, at(point, across, "low"), at(point, across, "high"), color=colour, linewidth=0.7, alpha=0.6)
 
@@ -172,7 +172,7 @@ def save_curves(folder: Path, points: Sequence[Point]) -> list[Path]:
 
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m e2rl.report.curves", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="e2rl curves", description=__doc__.splitlines()[0])
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN_DIR", help="of experiment=curves or of e2rl tune")
     parser.add_argument("--out", type=Path, default=Path(), help="folder to write to (default: the current one)")
     options = parser.parse_args(arguments)

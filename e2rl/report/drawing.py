@@ -84,10 +84,10 @@ class TrafficMap:
         self.axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         parts, colours, widths = [], [], []
         for path, colour, width in trails:
-            share = np.arange(1, len(path)) / len(path)
+            fade = np.arange(1, len(path)) / len(path)
             parts += list(np.stack([path[:-1], path[1:]], 1))
-            colours += [(colour, 0.15 + 0.6 * part) for part in share]
-            widths += list(width * self.scale * (0.4 + 0.6 * share))
+            colours += [(colour, 0.15 + 0.6 * part) for part in fade]
+            widths += list(width * self.scale * (0.4 + 0.6 * fade))
         self.trails.set(segments=parts, color=colours, linewidths=widths)
         self.shapes.set(
             verts=[shape.polygon for shape in shapes],

@@ -49,5 +49,5 @@ def mode_table(found: Mapping, ego: str, several: bool) -> Table:
     return Table(text + (f" Not computable here: {', '.join(absent)}." if absent else ""), head, rows)
 
 
-def percent(share: float | None) -> str:
-    return UNKNOWN if share is None else f"{100 * share:.0f}"
+def percent(fraction: float | None) -> str:
+    return UNKNOWN if fraction is None else f"{100 * fraction:.0f}"

@@ -87,8 +87,8 @@ class SkeletonPicture:
         """The three panels beside each other, under their titles."""
         (figure, axes), rollout = new_panels(3, SIDE, GAP, HEAD, FOOT), self.rollout
         title = (
-            f"{shorten(rollout['scene_id'])}   seed {rollout['seed']}   intensity {rollout['eta']:g}   "
-            f"{rollout['method']} vs {rollout['ego_policy']}   chosen at {self.step * rollout['dt']:.1f} s"
+            f"{shorten(rollout.scene_id)}   seed {rollout.seed}   intensity {rollout.eta:g}   "
+            f"{rollout.method} vs {rollout.ego_policy}   chosen at {self.step * rollout.dt:.1f} s"
         )
         figure.suptitle(title, x=0.004, y=0.985, ha="left", fontsize=15, color=drawing.INK)
         gap, longest = f"{self.settings.clearance:g} m", f"{self.ttc(self.settings.edge_threshold):.1f} s"
@@ -179,10 +179,10 @@ def name(agent: int) -> str:
 @dataclass
 class LongestChain:
     """Keeps a method's selection with the longest chain; ties go to the largest coalition, then to the greatest risk
-    between its members, then to the first. `kept`: that selection, B = 1."""
+    between its members, then to the first. `longest`: that selection, B = 1."""
 
     method: Method
-    kept: Selection | None = None
+    longest: Selection | None = None
     rank: tuple[float, ...] = (0, 0, 0)
 
     def __post_init__(self) -> None:
@@ -193,20 +193,20 @@ class LongestChain:
         ranks = torch.stack([depth.double(), size.double(), link_risk(selection).amax(1).double()], 1)
         for row, rank in enumerate(map(tuple, ranks.tolist())):
             if rank > self.rank:
-                self.kept, self.rank = take_rows(selection, torch.tensor([row])), rank
+                self.longest, self.rank = take_rows(selection, torch.tensor([row])), rank
 
     @property
     def selection(self) -> Selection:
-        """The kept selection; InputError if no adversary was chosen."""
-        if self.kept is None:
+        """The longest selection; InputError if no adversary was chosen."""
+        if self.longest is None:
             raise InputError(
                 f"figure=skeleton: {self.method.name} at eta={self.method.eta:g} chose no adversary in any scene; name "
                 "e2 first in methods, at an eta above 0, and evaluate more scenes, or name one with scene="
             )
-        return self.kept
+        return self.longest
 
     def rollout(self, scenes: SceneSet, ego_name: str, folder: Path) -> Rollout:
-        """The rollout of the kept selection, from its file; InputError if no adversary was chosen."""
+        """The rollout of the longest selection, from its file; InputError if no adversary was chosen."""
         seed, scene = divmod(int(self.selection.seed), SEEDS_APART)
         identity = {"method": self.method.name, "ego_policy": ego_name, "eta": self.method.eta}
         name = rollout_name(identity | {"scene_id": scenes.scene_id[scene], "seed": seed})

@@ -42,12 +42,11 @@ class SceneMap:
     parked_size: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
     def recording(
-        self, dataset: str, scene_id: str, first: int, states: np.ndarray, valid: np.ndarray, size: np.ndarray, ego: int
+        self, scene_id: str, first: int, states: np.ndarray, valid: np.ndarray, size: np.ndarray, ego: int
     ) -> Recording:
-        """A recording of vehicles on this map, whose first frame is frame `first` of the lights."""
+        """Returns a recording of vehicles on this map, whose first frame is frame `first` of the lights."""
         lights = {lane: state[first : first + len(states)] for lane, state in self.lights.items()}
-        kind = np.full(len(size), VEHICLE)
-        where = (scene_id, self.name, dataset)
+        where, kind = (scene_id, self.name, "bundled"), np.full(len(size), VEHICLE)
         return Recording(*where, states, valid, size, kind, ego, self.lanes, self.drivable, lights, CURRENT)
 
 
@@ -70,7 +69,7 @@ class BundledSource(Source):
 
 
 def asset_bytes(split: str) -> bytes:
-    """The archive of a split; raises InputError where the split is unknown or its file is missing."""
+    """Returns the archive of a split; raises InputError where the split is unknown or its file is missing."""
     if split not in SPLITS:
         raise InputError(f"split {split!r} of the bundled scenes: expected one of {', '.join(SPLITS)}")
     path = files("e2rl") / "assets" / "scenes" / f"{split}.npz"
@@ -80,7 +79,7 @@ def asset_bytes(split: str) -> bytes:
 
 
 def unpack(content: bytes, name: str) -> dict[str, np.ndarray]:
-    """Arrays of an archive's bytes; raises InputError where they are damaged or of another format."""
+    """Returns the arrays of an archive's bytes; raises InputError where they are damaged or of another format."""
     try:
         arrays = read_arrays(io.BytesIO(content))
     except ValueError as error:
@@ -95,7 +94,7 @@ def _split(values: np.ndarray, counts: np.ndarray) -> list[np.ndarray]:
 
 
 def read_maps(arrays: dict[str, np.ndarray]) -> list[SceneMap]:
-    """The maps of an archive."""
+    """Returns the maps of an archive, without what is parked there: recordings have it as tracks."""
     ids = [str(name) for name in arrays["lane_id"]]
     centrelines = _split(arrays["lane_points"] * MILLI, arrays["lane_counts"])
     rows = zip(centrelines, arrays["lane_width"] * MILLI, arrays["lane_speed"] * MILLI, strict=True)
@@ -106,7 +105,7 @@ def read_maps(arrays: dict[str, np.ndarray]) -> list[SceneMap]:
     polygons = _split(arrays["polygon_points"] * MILLI, arrays["polygon_counts"])
     own = {
         key: _split(np.arange(arrays[f"map_{key}"].sum()), arrays[f"map_{key}"])
-        for key in ("lanes", "polygons", "lights", "parked")
+        for key in ("lanes", "polygons", "lights")
     }
     return [
         SceneMap(
@@ -114,15 +113,13 @@ def read_maps(arrays: dict[str, np.ndarray]) -> list[SceneMap]:
             {ids[k]: lanes[k] for k in own["lanes"][m]},
             [polygons[k] for k in own["polygons"][m]],
             {ids[arrays["light_lane"][k]]: arrays["light_states"][k] for k in own["lights"][m]},
-            arrays["parked"][own["parked"][m]] * UNIT[:3],
-            arrays["parked_size"][own["parked"][m]] * MILLI,
         )
         for m, name in enumerate(arrays["map_name"])
     ]
 
 
 def read_recordings(arrays: dict[str, np.ndarray], name: str) -> list[Recording]:
-    """The validated recordings of an archive; raises InputError where its arrays do not fit together."""
+    """Returns the validated recordings of an archive; raises InputError where its arrays do not fit together."""
     try:
         maps, counts = read_maps(arrays), arrays["scene_agents"]
         states = np.cumsum(np.cumsum(arrays["states"], axis=1), axis=1) * UNIT
@@ -131,9 +128,7 @@ def read_recordings(arrays: dict[str, np.ndarray], name: str) -> list[Recording]
         scenes = [arrays[key] for key in ("scene_id", "scene_map", "scene_first", "scene_ego")]
         tracks = [_split(values, counts) for values in (states, arrays["valid"], arrays["size"] * MILLI)]
         return [
-            maps[index]
-            .recording("bundled", str(scene_id), first, states.swapaxes(0, 1), valid.T, size, int(ego))
-            .validate()
+            maps[index].recording(str(scene_id), first, states.swapaxes(0, 1), valid.T, size, int(ego)).validate()
             for scene_id, index, first, ego, states, valid, size in zip(*scenes, *tracks, strict=True)
         ]
     except (KeyError, IndexError, ValueError) as error:
@@ -142,14 +137,8 @@ def read_recordings(arrays: dict[str, np.ndarray], name: str) -> list[Recording]
         raise InputError(f"bundled scenes {name}: arrays do not fit together ({error!r}); {MEND}") from error
 
 
-@lru_cache(maxsize=3)
-def load_maps(split: str) -> list[SceneMap]:
-    """The maps of a split, read once."""
-    return read_maps(unpack(asset_bytes(split), split))
-
-
 def load_recordings(split: str) -> list[Recording]:
-    """The bundled recordings of split train, tune or test. Raises InputError for a missing or damaged asset."""
+    """Returns the bundled recordings of a split; raises InputError for a missing or damaged asset."""
     return read_recordings(unpack(asset_bytes(split), split), split)
 
 

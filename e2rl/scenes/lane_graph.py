@@ -1,6 +1,6 @@
 """The lane graph of a recording on the host (networkx), and the route candidates of a vehicle on it.
 
-Who drives against the lanes of a map.
+And who drives against the lanes of a map.
 """
 
 from dataclasses import dataclass
@@ -97,7 +97,7 @@ class LaneGraph:
         self.first_point = np.cumsum([0, *counts])
         self.tree = cKDTree(self.points)
         self.branches_of: dict[tuple[str, float, float], list[list[str]]] = {}
-        self.way_of: dict[tuple[str, ...], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        self.path_of: dict[tuple[str, ...], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def near_lanes(self, position: np.ndarray, heading: float) -> list[tuple[str, float]]:
         """(lane, arc length of its nearest point) of the lanes near a pose, best first, each once."""
@@ -177,17 +177,17 @@ class LaneGraph:
         """Arc lengths [lanes + 1] where lanes one after another begin, and where the last one ends."""
         return np.cumsum([0.0, *(self.arc[name] for name in lanes)])
 
-    def way(self, lanes: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def path(self, lanes: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The `centreline` of lanes, its arc lengths [P], and their `lane_starts`."""
         key = tuple(lanes)
-        if key not in self.way_of:
+        if key not in self.path_of:
             line = self.centreline(lanes)
-            self.way_of[key] = line, arc_length(line), self.lane_starts(lanes)
-        return self.way_of[key]
+            self.path_of[key] = line, arc_length(line), self.lane_starts(lanes)
+        return self.path_of[key]
 
     def route(self, lanes: list[str], begin: float, vertices: int) -> Route:
         """The smoothed route along `lanes` from arc length `begin` of the first lane, `vertices` points long."""
-        line, arc, starts = self.way(lanes)
+        line, arc, starts = self.path(lanes)
         scale = arc[-1] / max(starts[-1], 1e-6)
         at = np.arange(vertices) * SPACING + begin * scale
         length = min(arc[-1] - begin * scale, (vertices - 1) * SPACING)

@@ -23,6 +23,7 @@ MAX_OPCODES, MAX_CONTAINERS = 5_000_000, 500_000  # the longest genuine log know
 MAX_DEPTH = 64
 MAX_BITS = 64  # of a whole number
 HOLDING = frozenset([tuple, list, dict, set, frozenset, np.ndarray, Unbuilt])  # types that hold or stand for others
+LIBRARY: Any = pickle._Unpickler
 MOVED = {"__builtin__": "builtins", "numpy.core": "numpy._core"}  # modules under their old names
 
 
@@ -41,7 +42,7 @@ def load_plain(content: bytes) -> Any:
     return made
 
 
-class _Machine(pickle._Unpickler):
+class _Machine(LIBRARY):
     """The standard library's machine; handlers that hash, call, grow or share objects are replaced."""
 
     def __init__(self, file: BytesIO, *, encoding: str) -> None:
@@ -184,7 +185,7 @@ class _Opcodes(dict[int, Handler]):
 
 def _handler(name: str, before: Handler | None = None, after: Handler | None = None) -> Handler:
     """Returns the standard library's handler of an opcode, with a check before or after it."""
-    own = pickle._Unpickler.dispatch[getattr(pickle, name)[0]]
+    own = LIBRARY.dispatch[getattr(pickle, name)[0]]
 
     def handle(machine: _Machine) -> None:
         if before is not None:

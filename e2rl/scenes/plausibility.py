@@ -18,7 +18,7 @@ from e2rl.scenes.recording import DT, VEHICLE, Recording
 
 FRAMES = 5  # between the two poses of a displacement: half a second
 MOVED, DRIVES = 1.0, 2.0  # m, m/s: a vehicle that moves
-WAY, BACKWARDS = 15.0, 5.0  # m that a vehicle drives before it is looked at alone; m/s up to which it may reverse
+DRIVEN, BACKWARDS = 15.0, 5.0  # m that a vehicle drives before it is looked at alone; m/s up to which it may reverse
 ENOUGH = 20  # displacements that a median needs
 TWIN = 0.5  # m between the centres of vehicles that are one
 LANE_RADIUS, LANE_ANGLE, LANES = 3.0, 0.6, 8  # m, rad, neighbours: a vehicle on a lane
@@ -92,8 +92,8 @@ def check(measures: dict[str, float], scene_id: str) -> None:
 def extent(recording: Recording) -> dict[str, float]:
     """Sizes of a validated recording."""
     valid, points = recording.valid, recording.states[..., :2][recording.valid]
-    way = recording.states[valid[:, recording.ego], recording.ego, :2]
-    ego = np.median(way, axis=0) if len(way) else np.full(2, np.nan)
+    path = recording.states[valid[:, recording.ego], recording.ego, :2]
+    ego = np.median(path, axis=0) if len(path) else np.full(2, np.nan)
     rings = [lane.points for lane in recording.lanes.values()] + [ring[:, :2] for ring in recording.drivable]
     ground = np.concatenate([ring for ring in rings if len(ring)])
     lengths = [arc_length(lane.points)[-1] for lane in recording.lanes.values() if len(lane.points) > 1]
@@ -177,14 +177,16 @@ def _together(recording: Recording, tracks: np.ndarray) -> float:
 
 
 def _worst(distance: np.ndarray, turned: np.ndarray, ratio: np.ndarray, track: np.ndarray) -> dict[str, float]:
-    """The largest deviations of one vehicle, of those that drive WAY: of its heading and of its speeds. Who is slow may
-    drive backwards."""
-    drives = np.bincount(track, distance) / FRAMES > WAY if len(track) else np.zeros(0, bool)
-    aside, factor, way = (_medians(values, track) for values in (turned, np.abs(np.log(ratio)), distance))
-    fast = way > BACKWARDS * FRAMES * DT
+    """The largest deviations of one vehicle, of those that drive DRIVEN m: of its heading and of its speeds.
+
+    A slow vehicle may drive backwards.
+    """
+    drives = np.bincount(track, distance) / FRAMES > DRIVEN if len(track) else np.zeros(0, bool)
+    turn, factor, moved = (_medians(values, track) for values in (turned, np.abs(np.log(ratio)), distance))
+    fast = moved > BACKWARDS * FRAMES * DT
     return {
-        "track_direction": _largest(aside[drives & fast]),
-        "slow_direction": _largest(np.minimum(aside, np.pi - aside)[drives & ~fast]),
+        "track_direction": _largest(turn[drives & fast]),
+        "slow_direction": _largest(np.minimum(turn, np.pi - turn)[drives & ~fast]),
         "track_speed": float(np.exp(_largest(factor[drives]))),
     }
 

@@ -36,7 +36,7 @@ SYNC = "sync.arrow"  # every log's folder holds one
 FILES = (SYNC, "ego_state_se3.arrow", "box_detections_se3.arrow", "traffic_light_detections.arrow", "map.arrow")
 MAX_BYTES = 1 << 29  # of one of these files
 LONGEST, PIECE = 30.0, 20.0  # s: longer logs are cut into pieces
-REACH = 250.0  # m around the ego's way in which the map is taken
+REACH = 250.0  # m around the ego's path in which the map is taken
 TYPES = {"VEHICLE": VEHICLE, "TRAIN": VEHICLE, "TWO_WHEELER": CYCLIST, "PERSON": PEDESTRIAN}  # others are OTHER
 LEFT_OUT = ("EGO", "TRAFFIC_SIGN", "TRAFFIC_LIGHT")  # the ego's own box, and what stands beside or hangs over the road
 LIGHTS = {"RED": LIGHT_RED, "YELLOW": LIGHT_YELLOW, "GREEN": LIGHT_GREEN}
@@ -184,13 +184,13 @@ def _recording(scene_id: str, frames: list[Frame]) -> Recording:
     return recording
 
 
-def _map(land: Any, way: np.ndarray) -> tuple[dict[str, Lane], list[np.ndarray]]:
-    """Lanes for motor vehicles by id, and the surfaces to drive on, within REACH of the ego's way [F, 2]."""
+def _map(land: Any, path: np.ndarray) -> tuple[dict[str, Lane], list[np.ndarray]]:
+    """Lanes for motor vehicles by id, and the surfaces to drive on, within REACH of the ego's path [F, 2]."""
     from py123d.datatypes import MapLayer
     from shapely import LineString
 
     surfaces = [MapLayer.GENERIC_DRIVABLE, MapLayer.INTERSECTION, MapLayer.CARPARK]
-    found = land.query(LineString(way).buffer(REACH), [MapLayer.LANE, *surfaces], predicate="intersects")
+    found = land.query(LineString(path).buffer(REACH), [MapLayer.LANE, *surfaces], predicate="intersects")
     segments = {
         str(lane.object_id): lane for lane in found.get(MapLayer.LANE, ()) if lane.lane_type.name != "BIKE_LANE"
     }

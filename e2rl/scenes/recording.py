@@ -33,7 +33,7 @@ class Lane:
 
 
 def same_way(lanes: Mapping[str, Lane], lane: Lane, neighbour: object) -> list[str]:
-    """The id of a lane's neighbour, if it is one of `lanes` and leads the same way; maps name oncoming ones as well."""
+    """Returns the id of a lane's neighbour, if it is one of `lanes` and no oncoming one, which maps name as well."""
     other = lanes.get(str(neighbour))
     if other is None:
         return []
@@ -64,7 +64,7 @@ class Recording:
     current: int | None = HISTORY
 
     def windows(self, starts: Sequence[int] | None, steps: int) -> Iterator["Recording"]:
-        """The recordings of `steps` simulated steps that this log makes, with ids of the form `id@start`.
+        """Yields the recordings of `steps` simulated steps that this log makes, with ids of the form `id@start`.
 
         One from each of `starts` that leaves at least half of the steps recorded. Default: the log's own start frame,
         or, where it names none, as many windows as fit one after another (at least one).
@@ -81,7 +81,7 @@ class Recording:
             yield replace(self, current=start, scene_id=f"{self.scene_id}@{start}")
 
     def mirrored(self) -> "Recording":
-        """The same traffic in a mirror, y to -y: what turned left turns right, and left-hand traffic keeps right."""
+        """Returns the traffic in a mirror, y to -y: who turned left turns right, and left-hand traffic keeps right."""
         states = self.states * np.array([1.0, -1.0, -1.0, 1.0])
         mirror = np.array([1.0, -1.0])
         lanes = {
@@ -92,33 +92,27 @@ class Recording:
         return replace(self, scene_id=f"{self.scene_id}{MIRRORED}", states=states, lanes=lanes, drivable=drivable)
 
     def validate(self) -> "Recording":
-        """Return self; raise InputError naming the scene where tracks, ego, lanes or start cannot make a scene."""
+        """Returns self; raises InputError naming the scene where tracks, ego, lanes or start cannot make a scene."""
         return self.validate_log().validate_start()
 
     def validate_log(self) -> "Recording":
         """`validate` without the start frame."""
-        return self._refuse(self._log_problem())
-
-    def validate_start(self) -> "Recording":
-        """`validate` of the start frame alone."""
-        return self._refuse(self._start_problem())
-
-    def _refuse(self, problem: str | None) -> "Recording":
-        if problem:
+        if problem := self._log_problem():
             raise InputError(f"scene {self.scene_id!r}: {problem}")
         return self
 
-    def _start_problem(self) -> str | None:
-        """What is wrong with the start frame and how to mend it; None: nothing."""
-        frames = len(self.states)
+    def validate_start(self) -> "Recording":
+        """`validate` of the start frame alone."""
+        frames, scene = len(self.states), f"scene {self.scene_id!r}"
         if self.current is None or not 1 <= self.current < frames - 1:
-            return f"start frame {self.current} leaves no history or no future in {frames} frames"
+            start = f"start frame {self.current}"
+            raise InputError(f"{scene}: {start} leaves no history or no future in {frames} frames")
         if not self.valid[self.current, self.ego]:
-            return f"the ego is not recorded at the start frame {self.current}"
-        return None
+            raise InputError(f"{scene}: the ego is not recorded at the start frame {self.current}")
+        return self
 
     def _log_problem(self) -> str | None:
-        """What is wrong with the log and how to mend it; None: nothing."""
+        """Returns what is wrong with the log and how to mend it; None: nothing."""
         frames, agents = self.valid.shape if self.valid.ndim == 2 else (0, 0)
         if self.states.shape != (frames, agents, 4) or not frames or not agents:
             shapes = f"states {self.states.shape} do not match valid {self.valid.shape}"

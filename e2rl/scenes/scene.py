@@ -166,9 +166,11 @@ class SceneSet:
             return self
         scenes = self.scenes[:count] if list(indices) == list(range(count)) else self.batch(indices)
         scenes["scene_index"] = torch.arange(count, device=scenes["scene_index"].device)
-        lists = (self.scene_id, self.location, self.number, self.digests)
-        names, places, numbers, digests = ([column[index] for index in indices if column] for column in lists)
-        return replace(self, scenes=scenes, scene_id=names, location=places, number=numbers, digests=digests)
+        columns = {name: getattr(self, name) for name in ("scene_id", "location", "number", "digests")}
+        chosen: dict[str, Any] = {
+            name: [column[index] for index in indices] for name, column in columns.items() if column
+        }
+        return replace(self, scenes=scenes, **chosen)
 
     def to(self, device: torch.device | str) -> "SceneSet":
         """Returns the same scenes on a device."""

@@ -128,8 +128,8 @@ def read(path: Path) -> SceneSet | None:
         return None
     try:
         content = np.asarray(np.memmap(path, np.uint8, "c"))
-        length, name, digest = END.unpack(content[-END.size :])
-        if name != FORMAT or hashlib.sha256(content[: -END.size]).digest() != digest:
+        length, name, digest = END.unpack(content[-END.size :].tobytes())
+        if name != FORMAT or hashlib.sha256(content.data[: -END.size]).digest() != digest:
             raise ValueError("its content is not what was written")
         index = Index(**json.loads(content[: -END.size][-length:].tobytes()))
         scenes = {key: torch.from_numpy(value) for key, value in index.arrays(content).items()}
@@ -164,7 +164,7 @@ def write(path: Path, build: Build) -> None:
                 rows[number][tuple(map(slice, value.shape))] = value
         content.flush()
     about = json.dumps(vars(index)).encode()
-    digest = hashlib.sha256(content)
+    digest = hashlib.sha256(content.data)
     digest.update(about)
     with path.open("ab") as file:
         file.write(about + END.pack(len(about), FORMAT, digest.digest()))

@@ -181,7 +181,7 @@ class Source(Extension, ABC):
         try:
             builder = SceneBuilder(windows[0], self.build) if windows else None
         except InputError as error:
-            return [_row_of(window)._replace(reason=_naming(log, error)) for window in windows]
+            return [Row(window.scene_id, reason=_naming(log, error)) for window in windows]
         return [_row(log, window, builder) for window in windows if builder]
 
     def rows(self, most: int | None = None) -> Generator[Row]:
@@ -238,14 +238,9 @@ class Source(Extension, ABC):
             raise InputError(f"no valid scene in {data} ({left_out}); see the messages above, or pass other data")
 
 
-def _row_of(recording: Recording) -> Row:
-    """Returns a row without a scene."""
-    return Row(recording.scene_id, recording.location, recording.dataset)
-
-
 def _row(log: str, recording: Recording, builder: SceneBuilder) -> Row:
     """Returns what a recording makes, one of those of a builder."""
-    row = _row_of(recording)
+    row = Row(recording.scene_id, recording.location, recording.dataset)
     try:
         scene = builder.scene(recording)
         validate(scene, recording.scene_id)

@@ -55,7 +55,7 @@ def noise_of(seed: Tensor, draw: Tensor, shape: tuple[int, ...], uniform: bool =
 
 
 ROWS = 160, 1024  # vehicle rows of a group: SHRUNK applies from the first number on, the second is the maximum
-SHRUNK = 0.55  # a scene of at most this share of the group's largest scene starts a new group
+SHRUNK = 0.55  # a scene of at most this fraction of the group's largest scene starts a new group
 OF_ALL = {"size", "start", "start_accel", "start_yaw_rate", "valid", "agent_type", "parked"}  # keys with all agents
 OF_VEHICLES = {"past", "route_points", "route_length", "route_open", "route_valid", "route_limit"}
 OF_VEHICLES |= {"route_light", "route_light_s", "route_log"}

@@ -122,13 +122,13 @@ class TrafficPool:
         joined = {name: torch.cat([getattr(self, name), getattr(other, name)]) for name in names}
         return TrafficPool(source=torch.cat([self.source, moved]), parts=self.parts + other.parts, **joined)
 
-    def probabilities(self, priority: Tensor, share: float) -> Tensor:
-        """Draw probability [R] of each row: adversarial rows have total probability `share`; within a kind it is in
+    def probabilities(self, priority: Tensor, fraction: float) -> Tensor:
+        """Draw probability [R] of each row: adversarial rows have total probability `fraction`; within a kind it is in
         proportion to the row's weight times the priority [S] of its scene. If one kind has no rows, the other has
         probability 1."""
         weight = self.weight * priority.cpu().double()[self.scene_index].clamp(min=1e-12)
         result = torch.zeros(len(self), dtype=torch.float64)
-        for kind, part in ((True, share), (False, 1 - share)):
+        for kind, part in ((True, fraction), (False, 1 - fraction)):
             rows = self.adversarial == kind
             if rows.any():
                 result[rows] = (1.0 if rows.all() else part) * weight[rows] / weight[rows].sum()

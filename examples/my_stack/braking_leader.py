@@ -14,7 +14,7 @@ class BrakingLeader(Replay):
 
     replays_log, adversarial = False, True
 
-    def __init__(self, prior=None, reach: float = 40.0, braking: float = 1.0):
+    def __init__(self, prior, reach, braking):
         self.reach, self.braking = reach, braking
 
     def reset(self, scenes, seed, eta):
@@ -32,16 +32,16 @@ class BrakingLeader(Replay):
         state, plan = super().replan(state, world, ego_plan)
         vehicles, leader = plan.states.shape[1], state["leader"]
         path = world.scene["logged"][:, :, :vehicles].transpose(1, 2).contiguous()  # [B, V, T+1, 4]
-        way = path[..., :2].diff(dim=2).norm(dim=-1).cumsum(-1)  # [B, V, T]
+        travelled = path[..., :2].diff(dim=2).norm(dim=-1).cumsum(-1)  # [B, V, T]
         first = path[:, :, 0, 3].clamp(min=0.1)[..., None]
         braking = state["braking"][:, None, None].clamp(min=1e-3)
         time = torch.minimum(DT * steps_ahead(world)[:, None], first / braking)  # until the halt
         gone = (first * time - braking * time**2 / 2).contiguous()
-        index = torch.searchsorted(way, gone).clamp(max=way.shape[-1] - 1)
+        index = torch.searchsorted(travelled, gone).clamp(max=travelled.shape[-1] - 1)
         before, after = (path.gather(2, (index + k)[..., None].expand(-1, -1, -1, 4)) for k in (0, 1))
         length = (after - before)[..., :2].norm(dim=-1).clamp(min=1e-3)
-        share = 1 - (way.gather(-1, index) - gone) / length
-        xy = before[..., :2] + share[..., None] * (after - before)[..., :2]
+        fraction = 1 - (travelled.gather(-1, index) - gone) / length
+        xy = before[..., :2] + fraction[..., None] * (after - before)[..., :2]
         braked = torch.cat([xy, before[..., 2:3], (first - braking * time)[..., None]], -1)
         plan.states = torch.where(leader[..., None, None], braked, plan.states)
         plan.present = plan.present | (leader & world.valid[:, :vehicles])[..., None]

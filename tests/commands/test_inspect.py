@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from e2rl.commands.inspect import main
 from PIL import Image
 
+from e2rl.commands.inspect import main
 from e2rl.report import drawing
 from tests.report.pixels import rgb
 from tests.scenes.descriptions import ALL, description, straight, write_folder

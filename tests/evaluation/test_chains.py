@@ -41,7 +41,7 @@ def listener():
 def test_links_then_members_then_risk_decide_and_the_first_of_equals_stays():
     chain = listener()
     chain(selection([-1, -1, -1, -1]))
-    assert chain.kept is None
+    assert chain.longest is None
     for given, seed in (
         (selection([-1, 0, -1, -1], [-1, 0, 0, -1]), 1),
         (selection([-1, 0, 0, -1], seed=10), 1),
@@ -50,7 +50,7 @@ def test_links_then_members_then_risk_decide_and_the_first_of_equals_stays():
         (selection([-1, 0, 0, 0], seed=40), 31),
     ):
         chain(given)
-        assert chain.kept.seed.tolist() == [seed] and len(chain.kept.target) == 1
+        assert chain.longest.seed.tolist() == [seed] and len(chain.longest.target) == 1
 
 
 def test_the_risk_of_links_is_that_of_each_member_with_its_target():
@@ -65,7 +65,7 @@ def test_the_kept_selection_is_of_a_rollout_of_the_run(tmp_path):
     run_protocol(setup, [chain.method], [0, 4], tmp_path, only=[1, 2])
     rollout = chain.rollout(scene_set, "idm", tmp_path)
     assert rollout.scene_id in scene_set.scene_id[1:] and rollout.seed in (0, 4)
-    members = chain.kept.coalition[0].nonzero()[:, 0].tolist()
+    members = chain.longest.coalition[0].nonzero()[:, 0].tolist()
     assert members and rollout.adversaries[members].all()
 
 

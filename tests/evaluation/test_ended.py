@@ -4,7 +4,6 @@ import json
 
 import pytest
 import torch
-from e2rl.report.score_files import main as score
 
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.evaluation.rollout_files import ENDED_FILE, METRICS_FILE, TABLE, add_ended, read_metrics, read_rows
@@ -94,26 +93,3 @@ def test_what_ended_in_a_training_is_kept_by_round_and_not_doubled_by_a_resumed_
     path.write_text("[")
     add_ended(path, 3, [{"round": 3, "reason": "e"}])
     assert len(json.loads(path.read_text())) == 1
-
-
-def test_rollouts_on_disk_are_scored_by_a_command(tmp_path, capsys):
-    (first,) = run(IDMEgo(), tmp_path)
-    rows = read_rows(tmp_path / TABLE)
-    assert score([str(tmp_path)]) == 2 and "is there already" in capsys.readouterr().err
-    for name in (TABLE, METRICS_FILE):
-        (tmp_path / name).unlink()
-    assert score([str(tmp_path)]) == 0
-    found = {(row["scene_id"], row["seed"]): row for row in read_rows(tmp_path / TABLE)}
-    assert len(found) == len(rows)
-    for row in rows:
-        again = found[row["scene_id"], row["seed"]]
-        assert all(again[name] == pytest.approx(row[name], nan_ok=True) for name in ("cfr", "progress", "eta"))
-    assert read_metrics(tmp_path / METRICS_FILE)[0]["metrics"]["cfr"] == pytest.approx(
-        first["metrics"]["cfr"], nan_ok=True
-    )
-    path = sorted((tmp_path / ROLLOUTS).glob("*.npz"))[0]
-    path.write_bytes(path.read_bytes()[:100])
-    (tmp_path / TABLE).unlink()
-    assert score([str(tmp_path)]) == 0 and f"left out {path.name}" in capsys.readouterr().err
-    assert len(read_rows(tmp_path / TABLE)) == 7
-    assert score([str(tmp_path / "none")]) == 2

@@ -10,14 +10,11 @@ from e2rl.evaluation.protocol import Method, run_protocol
 from e2rl.evaluation.rollout_files import read_rows, write_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
-from e2rl.report import videos as replay
 from e2rl.report.mode_table import mode_tables
 from e2rl.report.tables import metric_tables
 from e2rl.run.errors import InputError
-from e2rl.sim.rollout_file import ROLLOUTS
 from tests.evaluation.test_protocol import setup_of
 from tests.metrics.random_rollouts import labelled, random_rollouts
-from tests.metrics.test_contact import course, scene
 from tests.metrics.test_failure_modes import CROSSING, REAR_END, failure
 from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
@@ -66,13 +63,10 @@ def test_the_typical_rollout_is_one_of_its_mode():
         assert typical["file"].startswith(f"{typical['method']}__idm__2__") and typical["file"].endswith("__0.npz")
 
 
-def test_a_run_without_failures_has_no_modes_and_no_table(tmp_path):
+def test_a_run_without_failures_has_no_modes_and_no_table():
     found = find_modes(crashes(CROSSING, 3, cfr=0.0, approach=""))
     assert found["modes"] == [] and found["unknown"] == [] and found["groups"][0]["failures"] == 0
     assert mode_tables(found) == [] and find_modes([])["modes"] == []
-    write_modes(tmp_path / MODES_FILE, found)
-    with pytest.raises(InputError, match="no failure modes"):
-        replay.typical_failures(tmp_path)
 
 
 def test_the_table_has_a_row_for_each_mode_and_says_what_is_missing():
@@ -131,17 +125,3 @@ def test_the_protocol_writes_the_modes_of_all_methods(tmp_path):
     found = read_modes(tmp_path / MODES_FILE)
     assert [(group["method"], group["rollouts"]) for group in found["groups"]] == [("nominal", 1), ("e2", 1)]
     assert found["failures"] == sum(mode["count"] for mode in found["modes"])
-
-
-def test_the_command_draws_a_typical_failure_of_each_mode(tmp_path, capsys):
-    rows = []
-    for seed, partner in enumerate((course(30.5, 0, 0, 5), course(31, 0, 0, 5), course(40, 0.3, math.pi, 6))):
-        rollouts = scene(course(0, 0, 0, 12), partner).replace(scene_id=[f"scene {seed}"])
-        rollouts.to_npz(tmp_path / ROLLOUTS)
-        rows += score_rollouts(rollouts)[0]
-    write_modes(tmp_path / MODES_FILE, find_modes(rows))
-    assert replay.main([str(tmp_path), "--modes", "--pixels", "120"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "1. ahead, partner keeps speed, ego keeps speed: no duty broken (2 failures)"
-    assert lines[3].startswith("2. oncoming")
-    assert len(lines) == 6 and all((tmp_path / "replays" / line.split("/")[-1]).exists() for line in lines[1:3])

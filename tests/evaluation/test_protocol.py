@@ -53,9 +53,9 @@ def test_files_hold_the_seed_of_the_protocol_and_who_was_controlled(run):
     _, folder = run
     for path in (folder / ROLLOUTS).glob("*.npz"):
         data = Rollout.read(path)
-        assert data["seed"] in SEEDS and data["ego_policy"] == "idm" and data["dt"] == pytest.approx(0.1)
-        assert data["adversaries"].any() == (data["method"] == "e2") and not data["adversaries"][0]
-        assert data["states"].shape[0] == 81
+        assert data.seed in SEEDS and data.ego_policy == "idm" and data.dt == pytest.approx(0.1)
+        assert data.adversaries.any() == (data.method == "e2") and not data.adversaries[0]
+        assert data.states.shape[0] == 81
 
 
 def test_the_independent_scorer_agrees(run):
@@ -160,7 +160,7 @@ def same_runs(one, other):
     assert files[0] == files[1]
 
 
-@pytest.mark.parametrize("stops", [(0,), (1,), (3,), (5, 0), (1, 1, 1), (6,)])
+@pytest.mark.parametrize("stops", [(0,), (3, 0, 1)])
 def test_a_run_that_was_interrupted_equals_one_that_was_not(tmp_path, stops):
     """However often it stops; no rollout is done twice, and none has two rows."""
     scene_set = small_scenes(3)

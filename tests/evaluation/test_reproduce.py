@@ -1,22 +1,85 @@
 """reproduce=RUN_DIR: the table of a run again, from its folder alone, with its configuration, scenes and weights."""
 
+import copy
 import json
+import math
 import shutil
 import zipfile
 
 import pytest
 from omegaconf import OmegaConf
 
+from e2rl.evaluation.protocol import Setup
+from e2rl.evaluation.reproduce import compare_tables
 from e2rl.evaluation.rollout_files import read_metrics, read_rows
+from e2rl.run.errors import InputError
 from e2rl.scenes.scene_list import read_list
 from tests.scripts import arguments, call, error_line, left_behind
 
 QUICK = ["seeds=[0]", "processes=1", "methods=[constant_velocity,nominal]", "prior.sampler.steps=2"]
 
 
+def table():
+    def numbers(mean):
+        return {"mean": mean, "low": 0.1, "high": math.nan, "n": 4}
+
+    metrics = {"cfr": numbers(0.25), "real": numbers(0.75), "seconds_per_rollout": numbers(1.5)}
+    row = {"dataset": "d", "split": "s", "method": "e2", "ego": "idm", "eta": 2.0, "n_rollouts": 4, "git": "abc"}
+    paired = {"nominal": {"cfr": {"difference": 0.2}, "seconds_per_rollout": {"difference": 1.0}}}
+    return [row | {"metrics": metrics, "paired": paired}, row | {"eta": 1.0, "metrics": metrics, "paired": {}}]
+
+
+def changed(**values):
+    """The table with other values in its first row at dotted keys."""
+    rows = [copy.deepcopy(row) for row in table()]  # each with parts of its own
+    for path, value in values.items():
+        *parents, last = path.split("__")
+        part = rows[0]
+        for key in parents:
+            part = part[key]
+        part[last] = value
+    return rows
+
+
+def test_tables_are_equal_but_for_wall_times_and_where_they_were_made():
+    found = compare_tables(table(), changed(git="other", metrics__seconds_per_rollout__mean=9.0))
+    assert found.different == [] and found.close == 0
+    assert found.equal == 2 * (1 + 2 * 4) + 1 and found.text() == "all 19 numbers of its tables are equal"
+
+
+def test_each_number_that_differs_is_named_with_both_values():
+    now = changed(metrics__cfr__mean=0.5, paired__nominal__cfr__difference=math.nan, n_rollouts=3)
+    found = compare_tables(table(), now)
+    names = ["n_rollouts", "cfr: mean", "paired: nominal: cfr: difference"]
+    assert [entry[0] for entry in found.different] == [f"d s e2 idm 2.0: {name}" for name in names]
+    assert "d s e2 idm 2.0: cfr: mean: 0.25 then, 0.5 now" in found.text() and "16 of 19" in found.text()
+
+
+@pytest.mark.parametrize(("factor", "close"), [(1 + 1e-9, 1), (1 + 2e-6, 0)])
+def test_rounding_is_told_apart(factor, close):
+    found = compare_tables(table(), changed(metrics__cfr__mean=0.25 * factor))
+    assert (found.close, len(found.different)) == (close, 1 - close)
+
+
+def test_rows_that_one_table_lacks_differ():
+    found = compare_tables(table(), table()[:1])
+    assert found.equal == 10 and {entry[2] for entry in found.different} == {"missing"}
+    found = compare_tables(table()[:1], table())
+    assert len(found.different) == 9 and {entry[1] for entry in found.different} == {"missing"}
+
+
+@pytest.mark.parametrize("rows", [[{}], [{"metrics": 1}], ["x"], [None]])
+def test_what_is_no_table_is_named(rows):
+    with pytest.raises(InputError, match=r"metrics\.json: damaged"):
+        compare_tables(rows, rows)
+
+
+# --- through evaluate.py
+
+
 @pytest.fixture(scope="module")
 def then(world, tmp_path_factory):
-    """A run on two logs, in traffic of a prior's file, with a weight file for the ego."""
+    """A run on two logs, in traffic of a prior's file."""
     folder = tmp_path_factory.mktemp("then")
     monkeypatch = pytest.MonkeyPatch()
     with monkeypatch.context():
@@ -40,13 +103,19 @@ def again(run, folder, *more):
     return [f"reproduce={run}", f"hydra.run.dir={folder}", f"data.cache={folder.parent / 'cache'}", *more]
 
 
+@pytest.fixture
+def sent(then, tmp_path):
+    """A copy of the run's folder."""
+    shutil.copytree(then, tmp_path / "sent")
+    return tmp_path / "sent"
+
+
 def test_one_command_makes_the_same_table_in_a_new_folder(then, tmp_path, monkeypatch, capsys):
     before = {path: path.read_bytes() for path in then.rglob("*") if path.is_file()}
     status, said = call("evaluate.py", again(then, tmp_path / "now"), monkeypatch, capsys)
     assert status == 0, said
     found = json.loads((tmp_path / "now" / "reproduced.json").read_text())
     assert found["different"] == [] and found["close"] == 0 and found["equal"] > 50, found
-    assert "versions differ" not in said and "not those listed" not in said
     rows = [read_rows(run / "rollouts.csv") for run in (then, tmp_path / "now")]
     for row, other in zip(*rows, strict=True):
         assert str({**row, "seconds": 0, "evasion_seconds": 0}) == str({**other, "seconds": 0, "evasion_seconds": 0})
@@ -54,17 +123,13 @@ def test_one_command_makes_the_same_table_in_a_new_folder(then, tmp_path, monkey
     assert before == {path: path.read_bytes() for path in then.rglob("*") if path.is_file()}
 
 
-def test_data_and_weights_may_lie_elsewhere_and_the_run_can_be_reproduced_and_resumed(
-    world, then, tmp_path, monkeypatch, capsys
-):
+@pytest.mark.slow
+def test_data_and_weights_may_lie_elsewhere(world, sent, tmp_path, monkeypatch, capsys):
     """A colleague's: the folder was sent, data and weights have other paths."""
-    sent, weights = tmp_path / "sent", tmp_path / "weights.safetensors"
-    shutil.copytree(then, sent)
+    weights = tmp_path / "weights.safetensors"
     shutil.copy(world / "prior.safetensors", weights)
-    config = (sent / ".hydra" / "config.yaml").read_text()
-    (sent / ".hydra" / "config.yaml").write_text(config.replace(str(world), "/nowhere"))
-    inputs = (sent / "provenance.json").read_text()
-    (sent / "provenance.json").write_text(inputs.replace(str(world), "/nowhere"))
+    for name in (".hydra/config.yaml", "provenance.json"):
+        (sent / name).write_text((sent / name).read_text().replace(str(world), "/nowhere"))
     with zipfile.ZipFile(tmp_path / "data.zip", "w") as archive:
         for path in sorted((world / "good").iterdir()):
             archive.write(path, path.name)
@@ -74,37 +139,27 @@ def test_data_and_weights_may_lie_elsewhere_and_the_run_can_be_reproduced_and_re
     status, said = call("evaluate.py", again(sent, tmp_path / "b", *here), monkeypatch, capsys)
     assert status == 0, said
     assert json.loads((tmp_path / "b" / "reproduced.json").read_text())["different"] == []
-    assert {row["split"] for row in read_metrics(tmp_path / "b" / "metrics.json")} == {"good"}
-    for command in (f"reproduce={tmp_path / 'b'}", f"resume={tmp_path / 'b'}"):
-        (tmp_path / "b" / "reproduced.json").unlink()
-        status, said = call("evaluate.py", [command, f"hydra.run.dir={tmp_path / 'c'}"], monkeypatch, capsys)
-        assert status == 0, said
-        folder = tmp_path / ("c" if command.startswith("reproduce") else "b")
-        assert json.loads((folder / "reproduced.json").read_text())["different"] == []
-        if folder == tmp_path / "c":
-            shutil.copy(folder / "reproduced.json", tmp_path / "b")
+    status, said = call("evaluate.py", again(tmp_path / "b", tmp_path / "c"), monkeypatch, capsys)  # a run, too
+    assert status == 0, said
+    assert json.loads((tmp_path / "c" / "reproduced.json").read_text())["different"] == []
 
 
-def test_other_weights_are_refused_by_name(world, then, tmp_path, monkeypatch, capsys):
-    other = tmp_path / "other.safetensors"
-    other.write_bytes((world / "prior.safetensors").read_bytes() + b" ")
-    given = again(then, tmp_path / "now", f"prior.checkpoint={other}")
+@pytest.mark.slow
+def test_other_weights_and_scenes_are_refused_by_name(world, then, tmp_path, monkeypatch, capsys):
+    (tmp_path / "weights.safetensors").write_bytes(b"other")
+    given = again(then, tmp_path / "now", f"prior.checkpoint={tmp_path / 'weights.safetensors'}")
     status, said = call("evaluate.py", given, monkeypatch, capsys)
     assert status == 2 and "prior.checkpoint is another file than the run's prior.checkpoint=" in error_line(said)
-    assert not left_behind(tmp_path / "now")
-
-
-def test_other_scenes_are_refused_by_name(world, then, tmp_path, monkeypatch, capsys):
     shutil.copytree(world / "good", tmp_path / "good")
     (tmp_path / "good" / "sd_00.pkl").write_bytes((world / "good" / "sd_01.pkl").read_bytes())
     given = again(then, tmp_path / "now", "data=scenarionet", f"data.path={tmp_path / 'good'}")
     status, said = call("evaluate.py", given, monkeypatch, capsys)
     assert status == 2 and "scenes are not" in error_line(said) and "scene-0" in error_line(said)
+    assert not left_behind(tmp_path / "now")
 
 
-def test_other_versions_are_told_and_what_differs_is_named(then, tmp_path, monkeypatch, capsys):
-    sent = tmp_path / "sent"
-    shutil.copytree(then, sent)
+@pytest.mark.slow
+def test_other_versions_are_told_and_what_differs_is_named(sent, tmp_path, monkeypatch, capsys):
     known = json.loads((sent / "provenance.json").read_text())
     known["versions"][-1] |= {"torch": "1.0.0", "e2rl": "0" * 64}
     known["inputs"]["synthesizer=nominal"] = {"name": "another"}
@@ -120,23 +175,14 @@ def test_other_versions_are_told_and_what_differs_is_named(then, tmp_path, monke
     assert len(different) == 1 and different[0][0].endswith("progress: mean")
 
 
-@pytest.mark.parametrize(
-    ("more", "what"),
-    [
-        (["seeds=[1]"], "leave out seeds (only "),
-        (["synthesizer=nominal"], "leave out synthesizer"),
-        (["ego=idm"], "leave out ego"),
-        (["prior.sampler.steps=4"], "leave out prior.sampler.steps"),
-    ],
-)
-def test_what_would_be_another_table_is_refused(then, tmp_path, monkeypatch, capsys, more, what):
-    status, said = call("evaluate.py", again(then, tmp_path / "now", *more), monkeypatch, capsys)
-    assert status == 2 and what in error_line(said) and not left_behind(tmp_path / "now")
+@pytest.mark.parametrize("more", ["seeds=[1]", "synthesizer=nominal", "ego=idm", "prior.sampler.steps=4"])
+def test_what_would_be_another_table_is_refused(then, tmp_path, monkeypatch, capsys, more):
+    status, said = call("evaluate.py", again(then, tmp_path / "now", more), monkeypatch, capsys)
+    assert status == 2 and f"leave out {more.partition('=')[0]} (only" in error_line(said)
+    assert not left_behind(tmp_path / "now")
 
 
-def test_a_stranger_s_run_runs_nothing(then, tmp_path, monkeypatch, capsys):
-    sent = tmp_path / "sent"
-    shutil.copytree(then, sent)
+def test_a_stranger_s_run_runs_nothing(sent, tmp_path, monkeypatch, capsys):
     file = sent / ".hydra" / "config.yaml"
     config = OmegaConf.load(file)
     for changes in (
@@ -145,21 +191,22 @@ def test_a_stranger_s_run_runs_nothing(then, tmp_path, monkeypatch, capsys):
         {"plugins": ["this"]},
     ):
         OmegaConf.save(OmegaConf.merge(config, changes), file)
-        status, said = call("evaluate.py", again(sent, tmp_path / "now"), monkeypatch, capsys)
-        assert status == 2 and "runs code that is no extension of e2rl" in error_line(said)
+        for option in ("reproduce", "resume"):
+            given = [f"{option}={sent}", f"hydra.run.dir={tmp_path / 'now'}"]
+            status, said = call("evaluate.py", given, monkeypatch, capsys)
+            assert status == 2 and "runs code that is no extension of e2rl" in error_line(said)
     assert not (tmp_path / "ran").exists()
 
 
 @pytest.mark.parametrize("name", ["metrics.json", "scenes.csv", "provenance.json", ".hydra/config.yaml"])
 @pytest.mark.parametrize("content", [None, "[1]"])
-def test_a_folder_that_is_no_run_with_a_table_is_named(then, tmp_path, monkeypatch, capsys, name, content):
-    sent = tmp_path / "sent"
-    shutil.copytree(then, sent)
+def test_a_folder_that_is_no_run_with_a_table_is_named(sent, tmp_path, monkeypatch, capsys, name, content):
     (sent / name).unlink() if content is None else (sent / name).write_text(content)
     status, said = call("evaluate.py", again(sent, tmp_path / "now"), monkeypatch, capsys)
     assert status == 2 and name.split("/")[-1] in error_line(said)
 
 
+@pytest.mark.slow
 def test_scenes_of_a_list_are_those_of_the_run(then, world, tmp_path, monkeypatch, capsys):
     """Its second scene alone: the same noise as in the run of both."""
     lines = (then / "scenes.csv").read_text().splitlines()
@@ -173,3 +220,39 @@ def test_scenes_of_a_list_are_those_of_the_run(then, world, tmp_path, monkeypatc
     assert [row["method"] for row in alone] == [row["method"] for row in rows] == ["constant_velocity", "nominal"]
     for row, other in zip(rows, alone, strict=True):
         assert row["progress"] == pytest.approx(other["progress"], rel=1e-5)
+
+
+SMALL_RUN = ["seeds=[0]", "batch=1", "processes=1", "methods=[constant_velocity,replay]", "data.build.steps=20"]
+
+
+@pytest.mark.slow
+def test_an_interrupted_evaluation_goes_on_by_the_command_that_it_names(world, tmp_path, monkeypatch, capsys):
+    """In its own folder, with its own configuration and ego; what changes its meaning is refused."""
+    score, left = Setup.score, [3]
+
+    def stopped(*given):
+        left[0] -= 1
+        if left[0] < 0:
+            raise KeyboardInterrupt
+        return score(*given)
+
+    given = [*arguments(world, tmp_path, "good", *SMALL_RUN), "ego=idm"]
+    status, said = call("evaluate.py", [*given, f"hydra.run.dir={tmp_path / 'whole'}"], monkeypatch, capsys)
+    assert status == 0, said
+    monkeypatch.setattr(Setup, "score", stopped)
+    run = tmp_path / "run"
+    status, said = call("evaluate.py", given, monkeypatch, capsys)
+    assert status == 130 and said.strip().endswith(f"evaluate.py resume={run}") and "interrupted (SIGINT)" in said
+    command = json.loads((run / "provenance.json").read_text())["command"]
+    left[0] = 1
+    other = [f"resume={run}", f"hydra.run.dir={tmp_path / 'other'}"]
+    status, said = call("evaluate.py", [*other, "seeds=[1]"], monkeypatch, capsys)
+    assert status == 2 and "leave out seeds (only processes, launcher, shard can change)" in error_line(said)
+    status, said = call("evaluate.py", [*other, "processes=1"], monkeypatch, capsys)
+    assert status == 0 and left == [0], said
+    rows = [read_rows(folder / "rollouts.csv") for folder in (tmp_path / "whole", run)]
+    for row, again_ in zip(*rows, strict=True):
+        timed = dict.fromkeys(("seconds", "evasion_seconds"))
+        assert row["ego_policy"] == "idm" and str({**row, **timed}) == str({**again_, **timed})
+    assert {row["command"] for row in read_metrics(run / "metrics.json")} == {command}
+    assert left_behind(tmp_path / "other") == []

@@ -1,7 +1,6 @@
 """Trials: what they are measured by, what refuses them, and small real runs of a planner and an adversary."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -16,6 +15,7 @@ from e2rl.evaluation.trials import (
     AttackTrials,
     PlannerObjective,
     PlannerTrials,
+    driving,
 )
 from e2rl.evaluation.tuning import SearchSettings, best_of, line_of, search
 from e2rl.planners.ego import PLAN_STEPS, Ego
@@ -46,8 +46,8 @@ class Cruise(Ego):
         return MissionPath(world).drive(speed.expand(-1, PLAN_STEPS + 1))
 
 
-def planner_trials(methods, make=Cruise, scene_set=None):
-    setup = Setup(scene_set or scenes(2, steps=20), Cruise(), "cruise", SimSettings(), batch=4)
+def planner_trials(methods, make=Cruise):
+    setup = Setup(scenes(2, steps=20), Cruise(), "cruise", SimSettings(), batch=4)
     return PlannerTrials(setup, methods, [0], lambda parameters: make(**parameters))
 
 
@@ -86,15 +86,12 @@ def test_every_trial_meets_traffic_made_against_it():
     assert len(made) >= 3 * 2 and not torch.allclose(made[0], made[-1])
 
 
-def test_leaving_the_road_counts_as_a_collision():
-    """A road of the ego's own lane is left by none; one that ends ahead is left."""
-    whole = scenes(1, steps=20)
-    ended = replace(whole, scenes=whole.scenes.clone())
-    ahead = ended.scenes["start"][0, 0, 0] + 3.0
-    ended.scenes["drivable_points"][..., 0] = ended.scenes["drivable_points"][..., 0].clamp(max=ahead)
-    for scene_set, expected in ((whole, 0.0), (ended, 1.0)):
-        found = planner_trials([Method("replay", Replay())], scene_set=scene_set)({"gain": 1.0})
-        assert found["collision"] == expected
+def test_contacts_with_anybody_and_leaving_the_road_count_as_collisions():
+    quiet = {"cfr": 0.0, "cfr_vru": 0.0, "ego_off_road": math.nan, "macc": 1.0, "progress": 50.0}
+    rows = [quiet, quiet | {"cfr": 1.0}, quiet | {"cfr_vru": 1.0, "macc": math.nan}, quiet | {"ego_off_road": 1.0}]
+    rows.append(quiet | {"cfr": 1.0, "ego_off_road": 1.0, "macc": 3.0, "progress": 0.0})
+    assert driving(rows) == {"collision": 0.8, "comfort": 1.5, "progress": 40.0}
+    assert all(map(math.isnan, driving([]).values()))
 
 
 def test_a_trial_that_loses_rollouts_is_counted_and_refused():

@@ -79,7 +79,7 @@ def braking_leader(monkeypatch):
     from my_stack.csv_tracks import CsvTracks
 
     scenes = CsvTracks(path=str(EXAMPLES / "logs"), workers=1).load()
-    return scenes, BrakingLeader()
+    return scenes, BrakingLeader(None, reach=40.0, braking=1.0)
 
 
 def test_the_leader_brakes_by_eta_on_its_path_and_nobody_else_does(braking_leader):

@@ -21,7 +21,7 @@ def test_both_stages_are_kept_and_the_second_is_compared_with_the_first(tmp_path
     measure("before", slow, 0)
     same = {row["method"]: row for row in measure("after", slow, 1) if row["stage"] == "after"}
     rows = measure("after", fast, 2)
-    assert rows == read_metrics(tmp_path / METRICS_FILE)
+    assert str(rows) == str(read_metrics(tmp_path / METRICS_FILE))
     stages = [(row["stage"], row["method"]) for row in rows]
     assert stages == [(stage, method) for stage in ("before", "after") for method in ("nominal", "ambush")]
     other = {row["method"]: row for row in rows if row["stage"] == "after"}

@@ -1,24 +1,25 @@
 """Every configuration of learner, curriculum and logger builds and runs, a curriculum of one's own among them."""
 
 import pytest
+from e2rl.scripts.train import train_round
 from omegaconf import open_dict
 
 from e2rl.evaluation.methods import build_ego
 from e2rl.learning.bandit import BanditCurriculum
-from e2rl.learning.build import build_evolution, build_logger, run_imitation
+from e2rl.learning.build import build_evolution, build_progress
 from e2rl.learning.planner_tuning import PlannerImprovement
 from e2rl.learning.policy import PolicyImprovement
 from e2rl.learning.run_checkpoint import load_checkpoint, save_checkpoint
 from e2rl.learning.scheduler import CurriculumScheduler
 from e2rl.learning.schedules import AdaptiveCurriculum, ConstantCurriculum, LinearCurriculum
-from e2rl.run.config import choices, load_config
+from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
 from tests.learning.small import Ambush, brake_check, small_scenes
 
 CURRICULA = {"adaptive": AdaptiveCurriculum, "linear": LinearCurriculum, "constant": ConstantCurriculum}
 CURRICULA |= {"bandit": BanditCurriculum}
 FULL_ONLY = {"bandit": ["curriculum.templates=[full]"]}  # Ambush knows no templates
-POLICY = ["ego.hidden=[16]", "learner.imitation.batch=2", "learner.imitation.epochs=1"]
+POLICY = ["ego.hidden=[16]", "learner.recorded=false"]
 POLICY += ["learner.ppo.cloning=0.1"]
 POLICY += [f"learner.collect.{setting}" for setting in ("batch=4", "steps=20", "iterations=1")]
 PLANNER = ["learner=planner_tuning", "ego=lane_graph", "learner.batch=2"]
@@ -27,27 +28,15 @@ PLANNER = ["learner=planner_tuning", "ego=lane_graph", "learner.batch=2"]
 class Doubling(CurriculumScheduler):
     """A curriculum of one's own: the intensity doubles after every round that the ego has survived."""
 
+    lasting = ("eta",)
+
     def __init__(self, num_scenes, rounds, seed=0, first=1.0, **scenes):
         super().__init__(num_scenes, rounds, seed, **scenes)
-        self._eta = first
-
-    @property
-    def eta(self):
-        return self._eta
-
-    @property
-    def share(self):
-        return 1.0
+        self.eta, self.fraction = first, 1.0
 
     def advance(self, collision_rate=None):
         super().advance(collision_rate)
-        self._eta *= 1 if collision_rate else 2
-
-    def extra_state(self):
-        return {"eta": self._eta}
-
-    def load_extra_state(self, state):
-        self._eta = state["eta"]
+        self.eta *= 1 if collision_rate else 2
 
 
 def config_of(*overrides):
@@ -64,13 +53,12 @@ def built(config, folder=None):
 def test_policy_learner(curriculum):
     run = built(config_of(f"curriculum={curriculum}", *FULL_ONLY.get(curriculum, []), *POLICY))
     assert isinstance(run.improve, PolicyImprovement) and type(run.curriculum) is CURRICULA[curriculum]
-    assert run.run_round()["train/expert_pairs"] > 0
+    assert train_round(run)["synthesizer/memory_rows"] > 0
 
 
-def test_a_recipe_is_of_options_that_exist():
-    for recipe in choices("recipe"):
-        run = built(config_of(f"recipe={recipe}", *FULL_ONLY["bandit"], *POLICY))
-        assert isinstance(run.improve, PolicyImprovement) and run.improve.teacher is not None
+def test_the_experiment_of_training_is_of_options_that_exist():
+    run = built(config_of("experiment=harden", *FULL_ONLY["bandit"], *POLICY))
+    assert isinstance(run.improve, PolicyImprovement) and run.improve.teacher is not None
 
 
 def test_planner_learner():
@@ -78,19 +66,19 @@ def test_planner_learner():
     config.learner.space, config.learner.search.trials = {"risk_slope": [0.2, 0.5]}, 2
     run = built(config)
     assert isinstance(run.improve, PlannerImprovement)
-    assert run.run_round()["train/trials"] == 2
+    assert train_round(run)["train/trials"] == 2
 
 
 def test_live_traffic_needs_no_stored_one():
     config = config_of("learner.round.traffic=live", *POLICY)
     run = build_evolution(config, small_scenes(3), build_ego(config), Ambush())
-    assert run.run_round()["synthesizer/contact"] > 0 and not run.memory.rows
+    assert train_round(run)["synthesizer/contact"] > 0 and not run.memory.rows
 
 
 def test_without_a_synthesizer_given_the_traffic_method_attacks():
     config = config_of("learner.round.nominal=log", "curriculum.solvable_only=false", *POLICY)
     run = build_evolution(config, small_scenes(3), build_ego(config), Ambush())
-    metrics = run.run_round()
+    metrics = train_round(run)
     assert metrics["synthesizer/attacked"] == metrics["synthesizer/contact"] == 1.0
     assert run.memory.rows == 2
 
@@ -98,15 +86,15 @@ def test_without_a_synthesizer_given_the_traffic_method_attacks():
 def test_a_curriculum_of_ones_own_is_built_and_resumed(tmp_path):
     config = config_of(*POLICY)
     with open_dict(config):
-        config.curriculum = {"_target_": f"{__name__}.Doubling", "first": 0.25, "staleness": 0.5}
+        config.curriculum = {"_target_": f"{__name__}.Doubling", "first": 0.25, "prioritised": False}
     run = built(config, tmp_path)
-    assert isinstance(run.curriculum, Doubling) and run.curriculum.staleness == 0.5
-    assert run.run_round()["curriculum/eta"] == 0.25
+    assert isinstance(run.curriculum, Doubling) and not run.curriculum.prioritised
+    assert train_round(run)["curriculum/eta"] == 0.25
     save_checkpoint(tmp_path, run, {})
     again = built(config, tmp_path)
     assert load_checkpoint(tmp_path, again) == 1
     assert again.curriculum.eta == run.curriculum.eta == 0.5
-    assert again.run_round()["curriculum/eta"] == 0.5
+    assert train_round(again)["curriculum/eta"] == 0.5
 
 
 def test_templates_for_traffic_without_any_are_refused_at_the_start():
@@ -116,17 +104,7 @@ def test_templates_for_traffic_without_any_are_refused_at_the_start():
             built(config)
 
 
-def test_imitation_stage(tmp_path):
-    config, scenes = config_of(*POLICY), small_scenes(3)
-    row = run_imitation(config, scenes, build_ego(config), tmp_path, build_logger(config, tmp_path))
-    assert row["epoch"] == 0.0 and (tmp_path / "actor.safetensors").is_file()
-    assert (tmp_path / "logs/scalars/train/imitation_loss.csv").is_file()
-
-
-def test_mismatched_groups_are_refused(tmp_path):
-    config, scenes = config_of(*PLANNER), small_scenes(3)
-    with pytest.raises(InputError, match="stage=imitation"):
-        run_imitation(config, scenes, build_ego(config), tmp_path)
+def test_mismatched_groups_are_refused():
     with pytest.raises(InputError, match="improves ego=actor"):
         built(config_of("ego=idm"))
     for group, target in (("learner", "e2rl.planners.idm_planner.IDMEgo"), ("curriculum", "e2rl.no.Such")):
@@ -138,6 +116,16 @@ def test_mismatched_groups_are_refused(tmp_path):
         built(config_of("+learner.ppo.clipp=1", *POLICY))
 
 
-@pytest.mark.parametrize("kind", ["csv", "tensorboard", "wandb", "none"])
-def test_logger_groups_name_their_kind(kind):
-    assert config_of(f"logger={kind}").logger.kind == kind
+def test_the_time_left_is_known_at_once_and_follows_what_phases_take(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    progress = build_progress(load_config("train", ["rounds=2"]))
+    assert progress.left().startswith("about ") and progress.left().endswith(" min left")
+    for kind, seconds in (("begin", 5), ("measurement", 600), ("round", 60)):
+        with progress.phase(kind):
+            now[0] += seconds
+    assert progress.left() == "about 11 min left", "a round of 60 s and a measurement of 600 s"
+    for kind in ("round", "measurement"):
+        with progress.phase(kind):
+            now[0] += 10
+    assert progress.left() == "done"

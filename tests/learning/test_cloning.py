@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import BCLoss
 
-from e2rl.learning.cloning import LABEL_WIDTH, cloning_loss, drawn, mirrored_pairs, teaching_loss
+from e2rl.learning.cloning import LABEL_WIDTH, cloning_loss, drawn, mirrored_demonstrations, teaching_loss
 from e2rl.planners.actor import ActorEgo
 from e2rl.sim.observation import OBSERVATION_SIZE, mirrored
 
@@ -17,8 +17,8 @@ def network():
     return ego.network
 
 
-def pairs(action, weight):
-    """Pairs [5] at random observations with labels action [C, 2] and weight [C]."""
+def shown(action, weight):
+    """Demonstrations [5] at random observations with labels action [C, 2] and weight [C]."""
     action, weight = torch.tensor(action), torch.tensor(weight)
     observation = torch.randn(5, OBSERVATION_SIZE, generator=torch.Generator().manual_seed(1))
     labels = {"action": action.expand(5, -1, -1), "weight": weight.expand(5, -1)}
@@ -33,15 +33,15 @@ def gradient(actor, given):
 
 
 def test_one_label_is_the_hard_loss():
-    actor, given = network(), pairs([[-3.0, 0.2]], [1.0])
+    actor, given = network(), shown([[-3.0, 0.2]], [1.0])
     hard = TensorDict({"observation": given["observation"], "action": given["action"][:, 0]}, [5])
     torch.testing.assert_close(cloning_loss(actor.actor, given), BCLoss(actor.actor)(hard)["loss_bc"])
 
 
 def test_loss_and_gradient_are_the_weighted_means_of_those_of_the_labels():
     actor, actions, weights = network(), [[-3.0, 0.2], [1.0, -0.4], [2.0, 0.0]], [0.5, 0.3, 0.2]
-    soft = gradient(actor, pairs(actions, weights))
-    single = [gradient(actor, pairs([action], [1.0])) for action in actions]
+    soft = gradient(actor, shown(actions, weights))
+    single = [gradient(actor, shown([action], [1.0])) for action in actions]
     for found, of_each in zip(soft, zip(*single, strict=True), strict=True):
         expected = sum(weight * each for weight, each in zip(weights, of_each, strict=True))
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
@@ -49,36 +49,13 @@ def test_loss_and_gradient_are_the_weighted_means_of_those_of_the_labels():
 
 def test_a_label_without_weight_changes_nothing():
     actor = network()
-    one, two = pairs([[-3.0, 0.2]], [1.0]), pairs([[-3.0, 0.2], [4.0, 1.0]], [1.0, 0.0])
+    one, two = shown([[-3.0, 0.2]], [1.0]), shown([[-3.0, 0.2], [4.0, 1.0]], [1.0, 0.0])
     assert cloning_loss(actor.actor, one) == cloning_loss(actor.actor, two)
-
-
-def test_the_minimum_between_two_labels_is_their_mean_before_squashing():
-    """A density of one mode cannot hold two: it stands between them, and as wide as they are apart."""
-    actor = network()
-    actions = torch.tensor([[-4.0, 0.5], [2.0, -0.1]])
-    at = ((actions - actor.network.middle) / actor.network.reach).atanh()
-
-    class Fixed(torch.nn.Module):
-        """A density with these parameters at every observation."""
-
-        def __init__(self, loc, scale):
-            super().__init__()
-            self.loc, self.scale = torch.nn.Parameter(loc), torch.nn.Parameter(scale)
-
-        def forward(self, observation):
-            return self.loc.expand(len(observation), 2), self.scale.expand(len(observation), 2)
-
-    fixed = Fixed(at.mean(0), at.std(0, correction=0))
-    actor.actor.module[0].module = fixed
-    loss = cloning_loss(actor.actor, pairs(actions.tolist(), [0.5, 0.5]))
-    for part in torch.autograd.grad(loss, list(fixed.parameters())):
-        torch.testing.assert_close(part, torch.zeros(2), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("count", [9, 10, 11])
 def test_kinds_share_a_minibatch_evenly_whatever_their_sizes(count):
-    few, many = pairs([[-3.0, 0.2]], [1.0])[:1], pairs([[1.0, 0.0], [2.0, 0.0]], [0.25, 0.75]).repeat(100)
+    few, many = shown([[-3.0, 0.2]], [1.0])[:1], shown([[1.0, 0.0], [2.0, 0.0]], [0.25, 0.75]).repeat(100)
     found = drawn([few, many], count)
     first = found["action"][:, 0, 0] == -3.0
     assert len(found) == count and abs(int(first.sum()) - count / 2) < 1
@@ -90,7 +67,7 @@ def taught(actions, weights, acted):
     """The teaching loss of a policy that acts as `acted` [2] everywhere, and its gradient there."""
     policy, acted = network().network, torch.nn.Parameter(torch.tensor(acted))
     policy.deterministic = lambda observation: acted.expand(len(observation), 2)
-    loss = teaching_loss(policy, pairs(actions, weights))
+    loss = teaching_loss(policy, shown(actions, weights))
     return loss.item(), torch.autograd.grad(loss, acted)[0]
 
 
@@ -113,7 +90,7 @@ def test_what_speaks_for_a_label_counts():
 
 def test_teaching_leaves_the_explorations_width_alone():
     policy = network().network
-    loss = teaching_loss(policy, pairs([[-3.0, 0.2], [1.0, -0.4]], [1.0, 0.0]))  # a weight of 0 fills up
+    loss = teaching_loss(policy, shown([[-3.0, 0.2], [1.0, -0.4]], [1.0, 0.0]))  # a weight of 0 fills up
     assert torch.autograd.grad(loss, policy.spread, allow_unused=True, retain_graph=True) == (None,)
     assert all(part.isfinite().all() for part in torch.autograd.grad(loss, list(policy.trunk.parameters())))
 
@@ -122,12 +99,12 @@ def test_a_teaching_error_of_the_labels_width_costs_one_half_each():
     policy = network().network
     wide = policy.reach * torch.tensor(LABEL_WIDTH)
     policy.deterministic = lambda observation: torch.zeros(len(observation), 2)
-    assert teaching_loss(policy, pairs([wide.tolist()], [1.0])).item() == pytest.approx(1.0)
+    assert teaching_loss(policy, shown([wide.tolist()], [1.0])).item() == pytest.approx(1.0)
 
 
 def test_what_is_right_in_a_scene_is_right_in_its_mirror():
-    found = pairs([[-3.0, 0.2], [1.0, -0.4]], [0.75, 0.25])
-    other = mirrored_pairs(found)
+    found = shown([[-3.0, 0.2], [1.0, -0.4]], [0.75, 0.25])
+    other = mirrored_demonstrations(found)
     assert torch.equal(other["action"], found["action"] * torch.tensor([1.0, -1.0]))
     assert torch.equal(other["weight"], found["weight"])
     assert torch.equal(other["observation"], mirrored(found["observation"]))

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from e2rl.scripts.train import train_round
 
 from e2rl.learning.bandit import BanditCurriculum
 from e2rl.learning.evolution import Evolution, RoundSettings
@@ -25,7 +26,7 @@ def test_a_round_improves_moves_on_and_reports():
     attack, asked = run.synthesize, []
     run.synthesize = lambda ego, index, eta, seed: asked.append((ego, eta, seed)) or attack(ego, index, eta, seed)
     before = {key: value.clone() for key, value in run.ego.network.weights().items()}
-    metrics = run.run_round()
+    metrics = train_round(run)
     etas = [eta.tolist() for _, eta, _ in asked]
     assert etas == [[1.0] * 3, [0.0] * 3], "the attack, then the same scenes by the prior alone"
     assert asked[0][0] is run.ego and asked[0][2] == asked[1][2]
@@ -33,7 +34,7 @@ def test_a_round_improves_moves_on_and_reports():
     assert run.round == 1 and all(name.split("/")[0] in GROUPS for name in metrics)
     assert metrics["curriculum/eta"] == 1.0 and run.curriculum.eta == 1.25, "no contact at eta 1: it rises"
     assert all(isinstance(value, float) for value in metrics.values())
-    run.run_round()
+    train_round(run)
     assert asked[2][2] != asked[0][2], "another round, another seed"
 
 
@@ -42,7 +43,7 @@ def test_a_data_set_made_once_meets_the_policy_that_the_run_began_with():
     attack, met = run.synthesize, []
     run.synthesize = lambda ego, *given: met.append(copy.deepcopy(ego.network.weights())) or attack(ego, *given)
     for _ in range(2):
-        run.run_round()
+        train_round(run)
     assert any(not torch.equal(value, begun[key]) for key, value in run.ego.network.weights().items())
     assert all(torch.equal(value, begun[key]) for weights in met for key, value in weights.items())
     with pytest.raises(InputError, match=r"against=start"):
@@ -53,10 +54,10 @@ def test_templates_are_given_to_the_attack_only_where_one_is_not_full():
     run = small_run(nominal="prior")
     attack, asked = run.synthesize, []
     run.synthesize = lambda ego, index, eta, seed, *limits: asked.append(limits) or attack(ego, index, eta, seed)
-    run.run_round()
+    train_round(run)
     run.curriculum = BanditCurriculum(4, 4, etas=[0.5, 2.0], templates=["pair", "chain"])
     run.curriculum.round = 1
-    run.run_round()
+    train_round(run)
     assert asked[:2] == [(), ()] and asked[3] == (), "the nominal traffic has none"
     assert set(asked[2][0].tolist()) <= {PAIR, CHAIN}
     newest = run.memory.rounds[-1].traffic["template"].tolist()
@@ -67,7 +68,7 @@ def test_templates_are_given_to_the_attack_only_where_one_is_not_full():
 @pytest.mark.parametrize("live", [None, Ambush()], ids=["replay", "live"])
 def test_a_round_s_choices_and_their_outcomes_are_counted(live):
     run = small_run(live=live)
-    metrics = run.run_round()
+    metrics = train_round(run)
     (row,) = run.choices
     assert (row["round"], row["eta"], row["template"], row["draws"]) == (0, 1.0, "full", 3)
     own = run.episodes.adversarial
@@ -77,14 +78,14 @@ def test_a_round_s_choices_and_their_outcomes_are_counted(live):
 
 def test_contacts_of_the_attack_lower_the_intensity():
     run = small_run()
-    etas = [run.run_round()["curriculum/eta"] for _ in range(4)]
+    etas = [train_round(run)["curriculum/eta"] for _ in range(4)]
     assert etas == [1.0, 1.25, 1.0, 1.25], "the trivial synthesizer hits above eta 1"
 
 
 def test_nominal_traffic_may_be_the_log_or_missing():
     for nominal, kinds in (("log", {True, False}), ("none", {True})):
         run = small_run(nominal=nominal)
-        run.run_round()
+        train_round(run)
         assert set(run.episodes.adversarial.tolist()) == kinds
     with pytest.raises(InputError, match="nominal=zero"):
         RoundSettings(nominal="zero")
@@ -96,9 +97,9 @@ def test_nominal_traffic_may_be_the_log_or_missing():
         RoundSettings(fresh=0.5)
 
 
-def test_recorded_pairs_are_cloned():
-    metrics = small_run(expert={"recorded": True, "imitation": {"drives": 0}}, cloning=0.5).run_round()
-    assert metrics["train/recorded_pairs"] == metrics["train/expert_pairs"] == 4 * 20 and metrics["time/pairs"] > 0
+def test_recorded_egos_are_cloned():
+    metrics = train_round(small_run(expert={"recorded": True}, cloning=0.5))
+    assert metrics["train/recorded_demonstrations"] >= 4 * 20 and metrics["time/demonstrations"] > 0
     assert "train/loss_cloning" in metrics
 
 
@@ -114,7 +115,7 @@ def test_live_traffic_reacts_to_the_learning_policy():
     run = small_run(nominal="prior", live=Watched())
     run.synthesize = None
     before = {key: value.clone() for key, value in run.ego.network.weights().items()}
-    metrics = run.run_round()
+    metrics = train_round(run)
     assert all(math.isfinite(value) for value in metrics.values())
     given, planned, straight = told[0]
     torch.testing.assert_close(given, planned)
@@ -134,7 +135,7 @@ def planner_run(space, live=None):
 
 def test_planners_are_tuned_and_attacked_as_tuned():
     run = planner_run({"desired_speed": [0.1, 12.0]})
-    metrics = run.run_round()
+    metrics = train_round(run)
     assert metrics["train/trials"] == 3 and len(run.improve.trials) == 3
     assert run.ego.desired_speed > 5, "standing still is no improvement"
     assert metrics["train/objective"] <= metrics["train/objective_before"]
@@ -143,14 +144,14 @@ def test_planners_are_tuned_and_attacked_as_tuned():
     attack = run.synthesize
     run.synthesize = lambda ego, *rest: asked.append(ego) or attack(ego, *rest)
     current = run.ego
-    run.run_round()
+    train_round(run)
     assert asked == [current]
 
 
 def test_unfit_combinations_are_refused():
     scenes = small_scenes()
     with pytest.raises(InputError, match="speeed"):
-        planner_run({"speeed": [1.0, 2.0]}).run_round()
+        train_round(planner_run({"speeed": [1.0, 2.0]}))
     with pytest.raises(InputError, match="improves ego=actor"):
         PolicyImprovement(LaneGraphEgo(), scenes, SimSettings())
     with pytest.raises(InputError, match="cannot hold an episode"):
@@ -160,9 +161,9 @@ def test_unfit_combinations_are_refused():
 
 
 def test_a_run_with_reacting_vehicles_goes_on_from_its_state():
-    settings = {"react": {"share": 1.0, "others": 0.0}}
+    settings = {"react": {"fraction": 1.0, "others": 0.0}}
     run, other = (small_run(expert=settings) for _ in range(2))
-    run.run_round()
+    train_round(run)
     assert run.improve.synthesizer.reaction is run.improve.reaction
     drawn = run.improve.reaction.generator.get_state()
     other.improve.load_state_dict(run.improve.state_dict())

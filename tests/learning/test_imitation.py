@@ -1,10 +1,11 @@
-"""Expert pairs come from the log, cloning fits them, and disturbed ones lead back to the lane."""
+"""Demonstrations come from the log, cloning fits them, and disturbed ones lead back to the lane."""
 
 import pytest
 import torch
 
+from e2rl.learning import imitation
 from e2rl.learning.cloning import clip_expert
-from e2rl.learning.imitation import Imitation, ImitationSettings, imitate, recorded_pairs
+from e2rl.learning.imitation import Imitation, ImitationSettings, recorded_demonstrations
 from e2rl.learning.logging import RunLogger
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.reference import executed_action
@@ -27,20 +28,21 @@ def settings(**changes):
     return ImitationSettings(**({"epochs": 8, "minibatch": 32, "learning_rate": 3e-3, "held_out": 0.25} | changes))
 
 
-def test_replayed_pairs_are_the_inverse_dynamics_of_the_log():
-    pairs = recorded_pairs(braking_log(), SimSettings(), settings(drives=0))
-    assert len(pairs) == 4 * 20 and pairs["scene_index"].unique().tolist() == [0, 1, 2, 3]
-    assert torch.allclose(pairs["action"], torch.tensor([-2.0, 0.0]).expand(80, 1, 2), atol=2e-3)
-    last = executed_action(pairs["observation"]).view(4, 20, 2)
-    assert torch.allclose(last[:, 1:], pairs["action"].view(4, 20, 2)[:, :-1], atol=2e-3), "in order of time"
+def test_replayed_demonstrations_are_the_inverse_dynamics_of_the_log():
+    shown = recorded_demonstrations(braking_log(), SimSettings(), 0, drives=0)
+    assert len(shown) == 4 * 20 and shown["scene_index"].unique().tolist() == [0, 1, 2, 3]
+    assert torch.allclose(shown["action"], torch.tensor([-2.0, 0.0]).expand(80, 1, 2), atol=2e-3)
+    last = executed_action(shown["observation"]).view(4, 20, 2)
+    assert torch.allclose(last[:, 1:], shown["action"].view(4, 20, 2)[:, :-1], atol=2e-3), "in order of time"
 
 
-def test_disturbed_pairs_lead_back():
+def test_disturbed_demonstrations_lead_back(monkeypatch):
     """Where the ego has turned off its track the label turns it back."""
-    pairs = recorded_pairs(braking_log(8), SimSettings(), settings(drives=3, disturbed_yaw_rate=0.2))
-    sideways, turned = 3 * pairs["observation"][:, 3], pairs["observation"][:, 4]
+    monkeypatch.setattr(imitation, "DISTURBED", (1.0, 0.2))
+    shown = recorded_demonstrations(braking_log(8), SimSettings(), 0)
+    sideways, turned = 3 * shown["observation"][:, 3], shown["observation"][:, 4]
     off = (sideways.abs() > 0.1) & (sideways * turned > 0)
-    assert off.sum() > 20 and (pairs["action"][off, 0, 1].sign() == -sideways[off].sign()).float().mean() > 0.9
+    assert off.sum() > 20 and (shown["action"][off, 0, 1].sign() == -sideways[off].sign()).float().mean() > 0.9
 
 
 def test_clipping_keeps_actions_off_the_bounds():
@@ -49,40 +51,29 @@ def test_clipping_keeps_actions_off_the_bounds():
     assert torch.allclose(clipped, torch.tensor([[4.935, -1.584], [0.0, 0.1]]))
 
 
-def test_cloning_reduces_the_held_out_loss_and_keeps_the_best_weights(tmp_path):
+def test_cloning_reduces_the_held_out_loss_and_takes_the_best_weights():
     torch.manual_seed(0)
     ego = ActorEgo(hidden=(32,))
-    pairs = recorded_pairs(braking_log(), SimSettings(), settings(drives=1))
-    before = Imitation(ego.network, pairs, settings()).measure(pairs)
-    best = imitate(ego.network, pairs, settings(), tmp_path)
-    assert best["held_out_loss"] < before[0] - 0.3 and best["held_out_miss"] < before[1] / 2
-    again = ActorEgo(hidden=(32,), checkpoint=str(tmp_path))
-    observation = pairs["observation"]
-    assert torch.equal(again.network.network.deterministic(observation), ego.network.network.deterministic(observation))
+    shown = recorded_demonstrations(braking_log(), SimSettings(), 0, drives=1)
+    training = Imitation(ego.network, shown, settings())
+    before = training.measure(training.held_out)
+    best = training.fit("imitation", 8)
+    assert best["held_out_loss"] < before["loss"] - 0.3 and best["held_out_miss"] < before["miss"] / 2
+    assert best["held_out_loss"] == min(row["held_out_loss"] for row in training.history)
+    assert training.measure(training.held_out)["loss"] == pytest.approx(best["held_out_loss"], abs=1e-6)
 
 
-@pytest.mark.parametrize("stop", [0, 1, 3])
-def test_cloning_that_was_interrupted_equals_one_that_was_not(tmp_path, monkeypatch, stop):
-    pairs, epoch = recorded_pairs(braking_log(), SimSettings(), settings(drives=1)), Imitation.epoch
+def test_cloning_that_was_interrupted_equals_one_that_was_not(tmp_path):
+    shown = recorded_demonstrations(braking_log(), SimSettings(), 0, drives=0)
 
-    def run(folder):
+    def run(folder, turns=4):
         torch.manual_seed(0)
         network = ActorEgo(hidden=(32,)).network
-        best = imitate(network, pairs, settings(epochs=5), folder, RunLogger("csv", folder), Parts(folder))
-        files = [
-            (folder / name).read_bytes() for name in ("actor.safetensors", "logs/scalars/train/imitation_loss.csv")
-        ]
-        return best, files, network.weights()
+        training = Imitation(network, shown, settings())
+        best = training.fit("imitation", turns, Parts(folder), None, RunLogger("csv", folder))
+        return best, (folder / "logs/scalars/train/imitation_loss.csv").read_text(), network.weights()
 
-    def stopped(training):
-        if len(training.history) == stop:
-            monkeypatch.undo()
-            raise KeyboardInterrupt
-        return epoch(training)
-
-    best, files, weights = run(tmp_path / "whole")
-    monkeypatch.setattr(Imitation, "epoch", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "parts")
+    best, log, weights = run(tmp_path / "whole")
+    run(tmp_path / "parts", 2)
     again = run(tmp_path / "parts")
-    assert again[:2] == (best, files) and all(torch.equal(again[2][name], value) for name, value in weights.items())
+    assert again[:2] == (best, log) and all(torch.equal(again[2][name], value) for name, value in weights.items())

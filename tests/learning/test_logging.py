@@ -1,9 +1,9 @@
 """Scalars land in a file each, in the known groups, and go on after a resume."""
 
 import pytest
-from PIL import Image
 
-from e2rl.learning.logging import RunLogger
+from e2rl.learning.logging import CHOICES, RunLogger
+from e2rl.learning.scheduler import COLUMNS
 from e2rl.run.errors import InputError
 
 
@@ -30,26 +30,6 @@ def test_unknown_groups_and_kinds_are_refused(tmp_path):
         RunLogger("paper", tmp_path)
 
 
-def test_wandb_is_offline(tmp_path, monkeypatch):
-    monkeypatch.setenv("WANDB_SILENT", "true")
-    logger = RunLogger("wandb", tmp_path, project="test")
-    logger.log({"train/loss": 1.0}, 1)
-    for suffix in ("png", "gif"):
-        path = tmp_path / f"picture.{suffix}"
-        Image.new("RGB", (8, 6), "red").save(path)
-        logger.show("train/picture", path, 1)
-    logger.close()
-    assert list((tmp_path / "wandb").glob("offline-run-*/*.wandb"))
-    media = list((tmp_path / "wandb").glob("offline-run-*/files/media/*/train/*"))
-    assert {path.suffix for path in media} == {".png", ".gif"}
-
-
-def test_a_missing_dashboard_names_its_extra(tmp_path, monkeypatch):
-    monkeypatch.setattr("e2rl.learning.logging.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pip install 'e2rl\[tensorboard\]'"):
-        RunLogger("tensorboard", tmp_path)
-
-
 def test_what_a_resumed_run_logs_again_is_not_doubled(tmp_path):
     """Also where the run was killed in the midst of a line."""
     RunLogger("csv", tmp_path).log({"train/loss": 0.5, "time/improve": 2.0}, 0)
@@ -62,3 +42,14 @@ def test_what_a_resumed_run_logs_again_is_not_doubled(tmp_path):
     scalars = tmp_path / "logs" / "scalars"
     assert (scalars / "train" / "loss.csv").read_text().split() == ["0,0.5", "1,0.25"]
     assert (scalars / "time" / "improve.csv").read_text().split() == ["0,2.0", "1,3.0"]
+
+
+def test_a_rounds_choices_stand_below_those_of_earlier_rounds(tmp_path):
+    def choice(number, draws):
+        return dict.fromkeys(COLUMNS, float("nan")) | {"round": number, "eta": 1.0, "template": "full", "draws": draws}
+
+    logger = RunLogger("csv", tmp_path)
+    for number, draws in ((0, 3), (1, 4), (1, 5)):  # a resumed run logs round 1 again
+        logger.log({"train/loss": 1.0}, number, [choice(number, draws)])
+    lines = (tmp_path / CHOICES).read_text().splitlines()
+    assert lines == [",".join(COLUMNS), "0,1.0,full,3,,,,,", "1,1.0,full,5,,,,,"]

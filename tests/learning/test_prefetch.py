@@ -2,7 +2,6 @@
 
 import os
 import signal
-import time
 
 import pytest
 import torch
@@ -43,23 +42,6 @@ def test_the_traffic_is_that_of_the_same_order_here():
     assert all(torch.equal(value, order.ego.network.weights()[name]) for name, value in kept.items())
     against_now = run.synthesize(run.ego, order.scenes, order.eta, order.seed)["states"]
     assert not torch.equal(against_now, found["states"][: len(order.scenes)])
-
-
-def test_results_do_not_depend_on_who_is_faster():
-    def driven(delay):
-        scenes = small_scenes()
-        run = small_run(scenes=scenes, prefetch=True, spread=0.5)
-        attack = brake_check(scenes)
-        run.synthesize = lambda *given: time.sleep(delay) or attack(*given)
-        metrics = [train_round(run) for _ in range(3)]
-        return [{name: row[name] for name in row if not name.startswith("time/")} for row in metrics], metrics
-
-    (quick, _), (slow, timed) = driven(0.0), driven(1.0)
-    assert quick == slow and timed[0]["time/waiting"] >= 1.0
-
-
-def test_without_it_nothing_waits_and_learning_acts_at_once():
-    assert "time/waiting" not in train_round(small_run())
 
 
 def test_a_process_that_dies_is_named_and_the_run_goes_on_from_its_checkpoint(tmp_path):

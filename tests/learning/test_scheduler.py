@@ -1,4 +1,4 @@
-"""Learnability, priorities and draws of scenes as defined; what counts for which attack; a state that goes on exactly."""
+"""Learnability, priorities and draws of scenes as defined; what counts for which attack; exact resume."""
 
 import pytest
 import torch

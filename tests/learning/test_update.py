@@ -1,18 +1,22 @@
 """The update improves the policy: it learns to drive where it stood, clones what it is shown, stops where it should."""
 
+import os
+import signal
+
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives.value import GAE
 
-from e2rl.learning.update import Learner, UpdateSettings, gentle_loss
+from e2rl.learning.update import Learner, UpdateSettings, action_penalty
 from e2rl.planners.actor import ActorEgo
+from e2rl.planners.network import ActorNetwork
+from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.sim.observation import OBSERVATION_SIZE, mirrored
+from e2rl.sim.observation import mirrored
 from tests.learning.small import small_scenes
 
 
@@ -28,6 +32,12 @@ def collector_of(env, ego, steps):
     )
 
 
+def settings_of(**changes):
+    """Without penalties and filters, which each have tests of their own."""
+    plain = {"action_penalty": 0.0, "advantage_filter": 0.0, "minibatch": 80}
+    return UpdateSettings(**plain | changes)
+
+
 def batch_of(ego, batch=8, steps=20):
     collector = collector_of(DrivingEnv(small_scenes(4), SimSettings(), batch), ego, steps)
     data = next(iter(collector))
@@ -38,8 +48,8 @@ def batch_of(ego, batch=8, steps=20):
 def expert_of(data, action):
     observation = data["observation"].reshape(-1, data["observation"].shape[-1])
     action = torch.tensor(action).expand(len(observation), 1, 2)
-    pairs = {"observation": observation, "action": action, "weight": torch.ones(len(observation), 1)}
-    return [TensorDict(pairs, [len(observation)])]
+    shown = {"observation": observation, "action": action, "weight": torch.ones(len(observation), 1)}
+    return [TensorDict(shown, [len(observation)])]
 
 
 def test_ppo_learns_to_drive_from_standing():
@@ -50,7 +60,7 @@ def test_ppo_learns_to_drive_from_standing():
     ego = ActorEgo(hidden=(32,), reference=False, initial_std=(0.4, 0.02))
     learner = Learner(
         ego.network,
-        UpdateSettings(learning_rate=1e-3, minibatch=240, gamma=0.95, critic_warmup=0, target_kl=0.2, epochs=6),
+        settings_of(learning_rate=1e-3, minibatch=240, gamma=0.95, critic_warmup=0, target_kl=0.2, epochs=6),
     )
     collector = collector_of(DrivingEnv(scenes, SimSettings(), 16), ego, 30)
     progress = []
@@ -66,7 +76,7 @@ def test_cloning_pulls_the_actor_towards_the_expert():
     torch.manual_seed(0)
     ego = ActorEgo(hidden=(16,))
     learner = Learner(
-        ego.network, UpdateSettings(critic_warmup=0, cloning=1.0, minibatch=80, learning_rate=3e-3, target_kl=1e9)
+        ego.network, settings_of(critic_warmup=0, cloning=1.0, minibatch=80, learning_rate=3e-3, target_kl=1e9)
     )
     data, losses = batch_of(ego), []
     expert = expert_of(data, [-3.0, 0.2])
@@ -79,7 +89,7 @@ def test_a_teacher_of_the_left_teaches_the_right_too():
     """Labels steer to the left; in the mirror of the same states, which nobody labelled, the policy steers right."""
     torch.manual_seed(0)
     ego = ActorEgo(hidden=(16,))
-    settings = UpdateSettings(critic_warmup=0, teaching=1.0, minibatch=80, learning_rate=3e-3, target_kl=1e9)
+    settings = settings_of(critic_warmup=0, teaching=1.0, minibatch=80, learning_rate=3e-3, target_kl=1e9)
     learner, (labels,) = Learner(ego.network, settings), expert_of(batch_of(ego), [0.0, 0.3])
 
     def turns():
@@ -92,23 +102,22 @@ def test_a_teacher_of_the_left_teaches_the_right_too():
     assert left > 0.05 and right < -0.05
 
 
-def test_a_gentle_learner_means_to_accelerate_less():
+def test_the_action_penalty_makes_meant_accelerations_smaller():
     """At equal data the price on the policy's own mean makes its accelerations smaller, and 0 changes nothing."""
     meant = {}
-    for gentle in (0.0, 5.0):
+    for price in (0.0, 5.0):
         torch.manual_seed(0)
         ego = ActorEgo(hidden=(16,))
-        learner = Learner(
-            ego.network, UpdateSettings(critic_warmup=0, gentle=gentle, minibatch=80, learning_rate=3e-3, target_kl=1e9)
-        )
+        settings = settings_of(critic_warmup=0, action_penalty=price, learning_rate=3e-3, target_kl=1e9)
+        learner = Learner(ego.network, settings)
         data = batch_of(ego)
         row = learner.update(data)
-        assert ("loss_gentle" in row) == (gentle > 0)
-        meant[gentle] = ego.network.network.deterministic(data["observation"])[..., 0].abs().mean().item()
+        assert ("action_penalty" in row) == (price > 0)
+        meant[price] = ego.network.network.deterministic(data["observation"])[..., 0].abs().mean().item()
     assert meant[5.0] < 0.9 * meant[0.0]
 
 
-def test_gentleness_is_asked_of_calm_frames_alone():
+def test_the_action_penalty_counts_calm_frames_alone():
     """Who is about to be hit may brake or accelerate as hard as it helps."""
     torch.manual_seed(0)
     ego = ActorEgo(hidden=(16,))
@@ -116,15 +125,15 @@ def test_gentleness_is_asked_of_calm_frames_alone():
     meant = ego.network.network.deterministic(data["observation"])[..., 0].abs()
     inputs = TensorDict(ego.network.prepared(data["observation"]), data.shape)
     for calm in (torch.rand(data.shape) < 0.5, torch.ones(data.shape, dtype=torch.bool)):
-        found = gentle_loss(ego.network.network, inputs.set("calm", calm)).item()
+        found = action_penalty(ego.network.network, inputs.set("calm", calm)).item()
         assert found == pytest.approx(meant[calm].mean().item() / 4, rel=1e-4)
-    assert gentle_loss(ego.network.network, inputs.set("calm", torch.zeros_like(calm))).item() == 0
+    assert action_penalty(ego.network.network, inputs.set("calm", torch.zeros_like(calm))).item() == 0
 
 
 def test_the_first_updates_fit_the_critic_alone():
     torch.manual_seed(0)
     ego = ActorEgo(hidden=(16,))
-    learner, data = Learner(ego.network, UpdateSettings(critic_warmup=1, minibatch=80)), batch_of(ego)
+    learner, data = Learner(ego.network, settings_of(critic_warmup=1, minibatch=80)), batch_of(ego)
     before = {key: value.clone() for key, value in ego.network.weights().items()}
     learner.update(data, expert_of(data, [1.0, 0.0]))
     changed = {key for key, value in ego.network.weights().items() if not torch.equal(value, before[key])}
@@ -136,7 +145,7 @@ def test_the_first_updates_fit_the_critic_alone():
 def test_passes_stop_at_the_target_kl():
     torch.manual_seed(0)
     ego = ActorEgo(hidden=(16,), initial_std=(0.05, 0.05))
-    settings = UpdateSettings(critic_warmup=0, learning_rate=0.05, minibatch=40, epochs=10, target_kl=0.01)
+    settings = settings_of(critic_warmup=0, learning_rate=0.05, minibatch=40, epochs=10, target_kl=0.01)
     row = Learner(ego.network, settings).update(batch_of(ego))
     assert row["stopped_by_kl"] == 1.0 and row["steps"] < 40
 
@@ -145,7 +154,7 @@ def test_advantages_are_those_of_torchrl():
     """Of one pass over the observations, where TorchRL takes two; with episodes that end and are cut off inside."""
     torch.manual_seed(0)
     ego = ActorEgo(hidden=(16,), initial_std=(0.9, 0.9))
-    learner, data = Learner(ego.network, UpdateSettings(gamma=0.9, lmbda=0.8)), batch_of(ego, 16, 50)
+    learner, data = Learner(ego.network, settings_of(gamma=0.9, lmbda=0.8)), batch_of(ego, 16, 50)
     assert data["next", "terminated"].any() and data["next", "truncated"].any()
     learner.returns.update(5 * torch.randn(100, 1) + 3)
     learner.network.normaliser.observe(data["observation"])
@@ -158,20 +167,6 @@ def test_advantages_are_those_of_torchrl():
         torch.testing.assert_close(value, expected[name], rtol=1e-4, atol=1e-4)
 
 
-def test_the_heads_act_and_value_as_the_network():
-    ego = ActorEgo(hidden=(16,))
-    torch.nn.init.normal_(ego.network.network.trunk.last.weight)
-    observation = torch.randn(7, OBSERVATION_SIZE)
-    actor, critic = ego.network.heads()
-    inputs = TensorDict(ego.network.prepared(observation), [7])
-    whole = TensorDict({"observation": observation}, [7])
-    for part, of in ((actor, ego.network.actor), (critic, ego.network.critic)):
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            part(inputs), of(whole)
-    for key in ("loc", "scale", "action", "state_value"):
-        assert torch.equal(inputs[key], whole[key]), key
-
-
 def test_the_critic_learns_values_of_any_size():
     """Its loss and error in units of the returns' spread do not depend on the reward's scale."""
     errors = []
@@ -180,15 +175,15 @@ def test_the_critic_learns_values_of_any_size():
         ego = ActorEgo(hidden=(16,))
         data = batch_of(ego)
         data["next", "reward"] *= scale
-        learner = Learner(ego.network, UpdateSettings(minibatch=40, critic_warmup=10, gamma=0.9))
+        learner = Learner(ego.network, settings_of(minibatch=40, critic_warmup=10, gamma=0.9))
         errors.append([learner.update(data)["loss_critic"] for _ in range(4)])
     assert errors[0][-1] < errors[0][0]
     torch.testing.assert_close(torch.tensor(errors[0]), torch.tensor(errors[1]), rtol=0.02, atol=1e-3)
 
 
-def test_the_learning_rate_falls_to_its_share_over_the_run():
+def test_the_learning_rate_falls_to_its_end_over_the_run():
     ego = ActorEgo(hidden=(16,))
-    settings, data = UpdateSettings(learning_rate=1e-3, final_lr=0.2, epochs=1), batch_of(ego)
+    settings, data = settings_of(learning_rate=1e-3, final_lr=0.2, epochs=1), batch_of(ego)
     learner = Learner(ego.network, settings, total=4)
     rates = [learner.update(data)["learning_rate"] for _ in range(6)]
     assert rates == pytest.approx([1e-3, 8e-4, 6e-4, 4e-4, 2e-4, 2e-4])
@@ -198,33 +193,52 @@ def test_the_learning_rate_falls_to_its_share_over_the_run():
 
 
 def test_frames_with_little_to_learn_are_left_out():
-    """Those below the share of the running maximum of |advantage|; none while the critic warms up."""
+    """Those below a fraction of the running maximum of |advantage|; none while the critic warms up."""
     torch.manual_seed(0)
     ego = ActorEgo(hidden=(16,))
     data = batch_of(ego)
-    learner = Learner(ego.network, UpdateSettings(advantage_filter=0.3, critic_warmup=1, epochs=1))
-    assert learner.update(data)["kept"] == 1.0
+    learner = Learner(ego.network, settings_of(advantage_filter=0.3, critic_warmup=1, epochs=1))
+    assert learner.update(data)["frames_used"] == 1.0
     seen = ego.network.prepared(data["observation"])["seen"]
     advantage, before = learner.advantages(data, seen)[0].abs(), learner.peak.clone()
     expected = (advantage >= 0.3 * (0.75 * before + 0.25 * advantage.max())).float().mean().item()
-    assert learner.update(data)["kept"] == pytest.approx(expected) and 0 < expected < 1
-    every = Learner(ego.network, UpdateSettings(advantage_filter=0.0, critic_warmup=0, epochs=1))
-    assert every.update(data)["kept"] == 1.0
+    assert learner.update(data)["frames_used"] == pytest.approx(expected) and 0 < expected < 1
+    every = Learner(ego.network, settings_of(advantage_filter=0.0, critic_warmup=0, epochs=1))
+    assert every.update(data)["frames_used"] == 1.0
 
 
-def test_losses_share_the_networks_parameters():
+def test_running_statistics_mix_the_past_and_a_batch():
+    """The normaliser sees a batch only after the passes over it, so that the collected probabilities stay right."""
+    torch.manual_seed(0)
     ego = ActorEgo(hidden=(16,))
-    learner = Learner(ego.network, UpdateSettings())
-    own = {id(value) for value in ego.network.parameters()}
-    assert {id(value) for value in learner.ppo.parameters()} == own
+    learner, data = Learner(ego.network, settings_of(epochs=1, critic_warmup=0)), batch_of(ego)
+    learner.update(data)
+    mean, peak = ego.network.normaliser.mean.clone(), learner.peak.clone()
+    other = batch_of(ego)
+    seen = ego.network.prepared(other["observation"])["seen"]
+    highest = learner.advantages(other, seen)[0].abs().max()
+    assert learner.update(other)["kl"] < 1e-2
+    assert not torch.equal(ego.network.normaliser.mean, mean)
+    torch.testing.assert_close(learner.peak, 0.75 * peak + 0.25 * highest)
 
 
 def test_all_values_are_floats_and_what_is_not_finite_is_refused():
     ego = ActorEgo(hidden=(16,))
-    learner, data = Learner(ego.network, UpdateSettings(critic_warmup=0)), batch_of(ego)
+    learner, data = Learner(ego.network, settings_of(critic_warmup=0)), batch_of(ego)
     row = learner.update(data)
     needed = {"loss_objective", "loss_critic", "kl", "clip_fraction", "entropy", "explained_variance"}
     assert needed <= set(row) and all(isinstance(value, float) for value in row.values())
     data["next", "reward"] = data["next", "reward"] * torch.nan
     with pytest.raises(InputError, match="not finite"):
         learner.update(data)
+
+
+def test_an_interrupt_in_an_update_ends_in_one_line_that_says_how_to_go_on(monkeypatch, capsys):
+    """TensorDict runs the loss in a `with` block whose end turns the interrupt into an error of its own."""
+    ego = ActorEgo(hidden=(16,))
+    learner, data, head = Learner(ego.network, settings_of(critic_warmup=0)), batch_of(ego), ActorNetwork.head
+    monkeypatch.setattr(ActorNetwork, "head", lambda *given: os.kill(os.getpid(), signal.SIGTERM) or head(*given))
+    with pytest.raises(SystemExit) as end, ending("python train.py resume=RUN"):
+        learner.update(data)
+    assert end.value.code == 128 + signal.SIGTERM
+    assert capsys.readouterr().err.strip() == "interrupted (SIGTERM); go on with: python train.py resume=RUN"

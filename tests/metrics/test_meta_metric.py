@@ -1,21 +1,34 @@
-"""The meta-metric's likelihoods: closed forms of smoothed histograms, and what they do not depend on."""
+"""The meta-metric: closed forms of likelihoods and features, an oracle for distances, and invariances."""
+
+import math
 
 import pytest
 import torch
 
 from e2rl.metrics.meta_metric import (
+    FAR,
     FEATURES,
     HISTOGRAMS,
     INDICATIONS,
     SMOOTHING,
+    TTC_CAP,
     Feature,
+    beyond_road,
     bin_counts,
     bin_index,
+    central,
+    kinematics,
     likelihood,
     log_bernoulli,
     log_probability,
     meta_metric,
+    nearest_object,
+    runs_red_light,
+    time_to_collision,
+    track_features,
 )
+from e2rl.scenes.recording import DT, LIGHT_RED
+from tests.metrics.random_rollouts import random_rollouts
 
 ONE = torch.zeros(1, dtype=torch.int64)  # every track in scene 0
 
@@ -97,3 +110,225 @@ def test_a_scene_s_likelihood_is_the_geometric_mean_over_its_known_values():
     assert found[2].item() == pytest.approx((0.5 * 0.25 * 0.125) ** (1 / 3))
     order = torch.tensor([1, 2, 0])
     assert torch.allclose(likelihood(p.log()[order], known[order], scene[order], 3), found, equal_nan=True)
+
+
+CAR = (4.0, 2.0)
+GREEN = LIGHT_RED + 2
+
+
+def cars(*states):
+    """Arguments of the pairwise features for one step: the first car against the others."""
+    track = torch.tensor(states[:1], dtype=torch.float64)[:, None]
+    others = torch.tensor([[states[1:]]], dtype=torch.float64)
+    size = torch.tensor(CAR, dtype=torch.float64)
+    return [
+        track,
+        size[None],
+        others,
+        size.expand(1, len(states) - 1, 2),
+        torch.ones(1, 1, len(states) - 1, dtype=torch.bool),
+    ]
+
+
+def ttc(*states):
+    return time_to_collision(*cars(*states)).item()
+
+
+def test_a_steady_turn_has_its_speed_and_yaw_rate_and_edges_are_unknown():
+    time = DT * torch.arange(20, dtype=torch.float64)
+    heading = 3.0 + 0.3 * time  # over pi on the way: headings wrap
+    xy = 10 / 0.3 * torch.stack([heading.sin(), -heading.cos()], -1)
+    track = torch.cat([xy, ((heading + math.pi) % (2 * math.pi) - math.pi)[:, None], torch.zeros(20, 1)], -1)[None]
+    found = kinematics(track, torch.ones(1, 20, dtype=torch.bool))
+    expected = {"linear_speed": 10, "linear_accel": 0, "angular_speed": 0.3, "angular_accel": 0}
+    for name, (values, known) in found.items():
+        edge = 1 if name.endswith("speed") else 2
+        assert known[0].tolist() == [False] * edge + [True] * (20 - 2 * edge) + [False] * edge, name
+        torch.testing.assert_close(
+            values[0, edge:-edge], torch.full((20 - 2 * edge,), expected[name] + 0.0).double(), rtol=1e-3, atol=1e-6
+        )
+
+
+def test_central_differences_are_exact_for_parabolas_and_need_both_neighbours():
+    time = DT * torch.arange(12, dtype=torch.float64)
+    known = torch.ones(1, 12, dtype=torch.bool)
+    known[0, 6] = False
+    change, both = central((3 * time - 2 * time**2)[None], known)
+    assert (~both[0]).nonzero()[:, 0].tolist() == [0, 5, 7, 11]
+    torch.testing.assert_close(change[0], (3 - 4 * time) * both[0])
+
+
+def minkowski_distance(one, one_size, other, other_size):
+    """Signed distance of two boxes: of the origin from the border of their Minkowski difference."""
+    geometry = pytest.importorskip("shapely.geometry")
+    from e2rl.scenes.boxes import corners
+
+    differences = corners(one, one_size)[:, None] - corners(other, other_size)[None]
+    hull = geometry.MultiPoint(differences.reshape(-1, 2).tolist()).convex_hull
+    origin = geometry.Point(0, 0)
+    return -hull.exterior.distance(origin) if hull.contains(origin) else hull.distance(origin)
+
+
+def test_the_nearest_object_is_the_smallest_signed_distance():
+    generator = torch.Generator().manual_seed(0)
+    draw = lambda *shape: torch.rand(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
+    track, others = draw(25, 2, 4) * 8, draw(25, 2, 5, 4) * torch.tensor([30, 30, 7, 9]).double()
+    size, other_size = 1 + 5 * draw(25, 2), 0.5 + 11 * draw(25, 5, 2)
+    seen = draw(25, 2, 5) < 0.8
+    found = nearest_object(track, size, others, other_size, seen)
+    overlaps = 0
+    for m in range(25):
+        for t in range(2):
+            gaps = [
+                minkowski_distance(track[m, t], size[m], others[m, t, n], other_size[m, n])
+                for n in range(5)
+                if seen[m, t, n]
+            ]
+            expected = min(gaps, default=FAR)
+            overlaps += expected < 0
+            assert found[m, t].item() == pytest.approx(expected, abs=2e-6)
+    assert 5 < overlaps < 45, "the draw must hold boxes apart and overlapping ones"
+
+
+def test_nobody_is_far():
+    arguments = cars((0, 0, 0, 5), (3, 0, 0, 5))
+    arguments[-1] = torch.zeros_like(arguments[-1])
+    assert nearest_object(*arguments).item() == FAR and time_to_collision(*arguments).item() == TTC_CAP
+
+
+@pytest.mark.parametrize(("gap", "fast", "slow"), [(6.0, 10.0, 4.0), (1.0, 3.0, 0.0), (20.0, 15.0, 10.5)])
+def test_two_in_line_meet_after_gap_over_closing_speed(gap, fast, slow):
+    assert ttc((0, 0, 0, fast), (gap + 4, 0, 0, slow)) == pytest.approx(gap / (fast - slow))
+    assert ttc((0, 0, 0, slow), (gap + 4, 0, 0, fast)) == TTC_CAP, "it gets away"
+    assert ttc((gap + 4, 0, 0, fast), (0, 0, 0, slow)) == TTC_CAP, "it is behind"
+
+
+def test_a_slanting_leader_counts_by_its_speed_along_and_its_extent_along():
+    turn = 0.5
+    reach = 2 * math.cos(turn) + math.sin(turn)  # half extent of the leader's box along
+    expected = (12 - reach - 2) / (9 - 4 * math.cos(turn))
+    assert ttc((0, 0, 0, 9), (12, 0, turn, 4)) == pytest.approx(expected)
+
+
+def test_only_the_nearest_in_one_s_own_width_and_about_one_s_own_heading_is_ahead():
+    slow = (16, 0, 0, 4)
+    assert ttc((0, 0, 0, 10), slow, (26, 0, 0, 0)) == pytest.approx(2)
+    assert ttc((0, 0, 0, 10), (16, 2.01, 0, 4)) == TTC_CAP, "beside"
+    assert ttc((0, 0, 0, 10), (16, 1.99, 0, 4)) == pytest.approx(2), "a parallel one counts at the least overlap"
+    assert ttc((0, 0, 0, 10), (16, 2.2, 0.3, 4)) == TTC_CAP, "a slanting one at half a metre"
+    assert ttc((0, 0, 0, 10), (16, 0, 1.4, 4)) == TTC_CAP, "crossing"
+    assert ttc((0, 0, 0, 10), (16, 0, math.pi, 4)) == TTC_CAP, "oncoming"
+
+
+def test_metres_beyond_the_road_are_those_of_the_worst_corner():
+    x = torch.arange(60.0)
+    field = x[None, :, None].expand(1, 60, 60)  # metres beyond the line x = 30, exact under bilinear look-up
+    origin = torch.tensor([[-30.0, -30.0]])
+    for heading, reach in ((0.0, 2.0), (math.pi / 2, 1.0), (math.atan2(2, 4), math.hypot(2, 1) * math.cos(0))):
+        state = torch.tensor([[[[5.0, 3.0, heading, 0.0]]]])
+        found = beyond_road(state, torch.tensor([[CAR]]), field, origin).item()
+        assert found == pytest.approx(30 + 5 + reach, abs=1e-4)
+
+
+def crossing_of(light_state, known=None, light=(0, -1), speed=10.0):
+    """Whether a 4 m car that drives at `speed` from x = 0 runs one of its lights, stop line at 8 m."""
+    steps = light_state.shape[0]
+    track = torch.zeros(1, steps, 4)
+    track[0, :, 0] = speed * DT * torch.arange(steps)
+    known = torch.ones(1, steps, dtype=torch.bool) if known is None else known
+    route = torch.stack([2.0 * torch.arange(-5, 40), torch.zeros(45)], -1)[None]
+    return runs_red_light(
+        track, known, torch.tensor([CAR]), route, torch.tensor([light]), torch.tensor([[18.0, 0.0]]), light_state[None]
+    ).item()  # 18 m from the route's begin
+
+
+def test_a_red_light_is_run_when_the_front_passes_its_line_while_it_is_red():
+    """The front is at 2 m at the start and passes 8 m between steps 6 and 7."""
+    red, green = torch.full((20, 1), LIGHT_RED), torch.full((20, 1), GREEN)
+    early, late = red.clone(), red.clone()
+    early[5:], late[:9] = GREEN, GREEN
+    assert crossing_of(red) and not crossing_of(green)
+    assert not crossing_of(early) and not crossing_of(late), "red before or after only"
+    only, but = green.clone(), red.clone()
+    only[7], but[7] = LIGHT_RED, GREEN
+    assert crossing_of(only) and not crossing_of(but), "the colour once it is across counts"
+    assert not crossing_of(red, light=(-1, -1)), "no light of its route"
+    assert not crossing_of(red, speed=2.0), "it does not get there"
+    known = torch.ones(1, 20, dtype=torch.bool)
+    known[0, 5:9] = False
+    assert not crossing_of(red, known), "it was not there"
+    assert not crossing_of(red[:, :0]), "no light in the scene"
+
+
+def random_batch(seed=0):
+    """A batch of random rollouts on a road field that is the same everywhere, with a route and a light each."""
+    rollouts = random_rollouts(3, seed=seed, vehicles=8, others=3, steps=30, extent=25.0)
+    generator = torch.Generator().manual_seed(seed)
+    heading = rollouts.states[:, 0, :8, 2].nan_to_num()
+    forward = torch.stack([heading.cos(), heading.sin()], -1)[:, :, None]
+    points = rollouts.states[:, 0, :8, None, :2].nan_to_num() + 2.0 * torch.arange(40)[:, None] * forward
+    light = torch.randint(-1, 2, (3, 8, 2), generator=generator)
+    return {
+        "states": rollouts.states.nan_to_num(),
+        "valid": rollouts.valid,
+        "size": rollouts.size,
+        "field": torch.full((3, 400, 400), -1.5),
+        "field_origin": torch.full((3, 2), -200.0),
+        "light_state": torch.full((3, 31, 2), LIGHT_RED),
+        "route_points": points,
+        "route_light": light,
+        "route_light_s": 12 * torch.rand(3, 8, 2, generator=generator),
+    }
+
+
+def tracks():
+    return [index.flatten() for index in torch.meshgrid(torch.arange(3), torch.arange(1, 8), indexing="ij")]
+
+
+def compare(one, other):
+    for (name, (values, known)), (others, seen) in zip(one[0].items(), other[0].values(), strict=True):
+        assert torch.equal(known, seen), name
+        torch.testing.assert_close(others[known], values[known], rtol=2e-3, atol=2e-3, msg=name)
+    for name, event in one[1].items():
+        assert torch.equal(event, other[1][name]), name
+
+
+def test_features_do_not_depend_on_where_the_scene_lies():
+    batch, (rollout, agent) = random_batch(), tracks()
+    found = track_features(batch, rollout, agent)
+    assert found[1]["collision"].any() and found[1]["red_light"].any() and not found[1]["offroad"].any()
+    cos, sin = math.cos(0.7), math.sin(0.7)
+    turn, shift = torch.tensor([[cos, sin], [-sin, cos]]), torch.tensor([15.0, -8.0])
+    states = torch.cat(
+        [batch["states"][..., :2] @ turn + shift, batch["states"][..., 2:3] + 0.7, batch["states"][..., 3:]], -1
+    )
+    elsewhere = batch | {"states": states, "route_points": batch["route_points"] @ turn + shift}
+    compare(found, track_features(elsewhere, rollout, agent))
+
+
+def test_features_do_not_depend_on_the_order_of_agents_nor_on_who_is_asked_with_whom():
+    batch, (rollout, agent) = random_batch(1), tracks()
+    found = track_features(batch, rollout, agent)
+    order = torch.tensor([0, 5, 7, 1, 3, 2, 6, 4, 9, 10, 8])
+    other = batch | {
+        "states": batch["states"][:, :, order],
+        "valid": batch["valid"][:, :, order],
+        "size": batch["size"][:, order],
+    }
+    other |= {key: batch[key][:, order[:8]] for key in ("route_points", "route_light", "route_light_s")}
+    compare(found, track_features(other, rollout, order[:8].argsort()[agent]))
+    some = torch.tensor([17, 2, 9])
+    part = track_features(batch, rollout[some], agent[some])
+    compare(
+        (
+            {name: tuple(column[some] for column in pair) for name, pair in found[0].items()},
+            {name: event[some] for name, event in found[1].items()},
+        ),
+        part,
+    )
+
+
+def test_what_absent_agents_hold_does_not_matter():
+    batch, (rollout, agent) = random_batch(2), tracks()
+    wild = batch["states"].masked_fill(~batch["valid"][..., None], 500.0)  # off the map
+    compare(track_features(batch, rollout, agent), track_features(batch | {"states": wild}, rollout, agent))

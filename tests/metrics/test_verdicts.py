@@ -1,4 +1,4 @@
-"""The columns of verdicts: what counts, what is unknown, and that a red light needs to be known."""
+"""The verdict's columns: what counts, what is unknown, and the duty that a partner broke in constructed collisions."""
 
 import math
 
@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from e2rl.metrics.score import score_rollouts
-from e2rl.metrics.verdicts import DUTIES
+from e2rl.metrics.verdicts import DUTIES, Lanes, duties
 from tests.metrics.random_rollouts import random_rollouts
 from tests.metrics.test_failure_features import course, scene
+from tests.metrics.test_preventable import collision, cut_in, track
 
 
 def row_of(ego, partner, **extra):
@@ -52,3 +53,93 @@ def test_a_red_light_is_a_duty_where_it_is_known():
     ran[0, 1] = contact - 5
     assert row_of(ego, partner, ran_light=ran)["duty"] == "light"
     assert row_of(ego, partner, ran_light=torch.full((1, 2), -1))["duty"] == "none"
+
+
+NO_LANES = Lanes(torch.zeros(1, 2, 2, dtype=torch.float64), torch.full((1, 2), -1))
+
+
+def duty(case, rear=False, red=-1, lanes=NO_LANES):
+    return DUTIES[duties(case, torch.tensor([rear]), torch.tensor([red]), lanes).item()]
+
+
+def crossing(speed, from_left):
+    """A straight crossing of the ego at 10 m/s, whose front meets the other's side."""
+    sign = 1 if from_left else -1
+    return collision(track(10.0), track(speed, -sign * math.pi / 2, (40.0, sign * (speed * 3.6 + 0.0))))
+
+
+def test_who_runs_into_the_ego_from_behind_broke_the_duty_of_a_follower():
+    assert duty(collision(track(8.0), track(15.0, start=(-25.0, 0.0))), rear=True) == "rear-end"
+
+
+@pytest.mark.parametrize("gap, expected", [(3.0, "entry"), (25.0, "none")])
+def test_a_cut_in_owes_what_a_competent_driver_needs(gap, expected):
+    assert duty(collision(track(14.0), cut_in(gap, 14.0, 6.0))) == expected
+
+
+def test_a_leader_that_brakes_in_its_own_lane_breaks_no_duty():
+    slowing = track(torch.linspace(12, 0, 81).clamp(min=0), start=(12.0, 0.0))
+    assert duty(collision(track(12.0), slowing)) == "none"
+
+
+@pytest.mark.parametrize("from_left, expected", [(True, "right of way"), (False, "none")])
+def test_without_another_rule_who_comes_from_the_left_gives_way(from_left, expected):
+    assert duty(crossing(8.0, from_left)) == expected
+
+
+def test_a_red_light_counts_if_it_was_run_shortly_before():
+    case = crossing(8.0, from_left=False)
+    stop = case.stop.item()
+    assert duty(case, red=stop - 10) == "light"
+    assert duty(case, red=-1) == "none"
+
+
+def test_against_every_lane_that_it_is_on_is_the_wrong_way():
+    case = collision(track(8.0), track(8.0, math.pi, (60.0, 0.0)))
+    x = torch.arange(-20, 80, 2, dtype=torch.float64)
+    line = torch.stack([x, torch.zeros_like(x)], -1)[None]
+    with_ego = Lanes(line, torch.zeros(1, len(x), dtype=torch.long))
+    assert duty(case, lanes=with_ego) == "wrong way"
+    assert duty(case, lanes=Lanes(line.flip(1), with_ego.lane)) != "wrong way"
+
+
+def test_mirrored_collisions_but_for_the_side_that_gives_way_have_the_same_duty():
+    for case in (collision(track(14.0), cut_in(3.0, 14.0, 6.0, side=side)) for side in (1.0, -1.0)):
+        assert duty(case) == "entry"
+
+
+@pytest.mark.parametrize(("steps", "expected"), [(50, "light"), (51, "none"), (0, "light"), (-1, "none")])
+def test_a_red_light_counts_for_five_seconds(steps, expected):
+    case = collision(track(10.0), track(8.0, math.pi / 2, (70.0, -8.0 * 6.6)))  # from the right
+    assert duty(case, red=case.stop.item() - steps) == expected
+
+
+@pytest.mark.parametrize(("off_until", "fault"), [(19, 1.0), (20, 0.0), (26, 0.0)])
+def test_whoever_enters_the_ego_s_path_less_than_a_second_before_the_contact_cuts_in(off_until, fault):
+    """The ego's front meets at step 30 a partner that is beside its path up to the step `off_until`."""
+    states, valid = course(34.3, 0, 0, 0)
+    states[:, 3], states[: off_until + 1, 1] = 5.0, 10.0
+    found = row_of(course(0, 0, 0, 10), (states, valid))
+    assert (found["contact_step"], found["contact_type"], found["at_fault"]) == (30, "front", fault)
+
+
+@pytest.mark.parametrize(("ego", "partner", "fault"), [(0.09, 5.0, 0.0), (0.11, 5.0, 1.0), (10.0, 0.09, 1.0)])
+def test_who_stands_is_not_at_fault_and_who_hits_the_standing_is(ego, partner, fault):
+    """Speeds in the states alone: the ego's front is hit by a partner ahead that backs into it, or the other way."""
+    states, valid = course(10, 0, 0, 0)
+    states[:, 0] -= 0.2 * torch.arange(81)
+    states[:, 3] = partner
+    still = course(0, 0, 0, 0)
+    still[0][:, 3] = ego
+    assert row_of(still, (states, valid))["at_fault"] == fault
+
+
+def test_the_driver_of_the_verdict_goes_with_the_rollout():
+    """Its states begin as the ego's; it stays clear where the verdict says that the collision is preventable."""
+    rollouts = torch.cat([scene(course(0, 0, 0, 12), course(at, 0, 0, 3)) for at in (40.0, 400.0)])
+    rows = score_rollouts(rollouts)[0]
+    assert [row["preventable"] == 1 for row in rows] == [True, False]
+    assert rollouts.driver[1].isnan().all()
+    torch.testing.assert_close(rollouts.driver[0, 0, :2], rollouts.states[0, 0, 0, :2])
+    gap = rollouts.states[0, :, 1, 0] - rollouts.driver[0, :, 0]
+    assert gap.min() > 4.8 and (rollouts.driver[0, :, 3].diff() < 0).any()

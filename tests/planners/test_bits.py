@@ -19,7 +19,7 @@ from e2rl.planners.bits_network import (
     reach,
     save_bits,
 )
-from e2rl.planners.ego import PLAN_STEPS, EgoPolicy
+from e2rl.planners.ego import PLAN_STEPS
 from e2rl.run.errors import InputError
 from e2rl.sim import dynamics
 from e2rl.sim.env import DrivingEnv, SimSettings
@@ -67,20 +67,6 @@ def test_a_moved_scene_gets_the_moved_candidates():
     torch.testing.assert_close(ego.costs(there, second), ego.costs(here, first), atol=0.5, rtol=1e-2)
 
 
-def test_scenes_of_a_batch_do_not_mix():
-    """Planned together, beyond a chunk, or alone, a scene gets the same plan."""
-    scenes = make_scenes(66, vehicles=[(0.0, 0, 10.0), (22.0, 0, 6.0), (10.0, 1, 10.0), (-15.0, 0, 11.0)])
-    scenes.scenes["start"][1, 1:4, 0] += 6.0
-    scenes.scenes["valid"][2, 1:] = False
-    _, world = worlds(scenes)
-    ego = wild_ego()
-    together = ego.plan(world)
-    for k in (0, 1, 2, 65):
-        one = replace(scenes, scenes=scenes.scenes[k : k + 1], scene_id=["one"], location=["straight"])
-        torch.testing.assert_close(ego.plan(worlds(one)[1])[0], together[k], atol=1e-3, rtol=0)
-    assert not torch.allclose(together[1, :, 3], together[2, :, 3])
-
-
 def test_sees_neither_plans_nor_routes_nor_what_the_recording_goes_on_to_tell():
     _, world = worlds(make_scenes(2, num_vehicles=6))
     vehicles = world.scene["route_log"].shape[1]
@@ -90,14 +76,6 @@ def test_sees_neither_plans_nor_routes_nor_what_the_recording_goes_on_to_tell():
     ego = wild_ego()
     told = replace(world, scene=later, plan=plan, route=route, step=world.step + 60)
     assert torch.equal(ego.plan(told), ego.plan(world)), "nor the time"
-
-
-@pytest.mark.parametrize(("x", "halts"), [(50.0, True), (None, False)])
-def test_halts_at_a_red_light(x, halts):
-    env, _ = worlds(make_scenes(1, num_vehicles=1, num_vrus=0, red_light_x=x))
-    env.rollout(80, EgoPolicy(BitsEgo(), env))
-    state = env.world().states[0, 0]
-    assert (state[3] < 2.0 and 35 < state[0] < 47.8) if halts else state[0] > 55
 
 
 def test_the_bundled_weights_hit_less_than_untrained_ones():

@@ -4,10 +4,13 @@ import pytest
 import torch
 from torchrl.collectors import Collector
 
+from e2rl.planners.bits import BitsEgo
 from e2rl.planners.ego import PLAN_STEPS, Ego, EgoPlanner, EgoPolicy, track
 from e2rl.planners.idm_planner import IDMEgo
+from e2rl.planners.lane_graph_planner import LaneGraphEgo
 from e2rl.planners.log_replay import ReplayEgo
 from e2rl.planners.path import MissionPath
+from e2rl.planners.sampling import SamplingEgo
 from e2rl.run.config import built, load_choice
 from e2rl.run.errors import InputError
 from e2rl.sim import dynamics
@@ -123,3 +126,29 @@ def test_a_file_of_the_configuration_builds_its_ego(name):
     assert plan.shape == (2, PLAN_STEPS, 4) and torch.isfinite(plan).all()
     with pytest.raises(InputError, match=r"ego\.replan_every=0"):
         type(ego)(replan_every=0)
+
+
+@pytest.mark.parametrize("kind", [LaneGraphEgo, SamplingEgo, BitsEgo])
+def test_scenes_of_a_batch_do_not_mix(kind):
+    """Planned together, beyond a chunk, or alone, a scene gets the same plan."""
+    ego, count = kind(), 66 if kind is BitsEgo else 10
+    scenes = make_scenes(count, vehicles=[(0.0, 0, 10.0), (22.0, 0, 6.0), (10.0, 1, 10.0), (-15.0, 0, 11.0)])
+    scenes.scenes["start"][1, 1:4, 0] += 6.0
+    scenes.scenes["valid"][2, 1:] = False
+    env, index = make_env(scenes, count), torch.arange(count)[:, None]
+    env.reset(env.reset().select("scene_index").set("scene_index", index))
+    together = ego.plan(env.world())
+    alone = make_env(scenes, 1)
+    for k in (0, 1, 2, count - 1):
+        alone.reset(alone.reset().select("scene_index").set("scene_index", index[k : k + 1]))
+        torch.testing.assert_close(ego.plan(alone.world())[0], together[k], atol=1e-3, rtol=0)
+    assert not torch.allclose(together[1, :, 3], together[2, :, 3])
+
+
+@pytest.mark.parametrize("kind", [IDMEgo, LaneGraphEgo, SamplingEgo, BitsEgo])
+def test_a_red_light_is_halted_at_and_without_one_it_drives_on(kind):
+    for light, low, high in ((50.0, 35.0, 47.8), (None, 55.0, 1e3)):
+        env = make_env(make_scenes(1, num_vehicles=1, num_vrus=0, red_light_x=light), 1)
+        env.rollout(80, EgoPolicy(kind(), env))
+        state = env.world().states[0, 0]
+        assert low < state[0] < high and (state[3] < 2.5) == (light is not None)

@@ -28,8 +28,8 @@ from e2rl.sim.mission import mission_of
 from e2rl.sim.world import World
 from e2rl.traffic.rule_based import Replay
 from tests.planners.planners import SameLaw, command_of, wrong_planner
+from tests.run.test_endings import alive
 from tests.synthetic import make_scenes
-from tests.test_ending import alive
 
 BAD = 2  # the scene in which planners of these tests go wrong: its ego is at y = 3.5, in all others at 0
 ROAD = [(0.0, 0, 10.0), (25.0, 0, 6.0), (60.0, 1, 4.0)]
@@ -55,7 +55,7 @@ def run(ego, folder=None, processes=1, batch=4):
 def test_it_drives_as_the_same_law_inside(replan_every, red_light_x):
     scenes = scene_set(red_light_x=red_light_x)
     inside, outside = (
-        roll_out(scenes, ego, Replay())["states"]
+        roll_out(scenes, ego, Replay()).states
         for ego in (SameLaw(replan_every), ExternalEgo(command_of(), replan_every=replan_every))
     )
     assert torch.allclose(inside, outside, atol=1e-3)

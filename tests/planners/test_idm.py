@@ -27,11 +27,10 @@ def test_adjacent_lanes_do_not_lead():
     assert world.world().states[0, 0, 3] > 9.9
 
 
-def test_stops_at_a_red_light_and_behind_a_parked_car():
-    for scene in ({"red_light_x": 60.0}, {"vehicles": [(0.0, 0, 10.0), (62.0, 0, 0.0)]}):
-        env, data = drive(80, **({"num_vehicles": 1} | scene))
-        x, speed = env.world().states[0, 0, 0], env.world().states[0, 0, 3]
-        assert not data["next", "terminated"].any() and speed < 2.5 and 40 < x < 58
+def test_stops_behind_a_parked_car():
+    env, data = drive(80, vehicles=[(0.0, 0, 10.0), (62.0, 0, 0.0)])
+    x, speed = env.world().states[0, 0, 0], env.world().states[0, 0, 3]
+    assert not data["next", "terminated"].any() and speed < 2.5 and 40 < x < 58
 
 
 def test_returns_to_its_lane():

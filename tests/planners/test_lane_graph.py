@@ -30,13 +30,6 @@ def test_stops_behind_a_parked_car():
     assert not data["next", "terminated"].any() and state[3] < 1.0 and 20 < state[0] < 46
 
 
-def test_halts_at_a_red_light():
-    env, _ = world_of(num_vehicles=1, num_vrus=0, red_light_x=50.0)
-    env.rollout(80, EgoPolicy(LaneGraphEgo(), env))
-    state = env.world().states[0, 0]
-    assert state[3] < 0.5 and 44 < state[0] < 47.8
-
-
 def test_off_its_route_it_prefers_the_shortest():
     env, world = world_of(num_vehicles=1, num_vrus=0)
     ego = LaneGraphEgo()
@@ -67,22 +60,6 @@ def test_plan_is_a_drivable_continuation():
     assert (states[..., 3].diff(dim=1).abs() <= 0.4 + 1e-4).all()
     step = (states[:, 1:, :2] - states[:, :-1, :2]).norm(dim=-1)
     assert torch.allclose(step, (states[:, 1:, 3] + states[:, :-1, 3]) / 20, atol=1e-3)
-
-
-def test_scenes_of_a_batch_do_not_mix():
-    """Planned together or alone, a scene gets the same plan."""
-    scenes = make_scenes(3, num_vehicles=8)
-    scenes.scenes["start"][1, 1:8, 0] += 6.0
-    scenes.scenes["valid"][2, 1:] = False
-    env = DrivingEnv(scenes, SimSettings(), 3)
-    index = torch.arange(3)[:, None]
-    env.reset(env.reset().select("scene_index").set("scene_index", index))
-    together = LaneGraphEgo().plan(env.world())
-    for k in range(3):
-        alone = DrivingEnv(scenes, SimSettings(), 1)
-        alone.reset(alone.reset().select("scene_index").set("scene_index", index[k : k + 1]))
-        assert torch.allclose(LaneGraphEgo().plan(alone.world())[0], together[k], atol=1e-4)
-    assert not torch.allclose(together[0], together[1])
 
 
 def test_hazard_equals_its_definition():

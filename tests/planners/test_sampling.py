@@ -39,13 +39,6 @@ def test_stops_behind_a_standing_car_where_there_is_no_way_past():
     assert not data["next", "terminated"].any() and state[3] < 2.0 and 20 < state[0] < 45.0
 
 
-def test_halts_at_a_red_light():
-    env, _ = world_of(num_vehicles=1, num_vrus=0, red_light_x=50.0)
-    env.rollout(80, EgoPolicy(SamplingEgo(), env))
-    state = env.world().states[0, 0]
-    assert state[3] < 2.0 and 40 < state[0] < 47.8
-
-
 def test_boxed_in_it_is_never_worse_than_hard_braking():
     """Cars on both sides and one standing ahead, too near to stop: the plan hits no harder than braking would."""
     box = [(0.0, 0, 12.0), (11.0, 0, 0.0), (0.0, 1, 12.0), (-25.0, 0, 12.0)]
@@ -102,23 +95,6 @@ def test_a_mirrored_scene_gets_the_mirrored_plan(beside):
         plans.append(SamplingEgo().plan(env.world()) * torch.tensor([1.0, sign, sign, 1.0]))
     torch.testing.assert_close(*plans, atol=1e-3, rtol=0)
     assert plans[0][..., 1].abs().max() > 0.3
-
-
-def test_scenes_of_a_batch_do_not_mix():
-    """Planned together or alone, a scene gets the same plan."""
-    count = 10  # more than a chunk
-    scenes = make_scenes(count, vehicles=[(0.0, 0, 10.0), (22.0, 0, 6.0), (10.0, 1, 10.0), (-15.0, 0, 11.0)])
-    scenes.scenes["start"][1, 1:4, 0] += 6.0
-    scenes.scenes["valid"][2, 1:] = False
-    env = DrivingEnv(scenes, SimSettings(), count)
-    index = torch.arange(count)[:, None]
-    env.reset(env.reset().select("scene_index").set("scene_index", index))
-    together = SamplingEgo().plan(env.world())
-    for k in range(count):
-        alone = DrivingEnv(scenes, SimSettings(), 1)
-        alone.reset(alone.reset().select("scene_index").set("scene_index", index[k : k + 1]))
-        assert torch.allclose(SamplingEgo().plan(alone.world())[0], together[k], atol=1e-3)
-    assert not torch.allclose(together[1, :, 3], together[2, :, 3])
 
 
 def test_speed_profiles_keep_the_caps():

@@ -1,4 +1,4 @@
-"""The answer on the terminal: what it says of known rows, and that it fits 80 columns and 25 lines whatever it is told."""
+"""The answer on the terminal: what it says of known rows, and that it fits 80 columns and 25 lines."""
 
 import math
 

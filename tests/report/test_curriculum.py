@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from e2rl.learning.logging import CHOICES, RunLogger, write_choices
+from e2rl.learning.logging import RunLogger
 from e2rl.learning.scheduler import COLUMNS
-from e2rl.report.curriculum_figure import PICTURE, choice_map, draw_choices, grids
+from e2rl.report.curriculum_figure import CHOICES, PICTURE, choice_map, draw_choices, grids
 from e2rl.report.drawing import image_of
 from e2rl.run.errors import InputError
 
@@ -22,7 +22,7 @@ def row(number, eta, template, draws, episodes=0, failures=0):
 ROWS = [row(0, 1.0, "pair", 3, 4, 1), row(0, 0.5, "full", 1), row(1, 2.0, "single", 2, 5, 5), row(1, 1.0, "pair", 0)]
 
 
-def test_cells_are_shares_of_a_round_s_draws_and_of_failed_episodes():
+def test_cells_are_fractions_of_a_round_s_draws_and_of_failed_episodes():
     rounds, arms, share, rate = grids(ROWS)
     assert rounds == [0, 1] and arms == [("single", 2.0), ("pair", 1.0), ("full", 0.5)]
     np.testing.assert_array_equal(share, [[NAN, 1.0], [0.75, NAN], [0.25, NAN]])
@@ -43,7 +43,6 @@ def test_the_picture_is_drawn_from_the_file_of_a_run(tmp_path):
 
 
 def test_a_file_of_another_kind_is_named(tmp_path):
-    write_choices(tmp_path / CHOICES, ROWS)
     (tmp_path / CHOICES).write_text("round,eta\n0,1\n")
     with pytest.raises(InputError, match=r"curriculum\.csv: no table of a curriculum's choices"):
         draw_choices(tmp_path)

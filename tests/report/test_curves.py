@@ -14,7 +14,7 @@ from e2rl.report.curves import by_method, colour_of, main, points_of_rows, point
 from e2rl.run.errors import InputError
 from tests.report.test_tuning import trial
 
-MEASURED = {"aor_step": 0.001, "cfr_bg": 0.02, "real": 0.9, "passes": 640.0}
+MEASURED = {"aor_step": 0.001, "cfr_bg": 0.02, "real": 0.9, "nfe": 640.0}
 
 
 def tuning(best=None):
@@ -26,7 +26,7 @@ def tuning(best=None):
 
 
 def row(method, eta, cfr):
-    metrics = {"cfr": cfr, "cfr_counted": cfr / 2, "real": 0.9 - cfr / 10, "aor_step": 0.001, "passes": 144.0}
+    metrics = {"cfr": cfr, "cfr_counted": cfr / 2, "real": 0.9 - cfr / 10, "aor_step": 0.001, "nfe": 144.0}
     about = {"dataset": "d", "split": "s", "ego": "idm", "n_scenes": 12, "n_seeds": 1, "n_rollouts": 12, "paired": {}}
     known = {name: interval(value) for name, value in metrics.items()}
     return {**about, "method": method, "eta": eta, "metrics": known}
@@ -46,15 +46,15 @@ def test_a_run_s_points_stand_by_eta_and_the_tables_intensity_is_kept():
         "cat": [1, 4],
         "e2": [2],
     }
-    assert [point.kept for own in found.values() for point in own] == [True, False, False, True]
+    assert [point.chosen for own in found.values() for point in own] == [True, False, False, True]
 
 
 @pytest.mark.parametrize(("best", "expected"), [(None, []), (1, [(2.0, True)]), (3, [(1.0, False)])])
 def test_a_tuning_s_points_are_its_ladder_and_its_best_trial(best, expected):
-    """A best trial that differs from the ladder in more than the gain is a dot beside the curve."""
+    """A best trial that differs from the sweep in more than the gain is a dot beside the curve."""
     *points, nominal = points_of_tuning(tuning(best), "ctg_adv")
     assert sorted(point.value for point in points if point.on_curve) == [0.1, 0.5, 2.0]
-    assert [(point.value, point.on_curve) for point in points if point.kept] == expected
+    assert [(point.value, point.on_curve) for point in points if point.chosen] == expected
     assert (nominal.method, nominal.metrics["cfr"]["mean"], nominal.metrics["real"]["mean"]) == ("nominal", 0.05, 0.93)
     assert points[0].metrics["cfr"] == {"mean": 0.1, "low": 0.0, "high": 0.2}
     assert math.isnan(points[0].metrics["real"]["low"])
@@ -78,7 +78,7 @@ def test_runs_of_both_kinds_are_drawn_together(tmp_path, capsys):
     assert "curves.png" in capsys.readouterr().out
     with (tmp_path / "out" / "curves.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [(line["method"], line["dial"], float(line["value"]), line["kept"]) for line in rows] == [
+    assert [(line["method"], line["dial"], float(line["value"]), line["chosen"]) for line in rows] == [
         ("nominal", "eta", 0, "1"),
         ("cat", "eta", 1, "0"),
         ("cat", "eta", 4, "0"),
@@ -101,7 +101,7 @@ def test_a_folder_of_neither_kind_is_named(tmp_path):
         read_points(tuned)
 
 
-def test_no_rival_is_drawn_in_a_colour_near_ours():
+def test_no_baseline_is_drawn_in_a_colour_near_ours():
     ours = torch.tensor(to_rgb(colour_of("e2", 1)))
-    others = torch.tensor([to_rgb(colour_of(f"rival {number}", number)) for number in range(20)])
+    others = torch.tensor([to_rgb(colour_of(f"baseline {number}", number)) for number in range(20)])
     assert float((others - ours).norm(dim=-1).min()) > 0.25

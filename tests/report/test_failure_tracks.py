@@ -101,8 +101,10 @@ def test_the_map_is_the_rollout_s():
         drawn = encoded_map(rollout)
         for name in ("lane", "drivable"):
             points = decoded(drawn[f"{name}_points"]).reshape(2, -1).cumsum(-1).cumsum(-1) * 0.05
-            np.testing.assert_allclose(points.T, rollout[f"{name}_points"], atol=0.0255)
-            np.testing.assert_array_equal(decoded(drawn[f"{name}_counts"]), np.diff(rollout[f"{name}_offsets"]))
+            np.testing.assert_allclose(points.T, getattr(rollout, f"{name}_points"), atol=0.0255)
+            np.testing.assert_array_equal(
+                decoded(drawn[f"{name}_counts"]), np.diff(getattr(rollout, f"{name}_offsets"))
+            )
 
 
 def test_a_replay_of_48_agents_takes_less_than_25_kb():

@@ -7,7 +7,7 @@ import pytest
 
 from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.metrics.failure_modes import is_failure
-from e2rl.report import html
+from e2rl.report.html import PAGE, write_report
 from e2rl.sim.rollout_file import ROLLOUTS, Rollout, rollout_name
 from tests.report.failed_run import SCENE, failed_run
 
@@ -22,7 +22,10 @@ ActionChains = webdriver.ActionChains
 Keys = webdriver.Keys
 support = pytest.importorskip("selenium.webdriver.support.ui")
 Select, WebDriverWait = support.Select, support.WebDriverWait
-pytestmark = pytest.mark.skipif(not (CHROMIUM and DRIVER), reason="no chromium and chromedriver on the path")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not (CHROMIUM and DRIVER), reason="no chromium and chromedriver on the path"),
+]
 DECODE = """const done = arguments[1];
 page.store.replay(arguments[0]).then(({ replay }) => done(replay.tracks.map((track) =>
   Object.fromEntries(Object.keys(page.report.channels).map((name) => [name, Array.from(track[name])])))));"""
@@ -60,9 +63,9 @@ def chromium(tmp_path_factory):
 @pytest.fixture
 def page(run, chromium):
     """A browser with the report freshly open."""
-    html.main([str(run)])
+    write_report(run)
     chromium.get("about:blank")
-    chromium.get((run / html.PAGE).as_uri())
+    chromium.get((run / PAGE).as_uri())
     wait_for(chromium, "return page.player.replay !== null")
     return chromium
 
@@ -126,7 +129,7 @@ def test_the_browser_decodes_what_the_files_hold(run, page):
 
 def test_scrubbing_moves_the_ego_on_the_canvas(run, page):
     row = failures_of(run)[page.execute_script("return page.player.failure.number")]
-    states = Rollout.read(run / ROLLOUTS / rollout_name(row))["states"][:, 0]
+    states = Rollout.read(run / ROLLOUTS / rollout_name(row)).states[:, 0]
     between = (states[4] + states[5]) / 2
     np.testing.assert_allclose(page.execute_script(POSE_OF_THE_EGO, 4.5), between[[0, 1, 3]], atol=0.011)
     pictures = set()

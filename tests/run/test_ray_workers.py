@@ -8,6 +8,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 import torch
+from e2rl.scripts.train import train_round
 
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.learning.attack import make_traffic
@@ -78,12 +79,12 @@ def test_two_workers_one_killed_on_the_way_give_what_two_processes_give(tmp_path
 def test_workers_make_the_traffic_of_a_round_while_it_learns(workers):
     """The same D' as of the same order here, made against the policy before learning."""
     scene_set = small_scenes()
-    run = small_run(scenes=scene_set, nominal="prior", spread=0.5, ahead=True)
+    run = small_run(scenes=scene_set, nominal="prior", spread=0.5, prefetch=True)
     run.synthesize, run.batch, run.workers = synthesize_traffic(scene_set, Ambush(), SimSettings()), 2, workers
-    run.run_round()
+    train_round(run)
     order = run._next
-    expected = make_traffic(order, run.synthesize, batch=2)
-    run.run_round()
+    expected, _ = make_traffic(order, run.synthesize, batch=2)
+    train_round(run)
     found = run.memory.rounds[-1].traffic
     assert set(found) == set(expected) and order.number == run.memory.rounds[-1].number == 1
     assert all(torch.equal(found[name], expected[name]) for name in expected)

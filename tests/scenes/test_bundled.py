@@ -6,20 +6,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from shapely.geometry import Polygon
 
 from e2rl.run.errors import InputError
 from e2rl.scenes import bundled
-from e2rl.scenes.boxes import corners
-from e2rl.scenes.bundled import CURRENT, FRAMES, SPLITS, SceneMap, load_maps, load_recordings, read_recordings
-from e2rl.scenes.interaction import lateral_acceleration, overlap, overlapping_pairs
-from e2rl.scenes.paths import WHEELBASE, arc_length
+from e2rl.scenes.bundled import (
+    CURRENT,
+    FRAMES,
+    SPLITS,
+    SceneMap,
+    asset_bytes,
+    load_recordings,
+    read_maps,
+    read_recordings,
+    unpack,
+)
+from e2rl.scenes.paths import WHEELBASE, arc_length, wrap
 from e2rl.scenes.recording import DT, Lane, Recording
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 from scenegen.archive import pack  # noqa: E402
+from scenegen.interaction import interaction_score, lateral_acceleration, overlapping_pairs  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -32,69 +39,49 @@ def recordings(sets):
     return [recording for part in sets.values() for recording in part]
 
 
-def test_counts_and_splits(sets):
+def test_splits_share_no_place_and_are_small(sets):
     nets = {split: {recording.location for recording in part} for split, part in sets.items()}
-    assert sum(map(len, sets.values())) >= 180
-    assert sum(map(len, nets.values())) >= 60
+    assert sum(map(len, sets.values())) >= 180 and sum(map(len, nets.values())) >= 60
     assert not nets["train"] & nets["test"] and not nets["train"] & nets["tune"] and not nets["tune"] & nets["test"]
-    share = len(nets["train"]) / sum(map(len, nets.values()))
-    assert 0.5 < share < 0.7
+    assert 0.5 < len(nets["train"]) / sum(map(len, nets.values())) < 0.7
     ids = [recording.scene_id for part in sets.values() for recording in part]
-    assert len(set(ids)) == len(ids)
+    assert len(set(ids)) == len(ids) and sum(len(asset_bytes(split)) for split in SPLITS) < 10e6
 
 
-def test_assets_are_small():
-    assert sum(len(bundled.asset_bytes(split)) for split in SPLITS) < 10e6
-
-
-def test_ego_drives_and_keeps_off_the_border(recordings):
-    for recording in recordings:
-        assert recording.states.shape[0] == FRAMES and recording.current == CURRENT
-        assert recording.valid[:, recording.ego].all()
-        track = recording.states[CURRENT : CURRENT + 81, recording.ego, :2]
-        assert arc_length(track)[-1] > 20.0
-
-
-def test_speed_is_displacement_along_the_heading(recordings):
+def test_traffic_is_physical_and_the_ego_drives(recordings):
     for recording in recordings:
         states, valid = recording.states, recording.valid
+        assert len(states) == FRAMES and recording.current == CURRENT and valid[:, recording.ego].all()
+        assert arc_length(states[CURRENT : CURRENT + 81, recording.ego, :2])[-1] > 20.0
         inner = valid[2:] & valid[1:-1] & valid[:-2]
         velocity = (states[2:, :, :2] - states[:-2, :, :2]) / (2 * DT)
         speed, heading = states[1:-1, :, 3], states[1:-1, :, 2]
         along = velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)
         assert np.abs(along - speed)[inner].max() < 0.05  # positions are kept to 1 mm
         aside = velocity[..., 1] * np.cos(heading) - velocity[..., 0] * np.sin(heading)
-        turned = (states[2:, :, 2] - states[:-2, :, 2] + np.pi) % (2 * np.pi) - np.pi
-        yaw_rate = turned / (2 * DT)  # a rear axle without side slip, WHEELBASE / 2 lengths behind the centre
-        assert np.abs(aside - WHEELBASE / 2 * recording.size[:, 0] * yaw_rate)[inner].max() < 0.05
+        yaw_rate = wrap(states[2:, :, 2] - states[:-2, :, 2]) / (2 * DT)
+        slip = aside - WHEELBASE / 2 * recording.size[:, 0] * yaw_rate  # 0 of a rear axle that follows
+        assert np.abs(slip)[inner].max() < 0.05
+        assert np.abs(lateral_acceleration(states, valid)).max() < 5.05
+        assert np.abs(wrap(np.diff(states[..., 2], axis=0)))[valid[1:] & valid[:-1]].max() < 0.15
+        assert not len(overlapping_pairs(states, valid, recording.size - 0.01)), recording.scene_id  # quantisation
 
 
-def test_turning_is_physical(recordings):
-    for recording in recordings:
-        assert np.abs(lateral_acceleration(recording.states, recording.valid)).max() < 5.05
-        turn = np.diff(recording.states[..., 2], axis=0)[recording.valid[1:] & recording.valid[:-1]]
-        assert np.abs((turn + np.pi) % (2 * np.pi) - np.pi).max() < 0.15
-
-
-def test_no_overlaps(recordings):
-    for recording in recordings:
-        shrunk = recording.size - 0.01  # quantisation
-        assert not len(overlapping_pairs(recording.states, recording.valid, shrunk)), recording.scene_id
-
-
-def test_overlap_agrees_with_shapely():
-    rng = np.random.default_rng(0)
-    pose = np.concatenate([rng.uniform(-4, 4, (2, 300, 2)), rng.uniform(-4, 4, (2, 300, 1))], -1)
-    size = rng.uniform(1, 5, (2, 300, 2))
-    ours = overlap(pose[0], size[0], pose[1], size[1])
-    boxes = [[Polygon(box) for box in row] for row in corners(torch.from_numpy(pose), torch.from_numpy(size)).numpy()]
-    oracle = np.array([a.intersection(b).area > 1e-9 for a, b in zip(*boxes, strict=True)])
-    assert (ours == oracle).all() and 0.2 < oracle.mean() < 0.9
+def test_crossing_turning_and_neighbours_make_interaction():
+    frames = np.arange(0, 100) * DT
+    still, level = np.zeros(100), np.full(100, 10.0)
+    east = np.stack([10 * frames - 50, still, still, level], -1)
+    north = np.stack([still, 10 * frames - 50, still + np.pi / 2, level], -1)
+    far = east + [0, 300, 0, 0]
+    score = interaction_score(np.stack([east, north, far], 1), np.ones((100, 3), bool))
+    assert score[2] == 0 and score[0] == score[1] and 2 < score[0] < 3  # 2 for who crosses, part of the time beside it
+    bent = np.stack([20 * np.sin(frames / 2), 20 * (1 - np.cos(frames / 2)), wrap(frames / 2), level], -1)
+    assert interaction_score(bent[:, None], np.ones((100, 1), bool)).tolist() == [2.0]
 
 
 def test_lane_ends_meet():
     for split in SPLITS:
-        for scene_map in load_maps(split):
+        for scene_map in read_maps(unpack(asset_bytes(split), split)):
             for name, lane in scene_map.lanes.items():
                 assert arc_length(lane.points)[-1] >= 1.0, (scene_map.name, name)
                 assert 2.5 <= lane.width <= 6.0 and 2.0 < lane.speed_limit < 40.0
@@ -130,33 +117,14 @@ def small_set() -> tuple[SceneMap, Recording]:
         "b": Lane(np.eye(2), 3.5, 8.0),
         "c": Lane(np.array([[0.0, 3.4], [50.0, 5.0]]), 3.4, 13.9, right=["a"]),
     }
-    scene_map = SceneMap(
-        "here",
-        lanes,
-        [np.eye(3)[:, :2]],
-        {"b": rng.integers(0, 4, 200).astype(np.int8)},
-        rng.normal(size=(2, 3)),
-        np.full((2, 2), 2.0),
-    )
+    lights = {"b": rng.integers(0, 4, 200).astype(np.int8)}
+    scene_map = SceneMap("here", lanes, [np.eye(3)[:, :2]], lights, rng.normal(size=(2, 3)), np.full((2, 2), 2.0))
     states = rng.normal(size=(FRAMES, 3, 4)).cumsum(0)
     states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
     valid = rng.random((FRAMES, 3)) < 0.8
     valid[:, 1] = True
     states = np.where(valid[..., None], states, 0.0)
-    lights = {"b": scene_map.lights["b"][7 : 7 + FRAMES]}
-    return scene_map, Recording(
-        "x",
-        "here",
-        "bundled",
-        states,
-        valid,
-        np.full((3, 2), 2.5),
-        np.zeros(3, int),
-        1,
-        lanes,
-        scene_map.drivable,
-        lights,
-    )
+    return scene_map, scene_map.recording("x", 7, states, valid, np.full((3, 2), 2.5), 1)
 
 
 def test_round_trip():

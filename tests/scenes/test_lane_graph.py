@@ -1,10 +1,21 @@
 """Route candidates on a road that forks: every branch once, from where the vehicle is, to where the map ends."""
 
+import math
+
 import numpy as np
 import pytest
+import torch
 from shapely.geometry import LineString, Point
 
-from e2rl.scenes.lane_graph import LaneGraph, infer_exits, plausible_width
+from e2rl.scenes.lane_graph import (
+    SAME_GAP,
+    START_ANGLE,
+    START_RADIUS,
+    LaneGraph,
+    against_lanes,
+    infer_exits,
+    plausible_width,
+)
 from e2rl.scenes.log_route import MARGIN, route_from_log
 from e2rl.scenes.paths import resample
 from e2rl.scenes.recording import Lane
@@ -136,6 +147,62 @@ def test_lanes_too_short_are_left_out_and_widths_doubted():
     assert len(points) == 8 and np.allclose(points[3], [0, 3])
 
 
+def test_lanes_near_a_pose_are_told_best_first_with_their_arc_lengths():
+    """2.5 m of distance weigh as much as 1 rad of heading."""
+    rows = {
+        "low": Lane(np.array([[0.0, 0.0], [40.0, 0.0]])),
+        "high": Lane(np.array([[-20.0, 3.0], [40.0, 3.0]])),
+        "cross": Lane(np.array([[20.0, 1.0], [20.0 + 40 * np.cos(0.5), 1.0 + 40 * np.sin(0.5)]])),
+        "back": Lane(np.array([[40.0, 0.0], [0.0, 0.0]])),
+    }
+    graph = LaneGraph(rows)
+    assert graph.near_lanes(np.array([20.0, 1.0]), 0.0) == [("low", 20.0), ("cross", 0.0), ("high", 40.0)]
+    assert [name for name, _ in graph.near_lanes(np.array([20.0, 1.0]), 0.5)][0] == "cross"
+    assert [name for name, _ in graph.near_lanes(np.array([20.0, 1.2]), np.pi)] == ["back"]
+    only = LaneGraph({"low": rows["low"]})
+    for y, heading, near in ((START_RADIUS - 0.01, 0, 1), (START_RADIUS + 0.01, 0, 0), (0, START_ANGLE - 0.01, 1)):
+        assert len(only.near_lanes(np.array([20.0, y]), heading)) == near
+    assert not only.near_lanes(np.array([20.0, 0.0]), START_ANGLE + 0.01)
+
+
+def test_of_several_lanes_before_one_the_straightest_is_behind_as_far_as_asked():
+    bend = np.linspace(-np.pi / 2, 0, 30)
+    rows = {
+        "straight": Lane(np.array([[-30.0, 0.0], [0.0, 0.0]]), exits=["on"]),
+        "first": Lane(np.array([[-60.0, 0.0], [-30.0, 0.0]]), exits=["straight"]),
+        "bent": Lane(np.stack([30 * np.cos(bend) - 30, 30 * np.sin(bend)], 1)[::-1] * [1, -1], exits=["on"]),
+        "on": Lane(np.array([[0.0, 0.0], [50.0, 0.0]])),
+    }
+    graph = LaneGraph(rows)
+    assert graph.behind("on", 30.0) == ["straight"] and graph.behind("on", 30.5) == ["first", "straight"]
+    assert graph.behind("on", 0.0) == [] and graph.behind("first", 10.0) == []
+    assert graph.bend("bent") == pytest.approx(np.pi / 2, abs=0.1) and graph.bend("straight") == 0
+    left = LaneGraph(lanes())
+    assert left.turn("in", "left") == pytest.approx(np.pi / 2, abs=1e-6) and left.turn("in", "on") == 0
+
+
+@pytest.mark.parametrize(("apart", "count"), [(SAME_GAP - 0.01, 1), (SAME_GAP + 0.01, 2)])
+def test_routes_are_one_where_they_are_nowhere_farther_apart_than_the_gap(apart, count):
+    pair = {str(k): Lane(np.array([[0.0, k * apart], [400.0, k * apart]])) for k in range(2)}
+    assert len(LaneGraph(pair).candidates(np.array([50.0, 0.0]), 0.0, 8.0, 6, 150)) == count
+
+
+@pytest.mark.parametrize("speed", [0.0, 4.0, 8.0])
+def test_forks_count_that_a_vehicle_reaches_in_five_seconds(speed):
+    reach = min(max(5 * speed + 25, 40), 120)
+    end = 20 * np.ceil((60 + reach) / 20)  # in steps of BUCKET
+
+    def routes(fork):
+        rows = {
+            "in": Lane(np.array([[0.0, 0], [fork, 0]]), exits=["on", "off"]),
+            "on": Lane(np.array([[fork, 0.0], [fork + 300, 0]])),
+            "off": Lane(np.array([[fork, 0.0], [fork + 10, 15], [fork + 10, 300]])),
+        }
+        return len(LaneGraph(rows).candidates(np.array([60.0, 0.0]), 0.0, speed, 6, 150))
+
+    assert routes(end - 1.0) == 2 and routes(end + 1.0) == 1
+
+
 def lane_change() -> np.ndarray:
     """A track [81, 4] at 5 m/s from y = 0 to y = 3.5 between x = 20 and x = 60."""
     x = 20 + 0.5 * np.arange(81)
@@ -161,3 +228,30 @@ def test_a_recorded_way_off_the_map_ends_soon_after_the_recording():
     route = route_from_log(LaneGraph(lanes()), standing, 150)
     assert route.open and abs(route.length - 30.0) < 1e-6 and np.isfinite(route.points).all()
     assert np.allclose(route.points[10], [5, 100], atol=0.01)
+
+
+X = torch.arange(0.0, 40.0, 2.0)
+ROAD = torch.cat([torch.stack([X, 0 * X], -1), torch.stack([X.flip(0), 0 * X + 3.5], -1)])[None]
+LANE = torch.arange(2).repeat_interleave(len(X))[None]
+AHEAD = torch.tensor([[[0.0, math.pi, math.pi / 2]]])
+
+
+def against(y):
+    return against_lanes(ROAD, LANE, torch.tensor([[[20.0, y]]]), AHEAD)[0, 0].tolist()
+
+
+def test_a_vehicle_is_against_the_lanes_where_none_runs_with_it():
+    assert against(0.0) == [False, True, False]
+    assert against(3.5) == [True, False, False]
+
+
+def test_between_two_lanes_or_off_them_nobody_is():
+    assert against(1.75) == [False, False, False]
+    assert against(-9.0) == [False, False, False]
+
+
+def test_the_gap_between_two_lanes_in_the_list_is_no_lane():
+    far = ROAD.clone()
+    far[:, len(X) :, 1] = 100.0  # the list jumps from (38, 0) to (38, 100)
+    middle = against_lanes(far, LANE, torch.tensor([[[38.0, 50.0]]]), torch.tensor([[[-math.pi / 2]]]))
+    assert not middle.any()

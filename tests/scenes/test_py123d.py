@@ -1,7 +1,6 @@
 """Logs converted by py123d: what its writers wrote arrives in the Recording; files of strangers import nothing."""
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +24,6 @@ from py123d.parser.registry import NuPlanBoxDetectionLabel as Label  # noqa: E40
 
 from e2rl.scenes.py123d import PIECE, Py123dSource
 
-RECORDED = Path(__file__).parents[3] / "shared" / "data" / "av2" / "sensor_logs"
 EGO = EgoStateSE3Metadata(
     "made", 2.0, 5.0, 1.6, 3.0, PoseSE3(1.5, 0, 0.5, 1, 0, 0, 0), PoseSE3(0, 0, 0, 1, 0, 0, 0)
 )  # its middle is 1.5 m ahead of its origin
@@ -225,56 +223,3 @@ def test_without_the_library_the_extra_is_named(made, monkeypatch):
     monkeypatch.setitem(sys.modules, "py123d.api.scene.arrow.arrow_scene_api", None)
     with pytest.raises(InputError, match=r"a library .*py123d.*pip install 'e2rl\[py123d\]'"):
         recordings(made)
-
-
-@pytest.mark.skipif(not RECORDED.is_dir(), reason="the recorded logs are not here")
-def test_recorded_logs_through_py123d_are_those_of_our_own_reader(tmp_path):
-    """An Argoverse 2 sensor log, converted by py123d's own parser, beside data=argoverse2. Its parser wants camera and
-    lidar files for whole frames; poses, boxes and map it reads without."""
-    pytest.importorskip("av2"), pytest.importorskip("geopandas")
-    from av2.utils.io import read_city_SE3_ego, read_feather
-    from py123d.parser.av2.av2_map_parser import Av2MapParser
-    from py123d.parser.av2.av2_sensor_parser import Av2SensorLogParser
-    from py123d.parser.av2.utils.av2_constants import (
-        AV2_SENSOR_BOX_DETECTIONS_SE3_METADATA,
-        AV2_SENSOR_EGO_STATE_SE3_METADATA,
-    )
-
-    from e2rl.scenes.argoverse2 import AHEAD, Argoverse2Source
-
-    name = next(log for log in Argoverse2Source(path=str(RECORDED)).logs() if Path(log).name == "annotations.feather")
-    (ours,) = Argoverse2Source(path=str(RECORDED)).read(name)
-    folder = (RECORDED / name).parent
-    parser = Av2SensorLogParser(folder, "av2-sensor_val", "nearest")
-    land = Av2MapParser(folder, "av2-sensor_val", "av2-sensor")
-    maps = ArrowMapWriter(False, tmp_path / "maps", tmp_path / "logs")
-    maps.reset(land.get_map_metadata())
-    for part in land.iter_map_objects():
-        maps.write_map_object(part)
-    maps.close()
-    writer = ArrowLogWriter(LogWriterConfig(), tmp_path / "logs", tmp_path / "sensors")
-    writer.reset(parser.get_log_metadata())
-    poses = list(parser._iter_ego_states_se3(AV2_SENSOR_EGO_STATE_SE3_METADATA))
-    times = np.array([pose.timestamp.time_us for pose in poses])  # rounded by the parser
-    for boxes in parser._iter_box_detections_se3(AV2_SENSOR_BOX_DETECTIONS_SE3_METADATA):
-        pose = poses[np.abs(times - boxes.timestamp.time_us).argmin()]
-        writer.write_sync(ModalitiesSync(boxes.timestamp, [pose, boxes]))
-    writer.close()
-    (theirs,) = recordings(tmp_path)
-    assert len(theirs.states) == len(ours.states) and theirs.scene_id == ours.scene_id
-    stamps = np.unique(read_feather(folder / "annotations.feather")["timestamp_ns"])
-    poses = read_city_SE3_ego(folder)
-    turns = np.stack([poses[int(stamp)].rotation for stamp in stamps])
-    middle = AV2_SENSOR_EGO_STATE_SE3_METADATA.center_to_imu_se3
-    apart = (middle.x - AHEAD) * turns[:, :2, 0] + middle.z * turns[:, :2, 2]  # they put the ego's middle elsewhere
-    assert np.allclose(theirs.states[:, 0, :2] - ours.states[:, 0, :2], apart, atol=1e-3)
-    assert np.abs(np.sin(theirs.states[:, 0, 2] - ours.states[:, 0, 2])).max() < 2e-3, "yaw, of which slopes are part"
-    half = len(ours.states) // 2
-    for kind in (VEHICLE, PEDESTRIAN):
-        mine, their = (
-            one.states[half, one.valid[half] & (one.agent_type == kind) & (np.arange(len(one.size)) > 0), :2]
-            for one in (ours, theirs)
-        )
-        gaps = np.linalg.norm(mine[:, None] - their[None], axis=-1)
-        assert len(mine) > 0 and (gaps.min(1) < 0.01).mean() > 0.9, "of a few, the two readers' types differ"
-    assert len(theirs.lanes) > 0 and len(theirs.drivable) > 0

@@ -327,6 +327,7 @@ def test_split_chooses_only_where_a_source_has_splits(tmp_path):
     assert load_scenes(data_config(folder, tmp_path / "cache"), split="tune").split == "x"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("own", [False, True])
 def test_a_script_without_a_main_guard_works_or_is_told(tmp_path, own):
     """Its workers import no script, unless the source is the script's own."""

@@ -1,4 +1,4 @@
-"""Rollouts and their files: exact keys and types, readable without pickle, whole or refused, the same when read back."""
+"""Rollouts and their files: exact keys and types, readable without pickle, whole or refused, the same when read."""
 
 import io
 import zipfile

@@ -1,17 +1,20 @@
-"""The prior as traffic: its plans are the prior's samples, continue each other, and see the ego as it drives."""
+"""The prior as traffic: its plans are its samples and continue each other; no planner can lie to it."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
+from e2rl.planners.ego import Ego, track
 from e2rl.prior.lane_relative import HORIZON, SIZE
 from e2rl.prior.sde import SamplerSettings
+from e2rl.run.errors import InputError
+from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
-from e2rl.traffic.grouping import noise_of, take_rows
+from e2rl.traffic.grouping import noise_of
 from e2rl.traffic.nominal import KNOWLEDGE, NominalTraffic
 from tests.prior.small import curved_scenes, small_prior
-from tests.traffic.e2.traffic_scenes import EGO, ROWS, begin, executed, scenes
+from tests.traffic.e2.traffic_scenes import EGO, ROWS, begin, drive, executed, scenes, synthesizer
 
 
 def nominal(knowledge="predicted", **options):
@@ -35,17 +38,6 @@ def test_a_plan_is_the_prior_s_sample(knowledge):
     torch.testing.assert_close(found.states[here], expected.states()[here], rtol=1e-4, atol=1e-4)
     assert torch.equal(found.present[here], expected.on_map[here]) and not found.present[~here].any()
     assert found.adversary is None and after.replans.tolist() == [1, 1]
-
-
-def test_scenes_that_were_planned_differently_often_share_a_batch():
-    on, scene = nominal(), scenes(2).scenes
-    world, fresh = World.at_start(scene), begin(on, scene, seeds=[5, 6])
-    _, plan = on.replan(replace(fresh, replans=torch.tensor([0, 3])), world, EGO.plan(world))
-    for row, count in enumerate((0, 3)):
-        rows = torch.tensor([row])
-        one, there = replace(take_rows(fresh, rows), replans=torch.tensor([count])), take_rows(world, rows)
-        _, alone = on.replan(one, there, EGO.plan(there))
-        torch.testing.assert_close(alone.states, plan.states[rows], rtol=0, atol=5e-3)
 
 
 def test_plans_continue_where_the_last_one_was_left():
@@ -82,3 +74,51 @@ def test_routes_and_noise_are_the_seed_s():
     _, one = on.replan(begin(on, scene, seeds=[1, 2, 3]), World.at_start(scene), EGO.plan(World.at_start(scene)))
     _, other = on.replan(begin(on, scene, seeds=[1, 2, 4]), World.at_start(scene), EGO.plan(World.at_start(scene)))
     assert torch.equal(one.states[:2], other.states[:2]) and not torch.equal(one.states[2], other.states[2])
+
+
+class Liar(Ego):
+    """Drives as EGO does, and announces a plan 50 m beside its own."""
+
+    def plan(self, world):
+        announced = EGO.plan(world).clone()
+        announced[..., 1] += 50.0
+        return announced
+
+    def act(self, world, observation, plan):
+        honest = EGO.plan(world)
+        return track(world.states[:, 0], world.states[:, 0], honest[:, 0])
+
+
+class Honest(Liar):
+    def plan(self, world):
+        return EGO.plan(world)
+
+
+def driven(ego, eta=2.0, **settings):
+    method = NominalTraffic(synthesizer().prior, **settings) if eta == 0 else synthesizer(**settings)
+    return drive(scenes(3), method, eta, ego=ego).states
+
+
+@pytest.mark.parametrize("eta", [0.0, 2.0])
+def test_nonsense_in_the_announced_plan_changes_nothing(eta):
+    assert torch.equal(*(driven(ego(1), eta) for ego in (Honest, Liar)))
+
+
+@pytest.mark.parametrize("eta", [0.0, 2.0])
+def test_who_is_told_the_plan_believes_it(eta):
+    assert not torch.equal(*(driven(ego(1), eta, knowledge="plan") for ego in (Honest, Liar)))
+
+
+def test_the_prediction_begins_at_the_ego():
+    on, scene = nominal(), scenes(3).scenes
+    world, state = World.at_start(scene), begin(synthesizer(), scene)
+    found = on.predicted_ego(state, world)
+    assert found.shape == (3, 50, 4) and found.isfinite().all()
+    first = world.states[:, 0, 3] * DT
+    way = (found[:, 0, :2] - world.states[:, 0, :2]).norm(dim=-1)
+    torch.testing.assert_close(way, first, rtol=0.1, atol=0.05)
+
+
+def test_a_choice_that_is_none_is_refused():
+    with pytest.raises(InputError, match="synthesizer.knowledge=all"):
+        nominal("all")

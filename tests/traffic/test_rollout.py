@@ -27,46 +27,46 @@ def test_the_method_of_a_few_lines_in_the_documentation_drives_everybody_as_it_s
     there = slice(1, len(VEHICLES))
     start = scene_set.scenes["start"][:, None, there]
     time = torch.minimum(DT * torch.arange(81)[:, None], start[..., 3] / 2.0)
-    track = out["states"][:, :, there]
+    track = out.states[:, :, there]
     torch.testing.assert_close(track[..., 3], start[..., 3] - 2.0 * time, rtol=0, atol=1e-3)
     torch.testing.assert_close(track[..., 0], start[..., 0] + start[..., 3] * time - time**2, rtol=0, atol=1e-2)
     assert torch.equal(track[..., 1:3], start[..., 1:3].expand_as(track[..., 1:3]))
-    assert out["valid"][:, :, there].all() and not out["adversaries"].any() and (out["transport_others"] == 0).all()
+    assert out.valid[:, :, there].all() and not out.adversaries.any() and (out.transport_others == 0).all()
 
 
 def test_rollouts_repeat_and_seeds_matter():
     scene_set = scenes()
     first, again = (drive(scene_set, synthesizer(), 1.0) for _ in range(2))
     other = drive(scene_set, synthesizer(), 1.0, seeds=[10, 11, 12])
-    assert torch.equal(first["states"], again["states"]) and torch.equal(first["valid"], again["valid"])
-    assert not torch.equal(first["states"][:, :, 1:5], other["states"][:, :, 1:5])
+    assert torch.equal(first.states, again.states) and torch.equal(first.valid, again.valid)
+    assert not torch.equal(first.states[:, :, 1:5], other.states[:, :, 1:5])
 
 
 def test_zero_intensity_is_the_nominal_rollout_and_more_of_it_is_not():
     scene_set, on = scenes(), synthesizer()
     nominal, zero = drive(scene_set, NominalTraffic(on.prior), 0.0), drive(scene_set, on, 0.0)
     pushed = drive(scene_set, on, 2.0)
-    assert torch.equal(nominal["states"], zero["states"]) and not zero["adversaries"].any()
-    assert (pushed["adversaries"].any(1)).all() and not pushed["adversaries"][:, 0].any()
-    assert (zero["transport_adversary"] == 0).all() and (pushed["transport_adversary"] > 0).all()
-    assert (zero["transport_anchor"] == 0).all() and (nominal["transport_anchor"] == 0).all()
+    assert torch.equal(nominal.states, zero.states) and not zero.adversaries.any()
+    assert (pushed.adversaries.any(1)).all() and not pushed.adversaries[:, 0].any()
+    assert (zero.transport_adversary == 0).all() and (pushed.transport_adversary > 0).all()
+    assert (zero.transport_anchor == 0).all() and (nominal.transport_anchor == 0).all()
 
 
 def test_the_start_is_the_scene_s_and_parked_vehicles_stay():
     scene_set = scenes()
     out = drive(scene_set, synthesizer(), 2.0)
-    assert out["states"].shape == (3, 21, ROWS + 2, 4)
-    torch.testing.assert_close(out["states"][:, 0], scene_set.scenes["start"])
-    assert torch.equal(out["valid"][:, 0], scene_set.scenes["valid"])
+    assert out.states.shape == (3, 21, ROWS + 2, 4)
+    torch.testing.assert_close(out.states[:, 0], scene_set.scenes["start"])
+    assert torch.equal(out.valid[:, 0], scene_set.scenes["valid"])
     parked = len(VEHICLES) - 1
-    torch.testing.assert_close(out["states"][:, :, parked], out["states"][:, :1, parked].expand(-1, 21, -1))
-    assert out["simulated"][:, : len(VEHICLES)].all() and not out["simulated"][:, len(VEHICLES) :].any()
-    assert out["states"].isfinite().all()
+    torch.testing.assert_close(out.states[:, :, parked], out.states[:, :1, parked].expand(-1, 21, -1))
+    assert out.simulated[:, : len(VEHICLES)].all() and not out.simulated[:, len(VEHICLES) :].any()
+    assert out.states.isfinite().all()
 
 
 def test_vehicles_are_gone_once_their_route_has_ended_and_stay_away():
     out = drive(scenes(2, steps=40, road=(-60.0, 60.0)), synthesizer(), 0.0)
-    x, valid = out["states"][:, :, 4, 0], out["valid"][:, :, 4]
+    x, valid = out.states[:, :, 4, 0], out.valid[:, :, 4]
     assert not valid[:, -1].any()
     assert (valid.int().diff(dim=1) <= 0).all()
     assert (x[valid] < 60.0 + 1e-3).all()
@@ -80,9 +80,9 @@ def test_traffic_drives_on_as_planned_after_the_ego_has_left(replay_ego):
     scene_set.scenes["logged_valid"][:, 4:, 0] = False
     scene_set.scenes["logged"][:, 50:, 1:ROWS, :2] += 500.0
     out = drive(scene_set, synthesizer(), 0.0, ego=ReplayEgo(), replay_ego=replay_ego)
-    assert not out["valid"][:, 5:, 0].any() and not out["simulated"][:, 0].any()
-    there = out["valid"][:, 1:, 1:5] & out["valid"][:, :-1, 1:5]
-    jump = (out["states"][:, 1:, 1:5, :2] - out["states"][:, :-1, 1:5, :2]).norm(dim=-1)
+    assert not out.valid[:, 5:, 0].any() and not out.simulated[:, 0].any()
+    there = out.valid[:, 1:, 1:5] & out.valid[:, :-1, 1:5]
+    jump = (out.states[:, 1:, 1:5, :2] - out.states[:, :-1, 1:5, :2]).norm(dim=-1)
     assert there.any() and jump[there].max() < 4.0
 
 
@@ -103,9 +103,9 @@ class Turns(Traffic):
 
 def test_adversaries_are_whoever_was_one_at_any_time_and_the_transport_is_shared_out():
     out = drive(scenes(2, steps=12), Turns(), 1.0)
-    assert out["adversaries"].nonzero()[:, 1].tolist() == [1, 2, 1, 2]
-    assert out["transport_adversary"].tolist() == [2.0, 2.0] and out["transport_others"].tolist() == [0.25, 0.25]
-    assert torch.equal(out["routes"], scenes(2).scenes["route_log"].clamp(min=0)), "nobody said otherwise"
+    assert out.adversaries.nonzero()[:, 1].tolist() == [1, 2, 1, 2]
+    assert out.transport_adversary.tolist() == [2.0, 2.0] and out.transport_others.tolist() == [0.25, 0.25]
+    assert torch.equal(out.routes, scenes(2).scenes["route_log"].clamp(min=0)), "nobody said otherwise"
 
 
 def test_the_traffic_of_a_round_is_the_rollouts_and_its_seeds_are_the_scenes_own():

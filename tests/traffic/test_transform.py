@@ -129,15 +129,6 @@ def test_with_held_actions_a_replan_comes_at_the_first_decision_at_which_it_is_d
     assert tensordict["timestep"].eq(20).all() and tensordict["done"].all()
 
 
-def test_the_ego_of_a_policy_that_writes_no_plan_is_expected_to_keep_its_velocity():
-    on = March()
-    env = environment(live(), on)
-    tensordict = advance(env, still, env.reset(), 6)
-    now = env.base_env.scene["start"][:, 0].clone()
-    torch.testing.assert_close(on.calls[0][1], keep_velocity(now))
-    assert on.calls[1][0] == [5, 5, 5] and tensordict["timestep"][:, 0].tolist() == [6, 6, 6]
-
-
 class Watching(IDMEgo):
     """An ego that notes the plans of the others that it sees."""
 
@@ -173,19 +164,6 @@ def test_a_partial_reset_begins_those_rows_anew_and_leaves_the_others():
     assert [steps for steps, _ in on.calls] == [[0, 0, 0], [5, 5, 5], [0], [10, 10]]
     speed = tensordict["agents", "states"][:, 1, 3]
     torch.testing.assert_close(speed, torch.tensor([0.2, 3.0, 2.2]))  # by seed, and replans of its own
-
-
-def test_other_rows_resets_do_not_change_a_row_s_traffic():
-    tracks = []
-    for reset in (False, True):
-        env = environment(live(1.0), synthesizer())
-        policy = EgoPolicy(IDMEgo(), env)
-        tensordict = advance(env, policy, env.reset(), 7)
-        if reset:
-            tensordict = env.reset(tensordict.set("_reset", SECOND))
-        tensordict = advance(env, policy, tensordict, 5)
-        tracks.append(tensordict["agents", "states"][[0, 2], 1:ROWS])
-    torch.testing.assert_close(*tracks, rtol=0, atol=2e-2)
 
 
 def test_ended_episodes_are_followed_by_the_next_rows():
@@ -257,32 +235,12 @@ def test_trajectories_never_mix_scenes_or_traffic():
     assert len(row.unique()) == len(pool) and data["next", "done"].sum() > 16
 
 
-def test_the_traffic_driven_in_is_the_row_s():
-    """Vehicle 1 stands where its row of the pool says, at every moment of a batch of stored and recorded traffic."""
-    env, pool, scene_set, _ = small_environment(8)
-    stored = torch.cat([pool.parts[0].states, scene_set.scenes["logged"][pool.scene_index[4:]]])
-    td = env.reset()
-    for _ in range(50):
-        td["action"] = torch.tensor([0.0, 0.3]).repeat(8, 1)
-        td = env.step_and_maybe_reset(td)[1]
-        world, row = env.base_env.world(), td["traffic", "row"][:, 0]
-        moving = world.step > 0
-        assert torch.equal(world.states[moving, 1], stored[row, world.step][moving, 1])
-
-
 def test_draws_follow_the_priorities():
     priority = torch.tensor([0.1, 0.2, 0.3, 0.4])
     env, pool, _, draw = small_environment(64, steps=1, probability=lambda pool: pool.probabilities(priority, 0.75))
     rows = torch.cat([env.reset()["traffic", "row"][:, 0] for _ in range(60)])
     share = torch.bincount(rows, minlength=8) / len(rows)
     assert torch.allclose(share.double(), draw.probability, atol=0.03)
-
-
-def test_draws_go_on_from_a_state():
-    (env, _, _, draw), (other, _, _, second) = small_environment(8), small_environment(8)
-    env.reset()
-    second.generator.set_state(draw.generator.get_state())
-    assert torch.equal(env.reset()["traffic", "row"], other.reset()["traffic", "row"])
 
 
 # --- all kinds of rows at once
@@ -310,18 +268,6 @@ def test_a_live_row_drives_alike_beside_rows_of_other_kinds():
         tensordict = advance(env, EgoPolicy(IDMEgo(), env), env.reset(), 12)
         tracks.append(tensordict["agents", "states"][:3])
     torch.testing.assert_close(*tracks, rtol=0, atol=2e-2)
-
-
-def test_an_environment_changes_between_kinds_of_rows_from_episode_to_episode():
-    scene_set = scenes(3, 10)
-    pool = mixed(scene_set)
-    env = environment(pool, March(), scene_set=scene_set)
-    out = env.rollout(30, EgoPolicy(IDMEgo(), env), break_when_any_done=False)
-    states, row = out["next", "agents", "states"][:, :, 1:ROWS], out["traffic", "row"][..., 0]
-    assert row[:, ::10].tolist() == [[0, 3, 6], [1, 4, 7], [2, 5, 8]]
-    assert torch.equal(states[:, 10:20], pool.parts[0].states[:, 1:, 1:ROWS])
-    assert torch.equal(states[:, 20:], scene_set.scenes["logged"][:, 1:, 1:ROWS])
-    torch.testing.assert_close(states[:, 5:10, :, 3], (torch.arange(3.0) + 0.1)[:, None, None].expand(3, 5, ROWS - 1))
 
 
 def test_vehicles_of_replayed_rows_are_expected_to_keep_their_velocity():

@@ -83,5 +83,5 @@ def cut_windows(
         known = known[:, rows]
         tracks = np.where(known[..., None], traffic[:, rows], 0.0)
         scene_id = f"{scene_map.name}_{first:04d}"
-        kept.append((scene_map.recording("bundled", scene_id, first, tracks, known, bodies[rows], 0), first))
+        kept.append((scene_map.recording(scene_id, first, tracks, known, bodies[rows], 0), first))
     return kept, refused

@@ -53,7 +53,7 @@ def run_prior_stage(run: Run, logger: RunLogger) -> tuple[Path, list[dict]] | No
         path = train_prior(prior, scenes, settings, folder, origin, _closed_loop(scenes, settings, device), *how)
         if path is None:
             return None
-        fields = {"stage": "prior", "kept": Parts(folder, "prior", path.name), **origin_of(folder)}
+        fields = {"stage": "prior", "parts": Parts(folder, "prior", path.name), **origin_of(folder)}
         return path, _nominal(prior, _first_starts(scenes), device, folder, **fields)
 
 

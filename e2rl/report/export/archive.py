@@ -22,7 +22,7 @@ def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> 
         path = folder / ROLLOUTS / episode.path.name
         write_atomically(path, episode.path.read_bytes())
         if episode.scene is not None:
-            scene = folder / SCENES / f"{re.sub(r'[^A-Za-z0-9._+-]', '-', episode.rollout['scene_id'])}.npz"
+            scene = folder / SCENES / f"{re.sub(r'[^A-Za-z0-9._+-]', '-', episode.rollout.scene_id)}.npz"
             buffer = io.BytesIO()
             np.savez_compressed(buffer, **scene_arrays(episode))
             write_atomically(scene, buffer.getvalue())

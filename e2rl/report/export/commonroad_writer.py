@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from e2rl.report.export.episode import Episode
-from e2rl.run.errors import InputError
 from e2rl.scenes.paths import shift_left, tangent_angle, wrap
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW
 
@@ -28,7 +27,6 @@ MOST_CHARACTERS = 40  # of a map's name
 
 def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> Iterator[tuple[Episode, Path]]:
     """Write ZAM_<place>-<n>_1_T-1.xml of each episode; open_ego: the ego is a planning problem only, no obstacle."""
-    _check_library()
     from commonroad.common.writer.file_writer_interface import OverwriteExistingFile
     from commonroad.common.writer.file_writer_xml import XMLFileWriter
     from commonroad.scenario.scenario import Tag
@@ -42,16 +40,6 @@ def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> 
         path = folder / f"{made.scenario_id}.xml"
         writer.write_to_file(str(path), OverwriteExistingFile.ALWAYS)
         yield episode, path
-
-
-def _check_library() -> None:
-    try:
-        import commonroad.common.writer.file_writer_xml  # noqa: F401
-    except ImportError as error:
-        reason = f"commonroad-io cannot be imported ({error})"
-        raise InputError(
-            f"--to commonroad: {reason}; install e2rl with its extra: pip install 'e2rl[commonroad]'"
-        ) from error
 
 
 def _comment(episode: Episode) -> str:

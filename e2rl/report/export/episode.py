@@ -150,6 +150,6 @@ def past_of(episode: Episode) -> Iterator[tuple[int, np.ndarray]]:
         ahead, left, turned = past.flip(0).T
         cos, sin = heading.cos(), heading.sin()
         pose = torch.stack([x + cos * ahead - sin * left, y + sin * ahead + cos * left, heading + turned], -1)
-        way = torch.cat([pose[1:], start[row, None, :3]])[:, :2] - pose[:, :2]
-        speed = way.norm(dim=-1, keepdim=True) / episode.rollout.dt
+        moved = torch.cat([pose[1:], start[row, None, :3]])[:, :2] - pose[:, :2]
+        speed = moved.norm(dim=-1, keepdim=True) / episode.rollout.dt
         yield row, torch.cat([pose, speed], -1).numpy()

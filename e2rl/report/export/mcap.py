@@ -14,7 +14,7 @@ Time begins at 0 at the start frame. The facts of the rollout are the metadata r
 import io
 import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -26,8 +26,8 @@ from matplotlib.colors import to_rgba
 from e2rl.report import drawing
 from e2rl.report.export.episode import Episode
 from e2rl.report.export.scenarionet_writer import HEIGHT
+from e2rl.report.failure_tracks import role_of
 from e2rl.report.picture import contact_point
-from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
 from e2rl.scenes.boxes import distance
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
@@ -35,28 +35,20 @@ from e2rl.traffic.traffic import REPLAN_STEPS
 
 MAP, EGO = "map", "ego"  # frames
 LIGHTS = {LIGHT_RED: drawing.CONTACT, LIGHT_YELLOW: drawing.VULNERABLE, LIGHT_GREEN: "#2e8b57"}
+COLOURS = {"ego": drawing.EGO, "adversary": drawing.ADVERSARY, "traffic": drawing.BACKGROUND}
+COLOURS |= {"pedestrian": drawing.VULNERABLE, "cyclist": drawing.VULNERABLE, "replayed": drawing.REPLAYED}
 ALL, LINE_LIST = 1, 2  # of foxglove.SceneEntityDeletion.Type and foxglove.LinePrimitive.Type
 SECOND = 1_000_000_000  # ns
 NUMBERS = {"type": "object", "properties": {name: {"type": "number"} for name in ("speed", "acceleration", "gap")}}
+Entity = dict[str, Any]  # of foxglove.SceneEntity
 
 
 def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> Iterator[tuple[Episode, Path]]:
     """Write NAME.mcap of each episode."""
-    _check_library()
     for episode in episodes:
         path = folder / f"{episode.path.stem}.mcap"
         write_atomically(path, content(episode))
         yield episode, path
-
-
-def _check_library() -> None:
-    try:
-        import foxglove_schemas_protobuf.SceneUpdate_pb2  # noqa: F401
-        import mcap.writer  # noqa: F401
-        import mcap_protobuf.schema  # noqa: F401
-    except ImportError as error:
-        reason = f"mcap, mcap-protobuf-support or foxglove-schemas-protobuf cannot be imported ({error})"
-        raise InputError(f"--to mcap: {reason}; install e2rl with its extra: pip install 'e2rl[mcap]'") from error
 
 
 def content(episode: Episode) -> bytes:
@@ -69,29 +61,49 @@ def content(episode: Episode) -> bytes:
     buffer = io.BytesIO()
     writer = Writer(buffer, compression=CompressionType.ZSTD)
     writer.start(profile="", library="e2rl")
-    update, frame = register_schema(writer, SceneUpdate), register_schema(writer, FrameTransform)
+    kinds = {"/map": SceneUpdate, "/traffic": SceneUpdate, "/plans": SceneUpdate, "/tf": FrameTransform}
+    schemas = {kind: register_schema(writer, kind) for kind in (SceneUpdate, FrameTransform)}
     numbers = writer.register_schema("e2rl.planners", "jsonschema", json.dumps(NUMBERS).encode())
-    topics = {"/map": update, "/traffic": update, "/plans": update, "/tf": frame}
-    channels = {topic: writer.register_channel(topic, "protobuf", schema) for topic, schema in topics.items()}
+    channels = {topic: writer.register_channel(topic, "protobuf", schemas[kind]) for topic, kind in kinds.items()}
     channels["/ego"] = writer.register_channel("/ego", "json", numbers)
-    for step, topic, message in messages(episode):
+    for step, topic, fields in messages(episode):
         time = round(step * episode.rollout.dt * SECOND)
+        if topic in kinds:
+            message = kinds[topic](**stamped(fields, time)).SerializeToString(deterministic=True)
+        else:
+            message = json.dumps(fields).encode()
         writer.add_message(channels[topic], time, message, time, sequence=step)
     writer.add_metadata("e2rl", {name: str(value) for name, value in episode.facts.items()})
     writer.finish()
     return buffer.getvalue()
 
 
-def messages(episode: Episode) -> Iterator[tuple[int, str, bytes]]:
-    """(step, topic, message) in the order of time."""
-    drawn, rollout, told = Drawn(episode), episode.rollout, ego_numbers(episode)
-    yield 0, "/map", drawn.road()
+def stamped(fields: dict[str, Any], time: int) -> dict[str, Any]:
+    """The fields of a message with their time [ns]; a scene update takes the place of the last one of its topic."""
+    stamp = {"timestamp": {"seconds": time // SECOND, "nanos": time % SECOND}}
+    if "entities" not in fields:
+        return fields | stamp
+    return {"deletions": [{"type": ALL} | stamp], "entities": [entity | stamp for entity in fields["entities"]]}
+
+
+def messages(episode: Episode) -> Iterator[tuple[int, str, dict[str, Any]]]:
+    """(step, topic, fields of the message) in the order of time."""
+    rollout, told = episode.rollout, ego_numbers(episode)
+    borders = [np.concatenate([ring, ring[:1]]) for ring in rollout.polygons()]
+    road = [lines("lanes", rollout.lanes(), drawing.BACKGROUND), lines("borders", borders, "black")]
+    yield 0, "/map", {"entities": road}
     for step in range(episode.steps + 1):
-        yield step, "/traffic", drawn.traffic(step)
-        if rollout.plans is not None and step % REPLAN_STEPS == 0 and step // REPLAN_STEPS < len(rollout.plans):
-            yield step, "/plans", drawn.plans(step // REPLAN_STEPS)
-        yield step, "/tf", drawn.frame(step)
-        yield step, "/ego", json.dumps({name: values[step] for name, values in told.items()}).encode()
+        yield step, "/traffic", {"entities": list(traffic(episode, step))}
+        number, rest = divmod(step, REPLAN_STEPS)
+        if rollout.plans is not None and rest == 0 and number < len(rollout.plans):
+            yield step, "/plans", {"entities": list(plans(episode, number))}
+        x, y, heading, _ = rollout.states[step, 0].tolist()
+        yield (
+            step,
+            "/tf",
+            {"parent_frame_id": MAP, "child_frame_id": EGO} | placed(x, y, heading, "translation", "rotation"),
+        )
+        yield step, "/ego", {name: values[step] for name, values in told.items()}
 
 
 def ego_numbers(episode: Episode) -> dict[str, list[float | None]]:
@@ -108,109 +120,60 @@ def ego_numbers(episode: Episode) -> dict[str, list[float | None]]:
     return {name: [None if math.isnan(x) else x for x in values.tolist()] for name, values in found.items()}
 
 
-class Drawn:
-    """The messages of an episode, as bytes."""
+def traffic(episode: Episode, step: int) -> Iterator[Entity]:
+    """Everybody who is there at a step, the lights at the beginning of their lanes, and the contact."""
+    for row in np.flatnonzero(episode.rollout.valid[step]).tolist():
+        yield agent(episode, step, row)
+    if episode.lights:
+        lit = [(episode.lanes[name].points[0], int(states[step])) for name, states in episode.lights.items()]
+        yield spheres("lights", [(place, LIGHTS[state], 1.0) for place, state in lit if state in LIGHTS])
+    if episode.facts.get("contact_step") == step and "partner" in episode.facts:
+        place = contact_point(episode.rollout, step, episode.facts["partner"])
+        yield spheres("contact", [(place, drawing.CONTACT, 1.5)])
 
-    def __init__(self, episode: Episode) -> None:
-        self.episode, self.rollout = episode, episode.rollout
 
-    def road(self) -> bytes:
-        """Lanes, and borders of the drivable area."""
-        lanes, borders = self.rollout.lanes(), self.rollout.polygons()
-        closed = [np.concatenate([ring, ring[:1]]) for ring in borders]
-        return self._update(
-            0, [self._lines("lanes", lanes, drawing.BACKGROUND), self._lines("borders", closed, "black")]
-        )
+def plans(episode: Episode, number: int) -> Iterator[Entity]:
+    """The plans of a replan."""
+    rollout, step = episode.rollout, number * REPLAN_STEPS
+    for row, path in zip(rollout.planners.tolist(), rollout.plans[number], strict=True):
+        if rollout.valid[step, row] and np.isfinite(path).all():
+            whole = np.concatenate([rollout.states[step, row, :2][None], path])
+            yield lines(f"plan of {row}", [whole], drawing.EGO if row == 0 else drawing.ADVERSARY)
 
-    def traffic(self, step: int) -> bytes:
-        """Everybody who is there at a step, the lights and the contact."""
-        present = np.flatnonzero(self.rollout.valid[step]).tolist()
-        entities = [self._agent(step, row) for row in present]
-        if self.episode.lights:
-            entities.append(self._lights(step))
-        if self.episode.facts.get("contact_step") == step and "partner" in self.episode.facts:
-            place = contact_point(self.rollout, step, self.episode.facts["partner"])
-            entities.append(self._spheres("contact", [(place, drawing.CONTACT, 1.5)]))
-        return self._update(step, entities)
 
-    def plans(self, number: int) -> bytes:
-        """The plans of a replan."""
-        step, paths = number * REPLAN_STEPS, self.rollout.plans[number]
-        entities = []
-        for row, path in zip(self.rollout.planners.tolist(), paths, strict=True):
-            start = self.rollout.states[step, row, :2]
-            colour = drawing.EGO if row == 0 else drawing.ADVERSARY
-            if self.rollout.valid[step, row] and np.isfinite(path).all():
-                entities.append(self._lines(f"plan of {row}", [np.concatenate([start[None], path])], colour))
-        return self._update(step, entities)
+def agent(episode: Episode, step: int, row: int) -> Entity:
+    """The box of an agent, with what it is."""
+    rollout, (length, width) = episode.rollout, episode.size(row)
+    x, y, heading, speed = rollout.states[step, row].tolist()
+    kind, role = str(rollout.agent_type[row]), role_of(rollout, row)
+    part, height = role if role in ("ego", "adversary") else kind, HEIGHT[kind]
+    pose = placed(x, y, heading, "position", "orientation", height / 2)
+    cube = {"pose": pose, "size": {"x": length, "y": width, "z": height}, "color": rgba(COLOURS[role])}
+    known = {"part": part, "speed": f"{speed:.2f} m/s"}
+    pairs = [{"key": key, "value": value} for key, value in known.items()]
+    return {"id": f"agent {row}", "frame_id": MAP, "cubes": [cube], "metadata": pairs}
 
-    def frame(self, step: int) -> bytes:
-        """Where the ego is."""
-        from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 
-        x, y, heading, _ = self.rollout.states[step, 0].tolist()
-        made = FrameTransform(parent_frame_id=MAP, child_frame_id=EGO)
-        made.translation.x, made.translation.y = x, y
-        made.rotation.z, made.rotation.w = math.sin(heading / 2), math.cos(heading / 2)
-        made.timestamp.FromNanoseconds(self._time(step))
-        return made.SerializeToString(deterministic=True)
+def spheres(name: str, parts: Sequence[tuple[np.ndarray, str, float]]) -> Entity:
+    """Spheres at (place, colour, size), 2 m above the ground."""
+    made = [
+        {"pose": {"position": {"x": float(x), "y": float(y), "z": 2.0}}, "size": dict.fromkeys("xyz", size)}
+        | {"color": rgba(colour)}
+        for (x, y), colour, size in parts
+    ]
+    return {"id": name, "frame_id": MAP, "spheres": made}
 
-    def _time(self, step: int) -> int:
-        return round(step * self.rollout.dt * SECOND)
 
-    def _update(self, step: int, entities: list[Any]) -> bytes:
-        """A message in place of the last one of its topic."""
-        from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+def lines(name: str, paths: Sequence[np.ndarray], colour: str) -> Entity:
+    """Polylines, piece by piece."""
+    pieces = [{"x": float(x), "y": float(y)} for path in paths for pair in pairwise(path) for x, y in pair]
+    made = {"type": LINE_LIST, "thickness": 0.2, "points": pieces, "color": rgba(colour)}
+    return {"id": name, "frame_id": MAP, "lines": [made | {"pose": {"orientation": {"w": 1}}}]}
 
-        made = SceneUpdate()
-        made.deletions.add(type=ALL).timestamp.FromNanoseconds(self._time(step))
-        for entity in entities:
-            entity.timestamp.FromNanoseconds(self._time(step))
-        made.entities.extend(entities)
-        return made.SerializeToString(deterministic=True)
 
-    def _agent(self, step: int, row: int) -> Any:
-        """The box of an agent, with what it is."""
-        kind, (length, width) = self.rollout.agent_type[row], self.episode.size(row)
-        x, y, heading, speed = self.rollout.states[step, row].tolist()
-        made, height = self._entity(f"agent {row}"), HEIGHT[kind]
-        pose = {"position": {"x": x, "y": y, "z": height / 2}}
-        pose["orientation"] = {"z": math.sin(heading / 2), "w": math.cos(heading / 2)}
-        made.cubes.add(pose=pose, size={"x": length, "y": width, "z": height}, color=rgba(self._colour(row)))
-        part = "ego" if row == 0 else "adversary" if self.rollout.adversaries[row] else kind
-        for key, value in (("part", part), ("speed", f"{speed:.2f} m/s")):
-            made.metadata.add(key=key, value=value)
-        return made
-
-    def _colour(self, row: int) -> str:
-        if row == 0 or self.rollout.adversaries[row]:
-            return drawing.EGO if row == 0 else drawing.ADVERSARY
-        if self.rollout.agent_type[row] in ("pedestrian", "cyclist"):
-            return drawing.VULNERABLE
-        return drawing.BACKGROUND if self.rollout.simulated[row] else drawing.REPLAYED
-
-    def _lights(self, step: int) -> Any:
-        """A sphere where each lane with a light begins."""
-        lit = [(self.episode.lanes[name].points[0], int(states[step])) for name, states in self.episode.lights.items()]
-        return self._spheres("lights", [(place, LIGHTS[state], 1.0) for place, state in lit if state in LIGHTS])
-
-    def _spheres(self, name: str, parts: list[tuple[np.ndarray, str, float]]) -> Any:
-        made = self._entity(name)
-        for (x, y), colour, size in parts:
-            position = {"x": float(x), "y": float(y), "z": 2.0}
-            made.spheres.add(pose={"position": position}, size=dict.fromkeys("xyz", size), color=rgba(colour))
-        return made
-
-    def _lines(self, name: str, paths: list[np.ndarray], colour: str) -> Any:
-        made = self._entity(name)
-        pieces = [{"x": float(x), "y": float(y)} for path in paths for pair in pairwise(path) for x, y in pair]
-        made.lines.add(type=LINE_LIST, thickness=0.2, points=pieces, color=rgba(colour), pose={"orientation": {"w": 1}})
-        return made
-
-    def _entity(self, name: str) -> Any:
-        from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
-
-        return SceneEntity(id=name, frame_id=MAP)
+def placed(x: float, y: float, heading: float, where: str, turned: str, z: float = 0.0) -> dict[str, Any]:
+    """A place and a rotation about the vertical, under these names."""
+    return {where: {"x": x, "y": y, "z": z}, turned: {"z": math.sin(heading / 2), "w": math.cos(heading / 2)}}
 
 
 def rgba(colour: str) -> dict[str, float]:

@@ -14,7 +14,6 @@ import numpy as np
 from e2rl.report.export.commonroad_writer import LONG
 from e2rl.report.export.episode import Episode
 from e2rl.report.export.opendrive import write_roads
-from e2rl.run.errors import InputError
 from e2rl.scenes.paths import WHEELBASE
 
 MINOR_VERSION = 2
@@ -27,7 +26,6 @@ PERFORMANCE = (70.0, 5.0, 8.0)  # m/s, m/s^2, m/s^2: top speed, acceleration, br
 
 def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> Iterator[tuple[Episode, Path]]:
     """Write NAME.xosc, and NAME.xodr where there are lanes; open_ego: the ego has a start, no trajectory."""
-    _check_library()
     for episode in episodes:
         path = folder / f"{episode.path.stem}.xosc"
         road = path.with_suffix(".xodr") if episode.lanes else None
@@ -35,16 +33,6 @@ def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> 
             write_roads(episode, road)
         scenario(episode, road.name if road else None, open_ego).write_xml(str(path))
         yield episode, path
-
-
-def _check_library() -> None:
-    try:
-        import scenariogeneration  # noqa: F401
-    except ImportError as error:
-        reason = f"scenariogeneration cannot be imported ({error})"
-        raise InputError(
-            f"--to openscenario: {reason}; install e2rl with its extra: pip install 'e2rl[openscenario]'"
-        ) from error
 
 
 def scenario(episode: Episode, road: str | None, open_ego: bool) -> Any:

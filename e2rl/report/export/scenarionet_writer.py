@@ -107,13 +107,13 @@ def track(episode: Episode, row: int, history: int, past: np.ndarray | None) -> 
 def object_summary(name: str, entry: dict[str, Any]) -> dict[str, Any]:
     """What ScenarioNet's filters know of a track: how long it is there, and how far it moves."""
     valid = entry["state"]["valid"]
-    way = np.linalg.norm(np.diff(entry["state"]["position"][valid, :2], axis=0), axis=1).sum()
+    distance = np.linalg.norm(np.diff(entry["state"]["position"][valid, :2], axis=0), axis=1).sum()
     first = int(valid.argmax())
     return {
         "type": entry["type"],
         "object_id": name,
         "track_length": len(valid),
-        "moving_distance": float(way),
+        "moving_distance": float(distance),
         "valid_length": int(valid.sum()),
         "continuous_valid_length": int(np.logical_and.accumulate(valid[first:]).sum()),
     }

@@ -154,7 +154,7 @@ class MeanGuided(Guided):
         if sampler.sampler == "dpm_solver_pp" or (sampler.sampler == "ddim" and sampler.churn == 0):
             raise InputError(
                 f"prior.sampler.sampler={sampler.sampler}, churn={sampler.churn}: {type(self).__name__} moves the mean "
-                "of ancestral steps by a share of their noise; use ddim with churn above 0, or euler_maruyama"
+                "of ancestral steps by a fraction of their noise; use ddim with churn above 0, or euler_maruyama"
             )
 
     def guidance(self, loss: Loss, guided: Tensor, strength: Tensor) -> MeanGuidance:

@@ -120,14 +120,14 @@ class Strive(OpenLoop):
         states = view.with_ego(motion)
         distance, delta = ego_distance(states)[0], softmin(states, view)
         attack = (delta * distance.square()).flatten(1).sum(-1)
-        share = delta.sum(-1)
+        fraction = delta.sum(-1)
         even = torch.full_like(states[0, 0, 0, :, 0], 1 / states.shape[-2])
         with_ego = torch.zeros_like(view.routed.conflict)
         with_ego[:, :, 0] = True
         bumps = [pair_term(states, view, disk_overlap(0.0), 0.0, even, rows)[0] for rows in (with_ego, ~with_ego)]
-        calm = COLLISION * (bumps[0] + (1 - share) * bumps[1] + off_road_term(states, view, even)[0])
-        energy = blend(PRIOR, share) * 0.5 * latent.square().sum(-1)
-        energy = energy + blend(START, share) * (latent - first).square().sum(-1)
+        calm = COLLISION * (bumps[0] + (1 - fraction) * bumps[1] + off_road_term(states, view, even)[0])
+        energy = blend(PRIOR, fraction) * 0.5 * latent.square().sum(-1)
+        energy = energy + blend(START, fraction) * (latent - first).square().sum(-1)
         return self.strength(state) * attack + ((calm + energy) * view.active).sum(-1)
 
     def solvable(self, first: Tensor, planned: LaneState, view: View, context: Context) -> Tensor:
@@ -168,9 +168,9 @@ def touched(ego: Tensor, others: Tensor, view: View) -> Tensor:
     return (touches & view.valid[:, 1:]).any(-1)
 
 
-def blend(weights: tuple[float, float], share: Tensor) -> Tensor:
-    """Between the weight of a bystander (share 0) and that of the attacker (share 1)."""
-    return weights[0] + (weights[1] - weights[0]) * share
+def blend(weights: tuple[float, float], fraction: Tensor) -> Tensor:
+    """Between the weight of a bystander (fraction 0) and that of the attacker (fraction 1)."""
+    return weights[0] + (weights[1] - weights[0]) * fraction
 
 
 def softmin(states: Tensor, view: View) -> Tensor:
@@ -186,5 +186,5 @@ def softmin(states: Tensor, view: View) -> Tensor:
 
 
 def attacker_weight(states: Tensor, view: View) -> Tensor:
-    """Share [B, V] of `softmin` that each vehicle has."""
+    """Fraction [B, V] of `softmin` that each vehicle has."""
     return softmin(states, view).sum(-1)

@@ -28,7 +28,7 @@ from e2rl.traffic.e2.motion import (
     remaining_offset,
     states_on_route,
     take,
-    way_to_stop_line,
+    distance_to_stop_line,
 )
 from e2rl.traffic.e2.skeleton import Skeleton
 
@@ -135,7 +135,7 @@ def _candidates(scene: TensorDictBase, world: World, index: Tensor, keep_route: 
     if keep_route:
         usable = usable & (route >= 0)
     if halt_at_red:
-        end = torch.minimum(end, s + way_to_stop_line(world, index, number))
+        end = torch.minimum(end, s + distance_to_stop_line(world, index, number))
     accel, size = take(world.accel[:, :vehicles], index), take(scene["size"], index)
     return _Candidates(number, points, usable, end, s, d, _bend_bound(points, s), states[..., 3], accel, size)
 

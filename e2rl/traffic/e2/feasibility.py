@@ -159,7 +159,7 @@ def feasible_vehicles(scene: TensorDictBase, world: World, settings: Feasibility
     """Returns the feasible set F of scenes [B] by the three criteria of Sec. IV-A2.
 
     associated: on the drivable area, near and along one of its candidate routes; conflicting: a candidate has a
-    conflict point with the ego's mission; relevant: moving, or standing in the ego's way, and not parked.
+    conflict point with the ego's mission; relevant: moving, or standing in front of the ego, and not parked.
     """
     vehicles = scene["route_points"].shape[1]
     states = world.states[:, :vehicles].detach()

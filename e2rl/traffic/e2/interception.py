@@ -24,7 +24,7 @@ from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
-from e2rl.traffic.e2.motion import direction, take, way_to_stop_line
+from e2rl.traffic.e2.motion import direction, take, distance_to_stop_line
 
 ENDS = 3  # directions tried at the end of a path
 SAMPLES = 17  # points of a path that are checked
@@ -160,8 +160,8 @@ def intercept(
 ) -> Interception:
     """The cheapest interception by each of vehicles index [B, M] of its target [B, M], at intensities eta [B].
 
-    expected [B, V, H, 4]: states of everybody at steps 1..H; on the way nobody but the target is touched.
-    halt_at_red: no path is longer than the way to a stop line that binds the vehicle now.
+    expected [B, V, H, 4]: states of everybody at steps 1..H; on the path nobody but the target is touched.
+    halt_at_red: no path is longer than the distance to a stop line that binds the vehicle now.
     """
     scene, vehicles = world.scene, expected.shape[1]
     states, target_states = take(world.states, index), take(expected, target)
@@ -178,7 +178,7 @@ def intercept(
     ok &= _on_road(paths, states, scene)
     if halt_at_red:
         assert world.route is not None
-        ok &= paths.length[..., -1] <= way_to_stop_line(world, index, take(world.route, index)[..., None].clamp(min=0))
+        ok &= paths.length[..., -1] <= distance_to_stop_line(world, index, take(world.route, index)[..., None].clamp(min=0))
     travelled = (v[..., None] * times + 0.5 * accel[..., None] * times**2).clamp(min=0)
     travelled = travelled.masked_fill(times >= time[..., None], -1.0)
     row = torch.arange(vehicles, device=index.device)
@@ -211,7 +211,7 @@ def _resampled(points: Tensor, length: Tensor, heading: Tensor, count: int) -> T
     s = SPACING * torch.arange(count, device=points.device, dtype=points.dtype).expand(*length.shape[:2], count)
     after = torch.searchsorted(length.contiguous(), s.contiguous(), right=True).clamp(1, SAMPLES - 1)
     low, high = length.gather(-1, after - 1), length.gather(-1, after)
-    share = ((s - low) / (high - low).clamp(min=1e-6)).clamp(max=1.0)
+    fraction = ((s - low) / (high - low).clamp(min=1e-6)).clamp(max=1.0)
     a, b = (points.gather(2, i[..., None].expand(*i.shape, 2)) for i in (after - 1, after))
     beyond = (s - length[..., -1:]).clamp(min=0)
-    return a + share[..., None] * (b - a) + beyond[..., None] * direction(heading)[:, :, None]
+    return a + fraction[..., None] * (b - a) + beyond[..., None] * direction(heading)[:, :, None]

@@ -1,4 +1,4 @@
-"""What feasibility, skeleton and anchoring share: picking vehicles, and coarse motion along routes.
+"""What feasibility, skeleton and anchoring have in common: picking vehicles, and coarse motion along routes.
 
 The red light that a proposal keeps (docs/adversaries.md).
 """
@@ -64,7 +64,7 @@ def frenet_pose(states: Tensor, routes: Tensor) -> tuple[Tensor, Tensor, Tensor]
 
 
 def remaining_offset(travelled: Tensor, speed: Tensor) -> Tensor:
-    """Share of a lateral offset that is left after `travelled` m: a quintic over the prior's lateral horizon."""
+    """Fraction of a lateral offset that is left after `travelled` m: a quintic over the prior's lateral horizon."""
     u = (travelled / lateral_horizon(speed)).clamp(0, 1)
     return 1 - u**3 * (10 + u * (6 * u - 15))
 
@@ -122,7 +122,7 @@ def reachable_distance(speed: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
 YELLOW_BRAKING = 3.0  # m/s^2 with which a vehicle halts at a yellow light, or else goes on
 
 
-def way_to_stop_line(world: World, index: Tensor, number: Tensor) -> Tensor:
+def distance_to_stop_line(world: World, index: Tensor, number: Tensor) -> Tensor:
     """Metres [B, M, R] that vehicles index [B, M] may drive along candidates number [B, M, R] before their front is at
     a stop line that binds them now, inf for none."""
     scene, states = world.scene, take(world.states, index)

@@ -41,7 +41,7 @@ from e2rl.traffic.traffic import REPLAN_STEPS
 
 MOMENTS = 10  # at which the ego may be met, one every 0.5 s
 CHECKED, RUN_ON = 3, 2.0  # points of a path that must be drivable, evenly spaced in time, for at least so many s
-TOUCH = 0.4  # share of both lengths by which boxes that move alike touch before their centres meet
+TOUCH = 0.4  # fraction of both lengths by which boxes that move alike touch before their centres meet
 MISS_COST = 1.0  # s that 1 m by which the ego is missed weighs, against the costs of an interception
 UNAIMED = 1.0  # m/s^2 of braking without an aim
 ALONG = 0.9  # cosine between headings from which on a vehicle follows the ego where they meet
@@ -95,10 +95,10 @@ def best_aim(states: Tensor, target: Target, eta: Tensor, ground: Ground, limits
     local = to_frame(target.states[..., :2], states[:, None])
     bearing = torch.atan2(local[..., 1], local[..., 0])
     chord = local.norm(dim=-1)
-    way = chord / torch.sinc(bearing / torch.pi).clamp(min=0.1)
+    length = chord / torch.sinc(bearing / torch.pi).clamp(min=0.1)
     alike = (states[:, 2:3] + 2 * bearing - target.states[..., 2]).cos().square()
     touch = TOUCH * (target.length + target.own_length)[:, None] * alike
-    accel = 2 * (way - touch - v * times) / times**2
+    accel = 2 * (length - touch - v * times) / times**2
     top = torch.minimum(limits.push * dial, (v.clamp(min=TOP_SPEED) - v) / times)
     accel = torch.minimum(accel.maximum(-limits.brake * dial), top).maximum(-v / times)
     fastest = torch.maximum(v, v + accel * times)
@@ -178,7 +178,7 @@ class Law:
 
 
 NEAR, MOVING = 50.0, 1.0  # m from the ego and m/s: other vehicles that may react
-LATEST = 0.6  # share of the episode in which vehicles begin to react
+LATEST = 0.6  # fraction of the episode in which vehicles begin to react
 MOST = 2  # vehicles that react in an episode
 NEVER = 1 << 30
 
@@ -228,7 +228,7 @@ def drawn(settings: ReactSettings, episodes: NewEpisodes, generator: torch.Gener
 
 def chosen(part: TensorDict, world: World, responsibility: str) -> tuple[Tensor, Tensor]:
     """Vehicles [b, MOST] that begin to react now and which of them there are [b, MOST]: present adversaries of the
-    traffic, or others that move near the ego; with full responsibility none of these that lead the ego's way."""
+    traffic, or others that move near the ego; with full responsibility none of these that lead the ego."""
     vehicles = part["rank"].shape[1]
     states = world.states[:, :vehicles]
     present = world.valid[:, :vehicles].clone()

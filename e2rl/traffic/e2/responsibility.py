@@ -49,7 +49,7 @@ def leading(world: World, vehicles: int) -> Tensor:
     return along & (place[..., 0] > NEAR)
 
 
-def owes_way(world: World, vehicles: int) -> Tensor:
+def yields_at_once(world: World, vehicles: int) -> Tensor:
     """Bool [B, V]: vehicles that cross the ego's path from its left, and so give way where nothing else decides."""
     angle = wrap(world.states[:, :vehicles, 2] - world.states[:, :1, 2])
     return (angle < -CROSSING) & (angle > CROSSING - torch.pi)
@@ -64,6 +64,6 @@ def duty_of(responsibility: str, settings: YieldingSettings, world: World, coali
     if responsibility == "rear":
         return Duty(ahead, nobody, zero)
     free = coalition & followed(world, vehicles)
-    waits = ahead & ~owes_way(world, vehicles)
+    waits = ahead & ~yields_at_once(world, vehicles)
     patience = (settings.patience * eta).clamp(max=settings.max_patience)[:, None] * waits
     return Duty(free, coalition & ~free, patience)

@@ -3,12 +3,31 @@
 import pytest
 import torch
 
-from e2rl.learning.prior_training.loss import augment, denoising_loss, held_out_loss
-from e2rl.learning.prior_training.training_settings import TrainingSettings
+from e2rl.learning.prior_training import loss
+from e2rl.learning.prior_training.loss import DenoisingLoss, augment, draw, held_out_loss, loss_weight
 from e2rl.learning.prior_training.windows import make_windows
 from tests.prior.small import curved_scenes, small_prior
 
-QUIET = {"drop": 0.0, "feature_noise": 0.0, "accel_noise": 0.0, "bf16": False}
+QUIET = {"MIRROR": 0.0, "DROP": 0.0, "ACCEL_NOISE": 0.0}
+
+
+@pytest.fixture
+def augmented(monkeypatch):
+    """Windows augmented in one way only."""
+
+    def augmented(windows, **constants):
+        for name, value in (QUIET | constants).items():
+            monkeypatch.setattr(loss, name, value)
+        return augment(windows, seeded())
+
+    return augmented
+
+
+def terms(prior, batch, generator):
+    """The loss of windows and its two terms, without noise on the features."""
+    drawn = draw(batch, generator)
+    total = loss_weight(batch, drawn).sum().clamp(min=1)
+    return DenoisingLoss(prior.denoiser, feature_noise=0.0)(batch, drawn, total)
 
 
 @pytest.fixture(scope="module")
@@ -20,65 +39,78 @@ def seeded(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
-def test_two_mirrors_cancel_and_none_changes_nothing(windows):
-    mirror, plain = TrainingSettings(mirror=1.0, **QUIET), TrainingSettings(mirror=0.0, **QUIET)
-    once = augment(windows, mirror, seeded())
+def test_two_mirrors_cancel_and_none_changes_nothing(windows, augmented):
+    once = augmented(windows, MIRROR=1.0)
     assert (once["x0"] != windows["x0"]).any()
-    for batch in (augment(once, mirror, seeded()), augment(windows, plain, seeded())):
+    for batch in (augmented(once, MIRROR=1.0), augmented(windows)):
         for key in windows.keys():  # noqa: SIM118 - a TensorDict
             torch.testing.assert_close(batch[key], windows[key], msg=key)
 
 
-def test_the_loss_of_a_mirrored_network_input_is_defined_by_the_same_targets(windows):
-    """An untrained network is odd in the sided entries, so its loss does not see the mirror."""
-    mirror = TrainingSettings(mirror=1.0, **QUIET)
+def test_an_untrained_network_is_odd_in_the_sided_entries_so_its_loss_does_not_see_the_mirror(windows, augmented):
     prior = small_prior()
     torch.nn.init.zeros_(prior.denoiser.head[1].weight)
     torch.nn.init.zeros_(prior.denoiser.head[1].bias)
-    settings = TrainingSettings(mirror=0.0, levels=1, **QUIET)
-    there = augment(windows, mirror, seeded())
-    losses = [denoising_loss(prior, batch, settings, seeded(3))[1]["trajectory"] for batch in (windows, there)]
-    assert losses[0] == pytest.approx(losses[1].item(), rel=0.2)
+    there = augmented(windows, MIRROR=1.0)
+    losses = [terms(prior, batch, seeded(3))[2].item() for batch in (windows, there)]
+    assert losses[0] == pytest.approx(losses[1], rel=0.2)
 
 
-def test_hidden_vehicles_are_absent_weigh_nothing_and_are_never_the_ego(windows):
-    batch = augment(windows, TrainingSettings(**{**QUIET, "drop": 1.0}), seeded())
+def test_hidden_vehicles_are_absent_weigh_nothing_and_are_never_the_ego(windows, augmented):
+    batch = augmented(windows, DROP=1.0)
     assert batch["present"][:, 0].all() and not batch["present"][:, 1:].any() and (batch["weight"][:, 1:] == 0).all()
 
 
 def test_the_windows_themselves_are_left_alone(windows):
     before = windows.clone()
-    augment(windows, TrainingSettings(), seeded())
+    augment(windows, seeded())
     assert all(torch.equal(before[key], windows[key]) for key in before.keys())  # noqa: SIM118
 
 
-def test_accelerations_are_noisy_in_feature_and_state_alike(windows):
-    settings = TrainingSettings(**{**QUIET, "accel_noise": 1.0, "mirror": 0.0})
-    batch = augment(windows, settings, seeded())
+def test_accelerations_are_noisy_in_feature_and_state_alike(windows, augmented):
+    batch = augmented(windows, ACCEL_NOISE=1.0)
     change = batch["a"] - windows["a"]
     assert 0.3 < (change == 0).float().mean() < 0.7
     torch.testing.assert_close(batch["nodes"][..., 1] - windows["nodes"][..., 1], change / 2, rtol=0, atol=1e-5)
 
 
+def test_noise_levels_are_stratified_and_a_clean_ego_weighs_nothing(windows):
+    drawn = draw(windows, seeded())
+    level = drawn["level"]
+    assert level.shape == (len(windows), loss.LEVELS) and level.min() >= 0.01 and level.max() <= 0.99
+    bins = ((level - 0.01) / 0.98 * loss.LEVELS).floor()
+    assert torch.equal(bins, torch.arange(float(loss.LEVELS)).expand_as(bins))
+    weight = loss_weight(windows, drawn).unflatten(0, (loss.LEVELS, len(windows)))
+    assert torch.equal(weight[..., 0], windows["weight"][:, 0] * ~drawn["clean"].T)
+    assert torch.equal(weight[..., 1:], windows["weight"][:, 1:].expand(loss.LEVELS, -1, -1))
+
+
 def test_a_perfect_estimate_costs_nothing_but_the_fit_s_own_error(windows):
-    prior, settings = small_prior(), TrainingSettings(levels=2, **QUIET)
-    batch = windows.clone()
-    prior.denoiser.forward = lambda x, level, encoding: torch.cat([batch["x0"]] * 2)
-    loss, parts = denoising_loss(prior, batch, settings, seeded())
-    assert parts["action"] == 0 and parts["trajectory"] < 0.05 and loss.isfinite()
+    prior = small_prior()
+    prior.denoiser.forward = lambda x, level, encoding: torch.cat([windows["x0"]] * loss.LEVELS)
+    total, action, trajectory = terms(prior, windows, seeded())
+    assert action == 0 and trajectory < 0.05 and total == loss.TRAJECTORY * trajectory
+
+
+def test_the_action_term_is_the_weighted_mean_square_over_known_knots(windows):
+    prior = small_prior()
+    prior.denoiser.forward = lambda x, level, encoding: torch.cat([windows["x0"] + 0.5] * loss.LEVELS)
+    drawn = draw(windows, seeded())
+    weight = loss_weight(windows, drawn)
+    known = torch.cat([windows["knot_weight"]] * loss.LEVELS).mean(-1)
+    expected = (0.25 * known * weight).sum() / weight.sum()
+    torch.testing.assert_close(terms(prior, windows, seeded())[1], expected)
 
 
 def test_offsets_count_on_lanes_only(windows):
-    prior, settings = small_prior(), TrainingSettings(levels=1, **QUIET)
-    lane, free = windows.clone(), windows.clone()
+    prior, free, wrong = small_prior(), windows.clone(), windows["x0"].clone()
     free["on_lane"] = torch.zeros_like(free["on_lane"])
-    wrong = windows["x0"].clone()
     wrong[..., -1] += 2.0  # 1 m to the left in the end
-    prior.denoiser.forward = lambda x, level, encoding: wrong
-    seen, unseen = (denoising_loss(prior, batch, settings, seeded())[1]["trajectory"] for batch in (lane, free))
+    prior.denoiser.forward = lambda x, level, encoding: torch.cat([wrong] * loss.LEVELS)
+    seen, unseen = (terms(prior, batch, seeded())[2] for batch in (windows, free))
     assert seen > 0.2 and unseen < 0.05
 
 
 def test_held_out_loss_is_the_same_each_time(windows):
-    prior, settings = small_prior(), TrainingSettings(batch=4)
-    assert held_out_loss(prior, windows, settings) == held_out_loss(prior, windows, settings)
+    prior = small_prior()
+    assert held_out_loss(prior, windows, 4) == held_out_loss(prior, windows, 4)

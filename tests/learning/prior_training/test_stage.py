@@ -5,9 +5,11 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 
+from e2rl.learning.logging import RunLogger
 from e2rl.learning.prior_training.stage import FIGURES, _closed_loop, _first_starts, run_prior_stage
-from e2rl.learning.prior_training.training_settings import TrainingSettings
+from e2rl.learning.prior_training.training import TrainingSettings
 from e2rl.run.errors import InputError
+from e2rl.run.run import Run
 from tests.prior.small import small_prior
 from tests.synthetic import make_scenes
 
@@ -17,13 +19,13 @@ CONF = str(Path(__file__).parents[3] / "conf")
 @pytest.mark.parametrize(
     ("override", "what"),
     [
-        ("+prior.training.x=1", "prior.training.x=1"),
-        ("prior.training.steps=abc", "prior.training.steps=abc"),
-        ("prior.training.steps=0", "prior.training.steps=0"),
+        ("+stage.x=1", "stage.x=1"),
+        ("stage.steps=abc", "stage.steps=abc"),
+        ("stage.steps=0", "stage.steps=0"),
         ("prior.network.width=95", "multiple of heads=4"),
         ("prior.network.blocks=two", "prior.network.blocks=two"),
         ("+prior.network.depth=2", "prior.network.depth=2"),
-        ("prior.training.starts=[]", "prior.training.starts"),
+        ("stage.starts=[]", "stage.starts"),
         ("+prior.bounds.up=1", "prior.bounds.up=1"),
     ],
 )
@@ -31,7 +33,7 @@ def test_impossible_settings_are_named_before_anything_is_read(tmp_path, overrid
     with initialize_config_dir(CONF, version_base="1.3"):
         config = compose("train", ["stage=prior", "data=scenarionet", "data.path=nowhere", override])
     with pytest.raises(InputError, match=what):
-        run_prior_stage(config, tmp_path, lambda scenes: None)
+        run_prior_stage(Run(config, tmp_path, {}), RunLogger("none", tmp_path))
     assert not list(tmp_path.iterdir())
 
 

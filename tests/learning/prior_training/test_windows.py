@@ -25,7 +25,8 @@ def test_constant_velocity_along_the_lane_is_zero_x():
 @pytest.mark.parametrize("free", [False, True])
 def test_mirrored_scenes_give_mirrored_windows(free):
     scene = curved_scenes()
-    here, there = make_windows(scene, free), make_windows(mirrored(scene), free)
+    scene["route_valid"][:, :FIRST] &= not free
+    here, there = make_windows(scene), make_windows(mirrored(scene))
     assert len(here) == len(there)
     for key, sided in (("nodes", SIDED_NODE), ("pairs", SIDED_EDGE), ("x0", (KNOTS, KNOTS + 1))):
         sign = torch.ones(here[key].shape[-1])
@@ -49,15 +50,16 @@ def test_the_ego_leads_every_window_and_parked_or_lost_vehicles_teach_nothing():
 
 
 def test_free_space_windows_are_not_judged_by_their_offset_from_a_route():
+    """Vehicles without a route candidate: the distance is the one driven, not one along a route."""
     scene = curved_scenes()
     scene["route_valid"][:, 2] = False
-    mixed, free, lane = make_windows(scene), make_windows(scene, True), make_windows(curved_scenes())
-    assert lane["on_lane"][:, :FIRST].all() and not free["on_lane"][:, :FIRST].any()
-    assert ((~mixed["on_lane"][:, :FIRST]).sum(1) == 1).all()
-    way = 0.5 * torch.arange(1, KNOTS + 1)
-    use = free["weight"] > 0
-    expected = (free["v"][..., None] * way)[use]
-    torch.testing.assert_close(free["ahead"][use], expected, rtol=0.02, atol=0.1, msg="way driven, not way of a route")
+    mixed, lane = make_windows(scene), make_windows(curved_scenes())
+    assert lane["on_lane"][:, :FIRST].all()
+    free = ~mixed["on_lane"] & (mixed["weight"] > 0)
+    assert (free[:, :FIRST].sum(1) == 1).all()
+    time = 0.5 * torch.arange(1, KNOTS + 1)
+    expected = (mixed["v"][..., None] * time)[free]
+    torch.testing.assert_close(mixed["ahead"][free], expected, rtol=0.02, atol=0.1)
 
 
 def test_the_derivative_of_a_parabola_is_exact_inside_and_one_sided_at_gaps():

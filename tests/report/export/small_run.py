@@ -12,6 +12,8 @@ from e2rl.metrics.score import score_rollouts
 from e2rl.scenes.recording import CYCLIST, OTHER, PEDESTRIAN
 from e2rl.scenes.source import load_scenes
 from e2rl.sim.rollout_file import ROLLOUTS, Rollout, rollout_name
+from e2rl.sim.rollouts import Rollouts
+from tests.metrics.random_rollouts import sourced
 from tests.scenes.descriptions import FRAMES, data_config, description, numbered, straight, track, write_folder
 
 PHASES = ["LANE_STATE_STOP"] * 40 + ["LANE_STATE_GO"] * (FRAMES - 40)

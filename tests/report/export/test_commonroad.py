@@ -12,9 +12,9 @@ import pytest
 pytest.importorskip("commonroad", reason="--to commonroad needs the extra commonroad")
 import commonroad  # noqa: E402
 from commonroad.common.reader.file_reader_xml import XMLFileReader  # noqa: E402
-from e2rl.scripts.export import LIST, main
 from lxml import etree  # noqa: E402
 
+from e2rl.commands.export import LIST, main
 from e2rl.scenes.commonroad import read_scenario
 from e2rl.scenes.recording import CYCLIST, OTHER, PEDESTRIAN
 from tests.report.export.small_run import CUT_IN, GAPS, LATE, TRUCK, rollout_of, row_of  # noqa: E402

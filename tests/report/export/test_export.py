@@ -5,9 +5,9 @@ import shutil
 
 import numpy as np
 import pytest
-from e2rl.scripts.export import LIST, main
 from omegaconf import OmegaConf
 
+from e2rl.commands.export import LIST, main
 from e2rl.evaluation.rollout_files import read_rows, write_rows
 from e2rl.scenes.source import source_of
 from e2rl.sim.rollout_file import Rollout
@@ -47,14 +47,12 @@ def test_npz_are_the_rollouts_and_their_scenes(run, tmp_path):
     main([str(run), "--to", "npz", "--all", "--out", str(tmp_path / "all")])
     for index, line in enumerate(lines(tmp_path / "all")):
         ours, theirs = rollout_of(run, index), Rollout.read(tmp_path / "all" / line["file"])
-        assert ours.keys() == theirs.keys() and all(
-            np.array_equal(ours[key], theirs[key]) for key in ("states", "valid")
-        )
+        assert all(np.array_equal(value, getattr(theirs, name)) for name, value in vars(ours).items())
         with np.load(tmp_path / "all" / "scenes" / f"scene-{index}.npz") as scene:
             assert scene["lane_id"].tolist() == ["in", "on", "left", "near"]
             np.testing.assert_allclose(scene["lane_limit"], [50 / 3.6, 20, 50 / 3.6, 50 / 3.6])
-            np.testing.assert_allclose(scene["origin"] + ours["states"][0, 0, :2], [28, 0], atol=1e-3)
-            np.testing.assert_allclose(scene["logged"], ours["logged"])
+            np.testing.assert_allclose(scene["origin"] + ours.states[0, 0, :2], [28, 0], atol=1e-3)
+            np.testing.assert_allclose(scene["logged"], ours.logged)
 
 
 def test_what_cannot_be_exported_is_named_and_nothing_is_left(run, copy, tmp_path, capsys):

@@ -11,10 +11,10 @@ import pytest
 
 pytest.importorskip("mcap_protobuf", reason="--to mcap needs the extra mcap")
 pytest.importorskip("foxglove_schemas_protobuf", reason="--to mcap needs the extra mcap")
-from e2rl.scripts.export import LIST, main
 from mcap.reader import make_reader  # noqa: E402
 from mcap_protobuf.decoder import DecoderFactory  # noqa: E402
 
+from e2rl.commands.export import LIST, main
 from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.report.export.episode import rollout_episode
 from e2rl.report.export.mcap import content
@@ -122,7 +122,7 @@ def test_plans_are_there_where_the_rollout_has_them_and_the_same_rollout_makes_t
     plans[2, 1] = np.nan
     ring = {"drivable_points": np.array([[0, 0], [9, 0], [9, 5.0]]), "drivable_offsets": np.array([0, 3])}
     more = ring | {"plans": plans, "planners": np.array([0, CUT_IN])}
-    planned = replace(episode, rollout=episode.rollout | more)
+    planned = replace(episode, rollout=replace(episode.rollout, **more))
     (tmp_path / "x.mcap").write_bytes(content(planned))
     with (tmp_path / "x.mcap").open("rb") as file:
         topics, _ = read(file)

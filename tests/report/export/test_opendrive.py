@@ -6,10 +6,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from e2rl.scripts.export import LIST, main
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from e2rl.commands.export import LIST, main
 from e2rl.report.export.opendrive import FIT, junctions_of, left_out, links
 from e2rl.scenes.paths import resample, tangent_angle
 from e2rl.scenes.recording import Lane

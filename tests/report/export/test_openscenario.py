@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 pytest.importorskip("scenariogeneration", reason="--to openscenario needs the extra openscenario")
-from e2rl.scripts.export import LIST, main
 from scenariogeneration import xosc  # noqa: E402
 
+from e2rl.commands.export import LIST, main
 from e2rl.report.export.openscenario import EGO
 from e2rl.scenes.recording import CYCLIST, OTHER, PEDESTRIAN
 from tests.report.export.small_run import CUT_IN, GAPS, LATE, TRUCK, rollout_of, row_of  # noqa: E402

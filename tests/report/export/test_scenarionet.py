@@ -5,8 +5,8 @@ import pickle
 
 import numpy as np
 import pytest
-from e2rl.scripts.export import LIST, main
 
+from e2rl.commands.export import LIST, main
 from e2rl.scenes.recording import AGENT_TYPES, LIGHT_GREEN, LIGHT_RED
 from e2rl.scenes.scenarionet import ScenarioNetSource
 from tests.report.export.small_run import CUT_IN, LATE, rollout_of

@@ -36,7 +36,7 @@ def test_after_the_plan_speed_is_kept():
 def test_a_scenario_is_made_once_and_again_when_its_plan_is_over():
     on, scene, made = baseline("diffscene"), scenes(2).scenes, []
     scenario = on.scenario
-    on.scenario = lambda state, *rest: made.append(state.replans.tolist()) or scenario(state, *rest)
+    on.scenario = lambda now, *rest: made.append(now.state.replans.tolist()) or scenario(now, *rest)
     state, world = begin(on, scene, 2.0), World.at_start(scene)
     for _ in range(EVERY + 1):
         plan = EGO.plan(world)

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from e2rl.prior.lane_relative import LaneState, speeds
-from e2rl.run.errors import InputError
 from e2rl.scenes.recording import DT
 from e2rl.traffic.e2 import anchoring
 from e2rl.traffic.e2.anchoring import AnchorSettings, propose
@@ -61,10 +60,35 @@ def test_both_arrive_at_the_crossing_at_once(ahead, way, speed):
     assert anchor.cost[0, 1] < 0.25 + 0.2 * anchor.knots[0, 1].abs().max() and not anchor.off_lane.any()
 
 
-def test_the_gentlest_of_equal_arrivals_wins():
+@pytest.mark.parametrize(("late", "finite"), [(4.0, True), (9.0, True), (14.0, False)])
+def test_a_crossing_that_is_missed_costs_the_time_gap(late, finite, monkeypatch):
+    """Without acceleration both keep 10 m/s: `late` m behind the crossing it misses by late / 10 s, 1 s at most."""
+    monkeypatch.setattr(anchoring, "MAX_OFFSET", 1.0)
+    world = make_world([EGO, (30.0, -30.0 - late, UP, 10.0)])
+    anchor, _ = anchored(world, 1, min_accel=-1e-6, max_accel=0.2 - 1e-6)
+    gap = late / 10
+    best = min(gap, anchor.cost[0, 1].item()) if finite else math.inf
+    assert anchor.feasible[0, 1] == (best <= 1.0)
+    still, _ = anchored(world, 1, min_accel=-0.05, max_accel=0.05)
+    assert bool(still.feasible[0, 1]) == finite
+    if finite:
+        assert still.cost[0, 1].item() == pytest.approx(gap, abs=0.2)
+
+
+def test_acceleration_and_offset_weigh_on_the_cost(monkeypatch):
     world = make_world([EGO, (40.0, -40.0, UP, 10.0)])
-    anchor, _ = anchored(world, 1)
-    assert anchor.knots[0, 1].abs().max() < 0.3
+    free = anchored(world, 1)[0].cost[0, 1].item()
+    world.states[:, 1, 0] += 1.0
+    beside = anchored(world, 1)[0].cost[0, 1].item()
+    assert beside - free == pytest.approx(anchoring.LATERAL_COST, abs=0.03)
+    late = make_world([EGO, (40.0, -50.0, UP, 10.0)])
+    costs = []
+    for weight in (0.0, 0.2):
+        monkeypatch.setattr(anchoring, "ACCEL_COST", weight)
+        costs.append(anchored(late, 1)[0])
+    used = [one.knots[0, 1, 0].item() for one in costs]
+    assert costs[0].cost[0, 1] < 0.05 and used[0] > 0.5
+    assert 0 < costs[1].cost[0, 1] - costs[0].cost[0, 1] <= 0.2 * used[0] + 0.05 and used[1] <= used[0]
 
 
 def test_a_leader_brakes_and_a_follower_speeds_up():
@@ -145,8 +169,3 @@ def test_accelerations_are_bounded_and_bends_slow_down(monkeypatch):
     speed, way = speeds(state, knots)
     inside = (way > 16) & (way < 34)
     assert inside.any() and (speed[inside] < 1.1 * math.sqrt(4.0 * radius)).all()
-
-
-def test_bad_settings_are_refused():
-    with pytest.raises(InputError, match="strength"):
-        AnchorSettings(strength=1.5)

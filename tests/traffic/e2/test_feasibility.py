@@ -47,7 +47,8 @@ def test_windows_hold_what_both_can_reach():
     [
         ((-20.0, 0.0, 0.0, 12.0), True),  # behind in the same lane
         ((25.0, 0.0, 0.0, 8.0), True),  # ahead in the same lane
-        ((0.0, 12.0, 0.0, 10.0), False),  # parallel
+        ((0.0, 5.9, 0.0, 10.0), True),  # parallel, and could come over
+        ((0.0, 6.1, 0.0, 10.0), False),  # parallel, too far
         ((30.0, 20.0, UP, 10.0), False),  # has crossed already
         ((110.0, -100.0, UP, 2.0), False),  # cannot be there in time
         ((60.0, 0.0, LEFT, 10.0), True),  # head-on
@@ -65,30 +66,47 @@ def test_only_the_candidate_that_crosses_is_listed():
 
 
 @pytest.mark.parametrize(
-    "vehicle, parked, relevant",
+    ("aside", "turn", "depth", "associated"),
     [
-        ((14.0, 0.0, 0.0, 0.0), False, True),  # standing in the way
-        ((14.0, 0.0, 0.0, 0.0), True, False),  # the same, parked
-        ((40.0, 0.0, 0.0, 0.0), False, False),  # standing too far ahead
-        ((14.0, 4.0, 0.0, 0.0), False, False),  # standing beside
-        ((-14.0, 0.0, 0.0, 0.0), False, False),  # standing behind
-        ((40.0, -20.0, UP, 3.0), False, True),  # moving
+        (1.9, 0.0, -1.0, True),
+        (2.1, 0.0, -1.0, False),
+        (-2.1, 0.0, -1.0, False),
+        (0.0, 0.75, -1.0, True),
+        (0.0, 0.85, -1.0, False),
+        (0.0, -0.85, -1.0, False),
+        (0.0, 0.0, 0.5, False),
     ],
 )
-def test_who_is_relevant(vehicle, parked, relevant):
-    world = make_world([EGO, vehicle])
-    world.scene["parked"][:, 1] = parked
-    assert feasible_vehicles(world.scene, world, SETTINGS).relevant[0, 1] == relevant
-
-
-def test_off_lane_off_road_and_turned_vehicles_are_not_associated():
-    world = make_world([EGO] + [(30.0 + 10 * k, -20.0, UP, 5.0) for k in range(4)])
-    world.states[:, 1, 0] += 3.0
-    world.states[:, 2, 2] += 1.2
+def test_whoever_is_on_the_road_near_a_centreline_and_along_it_is_associated(aside, turn, depth, associated):
+    world = make_world([EGO, (30.0, -20.0, UP, 5.0)])
+    world.states[:, 1, 0] += aside
+    world.states[:, 1, 2] += turn
+    world.scene["field"].fill_(depth)
     result = feasible_vehicles(world.scene, world, SETTINGS)
-    assert result.associated[0, 1:5].tolist() == [False, False, True, True]
-    world.scene["field"].fill_(2.0)
-    assert not feasible_vehicles(world.scene, world, SETTINGS).mask.any()
+    assert result.associated[0, 1] == associated and (associated or not result.mask.any())
+
+
+@pytest.mark.parametrize(
+    ("gap", "aside", "speed", "relevant"),
+    [
+        (14.9, 0.0, 0.0, True),
+        (15.1, 0.0, 0.0, False),
+        (10.0, 0.25, 0.0, True),
+        (10.0, 0.35, 0.0, False),
+        (40.0, 0.0, 0.55, True),
+        (40.0, 0.0, 0.45, False),
+        (-14.0, 0.0, 0.0, False),
+    ],
+)
+def test_whoever_moves_or_stands_closely_ahead_is_relevant(gap, aside, speed, relevant):
+    """gap: bumper to bumper; aside: beyond where the boxes would touch."""
+    world = make_world([EGO, (0.0, 0.0, 0.0, speed)])
+    length, width = (world.scene["size"][0, :2].sum(0) / 2).tolist()
+    world.states[:, 1, 0] = gap + math.copysign(length, gap)
+    world.states[:, 1, 1] = width + aside if aside else 0.0
+    assert feasible_vehicles(world.scene, world, SETTINGS).relevant[0, 1] == relevant
+    world.scene["parked"][:, 1] = True
+    assert not feasible_vehicles(world.scene, world, SETTINGS).relevant[0, 1]
 
 
 def test_absent_vehicles_and_the_ego_are_never_feasible_and_scenes_do_not_mix():

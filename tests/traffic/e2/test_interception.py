@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from e2rl.prior.lane_relative import LaneState, speeds
-from e2rl.run.errors import InputError
 from e2rl.scenes.boxes import overlap
 from e2rl.scenes.drivable_area import CELL
 from e2rl.scenes.recording import DT, LIGHT_GREEN, LIGHT_RED
@@ -67,12 +66,22 @@ def test_the_cubic_between_two_poses_of_a_circle_is_its_arc(angle):
     assert gap.abs().max() < 3e-3 * radius
 
 
-def test_limits_grow_with_intensity_and_nothing_is_proposed_at_zero():
-    vehicle = (-15.0, 0.0, 0.0, 10.0)  # behind at the same speed: it must speed up
-    feasible = [bool(met([EGO, vehicle], eta)[0].cost.isfinite()) for eta in (0.0, 0.2, 0.5, 1.0, 2.0, 3.0)]
-    assert feasible == sorted(feasible) and not feasible[0] and feasible[-1]
-    gentle, hard = (met([EGO, vehicle], settings=replace(FREE, push=push))[0].cost for push in (0.3, 2.0))
-    assert gentle.isinf() and hard.isfinite()
+@pytest.mark.parametrize(("x", "heading", "ego"), [(-12.0, 0.0, 10.0), (60.0, math.pi, -10.0)])
+def test_straight_on_it_costs_what_its_acceleration_and_time_weigh(x, heading, ego):
+    """Behind the ego, or head-on: one constant acceleration until the boxes touch; the cheapest of ten moments."""
+    found, _, size = met([EGO, (x, 0.0, heading, 10.0)])
+    touch = 0.4 * (size[0, 0, 0] + size[0, 1, 0]).item() * (heading == 0.0)
+    costs = []
+    for step in range(1, 11):
+        time = 0.5 * step
+        way = abs(x - 10.0 * time) - touch
+        accel = 2 * (way - 10.0 * time) / time**2
+        within = -2 * FREE.brake <= accel <= 2 * FREE.push and 10.0 + accel * time >= 0
+        costs.append((0.2 * abs(accel) + 0.1 * time - FREE.preference if within else math.inf, accel, step))
+    cost, accel, step = min(costs)
+    assert found.cost.item() == pytest.approx(cost, abs=1e-3)
+    assert found.knots[0, 0, :step].tolist() == pytest.approx([accel] * step, abs=1e-3)
+    assert not found.knots[0, 0, step:].any()
 
 
 @pytest.mark.parametrize("eta", [0.5, 1.0, 3.0])
@@ -114,11 +123,6 @@ def test_a_turned_and_moved_scene_has_the_turned_and_moved_way():
     other = met(moved)[0]
     torch.testing.assert_close(other.path[0, 0], one.path[0, 0] @ spin.T + shift, atol=2e-3, rtol=1e-4)
     torch.testing.assert_close(other.cost, one.cost, atol=1e-3, rtol=1e-4)
-
-
-def test_settings_that_make_no_sense_are_refused():
-    with pytest.raises(InputError, match="reach"):
-        InterceptionSettings(reach=9.0)
 
 
 def oncoming_world():

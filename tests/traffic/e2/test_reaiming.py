@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 from torchrl.envs import TransformedEnv
-from torchrl.envs.utils import check_env_specs
 
 from e2rl.planners.ego import EgoPolicy
 from e2rl.planners.idm_planner import IDMEgo
@@ -33,7 +32,7 @@ from e2rl.traffic.reaction import NewEpisodes
 from e2rl.traffic.transform import AdversarialSynthesizer
 from tests.traffic.e2.crossing import make_world
 from tests.traffic.e2.traffic_scenes import scenes
-from tests.traffic.test_transform import March, in_turn
+from tests.traffic.test_transform import in_turn
 
 ON = SimSettings(end_on_contact=False, end_off_road=False)
 EVERYBODY = ReactSettings(fraction=1.0, others=0.0)
@@ -76,13 +75,6 @@ def test_traffic_in_which_nobody_reacts_is_today_s_bit_for_bit(scene_set):
     assert torch.equal(tracks(today)[4:], tracks(reacting)[4:]), "nor in rows without an intensity"
 
 
-def test_rows_of_live_traffic_never_react(scene_set):
-    pool = TrafficPool.live(torch.arange(4), torch.full((4,), 2.0), torch.arange(4)) + stored(scene_set)
-    alone, beside = (driven(pool, scene_set, settings, traffic=March()) for settings in (None, EVERYBODY))
-    assert torch.equal(tracks(alone)[:4], tracks(beside)[:4])
-    assert not torch.equal(tracks(alone)[4:], tracks(beside)[4:])
-
-
 def test_the_row_s_adversaries_leave_the_replay_and_everybody_else_stays(scene_set):
     pool = stored(scene_set)
     frames = driven(pool, scene_set, EVERYBODY)
@@ -113,27 +105,6 @@ def test_motions_are_smooth_and_never_backwards(scene_set):
     assert (states[..., 3].diff(dim=1).abs() <= 0.1 * 7.0 + 1e-3).all(), "within the bounds of braking"
 
 
-def test_the_seed_decides(scene_set):
-    pool = stored(scene_set)
-    first, again, other = (tracks(driven(pool, scene_set, EVERYBODY, seed)) for seed in (0, 0, 1))
-    assert torch.equal(first, again) and not torch.equal(first, other)
-
-
-def test_an_announced_plan_changes_nothing(scene_set):
-    pool = stored(scene_set)
-
-    def policy(lie):
-        def act(tensordict):
-            tensordict["action"] = torch.tensor([0.3, 0.0]).repeat(len(tensordict), 1)
-            tensordict["ego", "plan"] = torch.full((len(tensordict), 50, 4), lie)
-            return tensordict
-
-        return act
-
-    one, two = (driven(pool, scene_set, EVERYBODY, policy=policy(lie)) for lie in (0.0, 99.0))
-    assert torch.equal(tracks(one), tracks(two))
-
-
 def test_new_episodes_draw_anew_and_others_go_on(scene_set):
     pool = stored(scene_set)
     reaction = Reaiming(EVERYBODY)
@@ -149,12 +120,6 @@ def test_new_episodes_draw_anew_and_others_go_on(scene_set):
     tensordict = env.reset(tensordict.set("_reset", second))
     assert not reaction.acting[1].any() and torch.equal(reaction.acting[[0, 2, 3]], before[[0, 2, 3]])
     assert torch.equal(tensordict["agents", "states"][1], scene_set.scenes["start"][tensordict["scene_index"][1, 0]])
-
-
-def test_the_specs_hold(scene_set):
-    pool = stored(scene_set)
-    base = DrivingEnv(scene_set, ON, 4, agents=True)
-    check_env_specs(TransformedEnv(base, AdversarialSynthesizer(pool, in_turn(pool), reaction=Reaiming(EVERYBODY))))
 
 
 def test_shares_of_episodes_are_as_set():

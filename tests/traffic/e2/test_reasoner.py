@@ -89,27 +89,6 @@ def test_the_rules_decide_where_the_model_fails(tmp_path, answer):
     assert not list(tmp_path.iterdir()), "failures are not kept"
 
 
-def test_slow_and_absent_endpoints_are_given_up(tmp_path):
-    def slow(request):
-        time.sleep(1.0)
-        return verdicts(request)
-
-    begin = time.perf_counter()
-    with chat_server(slow) as (url, _):
-        with pytest.warns(UserWarning, match="APITimeoutError"):
-            _, counts = ask(url, tmp_path, world(), timeout=0.2)
-        assert counts["lm_fallbacks"] == 1 and time.perf_counter() - begin < 0.9
-    with pytest.warns(UserWarning, match="APIConnectionError"):
-        _, counts = ask(url, tmp_path, world())
-    assert counts["lm_fallbacks"] == 1
-
-
-def test_failed_requests_are_retried_as_often_as_set(tmp_path):
-    with chat_server(lambda request: (500, "busy")) as (url, requests), pytest.warns(UserWarning):
-        ask(url, tmp_path, world(), retries=1)
-    assert len(requests) == 2
-
-
 def test_answers_are_kept_by_content(tmp_path):
     with chat_server(verdicts) as (url, requests):
         first, _ = ask(url, tmp_path, world())
@@ -137,12 +116,6 @@ def test_scenes_do_not_wait_for_each_other_and_do_not_mix(tmp_path):
         result, counts = ask(url, tmp_path, made)
     assert time.perf_counter() - begin < 1.2, "six quarters of a second one after another"
     assert result.mask[:, 2].tolist() == [True, True, True, False, True, True] and counts["lm_fallbacks"] == 1
-
-
-def test_an_ego_alone_asks_nothing(tmp_path):
-    with chat_server(verdicts) as (url, requests):
-        result, counts = ask(url, tmp_path, make_world([(0.0, 0.0, 0.0, 10.0)]))
-    assert not requests and not result.mask.any() and counts["lm_scenes"] == 0
 
 
 def test_the_synthesizer_counts_and_the_rules_are_the_default(tmp_path):

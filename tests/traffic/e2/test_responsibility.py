@@ -7,7 +7,6 @@ import torch
 
 from e2rl.traffic.e2.responsibility import YieldingSettings, duty_of, followed, leading
 from tests.traffic.e2.crossing import make_world
-from tests.traffic.e2.traffic_scenes import drive, scenes, synthesizer
 
 EGO = (0.0, 0.0, 0.0, 12.0)
 
@@ -57,14 +56,3 @@ def test_less_responsibility_binds_only_those_behind_or_nobody(responsibility, e
     duty = duty_of(responsibility, YieldingSettings(), world, coalition, torch.tensor([2.0]))
     assert duty.exempt[0, 1:3].tolist() == exempt
     assert not duty.yields.any() and not duty.patience.any()
-
-
-def test_an_adversary_with_responsibility_never_comes_from_behind():
-    """Closed loop, an ego that keeps its speed: whoever is behind it stays behind."""
-    scene_set = scenes(3, steps=40)
-    out = drive(scene_set, synthesizer(), 3.0)
-    start = out["states"][:, :1, :, 0] - out["states"][:, :1, :1, 0]
-    touching = out["states"][..., 0] - out["states"][..., :1, 0]
-    same_lane = (out["states"][..., 1] - out["states"][..., :1, 1]).abs() < 1.5
-    behind = (start < -4) & out["adversaries"][:, None]
-    assert not (behind & same_lane & (touching.abs() < 4.0)).any()

@@ -12,7 +12,7 @@ from e2rl.traffic.e2.anchoring import AnchorSettings, propose
 from e2rl.traffic.e2.feasibility import FeasibilitySettings, feasible_vehicles
 from e2rl.traffic.e2.interception import InterceptionSettings
 from e2rl.traffic.e2.motion import constant_speed_states
-from e2rl.traffic.e2.skeleton import STEP, SkeletonSettings, chain_depth, influence, lane_of, limits_of
+from e2rl.traffic.e2.skeleton import STEP, SkeletonSettings, influence, lane_of, limits_of
 from e2rl.traffic.e2.topology import TopologySettings, topological_candidates
 from e2rl.traffic.traffic import CHAIN, FULL, PAIR, SINGLE
 from tests.traffic.e2.crossing import add_route, make_world, mask, skeleton_of
@@ -159,7 +159,7 @@ def earliest(link, path):
     return step
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", [*range(10), 339, 343])  # in the last two a near one could act through another
 def test_a_chain_is_a_shortest_one_whose_effects_never_precede_their_causes(seed):
     """Against all orders of all vehicles between the far agent and a near one."""
     world = random_world(seed)
@@ -197,34 +197,23 @@ def test_some_of_the_random_worlds_have_a_chain_and_some_have_none():
     assert set(depths) >= {1, 2, 3}
 
 
+def test_absent_vehicles_take_no_part():
+    world = make_world([EGO, *COLUMN], copies=4)
+    for row, vehicle in enumerate((1, 2, 3)):
+        world.valid[row, vehicle] = False
+    assert members(skeleton_of(world, mask(world, 1, 2, 3), near=1)) == [
+        *([0, 2], [0, 3]),
+        [1, 1],
+        *([2, 1], [2, 2]),
+        *([3, 1], [3, 2], [3, 3]),
+    ]
+
+
 def test_any_candidate_route_may_lead_to_the_target():
     world = make_world([EGO, COLUMN[0], (10.0, -40.0, UP, 20.0)])
     assert not skeleton_of(world, mask(world, 1, 2), near=1).far.any()
     add_route(world, 2, 3, math.atan2(32.0, 20.0))  # towards where the first will be
     assert skeleton_of(world, mask(world, 1, 2), near=1, tau_long=60.0).far.any()
-
-
-def test_every_link_leads_to_the_ego_and_absent_vehicles_take_no_part():
-    generator = torch.Generator().manual_seed(0)
-    chains = 0
-    for _ in range(8):
-        spots = torch.rand(4, 4, generator=generator) * torch.tensor([80.0, 80, 6.28, 12])
-        spots[:, :2] -= 40
-        world = make_world([EGO, *COLUMN, *spots.tolist()], copies=4)
-        world.valid[:, 1:8] &= torch.rand(4, 7, generator=generator) < 0.9
-        support = torch.rand(4, 8, generator=generator) < 0.8
-        result = skeleton_of(world, support, near=1, far=2, tau_long=40.0)
-        chains += int(result.far.sum())
-        assert not (result.coalition & ~(support & world.valid[:, :8])).any() and not result.coalition[:, 0].any()
-        assert torch.equal(result.coalition, result.target >= 0) and torch.equal(result.coalition, result.depth > 0)
-        assert torch.equal(chain_depth(result.target), result.depth)
-        for b, i in result.coalition.nonzero().tolist():
-            way = [i]
-            while way[-1] != 0:
-                way.append(int(result.target[b, way[-1]]))
-                assert len(way) <= 5
-            assert len(way) - 1 == result.depth[b, i]
-    assert chains > 0
 
 
 def test_causal_templates_limit_each_scene_by_itself():

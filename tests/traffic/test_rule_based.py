@@ -1,4 +1,4 @@
-"""IDM: closed forms of car-following, red lights, standing cars, and the prior's own bounds."""
+"""Traffic without samples: log replay and constant velocity exactly, IDM by its closed forms and the prior's bounds."""
 
 import math
 
@@ -11,11 +11,65 @@ from e2rl.prior.lane_relative import HORIZON
 from e2rl.scenes.recording import DT, LIGHT_RED, LIGHT_YELLOW
 from e2rl.sim.world import World
 from e2rl.traffic import rule_based as idm_module
-from e2rl.traffic.rule_based import IDM
-from tests.prior.small import curved_scenes, small_prior
+from e2rl.traffic.rule_based import IDM, ConstantVelocity, Replay
+from tests.prior.small import VEHICLES, curved_scenes, small_prior
 from tests.synthetic import make_scenes
 from tests.traffic.e2.crossing import make_world
-from tests.traffic.e2.traffic_scenes import ROWS, begin, drive
+from tests.traffic.e2.traffic_scenes import ROWS, begin, drive, replanned, scenes
+
+
+def recorded(steps=40):
+    """Scenes whose vehicles waver, vanish, come back, end early or arrive late."""
+    scene_set = scenes(3, steps=steps)
+    logged, valid = scene_set.scenes["logged"], scene_set.scenes["logged_valid"]
+    generator = torch.Generator().manual_seed(0)
+    logged[:, 1:, 1:6] += 0.3 * torch.randn(3, steps, 5, 4, generator=generator)
+    valid[:, 7:13, 1], valid[:, 22:, 2], valid[:, :11, 6] = False, False, False
+    valid[:, 11:, 6] = True  # arrives during the scene
+    return scene_set
+
+
+def test_rollouts_are_the_log_bit_for_bit_with_its_gaps():
+    scene_set = recorded()
+    rollouts = drive(scene_set, Replay(), 0.0)
+    logged, valid = scene_set.scenes["logged"][:, :, 1:], scene_set.scenes["logged_valid"][:, :, 1:]
+    assert torch.equal(rollouts.valid[:, :, 1:], valid)
+    assert torch.equal(rollouts.states[:, :, 1:][valid], logged[valid])
+    assert not rollouts.adversaries.any() and (rollouts.transport_others == 0).all()
+
+
+def test_after_the_recording_s_end_nobody_is_there():
+    scene = curved_scenes(steps=30)
+    world = World.at_start(scene)
+    world.step = torch.tensor([12])
+    _, plan = Replay().replan(None, world, world.states[:, :1])
+    here = scene["logged_valid"][:, 13:31, :ROWS].transpose(1, 2)
+    assert torch.equal(plan.present[..., :18], here) and not plan.present[..., 18:].any()
+    assert torch.equal(plan.states[..., :18, :], scene["logged"][:, 13:31, :ROWS].transpose(1, 2))
+
+
+def test_everybody_goes_straight_on_for_the_whole_rollout_and_nobody_leaves():
+    scene_set = scenes(2, steps=40)
+    scene_set.scenes["start"][:, 1:5, 2] = torch.tensor([0.3, -2.0, 3.0, 1.0])
+    scene_set.scenes["logged"][:, 0] = scene_set.scenes["start"]
+    scene_set.scenes["logged_valid"][:, 5:, 2] = False  # what is recorded later is not known
+    rollouts = drive(scene_set, ConstantVelocity(), 0.0)
+    start = scene_set.scenes["start"][:, None, 1:6]
+    velocity = start[..., 3:] * torch.stack([start[..., 2].cos(), start[..., 2].sin()], -1)
+    track = rollouts.states[:, :, 1:6]
+    expected = start[..., :2] + velocity * DT * torch.arange(41)[:, None, None]
+    torch.testing.assert_close(track[..., :2], expected, rtol=0, atol=1e-4)
+    assert torch.equal(track[..., 2:], start[..., 2:].expand_as(track[..., 2:]))
+    assert rollouts.valid[:, :, 1:6].all() and (rollouts.states[:, :, 5, 3] == 0).all()
+
+
+def test_parked_vehicles_stay_whatever_speed_was_estimated():
+    scene = curved_scenes()
+    scene["parked"][:, 2] = True
+    states = replanned(ConstantVelocity(), scene)[1].states[0]
+    assert torch.equal(states[2, :, :3], scene["start"][0, 2, :3].expand(50, 3)) and (states[2, :, 3] == 0).all()
+    assert (states[1, -1, :2] - states[1, 0, :2]).norm().item() > 0.9 * 4.9 * VEHICLES[1][3]
+
 
 NO_BOUNDS = BoundSettings(meeting=False, curve=False)
 HEADWAY, STANDSTILL_GAP = 1.5, 2.0
@@ -88,7 +142,7 @@ def test_vehicles_drive_on_the_middle_of_their_lane_and_never_backwards():
     scene_set = scenes_of([AWAY, (0, 0, 9), (18, 0, 2), (5, 1, 12)], num_scenes=2, steps=60)
     for key in ("start", "logged"):
         scene_set.scenes[key][..., 1, 1] += 0.4
-    track = drive(scene_set, idm(BoundSettings()), 0.0)["states"][:, :, 1:4]
+    track = drive(scene_set, idm(BoundSettings()), 0.0).states[:, :, 1:4]
     assert (track[..., 3] >= 0).all() and (track.diff(dim=1)[..., 0] >= -1e-4).all()
     aside = track[..., 1] - torch.tensor([0, 0, 3.5])
     assert aside[..., 1:].abs().max() < 1e-4 and aside[:, -1, 0].max() < 0.15 and aside[..., 0].min() > -0.01
@@ -100,7 +154,7 @@ def test_it_stops_at_the_line_of_a_red_or_yellow_light_and_waits(colour):
     vehicles = [AWAY, (20, 0, 9), (5, 0, 9), (line - 0.5, 1, 9)]  # two in line, one that can no longer stop
     scene_set = scenes_of(vehicles, steps=200, red_light_x=line, limit=LIMIT)
     scene_set.scenes["light_state"][:] = colour
-    track = drive(scene_set, idm(BoundSettings()), 0.0)["states"][0]
+    track = drive(scene_set, idm(BoundSettings()), 0.0).states[0]
     front = track[:, 1:4, 0] + LENGTH / 2
     assert (front[:, 0] < line).all() and front[-1, 0] > line - 3 and track[-1, 1, 3] < 0.3
     assert front[-1, 1] < front[-1, 0] - LENGTH and track[-1, 2, 3] < 0.5
@@ -118,7 +172,7 @@ def test_a_green_light_is_no_obstacle():
 
 def test_who_stands_at_the_start_stands_for_good():
     scene_set = scenes_of([AWAY, (0, 0, 0.4), (30, 0, 0.0), (0, 1, 8.0)], steps=60)
-    states = drive(scene_set, idm(BoundSettings()), 0.0)["states"][0]
+    states = drive(scene_set, idm(BoundSettings()), 0.0).states[0]
     assert torch.equal(states[1:, 1:3, :2], scene_set.scenes["start"][0, 1:3, :2].expand(60, 2, 2))
     assert (states[1:, 1:3, 3] == 0).all() and states[-1, 3, 0] > 40
 
@@ -134,7 +188,7 @@ def test_a_vehicle_is_gone_once_its_route_leaves_the_map():
 @pytest.mark.parametrize("floor", [-7.0, -4.0])
 def test_it_never_brakes_harder_than_the_bounds_do(floor):
     scene_set = scenes_of([AWAY, (0, 0, 12), (9, 0, 2)], steps=40)
-    speed = drive(scene_set, idm(BoundSettings(floor=floor)), 0.0)["states"][0, :, 1, 3]
+    speed = drive(scene_set, idm(BoundSettings(floor=floor)), 0.0).states[0, :, 1, 3]
     assert (speed.diff() / DT).min().item() == pytest.approx(floor, abs=1e-2)
 
 
@@ -171,13 +225,3 @@ def test_it_is_under_the_bounds_of_the_prior(motion_of):
     onset = max(caps[row].item(), -settings.onset)
     assert first == pytest.approx(before + 0.25 * (onset + caps[row].item()), abs=1e-3)
     assert torch.equal(plan_of(world, settings)[~brakes], plan_of(world)[~brakes])
-
-
-def test_curves_are_taken_no_faster_than_the_bounds_allow(motion_of):
-    scene = curved_scenes()
-    scene["route_limit"][:] = 25.0
-    scene["start"][:, 1:, 3] *= 2.5
-    bounds = [BoundSettings(meeting=False, lateral=lateral) for lateral in (1.0, 5.0)]
-    motions = [motion_of(World.at_start(scene), settings)[0] for settings in bounds]
-    slow, fast = ((motion.v**2 * motion.kappa.abs())[0, 1:5, 25].amax().item() for motion in motions)
-    assert slow < fast

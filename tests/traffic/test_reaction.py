@@ -1,15 +1,13 @@
 """The lookahead asks the real ego how it would drive against a plan."""
 
-import pytest
 import torch
 
 from e2rl.prior.lane_relative import HORIZON
-from e2rl.run.errors import InputError
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 from e2rl.traffic.e2.motion import constant_speed_states
 from e2rl.traffic.reaction import Lookahead
-from tests.traffic.e2.traffic_scenes import EGO, begin, scenes, synthesizer
+from tests.traffic.e2.traffic_scenes import EGO, scenes
 
 TIMES = DT * torch.arange(1, HORIZON + 1)
 
@@ -39,24 +37,3 @@ def test_scenes_may_be_asked_about_in_any_order():
     world = World.at_start(scenes(3).scenes)
     look, planned, rows = Lookahead(EGO, world), onward(world), torch.tensor([2, 0, 1])
     torch.testing.assert_close(look(rows, planned[rows]), look(torch.arange(3), planned)[rows])
-
-
-def test_lookahead_changes_the_attack_but_nothing_at_zero_intensity():
-    scene = scenes(3).scenes
-    world = World.at_start(scene)
-    plan, react = EGO.plan(world), Lookahead(EGO, world)
-    told = {"knowledge": "plan", "responsibility": "none"}
-    plain, ahead = (synthesizer(**told, control={"adversarial_clip": 0.5, "lookahead": count}) for count in (0, 2))
-    assert ahead.queries_ego and not plain.queries_ego
-
-    def driven(on, eta, react):
-        return on.replan(begin(on, scene, eta), world, plan, react)[1].states
-
-    assert torch.equal(driven(plain, 0.0, None), driven(ahead, 0.0, react))
-    assert torch.equal(driven(plain, 2.0, react), driven(plain, 2.0, None))
-    assert not torch.equal(driven(ahead, 2.0, react), driven(plain, 2.0, react))
-
-
-def test_who_predicts_the_ego_cannot_ask_it():
-    with pytest.raises(InputError, match="lookahead.*knowledge=plan"):
-        synthesizer(control={"lookahead": 1})

@@ -5,8 +5,10 @@ import torch
 from tensordict import TensorDict
 
 from e2rl.metrics import evasion
-from e2rl.metrics.evasion import find_evasions, lateral_targets
+from e2rl.metrics.evasion import add_avoidable, find_evasions, lateral_targets, spliced
+from e2rl.scenes.boxes import separation
 from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.rollouts import Rollouts
 from tests.synthetic import make_scenes
 
 SIZES = {"max_vehicles": 8, "max_agents": 10, "num_routes": 2, "num_points": 150}
@@ -88,3 +90,51 @@ def test_ways_are_the_mission_then_real_candidates_then_shifts():
     route, shift = lateral_targets(valid, torch.tensor([1, 0]))
     assert route[0].tolist()[:5] == [1, 1, 1, 0, 3] and shift[0].tolist()[:5] == [0.0, 1.5, -1.5, 0.0, 0.0]
     assert route[1].tolist() == [0] * 8 and len(set(shift[1].tolist()[:7])) == 7
+
+
+SLOW_AHEAD = [(0, 0, 12.0), (40, 0, 3.0), (-40, 1, 5.0)]
+
+
+def test_a_collision_has_an_evasion_that_touches_nobody_and_a_clean_rollout_has_none():
+    scene_set = make_scenes(2, vehicles=SLOW_AHEAD, num_vrus=0, steps=60, max_vehicles=8, max_agents=10)
+    scene = scene_set.scenes
+    more = {"adversaries": scene["valid"] & False, "seed": torch.arange(2), "eta": torch.zeros(2).double()}
+    rollouts = Rollouts.in_scenes(scene_set, torch.arange(2), scene["logged"], scene["logged_valid"], **more)
+    rows = [{"cfr": 1, "contact_step": 40.0}, {"cfr": 0, "contact_step": float("nan")}]
+    add_avoidable(rows, rollouts, scene, SimSettings())
+    evasions = rollouts.evasion
+    assert rows[0]["avoidable"] == 1 and "avoidable" not in rows[1]
+    assert evasions.shape == (2, 61, 4) and evasions[1].isnan().all()
+    torch.testing.assert_close(evasions[0, 0], scene["logged"][0, 0, 0])
+    size = scene["size"][0]
+    gap = separation(evasions[0][:, None], size[:1], scene["logged"][0, :, 1:], size[1:])
+    assert (gap[scene["logged_valid"][0, :, 1:]] > 0).all()
+    driven = separation(scene["logged"][0, :, :1], size[:1], scene["logged"][0, :, 1:2], size[1:2])
+    assert (driven < 0).any(), "the ego as driven has the collision"
+
+
+def test_an_evasion_from_a_moment_on_follows_what_was_driven_until_then():
+    driven, after = torch.zeros(3, 11, 4), torch.arange(1, 11.0)[None, :, None].expand(3, -1, 4)
+    found = spliced(driven, after, torch.tensor([0, 4, 10]))[..., 0]
+    assert found[0].tolist() == list(range(11))
+    assert found[1].tolist() == [0] * 5 + [1, 2, 3, 4, 5, 6] and found[2].tolist() == [0] * 11
+
+
+def test_the_late_search_begins_a_second_before_the_contact_and_is_enough(monkeypatch):
+    scene_set = make_scenes(2, vehicles=SLOW_AHEAD, num_vrus=0, steps=60, max_vehicles=8, max_agents=10)
+    scene, asked = scene_set.scenes, []
+
+    def late_only(scene, states, valid, sim, moment=None):
+        asked.append(None if moment is None else moment.tolist())
+        found = torch.tensor([moment is not None] * len(states))
+        track, peak = torch.full((len(states), 60, 4), 7.0), torch.full((len(states),), 3.0)
+        return evasion.Evasions(found, track[..., :2], track, peak, peak.long(), batch_size=[len(states)])
+
+    monkeypatch.setattr(evasion, "find_evasions", late_only)
+    more = {"adversaries": scene["valid"] & False, "seed": torch.arange(2), "eta": torch.zeros(2).double()}
+    rollouts = Rollouts.in_scenes(scene_set, torch.arange(2), scene["logged"], scene["logged_valid"], **more)
+    rows = [{"cfr": 1, "contact_step": 40.0}, {"cfr": 1, "contact_step": 4.0}]
+    add_avoidable(rows, rollouts, scene, SimSettings())
+    assert asked == [None, [30, 0]]
+    assert [(row["avoidable"], row["avoidable_1s"], row["evasion_accel"]) for row in rows] == [(1, 1, 3.0)] * 2
+    assert torch.equal(rollouts.evasion[0, :31], scene["logged"][0, :31, 0]) and (rollouts.evasion[0, 31:] == 7).all()

@@ -1,15 +1,19 @@
 """Windows of the ego bits tell what recorded vehicles saw and did, and imitation lowers its losses on them."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
-from e2rl.learning.bits_training import BitsSettings, BitsTraining, as_ego, losses, train_bits, windows, world_at
-from e2rl.learning.build import build_logger, run_bits
+from e2rl.learning import bits_training
+from e2rl.learning.bits_training import BitsSettings, BitsTraining, as_ego, losses, run_bits_stage, windows, world_at
+from e2rl.learning.logging import RunLogger
 from e2rl.planners.bits import observed
 from e2rl.planners.bits_network import BitsNetwork, drive_controls, load_bits
 from e2rl.planners.path import RoutePath
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
+from e2rl.run.run import Run
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.observation import ELAPSED
 from tests.learning.small import small_scenes
@@ -17,7 +21,8 @@ from tests.synthetic import LANE_WIDTH
 
 
 def settings(**changes):
-    return BitsSettings(**({"hidden": 32, "epochs": 10, "minibatch": 32, "learning_rate": 3e-3} | changes))
+    quick = {"hidden": 32, "epochs": 10, "minibatch": 32, "learning_rate": 3e-3, "held_out": 0.1}
+    return BitsSettings(**quick | changes)
 
 
 def braking_scenes(num_scenes=4):
@@ -51,7 +56,7 @@ def test_a_vehicle_that_plays_the_ego_sees_the_ego():
 
 
 def test_goals_are_where_the_recording_is_5_s_later():
-    data = windows(small_scenes(3, steps=60), settings())
+    data = windows(small_scenes(3, steps=60), 0)
     assert len(data) == 2 * 3 * 3 * 3  # exact and disturbed, steps 0, 5 and 10, vehicles, scenes
     exact, disturbed = data[data["start"][:, 2] == 0], data[data["start"][:, 2] != 0]
     torch.testing.assert_close(exact["way"], torch.full((27,), 50.0), atol=1e-2, rtol=0)
@@ -61,13 +66,15 @@ def test_goals_are_where_the_recording_is_5_s_later():
     assert 0.2 < moved.std() < 1.0 and 0.3 < disturbed["start"][:, 3].std() < 2.0
 
 
-def test_training_lowers_the_losses_and_the_plan_halts_as_recorded():
+def test_training_lowers_the_losses_and_the_plan_halts_as_recorded(monkeypatch):
+    for name in ("FEATURE_NOISE", "LAST_ACTION_NOISE"):
+        monkeypatch.setattr(bits_training, name, 0.05)
     torch.manual_seed(0)
-    data, network = windows(braking_scenes(), settings()), BitsNetwork(32)
-    run = BitsTraining(network, data, settings(held_out=0.0, epochs=40, feature_noise=0.05, last_action_noise=0.05))
+    data, network = windows(braking_scenes(), 0), BitsNetwork(32)
+    run = BitsTraining(network, data, settings(held_out=0.0, epochs=40))
     before = run.measure(data)
     for _ in range(40):
-        run.epoch()
+        run.turn()
     after = run.measure(data)
     assert after["trajectory"] < 0.4 < before["trajectory"] / 5 and after["goal"] < before["goal"] - 3
     start = data[(data["start"][:, 3] == 10) & (data["way"] < 20)][:1]
@@ -80,25 +87,45 @@ def test_training_lowers_the_losses_and_the_plan_halts_as_recorded():
 
 def test_a_loss_of_zero_is_the_recording():
     """A vehicle at constant speed on its goal: the untrained policy keeps its speed, so its plan is the recording."""
-    data = windows(small_scenes(2, steps=60), settings(aside=0.0, turned=0.0, faster=0.0))
+    data = windows(small_scenes(2, steps=60), 0, (0.0, 0.0, 0.0))
     found = losses(BitsNetwork(16).eval(), data)
     assert found["trajectory"] < 1e-3 and found["goal"] > 5
 
 
-def test_the_stage_writes_the_weights_of_the_lowest_held_out_loss(tmp_path):
-    config = load_config("train", ["stage=bits", "bits.hidden=16", "bits.epochs=3", "bits.minibatch=16"])
-    row = run_bits(config, braking_scenes(), tmp_path, build_logger(config, tmp_path))
-    assert (tmp_path / "logs/scalars/train/bits_held_out_loss.csv").is_file()
-    logged = (tmp_path / "logs/scalars/train/bits_held_out_loss.csv").read_text().split()
+def small_stage(monkeypatch, folder, scenes=None):
+    """stage=bits on small scenes."""
+    options = ["stage=bits", "stage.hidden=16", "stage.epochs=3", "stage.minibatch=16"]
+    monkeypatch.setattr(bits_training, "load_scenes", lambda *given, **named: scenes or braking_scenes())
+    monkeypatch.setattr(Run, "begin", lambda run, inputs: None), monkeypatch.setattr(Run, "origin", lambda run: {})
+    torch.manual_seed(0)
+    return run_bits_stage(Run(load_config("train", options), folder, {}), RunLogger("csv", folder))
+
+
+def test_the_stage_writes_the_weights_of_the_lowest_held_out_loss_and_goes_on_exactly(tmp_path, monkeypatch):
+    row = small_stage(monkeypatch, tmp_path / "whole")
+    log = Path("logs/scalars/train/bits_held_out_loss.csv")
+    logged = (tmp_path / "whole" / log).read_text().split()
     assert min(float(line.split(",")[1]) for line in logged) == pytest.approx(row["held_out_loss"])
-    assert load_bits(str(tmp_path)).architecture["hidden"] == 16
+    turn, calls = BitsTraining.turn, []
+
+    def stopped(training):
+        calls.append(None)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return turn(training)
+
+    monkeypatch.setattr(BitsTraining, "turn", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        small_stage(monkeypatch, tmp_path / "parts")
+    assert small_stage(monkeypatch, tmp_path / "parts") == row
+    assert (tmp_path / "parts" / log).read_text().split() == logged
+    one, two = (load_bits(str(tmp_path / name)).state_dict() for name in ("whole", "parts"))
+    assert all(torch.equal(value, two[name]) for name, value in one.items())
 
 
-def test_scenes_without_recordings_to_learn_from_are_refused(tmp_path):
+def test_scenes_without_recordings_to_learn_from_are_refused():
     for scenes in (small_scenes(2, steps=20), small_scenes(2, steps=60, speed=0.1)):
         with pytest.raises(InputError, match="synthetic: no vehicle moves and is recorded for 5 s"):
-            train_bits(BitsNetwork(16), scenes, settings(), tmp_path, {})
+            windows(scenes, 0)
     with pytest.raises(InputError, match="of one scene none can be held out"):
-        train_bits(BitsNetwork(16), small_scenes(1, steps=60), settings(), tmp_path, {})
-    with pytest.raises(InputError, match=r"bits\.dropout"):
-        settings(dropout=1.0)
+        BitsTraining(BitsNetwork(16), windows(small_scenes(1, steps=60), 0), settings())

@@ -1,0 +1,257 @@
+"""The egos of a run: the same noise, paired differences, pooled trainings; those of a configuration."""
+
+import math
+
+import pytest
+import torch
+
+from e2rl.evaluation.ego_set import EgoSet, build_egos, pool_trainings, recorded_acceleration
+from e2rl.evaluation.methods import build_ego, build_methods, evaluation_settings
+from e2rl.evaluation.protocol import Method, Setup, drive_all, record, run_protocol
+from e2rl.evaluation.rollout_files import TABLE, read_rows
+from e2rl.evaluation.summary import metric_rows
+from e2rl.metrics.score import score_rollouts
+from e2rl.planners.actor import ActorEgo
+from e2rl.planners.idm_planner import IDMEgo
+from e2rl.planners.lane_graph_planner import LaneGraphEgo
+from e2rl.report.comparison_tables import ego_tables, guard_table
+from e2rl.report.drawing import image_of
+from e2rl.report.plots import collision_bars
+from e2rl.report.results import curve_runs
+from e2rl.run.config import load_config
+from e2rl.run.errors import InputError
+from e2rl.run.files import seal
+from e2rl.sim.env import SimSettings
+from e2rl.sim.rollout_file import ROLLOUTS
+from e2rl.traffic.rule_based import ConstantVelocity
+from tests.learning.small import small_scenes
+from tests.metrics.random_rollouts import labelled, random_rollouts
+from tests.prior.small import small_prior
+
+METHODS = [Method("nominal", ConstantVelocity())]
+
+
+def slow(speed=3.0):
+    return IDMEgo(desired_speed=speed, use_limits=False)
+
+
+def setup_of(scenes, ego=None):
+    return Setup(scenes, ego or slow(), "idm", SimSettings())
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """(rows, folder) of one ego, the same again, and two trainings of a faster one."""
+    folder = tmp_path_factory.mktemp("run")
+    egos = {"one": slow(), "same": slow(), "fast_0": slow(12.0), "fast_1": slow(9.0)}
+    pairs = [("same", "one"), ("fast", "one"), ("fast", "same")]
+    chosen = EgoSet(egos, ["one", "same", "fast"], pairs, {"fast": ["fast_0", "fast_1"]})
+    scenes = small_scenes(3)
+    scenes.location[:] = ["a", "b", "c"]
+    scored = drive_all(chosen.setups(setup_of(scenes)), METHODS, [0], folder / ROLLOUTS)
+    return record(*scored, folder, chosen.metric_rows), folder
+
+
+def test_every_ego_has_its_rows_and_files_and_drives_as_if_alone(run, tmp_path):
+    rows, folder = run
+    assert [row["ego"] for row in rows] == ["one", "same", "fast_0", "fast_1", "fast"]
+    lines = read_rows(folder / TABLE)
+    assert [line["ego_policy"] for line in lines] == ["one"] * 3 + ["same"] * 3 + ["fast_0"] * 3 + ["fast_1"] * 3
+    assert len(list((folder / ROLLOUTS).glob("*.npz"))) == 12
+    (alone,) = run_protocol(setup_of(small_scenes(3), slow(12.0)), METHODS, [0], tmp_path)
+    assert alone["metrics"]["progress"]["mean"] == rows[2]["metrics"]["progress"]["mean"]
+
+
+def test_an_ego_does_not_differ_from_itself_at_all(run):
+    paired = run[0][1]["paired"]["ego one"]
+    known = {name: value for name, value in paired.items() if value["n"] and name != "seconds_per_rollout"}
+    assert {"cfr", "progress", "macc", "failures_per_km"} <= set(known)
+    for value in known.values():
+        assert value["difference"] == 0
+        assert math.isnan(value["low"]) and math.isnan(value["high"]), "three places are too few for an interval"
+    assert paired["progress"]["relative"] == 0
+
+
+def test_trainings_are_pooled_and_compared_with_the_same_rollouts_of_another(run):
+    one, _, first, second, pooled = run[0]
+    assert (pooled["n_rollouts"], pooled["n_trainings"], one.get("n_trainings")) == (6, 2, None)
+    means = [row["metrics"]["progress"]["mean"] for row in (first, second, pooled)]
+    assert means[2] == pytest.approx((means[0] + means[1]) / 2)
+    paired = pooled["paired"]["ego one"]["progress"]
+    base = one["metrics"]["progress"]["mean"]
+    assert paired["n"] == 6 and paired["difference"] == pytest.approx(means[2] - base)
+    assert paired["relative"] == pytest.approx(means[2] / base - 1)
+
+
+def test_tables_guards_and_bars_name_every_ego_and_a_missed_guard(run):
+    rows = run[0]
+    names, pairs = ["one", "same", "fast"], [("fast", "one"), ("fast", "same")]
+    tables = ego_tables(rows, names, pairs, "Egos", "settings")
+    assert tables[0].title == "Egos" and tables[0].markdown().startswith("## Egos") and not tables[1].title
+    assert "pool" in tables[0].caption
+    progress = next(table for table in tables if table.head[0] == "progress [m]")
+    assert progress.head[1:] == [*names, "fast − one [m]", "fast − one [%]", "fast − same [m]"]
+    assert [row[0] for row in progress.rows] == ["nominal"] and progress.rows[0][4].startswith("+")
+    strict, loose = (guard_table(rows, "one", "fast", "same", recorded) for recorded in (0.0, 100.0))
+    verdicts = [{row[0].split(" ")[0]: row[-1] for row in table.rows} for table in (strict, loose)]
+    assert [verdict["macc"] for verdict in verdicts] == ["missed", "met"] and verdicts[0]["progress"] == "met"
+    assert image_of(collision_bars(rows, names, "e2")).size[0] > 0
+
+
+def rows_of(values, ego, training=None):
+    """Labelled rows of progress values, each in a place of its own, and no realism samples."""
+    scored, features = score_rollouts(random_rollouts(len(values)))
+    rows = [
+        row | {"progress": value, "scene_id": str(index), "location": "", "seed": 0}
+        for index, (row, value) in enumerate(zip(scored, values, strict=True))
+    ]
+    rows = labelled(rows, "made", "test", "nominal", ego)
+    return [row | ({} if training is None else {"training": training}) for row in rows], features
+
+
+def test_trainings_that_differ_widen_the_interval_that_places_alone_do_not():
+    """Every place drives the same 10 or 20 m: all that varies is the training."""
+    first, features = rows_of([10.0] * 12, "a_0")
+    second, more = rows_of([20.0] * 12, "a_1")
+    rows, samples = first + second, features + more
+    pooled, copies = pool_trainings(rows, samples, {"a": ["a_0", "a_1"]})
+    result = {row["ego"]: row["metrics"]["progress"] for row in metric_rows(rows + pooled, samples + copies, 200, 2)}
+    assert result["a_0"]["low"] == result["a_0"]["high"] == 10
+    assert (result["a"]["low"], result["a"]["mean"], result["a"]["high"]) == (10, 15, 20)
+    assert not any("training" in row for row in rows), "the rows themselves stay as they are"
+
+
+def test_a_share_of_nothing_is_unknown():
+    ours, features = rows_of([1.0, 2.0, 3.0] + [0.0] * 9, "a")
+    theirs, more = rows_of([0.0, 0.0, 4.0] + [0.0] * 9, "b")
+    result = metric_rows(ours + theirs, features + more, 100, 2, egos=[("a", "b")])
+    paired = result[0]["paired"]["ego b"]["progress"]
+    assert paired["relative"] == pytest.approx(0.5) and math.isnan(paired["relative_low"]), "some draws have only zeros"
+    assert paired["difference"] == pytest.approx(2 / 12) and not math.isnan(paired["low"])
+
+
+def test_the_recorded_acceleration_is_that_of_the_logged_speeds():
+    scenes = small_scenes(2)
+    time = 0.1 * torch.arange(scenes.scenes["logged"].shape[1])
+    scenes.scenes["logged"][:, :, 0, 3] = 2.0 + 1.5 * time
+    scenes.scenes["logged_valid"][:, :, 0] = True
+    assert recorded_acceleration(scenes) == pytest.approx(1.5, abs=1e-4)
+
+
+# --- from the configuration
+
+LEARNING = ["experiment=policy_learning"]
+
+
+def config_of(*overrides):
+    return load_config("evaluate", overrides)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    """A run folder with the weights of an untrained actor."""
+    folder = tmp_path_factory.mktemp("run")
+    (folder / "checkpoints" / "round-000001").mkdir(parents=True)
+    build_ego(config_of("ego=actor")).network.save(folder / "checkpoints" / "round-000001" / "actor.safetensors")
+    seal(folder / "checkpoints" / "round-000001")
+    return folder
+
+
+def test_without_egos_there_is_the_one_of_the_group():
+    chosen = build_egos(config_of("ego=idm"), "idm")
+    assert list(chosen.egos) == chosen.names == ["idm"] and not chosen.pairs and not chosen.trainings
+
+
+def test_an_entry_is_a_file_with_changes_of_its_fields():
+    chosen = build_egos(config_of("+egos.a={ego: lane_graph, max_risk: 0.3}", "+egos.b={ego: lane_graph}"), "")
+    assert isinstance(chosen.egos["a"], LaneGraphEgo) and chosen.pairs == [("b", "a")]
+    assert chosen.egos["a"].max_risk == 0.3 != chosen.egos["b"].max_risk
+
+
+def test_table_4_compares_every_ego_with_one_of_them():
+    config = config_of("experiment=table4")
+    evaluation_settings(config)
+    chosen = build_egos(config, "")
+    names = ["replay", "idm", "lane_graph", "sampling", "bits", "actor_untrained", "actor"]
+    assert list(chosen.egos) == names
+    assert chosen.pairs == [(name, "lane_graph") for name in names if name != "lane_graph"]
+    trained, untrained = (chosen.egos[name].network.weights() for name in ("actor", "actor_untrained"))
+    assert any((trained[name] != untrained[name]).any() for name in trained)
+    for wrong in ("compare=taxi", "policy_learning={before: idm, after: replay, planner: lane_graph, runs: null}"):
+        with pytest.raises(InputError, match="compare="):
+            evaluation_settings(config_of("experiment=table4", wrong))
+
+
+def test_first_weights_do_not_depend_on_the_other_egos():
+    one, two = (build_egos(config_of(*more, "+egos.x={ego: actor}"), "") for more in ([], ["+egos.a={ego: actor}"]))
+    first, second = (chosen.egos["x"].network.weights() for chosen in (one, two))
+    assert all((first[name] == second[name]).all() for name in first)
+
+
+def test_the_experiment_compares_what_was_trained_with_each_other_ego(checkpoint):
+    config = config_of(*LEARNING, f"egos.after.checkpoint={checkpoint}")
+    evaluation_settings(config)
+    methods = build_methods(config, small_prior())
+    attacks = ["e2", "e2_unbound", "no duty", "told the plan", "random_k"]
+    expected = [("nominal", 0), *((name, eta) for name in attacks for eta in (1, 2))]
+    assert [(method.name, method.eta) for method in methods] == expected
+    known = {method.name: (method.traffic.knowledge, method.traffic.responsibility) for method in methods[1:]}
+    assert list(known.values())[:4] == [
+        ("predicted", "full"),
+        ("plan", "none"),
+        ("predicted", "none"),
+        ("plan", "full"),
+    ]
+    chosen = build_egos(config, "")
+    assert list(chosen.egos) == ["before", "after", "lane_graph", "sampling"] and not chosen.trainings
+    assert chosen.pairs == [("after", "before"), ("after", "lane_graph"), ("after", "sampling")]
+    assert list(curve_runs(config)) == [], "the run has no logs"
+
+
+def test_several_checkpoints_are_trainings_of_one_name(checkpoint):
+    chosen = build_egos(config_of(*LEARNING, f"egos.after.checkpoints=[{checkpoint},{checkpoint}]"), "")
+    assert list(chosen.egos) == ["before", "after_0", "after_1", "lane_graph", "sampling"]
+    assert chosen.trainings == {"after": ["after_0", "after_1"]} and "after" in chosen.names
+    assert isinstance(chosen.egos["after_1"], ActorEgo)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (LEARNING, "egos.after.checkpoint: needed; give the folder that train.py wrote"),
+        ([*LEARNING, "egos.after.checkpoint=nowhere"], "egos.after: nowhere: no actor there; give"),
+        ([*LEARNING, "egos.after.checkpoints=[a,nowhere]"], "egos.after: a: no actor there"),
+        ([*LEARNING, "egos.after.checkpoints=nowhere"], "egos.after.checkpoints=nowhere: expected a list"),
+        ([*LEARNING, "egos.after.checkpoint=a", "egos.after.checkpoints=[b]"], "egos.after: has a checkpoint and"),
+        (["+egos.a={ego: taxi}"], "egos.a: ego=taxi: none of actor, bits, external, idm"),
+        (["+egos.a={ego: idm, speed: 3}"], "egos.a: Key 'speed' .*compare it with conf/ego/idm"),
+        (["+egos.a=idm"], "egos.a='idm': expected a file of conf/ego"),
+        (["+egos.a={headway: 1}"], "egos.a=.*: expected a file of conf/ego"),
+        (["+egos.a_0={ego: idm}", "+egos.a={ego: actor, checkpoints: [x, y]}"], "egos.a: a_0 is the name of another"),
+        (["policy_learning={before: a, after: b}"], "policy_learning: names no egos"),
+        ([*LEARNING, "egos.after.ego=idm", "egos.after.checkpoint=a"], "egos.after: Key 'checkpoint'"),
+    ],
+)
+def test_what_cannot_be_is_named_with_its_remedy(overrides, message):
+    with pytest.raises(InputError, match=message):
+        build_egos(config_of(*overrides), "")
+
+
+def test_a_name_that_no_file_may_have_is_refused():
+    config = config_of()
+    config.egos = {"a/b": {"ego": "idm"}}
+    with pytest.raises(InputError, match="egos.a/b: the name goes into file names"):
+        build_egos(config, "")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["policy_learning.planner=taxi"], "policy_learning.planner=taxi: none of egos .before, after, lane_graph"),
+        (["policy_learning.before=after"], "policy_learning: after is after, and before or planner, too"),
+        (["methods=[e2]"], "policy_learning compares nominal driving; name nominal, too"),
+    ],
+)
+def test_roles_are_names_of_egos(checkpoint, overrides, message):
+    with pytest.raises(InputError, match=message):
+        build_egos(config_of(*LEARNING, f"egos.after.checkpoint={checkpoint}", *overrides), "")
