@@ -6,7 +6,7 @@ The names below are those of e2rl.api, imported on first use; docs and an exampl
 from importlib import import_module
 from typing import Any
 
-__all__ = ["load_prior", "load_scenes", "make_ego", "make_traffic", "roll_out", "score"]
+__all__ = ["find_failures", "load_prior", "load_scenes", "make_ego", "make_traffic", "roll_out", "save_gif", "score"]
 
 
 def __getattr__(name: str) -> Any:

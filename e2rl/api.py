@@ -2,63 +2,73 @@
 
     import e2rl
 
+    failure = e2rl.find_failures(ego="lane_graph", method="e2")[0]
+    print(failure.row["scene_id"], "hit after", failure.row["contact_time"], "s; counts:", failure.row["counted"] == 1)
+    e2rl.save_gif(failure, "failure.gif")
+
+Step by step:
+
     scenes = e2rl.load_scenes("bundled", num_scenes=8)
-    prior = e2rl.load_prior()
-    traffic = e2rl.make_traffic("e2", prior, support="topology")
+    traffic = e2rl.make_traffic("e2", e2rl.load_prior(), support="topology")
     rollouts = e2rl.roll_out(scenes, e2rl.make_ego("lane_graph"), traffic, eta=2.0)
     rows = e2rl.score(rollouts)
-    print(sum(row["cfr"] for row in rows) / len(rows))
 
 Keyword arguments are keys of the file, nested ones as mappings. Everything runs in this process.
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from e2rl.evaluation.methods import build_ego, build_sim, build_traffic
-from e2rl.evaluation.protocol import scene_seed
+from e2rl.evaluation.protocol import Method, Setup
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.ego import Ego
 from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.checkpoint import load_prior as _load_prior
 from e2rl.prior.prior import Prior
 from e2rl.prior.sde import SamplerSettings
+from e2rl.report.picture import Replay
+from e2rl.report.videos import save_animation
 from e2rl.run.config import load_choice, load_config
 from e2rl.run.errors import InputError
 from e2rl.run.settings import settings_of
 from e2rl.scenes import source
 from e2rl.scenes.scene import SceneSet
+from e2rl.sim.rollout_file import Failure
 from e2rl.sim.rollouts import Rollouts
-from e2rl.traffic import rollout
 from e2rl.traffic.traffic import Traffic
+
+AT_ONCE = 4  # scenes that are driven together while failures are sought
 
 
 def load_scenes(
     data: str = "bundled", num_scenes: int | None = None, scenes: str | None = None, **settings: Any
 ) -> SceneSet:
-    """At most num_scenes scenes of conf/data/<data>.yaml, such as load_scenes("scenarionet", path="logs.zip"); scenes:
-    a list or the folder of a run, whose scenes are taken."""
+    """Returns at most num_scenes scenes of conf/data/<data>.yaml, such as load_scenes("scenarionet", path="logs.zip").
+
+    scenes: a list or the folder of a run, whose scenes are taken.
+    """
     return source.load_scenes(_choice("data", data, {"workers": 1} | settings), num_scenes, scenes=scenes)
 
 
 def load_prior(checkpoint: str = "bundled", device: str = "cpu", **settings: Any) -> Prior:
-    """The frozen prior of a checkpoint; settings: conf/prior/default.yaml, such as sampler={"steps": 8}."""
+    """Returns the frozen prior of a checkpoint; settings: conf/prior/default.yaml, such as sampler={"steps": 8}."""
     config = _choice("prior", "default", settings)
     sampler = settings_of(SamplerSettings, config.sampler, "prior.sampler")
     return _load_prior(checkpoint, sampler, settings_of(BoundSettings, config.bounds, "prior.bounds"), device)[0]
 
 
 def make_traffic(name: str, prior: Prior, **settings: Any) -> Traffic:
-    """The traffic method of conf/synthesizer/<name>.yaml on a prior."""
+    """Returns the traffic method of conf/synthesizer/<name>.yaml on a prior."""
     return build_traffic(_choice("synthesizer", name, settings), prior)
 
 
 def make_ego(name: str, **settings: Any) -> Ego:
-    """The ego of conf/ego/<name>.yaml."""
+    """Returns the ego of conf/ego/<name>.yaml."""
     shared = {"sim": load_choice("sim", "default"), "device": "cpu"}  # that some egos refer to
     return build_ego(OmegaConf.create(shared | {"ego": _choice("ego", name, settings)}))
 
@@ -66,20 +76,60 @@ def make_ego(name: str, **settings: Any) -> Ego:
 def roll_out(
     scenes: SceneSet, ego: Ego, traffic: Traffic, eta: float = 0.0, seeds: Sequence[int] = (0,), device: str = "cpu"
 ) -> Rollouts:
-    """The rollouts of every scene under every sampling seed, as `python evaluate.py` rolls them out; all are simulated
-    at once."""
+    """Returns the rollouts of every scene under every sampling seed, as `e2rl evaluate` makes them.
+
+    All are simulated at once. eta: adversarial intensity, 0 to 3.
+    """
+    setup = Setup(scenes, ego, type(ego).__name__, build_sim(load_config("evaluate")), device=device)
     tasks = [(scene, seed) for seed in seeds for scene in range(len(scenes))]
-    index = torch.tensor([scene for scene, _ in tasks])
-    noise = torch.tensor([scene_seed(scenes.number[scene], seed) for scene, seed in tasks])
-    sim = build_sim(load_config("evaluate"))
-    etas = torch.full((len(tasks),), float(eta), dtype=torch.float64)
-    rollouts = rollout.roll_out(scenes, index, noise, etas, ego, traffic, sim, device)
-    rollouts.seed = torch.tensor([seed for _, seed in tasks])
-    return rollouts
+    return setup.roll_out(Method(type(traffic).__name__, traffic, float(eta)), tasks)
+
+
+def find_failures(
+    ego: str | Ego = "lane_graph",
+    method: str | Traffic = "e2",
+    eta: float = 2.0,
+    scenes: SceneSet | None = None,
+    most: int = 1,
+    seed: int = 0,
+) -> list[Failure]:
+    """Returns the first rollouts in which the ego is hit, at least `most` of them where there are so many.
+
+    A few scenes are driven at a time, first one of each place, until enough failures are found.
+
+    Args:
+        ego: the planner, or the name of a file in conf/ego.
+        method: the traffic, or the name of a file in conf/synthesizer, on the bundled prior.
+        eta: adversarial intensity, 0 to 3.
+        scenes: where to drive; None: the bundled test scenes.
+        seed: of the sampling noise.
+    """
+    scenes = load_scenes() if scenes is None else scenes
+    planner = make_ego(ego) if isinstance(ego, str) else ego
+    traffic = make_traffic(method, load_prior()) if isinstance(method, str) else method
+    names = [each if isinstance(each, str) else type(each).__name__ for each in (ego, method)]
+    setup = Setup(scenes, planner, names[0], build_sim(load_config("evaluate")))
+    turns = [scenes.location[:scene].count(place) for scene, place in enumerate(scenes.location)]
+    order = sorted(range(len(scenes)), key=lambda scene: (turns[scene], scene))
+    failures: list[Failure] = []
+    for begin in range(0, len(order), AT_ONCE):
+        tasks = [(scene, seed) for scene in order[begin : begin + AT_ONCE]]
+        rollouts = setup.roll_out(Method(names[1], traffic, float(eta)), tasks)
+        rows = score_rollouts(rollouts)[0]
+        failures += [Failure(rollouts.rollout(k), row) for k, row in enumerate(rows) if row["cfr"]]
+        if len(failures) >= most:
+            break
+    return failures
+
+
+def save_gif(failure: Failure, path: str | Path) -> Path:
+    """Writes the moving picture of a failure; returns its path."""
+    save_animation(Path(path), Replay(failure.rollout, failure.row).frames())
+    return Path(path)
 
 
 def score(rollouts: Rollouts) -> list[dict]:
-    """One row of metrics per rollout (docs/method.md, section 10)."""
+    """Returns one row of metrics per rollout (docs/method.md, section 10)."""
     return score_rollouts(rollouts)[0]
 
 

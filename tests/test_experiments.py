@@ -1,11 +1,11 @@
 """The experiments of evaluate.py on tiny runs: their rows, tables, figures and files."""
 
-
 import pytest
 
 from e2rl.evaluation.rollout_files import read_metrics
-from e2rl.metrics.catalogue import META_STAGE, OPEN_LOOP_STAGE, STAGES
 from tests.scripts import SHORT, arguments, call, error_line
+
+pytestmark = pytest.mark.slow  # whole runs
 
 EXPERIMENTS = [
     ("table2", [("random_k", 2), ("topology", 2), ("e2", 2), ("e2_unbound", 2), ("nominal", 0)], None),
@@ -32,7 +32,6 @@ EXPERIMENTS = [
         None,
     ),
     ("intensity", [("e2", 0), ("e2", 1), ("e2", 2), ("e2", 3)], "intensity"),
-    ("skeleton", [("e2", 2)], "skeleton"),
 ]
 
 
@@ -169,43 +168,3 @@ def test_one_scene_is_driven_as_among_all(evaluate, tmp_path):
         assert status == 0, said
         found.append({path.name: path.read_bytes() for path in (folder / "rollouts").glob("*.npz")})
     assert len(found[0]) == 2 and len(found[1]) == 1 and found[1].items() <= found[0].items()
-
-
-def test_the_prior_s_experiment_has_rows_of_all_stages(world, tmp_path, monkeypatch, capsys):
-    """Open loop, closed loop and meta-metric of three bundled scenes with an untrained prior."""
-    overrides = [
-        "experiment=prior",
-        "data=bundled",
-        "num_scenes=3",
-        f"data.cache={tmp_path / 'cache'}",
-        "data.workers=1",
-        "data.build.vehicles=8",
-        "data.build.field_cells=128",
-        "seeds=[0]",
-        "open_loop_samples=2",
-        "meta_rollouts=2",
-        "prior.sampler.steps=2",
-        f"hydra.run.dir={tmp_path / 'run'}",
-        f"prior.checkpoint={world / 'prior.safetensors'}",
-    ]
-    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
-    assert status == 0, said
-    rows = read_metrics(tmp_path / "run" / "metrics.json")
-    found = {stage: [row for row in rows if row.get("stage") == stage] for stage in (*STAGES, None)}
-    assert sum(map(len, found.values())) == len(rows)
-    methods = ["replay", "constant_velocity", "idm", "nominal"]
-    assert {stage: [row["method"] for row in part] for stage, part in found.items()} == {
-        OPEN_LOOP_STAGE: methods[1:],
-        META_STAGE: methods,
-        None: methods,
-    }
-    for stage, metrics in STAGES.items():
-        known = [metric.name for metric in metrics if metric.name != "real_split_half"]
-        assert all(set(known) <= set(row["metrics"]) for row in found[stage])
-        assert all(row["metrics"][known[0]]["mean"] > 0 and row["n_scenes"] == 3 for row in found[stage])
-    meta = {row["method"]: row["metrics"]["meta_metric"]["mean"] for row in found[META_STAGE]}
-    assert max(meta, key=meta.get) == "replay" and "real_split_half" in found[META_STAGE][0]["metrics"]
-    assert found[None][0]["metrics"]["real"]["mean"] == 1, "the replayed log is wholly like itself"
-    text = (tmp_path / "run" / "tables.md").read_text()
-    assert all(word in text for word in ("min_ade_5", "meta_metric", "cfr_bg", "nominal", "constant_velocity"))
-    assert len(list((tmp_path / "run" / "rollouts").glob("*.npz"))) == 3 * len(methods)

@@ -13,8 +13,8 @@ from tests.synthetic import make_scenes
 
 PACKAGE = Path(e2rl.__file__).parent
 ORDER = (  # of the rooms
-    *("run", "scenes", "sim", "prior", "planners", "metrics", "traffic", "evaluation", "api"),
-    *("learning", "report", "commands"),
+    *("run", "scenes", "sim", "prior", "planners", "metrics", "traffic", "evaluation"),
+    *("learning", "report", "api", "commands"),
 )
 
 

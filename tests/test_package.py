@@ -37,6 +37,15 @@ def test_a_notebook_rolls_out_what_the_command_does():
     assert [row["scene_id"] for row in rows] == scenes.scene_id and {row["eta"] for row in rows} == {2.0}
 
 
+def test_a_failure_is_found_in_a_few_rollouts(tmp_path):
+    """Places first: with the bundled scenes the first four are of four places."""
+    scenes = e2rl.load_scenes("bundled", num_scenes=12)
+    found = e2rl.find_failures("lane_graph", "e2", scenes=scenes)
+    assert found and all(failure.row["cfr"] == 1 and failure.contact is not None for failure in found)
+    assert {failure.rollout.scene_id for failure in found} <= set(scenes.scene_id)
+    assert e2rl.save_gif(found[0], tmp_path / "failure.gif").stat().st_size > 10_000
+
+
 def test_settings_reach_the_objects_and_wrong_ones_are_named():
     traffic = e2rl.make_traffic("e2", e2rl.load_prior(sampler={"steps": 4}), support="topology", topology={"beta": 2.0})
     assert traffic.support == "topology" and traffic.topology.beta == 2.0 and traffic.prior.sampler.steps == 4

@@ -93,6 +93,6 @@ def test_the_search_finds_pages_docstrings_and_the_notebook(site):
     entries = json.loads((site[1] / "search" / "search_index.json").read_text())["docs"]
     for page, words in (
         ("concepts/synthesizer.html", "maximal cliques"),
-                ("tutorial.html", "which duty did the other vehicle break"),
+        ("tutorial.html", "which duty did the other vehicle break"),
     ):
         assert any(entry["location"].startswith(page) and words in entry["text"].lower() for entry in entries), page

@@ -14,7 +14,8 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from e2rl.run.config import load_config
-from e2rl.run.errors import InputError, stop
+from e2rl.run.endings import ending
+from e2rl.run.errors import InputError
 from e2rl.run.settings import settings_of
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.source import load_scenes
@@ -73,7 +74,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
+    with ending():
         main()
-    except InputError as error:
-        stop(error)

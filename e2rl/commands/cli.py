@@ -52,7 +52,8 @@ def main() -> None:
         import_module(COMMANDS[name][0]).main()
     else:
         near = get_close_matches(name, COMMANDS, 1, 0.4)
-        print(f"error: e2rl {name}: no such command; {f'did you mean {near[0]}?' if near else 'see e2rl --help'}")
+        advice = f"did you mean {near[0]}?" if near else "see e2rl --help"
+        print(f"error: e2rl {name}: no such command; {advice}", file=sys.stderr)
         sys.exit(2)
 
 

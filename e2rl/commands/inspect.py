@@ -17,7 +17,8 @@ from tensordict import TensorDict
 from e2rl.report import drawing
 from e2rl.report.drawing import Shape, TrafficMap, Trail, new_figure, save_figure
 from e2rl.run.config import load_choice
-from e2rl.run.errors import InputError, stop
+from e2rl.run.endings import ending
+from e2rl.run.errors import InputError
 from e2rl.scenes.paths import arc_length
 from e2rl.scenes.recording import AGENT_TYPES, LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, VEHICLE
 from e2rl.scenes.source import Row, Source, source_of
@@ -183,7 +184,7 @@ def main(arguments: list[str] | None = None) -> None:
         help="picture to write, with a PDF beside it (default %(default)s)",
     )
     options = parser.parse_args(arguments)
-    try:
+    with ending():
         name, source = open_source(options.path, options.data, options.workers)
         rows, contents, drawn = inspect(source, options.scene)
         print(f"data         {name}, {options.path}", *report(source, rows, contents), sep="\n")
@@ -192,9 +193,7 @@ def main(arguments: list[str] | None = None) -> None:
         assert drawn.scene is not None
         scene, title = drawn.scene, f"{drawn.scene_id}   {drawn.location}"
         save_figure(options.out, picture(scene, title, options.metres))
-    except InputError as error:
-        stop(error)
-    print(f"drawn        {drawn.scene_id}: {options.out}")
+        print(f"drawn        {drawn.scene_id}: {options.out}")
 
 
 if __name__ == "__main__":

@@ -171,14 +171,14 @@ def compared(rows: Sequence[dict], width: int) -> list[str]:
     egos = list(dict.fromkeys(row["ego"] for row in rows))
     names = {id(row): name for ego in egos for row, name in named(rows, ego)}
     order = list(dict.fromkeys(names[id(row)] for row in sorted(rows, key=lambda row: -row["eta"])))
-    rate = {id(row): row["metrics"]["cfr_counted"]["mean"] for row in rows}
+    counted = {id(row): row["metrics"]["cfr_counted"]["mean"] for row in rows}
     if len(egos) > 1:
-        ranked = sorted(rows, key=lambda row: (order.index(names[id(row)]), low_first(rate[id(row)])))
+        ranked = sorted(rows, key=lambda row: (order.index(names[id(row)]), low_first(counted[id(row)])))
         best = ranked[0]
         lead = f"{best['ego']} fails least: it was hit in {of(best, 'cfr')} rollouts {traffic(best)}, of which "
         lead += f"{of(best, 'cfr_counted').partition(' ')[0]} count."
     else:
-        ranked = sorted(rows, key=lambda row: (not row["eta"], low_first(-rate[id(row)]), row["eta"]))
+        ranked = sorted(rows, key=lambda row: (not row["eta"], low_first(-counted[id(row)]), row["eta"]))
         best = ranked[0]
         lead = f"{best['ego']} fails most in the traffic of {names[id(best)]}: hit in {of(best, 'cfr')} rollouts, of "
         lead += f"which {of(best, 'cfr_counted').partition(' ')[0]} count."

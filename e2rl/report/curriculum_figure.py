@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 
 from e2rl.report import drawing
 from e2rl.report.drawing import new_figure, save_figure
-from e2rl.run.errors import InputError, stop
+from e2rl.run.endings import ending
+from e2rl.run.errors import InputError
 from e2rl.traffic.traffic import TEMPLATES
 
 CHOICES, PICTURE = "curriculum.csv", "curriculum.png"  # of a run's folder
@@ -103,14 +104,13 @@ def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, nargs="+", help="folder of a run of train.py")
-    for folder in parser.parse_args().run:
-        try:
+    folders = parser.parse_args().run
+    with ending():
+        for folder in folders:
             if not (folder / CHOICES).is_file():
                 raise InputError(f"{folder}: no {CHOICES} there; give the folder of a train.py run with logger=csv")
             draw_choices(folder)
-        except InputError as error:
-            stop(error)
-        print(folder / PICTURE)
+            print(folder / PICTURE)
 
 
 if __name__ == "__main__":

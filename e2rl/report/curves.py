@@ -26,7 +26,8 @@ from e2rl.report.drawing import save_figure
 from e2rl.report.plots import plain_figure
 from e2rl.report.tables import heading
 from e2rl.report.tuning_curve import gain_of, on_curve
-from e2rl.run.errors import InputError, stop
+from e2rl.run.endings import ending
+from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
 from e2rl.run.run import read_provenance
 
@@ -176,11 +177,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN_DIR", help="of experiment=curves or of e2rl tune")
     parser.add_argument("--out", type=Path, default=Path(), help="folder to write to (default: the current one)")
     options = parser.parse_args(arguments)
-    try:
+    with ending():
         points = [point for run in options.runs for point in read_points(run)]
-    except InputError as error:
-        stop(error)
-    print(*save_curves(options.out, points), sep="\n")
+        print(*save_curves(options.out, points), sep="\n")
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ SHORT = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(run.BENCHMARKS))
 def test_every_benchmark_runs(name, tmp_path):
     path = tmp_path / "rows.json"

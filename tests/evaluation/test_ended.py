@@ -50,7 +50,7 @@ def test_the_others_are_scored_and_the_count_stands_everywhere(tmp_path, raises,
     (row,) = run(Fails(8.0, raises), tmp_path, 4, processes)
     assert row["n_rollouts"] == 6 and row["ended"] == {reason: 2} and row["n_scenes"] == 3
     assert read_metrics(tmp_path / METRICS_FILE)[0]["ended"] == {reason: 2}
-    assert f"2 without a score ({reason})" in metric_tables([row])[0].caption
+    assert f"2 rollouts without a score ({reason})" in metric_tables([row])[0].caption
     entries = json.loads((tmp_path / ENDED_FILE).read_text())
     assert {(entry["scene_id"], entry["seed"]) for entry in entries} == {(scene_set().scene_id[2], k) for k in (0, 1)}
     assert all(("no way out" if raises else "the ego's plan is NaN") in entry["traceback"] for entry in entries)
@@ -79,7 +79,7 @@ def test_a_method_of_which_all_rollouts_end_stays_in_the_table(tmp_path):
         ("lost", 0, "before"),
     ]
     assert rows[1]["ended"] == {"raised ZeroDivisionError": 2} and rows[1]["metrics"]["cfr"]["n"] == 0
-    assert "lost: 0 scenes, 0 seeds, 0 rollouts, 2 without a score" in metric_tables(rows)[0].caption.replace(
+    assert "lost: 0 scenes, 0 seeds, 0 rollouts, 2 rollouts without a score" in metric_tables(rows)[0].caption.replace(
         "before ", ""
     )
     assert read_metrics(tmp_path / METRICS_FILE)[1]["method"] == "lost"

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from e2rl.metrics.geometry import candidates
-from e2rl.metrics.off_road import LANE_CELL, MARGIN, inside_polygon, line_segments, near_lane, off_road_columns
+from e2rl.metrics.off_road import inside_polygon, near_lane, off_road_columns
 from tests.metrics.random_rollouts import random_map
 from tests.metrics.test_contact import course, row
 
@@ -116,15 +116,3 @@ def test_every_point_in_an_item_s_bounds_is_a_candidate_exactly_once():
     inside = ((points[:, None] >= low) & (points[:, None] <= high)).all(-1) & (groups[0][:, None] == groups[1])
     assert len(found) == len(set(found))
     assert {tuple(pair) for pair in inside.nonzero().tolist()} <= set(found)
-
-
-def test_few_of_a_map_s_segments_are_compared_with_a_point():
-    """Work grows with what lies nearby, not with the map: 2,592 points on a map of ten thousand."""
-    generator = torch.Generator().manual_seed(0)
-    road = random_map(1, 150.0, generator, lanes=90)
-    points = torch.rand(81 * 32, 2, generator=generator) * 200 - 100
-    owner, lane, ends = line_segments(road["lane_points"], road["lane_index"])
-    reach = road["lane_width"][owner, lane] / 2 + MARGIN
-    low, high = ends.amin(1) - reach[:, None], ends.amax(1) + reach[:, None]
-    compared, _ = candidates(points, torch.zeros(len(points), dtype=torch.int64), low, high, owner, LANE_CELL)
-    assert len(ends) > 1000 and len(compared) < 0.01 * len(points) * len(ends)

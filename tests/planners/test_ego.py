@@ -147,7 +147,7 @@ def test_scenes_of_a_batch_do_not_mix(kind):
 
 @pytest.mark.parametrize("kind", [IDMEgo, LaneGraphEgo, SamplingEgo, BitsEgo])
 def test_a_red_light_is_halted_at_and_without_one_it_drives_on(kind):
-    for light, low, high in ((50.0, 35.0, 47.8), (None, 55.0, 1e3)):
+    for light, low, high in ((50.0, 35.0, 48.5), (None, 55.0, 1e3)):
         env = make_env(make_scenes(1, num_vehicles=1, num_vrus=0, red_light_x=light), 1)
         env.rollout(80, EgoPolicy(kind(), env))
         state = env.world().states[0, 0]

@@ -68,7 +68,8 @@ def folders(tmp_path):
         each["metrics"] = {name: None if math.isnan(value) else value for name, value in each["metrics"].items()}
     (tmp_path / "tuned").mkdir()
     (tmp_path / "tuned" / "tuning.json").write_text(json.dumps(found))
-    known = {"command": "", "versions": [{"git": "0"}], "inputs": {}, "settings": {"synthesizer": {"name": "ctg_adv"}}}
+    known = {"command": "", "cwd": "", "choices": {}, "files": {}, "inputs": {}, "versions": [{"git": "0"}]}
+    known |= {"settings": {"synthesizer": {"name": "ctg_adv"}}}
     (tmp_path / "tuned" / "provenance.json").write_text(json.dumps(known))
     return [tmp_path / "run", tmp_path / "tuned"]
 

@@ -4,7 +4,17 @@ others are built or named."""
 import pytest
 
 from e2rl.planners.ego import Ego
-from e2rl.run.config import added_by_mistake, built, choices, conf_folder, help_text, load_choice, load_config, mistyped
+from e2rl.run.config import (
+    added_by_mistake,
+    built,
+    choices,
+    conf_folder,
+    help_text,
+    load_choice,
+    load_config,
+    mistyped,
+    of_another_command,
+)
 from e2rl.run.errors import InputError
 from e2rl.traffic.traffic import keep_velocity
 from tests.scripts import call
@@ -49,6 +59,13 @@ RIGHT = [["num_scenes=3", "ego=idm", "sim.max_acceleration=2"], ["hydra.run.dir=
 @pytest.mark.parametrize("arguments", RIGHT)
 def test_right_options_are_no_mistake(arguments):
     assert mistyped("evaluate", arguments) == []
+
+
+def test_an_experiment_of_the_other_command_is_named():
+    assert of_another_command("train", ["experiment=table1"]) == ["experiment=table1: of evaluate.py, not train.py"]
+    assert of_another_command("evaluate", ["experiment=harden"]) == ["experiment=harden: of train.py, not evaluate.py"]
+    assert not of_another_command("train", ["experiment=harden", "rounds=2"])
+    assert not any(of_another_command("evaluate", [f"experiment={name}"]) for name in ("table1", "curves", "prior"))
 
 
 def test_an_added_key_that_looks_like_one_there_is_would_do_nothing():

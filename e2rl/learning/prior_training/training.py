@@ -221,9 +221,7 @@ class PriorTraining(Supervised):
         """Restore a `state_dict`. Raises InputError if the number of processes differs."""
         count, draws = self.processes.count, state["draws"]
         if len(draws) != count:
-            raise InputError(
-                f"the interrupted run had {len(draws)} processes, this one has {count}; resume with as many"
-            )
+            raise InputError(f"the run was begun by {len(draws)} processes, this is {count}; resume with as many")
         super().load_state_dict(state)
         self.prior.denoiser.load_state_dict(state["denoiser"])
         self.prior.route_choice.load_state_dict(state["route_choice"])

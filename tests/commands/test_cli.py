@@ -1,0 +1,58 @@
+"""One command `e2rl`: it lists what there is, knows its version, and finds its modules from any folder."""
+
+import subprocess
+import sys
+import tomllib
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from e2rl.commands import cli
+from e2rl.commands.cli import COMMANDS, EXAMPLES, main
+
+ROOT = Path(__file__).parents[2]
+
+
+def said(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["e2rl", *arguments])
+    main()
+    return capsys.readouterr().out
+
+
+def test_help_names_every_command_and_gives_examples_of_those(monkeypatch, capsys):
+    text = said(monkeypatch, capsys, "--help")
+    assert text == said(monkeypatch, capsys) and all(name in text for name in COMMANDS)
+    used = {line.split()[1] for line in EXAMPLES.splitlines() if line.startswith("  e2rl ")}
+    assert used <= set(COMMANDS) and max(map(len, text.splitlines())) <= 100
+
+
+def test_the_version_is_that_of_the_package(monkeypatch, capsys):
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert said(monkeypatch, capsys, "--version").strip() == f"e2rl {version}"
+
+
+def test_an_unknown_command_is_told_the_nearest(monkeypatch, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        said(monkeypatch, capsys, "evalute")
+    assert stopped.value.code == 2 and "did you mean evaluate?" in capsys.readouterr().err
+
+
+def test_every_command_is_a_module_with_a_main():
+    for module, _ in COMMANDS.values():
+        spec = find_spec(module)
+        assert spec is not None and "def main(" in Path(spec.origin).read_text(), module
+
+
+def test_the_console_command_is_the_one_of_the_package():
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    assert scripts == {"e2rl": f"{cli.__name__}:main"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["evaluate", "train", "prior-tables", "skeleton", "tune"])
+def test_a_command_shows_its_configuration_in_an_empty_folder(name, tmp_path):
+    code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from e2rl.commands.cli import main; main()"
+    command = [sys.executable, "-c", code, name, "--cfg", "job"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and "_target_: e2rl.traffic.e2.e2.E2" in done.stdout, done.stderr
