@@ -85,8 +85,8 @@ def group_key(row: Row) -> tuple:
 
 
 def describe(mode: int, members: Sequence[Row], groups: Sequence[dict]) -> dict:
-    """A mode of modes.json: its number, name, failures, their fraction of each group's, verdicts, mean speeds [m/s], and
-    its most typical rollout. Fractions and means are over the members that know the value, None without any."""
+    """A mode of modes.json: its number, name, failures and their fraction of each group's, verdicts, mean speeds [m/s],
+    and its most typical rollout. Fractions and means are over the members that know the value, None without any."""
     keys = [group_key(row) for row in members]
     by_group = [keys.count(tuple(group[name] for name in GROUP)) for group in groups]
     total = sum(group["failures"] for group in groups)

@@ -45,7 +45,7 @@ NAME = "curves"
 
 class Point(NamedTuple):
     """Rollouts of a method at one value of its dial; metrics: {name: {mean, low, high}} of some of COLUMNS, NaN where
-    unknown; on_curve: nothing but the dial differs from the other points on the curve; chosen: the setting of the tables.
+    unknown; on_curve: nothing but the dial differs from the others on the curve; chosen: the setting of the tables.
     """
 
     method: str

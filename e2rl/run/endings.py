@@ -13,7 +13,10 @@ from typing import NoReturn
 
 from e2rl.run.errors import InputError
 
-WRITING = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM}
+WRITING = {
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO),
+    *(errno.EACCES, errno.EPERM, errno.ENOTDIR),
+}
 
 
 @contextmanager
@@ -42,8 +45,9 @@ def ending(go_on: str | Callable[[], str] = "") -> Iterator[None]:
             _end(f"\ninterrupted ({number.name}); go on with: {_command(go_on)}", 128 + number)
         if isinstance(error, InputError):
             _end(f"error: {' '.join(str(error).split())}", 2)
-        if isinstance(error, OSError) and error.errno in WRITING:
-            reason = f"{error.filename}: cannot be written ({error.strerror}); what was written before is whole"
+        failed = error.__cause__ if isinstance(error.__cause__, OSError) else error  # of logging that is set up
+        if isinstance(failed, OSError) and failed.errno in WRITING:
+            reason = f"{failed.filename}: cannot be written ({failed.strerror}); what was written before is whole"
             _end(f"\nerror: {reason}. Mend that, then go on with: {_command(go_on)}", 1)
         raise
     finally:

@@ -40,14 +40,15 @@ class World:
     def at_start(cls, scene: TensorDictBase) -> "World":
         """Scenes [B] at their start frames."""
         step = torch.zeros(scene.batch_size[0], dtype=torch.int64, device=scene["start"].device)
-        now = (scene[key] for key in ("start", "valid", "start_accel", "start_yaw_rate"))
-        return cls(scene, step, *now, route=scene["route_log"])
+        start, valid, accel, turn_rate = (scene[key] for key in ("start", "valid", "start_accel", "start_yaw_rate"))
+        return cls(scene, step, start, valid, accel, turn_rate, scene["route_log"])
 
     @classmethod
     def of(cls, tensordict: TensorDictBase, scene: TensorDictBase) -> "World":
         """The World that a DrivingEnv with `agents=True` reports in a TensorDict [B]; scene: `DrivingEnv.scene`."""
-        now = (tensordict["agents"][key] for key in AGENT_KEYS)
-        return cls(scene, tensordict["timestep"][:, 0], *now, plan=tensordict.get(("traffic", "plan"), None))
+        states, valid, accel, turn_rate = (tensordict["agents"][key] for key in AGENT_KEYS)
+        plan = tensordict.get(("traffic", "plan"), None)
+        return cls(scene, tensordict["timestep"][:, 0], states, valid, accel, turn_rate, plan=plan)
 
     def ego_action(self) -> Tensor:
         """The egos' last executed acceleration and yaw rate [B, 2]."""

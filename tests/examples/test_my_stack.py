@@ -86,16 +86,16 @@ def test_the_leader_brakes_by_eta_on_its_path_and_nobody_else_does(braking_leade
     scenes, traffic = braking_leader
     out = e2rl.roll_out(scenes, e2rl.make_ego("idm"), traffic, eta=2.0)
     logged = scenes.scenes["logged"]
-    braked = out["adversaries"].nonzero()
+    braked = out.adversaries.nonzero()
     assert len(braked) == 2, "one in each log"
     for scene, agent in braked.tolist():
-        speed = out["states"][scene, :, agent, 3]
+        speed = out.states[scene, :, agent, 3]
         moving = speed[1:] > 0
         assert torch.allclose((speed.diff() / DT)[moving], torch.tensor(-2.0), atol=0.02) and speed[-1] == 0
-        xy, path = out["states"][scene, :, agent, :2], logged[scene, :, agent, :2]
+        xy, path = out.states[scene, :, agent, :2], logged[scene, :, agent, :2]
         assert torch.cdist(xy, path).amin(1).max() < 0.8, "on its path, between recorded points"
-    others = out["valid"] & ~out["adversaries"][:, None]
+    others = out.valid & ~out.adversaries[:, None]
     others[:, :, 0] = False
-    assert torch.equal(out["states"][others], logged[others])
+    assert torch.equal(out.states[others], logged[others])
     calm = e2rl.roll_out(scenes, e2rl.make_ego("idm"), traffic, eta=0.0)
-    assert not calm["adversaries"].any()
+    assert not calm.adversaries.any()

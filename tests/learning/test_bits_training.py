@@ -82,7 +82,7 @@ def test_training_lowers_the_losses_and_the_plan_halts_as_recorded(monkeypatch):
     code = network.encode(start["observation"])
     controls = network.controls(code, start["start"][:, 3], path.d, start["way"][:, None], start["side"][:, None])
     driven = drive_controls(controls, start["start"], path)
-    assert driven.states[0, 0, -1, 3] < 1.0 and abs(driven.way.item() - 10.0) < 1.5
+    assert driven.states[0, 0, -1, 3] < 1.0 and abs(driven.distance.item() - 10.0) < 1.5
 
 
 def test_a_loss_of_zero_is_the_recording():

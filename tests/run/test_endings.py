@@ -72,6 +72,9 @@ def test_a_full_disk_ends_with_the_file_and_how_to_go_on(capsys):
     said = capsys.readouterr().err.strip()
     assert said.startswith("error: runs/1/file: cannot be written (No space left on device)") and "\n" not in said
     assert said.endswith("then go on with: run x again")
+    with pytest.raises(SystemExit), ending("run x again"):
+        raise ValueError("Unable to configure handler 'file'") from PermissionError(13, "Permission denied", "runs/log")
+    assert "error: runs/log: cannot be written (Permission denied)" in capsys.readouterr().err
 
 
 def test_bad_input_ends_with_its_message_and_other_errors_pass(capsys):

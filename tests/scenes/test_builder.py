@@ -18,7 +18,7 @@ from tests.scenes.descriptions import ALL, FRAMES, description, fork, lane, stra
 SETTINGS = BuildSettings(field_cells=64)
 DATA = Path(__file__).parents[2] / ".." / "shared" / "data"
 # nuScenes: left-hand traffic, lanes without connectivity.
-RECORDED = {"waymo": (DATA / "waymo" / "tune.zip", 20), "nuscenes": (DATA / "nuscenes_mini" / "scenes.zip", 4)}
+RECORDED = {"waymo": (DATA / "waymo" / "tune.zip", 7), "nuscenes": (DATA / "nuscenes_mini" / "scenes.zip", 4)}
 
 
 def recorded(tracks=None, lanes=None, **metadata):
@@ -101,6 +101,14 @@ def test_the_way_driven_is_found_and_is_the_mission():
     assert offset.abs().max() < 0.4 and torch.isinf(mission.end).all()
     follower = scene["route_log"][1]
     assert scene["route_points"][1, follower, 40:, 1].abs().max() < 0.1  # that one went straight on
+
+
+def test_of_two_routes_at_one_place_the_one_of_its_heading_is_driven():
+    cross = np.array([60.0, 0.05]) + np.outer([-40, 60], [np.cos(0.6), np.sin(0.6)])
+    stands = track([60.0, 0.0], 0.5, 0.0)
+    scene = build({"ego": straight(20, 0, 8), "7": stands}, fork() | {"cross": lane(cross)})
+    x, y = (scene["route_points"][1, scene["route_log"][1], [8, 12]].diff(dim=0))[0]
+    assert torch.atan2(y, x).item() == pytest.approx(0.6, abs=0.01)
 
 
 @pytest.mark.parametrize(("y_end", "more"), [(7.0, 120.0), (-12.0, 0.0)])
@@ -220,7 +228,7 @@ def test_recorded_scenes_keep_the_schema_and_their_parked_cars_stay(recorded_sce
         way = (scene["logged"][:, stay, :2] - scene["logged"][:1, stay, :2]).norm(dim=-1)
         parked += int(stay.sum())
         moved += int((way.masked_fill(~seen, 0).amax(0) > 2.0).sum())
-    assert parked > 20 and moved <= 0.02 * parked
+    assert parked > 10 and moved <= 0.02 * parked
 
 
 def test_recorded_vehicles_find_the_way_they_drove(recorded_scenes):

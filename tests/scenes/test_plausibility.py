@@ -141,7 +141,7 @@ def test_genuine_recordings_stay_well_inside_the_limits():
     """At half of each limit and twice each least value they would still pass."""
     for recording in load_recordings("tune")[::8]:
         measures = extent(recording) | motion(recording) | map_fit(recording, LaneGraph(recording.lanes))
-        assert measures.keys() == LIMITS.keys()
+        assert measures.keys() == LIMITS.keys() and measures["speed_ratio"] == pytest.approx(1, abs=0.05)
         for name, value in measures.items():
             low, high, *_ = LIMITS[name]
             assert not value < low and not value > high, name

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from e2rl.run.errors import InputError
+from e2rl.scenes import scene
 from e2rl.scenes import scene_cache as cache
 from e2rl.scenes.scene import RAGGED
 from e2rl.scenes.scene_cache import cached, uncached
@@ -36,9 +37,9 @@ SCENES = st.tuples(KINDS, SHAPES).flatmap(
 def yielding(scenes, index):
     index.dataset, index.split = "made", "test"
     index.dropped["invalid"] = 2
-    for number, scene in enumerate(scenes):
-        index.add(f"scene-{number}", f"place-{number}", scene)
-        yield scene
+    for number, made in enumerate(scenes):
+        index.add(f"scene-{number}", f"place-{number}", made)
+        yield made
 
 
 def build(index, seed: int = 0, count: int = 5):
@@ -68,12 +69,12 @@ def same(one, other) -> None:
 def test_scenes_come_back_bit_for_bit_and_padded(scenes):
     found = uncached(partial(yielding, scenes))
     assert found.scenes["scene_index"].tolist() == list(range(len(scenes))) == found.number
-    for scene, row in zip(scenes, found.scenes, strict=True):
-        for key, value in scene.items():
+    for made, row in zip(scenes, found.scenes, strict=True):
+        for key, value in made.items():
             inner = row[key].numpy()[tuple(map(slice, value.shape))]
             assert inner.tobytes() == value.tobytes() and inner.dtype == value.dtype
             assert (row[key] == RAGGED.get(key, 0)).sum() >= row[key].numel() - value.size
-    assert found.scenes["lane_exits"].shape[1:] == tuple(np.max([scene["lane_exits"].shape for scene in scenes], 0))
+    assert found.scenes["lane_exits"].shape[1:] == tuple(np.max([made["lane_exits"].shape for made in scenes], 0))
 
 
 def test_a_set_is_built_once_and_read_from_its_file(tmp_path):
@@ -130,7 +131,10 @@ def test_what_is_changed_in_memory_does_not_reach_the_file(tmp_path):
     same(cached(path, never, 1), before)
 
 
-def test_batches_are_copies_in_the_order_asked_for(tmp_path):
+@pytest.mark.parametrize("large", [0, 10**9])
+def test_batches_are_copies_in_the_order_asked_for(monkeypatch, large):
+    """Whether tensors are copied scene by scene or at once."""
+    monkeypatch.setattr(scene, "LARGE", large)
     found = uncached(build)
     for wanted in ([0], [1, 0], [4, 1, 4], [2, 3, 0, 1, 4]):
         batch = found.batch(wanted)

@@ -268,7 +268,7 @@ def test_an_outside_source_is_named_by_its_class_and_takes_part_in_all(tmp_path)
     (tmp_path / "a.txt").write_text("5.0")
     (tmp_path / "b.txt").write_text("9.0")
     config = {"_target_": "tests.scenes.test_source.SpeedSource", "path": str(tmp_path), "lane_width": 3.0}
-    config |= {"workers": 2, "cache": str(tmp_path / "cache"), "build": {"field_cells": 32, "steps": 80}}
+    config |= {"workers": 1, "cache": str(tmp_path / "cache"), "build": {"field_cells": 32, "steps": 80}}
     found = load_scenes(config)
     assert found.scene_id == ["a.txt@10", "a.txt@101", "b.txt@10", "b.txt@101"] and found.dataset == "speeds"
     assert found.scenes["start"][:, 0, 3].tolist() == pytest.approx([5, 5, 9, 9], abs=1e-4)

@@ -17,8 +17,8 @@ from tests.prior.small import curved_scenes, small_prior
 from tests.traffic.e2.traffic_scenes import EGO, ROWS, begin, drive, executed, scenes, synthesizer
 
 
-def nominal(knowledge="predicted", **options):
-    return NominalTraffic(small_prior(0, sampler=SamplerSettings(steps=4), **options), knowledge)
+def nominal(knowledge="predicted"):
+    return NominalTraffic(small_prior(0, sampler=SamplerSettings(steps=4)), knowledge)
 
 
 @pytest.mark.parametrize("knowledge", KNOWLEDGE)
@@ -55,10 +55,11 @@ def test_plans_continue_where_the_last_one_was_left():
 @pytest.mark.parametrize("free_space", [False, True])
 def test_the_ego_is_seen_as_it_drives_and_free_vehicles_beside_their_route(free_space):
     scene = curved_scenes()
-    on, world = nominal(free_space=free_space), World.at_start(scene)
+    on, world = nominal(), World.at_start(scene)
     turning = scene["logged"][:, 1 : HORIZON + 1, 0].clone()
     turning[..., 2] = 0.2 * 0.1 * torch.arange(1, HORIZON + 1)  # the ego turns at 0.2 rad/s
     state = begin(on, scene)
+    state.routed.has_lane[:] = not free_space
     state = replace(state, lane=state.lane.map(lambda value: value + 0.25))
     seen = on.lane_now(state, world, turning)
     assert seen.kappa[0, 0].item() == pytest.approx(0.2 / 8.0, rel=1e-3)

@@ -23,12 +23,12 @@ from e2rl.traffic.e2.motion import (
     TOP_SPEED,
     compact,
     constant_speed_states,
+    distance_to_stop_line,
     frenet_pose,
     put,
     remaining_offset,
     states_on_route,
     take,
-    distance_to_stop_line,
 )
 from e2rl.traffic.e2.skeleton import Skeleton
 

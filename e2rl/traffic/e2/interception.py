@@ -24,7 +24,7 @@ from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
-from e2rl.traffic.e2.motion import direction, take, distance_to_stop_line
+from e2rl.traffic.e2.motion import direction, distance_to_stop_line, take
 
 ENDS = 3  # directions tried at the end of a path
 SAMPLES = 17  # points of a path that are checked
@@ -178,7 +178,8 @@ def intercept(
     ok &= _on_road(paths, states, scene)
     if halt_at_red:
         assert world.route is not None
-        ok &= paths.length[..., -1] <= distance_to_stop_line(world, index, take(world.route, index)[..., None].clamp(min=0))
+        followed = take(world.route, index)[..., None].clamp(min=0)
+        ok &= paths.length[..., -1] <= distance_to_stop_line(world, index, followed)
     travelled = (v[..., None] * times + 0.5 * accel[..., None] * times**2).clamp(min=0)
     travelled = travelled.masked_fill(times >= time[..., None], -1.0)
     row = torch.arange(vehicles, device=index.device)

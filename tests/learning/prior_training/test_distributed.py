@@ -116,17 +116,20 @@ def same(one, two):
     return all(torch.equal(one[key], two[key]) for key in one)
 
 
+@pytest.mark.slow
 def test_weights_and_averages_are_the_same_everywhere_and_the_noise_is_not(ranks):
     one, two = ranks
     assert same(one["weights"], two["weights"]) and same(one["average"], two["average"])
     assert not torch.equal(one["generator"], two["generator"])
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_of_two_goes_on_exactly(ranks):
     for rank in ranks:
         assert same(rank["average"], rank["resumed"])
 
 
+@pytest.mark.slow
 def test_halves_of_a_batch_make_the_update_of_the_whole(ranks, windows):
     """Also where the halves weigh differently."""
     weight = prearranged(windows)[0][0]["weight"]
@@ -139,6 +142,7 @@ def test_halves_of_a_batch_make_the_update_of_the_whole(ranks, windows):
             torch.testing.assert_close(rank["shared"][1][key], value, rtol=1e-3, atol=1e-5, msg=key)
 
 
+@pytest.mark.slow
 def test_the_leader_speaks_for_all(ranks):
     for rank in ranks:
         assert rank["said"] == "the leader's trouble" and rank["mean"] == 0.5 and rank["order"] == ([0, 1], "by 0")

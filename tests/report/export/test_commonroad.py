@@ -2,8 +2,6 @@
 
 import copy
 import csv
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -136,14 +134,3 @@ def test_facts_and_origin_stand_in_the_file(files):
     (comment,) = document.xpath("/commonRoad/comment()")
     assert "scene_id: scene-0" in comment.text and f"adversaries: [{CUT_IN}]" in comment.text
     assert [float(document.findtext(f".//{axis}Translation")) for axis in "xy"] == [28, 0]
-
-
-def test_a_missing_package_is_named_with_its_extra(run, tmp_path):
-    code = (
-        "import sys; sys.modules['commonroad'] = None\n"
-        "from e2rl.commands.export import main\n"
-        f"main([{str(run)!r}, '--to', 'commonroad', '--out', {str(tmp_path / 'out')!r}])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 2 and "pip install 'e2rl[commonroad]'" in done.stderr
-    assert not list(tmp_path.iterdir())

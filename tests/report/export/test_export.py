@@ -2,6 +2,7 @@
 
 import csv
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -117,3 +118,12 @@ def test_a_stranger_s_folder_runs_no_code_but_that_which_the_command_names(copy,
 def test_the_run_s_scenes_are_made_from_its_own_settings(run):
     data = OmegaConf.to_container(OmegaConf.load(run / ".hydra" / "config.yaml").data)
     assert source_of(data).build.vehicles == 8
+
+
+@pytest.mark.parametrize(
+    ("name", "module"), [("openscenario", "scenariogeneration"), ("mcap", "mcap.writer"), ("commonroad", "commonroad")]
+)
+def test_a_missing_package_is_named_with_its_extra(run, tmp_path, capsys, monkeypatch, name, module):
+    monkeypatch.setitem(sys.modules, module, None)
+    assert f"pip install 'e2rl[{name}]'" in refused(capsys, run, "--to", name, "--out", tmp_path / "out")
+    assert not list(tmp_path.iterdir())

@@ -1,8 +1,6 @@
 """OpenSCENARIO: scenariogeneration's parser gets back every state, and the standard's schema holds."""
 
 import csv
-import subprocess
-import sys
 import warnings
 from xml.etree import ElementTree
 
@@ -130,14 +128,3 @@ def test_facts_stand_in_the_header(paths):
     properties = ElementTree.parse(paths[0]).iterfind("FileHeader/Properties/Property")
     facts = {item.get("name"): item.get("value") for item in properties}
     assert facts["scene_id"] == "scene-0" and facts["adversaries"] == f"[{CUT_IN}]" and facts["duty"]
-
-
-def test_a_missing_package_is_named_with_its_extra(run, tmp_path):
-    code = (
-        "import sys; sys.modules['scenariogeneration'] = None\n"
-        "from e2rl.commands.export import main\n"
-        f"main([{str(run)!r}, '--to', 'openscenario', '--out', {str(tmp_path / 'out')!r}])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 2 and "pip install 'e2rl[openscenario]'" in done.stderr
-    assert not list(tmp_path.iterdir())

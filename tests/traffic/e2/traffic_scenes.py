@@ -10,6 +10,7 @@ from e2rl.planners.idm_planner import IDMEgo
 from e2rl.prior.sde import SamplerSettings
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import SimSettings
+from e2rl.sim.rollouts import Rollouts
 from e2rl.sim.world import World
 from e2rl.traffic.e2.e2 import E2
 from e2rl.traffic.rollout import roll_out
@@ -32,7 +33,7 @@ def synthesizer(seed: int = 0, steps: int = 4, sampler: str = "ddim", **settings
     return E2(small_prior(seed, sampler=SamplerSettings(sampler=sampler, steps=steps)), **settings)
 
 
-def drive(scene_set: SceneSet, on: Traffic, eta: float, seeds=None, ego: Ego | None = None, **sim) -> dict:
+def drive(scene_set: SceneSet, on: Traffic, eta: float, seeds=None, ego: Ego | None = None, **sim) -> Rollouts:
     """Rollouts of every scene once."""
     index = torch.arange(len(scene_set))
     seeds = index if seeds is None else torch.tensor(seeds)
