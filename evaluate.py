@@ -5,18 +5,13 @@ import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one lin
 # isort: split
 from functools import partial
 
-import hydra
-from omegaconf import DictConfig
-
 from e2rl.evaluation.methods import processes_of
 from e2rl.evaluation.plan import begin
 from e2rl.evaluation.protocol import WHOLE, drive_all, record
-from e2rl.evaluation.reproduce import compared_with_run, reproduction_of
+from e2rl.evaluation.reproduce import compared_with_run, run_of
 from e2rl.report.results import references, write_results
-from e2rl.run.config import run_command
-from e2rl.run.endings import ending
-from e2rl.run.files import alone_in
-from e2rl.run.run import Run, how_to_go_on
+from e2rl.run.command import run_command
+from e2rl.run.run import Run
 from e2rl.sim.rollout_file import ROLLOUTS
 
 MAY_CHANGE = ("processes", "launcher", "shard")  # when a run is resumed
@@ -38,19 +33,9 @@ def evaluate(run: Run) -> None:
         print(f"{config.reproduce}: {compared_with_run(config, folder).text()}")
 
 
-@hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
-def command(config: DictConfig) -> None:
-    """An evaluation, as configured."""
-    with ending(lambda: how_to_go_on(config)):
-        anew = config.reproduce and not config.resume
-        run = reproduction_of(config) if anew else Run.of(config, MAY_CHANGE)
-        with alone_in(run.folder):
-            evaluate(run)
-
-
 def main() -> None:
     """The command."""
-    run_command(command, "evaluate")
+    run_command("evaluate", evaluate, MAY_CHANGE, run_of)
 
 
 if __name__ == "__main__":

@@ -7,13 +7,9 @@ import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one lin
 
 # isort: split
 import sys
-from contextlib import nullcontext
-
-import hydra
-from omegaconf import DictConfig
 
 from e2rl.evaluation.methods import build_ego, build_prior, build_traffic, caption
-from e2rl.evaluation.rollout_files import ENDED_FILE, add_ended
+from e2rl.evaluation.rollout_files import ERRORED_FILE, add_errored
 from e2rl.learning.bits_training import run_bits_stage
 from e2rl.learning.build import build_evolution, build_logger, build_measure, build_progress, check_training
 from e2rl.learning.evolution import Evolution
@@ -25,11 +21,10 @@ from e2rl.report.answer import compared_answer
 from e2rl.report.curriculum_figure import draw_choices
 from e2rl.report.rounds import round_line, save_videos
 from e2rl.report.tables import metric_tables, print_tables, save_tables
-from e2rl.run.config import resolved, run_command, set_up
-from e2rl.run.endings import ending
+from e2rl.run.command import run_command
+from e2rl.run.config import set_up
 from e2rl.run.errors import InputError
-from e2rl.run.files import alone_in
-from e2rl.run.run import Run, how_to_go_on
+from e2rl.run.run import Run
 from e2rl.scenes.scene_list import listed
 from e2rl.scenes.source import load_scenes
 
@@ -65,13 +60,13 @@ def evolve(task: Run) -> None:
         with progress.phase("measurement"):
             measure("before", run.ego, 0)
         progress.say("measured before training")
-        save_checkpoint(folder, run, resolved(config), config.keep_last)
+        save_checkpoint(folder, run, config.keep_last)
     for number in range(run.round, config.rounds):
         with progress.phase("round"):
             metrics = train_round(run)
             logger.log(metrics, number, run.choices)
-            add_ended(folder / ENDED_FILE, number, run.errored)
-            save_checkpoint(folder, run, resolved(config), config.keep_last)
+            add_errored(folder / ERRORED_FILE, number, run.errored)
+            save_checkpoint(folder, run, config.keep_last)
             if picture := draw_choices(folder):
                 logger.show("curriculum/choices", picture, number)
             if config.logger.videos and run.memory.rounds:
@@ -117,24 +112,20 @@ def losses_line(row: dict[str, float]) -> str:
 STAGES = {"evolution": evolve, "prior": train_prior, "imitation": imitate, "bits": train_bits}
 
 
-@hydra.main(version_base="1.3", config_path="conf", config_name="train")
-def command(config: DictConfig) -> None:
+def train(task: Run) -> None:
     """One stage of training, as configured."""
-    with ending(lambda: how_to_go_on(config)):
-        task = Run.of(config, MAY_CHANGE)
-        config = task.config
-        if started_by_torchrun() and config.stage.name != "prior":
-            raise InputError(f"torchrun: stage={config.stage.name} runs in one process, started with python")
-        set_up(config)
-        check_training(config)
-        with nullcontext() if follows() else alone_in(task.folder):
-            STAGES[config.stage.name](task)
+    config = task.config
+    if started_by_torchrun() and config.stage.name != "prior":
+        raise InputError(f"torchrun: stage={config.stage.name} runs in one process, started with python")
+    set_up(config)
+    check_training(config)
+    STAGES[config.stage.name](task)
 
 
 def main() -> None:
     """The command, in this process or in one of torchrun's."""
     sys.argv += follower_overrides()
-    run_command(command, "train")
+    run_command("train", train, MAY_CHANGE, alone=not follows())
 
 
 if __name__ == "__main__":

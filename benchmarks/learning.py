@@ -19,7 +19,7 @@ def learning(bench: Bench) -> Iterator[Row]:
     torch.manual_seed(0)
     collect, ppo = dict(config.learner.collect), {**config.learner.ppo, "cloning": 0.0}
     improve = PolicyImprovement(
-        build_ego(config), bench.scenes, build_sim(config), collect=collect, ppo=ppo, rounds=config.rounds
+        build_ego(config), bench.scenes, build_sim(config), collect=collect, ppo=ppo, react=None, rounds=config.rounds
     )
     collected, whole = [], []
     for number in range(WARM_UP + bench.repeats):

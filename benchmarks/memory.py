@@ -57,6 +57,8 @@ def _learn(bench: Bench, batch: int) -> None:
     """Collect and update twice, in recorded traffic."""
     config = bench.configured("train")
     ppo, collect = {**config.learner.ppo, "cloning": 0.0}, {**config.learner.collect, "batch": batch}
-    improve = PolicyImprovement(build_ego(config), bench.scenes, build_sim(config), collect=collect, ppo=ppo)
+    improve = PolicyImprovement(
+        build_ego(config), bench.scenes, build_sim(config), collect=collect, ppo=ppo, react=None
+    )
     for _ in range(2):
         improve.learner.update(improve.collected())

@@ -21,7 +21,8 @@ from scaling import scaling
 from simulator import simulator
 from synthesized_rollout import synthesized_rollout
 
-from e2rl.run.errors import InputError, stop
+from e2rl.run.endings import ending
+from e2rl.run.errors import InputError
 
 OWN = (simulator, collector, ppo_update, learning, guided_replan, synthesized_rollout, evolution_round, memory, scaling)
 BENCHMARKS: dict[str, Benchmark] = {function.__name__: function for function in OWN} | peer_benchmarks
@@ -79,7 +80,5 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
+    with ending():
         main(sys.argv[1:])
-    except InputError as error:
-        stop(error)

@@ -23,21 +23,18 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from e2rl.evaluation.methods import build_ego, build_sim, build_traffic
+from e2rl.evaluation.methods import build_ego, build_prior, build_traffic
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.ego import Ego
-from e2rl.prior.bounds import BoundSettings
-from e2rl.prior.checkpoint import load_prior as _load_prior
 from e2rl.prior.prior import Prior
-from e2rl.prior.sde import SamplerSettings
 from e2rl.report.picture import Replay
 from e2rl.report.videos import save_animation
-from e2rl.run.config import load_choice, load_config
+from e2rl.run.config import load_choice
 from e2rl.run.errors import InputError
-from e2rl.run.settings import settings_of
 from e2rl.scenes import source
 from e2rl.scenes.scene import SceneSet
+from e2rl.sim.env import SimSettings
 from e2rl.sim.rollout_file import Failure
 from e2rl.sim.rollouts import Rollouts
 from e2rl.traffic.traffic import Traffic
@@ -57,9 +54,8 @@ def load_scenes(
 
 def load_prior(checkpoint: str = "bundled", device: str = "cpu", **settings: Any) -> Prior:
     """Returns the frozen prior of a checkpoint; settings: conf/prior/default.yaml, such as sampler={"steps": 8}."""
-    config = _choice("prior", "default", settings)
-    sampler = settings_of(SamplerSettings, config.sampler, "prior.sampler")
-    return _load_prior(checkpoint, sampler, settings_of(BoundSettings, config.bounds, "prior.bounds"), device)[0]
+    config = _choice("prior", "default", {"checkpoint": checkpoint} | settings)
+    return build_prior(OmegaConf.create({"prior": config}), device)[0]
 
 
 def make_traffic(name: str, prior: Prior, **settings: Any) -> Traffic:
@@ -80,7 +76,7 @@ def roll_out(
 
     All are simulated at once. eta: adversarial intensity, 0 to 3.
     """
-    setup = Setup(scenes, ego, type(ego).__name__, build_sim(load_config("evaluate")), device=device)
+    setup = Setup(scenes, ego, type(ego).__name__, SimSettings(), device=device)
     tasks = [(scene, seed) for seed in seeds for scene in range(len(scenes))]
     return setup.roll_out(Method(type(traffic).__name__, traffic, float(eta)), tasks)
 
@@ -108,7 +104,7 @@ def find_failures(
     planner = make_ego(ego) if isinstance(ego, str) else ego
     traffic = make_traffic(method, load_prior()) if isinstance(method, str) else method
     names = [each if isinstance(each, str) else type(each).__name__ for each in (ego, method)]
-    setup = Setup(scenes, planner, names[0], build_sim(load_config("evaluate")))
+    setup = Setup(scenes, planner, names[0], SimSettings())
     turns = [scenes.location[:scene].count(place) for scene, place in enumerate(scenes.location)]
     order = sorted(range(len(scenes)), key=lambda scene: (turns[scene], scene))
     failures: list[Failure] = []

@@ -21,7 +21,7 @@ from e2rl.prior.checkpoint import save_prior
 from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.prior import Prior
 from e2rl.run.files import HASH
-from tests.scenes.descriptions import Malicious, description, lane, numbered, straight, write_folder
+from tests.scenes.descriptions import Malicious, description, numbered, straight, write_folder
 
 if "E2RL_TESTS" not in os.environ:  # the folder of caches of these tests and all processes that they start
     os.environ["E2RL_TESTS"] = tempfile.mkdtemp(prefix="e2rl-tests-")
@@ -39,8 +39,6 @@ def world(tmp_path_factory):
     nan["tracks"]["7"]["state"]["position"][40] = np.nan
     bad = {
         "forbidden": pickle.dumps({"x": Malicious(os.system, f"touch {root / 'ran'}")}),
-        "no_ego": description(sdc_id="nobody"),
-        "no_lanes": description(lanes={"b": lane([[0, 0]])}),
         "nan": nan,
         "damaged": b"nonsense",
     }
@@ -56,14 +54,11 @@ def world(tmp_path_factory):
 
 
 def _variants(root: Path) -> None:
-    """Checkpoints that are none: of another architecture, another format, cut off, not safetensors."""
+    """Checkpoints that are none: of another architecture, another format, cut off."""
     with safe_open(root / "prior.safetensors", "pt") as file:
         metadata, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     del metadata[HASH]  # as a stranger would
-    save_file(tensors, root / "plain.safetensors")
     save_file(dict(list(tensors.items())[1:]), root / "other.safetensors", metadata)
-    save_file(tensors, root / "unknown.safetensors", metadata | {"architecture": '{"denoiser": {"depth": 3}}'})
     save_file(tensors, root / "format.safetensors", metadata | {"format": "e2rl-prior/9"})
     content = (root / "prior.safetensors").read_bytes()
     (root / "cut.safetensors").write_bytes(content[: len(content) // 2])
-    (root / "text.safetensors").write_text("no checkpoint")

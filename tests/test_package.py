@@ -6,6 +6,9 @@ from pathlib import Path
 import pytest
 
 import e2rl
+from e2rl.evaluation.methods import build_prior, build_sim, build_traffic
+from e2rl.evaluation.protocol import Method, Setup
+from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
 
 ROOT = Path(__file__).parents[1]
@@ -21,10 +24,6 @@ def test_every_package_and_the_configuration_are_in_the_wheel():
 
 def test_a_notebook_rolls_out_what_the_command_does():
     """The ten lines of e2rl.api: the rollouts do not depend on how they are asked for."""
-    from e2rl.evaluation.methods import build_prior, build_sim, build_traffic
-    from e2rl.evaluation.protocol import Method, Setup
-    from e2rl.run.config import load_config
-
     scenes = e2rl.load_scenes("bundled", num_scenes=2)
     ego, prior = e2rl.make_ego("lane_graph"), e2rl.load_prior()
     ours = e2rl.roll_out(scenes, ego, e2rl.make_traffic("e2", prior), eta=2.0)
@@ -32,7 +31,7 @@ def test_a_notebook_rolls_out_what_the_command_does():
     setup = Setup(scenes, ego, "lane_graph", build_sim(config))
     traffic = build_traffic(config.synthesizer, build_prior(config)[0])
     theirs = setup.roll_out(Method("e2", traffic, 2.0), [(0, 0), (1, 0)])
-    assert (ours["states"] == theirs["states"]).all() and ours["adversaries"].any()
+    assert (ours.states == theirs.states).all() and ours.adversaries.any()
     rows = e2rl.score(ours)
     assert [row["scene_id"] for row in rows] == scenes.scene_id and {row["eta"] for row in rows} == {2.0}
 

@@ -37,7 +37,7 @@ SCENES = "data.build.steps=20 data.build.vehicles=8 data.build.others=2 data.bui
 TRAINED, TESTED = f"train.py {SCENES}", f"evaluate.py data.split=tune {SCENES} prior.sampler.steps=2"
 STAGES = {
     "prior": f"{TRAINED} stage=prior num_scenes=40 prior.network.width=32 stage.steps=60"
-    " stage.validate_every=10 stage.route_steps=50 stage.closed_loop_scenes=4",
+    " stage.validate_every=10 stage.route_steps=50",
     "imitation": f"{TRAINED} stage=imitation num_scenes=8 stage.epochs=20 stage.minibatch=64",
     "evolution": f"{TRAINED} prior.sampler.steps=2 num_scenes=4 rounds=3 batch=4 learner.round.scenes=4"
     " learner.collect.batch=4 learner.collect.iterations=1 measure.scenes=4 measure.seeds=[0] measure.eta=2",

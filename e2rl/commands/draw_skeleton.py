@@ -3,18 +3,12 @@
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
 
 # isort: split
-import hydra
-from omegaconf import DictConfig
-
 from e2rl.evaluation.plan import begin
 from e2rl.evaluation.protocol import run_protocol
 from e2rl.report.drawing import save_figure
-from e2rl.report.skeleton_figure import LongestChain, skeleton_figure
-from e2rl.run.config import run_command
-from e2rl.run.endings import ending
-from e2rl.run.files import alone_in
-from e2rl.run.run import Run, how_to_go_on
-from e2rl.run.settings import conf_folder
+from e2rl.report.skeleton_figure import LongestChain
+from e2rl.run.command import run_command
+from e2rl.run.run import Run
 
 
 def draw(run: Run) -> None:
@@ -22,23 +16,13 @@ def draw(run: Run) -> None:
     plan = begin(run)
     chain = LongestChain(plan.methods[0])
     run_protocol(plan.setup, plan.methods, plan.asked.seeds, run.folder, only=plan.only)
-    rollout = chain.rollout(plan.scenes, plan.setup.ego_name, run.folder)
-    save_figure(run.folder / "skeleton.png", skeleton_figure(rollout, chain.selection))
+    save_figure(run.folder / "skeleton.png", chain.figure(plan.scenes, plan.setup.ego_name, run.folder))
     print(f"\ndrawn: {run.folder / 'skeleton.png'}")
-
-
-@hydra.main(version_base="1.3", config_path=str(conf_folder().resolve()), config_name="skeleton")
-def command(config: DictConfig) -> None:
-    """The figure, as configured."""
-    with ending(lambda: how_to_go_on(config)):
-        run = Run.of(config)
-        with alone_in(run.folder):
-            draw(run)
 
 
 def main() -> None:
     """The command."""
-    run_command(command, "skeleton")
+    run_command("skeleton", draw)
 
 
 if __name__ == "__main__":

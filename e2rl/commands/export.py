@@ -2,9 +2,7 @@
 
 import argparse
 import csv
-import io
 from collections.abc import Sequence
-from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 
@@ -15,11 +13,11 @@ from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.export import archive, mcap, openscenario
 from e2rl.report.export import commonroad_writer as commonroad
 from e2rl.report.export import scenarionet_writer as scenarionet
-from e2rl.report.export.episode import FACTS, Episode
+from e2rl.report.export.episode import FACTS
 from e2rl.report.export.scene_files import episodes_of
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
-from e2rl.run.files import write_atomically, written_whole
+from e2rl.run.files import written_whole
 
 FORMATS = {
     "commonroad": commonroad.write,
@@ -38,11 +36,7 @@ LIBRARIES = {  # modules that a format needs, from the extra of its name
 
 
 def check_format(name: str, open_ego: bool) -> None:
-    """InputError for a format that there is not or whose library is missing, and for an open ego in a format without
-    one."""
-    if name not in FORMATS:
-        near = get_close_matches(name, FORMATS, 1, 0.0)[0]
-        raise InputError(f"--to {name}: no such format; did you mean {near}? There are {', '.join(FORMATS)}")
+    """InputError for a format whose library is missing, and for an open ego in a format without one."""
     if open_ego and name not in OPEN_EGO:
         raise InputError(f"--open-ego: {name} has no such form; leave it out, or pass --to {' or '.join(OPEN_EGO)}")
     for module in LIBRARIES.get(name, ()):
@@ -85,26 +79,19 @@ def export(
         raise InputError(f"{out}: is there already; remove it, or pass another folder with --out")
     episodes = episodes_of(run, rows, plugins, scene)
     shown = tqdm(episodes, "exporting", len(rows), unit="rollout", leave=False, disable=None)
-    with written_whole(out) as folder:
-        written = FORMATS[target](shown, folder, open_ego)
-        lines = [listed(episode, path.relative_to(folder)) for episode, path in written]
-        buffer = io.StringIO()
-        writer = csv.DictWriter(buffer, ("file", *FACTS, "adversaries"), restval="", lineterminator="\n")
+    with written_whole(out) as folder, (folder / LIST).open("w", newline="") as file:
+        writer = csv.DictWriter(file, ("file", *FACTS, "adversaries"), restval="", lineterminator="\n")
         writer.writeheader()
-        writer.writerows(lines)
-        write_atomically(folder / LIST, buffer.getvalue())
-    return len(lines)
-
-
-def listed(episode: Episode, path: Path) -> dict[str, object]:
-    """The line of a file in the list of what was exported."""
-    return episode.facts | {"file": str(path), "adversaries": " ".join(map(str, episode.facts["adversaries"]))}
+        for episode, path in FORMATS[target](shown, folder, open_ego):
+            facts = episode.facts | {"adversaries": " ".join(map(str, episode.facts["adversaries"]))}
+            writer.writerow({"file": str(path.relative_to(folder))} | facts)
+    return len(rows)
 
 
 def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="e2rl export", description=__doc__)
     parser.add_argument("run", type=Path, metavar="RUN_DIR", help="folder of a run of evaluate.py")
-    parser.add_argument("--to", required=True, metavar="FORMAT", help=", ".join(FORMATS))
+    parser.add_argument("--to", required=True, choices=FORMATS, metavar="FORMAT", help=", ".join(FORMATS))
     parser.add_argument("--failures", type=int, metavar="N", help="at most so many failures (default: all)")
     parser.add_argument("--all", action="store_true", help="every rollout, not only failures")
     parser.add_argument("--method", metavar="NAME", help="rollouts in its traffic only")
@@ -119,7 +106,7 @@ def main(arguments: list[str] | None = None) -> None:
     """The command."""
     options = parse_arguments(arguments)
     out = options.out or options.run / "export" / options.to
-    with ending("run the same command again"):
+    with ending():
         check_format(options.to, options.open_ego)
         if options.failures is not None and options.failures < 1:
             raise InputError(f"--failures {options.failures}: expected at least 1")

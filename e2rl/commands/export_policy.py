@@ -83,7 +83,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("actor", metavar="RUN_DIR", help="run of train.py, a checkpoint, an actor.safetensors; bundled")
     parser.add_argument("file", type=Path, metavar="FILE", help=f"to write: {ONNX}, or {TORCHSCRIPT} for TorchScript")
     options = parser.parse_args(arguments)
-    with ending("run the same command again"):
+    with ending():
         export_actor(options.actor, options.file)
         print(f"{options.file}: drive with it by ego=policy_file ego.file={options.file}")
 

@@ -81,8 +81,8 @@ def report(source: Source, rows: Sequence[Row], contents: Sequence[Counts]) -> l
 
 def picture(scene: dict[str, np.ndarray], title: str, metres: float) -> Figure:
     """Returns a picture of a scene at its start frame, `metres` wide, with the recorded paths of its agents."""
-    figure = new_figure(SIDE, SIDE + HEAD + FOOT)
     height = SIDE + HEAD + FOOT
+    figure = new_figure(SIDE, height)
     axes = figure.add_axes((0, FOOT / height, 1, SIDE / height))
     figure.text(14 / SIDE, 1 - 22 / height, title, fontsize=13, color=drawing.INK)
     drawing.add_legend(figure, LEGEND, 11)
@@ -92,12 +92,9 @@ def picture(scene: dict[str, np.ndarray], title: str, metres: float) -> Figure:
 
 def _trails(scene: dict[str, np.ndarray]) -> list[Trail]:
     """The recorded paths, the ego's on top; each fades towards the start frame."""
-    trails = []
-    for agent in reversed(np.flatnonzero(scene["valid"]).tolist()):
-        path = scene["logged"][scene["logged_valid"][:, agent], agent, :2]
-        if len(path) > 1:
-            trails.append(Trail(path, _colour(scene, agent), 0.4))
-    return trails
+    agents = np.flatnonzero(scene["valid"])[::-1]
+    paths = [scene["logged"][scene["logged_valid"][:, agent], agent, :2] for agent in agents]
+    return [Trail(path, _colour(scene, k), 0.4) for k, path in zip(agents, paths, strict=True) if len(path) > 1]
 
 
 def _shapes(scene: dict[str, np.ndarray]) -> list[Shape]:
@@ -105,12 +102,9 @@ def _shapes(scene: dict[str, np.ndarray]) -> list[Shape]:
     states = scene["light_state"][0].tolist()
     points = zip(scene["light_points"], states, strict=True)
     shapes = [drawing.disc(point, 0.7, LIGHTS[state], drawing.INK) for point, state in points]
-    for agent in reversed(np.flatnonzero(scene["valid"]).tolist()):
+    for agent in np.flatnonzero(scene["valid"])[::-1]:
         state, size, kind = scene["start"][agent], scene["size"][agent], AGENT_TYPES[scene["agent_type"][agent]]
-        if kind in ("pedestrian", "cyclist"):
-            shapes += drawing.vulnerable(state, size, kind == "cyclist")
-        else:
-            shapes += drawing.vehicle(state, size, _colour(scene, agent))
+        shapes += drawing.agent(kind, state, size, _colour(scene, agent))
     return shapes
 
 
@@ -162,8 +156,7 @@ def check_apart(rows: Sequence[Row], source: Source, other: Source) -> str:
         if "" in places:
             raise InputError(f"{path}: the place of some logs is not known; name it in index.csv (docs/data.md)")
     if shared := sorted(here & there):
-        names = ", ".join(shared[:5]) + (", ..." if len(shared) > 5 else "")
-        common = f"{len(shared)} places in common ({names})"
+        common = f"{len(shared)} places in common ({', '.join(shared[:5])})"
         raise InputError(f"{source.path} and {other.path}: {common}; part them by place")
     return f"apart        from the {len(there)} places of {other.path}"
 
@@ -177,12 +170,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--metres", type=float, default=140.0, help="width of the picture (default %(default)s)")
     parser.add_argument("--apart", type=Path, metavar="OTHER", help="logs that must share no place with those at PATH")
     parser.add_argument("--workers", type=int, default=2, help="processes (default %(default)s)")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("scene.png"),
-        help="picture to write, with a PDF beside it (default %(default)s)",
-    )
+    parser.add_argument("--out", type=Path, default="scene.png", help="picture, with a PDF (default %(default)s)")
     options = parser.parse_args(arguments)
     with ending():
         name, source = open_source(options.path, options.data, options.workers)

@@ -22,22 +22,20 @@ def chosen(run: Path, failures: int, modes: bool) -> Iterator[tuple[str, Failure
         yield "", Failure(rollout, score_rollouts(Rollouts.of([rollout]))[0][0])
         return
     rows = read_rows(run / TABLE)
+    found = [("", row) for row in found_failures(rows, failures)]
     if modes:
         files = {rollout_name(row): row for row in rows}
-        known = [mode for mode in read_modes(run / MODES_FILE)["modes"] if mode["mode"] != OTHER]
-        found = [(mode_title(mode), files[mode["typical"]["file"]]) for mode in known]
-    else:
-        found = [("", row) for row in found_failures(rows, failures)]
+        found = [
+            (f"{mode['mode']}. {mode['name']} ({mode['count']} failures)", files[mode["typical"]["file"]])
+            for mode in read_modes(run / MODES_FILE)["modes"]
+            if mode["mode"] != OTHER
+        ]
     if not found:
         raise InputError(
             f"{run / TABLE}: no rollout in which the ego hits a vehicle; raise eta or evaluate more scenes"
         )
     for title, row in found:
         yield title, Failure.read(run, row)
-
-
-def mode_title(mode: dict) -> str:
-    return f"{mode['mode']}. {mode['name']} ({mode['count']} failures)"
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -13,31 +13,19 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import hydra
 from omegaconf import DictConfig, OmegaConf
 
-from e2rl.evaluation.methods import build_ego, build_traffic, intensities, method_config, processes_of
+from e2rl.evaluation.methods import build_ego, build_traffic, method_config, processes_of
 from e2rl.evaluation.plan import Plan, begin
 from e2rl.evaluation.protocol import Method
 from e2rl.evaluation.trials import NOMINAL, AttackObjective, AttackTrials, PlannerObjective, PlannerTrials
-from e2rl.evaluation.tuning import (
-    STUDY_FILE,
-    TUNING_FILE,
-    Objective,
-    Parameters,
-    SearchSettings,
-    line_of,
-    save,
-    search,
-    yaml_of,
-)
+from e2rl.evaluation.tuning import STUDY_FILE, Objective, Parameters, SearchSettings, line_of, save, search, yaml_of
 from e2rl.report.tuning_curve import save_tuning_curve
-from e2rl.run.config import resolved, run_command
-from e2rl.run.endings import ending
+from e2rl.run.command import run_command
+from e2rl.run.config import resolved
 from e2rl.run.errors import InputError
-from e2rl.run.files import alone_in
-from e2rl.run.run import Run, how_to_go_on
-from e2rl.run.settings import check_choice, conf_folder, settings_of
+from e2rl.run.run import Run
+from e2rl.run.settings import check_choice, settings_of
 
 MAY_CHANGE = ("processes", "launcher")  # when a run is resumed
 GROUPS = ("synthesizer", "ego")
@@ -66,7 +54,7 @@ def tune(run: Run) -> dict:
         "rows": [f"{method.name}@{method.eta:g}" for method in plan.methods] if group == "ego" else [NOMINAL],
         "seeds": list(plan.asked.seeds),
         "scenes": plan.scenes.scene_id,
-        "eta": intensities(config),
+        "eta": list(plan.asked.eta),
     }
     space = resolved(config.tuning.space) or ranges
     file = folder / STUDY_FILE if config.tuning.study is None else Path(config.tuning.study)
@@ -74,16 +62,11 @@ def tune(run: Run) -> dict:
     result = save(rows, folder)
     if group == "synthesizer":
         save_tuning_curve(folder, rows, config.synthesizer.name)
-    print(f"\n{advice(result, group)}written to {folder}")
+    best = "no trial keeps within the limits\n"
+    if result["best"]:
+        best = f"best of {len(rows)} trials, for conf/{group}:\n{yaml_of(result['best'])}"
+    print(f"\n{best}written to {folder}")
     return result
-
-
-def advice(result: Mapping, group: str) -> str:
-    """Returns what to keep of a tuning's result."""
-    count = len(result["trials"])
-    if result["best"] is None:
-        return f"none of {count} trials keeps within the limits; {TUNING_FILE} has their metrics\n"
-    return f"best of {count} trials, for conf/{group}:\n{yaml_of(result['best'])}"
 
 
 def planner_trials(config: DictConfig, plan: Plan) -> PlannerTrials:
@@ -97,7 +80,7 @@ def planner_trials(config: DictConfig, plan: Plan) -> PlannerTrials:
 
 def attack_trials(config: DictConfig, plan: Plan) -> tuple[AttackTrials, Mapping]:
     """Returns trials of the group `synthesizer` at `config.eta` beside nominal traffic, and the ranges of its class."""
-    etas = intensities(config)
+    etas = plan.asked.eta
     if len(etas) != 1 or not etas[0]:
         raise InputError(f"eta={config.eta}: an adversary is tuned at one intensity above 0")
 
@@ -128,18 +111,9 @@ def changed(group: DictConfig, parameters: Parameters) -> DictConfig:
     return copied
 
 
-@hydra.main(version_base="1.3", config_path=str(conf_folder().resolve()), config_name="tune")
-def command(config: DictConfig) -> None:
-    """A tuning, as configured."""
-    with ending(lambda: how_to_go_on(config)):
-        run = Run.of(config, MAY_CHANGE)
-        with alone_in(run.folder):
-            tune(run)
-
-
 def main() -> None:
     """The command."""
-    run_command(command, "tune")
+    run_command("tune", tune, MAY_CHANGE)
 
 
 if __name__ == "__main__":

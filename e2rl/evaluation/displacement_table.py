@@ -5,14 +5,13 @@ from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from tensordict import TensorDict
 
 from e2rl.evaluation.protocol import SEEDS_APART, Method
 from e2rl.evaluation.rollout_files import require_rows
 from e2rl.evaluation.summary import metric_row
 from e2rl.metrics.catalogue import OPEN_LOOP_STAGE
-from e2rl.metrics.displacement import scene_displacements
+from e2rl.metrics.displacement import HORIZONS, scene_displacements
 from e2rl.metrics.statistics import bootstrap_draws, cluster_index, interval, resampled_means
 from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.scenes.recording import VEHICLE
@@ -20,7 +19,6 @@ from e2rl.scenes.scene import SceneSet
 from e2rl.traffic.attempt import attempt, count_reasons
 from e2rl.traffic.traffic import keep_velocity
 
-HORIZONS = (3.0, 5.0)  # s
 EGO = "unknown"  # `ego` column of the rows: no method receives the ego's plan
 BATCH = 32  # scenes planned at once
 
@@ -40,16 +38,16 @@ def open_loop_rows(
             continue
         count = samples if method.traffic.stochastic else 1
         compute = partial(open_loop_metrics, scenes, method, count, device)
-        found = parts.result(f"open-loop-{number:03}", [method.name, count, "with ended"], compute)
+        found = parts.result(f"open-loop-{number:03}", [method.name, count, "with errored"], compute)
         done, key = found["scenes"], (scenes.dataset, scenes.split, method.name, EGO, method.eta)
-        fields = {"stage": OPEN_LOOP_STAGE, "ended": found["ended"]}
+        fields = {"stage": OPEN_LOOP_STAGE, "errored": found["errored"]}
         rows.append(metric_row(key, done, count, done * count, found["metrics"], **fields))
     return rows
 
 
 def open_loop_metrics(scenes: SceneSet, method: Method, count: int, device: str) -> dict[str, Any]:
-    """`metrics` of `count` open-loop samples of every scene, the number of `scenes` that they are of, and `ended`: how
-    many others errored, for each reason.
+    """`metrics` of `count` open-loop samples of every scene, the number of `scenes` that they are of, and `errored`:
+    how many others errored, for each reason.
 
     Raises:
         InputError: all errored.
@@ -60,9 +58,12 @@ def open_loop_metrics(scenes: SceneSet, method: Method, count: int, device: str)
         scene = scenes.batch(index).to(device)
         seed = index.to(device) + SEEDS_APART * torch.arange(count, device=device)[:, None]
         plans = method.traffic.open_loop_plans(scene, seed)
-        there = _predicted(scene, plans.shape[2])[:, None, :, None].expand(plans.shape[:-1])
-        found = {"states": plans, "valid": there, **_displacements(scene, plans)}
-        return TensorDict(found, [len(tasks)]).cpu()
+        vehicles = plans.shape[2]
+        here = scene["valid"][:, :vehicles] & (scene["agent_type"][:, :vehicles] == VEHICLE)
+        log = scene["logged"][:, :, :vehicles], scene["logged_valid"][:, :, :vehicles]
+        columns = scene_displacements(plans, keep_velocity(scene["start"][:, :vehicles]), *log, here)
+        found = {"states": plans, "valid": here[:, None, :, None].expand(plans.shape[:-1])}
+        return TensorDict(found | {name: value.double() for name, value in columns.items()}, [len(tasks)]).cpu()
 
     planned, errored = [], []
     for batch in torch.arange(len(scenes)).split(BATCH):
@@ -72,31 +73,15 @@ def open_loop_metrics(scenes: SceneSet, method: Method, count: int, device: str)
     require_rows(planned, errored, None)
     done = [scene for tasks, _ in planned for scene in tasks]
     columns = torch.cat([part.exclude("states", "valid") for _, part in planned])
-    return {"metrics": _summary(columns, scenes, done), "scenes": len(done), "ended": count_reasons(errored)}
-
-
-def _predicted(scene: TensorDictBase, vehicles: int) -> Tensor:
-    """Bool [B, V]: vehicles that are there at the start."""
-    return scene["valid"][:, :vehicles] & (scene["agent_type"][:, :vehicles] == VEHICLE)
-
-
-def _displacements(scene: TensorDictBase, plans: Tensor) -> dict[str, Tensor]:
-    """The columns of `scene_displacements` of simulated vehicles for plans [B, S, V, HORIZON, 4]."""
-    vehicles = plans.shape[2]
-    here = _predicted(scene, vehicles)
-    straight = keep_velocity(scene["start"][:, :vehicles])
-    logged, valid = scene["logged"][:, :, :vehicles], scene["logged_valid"][:, :, :vehicles]
-    columns = scene_displacements(plans, straight, logged, valid, here, HORIZONS)
-    return {name: value.double() for name, value in columns.items()}
+    return {"metrics": _summary(columns, scenes, done), "scenes": len(done), "errored": count_reasons(errored)}
 
 
 def _summary(columns: TensorDict, scenes: SceneSet, done: Sequence[int]) -> dict[str, dict[str, float]]:
     """{metric: {mean, low, high, n}}: ratios of sums over the scenes `done`, places resampled; n counts vehicles."""
-    rows = [{"location": scenes.location[scene], "scene_id": scenes.scene_id[scene]} for scene in done]
-    cluster, clusters = cluster_index(rows)
+    cluster, clusters = cluster_index(*([names[k] for k in done] for names in (scenes.location, scenes.scene_id)))
     draws = bootstrap_draws(clusters)
     result: dict[str, dict[str, float]] = {}
-    for at in (f"_{horizon:g}" for horizon in HORIZONS):
+    for at in (f"_{horizon}" for horizon in HORIZONS):
         vehicles, straight = columns[f"vehicles{at}"], columns[f"cv_ade{at}"]
         quotients = {
             f"{name}{at}": (columns[name + at], vehicles) for name in ("min_ade", "mean_ade", "joint_ade", "cv_ade")

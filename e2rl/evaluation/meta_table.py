@@ -43,12 +43,13 @@ SPLITS = 200  # random splits of the logs into halves
 class Tally:
     """Counts of the features' bins and of indications for every vehicle [S * V] of scenes [S], over rollouts."""
 
-    def __init__(self, scenes: SceneSet):
+    def __init__(self, scenes: SceneSet, state: tuple | None = None):
+        """state: of a Tally to go on from."""
         self.scenes, self.vehicles = scenes, scenes.scenes["route_log"].shape[1]
-        size = len(scenes) * self.vehicles
-        self.counts = {name: torch.zeros(size, FEATURES[name].bins, dtype=torch.float64) for name in HISTOGRAMS}
-        self.hits = {name: torch.zeros(size, dtype=torch.float64) for name in INDICATIONS}
-        self.rollouts = torch.zeros(size, dtype=torch.float64)
+        none = torch.zeros(len(scenes) * self.vehicles, dtype=torch.float64)
+        counts = {name: none.new_zeros(len(none), FEATURES[name].bins) for name in HISTOGRAMS}
+        self.state = state or (none.clone(), counts, {name: none.clone() for name in INDICATIONS})
+        self.rollouts, self.counts, self.hits = self.state
 
     def add(self, index: Tensor, rollouts: Rollouts, weight: int = 1) -> None:
         """Count rollouts of scenes index [B] int64, each as `weight` equal ones."""
@@ -93,17 +94,6 @@ class Tally:
             result[name] = likelihood(log_p, known, scene, len(self.scenes))
         return result
 
-    def state(self, done: int, errored: list[str]) -> tuple:
-        """The counts after so many tasks, of which some errored for these reasons."""
-        return done, errored, self.rollouts, self.counts, self.hits
-
-    def goes_on(self, state: tuple | None) -> tuple[int, list[str]]:
-        """Go on from a `state`, None: from the beginning; returns the tasks done and the reasons so far."""
-        if state is None:
-            return 0, []
-        done, errored, self.rollouts, self.counts, self.hits = state
-        return done, errored
-
 
 def evaluated(scene: TensorDictBase) -> Tensor:
     """Bool [B, V]: vehicles other than the ego that are present at the start and recorded throughout."""
@@ -130,16 +120,19 @@ def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, parts: Par
     """Rows of metrics.json, stage `meta-metric`: every feature's likelihood and their weighted sum.
 
     They are over `rollouts` rollouts of each scene, with intervals over places; a deterministic method is rolled out
-    once. The row of the log also has its split-half `real`. Rollouts that error are counted in `ended`, and in no
+    once. The row of the log also has its split-half `real`. Rollouts that error are counted in `errored`, and in no
     likelihood. parts: the counts of each method so far.
     """
     scenes, rows = setup.scenes, []
     seeds = [rollouts if method.traffic.stochastic else 1 for method in methods]
     with tqdm(total=sum(seeds) * len(scenes), desc="meta-metric", unit="rollout", disable=None) as bar:
         for number, (method, count) in enumerate(zip(methods, seeds, strict=True)):
-            name, identity = f"meta-{number:03}", [method.name, float(method.eta), rollouts, "with ended"]
-            tally, tasks = (Tally(scenes), [(scene, seed) for seed in range(count) for scene in range(len(scenes))])
-            done, errored = tally.goes_on(parts.load(name, identity))
+            name, identity = f"meta-{number:03}", [method.name, float(method.eta), rollouts, "with errored"]
+            done, errored, state = parts.load(name, identity) or (0, [], None)
+            tally, tasks = (
+                Tally(scenes, state),
+                [(scene, seed) for seed in range(count) for scene in range(len(scenes))],
+            )
             bar.update(done)
             for begin in range(done, len(tasks), setup.batch):
                 batch = tasks[begin : begin + setup.batch]
@@ -147,13 +140,13 @@ def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, parts: Par
                 for pairs, rolled_out in driven:
                     tally.add(torch.tensor([scene for scene, _ in pairs]), rolled_out, rollouts // count)
                 errored += [why["reason"] for _, why in others]
-                parts.save(name, identity, tally.state(begin + len(batch), errored))
+                parts.save(name, identity, (begin + len(batch), errored, tally.state))
                 bar.update(len(batch))
             metrics = summarise_meta(tally.likelihoods(), scenes)
             if method.traffic.replays_log:
                 metrics["real_split_half"] = log_split_half(scenes)
             key = (scenes.dataset, scenes.split, method.name, setup.ego_name, method.eta)
-            fields = {"stage": META_STAGE, "ended": dict(Counter(errored))}
+            fields = {"stage": META_STAGE, "errored": dict(Counter(errored))}
             rolled = rollouts * len(scenes) - len(errored) * (rollouts // count)
             rows.append(metric_row(key, len(scenes), rollouts, rolled, metrics, **fields))
     return rows
@@ -161,7 +154,7 @@ def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, parts: Par
 
 def summarise_meta(likelihoods: dict[str, Tensor], scenes: SceneSet) -> dict[str, dict[str, float]]:
     """{metric: {mean, low, high, n}} of likelihoods [S] per scene; n counts the scenes with an evaluated vehicle."""
-    cluster, clusters = _clusters(scenes)
+    cluster, clusters = cluster_index(scenes.location, scenes.scene_id)
     table = torch.stack([meta_metric(likelihoods), *likelihoods.values()], -1)
     means = resampled_means(table, torch.ones_like(table), cluster, bootstrap_draws(clusters))
     known = ~table.isnan()
@@ -180,15 +173,9 @@ def log_split_half(scenes: SceneSet) -> dict[str, float]:
         simulated[:, scene["route_log"].shape[1] :] = False
         log = scene["logged"].double(), scene["logged_valid"]
         samples += kinematic_samples(*log, *log, simulated, torch.full((len(scene),), scenes.steps))
-    cluster, clusters = _clusters(scenes)
+    cluster, clusters = cluster_index(scenes.location, scenes.scene_id)
     generator = torch.Generator().manual_seed(0)
     order = torch.rand(SPLITS, clusters, generator=generator).argsort(1)
     values = split_half(samples, cluster, order < clusters // 2)
     low, high = values.nanquantile(values.new_tensor(LEVELS)).tolist()
     return {"mean": values.nanmean().item(), "low": low, "high": high, "n": len(scenes)}
-
-
-def _clusters(scenes: SceneSet) -> tuple[Tensor, int]:
-    return cluster_index(
-        [{"location": place, "scene_id": name} for place, name in zip(scenes.location, scenes.scene_id, strict=True)]
-    )

@@ -15,18 +15,16 @@ from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.checkpoint import load_prior
 from e2rl.prior.prior import Prior
 from e2rl.prior.sde import SamplerSettings
-from e2rl.run.config import built, check_counts, choices, load_choice
+from e2rl.run.config import built, choices, load_choice, machine_of
 from e2rl.run.errors import InputError
 from e2rl.run.processes import Processes, RayWorkers, cores
-from e2rl.run.settings import check_choice, check_range, check_settings, setting, settings_of
+from e2rl.run.settings import check_choice, check_settings, setting, settings_of
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.traffic import Traffic
 
 FIGURES = ("intensity", "curves")
-LAUNCHERS = ("processes", "ray")
 VARIED = ("prior", "synthesizer")  # groups that the variants of a table may change
 ALL = "all"  # metrics
-MOST = 100.0  # of the intensity; 0 to 3 are sensible
 
 
 # --- objects
@@ -46,7 +44,11 @@ def build_traffic(synthesizer: DictConfig, prior: Prior) -> Traffic:
 
 def build_methods(config: DictConfig, prior: Prior) -> list[Method]:
     """The rows of `config.methods` and of those `config.variants` that it does not name; methods with an intensity have
-    a row for each `config.eta`."""
+    a row for each `config.eta`.
+
+    Raises:
+        InputError: for a method that is not there, and for changes of a variant that cannot be.
+    """
     methods = []
     for name in dict.fromkeys([*as_list(config.methods), *config.variants]):
         if name in config.variants:
@@ -55,8 +57,8 @@ def build_methods(config: DictConfig, prior: Prior) -> list[Method]:
             traffic = build_traffic(changed.synthesizer, own)
         else:
             traffic = build_traffic(method_config(config, name), prior)
-        etas = intensities(config) if traffic.adversarial else [0.0]
-        methods += [Method(name, traffic, eta) for eta in etas]
+        etas = as_list(config.eta) if traffic.adversarial else [0.0]
+        methods += [Method(name, traffic, float(eta)) for eta in etas]
     return methods
 
 
@@ -83,10 +85,9 @@ class EvaluationSettings:
     """Keys of conf/evaluate.yaml, checked. shard: (k, n), only every n-th batch from the k-th on."""
 
     methods: tuple[str, ...]
-    eta: tuple[float, ...] = setting(low=0.0, high=MOST)
+    eta: tuple[float, ...] = setting(low=0.0, high=100.0)  # 0 to 3 are sensible
     seeds: tuple[int, ...] = setting(low=0)
     num_scenes: int | None = setting(low=1, optional=True)
-    batch: int = setting(low=1)
     shard: tuple[int, ...] = setting(low=0)
     metrics: str
     compare: tuple[str, ...]
@@ -115,13 +116,9 @@ def evaluation_settings(config: DictConfig) -> EvaluationSettings:
     settings = settings_of(EvaluationSettings, given | {"shard": config.shard or WHOLE})
     if not (settings.methods or config.variants):
         raise InputError("methods=[]: name at least one, such as [nominal,e2]")
-    for name in settings.methods:
-        if name not in config.variants:
-            method_config(config, name)
     for name in config.variants:
         if name in (config.synthesizer.name, *choices("synthesizer")):
             raise InputError(f"variants.{name}: {name} is a row already; choose another name")
-        varied(config, name)
     _check_compared(config, settings)
     processes_of(config)
     return settings
@@ -134,16 +131,6 @@ def as_list(value: Any) -> list:
         assert isinstance(plain, list)
         return list(dict.fromkeys(plain))
     return [] if value is None else [value]
-
-
-def intensities(config: DictConfig) -> list[float]:
-    """Returns `config.eta`, one or several; InputError for what is no intensity."""
-    etas = as_list(config.eta)
-    for eta in etas:
-        if not isinstance(eta, int | float):
-            raise InputError(f"eta={eta}: expected a number of at least 0, or a list of them")
-        check_range("eta", eta, 0, MOST)
-    return [float(eta) for eta in etas]
 
 
 def varied(config: DictConfig, name: str) -> DictConfig:
@@ -190,19 +177,17 @@ def _check_compared(config: DictConfig, settings: EvaluationSettings) -> None:
 def processes_of(config: DictConfig) -> Processes:
     """Returns the processes that rollouts are spread over: one a core by default, one on a device that they would
     share; with launcher=ray, Ray workers."""
-    given, device = config.get("processes"), str(config.device)
-    check_choice("launcher", config.launcher, LAUNCHERS)
-    if given is not None:
-        check_counts(config, processes=1)
-    alone, several = device == "cpu" and config.threads == 1, config.launcher == "ray" or (given or 1) > 1
-    if several and not alone:
+    machine, device = machine_of(config), str(config.device)
+    alone = device == "cpu" and machine.threads == 1
+    if not alone and (machine.launcher == "ray" or (machine.processes or 1) > 1):
         raise InputError(
-            f"processes={given}, threads={config.threads}, device={device}, launcher={config.launcher}: several "
-            "processes have one thread each and the CPU; set threads=1 device=cpu, or processes=1 launcher=processes"
+            f"processes={machine.processes}, threads={machine.threads}, device={device}, launcher={machine.launcher}: "
+            "several processes have one thread each and the CPU; set threads=1 device=cpu, or processes=1 "
+            "launcher=processes"
         )
-    if config.launcher == "ray":
-        return RayWorkers(given, tuple(map(str, config.plugins)))
-    return given or (cores() if alone else 1)
+    if machine.launcher == "ray":
+        return RayWorkers(machine.processes, tuple(map(str, config.plugins)))
+    return machine.processes or (cores() if alone else 1)
 
 
 def caption(config: DictConfig, origin: dict, methods: Sequence[Method] = ()) -> str:
@@ -226,10 +211,8 @@ def terms_by_method(methods: Sequence[Method]) -> dict[str, tuple[str, str]]:
 def terms(methods: Sequence[Method]) -> str:
     """What methods know of the ego and owe it, for a caption; "" for those that have no such settings."""
     by_terms: dict[str, list[str]] = {}
-    for method in methods:
-        known, owed = method.traffic.knowledge, method.traffic.responsibility
-        text = f"the ego {'predicted' if known == 'predicted' else 'announces its plan'}" if known else ""
-        text += f", responsibility {owed}" if owed else ""
-        if text and method.name not in by_terms.setdefault(text, []):
-            by_terms[text].append(method.name)
-    return "".join(f"; {', '.join(names)}: {text}" for text, names in by_terms.items())
+    for name, (known, owed) in terms_by_method(methods).items():
+        told = [f"the ego {'predicted' if known == 'predicted' else 'announces its plan'}"] if known else []
+        told += [f"responsibility {owed}"] if owed else []
+        by_terms.setdefault(", ".join(told), []).append(name)
+    return "".join(f"; {', '.join(names)}: {text}" for text, names in by_terms.items() if text)

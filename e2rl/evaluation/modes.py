@@ -7,7 +7,7 @@ from statistics import fmean
 from types import NoneType
 
 from e2rl.evaluation.rollout_files import nulls
-from e2rl.evaluation.summary import GROUP
+from e2rl.evaluation.summary import GROUP, group_of
 from e2rl.metrics.failure_modes import (
     FEATURES,
     Row,
@@ -37,7 +37,7 @@ SHAPE = {  # what readers of modes.json need
         | dict.fromkeys(("rollouts", "failures", "modes"), int)
     ],
     "modes": [
-        {"mode": int, "name": str, "count": int, "groups": [{"count": int, "share": (*NUMBER, NoneType)}]}
+        {"mode": int, "name": str, "count": int, "groups": [{"count": int, "fraction": (*NUMBER, NoneType)}]}
         | dict.fromkeys((*VERDICTS, *MEANS), (*NUMBER, NoneType))
         | {"typical": {"file": str}}
     ],
@@ -47,24 +47,24 @@ SHAPE = {  # what readers of modes.json need
 def find_modes(rows: Sequence[dict]) -> dict:
     """Group the failures among all rows of a run into modes, and return the content of modes.json.
 
-    Adds `mode`, the number of the mode, to the rows of failures, in place. rows: labelled (`label_rows`). Modes that
-    are too small are gathered as `other`, number 0. Columns that no failure knows, such as `duty`, are named under
+    Adds `mode`, the number of the mode, to the rows of failures, in place. Modes that are too small are gathered as
+    `other`, number 0. Columns that no failure knows, such as `duty`, are named under
     `unknown` and play no part.
     """
     failures = [row for row in rows if is_failure(row)]
     numbers = cluster_failures(failures)
     for row, number in zip(failures, numbers, strict=True):
         row["mode"] = number
-    large, used = large_modes(numbers), [feature.column for feature in known_features(failures)]
+    large, used = large_modes(numbers), known_features(failures)
     members = {number: [row for row in failures if row["mode"] == number] for number in large}
     if len(large) < len(set(numbers)):
         members[OTHER] = [row for row in failures if row["mode"] not in large]
-    groups = [dict(zip(GROUP, key, strict=True)) for key in dict.fromkeys(group_key(row) for row in rows)]
+    groups = [dict(zip(GROUP, key, strict=True)) for key in dict.fromkeys(group_of(row) for row in rows)]
     counts = [group_counts(group, rows, members) for group in groups]
     return {
         "failures": len(failures),
         "rollouts": len(rows),
-        "unknown": [feature.column for feature in FEATURES if failures and feature.column not in used],
+        "unknown": [column for column in FEATURES if failures and column not in used],
         "groups": counts,
         "modes": [describe(number, ours, counts) for number, ours in members.items()],
     }
@@ -74,20 +74,16 @@ def group_counts(group: dict, rows: Sequence[Row], members: Mapping[int, Sequenc
     """A group (dataset, split, method, ego_policy, eta) with its rollouts, failures, and modes other than the small
     ones that have one of its failures."""
     key = tuple(group.values())
-    ours = {number: sum(group_key(row) == key for row in failures) for number, failures in members.items()}
+    ours = {number: sum(group_of(row) == key for row in failures) for number, failures in members.items()}
     modes = sum(count > 0 for number, count in ours.items() if number != OTHER)
-    rollouts = sum(group_key(row) == key for row in rows)
+    rollouts = sum(group_of(row) == key for row in rows)
     return group | {"rollouts": rollouts, "failures": sum(ours.values()), "modes": modes}
-
-
-def group_key(row: Row) -> tuple:
-    return tuple(row[name] for name in GROUP)
 
 
 def describe(mode: int, members: Sequence[Row], groups: Sequence[dict]) -> dict:
     """A mode of modes.json: its number, name, failures and their fraction of each group's, verdicts, mean speeds [m/s],
     and its most typical rollout. Fractions and means are over the members that know the value, None without any."""
-    keys = [group_key(row) for row in members]
+    keys = [group_of(row) for row in members]
     by_group = [keys.count(tuple(group[name] for name in GROUP)) for group in groups]
     total = sum(group["failures"] for group in groups)
     typical = members[medoid(members)]
@@ -95,10 +91,10 @@ def describe(mode: int, members: Sequence[Row], groups: Sequence[dict]) -> dict:
         "mode": mode,
         "name": "other" if mode == OTHER else mode_name(members),
         "count": len(members),
-        "share": len(members) / total,
+        "fraction": len(members) / total,
         "groups": [
             {"method": group["method"], "ego_policy": group["ego_policy"], "eta": group["eta"], "count": count}
-            | {"share": count / group["failures"] if group["failures"] else None}
+            | {"fraction": count / group["failures"] if group["failures"] else None}
             for group, count in zip(groups, by_group, strict=True)
         ],
         **{name: known_mean(members, name) for name in (*VERDICTS, *MEANS)},

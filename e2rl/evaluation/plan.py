@@ -55,6 +55,6 @@ def begin(run: Run) -> Plan:
     scenes = load_scenes(config.data, asked.num_scenes, scenes=config.scenes, files=files_of_run(config))
     only = None if config.scene is None else [scenes.index(config.scene)]
     name, ego = next(iter(egos.egos.items()))
-    setup = Setup(scenes, ego, name, build_sim(config), asked.batch, config.device)
+    setup = Setup(scenes, ego, name, build_sim(config), config.batch, config.device)
     run.begin({"scenes": listed(scenes)})
     return Plan(asked, egos, prior, origin, methods, setup, only)

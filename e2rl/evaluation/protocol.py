@@ -10,17 +10,9 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from e2rl.evaluation import rollout_files as files
 from e2rl.evaluation.modes import MODES_FILE, find_modes, write_modes
-from e2rl.evaluation.rollout_files import (
-    ENDED_FILE,
-    METRICS_FILE,
-    TABLE,
-    require_rows,
-    write_ended,
-    write_metrics,
-    write_rows,
-)
-from e2rl.evaluation.summary import empty_rows, metric_rows
+from e2rl.evaluation.summary import empty_rows, group_of, metric_rows
 from e2rl.metrics.catalogue import SOURCE
 from e2rl.metrics.evasion import add_avoidable
 from e2rl.metrics.score import score_rollouts
@@ -39,7 +31,7 @@ from e2rl.traffic.traffic import Traffic
 SEEDS_APART = 1_000_003
 WHOLE = (0, 1)  # the only shard of a run
 Task = tuple[int, int]  # position of a scene, sampling seed
-# Rows and realism samples, one of each per rollout; and the entries of ended.json of rollouts that errored.
+# Rows and realism samples, one of each per rollout; and the entries of errored.json of rollouts that errored.
 Scored = tuple[list[dict], list[dict[str, Tensor]], list[dict]]
 
 
@@ -54,25 +46,15 @@ class Method:
 
 @dataclass
 class Setup:
-    """What all methods of a table share.
-
-    Args:
-        scenes: where to drive.
-        ego: the planner.
-        ego_name: its name in files.
-        sim: settings of the simulator.
-        batch: rollouts at once.
-        device: where to compute.
-        evasions: whether the collisions are searched for evasions.
-    """
+    """What all methods of a table share."""
 
     scenes: SceneSet
     ego: Ego
-    ego_name: str
+    ego_name: str  # in files
     sim: SimSettings
-    batch: int = 64
+    batch: int = 64  # rollouts at once
     device: str = "cpu"
-    evasions: bool = True
+    evasions: bool = True  # collisions are searched for evasions
 
     def roll_out(self, method: Method, tasks: Sequence[Task]) -> Rollouts:
         """The rollouts of (scene, seed) pairs under one method."""
@@ -119,20 +101,14 @@ def run_protocol(
     methods: Sequence[Method],
     seeds: Sequence[int],
     folder: Path | None = None,
-    save_rollouts: bool = True,
     processes: Processes = 1,
     only: Sequence[int] | None = None,
     parts: Parts = NO_PARTS,
     **fields: Any,
 ) -> list[dict]:
-    """The rows of metrics.json of every method on every (scene, seed): `drive_all`, then `record`.
-
-    Args:
-        folder: where rollouts/ (if save_rollouts) and the tables are written (None: nowhere).
-        fields: added to each row, or further arguments of `metric_rows`.
-    """
-    into = folder / ROLLOUTS if folder is not None and save_rollouts else None
-    scored = drive_all([setup], methods, seeds, into, processes, only, parts)
+    """The rows of metrics.json of every method on every (scene, seed): `drive_all`, then `record` into a folder (None:
+    nothing is written). fields: added to each row, or further arguments of `metric_rows`."""
+    scored = drive_all([setup], methods, seeds, folder and folder / ROLLOUTS, processes, only, parts)
     return record(*scored, folder, partial(metric_rows, **fields))
 
 
@@ -208,26 +184,22 @@ def record(
 ) -> list[dict]:
     """The rows of metrics.json: summarise(rows, samples), with the counts of what errored where they have none.
 
-    Writes rollouts.csv, modes.json, metrics.json and, where rollouts errored, ended.json into a folder. A method of
+    Writes rollouts.csv, modes.json, metrics.json and, where rollouts errored, errored.json into a folder. A method of
     which all rollouts errored has a row too, without metrics.
 
     Raises:
         InputError: no rollout could be scored.
     """
     if folder is not None:
-        write_ended(folder / ENDED_FILE, errored)
-    require_rows(rows, errored, folder)
+        files.write_errored(folder / files.ERRORED_FILE, errored)
+    files.require_rows(rows, errored, folder)
     modes, known = find_modes(rows), summarise(rows, samples)
     known += empty_rows(known, errored)
-    result = [{"ended": count_reasons(entry for entry in errored if _is_of(entry, row))} | row for row in known]
+    result = [
+        {"errored": count_reasons(why for why in errored if group_of(why) == group_of(row))} | row for row in known
+    ]
     if folder is not None:
         write_modes(folder / MODES_FILE, modes)
-        write_rows(folder / TABLE, rows)
-        write_metrics(folder / METRICS_FILE, result)
+        files.write_rows(folder / files.TABLE, rows)
+        files.write_metrics(folder / files.METRICS_FILE, result)
     return result
-
-
-def _is_of(entry: dict, row: dict) -> bool:
-    """Whether an entry of ended.json is of the rollouts of a row of metrics.json."""
-    names = {"dataset": "dataset", "split": "split", "method": "method", "ego_policy": "ego", "eta": "eta"}
-    return all(entry[name] == row[other] for name, other in names.items())

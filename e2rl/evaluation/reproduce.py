@@ -19,7 +19,7 @@ from e2rl.evaluation.rollout_files import METRICS_FILE, nulls, read_metrics
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
 from e2rl.run.run import ALWAYS, Run, changed, inputs, read_provenance, versions
-from e2rl.run.trust import saved_configuration
+from e2rl.run.trust import leaves, saved_configuration
 from e2rl.scenes.scene_list import SCENES
 
 HERE = ("processes", "data.cache", "data.workers")  # always the command line's: of this machine, without influence
@@ -27,14 +27,15 @@ MOVED = ("device", "data.path", *HERE)  # what the command line may set, besides
 RESULT = "reproduced.json"
 LISTED = "scenes"  # the name of the scenes in provenance.json
 IDENTITY = ("stage", "dataset", "split", "method", "ego", "eta", "training")  # of a row, as far as it has them
-COUNTS = ("n_scenes", "n_seeds", "n_rollouts", "ended")
+COUNTS = ("n_scenes", "n_seeds", "n_rollouts", "errored")
 CLOSE = 1e-6  # relative difference: rounding of another machine
-TIMES = ("seconds_per_rollout",)  # metrics of wall time, which are never the same
+TIME = "seconds_per_rollout"  # the metric of wall time, which is never the same
 SHOWN = 10  # differences in a text
 
 
-def reproduction_of(config: DictConfig) -> Run:
-    """Returns the run that `config.reproduce` asks for: the configuration of that run, in a new folder.
+def run_of(config: DictConfig, free: Sequence[str]) -> Run:
+    """Returns the run that the command line asks for; with `config.reproduce` the configuration of that run, in a new
+    folder.
 
     Tells on stderr where versions differ.
 
@@ -42,6 +43,8 @@ def reproduction_of(config: DictConfig) -> Run:
         InputError: where there is no finished table, where its configuration names code (`e2rl.run.trust`), for weights
             that are others or not there, and for settings that cannot change.
     """
+    if config.resume or not config.reproduce:
+        return Run.of(config, free)
     where, old = f"reproduce={config.reproduce}", Path(config.reproduce).resolve()
     saved, known = saved_configuration(config, old, where), read_provenance(old)
     if missing := [name for name in (METRICS_FILE, SCENES) if not (old / name).is_file()]:
@@ -74,15 +77,8 @@ def _move(
         )
     if "data.path" in names and OmegaConf.select(saved, "data.split") is None:  # which names the split otherwise
         saved.data.split = Path(str(saved.data.path)).stem
-    for name in {*names, *(key for key in HERE if _has(saved, key))}:
+    for name in {*names, *(key for key in HERE if OmegaConf.select(saved, key) is not None)}:
         OmegaConf.update(saved, name, OmegaConf.select(config, name))
-
-
-def _has(config: DictConfig, key: str) -> bool:
-    """Whether a configuration has a dotted key, null or not."""
-    parent, _, name = key.rpartition(".")
-    inside = OmegaConf.select(config, parent) if parent else config
-    return isinstance(inside, DictConfig) and name in inside
 
 
 def _key(name: str) -> str:
@@ -100,7 +96,7 @@ def _check_weights(config: DictConfig, saved: DictConfig, files: Mapping[str, st
         key, setting = name.partition("=")[0], _key(name)
         if key == LISTED:
             continue
-        mend = f"{'' if _has(config, setting) else '+'}{setting}=FILE"
+        mend = f"{'++' if OmegaConf.select(config, setting) is None else ''}{setting}=FILE"
         if key not in now:
             raise InputError(f"{where}: {name}: not there; say where the file lies that the run used, by {mend}")
         if now[key] != value:
@@ -187,17 +183,9 @@ def _numbers(row: Mapping) -> Iterator[tuple[str, Any]]:
     """(name, value) of every number of a row."""
     named = " ".join(str(row[key]) for key in IDENTITY if key in row)
     parts = {key: row[key] for key in COUNTS if key in row} | {"metrics": row["metrics"], "paired": row["paired"]}
-    for key, value in _leaves(parts):
-        if not set(key.split(": ")) & set(TIMES):
-            yield f"{named}: {key.removeprefix('metrics: ')}", value
-
-
-def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(value, Mapping):
-        for key, part in value.items():
-            yield from _leaves(part, f"{name}: {key}" if name else str(key))
-    else:
-        yield name, value
+    for key, value in leaves(parts):
+        if TIME not in key:
+            yield f"{named}: {key.removeprefix('metrics.')}", value
 
 
 def _shown(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""Tables of a run, written and read whole: rollouts.csv, metrics.json, ended.json (docs/method.md, section 11)."""
+"""Tables of a run, written and read whole: rollouts.csv, metrics.json, errored.json (docs/method.md, section 11)."""
 
 import csv
 import io
@@ -14,7 +14,7 @@ from e2rl.run.errors import InputError
 from e2rl.run.files import misfit, write_atomically
 from e2rl.traffic.attempt import summary_of
 
-TABLE, METRICS_FILE, ENDED_FILE = "rollouts.csv", "metrics.json", "ended.json"
+TABLE, METRICS_FILE, ERRORED_FILE = "rollouts.csv", "metrics.json", "errored.json"
 NEEDED = (*SOURCE, "scene_id", "seed", "eta")
 NUMBER = (int, float, NoneType)
 INTERVAL = {"low": NUMBER, "high": NUMBER, "n": NUMBER, ...: NUMBER}
@@ -24,7 +24,7 @@ METRICS_ROW = {  # what readers of metrics.json need
     "metrics": {...: {"mean": NUMBER, **INTERVAL}},
     "paired": {...: {...: {"difference": NUMBER, **INTERVAL}}},
 }
-SOMETIMES = {"ended": {...: int}, "stage": (str, NoneType), "git": str, "command": str, "n_trainings": int}
+SOMETIMES = {"errored": {...: int}, "stage": (str, NoneType), "git": str, "command": str, "n_trainings": int}
 TEXTS = (*SOURCE, "scene_id", "location", *WORDS)
 
 
@@ -91,16 +91,14 @@ def read_metrics(path: Path) -> list[dict]:
     path = Path(path)
     try:
         rows = json.loads(path.read_text())
-        if wrong := misfit(rows, [METRICS_ROW]) or next(filter(None, map(_other, rows)), None):
+        wrong = misfit(rows, [METRICS_ROW])
+        for row in [] if wrong else rows:
+            wrong = wrong or misfit(row, {name: shape for name, shape in SOMETIMES.items() if name in row})
+        if wrong:
             raise ValueError(wrong)
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: no readable metrics ({error}); give a metrics.json that a run wrote") from error
     return [{key: nans(value) if key in ("metrics", "paired") else value for key, value in row.items()} for row in rows]
-
-
-def _other(row: dict) -> str | None:
-    """What has another shape in the entries that not every row of metrics.json has."""
-    return misfit(row, {name: shape for name, shape in SOMETIMES.items() if name in row})
 
 
 def nulls(value: object) -> object:
@@ -119,28 +117,28 @@ def nans(value: object) -> object:
     return math.nan if value is None else value
 
 
-def write_ended(path: Path, ended: Sequence[dict]) -> None:
-    """Write ended.json, where rollouts ended without a score; remove an older one where none did."""
-    if ended:
-        write_atomically(path, json.dumps(list(ended), indent=1))
+def write_errored(path: Path, errored: Sequence[dict]) -> None:
+    """Write errored.json, where rollouts errored; remove an older one where none did."""
+    if errored:
+        write_atomically(path, json.dumps(list(errored), indent=1))
     else:
         path.unlink(missing_ok=True)
 
 
-def add_ended(path: Path, number: int, ended: Sequence[dict]) -> None:
-    """Write the entries of round `number` of a training into its ended.json, after those of earlier rounds; a resumed
+def add_errored(path: Path, number: int, errored: Sequence[dict]) -> None:
+    """Write the entries of round `number` of a training into its errored.json, after those of earlier rounds; a resumed
     run repeats some. A damaged file is begun anew."""
     try:
         known = json.loads(path.read_text()) if path.is_file() else []
         earlier = [entry for entry in known if entry["round"] < number]
     except (OSError, ValueError, TypeError, KeyError):
         earlier = []
-    write_ended(path, [*earlier, *ended])
+    write_errored(path, [*earlier, *errored])
 
 
-def require_rows(rows: Sequence[dict], ended: Sequence[dict], folder: Path | None) -> None:
-    """InputError where all rollouts ended without a score."""
-    if rows or not ended:
+def require_rows(rows: Sequence[dict], errored: Sequence[dict], folder: Path | None) -> None:
+    """InputError where all rollouts errored."""
+    if rows or not errored:
         return
-    where = f"; {folder / ENDED_FILE} has the tracebacks" if folder is not None else ""
-    raise InputError(f"no rollout could be scored: {summary_of(ended)}{where}; mend the planner or the traffic")
+    where = f"; {folder / ERRORED_FILE} has the tracebacks" if folder is not None else ""
+    raise InputError(f"no rollout could be scored: {summary_of(errored)}{where}; mend the planner or the traffic")

@@ -15,6 +15,11 @@ GROUP = ("dataset", "split", "method", "ego_policy", "eta")
 Key = tuple  # values of GROUP
 
 
+def group_of(row: Mapping) -> Key:
+    """Values of GROUP of a row of metrics.json, of rollouts.csv or of errored.json."""
+    return tuple(row["ego" if name == "ego_policy" and "ego" in row else name] for name in GROUP)
+
+
 def metric_row(key: Key, scenes: int, seeds: int, rollouts: int, metrics: Mapping, **fields: Any) -> dict:
     """One row of metrics.json; key: dataset, split, method, ego and eta; fields override or extend it."""
     identity = dict(zip(("dataset", "split", "method", "ego", "eta"), key, strict=True))
@@ -32,7 +37,7 @@ def metric_rows(
     references: Collection[str] | None = None,
     **fields: Any,
 ) -> list[dict]:
-    """Rows of metrics.json from labelled rows of rollouts (`label_rows`) and their features.
+    """Rows of metrics.json from the rows of rollouts and their realism samples (`features`).
 
     A row's `paired` compares it with every other method (or eta) on the same dataset, split and ego over the shared
     (scene, seed); a method there with several etas is named method@eta. egos: pairs of egos of which the first is also
@@ -42,47 +47,36 @@ def metric_rows(
     """
     groups: dict[Key, list[int]] = {}
     for index, row in enumerate(rows):
-        groups.setdefault(tuple(row[name] for name in GROUP), []).append(index)
+        groups.setdefault(group_of(row), []).append(index)
     members = {key: ([rows[i] for i in index], [features[i] for i in index]) for key, index in groups.items()}
     result = []
     for key, ours in members.items():
         paired = {}
-        others = [other for other in rivals(key, list(members)) if references is None or other[2] in references]
+        others = [other for other in members if other != key and (*other[:2], other[3]) == (*key[:2], key[3])]
+        others = [other for other in others if references is None or other[2] in references]
         for other in others[: 1 if egos else None]:
             differences = paired_differences(*ours, *members[other], draws, realism_draws)
-            paired[rival_name(other, list(members))] = differences
-        for name, other in same_traffic(key, egos, members):
-            paired[f"ego {name}"] = paired_differences(*ours, *members[other], draws, 0, relative=True)
+            paired[_method_name(other, members)] = differences
+        for first, second in egos:
+            other = (*key[:3], second, key[4])
+            if first == key[3] and other in members:
+                paired[f"ego {second}"] = paired_differences(*ours, *members[other], draws, 0, relative=True)
         scenes, seeds = ({row[name] for row in ours[0]} for name in ("scene_id", "seed"))
         metrics = summarise(*ours, draws, realism_draws)
         result.append(metric_row(key, len(scenes), len(seeds), len(ours[0]), metrics, paired=paired, **fields))
     return result
 
 
-def empty_rows(known: Sequence[dict], ended: Sequence[dict]) -> list[dict]:
-    """Rows of metrics.json of the groups of which every rollout ended without a score: no metric is known. known: the
-    rows of the others, of which the first lends the fields that all have."""
-    present = {tuple(row["ego" if name == "ego_policy" else name] for name in GROUP) for row in known}
-    lost = dict.fromkeys(tuple(entry[name] for name in GROUP) for entry in ended)
+def empty_rows(known: Sequence[dict], errored: Sequence[dict]) -> list[dict]:
+    """Rows of metrics.json of the groups of which every rollout errored: no metric is known. known: the rows of the
+    others, of which the first lends the fields that all have."""
+    present, lost = set(map(group_of, known)), dict.fromkeys(map(group_of, errored))
     nothing = {"mean": math.nan, "low": math.nan, "high": math.nan, "n": 0}
     shared = {name: known[0][name] for name in ("git", "command", "stage") if known and name in known[0]}
     return [metric_row(key, 0, 0, 0, dict.fromkeys(METRICS, nothing), **shared) for key in lost if key not in present]
 
 
-def rivals(key: Key, keys: Sequence[Key]) -> list[Key]:
-    """The other groups on the same dataset and split with the same ego."""
-    shared = [GROUP.index(name) for name in ("dataset", "split", "ego_policy")]
-    return [other for other in keys if other != key and all(other[i] == key[i] for i in shared)]
-
-
-def same_traffic(key: Key, egos: Sequence[tuple[str, str]], keys: Collection[Key]) -> list[tuple[str, Key]]:
-    """(ego, group) of the egos that the group's own is compared with, in the same traffic."""
-    dataset, split, method, ego, eta = key
-    others = [(name, (dataset, split, method, name, eta)) for first, name in egos if first == ego]
-    return [(name, other) for name, other in others if other in keys]
-
-
-def rival_name(key: Key, keys: Sequence[Key]) -> str:
+def _method_name(key: Key, keys: Collection[Key]) -> str:
     """The group's method, with its eta if the method occurs with several etas for the same ego."""
     etas = {other[4] for other in keys if other[:4] == key[:4]}
     return key[2] if len(etas) == 1 else f"{key[2]}@{key[4]:g}"

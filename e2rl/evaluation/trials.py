@@ -16,7 +16,6 @@ from e2rl.evaluation.rollout_files import require_rows
 from e2rl.evaluation.tuning import Parameters
 from e2rl.metrics.statistics import summarise
 from e2rl.planners.ego import Ego
-from e2rl.run.errors import InputError
 from e2rl.run.processes import Processes
 from e2rl.run.settings import configured, setting
 from e2rl.traffic.attempt import count_reasons
@@ -24,7 +23,7 @@ from e2rl.traffic.traffic import Traffic
 
 SOUGHT = ("cfr", "cfr_counted", "cfr_preventable")
 MEASURED = (*SOUGHT, "aor_step", "cfr_bg", "real", "real_adv", "nfe")
-LOST = 0.01  # fraction of rollouts that may end for an error of the planner or the traffic
+ERRORED = 0.01  # fraction of rollouts that may error
 NOMINAL = "nominal"  # after a metric's name: its value in the traffic that the budget is held against
 DRIVING = ("collision", "comfort", "progress")
 
@@ -38,7 +37,7 @@ class PlannerObjective:
     optimum of safety; comfort_ceiling: multiple of the present |acceleration| above which it is.
     """
 
-    shown: ClassVar[tuple[str, ...]] = (*DRIVING, "ended")
+    shown: ClassVar[tuple[str, ...]] = (*DRIVING, "errored")
 
     comfort: float = setting(low=0)
     progress: float = setting(low=0)
@@ -46,15 +45,13 @@ class PlannerObjective:
     comfort_ceiling: float = setting(low=0)
 
     def judge(self, metrics: Mapping[str, float], reference: Mapping[str, float]) -> tuple[float, float]:
-        """See `Objective`. A trial in which more rollouts ended for an error than of the reference is refused."""
-        if missing := [name for name in DRIVING if name not in metrics]:
-            raise InputError(f"tuning: evaluate() returned no {', '.join(missing)}")
-        ended = metrics.get("ended", 0.0) - reference.get("ended", 0.0)
+        """See `Objective`. A trial in which more rollouts errored than of the reference is refused."""
+        errored = metrics.get("errored", 0.0) - reference.get("errored", 0.0)
         progress = metrics["progress"] / max(reference["progress"], 1e-6)
         rougher = metrics["comfort"] / max(reference["comfort"], 1e-6)
         lost = self.progress * max(0.0, 1 - progress)
         value = metrics["collision"] + self.comfort * metrics["comfort"] + lost
-        excess = max(0.0, self.progress_floor - progress) + max(0.0, rougher - self.comfort_ceiling) + max(0.0, ended)
+        excess = max(0.0, self.progress_floor - progress) + max(0.0, rougher - self.comfort_ceiling) + max(0.0, errored)
         return value, math.inf if math.isnan(value) else excess
 
 
@@ -67,18 +64,18 @@ class AttackObjective:
     in any rollout has no `real_adv`, and keeps every such limit.
     """
 
-    shown: ClassVar[tuple[str, ...]] = ("cfr", "cfr_counted", "aor_step", f"aor_step {NOMINAL}", "real_adv", "ended")
+    shown: ClassVar[tuple[str, ...]] = ("cfr", "cfr_counted", "aor_step", f"aor_step {NOMINAL}", "real_adv", "errored")
 
     seek: str = setting(choices=SOUGHT)
     off_road: float = setting(low=0, high=1)
     realism: float | None = setting(low=0, high=1, optional=True)
 
     def judge(self, metrics: Mapping[str, float], reference: Mapping[str, float]) -> tuple[float, float]:
-        """See `Objective`; each trial has its nominal metrics. One that loses more than LOST of its rollouts beyond
+        """See `Objective`; each trial has its nominal metrics. One that loses more than ERRORED of its rollouts beyond
         nominal traffic's is refused: it would be compared on other scenes."""
         over = metrics["aor_step"] - metrics[f"aor_step {NOMINAL}"] - self.off_road
-        lost = metrics.get("ended", 0.0) - metrics.get(f"ended {NOMINAL}", 0.0) - LOST
-        excess = max(0.0, over) + max(0.0, lost)
+        more = metrics.get("errored", 0.0) - metrics.get(f"errored {NOMINAL}", 0.0) - ERRORED
+        excess = max(0.0, over) + max(0.0, more)
         if self.realism is not None and not math.isnan(metrics["real_adv"]):
             excess += max(0.0, self.realism - metrics["real_adv"])
         value = -metrics[self.seek]
@@ -96,20 +93,20 @@ class PlannerTrials:
     processes: Processes = 1
 
     def __call__(self, parameters: Parameters) -> dict[str, float]:
-        """Returns the means of DRIVING, also of every method alone as `NAME METHOD@ETA`, and `ended`.
+        """Returns the means of DRIVING, also of every method alone as `NAME METHOD@ETA`, and `errored`.
 
         collision: fraction of rollouts in which the ego touches something or leaves the road; comfort: mean
-        |acceleration| [m/s^2]; progress [m]; ended: fraction without a score, `ended: REASON` for each reason.
+        |acceleration| [m/s^2]; progress [m]; errored: fraction without a score, `errored: REASON` for each reason.
         """
         setup = replace(self.setup, ego=self.make(parameters), evasions=False)
-        rows, _, ended = drive_all([setup], self.methods, self.seeds, processes=self.processes)
+        rows, _, errored = drive_all([setup], self.methods, self.seeds, processes=self.processes)
         metrics = driving(rows)
         for method in self.methods:
             own = [row for row in rows if row["method"] == method.name and row["eta"] == method.eta]
             metrics |= {f"{name} {method.name}@{method.eta:g}": value for name, value in driving(own).items()}
-        count = len(rows) + len(ended)
-        metrics |= {f"ended: {reason}": number / count for reason, number in count_reasons(ended).items()}
-        return metrics | {"ended": len(ended) / count}
+        count = len(rows) + len(errored)
+        metrics |= {f"errored: {reason}": number / count for reason, number in count_reasons(errored).items()}
+        return metrics | {"errored": len(errored) / count}
 
 
 def driving(rows: Sequence[Mapping]) -> dict[str, float]:
@@ -135,20 +132,21 @@ class AttackTrials:
     processes: Processes = 1
 
     def __call__(self, parameters: Parameters) -> dict[str, float]:
-        """Returns the means of MEASURED, NAME_low and NAME_high of the 95% intervals of SOUGHT, and `ended`; and all
+        """Returns the means of MEASURED, NAME_low and NAME_high of the 95% intervals of SOUGHT, and `errored`; and all
         of them as `NAME nominal` in nominal traffic."""
         return self.measure(Method("trial", self.make(parameters), self.eta)) | self.reference
 
     @cached_property
     def reference(self) -> dict[str, float]:
-        known = (*MEASURED, "ended")
-        return {f"{name} {NOMINAL}": value for name, value in self.measure(self.nominal).items() if name in known}
+        found = self.measure(self.nominal)
+        return {f"{name} {NOMINAL}": found[name] for name in (*MEASURED, "errored")}
 
     def measure(self, method: Method) -> dict[str, float]:
         """Returns the metrics of a method; InputError where no rollout has a score."""
         setup = replace(self.setup, evasions=False)  # no trial is judged by them
-        rows, samples, ended = drive_all([setup], [method], self.seeds, processes=self.processes)
-        require_rows(rows, ended, None)
+        rows, samples, errored = drive_all([setup], [method], self.seeds, processes=self.processes)
+        require_rows(rows, errored, None)
         found = summarise(rows, samples, realism_draws=0)
-        metrics = {name: found[name]["mean"] for name in MEASURED} | {"ended": len(ended) / (len(rows) + len(ended))}
+        metrics = {name: found[name]["mean"] for name in MEASURED}
+        metrics["errored"] = len(errored) / (len(rows) + len(errored))
         return metrics | {f"{name}_{end}": found[name][end] for name in SOUGHT for end in ("low", "high")}

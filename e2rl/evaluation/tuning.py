@@ -5,7 +5,6 @@ What a trial is and what its metrics are worth is told by `e2rl.evaluation.trial
 
 import json
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any, ClassVar, Protocol
 
 from omegaconf import OmegaConf
 
-from e2rl.evaluation.rollout_files import nulls
+from e2rl.evaluation.rollout_files import nans, nulls
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
 from e2rl.run.settings import configured, setting
@@ -23,9 +22,8 @@ Space = Mapping[str, Sequence]  # {name: (low, high) or (low, high, "log")} of s
 Evaluate = Callable[[Parameters], Mapping[str, float]]  # the metrics of a trial
 REFUSED = 10.0  # added to the objective of refused trials, so that the sampler leaves their region
 UNKNOWN = 2 * REFUSED  # of trials in which no rollout has a score
-STUDY = "trials"  # name of the study in its file
-LOCK_GRACE = 5  # s after which the lock of a writer that does nothing more is broken
-STUDY_FILE, TUNING_FILE, TUNED_FILE = "study.log", "tuning.json", "tuned.yaml"
+ROW = ("parameters", "metrics", "objective", "admissible")
+STUDY_FILE, TUNING_FILE, TUNED_FILE = "study.json", "tuning.json", "tuned.yaml"
 
 
 class Objective(Protocol):
@@ -75,25 +73,38 @@ def search(
         InputError: for a space that does not fit, for a study of another task, and where the present parameters have no
             metrics.
     """
-    optuna = _optuna()
-    ranges = distributions(optuna, present, space)
+    ranges = distributions(present, space)
     given = [{name: present[name] for name in space}, *sweep(present, space, settings.sweep)]
     task = {"space": {name: list(space[name]) for name in space}, "parameters": present, "sweep": settings.sweep}
-    study = open_study(optuna, file, task | {"objective": vars(objective)} | dict(about or {}))
-    done = _finished(study)
-    for number in range(len(done), settings.trials):
-        parameters = given[number] if number < len(given) else proposal(optuna, done, ranges, settings)
+    task = json.loads(json.dumps(nulls(task | {"objective": vars(objective)} | dict(about or {}))))
+    rows = read_study(file, task)
+    for number in range(len(rows), settings.trials):
+        parameters = given[number] if number < len(given) else proposal(rows, ranges, settings, objective)
         metrics = dict(evaluate(present | parameters))
-        value, excess = objective.judge(metrics, done[0].user_attrs["metrics"] if done else metrics)
-        if math.isinf(excess) and not done:
-            reasons = [name for name, part in metrics.items() if name.startswith(("ended: ", "ended_")) and part]
+        value, excess = objective.judge(metrics, rows[0]["metrics"] if rows else metrics)
+        if math.isinf(excess) and not rows:
+            reasons = [name for name, part in metrics.items() if name.startswith(("errored: ", "errored_")) and part]
             raise InputError(f"tuning: {parameters} yield NaN metrics ({', '.join(reasons) or 'check the scenes'})")
-        outcome = {"metrics": metrics, "objective": value, "admissible": excess == 0}
-        value = UNKNOWN if math.isinf(excess) else value + (REFUSED + excess if excess else 0)
-        study.add_trial(optuna.create_trial(params=parameters, distributions=ranges, value=value, user_attrs=outcome))
-        done = _finished(study)
-        told(_rows(done))
-    return _rows(done)
+        rows.append({"parameters": parameters, "metrics": metrics, "objective": value, "admissible": excess == 0})
+        if file is not None:
+            write_atomically(file, json.dumps(nulls({"task": task, "trials": rows})))
+        told(rows)
+    return rows
+
+
+def read_study(file: Path | None, task: Mapping) -> list[dict]:
+    """Returns the rows of a study's file, none where there is none; InputError for one of another task."""
+    if file is None or not file.exists():
+        return []
+    try:
+        study = json.loads(file.read_text())
+        known, rows = study["task"], [nans({name: row[name] for name in ROW}) for row in study["trials"]]
+        differ = ", ".join(sorted(name for name in {*known, *task} if known.get(name) != task.get(name)))
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise InputError(f"tuning.study={file}: no study; name another file") from error
+    if differ:
+        raise InputError(f"tuning.study={file}: a study that differs in {differ}; name another file")
+    return rows
 
 
 def best_of(rows: Sequence[dict]) -> dict | None:
@@ -141,9 +152,10 @@ def sweep(present: Parameters, space: Space, count: int) -> list[Parameters]:
     return [{each: present[each] for each in space} | {name: value} for value in others]
 
 
-def distributions(optuna: Any, present: Parameters, space: Space) -> dict:
+def distributions(present: Parameters, space: Space) -> dict:
     """Returns optuna's distributions of a space; InputError for a name that is no parameter, and for a range that is
     none or leaves out the present value."""
+    optuna = _optuna()
     if not space:
         raise InputError("tuning.space: no ranges; name one of each parameter to tune, {NAME: [low, high]}")
     found = {}
@@ -161,41 +173,16 @@ def distributions(optuna: Any, present: Parameters, space: Space) -> dict:
     return found
 
 
-def proposal(optuna: Any, done: Sequence, ranges: Mapping, settings: SearchSettings) -> Parameters:
+def proposal(rows: Sequence[dict], ranges: Mapping, settings: SearchSettings, objective: Objective) -> Parameters:
     """Returns optuna's next parameters, which depend on nothing but the finished trials and the seed."""
-    sampler = optuna.samplers.TPESampler(seed=settings.seed + len(done), n_startup_trials=settings.startup)
+    optuna = _optuna()
+    sampler = optuna.samplers.TPESampler(seed=settings.seed + len(rows), n_startup_trials=settings.startup)
     study = optuna.create_study(sampler=sampler)
-    study.add_trials(done)
+    for row in rows:
+        value, excess = objective.judge(row["metrics"], rows[0]["metrics"])
+        value = UNKNOWN if math.isinf(excess) else value + (REFUSED + excess if excess else 0)
+        study.add_trial(optuna.create_trial(params=row["parameters"], distributions=ranges, value=value))
     return study.ask(dict(ranges)).params
-
-
-def open_study(optuna: Any, file: Path | None, task: Mapping) -> Any:
-    """Returns the study in a file, a new one where there is none; InputError for one of another task."""
-    storage = None if file is None else journal(optuna, file)
-    study = optuna.create_study(storage=storage, study_name=STUDY, load_if_exists=True)
-    task = json.loads(json.dumps(nulls(dict(task))))
-    known = study.user_attrs.get("task", task)
-    if known != task:
-        differ = ", ".join(sorted(name for name in {*known, *task} if known.get(name) != task.get(name)))
-        raise InputError(f"tuning.study={file}: a study that differs in {differ}; name another file")
-    study.set_user_attr("task", task)
-    return study
-
-
-def journal(optuna: Any, file: Path) -> Any:
-    """Returns optuna's storage in a file. The half line of a writer that was killed is cut off; its lock is broken
-    after LOCK_GRACE seconds."""
-    file = file.absolute()  # optuna's lock is a link to this path, from the file's own folder
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.touch()
-    lock = optuna.storages.journal.JournalFileSymlinkLock(str(file), LOCK_GRACE)
-    lock.acquire()
-    try:
-        if tail := len(file.read_bytes().rpartition(b"\n")[2]):
-            os.truncate(file, file.stat().st_size - tail)
-    finally:
-        lock.release()
-    return optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(file), lock))
 
 
 def _optuna() -> Any:
@@ -205,11 +192,3 @@ def _optuna() -> Any:
         raise InputError("tuning: optuna is not installed; install its extra: pip install 'e2rl[tune]'") from error
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna
-
-
-def _finished(study: Any) -> list:
-    return [trial for trial in study.get_trials(deepcopy=False) if trial.state.name == "COMPLETE"]
-
-
-def _rows(done: Sequence) -> list[dict]:
-    return [{"parameters": trial.params, **trial.user_attrs} for trial in done]

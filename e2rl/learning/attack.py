@@ -26,17 +26,17 @@ LATE = 20  # steps before the contact at which an evasion is to begin: from its 
 
 
 class Solved(NamedTuple):
-    """Of synthesized traffic [S]: kept [S] bool: the ego was not hit, or there is an evasion; evasion [S, T, 2]: its
-    actions from the start, 0 without one; span [S, 2] int64: the steps from .. up to which it acts, (0, 0) without
+    """Of synthesized traffic [S]: entered [S] bool: it is in D', as the ego was not hit or there is an evasion; evasion
+    [S, T, 2]: its actions from the start; span [S, 2] int64: the steps from .. up to which it acts; both 0 without
     one."""
 
-    kept: Tensor
+    entered: Tensor
     evasion: Tensor
     span: Tensor
 
 
 def unsearched(states: Tensor) -> Solved:
-    """Everything is kept and no evasion known, of traffic with states [S, T+1, N, 4]."""
+    """Everything enters and no evasion is known, of traffic with states [S, T+1, N, 4]."""
     rows, steps = states.shape[0], states.shape[1] - 1
     span = torch.zeros(rows, 2, dtype=torch.int64)
     return Solved(torch.ones(rows, dtype=torch.bool), torch.zeros(rows, steps, 2), span)
@@ -57,7 +57,7 @@ def solvable(traffic: Mapping[str, Tensor], scenes: SceneSet, sim: SimSettings) 
         if len(again):
             result[again] = find_evasions(scene[again], states[again], valid[again], sim)
             begin = begin.index_fill(0, again, 0)
-        solved.kept[hit] = result.found
+        solved.entered[hit] = result.found
         shown = (result.found & first["hit"]).nonzero()[:, 0]
         actions = from_start(dynamics.inverse(states[shown, :, 0]), result.actions[shown], begin[shown])
         evasion = dynamics.rollout(states[shown, 0, 0], actions)
@@ -89,7 +89,7 @@ def acting(evasion: Tensor, driven: Tensor, begin: Tensor, stop: Tensor) -> Tens
 Synthesize = Callable[..., Mapping[str, Any]]  # (ego, scene_index [S], eta [S], seed), or these and template [S]
 Solvable = Callable[[Mapping[str, Tensor]], Solved]
 ATTACK, NOMINAL = "attack", "nominal traffic"  # of a round: what was made
-FLAGS = ("attacked", "contact", "kept")
+FLAGS = ("attacked", "contact", "entered")
 TRACKS = ("scene_index", "states", "valid", "adversaries")
 
 
@@ -119,7 +119,7 @@ def make_traffic(
     The traffic is the attack without rows that no driver avoids, then, with `nominal`, the same scenes at intensity 0;
     both without errored rows. Equal orders yield equal traffic, in whichever processes: `batch` scenes are the unit
     that one makes. It has scene_index [R], eta [R], template [R], states [R, T+1, N, 4], valid [R, T+1, N], adversaries
-    [R, N]; evasion [R, T, 2] and span [R, 2] as in `Solved`; of the attack kept [S] bool (rows that entered) and the
+    [R, N]; evasion [R, T, 2] and span [R, 2] as in `Solved`; of the attack entered [S] bool (rows in D') and the
     fractions of the made rows that were attacked [] (have an adversary) and in contact [] (the ego was hit).
 
     Args:
@@ -134,36 +134,36 @@ def make_traffic(
     parts = list(in_processes(work, jobs, processes, cost=lambda job: job[1]))
     errored = [entry for part in parts for entry in part.pop("errored")]
     traffic = {name: torch.cat([part[name] for part in parts]) for name in parts[0] if name not in FLAGS}
-    attack, contact, kept = (torch.cat([part[name] for part in parts[: len(rows)]]) for name in FLAGS)
+    attack, contact, entered = (torch.cat([part[name] for part in parts[: len(rows)]]) for name in FLAGS)
     if not len(attack):
         raise InputError(f"no traffic could be made: {summary_of(errored)}; mend the planner or the traffic")
     fractions = {"attacked": attack.float().mean(), "contact": contact.float().mean()}
-    return traffic | fractions | {"kept": kept}, errored
+    return traffic | fractions | {"entered": entered}, errored
 
 
 def _make_part(
     order: Order, synthesize: Synthesize, solvable: Solvable | None, job: tuple[Tensor, bool]
 ) -> dict[str, Any]:
-    """The traffic of an order's scenes rows [s], attacked or at intensity 0; FLAGS of them (kept [s], the others of the
-    rows that were made); and the errored rest."""
+    """The traffic of an order's scenes rows [s], attacked or at intensity 0; FLAGS of them (entered [s], the others of
+    the rows that were made); and the errored rest."""
     rows, attack = job
     scenes, none = order.scenes[rows], torch.zeros_like(order.eta[rows])
     eta, template = (order.eta[rows], order.template[rows]) if attack else (none, torch.full_like(scenes, FULL))
     limits = () if not attack or bool((order.template == FULL).all()) else (template,)
     made = synthesize(order.ego, scenes, eta, order.seed, *limits)
-    why: Mapping[int, dict] = made.get("ended", {})
+    why: Mapping[int, dict] = made.get("errored", {})
     there = torch.tensor([row for row in range(len(rows)) if row not in why], dtype=torch.int64)
     searching = solvable if attack and len(there) else None
     solved = unsearched(made["states"]) if searching is None else searching(made)
     every = {name: made[name] for name in TRACKS} | {"eta": eta[there], "template": template[there]}
     every |= {"evasion": solved.evasion, "span": solved.span}
-    kept = torch.zeros(len(rows), dtype=torch.bool).index_fill(0, there[solved.kept], True)
-    flags = dict(zip(FLAGS, (made["adversaries"].any(-1), made["contact"], kept), strict=True))
+    entered = torch.zeros(len(rows), dtype=torch.bool).index_fill(0, there[solved.entered], True)
+    flags = dict(zip(FLAGS, (made["adversaries"].any(-1), made["contact"], entered), strict=True))
     about = {"round": order.number, "during": ATTACK if attack else NOMINAL}
     errored = [
         about | {"scene": int(scenes[row]), "eta": round(float(eta[row]), 4)} | reason for row, reason in why.items()
     ]
-    return {name: value[solved.kept] for name, value in every.items()} | flags | {"errored": errored}
+    return {name: value[solved.entered] for name, value in every.items()} | flags | {"errored": errored}
 
 
 def counted(errored: Sequence[dict]) -> dict[str, float]:
@@ -191,12 +191,12 @@ def mixture(first: Synthesize, second: Synthesize, fraction: float) -> Synthesiz
             if not len(rows):
                 continue
             made = dict(make(ego, scenes[rows], eta[rows], seed, *(each[rows] for each in template)))
-            own = made.pop("ended", {})
+            own = made.pop("errored", {})
             errored |= {int(rows[place]): why for place, why in own.items()}
             places += [int(row) for place, row in enumerate(rows) if place not in own]
             parts.append(made)
         order = torch.tensor(places, dtype=torch.int64).argsort()
-        return {name: torch.cat([part[name] for part in parts])[order] for name in parts[0]} | {"ended": errored}
+        return {name: torch.cat([part[name] for part in parts])[order] for name in parts[0]} | {"errored": errored}
 
     return synthesize
 

@@ -7,6 +7,7 @@ exponentially, so an arm that is no longer drawn drifts back to the prior and is
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,26 +25,22 @@ EXPLORATION = 0.1  # fraction of the draws that goes to all arms alike
 class BanditCurriculum(CurriculumScheduler):
     """Draws an arm for each scene of a round, by a softmax of the arms' values and some exploration.
 
-    State of A arms: counts [4, A] of failed, survived, kept and left-out attacks. An attack of this round counts once,
-    however many episodes are driven in it: they are alike. Settings: conf/curriculum/bandit.yaml.
+    State of A arms: counts [4, A] of attacks that failed, survived, entered D' and were left out. An attack of this
+    round counts once, however many episodes are driven in it: they are alike. Settings: conf/curriculum/bandit.yaml.
     """
 
     lasting = ("_counts",)
 
     def __init__(
         self,
-        num_scenes: int,
-        rounds: int,
-        seed: int = 0,
-        *,
+        *run: int,
         etas: Sequence[float],
         templates: Sequence[str],
         forgetting: float,
         fraction: float,
-        prioritised: bool,
-        solvable_only: bool,
+        **scenes: Any,
     ) -> None:
-        super().__init__(num_scenes, rounds, seed, prioritised=prioritised, solvable_only=solvable_only)
+        super().__init__(*run, **scenes)
         check_range("curriculum.etas: intensities", len(etas), 1)
         check_range("curriculum.etas", min(etas), 1e-6)
         check_range("curriculum.templates: names", len(templates), 1)
@@ -66,10 +63,10 @@ class BanditCurriculum(CurriculumScheduler):
     def value(self) -> Tensor:
         """What an attack of each arm [A] teaches, in expectation: the fraction of its attacks that enter D'
         times p (1 - p) under the Beta posterior of its failure rate p, whose prior is uniform."""
-        failed, survived, kept, left_out = self._counts
+        failed, survived, entered, left_out = self._counts
         failed, survived = failed + 1, survived + 1
         total = failed + survived
-        return (kept + 1) / (kept + left_out + 1) * failed * survived / (total * (total + 1))
+        return (entered + 1) / (entered + left_out + 1) * failed * survived / (total * (total + 1))
 
     def probability(self) -> Tensor:
         """Probability [A] with which an arm is drawn."""

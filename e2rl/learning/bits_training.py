@@ -1,8 +1,8 @@
 """Training of the ego `bits` on recordings: every moving vehicle of a scene plays the ego, along its own route.
 
 A window is a vehicle at a frame and its next 5 s. Where they end is the goal. The goal head learns it by cross-entropy;
-the policy, told the goal, learns the way there through the unicycle. Half of the windows begin beside the recording, so
-that the policy learns to come back.
+the policy, told the goal, learns to drive there through the unicycle. Half of the windows begin beside the recording,
+so that the policy learns to come back.
 """
 
 from collections.abc import Mapping, Sequence
@@ -114,11 +114,11 @@ def windows(scenes: SceneSet, seed: int, disturbed: Sequence[float] = DISTURBED)
 def _disturbed(world: World, size: Sequence[float], generator: torch.Generator) -> World:
     """Worlds whose egos are beside their recording, turned, and faster or slower; who stands stays."""
     draws = torch.randn(len(world.step), 3, generator=generator) * torch.tensor(size)
-    aside, turned, faster = draws.unbind(1)
+    sideways, turned, faster = draws.unbind(1)
     states = world.states.clone()
     x, y, heading, speed = states[:, 0].unbind(-1)
     part = (speed / 5).clamp(max=1)
-    moved = [x - aside * part * heading.sin(), y + aside * part * heading.cos(), wrap(heading + turned * part)]
+    moved = [x - sideways * part * heading.sin(), y + sideways * part * heading.cos(), wrap(heading + turned * part)]
     states[:, 0] = torch.stack([*moved, (speed + faster * part).clamp(min=0)], -1)
     return replace(world, states=states)
 
@@ -130,11 +130,11 @@ def _windows(world: World, scene: Tensor) -> TensorDict:
     future, known = world.scene["logged"][:, ahead, 0], world.scene["logged_valid"][:, step : ahead.stop, 0].all(1)
     path = RoutePath(world.states[:, 0], route)
     hint = path.s + (future[..., 3] * DT).sum(1)
-    end, side, _ = (value[:, 0] for value in project(future[:, -1:, :2], route, hint[:, None]))
+    end, offset, _ = (value[:, 0] for value in project(future[:, -1:, :2], route, hint[:, None]))
     columns = {"observation": observed(world), "start": world.states[:, 0], "route": route, "future": future}
-    columns |= {"way": (end - path.s).clamp(min=0), "side": side, "scene_index": scene}
-    kept = known & world.valid[:, 0] & (torch.maximum(side.abs(), path.d.abs()) < FARTHEST)
-    return TensorDict(columns, batch_size=[len(scene)])[kept]
+    columns |= {"distance": (end - path.s).clamp(min=0), "offset": offset, "scene_index": scene}
+    follows = known & world.valid[:, 0] & (torch.maximum(offset.abs(), path.d.abs()) < FARTHEST)
+    return TensorDict(columns, batch_size=[len(scene)])[follows]
 
 
 # --- training
@@ -143,12 +143,12 @@ def _windows(world: World, scene: Tensor) -> TensorDict:
 def losses(network: BitsNetwork, batch: TensorDictBase, noise: Tensor | None = None) -> dict[str, Tensor]:
     """Mean losses of windows [W]: goal (cross-entropy of the recorded goal's cell, nats), residual (of the place in it,
     cells), trajectory (distance from the recording of the plan to that goal, mean over the 5 s, m)."""
-    start, way, side = batch["start"], batch["way"], batch["side"]
+    start, distance, offset = batch["start"], batch["distance"], batch["offset"]
     path, code = RoutePath(start, batch["route"]), network.encode(batch["observation"], noise)
-    cell, residual = cell_of(start[:, 3], way, side)
+    cell, residual = cell_of(start[:, 3], distance, offset)
     logits, residuals = network.goals(code)
     guessed = residuals.gather(1, cell[:, None, None].expand(-1, 1, 2))[:, 0]
-    controls = network.controls(code, start[:, 3], path.d, way[:, None], side[:, None])
+    controls = network.controls(code, start[:, 3], path.d, distance[:, None], offset[:, None])
     states = drive_controls(controls, start, path).states[:, 0]
     gap = (states[..., :2] - batch["future"][..., :2]).square().sum(-1)
     return {

@@ -1,10 +1,9 @@
 """Drives an ego through one episode per pool row, for planner tuning and demonstrations; outcomes of episodes."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, tensorclass
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
@@ -27,7 +26,7 @@ OUTCOME_KEYS = (
 )
 
 
-@dataclass
+@tensorclass
 class Episodes:
     """E finished episodes, each field [E]: pool row and scene (int64), adversarial traffic, contact with any agent,
     off the road (bool), return, progress [m] and mean |acceleration| [m/s^2] (NaN if not measured)."""
@@ -40,9 +39,6 @@ class Episodes:
     returns: Tensor
     progress: Tensor
     acceleration: Tensor
-
-    def __len__(self) -> int:
-        return len(self.row)
 
     @property
     def failed(self) -> Tensor:
@@ -62,16 +58,6 @@ class Episodes:
                 if len(known):
                     result[name + suffix] = known.mean().item()
         return result
-
-
-NONE, NEVER = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool)
-NO_EPISODES = Episodes(NONE, NONE, NEVER, NEVER, NEVER, *[torch.zeros(0)] * 3)
-
-
-def concatenated(parts: list[Episodes]) -> Episodes:
-    """All episodes of the parts, in order."""
-    parts = parts or [NO_EPISODES]
-    return Episodes(*(torch.cat([getattr(part, name) for part in parts]) for name in Episodes.__dataclass_fields__))
 
 
 def decisions(steps, hold: int):
@@ -100,6 +86,7 @@ def finished_episodes(batches: list[TensorDictBase], adversarial: Tensor, horizo
         after["episode_reward"][ended][:, 0],
         metrics["progress"][ended][:, 0],
         torch.full((len(row),), torch.nan),
+        batch_size=[len(row)],
     )
 
 
@@ -159,15 +146,15 @@ class PoolDriver:
     def drive_all(self, ego: Ego, pool: TrafficPool) -> tuple[Episodes, list[dict]]:
         """Outcomes of one episode in every row of the pool, in their order, but for those in which the ego raises or
         becomes NaN; and these, each with its row and reason."""
-        parts: list[Episodes] = []
+        none, never = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool)
+        parts = [Episodes(none, none, never, never, never, *[torch.zeros(0)] * 3, batch_size=[0])]
         errored: list[dict] = []
         for rows in torch.arange(len(pool)).split(self.env.batch_size[0]):
             found, failed = attempt(lambda tasks: self._frames(ego, pool, tasks), rows.tolist())
             parts += [episodes_of(frames, pool, torch.tensor(done)) for done, frames in found]
             errored += [{"row": row, **why} for row, why in failed]
-        every = concatenated(parts)
-        order = every.row.argsort()
-        return Episodes(*(getattr(every, name)[order] for name in Episodes.__dataclass_fields__)), errored
+        every = torch.cat(parts)
+        return every[every.row.argsort()], errored
 
     def _frames(self, ego: Ego, pool: TrafficPool, rows: Sequence[int]) -> TensorDict:
         """Frames of `drive` of at most as many rows as there are environments, as `attempt` looks at them."""
@@ -199,4 +186,4 @@ def episodes_of(frames: TensorDictBase, pool: TrafficPool, rows: Tensor) -> Epis
     effort = (frames["executed"][..., 0].abs() * frames["alive"]).sum(1) / count
     ended = frames["contact"].any(1), frames["off_road"].any(1)
     of_rows = pool.scene_index[rows], pool.adversarial[rows]
-    return Episodes(rows, *of_rows, *ended, frames["reward"].sum(1), progress, effort)
+    return Episodes(rows, *of_rows, *ended, frames["reward"].sum(1), progress, effort, batch_size=[len(rows)])

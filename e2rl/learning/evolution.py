@@ -63,13 +63,13 @@ class Evolution:
     """The state of a run: curriculum, improvement (which holds the ego) and the memory of D'.
 
     choices: what the curriculum chose for the last round and what came of it (e2rl/learning/scheduler.py); errored: the
-    last round's rollouts that ended for an error of the planner or the traffic, each with its reason.
+    last round's rollouts that errored, each with its reason.
 
     Args:
         synthesize: (ego, scene_index [S], eta [S], seed) -> {scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N],
             adversaries [S, N] bool, contact [S] bool}: closed-loop traffic against that ego; contact: it was hit. Rows
-            that cannot be made are left out, and `ended` {position in S: why} names them. Of a curriculum that chooses
-            causal templates it also takes template [S].
+            that cannot be made are left out, and `errored` {position in S: why} names them. A curriculum that chooses
+            causal templates gives template [S], too.
         solvable: traffic -> Solved: the rows that enter D', and evasions; None: all, and none.
         memory: None: in a temporary folder.
         batch: scenes that are synthesized at once.
@@ -162,7 +162,7 @@ class Evolution:
             **attack.metrics,
         }
         attacked |= {} if contact is None else {"contact": contact}
-        self.errored = [*attack.errored, *({"round": order.number, **entry} for entry in self.improve.ended)]
+        self.errored = [*attack.errored, *({"round": order.number, **entry} for entry in self.improve.errored)]
         groups = {"curriculum": state, "train": learned, "synthesizer": attacked, "time": attack.spent}
         return {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
 
@@ -199,7 +199,7 @@ class Evolution:
         pool = self.memory.pool(self.settings.fresh)
         if self.settings.nominal == "log" or not len(pool):  # without nominal traffic the pool may be empty
             pool = pool + TrafficPool.recorded(order.scenes)
-        metrics, drawn = {"attacked": made.traffic["attacked"].item()}, made.traffic["kept"].nonzero()[:, 0]
+        metrics, drawn = {"attacked": made.traffic["attacked"].item()}, made.traffic["entered"].nonzero()[:, 0]
         return Attack(pool, drawn, metrics, spent, made.traffic["contact"].item(), made.errored)
 
     def _live(self, order: Order) -> Attack:

@@ -133,9 +133,6 @@ def run_imitation_stage(run: Run, logger: RunLogger) -> dict[str, float]:
         raise InputError("stage=imitation trains ego=actor; set it")
     settings = stage_settings(config, ImitationSettings)
     scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
-    if settings.held_out > 0 and len(scenes) < 2:
-        reason = "of one scene none can be held out"
-        raise InputError(f"stage.held_out={settings.held_out:g}: {reason}; pass more, or set it to 0")
     run.begin({"scenes": listed(scenes)})
     shown = recorded_demonstrations(scenes, build_sim(config), settings.seed)
     training = Imitation(ego.network, shown, settings)

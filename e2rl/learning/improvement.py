@@ -17,7 +17,7 @@ class Improvement(Extension, ABC):
     rows, None without live rows."""
 
     ego: Ego
-    ended: Sequence[dict] = ()  # episodes of the last round that ended for an error, each with its reason
+    errored: Sequence[dict] = ()  # episodes of the last round that errored, each with its reason
 
     @abstractmethod
     def __call__(self, pool: TrafficPool, curriculum: CurriculumScheduler) -> tuple[dict[str, float], Episodes]:

@@ -14,6 +14,7 @@ from torchrl.record.loggers.common import Logger
 from e2rl.learning.scheduler import COLUMNS, Choice
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
+from e2rl.run.settings import check_choice
 
 GROUPS = ("train", "eval", "curriculum", "synthesizer", "time")
 KINDS = ("csv", "tensorboard", "wandb", "none")
@@ -83,8 +84,7 @@ class RunLogger:
 
 def _logger(kind: str, folder: Path, project: str, name: str | None) -> Logger | None:
     """TorchRL's logger of a kind; None for none. Raises InputError for one that is unknown or not installed."""
-    if kind not in KINDS:
-        raise InputError(f"logger.kind={kind}: choose one of {', '.join(KINDS)}")
+    check_choice("logger.kind", kind, KINDS)
     if kind == "csv":
         return CSVLogger("logs", log_dir=str(folder))
     if kind == "wandb":

@@ -21,7 +21,6 @@ from e2rl.run.files import write_atomically
 from e2rl.traffic.pool import TrafficPool
 
 FOLDER, ERRORED = "memory", "errored"  # of a run; the key of a file's metadata
-CHUNK = 1 << 22  # bytes that are read at once for a checksum
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,9 @@ class Memory:
     def pool(self, fresh: float) -> TrafficPool:
         """Rows of all rounds, the newest first, whose rows weigh `fresh` times as much as the others'. The tracks stay
         in their files."""
-        *older, newest = (_pool(one.traffic) for one in self.rounds)
+        *older, newest = (
+            TrafficPool.stored(one.traffic, one.traffic["eta"], one.traffic["template"]) for one in self.rounds
+        )
         joined = replace(newest, weight=newest.weight * fresh)
         for pool in reversed(older):
             joined = joined + replace(pool, fresh=torch.zeros_like(pool.fresh))
@@ -110,16 +111,4 @@ class Memory:
                 errored = json.loads((file.metadata() or {}).get(ERRORED, "[]"))
         except (SafetensorError, OSError, ValueError) as error:
             raise InputError(f"{path}: damaged ({error}); restore it or begin a new run") from None
-        return Remembered(number, traffic, errored, _checksum(path))
-
-
-def _pool(traffic: Mapping[str, Tensor]) -> TrafficPool:
-    return TrafficPool.stored(traffic, traffic["eta"], traffic["template"])
-
-
-def _checksum(path: Path) -> int:
-    crc32 = 0
-    with path.open("rb") as file:
-        while chunk := file.read(CHUNK):
-            crc32 = zlib.crc32(chunk, crc32)
-    return crc32
+        return Remembered(number, traffic, errored, zlib.crc32(path.read_bytes()))

@@ -44,8 +44,7 @@ class PlannerImprovement(Improvement):
         seed: int = 0,
         device: str = "cpu",
     ) -> None:
-        """parameters: those that `ego` was built with; others: conf/learner/planner_tuning.yaml. Raises InputError for
-        settings that do not fit, or for live traffic."""
+        """parameters: those that `ego` was built with. Raises InputError for live traffic."""
         if traffic is not None:
             raise InputError("learner.round.traffic=live: a planner is tuned on stored traffic; set it to replay")
         self.ego, self.present, self.space = ego, dict(parameters), dict(space) or dict(ego.tuned)
@@ -59,20 +58,20 @@ class PlannerImprovement(Improvement):
         driven: list[tuple[Parameters, Episodes, list[dict]]] = []
 
         def evaluate(parameters: Parameters) -> dict[str, float]:
-            episodes, ended = self.driver.drive_all(type(self.ego)(**parameters), pool)
-            driven.append((parameters, episodes, ended))
+            episodes, errored = self.driver.drive_all(type(self.ego)(**parameters), pool)
+            driven.append((parameters, episodes, errored))
             summary = {"contact": nan, "acceleration": nan, "progress": nan} | episodes.summary()
             named = {"collision": summary["contact"], "comfort": summary["acceleration"]}
-            return named | summary | counted(ended)
+            return named | summary | counted(errored)
 
         self.trials = search(evaluate, self.present, self.space, self.search, self.objective)
         first, best = self.trials[0], best_of(self.trials) or self.trials[0]
-        self.present, episodes, ended = driven[self.trials.index(best)]
+        self.present, episodes, errored = driven[self.trials.index(best)]
         self.ego = type(self.ego)(**self.present)
         metrics = {f"parameter_{name}": float(value) for name, value in best["parameters"].items()}
         metrics |= {"objective_before": first["objective"], "objective": best["objective"]}
-        self.ended = [{"during": "tuning", **entry} for entry in ended]
-        return metrics | {"trials": float(len(driven))} | episodes.summary() | counted(ended), episodes
+        self.errored = [{"during": "tuning", **entry} for entry in errored]
+        return metrics | {"trials": float(len(driven))} | episodes.summary() | counted(errored), episodes
 
     def outcome(self, folder: Path) -> str:
         """Write the trials of the last round to tuning.json; returns how to evaluate the tuned planner."""

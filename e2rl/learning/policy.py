@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from omegaconf import OmegaConf
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
@@ -23,6 +24,7 @@ from e2rl.learning.teaching import Teacher
 from e2rl.learning.update import Learner, UpdateSettings
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import Ego, EgoPlanner
+from e2rl.run.config import built
 from e2rl.run.errors import InputError
 from e2rl.run.settings import configured, setting, settings_of
 from e2rl.scenes.scene import SceneSet
@@ -60,6 +62,7 @@ def steps_of(data: TensorDictBase) -> int:
     return int((data["next", "timestep"] - data["timestep"]).sum())
 
 
+@configured("learner/ppo_bc")
 class PolicyImprovement(Improvement):
     """Collects episodes with the actor's stochastic policy in the round's pool and updates it after each batch."""
 
@@ -73,32 +76,33 @@ class PolicyImprovement(Improvement):
         traffic: Traffic | None = None,
         seed: int = 0,
         device: str = "cpu",
-        collect: Mapping[str, Any] | None = None,
-        ppo: Mapping[str, Any] | None = None,
-        recorded: bool = False,
-        evasions: bool = False,
-        teacher: Ego | None = None,
-        teaching: Mapping[str, Any] | None = None,
         parameters: Mapping[str, Any] | None = None,
-        react: Mapping[str, Any] | None = None,
-        rounds: int = 1,
+        *,
+        collect: Mapping[str, Any],
+        ppo: Mapping[str, Any],
+        recorded: bool,
+        evasions: bool,
+        teacher: Ego | Mapping[str, Any],
+        teaching: Mapping[str, Any],
+        react: Mapping[str, Any] | None,
+        rounds: int,
     ) -> None:
         """Settings: conf/learner/ppo_bc.yaml.
 
         Args:
             recorded, evasions: with ppo.cloning > 0, clone the recorded egos, and the evasions in the pool's traffic.
-            teacher: with ppo.teaching > 0, a RankingEgo that labels states of the collected episodes, as `teaching`
+            teacher: with ppo.teaching > 0, a ScoringEgo that labels states of the collected episodes, as `teaching`
                 says.
             react: vehicles that leave the replayed traffic; None: nobody.
             rounds: of the run, over which the learning rate falls.
 
         Raises:
-            InputError: if the ego is no actor, the teacher no RankingEgo, or a round shorter than an episode.
+            InputError: if the ego is no actor, the teacher no ScoringEgo, or a round shorter than an episode.
         """
         if not isinstance(ego, ActorEgo):
             raise InputError(f"learner=ppo_bc improves ego=actor, not {type(ego).__name__}; use learner=planner_tuning")
-        self.settings = settings_of(CollectSettings, collect or {}, "learner.collect")
-        update = settings_of(UpdateSettings, ppo or {}, "learner.ppo")
+        self.settings = settings_of(CollectSettings, collect, "learner.collect")
+        update = settings_of(UpdateSettings, ppo, "learner.ppo")
         batch, self.horizon = self.settings.batch, scenes.steps
         hold, iterations = self.settings.hold, self.settings.iterations
         if self.settings.steps * iterations * hold < self.horizon:
@@ -113,7 +117,8 @@ class PolicyImprovement(Improvement):
             known = recorded_demonstrations(scenes, sim, seed) if recorded else None
             self.experts = Experts(scenes, sim, hold, device, known, evasions)
         if update.teaching > 0:
-            self.teacher = Teacher(teacher, scenes, (ego.network.low, ego.network.high), hold, teaching)
+            planner = teacher if isinstance(teacher, Ego) else built(OmegaConf.create(dict(teacher)), "teacher", Ego)
+            self.teacher = Teacher(planner, scenes, (ego.network.low, ego.network.high), hold, teaching)
         every = torch.arange(len(scenes))
         self.draw = RowDraw(torch.full((len(scenes),), 1 / len(scenes), dtype=torch.float64), seed)
         self.reaction = None

@@ -1,13 +1,12 @@
 """Checkpoints of an evolution run: all state that later rounds depend on, written atomically.
 
-A checkpoint is a folder checkpoints/round-000002 of state.pt (optimiser, curriculum, sampler, counters, generators;
-read with weights_only), actor.safetensors (weights and observation statistics; also what `ego.checkpoint` takes),
-memory.json (the rounds in memory, whose traffic stays in memory/ beside checkpoints/) and config.json. It is sealed by
-the hashes of these files: a torn or altered one is noticed, and the one before it is used.
+A checkpoint is a folder checkpoints/round-000002 of state.pt (optimiser, curriculum, sampler, counters, generators,
+and which rounds are in memory, whose traffic stays in memory/ beside checkpoints/; read with weights_only) and
+actor.safetensors (weights and observation statistics; also what `ego.checkpoint` takes). It is sealed by the hashes of
+these files: a torn or altered one is noticed, and the one before it is used.
 """
 
 import io
-import json
 import os
 import random
 import shutil
@@ -21,12 +20,12 @@ from e2rl.learning.evolution import Evolution
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.network import WEIGHTS
 from e2rl.run.errors import InputError
-from e2rl.run.files import altered, seal
+from e2rl.run.files import altered, misfit, seal
 
-STATE, MEMORY, CONFIG, FORMAT = "state.pt", "memory.json", "config.json", "e2rl-checkpoint/7"
+STATE, FORMAT = "state.pt", "e2rl-checkpoint/8"
 
 
-def save_checkpoint(folder: Path, run: Evolution, config: dict, keep_last: int = 2) -> Path:
+def save_checkpoint(folder: Path, run: Evolution, keep_last: int = 2) -> Path:
     """Write checkpoints/round-<rounds done> under a run's folder; only the keep_last newest are kept, and of the memory
     the files that these name."""
     parent = Path(folder) / "checkpoints"
@@ -36,7 +35,7 @@ def save_checkpoint(folder: Path, run: Evolution, config: dict, keep_last: int =
         shutil.rmtree(left)
     partial.mkdir()
     try:
-        _write(partial, run, config)
+        _write(partial, run)
     except BaseException:
         shutil.rmtree(partial)
         raise
@@ -46,32 +45,21 @@ def save_checkpoint(folder: Path, run: Evolution, config: dict, keep_last: int =
     kept = [*older, newest][-max(1, keep_last) :]
     for old in set(older) - set(kept):
         shutil.rmtree(old)
-    first = [entry["round"] for folder in kept if altered(folder) is None for entry in _memory_index(folder)]
+    whole = [torch.load(each / STATE, weights_only=True) for each in kept if altered(each) is None]
+    first = [entry["round"] for state in whole for entry in state["memory"]]
     run.memory.prune(min(first, default=0))  # a file goes when no checkpoint names it any more
     return target
 
 
-def _write(folder: Path, run: Evolution, config: dict) -> None:
+def _write(folder: Path, run: Evolution) -> None:
     """The files of a checkpoint, sealed."""
     state = io.BytesIO()  # a full disk is an OSError then
-    torch.save({"format": FORMAT, "run": run.state_dict(), "generators": generator_states()}, state)
+    content = {"format": FORMAT, "memory": run.memory.index(), "run": run.state_dict()}
+    torch.save(content | {"generators": generator_states()}, state)
     (folder / STATE).write_bytes(state.getbuffer())
     if isinstance(run.ego, ActorEgo):
         run.ego.network.save(folder / WEIGHTS)
-    (folder / MEMORY).write_text(json.dumps(run.memory.index()))
-    own = {key: value for key, value in config.items() if key != "resume"}  # equal, whether the run was interrupted
-    (folder / CONFIG).write_text(json.dumps(own, indent=1, sort_keys=True))
     seal(folder)
-
-
-def _memory_index(folder: Path) -> list[dict[str, int]]:
-    """The rounds in memory by a checkpoint; InputError where its file is missing or damaged."""
-    file = folder / MEMORY
-    try:
-        index = json.loads(file.read_text())
-        return [{"round": int(entry["round"]), "crc32": int(entry["crc32"])} for entry in index]
-    except (OSError, ValueError, TypeError, LookupError, ArithmeticError, RecursionError) as error:
-        raise InputError(f"{file}: damaged ({type(error).__name__}); resume from an older checkpoint") from error
 
 
 def checkpoints(path: str | Path) -> list[Path]:
@@ -113,14 +101,14 @@ def _whole(folder: Path, run: Evolution) -> dict:
         raise InputError(f"{folder / name}: missing or damaged; resume from an older checkpoint")
     try:
         state = torch.load(file, map_location="cpu", weights_only=True)
+        written = state["format"]
     except Exception as error:  # a stranger's pickle can raise any exception
         raise InputError(f"{file}: damaged ({type(error).__name__}); resume from an older checkpoint") from error
-    written = state.get("format") if isinstance(state, dict) else None
-    if written != FORMAT and str(written).startswith(FORMAT.split("/")[0]):
-        raise InputError(f"{file}: of another version of this program ({written}, not {FORMAT}); begin a new run")
     if written != FORMAT:
-        raise InputError(f"{file}: not a checkpoint of this program ({FORMAT}); give a run's folder")
-    run.memory.restore(_memory_index(folder))
+        raise InputError(f"{file}: of another version of this program ({written}, not {FORMAT}); begin a new run")
+    if wrong := misfit(state, {"memory": [{"round": int, "crc32": int}]}):
+        raise InputError(f"{file}: damaged ({wrong}); resume from an older checkpoint")
+    run.memory.restore(state["memory"])
     return state
 
 
@@ -131,13 +119,11 @@ def _restore(folder: Path, state: dict, run: Evolution) -> None:
     try:
         run.load_state_dict(state["run"])
         restore_generators(state["generators"])
+    except InputError:
+        raise
     except (LookupError, ValueError, TypeError, AttributeError, RuntimeError, ArithmeticError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"{folder / STATE}: its learner is of another kind or shape ({error}); resume with the configuration "
-            f"in {folder / CONFIG}"
-        ) from None
+        reason = f"its learner is of another kind or shape ({error}); resume with the configuration of its run"
+        raise InputError(f"{folder / STATE}: {reason}") from None
 
 
 def generator_states() -> dict:

@@ -85,7 +85,8 @@ class CurriculumScheduler(Extension):
 
     A curriculum is a subclass with `eta` and `fraction`, attributes or properties, and a YAML file in conf/curriculum
     with its `_target_` and settings. It overrides `etas` where the scenes of a round differ in intensity, `choices` and
-    `templates` where they differ in causal template as well.
+    `templates` where they differ in causal template as well. Its constructor takes its own settings by name and hands
+    on the others, `def __init__(self, *run, stairs, **scenes): super().__init__(*run, **scenes)`.
 
     Args:
         rounds: of the whole run.

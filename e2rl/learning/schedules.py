@@ -1,6 +1,7 @@
 """Curricula that follow a plan: constant, linear as in CAT (Zhang et al. 2023), and adaptive to a target band."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,18 +14,8 @@ from e2rl.run.settings import check_range, configured
 class ConstantCurriculum(CurriculumScheduler):
     """Intensity and fraction never change: the control experiment. Settings: conf/curriculum/constant.yaml."""
 
-    def __init__(
-        self,
-        num_scenes: int,
-        rounds: int,
-        seed: int = 0,
-        *,
-        eta: float | Sequence[float],
-        fraction: float,
-        prioritised: bool,
-        solvable_only: bool,
-    ) -> None:
-        super().__init__(num_scenes, rounds, seed, prioritised=prioritised, solvable_only=solvable_only)
+    def __init__(self, *run: int, eta: float | Sequence[float], fraction: float, **scenes: Any) -> None:
+        super().__init__(*run, **scenes)
         check_range("curriculum.fraction", fraction, 0, 1)
         self._cycle = torch.tensor([eta] if isinstance(eta, int | float) else list(eta), dtype=torch.float32)
         check_range("curriculum.eta: intensities", len(self._cycle), 1)
@@ -43,29 +34,21 @@ class LinearCurriculum(CurriculumScheduler):
 
     def __init__(
         self,
-        num_scenes: int,
-        rounds: int,
-        seed: int = 0,
-        *,
+        *run: int,
         eta: float,
         eta_final: float,
         spread: float,
         fraction: float,
         fraction_final: float,
         ramp: float,
-        prioritised: bool,
-        solvable_only: bool,
+        **scenes: Any,
     ) -> None:
-        super().__init__(num_scenes, rounds, seed, prioritised=prioritised, solvable_only=solvable_only)
+        super().__init__(*run, **scenes)
         check_range("curriculum.fraction", fraction, 0, 1)
         check_range("curriculum.fraction_final", fraction_final, 0, 1)
         check_range("curriculum.spread", spread, 0)
-        self._etas, self._fractions, self._ramp, self._spread = (
-            (eta, eta_final),
-            (fraction, fraction_final),
-            ramp,
-            spread,
-        )
+        self._etas, self._fractions = (eta, eta_final), (fraction, fraction_final)
+        self._ramp, self._spread = ramp, spread
 
     def _between(self, first: float, last: float) -> float:
         return first + min(1.0, self.round / max(1.0, self._ramp * self.rounds)) * (last - first)
@@ -94,10 +77,7 @@ class AdaptiveCurriculum(CurriculumScheduler):
 
     def __init__(
         self,
-        num_scenes: int,
-        rounds: int,
-        seed: int = 0,
-        *,
+        *run: int,
         eta: float,
         eta_min: float,
         eta_max: float,
@@ -106,10 +86,9 @@ class AdaptiveCurriculum(CurriculumScheduler):
         target_low: float,
         target_high: float,
         fraction: float,
-        prioritised: bool,
-        solvable_only: bool,
+        **scenes: Any,
     ) -> None:
-        super().__init__(num_scenes, rounds, seed, prioritised=prioritised, solvable_only=solvable_only)
+        super().__init__(*run, **scenes)
         check_range("curriculum.target_low", target_low, 0, target_high)
         check_range("curriculum.target_high", target_high, target_low, 1)
         check_range("curriculum.fraction", fraction, 0, 1)

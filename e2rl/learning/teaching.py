@@ -15,7 +15,7 @@ from torch import Tensor
 
 from e2rl.learning.cloning import clip_expert
 from e2rl.planners.ego import Ego
-from e2rl.planners.sampling import RankingEgo, ranked_actions
+from e2rl.planners.sampling import ScoringEgo, ranked_actions
 from e2rl.run.errors import InputError
 from e2rl.run.settings import configured, setting, settings_of
 from e2rl.scenes.recording import DT
@@ -65,21 +65,16 @@ class Teacher:
     """Labels states of collected batches; `labelled` [M] (e2rl.learning.cloning) are the newest ones of all rounds."""
 
     def __init__(
-        self,
-        planner: Ego | None,
-        scenes: SceneSet,
-        bounds: tuple[Tensor, Tensor],
-        hold: int,
-        settings: Mapping[str, Any] | None = None,
+        self, planner: Ego, scenes: SceneSet, bounds: tuple[Tensor, Tensor], hold: int, settings: Mapping[str, Any]
     ) -> None:
         """bounds: lowest and highest action [2]; hold: steps of a decision; settings: of TeachingSettings. Raises
         InputError if the planner does not rank candidates."""
-        if not isinstance(planner, RankingEgo):
+        if not isinstance(planner, ScoringEgo):
             raise InputError(
                 f"learner.teacher={type(planner).__name__}: it cannot tell what its candidates cost; take an "
-                "RankingEgo such as e2rl.planners.sampling.SamplingEgo, or set learner.ppo.teaching=0"
+                "ScoringEgo such as e2rl.planners.sampling.SamplingEgo, or set learner.ppo.teaching=0"
             )
-        self.settings = settings_of(TeachingSettings, settings or {}, "learner.teaching")
+        self.settings = settings_of(TeachingSettings, settings, "learner.teaching")
         self.planner, self.scenes, self.bounds, self.hold = planner, scenes, bounds, hold
         self.labelled: TensorDict | None = None
 

@@ -110,8 +110,8 @@ class Learner:
         result = {name: torch.stack(values).mean().item() for name, values in sums.items()}
         return result | {
             "stopped_by_kl": float(stopped),
-            "std_acceleration": self._std()[0],
-            "std_yaw_rate": self._std()[1],
+            "std_acceleration": self.network.network.std[0].item(),
+            "std_yaw_rate": self.network.network.std[1].item(),
             "steps": float(len(sums["kl"])),
             "learning_rate": rate,
             "frames_used": len(flat) / data.numel(),
@@ -194,10 +194,6 @@ class Learner:
             total = total + settings.teaching * losses["loss_teaching"]
         take_step(self.optimiser, total, MAX_GRAD_NORM)
         return {name: value.detach().mean() for name, value in losses.items()}
-
-    @torch.no_grad()
-    def _std(self) -> list[float]:
-        return self.network.network.std.tolist()
 
     def state_dict(self) -> dict:
         """Optimiser, counter and running statistics; the weights are the network's."""

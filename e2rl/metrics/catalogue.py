@@ -5,7 +5,7 @@ A metric is declared beside the function that computes it, by `columns`, or in a
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
 
 from torch import Tensor
 
@@ -41,11 +41,7 @@ class Metric:
         return self.column or self.name
 
 
-def rate(name: str, about: str, **options: Any) -> Metric:
-    """A metric in [0, 1]."""
-    return Metric(name, about, fraction=True, **options)
-
-
+rate = partial(Metric, fraction=True)  # a metric in [0, 1]
 TABLES = ("main", "traffic", "adversaries", "methods", "egos", "public")  # of the package
 ORDER = (  # of columns in every table (docs/method.md, section 10); others follow as they are declared
     *("cfr", "cfr_counted", "cfr_preventable", "cfr_adv", "cfr_vru", "cfr_bg", "avoidable", "front", "side", "rear"),
@@ -63,16 +59,8 @@ STAGES: dict[str, tuple[Metric, ...]] = {}  # parts of a run with metrics of the
 
 
 def declare(*metrics: Metric, events: Sequence[str] = (), words: Mapping[str, tuple[str, ...]] | None = None) -> None:
-    """Add metrics whose columns are in the rows already, or are added to them later.
-
-    Args:
-        metrics: the metrics.
-        events: further columns of the rows.
-        words: columns among these that hold words.
-
-    Raises:
-        ValueError: a name is taken.
-    """
+    """Add metrics whose columns are in the rows already, or are added to them later; `events`: further columns of the
+    rows, `words`: those that hold words. Raises ValueError where a name is taken."""
     if taken := [metric.name for metric in metrics if metric.name in METRICS]:
         raise ValueError(f"metric {taken[0]}: name is taken; choose another, or unregister it first")
     found = {**METRICS, **{metric.name: metric for metric in metrics}}

@@ -29,11 +29,11 @@ def steps_until(stop: Tensor, length: int) -> Tensor:
 def first_contact(batch: Batch) -> Batch:
     """The ego's first contact with a vehicle in each rollout.
 
-    area [B, T+1, N] [m2]: overlap of the ego with every agent, 0 with itself. start_overlap [B] bool: the ego overlaps
-    a vehicle at step 0, so its collision metrics are unknown. hit [B] bool. stop [B]: step of the contact, else T.
-    touching [B, N] bool: vehicles that overlap the ego at `stop`. partner [B]: the one with the largest overlap. kind
-    [B]: index into KINDS, by the edge of the ego that is hit. Partner and kind are -1 without a contact. before [B]:
-    the step before the contact, or the contact's own where the partner was absent before.
+    area [B, T+1, N] [m2]: overlap of the ego with every agent. start_overlap [B]: the ego overlaps a vehicle at step 0,
+    so its collision metrics are unknown. hit [B] bool. stop [B]: step of the contact, else T. touching [B, N]: vehicles
+    that overlap the ego at `stop`. partner [B]: the one with the largest overlap. kind [B]: index into KINDS, by the
+    ego's edge that is hit. Partner and kind are -1 without a contact. before [B]: the step before the contact, or the
+    contact's own where the partner was absent before.
     """
     states, valid, size = batch["states"], batch["valid"], batch["size"]
     row = torch.arange(len(states), device=states.device)
@@ -110,16 +110,12 @@ def kinds_at_stop(batch: Batch) -> Tensor:
     rate("rear_any", "ego's rear in contact at first contact", tables="egos"),
     rate("rir", "rear impacts per collision", per_collision=True, tables="main adversaries methods"),
     Metric(
-        "relvel",
-        "speed difference before contact",
-        unit="m/s",
-        per_collision=True,
-        tables="main adversaries methods egos",
+        "relvel", "speed difference before contact", "m/s", per_collision=True, tables="main adversaries methods egos"
     ),
     Metric(
         "contact_time",
         "median time of the first contact",
-        unit="s",
+        "s",
         median=True,
         per_collision=True,
         tables="main adversaries egos",
@@ -182,16 +178,13 @@ def traffic_contact_columns(batch: Batch) -> Batch:
     return found | touched_columns(batch, touched)
 
 
-def nearby(states: Tensor, size: Tensor, one: Tensor, two: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Indices (rollout, step, pair) of pairs of agents one [P], two [P], both present [B, T+1, N], whose bounding
-    circles meet."""
+def nearby(states: Tensor, size: Tensor, one: Tensor, two: Tensor, present: Tensor) -> tuple[Tensor, ...]:
+    """Indices (rollout, step, pair) where agents one [P] and two [P] are present and their bounding circles meet."""
     x, y = states[..., 0], states[..., 1]
     radius = size.norm(dim=-1) / 2
     square = (x[:, :, one] - x[:, :, two]).square_().add_((y[:, :, one] - y[:, :, two]).square_())
     reach = (radius[:, one] + radius[:, two]).square_()
-    near = present[:, :, one] & present[:, :, two] & (square <= reach[:, None])
-    rollout, step, pair = near.nonzero(as_tuple=True)
-    return rollout, step, pair
+    return (present[:, :, one] & present[:, :, two] & (square <= reach[:, None])).nonzero(as_tuple=True)
 
 
 def touched_columns(batch: Batch, touched: Tensor) -> Batch:

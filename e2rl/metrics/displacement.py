@@ -5,8 +5,6 @@ vehicle's best sample, the joint minADE the scene's best sample for all its vehi
 sums over vehicles.
 """
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
@@ -14,9 +12,10 @@ from e2rl.metrics.catalogue import OPEN_LOOP_STAGE, STAGES, Metric
 from e2rl.metrics.realism import MOVING
 from e2rl.scenes.recording import DT
 
+HORIZONS = (3, 5)  # s
 STAGES[OPEN_LOOP_STAGE] = tuple(
     Metric(f"{name}_{horizon}", about.format(horizon), unit=unit)
-    for horizon in (3, 5)
+    for horizon in HORIZONS
     for name, about, unit in (
         ("min_ade", "mean displacement over {} s, each vehicle's best sample", "m"),
         ("mean_ade", "the same, mean over samples", "m"),
@@ -45,9 +44,9 @@ def displacement(plans: Tensor, logged: Tensor) -> Tensor:
 
 
 def scene_displacements(
-    plans: Tensor, reference: Tensor, logged: Tensor, logged_valid: Tensor, simulated: Tensor, horizons: Sequence[float]
+    plans: Tensor, reference: Tensor, logged: Tensor, logged_valid: Tensor, simulated: Tensor
 ) -> dict[str, Tensor]:
-    """Sums [B] over each scene's counted vehicles, and their number, for every horizon [s].
+    """Sums [B] over each scene's counted vehicles, and their number, for each of HORIZONS.
 
     plans [B, S, V, H, 4]: samples of steps 1..H; reference [B, V, H, 4]: constant velocity; logged [B, T+1, V, 4].
     Keys, with the horizon in s appended: min_ade_, mean_ade_, joint_ade_ (the best joint sample), cv_ade_, vehicles_.
@@ -56,7 +55,7 @@ def scene_displacements(
     future = logged[:, steps.clamp(max=logged.shape[1] - 1)].transpose(1, 2)  # no vehicle counts after the log's end
     planned, constant = displacement(plans, future), displacement(reference[:, None], future)[:, 0]
     columns: dict[str, Tensor] = {}
-    for horizon in horizons:
+    for horizon in HORIZONS:
         last = round(horizon / DT)
         counted = moving_vehicles(logged, logged_valid, simulated, last)
         ade = torch.where(counted[:, None], planned[..., last - 1], 0.0)
@@ -67,5 +66,5 @@ def scene_displacements(
             "cv_ade": torch.where(counted, constant[..., last - 1], 0.0).sum(-1),
             "vehicles": counted.sum(-1),
         }
-        columns |= {f"{name}_{horizon:g}": value for name, value in found.items()}
+        columns |= {f"{name}_{horizon}": value for name, value in found.items()}
     return columns

@@ -33,8 +33,6 @@ SHIFTS = (0.0, 1.5, -1.5, 3.5, -3.5, 2.5, -2.5)  # m beside the mission
 RAMP = 3  # knots that a shift takes
 TARGETS = 8  # lateral targets a profile is tried on
 CHUNK = 8  # rollouts searched at once: bounds the memory
-
-
 CLEARANCE = 0.05  # m that an evasion keeps to others
 ROAD_MARGIN = 0.5  # m inside the drivable border (1 m beyond the lanes) that its centre keeps; recorded egos keep 0.8
 SAMPLES, SURVIVORS, ROUNDS = 192, 24, 16  # of the strategy: per round, parents, at most
@@ -49,7 +47,7 @@ declare(
         tables="main adversaries",
     ),
     rate("avoidable_1s", "the same, acting only 1 s before contact", per_collision=True),
-    Metric("evasion_accel", "peak acceleration of the mildest evasion found", unit="m/s²", per_collision=True),
+    Metric("evasion_accel", "peak acceleration of the mildest evasion found", "m/s²", per_collision=True),
     events=("evasion_tried", "evasion_seconds"),
 )
 
@@ -92,12 +90,8 @@ def find_evasions(
 ) -> Evasions:
     """The mildest evasion found of each rollout; all draw the same numbers, so a result does not depend on the batch.
 
-    Args:
-        scene: scenes [B >= 1].
-        states, valid: [B, T+1, N, 4] and [B, T+1, N], motion of the agents, the ego first.
-        sim: the ego's limits.
-        moment: [B] int64, the step from which the ego may act otherwise (None: the start). An evasion holds the T steps
-            from there on and counts to the last recorded one.
+    states [B, T+1, N, 4], valid [B, T+1, N]: motion in scenes [B >= 1]; moment [B] int64: the step from which the ego
+    may act otherwise (None: 0). An evasion holds the T steps from there on and counts to the last recorded one.
     """
     moment = torch.zeros(len(states), dtype=torch.int64, device=states.device) if moment is None else moment
     rows = torch.arange(len(states), device=states.device).split(CHUNK)
@@ -175,11 +169,8 @@ def _try(task: EvasionScene, route: Tensor, accel: Tensor, shift: Tensor, sim: S
 
 
 def _mutated(parents: Trials, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-    """Route, acceleration and shift knots of SAMPLES children of parents [B, C], better ones more often.
-
-    The disturbances of knots are smooth over about 1 s, and of a strength drawn for each child, so that small and large
-    changes are both tried.
-    """
+    """Route, acceleration and shift knots of SAMPLES children of parents [B, C], better ones more often: disturbed
+    smoothly over about 1 s, with a strength drawn for each child."""
     count, knots, device = SAMPLES, parents.accel.shape[-1], parents.accel.device
     parent = torch.rand(count, generator=generator).to(device)
     strength = torch.rand(count, 2, generator=generator).square() + 0.02

@@ -2,16 +2,15 @@
 
 A failure is a row of `score_rollouts` with a collision of the ego. Two failures are as far apart as the sum of the
 weights of what differs: from where the partner came, what both did, who was hit where, which duty was broken, how fast
-both were. Clusters of average linkage are cut at the distance THRESHOLD, so a whole group of failures that differs from
-another in the kind of approach, or in the duty, is a mode of its own, while one that differs in a single manoeuvre is
-not.
+both were. Clusters of average linkage are cut at the distance THRESHOLD: another kind of approach, or another duty,
+makes a mode of its own, a single manoeuvre does not.
 """
 
 import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,45 +28,20 @@ SIDE = re.compile(r"(?: from the| on the)? (left|right)$")
 SPEEDS = ("ego_speed", "partner_speed")
 PLACES = 10  # at which `mode_coverage` looks: failures at fewer places give none
 
+_coverage = partial(Metric, decimals=1, column="mode", places=PLACES, per_collision=True, tables="adversaries")
 declare(
-    Metric(
-        "mode_coverage",
-        f"failure modes expected of collisions at {PLACES} places",
-        decimals=1,
-        column="mode",
-        places=PLACES,
-        per_collision=True,
-        tables="adversaries",
-    ),
-    Metric(
-        "mode_coverage_counted",
-        "the same, of collisions that count",
-        decimals=1,
-        column="mode",
-        weight="counted",
-        places=PLACES,
-        per_collision=True,
-        tables="adversaries",
-    ),
+    _coverage("mode_coverage", f"failure modes expected of collisions at {PLACES} places"),
+    _coverage("mode_coverage_counted", "the same, of collisions that count", weight="counted"),
 )
 
 
-@dataclass(frozen=True)
-class Feature:
-    """A column of words: how far apart two failures are whose words differ in kind, or in the side (left, right)."""
-
-    column: str
-    kind: float
-    side: float = 0.0
-
-
-FEATURES = (
-    Feature("approach", 2.0, 0.5),
-    Feature("duty", 1.0),
-    Feature("partner_manoeuvre", 0.5, 0.25),
-    Feature("ego_manoeuvre", 0.5, 0.25),
-    Feature("contact_type", 0.25),
-)
+FEATURES = {  # columns of words: how far apart two failures are whose words differ in kind, in the side (left, right)
+    "approach": (2.0, 0.5),
+    "duty": (1.0, 0.0),
+    "partner_manoeuvre": (0.5, 0.25),
+    "ego_manoeuvre": (0.5, 0.25),
+    "contact_type": (0.25, 0.0),
+}
 
 
 def is_failure(row: Row) -> bool:
@@ -87,18 +61,18 @@ def split_side(text: str) -> tuple[str, str]:
     return (text[: found.start()], found.group(1)) if found else (text, "")
 
 
-def known_features(failures: Sequence[Row]) -> tuple[Feature, ...]:
-    """The features whose column holds a word in at least one failure; the others play no part."""
-    return tuple(feature for feature in FEATURES if any(word(row, feature.column) for row in failures))
+def known_features(failures: Sequence[Row]) -> list[str]:
+    """The FEATURES that at least one failure has a word of; the others play no part."""
+    return [column for column in FEATURES if any(word(row, column) for row in failures)]
 
 
-def feature_vectors(failures: Sequence[Row], features: Sequence[Feature]) -> np.ndarray:
+def feature_vectors(failures: Sequence[Row]) -> np.ndarray:
     """Vectors [n, F] of failures, whose distance is the sum of absolute differences: indicators of each word's kind and
     side, with half of their weight (two of them change), and weighted speeds (unknown: the mean of the others)."""
     columns = []
-    for feature in features:
-        words = [split_side(word(row, feature.column)) for row in failures]
-        for part, weight in enumerate((feature.kind, feature.side)):
+    for column in known_features(failures):
+        words = [split_side(word(row, column)) for row in failures]
+        for part, weight in enumerate(FEATURES[column]):
             for value in sorted({pair[part] for pair in words}):
                 columns.append([weight / 2 * (pair[part] == value) for pair in words])
     for name in SPEEDS:
@@ -113,7 +87,7 @@ def cluster_failures(failures: Sequence[Row]) -> list[int]:
     """The mode of each failure, numbered from 1 by size. The order of the failures does not matter."""
     if not failures:
         return []
-    vectors = feature_vectors(failures, known_features(failures))
+    vectors = feature_vectors(failures)
     order = sorted(range(len(failures)), key=lambda index: (*vectors[index], *identity(failures[index])))
     found = [1]
     if len(order) > 1:
@@ -137,7 +111,7 @@ def identity(row: Row) -> tuple[str, ...]:
 
 def medoid(members: Sequence[Row]) -> int:
     """Position of the failure that is nearest to all members: the most typical one."""
-    vectors = feature_vectors(members, known_features(members))
+    vectors = feature_vectors(members)
     order = sorted(range(len(members)), key=lambda index: identity(members[index]))
     far = cdist(vectors, vectors, "cityblock").sum(1)
     return min(order, key=lambda index: round(far[index], 9))
@@ -147,10 +121,8 @@ def mode_name(members: Sequence[Row]) -> str:
     """A sentence of the words that are true of most members, such as "crossing from the right, partner turns left, ego
     keeps speed: right of way". What they do not agree on is left out, and so is a duty that no row knows."""
     who = {"approach": "", "partner_manoeuvre": "partner ", "ego_manoeuvre": "ego "}
-    agreed = {column: agreed_word(members, column) for column in who}
-    parts = [who[column] + text for column, text in agreed.items() if text]
-    duty = agreed_word(members, "duty")
-    named = ", ".join(parts) or "various"
+    parts = [whose + text for column, whose in who.items() if (text := agreed_word(members, column))]
+    named, duty = ", ".join(parts) or "various", agreed_word(members, "duty")
     return named + (f": {'no duty broken' if duty == 'none' else duty.replace('_', ' ')}" if duty else "")
 
 

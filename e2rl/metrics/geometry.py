@@ -1,12 +1,8 @@
-"""Exact overlap of oriented boxes, in addition to `scene.boxes`: its area, and the parts of edges inside another box.
+"""Exact overlap of oriented boxes, in addition to `scenes.boxes`: its area, and the parts of edges inside another box;
+and a broad phase with buckets: which of many items may lie at which of many points.
 
 A box is a state (x, y, heading, speed) and a size (length, width); leading dimensions broadcast. Use float64 where an
 overlap of 1e-6 m2 decides.
-
-A broad phase with buckets: which of many items may lie at which of many points, without comparing all of them.
-
-Items cover ranges of integer cells (rows, or a grid), a point lies in one cell; the answer is the list of candidate
-(point, item) pairs. All steps are sorts and gathers over flat lists: no loop, no padding to the fullest cell.
 """
 
 import torch
@@ -14,7 +10,7 @@ from torch import Tensor
 
 from e2rl.scenes.boxes import corners, overlap, to_frame
 
-EDGES = ("left", "rear", "right", "front")  # edge i runs from corner i to corner i + 1 of scene.boxes.corners
+EDGES = ("left", "rear", "right", "front")  # edge i runs from corner i to corner i + 1 of scenes.boxes.corners
 MIN_AREA = 1e-6  # m2: a smaller overlap is the rounding of float32 positions
 
 
@@ -26,7 +22,7 @@ def velocity(states: Tensor) -> Tensor:
 def pair_overlap(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor, possible: Tensor) -> Tensor:
     """Overlap area [...] [m2] of pairs of boxes; 0 where `possible` [...] is false or the area is at most MIN_AREA.
 
-    The exact area is computed only for the pairs that `scene.boxes.overlap` finds.
+    The exact area is computed only for the pairs that `scenes.boxes.overlap` finds.
     """
     boxes = (first, first_size, second, second_size)
     meets = possible & overlap(*boxes)

@@ -64,9 +64,8 @@ def execute(
     """(actions [..., T, 2], states [..., T, 4] at steps 1..T) of manoeuvres from start [..., 4].
 
     accel [..., K] m/s^2 and shift [..., K] m beside route [..., P, 2] are knots. The path leaves the start's pose and
-    returns onto the shifted route (`RoutePath`); its headings become yaw rates. Acceleration, braking and yaw rate
-    keep the simulator's bounds, and braking and turning share the tyres' grip. Where a bound binds, the vehicle leaves
-    the path; the result is what it really does.
+    returns onto the shifted route (`RoutePath`); its headings become yaw rates. The simulator's bounds hold, and
+    braking and turning share the tyres' grip; where a bound binds, the vehicle leaves the path.
     """
     bounded = accelerations(accel, steps).clamp(-sim.max_braking, sim.max_acceleration)
     v0 = start[..., 3:4]
@@ -105,24 +104,19 @@ AWAY = 1e6  # m, position of absent agents
 
 
 class EvasionScene(TensorClass):
-    """Scenes [B] in the T steps after a given one, in which the motion of all agents but the ego is fixed.
-
-    `inside` tells which steps lie within the episode. `others` are AWAY where absent. `field` and `origin` are those of
-    `sim.drivable.off_road`. `s` is the ego's arc length at the start on its mission, `end` the one at which the map
-    ends (inf: it does not).
-    """
+    """Scenes [B] in the T steps after a given one, in which the motion of all agents but the ego is fixed."""
 
     start: Tensor  # [B, 4], the ego's
     ego_size: Tensor  # [B, 2]
-    inside: Tensor  # [B, T] bool
-    others: Tensor  # [B, T, N, 4]
+    inside: Tensor  # [B, T] bool: within the episode
+    others: Tensor  # [B, T, N, 4], AWAY where absent
     other_size: Tensor  # [B, N, 2]
-    field: Tensor  # [B, G, G]
+    field: Tensor  # [B, G, G], of `scenes.drivable_area.off_road`
     origin: Tensor  # [B, 2]
     routes: Tensor  # [B, R, P, 2], the ego's candidates
     mission: Tensor  # [B, P, 2]
-    s: Tensor  # [B]
-    end: Tensor  # [B]
+    s: Tensor  # [B] m, arc length of the ego on its mission at the start
+    end: Tensor  # [B] m, the one at which the map ends (inf: it does not)
 
     @staticmethod
     def after(moment: Tensor, scene: TensorDictBase, states: Tensor, valid: Tensor) -> "EvasionScene":
@@ -155,21 +149,19 @@ def violations(states: Tensor, scene: EvasionScene, clearance: float, road_margi
 
 def clearance_violation(states: Tensor, scene: EvasionScene, clearance: float) -> Tensor:
     """Metres [B, C, T] of missing clearance, summed over the agents nearer than it; exact box separation."""
-    chunk = max(1, PAIRS // max(1, states.shape[0] * states.shape[2] * scene.others.shape[2]))
-    return torch.cat([_clearance_violation(part, scene, clearance) for part in states.split(chunk, 1)], 1)
-
-
-def _clearance_violation(states: Tensor, scene: EvasionScene, clearance: float) -> Tensor:
     others, size, other_size = scene.others, scene.ego_size, scene.other_size
     reach = (size.norm(dim=-1)[:, None] + other_size.norm(dim=-1)) / 2 + clearance
-    gap_x = states[..., None, 0] - others[:, None, ..., 0]
-    gap_y = states[..., None, 1] - others[:, None, ..., 1]
-    near = gap_x.square_().add_(gap_y.square_()) < reach.square()[:, None, None]
-    row, trial, step, other = near.nonzero(as_tuple=True)
-    apart = separation(states[row, trial, step], size[row], others[row, step, other], other_size[row, other])
-    index = (row * states.shape[1] + trial) * states.shape[2] + step
-    missed = states.new_zeros(states.shape[:-1]).view(-1)
-    return missed.index_add(0, index, (clearance - apart).clamp(min=0)).view(states.shape[:-1])
+    chunk, parts = max(1, PAIRS // max(1, states.shape[0] * states.shape[2] * others.shape[2])), []
+    for part in states.split(chunk, 1):
+        gap_x = part[..., None, 0] - others[:, None, ..., 0]
+        gap_y = part[..., None, 1] - others[:, None, ..., 1]
+        near = gap_x.square_().add_(gap_y.square_()) < reach.square()[:, None, None]
+        row, trial, step, other = near.nonzero(as_tuple=True)
+        apart = separation(part[row, trial, step], size[row], others[row, step, other], other_size[row, other])
+        index = (row * part.shape[1] + trial) * part.shape[2] + step
+        missed = part.new_zeros(part.shape[:-1]).view(-1)
+        parts.append(missed.index_add(0, index, (clearance - apart).clamp(min=0)).view(part.shape[:-1]))
+    return torch.cat(parts, 1)
 
 
 def road_violation(states: Tensor, scene: EvasionScene, margin: float) -> Tensor:

@@ -5,11 +5,8 @@ likelihood = exp(mean log p(logged value)) over a scene's vehicles and known ste
 road, red light) happen to a vehicle in a rollout or not: their p is Bernoulli, the fraction of rollouts. Every bin has
 additive smoothing SMOOTHING. The meta-metric is the weighted sum of the likelihoods, in (0, 1].
 
-Features of the realism meta-metric per vehicle and step: motion, nearest agent, time to collision, road and lights.
-
-They follow the public description of the Waymo Open Sim Agents Challenge (Montali et al. 2023) and are computed alike
-for rollouts and for their logs. Shapes: B rollouts, M tracks (one vehicle of one rollout each), N agents, T steps; time
-begins at step 1 of a rollout.
+Features follow the challenge's public description (Montali et al. 2023), alike for rollouts and logs. Shapes: B
+rollouts, M tracks (one vehicle of one rollout each), N agents, T steps; time begins at step 1 of a rollout.
 """
 
 from dataclasses import dataclass
@@ -124,7 +121,7 @@ def time_to_collision(track: Tensor, size: Tensor, others: Tensor, other_size: T
 def beyond_road(states: Tensor, size: Tensor, field: Tensor, origin: Tensor) -> Tensor:
     """Metres [B, T, V] that the worst corner of boxes lies beyond the drivable border (< 0 inside).
 
-    states [B, T, V, 4], size [B, V, 2]; field [B, G, G], origin [B, 2] as in `sim.drivable.off_road`.
+    states [B, T, V, 4], size [B, V, 2]; field [B, G, G], origin [B, 2] as in `scenes.drivable_area.off_road`.
     """
     return off_road(corners(states, size[:, None]), field, origin).amax(-1)
 

@@ -21,6 +21,10 @@ from e2rl.scenes.route import SPACING, project
 from e2rl.sim.dynamics import wrap
 
 STRAIGHT = 60.0  # m by which a way goes on straight
+NEAREST = 16  # vehicles that come nearest to the ego are seen
+AFTER = round(3.0 / DT)  # steps beyond the ego's contact for which the driver must have none
+CHAIN = 2  # followers that may be driven again
+SAME_WAY = 0.5  # cosine of the headings of a follower and its leader at least
 
 
 class Tracks(NamedTuple):
@@ -32,18 +36,14 @@ class Tracks(NamedTuple):
 
 
 class Along(NamedTuple):
-    """Others seen along a way, each [T+1, B, N]: rear (arc length of its near end, m), speed and acceleration along the
-    way, lateral gap (m between the facing sides), lateral speed towards the way, length along the way.
+    """Others seen along a way, each [T+1, B, N]. Those absent or never on the way are at an infinite distance."""
 
-    Absent ones, and those that never enter the way, are at an infinite distance.
-    """
-
-    rear: Tensor
-    speed: Tensor
-    acceleration: Tensor
-    lateral_gap: Tensor
-    lateral_speed: Tensor
-    length: Tensor
+    rear: Tensor  # m, arc length of its near end
+    speed: Tensor  # m/s, along the way
+    acceleration: Tensor  # m/s^2, along the way
+    lateral_gap: Tensor  # m, between the facing sides
+    lateral_speed: Tensor  # m/s, towards the way
+    length: Tensor  # m, along the way
 
 
 def driven_length(states: Tensor) -> Tensor:
@@ -80,14 +80,8 @@ def along_way(states: Tensor, width: Tensor, others: Tracks) -> Along:
     enters = ((gap <= 0) & others.present).any(1, keepdim=True)
     away = ~others.present | ~enters
     change = torch.nn.functional.pad(speed.diff(dim=1) / DT, (0, 0, 1, 0)) * cos
-    values = (
-        (s - extent).masked_fill(away, torch.inf),
-        speed * cos,
-        change,
-        gap.masked_fill(away, torch.inf),
-        -d.sign() * speed * sin,
-        2 * extent,
-    )
+    rear, gap = (value.masked_fill(away, torch.inf) for value in (s - extent, gap))
+    values = rear, speed * cos, change, gap, -d.sign() * speed * sin, 2 * extent
     return Along(*(value.transpose(0, 1) for value in values))
 
 
@@ -103,20 +97,10 @@ def redrive(driver: Driver, states: Tensor, size: Tensor, others: Along) -> Tens
     length = size[:, :1].expand_as(others.rear[0])
     way, speeds = [s], [speed]
     for t in range(recorded.shape[1]):
-        gap = others.rear[t] - (s + size[:, 0] / 2)[:, None]
-        side = others.lateral_gap[t]
-        seen = Observation(
-            speed[:, None].expand_as(gap),
-            acceleration[:, None].expand_as(gap),
-            gap,
-            others.speed[t],
-            others.acceleration[t],
-            side,
-            others.lateral_speed[t],
-            side <= 0,
-            length,
-            others.length[t],
-        )
+        gap, side = others.rear[t] - (s + size[:, 0] / 2)[:, None], others.lateral_gap[t]
+        own = (value[:, None].expand_as(gap) for value in (speed, acceleration))
+        lateral = side, others.lateral_speed[t], side <= 0
+        seen = Observation(*own, gap, others.speed[t], others.acceleration[t], *lateral, length, others.length[t])
         memory, wanted = driver.step(memory, seen)
         asked = wanted.amin(1)
         reacted = reacted | (asked < 0)
@@ -133,12 +117,6 @@ def contacts(states: Tensor, size: Tensor, others: Tracks) -> Tensor:
     """Bool [B, T+1, N]: a vehicle at states [B, T+1, 4] of size [B, 2] overlaps each of the others."""
     apart = separation(states[:, :, None], size[:, None, None], others.states, others.size[:, None])
     return (apart < 0) & others.present
-
-
-NEAREST = 16  # vehicles that come nearest to the ego are seen
-AFTER = round(3.0 / DT)  # steps beyond the ego's contact for which the driver must have none
-CHAIN = 2  # followers that may be driven again
-SAME_WAY = 0.5  # cosine of the headings of a follower and its leader at least
 
 
 class Collision(NamedTuple):

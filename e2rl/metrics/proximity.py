@@ -16,6 +16,8 @@ from e2rl.sim.dynamics import wrap
 
 SMOOTHING = 0.5  # s, moving average of the ego's speed before its derivative
 LEAST_WAY = 1.0  # m: of a shorter recorded way no fraction is known
+STANDING = 0.5  # m/s at the start frame
+MOVED = 2.0  # m from the start position
 
 
 @columns(
@@ -125,10 +127,6 @@ def route_completion(path: Tensor, count: Tensor, logged: Tensor, logged_valid: 
     whole = length.sum(-1)
     behind = length.cumsum(-1)[row, nearest] - ((1 - fraction) * length)[row, nearest]
     return (behind / whole).clamp(max=1).masked_fill((count == 0) | (whole < LEAST_WAY), torch.nan)
-
-
-STANDING = 0.5  # m/s at the start frame
-MOVED = 2.0  # m from the start position
 
 
 def moved(states: Tensor, valid: Tensor) -> Tensor:

@@ -7,6 +7,8 @@ rollouts and of their logs: real = 1 - mean_k min(1, W1_k). real_norm divides ea
 real_adv is `real` of the adversaries alone, against the logs of the same vehicles.
 """
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -23,21 +25,19 @@ MOVING = 0.5  # m/s
 COLUMNS = 8192  # sorted samples handled at once: bounds the memory of the bootstrap
 Samples = dict[str, Tensor]
 
+_real = partial(Metric, decimals=3)
 declare(
-    Metric(
-        "real", "realism, 1 - mean capped W1", decimals=3, samples="a_lon", tables="main traffic adversaries methods"
-    ),
-    Metric(
+    _real("real", "realism, 1 - mean capped W1", samples="a_lon", tables="main traffic adversaries methods"),
+    _real(
         "real_adv",
         "realism of the adversaries alone",
-        decimals=3,
-        samples="a_lon_adversary",
+        samples=OF_ADVERSARIES[0],
         tables="main adversaries methods public",
     ),
-    Metric("real_norm", "realism, W1 over the log's range", decimals=3, samples="a_lon", tables="main traffic"),
-    Metric("w1_a_lon", "W1 of longitudinal acceleration", unit="m/s²", samples="a_lon", tables="traffic"),
-    Metric("w1_a_lat", "W1 of lateral acceleration", unit="m/s²", samples="a_lon", tables="traffic"),
-    Metric("w1_jerk", "W1 of |jerk|", unit="m/s³", samples="a_lon", tables="traffic"),
+    _real("real_norm", "realism, W1 over the log's range", samples="a_lon", tables="main traffic"),
+    Metric("w1_a_lon", "W1 of longitudinal acceleration", "m/s²", samples="a_lon", tables="traffic"),
+    Metric("w1_a_lat", "W1 of lateral acceleration", "m/s²", samples="a_lon", tables="traffic"),
+    Metric("w1_jerk", "W1 of |jerk|", "m/s³", samples="a_lon", tables="traffic"),
 )
 
 
@@ -95,9 +95,8 @@ def block_kinematics(states: Tensor) -> Samples:
 def wasserstein(pair: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
     """W1 [D] between the two samples of pair [2, n], weighted by each draw's multiplicity of the samples' clusters.
 
-    cluster [n] int64 below C, draws [D, C] >= 0. W1 is the area between the two distribution functions; these are
-    linear in the multiplicities, so one cumulative sum per cluster and a matrix product serve all draws. NaN for an
-    empty draw.
+    cluster [n] int64 below C, draws [D, C] >= 0. W1 is the area between the two distribution functions, which are
+    linear in the multiplicities: a cumulative sum per cluster serves all draws. NaN for an empty draw.
     """
     values, order = pair.flatten().sort()
     sign = torch.ones_like(pair)

@@ -19,16 +19,7 @@ CHUNK = 32  # rollouts scored at once: bounds the memory of the pairwise steps
     Metric("transport_adversary", "path KL of the control, adversaries"),
     Metric("transport_others", "path KL of the control, other vehicles"),
     Metric("transport_anchor", "anchor jump"),
-)
-def transport_columns(batch: Batch) -> Batch:
-    """The control's path KL of adversaries and others, their sum `transport`, and the anchor's jump, where known."""
-    names = ("transport_adversary", "transport_others", "transport_anchor")
-    known = {name: batch[name].to(batch["states"].dtype) for name in names if name in batch}
-    return known | ({"transport": known[names[0]] + known[names[1]]} if known else {})
-
-
-@columns(
-    Metric("seconds_per_rollout", "wall time", unit="s", column="seconds", cost=True, tables="main traffic methods"),
+    Metric("seconds_per_rollout", "wall time", "s", column="seconds", cost=True, tables="main traffic methods"),
     Metric(
         "nfe",
         "evaluations of the prior's network per rollout, one with a gradient twice",
@@ -36,9 +27,11 @@ def transport_columns(batch: Batch) -> Batch:
         tables="main methods",
     ),
 )
-def cost_columns(batch: Batch) -> Batch:
-    """Wall time and evaluations of the prior's network, where known."""
-    return {name: batch[name].to(batch["states"].dtype) for name in ("seconds", "nfe") if name in batch}
+def recorded_columns(batch: Batch) -> Batch:
+    """What the rollout itself recorded, where known: the control's transport, wall time, network evaluations."""
+    names = ("transport_adversary", "transport_others", "transport_anchor", "seconds", "nfe")
+    known = {name: batch[name].to(batch["states"].dtype) for name in names if name in batch}
+    return known | ({"transport": known[names[0]] + known[names[1]]} if names[0] in known else {})
 
 
 def score_rollouts(rollouts: Rollouts) -> tuple[list[dict], list[Samples]]:

@@ -15,7 +15,7 @@ as well as places, independently of them: a rollout counts as often as its place
 pigeonhole bootstrap, Owen 2007). Few trainings still understate how much they vary.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -33,11 +33,11 @@ LEAST = 10  # places
 Row = Mapping[str, Any]
 
 
-def cluster_index(rows: Sequence[Row]) -> tuple[Tensor, int]:
-    """(cluster [R] int64, number of clusters) of rows: by location; where there is none by log, of which a scene may be
-    one of several windows, LOG@START."""
-    places = [(row["location"], row["scene_id"].split("@")[0]) for row in rows]
-    names = [f"location {location}" if location else f"log {log}" for location, log in places]
+def cluster_index(locations: Iterable[str], scenes: Iterable[str]) -> tuple[Tensor, int]:
+    """(cluster [R] int64, number of clusters) by location; where there is none by log, of which a scene may be one of
+    several windows, LOG@START."""
+    places = zip(locations, scenes, strict=True)
+    names = [f"location {place}" if place else f"log {scene.split('@')[0]}" for place, scene in places]
     number = {name: index for index, name in enumerate(sorted(set(names)))}
     return torch.tensor([number[name] for name in names], dtype=torch.int64), len(number)
 
@@ -84,11 +84,11 @@ def resampled_medians(values: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
 
 
 def resampled_labels(labels: Tensor, cluster: Tensor, draws: Tensor, places: int) -> Tensor:
-    """Expected number [D], per draw [D, C], of different labels among those of rollouts at `places` different clusters.
+    """Expected number [D], per draw [D, C], of different labels [R] (NaN: none) of one rollout at each of `places`
+    different clusters of the draw, picked at random.
 
-    The clusters are picked at random from a draw, without picking one twice, and at each one of its rollouts with a
-    label [R] (NaN: none). So neither many rollouts nor many at one place raise the number. It is exact: the clusters
-    picked miss a label with the ratio of two elementary symmetric polynomials. NaN where a draw has fewer clusters.
+    Neither many rollouts nor many at one place raise it. It is exact: the clusters picked miss a label with the ratio
+    of two elementary symmetric polynomials. NaN where a draw has fewer clusters.
     """
     known = ~labels.isnan()
     values, index = labels[known].unique(return_inverse=True)
@@ -112,7 +112,8 @@ def interval(values: Tensor, places: int) -> dict[str, float]:
     low = high = torch.nan
     if places >= LEAST and len(values) > 1:
         low, high = values[1:].nanquantile(values.new_tensor(LEVELS)).tolist()
-    return {"mean": values[0].item()} | (_nothing() if low == high else {"low": low, "high": high})
+        low, high = (torch.nan, torch.nan) if low == high else (low, high)
+    return {"mean": values[0].item(), "low": low, "high": high}
 
 
 def exact_interval(fraction: float, places: int, level: float = LEVEL) -> tuple[float, float]:
@@ -121,10 +122,6 @@ def exact_interval(fraction: float, places: int, level: float = LEVEL) -> tuple[
     low = float(betaincinv(events, places - events + 1, tail)) if events > 0 else 0.0
     high = float(betaincinv(events + 1, places - events, 1 - tail)) if events < places else 1.0
     return low, high
-
-
-def _nothing() -> dict[str, float]:
-    return {"low": torch.nan, "high": torch.nan}
 
 
 def row_metrics() -> list[Metric]:
@@ -153,7 +150,7 @@ class Bootstrap:
     """The resampling of rollouts that a group, or two groups that are compared, share."""
 
     def __init__(self, rows: Sequence[Row], draws: int, realism_draws: int) -> None:
-        self.place, places = cluster_index(rows)
+        self.place, places = cluster_index(*([row[name] for row in rows] for name in ("location", "scene_id")))
         training = torch.tensor([row.get("training", 0) for row in rows], dtype=torch.int64)
         trainings = int(training.amax()) + 1 if len(rows) else 1
         self.cluster, self.place_draws = self.place * trainings + training, bootstrap_draws(places, draws)

@@ -7,7 +7,7 @@ red; it drove against its lane; it crossed the ego's way, or came into it, leavi
 driver needs to brake.
 """
 
-from typing import NamedTuple
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -33,18 +33,11 @@ CUT_IN_STEPS = 10  # 1 s at 10 Hz
 AHEAD = 30.0  # m, straight on from the contact, that count as the ego's path
 
 
-class Lanes(NamedTuple):
-    """The map's centrelines: points [B, M, 2], lane [B, M]: which one a point is of (-1: padding)."""
-
-    points: Tensor
-    lane: Tensor
-
-
-def duties(collision: Collision, rear: Tensor, red: Tensor, lanes: Lanes) -> Tensor:
+def duties(collision: Collision, rear: Tensor, red: Tensor, lanes: tuple[Tensor, Tensor]) -> Tensor:
     """Index [B] into DUTIES of collisions [B].
 
     rear [B] bool: the ego is hit at its rear; red [B] int64: step at which the partner last crossed a stop line at red,
-    -1 for never.
+    -1 for never; lanes: points [B, M, 2] of the map's centrelines, and which line [B, M] each is of (-1: padding).
     """
     row = torch.arange(len(rear), device=rear.device)
     pair = torch.stack([torch.zeros_like(collision.partner), collision.partner], 1)
@@ -58,7 +51,8 @@ def duties(collision: Collision, rear: Tensor, red: Tensor, lanes: Lanes) -> Ten
     gap, closing, entered = _entry(ego, other, size, stop)
     unsafe = entered & (gap < HumanDriver().stopping_gap(closing).clamp(min=0.0))
     crosses = angle.abs() > SAME_WAY
-    priority = torch.where(turned[0] == turned[1], _from_left(ego, other, row, before), turned[1] & ~turned[0])
+    # Who turns gives way; where both or none do, the other does if it comes from the ego's left.
+    priority = torch.where(turned[0] == turned[1], angle < 0, turned[1] & ~turned[0])
     result = torch.full_like(stop, NONE)
     result = torch.where(unsafe & ~crosses, ENTRY, result)
     result = torch.where(unsafe & crosses & priority, RIGHT_OF_WAY, result)
@@ -75,11 +69,6 @@ def _turn(track: Tensor, stop: Tensor) -> Tensor:
     return (wrap(track[..., 2].diff(dim=1)) * counted).sum(1).abs() > TURN
 
 
-def _from_left(ego: Tensor, other: Tensor, row: Tensor, step: Tensor) -> Tensor:
-    """Bool [B]: the other comes from the ego's left, so that it gives way where nothing else decides."""
-    return wrap(other[row, step, 2] - ego[row, step, 2]) < 0
-
-
 def _entry(ego: Tensor, other: Tensor, size: Tensor, stop: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Gap [B] m along the ego's way and closing speed [B] m/s when the other last came into it, and whether it did."""
     tracks = Tracks(other[:, :, None], size[:, 1:], torch.ones_like(other[..., :1], dtype=torch.bool))
@@ -93,12 +82,12 @@ def _entry(ego: Tensor, other: Tensor, size: Tensor, stop: Tensor) -> tuple[Tens
     return gap, ego[row, step, 3] - along.speed[step, row, 0], entered | (last == stop)
 
 
-def _against(track: Tensor, stop: Tensor, lanes: Lanes) -> Tensor:
+def _against(track: Tensor, stop: Tensor, lanes: tuple[Tensor, Tensor]) -> Tensor:
     """Bool [B]: in half of the WRONG_STEPS before stop [B] every lane that the vehicle is on runs against it."""
     row = torch.arange(len(stop), device=stop.device)[:, None]
     window = (stop[:, None] - torch.arange(1, WRONG_STEPS + 1, device=stop.device)).clamp(min=0)
     states = track[row, window]
-    against = against_lanes(lanes.points, lanes.lane, states[..., :2], states[..., 2, None])[..., 0]
+    against = against_lanes(*lanes, states[..., :2], states[..., 2, None])[..., 0]
     return against.float().mean(-1) >= 0.5
 
 
@@ -143,27 +132,18 @@ def ego_path_boxes(states: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat([states, strip], 1), sizes
 
 
+_MOST = "main adversaries methods egos"
+_of_collisions = partial(rate, per_collision=True)
 declare(
-    rate(
-        "cfr_counted",
-        "a failure that counts: preventable, or the ego's fault",
-        tables="main adversaries methods egos public",
-    ),
-    rate(
-        "cfr_preventable", "a failure that a competent driver prevents", tables="main adversaries methods egos public"
-    ),
-    rate("counted", "collisions that count", per_collision=True, tables="main adversaries"),
-    rate("at_fault", "ego's fault, per collision", per_collision=True, tables="main adversaries methods egos public"),
-    rate(
-        "preventable",
-        "prevented by UN R157's careful and competent driver",
-        per_collision=True,
-        tables="main adversaries methods egos",
-    ),
-    rate("preventable_fsm", "prevented by the fuzzy safety model", per_collision=True),
-    rate("preventable_rss", "prevented by RSS", per_collision=True),
-    rate("preventable_regulation", "prevented at UN R157's limit", per_collision=True),
-    rate("preventable_chain", "prevented if a follower brakes, too", per_collision=True),
+    rate("cfr_counted", "a failure that counts: preventable, or the ego's fault", tables=f"{_MOST} public"),
+    rate("cfr_preventable", "a failure that a competent driver prevents", tables=f"{_MOST} public"),
+    _of_collisions("counted", "collisions that count", tables="main adversaries"),
+    _of_collisions("at_fault", "ego's fault, per collision", tables=f"{_MOST} public"),
+    _of_collisions("preventable", "prevented by UN R157's careful and competent driver", tables=_MOST),
+    _of_collisions("preventable_fsm", "prevented by the fuzzy safety model"),
+    _of_collisions("preventable_rss", "prevented by RSS"),
+    _of_collisions("preventable_regulation", "prevented at UN R157's limit"),
+    _of_collisions("preventable_chain", "prevented if a follower brakes, too"),
     events=("duty",),
     words={"duty": DUTIES},
 )
@@ -199,7 +179,7 @@ def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor, Tensor
     collision = Collision(batch["states"][hit], vehicles, batch["size"][hit], batch["partner"][hit], batch["stop"][hit])
     row, ran = torch.arange(len(collision.stop)), batch.get("ran_light")
     red = torch.full_like(collision.stop, -1) if ran is None else ran[hit][row, collision.partner]
-    lanes = Lanes(batch["lane_points"][hit], batch["lane_index"][hit])
+    lanes = batch["lane_points"][hit], batch["lane_index"][hit]
     duty = duties(collision, batch["kind"][hit] == REAR, red, lanes)
     result = preventions(collision)
     dtype = batch["states"].dtype

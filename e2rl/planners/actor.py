@@ -104,19 +104,14 @@ class ActorEgo(ObservingEgo):
         sizes = self.hidden, self.agent_units, self.reference, self.initial_std
         self.network = ActorCritic(low, high, *sizes, self.device)
         if self.checkpoint is not None:
-            bounds, path = bounds_of(self.network), find_weights(self.checkpoint)
+            asked, path = self.network.architecture, find_weights(self.checkpoint)
             self.network = read_actor(path, self.device)
-            if bounds_of(self.network) != bounds:
+            own, wanted = ((of["low"], of["high"]) for of in (self.network.architecture, asked))
+            if own != wanted:
                 raise InputError(
-                    f"{path}: its actions have the bounds {bounds_of(self.network)}, not {bounds}; set sim.max_* as in "
-                    "the run that wrote it"
+                    f"{path}: its actions have the bounds {own}, not {wanted}; set sim.max_* as in its run"
                 )
 
     def decide(self, observation: Tensor) -> Tensor:
         """Most central action [B, 2] at the observation."""
         return self.network.network.deterministic(observation)
-
-
-def bounds_of(network: ActorCritic) -> tuple[object, object]:
-    """Lowest and highest action (m/s^2, rad/s), as the network's file states them."""
-    return network.architecture["low"], network.architecture["high"]

@@ -62,10 +62,11 @@ def drive(start: Tensor, path: RoutePath, speed: Tensor, shift: Tensor, time: Te
     beside, turned = shift[..., None], path.turned[:, None, None]
     offset, slope = fading(path.d[:, None, None, None] - beside, turned[..., None], length, driven)
     table = heading_table(path)
-    inner = (1 - curvature_at(table, driven) * (beside + offset)).clamp(min=0.2)
+    before, after, _ = between_entries(table, driven)
+    inner = (1 - (after - before) / CELL * (beside + offset)).clamp(min=0.2)
     stretch = torch.hypot(inner, slope)
     along = (driven.diff(dim=-1) * 2 / (stretch[..., 1:] + stretch[..., :-1])).cumsum(-1)
-    aimed = heading_at(table, along) + torch.atan(slope[..., 1:] / inner[..., 1:])
+    aimed = torch.lerp(*between_entries(table, along)) + torch.atan(slope[..., 1:] / inner[..., 1:])
     grip = (dynamics.MAX_LATERAL**2 - accel.square()).clamp(min=0).sqrt() / mean.clamp(min=1e-3)
     bound = torch.minimum(grip, dynamics.yaw_rate_bound(mean)).clamp(max=MAX_YAW_RATE)
     yaw_rate = steer(turned.expand_as(shift), aimed, bound * DT) / DT
@@ -92,20 +93,9 @@ def heading_table(path: RoutePath) -> Tensor:
     return torch.nn.functional.pad(wrap(heading.diff(dim=-1)).cumsum(-1), (1, 0))
 
 
-def heading_at(table: Tensor, ahead: Tensor) -> Tensor:
-    """Headings [B, ...] of a `heading_table` at `ahead` [B, ...] m."""
-    low, high, fraction = _between(table, ahead)
-    return torch.lerp(low, high, fraction)
-
-
-def curvature_at(table: Tensor, ahead: Tensor) -> Tensor:
-    """Curvatures [B, ...] 1/m of a `heading_table` at `ahead` [B, ...] m."""
-    low, high, _ = _between(table, ahead)
-    return (high - low) / CELL
-
-
-def _between(table: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The entries before and after `ahead` [B, ...] m, and the fraction of the distance between them."""
+def between_entries(table: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The entries of a `heading_table` before and after `ahead` [B, ...] m, and the fraction of the distance between
+    them."""
     at = (ahead / CELL).clamp(0, REACH - 1.001)
     index = at.long()
     flat = index.flatten(1)

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from e2rl.planners.ego import PLAN_STEPS, Ego, PlannerError
 from e2rl.planners.planner_link import (
-    Failed,
-    Malformed,
+    BadReply,
+    PlannerFailed,
     PlannerLink,
     plan_message,
     read_reply,
@@ -25,14 +25,6 @@ from e2rl.sim.world import World
 
 FASTEST = 50.0  # m/s: a plan that is faster, in its speeds or from pose to pose, is nonsense
 LARGEST = 100.0  # m/s^2, rad/s: so is a larger action
-
-
-class PlannerFailed(PlannerError):
-    """The planner says that it failed."""
-
-
-class BadReply(PlannerError):
-    """A reply that the protocol does not allow, or a plan that is not finite or no vehicle can drive."""
 
 
 class PlannerTimedOut(PlannerError):
@@ -97,21 +89,21 @@ class ExternalEgo(Ego):
         replies: dict[int, tuple[int, bytes]] = {}
         deadline = time.monotonic() + self.timeout * count
         try:
-            if link.unread:
-                raise Malformed("more replies came than scenes were asked for")
+            if link.buffer:
+                raise BadReply("more replies came than scenes were asked for")
             link.send(content, deadline)
             while len(replies) < count:
                 kind, payload = link.receive(deadline)
                 row = read_scene(kind, payload)
                 if row >= count or row in replies:
-                    raise Malformed(f"a reply for scene {row}, which was not asked for or answered before")
+                    raise BadReply(f"a reply for scene {row}, which was not asked for or answered before")
                 replies[row] = kind, payload
         except TimeoutError:
             why = f"no reply within {self.timeout:g} s a scene ({len(replies)} of {count} scenes answered)"
             raise self._dropped(PlannerTimedOut, f"{why}; see ego.timeout", replies, count) from None
         except (OSError, EOFError):
             raise self._dropped(PlannerDied, link.ending(), replies, count) from None
-        except Malformed as error:
+        except BadReply as error:
             raise self._dropped(BadReply, str(error), {}, count) from None
         return [replies[row] for row in range(count)]
 
@@ -157,9 +149,9 @@ def plans_of(now: Tensor, replies: list[tuple[int, bytes]], steps: int) -> Tenso
     for row, reply in enumerate(replies):
         try:
             found = torch.from_numpy(read_reply(*reply))
-        except Failed as error:
+        except PlannerFailed as error:
             failed[row] = str(error)
-        except Malformed as error:
+        except BadReply as error:
             bad[row] = str(error)
         else:
             if found.dim() == 1:

@@ -20,7 +20,10 @@ REACTION = 0.5  # s ahead at which the speed caps are met
 @configured("ego/idm")
 @dataclass(eq=False)
 class IDMEgo(Ego):
-    """Stays on its mission and follows the nearest agent ahead within the lateral gate; never changes lanes."""
+    """Stays on its mission and follows the nearest agent or red light ahead; never changes lanes.
+
+    An agent leads if its box is laterally within half the ego's width + GATE_MARGIN of the route.
+    """
 
     desired_speed: float = setting(low=0.1)
     headway: float = setting(low=0)
@@ -35,8 +38,16 @@ class IDMEgo(Ego):
         """The current IDM acceleration held for the whole plan, within the path's speed caps."""
         path, speed = MissionPath(world), world.states[:, 0, 3]
         caps = path.speed_caps(self.desired_speed, self.braking, self.use_limits, lights=False)
-        gap, leading = self.leader(world, path)
-        desired = self.desired(path)
+        found = leaders(
+            path.s[:, None], path.route[:, None], world.states, world.scene["size"], world.valid, free_gap=torch.inf
+        )
+        gap, leading = found.gap[:, 0], found.speed[:, 0].clamp(min=0)
+        light = path.stop_distance(self.braking) + self.standstill_gap
+        gap, leading = torch.minimum(gap, light), torch.where(light < gap, 0.0, leading)
+        desired = torch.full_like(path.s, self.desired_speed)
+        if self.use_limits:
+            limit = limit_at(path.mission, path.s)
+            desired = torch.where(limit > 0, limit, desired)
         driver = IDMParameters(self.headway, self.standstill_gap, self.acceleration, self.braking)
         accel = idm_acceleration(speed, desired, gap, leading, driver, improved=True)
         allowed = look_up(caps, (REACTION * speed)[:, None])[:, 0]
@@ -45,22 +56,3 @@ class IDMEgo(Ego):
         future = bounded_speed(speed[:, None], (accel * DT)[:, None].expand(-1, PLAN_STEPS), 0.0, MAX_SPEED)
         future = torch.minimum(future, torch.maximum(desired, speed)[:, None])
         return path.drive(torch.cat([speed[:, None], future], 1))
-
-    def desired(self, path: MissionPath) -> Tensor:
-        """Desired speed [B]: the local speed limit if known and `use_limits`, else `desired_speed`."""
-        set_speed = torch.full_like(path.s, self.desired_speed)
-        if not self.use_limits:
-            return set_speed
-        limit = limit_at(path.mission, path.s)
-        return torch.where(limit > 0, limit, set_speed)
-
-    def leader(self, world: World, path: MissionPath) -> tuple[Tensor, Tensor]:
-        """Free gap [B] m, inf for none, and speed [B] m/s along the route of the nearest agent or red light ahead.
-
-        An agent is a leader if its box is laterally within half the ego's width + GATE_MARGIN of the route.
-        """
-        route, size = path.route[:, None], world.scene["size"]
-        found = leaders(path.s[:, None], route, world.states, size, world.valid, free_gap=torch.inf)
-        gap, leading = found.gap[:, 0], found.speed[:, 0].clamp(min=0)
-        light = path.stop_distance(self.braking) + self.standstill_gap
-        return torch.minimum(gap, light), torch.where(light < gap, 0.0, leading)

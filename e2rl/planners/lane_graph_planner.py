@@ -99,7 +99,7 @@ def collision_hazard(ego: Tensor, ego_size: Tensor, others: Prediction, slope: f
     centre = ego[others.scene, :, :, :2].transpose(1, 2)  # [J, T, C, 2]
     apart = _squared(centre, others.poses[:, :, None, :2])
     reach = (ego_size[others.scene].norm(dim=-1) + others.size.norm(dim=-1))[:, None] / 2
-    cut = reach + _distance_of(NEGLIGIBLE) / weight  # [J, T]
+    cut = reach + math.atanh(1 - NEGLIGIBLE) / weight  # [J, T]
     other, time, profile = (apart < cut.square()[..., None]).nonzero(as_tuple=True)
     scene = others.scene[other]
     for part in torch.arange(len(other), device=ego.device).split(CHUNK):
@@ -113,11 +113,6 @@ def collision_hazard(ego: Tensor, ego_size: Tensor, others: Prediction, slope: f
 def _squared(first: Tensor, second: Tensor) -> Tensor:
     """Squared distance [...] of points [..., 2]; per axis, as reducing a last axis of two is slow."""
     return (first[..., 0] - second[..., 0]).square() + (first[..., 1] - second[..., 1]).square()
-
-
-def _distance_of(probability: float) -> float:
-    """The d w at which 1 - tanh(d w) = `probability`."""
-    return torch.atanh(torch.tensor(1 - probability, dtype=torch.float64)).item()
 
 
 def circles(pose: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:

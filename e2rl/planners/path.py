@@ -28,11 +28,10 @@ class RoutePath:
     offset * exp(-a^2 / 3.5^2) of STRIVE's planner (Rempe et al. 2022) starts with a kink that no car can drive.
     """
 
-    def __init__(self, state: Tensor, route: Tensor, hint: Tensor | None = None) -> None:
-        """state [..., 4], route [..., P, 2]; hint [...]: expected arc length."""
+    def __init__(self, state: Tensor, route: Tensor) -> None:
+        """state [..., 4], route [..., P, 2]."""
         self.route = route
-        hint = None if hint is None else hint[..., None]
-        s, d, heading = (value[..., 0] for value in project(state[..., None, :2], route, hint))
+        s, d, heading = (value[..., 0] for value in project(state[..., None, :2], route))
         self.s, self.d, self.turned = s, d, wrap(state[..., 2] - heading)
         self.length = return_length(state[..., 3])
         self.residual = torch.zeros_like(state[..., :2])

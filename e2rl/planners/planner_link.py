@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from e2rl.planners.ego import PLAN_STEPS
+from e2rl.planners.ego import PLAN_STEPS, PlannerError
 from e2rl.run.errors import InputError
 from e2rl.run.processes import die_with_parent
 from e2rl.scenes.recording import DT
@@ -37,21 +37,16 @@ MAX_REPLY = 4 + max(4 + 16 * PLAN_STEPS, MAX_TEXT)  # bytes of a reply's payload
 AGENT_WORDS = 10
 
 
-class Malformed(ValueError):
-    """A payload that its kind does not allow."""
+class BadReply(PlannerError):
+    """A reply that the protocol does not allow, or a plan that is not finite or no vehicle can drive."""
 
 
-class Failed(Exception):
-    """The planner replied that it failed, and why."""
+class PlannerFailed(PlannerError):
+    """The planner says that it failed."""
 
 
 def message(kind: int, payload: bytes) -> bytes:
     return HEADER.pack(kind, len(payload)) + payload
-
-
-def hello(replan_every: int) -> bytes:
-    """HELLO of a simulator that asks for a plan every so many steps."""
-    return message(HELLO, struct.pack("<IfII", VERSION, DT, PLAN_STEPS, replan_every))
 
 
 def scene_messages(world: World, rows: list[int]) -> bytes:
@@ -96,32 +91,25 @@ def plan_message(world: World) -> bytes:
     return message(PLAN, struct.pack("<I", count) + _bytes(body[sent]))
 
 
-def read_version(kind: int, payload: bytes) -> int:
-    """The version of a planner's HELLO."""
-    if kind != HELLO or len(payload) != 4:
-        raise Malformed(f"its first message is of kind {kind} and {len(payload)} bytes, not HELLO ({HELLO}) of 4")
-    return struct.unpack("<I", payload)[0]
-
-
 def read_scene(kind: int, payload: bytes) -> int:
     """The number of the scene that a reply is for."""
     if kind not in (TRAJECTORY, ACTION, FAILED) or len(payload) < 4:
-        raise Malformed(f"a message of kind {kind} and {len(payload)} bytes is no reply to PLAN")
+        raise BadReply(f"a message of kind {kind} and {len(payload)} bytes is no reply to PLAN")
     return struct.unpack_from("<I", payload)[0]
 
 
 def read_reply(kind: int, payload: bytes) -> np.ndarray:
-    """States [K, 4] or an action [2] of a reply; raises Failed or Malformed."""
+    """States [K, 4] or an action [2] of a reply; raises PlannerFailed or BadReply."""
     if kind == FAILED:
-        raise Failed(payload[4:].decode(errors="replace"))
+        raise PlannerFailed(payload[4:].decode(errors="replace"))
     if kind == ACTION:
         if len(payload) != 12:
-            raise Malformed(f"an ACTION has 12 bytes, this one {len(payload)}")
+            raise BadReply(f"an ACTION has 12 bytes, this one {len(payload)}")
         return np.frombuffer(payload, "<f4", offset=4).astype(np.float32)
     count = struct.unpack_from("<I", payload, 4)[0] if len(payload) >= 8 else 0
     if not 1 <= count <= PLAN_STEPS or len(payload) != 8 + 16 * count:
         size = f"{len(payload)} bytes for {count} states"
-        raise Malformed(f"a TRAJECTORY has 8 + 16 K bytes for 1 to {PLAN_STEPS} states; this one has {size}")
+        raise BadReply(f"a TRAJECTORY has 8 + 16 K bytes for 1 to {PLAN_STEPS} states; this one has {size}")
     return np.frombuffer(payload, "<f4", offset=8).reshape(count, 4).astype(np.float32)
 
 
@@ -149,7 +137,8 @@ class PlannerLink:
 
         Raises InputError where none answers within `timeout` s.
         """
-        self._buffer = bytearray()
+        self.buffer = bytearray()
+        """What came beyond the last message taken."""
         self._name = f"ego.address={address}" if command is None else f"ego.command={command}"
         folder = None if command is None else tempfile.mkdtemp(prefix="e2rl-")
         self._process, deadline = None, time.monotonic() + timeout
@@ -159,7 +148,7 @@ class PlannerLink:
                 self._process = start(command, address)
             self._socket = connect(str(address), self._process, deadline, self._name)
         except BaseException:
-            end(self._process)
+            close(None, self._process)
             raise
         finally:
             if folder is not None:
@@ -169,9 +158,13 @@ class PlannerLink:
 
     def _greet(self, replan_every: int, deadline: float) -> None:
         try:
-            self.send(hello(replan_every), deadline)
-            version = read_version(*self.receive(deadline))
-        except (OSError, EOFError, Malformed) as error:
+            about = struct.pack("<IfII", VERSION, DT, PLAN_STEPS, replan_every)
+            self.send(message(HELLO, about), deadline)
+            kind, payload = self.receive(deadline)
+            if kind != HELLO or len(payload) != 4:
+                raise BadReply(f"its first message is of kind {kind} and {len(payload)} bytes, not HELLO of 4")
+            (version,) = struct.unpack("<I", payload)
+        except (OSError, EOFError, BadReply) as error:
             self.close()
             raise InputError(f"{self._name}: no planner answers there: {error or 'no HELLO in time'}") from error
         if version != VERSION:
@@ -185,14 +178,14 @@ class PlannerLink:
 
     def receive(self, deadline: float) -> tuple[int, bytes]:
         """Kind and payload of the next message. Raises TimeoutError; EOFError or OSError where the connection broke;
-        Malformed where the payload is longer than any reply's."""
+        BadReply where the payload is longer than any reply's."""
         kind, length = HEADER.unpack(self._take(HEADER.size, deadline))
         if length > MAX_REPLY:
-            raise Malformed(f"a message of kind {kind} announces {length} bytes; replies have at most {MAX_REPLY}")
+            raise BadReply(f"a message of kind {kind} announces {length} bytes; replies have at most {MAX_REPLY}")
         return kind, self._take(length, deadline)
 
     def _take(self, count: int, deadline: float) -> bytes:
-        while len(self._buffer) < count:
+        while len(self.buffer) < count:
             left = deadline - time.monotonic()
             if left <= 0:
                 raise TimeoutError("no reply in time")
@@ -200,15 +193,10 @@ class PlannerLink:
             part = self._socket.recv(1 << 16)
             if not part:
                 raise EOFError("it closed the connection")
-            self._buffer += part
-        taken = bytes(self._buffer[:count])
-        del self._buffer[:count]
+            self.buffer += part
+        taken = bytes(self.buffer[:count])
+        del self.buffer[:count]
         return taken
-
-    @property
-    def unread(self) -> int:
-        """Bytes that came beyond the last message taken."""
-        return len(self._buffer)
 
     def ending(self) -> str:
         """How the planner's process ended, as far as is known."""
@@ -264,14 +252,10 @@ def _connected(address: str, name: str) -> socket.socket:
     return connection
 
 
-def close(connection: socket.socket, process: Process | None) -> None:
-    """Close a connection and end the planner's process, if it is known."""
-    connection.close()
-    end(process)
-
-
-def end(process: Process | None) -> None:
-    """End a planner's process, and those that it started."""
+def close(connection: socket.socket | None, process: Process | None) -> None:
+    """Close a connection and end the planner's process, and those that it started."""
+    if connection is not None:
+        connection.close()
     if process is None or process.poll() is not None:
         return
     for number in (signal.SIGTERM, signal.SIGKILL):

@@ -85,20 +85,15 @@ class OnnxPolicy:
     """A session of onnxruntime with one thread, in each process its own."""
 
     def __init__(self, file: Path) -> None:
-        try:
-            import onnxruntime  # noqa: F401
-        except ImportError as error:
-            reason = f"onnxruntime cannot be imported ({error})"
-            raise InputError(
-                f"ego.file={file}: {reason}; install e2rl with its extra: pip install 'e2rl[onnx]'"
-            ) from error
         self.file = file
         self._open()
-        self.name = self.session.get_inputs()[0].name
 
     def _open(self) -> None:
-        import onnxruntime
-
+        try:
+            import onnxruntime
+        except ImportError as error:
+            reason = f"onnxruntime cannot be imported ({error}); pip install 'e2rl[onnx]'"
+            raise InputError(f"ego.file={self.file}: {reason}") from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 4  # what fails is raised
@@ -107,7 +102,7 @@ class OnnxPolicy:
         except Exception as error:  # onnxruntime's are of many kinds
             reason = " ".join(str(error).split())[:200]
             raise InputError(f"ego.file={self.file}: cannot be read as ONNX ({reason}); export it again") from error
-        self._process = os.getpid()
+        self.name, self._process = self.session.get_inputs()[0].name, os.getpid()
 
     def __call__(self, observation: Tensor) -> Any:
         if self._process != os.getpid():  # forked

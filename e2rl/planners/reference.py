@@ -4,11 +4,7 @@ Steering is pure pursuit of the mission. The acceleration is the minimum over ID
 IDM behind stop lines that bind, and the speed caps by limits and curves. Pure functions of e2rl.sim.observation.
 
 The network of the learned ego: every nearby agent goes through the same layers, and the largest of each unit over the
-agents joins the rest of the scene.
-
-A flat network learns anew in each of the observation's twelve places what an agent there means. Which place one takes
-says how near it is, not what it does; with shared layers, every agent teaches them (Qi et al., PointNet, 2017; what it
-is worth here stands in docs/learning.md).
+agents joins the rest of the scene (Qi et al., PointNet, 2017; what it is worth here stands in docs/learning.md).
 """
 
 from collections.abc import Sequence
@@ -35,11 +31,6 @@ LATERAL = 2.5  # m/s^2 in curves
 GATE_MARGIN = 0.3  # m beyond the half widths
 REACTION = 0.5  # s in which a speed cap is met
 LINE_GAP = 1.0  # m kept to a stop line
-
-
-def executed_action(observation: Tensor) -> Tensor:
-    """Last executed action [..., 2] (m/s^2, rad/s) that an observation [..., D] reports."""
-    return torch.stack([4 * observation[..., 1], observation[..., 2]], -1)
 
 
 def reference_action(observation: Tensor) -> Tensor:

@@ -31,21 +31,8 @@ SCENE_KEYS = (
 )  # that costs and paths need
 
 
-class RankingEgo(Ego):
-    """An ego that plans its cheapest candidate and can tell the others' costs."""
-
-    @abstractmethod
-    def ranked(self, world: World, count: int) -> tuple[Tensor, Tensor]:
-        """Planned states [B, C, PLAN_STEPS, 4] and costs [B, C] of the C = `count` cheapest candidates, the cheapest
-        first; inf where there are no more."""
-
-    @abstractmethod
-    def rated(self, world: World, states: Tensor) -> Tensor:
-        """Costs [B, C], in the same units, of driving along states [B, C, PLAN_STEPS, 4] that somebody else plans."""
-
-
 @dataclass(eq=False)
-class ScoringEgo(Weights, RankingEgo):
+class ScoringEgo(Weights, Ego):
     """Plans the cheapest of its `candidates` by `scoring.score` on a forecast of the others. It looks at nobody's plan.
 
     CHUNK: scenes that are planned for at a time; READS: keys of the scene that are looked at.
@@ -94,8 +81,8 @@ class ScoringEgo(Weights, RankingEgo):
         return candidates.states[torch.arange(len(best), device=best.device), best]
 
     def ranked(self, world: World, count: int) -> tuple[Tensor, Tensor]:
-        """States [B, C, PLAN_STEPS, 4] and costs [B, C] of the cheapest candidates, the cheapest first; of those that
-        are driven alike (caps and bounds make many so) one counts, the others cost inf."""
+        """States [B, C, PLAN_STEPS, 4] and costs [B, C] of the C = `count` cheapest candidates, the cheapest first; of
+        those that are driven alike (caps and bounds make many so) one counts, the others cost inf."""
         states, costs = zip(*(self._ranked(part, count) for part in self._chunks(world)), strict=True)
         return torch.cat(states), torch.cat(costs)
 
@@ -111,7 +98,7 @@ class ScoringEgo(Weights, RankingEgo):
         return states[row, best], costs
 
     def rated(self, world: World, states: Tensor) -> Tensor:
-        """Costs [B, C] of driving along states [B, C, PLAN_STEPS, 4], which lead where they end."""
+        """Costs [B, C] of driving along anybody's states [B, C, PLAN_STEPS, 4], which lead where they end."""
         path = MissionPath(world)
         end, shift, _ = project(states[:, :, -1, :2], path.route)
         return self.costs(world, Candidates(states, end - path.s[:, None], shift))
@@ -127,7 +114,7 @@ def take(world: World, rows: Tensor, keys: tuple[str, ...] = SCENE_KEYS) -> Worl
     return World(world.scene.select(*keys)[rows], *now)
 
 
-def ranked_actions(ego: RankingEgo, world: World, count: int, hold: int) -> tuple[Tensor, Tensor]:
+def ranked_actions(ego: ScoringEgo, world: World, count: int, hold: int) -> tuple[Tensor, Tensor]:
     """Actions [B, C, 2] (m/s^2, rad/s) of the C = `count` cheapest candidates, in the mean over the coming `hold`
     steps, and their costs [B, C]."""
     states, costs = ego.ranked(world, count)

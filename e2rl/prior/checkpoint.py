@@ -46,7 +46,9 @@ def load_prior(
 
     Raises InputError, naming the file, where it is missing, damaged or of another architecture.
     """
-    path = bundled_checkpoint() if checkpoint == BUNDLED else Path(checkpoint)
+    path = Path(checkpoint)
+    if checkpoint == BUNDLED:  # shipped with the package, trained on the bundled scenes alone
+        path = max(Path(str(files("e2rl") / "assets" / "prior")).glob("prior-*.safetensors"), default=path)
     if not path.exists():
         raise InputError(
             f"prior.checkpoint={checkpoint}: no such file; train one with `python train.py stage=prior`, "
@@ -76,11 +78,3 @@ def load_prior(
         reason = " ".join(str(error).split("\n\t")[:2])  # of torch's list of tensors that do not fit, the first
         raise InputError(f"{path}: another architecture ({reason}); train the prior again") from error
     return prior.requires_grad_(False).eval().to(device), origin
-
-
-def bundled_checkpoint() -> Path:
-    """The checkpoint shipped with the package, trained on the bundled scenes alone."""
-    found = sorted(Path(str(files("e2rl") / "assets" / "prior")).glob("prior-*.safetensors"))
-    if not found:
-        raise InputError("the package holds no bundled prior; reinstall it, or pass prior.checkpoint=FILE")
-    return found[-1]

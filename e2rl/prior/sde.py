@@ -34,14 +34,6 @@ class NoiseSchedule:
         """Noise scale sigma(t)."""
         return torch.sin(0.5 * math.pi * t)
 
-    def beta(self, t: Tensor) -> Tensor:
-        """beta(t) = g(t)^2."""
-        return math.pi * torch.tan(0.5 * math.pi * t)
-
-    def drift(self, x: Tensor, t: Tensor) -> Tensor:
-        """f(x, t) of the forward SDE."""
-        return -0.5 * self.beta(t) * x
-
     def beta_integral(self, high: Tensor, low: Tensor) -> Tensor:
         """Integral of beta over [low, high]: 2 log(alpha(low) / alpha(high))."""
         return 2.0 * torch.log(self.alpha(low) / self.alpha(high))

@@ -6,11 +6,12 @@ It reads the rows of metrics.json and the content of modes.json, and computes no
 import math
 import shutil
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from e2rl.metrics.catalogue import META_STAGE, METRICS, OPEN_LOOP_STAGE, STAGES
-from e2rl.report.tables import UNKNOWN, column_names, number
+from e2rl.metrics.catalogue import META_STAGE, METRICS, OPEN_LOOP_STAGE
+from e2rl.report.comparison_tables import by_ego
+from e2rl.report.tables import UNKNOWN, closed_loop, number, plural
 
 LINES, NARROWEST, WIDEST = 25, 80, 100
 WEAKNESSES, MOST_ROWS = 3, 10  # lines of failure modes; rows of a comparison
@@ -45,34 +46,28 @@ def answer_lines(
         width: columns; None: those of the terminal.
     """
     width = width or terminal_width()
-    driven = closed_loop(rows)
-    lines = []
-    if driven:
-        nominal = [row for row in driven if not row["eta"]]
-        attacks = [row for row in driven if row["eta"]]
-        if len({row["ego"] for row in driven}) == 1 and len(attacks) <= 1 and len(nominal) <= 1:
-            lines += told(attacks[0] if attacks else nominal[0], nominal[0] if attacks and nominal else None, width)
-        else:
-            lines += compared(driven, width)
-        lines += weaknesses(modes, width)
-    lines += [line for row in rows if row.get("stage") in STAGES for line in prior_line(row, width)]
+    driven = [row for row in closed_loop(rows) if row["n_rollouts"]]
+    nominal = [row for row in driven if not row["eta"]]
+    attacks = [row for row in driven if row["eta"]]
+    lines: list[str] = []
+    if len({row["ego"] for row in driven}) == 1 and len(attacks) <= 1 and len(nominal) <= 1:
+        lines += told(attacks[0] if attacks else nominal[0], nominal[0] if attacks and nominal else None, width)
+    elif driven:
+        lines += compared(driven, width)
+    lines += weaknesses(modes if driven else None, width)
+    lines += [line for row in rows for line in wrapped(prior_text(row), width)]
     last = closing(rows, width, folder, report, notes)
     return [*lines[: LINES - len(last)], *last]
 
 
 def compared_answer(
-    before: Sequence[dict],
-    after: Sequence[dict],
-    modes: Sequence[Mapping] = (),
-    folder: Path | None = None,
-    width: int | None = None,
+    before: Sequence[dict], after: Sequence[dict], folder: Path | None = None, width: int | None = None
 ) -> list[str]:
     """Returns the lines that say what training changed: the ego before and after it, side by side.
 
     Args:
         before: rows of metrics.json of the stage `before`.
         after: rows of the stage `after`, which are paired with those before under the name `before`.
-        modes: contents of the two stages' modes.json; without them no weaknesses are named.
         folder: of the run, which holds tables.md.
         width: columns; None: those of the terminal.
     """
@@ -80,7 +75,7 @@ def compared_answer(
     earlier = {(row["method"], row["eta"]): row for row in closed_loop(before)}
     later = {(row["method"], row["eta"]): row for row in closed_loop(after)}
     pairs = [(earlier[key], row) for key, row in later.items() if key in earlier]
-    lines: list[str] = []
+    last, lines = closing(after, width, folder), []
     if pairs:
         old, new = max(pairs, key=lambda pair: pair[1]["eta"])
         lines += wrapped(
@@ -88,16 +83,19 @@ def compared_answer(
             f"before it in {of(old, 'cfr')} ({rate(old, 'cfr')}).",
             width,
         )
-    kinds = {"hit": "cfr", "count": "cfr_counted", "count per 1,000 km": "counted_per_km", "progress [m]": "progress"}
-    table = [["", "before", "after", "difference"]]
-    for title, name in kinds.items():
-        for old, new in pairs:
-            cells = [cell(old, name), cell(new, name), gap(new, "before", name)]
-            table.append([f"{title}, {traffic_name(new)}", *cells])
-    last = closing(after, width, folder)
-    lines += [*columns(table[: LINES - len(lines) - len(last) - 1], width), COUNTS] if pairs else []
-    for stage, found in zip(("before", "after"), modes, strict=False):
-        lines += weaknesses(found, width, f"Weaknesses {stage} training", most=1)
+        kinds = {
+            "hit": "cfr",
+            "count": "cfr_counted",
+            "count per 1,000 km": "counted_per_km",
+            "progress [m]": "progress",
+        }
+        table = [["", "before", "after", "difference"]]
+        table += [
+            [f"{title}, {traffic_name(new)}", cell(old, name), cell(new, name), gap(new, name)]
+            for title, name in kinds.items()
+            for old, new in pairs
+        ]
+        lines += [*columns(table[: LINES - len(lines) - len(last) - 1], width), COUNTS]
     return [*lines[: LINES - len(last)], *last]
 
 
@@ -106,10 +104,14 @@ def compared_answer(
 
 def told(row: dict, nominal: dict | None, width: int) -> list[str]:
     """Sentences about one row of metrics.json, beside the nominal traffic where that was driven."""
-    kind = "attacked " if row["eta"] else ""
-    text = f"{row['ego']} was hit in {of(row, 'cfr')} {kind}rollouts ({rate(row, 'cfr')})"
-    sentences = [f"{text}, {of(nominal, 'cfr')} nominal." if nominal else f"{text}.", verdict(row), rates(row, nominal)]
-    sentences += [effect(row, nominal), cost(row, nominal)] if nominal else []
+    found = f"{row['ego']} was hit in {of(row, 'cfr')} {'attacked ' if row['eta'] else ''}rollouts ({rate(row, 'cfr')})"
+    per_km = value(row, "counted_per_km")
+    rates = "" if per_km == UNKNOWN else f"Failures that count per 1,000 km driven: {per_km}"
+    sentences = [f"{found}.", verdict(row), rates and f"{rates}."]
+    if nominal:
+        sentences = [f"{found}, {of(nominal, 'cfr')} nominal.", verdict(row)]
+        sentences += [rates and f"{rates} attacked, {value(nominal, 'counted_per_km')} nominal."]
+        sentences += [effect(row, nominal), cost(row, nominal)]
     return [line for sentence in sentences for line in wrapped(sentence, width, "  ")]
 
 
@@ -129,15 +131,6 @@ def verdict(row: dict) -> str:
     because = " or ".join(f"{reason} ({count})" for reason, count in reasons.items() if count)
     which = f"{found} of the {hits}" if found < hits else f"All {hits}" if hits > 1 else "It"
     return f"{which} count{'s' if found == 1 else ''}, because {because}.{search}"
-
-
-def rates(row: dict, nominal: dict | None) -> str:
-    """Failures that count per 1,000 km, in the attack and in nominal traffic."""
-    rate, usual = per_thousand(row), per_thousand(nominal) if nominal else UNKNOWN
-    if rate == UNKNOWN:
-        return ""
-    text = f"Failures that count per 1,000 km driven: {rate}"
-    return f"{text} attacked, {usual} nominal." if nominal else f"{text}."
 
 
 def effect(row: dict, nominal: dict) -> str:
@@ -167,47 +160,35 @@ def cost(row: dict, nominal: dict) -> str:
 
 def compared(rows: Sequence[dict], width: int) -> list[str]:
     """A table with a row for each ego, method and intensity. Methods: those that find most failures that count first.
-    Egos: in each traffic the one with the fewest first."""
+    Egos: in each traffic, the strongest first, the one with the fewest first. Unknown rates come last."""
     egos = list(dict.fromkeys(row["ego"] for row in rows))
-    names = {id(row): name for ego in egos for row, name in named(rows, ego)}
-    order = list(dict.fromkeys(names[id(row)] for row in sorted(rows, key=lambda row: -row["eta"])))
-    counted = {id(row): row["metrics"]["cfr_counted"]["mean"] for row in rows}
-    if len(egos) > 1:
-        ranked = sorted(rows, key=lambda row: (order.index(names[id(row)]), low_first(counted[id(row)])))
-        best = ranked[0]
-        lead = f"{best['ego']} fails least: it was hit in {of(best, 'cfr')} rollouts {traffic(best)}, of which "
-        lead += f"{of(best, 'cfr_counted').partition(' ')[0]} count."
-    else:
-        ranked = sorted(rows, key=lambda row: (not row["eta"], low_first(-counted[id(row)]), row["eta"]))
-        best = ranked[0]
-        lead = f"{best['ego']} fails most in the traffic of {names[id(best)]}: hit in {of(best, 'cfr')} rollouts, of "
-        lead += f"which {of(best, 'cfr_counted').partition(' ')[0]} count."
-    head = ["ego", "traffic", "hit", "count", "realism", "count per 1,000 km"]
-    table = [
-        [row["ego"], names[id(row)], *(cell(row, name) for name in ("cfr", "cfr_counted", "real", "counted_per_km"))]
-        for row in ranked[:MOST_ROWS]
-    ]
-    table = [head, *table] if len(egos) > 1 else [cells[1:] for cells in [head, *table]]
+    cells, labels = by_ego(rows, egos)
+    several = len(egos) > 1
+
+    def rank(key: tuple[str, str]) -> tuple:
+        row, counted = cells[key], cells[key]["metrics"]["cfr_counted"]["mean"]
+        counted = math.inf if math.isnan(counted) else counted if several else -counted
+        return (-row["eta"], labels.index(key[1]), counted) if several else (not row["eta"], counted, row["eta"])
+
+    ranked = sorted(cells, key=rank)
+    ego, name = ranked[0]
+    best = cells[ranked[0]]
+    lead = f"{ego} fails most in the traffic of {name}: hit in {of(best, 'cfr')} rollouts"
+    if several:
+        lead = f"{ego} fails least: it was hit in {of(best, 'cfr')} rollouts {traffic(best)}"
+    lead += f", of which {of(best, 'cfr_counted').partition(' ')[0]} count."
+    table = [["ego", "traffic", "hit", "count", "realism", "count per 1,000 km"]]
+    shown = ("cfr", "cfr_counted", "real", "counted_per_km")
+    table += [[*key, *(cell(cells[key], metric) for metric in shown)] for key in ranked[:MOST_ROWS]]
     rest = len(ranked) - MOST_ROWS
     more = [f"... and {rest} more in tables.md"] if rest > 0 else []
-    return [*wrapped(lead, width), *columns(table, width), *more, COUNTS]
-
-
-def named(rows: Sequence[dict], ego: str) -> Iterable[tuple[dict, str]]:
-    """The rows of an ego with the names of their traffic."""
-    own = [row for row in rows if row["ego"] == ego]
-    return zip(own, column_names(own), strict=True)
-
-
-def low_first(rate: float) -> float:
-    """A rate to sort by; unknown ones come last."""
-    return math.inf if math.isnan(rate) else rate
+    return [*wrapped(lead, width), *columns(table if several else [line[1:] for line in table], width), *more, COUNTS]
 
 
 # --- weaknesses, and what was measured
 
 
-def weaknesses(modes: Mapping | None, width: int, title: str = "Weaknesses", most: int = WEAKNESSES) -> list[str]:
+def weaknesses(modes: Mapping | None, width: int) -> list[str]:
     """The failure modes with the most failures that count, a line each; where none counts, the most frequent ones."""
     found = [mode for mode in (modes["modes"] if modes else ()) if mode["mode"] != OTHER]
     if modes is None or not found:
@@ -216,25 +197,28 @@ def weaknesses(modes: Mapping | None, width: int, title: str = "Weaknesses", mos
     any_counts = any(counts.values())
     chosen = [mode for mode in found if counts[mode["mode"]] or not any_counts]
     chosen.sort(key=lambda mode: (-counts[mode["mode"]], -mode["count"], mode["mode"]))
-    lines = [f"{title}, {'most failures that count first' if any_counts else 'although none of the failures counts'}:"]
-    for place, mode in enumerate(chosen[:most], 1):
+    lines = [
+        f"Weaknesses, {'most failures that count first' if any_counts else 'although none of the failures counts'}:"
+    ]
+    for place, mode in enumerate(chosen[:WEAKNESSES], 1):
         text = f"{place}. {mode['name']} ({mode['count']} of {plural(modes['failures'], 'failure')}"
         lines += wrapped(f"{text}, {counts[mode['mode']]} count)" if any_counts else f"{text})", width, "   ")
     return lines
 
 
-def prior_line(row: dict, width: int) -> list[str]:
-    """The line of a row of the stages open loop and meta-metric, which measure the traffic's prior."""
-    text = ""
-    if row["stage"] == OPEN_LOOP_STAGE:
-        best, plain = (row["metrics"].get(name, {}).get("mean", math.nan) for name in ("min_ade_3", "cv_ade_3"))
-        if not math.isnan(best):
-            text = f"{row['method']}, open loop: each vehicle's best sample is {best:.2f} m beside the recording over "
-            text += f"3 s, constant velocity {plain:.2f} m."
-    elif row["stage"] == META_STAGE and row["metrics"].get("meta_metric", {}).get("n"):
-        found = row["metrics"]["meta_metric"]
-        text = f"{row['method']}: realism meta-metric {found['mean']:.3f} of {found['n']} scenes."
-    return wrapped(text, width) if text else []
+def prior_text(row: dict) -> str:
+    """The sentence of a row of the stages open loop and meta-metric, which measure the traffic's prior; else ""."""
+    metrics, stage = row["metrics"], row.get("stage")
+    if stage == OPEN_LOOP_STAGE and metrics.get("min_ade_3", {}).get("n"):
+        best, plain = (metrics[name]["mean"] for name in ("min_ade_3", "cv_ade_3"))
+        text = (
+            f"each vehicle's best sample is {best:.2f} m beside the recording over 3 s, constant velocity {plain:.2f} m"
+        )
+        return f"{row['method']}, open loop: {text}."
+    if stage == META_STAGE and metrics.get("meta_metric", {}).get("n"):
+        found = metrics["meta_metric"]
+        return f"{row['method']}: realism meta-metric {found['mean']:.3f} of {found['n']} scenes."
+    return ""
 
 
 def closing(
@@ -255,18 +239,14 @@ def measured(rows: Sequence[dict]) -> str:
     methods = dict.fromkeys(traffic_name(row) for row in rows if row["eta"])
     attack = f"; attack: {', '.join(methods)}" if len(methods) == 1 else ""
     text = f"Measured: {first['dataset']}/{first['split']}, {scenes}, {seeds}{attack}."
-    if all(math.isnan(row["metrics"]["cfr"]["low"]) for row in rows if "cfr" in row["metrics"]):
-        text += f" {FEW}" if any("cfr" in row["metrics"] for row in rows) else ""
+    rates = [row["metrics"]["cfr"] for row in rows if "cfr" in row["metrics"]]
+    if rates and all(math.isnan(found["low"]) for found in rates):
+        text += f" {FEW}"
     ended = sum(count for row in rows for count in row.get("ended", {}).values())
     return text + (f" {plural(ended, 'rollout')} failed without a score: see ended.json." if ended else "")
 
 
 # --- cells
-
-
-def closed_loop(rows: Sequence[dict]) -> list[dict]:
-    """The rows of rollouts, without those of the stages that measure the prior."""
-    return [row for row in rows if row.get("stage") not in STAGES and row["n_rollouts"]]
 
 
 def tally(row: dict, name: str) -> int:
@@ -290,15 +270,15 @@ def rate(row: dict, name: str) -> str:
 
 
 def cell(row: dict, name: str) -> str:
-    """Such as `25% (3 of 12)` for a rate of rollouts, a number per 1,000 km, or the mean of another metric."""
-    if METRICS[name].fraction:
-        return UNKNOWN if of(row, name) == UNKNOWN else f"{per_cent(row['metrics'][name]['mean'])} ({of(row, name)})"
-    return per_thousand(row, name) if METRICS[name].per else value(row, name)
+    """Such as `25% (3 of 12)` for a rate of rollouts, else `value`."""
+    if not METRICS[name].fraction or of(row, name) == UNKNOWN:
+        return value(row, name)
+    return f"{per_cent(row['metrics'][name]['mean'])} ({of(row, name)})"
 
 
-def gap(row: dict, other: str, name: str) -> str:
-    """A paired difference such as `-20 [-28, -12]`, of shares in per cent points, of rates per 1,000 km."""
-    found, metric = (row["paired"].get(other) or {}).get(name), METRICS[name]
+def gap(row: dict, name: str) -> str:
+    """The paired difference to `before`, such as `-20 [-28, -12]`: points of per cent, or rates per 1,000 km."""
+    found, metric = (row["paired"].get("before") or {}).get(name), METRICS[name]
     if not found or math.isnan(found["difference"]):
         return UNKNOWN
     scale = 100 if metric.fraction else 1000 if metric.per else 1
@@ -307,15 +287,11 @@ def gap(row: dict, other: str, name: str) -> str:
 
 
 def value(row: dict, name: str) -> str:
-    """The mean of a metric, as the tables print it."""
-    found = row["metrics"].get(name)
-    return number(METRICS[name], found["mean"]) if found and found["n"] else UNKNOWN
-
-
-def per_thousand(row: dict, name: str = "counted_per_km") -> str:
-    """A rate per 1,000 km."""
-    found = row["metrics"].get(name, {}).get("mean", math.nan)
-    return UNKNOWN if math.isnan(found) else f"{1000 * found:,.0f}"
+    """The mean of a metric as the tables print it; a rate of metres or kilometres per 1,000 of them."""
+    found, metric = row["metrics"].get(name), METRICS[name]
+    if not found or not found["n"] or math.isnan(found["mean"]):
+        return UNKNOWN
+    return f"{1000 * found['mean']:,.0f}" if metric.per else number(metric, found["mean"])
 
 
 def per_cent(value: float) -> str:
@@ -330,10 +306,6 @@ def traffic(row: dict) -> str:
 
 def traffic_name(row: dict) -> str:
     return f"{row['method']} at η={row['eta']:g}" if row["eta"] else row["method"]
-
-
-def plural(count: int, word: str) -> str:
-    return f"{count} {word}{'' if count == 1 else 's'}"
 
 
 def wrapped(text: str, width: int, indent: str = "") -> list[str]:

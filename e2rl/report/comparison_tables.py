@@ -5,12 +5,13 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from e2rl.metrics.catalogue import METRICS, STAGES, Metric, table_metrics
+from e2rl.metrics.catalogue import METRICS, Metric, table_metrics
 from e2rl.report.tables import (
     MEANS,
     PAIRED,
     UNKNOWN,
     Table,
+    closed_loop,
     column_names,
     counts,
     difference_cell,
@@ -35,11 +36,6 @@ TRAININGS = (
 UP, PROGRESS, ROUGHNESS = 0.01, 0.97, 1.25  # fraction of rollouts; of the planner's; of the recorded egos'
 
 
-def closed_loop(rows: Sequence[dict]) -> list[dict]:
-    """The rows of rollouts, without those of the stages that measure the prior."""
-    return [row for row in rows if row.get("stage") not in STAGES]
-
-
 def method_tables(
     rows: Sequence[dict], terms: Terms, references: Sequence[str], settings: str = "", table: str = METHODS
 ) -> list[Table]:
@@ -54,10 +50,8 @@ def method_tables(
     """
     group = closed_loop(rows)
     names = column_names(group)
-    labels = [
-        [name, *(term or UNKNOWN for term in terms.get(row["method"], ("", "")))]
-        for name, row in zip(names, group, strict=True)
-    ]
+    known = [[term or UNKNOWN for term in terms.get(row["method"], ("", ""))] for row in group]
+    labels = [[name, *cells] for name, cells in zip(names, known, strict=True)]
     text = f"{origin(group[0])}. {counts(group, names)}"
     note = f"{MEANS} Knowledge: the ego's plan, or its motion predicted; duty: what adversaries owe the ego. {settings}"
     difference = f"{text} Difference of each method to {' and to '.join(references)}"
@@ -89,25 +83,15 @@ def tables_of(
     difference: str,
     references: Mapping[str, str],
 ) -> list[Table]:
-    """The table of means, then that of differences where there are some.
-
-    Args:
-        group: rows of metrics.json.
-        labels: the first cells of each, under `head`.
-        table: of the catalogue.
-        title, caption: of the means.
-        difference: begin of the other caption.
-        references: {name: its key in a row's `paired`}.
-    """
-    metrics = known_metrics(group, table_metrics(table))
-    means = [
-        [*cells, *(mean_cell(metric, row) for metric in metrics)] for cells, row in zip(labels, group, strict=True)
-    ]
+    """The table of means of rows of metrics.json, which begin with `labels` under `head`, then that of differences to
+    the `references` {name: its key in a row's `paired`} where there are some."""
+    metrics, labelled = known_metrics(group, table_metrics(table)), list(zip(labels, group, strict=True))
+    means = [[*cells, *(mean_cell(metric, row) for metric in metrics)] for cells, row in labelled]
     found = [Table(f"{caption.strip().rstrip('.')}.", [*head, *map(heading, metrics)], means, title)]
     pairs = [
         [*cells, name, *(difference_cell(metric, row["paired"][key].get(metric.name)) for metric in metrics)]
         for name, key in references.items()
-        for cells, row in zip(labels, group, strict=True)
+        for cells, row in labelled
         if key in row["paired"]
     ]
     heads = [*head, "minus", *(heading(metric, points=True) for metric in metrics)]
@@ -148,9 +132,8 @@ def ego_tables(
     for metric in (METRICS[name] for name in SHOWN):
         lines = []
         for label in traffic:
-            found = [
-                (cells[first, label]["paired"].get(f"ego {second}") or {}).get(metric.name) for first, second in pairs
-            ]
+            paired = [cells[first, label]["paired"].get(f"ego {second}") or {} for first, second in pairs]
+            found = [each.get(metric.name) for each in paired]
             differences = [difference_cell(metric, value) for value in found]
             differences[1:1] = [relative_cell(value) for value in found[:1]]
             lines.append([label, *(mean_cell(metric, cells[name, label]) for name in names), *differences])

@@ -1,10 +1,9 @@
-"""A heat map of what a curriculum chose: `python -m e2rl.report.curriculum_figure RUN_DIR`.
+"""A heat map of what a curriculum chose.
 
 Rounds run to the right, the arms (intensity within causal template) upwards. Left: the fraction of a round's draws;
 right: the fraction of the policy's episodes in these attacks that failed.
 """
 
-import argparse
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,13 +14,12 @@ from matplotlib.figure import Figure
 
 from e2rl.report import drawing
 from e2rl.report.drawing import new_figure, save_figure
-from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.traffic.traffic import TEMPLATES
 
 CHOICES, PICTURE = "curriculum.csv", "curriculum.png"  # of a run's folder
 Choice = Mapping[str, float | str]  # a row of curriculum.csv
-NUMBERS = ("round", "eta", "draws", "episodes", "failures")
+TEXT, NEEDED = "template", ("round", "eta", "template", "draws", "episodes", "failures", "value")
 LINE, MARGIN, WIDTH, DPI = 14, 90, 900, 144  # points: a line of an arm, the space around them, the width
 PANELS = (("fraction of the round's draws", "viridis"), ("fraction of failed episodes", "magma"))
 
@@ -75,20 +73,16 @@ def _label(axes: Axes, rounds: Sequence[int], arms: Sequence[tuple[str, float]])
 
 
 def read_choices(path: Path) -> list[Choice]:
-    """The rows of a curriculum.csv, all but the template numbers; InputError for a file that is no such table."""
+    """The columns NEEDED of a curriculum.csv, all but the template numbers; InputError for a file that is no such
+    table."""
     try:
         with path.open(newline="") as file:
             rows = list(csv.DictReader(file, strict=True))
-        return [_typed(row) for row in rows]
+        if not {row[TEXT] for row in rows} <= set(TEMPLATES):
+            raise ValueError("a template")
+        return [{name: row[name] if name == TEXT else float(row[name] or "nan") for name in NEEDED} for row in rows]
     except (KeyError, ValueError, TypeError, csv.Error) as error:
         raise InputError(f"{path}: no table of a curriculum's choices ({error}); remove it") from None
-
-
-def _typed(row: Mapping[str, str]) -> Choice:
-    if row["template"] not in TEMPLATES:
-        raise ValueError(f"template {row['template']}")
-    numbers = {name: float(value or "nan") for name, value in row.items() if name != "template"}
-    return {name: numbers[name] for name in NUMBERS} | numbers | {"template": row["template"]}
 
 
 def draw_choices(folder: Path) -> Path | None:
@@ -98,20 +92,3 @@ def draw_choices(folder: Path) -> Path | None:
         return None
     save_figure(folder / PICTURE, choice_map(read_choices(folder / CHOICES)))
     return folder / PICTURE
-
-
-def main() -> None:
-    """The command."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run", type=Path, nargs="+", help="folder of a run of train.py")
-    folders = parser.parse_args().run
-    with ending():
-        for folder in folders:
-            if not (folder / CHOICES).is_file():
-                raise InputError(f"{folder}: no {CHOICES} there; give the folder of a train.py run with logger=csv")
-            draw_choices(folder)
-            print(folder / PICTURE)
-
-
-if __name__ == "__main__":
-    main()

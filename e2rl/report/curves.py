@@ -21,10 +21,9 @@ from e2rl.evaluation.rollout_files import METRICS_FILE, cell, nans, read_metrics
 from e2rl.evaluation.tuning import TUNING_FILE
 from e2rl.metrics.catalogue import METRICS
 from e2rl.report import drawing
-from e2rl.report.comparison_tables import closed_loop
 from e2rl.report.drawing import save_figure
 from e2rl.report.plots import plain_figure
-from e2rl.report.tables import heading
+from e2rl.report.tables import closed_loop, heading
 from e2rl.report.tuning_curve import gain_of, on_curve
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
@@ -68,10 +67,10 @@ def points_of_tuning(result: Mapping, method: str) -> list[Point]:
     """The points of tuning.json: those on the sweep, the best trial, and the nominal traffic beside them."""
     trials, best = result["trials"], result["best"]
     curve, dial = on_curve(trials), next(iter(trials[0]["parameters"]))
-    best_ones = [trial for trial in trials if trial["parameters"] == best][:1]
+    chosen = [trial for trial in trials if trial["parameters"] == best][:1]
     points = [
-        Point(method, dial, gain_of(trial), trial in curve, trial in best_ones, intervals(trial["metrics"]))
-        for trial in [*curve, *(trial for trial in best_ones if trial not in curve)]
+        Point(method, dial, gain_of(trial), trial in curve, trial in chosen, intervals(trial["metrics"]))
+        for trial in [*curve, *(trial for trial in chosen if trial not in curve)]
     ]
     nominal = {name: trials[0]["metrics"].get(f"{name} {NOMINAL}", math.nan) for name in COLUMNS}
     return [*points, Point(NOMINAL, dial, 0.0, True, True, intervals(nominal))]

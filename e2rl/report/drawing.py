@@ -115,6 +115,13 @@ def vulnerable(state: np.ndarray, size: np.ndarray, cyclist: bool) -> list[Shape
     return [*([bicycle] if cyclist else []), disc(state[:2], 0.45, VULNERABLE, ("black", 0.4))]
 
 
+def agent(kind: str, state: np.ndarray, size: np.ndarray, colour: Colour) -> list[Shape]:
+    """An agent of one of the kinds of `recording.AGENT_TYPES`; colour: of a vehicle, or of another thing."""
+    if kind in ("pedestrian", "cyclist"):
+        return vulnerable(state, size, kind == "cyclist")
+    return vehicle(state, size, colour)
+
+
 def contact_mark(point: np.ndarray, phase: float) -> list[Shape]:
     """A dot at a point of contact [2] m and a ring around it, which widens as `phase` goes from 0 to 1."""
     radius, width = 1.9 + 2.6 * phase, 0.34 - 0.18 * phase

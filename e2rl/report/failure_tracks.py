@@ -58,19 +58,20 @@ class Track(NamedTuple):
 
 
 def failure_replay(failure: Failure) -> dict[str, Any]:
-    """The replay of a failure, from the start to AFTER steps beyond the contact, for the data block of the
-    page.
+    """The replay of a failure, from the start to AFTER steps beyond the contact, for the data block of the page.
 
-    `tracks` has the role, length and width [m] of each track, `partner` and `contact` are a track and a step,
-    `point` [m] is where they touch. `motion`
-    encodes the second differences over time of the CHANNELS [6, tracks, K] in their quanta; the gap [m] is that of the
-    ego, and of those in its place, to the partner. `plans` is None where the file has none.
+    `tracks` has the role, length and width [m] of each track, `partner` and `contact` are a track and a step, `point`
+    [m] is where they touch. `motion` encodes the second differences over time of the CHANNELS [6, tracks, K] in their
+    quanta; the gap [m] is that of the ego, and of those in its place, to the partner. `plans` may be None.
     """
     rollout, contact, partner = failure.rollout, failure.contact, failure.partner
     assert contact is not None
     steps = min(contact + AFTER + 1, len(rollout.states))
     rows = np.flatnonzero(rollout.valid[:steps].any(0))
-    tracks = [driven_track(rollout, row, steps) for row in rows.tolist()]
+    driven = rollout.states[:steps], rollout.valid[:steps]
+    tracks = [
+        Track(role_of(rollout, row), rollout.size[row], *(part[:, row] for part in driven)) for row in rows.tolist()
+    ]
     tracks += other_egos(rollout, steps)
     other = int(np.searchsorted(rows, partner))
     motion = np.stack([channels_of(track, tracks[other]) for track in tracks], 1)
@@ -84,12 +85,6 @@ def failure_replay(failure: Failure) -> dict[str, Any]:
         "motion": encode(second_difference(quantised(motion, quanta))),
         "plans": encoded_plans(rollout, rows) if rollout.plans is not None else None,
     }
-
-
-def driven_track(rollout: Rollout, row: int, steps: int) -> Track:
-    """The track of an agent of the rollout."""
-    present = rollout.valid[:steps, row]
-    return Track(role_of(rollout, row), rollout.size[row], rollout.states[:steps, row], present)
 
 
 def role_of(rollout: Rollout, row: int) -> str:
@@ -107,14 +102,17 @@ def role_of(rollout: Rollout, row: int) -> str:
 def other_egos(rollout: Rollout, steps: int) -> list[Track]:
     """Others in the ego's place: the careful and competent driver of UN R157 as the verdict has it, the recording, and
     the evasion that the search found; where the file has them."""
-    ego = rollout.ego
-    size, present = rollout.size[ego], rollout.logged_valid[:steps, ego]
-    recorded, always = Track("recorded", size, rollout.logged[:steps, ego], present), np.ones(steps, bool)
-    driver, evasion = (
-        [] if states is None else [Track(role, size, states[:steps], always)]
-        for role, states in (("driver", rollout.driver), ("evasion", rollout.evasion))
-    )
-    return [*driver, recorded, *evasion]
+    ego, always = rollout.ego, np.ones(steps, bool)
+    known = {
+        "driver": (rollout.driver, always),
+        "recorded": (rollout.logged[:, ego], rollout.logged_valid[:steps, ego]),
+        "evasion": (rollout.evasion, always),
+    }
+    return [
+        Track(role, rollout.size[ego], states[:steps], present)
+        for role, (states, present) in known.items()
+        if states is not None
+    ]
 
 
 def channels_of(track: Track, partner: Track) -> np.ndarray:

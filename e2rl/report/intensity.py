@@ -18,9 +18,9 @@ def intensity_figure(sweep: Sequence[Failure]) -> Figure:
     """Returns a panel for each rollout, in the order of intensity, at the moment of its contact; one without contact is
     shown when the next one that has a contact has it, else at its end."""
     replays = [Replay(each.rollout, each.row, METRES) for each in sweep]
-    rows = math.ceil(len(replays) / COLUMNS)
-    figure = new_figure(*(count * (SIDE + GAP) - GAP for count in (COLUMNS, rows)))
-    wide, high = ([SIDE, *[GAP, SIDE] * (count - 1)] for count in (COLUMNS, rows))
+    sizes = COLUMNS, math.ceil(len(replays) / COLUMNS)
+    figure = new_figure(*(count * (SIDE + GAP) - GAP for count in sizes))
+    wide, high = ([SIDE, *[GAP, SIDE] * (count - 1)] for count in sizes)
     places = figure.add_gridspec(len(high), len(wide), width_ratios=wide, height_ratios=high)
     for index, replay in enumerate(replays):
         contacts = [other.contact for other in replays[index:] if other.contact is not None]

@@ -3,15 +3,15 @@
 from collections.abc import Mapping
 
 from e2rl.metrics.failure_modes import LEAST, MANY
-from e2rl.report.tables import UNKNOWN, Table, column_names
+from e2rl.report.tables import UNKNOWN, Table, column_names, plural
 
 VERDICTS = {"counted": "counts", "preventable": "preventable", "at_fault": "at fault", "avoidable": "avoidable"}
 SPEEDS = {"ego_speed": "ego [m/s]", "partner_speed": "partner [m/s]"}
 
 
 def mode_tables(found: Mapping) -> list[Table]:
-    """Returns a table of failure modes for each ego: a row for each mode, with its share of the failures of each method
-    and intensity, verdicts and mean speeds; no table without failures.
+    """Returns a table of failure modes for each ego: a row for each mode, with its fraction of the failures of each
+    method and intensity, verdicts and mean speeds; no table without failures.
 
     Of several egos the modes are common, and so are their verdicts and speeds.
     """
@@ -28,18 +28,18 @@ def mode_table(found: Mapping, ego: str, several: bool) -> Table:
     for mode in found["modes"]:
         if count := sum(mode["groups"][index]["count"] for index in chosen):
             failures += count
-            shares = [mode["groups"][index]["share"] for index in chosen] + [mode[name] for name in known]
+            fractions = [mode["groups"][index]["fraction"] for index in chosen] + [mode[name] for name in known]
             name = mode["name"] if mode["name"] == "other" else f"{mode['mode']}. {mode['name']}"
             speeds = [UNKNOWN if mode[name] is None else f"{mode[name]:.1f}" for name in SPEEDS]
-            rows.append([name, str(count), *map(percent, shares), *speeds])
+            rows.append([name, str(count), *map(percent, fractions), *speeds])
     if rows:
-        cells = [f"{each['failures']} in {each['modes']} mode{'' if each['modes'] == 1 else 's'}" for each in groups]
+        cells = [f"{each['failures']} in {plural(each['modes'], 'mode')}" for each in groups]
         rows.append(["all failures", str(failures), *cells, *[""] * (len(known) + len(SPEEDS))])
     columns = [*column_names(groups), *known.values()]
     head = ["", "failures", *(f"{name} [%]" for name in columns), *SPEEDS.values()]
     text = (
-        f"Failure modes of {ego}: share of each method's collisions; verdicts and mean speeds just before contact, of "
-        f"the mode's collisions{' with any ego' if several else ''}. Each word holds for two thirds of them; other: "
+        f"Failure modes of {ego}: fraction of each method's collisions; verdicts and mean speeds just before contact, "
+        f"of the mode's collisions{' with any ego' if several else ''}. Each word holds for two thirds of them; other: "
         f"modes of less than {LEAST:.0%}, or of one collision of {MANY} or more. `e2rl replay RUN_DIR --modes` draws a "
         "typical one of each."
     )

@@ -113,11 +113,7 @@ class Replay:
             logged = interpolated(rollout.logged, rollout.logged_valid, time)
             shapes.append(Shape(placed(drawing.BOX, logged[ego], size[ego]), "none", drawing.EGO, 0.14))
         for agent in sorted(np.flatnonzero(rollout.valid[step]).tolist(), key=self.layer):
-            kind = rollout.agent_type[agent]
-            if kind in ("pedestrian", "cyclist"):
-                shapes += drawing.vulnerable(states[agent], size[agent], kind == "cyclist")
-            else:
-                shapes += drawing.vehicle(states[agent], size[agent], self.colour(agent))
+            shapes += drawing.agent(rollout.agent_type[agent], states[agent], size[agent], self.colour(agent))
         if phase is not None:
             shapes += drawing.contact_mark(contact_point(rollout, step, self.row["partner"]), phase)
         return shapes

@@ -1,10 +1,10 @@
 """Plots of numbers: collision rates of several egos as bars, and learning curves over environment steps."""
 
 import csv
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -35,14 +35,11 @@ def collision_bars(rows: Sequence[dict], names: Sequence[str], method: str) -> F
     width = 0.8 / len(names)
     for index, name in enumerate(names):
         found = [cells[name, label]["metrics"]["cfr"] for label in traffic]
-        places = [group + (index - (len(names) - 1) / 2) * width for group in range(len(traffic))]
-        means = [100 * value["mean"] for value in found]
-        gaps = [[abs(100 * (value[end] - value["mean"])) for value in found] for end in ("low", "high")]
-        gaps = [[0 if math.isnan(gap) else gap for gap in side] for side in gaps]
+        places = np.arange(len(traffic)) + (index - (len(names) - 1) / 2) * width
+        means, *ends = 100 * np.array([[value[end] for value in found] for end in ("mean", "low", "high")])
+        style = {"color": COLOURS[index % len(COLOURS)], "label": name, "yerr": np.nan_to_num(np.abs(ends - means))}
         error = {"ecolor": drawing.INK, "capsize": 3, "elinewidth": 1}
-        axes[0].bar(
-            places, means, 0.92 * width, yerr=gaps, color=COLOURS[index % len(COLOURS)], label=name, error_kw=error
-        )
+        axes[0].bar(places, means, 0.92 * width, error_kw=error, **style)
     axes[0].set_xticks(range(len(traffic)), traffic)
     axes[0].set_ylabel(f"{METRICS['cfr'].about} [%]")
     axes[0].set_ylim(bottom=0)
@@ -84,9 +81,8 @@ def read_curves(run: Path) -> dict[str, tuple[list[float], list[float]]]:
     result = {}
     for name, _, before in CURVES:
         values, done = read_scalar(logs / f"{name}.csv"), earlier if before else steps
-        points = [(done[number], value) for number, value in sorted(values.items()) if number in done]
-        if points:
-            result[name] = ([step for step, _ in points], [value for _, value in points])
+        if shared := sorted(values.keys() & done.keys()):
+            result[name] = ([done[number] for number in shared], [values[number] for number in shared])
     return result
 
 

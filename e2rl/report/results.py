@@ -1,6 +1,6 @@
 """What an evaluation leaves behind: tables.md, figures, the failure report, and the lines that answer it."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -31,10 +31,6 @@ from e2rl.run.run import Run
 
 NOMINAL = "nominal"  # traffic without an attack, which every attack is compared with
 MAIN = "main"  # table of metrics
-FIGURES: Mapping[str, Callable[[Path, Sequence[dict]], object]] = {
-    "intensity": lambda folder, rows: save_figure(folder / "intensity.png", intensity_figure(intensity_sweep(folder))),
-    "curves": lambda folder, rows: save_curves(folder, points_of_rows(rows)),
-}
 
 
 def write_results(run: Run, plan: Plan, rows: Sequence[dict]) -> list[str]:
@@ -50,8 +46,10 @@ def write_results(run: Run, plan: Plan, rows: Sequence[dict]) -> list[str]:
     save_tables(folder / "tables.md", tables)
     if asked.metrics == ALL:
         print_tables(tables)
-    if asked.figure:
-        FIGURES[asked.figure](folder, rows)
+    if asked.figure == "intensity":
+        save_figure(folder / "intensity.png", intensity_figure(intensity_sweep(folder)))
+    if asked.figure == "curves":
+        save_curves(folder, points_of_rows(rows))
     shown = asked.report and asked.save_rollouts and modes["failures"]
     page = write_report(folder, rows, modes, tables) if shown else None
     return answer_lines(rows, modes, folder, page, dropped)
@@ -91,18 +89,17 @@ def egos_tables(run: Run, plan: Plan, rows: Sequence[dict], text: str) -> list[T
         return tables
     bars = collision_bars(rows, egos.names, run.config.synthesizer.name)
     save_figure(run.folder / "policy_learning.png", bars)
-    if runs := list(curve_runs(run.config)):
+    if runs := curve_runs(run.config):
         save_figure(run.folder / "curves.png", learning_curves(runs))
     recorded = recorded_acceleration(plan.scenes)
     return [*tables, guard_table(rows, roles.before, roles.after, roles.planner, recorded)]
 
 
-def curve_runs(config: DictConfig) -> Iterator[Path]:
+def curve_runs(config: DictConfig) -> list[Path]:
     """The run folders whose learning curves are drawn: `policy_learning.runs`, or null: those among the checkpoints of
     `policy_learning.after` that have logged scalars."""
     if config.policy_learning.runs is not None:
-        yield from map(Path, config.policy_learning.runs)
-        return
-    for entry in trainings_of(config, config.policy_learning.after).values():
-        if entry.get("checkpoint") and (Path(entry["checkpoint"]) / "logs").is_dir():
-            yield Path(entry["checkpoint"])
+        return list(map(Path, config.policy_learning.runs))
+    trained = trainings_of(config, config.policy_learning.after).values()
+    folders = [Path(entry["checkpoint"]) for entry in trained if entry.get("checkpoint")]
+    return [folder for folder in folders if (folder / "logs").is_dir()]

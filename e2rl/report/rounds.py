@@ -20,18 +20,14 @@ METRES, PIXELS = 60.0, 360  # side of a video's picture
 def round_line(metrics: Mapping[str, float], number: int, rounds: int) -> str:
     """A round in one line of at most 100 characters, errored rollouts apart."""
     hit, left_out = metrics.get("synthesizer/contact", float("nan")), metrics["synthesizer/left_out"]
+    found = {name.rpartition("/errored_")[2]: count for name, count in metrics.items() if "/errored_" in name}
+    reasons = ", ".join(f"{count:.0f} {reason.replace('_', ' ')}" for reason, count in found.items())
+    errored = f", without a score: {reasons}" if reasons else ""
     left = f", {left_out:.0f} left out" if left_out else ""
     return (
         f"round {number}/{rounds}: the attacks hit in {hit:.0%} of {metrics['synthesizer/scenes']:.0f} scenes{left} "
-        f"(eta {metrics['synthesizer/eta']:.2f}); {metrics['time/improve']:.0f} s learning{errored_text(metrics)}"
+        f"(eta {metrics['synthesizer/eta']:.2f}); {metrics['time/improve']:.0f} s learning{errored}"
     )
-
-
-def errored_text(metrics: Mapping[str, float]) -> str:
-    """How many rollouts and episodes errored, and why; "" for none."""
-    found = {name.rpartition("/errored_")[2]: count for name, count in metrics.items() if "/errored_" in name}
-    reasons = ", ".join(f"{count:.0f} {reason.replace('_', ' ')}" for reason, count in found.items())
-    return f", without a score: {reasons}" if reasons else ""
 
 
 def save_videos(

@@ -1,6 +1,4 @@
-"""The selection of a coalition shown in the skeleton figure.
-
-The skeleton figure: from pairwise risk to an active chain, for one coalition of a real rollout (Sec. IV-A).
+"""The skeleton figure: from pairwise risk to an active chain, for one coalition of a real rollout (Sec. IV-A).
 
 Three panels: the times to collision in the reference rollout, when the links of the coalition weigh most; the risk
 graph at that time; the chain when it was chosen, with the paths that were driven after it.
@@ -167,11 +165,6 @@ class SkeletonPicture:
             text.set(color=drawing.INK, path_effects=outline, zorder=ON_TOP + 1, clip_on=True)
 
 
-def skeleton_figure(rollout: Rollout, selection: Selection) -> Figure:
-    """The figure of a selection (B = 1) and of the rollout that it belongs to."""
-    return SkeletonPicture(rollout, selection).figure()
-
-
 def name(agent: int) -> str:
     return "ego" if agent == 0 else str(agent)
 
@@ -195,22 +188,18 @@ class LongestChain:
             if rank > self.rank:
                 self.longest, self.rank = take_rows(selection, torch.tensor([row])), rank
 
-    @property
-    def selection(self) -> Selection:
-        """The longest selection; InputError if no adversary was chosen."""
+    def figure(self, scenes: SceneSet, ego_name: str, folder: Path) -> Figure:
+        """The figure of the longest selection and its rollout, read from a run's folder; InputError if no adversary was
+        chosen."""
         if self.longest is None:
             raise InputError(
-                f"figure=skeleton: {self.method.name} at eta={self.method.eta:g} chose no adversary in any scene; name "
-                "e2 first in methods, at an eta above 0, and evaluate more scenes, or name one with scene="
+                f"skeleton: {self.method.name} at eta={self.method.eta:g} chose no adversary in any scene; name e2 "
+                "first in methods, at an eta above 0, and evaluate more scenes, or name one with scene="
             )
-        return self.longest
-
-    def rollout(self, scenes: SceneSet, ego_name: str, folder: Path) -> Rollout:
-        """The rollout of the longest selection, from its file; InputError if no adversary was chosen."""
-        seed, scene = divmod(int(self.selection.seed), SEEDS_APART)
+        seed, scene = divmod(int(self.longest.seed), SEEDS_APART)
         identity = {"method": self.method.name, "ego_policy": ego_name, "eta": self.method.eta}
         name = rollout_name(identity | {"scene_id": scenes.scene_id[scene], "seed": seed})
-        return Rollout.read(Path(folder) / ROLLOUTS / name)
+        return SkeletonPicture(Rollout.read(Path(folder) / ROLLOUTS / name), self.longest).figure()
 
 
 def link_risk(selection: Selection) -> Tensor:

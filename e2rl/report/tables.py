@@ -128,6 +128,15 @@ def known_metrics(group: Sequence[dict], metrics: Iterable[Metric]) -> list[Metr
     return [metric for metric in metrics if any(row["metrics"].get(metric.name, {}).get("n", 0) for row in group)]
 
 
+def closed_loop(rows: Sequence[dict]) -> list[dict]:
+    """The rows of rollouts, without those of the stages that measure the prior."""
+    return [row for row in rows if row.get("stage") not in STAGES]
+
+
+def plural(count: int, word: str) -> str:
+    return f"{count} {word}{'' if count == 1 else 's'}"
+
+
 def origin(row: dict) -> str:
     return f"{row['dataset']}/{row['split']}, ego {row['ego']}"
 
@@ -140,7 +149,7 @@ def counts(group: Sequence[dict], names: Sequence[str], per: str = "method") -> 
         numbers = {"scene": row["n_scenes"], "seed": row["n_seeds"], "rollout": row["n_rollouts"]}
         if row.get("n_trainings", 1) > 1:
             numbers["training"] = row["n_trainings"]
-        failed = [f"{count} rollouts without a score ({reason})" for reason, count in row.get("ended", {}).items()]
+        failed = [f"{count} rollouts without a score ({reason})" for reason, count in row.get("errored", {}).items()]
         texts.append(", ".join([*(f"{n} {word}{'' if n == 1 else 's'}" for word, n in numbers.items()), *failed]))
     if len(set(texts)) == 1:
         return f"{texts[0]} per {per}."

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from e2rl.evaluation.rollout_files import cell
@@ -50,30 +49,24 @@ def curve_csv(trials: Sequence[dict]) -> str:
 
 
 def curve_figure(trials: Sequence[dict], method: str) -> Figure:
-    """Returns a panel for each of PANELS: the curve over the gain with 95% intervals, the other trials as dots."""
+    """Returns a panel for each of PANELS: the curve over the gain with 95% intervals, the other trials as dots; hollow
+    are trials that are refused."""
     figure, panels = plain_figure(SIDE * len(PANELS), RISE, len(PANELS))
-    curve = on_curve(trials)
+    curve, gain = on_curve(trials), next(iter(trials[0]["parameters"]))
     for axes, (metric, title) in zip(panels, PANELS, strict=True):
-        points = [(trial["metrics"][REALISM], 100 * trial["metrics"][metric]) for trial in curve]
-        axes.plot(*zip(*points, strict=True), color=drawing.EGO, linewidth=1)
-        for trial in trials:
-            _draw(axes, trial, metric, trial in curve)
+        places = [(trial["metrics"][REALISM], 100 * trial["metrics"][metric]) for trial in trials]
+        axes.plot(*zip(*(places[trials.index(trial)] for trial in curve), strict=True), color=drawing.EGO, linewidth=1)
+        for trial, (x, y) in zip(trials, places, strict=True):
+            on = trial in curve
+            colour = drawing.EGO if on else drawing.BACKGROUND
+            face = colour if trial["admissible"] else drawing.PANEL
+            axes.plot(x, y, marker="o", markersize=5, color=colour, markerfacecolor=face, zorder=2 + on)
+            if on and not math.isnan(x):
+                low, high = (100 * trial["metrics"][f"{metric}_{end}"] for end in ("low", "high"))
+                axes.vlines(x, low, high, color=drawing.EGO, linewidth=0.8, alpha=0.5)
+                axes.annotate(f"{gain_of(trial):.2g}", (x, y), (4, 4), textcoords="offset points", fontsize=7)
         axes.set_title(title, fontsize=10)
         axes.set_xlabel(f"realism of the adversaries ({REALISM})")
         axes.set_ylim(bottom=0)
-    gain = next(iter(trials[0]["parameters"]))
     figure.suptitle(f"{method}: {gain} written at its points; hollow: refused", fontsize=9)
     return figure
-
-
-def _draw(axes: Axes, trial: dict, metric: str, on: bool) -> None:
-    """Draw a trial, hollow where it is refused; on the curve also its interval and its gain."""
-    x, y = trial["metrics"][REALISM], 100 * trial["metrics"][metric]
-    colour = drawing.EGO if on else drawing.BACKGROUND
-    face = colour if trial["admissible"] else drawing.PANEL
-    axes.plot(x, y, marker="o", markersize=5, color=colour, markerfacecolor=face, linestyle="none", zorder=2 + on)
-    low, high = (100 * trial["metrics"][f"{metric}_{end}"] for end in ("low", "high"))
-    if on and not math.isnan(low):
-        axes.vlines(x, low, high, color=drawing.EGO, linewidth=0.8, alpha=0.5)
-    if on and not math.isnan(x):
-        axes.annotate(f"{gain_of(trial):.2g}", (x, y), xytext=(4, 4), textcoords="offset points", fontsize=7)

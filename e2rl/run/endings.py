@@ -19,42 +19,6 @@ WRITING = {
 }
 
 
-@contextmanager
-def ending(go_on: str | Callable[[], str] = "") -> Iterator[None]:
-    """End the process where the block ends early, with one line on stderr.
-
-    The status is 2 for bad input, 1 for a file that cannot be written, 130 for Ctrl-C, 143 for SIGTERM. Libraries may
-    turn the interrupt into an error of their own, or lose it on the way; what counts is that the signal arrived.
-
-    Args:
-        go_on: the command that goes on where this one ends, or a function that returns it; by default the same again.
-    """
-    arrived: list[int] = []
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        arrived.append(number)
-        raise KeyboardInterrupt
-
-    heeded = [each for each in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(each) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, interrupt) for number in heeded}
-    try:
-        yield
-    except (Exception, KeyboardInterrupt) as error:
-        if arrived or isinstance(error, KeyboardInterrupt):
-            number = signal.Signals(arrived[0] if arrived else signal.SIGINT)
-            _end(f"\ninterrupted ({number.name}); go on with: {_command(go_on)}", 128 + number)
-        if isinstance(error, InputError):
-            _end(f"error: {' '.join(str(error).split())}", 2)
-        failed = error.__cause__ if isinstance(error.__cause__, OSError) else error  # of logging that is set up
-        if isinstance(failed, OSError) and failed.errno in WRITING:
-            reason = f"{failed.filename}: cannot be written ({failed.strerror}); what was written before is whole"
-            _end(f"\nerror: {reason}. Mend that, then go on with: {_command(go_on)}", 1)
-        raise
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def program() -> list[str]:
     """Returns the words that start the running command: `python evaluate.py`, `e2rl evaluate`, `python -m MODULE`."""
     script, package = Path(sys.argv[0]), Path(__file__).parents[1]
@@ -70,14 +34,46 @@ def command_line() -> str:
     return shlex.join([*program(), *sys.argv[1:]])
 
 
+@contextmanager
+def ending(go_on: Callable[[], str] = command_line) -> Iterator[None]:
+    """End the process where the block ends early, with one line on stderr.
+
+    The status is 2 for bad input, 1 for a file that cannot be written, 130 for Ctrl-C, 143 for SIGTERM. Libraries may
+    turn the interrupt into an error of their own, or lose it on the way; what counts is that the signal arrived.
+
+    Args:
+        go_on: returns the command that goes on where this one ends; by default the same again.
+    """
+    arrived: list[int] = []
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        arrived.append(number)
+        raise KeyboardInterrupt
+
+    heeded = [each for each in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(each) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, interrupt) for number in heeded}
+    try:
+        yield
+    except (Exception, KeyboardInterrupt) as error:
+        if arrived or isinstance(error, KeyboardInterrupt):
+            number = signal.Signals(arrived[0] if arrived else signal.SIGINT)
+            _end(f"\ninterrupted ({number.name}); go on with: {go_on()}", 128 + number)
+        if isinstance(error, InputError):
+            _end(f"error: {' '.join(str(error).split())}", 2)
+        failed = error.__cause__ if isinstance(error.__cause__, OSError) else error  # of logging that is set up
+        if isinstance(failed, OSError) and failed.errno in WRITING:
+            reason = f"{failed.filename}: cannot be written ({failed.strerror}); what was written before is whole"
+            _end(f"\nerror: {reason}. Mend that, then go on with: {go_on()}", 1)
+        raise
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def kill_workers(others: set | None = None) -> None:
     """Kill the worker processes of this process, but for `others`."""
     for child in set(multiprocessing.active_children()) - (others or set()):
         child.kill()
-
-
-def _command(go_on: str | Callable[[], str]) -> str:
-    return (go_on() if callable(go_on) else go_on) or command_line()
 
 
 def _end(message: str, status: int) -> NoReturn:

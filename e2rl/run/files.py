@@ -29,6 +29,7 @@ from e2rl.run.errors import InputError
 
 MAX_ARRAYS = 1 << 30  # bytes of one npz, unpacked
 WAIT = 5  # s that another run's workers have to end
+HASH = "sha256"  # key in the header of a file of weights
 SEAL = "sha256.json"  # of a sealed folder: {file: hash}
 DAMAGED = (OSError, EOFError, LookupError, TypeError, ValueError, RuntimeError, MemoryError, SyntaxError)
 
@@ -197,7 +198,7 @@ def _truth(array: np.ndarray) -> np.ndarray:
     return array.view(np.uint8) != 0 if array.dtype.kind == "b" and array.shape else array
 
 
-HASH = "sha256"  # key of the header
+# --- weights
 
 
 def weight_bytes(weights: Mapping[str, Tensor], header: Mapping[str, str]) -> bytes:

@@ -82,11 +82,6 @@ class Run:
             left.unlink(missing_ok=True)
         return cls(saved, folder, known["choices"], free)
 
-    @property
-    def resumed(self) -> bool:
-        """Whether it goes on with a run that was begun before."""
-        return bool(self.config.resume)
-
     def parts(self, stage: str = "", about: str = "") -> Parts:
         """Returns the parts of a stage that are done."""
         return Parts(self.folder, stage, about)
@@ -113,7 +108,7 @@ class Run:
             "inputs": lists | dict(inputs(self.config)),
             "files": {name: files for name, (_, files) in scenes.items()},
         }
-        if self.resumed:
+        if self.config.resume:
             self._compare(json.loads(json.dumps(now)))
             return
         write_atomically(self.folder / CONFIG, OmegaConf.to_yaml(self.config))

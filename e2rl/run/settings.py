@@ -40,7 +40,8 @@ def setting(
 def configured(file: str, part: str = "") -> Callable[[Kind], Kind]:
     """Returns a class decorator: arguments that are not given have the values of conf/<file>.yaml.
 
-    So a default stands in the YAML file only, and whoever builds the class gets what the command line gets.
+    So a default stands in the YAML file only, and whoever builds the class gets what the command line gets. A class
+    that takes any keyword gets all values of the file.
 
     Args:
         file: such as "synthesizer/diffscene"; its `defaults` list is not followed.
@@ -50,14 +51,15 @@ def configured(file: str, part: str = "") -> Callable[[Kind], Kind]:
     def decorate(kind: Kind) -> Kind:
         build = kind.__init__  # type: ignore[misc]
         signature = inspect.signature(build)
+        takes_any = any(each.kind is each.VAR_KEYWORD for each in signature.parameters.values())
 
         @wraps(build)
         def filled(self: Any, *positional: Any, **named: Any) -> None:
-            given = signature.bind_partial(self, *positional, **named).arguments
+            given = {*signature.bind_partial(self, *positional, **named).arguments, *named}
             values = file_values(file, part)
-            build(
-                self, *positional, **named, **{k: values[k] for k in signature.parameters if k in values.keys() - given}
-            )
+            wanted = values.keys() - {"_target_"} if takes_any else signature.parameters.keys()
+            missing = {name: value for name, value in values.items() if name in wanted and name not in given}
+            build(self, *positional, **named, **missing)
             if is_dataclass(kind):
                 check_settings(self, ".".join(filter(None, (file.partition("/")[0], part))))
 

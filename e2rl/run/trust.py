@@ -69,15 +69,17 @@ def check_code(config: DictConfig, allowed: Sequence[str], where: str) -> None:
     command or an address for an extension, other than of the modules `allowed`; or another of Hydra's keys."""
     plain = OmegaConf.to_container(config)
     assert isinstance(plain, dict)
-    keys = {part for key in _keys(plain) for part in re.split(r"[.\[\]]", key)}
+    nodes = list(_nodes(plain))
+    keys = {part for key, _ in nodes for part in re.split(r"[.\[\]]", key)}
     if hidden := sorted(key for key in keys if key.startswith("_") and key != "_target_"):
         raise InputError(f"{where}: its configuration has {', '.join(hidden)}, which no run of e2rl needs; take it out")
     plugins = plain.get("plugins") or []
     if not isinstance(plugins, list):
         raise InputError(f"{where}: its configuration is damaged (plugins: {str(plugins)[:40]}); restore it")
     named = [str(name) for name in plugins]
-    named += [target for target in _targets(plain) if not _is_extension(target)]
-    named += [text for text in _texts(plain) if "${" in text and ":" in text]  # a resolver: what it makes is unknown
+    named += [str(target) for key, target in nodes if "_target_" in key and not _is_extension(str(target))]
+    texts = [text for node in nodes for text in node if isinstance(text, str)]
+    named += [text for text in texts if "${" in text and ":" in text]  # a resolver: what it makes is unknown
     named += starting_modules(plain)
     outside = [name for name in named if not any(name == own or name.startswith(f"{own}.") for own in allowed)]
     if outside:
@@ -103,41 +105,18 @@ def starting_modules(plain: Any) -> set[str]:
     return found | {PROGRAM for key, value in named if "file" in key and not value.endswith(ARITHMETIC)}
 
 
-def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """(dotted key, value) of every value in nested containers."""
+def leaves(value: Any) -> Iterator[tuple[str, Any]]:
+    """(dotted key, value) of every value in nested containers that is no container."""
+    return ((key, part) for key, part in _nodes(value) if not isinstance(part, dict | list))
+
+
+def _nodes(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted key, value) of every value in nested containers, containers included."""
     if isinstance(value, dict | list):
         for name, part in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from leaves(part, f"{key}.{name}" if key else str(name))
-    else:
-        yield key, value
-
-
-def _targets(value: Any) -> Iterator[str]:
-    """Every `_target_` in nested containers, as written; also of changes, whose keys are paths (`ego._target_`)."""
-    if isinstance(value, dict):
-        yield from (str(part) for key, part in value.items() if "_target_" in str(key))
-    for part in _parts(value):
-        yield from _targets(part)
-
-
-def _keys(value: Any) -> Iterator[str]:
-    """Every key in nested containers."""
-    if isinstance(value, dict):
-        yield from map(str, value)
-    for part in _parts(value):
-        yield from _keys(part)
-
-
-def _texts(value: Any) -> Iterator[str]:
-    """Every string in nested containers, keys included, as written."""
-    if isinstance(value, str):
-        yield value
-    for part in _parts(value):
-        yield from _texts(part)
-
-
-def _parts(value: Any) -> list:
-    return [*value, *value.values()] if isinstance(value, dict) else value if isinstance(value, list) else []
+            below = f"{key}.{name}" if key else str(name)
+            yield below, part
+            yield from _nodes(part, below)
 
 
 def _is_extension(target: str) -> bool:

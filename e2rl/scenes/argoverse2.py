@@ -23,13 +23,11 @@ from e2rl.scenes.source import Source
 FILES = ("scenario_*.parquet", "annotations*.feather")
 LEVELS = ("", "*/", "*/*/")  # of folders below `path` in which logs are looked for
 TYPES = {  # by the object types of scenarios and the categories of annotations, in lower case; others are OTHER
-    **dict.fromkeys(("vehicle", "bus", "motorcyclist"), VEHICLE),
-    **dict.fromkeys(
-        ("regular_vehicle", "large_vehicle", "box_truck", "truck", "truck_cab", "vehicular_trailer"), VEHICLE
-    ),
-    **dict.fromkeys(("school_bus", "articulated_bus", "motorcycle", "railed_vehicle"), VEHICLE),
-    **dict.fromkeys(("pedestrian", "official_signaler", "stroller", "wheelchair"), PEDESTRIAN),
-    **dict.fromkeys(("cyclist", "bicyclist", "wheeled_rider"), CYCLIST),
+    **dict.fromkeys(["vehicle", "regular_vehicle", "large_vehicle", "box_truck", "truck", "truck_cab"], VEHICLE),
+    **dict.fromkeys(["vehicular_trailer", "bus", "school_bus", "articulated_bus", "railed_vehicle"], VEHICLE),
+    **dict.fromkeys(["motorcyclist", "motorcycle"], VEHICLE),
+    **dict.fromkeys(["pedestrian", "official_signaler", "stroller", "wheelchair"], PEDESTRIAN),
+    **dict.fromkeys(["cyclist", "bicyclist", "wheeled_rider"], CYCLIST),
 }
 SIZES = {  # m, of the object types of scenarios, which hold no sizes
     "vehicle": (4.7, 1.9),
@@ -114,7 +112,8 @@ def _scenario(path: Path) -> Recording:
     size = np.array([SIZES.get(kind, SMALL) for kind in kinds])
     size[ego] = EGO_SIZE
     seconds = (np.asarray(scenario.timestamps_ns, float) - scenario.timestamps_ns[0]) / 1e9
-    return _recording(scenario.scenario_id, scenario.city_name, states, valid, size, kinds, ego, seconds)
+    arrays = (*resample_uniform(states, valid, seconds), size, _types(kinds))
+    return Recording(scenario.scenario_id, scenario.city_name, "argoverse2", *arrays, ego, {}, current=None)
 
 
 def _sensor_log(path: Path) -> Recording:
@@ -144,22 +143,12 @@ def _sensor_log(path: Path) -> Recording:
     size = np.stack([EGO_SIZE, *table[["length_m", "width_m"]].to_numpy(float)[first]])
     kinds = ["regular_vehicle", *table["category"].to_numpy()[first]]
     code = _files(path)[-1].stem.split("____")[-1].split("_")[0]
-    return _recording(path.parent.name, CITIES.get(code, code), states, valid, size, kinds, 0, seconds)
+    arrays = (*resample_uniform(states, valid, seconds), size, _types(kinds))
+    return Recording(path.parent.name, CITIES.get(code, code), "argoverse2", *arrays, 0, {}, current=None)
 
 
-def _recording(
-    scene_id: str,
-    city: str,
-    states: np.ndarray,
-    valid: np.ndarray,
-    size: np.ndarray,
-    kinds: list[str],
-    ego: int,
-    seconds: np.ndarray,
-) -> Recording:
-    states, valid = resample_uniform(states, valid, seconds)
-    types = np.array([TYPES.get(kind.lower(), OTHER) for kind in kinds])
-    return Recording(scene_id, city, "argoverse2", states, valid, size, types, ego, {}, current=None)
+def _types(kinds: list[str]) -> np.ndarray:
+    return np.array([TYPES.get(kind.lower(), OTHER) for kind in kinds])
 
 
 def _forward(w: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -78,14 +78,14 @@ def asset_bytes(split: str) -> bytes:
     return path.read_bytes()
 
 
-def unpack(content: bytes, name: str) -> dict[str, np.ndarray]:
-    """Returns the arrays of an archive's bytes; raises InputError where they are damaged or of another format."""
+def unpack(split: str) -> dict[str, np.ndarray]:
+    """Returns the arrays of a split's archive; raises InputError where they are damaged or of another format."""
     try:
-        arrays = read_arrays(io.BytesIO(content))
+        arrays = read_arrays(io.BytesIO(asset_bytes(split)))
+        if str(arrays.get("format")) != FORMAT:
+            raise ValueError(f"its format is not {FORMAT}")
     except ValueError as error:
-        raise InputError(f"bundled scenes {name}: damaged ({error}); {MEND}") from error
-    if str(arrays.get("format")) != FORMAT:
-        raise InputError(f"bundled scenes {name}: format {arrays.get('format')}, expected {FORMAT}; {MEND}")
+        raise InputError(f"bundled scenes {split}: damaged ({error}); {MEND}") from error
     return arrays
 
 
@@ -118,28 +118,23 @@ def read_maps(arrays: dict[str, np.ndarray]) -> list[SceneMap]:
     ]
 
 
-def read_recordings(arrays: dict[str, np.ndarray], name: str) -> list[Recording]:
-    """Returns the validated recordings of an archive; raises InputError where its arrays do not fit together."""
-    try:
-        maps, counts = read_maps(arrays), arrays["scene_agents"]
-        states = np.cumsum(np.cumsum(arrays["states"], axis=1), axis=1) * UNIT
-        states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
-        states[~arrays["valid"]] = 0.0
-        scenes = [arrays[key] for key in ("scene_id", "scene_map", "scene_first", "scene_ego")]
-        tracks = [_split(values, counts) for values in (states, arrays["valid"], arrays["size"] * MILLI)]
-        return [
-            maps[index].recording(str(scene_id), first, states.swapaxes(0, 1), valid.T, size, int(ego)).validate()
-            for scene_id, index, first, ego, states, valid, size in zip(*scenes, *tracks, strict=True)
-        ]
-    except (KeyError, IndexError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"bundled scenes {name}: arrays do not fit together ({error!r}); {MEND}") from error
+def read_recordings(arrays: dict[str, np.ndarray]) -> list[Recording]:
+    """Returns the recordings of an archive."""
+    maps, counts = read_maps(arrays), arrays["scene_agents"]
+    states = np.cumsum(np.cumsum(arrays["states"], axis=1), axis=1) * UNIT
+    states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
+    states[~arrays["valid"]] = 0.0
+    scenes = [arrays[key] for key in ("scene_id", "scene_map", "scene_first", "scene_ego")]
+    tracks = [_split(values, counts) for values in (states, arrays["valid"], arrays["size"] * MILLI)]
+    return [
+        maps[index].recording(str(scene_id), first, states.swapaxes(0, 1), valid.T, size, int(ego))
+        for scene_id, index, first, ego, states, valid, size in zip(*scenes, *tracks, strict=True)
+    ]
 
 
 def load_recordings(split: str) -> list[Recording]:
     """Returns the bundled recordings of a split; raises InputError for a missing or damaged asset."""
-    return read_recordings(unpack(asset_bytes(split), split), split)
+    return read_recordings(unpack(split))
 
 
 @lru_cache(maxsize=1)

@@ -22,10 +22,8 @@ from e2rl.scenes.recording import (
     CYCLIST,
     DT,
     HISTORY,
-    LIGHT_GREEN,
-    LIGHT_RED,
     LIGHT_UNKNOWN,
-    LIGHT_YELLOW,
+    LIGHTS,
     OTHER,
     PEDESTRIAN,
     VEHICLE,
@@ -35,12 +33,10 @@ from e2rl.scenes.recording import (
 from e2rl.scenes.smoothing import resample_uniform
 
 TYPES = {  # by the name of an ObstacleType
-    **dict.fromkeys(
-        ("car", "truck", "bus", "motorcycle", "taxi", "priorityVehicle", "parkedVehicle", "vehicle"), VEHICLE
-    ),
+    **dict.fromkeys(["car", "truck", "bus", "motorcycle", "taxi", "vehicle"], VEHICLE),
+    **dict.fromkeys(["priorityVehicle", "parkedVehicle"], VEHICLE),
     **{"bicycle": CYCLIST, "pedestrian": PEDESTRIAN},
 }
-LIGHTS = {"red": LIGHT_RED, "redYellow": LIGHT_RED, "yellow": LIGHT_YELLOW, "green": LIGHT_GREEN}
 FOR_OTHERS = {"sidewalk", "crosswalk", "bicycleLane", "busStop", "border", "parking", "restricted_area"}  # LaneletType
 MOVES, NEAR = 0.5, 1.0  # m/s, m: a vehicle that moves; from a planning problem's start
 NUMBERS = {"x", "y", "z", "exact", "intervalStart", "intervalEnd", "length", "width", "radius", "orientation"}
@@ -233,6 +229,6 @@ def _lights(network: Any, lanes: dict[str, Lane], steps: np.ndarray) -> dict[str
         light = network.find_traffic_light_by_id(*lanelet.traffic_lights) if len(lanelet.traffic_lights) == 1 else None
         if light is None or not light.active or light.traffic_light_cycle is None:
             continue
-        cycle = [LIGHTS.get(light.get_state_at_time_step(int(step)).value, LIGHT_UNKNOWN) for step in steps]
+        cycle = [LIGHTS.get(light.get_state_at_time_step(int(step)).value.upper(), LIGHT_UNKNOWN) for step in steps]
         lights |= {str(lane): np.array(cycle, np.int8) for lane in lanelet.successor if str(lane) in lanes}
     return lights

@@ -108,13 +108,12 @@ class LaneGraph:
         found: dict[int, int] = {}
         for _, point in sorted(zip(distance + 2.5 * angle, near, strict=True)):
             found.setdefault(self.lane_of[point], point)
-        return [(self.ids[lane], self.arc_of(point)) for lane, point in list(found.items())[:MAX_START_LANES]]
-
-    def arc_of(self, point: int) -> float:
-        """Arc length [m] of one of `points` on its lane."""
-        lane = self.lane_of[point]
-        name = self.ids[lane]
-        return float(point - self.first_point[lane]) * (self.arc[name] / (len(self.line[name]) - 1))
+        starts = []
+        for lane, point in list(found.items())[:MAX_START_LANES]:
+            name = self.ids[lane]
+            along = float(point - self.first_point[lane]) * (self.arc[name] / (len(self.line[name]) - 1))
+            starts.append((name, along))
+        return starts
 
     def turn(self, a: str, b: str) -> float:
         """Heading change [rad] from the end of lane a to the end of its successor b."""
@@ -167,22 +166,15 @@ class LaneGraph:
             length -= self.arc[best]
         return path
 
-    def centreline(self, lanes: list[str]) -> np.ndarray:
-        """The centrelines of lanes one after another [P, 2], without repeated points."""
-        line = np.concatenate([self.line[name] for name in lanes])
-        keep = np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=1) > 0.05])
-        return line[keep] if keep.sum() >= 2 else line
-
-    def lane_starts(self, lanes: list[str]) -> np.ndarray:
-        """Arc lengths [lanes + 1] where lanes one after another begin, and where the last one ends."""
-        return np.cumsum([0.0, *(self.arc[name] for name in lanes)])
-
     def path(self, lanes: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The `centreline` of lanes, its arc lengths [P], and their `lane_starts`."""
+        """The centrelines of lanes one after another [P, 2], without repeated points; their arc lengths [P]; the arc
+        lengths [lanes + 1] where the lanes begin and the last one ends."""
         key = tuple(lanes)
         if key not in self.path_of:
-            line = self.centreline(lanes)
-            self.path_of[key] = line, arc_length(line), self.lane_starts(lanes)
+            line = np.concatenate([self.line[name] for name in lanes])
+            keep = np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=1) > 0.05])
+            line = line[keep] if keep.sum() >= 2 else line
+            self.path_of[key] = line, arc_length(line), np.cumsum([0.0, *(self.arc[name] for name in lanes)])
         return self.path_of[key]
 
     def route(self, lanes: list[str], begin: float, vertices: int) -> Route:

@@ -50,29 +50,15 @@ LIMITS = {
     "vehicle_length": Limit(2.5, 9, "m is the median length of vehicles", "give sizes in m"),  # 3.9 to 5.9
     "vehicle_width": Limit(1.0, 4, "m is the median width of vehicles", "give sizes in m"),  # 1.7 to 2.8
     "speed": Limit(0, 45, "m/s is the median speed of moving vehicles", "give speeds in m/s"),  # 2.7 to 22
-    "speed_ratio": Limit(
-        0.7, 1.4, "times the displacement is what the recorded speeds make", "give m, m/s and s"
-    ),  # 0.99 to 1.01
-    "direction": Limit(
-        0,
-        0.4,
-        "rad lie between heading and displacement",
-        "give headings in rad from x to y, and do not mirror or swap axes",
-    ),  # 0.001 to 0.16
+    "speed_ratio": Limit(0.7, 1.4, "times the displacement is what the recorded speeds make", "give m, m/s and s"),  # 1
+    # 0.001 to 0.16
+    "direction": Limit(0, 0.4, "rad lie between heading and displacement", "give rad from x to y, mirror no axes"),
     "ego_speed_ratio": Limit(0.7, 1.4, "times its displacement is what the ego's speeds make", "give m, m/s and s"),
-    "ego_direction": Limit(
-        0, 0.45, "rad lie between the ego's heading and displacement", "give headings in rad"
-    ),  # 0.28
-    "track_direction": Limit(
-        0, 0.45, "rad lie between the heading and the displacement of a vehicle", "give its heading in rad"
-    ),  # 0.20
-    "slow_direction": Limit(
-        0, 0.8, "rad lie between the heading and the displacement of a slow vehicle", "give its heading in rad"
-    ),  # 0.43
+    "ego_direction": Limit(0, 0.45, "rad lie between the ego's heading and displacement", "give rad"),  # 0.28
+    "track_direction": Limit(0, 0.45, "rad lie between heading and displacement of a vehicle", "give rad"),  # 0.20
+    "slow_direction": Limit(0, 0.8, "rad lie between heading and displacement of a slow vehicle", "give rad"),  # 0.43
     "twins": Limit(0, 2.0, "s are two vehicles that drive at the same place", "leave one of the two out"),  # 0 to 0.5
-    "track_speed": Limit(
-        1, 2.0, "is the factor between the speeds and the displacement of a vehicle", "give its speeds in m/s"
-    ),  # 1.5
+    "track_speed": Limit(1, 2.0, "is the factor between speeds and displacement of a vehicle", "give m/s"),  # 1.5
     # `map_fit`
     "lane_distance": Limit(0, 10, "m is the ego from the nearest lane", "give the map of this place"),  # 0.2 to 3.5
     "on_lanes": Limit(0.3, 1, "of the moving vehicles drive along a lane", "give the map of this place"),  # 0.36 to 1

@@ -18,10 +18,8 @@ from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import (
     CYCLIST,
     DT,
-    LIGHT_GREEN,
-    LIGHT_RED,
     LIGHT_UNKNOWN,
-    LIGHT_YELLOW,
+    LIGHTS,
     OTHER,
     PEDESTRIAN,
     VEHICLE,
@@ -39,7 +37,6 @@ LONGEST, PIECE = 30.0, 20.0  # s: longer logs are cut into pieces
 REACH = 250.0  # m around the ego's path in which the map is taken
 TYPES = {"VEHICLE": VEHICLE, "TRAIN": VEHICLE, "TWO_WHEELER": CYCLIST, "PERSON": PEDESTRIAN}  # others are OTHER
 LEFT_OUT = ("EGO", "TRAFFIC_SIGN", "TRAFFIC_LIGHT")  # the ego's own box, and what stands beside or hangs over the road
-LIGHTS = {"RED": LIGHT_RED, "YELLOW": LIGHT_YELLOW, "GREEN": LIGHT_GREEN}
 EGO = ""  # the name of its track
 OWN = "py123d."  # modules that a file may name
 

@@ -10,6 +10,11 @@ from e2rl.run.errors import InputError
 VEHICLE, PEDESTRIAN, CYCLIST, OTHER = range(4)
 AGENT_TYPES = ("vehicle", "pedestrian", "cyclist", "other")
 LIGHT_UNKNOWN, LIGHT_RED, LIGHT_YELLOW, LIGHT_GREEN = range(4)
+LIGHTS = {  # by the upper-case names in logs
+    **dict.fromkeys(("RED", "REDYELLOW", "STOP"), LIGHT_RED),
+    **dict.fromkeys(("YELLOW", "CAUTION"), LIGHT_YELLOW),
+    **dict.fromkeys(("GREEN", "GO"), LIGHT_GREEN),
+}
 DT = 0.1  # s, the time step of every recording, scene and simulation
 HISTORY = 10  # frames of history before a start frame that is chosen here
 MIRRORED = "~mirrored"  # ends the ids of logs in a mirror
@@ -91,18 +96,14 @@ class Recording:
         drivable = [ring * mirror for ring in self.drivable]
         return replace(self, scene_id=f"{self.scene_id}{MIRRORED}", states=states, lanes=lanes, drivable=drivable)
 
-    def validate(self) -> "Recording":
-        """Returns self; raises InputError naming the scene where tracks, ego, lanes or start cannot make a scene."""
-        return self.validate_log().validate_start()
-
     def validate_log(self) -> "Recording":
-        """`validate` without the start frame."""
+        """Returns self; raises InputError naming the scene where tracks, ego or lanes cannot make a scene."""
         if problem := self._log_problem():
             raise InputError(f"scene {self.scene_id!r}: {problem}")
         return self
 
     def validate_start(self) -> "Recording":
-        """`validate` of the start frame alone."""
+        """Returns self; raises InputError naming the scene where the start frame cannot be one."""
         frames, scene = len(self.states), f"scene {self.scene_id!r}"
         if self.current is None or not 1 <= self.current < frames - 1:
             start = f"start frame {self.current}"

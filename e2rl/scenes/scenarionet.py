@@ -16,15 +16,10 @@ from e2rl.run.errors import InputError
 from e2rl.scenes.log_files import LogFiles
 from e2rl.scenes.plain_pickle import load_plain
 from e2rl.scenes.plausibility import check
-from e2rl.scenes.recording import AGENT_TYPES, DT, LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, Lane, Recording
+from e2rl.scenes.recording import AGENT_TYPES, DT, LIGHT_UNKNOWN, LIGHTS, Lane, Recording
 from e2rl.scenes.smoothing import resample_uniform
 
 TYPES = {name.upper(): index for index, name in enumerate(AGENT_TYPES)}
-LIGHTS = {  # by the last word of LANE_STATE_... (Waymo) or TRAFFIC_LIGHT_... (nuPlan)
-    **dict.fromkeys(("GO", "GREEN"), LIGHT_GREEN),
-    **dict.fromkeys(("CAUTION", "YELLOW"), LIGHT_YELLOW),
-    **dict.fromkeys(("STOP", "RED"), LIGHT_RED),
-}
 OBSTACLES = ("UNSET", "TRAFFIC_CONE", "TRAFFIC_BARRIER", "TRAFFIC_OBJECT", "TRAFFIC_LIGHT", "BUILDING", "GROUND")
 TYPES |= dict.fromkeys(OBSTACLES, TYPES["OTHER"])  # MetaDrive's further names of tracks
 MAX_NAME = 128  # characters of a scene's id
@@ -188,7 +183,7 @@ def _lights(dynamic: dict, lanes: dict[str, Lane], seconds: np.ndarray, frames: 
             continue
         states, last = np.zeros(len(seconds), np.int8), LIGHT_UNKNOWN
         given = list(light["state"].get("object_state", ()))[: len(seconds)]
-        for frame, state in enumerate(given):
+        for frame, state in enumerate(given):  # LANE_STATE_... (Waymo) or TRAFFIC_LIGHT_... (nuPlan)
             last = states[frame] = LIGHTS.get(str(state).rsplit("_", 1)[-1], last)
         states[len(given) :] = last
         lights[lane] = states[now]

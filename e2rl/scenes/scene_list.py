@@ -50,16 +50,11 @@ def scene_hashes(scenes: SceneSet) -> list[str]:
 
 def listed(scenes: SceneSet) -> tuple[str, str]:
     """Returns the list of scenes as the content of a file, and the hash of their data's files."""
-    return list_text(scenes), scenes.files
-
-
-def list_text(scenes: SceneSet) -> str:
-    """The list of scenes as the content of a file."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(COLUMNS)
     writer.writerows(zip(scenes.scene_id, scenes.location, scenes.number, scene_hashes(scenes), strict=True))
-    return buffer.getvalue()
+    return buffer.getvalue(), scenes.files
 
 
 def read_list(path: str | Path) -> list[Listed]:
@@ -69,16 +64,12 @@ def read_list(path: str | Path) -> list[Listed]:
         with file.open(newline="", encoding="utf-8-sig") as content:
             rows = csv.DictReader(content, strict=True)
             if "scene_id" not in (rows.fieldnames or ()):
-                raise InputError(
-                    f"scenes={file}: no column scene_id; give the {SCENES} of a run, or a CSV file whose first line "
-                    "names the columns"
-                )
+                raise InputError(f"scenes={file}: no column scene_id; give the {SCENES} of a run, or a table with one")
             found = dict.fromkeys(_line(file, rows.line_num, row) for row in rows)
     except (OSError, ValueError, csv.Error) as error:
         if isinstance(error, InputError):
             raise
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"scenes={file}: cannot be read ({reason}); give the {SCENES} of a run") from error
+        raise InputError(f"scenes={file}: cannot be read ({error}); give the {SCENES} of a run") from error
     if not found:
         raise InputError(f"scenes={file}: names no scene; add a line for each")
     return list(found)
@@ -111,29 +102,17 @@ def listed_scenes(
             return _taken(scenes, listed, hashes)
     scenes = load(None)
     hashes = scene_hashes(scenes)
-    where = f"scenes={path}"
-    _check_known(where, listed, scenes)
-    other = [line.scene_id for line in listed if line.sha256 and line.sha256 not in hashes]
-    if other:
-        count = f"{len(other)} of {len(listed)} scenes are not those listed ({_some(other)})"
-        if not files or files != scenes.files:
-            raise InputError(
-                f"{where}: {count}: the data, data.build or e2rl's version are others; restore them, or take the "
-                "column sha256 out of the list to run the scenes as they are"
-            )
-        tqdm.write(
-            f"{where}: {count}, though the data files are: another version, or another machine's rounding", sys.stderr
-        )
-    return _taken(scenes, listed, hashes)
-
-
-def _check_known(where: str, listed: Sequence[Listed], scenes: SceneSet) -> None:
-    known = set(scenes.scene_id)
+    known, count = set(scenes.scene_id), f"of {len(listed)} scenes are not"
     if missing := [line.scene_id for line in listed if line.scene_id not in known]:
-        raise InputError(
-            f"{where}: {len(missing)} of {len(listed)} scenes are not in the data ({_some(missing)}), whose first is "
-            f"{scenes.scene_id[0]}; pass the data that the list is of (data=, data.path=)"
-        )
+        mend = f"whose first is {scenes.scene_id[0]}; pass the data that the list is of (data=, data.path=)"
+        raise InputError(f"scenes={path}: {len(missing)} {count} in the data ({_some(missing)}), {mend}")
+    if other := [line.scene_id for line in listed if line.sha256 and line.sha256 not in hashes]:
+        message = f"scenes={path}: {len(other)} {count} those listed ({_some(other)})"
+        if not files or files != scenes.files:
+            cause = "the data, data.build or e2rl's version are others"
+            raise InputError(f"{message}: {cause}; restore them, or leave the column sha256 out to run these")
+        tqdm.write(f"{message}, though the data files are: another version or machine", sys.stderr)
+    return _taken(scenes, listed, hashes)
 
 
 def _taken(scenes: SceneSet, listed: Sequence[Listed], hashes: Sequence[str]) -> SceneSet:
@@ -141,10 +120,9 @@ def _taken(scenes: SceneSet, listed: Sequence[Listed], hashes: Sequence[str]) ->
     by_hash = {value: index for index, value in reversed(list(enumerate(hashes)))}
     by_name = {name: index for index, name in reversed(list(enumerate(scenes.scene_id)))}
     keep = [by_hash.get(line.sha256 or "", by_name.get(line.scene_id, -1)) for line in listed]
-    numbers = [
-        scenes.number[index] if line.number is None else line.number for index, line in zip(keep, listed, strict=True)
-    ]
-    return replace(scenes.chosen(keep), number=numbers)
+    chosen = scenes.chosen(keep)
+    own = zip(chosen.number, listed, strict=True)
+    return replace(chosen, number=[number if line.number is None else line.number for number, line in own])
 
 
 def _some(names: Collection[str]) -> str:

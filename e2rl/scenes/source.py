@@ -176,13 +176,22 @@ class Source(Extension, ABC):
             return [Row(log, reason=str(error))]
         return rows or [Row(log, reason=TOO_SHORT)]
 
-    def _rows(self, log: str, windows: list[Recording]) -> list[Row]:
-        """Returns what recordings of the same tracks and map make."""
-        try:
-            builder = SceneBuilder(windows[0], self.build) if windows else None
-        except InputError as error:
-            return [Row(window.scene_id, reason=_naming(log, error)) for window in windows]
-        return [_row(log, window, builder) for window in windows if builder]
+    def _rows(self, log: str, windows: list[Recording]) -> Iterator[Row]:
+        """Yields what recordings of the same tracks and map make."""
+        builder = None
+        for window in windows:
+            row = Row(window.scene_id, window.location, window.dataset)
+            try:
+                builder = builder or SceneBuilder(window, self.build)
+                scene = builder.scene(window)
+                validate(scene, window.scene_id)
+            except InputError as error:
+                yield row._replace(reason=_naming(log, error))
+                continue
+            if ego_overlaps(scene):
+                yield row._replace(reason=OVERLAP)
+            else:
+                yield row._replace(scene={key: value.numpy() for key, value in scene.items()})
 
     def rows(self, most: int | None = None) -> Generator[Row]:
         """Yields what the logs make, in their order, of which `most` scenes are asked for (None: all).
@@ -236,19 +245,6 @@ class Source(Extension, ABC):
             left_out = ", ".join(f"{count} {reason}" for reason, count in index.dropped.items())
             data = self.path or f"split {self.split_name}"
             raise InputError(f"no valid scene in {data} ({left_out}); see the messages above, or pass other data")
-
-
-def _row(log: str, recording: Recording, builder: SceneBuilder) -> Row:
-    """Returns what a recording makes, one of those of a builder."""
-    row = Row(recording.scene_id, recording.location, recording.dataset)
-    try:
-        scene = builder.scene(recording)
-        validate(scene, recording.scene_id)
-    except InputError as error:
-        return row._replace(reason=_naming(log, error))
-    if ego_overlaps(scene):
-        return row._replace(reason=OVERLAP)
-    return row._replace(scene={key: value.numpy() for key, value in scene.items()})
 
 
 def load_scenes(

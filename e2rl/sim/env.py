@@ -21,7 +21,7 @@ from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, observation_config,
 from e2rl.sim.reward import check_weights
 from e2rl.sim.static import FrenetPose, static_scene, write_rows
 from e2rl.sim.step import Outcome, StepConfig, hold_step, step
-from e2rl.sim.world import AGENT_KEYS, Agents, Trajectories, World
+from e2rl.sim.world import AGENT_KEYS, Agents, Trajectories, World, trajectories_at
 
 OF_ROUTE = ("points", "length", "open", "limit", "light", "light_s", "log")
 OF_SCENE = ("start", "valid", "start_accel", "start_yaw_rate", "size", "agent_type", "field_origin")
@@ -143,7 +143,7 @@ class DrivingEnv(EnvBase):
     def world(self) -> World:
         """The current World. Its `scene` is the environment's own storage, which the next reset overwrites."""
         ego = self._ego
-        states, valid, accel, turn = self._trajectories.at(ego.step)
+        states, valid, accel, turn = trajectories_at(self._trajectories.states, self._trajectories.valid, ego.step)
         first = (ego.step == 0)[:, None]
         states = torch.where(first[..., None], self.scene["start"], states)
         valid = torch.where(first, self.scene["valid"], valid)
@@ -209,10 +209,8 @@ class DrivingEnv(EnvBase):
     @torch.no_grad()  # the stored state must not accumulate an autograd graph
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self.clock += 1
-        tracks, recording = (
-            (self._trajectories.states, self._trajectories.valid),
-            (self.scene["logged"], self.scene["logged_valid"]),
-        )
+        tracks = self._trajectories.states, self._trajectories.valid
+        recording = self.scene["logged"], self.scene["logged_valid"]
         function = compiled(step) if self.settings.compile else step
         given = recording if self.settings.replay_ego else tensordict["action"]
         self._ego, outcome = hold_step(function, self.hold, self._ego, given, tracks, self._static, self._config)

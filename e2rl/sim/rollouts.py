@@ -14,6 +14,7 @@ from e2rl.scenes.recording import AGENT_TYPES, VEHICLE
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.rollout_file import Road, Rollout
 
+TEXTS = ("scene_id", "location", "dataset", "split", "method", "ego_policy")
 MAP = ("lane_points", "lane_index", "lane_width", "drivable_points", "drivable_index")
 
 
@@ -111,24 +112,21 @@ class Rollouts(TensorClass["shadow"]):  # `size` and `split` are fields, not met
 
         padded = ("states", "valid", "size", "simulated", "adversaries", "logged", "logged_valid")
         padded += ("lane_points", "lane_width", "drivable_points")
-        codes = [[AGENT_TYPES.index(kind) for kind in rollout.agent_type.tolist()] for rollout in rollouts]
+        lines: dict[str, list[Tensor]] = {"lane": [], "drivable": []}  # the line number of each point
+        for each in rollouts:
+            for name, numbers in lines.items():
+                counts = np.diff(getattr(each, f"{name}_offsets"))
+                numbers.append(torch.from_numpy(np.repeat(np.arange(len(counts)), counts)))
+        codes = [torch.tensor([AGENT_TYPES.index(kind) for kind in each.agent_type.tolist()]) for each in rollouts]
         lights = all(rollout.ran_light is not None for rollout in rollouts)
-        texts = ("scene_id", "location", "dataset", "split", "method", "ego_policy")
         return cls(
             **{name: pad(name) for name in padded},
-            agent_type=pad_sequence([torch.tensor(each) for each in codes], batch_first=True),
-            **{
-                f"{name}_index": pad_sequence(
-                    [torch.from_numpy(line_numbers(getattr(rollout, f"{name}_offsets"))) for rollout in rollouts],
-                    batch_first=True,
-                    padding_value=-1,
-                )
-                for name in ("lane", "drivable")
-            },
+            agent_type=pad_sequence(codes, batch_first=True),
+            **{f"{name}_index": pad_sequence(each, True, padding_value=-1) for name, each in lines.items()},
             ran_light=pad("ran_light", -1) if lights else None,
             seed=torch.tensor([rollout.seed for rollout in rollouts]),
             eta=torch.tensor([rollout.eta for rollout in rollouts], dtype=torch.float64),
-            **{name: [getattr(rollout, name) for rollout in rollouts] for name in texts},
+            **{name: [getattr(rollout, name) for rollout in rollouts] for name in TEXTS},
             batch_size=[len(rollouts)],
         )
 
@@ -144,7 +142,6 @@ class Rollouts(TensorClass["shadow"]):  # `size` and `split` are fields, not met
     def rollout(self, index: int) -> Rollout:
         """One of B rollouts as numpy arrays. Plans are those of the ego and of the adversaries."""
         row = self[index]
-        texts = ("scene_id", "location", "dataset", "split", "method", "ego_policy")
         plans = {}
         if row.plans is not None:
             planners = row.adversaries[: row.plans.shape[1]].bool().clone()
@@ -152,7 +149,7 @@ class Rollouts(TensorClass["shadow"]):  # `size` and `split` are fields, not met
             plans["planners"] = planners.nonzero()[:, 0].numpy()
             plans |= {"plans": row.plans[:, planners].float().numpy(), "targets": row.targets[:, planners].numpy()}
         return Rollout(
-            **{name: str(getattr(row, name) or "") for name in texts},
+            **{name: str(getattr(row, name) or "") for name in TEXTS},
             seed=int(row.seed),
             eta=float(row.eta),
             agent_type=np.array(AGENT_TYPES)[row.agent_type.numpy()],
@@ -195,11 +192,6 @@ def polylines(points: Tensor, index: Tensor, minimum: int) -> tuple[np.ndarray, 
         np.concatenate([[0], np.cumsum(counts[whole])]).astype(np.int64),
         whole,
     )
-
-
-def line_numbers(offsets: np.ndarray) -> np.ndarray:
-    """The line number of each point [M] of lines that start and end at offsets [L + 1]."""
-    return np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
 
 
 def _known_track(track: Tensor | None) -> np.ndarray | None:

@@ -73,7 +73,8 @@ def step(
     pose = follow(static, state[:, :2], ego.pose.s + ego.state[:, 3] * DT)
     moved = EgoState(now, state, action, pose, present, ego.been_on_road, ego.start_s)
     if ended is not None:
-        moved = unless(ended, moved, ego)
+        stay = ended
+        moved = ego.merged(moved, lambda old, new: torch.where(stay.view(-1, *[1] * (new.ndim - 1)), old, new))
         now, state, action, pose, present, *_ = moved
     others = Agents(*(value[:, 1:] for value in trajectories_at(*tracks, now)))
     seen = sense(config.observation, static, moved, others, config.horizon)
@@ -113,12 +114,3 @@ def hold_step(
         flags = {name: outcome[name] | (later[name] & ~ended) for name in FLAGS}
         outcome = later | flags | {"reward": outcome["reward"] + later["reward"].masked_fill(ended, 0)}
     return ego, outcome
-
-
-def unless(flag: Tensor, new: EgoState, old: EgoState) -> EgoState:
-    """The new egos, but the old ones where flag [B]."""
-
-    def pick(after: Tensor, before: Tensor) -> Tensor:
-        return torch.where(flag.view(-1, *[1] * (after.ndim - 1)), before, after)
-
-    return new.merged(old, pick)

@@ -81,7 +81,7 @@ class Trajectories:
         self._scheduled: list[tuple[Tensor, Tensor, Tensor]] = []
 
     def schedule(self, rows: Tensor, states: Tensor, valid: Tensor) -> None:
-        """Set trajectories of scenes rows [b] from their next reset on; raises InputError on a wrong shape or NaN."""
+        """See `DrivingEnv.set_traffic`."""
         expected = (len(rows), *self.states.shape[1:])
         if tuple(states.shape) != expected or tuple(valid.shape) != expected[:-1]:
             given = f"states {tuple(states.shape)} and valid {tuple(valid.shape)}"
@@ -106,10 +106,7 @@ class Trajectories:
                 self._scheduled.append((rows[~now], states[~now], valid[~now]))
 
     def write(self, rows: Tensor, step: Tensor, states: Tensor, valid: Tensor) -> None:
-        """Overwrite the vehicles of scenes rows [b] at steps step [b] + 1 .. + H; steps beyond T are dropped.
-
-        states [b, V, H, 4], valid [b, V, H].
-        """
+        """See `DrivingEnv.write_traffic`; from step [b] + 1 on."""
         at = step[:, None] + torch.arange(1, states.shape[2] + 1, device=step.device)
         inside = at < self.states.shape[1]
         row, at = rows[:, None].expand_as(at)[inside], at[inside]
@@ -117,17 +114,12 @@ class Trajectories:
         self.valid[row, at, : self.vehicles] = valid.transpose(1, 2)[inside]
 
     def write_agents(self, rows: Tensor, agents: Tensor, step: Tensor, states: Tensor) -> None:
-        """Put vehicles agents [K] of scenes rows [K] at states [K, H, 4] at steps step [K] + 1 .. + H, present; steps
-        beyond T are dropped."""
+        """See `DrivingEnv.write_agents`; from step [K] + 1 on."""
         at = step[:, None] + torch.arange(1, states.shape[1] + 1, device=step.device)
         inside = at < self.states.shape[1]
         where = rows[:, None].expand_as(at)[inside], at[inside], agents[:, None].expand_as(at)[inside]
         self.states[where] = states[inside].to(self.states.dtype)
         self.valid[where] = True
-
-    def at(self, step: Tensor) -> Agents:
-        """`trajectories_at` step [B]."""
-        return trajectories_at(self.states, self.valid, step)
 
 
 def trajectories_at(states: Tensor, valid: Tensor, step: Tensor) -> Agents:

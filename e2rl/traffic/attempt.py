@@ -26,7 +26,7 @@ Batch = Rollouts | TensorDictBase
 def attempt(
     roll_out: Callable[[Sequence[Task]], Batch], tasks: Sequence[Task]
 ) -> tuple[list[tuple[list[Task], Batch]], list[tuple[Task, dict]]]:
-    """(the tasks that could be rolled out, in parts with their rollouts; the others with what ended them).
+    """(the tasks that could be rolled out, in parts with their rollouts; the others with the reasons).
 
     roll_out(tasks) returns Rollouts, or a TensorDict with states [B, ..., C] and valid [B, ...]. What raises for a
     batch is looked for by halving the batch, where a PlannerError does not name it.
@@ -52,10 +52,10 @@ def attempt(
         return parts, own + further
     finite = finite_rollouts(rollouts)
     kept = [task for task, known in zip(tasks, finite, strict=True) if known]
-    lost = [task for task, known in zip(tasks, finite, strict=True) if not known]
-    ended = [(task, {"reason": NOT_FINITE, "detail": "", "traceback": ""}) for task in lost]
+    why = {"reason": NOT_FINITE, "detail": "", "traceback": ""}
+    errored = [(task, dict(why)) for task, known in zip(tasks, finite, strict=True) if not known]
     good = rollouts if all(finite) else rollouts[torch.tensor(finite)]
-    return ([(kept, good)] if kept else []), ended
+    return ([(kept, good)] if kept else []), errored
 
 
 def finite_rollouts(rollouts: Batch) -> list[bool]:
@@ -64,13 +64,13 @@ def finite_rollouts(rollouts: Batch) -> list[bool]:
     return known.flatten(1).all(1).tolist()
 
 
-def summary_of(ended: Iterable[dict]) -> str:
+def summary_of(errored: Iterable[dict]) -> str:
     """The reasons with their counts, and the first one's own words, for a message."""
-    entries = list(ended)
+    entries = list(errored)
     counts = ", ".join(f"{count} {reason}" for reason, count in count_reasons(entries).items())
     return f"{counts} ({entries[0]['detail'][:200]})"
 
 
-def count_reasons(ended: Iterable[dict]) -> dict[str, int]:
-    """How many rollouts ended for each reason."""
-    return dict(Counter(entry["reason"] for entry in ended))
+def count_reasons(errored: Iterable[dict]) -> dict[str, int]:
+    """How many rollouts errored for each reason."""
+    return dict(Counter(entry["reason"] for entry in errored))

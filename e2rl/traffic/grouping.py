@@ -119,12 +119,11 @@ def crop_world(world: World, group: Group) -> World:
 
 
 def crop_state(value: Any, group: Group, width: int, axes: int | None = 1) -> Any:
-    """Returns the group's part of a state, a nested dataclass of tensors whose scenes have `width` vehicle rows.
-
-    axes: of a tensor, see `no_vehicles`.
-    """
+    """Returns the group's part of a state of scenes of `width` vehicle rows; axes: of a tensor, see `no_vehicles`."""
     if is_dataclass(value) and not isinstance(value, type):
-        parts = {f.name: crop_state(getattr(value, f.name), group, width, axes_of(f)) for f in fields(value)}
+        parts = {
+            each.name: crop_state(getattr(value, each.name), group, width, axes_of(each)) for each in fields(value)
+        }
         return replace(value, **parts)
     value = value[group.rows]
     if axes is None:

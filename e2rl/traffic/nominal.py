@@ -147,11 +147,8 @@ class NominalTraffic(Traffic):
 
     @torch.no_grad()
     def open_loop_plans(self, scene: TensorDictBase, seed: Tensor) -> Tensor:
-        """Returns joint samples [B, S, V, HORIZON, 4] beside an ego whose plan is unknown, stratified over S samples.
-
-        No acceleration bounds are applied: they hold for the executed 0.5 s, and the current bounds applied over 5 s
-        would make the samples a tenth less accurate.
-        """
+        """Returns joint samples [B, S, V, HORIZON, 4] beside an ego whose plan is unknown, stratified over S samples,
+        without acceleration bounds: those hold for 0.5 s; applied over 5 s they cost a tenth of the accuracy."""
         prior, (count, batch), vehicles = self.prior, seed.shape, scene["route_log"].shape[1]
 
         def draw(number: int, *shape: int, uniform: bool = False) -> Tensor:

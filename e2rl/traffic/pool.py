@@ -78,8 +78,7 @@ class TrafficPool:
         return states, valid
 
     def evaded(self, number: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Rows [b] of the pool whose traffic is of parts[number] and has an evasion, its actions [b, T, 2] and its span
-        [b, 2]; of the actions only these are read."""
+        """Rows [b] whose traffic is of parts[number] and has an evasion, its actions [b, T, 2] and its span [b, 2]."""
         part = self.parts[number]
         at = self.source - (self._ends[number] - len(part.states))
         rows = ((at >= 0) & (at < len(part.states)) & (self.source >= 0)).nonzero()[:, 0]
@@ -93,8 +92,7 @@ class TrafficPool:
 
     @staticmethod
     def live(scene_index: Tensor, eta: Tensor, seed: Tensor, template: Tensor | None = None) -> "TrafficPool":
-        """Rows of scenes [R] whose traffic is replanned against the ego; eta [R], seed [R], template [R] (None: full
-        for all)."""
+        """Rows of scenes [R] that are replanned against the ego; eta [R], seed [R], template [R] (None: full)."""
         return _rows(scene_index, LIVE, eta, seed, template)
 
     @staticmethod
@@ -123,9 +121,8 @@ class TrafficPool:
         return TrafficPool(source=torch.cat([self.source, moved]), parts=self.parts + other.parts, **joined)
 
     def probabilities(self, priority: Tensor, fraction: float) -> Tensor:
-        """Draw probability [R] of each row: adversarial rows have total probability `fraction`; within a kind it is in
-        proportion to the row's weight times the priority [S] of its scene. If one kind has no rows, the other has
-        probability 1."""
+        """Draw probability [R]: `fraction` for all adversarial rows (1 or 0 where there is one kind), within a kind in
+        proportion to the row's weight times the priority [S] of its scene."""
         weight = self.weight * priority.cpu().double()[self.scene_index].clamp(min=1e-12)
         result = torch.zeros(len(self), dtype=torch.float64)
         for kind, part in ((True, fraction), (False, 1 - fraction)):

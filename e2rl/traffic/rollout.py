@@ -38,17 +38,11 @@ def roll_out(
     device: str = "cpu",
     template: Tensor | None = None,
 ) -> Rollouts:
-    """Rollouts of scenes to their last step.
+    """Rollouts of scenes `index` [B] int64 to their last step, on through contacts and off the road.
 
     Args:
-        scenes: the scenes.
-        index: [B] int64, which of them.
         seed: [B] int64, of the noise.
         eta: [B], intensities.
-        ego: the planner.
-        traffic: drives the other vehicles.
-        sim: settings of the simulator; episodes go on after a contact and off the road.
-        device: where to compute.
         template: [B] int64, causal templates (None: full for all).
     """
     begin = time.perf_counter()
@@ -62,7 +56,7 @@ def roll_out(
     with set_exploration_type(ExplorationType.DETERMINISTIC), counted_nfe(traffic) as nfe:
         steps = env.rollout(base.horizon, EgoPolicy(ego, env))
     known = _driven(steps, base.scene, log) | log.plans(steps["ego", "plan"])
-    cost = {"seconds": time.perf_counter() - begin, "nfe": float(nfe.count)}
+    cost = {"seconds": time.perf_counter() - begin, "nfe": float(sum(nfe))}
     known |= {name: torch.full((len(index),), value / len(index)) for name, value in cost.items()}
     known |= {"seed": seed, "eta": eta.double()}
     return Rollouts.in_scenes(scenes, index, scene=base.scene, replays_ego=settings.replay_ego, **known)
@@ -101,7 +95,7 @@ def synthesize_traffic(scenes: SceneSet, traffic: Traffic, sim: SimSettings, bat
     of Algorithm 1 against that ego.
 
     D': scene_index [K], states [K, T+1, N, 4], valid [K, T+1, N], adversaries [K, N], contact [K] (the ego touched a
-    vehicle), and ended {position in S: why} of the S - K rows in which the ego or the traffic raised or became NaN.
+    vehicle), and errored {position in S: why} of the S - K rows in which the ego or the traffic raised or became NaN.
     """
 
     scene = scenes.batch([0])[:0]
@@ -120,15 +114,15 @@ def synthesize_traffic(scenes: SceneSet, traffic: Traffic, sim: SimSettings, bat
             return roll_out(scenes, index, noise, etas[at], ego, traffic, sim, device, template[at])
 
         done: list[int] = []
-        parts, ended = list[Rollouts](), dict[int, dict]()
+        parts, errored = list[Rollouts](), dict[int, dict]()
         for rows in torch.arange(len(scene_index)).split(batch):
             found, lost = attempt(roll_out_rows, rows.tolist())
             done += [row for tasks, _ in found for row in tasks]
             parts += [part for _, part in found]
-            ended |= dict(lost)
+            errored |= dict(lost)
         at = torch.tensor(done, dtype=torch.int64)
         order = at.argsort()
         made = {name: torch.cat([nothing[name], *(part.get(name) for part in parts)])[order] for name in MADE}
-        return made | {"scene_index": scene_index[at[order]], "ended": ended}
+        return made | {"scene_index": scene_index[at[order]], "errored": errored}
 
     return synthesize

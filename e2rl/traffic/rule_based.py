@@ -1,8 +1,7 @@
 """Traffic without a prior's samples: log replay, constant velocity, and lane-following by IDM.
 
-IDM: every vehicle keeps the route candidate nearest to it, returns to its centreline, and accelerates by the
-Intelligent Driver Model (Treiber et al. 2000) behind the nearest agent or red light ahead. Bounds, decoder and the end
-of a vehicle at the map's border are those of the prior (e2rl/prior/bounds.py, lane_relative.py).
+IDM: every vehicle returns to the centreline of the route candidate nearest to it and accelerates by the Intelligent
+Driver Model (Treiber et al. 2000) behind the nearest agent or red light ahead, within the bounds of the prior.
 """
 
 from dataclasses import dataclass, replace
@@ -63,8 +62,7 @@ class IDMState:
 @configured("synthesizer/idm")
 @dataclass(eq=False, repr=False)
 class IDM(Traffic):
-    """Car-following on the nearest route candidate; vehicles that stand at the start never move. The prior is the
-    source of the bounds."""
+    """Car-following on the nearest route candidate, within the prior's bounds; who stands at the start never moves."""
 
     prior: Prior
     headway: float = setting()

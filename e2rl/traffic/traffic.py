@@ -28,7 +28,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.prior.prior import Prior
@@ -156,15 +156,8 @@ class PlanLog:
         self.acted, self.last = self.acted | acts, plan
 
     def plans(self, ego_plans: Tensor) -> dict[str, Tensor]:
-        """Returns the plans, thinned out for a rollout's file.
-
-        Args:
-            ego_plans: the ego's plan [B, T, H, 4] at every step; it becomes row 0.
-
-        Returns:
-            plans [B, R, V, K, 2] m, at POINT_STEPS, 2 POINT_STEPS .. steps after each of R replans, and targets
-            [B, R, V] (0 the ego, -1 nobody).
-        """
+        """Returns plans [B, R, V, K, 2] m, at POINT_STEPS, 2 POINT_STEPS .. steps after each of R replans, and targets
+        [B, R, V] (0 the ego, -1 nobody). ego_plans [B, T, H, 4], of every step, become row 0."""
         plans = torch.stack(self.paths, 1)
         plans[:, :, 0] = points_of(ego_plans[:, ::REPLAN_STEPS]).cpu()
         return {"plans": plans, "targets": torch.stack(self.targets, 1)}
@@ -186,26 +179,15 @@ def points_of(states: Tensor) -> Tensor:
     return states[..., POINT_STEPS - 1 :: POINT_STEPS, :2]
 
 
-@dataclass
-class NFE:
-    """count: evaluations of the prior's network so far, of a joint sample each; one whose gradient is wanted counts
-    twice."""
-
-    count: int = 0
-
-    def __call__(self, network: nn.Module, inputs: tuple[Tensor, ...], x0: Tensor) -> None:
-        """A forward hook of the denoiser."""
-        self.count += len(x0) * (2 if x0.requires_grad else 1)
-
-
 @contextmanager
-def counted_nfe(traffic: Traffic) -> Iterator[NFE]:
-    """Yields the NFE of a method within the block, whatever the machine; 0 for a method without a prior."""
-    nfe, prior = NFE(), getattr(traffic, "prior", None)
+def counted_nfe(traffic: Traffic) -> Iterator[list[int]]:
+    """Yields the NFE of a method within the block, one number per call of the prior's network: its joint samples, twice
+    where a gradient is wanted."""
+    nfe, prior = list[int](), getattr(traffic, "prior", None)
     if not isinstance(prior, Prior):
         yield nfe
         return
-    hook = prior.denoiser.register_forward_hook(nfe)
+    hook = prior.denoiser.register_forward_hook(lambda _, given, x0: nfe.append(len(x0) * (1 + x0.requires_grad)))
     try:
         yield nfe
     finally:

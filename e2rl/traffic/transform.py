@@ -11,9 +11,10 @@ from torchrl.envs import Transform
 from e2rl.planners.ego import Ego
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.sim.env import DrivingEnv
+from e2rl.traffic.e2.reaiming import Reaiming
 from e2rl.traffic.grouping import put_rows, take_rows
 from e2rl.traffic.pool import LIVE, RECORDED, TrafficPool
-from e2rl.traffic.reaction import Lookahead, NewEpisodes, Reaction
+from e2rl.traffic.reaction import Lookahead
 from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan, keep_velocity
 
 Draw = Callable[[int], Tensor]  # count -> pool rows [count] of new episodes
@@ -22,12 +23,10 @@ Draw = Callable[[int], Tensor]  # count -> pool rows [count] of new episodes
 class AdversarialSynthesizer(Transform):
     """Draws a pool row for every new episode, injects its scene, and drives its traffic.
 
-    Rows with recorded or stored traffic replay it. LIVE rows react: before a step at which a replan is due (every
-    REPLAN_STEPS steps) the traffic method plans. It is given ("ego", "plan") [B, H, 4], which the policy has just
-    written (without this key, constant velocity), and may not look at it (`Traffic.knowledge`).
-
-    With a reaction, vehicles of replayed rows with an intensity may leave their trajectories and react to the ego. All
-    environments are asked at once, every REPLAN_STEPS simulated steps.
+    Rows with recorded or stored traffic replay it; with a reaction, vehicles of those with an intensity may leave their
+    trajectories every REPLAN_STEPS simulated steps. LIVE rows are replanned by the traffic method every REPLAN_STEPS
+    steps. It is given ("ego", "plan") [B, H, 4], which the policy has just written (without this key, constant
+    velocity), and may not look at it (`Traffic.knowledge`).
 
     Writes ("traffic", ...): row [B, 1] int64 and, with a traffic method, plan [B, V, H, 4]: states planned for the
     coming steps, only for the policy, not stacked over time. Everything else about a plan is handed to `on_plan`.
@@ -39,7 +38,7 @@ class AdversarialSynthesizer(Transform):
         draw: Draw,
         traffic: Traffic | None = None,
         ego: Ego | None = None,
-        reaction: Reaction | None = None,
+        reaction: Reaiming | None = None,
     ) -> None:
         """traffic: drives LIVE rows; ego: the ego that a method with `queries_ego` queries; reaction: None, nobody
         leaves replayed traffic."""
@@ -85,14 +84,14 @@ class AdversarialSynthesizer(Transform):
         if bool(stored.any()):
             self._env.set_traffic(rows[stored].to(self._env.device), *self.pool.tracks(source[stored]))
 
-    def _begin_reaction(self, reaction: Reaction, rows: Tensor) -> None:
+    def _begin_reaction(self, reaction: Reaiming, rows: Tensor) -> None:
         """Who reacts in the new episodes of environments rows [b]."""
         env, drawn = self._env, self._drawn[rows]
         adversarial = self.pool.adversarial[drawn] & (self.pool.source[drawn] != LIVE)
-        given = rows.to(env.device), adversarial.to(env.device), self._stored_adversaries()[rows.to(env.device)]
         if len(rows) == len(self._drawn):
             self._next_reaction = env.clock
-        reaction.begin(NewEpisodes(*given, len(self._drawn), env.horizon))
+        rows = rows.to(env.device)
+        reaction.begin(rows, adversarial.to(env.device), self._stored_adversaries()[rows], env.horizon)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         if self.traffic is not None:

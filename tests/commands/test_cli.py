@@ -12,6 +12,7 @@ from e2rl.commands import cli
 from e2rl.commands.cli import COMMANDS, EXAMPLES, main
 
 ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 def said(monkeypatch, capsys, *arguments):
@@ -20,19 +21,11 @@ def said(monkeypatch, capsys, *arguments):
     return capsys.readouterr().out
 
 
-def test_help_names_every_command_and_gives_examples_of_those(monkeypatch, capsys):
+def test_help_version_and_the_nearest_command(monkeypatch, capsys):
     text = said(monkeypatch, capsys, "--help")
     assert text == said(monkeypatch, capsys) and all(name in text for name in COMMANDS)
-    used = {line.split()[1] for line in EXAMPLES.splitlines() if line.startswith("  e2rl ")}
-    assert used <= set(COMMANDS) and max(map(len, text.splitlines())) <= 100
-
-
-def test_the_version_is_that_of_the_package(monkeypatch, capsys):
-    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
-    assert said(monkeypatch, capsys, "--version").strip() == f"e2rl {version}"
-
-
-def test_an_unknown_command_is_told_the_nearest(monkeypatch, capsys):
+    assert {line.split()[1] for line in EXAMPLES.splitlines() if line.startswith("  e2rl ")} <= set(COMMANDS)
+    assert said(monkeypatch, capsys, "--version").strip() == f"e2rl {PROJECT['version']}"
     with pytest.raises(SystemExit) as stopped:
         said(monkeypatch, capsys, "evalute")
     assert stopped.value.code == 2 and "did you mean evaluate?" in capsys.readouterr().err
@@ -42,11 +35,7 @@ def test_every_command_is_a_module_with_a_main():
     for module, _ in COMMANDS.values():
         spec = find_spec(module)
         assert spec is not None and "def main(" in Path(spec.origin).read_text(), module
-
-
-def test_the_console_command_is_the_one_of_the_package():
-    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-    assert scripts == {"e2rl": f"{cli.__name__}:main"}
+    assert PROJECT["scripts"] == {"e2rl": f"{cli.__name__}:main"}
 
 
 @pytest.mark.slow

@@ -46,10 +46,7 @@ def test_metrics_are_strict_json_with_counts_command_and_paired_differences(tmp_
     assert (first["n_scenes"], first["n_seeds"], first["n_rollouts"]) == (3, 2, 6)
     assert first["command"] == "python evaluate.py 'eta=[1, 2]'" and first["stage"] == "after" and "git" in first
     assert first["metrics"]["transport"] == {"mean": None, "low": None, "high": None, "n": 0}
-    assert (
-        first["paired"].keys() == {"nominal"}
-        and {"difference", "low", "high"} <= first["paired"]["nominal"]["cfr"].keys()
-    )
+    assert list(first["paired"]) == ["nominal"] and "difference" in first["paired"]["nominal"]["cfr"]
     assert math.isnan(read_metrics(tmp_path / "metrics.json")[0]["metrics"]["transport"]["mean"])
     for where, name in (("metrics", "mean"), ("metrics", "n"), ("paired.nominal", "difference")):
         changed = json.loads(text)

@@ -1,4 +1,4 @@
-"""modes.json: shares, verdicts and typical rollouts of a run's modes, their table, and replays of them."""
+"""modes.json: fractions, verdicts and typical rollouts of a run's modes, their table, and replays of them."""
 
 import json
 import math
@@ -6,17 +6,9 @@ import math
 import pytest
 
 from e2rl.evaluation.modes import MODES_FILE, find_modes, read_modes, write_modes
-from e2rl.evaluation.protocol import Method, run_protocol
-from e2rl.evaluation.rollout_files import read_rows, write_rows
-from e2rl.evaluation.summary import metric_rows
-from e2rl.metrics.score import score_rollouts
 from e2rl.report.mode_table import mode_tables
-from e2rl.report.tables import metric_tables
 from e2rl.run.errors import InputError
-from tests.evaluation.test_protocol import setup_of
-from tests.metrics.random_rollouts import labelled, random_rollouts
 from tests.metrics.test_failure_modes import CROSSING, REAR_END, failure
-from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
 
 def crashes(kind, number, method="e2", eta=2.0, **changes):
@@ -31,19 +23,24 @@ def run_rows():
     return rows + crashes(CROSSING, 5, "nominal", 0.0, cfr=0.0, approach="")
 
 
-def test_modes_have_counts_shares_by_method_and_verdicts():
+def test_modes_have_counts_fractions_by_method_and_verdicts():
     rows = run_rows()
     found = find_modes(rows)
     crossing, rear_end = found["modes"]
     assert (found["failures"], found["rollouts"], found["unknown"]) == (12, 17, ["duty"])
     assert crossing["name"] == "crossing from the right, partner turns left, ego keeps speed"
-    assert (crossing["count"], crossing["share"]) == (8, pytest.approx(8 / 12))
+    assert (crossing["count"], crossing["fraction"]) == (8, pytest.approx(8 / 12))
     assert [group["count"] for group in crossing["groups"]] == [6, 2, 0]
-    assert [group["share"] for group in crossing["groups"]] == [1.0, pytest.approx(1 / 3), None]
+    assert [group["fraction"] for group in crossing["groups"]] == [1.0, pytest.approx(1 / 3), None]
     assert (crossing["counted"], crossing["preventable"], crossing["at_fault"]) == (0.75, 1.0, 0.0)
     assert rear_end["at_fault"] == 1 and rear_end["avoidable"] is None and rear_end["ego_speed"] == 10
     assert [(group["failures"], group["modes"]) for group in found["groups"]] == [(6, 1), (6, 2), (0, 0)]
     assert [row.get("mode") for row in rows] == [1] * 8 + [2] * 4 + [None] * 5
+    for mode in found["modes"]:
+        typical = mode["typical"]
+        same = [row for row in rows if all(row[name] == typical[name] for name in ("method", "scene_id", "seed"))]
+        assert [row["mode"] for row in same] == [mode["mode"]]
+        assert typical["file"].startswith(f"{typical['method']}__idm__2__") and typical["file"].endswith("__0.npz")
 
 
 def test_what_is_written_is_what_is_read_and_strict(tmp_path):
@@ -52,21 +49,6 @@ def test_what_is_written_is_what_is_read_and_strict(tmp_path):
     assert read_modes(tmp_path / MODES_FILE) == json.loads(json.dumps(found))
     with pytest.raises(InputError, match="modes"):
         read_modes(tmp_path / "absent.json")
-
-
-def test_the_typical_rollout_is_one_of_its_mode():
-    rows = run_rows()
-    for mode in find_modes(rows)["modes"]:
-        typical = mode["typical"]
-        same = [row for row in rows if all(row[name] == typical[name] for name in ("method", "scene_id", "seed"))]
-        assert [row["mode"] for row in same] == [mode["mode"]]
-        assert typical["file"].startswith(f"{typical['method']}__idm__2__") and typical["file"].endswith("__0.npz")
-
-
-def test_a_run_without_failures_has_no_modes_and_no_table():
-    found = find_modes(crashes(CROSSING, 3, cfr=0.0, approach=""))
-    assert found["modes"] == [] and found["unknown"] == [] and found["groups"][0]["failures"] == 0
-    assert mode_tables(found) == [] and find_modes([])["modes"] == []
 
 
 def test_the_table_has_a_row_for_each_mode_and_says_what_is_missing():
@@ -87,41 +69,3 @@ def test_small_modes_are_gathered_but_keep_their_numbers():
     found = find_modes(rows)
     assert [(mode["mode"], mode["name"], mode["count"]) for mode in found["modes"]][1:] == [(0, "other", 2)]
     assert sorted(row["mode"] for row in rows)[-2:] == [2, 3] and found["groups"][0]["modes"] == 1
-
-
-def test_words_speeds_and_mode_survive_in_rollouts_csv(tmp_path):
-    rows = labelled(score_rollouts(random_rollouts(12, seed=20))[0], "d", "s", "e2", "idm")
-    modes = find_modes(rows)
-    assert modes["failures"] > 2
-    write_rows(tmp_path / "rollouts.csv", rows)
-    read = read_rows(tmp_path / "rollouts.csv")
-    for row, other in zip(rows, read, strict=True):
-        for name in ("approach", "ego_manoeuvre", "partner_manoeuvre"):
-            assert other[name] == row[name] and isinstance(other[name], str)
-        assert other["mode"] == row["mode"] or (math.isnan(other["mode"]) and math.isnan(row["mode"]))
-    again = find_modes(read)
-    assert again == json.loads(json.dumps(modes)), "the same from the file"
-
-
-def test_coverage_reaches_the_table_of_adversaries():
-    rollouts = random_rollouts(40, seed=3, vehicles=24, others=2, extent=25.0)
-    rollouts.location = [f"place {index}" for index in range(40)]
-    scores, samples = score_rollouts(rollouts)
-    rows = labelled(scores, "d", "s", "e2", "idm")
-    modes = find_modes(rows)
-    (summary,) = metric_rows(rows, samples, draws=100, realism_draws=2)
-    value = summary["metrics"]["mode_coverage"]
-    assert modes["failures"] == value["n"] >= 10 and 1 < value["low"] <= value["mean"] <= value["high"] <= 10
-    names = [row[0] for row in metric_tables([summary], table="adversaries")[0].rows]
-    counted = summary["metrics"]["mode_coverage_counted"]["n"]
-    assert {"mode_coverage", "mode_coverage_counted"} <= set(names)
-    assert counted == sum(row["counted"] == 1 for row in rows) < modes["failures"]
-
-
-def test_the_protocol_writes_the_modes_of_all_methods(tmp_path):
-    on = synthesizer()
-    methods = [Method("nominal", on), Method("e2", on, 3.0)]
-    run_protocol(setup_of(scenes(1, steps=40)), methods, [0], tmp_path)
-    found = read_modes(tmp_path / MODES_FILE)
-    assert [(group["method"], group["rollouts"]) for group in found["groups"]] == [("nominal", 1), ("e2", 1)]
-    assert found["failures"] == sum(mode["count"] for mode in found["modes"])

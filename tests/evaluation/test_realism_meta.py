@@ -179,26 +179,6 @@ def test_split_halves_part_whole_places():
     assert log_split_half(scene_set)["mean"] != log_split_half(scene_set)["mean"], "one place has no halves"
 
 
-def test_a_meta_metric_that_was_interrupted_equals_one_that_was_not(tmp_path, monkeypatch):
-    """The counts so far are kept; batches that are counted are not rolled out again."""
-    methods = [Method("nominal", nominal()), Method("constant_velocity", ConstantVelocity())]
-    whole = meta_rows(setup_of(places(2), 3), methods, 4)
-    drive, driven = Setup.roll_out, []
-
-    def stopped(setup, method, tasks):
-        if len(driven) == 2:
-            driven.append(None)
-            raise KeyboardInterrupt
-        driven.append(method.name)
-        return drive(setup, method, tasks)
-
-    monkeypatch.setattr(Setup, "roll_out", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        meta_rows(setup_of(places(2), 3), methods, 4, Parts(tmp_path))
-    again = meta_rows(setup_of(places(2), 3), methods, 4, Parts(tmp_path))
-    assert again == whole and driven == ["nominal", "nominal", None, "nominal", "constant_velocity"]
-
-
 def test_rollouts_that_end_are_counted_and_weigh_nothing(tmp_path):
     """A planner that raises in scene 1: scene 0 keeps its likelihoods, scene 1 has none."""
 
@@ -213,6 +193,6 @@ def test_rollouts_that_end_are_counted_and_weigh_nothing(tmp_path):
     scene_set, methods = places(2), [Method("nominal", nominal()), Method("replay", Replay())]
     setup = Setup(scene_set, Fails(), "fails", SIM, 4)
     for row, count in zip(meta_rows(setup, methods, 3, Parts(tmp_path)), (3, 1), strict=True):
-        assert row["ended"] == {"raised ZeroDivisionError": count} and row["n_rollouts"] == 3
+        assert row["errored"] == {"raised ZeroDivisionError": count} and row["n_rollouts"] == 3
         assert {row["metrics"][name]["n"] for name in FEATURES} == {1}
-    assert meta_rows(setup, methods, 3, Parts(tmp_path))[0]["ended"] == {"raised ZeroDivisionError": 3}
+    assert meta_rows(setup, methods, 3, Parts(tmp_path))[0]["errored"] == {"raised ZeroDivisionError": 3}

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from e2rl.commands.tune import changed, flat
+from e2rl.evaluation.methods import build_traffic
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.evaluation.trials import (
     DRIVING,
@@ -17,15 +18,13 @@ from e2rl.evaluation.trials import (
     PlannerTrials,
     driving,
 )
-from e2rl.evaluation.tuning import SearchSettings, best_of, line_of, search
+from e2rl.evaluation.tuning import SearchSettings, search
 from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.planners.path import MissionPath
 from e2rl.run.config import load_choice, resolved
-from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.baselines.ctg import CTGAdv
 from e2rl.traffic.nominal import NominalTraffic
-from e2rl.traffic.rule_based import Replay
 from tests.prior.small import small_prior
 from tests.traffic.e2.traffic_scenes import EGO, scenes, synthesizer
 
@@ -33,36 +32,27 @@ ATTACKS = ("e2", "e2_unbound", "e2_pursuit", "ctg_adv", "safe_sim_opt", "ccdiff"
 
 
 class Cruise(Ego):
-    """Holds a fraction of its speed; raises in scene 1 unless it holds all of it, where it is frail."""
+    """Holds a fraction of its speed."""
 
-    def __init__(self, gain: float = 1.0, frail: bool = False) -> None:
+    def __init__(self, gain: float = 1.0) -> None:
         super().__init__()
-        self.gain, self.frail = gain, frail
+        self.gain = gain
 
     def plan(self, world):
-        if self.frail and self.gain < 1 and (world.scene["scene_index"] == 1).any():
-            raise KeyError("lost")
         speed = self.gain * world.states[:, 0, 3:]
         return MissionPath(world).drive(speed.expand(-1, PLAN_STEPS + 1))
 
 
-def planner_trials(methods, make=Cruise):
-    setup = Setup(scenes(2, steps=20), Cruise(), "cruise", SimSettings(), batch=4)
-    return PlannerTrials(setup, methods, [0], lambda parameters: make(**parameters))
-
-
 def test_a_planner_s_objective_is_collisions_comfort_and_lost_progress_within_guards():
     objective = PlannerObjective(comfort=0.2, progress=0.4, progress_floor=0.9, comfort_ceiling=1.5)
-    reference = {"collision": 0.5, "comfort": 1.0, "progress": 80.0, "ended": 0.1}
-    trial = {"collision": 0.25, "comfort": 2.0, "progress": 60.0, "ended": 0.3}
+    reference = {"collision": 0.5, "comfort": 1.0, "progress": 80.0, "errored": 0.1}
+    trial = {"collision": 0.25, "comfort": 2.0, "progress": 60.0, "errored": 0.3}
     value, excess = objective.judge(trial, reference)
     assert value == pytest.approx(0.25 + 0.2 * 2.0 + 0.4 * 0.25)
     assert excess == pytest.approx((0.9 - 0.75) + (2.0 - 1.5) + (0.3 - 0.1))
-    assert objective.judge(trial | {"comfort": 1.5, "progress": 72.0, "ended": 0.1}, reference)[1] == 0
+    assert objective.judge(trial | {"comfort": 1.5, "progress": 72.0, "errored": 0.1}, reference)[1] == 0
     faster = objective.judge(trial | {"progress": 100.0}, reference)[0]
     assert faster == pytest.approx(0.25 + 0.2 * 2.0), "more progress earns nothing"
-    with pytest.raises(InputError, match="returned no progress"):
-        objective.judge({"collision": 0.0, "comfort": 0.0}, reference)
 
 
 def test_every_trial_meets_traffic_made_against_it():
@@ -75,10 +65,12 @@ def test_every_trial_meets_traffic_made_against_it():
             return super().replan(state, world, ego_plan)
 
     on = Watched(synthesizer().prior)
-    trials = planner_trials([Method("nominal", on), Method("e2", on, 2.0)])
+    setup = Setup(scenes(2, steps=20), Cruise(), "cruise", SimSettings(), batch=4)
+    methods = [Method("nominal", on), Method("e2", on, 2.0)]
+    trials = PlannerTrials(setup, methods, [0], lambda parameters: Cruise(**parameters))
     settings = SearchSettings(trials=3, startup=1, sweep=0)
     first, *others = search(trials, {"gain": 1.0}, {"gain": [0.0, 1.0]}, settings, PlannerObjective())
-    assert {*DRIVING, "collision nominal@0", "collision e2@2", "ended"} <= set(first["metrics"])
+    assert {*DRIVING, "collision nominal@0", "collision e2@2", "errored"} <= set(first["metrics"])
     assert first["admissible"] and first["metrics"]["progress"] > 15
     both = [first["metrics"][f"progress {label}"] for label in ("nominal@0", "e2@2")]
     assert first["metrics"]["progress"] == pytest.approx(sum(both) / 2)
@@ -94,17 +86,6 @@ def test_contacts_with_anybody_and_leaving_the_road_count_as_collisions():
     assert all(map(math.isnan, driving([]).values()))
 
 
-def test_a_trial_that_loses_rollouts_is_counted_and_refused():
-    trials = planner_trials([Method("replay", Replay())])
-    settings, limits = SearchSettings(trials=2, startup=1, sweep=0), PlannerObjective(progress_floor=0.0)
-    frail = {"gain": 1.0, "frail": True}
-    first, second = search(trials, frail, {"gain": [0.9, 1.0]}, settings, limits)
-    assert first["metrics"]["ended"] == 0.0 and first["admissible"]
-    assert second["metrics"]["ended"] == 0.5 == second["metrics"]["ended: raised KeyError"]
-    assert not second["admissible"] and second["metrics"]["progress"] > 0
-    assert "ended 0.5; gain=" in line_of([first, second], limits)
-
-
 def attack(parameters):
     """More gain finds more failures, leaves the road more often (1 point a unit, 0.2 nominal) and is less real."""
     gain = parameters["gain"]
@@ -113,28 +94,14 @@ def attack(parameters):
     return found | {"aor_step": 0.01 * gain + 0.002} | nominal
 
 
-@pytest.mark.parametrize(
-    ("limits", "low", "high"),
-    [({"off_road": 0.03}, 2.0, 3.0), ({"off_road": 1.0}, 7.99, 8.0), ({"off_road": 0.03, "realism": 0.8}, 1.4, 2.0)],
-)
-def test_the_most_failures_within_the_budget_are_found(limits, low, high):
-    """Failures and the price both rise with the gain: the best trial is the largest gain that the limits allow."""
-    settings = SearchSettings(trials=30, startup=10, sweep=9)
-    present, space = {"gain": 0.1, "step_size": 1.0}, {"gain": [0.1, 8.0, "log"]}
-    trials = search(attack, present, space, settings, AttackObjective(**limits))
-    best = best_of(trials)["parameters"]["gain"]
-    assert low < best <= high + 1e-9
-    assert all(trial["admissible"] == (trial["parameters"]["gain"] <= best) for trial in trials)
-
-
 def test_the_limits_of_an_attack_belong_to_it():
     metrics = attack({"gain": 3.0})
     assert AttackObjective(off_road=0.031).judge(metrics, {})[1] == 0
     assert AttackObjective(off_road=0.01).judge(metrics, {})[1] == pytest.approx(0.02)
     assert AttackObjective(off_road=0.01).judge(metrics | {"aor_step nominal": 0.022}, {})[1] == pytest.approx(0)
     wide = AttackObjective(off_road=1.0)
-    assert wide.judge(metrics | {"ended": 0.035, "ended nominal": 0.025}, {})[1] == pytest.approx(0)
-    assert wide.judge(metrics | {"ended": 0.045, "ended nominal": 0.025}, {})[1] == pytest.approx(0.01)
+    assert wide.judge(metrics | {"errored": 0.035, "errored nominal": 0.025}, {})[1] == pytest.approx(0)
+    assert wide.judge(metrics | {"errored": 0.045, "errored nominal": 0.025}, {})[1] == pytest.approx(0.01)
     assert AttackObjective(realism=0.9, off_road=1.0).judge(metrics, {})[1] == pytest.approx(0.2)
     assert AttackObjective(realism=0.9, off_road=1.0).judge(metrics | {"real_adv": math.nan}, {})[1] == 0
     assert math.isinf(AttackObjective().judge(metrics | {"cfr": math.nan}, {})[1])
@@ -167,12 +134,6 @@ def test_a_trial_is_measured_as_the_protocol_measures_the_method(trials):
 def test_every_attack_has_ranges_round_its_present_values(name):
     """Its first parameter is the gain; a trial of the present parameters is the method of conf/synthesizer."""
     group = load_choice("synthesizer", name)
-    present, ranges = flat(resolved(group)), built_traffic(group).tuned
+    present, ranges = flat(resolved(group)), build_traffic(group, small_prior(0)).tuned
     assert ranges and all(low <= present[parameter] <= high for parameter, (low, high, *_) in ranges.items())
     assert changed(group, {parameter: present[parameter] for parameter in ranges}) == group
-
-
-def built_traffic(group):
-    from e2rl.evaluation.methods import build_traffic
-
-    return build_traffic(group, small_prior(0))

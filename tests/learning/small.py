@@ -82,7 +82,7 @@ def small_run(
         collect={"batch": 4, "steps": 20, "hold": 1, "iterations": 2} | (collect or {}),
         ppo={"minibatch": 64, "epochs": 2, "critic_warmup": 0, "target_kl": 1.0} | ppo,
         rounds=rounds,
-        **(expert or {}),
+        **({"recorded": False, "evasions": False, "react": None} | (expert or {})),
     )
     traffic = "replay" if live is None else "live"
     given = {"traffic": traffic, "against": against, "memory": memory, "prefetch": prefetch}

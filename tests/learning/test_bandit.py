@@ -72,46 +72,6 @@ def test_the_value_is_the_expected_learnability_under_the_posterior():
     assert curriculum.values()[1.0, "pair"] == pytest.approx((p * (1 - p)).mean().item(), abs=1e-3)
 
 
-def test_what_is_not_drawn_any_more_is_forgotten_and_tried_again():
-    curriculum = BanditCurriculum(6, 10, etas=[1.0, 2.0], templates=["single"], forgetting=0.3)
-    fresh = curriculum.values()[1.0, "single"]
-    told(curriculum, 1.0, SINGLE, 0.0)
-    known = curriculum.values()[1.0, "single"]
-    for _ in range(10):
-        told(curriculum, 2.0, SINGLE, 0.5)
-    assert known < 0.3 * fresh and curriculum.values()[1.0, "single"] > 0.8 * fresh
-
-
-def test_as_the_policy_hardens_the_intensity_rises():
-    """A policy that fails at eta above its skill: the draws follow, past eta 2, without a schedule."""
-    torch.manual_seed(0)
-    curriculum, drawn, within = BanditCurriculum(64, 30), [], []
-    for number in range(30):
-        skill = 0.5 + 2.3 * number / 29
-        eta, template = curriculum.choices(curriculum.draw(64))
-        rate = torch.sigmoid(4 * (eta + torch.tensor([-0.4, -0.1, -0.3, 0.0])[template] - skill))
-        episodes = torch.full((64,), 10)
-        failures = torch.distributions.Binomial(10, rate).sample().long()
-        curriculum.observe(Outcomes(eta, template, torch.zeros(64, dtype=torch.bool), episodes, failures))
-        curriculum.advance()
-        drawn.append(eta.mean().item()), within.append(((rate > 0.15) & (rate < 0.85)).float().mean().item())
-    assert sum(drawn[3:8]) / 5 < 1.5 and min(drawn[-3:]) >= 2.0
-    assert sum(within[5:]) / 25 > 1.5 * within[0], "the first round draws all arms alike"
-
-
-def test_state_goes_on_exactly():
-    first, second = BanditCurriculum(6, 10, seed=1), BanditCurriculum(6, 10, seed=2)
-    for rate in (0.2, 0.6):
-        first.choices(first.draw(4))
-        told(first, 1.0, PAIR, rate)
-        first.advance(0.1)
-    second.load_state_dict(first.state_dict())
-    scenes = torch.arange(6)
-    for ours, theirs in zip(first.choices(scenes), second.choices(scenes), strict=True):
-        assert torch.equal(ours, theirs)
-    assert first.eta == second.eta and first.values() == second.values()
-
-
 def test_wrong_settings_are_refused():
     wrong = ({"etas": []}, {"etas": [0.0, 1.0]}, {"templates": []}, {"templates": ["trio"]}, {"num_scenes": 0})
     for settings in (*wrong, {"forgetting": -0.1}, {"fraction": 1.5}):

@@ -1,6 +1,5 @@
 """The before/after table: both stages on the same scenes and seeds, the second one paired with the first."""
 
-import pytest
 import torch
 
 from e2rl.evaluation.protocol import Method, Setup
@@ -32,30 +31,3 @@ def test_both_stages_are_kept_and_the_second_is_compared_with_the_first(tmp_path
             for paired in (unchanged, changed)
         ]
         assert differences[0] and not any(differences[0]) and any(differences[1])
-
-
-def test_a_measurement_that_was_cut_off_goes_on_and_one_of_other_rounds_does_not(tmp_path, monkeypatch):
-    setup = Setup(small_scenes(3), IDMEgo(), "idm", SimSettings(), batch=1)
-    methods, score, driven = [Method("ambush", Ambush(), 2.0)], Setup.score, []
-
-    def stopped(setup, method, tasks, folder=None):
-        driven.append(tasks[0])
-        if len(driven) == 3:
-            raise KeyboardInterrupt
-        return score(setup, method, tasks, folder)
-
-    monkeypatch.setattr(Setup, "score", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        BeforeAfter(setup, methods, [0], tmp_path)("before", setup.ego, 0)
-    found = BeforeAfter(setup, methods, [0], tmp_path)("before", setup.ego, 0)
-    assert driven == [(0, 0), (1, 0), (2, 0), (2, 0)], "two were kept"
-    whole = BeforeAfter(setup, methods, [0], tmp_path / "whole")("before", setup.ego, 0)
-    assert without_times(found) == without_times(whole)
-    driven.clear()
-    driven += [None] * 3
-    BeforeAfter(setup, methods, [0], tmp_path)("before", setup.ego, 2)
-    assert len(driven) == 6
-
-
-def without_times(rows):
-    return [{k: str(v) for k, v in row["metrics"].items() if "seconds" not in k} for row in rows]

@@ -12,7 +12,6 @@ from e2rl.planners.bits import observed
 from e2rl.planners.bits_network import BitsNetwork, drive_controls, load_bits
 from e2rl.planners.path import RoutePath
 from e2rl.run.config import load_config
-from e2rl.run.errors import InputError
 from e2rl.run.run import Run
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.observation import ELAPSED
@@ -59,8 +58,8 @@ def test_goals_are_where_the_recording_is_5_s_later():
     data = windows(small_scenes(3, steps=60), 0)
     assert len(data) == 2 * 3 * 3 * 3  # exact and disturbed, steps 0, 5 and 10, vehicles, scenes
     exact, disturbed = data[data["start"][:, 2] == 0], data[data["start"][:, 2] != 0]
-    torch.testing.assert_close(exact["way"], torch.full((27,), 50.0), atol=1e-2, rtol=0)
-    assert exact["side"].abs().max() < 1e-3 and disturbed["side"].abs().max() < 1e-3, "each on its own route"
+    torch.testing.assert_close(exact["distance"], torch.full((27,), 50.0), atol=1e-2, rtol=0)
+    assert exact["offset"].abs().max() < 1e-3 and disturbed["offset"].abs().max() < 1e-3, "each on its own route"
     assert set((exact["start"][:, 1] / LANE_WIDTH).round().tolist()) == {0, 1}
     moved = disturbed["start"][:, 1] - LANE_WIDTH * (disturbed["start"][:, 1] / LANE_WIDTH).round()
     assert 0.2 < moved.std() < 1.0 and 0.3 < disturbed["start"][:, 3].std() < 2.0
@@ -77,10 +76,12 @@ def test_training_lowers_the_losses_and_the_plan_halts_as_recorded(monkeypatch):
         run.turn()
     after = run.measure(data)
     assert after["trajectory"] < 0.4 < before["trajectory"] / 5 and after["goal"] < before["goal"] - 3
-    start = data[(data["start"][:, 3] == 10) & (data["way"] < 20)][:1]
+    start = data[(data["start"][:, 3] == 10) & (data["distance"] < 20)][:1]
     path = RoutePath(start["start"], start["route"])
     code = network.encode(start["observation"])
-    controls = network.controls(code, start["start"][:, 3], path.d, start["way"][:, None], start["side"][:, None])
+    controls = network.controls(
+        code, start["start"][:, 3], path.d, start["distance"][:, None], start["offset"][:, None]
+    )
     driven = drive_controls(controls, start["start"], path)
     assert driven.states[0, 0, -1, 3] < 1.0 and abs(driven.distance.item() - 10.0) < 1.5
 
@@ -121,11 +122,3 @@ def test_the_stage_writes_the_weights_of_the_lowest_held_out_loss_and_goes_on_ex
     assert (tmp_path / "parts" / log).read_text().split() == logged
     one, two = (load_bits(str(tmp_path / name)).state_dict() for name in ("whole", "parts"))
     assert all(torch.equal(value, two[name]) for name, value in one.items())
-
-
-def test_scenes_without_recordings_to_learn_from_are_refused():
-    for scenes in (small_scenes(2, steps=20), small_scenes(2, steps=60, speed=0.1)):
-        with pytest.raises(InputError, match="synthetic: no vehicle moves and is recorded for 5 s"):
-            windows(scenes, 0)
-    with pytest.raises(InputError, match="of one scene none can be held out"):
-        BitsTraining(BitsNetwork(16), windows(small_scenes(1, steps=60), 0), settings())

@@ -47,12 +47,6 @@ def test_loss_and_gradient_are_the_weighted_means_of_those_of_the_labels():
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_a_label_without_weight_changes_nothing():
-    actor = network()
-    one, two = shown([[-3.0, 0.2]], [1.0]), shown([[-3.0, 0.2], [4.0, 1.0]], [1.0, 0.0])
-    assert cloning_loss(actor.actor, one) == cloning_loss(actor.actor, two)
-
-
 @pytest.mark.parametrize("count", [9, 10, 11])
 def test_kinds_share_a_minibatch_evenly_whatever_their_sizes(count):
     few, many = shown([[-3.0, 0.2]], [1.0])[:1], shown([[1.0, 0.0], [2.0, 0.0]], [0.25, 0.75]).repeat(100)

@@ -2,14 +2,13 @@
 
 import pytest
 import torch
-from e2rl.scripts.train import train_round
 from tensordict import TensorDict
 
 from e2rl.learning.driving import PoolDriver, episodes_of, finished_episodes
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.pool import TrafficPool
-from tests.learning.small import brake_check, small_run, small_scenes
+from tests.learning.small import brake_check, small_scenes
 
 
 def attacked(scenes, eta=1.0):
@@ -111,43 +110,3 @@ def test_decisions_of_several_steps_are_told_from_steps():
     assert finished_episodes([data], adversarial, 5, hold=2).row.tolist() == [0, 1, 2]
     assert finished_episodes([data[:, :7]], adversarial, 5, hold=2).row.tolist() == [0, 1]
     assert finished_episodes([data[:, :5]], adversarial, 5, hold=2).row.tolist() == [0], "the second might have lasted"
-
-
-def test_the_failure_rate_is_unbiased():
-    """Half of the environments' episodes fail after 3 of 10 steps; counting every finished one would say more."""
-    torch.manual_seed(0)
-    batches, total = [], 20
-    for _ in range(300):
-        fails = torch.rand(12) < 0.5
-        lengths = torch.where(fails, 3, 10).tolist()
-        batches.append(frames(lengths, total, fail=fails.nonzero()[:, 0].tolist()))
-    data = torch.cat(batches, 0)
-    fair = finished_episodes([data], torch.zeros(12, dtype=torch.bool), 10).failed.float().mean().item()
-    naive = data["next", "metrics", "contact"].sum() / data["next", "done"].sum()
-    assert fair == pytest.approx(0.5, abs=0.04) and naive > fair + 0.07
-
-
-def test_a_rounds_episodes_are_those_of_its_pool():
-    run = small_run()
-    train_round(run)
-    episodes = run.episodes
-    assert len(episodes) == 8 and set(episodes.row.tolist()) <= set(range(6))
-    assert torch.equal(episodes.adversarial, episodes.row < 3)
-    assert torch.isin(episodes.scene_index, run.memory.rounds[-1].traffic["scene_index"]).all()
-
-
-def test_the_episode_reward_is_the_sum_of_an_episode_s_rewards():
-    scenes = small_scenes(steps=40)
-    run = small_run(scenes=scenes, collect={"steps": 40})
-    index = torch.arange(4)
-    attack = TrafficPool.stored(brake_check(scenes)(None, index, 7.0, 0), 7.0)
-    run.improve.synthesizer.pool = attack + TrafficPool.recorded(index)
-    run.improve.draw.probability = torch.ones(8, dtype=torch.float64)
-    after = run.improve.env.rollout(90, break_when_any_done=False)["next"]
-    total, lengths = torch.zeros(4, 1), set()
-    for step in range(90):
-        total = total + after["reward"][:, step]
-        torch.testing.assert_close(after["episode_reward"][:, step], total)
-        lengths |= set(after["timestep"][:, step][after["done"][:, step]].tolist())
-        total = total * ~after["done"][:, step]
-    assert len(lengths) > 1, "episodes of several lengths in turn"

@@ -2,15 +2,13 @@
 
 import pytest
 import torch
-from e2rl.scripts.train import train_round
 
 from e2rl.learning.attack import solvable
 from e2rl.learning.driving import PoolDriver, episodes_of
 from e2rl.learning.experts import Experts, GivenActions, evasion_demonstrations
-from e2rl.learning.run_checkpoint import load_checkpoint, save_checkpoint
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.pool import TrafficPool
-from tests.learning.small import brake_check, small_run, small_scenes, steady
+from tests.learning.small import brake_check, small_scenes
 
 SIM = SimSettings()
 
@@ -54,15 +52,6 @@ def test_evasions_that_fail_by_decisions_are_left_out():
     assert evasion_demonstrations(driver, pool, 0)["scene_index"].unique().tolist() == [1]
 
 
-def test_rows_without_an_evasion_yield_no_demonstrations():
-    scenes = small_scenes(2)
-    index, driver = torch.arange(2), PoolDriver(scenes, SIM, 2)
-    pool = TrafficPool.stored(brake_check(scenes)(None, index, 2.0, 0), 2.0) + TrafficPool.recorded(index)
-    assert evasion_demonstrations(driver, pool, 0) is None
-    experts = Experts(scenes, SIM, 2, evasions=True)
-    assert experts.demonstrations(pool) == {} == experts.demonstrations(TrafficPool.recorded(index))
-
-
 def test_demonstrations_of_remembered_evasions_are_made_once_and_leave_with_their_rows():
     scenes = small_scenes(2, steps=40)
     older, newer = attacked(scenes), attacked(scenes, 3.0)
@@ -73,26 +62,3 @@ def test_demonstrations_of_remembered_evasions_are_made_once_and_leave_with_thei
     both = experts.demonstrations(newer + older)["evasions"]
     assert len(made) == 2 and torch.equal(both[-len(first) :]["action"], first["action"])
     assert len(experts.demonstrations(newer)["evasions"]) == len(both) - len(first) and len(made) == 2
-
-
-@pytest.mark.slow
-def test_a_round_clones_evasions_and_a_resumed_one_the_same(tmp_path):
-    scenes = small_scenes(steps=40)
-
-    def begun():
-        expert = {"evasions": True}
-        run = small_run(folder=tmp_path, scenes=scenes, expert=expert, cloning=0.5, collect={"hold": 2}, final_lr=1.0)
-        attack = brake_check(scenes)
-        run.synthesize = lambda ego, index, eta, seed: attack(ego, index, eta + 1.5 * (eta > 0), seed)
-        run.solvable = lambda traffic: solvable(traffic, scenes, SIM)
-        return run
-
-    run = begun()
-    one = train_round(run)
-    save_checkpoint(tmp_path, run, {})
-    two = train_round(run)
-    assert two["train/evasions_demonstrations"] > one["train/evasions_demonstrations"] > 0
-    again = begun()
-    assert load_checkpoint(tmp_path, again) == 1
-    resumed = train_round(again)
-    assert steady(resumed) == steady(two)

@@ -7,22 +7,6 @@ from e2rl.learning.scheduler import COLUMNS
 from e2rl.run.errors import InputError
 
 
-def test_csv_rows_go_on_after_a_resume(tmp_path):
-    for step in (1, 2):
-        logger = RunLogger("csv", tmp_path)
-        logger.log({"train/loss": 0.5 * step, "eval/after_cfr": float("nan")}, step)
-        logger.close()
-        del logger
-    scalars = tmp_path / "logs" / "scalars"
-    assert (scalars / "train" / "loss.csv").read_text().split() == ["1,0.5", "2,1.0"]
-    assert not (scalars / "eval").exists(), "NaN is no measurement"
-
-
-def test_none_writes_nothing(tmp_path):
-    RunLogger("none", tmp_path).log({"train/loss": 1.0}, 0)
-    assert not list(tmp_path.iterdir())
-
-
 def test_unknown_groups_and_kinds_are_refused(tmp_path):
     with pytest.raises(InputError, match="loss"):
         RunLogger("none", tmp_path).log({"loss": 1.0}, 0)

@@ -1,11 +1,8 @@
 """The memory of D': bounded, the oldest leave first, mapped from plain arrays, and drawn less than what is fresh."""
 
-import pickle
-
 import pytest
 import torch
 from e2rl.scripts.train import train_round
-from safetensors import safe_open
 
 from e2rl.learning.attack import Order, Solved, make_traffic
 from e2rl.learning.memory import Memory
@@ -65,23 +62,6 @@ def test_evasions_make_the_round_trip(tmp_path):
         assert rows.tolist() == [first, first + 2] and pool.scene_index[rows].tolist() == [0, 3]
         assert torch.equal(found, actions[[0, 3]]) and torch.equal(acts, span[[0, 3]])
     assert not pool.parts[0].evasion[3:].any() and len(pool) == 14
-
-
-def test_errored_rows_stand_in_the_file(tmp_path):
-    memory, errored = Memory(tmp_path, 100), [{"scene": 3, "reason": "raised KeyError", "eta": 1.5}]
-    memory.write(0, traffic(0), errored)
-    assert memory.take(0).errored == errored
-    memory.restore(memory.index())
-    assert memory.rounds[0].errored == errored
-
-
-def test_files_hold_plain_arrays(tmp_path):
-    path = filled(tmp_path, 100, rounds=1).path(0)
-    with safe_open(path, "pt") as file:
-        assert {"states", "valid", "adversaries", "eta", "template", "scene_index"} <= set(file.keys())
-    with path.open("rb") as file, pytest.raises(pickle.UnpicklingError):
-        pickle.load(file)
-    assert not list(tmp_path.rglob("*.part"))
 
 
 def test_rounds_are_remembered_and_reported():

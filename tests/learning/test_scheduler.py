@@ -87,13 +87,6 @@ def test_scenes_left_out_are_not_drawn_first():
     assert curriculum.learnability().nan_to_num(-1).tolist() == [0.25, 0.0, -1.0, -1.0]
 
 
-def test_the_summary_tells_what_is_known():
-    curriculum = curriculum_of(4, eta=2.0, fraction=0.7)
-    assert curriculum.summary() == {"eta": 2.0, "fraction": 0.7, "scenes_seen": 0.0}
-    failing(curriculum, 0.5, 0.0)
-    assert curriculum.summary() == {"eta": 2.0, "fraction": 0.7, "scenes_seen": 0.5, "learnability": 0.125}
-
-
 def test_state_goes_on_exactly():
     first, second = curriculum_of(), curriculum_of(seed=4)
     for _ in range(3):

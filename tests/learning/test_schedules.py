@@ -31,14 +31,6 @@ def test_adaptive_intensity_seeks_the_band_within_its_bounds():
     assert curriculum.eta == 0.5 and curriculum.round == 11, "no collision rate is known: it stays"
 
 
-def test_adaptive_intensity_settles_where_the_ego_collides_as_often_as_wanted():
-    """An ego that collides at rate eta / 4 ends in the band."""
-    curriculum = AdaptiveCurriculum(6, 10, eta=0.25, target_low=0.4, target_high=0.5, eta_step=0.25)
-    for _ in range(40):
-        curriculum.advance(curriculum.eta / 4)
-    assert 0.4 <= curriculum.eta / 4 <= 0.5
-
-
 @pytest.mark.parametrize(
     ("eta", "spread", "low", "high"),
     [(2.0, 1.0, 1.0, 3.0), (0.5, 1.0, 0.25, 1.5), (4.5, 1.0, 3.5, 5.0), (1.0, 0.0, 1.0, 1.0)],
@@ -77,10 +69,7 @@ def test_the_template_is_full_and_intensities_are_counted_under_multiples_of_a_h
     ("kind", "settings"),
     [
         (AdaptiveCurriculum, {"target_low": 0.6}),
-        (AdaptiveCurriculum, {"fraction": 1.5}),
-        (LinearCurriculum, {"fraction_final": -0.1}),
         (LinearCurriculum, {"spread": -1.0}),
-        (ConstantCurriculum, {"eta": []}),
         (ConstantCurriculum, {"eta": [1.0, -1.0]}),
     ],
 )

@@ -2,11 +2,9 @@
 
 import pytest
 import torch
-from e2rl.scripts.train import train_round
 from tensordict import TensorDict
 
 from e2rl.learning.cloning import clip_expert
-from e2rl.learning.run_checkpoint import load_checkpoint, save_checkpoint
 from e2rl.learning.teaching import Teacher, critical
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.idm_planner import IDMEgo
@@ -15,7 +13,7 @@ from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.observation import OBSERVATION_SIZE
 from e2rl.traffic.pool import TrafficPool
-from tests.learning.small import brake_check, small_run, small_scenes, steady
+from tests.learning.small import brake_check, small_run, small_scenes
 
 ANY = {"near": 1e9, "regret": -1e9, "survivable": 1e9}  # every state of an adversarial episode is labelled
 BOUNDS = torch.tensor([-8.0, -1.6]), torch.tensor([5.0, 1.6])
@@ -110,7 +108,7 @@ def test_only_what_the_teacher_does_better_by_far_and_survives_is_labelled():
     scenes = small_scenes(3, steps=40)
     data, improve = collected(scenes, attacked(scenes, 3.0))
     start = data[:, 2]  # the leader is there from the first step on
-    strict = Teacher(SamplingEgo(), scenes, BOUNDS, 2)
+    strict = Teacher(SamplingEgo(), scenes, BOUNDS, 2, {})
     assert len(strict.labels(start, Blind())) == len(start)
     assert len(strict.labels(start, SamplingActor())) == 0
     hopeless = start.clone()
@@ -134,28 +132,7 @@ def test_nominal_episodes_are_not_labelled_and_the_newest_labels_stay():
     assert teacher.watch(data, torch.tensor([False, True, False]), ego, 5)["critical"] == of_one > 0
 
 
-@pytest.mark.slow
-def test_a_resumed_round_knows_the_labels_of_before(tmp_path):
-    scenes = small_scenes(steps=40)
-
-    def begun():
-        expert = {"teacher": SamplingEgo(), "teaching": {**ANY, "states": 20}}
-        return small_run(folder=tmp_path, scenes=scenes, expert=expert, teaching=0.1, collect={"hold": 2}, final_lr=1.0)
-
-    run = begun()
-    one = train_round(run)
-    assert one["train/labels"] == 10 and one["train/loss_teaching"] > 0 and len(run.improve.teacher.labelled) == 20
-    save_checkpoint(tmp_path, run, {})
-    two = steady(train_round(run))
-    again = begun()
-    assert load_checkpoint(tmp_path, again) == 1
-    assert steady(train_round(again)) == two and len(again.improve.teacher.labelled) == 40
-
-
 def test_what_cannot_teach_is_refused():
     scenes = small_scenes(1)
-    for planner in (IDMEgo(), None):
-        with pytest.raises(InputError, match=r"learner\.teacher=.*RankingEgo"):
-            Teacher(planner, scenes, BOUNDS, 2)
-    with pytest.raises(InputError, match=r"learner\.teaching\.states"):
-        Teacher(SamplingEgo(), scenes, BOUNDS, 2, {"states": 0})
+    with pytest.raises(InputError, match=r"learner\.teacher=.*ScoringEgo"):
+        Teacher(IDMEgo(), scenes, BOUNDS, 2, {})

@@ -238,7 +238,7 @@ def test_an_interrupt_in_an_update_ends_in_one_line_that_says_how_to_go_on(monke
     ego = ActorEgo(hidden=(16,))
     learner, data, head = Learner(ego.network, settings_of(critic_warmup=0)), batch_of(ego), ActorNetwork.head
     monkeypatch.setattr(ActorNetwork, "head", lambda *given: os.kill(os.getpid(), signal.SIGTERM) or head(*given))
-    with pytest.raises(SystemExit) as end, ending("python train.py resume=RUN"):
+    with pytest.raises(SystemExit) as end, ending(lambda: "python train.py resume=RUN"):
         learner.update(data)
     assert end.value.code == 128 + signal.SIGTERM
     assert capsys.readouterr().err.strip() == "interrupted (SIGTERM); go on with: python train.py resume=RUN"

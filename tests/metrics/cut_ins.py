@@ -12,7 +12,6 @@ LENGTH, WIDTH = 4.3, 1.9  # m, of both vehicles
 LATERAL_GAP = 1.6  # m between the sides of two vehicles in the middle of neighbouring lanes of 3.5 m
 LATERAL_ACCELERATION = 1.5  # m/s^2
 DURATION = 40.0  # s after the lateral speed has been reached
-NO_CRASH, SIDE, FRONT = range(3)  # SIDE: the ego's front has passed the other's front; FRONT: it has not
 
 
 class CutIn(NamedTuple):
@@ -40,23 +39,22 @@ def lateral_motion(cut_in: CutIn) -> tuple[Tensor, Tensor, int]:
 
 
 def simulate_cut_ins(driver: Driver, cut_in: CutIn) -> Tensor:
-    """Kind of crash [B]: NO_CRASH, SIDE or FRONT, with the driver in the ego. Both speeds are constant but for it.
+    """Whether [B] it crashes with the driver in the ego. Both speeds are constant but for it.
 
     Semi-implicit Euler steps of DT along the road: v' = max(v + a DT, 0), x' = x + v' DT.
     """
     lateral_speed, lateral_gap, start = lateral_motion(cut_in)
     speed, other = cut_in.speed, cut_in.other_speed
     gap = cut_in.gap + (speed - other) * start * DT
-    kind, length = torch.zeros_like(speed, dtype=torch.long), torch.full_like(speed, LENGTH)
+    crash, length = torch.zeros_like(speed, dtype=torch.bool), torch.full_like(speed, LENGTH)
     still = torch.zeros_like(speed)
     state, acceleration = no_conflict(speed), still
     for lateral, side in zip(lateral_speed, lateral_gap, strict=True):
         overlaps = side <= 0
-        hit = overlaps & (gap <= 0) & (gap >= -2 * LENGTH) & (kind == NO_CRASH)
-        kind = torch.where(hit, torch.where(gap < -LENGTH, SIDE, FRONT), kind)
+        crash |= overlaps & (gap <= 0) & (gap >= -2 * LENGTH)
         seen = Observation(speed, acceleration, gap, other, still, side, lateral, overlaps, length, length)
         state, wanted = driver.step(state, seen)
         after = (speed + wanted * DT).clamp(min=0)
         acceleration = (after - speed) / DT
         speed, gap = after, gap + (other - after) * DT
-    return kind
+    return crash

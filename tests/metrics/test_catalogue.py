@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from e2rl.evaluation.rollout_files import read_rows, table_columns, write_rows
+from e2rl.evaluation.rollout_files import read_rows, write_rows
 from e2rl.evaluation.summary import metric_rows
-from e2rl.metrics.catalogue import METRICS, Metric, register, row_columns, table_metrics, unregister
+from e2rl.metrics.catalogue import Metric, register, table_metrics, unregister
 from e2rl.metrics.score import score_rollouts
 from e2rl.metrics.statistics import metric_table, paired_differences, summarise
 from e2rl.report.tables import legend, metric_tables
@@ -44,29 +44,6 @@ def test_it_is_in_rows_files_summaries_and_its_tables(fast, tmp_path):
     assert row[0] == "fast [%]" and row[1].startswith(f"{100 * expected:.1f} [")
     assert metric_tables(summaries, table="main")[0].rows[-1] == row
     assert "above 10 m/s" in legend() and fast not in table_metrics("traffic")
-
-
-def test_built_in_columns_stay_as_they_are():
-    before, columns, names = score_rollouts(random_rollouts(2))[0], table_columns(), list(METRICS)
-    register(Metric("one", "always 1"), lambda batch: torch.ones(len(batch["stop"])))
-    try:
-        rows = score_rollouts(random_rollouts(2))[0]
-        assert [name for name in table_columns() if name != "one"] == list(columns) and list(METRICS) == [*names, "one"]
-        for row, old in zip(rows, before, strict=True):
-            assert row.pop("one") == 1 and str(row) == str(old)
-    finally:
-        unregister("one")
-    assert table_columns() == columns and list(METRICS) == names
-
-
-def test_a_median_of_a_column_that_exists_needs_no_function():
-    register(Metric("median_progress", "", column="progress", median=True))
-    try:
-        rows, samples = score_rollouts(random_rollouts(5))
-        found = summarise(rows, samples, 20, 2)["median_progress"]["mean"]
-        assert found == sorted(row["progress"] for row in rows)[2] and "median_progress" not in row_columns()
-    finally:
-        unregister("median_progress")
 
 
 def test_taken_names_and_wrong_shapes_are_refused():

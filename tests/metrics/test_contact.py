@@ -8,7 +8,6 @@ import torch
 from e2rl.metrics.contact import touched_columns
 from e2rl.metrics.score import score_rollouts
 from e2rl.sim.rollouts import Rollouts
-from tests.metrics.random_rollouts import random_rollouts
 
 SIZE = (4.8, 2.0)
 
@@ -59,39 +58,52 @@ def row(*courses, **options):
     return score_rollouts(scene(*courses, **options))[0][0]
 
 
-def test_running_into_a_slower_vehicle_is_a_front_contact_at_the_computed_time():
-    result = row(course(0, 0, 0, 12), course(30.5, 0, 0, 5), adversaries=[1])
-    expected = math.ceil((30.5 - 4.8) / 7 * 10) / 10
-    assert (result["contact_type"], result["contact_time"]) == ("front", pytest.approx(expected))
-    assert (result["cfr"], result["cfr_adv"], result["front"], result["rir"]) == (1, 1, 1, 0)
-    assert result["relvel"] == pytest.approx(7, abs=1e-5) and result["partner"] == 1
-    assert result["at_fault"] == 1, "the lead was on the ego's way all along"
-    assert result["min_dtc"] == 0
+HEAD_ON = course(
+    100.1, 0.3, math.pi, 30
+)  # 3 m deep at the step of the contact, where the ego's sides are longer inside
+CASES = {
+    "a slower one ahead": (
+        [course(0, 0, 0, 12), course(30.5, 0, 0, 5)],
+        {"contact_type": "front", "contact_time": 3.7, "cfr": 1, "front": 1, "rir": 0, "relvel": 7}
+        | {"partner": 1, "at_fault": 1, "min_dtc": 0, "cfr_adv": 0},
+    ),
+    "from behind": (
+        [course(0, 0, 0, 0), course(-30, 0.5, 0, 15)],
+        {"contact_type": "rear", "rear": 1, "rir": 1, "at_fault": 0, "relvel": 15},
+    ),
+    "head on": (
+        [course(0, 0, 0, 30), HEAD_ON],
+        {"contact_type": "front", "relvel": 60, "front_any": 1, "side_any": 1, "rear_any": 0},
+    ),
+    "from the right": (
+        [course(0, 0, 0, 0), course(0.5, -25, math.pi / 2, 10)],
+        {"contact_type": "side", "at_fault": 0},
+    ),
+    "from the left": ([course(0, 0, 0, 0), course(0.5, 25, -math.pi / 2, 10)], {"contact_type": "side", "at_fault": 0}),
+    "a standing one": ([course(0, 0, 0, 10), course(40, 0.4, 0.2, 0)], {"at_fault": 1}),
+    "one that cuts in": (
+        [course(0, 0, 0, 10), course(43.0, -24.0, math.pi / 2, 6)],
+        {"contact_type": "front", "at_fault": 0},
+    ),
+    "one that appears": (
+        [course(0, 0, 0, 0), course(-2.0, 0, 0, 3, appears=20)],
+        {"contact_step": 20, "contact_type": "front", "relvel": 3},
+    ),
+}
 
 
-def test_being_hit_from_behind_while_standing_is_a_rear_contact_and_not_the_ego_s_fault():
-    result = row(course(0, 0, 0, 0), course(-30, 0.5, 0, 15))
-    assert (result["contact_type"], result["rear"], result["rir"], result["at_fault"]) == ("rear", 1, 1, 0)
-    assert result["relvel"] == pytest.approx(15, abs=1e-5) and result["cfr_adv"] == 0
+@pytest.mark.parametrize("case", CASES)
+def test_contacts_on_known_courses(case):
+    courses, expected = CASES[case]
+    found = row(*courses)
+    assert {name: found[name] for name in expected} == pytest.approx(expected, abs=1e-4)
 
 
-def test_a_fast_head_on_contact_is_at_the_front_although_a_step_is_three_metres_deep():
-    """At the grid step alone the ego's sides are 3 m inside the other, longer than its front: `side`."""
-    result = row(course(0, 0, 0, 30), course(100.1, 0.3, math.pi, 30))
-    assert result["contact_type"] == "front" and result["relvel"] == pytest.approx(60, abs=1e-4)
-    assert (result["front_any"], result["side_any"], result["rear_any"]) == (1, 1, 0)
-
-
-@pytest.mark.parametrize("start, heading", [(-25.0, math.pi / 2), (25.0, -math.pi / 2)])
-def test_a_vehicle_from_the_side_hits_the_side(start, heading):
-    result = row(course(0, 0, 0, 0), course(0.5, start, heading, 10))
-    assert (result["contact_type"], result["at_fault"]) == ("side", 0)
-
-
-def test_the_ego_is_at_fault_against_standing_vehicles_but_not_against_one_that_cuts_in():
-    assert row(course(0, 0, 0, 10), course(40, 0.4, 0.2, 0))["at_fault"] == 1
-    crossing = row(course(0, 0, 0, 10), course(43.0, -24.0, math.pi / 2, 6))
-    assert (crossing["contact_type"], crossing["at_fault"]) == ("front", 0)
+def test_a_contact_is_with_an_adversary_or_not_and_who_has_left_is_not_hit():
+    gone = course(30, 0, 0, 0)
+    gone[1][5:] = False
+    found = row(course(0, 0, 0, 12), course(30.5, 0, 0, 5), adversaries=[1])
+    assert found["cfr_adv"] == 1 and row(course(0, 0, 0, 10), gone)["cfr"] == 0
 
 
 def test_a_contact_of_two_tenths_of_a_second_between_replans_is_found():
@@ -125,52 +137,23 @@ def test_background_pairs_leave_out_those_that_overlap_at_the_start_and_what_com
     assert (result["cfr"], result["cfr_bg"]) == (1, 0)
 
 
-def test_a_partner_that_was_not_there_the_step_before_is_judged_at_contact():
-    result = row(course(0, 0, 0, 0), course(-2.0, 0, 0, 3, appears=20))
-    assert (result["contact_step"], result["contact_type"]) == (20, "front")
-    assert result["relvel"] == pytest.approx(3, abs=1e-5)
-
-
-def test_a_vehicle_that_has_left_cannot_be_hit():
-    gone = course(30, 0, 0, 0)
-    gone[1][5:] = False
-    assert row(course(0, 0, 0, 10), gone)["cfr"] == 0
-
-
-def test_types_are_exclusive_and_partner_was_touched():
-    for result in score_rollouts(random_rollouts(24, seed=11))[0]:
-        if result["cfr"] == 1:
-            assert result["front"] + result["side"] + result["rear"] == 1
-            assert result[result["contact_type"]] == 1 and result["partner"] > 0
-        elif result["cfr"] == 0:
-            assert result["front"] + result["side"] + result["rear"] == 0 and math.isnan(result["rir"])
-
-
-def touched(speeds, hit, logged=None, valid=None):
-    """touched and moving_vehicles of one rollout of vehicles at speeds [N] throughout; the ego is no traffic."""
-    speed = torch.tensor(speeds, dtype=torch.float64)
+@pytest.mark.parametrize(
+    ("speeds", "logged", "there", "hit", "expected"),
+    [
+        ([9, 5, 5, 5, 0], None, None, [1, 2, 4], (2 / 3, 3)),
+        ([9, 5, 5], None, None, [0], (0, 2)),  # the ego is no traffic
+        ([9, 0, 5], [9, 5, 5], None, [1], (0.5, 2)),  # who moves in the log alone counts
+        ([9, 5, 5], None, [True, False, True], [1], (0, 1)),  # but not while absent
+        ([9, 0, 0.4], None, None, [1, 2], (math.nan, 0)),
+    ],
+)
+def test_touched_is_a_fraction_of_the_traffic_that_moves(speeds, logged, there, hit, expected):
+    speed, log = torch.tensor(speeds).double(), torch.tensor(logged or speeds).double()
     count = len(speeds)
     track = torch.zeros(1, 5, count, 4, dtype=torch.float64)
-    log = track.clone()
-    track[..., 3], log[..., 3] = speed, speed if logged is None else torch.tensor(logged, dtype=torch.float64)
-    there = torch.ones(1, 5, count, dtype=torch.bool)
-    known = there if valid is None else there & torch.tensor(valid)
-    batch = {"states": track, "valid": known, "logged": log, "logged_valid": known}
+    known = torch.tensor(there or [True] * count).expand(1, 5, count)
+    batch = {"states": track + 0, "logged": track + 0, "valid": known, "logged_valid": known}
+    batch["states"][..., 3], batch["logged"][..., 3] = speed, log
     batch["traffic"] = torch.arange(count)[None] > 0
-    found = touched_columns(batch, torch.tensor([hit]))
-    return found["touched"].item(), found["moving_vehicles"].item()
-
-
-def test_it_is_a_share_of_those_that_move():
-    assert touched([9, 5, 5, 5, 0], [False, True, True, False, True]) == (2 / 3, 3)
-    assert touched([9, 5, 5], [True, False, False]) == (0, 2), "the ego is no traffic"
-
-
-def test_whoever_moves_in_the_log_alone_counts_but_not_while_absent():
-    assert touched([9, 0, 5], [False, True, False], logged=[9, 5, 5]) == (0.5, 2)
-    assert touched([9, 5, 5], [False, True, False], valid=[True, False, True]) == (0, 1)
-
-
-def test_nobody_moving_is_unknown():
-    share, number = touched([9, 0, 0.4], [False, True, True])
-    assert share != share and number == 0
+    found = touched_columns(batch, torch.isin(torch.arange(count), torch.tensor(hit))[None])
+    assert (found["touched"].item(), found["moving_vehicles"].item()) == pytest.approx(expected, nan_ok=True)

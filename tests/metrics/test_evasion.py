@@ -95,11 +95,16 @@ def test_ways_are_the_mission_then_real_candidates_then_shifts():
 SLOW_AHEAD = [(0, 0, 12.0), (40, 0, 3.0), (-40, 1, 5.0)]
 
 
-def test_a_collision_has_an_evasion_that_touches_nobody_and_a_clean_rollout_has_none():
+def collided():
+    """(scenes, rollouts) of two recordings in which the ego runs into a slow vehicle."""
     scene_set = make_scenes(2, vehicles=SLOW_AHEAD, num_vrus=0, steps=60, max_vehicles=8, max_agents=10)
     scene = scene_set.scenes
     more = {"adversaries": scene["valid"] & False, "seed": torch.arange(2), "eta": torch.zeros(2).double()}
-    rollouts = Rollouts.in_scenes(scene_set, torch.arange(2), scene["logged"], scene["logged_valid"], **more)
+    return scene, Rollouts.in_scenes(scene_set, torch.arange(2), scene["logged"], scene["logged_valid"], **more)
+
+
+def test_a_collision_has_an_evasion_that_touches_nobody_and_a_clean_rollout_has_none():
+    scene, rollouts = collided()
     rows = [{"cfr": 1, "contact_step": 40.0}, {"cfr": 0, "contact_step": float("nan")}]
     add_avoidable(rows, rollouts, scene, SimSettings())
     evasions = rollouts.evasion
@@ -121,8 +126,7 @@ def test_an_evasion_from_a_moment_on_follows_what_was_driven_until_then():
 
 
 def test_the_late_search_begins_a_second_before_the_contact_and_is_enough(monkeypatch):
-    scene_set = make_scenes(2, vehicles=SLOW_AHEAD, num_vrus=0, steps=60, max_vehicles=8, max_agents=10)
-    scene, asked = scene_set.scenes, []
+    (scene, rollouts), asked = collided(), []
 
     def late_only(scene, states, valid, sim, moment=None):
         asked.append(None if moment is None else moment.tolist())
@@ -131,8 +135,6 @@ def test_the_late_search_begins_a_second_before_the_contact_and_is_enough(monkey
         return evasion.Evasions(found, track[..., :2], track, peak, peak.long(), batch_size=[len(states)])
 
     monkeypatch.setattr(evasion, "find_evasions", late_only)
-    more = {"adversaries": scene["valid"] & False, "seed": torch.arange(2), "eta": torch.zeros(2).double()}
-    rollouts = Rollouts.in_scenes(scene_set, torch.arange(2), scene["logged"], scene["logged_valid"], **more)
     rows = [{"cfr": 1, "contact_step": 40.0}, {"cfr": 1, "contact_step": 4.0}]
     add_avoidable(rows, rollouts, scene, SimSettings())
     assert asked == [None, [30, 0]]

@@ -38,55 +38,44 @@ def mirrored(text):
     return text.replace("left", "\0").replace("right", "left").replace("\0", "right")
 
 
-def test_running_into_a_slower_leader_and_into_one_that_brakes():
-    assert words(course(0, 0, EAST, 12), course(30.5, 0, EAST, 5)) == ("ahead", "keeps speed", "keeps speed")
-    braking = drive(20, 0, EAST, 12, accel=lambda t: -5.0 if t > 0.5 else 0.0)
-    assert words(course(0, 0, EAST, 12), braking) == ("ahead", "keeps speed", "brakes")
-    result = row(course(0, 0, EAST, 12), course(40, 0, EAST, 0))
-    assert (result["approach"], result["partner_manoeuvre"]) == ("ahead", "stands")
-    assert result["ego_speed"] == pytest.approx(12) and result["partner_speed"] == 0
+EGO = course(0, 0, EAST, 12)
+STRAIGHT = ("keeps speed", "keeps speed")
+CASES = [
+    (EGO, course(30.5, 0, EAST, 5), ("ahead", *STRAIGHT)),
+    (EGO, drive(20, 0, EAST, 12, accel=lambda t: -5.0 if t > 0.5 else 0.0), ("ahead", "keeps speed", "brakes")),
+    *((EGO, course(40, 0, heading, 0), ("ahead", "keeps speed", "stands")) for heading in (EAST, NORTH, WEST, 2.0)),
+    (course(0, 0, EAST, 10), course(43.0, -24, NORTH, 6), ("crossing from the right", *STRAIGHT)),
+    (course(0, 0, EAST, 10), course(43.0, 24, SOUTH, 6), ("crossing from the left", *STRAIGHT)),
+    (  # a left turn across oncoming traffic, of the ego and of its partner
+        drive(-10, 0, EAST, 6, turn=lambda t: 0.4 if 2 < t < 5 else 0.0),
+        course(47, 5, WEST, 9),
+        ("oncoming", "turns left", "keeps speed"),
+    ),
+    (
+        course(0, 0, EAST, 8),
+        drive(26, 3.5, WEST, 6, turn=lambda t: 0.5 if t > 0.5 else 0.0),
+        ("oncoming", "keeps speed", "turns left"),
+    ),
+    (
+        drive(0, 0, EAST, 10, accel=lambda t: -4.0 if t > 1 else 0.0),
+        course(-14, 0, EAST, 10),
+        ("from behind", "brakes", "keeps speed"),
+    ),
+    (course(0, 0, EAST, 0), course(-30, 0.5, EAST, 15), ("from behind", "stands", "keeps speed")),
+]
 
 
-def test_a_standing_vehicle_across_the_way_is_ahead_whatever_its_heading():
-    for heading in (NORTH, WEST, 2.0):
-        assert words(course(0, 0, EAST, 10), course(40, 0, heading, 0)) == ("ahead", "keeps speed", "stands")
+@pytest.mark.parametrize(("ego", "partner", "expected"), CASES)
+def test_known_cases_have_their_words(ego, partner, expected):
+    assert words(ego, partner) == expected
 
 
-@pytest.mark.parametrize("side, sign", [("left", 1), ("right", -1)])
-def test_a_lane_change_into_the_ego_s_front_is_a_cut_in_from_its_side(side, sign):
-    other = "right" if side == "left" else "left"
-    partner = drive(18, 3.5 * sign, EAST, 9, turn=swerve(-sign, 1.5))
-    assert words(course(0, 0, EAST, 13), partner) == (f"cut-in from the {side}", "keeps speed", f"veers {other}")
-
-
-@pytest.mark.parametrize("side, sign", [("left", 1), ("right", -1)])
-def test_a_vehicle_beside_that_comes_over_is_beside(side, sign):
-    other = "right" if side == "left" else "left"
-    partner = drive(0, 3.5 * sign, EAST, 12, turn=swerve(-sign, 2.0))
-    assert words(course(0, 0, EAST, 12), partner) == (f"beside on the {side}", "keeps speed", f"veers {other}")
-
-
-@pytest.mark.parametrize("side, y, heading", [("right", -24.0, NORTH), ("left", 24.0, SOUTH)])
-def test_crossing_traffic_has_the_side_that_it_comes_from(side, y, heading):
-    assert words(course(0, 0, EAST, 10), course(43.0, y, heading, 6)) == (
-        f"crossing from the {side}",
-        "keeps speed",
-        "keeps speed",
-    )
-
-
-def test_a_left_turn_across_oncoming_traffic():
-    ego = drive(-10, 0, EAST, 6, turn=lambda t: 0.4 if 2 < t < 5 else 0.0)
-    result = words(ego, course(47, 5, WEST, 9))
-    assert result == ("oncoming", "turns left", "keeps speed")
-    partner = drive(26, 3.5, WEST, 6, turn=lambda t: 0.5 if t > 0.5 else 0.0)
-    assert words(course(0, 0, EAST, 8), partner) == ("oncoming", "keeps speed", "turns left")
-
-
-def test_being_run_into_while_braking_for_something():
-    ego = drive(0, 0, EAST, 10, accel=lambda t: -4.0 if t > 1 else 0.0)
-    assert words(ego, course(-14, 0, EAST, 10)) == ("from behind", "brakes", "keeps speed")
-    assert words(course(0, 0, EAST, 0), course(-30, 0.5, EAST, 15)) == ("from behind", "stands", "keeps speed")
+@pytest.mark.parametrize(("side", "sign", "other"), [("left", 1, "right"), ("right", -1, "left")])
+def test_who_comes_over_cuts_in_from_its_side_or_is_beside(side, sign, other):
+    cuts_in = drive(18, 3.5 * sign, EAST, 9, turn=swerve(-sign, 1.5))
+    assert words(course(0, 0, EAST, 13), cuts_in) == (f"cut-in from the {side}", "keeps speed", f"veers {other}")
+    beside = drive(0, 3.5 * sign, EAST, 12, turn=swerve(-sign, 2.0))
+    assert words(EGO, beside) == (f"beside on the {side}", "keeps speed", f"veers {other}")
 
 
 def test_a_leader_in_a_sharp_bend_is_ahead_and_the_follower_is_behind():
@@ -170,10 +159,6 @@ def test_a_mirrored_world_has_mirrored_words(crashes):
     assert len({one["approach"] for one in before}) > 4
     for one, other in zip(before, after, strict=True):
         assert [mirrored(one[name]) for name in WORDS] == [other[name] for name in WORDS]
-
-
-def test_only_collisions_have_words(crashes):
-    for found in score_rollouts(crashes)[0]:
-        hit = found["cfr"] == 1
-        assert (found["approach"] in APPROACHES) == hit and (found["ego_manoeuvre"] in MANOEUVRES) == hit
-        assert math.isnan(found["ego_speed"]) != hit
+        hit = one["cfr"] == 1
+        assert (one["approach"] in APPROACHES) == (one["ego_manoeuvre"] in MANOEUVRES) == hit
+        assert math.isnan(one["ego_speed"]) != hit

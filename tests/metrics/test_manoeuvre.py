@@ -30,10 +30,6 @@ def arc(radius):
     return radius * torch.stack([angle.sin(), 1 - angle.cos()], -1)
 
 
-def straight():
-    return torch.stack([SPACING * torch.arange(150.0) - 20, torch.zeros(150)], -1)
-
-
 def test_knots_are_interpolated_and_come_back():
     ramp = torch.arange(KNOTS, dtype=torch.float32)
     torch.testing.assert_close(accelerations(ramp, STEPS), (torch.arange(STEPS) + 0.5) / 5)
@@ -61,12 +57,6 @@ def test_a_bend_is_followed_at_the_shift_asked_for():
         assert (offset - wanted).abs().max() < 0.4, offset
 
 
-def test_who_starts_beside_and_turned_returns_to_the_route():
-    start = torch.tensor([0.0, 1.5, 0.15, 10.0])
-    _, states = execute(start, straight(), torch.zeros(KNOTS), torch.zeros(KNOTS), STEPS, LIMITS)
-    assert states[-1, 1].abs() < 0.1 and (states[0, :2] - start[:2]).norm() < 1.1
-
-
 def test_limits_hold_and_the_actions_give_the_states():
     generator = torch.Generator().manual_seed(1)
     accel, shift = 20 * torch.randn(2, 200, KNOTS, generator=generator)
@@ -76,12 +66,6 @@ def test_limits_hold_and_the_actions_give_the_states():
     torch.testing.assert_close(dynamics.rollout(start, actions), states)
     assert peak_acceleration(start, states).max() < dynamics.MAX_LATERAL + 1e-2, "braking and turning share the grip"
     assert (states[..., 3] >= 0).all()
-
-
-def test_who_stands_stays():
-    start = torch.zeros(4)
-    _, states = execute(start, straight(), torch.full((KNOTS,), -3.0), torch.full((KNOTS,), 3.0), STEPS, LIMITS)
-    torch.testing.assert_close(states, torch.zeros(STEPS, 4))
 
 
 SMALL = {"max_vehicles": 4, "max_agents": 6, "num_routes": 2, "num_points": 120}

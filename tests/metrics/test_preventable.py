@@ -52,20 +52,6 @@ def test_it_never_leaves_its_way_nor_outruns_its_recording(name):
     assert (driven[..., 3] < way[..., 3] - 1).any()  # it did brake
 
 
-def test_a_standing_vehicle_far_ahead_is_not_hit_at_any_speed():
-    for speed in (5.0, 15.0, 25.0, 35.0):
-        way, standing = track(speed), others(track(0.0, start=(150.0, 0.0)))
-        driven = redrive(DRIVERS["human"], way, SIZE, along_way(way, SIZE[:, 1], standing))
-        assert contacts(way, SIZE, standing).any() == (speed * 8 > 145.5)
-        assert not contacts(driven, SIZE, standing).any()
-
-
-def test_a_vehicle_beside_the_way_is_no_reason_to_brake():
-    way, beside = track(10.0), others(track(10.0, start=(10.0, 3.0)), track(0.0, start=(40.0, -3.0)))
-    driven = redrive(DRIVERS["human"], way, SIZE, along_way(way, SIZE[:, 1], beside))
-    assert torch.allclose(driven[..., 3], way[..., 3])
-
-
 def test_poses_interpolate_the_way_and_go_on_straight():
     way = circle(20.0, 10.0)
     length = driven_length(way)
@@ -96,7 +82,7 @@ def driven_again(driver, cut_in):
 def test_verdicts_on_recorded_tracks_agree_with_the_oracle(name):
     cut_in, expected = oracle(MODELS[name])
     crash = driven_again(DRIVERS[name], CutIn(*(field[::8] for field in cut_in)))
-    assert (crash == (expected[::8] > 0)).double().mean() >= 0.95
+    assert (crash == expected[::8]).double().mean() >= 0.95
 
 
 LANE = 3.5
@@ -134,12 +120,6 @@ def test_a_cut_in_is_preventable_where_there_is_room_to_brake():
     assert 5.0 < needed < 14.0
 
 
-def test_a_vehicle_that_runs_into_the_ego_from_behind_is_not_the_driver_s_to_prevent():
-    rammer = track(15.0, start=(-25.0, 0.0))
-    for result in preventions(collision(track(8.0), rammer)).values():
-        assert not result.avoided.any()
-
-
 def follower(gap, speed=14.0):
     return track(speed, start=(-4.5 - gap, 0.0))
 
@@ -150,11 +130,6 @@ def test_a_follower_that_is_replayed_into_the_driver_brakes_as_competently_as_it
     result = human(case)
     assert result.avoided.item() is avoided
     assert (result.followers > 0).item() is avoided
-
-
-def test_a_follower_that_is_slower_anyway_is_not_asked():
-    result = human(collision(track(14.0), cut_in(14.0, 14.0, 6.0), follower(30.0, speed=5.0)))
-    assert result.avoided.all() and not result.followers.any()
 
 
 @pytest.mark.parametrize("gap, avoided", [(44.0, True), (30.0, False)])
@@ -180,11 +155,3 @@ def test_the_answer_does_not_depend_on_place_heading_mirror_or_order():
     ]
     for other in changed:
         assert {name: result.avoided.item() for name, result in preventions(other).items()} == expected
-
-
-def test_a_batch_gives_the_answers_of_its_members():
-    cases = [collision(track(14.0), cut_in(gap, 14.0, 6.0), follower(20.0)) for gap in (4.0, 14.0)]
-    together = preventions(Collision(*(torch.cat(parts) for parts in zip(*cases, strict=True))))
-    for name in DRIVERS:
-        alone = [preventions(case)[name].avoided.item() for case in cases]
-        assert together[name].avoided.tolist() == alone

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from e2rl.metrics.score import score_rollouts
-from e2rl.metrics.verdicts import DUTIES, Lanes, duties
+from e2rl.metrics.verdicts import DUTIES, duties
 from tests.metrics.random_rollouts import random_rollouts
 from tests.metrics.test_failure_features import course, scene
 from tests.metrics.test_preventable import collision, cut_in, track
@@ -55,7 +55,7 @@ def test_a_red_light_is_a_duty_where_it_is_known():
     assert row_of(ego, partner, ran_light=torch.full((1, 2), -1))["duty"] == "none"
 
 
-NO_LANES = Lanes(torch.zeros(1, 2, 2, dtype=torch.float64), torch.full((1, 2), -1))
+NO_LANES = torch.zeros(1, 2, 2, dtype=torch.float64), torch.full((1, 2), -1)
 
 
 def duty(case, rear=False, red=-1, lanes=NO_LANES):
@@ -87,25 +87,13 @@ def test_without_another_rule_who_comes_from_the_left_gives_way(from_left, expec
     assert duty(crossing(8.0, from_left)) == expected
 
 
-def test_a_red_light_counts_if_it_was_run_shortly_before():
-    case = crossing(8.0, from_left=False)
-    stop = case.stop.item()
-    assert duty(case, red=stop - 10) == "light"
-    assert duty(case, red=-1) == "none"
-
-
 def test_against_every_lane_that_it_is_on_is_the_wrong_way():
     case = collision(track(8.0), track(8.0, math.pi, (60.0, 0.0)))
     x = torch.arange(-20, 80, 2, dtype=torch.float64)
     line = torch.stack([x, torch.zeros_like(x)], -1)[None]
-    with_ego = Lanes(line, torch.zeros(1, len(x), dtype=torch.long))
+    with_ego = line, torch.zeros(1, len(x), dtype=torch.long)
     assert duty(case, lanes=with_ego) == "wrong way"
-    assert duty(case, lanes=Lanes(line.flip(1), with_ego.lane)) != "wrong way"
-
-
-def test_mirrored_collisions_but_for_the_side_that_gives_way_have_the_same_duty():
-    for case in (collision(track(14.0), cut_in(3.0, 14.0, 6.0, side=side)) for side in (1.0, -1.0)):
-        assert duty(case) == "entry"
+    assert duty(case, lanes=(line.flip(1), with_ego[1])) != "wrong way"
 
 
 @pytest.mark.parametrize(("steps", "expected"), [(50, "light"), (51, "none"), (0, "light"), (-1, "none")])

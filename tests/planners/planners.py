@@ -4,14 +4,17 @@ import sys
 from pathlib import Path
 
 import torch
+from tensordict import TensorDict
 
-from e2rl.planners.ego import Ego
+from e2rl.planners.ego import Ego, EgoPolicy
 from e2rl.planners.external import continued
 from e2rl.scenes.boxes import to_frame
 from e2rl.scenes.recording import LIGHT_RED
 from e2rl.scenes.route import SPACING
 from e2rl.sim import dynamics
+from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.mission import light_state_at, mission_of
+from tests.synthetic import make_scenes
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "external_planner.py"
 WRONG = """
@@ -61,6 +64,25 @@ def wrong_planner(folder: Path, bad: float, act: str = "pass", read: str = "pass
     fields = {"folder": str(EXAMPLE.parent), "marks": str(folder / "marks"), "bad": bad}
     (folder / "wrong.py").write_text(WRONG.format(act=act, read=read, reply=reply, **fields))
     return command_of(folder / "wrong.py")
+
+
+def worlds(scenes):
+    """An environment that begins each of the scenes, and its World."""
+    env = DrivingEnv(scenes, SimSettings(), len(scenes), agents=True)
+    env.reset(TensorDict({"scene_index": torch.arange(len(scenes))[:, None]}, [len(scenes)]))
+    return env, env.world()
+
+
+def world_of(**scene):
+    """`worlds` of synthetic scenes, one if not said otherwise."""
+    return worlds(make_scenes(**{"num_scenes": 1} | scene))
+
+
+def driven(ego, steps=80, **scene):
+    """What an ego does in a scene, and its last state [4]."""
+    env, _ = world_of(**scene)
+    data = env.rollout(steps, EgoPolicy(ego, env))
+    return data, env.world().states[0, 0]
 
 
 class SameLaw(Ego):

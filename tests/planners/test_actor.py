@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import PLAN_STEPS, EgoPolicy
@@ -72,15 +71,6 @@ def test_the_network_can_override_the_reference():
     assert torch.allclose(ego.network.network.deterministic(observation), torch.tensor([5.0, -1.6]), atol=1e-2)
 
 
-def test_samples_stay_within_the_bounds_and_have_their_log_probability():
-    ego, env = ActorEgo(hidden=(8,), initial_std=(0.9, 0.9)), DrivingEnv(make_scenes(2), SimSettings(), 64)
-    with set_exploration_type(ExplorationType.RANDOM):
-        td = ego.network.actor(env.reset())
-    low, high = ego.network.low, ego.network.high
-    assert ((td["action"] >= low) & (td["action"] <= high)).all() and td["action"].std(0).min() > 0.1
-    assert torch.allclose(ego.network.actor.get_dist(td).log_prob(td["action"]), td["action_log_prob"], atol=1e-3)
-
-
 def test_normaliser_equals_the_statistics_of_all_it_saw_and_is_frozen_otherwise():
     normaliser, parts = Normaliser(3), [2 + 3 * torch.randn(n, 3) for n in (5, 100, 31)]
     for part in parts:
@@ -118,16 +108,6 @@ def test_other_bounds_damage_and_absence_are_refused(tmp_path):
     file.write_bytes(b"no weights")
     with pytest.raises(InputError, match="not a readable actor file"):
         ActorEgo(hidden=(8,), checkpoint=str(file))
-    with pytest.raises(InputError, match="no actor there"):
-        ActorEgo(checkpoint=str(tmp_path / "missing"))
-
-
-def test_it_collects_and_survives_a_change_of_batch():
-    ego = ActorEgo(hidden=(8,))
-    for batch in (2, 3):
-        env = DrivingEnv(make_scenes(3, num_vehicles=2), SimSettings(), batch, agents=True)
-        data = env.rollout(30, EgoPolicy(ego, env))
-        assert torch.isfinite(data["action"]).all() and torch.isfinite(ego.plan(env.world())).all()
 
 
 def test_noise_is_the_networks_alone_and_ends_with_the_block():
@@ -139,12 +119,3 @@ def test_noise_is_the_networks_alone_and_ends_with_the_block():
         torch.nn.init.zeros_(network.trunk.last.weight)
         assert torch.allclose(network.deterministic(observation), reference_action(observation), atol=1e-4)
     assert torch.equal(network.deterministic(observation), network.deterministic(observation))
-
-
-def test_the_bundled_policy_corrects_the_route_follower():
-    env = DrivingEnv(make_scenes(2, num_vehicles=6), SimSettings(), 2)
-    observation = env.reset()["observation"]
-    bundled, untrained = (
-        ego.network.network.deterministic(observation) for ego in (ActorEgo(checkpoint="bundled"), ActorEgo())
-    )
-    assert torch.isfinite(bundled).all() and (bundled - untrained).abs().amax() > 0.05

@@ -1,37 +1,25 @@
 """Lane-graph planner: parked cars, free roads, off-lane caution, hazards in closed form, nobody else, many scenes."""
 
+import pytest
 import torch
 
-from e2rl.planners.ego import PLAN_STEPS, EgoPolicy
+from e2rl.planners.ego import PLAN_STEPS
 from e2rl.planners.lane_graph_planner import LaneGraphEgo, Prediction, circle_gap, circles, collision_hazard
-from e2rl.sim.env import DrivingEnv, SimSettings
-from tests.synthetic import make_scenes
-
-
-def world_of(**scene):
-    env = DrivingEnv(make_scenes(**{"num_scenes": 1} | scene), SimSettings(), scene.get("num_scenes", 1), agents=True)
-    env.reset()
-    return env, env.world()
+from tests.planners.planners import driven, world_of
 
 
 def test_free_road_accelerates_to_the_top_speed():
-    env, _ = world_of(num_vehicles=1, num_vrus=0, limit=0.0)
-    env.rollout(80, EgoPolicy(LaneGraphEgo(), env))
-    assert torch.allclose(env.world().states[0, 0, 3], torch.tensor(20.0), atol=0.3)
-    env, _ = world_of(num_vehicles=1, num_vrus=0, limit=12.0)
-    env.rollout(80, EgoPolicy(LaneGraphEgo(), env))
-    assert torch.allclose(env.world().states[0, 0, 3], torch.tensor(12.0), atol=0.1)
+    for limit, speed in ((0.0, 20.0), (12.0, 12.0)):
+        _, state = driven(LaneGraphEgo(), num_vehicles=1, num_vrus=0, limit=limit)
+        assert state[3].item() == pytest.approx(speed, abs=0.3)
 
 
 def test_stops_behind_a_parked_car():
-    env, _ = world_of(vehicles=[(0.0, 0, 10.0), (50.0, 0, 0.0)], num_vrus=0)
-    data = env.rollout(80, EgoPolicy(LaneGraphEgo(), env))
-    state = env.world().states[0, 0]
+    data, state = driven(LaneGraphEgo(), vehicles=[(0.0, 0, 10.0), (50.0, 0, 0.0)], num_vrus=0)
     assert not data["next", "terminated"].any() and state[3] < 1.0 and 20 < state[0] < 46
 
 
 def test_off_its_route_it_prefers_the_shortest():
-    env, world = world_of(num_vehicles=1, num_vrus=0)
     ego = LaneGraphEgo()
     hazard, driven = torch.tensor([[0.01, 0.0, 3.0]]), torch.tensor([[30.0, 10.0, 40.0]])
     assert ego.choose(hazard, driven, torch.tensor([True])).item() == 0

@@ -7,7 +7,7 @@ import torch
 
 from e2rl.planners.path import MissionPath, RoutePath, fading, look_up
 from e2rl.sim.dynamics import inverse
-from e2rl.sim.env import DrivingEnv, SimSettings
+from tests.planners.planners import world_of, worlds
 from tests.synthetic import make_scenes
 
 
@@ -47,9 +47,7 @@ def test_drive_is_nearly_unicycle_motion():
 
 
 def test_caps_halt_at_red_lights_and_obey_limits():
-    env = DrivingEnv(make_scenes(1, num_vehicles=1, red_light_x=60.0, limit=8.0), SimSettings(), 1)
-    env.reset()
-    path = MissionPath(env.world())
+    path = MissionPath(world_of(num_vehicles=1, red_light_x=60.0, limit=8.0)[1])
     caps = path.speed_caps(20.0)
     stop = 60.0 - 4.5 / 2 - 1.0
     assert torch.allclose(look_up(caps, torch.tensor([[0.0, 20.0]])), torch.tensor(8.0), atol=0.01)
@@ -78,8 +76,6 @@ def test_caps_slow_down_for_curves():
     x = torch.cat([torch.zeros(1), (2 * angle.cos()).cumsum(0)[:-1]]) - 20
     y = torch.cat([torch.zeros(1), (2 * angle.sin()).cumsum(0)[:-1]])
     scenes.scenes["route_points"][0, 0] = torch.stack([x, y], -1)
-    env = DrivingEnv(scenes, SimSettings(), 1)
-    env.reset()
-    caps = MissionPath(env.world()).speed_caps(20.0, limits=False)[0]
+    caps = MissionPath(worlds(scenes)[1]).speed_caps(20.0, limits=False)[0]
     assert torch.allclose(caps[32:44].min(), torch.tensor(3.0 * 20), rtol=0.05)
     assert caps[15] < 399 and abs(caps[-5] - 400) < 1e-2

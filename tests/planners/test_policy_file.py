@@ -1,15 +1,13 @@
 """A policy's file drives by what it returns, and is refused with one message where it is no policy."""
 
 import math
-import sys
 from importlib.util import find_spec
 
-import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from e2rl.commands.export_policy import export_actor, main
+from e2rl.commands.export_policy import export_actor
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import EgoPolicy, NotFinite
 from e2rl.planners.network import read_actor
@@ -38,43 +36,17 @@ class Proportional(nn.Module):
 class Shaped(nn.Module):
     """Returns what is no action of a batch."""
 
-    def __init__(self, kind: str) -> None:
+    def __init__(self, rows: int | None, numbers: int) -> None:
         super().__init__()
-        self.kind = kind
+        self.rows, self.numbers = rows, numbers
 
     def forward(self, observation):
-        if self.kind == "wide":
-            return observation[:, :3]
-        if self.kind == "flat":
-            return observation[:, 0]
-        if self.kind == "tuple":
-            return observation[:, :2], observation[:, :1]
-        if self.kind == "whole":
-            return (observation[:, :2] > 0).long()
-        return observation[:1, :2]  # one for all
+        return observation[: self.rows, : self.numbers]
 
 
-def scripted(folder, module, name="policy.pt"):
-    torch.jit.save(torch.jit.trace(module.eval(), torch.zeros(2, OBSERVATION_SIZE)), folder / name)
-    return str(folder / name)
-
-
-def onnx_file(folder, inputs=("observation",), outputs=("action",), rows="batch", numbers=OBSERVATION_SIZE):
-    """An ONNX model of the first two numbers of the (first) input."""
-    from onnx import TensorProto, checker, helper, save
-
-    given = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [rows, numbers]) for name in inputs]
-    made = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [rows, 2]) for name in outputs]
-    ends = [
-        helper.make_tensor(name, TensorProto.INT64, [1], np.array([value]))
-        for name, value in (("begin", 0), ("end", 2), ("axis", 1))
-    ]
-    nodes = [helper.make_node("Slice", [inputs[0], "begin", "end", "axis"], [name]) for name in outputs]
-    model = helper.make_model(helper.make_graph(nodes, "policy", given, made, ends))
-    model.ir_version = 10
-    checker.check_model(model)
-    save(model, folder / "policy.onnx")
-    return str(folder / "policy.onnx")
+def scripted(folder, module):
+    torch.jit.save(torch.jit.trace(module.eval(), torch.zeros(2, OBSERVATION_SIZE)), folder / "policy.pt")
+    return str(folder / "policy.pt")
 
 
 def test_it_drives_by_its_actions_within_the_bounds(tmp_path):
@@ -95,26 +67,21 @@ def test_a_rollout_in_which_it_returns_nan_ends(tmp_path, value):
 
 
 @pytest.mark.parametrize(
-    ("kind", "what"),
+    ("rows", "numbers", "what"),
     [
-        ("wide", r"fails at observations \[1, 326\]: maps them to torch.float32 \[1, 3\]; it maps float32"),
-        ("flat", r"fails at observations \[1, 326\]: maps them to torch.float32 \[1\]; it maps"),
-        ("tuple", "fails at .*: <class 'tuple'>; it maps"),
-        ("whole", "fails at .*: maps them to torch.int64"),
-        ("one", r"fails at observations \[3, 326\]: maps them to .* \[1, 2\]; .*for every B"),
+        (None, 3, r"fails at observations \[1, 326\]: maps them to torch.float32 \[1, 3\]; it maps float32"),
+        (1, 2, r"fails at observations \[3, 326\]: maps them to .* \[1, 2\]; .*for every B"),
     ],
 )
-def test_other_shapes_are_refused(tmp_path, kind, what):
+def test_other_shapes_are_refused(tmp_path, rows, numbers, what):
     with pytest.raises(InputError, match=f"^ego.file=.*policy.pt: {what}"):
-        PolicyFileEgo(scripted(tmp_path, Shaped(kind)))
+        PolicyFileEgo(scripted(tmp_path, Shaped(rows, numbers)))
 
 
 @pytest.mark.parametrize(
     ("name", "content", "what"),
     [
-        (None, None, "no such file"),
         ("policy.pt", None, "no such file"),
-        ("policy.h5", b"x", "no kind of policy; pass .onnx, or .pt"),
         ("policy.pt", b"nonsense", "no TorchScript archive"),
         pytest.param("policy.onnx", b"nonsense", "cannot be read as ONNX", marks=needs_onnx),
     ],
@@ -124,28 +91,6 @@ def test_what_is_no_policy_is_named(tmp_path, name, content, what):
         (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=what):
         PolicyFileEgo(name and str(tmp_path / name))
-
-
-@needs_onnx
-@pytest.mark.parametrize(
-    ("model", "what"),
-    [
-        ({"inputs": ("observation", "hidden")}, r"fails at observations \[1, 326\]"),
-        ({"outputs": ("action", "value")}, r"fails at observations \[1, 326\]"),
-        ({"numbers": 12}, r"fails at observations \[1, 326\]: .*326"),
-        ({"rows": 1}, r"fails at observations \[3, 326\]: .*for every B"),
-    ],
-)
-def test_an_onnx_file_of_other_shapes_is_refused(tmp_path, model, what):
-    with pytest.raises(InputError, match=what):
-        PolicyFileEgo(onnx_file(tmp_path, **model))
-
-
-def test_without_onnxruntime_the_extra_is_named(tmp_path, monkeypatch):
-    (tmp_path / "policy.onnx").write_bytes(b"x")
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(InputError, match=r"pip install 'e2rl\[onnx\]'"):
-        PolicyFileEgo(str(tmp_path / "policy.onnx"))
 
 
 def drive(ego, **options):
@@ -183,26 +128,10 @@ def test_the_same_rollouts(actor, tmp_path, name):
 
 @pytest.mark.parametrize(
     ("change", "what"),
-    [
-        ({"observation": 12}, "of another version .of 12 numbers"),
-        ({"hidden": [10**9]}, "another version"),
-        ({"hidden": []}, "another version"),
-        ({"agent_units": 0}, "another version"),
-        ({"low": [1]}, "another"),
-    ],
+    [({"observation": 12}, "of another version .of 12 numbers"), ({"hidden": [10**9]}, "another version")],
 )
 def test_an_actor_of_another_version_is_refused(actor, tmp_path, monkeypatch, change, what):
     monkeypatch.setattr(actor.network, "architecture", actor.network.architecture | change)
     actor.network.save(tmp_path / "actor.safetensors")
     with pytest.raises(InputError, match=what):
         read_actor(tmp_path / "actor.safetensors")
-
-
-def test_the_command_says_how_to_drive_and_refuses_other_kinds(actor, tmp_path, capsys):
-    actor.network.save(tmp_path / "actor.safetensors")
-    main([str(tmp_path), str(tmp_path / "out" / "p.pt")])
-    assert f"ego=policy_file ego.file={tmp_path / 'out' / 'p.pt'}" in capsys.readouterr().out
-    for given, what in (([str(tmp_path), "p.h5"], "name it .onnx"), ([str(tmp_path / "no"), "p.pt"], "no actor there")):
-        with pytest.raises(SystemExit):
-            main(given)
-        assert what in capsys.readouterr().err

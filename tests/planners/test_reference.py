@@ -1,12 +1,10 @@
 """The reference follower: executed actions are read back, it keeps its lane, its distance and red lights."""
 
-import pytest
 import torch
 
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import EgoPolicy
-from e2rl.planners.reference import AGENTS, Trunk, executed_action, reference_action
-from e2rl.run.errors import InputError
+from e2rl.planners.reference import AGENTS, Trunk, reference_action
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.observation import NEAREST, OBSERVATION_SIZE, PER_AGENT
 from tests.synthetic import make_scenes
@@ -16,15 +14,6 @@ def drive(scenes, batch=2):
     """The untrained actor drives as its reference does."""
     env = DrivingEnv(scenes, SimSettings(end_on_contact=False), batch, agents=True)
     return env.rollout(80, EgoPolicy(ActorEgo(hidden=(8,)), env)), env.world()
-
-
-def test_executed_action_is_read_from_the_observation():
-    env = DrivingEnv(make_scenes(2), SimSettings(), 2)
-    data = env.rollout(20)
-    done_to = data["action"].clone()
-    reported = executed_action(data["next", "observation"])
-    assert torch.allclose(reported[..., 0], done_to[..., 0], atol=1e-3)
-    assert (reported[..., 1].abs() <= done_to[..., 1].abs() + 1e-3).all(), "the unicycle bounds yaw rates further"
 
 
 def test_an_empty_road_is_driven_at_the_limit():
@@ -81,11 +70,3 @@ def test_the_rest_of_the_scene_counts_and_a_last_layer_of_zeros_says_nothing():
     (gradient,) = torch.autograd.grad(Trunk((32,), 8, 1, last_gain=1.0)(seen).sum(), seen)
     assert (gradient[: AGENTS.start] != 0).all() and (gradient[AGENTS.stop :] != 0).all()
     assert torch.equal(Trunk((32, 16), 8, 2, last_gain=0.0)(seen), torch.zeros(2))
-
-
-@pytest.mark.parametrize(
-    ("change", "what"), [({"hidden": ()}, "one layer at least"), ({"agent_units": 0}, "at least 1")]
-)
-def test_a_network_without_layers_is_refused(change, what):
-    with pytest.raises(InputError, match=what):
-        ActorEgo(**change)

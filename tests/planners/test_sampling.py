@@ -3,39 +3,30 @@
 import pytest
 import torch
 
-from e2rl.planners.candidates import drive, heading_at, heading_table, speed_profiles, steer
-from e2rl.planners.ego import PLAN_STEPS, EgoPolicy
+from e2rl.planners.candidates import drive, speed_profiles, steer
+from e2rl.planners.ego import PLAN_STEPS
 from e2rl.planners.path import MissionPath
 from e2rl.planners.sampling import PROFILES, SHIFTS, SamplingEgo
 from e2rl.planners.scoring import forecast, nearest, pair_cost
 from e2rl.scenes.boxes import separation
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
-from e2rl.sim.env import DrivingEnv, SimSettings
+from tests.planners.planners import driven, world_of, worlds
 from tests.synthetic import LANE_WIDTH, make_scenes
 
 TIMES = torch.arange(1, 21) * 0.2
 
 
-def world_of(**scene):
-    env = DrivingEnv(make_scenes(**{"num_scenes": 1} | scene), SimSettings(), scene.get("num_scenes", 1), agents=True)
-    env.reset()
-    return env, env.world()
-
-
 def test_keeps_its_mission_alone_and_reaches_its_speed():
     for limit, speed in ((0.0, 20.0), (12.0, 12.0)):
-        env, _ = world_of(num_vehicles=1, num_vrus=0, limit=limit)
-        data = env.rollout(80, EgoPolicy(SamplingEgo(), env))
+        data, _ = driven(SamplingEgo(), num_vehicles=1, num_vrus=0, limit=limit)
         states = data["next", "agents", "states"][0, :, 0]
         assert abs(states[-1, 3].item() - speed) < 0.3 and states[:, 1].abs().max() < 0.05
 
 
 def test_stops_behind_a_standing_car_where_there_is_no_way_past():
     wall = [(0.0, 0, 10.0), (50.0, 0, 0.0), (50.0, 1, 0.0)]
-    env, _ = world_of(vehicles=wall, num_vrus=0)
-    data = env.rollout(80, EgoPolicy(SamplingEgo(), env))
-    state = env.world().states[0, 0]
+    data, state = driven(SamplingEgo(), vehicles=wall, num_vrus=0)
     assert not data["next", "terminated"].any() and state[3] < 2.0 and 20 < state[0] < 45.0
 
 
@@ -57,10 +48,8 @@ def test_boxed_in_it_is_never_worse_than_hard_braking():
 def test_candidates_obey_the_simulator_s_bounds():
     scenes = make_scenes(2, num_vehicles=6)
     scenes.scenes["start"][1, 0, 1:3] = torch.tensor([1.5, 0.6])
-    env = DrivingEnv(scenes, SimSettings(), 2)
-    env.reset(env.reset().select("scene_index").set("scene_index", torch.arange(2)[:, None]))
-    world, ego = env.world(), SamplingEgo()
-    candidates = ego.candidates(world)
+    _, world = worlds(scenes)
+    candidates = SamplingEgo().candidates(world)
     count = len(PROFILES) * (2 * len(SHIFTS) + 1)
     assert candidates.states.shape == (2, count, PLAN_STEPS, 4) and torch.isfinite(candidates.states).all()
     start = world.states[:, :1].expand(-1, count, -1)[:, :, None]
@@ -90,9 +79,7 @@ def test_a_mirrored_scene_gets_the_mirrored_plan(beside):
         start = scenes.scenes["start"]
         start[0, 1, 1:3] = torch.tensor([2.6 * sign, -0.12 * sign])
         scenes.scenes["field"].fill_(-10.0)
-        env = DrivingEnv(scenes, SimSettings(), 1, agents=True)
-        env.reset()
-        plans.append(SamplingEgo().plan(env.world()) * torch.tensor([1.0, sign, sign, 1.0]))
+        plans.append(SamplingEgo().plan(worlds(scenes)[1]) * torch.tensor([1.0, sign, sign, 1.0]))
     torch.testing.assert_close(*plans, atol=1e-3, rtol=0)
     assert plans[0][..., 1].abs().max() > 0.3
 
@@ -103,17 +90,6 @@ def test_speed_profiles_keep_the_caps():
     assert speed.shape == (1, 3, PLAN_STEPS + 1) and (speed[..., 0] == 10).all()
     assert torch.allclose(speed[0, :2, 10:], torch.tensor(8.0)) and (speed[0, 2, 15:] == 0).all()
     assert (speed.diff(dim=-1) / DT > -8.001).all() and (speed[0, :2].diff(dim=-1) / DT > -4.001).all()
-
-
-def test_headings_along_the_mission():
-    _, world = world_of(num_vehicles=1)
-    path = MissionPath(world)
-    angle = torch.linspace(0, 3, 150)
-    path.route = torch.stack([20 * angle.sin(), 20 * (1 - angle.cos())], -1)[None]
-    table = heading_table(path)
-    ahead = torch.tensor([[0.0, 5.0, 20.0]])
-    per_arc = 3 / 149 / 2  # rad of the circle per metre of the route's index scale
-    torch.testing.assert_close(heading_at(table, ahead), ahead * per_arc, atol=1e-3, rtol=0)
 
 
 def test_steering_catches_up_with_what_a_bound_withheld():
@@ -127,9 +103,7 @@ def test_a_curve_is_driven_along_its_mission():
     angle = torch.arange(150) * 2.0 / 40
     scenes.scenes["route_points"][0, 0, 0] = torch.stack([40 * angle.sin() - 20, 40 * (1 - angle.cos())], -1)
     scenes.scenes["start"][0, 0] = torch.tensor([-20.0, 0.0, 0.0, 8.0])
-    env = DrivingEnv(scenes, SimSettings(), 1)
-    env.reset()
-    world = env.world()
+    _, world = worlds(scenes)
     path = MissionPath(world)
     steady = torch.full((1, 1, PLAN_STEPS + 1), 8.0)
     driven = drive(world.states[:, 0], path, steady, torch.zeros(1, 1), torch.ones(1)).states[0, 0]
@@ -140,9 +114,7 @@ def test_a_curve_is_driven_along_its_mission():
 def test_forecasts_of_constant_acceleration_and_turn():
     scenes = make_scenes(1, vehicles=[(0.0, 0, 10.0), (20.0, 0, 10.0), (40.0, 1, 10.0)], num_vrus=0)
     scenes.scenes["start_accel"][0, 1], scenes.scenes["start_yaw_rate"][0, 2] = -8.0, 0.5
-    env = DrivingEnv(scenes, SimSettings(), 1)
-    env.reset()
-    world = env.world()
+    _, world = worlds(scenes)
     agents, seen = nearest(world, 5)
     assert seen.tolist() == [[True, True, False, False, False]] and agents[0, :2].tolist() == [1, 2]
     found = forecast(world, agents, seen, TIMES, 1.0, 2.0)

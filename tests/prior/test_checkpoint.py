@@ -25,12 +25,6 @@ def test_a_saved_prior_comes_back(tmp_path):
     assert not any(parameter.requires_grad for parameter in back.parameters()) and not back.training
 
 
-def test_the_name_tells_weights_apart(tmp_path):
-    first, second, again = (save_prior(small_prior(seed), tmp_path, {}) for seed in (0, 1, 0))
-    assert first == again != second
-    assert sorted(tmp_path.iterdir()) == sorted({first, second})
-
-
 def rewritten(path, change, drop=None):
     """The checkpoint with its architecture passed through `change`, without tensor `drop` and without its hash."""
     with safe_open(path, "pt") as file:
@@ -47,13 +41,10 @@ def rewritten(path, change, drop=None):
     "change",
     [
         lambda a: a["denoiser"].update(width=16),
-        lambda a: a["denoiser"].update(layers=2),
         lambda a: a["denoiser"].update(width=96 * 10**6),
         lambda a: a.update(free_space=True),
-        lambda a: a.update(features=[1, 2, 3]),
-        lambda a: a.pop("denoiser"),
     ],
-    ids=["width", "unknown-setting", "endless-width", "without-lanes", "features", "no-network"],
+    ids=["width", "endless-width", "without-lanes"],
 )
 def test_another_architecture_is_refused(tmp_path, change):
     path = rewritten(save_prior(small_prior(), tmp_path, {}), change)

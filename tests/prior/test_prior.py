@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from e2rl.prior.bounds import BoundSettings, Duty
-from e2rl.prior.lane_relative import HORIZON, SIZE, decode
-from e2rl.prior.prior import Prior, plan_to_x
+from e2rl.prior.lane_relative import HORIZON, SIZE
+from e2rl.prior.prior import Prior
 from e2rl.prior.routes import sample_route
 from e2rl.prior.sde import SamplerSettings
 from tests.prior.small import VEHICLES, arc, curved_scenes, small_prior
@@ -122,17 +122,6 @@ def test_the_ego_s_plan_becomes_the_x_that_decodes_to_it(on_lane):
     x[:, 0] = context.ego_x
     decoded = prior.decode(x, context).states()[:, 0]
     assert (decoded - plan)[..., :2].norm(dim=-1).max() < 0.3
-
-
-def test_a_plan_decodes_back_from_lane_coordinates():
-    scene, prior = curved_scenes(), small_prior()
-    routed, state = prior.start(scene, scene["route_log"].clamp(min=0))
-    ego = state.map(lambda value: value[:, :1])
-    x = 0.3 * torch.ones(1, 1, SIZE)
-    wanted = decode(x, ego, routed.points[:, :1])
-    again = decode(plan_to_x(wanted.states()[:, 0], state, routed)[:, None], ego, routed.points[:, :1])
-    gap = torch.hypot(again.x - wanted.x, again.y - wanted.y)
-    assert gap.max() < 0.15
 
 
 def test_bounds_change_what_is_executed_of_infeasible_plans_and_only_of_them():

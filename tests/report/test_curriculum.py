@@ -3,13 +3,11 @@
 import math
 
 import numpy as np
-import pytest
 
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.scheduler import COLUMNS
 from e2rl.report.curriculum_figure import CHOICES, PICTURE, choice_map, draw_choices, grids
 from e2rl.report.drawing import image_of
-from e2rl.run.errors import InputError
 
 NAN = math.nan
 
@@ -40,9 +38,3 @@ def test_the_picture_is_drawn_from_the_file_of_a_run(tmp_path):
     draw_choices(tmp_path)
     assert (tmp_path / PICTURE).stat().st_size > 5000
     assert image_of(choice_map(ROWS * 40)).size == image_of(choice_map(ROWS)).size
-
-
-def test_a_file_of_another_kind_is_named(tmp_path):
-    (tmp_path / CHOICES).write_text("round,eta\n0,1\n")
-    with pytest.raises(InputError, match=r"curriculum\.csv: no table of a curriculum's choices"):
-        draw_choices(tmp_path)

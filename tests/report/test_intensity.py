@@ -7,20 +7,9 @@ NAN = float("nan")
 
 def sweep(*times, scene="a", seed=0):
     """Rows at eta 0, 1, ... with contacts at these times (NaN: none)."""
-    return [
-        {
-            "method": "e2",
-            "ego_policy": "idm",
-            "scene_id": scene,
-            "seed": seed,
-            "eta": float(eta),
-            "cfr": float(time == time),
-            "contact_time": time,
-            "min_dtc": 1.0 + eta,
-            "partner": 1,
-        }
-        for eta, time in enumerate(times)
-    ]
+    same = {"method": "e2", "ego_policy": "idm", "scene_id": scene, "seed": seed, "partner": 1}
+    found = enumerate(times)
+    return [same | {"eta": eta, "cfr": time == time, "contact_time": time, "min_dtc": 1.0 + eta} for eta, time in found]
 
 
 def test_what_eta_does_shows_best_where_contacts_come_and_then_come_earlier():

@@ -3,7 +3,6 @@
 import pytest
 
 from e2rl.learning.logging import RunLogger
-from e2rl.report.drawing import image_of
 from e2rl.report.plots import learning_curves, read_curves
 from e2rl.run.errors import InputError
 
@@ -21,19 +20,6 @@ def test_what_was_measured_before_a_round_stands_at_the_steps_done_by_then(tmp_p
     found = read_curves(logged(tmp_path / "run", [(100, 0.7, 0.5), (250, 0.6, 0.4)]))
     assert found["synthesizer/contact"] == ([0, 100], [0.7, 0.6])
     assert found["train/contact_adversarial"] == ([100, 250], [0.5, 0.4]) and len(found) == 2
-
-
-def test_a_round_done_twice_counts_once(tmp_path):
-    folder = logged(tmp_path / "run", [(100, 0.7, 0.5)])
-    with (folder / "logs" / "scalars" / "train" / "contact_adversarial.csv").open("a") as file:
-        file.write("0,0.3\n")
-    assert read_curves(folder)["train/contact_adversarial"] == ([100], [0.3])
-
-
-def test_a_figure_has_a_panel_for_each_known_curve(tmp_path):
-    runs = [logged(tmp_path / name, [(100, 0.7, 0.5), (200, 0.6, 0.4)]) for name in ("one", "two")]
-    width, height = image_of(learning_curves(runs)).size
-    assert width > 2 * height
 
 
 def test_a_folder_without_a_log_is_named(tmp_path):

@@ -1,16 +1,13 @@
 """The selection of the skeleton figure: the longest chain of a run, and the rollout it belongs to."""
 
-import pytest
 import torch
 
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.planners.idm_planner import IDMEgo
-from e2rl.report.skeleton_figure import LongestChain, link_risk
-from e2rl.run.errors import InputError
+from e2rl.report.skeleton_figure import LongestChain, SkeletonPicture, link_risk
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.e2.skeleton import Selection
 from e2rl.traffic.e2.topology import TopologySettings
-from e2rl.traffic.rule_based import Replay
 from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
 
@@ -20,18 +17,8 @@ def selection(*targets, seed=0, risk=0.5):
     count, vehicles = target.shape
     weights = torch.full((count, 2, vehicles, vehicles), risk)
     moments, acts = torch.tensor([[0.1, 0.6]]).expand(count, 2), target >= 0
-    return Selection(
-        torch.arange(count) + seed,
-        torch.zeros(count).long(),
-        torch.zeros(count, 2, vehicles, 4),
-        moments,
-        weights,
-        acts,
-        acts,
-        acts,
-        target,
-        TopologySettings(),
-    )
+    what = torch.arange(count) + seed, torch.zeros(count).long(), torch.zeros(count, 2, vehicles, 4), moments, weights
+    return Selection(*what, acts, acts, acts, target, TopologySettings())
 
 
 def listener():
@@ -59,20 +46,13 @@ def test_the_risk_of_links_is_that_of_each_member_with_its_target():
     torch.testing.assert_close(link_risk(given), torch.tensor([[1.0, 0.9]]))
 
 
-def test_the_kept_selection_is_of_a_rollout_of_the_run(tmp_path):
+def test_the_kept_selection_is_of_a_rollout_of_the_run(tmp_path, monkeypatch):
     chain, scene_set = listener(), scenes(3)
     setup = Setup(scene_set, IDMEgo(), "idm", SimSettings(), batch=2)
     run_protocol(setup, [chain.method], [0, 4], tmp_path, only=[1, 2])
-    rollout = chain.rollout(scene_set, "idm", tmp_path)
-    assert rollout.scene_id in scene_set.scene_id[1:] and rollout.seed in (0, 4)
-    members = chain.longest.coalition[0].nonzero()[:, 0].tolist()
-    assert members and rollout.adversaries[members].all()
-
-
-def test_what_chooses_nobody_has_no_figure_and_says_so(tmp_path):
-    scene_set = scenes(1)
-    for method in (Method("e2", synthesizer(), 0.0), Method("replay", Replay())):
-        chain = LongestChain(method)
-        run_protocol(Setup(scene_set, IDMEgo(), "idm", SimSettings()), [method], [0])
-        with pytest.raises(InputError, match=f"figure=skeleton: {method.name} at eta=0 chose no adversary .*name e2"):
-            chain.rollout(scene_set, "idm", tmp_path)
+    figures = []
+    monkeypatch.setattr(SkeletonPicture, "figure", lambda shown: figures.append(shown))
+    chain.figure(scene_set, "idm", tmp_path)
+    (shown,) = figures
+    assert shown.rollout.scene_id in scene_set.scene_id[1:] and shown.rollout.seed in (0, 4)
+    assert shown.members and shown.rollout.adversaries[shown.members].all()

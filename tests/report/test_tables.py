@@ -1,7 +1,6 @@
 """Tables: the order of the metrics, per cent, what is counted, what is unknown; in Markdown, CSV and LaTeX."""
 
 import csv
-import math
 from types import SimpleNamespace
 
 import pytest
@@ -9,8 +8,8 @@ import pytest
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.catalogue import METRICS, table_metrics
 from e2rl.metrics.score import score_rollouts
-from e2rl.report.comparison_tables import EGOS, method_tables, planner_tables, save_compared
-from e2rl.report.tables import Table, escaped, metric_tables, number, print_tables, save_tables
+from e2rl.report.comparison_tables import method_tables, planner_tables, save_compared
+from e2rl.report.tables import Table, escaped, metric_tables, number, save_tables
 from tests.metrics.random_rollouts import random_rollouts
 
 TERMS = {"e2": ("predicted", "full"), "ctg_adv": ("plan", "none"), "replay": ("", "")}
@@ -41,12 +40,6 @@ def test_tables_list_known_metrics_in_the_catalogue_s_order(rows):
     assert traffic == [metric.name for metric in table_metrics("traffic") if metric.name in traffic]
 
 
-def test_a_sweep_names_every_intensity():
-    means, paired = metric_tables(rows_of(("e2", "idm", 0.0), ("e2", "idm", 2.0), rollouts=4, draws=5))
-    assert means.head == ["", "e2 η=0", "e2 η=2"] and paired.head == ["", "e2 η=2"]
-    assert "Difference to e2 η=0" in paired.caption
-
-
 def test_rates_are_per_cent_and_what_rests_on_fewer_rollouts_says_so(rows):
     means, paired = metric_tables(rows)
     cells = {row[0].split(" [")[0]: row[1:] for row in means.rows}
@@ -55,12 +48,6 @@ def test_rates_are_per_cent_and_what_rests_on_fewer_rollouts_says_so(rows):
     for column, row in enumerate(rows):
         known = row["metrics"]["relvel"]["n"]
         assert cells["relvel"][column].endswith(f"({known})") if known else cells["relvel"][column] == "–"
-
-
-def test_captions_say_how_much_a_table_is_computed_from(rows):
-    caption = metric_tables(rows, settings="16 samples.")[0].caption
-    assert "4 scenes, 2 seeds, 8 rollouts per method" in caption and "16 samples." in caption
-    assert "Not computable here: avoidable, transport." in caption
 
 
 def test_a_star_marks_an_interval_without_0_but_not_of_a_cost():
@@ -74,11 +61,8 @@ def test_a_star_marks_an_interval_without_0_but_not_of_a_cost():
     assert {row[0].split(" [")[0]: row[1][-1] for row in table.rows} == {"progress": "*", "nfe": "]"}
 
 
-def test_tables_are_printed_and_saved_as_markdown(rows, tmp_path, capsys):
+def test_tables_are_saved_as_markdown(rows, tmp_path):
     tables = [*metric_tables(rows), Table("C.", ["", "x"], [["a|b", "1"]], "Title")]
-    print_tables(tables)
-    lines = capsys.readouterr().out.splitlines()
-    assert any(line.startswith("cfr [%]") for line in lines)
     save_tables(tmp_path / "tables.md", tables)
     text = (tmp_path / "tables.md").read_text()
     table = [line for line in text.splitlines() if line.startswith("|")]
@@ -93,14 +77,6 @@ def test_numbers_keep_three_digits():
     assert number(real, 0.8764, "+") == "+0.876"
     declared = SimpleNamespace(fraction=False, decimals=3)
     assert [number(declared, value) for value in (1.0, 12.34)] == ["1.000", "12.340"]
-
-
-def test_one_rollout_makes_a_table_without_intervals():
-    rows = rows_of(("e2", "idm", 2.0), rollouts=1, draws=5)
-    (table,) = metric_tables(rows)
-    assert "1 scene, 1 seed, 1 rollout per method" in table.caption
-    assert math.isnan(rows[0]["metrics"]["progress"]["low"])
-    assert "[" not in next(row for row in table.rows if row[0].startswith("progress"))[1]
 
 
 # --- a row a method, a row an ego
@@ -118,8 +94,6 @@ def test_every_method_has_a_row_with_its_terms_and_its_cost(methods):
         ["ctg_adv η=2", "plan", "none"],
         ["replay η=2", "–", "–"],
     ]
-    cost = {head: means.rows[0][place] for place, head in enumerate(means.head)}
-    assert cost["nfe"].startswith("128") and "seconds_per_rollout [s]" in cost
     assert "The prior." in means.caption and "6 rollouts per method" in means.caption
 
 
@@ -131,8 +105,6 @@ def test_differences_are_paired_to_each_reference(methods):
     assert float(there) == -float(back) != 0
     pairs = [(row[0], row[3]) for row in differences.rows]
     assert pairs == [("ctg_adv η=2", "e2"), ("replay η=2", "e2"), ("e2 η=2", "replay"), ("ctg_adv η=2", "replay")]
-    assert "Difference of each method to e2 and to replay" in differences.caption
-    assert len(differences.head) == len(means.head) + 1
 
 
 def test_they_are_written_in_three_formats(methods, tmp_path):
@@ -152,16 +124,9 @@ def test_every_ego_has_a_row_and_a_difference_to_the_reference(tmp_path):
     names = ["idm", "lane_graph", "actor"]
     pairs = [("idm", "lane_graph"), ("actor", "lane_graph")]
     rows = rows_of(*(("e2", name, 2.0) for name in names), egos=pairs)
-    means, differences = tables = planner_tables(rows, names, "lane_graph")
+    means, differences = planner_tables(rows, names, "lane_graph")
     assert [row[:2] for row in means.rows] == [[ego, "e2 η=2"] for ego in names]
     assert [row[0] for row in differences.rows] == ["idm", "actor"]
     difference = rows[0]["paired"]["ego lane_graph"]["cfr"]["difference"]
     assert differences.rows[0][differences.head.index("cfr [points]")].startswith(f"{100 * difference:+.1f}"[:4])
     assert {f"{side}{of} [%]" for side in ("front", "side", "rear") for of in ("", "_any")} <= set(means.head)
-    save_compared(tmp_path, tables, EGOS)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "egos.csv",
-        "egos.md",
-        "egos.tex",
-        "egos_differences.csv",
-    ]

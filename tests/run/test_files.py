@@ -1,27 +1,28 @@
-"""A file appears whole or not at all."""
+"""A file appears whole or not at all; weights read back are those written, and an altered file is noticed."""
 
 import multiprocessing
+import random
 import time
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors.torch import save
 
+from e2rl.planners.actor import ActorEgo
+from e2rl.planners.bits_network import BitsNetwork, load_bits, save_bits
+from e2rl.prior.checkpoint import load_prior, save_prior
 from e2rl.run import files
 from e2rl.run.errors import InputError
-from e2rl.run.files import alone_in, locked, write_atomically, written_whole
+from e2rl.run.files import HASH, alone_in, locked, read_weights, weight_bytes, write_atomically, written_whole
+from tests.prior.small import small_prior
 
-
-def test_text_bytes_and_writers_are_written(tmp_path):
-    folder = tmp_path / "new" / "folder"
-    write_atomically(folder / "a", "text")
-    write_atomically(folder / "b", b"bytes")
-    write_atomically(folder / "c", lambda part: part.write_text("by hand"))
-    assert [(folder / name).read_text() for name in "abc"] == ["text", "bytes", "by hand"]
+WEIGHTS = {"a": torch.arange(12.0).view(3, 4), "b": torch.tensor(3), "c": torch.zeros(0, 2, dtype=torch.float64)}
 
 
 def test_what_fails_on_the_way_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
-    path = tmp_path / "file"
-    write_atomically(path, b"old")
+    path = tmp_path / "new" / "file"
+    write_atomically(path, "old")
 
     def fail(*_):
         raise OSError("disk full")
@@ -31,7 +32,7 @@ def test_what_fails_on_the_way_leaves_the_old_file_and_no_other(tmp_path, monkey
     monkeypatch.setattr(Path, "replace", fail)
     with pytest.raises(OSError, match="disk full"):
         write_atomically(path, b"new")
-    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+    assert path.read_bytes() == b"old" and list(path.parent.iterdir()) == [path]
 
 
 def test_a_folder_appears_whole_or_not_at_all(tmp_path):
@@ -82,6 +83,66 @@ def test_one_run_at_a_time_is_at_work_in_a_folder_until_it_is_killed(tmp_path, m
         pass
     other.kill()
     other.join(20)
-    for _ in range(2):
-        with alone_in(tmp_path):
-            assert not list(tmp_path.iterdir())
+    with alone_in(tmp_path):
+        assert not list(tmp_path.iterdir())
+
+
+# --- weights
+
+
+def test_what_is_written_is_read_and_equal_weights_make_equal_bytes(tmp_path):
+    path, header = tmp_path / "x.safetensors", {"architecture": "small", "kind": "actor", "version": "1"}
+    assert len({weight_bytes(dict(WEIGHTS), dict(header)) for _ in range(20)}) == 1
+    path.write_bytes(weight_bytes(WEIGHTS, header))
+    weights, read = read_weights(path)
+    assert read == header and set(weights) == set(WEIGHTS)
+    assert all(torch.equal(value, WEIGHTS[key]) and value.dtype == WEIGHTS[key].dtype for key, value in weights.items())
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_flipped_bit_changes_no_weight_in_silence(tmp_path, seed):
+    """It is noticed wherever it is but in the name of the hash, where it changes nothing else."""
+    content, draw = bytearray(weight_bytes(WEIGHTS, {"architecture": "small"})), random.Random(seed)
+    content[draw.randrange(len(content))] ^= 1 << draw.randrange(8)
+    (tmp_path / "x.safetensors").write_bytes(content)
+    try:
+        weights, header = read_weights(tmp_path / "x.safetensors")
+    except ValueError:
+        return
+    assert HASH.encode() not in content and header["architecture"] == "small"
+    assert all(torch.equal(value, WEIGHTS[key]) for key, value in weights.items())
+
+
+def test_files_without_a_hash_are_read_but_not_with_nan(tmp_path):
+    path = tmp_path / "x.safetensors"
+    path.write_bytes(save(WEIGHTS, {"architecture": "small"}))
+    assert read_weights(path)[1] == {"architecture": "small"}
+    path.write_bytes(weight_bytes(WEIGHTS | {"a": torch.tensor([1.0, torch.nan])}, {}))
+    with pytest.raises(ValueError, match="a holds NaN"):
+        read_weights(path)
+
+
+def actor(folder, path=None):
+    network = ActorEgo(hidden=(8,)).network
+    network.save(folder / "actor.safetensors") if path is None else network.load(path)
+    return folder / "actor.safetensors"
+
+
+def bits(folder, path=None):
+    save_bits(BitsNetwork(8), folder / "bits.safetensors", {}) if path is None else load_bits(str(path))
+    return folder / "bits.safetensors"
+
+
+def prior(folder, path=None):
+    return save_prior(small_prior(), folder, {}) if path is None else load_prior(str(path))
+
+
+@pytest.mark.parametrize("kind", [actor, bits, prior])
+def test_checkpoints_with_a_flipped_bit_are_refused_by_name(tmp_path, kind):
+    path = kind(tmp_path)
+    kind(tmp_path, path)
+    content = bytearray(path.read_bytes())
+    content[-3] ^= 4
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=rf"{path.name}.*not what was written"):
+        kind(tmp_path, path)

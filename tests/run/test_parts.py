@@ -11,42 +11,47 @@ from e2rl.run.parts import Parts, state_bytes
 VALUE = ([{"cfr": 1.0, "seed": 3, "duty": ""}], [{"speed": torch.arange(3.0)}], [])
 
 
-def fail():
-    raise AssertionError("done already")
+def computes(parts, name="a", identity=(1,), **options):
+    """Whether a part is computed, not read."""
+    calls = []
 
-
-def counted(calls, value=VALUE):
     def compute():
         calls.append(1)
-        return value
+        return VALUE
 
-    return compute
+    parts.result(name, list(identity), compute, **options)
+    return bool(calls)
 
 
-def test_a_part_is_computed_once_and_read_as_it_was(tmp_path):
-    Parts(tmp_path, "after").result("a", [("x", 1.5)], lambda: VALUE)
-    rows, samples, ended = Parts(tmp_path, "after").result("a", [("x", 1.5)], fail)
-    assert (rows, ended) == (VALUE[0], VALUE[2]) and torch.equal(samples[0]["speed"], VALUE[1][0]["speed"])
+@pytest.fixture
+def file(tmp_path):
+    """The file of a part."""
+    assert computes(Parts(tmp_path))
+    (found,) = tmp_path.rglob("*.pt")
+    return found
+
+
+def test_a_part_is_computed_once_and_read_as_it_was(tmp_path, file, monkeypatch):
+    assert not computes(Parts(tmp_path))
+    rows, samples, errored = Parts(tmp_path).load("a", [1])
+    assert (rows, errored) == (VALUE[0], VALUE[2]) and torch.equal(samples[0]["speed"], VALUE[1][0]["speed"])
+    monkeypatch.chdir(tmp_path / "parts")
+    assert computes(Parts()) and computes(Parts()), "without a folder nothing is written"
+    assert computes(Parts(tmp_path), valid=lambda found: False)
 
 
 @pytest.mark.parametrize(
     ("stage", "about", "identity"), [("other", "", [1]), ("", "another round", [1]), ("", "", [2])]
 )
-def test_a_part_of_something_else_is_none(tmp_path, stage, about, identity):
-    Parts(tmp_path).save("a", [1], VALUE)
-    calls = []
-    Parts(tmp_path, stage, about).result("a", identity, counted(calls))
-    assert calls == [1]
+def test_a_part_of_something_else_is_none(tmp_path, file, stage, about, identity):
+    assert computes(Parts(tmp_path, stage, about), identity=identity)
 
 
-def test_every_damage_is_noticed_and_the_part_done_again(tmp_path):
-    Parts(tmp_path).save("a", [1], VALUE)
-    (file,) = tmp_path.rglob("*.pt")
-    whole = file.read_bytes()
+def test_every_damage_is_noticed_and_the_part_done_again(tmp_path, file):
+    whole, draw = file.read_bytes(), random.Random(0)
     for cut in (0, 1, len(whole) // 2, len(whole) - 1):
         file.write_bytes(whole[:cut])
         assert Parts(tmp_path).load("a", [1]) is None
-    draw = random.Random(0)
     for _ in range(200):
         flipped = bytearray(whole)
         flipped[draw.randrange(len(whole))] ^= 1 << draw.randrange(8)
@@ -55,9 +60,7 @@ def test_every_damage_is_noticed_and_the_part_done_again(tmp_path):
     for value in ([1, 2], {"format": "e2rl-part/1"}, "text"):  # whole, but no part
         file.write_bytes(state_bytes(value))
         assert Parts(tmp_path).load("a", [1]) is None
-    calls = []
-    Parts(tmp_path).result("a", [1], counted(calls))
-    assert calls == [1] and Parts(tmp_path).load("a", [1]) is not None
+    assert computes(Parts(tmp_path)) and Parts(tmp_path).load("a", [1]) is not None
 
 
 class Malicious:
@@ -68,24 +71,7 @@ class Malicious:
         return os.mkdir, (str(self.mark),)
 
 
-def test_a_strangers_part_runs_nothing(tmp_path):
-    Parts(tmp_path).save("a", [1], VALUE)
-    (file,) = tmp_path.rglob("*.pt")
+def test_a_strangers_part_runs_nothing(tmp_path, file):
     part = {"format": "e2rl-part/1", "about": "", "identity": [1], "value": Malicious(tmp_path / "ran")}
     file.write_bytes(state_bytes(part))
     assert Parts(tmp_path).load("a", [1]) is None and not (tmp_path / "ran").exists()
-
-
-def test_a_part_that_is_not_valid_any_more_is_done_again(tmp_path):
-    calls = []
-    for _ in range(2):
-        Parts(tmp_path).result("a", [1], counted(calls), lambda found: False)
-    assert len(calls) == 2
-
-
-def test_without_a_folder_nothing_is_kept(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    calls = []
-    for _ in range(2):
-        Parts().result("a", [1], counted(calls))
-    assert len(calls) == 2 and not list(tmp_path.iterdir())

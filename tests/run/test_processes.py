@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from e2rl.run.errors import InputError
-from e2rl.run.processes import cores, in_processes
+from e2rl.run.processes import in_processes
 
 
 def square(job):
@@ -56,7 +56,3 @@ def vanish(job):
 def test_a_child_that_dies_is_named():
     with pytest.raises(InputError, match="processes=2"):
         list(in_processes(vanish, range(4), 2, cost=float))
-
-
-def test_cores():
-    assert 1 <= cores() <= (os.cpu_count() or 1)

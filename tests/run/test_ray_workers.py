@@ -2,7 +2,6 @@
 
 import os
 import signal
-import threading
 from importlib.util import find_spec
 
 import numpy as np
@@ -104,24 +103,6 @@ def test_errors_of_workers_arrive_and_one_that_always_dies_is_named(workers, mon
     for fault, message in ((refuse, "^job 0: refused$"), (vanish, "launcher=ray: a job lost its worker 2 times")):
         with pytest.raises(InputError, match=message):
             list(in_processes(fault, range(1), workers, cost=float))
-
-
-@needs_ray
-def test_files_that_a_worker_wrote_elsewhere_are_missed(tmp_path, workers):
-    class Elsewhere(Setup):
-        def score(self, method, tasks, folder=None):
-            return super().score(method, tasks, tmp_path / "of another machine")
-
-    setup = Elsewhere(small_scenes(1), IDMEgo(), "idm", SimSettings())
-    with pytest.raises(InputError, match="put the run's folder where all machines have it"):
-        run_protocol(setup, [Method("ambush", Ambush(), 2.0)], [0], tmp_path / "run", processes=workers)
-
-
-@needs_ray
-def test_what_cannot_be_sent_is_named(workers):
-    lock = threading.Lock()
-    with pytest.raises(InputError, match="launcher=ray: cannot be sent to workers: .*launcher=processes"):
-        list(in_processes(lambda job: lock, range(2), workers, cost=float))
 
 
 def test_without_ray_the_extra_is_named(monkeypatch):

@@ -54,26 +54,15 @@ def test_constructors_are_filled_by_name_and_never_overruled():
     assert vars(Guard("a", 7.0)) == {"name": "a", "gap": 7.0, "look": 2.5}
 
 
-BAD = [
-    {"gap": -1.0},
-    {"gap": 10.5},
-    {"gap": float("nan")},
-    {"gpa": 1.0},
-    {"look": "far"},
-    {"look": None},
-    {"kind": "round"},
-    {"times": [2, 0.5]},
-    {"most": 2},
-]
-
-
-@pytest.mark.parametrize("values", BAD)
+@pytest.mark.parametrize(
+    "values",
+    [{"gap": -1.0}, {"gap": 10.5}, {"gap": float("nan")}, {"gpa": 1.0}, {"look": "far"}, {"look": None}]
+    + [{"kind": "round"}, {"times": [2, 0.5]}, {"most": 2}],
+)
 def test_bad_values_name_the_group_and_the_key(values):
     (key,) = values
     with pytest.raises(InputError, match=rf"^(driver\.)?reach\.{key}"):
         settings_of(Reach, values, "reach")
-    with pytest.raises(InputError, match=rf"(^|\.){key}"):
-        settings_of(Reach, values)
 
 
 def test_bounds_are_allowed_themselves():

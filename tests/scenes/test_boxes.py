@@ -61,10 +61,3 @@ def test_rigid_motion_and_order_do_not_matter(boxes):
 
     assert torch.allclose(signed_distance(move(first[0]), first[1], move(second[0]), second[1]), before)
     assert torch.allclose(signed_distance(*second, *first), before)
-
-
-def test_pairs_broadcast(boxes):
-    (pose, size), (other, other_size), _ = boxes
-    pairs = overlap(pose[:20, None], size[:20, None], other[None, :30], other_size[None, :30])
-    assert pairs.shape == (20, 30)
-    assert torch.equal(pairs[3, 5], overlap(pose[3], size[3], other[5], other_size[5]))

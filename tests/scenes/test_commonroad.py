@@ -1,9 +1,6 @@
 """CommonRoad XML: what a scenario says arrives in the Recording, entities and nonsense are refused by name."""
 
 import re
-import sys
-import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +11,6 @@ from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, OTHER, PEDESTRIAN, VEH
 pytest.importorskip("commonroad", reason="data=commonroad needs the extra commonroad")
 from e2rl.scenes.commonroad import CommonRoadSource, read_scenario
 from tests.scenes.descriptions import recordings_in
-
-RECORDED = Path(__file__).parents[3] / "shared" / "data" / "commonroad_ngsim" / "scenarios.zip"
 
 
 def exact(name: str, value: float) -> str:
@@ -135,21 +130,7 @@ def test_the_ego_is_who_starts_where_the_planning_problem_does_else_who_moves_lo
     gone = [obstacle(10, 0, 6, 5, 0.1), obstacle(11, 3.6, 1, 60, 0.1)]
     assert read_scenario(scenario(gone)).ego == 1  # who is there at the start frame
     with pytest.raises(InputError, match="no ego"):
-        read_scenario(scenario([obstacle(12, -5, 1, 91, 0.1, kind="pedestrian")])).validate()
-
-
-def test_folders_and_zips_make_the_same_scenes_and_short_scenarios_are_counted(tmp_path):
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    contents = {"a.xml": scenario(), "short.xml": scenario(steps=45)}
-    with zipfile.ZipFile(tmp_path / "made.zip", "w") as archive:
-        for name, content in contents.items():
-            (folder / name).write_bytes(content)
-            archive.writestr(name, content)
-    for path in (folder, tmp_path / "made.zip"):
-        scenes = CommonRoadSource(str(path), cache=str(tmp_path / "cache"), workers=1).load()
-        assert scenes.scene_id == ["DEU_Made-7_1_T-1"] and scenes.dropped == {"too short for a start frame": 1}
-        assert scenes.scenes["logged_valid"][0, :, 0].all()
+        read_scenario(scenario([obstacle(12, -5, 1, 91, 0.1, kind="pedestrian")])).validate_log()
 
 
 def turned(text: bytes, angle: bytes) -> bytes:
@@ -165,24 +146,17 @@ BOMB = b'<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
     ("change", "message"),
     [
         (lambda text: text.replace(b"<commonRoad", ENTITY + b"<commonRoad", 1), "document type"),
-        (lambda text: text.replace(b"<commonRoad", BOMB + b"<commonRoad", 1), "document type"),
         (
             lambda text: text.decode().replace("<commonRoad", BOMB.decode() + "<commonRoad", 1).encode("utf-16"),
             "document type",
         ),
         (lambda text: text[: len(text) // 2], "is none of CommonRoad scenarios"),
-        (lambda text: b"", "is none of CommonRoad scenarios"),
-        (lambda text: b"<commonRoad/>", "is none of CommonRoad scenarios"),
-        (lambda text: text.replace(b'timeStepSize="0.1"', b'timeStepSize="7"'), "timeStepSize=7"),
         (lambda text: text.replace(b'timeStepSize="0.1"', b'timeStepSize="nan"'), "timeStepSize=nan"),
         (
             lambda text: text.replace(b"<time><exact>90</exact>", b"<time><exact>9000000000</exact>", 1),
             "frames x agents|is none of CommonRoad scenarios",
         ),
-        (lambda text: text.replace(b"<x>20.0</x>", b"<x>here</x>", 1), "is none of CommonRoad scenarios"),
         (lambda text: text.replace(b"<x>20.0</x>", b"<x>1e400</x>", 1), "point/x is 1e400; repair it"),
-        (lambda text: turned(text, b"1e400"), "orientation/exact is 1e400"),
-        (lambda text: turned(text, b"nan"), "orientation/exact is nan"),
         (lambda text: turned(text, b"99999999999"), "orientation/exact is 99999999999"),
         (lambda text: text.replace(b"</commonRoad>", b"<a>" * 9999), "nests deeper than 32 elements"),
     ],
@@ -190,23 +164,3 @@ BOMB = b'<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
 def test_what_is_wrong_is_named_with_the_file(change, message):
     with pytest.raises(InputError, match=rf"^made\.xml: .*({message})"):
         recordings_in(CommonRoadSource, change(scenario()), "made.xml")
-
-
-def test_a_missing_package_is_named_with_its_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "commonroad.common.reader.file_reader_xml", None)
-    with pytest.raises(InputError, match=r"made\.xml: a library .*commonroad.*pip install 'e2rl\[commonroad\]'"):
-        recordings_in(CommonRoadSource, scenario(), "made.xml")
-
-
-@pytest.mark.skipif(not RECORDED.is_file(), reason=f"recorded scenarios are missing: {RECORDED}")
-@pytest.mark.parametrize("log", ["USA_Lanker-2_9_T-1.xml", "USA_Peach-4_1_T-1.xml", "USA_US101-1_1_T-1.xml"])
-def test_recorded_scenarios_make_scenes_and_the_ego_s_speed_is_that_of_its_displacements(log, monkeypatch):
-    """One of each site."""
-    monkeypatch.setattr(CommonRoadSource, "logs", lambda self: [log])
-    source = CommonRoadSource(str(RECORDED), workers=1)
-    (recording,) = source.recordings()
-    track = recording.states[recording.valid[:, recording.ego], recording.ego]
-    moved = np.linalg.norm(np.diff(track[:, :2], axis=0), axis=1).sum()
-    assert abs(moved - 0.1 * track[1:, 3].sum()) < 0.05 * moved + 1
-    (row,) = source.rows()
-    assert row.scene is not None and row.scene["logged_valid"][:, 0].any()

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+import torch
 from shapely import contains_xy, distance, points
 from shapely.geometry import LineString, Polygon
 from shapely.ops import unary_union
 
-from e2rl.scenes.drivable_area import FAR, MARGIN, drivable_field
+from e2rl.scenes.drivable_area import FAR, MARGIN, drivable_field, off_road
 from e2rl.scenes.paths import resample
 
 
@@ -58,3 +59,25 @@ def test_polygons_and_lanes_together(seed):
 def test_nothing_is_drivable_on_an_empty_map():
     field, origin = drivable_field([], np.zeros(0), [], np.zeros(2), 11)
     assert (field == FAR).all() and origin.tolist() == [-5.0, -5.0]
+
+
+def test_bilinear_is_exact_on_planes():
+    cells = torch.arange(20.0)
+    plane = 0.1 * cells[:, None] - 0.2 * cells[None] + 1.0
+    origin = torch.tensor([[-5.0, 3.0], [2.0, -1.0]])
+    points = origin[:, None] + 19 * torch.rand(2, 50, 2)
+    local = points - origin[:, None]
+    expected = 0.1 * local[..., 0] - 0.2 * local[..., 1] + 1.0
+    assert torch.allclose(off_road(points, plane.repeat(2, 1, 1), origin), expected, atol=1e-5)
+
+
+def test_outside_the_grid_is_far():
+    points = torch.tensor([[[-0.1, 3.0], [3.0, 9.2], [9.0, 9.0]]])
+    assert off_road(points, torch.zeros(1, 10, 10), torch.zeros(1, 2)).tolist() == [[FAR, FAR, 0.0]]
+
+
+def test_points_may_name_the_row_of_their_field():
+    torch.manual_seed(0)
+    field, origin, row = torch.randn(3, 12, 12).half(), torch.randn(3, 2), torch.tensor([2, 0, 2, 1])
+    points = 12 * torch.rand(4, 7, 2)
+    assert torch.equal(off_road(points, field, origin, row), off_road(points, field[row], origin[row]))

@@ -49,22 +49,9 @@ def setting(where, value):
     return change
 
 
-def longer(recording):
-    recording.size = recording.size.copy()
-    recording.size[1, 0] = 200.0
-
-
-def turned(recording):
-    recording.states[:, recording.ego, 2] = np.degrees(recording.states[:, recording.ego, 2]) + 40.0
-
-
 def far_away(recording):
     agent = 1 - recording.ego if recording.ego < 2 else 0
     recording.states[:, agent, 0] += 1e9
-
-
-def long_lane(recording):
-    recording.lanes = recording.lanes | {"long": Lane(np.array([[0.0, 0.0], [1e7, 0.0]]))}
 
 
 def fastest(recording):
@@ -91,7 +78,6 @@ def twice(recording):
 ALL = ("positions", "speeds", "sizes", "map")
 MUTATIONS = {
     "degrees": (lambda r: setting((..., 2), np.degrees(r.states[..., 2]))(r), "rad lie between|rad is the largest"),
-    "the ego in degrees": (turned, "rad lie between|rad is the largest"),
     "mirrored tracks": (lambda r: setting((..., 1), -r.states[..., 1])(r), "rad lie between"),
     "tracks with swapped axes": (lambda r: setting((..., slice(0, 2)), r.states[..., [1, 0]])(r), "rad lie between"),
     "reversed headings": (lambda r: setting((..., 2), r.states[..., 2] + np.pi)(r), "rad lie between"),
@@ -99,11 +85,6 @@ MUTATIONS = {
         lambda r: moved(r, lambda points: points * [1, -1] + [0, 17]),
         "m is the ego from|drive along a lane",
     ),
-    "map with swapped axes": (
-        lambda r: moved(r, lambda points: points[:, ::-1]),
-        "m is the ego from|drive along a lane",
-    ),
-    "map 5 km away": (lambda r: moved(r, lambda points: points + 5000), "from the nearest lane"),
     "map of another place": (lambda r: moved(r, lambda points: points + [0, 13]), "drive along a lane"),
     "feet": (lambda r: scaled(r, 3.28, *ALL), "median length of vehicles"),
     "feet but for sizes": (lambda r: scaled(r, 3.28, *ALL[:2], "map"), "side by side"),
@@ -122,9 +103,7 @@ MUTATIONS = {
     "millimetres": (lambda r: scaled(r, 1000.0, *ALL), "m is"),
     "kilometres": (lambda r: scaled(r, 1e-3, *ALL), "m is an agent's"),
     "km/h": (lambda r: scaled(r, 3.6, "speeds"), "is what the recorded speeds make"),
-    "a car of 200 m": (longer, "m is an agent's length"),
     "coordinates of 1e9": (far_away, "m is the largest coordinate"),
-    "a lane of 10,000 km": (long_lane, "m is"),
 }
 
 

@@ -78,34 +78,18 @@ def test_a_bomb_is_not_unpacked(tmp_path, method, claimed):
         tracemalloc.stop()
 
 
-def test_a_damaged_zip_and_an_index_that_is_no_table_are_named(tmp_path):
+def test_a_damaged_zip_is_named(tmp_path):
     path = write_zip(tmp_path / "x.zip", [description()])
     torn = bytearray(path.read_bytes())
     torn[200:400] = bytes(200)
     (tmp_path / "torn.zip").write_bytes(torn)
     with pytest.raises(InputError, match=r"sd_00\.pkl in .*torn\.zip: cannot be read"):
         contents(tmp_path / "torn.zip")
-    (tmp_path / "index.csv").write_bytes(b"file,location_group\n\xff\xfe,\x00\n")
-    with pytest.raises(InputError, match=r"index\.csv: cannot be read"):
-        _ = ScenarioNetSource(str(path)).locations
     content = path.read_bytes()
     place = content.index(b"PK\x01\x02")
     path.write_bytes(content[:place] + b"XXXX" + content[place + 4 :])
     with pytest.raises(InputError, match="damaged zip"):
         ScenarioNetSource(str(path)).logs()
-
-
-def test_paths_that_hold_nothing_say_so(tmp_path):
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "file.bin").write_bytes(b"x" * 100)
-    for name, message in (
-        ("none", "no such file or folder"),
-        ("empty", r"no \.pkl scenario"),
-        ("file.bin", "neither a folder nor a zip"),
-    ):
-        with pytest.raises(InputError, match=message) as caught:
-            ScenarioNetSource(str(tmp_path / name)).logs()
-        assert str(tmp_path / name) in str(caught.value)
 
 
 def test_tracks_types_sizes_and_the_map_arrive():
@@ -119,7 +103,7 @@ def test_tracks_types_sizes_and_the_map_arrive():
     tracks["p"]["state"]["length"] = tracks["p"]["state"]["length"][:, None]
     tracks["p"]["state"]["position"][30:] = np.nan
     (recording,) = read(description(tracks))
-    assert recording.validate() is recording and (recording.scene_id, recording.location) == ("fork", "place")
+    assert recording.validate_log() is recording and (recording.scene_id, recording.location) == ("fork", "place")
     assert recording.dataset == "made" and recording.current == 10 and recording.ego == 0
     assert recording.agent_type.tolist() == [VEHICLE, VEHICLE, OTHER, PEDESTRIAN]
     assert recording.size.tolist() == [[4.5, 1.9], [4.1, 1.7], [4.5, 1.9], [0.5, 0.6]]  # a car is longer than wide
@@ -155,14 +139,8 @@ def test_lights_keep_their_last_known_state():
     }
     (recording,) = read(scene)
     assert recording.lights.keys() == {"on", "left", "near"}
-    assert recording.lights["on"][:6].tolist() == [
-        LIGHT_UNKNOWN,
-        LIGHT_RED,
-        LIGHT_RED,
-        LIGHT_YELLOW,
-        LIGHT_GREEN,
-        LIGHT_GREEN,
-    ]
+    names = [LIGHT_UNKNOWN, LIGHT_RED, LIGHT_RED, LIGHT_YELLOW, LIGHT_GREEN, LIGHT_GREEN]
+    assert recording.lights["on"][:6].tolist() == names
     assert (recording.lights["left"] == LIGHT_RED).all() and (recording.lights["near"] == LIGHT_UNKNOWN).all()
     assert all(len(light) == FRAMES for light in recording.lights.values())
 
@@ -196,27 +174,14 @@ def test_start_frames():
     ("change", "message"),
     [
         (lambda s: s["metadata"].update(sdc_id="nobody"), r"no ego: metadata\.sdc_id='nobody'"),
-        (lambda s: s["metadata"].pop("sdc_id"), "no ego"),
-        (lambda s: s.pop("metadata"), "is none of ScenarioDescription pickles"),
-        (lambda s: s.update(tracks={}), "no ego"),
         (lambda s: s.update(metadata=3), "is none of ScenarioDescription pickles"),
-        (lambda s: s["tracks"]["7"].pop("state"), "is none of ScenarioDescription pickles: KeyError .state"),
         (lambda s: s["tracks"]["7"]["state"]["position"].fill(np.nan), "track 7 is NaN or infinite at frame 0"),
-        (lambda s: s["metadata"].update(ts=ALL[:5]), "5 time stamps for 91 frames"),
         (lambda s: s["metadata"].update(ts=ALL[::-1] * 0.1), "time stamps do not increase"),
-        (lambda s: s["metadata"].update(current_time_index="x"), "current_time_index='x' is no frame of 91"),
-        (lambda s: s["metadata"].update(current_time_index=np.inf), "current_time_index=inf is no frame of 91"),
         (lambda s: s["metadata"].update(current_time_index=-80), "current_time_index=-80 is no frame of 91"),
         (lambda s: s["metadata"].update(ts=np.append(ALL[:90] * 0.1, 1e9)), "scene 'fork': 3e.10 frames x agents"),
         (lambda s: s.update(id="x" * 200), "its id has more than 128 characters"),
-        (
-            lambda s: s["tracks"]["7"]["state"].update(position=np.zeros((4, 3))),
-            "is none of ScenarioDescription pickles",
-        ),
-        (lambda s: s.update(map_features=[1]), "is none of ScenarioDescription pickles"),
         (lambda s: s["tracks"].update({7: s["tracks"]["7"]}), "two of its tracks have the id '7'"),
         (lambda s: s["tracks"]["7"].update(type="SPACESHIP"), "track 7 is of the unknown type 'SPACESHIP'; known are"),
-        (lambda s: s["tracks"]["7"].update(type=[1]), r"track 7 is of the unknown type '\[1\]'"),
     ],
 )
 def test_what_is_wrong_is_named_with_the_file(change, message):

@@ -5,7 +5,6 @@ import json
 import multiprocessing
 import os
 import pickle
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -81,20 +80,19 @@ def test_a_set_is_built_once_and_read_from_its_file(tmp_path):
     path = file_of(tmp_path / "cache")
     first = cached(path, build, 1)
     same(uncached(build), first)
+    changed = cached(path, never, 1)
+    changed.scenes["logged"].fill_(7.0)  # in memory, not in the file
     same(cached(path, never, 1), first)
     assert list(path.parent.iterdir()) == [path]
 
 
 DAMAGES = {
     "truncated": lambda content: content[: len(content) // 2],
-    "nonsense": lambda content: b"\xff" * 640,
     "empty": lambda content: b"",
     "a bit of a scene": lambda content: content[:20] + bytes([content[20] ^ 1]) + content[21:],
     "a bit of the index": lambda content: content[:-90] + bytes([content[-90] ^ 1]) + content[-89:],
-    "a bit of the hash": lambda content: content[:-1] + bytes([content[-1] ^ 1]),
     "another format": lambda content: content.replace(cache.FORMAT, b"e2rl-scenes-cache/0"),
     "more at its end": lambda content: content + b"x",
-    "more at its beginning": lambda content: b"x" + content,
 }
 
 
@@ -121,14 +119,6 @@ def test_a_file_of_other_arrays_than_numbers_is_refused(tmp_path, change):
     body = content[:begin] + about
     path.write_bytes(body + cache.END.pack(len(about), cache.FORMAT, hashlib.sha256(body).digest()))
     assert cache.read(path) is None
-
-
-def test_what_is_changed_in_memory_does_not_reach_the_file(tmp_path):
-    path = file_of(tmp_path)
-    before = cached(path, build, 1)
-    mine = cached(path, never, 1)
-    mine.scenes["logged"].fill_(7.0)
-    same(cached(path, never, 1), before)
 
 
 @pytest.mark.parametrize("large", [0, 10**9])
@@ -169,38 +159,10 @@ def test_what_is_sent_to_another_process_is_the_set_alone(tmp_path):
         same(pickle.loads(sent), some)
 
 
-def test_hashes_are_of_the_content_without_padding():
-    several = uncached(partial(build, count=3))
-    alone = replace(uncached(partial(build, count=1)), digests=[])
-    assert replace(several, digests=[]).scenes["lane_points"].shape[1] == 3
-    assert (
-        cache.content_hash({key: alone.scenes[key][0].numpy() for key in ("logged", "lane_points")})
-        == (several.hashes()[0])
-    )
-
-
 def test_scenes_of_other_settings_are_no_set():
     scenes = [{"logged": np.zeros((5, count, 4))} for count in (3, 4)]
     with pytest.raises(InputError, match="different logged shapes cannot be one set"):
         uncached(partial(yielding, scenes))
-
-
-def test_what_a_killed_process_left_is_removed_and_an_error_leaves_nothing(tmp_path):
-    left, other = (tmp_path / f".{file_of(tmp_path, letter).name}.x.part" for letter in "ab")
-    left.write_bytes(b"half"), other.write_bytes(b"half")
-    cached(file_of(tmp_path), build, 1)
-    assert not left.exists() and other.exists()  # the other may be at work
-    before = sorted(tmp_path.iterdir())
-
-    def fails(index, error):
-        yield from build(index)
-        raise error
-
-    with pytest.raises(InputError, match="no"):
-        cached(file_of(tmp_path, "c"), partial(fails, error=InputError("no")), 1)
-    with pytest.raises(InputError, match=r"data\.cache=.*No space left.*free space"):
-        cached(file_of(tmp_path, "c"), partial(fails, error=OSError(28, "No space left on device")), 1)
-    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_sets_not_used_for_longest_make_room_and_nothing_else_does(tmp_path, capsys):
@@ -219,14 +181,6 @@ def test_sets_not_used_for_longest_make_room_and_nothing_else_does(tmp_path, cap
     assert f"removed {names[1]}" in capsys.readouterr().err
     cached(file_of(tmp_path, "e"), build, 0)  # what is used stays, however small the limit
     assert sorted(tmp_path.iterdir()) == sorted([*others, file_of(tmp_path, "e")])
-
-
-def test_the_folder_is_the_users(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert cache.cache_folder() == tmp_path / "e2rl"
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert cache.cache_folder() == tmp_path / ".cache" / "e2rl"
 
 
 def _counted(folder, _: int) -> list[str]:

@@ -9,9 +9,7 @@ import torch
 from e2rl.run.errors import InputError
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.scene_cache import uncached
-from e2rl.scenes.scene_list import SCENES, Listed, list_text, listed_scenes, read_list, scene_hashes
-from e2rl.scenes.source import load_scenes
-from tests.scenes.descriptions import data_config, description, lane, numbered, straight, write_folder
+from e2rl.scenes.scene_list import SCENES, Listed, listed, listed_scenes, read_list, scene_hashes
 from tests.synthetic import make_scenes
 
 SMALL = {"num_vehicles": 3, "max_vehicles": 4, "max_agents": 5, "num_routes": 1, "num_points": 120, "steps": 10}
@@ -38,15 +36,6 @@ def written(folder, text):
     return folder / "list.csv"
 
 
-def load_of(scenes, asked=None):
-    def load(most):
-        if asked is not None:
-            asked.append(most)
-        return scenes.first(most)
-
-    return load
-
-
 def test_a_hash_is_of_the_scene_alone_and_of_all_of_it():
     scenes = scenes_of()
     hashes = scene_hashes(scenes)
@@ -70,29 +59,20 @@ def test_what_a_run_lists_is_what_another_takes(tmp_path):
     scenes = scenes_of()
     some = scenes.chosen([3, 1])
     assert some.number == [3, 1] and some.scenes["scene_index"].tolist() == [0, 1]
-    (tmp_path / SCENES).write_text(list_text(some))
+    (tmp_path / SCENES).write_text(listed(some)[0])
     for data in (scenes, scenes.chosen([2, 1, 0, 3])):
-        found = listed_scenes(tmp_path, load_of(data))
+        found = listed_scenes(tmp_path, data.first)
         assert found.scene_id == ["s3", "s1"] and found.number == [3, 1]
         assert torch.equal(found.scenes["logged"], some.scenes["logged"])
         assert found.scenes["scene_index"].tolist() == [0, 1]
-    assert listed_scenes(tmp_path, load_of(scenes), 1).scene_id == ["s3"]
-
-
-def test_no_more_scenes_are_built_than_the_list_reaches(tmp_path):
-    scenes, asked = scenes_of(), []
-    (tmp_path / SCENES).write_text(list_text(scenes.chosen([1, 0])))
-    listed_scenes(tmp_path, load_of(scenes, asked))
-    assert asked == [2]
-    listed_scenes(tmp_path, load_of(scenes.chosen([3, 2, 1, 0]), asked))
-    assert asked == [2, 2, None], "they stand elsewhere in these data"
+    assert listed_scenes(tmp_path, scenes.first, 1).scene_id == ["s3"]
 
 
 def test_a_list_by_hand_names_scenes_only(tmp_path):
     """A part of rollouts.csv, say, or what a spreadsheet writes; a scene that it names twice is taken once."""
     scenes = scenes_of()
     file = written(tmp_path, "\ufeffmethod,scene_id\ne2,s2\r\ne2,s0\nnominal,s2\n")
-    found = listed_scenes(file, load_of(scenes))
+    found = listed_scenes(file, scenes.first)
     assert found.scene_id == ["s2", "s0"] and found.number == [2, 0]
     assert read_list(written(tmp_path, "scene_id,number\na,7\n")) == [Listed("a", 7)]
 
@@ -100,28 +80,24 @@ def test_a_list_by_hand_names_scenes_only(tmp_path):
 def test_other_scenes_of_the_same_name_are_refused_unless_their_files_are_the_same(tmp_path, capsys):
     scenes, moved = scenes_of(), scenes_of()
     moved.scenes["logged"][1, 3, 2, 0] += 0.01
-    (tmp_path / SCENES).write_text(list_text(scenes))
+    (tmp_path / SCENES).write_text(listed(scenes)[0])
     for files in ("", "0" * 64):
         with pytest.raises(InputError, match=r"1 of 4 scenes are not those listed \(s1\): .*sha256"):
-            listed_scenes(tmp_path, load_of(moved), files=files)
-    found = listed_scenes(tmp_path, load_of(moved), files="f" * 64)
+            listed_scenes(tmp_path, moved.first, files=files)
+    found = listed_scenes(tmp_path, moved.first, files="f" * 64)
     assert found.scene_id == scenes.scene_id
     assert "1 of 4 scenes are not those listed (s1), though the data files are" in capsys.readouterr().err
     with pytest.raises(
         InputError, match=r"2 of 4 scenes are not in the data \(s1, s2\), whose first is s0; pass the data"
     ):
-        listed_scenes(tmp_path, load_of(scenes.chosen([0, 3])))
+        listed_scenes(tmp_path, scenes.chosen([0, 3]).first)
 
 
 @pytest.mark.parametrize(
     ("content", "what"),
     [
-        ("", "no column scene_id"),
         ("id,number\na,1\n", "no column scene_id"),
-        ("scene_id\n", "names no scene"),
-        ("scene_id,number\n,1\n", "line 2: no scene_id"),
         ("scene_id,number\na,1\nb,-1\n", "line 3: number -1"),
-        ("scene_id,number\na,1.5\n", "number 1.5"),
         ("scene_id,number\na,99999999999\n", "number 99999999999"),
         ("scene_id,number\na,²\n", "number ²"),
         ('scene_id\n"a', "cannot be read"),
@@ -130,25 +106,3 @@ def test_other_scenes_of_the_same_name_are_refused_unless_their_files_are_the_sa
 def test_what_is_no_list_is_named(tmp_path, content, what):
     with pytest.raises(InputError, match=what):
         read_list(written(tmp_path, content))
-
-
-def test_a_file_that_is_not_there_or_no_text_is_named(tmp_path):
-    with pytest.raises(InputError, match="cannot be read"):
-        read_list(tmp_path)
-    (tmp_path / "bytes.csv").write_bytes(b"scene_id\n\xff\xfe\x00\n")
-    with pytest.raises(InputError, match="cannot be read"):
-        read_list(tmp_path / "bytes.csv")
-
-
-def test_scenes_of_a_source_are_those_of_the_list(tmp_path):
-    """Through the builder and its cache; adding logs to the folder changes neither scenes nor noise."""
-    logs = numbered([description({"ego": straight(20 + k, 0, 8)}) for k in range(3)])
-    config = data_config(write_folder(tmp_path / "logs", logs), tmp_path / "cache")
-    all_of_them = load_scenes(config)
-    assert len(all_of_them.files) == 64 and load_scenes(config).files == all_of_them.files
-    (tmp_path / SCENES).write_text(list_text(all_of_them.chosen([2, 0])))
-    wide = description({"ego": straight(10, 0, 8)}, lanes={"a": lane([[0, 0], [400, 0]])})
-    more = data_config(write_folder(tmp_path / "more", [wide, *logs]), tmp_path / "cache")
-    found = load_scenes(more, scenes=tmp_path)
-    assert found.scene_id == [all_of_them.scene_id[2], all_of_them.scene_id[0]] and found.number == [2, 0]
-    assert found.files != all_of_them.files

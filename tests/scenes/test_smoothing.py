@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from e2rl.run.errors import InputError
-from e2rl.scenes.smoothing import causal_past, causal_state, drop_jumps, resample_uniform, runs_of_true, smooth
+from e2rl.scenes.smoothing import causal_past, causal_state, drop_jumps, resample_uniform, smooth
 
 TIME = np.arange(40) * 0.1
 
@@ -101,10 +101,6 @@ def test_smoothing_works_run_by_run_and_removes_noise():
     noisy[..., :2] += noise
     error = smooth(noisy, np.ones((40, 1), bool))[..., :2] - accelerating()[..., :2]
     assert np.abs(error).mean() < 0.6 * np.abs(noise).mean()
-
-
-def test_runs_of_true():
-    assert runs_of_true(np.array([1, 1, 0, 1, 0, 0, 1], bool)) == [(0, 2), (3, 4), (6, 7)]
 
 
 def test_a_glitch_costs_its_own_frames_only():

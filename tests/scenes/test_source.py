@@ -2,31 +2,24 @@
 
 import os
 import pickle
-import subprocess
-import sys
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import torch
 
-from e2rl.run.config import load_choice
 from e2rl.run.errors import InputError
 from e2rl.run.files import hash_files
 from e2rl.scenes import source
 from e2rl.scenes.builder import BuildSettings
 from e2rl.scenes.bundled import BundledSource
 from e2rl.scenes.recording import Lane, Recording
-from e2rl.scenes.scenarionet import ScenarioNetSource
-from e2rl.scenes.source import AHEAD, Source, load_scenes
+from e2rl.scenes.source import Source, load_scenes
 from tests.scenes.descriptions import (
-    ALL,
     Malicious,
     data_config,
     description,
-    fork,
     lane,
     numbered,
     straight,
@@ -84,29 +77,6 @@ def test_the_first_scenes_take_no_more_than_their_logs(tmp_path, workers):
         load_scenes(config, num_scenes=3)
 
 
-class CountedSource(ScenarioNetSource):
-    """It tells which logs it read."""
-
-    def read(self, log):
-        self.asked.append(log)
-        return super().read(log)
-
-
-def test_no_more_logs_are_built_than_are_asked_for(tmp_path, monkeypatch):
-    """A few scenes in this process and without one log too many; many by a pool that is never far ahead."""
-    folder, build = write_folder(tmp_path / "x", scenes_of(20)), BuildSettings(field_cells=32)
-    counted = CountedSource(str(folder), cache=str(tmp_path / "cache"), workers=2, build=build)
-    monkeypatch.setattr(source, "worker_pool", lambda workers, method: ThreadPoolExecutor(workers))
-    counted.asked = []
-    first = counted.load(2)
-    assert len(first) == len(counted.asked) == 2
-    monkeypatch.setattr(source, "FEW", 0)
-    counted.asked = []
-    assert counted.load(3).scene_id[:2] == first.scene_id
-    assert sorted(counted.asked) == counted.logs()[: len(counted.asked)] and len(counted.asked) <= 3 + 2 * AHEAD
-    assert counted.load().scene_id == [f"scene-{k}" for k in range(20)]
-
-
 def test_the_cache_is_keyed_by_content_and_settings(tmp_path):
     folder, cache = write_folder(tmp_path / "x", scenes_of(1)), tmp_path / "cache"
     load_scenes(data_config(folder, cache))
@@ -116,40 +86,6 @@ def test_the_cache_is_keyed_by_content_and_settings(tmp_path):
     assert load_scenes(data_config(folder, cache, split="mine")).split == "mine"
     assert load_scenes(data_config(folder, cache), starts=[10, 30]).scene_id == ["scene-0@10", "scene-0@30"]
     assert len(list(cache.iterdir())) == 5
-
-
-def test_settings_of_the_cache_do_not_change_the_scenes(tmp_path):
-    folder, cache = write_folder(tmp_path / "x", scenes_of(3)), tmp_path / "cache"
-    first = load_scenes(data_config(folder, cache))
-    same(first, load_scenes(data_config(folder, cache, cache_gb=5, workers=2)))
-    assert len(list(cache.iterdir())) == 1
-    moved = write_folder(tmp_path / "moved" / "x", scenes_of(3))
-    same(first, load_scenes(data_config(moved, cache)))
-    assert len(list(cache.iterdir())) == 1  # wherever the same logs lie
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"cache_gb": -1}, r"data\.cache_gb=-1.*at least 0"),
-        ({"cache_gb": "much"}, r"data\.cache_gb=much"),
-        ({"build": {"steps": 0}}, r"build\.steps=0.*at least 1"),
-        ({"build": {"wheels": 4}}, r"data\.build\.wheels"),
-        ({"unknown": 1}, r"data\.unknown"),
-    ],
-)
-def test_impossible_settings_are_refused(tmp_path, settings, message):
-    folder = write_folder(tmp_path / "x", scenes_of(1))
-    with pytest.raises(InputError, match=message):
-        load_scenes(data_config(folder, tmp_path / "cache", **settings))
-
-
-def test_settings_that_are_not_given_are_those_of_the_files(tmp_path):
-    built, given = BundledSource(), load_choice("data", "bundled")
-    assert asdict(built) == {key: value for key, value in given.items() if key != "_target_"} | {"path": None}
-    assert SpeedSource("x").build == built.build == BuildSettings() and SpeedSource("x").split_name == "x"
-    with pytest.raises(InputError, match=r"build\.vehicles=1"):
-        BuildSettings(vehicles=1)
 
 
 def test_mirror_images_are_scenes_of_the_same_place(tmp_path):
@@ -194,52 +130,6 @@ def test_overlaps_with_the_ego_and_logs_too_short_are_dropped_and_counted(tmp_pa
     assert len(found) == 1 and found.dropped == {source.OVERLAP: 1}
     with pytest.raises(InputError, match=f"no valid scene in .*x .2 {source.TOO_SHORT}"):
         load_scenes(data_config(folder, tmp_path / "cache"), starts=[80])
-
-
-def test_start_frames_of_the_config_make_windows(tmp_path):
-    folder = write_folder(tmp_path / "x", scenes_of(2))
-    found = load_scenes(data_config(folder, tmp_path / "cache", starts=[10, 40]))
-    assert found.scene_id == ["scene-0@10", "scene-0@40", "scene-1@10", "scene-1@40"]
-    ego = found.scenes["logged_valid"][:, :, 0].sum(1)
-    assert ego.tolist() == [81, 51, 81, 51] and len(ALL) == 91
-
-
-def test_places_of_an_index_reach_the_scenes(tmp_path):
-    write_folder(tmp_path / "x", scenes_of(2))
-    (tmp_path / "index.csv").write_text("file,location_group\nsd_00.pkl,a\nsd_01.pkl,b\n")
-    assert load_scenes(data_config(tmp_path / "x", tmp_path / "cache")).location == ["a", "b"]
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"path": None}, r"data\.path is not set"),
-        ({"path": "nowhere"}, "nowhere: no such file or folder"),
-        ({"workers": "many"}, r"data\.workers=many"),
-        ({"_target_": "no.such.Source"}, r"^data=no\.such\.Source: cannot be built: .*no"),
-        ({"_target_": "torch.nn.ReLU"}, r"^data=torch\.nn\.ReLU: is no e2rl\.scenes\.source\.Source"),
-        ({"_target_": "e2rl.scenes.bundled.BundledSource", "split": "best"}, "split 'best'"),
-    ],
-)
-def test_configurations_that_name_nothing_say_so(tmp_path, change, message):
-    config = data_config(tmp_path, tmp_path / "cache")
-    with pytest.raises(InputError, match=message):
-        load_scenes(config | change)
-    with pytest.raises(InputError, match="num_scenes=0"):
-        load_scenes(data_config(tmp_path, tmp_path / "cache"), num_scenes=0)
-
-
-def test_a_cache_that_cannot_be_made_is_named(tmp_path):
-    folder = write_folder(tmp_path / "x", scenes_of(1))
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="data.cache=.*file.*cannot be made"):
-        load_scenes(data_config(folder, tmp_path / "file"))
-
-
-def test_scenes_with_unlike_maps_are_one_set(tmp_path):
-    scenes = [*scenes_of(1), description(lanes=fork() | {"more": lane([[0, 30], [90, 30]])})]
-    found = load_scenes(data_config(write_folder(tmp_path / "x", scenes), tmp_path / "cache"))
-    assert found.scenes["lane_width"].shape == (2, 5) and found.scene_id == ["scene-0", "fork"]
 
 
 @dataclass
@@ -305,41 +195,8 @@ def test_what_reading_a_log_raises_is_told_where_the_source_knows_what_to_do(tmp
         Mended(str(tmp_path), cache=str(tmp_path), workers=1).load()
 
 
-class Uncached(SpeedSource):
-    def fingerprint(self):
-        return None
-
-
-def test_a_source_without_fingerprint_leaves_no_file(tmp_path):
-    (tmp_path / "a.txt").write_text("5.0")
-    made = [
-        kind(str(tmp_path), cache=str(tmp_path / "cache"), workers=1).load(1)
-        for kind in (Uncached, Uncached, SpeedSource)
-    ]
-    assert made[0].hashes() == made[1].hashes() == made[2].hashes() and made[0].files == "" != made[2].files
-    assert len(list((tmp_path / "cache").iterdir())) == 1
-
-
 def test_split_chooses_only_where_a_source_has_splits(tmp_path):
     bundled = BundledSource(cache=str(tmp_path / "cache"), workers=1, build=BuildSettings(field_cells=32, steps=20))
     assert load_scenes(bundled, 1).split == "test" and load_scenes(bundled, 1, split="tune").split == "tune"
     folder = write_folder(tmp_path / "x", scenes_of(1))
     assert load_scenes(data_config(folder, tmp_path / "cache"), split="tune").split == "x"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("own", [False, True])
-def test_a_script_without_a_main_guard_works_or_is_told(tmp_path, own):
-    """Its workers import no script, unless the source is the script's own."""
-    folder = write_folder(tmp_path / "x", scenes_of(2))
-    source = "class Mine(ScenarioNetSource): pass" if own else "Mine = ScenarioNetSource"
-    (tmp_path / "script.py").write_text(
-        f"from e2rl.scenes.scenarionet import ScenarioNetSource\n{source}\n"
-        f"found = Mine({str(folder)!r}, cache={str(tmp_path / 'cache')!r}, workers=2).load()\n"
-        "print(found.scene_id)\n"
-    )
-    done = subprocess.run([sys.executable, str(tmp_path / "script.py")], capture_output=True, text=True, timeout=100)
-    if own:
-        assert done.returncode == 1 and "InputError: data.workers=2: a process" in done.stderr.splitlines()[-1]
-    else:
-        assert done.returncode == 0 and done.stdout == "['scene-0', 'scene-1']\n" and "Traceback" not in done.stderr

@@ -3,10 +3,6 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
-from torchrl.collectors import Collector
-from torchrl.envs import TransformedEnv
-from torchrl.envs.transforms import Transform
 from torchrl.envs.utils import check_env_specs
 
 from e2rl.run.errors import InputError
@@ -73,39 +69,12 @@ def test_seed_makes_batches_identical():
     def batch():
         torch.manual_seed(7)
         env = make_env(batch=4, num_scenes=6)
-        policy = TensorDictModule(lambda o: 3 * torch.randn(len(o), 2), ["observation"], ["action"])
-        collector = Collector(env, policy, frames_per_batch=80, total_frames=80, auto_register_policy_transforms=False)
         env.set_seed(3)
-        return next(iter(collector))
+        return env.rollout(20, lambda td: td.set("action", 3 * torch.randn(4, 2)), break_when_any_done=False)
 
     first, second = batch(), batch()
     assert (first["scene_index"] == second["scene_index"]).all()
     assert torch.equal(first["next", "observation"], second["next", "observation"])
-
-
-class Inject(Transform):
-    """A synthesizer in small: names the scene and its traffic before the environment resets."""
-
-    def _reset_env_preprocess(self, tensordict):
-        env = self.parent.base_env
-        batch = env.batch_size[0]
-        tensordict = TensorDict({}, env.batch_size) if tensordict is None else tensordict
-        tensordict["scene_index"] = torch.full((batch, 1), 2)
-        scene = env.scenes.batch([2] * batch)
-        states = scene["logged"] + torch.tensor([0.0, 50.0, 0.0, 0.0])
-        env.set_traffic(torch.arange(batch), states, scene["logged_valid"])
-        return tensordict
-
-
-def test_transform_injects_scene_and_traffic():
-    env = TransformedEnv(make_env(batch=3), Inject())
-    td = env.reset()
-    assert (td["scene_index"] == 2).all()
-    td = env.rand_step(td)["next"]
-    world = env.base_env.world()
-    vehicles = world.scene["route_log"].shape[1]
-    assert (world.states[:, 1:3, 1] >= 50).all()
-    assert torch.equal(world.states[:, vehicles:], world.scene["logged"][:, 1, vehicles:]), "VRUs replay the log"
 
 
 def test_traffic_of_wrong_shape_or_nan_is_refused():
@@ -242,7 +211,7 @@ WAYS = {  # what may end an episode on the way: 80 is no multiple of 3, contact 
 }
 
 
-@pytest.mark.parametrize("hold", [1, 2, 3])
+@pytest.mark.parametrize("hold", [2, 3])
 @pytest.mark.parametrize("way", WAYS)
 def test_a_held_action_is_that_action_at_every_step_until_the_episode_ends(way, hold):
     """Against an environment without holding: rewards add up, flags of any moment count, nobody runs on."""
@@ -268,16 +237,6 @@ def test_a_held_action_is_that_action_at_every_step_until_the_episode_ends(way, 
         last = found["done"][:, 0] if last is None else last | found["done"][:, 0]
         rewards.append(reward)
     assert last.all()
-
-
-def test_held_actions_keep_the_specs_and_the_resets():
-    env = DrivingEnv(make_scenes(5, num_vehicles=4), SimSettings(), 8, hold=3)
-    check_env_specs(env, seed=0)
-    torch.manual_seed(0)
-    data = env.rollout(80, break_when_any_done=False)
-    way, done = data["next", "timestep"] - data["timestep"], data["next", "done"]
-    assert (way[~done] == 3).all() and ((way >= 1) & (way <= 3)).all() and (way < 3).any()
-    assert data["next", "timestep"].max() <= 80 and (data["timestep"][:, 1:][done[:, :-1]] == 0).all()
 
 
 def test_what_a_reset_of_some_writes_is_what_a_reset_of_all_writes():

@@ -3,9 +3,6 @@
 import pytest
 import torch
 
-from e2rl.metrics.contact import KINDS, first_contact
-from e2rl.metrics.verdicts import at_fault
-from e2rl.scenes.recording import VEHICLE
 from e2rl.sim.neighbours import neighbours_of, own_fault, rotation_into
 from e2rl.sim.world import Agents
 
@@ -44,35 +41,3 @@ def test_own_fault_by_place_and_speed(place, speed, other_speed, expected):
 
 def test_no_other_agent_no_fault():
     assert judged(torch.tensor([[0.0, 0.0, 0.0, 5.0]]), torch.zeros(1, 0, 4)).tolist() == [False]
-
-
-def test_agrees_with_the_verdict_on_most_first_contacts():
-    """Against metrics/verdicts.py, which bisects the time of the contact: straight drives from all sides at 10 Hz."""
-    draw = torch.Generator().manual_seed(0)
-    count, steps = 400, 30
-    bearing = torch.rand(count, generator=draw) * 6.28
-    heading = bearing + 3.14 + (torch.rand(count, generator=draw) - 0.5) * 0.4
-    speed = torch.rand(count, 2, generator=draw) * 8 + 1
-    time = torch.arange(steps + 1) * 0.1
-    ego = torch.stack([speed[:, :1] * time, 0 * speed[:, :1] * time], -1)
-    meet = torch.stack([speed[:, 0] * 2, torch.zeros(count)], -1)
-    way = torch.stack([heading.cos(), heading.sin()], -1) * speed[:, 1:]
-    other = meet[:, None] + way[:, None] * (time[:, None] - 2)
-    states = torch.zeros(count, steps + 1, 2, 4)
-    states[..., 0, :2], states[..., 1, :2] = ego, other
-    states[..., 1, 2], states[..., 3] = heading[:, None], speed[:, None]
-    batch = {
-        "states": states,
-        "valid": torch.ones(count, steps + 1, 2, dtype=torch.bool),
-        "size": SIZE.expand(count, 2, 2),
-        "agent_type": torch.full((count, 2), VEHICLE),
-    }
-    batch |= first_contact(batch)
-    known = batch["hit"] & ~batch["start_overlap"]
-    at = states[torch.arange(count), batch["stop"]]
-    made = judged(at[:, 0], at[:, 1:])
-    assert known.sum() > 200 and {KINDS[k] for k in batch["kind"][known].tolist()} == set(KINDS)
-    share = {name: made[known & (batch["kind"] == k)].double().mean() for k, name in enumerate(KINDS)}
-    assert share["front"] > 0.9 and share["rear"] == 0
-    assert share["side"] < 0.4, "only near the corners"
-    assert (at_fault(batch) == 1)[known & ~made].double().mean() < 0.1, "what the verdict blames, the reward does too"

@@ -3,7 +3,7 @@
 import torch
 
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED
-from e2rl.sim.mission import light_state_at, limit_at, mission_of, ran_red, stop_ahead
+from e2rl.sim.mission import limit_at, mission_of, ran_red, stop_ahead
 from tests.synthetic import BACK, make_scenes
 
 
@@ -32,13 +32,6 @@ def test_red_binds_unless_halting_is_hopeless_yellow_where_it_is_comfortable():
     assert stop(colour=1, speed=30) == float("inf")
     assert stop(colour=3, speed=10) == float("inf") and stop(colour=0, speed=10) == float("inf")
     assert stop(colour=1, speed=1, light_x=-5.0) == float("inf"), "a line passed binds no longer"
-
-
-def test_scenes_without_lights():
-    scene = make_scenes(2).scenes
-    scene["light_state"] = scene["light_state"][..., :0]
-    now = light_state_at(scene["light_state"], mission_of(scene).light, torch.zeros(2, dtype=torch.long))
-    assert (now == 0).all()
 
 
 def test_a_line_is_run_at_the_step_at_which_the_front_passes_it_at_red():

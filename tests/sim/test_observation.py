@@ -5,7 +5,6 @@ import torch
 import e2rl
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED
 from e2rl.scenes.scene import SceneSet
-from e2rl.sim import observation as sight
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.mission import mission_of
 from e2rl.sim.observation import light_features, mirrored, observation_config
@@ -81,20 +80,6 @@ def test_beyond_the_recording_a_light_keeps_its_last_state_in_its_own_scene():
         for step in (last, last + 40)
     )
     assert torch.equal(beyond, at_the_end) and beyond[0, 0] == 1 and beyond[1, 2] == 1
-
-
-def test_a_glance_sees_what_events_and_reward_take_from_an_observation():
-    env = DrivingEnv(make_scenes(3, num_vehicles=9, limit=8.0), SimSettings(), 3)
-    env.reset()
-    world = env.world()
-    full, short = (
-        sense(env._config.observation, env._static, env._ego, world.others(), 80)
-        for sense in (sight.observe, sight.glance)
-    )
-    assert (
-        not short.features.numel() and torch.equal(full.beyond, short.beyond) and torch.equal(full.limit, short.limit)
-    )
-    assert torch.equal(full.neighbours.gap, short.neighbours.gap) and (full.limit == 8).all()
 
 
 def observations(scenes, actions):

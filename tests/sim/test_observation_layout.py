@@ -1,8 +1,6 @@
 """The names of the observation's numbers are those of what stands there, and the page about them says the same."""
 
 import math
-import re
-from pathlib import Path
 
 import pytest
 import torch
@@ -11,8 +9,6 @@ from e2rl.planners import reference
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.observation import ELAPSED, OBSERVATION_SIZE, observation_layout
 from tests.synthetic import LANE_WIDTH, make_scenes
-
-PAGE = Path(__file__).parents[2] / "docs" / "observation.md"
 
 
 @pytest.fixture(scope="module")
@@ -75,17 +71,3 @@ def test_manoeuvres(seen):
     """To brake hard keeps the distance, to accelerate on the lane does not."""
     assert seen["manoeuvre.+3.5.+0.gap"] < seen["manoeuvre.-7.+0.gap"]
     assert seen["manoeuvre.-7.+0.contact"] == pytest.approx(3.7), "none within 3.2 s"
-
-
-def test_the_page_has_the_blocks_where_they_are():
-    """Each line of its table: `first to last | name pattern | ..`."""
-    names = [entry.name for entry in observation_layout()]
-    covered = []
-    for first, last, pattern in re.findall(r"^\| (\d+)(?: to (\d+))? \| `([^`]+)` \|", PAGE.read_text(), re.MULTILINE):
-        rows = range(int(first), int(last or first) + 1)
-        covered += rows
-        matching = re.compile(
-            re.escape(pattern).replace("K", r"\d+").replace("X", r"[+-][\d.]+").replace("Y", r"[+-][\d.]+")
-        )
-        assert all(matching.match(names[row]) for row in rows), (pattern, names[rows[0]])
-    assert covered == list(range(OBSERVATION_SIZE))

@@ -6,7 +6,7 @@ import torch
 
 from e2rl.sim.dynamics import Arc, along_arc
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.sim.prospects import TIGHT, TIMES, Others, gaps, time_to_contact, travelled
+from e2rl.sim.prospects import TIMES, Others, gaps, time_to_contact, travelled
 from tests.synthetic import make_scenes
 
 CAR = (4.6, 2.0)
@@ -71,19 +71,6 @@ def test_who_turns_goes_on_turning():
     path, _ = along_arc(torch.tensor([*pose, speed]), arc, torch.tensor(TIMES[:4]))
     standing = [gaps(place, along, size, others((*state[:3], 0.0, 0.0)))[0, 0, 0] for state in path.tolist()]
     torch.testing.assert_close(found[:4], torch.stack(standing))
-
-
-def test_nobody_is_near_without_agents():
-    place, along = straight_on(5.0)
-    nothing, nobody = torch.zeros(1, 0), torch.zeros(1, 0, dtype=torch.bool)
-    nobody = Others(*(torch.zeros(1, 2, 0) for _ in range(3)), nothing, Arc(nothing, nothing), nobody)
-    assert gaps(place, along, torch.tensor([CAR]), nobody).isinf().all()
-
-
-def test_braking_ends_before_a_car_ahead_and_driving_on_does_not():
-    ahead, size = others((22.0, 0.0, 0.0, 0.0, 0.0)), torch.tensor([CAR])
-    braking, going_on = (gaps(*straight_on(10.0, accel), size, ahead).amin() for accel in (-7.0, 1.0))
-    assert braking > 5 and going_on < TIGHT
 
 
 @pytest.mark.parametrize(("gap", "expected"), [(8.0, 1.0), (22.0, 2.6), (80.0, TIMES[0] + TIMES[-1])])

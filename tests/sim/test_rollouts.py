@@ -136,24 +136,16 @@ def test_a_damaged_rollout_is_refused_by_name(tmp_path, rollouts, changes, kept)
     ("name", "value", "what"),
     [
         ("states", np.zeros((81, 48, 3), np.float32), "states has shape"),
-        ("valid", np.ones((80, 48), bool), "valid has shape"),
-        ("size", np.array(["a"]), "size has shape"),
-        ("seed", np.array([1, 2]), "seed is no single number"),
         ("eta", np.array(np.nan), "eta is out of range"),
-        ("eta", np.array(1e300), "out of range"),
-        ("dt", np.array(0.0), "out of range"),
         ("seed", np.array(1e300), "seed is no single number"),
         ("ego", np.array(48), "ego is out of range"),
         ("size", np.full((48, 2), 1e9, np.float32), "size is not between"),
         ("states", np.full((81, 48, 4), np.nan, np.float32), "a valid state is NaN"),
-        ("states", np.full((81, 48, 4), 1e6, np.float32), "a valid state of states is beyond"),
         ("logged", np.full((81, 48, 4), -1e6, np.float32), "a valid state of logged is beyond"),
         ("states", np.full((81, 48, 4), [0, 0, 1e4, 0], np.float32), "beyond 100000 m, 1000 rad"),
         ("lane_width", np.full(3, np.nan, np.float32), "as many lanes as borders"),
-        ("evasion", np.zeros((80, 4), np.float32), "evasion has shape"),
         ("plans", np.zeros((16, 1, 10, 2), np.float32), "some are missing"),
         ("agent_type", np.array(["horse"] * 48), "unknown type"),
-        ("lane_offsets", np.array([0, 9, 3]), "as many lanes as borders"),
         ("drivable_offsets", np.array([0, 10**12]), "do not divide"),
     ],
 )
@@ -179,13 +171,3 @@ def test_an_archive_that_claims_more_than_it_may_is_not_unpacked(tmp_path):
         archive.writestr("states.npy", claim.getvalue())
     with pytest.raises(InputError, match=r"claim\.npz: no readable rollout"):
         Rollout.read(tmp_path / "claim.npz")
-
-
-def test_bad_rollout_files_are_named(tmp_path, rollouts):
-    broken, foreign = tmp_path / "broken.npz", tmp_path / "foreign.npz"
-    whole = rollouts[:1].to_npz(tmp_path / "good")[0].read_bytes()
-    broken.write_bytes(whole[: len(whole) // 2])
-    np.savez(foreign, format=np.array("other/1"))
-    for path in (broken, foreign, tmp_path / "absent.npz"):
-        with pytest.raises(InputError, match=path.name):
-            Rollout.read(path)

@@ -6,7 +6,7 @@ from e2rl.scenes.boxes import separation, to_frame
 from e2rl.scenes.route import SPACING, interpolate, project
 from e2rl.sim.mission import Mission, limit_at, mission_of
 from e2rl.sim.neighbours import neighbours_of, rotation_into
-from e2rl.sim.static import follow, look_along, static_scene, write_rows
+from e2rl.sim.static import follow, look_along, static_scene
 from e2rl.sim.world import Agents
 from tests.synthetic import make_scenes
 
@@ -57,15 +57,3 @@ def test_others_are_seen_in_the_ego_frame_with_their_gap():
     assert torch.allclose(seen.direction, torch.stack([turned.cos(), turned.sin()], 1), atol=1e-5)
     size = scene["size"]
     assert torch.allclose(seen.gap, separation(ego[:, None], size[:, :1], others, size[:, 1:]), atol=1e-5)
-
-
-def test_rows_that_begin_anew_are_those_of_their_scene():
-    scene = make_scenes(4, num_vehicles=3, red_light_x=50.0).scenes
-    other = make_scenes(2, num_vehicles=7, limit=7.0, red_light_x=70.0).scenes
-    static, rows = static_scene(scene, mission_of(scene)), torch.tensor([2, 0])
-    fresh = static_scene(other, mission_of(other))
-    scene[rows] = other  # as the environment does: the rest of a StaticScene is the scenes' own storage
-    write_rows(static, rows, fresh)
-    expected = static_scene(scene, mission_of(scene))
-    for found, value in zip((*static.mission, *static[1:]), (*expected.mission, *expected[1:]), strict=True):
-        assert torch.equal(found, value)

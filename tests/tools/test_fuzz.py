@@ -69,8 +69,3 @@ def test_what_no_reader_may_return_is_known():
     for bad in ({"a": object()}, [len], np.array([len], object), np.zeros(1000)):
         with pytest.raises(Garbage):
             require_plain(bad, 1 << 10)
-
-
-def test_a_table_counts_readers_and_all():
-    counts = Counter({("a", "read"): 2, ("a", "crash"): 1, ("b", "refused"): 3})
-    assert fuzz.table(counts)[-1] == "| all | 6 | 3 | 2 | 0 | 0 | 0 | 1 | 0 | 0 |"

@@ -12,7 +12,7 @@ pytest.importorskip("packaging")
 from packaging.requirements import Requirement  # noqa: E402
 from packaging.utils import canonicalize_name  # noqa: E402
 
-from tools.licences import closure, licence_of, main  # noqa: E402
+from tools.licences import licence_of  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
 
@@ -46,22 +46,10 @@ class Package:
     ("fields", "licence"),
     [
         ({"License_Expression": "MIT", "License": "other"}, "MIT"),
-        ({"License": "BSD"}, "BSD"),
-        ({"License": "UNKNOWN", "Classifier": ["License :: OSI Approved :: MIT License"]}, "MIT License"),
         ({"License": "Copyright 2020\n" + 80 * "x", "Classifier": ["License :: OSI Approved :: ISC", "X"]}, "ISC"),
-        ({"License": "Apache 2\n" + 80 * "x"}, "Apache 2"),
         ({"License_File": ["LICENSE"]}, "MIT License"),
         ({}, "not named"),
     ],
 )
 def test_a_licence_is_the_shortest_that_the_metadata_says(fields, licence):
     assert licence_of(Package(**fields)) == licence
-
-
-@pytest.mark.slow
-def test_what_dependencies_need_is_in_the_list(capsys):
-    core, missing = closure()
-    assert {"torch", "sympy", "omegaconf"} <= set(core) and not missing, "sympy is torch's, omegaconf Hydra's"
-    assert "optuna" not in core and "optuna" in {*closure("tune")[0], *closure("tune")[1]}
-    main()
-    assert capsys.readouterr().out.startswith("# Licences")

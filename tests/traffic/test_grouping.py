@@ -45,11 +45,6 @@ def test_every_scene_is_in_one_group_that_holds_its_vehicles_and_wastes_less_tha
         assert min(here) > SHRUNK * group.vehicles or rows < 2 * ROWS[0]
 
 
-def test_small_batches_are_one_group():
-    (group,) = group_scenes(sized([1, 12, 3]))
-    assert group.rows.tolist() == [1, 2, 0] and group.vehicles == 12 and group.others == 0
-
-
 def leaves(value):
     return [leaf for f in fields(value) for leaf in leaves(getattr(value, f.name))] if is_dataclass(value) else [value]
 
@@ -97,12 +92,3 @@ def test_rows_are_taken_and_put_in_nested_states_without_touching_the_original()
     assert part.v.tolist() == [18.0, 16.0]
     back = put_rows(state, rows, part.map(lambda value: value + 100))
     assert back.v.tolist() == [116.0, 17.0, 118.0, 19.0] and state.v.tolist() == [16.0, 17.0, 18.0, 19.0]
-
-
-def test_states_may_be_worlds_tensors_tensordicts_or_nothing():
-    world, row = World.at_start(scenes(2).scenes), torch.tensor([1])
-    one = take_rows(world, row)
-    assert len(one.scene) == 1 and one.plan is None
-    assert put_rows(world.step, row, torch.tensor([7])).tolist() == [0, 7] and world.step.tolist() == [0, 0]
-    assert (put_rows(world.scene, row, world.scene[:1])["scene_index"] == 0).all()
-    assert take_rows(None, row) is None and put_rows(None, row, None) is None

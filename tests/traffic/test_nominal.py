@@ -8,7 +8,6 @@ import torch
 from e2rl.planners.ego import Ego, track
 from e2rl.prior.lane_relative import HORIZON, SIZE
 from e2rl.prior.sde import SamplerSettings
-from e2rl.run.errors import InputError
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 from e2rl.traffic.grouping import noise_of
@@ -101,13 +100,10 @@ def driven(ego, eta=2.0, **settings):
 
 
 @pytest.mark.parametrize("eta", [0.0, 2.0])
-def test_nonsense_in_the_announced_plan_changes_nothing(eta):
-    assert torch.equal(*(driven(ego(1), eta) for ego in (Honest, Liar)))
-
-
-@pytest.mark.parametrize("eta", [0.0, 2.0])
-def test_who_is_told_the_plan_believes_it(eta):
-    assert not torch.equal(*(driven(ego(1), eta, knowledge="plan") for ego in (Honest, Liar)))
+@pytest.mark.parametrize("knowledge", KNOWLEDGE)
+def test_nonsense_in_the_announced_plan_is_believed_only_by_whoever_is_told_the_plan(eta, knowledge):
+    honest, lied = (driven(ego(1), eta, knowledge=knowledge) for ego in (Honest, Liar))
+    assert torch.equal(honest, lied) == (knowledge == "predicted")
 
 
 def test_the_prediction_begins_at_the_ego():
@@ -118,8 +114,3 @@ def test_the_prediction_begins_at_the_ego():
     first = world.states[:, 0, 3] * DT
     way = (found[:, 0, :2] - world.states[:, 0, :2]).norm(dim=-1)
     torch.testing.assert_close(way, first, rtol=0.1, atol=0.05)
-
-
-def test_a_choice_that_is_none_is_refused():
-    with pytest.raises(InputError, match="synthesizer.knowledge=all"):
-        nominal("all")

@@ -59,20 +59,6 @@ def test_weights_multiply_within_a_kind_and_leave_the_share():
     assert probability[pool.fresh & pool.adversarial].sum().item() == pytest.approx(0.8 * 3 / 4)
 
 
-def test_rows_with_an_intensity_are_adversarial():
-    pool = stored() + recorded() + live(1.0) + live(0.0) + stored(0.0)
-    assert pool.adversarial.tolist() == [True] * 3 + [False] * 3 + [True] * 3 + [False] * 6
-
-
-def test_probabilities_split_by_share_then_by_priority():
-    priority = torch.tensor([0.5, 0.25, 0.25, 0.0])
-    for attack in (stored(), live()):
-        probability = (attack + recorded()).probabilities(priority, 0.8)
-        assert probability[:3].tolist() == pytest.approx([0.2, 0.4, 0.2])
-        assert probability[3:].tolist() == pytest.approx([0.05, 0.1, 0.05])
-        assert attack.probabilities(priority, 0.0).sum().item() == pytest.approx(1.0), "the only kind takes all"
-
-
 @pytest.mark.parametrize("missing", ["scene_index", "states", "valid", "adversaries"])
 def test_traffic_that_lacks_something_is_refused(missing):
     traffic = brake_check(small_scenes())(None, INDEX, 2.0, 0)

@@ -34,18 +34,13 @@ def test_the_method_of_a_few_lines_in_the_documentation_drives_everybody_as_it_s
     assert out.valid[:, :, there].all() and not out.adversaries.any() and (out.transport_others == 0).all()
 
 
-def test_rollouts_repeat_and_seeds_matter():
-    scene_set = scenes()
-    first, again = (drive(scene_set, synthesizer(), 1.0) for _ in range(2))
-    other = drive(scene_set, synthesizer(), 1.0, seeds=[10, 11, 12])
-    assert torch.equal(first.states, again.states) and torch.equal(first.valid, again.valid)
-    assert not torch.equal(first.states[:, :, 1:5], other.states[:, :, 1:5])
-
-
-def test_zero_intensity_is_the_nominal_rollout_and_more_of_it_is_not():
+def test_zero_intensity_is_the_nominal_rollout_more_of_it_is_not_and_seeds_decide():
     scene_set, on = scenes(), synthesizer()
     nominal, zero = drive(scene_set, NominalTraffic(on.prior), 0.0), drive(scene_set, on, 0.0)
-    pushed = drive(scene_set, on, 2.0)
+    pushed, again = drive(scene_set, on, 2.0), drive(scene_set, synthesizer(), 2.0)
+    other = drive(scene_set, on, 2.0, seeds=[10, 11, 12])
+    assert torch.equal(pushed.states, again.states)
+    assert not torch.equal(pushed.states[:, :, 1:5], other.states[:, :, 1:5])
     assert torch.equal(nominal.states, zero.states) and not zero.adversaries.any()
     assert (pushed.adversaries.any(1)).all() and not pushed.adversaries[:, 0].any()
     assert (zero.transport_adversary == 0).all() and (pushed.transport_adversary > 0).all()

@@ -37,11 +37,6 @@ def test_whoever_aims_is_an_adversary_and_aims_at_the_ego_or_at_another_one():
         assert target != vehicle and (target == 0 or aims[scene, replan, target])
 
 
-def test_traffic_without_adversaries_aims_at_nobody():
-    out = drive(scenes(), NominalTraffic(synthesizer().prior), 0.0)
-    assert (out.targets == -1).all() and out.plans.isfinite().all()
-
-
 REPLANS, STEPS = 4, 4  # of two seconds; of the small prior
 
 

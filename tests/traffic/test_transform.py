@@ -6,15 +6,13 @@ from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from e2rl.learning.policy import RowDraw
-from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import EgoPolicy
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import Traffic, TrafficPlan, keep_velocity
 from e2rl.traffic.transform import AdversarialSynthesizer
-from tests.learning.small import brake_check, small_scenes
+from tests.learning.small import brake_check
 from tests.traffic.e2.traffic_scenes import EGO, ROWS, scenes, synthesizer
 
 ON = SimSettings(end_on_contact=False, end_off_road=False)
@@ -113,22 +111,6 @@ def test_live_traffic_is_the_plan_and_is_replanned_every_half_second_before_the_
         torch.testing.assert_close(tensordict["agents", "states"][:, 1:ROWS], keep_velocity(expected)[:, :, 0])
 
 
-def test_with_held_actions_a_replan_comes_at_the_first_decision_at_which_it_is_due():
-    """Decisions of 2 steps: replans at 0, 6, 12, ... and in between everybody drives the plan that was written."""
-    on = March()
-    base = DrivingEnv(scenes(3, 20), ON, 3, agents=True, hold=2)
-    env = TransformedEnv(base, AdversarialSynthesizer(live(), in_turn(live()), on))
-    policy, tensordict = EgoPolicy(IDMEgo(), env), env.reset()
-    for decision in range(10):
-        tensordict = env.step(policy(tensordict))["next"]
-        assert [steps for steps, _ in on.calls] == [[6 * k] * 3 for k in range(1 + decision // 3)]
-        speed = torch.arange(3.0)[:, None] + (decision // 3) / 10
-        torch.testing.assert_close(tensordict["agents", "states"][:, 1:ROWS, 3], speed.expand(3, ROWS - 1))
-        left = tensordict["traffic", "plan"][:, 1:, 0, :2] - tensordict["agents", "states"][:, 1:ROWS, :2]
-        torch.testing.assert_close(left.norm(dim=-1), (0.1 * speed).expand(3, ROWS - 1), rtol=0, atol=1e-3)
-    assert tensordict["timestep"].eq(20).all() and tensordict["done"].all()
-
-
 class Watching(IDMEgo):
     """An ego that notes the plans of the others that it sees."""
 
@@ -139,17 +121,6 @@ class Watching(IDMEgo):
     def plan(self, world):
         self.seen.append(world.plan)
         return super().plan(world)
-
-
-def test_walkers_replay_their_log_and_the_ego_sees_what_the_others_plan():
-    ego, env = Watching(), environment(live(), March())
-    tracks = env.rollout(8, EgoPolicy(ego, env))["next", "agents", "states"]
-    torch.testing.assert_close(tracks[:, 6, ROWS:], env.base_env.scene["logged"][:, 7, ROWS:])
-    for step in (1, 4, 6):
-        assert ego.seen[step].shape == (3, ROWS, 50, 4)
-        torch.testing.assert_close(ego.seen[step][:, 1:, 0], tracks[:, step, 1:ROWS])
-    torch.testing.assert_close(ego.seen[1][:, 1:, 3], tracks[:, 4, 1:ROWS])
-    assert torch.equal(ego.seen[5][:, 1:, :44], ego.seen[4][:, 1:, 1:45]), "until it is replanned, the old plan holds"
 
 
 def test_a_partial_reset_begins_those_rows_anew_and_leaves_the_others():
@@ -164,13 +135,6 @@ def test_a_partial_reset_begins_those_rows_anew_and_leaves_the_others():
     assert [steps for steps, _ in on.calls] == [[0, 0, 0], [5, 5, 5], [0], [10, 10]]
     speed = tensordict["agents", "states"][:, 1, 3]
     torch.testing.assert_close(speed, torch.tensor([0.2, 3.0, 2.2]))  # by seed, and replans of its own
-
-
-def test_ended_episodes_are_followed_by_the_next_rows():
-    env = environment(live(), synthesizer(), steps=10)
-    out = env.rollout(25, EgoPolicy(IDMEgo(), env), break_when_any_done=False)
-    assert out["next", "done"][:, :, 0].sum(1).tolist() == [2, 2, 2]
-    assert out["traffic", "row"][:, ::10, 0].tolist() == [[0, 3, 6], [1, 4, 7], [2, 5, 8]]
 
 
 def test_a_method_that_asks_the_ego_can_where_there_is_one():
@@ -192,55 +156,12 @@ def test_a_method_that_asks_the_ego_can_where_there_is_one():
 # --- stored and recorded rows
 
 
-def test_specs_and_memory_know_no_plan_without_a_method():
-    env = environment(replayed(scenes(3)))
-    assert set(env.reset()["traffic"].keys()) == {"row"}
-
-
-def small_environment(batch=16, num_scenes=4, probability=None, **scene):
-    scene_set = small_scenes(num_scenes, **scene)
-    pool = replayed(scene_set)
-    draw = RowDraw(torch.full((len(pool),), 1 / len(pool)) if probability is None else probability(pool))
-    env = TransformedEnv(DrivingEnv(scene_set, SimSettings(), batch), AdversarialSynthesizer(pool, draw))
-    return env, pool, scene_set, draw
-
-
 def collect(env, policy, steps):
-    torch.manual_seed(0)
-    batch = env.batch_size[0]
-    collector = Collector(
-        env,
-        policy,
-        frames_per_batch=batch * steps,
-        total_frames=-1,
-        trust_policy=True,
-        track_traj_ids=False,
-        auto_register_policy_transforms=False,
-    )
+    options = {"trust_policy": True, "track_traj_ids": False, "auto_register_policy_transforms": False}
+    collector = Collector(env, policy, frames_per_batch=env.batch_size[0] * steps, total_frames=-1, **options)
     data = next(iter(collector)).clone()
     collector.shutdown()
     return data
-
-
-def test_trajectories_never_mix_scenes_or_traffic():
-    env, pool, _, _ = small_environment()
-    data = collect(env, ActorEgo(hidden=(8,), initial_std=(0.9, 0.5)).network.actor, 60)
-    for key in ("scene_index", ("traffic", "row")):
-        assert torch.equal(data["next"][key], data[key])
-        changed = (data[key][:, 1:] != data[key][:, :-1]) & ~data["next", "done"][:, :-1]
-        assert not changed.any()
-    row = data["traffic", "row"]
-    assert torch.equal(pool.scene_index[row], data["scene_index"])
-    assert torch.equal(data["next", "timestep"], data["timestep"] + 1)
-    assert len(row.unique()) == len(pool) and data["next", "done"].sum() > 16
-
-
-def test_draws_follow_the_priorities():
-    priority = torch.tensor([0.1, 0.2, 0.3, 0.4])
-    env, pool, _, draw = small_environment(64, steps=1, probability=lambda pool: pool.probabilities(priority, 0.75))
-    rows = torch.cat([env.reset()["traffic", "row"][:, 0] for _ in range(60)])
-    share = torch.bincount(rows, minlength=8) / len(rows)
-    assert torch.allclose(share.double(), draw.probability, atol=0.03)
 
 
 # --- all kinds of rows at once
@@ -259,15 +180,6 @@ def test_live_stored_and_recorded_rows_run_side_by_side():
         assert torch.equal(states[3:6], pool.parts[0].states[:, step, 1:ROWS])
         assert torch.equal(states[6:], scene_set.scenes["logged"][:, step, 1:ROWS])
     assert [steps for steps, _ in on.calls] == [[0] * 3, [5] * 3, [10] * 3], "only live rows are replanned"
-
-
-def test_a_live_row_drives_alike_beside_rows_of_other_kinds():
-    scene_set, tracks = scenes(3), []
-    for pool in (live(1.0, 3), mixed(scene_set)):
-        env = environment(pool, synthesizer(), batch=len(pool), scene_set=scene_set)
-        tensordict = advance(env, EgoPolicy(IDMEgo(), env), env.reset(), 12)
-        tracks.append(tensordict["agents", "states"][:3])
-    torch.testing.assert_close(*tracks, rtol=0, atol=2e-2)
 
 
 def test_vehicles_of_replayed_rows_are_expected_to_keep_their_velocity():

@@ -14,35 +14,11 @@ from e2rl.scenes.recording import DT, LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIG
 from scenegen.layout import Layout
 from scenegen.traffic import write_demand
 
-NETCONVERT = {
-    "no-turnarounds": "true",
-    "junctions.internal-link-detail": "15",
-    "junctions.limit-turn-speed": "2.0",
-    "default.junctions.radius": "6",
-    "junctions.corner-detail": "8",
-    "rectangular-lane-cut": "false",
-    "junctions.scurve-stretch": "1.0",
-    "tls.default-type": "actuated",
-    "tls.left-green.time": "8",
-    "offset.disable-normalization": "true",
-    "no-warnings": "true",
-}
-SUMO = [
-    "--step-length",
-    str(DT),
-    "--lateral-resolution",
-    "0.3",
-    "--time-to-teleport",
-    "-1",
-    "--collision.action",
-    "warn",
-    "--collision.check-junctions",
-    "true",
-    "--no-warnings",
-    "true",
-    "--no-step-log",
-    "true",
-]
+NETCONVERT = """--no-turnarounds true --junctions.internal-link-detail 15 --junctions.limit-turn-speed 2.0
+--default.junctions.radius 6 --junctions.corner-detail 8 --rectangular-lane-cut false --junctions.scurve-stretch 1.0
+--tls.default-type actuated --tls.left-green.time 8 --offset.disable-normalization true --no-warnings true"""
+SUMO = f"""--step-length {DT} --lateral-resolution 0.3 --time-to-teleport -1 --collision.action warn
+--collision.check-junctions true --no-warnings true --no-step-log true"""
 WARM_UP, RECORDED, LEAD = 60.0, 100.0, 8.0  # s; tracks begin LEAD s before the recorded time, for the smoothers
 STATES = {"r": LIGHT_RED, "u": LIGHT_RED, "y": LIGHT_YELLOW, "Y": LIGHT_YELLOW, "g": LIGHT_GREEN, "G": LIGHT_GREEN}
 SHORTEST = 1.0  # m: shorter lanes are bridged by their neighbours
@@ -72,11 +48,9 @@ class Track:
 def convert(layout: Layout, folder: Path) -> tuple[Path, Net]:
     """Build the net with netconvert and read it back."""
     path = folder / f"{layout.name}.net.xml"
-    options = [part for key, value in NETCONVERT.items() for part in (f"--{key}", value)]
     program = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
-    done = subprocess.run(
-        [program, *layout.write(folder), "--output-file", path, *options], capture_output=True, text=True
-    )
+    command = [program, *layout.write(folder), "--output-file", path, *NETCONVERT.split()]
+    done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"netconvert failed on {layout.name}: {done.stderr}")
     return path, read_net(ET.parse(path).getroot(), layout)
@@ -154,7 +128,7 @@ def bridge_short_lanes(lanes: dict[str, Lane]) -> None:
 def run(layout: Layout, path: Path, net: Net, folder: Path, seed: int, rng) -> tuple[list[Track], dict]:
     """Simulate; returns the tracks and the light states (lane id -> [RECORDED / DT]) of the controlled lanes."""
     demand = write_demand(layout, folder, WARM_UP + RECORDED, rng)
-    libsumo.start(["sumo", "-n", str(path), "-r", str(demand), "--seed", str(seed), *SUMO])
+    libsumo.start(["sumo", "-n", str(path), "-r", str(demand), "--seed", str(seed), *SUMO.split()])
     try:
         return _trace(net)
     finally:

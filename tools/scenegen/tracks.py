@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from e2rl.scenes.paths import WHEELBASE, arc_length, shift_left, tractrix, whittaker
+from e2rl.scenes.paths import WHEELBASE, arc_length, shift_left
 from e2rl.scenes.recording import DT
+from scenegen.bodies import tractrix, whittaker
 from scenegen.interaction import overlap
 from scenegen.simulate import Net, Track
 

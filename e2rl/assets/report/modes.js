@@ -1,10 +1,10 @@
-// The failure modes: each with its share, how many of it count, and a picture of its typical case at the contact.
+// The failure modes: each with its fraction, how many of it count, and a picture of its typical case at the contact.
 
 const OTHER = 0;
 
 /**
- * Modes of some failures: {mode, name, failures, typical, counted}, those with the most failures that count first, the
- * small groups last. A mode whose failures nobody holds against the ego says little about it.
+ * Modes of some failures: {mode, name, failures, typical, counted}, those with the most failures that count first, then
+ * the small groups if any of theirs counts. A mode whose failures nobody holds against the ego says little about it.
  */
 function groupByMode(failures, names) {
   const members = new Map();
@@ -21,6 +21,7 @@ function groupByMode(failures, names) {
   }));
   return modes.sort(
     (first, second) =>
+      !first.counted - !second.counted ||
       (first.mode === OTHER) - (second.mode === OTHER) ||
       second.counted - first.counted ||
       second.failures.length - first.failures.length,
@@ -37,7 +38,7 @@ const typicalOf = (failures) =>
 
 /** The list of modes; `choose` is called with a mode. */
 function showModes(container, modes, total, store, choose) {
-  const first = modes.findIndex(({ mode, counted }) => mode !== OTHER && !counted);
+  const first = modes.findIndex(({ counted }) => !counted);
   container.replaceChildren(
     ...modes.flatMap((mode, index) => {
       const picture = element("canvas", { "aria-hidden": "true" });
@@ -58,12 +59,12 @@ function showModes(container, modes, total, store, choose) {
 
 function modeText({ name, failures, counted }, total) {
   const [what, duty] = name.split(": ");
-  const share = failures.length / total;
+  const fraction = failures.length / total;
   const bars = [
     element("i", { class: "counts", style: `width: ${(100 * counted) / total}%` }),
     element("i", { style: `width: ${(100 * (failures.length - counted)) / total}%` }),
   ];
-  const facts = [`${percent(share)}, ${failures.length} failure${failures.length === 1 ? "" : "s"}`];
+  const facts = [`${percent(fraction)}, ${failures.length} failure${failures.length === 1 ? "" : "s"}`];
   if (meanOf(failures, "counted") !== null) facts.push(counted ? `${counted} count` : "none counts");
   return element(
     "span",
@@ -93,5 +94,5 @@ function meanOf(failures, column) {
   return known.length ? known.reduce((sum, value) => sum + value, 0) / known.length : null;
 }
 
-const percent = (share) => `${Math.round(100 * share)}%`;
+const percent = (fraction) => `${Math.round(100 * fraction)}%`;
 const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);

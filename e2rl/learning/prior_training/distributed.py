@@ -10,8 +10,7 @@ from typing import TypeVar
 
 import torch
 import torch.distributed as dist
-from torch import Tensor, nn
-from torch.nn.parallel import DistributedDataParallel
+from torch import Tensor
 
 from e2rl.run.errors import InputError
 
@@ -69,12 +68,6 @@ class Processes:
         own: list[Value] = []
         self.from_leader(lambda: own.append(work()))
         return own[0] if self.leader else work()
-
-    def averaging(self, module: nn.Module) -> nn.Module:
-        """The module with the leader's parameters, whose gradients are averaged over the processes in `backward`."""
-        if self.count == 1:
-            return module
-        return DistributedDataParallel(module, broadcast_buffers=False)
 
 
 ALONE = Processes()

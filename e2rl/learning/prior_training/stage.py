@@ -1,16 +1,12 @@
 """`python train.py stage=prior`: train a prior on the user's data and measure its closed loop on held-out logs."""
 
 import hashlib
-from copy import deepcopy
 from pathlib import Path
-from typing import Any
-
-from omegaconf import DictConfig
 
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.prior_training.distributed import process_group
-from e2rl.learning.prior_training.training import ClosedLoop, TrainingSettings, held_out, train_prior
+from e2rl.learning.prior_training.training import TrainingSettings, held_out, train_prior
 from e2rl.learning.supervised import stage_settings
 from e2rl.planners.log_replay import ReplayEgo
 from e2rl.prior.bounds import BoundSettings
@@ -26,8 +22,6 @@ from e2rl.scenes.source import load_scenes
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.nominal import NominalTraffic
 
-FIGURES = ("real", "aor_step", "cfr_bg")  # metrics of the closed loop at a validation
-
 
 def run_prior_stage(run: Run, logger: RunLogger) -> tuple[Path, list[dict]] | None:
     """Train a prior; returns its checkpoint's path and the metrics rows of the nominal closed loop on held-out scenes,
@@ -36,7 +30,12 @@ def run_prior_stage(run: Run, logger: RunLogger) -> tuple[Path, list[dict]] | No
     settings = stage_settings(config, TrainingSettings)
     with process_group(config.device) as (processes, device):
         folder = processes.from_leader(lambda: run.folder)
-        prior = _untrained(config).to(device)
+        own = config.prior
+        prior = Prior(  # whose first weights follow the run's seed
+            settings_of(DenoiserSettings, own.network, "prior.network"),
+            settings_of(SamplerSettings, own.sampler, "prior.sampler"),
+            settings_of(BoundSettings, own.bounds, "prior.bounds"),
+        ).to(device)
         scenes = processes.leader_first(
             lambda: load_scenes(config.data, config.num_scenes, "train", list(settings.starts), config.scenes)
         )
@@ -49,43 +48,13 @@ def run_prior_stage(run: Run, logger: RunLogger) -> tuple[Path, list[dict]] | No
             **origin_of(folder),
             "settings": vars(settings),
         }
-        how = (processes, logger, Parts(folder, "training", data))
-        path = train_prior(prior, scenes, settings, folder, origin, _closed_loop(scenes, settings, device), *how)
+        parts = Parts(folder, "training", data)
+        path = train_prior(prior, scenes, settings, folder, origin, processes, logger, parts)
         if path is None:
             return None
         fields = {"stage": "prior", "parts": Parts(folder, "prior", path.name), **origin_of(folder)}
-        return path, _nominal(prior, _first_starts(scenes), device, folder, **fields)
-
-
-def _untrained(config: DictConfig) -> Prior:
-    """An untrained prior; its first weights follow the run's seed."""
-    return Prior(
-        settings_of(DenoiserSettings, config.prior.network, "prior.network"),
-        settings_of(SamplerSettings, config.prior.sampler, "prior.sampler"),
-        settings_of(BoundSettings, config.prior.bounds, "prior.bounds"),
-    )
-
-
-def _nominal(prior: Prior, scenes: SceneSet, device: str, folder: Path | None, **fields: Any) -> list[dict]:
-    """Metrics rows of the uncontrolled prior as traffic around the replayed ego."""
-    setup = Setup(scenes, ReplayEgo(), "replay", SimSettings(), device=device)
-    return run_protocol(setup, [Method("nominal", NominalTraffic(prior))], [0], folder, **fields)
-
-
-def _closed_loop(scenes: SceneSet, settings: TrainingSettings, device: str) -> ClosedLoop:
-    """FIGURES of a prior on at most `closed_loop_scenes` held-out scenes, evenly spaced over the places.
-
-    Scenes and noise are fixed, so validations differ only by the weights.
-    """
-    first = _first_starts(scenes)
-    count = min(settings.closed_loop_scenes, len(first))
-    some = _chosen(first, [k * len(first) // count for k in range(count)])
-
-    def closed_loop(prior: Prior) -> dict[str, float]:
-        metrics = _nominal(deepcopy(prior), some, device, None)[0]["metrics"]  # a synthesizer freezes its prior
-        return {name: round(metrics[name]["mean"], 4) for name in FIGURES}
-
-    return closed_loop
+        setup = Setup(_first_starts(scenes), ReplayEgo(), "replay", SimSettings(), device=device)
+        return path, run_protocol(setup, [Method("nominal", NominalTraffic(prior))], [0], folder, **fields)
 
 
 def _first_starts(scenes: SceneSet) -> SceneSet:
@@ -94,11 +63,7 @@ def _first_starts(scenes: SceneSet) -> SceneSet:
     for index in held_out(scenes).nonzero()[:, 0].tolist():
         log, _, start = scenes.scene_id[index].rpartition("@")
         first[log] = min(first.get(log, (int(start), index)), (int(start), index))
-    return _chosen(scenes, [index for _, index in first.values()])
-
-
-def _chosen(scenes: SceneSet, keep: list[int]) -> SceneSet:
-    """The scenes with indices `keep`."""
+    keep = [index for _, index in first.values()]
     names, places = ([values[i] for i in keep] for values in (scenes.scene_id, scenes.location))
     return SceneSet(scenes.batch(keep), names, places, scenes.dataset, f"{scenes.split}-held-out", {})
 

@@ -3,7 +3,7 @@
 import math
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,8 @@ from pathlib import Path
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel
 from tqdm import tqdm
 
@@ -44,8 +45,6 @@ EMA = 0.998  # decay of the weights' moving average at most; (1 + step) / (10 + 
 CAUSAL = 0.4  # fraction of windows whose start states are a causal observer's estimates
 RANK_SEED = 1_000_003  # difference of the generator seeds of consecutive ranks
 
-ClosedLoop = Callable[[Prior], dict[str, float]]  # metrics of a prior that drives held-out scenes
-
 
 @configured("stage/prior")
 @dataclass(frozen=True)
@@ -60,8 +59,6 @@ class TrainingSettings:
     compile: bool = setting()
     route_steps: int = setting(low=0)
     validate_every: int = setting(low=1)
-    closed_loop_every: int = setting(low=0)
-    closed_loop_scenes: int = setting(low=1)
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -81,8 +78,8 @@ class PriorTraining(Supervised):
     Each process draws its part of a step's windows and noise, and gradients are averaged. Hence weights and moving
     averages are equal in all processes, and a run is determined by its seed and the number of processes.
 
-    Only the held-out loss selects: thousands of windows at fixed noise make it precise. Closed-loop metrics on a few
-    scenes are only reported: their noise exceeds the differences between turns (conf/stage/prior.yaml).
+    The held-out loss selects: thousands of windows at fixed noise make it precise. Closed-loop metrics on a few scenes
+    would not: their noise exceeds the differences between turns.
     """
 
     def __init__(
@@ -92,7 +89,6 @@ class PriorTraining(Supervised):
         test: TensorDictBase,
         settings: TrainingSettings,
         processes: Processes = ALONE,
-        closed_loop: ClosedLoop | None = None,
     ):
         """windows, test: to train on and held out. Raises InputError if the processes cannot share a batch evenly."""
         super().__init__()
@@ -100,7 +96,7 @@ class PriorTraining(Supervised):
             text = f"stage.batch={settings.batch}: {processes.count} processes share the windows of a step"
             raise InputError(f"{text} evenly; choose a multiple of their number")
         self.prior, self.windows, self.test, self.settings = prior, windows, test, settings
-        self.processes, self.closed_loop, self.writes = processes, closed_loop, processes.leader
+        self.processes, self.writes = processes, processes.leader
         self.done, self.part = 0, settings.batch // processes.count
         self.routes: TensorDictBase | None = None  # scenes that the first turn trains the route choice on
         self.accuracy = math.nan  # of the route choice
@@ -112,7 +108,9 @@ class PriorTraining(Supervised):
         prior.denoiser.node_mean.copy_(nodes.mean(0))
         prior.denoiser.node_std.copy_(torch.where(std < 1e-6, CONSTANT_STD, std.clamp(min=MIN_STD)))
         self.rows = [rows for rows in (causal.nonzero()[:, 0], (~causal).nonzero()[:, 0]) if len(rows)]
-        loss = processes.averaging(DenoisingLoss(prior.denoiser))
+        loss: nn.Module = DenoisingLoss(prior.denoiser)
+        if processes.count > 1:  # the leader's first weights, and gradients averaged in `backward`
+            loss = DistributedDataParallel(loss, broadcast_buffers=False)
         self.loss = torch.compile(loss) if settings.compile else loss
         self.optimiser = torch.optim.AdamW(
             prior.denoiser.parameters(), settings.learning_rate, weight_decay=WEIGHT_DECAY, fused=True
@@ -130,8 +128,11 @@ class PriorTraining(Supervised):
         if self.routes is not None and not self.done:
             self.accuracy = train_route_choice(self.prior, self.routes, self.settings)
         row = self.train(min(self.done + self.settings.validate_every, self.settings.steps))
-        with self.averaged():
-            return row | self._validate() if self.processes.leader else row | {"held_out_loss": math.nan}
+        if not self.processes.leader:
+            return row | {"held_out_loss": math.nan}
+        with self.averaged() as prior:
+            loss = held_out_loss(prior, self.test, self.settings.batch)
+        return row | {"step": float(self.done), "held_out_loss": loss}
 
     def train(self, until: int) -> dict[str, float]:
         """Train up to step `until`; returns the running means of the loss's terms."""
@@ -145,15 +146,6 @@ class PriorTraining(Supervised):
                     running[key] = 0.9 * running.get(key, value) + 0.1 * value
                 bar.set_postfix({key: f"{value:.3f}" for key, value in running.items()})
         return running
-
-    def _validate(self) -> dict[str, float]:
-        """Held-out loss and, if due, closed-loop metrics."""
-        settings, number = self.settings, len(self.history) + 1
-        row = {"step": float(self.done), "held_out_loss": held_out_loss(self.prior, self.test, settings.batch)}
-        every = settings.closed_loop_every
-        if self.closed_loop is not None and every and (number == settings.turns or number % every == 0):
-            row |= self.closed_loop(self.prior)
-        return row
 
     def pick(self) -> Tensor:
         """Indices [part] of a step's windows: a fraction CAUSAL of them with estimated starts, if both kinds exist."""
@@ -296,7 +288,6 @@ def train_prior(
     settings: TrainingSettings,
     folder: Path,
     origin: dict,
-    closed_loop: ClosedLoop | None = None,
     processes: Processes = ALONE,
     logger: RunLogger | None = None,
     parts: Parts = NO_PARTS,
@@ -306,7 +297,6 @@ def train_prior(
     Args:
         folder: for the checkpoint, which has the averaged weights of the lowest held-out loss.
         origin: data and command, for the checkpoint's header, which also has the results of the training.
-        closed_loop: metrics that every `closed_loop_every`-th validation and the last one report.
         parts: of the run, from which an interrupted training goes on exactly.
 
     Raises:
@@ -314,7 +304,7 @@ def train_prior(
     """
     begin = time.perf_counter()
     windows, test = window_sets(scenes)
-    run = PriorTraining(prior, windows, test, settings, processes, closed_loop)
+    run = PriorTraining(prior, windows, test, settings, processes)
     run.routes = scenes.batch((~held_out(scenes)).nonzero()[:, 0])
     best = run.fit("prior", settings.turns, parts, vars(settings), logger)
     if not processes.leader:

@@ -36,15 +36,11 @@ def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> 
         made, problems = scenario(episode, number, open_ego)
         known = {"author": "", "affiliation": "", "source": "e2rl", "tags": {Tag.CRITICAL, Tag.SIMULATED}}
         writer = XMLFileWriter(made, problems, **known, decimal_precision=6)
-        writer.root_node.append(etree.Comment(_comment(episode)))
+        text = re.sub("-(?=-)", "- ", f" {episode.text()} ")  # a comment must not hold two dashes in a row
+        writer.root_node.append(etree.Comment(text))
         path = folder / f"{made.scenario_id}.xml"
         writer.write_to_file(str(path), OverwriteExistingFile.ALWAYS)
         yield episode, path
-
-
-def _comment(episode: Episode) -> str:
-    """The facts as the text of an XML comment, which must not hold two dashes in a row."""
-    return re.sub("-(?=-)", "- ", f" {episode.text()} ")
 
 
 def scenario(episode: Episode, number: int, open_ego: bool) -> tuple[Any, Any]:
@@ -75,11 +71,7 @@ def lanelets(episode: Episode, ids: Iterator[int]) -> list:
     from commonroad.scenario.lanelet import Lanelet, LaneletType
 
     number = {name: next(ids) for name in episode.lanes}
-    entries: dict[str, list[int]] = {name: [] for name in episode.lanes}
-    for name, lane in episode.lanes.items():
-        for other in lane.exits:
-            entries[other].append(number[name])
-    made = []
+    entries, made = episode.entries(), []
     for name, lane in episode.lanes.items():
         left, right = next(iter(lane.left), None), next(iter(lane.right), None)
         made.append(
@@ -88,7 +80,7 @@ def lanelets(episode: Episode, ids: Iterator[int]) -> list:
                 center_vertices=lane.points,
                 right_vertices=shift_left(lane.points, -lane.width / 2),
                 lanelet_id=number[name],
-                predecessor=entries[name],
+                predecessor=[number[other] for other in entries[name]],
                 successor=[number[other] for other in lane.exits],
                 adjacent_left=number[left] if left else None,
                 adjacent_left_same_direction=True if left else None,
@@ -110,9 +102,8 @@ def speed_limits(episode: Episode, made: Any, ids: Iterator[int]) -> list:
             continue
         if lane.speed_limit not in signs:
             element = TrafficSignElement(TrafficSignIDZamunda.MAX_SPEED, [f"{lane.speed_limit:.6g}"])
-            signs[lane.speed_limit] = TrafficSign(
-                next(ids), [element], {lanelet.lanelet_id}, lane.points[0], virtual=True
-            )
+            first = {lanelet.lanelet_id}, lane.points[0]
+            signs[lane.speed_limit] = TrafficSign(next(ids), [element], *first, virtual=True)
         lanelet.add_traffic_sign_to_lanelet(signs[lane.speed_limit].traffic_sign_id)
     return list(signs.values())
 
@@ -130,10 +121,8 @@ def traffic_lights(episode: Episode, made: Any, ids: Iterator[int]) -> list:
                 groups.setdefault(tuple(episode.lights[other].tolist()), []).append(other)
         for states, others in groups.items():
             turns = {"ALL"} if len(others) == len(lane.exits) else {turn(episode, other) for other in others}
-            for direction in sorted(turns):
-                light = TrafficLight(
-                    next(ids), lane.points[-1], cycle(states), direction=TrafficLightDirection[direction]
-                )
+            for direction in map(TrafficLightDirection.__getitem__, sorted(turns)):
+                light = TrafficLight(next(ids), lane.points[-1], cycle(states), direction=direction)
                 number[name].add_traffic_light_to_lanelet(light.traffic_light_id)
                 found.append(light)
     return found
@@ -143,10 +132,8 @@ def cycle(states: Iterable[int]) -> Any:
     """Light states, one a time step, as a cycle."""
     from commonroad.scenario.traffic_light import TrafficLightCycle, TrafficLightCycleElement, TrafficLightState
 
-    runs = [(state, len(list(group))) for state, group in groupby(states)]
-    return TrafficLightCycle(
-        [TrafficLightCycleElement(TrafficLightState[LIGHTS[state]], length) for state, length in runs]
-    )
+    runs = [(TrafficLightState[LIGHTS[state]], len(list(group))) for state, group in groupby(states)]
+    return TrafficLightCycle([TrafficLightCycleElement(state, length) for state, length in runs])
 
 
 def turn(episode: Episode, name: str) -> str:

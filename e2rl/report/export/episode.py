@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from e2rl.evaluation.rollout_files import cell
 from e2rl.run.errors import InputError
 from e2rl.scenes.builder import BuildSettings, build_scene
 from e2rl.scenes.lane_graph import LaneGraph
@@ -63,6 +64,14 @@ class Episode:
         length, width = self.rollout.size[row].tolist()
         return length, width
 
+    def entries(self) -> dict[str, list[str]]:
+        """By lane the lanes that lead into it."""
+        found: dict[str, list[str]] = {name: [] for name in self.lanes}
+        for name, lane in self.lanes.items():
+            for other in lane.exits:
+                found[other].append(name)
+        return found
+
     def text(self) -> str:
         """The facts in one line."""
         return "; ".join(f"{name}: {value}" for name, value in self.facts.items())
@@ -75,13 +84,8 @@ def recorded_episode(run: Path, row: Mapping, recording: Recording, build: Build
     rollout = bare.rollout
     same = len(graph.points) == len(rollout.lane_points) and len(scene["logged"]) == bare.steps + 1
     origin = np.round(graph.points[0] - rollout.lane_points[0]) if same else np.zeros(2)
-    if not same or not all(
-        np.allclose(ours, theirs, rtol=0, atol=SAME)
-        for ours, theirs in (
-            (graph.points - origin, rollout.lane_points),
-            (scene["start"][0, :2].numpy(), rollout.states[0, 0, :2]),
-        )
-    ):
+    same = same and np.allclose(graph.points - origin, rollout.lane_points, rtol=0, atol=SAME)
+    if not same or not np.allclose(scene["start"][0, :2].numpy(), rollout.states[0, 0, :2], rtol=0, atol=SAME):
         raise InputError(
             f"{bare.path}: not driven in the scene {row['scene_id']!r} that the data make now; restore the data and "
             "the `data` settings of the run, or pass --no-scene"
@@ -89,13 +93,12 @@ def recorded_episode(run: Path, row: Mapping, recording: Recording, build: Build
     start = recording.current
     assert start is not None
     frames = np.minimum(start + np.arange(bare.steps + 1), len(recording.states) - 1)
-    return Episode(
-        path=bare.path,
-        rollout=rollout,
-        facts=bare.facts,
+    lights = {name: states for name, states in recording.lights.items() if name in graph.lanes}
+    return replace(
+        bare,
         lanes={name: _linked(graph, name, lane) for name, lane in zip(graph.ids, bare.lanes.values(), strict=True)},
-        lights={name: states[frames] for name, states in recording.lights.items() if name in graph.lanes},
-        light_past={name: states[:start] for name, states in recording.lights.items() if name in graph.lanes},
+        lights={name: states[frames] for name, states in lights.items()},
+        light_past={name: states[:start] for name, states in lights.items()},
         scene=scene,
         origin=origin,
     )
@@ -113,12 +116,11 @@ def rollout_episode(run: Path, row: Mapping) -> Episode:
 
 def known_facts(row: Mapping) -> dict[str, Any]:
     """The FACTS of a row that are known, as words and plain numbers."""
-    found = {name: row[name] for name in FACTS if name in row and row[name] != ""}
-    known = {name: value for name, value in found.items() if not (isinstance(value, float) and math.isnan(value))}
+    known = {name: row[name] for name in FACTS if name in row and cell(row[name]) != ""}
     if known.get("partner", 0) < 0:  # nobody
         del known["partner"]
     return {
-        name: int(value) if isinstance(value, float) and value == int(value) else value for name, value in known.items()
+        name: int(value) if isinstance(value, float) and value.is_integer() else value for name, value in known.items()
     }
 
 

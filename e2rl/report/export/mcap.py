@@ -97,12 +97,8 @@ def messages(episode: Episode) -> Iterator[tuple[int, str, dict[str, Any]]]:
         number, rest = divmod(step, REPLAN_STEPS)
         if rollout.plans is not None and rest == 0 and number < len(rollout.plans):
             yield step, "/plans", {"entities": list(plans(episode, number))}
-        x, y, heading, _ = rollout.states[step, 0].tolist()
-        yield (
-            step,
-            "/tf",
-            {"parent_frame_id": MAP, "child_frame_id": EGO} | placed(x, y, heading, "translation", "rotation"),
-        )
+        pose = placed(*rollout.states[step, 0, :3].tolist(), "translation", "rotation")
+        yield step, "/tf", {"parent_frame_id": MAP, "child_frame_id": EGO} | pose
         yield step, "/ego", {name: values[step] for name, values in told.items()}
 
 
@@ -149,8 +145,7 @@ def agent(episode: Episode, step: int, row: int) -> Entity:
     part, height = role if role in ("ego", "adversary") else kind, HEIGHT[kind]
     pose = placed(x, y, heading, "position", "orientation", height / 2)
     cube = {"pose": pose, "size": {"x": length, "y": width, "z": height}, "color": rgba(COLOURS[role])}
-    known = {"part": part, "speed": f"{speed:.2f} m/s"}
-    pairs = [{"key": key, "value": value} for key, value in known.items()]
+    pairs = [{"key": "part", "value": part}, {"key": "speed", "value": f"{speed:.2f} m/s"}]
     return {"id": f"agent {row}", "frame_id": MAP, "cubes": [cube], "metadata": pairs}
 
 

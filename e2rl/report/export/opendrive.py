@@ -27,7 +27,7 @@ def write_roads(episode: Episode, path: Path) -> None:
     root = road_network(episode).get_element()
     header = root.find("header")
     (west, south), (east, north) = (edge(episode.rollout.lane_points, axis=0) for edge in (np.min, np.max))
-    for name, side in (("north", north), ("south", south), ("east", east), ("west", west)):
+    for name, side in {"north": north, "south": south, "east": east, "west": west}.items():
         header.set(name, f"{side:.3f}")
     known = {"links_left_out": str(left_out(episode.lanes))}
     if episode.origin is not None:
@@ -47,22 +47,14 @@ def road_network(episode: Episode) -> Any:
     plain, connecting = links(episode.lanes)
     junctions = junctions_of(connecting)
     junction_of = {name: index for index, names in enumerate(junctions, 1) for name in names}
-    follows, precedes = dict(plain), {b: a for a, b in plain}
-    for name, (before, after) in connecting.items():
-        follows[name], precedes[name] = after, before
+    precedes = {b: a for a, b in plain} | {name: before for name, (before, _) in connecting.items()}
+    follows = dict(plain) | {name: after for name, (_, after) in connecting.items()}
     into = {before: junction_of[name] for name, (before, _) in connecting.items()}
     out_of = {after: junction_of[name] for name, (_, after) in connecting.items()}
     for name, lane in episode.lanes.items():
-        made.add_road(
-            road(
-                lane,
-                number[name],
-                junction_of.get(name, -1),
-                (number.get(precedes.get(name, "")), out_of.get(name)),
-                (number.get(follows.get(name, "")), into.get(name)),
-                name,
-            )
-        )
+        begin = number.get(precedes.get(name, "")), out_of.get(name)
+        end = number.get(follows.get(name, "")), into.get(name)
+        made.add_road(road(lane, number[name], junction_of.get(name, -1), begin, end, name))
     for index, names in enumerate(junctions, 1):
         junction = xodr.Junction(f"junction {index}", index)
         for name in names:
@@ -132,8 +124,8 @@ def road(
         plan.add_fixed_geometry(geometry, x, y, heading)
     centre, driving = xodr.Lane(), xodr.Lane(a=lane.width)
     section = xodr.LaneSection(0, centre).add_right_lane(driving)
-    section_lanes = xodr.Lanes().add_lanesection(section).add_laneoffset(xodr.LaneOffset(a=lane.width / 2))
-    made = xodr.Road(number, plan, section_lanes, road_type=junction, name=name)
+    lanes = xodr.Lanes().add_lanesection(section).add_laneoffset(xodr.LaneOffset(a=lane.width / 2))
+    made = xodr.Road(number, plan, lanes, road_type=junction, name=name)
     if lane.speed_limit > 0:
         made.add_type(xodr.RoadType.town, speed=round(lane.speed_limit, 3), speed_unit="m/s")
     for side, contact, (other, through) in (
@@ -174,5 +166,4 @@ def geometries(points: np.ndarray, angle: np.ndarray) -> list[tuple[Any, float, 
 def left_out(lanes: dict[str, Lane]) -> int:
     """How many links of the lane graph OpenDRIVE does not say."""
     plain, connecting = links(lanes)
-    said = len(plain) + 2 * len(connecting)
-    return sum(len(lane.exits) for lane in lanes.values()) - said
+    return sum(len(lane.exits) for lane in lanes.values()) - len(plain) - 2 * len(connecting)

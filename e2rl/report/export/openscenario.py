@@ -61,17 +61,9 @@ def scenario(episode: Episode, road: str | None, open_ego: bool) -> Any:
     facts = xosc.Properties()
     for key, value in episode.facts.items():
         facts.add_property(key, str(value))
-    return xosc.Scenario(
-        episode.text(),
-        "e2rl",
-        xosc.ParameterDeclarations(),
-        entities,
-        board,
-        xosc.RoadNetwork(roadfile=road),
-        xosc.Catalog(),
-        osc_minor_version=MINOR_VERSION,
-        header_properties=facts,
-    )
+    parts = xosc.ParameterDeclarations(), entities, board, xosc.RoadNetwork(roadfile=road), xosc.Catalog()
+    how = {"osc_minor_version": MINOR_VERSION, "header_properties": facts}
+    return xosc.Scenario(episode.text(), "e2rl", *parts, **how)
 
 
 def name_of(row: int) -> str:

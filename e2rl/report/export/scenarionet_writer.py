@@ -134,10 +134,7 @@ def light(episode: Episode, name: str, history: int) -> dict[str, Any]:
 
 def map_features(episode: Episode) -> dict[str, dict[str, Any]]:
     """The lanes."""
-    entries: dict[str, list[str]] = {name: [] for name in episode.lanes}
-    for name, lane in episode.lanes.items():
-        for other in lane.exits:
-            entries[other].append(name)
+    entries = episode.entries()
     return {
         name: {
             "type": "LANE_SURFACE_STREET",

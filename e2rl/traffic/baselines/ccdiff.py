@@ -4,7 +4,6 @@ The ranker finds the vehicles that stand in the heaviest cliques of the recent p
 """
 
 from dataclasses import dataclass
-from math import fsum
 
 import numpy as np
 import torch
@@ -20,7 +19,7 @@ from e2rl.traffic.baselines.guidance import Loss, MeanGuided
 from e2rl.traffic.baselines.losses import discounts, disk_overlap, off_road_term, pair_term
 from e2rl.traffic.baselines.view import View
 from e2rl.traffic.e2.motion import direction, smallest
-from e2rl.traffic.e2.topology import maximal_cliques
+from e2rl.traffic.e2.topology import cliques_in, weight_of
 from e2rl.traffic.grouping import noise_of
 from e2rl.traffic.nominal import React
 from e2rl.traffic.traffic import TrafficPlan
@@ -86,16 +85,8 @@ def ranked(scene: TensorDictBase, count: int, draw: Tensor) -> Tensor:
 
 def _top_cliques(adjacency: np.ndarray, weight: np.ndarray) -> list[tuple[int, ...]]:
     """The maximal cliques of SMALLEST or more of greatest total weight; adjacency, weight [V, V]."""
-    nodes = np.flatnonzero(adjacency.any(-1))
-    if len(nodes) < SMALLEST:
-        return []
-    found = maximal_cliques(np.ascontiguousarray(adjacency[np.ix_(nodes, nodes)]).tobytes(), len(nodes))
-    large = [tuple(int(nodes[i]) for i in clique) for clique in found if len(clique) >= SMALLEST]
-
-    def rank(clique: tuple[int, ...]) -> tuple[float, tuple[int, ...]]:
-        return -round(fsum(weight[i, j] for k, i in enumerate(clique) for j in clique[k + 1 :]), 6), clique
-
-    return sorted(large, key=rank)[:TOP]
+    large = [clique for clique in cliques_in(adjacency) if len(clique) >= SMALLEST]
+    return sorted(large, key=lambda clique: (-round(weight_of(clique, weight), 6), clique))[:TOP]
 
 
 TIES = 900  # number of the draw that orders vehicles of equal rank

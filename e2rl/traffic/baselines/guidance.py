@@ -1,8 +1,7 @@
 """The two ways in which baselines guide a diffusion prior by a loss of the decoded plan.
 
 `MeanGuidance` moves the posterior mean of a step (CTG, Zhong et al. 2023), `CleanGuidance` the clean estimate
-(Safe-Sim, Chang et al. 2024). Both are controls of `Prior.sample`, for S samples of B scenes at once. `Guided` says
-whom they guide in closed loop, by which loss, and which of the samples is driven.
+(Safe-Sim, Chang et al. 2024). Both are controls of `Prior.sample`, for S samples of B scenes at once.
 """
 
 from abc import abstractmethod

@@ -24,8 +24,8 @@ CONFLICT_REACH = 100.0  # m within which a conflict counts
 @configured("synthesizer/safe_sim_opt")
 @dataclass(eq=False, repr=False)
 class SafeSimOpt(Guided):
-    """Clean guidance: everybody keeps to its route and clear of others, adversaries also seek the ego. Each vehicle
-    takes the sample that suits it best, as in the source."""
+    """Clean guidance to keep to one's route and clear of others, and of adversaries to the ego; each vehicle takes the
+    sample that suits it best, as in the source."""
 
     step_size: float = setting(low=0)
     clip: float = setting(low=0)

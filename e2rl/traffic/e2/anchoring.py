@@ -38,8 +38,6 @@ BEND_BRAKING = 3.0  # m/s^2 with which a vehicle slows down for a bend
 EXTRA = 2  # steps beyond the horizon, for the slope of the speed at the last knot
 SWING = 0.2  # peak of the lateral decoder's offset, per unit of slope and lateral horizon
 BEND_VERTICES = 64  # of a route ahead, whose curvature bounds the speed
-
-
 ACCEL_COST = 0.2  # s of time gap that 1 m/s^2 weighs
 LATERAL_COST = 0.05  # s that 1 m of present offset from the route weighs
 MAX_OFFSET = 1.0  # s of time gap at most; links that cannot meet better have no anchor
@@ -151,10 +149,8 @@ def _along(candidates: _Candidates, path: Tensor, size: Tensor) -> _Target:
 
 
 def _knots(candidates: _Candidates, accel: Tensor, settings: AnchorSettings) -> Tensor:
-    """Knots [B, M, R, A, 10] that hold accelerations accel [B, M, R, A] but for standstill, top speed and bends.
-
-    The bound on speed depends on the distance, which depends on speed: three fixed-point steps from the free motion.
-    """
+    """Knots [B, M, R, A, 10] that hold accelerations accel [B, M, R, A] but for standstill, top speed and bends: the
+    bound depends on the distance, which depends on speed, so three fixed-point steps from the free motion."""
     time = DT * torch.arange(HORIZON + EXTRA + 1, device=accel.device)
     v0 = candidates.speed[..., None, None, None]
     free = v0 + accel[..., None] * time
@@ -185,8 +181,7 @@ def _score(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Cost and time gap [s] (both [B, M, R, A]) and knots [B, M, R, A, 10] of accelerations accel [B, M, R, A].
 
-    At each step at which the target is on a candidate, the vehicle's distance to that point over its speed is the gap
-    between the two arrival times; the smallest counts.
+    Time gap: distance to the target over speed, least over the steps at which the target is on the candidate.
     """
     knots = _knots(candidates, accel, settings)
     v, travelled = _decode(candidates, knots)

@@ -2,9 +2,8 @@
 
 Guidance replaces the score s by s - grad V (Dhariwal and Nichol 2021), which moves the clean estimate:
 x0 <- x0 - (sigma^2 / alpha) grad V. To keep eta a usable dial, each vehicle's gradient is scaled by the noise level and
-clipped before eta multiplies it; V_feas has a clip of its own. Only V_adv is pulled back through the network. V_feas
-acts on the clean estimate, and only once that has taken shape (FEASIBILITY_LEVEL): the same outcome at a fraction of
-the cost.
+clipped before eta multiplies it. Only V_adv is pulled back through the network; V_feas acts on the clean estimate, once
+that has taken shape: the same outcome at a fraction of the cost.
 """
 
 from collections.abc import Callable

@@ -19,10 +19,10 @@ from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 from e2rl.traffic.e2.anchoring import Anchor, AnchorSettings, propose
 from e2rl.traffic.e2.control import ControlSettings, SparseControl
-from e2rl.traffic.e2.feasibility import FeasibilitySettings
+from e2rl.traffic.e2.feasibility import FeasibilitySettings, feasible_vehicles
 from e2rl.traffic.e2.interception import InterceptionSettings
 from e2rl.traffic.e2.potentials import PotentialContext, PotentialSettings
-from e2rl.traffic.e2.reasoner import ReasonerSettings, build_reasoner
+from e2rl.traffic.e2.reasoner import LanguageReasoner, ReasonerSettings
 from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, YieldingSettings, duty_of, leading, place_of
 from e2rl.traffic.e2.skeleton import (
     STEP,
@@ -96,7 +96,8 @@ class E2(NominalTraffic):
             given = getattr(self, part.name)
             if isinstance(given, Mapping):
                 setattr(self, part.name, settings_of(part.type, given, f"synthesizer.{part.name}"))
-        self.feasible_vehicles = build_reasoner(self.reasoner)
+        rules = self.reasoner.kind == "rules"
+        self.feasible_vehicles = feasible_vehicles if rules else LanguageReasoner(self.reasoner)
 
     @property
     def tuned(self) -> Mapping[str, tuple]:  # type: ignore[override]
@@ -114,19 +115,10 @@ class E2(NominalTraffic):
         near, far = limits_of(torch.full_like(seed, FULL) if template is None else template, self.skeleton)
         nominal = super().reset(scenes, seed, eta)
         none, zero = torch.zeros_like(nominal.routed.parked), torch.zeros_like(nominal.routed.length)
-        return E2State(
-            **vars(nominal),
-            eta=eta,
-            near=near,
-            far=far,
-            coalition=none,
-            target=none.long() - 1,
-            off_lane=none,
-            committed=none,
-            knots=zero[..., None].repeat(1, 1, KNOTS),
-            path_kl=zero,
-            anchor_jump=zero,
-        )
+        nobody = {"coalition": none, "target": none.long() - 1, "off_lane": none, "committed": none}
+        costs = {"path_kl": zero, "anchor_jump": zero}
+        knots = zero[..., None].repeat(1, 1, KNOTS)
+        return E2State(**vars(nominal), eta=eta, near=near, far=far, knots=knots, **nobody, **costs)
 
     def replan(
         self, state: E2State, world: World, ego_plan: Tensor, react: React | None = None
@@ -148,16 +140,13 @@ class E2(NominalTraffic):
         context = self.encode(state, world, ego_plan)
         context.obstacles.duty = duty_of(self.responsibility, self.yielding, world, state.coalition, state.eta)
         control = self._control(state, world, ego_plan, anchor)
-        sample = self.prior.sample(context, now.noise, control, self._budget(state))
+        limit = self.control.transport_budget
+        budget = None if limit is None else (limit - state.path_kl.sum(-1)).clamp(min=0)  # what control may still add
+        sample = self.prior.sample(context, now.noise, control, budget)
         kl, jump = state.path_kl + sample.kl, state.anchor_jump + control.jump
         acts = anchor.feasible & state.coalition
         state = replace(state, path_kl=kl, anchor_jump=jump, committed=acts, knots=anchor.knots)
         return state, sample.x0, context
-
-    def _budget(self, state: E2State) -> Tensor | None:
-        """Path KL [B] that control may still add to each scene."""
-        limit = self.control.transport_budget
-        return None if limit is None else (limit - state.path_kl.sum(-1)).clamp(min=0)
 
     def _reselected(self, state: E2State, world: World, ego_plan: Tensor) -> tuple[E2State, Anchor]:
         """States and anchors, with a new coalition in scenes whose choice is due and in which no member of the present
@@ -201,8 +190,7 @@ class E2(NominalTraffic):
     def _propose(
         self, skeleton: Skeleton, state: E2State, world: World, ego_plan: Tensor, keep_route: bool = False
     ) -> Anchor:
-        settings = self.anchor, self.interception
-        lawful = self.responsibility == "full"
+        settings, lawful = (self.anchor, self.interception), self.responsibility == "full"
         return propose(world.scene, world, skeleton, ego_plan, *settings, state.eta, keep_route, lawful)
 
     def _select(self, state: E2State, world: World, ego_plan: Tensor) -> E2State:
@@ -236,11 +224,9 @@ class E2(NominalTraffic):
             moments = (DT * (found.steps + 1)).expand(len(reference), -1)
             chosen = (found.candidates, feasible, state.coalition, state.target)
             at = reference[:, found.steps]
-            selection = Selection(state.seed, world.step, at, moments, found.weights, *chosen, self.topology)
-            self.on_decision(selection)
-        return self._onto(
-            state, world, torch.where(acts, anchor.route, state.routed.route), acts & False, anchor.off_lane_path
-        )
+            self.on_decision(Selection(state.seed, world.step, at, moments, found.weights, *chosen, self.topology))
+        route = torch.where(acts, anchor.route, state.routed.route)
+        return self._onto(state, world, route, acts & False, anchor.off_lane_path)
 
     def _support(self, state: E2State, world: World, candidates: Tensor, feasible: Tensor) -> tuple[Tensor, Tensor]:
         """S [B, V] and who may take its place where it is empty, by `support` (Sec. IV-A2)."""

@@ -76,10 +76,8 @@ class _Samples(NamedTuple):
 
 
 def _sample(route: Tensor, s: Tensor, end: Tensor, speed: Tensor, length: Tensor, acceleration: float) -> _Samples:
-    """Samples ahead of arc lengths s [Q] on routes [Q, P, 2] that end at arc lengths end [Q].
-
-    A vehicle of `length` [Q] m is at a point from when its front bumper arrives until its rear bumper has passed.
-    """
+    """Samples ahead of arc lengths s [Q] on routes [Q, P, 2] that end at `end` [Q]; a vehicle of `length` [Q] m is at a
+    point from when its front bumper arrives until its rear bumper has passed."""
     distance = torch.arange(0, SAMPLE_REACH + 1e-3, SAMPLE_SPACING, device=s.device)
     arc, speed, half = s[:, None] + distance, speed[:, None], length[:, None] / 2
     xy, heading, _ = interpolate(route, arc)
@@ -89,11 +87,8 @@ def _sample(route: Tensor, s: Tensor, end: Tensor, speed: Tensor, length: Tensor
 
 
 def _conflict_samples(own: _Samples, ego: _Samples, settings: FeasibilitySettings) -> tuple[Tensor, ...]:
-    """The pair of samples at which each candidate [Q] meets the mission: index on both, earliest, latest, time gap.
-
-    Of the pairs within the corridor that both vehicles can occupy at once, that of least time gap, where the routes
-    touch if they touch anywhere. The time gap is inf where there is none.
-    """
+    """Index on both, earliest, latest and time gap of the samples at which each candidate [Q] meets the mission: of
+    those within the corridor that both vehicles can occupy at once, that of least time gap (inf for none)."""
     squared = torch.cdist(own.xy, ego.xy, compute_mode="use_mm_for_euclid_dist").square()
     earliest = torch.maximum(own.earliest[:, :, None], ego.earliest[:, None])
     latest = torch.minimum(own.latest[:, :, None], ego.latest[:, None]).clamp(max=settings.horizon)

@@ -1,10 +1,9 @@
 """Interceptions: proposals off the lanes (Sec. IV-B1), a smooth path from a vehicle's pose to its target's path.
 
-A lane-graph proposal can only choose when a vehicle is where its lane leads, where every planner expects it. Vehicles
-that drift over, cut in or turn in early leave their lane for a few seconds. Such a path is proposed in closed form: a
-cubic from the pose to where the target will be at one of several moments, driven at one constant acceleration, on the
-drivable area, clear of everybody else, within limits of acceleration that are proportional to the intensity. The prior
-then plans along it as along any route, so what is driven stays a sample of the prior.
+Every planner expects a vehicle where its lane leads. One that cuts in or turns in early leaves it for a few seconds: on
+a cubic from its pose to where the target will be at one of several moments, at one constant acceleration, on the
+drivable area, clear of everybody else, within limits that are proportional to the intensity. The prior then plans along
+it as along any route, so what is driven stays a sample of the prior.
 """
 
 from dataclasses import dataclass
@@ -31,8 +30,6 @@ SAMPLES = 17  # points of a path that are checked
 MAX_BEARING, MAX_TURN = 1.05, 1.4  # rad between heading and target, and between both ends of a path
 MAX_CURVATURE = 0.12  # 1/m, what a car's steering allows
 CLEARANCE = 0.3  # m kept to others on the path
-
-
 SHOULDER = 0.5  # m that its centre may leave the drivable area by
 ACCEL_COST, LATERAL_COST = 0.2, 0.2  # s that 1 m/s^2 of acceleration, and of lateral acceleration, weighs
 TIME_COST = 0.1  # s that 1 s until the meeting weighs
@@ -52,9 +49,7 @@ class InterceptionSettings:
 
 
 class Interception(NamedTuple):
-    """path [B, M, P, 2]: a vertex every SPACING m; knots [B, M, 10]: accelerations in m/s^2; cost [B, M] in s, inf for
-    vehicles that have no interception within the limits.
-    """
+    """path [B, M, P, 2]: a vertex every SPACING m; knots [B, M, 10] m/s^2; cost [B, M] s, inf for none."""
 
     path: Tensor
     knots: Tensor
@@ -91,9 +86,7 @@ def cubic(start: Tensor, heading: Tensor, end: Tensor, end_heading: Tensor, u: T
 
 
 def _paths(states: Tensor, meeting: Tensor) -> _Paths:
-    """Paths from states [B, M, 4] to meeting states [B, M, I, 4], ENDS to each: along an arc, straight at the target in
-    the end, or into the target's direction.
-    """
+    """Paths to meeting states [B, M, I, 4], ENDS to each: on an arc, straight at the target, or into its heading."""
     heading = states[:, :, None, 2].expand(meeting.shape[:3])
     gap = meeting[..., :2] - states[:, :, None, :2]
     bearing = wrap(torch.atan2(gap[..., 1], gap[..., 0]) - heading)
@@ -106,9 +99,7 @@ def _paths(states: Tensor, meeting: Tensor) -> _Paths:
 
 
 def _lateral(paths: _Paths, speed: Tensor, accel: Tensor) -> tuple[Tensor, Tensor]:
-    """Largest lateral acceleration [m/s^2] and curvature [1/m] (both [B, M, O]) on paths entered at speed [B, M, 1] and
-    driven at accel [B, M, O].
-    """
+    """Largest lateral acceleration [m/s^2] and curvature [1/m] on paths entered at `speed` and driven at `accel`."""
     turn = wrap(torch.atan2(paths.tangents[..., 1], paths.tangents[..., 0]).diff(dim=-1))
     curvature = (turn / paths.length.diff(dim=-1).clamp(min=0.1)).abs()
     squared = (speed[..., None] ** 2 + 2 * accel[..., None] * paths.length[..., 1:]).clamp(min=0)
@@ -118,8 +109,7 @@ def _lateral(paths: _Paths, speed: Tensor, accel: Tensor) -> tuple[Tensor, Tenso
 def _within(
     settings: InterceptionSettings, paths: _Paths, speed: Tensor, accel: Tensor, time: Tensor, eta: Tensor
 ) -> Tensor:
-    """Bool [B, M, O]: paths entered at speed [B, M, 1] and driven at accel for time [B, M, O] keep the limits of
-    intensities eta [B, 1, 1]."""
+    """Bool [B, M, O]: paths entered at speed [B, M, 1], driven at accel for time [B, M, O], keep the limits of eta."""
     lateral, curvature = _lateral(paths, speed, accel)
     ok = (accel <= settings.push * eta) & (accel >= -settings.brake * eta) & (speed + accel * time >= 0)
     ok &= (lateral <= settings.lateral * eta) & (curvature < MAX_CURVATURE)
@@ -206,9 +196,7 @@ def _against_lanes(scene: TensorDictBase, meeting: Tensor, end_heading: Tensor) 
 
 
 def _resampled(points: Tensor, length: Tensor, heading: Tensor, count: int) -> Tensor:
-    """Vertices [B, M, count, 2] every SPACING m along polylines points [B, M, U, 2] of cumulative length [B, M, U],
-    then straight on along heading [B, M].
-    """
+    """Vertices [B, M, count, 2] every SPACING m along points [B, M, U, 2] at length [B, M, U], then along `heading`."""
     s = SPACING * torch.arange(count, device=points.device, dtype=points.dtype).expand(*length.shape[:2], count)
     after = torch.searchsorted(length.contiguous(), s.contiguous(), right=True).clamp(1, SAMPLES - 1)
     low, high = length.gather(-1, after - 1), length.gather(-1, after)

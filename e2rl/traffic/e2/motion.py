@@ -21,10 +21,8 @@ TOP_SPEED = 25.0  # m/s up to which vehicles accelerate; a faster one keeps its 
 
 
 def compact(mask: Tensor) -> tuple[Tensor, Tensor]:
-    """The true entries of mask [B, V] as M slots: index [B, M] int64 (ascending, true ones first), present [B, M] bool.
-
-    M is the largest count of the batch, at least 1.
-    """
+    """The true entries of mask [B, V] as slots: index [B, M] int64 (ascending, true ones first), present [B, M] bool; M
+    is the largest count, at least 1."""
     count = mask.sum(-1)
     width = max(int(count.max()), 1)
     index = torch.argsort(~mask, dim=-1, stable=True)[:, :width]
@@ -56,9 +54,7 @@ def direction(heading: Tensor) -> Tensor:
 
 
 def frenet_pose(states: Tensor, routes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Arc length s [m], lateral offset d [m, left positive] and heading error [rad] of states [B, M, 4] on routes
-    [B, M, R, P, 2]; each [B, M, R].
-    """
+    """s, offset [m] and heading error [rad], each [B, M, R], of states [B, M, 4] on routes [B, M, R, P, 2]."""
     s, d, heading = project(states[:, :, None, None, :2], routes)
     return s[..., 0], d[..., 0], wrap(states[:, :, None, 2] - heading[..., 0])
 
@@ -77,10 +73,8 @@ def states_on_route(route: Tensor, s: Tensor, d: Tensor, speed: Tensor) -> Tenso
 
 
 def constant_speed_states(scene: TensorDictBase, world: World, times: Tensor) -> Tensor:
-    """States [B, V, K, 4] of all vehicles at `times` [K] s from now, each at its present speed along its route.
-
-    Vehicles without a route go straight on. Lateral offsets vanish as in the prior's plans.
-    """
+    """States [B, V, K, 4] of vehicles after `times` [K] s at present speed, along their routes, else straight on;
+    lateral offsets vanish as in the prior's plans."""
     states = world.states[:, : scene["route_points"].shape[1]]
     assert world.route is not None
     chosen = world.route.clamp(min=0)

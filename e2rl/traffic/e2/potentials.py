@@ -29,8 +29,6 @@ DISKS = 3  # that stand for a vehicle against another's box
 NEIGHBOURS = 6  # nearest vehicles looked at
 NEAR = 5.0  # m: pairs that stay farther apart cost nothing
 MAX_EXCESS = 5.0  # m: excesses of offset and of distance off the road are cut there
-
-
 OFF_ROAD_MARGIN = 0.3  # m inside the border of the drivable area where its term begins
 LATERAL_BOUND = 1.0  # m of offset that cost nothing
 PAIR_MARGIN = 0.3  # m of gap that is wanted
@@ -135,10 +133,7 @@ def _neighbours(states: Tensor, context: PotentialContext, size: Tensor) -> tupl
 
 
 def _overlap_term(states: Tensor, context: PotentialContext) -> Tensor:
-    """Squared shortfall of the gap to each neighbour [m^2], mean over steps, summed over neighbours [B, V].
-
-    The gap that is asked for is at most the present one.
-    """
+    """Squared shortfall of the gap to neighbours [m^2], at most the present gap; mean over steps, their sum [B, V]."""
     size = context.scene["size"][:, : states.shape[1]]
     index, near = _neighbours(states, context, size)
     scene, own, rank = near.nonzero(as_tuple=True)  # most of the nearest are too far to cost anything

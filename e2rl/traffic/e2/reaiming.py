@@ -1,13 +1,9 @@
 """Re-aiming: vehicles of replayed traffic leave it at a random moment and re-aim at the ego every 0.5 s.
 
 A policy that trains on replayed attacks learns where the adversary will not be. One that re-aims must be reacted to.
-Here: in which episodes, who, and from when on; `aim` has the law.
-
-The law by which a vehicle re-aims at the ego, in closed form (`reaiming` says who does, and when).
-
-Every 0.5 s it takes the constant acceleration and path curvature that best meet the ego at one of ten moments ahead,
-within the limits of an interception (`InterceptionSettings`). It knows of the ego, and owes it, what adversaries of e2
-do: it predicts it from its present motion, and gives way by the same rules (`responsibility`, `prior.bounds`).
+It takes the constant acceleration and path curvature that best meet the ego at one of ten moments ahead, within the
+limits of an interception (`InterceptionSettings`). It knows of the ego, and owes it, what adversaries of e2 do: it
+predicts it from its present motion, and gives way by the same rules (`responsibility`, `prior.bounds`).
 """
 
 from dataclasses import dataclass, field
@@ -36,7 +32,6 @@ from e2rl.traffic.e2.interception import (
 )
 from e2rl.traffic.e2.motion import TOP_SPEED
 from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, YieldingSettings, duty_of, leading
-from e2rl.traffic.reaction import Motion, NewEpisodes, Reaction
 from e2rl.traffic.traffic import REPLAN_STEPS
 
 MOMENTS = 10  # at which the ego may be met, one every 0.5 s
@@ -63,19 +58,6 @@ def surroundings(world: World, rows: Tensor, agents: Tensor) -> World:
     return World(scene, world.step[rows], world.states[at], valid, world.accel[at], turn_rate=world.turn_rate[at])
 
 
-def present_motion(world: World) -> Arc:
-    """The present acceleration and path curvature [K, N] of everybody."""
-    return Arc(world.accel, curvature_of(world.turn_rate, world.states[..., 3]))
-
-
-class Target(NamedTuple):
-    """What K vehicles aim at: states [K, MOMENTS, 4] of the ego and its length [K]; own length [K]."""
-
-    states: Tensor
-    length: Tensor
-    own_length: Tensor
-
-
 class Ground(NamedTuple):
     """Drivable fields [B, G, G] of environments, their origins [B, 2], and whose K vehicles stand on: row [K]."""
 
@@ -84,20 +66,23 @@ class Ground(NamedTuple):
     row: Tensor
 
 
-def best_aim(states: Tensor, target: Target, eta: Tensor, ground: Ground, limits: InterceptionSettings) -> Arc:
-    """The Arc of vehicles states [K, 4] that best meets the target within `limits` at intensities eta [K].
+def best_aim(
+    states: Tensor, target: Tensor, lengths: Tensor, eta: Tensor, ground: Ground, limits: InterceptionSettings
+) -> Arc:
+    """The Arc of vehicles states [K, 4] that best meets the ego, target [K, MOMENTS, 4], within `limits` at intensities
+    eta [K]; lengths [K]: of both together.
 
     At each moment: the arc through the target, at the acceleration that arrives in time; both clamped to the limits.
     The cheapest of those with a drivable path is taken; NaN where there is none, or the target is not ahead.
     """
     times = moments(states)
     v, dial = states[:, 3:], eta[:, None]
-    local = to_frame(target.states[..., :2], states[:, None])
+    local = to_frame(target[..., :2], states[:, None])
     bearing = torch.atan2(local[..., 1], local[..., 0])
     chord = local.norm(dim=-1)
     length = chord / torch.sinc(bearing / torch.pi).clamp(min=0.1)
-    alike = (states[:, 2:3] + 2 * bearing - target.states[..., 2]).cos().square()
-    touch = TOUCH * (target.length + target.own_length)[:, None] * alike
+    alike = (states[:, 2:3] + 2 * bearing - target[..., 2]).cos().square()
+    touch = TOUCH * lengths[:, None] * alike
     accel = 2 * (length - touch - v * times) / times**2
     top = torch.minimum(limits.push * dial, (v.clamp(min=TOP_SPEED) - v) / times)
     accel = torch.minimum(accel.maximum(-limits.brake * dial), top).maximum(-v / times)
@@ -107,7 +92,7 @@ def best_aim(states: Tensor, target: Target, eta: Tensor, ground: Ground, limits
     aim, portions = Arc(accel, curvature), torch.arange(1, CHECKED + 1, device=times.device) / CHECKED
     looked_at = torch.cat([times[:, None], times[:, None].clamp(min=RUN_ON) * portions], 1)
     path, _ = along_arc(states[:, None], aim, looked_at)
-    miss = ((path[:, :, 0, :2] - target.states[..., :2]).norm(dim=-1) - touch).clamp(min=0)
+    miss = ((path[:, :, 0, :2] - target[..., :2]).norm(dim=-1) - touch).clamp(min=0)
     cost = MISS_COST * miss + ACCEL_COST * accel.abs() + TIME_COST * times
     cost = cost + LATERAL_COST * fastest.square() * curvature.abs()
     beyond = off_road(torch.cat([states[:, None, :2], path[..., :2].flatten(1, 2)], 1), *ground)
@@ -149,30 +134,30 @@ def braking_for(world: World, aim: Arc, motion: Arc, duty: Duty, bounds: BoundSe
 
 @dataclass(frozen=True)
 class Law:
-    """How vehicles re-aim: limits of the aims, how late they give way, bounds of their braking, what they owe."""
+    """How vehicles re-aim: what they owe, limits of the aims, how late they give way, bounds of their braking."""
 
-    responsibility: str = "full"
+    responsibility: str
     limits: InterceptionSettings = field(default_factory=InterceptionSettings)
     yielding: YieldingSettings = field(default_factory=YieldingSettings)
     bounds: BoundSettings = field(default_factory=BoundSettings)
 
-    def __call__(self, world: World, eta: Tensor, shift: Tensor, ground: Ground, reckless: Tensor | None = None) -> Arc:
+    def __call__(self, world: World, eta: Tensor, shift: Tensor, ground: Ground, reckless: Tensor) -> Arc:
         """The Arc of K vehicles in their `surroundings` at intensities eta [K].
 
-        shift [K, 2]: m by which they misjudge the ego's place; reckless [K] bool: those that owe it nothing (None:
-        nobody). Without an aim they halve their curvature and brake gently.
+        shift [K, 2]: m by which they misjudge the ego's place; reckless [K] bool: those that owe it nothing. Without an
+        aim they halve their curvature and brake gently.
         """
-        states, motion, length = world.states[:, 1], present_motion(world), world.scene["size"][..., 0]
+        states, length = world.states[:, 1], world.scene["size"][..., 0]
+        motion = Arc(world.accel, curvature_of(world.turn_rate, world.states[..., 3]))
         its_motion = Arc(*(value[:, 0] for value in motion))
         expected, _ = along_arc(world.states[:, 0], its_motion, moments(states), HOLD, TURN)
         expected = expected + torch.nn.functional.pad(shift, (0, 2))[:, None]
-        aim = best_aim(states, Target(expected, length[:, 0], length[:, 1]), eta, ground, self.limits)
+        aim = best_aim(states, expected, length[:, 0] + length[:, 1], eta, ground, self.limits)
         none = aim.accel.isnan()
         aim = Arc(aim.accel.masked_fill(none, -UNAIMED), torch.where(none, motion.curvature[:, 1] / 2, aim.curvature))
         itself = torch.tensor([[False, True]], device=eta.device).expand(len(eta), -1)
         duty = duty_of(self.responsibility, self.yielding, world, itself, eta)
-        exempt = duty.exempt[:, 1:] if reckless is None else duty.exempt[:, 1:] | reckless[:, None]
-        duty = Duty(exempt, duty.yields[:, 1:], duty.patience[:, 1:])
+        duty = Duty(duty.exempt[:, 1:] | reckless[:, None], duty.yields[:, 1:], duty.patience[:, 1:])
         braking = braking_for(world, aim, motion, duty, self.bounds)
         return aim._replace(accel=torch.minimum(aim.accel, (-braking).clamp(min=self.bounds.floor)))
 
@@ -200,25 +185,27 @@ class ReactSettings:
             raise InputError(f"learner.react.eta={list(self.eta)}: expected the lowest and the highest intensity")
 
 
-def drawn(settings: ReactSettings, episodes: NewEpisodes, generator: torch.Generator) -> TensorDict:
-    """The part of the traffic in b new episodes: start [b]: step from which on vehicles react (NEVER: they do not), eta
-    [b], count [b] of them, others [b] bool: not the traffic's own adversaries; reckless [b] bool: they owe the ego
-    nothing; rank [b, V]: random, the lowest react; adversaries [b, V]; vehicle [b, MOST] and acts [b, MOST]: who they
-    are, nobody yet; chosen [b]."""
-    size, device = episodes.adversaries.shape, episodes.adversaries.device
+def drawn(
+    settings: ReactSettings, adversarial: Tensor, adversaries: Tensor, horizon: int, generator: torch.Generator
+) -> TensorDict:
+    """The part of the traffic in b new episodes of `horizon` steps: start [b]: step from which on vehicles react
+    (NEVER: they do not), eta [b], count [b] of them, others [b] bool: not the traffic's own adversaries; reckless [b]
+    bool: they owe the ego nothing; rank [b, V]: random, the lowest react; adversaries [b, V]; vehicle [b, MOST] and
+    acts [b, MOST]: who they are, nobody yet; chosen [b]."""
+    size, device = adversaries.shape, adversaries.device
     draws = torch.rand(size[0], 6 + size[1], generator=generator).to(device)
     reacts, others, when, how, many, reckless = draws[:, :6].unbind(1)
-    start = (when * LATEST * episodes.horizon).long()
+    start = (when * LATEST * horizon).long()
     low, high = settings.eta
     nobody = torch.zeros(size[0], MOST, dtype=torch.int64, device=device)
     part = {
-        "start": torch.where(episodes.adversarial & (reacts < settings.fraction), start, NEVER),
+        "start": torch.where(adversarial & (reacts < settings.fraction), start, NEVER),
         "eta": low + (high - low) * how,
         "count": 1 + (many * MOST).long(),
         "others": others < settings.others,
         "reckless": reckless < settings.reckless,
         "rank": draws[:, 6:],
-        "adversaries": episodes.adversaries,
+        "adversaries": adversaries,
         "vehicle": nobody,
         "acts": nobody.bool(),
         "chosen": torch.zeros_like(start, dtype=torch.bool),
@@ -245,29 +232,28 @@ def chosen(part: TensorDict, world: World, responsibility: str) -> tuple[Tensor,
     return found.indices, taken & (found.values < torch.inf)
 
 
-class Reaiming(Reaction):
+class Reaiming:
     """Vehicles of replayed adversarial episodes that re-aim, as the settings say; draws from a generator of its own."""
 
-    def __init__(self, settings: ReactSettings, seed: int = 0, law: Law | None = None) -> None:
+    def __init__(self, settings: ReactSettings, seed: int = 0) -> None:
         self.settings, self.generator = settings, torch.Generator().manual_seed(seed)
-        self.law = law or Law(settings.responsibility)
+        self.law = Law(settings.responsibility)
         self._part: TensorDict | None = None  # [B] `drawn`
 
-    @property
-    def acting(self) -> Tensor:
-        assert self._part is not None
-        marks = torch.zeros_like(self._part["adversaries"])
-        return marks.scatter(1, self._part["vehicle"], self._part["acts"])
+    def begin(self, rows: Tensor, adversarial: Tensor, adversaries: Tensor, horizon: int) -> None:
+        """Draws for new episodes of environments rows [b] whether, who and when.
 
-    def begin(self, episodes: NewEpisodes) -> None:
-        part = drawn(self.settings, episodes, self.generator)
-        if self._part is None or len(part) == episodes.batch:
+        adversarial [b] bool: replayed traffic with an intensity; adversaries [b, V] bool: of that traffic.
+        """
+        part = drawn(self.settings, adversarial, adversaries, horizon, self.generator)
+        if self._part is None or len(part) == len(self._part):
             self._part = part  # the first reset is of all environments
         else:
-            self._part[episodes.rows] = part
+            self._part[rows] = part
 
     @torch.no_grad()
-    def react(self, world: World) -> Motion | None:
+    def react(self, world: World) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Environments rows [K], agents [K] and their states [K, H, 4] of the coming 1 s; None where nobody reacts."""
         part = self._part
         assert part is not None
         due = ~part["chosen"] & (part["start"] <= world.step)
@@ -285,4 +271,4 @@ class Reaiming(Reaction):
         aim = self.law(seen, part["eta"][row], shift, ground, part["reckless"][row])
         times = DT * torch.arange(1, 2 * REPLAN_STEPS + 1, device=row.device)
         states, _ = along_arc(seen.states[:, 1], aim, times)
-        return Motion(row, agents, states)
+        return row, agents, states

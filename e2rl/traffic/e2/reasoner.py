@@ -9,7 +9,6 @@ import json
 import math
 import threading
 import warnings
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -44,18 +43,15 @@ number, in the JSON format asked for."""
 CRITERIA = ("on_lane", "can_meet_ego", "moving_or_blocking")
 Verdicts = dict[int, tuple[bool, ...]]  # of each vehicle: the CRITERIA in order
 
-VEHICLE_SCHEMA = {
-    "type": "object",
-    "properties": {"id": {"type": "integer"}, **{name: {"type": "boolean"} for name in CRITERIA}},
-    "required": ["id", *CRITERIA],
-    "additionalProperties": False,
-}
-SCHEMA = {
-    "type": "object",
-    "properties": {"vehicles": {"type": "array", "items": VEHICLE_SCHEMA}},
-    "required": ["vehicles"],
-    "additionalProperties": False,
-}
+
+def _object(**properties: dict) -> dict:
+    """The JSON schema of an object of exactly these properties."""
+    return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
+
+
+VEHICLE = _object(id={"type": "integer"}, **{name: {"type": "boolean"} for name in CRITERIA})
+SCHEMA = _object(vehicles={"type": "array", "items": VEHICLE})
+FORMAT = {"type": "json_schema", "json_schema": {"name": "feasibility", "strict": True, "schema": SCHEMA}}
 
 
 def messages(ego: str, vehicles: dict[int, str]) -> list[dict[str, str]]:
@@ -66,10 +62,7 @@ def messages(ego: str, vehicles: dict[int, str]) -> list[dict[str, str]]:
 
 
 def read_answer(text: str, vehicles: list[int]) -> Verdicts:
-    """The verdicts in an answer about `vehicles`.
-
-    Raises ValueError where it is not JSON of the schema, or not about exactly these vehicles.
-    """
+    """The verdicts in an answer; ValueError where it is not JSON of the schema about exactly these vehicles."""
     try:
         entries = json.loads(text)["vehicles"]
         verdicts = {entry["id"]: tuple(entry[name] for name in CRITERIA) for entry in entries}
@@ -118,26 +111,19 @@ def _next_light(scene: TensorDictBase, step: Tensor, vehicle: int, candidate: in
 
 
 def describe(scene: TensorDictBase, world: World, conflicts: Conflicts, row: int) -> tuple[str, dict[int, str]]:
-    """The ego of scene `row` in words, and every vehicle that is present and not parked, by its index."""
+    """The ego of scene `row` and its mission in words, and every present vehicle that is not parked, by its index."""
     vehicles = scene["route_points"].shape[1]
     present = (world.valid[row, :vehicles] & ~scene["parked"][row, :vehicles]).nonzero()[:, 0].tolist()
     texts = {vehicle: describe_vehicle(scene, world, conflicts, row, vehicle) for vehicle in present if vehicle > 0}
-    return describe_ego(scene, world, row), texts
-
-
-def describe_ego(scene: TensorDictBase, world: World, row: int) -> str:
-    """How the ego of scene `row` drives, and where its mission leads."""
     mission = mission_of(scene[row : row + 1])
     limit, s = float(mission.limit[0, 10]), project(world.states[row : row + 1, :1, :2], mission.points)[0][0, 0]
     limited = f" (limit {limit:.0f} m/s)" if limit else ""
-    return f"The ego drives at {world.states[row, 0, 3]:.1f} m/s{limited}; its route {_course(mission.points[0], s)}."
+    course, speed = _course(mission.points[0], s), world.states[row, 0, 3]
+    return f"The ego drives at {speed:.1f} m/s{limited}; its route {course}.", texts
 
 
 def describe_vehicle(scene: TensorDictBase, world: World, conflicts: Conflicts, row: int, vehicle: int) -> str:
-    """A few sentences about `vehicle` of scene `row`: position, motion, and how its routes meet the ego's.
-
-    The numbers are those of the rules' conflict points; their verdict is not told.
-    """
+    """Position and motion of a vehicle, and where its routes meet the ego's by the rules, whose verdict is not told."""
     rows, here = slice(row, row + 1), slice(vehicle, vehicle + 1)
     state, ego, size = world.states[row, vehicle], world.states[row, 0], scene["size"][row, vehicle].tolist()
     sentences = [
@@ -163,11 +149,6 @@ def describe_vehicle(scene: TensorDictBase, world: World, conflicts: Conflicts, 
     return " ".join(sentences if len(sentences) > 1 else [*sentences, "It follows no lane."])
 
 
-FORMAT = {"type": "json_schema", "json_schema": {"name": "feasibility", "strict": True, "schema": SCHEMA}}
-COUNTS = ("lm_scenes", "lm_requests", "lm_cached", "lm_fallbacks")
-Reasoner = Callable[[TensorDictBase, World, FeasibilitySettings], Feasibility]
-
-
 @configured("synthesizer/e2", "reasoner")
 @dataclass(frozen=True)
 class ReasonerSettings:
@@ -186,16 +167,11 @@ class ReasonerSettings:
             raise InputError("synthesizer.reasoner.kind=lm: name a model with synthesizer.reasoner.model=NAME")
 
 
-def build_reasoner(settings: ReasonerSettings) -> Reasoner:
-    """Returns the rules or a LanguageReasoner."""
-    return feasible_vehicles if settings.kind == "rules" else LanguageReasoner(settings)
-
-
 class LanguageReasoner:
     """Asks an OpenAI-compatible endpoint; called as `feasible_vehicles` is.
 
-    statistics: lm_scenes judged, lm_requests sent, lm_cached answers, lm_fallbacks (scenes that the rules decided).
-    Warns of the 1st, 10th, 100th, ... fallback. Raises InputError without the client, a key or a writable cache.
+    statistics: lm_scenes judged, lm_requests sent, lm_cached answers, lm_fallbacks (scenes that the rules decided, the
+    1st, 10th, 100th, ... with a warning).
     """
 
     def __init__(self, settings: ReasonerSettings) -> None:
@@ -205,21 +181,19 @@ class LanguageReasoner:
         except ImportError as error:
             reason = "the openai client is not installed; install e2rl with its extra: pip install 'e2rl[lm]'"
             raise InputError(f"{where}: {reason}") from error
-        base_url, timeout = settings.base_url, settings.timeout
+        given = {"base_url": settings.base_url, "timeout": settings.timeout, "max_retries": settings.retries}
         try:
-            self._client = openai.OpenAI(base_url=base_url, timeout=timeout, max_retries=settings.retries)
+            self._client = openai.OpenAI(**given)
         except openai.OpenAIError as error:
             reason = f"{str(error).splitlines()[0]} (for an endpoint without keys any OPENAI_API_KEY will do)"
             raise InputError(f"{where}: {reason}") from error
         self._failures = (openai.OpenAIError, ValueError)
         self.settings, self._lock = settings, threading.Lock()
-        self.statistics = dict.fromkeys(COUNTS, 0)
+        self.statistics = dict.fromkeys(("lm_scenes", "lm_requests", "lm_cached", "lm_fallbacks"), 0)
 
     def __call__(self, scene: TensorDictBase, world: World, settings: FeasibilitySettings) -> Feasibility:
-        """Feasible vehicles of scenes [B]: by the model's verdicts on the three criteria, or the rules' where it fails.
-
-        The conflict points are always the rules', and neither the ego nor parked vehicles are ever feasible.
-        """
+        """Feasible vehicles of scenes [B]: by the model's verdicts on the three criteria, or the rules' where it fails;
+        never the ego nor parked ones. The conflict points are the rules'."""
         rules = feasible_vehicles(scene, world, settings)
         criteria = torch.stack([rules.associated, rules.conflicting, rules.relevant], -1).cpu()
         for row, verdicts in enumerate(self.judge(scene, world, rules)):
@@ -244,7 +218,8 @@ class LanguageReasoner:
             return {}
         self._count("lm_scenes")
         chat = messages(ego, vehicles)
-        path = self._path(chat)
+        key = json.dumps([self.settings.base_url, self.settings.model, chat, FORMAT], sort_keys=True)
+        path = Path(self.settings.cache) / f"{hashlib.sha256(key.encode()).hexdigest()}.json"
         with suppress(OSError, ValueError):  # no answer yet, or a damaged one: ask
             verdicts = read_answer(path.read_text(), list(vehicles))
             self._count("lm_cached")
@@ -254,7 +229,11 @@ class LanguageReasoner:
             answer = self._ask(chat)
             verdicts = read_answer(answer, list(vehicles))
         except self._failures as error:
-            self._fell_back(error)
+            count = self._count("lm_fallbacks")
+            if str(count).rstrip("0") == "1":
+                reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+                scenes = f"{count} of {self.statistics['lm_scenes']} scenes so far"
+                warnings.warn(f"language-model reasoner: the rules decided for {scenes} ({reason})", stacklevel=2)
             return None
         try:
             write_atomically(path, answer)
@@ -270,19 +249,7 @@ class LanguageReasoner:
             raise ValueError("the endpoint sent no answer")
         return completion.choices[0].message.content
 
-    def _path(self, chat: list[dict[str, str]]) -> Path:
-        """The cache file of a chat: by endpoint, model, prompt, description and schema."""
-        key = json.dumps([self.settings.base_url, self.settings.model, chat, FORMAT], sort_keys=True)
-        return Path(self.settings.cache) / f"{hashlib.sha256(key.encode()).hexdigest()}.json"
-
     def _count(self, name: str) -> int:
         with self._lock:
             self.statistics[name] += 1
             return self.statistics[name]
-
-    def _fell_back(self, error: Exception) -> None:
-        count = self._count("lm_fallbacks")
-        if str(count).rstrip("0") == "1":
-            reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-            scenes = f"{count} of {self.statistics['lm_scenes']} scenes so far"
-            warnings.warn(f"language-model reasoner: the rules decided for {scenes} ({reason})", stacklevel=2)

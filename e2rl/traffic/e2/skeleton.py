@@ -1,10 +1,8 @@
 """Interaction skeleton (Algorithm 2): near agents act on the ego, a distant one acts on them through a causal chain.
 
 The arg min / arg max over subsets of a sum of distances are the K nearest / farthest agents. Intermediate members of a
-chain are taken from S and join the coalition C*. The far agent is sought within MAX_DIST: the influence of the
-farthest of all would arrive last.
-
-`Selection` is what a choice of coalitions rested on, for whoever listens (`Traffic.on_decision`).
+chain are taken from S and join the coalition C*. The influence of the farthest of all would arrive last, so the far
+agent is sought within MAX_DIST.
 """
 
 from dataclasses import dataclass
@@ -20,8 +18,6 @@ from e2rl.traffic.e2.motion import compact, direction, frenet_pose, put, reachab
 from e2rl.traffic.e2.topology import TopologySettings
 
 LIMITS = ((1, 0), (2, 0), (1, 1))  # near and far agents of the causal templates single, pair and chain
-
-
 MAX_DIST = 80.0  # m; farther vehicles start no chain
 STEP = 0.5  # s between the moments that are looked at
 CORRIDOR = 2.5  # m from a route within which a vehicle is on it
@@ -145,11 +141,10 @@ def _first_after(link: Tensor) -> Tensor:
 def _shortest_chain(
     after: Tensor, start: Tensor, near: Tensor, blocked: Tensor, links: int
 ) -> tuple[Tensor, Tensor, list[Tensor]]:
-    """Fewest links from slot start [B] to a near slot that can still act on the ego, each no earlier than the last.
+    """Fewest links [B] (0 none) from slot start [B] to a near slot that can still act on the ego, each no earlier than
+    the last; that slot [B]; each layer's predecessors [B, M]. after: of _first_after; blocked: slots not to pass.
 
-    after [B, M, M + 1, K + 1] of _first_after; blocked [B, M]: slots not to pass. Breadth-first by the earliest arrival
-    at every slot, since departing later never arrives earlier. Returns the number of links [B] (0 none), the near slot
-    [B] and each layer's predecessors [B, M].
+    Breadth-first by the earliest arrival at every slot, since departing later never arrives earlier.
     """
     slots, never = near.shape[1], after.shape[-1] - 1
     arrival = torch.full_like(near, never, dtype=torch.int64).scatter(1, start[:, None], 0)
@@ -167,9 +162,7 @@ def _shortest_chain(
 
 
 def _link_chains(after: Tensor, near: Tensor, far: Tensor, max_links: int) -> tuple[Tensor, Tensor]:
-    """Targets [B, M] of the slots (M: the ego, -1: none), and the far slots [B, M] bool with a viable chain of at most
-    `max_links` links to a near slot.
-    """
+    """Targets [B, M] of slots (M: the ego, -1: none); far slots [B, M] with a chain of up to `max_links` links."""
     target = torch.where(near, near.shape[1], -1)
     viable = torch.zeros_like(far)
     initiators, there = compact(far)
@@ -235,7 +228,7 @@ def build_skeleton(
 
 @dataclass(frozen=True)
 class Selection:
-    """B scenes whose coalitions have just been chosen, in the batch's order of the moment.
+    """What a choice of coalitions in B scenes rested on, for whoever listens (`Traffic.on_decision`).
 
     seed [B]: of the scene's noise, which names the rollout; step [B]: of the choice; reference [B, T', V, 4]: states of
     the reference rollout at the steps looked at, moments [B, T'] s after the choice; weights [B, T', V, V]: pair risks

@@ -1,12 +1,8 @@
 """Topological bifurcation (Sec. IV-A1): the vehicles that a reference rollout entangles with the ego.
 
 Pairs are weighted by their time to collision (eq. ttc_weight), the maximal cliques of each step's risk graph are ranked
-by mean weight, and members of the top cliques score over time (eq. temporal_scoring). Batched up to the adjacency;
-networkx enumerates the cliques on the host.
-
-Only maximal cliques compete: the mean weight of a sub-clique's best pair is never below the clique's, so ranking all of
-them would leave pairs only. Cliques larger than `max_clique` (a queue, a pile of parked cars) are cut down to their
-heaviest members, the ego kept.
+by mean weight, and members of the top cliques score over time (eq. temporal_scoring). Only maximal cliques compete:
+the best pair of a clique never weighs less than the whole, so ranking all cliques would leave pairs only.
 """
 
 from dataclasses import dataclass
@@ -101,6 +97,18 @@ def maximal_cliques(adjacency: bytes, nodes: int) -> tuple[tuple[int, ...], ...]
     return tuple(tuple(sorted(clique)) for clique in networkx.find_cliques(networkx.Graph(edges.tolist())))
 
 
+def cliques_in(adjacency: np.ndarray) -> list[tuple[int, ...]]:
+    """Maximal cliques of size >= 2 of a graph [V, V] of bytes."""
+    nodes = np.flatnonzero(adjacency.any(-1))
+    found = maximal_cliques(np.ascontiguousarray(adjacency[np.ix_(nodes, nodes)]).tobytes(), len(nodes))
+    return [tuple(int(nodes[i]) for i in clique) for clique in found]
+
+
+def weight_of(clique: tuple[int, ...], weight: np.ndarray) -> float:
+    """Total weight [V, V] of a clique's pairs."""
+    return fsum(weight[i, j] for k, i in enumerate(clique) for j in clique[k + 1 :])
+
+
 def _within_hops(adjacency: Tensor, hops: int) -> Tensor:
     """Nodes [..., V] bool within `hops` edges of the ego (node 0)."""
     near = torch.zeros(adjacency.shape[:-1], dtype=torch.bool, device=adjacency.device)
@@ -124,18 +132,13 @@ def _top_cliques(graph: tuple[np.ndarray, ...], settings: TopologySettings) -> l
     graph: adjacency [V, V], relevant nodes [V] bool, weights [V, V], distance [V] of each vehicle to the ego in m.
     """
     adjacency, relevant, weight, distance = graph
-    nodes = np.flatnonzero(adjacency.any(-1))
-    if len(nodes) < 2:
-        return []
 
     def rank(clique: tuple[int, ...]) -> tuple[float, float, tuple[int, ...]]:
         size = len(clique)
-        total = fsum(weight[i, j] for k, i in enumerate(clique) for j in clique[k + 1 :])
-        return -round(total / (size * (size - 1) / 2), 6), fsum(distance[i] for i in clique) / size, clique
+        mean = weight_of(clique, weight) / (size * (size - 1) / 2)
+        return -round(mean, 6), fsum(distance[i] for i in clique) / size, clique
 
-    found = maximal_cliques(np.ascontiguousarray(adjacency[np.ix_(nodes, nodes)]).tobytes(), len(nodes))
-    named = (tuple(int(nodes[i]) for i in clique) for clique in found)
-    trimmed = {_trim(clique, weight, distance, settings.max_clique) for clique in named}
+    trimmed = {_trim(clique, weight, distance, settings.max_clique) for clique in cliques_in(adjacency)}
     return sorted((clique for clique in trimmed if relevant[list(clique)].any()), key=rank)[: settings.top_cliques]
 
 

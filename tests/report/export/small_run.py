@@ -1,5 +1,6 @@
 """A run's folder on two scenes of a fork with lights: in the first a car cuts in on the ego, which hits it."""
 
+import csv
 import json
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 import torch
 from omegaconf import OmegaConf
 
+from e2rl.commands.export import LIST, main
 from e2rl.evaluation.rollout_files import TABLE, write_rows
 from e2rl.metrics.score import score_rollouts
 from e2rl.scenes.recording import CYCLIST, OTHER, PEDESTRIAN
@@ -94,3 +96,10 @@ def row_of(rollout: Rollout, kind: int) -> int:
     name = {PEDESTRIAN: "pedestrian", CYCLIST: "cyclist", OTHER: "other"}[kind]
     (row,) = np.flatnonzero((rollout.agent_type == name) & rollout.valid.any(0))
     return int(row)
+
+
+def exported(run: Path, out: Path, *options: str) -> list[Path]:
+    """The files that `e2rl export` writes of all rollouts into a new folder, in their order."""
+    main([str(run), "--all", "--out", str(out), "--to", *options])
+    with (out / LIST).open(newline="") as file:
+        return [out / line["file"] for line in csv.DictReader(file)]

@@ -1,7 +1,6 @@
 """CommonRoad: commonroad-io's reader gets back every state, and the schema holds."""
 
 import copy
-import csv
 from pathlib import Path
 
 import numpy as np
@@ -12,24 +11,14 @@ import commonroad  # noqa: E402
 from commonroad.common.reader.file_reader_xml import XMLFileReader  # noqa: E402
 from lxml import etree  # noqa: E402
 
-from e2rl.commands.export import LIST, main
-from e2rl.scenes.commonroad import read_scenario
-from e2rl.scenes.recording import CYCLIST, OTHER, PEDESTRIAN
-from tests.report.export.small_run import CUT_IN, GAPS, LATE, TRUCK, rollout_of, row_of  # noqa: E402
+from tests.report.export.small_run import CUT_IN, GAPS, LATE, exported, rollout_of  # noqa: E402
 
 SCHEMA = Path(commonroad.__file__).parent / "common" / "xml_definition_files" / "XML_commonRoad_XSD.xsd"
 
 
-def written(run, out, *options):
-    """The files of all rollouts, in their order."""
-    main([str(run), "--to", "commonroad", "--all", "--out", str(out), *options])
-    with (out / LIST).open(newline="") as file:
-        return [out / line["file"] for line in csv.DictReader(file)]
-
-
 @pytest.fixture(scope="module")
 def files(run, tmp_path_factory):
-    return written(run, tmp_path_factory.mktemp("commonroad") / "out")
+    return exported(run, tmp_path_factory.mktemp("commonroad") / "out", "commonroad")
 
 
 @pytest.fixture(scope="module")
@@ -59,27 +48,11 @@ def test_every_state_comes_back_and_no_other(run, scenarios):
         assert (seen == rollout.valid & ~(single & (np.arange(81) == GAPS[2][0])[:, None])).all()
 
 
-def test_who_comes_back_is_a_further_obstacle_and_nobody_is_there_before_he_appears(scenarios):
-    scenario, _ = scenarios[0]
-    first = scenario.obstacle_by_id(LATE + 1)
-    assert states_of(first)[0].time_step == GAPS[0][0] and first.occupancy_at_time(GAPS[0][0] - 1) is None
-    assert first.state_at_time(GAPS[0][1] - 1) is not None and first.state_at_time(GAPS[0][1]) is None
-    begins = [states_of(obstacle)[0].time_step for obstacle in scenario.dynamic_obstacles]
-    assert sorted(begin for begin in begins if begin) == [GAPS[0][0], GAPS[1][0]]
-
-
-def test_types_are_those_of_the_agents(run, scenarios):
-    kind = {o.obstacle_id - 1: o.obstacle_type.value for o in scenarios[0][0].dynamic_obstacles}
-    rollout = rollout_of(run, 0)
-    assert [kind[row] for row in (0, CUT_IN, TRUCK)] == ["car", "car", "truck"]
-    found = [kind[row_of(rollout, which)] for which in (PEDESTRIAN, CYCLIST, OTHER)]
-    assert found == ["pedestrian", "bicycle", "unknown"]
-
-
 def test_files_follow_the_schema_but_for_late_starts(files):
     schema = etree.XMLSchema(etree.parse(str(SCHEMA)))
     for file in files:
         document = etree.parse(str(file))
+        assert [float(document.findtext(f".//{axis}Translation")) for axis in "xy"] == [28, 0]
         begins = document.findall(".//dynamicObstacle/initialState/time/exact")
         assert sorted(int(begin.text) for begin in begins)[-2:] == [GAPS[0][0], GAPS[1][0]]
         prompt = copy.deepcopy(document)
@@ -114,23 +87,7 @@ def test_the_mission_leads_from_the_start_to_where_the_recording_ends(run, scena
     assert (goal.time_step.start, goal.time_step.end) == (1, 80)
 
 
-def test_the_project_s_own_reader_finds_the_ego_and_the_agents(run, files):
-    recording = read_scenario(files[1].read_bytes())
-    rollout = rollout_of(run, 1)
-    ego = recording.states[:, recording.ego]
-    np.testing.assert_allclose(ego[:, :2], rollout.states[:, 0, :2], atol=0.01)
-    assert len(recording.lanes) == 4 and recording.location == "ZAM_aplace"
-    assert not recording.lights  # two lights stand at the fork, and the reader leaves such lanelets out
-
-
 def test_an_open_ego_is_a_planning_problem_only(run, tmp_path):
-    scenario, problems = XMLFileReader(str(written(run, tmp_path / "out", "--open-ego")[0])).open()
+    scenario, problems = XMLFileReader(str(exported(run, tmp_path / "out", "commonroad", "--open-ego")[0])).open()
     assert 1 not in {obstacle.obstacle_id for obstacle in scenario.dynamic_obstacles}
     assert scenario.obstacle_by_id(CUT_IN + 1) is not None and len(problems.planning_problem_dict) == 1
-
-
-def test_facts_and_origin_stand_in_the_file(files):
-    document = etree.parse(str(files[0]))
-    (comment,) = document.xpath("/commonRoad/comment()")
-    assert "scene_id: scene-0" in comment.text and f"adversaries: [{CUT_IN}]" in comment.text
-    assert [float(document.findtext(f".//{axis}Translation")) for axis in "xy"] == [28, 0]

@@ -1,6 +1,5 @@
 """OpenDRIVE: which links of the lane graph it says, and roads that lie where the lanes do."""
 
-import csv
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -9,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from e2rl.commands.export import LIST, main
 from e2rl.report.export.opendrive import FIT, junctions_of, left_out, links
 from e2rl.scenes.paths import resample, tangent_angle
 from e2rl.scenes.recording import Lane
+from tests.report.export.small_run import exported
 
 
 def graph(**exits: str) -> dict[str, Lane]:
@@ -52,11 +51,7 @@ def test_said_links_are_links_and_every_end_has_at_most_one_partner(pairs):
 def roads(run, tmp_path_factory):
     """(root of the OpenDRIVE file, its path) of the first rollout."""
     pytest.importorskip("scenariogeneration", reason="--to openscenario needs the extra openscenario")
-    out = tmp_path_factory.mktemp("opendrive") / "out"
-    main([str(run), "--to", "openscenario", "--out", str(out)])
-    with (out / LIST).open(newline="") as file:
-        (line,) = csv.DictReader(file)
-    path = (out / line["file"]).with_suffix(".xodr")
+    path = exported(run, tmp_path_factory.mktemp("opendrive") / "out", "openscenario")[0].with_suffix(".xodr")
     return ElementTree.parse(path).getroot(), path
 
 

@@ -3,14 +3,9 @@
 import pytest
 import torch
 
-from e2rl.prior.sde import SamplerSettings
-from e2rl.run.errors import InputError
-from e2rl.run.settings import file_values
 from e2rl.sim.world import World
-from e2rl.traffic.baselines.ctg import CTGAdv
 from e2rl.traffic.nominal import NominalTraffic
 from e2rl.traffic.rule_based import Replay
-from tests.prior.small import small_prior
 from tests.traffic.baselines.attacks import ADVERSARIES, SMALL, baseline, first_replan
 from tests.traffic.e2.traffic_scenes import EGO, begin, executed, replanned, scenes
 
@@ -92,25 +87,3 @@ def test_who_is_left_alone_replays_and_the_prior_sees_where_they_are(name):
         here = scene["valid"][:, :8] & ~driven
         torch.testing.assert_close(state.lane.states()[here][:, :3], logged.states[here][:, 4, :3])
     assert traffic.adversary.any() and not (traffic.adversary & ~driven).any()
-
-
-def test_settings_that_cannot_be_are_named():
-    for name, settings, word in (
-        ("ctg_adv", {"gain": -1.0}, "synthesizer.gain"),
-        ("strive", {"iterations": 0}, "synthesizer.iterations"),
-        ("cat", {"tracks": 99}, "synthesizer.tracks"),
-        ("diffscene", {"responsibility": "some"}, "synthesizer.responsibility"),
-    ):
-        with pytest.raises(InputError, match=word):
-            baseline(name, **settings)
-    for sampler in (SamplerSettings("dpm_solver_pp"), SamplerSettings(churn=0.0)):
-        with pytest.raises(InputError, match="CTGAdv moves the mean"):
-            CTGAdv(small_prior(0, sampler=sampler))
-
-
-@pytest.mark.parametrize("name", SMALL)
-def test_a_class_has_the_values_of_its_file_and_a_tuning_space_of_its_settings(name):
-    kind, values = SMALL[name][0], file_values(f"synthesizer/{name}")
-    on = kind(small_prior(0, sampler=SamplerSettings(steps=2)))
-    assert all(getattr(on, key) == value for key, value in values.items() if key not in ("name", "_target_"))
-    assert bool(on.tuned) == on.adversarial and set(on.tuned) <= set(values)

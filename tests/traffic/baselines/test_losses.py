@@ -1,6 +1,7 @@
 """Losses against closed forms and a pair by pair computation."""
 
 import math
+from itertools import permutations, product
 
 import pytest
 import torch
@@ -55,18 +56,10 @@ def test_pairs_cost_what_all_pairs_computed_one_by_one_cost():
     weights = torch.tensor([0.5, 0.3, 0.2])
     found = pair_term(states, view, disk_overlap(0.2), 0.2, weights)
     expected = torch.zeros_like(found)
-    for s in range(2):
-        for b in range(2):
-            for i in view.valid[b].nonzero()[:, 0]:
-                for j in view.valid[b].nonzero()[:, 0]:
-                    if i != j:
-                        pair = (
-                            states[s, b, i][None],
-                            view.size[b, i][None],
-                            states[s, b, j][None],
-                            view.size[b, j][None],
-                        )
-                        expected[s, b, i] += (disk_overlap(0.2)(*pair)[0] * weights).sum()
+    for s, b in product(range(2), range(2)):
+        for i, j in permutations(view.valid[b].nonzero()[:, 0].tolist(), 2):
+            first, second = ((states[s, b, k][None], view.size[b, k][None]) for k in (i, j))
+            expected[s, b, i] += (disk_overlap(0.2)(*first, *second)[0] * weights).sum()
     assert expected.max() > 0.1
     torch.testing.assert_close(found, expected)
     none = torch.ones_like(view.routed.conflict)

@@ -72,19 +72,3 @@ def test_an_ego_that_is_boxed_in_has_no_solution():
         motion.x, motion.y, motion.heading, motion.v = states.unbind(-1)
         found.append(on.solvable(first, motion, view, context).tolist())
     assert found == [[True], [False]]
-
-
-def test_a_solution_is_searched_for_where_the_planner_is_hit_alone():
-    """Elsewhere its own motion is one; a scene that is searched alone has the answer that it has among others."""
-    on = baseline("strive", iterations=10)
-    (now, context), view = first_replan(on, scenes(3).scenes)
-    first, states = now.noise[0, ..., 0, :], view.states[None, :, :, None].repeat(1, 1, 1, 10, 1)
-    states[..., 1] += 100.0 * (torch.arange(states.shape[2]) > 0)[:, None]
-    states[:, 1, 1] = view.ego[1]  # who drives where the planner of the second scene does
-    motion = motion_of(on.prior, torch.zeros_like(first), context, 1)
-    motion.x, motion.y, motion.heading, motion.v = states.unbind(-1)
-    searched, evaded = [], on.evaded
-    on.evaded = lambda *given: searched.append(len(given[0])) or evaded(*given)
-    found = on.solvable(first, motion, view, context)
-    assert searched == [1] and found[0] and found[2]
-    assert found[1] == evaded(first, states[0], view, context)[1]

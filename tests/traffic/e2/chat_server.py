@@ -32,15 +32,8 @@ def chat_server(answer):
             given = answer(request)
             status, text = given if isinstance(given, tuple) else (200, given)
             choice = {"index": 0, "finish_reason": "stop", "message": {"role": "assistant", "content": text}}
-            body = json.dumps(
-                {
-                    "id": "1",
-                    "object": "chat.completion",
-                    "created": int(time.time()),
-                    "model": "small",
-                    "choices": [choice],
-                }
-            ).encode()
+            named = {"id": "1", "object": "chat.completion", "created": int(time.time()), "model": "small"}
+            body = json.dumps(named | {"choices": [choice]}).encode()
             self.send_response(status)
             self.send_header("Content-Type", "application/json")
             self.send_header("Content-Length", str(len(body)))

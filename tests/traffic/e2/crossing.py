@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import torch
 
+from e2rl.prior.lane_relative import LaneState, speeds
 from e2rl.scenes.route import SPACING
 from e2rl.sim.world import World
 from e2rl.traffic.e2.motion import constant_speed_states
@@ -43,6 +44,13 @@ def add_route(world: World, vehicle: int, candidate: int, heading: float) -> Non
     arc = SPACING * torch.arange(world.scene["route_points"].shape[3]) - BACK
     world.scene["route_points"][:, vehicle, candidate] = state[:, None, :2] + arc[:, None] * forward
     world.scene["route_valid"][:, vehicle, candidate] = True
+
+
+def decoded(knots: torch.Tensor, speed: float, accel: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Speed and way [50] of one vehicle's knots [10], by the prior's decoder."""
+    state = LaneState(*(torch.zeros(()) for _ in range(10)))
+    state.v, state.a = torch.tensor(speed), torch.as_tensor(accel)
+    return speeds(state, knots)
 
 
 def mask(world: World, *vehicles: int) -> torch.Tensor:

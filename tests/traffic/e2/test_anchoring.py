@@ -3,33 +3,22 @@ import math
 import pytest
 import torch
 
-from e2rl.prior.lane_relative import LaneState, speeds
 from e2rl.scenes.recording import DT
 from e2rl.traffic.e2 import anchoring
 from e2rl.traffic.e2.anchoring import AnchorSettings, propose
 from e2rl.traffic.e2.interception import InterceptionSettings
 from e2rl.traffic.e2.motion import constant_speed_states
-from tests.traffic.e2.crossing import add_route, make_world, mask, skeleton_of
+from tests.traffic.e2.crossing import add_route, decoded, make_world, mask, skeleton_of
 
 UP = math.pi / 2
 EGO = (0.0, 0.0, 0.0, 10.0)
 TIMES = DT * torch.arange(1, 51)
-
-
 LANES = InterceptionSettings(reach=0.0)
 
 
 def proposed(world, skeleton, plan, settings=None, interception=LANES, eta=2.0, **options):
-    return propose(
-        world.scene,
-        world,
-        skeleton,
-        plan,
-        settings or AnchorSettings(),
-        interception,
-        torch.full((len(plan),), eta),
-        **options,
-    )
+    settings, etas = settings or AnchorSettings(), torch.full((len(plan),), eta)
+    return propose(world.scene, world, skeleton, plan, settings, interception, etas, **options)
 
 
 def anchored(world, *vehicles, near=2, **settings):
@@ -37,13 +26,6 @@ def anchored(world, *vehicles, near=2, **settings):
     skeleton = skeleton_of(world, support, near=near)
     plan = constant_speed_states(world.scene, world, TIMES)[:, 0]
     return proposed(world, skeleton, plan, AnchorSettings(**settings)), skeleton
-
-
-def travelled(knots, speed, accel=0.0):
-    """Way [50] of one vehicle's knots [10], by the prior's decoder."""
-    state = LaneState(*(torch.zeros(()) for _ in range(10)))
-    state.v, state.a = torch.tensor(speed), torch.tensor(accel)
-    return speeds(state, knots)[1]
 
 
 @pytest.mark.parametrize(
@@ -54,7 +36,7 @@ def test_both_arrive_at_the_crossing_at_once(ahead, way, speed):
     world = make_world([EGO, (ahead, -way, UP, speed)])
     anchor, _ = anchored(world, 1)
     assert anchor.feasible[0].tolist() == [False, True] + [False] * 6
-    gone = travelled(anchor.knots[0, 1], speed)
+    gone = decoded(anchor.knots[0, 1], speed)[1]
     arrival = torch.searchsorted(gone, torch.tensor(way)).item() * DT
     assert arrival == pytest.approx(ahead / 10, abs=0.25)
     assert anchor.cost[0, 1] < 0.25 + 0.2 * anchor.knots[0, 1].abs().max() and not anchor.off_lane.any()
@@ -143,7 +125,7 @@ def test_a_chain_s_first_link_meets_its_target_not_the_ego():
     world = make_world([EGO, (30.0, -20.0, UP, 8.0), (30.0, -38.0, UP, 8.0)])
     anchor, skeleton = anchored(world, 1, 2, near=1)
     assert skeleton.target[0, 1:3].tolist() == [0, 1] and anchor.feasible[0, 1:3].all()
-    gap = (18 + travelled(anchor.knots[0, 1], 8.0) - travelled(anchor.knots[0, 2], 8.0)).abs().min()
+    gap = (18 + decoded(anchor.knots[0, 1], 8.0)[1] - decoded(anchor.knots[0, 2], 8.0)[1]).abs().min()
     assert gap < 4.5  # the boxes would touch
 
 
@@ -152,20 +134,30 @@ def test_accelerations_are_bounded_and_bends_slow_down(monkeypatch):
     arc, radius = 2.0 * torch.arange(150) - 20, 15.0
     bend = (arc - 15).clamp(0, radius * math.pi / 2)  # straight up, then left on to the ego's lane, against it
     rest = (arc - 15 - radius * math.pi / 2).clamp(min=0)
-    line = torch.stack(
-        [
-            60 - radius * (1 - (bend / radius).cos()) - rest,
-            -15 + radius * (bend / radius).sin() + (arc - 15).clamp(max=0),
-        ],
-        -1,
-    )
-    world.scene["route_points"][:, 1, 0] = line
+    x = 60 - radius * (1 - (bend / radius).cos()) - rest
+    y = -15 + radius * (bend / radius).sin() + (arc - 15).clamp(max=0)
+    world.scene["route_points"][:, 1, 0] = torch.stack([x, y], -1)
     monkeypatch.setattr(anchoring, "MAX_OFFSET", 10.0)
     anchor, _ = anchored(world, 1)
     knots = anchor.knots[0, 1]
     assert knots.min() >= -5.0 and knots.max() <= 4.0 and anchor.feasible[0, 1]
-    state = LaneState(*(torch.zeros(()) for _ in range(10)))
-    state.v = torch.tensor(12.0)
-    speed, way = speeds(state, knots)
+    speed, way = decoded(knots, 12.0)
     inside = (way > 16) & (way < 34)
     assert inside.any() and (speed[inside] < 1.1 * math.sqrt(4.0 * radius)).all()
+
+
+@pytest.mark.parametrize(("beside", "crossing", "slack"), [(1.0, 0.2, 0.0), (-1.5, 0.1, 0.0), (0.0, 0.3, 3.0)])
+def test_the_time_gap_is_the_missing_distance_over_speed_and_what_the_target_still_has_to_cross(
+    beside, crossing, slack
+):
+    """At 10 m/s to a target that stays 30.5 m ahead: the nearest steps are half a metre off it."""
+    one, speed = torch.ones(1, 1, 1), torch.full((1, 1), 10.0)
+    ample, size = torch.full((1, 1, 1, anchoring.BEND_VERTICES), 1e4), torch.tensor([[[4.0, 2.0]]])
+    candidates = anchoring._Candidates(
+        one.long(), one, one.bool(), 200 * one, 0 * one, 0 * one, ample, speed, 0 * speed, size
+    )
+    steps = torch.ones(1, 1, 1, 50)
+    target = anchoring._Target(30.5 * steps, beside * steps, slack * steps, crossing * steps, torch.full((1, 1), 2.0))
+    cost, gap, _ = anchoring._score(candidates, torch.zeros(1, 1, 1, 1), target, AnchorSettings())
+    expected = max(0.5 - slack, 0.0) / 10 + abs(beside) * crossing
+    assert gap.item() == pytest.approx(expected, abs=1e-4) and cost.item() == pytest.approx(expected, abs=1e-4)

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE
-from e2rl.run.errors import InputError
 from e2rl.traffic.e2 import control as control_module
 from e2rl.traffic.e2.anchoring import Anchor
 from e2rl.traffic.e2.control import ControlSettings, SparseControl, clip_rows
@@ -36,41 +35,20 @@ class Case:
         self.coalition[:, MEMBER] = True
         self.context = self.prior.encode(routed, state, self.scene["start"], self.scene["valid"], step, plan)
         target = torch.where(self.coalition, 0, -1)
-        self.where = PotentialContext(
-            self.scene,
-            self.scene["start"][:, :ROWS],
-            state.a,
-            self.scene["valid"][:, :ROWS],
-            routed.points,
-            routed.has_lane,
-            plan,
-            target,
-        )
-        self.anchor = Anchor(
-            route,
-            torch.full((count, ROWS, KNOTS), -2.0),
-            self.coalition.clone(),
-            torch.zeros(count, ROWS),
-            self.coalition & False,
-            routed.points,
-        )
+        now = self.scene["start"][:, :ROWS], state.a, self.scene["valid"][:, :ROWS]
+        self.where = PotentialContext(self.scene, *now, routed.points, routed.has_lane, plan, target)
+        feasible, none = self.coalition.clone(), self.coalition & False
+        knots = torch.full((count, ROWS, KNOTS), -2.0)
+        self.anchor = Anchor(route, knots, feasible, torch.zeros(count, ROWS), none, routed.points)
         self.generator = torch.Generator().manual_seed(0)
         self.noise = torch.randn(self.prior.sampler.steps, count, ROWS, SIZE, generator=self.generator)
 
     def control(self, eta=1.0, strength=0.0, **settings):
         eta = torch.full((len(self.scene),), eta) if isinstance(eta, float) else torch.tensor(eta)
         extra = torch.randn(len(self.scene), ROWS, SIZE, generator=torch.Generator().manual_seed(7))
-        return SparseControl(
-            self.prior,
-            ControlSettings(**({"adversarial_clip": 0.5} | settings)),
-            PotentialSettings(),
-            self.where,
-            self.coalition,
-            eta,
-            self.anchor,
-            strength,
-            extra,
-        )
+        chosen = ControlSettings(**({"adversarial_clip": 0.5} | settings)), PotentialSettings()
+        given = self.where, self.coalition, eta, self.anchor
+        return SparseControl(self.prior, *chosen, *given, strength, extra)
 
     def shift(self, level=0.5, k=1, seed=0, **options):
         """(x0 after - x0 before control, x after - x before anchoring) at one noise level."""
@@ -80,21 +58,8 @@ class Case:
         after, nominal, x0 = control(x, level, k, self.context, lambda y: self.prior.denoise(y, level, self.context))
         return x0 - nominal, after - x
 
-    def values(self, x0):
-        states = self.prior.decode(x0, self.context, steps=SAMPLED_STEPS).states()
-        return (
-            adversarial_potential(states, self.where, PotentialSettings())[:, MEMBER],
-            feasibility_potential(states, self.where, PotentialSettings())[:, 1:].sum(-1),
-        )
-
 
 OTHERS = [i for i in range(ROWS) if i != MEMBER]
-
-
-@pytest.mark.parametrize("gradient", ["denoiser", "clean"])
-def test_v_adv_moves_members_of_the_coalition_only(gradient):
-    shift, _ = Case().shift(feasibility=0.0, gradient=gradient)
-    assert (shift[:, OTHERS] == 0).all() and (shift[:, MEMBER] != 0).any()
 
 
 def crowded():
@@ -103,12 +68,6 @@ def crowded():
     case.scene["start"][:, 2, 1] = 2.2
     case.context.state.d[:, 2] = -1.3
     return case
-
-
-def test_feasibility_may_move_others_but_never_the_ego_parked_or_absent_ones():
-    shift, _ = crowded().shift(feasibility_clip=5.0)
-    assert (shift[:, [0, 5, 6, 7]] == 0).all()
-    assert (shift[:, [2, 3, 4]] != 0).any(), "feasibility acts beyond the support"
 
 
 @pytest.mark.parametrize("level", [0.5, 1.0])
@@ -168,23 +127,6 @@ def test_clipping_keeps_directions_and_short_rows():
     assert (clip_rows(rows, 0.0) == 0).all(), "a clip of 0 is no shift, also where there is no gradient"
 
 
-@pytest.mark.parametrize("gradient", ["denoiser", "clean"])
-def test_guidance_lowers_the_adversarial_potential_and_more_of_it_lowers_it_more(gradient):
-    case = Case(count=16)
-    values = []
-    for eta in (0.0, 1.0, 3.0):
-        control = case.control(eta=eta, gradient=gradient, feasibility=0.0)
-        values.append(case.values(case.prior.sample(case.context, case.noise, control).x0)[0].mean().item())
-    assert values[2] < values[1] < values[0]
-
-
-def test_zero_intensity_sampling_is_the_nominal_sample_bit_for_bit():
-    case = Case()
-    nominal = case.prior.sample(case.context, case.noise)
-    guided = case.prior.sample(case.context, case.noise, case.control(eta=0.0, strength=1.0))
-    assert torch.equal(guided.x0, nominal.x0) and (guided.kl == 0).all()
-
-
 def anchored(case, strength, **settings):
     """x at the anchor's level before and after it, for x = alpha x0 + sigma e with the denoiser's own x0."""
     control = case.control(strength=strength, **settings)
@@ -234,10 +176,3 @@ def test_anchoring_happens_once_at_the_level_nearest_to_the_set_one_and_can_be_o
     assert (case.shift(k=step, strength=0.5, anchoring="off")[1] == 0).all()
     case.anchor.feasible[:] = False
     assert (case.shift(k=step, strength=0.5)[1] == 0).all(), "members that cannot meet their target are not anchored"
-
-
-def test_settings_are_checked():
-    for wrong in ({"gradient": "x"}, {"scaling": "unit"}, {"anchoring": "x"}, {"transport_budget": -1.0}):
-        with pytest.raises(InputError, match=f"synthesizer.control.{next(iter(wrong))}"):
-            ControlSettings(**wrong)
-    assert ControlSettings().transport_budget is None

@@ -5,19 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-import e2rl
 from e2rl.planners.idm_planner import IDMEgo
-from e2rl.run.errors import InputError
-from e2rl.scenes.builder import BuildSettings
-from e2rl.scenes.bundled import BundledSource
-from e2rl.scenes.source import load_scenes
 from e2rl.sim.env import SimSettings
 from e2rl.sim.world import World
 from e2rl.traffic.e2 import e2
-from e2rl.traffic.e2.potentials import PotentialSettings
 from e2rl.traffic.nominal import NominalTraffic
-from e2rl.traffic.rollout import roll_out, synthesize_traffic
-from e2rl.traffic.traffic import CHAIN, FULL, PAIR, SINGLE
+from e2rl.traffic.rollout import synthesize_traffic
+from e2rl.traffic.traffic import FULL, PAIR, SINGLE
 from tests.traffic.e2.traffic_scenes import EGO, begin, replanned, scenes, synthesizer
 
 
@@ -106,22 +100,6 @@ def test_who_leaves_its_lane_returns_to_it_once_it_meets_nobody():
     assert not calm.off_lane.any() and torch.equal(calm.routed.points, lanes.routed.points)
 
 
-def test_a_listener_hears_of_every_choice_and_changes_nothing():
-    heard, scene = [], scenes(3).scenes
-    for eta in (0.0, 2.0):
-        silent, listened = synthesizer(), synthesizer()
-        listened.on_decision = heard.append
-        state, plan = replanned(listened, scene, eta, [5, 6, 7])
-        assert torch.equal(plan.states, replanned(silent, scene, eta, [5, 6, 7])[1].states)
-        assert bool(heard) == (eta > 0)
-    (chosen,) = heard
-    assert chosen.seed.tolist() == [5, 6, 7] and chosen.step.tolist() == [0, 0, 0]
-    used = chosen.coalition.shape[1]
-    assert torch.equal(chosen.coalition, state.coalition[:, :used]) and chosen.weights.shape[2:] == (used, used)
-    assert torch.equal(chosen.target, state.target[:, :used]) and not (chosen.coalition & ~chosen.feasible).any()
-    assert chosen.reference.shape[:3] == chosen.weights.shape[:3] and chosen.moments[0, 0] == pytest.approx(0.1)
-
-
 @pytest.mark.parametrize("support", ["topology", "random"])
 def test_the_other_supports_choose_a_coalition_too(support):
     """The ablations: whoever topology finds, or anybody who is there and not parked, drawn by the scene's seed."""
@@ -150,81 +128,7 @@ def test_the_transport_budget_of_a_rollout_holds_and_is_used(sampler):
     torch.testing.assert_close(spent(2 * float(free.max())), free, rtol=1e-3, atol=1e-4)
 
 
-def test_what_is_no_setting_is_refused_by_name():
-    for wrong, message in (
-        ({"support": "everybody"}, "synthesizer.support=everybody"),
-        ({"control": {"strength": 2}}, "synthesizer.control.strength"),
-        ({"control": {"gradient": "none"}}, "synthesizer.control.gradient=none"),
-    ):
-        with pytest.raises(InputError, match=message):
-            synthesizer(**wrong)
-
-
-def test_groups_of_settings_may_be_given_in_part_and_the_rest_is_the_file_s():
-    on = synthesizer(skeleton={"near": 5}, potentials=PotentialSettings(ttc=0.0))
-    assert (on.skeleton.near, on.skeleton.far, on.potentials.ttc) == (5, 1, 0.0)
-    assert on.control.feasibility == 4.0 and on.knowledge == "predicted"
-
-
-@pytest.mark.parametrize(
-    ("changes", "names"),
-    [
-        ({}, ["interception.lateral", "interception.push"]),
-        ({"control": {"adversarial_clip": 0.5}}, ["control.adversarial_clip", "interception.lateral"]),
-        ({"skeleton": {"pursuit": True}}, ["control.adversarial_clip", "potentials.distance"]),
-    ],
-)
-def test_its_tuning_space_begins_with_what_stands_for_a_gain(changes, names):
-    on = synthesizer(**changes)
-    assert list(on.tuned) == names and all(low < high for low, high, *_ in on.tuned.values())
-    assert all(hasattr(getattr(on, name.split(".")[0]), name.split(".")[1]) for name in names)
-
-
 # --- causal templates limit the coalitions, scene by scene; `full` changes nothing
-
-COUNT = 16
-
-
-@pytest.fixture(scope="module")
-def bundled(tmp_path_factory):
-    """The bundled tune scenes, the shipped prior, and e2 as configured but for few denoising steps."""
-    build = BuildSettings(field_cells=128, steps=20)
-    source = BundledSource(cache=str(tmp_path_factory.mktemp("cache")), workers=1, build=build)
-    return load_scenes(source, COUNT, split="tune"), e2rl.make_traffic("e2", e2rl.load_prior(sampler={"steps": 2}))
-
-
-def selections(bundled, template):
-    """Coalitions [K, V] and targets chosen in a rollout of every scene, with the template of each row."""
-    scene_set, on = bundled
-    index, found = torch.arange(COUNT), []
-    on.on_decision = lambda chosen: found.append((chosen.seed, chosen.coalition, chosen.target))
-    driven = roll_out(
-        scene_set, index, index, torch.full((COUNT,), 3.0), IDMEgo(), on, SimSettings(), template=template
-    )
-    on.on_decision = None
-    return found, driven
-
-
-def test_coalitions_on_the_bundled_scenes_keep_to_their_template(bundled):
-    template = torch.arange(COUNT) % 3
-    found, driven = selections(bundled, template)
-    most = {SINGLE: 1, PAIR: 2, CHAIN: 1}
-    seen = dict.fromkeys(most, 0)
-    for seed, coalition, target in found:
-        for row, code in enumerate(template[seed].tolist()):
-            near, through = int((target[row] == 0).sum()), int((target[row] > 0).sum())
-            assert near <= most[code] and (code == CHAIN or through == 0)
-            assert near + through == int(coalition[row].sum())
-            seen[code] = max(seen[code], near)
-    assert seen == most, "and use it up"
-    assert driven.adversaries.any()
-
-
-def test_full_is_what_the_settings_say_bit_for_bit(bundled):
-    _, whole = selections(bundled, None)
-    found, again = selections(bundled, torch.full((COUNT,), FULL))
-    assert all(torch.equal(whole.get(name), again.get(name)) for name in ("states", "valid", "adversaries", "routes"))
-    assert max(int((target == 0).sum(1).max()) for _, _, target in found) == 3
 
 
 def test_templates_reach_the_rows_of_synthesized_traffic():

@@ -3,10 +3,8 @@ import math
 import pytest
 import torch
 
-from e2rl.run.errors import InputError
 from e2rl.traffic.e2.feasibility import EGO_ACCELERATION, FeasibilitySettings, feasible_vehicles
-from e2rl.traffic.e2.motion import MAX_BRAKING, arrival_window, compact, reachable_distance
-from e2rl.traffic.e2.reasoner import describe
+from e2rl.traffic.e2.motion import MAX_BRAKING, arrival_window, reachable_distance
 from tests.traffic.e2.crossing import add_route, make_world
 
 UP, LEFT = math.pi / 2, math.pi
@@ -127,23 +125,3 @@ def test_arrival_windows_solve_the_equations_of_motion():
     assert latest.tolist()[:2] == [torch.inf, torch.inf]
     assert 10 * latest[2] - MAX_BRAKING / 2 * latest[2] ** 2 == pytest.approx(9.0, abs=1e-4)
     assert arrival_window(torch.tensor(-3.0), torch.tensor(7.0))[1] == 0
-
-
-def test_compact_lists_true_entries_first():
-    index, present = compact(torch.tensor([[False, True, True], [False, False, False]]))
-    assert index[0].tolist() == [1, 2] and present.tolist() == [[True, True], [False, False]]
-
-
-def test_the_description_names_position_motion_and_conflict():
-    world = make_world([EGO, (50.0, -40.0, UP, 10.0)])
-    conflicts = feasible_vehicles(world.scene, world, SETTINGS).conflicts
-    ego, vehicles = describe(world.scene, world, conflicts, 0)
-    (text,) = vehicles.values()
-    assert ego.startswith("The ego drives at 10.0 m/s") and ego.endswith("goes straight on.")
-    for part in ("50 m ahead of it and 40 m to its right", "90 degrees to the left", "10.0 m/s", "in 40 m"):
-        assert part in text, text
-
-
-def test_a_corridor_narrower_than_the_sampling_is_refused():
-    with pytest.raises(InputError, match="corridor"):
-        FeasibilitySettings(corridor=2.0)

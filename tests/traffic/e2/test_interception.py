@@ -4,14 +4,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from e2rl.prior.lane_relative import LaneState, speeds
 from e2rl.scenes.boxes import overlap
 from e2rl.scenes.drivable_area import CELL
 from e2rl.scenes.recording import DT, LIGHT_GREEN, LIGHT_RED
 from e2rl.scenes.route import SPACING, interpolate
 from e2rl.traffic.e2.interception import InterceptionSettings, cubic, intercept
 from e2rl.traffic.e2.motion import constant_speed_states
-from tests.traffic.e2.crossing import make_world
+from tests.traffic.e2.crossing import decoded, make_world
 
 UP = math.pi / 2
 EGO = (0.0, 0.0, 0.0, 10.0)
@@ -31,9 +30,7 @@ def met(vehicles, eta=2.0, settings=FREE, world=None, halt_at_red=False):
 
 def driven(found, speed):
     """States [50, 4] of the vehicle on its way, by the prior's decoder of speeds."""
-    state = LaneState(*(torch.zeros(()) for _ in range(10)))
-    state.v, state.a = torch.tensor(speed), found.knots[0, 0, 0]
-    v, way = speeds(state, found.knots[0, 0])
+    v, way = decoded(found.knots[0, 0], speed, found.knots[0, 0, 0])
     xy, heading, _ = interpolate(found.path[0, 0], way)
     return torch.cat([xy, heading[:, None], v[:, None]], -1)
 
@@ -135,14 +132,6 @@ def test_a_path_that_ends_against_every_lane_costs_what_is_set_and_is_not_made_a
     dear = met(None, settings=replace(FREE, wrong_way=1.5), world=oncoming_world())[0].cost
     assert dear.item() == pytest.approx(free.item() + 1.5, abs=1e-5)
     assert met(None, settings=replace(FREE, wrong_way=math.inf), world=oncoming_world())[0].cost.isinf()
-
-
-def test_whoever_drives_with_the_lanes_or_where_there_is_none_costs_no_more():
-    dear = replace(FREE, wrong_way=math.inf)
-    assert torch.equal(met([EGO, BESIDE], settings=dear)[0].cost, met([EGO, BESIDE])[0].cost)
-    world = oncoming_world()
-    world.scene["lane_index"][:] = -1
-    assert torch.equal(met(None, settings=dear, world=world)[0].cost, met(None, world=oncoming_world())[0].cost)
 
 
 @pytest.mark.parametrize("line, finite", [(40.0, False), (200.0, True)])

@@ -34,70 +34,28 @@ def adversarial_potential(states, context, settings, *temperature):
 POTENTIALS = [feasibility_potential, adversarial_potential]
 
 
-def situation(*vehicles, targets=(), copies=1):
+def situation(*vehicles, targets=()):
     """Cruising states [B, 8, 50, 4] in float64, and their context; targets: (vehicle, target) pairs."""
-    world = make_world([EGO, *vehicles], copies)
+    world = make_world([EGO, *vehicles])
     states = constant_speed_states(world.scene, world, 0.1 * torch.arange(1, 51)).double()
     scene = world.scene.apply(lambda x: x.double() if x.dtype == torch.float32 else x)
-    target = torch.full((copies, 8), -1)
+    target = torch.full((1, 8), -1)
     for vehicle, aim in targets:
         target[:, vehicle] = aim
-    return states, PotentialContext(
-        scene,
-        scene["start"][:, :8],
-        scene["start_accel"][:, :8],
-        world.valid[:, :8],
-        scene["route_points"][:, :, 0],
-        scene["route_valid"].any(-1),
-        states[:, 0].clone(),
-        target,
-    )
+    now = scene["start"][:, :8], scene["start_accel"][:, :8], world.valid[:, :8]
+    path = scene["route_points"][:, :, 0], scene["route_valid"].any(-1)
+    return states, PotentialContext(scene, *now, *path, states[:, 0].clone(), target)
 
 
-def rough(states, seed=0):
-    """Perturbed plans: every term is at work."""
-    generator = torch.Generator().manual_seed(seed)
-    scale = torch.tensor([1.0, 1.0, 0.3, 1.5], dtype=torch.float64)
-    return states + scale * torch.randn(states.shape, generator=generator, dtype=torch.float64)
-
-
-def busy(copies=1):
-    states, context = situation(
-        (12.0, 2.0, 0.1, 9.0),
-        (20.0, -8.0, UP, 6.0),
-        (22.0, -12.0, UP, 7.0),
-        (15.0, 3.0, 0.0, 10.0),
-        targets=[(1, 0), (2, 1)],
-        copies=copies,
-    )
+def busy():
+    """Perturbed plans of a crowd off the road, so that every term is at work."""
+    crowd = [(12.0, 2.0, 0.1, 9.0), (20.0, -8.0, UP, 6.0), (22.0, -12.0, UP, 7.0), (15.0, 3.0, 0.0, 10.0)]
+    states, context = situation(*crowd, targets=[(1, 0), (2, 1)])
     field = torch.linspace(-4, 4, context.scene["field"].shape[-1]).half()
     context.scene["field"] = field.expand_as(context.scene["field"]).contiguous()
-    return rough(states), context
-
-
-@pytest.mark.parametrize("potential", POTENTIALS)
-def test_gradients_are_those_of_finite_differences(potential, monkeypatch):
-    states, context = busy()
-    # The impact term is left out: the moment of the impact is detached in it, by design.
-    monkeypatch.setattr(potentials, "MAX_JERK", 0.5)
-    monkeypatch.setattr(potentials, "MAX_LATERAL_ACCEL", 0.5)
-    settings = replace(SETTINGS, impact_speed=0.0)
-    states.requires_grad_()
-    value = potential(states, context, settings)
-    gradient = torch.autograd.grad(value.sum(), states)[0]
-    assert gradient.abs().sum(-1)[0, 1:3].amax(-1).min() > 0
-    generator = torch.Generator().manual_seed(1)
-    step, checked = 1e-6, 0
-    with torch.no_grad():
-        for _ in range(60):
-            i, h, c = (int(torch.randint(n, (), generator=generator)) for n in (5, 10, 4))
-            shift = torch.zeros_like(states)
-            shift[0, i, 5 * h + 4, c] = step
-            up, down = (potential(states + way * shift, context, settings)[0, i] for way in (1, -1))
-            moved = up - down
-            assert moved / (2 * step) == pytest.approx(gradient[0, i, 5 * h + 4, c].item(), rel=1e-3, abs=1e-4)
-            checked += abs(moved) > 0
-    assert checked > 8
+    scale = torch.tensor([1.0, 1.0, 0.3, 1.5], dtype=torch.float64)
+    noise = torch.randn(states.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return states + scale * noise, context
 
 
 @pytest.mark.parametrize("potential", POTENTIALS)
@@ -265,10 +223,3 @@ def test_the_temperature_anneals_from_wide_to_narrow():
     levels = annealed_temperature(torch.linspace(0, 1, 5), SETTINGS)
     assert levels[0] == pytest.approx(SETTINGS.narrow) and levels[-1] == pytest.approx(SETTINGS.wide)
     assert (levels.diff() > 0).all()
-    states, context = situation((30.0, -60.0, UP, 10.0), targets=[(1, 0)])
-    states.requires_grad_()
-    felt = []
-    for temperature in (SETTINGS.narrow, SETTINGS.wide):
-        value = adversarial_potential(states, context, SETTINGS, temperature).sum()
-        felt.append((torch.autograd.grad(value, states)[0].norm(dim=-1) > 1e-3).sum())
-    assert felt[1] > felt[0]

@@ -2,19 +2,14 @@
 
 import json
 import math
-import sys
-import threading
-import warnings
 
 import pytest
 import torch
 
-from e2rl.run.errors import InputError
 from e2rl.traffic.e2.feasibility import FeasibilitySettings, feasible_vehicles
-from e2rl.traffic.e2.reasoner import CRITERIA, LanguageReasoner, ReasonerSettings, build_reasoner, read_answer
+from e2rl.traffic.e2.reasoner import CRITERIA, LanguageReasoner, ReasonerSettings, read_answer
 from tests.traffic.e2.chat_server import chat_server, verdicts
 from tests.traffic.e2.crossing import make_world
-from tests.traffic.e2.traffic_scenes import synthesizer
 
 pytest.importorskip("openai")
 RULES = FeasibilitySettings()
@@ -104,43 +99,6 @@ def test_answers_are_kept_by_content(tmp_path):
             path.write_text("{")
         ask(url, tmp_path, world())
         assert len(requests) == 4, "damaged answers are not believed"
-
-
-def test_scenes_do_not_wait_for_each_other_and_do_not_mix(tmp_path):
-    together = threading.Barrier(2)  # nobody is answered before a second one asks
-
-    def half(request):
-        together.wait(60)
-        return (500, "") if "13.0 m/s" in request["messages"][-1]["content"] else verdicts(request)
-
-    made = world(6)
-    with chat_server(half) as (url, _), pytest.warns(UserWarning):
-        result, counts = ask(url, tmp_path, made)
-    assert result.mask[:, 2].tolist() == [True, True, True, False, True, True] and counts["lm_fallbacks"] == 1
-
-
-def test_the_synthesizer_counts_and_the_rules_are_the_default(tmp_path):
-    assert build_reasoner(ReasonerSettings()) is feasible_vehicles
-    with chat_server(verdicts) as (url, _):
-        settings = {"kind": "lm", "model": "small", "base_url": url, "cache": str(tmp_path)}
-        made, on = world(), synthesizer(reasoner=settings)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            on.feasible_vehicles(made.scene, made, RULES)
-    assert on.feasible_vehicles.statistics["lm_requests"] == 1
-
-
-def test_what_is_missing_is_said(monkeypatch):
-    with pytest.raises(InputError, match="name a model"):
-        ReasonerSettings(kind="lm")
-    with pytest.raises(InputError, match="kind=oracle"):
-        ReasonerSettings(kind="oracle")
-    monkeypatch.delenv("OPENAI_API_KEY")
-    with pytest.raises(InputError, match="OPENAI_API_KEY"):
-        LanguageReasoner(ReasonerSettings("lm", "small"))
-    monkeypatch.setitem(sys.modules, "openai", None)
-    with pytest.raises(InputError, match="pip install"):
-        LanguageReasoner(ReasonerSettings("lm", "small"))
 
 
 def test_answers_must_be_about_whom_was_asked():

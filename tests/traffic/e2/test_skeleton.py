@@ -6,14 +6,9 @@ from itertools import permutations
 import pytest
 import torch
 
-from e2rl.run.errors import InputError
 from e2rl.traffic.e2 import skeleton
-from e2rl.traffic.e2.anchoring import AnchorSettings, propose
-from e2rl.traffic.e2.feasibility import FeasibilitySettings, feasible_vehicles
-from e2rl.traffic.e2.interception import InterceptionSettings
 from e2rl.traffic.e2.motion import constant_speed_states
 from e2rl.traffic.e2.skeleton import STEP, SkeletonSettings, influence, lane_of, limits_of
-from e2rl.traffic.e2.topology import TopologySettings, topological_candidates
 from e2rl.traffic.traffic import CHAIN, FULL, PAIR, SINGLE
 from tests.traffic.e2.crossing import add_route, make_world, mask, skeleton_of
 
@@ -89,13 +84,6 @@ def test_the_ego_s_own_neighbour_and_following_lanes_hold_no_initiator():
             world.scene[lane][:, 0] = 1
         states, asked = world.states[:, [0, 2]], torch.tensor([[True]])
         assert skeleton._on_ego_lanes(states, asked, world.scene).item() != counts, lane
-
-
-def test_an_empty_support_falls_back_to_the_nearest_feasible_then_to_nobody():
-    world = make_world([EGO, (40.0, -30.0, UP, 8.0), (12.0, 3.5, 0.0, 10.0), (20.0, 3.5, 0.0, 9.0)], copies=3)
-    support, feasible = mask(world, 1), mask(world, 1, 2, 3)
-    support[1:], feasible[2] = False, False
-    assert members(skeleton_of(world, support, feasible, near=2)) == [[0, 1], [1, 2], [1, 3]]
 
 
 def test_pursuit_takes_the_nearest_of_the_support_where_nobody_can_meet_the_ego():
@@ -188,27 +176,6 @@ def test_a_chain_is_a_shortest_one_whose_effects_never_precede_their_causes(seed
     assert set(result.coalition[0].nonzero()[:, 0].tolist()) == {i + 1 for i in near} | set(way[:-1])
 
 
-def test_some_of_the_random_worlds_have_a_chain_and_some_have_none():
-    depths = []
-    for seed in range(12):
-        world = random_world(seed)
-        result = skeleton_of(world, mask(world, *range(1, 8)), near=2, far=1, tau_long=25.0, max_chain=4)
-        depths.append(int(result.depth.max()))
-    assert set(depths) >= {1, 2, 3}
-
-
-def test_absent_vehicles_take_no_part():
-    world = make_world([EGO, *COLUMN], copies=4)
-    for row, vehicle in enumerate((1, 2, 3)):
-        world.valid[row, vehicle] = False
-    assert members(skeleton_of(world, mask(world, 1, 2, 3), near=1)) == [
-        *([0, 2], [0, 3]),
-        [1, 1],
-        *([2, 1], [2, 2]),
-        *([3, 1], [3, 2], [3, 3]),
-    ]
-
-
 def test_any_candidate_route_may_lead_to_the_target():
     world = make_world([EGO, COLUMN[0], (10.0, -40.0, UP, 20.0)])
     assert not skeleton_of(world, mask(world, 1, 2), near=1).far.any()
@@ -228,20 +195,3 @@ def test_causal_templates_limit_each_scene_by_itself():
     assert torch.equal(result.coalition[:2], result.near[:2]) and (result.target[:3] == 0).sum(1).tolist() == [1, 2, 1]
     alone = skeleton_of(world, support, near=3)
     assert all(torch.equal(getattr(result, name)[3], getattr(alone, name)[3]) for name in vars(alone))
-
-
-def test_bad_settings_are_refused():
-    with pytest.raises(InputError, match="synthesizer.skeleton.near"):
-        SkeletonSettings(near=0)
-
-
-def test_an_ego_alone_passes_through_every_room():
-    world = make_world([EGO], copies=2)
-    scene, plan = world.scene, world.scene["logged"][:, 1:51, 0]
-    found = topological_candidates(
-        scene["logged"][:, :, :8], scene["logged_valid"][:, :, :8], scene["size"][:, :8], TopologySettings()
-    )
-    feasible = feasible_vehicles(scene, world, FeasibilitySettings()).mask
-    result = skeleton_of(world, found.candidates & feasible, feasible)
-    anchor = propose(scene, world, result, plan, AnchorSettings(), InterceptionSettings(), torch.full((2,), 2.0))
-    assert not (found.candidates | feasible | result.coalition | anchor.feasible).any()

@@ -3,13 +3,11 @@
 import math
 from itertools import combinations
 
-import networkx
 import numpy as np
 import pytest
 import shapely
 import torch
 
-from e2rl.run.errors import InputError
 from e2rl.scenes.boxes import corners
 from e2rl.traffic.e2 import topology
 from e2rl.traffic.e2.topology import (
@@ -17,7 +15,6 @@ from e2rl.traffic.e2.topology import (
     HORIZON,
     STRIDE,
     TopologySettings,
-    maximal_cliques,
     pair_weights,
     time_to_collision,
     topological_candidates,
@@ -80,14 +77,6 @@ def test_weights_are_the_sigmoid_of_the_ttc_and_nothing_for_the_absent():
     weight = pair_weights(states, torch.tensor([True, True, False]), torch.tensor([4.0, 2.0]).expand(3, 2), settings)
     assert weight[0, 1].item() == pytest.approx(1 / (1 + math.exp((2.9 - 2.5) / 0.5)))
     assert weight[1, 0] == weight[0, 1] and weight[2].sum() == 0 and weight.diagonal().sum() == 0
-
-
-def test_cliques_are_those_of_networkx():
-    generator = np.random.default_rng(0)
-    adjacency = np.triu(generator.random((9, 9)) < 0.5, 1)
-    adjacency = (adjacency | adjacency.T).astype(np.uint8)
-    expected = {tuple(sorted(c)) for c in networkx.find_cliques(networkx.from_numpy_array(adjacency)) if len(c) > 1}
-    assert set(maximal_cliques(adjacency.tobytes(), 9)) == expected
 
 
 def cliques_by_definition(weight, distance, valid, settings):
@@ -157,34 +146,3 @@ def test_permuting_vehicles_permutes_scores_and_candidates():
     assert torch.equal(permuted.score, result.score[:, order])
     assert torch.equal(permuted.candidates, result.candidates[:, order])
     assert result.candidates.any()
-
-
-@pytest.mark.parametrize("count", [1, 2, 48])
-def test_the_ego_is_never_a_candidate_whatever_the_number_of_vehicles(count):
-    states, size = random_boxes(2, count, 25.0, 2)
-    present = torch.ones(2, 81, count, dtype=torch.bool)
-    result = topological_candidates(rollout(states), present, size, TopologySettings())
-    assert not result.candidates[:, 0].any() and result.weights.shape == (2, 17, count, count)
-    assert (result.candidates.sum(1) <= 10).all() and (result.score[result.candidates] > 0).all()
-
-
-def test_who_is_absent_at_the_start_is_no_candidate():
-    states = torch.tensor([[[0.0, 0, 0, 10], [40, 0, torch.pi, 10], [45, 1, torch.pi, 10]]])
-    valid = torch.ones(1, 81, 3, dtype=torch.bool)
-    valid[:, 0, 1] = False
-    result = topological_candidates(rollout(states), valid, torch.full((1, 3, 2), 2.0), TopologySettings())
-    assert result.candidates.tolist() == [[False, False, True]] and result.score[0, 1] > 0
-
-
-@pytest.mark.parametrize(("x", "y", "counts"), [(200.0, 50.0, False), (40.0, 0.0, True)])
-def test_a_queue_counts_only_where_the_ego_is_entangled_with_it(x, y, counts):
-    queue = [[x + 5 * k, y, 0, 0] for k in range(4)]
-    states, present = torch.tensor([[[0.0, 0, 0, 10], *queue]]), torch.ones(1, 81, 5, dtype=torch.bool)
-    size = torch.tensor([[[4.5, 2.0]]]).expand(1, 5, 2)
-    assert topological_candidates(rollout(states), present, size, TopologySettings()).candidates.any() == counts
-
-
-def test_bad_settings_name_their_key():
-    for wrong in ({"max_clique": 1}, {"edge_threshold": 1.5}):
-        with pytest.raises(InputError, match=f"synthesizer.topology.{next(iter(wrong))}"):
-            TopologySettings(**wrong)

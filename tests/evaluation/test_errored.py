@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
-from e2rl.evaluation.rollout_files import ENDED_FILE, METRICS_FILE, TABLE, add_ended, read_metrics, read_rows
+from e2rl.evaluation.rollout_files import ERRORED_FILE, METRICS_FILE, TABLE, add_errored, read_metrics, read_rows
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.report.tables import metric_tables
 from e2rl.run.errors import InputError
@@ -48,15 +48,15 @@ def run(ego, folder=None, batch=64, processes=1, count=4):
 @pytest.mark.parametrize(("raises", "reason"), [(True, "raised ZeroDivisionError"), (False, "raised NotFinite")])
 def test_the_others_are_scored_and_the_count_stands_everywhere(tmp_path, raises, reason, processes):
     (row,) = run(Fails(8.0, raises), tmp_path, 4, processes)
-    assert row["n_rollouts"] == 6 and row["ended"] == {reason: 2} and row["n_scenes"] == 3
-    assert read_metrics(tmp_path / METRICS_FILE)[0]["ended"] == {reason: 2}
+    assert row["n_rollouts"] == 6 and row["errored"] == {reason: 2} and row["n_scenes"] == 3
+    assert read_metrics(tmp_path / METRICS_FILE)[0]["errored"] == {reason: 2}
     assert f"2 rollouts without a score ({reason})" in metric_tables([row])[0].caption
-    entries = json.loads((tmp_path / ENDED_FILE).read_text())
+    entries = json.loads((tmp_path / ERRORED_FILE).read_text())
     assert {(entry["scene_id"], entry["seed"]) for entry in entries} == {(scene_set().scene_id[2], k) for k in (0, 1)}
     assert all(("no way out" if raises else "the ego's plan is NaN") in entry["traceback"] for entry in entries)
     assert len(read_rows(tmp_path / TABLE)) == 6 == len(list((tmp_path / ROLLOUTS).glob("*.npz")))
     (whole,) = run(IDMEgo(), tmp_path, 4, processes)
-    assert whole["ended"] == {} and whole["n_rollouts"] == 8 and not (tmp_path / ENDED_FILE).exists()
+    assert whole["errored"] == {} and whole["n_rollouts"] == 8 and not (tmp_path / ERRORED_FILE).exists()
 
 
 def test_where_all_end_the_message_says_why(tmp_path):
@@ -64,7 +64,7 @@ def test_where_all_end_the_message_says_why(tmp_path):
         InputError, match="no rollout could be scored: 2 raised ZeroDivisionError .no way out.*tracebacks"
     ):
         run(Fails(6.0, True), tmp_path, count=1)
-    assert len(json.loads((tmp_path / ENDED_FILE).read_text())) == 2
+    assert len(json.loads((tmp_path / ERRORED_FILE).read_text())) == 2
 
 
 def test_a_method_of_which_all_rollouts_end_stays_in_the_table(tmp_path):
@@ -74,11 +74,8 @@ def test_a_method_of_which_all_rollouts_end_stays_in_the_table(tmp_path):
 
     setup = Setup(scene_set(2), IDMEgo(), "idm", SimSettings(), 4)
     rows = run_protocol(setup, [*METHODS, Method("lost", Lost(), 0.0)], [0], tmp_path, stage="before")
-    assert [(row["method"], row["n_rollouts"], row["stage"]) for row in rows] == [
-        ("replay", 2, "before"),
-        ("lost", 0, "before"),
-    ]
-    assert rows[1]["ended"] == {"raised ZeroDivisionError": 2} and rows[1]["metrics"]["cfr"]["n"] == 0
+    assert [(row["method"], row["n_rollouts"]) for row in rows] == [("replay", 2), ("lost", 0)]
+    assert rows[1]["errored"] == {"raised ZeroDivisionError": 2} and rows[1]["metrics"]["cfr"]["n"] == 0
     assert "lost: 0 scenes, 0 seeds, 0 rollouts, 2 rollouts without a score" in metric_tables(rows)[0].caption.replace(
         "before ", ""
     )
@@ -86,10 +83,10 @@ def test_a_method_of_which_all_rollouts_end_stays_in_the_table(tmp_path):
 
 
 def test_what_ended_in_a_training_is_kept_by_round_and_not_doubled_by_a_resumed_one(tmp_path):
-    path = tmp_path / ENDED_FILE
+    path = tmp_path / ERRORED_FILE
     for number, reasons in ((0, "ab"), (1, ""), (2, "c"), (1, "d")):
-        add_ended(path, number, [{"round": number, "reason": reason} for reason in reasons])
+        add_errored(path, number, [{"round": number, "reason": reason} for reason in reasons])
     assert [entry["reason"] for entry in json.loads(path.read_text())] == ["a", "b", "d"]
     path.write_text("[")
-    add_ended(path, 3, [{"round": 3, "reason": "e"}])
+    add_errored(path, 3, [{"round": 3, "reason": "e"}])
     assert len(json.loads(path.read_text())) == 1

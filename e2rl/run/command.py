@@ -1,0 +1,146 @@
+"""A command that Hydra configures: `--help` prints all options; an option that is none is told the nearest."""
+
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+
+from e2rl.run.config import choices, load_config
+from e2rl.run.endings import ending, program
+from e2rl.run.errors import InputError
+from e2rl.run.files import alone_in
+from e2rl.run.run import Run, how_to_go_on
+from e2rl.run.settings import conf_folder
+
+
+def run_command(
+    name: str,
+    work: Callable[[Run], object],
+    may_change: Sequence[str] = (),
+    begun: Callable[[DictConfig, Sequence[str]], Run] = Run.of,
+    alone: bool = True,
+) -> None:
+    """Do the work of a command that Hydra configures by conf/<name>.yaml.
+
+    `--help` prints the files of the configuration, with the files that the command line chooses. An option that there
+    is not ends the command with the nearest one, status 2.
+
+    Args:
+        may_change: keys that may be others when a run is resumed.
+        begun: makes the run of a configuration.
+        alone: no other process may be at work in the run's folder.
+    """
+    arguments = sys.argv[1:]
+    if {"-h", "--help"} & set(arguments):
+        print(help_text(name, arguments))
+        return
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors arrive here as they are
+
+    @hydra.main(version_base="1.3", config_path=str(conf_folder().resolve()), config_name=name)
+    def command(config: DictConfig) -> None:
+        with ending(lambda: how_to_go_on(config)):
+            check_keys(config, name)
+            run = begun(config, may_change)
+            with alone_in(run.folder) if alone else nullcontext():
+                work(run)
+
+    with ending():
+        try:
+            command()
+        except HydraException as error:
+            raise InputError(told(name, arguments, str(error))) from error
+
+
+def check_keys(config: DictConfig, name: str) -> None:
+    """Raises InputError for keys that conf/<name>.yaml does not have, which do nothing: added by +, or by an experiment
+    of another command."""
+    known = [*map(str, load_config(name)), *_groups(name)]
+    if wrong := [_nearest(str(key), str(key), known) for key in config if key not in known]:
+        raise InputError(f"{'; '.join(wrong)} ({' '.join(program())})")
+
+
+def help_text(name: str, arguments: Sequence[str]) -> str:
+    """Returns the configuration of a command as its files say it, comments included."""
+    folders = [conf_folder(), *_further(arguments)]
+    parts = [
+        f"{' '.join(program())} [GROUP=FILE] [KEY=VALUE] [PART.KEY=VALUE]\n\nOptions by group, with what they are now; "
+        f"`GROUP=FILE --help` shows those of another file. hydra.run.dir=FOLDER: where the run is written.",
+        (conf_folder() / f"{name}.yaml").read_text(),
+    ]
+    chosen = dict(argument.split("=", 1) for argument in arguments if "=" in argument)
+    for group, file in _groups(name).items():
+        if file := chosen.get(group, file):
+            parts += _file_texts(folders, group, file)
+    return "\n\n".join(part.rstrip() for part in parts)
+
+
+def _file_texts(folders: Sequence[Path], group: str, name: str) -> Iterator[str]:
+    """A group's file under a heading, and those of the group that it builds on."""
+    file = next((each for folder in folders if (each := folder / group / f"{name}.yaml").is_file()), None)
+    if file is None:
+        yield f"### {group}={name}: none of {', '.join(choices(group))}"
+        return
+    others = ", ".join(sorted(path.stem for folder in folders for path in (folder / group).glob("*.yaml")))
+    yield f"### {group}={name} (of: {others})\n\n{file.read_text()}"
+    for base in _content(file).get("defaults", ()):
+        if isinstance(base, str) and base != "_self_":
+            yield from _file_texts(folders, group, base)
+
+
+def told(name: str, arguments: Sequence[str], said: str) -> str:
+    """Returns what Hydra said of a wrong option or choice, in short and with the nearest that there is."""
+    if found := re.search("Could not find '(.+)/(.+?)'", said):
+        group, file = found.groups()
+        return _nearest(f"{group}={file}", file, choices(group))
+    if found := re.search("Could not override '(.+?)'", said):
+        groups = () if any(_further(arguments)) else _groups(name)
+        config = load_config(name, [argument for argument in arguments if argument.split("=")[0] in groups])
+        return _nearest(found[1], found[1], list(_keys(OmegaConf.to_container(config))))
+    return said
+
+
+def _nearest(option: str, given: str, known: Sequence[str]) -> str:
+    near = get_close_matches(given, known, 1, 0.5) or get_close_matches(
+        given.rpartition(".")[2], [key.rpartition(".")[2] for key in known], 1, 0.5
+    )
+    return f"{option}: there is no such option" + (f"; the nearest is {near[0]}" if near else "; see --help")
+
+
+def _further(arguments: Sequence[str]) -> Iterator[Path]:
+    """Folders of configuration that the command line names."""
+    for position, argument in enumerate(arguments):
+        option, _, value = argument.partition("=")
+        if option in ("--config-dir", "-cd"):
+            yield Path(value or "".join(arguments[position + 1 : position + 2]))
+
+
+def _content(file: Path) -> dict[str, Any]:
+    content = OmegaConf.to_container(OmegaConf.load(file))
+    return {str(key): value for key, value in content.items()} if isinstance(content, dict) else {}
+
+
+def _groups(name: str) -> dict[str, str | None]:
+    """The groups that a command's configuration chooses from, with the file that it chooses."""
+    groups: dict[str, str | None] = {}
+    for entry in _content(conf_folder() / f"{name}.yaml")["defaults"]:
+        if isinstance(entry, dict):
+            groups |= {key.removeprefix("override ").removeprefix("/"): value for key, value in entry.items()}
+        elif entry != "_self_":  # the configuration that it builds on
+            groups |= _groups(entry)
+    return groups
+
+
+def _keys(config: Any, prefix: str = "") -> Iterator[str]:
+    """The dotted names of all entries of nested containers."""
+    if isinstance(config, dict):
+        for key, value in config.items():
+            yield f"{prefix}{key}"
+            yield from _keys(value, f"{prefix}{key}.")
