@@ -16,7 +16,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from e2rl.evaluation.methods import build_ego, build_traffic, method_config, processes_of
-from e2rl.evaluation.plan import Plan, begin
+from e2rl.evaluation.plan import Evaluation, begin
 from e2rl.evaluation.protocol import Method
 from e2rl.evaluation.trials import NOMINAL, AttackObjective, AttackTrials, PlannerObjective, PlannerTrials
 from e2rl.evaluation.tuning import STUDY_FILE, Objective, Parameters, SearchSettings, line_of, save, search, yaml_of
@@ -69,7 +69,7 @@ def tune(run: Run) -> dict:
     return result
 
 
-def planner_trials(config: DictConfig, plan: Plan) -> PlannerTrials:
+def planner_trials(config: DictConfig, plan: Evaluation) -> PlannerTrials:
     """Returns trials of the group `ego` against all of `config.methods`."""
 
     def make(parameters: Parameters) -> Any:
@@ -78,7 +78,7 @@ def planner_trials(config: DictConfig, plan: Plan) -> PlannerTrials:
     return PlannerTrials(plan.setup, plan.methods, plan.asked.seeds, make, processes_of(config))
 
 
-def attack_trials(config: DictConfig, plan: Plan) -> tuple[AttackTrials, Mapping]:
+def attack_trials(config: DictConfig, plan: Evaluation) -> tuple[AttackTrials, Mapping]:
     """Returns trials of the group `synthesizer` at `config.eta` beside nominal traffic, and the ranges of its class."""
     etas = plan.asked.eta
     if len(etas) != 1 or not etas[0]:

@@ -17,7 +17,7 @@ from e2rl.scenes.source import load_scenes
 
 
 @dataclass(frozen=True)
-class Plan:
+class Evaluation:
     """The objects of an evaluation.
 
     Args:
@@ -41,7 +41,7 @@ class Plan:
         return self.setup.scenes
 
 
-def begin(run: Run) -> Plan:
+def begin(run: Run) -> Evaluation:
     """Returns the plan of a run, which begins or goes on with it.
 
     Raises:
@@ -57,4 +57,4 @@ def begin(run: Run) -> Plan:
     name, ego = next(iter(egos.egos.items()))
     setup = Setup(scenes, ego, name, build_sim(config), config.batch, config.device)
     run.begin({"scenes": listed(scenes)})
-    return Plan(asked, egos, prior, origin, methods, setup, only)
+    return Evaluation(asked, egos, prior, origin, methods, setup, only)

@@ -153,7 +153,8 @@ def meeting_braking(meeting: Meeting, speed: Tensor, length: Tensor, duty: Duty 
     if duty is not None:
         to_ego = _towards_ego(duty, happens[..., 0], yields[..., 0], room[..., 0], closing[..., 0])
         yields = torch.cat([to_ego[..., None], yields[..., 1:]], -1)
-        back = falling_back(length + GAP - ahead[..., 0], DT * steps[..., 0]) * (along[..., 0] > ALONGSIDE)
+        back = 2 * (length + GAP - ahead[..., 0]).clamp(min=0) / (DT * steps[..., 0]) ** 2
+        back = back * (along[..., 0] > ALONGSIDE)  # who comes into the ego's side is behind it when they would touch
         braking = torch.cat([torch.maximum(braking[..., 0], back)[..., None], braking[..., 1:]], -1)
     return torch.where(yields, braking.clamp(min=MIN_BRAKING), -NO_CAP).amax(-1)
 
@@ -166,11 +167,6 @@ def _towards_ego(duty: Duty, meets: Tensor, yields: Tensor, room: Tensor, closin
     later = room - closing * WAIT
     waits = (closing**2 < 2 * later * duty.patience) & (later > 0)
     return meets & ~duty.exempt & (yields | duty.yields) & ~waits
-
-
-def falling_back(missing: Tensor, time: Tensor) -> Tensor:
-    """Braking by which a vehicle beside another one is `missing` m farther back in `time` s, and so behind it."""
-    return 2 * missing.clamp(min=0) / time**2
 
 
 def _first_meeting(tracks: Tensor, obstacles: Obstacles, vehicles: int) -> tuple[Tensor, Tensor]:

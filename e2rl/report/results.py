@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 from e2rl.evaluation.ego_set import recorded_acceleration, trainings_of
 from e2rl.evaluation.methods import ALL, EvaluationSettings, caption, terms_by_method
 from e2rl.evaluation.modes import MODES_FILE, read_modes
-from e2rl.evaluation.plan import Plan
+from e2rl.evaluation.plan import Evaluation
 from e2rl.metrics.evasion import search_effort
 from e2rl.report.answer import answer_lines
 from e2rl.report.comparison_tables import (
@@ -33,7 +33,7 @@ NOMINAL = "nominal"  # traffic without an attack, which every attack is compared
 MAIN = "main"  # table of metrics
 
 
-def write_results(run: Run, plan: Plan, rows: Sequence[dict]) -> list[str]:
+def write_results(run: Run, plan: Evaluation, rows: Sequence[dict]) -> list[str]:
     """Writes the tables, figures and failure report of an evaluation; returns the lines that answer it.
 
     Args:
@@ -55,7 +55,7 @@ def write_results(run: Run, plan: Plan, rows: Sequence[dict]) -> list[str]:
     return answer_lines(rows, modes, folder, page, dropped)
 
 
-def references(plan: Plan) -> tuple[str, ...] | None:
+def references(plan: Evaluation) -> tuple[str, ...] | None:
     """Returns the methods that all are compared with; None: each with every other."""
     return (*plan.asked.compare, NOMINAL) if compares(plan.asked) and not plan.egos.pairs else None
 
@@ -65,7 +65,7 @@ def compares(asked: EvaluationSettings) -> bool:
     return bool(asked.compare) or asked.figure == "curves"
 
 
-def tables_of(plan: Plan, rows: Sequence[dict], text: str, folder: Path) -> list[Table]:
+def tables_of(plan: Evaluation, rows: Sequence[dict], text: str, folder: Path) -> list[Table]:
     """Returns the tables of metrics; those with a row a method or an ego also become files of their own."""
     metrics = MAIN if plan.asked.metrics == ALL else plan.asked.metrics
     if not compares(plan.asked):
@@ -79,7 +79,7 @@ def tables_of(plan: Plan, rows: Sequence[dict], text: str, folder: Path) -> list
     return tables
 
 
-def egos_tables(run: Run, plan: Plan, rows: Sequence[dict], text: str) -> list[Table]:
+def egos_tables(run: Run, plan: Evaluation, rows: Sequence[dict], text: str) -> list[Table]:
     """Returns the tables that compare several egos; with `policy_learning` also its guards, and draws its figures."""
     roles, egos = run.config.policy_learning, plan.egos
     if not egos.pairs or plan.asked.compare:

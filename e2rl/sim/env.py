@@ -179,7 +179,9 @@ class DrivingEnv(EnvBase):
         others = Agents(*(fresh[name][:, 1:] for name in ("start", "valid", "start_accel", "start_yaw_rate")))
         features = observe(self._config.observation, static, begun, others, self.horizon).features
         self._features = self._features.index_copy(0, index, features)
-        return self._reset_output()
+        ego = self._ego
+        outcome = dict.fromkeys((*FLAGS, *METRICS), torch.zeros_like(ego.present))
+        return self._output(outcome | {"observation": self._features, "progress": ego.pose.s - ego.start_s})
 
     def _beginning(self, index: Tensor) -> TensorDict:
         """What a reset of environments index [b] needs of their scenes; of routes and recording, that of the ego."""
@@ -200,11 +202,6 @@ class DrivingEnv(EnvBase):
 
         self._ego = self._ego.merged(fresh, lambda old, new: old.index_copy(0, index, new))
         return fresh
-
-    def _reset_output(self) -> TensorDict:
-        ego = self._ego
-        outcome = dict.fromkeys((*FLAGS, *METRICS), torch.zeros_like(ego.present))
-        return self._output(outcome | {"observation": self._features, "progress": ego.pose.s - ego.start_s})
 
     @torch.no_grad()  # the stored state must not accumulate an autograd graph
     def _step(self, tensordict: TensorDictBase) -> TensorDict:

@@ -35,7 +35,7 @@ class Others(NamedTuple):
     present: Tensor
 
 
-class Plan(NamedTuple):
+class Manoeuvres(NamedTuple):
     """The manoeuvres as tensors: accelerations [A] m/s^2, offsets [O, 1] m, times [T] s, fraction [T] of the offset
     that is reached then, ends [3, 1]: circles of a box along its length."""
 
@@ -47,13 +47,13 @@ class Plan(NamedTuple):
 
 
 @cache
-def plan_on(device: torch.device) -> Plan:
-    """The Plan on a device (cached)."""
+def manoeuvres_on(device: torch.device) -> Manoeuvres:
+    """Returns the manoeuvres on a device (cached)."""
     accel, offset, time, ends = (
         torch.tensor(x, device=device) for x in (ACCELERATIONS, OFFSETS, TIMES, (-1.0, 0.0, 1.0))
     )
     fraction = (time / MOVED_OVER).clamp(max=1)
-    return Plan(accel, offset[:, None], time, fraction**2 * (3 - 2 * fraction), ends[:, None])
+    return Manoeuvres(accel, offset[:, None], time, fraction**2 * (3 - 2 * fraction), ends[:, None])
 
 
 def travelled(speed: Tensor, accel: Tensor, time: Tensor) -> Tensor:
@@ -64,7 +64,7 @@ def travelled(speed: Tensor, accel: Tensor, time: Tensor) -> Tensor:
 
 def manoeuvres(static: StaticScene, state: Tensor, pose: FrenetPose, rotation: Tensor) -> tuple[Tensor, Tensor]:
     """Places and directions [B, C, T, 2] of egos [B, 4] in their own frames; C: accelerations x offsets."""
-    plan = plan_on(state.device)
+    plan = manoeuvres_on(state.device)
     distance = travelled(state[:, 3, None, None], plan.accel[:, None], plan.time)
     xy, heading, *_ = look_along(static, pose.s[:, None] + distance.flatten(1))
     local = (xy - state[:, None, :2]).bmm(rotation.transpose(1, 2)).unflatten(1, distance.shape[1:])[:, :, None]
@@ -90,7 +90,7 @@ def later(others: Others, time: Tensor) -> tuple[Tensor, Tensor]:
 def gaps(place: Tensor, along: Tensor, size: Tensor, others: Others) -> Tensor:
     """Least gap [B, C, T] m between egos of size [B, 2] at `place`, `along` [B, C, T, 2] and the others then; inf where
     there are none."""
-    plan, steps = plan_on(place.device), place.shape[2]
+    plan, steps = manoeuvres_on(place.device), place.shape[2]
     if not others.present.shape[1]:
         return place.new_full(place.shape[:3], torch.inf)
     position, direction = (x.flatten(0, 1) for x in later(others, plan.time))  # [B T, 2, K]
@@ -116,7 +116,7 @@ def gaps(place: Tensor, along: Tensor, size: Tensor, others: Others) -> Tensor:
 def prospects(static: StaticScene, state: Tensor, pose: FrenetPose, rotation: Tensor, others: Others) -> Tensor:
     """[B, PROSPECTS] of every manoeuvre: its least gap, then the time of its first gap below TIGHT, in [-1/3, 1]."""
     gap, end = gaps(*manoeuvres(static, state, pose, rotation), static.size, others), TIMES[-1] + TIMES[0]
-    first = torch.where(gap < TIGHT, plan_on(gap.device).time, end).amin(-1) / end
+    first = torch.where(gap < TIGHT, manoeuvres_on(gap.device).time, end).amin(-1) / end
     return torch.cat([gap.amin(-1).clamp(-1, WIDEST) / WIDEST, first], -1)
 
 

@@ -23,7 +23,7 @@ from e2rl.sim.world import World
 from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan, keep_velocity, steps_ahead
 
 
-class Replay(Traffic):
+class LogReplay(Traffic):
     """The smoothed recording; a vehicle is absent in gaps of its track and after its end."""
 
     stochastic, predicts, replays_log = False, False, True

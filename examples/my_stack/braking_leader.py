@@ -5,11 +5,11 @@ from tensordict import TensorDict
 
 from e2rl.scenes.boxes import to_frame
 from e2rl.scenes.recording import DT
-from e2rl.traffic.rule_based import Replay
+from e2rl.traffic.rule_based import LogReplay
 from e2rl.traffic.traffic import steps_ahead
 
 
-class BrakingLeader(Replay):
+class BrakingLeader(LogReplay):
     """The nearest vehicle ahead, within `reach` m and half a lane beside, brakes at eta times `braking` m/s^2."""
 
     replays_log, adversarial = False, True

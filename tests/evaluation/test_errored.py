@@ -12,10 +12,10 @@ from e2rl.report.tables import metric_tables
 from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings
 from e2rl.sim.rollout_file import ROLLOUTS
-from e2rl.traffic.rule_based import Replay
+from e2rl.traffic.rule_based import LogReplay
 from tests.traffic.e2.traffic_scenes import scenes
 
-METHODS = [Method("replay", Replay())]
+METHODS = [Method("replay", LogReplay())]
 
 
 class Fails(IDMEgo):
@@ -68,7 +68,7 @@ def test_where_all_end_the_message_says_why(tmp_path):
 
 
 def test_a_method_of_which_all_rollouts_end_stays_in_the_table(tmp_path):
-    class Lost(Replay):
+    class Lost(LogReplay):
         def replan(self, *rest):
             raise ZeroDivisionError("no way out")
 

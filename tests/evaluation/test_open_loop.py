@@ -12,7 +12,7 @@ from e2rl.metrics.displacement import HORIZONS
 from e2rl.prior.sde import SamplerSettings
 from e2rl.run.errors import InputError
 from e2rl.traffic.nominal import NominalTraffic
-from e2rl.traffic.rule_based import IDM, ConstantVelocity, Replay
+from e2rl.traffic.rule_based import IDM, ConstantVelocity, LogReplay
 from tests.prior.small import small_prior
 from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
@@ -57,7 +57,7 @@ def test_every_figure_of_the_catalogue_counts_the_moving_vehicles_but_not_the_eg
 
 def test_who_looks_the_future_up_or_attacks_has_no_row_and_baselines_have_one_sample():
     methods = [
-        Method("replay", Replay()),
+        Method("replay", LogReplay()),
         STRAIGHT,
         Method("idm", IDM(small_prior())),
         Method("nominal", nominal()),

@@ -15,7 +15,7 @@ from e2rl.run.parts import Parts
 from e2rl.sim.env import SimSettings
 from e2rl.sim.rollouts import Rollouts
 from e2rl.traffic.nominal import NominalTraffic
-from e2rl.traffic.rule_based import ConstantVelocity, Replay
+from e2rl.traffic.rule_based import ConstantVelocity, LogReplay
 from tests.prior.small import small_prior
 from tests.traffic.e2.traffic_scenes import scenes
 
@@ -146,7 +146,7 @@ def test_lights_belong_to_ways_so_that_whoever_follows_none_runs_none():
 def test_the_rows_of_a_run():
     scene_set, rollouts = places(), 3
     methods = [
-        Method("replay", Replay()),
+        Method("replay", LogReplay()),
         Method("constant_velocity", ConstantVelocity()),
         Method("nominal", nominal()),
     ]
@@ -190,7 +190,7 @@ def test_rollouts_that_end_are_counted_and_weigh_nothing(tmp_path):
                 raise ZeroDivisionError
             return super().plan(world)
 
-    scene_set, methods = places(2), [Method("nominal", nominal()), Method("replay", Replay())]
+    scene_set, methods = places(2), [Method("nominal", nominal()), Method("replay", LogReplay())]
     setup = Setup(scene_set, Fails(), "fails", SIM, 4)
     for row, count in zip(meta_rows(setup, methods, 3, Parts(tmp_path)), (3, 1), strict=True):
         assert row["errored"] == {"raised ZeroDivisionError": count} and row["n_rollouts"] == 3

@@ -7,11 +7,11 @@ import pytest
 import torch
 from e2rl.scripts.train import train_round
 
-from e2rl.evaluation.methods import build_ego
 from e2rl.learning.attack import make_traffic
-from e2rl.learning.build import build_evolution
+from e2rl.learning.prefetch import why_no_prefetch
 from e2rl.learning.run_checkpoint import load_checkpoint, save_checkpoint
-from e2rl.run.config import load_config
+from e2rl.planners.actor import ActorEgo
+from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.rollout import synthesize_traffic
@@ -63,16 +63,13 @@ def test_a_process_that_dies_is_named_and_the_run_goes_on_from_its_checkpoint(tm
     assert whole.memory.index() == again.memory.index()
 
 
-WHERE = {"threads=2": {"threads": 2}, "live": {}}
-
-
-@pytest.mark.parametrize("where", WHERE)
-def test_where_it_cannot_be_it_is_refused(where):
-    sizes = [f"learner.collect.{setting}" for setting in ("batch=4", "steps=20", "iterations=1")]
-    config = load_config("train", ["learner.round.prefetch=true", *sizes])
-    if where == "live":
-        config.learner.round.traffic = "live"
-    ego, scenes = build_ego(config), small_scenes()
-    config.merge_with(WHERE[where])
-    with pytest.raises(InputError, match=r"learner\.round\.prefetch=true"):
-        build_evolution(config, scenes, ego, Ambush(), brake_check(scenes))
+def test_only_an_actor_on_one_thread_of_the_cpu_is_attacked_beside_learning():
+    actor = ActorEgo(hidden=(8,))
+    assert not why_no_prefetch("cpu", 1, actor, "replay")
+    for device, threads, ego, traffic in (
+        ("cuda", 1, actor, "replay"),
+        ("cpu", 2, actor, "replay"),
+        ("cpu", 1, actor, "live"),
+        ("cpu", 1, IDMEgo(), "replay"),
+    ):
+        assert why_no_prefetch(device, threads, ego, traffic)

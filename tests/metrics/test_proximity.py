@@ -152,3 +152,11 @@ def test_moved_means_farther_than_the_limit_at_a_step_where_it_is_there():
     states[0, 2, 1, 0] = MOVED
     states[0, 2, 2, 0], valid[0, 2, 2] = 9.0, False
     assert moved(states, valid)[0].tolist() == [True, False, False, False]
+
+
+@pytest.mark.parametrize(("metres", "found"), [(1.9, False), (2.1, True)])
+def test_two_metres_from_the_start_in_any_direction_are_a_move(metres, found):
+    states = torch.zeros(1, 4, 1, 4)
+    states[0, 2, 0, :2] = metres * torch.tensor([0.6, -0.8])  # and back again
+    valid = torch.ones(1, 4, 1, dtype=torch.bool)
+    assert moved(states, valid).item() is found and not moved(states, valid & (states[..., 0] == 0)).item()

@@ -26,7 +26,7 @@ from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings
 from e2rl.sim.mission import mission_of
 from e2rl.sim.world import World
-from e2rl.traffic.rule_based import Replay
+from e2rl.traffic.rule_based import LogReplay
 from tests.planners.planners import SameLaw, command_of, wrong_planner
 from tests.run.test_endings import alive
 from tests.synthetic import make_scenes
@@ -47,14 +47,14 @@ def scene_set(count=4, **about):
 
 def run(ego, folder=None, processes=1, batch=4):
     setup = Setup(scene_set(), ego, "external", SimSettings(), batch)
-    return run_protocol(setup, [Method("replay", Replay())], [0], folder, processes=processes)
+    return run_protocol(setup, [Method("replay", LogReplay())], [0], folder, processes=processes)
 
 
 @pytest.mark.parametrize(("replan_every", "red_light_x"), [(1, None), (5, 45.0)])
 def test_it_drives_as_the_same_law_inside(replan_every, red_light_x):
     scenes = scene_set(red_light_x=red_light_x)
     inside, outside = (
-        roll_out(scenes, ego, Replay()).states
+        roll_out(scenes, ego, LogReplay()).states
         for ego in (SameLaw(replan_every), ExternalEgo(command_of(), replan_every=replan_every))
     )
     assert torch.allclose(inside, outside, atol=1e-3)

@@ -14,6 +14,7 @@ def outcomes(settings, steps=12):
     return environment.rollout(steps, break_when_any_done=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("replays", [False, True])
 def test_a_compiled_step_is_the_eager_one(replays, monkeypatch):
     """By dynamo and autograd without C++, which would take a minute; benchmarks/simulator.py compares the whole."""

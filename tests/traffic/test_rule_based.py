@@ -9,7 +9,7 @@ from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.scenes.recording import DT, LIGHT_RED, LIGHT_YELLOW
 from e2rl.sim.world import World
-from e2rl.traffic.rule_based import IDM, ConstantVelocity, Replay
+from e2rl.traffic.rule_based import IDM, ConstantVelocity, LogReplay
 from tests.prior.small import curved_scenes, small_prior
 from tests.synthetic import make_scenes
 from tests.traffic.e2.traffic_scenes import ROWS, begin, drive, scenes
@@ -28,7 +28,7 @@ def recorded(steps=40):
 
 def test_rollouts_are_the_log_bit_for_bit_with_its_gaps():
     scene_set = recorded()
-    rollouts = drive(scene_set, Replay(), 0.0)
+    rollouts = drive(scene_set, LogReplay(), 0.0)
     logged, valid = scene_set.scenes["logged"][:, :, 1:], scene_set.scenes["logged_valid"][:, :, 1:]
     assert torch.equal(rollouts.valid[:, :, 1:], valid)
     assert torch.equal(rollouts.states[:, :, 1:][valid], logged[valid])
@@ -39,7 +39,7 @@ def test_after_the_recording_s_end_nobody_is_there():
     scene = curved_scenes(steps=30)
     world = World.at_start(scene)
     world.step = torch.tensor([12])
-    _, plan = Replay().replan(None, world, world.states[:, :1])
+    _, plan = LogReplay().replan(None, world, world.states[:, :1])
     here = scene["logged_valid"][:, 13:31, :ROWS].transpose(1, 2)
     assert torch.equal(plan.present[..., :18], here) and not plan.present[..., 18:].any()
     assert torch.equal(plan.states[..., :18, :], scene["logged"][:, 13:31, :ROWS].transpose(1, 2))

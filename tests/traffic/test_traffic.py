@@ -6,7 +6,7 @@ from e2rl.sim.world import World
 from e2rl.traffic.baselines.ctg import CTGAdv
 from e2rl.traffic.baselines.safe_sim_opt import SafeSimOpt
 from e2rl.traffic.nominal import NominalTraffic
-from e2rl.traffic.rule_based import Replay
+from e2rl.traffic.rule_based import LogReplay
 from e2rl.traffic.traffic import POINT_STEPS, REPLAN_STEPS
 from tests.traffic.baselines.attacks import baseline
 from tests.traffic.e2.traffic_scenes import EGO, ROWS, drive, scenes, synthesizer
@@ -46,7 +46,7 @@ def nfe(on, eta=2.0):
 
 def test_every_denoising_step_is_a_pass_of_each_sample_and_a_gradient_doubles_it():
     prior = baseline("ctg_adv").prior
-    assert nfe(Replay()) == [0]
+    assert nfe(LogReplay()) == [0]
     assert nfe(NominalTraffic(prior, "plan")) == [REPLANS * STEPS]
     assert nfe(NominalTraffic(prior, "predicted")) == [REPLANS * (STEPS + 1)]  # and one predicts the ego
     assert nfe(CTGAdv(prior, samples=3)) == [REPLANS * STEPS * 3]  # its gradients stop at the posterior mean

@@ -5,7 +5,7 @@ import torch
 
 from e2rl.sim.world import World
 from e2rl.traffic.nominal import NominalTraffic
-from e2rl.traffic.rule_based import Replay
+from e2rl.traffic.rule_based import LogReplay
 from tests.traffic.baselines.attacks import ADVERSARIES, SMALL, baseline, first_replan
 from tests.traffic.e2.traffic_scenes import EGO, begin, executed, replanned, scenes
 
@@ -79,7 +79,7 @@ def test_who_is_left_alone_replays_and_the_prior_sees_where_they_are(name):
     for _ in range(2):
         plan = EGO.plan(world)
         state, traffic = on.replan(state, world, plan)
-        logged = Replay().replan(None, world, plan)[1]
+        logged = LogReplay().replan(None, world, plan)[1]
         driven = state.top if name == "ccdiff" else state.held
         assert torch.equal(traffic.states[~driven], logged.states[~driven])
         assert torch.equal(traffic.present[~driven], logged.present[~driven])
