@@ -67,7 +67,6 @@ def test_bad_checkpoints(world, tmp_path, monkeypatch, capsys, script, name, wha
         ("train.py", ["rounds=abc"], "rounds=abc"),
         ("train.py", ["resume=nowhere"], "resume=nowhere"),
         ("train.py", ["sim.max_braking=-1"], "sim.max_braking=-1.0: expected a number of at least 0.1"),
-        ("train.py", ["stage=imitation", "num_scenes=1"], "of one scene none can be held out"),
         ("train.py", ["curriculum=bandit", "synthesizer=idm"], "synthesizer=idm has none; set synthesizer=e2"),
     ],
 )

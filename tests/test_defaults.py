@@ -1,0 +1,46 @@
+"""A default stands once, in conf/: neither a class nor a settings dataclass repeats a key of its YAML file."""
+
+import inspect
+from dataclasses import MISSING, fields, is_dataclass
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+import e2rl
+from e2rl.run.settings import conf_folder, file_values
+
+FILES = sorted(conf_folder().glob("*/*.yaml"))
+BASES = {"path", "split", "replan_every"}  # what a source or ego from outside, without a YAML file, inherits
+
+
+def defaults_of(kind: type) -> set[str]:
+    """The names of the arguments that have a default in Python."""
+    parameters = inspect.signature(inspect.unwrap(kind.__init__)).parameters.values()
+    return {each.name for each in parameters if each.default is not each.empty}
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: f"{file.parent.name}={file.stem}")
+def test_what_a_file_builds_has_no_default_for_its_keys(file):
+    target = OmegaConf.load(file).get("_target_")
+    if target is None:
+        pytest.skip("builds nothing itself")
+    module, _, name = target.rpartition(".")
+    keys = set(file_values(f"{file.parent.name}/{file.stem}")) - BASES
+    assert not defaults_of(getattr(import_module(module), name)) & keys
+
+
+def test_settings_dataclasses_have_no_defaults():
+    root, found = Path(e2rl.__file__).parent, 0
+    for path in root.rglob("*.py"):
+        if path.parent.name in ("scripts", "commands") or path.stem.startswith("__"):
+            continue
+        module = import_module(".".join(("e2rl", *path.relative_to(root).with_suffix("").parts)))
+        own = [kind for kind in vars(module).values() if isinstance(kind, type) and kind.__module__ == module.__name__]
+        for kind in (kind for kind in own if "__configured__" in vars(kind) and is_dataclass(kind)):
+            known = file_values(*kind.__configured__).keys() - BASES
+            twice = {each.name for each in fields(kind) if each.name in known and each.default is not MISSING}
+            assert not twice, f"{kind.__name__}: {', '.join(sorted(twice))}"
+            found += 1
+    assert found > 20
