@@ -212,9 +212,9 @@ def run_bits_stage(run: Run, logger: RunLogger) -> dict[str, float]:
     folder. Returns the losses of the chosen epoch."""
     config, settings = run.config, stage_settings(run.config, BitsSettings)
     scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
-    run.begin({"scenes": listed(scenes)})
     network, data = BitsNetwork(settings.hidden, DROPOUT).to(config.device), windows(scenes, settings.seed)
     training = BitsTraining(network, data, settings)
+    run.begin({"scenes": listed(scenes)})
     row = training.fit("bits", settings.epochs, run.parts("bits"), vars(settings), logger)
     origin = {"data": f"{scenes.dataset}/{scenes.split}", "scenes": len(scenes), **run.origin()}
     given = {"windows": len(data), "settings": vars(settings), "result": row}

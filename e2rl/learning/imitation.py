@@ -133,9 +133,9 @@ def run_imitation_stage(run: Run, logger: RunLogger) -> dict[str, float]:
         raise InputError("stage=imitation trains ego=actor; set it")
     settings = stage_settings(config, ImitationSettings)
     scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
-    run.begin({"scenes": listed(scenes)})
     shown = recorded_demonstrations(scenes, build_sim(config), settings.seed)
     training = Imitation(ego.network, shown, settings)
+    run.begin({"scenes": listed(scenes)})
     row = training.fit("imitation", settings.epochs, run.parts("imitation"), vars(settings), logger)
     ego.network.save(run.folder / WEIGHTS)
     return row
