@@ -4,6 +4,7 @@ import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one lin
 
 # isort: split
 from functools import partial
+from typing import Any
 
 from e2rl.evaluation.methods import processes_of
 from e2rl.evaluation.plan import begin
@@ -22,7 +23,7 @@ def evaluate(run: Run) -> None:
     config, folder, plan = run.config, run.folder, begin(run)
     asked, egos = plan.asked, plan.egos
     into = folder / ROLLOUTS if asked.save_rollouts else None
-    how = (asked.seeds, into, processes_of(config), plan.only, run.parts(), asked.shard)
+    how: Any = (asked.seeds, into, processes_of(config), plan.only, run.parts(), asked.shard)
     scored = drive_all(egos.setups(plan.setup), plan.methods, *how)  # every ego, method, eta, scene and seed
     if asked.shard != WHOLE:
         print(f"\nshard {asked.shard[0]} of {asked.shard[1]} written to {folder}; e2rl merge joins all of them")

@@ -3,6 +3,8 @@
 Open-loop accuracy (minADE), the closed loop, and the realism meta-metric over many rollouts of each scene.
 """
 
+from typing import Any
+
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
 
 # isort: split
@@ -45,7 +47,7 @@ def prior_tables(run: Run) -> None:
     if asked.meta_rollouts:
         after = meta_rows(setup, methods, asked.meta_rollouts, parts)
 
-    def summarise(*found: list) -> list[dict]:
+    def summarise(*found: Any) -> list[dict]:
         return [row | run.origin() for row in (*before, *metric_rows(*found), *after)]
 
     rows = record(*scored, folder, summarise)

@@ -39,6 +39,7 @@ def tune(run: Run) -> dict:
     settings = settings_of(SearchSettings, given, "tuning")
     plan = begin(run)
     objective: Objective
+    trials: PlannerTrials | AttackTrials
     if group == "ego":
         objective = settings_of(PlannerObjective, config.tuning.planner, "tuning.planner")
         trials, ranges = planner_trials(config, plan), plan.setup.ego.tuned

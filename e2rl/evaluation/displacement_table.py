@@ -65,7 +65,8 @@ def open_loop_metrics(scenes: SceneSet, method: Method, count: int, device: str)
         found = {"states": plans, "valid": here[:, None, :, None].expand(plans.shape[:-1])}
         return TensorDict(found | {name: value.double() for name, value in columns.items()}, [len(tasks)]).cpu()
 
-    planned, errored = [], []
+    planned: list[Any] = []
+    errored: list[dict] = []
     for batch in torch.arange(len(scenes)).split(BATCH):
         found, others = attempt(plan, batch.tolist())
         planned += found

@@ -55,6 +55,7 @@ class Tally:
         """Count rollouts of scenes index [B] int64, each as `weight` equal ones."""
         scenes = self.scenes.batch(index)
         tracks = {"states": rollouts.states, "valid": rollouts.valid, "size": rollouts.size}
+        assert rollouts.routes is not None
         batch = {**tracks, **roads_of(scenes, rollouts.routes)}
         every = index[:, None] * self.vehicles + torch.arange(self.vehicles)
         self.rollouts.index_add_(0, every.flatten(), torch.full((every.numel(),), float(weight), dtype=torch.float64))

@@ -1,7 +1,7 @@
 """From the configuration of an evaluation to its objects."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -190,7 +190,7 @@ def processes_of(config: DictConfig) -> Processes:
     return machine.processes or (cores() if alone else 1)
 
 
-def caption(config: DictConfig, origin: dict, methods: Sequence[Method] = ()) -> str:
+def caption(config: DictConfig, origin: Mapping, methods: Sequence[Method] = ()) -> str:
     """What stands in every table's caption: the settings that all methods share, and what each knows of the ego and
     owes it."""
     sampler, bounds = config.prior.sampler, config.prior.bounds

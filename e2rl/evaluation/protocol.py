@@ -152,7 +152,9 @@ def drive_all(
         compute = partial(setup.score, method, batch, into)
         return parts.result(f"rollouts-{number:06}", identity, compute, partial(has_files, into))
 
-    rows, samples, errored = [], [], []
+    rows: list[dict] = []
+    samples: list[dict[str, Tensor]] = []
+    errored: list[dict] = []
     total = sum(len(batch) for _, (_, _, batch) in jobs)
     with tqdm(total=total, desc="rollouts", unit="rollout", disable=None) as bar:
 

@@ -98,7 +98,8 @@ def read_study(file: Path | None, task: Mapping) -> list[dict]:
         return []
     try:
         study = json.loads(file.read_text())
-        known, rows = study["task"], [nans({name: row[name] for name in ROW}) for row in study["trials"]]
+        known = study["task"]
+        rows: list[Any] = [nans({name: row[name] for name in ROW}) for row in study["trials"]]
         differ = ", ".join(sorted(name for name in {*known, *task} if known.get(name) != task.get(name)))
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise InputError(f"tuning.study={file}: no study; name another file") from error

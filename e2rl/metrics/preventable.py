@@ -98,7 +98,7 @@ def redrive(driver: Driver, states: Tensor, size: Tensor, others: Along) -> Tens
     way, speeds = [s], [speed]
     for t in range(recorded.shape[1]):
         gap, side = others.rear[t] - (s + size[:, 0] / 2)[:, None], others.lateral_gap[t]
-        own = (value[:, None].expand_as(gap) for value in (speed, acceleration))
+        own = speed[:, None].expand_as(gap), acceleration[:, None].expand_as(gap)
         lateral = side, others.lateral_speed[t], side <= 0
         seen = Observation(*own, gap, others.speed[t], others.acceleration[t], *lateral, length, others.length[t])
         memory, wanted = driver.step(memory, seen)

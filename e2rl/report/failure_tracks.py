@@ -137,6 +137,7 @@ def encoded_plans(rollout: Rollout, rows: np.ndarray) -> dict[str, Any]:
     """Plans of the ego and the adversaries: `agents`, their tracks; `points` [A, R, 2, K] as second differences in the
     quantum of x; `targets` [A, R], the track that an adversary aims at, -1 for none. Steps between plans: `every`,
     between points: `spacing`."""
+    assert rollout.planners is not None and rollout.plans is not None and rollout.targets is not None
     known = np.isin(rollout.planners, rows)
     points = rollout.plans[:, known].transpose(1, 0, 3, 2)
     targets = rollout.targets[:, known].T

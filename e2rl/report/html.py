@@ -138,7 +138,7 @@ def add_replays(run: Path, rows: Sequence[dict], index: Sequence[dict], count: i
     """`maps` and `replays` of the data block, for `count` failures; writes the number of its replay into each of
     `index`. Scenes share their map."""
     maps: dict[str, dict] = {}
-    replays = []
+    replays: list[dict] = []
     for position in tqdm(replay_order(index)[:count], desc="replays", leave=False, disable=None):
         shown = Failure.read(run, rows[position])
         drawn = encoded_map(shown.rollout)

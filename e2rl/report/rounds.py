@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -64,10 +65,11 @@ def hits(traffic: Mapping[str, Tensor], scenes: SceneSet) -> Tensor:
 
 def replay_of(traffic: Mapping[str, Tensor], row: int, scenes: SceneSet, method: str) -> Replay:
     """The replay of one row of a round's traffic."""
-    own = {name: traffic[name][row : row + 1] for name in ("scene_index", "states", "valid", "adversaries")}
+    shown = ("scene_index", "states", "valid", "adversaries")
+    own: dict[str, Any] = {name: traffic[name][row : row + 1] for name in shown}
     index, about = own.pop("scene_index"), {"dataset": "", "split": "train", "method": method, "ego_policy": "actor"}
     eta = traffic["eta"][row : row + 1].double().round(decimals=2)
-    names = {name: [value] for name, value in about.items()}
+    names: dict[str, Any] = {name: [value] for name, value in about.items()}
     rollouts = Rollouts.in_scenes(scenes, index, **own, seed=index, eta=eta, seconds=torch.zeros(1), **names)
     rows, _ = score_rollouts(rollouts)
     return Replay(rollouts.rollout(0), rows[0], METRES, PIXELS)

@@ -86,7 +86,7 @@ class Run:
         """Returns the parts of a stage that are done."""
         return Parts(self.folder, stage, about)
 
-    def origin(self) -> dict[str, str]:
+    def origin(self) -> dict[str, Any]:
         """Returns `git` and `command` for the rows of metrics.json."""
         return origin_of(self.folder)
 
@@ -173,7 +173,7 @@ def read_provenance(folder: Path) -> dict[str, Any]:
     raise InputError(f"{file}: damaged, or of another version; restore it, or begin a new run")
 
 
-def origin_of(folder: Path) -> dict[str, str]:
+def origin_of(folder: Path) -> dict[str, Any]:
     """Returns `git` and `command` of a run's rows: as it was begun; several commits where it went on with others."""
     if not (Path(folder) / PROVENANCE).is_file():
         return {"git": git_commit(), "command": command_line()}

@@ -106,12 +106,12 @@ class Rollout(Road):
             )
         if wrong := _misfit(data, known) or _odd_agents(data) or _odd_map(data):
             raise InputError(f"{path}: damaged: {wrong}; run evaluate.py again to rewrite it")
-        found = {each.name: data[each.name] for each in known if each.name in data}
+        found: dict[str, Any] = {each.name: data[each.name] for each in known if each.name in data}
         return cls(**{name: value if value.shape else value.item() for name, value in found.items()})
 
     def write(self, folder: Path) -> Path:
         """Write its file into a folder, whole or not at all; returns its path."""
-        known = {name: np.asarray(value) for name, value in vars(self).items() if value is not None}
+        known: dict[str, Any] = {name: np.asarray(value) for name, value in vars(self).items() if value is not None}
         buffer = io.BytesIO()
         np.savez_compressed(buffer, format=np.array(FORMAT), **known)
         path = Path(folder) / self.name

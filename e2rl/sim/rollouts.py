@@ -18,7 +18,7 @@ TEXTS = ("scene_id", "location", "dataset", "split", "method", "ego_policy")
 MAP = ("lane_points", "lane_index", "lane_width", "drivable_points", "drivable_index")
 
 
-class Rollouts(TensorClass["shadow"]):  # `size` and `split` are fields, not methods
+class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` and `split` are fields, not methods
     """B rollouts of N agents, the ego first, over T steps of DT; step 0 is the start. Everything lies on the CPU.
 
     Indexing and `torch.cat` work as for tensors: `rollouts[mask]`, `rollouts[3]` (without the leading B). What is None
@@ -110,8 +110,8 @@ class Rollouts(TensorClass["shadow"]):  # `size` and `split` are fields, not met
                 row[tuple(slice(length) for length in each.shape)] = each
             return result
 
-        padded = ("states", "valid", "size", "simulated", "adversaries", "logged", "logged_valid")
-        padded += ("lane_points", "lane_width", "drivable_points")
+        tracks = ("states", "valid", "size", "simulated", "adversaries", "logged", "logged_valid")
+        padded = (*tracks, "lane_points", "lane_width", "drivable_points")
         lines: dict[str, list[Tensor]] = {"lane": [], "drivable": []}  # the line number of each point
         for each in rollouts:
             for name, numbers in lines.items():
@@ -142,14 +142,15 @@ class Rollouts(TensorClass["shadow"]):  # `size` and `split` are fields, not met
     def rollout(self, index: int) -> Rollout:
         """One of B rollouts as numpy arrays. Plans are those of the ego and of the adversaries."""
         row = self[index]
-        plans = {}
+        plans: dict[str, Any] = {}
         if row.plans is not None:
             planners = row.adversaries[: row.plans.shape[1]].bool().clone()
             planners[0] = True
             plans["planners"] = planners.nonzero()[:, 0].numpy()
             plans |= {"plans": row.plans[:, planners].float().numpy(), "targets": row.targets[:, planners].numpy()}
+        texts: dict[str, Any] = {name: str(getattr(row, name) or "") for name in TEXTS}
         return Rollout(
-            **{name: str(getattr(row, name) or "") for name in TEXTS},
+            **texts,
             seed=int(row.seed),
             eta=float(row.eta),
             agent_type=np.array(AGENT_TYPES)[row.agent_type.numpy()],

@@ -20,7 +20,7 @@ OF_THE_RUN = (InputError, MemoryError, torch.OutOfMemoryError)  # errors that ar
 EXHAUSTED = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENOMEM, errno.EMFILE, errno.ENFILE)  # nor these
 
 Task = TypeVar("Task")
-Batch = Rollouts | TensorDictBase
+Batch = TypeVar("Batch", Rollouts, TensorDictBase)
 
 
 def attempt(

@@ -2,6 +2,7 @@
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.learning.logging import RunLogger
@@ -52,7 +53,7 @@ def run_prior_stage(run: Run, logger: RunLogger) -> tuple[Path, list[dict]] | No
         path = train_prior(prior, scenes, settings, folder, origin, processes, logger, parts)
         if path is None:
             return None
-        fields = {"stage": "prior", "parts": Parts(folder, "prior", path.name), **origin_of(folder)}
+        fields: dict[str, Any] = {"stage": "prior", "parts": Parts(folder, "prior", path.name), **origin_of(folder)}
         setup = Setup(_first_starts(scenes), ReplayEgo(), "replay", SimSettings(), device=device)
         return path, run_protocol(setup, [Method("nominal", NominalTraffic(prior))], [0], folder, **fields)
 

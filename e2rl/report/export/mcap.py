@@ -61,7 +61,7 @@ def content(episode: Episode) -> bytes:
     buffer = io.BytesIO()
     writer = Writer(buffer, compression=CompressionType.ZSTD)
     writer.start(profile="", library="e2rl")
-    kinds = {"/map": SceneUpdate, "/traffic": SceneUpdate, "/plans": SceneUpdate, "/tf": FrameTransform}
+    kinds: dict[str, Any] = {"/map": SceneUpdate, "/traffic": SceneUpdate, "/plans": SceneUpdate, "/tf": FrameTransform}
     schemas = {kind: register_schema(writer, kind) for kind in (SceneUpdate, FrameTransform)}
     numbers = writer.register_schema("e2rl.planners", "jsonschema", json.dumps(NUMBERS).encode())
     channels = {topic: writer.register_channel(topic, "protobuf", schemas[kind]) for topic, kind in kinds.items()}
@@ -97,7 +97,8 @@ def messages(episode: Episode) -> Iterator[tuple[int, str, dict[str, Any]]]:
         number, rest = divmod(step, REPLAN_STEPS)
         if rollout.plans is not None and rest == 0 and number < len(rollout.plans):
             yield step, "/plans", {"entities": list(plans(episode, number))}
-        pose = placed(*rollout.states[step, 0, :3].tolist(), "translation", "rotation")
+        x, y, heading = rollout.states[step, 0, :3].tolist()
+        pose = placed(x, y, heading, "translation", "rotation")
         yield step, "/tf", {"parent_frame_id": MAP, "child_frame_id": EGO} | pose
         yield step, "/ego", {name: values[step] for name, values in told.items()}
 
@@ -131,6 +132,7 @@ def traffic(episode: Episode, step: int) -> Iterator[Entity]:
 def plans(episode: Episode, number: int) -> Iterator[Entity]:
     """The plans of a replan."""
     rollout, step = episode.rollout, number * REPLAN_STEPS
+    assert rollout.planners is not None and rollout.plans is not None
     for row, path in zip(rollout.planners.tolist(), rollout.plans[number], strict=True):
         if rollout.valid[step, row] and np.isfinite(path).all():
             whole = np.concatenate([rollout.states[step, row, :2][None], path])

@@ -6,6 +6,7 @@ sample under sparse control. With eta = 0 nothing is controlled, and the traffic
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -95,7 +96,7 @@ class E2(NominalTraffic):
         for part in fields(self):
             given = getattr(self, part.name)
             if isinstance(given, Mapping):
-                setattr(self, part.name, settings_of(part.type, given, f"synthesizer.{part.name}"))
+                setattr(self, part.name, settings_of(cast(type, part.type), given, f"synthesizer.{part.name}"))
         rules = self.reasoner.kind == "rules"
         self.feasible_vehicles = feasible_vehicles if rules else LanguageReasoner(self.reasoner)
 
@@ -118,7 +119,8 @@ class E2(NominalTraffic):
         nobody = {"coalition": none, "target": none.long() - 1, "off_lane": none, "committed": none}
         costs = {"path_kl": zero, "anchor_jump": zero}
         knots = zero[..., None].repeat(1, 1, KNOTS)
-        return E2State(**vars(nominal), eta=eta, near=near, far=far, knots=knots, **nobody, **costs)
+        begun: dict[str, Any] = {**vars(nominal), **nobody, **costs}
+        return E2State(**begun, eta=eta, near=near, far=far, knots=knots)
 
     def replan(
         self, state: E2State, world: World, ego_plan: Tensor, react: React | None = None

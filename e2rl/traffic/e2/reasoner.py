@@ -181,9 +181,9 @@ class LanguageReasoner:
         except ImportError as error:
             reason = "the openai client is not installed; install e2rl with its extra: pip install 'e2rl[lm]'"
             raise InputError(f"{where}: {reason}") from error
-        given = {"base_url": settings.base_url, "timeout": settings.timeout, "max_retries": settings.retries}
+        given: dict[str, Any] = {"base_url": settings.base_url, "timeout": settings.timeout}
         try:
-            self._client = openai.OpenAI(**given)
+            self._client = openai.OpenAI(**given, max_retries=settings.retries)
         except openai.OpenAIError as error:
             reason = f"{str(error).splitlines()[0]} (for an endpoint without keys any OPENAI_API_KEY will do)"
             raise InputError(f"{where}: {reason}") from error
