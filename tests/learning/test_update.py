@@ -242,3 +242,22 @@ def test_an_interrupt_in_an_update_ends_in_one_line_that_says_how_to_go_on(monke
         learner.update(data)
     assert end.value.code == 128 + signal.SIGTERM
     assert capsys.readouterr().err.strip() == "interrupted (SIGTERM); go on with: python train.py resume=RUN"
+
+
+@pytest.mark.parametrize("name", ["cloning", "teaching"])
+def test_what_is_shown_counts_by_its_weight(name):
+    """One step with a weight that is next to nothing is the step without; with a weight of 1 it is another."""
+
+    def after(weight):
+        torch.manual_seed(0)
+        ego = ActorEgo(hidden=(16,))
+        data = batch_of(ego)
+        shown = expert_of(data, (1.0, 0.5))
+        others = {"cloning": 0.0, "teaching": 0.0, name: weight}
+        learner = Learner(ego.network, settings_of(critic_warmup=0, epochs=1, minibatch=10_000, **others))
+        torch.manual_seed(1)
+        learner.update(data, shown if name == "cloning" else (), shown[0] if name == "teaching" else None)
+        return torch.cat([each.detach().flatten() for each in ego.network.parameters()])
+
+    none, little, much = after(0.0), after(1e-9), after(1.0)
+    assert torch.allclose(none, little, atol=2e-5) and not torch.allclose(none, much, atol=2e-5)

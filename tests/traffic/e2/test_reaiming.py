@@ -62,6 +62,17 @@ def test_traffic_in_which_nobody_reacts_is_today_s_bit_for_bit(scene_set):
     assert torch.equal(tracks(today)[4:], tracks(reacting)[4:]), "nor in rows without an intensity"
 
 
+def test_only_stored_attacks_count_as_adversarial_episodes(scene_set):
+    class Spy:
+        def begin(self, rows, adversarial, adversaries, horizon):
+            self.seen = adversarial.tolist()
+
+    pool, spy = stored(scene_set) + stored(scene_set, 0.0) + TrafficPool.recorded(torch.arange(4)), Spy()
+    base = DrivingEnv(scene_set, ON, len(pool), agents=True)
+    TransformedEnv(base, AdversarialSynthesizer(pool, in_turn(pool), reaction=spy)).reset()
+    assert spy.seen == [True] * 4 + [False] * 8
+
+
 def test_the_row_s_adversaries_leave_the_replay_and_everybody_else_stays(scene_set):
     pool = stored(scene_set)
     frames = driven(pool, scene_set, EVERYBODY)
