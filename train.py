@@ -84,7 +84,8 @@ def evolve(task: Run) -> None:
 
 def train_prior(task: Run) -> None:
     """Train a prior and print its nominal closed loop on held-out logs."""
-    outcome = run_prior_stage(task, build_logger(task.config, task.folder))
+    logger = None if follows() else build_logger(task.config, task.folder)  # the leader alone writes
+    outcome = run_prior_stage(task, logger)
     if outcome is None:
         return  # another process of torchrun is the leader and reports
     path, rows = outcome

@@ -150,7 +150,7 @@ def test_other_versions_are_told_and_what_differs_is_named(sent, tmp_path, monke
     for part in ("torch 1.0.0 then, ", "e2rl 000000000000 then, ", "conf/synthesizer/nominal.yaml"):
         assert part in said
     different = json.loads((tmp_path / "now" / "reproduced.json").read_text())["different"]
-    assert len(different) == 1 and different[0][0].endswith("progress: mean")
+    assert len(different) == 1 and different[0][0].endswith("progress.mean")
 
 
 @pytest.mark.parametrize("more", ["seeds=[1]", "ego=idm"])

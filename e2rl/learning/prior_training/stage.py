@@ -24,7 +24,7 @@ from e2rl.sim.env import SimSettings
 from e2rl.traffic.nominal import NominalTraffic
 
 
-def run_prior_stage(run: Run, logger: RunLogger) -> tuple[Path, list[dict]] | None:
+def run_prior_stage(run: Run, logger: RunLogger | None) -> tuple[Path, list[dict]] | None:
     """Train a prior; returns its checkpoint's path and the metrics rows of the nominal closed loop on held-out scenes,
     the ego replayed. None in processes other than the leader."""
     config = run.config
