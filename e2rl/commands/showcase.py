@@ -13,16 +13,16 @@ from pathlib import Path
 
 from PIL import Image
 
-from e2rl.api import load_prior, load_scenes, make_ego, make_traffic
-from e2rl.evaluation.methods import build_sim
+from e2rl.evaluation.methods import build_ego, build_prior, build_sim, build_traffic
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.metrics.score import score_rollouts
 from e2rl.report.html import write_report
 from e2rl.report.picture import Replay
 from e2rl.report.videos import save_animation
-from e2rl.run.config import load_config
+from e2rl.run.config import load_choice, load_config
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
+from e2rl.scenes.source import load_scenes
 
 SCENE, SEED, ETA = "arterial_065_0440", 0, 2.0  # of the bundled test scenes
 METRES, PIXELS, COLOURS = 60.0, 400, 32
@@ -64,10 +64,14 @@ def main(arguments: list[str] | None = None) -> None:
     with ending():
         if options.run:
             photograph(write_report(options.run), options.out / "report.png")
-        scenes, prior, sim = load_scenes("bundled"), load_prior(), build_sim(load_config("evaluate"))
+        config = load_config("evaluate", ["ego=actor", "data.workers=1"])
+        scenes, prior, sim = load_scenes(config.data), build_prior(config)[0], build_sim(config)
         for name, (checkpoint, traffic, caption) in PICTURES.items():
-            setup = Setup(scenes, make_ego("actor", checkpoint=checkpoint), "actor", sim)
-            method = Method(traffic, make_traffic(traffic, prior), ETA if traffic == "e2" else 0.0)
+            config.ego.checkpoint = checkpoint
+            setup = Setup(scenes, build_ego(config), "actor", sim)
+            method = Method(
+                traffic, build_traffic(load_choice("synthesizer", traffic), prior), ETA if traffic == "e2" else 0.0
+            )
             rollouts = setup.roll_out(method, [(scenes.index(options.scene), SEED)])
             row = score_rollouts(rollouts)[0][0]
             frames = Replay(rollouts.rollout(0), row, METRES, PIXELS, caption=caption).frames()
