@@ -160,6 +160,7 @@ def assigned(key: str, value: object) -> str:
 def read_provenance(folder: Path) -> dict[str, Any]:
     """Returns the content of a run's provenance.json; InputError where it is not there or damaged."""
     file = Path(folder) / PROVENANCE
+    damaged = InputError(f"{file}: damaged, or of another version; restore it, or begin a new run")
     try:
         known = json.loads(file.read_text())
         kinds = {"command": str, "cwd": str, "choices": dict, "inputs": dict, "settings": dict, "files": dict}
@@ -168,9 +169,9 @@ def read_provenance(folder: Path) -> dict[str, Any]:
             return known
     except FileNotFoundError as error:
         raise InputError(f"{file}: not there; give the folder of a run that had begun") from error
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        pass
-    raise InputError(f"{file}: damaged, or of another version; restore it, or begin a new run")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise damaged from error
+    raise damaged
 
 
 def origin_of(folder: Path) -> dict[str, Any]:
