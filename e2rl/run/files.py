@@ -5,11 +5,13 @@ Weights in safetensors files, with a hash of what was written in the header: an 
 Files of earlier versions have no hash; of those only the form is checked.
 """
 
+import errno
 import fcntl
 import hashlib
 import json
 import os
 import shutil
+import stat
 import tempfile
 import time
 import zipfile
@@ -27,11 +29,43 @@ from torch import Tensor, nn
 
 from e2rl.run.errors import InputError
 
+MAX_FILE = 1 << 30  # bytes of a file of a run
 MAX_ARRAYS = 1 << 30  # bytes of one npz, unpacked
 WAIT = 5  # s that another run's workers have to end
 HASH = "sha256"  # key in the header of a file of weights
 SEAL = "sha256.json"  # of a sealed folder: {file: hash}
 DAMAGED = (OSError, EOFError, LookupError, TypeError, ValueError, RuntimeError, MemoryError, SyntaxError)
+
+
+def open_regular(path: Path, limit: int = MAX_FILE, within: Path | None = None) -> IO[bytes]:
+    """Open a regular file to read, which never blocks.
+
+    Args:
+        limit: bytes that it has at most.
+        within: folder in which it lies once links are followed, as the files of a run do.
+
+    Raises:
+        OSError: where it is missing, a folder, a pipe, a device, larger, or a link to somewhere else.
+    """
+    if within is not None and not path.resolve().is_relative_to(within.resolve()):
+        raise OSError(errno.EPERM, f"a link out of {within}", str(path))
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        found = os.fstat(handle)
+        if not stat.S_ISREG(found.st_mode):
+            raise OSError(errno.EINVAL, "no regular file", str(path))
+        if found.st_size > limit:
+            raise OSError(errno.EFBIG, f"larger than {limit / 1e6:.0f} MB", str(path))
+        return os.fdopen(handle, "rb")
+    except BaseException:
+        os.close(handle)
+        raise
+
+
+def read_regular(path: Path, limit: int = MAX_FILE, within: Path | None = None) -> bytes:
+    """Returns the bytes of a file as `open_regular` opens it; raises as it does."""
+    with open_regular(path, limit, within) as file:
+        return file.read()
 
 
 def write_atomically(path: Path, content: bytes | str | Callable[[Path], object]) -> None:
