@@ -13,7 +13,6 @@ from e2rl.evaluation.reproduce import compared_with_run, run_of
 from e2rl.report.results import references, write_results
 from e2rl.run.command import run_command
 from e2rl.run.run import Run
-from e2rl.sim.rollout_file import ROLLOUTS
 
 MAY_CHANGE = ("processes", "launcher", "shard")  # when a run is resumed
 
@@ -22,8 +21,7 @@ def evaluate(run: Run) -> None:
     """Roll out and score what is not done yet; then summarise, draw and print."""
     config, folder, plan = run.config, run.folder, begin(run)
     asked, egos = plan.asked, plan.egos
-    into = folder / ROLLOUTS if asked.save_rollouts else None
-    how: Any = (asked.seeds, into, processes_of(config), plan.only, run.parts(), asked.shard)
+    how: Any = (asked.seeds, plan.rollouts(folder), processes_of(config), plan.only, run.parts(), asked.shard)
     scored = drive_all(egos.setups(plan.setup), plan.methods, *how)  # every ego, method, eta, scene and seed
     if asked.shard != WHOLE:
         print(f"\nshard {asked.shard[0]} of {asked.shard[1]} written to {folder}; e2rl merge joins all of them")

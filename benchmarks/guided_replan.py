@@ -6,7 +6,8 @@ from dataclasses import replace
 import torch
 from measure import Bench, Row
 
-from e2rl.api import make_ego
+from e2rl.evaluation.methods import build_ego
+from e2rl.run.config import load_config
 
 ETA = 2.0
 
@@ -14,7 +15,7 @@ ETA = 2.0
 def guided_replan(bench: Bench) -> Iterator[Row]:
     """Milliseconds a scene and replan in the middle of an episode, for the densest scenes and for the first ones, and
     of two egos' plans beside it."""
-    sampling = make_ego("sampling")
+    sampling = build_ego(load_config("evaluate", ["ego=sampling"]))
     for scenes, agents in (("densest scenes", bench.scenes.scenes["valid"].shape[1]), ("first scenes", None)):
         for batch in bench.batches(1, 8, 32):
             index = bench.pick(batch, agents)

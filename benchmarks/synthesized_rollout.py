@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 import torch
 from measure import Bench, Row
 
-from e2rl.prior.prior import Prior
 from e2rl.sim.env import DrivingEnv
 from e2rl.traffic.e2.skeleton import build_skeleton
 from e2rl.traffic.e2.topology import topological_candidates
@@ -27,10 +26,11 @@ def synthesized_rollout(bench: Bench) -> Iterator[Row]:
         wall, cpu = bench.both(lambda e=eta: run(e))
         yield bench.row("synthesized_rollout", name, index, wall / batch, "s/rollout")
         yield bench.row("synthesized_rollout", name, index, cpu / batch, "CPU s/rollout")
+    prior = type(bench.traffic.prior)
     parts = {
         "topology, feasibility and skeleton": (topological_candidates, bench.traffic.feasible_vehicles, build_skeleton),
-        "sampling": (Prior.sample,),
-        "bounds and decoding of the plan": (Prior.plan,),
+        "sampling": (prior.sample,),
+        "bounds and decoding of the plan": (prior.plan,),
         "plans of lane_graph": (type(bench.ego).plan,),
         "simulator": (DrivingEnv._step,),
     }

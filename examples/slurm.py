@@ -30,7 +30,7 @@ class Shard(Checkpointable):
 
     def __call__(self) -> str:
         if (self.folder / "provenance.json").exists():
-            return CommandFunction([*EVALUATE, f"resume={self.folder}"])()
+            return CommandFunction([*EVALUATE, f"resume={self.folder}", *cache_of(self.options)])()
         own = [f"shard=[{self.number},{self.count}]", f"hydra.run.dir={self.folder}"]
         return CommandFunction([*EVALUATE, *self.options, *own])()
 
@@ -54,7 +54,12 @@ def main(arguments: list[str] | None = None) -> None:
     whole = into / "whole"
     if not whole.exists():
         subprocess.run([*MERGE, *(str(shard.folder) for shard in shards), "--into", str(whole)], check=True)
-    subprocess.run([*EVALUATE, f"resume={whole}", "shard=null"], check=True)
+    subprocess.run([*EVALUATE, f"resume={whole}", "shard=null", *cache_of(given.options)], check=True)
+
+
+def cache_of(options: list[str]) -> list[str]:
+    """Those that a run that goes on is told again: where it writes outside of its folder."""
+    return [option for option in options if option.startswith("data.cache")]
 
 
 def value_of(text: str) -> int | str:

@@ -4,6 +4,7 @@ Needs the build-time extra: pip install -e '.[sumo]'. The same seed and SUMO ver
 """
 
 import argparse
+import hashlib
 import sys
 import tempfile
 import time
@@ -65,7 +66,9 @@ def main() -> None:
     for split, (maps, scenes) in made.items():
         path = options.out / f"{split}.npz"
         np.savez_compressed(path, **pack(maps, scenes))
-        print(f"{split}: {len(maps)} nets, {len(scenes)} scenes, {path.stat().st_size / 1e6:.2f} MB")
+        content = path.read_bytes()
+        print(f"{split}: {len(maps)} nets, {len(scenes)} scenes, {len(content) / 1e6:.2f} MB")
+        print(f'    "{split}": "{hashlib.sha256(content).hexdigest()}",  # SHA256 of e2rl/scenes/bundled.py')
     print(f"refused {dict(refusals)}; {time.time() - began:.0f} s")
 
 

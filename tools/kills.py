@@ -111,7 +111,7 @@ def interrupted(command: list[str], folder: Path, took: float, draw: random.Rand
     came = []
     for left in range(times, -1, -1):
         begun = (folder / "run" / PROVENANCE).is_file()
-        now = [command[0], "resume=run"] if begun else command
+        now = [command[0], "resume=run", *(each for each in command if "data.cache=" in each)] if begun else command
         if not left:
             return came, complete(now, folder)
         number = draw.choice(SIGNALS)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from e2rl.evaluation.rollout_files import TABLE, read_rows
+from e2rl.evaluation.rollout_files import TABLE, own_folder, read_rows
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.export import archive, mcap, openscenario
 from e2rl.report.export import commonroad_writer as commonroad
@@ -105,8 +105,8 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
     options = parse_arguments(arguments)
-    out = options.out or options.run / "export" / options.to
     with ending():
+        out = options.out or own_folder(options.run, "export", options.to)
         check_format(options.to, options.open_ego)
         if options.failures is not None and options.failures < 1:
             raise InputError(f"--failures {options.failures}: expected at least 1")

@@ -170,7 +170,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--metres", type=float, default=140.0, help="width of the picture (default %(default)s)")
     parser.add_argument("--apart", type=Path, metavar="OTHER", help="logs that must share no place with those at PATH")
     parser.add_argument("--workers", type=int, default=2, help="processes (default %(default)s)")
-    parser.add_argument("--out", type=Path, default="scene.png", help="picture, with a PDF (default %(default)s)")
+    parser.add_argument("--out", type=Path, default="runs/inspect/scene.png", help="picture, with a PDF (%(default)s)")
     options = parser.parse_args(arguments)
     with ending():
         name, source = open_source(options.path, options.data, options.workers)

@@ -9,10 +9,11 @@ import shlex
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import IO
 
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
-from e2rl.run.files import write_atomically, written_whole
+from e2rl.run.files import open_regular, write_atomically, written_whole
 from e2rl.run.parts import PARTS
 from e2rl.run.run import PROVENANCE, assigned, changed, read_provenance
 from e2rl.run.trust import CONFIG
@@ -37,18 +38,30 @@ def merge(runs: Sequence[Path], into: Path) -> int:
             )
     if into.exists():
         raise InputError(f"{into}: is there already; name a new folder")
+    try:
+        command = [part for part in shlex.split(first["command"]) if not part.startswith(OWN)]
+    except ValueError as error:
+        raise InputError(f"{runs[0] / PROVENANCE}: its command is none ({error}); restore it") from error
     with written_whole(into) as folder:
         for run in runs:
             for source in (source for pattern in COPIED for source in sorted(run.glob(pattern))):
                 copy = folder / source.relative_to(run)
                 copy.parent.mkdir(exist_ok=True)
-                shutil.copyfile(source, copy)
-        command = [part for part in shlex.split(first["command"]) if not part.startswith(OWN)]
+                with opened(source, run) as content, copy.open("wb") as file:
+                    shutil.copyfileobj(content, file)
         versions = [each for run in runs for each in known[run]["versions"]]
         versions = [each for number, each in enumerate(versions) if each not in versions[:number]]
         whole = first | {"command": shlex.join(command), "versions": versions}
         write_atomically(folder / PROVENANCE, json.dumps(whole, indent=1))
         return len(list(folder.glob(COPIED[0])))
+
+
+def opened(file: Path, run: Path) -> IO[bytes]:
+    """A file of a shard, to read; InputError for a link to elsewhere, a pipe, a device."""
+    try:
+        return open_regular(file, within=run)
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror}); put the shard's own file there") from error
 
 
 def main(arguments: list[str] | None = None) -> None:

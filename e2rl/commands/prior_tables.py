@@ -17,10 +17,10 @@ from e2rl.evaluation.plan import begin
 from e2rl.evaluation.protocol import drive_all, record
 from e2rl.evaluation.summary import metric_rows
 from e2rl.report.results import write_results
+from e2rl.report.tables import metric_tables, print_tables
 from e2rl.run.command import run_command
 from e2rl.run.run import Run
 from e2rl.run.settings import setting, settings_of
-from e2rl.sim.rollout_file import ROLLOUTS
 
 MAY_CHANGE = ("processes", "launcher")  # when a run is resumed
 
@@ -42,7 +42,7 @@ def prior_tables(run: Run) -> None:
     before, after = [], []
     if asked.open_loop_samples:
         before = open_loop_rows(plan.scenes, methods, asked.open_loop_samples, config.device, parts)
-    into = folder / ROLLOUTS if plan.asked.save_rollouts else None
+    into = plan.rollouts(folder)
     scored = drive_all([setup], methods, plan.asked.seeds, into, processes_of(config), plan.only, parts)
     if asked.meta_rollouts:
         after = meta_rows(setup, methods, asked.meta_rollouts, parts)
@@ -51,7 +51,9 @@ def prior_tables(run: Run) -> None:
         return [row | run.origin() for row in (*before, *metric_rows(*found), *after)]
 
     rows = record(*scored, folder, summarise)
-    print("", *write_results(run, plan, rows), sep="\n")
+    answer = write_results(run, plan, rows)
+    print_tables(metric_tables([*before, *after]))
+    print("", *answer, sep="\n")
 
 
 def main() -> None:

@@ -1,14 +1,14 @@
-"""`e2rl replay RUN_DIR`: videos (GIF) and strips of four moments (PNG, PDF) of the first failures of a run."""
+"""`e2rl replay RUN_DIR`: videos (GIF) of the first failures of a run."""
 
 import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
 from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
-from e2rl.evaluation.rollout_files import TABLE, read_rows
+from e2rl.evaluation.rollout_files import TABLE, own_folder, read_rows
 from e2rl.metrics.score import score_rollouts
 from e2rl.report.picture import Replay
-from e2rl.report.videos import found_failures, save_replay
+from e2rl.report.videos import found_failures, save_animation
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.sim.rollout_file import Failure, Rollout, rollout_name
@@ -24,10 +24,12 @@ def chosen(run: Path, failures: int, modes: bool) -> Iterator[tuple[str, Failure
     rows = read_rows(run / TABLE)
     found = [("", row) for row in found_failures(rows, failures)]
     if modes:
-        files = {rollout_name(row): row for row in rows}
+        files, known = {rollout_name(row): row for row in rows}, read_modes(run / MODES_FILE)["modes"]
+        if lost := [mode["typical"]["file"] for mode in known if mode["typical"]["file"] not in files]:
+            raise InputError(f"{run / MODES_FILE}: {lost[0]} is not in {TABLE}; run evaluate.py again to rewrite both")
         found = [
             (f"{mode['mode']}. {mode['name']} ({mode['count']} failures)", files[mode["typical"]["file"]])
-            for mode in read_modes(run / MODES_FILE)["modes"]
+            for mode in known
             if mode["mode"] != OTHER
         ]
     if not found:
@@ -47,13 +49,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, help="folder to write to (default: RUN_DIR/replays)")
     parser.add_argument("--metres", type=float, default=70.0, help="side of the picture, m (default %(default)s)")
     parser.add_argument("--pixels", type=int, default=720, help="side of the picture, pixels (default %(default)s)")
-    parser.add_argument("--ghost", action="store_true", help="outline where the recording has the ego")
     options = parser.parse_args(arguments)
-    folder = options.out or (options.run.parent if options.run.is_file() else options.run) / "replays"
     with ending():
+        folder = options.out or own_folder(options.run.parent if options.run.is_file() else options.run, "replays")
         for title, shown in chosen(options.run, options.failures, options.modes):
-            replay = Replay(shown.rollout, shown.row, options.metres, options.pixels, options.ghost)
-            print(*filter(None, [title]), *save_replay(replay, folder), sep="\n")
+            path = folder / f"{shown.rollout.name.removesuffix('.npz')}.gif"
+            save_animation(path, Replay(shown.rollout, shown.row, options.metres, options.pixels).frames())
+            print(*filter(None, [title]), path, sep="\n")
 
 
 if __name__ == "__main__":

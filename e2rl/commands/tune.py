@@ -20,7 +20,7 @@ from e2rl.evaluation.plan import Evaluation, begin
 from e2rl.evaluation.protocol import Method
 from e2rl.evaluation.trials import NOMINAL, AttackObjective, AttackTrials, PlannerObjective, PlannerTrials
 from e2rl.evaluation.tuning import STUDY_FILE, Objective, Parameters, SearchSettings, line_of, save, search, yaml_of
-from e2rl.report.tuning_curve import save_tuning_curve
+from e2rl.report.curves import points_of_tuning, save_curves
 from e2rl.run.command import run_command
 from e2rl.run.config import resolved
 from e2rl.run.errors import InputError
@@ -62,7 +62,7 @@ def tune(run: Run) -> dict:
     rows = search(trials, flat(resolved(config[group])), space, settings, objective, file, about, told)
     result = save(rows, folder)
     if group == "synthesizer":
-        save_tuning_curve(folder, rows, config.synthesizer.name)
+        save_curves(folder, points_of_tuning(result, config.synthesizer.name))
     best = "no trial keeps within the limits\n"
     if result["best"]:
         best = f"best of {len(rows)} trials, for conf/{group}:\n{yaml_of(result['best'])}"

@@ -6,7 +6,7 @@ from pathlib import Path
 from statistics import fmean
 from types import NoneType
 
-from e2rl.evaluation.rollout_files import nulls
+from e2rl.evaluation.rollout_files import nulls, read_json
 from e2rl.evaluation.summary import GROUP, group_of
 from e2rl.metrics.failure_modes import (
     FEATURES,
@@ -18,7 +18,6 @@ from e2rl.metrics.failure_modes import (
     medoid,
     mode_name,
 )
-from e2rl.run.errors import InputError
 from e2rl.run.files import misfit, write_atomically
 from e2rl.sim.rollout_file import rollout_name
 
@@ -125,10 +124,4 @@ def write_modes(path: Path, found: dict) -> None:
 
 def read_modes(path: Path) -> dict:
     """The content of a modes.json; raises InputError where it is none."""
-    try:
-        found = json.loads(Path(path).read_text())
-        if wrong := misfit(found, SHAPE) or _mismatch(found):
-            raise ValueError(wrong)
-        return found
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: no readable modes ({error}); run evaluate.py again to write them") from error
+    return read_json(path, lambda found: misfit(found, SHAPE) or _mismatch(found))

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from e2rl.evaluation.ego_set import EgoSet, build_egos
@@ -14,6 +15,7 @@ from e2rl.run.run import Run
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.scene_list import listed
 from e2rl.scenes.source import load_scenes
+from e2rl.sim.rollout_file import ROLLOUTS
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,10 @@ class Evaluation:
     methods: list[Method]
     setup: Setup
     only: list[int] | None
+
+    def rollouts(self, folder: Path) -> Path | None:
+        """Returns where a run's rollouts are written; None: nowhere."""
+        return folder / ROLLOUTS if self.asked.save_rollouts else None
 
     @property
     def scenes(self) -> SceneSet:

@@ -1,5 +1,6 @@
 """The closed-loop protocol: methods x scenes x seeds with one ego, the files of a run (docs/method.md, section 11)."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,7 +23,7 @@ from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.processes import Processes, in_processes
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import SimSettings
-from e2rl.sim.rollout_file import ROLLOUTS, rollout_name
+from e2rl.sim.rollout_file import ROLLOUTS, UNPRINTABLE, rollout_name
 from e2rl.sim.rollouts import Rollouts
 from e2rl.traffic.attempt import attempt, count_reasons
 from e2rl.traffic.rollout import roll_out
@@ -43,6 +44,9 @@ class Method:
     traffic: Traffic
     eta: float = 0.0
 
+    def __post_init__(self) -> None:
+        check_names(self.name)
+
 
 @dataclass
 class Setup:
@@ -55,6 +59,14 @@ class Setup:
     batch: int = 64  # rollouts at once
     device: str = "cpu"
     evasions: bool = True  # collisions are searched for evasions
+
+    def __post_init__(self) -> None:
+        """InputError where two scenes share an id, and so the files of their rollouts, or a name is not printable."""
+        scenes = self.scenes
+        if twice := [name for name, count in Counter(scenes.scene_id).items() if count > 1]:
+            mend = "give each an id of its own in the data, or list the scenes to take with scenes=FILE"
+            raise InputError(f"scene id {twice[0]!r}: stands for several scenes; {mend}")
+        check_names(scenes.dataset, scenes.split, self.ego_name, *scenes.scene_id, *scenes.location)
 
     def roll_out(self, method: Method, tasks: Sequence[Task]) -> Rollouts:
         """The rollouts of (scene, seed) pairs under one method."""
@@ -86,6 +98,12 @@ class Setup:
         about = dict(zip(SOURCE, self.source(method), strict=True)) | {"eta": float(method.eta)}
         names = self.scenes.scene_id
         return rows, samples, [about | {"scene_id": names[k], "seed": seed} | why for (k, seed), why in errored]
+
+
+def check_names(*names: str) -> None:
+    """InputError for a name that a terminal or a table could not show as it is."""
+    if odd := next(filter(UNPRINTABLE.search, names), None):
+        raise InputError(f"the name {odd!r}: holds control characters; rename it in the data or the configuration")
 
 
 Job = tuple[int, tuple[Setup, Method, list[Task]]]  # with its number

@@ -16,13 +16,14 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from e2rl.evaluation.rollout_files import METRICS_FILE, nulls, read_metrics
+from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
 from e2rl.run.run import ALWAYS, Run, changed, inputs, read_provenance, versions
-from e2rl.run.trust import leaves, saved_configuration
+from e2rl.run.trust import WRITTEN, check_written, leaves, saved_configuration
 from e2rl.scenes.scene_list import SCENES
 
-HERE = ("processes", "data.cache", "data.workers")  # always the command line's: of this machine, without influence
+HERE = ("processes", "data.cache", "data.cache_gb", "data.workers")  # of this machine: always the command line's
 MOVED = ("device", "data.path", *HERE)  # what the command line may set, besides files of weights
 RESULT = "reproduced.json"
 LISTED = "scenes"  # the name of the scenes in provenance.json
@@ -49,10 +50,10 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
     saved, known = saved_configuration(config, old, where), read_provenance(old)
     if missing := [name for name in (METRICS_FILE, SCENES) if not (old / name).is_file()]:
         raise InputError(f"{where}: {missing[0]} is missing; give a finished run of evaluate.py that has tables")
-    table = read_metrics(old / METRICS_FILE)
-    compare_tables(table, table)  # what is damaged is told now, and not at the end
+    read_metrics(old / METRICS_FILE)  # what is damaged is told now, and not at the end
     files = {name: value for name, value in known["inputs"].items() if "=" in name and isinstance(value, str)}
     _move(config, saved, [_key(name) for name in files], known["choices"], where)
+    check_written(saved, old, where, config, load_config())
     saved.plugins, saved.resume, saved.reproduce, saved.scenes = config.plugins, None, str(old), str(old / SCENES)
     _check_weights(config, saved, files, where)
     _tell_versions(saved, known, where)
@@ -70,7 +71,7 @@ def _move(
     """Set in `saved` what the command line may set anew."""
     given = [item.lstrip("+~").partition("=")[::2] for item in HydraConfig.get().overrides.task]
     names = [name for name, value in given if name not in ("reproduce", *ALWAYS) and choices.get(name) != value]
-    if wrong := [name for name in names if name not in (*MOVED, *files)]:
+    if wrong := [name for name in names if name not in (*MOVED, *WRITTEN, *files)]:
         raise InputError(
             f"{where}: is made again as it was; leave out {', '.join(wrong)} (only {', '.join(MOVED)} and files of "
             "weights can be others)"
@@ -156,15 +157,8 @@ def compared_with_run(config: DictConfig, folder: Path) -> Comparison:
 
 
 def compare_tables(then: Sequence[Mapping], now: Sequence[Mapping]) -> Comparison:
-    """Returns how the rows of two metrics.json agree: counts, metrics and paired differences, wall times apart.
-
-    Raises:
-        InputError: for rows that are none of metrics.json.
-    """
-    try:
-        before, after = (dict(number for row in rows for number in _numbers(row)) for rows in (then, now))
-    except (TypeError, AttributeError, LookupError) as error:
-        raise InputError(f"metrics.json: damaged ({error}); give the folder of a run of evaluate.py") from error
+    """Returns how the rows of two metrics.json agree: counts, metrics and paired differences, wall times apart."""
+    before, after = (dict(number for row in rows for number in _numbers(row)) for rows in (then, now))
     equal = close = 0
     different = []
     for name in dict.fromkeys([*before, *after]):

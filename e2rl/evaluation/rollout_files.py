@@ -4,27 +4,30 @@ import csv
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from types import NoneType
-from typing import Any
+from typing import IO, Any
 
 from e2rl.metrics.catalogue import SOURCE, WORDS, row_columns
 from e2rl.run.errors import InputError
-from e2rl.run.files import misfit, write_atomically
+from e2rl.run.files import leads_into, misfit, open_regular, read_regular, write_atomically
+from e2rl.sim.rollout_file import UNPRINTABLE
 from e2rl.traffic.attempt import summary_of
 
 TABLE, METRICS_FILE, ERRORED_FILE = "rollouts.csv", "metrics.json", "errored.json"
-NEEDED = (*SOURCE, "scene_id", "seed", "eta")
+MAX_JSON, MOST_ROWS = 48 << 20, 300_000  # bytes and lines that take less than 2 GB of memory
+DIGITS = 15  # of a whole number: more would not fit a float
 NUMBER = (int, float, NoneType)
 INTERVAL = {"low": NUMBER, "high": NUMBER, "n": NUMBER, ...: NUMBER}
 METRICS_ROW = {  # what readers of metrics.json need
-    **dict.fromkeys(("dataset", "split", "method", "ego"), str),
+    **dict.fromkeys(("dataset", "split", "method", "ego", "git", "command"), str),
     **dict.fromkeys(("eta", "n_scenes", "n_seeds", "n_rollouts"), (int, float)),
     "metrics": {...: {"mean": NUMBER, **INTERVAL}},
     "paired": {...: {...: {"difference": NUMBER, **INTERVAL}}},
 }
-SOMETIMES = {"errored": {...: int}, "stage": (str, NoneType), "git": str, "command": str, "n_trainings": int}
+SOMETIMES = {"errored": {...: int}, "stage": (str, NoneType), "n_trainings": int}
 TEXTS = (*SOURCE, "scene_id", "location", *WORDS)
 
 
@@ -56,22 +59,37 @@ def read_rows(path: Path) -> list[dict]:
     Raises InputError for a file that is no such table.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such table; give the folder of a run that evaluate.py wrote")
     try:
-        with path.open(newline="") as file:
+        with opened(path) as file:
             rows = csv.DictReader(file, strict=True)
-            if missing := [name for name in NEEDED if name not in (rows.fieldnames or ())]:
+            if missing := [name for name in table_columns() if name not in (rows.fieldnames or ())]:
                 raise ValueError(f"no column {missing[0]}")
-            return [_row(rows.line_num, row) for row in rows]
+            found = [_row(rows.line_num, row) for row in islice(rows, MOST_ROWS + 1)]
+        if len(found) > MOST_ROWS:
+            raise ValueError(f"more than {MOST_ROWS:,} rows")
+        return found
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such table; give the folder of a run that evaluate.py wrote") from error
     except (OSError, ValueError, csv.Error) as error:
-        raise InputError(f"{path}: damaged ({error}); run evaluate.py again to rewrite it") from error
+        raise InputError(f"{path}: damaged ({cause(error)}); run evaluate.py again to rewrite it") from error
+
+
+def opened(path: Path) -> IO[str]:
+    """A table of a run, to read; raises OSError as `open_regular` does."""
+    return io.TextIOWrapper(open_regular(path, within=path.parent), "utf-8", newline="")
+
+
+def cause(error: Exception) -> str:
+    """What an error says, without the path and number of one of the file system."""
+    return str(isinstance(error, OSError) and error.strerror or error)
 
 
 def _row(line: int, row: dict[str, Any]) -> dict:
     """A line of the table with its values; ValueError where it has other cells than the head."""
     if None in row or None in row.values():
         raise ValueError(f"line {line} has other cells than the head")
+    if odd := [name for name in TEXTS if UNPRINTABLE.search(row.get(name, ""))]:
+        raise ValueError(f"line {line}: {odd[0]} holds control characters")
     try:
         return {
             key: value if key in TEXTS else int(value) if key in ("seed", "partner") else float(value or "nan")
@@ -88,17 +106,55 @@ def write_metrics(path: Path, rows: Sequence[dict]) -> None:
 
 def read_metrics(path: Path) -> list[dict]:
     """The rows of a metrics.json, null as NaN inside `metrics` and `paired`."""
-    path = Path(path)
-    try:
-        rows = json.loads(path.read_text())
-        wrong = misfit(rows, [METRICS_ROW])
-        for row in [] if wrong else rows:
-            wrong = wrong or misfit(row, {name: shape for name, shape in SOMETIMES.items() if name in row})
-        if wrong:
-            raise ValueError(wrong)
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: no readable metrics ({error}); give a metrics.json that a run wrote") from error
+
+    def wrong(rows: Any) -> str | None:
+        if found := misfit(rows, [METRICS_ROW]):
+            return found
+        others = ({name: shape for name, shape in SOMETIMES.items() if name in row} for row in rows)
+        return next(filter(None, map(misfit, rows, others)), None)
+
+    rows = read_json(path, wrong)
     return [{key: nans(value) if key in ("metrics", "paired") else value for key, value in row.items()} for row in rows]
+
+
+def read_json(path: Path, wrong: Callable[[Any], str | None]) -> Any:
+    """The content of a JSON file of a run; raises InputError where it is none, or has something wrong."""
+    try:
+        found = json.loads(read_regular(path, MAX_JSON, path.parent), parse_int=_whole)
+        if reason := wrong(found):
+            raise ValueError(reason)
+        if odd := next(filter(UNPRINTABLE.search, _texts(found)), None):
+            raise ValueError(f"{odd[:40]!r} holds control characters")
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: cannot be read ({cause(error)}); give the folder of a finished run") from error
+    return found
+
+
+def _whole(digits: str) -> int:
+    if len(digits) > DIGITS:
+        raise ValueError(f"a number of {len(digits)} digits")
+    return int(digits)
+
+
+def _texts(value: object) -> Iterator[str]:
+    """All text in nested containers, but for the command line, which is never shown as it is."""
+    if isinstance(value, dict):
+        for key, part in value.items():
+            yield key
+            yield from () if key == "command" else _texts(part)
+    elif isinstance(value, list):
+        for part in value:
+            yield from _texts(part)
+    elif isinstance(value, str):
+        yield value
+
+
+def own_folder(run: Path, *names: str) -> Path:
+    """A folder of a run to write to; InputError where a link leads out of the run."""
+    folder = run.joinpath(*names)
+    if not leads_into(folder, run):
+        raise InputError(f"{folder}: a link out of {run}; remove it, or name another folder with --out")
+    return folder
 
 
 def nulls(value: object) -> object:
@@ -110,7 +166,7 @@ def nulls(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def nans(value: object) -> object:
+def nans(value: Any) -> Any:
     """The value with None replaced by NaN, in nested dicts."""
     if isinstance(value, dict):
         return {key: nans(part) for key, part in value.items()}
@@ -129,9 +185,9 @@ def add_errored(path: Path, number: int, errored: Sequence[dict]) -> None:
     """Write the entries of round `number` of a training into its errored.json, after those of earlier rounds; a resumed
     run repeats some. A damaged file is begun anew."""
     try:
-        known = json.loads(path.read_text()) if path.is_file() else []
+        known = json.loads(read_regular(path, MAX_JSON, path.parent))
         earlier = [entry for entry in known if entry["round"] < number]
-    except (OSError, ValueError, TypeError, KeyError):
+    except (OSError, ValueError, TypeError, LookupError, RecursionError):
         earlier = []
     write_errored(path, [*earlier, *errored])
 

@@ -5,6 +5,7 @@ What a trial is and what its metrics are worth is told by `e2rl.evaluation.trial
 
 import json
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from omegaconf import OmegaConf
 
 from e2rl.evaluation.rollout_files import nans, nulls
 from e2rl.run.errors import InputError
-from e2rl.run.files import write_atomically
+from e2rl.run.files import misfit, read_regular, write_atomically
 from e2rl.run.settings import configured, setting
 
 Parameters = dict[str, Any]
@@ -22,7 +23,8 @@ Space = Mapping[str, Sequence]  # {name: (low, high) or (low, high, "log")} of s
 Evaluate = Callable[[Parameters], Mapping[str, float]]  # the metrics of a trial
 REFUSED = 10.0  # added to the objective of refused trials, so that the sampler leaves their region
 UNKNOWN = 2 * REFUSED  # of trials in which no rollout has a score
-ROW = ("parameters", "metrics", "objective", "admissible")
+STUDY = {"task": dict, "trials": [{"parameters": {...: int | float}, "metrics": {...: int | float | None}}]}  # its file
+MAX_STUDY = 1 << 24  # bytes of it
 STUDY_FILE, TUNING_FILE, TUNED_FILE = "study.json", "tuning.json", "tuned.yaml"
 
 
@@ -77,7 +79,7 @@ def search(
     given = [{name: present[name] for name in space}, *sweep(present, space, settings.sweep)]
     task = {"space": {name: list(space[name]) for name in space}, "parameters": present, "sweep": settings.sweep}
     task = json.loads(json.dumps(nulls(task | {"objective": vars(objective)} | dict(about or {}))))
-    rows = read_study(file, task)
+    rows = read_study(file, task, ranges, objective)
     for number in range(len(rows), settings.trials):
         parameters = given[number] if number < len(given) else proposal(rows, ranges, settings, objective)
         metrics = dict(evaluate(present | parameters))
@@ -92,20 +94,36 @@ def search(
     return rows
 
 
-def read_study(file: Path | None, task: Mapping) -> list[dict]:
-    """Returns the rows of a study's file, none where there is none; InputError for one of another task."""
-    if file is None or not file.exists():
+def read_study(file: Path | None, task: Mapping, ranges: Mapping, objective: Objective) -> list[dict]:
+    """Returns the rows of a study's file, none where there is none; InputError where it is no study, or of another
+    task."""
+    if file is None or not os.path.lexists(file):
         return []
     try:
-        study = json.loads(file.read_text())
-        known = study["task"]
-        rows: list[Any] = [nans({name: row[name] for name in ROW}) for row in study["trials"]]
-        differ = ", ".join(sorted(name for name in {*known, *task} if known.get(name) != task.get(name)))
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
-        raise InputError(f"tuning.study={file}: no study; name another file") from error
-    if differ:
-        raise InputError(f"tuning.study={file}: a study that differs in {differ}; name another file")
-    return rows
+        study = json.loads(read_regular(file, MAX_STUDY))
+        if wrong := misfit(study, STUDY):
+            raise ValueError(wrong)
+        known, rows = study["task"], [nans(row) for row in study["trials"]]
+        if differ := sorted(name for name in {*known, *task} if known.get(name) != task.get(name)):
+            raise InputError(f"tuning.study={file}: a study that differs in {', '.join(differ)}; name another file")
+        return [_row(row["parameters"], row["metrics"], rows[0]["metrics"], ranges, objective) for row in rows]
+    except InputError:
+        raise
+    except (OSError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
+        raise InputError(f"tuning.study={file}: no study, or a damaged one ({error}); name another file") from error
+
+
+def _row(parameters: Parameters, metrics: Mapping, reference: Mapping, ranges: Mapping, objective: Objective) -> dict:
+    """The row of a trial in a study's file; ValueError for parameters out of their ranges."""
+    inside = parameters.keys() == ranges.keys() and all(
+        isinstance(value, type(ranges[name].low) | int) and ranges[name].low <= value <= ranges[name].high
+        for name, value in parameters.items()
+    )
+    if not inside:
+        raise ValueError("a trial out of its ranges")
+    list(map(float, metrics.values()))  # raises OverflowError for an endless number
+    value, excess = objective.judge(metrics, reference)
+    return {"parameters": parameters, "metrics": metrics, "objective": value, "admissible": excess == 0}
 
 
 def best_of(rows: Sequence[dict]) -> dict | None:

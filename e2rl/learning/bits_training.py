@@ -175,34 +175,27 @@ class BitsTraining(Epochs):
         return torch.stack(list(parts.values())).sum()
 
     def step(self, loss: Tensor) -> None:
-        """One step of the optimiser and of its schedule."""
         super().step(loss)
         self.schedule.step()
 
     @torch.no_grad()
     def measure(self, data: TensorDictBase) -> dict[str, float]:
-        """The losses of windows and their sum `loss`; NaN without windows."""
-        if not len(data):
-            return dict.fromkeys(("goal", "residual", "trajectory", "loss"), float("nan"))
+        """The losses of windows and their sum `loss`."""
         self.network.eval()
         rows = [(len(part), losses(self.network, part)) for part in data.split(4096)]
         mean = {name: float(sum(count * row[name] for count, row in rows)) / len(data) for name in rows[0][1]}
         return mean | {"loss": sum(mean.values())}
 
     def weights(self) -> dict[str, Tensor]:
-        """Those of the network."""
         return dict(self.network.state_dict())
 
     def set_weights(self, weights: Mapping[str, Tensor]) -> None:
-        """Take chosen weights."""
         self.network.load_state_dict(weights)
 
     def state_dict(self) -> dict:
-        """All that later turns depend on."""
         return super().state_dict() | {"schedule": self.schedule.state_dict()}
 
     def load_state_dict(self, state: dict) -> None:
-        """Restore a `state_dict`."""
         super().load_state_dict(state)
         self.schedule.load_state_dict(state["schedule"])
 

@@ -1,10 +1,15 @@
-"""Builds the parts of an evolution from a run's configuration."""
+"""Builds the parts of an evolution from a run's configuration, and says how long it takes."""
 
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf, open_dict
+from tqdm import tqdm
 
 from e2rl.evaluation.methods import as_list, build_prior, build_sim, build_traffic, processes_of
 from e2rl.evaluation.protocol import Method, Setup
@@ -15,7 +20,6 @@ from e2rl.learning.improvement import Improvement
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.memory import Memory
 from e2rl.learning.prefetch import why_no_prefetch
-from e2rl.learning.progress import BEGIN, FRAMES, ROLLOUT, Progress
 from e2rl.learning.scheduler import CurriculumScheduler
 from e2rl.planners.ego import Ego
 from e2rl.prior.prior import Prior
@@ -140,6 +144,51 @@ def build_measure(
     methods = [Method("nominal", nominal), *(Method(config.synthesizer.name, traffic, eta) for eta in options.eta)]
     setup = Setup(scenes, ego, ego_name, build_sim(config), config.batch, config.device)
     return BeforeAfter(setup, methods, options.seeds, folder, processes_of(config))
+
+
+ROLLOUT = 0.7  # s on one core, measured and scored
+FRAMES = 7_000  # simulated steps a second that are collected and learned from
+BEGIN = 20.0  # s to read what a run begins with
+
+
+class Progress:
+    """The phases of a training: (kind, expected seconds), in order. Phases of one kind take about equally long."""
+
+    def __init__(self, phases: Sequence[tuple[str, float]]) -> None:
+        self._phases = list(phases)
+        self._spent: dict[str, list[float]] = defaultdict(list)
+
+    @contextmanager
+    def phase(self, kind: str) -> Iterator[None]:
+        """The next phase, of this kind, is done in the block."""
+        begin = time.monotonic()
+        yield
+        self._spent[kind].append(time.monotonic() - begin)
+
+    def left(self) -> str:
+        """Returns the time left in words: "about 12 min left", "done"."""
+        done = {kind: len(seconds) for kind, seconds in self._spent.items()}
+        seconds = 0.0
+        for kind, guess in self._phases:
+            if done.get(kind, 0) > 0:
+                done[kind] -= 1
+                continue
+            known = self._spent[kind]
+            seconds += sum(known) / len(known) if known else guess
+        return f"about {duration(seconds)} left" if seconds else "done"
+
+    def say(self, text: str) -> None:
+        """Print a line with the time left, above any progress bar."""
+        with tqdm.external_write_mode():
+            print(f"{text}; {self.left()}", flush=True)
+
+
+def duration(seconds: float) -> str:
+    """A duration in its two largest sensible units."""
+    minutes = round(seconds / 60)
+    if minutes < 1:
+        return f"{max(round(seconds), 1)} s"
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
 
 
 def build_progress(config: DictConfig, done: int = 0) -> Progress:

@@ -104,8 +104,6 @@ class Imitation(Epochs):
     def measure(self, data: TensorDictBase) -> dict[str, float]:
         """The cloning loss, and `miss`: the mean distance of the deterministic action from the labels in halves of the
         action's range."""
-        if not len(data):
-            return dict.fromkeys(("loss", "miss"), float("nan"))
         reach = (self.network.high - self.network.low) / 2
         central = self.network.network.deterministic(data["observation"])
         miss = ((central[:, None] - data["action"]).abs() / reach).mean(-1)
@@ -121,7 +119,6 @@ class Imitation(Epochs):
         return dict(self.network.weights())
 
     def set_weights(self, weights: Mapping[str, Tensor]) -> None:
-        """Take chosen weights."""
         self.network.set_weights(dict(weights))
 
 

@@ -84,6 +84,5 @@ class PlannerImprovement(Improvement):
         return {"present": dict(self.present)}
 
     def load_state_dict(self, state: dict) -> None:
-        """Restore a `state_dict`."""
         self.present = dict(state["present"])
         self.ego = type(self.ego)(**self.present)

@@ -191,7 +191,6 @@ class PolicyImprovement(Improvement):
         return state | ({} if self.reaction is None else {"reaction": self.reaction.generator.get_state()})
 
     def load_state_dict(self, state: dict) -> None:
-        """Restore a `state_dict`."""
         self.learner.load_state_dict(state["learner"])
         self.draw.generator.set_state(state["draws"].cpu())
         if self.reaction is not None:

@@ -20,7 +20,8 @@ from e2rl.learning.evolution import Evolution
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.network import WEIGHTS
 from e2rl.run.errors import InputError
-from e2rl.run.files import altered, misfit, seal
+from e2rl.run.files import altered, misfit, read_regular, seal
+from e2rl.run.parts import load_plain
 
 STATE, FORMAT = "state.pt", "e2rl-checkpoint/8"
 
@@ -45,7 +46,7 @@ def save_checkpoint(folder: Path, run: Evolution, keep_last: int = 2) -> Path:
     kept = [*older, newest][-max(1, keep_last) :]
     for old in set(older) - set(kept):
         shutil.rmtree(old)
-    whole = [torch.load(each / STATE, weights_only=True) for each in kept if altered(each) is None]
+    whole = [load_plain(read_regular(each / STATE, within=each)) for each in kept if altered(each) is None]
     first = [entry["round"] for state in whole for entry in state["memory"]]
     run.memory.prune(min(first, default=0))  # a file goes when no checkpoint names it any more
     return target
@@ -100,7 +101,7 @@ def _whole(folder: Path, run: Evolution) -> dict:
     if name := altered(folder):
         raise InputError(f"{folder / name}: missing or damaged; resume from an older checkpoint")
     try:
-        state = torch.load(file, map_location="cpu", weights_only=True)
+        state = load_plain(read_regular(file, within=folder))
         written = state["format"]
     except Exception as error:  # a stranger's pickle can raise any exception
         raise InputError(f"{file}: damaged ({type(error).__name__}); resume from an older checkpoint") from error

@@ -1,6 +1,7 @@
 """Supervised training for the stages imitation, bits and prior: turns of optimiser steps, each followed by a
 validation; the weights of the lowest held-out loss are chosen; an interrupted training goes on exactly."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
@@ -124,7 +125,7 @@ class Epochs(Supervised):
 
     @abstractmethod
     def measure(self, data: TensorDictBase) -> dict[str, float]:
-        """The mean losses of data, `loss` among them; NaN without data."""
+        """The mean losses of data, which has rows, `loss` among them."""
 
     def turn(self) -> dict[str, float]:
         """One pass over the training rows; returns the mean of its losses, and the held-out ones."""
@@ -134,7 +135,8 @@ class Epochs(Supervised):
             loss = self.loss(self.train[index])
             self.step(loss)
             seen.append(loss.detach())
-        held_out = {f"held_out_{name}": value for name, value in self.measure(self.held_out).items()}
+        measured = self.measure(self.held_out) if len(self.held_out) else {"loss": math.nan}
+        held_out = {f"held_out_{name}": value for name, value in measured.items()}
         return {"loss": torch.stack(seen).mean().item(), **held_out}
 
     def step(self, loss: Tensor) -> None:
@@ -142,7 +144,6 @@ class Epochs(Supervised):
         take_step(self.optimiser, loss, MAX_GRAD_NORM)
 
     def state_dict(self) -> dict:
-        """All that later turns depend on."""
         own = {"optimiser": self.optimiser.state_dict(), "order": self._generator.get_state()}
         return super().state_dict() | own | {"weights": dict(self.weights())}
 

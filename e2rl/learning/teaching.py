@@ -14,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from e2rl.learning.cloning import clip_expert
-from e2rl.planners.ego import Ego
+from e2rl.planners.ego import Ego, ask
 from e2rl.planners.sampling import ScoringEgo, ranked_actions
 from e2rl.run.errors import InputError
 from e2rl.run.settings import configured, setting, settings_of
@@ -97,7 +97,7 @@ class Teacher:
         settings = self.settings
         world = World.of(frames, self.scenes.batch(frames["scene_index"][:, 0].cpu()).to(frames.device))
         action, cost = ranked_actions(self.planner, world, CANDIDATES, self.hold)
-        own = self.planner.rated(world, ego.plan(world)[:, None])[:, 0]
+        own = self.planner.rated(world, ask(ego, "plan", world)[:, None])[:, 0]
         weight = torch.softmax(-cost / TEMPERATURE, -1)
         found = {"observation": frames["observation"], "action": clip_expert(action, *self.bounds), "weight": weight}
         kept = (own - cost[:, 0] >= settings.regret) & (cost[:, 0] < settings.survivable)

@@ -23,7 +23,6 @@ class Observation(NamedTuple):
     acceleration: Tensor  # m/s^2, the ego's in the step before
     gap: Tensor  # m, from the ego's front to the other's rear; negative: side by side; inf: there is no other
     other_speed: Tensor  # m/s, along the ego's way
-    other_acceleration: Tensor  # m/s^2, along the ego's way
     lateral_gap: Tensor  # m, between the facing sides; at most 0: they overlap laterally
     lateral_speed: Tensor  # m/s, the other's towards the ego's lane
     overlaps: Tensor  # bool, whether they overlap laterally

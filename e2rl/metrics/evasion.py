@@ -5,8 +5,6 @@ routes, and shifts beside its mission). Where none is clean, an evolution strate
 What it finds proves that a collision was avoidable; what it does not find proves nothing.
 """
 
-import time
-
 import torch
 from tensordict import TensorClass, TensorDictBase
 from torch import Tensor
@@ -48,7 +46,6 @@ declare(
     ),
     rate("avoidable_1s", "the same, acting only 1 s before contact", per_collision=True),
     Metric("evasion_accel", "peak acceleration of the mildest evasion found", "m/s²", per_collision=True),
-    events=("evasion_tried", "evasion_seconds"),
 )
 
 
@@ -59,7 +56,6 @@ class Evasions(TensorClass):
     actions: Tensor  # [B, T, 2]
     states: Tensor  # [B, T, 4], at steps 1..T
     peak: Tensor  # [B] m/s^2, its largest acceleration
-    tried: Tensor  # [B], manoeuvres executed
 
 
 class Trials(TensorClass):
@@ -79,10 +75,10 @@ class Trials(TensorClass):
         row = torch.arange(len(rank), device=rank.device)[:, None]
         return self[row, rank.argsort(1)[:, :count]]
 
-    def evasions(self, tried: Tensor) -> Evasions:
-        """The best of each rollout as the result after `tried` [B] manoeuvres."""
+    def evasions(self) -> Evasions:
+        """The best of each rollout."""
         best = self.best(1)[:, 0]
-        return Evasions(best.violation == 0, best.actions, best.states, best.peak, tried, batch_size=best.batch_size)
+        return Evasions(best.violation == 0, best.actions, best.states, best.peak, batch_size=best.batch_size)
 
 
 def find_evasions(
@@ -105,7 +101,7 @@ def _search(scene: TensorDictBase, states: Tensor, valid: Tensor, moment: Tensor
     driven = driven.gather(1, (moment[:, None] + torch.arange(steps, device=moment.device)).clamp(max=steps - 1))
     task = EvasionScene.after(moment, scene, states, valid)
     pool = _try(task, *grid(driven, scene["route_valid"][:, 0], scene["route_log"][:, 0]), sim)
-    result = pool.evasions(torch.full_like(moment, pool.batch_size[1]))
+    result = pool.evasions()
     row = torch.arange(len(states), device=states.device)
     generator = torch.Generator().manual_seed(0)
     for _ in range(ROUNDS):
@@ -115,7 +111,7 @@ def _search(scene: TensorDictBase, states: Tensor, valid: Tensor, moment: Tensor
             break
         parents = pool.best(SURVIVORS)
         pool = Trials.cat([parents, _try(task, *_mutated(parents, generator), sim)], 1)
-        result[row] = pool.evasions(result.tried[row] + SAMPLES)
+        result[row] = pool.evasions()
     return result
 
 
@@ -189,8 +185,7 @@ def add_avoidable(rows: list[dict], rollouts: Rollouts, scene: TensorDictBase, s
 
     Args:
         rows: of `score_rollouts`. Those with a collision get avoidable and avoidable_1s (0 or 1: an evasion was found
-            from the start, from LATE seconds before contact), evasion_accel [m/s^2] of the mildest one from the start,
-            evasion_tried (manoeuvres driven) and evasion_seconds.
+            from the start, from LATE seconds before contact), evasion_accel [m/s^2] of the mildest one from the start.
         rollouts: [B], those of the rows. `evasion` [B, T+1, 4] is the ego's mildest one from the start where there is
             one, else the late one; NaN where none was found.
         scene: their scenes [B].
@@ -200,7 +195,7 @@ def add_avoidable(rows: list[dict], rollouts: Rollouts, scene: TensorDictBase, s
     collided = [index for index, row in enumerate(rows) if row["cfr"] == 1]
     if not collided:
         return
-    begin, picked = time.perf_counter(), torch.tensor(collided)
+    picked = torch.tensor(collided)
     given = scene[picked], rollouts.states[picked], rollouts.valid[picked]
     contact = torch.tensor([int(rows[index]["contact_step"]) for index in collided])
     early = find_evasions(*given, sim)
@@ -208,14 +203,11 @@ def add_avoidable(rows: list[dict], rollouts: Rollouts, scene: TensorDictBase, s
     late = find_evasions(*given, sim, moment)
     found = early.found | late.found  # avoidable late implies avoidable early: drive as in the rollout until then
     peak = torch.where(early.found, early.peak, torch.where(late.found, late.peak, torch.nan))
-    spent = (time.perf_counter() - begin) / len(collided)
     for row, index in enumerate(collided):
         rows[index] |= {
             "avoidable": float(found[row]),
             "avoidable_1s": float(late.found[row]),
             "evasion_accel": peak[row].item(),
-            "evasion_tried": int(early.tried[row] + late.tried[row]),
-            "evasion_seconds": spent,
         }
     driven = given[1][:, :, 0]
     rollouts.evasion[picked[late.found]] = spliced(driven, late.states, moment)[late.found]

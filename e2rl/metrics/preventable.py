@@ -40,7 +40,6 @@ class Along(NamedTuple):
 
     rear: Tensor  # m, arc length of its near end
     speed: Tensor  # m/s, along the way
-    acceleration: Tensor  # m/s^2, along the way
     lateral_gap: Tensor  # m, between the facing sides
     lateral_speed: Tensor  # m/s, towards the way
     length: Tensor  # m, along the way
@@ -79,9 +78,8 @@ def along_way(states: Tensor, width: Tensor, others: Tracks) -> Along:
     gap = d.abs() - side - width[:, None, None] / 2
     enters = ((gap <= 0) & others.present).any(1, keepdim=True)
     away = ~others.present | ~enters
-    change = torch.nn.functional.pad(speed.diff(dim=1) / DT, (0, 0, 1, 0)) * cos
     rear, gap = (value.masked_fill(away, torch.inf) for value in (s - extent, gap))
-    values = rear, speed * cos, change, gap, -d.sign() * speed * sin, 2 * extent
+    values = rear, speed * cos, gap, -d.sign() * speed * sin, 2 * extent
     return Along(*(value.transpose(0, 1) for value in values))
 
 
@@ -100,7 +98,7 @@ def redrive(driver: Driver, states: Tensor, size: Tensor, others: Along) -> Tens
         gap, side = others.rear[t] - (s + size[:, 0] / 2)[:, None], others.lateral_gap[t]
         own = speed[:, None].expand_as(gap), acceleration[:, None].expand_as(gap)
         lateral = side, others.lateral_speed[t], side <= 0
-        seen = Observation(*own, gap, others.speed[t], others.acceleration[t], *lateral, length, others.length[t])
+        seen = Observation(*own, gap, others.speed[t], *lateral, length, others.length[t])
         memory, wanted = driver.step(memory, seen)
         asked = wanted.amin(1)
         reacted = reacted | (asked < 0)

@@ -4,6 +4,8 @@
 Vehicles that stand at the start: parked ones should stay, some of those on a lane should start.
 """
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -12,12 +14,13 @@ from e2rl.metrics.contact import steps_until
 from e2rl.metrics.geometry import velocity
 from e2rl.scenes.boxes import distance
 from e2rl.scenes.recording import DT
-from e2rl.sim.dynamics import wrap
+from e2rl.sim.dynamics import closest_approach_cost, wrap
 
 SMOOTHING = 0.5  # s, moving average of the ego's speed before its derivative
 LEAST_WAY = 1.0  # m: of a shorter recorded way no fraction is known
 STANDING = 0.5  # m/s at the start frame
 MOVED = 2.0  # m from the start position
+per_km = partial(Metric, unit="1/km", per="driven_km", tables="egos")
 
 
 @columns(
@@ -27,8 +30,8 @@ MOVED = 2.0  # m from the start position
     Metric("macc", "ego's mean |acceleration|", unit="m/s²", tables="main egos public"),
     Metric("progress", "distance that the ego drives", unit="m", tables="main egos public"),
     rate("route_completion", "fraction of the recorded ego's path driven until contact", tables="public"),
-    Metric("failures_per_km", "`cfr`, of all that the ego drives", unit="1/km", column="cfr", per="driven_km"),
-    Metric("counted_per_km", "the same of `cfr_counted`", unit="1/km", column="cfr_counted", per="driven_km"),
+    per_km("failures_per_km", "`cfr`, of all that the ego drives", column="cfr"),
+    per_km("counted_per_km", "the same of `cfr_counted`", column="cfr_counted"),
 )
 def motion_columns(batch: Batch) -> Batch:
     """min_dtc, ttc_c, ttc_c_all, macc, progress, driven_km and route_completion over the steps 1..stop; NaN without any
@@ -38,7 +41,8 @@ def motion_columns(batch: Batch) -> Batch:
     seen[..., 0] = False
     gap = distance(states[:, :, :1], batch["size"][:, None, :1], states, batch["size"][:, None])
     gap = gap.masked_fill(~seen, torch.inf).flatten(1).amin(-1)
-    cost = closest_approach_cost(states)
+    moving = velocity(states)
+    cost = closest_approach_cost(states[..., :2] - states[..., :1, :2], moving - moving[..., :1, :])
     path, count = ego_path(states, valid, stop)
     driven = progress(path, count)
     return {
@@ -50,19 +54,6 @@ def motion_columns(batch: Batch) -> Batch:
         "driven_km": driven / 1000,
         "route_completion": route_completion(path, count, batch["logged"], batch["logged_valid"]),
     }
-
-
-def closest_approach_cost(states: Tensor) -> Tensor:
-    """exp(-t*^2 / 2 - d*^2 / 2) [..., N] at the ego's and each agent's closest approach at constant velocity.
-
-    t* = relu(-(p . v) / (|v|^2 + 1e-6)), d* = |p + v t*| for the relative position p and velocity v of states
-    [..., N, 4]. A pair at the same velocity keeps its distance, hence costs nearly nothing.
-    """
-    moving = velocity(states)
-    offset, closing = states[..., :2] - states[..., :1, :2], moving - moving[..., :1, :]
-    time = (-(offset * closing).sum(-1) / (closing.square().sum(-1) + 1e-6)).clamp(min=0)
-    miss = offset + closing * time[..., None]
-    return (-(time.square() + miss.square().sum(-1)) / 2).exp()
 
 
 def mean_worst_cost(cost: Tensor, counted: Tensor) -> Tensor:

@@ -157,15 +157,10 @@ def load_bits(checkpoint: str) -> BitsNetwork:
         )
     try:
         weights, header = read_weights(path)
-    except ValueError as error:
-        raise InputError(f"{path}: not a readable safetensors file ({error}); train it again") from error
-    if header.get("format") != FORMAT:
-        raise InputError(f"{path}: format {header.get('format')!r}, expected {FORMAT!r}; give a {WEIGHTS} file")
-    try:
         saved = json.loads(header["architecture"])
         hidden = saved["hidden"]
-        if type(hidden) is not int or not 0 < hidden <= LARGEST:
-            raise ValueError(f"hidden {hidden} instead of 1 to {LARGEST}")
+        if header.get("format") != FORMAT or type(hidden) is not int or not 0 < hidden <= LARGEST:
+            raise ValueError(f"format {header.get('format')!r} instead of {FORMAT!r}, or {hidden} hidden units")
         if wrong := unlike(partial(BitsNetwork, hidden), weights):
             raise ValueError(wrong)
         network = BitsNetwork(hidden)
@@ -174,5 +169,5 @@ def load_bits(checkpoint: str) -> BitsNetwork:
         network.load_state_dict(weights)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split("\n\t")[:2])
-        raise InputError(f"{path}: another architecture ({reason}); train it again") from error
+        raise InputError(f"{path}: damaged, or of another architecture ({reason}); train it again") from error
     return network.requires_grad_(False).eval()

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from e2rl.planners.ego import PLAN_STEPS, RETURN_LENGTH
 from e2rl.planners.lane_graph_planner import HALVES, PLAN_DT, capped, upsample
-from e2rl.planners.path import RoutePath, fading
+from e2rl.planners.path import RoutePath, between_entries, fading
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import interpolate
 from e2rl.sim import dynamics
@@ -62,11 +62,11 @@ def drive(start: Tensor, path: RoutePath, speed: Tensor, shift: Tensor, time: Te
     beside, turned = shift[..., None], path.turned[:, None, None]
     offset, slope = fading(path.d[:, None, None, None] - beside, turned[..., None], length, driven)
     table = heading_table(path)
-    before, after, _ = between_entries(table, driven)
+    before, after, _ = between_entries(table, driven / CELL)
     inner = (1 - (after - before) / CELL * (beside + offset)).clamp(min=0.2)
     stretch = torch.hypot(inner, slope)
     along = (driven.diff(dim=-1) * 2 / (stretch[..., 1:] + stretch[..., :-1])).cumsum(-1)
-    aimed = torch.lerp(*between_entries(table, along)) + torch.atan(slope[..., 1:] / inner[..., 1:])
+    aimed = torch.lerp(*between_entries(table, along / CELL)) + torch.atan(slope[..., 1:] / inner[..., 1:])
     grip = (dynamics.MAX_LATERAL**2 - accel.square()).clamp(min=0).sqrt() / mean.clamp(min=1e-3)
     bound = torch.minimum(grip, dynamics.yaw_rate_bound(mean)).clamp(max=MAX_YAW_RATE)
     yaw_rate = steer(turned.expand_as(shift), aimed, bound * DT) / DT
@@ -91,13 +91,3 @@ def heading_table(path: RoutePath) -> Tensor:
     grid = CELL * torch.arange(REACH, device=path.s.device, dtype=path.s.dtype)
     heading = interpolate(path.route, path.s[:, None] + grid)[1]
     return torch.nn.functional.pad(wrap(heading.diff(dim=-1)).cumsum(-1), (1, 0))
-
-
-def between_entries(table: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The entries of a `heading_table` before and after `ahead` [B, ...] m, and the fraction of the distance between
-    them."""
-    at = (ahead / CELL).clamp(0, REACH - 1.001)
-    index = at.long()
-    flat = index.flatten(1)
-    low, high = (table.gather(1, flat + shift).view(ahead.shape) for shift in (0, 1))
-    return low, high, at - index

@@ -7,7 +7,7 @@ its `plan` returns its own predicted motion.
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -17,12 +17,17 @@ from torch import Tensor
 from e2rl.run.config import Extension
 from e2rl.run.settings import check_range
 from e2rl.scenes.boxes import to_frame
+from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
-from e2rl.sim.world import World
+from e2rl.sim.world import World, without_future
 
 PLAN_STEPS = 50  # H: planned steps of DT
 RETURN_TIME, RETURN_LENGTH = 0.7, 1.5  # s, m: a lateral error decays over max(RETURN_LENGTH, RETURN_TIME * v)
 CATCH_UP = 1.0  # 1/s: rate at which a longitudinal error is corrected
+FASTEST = 50.0  # m/s: a plan that is faster, in its speeds or from pose to pose, is nonsense
+LARGEST = 100.0  # m/s^2, rad/s: so is a larger action
+JUMPS = f"a plan that is not finite, or jumps (above {FASTEST:g} m/s)"
+WILD = f"an action that is not finite, or above {LARGEST:g}"
 
 
 class Ego(Extension, ABC):
@@ -86,6 +91,14 @@ class PlannerError(Exception):
         self.rows = dict(rows or {})
 
 
+class Undrivable(PlannerError):
+    """A planner in this process asked for what no vehicle can drive."""
+
+
+class PlannerExited(PlannerError):
+    """A planner called sys.exit."""
+
+
 class NotFinite(ArithmeticError):
     """An ego planned or acted NaN or infinite."""
 
@@ -95,6 +108,34 @@ def finite(values: Tensor, name: str) -> Tensor:
     if not bool(values.isfinite().all()):
         raise NotFinite(f"the ego's {name} is NaN or infinite")
     return values
+
+
+def drivable(now: Tensor, given: Tensor, known: Tensor | int = PLAN_STEPS) -> Tensor:
+    """Bool [B]: the first `known` [B] states of given [B, H, 4] are finite and no faster than FASTEST, in their speeds
+    and from pose to pose, beginning at states now [B, 4]."""
+    moved = torch.cat([now[:, None, :2], given[..., :2]], 1).diff(dim=1).norm(dim=-1)
+    fine = (moved <= FASTEST * DT) & (given[..., 3].abs() <= FASTEST) & given.isfinite().all(-1)
+    counts = torch.arange(given.shape[1], device=given.device) < torch.as_tensor(known, device=given.device)[..., None]
+    return (fine | ~counts).all(1)
+
+
+def from_outside(ego: Ego) -> bool:
+    """Whether the class of the ego is not e2rl's own."""
+    return not type(ego).__module__.startswith("e2rl.")
+
+
+def ask(ego: Ego, method: str, world: World, *given: Tensor, scene: TensorDictBase | None = None) -> Any:
+    """What a method of the ego returns; one from outside the package is given copies, by `World.shown` of `scene`.
+
+    Raises PlannerExited where it ends the program.
+    """
+    asked = getattr(ego, method)
+    if from_outside(ego) and asked.__module__ != __name__:
+        world, given = world.shown(scene), tuple(value.clone() for value in given)
+    try:
+        return asked(world, *given)
+    except SystemExit as error:
+        raise PlannerExited(f"it called sys.exit({error.code!r})") from error
 
 
 class EgoPlanner(TensorDictModuleBase):
@@ -114,6 +155,7 @@ class EgoPlanner(TensorDictModuleBase):
         self.ego, self.scene, self.bounds = ego, base.scene, base.action_spec.space
         self._plan: Tensor | None = None  # [B, 1 + PLAN_STEPS, 4], the state at the time of planning first
         self._planned_at: Tensor | None = None  # [B] step of planning
+        self._shown: TensorDictBase | None = None  # the scenes as a planner from outside sees them
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         tensordict["ego", "plan"] = self.plan(World.of(tensordict, self.scene))[:, 1:]
@@ -122,18 +164,29 @@ class EgoPlanner(TensorDictModuleBase):
     def plan(self, world: World) -> Tensor:
         """States [B, 1 + PLAN_STEPS, 4] now and at the coming steps of the last plan; replans where due."""
         if bool((world.step == 0).any()):
-            self.ego.reset(world)
+            self._shown = without_future(self.scene) if from_outside(self.ego) else None
+            self._ask("reset", world)
         if self._plan is None or self._planned_at is None:
             self._plan = torch.zeros(len(world.step), 1 + PLAN_STEPS, 4, device=world.states.device)
             self._planned_at = torch.full_like(world.step, -PLAN_STEPS)
         age = world.step - self._planned_at
         due = (age >= self.ego.replan_every) | (age < 0) | (world.step == 0)
         if bool(due.any()):
-            fresh = torch.cat([world.states[:, :1], finite(self.ego.plan(world), "plan")], 1)
+            fresh = finite(self._ask("plan", world), "plan")
+            self._refuse(due & ~drivable(world.states[:, 0], fresh), JUMPS)
+            fresh = torch.cat([world.states[:, :1], fresh], 1)
             self._plan = torch.where(due[:, None, None], fresh, self._plan)
             self._planned_at = torch.where(due, world.step, self._planned_at)
         ahead = (world.step - self._planned_at)[:, None] + torch.arange(1 + PLAN_STEPS, device=world.step.device)
         return self._plan.gather(1, ahead.clamp(max=PLAN_STEPS)[..., None].expand(-1, -1, 4))
+
+    def _ask(self, method: str, world: World, *given: Tensor) -> Any:
+        return ask(self.ego, method, world, *given, scene=self._shown)
+
+    def _refuse(self, wrong: Tensor, why: str) -> None:
+        """Raises Undrivable for rows wrong [B] bool of an ego from outside the package."""
+        if from_outside(self.ego) and bool(wrong.any()):
+            raise Undrivable(why, dict.fromkeys(wrong.nonzero()[:, 0].tolist(), why))
 
 
 class EgoPolicy(EgoPlanner):
@@ -145,7 +198,8 @@ class EgoPolicy(EgoPlanner):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         world = World.of(tensordict, self.scene)
         plan = self.plan(world)
-        action = finite(self.ego.act(world, tensordict["observation"], plan), "action")
+        action = finite(self._ask("act", world, tensordict["observation"], plan), "action")
+        self._refuse((action.abs() > LARGEST).any(1), WILD)
         tensordict["action"] = action.clamp(self.bounds.low, self.bounds.high)
         tensordict["ego", "plan"] = plan[:, 1:]
         return tensordict

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from e2rl.planners.ego import PLAN_STEPS, Ego, PlannerError
+from e2rl.planners.ego import JUMPS, LARGEST, PLAN_STEPS, WILD, Ego, PlannerError, drivable
 from e2rl.planners.planner_link import (
     BadReply,
     PlannerFailed,
@@ -22,9 +22,6 @@ from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
 from e2rl.sim.world import World
-
-FASTEST = 50.0  # m/s: a plan that is faster, in its speeds or from pose to pose, is nonsense
-LARGEST = 100.0  # m/s^2, rad/s: so is a larger action
 
 
 class PlannerTimedOut(PlannerError):
@@ -163,22 +160,14 @@ def plans_of(now: Tensor, replies: list[tuple[int, bytes]], steps: int) -> Tenso
     held = dynamics.rollout(now, actions.nan_to_num()[:, None].expand(-1, steps, -1))
     given[:, :steps] = torch.where(acts[:, None, None], held, given[:, :steps])
     for why, wrong in {
-        f"an ACTION that is not finite, or above {LARGEST:g}": acts & ~(actions.abs() <= LARGEST).all(1),
+        WILD: acts & ~(actions.abs() <= LARGEST).all(1),
         f"a TRAJECTORY of fewer than the {steps} steps until the next plan": known < steps,
-        f"a plan that is not finite, or jumps (above {FASTEST:g} m/s)": ~drivable(now, given, known),
+        JUMPS: ~drivable(now, given, known),
     }.items():
         bad = dict.fromkeys(wrong.nonzero()[:, 0].tolist(), why) | bad
     if bad:
         raise BadReply(next(iter(bad.values())), bad)
     return continued(given, known)
-
-
-def drivable(now: Tensor, given: Tensor, known: Tensor) -> Tensor:
-    """Bool [B]: the first `known` [B] states of given [B, H, 4] are finite and no faster than FASTEST, in their speeds
-    and from pose to pose, beginning at states now [B, 4]."""
-    moved = torch.cat([now[:, None, :2], given[..., :2]], 1).diff(dim=1).norm(dim=-1)
-    fine = (moved <= FASTEST * DT) & (given[..., 3].abs() <= FASTEST) & given.isfinite().all(-1)
-    return (fine | (torch.arange(given.shape[1]) >= known[:, None])).all(1)
 
 
 def continued(given: Tensor, known: Tensor) -> Tensor:

@@ -225,9 +225,6 @@ def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
     try:
         weights, header = read_weights(path)
         saved = json.loads(header.get("architecture", "null"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not a readable actor file ({error}); give an {WEIGHTS} file") from None
-    try:
         low, high = (torch.tensor(saved[key], dtype=torch.float32).reshape(2) for key in ("low", "high"))
         sizes, units = [int(size) for size in saved["hidden"]], int(saved["agent_units"])
         fits = 0 < len(sizes) <= DEEPEST and all(0 < size <= WIDEST for size in [*sizes, units])
@@ -238,8 +235,8 @@ def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
         wrong = set(own) ^ set(weights) or {key for key in own if own[key].shape != weights[key].shape}
         if wrong:
             raise ValueError(f"weights {', '.join(sorted(wrong))} do not fit")
-    except (TypeError, KeyError, ValueError, RuntimeError) as error:
-        raise InputError(f"{path}: an actor of another version ({error}); train it again") from None
+    except (TypeError, KeyError, ValueError, RuntimeError) as error:  # RecursionError among them
+        raise InputError(f"{path}: damaged, or an actor of another version ({error}); train it again") from None
     actor.set_weights(weights)
     return actor
 

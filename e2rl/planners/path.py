@@ -110,8 +110,15 @@ class MissionPath(RoutePath):
 
 def look_up(caps: Tensor, ahead: Tensor) -> Tensor:
     """Speeds [B, ...] of the squared caps of `speed_caps` at `ahead` [B, ...] metres; the last cap is held."""
-    vertex = (ahead / SPACING).clamp(0, caps.shape[-1] - 1.001)
-    index = vertex.detach().floor().long()
-    flat = index.view(len(caps), -1)
-    low, high = (caps.gather(1, flat + shift).view(ahead.shape) for shift in (0, 1))
-    return (low + (vertex - index) * (high - low)).clamp(min=0).sqrt()
+    low, high, fraction = between_entries(caps, ahead / SPACING)
+    return (low + fraction * (high - low)).clamp(min=0).sqrt()
+
+
+def between_entries(table: Tensor, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The entries of a table [B, K] before and after places `at` [B, ...], in entries, and the fraction of the distance
+    between them; outside of the table, its first and last."""
+    at = at.clamp(0, table.shape[-1] - 1.001)
+    index = at.long()
+    flat = index.flatten(1)
+    low, high = (table.gather(1, flat + shift).view(at.shape) for shift in (0, 1))
+    return low, high, at - index

@@ -3,10 +3,11 @@
 An ONNX file holds arithmetic. A TorchScript file is a program, which may write files: run those that you trust.
 """
 
-import os
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import torch
@@ -14,13 +15,17 @@ from torch import Tensor
 
 from e2rl.planners.actor import ObservingEgo
 from e2rl.planners.ego import finite
+from e2rl.planners.onnx_policy import OnnxPolicy
 from e2rl.run.errors import InputError
+from e2rl.run.files import read_regular
 from e2rl.run.settings import configured, setting
 from e2rl.sim.observation import OBSERVATION_SIZE
 
 ONNX, TORCHSCRIPT = ".onnx", ".pt"
 MAPS = f"it maps float32 observations [B, {OBSERVATION_SIZE}] to actions [B, 2] for every B (docs/observation.md)"
 PROBED = (1, 3)  # batches that a file is tried with
+MAX_FILE = 1 << 26  # bytes: 16 million weights
+SECONDS = 20.0  # to open and try a file
 
 
 @configured("ego/policy_file")
@@ -34,78 +39,76 @@ class PolicyFileEgo(ObservingEgo):
     max_yaw_rate: float = setting()
 
     def __post_init__(self) -> None:
-        """Raises InputError where the file is none or maps other shapes."""
-        if not self.file or not Path(self.file).is_file():
-            raise InputError(
-                f"ego.file={self.file}: no such file; pass POLICY{ONNX}, or POLICY{TORCHSCRIPT} of TorchScript"
-            )
+        """Raises InputError where the file is none, maps other shapes, or takes longer than SECONDS to find out."""
         self.low = torch.tensor([-self.max_braking, -self.max_yaw_rate])
         self.high = torch.tensor([self.max_acceleration, self.max_yaw_rate])
-        self.policy = open_policy(Path(self.file))
+        self.policy = within_time(self._opened, f"ego.file={self.file}")
+
+    def _opened(self) -> Callable[[Tensor], Any]:
+        policy = open_policy(Path(self.file or ""), f"ego.file={self.file}")
         for count in PROBED:
-            self._probe(f"ego.file={self.file}", count)
+            probe(policy, f"ego.file={self.file}", count)
+        return policy
 
     def decide(self, observation: Tensor) -> Tensor:
         """The file's action [B, 2] at the observation; raises NotFinite where it is NaN or infinite."""
-        action = finite(self.policy(observation.float().cpu()), "action")
+        action = finite(self.policy(observation.float().cpu().clone()), "action")
         return torch.clamp(action, self.low, self.high).to(observation)
 
-    def _probe(self, where: str, count: int) -> None:
-        """InputError where the policy does not map observations of a batch of `count` to actions."""
+
+def within_time(work: Callable[[], Any], where: str) -> Any:
+    """What work() returns or raises; raises InputError where it goes on for longer than SECONDS."""
+    ended: list[tuple[Any, BaseException | None]] = []
+
+    def run() -> None:
         try:
-            action = self.policy(torch.zeros(count, OBSERVATION_SIZE))
-            fits = isinstance(action, Tensor) and action.is_floating_point() and action.shape == (count, 2)
-            found = f"maps them to {action.dtype} {list(action.shape)}" if isinstance(action, Tensor) else type(action)
-        except Exception as error:  # the file's own
-            fits, found = False, " ".join(str(error).split())[-300:]
-        if not fits:
-            raise InputError(f"{where}: fails at observations [{count}, {OBSERVATION_SIZE}]: {found}; {MAPS}")
+            ended.append((work(), None))
+        except BaseException as error:
+            ended.append((None, error))
+
+    thread = Thread(target=run, daemon=True)  # what does not end is left behind
+    thread.start()
+    thread.join(SECONDS)
+    if not ended:
+        raise InputError(f"{where}: opening it takes longer than {SECONDS} s; give a smaller policy")
+    result, error = ended[0]
+    if error is not None:
+        raise error
+    return result
 
 
-def open_policy(file: Path) -> Callable[[Tensor], Any]:
+def probe(policy: Callable[[Tensor], Any], where: str, count: int) -> None:
+    """Raises InputError where a policy does not map observations of a batch of `count` to actions."""
+    try:
+        action = policy(torch.zeros(count, OBSERVATION_SIZE))
+        fits = isinstance(action, Tensor) and action.is_floating_point() and action.shape == (count, 2)
+        found = f"maps them to {action.dtype} {list(action.shape)}" if isinstance(action, Tensor) else type(action)
+    except Exception as error:  # the file's own
+        fits, found = False, " ".join(str(error).split())[-300:]
+    if not fits:
+        raise InputError(f"{where}: fails at observations [{count}, {OBSERVATION_SIZE}]: {found}; {MAPS}")
+
+
+def open_policy(file: Path, where: str) -> Callable[[Tensor], Any]:
     """The function of a policy's file, told by the file's suffix."""
-    if file.suffix == ONNX:
-        return OnnxPolicy(file)
-    if file.suffix == TORCHSCRIPT:
-        return torchscript_policy(file)
-    raise InputError(f"ego.file={file}: no kind of policy; pass {ONNX}, or {TORCHSCRIPT} for TorchScript")
+    kinds: dict[str, Callable[[bytes, str], Callable[[Tensor], Any]]] = {
+        ONNX: OnnxPolicy,
+        TORCHSCRIPT: torchscript_policy,
+    }
+    if file.suffix not in kinds:
+        raise InputError(f"{where}: no kind of policy; pass POLICY{ONNX}, or POLICY{TORCHSCRIPT} of TorchScript")
+    try:
+        content = read_regular(file, MAX_FILE)
+    except OSError as error:
+        raise InputError(f"{where}: cannot be read ({error.strerror}); pass a file of a policy") from error
+    return kinds[file.suffix](content, where)
 
 
-def torchscript_policy(file: Path) -> Callable[[Tensor], Any]:
+def torchscript_policy(content: bytes, where: str) -> Callable[[Tensor], Any]:
     """The module of a TorchScript archive."""
     try:
-        module = torch.jit.load(str(file), map_location="cpu").eval()
+        module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
     except (RuntimeError, ValueError) as error:
         reason = str(error).strip().splitlines()[0][:200]
-        raise InputError(f"ego.file={file}: no TorchScript archive ({reason}); write one by torch.jit.save") from error
+        raise InputError(f"{where}: no TorchScript archive ({reason}); write one by torch.jit.save") from error
     return torch.no_grad()(module)
-
-
-class OnnxPolicy:
-    """A session of onnxruntime with one thread, in each process its own."""
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        self._open()
-
-    def _open(self) -> None:
-        try:
-            import onnxruntime
-        except ImportError as error:
-            reason = f"onnxruntime cannot be imported ({error}); pip install 'e2rl[onnx]'"
-            raise InputError(f"ego.file={self.file}: {reason}") from error
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 4  # what fails is raised
-        try:
-            self.session = onnxruntime.InferenceSession(str(self.file), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime's are of many kinds
-            reason = " ".join(str(error).split())[:200]
-            raise InputError(f"ego.file={self.file}: cannot be read as ONNX ({reason}); export it again") from error
-        self.name, self._process = self.session.get_inputs()[0].name, os.getpid()
-
-    def __call__(self, observation: Tensor) -> Any:
-        if self._process != os.getpid():  # forked
-            self._open()
-        (action,) = self.session.run(None, {self.name: observation.numpy()})
-        return torch.as_tensor(action)

@@ -117,7 +117,7 @@ def meeting_cost(ego: Tensor, ego_size: Tensor, others: Forecast, times: Tensor,
     dx = ego[:, :, None, :, 0] - others.poses[:, None, :, :, 0]
     dy = ego[:, :, None, :, 1] - others.poses[:, None, :, :, 1]
     near = (dx * dx + dy * dy < room * room) & others.seen[:, None, :, None]
-    scene, candidate, agent, time = _unravel(near.view(-1).nonzero()[:, 0], near.shape)
+    scene, candidate, agent, time = torch.unravel_index(near.view(-1).nonzero()[:, 0], near.shape)
     mine, pair = scene * count + candidate, scene * agents + agent
     cost, ends = pair_cost(
         ego.reshape(-1, 4)[mine * steps + time],
@@ -185,12 +185,3 @@ def discomfort(states: Tensor, world: World) -> Tensor:
     first = (speed[..., 0] - world.states[:, :1, 3]) / DT - world.accel[:, :1]
     along, across = speed.diff(dim=-1).abs().mean(-1) / DT, (turn * speed[..., 1:]).abs().mean(-1)
     return along + across + JERK_TIME * first.abs()
-
-
-def _unravel(flat: Tensor, shape: torch.Size) -> tuple[Tensor, ...]:
-    """Indices [Q] along each dim of flat ones [Q]."""
-    index = []
-    for size in reversed(shape):
-        index.append(flat % size)
-        flat = flat.div(size, rounding_mode="floor")
-    return tuple(reversed(index))

@@ -9,7 +9,8 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from e2rl.metrics.catalogue import META_STAGE, METRICS, OPEN_LOOP_STAGE
+from e2rl.evaluation.rollout_files import ERRORED_FILE
+from e2rl.metrics.catalogue import METRICS
 from e2rl.report.comparison_tables import by_ego
 from e2rl.report.tables import UNKNOWN, closed_loop, number, plural
 
@@ -31,7 +32,6 @@ def answer_lines(
     folder: Path | None = None,
     report: Path | None = None,
     notes: Sequence[str] = (),
-    width: int | None = None,
 ) -> list[str]:
     """Returns the lines that say what an evaluation found.
 
@@ -43,45 +43,37 @@ def answer_lines(
         folder: of the run, which holds tables.md.
         report: the failure report, where one was written.
         notes: further lines, such as the scenes that were left out.
-        width: columns; None: those of the terminal.
     """
-    width = width or terminal_width()
     driven = [row for row in closed_loop(rows) if row["n_rollouts"]]
     nominal = [row for row in driven if not row["eta"]]
     attacks = [row for row in driven if row["eta"]]
     lines: list[str] = []
     if len({row["ego"] for row in driven}) == 1 and len(attacks) <= 1 and len(nominal) <= 1:
-        lines += told(attacks[0] if attacks else nominal[0], nominal[0] if attacks and nominal else None, width)
+        lines += told(attacks[0] if attacks else nominal[0], nominal[0] if attacks and nominal else None)
     elif driven:
-        lines += compared(driven, width)
-    lines += weaknesses(modes if driven else None, width)
-    lines += [line for row in rows for line in wrapped(prior_text(row), width)]
-    last = closing(rows, width, folder, report, notes)
+        lines += compared(driven)
+    lines += weaknesses(modes if driven else None)
+    last = closing(rows, folder, report, notes)
     return [*lines[: LINES - len(last)], *last]
 
 
-def compared_answer(
-    before: Sequence[dict], after: Sequence[dict], folder: Path | None = None, width: int | None = None
-) -> list[str]:
+def compared_answer(before: Sequence[dict], after: Sequence[dict], folder: Path | None = None) -> list[str]:
     """Returns the lines that say what training changed: the ego before and after it, side by side.
 
     Args:
         before: rows of metrics.json of the stage `before`.
         after: rows of the stage `after`, which are paired with those before under the name `before`.
         folder: of the run, which holds tables.md.
-        width: columns; None: those of the terminal.
     """
-    width = width or terminal_width()
     earlier = {(row["method"], row["eta"]): row for row in closed_loop(before)}
     later = {(row["method"], row["eta"]): row for row in closed_loop(after)}
     pairs = [(earlier[key], row) for key, row in later.items() if key in earlier]
-    last, lines = closing(after, width, folder), []
+    last, lines = closing(after, folder), []
     if pairs:
         old, new = max(pairs, key=lambda pair: pair[1]["eta"])
         lines += wrapped(
             f"After training, {new['ego']} was hit in {of(new, 'cfr')} rollouts {traffic(new)} ({rate(new, 'cfr')}); "
-            f"before it in {of(old, 'cfr')} ({rate(old, 'cfr')}).",
-            width,
+            f"before it in {of(old, 'cfr')} ({rate(old, 'cfr')})."
         )
         kinds = {
             "hit": "cfr",
@@ -95,14 +87,14 @@ def compared_answer(
             for title, name in kinds.items()
             for old, new in pairs
         ]
-        lines += [*columns(table[: LINES - len(lines) - len(last) - 1], width), COUNTS]
+        lines += [*columns(table[: LINES - len(lines) - len(last) - 1]), COUNTS]
     return [*lines[: LINES - len(last)], *last]
 
 
 # --- one attack on one ego
 
 
-def told(row: dict, nominal: dict | None, width: int) -> list[str]:
+def told(row: dict, nominal: dict | None) -> list[str]:
     """Sentences about one row of metrics.json, beside the nominal traffic where that was driven."""
     found = f"{row['ego']} was hit in {of(row, 'cfr')} {'attacked ' if row['eta'] else ''}rollouts ({rate(row, 'cfr')})"
     per_km = value(row, "counted_per_km")
@@ -112,7 +104,7 @@ def told(row: dict, nominal: dict | None, width: int) -> list[str]:
         sentences = [f"{found}, {of(nominal, 'cfr')} nominal.", verdict(row)]
         sentences += [rates and f"{rates} attacked, {value(nominal, 'counted_per_km')} nominal."]
         sentences += [effect(row, nominal), cost(row, nominal)]
-    return [line for sentence in sentences for line in wrapped(sentence, width, "  ")]
+    return [line for sentence in sentences for line in wrapped(sentence, "  ")]
 
 
 def verdict(row: dict) -> str:
@@ -158,7 +150,7 @@ def cost(row: dict, nominal: dict) -> str:
 # --- several
 
 
-def compared(rows: Sequence[dict], width: int) -> list[str]:
+def compared(rows: Sequence[dict]) -> list[str]:
     """A table with a row for each ego, method and intensity. Methods: those that find most failures that count first.
     Egos: in each traffic, the strongest first, the one with the fewest first. Unknown rates come last."""
     egos = list(dict.fromkeys(row["ego"] for row in rows))
@@ -182,13 +174,13 @@ def compared(rows: Sequence[dict], width: int) -> list[str]:
     table += [[*key, *(cell(cells[key], metric) for metric in shown)] for key in ranked[:MOST_ROWS]]
     rest = len(ranked) - MOST_ROWS
     more = [f"... and {rest} more in tables.md"] if rest > 0 else []
-    return [*wrapped(lead, width), *columns(table if several else [line[1:] for line in table], width), *more, COUNTS]
+    return [*wrapped(lead), *columns(table if several else [line[1:] for line in table]), *more, COUNTS]
 
 
 # --- weaknesses, and what was measured
 
 
-def weaknesses(modes: Mapping | None, width: int) -> list[str]:
+def weaknesses(modes: Mapping | None) -> list[str]:
     """The failure modes with the most failures that count, a line each; where none counts, the most frequent ones."""
     found = [mode for mode in (modes["modes"] if modes else ()) if mode["mode"] != OTHER]
     if modes is None or not found:
@@ -202,30 +194,15 @@ def weaknesses(modes: Mapping | None, width: int) -> list[str]:
     ]
     for place, mode in enumerate(chosen[:WEAKNESSES], 1):
         text = f"{place}. {mode['name']} ({mode['count']} of {plural(modes['failures'], 'failure')}"
-        lines += wrapped(f"{text}, {counts[mode['mode']]} count)" if any_counts else f"{text})", width, "   ")
+        lines += wrapped(f"{text}, {counts[mode['mode']]} count)" if any_counts else f"{text})", "   ")
     return lines
 
 
-def prior_text(row: dict) -> str:
-    """The sentence of a row of the stages open loop and meta-metric, which measure the traffic's prior; else ""."""
-    metrics, stage = row["metrics"], row.get("stage")
-    if stage == OPEN_LOOP_STAGE and metrics.get("min_ade_3", {}).get("n"):
-        best, plain = (metrics[name]["mean"] for name in ("min_ade_3", "cv_ade_3"))
-        text = (
-            f"each vehicle's best sample is {best:.2f} m beside the recording over 3 s, constant velocity {plain:.2f} m"
-        )
-        return f"{row['method']}, open loop: {text}."
-    if stage == META_STAGE and metrics.get("meta_metric", {}).get("n"):
-        found = metrics["meta_metric"]
-        return f"{row['method']}: realism meta-metric {found['mean']:.3f} of {found['n']} scenes."
-    return ""
-
-
 def closing(
-    rows: Sequence[dict], width: int, folder: Path | None, report: Path | None = None, notes: Sequence[str] = ()
+    rows: Sequence[dict], folder: Path | None, report: Path | None = None, notes: Sequence[str] = ()
 ) -> list[str]:
     """The last lines: what the numbers rest on, and where everything lies."""
-    last = [line for text in (*notes, measured(rows)) for line in wrapped(text, width)]
+    last = [line for text in (*notes, measured(rows)) for line in wrapped(text)]
     last += [f"Watch every failure: {report}"] if report else []
     return last + ([f"All metrics, with intervals: {folder / 'tables.md'}"] if folder else [])
 
@@ -242,8 +219,8 @@ def measured(rows: Sequence[dict]) -> str:
     rates = [row["metrics"]["cfr"] for row in rows if "cfr" in row["metrics"]]
     if rates and all(math.isnan(found["low"]) for found in rates):
         text += f" {FEW}"
-    ended = sum(count for row in rows for count in row.get("ended", {}).values())
-    return text + (f" {plural(ended, 'rollout')} failed without a score: see ended.json." if ended else "")
+    errored = sum(count for row in rows for count in row.get("errored", {}).values())
+    return text + (f" {plural(errored, 'rollout')} without a score: see {ERRORED_FILE}." if errored else "")
 
 
 # --- cells
@@ -308,14 +285,14 @@ def traffic_name(row: dict) -> str:
     return f"{row['method']} at η={row['eta']:g}" if row["eta"] else row["method"]
 
 
-def wrapped(text: str, width: int, indent: str = "") -> list[str]:
-    """The text in lines of at most `width` columns, the second and later ones indented."""
-    return textwrap.wrap(text.strip(), width, subsequent_indent=indent, break_on_hyphens=False)
+def wrapped(text: str, indent: str = "") -> list[str]:
+    """The text in lines of the terminal's width, the second and later ones indented."""
+    return textwrap.wrap(text.strip(), terminal_width(), subsequent_indent=indent, break_on_hyphens=False)
 
 
-def columns(table: Sequence[Sequence[str]], width: int) -> list[str]:
+def columns(table: Sequence[Sequence[str]]) -> list[str]:
     """Aligned rows of text; the last columns are left out, and then the first is cut, where they are too wide."""
-    sizes = [max(map(len, column)) for column in zip(*table, strict=True)]
+    sizes, width = [max(map(len, column)) for column in zip(*table, strict=True)], terminal_width()
     while len(sizes) > 3 and sum(sizes) + 2 * (len(sizes) - 1) > width:
         sizes.pop()
     sizes[0] = max(8, min(sizes[0], width - sum(sizes[1:]) - 2 * (len(sizes) - 1)))

@@ -1,11 +1,11 @@
-"""Tables that compare methods or egos: a row each, with their differences to one of them (tables 1 and 4); the egos of
-policy learning side by side, and whether the trained one still drives as it should."""
+"""Tables that compare methods or egos: a row each, with their differences to some of them (tables 1 and 4); and whether
+an ego that was trained still drives as it should."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
-from e2rl.metrics.catalogue import METRICS, Metric, table_metrics
+from e2rl.metrics.catalogue import METRICS, table_metrics
 from e2rl.report.tables import (
     MEANS,
     PAIRED,
@@ -24,11 +24,6 @@ from e2rl.run.files import write_atomically
 
 METHODS, EGOS = "methods", "egos"  # tables of the catalogue, and names of the files
 Terms = Mapping[str, tuple[str, str]]  # by method: what it knows of the ego and owes it, "" for nothing to say
-SHOWN = ("cfr", "cfr_counted", "failures_per_km", "counted_per_km", "cfr_adv", "progress", "macc", "ego_off_road")
-NOTES = {
-    "failures_per_km": "Collisions of all rollouts over the kilometres driven in them, up to the first contact.",
-    "counted_per_km": "Failures that count over the kilometres driven, up to the first contact.",
-}
 TRAININGS = (
     "An ego of several trainings is their pool: the intervals draw trainings as well as places, with replacement, and "
     "with few trainings are too narrow rather than too wide."
@@ -60,17 +55,18 @@ def method_tables(
 
 
 def planner_tables(
-    rows: Sequence[dict], names: Sequence[str], reference: str, settings: str = "", table: str = EGOS
+    rows: Sequence[dict], names: Sequence[str], references: Collection[str], settings: str = "", table: str = EGOS
 ) -> list[Table]:
-    """Returns the same with a row for each ego of `names` and each traffic and intensity, and differences to the ego
-    `reference` in the same traffic."""
+    """Returns the same with a row for each ego of `names` and each traffic and intensity, and differences to the egos
+    `references` in the same traffic, as far as the rows are paired with them."""
     cells, _ = by_ego(closed_loop(rows), names)
     group, labels = list(cells.values()), [list(key) for key in cells]
     text = f"{group[0]['dataset']}/{group[0]['split']}. "
     text += counts(group, [f"{ego} under {traffic}" for ego, traffic in labels], "ego and traffic")
-    difference = f"{text} Difference of each ego to {reference} in the same traffic"
-    keys = {reference: f"ego {reference}"}
-    return tables_of(group, labels, ["ego", "traffic"], table, "Egos", f"{text} {MEANS} {settings}", difference, keys)
+    difference = f"{text} Difference of each ego to {' and to '.join(references)} in the same traffic"
+    pooled = f" {TRAININGS}" if any(row.get("n_trainings", 1) > 1 for row in group) else ""
+    caption, keys = f"{text} {MEANS}{pooled} {settings}", {name: f"ego {name}" for name in references}
+    return tables_of(group, labels, ["ego", "traffic"], table, "Egos", caption, difference, keys)
 
 
 def tables_of(
@@ -119,34 +115,6 @@ def by_ego(rows: Sequence[dict], names: Sequence[str]) -> tuple[dict[tuple[str, 
     return cells, list(dict.fromkeys(label for _, label in cells))
 
 
-def ego_tables(
-    rows: Sequence[dict], names: Sequence[str], pairs: Sequence[tuple[str, str]], title: str, settings: str = ""
-) -> list[Table]:
-    """Returns a table for each of SHOWN that some row knows: a row for each traffic and intensity, a column for each
-    ego of `names`, for each of `pairs` the paired difference, of the first pair also in per cent of its second ego.
-
-    rows: of metrics.json; settings: for the first caption.
-    """
-    cells, traffic = by_ego(rows, names)
-    tables: list[Table] = []
-    for metric in (METRICS[name] for name in SHOWN):
-        lines = []
-        for label in traffic:
-            paired = [cells[first, label]["paired"].get(f"ego {second}") or {} for first, second in pairs]
-            found = [each.get(metric.name) for each in paired]
-            differences = [difference_cell(metric, value) for value in found]
-            differences[1:1] = [relative_cell(value) for value in found[:1]]
-            lines.append([label, *(mean_cell(metric, cells[name, label]) for name in names), *differences])
-        if all(cell == UNKNOWN for line in lines for cell in line[1:]):
-            continue
-        unit = "points" if metric.fraction else metric.unit
-        heads = [f"{first} − {second}{f' [{unit}]' if unit else ''}" for first, second in pairs]
-        heads[1:1] = [f"{first} − {second} [%]" for first, second in pairs[:1]]
-        text = caption_of(metric, rows, "" if tables else settings)
-        tables.append(Table(text, [heading(metric), *names, *heads], lines, "" if tables else title))
-    return tables
-
-
 def relative_cell(value: dict | None) -> str:
     """Such as `-31 [-42, -17]*`, per cent; the interval is unknown where a draw has nothing to be a share of."""
     if not value or not math.isfinite(value["relative"]):
@@ -155,18 +123,6 @@ def relative_cell(value: dict | None) -> str:
     if math.isnan(low):
         return f"{centre:+.0f}"
     return f"{centre:+.0f} [{low:+.0f}, {high:+.0f}]" + ("*" if low > 0 or high < 0 else "")
-
-
-def caption_of(metric: Metric, rows: Sequence[dict], settings: str) -> str:
-    """What the table shows; with the settings also how it was measured."""
-    text = f"{metric.name}: {metric.about}. {NOTES.get(metric.name, '')}".strip()
-    text += f" Mean [95% interval, by location or scene]; difference {PAIRED}"
-    if not settings:
-        return text
-    first = rows[0]
-    text += f" {first['dataset']}/{first['split']}, {first['n_scenes']} scenes, {first['n_seeds']} seeds."
-    pooled = any(row.get("n_trainings", 1) > 1 for row in rows)
-    return f"{text}{f' {TRAININGS}' if pooled else ''} {settings.rstrip('.')}."
 
 
 def guard_table(rows: Sequence[dict], before: str, after: str, planner: str, recorded: float) -> Table:

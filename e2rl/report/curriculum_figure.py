@@ -5,13 +5,17 @@ right: the fraction of the policy's episodes in these attacks that failed.
 """
 
 import csv
+import math
+import os
 from collections.abc import Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from e2rl.evaluation.rollout_files import MOST_ROWS, cause, opened
 from e2rl.report import drawing
 from e2rl.report.drawing import new_figure, save_figure
 from e2rl.run.errors import InputError
@@ -19,7 +23,7 @@ from e2rl.traffic.traffic import TEMPLATES
 
 CHOICES, PICTURE = "curriculum.csv", "curriculum.png"  # of a run's folder
 Choice = Mapping[str, float | str]  # a row of curriculum.csv
-TEXT, NEEDED = "template", ("round", "eta", "template", "draws", "episodes", "failures", "value")
+TEXT, NEEDED = "template", ("round", "eta", "template", "draws", "episodes", "failures")
 LINE, MARGIN, WIDTH, DPI = 14, 90, 900, 144  # points: a line of an arm, the space around them, the width
 PANELS = (("fraction of the round's draws", "viridis"), ("fraction of failed episodes", "magma"))
 
@@ -73,22 +77,25 @@ def _label(axes: Axes, rounds: Sequence[int], arms: Sequence[tuple[str, float]])
 
 
 def read_choices(path: Path) -> list[Choice]:
-    """The columns NEEDED of a curriculum.csv, all but the template numbers; InputError for a file that is no such
-    table."""
+    """The columns NEEDED of a curriculum.csv, finite numbers but for the template; InputError where it is none."""
     try:
-        with path.open(newline="") as file:
-            rows = list(csv.DictReader(file, strict=True))
+        with opened(path) as file:
+            rows = list(islice(csv.DictReader(file, strict=True), MOST_ROWS))
         if not {row[TEXT] for row in rows} <= set(TEMPLATES):
             raise ValueError("a template")
-        return [{name: row[name] if name == TEXT else float(row[name] or "nan") for name in NEEDED} for row in rows]
-    except (KeyError, ValueError, TypeError, csv.Error) as error:
-        raise InputError(f"{path}: no table of a curriculum's choices ({error}); remove it") from None
+        numbers = [{name: float(row[name]) for name in NEEDED if name != TEXT} for row in rows]
+        if not all(math.isfinite(value) for row in numbers for value in row.values()):
+            raise ValueError("an infinite number")
+        return [{TEXT: row[TEXT], **own} for row, own in zip(rows, numbers, strict=True)]
+    except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
+        raise InputError(f"{path}: no table of a curriculum's choices ({cause(error)}); remove it") from None
 
 
 def draw_choices(folder: Path) -> Path | None:
     """Draw curriculum.png and .pdf from the curriculum.csv of a run's folder; returns the picture, None where the run
     has logged none."""
-    if not (folder / CHOICES).is_file():
+    rows = read_choices(folder / CHOICES) if os.path.lexists(folder / CHOICES) else []
+    if not rows:
         return None
-    save_figure(folder / PICTURE, choice_map(read_choices(folder / CHOICES)))
+    save_figure(folder / PICTURE, choice_map(rows))
     return folder / PICTURE

@@ -1,34 +1,33 @@
 """Failures against realism and against verdicts over the gain of each adversary, as CSV and as a picture.
 
 The strength of an attack is its gain times eta. So its curve is a run of several intensities (`evaluate.py
-experiment=curves`), or the sweep of its tuning (`e2rl tune`). `e2rl curves RUN_DIR...` draws
-runs of either kind together.
+experiment=curves`), or the sweep of its tuning (`e2rl tune`). `e2rl curves RUN_DIR...` draws both kinds together.
 """
 
 import argparse
 import csv
 import io
-import json
 import math
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from types import NoneType
+from typing import Any, NamedTuple
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from e2rl.evaluation.rollout_files import METRICS_FILE, cell, nans, read_metrics
+from e2rl.evaluation.rollout_files import METRICS_FILE, NUMBER, cell, nans, read_json, read_metrics
 from e2rl.evaluation.tuning import TUNING_FILE
 from e2rl.metrics.catalogue import METRICS
 from e2rl.report import drawing
-from e2rl.report.drawing import save_figure
-from e2rl.report.plots import plain_figure
+from e2rl.report.drawing import new_figure, save_figure
 from e2rl.report.tables import closed_loop, heading
-from e2rl.report.tuning_curve import gain_of, on_curve
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
-from e2rl.run.files import write_atomically
+from e2rl.run.files import misfit, write_atomically
 from e2rl.run.run import read_provenance
+from e2rl.sim.rollout_file import UNPRINTABLE
 
 PANELS = (  # (horizontal, vertical): failures over realism, then the share of them that counts
     (("real", "cfr"), ("real_adv", "cfr"), ("aor_step", "cfr")),
@@ -38,8 +37,9 @@ COLUMNS = ("cfr", "cfr_counted", "cfr_preventable", "real", "real_adv", "aor_ste
 OURS, NOMINAL = "e2", "nominal"
 APART = (0, 1, 2, 4, 5, 6, 7, 8, 9)  # colours of the cycle for the others: its red is too near to ours
 TABLES_ETA = 2.0  # intensity of the tables
-SIDE, RISE = 380, 330  # points: width and height of a panel
+SIDE, RISE, DPI = 380, 330, 144  # points: width and height of a panel
 NAME = "curves"
+TUNING = {"best": (dict, NoneType), "trials": [{"parameters": {...: (int, float)}, "metrics": {...: NUMBER}}]}
 
 
 class Point(NamedTuple):
@@ -64,15 +64,18 @@ def points_of_rows(rows: Sequence[dict]) -> list[Point]:
 
 
 def points_of_tuning(result: Mapping, method: str) -> list[Point]:
-    """The points of tuning.json: those on the sweep, the best trial, and the nominal traffic beside them."""
-    trials, best = result["trials"], result["best"]
-    curve, dial = on_curve(trials), next(iter(trials[0]["parameters"]))
-    chosen = [trial for trial in trials if trial["parameters"] == best][:1]
-    points = [
-        Point(method, dial, gain_of(trial), trial in curve, trial in chosen, intervals(trial["metrics"]))
-        for trial in [*curve, *(trial for trial in chosen if trial not in curve)]
-    ]
-    nominal = {name: trials[0]["metrics"].get(f"{name} {NOMINAL}", math.nan) for name in COLUMNS}
+    """The points of tuning.json: the trials that differ from the first in the gain alone, which is the first of the
+    parameters; the best trial; and the nominal traffic beside them."""
+    first, best = result["trials"][0], result["best"]
+    dial, *others = first["parameters"]
+    points: list[Point] = []
+    for trial in result["trials"]:
+        on_curve = all(trial["parameters"][name] == first["parameters"][name] for name in others)
+        chosen = trial["parameters"] == best and not any(point.chosen for point in points)
+        if on_curve or chosen:
+            found = intervals(trial["metrics"])
+            points.append(Point(method, dial, trial["parameters"][dial], on_curve, chosen, found))
+    nominal = {name: first["metrics"].get(f"{name} {NOMINAL}", math.nan) for name in COLUMNS}
     return [*points, Point(NOMINAL, dial, 0.0, True, True, intervals(nominal))]
 
 
@@ -88,15 +91,22 @@ def intervals(metrics: Mapping[str, float]) -> dict[str, dict[str, float]]:
 def read_points(run: Path) -> list[Point]:
     """The points of a run's folder; InputError where it holds neither tuning.json nor metrics.json."""
     file = Path(run) / TUNING_FILE
-    if not file.is_file():
+    if not os.path.lexists(file):
         return points_of_rows(read_metrics(Path(run) / METRICS_FILE))
-    try:
-        known = read_provenance(run)
-        result = json.loads(file.read_text())
-        trials = [trial | {"metrics": nans(trial["metrics"])} for trial in result["trials"]]
-        return points_of_tuning(result | {"trials": trials}, known["settings"]["synthesizer"]["name"])
-    except (ValueError, LookupError, TypeError) as error:
-        raise InputError(f"{file}: no tuning of an adversary; give the folder of a run of e2rl tune") from error
+    result = read_json(file, wrong_tuning)
+    known = read_provenance(run)["settings"].get("synthesizer")
+    if misfit(known, {"name": str}) or UNPRINTABLE.search(known["name"]):
+        raise InputError(f"{file}: no tuning of an adversary; give the folder of a run of e2rl tune")
+    trials = [trial | {"metrics": nans(trial["metrics"])} for trial in result["trials"]]
+    return points_of_tuning(result | {"trials": trials}, known["name"])
+
+
+def wrong_tuning(found: Any) -> str | None:
+    """What in the content of a tuning.json is not as it is written; None: nothing."""
+    if wrong := misfit(found, TUNING):
+        return wrong
+    names = [list(trial["parameters"]) for trial in found["trials"]]
+    return None if names and names[0] and names.count(names[0]) == len(names) else "its trials have other parameters"
 
 
 def curves_csv(points: Sequence[Point]) -> str:
@@ -124,8 +134,9 @@ def by_method(points: Sequence[Point]) -> dict[str, list[Point]]:
 
 def curves_figure(points: Sequence[Point]) -> Figure:
     """PANELS, with a line a method: dots grow with the gain, the chosen setting is filled and has its intervals."""
-    figure, panels = plain_figure(SIDE * len(PANELS[0]), RISE * len(PANELS), len(PANELS[0]), len(PANELS))
-    methods = by_method(points)
+    figure, methods = new_figure(SIDE * len(PANELS[0]), RISE * len(PANELS), DPI), by_method(points)
+    figure.set_layout_engine("tight")
+    panels = figure.subplots(len(PANELS), len(PANELS[0])).ravel()
     for axes, (across, up) in zip(panels, (pair for row in PANELS for pair in row), strict=True):
         for number, (name, own) in enumerate(methods.items()):
             draw_curve(axes, own, across, up, colour_of(name, number))
@@ -135,6 +146,9 @@ def curves_figure(points: Sequence[Point]) -> Figure:
         axes.set_xlabel(heading(METRICS[across]))
         axes.set_ylabel(heading(METRICS[up]))
         axes.set_ylim(bottom=0)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", color=drawing.ROAD, linewidth=0.6)
+        axes.set_axisbelow(True)
     panels[0].legend(frameon=False, fontsize=7)
     figure.suptitle("A dot a gain, larger dots for larger gains; filled: the setting of the tables, with 95% intervals")
     return figure

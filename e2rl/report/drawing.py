@@ -15,6 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Patch
+from matplotlib.text import Text
 from PIL import Image
 
 from e2rl.run.files import write_atomically
@@ -149,17 +150,17 @@ def new_panels(count: int, side: float, gap: float, head: float, foot: float = 0
     return figure, list(figure.subplots(1, count, squeeze=False, gridspec_kw=grid)[0])
 
 
-def add_legend(figure: Figure | SubFigure, colours: Mapping[str, Colour], size: float, ghost: bool = False) -> None:
-    """What the colours mean and, with `ghost`, an empty box, in one row at the figure's lower left; font of `size`."""
+def add_legend(figure: Figure | SubFigure, colours: Mapping[str, Colour], size: float) -> None:
+    """What the colours mean, in one row at the figure's lower left; font of `size`."""
     handles = [Patch(facecolor=colour, label=text) for text, colour in colours.items()]
-    if ghost:
-        handles.append(Patch(facecolor="none", edgecolor=EGO, label="ego as recorded"))
     style = {"frameon": False, "handlelength": 1.4, "handleheight": 0.9, "columnspacing": 1.4}
     figure.legend(handles=handles, ncols=len(handles), loc="lower left", fontsize=size, **style)
 
 
 def image_of(figure: Figure) -> Image.Image:
-    """The figure drawn as it is now."""
+    """The figure drawn as it is now; no text in it is a formula, as names may hold dollar signs."""
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])

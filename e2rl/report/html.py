@@ -14,21 +14,19 @@ from typing import Any
 
 from tqdm import tqdm
 
-import e2rl
 from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
 from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, nulls, read_metrics, read_rows
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.failure_tracks import CHANNELS, MAP_QUANTUM, encoded_map, failure_replay
-from e2rl.report.mode_table import mode_tables
-from e2rl.report.tables import Table, column_names, metric_tables
+from e2rl.report.tables import Table, column_names, metric_tables, mode_tables
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
 from e2rl.sim.rollout_file import Failure, rollout_name
 
 PAGE = "failures.html"
 REPLAYS = 300  # in the page at most
-ASSETS = Path(e2rl.__file__).parent / "assets" / "report"
+ASSETS = Path(__file__).parents[1] / "assets" / "report"
 GROUP = ("ego_policy", "method", "eta")
 COLUMNS = (  # of rollouts.csv, in the page's index and facts
     *(*GROUP, "scene_id", "seed", "approach", "ego_manoeuvre", "partner_manoeuvre", "contact_type", "duty"),
@@ -60,8 +58,6 @@ def write_report(
     Raises:
         InputError: files of the run are missing, or no method has the name.
     """
-    if not run.is_dir():
-        raise InputError(f"{run}: no such folder; give the folder of a run of evaluate.py")
     metrics = read_metrics(run / METRICS_FILE) if metrics is None else metrics
     modes = read_modes(run / MODES_FILE) if modes is None else modes
     tables = [*metric_tables(metrics), *mode_tables(modes)] if tables is None else tables
@@ -90,7 +86,7 @@ def page(content: Mapping[str, Any]) -> str:
 def page_content(run: Path, metrics: Sequence[dict], modes: Mapping, methods: Sequence[str]) -> dict[str, Any]:
     """The data block without tables and replays; `rows` are the failures' rows of rollouts.csv."""
     known = dict.fromkeys(group["method"] for group in modes["groups"])
-    if not known:
+    if not (known and metrics):
         raise InputError(f"{run / TABLE}: no closed-loop rollouts; give the folder of a run of evaluate.py with some")
     if wrong := [name for name in methods if name not in known]:
         raise InputError(f"--method {wrong[0]}: not in {run / TABLE}; choose among {', '.join(known)}")

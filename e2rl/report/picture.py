@@ -1,8 +1,9 @@
-"""One rollout as pictures: any moment of it, all frames of its replay, and a strip of four moments."""
+"""One rollout as pictures: any moment of it, and all frames of its replay; one scene at several intensities."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,19 +14,19 @@ from PIL import Image
 from scipy.signal import savgol_filter
 from tqdm import tqdm
 
+from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.report import drawing
-from e2rl.report.drawing import Shape, TrafficMap, Trail, add_legend, image_of, new_figure, new_panels, placed
+from e2rl.report.drawing import Shape, TrafficMap, Trail, add_legend, image_of, new_figure
 from e2rl.scenes.boxes import corners, to_frame
-from e2rl.sim.rollout_file import Rollout
+from e2rl.sim.rollout_file import Failure, Rollout
 
 TRAIL = 2.0  # s
 SMOOTHING = 41  # steps over which the camera's path is smoothed
 SLOW = 0.6  # s before contact that are played at half speed
 FREEZE = 14  # frames that hold the contact
-STRIP_TIMES = (-2.0, -1.0, -0.4, 0.0)  # s before contact
 SIDE, HEAD, FOOT = 720, 50, 30  # points: of a picture, of its header and of its legend
 LARGE_HEAD, LARGE_FOOT = 86, 48  # the same with large letters
-STRIP_SIDE, STRIP_GAP, STRIP_HEAD = 420, 8, 34  # points: of a panel, between panels, above them
+SWEEP_METRES, SWEEP_GAP, SWEEP_COLUMNS = 60.0, 10, 2  # side of a panel in m, points between panels, panels in a row
 LEGEND = {"ego": drawing.EGO, "adversary": drawing.ADVERSARY, "traffic": drawing.BACKGROUND}
 LEGEND |= {"replayed": drawing.REPLAYED, "pedestrian, cyclist": drawing.VULNERABLE}
 
@@ -39,7 +40,6 @@ class Replay:
         rollout, row: the rollout and its row of metrics.
         metres: side of the square that is shown.
         pixels: side of a picture.
-        ghost: also outline the recorded ego.
         caption: two lines to show in large letters; by default the method, ego, scene, seed and intensity.
     """
 
@@ -47,7 +47,6 @@ class Replay:
     row: Mapping[str, Any]
     metres: float = 70.0
     pixels: int = 720
-    ghost: bool = False
     caption: tuple[str, str] | None = None
 
     def __post_init__(self):
@@ -74,22 +73,6 @@ class Replay:
             pictures += [self.picture(self.contact, phase=(index % 7) / 6) for index in range(FREEZE)]
         return pictures
 
-    def strip(self) -> Figure:
-        """Four moments side by side: up to the contact, or spread over a rollout that has none."""
-        times = np.linspace(0, self.last, 4)
-        if self.contact is not None:
-            times = np.maximum(0, self.contact + np.array(STRIP_TIMES) / self.rollout.dt)
-        figure, panels = new_panels(len(times), STRIP_SIDE, STRIP_GAP, STRIP_HEAD)
-        for axes, time in zip(panels, times, strict=True):
-            text, colour, phase = f"{time * self.rollout.dt:.1f} s", drawing.INK, None
-            if time == self.contact:
-                text, colour, phase = f"{text}   {contact_text(self.row)}", drawing.CONTACT, 0.25
-            elif time == times[0] and self.contact is not None:
-                text = f"{text}   {verdict_text(self.row)}"
-            axes.set_title(text, loc="left", x=4 / STRIP_SIDE, fontsize=15, color=colour)
-            self.draw(TrafficMap(axes, self.rollout, self.metres), time, phase)
-        return figure
-
     def draw(self, traffic_map: TrafficMap, time: float, phase: float | None) -> None:
         """Show a moment on a map of the rollout."""
         centre = np.array([np.interp(time, np.arange(len(self.centres)), axis) for axis in self.centres.T])
@@ -106,12 +89,9 @@ class Replay:
         return trails
 
     def shapes(self, time: float, phase: float | None) -> list[Shape]:
-        """All agents, the recorded ego as an empty box and the mark of contact, from the lowest to the highest."""
-        rollout, step, ego, shapes = self.rollout, math.floor(time), self.rollout.ego, []
+        """All agents and the mark of contact, from the lowest to the highest."""
+        rollout, step, shapes = self.rollout, math.floor(time), []
         states, size = interpolated(rollout.states, rollout.valid, time), rollout.size
-        if self.ghost and rollout.logged_valid[step, ego]:
-            logged = interpolated(rollout.logged, rollout.logged_valid, time)
-            shapes.append(Shape(placed(drawing.BOX, logged[ego], size[ego]), "none", drawing.EGO, 0.14))
         for agent in sorted(np.flatnonzero(rollout.valid[step]).tolist(), key=self.layer):
             shapes += drawing.agent(rollout.agent_type[agent], states[agent], size[agent], self.colour(agent))
         if phase is not None:
@@ -155,7 +135,7 @@ class Panel:
         badge = contact_text(replay.row) if large else f"{contact_text(replay.row)}\n{verdict_text(replay.row)}"
         self.badge = text(0.5, 1 - (head + 40) / SIDE, badge, fontsize=22 if large else 13, color="w", bbox=box)
         self.badge.set(ha="center", va="center")
-        add_legend(self.figure, dict(list(LEGEND.items())[:3]) if large else LEGEND, 20 if large else 11, replay.ghost)
+        add_legend(self.figure, dict(list(LEGEND.items())[:3]) if large else LEGEND, 20 if large else 11)
         bar = (right - 10 / replay.metres, right)
         self.figure.add_artist(Line2D(bar, (10 / SIDE, 10 / SIDE), color=drawing.INK, linewidth=2))
         text(sum(bar) / 2, 14 / SIDE, "10 m", fontsize=second - 1, color=drawing.MUTED, ha="center")
@@ -207,3 +187,47 @@ def verdict_text(row: Mapping[str, Any]) -> str:
 
 def shorten(name: str, limit: int = 42) -> str:
     return name if len(name) <= limit else f"{name[: limit // 2 - 1]}…{name[-limit // 2 :]}"
+
+
+# --- one scene and seed at several intensities
+
+
+def intensity_figure(sweep: Sequence[Failure]) -> Figure:
+    """Returns a panel for each rollout, in the order of intensity, at the moment of its contact; one without contact is
+    shown when the next one that has a contact has it, else at its end."""
+    replays = [Replay(each.rollout, each.row, SWEEP_METRES) for each in sweep]
+    sizes = SWEEP_COLUMNS, math.ceil(len(replays) / SWEEP_COLUMNS)
+    figure = new_figure(*(count * (SIDE + SWEEP_GAP) - SWEEP_GAP for count in sizes))
+    wide, high = ([SIDE, *[SWEEP_GAP, SIDE] * (count - 1)] for count in sizes)
+    places = figure.add_gridspec(len(high), len(wide), width_ratios=wide, height_ratios=high)
+    for index, replay in enumerate(replays):
+        contacts = [other.contact for other in replays[index:] if other.contact is not None]
+        phase = None if replay.contact is None else 0.25
+        place = places[2 * (index // SWEEP_COLUMNS), 2 * (index % SWEEP_COLUMNS)]
+        Panel(replay, figure.add_subfigure(place)).show(contacts[0] if contacts else replay.last, phase)
+    return figure
+
+
+def intensity_sweep(folder: Path) -> list[Failure]:
+    """Returns the rollouts of `best_sweep` of a run's folder."""
+    return [Failure.read(folder, row) for row in best_sweep(read_rows(Path(folder) / TABLE))]
+
+
+def best_sweep(rows: Sequence[dict]) -> list[dict]:
+    """Returns the rows, by eta, of the one (method, scene, seed) that best shows the effect of eta: no contact at the
+    lowest eta, contact at as many others as possible, earlier at greater eta, late at first."""
+    groups: dict[tuple, list[dict]] = {}
+    for row in rows:
+        groups.setdefault((row["method"], row["ego_policy"], row["scene_id"], row["seed"]), []).append(row)
+    sweeps = [sorted(group, key=lambda row: row["eta"]) for group in groups.values()]
+    most = max(map(len, sweeps))
+    return max((sweep for sweep in sweeps if len(sweep) == most), key=worth)
+
+
+def worth(sweep: Sequence[dict]) -> tuple[float, ...]:
+    """Score of rows of rollouts by eta for `best_sweep`; greater is better."""
+    times = [row["contact_time"] for row in sweep if row["cfr"] == 1]
+    falls = sum(later < earlier for earlier, later in zip(times, times[1:], strict=False))
+    found = [row["cfr"] == 1 for row in sweep]
+    monotone = found == sorted(found)
+    return (not found[0], monotone, len(times), falls, times[0] - times[-1] if times else -sweep[-1]["min_dtc"])

@@ -3,30 +3,19 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from omegaconf import DictConfig
-
-from e2rl.evaluation.ego_set import recorded_acceleration, trainings_of
+from e2rl.evaluation.ego_set import recorded_acceleration
 from e2rl.evaluation.methods import ALL, EvaluationSettings, caption, terms_by_method
 from e2rl.evaluation.modes import MODES_FILE, read_modes
 from e2rl.evaluation.plan import Evaluation
 from e2rl.metrics.evasion import search_effort
 from e2rl.report.answer import answer_lines
-from e2rl.report.comparison_tables import (
-    EGOS,
-    METHODS,
-    ego_tables,
-    guard_table,
-    method_tables,
-    planner_tables,
-    save_compared,
-)
+from e2rl.report.comparison_tables import EGOS, METHODS, guard_table, method_tables, planner_tables, save_compared
 from e2rl.report.curves import points_of_rows, save_curves
 from e2rl.report.drawing import save_figure
 from e2rl.report.html import write_report
-from e2rl.report.intensity import intensity_figure, intensity_sweep
-from e2rl.report.mode_table import mode_tables
-from e2rl.report.plots import collision_bars, learning_curves
-from e2rl.report.tables import Table, metric_tables, print_tables, save_tables
+from e2rl.report.picture import intensity_figure, intensity_sweep
+from e2rl.report.policy_figure import policy_figure
+from e2rl.report.tables import Table, metric_tables, mode_tables, print_tables, save_tables
 from e2rl.run.run import Run
 
 NOMINAL = "nominal"  # traffic without an attack, which every attack is compared with
@@ -72,7 +61,7 @@ def tables_of(plan: Evaluation, rows: Sequence[dict], text: str, folder: Path) -
         return metric_tables(rows, text, metrics)
     others, egos = plan.asked.compare or (NOMINAL,), plan.egos
     if egos.pairs:
-        tables = planner_tables(rows, egos.names, others[0], text, metrics)
+        tables = planner_tables(rows, egos.names, others, text, metrics)
     else:
         tables = method_tables(rows, terms_by_method(plan.methods), others, text, metrics)
     save_compared(folder, tables, EGOS if egos.pairs else METHODS)
@@ -80,26 +69,16 @@ def tables_of(plan: Evaluation, rows: Sequence[dict], text: str, folder: Path) -
 
 
 def egos_tables(run: Run, plan: Evaluation, rows: Sequence[dict], text: str) -> list[Table]:
-    """Returns the tables that compare several egos; with `policy_learning` also its guards, and draws its figures."""
+    """Returns the tables that compare several egos; with `policy_learning` also its guards, and draws what
+    training changed."""
     roles, egos = run.config.policy_learning, plan.egos
     if not egos.pairs or plan.asked.compare:
         return []
-    tables = ego_tables(rows, egos.names, egos.pairs, "Egos" if roles is None else "Policy learning", text)
+    others = dict.fromkeys(second for _, second in egos.pairs)
+    tables = planner_tables(rows, egos.names, others, text, MAIN if plan.asked.metrics == ALL else plan.asked.metrics)
     if roles is None:
         return tables
-    bars = collision_bars(rows, egos.names, run.config.synthesizer.name)
-    save_figure(run.folder / "policy_learning.png", bars)
-    if runs := curve_runs(run.config):
-        save_figure(run.folder / "curves.png", learning_curves(runs))
+    figure = policy_figure(rows, roles.before, roles.after, run.config.synthesizer.name)
+    save_figure(run.folder / "policy_learning.png", figure)
     recorded = recorded_acceleration(plan.scenes)
     return [*tables, guard_table(rows, roles.before, roles.after, roles.planner, recorded)]
-
-
-def curve_runs(config: DictConfig) -> list[Path]:
-    """The run folders whose learning curves are drawn: `policy_learning.runs`, or null: those among the checkpoints of
-    `policy_learning.after` that have logged scalars."""
-    if config.policy_learning.runs is not None:
-        return list(map(Path, config.policy_learning.runs))
-    trained = trainings_of(config, config.policy_learning.after).values()
-    folders = [Path(entry["checkpoint"]) for entry in trained if entry.get("checkpoint")]
-    return [folder for folder in folders if (folder / "logs").is_dir()]

@@ -1,6 +1,7 @@
 """Tables of metrics from the rows of metrics.json, for a terminal, Markdown, LaTeX and CSV. Shares are in per cent.
 
-A run has a table with a row for each metric and a column for each method, and one with the differences to the first.
+A run has a table with a row for each metric and a column for each method, one with the differences to the first, and
+one of its failure modes, from its modes.json.
 """
 
 import csv
@@ -14,6 +15,7 @@ from pathlib import Path
 from tabulate import LATEX_ESCAPE_RULES, tabulate
 
 from e2rl.metrics.catalogue import META_STAGE, METRICS, OPEN_LOOP_STAGE, STAGES, Metric, table_metrics
+from e2rl.metrics.failure_modes import LEAST, MANY
 from e2rl.run.files import write_atomically
 
 UNKNOWN = "–"
@@ -26,6 +28,8 @@ COUNTED = {  # what the count (n) of a stage's cells counts, and how its metrics
 MEANS = "Mean [95% interval, by location or scene]; (n) rollouts where fewer count."
 PAIRED = "[95% interval], paired by (scene, seed); * the interval leaves out 0."
 SYMBOLS = str.maketrans({"–": "--", "−": "$-$", "η": r"$\eta$", "²": "$^2$", "³": "$^3$", "≤": r"$\le$", "≥": r"$\ge$"})
+VERDICTS = {"counted": "counts", "preventable": "preventable", "at_fault": "at fault", "avoidable": "avoidable"}
+SPEEDS = {"ego_speed": "ego [m/s]", "partner_speed": "partner [m/s]"}
 
 
 @dataclass
@@ -168,6 +172,53 @@ def column_names(group: Sequence[Mapping]) -> list[str]:
         eta = f" η={row['eta']:g}" if row["eta"] or len(etas[row["method"]]) > 1 else ""
         names.append(f"{before}{row['method']}{eta}")
     return names
+
+
+# --- failure modes
+
+
+def mode_tables(found: Mapping) -> list[Table]:
+    """Returns a table of failure modes for each ego: a row for each mode, with its fraction of the failures of each
+    method and intensity, verdicts and mean speeds; no table without failures.
+
+    Of several egos the modes are common, and so are their verdicts and speeds.
+    """
+    egos = dict.fromkeys(group["ego_policy"] for group in found["groups"])
+    return [table for ego in egos if (table := mode_table(found, ego, len(egos) > 1)).rows]
+
+
+def mode_table(found: Mapping, ego: str, several: bool) -> Table:
+    """The table of one ego; several: there are other egos in the run."""
+    chosen = [index for index, group in enumerate(found["groups"]) if group["ego_policy"] == ego]
+    groups = [found["groups"][index] for index in chosen]
+    known = {name: title for name, title in VERDICTS.items() if any(mode[name] is not None for mode in found["modes"])}
+    rows, failures = [], 0
+    for mode in found["modes"]:
+        if count := sum(mode["groups"][index]["count"] for index in chosen):
+            failures += count
+            fractions = [mode["groups"][index]["fraction"] for index in chosen] + [mode[name] for name in known]
+            name = mode["name"] if mode["name"] == "other" else f"{mode['mode']}. {mode['name']}"
+            speeds = [UNKNOWN if mode[name] is None else f"{mode[name]:.1f}" for name in SPEEDS]
+            rows.append([name, str(count), *map(percent, fractions), *speeds])
+    if rows:
+        cells = [f"{each['failures']} in {plural(each['modes'], 'mode')}" for each in groups]
+        rows.append(["all failures", str(failures), *cells, *[""] * (len(known) + len(SPEEDS))])
+    columns = [*column_names(groups), *known.values()]
+    head = ["", "failures", *(f"{name} [%]" for name in columns), *SPEEDS.values()]
+    text = (
+        f"Failure modes of {ego}: fraction of each method's collisions; verdicts and mean speeds just before contact, "
+        f"of the mode's collisions{' with any ego' if several else ''}. Each word holds for two thirds of them; other: "
+        f"modes of less than {LEAST:.0%}, or of one collision of {MANY} or more. `e2rl replay RUN_DIR --modes` draws a "
+        "typical one of each."
+    )
+    if found["unknown"]:
+        text += f" Grouped without {', '.join(found['unknown'])}, which the rollouts do not know."
+    absent = [title for name, title in VERDICTS.items() if name not in known]
+    return Table(text + (f" Not computable here: {', '.join(absent)}." if absent else ""), head, rows)
+
+
+def percent(fraction: float | None) -> str:
+    return UNKNOWN if fraction is None else f"{100 * fraction:.0f}"
 
 
 # --- cells

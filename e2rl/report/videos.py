@@ -1,4 +1,4 @@
-"""Videos: an animated GIF and a strip of four moments of a rollout, and which failures of a run are worth one."""
+"""Videos: an animated GIF of a rollout, and which failures of a run are worth one."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -9,23 +9,12 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from e2rl.report import drawing
-from e2rl.report.drawing import save_figure
-from e2rl.report.picture import Replay
 from e2rl.run.files import write_atomically
 
 FRAME_MS = 100  # real time at 10 Hz
 LAST_MS = 1200  # the last frame stays a little before the video starts again
 COLOURS = 160  # of the GIF's palette
 KEYS = (drawing.EGO, drawing.ADVERSARY, drawing.BACKGROUND, drawing.VULNERABLE, drawing.INK)  # always in the palette
-
-
-def save_replay(replay: Replay, folder: Path) -> tuple[Path, Path]:
-    """Write <name>.gif and <name>.png (the strip; also as <name>.pdf) into folder and return the first two paths."""
-    name = replay.rollout.name.removesuffix(".npz")
-    gif, png = Path(folder) / f"{name}.gif", Path(folder) / f"{name}.png"
-    save_animation(gif, replay.frames())
-    save_figure(png, replay.strip())
-    return gif, png
 
 
 def save_animation(path: Path, frames: Sequence[Image.Image], colours: int = COLOURS, every: int = 1) -> None:

@@ -1,15 +1,19 @@
 """A command that Hydra configures: `--help` prints all options; an option that is none is told the nearest."""
 
+import logging
 import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import suppress
+from datetime import datetime
 from difflib import get_close_matches
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
@@ -44,19 +48,53 @@ def run_command(
         return
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors arrive here as they are
 
+    OmegaConf.register_new_resolver("new_folder", new_folder, replace=True, use_cache=True)
+
     @hydra.main(version_base="1.3", config_path=str(conf_folder().resolve()), config_name=name)
     def command(config: DictConfig) -> None:
-        with ending(lambda: how_to_go_on(config)):
-            check_keys(config, name)
-            run = begun(config, may_change)
-            with alone_in(run.folder) if alone else nullcontext():
-                work(run)
+        try:
+            with ending(lambda: how_to_go_on(config)):
+                check_keys(config, name)
+                run = begun(config, may_change)
+                if not alone:
+                    work(run)
+                    return
+                with alone_in(run.folder):
+                    run.enter()
+                    work(run)
+        finally:
+            end_log()
+            if not any(item.startswith("hydra.run.dir=") for item in HydraConfig.get().overrides.hydra):
+                with suppress(OSError):
+                    os.rmdir(HydraConfig.get().runtime.output_dir)  # where nothing was written into it
 
     with ending():
         try:
             command()
         except HydraException as error:
             raise InputError(told(name, arguments, str(error))) from error
+
+
+def end_log() -> None:
+    """End the run's log, so that what else this process logs neither goes there nor makes the file anew."""
+    root = logging.getLogger()
+    for handler in [each for each in root.handlers if isinstance(each, logging.FileHandler)]:
+        root.removeHandler(handler)
+        handler.close()
+
+
+def new_folder(parent: str) -> str:
+    """Returns parent/DATE/TIME, a folder made now: of commands that begin in one second each has its own."""
+    now = datetime.now()
+    name = f"{now:%Y-%m-%d}/{now:%H-%M-%S}"
+    with suppress(OSError):  # Hydra makes it, too, and says what is wrong
+        Path(parent, name).parent.mkdir(parents=True, exist_ok=True)
+        for number in count(1):
+            folder = Path(parent, name if number == 1 else f"{name}-{number}")
+            with suppress(FileExistsError):
+                folder.mkdir()
+                return str(folder)
+    return str(Path(parent, name))
 
 
 def check_keys(config: DictConfig, name: str) -> None:

@@ -40,6 +40,12 @@ def load_config(name: str = "evaluate", overrides: Sequence[str] = ()) -> DictCo
         return compose(name, list(overrides))
 
 
+def assigned(key: str, value: object) -> str:
+    """Returns `key=value` for Hydra's command line, quoted for Hydra but not yet for a shell."""
+    text = str(value)
+    return f"{key}={text}" if re.fullmatch(r"[\w./:+@%-]+", text) else f"{key}='" + text.replace("'", "\\'") + "'"
+
+
 def load_choice(group: str, name: str) -> DictConfig:
     """Returns the file conf/<group>/<name>.yaml, of the running script's search path where there is one.
 
@@ -88,6 +94,8 @@ def built(config: DictConfig, where: str, kind: type, **given: Any) -> Any:
         made = instantiate(settings, _partial_=True, _convert_="all")(**given)
     except InputError:
         raise
+    except SystemExit as error:  # of outside code, perhaps as it is imported
+        raise InputError(f"{where}={target}: it called sys.exit({error.code!r}) instead of being built") from error
     except (InstantiationException, TypeError) as error:
         reason = f"{where}={target}: cannot be built: {error.__cause__ or error}"
         raise InputError(f"{reason}; check the class path and its arguments in conf/{where}") from error

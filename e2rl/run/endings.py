@@ -14,9 +14,10 @@ from typing import NoReturn
 from e2rl.run.errors import InputError
 
 WRITING = {
-    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO),
-    *(errno.EACCES, errno.EPERM, errno.ENOTDIR),
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EEXIST, errno.ENAMETOOLONG),
+    *(errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.ELOOP),
 }
+MEMORY = ("can't allocate memory", "not enough memory", "out of memory")  # in what torch raises
 
 
 def program() -> list[str]:
@@ -38,8 +39,8 @@ def command_line() -> str:
 def ending(go_on: Callable[[], str] = command_line) -> Iterator[None]:
     """End the process where the block ends early, with one line on stderr.
 
-    The status is 2 for bad input, 1 for a file that cannot be written, 130 for Ctrl-C, 143 for SIGTERM. Libraries may
-    turn the interrupt into an error of their own, or lose it on the way; what counts is that the signal arrived.
+    The status is 2 for bad input, 1 for a full disk or memory, 130 for Ctrl-C, 143 for SIGTERM. Libraries may turn the
+    interrupt into an error of their own, or lose it on the way; what counts is that the signal arrived.
 
     Args:
         go_on: returns the command that goes on where this one ends; by default the same again.
@@ -62,12 +63,23 @@ def ending(go_on: Callable[[], str] = command_line) -> Iterator[None]:
             _end(f"error: {' '.join(str(error).split())}", 2)
         failed = error.__cause__ if isinstance(error.__cause__, OSError) else error  # of logging that is set up
         if isinstance(failed, OSError) and failed.errno in WRITING:
-            reason = f"{failed.filename}: cannot be written ({failed.strerror}); what was written before is whole"
+            where = failed.filename or "a file"
+            reason = f"{where}: cannot be written ({failed.strerror}); what was written before is whole"
             _end(f"\nerror: {reason}. Mend that, then go on with: {go_on()}", 1)
+        if _lacks_memory(error):
+            reason = "out of memory; what was written before is whole"
+            _end(f"\nerror: {reason}. Free memory, or use fewer processes, then go on with: {go_on()}", 1)
         raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _lacks_memory(error: BaseException) -> bool:
+    """Whether an error says that there was no memory, that of a GPU included."""
+    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+        return True
+    return isinstance(error, RuntimeError) and any(words in str(error) for words in MEMORY)
 
 
 def kill_workers(others: set | None = None) -> None:

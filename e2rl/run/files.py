@@ -8,10 +8,12 @@ Files of earlier versions have no hash; of those only the form is checked.
 import errno
 import fcntl
 import hashlib
+import io
 import json
 import os
 import shutil
 import stat
+import sys
 import tempfile
 import time
 import zipfile
@@ -30,14 +32,17 @@ from torch import Tensor, nn
 from e2rl.run.errors import InputError
 
 MAX_FILE = 1 << 30  # bytes of a file of a run
+MAX_RECORD = 1 << 22  # bytes of a file of plain values that a command writes about a run
+MAX_HASHED = 1 << 36  # bytes of a file whose content is not held, weights
 MAX_ARRAYS = 1 << 30  # bytes of one npz, unpacked
 WAIT = 5  # s that another run's workers have to end
+LOGGER = "wandb"
 HASH = "sha256"  # key in the header of a file of weights
 SEAL = "sha256.json"  # of a sealed folder: {file: hash}
 DAMAGED = (OSError, EOFError, LookupError, TypeError, ValueError, RuntimeError, MemoryError, SyntaxError)
 
 
-def open_regular(path: Path, limit: int = MAX_FILE, within: Path | None = None) -> IO[bytes]:
+def open_regular(path: Path, limit: int = MAX_FILE, within: Path | None = None) -> io.BufferedReader:
     """Open a regular file to read, which never blocks.
 
     Args:
@@ -47,7 +52,7 @@ def open_regular(path: Path, limit: int = MAX_FILE, within: Path | None = None) 
     Raises:
         OSError: where it is missing, a folder, a pipe, a device, larger, or a link to somewhere else.
     """
-    if within is not None and not path.resolve().is_relative_to(within.resolve()):
+    if within is not None and not leads_into(path, within):
         raise OSError(errno.EPERM, f"a link out of {within}", str(path))
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
@@ -55,7 +60,7 @@ def open_regular(path: Path, limit: int = MAX_FILE, within: Path | None = None) 
         if not stat.S_ISREG(found.st_mode):
             raise OSError(errno.EINVAL, "no regular file", str(path))
         if found.st_size > limit:
-            raise OSError(errno.EFBIG, f"larger than {limit / 1e6:.0f} MB", str(path))
+            raise OSError(errno.EFBIG, f"larger than {limit / 1e6:.3g} MB", str(path))
         return os.fdopen(handle, "rb")
     except BaseException:
         os.close(handle)
@@ -66,6 +71,25 @@ def read_regular(path: Path, limit: int = MAX_FILE, within: Path | None = None) 
     """Returns the bytes of a file as `open_regular` opens it; raises as it does."""
     with open_regular(path, limit, within) as file:
         return file.read()
+
+
+def check_folder(folder: Path) -> None:
+    """Raises InputError where a run's folder, which may be a stranger's, holds a link out of it, a pipe or a device.
+
+    The folder of LOGGER is left out, which links to its own logs: nothing is read there.
+    """
+    for place, folders, files in os.walk(folder):
+        for path in (Path(place, name) for name in (*folders, *files)):
+            if path.is_symlink() and not leads_into(path, folder):
+                raise InputError(f"{path}: a link out of the run's folder; put there what it leads to")
+            if not (path.is_symlink() or path.is_dir() or path.is_file()):
+                raise InputError(f"{path}: no regular file; remove it")
+        folders[:] = [name for name in folders if Path(place, name) != folder / LOGGER]
+
+
+def leads_into(path: Path, folder: Path) -> bool:
+    """Whether a path lies in a folder once links are followed."""
+    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
 def write_atomically(path: Path, content: bytes | str | Callable[[Path], object]) -> None:
@@ -117,17 +141,17 @@ def seal(folder: Path) -> None:
 def altered(folder: Path) -> str | None:
     """The name of the first file of a sealed folder that is not what was written; None: all are."""
     try:
-        hashes = json.loads((folder / SEAL).read_text())
-        return next((name for name, known in hashes.items() if sha256_of(folder / name) != known), None)
+        hashes = json.loads(read_regular(folder / SEAL, MAX_RECORD, folder))
+        return next((name for name, known in hashes.items() if sha256_of(folder / name, folder) != known), None)
     except FileNotFoundError as error:
         return Path(error.filename).name
-    except (OSError, ValueError, AttributeError):
+    except (OSError, ValueError, AttributeError, RecursionError):
         return SEAL
 
 
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file's content, in hex."""
-    with path.open("rb") as file:
+def sha256_of(path: Path, within: Path | None = None) -> str:
+    """SHA-256 of a file's content, in hex; raises OSError as `open_regular` does."""
+    with open_regular(path, MAX_HASHED, within) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -138,11 +162,11 @@ def hash_files(paths: Iterable[Path]) -> bytes:
     """
     digest = hashlib.sha256()
     for path in paths:
-        digest.update(path.name.encode())
+        digest.update(os.fsencode(path.name))
         if not path.is_file():
             continue
         try:
-            with open(path, "rb") as file:
+            with open_regular(path, sys.maxsize) as file:
                 digest.update(hashlib.file_digest(file, "sha256").digest())
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror}; make it readable, or remove it") from error
@@ -189,15 +213,15 @@ def alone_in(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def read_arrays(file: Path | IO[bytes]) -> dict[str, np.ndarray]:
-    """The arrays of an npz, none of them pickled; raises ValueError where it is damaged or claims MAX_ARRAYS bytes."""
+def read_arrays(file: Path | IO[bytes], most: int = MAX_ARRAYS) -> dict[str, np.ndarray]:
+    """The arrays of an npz, none of them pickled; ValueError where it is damaged or claims more than `most` bytes."""
     if isinstance(file, Path) and not file.is_file():
         raise ValueError("no regular file")
     try:
         with zipfile.ZipFile(file) as archive:
             size = sum(member.file_size for member in archive.infolist())
-        if size > MAX_ARRAYS:
-            raise ValueError(f"unpacks to {size / 1e6:.0f} MB, more than {MAX_ARRAYS / 1e6:.0f}")
+        if size > most:
+            raise ValueError(f"unpacks to {size / 1e6:.0f} MB, more than {most / 1e6:.0f}")
         with np.load(file, allow_pickle=False) as arrays:
             return {key: _truth(np.asarray(arrays[key])) for key in arrays.files}
     except (*DAMAGED, zipfile.BadZipFile, zlib.error) as error:

@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import torch
 
-from e2rl.run.files import write_atomically
+from e2rl.run.files import MAX_FILE, read_regular, write_atomically
 
 PARTS, FORMAT, HASHED = "parts", "e2rl-part/1", b"e2rl-sha256:"
 
@@ -44,7 +45,7 @@ class Parts:
         if self.folder is None or not self._file(name).is_file():
             return None
         try:
-            part = read_state(self._file(name))
+            part = read_state(self._file(name), self.folder)
             known = [part[key] for key in ("format", "about", "identity")]
             return part["value"] if known == [FORMAT, self.about, identity] else None
         except (ValueError, TypeError, LookupError):  # damaged, or a stranger's: the part is done again
@@ -71,17 +72,46 @@ def state_bytes(state: Any) -> bytes:
     return HASHED + hashlib.sha256(content.getvalue()).digest() + content.getvalue()
 
 
-def read_state(file: Path) -> Any:
+def read_state(file: Path, folder: Path | None = None) -> Any:
     """Returns what `state_bytes` made, on the CPU; nothing but plain values and tensors is unpickled.
+
+    Args:
+        folder: in which the file must lie, links followed.
 
     Raises:
         ValueError: where the file is damaged.
     """
     try:
-        content = file.read_bytes()
+        content = read_regular(file, within=folder)
         begin = len(HASHED) + hashlib.sha256().digest_size
         if content[: len(HASHED)] != HASHED or hashlib.sha256(content[begin:]).digest() != content[len(HASHED) : begin]:
             raise ValueError("not what was written, or of an earlier version")
-        return torch.load(io.BytesIO(content[begin:]), map_location="cpu", weights_only=True)
+        return load_plain(content[begin:])
     except Exception as error:  # damaged bytes raise anything
         raise ValueError(f"{file}: damaged ({error})") from error
+
+
+def load_plain(content: bytes) -> Any:
+    """Returns what torch.save wrote, plain values and tensors on the CPU.
+
+    Raises:
+        ValueError: where it would grow as it is read: torch packs nothing, and repeats nothing. Damaged bytes raise
+            anything.
+    """
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = archive.infolist()
+    packed = any(each.compress_type != zipfile.ZIP_STORED for each in members) or content[:2] != b"PK"
+    if packed or sum(each.file_size for each in members) > len(content):
+        raise ValueError("packed")
+    value = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    waiting, known, size = [value], set(), 0
+    while waiting:
+        part = waiting.pop()
+        if id(part) not in known and isinstance(part, dict | list | tuple):
+            waiting += part.values() if isinstance(part, dict) else part
+        elif id(part) not in known and isinstance(part, torch.Tensor):
+            size += part.numel() * part.element_size() if part.layout == torch.strided else MAX_FILE
+        known.add(id(part))
+    if size > MAX_FILE:
+        raise ValueError(f"its tensors have {size / 1e6:.0f} MB")
+    return value

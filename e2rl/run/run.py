@@ -8,8 +8,8 @@ the user may have mended what ended the run.
 import copy
 import hashlib
 import json
+import os
 import platform
-import re
 import shlex
 import subprocess
 import sys
@@ -24,16 +24,25 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from e2rl.run.config import load_choice, resolved
+from e2rl.run.config import assigned, load_choice, load_config, resolved
 from e2rl.run.endings import command_line, program
 from e2rl.run.errors import InputError
-from e2rl.run.files import altered, hash_files, sha256_of, write_atomically
+from e2rl.run.files import MAX_RECORD, altered, hash_files, read_regular, sha256_of, write_atomically
 from e2rl.run.parts import PARTS, Parts
-from e2rl.run.trust import CONFIG, ENDPOINT, leaves, outside_modules, saved_configuration
+from e2rl.run.trust import (
+    CONFIG,
+    ENDPOINT,
+    check_written,
+    leaves,
+    outside_modules,
+    saved_configuration,
+    written_outside,
+)
 
 PROVENANCE = "provenance.json"
 PACKAGE = Path(__file__).parents[1]
 ALWAYS = ("resume", "plugins", ENDPOINT)  # keys that a command line may hold anyway
+LOGS = (".log", ".out", ".err")  # files that whatever starts a command may write into its run's folder
 READ_OTHERWISE = ("data", "tuning")  # groups whose files are not hashed: scenes are, and a study is to grow
 
 
@@ -56,31 +65,49 @@ class Run:
         """Returns the run that the command line asks for: a new one, or the one that `config.resume` goes on with.
 
         Raises:
-            InputError: where a new run's folder has a run already; where there is none to go on with; where its
-                configuration names code that the command line does not (`e2rl.run.trust`); for settings that are fixed.
+            InputError: where there is none to go on with; where its configuration names what the command line does not
+                (`e2rl.run.trust`); for settings that are fixed.
         """
         hydra = HydraConfig.get()
-        folder = Path(hydra.runtime.output_dir)
         if not config.resume:
-            if any((folder / name).exists() for name in (PROVENANCE, PARTS)):
-                raise InputError(
-                    f"{folder}: has a run already; go on with it by {assigned('resume', folder)}, or name another "
-                    "folder by hydra.run.dir=FOLDER"
-                )
-            return cls(config, folder, dict(hydra.runtime.choices), free)
+            return cls(config, Path(hydra.runtime.output_dir), dict(hydra.runtime.choices), free)
         folder, where = Path(config.resume).resolve(), f"resume={config.resume}"
         saved, known = saved_configuration(config, folder, where), read_provenance(folder)
         given = {item.split("=", 1)[0].lstrip("+~") for item in hydra.overrides.task}
-        if wrong := sorted(given - {*free, *ALWAYS}):
+        default = load_config(str(hydra.job.config_name))
+        needed = {option.partition("=")[0] for option in written_outside(saved, folder, default)}
+        if wrong := sorted(given - {*free, *ALWAYS, *needed}):
             raise InputError(
                 f"{where}: goes on as it was begun; leave out {', '.join(wrong)} (only {', '.join(free)} can change)"
             )
+        check_written(saved, folder, where, config, default)
         for key in given.intersection(free):
             saved[key] = config[key]
         saved.plugins, saved.resume = config.plugins, str(folder)
-        for left in folder.rglob(".*.part"):  # of a file that was being written at the end
-            left.unlink(missing_ok=True)
         return cls(saved, folder, known["choices"], free)
+
+    def enter(self) -> None:
+        """Make the folder ready, once nobody else is at work in it.
+
+        Raises:
+            InputError: where it cannot be written; where a new run's is not empty, but for logs and for what is left of
+                a run that was killed as it began.
+        """
+        if not os.access(self.folder, os.W_OK):
+            raise InputError(f"{self.folder}: cannot be written; make it writable, or name another folder")
+        if self.config.resume:
+            for left in self.folder.rglob(".*.part"):  # of a file that was being written at the end
+                left.unlink(missing_ok=True)
+            return
+        found = {path.relative_to(self.folder).parts[0] for path in self.folder.rglob("*") if not path.is_dir()}
+        found -= {name for name in found if name.endswith(LOGS)}
+        if {PROVENANCE, PARTS} & found:
+            raise InputError(
+                f"{self.folder}: has a run already; go on with it by {assigned('resume', self.folder)}, or name "
+                "another folder by hydra.run.dir=FOLDER"
+            )
+        if CONFIG.parts[0] not in found and (others := sorted(found)):
+            raise InputError(f"{self.folder}: is not empty ({others[0]}); name another folder by hydra.run.dir=FOLDER")
 
     def parts(self, stage: str = "", about: str = "") -> Parts:
         """Returns the parts of a stage that are done."""
@@ -146,15 +173,10 @@ def how_to_go_on(config: DictConfig) -> str:
         if argument.split("=")[0] in ("--config-dir", "-cd"):
             words += [argument] if "=" in argument else arguments[position : position + 2]
     words.append(assigned("resume", folder))
+    words += written_outside(config, folder, load_config(str(HydraConfig.get().job.config_name)))
     if modules := sorted(outside_modules(config)):
         words.append(f"plugins=[{','.join(modules)}]")
     return shlex.join(words)
-
-
-def assigned(key: str, value: object) -> str:
-    """Returns `key=value` for Hydra's command line, quoted for Hydra but not yet for a shell."""
-    text = str(value)
-    return f"{key}={text}" if re.fullmatch(r"[\w./:+@%-]+", text) else f"{key}='" + text.replace("'", "\\'") + "'"
 
 
 def read_provenance(folder: Path) -> dict[str, Any]:
@@ -162,7 +184,7 @@ def read_provenance(folder: Path) -> dict[str, Any]:
     file = Path(folder) / PROVENANCE
     damaged = InputError(f"{file}: damaged, or of another version; restore it, or begin a new run")
     try:
-        known = json.loads(file.read_text())
+        known = json.loads(read_regular(file, MAX_RECORD, Path(folder)))
         kinds = {"command": str, "cwd": str, "choices": dict, "inputs": dict, "settings": dict, "files": dict}
         wrong = [name for name, kind in kinds.items() if not isinstance(known[name], kind)]
         if not wrong and known["versions"] and all(isinstance(each["git"], str) for each in known["versions"]):
@@ -220,7 +242,10 @@ def inputs(config: DictConfig) -> Iterator[tuple[str, Any]]:
         if "checkpoint" in key and path.is_dir():
             path = _weights(path)
         if path.is_file():
-            yield f"{key}={value}", sha256_of(path)
+            try:
+                yield f"{key}={value}", sha256_of(path)
+            except OSError as error:
+                raise InputError(f"{key}={value}: cannot be read: {error.strerror}; name another file") from error
     for name in config.get("methods", ()):
         if name not in config.variants and name != config.synthesizer.name:
             yield f"synthesizer={name}", resolved(load_choice("synthesizer", name))

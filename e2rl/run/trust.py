@@ -1,24 +1,36 @@
 """The configuration that a run was begun with, read from its folder, which may be a stranger's.
 
-It may name extensions of e2rl's own only. Code from elsewhere, a command to start, an address to connect to, and an
-endpoint that would be sent the user's key take part if the command line names them, too.
+It may name extensions of e2rl's own only. Code from elsewhere, a command to start, an address to connect to, an
+endpoint that would be sent the user's key, and a path outside of the folder that would be written to take part if the
+command line names them, too.
 """
 
+import io
+import os
 import re
 from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
-from e2rl.run.config import Extension
+from e2rl.run.config import Extension, assigned
 from e2rl.run.errors import InputError
+from e2rl.run.files import check_folder, leads_into, read_regular
 
 CONFIG = Path(".hydra", "config.yaml")  # of a run's folder
+MAX_BYTES, MAX_NODES, MAX_DEPTH, MAX_TEXT = 1 << 18, 20_000, 50, 1024  # of it; the last of a text that others refer to
+REFERENCES = re.compile(r"([^$\\]|\$\{[A-Za-z_][\w.]*\})*")  # a text that refers to other values and does nothing else
 ENDPOINT = "synthesizer.reasoner.base_url"
+WRITTEN = (
+    "data.cache",
+    "data.cache_gb",
+    "tuning.study",
+    "synthesizer.reasoner.cache",
+)  # paths to write to, and how much
 STARTING = {"command": "e2rl.planners.external", "address": "e2rl.planners.external"}  # by a part of the key
 PROGRAM, ARITHMETIC = "e2rl.planners.policy_file", ".onnx"  # other files of policies are programs
 
@@ -36,15 +48,13 @@ def saved_configuration(config: DictConfig, folder: Path, where: str) -> DictCon
     file = folder / CONFIG
     if not file.is_file():
         raise InputError(f"{where}: no run found ({file} is missing); give the folder that the run printed")
+    check_folder(folder)
     saved = read_yaml(file)
-    plain = OmegaConf.to_container(saved)
-    if not isinstance(saved, DictConfig) or not isinstance(plain, dict):
-        raise InputError(f"{file}: no configuration of a run; give the folder of a run")
-    if missing := sorted({str(key) for key in config} - set(map(str, plain))):
+    if missing := sorted({str(key) for key in config} - {str(key) for key in saved}):
         reason = "of the other command, of another version, or cut off"
         raise InputError(f"{file}: {reason} ({', '.join(missing)}: missing); give another run, or begin a new one")
     check_code(saved, [str(name) for name in config.plugins], where)
-    named = {str(value) for key, value in leaves(plain) if key.endswith("base_url") and value}
+    named = {str(value) for key, value in leaves(OmegaConf.to_container(saved)) if key.endswith("base_url") and value}
     if unknown := sorted(named - {str(OmegaConf.select(config, ENDPOINT))}):
         raise InputError(
             f"{where}: its reasoner sends your API key to {', '.join(unknown)}; if that is right, add "
@@ -53,15 +63,87 @@ def saved_configuration(config: DictConfig, folder: Path, where: str) -> DictCon
     return saved
 
 
-def read_yaml(file: Path) -> Any:
-    """Returns the configuration in a file of a run; InputError where it cannot be read."""
+def read_yaml(file: Path) -> DictConfig:
+    """Returns the configuration in CONFIG of a run's folder; InputError where it is none, or takes much to read."""
     try:
-        saved = OmegaConf.load(file)
-        OmegaConf.to_container(saved)
+        text = read_regular(file, MAX_BYTES, within=file.parents[1]).decode()
+        _check_size(text)
+        saved = OmegaConf.load(io.StringIO(text))
+        if not isinstance(saved, DictConfig):
+            raise ValueError("no configuration of a run")
+        _check_values(OmegaConf.to_container(saved))
         return saved
-    except (OSError, ValueError, RecursionError, YAMLError, OmegaConfBaseException) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    except (OSError, ValueError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
+        said = str(isinstance(error, OSError) and error.strerror or error) or type(error).__name__
+        reason = said.splitlines()[0]
         raise InputError(f"{file}: damaged ({reason}); restore it, or begin a new run") from error
+
+
+def _check_size(text: str) -> None:
+    """Raises ValueError for YAML that grows as it is read, by aliases, and for what has too many or too deep nodes."""
+    depth = 0
+    for number, event in enumerate(yaml.parse(text, yaml.SafeLoader)):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if isinstance(event, yaml.AliasEvent) or number > MAX_NODES or depth > MAX_DEPTH:
+            raise ValueError("aliases, or more than a run's configuration holds")
+
+
+def _check_values(plain: Any) -> None:
+    """Raises ValueError for an endless number, and where a text refers to others by more than ${KEY}, or to one that
+    itself refers to others: as few lines as one wants grow as they are resolved, and a resolver runs code."""
+    for key, value in leaves(plain):
+        if isinstance(value, int) and value.bit_length() > 64:
+            raise ValueError(f"{key} is an endless number")
+        if not isinstance(value, str) or "${" not in value:
+            continue
+        names = re.findall(r"\$\{(.*?)\}", value) if REFERENCES.fullmatch(value) else [""]
+        known = [str(_of(plain, name.split("."))) for name in names]
+        if any(len(text) > MAX_TEXT or "$" in text for text in known):
+            raise ValueError(f"{key} refers to what refers to others")
+
+
+def _of(plain: Any, parts: Sequence[str]) -> Any:
+    """The value of a dotted key in nested containers; ValueError where it is not there, or a container."""
+    for part in parts:
+        if not isinstance(plain, dict) or part not in plain:
+            raise ValueError(f"it refers to {'.'.join(parts) or 'more than a key'}, which is not there")
+        plain = plain[part]
+    if isinstance(plain, dict | list):
+        raise ValueError(f"it refers to {'.'.join(parts)}, which is no plain value")
+    return plain
+
+
+def check_written(saved: DictConfig, folder: Path, where: str, *trusted: DictConfig) -> None:
+    """Raises InputError where a saved configuration writes outside of its run's folder (`written_outside`)."""
+    if added := written_outside(saved, folder, *trusted):
+        raise InputError(
+            f"{where}: its configuration writes outside of its folder; if that is right, add {' '.join(added)}"
+        )
+
+
+def written_outside(saved: DictConfig, folder: Path, *trusted: DictConfig) -> list[str]:
+    """Returns the options for Hydra that name where `saved` writes outside of the folder, links followed, and how much,
+    other than the trusted configurations."""
+    mine = {(key.rpartition(".")[2], _place(value)) for config in trusted for key, value in _written(config)}
+    added = []
+    for key, value in _written(saved):
+        place, inside = _place(value), isinstance(value, str) and leads_into(Path(value), folder)
+        if value is not None and not inside and (key.rpartition(".")[2], place) not in mine:
+            added.append(assigned(next((name for name in WRITTEN if key.endswith(name)), key), value))
+    return list(dict.fromkeys(added))
+
+
+def _place(value: Any) -> Any:
+    return os.path.realpath(value) if isinstance(value, str) else value
+
+
+def _written(config: DictConfig) -> Iterator[tuple[str, Any]]:
+    """(dotted key, value) wherever a configuration has a key as WRITTEN has them, perhaps as a change of a variant."""
+    names = {name.rpartition(".")[2] for name in WRITTEN}
+    for key, value in leaves(OmegaConf.to_container(config, resolve=True)):
+        parts = re.split(r"[.\[\]]+", key)
+        if names.intersection(parts):
+            yield ".".join(filter(None, parts)), value
 
 
 def check_code(config: DictConfig, allowed: Sequence[str], where: str) -> None:
@@ -78,8 +160,6 @@ def check_code(config: DictConfig, allowed: Sequence[str], where: str) -> None:
         raise InputError(f"{where}: its configuration is damaged (plugins: {str(plugins)[:40]}); restore it")
     named = [str(name) for name in plugins]
     named += [str(target) for key, target in nodes if "_target_" in key and not _is_extension(str(target))]
-    texts = [text for node in nodes for text in node if isinstance(text, str)]
-    named += [text for text in texts if "${" in text and ":" in text]  # a resolver: what it makes is unknown
     named += starting_modules(plain)
     outside = [name for name in named if not any(name == own or name.startswith(f"{own}.") for own in allowed)]
     if outside:

@@ -14,7 +14,7 @@ import numpy as np
 
 from e2rl.run.errors import InputError
 from e2rl.run.files import hash_files
-from e2rl.scenes.log_files import check_size
+from e2rl.scenes.log_files import bounded_memory, check_file
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import CYCLIST, OTHER, PEDESTRIAN, VEHICLE, Lane, Recording, same_way
 from e2rl.scenes.smoothing import resample_uniform, speeds
@@ -48,6 +48,7 @@ CITIES = {  # by the code in the name of a sensor log's map; scenarios have the 
     "WDC": "washington-dc",
 }
 MID_POINTS = 10  # of a lane segment's centreline
+MAX_ROWS, MAX_COLUMNS, MAX_TABLE = 500_000, 64, 1 << 28  # of a scenario; the last in bytes, unpacked
 
 
 @dataclass
@@ -71,9 +72,10 @@ class Argoverse2Source(Source):
 
         path = self.root() / log
         for file in _files(path):
-            check_size(file)
-        recording = _scenario(path) if path.suffix == ".parquet" else _sensor_log(path)
-        recording.lanes, recording.drivable = _map(ArgoverseStaticMap.from_json(_files(path)[-1]))
+            check_file(file)
+        with bounded_memory():
+            recording = _scenario(path) if path.suffix == ".parquet" else _sensor_log(path)
+            recording.lanes, recording.drivable = _map(ArgoverseStaticMap.from_json(_files(path)[-1]))
         yield recording
 
     def fingerprint(self) -> bytes:
@@ -93,6 +95,7 @@ def _scenario(path: Path) -> Recording:
     """A motion-forecasting scenario, still without a map."""
     from av2.datasets.motion_forecasting.scenario_serialization import load_argoverse_scenario_parquet
 
+    _check_table(path)
     scenario = load_argoverse_scenario_parquet(path)
     frames, tracks = len(scenario.timestamps_ns), scenario.tracks
     check({"states": frames * len(tracks)}, scenario.scenario_id)
@@ -114,6 +117,19 @@ def _scenario(path: Path) -> Recording:
     seconds = (np.asarray(scenario.timestamps_ns, float) - scenario.timestamps_ns[0]) / 1e9
     arrays = (*resample_uniform(states, valid, seconds), size, _types(kinds))
     return Recording(scenario.scenario_id, scenario.city_name, "argoverse2", *arrays, ego, {}, current=None)
+
+
+def _check_table(path: Path) -> None:
+    """InputError where a table claims to be larger than any scenario."""
+    from pyarrow.parquet import read_metadata
+
+    about = read_metadata(path)
+    size = sum(about.row_group(index).total_byte_size for index in range(about.num_row_groups))
+    if about.num_rows > MAX_ROWS or about.num_columns > MAX_COLUMNS or size > MAX_TABLE:
+        claim = f"{about.num_rows} rows of {about.num_columns} columns, unpacked {size / 1e6:.0f} MB"
+        raise InputError(
+            f"{claim}: more than {MAX_ROWS}, {MAX_COLUMNS}, {MAX_TABLE / 1e6:.0f} MB; cut it, or leave it out"
+        )
 
 
 def _sensor_log(path: Path) -> Recording:
@@ -177,4 +193,4 @@ def _map(static_map: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
     for key, lane in lanes.items():
         lane.left = same_way(lanes, lane, segments[key].left_neighbor_id)
         lane.right = same_way(lanes, lane, segments[key].right_neighbor_id)
-    return lanes, [area.xyz[:, :2] for area in static_map.vector_drivable_areas.values()]
+    return lanes, [np.asarray(area.xyz[:, :2], float) for area in static_map.vector_drivable_areas.values()]

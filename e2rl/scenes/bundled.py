@@ -5,6 +5,7 @@ Format e2rl-scenes/1 (npz, readable without pickle; written by tools/scenegen/ar
 after another, with counts.
 """
 
+import hashlib
 import io
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -18,7 +19,12 @@ from e2rl.run.files import read_arrays
 from e2rl.scenes.recording import VEHICLE, Lane, Recording
 from e2rl.scenes.source import Source, default_of
 
-SPLITS = ("train", "tune", "test")
+SHA256 = {  # of the archives of the splits, as tools/generate_scenes.py prints them
+    "train": "1cea380fbf9246395a7a4514e7a1d8e2d7acd83b82ba34e6a01e6411e0aafb3d",
+    "tune": "78e4ec78fe3ee1c11458b47a6bcea8e00671bbed6e186687ead1c32c905bbe1a",
+    "test": "2cf8f86f8aa91d05eeee83db7f5a2629aafb501dfeef40f0548480e3564a9b67",
+}
+SPLITS = tuple(SHA256)
 FORMAT = "e2rl-scenes/1"
 FRAMES, CURRENT = 111, 10
 MILLI = 1e-3
@@ -69,13 +75,16 @@ class BundledSource(Source):
 
 
 def asset_bytes(split: str) -> bytes:
-    """Returns the archive of a split; raises InputError where the split is unknown or its file is missing."""
+    """Returns the archive of a split; raises InputError where the split is unknown, or its file missing or altered."""
     if split not in SPLITS:
         raise InputError(f"split {split!r} of the bundled scenes: expected one of {', '.join(SPLITS)}")
     path = files("e2rl") / "assets" / "scenes" / f"{split}.npz"
     if not path.is_file():
         raise InputError(f"bundled scenes: {path} is missing; reinstall the package or restore the file from git")
-    return path.read_bytes()
+    content = path.read_bytes()
+    if hashlib.sha256(content).hexdigest() != SHA256[split]:
+        raise InputError(f"bundled scenes: {path} is damaged: not what comes with the package; {MEND}")
+    return content
 
 
 def unpack(split: str) -> dict[str, np.ndarray]:

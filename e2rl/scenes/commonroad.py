@@ -16,7 +16,7 @@ from xml.parsers import expat
 import numpy as np
 
 from e2rl.run.errors import InputError
-from e2rl.scenes.log_files import LogFiles
+from e2rl.scenes.log_files import LogFiles, bounded_memory
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import (
     CYCLIST,
@@ -58,7 +58,8 @@ class CommonRoadSource(LogFiles):
 
     def read(self, log: str) -> Iterator[Recording]:
         start = min(self.starts or (HISTORY,))
-        recording = read_scenario(self.content(log), start)
+        with bounded_memory():
+            recording = read_scenario(self.content(log), start)
         if len(recording.states) - self.build.steps // 2 >= start:
             yield recording
 

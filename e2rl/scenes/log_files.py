@@ -1,16 +1,20 @@
 """Logs that are one file each, in a folder or a zip; read whole, at bounded size."""
 
 import lzma
+import resource
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import ClassVar
 
 from e2rl.run.errors import InputError
-from e2rl.run.files import hash_files
+from e2rl.run.files import hash_files, open_regular, read_regular
 from e2rl.scenes.source import Source
 
 MAX_BYTES = 1 << 26  # of one log; the largest pickle of nuScenes v1.0-mini has 4 MB, the largest XML of NGSIM as well
+MAX_MEMORY = 1 << 30  # bytes that reading one log may take
 PIECE = 4096  # bytes of a zip unpacked at a time: at most 7,000 times as many come out
 DAMAGED = (*(OSError, EOFError, KeyError, ValueError, RuntimeError), zipfile.BadZipFile, zlib.error, lzma.LZMAError)
 
@@ -53,19 +57,42 @@ class LogFiles(Source):
         if root.is_file():
             with self.archive() as archive:
                 return _member(archive, log)
-        check_size(root / log)
         try:
-            return (root / log).read_bytes()
+            return read_regular(root / log, MAX_BYTES)
         except OSError as error:
-            raise InputError(f"{log} in {root}: cannot be read: {error}; copy or export it again") from error
+            raise InputError(f"{log} in {root}: cannot be read: {error.strerror}; copy or export it again") from error
 
 
-def check_size(file: Path, most: int = MAX_BYTES) -> None:
-    """Raises InputError for a file of a log that has more than `most` bytes, or is none."""
-    if not file.is_file():
-        raise InputError(f"{file}: no regular file (a pipe, or a link to nothing); remove it")
-    if file.stat().st_size > most:
-        raise InputError(f"{file.name} has more than the {most / 1e6:.0f} MB of a log; cut it, or leave it out")
+def check_file(file: Path, most: int = MAX_BYTES) -> None:
+    """Raises InputError for a file of a log that is no regular one, has more than `most` bytes, or is not readable."""
+    try:
+        open_regular(file, most).close()
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read: {error.strerror}; copy it again, or leave it out") from error
+
+
+@contextmanager
+def bounded_memory(most: int = MAX_MEMORY) -> Iterator[None]:
+    """The block may allocate `most` bytes: libraries that believe what a file says it holds would take all there is.
+
+    Raises InputError where it asks for more. Without effect where the system does not tell what a process has.
+    """
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[5])
+    except OSError:
+        yield
+        return
+    soft, hard = before = resource.getrlimit(resource.RLIMIT_DATA)
+    asked = pages * resource.getpagesize() + most
+    resource.setrlimit(resource.RLIMIT_DATA, (asked if soft == resource.RLIM_INFINITY else min(asked, soft), hard))
+    try:
+        yield
+    except MemoryError as error:
+        raise InputError(
+            f"takes more than the {most / 1e6:.0f} MB of memory of a log; cut it, or leave it out"
+        ) from error
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, before)
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> bytes:

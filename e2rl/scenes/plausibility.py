@@ -20,6 +20,7 @@ FRAMES = 5  # between the two poses of a displacement: half a second
 MOVED, DRIVES = 1.0, 2.0  # m, m/s: a vehicle that moves
 DRIVEN, BACKWARDS = 15.0, 5.0  # m that a vehicle drives before it is looked at alone; m/s up to which it may reverse
 ENOUGH = 20  # displacements that a median needs
+CROWD = 100_000  # pairs of vehicles at one place at one moment, of which all are one
 TWIN = 0.5  # m between the centres of vehicles that are one
 LANE_RADIUS, LANE_ANGLE, LANES = 3.0, 0.6, 8  # m, rad, neighbours: a vehicle on a lane
 PARALLEL, BESIDE = 0.2, (1.5, 20.0)  # rad, m: lanes side by side
@@ -44,6 +45,8 @@ LIMITS = {
     "map_reach": Limit(0, 50_000, "m is a point of the map from the ego", "cut the map, or give it in m"),  # 126 to 770
     "lane": Limit(0, 10_000, "m is the longest lane", "cut the map, or give it in m"),  # 72 to 676
     "lanes": Limit(0, 500_000, "m are all lanes together", "cut the map"),  # 620 to 32,000
+    "borders": Limit(0, 5_000_000, "m are the borders of all drivable areas", "cut the map"),  # 0 to 41,000
+    "links": Limit(0, 100, "lanes begin at one place, or follow one lane", "draw each lane once"),  # 1 to 5
     "length": Limit(0.05, 40, "m is an agent's length", "give sizes in m"),  # 0.2 to 17
     "width": Limit(0.05, 15, "m is an agent's width", "give sizes in m"),  # 0.2 to 10, of a glitch
     # `motion`
@@ -92,9 +95,18 @@ def extent(recording: Recording) -> dict[str, float]:
         "map_reach": np.linalg.norm(ground - ego, axis=-1).max(),
         "lane": max(lengths, default=0.0),
         "lanes": sum(lengths),
+        "borders": sum(arc_length(ring[:, :2])[-1] for ring in recording.drivable if len(ring)),
+        "links": links(recording),
         **_extremes(size[:, 0], "length"),
         **_extremes(size[:, 1], "width"),
     }
+
+
+def links(recording: Recording) -> int:
+    """The most lanes that begin at one place, or are named to follow one: of so many, all pairs would be looked at."""
+    starts = np.array([lane.points[0] for lane in recording.lanes.values() if len(lane.points)])
+    together = cKDTree(starts).query_ball_point(starts, TWIN, return_length=True) if len(starts) else [0]
+    return max(int(np.max(together)), *(len(lane.exits) for lane in recording.lanes.values()))
 
 
 def _extremes(sizes: np.ndarray, name: str) -> dict[str, float]:
@@ -157,7 +169,10 @@ def _together(recording: Recording, tracks: np.ndarray) -> float:
     for known, points in zip(valid, place, strict=True):
         there = np.flatnonzero(known)
         if len(there) > 1:
-            pairs.append(there[cKDTree(points[there]).query_pairs(TWIN, output_type="ndarray")])
+            tree = cKDTree(points[there])
+            if tree.count_neighbors(tree, TWIN) > CROWD + len(there):
+                return inf
+            pairs.append(there[tree.query_pairs(TWIN, output_type="ndarray")])
     _, count = np.unique(np.concatenate(pairs), axis=0, return_counts=True)
     return float(count.max(initial=0) * FRAMES * DT)
 
@@ -210,14 +225,13 @@ def lane_spacing(graph: LaneGraph) -> float:
     chosen = np.unique(np.linspace(0, len(graph.points) - 1, SAMPLES).astype(int))
     direction = np.stack([np.cos(graph.heading), np.sin(graph.heading)], -1)
     nearest = np.full(len(chosen), inf)
-    pairs = cKDTree(graph.points[chosen]).sparse_distance_matrix(graph.tree, BESIDE[1], output_type="ndarray")
-    row, other = pairs["i"], pairs["j"]
-    away, ahead = graph.points[other] - graph.points[chosen][row], direction[chosen][row]
-    across = np.abs(away[:, 1] * ahead[:, 0] - away[:, 0] * ahead[:, 1])
-    along = np.abs((away * ahead).sum(-1))
-    parallel = np.abs((direction[other] * ahead).sum(-1)) > np.cos(PARALLEL)
-    kept = parallel & (along < 1.0) & (across > BESIDE[0])
-    np.minimum.at(nearest, row[kept], across[kept])
+    for row, point in enumerate(chosen):  # one by one: a map may have all its points at one place
+        other = np.array(graph.tree.query_ball_point(graph.points[point], BESIDE[1]), dtype=int)
+        away, ahead = graph.points[other] - graph.points[point], direction[point]
+        across = np.abs(away[:, 1] * ahead[0] - away[:, 0] * ahead[1])
+        along = np.abs((away * ahead).sum(-1))
+        parallel = np.abs((direction[other] * ahead).sum(-1)) > np.cos(PARALLEL)
+        nearest[row] = across[parallel & (along < 1.0) & (across > BESIDE[0])].min(initial=inf)
     return _median(nearest[nearest < inf])
 
 

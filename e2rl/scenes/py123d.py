@@ -4,6 +4,7 @@
 The ego is the recording vehicle. Logs of a higher rate are read at about 10 Hz, long ones in pieces.
 """
 
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 
 from e2rl.run.errors import InputError
 from e2rl.run.files import hash_files
-from e2rl.scenes.log_files import check_size
+from e2rl.scenes.log_files import bounded_memory, check_file
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import (
     CYCLIST,
@@ -72,10 +73,16 @@ class Py123dSource(Source):
         return (above[0] if above else root) / "maps"
 
     def read(self, log: str) -> Iterator[Recording]:
+        with bounded_memory():
+            recordings = list(self._recordings(self.root() / log))
+        yield from recordings
+
+    def _recordings(self, folder: Path) -> Iterator[Recording]:
         from py123d.api.scene.arrow.arrow_scene_api import ArrowSceneAPI
 
-        folder = self.root() / log
         _check_files(folder)
+        for file in self.maps().rglob("*.arrow"):
+            check_file(file, sys.maxsize)
         scene = ArrowSceneAPI(folder, maps_root=self.maps())
         frames, about, land = _frames(scene), scene.log_metadata, scene.get_map_api()
         if len(frames) < 2:
@@ -99,10 +106,8 @@ def _check_files(folder: Path) -> None:
     import msgpack
     import pyarrow as pa
 
-    for name in FILES:
-        if (folder / name).exists():
-            check_size(folder / name, MAX_BYTES)
     for file in sorted(folder.glob("*.arrow")):
+        check_file(file, MAX_BYTES if file.name in FILES else sys.maxsize)
         with pa.memory_map(str(file)) as source:
             about = (pa.ipc.open_file(source).schema.metadata or {}).get(b"metadata")
         if about is None:

@@ -18,6 +18,7 @@ LIGHTS = {  # by the upper-case names in logs
 DT = 0.1  # s, the time step of every recording, scene and simulation
 HISTORY = 10  # frames of history before a start frame that is chosen here
 MIRRORED = "~mirrored"  # ends the ids of logs in a mirror
+MAX_NAME = 128  # characters of the name of a scene, a place or a data set
 
 
 @dataclass
@@ -96,6 +97,18 @@ class Recording:
         drivable = [ring * mirror for ring in self.drivable]
         return replace(self, scene_id=f"{self.scene_id}{MIRRORED}", states=states, lanes=lanes, drivable=drivable)
 
+    def validate_names(self) -> "Recording":
+        """Returns self; raises InputError for a name that is no short text: files, tables and messages hold it."""
+        for what in ("scene_id", "location", "dataset"):
+            name = getattr(self, what)
+            if not isinstance(name, str) or not name.isprintable() or len(name) > MAX_NAME:
+                raise InputError(
+                    f"its {what} {ascii(name)[:60]} is no line of {MAX_NAME} printable characters; rename it"
+                )
+        if not self.scene_id:
+            raise InputError("it has no id; give it one")
+        return self
+
     def validate_log(self) -> "Recording":
         """Returns self; raises InputError naming the scene where tracks, ego or lanes cannot make a scene."""
         if problem := self._log_problem():
@@ -126,10 +139,10 @@ class Recording:
             kind = AGENT_TYPES[self.agent_type[self.ego]]
             return f"the ego is a {kind}, expected a vehicle; name another track, or leave the scene out"
         for name, lane in self.lanes.items():
-            if lane.points.ndim != 2 or lane.points.shape[1] != 2 or not np.isfinite(lane.points).all():
+            if not _are_points(lane.points) or lane.points.shape[1] != 2:
                 return f"the centreline of lane {name} is not a list of finite points; repair the map or drop the lane"
-        if not all(np.isfinite(ring).all() for ring in self.drivable):
-            return "a drivable polygon holds NaN or infinite points; repair the map"
+        if not all(_are_points(ring) for ring in self.drivable):
+            return "a drivable polygon is not a list of finite points; repair the map"
         bad = self.valid & ~np.isfinite(self.states).all(-1)
         if bad.any():
             frame, agent = np.argwhere(bad)[0]
@@ -138,3 +151,8 @@ class Recording:
         if not (np.isfinite(size).all() and (size > 0).all()):
             return "an agent's length or width is not positive; repair the log"
         return None
+
+
+def _are_points(points: np.ndarray) -> bool:
+    """Whether an array is of finite points [P, 2 or more]."""
+    return points.ndim == 2 and points.shape[1] >= 2 and points.dtype.kind in "fiu" and bool(np.isfinite(points).all())

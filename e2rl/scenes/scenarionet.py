@@ -3,6 +3,7 @@ Argoverse 2 and Lyft. They are read without ever executing what a file names.
 """
 
 import csv
+import io
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -13,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from e2rl.run.errors import InputError
-from e2rl.scenes.log_files import LogFiles
+from e2rl.run.files import read_regular
+from e2rl.scenes.log_files import MAX_BYTES, LogFiles
 from e2rl.scenes.plain_pickle import load_plain
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import AGENT_TYPES, DT, LIGHT_UNKNOWN, LIGHTS, Lane, Recording
@@ -22,7 +24,6 @@ from e2rl.scenes.smoothing import resample_uniform
 TYPES = {name.upper(): index for index, name in enumerate(AGENT_TYPES)}
 OBSTACLES = ("UNSET", "TRAFFIC_CONE", "TRAFFIC_BARRIER", "TRAFFIC_OBJECT", "TRAFFIC_LIGHT", "BUILDING", "GROUND")
 TYPES |= dict.fromkeys(OBSTACLES, TYPES["OTHER"])  # MetaDrive's further names of tracks
-MAX_NAME = 128  # characters of a scene's id
 
 
 @dataclass
@@ -50,8 +51,8 @@ class ScenarioNetSource(LogFiles):
         if not index.is_file():
             return {}
         try:
-            with index.open(newline="") as stream:
-                rows = [row for row in csv.DictReader(stream) if row.get("file") and row.get("location_group")]
+            lines = io.StringIO(read_regular(index, MAX_BYTES).decode(), newline="")
+            rows = [row for row in csv.DictReader(lines) if row.get("file") and row.get("location_group")]
         except (OSError, ValueError, csv.Error) as error:
             raise InputError(f"{index}: cannot be read: {error}; write it again, or remove it") from error
         return {Path(row["file"]).stem: row["location_group"] for row in rows}
@@ -80,9 +81,7 @@ def recording_of(data: dict, location: str = "") -> Recording:
         twice = next(key for key, count in Counter(keys).items() if count > 1)
         raise InputError(f"two of its tracks have the id {twice!r}; give each its own")
     states, valid, size = _tracks(tracks)
-    frames, scene_id = len(states), str(data.get("id") or metadata.get("scenario_id"))[: MAX_NAME + 1]
-    if len(scene_id) > MAX_NAME:
-        raise InputError(f"its id has more than {MAX_NAME} characters; shorten it, files are named by it")
+    frames, scene_id = len(states), _text(data.get("id") or metadata.get("scenario_id"))
     ts = np.asarray(metadata.get("ts", np.arange(frames) * DT), float)
     if len(ts) != frames:
         raise InputError(f"{len(ts)} time stamps for {frames} frames; repair metadata.ts")
@@ -94,8 +93,8 @@ def recording_of(data: dict, location: str = "") -> Recording:
     lanes, drivable = _map(data["map_features"])
     return Recording(
         scene_id=scene_id,
-        location=location or str(metadata.get("e2rl", {}).get("location", "")),
-        dataset=str(metadata.get("dataset", "scenarionet")),
+        location=location or _text(metadata.get("e2rl", {}).get("location", "")),
+        dataset=_text(metadata.get("dataset", "scenarionet")),
         states=states,
         valid=valid,
         size=size,
@@ -106,6 +105,11 @@ def recording_of(data: dict, location: str = "") -> Recording:
         lights=_lights(data.get("dynamic_map_states", {}), lanes, seconds, len(states)),
         current=None if current is None else int(round(seconds[int(current)] / DT)),
     )
+
+
+def _text(value: object) -> str:
+    """A name; "" for what is none."""
+    return str(value) if isinstance(value, str | int | float) else ""
 
 
 def _type(key: object, name: object) -> int:

@@ -86,7 +86,7 @@ class SceneSet:
 
     scenes [S]: in memory, or mapped from the cache, in which case only what is used of them is read; dropped: counts
     recordings left out, by reason; number: of each scene's noise, by default its position; files: SHA-256 of the data's
-    files, "" where unknown; digests: `content_hash` of each scene, where it is known.
+    files, "" where unknown.
     """
 
     scenes: TensorDict
@@ -97,7 +97,6 @@ class SceneSet:
     dropped: dict[str, int]
     number: list[int] = field(default_factory=list)
     files: str = ""
-    digests: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.number = self.number or list(range(len(self.scene_id)))
@@ -115,9 +114,9 @@ class SceneSet:
         return self.scenes["logged"].shape[1] - 1
 
     def hashes(self) -> list[str]:
-        """Returns the `content_hash` of each scene."""
-        found = ({key: scene[key].cpu().numpy() for key in KEYS} for scene in self.scenes)
-        return self.digests or [content_hash(scene) for scene in found]
+        """Returns the `content_hash` of each scene, of what is used: what a file says of itself may be forged."""
+        columns = {key: value.cpu().numpy() for key, value in self.scenes.items() if key != "scene_index"}
+        return [content_hash({key: value[row] for key, value in columns.items()}) for row in range(len(self))]
 
     def batch(self, indices: Sequence[int] | Tensor) -> TensorDict:
         """Returns the scenes [B] at `indices`, as a copy."""
@@ -160,10 +159,8 @@ class SceneSet:
             return self
         scenes = self.scenes[:count] if list(indices) == list(range(count)) else self.batch(indices)
         scenes["scene_index"] = torch.arange(count, device=scenes["scene_index"].device)
-        columns = {name: getattr(self, name) for name in ("scene_id", "location", "number", "digests")}
-        chosen: dict[str, Any] = {
-            name: [column[index] for index in indices] for name, column in columns.items() if column
-        }
+        columns = {name: getattr(self, name) for name in ("scene_id", "location", "number")}
+        chosen: dict[str, Any] = {name: [column[index] for index in indices] for name, column in columns.items()}
         return replace(self, scenes=scenes, **chosen)
 
     def to(self, device: torch.device | str) -> "SceneSet":

@@ -23,9 +23,9 @@ from tqdm import tqdm
 
 from e2rl.run.errors import InputError
 from e2rl.run.files import locked, write_atomically
-from e2rl.scenes.scene import RAGGED, SceneSet, content_hash
+from e2rl.scenes.scene import RAGGED, SceneSet
 
-FORMAT = b"e2rl-scenes-cache/2"
+FORMAT = b"e2rl-scenes-cache/3"
 END = struct.Struct(f"<Q{len(FORMAT)}s32s")
 ALIGN = 64  # bytes of which the place of every array is a multiple
 NAME = re.compile(r"scenes-[0-9a-f]{64}\.map")  # of a file of the cache
@@ -37,7 +37,6 @@ class Index:
 
     scene_id: list[str] = field(default_factory=list)
     location: list[str] = field(default_factory=list)
-    digests: list[str] = field(default_factory=list)
     layout: dict[str, tuple[str, tuple[int, ...]]] = field(default_factory=dict)
     dataset: str = ""
     split: str = ""
@@ -52,7 +51,6 @@ class Index:
             self.layout[key] = kind, tuple(map(max, largest, value.shape))
         self.scene_id.append(scene_id)
         self.location.append(location)
-        self.digests.append(content_hash(scene))
 
     def places(self) -> tuple[dict[str, slice], int]:
         """Returns the bytes of a file that each key's array has, and how many all have, at least one."""
@@ -139,7 +137,7 @@ def read(path: Path) -> SceneSet | None:
     count = len(index.scene_id)
     rows = TensorDict(scenes | {"scene_index": torch.arange(count)}, [count])
     about = index.scene_id, index.location, index.dataset, index.split, dict(index.dropped)
-    return SceneSet(rows, *about, digests=index.digests)
+    return SceneSet(rows, *about)
 
 
 def write(path: Path, build: Build) -> None:

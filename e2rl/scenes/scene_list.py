@@ -25,6 +25,7 @@ from typing import NamedTuple
 from tqdm import tqdm
 
 from e2rl.run.errors import InputError
+from e2rl.run.files import read_regular
 from e2rl.scenes.scene import SceneSet
 
 SCENES = "scenes.csv"  # of a run's folder
@@ -61,11 +62,11 @@ def read_list(path: str | Path) -> list[Listed]:
     """The lines of a list, or of the list in a run's folder; raises InputError where it is none."""
     file = Path(path) / SCENES if Path(path).is_dir() else Path(path)
     try:
-        with file.open(newline="", encoding="utf-8-sig") as content:
-            rows = csv.DictReader(content, strict=True)
-            if "scene_id" not in (rows.fieldnames or ()):
-                raise InputError(f"scenes={file}: no column scene_id; give the {SCENES} of a run, or a table with one")
-            found = dict.fromkeys(_line(file, rows.line_num, row) for row in rows)
+        content = io.StringIO(read_regular(file).decode("utf-8-sig"), newline="")
+        rows = csv.DictReader(content, strict=True)
+        if "scene_id" not in (rows.fieldnames or ()):
+            raise InputError(f"scenes={file}: no column scene_id; give the {SCENES} of a run, or a table with one")
+        found = dict.fromkeys(_line(file, rows.line_num, row) for row in rows)
     except (OSError, ValueError, csv.Error) as error:
         if isinstance(error, InputError):
             raise

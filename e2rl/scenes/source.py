@@ -145,6 +145,7 @@ class Source(Extension, ABC):
         """Yields the recordings that one log makes, those of the same tracks and map together."""
         with self.named(log):
             for recording in self.read(log):
+                recording.validate_names()
                 if self.mirror:  # both are of one place, or else of one log
                     recording = replace(recording, location=recording.location or recording.scene_id)
                 for each in (recording, recording.mirrored()) if self.mirror else (recording,):

@@ -31,6 +31,17 @@ def constant_velocity(states: Tensor, times: Tensor) -> Tensor:
     return torch.cat([xy, states[..., None, 2:].expand(*xy.shape[:-1], 2)], -1)
 
 
+def closest_approach_cost(offset: Tensor, closing: Tensor) -> Tensor:
+    """exp(-t^2 / 2 - d^2 / 2) [...] of the closest approach, in t s and d m apart, at constant velocities.
+
+    offset, closing [..., 2]: relative position [m] and velocity [m/s]. 1 on contact at the centres; a pair at the same
+    velocity keeps its distance, hence costs nearly nothing.
+    """
+    time = (-(offset * closing).sum(-1) / (closing.square().sum(-1) + 1e-6)).clamp(min=0)
+    miss = offset + closing * time[..., None]
+    return (-(time.square() + miss.square().sum(-1)) / 2).exp()
+
+
 def yaw_rate_bound(speed: Tensor) -> Tensor:
     """Largest |yaw rate| [rad/s] at speed [m/s]: MAX_CURVATURE * v at low speeds, MAX_LATERAL / v at high speeds."""
     return torch.minimum(MAX_CURVATURE * speed, MAX_LATERAL / speed.clamp(min=1e-3))

@@ -1,6 +1,8 @@
 """The file of a rollout: an npz of format e2rl-rollout/1, readable without pickle (docs/method.md, section 11)."""
 
+import hashlib
 import io
+import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import Field, dataclass, field, fields
@@ -10,13 +12,17 @@ from typing import Any
 import numpy as np
 
 from e2rl.run.errors import InputError
-from e2rl.run.files import read_arrays, write_atomically
+from e2rl.run.files import open_regular, read_arrays, write_atomically
 from e2rl.scenes.recording import AGENT_TYPES, DT
 
 FORMAT = "e2rl-rollout/1"
 ROLLOUTS = "rollouts"  # folder of a run with a file per rollout
+MAX_BYTES = 1 << 27  # of a file, unpacked
 MOST = 1e6  # intensity
 FARTHEST, FASTEST, LONGEST, TURNED = 1e5, 150.0, 100.0, 1e3  # m, m/s, m and rad of an agent
+PLAIN = re.compile(r"[a-z0-9.@+-]+(_[a-z0-9.@+-]+)*")  # part of a file name that stands for itself
+STEM, DIGITS = 200, 10  # characters of a file name without its ending, and of the hash after it
+UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")  # also what turns text round
 
 
 def array(kinds: str, shape: str, low: float | None = None, high: float | None = None, **options: Any) -> Any:
@@ -90,12 +96,14 @@ class Rollout(Road):
         return rollout_name(vars(self))
 
     @classmethod
-    def read(cls, path: Path) -> "Rollout":
-        """The rollout of a file. Raises InputError, naming the file, where it is none."""
+    def read(cls, path: Path, within: Path | None = None) -> "Rollout":
+        """The rollout of a file, which lies in the folder `within` once links are followed. Raises InputError, naming
+        the file, where it is none."""
         path = Path(path)
         try:
-            data = read_arrays(path)
-        except ValueError as error:
+            with open_regular(path, MAX_BYTES, within) as file:
+                data = read_arrays(file, MAX_BYTES)
+        except (OSError, ValueError) as error:
             raise InputError(f"{path}: no readable rollout ({error}); run evaluate.py again to rewrite it") from error
         known = fields(cls)
         missing = [each.name for each in known if each.default is not None and each.name not in data]
@@ -128,8 +136,13 @@ class Failure:
 
     @classmethod
     def read(cls, run: Path, row: Mapping[str, Any]) -> "Failure":
-        """The failure of a row of a run's table, with the rollout from its file."""
-        return cls(Rollout.read(Path(run) / ROLLOUTS / rollout_name(row)), row)
+        """The failure of a row of a run's table, with the rollout from its file; InputError where they do not fit."""
+        path = Path(run) / ROLLOUTS / rollout_name(row)
+        rollout = Rollout.read(path, run)
+        (steps, agents), step, partner = rollout.valid.shape, row["contact_step"], row["partner"]
+        if rollout.name != path.name or (step == step and not (step in range(steps) and partner in range(agents))):
+            raise InputError(f"{path}: does not fit to its row of the table; run evaluate.py again to rewrite both")
+        return cls(rollout, row)
 
     @property
     def contact(self) -> int | None:
@@ -144,9 +157,23 @@ class Failure:
 
 
 def rollout_name(row: Mapping[str, Any]) -> str:
-    """<method>__<ego>__<eta>__<scene_id>__<seed>.npz of a row or rollout; '-' for what no file name may hold."""
-    parts = (row["method"], row["ego_policy"], f"{float(row['eta']):g}", row["scene_id"], row["seed"])
-    return "__".join(re.sub(r"[^A-Za-z0-9._+-]", "-", str(part)) for part in parts) + ".npz"
+    """<method>__<ego>__<eta>__<scene_id>__<seed>.npz of a row or rollout, as `file_stem` writes it."""
+    eta = float(row["eta"])
+    short = f"{eta:g}" if float(f"{eta:g}") == eta else eta
+    return file_stem(row["method"], row["ego_policy"], short, row["scene_id"], row["seed"]) + ".npz"
+
+
+def file_stem(*parts: object) -> str:
+    """The parts, joined by '__', as a file name without its ending; other parts have another name.
+
+    Others than letters, digits and . _ @ + - become '-', and long names are cut. Then, and where a part has capitals,
+    which some file systems do not tell apart, a hash of the parts follows after '~'.
+    """
+    texts = [str(part) for part in parts]
+    stem = "__".join(re.sub(r"[^A-Za-z0-9._@+-]", "-", text) for text in texts)
+    if len(stem) <= STEM and all(map(PLAIN.fullmatch, texts)):
+        return stem
+    return f"{stem[:STEM]}~{hashlib.sha256(json.dumps(texts).encode()).hexdigest()[:DIGITS]}"
 
 
 def _misfit(data: Mapping[str, np.ndarray], known: Iterable[Field]) -> str | None:
@@ -158,6 +185,8 @@ def _misfit(data: Mapping[str, np.ndarray], known: Iterable[Field]) -> str | Non
         value, (kinds, shape, low, high) = data[each.name], each.metadata.values()
         if not shape and (value.shape != () or value.dtype.kind not in kinds):
             return f"{each.name} is no single {'text' if kinds == 'U' else 'number'}"
+        if not shape and kinds == "U" and UNPRINTABLE.search(value.item()):
+            return f"{each.name} holds control characters"
         wrong = value.ndim != len(shape) or value.dtype.kind not in kinds
         if wrong or any(
             sizes.setdefault(letter, int(letter) if letter.isdigit() else size) != size

@@ -50,6 +50,21 @@ class World:
         plan = tensordict.get(("traffic", "plan"), None)
         return cls(scene, tensordict["timestep"][:, 0], states, valid, accel, turn_rate, plan=plan)
 
+    def shown(self, scene: TensorDictBase | None = None) -> "World":
+        """A copy for code from outside the package: what it changes there moves nobody, and it tells nothing of what
+        comes. Lights stay as they are now, whoever is not there has no size and type, and nobody's plan is known.
+
+        scene: `without_future` of this World's scene, where it is made already.
+        """
+        scene = (without_future(self.scene) if scene is None else scene).copy()
+        lights, there = self.scene["light_state"], self.valid
+        last = torch.arange(lights.shape[1], device=there.device).minimum(self.step[:, None])
+        scene["light_state"] = lights.gather(1, last[..., None].expand_as(lights))
+        scene["size"] = torch.where(there[..., None], self.scene["size"], 1.0)
+        scene["agent_type"] = self.scene["agent_type"] * there
+        now = (getattr(self, key).clone() for key in ("step", *AGENT_KEYS))
+        return World(scene, *now)
+
     def ego_action(self) -> Tensor:
         """The egos' last executed acceleration and yaw rate [B, 2]."""
         return torch.stack([self.accel[:, 0], self.turn_rate[:, 0]], -1)
@@ -57,6 +72,16 @@ class World:
     def others(self) -> "Agents":
         """All agents but the ego."""
         return Agents(*(getattr(self, key)[:, 1:] for key in AGENT_KEYS))
+
+
+def without_future(scene: TensorDictBase) -> TensorDictBase:
+    """A copy of scenes [B] that tells nothing of what was recorded after their start frames, but the egos' missions and
+    the lights."""
+    scene = scene.clone()
+    for key in ("logged", "logged_valid"):
+        scene[key][:, 1:] = 0
+    scene["route_log"][:, 1:] = -1
+    return scene
 
 
 class Agents(NamedTuple):

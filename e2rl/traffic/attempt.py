@@ -35,7 +35,7 @@ def attempt(
         rollouts = roll_out(tasks)
     except OF_THE_RUN:
         raise
-    except Exception as error:  # a planner is outside code and raises anything
+    except (Exception, SystemExit) as error:  # outside code raises anything
         if isinstance(error, OSError) and error.errno in EXHAUSTED:
             raise
         named = error.rows if isinstance(error, PlannerError) else {}

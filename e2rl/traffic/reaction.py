@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from e2rl.planners.ego import Ego
+from e2rl.planners.ego import Ego, ask, from_outside
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import constant_velocity
@@ -27,12 +27,13 @@ class Lookahead:
         row 0; agents without a plan keep their velocity."""
         whole = len(rows) == len(self.world.step) and bool((rows.diff() > 0).all())
         world = self.world if whole else replace(take_rows(self.world, rows), plan=None)
+        world = world.shown() if from_outside(self.ego) else world  # of now: it is asked about steps to come
         states, vehicles, pieces = world.states, planned.shape[1], []
         ends = torch.arange(self.period, HORIZON + self.period, self.period, device=states.device)
         moved = constant_velocity(states[:, vehicles:], DT * ends)
         now = world
         for number, after in enumerate(ends.tolist()):
-            pieces.append(self.ego.plan(now)[:, : self.period])
+            pieces.append(ask(self.ego, "plan", now, scene=world.scene)[:, : self.period])
             ego, others = pieces[-1][:, -1:], planned[:, 1:, min(after, HORIZON) - 1]
             now = replace(now, step=world.step + after, states=torch.cat([ego, others, moved[:, :, number]], 1))
         return torch.cat(pieces, 1)[:, :HORIZON]

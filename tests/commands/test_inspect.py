@@ -59,22 +59,20 @@ def test_the_chosen_scene_is_drawn_with_the_ego_in_the_middle(folder, tmp_path, 
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [(("--scene", "nobody"), "--scene=nobody: name a scene of"), (("--data", "nothing"), "data=nothing: none of")],
+    ("path", "arguments", "messages"),
+    [
+        (".", ("--scene", "nobody"), ["--scene=nobody: name a scene of"]),
+        (".", ("--data", "nothing"), ["data=nothing: none of"]),
+        ("none", (), [".pkl", ".xml", "scenario_*.parquet"]),  # what each of the sources reads
+    ],
 )
-def test_what_is_not_there_ends_with_one_line_and_writes_nothing(folder, tmp_path, capsys, arguments, message):
+def test_what_is_not_there_ends_with_one_line_and_writes_nothing(folder, tmp_path, capsys, path, arguments, messages):
+    (folder / "none").mkdir(exist_ok=True)
     with pytest.raises(SystemExit) as ended:
-        run(folder, *arguments, "--out", tmp_path / "x.png", capsys=capsys)
+        run(folder / path, *arguments, "--out", tmp_path / "x.png", capsys=capsys)
     error = capsys.readouterr().err.splitlines()[-1]
-    assert ended.value.code == 2 and error.startswith("error: ") and message in error
+    assert ended.value.code == 2 and error.startswith("error: ") and all(message in error for message in messages)
     assert not (tmp_path / "x.png").exists()
-
-
-def test_a_path_that_no_source_reads_names_what_each_of_them_reads(tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        run(tmp_path, capsys=capsys)
-    error = capsys.readouterr().err
-    assert ".pkl" in error and ".xml" in error and "scenario_*.parquet" in error
 
 
 def test_two_data_sets_are_apart_where_they_share_no_place(tmp_path, capsys):

@@ -35,7 +35,7 @@ def test_an_adversary_is_tuned_and_the_study_goes_on(tune):
     assert tried == pytest.approx([load_choice("synthesizer", "e2").interception.lateral, 0.5, 4.0])
     assert {"cfr", "aor_step", "aor_step nominal", "real_adv"} <= set(result["trials"][0]["metrics"])
     assert "interception:\n  lateral: " in (run / "tuned.yaml").read_text()
-    assert len((run / "tuning_curve.csv").read_text().splitlines()) == 4 and (run / "tuning_curve.png").exists()
+    assert len((run / "curves.csv").read_text().splitlines()) == 5 and (run / "curves.png").exists()
     assert "differs in objective; name another file" in tune(*e2, "tuning.attack.off_road=0.1", wrong=True)
 
 
@@ -56,4 +56,4 @@ def test_a_planner_is_tuned_in_the_traffic_of_all_methods(tune):
     result = json.loads((run / "tuning.json").read_text())
     assert len(result["trials"]) == 2 and set(result["best"]) <= set(load_choice("ego", "sampling"))
     assert {"collision nominal@0", "collision e2@2"} <= set(result["trials"][0]["metrics"])
-    assert "margin: " in (run / "tuned.yaml").read_text() and not (run / "tuning_curve.csv").exists()
+    assert "margin: " in (run / "tuned.yaml").read_text() and not (run / "curves.csv").exists()

@@ -1,13 +1,12 @@
 """modes.json: fractions, verdicts and typical rollouts of a run's modes, their table, and replays of them."""
 
-import json
 import math
 
 import pytest
 
 from e2rl.evaluation.modes import MODES_FILE, find_modes, read_modes, write_modes
-from e2rl.report.mode_table import mode_tables
-from e2rl.run.errors import InputError
+from e2rl.report.tables import mode_tables
+from e2rl.sim.rollout_file import rollout_name
 from tests.metrics.test_failure_modes import CROSSING, REAR_END, failure
 
 
@@ -23,9 +22,11 @@ def run_rows():
     return rows + crashes(CROSSING, 5, "nominal", 0.0, cfr=0.0, approach="")
 
 
-def test_modes_have_counts_fractions_by_method_and_verdicts():
+def test_modes_have_counts_fractions_by_method_and_verdicts(tmp_path):
     rows = run_rows()
     found = find_modes(rows)
+    write_modes(tmp_path / MODES_FILE, found)
+    assert read_modes(tmp_path / MODES_FILE) == found
     crossing, rear_end = found["modes"]
     assert (found["failures"], found["rollouts"], found["unknown"]) == (12, 17, ["duty"])
     assert crossing["name"] == "crossing from the right, partner turns left, ego keeps speed"
@@ -40,15 +41,7 @@ def test_modes_have_counts_fractions_by_method_and_verdicts():
         typical = mode["typical"]
         same = [row for row in rows if all(row[name] == typical[name] for name in ("method", "scene_id", "seed"))]
         assert [row["mode"] for row in same] == [mode["mode"]]
-        assert typical["file"].startswith(f"{typical['method']}__idm__2__") and typical["file"].endswith("__0.npz")
-
-
-def test_what_is_written_is_what_is_read_and_strict(tmp_path):
-    found = find_modes(run_rows())
-    write_modes(tmp_path / MODES_FILE, found)
-    assert read_modes(tmp_path / MODES_FILE) == json.loads(json.dumps(found))
-    with pytest.raises(InputError, match="modes"):
-        read_modes(tmp_path / "absent.json")
+        assert typical["file"] == rollout_name(same[0])
 
 
 def test_the_table_has_a_row_for_each_mode_and_says_what_is_missing():
@@ -59,9 +52,7 @@ def test_the_table_has_a_row_for_each_mode_and_says_what_is_missing():
     assert first[0].startswith("1. crossing") and first[1:6] == ["8", "100", "33", "–", "75"]
     assert second[1:] == ["4", "0", "67", "–", "100", "0", "100", "10.0", "5.0"]
     assert last[1:5] == ["12", "6 in 1 mode", "6 in 2 modes", "0 in 0 modes"]
-    assert table.caption.startswith("Failure modes of idm:") and "without duty" in table.caption
-    assert "avoidable" in table.caption and len({len(row) for row in (table.head, *table.rows)}) == 1
-    assert table.text() and table.markdown()
+    assert "without duty" in table.caption and "avoidable" in table.caption
 
 
 def test_small_modes_are_gathered_but_keep_their_numbers():

@@ -1,6 +1,5 @@
 """The protocol: paired noise, rows and files of every rollout, and agreement with the independent scorer."""
 
-import numpy as np
 import pytest
 import torch
 
@@ -55,17 +54,6 @@ def test_methods_share_the_noise_of_a_scene_and_seed():
         if not name.startswith("seconds"):
             means = torch.tensor([one[name]["mean"], two[name]["mean"]])
             torch.testing.assert_close(means[0], means[1], equal_nan=True, msg=name)
-
-
-def test_scenes_alone_have_the_noise_that_they_have_among_all(tmp_path):
-    setup, methods = setup_of(scenes(3, steps=20)), [Method("e2", synthesizer(), 3.0)]
-    for name, only in (("all", None), ("one", [2])):
-        run_protocol(setup, methods, SEEDS, tmp_path / name, only=only)
-    alone = sorted((tmp_path / "one" / ROLLOUTS).iterdir())
-    assert len(alone) == len(SEEDS)
-    for path in alone:
-        one, other = np.load(path), np.load(tmp_path / "all" / ROLLOUTS / path.name)
-        np.testing.assert_allclose(one["states"], other["states"], atol=5e-3)
 
 
 def test_processes_change_nothing_but_the_time(tmp_path):

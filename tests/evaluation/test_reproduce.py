@@ -2,6 +2,7 @@
 
 import json
 import math
+import shlex
 import shutil
 import zipfile
 from types import SimpleNamespace
@@ -11,9 +12,8 @@ from omegaconf import OmegaConf
 
 from e2rl.evaluation.protocol import Setup
 from e2rl.evaluation.reproduce import compare_tables
-from e2rl.evaluation.rollout_files import read_metrics, read_rows
-from e2rl.run.errors import InputError
 from e2rl.scenes.scene_list import read_list
+from tests.evaluation.test_protocol import same_runs
 from tests.scripts import arguments, call, error_line, left_behind
 
 QUICK = ["seeds=[0]", "processes=1", "methods=[constant_velocity,nominal]", "prior.sampler.steps=2"]
@@ -58,12 +58,6 @@ def test_rounding_is_told_apart(factor, close):
     assert (found.close, len(found.different)) == (close, 1 - close)
 
 
-@pytest.mark.parametrize("rows", [[{}], [{"metrics": 1}], ["x"], [None]])
-def test_what_is_no_table_is_named(rows):
-    with pytest.raises(InputError, match=r"metrics\.json: damaged"):
-        compare_tables(rows, rows)
-
-
 # --- through evaluate.py
 
 
@@ -97,9 +91,7 @@ def test_one_command_makes_the_same_table_in_a_new_folder(then, tmp_path, monkey
     assert status == 0, said
     found = json.loads((tmp_path / "now" / "reproduced.json").read_text())
     assert found["different"] == [] and found["close"] == 0 and found["equal"] > 50, found
-    rows = [read_rows(run / "rollouts.csv") for run in (then, tmp_path / "now")]
-    for row, other in zip(*rows, strict=True):
-        assert str({**row, "seconds": 0, "evasion_seconds": 0}) == str({**other, "seconds": 0, "evasion_seconds": 0})
+    same_runs(then, tmp_path / "now")
     assert read_list(tmp_path / "now") == read_list(then)
     assert before == {path: path.read_bytes() for path in then.rglob("*") if path.is_file()}
 
@@ -114,6 +106,9 @@ def test_data_and_weights_may_lie_elsewhere(world, sent, tmp_path, monkeypatch, 
     with zipfile.ZipFile(tmp_path / "data.zip", "w") as archive:
         for path in sorted((world / "good").iterdir()):
             archive.write(path, path.name)
+    other = again(sent, tmp_path / "a", f"prior.checkpoint={sent / 'provenance.json'}")
+    status, said = call("evaluate.py", other, monkeypatch, capsys)
+    assert status == 2 and "prior.checkpoint is another file than the run's prior.checkpoint=" in error_line(said)
     status, said = call("evaluate.py", again(sent, tmp_path / "a"), monkeypatch, capsys)
     assert status == 2 and "not there; say where the file lies that the run used, by prior.checkpoint=FILE" in said
     here = ["data=scenarionet", f"data.path={tmp_path / 'data.zip'}", f"prior.checkpoint={weights}"]
@@ -123,11 +118,7 @@ def test_data_and_weights_may_lie_elsewhere(world, sent, tmp_path, monkeypatch, 
 
 
 @pytest.mark.slow
-def test_other_weights_and_scenes_are_refused_by_name(world, then, tmp_path, monkeypatch, capsys):
-    (tmp_path / "weights.safetensors").write_bytes(b"other")
-    given = again(then, tmp_path / "now", f"prior.checkpoint={tmp_path / 'weights.safetensors'}")
-    status, said = call("evaluate.py", given, monkeypatch, capsys)
-    assert status == 2 and "prior.checkpoint is another file than the run's prior.checkpoint=" in error_line(said)
+def test_other_scenes_are_refused_by_name(world, then, tmp_path, monkeypatch, capsys):
     shutil.copytree(world / "good", tmp_path / "good")
     (tmp_path / "good" / "sd_00.pkl").write_bytes((world / "good" / "sd_01.pkl").read_bytes())
     given = again(then, tmp_path / "now", "data=scenarionet", f"data.path={tmp_path / 'good'}")
@@ -136,62 +127,25 @@ def test_other_weights_and_scenes_are_refused_by_name(world, then, tmp_path, mon
     assert not left_behind(tmp_path / "now")
 
 
-@pytest.mark.slow
-def test_other_versions_are_told_and_what_differs_is_named(sent, tmp_path, monkeypatch, capsys):
-    known = json.loads((sent / "provenance.json").read_text())
-    known["versions"][-1] |= {"torch": "1.0.0", "e2rl": "0" * 64}
-    known["inputs"]["synthesizer=nominal"] = {"name": "another"}
-    (sent / "provenance.json").write_text(json.dumps(known))
-    rows = json.loads((sent / "metrics.json").read_text())
-    rows[0]["metrics"]["progress"]["mean"] += 1
-    (sent / "metrics.json").write_text(json.dumps(rows))
-    status, said = call("evaluate.py", again(sent, tmp_path / "now"), monkeypatch, capsys)
-    assert status == 0 and "versions differ: " in said
-    for part in ("torch 1.0.0 then, ", "e2rl 000000000000 then, ", "conf/synthesizer/nominal.yaml"):
-        assert part in said
-    different = json.loads((tmp_path / "now" / "reproduced.json").read_text())["different"]
-    assert len(different) == 1 and different[0][0].endswith("progress.mean")
-
-
-@pytest.mark.parametrize("more", ["seeds=[1]", "ego=idm"])
-def test_what_would_be_another_table_is_refused(then, tmp_path, monkeypatch, capsys, more):
-    status, said = call("evaluate.py", again(then, tmp_path / "now", more), monkeypatch, capsys)
-    assert status == 2 and f"leave out {more.partition('=')[0]} (only" in error_line(said)
-    assert not left_behind(tmp_path / "now")
+def test_what_would_be_another_table_is_refused(then, tmp_path, monkeypatch, capsys):
+    status, said = call("evaluate.py", again(then, tmp_path / "now", "seeds=[1]"), monkeypatch, capsys)
+    assert status == 2 and "leave out seeds (only" in error_line(said) and not left_behind(tmp_path / "now")
 
 
 def test_a_stranger_s_run_runs_nothing(sent, tmp_path, monkeypatch, capsys):
     file = sent / ".hydra" / "config.yaml"
     config = OmegaConf.load(file)
-    for changes in (
-        {"ego": {"_target_": "os.system", "command": f"touch {tmp_path / 'ran'}"}},
-        {"ego": {"_target_": "e2rl.planners.external.ExternalEgo", "command": f"touch {tmp_path / 'ran'}"}},
-        {"plugins": ["this"]},
-    ):
-        OmegaConf.save(OmegaConf.merge(config, changes), file)
-        for option in ("reproduce", "resume"):
-            given = [f"{option}={sent}", f"hydra.run.dir={tmp_path / 'now'}"]
-            status, said = call("evaluate.py", given, monkeypatch, capsys)
-            assert status == 2 and "runs code that is no extension of e2rl" in error_line(said)
+    for target in ("os.system", "e2rl.planners.external.ExternalEgo"):
+        ego = {"_target_": target, "command": f"touch {tmp_path / 'ran'}"}
+        OmegaConf.save(OmegaConf.merge(config, {"ego": ego}), file)
+        status, said = call("evaluate.py", again(sent, tmp_path / "now"), monkeypatch, capsys)
+        assert status == 2 and "runs code that is no extension of e2rl" in error_line(said)
     assert not (tmp_path / "ran").exists()
-
-
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [("metrics.json", None), ("metrics.json", "[1]"), ("scenes.csv", None), ("provenance.json", "[1]")],
-)
-def test_a_folder_that_is_no_run_with_a_table_is_named(sent, tmp_path, monkeypatch, capsys, name, content):
-    (sent / name).unlink() if content is None else (sent / name).write_text(content)
-    status, said = call("evaluate.py", again(sent, tmp_path / "now"), monkeypatch, capsys)
-    assert status == 2 and name in error_line(said)
-
-
-SMALL_RUN = ["seeds=[0]", "batch=1", "processes=1", "methods=[constant_velocity,replay]", "data.build.steps=20"]
 
 
 @pytest.mark.slow
 def test_an_interrupted_evaluation_goes_on_by_the_command_that_it_names(world, tmp_path, monkeypatch, capsys):
-    """In its own folder, with its own configuration and ego; what changes its meaning is refused."""
+    """In its own folder, with its own configuration; what changes its meaning is refused."""
     score, left = Setup.score, [3]
 
     def stopped(*given):
@@ -200,23 +154,17 @@ def test_an_interrupted_evaluation_goes_on_by_the_command_that_it_names(world, t
             raise KeyboardInterrupt
         return score(*given)
 
-    given = [*arguments(world, tmp_path, "good", *SMALL_RUN), "ego=idm"]
+    small = ["seeds=[0]", "batch=1", "processes=1", "methods=[constant_velocity,replay]", "data.build.steps=20"]
+    given = [*arguments(world, tmp_path, "good", *small), "ego=idm"]
     status, said = call("evaluate.py", [*given, f"hydra.run.dir={tmp_path / 'whole'}"], monkeypatch, capsys)
     assert status == 0, said
     monkeypatch.setattr(Setup, "score", stopped)
     run = tmp_path / "run"
     status, said = call("evaluate.py", given, monkeypatch, capsys)
-    assert status == 130 and said.strip().endswith(f"evaluate.py resume={run}") and "interrupted (SIGINT)" in said
-    command = json.loads((run / "provenance.json").read_text())["command"]
-    left[0] = 1
-    other = [f"resume={run}", f"hydra.run.dir={tmp_path / 'other'}"]
-    status, said = call("evaluate.py", [*other, "seeds=[1]"], monkeypatch, capsys)
+    assert status == 130 and f"evaluate.py resume={run}" in said and "interrupted (SIGINT)" in said
+    left[0], named = 1, shlex.split(said.rpartition("evaluate.py ")[2])
+    status, said = call("evaluate.py", [*named, "seeds=[1]"], monkeypatch, capsys)
     assert status == 2 and "leave out seeds (only processes, launcher, shard can change)" in error_line(said)
-    status, said = call("evaluate.py", [*other, "processes=1"], monkeypatch, capsys)
+    status, said = call("evaluate.py", named, monkeypatch, capsys)
     assert status == 0 and left == [0], said
-    rows = [read_rows(folder / "rollouts.csv") for folder in (tmp_path / "whole", run)]
-    for row, again_ in zip(*rows, strict=True):
-        timed = dict.fromkeys(("seconds", "evasion_seconds"))
-        assert row["ego_policy"] == "idm" and str({**row, **timed}) == str({**again_, **timed})
-    assert {row["command"] for row in read_metrics(run / "metrics.json")} == {command}
-    assert left_behind(tmp_path / "other") == []
+    same_runs(tmp_path / "whole", run)

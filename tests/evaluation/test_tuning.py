@@ -1,7 +1,10 @@
 """Tuning on a budget of trials: studies that go on, ranges, ladders, what is written; on a problem of known answer."""
 
+import copy
 import json
 import math
+import os
+import sqlite3
 
 import pytest
 from omegaconf import OmegaConf
@@ -40,11 +43,16 @@ def test_standing_still_and_rough_driving_are_refused_and_the_best_of_the_rest_i
     assert best_of(trials)["objective"] == min(admissible)
 
 
-def test_a_study_goes_on_as_if_it_had_not_stopped(tmp_path):
+def test_a_study_goes_on_as_if_it_had_not_stopped_nor_been_interrupted_in_a_trial(tmp_path):
     def run(name, trials, **more):
         return tried(trials=trials, startup=4, file=tmp_path / name / "study", **more)
 
+    def dies(parameters):
+        raise KeyboardInterrupt
+
     whole, part = run("whole", 9), run("parts", 5)
+    with pytest.raises(KeyboardInterrupt):
+        run("parts", 9, evaluate=dies)
     assert len(part) == 5 and run("parts", 9) == whole == run("whole", 9) == tried(trials=9, startup=4)
     for what, more in (
         ("space", {"space": {"speed": [5.0, 20.0]}}),
@@ -53,27 +61,58 @@ def test_a_study_goes_on_as_if_it_had_not_stopped(tmp_path):
     ):
         with pytest.raises(InputError, match=f"differs in {what}; name another file"):
             run("parts", 12, **more)
-    (tmp_path / "parts" / "study").write_text('{"task": {}, "trials": [{}]}')
-    with pytest.raises(InputError, match="no study"):
-        run("parts", 9)
 
 
-def test_a_study_that_was_interrupted_in_the_midst_of_a_trial_equals_one_that_was_not(tmp_path):
-    done = []
-    for left in (6, 2, 100):
-        limit = len(done) + left
+def test_a_file_that_is_no_study_stays_as_it_is(tmp_path):
+    database = sqlite3.connect(tmp_path / "trips.sqlite")
+    database.execute("create table trips (x)")
+    database.executemany("insert into trips values (?)", [(str(k) * 100,) for k in range(100)])
+    database.commit()
+    database.close()
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.tex").write_text("no line ends")
+    (tmp_path / "notes.json").write_text('{"task": {}, "trials": [], "mine": 1}')
+    (tmp_path / "link").symlink_to(tmp_path / "notes.json")
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "empty").touch()
+    files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    for path in [*tmp_path.iterdir(), tmp_path / "thesis" / "chapter.tex"]:
+        with pytest.raises(InputError, match=rf"^tuning.study={path}: .*name another file$"):
+            tried(file=path)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == files
 
-        def evaluate(parameters, most=limit):
-            if len(done) == most:
-                raise KeyboardInterrupt
-            done.append(dict(parameters))
-            return road(parameters)
 
+def replaced(value, odd):
+    """Every content that differs from a JSON one in one node, which is odd, or missing."""
+    if isinstance(value, dict | list):
+        for name in value if isinstance(value, dict) else range(len(value)):
+            for changed in replaced(value[name], odd):
+                other = copy.deepcopy(value)
+                other[name] = changed
+                yield other
+            other = copy.deepcopy(value)
+            del other[name]
+            yield other
+    yield from odd
+
+
+def test_every_damage_to_a_study_is_one_clear_line_or_changes_nothing_that_counts(tmp_path):
+    file = tmp_path / "study"
+    tried(trials=3, file=file)
+    odd = [None, True, "x", "\ud800", -1, 10**400, 1e999, [], {}, [[1]], {"x": 1}]
+    for content in replaced(json.loads(file.read_text()), odd):
+        file.write_text(json.dumps(content))
+        before = file.read_bytes()
         try:
-            found = tried(evaluate=evaluate, trials=9, startup=4, file=tmp_path / "study")
-        except KeyboardInterrupt:
-            assert left < 100
-    assert found == tried(trials=9, startup=4) and len(done) == 9
+            rows = tried(trials=4, file=file)
+            save(rows, tmp_path)
+        except InputError as error:
+            assert str(error).startswith(f"tuning.study={file}: ") and file.read_bytes() == before
+        else:
+            assert all(set(row["parameters"]) == set(SPACE) for row in rows)
+    file.write_text("[" * 10**5)
+    with pytest.raises(InputError, match="no study"):
+        tried(file=file)
 
 
 @pytest.mark.parametrize(

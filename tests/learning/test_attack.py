@@ -7,25 +7,13 @@ import pytest
 import torch
 from e2rl.scripts.train import train_round
 
-from e2rl.learning.attack import (
-    AFTER,
-    ATTACK,
-    LATE,
-    Order,
-    acting,
-    drawn,
-    from_start,
-    make_traffic,
-    mixture,
-    solvable,
-    unsearched,
-)
+from e2rl.learning.attack import AFTER, ATTACK, LATE, Order, acting, drawn, make_traffic, mixture, solvable, unsearched
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.scenes.boxes import separation
 from e2rl.sim import dynamics
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.rollout import synthesize_traffic
-from e2rl.traffic.traffic import FULL
+from e2rl.traffic.traffic import CHAIN, FULL, PAIR, SINGLE
 from tests.learning.small import Ambush, brake_check, small_run, small_scenes
 
 SCENES = torch.tensor([3, 0, 4, 1, 2])
@@ -40,62 +28,43 @@ def odd_ones_left_out(traffic):
 @pytest.mark.parametrize("nominal", [True, False])
 @pytest.mark.parametrize("batch", [1, 2, 5])
 def test_batches_are_joined_in_the_order_of_the_scenes(nominal, batch):
-    order = Order(0, SCENES, ETA, torch.full_like(SCENES, FULL), 7, None)
-    traffic, _ = make_traffic(order, brake_check(small_scenes(5)), odd_ones_left_out, nominal, batch)
+    attack, template = brake_check(small_scenes(5)), torch.tensor([SINGLE, PAIR, FULL, CHAIN, SINGLE])
+
+    def synthesize(ego, index, eta, seed, *limits):
+        assert all(torch.equal(each, template[torch.isin(SCENES, index)]) for each in limits)
+        return attack(ego, index, eta, seed)
+
+    order = Order(0, SCENES, ETA, template, 7, None)
+    traffic, _ = make_traffic(order, synthesize, odd_ones_left_out, nominal, batch)
     kept = [0, 4, 2]
     every = kept + SCENES.tolist() * nominal
     assert traffic["scene_index"].tolist() == every and traffic["entered"].tolist() == (SCENES % 2 == 0).tolist()
     assert traffic["eta"].tolist() == [2.0, 0.0, 1.5] + [0.0] * (len(every) - 3)
+    assert traffic["template"].tolist() == [PAIR, FULL, SINGLE] + [FULL] * (len(every) - 3)
     assert traffic["span"][:3, 0].tolist() == kept and not traffic["span"][3:].any()
     assert traffic["attacked"] == 4 / 5 and traffic["contact"] == 3 / 5  # of all that were attacked
-    whole, _ = make_traffic(order, brake_check(small_scenes(5)), odd_ones_left_out, nominal)
+    whole, _ = make_traffic(order, synthesize, odd_ones_left_out, nominal)
     assert all(torch.equal(traffic[name], whole[name]) for name in whole) and set(traffic) == set(whole)
 
 
-def test_templates_are_given_by_scene_and_to_the_attack_alone():
-    given = []
-
-    def synthesize(ego, index, eta, seed, *template):
-        given.append((index.tolist(), [part.tolist() for part in template]))
-        return brake_check(small_scenes(5))(ego, index, eta, seed)
-
-    order = Order(0, SCENES, ETA, torch.tensor([0, 0, 0, 1, 0]), 7, None)
-    make_traffic(order, synthesize, batch=3)
-    assert given == [([3, 0, 4], [[0, 0, 0]]), ([1, 2], [[1, 0]]), ([3, 0, 4], []), ([1, 2], [])]
-
-
 class Stumbles(Ambush):
-    """Raises in the scenes of `bad` where it attacks, or plans NaN in them."""
-
-    def __init__(self, bad, raises=True):
-        super().__init__()
-        self.bad, self.raises = torch.tensor(bad), raises
+    """Raises where it attacks scene 2."""
 
     def replan(self, state, world, ego_plan):
-        ill = torch.isin(world.scene["scene_index"], self.bad) & (state > 0)
-        if self.raises and ill.any():
+        if ((world.scene["scene_index"] == 2) & (state > 0)).any():
             raise ZeroDivisionError("no way out")
-        state, plan = super().replan(state, world, ego_plan)
-        plan.states[ill] = torch.nan
-        return state, plan
+        return super().replan(state, world, ego_plan)
 
 
-def order_of(count, number=2):
-    scenes, eta = torch.arange(count), torch.full((count,), 2.0)
-    return Order(number, scenes, eta, torch.zeros(count, dtype=torch.int64), 7, IDMEgo())
-
-
-@pytest.mark.parametrize(
-    ("raises", "reason"), [(True, "raised ZeroDivisionError"), (False, "a state was NaN or infinite")]
-)
-def test_rows_that_raise_are_left_out_and_named_and_the_others_are_as_without_them(raises, reason):
-    scenes = small_scenes(4)
-    made, errored = make_traffic(order_of(4), synthesize_traffic(scenes, Stumbles([2], raises), SimSettings(), batch=3))
-    whole, none = make_traffic(order_of(4), synthesize_traffic(scenes, Ambush(), SimSettings(), batch=3))
+def test_rows_that_raise_are_left_out_and_named_and_the_others_are_as_without_them():
+    scenes, index = small_scenes(4), torch.arange(4)
+    order = Order(2, index, torch.full((4,), 2.0), torch.zeros_like(index), 7, IDMEgo())
+    made, errored = make_traffic(order, synthesize_traffic(scenes, Stumbles(), SimSettings(), batch=3))
+    whole, none = make_traffic(order, synthesize_traffic(scenes, Ambush(), SimSettings(), batch=3))
     assert made["entered"].tolist() == [True, True, False, True] and whole["entered"].all() and not none
     (entry,) = errored
     assert (entry["round"], entry["during"], entry["scene"], entry["eta"]) == (2, ATTACK, 2, 2.0)
-    assert entry["reason"] == reason and ("no way out" in entry["traceback"]) == raises
+    assert entry["reason"] == "raised ZeroDivisionError" and "no way out" in entry["traceback"]
     assert made["scene_index"].tolist() == [0, 1, 3, 0, 1, 2, 3] and made["eta"].tolist() == [2.0] * 3 + [0.0] * 4
     rest = torch.tensor([0, 1, 3, 4, 5, 6, 7])
     torch.testing.assert_close(made["states"], whole["states"][rest], rtol=0, atol=1e-4)
@@ -106,16 +75,13 @@ def test_rows_that_raise_are_left_out_and_named_and_the_others_are_as_without_th
 
 
 def ambush(scenes):
-    """Vehicle 1 stands on the ego from the second step on in odd scenes; in even ones it is where `brake_check` puts
-    it."""
+    """Vehicle 1 is where the ego is from the first step on in odd scenes, else where `brake_check` puts it."""
     attack = brake_check(scenes)
 
     def synthesize(ego, index, eta, seed):
         traffic = attack(ego, index, eta, seed)
         doomed = (index % 2 == 1) & (eta > 0)
-        at = scenes.batch(index)["start"][:, None, 0, :2].expand(-1, traffic["states"].shape[1], 2)
-        spread = 1.0 + torch.arange(traffic["states"].shape[1])[:, None]  # wherever the ego gets to
-        traffic["states"][doomed, :, 1, :2] = (at + spread * torch.tensor([1.0, 0.0]))[doomed]
+        traffic["states"][doomed, 1:, 1] = traffic["states"][doomed, 1:, 0]
         return traffic | {"contact": eta > 0}
 
     return synthesize
@@ -139,14 +105,6 @@ def test_a_round_goes_on_where_everything_is_left_out():
     run.solvable = lambda traffic: unsearched(traffic["states"])._replace(entered=torch.zeros_like(traffic["contact"]))
     metrics = train_round(run)
     assert metrics["synthesizer/left_out"] == 3.0 and not run.episodes.adversarial.any()
-
-
-def test_an_evasion_that_begins_late_is_preceded_by_the_drive():
-    driven = torch.arange(12.0).view(1, 6, 2).repeat(2, 1, 1)
-    evasion = -1 - driven
-    found = from_start(driven, evasion, torch.tensor([0, 4]))
-    assert torch.equal(found[0], evasion[0])
-    assert torch.equal(found[1], torch.cat([driven[1, :4], evasion[1, :2]]))
 
 
 def test_evasions_are_kept_with_what_they_avoid():

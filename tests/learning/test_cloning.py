@@ -5,9 +5,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import BCLoss
 
-from e2rl.learning.cloning import LABEL_WIDTH, cloning_loss, drawn, mirrored_demonstrations, teaching_loss
+from e2rl.learning.cloning import cloning_loss, drawn, teaching_loss
 from e2rl.planners.actor import ActorEgo
-from e2rl.sim.observation import OBSERVATION_SIZE, mirrored
+from e2rl.sim.observation import OBSERVATION_SIZE
 
 
 def network():
@@ -57,29 +57,14 @@ def test_kinds_share_a_minibatch_evenly_whatever_their_sizes(count):
     assert not found["weight"][first, 1].any(), "filled up"
 
 
-def taught(actions, weights, acted):
-    """The teaching loss of a policy that acts as `acted` [2] everywhere, and its gradient there."""
-    policy, acted = network().network, torch.nn.Parameter(torch.tensor(acted))
-    policy.deterministic = lambda observation: acted.expand(len(observation), 2)
-    loss = teaching_loss(policy, shown(actions, weights))
-    return loss.item(), torch.autograd.grad(loss, acted)[0]
-
-
-def test_of_two_ways_out_one_is_taken_and_not_their_mean():
-    left_and_right = [[0.0, 1.2], [0.0, -1.2]]
-    between, _ = taught(left_and_right, [0.5, 0.5], [0.0, 0.0])
-    for way in (1.2, -1.2):
-        loss, gradient = taught(left_and_right, [0.5, 0.5], [0.0, way])
-        assert loss < between - 5 and gradient.abs().max() < 1e-3
-    _, gradient = taught(left_and_right, [0.5, 0.5], [0.0, 0.3])
-    assert gradient[1] < 0, "to the nearer one: a step down the gradient turns further left"
-
-
-def test_what_speaks_for_a_label_counts():
-    left_and_right = [[0.0, 1.2], [0.0, -1.2]]
-    _, gradient = taught(left_and_right, [0.99, 0.01], [0.0, -0.05])
-    assert gradient[1] < 0, "towards the likely one, though the other is nearer"
-    assert taught([[-3.0, 0.2]], [1.0], [-3.0, 0.2])[0] == pytest.approx(0.0, abs=1e-6)
+def test_the_teaching_loss_is_that_of_a_mixture_round_the_labels():
+    """Each counts by its weight and by its distance in units of the labels' width."""
+    policy, weights = network().network, [0.7, 0.3]
+    given = shown([[-3.0, 0.2], [1.0, -0.4]], weights)
+    away = given["action"] - policy.deterministic(given["observation"])[:, None]
+    away = away / (policy.reach * torch.tensor([0.25, 0.12]))
+    likelihood = (torch.tensor(weights) * torch.exp(-away.square().sum(-1) / 2)).sum(1)
+    torch.testing.assert_close(teaching_loss(policy, given), -likelihood.log().mean())
 
 
 def test_teaching_leaves_the_explorations_width_alone():
@@ -87,18 +72,3 @@ def test_teaching_leaves_the_explorations_width_alone():
     loss = teaching_loss(policy, shown([[-3.0, 0.2], [1.0, -0.4]], [1.0, 0.0]))  # a weight of 0 fills up
     assert torch.autograd.grad(loss, policy.spread, allow_unused=True, retain_graph=True) == (None,)
     assert all(part.isfinite().all() for part in torch.autograd.grad(loss, list(policy.trunk.parameters())))
-
-
-def test_a_teaching_error_of_the_labels_width_costs_one_half_each():
-    policy = network().network
-    wide = policy.reach * torch.tensor(LABEL_WIDTH)
-    policy.deterministic = lambda observation: torch.zeros(len(observation), 2)
-    assert teaching_loss(policy, shown([wide.tolist()], [1.0])).item() == pytest.approx(1.0)
-
-
-def test_what_is_right_in_a_scene_is_right_in_its_mirror():
-    found = shown([[-3.0, 0.2], [1.0, -0.4]], [0.75, 0.25])
-    other = mirrored_demonstrations(found)
-    assert torch.equal(other["action"], found["action"] * torch.tensor([1.0, -1.0]))
-    assert torch.equal(other["weight"], found["weight"])
-    assert torch.equal(other["observation"], mirrored(found["observation"]))

@@ -2,8 +2,7 @@
 
 import pytest
 
-from e2rl.learning.logging import CHOICES, RunLogger
-from e2rl.learning.scheduler import COLUMNS
+from e2rl.learning.logging import RunLogger
 from e2rl.run.errors import InputError
 
 
@@ -26,14 +25,3 @@ def test_what_a_resumed_run_logs_again_is_not_doubled(tmp_path):
     scalars = tmp_path / "logs" / "scalars"
     assert (scalars / "train" / "loss.csv").read_text().split() == ["0,0.5", "1,0.25"]
     assert (scalars / "time" / "improve.csv").read_text().split() == ["0,2.0", "1,3.0"]
-
-
-def test_a_rounds_choices_stand_below_those_of_earlier_rounds(tmp_path):
-    def choice(number, draws):
-        return dict.fromkeys(COLUMNS, float("nan")) | {"round": number, "eta": 1.0, "template": "full", "draws": draws}
-
-    logger = RunLogger("csv", tmp_path)
-    for number, draws in ((0, 3), (1, 4), (1, 5)):  # a resumed run logs round 1 again
-        logger.log({"train/loss": 1.0}, number, [choice(number, draws)])
-    lines = (tmp_path / CHOICES).read_text().splitlines()
-    assert lines == [",".join(COLUMNS), "0,1.0,full,3,,,,,", "1,1.0,full,5,,,,,"]

@@ -2,12 +2,11 @@
 
 import pytest
 import torch
-from e2rl.scripts.train import train_round
 
 from e2rl.learning.attack import Order, Solved, make_traffic
 from e2rl.learning.memory import Memory
 from e2rl.traffic.traffic import FULL
-from tests.learning.small import brake_check, small_run, small_scenes
+from tests.learning.small import brake_check, small_scenes
 
 
 def traffic(number, rows=4, eta=2.0, template=FULL):
@@ -62,11 +61,3 @@ def test_evasions_make_the_round_trip(tmp_path):
         assert rows.tolist() == [first, first + 2] and pool.scene_index[rows].tolist() == [0, 3]
         assert torch.equal(found, actions[[0, 3]]) and torch.equal(acts, span[[0, 3]])
     assert not pool.parts[0].evasion[3:].any() and len(pool) == 14
-
-
-def test_rounds_are_remembered_and_reported():
-    run = small_run(memory=6, rounds=4, collect={"batch": 16})  # enough episodes to meet every row
-    reports = [train_round(run) for _ in range(3)]
-    assert [report["synthesizer/memory_rows"] for report in reports] == [3.0, 6.0, 6.0]
-    assert reports[0]["synthesizer/fresh_draws"] == 1.0
-    assert all(0 < report["synthesizer/fresh_draws"] < 1.0 for report in reports[1:])

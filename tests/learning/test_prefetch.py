@@ -8,10 +8,7 @@ import torch
 from e2rl.scripts.train import train_round
 
 from e2rl.learning.attack import make_traffic
-from e2rl.learning.prefetch import why_no_prefetch
 from e2rl.learning.run_checkpoint import load_checkpoint, save_checkpoint
-from e2rl.planners.actor import ActorEgo
-from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.rollout import synthesize_traffic
@@ -61,15 +58,3 @@ def test_a_process_that_dies_is_named_and_the_run_goes_on_from_its_checkpoint(tm
     train_round(again)
     train_round(whole), train_round(whole)
     assert whole.memory.index() == again.memory.index()
-
-
-def test_only_an_actor_on_one_thread_of_the_cpu_is_attacked_beside_learning():
-    actor = ActorEgo(hidden=(8,))
-    assert not why_no_prefetch("cpu", 1, actor, "replay")
-    for device, threads, ego, traffic in (
-        ("cuda", 1, actor, "replay"),
-        ("cpu", 2, actor, "replay"),
-        ("cpu", 1, actor, "live"),
-        ("cpu", 1, IDMEgo(), "replay"),
-    ):
-        assert why_no_prefetch(device, threads, ego, traffic)

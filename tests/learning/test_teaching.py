@@ -88,10 +88,6 @@ def test_a_label_is_what_the_planner_would_do_in_the_same_state():
         env.step(TensorDict({"action": frames["action"]}, [len(index)]))
 
 
-class SamplingActor(SamplingEgo):
-    """A policy that plans as its teacher."""
-
-
 class Blind(ActorEgo):
     """A policy that plans to go on at its speed."""
 
@@ -110,7 +106,7 @@ def test_only_what_the_teacher_does_better_by_far_and_survives_is_labelled():
     start = data[:, 2]  # the leader is there from the first step on
     strict = Teacher(SamplingEgo(), scenes, BOUNDS, 2, {})
     assert len(strict.labels(start, Blind())) == len(start)
-    assert len(strict.labels(start, SamplingActor())) == 0
+    assert len(strict.labels(start, SamplingEgo())) == 0
     hopeless = start.clone()
     hopeless["agents", "states"][:, 1, :2] = hopeless["agents", "states"][:, 0, :2] + torch.tensor([3.0, 0.0])
     assert len(strict.labels(hopeless, Blind())) == 0

@@ -47,12 +47,11 @@ def simulate_cut_ins(driver: Driver, cut_in: CutIn) -> Tensor:
     speed, other = cut_in.speed, cut_in.other_speed
     gap = cut_in.gap + (speed - other) * start * DT
     crash, length = torch.zeros_like(speed, dtype=torch.bool), torch.full_like(speed, LENGTH)
-    still = torch.zeros_like(speed)
-    state, acceleration = no_conflict(speed), still
+    state, acceleration = no_conflict(speed), torch.zeros_like(speed)
     for lateral, side in zip(lateral_speed, lateral_gap, strict=True):
         overlaps = side <= 0
         crash |= overlaps & (gap <= 0) & (gap >= -2 * LENGTH)
-        seen = Observation(speed, acceleration, gap, other, still, side, lateral, overlaps, length, length)
+        seen = Observation(speed, acceleration, gap, other, side, lateral, overlaps, length, length)
         state, wanted = driver.step(state, seen)
         after = (speed + wanted * DT).clamp(min=0)
         acceleration = (after - speed) / DT

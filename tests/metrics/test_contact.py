@@ -7,7 +7,7 @@ import torch
 
 from e2rl.metrics.contact import touched_columns
 from e2rl.metrics.score import score_rollouts
-from e2rl.sim.rollouts import Rollouts
+from tests.metrics.random_rollouts import random_rollouts
 
 SIZE = (4.8, 2.0)
 
@@ -28,7 +28,7 @@ def scene(*courses, kinds=None, adversaries=()):
     count = len(courses)
     simulated = torch.ones(1, count, dtype=torch.bool)
     simulated[:, 0] = False
-    return Rollouts(
+    return random_rollouts(1, vehicles=count, others=0, steps=len(states[0]) - 1).replace(
         states=states,
         valid=valid,
         size=torch.tensor(SIZE).expand(1, count, 2),
@@ -42,15 +42,6 @@ def scene(*courses, kinds=None, adversaries=()):
         lane_width=torch.tensor([[4.0]]),
         drivable_points=torch.zeros(1, 0, 2),
         drivable_index=torch.zeros(1, 0, dtype=torch.int64),
-        seed=torch.zeros(1, dtype=torch.int64),
-        eta=torch.zeros(1, dtype=torch.float64),
-        scene_id=["scene"],
-        location=[""],
-        dataset=["d"],
-        split=["s"],
-        method=["e2"],
-        ego_policy=["idm"],
-        batch_size=[1],
     )
 
 
@@ -89,6 +80,10 @@ CASES = {
         [course(0, 0, 0, 0), course(-2.0, 0, 0, 3, appears=20)],
         {"contact_step": 20, "contact_type": "front", "relvel": 3},
     ),
+    "one that crosses between two replans: steps 31 and 32 alone": (
+        [course(0, 0, 0, 0), course(1.9, -108.5, math.pi / 2, 34)],
+        {"cfr": 1, "contact_step": 31, "contact_type": "side"},
+    ),
 }
 
 
@@ -104,15 +99,6 @@ def test_a_contact_is_with_an_adversary_or_not_and_who_has_left_is_not_hit():
     gone[1][5:] = False
     found = row(course(0, 0, 0, 12), course(30.5, 0, 0, 5), adversaries=[1])
     assert found["cfr_adv"] == 1 and row(course(0, 0, 0, 10), gone)["cfr"] == 0
-
-
-def test_a_contact_of_two_tenths_of_a_second_between_replans_is_found():
-    """It holds at steps 31 and 32 alone: looking every fifth step would miss it."""
-    passing = course(1.9, -108.5, math.pi / 2, 34)
-    inside = (passing[0][:, 1].abs() < (SIZE[0] + SIZE[1]) / 2).nonzero()[:, 0].tolist()
-    assert inside == [31, 32]
-    result = row(course(0, 0, 0, 0), passing)
-    assert (result["cfr"], result["contact_step"], result["contact_type"]) == (1, 31, "side")
 
 
 def test_an_ego_that_overlaps_at_the_start_has_no_collision_metrics():

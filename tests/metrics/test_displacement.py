@@ -24,9 +24,8 @@ def sampled(logged, samples, noise=1.0, seed=1):
     return future + noise * torch.randn(shape, generator=generator)
 
 
-def columns(plans, logged, valid, simulated, **options):
-    reference = sampled(logged, 1, 0.5, seed=9)[:, 0]
-    return scene_displacements(plans, options.get("reference", reference), logged, valid, simulated)
+def columns(plans, logged, valid, simulated):
+    return scene_displacements(plans, sampled(logged, 1, 0.5, seed=9)[:, 0], logged, valid, simulated)
 
 
 def test_a_steady_drift_has_its_mean_distance_at_every_horizon():
@@ -37,16 +36,6 @@ def test_a_steady_drift_has_its_mean_distance_at_every_horizon():
     torch.testing.assert_close(found, 0.5 * (torch.arange(1, STEPS + 1) + 1) / 2)
     plans[..., 2:] += 7.0  # heading and speed are not looked at
     assert torch.equal(displacement(plans, logged)[0, 0, 0], found)
-
-
-def test_a_sample_equal_to_the_log_makes_the_best_error_zero_but_not_the_mean():
-    logged, valid, simulated = logs()
-    plans = sampled(logged, 4)
-    plans[:, 2] = sampled(logged, 1, 0.0)[:, 0]
-    found = columns(plans, logged, valid, simulated)
-    for at in ("_3", "_5"):
-        assert (found[f"min_ade{at}"] == 0).all() and (found[f"joint_ade{at}"] == 0).all()
-        assert (found[f"mean_ade{at}"] > 0).all()
 
 
 def test_best_of_each_is_below_best_of_all_is_below_mean_and_one_sample_makes_them_equal():
@@ -60,17 +49,6 @@ def test_best_of_each_is_below_best_of_all_is_below_mean_and_one_sample_makes_th
         assert (more[f"min_ade{at}"] <= best).all() and (more[f"joint_ade{at}"] <= joint).all()
         torch.testing.assert_close(one[f"min_ade{at}"], one[f"mean_ade{at}"])
         torch.testing.assert_close(one[f"min_ade{at}"], one[f"joint_ade{at}"])
-
-
-def test_neither_the_order_of_samples_nor_of_vehicles_matters():
-    logged, valid, simulated = logs()
-    plans, reference = sampled(logged, 4), sampled(logged, 1, seed=5)[:, 0]
-    order = torch.tensor([0, 3, 1, 2])  # the ego stays first
-    found = columns(plans, logged, valid, simulated, reference=reference)
-    tracks = plans.flip(1)[:, :, order], logged[:, :, order], valid[:, :, order], simulated[:, order]
-    other = columns(*tracks, reference=reference[:, order])
-    for name, value in found.items():
-        torch.testing.assert_close(other[name], value)
 
 
 def test_only_simulated_moving_vehicles_recorded_throughout_count_and_never_the_ego():

@@ -25,14 +25,10 @@ EACH = pytest.mark.parametrize("name", DRIVERS)
 
 def observe(**fields):
     """One conflict: an ego at 20 m/s, 5 m behind the overlapping rear of a vehicle at 10 m/s, unless said otherwise."""
-    usual = Observation(20.0, 0.0, 5.0, 10.0, 0.0, -1.9, 0.0, True, 4.3, 4.3)._asdict()
+    usual = Observation(20.0, 0.0, 5.0, 10.0, -1.9, 0.0, True, 4.3, 4.3)._asdict()
     values = {key: torch.as_tensor(value) for key, value in (usual | fields).items()}
     values = {k: v.double() if v.is_floating_point() else v for k, v in values.items()}
     return Observation(**dict(zip(values, torch.broadcast_tensors(*values.values()), strict=True)))
-
-
-def nobody(**fields):
-    return observe(gap=torch.inf, lateral_gap=torch.inf, overlaps=False, **fields)
 
 
 def drive(driver, observations):
@@ -74,7 +70,7 @@ def test_the_human_driver_releases_the_pedal_then_brakes_ever_harder():
 @EACH
 def test_no_reaction_without_a_conflict(name):
     calm = {
-        "nobody is there": nobody(),
+        "nobody is there": observe(gap=torch.inf, lateral_gap=torch.inf, overlaps=False),
         "the other is faster and far": observe(other_speed=25.0, gap=60.0),
         "the other keeps its lane": observe(lateral_gap=1.6, overlaps=False, gap=8.0),
         "the other leaves": observe(lateral_gap=1.4, overlaps=False, lateral_speed=-0.5),

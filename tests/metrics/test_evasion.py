@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from e2rl.metrics import evasion
-from e2rl.metrics.evasion import add_avoidable, find_evasions, lateral_targets, spliced
+from e2rl.metrics.evasion import add_avoidable, find_evasions, spliced
 from e2rl.scenes.boxes import separation
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.rollouts import Rollouts
@@ -60,7 +60,7 @@ def test_the_boxed_in_have_no_way_out_and_nothing_is_claimed():
     scene = scene_set.scenes
     scene["logged"][:, :, 1, 0] += torch.linspace(0, 6, 61)  # the one behind pushes
     result = find_evasions(scene, scene["logged"], scene["logged_valid"], SimSettings())
-    assert not result.found.any() and result.tried[0] > 4 * evasion.SAMPLES
+    assert not result.found.any()
 
 
 def test_a_wall_is_a_matter_of_braking_distance():
@@ -83,13 +83,6 @@ def test_a_rollout_s_result_does_not_depend_on_the_batch():
     scene = scene_set.scenes[2:]
     alone = find_evasions(scene, scene["logged"], scene["logged_valid"], SimSettings())
     torch.testing.assert_close(together.states[2], alone.states[0], atol=1e-4, rtol=0)
-
-
-def test_ways_are_the_mission_then_real_candidates_then_shifts():
-    valid = torch.tensor([[True, True, False, True], [True, False, False, False]])
-    route, shift = lateral_targets(valid, torch.tensor([1, 0]))
-    assert route[0].tolist()[:5] == [1, 1, 1, 0, 3] and shift[0].tolist()[:5] == [0.0, 1.5, -1.5, 0.0, 0.0]
-    assert route[1].tolist() == [0] * 8 and len(set(shift[1].tolist()[:7])) == 7
 
 
 SLOW_AHEAD = [(0, 0, 12.0), (40, 0, 3.0), (-40, 1, 5.0)]
@@ -132,7 +125,7 @@ def test_the_late_search_begins_a_second_before_the_contact_and_is_enough(monkey
         asked.append(None if moment is None else moment.tolist())
         found = torch.tensor([moment is not None] * len(states))
         track, peak = torch.full((len(states), 60, 4), 7.0), torch.full((len(states),), 3.0)
-        return evasion.Evasions(found, track[..., :2], track, peak, peak.long(), batch_size=[len(states)])
+        return evasion.Evasions(found, track[..., :2], track, peak, batch_size=[len(states)])
 
     monkeypatch.setattr(evasion, "find_evasions", late_only)
     rows = [{"cfr": 1, "contact_step": 40.0}, {"cfr": 1, "contact_step": 4.0}]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from e2rl.metrics.geometry import EDGES, edge_distances, edge_parts_inside, overlap_area, pair_overlap
+from e2rl.metrics.geometry import edge_distances, edge_parts_inside, overlap_area, pair_overlap
 from e2rl.scenes.boxes import corners
 
 shapely = pytest.importorskip("shapely")
@@ -47,19 +47,9 @@ def test_shared_and_collinear_edges_need_no_special_case(turn):
 def test_edge_parts_are_shapely_s():
     first, second = random_boxes(600, 3), random_boxes(600, 4)
     parts, corner = edge_parts_inside(*first, *second), corners(*first).numpy()
-    other = polygons(*second)
+    other, point = polygons(*second), shapely.points(second[0][:, :2].numpy())
+    away = edge_distances(*first, second[0][:, :2])
     for edge in range(4):
         line = shapely.linestrings(corner[:, [edge, (edge + 1) % 4]])
         np.testing.assert_allclose(parts[:, edge], shapely.length(shapely.intersection(line, other)), atol=1e-9)
-    point = second[0][:, :2]
-    line = shapely.linestrings(corner[:, [0, 1]])
-    np.testing.assert_allclose(
-        edge_distances(*first, point)[:, 0], shapely.distance(line, shapely.points(point.numpy())), atol=1e-9
-    )
-
-
-def test_edges_are_named_after_where_they_lie():
-    state, size = torch.zeros(4, dtype=torch.float64), torch.tensor([4.0, 2.0], dtype=torch.float64)
-    for name, point in {"front": (2.0, 0), "rear": (-2.0, 0), "left": (0, 1.0), "right": (0, -1.0)}.items():
-        distances = edge_distances(state, size, torch.tensor(point, dtype=torch.float64))
-        assert EDGES[int(distances.argmin())] == name
+        np.testing.assert_allclose(away[:, edge], shapely.distance(line, point), atol=1e-9)

@@ -25,6 +25,7 @@ from e2rl.metrics.meta_metric import (
     runs_red_light,
     time_to_collision,
 )
+from e2rl.scenes.boxes import signed_distance
 from e2rl.scenes.recording import DT, LIGHT_RED
 
 
@@ -121,17 +122,6 @@ def test_central_differences_are_exact_for_parabolas_and_need_both_neighbours():
     torch.testing.assert_close(change[0], (3 - 4 * time) * both[0])
 
 
-def minkowski_distance(one, one_size, other, other_size):
-    """Signed distance of two boxes: of the origin from the border of their Minkowski difference."""
-    geometry = pytest.importorskip("shapely.geometry")
-    from e2rl.scenes.boxes import corners
-
-    differences = corners(one, one_size)[:, None] - corners(other, other_size)[None]
-    hull = geometry.MultiPoint(differences.reshape(-1, 2).tolist()).convex_hull
-    origin = geometry.Point(0, 0)
-    return -hull.exterior.distance(origin) if hull.contains(origin) else hull.distance(origin)
-
-
 def test_the_nearest_object_is_the_smallest_signed_distance():
     generator = torch.Generator().manual_seed(0)
     draw = lambda *shape: torch.rand(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
@@ -139,18 +129,9 @@ def test_the_nearest_object_is_the_smallest_signed_distance():
     size, other_size = 1 + 5 * draw(25, 2), 0.5 + 11 * draw(25, 5, 2)
     seen = draw(25, 2, 5) < 0.8
     found = nearest_object(track, size, others, other_size, seen)
-    overlaps = 0
-    for m in range(25):
-        for t in range(2):
-            gaps = [
-                minkowski_distance(track[m, t], size[m], others[m, t, n], other_size[m, n])
-                for n in range(5)
-                if seen[m, t, n]
-            ]
-            expected = min(gaps, default=FAR)
-            overlaps += expected < 0
-            assert found[m, t].item() == pytest.approx(expected, abs=2e-6)
-    assert 5 < overlaps < 45, "the draw must hold boxes apart and overlapping ones"
+    gaps = signed_distance(track[:, :, None], size[:, None, None], others, other_size[:, None])
+    torch.testing.assert_close(found, gaps.masked_fill(~seen, FAR).amin(-1))
+    assert 5 < (found < 0).sum() < 45, "the draw must hold boxes apart and overlapping ones"
 
 
 def test_nobody_is_far():

@@ -138,20 +138,9 @@ def test_a_second_follower_must_manage_behind_the_first(gap, avoided):
     assert result.avoided.item() is avoided
 
 
-def test_the_answer_does_not_depend_on_place_heading_mirror_or_order():
+def test_the_order_of_the_others_does_not_matter():
     case = collision(track(14.0), cut_in(13.0, 14.0, 6.0), follower(20.0), track(10.0, start=(3.0, -3.5)))
-    expected = {name: result.avoided.item() for name, result in preventions(case).items()}
-    turn = 0.7
-    states = case.states.clone()
-    rotation = torch.tensor([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]], dtype=torch.float64)
-    states[..., :2] = states[..., :2] @ rotation.T + torch.tensor([100.0, -40.0])
-    states[..., 2] += turn
-    mirrored = case.states * torch.tensor([1.0, -1.0, -1.0, 1.0])
     order = torch.tensor([0, 3, 2, 1])
-    changed = [
-        case._replace(states=states),
-        case._replace(states=mirrored),
-        case._replace(states=case.states[:, :, order], partner=torch.tensor([3])),
-    ]
-    for other in changed:
-        assert {name: result.avoided.item() for name, result in preventions(other).items()} == expected
+    other = preventions(case._replace(states=case.states[:, :, order], partner=torch.tensor([3])))
+    for name, result in preventions(case).items():
+        assert other[name].avoided.item() == result.avoided.item()

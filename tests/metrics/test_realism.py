@@ -18,24 +18,6 @@ def once(clusters):
     return torch.ones(1, clusters, dtype=torch.float64), torch.arange(clusters)
 
 
-def test_the_recording_is_wholly_like_itself():
-    rollouts = random_rollouts(6)
-    features = features_of(rollouts.replace(logged=rollouts.states))
-    draws, cluster = once(6)
-    table = realism(features, cluster, draws)
-    assert table["real"].item() == 1 and table["real_norm"].item() == 1
-
-
-def test_distance_is_symmetric_and_scipy_s():
-    pair = torch.randn(2, 500, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    pair[1] = pair[1] * 1.7 + 0.4
-    draws, cluster = torch.ones(1, 1, dtype=torch.float64), torch.zeros(500, dtype=torch.int64)
-    distance = wasserstein(pair, cluster, draws).item()
-    assert distance == pytest.approx(wasserstein_distance(*pair.numpy()))
-    assert distance == pytest.approx(wasserstein(pair.flip(0), cluster, draws).item())
-    assert distance == pytest.approx((pair.sort(-1).values.diff(dim=0)).abs().mean().item()), "quantile form"
-
-
 def test_a_draw_equals_the_distance_of_the_repeated_samples():
     generator = torch.Generator().manual_seed(2)
     pair = torch.randn(2, 9000, generator=generator, dtype=torch.float64)  # more than one block of columns

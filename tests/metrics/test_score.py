@@ -1,4 +1,4 @@
-"""The rows agree with the protocol's independent scorer, which knows the rollout files alone."""
+"""The rows agree with the independent scorer; the batch and the world's place, direction and hand do not matter."""
 
 import csv
 import json
@@ -81,15 +81,40 @@ def test_rows_do_not_depend_on_the_batch_they_are_scored_in():
         assert str(score_rollouts(rollouts[index : index + 1])[0][0]) == str(together[index])
 
 
-def test_moving_the_world_changes_no_metric():
-    rollouts = random_rollouts(4, seed=5)
-    shift = torch.tensor([64.0, -32.0])  # exact in float32 at this size, up to the last bits of small coordinates
-    moved = {key: rollouts.get(key) + torch.nn.functional.pad(shift, (0, 2)) for key in ("states", "logged")}
-    moved |= {key: rollouts.get(key) + shift for key in ("lane_points", "drivable_points")}
-    moved = rollouts.replace(**moved)
-    for before, after in zip(score_rollouts(rollouts)[0], score_rollouts(moved)[0], strict=True):
-        for name in ("cfr", "min_dtc", "ttc_c", "aor_step", "progress", "real"):
-            assert after[name] == pytest.approx(before[name], abs=2e-3, nan_ok=True), name
+def changed(rollouts, matrix, shift, heading):
+    """The rollouts with all positions mapped by a matrix and shifted [m], and all headings by a function."""
+    result, (matrix, shift) = {}, (torch.tensor(given, dtype=torch.float64) for given in (matrix, shift))
+    for name in ("lane_points", "drivable_points"):
+        result[name] = rollouts.get(name).double() @ matrix.T + shift
+    for name in ("states", "logged"):
+        track = rollouts.get(name).double()
+        xy = track[..., :2] @ matrix.T + shift
+        result[name] = torch.cat([xy, heading(track[..., 2:3]), track[..., 3:]], -1)
+    return rollouts.replace(**result)
+
+
+def mirrored(text):
+    return text.replace("left", "\0").replace("right", "left").replace("\0", "right")
+
+
+TURN = [[math.cos(1.1), -math.sin(1.1)], [math.sin(1.1), math.cos(1.1)]]
+WORLDS = {
+    "moved and turned": ((TURN, [300.0, -80.0], lambda heading: heading + 1.1), lambda text: text),
+    "mirrored": (([[1.0, 0.0], [0.0, -1.0]], [0.0, 0.0], lambda heading: -heading), mirrored),
+}
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_the_world_s_place_direction_and_hand_do_not_matter(world):
+    """Mirrored, left and right are the other way round, and so who gives way to whom."""
+    rollouts, (change, word) = random_rollouts(24, seed=5, vehicles=24, others=2, extent=30.0), WORLDS[world]
+    before, after = score_rollouts(rollouts)[0], score_rollouts(changed(rollouts, *change))[0]
+    assert len({row["approach"] for row in before}) > 4 and len({row["preventable"] for row in before}) > 2
+    for row, other in zip(before, after, strict=True):
+        row = {name: word(value) if isinstance(value, str) else value for name, value in row.items()}
+        if world == "mirrored":
+            row |= {"duty": other["duty"]}
+        assert other == pytest.approx(row, abs=1e-6, nan_ok=True)
 
 
 def test_transport_is_the_control_s_energy_and_unknown_without_control():

@@ -58,18 +58,14 @@ def test_a_red_light_is_a_duty_where_it_is_known():
 NO_LANES = torch.zeros(1, 2, 2, dtype=torch.float64), torch.full((1, 2), -1)
 
 
-def duty(case, rear=False, red=-1, lanes=NO_LANES):
-    return DUTIES[duties(case, torch.tensor([rear]), torch.tensor([red]), lanes).item()]
+def duty(case, red=-1, lanes=NO_LANES):
+    return DUTIES[duties(case, torch.tensor([False]), torch.tensor([red]), lanes).item()]
 
 
 def crossing(speed, from_left):
     """A straight crossing of the ego at 10 m/s, whose front meets the other's side."""
     sign = 1 if from_left else -1
-    return collision(track(10.0), track(speed, -sign * math.pi / 2, (40.0, sign * (speed * 3.6 + 0.0))))
-
-
-def test_who_runs_into_the_ego_from_behind_broke_the_duty_of_a_follower():
-    assert duty(collision(track(8.0), track(15.0, start=(-25.0, 0.0))), rear=True) == "rear-end"
+    return collision(track(10.0), track(speed, -sign * math.pi / 2, (40.0, sign * speed * 3.6)))
 
 
 @pytest.mark.parametrize("gap, expected", [(3.0, "entry"), (25.0, "none")])

@@ -1,5 +1,6 @@
 """Planners outside of e2rl for the tests: that of examples/, its law as an Ego, and ones that go wrong in one scene."""
 
+import runpy
 import sys
 from pathlib import Path
 
@@ -8,15 +9,13 @@ from tensordict import TensorDict
 
 from e2rl.planners.ego import Ego, EgoPolicy
 from e2rl.planners.external import continued
-from e2rl.scenes.boxes import to_frame
-from e2rl.scenes.recording import LIGHT_RED
-from e2rl.scenes.route import SPACING
 from e2rl.sim import dynamics
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.sim.mission import light_state_at, mission_of
+from e2rl.sim.mission import mission_of
 from tests.synthetic import make_scenes
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "external_planner.py"
+LAW = runpy.run_path(str(EXAMPLE))["act"]
 WRONG = """
 import math, os, struct, sys, time
 from pathlib import Path
@@ -86,32 +85,18 @@ def driven(ego, steps=80, **scene):
 
 
 class SameLaw(Ego):
-    """The law of examples/external_planner.py for whole batches, in e2rl."""
+    """The law of examples/external_planner.py in e2rl, told what the World and the missions hold."""
 
     def plan(self, world):
-        mission, scene = mission_of(world.scene), world.scene
-        now, size = world.states[:, 0].double(), scene["size"].double()
-        speed, row = now[:, 3], torch.arange(len(now))
-        near = (mission.points.double() - now[:, None, :2]).square().sum(-1).argmin(1)
-        limit = mission.limit[row, near].double()
-        desired = torch.where(limit > 0, limit, 10.0)
-        along, aside = to_frame(world.states[:, 1:, :2].double(), now[:, None]).unbind(-1)
-        free = along - (size[:, :1, 0] + size[:, 1:, 0]) / 2
-        there = world.valid[:, 1:] & (along > 0) & (aside.abs() < (size[:, :1, 1] + size[:, 1:, 1]) / 2)
-        gap, first = free.masked_fill(~there, torch.inf).min(1)
-        other = world.states[:, 1:].double()[row, first]
-        leader = torch.where(gap.isfinite(), other[:, 3] * torch.cos(other[:, 2] - now[:, 2]), 0.0)
-        line = mission.light_s.double() - (SPACING * near + size[:, 0, 0] / 2)[:, None]
-        red = (light_state_at(scene["light_state"], mission.light, world.step) == LIGHT_RED) & (line > 0)
-        line = line.masked_fill(~red, torch.inf).amin(1)
-        gap, leader = torch.minimum(gap, line), torch.where(line < gap, 0.0, leader)
-        wanted = 4.0 + (speed * 1.2 + speed * (speed - leader) / (2 * 4.5**0.5)).clamp(min=0)
-        push = 1 - (speed / desired) ** 4 - (wanted / gap.clamp(min=0.1)) ** 2
-        goal = (near + 2 + (speed / SPACING).long()).clamp(max=mission.points.shape[1] - 1)
-        ahead, left = to_frame(mission.points[row, goal].double(), now).unbind(-1)
-        yaw_rate = 2 * speed * left / (ahead**2 + left**2).clamp(min=1.0)
-        action = torch.stack([(1.5 * push).clamp(min=-8.0), yaw_rate], -1).float()
+        mission, scene, now, actions = mission_of(world.scene), world.scene, world.states, []
+        for row, there in enumerate(world.valid):
+            route = torch.cat([mission.points[row], mission.limit[row, :, None]], 1).tolist()
+            lines = list(zip(mission.light[row].tolist(), mission.light_s[row].tolist(), strict=True))
+            agents = torch.cat([now[row], scene["size"][row], 0 * now[row]], 1)[there].tolist()
+            lights = scene["light_state"][row, world.step[row]].tolist()
+            known = (*scene["size"][row, 0].tolist(), route, lines)
+            actions.append(LAW(known, lights, [(0, 0, *agent[:8]) for agent in agents]))
         steps = self.replan_every
-        held = dynamics.rollout(world.states[:, 0], action[:, None].expand(-1, steps, -1))
+        held = dynamics.rollout(now[:, 0], torch.tensor(actions)[:, None].expand(-1, steps, -1))
         plan = torch.cat([held, held.new_zeros(len(held), 50 - steps, 4)], 1)
         return continued(plan, torch.full((len(held),), steps))

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from e2rl.planners.actor import ActorEgo
-from e2rl.planners.ego import PLAN_STEPS, EgoPolicy
+from e2rl.planners.ego import PLAN_STEPS
 from e2rl.planners.network import Normaliser, find_weights
 from e2rl.planners.reference import reference_action
 from e2rl.run.errors import InputError
@@ -20,33 +20,20 @@ def wild(ego, scale=0.3):
     return ego
 
 
-def test_its_plan_begins_with_what_it_does_now():
-    """Planning sees what the environment observes: the first planned state is where the next action leads."""
-    env, ego = DrivingEnv(make_scenes(3, num_vehicles=8), SimSettings(), 3), wild(ActorEgo(hidden=(16,)))
-    td = env.reset()
-    for _ in range(10):
-        world = env.world()
-        plan = ego.plan(world)
-        td["action"] = ego.act(world, td["observation"], torch.cat([world.states[:, :1], plan], 1))
-        td = env.step(td)["next"].exclude("reward")
-        assert torch.allclose(env.world().states[:, 0], plan[:, 0], atol=1e-4)
-
-
-def test_plan_is_what_it_does_on_a_lonely_road():
-    """Actions held as in the plan, alone on the road: the plan comes true exactly, and planning changes nothing."""
-    env = DrivingEnv(make_scenes(2, num_vehicles=1, num_vrus=0), SimSettings(), 2)
+@pytest.mark.parametrize(("vehicles", "true"), [(8, 1), (1, 15)])
+def test_its_plan_comes_true(vehicles, true):
+    """Planning sees what the environment observes: among others the first step is where the action leads; alone on the
+    road the whole plan is, with the actions held as in it."""
+    env = DrivingEnv(make_scenes(2, num_vehicles=vehicles, num_vrus=2 * (vehicles > 1)), SimSettings(), 2)
     ego, td = wild(ActorEgo(hidden=(16,)), 0.1), env.reset()
-    plan = ego.plan(env.world())
-    assert plan.shape == (2, PLAN_STEPS, 4) and torch.equal(plan, ego.plan(env.world()))
-    for step in range(PLAN_STEPS):
-        if step % 5 == 0:
+    for step in range(15):
+        if step % true == 0:
+            plan = ego.plan(env.world())
+            assert plan.shape == (2, PLAN_STEPS, 4) and torch.equal(plan, ego.plan(env.world()))
+        if step % min(true, 5) == 0:
             action = ego.act(env.world(), td["observation"], plan)
-        td["action"] = action
-        td = env.step(td)["next"].exclude("reward")
-        if td["done"].any():
-            break
-        assert torch.allclose(env.world().states[:, 0], plan[:, step], atol=1e-3), step
-    assert step > 15
+        td = env.step(td.set("action", action))["next"].exclude("reward")
+        assert torch.allclose(env.world().states[:, 0], plan[:, step % true], atol=1e-3), step
 
 
 def test_plans_expect_the_others_plans():
@@ -82,7 +69,7 @@ def test_normaliser_equals_the_statistics_of_all_it_saw_and_is_frozen_otherwise(
 
 
 def test_file_round_trip(tmp_path):
-    first, second = wild(ActorEgo(hidden=(8,))), ActorEgo(hidden=(8,))
+    first = wild(ActorEgo(hidden=(8,)))
     first.network.normaliser.observe(torch.randn(10, first.network.normaliser.mean.shape[0]))
     folder = tmp_path / "checkpoints" / "round-000001"
     folder.mkdir(parents=True)
@@ -90,23 +77,26 @@ def test_file_round_trip(tmp_path):
     seal(folder)
     assert find_weights(tmp_path) == find_weights(folder) == folder / "actor.safetensors"
     second = ActorEgo(hidden=(8,), checkpoint=str(tmp_path))
-    env = DrivingEnv(make_scenes(2), SimSettings(), 2, agents=True)
-    policies = [EgoPolicy(ego, env)(env.reset().clone()) for ego in (first, second)]
-    observation = policies[0]["observation"]
-    acted, valued = [], []
-    for ego in (first, second):
-        acted.append(ego.network.network.deterministic(observation))
-        valued.append(ego.network.critic(policies[0])["state_value"])
-    assert torch.equal(*acted) and torch.equal(*valued)
+    seen = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()
+    for ask in (
+        lambda ego: ego.decide(seen["observation"]),
+        lambda ego: ego.network.critic(seen)["state_value"].clone(),
+    ):
+        assert torch.equal(ask(first), ask(second))
 
 
-def test_other_bounds_damage_and_absence_are_refused(tmp_path):
-    file = tmp_path / "actor.safetensors"
-    ActorEgo(hidden=(8,)).network.save(file)
-    with pytest.raises(InputError, match=r"actor\.safetensors: .*bounds .*5\.0, .* not .*2\.0.*set sim\.max_"):
+def test_other_bounds_damage_and_other_versions_are_refused(tmp_path, monkeypatch):
+    file, network = tmp_path / "actor.safetensors", ActorEgo(hidden=(8,)).network
+    network.save(file)
+    with pytest.raises(InputError, match=r"bounds .*5\.0, .* not .*2\.0.*set sim\.max_"):
         ActorEgo(hidden=(8,), max_acceleration=2.0, checkpoint=str(file))
+    for change in ({"observation": 12}, {"hidden": [10**9]}):
+        monkeypatch.setattr(network, "architecture", network.architecture | change)
+        network.save(file)
+        with pytest.raises(InputError, match="another version"):
+            ActorEgo(hidden=(8,), checkpoint=str(file))
     file.write_bytes(b"no weights")
-    with pytest.raises(InputError, match="not a readable actor file"):
+    with pytest.raises(InputError, match="damaged"):
         ActorEgo(hidden=(8,), checkpoint=str(file))
 
 

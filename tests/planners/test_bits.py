@@ -1,6 +1,4 @@
-"""The ego bits: cheapest candidate, bounds, symmetries, what it may not see, red lights, its files, its worth."""
-
-from dataclasses import replace
+"""The ego bits: cheapest candidate, bounds, symmetries, its files."""
 
 import pytest
 import torch
@@ -10,7 +8,6 @@ from e2rl.planners.bits_network import (
     CELLS,
     HORIZON,
     SIDES,
-    BitsNetwork,
     cell_of,
     load_bits,
     needed_acceleration,
@@ -21,6 +18,7 @@ from e2rl.planners.bits_network import (
 from e2rl.planners.ego import PLAN_STEPS
 from e2rl.run.errors import InputError
 from e2rl.sim import dynamics
+from e2rl.sim.observation import OBSERVATION_SIZE
 from tests.planners.planners import worlds
 from tests.sim.test_observation import quarter_turn
 from tests.synthetic import make_scenes
@@ -60,36 +58,17 @@ def test_a_moved_scene_gets_the_moved_candidates():
     torch.testing.assert_close(ego.costs(there, second), ego.costs(here, first), atol=0.5, rtol=1e-2)
 
 
-def test_sees_neither_plans_nor_routes_nor_what_the_recording_goes_on_to_tell():
-    _, world = worlds(make_scenes(2, num_vehicles=6))
-    vehicles = world.scene["route_log"].shape[1]
-    plan, route = torch.randn(2, vehicles, PLAN_STEPS, 4), torch.ones(2, vehicles, dtype=torch.long)
-    later = world.scene.clone()
-    later["logged"][:, 1:] += 50.0
-    ego = wild_ego()
-    told = replace(world, scene=later, plan=plan, route=route, step=world.step + 60)
-    assert torch.equal(ego.plan(told), ego.plan(world)), "nor the time"
-
-
-def test_a_file_gives_the_network_back(tmp_path):
-    network = wild_ego().network
+def test_a_file_gives_the_network_back_and_another_is_refused(tmp_path):
+    network, seen = wild_ego().network, torch.randn(4, OBSERVATION_SIZE)
     save_bits(network, tmp_path / "bits.safetensors", {"data": "made"})
     again = load_bits(str(tmp_path))
-    seen = torch.randn(4, network.architecture["observation"])
     for one, other in zip(network.goals(network.encode(seen)), again.goals(again.encode(seen)), strict=True):
-        assert torch.equal(one, other)
-    assert not any(value.requires_grad for value in again.parameters())
-
-
-def test_wrong_checkpoints_are_named(tmp_path):
-    with pytest.raises(InputError, match=r"ego\.checkpoint=.*no bits\.safetensors.*stage=bits"):
-        BitsEgo(checkpoint=str(tmp_path))
-    file = tmp_path / "bits.safetensors"
-    network = BitsNetwork(hidden=16)
+        assert torch.equal(one, other) and not other.requires_grad
     network.architecture["cells"] = 9
-    save_bits(network, file, {})
-    with pytest.raises(InputError, match="another architecture"):
-        load_bits(str(file))
+    save_bits(network, tmp_path / "bits.safetensors", {})
+    for where, why in ((tmp_path, "another architecture"), (tmp_path / "no", "no bits.safetensors there")):
+        with pytest.raises(InputError, match=why):
+            BitsEgo(checkpoint=str(where))
 
 
 def test_cells_and_places_are_inverses():

@@ -1,32 +1,35 @@
 """Tracking leaves no error on drivable plans, makes good deviations, and a policy restarts with its episodes."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from e2rl.planners.bits import BitsEgo
-from e2rl.planners.ego import PLAN_STEPS, Ego, EgoPlanner, EgoPolicy, track
+from e2rl.planners.ego import PLAN_STEPS, Ego, EgoPolicy, Undrivable, track
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.planners.lane_graph_planner import LaneGraphEgo
 from e2rl.planners.log_replay import ReplayEgo
 from e2rl.planners.path import MissionPath
 from e2rl.planners.sampling import SamplingEgo
+from e2rl.prior.lane_relative import HORIZON
 from e2rl.run.config import built, load_choice
 from e2rl.run.errors import InputError
+from e2rl.scenes.recording import LIGHT_GREEN
 from e2rl.sim import dynamics
 from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.traffic.reaction import Lookahead
+from e2rl.traffic.rollout import roll_out
+from e2rl.traffic.rule_based import ConstantVelocity, LogReplay
 from tests.planners.planners import driven, world_of, worlds
 from tests.synthetic import make_scenes
 
 
 class Cruise(Ego):
-    """Holds its speed along its mission, and counts its plans."""
-
-    plans = 0
+    """Holds its speed along its mission."""
 
     def plan(self, world):
-        self.plans += 1
-        path = MissionPath(world)
-        return path.drive(world.states[:, 0, 3:].expand(-1, PLAN_STEPS + 1))
+        return MissionPath(world).drive(world.states[:, 0, 3:].expand(-1, PLAN_STEPS + 1))
 
 
 def test_a_drivable_plan_is_followed_without_error():
@@ -71,16 +74,6 @@ def test_what_a_policy_writes_as_its_plan_is_what_it_then_drives(kind, atol):
         assert torch.allclose(driven[:, step : step + 5], told[:, step, :5], atol=atol), "the interval that follows"
 
 
-def test_a_planner_beside_another_policy_tells_the_plan_and_leaves_the_action():
-    env, ego = make_env(make_scenes(2, num_vehicles=1), 2), Cruise(replan_every=5)
-    constant = lambda td: td.set("action", torch.tensor([-1.0, 0.0]).repeat(2, 1))  # noqa: E731
-    planner = EgoPlanner(ego, env)
-    data = env.rollout(12, lambda td: constant(planner(td)))
-    assert ego.plans == 3 and (data["action"] == torch.tensor([-1.0, 0.0])).all()
-    speed = data["agents", "states"][:, ::5, 0, 3]
-    assert torch.allclose(data["ego", "plan"][:, ::5, -1, 3], speed, atol=1e-4), "each plan begins where the ego is"
-
-
 def test_a_reset_in_between_makes_a_new_plan_there():
     """Environment 0 hits a wall early and starts anew while 1 drives on: both stay on their lanes' centre."""
     scenes = make_scenes(2, vehicles=[(0.0, 0, 10.0), (23.0, 0, 0.0)])
@@ -102,16 +95,94 @@ def test_replayed_log_is_tracked():
 
 @pytest.mark.parametrize("name", ["idm", "lane_graph", "lane_graph_tuned", "replay", "sampling", "bits"])
 def test_a_file_of_the_configuration_builds_its_ego(name):
-    """The class alone has the values of its file; each value is checked."""
-    group = load_choice("ego", name)
-    ego = built(group, "ego", Ego)
-    for key in set(group) - {"_target_", "predicted_speeds"}:
-        assert getattr(ego, key) == group[key]
-        assert name == "lane_graph_tuned" or getattr(type(ego)(), key) == group[key]
+    ego = built(load_choice("ego", name), "ego", Ego)
     plan = ego.plan(world_of(num_scenes=2)[1])
     assert plan.shape == (2, PLAN_STEPS, 4) and torch.isfinite(plan).all()
     with pytest.raises(InputError, match=r"ego\.replan_every=0"):
         type(ego)(replan_every=0)
+
+
+class Straight(Ego):
+    """Holds its speed and heading; acts itself."""
+
+    def plan(self, world):
+        return dynamics.constant_velocity(world.states[:, 0], 0.1 * torch.arange(1, PLAN_STEPS + 1))
+
+    def act(self, world, observation, plan):
+        return super().act(world, observation, plan)
+
+
+class Meddler(Straight):
+    """Keeps what it is told as it plans, and overwrites whatever it is given."""
+
+    def reset(self, world):
+        self.told = []
+
+    def plan(self, world):
+        told = {**world.scene, **{name: value for name, value in vars(world).items() if name != "scene"}}
+        self.told.append({key: value if value is None else value.clone() for key, value in told.items()})
+        return self.meddle(super().plan(world), *told.values())
+
+    def act(self, world, observation, plan):
+        told = observation, plan, world.states, world.valid, *world.scene.values()
+        return self.meddle(super().act(world, observation, plan), *told)
+
+    def meddle(self, made, *told):
+        for value in told:
+            if value is not None and not value.dtype.is_floating_point:  # of the scene, the step, who is there
+                value.zero_()
+            elif value is not None:
+                value.add_(7.0)
+        return made
+
+
+def test_code_from_outside_moves_nobody():
+    scenes = make_scenes(2, num_vehicles=3, red_light_x=60.0)
+    data = [env.rollout(20, EgoPolicy(ego(), env)) for ego in (Straight, Meddler) for env in [make_env(scenes, 2)]]
+    for key in ("observation", "agents", "action", "ego"):
+        assert (data[0][key] == data[1][key]).all(), key
+
+
+@pytest.mark.parametrize("traffic", [LogReplay(), ConstantVelocity()])
+def test_two_recordings_with_one_present_tell_code_from_outside_the_same(traffic):
+    """Everything that a planner is told, in rollouts and by traffic that asks it beforehand, is of the present."""
+    first, told = make_scenes(2, num_vehicles=3, num_vrus=2, red_light_x=60.0, steps=40), []
+    first.scenes["valid"][:, 2] = first.scenes["logged_valid"][:, :, 2] = False
+    second = replace(first, scenes=first.scenes.clone())
+    later = {key: second.scenes[key][:, 12:] for key in ("logged", "logged_valid", "light_state")}
+    later["logged"][..., :2] += 9.0
+    later["logged_valid"].logical_not_(), later["light_state"].fill_(LIGHT_GREEN)
+    second.scenes["route_log"][:, 1:] += 1
+    second.scenes["size"][:, 2] = second.scenes["agent_type"][:, 2] = 3
+    for scenes in (first, second):
+        ego = Meddler()
+        roll_out(scenes, torch.arange(2), torch.arange(2), torch.zeros(2), ego, traffic, SimSettings())
+        told.append(ego.told[:3])  # at steps 0, 5 and 10
+        ego.told, world = [], worlds(scenes)[1]
+        planned = world.states[:, :3, None].repeat(1, 1, HORIZON, 1)
+        Lookahead(ego, replace(world, plan=planned))(torch.arange(2), planned)
+        told[-1] += ego.told
+    for one, other in zip(*told, strict=True):
+        assert len(told[0]) == 8 and one.pop("plan") is one.pop("route") is None
+        assert not [key for key in one if not torch.equal(one[key], other[key])]
+
+
+def test_an_action_that_no_vehicle_can_take_is_refused_by_its_row():
+    class Wild(Straight):
+        def act(self, world, observation, plan):
+            return torch.tensor([[1.0, 0.1], [1e30, 0.0]])
+
+    env = make_env(make_scenes(2), 2)
+    with pytest.raises(Undrivable) as caught:
+        EgoPolicy(Wild(), env)(env.reset())
+    assert list(caught.value.rows) == [1]
+
+
+@pytest.mark.parametrize("kind", [IDMEgo, LaneGraphEgo, SamplingEgo, BitsEgo])
+def test_a_planner_of_the_package_needs_no_future(kind):
+    env, world = world_of(num_scenes=2, red_light_x=60.0)
+    env.rollout(7, EgoPolicy(kind(), env))
+    assert torch.equal(kind().plan(env.world()), kind().plan(env.world().shown()))
 
 
 @pytest.mark.parametrize("kind", [LaneGraphEgo, SamplingEgo, BitsEgo])
@@ -134,3 +205,22 @@ def test_a_red_light_is_halted_at_and_without_one_it_drives_on(kind):
     for light, low, high in ((50.0, 35.0, halts_by), (None, 55.0, 1e3)):
         _, state = driven(kind(), num_vehicles=1, num_vrus=0, red_light_x=light)
         assert low < state[0] < high and (state[3] < 2.5) == (light is not None)
+
+
+@pytest.mark.parametrize("kind", [LaneGraphEgo, SamplingEgo])
+def test_a_free_road_is_driven_at_the_limit_and_behind_a_wall_it_halts(kind):
+    for limit, speed in ((0.0, 20.0), (12.0, 12.0)):
+        data, state = driven(kind(), num_vehicles=1, num_vrus=0, limit=limit)
+        assert abs(state[3] - speed) < 0.3 and data["next", "agents", "states"][0, :, 0, 1].abs().max() < 0.05
+    data, state = driven(kind(), vehicles=[(0.0, 0, 10.0), (50.0, 0, 0.0), (50.0, 1, 0.0)], num_vrus=0)
+    assert not data["next", "terminated"].any() and state[3] < 2.0 and 20 < state[0] < 46
+
+
+def test_idm_settles_behind_a_slower_leader_and_returns_to_its_lane():
+    data, state = driven(IDMEgo(), vehicles=[(0.0, 0, 9.0), (30.0, 0, 6.0), (30.0, 1, 0.0)], limit=10.0)
+    assert not data["next", "done"][:, :-1].any() and state[3] < 7.0 and 8 < 30.0 + 8 * 6.0 - state[0] - 4.5 < 20
+    scenes = make_scenes(1, num_vehicles=1)
+    scenes.scenes["start"][0, 0, 1:3] = torch.tensor([0.8, -0.1])
+    env = worlds(scenes)[0]
+    assert env.rollout(60, EgoPolicy(IDMEgo(), env))["action"][..., 1].abs().max() < 0.3
+    assert env.world().states[0, 0, 1].abs() < 0.03

@@ -1,16 +1,18 @@
 """Checkpoints: the same prior comes back, and what does not fit is refused in a sentence."""
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+import e2rl
 from e2rl.prior.checkpoint import load_prior, save_prior
 from e2rl.prior.sde import SamplerSettings
 from e2rl.run.errors import InputError
-from e2rl.run.files import HASH
+from e2rl.run.files import HASH, read_weights
 from tests.prior.small import small_prior
 
 
@@ -23,6 +25,17 @@ def test_a_saved_prior_comes_back(tmp_path):
     for key, value in prior.state_dict().items():
         assert torch.equal(value, back.state_dict()[key])
     assert not any(parameter.requires_grad for parameter in back.parameters()) and not back.training
+
+
+@pytest.mark.parametrize("path", sorted((Path(e2rl.__file__).parent / "assets").rglob("*.safetensors")), ids=str)
+def test_weights_that_come_with_the_package_carry_the_hash_of_what_they_are(tmp_path, path):
+    with safe_open(path, "pt") as file:
+        metadata, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    assert HASH in metadata and read_weights(path)[0].keys() == tensors.keys()
+    next(value for value in tensors.values() if value.is_floating_point()).view(-1)[0] += 1e-3
+    save_file(tensors, tmp_path / path.name, metadata)
+    with pytest.raises(ValueError, match="not what was written"):
+        read_weights(tmp_path / path.name)
 
 
 def rewritten(path, change, drop=None):

@@ -47,12 +47,6 @@ def test_present_vehicles_influence_each_other():
     assert (run(net, x, level, nodes, pairs, present)[0, 3] != here[0, 3]).any()
 
 
-def test_scenes_of_a_batch_do_not_influence_each_other():
-    net, values = small_prior().denoiser, inputs()
-    alone = run(net, *(value[:1] for value in values))
-    torch.testing.assert_close(alone, run(net, *values)[:1], rtol=0, atol=1e-5)
-
-
 def test_an_untrained_denoiser_scales_x_and_a_clean_one_keeps_it():
     x, level, nodes, pairs, present = inputs()
     net = Denoiser()

@@ -64,20 +64,6 @@ def test_an_ancestral_step_is_the_posterior_given_both_ends():
     torch.testing.assert_close(noise, variance)
 
 
-def test_moving_the_clean_estimate_is_moving_the_score():
-    x, t = torch.linspace(-2, 2, 5), torch.tensor(0.5)
-    gradient = torch.sin(x)
-    x0 = denoiser(MEAN, STD)(x, t)
-    shifted = x0 - SCHEDULE.sigma(t) ** 2 / SCHEDULE.alpha(t) * gradient
-    torch.testing.assert_close(SCHEDULE.score(x, shifted, t), SCHEDULE.score(x, x0, t) - gradient)
-
-
-def test_path_kl_counts_only_steps_with_noise():
-    shift = torch.tensor([[3.0, 4.0], [1.0, 0.0]])
-    torch.testing.assert_close(path_kl(shift, torch.tensor(2.0)), torch.tensor([25.0 / 4, 1.0 / 4]))
-    assert path_kl(shift, torch.tensor(0.0)).tolist() == [0, 0]
-
-
 @pytest.mark.parametrize("data", [(MEAN, STD), TILTED], ids=["data", "tilt, exactly guided"])
 @pytest.mark.parametrize("sampler", [DDPM, DDIM_0, SDE_2M, ODE_2M, EULER])
 def test_many_steps_draw_the_data(sampler, data):

@@ -6,8 +6,7 @@ import numpy as np
 
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.scheduler import COLUMNS
-from e2rl.report.curriculum_figure import CHOICES, PICTURE, choice_map, draw_choices, grids
-from e2rl.report.drawing import image_of
+from e2rl.report.curriculum_figure import CHOICES, PICTURE, draw_choices, grids
 
 NAN = math.nan
 
@@ -37,4 +36,3 @@ def test_the_picture_is_drawn_from_the_file_of_a_run(tmp_path):
     assert lines[0] == ",".join(COLUMNS) and len(lines) == 5 and lines[1].startswith("0,1.0,pair,3,0,4,1,0.25,")
     draw_choices(tmp_path)
     assert (tmp_path / PICTURE).stat().st_size > 5000
-    assert image_of(choice_map(ROWS * 40)).size == image_of(choice_map(ROWS)).size

@@ -19,7 +19,6 @@ FLAGS = (
 )
 webdriver = pytest.importorskip("selenium.webdriver", reason="needs the extra browser")
 support = pytest.importorskip("selenium.webdriver.support.ui")
-Keys = webdriver.Keys
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(not (CHROMIUM and DRIVER), reason="no chromium and chromedriver on the path"),
@@ -35,9 +34,6 @@ const [x, y] = cameraAt(replay, time);
 const scale = Math.min(scene.width, scene.height) / metres;
 const at = [scene.width / 2 + (arguments[0] - x) * scale, scene.height / 2 - (arguments[1] - y) * scale];
 return Array.from(scene.getContext("2d").getImageData(...at, 1, 1).data.slice(0, 3));"""
-POSE_OF_THE_EGO = """const ego = page.player.replay.tracks.find(({ role }) => role === "ego");
-const { x, y, speed } = poseAt(ego, arguments[0]);
-return [x, y, speed];"""
 EGO = [0x15, 0x65, 0xD8]  # page.css
 
 
@@ -72,10 +68,6 @@ def wait_for(browser, condition):
     support.WebDriverWait(browser, 20, 0.05).until(lambda _: browser.execute_script(condition))
 
 
-def press(browser, *keys):
-    webdriver.ActionChains(browser).send_keys(*keys).perform()
-
-
 def rows_of(browser) -> list[list[str]]:
     """The cells of the index."""
     return browser.execute_script(
@@ -92,12 +84,8 @@ def failures_of(run) -> list[dict]:
     return [row for row in read_rows(run / TABLE) if is_failure(row)]
 
 
-def test_it_opens_on_the_first_weakness_without_a_complaint(run, page):
-    failures = failures_of(run)
-    assert page.get_log("browser") == []
-    assert len(rows_of(page)) == len(failures)
-    modes = page.execute_script("return page.report.failures.map(({ mode }) => mode)")
-    assert len(page.find_elements("css selector", ".mode")) == len(set(modes))
+def test_it_opens_without_a_complaint(run, page):
+    assert page.get_log("browser") == [] and len(rows_of(page)) == len(failures_of(run))
     assert len(page.find_elements("css selector", "#curves svg polyline")) >= 5  # ego, partner, driver; gaps of two
 
 
@@ -119,34 +107,13 @@ def test_the_browser_decodes_what_the_files_hold(run, page):
 def test_scrubbing_moves_the_ego_on_the_canvas(run, page):
     row = failures_of(run)[page.execute_script("return page.player.failure.number")]
     states = Rollout.read(run / ROLLOUTS / rollout_name(row)).states[:, 0]
-    between = (states[4] + states[5]) / 2
-    np.testing.assert_allclose(page.execute_script(POSE_OF_THE_EGO, 4.5), between[[0, 1, 3]], atol=0.011)
-    pictures = set()
     for step in (0, 4, 8):
         page.execute_script("page.player.seek(arguments[0])", step)
         x, y, heading, _ = states[step].tolist()
         assert page.execute_script(COLOUR_AT, x - np.cos(heading), y - np.sin(heading)) == EGO  # 1 m behind its middle
-        pictures.add(page.execute_script("return page.player.node.scene.toDataURL()"))
-        assert page.find_element("id", "clock").text.startswith(f"{step / 10:.1f} s")
-    assert len(pictures) == 3
 
 
-def test_keys_step_play_and_change_the_failure(page):
-    press(page, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_LEFT)
-    assert page.execute_script("return page.player.time") == 2
-    first = page.execute_script("return page.player.failure.number")
-    press(page, "n")
-    wait_for(page, f"return page.player.failure.number !== {first} && page.player.time === 0")
-    press(page, "p")
-    wait_for(page, f"return page.player.failure.number === {first} && page.player.time === 0")
-    page.execute_script("page.player.seek(page.player.replay.contact - 3)")
-    press(page, " ")
-    wait_for(page, "return !page.player.playing")
-    assert page.execute_script("return page.player.time === page.player.replay.contact")
-    assert page.find_element("id", "badge").text.startswith("contact at")
-
-
-def test_filters_keep_what_they_say_heads_sort_and_names_from_files_are_text(run, page):
+def test_filters_keep_what_they_say_and_names_from_files_are_text(run, page):
     heads = heads_of(page)
     side = [row for row in failures_of(run) if row["contact_type"] == "side"]
     labels = page.find_elements("css selector", "#filters label")
@@ -156,10 +123,6 @@ def test_filters_keep_what_they_say_heads_sort_and_names_from_files_are_text(run
     shown = rows_of(page)
     assert 0 < len(shown) == len(side) and {row[heads.index("Contact")] for row in shown} == {"side"}
     choice.select_by_visible_text("all")
-    for sign in (1, -1):
-        page.find_elements("css selector", "#index thead button")[heads.index("Ego [m/s]")].click()
-        speeds = [sign * float(row[heads.index("Ego [m/s]")]) for row in rows_of(page)]
-        assert speeds == sorted(speeds) and len(speeds) == len(failures_of(run))
     scenes = [row[heads.index("Scene")] for row in rows_of(page)]
     assert scenes and all(name.startswith(SCENE) for name in scenes)
     assert not page.find_elements("tag name", "img") and not page.find_elements("css selector", ".caption b")

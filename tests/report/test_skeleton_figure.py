@@ -1,14 +1,12 @@
-"""The selection of the skeleton figure: the longest chain of a run, and the rollout it belongs to."""
+"""The selection of the skeleton figure: the longest chain of a run."""
 
 import torch
 
-from e2rl.evaluation.protocol import Method, Setup, run_protocol
-from e2rl.planners.idm_planner import IDMEgo
-from e2rl.report.skeleton_figure import LongestChain, SkeletonPicture, link_risk
-from e2rl.sim.env import SimSettings
+from e2rl.evaluation.protocol import Method
+from e2rl.report.skeleton_figure import LongestChain, link_risk
 from e2rl.traffic.e2.skeleton import Selection
 from e2rl.traffic.e2.topology import TopologySettings
-from tests.traffic.e2.traffic_scenes import scenes, synthesizer
+from tests.traffic.e2.traffic_scenes import synthesizer
 
 
 def selection(*targets, seed=0, risk=0.5):
@@ -21,12 +19,8 @@ def selection(*targets, seed=0, risk=0.5):
     return Selection(*what, acts, acts, acts, target, TopologySettings())
 
 
-def listener():
-    return LongestChain(Method("e2", synthesizer(), 2.0))
-
-
 def test_links_then_members_then_risk_decide_and_the_first_of_equals_stays():
-    chain = listener()
+    chain = LongestChain(Method("e2", synthesizer(), 2.0))
     chain(selection([-1, -1, -1, -1]))
     assert chain.longest is None
     for given, seed in (
@@ -44,15 +38,3 @@ def test_the_risk_of_links_is_that_of_each_member_with_its_target():
     given = selection([-1, 0, 1, -1])
     given.weights[0, 1, 1, 0], given.weights[0, 1, 2, 1], given.weights[0, 1, 2, 0] = 0.7, 0.2, 0.99
     torch.testing.assert_close(link_risk(given), torch.tensor([[1.0, 0.9]]))
-
-
-def test_the_kept_selection_is_of_a_rollout_of_the_run(tmp_path, monkeypatch):
-    chain, scene_set = listener(), scenes(3)
-    setup = Setup(scene_set, IDMEgo(), "idm", SimSettings(), batch=2)
-    run_protocol(setup, [chain.method], [0, 4], tmp_path, only=[1, 2])
-    figures = []
-    monkeypatch.setattr(SkeletonPicture, "figure", lambda shown: figures.append(shown))
-    chain.figure(scene_set, "idm", tmp_path)
-    (shown,) = figures
-    assert shown.rollout.scene_id in scene_set.scene_id[1:] and shown.rollout.seed in (0, 4)
-    assert shown.members and shown.rollout.adversaries[shown.members].all()

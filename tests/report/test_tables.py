@@ -9,7 +9,7 @@ from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.catalogue import METRICS, table_metrics
 from e2rl.metrics.score import score_rollouts
 from e2rl.report.comparison_tables import method_tables, planner_tables, save_compared
-from e2rl.report.tables import Table, escaped, metric_tables, number, save_tables
+from e2rl.report.tables import Table, difference_cell, escaped, metric_tables, number
 from tests.metrics.random_rollouts import random_rollouts
 
 TERMS = {"e2": ("predicted", "full"), "ctg_adv": ("plan", "none"), "replay": ("", "")}
@@ -31,43 +31,18 @@ def rows():
 
 
 def test_tables_list_known_metrics_in_the_catalogue_s_order(rows):
-    means, paired = metric_tables(rows)
-    assert means.head == ["", "nominal", "e2 η=2"] and paired.head == ["", "e2 η=2"]
-    names = [row[0].split(" [")[0] for row in means.rows]
-    main = [metric.name for metric in table_metrics("main")]
-    assert names == [name for name in main if name not in ("avoidable", "transport")]
-    traffic = [row[0].split(" [")[0] for row in metric_tables(rows, table="traffic")[0].rows]
-    assert traffic == [metric.name for metric in table_metrics("traffic") if metric.name in traffic]
+    for table, absent in (("main", ("avoidable", "transport")), ("traffic", ())):
+        names = [row[0].split(" [")[0] for row in metric_tables(rows, table=table)[0].rows]
+        order = [metric.name for metric in table_metrics(table) if metric.name not in absent]
+        assert names == [name for name in order if name in names] and {*names} >= {"cfr_bg", "real"}
 
 
-def test_rates_are_per_cent_and_what_rests_on_fewer_rollouts_says_so(rows):
-    means, paired = metric_tables(rows)
-    cells = {row[0].split(" [")[0]: row[1:] for row in means.rows}
-    assert cells["cfr_bg"][1].startswith(f"{100 * rows[1]['metrics']['cfr_bg']['mean']:.1f}")
-    assert paired.rows[0][0] == "cfr [points]" and paired.rows[0][1][0] in "+-"
-    for column, row in enumerate(rows):
+def test_what_rests_on_fewer_rollouts_says_so(rows):
+    means, _ = metric_tables(rows)
+    (cells,) = (row[1:] for row in means.rows if row[0].startswith("relvel ["))
+    for cell, row in zip(cells, rows, strict=True):
         known = row["metrics"]["relvel"]["n"]
-        assert cells["relvel"][column].endswith(f"({known})") if known else cells["relvel"][column] == "–"
-
-
-def test_a_star_marks_an_interval_without_0_but_not_of_a_cost():
-    paired = {"difference": 3.0, "low": 1.0, "high": 5.0, "n": 9}
-    rows = [
-        {"method": name, "eta": 0.0, "dataset": "d", "split": "s", "ego": "idm", "n_scenes": 1, "n_seeds": 1}
-        | {"n_rollouts": 9, "metrics": {}, "paired": {"a": {"progress": paired, "nfe": paired}} if name == "b" else {}}
-        for name in "ab"
-    ]
-    (table,) = metric_tables(rows)
-    assert {row[0].split(" [")[0]: row[1][-1] for row in table.rows} == {"progress": "*", "nfe": "]"}
-
-
-def test_tables_are_saved_as_markdown(rows, tmp_path):
-    tables = [*metric_tables(rows), Table("C.", ["", "x"], [["a|b", "1"]], "Title")]
-    save_tables(tmp_path / "tables.md", tables)
-    text = (tmp_path / "tables.md").read_text()
-    table = [line for line in text.splitlines() if line.startswith("|")]
-    assert {line.count("|") for line in table[: len(tables[0].rows) + 2]} == {4}
-    assert "## Title" in text and "a&#124;b" in text
+        assert cell.endswith(f"({known})") if known else cell == "–"
 
 
 def test_numbers_keep_three_digits():
@@ -87,24 +62,18 @@ def methods():
     return method_tables(rows_of(*((name, "idm", 2.0) for name in TERMS)), TERMS, ["e2", "replay"], "The prior.")
 
 
-def test_every_method_has_a_row_with_its_terms_and_its_cost(methods):
-    means = methods[0]
-    assert [row[:3] for row in means.rows] == [
-        ["e2 η=2", "predicted", "full"],
-        ["ctg_adv η=2", "plan", "none"],
-        ["replay η=2", "–", "–"],
-    ]
-    assert "The prior." in means.caption and "6 rollouts per method" in means.caption
-
-
 def test_differences_are_paired_to_each_reference(methods):
-    """A difference to the one is the opposite of the difference from it."""
+    """A difference to the one is the opposite of the difference from it; a star marks intervals without 0."""
     means, differences = methods
+    assert [row[:3] for row in means.rows[::2]] == [["e2 η=2", "predicted", "full"], ["replay η=2", "–", "–"]]
     cfr = differences.head.index("cfr [points]")
     there, back = (differences.rows[place][cfr].split(" ")[0] for place in (1, 2))
     assert float(there) == -float(back) != 0
     pairs = [(row[0], row[3]) for row in differences.rows]
     assert pairs == [("ctg_adv η=2", "e2"), ("replay η=2", "e2"), ("e2 η=2", "replay"), ("ctg_adv η=2", "replay")]
+    progress = METRICS["progress"]
+    cells = [difference_cell(progress, {"difference": 3.0, "low": low, "high": 5.0}) for low in (1.0, -1.0)]
+    assert [cell.endswith("*") for cell in cells] == [True, False]
 
 
 def test_they_are_written_in_three_formats(methods, tmp_path):
@@ -117,16 +86,15 @@ def test_they_are_written_in_three_formats(methods, tmp_path):
     assert len(body) == 2 + 3 + 4
     assert {line.count(" & ") for line in body} == {len(table.head) - 1 for table in methods}
     assert r"cfr [\%]" in latex and r"seconds\_per\_rollout" in latex and r"$\eta$" in latex
+    assert "a&#124;b" in Table("C.", ["", "x"], [["a|b", "1"]]).markdown()
     assert escaped("a_b & 5% {x} \\ 3 m/s²") == r"a\_b \& 5\% \{x\} \textbackslash{} 3 m/s$^2$"
 
 
-def test_every_ego_has_a_row_and_a_difference_to_the_reference(tmp_path):
-    names = ["idm", "lane_graph", "actor"]
-    pairs = [("idm", "lane_graph"), ("actor", "lane_graph")]
+def test_every_ego_has_a_row_and_a_difference_to_the_reference():
+    names, pairs = ["idm", "lane_graph", "actor"], [("idm", "lane_graph"), ("actor", "lane_graph")]
     rows = rows_of(*(("e2", name, 2.0) for name in names), egos=pairs)
-    means, differences = planner_tables(rows, names, "lane_graph")
+    means, differences = planner_tables(rows, names, ["lane_graph"])
     assert [row[:2] for row in means.rows] == [[ego, "e2 η=2"] for ego in names]
     assert [row[0] for row in differences.rows] == ["idm", "actor"]
     difference = rows[0]["paired"]["ego lane_graph"]["cfr"]["difference"]
     assert differences.rows[0][differences.head.index("cfr [points]")].startswith(f"{100 * difference:+.1f}"[:4])
-    assert {f"{side}{of} [%]" for side in ("front", "side", "rear") for of in ("", "_any")} <= set(means.head)

@@ -1,6 +1,7 @@
 """A command that is interrupted, killed or out of disk ends soon, leaves no process, and says how to go on."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -8,7 +9,9 @@ import time
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
@@ -65,16 +68,27 @@ def test_an_interrupted_command_leaves_no_process(tmp_path, method, how):
         assert said.strip() == f"interrupted ({name}); go on with: do it again"
 
 
-def test_a_full_disk_ends_with_the_file_and_how_to_go_on(capsys):
+def unconfigured():
+    raise ValueError("Unable to configure handler 'file'") from PermissionError(13, "Permission denied", "runs/log")
+
+
+@pytest.mark.parametrize(
+    ("fail", "told"),
+    [
+        (lambda: os.write(os.open("/dev/full", os.O_WRONLY), b"x"), "a file: cannot be written (No space left"),
+        (lambda: Path("/dev/null/x").mkdir(), "/dev/null/x: cannot be written (Not a directory)"),
+        (lambda: Path("/dev/null").mkdir(), "/dev/null: cannot be written (File exists)"),
+        (unconfigured, "runs/log: cannot be written (Permission denied)"),
+        (lambda: torch.empty(2**48, dtype=torch.uint8), "out of memory"),
+        (lambda: np.empty(2**50, np.uint8), "out of memory"),
+    ],
+)
+def test_a_disk_or_memory_that_is_full_ends_in_one_line_with_how_to_go_on(capsys, fail, told):
     with pytest.raises(SystemExit) as stopped, ending(lambda: "run x again"):
-        raise OSError(28, "No space left on device", "runs/1/file")
-    assert stopped.value.code == 1
+        fail()
     said = capsys.readouterr().err.strip()
-    assert said.startswith("error: runs/1/file: cannot be written (No space left on device)") and "\n" not in said
-    assert said.endswith("then go on with: run x again")
-    with pytest.raises(SystemExit), ending(lambda: "run x again"):
-        raise ValueError("Unable to configure handler 'file'") from PermissionError(13, "Permission denied", "runs/log")
-    assert "error: runs/log: cannot be written (Permission denied)" in capsys.readouterr().err
+    assert stopped.value.code == 1 and said.startswith(f"error: {told}") and "\n" not in said
+    assert said.endswith("go on with: run x again")
 
 
 def test_bad_input_ends_with_its_message_and_other_errors_pass(capsys):
@@ -104,10 +118,22 @@ def test_an_interrupt_that_a_library_turns_into_an_error_of_its_own_is_one(capsy
     assert capsys.readouterr().err.strip() == told
 
 
-def test_before_a_command_begins_an_interrupt_is_one_line():
-    code = "import e2rl.commands.cli, os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(5)"
-    heed = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
-    done = subprocess.run([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, preexec_fn=heed, timeout=60)
-    assert (
-        done.returncode == 130 and done.stderr.strip().count("\n") == 0 and "run the same command again" in done.stderr
-    )
+@pytest.mark.parametrize(
+    ("code", "status", "told"),
+    [
+        ("import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(5)", 130, "run the same command"),
+        ("", 1, "name a writable folder by TMPDIR"),
+    ],
+)
+def test_what_ends_a_command_before_it_begins_is_one_line(code, status, told):
+    """An interrupt; a disk on which nothing can be written."""
+
+    def heed():
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        if not code:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+
+    command = [sys.executable, "-c", f"import e2rl.commands.cli; {code}"]
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, preexec_fn=heed, timeout=60)
+    assert done.returncode == status and done.stderr.strip().count("\n") == 0 and told in done.stderr

@@ -1,12 +1,15 @@
 """Parts that are done are read, whole and of what is asked for, or done again; a stranger's file runs nothing."""
 
+import hashlib
+import io
 import os
 import random
+import zipfile
 
 import pytest
 import torch
 
-from e2rl.run.parts import Parts, state_bytes
+from e2rl.run.parts import HASHED, Parts, state_bytes
 
 VALUE = ([{"cfr": 1.0, "seed": 3, "duty": ""}], [{"speed": torch.arange(3.0)}], [])
 
@@ -75,3 +78,30 @@ def test_a_strangers_part_runs_nothing(tmp_path, file):
     part = {"format": "e2rl-part/1", "about": "", "identity": [1], "value": Malicious(tmp_path / "ran")}
     file.write_bytes(state_bytes(part))
     assert Parts(tmp_path).load("a", [1]) is None and not (tmp_path / "ran").exists()
+
+
+def packed():
+    """A part that grows a thousandfold as it is read."""
+    content, small = io.BytesIO(), io.BytesIO()
+    torch.save({"format": "e2rl-part/1", "about": "", "identity": [1], "value": torch.zeros(10**6)}, content)
+    with zipfile.ZipFile(content) as full, zipfile.ZipFile(small, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in full.namelist():
+            archive.writestr(name, full.read(name))
+    return HASHED + hashlib.sha256(small.getvalue()).digest() + small.getvalue()
+
+
+def test_a_part_that_grows_as_it_is_read_is_none(tmp_path, file):
+    part = {"format": "e2rl-part/1", "about": "", "identity": [1]}
+    for content in (packed(), state_bytes(part | {"value": torch.zeros(1).expand(2**20, 2**20)})):
+        assert len(content) < 10**5
+        file.write_bytes(content)
+        assert Parts(tmp_path).load("a", [1]) is None
+
+
+def test_a_part_is_a_file_of_the_run_s_folder(tmp_path, file):
+    elsewhere = file.rename(tmp_path.parent / f"{tmp_path.name}.pt")
+    file.symlink_to(elsewhere)
+    assert Parts(tmp_path).load("a", [1]) is None
+    file.unlink()
+    os.mkfifo(file)
+    assert computes(Parts(tmp_path)) and not computes(Parts(tmp_path))

@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from omegaconf import OmegaConf
@@ -9,13 +10,14 @@ from omegaconf import OmegaConf
 from e2rl.commands.merge import merge
 from e2rl.prior.checkpoint import save_prior
 from e2rl.run import run as runs
+from e2rl.run.command import new_folder
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
 from e2rl.run.files import seal
 from e2rl.run.run import PROVENANCE, Run, assigned, inputs, origin_of, read_provenance
 from e2rl.run.trust import CONFIG
 from tests.prior.small import small_prior
-from tests.scripts import call, error_line, left_behind
+from tests.scripts import call, error_line
 
 SCENES = {"scenes": ("scene_id\na\n", "abc")}
 
@@ -102,14 +104,41 @@ def test_a_damaged_file_is_named(tmp_path, content):
         begin(tmp_path, resume=True)
 
 
-def test_a_second_run_in_the_same_folder_is_refused(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("name", ["thesis.tex", "metrics.json", "parts/a.pt", PROVENANCE])
+def test_a_new_run_begins_in_an_empty_folder(tmp_path, name):
+    """Logs may be there, and what was left where a run was killed as it began."""
+    config = load_config("evaluate")
+    for own in ("job.log", "job.err", str(CONFIG), "scenes.csv"):
+        (tmp_path / own).parent.mkdir(exist_ok=True)
+        (tmp_path / own).write_text("")
+        Run(config, tmp_path, {}).enter()
+    (tmp_path / CONFIG).unlink()
+    (tmp_path / CONFIG).parent.rmdir()
+    (tmp_path / "scenes.csv").unlink()
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(InputError, match="name another folder by hydra.run.dir=FOLDER"):
+        Run(config, tmp_path, {}).enter()
+
+
+def test_a_run_that_is_refused_leaves_everything_as_it_was(tmp_path, monkeypatch, capsys):
     begin(tmp_path / "run")
     before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    monkeypatch.chdir(tmp_path)
     for script in ("evaluate.py", "train.py"):
         status, said = call(script, [f"hydra.run.dir={tmp_path / 'run'}"], monkeypatch, capsys)
         assert status == 2 and f"has a run already; go on with it by resume={tmp_path / 'run'}" in error_line(said)
-    after = {path: path.read_bytes() for path in before}
-    assert after == before and len(left_behind(tmp_path / "run")) == 2
+        assert call(script, ["batch=0"], monkeypatch, capsys)[0] == 2
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_runs_that_begin_in_one_second_have_a_folder_each(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with ThreadPoolExecutor(8) as pool:
+        made = list(pool.map(new_folder, ["runs/x"] * 40))
+    assert len(set(made)) == 40 and all(not list((tmp_path / name).iterdir()) for name in made)
+    (tmp_path / "file").touch()
+    assert new_folder("file/x").startswith("file/x/"), "Hydra says that it cannot be made"
 
 
 def test_options_for_hydra_and_the_shell_are_quoted(tmp_path, monkeypatch):

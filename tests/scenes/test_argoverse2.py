@@ -1,12 +1,14 @@
 """Argoverse 2's own files: what scenarios and sensor logs say arrives in the Recording, in city coordinates."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from e2rl.run.errors import InputError
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import OTHER, PEDESTRIAN, VEHICLE
 
@@ -15,7 +17,7 @@ import pandas as pd  # noqa: E402
 from av2.datasets.motion_forecasting import data_schema as schema  # noqa: E402
 from av2.datasets.motion_forecasting.scenario_serialization import serialize_argoverse_scenario_parquet  # noqa: E402
 
-from e2rl.scenes.argoverse2 import AHEAD, EGO_SIZE, Argoverse2Source
+from e2rl.scenes.argoverse2 import AHEAD, EGO_SIZE, MAX_ROWS, Argoverse2Source
 
 RECORDED = Path(__file__).parents[3] / "shared" / "data" / "av2"
 FRAMES = 110
@@ -147,6 +149,51 @@ def test_boxes_of_a_sensor_log_stand_where_the_vehicle_saw_them(tmp_path):
     assert np.allclose(recording.states[:, 2], [50, 30, 0, 0], atol=1e-6)
     assert recording.size.tolist() == [list(EGO_SIZE), [4.4, 1.8], [0.6, 0.5]]
     assert recording.agent_type.tolist() == [VEHICLE, VEHICLE, PEDESTRIAN]
+
+
+def in_map(change):
+    def apply(folder: Path) -> None:
+        (file,) = folder.glob("log_map_archive_*.json")
+        parts = json.loads(file.read_text())
+        change(parts)
+        file.write_text(json.dumps(parts))
+
+    return apply
+
+
+def many_rows(folder: Path) -> None:
+    (file,) = folder.glob("*.parquet")
+    table = pd.read_parquet(file)
+    pd.concat([table] * (MAX_ROWS // len(table) + 1)).to_parquet(file)
+    assert file.stat().st_size < 1e6
+
+
+def pipe(folder: Path) -> None:
+    (file,) = folder.glob("*.parquet")
+    file.unlink()
+    os.mkfifo(file)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (many_rows, "rows of 17 columns, unpacked .* cut it"),
+        (pipe, "cannot be read: no regular file"),
+        (
+            in_map(lambda parts: [part.update(x="a") for part in parts["drivable_areas"]["9"]["area_boundary"]]),
+            "is none",
+        ),
+        (in_map(lambda parts: parts["lane_segments"]["1"]["left_lane_boundary"][0].update(x="a")), "is none of"),
+        (
+            in_map(lambda parts: parts["lane_segments"].update({str(k): segment(k, (0, 5), 0) for k in range(9, 999)})),
+            "lanes begin at one place",
+        ),
+    ],
+)
+def test_what_would_cost_much_or_is_of_another_type_is_refused(tmp_path, change, message):
+    change(write_scenario(tmp_path) / "made")
+    with pytest.raises(InputError, match=rf"made/scenario_made\.parquet: .*{message}"):
+        Argoverse2Source(str(tmp_path), cache=str(tmp_path / "cache"), workers=1).load()
 
 
 def test_a_folder_of_both_kinds_makes_scenes(tmp_path):

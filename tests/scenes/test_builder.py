@@ -103,14 +103,6 @@ def test_the_way_driven_is_found_and_is_the_mission():
     assert scene["route_points"][1, follower, 40:, 1].abs().max() < 0.1  # that one went straight on
 
 
-def test_of_two_routes_at_one_place_the_one_of_its_heading_is_driven():
-    cross = np.array([60.0, 0.05]) + np.outer([-40, 60], [np.cos(0.6), np.sin(0.6)])
-    stands = track([60.0, 0.0], 0.5, 0.0)
-    scene = build({"ego": straight(20, 0, 8), "7": stands}, fork() | {"cross": lane(cross)})
-    x, y = (scene["route_points"][1, scene["route_log"][1], [8, 12]].diff(dim=0))[0]
-    assert torch.atan2(y, x).item() == pytest.approx(0.6, abs=0.01)
-
-
 @pytest.mark.parametrize(("y_end", "more"), [(7.0, 120.0), (-12.0, 0.0)])
 def test_a_mission_without_lane_is_the_recorded_way_and_ends_with_what_is_known(y_end, more):
     scene = build({"ego": lane_change(y_end)}, fork() | {"second": lane([[0, 7], [207, 7]])})
@@ -137,23 +129,6 @@ def test_limits_and_lights_lie_on_the_route():
     straight_on = next(r for r in range(6) if scene["route_points"][0, r, -1, 0] > 200)
     assert scene["route_limit"][0, straight_on, 10].item() == pytest.approx(50 / 3.6, abs=1e-3)
     assert scene["route_limit"][0, straight_on, 80].item() == pytest.approx(20, abs=1e-3)
-
-
-def test_a_light_close_ahead_counts_where_the_map_begins_at_the_vehicle():
-    full = description({"ego": straight(-6.4, 0, 8)})
-    full["map_features"]["before"] = full["map_features"]["in"] | {
-        "polyline": np.array([[0.0, 0], [8, 0]]),
-        "width": np.zeros((0, 2)),
-        "exit_lanes": ["next"],
-    }
-    full["map_features"]["next"] = full["map_features"]["on"] | {"polyline": np.array([[8.0, 0], [300, 0]])}
-    del full["map_features"]["in"], full["map_features"]["near"]
-    full["dynamic_map_states"] = {"next": {"state": {"object_state": ["LANE_STATE_STOP"]}}}
-    scene = build_scene(recording_of(full), SETTINGS)
-    slot = int(scene["route_log"][0])
-    own = project(scene["start"][None, 0, :2], scene["route_points"][0, slot])[0].item()
-    assert own < 3 and scene["route_light"][0, slot, 0] == 0
-    assert scene["route_light_s"][0, slot, 0].item() - own == pytest.approx(6.4, abs=0.6)
 
 
 def test_only_vehicles_that_stand_beside_the_lanes_are_parked():
@@ -189,9 +164,7 @@ def test_overlap_with_the_ego_is_seen_and_only_that():
     [
         (lambda r: setattr(r, "ego", 2), "the ego is a pedestrian"),
         (lambda r: setattr(r, "current", 90), "start frame 90"),
-        (lambda r: r.valid.__setitem__((10, 0), False), "not recorded"),
         (lambda r: r.states.__setitem__((40, 1, 0), np.nan), "NaN or infinite state of agent 1 at frame 40"),
-        (lambda r: r.drivable.append(np.full((3, 2), np.nan)), "drivable polygon"),
         (lambda r: [setattr(each, "points", each.points[:1]) for each in r.lanes.values()], "no lane is at least"),
     ],
 )

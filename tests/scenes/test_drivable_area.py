@@ -56,11 +56,6 @@ def test_polygons_and_lanes_together(seed):
     compare([], [], [star, notched])
 
 
-def test_nothing_is_drivable_on_an_empty_map():
-    field, origin = drivable_field([], np.zeros(0), [], np.zeros(2), 11)
-    assert (field == FAR).all() and origin.tolist() == [-5.0, -5.0]
-
-
 def test_bilinear_is_exact_on_planes():
     cells = torch.arange(20.0)
     plane = 0.1 * cells[:, None] - 0.2 * cells[None] + 1.0

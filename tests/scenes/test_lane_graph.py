@@ -7,17 +7,8 @@ import pytest
 import torch
 from shapely.geometry import LineString, Point
 
-from e2rl.scenes.lane_graph import (
-    SAME_GAP,
-    START_ANGLE,
-    START_RADIUS,
-    LaneGraph,
-    against_lanes,
-    infer_exits,
-    plausible_width,
-)
+from e2rl.scenes.lane_graph import LaneGraph, against_lanes, infer_exits
 from e2rl.scenes.log_route import MARGIN, route_from_log
-from e2rl.scenes.paths import resample
 from e2rl.scenes.recording import Lane
 from e2rl.scenes.route import SPACING
 
@@ -44,16 +35,6 @@ def ways(graph: LaneGraph, x: float, speed: float = 8.0, y: float = 0.0, heading
 @pytest.mark.parametrize("x", [40.0, 60.0, 95.0])
 def test_every_branch_is_a_candidate_from_anywhere_on_the_lane(x):
     assert ways(LaneGraph(lanes()), x) == [("in", "on"), ("in", "left")]
-
-
-def test_of_many_branches_those_of_the_nearest_forks_come_first():
-    row, ids = {}, [f"s{k}" for k in range(7)]
-    for k, name in enumerate(ids):
-        start = np.array([30.0 * k, 0.0])
-        row[name] = Lane(np.array([start, start + [30, 0]]), exits=[f"t{k}", *ids[k + 1 : k + 2]])
-        row[f"t{k}"] = Lane(np.array([start + [30, 0], start + [40, 10 + k], start + [45, 300]]))
-    turns = [way[-1] for way in ways(LaneGraph(row), 5.0, speed=20.0)]
-    assert turns == ["t6", "t0", "t1", "t2"]  # the straightest way on, then the turns in the order of the road
 
 
 def test_a_route_follows_its_lanes_and_ends_where_the_map_does():
@@ -122,73 +103,6 @@ def test_connectivity_is_inferred_from_geometry_and_heights():
     assert no_heights["a"] == ["b"]
     doubled = {"a": Lane(np.array([[0.0, 5], [0, 50], [0, 50]])), "b": Lane(np.array([[0.0, 50], [0, 50], [0, 90]]))}
     assert infer_exits(doubled) == {"a": ["b"], "b": []}
-
-
-def test_lanes_too_short_are_left_out_and_widths_doubted():
-    assert LaneGraph(lanes(dot=Lane(np.zeros((1, 2))), stub=Lane(np.array([[0.0, 0], [0.3, 0]])))).ids == [
-        "in",
-        "on",
-        "left",
-    ]
-    assert [plausible_width(w) for w in (0.0, float("nan"), 2.5, 3.2, 6.0, 90.0)] == [3.7, 3.7, 2.5, 3.2, 6.0, 3.7]
-    points = resample(np.array([[0.0, 0], [0, 3], [4, 3]]), 1.0)
-    assert len(points) == 8 and np.allclose(points[3], [0, 3])
-
-
-def test_lanes_near_a_pose_are_told_best_first_with_their_arc_lengths():
-    """2.5 m of distance weigh as much as 1 rad of heading."""
-    rows = {
-        "low": Lane(np.array([[0.0, 0.0], [40.0, 0.0]])),
-        "high": Lane(np.array([[-20.0, 3.0], [40.0, 3.0]])),
-        "cross": Lane(np.array([[20.0, 1.0], [20.0 + 40 * np.cos(0.5), 1.0 + 40 * np.sin(0.5)]])),
-        "back": Lane(np.array([[40.0, 0.0], [0.0, 0.0]])),
-    }
-    graph = LaneGraph(rows)
-    assert graph.near_lanes(np.array([20.0, 1.0]), 0.0) == [("low", 20.0), ("cross", 0.0), ("high", 40.0)]
-    assert [name for name, _ in graph.near_lanes(np.array([20.0, 1.0]), 0.5)][0] == "cross"
-    assert [name for name, _ in graph.near_lanes(np.array([20.0, 1.2]), np.pi)] == ["back"]
-    only = LaneGraph({"low": rows["low"]})
-    for y, heading, near in ((START_RADIUS - 0.01, 0, 1), (START_RADIUS + 0.01, 0, 0), (0, START_ANGLE - 0.01, 1)):
-        assert len(only.near_lanes(np.array([20.0, y]), heading)) == near
-    assert not only.near_lanes(np.array([20.0, 0.0]), START_ANGLE + 0.01)
-
-
-def test_of_several_lanes_before_one_the_straightest_is_behind_as_far_as_asked():
-    bend = np.linspace(-np.pi / 2, 0, 30)
-    rows = {
-        "straight": Lane(np.array([[-30.0, 0.0], [0.0, 0.0]]), exits=["on"]),
-        "first": Lane(np.array([[-60.0, 0.0], [-30.0, 0.0]]), exits=["straight"]),
-        "bent": Lane(np.stack([30 * np.cos(bend) - 30, 30 * np.sin(bend)], 1)[::-1] * [1, -1], exits=["on"]),
-        "on": Lane(np.array([[0.0, 0.0], [50.0, 0.0]])),
-    }
-    graph = LaneGraph(rows)
-    assert graph.behind("on", 30.0) == ["straight"] and graph.behind("on", 30.5) == ["first", "straight"]
-    assert graph.behind("on", 0.0) == [] and graph.behind("first", 10.0) == []
-    assert graph.bend("bent") == pytest.approx(np.pi / 2, abs=0.1) and graph.bend("straight") == 0
-    left = LaneGraph(lanes())
-    assert left.turn("in", "left") == pytest.approx(np.pi / 2, abs=1e-6) and left.turn("in", "on") == 0
-
-
-@pytest.mark.parametrize(("apart", "count"), [(SAME_GAP - 0.01, 1), (SAME_GAP + 0.01, 2)])
-def test_routes_are_one_where_they_are_nowhere_farther_apart_than_the_gap(apart, count):
-    pair = {str(k): Lane(np.array([[0.0, k * apart], [400.0, k * apart]])) for k in range(2)}
-    assert len(LaneGraph(pair).candidates(np.array([50.0, 0.0]), 0.0, 8.0, 6, 150)) == count
-
-
-@pytest.mark.parametrize("speed", [0.0, 4.0, 8.0])
-def test_forks_count_that_a_vehicle_reaches_in_five_seconds(speed):
-    reach = min(max(5 * speed + 25, 40), 120)
-    end = 20 * np.ceil((60 + reach) / 20)  # in steps of BUCKET
-
-    def routes(fork):
-        rows = {
-            "in": Lane(np.array([[0.0, 0], [fork, 0]]), exits=["on", "off"]),
-            "on": Lane(np.array([[fork, 0.0], [fork + 300, 0]])),
-            "off": Lane(np.array([[fork, 0.0], [fork + 10, 15], [fork + 10, 300]])),
-        }
-        return len(LaneGraph(rows).candidates(np.array([60.0, 0.0]), 0.0, speed, 6, 150))
-
-    assert routes(end - 1.0) == 2 and routes(end + 1.0) == 1
 
 
 def lane_change() -> np.ndarray:

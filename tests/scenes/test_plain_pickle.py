@@ -16,7 +16,7 @@ from e2rl.run.errors import InputError
 from e2rl.scenes import plain_pickle
 from e2rl.scenes.plain_pickle import load_plain
 from e2rl.scenes.scenarionet import safe_load
-from tests.scenes.descriptions import Malicious, description
+from tests.scenes.descriptions import Malicious
 
 
 def objects(parts: list) -> np.ndarray:
@@ -75,12 +75,6 @@ def same(ours, theirs) -> bool:
 def test_plain_data_of_every_protocol_is_what_pickle_reads(data, protocol):
     content = pickle.dumps(data, protocol)
     assert same(load_plain(content), pickle.loads(content))
-
-
-def test_what_two_places_share_is_one_object():
-    shared = {"x": [1.0]}
-    found = load_plain(pickle.dumps({"a": shared, "b": shared}))
-    assert found["a"] is found["b"]
 
 
 def deep_tuple(depth: int) -> bytes:
@@ -212,24 +206,3 @@ def test_limits_stop_long_programs(monkeypatch):
 def test_bytes_that_are_no_truth_values_count_as_true():
     found = load_plain(array(b"K\x03\x85", b"b1", b"C\x03\x00\x01\x07") + b".")
     assert found.tolist() == [False, True, True] and found.view(np.uint8).tolist() == [0, 1, 1]
-
-
-GENUINE = [pickle.dumps(description(), protocol) for protocol in (0, 2, 4, 5)]
-
-
-@settings(max_examples=300, deadline=None)
-@given(
-    st.sampled_from(GENUINE),
-    st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=8),
-    st.floats(0.5, 1),
-)
-def test_damaged_bytes_are_read_or_refused_by_name(content, changes, kept):
-    damaged = bytearray(content[: int(kept * len(content)) or 1])
-    for where, value in changes:
-        damaged[int(where * len(damaged))] = value
-    try:
-        found = safe_load(bytes(damaged), "made.pkl")
-    except InputError as error:
-        assert str(error).startswith("made.pkl: ")
-    else:
-        assert isinstance(found, dict)

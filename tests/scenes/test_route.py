@@ -75,13 +75,6 @@ def test_leading_dims_broadcast_and_a_hint_chooses_the_pass():
     assert abs(project(here, loop, torch.tensor([145.0]))[0].item() - 20.0 - 40 * torch.pi) < 0.1
 
 
-def test_a_hint_keeps_to_its_window_at_both_ends_of_a_route():
-    route = torch.stack([SPACING * torch.arange(40.0), torch.zeros(40)], -1)
-    points = torch.tensor([[30.0, 1.0], [48.0, 1.0]])
-    s, _, _ = project(points, route, hint=torch.tensor([0.0, 78.0]), window=20.0)
-    assert s.tolist() == [22.0, 56.0]  # the ends of the segments that meet at the last vertex within the window
-
-
 def test_interpolation_differentiates():
     route = wavy(5)
     s = torch.tensor([11.3, 47.9], dtype=torch.float64, requires_grad=True)

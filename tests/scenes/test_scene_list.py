@@ -28,7 +28,7 @@ def scenes_of(count=4):
             index.add(f"s{k}", "place", scene)
             yield scene
 
-    return replace(uncached(build), digests=[], files="f" * 64)
+    return replace(uncached(build), files="f" * 64)
 
 
 def written(folder, text):

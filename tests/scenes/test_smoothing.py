@@ -42,23 +42,6 @@ def test_the_start_state_is_blind_to_the_future_and_to_gaps_before():
     assert all(np.allclose(a, b, atol=1e-4) for a, b in zip(before, after, strict=True))
 
 
-@pytest.mark.parametrize("known", [1, 2, 3, 4, 5])
-def test_short_histories_stay_finite_and_tell_an_acceleration_from_five_frames_on(known):
-    states, valid = accelerating(), np.zeros((40, 1), bool)
-    valid[21 - known : 21] = True
-    start, accel, yaw_rate = causal_state(states, valid, 20)
-    assert np.isfinite(start).all() and np.isfinite(accel).all() and np.isfinite(yaw_rate).all()
-    assert np.isclose(accel[0], 1.5 if known >= 5 else 0.0, atol=1e-3)
-    if known > 1:
-        assert abs(start[0, 3] - 7.0) < 0.5
-
-
-@pytest.mark.parametrize(("speed", "accel"), [(1.0, 1.0), (0.15, 1.0), (0.05, 0.0)])
-def test_who_stands_does_not_accelerate(speed, accel):
-    found = causal_state(accelerating(speed=speed - 2.0, accel=1.0), np.ones((40, 1), bool), 20)
-    assert np.isclose(found[0][0, 3], speed, atol=1e-3) and np.isclose(found[1][0], accel, atol=1e-3)
-
-
 def test_the_past_is_seen_from_the_present_and_blind_to_the_future_and_to_gaps_before():
     states, valid, speed = accelerating(), np.ones((40, 1), bool), np.array([7.0])
     back = np.arange(1, 11) * 0.1

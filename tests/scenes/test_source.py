@@ -3,7 +3,7 @@
 import os
 import pickle
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -173,6 +173,34 @@ def test_an_outside_source_is_named_by_its_class_and_takes_part_in_all(tmp_path)
         load_scenes(config | {"path": "nowhere"})
     with pytest.raises(InputError, match="data.lane_width=wide"):
         load_scenes(config | {"lane_width": "wide"})
+
+
+@pytest.mark.parametrize("what", ["scene_id", "location", "dataset"])
+@pytest.mark.parametrize("name", ["a\ud800", "a\x1b[2J", "a\nb", "a\u202eb", "x" * 129, 7, None])
+def test_names_that_no_file_table_or_terminal_can_hold_are_refused_whatever_the_source(tmp_path, what, name):
+    class Named(Mended):
+        def read(self, log):
+            yield replace(next(SpeedSource.read(self, log)), **{what: name})
+
+    (tmp_path / "a.txt").write_text("5.0")
+    with pytest.raises(InputError, match=rf"^a\.txt: its {what} .* is no line of 128 printable characters") as caught:
+        Named(str(tmp_path), cache=str(tmp_path), workers=1).load()
+    assert str(caught.value).isprintable() and str(caught.value).isascii()
+
+
+@pytest.mark.parametrize("part", ["lane", "ring"])
+@pytest.mark.parametrize(
+    "points", [np.array([["0", "0"], ["9", "0"]]), np.zeros(3), np.array([[None, 1], [2, 3]]), np.full((3, 2), np.nan)]
+)
+def test_maps_of_other_points_than_numbers_are_refused_whatever_the_source(tmp_path, part, points):
+    class Drawn(Mended):
+        def read(self, log):
+            made = next(SpeedSource.read(self, log))
+            yield replace(made, lanes={"road": Lane(points)}) if part == "lane" else replace(made, drivable=[points])
+
+    (tmp_path / "a.txt").write_text("5.0")
+    with pytest.raises(InputError, match=r"^a\.txt: scene .* is not a list of finite points"):
+        Drawn(str(tmp_path), cache=str(tmp_path), workers=1).load()
 
 
 class Torn(SpeedSource):

@@ -32,12 +32,6 @@ def test_constant_acceleration_is_exact():
     assert torch.allclose(states[:, 0], 2 * t + 0.75 * t**2, atol=1e-4)
 
 
-def test_a_step_is_a_rollout_of_one():
-    start, actions = random_case()
-    start, action = start.float(), actions[:, 0].float()
-    assert torch.equal(dynamics.step(start, action), dynamics.rollout(start, action[:, None])[:, 0])
-
-
 def test_rollout_equals_recursion_with_clipped_speeds():
     start, actions = random_case()
     parallel = dynamics.rollout(start, actions)
@@ -113,3 +107,18 @@ def test_what_is_seen_lasts_a_while_then_speed_and_heading_stay():
     torch.testing.assert_close(arc[1:, 2], torch.full((3,), 1.0))
     assert arc[0, 2].item() == pytest.approx(0.55)
     torch.testing.assert_close((arc[3, :2] - arc[2, :2]).norm(), torch.tensor(12.0))
+
+
+@pytest.mark.parametrize(
+    ("offset", "closing", "cost"),
+    [
+        ((10, 0), (-5, 0), 0.1353),
+        ((10, 1), (-5, 0), 0.0821),
+        ((5, 0), (-10, 0), 0.8825),
+        ((10, 0), (5, 0), 0.0),
+        ((40, 3), (0, 0), 0.0),
+    ],
+)
+def test_the_cost_of_the_closest_approach_has_its_published_values(offset, closing, cost):
+    found = dynamics.closest_approach_cost(torch.tensor(offset).double(), torch.tensor(closing).double())
+    assert found.item() == pytest.approx(cost, abs=1e-4)

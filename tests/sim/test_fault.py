@@ -1,5 +1,7 @@
 """A contact is of the ego's own making where it moves and its front, or a standing agent, is hit."""
 
+import math
+
 import pytest
 import torch
 
@@ -31,9 +33,8 @@ def judged(ego, others):
 )
 def test_own_fault_by_place_and_speed(place, speed, other_speed, expected):
     for heading in (0.0, 2.0):  # whichever way the ego looks
-        turn = torch.tensor([[torch.tensor(heading).cos(), -torch.tensor(heading).sin()]])
-        turn = torch.cat([turn, turn.flip(1) * torch.tensor([[-1.0, 1.0]])])
-        there = turn @ torch.tensor(place) + torch.tensor([10.0, -5.0])
+        cos, sin = math.cos(heading), math.sin(heading)
+        there = torch.tensor([[cos, -sin], [sin, cos]]) @ torch.tensor(place) + torch.tensor([10.0, -5.0])
         ego = torch.tensor([[10.0, -5.0, heading, speed]])
         others = torch.tensor([[[*there.tolist(), heading, other_speed], [60.0, 60.0, 0.0, 5.0]]])
         assert judged(ego, others).tolist() == [expected]

@@ -11,14 +11,12 @@ LENGTH, WIDTH = 4.0, 2.0
 DRIVER = IDMParameters(headway=1.0, standstill_gap=5.0, acceleration=1.0, braking=3.0)
 
 
-def lead(agents, vehicles=1, present=None, size=None):
-    """Leaders of the first `vehicles` of agents (x, y, heading, speed), all on the x axis as their route."""
+def lead(agents):
+    """Leaders of the first of agents (x, y, heading, speed), whose route is the x axis."""
     agents = torch.tensor(agents, dtype=torch.float32)[None]
-    size = torch.tensor([LENGTH, WIDTH]).expand(1, agents.shape[1], 2) if size is None else size
-    present = torch.ones(agents.shape[:2], dtype=torch.bool) if present is None else present
-    points = arc(0.0, 0.0, 0.0, 0.0)[None, None].expand(1, vehicles, -1, -1)
-    s = agents[:, :vehicles, 0] + 20.0
-    return tuple(value[0] for value in leaders(s, points, agents, size, present))
+    size, present = torch.tensor([LENGTH, WIDTH]).expand(1, agents.shape[1], 2), torch.ones(agents.shape[:2]).bool()
+    found = leaders(agents[:, :1, 0] + 20.0, arc(0.0, 0.0, 0.0, 0.0)[None, None], agents, size, present)
+    return tuple(value[0] for value in found)
 
 
 def test_the_gap_is_between_bumpers_of_the_nearest():
@@ -26,32 +24,10 @@ def test_the_gap_is_between_bumpers_of_the_nearest():
     assert gap.item() == pytest.approx(18 - LENGTH) and speed.item() == pytest.approx(7) and index.item() == 2
 
 
-def test_those_behind_beside_absent_or_identical_do_not_lead():
-    present = torch.tensor([[True, True, True, False]])
-    gap, _, _ = lead([(0, 0, 0, 9), (-5, 0, 0, 9), (12, 3.5, 0, 9), (12, 0, 0, 9)], present=present)
-    assert gap.item() == FREE_GAP
-
-
 def test_a_vehicle_across_the_lane_leads_with_its_side_and_stands_along_it():
     gap, speed, _ = lead([(0, 0, 0, 9), (20, 2.0, torch.pi / 2, 5)])
     assert gap.item() == pytest.approx(20 - LENGTH / 2 - WIDTH / 2, abs=1e-4)
     assert speed.item() == pytest.approx(0, abs=1e-4)
-
-
-def test_everyone_of_a_queue_follows_the_next():
-    gap, _, index = lead([(0, 0, 0, 5), (10, 0, 0, 5), (20, 0, 0, 5)], vehicles=3)
-    assert index[:2].tolist() == [1, 2] and gap.tolist() == pytest.approx([6, 6, FREE_GAP])
-
-
-def test_whoever_is_between_a_vehicle_and_its_route_is_ahead_too():
-    points = torch.stack([2.0 * torch.arange(60), torch.zeros(60)], -1).expand(1, 2, 60, 2)
-    agents = torch.tensor([[[20.0, 3.5, 0.0, 10.0], [40.0, 3.5, 0.0, 4.0]]])
-    size, present = torch.tensor([4.0, 2.0]).expand(1, 2, 2), torch.ones(1, 2, dtype=torch.bool)
-    s = agents[..., 0]
-    on_route = leaders(s, points, agents, size, present)
-    changing = leaders(s, points, agents, size, present, agents[..., 1])
-    assert on_route[0][0, 0] == FREE_GAP
-    assert torch.isclose(changing[0][0, 0], torch.tensor(16.0)) and changing[1][0, 0] == 4.0
 
 
 def all_pairs(s, points, agents, size, present, d, margin, free_gap):

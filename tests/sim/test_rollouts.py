@@ -107,7 +107,7 @@ def test_lines_too_short_to_be_lines_are_left_out():
 
 def test_names_that_no_path_may_hold_are_mended(tmp_path, rollouts):
     path = rollouts[:1].replace(scene_id=["a/../b c"]).to_npz(tmp_path)[0]
-    assert path.parent == tmp_path and path.name == "e2__idm__2__a-..-b-c__0.npz"
+    assert path.parent == tmp_path and path.name.startswith("e2__idm__2__a-..-b-c__0~")
     assert Rollout.read(path).scene_id == "a/../b c"
 
 

@@ -1,7 +1,10 @@
 """The fuzzer reads whole inputs, so that what it counts as refused is refused for the damage, and knows what is bad."""
 
+import os
 import pickle
+import subprocess
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +13,10 @@ from hypothesis import given, settings
 from e2rl.run.errors import InputError
 from tests.scenes.descriptions import description
 from tools import fuzz
-from tools.fuzz import Garbage, Readers, Watch, outcome, require_plain
+from tools.fuzz import Watch, outcome
+from tools.fuzz_commands import ended
+from tools.fuzz_inputs import Garbage, hostile
+from tools.fuzz_readers import Readers, require_plain
 
 
 @pytest.fixture(scope="module")
@@ -36,10 +42,23 @@ def raises(error):
         (raises(MemoryError()), "memory"),
         (raises(fuzz.Hang()), "hang"),
         (lambda content: pickle.loads(pickle.dumps(len)), "executed"),
+        (lambda content: os.mkdir("/nowhere/at-all"), "executed"),
+        (lambda content: os.symlink("x", "/nowhere/at-all"), "executed"),
+        (lambda content: Path("/nowhere/at-all").write_text("x"), "executed"),
+        (lambda content: subprocess.run(["nothing"]), "executed"),
     ],
 )
 def test_outcomes_are_what_happened(watch, tmp_path, read, expected):
     assert outcome(read, b"", watch, tmp_path / "mark")[0] == expected
+
+
+def test_a_command_is_refused_by_one_line_and_no_other_way():
+    ended(None, "any warning")
+    with pytest.raises(InputError, match="error: of the user"):
+        ended(2, "a warning\nerror: of the user")
+    for status, said in ((1, "Traceback\nerror: x"), (2, ""), (-9, ""), (2, "error: x\nerror: y")):
+        with pytest.raises(Garbage):
+            ended(status, said)
 
 
 def test_what_an_input_leaves_behind_counts_as_executed(watch, tmp_path):
@@ -56,7 +75,7 @@ def test_whole_inputs_are_read_and_hostile_ones_run_nothing(tmp_path, watch):
     found = Counter()
 
     @settings(max_examples=40, database=None, deadline=None)
-    @given(fuzz.hostile(str(readers.mark)))
+    @given(hostile(str(readers.mark)))
     def each(content):
         found[outcome(readers.pickles()[1], content, watch, readers.mark)[0]] += 1
 

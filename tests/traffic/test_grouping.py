@@ -1,7 +1,5 @@
 """Rows and groups of nested states, and noise that depends on a scene's seed alone."""
 
-from dataclasses import fields, is_dataclass
-
 import torch
 from tensordict import TensorDict
 
@@ -12,7 +10,6 @@ from e2rl.traffic.grouping import (
     SHRUNK,
     clone,
     crop_state,
-    crop_world,
     group_scenes,
     noise_of,
     put_rows,
@@ -45,34 +42,16 @@ def test_every_scene_is_in_one_group_that_holds_its_vehicles_and_wastes_less_tha
         assert min(here) > SHRUNK * group.vehicles or rows < 2 * ROWS[0]
 
 
-def leaves(value):
-    return [leaf for f in fields(value) for leaf in leaves(getattr(value, f.name))] if is_dataclass(value) else [value]
-
-
-def test_writing_back_what_was_cropped_changes_nothing_and_what_changed_arrives():
+def test_what_changes_in_a_crop_arrives_where_it_belongs_and_nothing_else_changes():
     on, scene = synthesizer(), scenes(3).scenes
-    world, state = World.at_start(scene), begin(on, scene, 1.0)
-    width = state.routed.route.shape[1]
-    (group,) = group_scenes(world)
-    assert group.vehicles < width, "there is padding to crop"
-    part, whole = crop_state(state, group, width), clone(state)
-    write_state(whole, part, group)
-    for before, after in zip(leaves(state), leaves(whole), strict=True):
-        torch.testing.assert_close(after, before)
+    state, (group,) = begin(on, scene, 1.0), group_scenes(World.at_start(scene))
+    part, whole = crop_state(state, group, state.routed.route.shape[1]), clone(state)
     part.routed.conflict_s[0, 1, 2] += 7.0
     part.path_kl[1, 3] += 1.0
     write_state(whole, part, group)
-    assert whole.routed.conflict_s[group.rows[0], 1, 2] == state.routed.conflict_s[group.rows[0], 1, 2] + 7
-    assert whole.path_kl[group.rows[1], 3] == 1 and whole.path_kl.sum() == 1
-
-
-def test_a_cropped_world_holds_the_same_agents():
-    world = World.at_start(scenes(3).scenes)
-    (group,) = group_scenes(world)
-    small = crop_world(world, group)
-    assert small.valid.sum() == world.valid.sum() and small.scene["route_points"].shape[1] == group.vehicles
-    torch.testing.assert_close(small.states[small.valid], world.states[group.rows][world.valid[group.rows]])
-    assert small.scene["size"].shape[1] == small.states.shape[1]
+    rows, changed = group.rows.tolist(), whole.routed.conflict_s != state.routed.conflict_s
+    assert changed.nonzero().tolist() == [[rows[0], 1, 2]] and whole.path_kl.nonzero().tolist() == [[rows[1], 3]]
+    assert group.vehicles < changed.shape[1] and torch.equal(whole.lane.s, state.lane.s), "there is padding to crop"
 
 
 def test_noise_is_standard_and_depends_on_seed_and_draw_only():

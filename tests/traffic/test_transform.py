@@ -92,37 +92,6 @@ def test_the_specs_hold(traffic):
 # --- live rows
 
 
-def test_live_traffic_is_the_plan_and_is_replanned_every_half_second_before_the_step():
-    on = March()
-    env = environment(live(), on)
-    policy, tensordict = EgoPolicy(IDMEgo(), env), env.reset()
-    for step in range(12):
-        before = tensordict["agents", "states"].clone()
-        tensordict = policy(tensordict)
-        planned = tensordict["ego", "plan"].clone()
-        tensordict = env.step(tensordict)["next"]
-        steps, ego_plan = on.calls[-1]
-        assert len(on.calls) == 1 + step // 5 and steps == [step // 5 * 5] * 3
-        if step % 5 == 0:
-            assert torch.equal(ego_plan, planned), "what the policy has just written"
-        speed = torch.arange(3.0)[:, None] + (step // 5) / 10
-        expected = before[:, 1:ROWS].clone()
-        expected[..., 3] = speed
-        torch.testing.assert_close(tensordict["agents", "states"][:, 1:ROWS], keep_velocity(expected)[:, :, 0])
-
-
-class Watching(IDMEgo):
-    """An ego that notes the plans of the others that it sees."""
-
-    def __init__(self):
-        super().__init__(replan_every=1)
-        self.seen = []
-
-    def plan(self, world):
-        self.seen.append(world.plan)
-        return super().plan(world)
-
-
 def test_a_partial_reset_begins_those_rows_anew_and_leaves_the_others():
     on = March()
     env = environment(live(), on)
@@ -153,32 +122,23 @@ def test_a_method_that_asks_the_ego_can_where_there_is_one():
     assert asked == [(1, 50, 4), None]
 
 
-# --- stored and recorded rows
-
-
-def collect(env, policy, steps):
-    options = {"trust_policy": True, "track_traj_ids": False, "auto_register_policy_transforms": False}
-    collector = Collector(env, policy, frames_per_batch=env.batch_size[0] * steps, total_frames=-1, **options)
-    data = next(iter(collector)).clone()
-    collector.shutdown()
-    return data
-
-
 # --- all kinds of rows at once
 
 
 def test_live_stored_and_recorded_rows_run_side_by_side():
     scene_set = scenes(3)
-    pool, on = mixed(scene_set), March()
+    pool, on = replayed(scene_set) + live(1.0, 3), March()
     env = environment(pool, on, batch=9, scene_set=scene_set)
     policy, tensordict = EgoPolicy(IDMEgo(), env), env.reset()
-    for step in range(1, 13):
-        tensordict = env.step(policy(tensordict))["next"]
+    for step in range(12):
+        going_on, tensordict = tensordict["agents", "states"][6:, 1:ROWS].clone(), policy(tensordict)
+        going_on[..., 3], planned = (torch.arange(3.0) + step // 5 / 10)[:, None], tensordict["ego", "plan"][6:].clone()
+        tensordict = env.step(tensordict)["next"]
         states = tensordict["agents", "states"][:, 1:ROWS]
-        speed = (torch.arange(3.0) + (step - 1) // 5 / 10)[:, None]
-        torch.testing.assert_close(states[:3, :, 3], speed.expand(3, ROWS - 1))
-        assert torch.equal(states[3:6], pool.parts[0].states[:, step, 1:ROWS])
-        assert torch.equal(states[6:], scene_set.scenes["logged"][:, step, 1:ROWS])
+        assert torch.equal(states[:3], pool.parts[0].states[:, step + 1, 1:ROWS])
+        assert torch.equal(states[3:6], scene_set.scenes["logged"][:, step + 1, 1:ROWS])
+        torch.testing.assert_close(states[6:], keep_velocity(going_on)[:, :, 0])
+        assert step % 5 or torch.equal(on.calls[-1][1], planned), "replanned by what the policy has just written"
     assert [steps for steps, _ in on.calls] == [[0] * 3, [5] * 3, [10] * 3], "only live rows are replanned"
 
 
@@ -193,13 +153,16 @@ def test_vehicles_of_replayed_rows_are_expected_to_keep_their_velocity():
 
 
 def test_plans_are_for_the_policy_alone_and_are_not_stacked_over_time():
-    def rolled(env, policy):
-        return env.rollout(12, policy, break_when_any_done=False)
+    seen, env = [], environment(live(), March())
 
-    for gather in (rolled, lambda env, policy: collect(env, policy, 12)):
-        ego, env = Watching(), environment(live(), March())
-        data = gather(env, EgoPolicy(ego, env))
-        kept = set(data.keys(True))
-        assert ("traffic", "plan") not in kept and ("next", "traffic", "plan") not in kept
-        assert {("traffic", "row"), ("next", "traffic", "row")} <= kept
-        torch.testing.assert_close(ego.seen[-1][:, 1:, 0], data["next", "agents", "states"][:, -1, 1:ROWS])
+    class Watching(EgoPolicy):
+        def forward(self, tensordict):
+            seen.append(tensordict.get(("traffic", "plan"), None))
+            return super().forward(tensordict)
+
+    options = {"trust_policy": True, "track_traj_ids": False, "auto_register_policy_transforms": False}
+    collector = Collector(env, Watching(IDMEgo(), env), frames_per_batch=36, total_frames=-1, **options)
+    data = next(iter(collector))
+    assert ("traffic", "plan") not in data.keys(True) and ("next", "traffic", "plan") not in data.keys(True)
+    torch.testing.assert_close(seen[-1][:, 1:, 0], data["next", "agents", "states"][:, -1, 1:ROWS])
+    collector.shutdown()

@@ -16,20 +16,19 @@ def bends(rng: np.random.Generator, radius: float) -> np.ndarray:
     return np.array([0.0, 0.0, *(rng.uniform(-1, 1, 3) / radius)])
 
 
-def star(rng, name: str, kind: str, angles, lanes, speeds, ranks, flow, pocket=False) -> Layout:
-    """A junction of arms; lanes, speeds, ranks per arm; flow: vehicles per hour and inward lane, per arm."""
+def star(rng, name: str, kind: str, angles, roads: list[tuple[int, float, int]], flow, pocket=False) -> Layout:
+    """A junction of arms; roads: lanes, speed, rank of each; flow: vehicles per hour and inward lane, of each."""
     layout = Layout(name, rng.uniform(3.2, 3.7))
     centre = layout.node(np.zeros(2), kind, rng.uniform(5, 9))
     median = layout.lane_width if pocket else rng.choice([0.0, 0.3])
     arms = []
-    for angle, count, speed, rank in zip(angles, lanes, speeds, ranks, strict=True):
-        length = 90.0 + 8.5 * speed
-        axis = road_axis(np.zeros(2), angle, length, bends(rng, max(2.0 * speed**2, 90.0)))
+    for angle, (count, speed, rank) in zip(angles, roads, strict=True):
+        axis = road_axis(np.zeros(2), angle, 90.0 + 8.5 * speed, bends(rng, max(2.0 * speed**2, 90.0)))
         depth = rng.uniform(45, 70) if pocket and count > 1 else 0.0
         arms.append(layout.arm(centre, axis, count, speed, rank, median, depth))
     layout.join(arms)
     spread_demand(layout, arms, flow, rng)
-    if max(speeds) < 14.5:
+    if max(speed for _, speed, _ in roads) < 14.5:
         layout.parking += [edge for arm in arms if not arm.pocket for edge in (arm.inward, arm.outward)]
     return layout
 
@@ -51,62 +50,33 @@ def cross_angles(rng, arms: int = 4, jitter: float = 0.2) -> np.ndarray:
 
 def signalled_cross(rng, name: str) -> Layout:
     """Four-way signals with left-turn pockets."""
-    major, minor = int(rng.integers(2, 4)), 2
-    speed = rng.uniform(13, 17.5)
-    return star(
-        rng,
-        name,
-        SIGNAL,
-        cross_angles(rng, 4, 0.12),
-        [major, minor] * 2,
-        [speed, MEDIUM] * 2,
-        [3, 2] * 2,
-        rng.uniform(0.3, 0.8) * np.array([420, 330] * 2),
-        pocket=True,
-    )
+    roads = [(int(rng.integers(2, 4)), rng.uniform(13, 17.5), 3), (2, MEDIUM, 2)] * 2
+    angles, flow = cross_angles(rng, 4, 0.12), np.array([420, 330] * 2)
+    return star(rng, name, SIGNAL, angles, roads, rng.uniform(0.3, 0.8) * flow, pocket=True)
 
 
 def signalled_small(rng, name: str) -> Layout:
     """Four-way signals of single-lane streets."""
-    return star(rng, name, SIGNAL, cross_angles(rng), [1] * 4, [MEDIUM] * 4, [2] * 4, rng.uniform(0.3, 0.8, 4) * 480)
+    return star(rng, name, SIGNAL, cross_angles(rng), [(1, MEDIUM, 2)] * 4, rng.uniform(0.3, 0.8, 4) * 480)
 
 
 def priority_cross(rng, name: str) -> Layout:
     """A main road that side roads cross, by priority or by stop signs."""
-    lanes = int(rng.integers(1, 3))
-    kind = rng.choice([PRIORITY, "priority_stop"])
-    speed = rng.uniform(11, 16.5)
-    return star(
-        rng,
-        name,
-        kind,
-        cross_angles(rng),
-        [lanes, 1] * 2,
-        [speed, 11.1] * 2,
-        [4, 1] * 2,
-        rng.uniform(0.4, 0.8) * np.array([560, 260] * 2),
-    )
+    lanes, kind = int(rng.integers(1, 3)), rng.choice([PRIORITY, "priority_stop"])
+    roads, flow = [(lanes, rng.uniform(11, 16.5), 4), (1, 11.1, 1)] * 2, np.array([560, 260] * 2)
+    return star(rng, name, kind, cross_angles(rng), roads, rng.uniform(0.4, 0.8) * flow)
 
 
 def t_junction(rng, name: str) -> Layout:
     """A side road that ends at a main road."""
     angles = rng.uniform(0, 2 * np.pi) + np.array([0, np.pi, np.pi / 2 + rng.uniform(-0.35, 0.35)])
-    lanes = int(rng.integers(1, 3))
-    return star(
-        rng,
-        name,
-        PRIORITY,
-        angles,
-        [lanes, lanes, 1],
-        [MEDIUM, MEDIUM, 11.1],
-        [4, 4, 1],
-        rng.uniform(0.4, 0.8) * np.array([600, 600, 380]),
-    )
+    main, flow = (int(rng.integers(1, 3)), MEDIUM, 4), np.array([600, 600, 380])
+    return star(rng, name, PRIORITY, angles, [main, main, (1, 11.1, 1)], rng.uniform(0.4, 0.8) * flow)
 
 
 def allway_stop(rng, name: str) -> Layout:
     """All-way stop of residential streets."""
-    return star(rng, name, STOP, cross_angles(rng), [1] * 4, [11.1] * 4, [2] * 4, rng.uniform(0.4, 0.8, 4) * 330)
+    return star(rng, name, STOP, cross_angles(rng), [(1, 11.1, 2)] * 4, rng.uniform(0.4, 0.8, 4) * 330)
 
 
 def curved_road(rng, name: str) -> Layout:

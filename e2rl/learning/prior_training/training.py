@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -194,20 +195,18 @@ class PriorTraining(Supervised):
             return {key: value.cpu() for key, value in prior.state_dict().items()}
 
     def set_weights(self, weights: Mapping[str, Tensor]) -> None:
-        """Take chosen weights."""
         self.prior.load_state_dict(weights)
 
     def state_dict(self) -> dict:
         """All that later turns depend on. Collective: all processes must call it."""
-        return super().state_dict() | {
-            "denoiser": self.prior.denoiser.state_dict(),
-            "route_choice": self.prior.route_choice.state_dict(),
-            "average": self.average.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-            "done": self.done,
-            "accuracy": self.accuracy,
-            "draws": self.processes.gather(self.generator.get_state().cpu()),
-        }
+        own: dict[str, Any] = {"done": self.done, "accuracy": self.accuracy}
+        own["draws"] = self.processes.gather(self.generator.get_state().cpu())
+        return super().state_dict() | own | {name: part.state_dict() for name, part in self._stateful().items()}
+
+    def _stateful(self) -> dict[str, Any]:
+        prior = self.prior
+        parts = {"denoiser": prior.denoiser, "route_choice": prior.route_choice, "average": self.average}
+        return parts | {"optimiser": self.optimiser}
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`. Raises InputError if the number of processes differs."""
@@ -215,10 +214,8 @@ class PriorTraining(Supervised):
         if len(draws) != count:
             raise InputError(f"the run was begun by {len(draws)} processes, this is {count}; resume with as many")
         super().load_state_dict(state)
-        self.prior.denoiser.load_state_dict(state["denoiser"])
-        self.prior.route_choice.load_state_dict(state["route_choice"])
-        self.average.load_state_dict(state["average"])
-        self.optimiser.load_state_dict(state["optimiser"])
+        for name, part in self._stateful().items():
+            part.load_state_dict(state[name])
         self.done, self.accuracy = state["done"], state["accuracy"]
         self.generator.set_state(draws[self.processes.rank].cpu())
 

@@ -1,7 +1,6 @@
 """Rollout files as they are, and their scenes (docs/export.md)."""
 
 import io
-import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 from e2rl.report.export.episode import Episode
 from e2rl.run.files import write_atomically
 from e2rl.scenes.scene import KEYS
-from e2rl.sim.rollout_file import ROLLOUTS
+from e2rl.sim.rollout_file import ROLLOUTS, file_stem
 
 SCENES = "scenes"  # the folder of scenes, beside the one of rollouts
 
@@ -19,10 +18,9 @@ SCENES = "scenes"  # the folder of scenes, beside the one of rollouts
 def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> Iterator[tuple[Episode, Path]]:
     """Write rollouts/NAME.npz, a copy, and scenes/SCENE_ID.npz of each episode."""
     for episode in episodes:
-        path = folder / ROLLOUTS / episode.path.name
-        write_atomically(path, episode.path.read_bytes())
+        path = episode.rollout.write(folder / ROLLOUTS)
         if episode.scene is not None:
-            scene = folder / SCENES / f"{re.sub(r'[^A-Za-z0-9._+-]', '-', episode.rollout.scene_id)}.npz"
+            scene = folder / SCENES / f"{file_stem(episode.rollout.scene_id)}.npz"
             buffer = io.BytesIO()
             np.savez_compressed(buffer, **scene_arrays(episode))
             write_atomically(scene, buffer.getvalue())

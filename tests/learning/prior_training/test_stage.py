@@ -1,17 +1,13 @@
 """The stage that trains a prior: impossible settings, which scenes validate it, and its closed loop on them."""
 
-from pathlib import Path
-
 import pytest
-from hydra import compose, initialize_config_dir
 
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.prior_training.stage import _first_starts, run_prior_stage
+from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
 from e2rl.run.run import Run
 from tests.synthetic import make_scenes
-
-CONF = str(Path(__file__).parents[3] / "conf")
 
 
 @pytest.mark.parametrize(
@@ -23,20 +19,15 @@ CONF = str(Path(__file__).parents[3] / "conf")
     ],
 )
 def test_impossible_settings_are_named_before_anything_is_read(tmp_path, override, what):
-    with initialize_config_dir(CONF, version_base="1.3"):
-        config = compose("train", ["stage=prior", "data=scenarionet", "data.path=nowhere", override])
+    config = load_config("train", ["stage=prior", "data=scenarionet", "data.path=nowhere", override])
     with pytest.raises(InputError, match=what):
         run_prior_stage(Run(config, tmp_path, {}), RunLogger("none", tmp_path))
     assert not list(tmp_path.iterdir())
 
 
-def logs(names, place):
-    scenes = make_scenes(len(names))
-    scenes.scene_id[:], scenes.location[:] = names, place
-    return scenes
-
-
 def test_each_held_out_log_is_driven_from_its_earliest_start():
-    scenes = logs(["a@30", "a@10", "b@10", "c@50", "c@30", "d@10"], ["p", "p", "q", "p", "p", "q"])
+    scenes = make_scenes(6)
+    scenes.scene_id[:] = ["a@30", "a@10", "b@10", "c@50", "c@30", "d@10"]
+    scenes.location[:] = ["p", "p", "q", "p", "p", "q"]
     first = _first_starts(scenes)
     assert first.scene_id == ["a@10", "c@30"] and first.location == ["p", "p"] and len(first.scenes) == 2

@@ -49,17 +49,6 @@ def test_training_lowers_the_loss(windows):
     assert held_out_loss(run.prior, windows, 8) < 0.8 * before
 
 
-def test_averaged_weights_are_held_only_inside_the_context(windows):
-    run = of(windows)
-    run.train(5)
-    raw = {key: value.clone() for key, value in run.prior.denoiser.state_dict().items()}
-    with run.averaged():
-        inside = run.prior.denoiser.state_dict()
-        assert all(torch.equal(inside[key], run.average.module.state_dict()[key]) for key in raw)
-        assert any(not torch.equal(inside[key], raw[key]) for key in raw)
-    assert all(torch.equal(value, raw[key]) for key, value in run.prior.denoiser.state_dict().items())
-
-
 def test_the_average_is_exponential_with_a_decay_that_grows_to_ema(windows, monkeypatch):
     monkeypatch.setattr(training, "EMA", 0.2)
     run = of(windows)
@@ -130,23 +119,14 @@ def test_an_interrupted_training_ends_as_the_whole_one_and_its_checkpoint_says_w
         trained("part")
     two, again = load_prior(str(trained("part", seed=3)))
     assert all(torch.equal(a, b) for a, b in zip(one.state_dict().values(), two.state_dict().values(), strict=True))
-    for key in ("held_out_loss", "route_accuracy", "step"):
-        assert origin[key] == again[key] or origin[key] != origin[key]
+    assert origin["held_out_loss"] == again["held_out_loss"]
     losses = [
         (tmp_path / name / "logs/scalars/train/prior_held_out_loss.csv").read_text().split()
         for name in ("whole", "part")
     ]
     assert losses[0] == losses[1] and len(losses[0]) == 2
     assert origin["held_out_loss"] == pytest.approx(min(float(line.split(",")[1]) for line in losses[0]))
-    assert origin["windows"] > 0 and origin["held_out_windows"] > 0 and origin["command"] == "test"
-    assert origin["versions"]["torch"] == torch.__version__ and origin["processes"] == 1
-
-
-def test_the_lowest_held_out_loss_is_chosen(windows, monkeypatch):
-    losses = iter([0.5, 0.4, 0.6])
-    monkeypatch.setattr(PriorTraining, "turn", lambda run: {"held_out_loss": next(losses)})
-    run = of(windows)
-    assert run.fit("prior", 3)["turn"] == 1 and len(run.history) == 3
+    assert origin["windows"] > 0 and origin["command"] == "test" and origin["versions"]["torch"] == torch.__version__
 
 
 def test_logs_without_a_moving_vehicle_are_named(tmp_path):

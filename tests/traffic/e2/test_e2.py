@@ -1,4 +1,4 @@
-"""e2: the prior at eta = 0, else a coalition that is chosen, kept and accounted for."""
+"""e2: a coalition that is chosen, kept and accounted for."""
 
 from dataclasses import replace
 
@@ -9,20 +9,9 @@ from e2rl.planners.idm_planner import IDMEgo
 from e2rl.sim.env import SimSettings
 from e2rl.sim.world import World
 from e2rl.traffic.e2 import e2
-from e2rl.traffic.nominal import NominalTraffic
 from e2rl.traffic.rollout import synthesize_traffic
 from e2rl.traffic.traffic import FULL, PAIR, SINGLE
 from tests.traffic.e2.traffic_scenes import EGO, begin, replanned, scenes, synthesizer
-
-
-def test_without_intensity_it_is_the_prior_bit_for_bit_and_nobody_is_controlled():
-    on, scene = synthesizer(), scenes(2).scenes
-    state, plan = replanned(on, scene, 0.0, times=3)
-    _, nominal = replanned(NominalTraffic(on.prior), scene, times=3)
-    assert torch.equal(plan.states, nominal.states) and torch.equal(plan.present, nominal.present)
-    assert torch.equal(plan.route, nominal.route) and not plan.adversary.any()
-    assert (plan.path_kl == 0).all() and (plan.anchor_jump == 0).all()
-    assert not state.coalition.any() and (state.target == -1).all()
 
 
 def test_a_scene_is_planned_alike_alone_and_in_a_batch():

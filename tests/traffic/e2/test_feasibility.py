@@ -18,18 +18,13 @@ def judge(*vehicles, settings=SETTINGS):
 
 
 def test_routes_that_cross_meet_where_the_lines_do():
+    oblique = judge((20.0, -30.0, 0.7, 12.0))[0].conflicts
+    assert oblique.s[0, 1, 0] == pytest.approx(20 + 30 / math.sin(0.7), abs=0.1)
     result, _ = judge((50.3, -41.7, UP, 10.0))
     table = result.conflicts
     assert result.mask[0].tolist() == [False, True] + [False] * 6
     assert table.s[0, 1, 0] == pytest.approx(20 + 41.7, abs=0.05)
     assert table.exists[0, 1].tolist() == [True] + [False] * 5 and not table.exists[0, 2].any()
-
-
-def test_an_oblique_crossing_is_found_too():
-    heading = 0.7
-    result, _ = judge((20.0, -30.0, heading, 12.0))
-    way = 30 / math.sin(heading)
-    assert result.conflicts.s[0, 1, 0] == pytest.approx(20 + way, abs=0.1)
 
 
 def test_windows_hold_what_both_can_reach():

@@ -8,14 +8,7 @@ import torch
 from e2rl.scenes.boxes import corners
 from e2rl.traffic.e2 import potentials
 from e2rl.traffic.e2.motion import constant_speed_states
-from e2rl.traffic.e2.potentials import (
-    SAMPLED_STEPS,
-    PotentialContext,
-    PotentialSettings,
-    annealed_temperature,
-    box_gap,
-    ttc_cost,
-)
+from e2rl.traffic.e2.potentials import SAMPLED_STEPS, PotentialContext, PotentialSettings, box_gap
 from tests.traffic.e2.crossing import make_world
 
 UP = math.pi / 2
@@ -192,21 +185,6 @@ def test_who_starts_off_the_road_or_beside_its_route_is_only_kept_from_worse():
     assert feasibility_potential(states, context, SETTINGS)[0, 1] == 0
 
 
-@pytest.mark.parametrize(
-    "offset, closing, cost",
-    [
-        ((10, 0), (-5, 0), 0.1353),
-        ((10, 1), (-5, 0), 0.0821),
-        ((5, 0), (-10, 0), 0.8825),
-        ((10, 0), (5, 0), 0.0),
-        ((40, 3), (0, 0), 0.0),
-    ],
-)
-def test_ttc_cost_has_its_published_values(offset, closing, cost):
-    value = ttc_cost(torch.tensor(offset, dtype=torch.float64), torch.tensor(closing, dtype=torch.float64))
-    assert value == pytest.approx(cost, abs=2e-4)
-
-
 def test_the_gap_of_disks_is_near_that_of_the_boxes():
     generator = torch.Generator().manual_seed(0)
     pose = torch.rand(400, 2, 4, generator=generator, dtype=torch.float64) * torch.tensor([16.0, 16, 6.28, 1])
@@ -217,9 +195,3 @@ def test_the_gap_of_disks_is_near_that_of_the_boxes():
     assert (gap - exact)[apart].min() > -2e-3  # disks lie inside the box
     assert (gap - exact)[apart].max() < (math.sqrt(2) - 1) * 1.0 + 1e-2  # and miss its corners at most
     assert (gap[~apart] < 0.45).all()
-
-
-def test_the_temperature_anneals_from_wide_to_narrow():
-    levels = annealed_temperature(torch.linspace(0, 1, 5), SETTINGS)
-    assert levels[0] == pytest.approx(SETTINGS.narrow) and levels[-1] == pytest.approx(SETTINGS.wide)
-    assert (levels.diff() > 0).all()

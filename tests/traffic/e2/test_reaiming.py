@@ -35,12 +35,12 @@ def stored(scene_set, eta=2.0):
     return TrafficPool.stored(traffic | {"adversaries": adversaries}, eta)
 
 
-def driven(pool, scene_set, settings, seed=0, traffic=None, policy=None, steps=STEPS):
+def driven(pool, scene_set, settings):
     """Frames [B, T] of an ego in each row of a pool."""
     base = DrivingEnv(scene_set, ON, len(pool), agents=True)
-    reaction = None if settings is None else Reaiming(settings, seed)
-    env = TransformedEnv(base, AdversarialSynthesizer(pool, in_turn(pool), traffic, reaction=reaction))
-    return env.rollout(steps, policy or EgoPolicy(IDMEgo(), env), break_when_any_done=False)
+    reaction = None if settings is None else Reaiming(settings)
+    env = TransformedEnv(base, AdversarialSynthesizer(pool, in_turn(pool), reaction=reaction))
+    return env.rollout(STEPS, EgoPolicy(IDMEgo(), env), break_when_any_done=False)
 
 
 def tracks(frames):
@@ -60,17 +60,6 @@ def test_traffic_in_which_nobody_reacts_is_today_s_bit_for_bit(scene_set):
         assert torch.equal(today[key], nobody[key]), key
     reacting = driven(pool, scene_set, EVERYBODY)
     assert torch.equal(tracks(today)[4:], tracks(reacting)[4:]), "nor in rows without an intensity"
-
-
-def test_only_stored_attacks_count_as_adversarial_episodes(scene_set):
-    class Spy:
-        def begin(self, rows, adversarial, adversaries, horizon):
-            self.seen = adversarial.tolist()
-
-    pool, spy = stored(scene_set) + stored(scene_set, 0.0) + TrafficPool.recorded(torch.arange(4)), Spy()
-    base = DrivingEnv(scene_set, ON, len(pool), agents=True)
-    TransformedEnv(base, AdversarialSynthesizer(pool, in_turn(pool), reaction=spy)).reset()
-    assert spy.seen == [True] * 4 + [False] * 8
 
 
 def test_the_row_s_adversaries_leave_the_replay_and_everybody_else_stays(scene_set):
@@ -98,13 +87,14 @@ def test_other_vehicles_that_move_near_the_ego_react(scene_set):
 STILL, LAWFUL = torch.zeros(1, 2), torch.tensor([False])
 
 
-def ground_of(world, depth=-5.0):
-    return Ground(torch.full_like(world.scene["field"], depth), world.scene["field_origin"], torch.tensor([0]))
+def ground_of(world):
+    return Ground(torch.full_like(world.scene["field"], -5.0), world.scene["field_origin"], torch.tensor([0]))
 
 
-def seen_by(vehicles, index=1):
+def seen_by(vehicles):
+    """What vehicle 1 sees, and the ground, all of it drivable."""
     world = make_world(vehicles)
-    return surroundings(world, torch.tensor([0]), torch.tensor([index])), ground_of(world)
+    return surroundings(world, torch.tensor([0]), torch.tensor([1])), ground_of(world)
 
 
 def aimed(vehicles, eta=2.0, responsibility="none", shift=STILL):
@@ -154,13 +144,10 @@ def test_it_aims_where_the_ego_is_expected_by_its_motion():
 
 def test_without_a_drivable_aim_it_unwinds_its_curvature_and_brakes_gently():
     """Off the road on all sides but its own place; or with the ego behind."""
-    world = make_world([(0, 0, 0, 5.0), (30, 20, -1.6, 8.0)])
-    seen = surroundings(world, torch.tensor([0]), torch.tensor([1]))
+    seen, ground = seen_by([(0, 0, 0, 5.0), (30, 20, -1.6, 8.0)])
     seen.turn_rate[:, 1] = 0.8
-    field = torch.full_like(world.scene["field"], 5.0)
-    column, row = (seen.states[0, 1, :2] - world.scene["field_origin"][0]).round().long()
-    field[:, column - 1 : column + 2, row - 1 : row + 2] = -1.0
-    ground = Ground(field, world.scene["field_origin"], torch.tensor([0]))
+    column, row = (seen.states[0, 1, :2] - ground.origin[0]).round().long()
+    ground.field.fill_(5.0)[:, column - 1 : column + 2, row - 1 : row + 2] = -1.0
     aim = Law("none")(seen, torch.tensor([2.0]), STILL, ground, LAWFUL)
     assert aim.curvature.item() == pytest.approx(0.05) and aim.accel.item() == pytest.approx(-1.0)
     _, away = aimed([(0, 0, 0, 5.0), (10, 0, 0, 20.0)], eta=0.1)
@@ -168,19 +155,17 @@ def test_without_a_drivable_aim_it_unwinds_its_curvature_and_brakes_gently():
 
 
 def test_only_paths_on_the_drivable_area_are_taken():
-    world = make_world([(0, 20, 0, 5.0), (-20, 0, 0, 8.0)])
-    seen = surroundings(world, torch.tensor([0]), torch.tensor([1]))
-    free = Law("none")(seen, torch.tensor([2.0]), STILL, ground_of(world), LAWFUL)
-    y = torch.arange(world.scene["field"].shape[-1]) + world.scene["field_origin"][0, 1]
-    field = (y - 3.0).clamp(-5, 5).expand_as(world.scene["field"])
-    kerb = Law("none")(seen, torch.tensor([2.0]), STILL, Ground(field.contiguous(), *ground_of(world)[1:]), LAWFUL)
+    seen, ground = seen_by([(0, 20, 0, 5.0), (-20, 0, 0, 8.0)])
+    free = Law("none")(seen, torch.tensor([2.0]), STILL, ground, LAWFUL)
+    ground.field[:] = (torch.arange(ground.field.shape[-1]) + ground.origin[0, 1] - 3.0).clamp(-5, 5)
+    kerb = Law("none")(seen, torch.tensor([2.0]), STILL, ground, LAWFUL)
     assert free.curvature > 0.01
     end = along_arc(seen.states[:, 1], kerb, torch.tensor([2.0]))[0]
     assert end[0, 0, 1] < 3.6
 
 
-def followed_for(seconds, responsibility, vehicles, steer=None):
-    """Whether vehicle 1, re-aiming every 0.5 s, touches an ego that keeps its velocity, and their least gap [m]."""
+def followed_for(seconds, responsibility, vehicles):
+    """Whether vehicle 1, re-aiming every 0.5 s, touches an ego that keeps its velocity."""
     world = make_world(vehicles)
     law, generator, touched = Law(responsibility), torch.Generator().manual_seed(0), False
     for _ in range(round(seconds / 0.5)):
@@ -199,9 +184,6 @@ def followed_for(seconds, responsibility, vehicles, steer=None):
     return touched
 
 
-BEHIND = [(0, 0, 0, 9.0), (-12, 0, 0, 14.0)]
-
-
 @pytest.mark.parametrize("speed", [10.0, 16.0])
 def test_from_behind_it_hits_a_steady_ego_without_responsibility_and_never_with_it(speed):
     vehicles = [(0, 0, 0, 9.0), (-25, 0, 0, speed)]
@@ -210,9 +192,7 @@ def test_from_behind_it_hits_a_steady_ego_without_responsibility_and_never_with_
 
 
 def test_a_reckless_vehicle_owes_the_ego_nothing_whatever_the_law():
-    seen, _ = aimed(BEHIND)
-    world = make_world(BEHIND)
-    eta, ground, reckless = torch.tensor([3.0]), ground_of(world), torch.tensor([True])
+    (seen, ground), eta, reckless = seen_by([(0, 0, 0, 9.0), (-12, 0, 0, 14.0)]), torch.tensor([3.0]), ~LAWFUL
     free, lawful = (Law(name)(seen, eta, STILL, ground, LAWFUL) for name in ("none", "full"))
     assert Law("full")(seen, eta, STILL, ground, reckless) == free
     assert Law("full")(seen, eta, STILL, ground, ~reckless) == lawful and lawful.accel < free.accel

@@ -133,16 +133,3 @@ def test_scores_and_candidates_are_those_of_the_definition(seed, nodes, monkeypa
     assert result.score[0].tolist() == score
     order = sorted((i for i in range(1, 11) if score[i] > 0), key=lambda i: (-score[i], nearest[i], i))
     assert len(order) > 3 and result.candidates[0].nonzero()[:, 0].tolist() == sorted(order[:3])
-
-
-def test_permuting_vehicles_permutes_scores_and_candidates():
-    states, size = random_boxes(4, 30, 40.0, 1)
-    track, valid = rollout(states), torch.rand(4, 81, 30) < 0.95
-    valid[:, 0] = True
-    settings = TopologySettings(candidates=4)
-    result = topological_candidates(track, valid, size, settings)
-    order = torch.cat([torch.zeros(1, dtype=torch.int64), 1 + torch.randperm(29)])
-    permuted = topological_candidates(track[:, :, order], valid[:, :, order], size[:, order], settings)
-    assert torch.equal(permuted.score, result.score[:, order])
-    assert torch.equal(permuted.candidates, result.candidates[:, order])
-    assert result.candidates.any()
