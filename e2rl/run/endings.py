@@ -15,7 +15,7 @@ from e2rl.run.errors import InputError
 
 WRITING = {
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EEXIST, errno.ENAMETOOLONG),
-    *(errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.ELOOP),
+    *(errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EISDIR, errno.ELOOP),
 }
 MEMORY = ("can't allocate memory", "not enough memory", "out of memory")  # in what torch raises
 

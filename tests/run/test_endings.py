@@ -78,6 +78,7 @@ def unconfigured():
         (lambda: os.write(os.open("/dev/full", os.O_WRONLY), b"x"), "a file: cannot be written (No space left"),
         (lambda: Path("/dev/null/x").mkdir(), "/dev/null/x: cannot be written (Not a directory)"),
         (lambda: Path("/dev/null").mkdir(), "/dev/null: cannot be written (File exists)"),
+        (lambda: Path("/dev").write_bytes(b""), "/dev: cannot be written (Is a directory)"),
         (unconfigured, "runs/log: cannot be written (Permission denied)"),
         (lambda: torch.empty(2**48, dtype=torch.uint8), "out of memory"),
         (lambda: np.empty(2**50, np.uint8), "out of memory"),
