@@ -3,6 +3,7 @@
 import torch
 from tensordict import TensorDict
 
+from e2rl.metrics.preventable import poses
 from e2rl.scenes.boxes import to_frame
 from e2rl.scenes.recording import DT
 from e2rl.traffic.rule_based import LogReplay
@@ -31,18 +32,12 @@ class BrakingLeader(LogReplay):
         """The log, but for the leader: where its braked distance is on its recorded path."""
         state, plan = super().replan(state, world, ego_plan)
         vehicles, leader = plan.states.shape[1], state["leader"]
-        path = world.scene["logged"][:, :, :vehicles].transpose(1, 2).contiguous()  # [B, V, T+1, 4]
-        travelled = path[..., :2].diff(dim=2).norm(dim=-1).cumsum(-1)  # [B, V, T]
-        first = path[:, :, 0, 3].clamp(min=0.1)[..., None]
-        braking = state["braking"][:, None, None].clamp(min=1e-3)
+        path = world.scene["logged"][:, :, :vehicles].transpose(1, 2)  # [B, V, T+1, 4]
+        first, braking = path[:, :, 0, 3].clamp(min=0.1)[..., None], state["braking"][:, None, None].clamp(min=1e-3)
         time = torch.minimum(DT * steps_ahead(world)[:, None], first / braking)  # until the halt
-        gone = (first * time - braking * time**2 / 2).contiguous()
-        index = torch.searchsorted(travelled, gone).clamp(max=travelled.shape[-1] - 1)
-        before, after = (path.gather(2, (index + k)[..., None].expand(-1, -1, -1, 4)) for k in (0, 1))
-        length = (after - before)[..., :2].norm(dim=-1).clamp(min=1e-3)
-        fraction = 1 - (travelled.gather(-1, index) - gone) / length
-        xy = before[..., :2] + fraction[..., None] * (after - before)[..., :2]
-        braked = torch.cat([xy, before[..., 2:3], (first - braking * time)[..., None]], -1)
+        gone = first * time - braking * time**2 / 2
+        pose = poses(path.flatten(0, 1), gone.flatten(0, 1)).view(*gone.shape, 3)
+        braked = torch.cat([pose, (first - braking * time)[..., None]], -1)
         plan.states = torch.where(leader[..., None, None], braked, plan.states)
         plan.present = plan.present | (leader & world.valid[:, :vehicles])[..., None]
         plan.adversary = leader
