@@ -1,6 +1,7 @@
-"""`e2rl prior-tables`: the prior as traffic beside log replay, constant velocity and IDM, in three tables.
+"""`e2rl prior-tables`: the prior as traffic beside log replay, constant velocity and IDM, in four tables.
 
-Open-loop accuracy (minADE), the closed loop, and the realism meta-metric over many rollouts of each scene.
+Open-loop accuracy (minADE), the spread of samples, the closed loop, and the realism meta-metric over many rollouts of
+each scene.
 """
 
 from typing import Any
@@ -15,6 +16,7 @@ from e2rl.evaluation.meta_table import meta_rows
 from e2rl.evaluation.methods import processes_of
 from e2rl.evaluation.plan import begin
 from e2rl.evaluation.protocol import drive_all, record
+from e2rl.evaluation.spread_table import spread_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.report.results import write_results
 from e2rl.report.tables import metric_tables, print_tables
@@ -30,11 +32,12 @@ class TableSettings:
     """Keys of conf/prior_tables.yaml, checked."""
 
     open_loop_samples: int = setting(low=0)
+    spread_samples: int = setting(low=0)
     meta_rollouts: int = setting(low=0)
 
 
 def prior_tables(run: Run) -> None:
-    """Make the rows of the three tables; write and print them."""
+    """Make the rows of the tables; write and print them."""
     config, folder = run.config, run.folder
     asked = settings_of(TableSettings, {each.name: config[each.name] for each in fields(TableSettings)})
     plan = begin(run)
@@ -42,6 +45,8 @@ def prior_tables(run: Run) -> None:
     before, after = [], []
     if asked.open_loop_samples:
         before = open_loop_rows(plan.scenes, methods, asked.open_loop_samples, config.device, parts)
+    if asked.spread_samples:
+        before += spread_rows(plan.scenes, methods, asked.spread_samples, config.device, parts)
     into = plan.rollouts(folder)
     scored = drive_all([setup], methods, plan.asked.seeds, into, processes_of(config), plan.only, parts)
     if asked.meta_rollouts:

@@ -44,8 +44,22 @@ class Metric:
 rate = partial(Metric, fraction=True)  # a metric in [0, 1]
 TABLES = ("main", "traffic", "adversaries", "methods", "egos", "public")  # of the package
 ORDER = (  # of columns in every table (docs/method.md, section 10); others follow as they are declared
-    *("cfr", "cfr_counted", "cfr_preventable", "cfr_adv", "cfr_vru", "cfr_bg", "avoidable", "front", "side", "rear"),
-    *("rir", "counted", "at_fault", "preventable", "relvel", "contact_time", "min_dtc", "ttc_c", "macc", "progress"),
+    *("cfr", "cfr_preventable", "cfr_clean", "cfr_counted", "cfr_adv", "cfr_vru", "cfr_bg", "avoidable"),
+    *(
+        "front",
+        "side",
+        "rear",
+        "rir",
+        "counted",
+        "at_fault",
+        "preventable",
+        "relvel",
+        "contact_time",
+        "min_dtc",
+        "ttc_c",
+        "macc",
+        "progress",
+    ),
     *("aor_step", "aor_any", "real", "real_adv", "real_norm", "transport", "seconds_per_rollout", "nfe"),
 )
 METRICS: dict[str, Metric] = {}  # of rollouts, in ORDER
@@ -54,7 +68,7 @@ EVENTS: list[str] = []  # columns of a row after its metrics: what happened, and
 WORDS: dict[str, tuple[str, ...]] = {}  # columns that hold one of these words, or "" where the computed index is -1
 SOURCE = ("dataset", "split", "method", "ego_policy")  # columns of a row of a run
 IDENTITY = ("scene_id", "location", "seed", "eta")  # columns of a row before its metrics
-OPEN_LOOP_STAGE, META_STAGE = "open loop", "meta-metric"
+OPEN_LOOP_STAGE, META_STAGE, SPREAD_STAGE = "open loop", "meta-metric", "spread"
 STAGES: dict[str, tuple[Metric, ...]] = {}  # parts of a run with metrics of their own
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from e2rl.metrics.catalogue import COMPUTE, IDENTITY, METRICS, SOURCE, WORDS, Batch, Metric, columns, row_columns
 from e2rl.metrics.contact import first_contact
 from e2rl.metrics.realism import Samples, realism, traffic_samples
-from e2rl.metrics.verdicts import judge
+from e2rl.metrics.verdicts import clean, judge
 from e2rl.sim.rollouts import Rollouts
 
 CHUNK = 32  # rollouts scored at once: bounds the memory of the pairwise steps
@@ -73,6 +73,7 @@ def score_batch(batch: Batch) -> tuple[Batch, list[Samples], Tensor]:
     for name, compute in COMPUTE.items():
         found = compute(batch)
         result |= found if isinstance(found, dict) else {METRICS[name].source: found}
+    result["cfr_clean"] = clean(result)
     wrong = [name for name, column in result.items() if column.shape != batch["stop"].shape]
     if wrong:
         raise ValueError(f"{', '.join(wrong)}: a metric is one number per rollout, a tensor [{len(traffic)}] here")

@@ -1,12 +1,16 @@
 """The verdict on every collision of the ego: whose fault, preventable by whom, which duty broken (docs/verdicts.md).
 
 A collision counts if it is the ego's fault or a careful and competent driver in its place would have prevented it.
+Nobody prevents by braking what comes to an ego that stands. A verdict on a partner that strikes the ego is `replayed`:
+it would have driven otherwise towards another ego. A clean failure is preventable and not replayed, its partner broke
+no duty, no other vehicles hit each other, and nobody left the road.
 
 The partner broke the first of these duties that applies: it ran into the ego from behind; it had crossed a stop line at
 red; it drove against its lane; it crossed the ego's way, or came into it, leaving less than a careful and competent
 driver needs to brake.
 """
 
+import math
 from functools import partial
 
 import torch
@@ -31,6 +35,9 @@ TURN = torch.pi / 7  # rad of heading within the last four seconds that make a t
 TURN_STEPS = round(4.0 / DT)
 CUT_IN_STEPS = 10  # 1 s at 10 Hz
 AHEAD = 30.0  # m, straight on from the contact, that count as the ego's path
+STOOD = round(2.0 / DT)  # steps; who keeps two seconds of distance (UK Highway Code, rule 126) stops behind what stood
+CREEPING = 0.5  # m/s: an ego that is slower does not run into anybody
+LANE_HALF = 1.75  # m from a lane's centreline to its edge
 
 
 def duties(collision: Collision, rear: Tensor, red: Tensor, lanes: tuple[Tensor, Tensor]) -> Tensor:
@@ -94,14 +101,39 @@ def _against(track: Tensor, stop: Tensor, lanes: tuple[Tensor, Tensor]) -> Tenso
 def at_fault(batch: Batch) -> Tensor:
     """Whether the ego is at fault [B]: 1 or 0, NaN without contact.
 
-    It is if it moves and either its partner stands still, or its front hits a partner that did not cut in: one that
-    enters the ego's path less than a second before the contact.
+    It is if it moves and either its partner has stood for STOOD steps, or its front hits a partner that moves and did
+    not cut in: that entered the ego's path more than a second before the contact. An ego that stands is, if it has
+    stood for STOOD steps in the way of a lane that the partner comes along.
     """
-    row = torch.arange(len(batch["states"]))
+    row, partner = torch.arange(len(batch["states"])), batch["partner"].clamp(min=0)
     speed = batch["states"][row, batch["before"], :, 3].abs()
-    moving, partner_stands = speed[:, 0] > STANDING, speed[row, batch["partner"].clamp(min=0)] <= STANDING
-    fault = moving & (partner_stands | ((batch["kind"] == FRONT) & ~cuts_in(batch)))
+    moves, partner_moves = speed[:, 0] > STANDING, speed[row, partner] > STANDING
+    fault = moves & (stood(batch, partner) | ((batch["kind"] == FRONT) & partner_moves & ~cuts_in(batch)))
+    fault = fault | (~moves & stood(batch, torch.zeros_like(partner)) & blocks(batch, partner))
     return fault.to(speed.dtype).masked_fill(~batch["hit"], torch.nan)
+
+
+def stood(batch: Batch, agent: Tensor) -> Tensor:
+    """Bool [B]: the agent [B] has stood for the STOOD steps before the contact, or for as long as it is known."""
+    row = torch.arange(len(agent), device=agent.device)[:, None]
+    window = batch["before"][:, None] - torch.arange(STOOD + 1, device=agent.device)
+    known = (window >= 0) & batch["valid"][row, window.clamp(min=0), agent[:, None]]
+    moves = batch["states"][row, window.clamp(min=0), agent[:, None], 3].abs() > STANDING
+    return known[:, 0] & ~(moves & known).any(1)
+
+
+def blocks(batch: Batch, partner: Tensor) -> Tensor:
+    """Bool [B]: the ego is on a lane that runs as the partner [B] drives, and across its own heading."""
+    row = torch.arange(len(partner), device=partner.device)
+    ego, other = (batch["states"][row, batch["before"], agent] for agent in (torch.zeros_like(partner), partner))
+    across = wrap(other[:, 2] - ego[:, 2]).sin().abs() > math.sin(SAME_WAY)
+    points, line = batch["lane_points"], batch["lane_index"]
+    begin, step = points[:, :-1], points.diff(dim=1)
+    along = ((ego[:, None, :2] - begin) * step).sum(-1) / step.square().sum(-1).clamp(min=1e-9)
+    gap = (begin + along.clamp(0, 1)[..., None] * step - ego[:, None, :2]).norm(dim=-1)
+    turn = wrap(torch.atan2(step[..., 1], step[..., 0]) - other[:, None, 2])
+    on_it = (line[:, 1:] == line[:, :-1]) & (line[:, 1:] >= 0) & (gap <= LANE_HALF) & (turn.abs() < SAME_WAY)
+    return across & on_it.any(1)
 
 
 def cuts_in(batch: Batch) -> Tensor:
@@ -137,6 +169,7 @@ _of_collisions = partial(rate, per_collision=True)
 declare(
     rate("cfr_counted", "a failure that counts: preventable, or the ego's fault", tables=f"{_MOST} public"),
     rate("cfr_preventable", "a failure that a competent driver prevents", tables=f"{_MOST} public"),
+    rate("cfr_clean", "a clean failure: preventable, and nobody else did wrong", tables=f"{_MOST} public"),
     _of_collisions("counted", "collisions that count", tables="main adversaries"),
     _of_collisions("at_fault", "ego's fault, per collision", tables=f"{_MOST} public"),
     _of_collisions("preventable", "prevented by UN R157's careful and competent driver", tables=_MOST),
@@ -144,10 +177,12 @@ declare(
     _of_collisions("preventable_rss", "prevented by RSS"),
     _of_collisions("preventable_regulation", "prevented at UN R157's limit"),
     _of_collisions("preventable_chain", "prevented if a follower brakes, too"),
+    _of_collisions("replayed", "prevented, given that the partner, which strikes the ego, is replayed"),
     events=("duty",),
     words={"duty": DUTIES},
 )
-COLUMNS = ("preventable", *(f"preventable_{name}" for name in DRIVERS if name != "human"), "preventable_chain")
+_MODELS = tuple(f"preventable_{name}" for name in DRIVERS if name != "human")
+COLUMNS = ("preventable", *_MODELS, "preventable_chain", "replayed")
 
 
 def judge(batch: Batch) -> tuple[Batch, Tensor]:
@@ -155,8 +190,9 @@ def judge(batch: Batch) -> tuple[Batch, Tensor]:
 
     Returns:
         columns: [B] each, NaN where unknown. Of each collision: at_fault, preventable (by the human driver) and
-            preventable_<model>, counted (0 or 1), preventable_chain (a follower's braking was needed for it), duty
-            (index into DUTIES, -1 without a collision). Of each rollout: cfr_counted, cfr_preventable.
+            preventable_<model>, counted (0 or 1), preventable_chain (a follower's braking was needed for it), replayed
+            (preventable, and the partner strikes the ego), duty (index into DUTIES, -1 without a collision). Of each
+            rollout: cfr_counted, cfr_preventable.
         driver: states [B, T+1, 4] of the human driver in the ego's place, NaN without a collision.
     """
     hit, fault = batch["hit"], at_fault(batch)
@@ -183,8 +219,17 @@ def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor, Tensor
     duty = duties(collision, batch["kind"][hit] == REAR, red, lanes)
     result = preventions(collision)
     dtype = batch["states"].dtype
-    found = {f"preventable_{name}": value.avoided.to(dtype) for name, value in result.items()}
+    moves = batch["states"][hit][row, batch["before"][hit], 0, 3].abs() > CREEPING
+    found = {f"preventable_{name}": (value.avoided & moves).to(dtype) for name, value in result.items()}
     human = result["human"]
     found["preventable"] = found.pop("preventable_human")
-    found["preventable_chain"] = (human.avoided & (human.followers > 0)).to(dtype)
+    found["preventable_chain"] = found["preventable"] * (human.followers > 0)
+    found["replayed"] = found["preventable"] * (batch["kind"][hit] != FRONT)
     return found, duty, human.states
+
+
+def clean(found: Batch) -> Tensor:
+    """cfr_clean [B] of the columns of B rollouts: 1 for a clean failure, NaN where `cfr_preventable` is unknown."""
+    wrong = (found["duty"] > NONE) | (found["replayed"] == 1) | (found["cfr_bg"] == 1)
+    wrong = wrong | (found["aor_any"] == 1) | (found["ego_off_road"] == 1)
+    return found["cfr_preventable"].where(~wrong | found["cfr_preventable"].isnan(), 0.0)

@@ -161,7 +161,7 @@ class Prior(nn.Module):
                 exceed it takes the fraction of its control that uses the budget up; no later step is controlled.
         """
         settings, sampler = self.sampler, self.sampler.on(self.schedule)
-        levels = self.schedule.levels(settings.steps, noise.device)
+        levels = settings.levels(self.schedule, noise.device)
         noise = settings.temperature * noise
         x, kl, past, nominal_past = noise[0], torch.zeros(noise.shape[1:3], device=noise.device), None, None
         for k in range(settings.steps, 0, -1):

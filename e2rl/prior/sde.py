@@ -16,6 +16,8 @@ from torch import Tensor
 
 from e2rl.run.settings import configured, setting
 
+END = 0.24  # noise level of the last of `steps` steps, times steps, where levels are spaced by log(alpha / sigma)
+SPACINGS = ("level", "log_ratio")
 Past = tuple[Tensor, Tensor] | None  # clean estimate and noise level of a step
 Stepped = tuple[Tensor, Tensor]  # x at the lower level, and the variance of the noise in it
 
@@ -54,9 +56,17 @@ class NoiseSchedule:
         """lambda(t) = log(alpha / sigma), half the log of the signal-to-noise ratio; infinite at 0."""
         return torch.log(self.alpha(t) / self.sigma(t))
 
-    def levels(self, steps: int, device: torch.device | None = None) -> Tensor:
-        """Noise levels t_K > ... > t_0 = 0, [steps + 1], evenly spaced."""
-        return torch.linspace(self.start, 0.0, steps + 1, device=device)
+    def levels(self, steps: int, device: torch.device | None = None, spacing: str = "level") -> Tensor:
+        """Noise levels t_K > ... > t_0 = 0, [steps + 1].
+
+        spacing: `level`: evenly in t; `log_ratio`: evenly in log(alpha / sigma) from `start` to END / steps (Lu et al.
+        2022), then 0, where the last step takes the clean estimate itself and so leaves out the noise at its level.
+        """
+        if spacing == "level":
+            return torch.linspace(self.start, 0.0, steps + 1, device=device)
+        first, last = (math.log(math.tan(0.5 * math.pi * t)) for t in (self.start, END / steps))
+        ratio = torch.linspace(first, last, steps, device=device).exp()
+        return torch.nn.functional.pad(torch.atan(ratio) * (2 / math.pi), (0, 1))
 
 
 class Sampler(ABC):
@@ -127,6 +137,7 @@ class SamplerSettings:
 
     sampler: str = setting(choices=SAMPLERS)
     steps: int = setting(low=1)
+    spacing: str = setting(choices=SPACINGS)
     churn: float = setting(low=0, high=1)
     temperature: float = setting(low=0)
     route_temperature: float = setting(low=0)
@@ -134,6 +145,10 @@ class SamplerSettings:
     def on(self, schedule: NoiseSchedule) -> Sampler:
         """The Sampler of this name."""
         return SAMPLERS[self.sampler](schedule, self.churn)
+
+    def levels(self, schedule: NoiseSchedule, device: torch.device | None = None) -> Tensor:
+        """The noise levels [steps + 1] of a replan."""
+        return schedule.levels(self.steps, device, self.spacing)
 
 
 def path_kl(shift: Tensor, variance: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ def impulse_response(schedule: NoiseSchedule, sampler: SamplerSettings, device: 
 
     The sampler is linear then, and the answers to unit impulses are read off.
     """
-    levels, noise = schedule.levels(sampler.steps, device), torch.eye(sampler.steps, device=device)
+    levels, noise = sampler.levels(schedule, device), torch.eye(sampler.steps, device=device)
     past: Past = None
     x, step = noise[0], sampler.on(schedule).step
     for k in range(sampler.steps - 1):

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from tabulate import LATEX_ESCAPE_RULES, tabulate
 
-from e2rl.metrics.catalogue import META_STAGE, METRICS, OPEN_LOOP_STAGE, STAGES, Metric, table_metrics
+from e2rl.metrics.catalogue import META_STAGE, METRICS, OPEN_LOOP_STAGE, SPREAD_STAGE, STAGES, Metric, table_metrics
 from e2rl.metrics.failure_modes import LEAST, MANY
 from e2rl.run.files import write_atomically
 
@@ -24,6 +24,7 @@ COUNTED = {  # what the count (n) of a stage's cells counts, and how its metrics
     "throughout the horizon; causal start states, a route drawn per sample; samples without acceleration bounds.",
     META_STAGE: "(n) scenes. Likelihood of the log under each vehicle's histogram over all rollouts and steps; "
     "vehicles recorded throughout. A deterministic method's rollout stands for all.",
+    SPREAD_STAGE: "(n) vehicles: others than the ego, faster than 1 m/s at the start; samples on one route each.",
 }
 MEANS = "Mean [95% interval, by location or scene]; (n) rollouts where fewer count."
 PAIRED = "[95% interval], paired by (scene, seed); * the interval leaves out 0."

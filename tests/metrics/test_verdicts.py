@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from e2rl.metrics.score import score_rollouts
-from e2rl.metrics.verdicts import DUTIES, duties
+from e2rl.metrics.verdicts import DUTIES, clean, duties
 from tests.metrics.random_rollouts import random_rollouts
-from tests.metrics.test_failure_features import course, scene
+from tests.metrics.test_failure_features import course, drive, scene
 from tests.metrics.test_preventable import collision, cut_in, track
 
 
@@ -116,6 +116,63 @@ def test_who_stands_is_not_at_fault_and_who_hits_the_standing_is(ego, partner, f
     still = course(0, 0, 0, 0)
     still[0][:, 3] = ego
     assert row_of(still, (states, valid))["at_fault"] == fault
+
+
+@pytest.mark.parametrize(("moves_until", "fault"), [(8, 1.0), (9, 0.0), (28, 0.0)])
+def test_a_partner_that_swerves_in_and_stops_is_not_the_ego_s_fault(moves_until, fault):
+    """It cuts in 0.4 s before the contact at step 30, and stands since the step after `moves_until`: 2 s, or less."""
+    states, valid = course(34.3, 0, 0, 0)
+    states[:27, 1], states[: moves_until + 1, 3] = 10.0, 5.0
+    found = row_of(course(0, 0, 0, 10), (states, valid))
+    assert (found["contact_step"], found["at_fault"], found["counted"]) == (30, fault, fault)
+
+
+def test_of_a_leader_that_has_just_stopped_only_what_a_driver_prevents_counts():
+    """It has stood for a second when the ego runs into it, far enough ahead to brake for it or not."""
+    for speed, preventable in ((10, 1), (13, 0)):
+        stopping = drive(40, 0, 0, 4, accel=lambda t: -3.0 if t > 2.2 else 0.0)
+        found = row_of(course(10 * 4.67 - speed * 4.67, 0, 0, speed), stopping)
+        assert (found["at_fault"], found["preventable"], found["counted"]) == (0, preventable, preventable)
+
+
+def test_what_stands_since_the_start_has_stood():
+    assert row_of(course(0, 0, 0, 10), course(8, 1.5, 0, 0))["at_fault"] == 1
+
+
+@pytest.mark.parametrize(("speed", "preventable"), [(0.6, 1.0), (0.4, 0.0)])
+def test_an_ego_that_creeps_prevents_nothing_by_braking(speed, preventable):
+    found = row_of(course(0, 0, 0, speed), course(5.5, 0, 0, 0))
+    assert found["preventable"] == preventable and found["counted"] == found["at_fault"] == 1
+
+
+@pytest.mark.parametrize(
+    ("lane", "stands_from", "fault"), [((-40, 40), 0, 1.0), ((40, -40), 0, 0.0), (None, 0, 0.0), ((-40, 40), 20, 0.0)]
+)
+def test_an_ego_that_stands_across_a_lane_is_in_the_way_of_who_comes_along_it(lane, stands_from, fault):
+    """It faces north; the partner comes from the west at step 35 or so, along the lane, against it, or without one."""
+    ego = course(0, 0, math.pi / 2, 0)
+    ego[0][:stands_from, 3] = 1.0
+    rollouts = scene(ego, course(-30, 0, 0, 7.6))
+    x = torch.linspace(*(lane or (400, 480)), 41, dtype=torch.float64)
+    line = torch.stack([x, torch.zeros_like(x)], -1)[None]
+    extra = {"lane_points": line.to(rollouts.lane_points), "lane_index": torch.zeros(1, 41).to(rollouts.lane_index)}
+    found = score_rollouts(rollouts.replace(**extra))[0][0]
+    assert found["cfr"] == 1 and found["at_fault"] == fault
+
+
+def test_a_failure_is_clean_if_it_is_preventable_and_nobody_else_did_wrong():
+    row = row_of(course(0, 0, 0, 12), course(40, 0, 0, 3))
+    assert row["cfr_clean"] == row["preventable"] == 1 and row["replayed"] == 0
+    none = {"duty": 0, "replayed": 0, "cfr_bg": 0, "aor_any": 0, "ego_off_road": 0}
+    cases = [none, *({**none, name: 1} for name in none)]
+    columns = {name: torch.tensor([case[name] for case in cases]) for name in none}
+    assert clean(columns | {"cfr_preventable": torch.ones(6)}).tolist() == [1, 0, 0, 0, 0, 0]
+    assert clean(columns | {"cfr_preventable": torch.zeros(6)}).tolist() == [0] * 6
+
+
+def test_who_strikes_the_ego_is_only_replayed():
+    struck = row_of(course(0, 0, 0, 12), course(5, 4, -0.1, 12))
+    assert struck["contact_type"] == "side" and struck["preventable"] == struck["replayed"] == 1
 
 
 def test_the_driver_of_the_verdict_goes_with_the_rollout():

@@ -51,7 +51,7 @@ class MeanGuidance:
         if k == 1:
             return x, x0, x0
         sampler, schedule = self.prior.sampler, self.prior.schedule
-        low, zero = schedule.levels(sampler.steps, x.device)[sampler.steps - k + 1], torch.zeros_like(level)
+        low, zero = sampler.levels(schedule, x.device)[sampler.steps - k + 1], torch.zeros_like(level)
         step = partial(sampler.on(schedule).step, high=level, low=low, noise=zero)
         mean, variance = step(x=x, x0=x0)
         per_x0, _ = step(x=zero, x0=zero + 1)  # a step is affine in x0

@@ -78,7 +78,7 @@ class SparseControl:
 
     def __post_init__(self) -> None:
         steps = self.prior.sampler.steps
-        levels = self.prior.schedule.levels(steps)[:-1]
+        levels = self.prior.sampler.levels(self.prior.schedule)[:-1]
         self.anchor_step = steps - int((levels - self.settings.anchor_level).abs().argmin())
         self.feasibility_step = int((levels <= FEASIBILITY_LEVEL).sum())
         self.jump = torch.zeros(self.coalition.shape, device=self.eta.device)

@@ -1,0 +1,31 @@
+"""The spread of samples: none without noise, and for a linear denoiser what the sampler's own moments say."""
+
+from dataclasses import replace
+
+import pytest
+
+from e2rl.prior.sde import SamplerSettings
+from e2rl.prior.spread import sample_variances
+from tests.prior.gaussian import denoiser, moments
+from tests.prior.small import small_prior
+from tests.traffic.e2.traffic_scenes import scenes
+
+STD = 0.6
+
+
+def test_without_noise_all_samples_are_one():
+    prior = small_prior(sampler=SamplerSettings(steps=3, temperature=0.0))
+    found = sample_variances(prior, scenes(2).scenes, 3)
+    assert found["vehicles"].min() > 0
+    assert all(found[name].abs().max() < 1e-9 for name in ("knots", "lateral", "travel"))
+
+
+@pytest.mark.parametrize("sampler", ["ddim", "dpm_solver_pp"])
+def test_gaussian_samples_have_the_variance_of_the_sampler(sampler, monkeypatch):
+    prior = small_prior(sampler=replace(SamplerSettings(), sampler=sampler))
+    exact = denoiser(0.0, STD)
+    monkeypatch.setattr(prior, "denoise", lambda x, level, context: exact(x, level))
+    found = sample_variances(prior, scenes(4).scenes, 200)
+    _, std = moments(exact, sampler, 1.0, prior.sampler.steps)
+    assert found["knots"].sum() / found["vehicles"].sum() == pytest.approx(std**2, rel=0.03)
+    assert found["lateral"].sum() / found["vehicles"].sum() == pytest.approx(std**2, rel=0.05)
