@@ -211,7 +211,7 @@ def measured(rows: Sequence[dict]) -> str:
     """Where the numbers come from, and what they lack."""
     if not rows:
         return "No rollout was scored."
-    first = max(rows, key=lambda row: row["n_rollouts"])
+    first = max(closed_loop(rows) or rows, key=lambda row: row["n_rollouts"])
     scenes, seeds = plural(first["n_scenes"], "scene"), plural(first["n_seeds"], "seed")
     methods = dict.fromkeys(traffic_name(row) for row in rows if row["eta"])
     attack = f"; attack: {', '.join(methods)}" if len(methods) == 1 else ""

@@ -7,7 +7,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from e2rl.commands import draw_skeleton, prior_tables
 from e2rl.evaluation.rollout_files import read_metrics
-from e2rl.metrics.catalogue import META_STAGE, OPEN_LOOP_STAGE, STAGES
+from e2rl.metrics.catalogue import META_STAGE, OPEN_LOOP_STAGE, SPREAD_STAGE, STAGES
 from tests.scripts import SHORT
 
 pytestmark = pytest.mark.slow
@@ -23,14 +23,18 @@ def run(command, folder, world, monkeypatch, *options):
 
 
 def test_the_prior_s_tables_have_rows_of_all_stages(world, tmp_path, monkeypatch, capsys):
-    """Open loop, closed loop and meta-metric of two scenes."""
-    run(prior_tables, tmp_path / "run", world, monkeypatch, "open_loop_samples=2", "meta_rollouts=2")
+    """Open loop, spread, closed loop and meta-metric of two scenes."""
+    run(
+        prior_tables, tmp_path / "run", world, monkeypatch, "open_loop_samples=2", "spread_samples=2", "meta_rollouts=2"
+    )
+    assert "bundled/tune, 2 scenes, 1 seed." in capsys.readouterr().out, "the closed loop's, not the samples"
     rows = read_metrics(tmp_path / "run" / "metrics.json")
     found = {stage: [row for row in rows if row.get("stage") == stage] for stage in (*STAGES, None)}
     methods = ["replay", "constant_velocity", "idm", "nominal"]
     assert {stage: [row["method"] for row in part] for stage, part in found.items()} == {
         OPEN_LOOP_STAGE: methods[1:],
         META_STAGE: methods,
+        SPREAD_STAGE: ["nominal"],
         None: methods,
     }
     for stage, metrics in STAGES.items():
