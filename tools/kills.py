@@ -45,7 +45,7 @@ STAGES = {
     "table1": f"{TESTED} experiment=table1 methods=[e2,nominal,ctg_adv,cat] num_scenes=2 seeds=[0,1] batch=1",
 }
 WORKING = {".hydra", "parts", "time"}  # what a run keeps for itself, and logs of wall times
-TIMED = re.compile(r"seconds|^time$")  # names of wall times
+TIMED = re.compile(r"seconds|^time$|^cwd$")  # names of wall times, and of the folder that a run began in
 DERIVED = {".pdf", ".md", ".tex", ".log", ".html"}  # files that show what others hold
 HASHES = "sha256.json"  # of files that are compared themselves
 
