@@ -42,7 +42,7 @@ STAGES = {
     "evolution": f"{TRAINED} prior.sampler.steps=2 num_scenes=4 rounds=3 batch=4 learner.round.scenes=4"
     " learner.collect.batch=4 learner.collect.iterations=1 measure.scenes=4 measure.seeds=[0] measure.eta=2",
     "evaluation": f"{TESTED} num_scenes=4 seeds=[0,1] batch=2 processes=2",
-    "table1": f"{TESTED} experiment=table1 methods=[e2,nominal,ctg_adv,cat] num_scenes=2 seeds=[0,1] batch=1",
+    "table1": f"{TESTED} experiment=table1 methods=[e2,e2_pursuit,nominal,ctg_adv] num_scenes=2 seeds=[0,1] batch=1",
 }
 WORKING = {".hydra", "parts", "time"}  # what a run keeps for itself, and logs of wall times
 TIMED = re.compile(r"seconds|^time$|^cwd$")  # names of wall times, and of the folder that a run began in
