@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardSum, TransformedEnv
@@ -129,10 +129,14 @@ class PolicyImprovement(Improvement):
         base = DrivingEnv(scenes, sim, batch, device, agents=agents, hold=hold)
         self.env = TransformedEnv(base, Compose(self.synthesizer, RewardSum()))
         actor = ego.network.actor
+        self._collect_by(actor if traffic is None else TensorDictSequential(EgoPlanner(ego, base), actor), device)
+
+    def _collect_by(self, policy: TensorDictModuleBase, device: str) -> None:
+        """Collect batches [B, steps] of decisions of a policy from here on."""
         self._collector = Collector(
             self.env,
-            actor if traffic is None else TensorDictSequential(EgoPlanner(ego, base), actor),
-            frames_per_batch=batch * self.settings.steps,
+            policy,
+            frames_per_batch=self.settings.batch * self.settings.steps,
             total_frames=-1,
             trust_policy=True,
             track_traj_ids=False,

@@ -127,6 +127,7 @@ def test_the_folder_itself_is_read_by_all_commands(run, tmp_path, capsys, monkey
     monkeypatch.setattr("e2rl.report.picture.Replay.frames", lambda shown: [])
     for name, command in COMMANDS.items():
         command(run, tmp_path / name)
+        assert not capsys.readouterr().err.startswith("error"), name
 
 
 @pytest.mark.parametrize("command", ["replay", "export"])

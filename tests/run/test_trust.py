@@ -45,7 +45,8 @@ def test_a_run_of_ones_own_goes_on(tmp_path, config):
 @pytest.mark.parametrize("group", ["learner", "ego", "curriculum", "synthesizer"])
 def test_every_file_of_ones_own_goes_on(tmp_path, group):
     for name in set(choices(group)) - {"external", "policy_file"}:
-        reading(tmp_path, changed(TRAIN, with_choice(group, name)), TRAIN)
+        own = changed(TRAIN, with_choice(group, name))
+        assert reading(tmp_path, own, TRAIN) == own, name
 
 
 def test_a_policy_that_holds_arithmetic_goes_on():
