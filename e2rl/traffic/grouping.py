@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from e2rl.prior.prior import Context
 from e2rl.sim.world import World
 
 Value = TypeVar("Value")  # a tensor, a TensorDict, a (nested) dataclass of them, or None
@@ -44,6 +45,16 @@ def map_tensors(function: Callable, value: Any, *others: Any) -> Any:
     return replace(value, **{name: map_tensors(function, *part) for name, part in parts.items()})
 
 
+def of_scenes(context: Context, rows: Tensor) -> Context:
+    """The Context of scenes rows [G] of those of a Context."""
+    return mapped(context, lambda value: value[rows])
+
+
+def mapped(context: Context, function: Callable[[Tensor], Tensor]) -> Context:
+    """A Context with `function` applied to every tensor."""
+    return replace(map_tensors(function, context), encoding=context.encoding.map(function))
+
+
 def noise_of(seed: Tensor, draw: Tensor, shape: tuple[int, ...], uniform: bool = False) -> Tensor:
     """Random numbers [B, *shape] that depend only on each scene's seed [B] and draw number [B], not on the
     batch: standard normal, or uniform in [0, 1)."""
@@ -51,7 +62,7 @@ def noise_of(seed: Tensor, draw: Tensor, shape: tuple[int, ...], uniform: bool =
     for value, number in torch.stack([seed, draw], -1).tolist():
         generator = torch.Generator().manual_seed((value * 1_000_003 + number) % (2**63))
         rows.append((torch.rand if uniform else torch.randn)(shape, generator=generator))
-    return torch.stack(rows).to(seed.device)
+    return (torch.stack(rows) if rows else torch.empty(0, *shape)).to(seed.device)
 
 
 ROWS = 160, 1024  # vehicle rows of a group: SHRUNK applies from the first number on, the second is the maximum

@@ -18,7 +18,7 @@ from e2rl.scenes.boxes import overlap, to_frame
 from e2rl.scenes.recording import DT
 from e2rl.traffic.baselines.losses import disk_overlap, ego_distance, off_road_term, pair_term
 from e2rl.traffic.baselines.open_loop import OpenLoop, OpenLoopState, Scenario
-from e2rl.traffic.baselines.view import View, motion_of, of_scenes
+from e2rl.traffic.baselines.view import View, motion_of
 from e2rl.traffic.e2.potentials import SAMPLED_STEPS, STRIDE
 from e2rl.traffic.grouping import take_rows
 from e2rl.traffic.nominal import Replan

@@ -3,8 +3,7 @@
 Several joint samples of the same scenes: S of them along the batch, and back to [S, B, ...].
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
@@ -15,7 +14,7 @@ from e2rl.prior.prior import Context, Prior
 from e2rl.prior.routes import RoutedScene
 from e2rl.sim.world import World
 from e2rl.traffic.e2.potentials import SAMPLED_STEPS
-from e2rl.traffic.grouping import map_tensors
+from e2rl.traffic.grouping import mapped
 
 
 @dataclass(frozen=True)
@@ -60,16 +59,6 @@ def tiled(context: Context, count: int) -> Context:
         return value.repeat(count, *[1] * (value.ndim - 1))
 
     return mapped(context, tile)
-
-
-def of_scenes(context: Context, rows: Tensor) -> Context:
-    """The Context of scenes rows [G] of those of a Context."""
-    return mapped(context, lambda value: value[rows])
-
-
-def mapped(context: Context, function: Callable[[Tensor], Tensor]) -> Context:
-    """A Context with `function` applied to every tensor."""
-    return replace(map_tensors(function, context), encoding=context.encoding.map(function))
 
 
 def folded(noise: Tensor) -> Tensor:

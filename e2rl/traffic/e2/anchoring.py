@@ -50,7 +50,7 @@ MAX_SWING = 1.0  # m that it may swing out while it turns in
 class AnchorSettings:
     """Settings of the proposals and of the blend; conf/synthesizer/e2.yaml explains each."""
 
-    strength: float = setting(low=0, high=1)
+    strength: float = setting(low=0)
     min_accel: float = setting()
     max_accel: float = setting()
 

@@ -1,9 +1,12 @@
-"""Sparse gradient control (Sec. IV-B2): the masked control of one replan, inside every step of the reverse SDE.
+"""Sparse control (Sec. IV-B): the masked control of one replan, inside every step of the reverse SDE.
 
 Guidance replaces the score s by s - grad V (Dhariwal and Nichol 2021), which moves the clean estimate:
 x0 <- x0 - (sigma^2 / alpha) grad V. To keep eta a usable dial, each vehicle's gradient is scaled by the noise level and
 clipped before eta multiplies it. Only V_adv is pulled back through the network; V_feas acts on the clean estimate, once
 that has taken shape: the same outcome at a fraction of the cost.
+
+Anchors and kernels pull the clean estimate to a goal at every step (`pulled`). The last step has no noise, so that no
+control of it has a price in nats; it is the prior's.
 """
 
 from collections.abc import Callable
@@ -12,11 +15,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS
+from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS, SIZE
 from e2rl.prior.prior import Context, Prior
 from e2rl.prior.sde import NoiseSchedule
 from e2rl.run.settings import configured, setting
 from e2rl.traffic.e2.anchoring import Anchor
+from e2rl.traffic.e2.kernels import pulled
 from e2rl.traffic.e2.potentials import (
     SAMPLED_STEPS,
     PotentialContext,
@@ -58,12 +62,27 @@ def gradient_weight(schedule: NoiseSchedule, level: Tensor, scaling: str) -> Ten
 
 
 @dataclass
+class Pull:
+    """Goals [B, V, SIZE] that vehicles [B, V] bool are pulled to, with `strength` [B] (see `pulled`)."""
+
+    goal: Tensor
+    vehicles: Tensor
+    strength: Tensor
+
+    def __call__(self, x0: Tensor, level: Tensor, schedule: NoiseSchedule) -> Tensor:
+        """x0 [B, V, SIZE] after the pull at a noise level; where a goal is NaN nothing pulls."""
+        goal = torch.where(self.goal.isnan(), x0, self.goal)
+        moved = pulled(x0, goal, self.strength[:, None, None], level, schedule)
+        return torch.where(self.vehicles[..., None], moved, x0)
+
+
+@dataclass
 class SparseControl:
     """The control of one replan of B scenes; called by `Prior.sample` at every noise level.
 
     conditions: what the potentials see; coalition [B, V] bool: C*; eta [B]: intensity; anchor: the skeleton's proposal,
-    blended in with `strength`; anchor_noise [B, V, SIZE]: for the literal blend. After sampling, `jump` [B, V] is the
-    energy of the anchor's shift, ||shift||^2 / (2 sigma^2).
+    with `strength`; anchor_noise [B, V, SIZE]: for the literal blend; kernel: what else is pulled. After sampling, `jump`
+    [B, V] is the energy of the literal blend's shift, ||shift||^2 / (2 sigma^2).
     """
 
     prior: Prior
@@ -75,38 +94,48 @@ class SparseControl:
     anchor: Anchor
     strength: float
     anchor_noise: Tensor
+    kernel: Pull | None = None
 
     def __post_init__(self) -> None:
         steps = self.prior.sampler.steps
         levels = self.prior.sampler.levels(self.prior.schedule)[:-1]
         self.anchor_step = steps - int((levels - self.settings.anchor_level).abs().argmin())
-        self.feasibility_step = int((levels <= FEASIBILITY_LEVEL).sum())
+        self.feasibility_step = int((levels <= FEASIBILITY_LEVEL).sum()) if self.settings.feasibility > 0 else 0
         self.jump = torch.zeros(self.coalition.shape, device=self.eta.device)
         # Asked once, on the host: without a coalition V_adv is 0, and with a clip of 0 it has no effect.
         self.has_coalition = self.settings.adversarial_clip > 0 and bool(self.coalition.any())
+        self.pulls = [] if self.kernel is None else [self.kernel]
+        if self.settings.anchoring == "clean" and self.strength > 0:
+            lateral = torch.full_like(self.anchor.knots[..., : SIZE - KNOTS], torch.nan)
+            goal = torch.cat([self.anchor.knots / ACCEL_SCALE, lateral], -1)
+            self.pulls.append(Pull(goal, self.anchor.feasible & self.coalition, self.strength * self.eta))
 
     def __call__(
         self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Callable[[Tensor], Tensor]
     ) -> tuple[Tensor, Tensor, Tensor]:
         """x [B, V, SIZE] of step k and its noise level -> (x after anchoring, clean estimate x0, controlled x0)."""
         settings = self.settings
-        if k == self.anchor_step and settings.anchoring != "off" and self.strength > 0:
-            x = self._anchored(x, level, context, denoise)
+        if k == self.anchor_step and settings.anchoring == "literal" and self.strength > 0:
+            x = self._blended(x, level, context, denoise)
         x0, adversarial, feasibility = self._gradients(x, level, k, context, denoise)
+        if k == 1:
+            return x, x0, x0
         weight = gradient_weight(self.prior.schedule, level, settings.scaling)
         adversarial = clip_rows(weight * adversarial, settings.adversarial_clip)
         feasibility = clip_rows(settings.feasibility * weight * feasibility, settings.feasibility_clip)
         shift = self.eta[:, None, None] * adversarial * self.coalition[..., None]
-        shift = shift + feasibility * context.active[..., None]
+        moved = x0 - shift - feasibility * context.active[..., None]
+        for pull in self.pulls:
+            moved = pull(moved, level, self.prior.schedule)
         controlled = (context.active & (self.eta > 0)[:, None])[..., None]
-        return x, x0, x0 - torch.where(controlled, shift, 0.0)
+        return x, x0, torch.where(controlled, moved, x0)
 
     def _gradients(
         self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Callable[[Tensor], Tensor]
     ) -> tuple[Tensor, Tensor, Tensor]:
         """(x0, grad V_adv by x or x0 as set, grad V_feas by x0)."""
         adversarial = feasibility = torch.zeros_like(x)
-        with_feasibility = k <= self.feasibility_step
+        with_feasibility = 1 < k <= self.feasibility_step
         with torch.enable_grad():
             variable = x.detach().requires_grad_(self.has_coalition and self.settings.gradient == "denoiser")
             denoised = denoise(variable)
@@ -125,21 +154,17 @@ class SparseControl:
             (adversarial,) = torch.autograd.grad(denoised, variable, adversarial)
         return x0.detach(), adversarial, feasibility
 
-    def _anchored(self, x: Tensor, level: Tensor, context: Context, denoise: Callable[[Tensor], Tensor]) -> Tensor:
-        """x after topological anchoring of the coalition at this level; records the energy of the shift.
+    def _blended(self, x: Tensor, level: Tensor, context: Context, denoise: Callable[[Tensor], Tensor]) -> Tensor:
+        """x after the printed anchoring, eq. (anchor_injection), (1 - w) x + w (alpha a + sigma e') of proposal a; records
+        the energy of the shift.
 
-        With x = alpha x0 + sigma e and proposal a, clean anchoring at strength w is alpha ((1 - w) x0 + w a) + sigma e.
-        The printed one, eq. (anchor_injection), is (1 - w) x + w (alpha a + sigma e'): with a noise e' of its own it
-        shrinks the noise variance by (1 - w)^2 + w^2. It is kept for the ablation.
+        With a noise e' of its own it shrinks the noise variance by (1 - w)^2 + w^2. It is kept for the ablation.
         """
         with torch.no_grad():
             x0 = denoise(x)
-        schedule, strength = self.prior.schedule, self.strength
+        schedule, strength = self.prior.schedule, min(self.strength, 1.0)
         proposal = torch.cat([self.anchor.knots / ACCEL_SCALE, x0[..., KNOTS:]], -1)
-        if self.settings.anchoring == "clean":
-            blend = x + schedule.alpha(level) * strength * (proposal - x0)
-        else:
-            blend = (1 - strength) * x + strength * schedule.noised(proposal, level, self.anchor_noise)
+        blend = (1 - strength) * x + strength * schedule.noised(proposal, level, self.anchor_noise)
         mask = self.anchor.feasible & self.coalition & context.active & (self.eta > 0)[:, None]
         after = torch.where(mask[..., None], blend, x)
         self.jump = ((after - x) ** 2).sum(-1) / (2 * schedule.sigma(level) ** 2)

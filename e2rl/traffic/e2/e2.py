@@ -1,9 +1,11 @@
 """e2, the adversarial synthesizer: Algorithm 1's inner part for batches of scenes (docs/method.md, sections 5 to 9).
 
-When a coalition is due: reference rollout, topology, feasibility, skeleton. At every replan: encode once, anchor,
-sample under sparse control. With eta = 0 nothing is controlled, and the traffic is the prior's, bit for bit.
+When a coalition is due: reference rollout, topology, feasibility, skeleton. At every replan: encode once, anchor, draw
+kernels, sample under sparse control, choose among the samples. With eta = 0 nothing is controlled, and the traffic is
+the prior's, bit for bit.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, cast
@@ -14,14 +16,16 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import HORIZON, KNOTS, SIZE, locate, select
 from e2rl.prior.prior import Context
-from e2rl.prior.routes import reroute
+from e2rl.prior.routes import reroute, take_route
 from e2rl.run.settings import configured, setting, settings_of
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 from e2rl.traffic.e2.anchoring import Anchor, AnchorSettings, propose
-from e2rl.traffic.e2.control import ControlSettings, SparseControl
+from e2rl.traffic.e2.control import ControlSettings, Pull, SparseControl
 from e2rl.traffic.e2.feasibility import FeasibilitySettings, feasible_vehicles
 from e2rl.traffic.e2.interception import InterceptionSettings
+from e2rl.traffic.e2.foresight import time_before
+from e2rl.traffic.e2.kernels import Attack, Kernels, KernelSettings, propose_kernels, sideways, watched
 from e2rl.traffic.e2.potentials import PotentialContext, PotentialSettings
 from e2rl.traffic.e2.reasoner import LanguageReasoner, ReasonerSettings
 from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, YieldingSettings, duty_of, leading, place_of
@@ -36,11 +40,13 @@ from e2rl.traffic.e2.skeleton import (
     limits_of,
 )
 from e2rl.traffic.e2.topology import TopologySettings, topological_candidates
-from e2rl.traffic.grouping import no_vehicles, noise_of, put_rows, take_rows
+from e2rl.traffic.e2.motion import compact, put, take
+from e2rl.traffic.grouping import no_vehicles, noise_of, of_scenes, put_rows, take_rows
 from e2rl.traffic.nominal import NominalTraffic, PriorState, React, Replan
 from e2rl.traffic.traffic import FULL, TrafficPlan
 
-LITERAL, SUPPORT = 500, 750  # numbers of draws: the literal blend's noise, a random support's
+LITERAL, SUPPORT, SAMPLES = 500, 750, 2000  # numbers of draws: the literal blend's noise, a random support's, kernels'
+MIN_TEMPERATURE, MAX_ROUTE_NATS = 0.05, 50.0  # of the prior's choice of routes, where a new route is booked
 SUPPORTS = ("feasible", "topology", "random")
 
 
@@ -50,8 +56,9 @@ class E2State(PriorState):
 
     eta [B]; near, far [B] int64: the most near and far agents of a coalition; coalition [B, V]: C*; target [B, V]
     int64: whom each member acts on (0 the ego, -1 none); off_lane [B, V]: on an interception instead of its lane;
-    committed [B, V]: with a proposal, knots [B, V, KNOTS]: its accelerations [m/s^2]; path_kl, anchor_jump [B, V]: path
-    KL of the control and energy of anchoring since the start.
+    committed [B, V]: with a proposal, knots [B, V, KNOTS]: its accelerations [m/s^2]; drawn [B, V]: by a kernel; since
+    [B, V] s: see `foresee`; settled [B, V]: once drawn to what the competent driver prevents; path_kl, anchor_jump [B,
+    V]: path KL of the control and energy of the literal blend since the start.
     """
 
     eta: Tensor = no_vehicles()
@@ -62,6 +69,9 @@ class E2State(PriorState):
     off_lane: Tensor
     committed: Tensor
     knots: Tensor
+    drawn: Tensor
+    since: Tensor
+    settled: Tensor
     path_kl: Tensor
     anchor_jump: Tensor
 
@@ -84,6 +94,7 @@ class E2(NominalTraffic):
     skeleton: SkeletonSettings
     anchor: AnchorSettings
     interception: InterceptionSettings
+    kernels: KernelSettings
     yielding: YieldingSettings
     potentials: PotentialSettings
     control: ControlSettings
@@ -116,7 +127,8 @@ class E2(NominalTraffic):
         near, far = limits_of(torch.full_like(seed, FULL) if template is None else template, self.skeleton)
         nominal = super().reset(scenes, seed, eta)
         none, zero = torch.zeros_like(nominal.routed.parked), torch.zeros_like(nominal.routed.length)
-        nobody = {"coalition": none, "target": none.long() - 1, "off_lane": none, "committed": none}
+        nobody = {name: none for name in ("coalition", "off_lane", "committed", "drawn", "settled")}
+        nobody |= {"target": none.long() - 1, "since": zero - 1}
         costs = {"path_kl": zero, "anchor_jump": zero}
         knots = zero[..., None].repeat(1, 1, KNOTS)
         begun: dict[str, Any] = {**vars(nominal), **nobody, **costs}
@@ -128,27 +140,116 @@ class E2(NominalTraffic):
         """Returns states and plans of the coming HORIZON steps."""
         state, plan = super().replan(state, world, ego_plan, react)
         costs = {"path_kl": state.path_kl, "anchor_jump": state.anchor_jump}
-        return state, replace(plan, adversary=state.coalition, target=state.target, **costs)
+        target = torch.where(state.drawn & ~state.coalition, 0, state.target)
+        return state, replace(plan, adversary=state.coalition | state.drawn, target=target, **costs)
 
     def replan_group(self, now: Replan) -> tuple[E2State, Tensor, Context]:
         """Returns state, guided joint sample x0 [G, V, SIZE] and context of a group."""
         state, ego_plan = now.state, now.ego_plan
-        if not bool((state.eta > 0).any()):
+        if not bool((state.eta > 0).any()) or self.control.transport_budget == 0:
             return super().replan_group(now)
         world = replace(now.world, route=state.routed.route)
         state, anchor = self._reselected(state, world, ego_plan)
-        off_lane = anchor.off_lane & state.coalition & (state.eta > 0)[:, None]
-        state = self._onto(state, world, state.routed.route, off_lane, anchor.off_lane_path)
+        state, anchor = self._afforded(state, world, anchor)
         context = self.encode(state, world, ego_plan)
-        context.obstacles.duty = duty_of(self.responsibility, self.yielding, world, state.coalition, state.eta)
-        control = self._control(state, world, ego_plan, anchor)
-        limit = self.control.transport_budget
-        budget = None if limit is None else (limit - state.path_kl.sum(-1)).clamp(min=0)  # what control may still add
-        sample = self.prior.sample(context, now.noise, control, budget)
-        kl, jump = state.path_kl + sample.kl, state.anchor_jump + control.jump
         acts = anchor.feasible & state.coalition
-        state = replace(state, path_kl=kl, anchor_jump=jump, committed=acts, knots=anchor.knots)
-        return state, sample.x0, context
+        state = replace(state, committed=acts, knots=anchor.knots)
+        if self.kernels.samples == 1:
+            control = self._control(state, world, ego_plan, anchor)
+            sample = self.prior.sample(context, now.noise, control, self._budget(state))
+            x0, kl, jump = sample.x0, sample.kl, control.jump
+        else:
+            attack, kernels = self._kernels(state, world, ego_plan, context, acts)
+            state, x0, kl, jump = self._best(state, attack, kernels, anchor, context, now.noise)
+        members = state.coalition | state.drawn
+        context.obstacles.duty = duty_of(self.responsibility, self.yielding, world, members, state.eta)
+        return replace(state, path_kl=state.path_kl + kl, anchor_jump=state.anchor_jump + jump), x0, context
+
+    def _budget(self, state: E2State) -> Tensor | None:
+        """Nats [B] that control may still add; None: any."""
+        limit = self.control.transport_budget
+        return None if limit is None else (limit - state.path_kl.sum(-1)).clamp(min=0)
+
+    def _afforded(self, state: E2State, world: World, anchor: Anchor) -> tuple[E2State, Anchor]:
+        """States with the interceptions under way and their nats booked; those that the budget does not hold are off."""
+        off_lane = anchor.off_lane & state.coalition & (state.eta > 0)[:, None]
+        lane = take_route(world.scene["route_points"], state.routed.route.clamp(min=0))
+        cost = sideways(anchor, world, state.lane, lane) * off_lane
+        budget = self._budget(state)
+        if budget is not None:
+            held = (cost.sum(-1) <= budget)[:, None]
+            anchor = replace(anchor, feasible=anchor.feasible & (held | ~off_lane))
+            off_lane, cost = off_lane & held, cost * held
+        state = replace(state, path_kl=state.path_kl + cost)
+        return self._onto(state, world, state.routed.route, off_lane, anchor.off_lane_path), anchor
+
+    def _kernels(
+        self, state: E2State, world: World, ego_plan: Tensor, context: Context, acts: Tensor
+    ) -> tuple[Attack, Kernels]:
+        """The best kernels for vehicles that do not act [B, V] already, and what they are valued by."""
+        mean = self.prior.estimate(context)
+        plan = self.prior.decode(mean, context).states()
+        index, there = compact(watched(world, context, plan, acts) & (state.eta > 0)[:, None])
+        attack = Attack(world, ego_plan, plan, index, there, state.since, state.settled)
+        gain, count = self.kernels.gain * state.eta, self.kernels.samples - 1
+        return attack, propose_kernels(attack, state.lane, state.routed.points, mean, gain, count)
+
+    def _best(
+        self, state: E2State, attack: Attack, kernels: Kernels, anchor: Anchor, context: Context, noise: Tensor
+    ) -> tuple[E2State, Tensor, Tensor, Tensor]:
+        """State, x0, path KL and jump of the joint sample of highest value in each scene: a plain one, or one of those
+        drawn to kernels, which has gain times its worth more and its path KL less.
+
+        Scenes without a kernel have one sample. The choice is booked as its most, log M, with the vehicle drawn.
+        """
+        batch, count = len(state.eta), self.kernels.samples - 1
+        rows = ((kernels.vehicle >= 0).any(1) & self._affords(state)).nonzero()[:, 0]
+        first = torch.arange(batch, device=rows.device)
+        many = torch.cat([first, rows.repeat_interleave(count)])
+        extra = noise_of(state.seed[rows], SAMPLES + state.replans[rows], (noise.shape[0], count, *noise.shape[2:]))
+        noise = torch.cat([noise, extra.transpose(0, 1).flatten(1, 2)], 1)
+        nobody = torch.full_like(first, -1)
+        vehicle = torch.cat([nobody, kernels.vehicle[rows].flatten()])
+        drawn = vehicle[:, None] == torch.arange(state.coalition.shape[1], device=rows.device)
+        goal = torch.zeros_like(noise[0])
+        goal[batch:] = kernels.goal[rows].flatten(0, 1)[:, None]
+        copies, scenes = take_rows(state, many), take_rows(attack.world, many)
+        pull = Pull(goal, drawn, self.kernels.pull * copies.eta)
+        control = self._control(copies, scenes, attack.ego_plan[many], take_rows(anchor, many), pull)
+        context = of_scenes(context, many)
+        budget = self._budget(copies)
+        choice = math.log(count + 1) * drawn
+        if budget is not None:
+            budget = budget - choice.sum(-1)
+        sample = self.prior.sample(context, noise, control, budget)
+        kl = sample.kl + choice
+        worth, prevented = self._worth(attack, context, sample.x0, many)
+        value = self.kernels.gain * copies.eta * worth.amax(-1) - kl.sum(-1)
+        table = value.new_full((batch, count + 1), -torch.inf)
+        table[:, 0] = value[:batch]
+        table[rows, 1:] = value[batch:].view(-1, count)
+        place = torch.zeros(batch, count + 1, dtype=torch.int64, device=rows.device)
+        place[:, 0] = first
+        place[rows, 1:] = torch.arange(batch, len(many), device=rows.device).view(-1, count)
+        pick = place.gather(1, table.argmax(1, keepdim=True))[:, 0]
+        settled = state.settled | (drawn & (worth > 0) & prevented)[pick]
+        since = time_before(attack.world, attack.ego_plan, state.since)
+        state = replace(state, drawn=drawn[pick], settled=settled, since=since)
+        return state, sample.x0[pick], kl[pick], control.jump[pick]
+
+    def _affords(self, state: E2State) -> Tensor:
+        """Bool [B]: there are nats left for the choice of a sample."""
+        budget = self._budget(state)
+        return state.eta > 0 if budget is None else (state.eta > 0) & (budget > math.log(self.kernels.samples))
+
+    def _worth(self, attack: Attack, context: Context, x0: Tensor, many: Tensor) -> tuple[Tensor, Tensor]:
+        """What `foresee` makes of samples x0 [C, V, SIZE] of scenes many [C]: worth and prevented [C, V]."""
+        copies = replace(attack, **{name: take_rows(getattr(attack, name), many) for name in vars(attack)})
+        tracks = take(self.prior.decode(x0, context).states(), copies.index)[:, :, None]
+        seen = copies.foresight(tracks)
+        zero = torch.zeros_like(x0[..., 0])
+        worth = put(zero, copies.index, copies.there, seen.worth[..., 0])
+        return worth, put(zero.bool(), copies.index, copies.there, seen.prevented[..., 0])
 
     def _reselected(self, state: E2State, world: World, ego_plan: Tensor) -> tuple[E2State, Anchor]:
         """States and anchors, with a new coalition in scenes whose choice is due and in which no member of the present
@@ -219,9 +320,15 @@ class E2(NominalTraffic):
         acts = members & anchor.feasible
         if self.skeleton.pursuit:  # where nobody can meet its target yet, V_adv alone brings them nearer
             acts = torch.where(acts.any(1, keepdim=True), acts, members)
+        change = self._route_nats(scene, anchor.route) * (acts & (anchor.route != state.routed.route))
+        budget = self._budget(state)
+        if budget is not None:  # who cannot afford its new route stays on the old one, and out of the coalition
+            held = (change.sum(-1) <= budget)[:, None] | (change == 0)
+            acts, change = acts & held, change * held
         for _ in range(self.skeleton.max_chain - 1):
             acts = acts & ((skeleton.target <= 0) | acts.gather(1, skeleton.target.clamp(min=0)))
-        state = replace(state, coalition=acts, target=torch.where(acts, skeleton.target, -1))
+        target = torch.where(acts, skeleton.target, -1)
+        state = replace(state, coalition=acts, target=target, path_kl=state.path_kl + change * acts)
         if self.on_decision:
             moments = (DT * (found.steps + 1)).expand(len(reference), -1)
             chosen = (found.candidates, feasible, state.coalition, state.target)
@@ -229,6 +336,13 @@ class E2(NominalTraffic):
             self.on_decision(Selection(state.seed, world.step, at, moments, found.weights, *chosen, self.topology))
         route = torch.where(acts, anchor.route, state.routed.route)
         return self._onto(state, world, route, acts & False, anchor.off_lane_path)
+
+    def _route_nats(self, scene: TensorDictBase, route: Tensor) -> Tensor:
+        """-log p of candidates route [B, V] under the prior's own choice of routes."""
+        temperature = max(self.prior.sampler.route_temperature, MIN_TEMPERATURE)
+        with torch.no_grad():
+            log_p = torch.log_softmax(self.prior.route_choice(scene) / temperature, -1)
+        return -take_route(log_p, route.clamp(min=0)).clamp(min=-MAX_ROUTE_NATS)
 
     def _support(self, state: E2State, world: World, candidates: Tensor, feasible: Tensor) -> tuple[Tensor, Tensor]:
         """S [B, V] and who may take its place where it is empty, by `support` (Sec. IV-A2)."""
@@ -252,10 +366,12 @@ class E2(NominalTraffic):
         moved = locate(world.states[:, : route.shape[1]], old.a, old.kappa * old.v, routed.points)
         return replace(state, routed=routed, lane=select(changed, moved, old), off_lane=off_lane)
 
-    def _control(self, state: E2State, world: World, ego_plan: Tensor, anchor: Anchor) -> SparseControl:
+    def _control(
+        self, state: E2State, world: World, ego_plan: Tensor, anchor: Anchor, kernel: Pull | None = None
+    ) -> SparseControl:
         vehicles, routed = state.routed.route.shape[1], state.routed
         now = world.states[:, :vehicles], state.lane.a, world.valid[:, :vehicles]
         seen = PotentialContext(world.scene, *now, routed.points, routed.has_lane, ego_plan[:, :HORIZON], state.target)
         literal = noise_of(state.seed, LITERAL + state.replans, (*state.target.shape[1:], SIZE))
         given = self.prior, self.control, self.potentials, seen, state.coalition, state.eta
-        return SparseControl(*given, anchor, self.anchor.strength, literal)
+        return SparseControl(*given, anchor, self.anchor.strength, literal, kernel)
