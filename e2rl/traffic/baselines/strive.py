@@ -20,7 +20,7 @@ from e2rl.traffic.baselines.losses import disk_overlap, ego_distance, off_road_t
 from e2rl.traffic.baselines.open_loop import OpenLoop, OpenLoopState, Scenario
 from e2rl.traffic.baselines.view import View, motion_of
 from e2rl.traffic.e2.potentials import SAMPLED_STEPS, STRIDE
-from e2rl.traffic.grouping import take_rows
+from e2rl.traffic.grouping import of_scenes, take_rows
 from e2rl.traffic.nominal import Replan
 
 

@@ -81,8 +81,8 @@ class SparseControl:
     """The control of one replan of B scenes; called by `Prior.sample` at every noise level.
 
     conditions: what the potentials see; coalition [B, V] bool: C*; eta [B]: intensity; anchor: the skeleton's proposal,
-    with `strength`; anchor_noise [B, V, SIZE]: for the literal blend; kernel: what else is pulled. After sampling, `jump`
-    [B, V] is the energy of the literal blend's shift, ||shift||^2 / (2 sigma^2).
+    with `strength`; anchor_noise [B, V, SIZE]: for the literal blend; kernel: what else is pulled. After sampling,
+    `jump` [B, V] is the energy of the literal blend's shift, ||shift||^2 / (2 sigma^2).
     """
 
     prior: Prior
@@ -155,7 +155,7 @@ class SparseControl:
         return x0.detach(), adversarial, feasibility
 
     def _blended(self, x: Tensor, level: Tensor, context: Context, denoise: Callable[[Tensor], Tensor]) -> Tensor:
-        """x after the printed anchoring, eq. (anchor_injection), (1 - w) x + w (alpha a + sigma e') of proposal a; records
+        """x after the printed anchoring of proposal a, (1 - w) x + w (alpha a + sigma e') (eq. anchor_injection). Records
         the energy of the shift.
 
         With a noise e' of its own it shrinks the noise variance by (1 - w)^2 + w^2. It is kept for the ablation.

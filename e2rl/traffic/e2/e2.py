@@ -23,9 +23,9 @@ from e2rl.sim.world import World
 from e2rl.traffic.e2.anchoring import Anchor, AnchorSettings, propose
 from e2rl.traffic.e2.control import ControlSettings, Pull, SparseControl
 from e2rl.traffic.e2.feasibility import FeasibilitySettings, feasible_vehicles
-from e2rl.traffic.e2.interception import InterceptionSettings
 from e2rl.traffic.e2.foresight import time_before
-from e2rl.traffic.e2.kernels import Attack, Kernels, KernelSettings, propose_kernels, sideways, watched
+from e2rl.traffic.e2.interception import InterceptionSettings
+from e2rl.traffic.e2.kernels import Attack, Kernels, KernelSettings, propose_kernels, sideways
 from e2rl.traffic.e2.potentials import PotentialContext, PotentialSettings
 from e2rl.traffic.e2.reasoner import LanguageReasoner, ReasonerSettings
 from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, YieldingSettings, duty_of, leading, place_of
@@ -40,7 +40,6 @@ from e2rl.traffic.e2.skeleton import (
     limits_of,
 )
 from e2rl.traffic.e2.topology import TopologySettings, topological_candidates
-from e2rl.traffic.e2.motion import compact, put, take
 from e2rl.traffic.grouping import no_vehicles, noise_of, of_scenes, put_rows, take_rows
 from e2rl.traffic.nominal import NominalTraffic, PriorState, React, Replan
 from e2rl.traffic.traffic import FULL, TrafficPlan
@@ -171,7 +170,7 @@ class E2(NominalTraffic):
         return None if limit is None else (limit - state.path_kl.sum(-1)).clamp(min=0)
 
     def _afforded(self, state: E2State, world: World, anchor: Anchor) -> tuple[E2State, Anchor]:
-        """States with the interceptions under way and their nats booked; those that the budget does not hold are off."""
+        """States with the interceptions under way and their nats booked; those beyond the budget are off."""
         off_lane = anchor.off_lane & state.coalition & (state.eta > 0)[:, None]
         lane = take_route(world.scene["route_points"], state.routed.route.clamp(min=0))
         cost = sideways(anchor, world, state.lane, lane) * off_lane
@@ -189,8 +188,9 @@ class E2(NominalTraffic):
         """The best kernels for vehicles that do not act [B, V] already, and what they are valued by."""
         mean = self.prior.estimate(context)
         plan = self.prior.decode(mean, context).states()
-        index, there = compact(watched(world, context, plan, acts) & (state.eta > 0)[:, None])
-        attack = Attack(world, ego_plan, plan, index, there, state.since, state.settled)
+        more = state.coalition.sum(1) < state.near  # of the scene's template
+        free = context.active & ~acts & (state.coalition | more[:, None]) & (state.eta > 0)[:, None]
+        attack = Attack.of(world, free, ego_plan, plan, state.since, state.settled)
         gain, count = self.kernels.gain * state.eta, self.kernels.samples - 1
         return attack, propose_kernels(attack, state.lane, state.routed.points, mean, gain, count)
 
@@ -244,12 +244,11 @@ class E2(NominalTraffic):
 
     def _worth(self, attack: Attack, context: Context, x0: Tensor, many: Tensor) -> tuple[Tensor, Tensor]:
         """What `foresee` makes of samples x0 [C, V, SIZE] of scenes many [C]: worth and prevented [C, V]."""
-        copies = replace(attack, **{name: take_rows(getattr(attack, name), many) for name in vars(attack)})
-        tracks = take(self.prior.decode(x0, context).states(), copies.index)[:, :, None]
-        seen = copies.foresight(tracks)
         zero = torch.zeros_like(x0[..., 0])
-        worth = put(zero, copies.index, copies.there, seen.worth[..., 0])
-        return worth, put(zero.bool(), copies.index, copies.there, seen.prevented[..., 0])
+        copy, pair = (attack.row == many[:, None]).nonzero(as_tuple=True)
+        at = copy, attack.vehicle[pair]
+        seen = attack.foresight(self.prior.decode(x0, context).states()[at][:, None], pair)
+        return zero.index_put(at, seen.worth[:, 0]), zero.bool().index_put(at, seen.prevented[:, 0])
 
     def _reselected(self, state: E2State, world: World, ego_plan: Tensor) -> tuple[E2State, Anchor]:
         """States and anchors, with a new coalition in scenes whose choice is due and in which no member of the present

@@ -27,8 +27,8 @@ SOON = 0.1  # share of the worth that a failure at the end of the horizon loses
 
 
 class Foresight(NamedTuple):
-    """Of plans [B, M, O]: worth in [0, 1]; prevented: whether the competent driver is not hit; time [s] at which one
-    who does not react is, inf for never."""
+    """Of plans [G, O]: worth in [0, 1]; prevented: whether the competent driver is not hit; time [s] at which one who
+    does not react is, inf for never."""
 
     worth: Tensor
     prevented: Tensor
@@ -42,35 +42,32 @@ def population(like: Tensor) -> HumanDriver:
 
 
 def foresee(path: Tensor, size: Tensor, tracks: Tensor, sizes: Tensor, since: Tensor, settled: Tensor) -> Foresight:
-    """The Foresight of plans tracks [B, M, O, T + 1, 4] of M vehicles, each alone with the ego.
+    """The Foresight of O plans of each of G vehicles, tracks [G, O, T + 1, 4] from now on, each alone with an ego.
 
-    path [B, T + 1, 4]: the ego's expected states; size [B, 2], sizes [B, M, 2]; since [B, M]: s for which the ego has
-    had the vehicle before it (-1: not yet), when a competent driver would have begun to react; settled [B, M] bool:
+    path [G, T + 1, 4]: the ego's expected states; size, sizes [G, 2] of ego and vehicle; since [G]: s for which the ego
+    has had the vehicle before it (-1: not yet), when a competent driver would have begun to react; settled [G] bool:
     that driver would have prevented what has begun, so that it need not prevent what is left of it.
     """
-    batch, count, options, steps, _ = tracks.shape
-    plans = tracks.flatten(1, 2).transpose(1, 2)  # [B, T + 1, M O, 4]
-    box = sizes[:, :, None].expand(batch, count, options, 2).flatten(1, 2)
+    plans = tracks.transpose(1, 2)
+    box = sizes[:, None].expand(*tracks.shape[:2], 2)
     along = along_way(path, size[:, 1], Tracks(plans, box, torch.ones_like(plans[..., 0], dtype=torch.bool)))
-    along = Along(*(value.reshape(steps, batch * count, options) for value in along))
-    hit, time = _contacts(path.repeat_interleave(count, 0), size.repeat_interleave(count, 0)[:, 0], along, since)
-    hit, time = hit.unflatten(1, (batch, count)), time.unflatten(0, (batch, count))
-    prevented = ~hit[0]
-    worth = (hit[1:] * hit.new_tensor(WEIGHTS, dtype=path.dtype)[:, None, None, None]).sum(0)
-    worth = worth * (prevented | settled[..., None]) * (1 - SOON * time.clamp(max=DT * steps) / (DT * steps))
+    hit, time = _contacts(path, size[:, 0], along, since)
+    prevented, horizon = ~hit[0], DT * tracks.shape[2]
+    worth = (hit[1:] * path.new_tensor(WEIGHTS)[:, None, None]).sum(0)
+    worth = worth * (prevented | settled[:, None]) * (1 - SOON * time.clamp(max=horizon) / horizon)
     return Foresight(worth, prevented, time)
 
 
 def _contacts(path: Tensor, length: Tensor, along: Along, since: Tensor) -> tuple[Tensor, Tensor]:
     """Whether drivers [D, G, O] run their front into the plans seen `along` path [G, T + 1, 4] ([T + 1, G, O] each),
-    and when [G, O] s the one who does not react does; length [G] m of the ego, since [G, M] or [G].
+    and when [G, O] s the one who does not react does; length [G] m of the ego, since [G].
 
     The competent driver counts any contact as its own.
     """
     drivers = population(path)
     shape = torch.broadcast_shapes(drivers.delay.shape, along.rear.shape[1:])  # type: ignore[attr-defined]
     speed, way = path[:, 0, 3, None].expand(shape), path.new_zeros(shape)
-    memory = no_conflict(way)._replace(since=since.reshape(-1, 1).expand(shape))
+    memory = no_conflict(way)._replace(since=since[:, None].expand(shape))
     own, length = path[..., 3].diff(dim=1) / DT, length[:, None].expand(shape)
     hit, front, reacts = (torch.zeros_like(way, dtype=torch.bool) for _ in range(3))
     time = path.new_full(shape[1:], torch.inf)

@@ -23,6 +23,7 @@ from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
+from e2rl.traffic.e2.foresight import foresee
 from e2rl.traffic.e2.motion import direction, distance_to_stop_line, take
 
 ENDS = 3  # directions tried at the end of a path
@@ -33,6 +34,7 @@ CLEARANCE = 0.3  # m kept to others on the path
 SHOULDER = 0.5  # m that its centre may leave the drivable area by
 ACCEL_COST, LATERAL_COST = 0.2, 0.2  # s that 1 m/s^2 of acceleration, and of lateral acceleration, weighs
 TIME_COST = 0.1  # s that 1 s until the meeting weighs
+WORTH = 2.0  # s by which a path is preferred that only the competent driver survives
 
 
 @configured("synthesizer/e2", "interception")
@@ -180,11 +182,48 @@ def intercept(
     if settings.wrong_way > 0:
         against = _against_lanes(scene, meeting, paths.end_heading)
         cost = torch.where(against, cost + settings.wrong_way, cost)
+    known = expected[:, 0], states, size, torch.full_like(states[..., 3], -1.0)
+    cost = cost - WORTH * _foresight(world, known, _tracks(paths, v, accel))
     cost, pick = (cost - settings.preference).masked_fill(~ok, torch.inf).min(-1)
     knot_times = DT * KNOT_STEPS * torch.arange(1, HORIZON // KNOT_STEPS + 1, device=cost.device)
     knots = take_route(accel, pick)[..., None] * (knot_times <= take_route(time, pick)[..., None])
     points, length, heading = (take_route(x, pick) for x in (paths.points, paths.length, paths.end_heading))
     return Interception(_resampled(points, length, heading, scene["route_points"].shape[3]), knots, cost)
+
+
+def _tracks(paths: _Paths, speed: Tensor, accel: Tensor) -> Tensor:
+    """States [B, M, O, HORIZON, 4] of vehicles at speed [B, M, 1] that drive paths at accel [B, M, O], then straight
+    on."""
+    time = DT * torch.arange(HORIZON + 1, device=speed.device)
+    v = (speed[..., None] + accel[..., None] * time).clamp(min=0)
+    driven = ((v[..., 1:] + v[..., :-1]) / 2 * DT).cumsum(-1)
+    on_path = driven.minimum(paths.length[..., -1:])
+    after = torch.searchsorted(paths.length.contiguous(), on_path.contiguous()).clamp(1, SAMPLES - 1)
+    low, high = paths.length.gather(-1, after - 1), paths.length.gather(-1, after)
+    share = ((on_path - low) / (high - low).clamp(min=1e-6))[..., None]
+
+    def between(values: Tensor) -> Tensor:
+        first, second = (values.gather(3, i[..., None].expand(*i.shape, 2)) for i in (after - 1, after))
+        return first + share * (second - first)
+
+    tangent = between(paths.tangents)
+    heading = torch.atan2(tangent[..., 1], tangent[..., 0])
+    xy = between(paths.points) + (driven - on_path)[..., None] * direction(heading)
+    return torch.cat([xy, heading[..., None], v[..., 1:, None]], -1)
+
+
+def _foresight(world: World, known: tuple[Tensor, Tensor, Tensor, Tensor], tracks: Tensor) -> Tensor:
+    """Worth [B, M, O] of plans tracks [B, M, O, H, 4] (`foresee`).
+
+    known: the ego's expected states [B, H, 4], and of the vehicles states [B, M, 4], size [B, M, 2], since [B, M].
+    """
+    expected, states, size, since = known
+    count = states.shape[1]
+    path = torch.cat([world.states[:, :1], expected], 1).repeat_interleave(count, 0)
+    plans = torch.cat([states[:, :, None, None].expand(*tracks.shape[:3], 1, 4), tracks], 3).flatten(0, 1)
+    ego = world.scene["size"][:, 0].repeat_interleave(count, 0)
+    flat = since.flatten()
+    return foresee(path, ego, plans, size.flatten(0, 1), flat, flat > 0).worth.view(tracks.shape[:3])
 
 
 def _against_lanes(scene: TensorDictBase, meeting: Tensor, end_heading: Tensor) -> Tensor:

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from e2rl.prior import lane_relative
 from e2rl.prior.lane_relative import BEND_SCALE, HORIZON, KNOTS, OFFSET_SCALE, SIZE, LaneState
-from e2rl.prior.prior import Context
 from e2rl.prior.sde import NoiseSchedule
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.drivable_area import off_road
@@ -24,7 +23,7 @@ from e2rl.scenes.route import interpolate, project
 from e2rl.sim.world import World
 from e2rl.traffic.e2.anchoring import Anchor
 from e2rl.traffic.e2.foresight import Foresight, foresee
-from e2rl.traffic.e2.motion import smallest, take
+from e2rl.traffic.e2.motion import smallest
 
 # Standard deviations of x over 12 samples of a Waymo prior (200 scenes, DPM-Solver++), and the correlation of knots
 # that are neighbours. They set how a pull is spread over x and over the noise levels; what it costs is booked exactly.
@@ -33,7 +32,7 @@ CORRELATION = 0.57
 ACCELERATIONS = (-3.0, -2.0, -1.2, -0.6, 0.0, 0.6, 1.2, 2.0)  # m/s^2, from the prior's mean
 OFFSETS = (0.8, 1.6, 2.5, 3.5, 4.5)  # m, to either side of it, after the lateral horizon
 EARLY = 0.5  # of the way across that half of the kernels have come sooner, at half of the horizon
-REACH, NEAREST = 60.0, 10  # m: vehicles that have kernels, and how many
+REACH, ASIDE, NEAREST = 60.0, 10.0, 10  # m from the ego, m from its way, of vehicles that have kernels; how many
 STIRS = 1.0  # m/s that such a vehicle reaches within its expected plan
 MAX_LATERAL = 4.0  # m/s^2
 APART = 6.0  # nats between two kernels of a vehicle that are drawn
@@ -119,93 +118,102 @@ def sideways(anchor: Anchor, world: World, lane: LaneState, points: Tensor) -> T
     return (x[..., KNOTS:].square() / (2 * variance)).sum(-1)
 
 
-def watched(world: World, context: Context, plan: Tensor, exempt: Tensor) -> Tensor:
-    """Bool [B, V]: the NEAREST vehicles within REACH of the ego that move, by plan [B, V, H, 4], and are not exempt."""
-    gap = (world.states[:, : exempt.shape[1], :2] - world.states[:, :1, :2]).norm(dim=-1)
-    return smallest(context.active & ~exempt & (gap < REACH) & (plan[..., 3].amax(-1) > STIRS), gap, NEAREST)
-
-
 @dataclass(frozen=True)
 class Attack:
-    """What plans of vehicles index [B, M] (there: bool) are valued by: the scenes now, the ego's expected states
-    ego_plan [B, H, 4], what everybody is expected to do, plan [B, V, H, 4], and `since`, `settled` of `foresee`."""
+    """G vehicles whose plans are valued: scene row [G] and vehicle [G] int64; world: the B scenes now; ego_plan [B, H,
+    4]: the ego's expected states; plan [B, V, H, 4]: everybody's; since, settled [G]: see `foresee`."""
 
+    row: Tensor
+    vehicle: Tensor
     world: World
     ego_plan: Tensor
     plan: Tensor
-    index: Tensor
-    there: Tensor
     since: Tensor
     settled: Tensor
 
-    def foresight(self, tracks: Tensor) -> Foresight:
-        """Of plans [B, M, O, H, 4]."""
-        world = self.world
-        size, states = world.scene["size"], world.states
-        now = take(states, self.index)[:, :, None, None].expand(*tracks.shape[:3], 1, 4)
-        path = torch.cat([states[:, :1], self.ego_plan[:, :HORIZON]], 1)
-        known = take(size, self.index), take(self.since, self.index), take(self.settled, self.index)
-        return foresee(path, size[:, 0], torch.cat([now, tracks], 3), *known)
+    @classmethod
+    def of(
+        cls, world: World, active: Tensor, ego_plan: Tensor, plan: Tensor, since: Tensor, settled: Tensor
+    ) -> "Attack":
+        """Of the NEAREST active [B, V] vehicles that move, within REACH of the ego and ASIDE of its way."""
+        gap = (world.states[:, : active.shape[1], :2] - world.states[:, :1, :2]).norm(dim=-1)
+        way, points = ego_plan[:, None, 4::5, :2], plan[..., 4::5, :2]
+        aside = torch.cdist(points, way.expand(*points.shape[:2], -1, -1)).flatten(2).amin(-1)
+        near = active & (gap < REACH) & (aside < ASIDE) & (plan[..., 3].amax(-1) > STIRS)
+        row, vehicle = smallest(near, gap, NEAREST).nonzero(as_tuple=True)
+        return cls(row, vehicle, world, ego_plan, plan, since[row, vehicle], settled[row, vehicle])
+
+    def foresight(self, tracks: Tensor, rows: Tensor | None = None) -> Foresight:
+        """Of plans [G, O, H, 4]; rows [C]: of those of the vehicles whose they are."""
+        row, vehicle, since, settled = (
+            value if rows is None else value[rows] for value in (self.row, self.vehicle, self.since, self.settled)
+        )
+        size, states = self.world.scene["size"], self.world.states
+        now = states[row, vehicle, None, None].expand(*tracks.shape[:2], 1, 4)
+        path = torch.cat([states[:, :1], self.ego_plan[:, :HORIZON]], 1)[row]
+        return foresee(path, size[row, 0], torch.cat([now, tracks], 2), size[row, vehicle], since, settled)
 
     def impossible(self, tracks: Tensor, lateral: Tensor, time: Tensor) -> Tensor:
-        """Bool [B, M, O]: plans [B, M, O, H, 4] that leave the road, turn too sharply (lateral [B, M, O] m/s^2) or touch
-        somebody else before they meet the ego at `time` [B, M, O]."""
+        """Bool [G, O]: plans [G, O, H, 4] that leave the road, turn too sharply (lateral [G, O] m/s^2) or touch others
+        before they meet the ego at `time` [G, O]."""
         field = self.world.scene["field"], self.world.scene["field_origin"]
-        points = tracks[..., 4::5, :2]  # [B, M, O, 10, 2]
-        beyond = off_road(points.flatten(1, 3), *field).view(points.shape[:-1]).amax(-1)
-        allowed = off_road(take(self.world.states, self.index)[..., :2], *field).clamp(min=-0.3)
-        batch, count, options, moments, _ = points.shape
-        others = self.plan[:, :, 4::5, :2].transpose(1, 2)
-        gap = torch.cdist(points.permute(0, 3, 1, 2, 4).flatten(2, 3), others).view(batch, moments, count, options, -1)
-        counts = self.world.valid[:, None, : gap.shape[-1]].expand(-1, count, -1).clone()
-        counts[..., 0] = False
-        counts &= ~torch.nn.functional.one_hot(self.index, gap.shape[-1]).bool()
-        nearest = gap.masked_fill(~counts[:, None, :, None], torch.inf).amin(-1)
-        moment = 5 * DT * torch.arange(1, moments + 1, device=gap.device)[:, None, None, None]
-        before = moment <= time.clamp(max=HORIZON * DT) + 5 * DT
-        bumps = ((nearest < BUMP).transpose(0, 1) & before).any(0)
-        return (beyond > allowed[..., None]) | (lateral > MAX_LATERAL) | bumps
+        points = tracks[..., 4::5, :2]  # [G, O, 10, 2]
+        beyond = off_road(points.flatten(1, 2), *field, self.row).view(points.shape[:-1]).amax(-1)
+        now = self.world.states[self.row, self.vehicle, :2]
+        allowed = off_road(now[:, None], *field, self.row).clamp(min=-0.3)
+        gap = torch.cdist(points.transpose(1, 2), self.plan[self.row, :, 4::5, :2].transpose(1, 2))  # [G, 10, O, V]
+        counts = self.world.valid[self.row, : gap.shape[-1]].clone()
+        counts[:, 0] = counts[torch.arange(len(self.row)), self.vehicle] = False
+        nearest = gap.masked_fill(~counts[:, None, None], torch.inf).amin(-1)
+        moment = 5 * DT * torch.arange(1, nearest.shape[1] + 1, device=gap.device)[:, None]
+        bumps = ((nearest < BUMP) & (moment <= time[:, None].clamp(max=HORIZON * DT) + 5 * DT)).any(1)
+        return (beyond > allowed) | (lateral > MAX_LATERAL) | bumps
 
     def against(self, tracks: Tensor, time: Tensor, plans: Tensor) -> Tensor:
-        """Bool [B, M, K]: plans [B, M, K] of tracks [B, M, O, H, 4] that meet the ego, or half a second before, against
-        the lanes."""
-        at = (time.clamp(max=HORIZON * DT) / DT).long().clamp(1, HORIZON).gather(2, plans) - 1
-        tracks = tracks.gather(2, plans[..., None, None].expand(*plans.shape, *tracks.shape[3:]))
+        """Bool [G, K]: plans [G, K] of tracks [G, O, H, 4] that meet the ego, or half a second before, against the
+        lanes."""
+        at = (time.clamp(max=HORIZON * DT) / DT).long().clamp(1, HORIZON).gather(1, plans) - 1
+        tracks = tracks.gather(1, plans[..., None, None].expand(*plans.shape, *tracks.shape[2:]))
         at = torch.stack([(at - 5).clamp(min=0), at], -1)
-        pose = tracks.gather(3, at[..., None].expand(*at.shape, 4)).flatten(1, 3)
-        lanes = self.world.scene["lane_points"], self.world.scene["lane_index"]
-        return against_lanes(*lanes, pose[..., :2], pose[..., 2, None])[..., 0].view(at.shape).any(-1)
+        pose = tracks.gather(2, at[..., None].expand(*at.shape, 4)).flatten(1, 2)
+        wrong = torch.zeros(pose.shape[:2], dtype=torch.bool, device=pose.device)
+        points, line = self.world.scene["lane_points"], self.world.scene["lane_index"]
+        for scene in self.row.unique().tolist():  # maps are large
+            mine = self.row == scene
+            flat = pose[mine].flatten(0, 1)[None]
+            found = against_lanes(points[scene, None], line[scene, None], flat[..., :2], flat[..., 2, None])[..., 0]
+            wrong[mine] = found.view(-1, pose.shape[1])
+        return wrong.view(at.shape).any(-1)
 
 
-def propose_kernels(
-    attack: Attack, lane: LaneState, points: Tensor, mean: Tensor, gain: Tensor, count: int
-) -> Kernels:
+def propose_kernels(attack: Attack, lane: LaneState, points: Tensor, mean: Tensor, gain: Tensor, count: int) -> Kernels:
     """The `count` kernels of highest value: gain [B] nats times their worth, less what they cost.
 
     lane: states [B, V] on routes points [B, V, P, 2]; mean [B, V, SIZE]: the prior's. Those that gain nothing are none.
     """
-    index, table = attack.index, shifts(mean.device)
-    x = take(mean, index)[:, :, None] + table
-
-    def of_options(value: Tensor) -> Tensor:
-        return take(value, index)[:, :, None].expand(*x.shape[:3], *value.shape[2:]).flatten(0, 2)
-
-    motion = lane_relative.decode(x.flatten(0, 2), lane.map(of_options), of_options(points))
-    tracks = motion.states().view(*x.shape[:3], HORIZON, 4)
+    table, at = shifts(mean.device), (attack.row, attack.vehicle)
+    if not len(attack.row):
+        return Kernels(mean.new_zeros(len(mean), count, SIZE), gain.new_full((len(mean), count), -1, dtype=torch.int64))
+    x = mean[at][:, None] + table
+    start = lane.map(lambda value: value[at][:, None].expand(x.shape[:2]))
+    motion = lane_relative.decode(x, start, points[at][:, None])
+    tracks = motion.states()
     seen = attack.foresight(tracks)
-    lateral = (motion.v**2 * motion.kappa.abs()).amax(-1).view(x.shape[:3])
-    value = gain[:, None, None] * seen.worth - nats(table)
-    value = value.masked_fill(attack.impossible(tracks, lateral, seen.time) | ~attack.there[..., None], -torch.inf)
+    lateral = (motion.v**2 * motion.kappa.abs()).amax(-1)
+    value = gain[attack.row, None] * seen.worth - nats(table)
+    value = value.masked_fill(attack.impossible(tracks, lateral, seen.time), -torch.inf)
     best = value.topk(min(CHECKED, value.shape[-1]), -1)
     lawful = best.values.masked_fill(attack.against(tracks, seen.time, best.indices), -torch.inf)
-    value = torch.full_like(value, -torch.inf).scatter(2, best.indices, lawful)
-    goals, vehicles, slots = [], [], torch.arange(index.shape[1], device=index.device)
-    row = torch.arange(len(index), device=index.device)
+    value = torch.full_like(value, -torch.inf).scatter(1, best.indices, lawful)
+    of_scene = mean.new_full((*mean.shape[:2], len(table)), -torch.inf).index_put(at, value)  # [B, V, O]
+    goals, vehicles = [], []
+    row = torch.arange(len(mean), device=mean.device)
     for _ in range(count):
-        top, at = value.flatten(1).max(1)
-        slot, option = at // len(table), at % len(table)
-        goals.append(x[row, slot, option])
-        vehicles.append(torch.where(top > 0, index[row, slot], -1))
-        alike = (nats(table - table[option][:, None]) < APART)[:, None] & (slots == slot[:, None])[..., None]
-        value = value.masked_fill(alike, -torch.inf)
+        top, pick = of_scene.flatten(1).max(1)
+        vehicle, option = pick // len(table), pick % len(table)
+        goals.append(mean[row, vehicle] + table[option])
+        vehicles.append(torch.where(top > 0, vehicle, -1))
+        alike = nats(table - table[option][:, None]) < APART  # [B, O]
+        mine = torch.nn.functional.one_hot(vehicle, mean.shape[1]).bool()
+        of_scene = of_scene.masked_fill(mine[..., None] & alike[:, None], -torch.inf)
     return Kernels(torch.stack(goals, 1), torch.stack(vehicles, 1))

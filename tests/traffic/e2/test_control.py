@@ -46,11 +46,11 @@ class Case:
     def control(self, eta=1.0, strength=0.0, **settings):
         eta = torch.full((len(self.scene),), eta) if isinstance(eta, float) else torch.tensor(eta)
         extra = torch.randn(len(self.scene), ROWS, SIZE, generator=torch.Generator().manual_seed(7))
-        chosen = ControlSettings(**({"adversarial_clip": 0.5} | settings)), PotentialSettings()
+        chosen = ControlSettings(**({"adversarial_clip": 0.5, "feasibility": 4.0} | settings)), PotentialSettings()
         given = self.where, self.coalition, eta, self.anchor
         return SparseControl(self.prior, *chosen, *given, strength, extra)
 
-    def shift(self, level=0.5, k=1, seed=0, **options):
+    def shift(self, level=0.5, k=2, seed=0, **options):
         """(x0 after - x0 before control, x after - x before anchoring) at one noise level."""
         x = torch.randn(len(self.scene), ROWS, SIZE, generator=torch.Generator().manual_seed(seed))
         level = torch.tensor(level)
@@ -78,7 +78,7 @@ def test_feasibility_acts_once_the_clean_estimate_has_taken_shape(level, monkeyp
     for k in range(1, case.prior.sampler.steps + 1):
         at = float(levels[case.prior.sampler.steps - k])
         shift, _ = case.shift(level=at, k=k, adversarial_clip=0.0)
-        assert bool((shift != 0).any()) == (at <= level), at
+        assert bool((shift != 0).any()) == (at <= level and k > 1), "the last step, without noise, is the prior's"
 
 
 @pytest.mark.parametrize("gradient", ["denoiser", "clean"])
@@ -108,7 +108,7 @@ def test_the_shift_is_that_of_the_gradients_scaled_clipped_and_masked(gradient, 
     expected[0] = 0.0
     options = {"adversarial_clip": clips[0], "feasibility": 3.0, "feasibility_clip": clips[1]}
     made = case.control(eta=eta.tolist(), gradient=gradient, scaling=scaling, **options)
-    after, nominal, controlled = made(x, level, 1, case.context, lambda y: case.prior.denoise(y, level, case.context))
+    after, nominal, controlled = made(x, level, 2, case.context, lambda y: case.prior.denoise(y, level, case.context))
     torch.testing.assert_close(nominal, x0.detach())
     torch.testing.assert_close(nominal - controlled, expected, rtol=2e-3, atol=1e-5)
     assert torch.equal(after, x) and (expected[1:, [MEMBER, 2]] != 0).any(-1).any(0).all()
@@ -116,9 +116,10 @@ def test_the_shift_is_that_of_the_gradients_scaled_clipped_and_masked(gradient, 
 
 def test_without_intensity_nothing_moves_in_a_mixed_batch():
     case = Case()
-    shift, jump = case.shift(eta=[0.0, 1.0, 0.0, 2.0], strength=1.0, k=case.control().anchor_step)
-    assert (shift[[0, 2]] == 0).all() and (jump[[0, 2]] == 0).all()
-    assert (shift[[1, 3]] != 0).any() and (jump[[1, 3], MEMBER] != 0).any()
+    for options in ({"strength": 8.0}, {"strength": 0.5, "anchoring": "literal", "k": case.control().anchor_step}):
+        shift, jump = case.shift(eta=[0.0, 1.0, 0.0, 2.0], **options)
+        assert (shift[[0, 2]] == 0).all() and (jump[[0, 2]] == 0).all()
+        assert (shift[[1, 3]] != 0).any() and bool((jump[[1, 3], MEMBER] != 0).any()) == ("k" in options)
 
 
 def test_clipping_keeps_directions_and_short_rows():
@@ -139,40 +140,42 @@ def anchored(case, strength, **settings):
     return control, level, x, after
 
 
-@pytest.mark.parametrize(("anchoring", "variance"), [("clean", 1.0), ("literal", 0.5)])
-def test_anchoring_keeps_the_noise_and_the_printed_blend_halves_it(anchoring, variance):
+def test_the_printed_blend_halves_the_noise_and_its_energy_is_booked():
     case = Case(count=600)
-    _, level, x, after = anchored(case, 0.5, anchoring=anchoring, gradient="clean")
+    control, level, x, after = anchored(case, 0.5, anchoring="literal", gradient="clean")
     assert torch.equal(after[:, OTHERS], x[:, OTHERS])
     alpha, sigma = case.prior.schedule.alpha(level), case.prior.schedule.sigma(level)
     mean = alpha * (0.5 * 0.3 - 0.5 * 2.0 / ACCEL_SCALE)
     knots = after[:, MEMBER, :KNOTS]
     assert knots.mean().item() == pytest.approx(mean.item(), abs=0.04)
-    assert knots.var().item() == pytest.approx(variance * sigma.item() ** 2, rel=0.06)
-
-
-def test_a_full_anchor_is_the_proposal_with_the_same_noise_and_its_energy_is_booked():
-    case = Case()
-    control, level, x, after = anchored(case, 1.0)
-    schedule = case.prior.schedule
-    noise = schedule.noise(x, torch.full_like(x, 0.3), level)[:, MEMBER, :KNOTS]
-    torch.testing.assert_close(after[:, MEMBER, :KNOTS], schedule.noised(torch.tensor(-2.0), level, noise))
-    assert torch.equal(after[:, OTHERS], x[:, OTHERS])
-    expected = ((after - x) ** 2).sum(-1) / (2 * schedule.sigma(level) ** 2)
-    torch.testing.assert_close(control.jump, expected)
+    assert knots.var().item() == pytest.approx(0.5 * sigma.item() ** 2, rel=0.06)
+    torch.testing.assert_close(control.jump, ((after - x) ** 2).sum(-1) / (2 * sigma**2))
     assert (control.jump[:, MEMBER] > 0).all() and (control.jump[:, OTHERS] == 0).all()
 
 
-def test_anchoring_happens_once_at_the_level_nearest_to_the_set_one_and_can_be_off():
+def test_the_printed_blend_happens_once_at_the_level_nearest_to_the_set_one_and_can_be_off():
     case = Case()
     levels = case.prior.schedule.levels(case.prior.sampler.steps)
     for wanted in (0.1, 0.5, 0.9):
         control = case.control(anchor_level=wanted)
         at = levels[case.prior.sampler.steps - control.anchor_step]
         assert (at - wanted).abs() == (levels[:-1] - wanted).abs().min()
-    step = case.control().anchor_step
-    moved = [bool((case.shift(k=k, strength=0.5)[1] != 0).any()) for k in range(1, case.prior.sampler.steps + 1)]
+    step, literal = case.control().anchor_step, {"strength": 0.5, "anchoring": "literal"}
+    moved = [bool((case.shift(k=k, **literal)[1] != 0).any()) for k in range(1, case.prior.sampler.steps + 1)]
     assert moved == [k == step for k in range(1, case.prior.sampler.steps + 1)]
     assert (case.shift(k=step, strength=0.5, anchoring="off")[1] == 0).all()
     case.anchor.feasible[:] = False
-    assert (case.shift(k=step, strength=0.5)[1] == 0).all(), "members that cannot meet their target are not anchored"
+    assert (case.shift(k=step, **literal)[1] == 0).all(), "members that cannot meet their target are not anchored"
+
+
+def test_an_anchor_pulls_the_coalition_at_every_step_but_the_last_and_to_the_prior_as_eta_goes_to_0():
+    case = Case()
+    options = {"strength": 8.0, "adversarial_clip": 0.0, "feasibility": 0.0}
+    for k in range(1, case.prior.sampler.steps + 1):
+        shift, _ = case.shift(k=k, **options)
+        assert (shift[:, OTHERS] == 0).all() and (shift[:, MEMBER, KNOTS:].abs() < 1e-5).all()
+        assert bool((shift[:, MEMBER] != 0).any()) == (k > 1)
+    sizes = [case.shift(eta=eta, **options)[0].norm().item() for eta in (1e-3, 1e-2, 1e-1, 1.0)]
+    assert sizes == sorted(sizes) and sizes[0] < 0.02 * sizes[-1]
+    case.anchor.feasible[:] = False
+    assert (case.shift(**options)[0] == 0).all(), "members that cannot meet their target are not anchored"

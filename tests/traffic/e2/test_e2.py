@@ -27,7 +27,8 @@ def test_a_coalition_acts_on_the_ego_directly_or_through_members():
     on, scene = synthesizer(), scenes(4).scenes
     state, plan = replanned(on, scene, 2.0)
     assert state.coalition.any(1).all() and not state.coalition[:, 0].any()
-    assert torch.equal(state.coalition, state.target >= 0) and torch.equal(plan.adversary, state.coalition)
+    assert torch.equal(state.coalition, state.target >= 0)
+    assert torch.equal(plan.adversary, state.coalition | state.drawn)
     members = state.coalition.clone()
     members[:, 0] = True
     assert members.gather(1, state.target.clamp(min=0)).all(), "no chain leads over somebody who is not controlled"

@@ -1,0 +1,115 @@
+"""Importance kernels: their pull is the exact posterior, their price is booked, and nothing is drawn for nothing."""
+
+import math
+
+import pytest
+import torch
+
+from e2rl.prior.lane_relative import SIZE
+from e2rl.prior.sde import NoiseSchedule
+from e2rl.sim.world import World
+from e2rl.traffic.e2 import kernels
+from e2rl.traffic.e2.kernels import Attack, covariance, nats, propose_kernels, pulled, shifts
+from tests.prior.test_prior import MEAN, STD, gaussian_prior
+from tests.traffic.e2.traffic_scenes import EGO, begin, replanned, scenes, synthesizer
+
+CPU = torch.device("cpu")
+
+
+def test_the_covariance_is_one_and_the_price_is_its_quadratic_form():
+    c = covariance(CPU)
+    torch.testing.assert_close(c, c.T)
+    assert (torch.linalg.eigvalsh(c) > 0).all()
+    table = shifts(CPU)
+    torch.testing.assert_close(
+        nats(table), 0.5 * (table * torch.linalg.solve(c, table.T).T).sum(-1), rtol=1e-4, atol=1e-4
+    )
+    assert float(nats(table)[0]) == 0 and (nats(table)[1:] > 0).all()
+    assert len(table.unique(dim=0)) == len(table), "no kernel stands twice in the table"
+
+
+@pytest.mark.parametrize("level", [0.1, 0.5, 0.95])
+@pytest.mark.parametrize("strength", [0.0, 0.3, 4.0])
+def test_the_pull_is_the_posterior_mean_of_a_gaussian_prior(level, strength):
+    """x0 ~ N(m, C), x = alpha x0 + sigma e, and a potential strength (x0 - goal)^T C^-1 (x0 - goal) / 2."""
+    schedule, t = NoiseSchedule(), torch.tensor(level, dtype=torch.float64)
+    alpha, sigma = schedule.alpha(t), schedule.sigma(t)
+    generator = torch.Generator().manual_seed(0)
+    m, goal, x = torch.randn(3, SIZE, generator=generator, dtype=torch.float64)
+    precision = torch.linalg.inv(covariance(CPU).double())
+    noise = alpha**2 / sigma**2 * torch.eye(SIZE, dtype=torch.float64)
+    clean = torch.linalg.solve(precision + noise, precision @ m + alpha / sigma**2 * x)
+    tilted = torch.linalg.solve(
+        (1 + strength) * precision + noise, precision @ (m + strength * goal) + alpha / sigma**2 * x
+    )
+    found = pulled(clean.float(), goal.float(), torch.tensor(strength), t.float(), schedule)
+    torch.testing.assert_close(found.double(), tilted, rtol=1e-3, atol=1e-3)
+
+
+def test_what_a_pull_costs_goes_to_the_divergence_of_the_tilted_gaussian(monkeypatch):
+    """Prior N(m, s^2 I): the tilt towards a goal m + d is N(m + w d, (1 - w) s^2 I), w = strength / (1 + strength)."""
+    monkeypatch.setattr(kernels, "SPREAD", (STD,) * SIZE)
+    monkeypatch.setattr(kernels, "CORRELATION", 0.0)
+    caches = covariance, kernels._axes
+    prior, w, d = gaussian_prior(steps=200), 0.5, 1.5
+    noise = torch.randn(200, 400, 1, SIZE, generator=torch.Generator().manual_seed(1))
+
+    def control(x, level, k, context, denoise):
+        x0 = denoise(x)
+        return x, x0, pulled(x0, torch.full((SIZE,), MEAN + d), torch.tensor(w / (1 - w)), level, prior.schedule)
+
+    try:
+        for cached in caches:
+            cached.cache_clear()
+        sample = prior.sample(None, noise, control)
+    finally:
+        for cached in caches:
+            cached.cache_clear()
+    known = SIZE / 2 * ((1 - w) + (w * d / STD) ** 2 - 1 - math.log(1 - w))
+    assert sample.kl.mean().item() == pytest.approx(known, rel=0.06)
+    assert sample.x0.mean().item() == pytest.approx(MEAN + w * d, abs=0.03)
+    assert sample.x0.var().item() == pytest.approx((1 - w) * STD**2, rel=0.1)
+
+
+def proposed(gain, count=5):
+    on, scene = synthesizer(), scenes(3).scenes
+    state, world = begin(on, scene, 2.0), World.at_start(scene)
+    context = on.encode(state, world, EGO.plan(world))
+    mean = on.prior.estimate(context)
+    plan = on.prior.decode(mean, context).states()
+    attack = Attack.of(world, context.active, EGO.plan(world), plan, state.since, state.settled)
+    gains = torch.full((3,), gain)
+    return mean, world, propose_kernels(attack, state.lane, state.routed.points, mean, gains, count)
+
+
+def test_kernels_are_shifts_of_moving_vehicles_that_gain_more_than_they_cost():
+    mean, world, found = proposed(300.0)
+    assert found.goal.shape == (3, 5, SIZE) and (found.vehicle >= 0).any() and (found.vehicle != 0).all()
+    parked = world.scene["parked"]
+    for b, n in (found.vehicle >= 0).nonzero().tolist():
+        vehicle = int(found.vehicle[b, n])
+        shift = found.goal[b, n] - mean[b, vehicle]
+        assert not parked[b, vehicle] and world.valid[b, vehicle]
+        assert (shifts(CPU) - shift).abs().amax(-1).min() < 1e-5
+        assert float(nats(shift)) < 300.0
+    assert (proposed(0.0)[2].vehicle == -1).all(), "without a gain none is worth its nats"
+
+
+def test_a_drawn_vehicle_is_an_adversary_that_pays_for_its_shift_and_the_choice():
+    on, scene = synthesizer(kernels={"samples": 4}, interception={"reach": 0}), scenes(4).scenes
+    state, plan = replanned(on, scene, 3.0)
+    assert state.drawn.any()
+    assert (plan.adversary == (state.coalition | state.drawn)).all() and (plan.target[state.drawn] == 0).all()
+    assert (plan.path_kl[state.drawn] > math.log(4)).all()
+    _, one = replanned(synthesizer(kernels={"samples": 1}, interception={"reach": 0}), scene, 3.0)
+    assert not torch.equal(one.states, plan.states)
+
+
+def test_a_budget_below_the_price_of_a_choice_draws_nobody_and_none_is_the_prior():
+    scene = scenes(3).scenes
+    for budget, drawn in ((math.log(6) / 2, False), (None, True)):
+        on = synthesizer(control={"transport_budget": budget}, interception={"reach": 0})
+        assert bool(replanned(on, scene, 3.0)[0].drawn.any()) == drawn
+    _, prior = replanned(synthesizer(), scene, 0.0)
+    _, none = replanned(synthesizer(control={"transport_budget": 0.0}), scene, 3.0)
+    assert torch.equal(none.states, prior.states) and not none.adversary.any()
