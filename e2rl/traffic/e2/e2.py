@@ -151,7 +151,8 @@ class E2(NominalTraffic):
         state, anchor = self._reselected(state, world, ego_plan)
         state, anchor = self._afforded(state, world, anchor)
         context = self.encode(state, world, ego_plan)
-        acts = anchor.feasible & state.coalition
+        anchored = anchor.feasible & state.coalition
+        acts = anchored if self.control.anchoring != "off" else anchored & state.off_lane
         state = replace(state, committed=acts, knots=anchor.knots)
         if self.kernels.samples == 1:
             control = self._control(state, world, ego_plan, anchor)

@@ -25,8 +25,8 @@ from e2rl.traffic.e2.anchoring import Anchor
 from e2rl.traffic.e2.foresight import Foresight, foresee
 from e2rl.traffic.e2.motion import smallest
 
-# Standard deviations of x over 12 samples of a Waymo prior (200 scenes, DPM-Solver++), and the correlation of knots
-# that are neighbours. They set how a pull is spread over x and over the noise levels; what it costs is booked exactly.
+# Standard deviations of x over 12 samples of a Waymo prior (48 scenes, DPM-Solver++), and the correlation of knots that
+# are neighbours. They set how a pull is spread over x and over the noise levels; what it costs is booked exactly.
 SPREAD = (0.85, 0.53, 0.51, 0.51, 0.52, 0.54, 0.57, 0.60, 0.63, 0.71, 1.02, 0.89)
 CORRELATION = 0.57
 ACCELERATIONS = (-3.0, -2.0, -1.2, -0.6, 0.0, 0.6, 1.2, 2.0)  # m/s^2, from the prior's mean
