@@ -155,8 +155,8 @@ class SparseControl:
         return x0.detach(), adversarial, feasibility
 
     def _blended(self, x: Tensor, level: Tensor, context: Context, denoise: Callable[[Tensor], Tensor]) -> Tensor:
-        """x after the printed anchoring of proposal a, (1 - w) x + w (alpha a + sigma e') (eq. anchor_injection). Records
-        the energy of the shift.
+        """x after the printed anchoring of proposal a, (1 - w) x + w (alpha a + sigma e'), eq. (anchor_injection).
+        Books the energy of the shift in `jump`.
 
         With a noise e' of its own it shrinks the noise variance by (1 - w)^2 + w^2. It is kept for the ablation.
         """

@@ -25,7 +25,7 @@ from e2rl.traffic.e2.control import ControlSettings, Pull, SparseControl
 from e2rl.traffic.e2.feasibility import FeasibilitySettings, feasible_vehicles
 from e2rl.traffic.e2.foresight import time_before
 from e2rl.traffic.e2.interception import InterceptionSettings
-from e2rl.traffic.e2.kernels import Attack, Kernels, KernelSettings, propose_kernels, sideways
+from e2rl.traffic.e2.kernels import Attack, Kernels, KernelSettings, best_try, propose_kernels, sideways, tries
 from e2rl.traffic.e2.potentials import PotentialContext, PotentialSettings
 from e2rl.traffic.e2.reasoner import LanguageReasoner, ReasonerSettings
 from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, YieldingSettings, duty_of, leading, place_of
@@ -203,36 +203,21 @@ class E2(NominalTraffic):
 
         Scenes without a kernel have one sample. The choice is booked as its most, log M, with the vehicle drawn.
         """
-        batch, count = len(state.eta), self.kernels.samples - 1
+        count = self.kernels.samples - 1
         rows = ((kernels.vehicle >= 0).any(1) & self._affords(state)).nonzero()[:, 0]
-        first = torch.arange(batch, device=rows.device)
-        many = torch.cat([first, rows.repeat_interleave(count)])
-        extra = noise_of(state.seed[rows], SAMPLES + state.replans[rows], (noise.shape[0], count, *noise.shape[2:]))
-        noise = torch.cat([noise, extra.transpose(0, 1).flatten(1, 2)], 1)
-        nobody = torch.full_like(first, -1)
-        vehicle = torch.cat([nobody, kernels.vehicle[rows].flatten()])
-        drawn = vehicle[:, None] == torch.arange(state.coalition.shape[1], device=rows.device)
-        goal = torch.zeros_like(noise[0])
-        goal[batch:] = kernels.goal[rows].flatten(0, 1)[:, None]
-        copies, scenes = take_rows(state, many), take_rows(attack.world, many)
+        shape = noise.shape[0], count, *noise.shape[2:]
+        extra = noise_of(state.seed[rows], SAMPLES + state.replans[rows], shape).transpose(0, 1).flatten(1, 2)
+        many, goal, drawn = tries(kernels, rows)
+        copies, context = take_rows(state, many), of_scenes(context, many)
         pull = Pull(goal, drawn, self.kernels.pull * copies.eta)
-        control = self._control(copies, scenes, attack.ego_plan[many], take_rows(anchor, many), pull)
-        context = of_scenes(context, many)
-        budget = self._budget(copies)
-        choice = math.log(count + 1) * drawn
-        if budget is not None:
-            budget = budget - choice.sum(-1)
-        sample = self.prior.sample(context, noise, control, budget)
+        given = take_rows(attack.world, many), attack.ego_plan[many], take_rows(anchor, many)
+        control = self._control(copies, *given, pull)
+        choice, budget = math.log(count + 1) * drawn, self._budget(copies)
+        budget = None if budget is None else budget - choice.sum(-1)
+        sample = self.prior.sample(context, torch.cat([noise, extra], 1), control, budget)
         kl = sample.kl + choice
         worth, prevented = self._worth(attack, context, sample.x0, many)
-        value = self.kernels.gain * copies.eta * worth.amax(-1) - kl.sum(-1)
-        table = value.new_full((batch, count + 1), -torch.inf)
-        table[:, 0] = value[:batch]
-        table[rows, 1:] = value[batch:].view(-1, count)
-        place = torch.zeros(batch, count + 1, dtype=torch.int64, device=rows.device)
-        place[:, 0] = first
-        place[rows, 1:] = torch.arange(batch, len(many), device=rows.device).view(-1, count)
-        pick = place.gather(1, table.argmax(1, keepdim=True))[:, 0]
+        pick = best_try(self.kernels.gain * copies.eta * worth.amax(-1) - kl.sum(-1), rows, len(state.eta))
         settled = state.settled | (drawn & (worth > 0) & prevented)[pick]
         since = time_before(attack.world, attack.ego_plan, state.since)
         state = replace(state, drawn=drawn[pick], settled=settled, since=since)

@@ -52,10 +52,12 @@ class KernelSettings:
 
 @dataclass(frozen=True)
 class Kernels:
-    """Goals x [B, N, SIZE] of N kernels, best first, and the vehicle [B, N] that each moves, -1 for none."""
+    """Goals x [B, N, SIZE] of N kernels, best first, and the vehicle [B, N] that each moves, -1 for none; of so many
+    vehicles."""
 
     goal: Tensor
     vehicle: Tensor
+    vehicles: int
 
 
 @cache
@@ -193,7 +195,8 @@ def propose_kernels(attack: Attack, lane: LaneState, points: Tensor, mean: Tenso
     """
     table, at = shifts(mean.device), (attack.row, attack.vehicle)
     if not len(attack.row):
-        return Kernels(mean.new_zeros(len(mean), count, SIZE), gain.new_full((len(mean), count), -1, dtype=torch.int64))
+        nobody = gain.new_full((len(mean), count), -1, dtype=torch.int64)
+        return Kernels(mean.new_zeros(len(mean), count, SIZE), nobody, mean.shape[1])
     x = mean[at][:, None] + table
     start = lane.map(lambda value: value[at][:, None].expand(x.shape[:2]))
     motion = lane_relative.decode(x, start, points[at][:, None])
@@ -216,4 +219,27 @@ def propose_kernels(attack: Attack, lane: LaneState, points: Tensor, mean: Tenso
         alike = nats(table - table[option][:, None]) < APART  # [B, O]
         mine = torch.nn.functional.one_hot(vehicle, mean.shape[1]).bool()
         of_scene = of_scene.masked_fill(mine[..., None] & alike[:, None], -torch.inf)
-    return Kernels(torch.stack(goals, 1), torch.stack(vehicles, 1))
+    return Kernels(torch.stack(goals, 1), torch.stack(vehicles, 1), mean.shape[1])
+
+
+def tries(kernels: Kernels, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The joint samples of a replan: one plain one of each of B scenes, then one for each kernel of scenes rows [R].
+
+    Returns:
+        scenes [C] int64, goals [C, V, SIZE] and who is drawn [C, V] bool.
+    """
+    batch, count, _ = kernels.goal.shape
+    first = torch.arange(batch, device=rows.device)
+    scenes = torch.cat([first, rows.repeat_interleave(count)])
+    vehicle = torch.cat([torch.full_like(first, -1), kernels.vehicle[rows].flatten()])
+    drawn = vehicle[:, None] == torch.arange(kernels.vehicles, device=rows.device)
+    goal = torch.cat([torch.zeros_like(kernels.goal[:, 0]), kernels.goal[rows].flatten(0, 1)])
+    return scenes, goal[:, None].expand(-1, kernels.vehicles, -1), drawn
+
+
+def best_try(value: Tensor, rows: Tensor, batch: int) -> Tensor:
+    """Which [B] of the samples [C] of `tries` is worth the most in each scene, of their value [C]; ties: the first."""
+    count = (len(value) - batch) // max(len(rows), 1)
+    place = torch.arange(batch, device=rows.device)[:, None].repeat(1, count + 1)
+    place[rows, 1:] = torch.arange(batch, len(value), device=rows.device).view(len(rows), count)
+    return place.gather(1, value[place].argmax(1, keepdim=True))[:, 0]

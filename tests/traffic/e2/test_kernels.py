@@ -9,7 +9,7 @@ from e2rl.prior.lane_relative import SIZE
 from e2rl.prior.sde import NoiseSchedule
 from e2rl.sim.world import World
 from e2rl.traffic.e2 import kernels
-from e2rl.traffic.e2.kernels import Attack, covariance, nats, propose_kernels, pulled, shifts
+from e2rl.traffic.e2.kernels import Attack, Kernels, best_try, covariance, nats, propose_kernels, pulled, shifts, tries
 from tests.prior.test_prior import MEAN, STD, gaussian_prior
 from tests.traffic.e2.traffic_scenes import EGO, begin, replanned, scenes, synthesizer
 
@@ -113,3 +113,16 @@ def test_a_budget_below_the_price_of_a_choice_draws_nobody_and_none_is_the_prior
     _, prior = replanned(synthesizer(), scene, 0.0)
     _, none = replanned(synthesizer(control={"transport_budget": 0.0}), scene, 3.0)
     assert torch.equal(none.states, prior.states) and not none.adversary.any()
+
+
+def test_the_best_of_a_scene_s_tries_is_taken_and_the_plain_one_where_there_are_no_others():
+    vehicle = torch.tensor([[-1, -1], [2, 1], [-1, -1], [3, -1]])
+    found = Kernels(torch.arange(8.0).view(4, 2, 1).expand(4, 2, SIZE), vehicle, 5)
+    rows = torch.tensor([1, 3])
+    scenes, goal, drawn = tries(found, rows)
+    assert scenes.tolist() == [0, 1, 2, 3, 1, 1, 3, 3]
+    assert drawn.nonzero().tolist() == [[4, 2], [5, 1], [6, 3]]
+    assert goal[4:, 0, 0].tolist() == [2.0, 3.0, 6.0, 7.0]
+    value = torch.tensor([9.0, 1.0, 0.0, 5.0, 2.0, 3.0, 4.0, 5.0])
+    assert best_try(value, rows, 4).tolist() == [0, 5, 2, 3]
+    assert best_try(value[:4], rows[:0], 4).tolist() == [0, 1, 2, 3]
