@@ -10,6 +10,7 @@ from torchrl.envs import Transform
 
 from e2rl.planners.ego import Ego
 from e2rl.prior.lane_relative import HORIZON
+from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv
 from e2rl.traffic.e2.reaiming import Reaiming
 from e2rl.traffic.grouping import put_rows, take_rows
@@ -138,7 +139,13 @@ class AdversarialSynthesizer(Transform):
     def _replan(self, rows: Tensor, ego_plan: Tensor | None) -> None:
         """New plans of environments rows [b], written into the environment's traffic."""
         world = self._env.world()
-        ego_plan = keep_velocity(world.states[:, 0]) if ego_plan is None else ego_plan
+        if ego_plan is None:
+            if self._method.knowledge == "plan":
+                raise InputError(
+                    'the policy writes no ("ego", "plan"), which this traffic is told (synthesizer.knowledge=plan): '
+                    "drive with an EgoPolicy, write the plan, or set synthesizer.knowledge=predicted"
+                )
+            ego_plan = keep_velocity(world.states[:, 0])  # nobody is told it
         whole = len(rows) == len(world.step)
         state, now = (self._state, world) if whole else (take_rows(self._state, rows), take_rows(world, rows))
         queries = {"react": Lookahead(self.ego, now)} if self._method.queries_ego and self.ego is not None else {}

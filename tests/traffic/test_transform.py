@@ -8,6 +8,7 @@ from torchrl.envs.utils import check_env_specs
 
 from e2rl.planners.ego import EgoPolicy
 from e2rl.planners.idm_planner import IDMEgo
+from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import Traffic, TrafficPlan, keep_velocity
@@ -120,6 +121,17 @@ def test_a_method_that_asks_the_ego_can_where_there_is_one():
         env = environment(live(), Asking(), ego=ego)
         advance(env, still, env.reset(), 1)
     assert asked == [(1, 50, 4), None]
+
+
+def test_traffic_that_is_told_the_plan_refuses_a_policy_that_writes_none():
+    class Told(March):
+        knowledge = "plan"
+
+    env = environment(live(), Told())
+    with pytest.raises(InputError, match="the policy writes no"):
+        advance(env, still, env.reset(), 1)
+    policy = EgoPolicy(IDMEgo(), env)
+    advance(env, policy, env.reset(), 1)
 
 
 # --- all kinds of rows at once
