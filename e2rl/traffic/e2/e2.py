@@ -201,8 +201,8 @@ class E2(NominalTraffic):
         """State, x0, path KL and jump of the joint sample of highest value in each scene: a plain one, or one of those
         drawn to kernels, which has gain times its worth more and its path KL less.
 
-        Scenes without a kernel have one sample. Taking a drawn one is booked as log M, the most that a choice costs; taking the
-        plain one is not booked.
+        Scenes without a kernel have one sample. Taking a drawn one is booked as log M, the most that a choice costs;
+        taking the plain one is not booked.
         """
         count = self.kernels.samples - 1
         rows = ((kernels.vehicle >= 0).any(1) & self._affords(state)).nonzero()[:, 0]
