@@ -14,7 +14,7 @@ from e2rl.prior.denoiser import Denoiser, DenoiserSettings, Encoding
 from e2rl.prior.features import edge_features, node_features
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, select
 from e2rl.prior.routes import RouteChoice, RoutedScene, route_scene, sample_route, start_state
-from e2rl.prior.sde import SamplerSettings, path_kl
+from e2rl.prior.sde import SamplerSettings, path_kl, path_martingale
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import project
 
@@ -43,10 +43,12 @@ class Context:
 
 @dataclass
 class Sample:
-    """x0 [B, V, SIZE] and the discrete path KL [B, V] that control added."""
+    """x0 [B, V, SIZE]; kl [B, V]: path KL that control added; log_ratio [B, V]: of the drawn path's densities, control
+    over prior."""
 
     x0: Tensor
     kl: Tensor
+    log_ratio: Tensor
 
 
 @dataclass
@@ -163,7 +165,8 @@ class Prior(nn.Module):
         settings, sampler = self.sampler, self.sampler.on(self.schedule)
         levels = settings.levels(self.schedule, noise.device)
         noise = settings.temperature * noise
-        x, kl, past, nominal_past = noise[0], torch.zeros(noise.shape[1:3], device=noise.device), None, None
+        x, past, nominal_past = noise[0], None, None
+        kl = log_ratio = torch.zeros(noise.shape[1:3], device=noise.device)
         for k in range(settings.steps, 0, -1):
             index = settings.steps - k
             high, low = levels[index], levels[index + 1]
@@ -173,20 +176,23 @@ class Prior(nn.Module):
             else:
                 x, nominal, x0 = control(x, high, k, context, partial(self.denoise, level=high, context=context))
             if k > 1:  # the last step takes x0 itself
-                step = partial(sampler.step, x, high=high, low=low, noise=noise[index + 1])
+                injected = noise[index + 1]
+                step = partial(sampler.step, x, high=high, low=low, noise=injected)
                 x, variance = step(x0=x0, past=past)
                 if control is not None:  # against what the prior would do from the same visited states
                     plain = step(x0=nominal, past=nominal_past)[0]
-                    added = path_kl(x - plain, variance * settings.temperature**2)
+                    variance = variance * settings.temperature**2
+                    added = path_kl(x - plain, variance)
                     if budget is not None:
                         fraction = within_budget(budget, kl, added)[:, None, None]
                         x, x0 = plain + fraction * (x - plain), nominal + fraction * (x0 - nominal)
                         added = fraction[..., 0] ** 2 * added
                     kl = kl + added
+                    log_ratio = log_ratio + added + path_martingale(x - plain, injected, variance, settings.temperature)
                 past, nominal_past = (x0, high), (nominal, high)
             elif budget is not None and control is not None:  # without noise there is no KL to count
                 x0 = torch.where((kl.sum(-1) < BUDGET_SPENT * budget)[:, None, None], x0, nominal)
-        return Sample(x0, kl)
+        return Sample(x0, kl, log_ratio)
 
     @torch.no_grad()
     def plan(self, x0: Tensor, context: Context) -> Plan:

@@ -159,3 +159,13 @@ def path_kl(shift: Tensor, variance: Tensor) -> Tensor:
     """
     energy = (shift**2).sum(-1)
     return torch.where(variance > 0, energy / (2 * variance.clamp(min=1e-12)), torch.zeros_like(energy))
+
+
+def path_martingale(shift: Tensor, noise: Tensor, variance: Tensor, temperature: float) -> Tensor:
+    """What log q/p [...] of one step is beyond `path_kl`: shift . noise / standard deviation, of mean 0 under q.
+
+    shift, noise [..., D]: of the mean, and what was injected, `temperature` times a standard normal; variance of the
+    injection.
+    """
+    along = (shift * noise).sum(-1) / (temperature * variance.clamp(min=1e-12).sqrt())
+    return torch.where(variance > 0, along, torch.zeros_like(along))

@@ -79,6 +79,27 @@ def test_path_kl_is_that_of_the_two_laws_of_the_path(sampler, temperature):
     torch.testing.assert_close(kl[:, 0].double(), expected.expand(steps + 1), rtol=1e-3, atol=0)
 
 
+def test_the_log_ratio_is_that_of_the_two_densities_of_the_path():
+    """Both laws of the path are products of Gaussian steps, whose densities torch knows."""
+    prior = gaussian_prior(steps=4)
+    noise = torch.randn(4, 6, 1, SIZE, generator=torch.Generator().manual_seed(2)).double()
+    levels, step = prior.sampler.levels(prior.schedule), prior.sampler.on(prior.schedule).step
+    total, before = torch.zeros(6, 1).double(), []
+
+    def control(x, level, k, context, denoise):
+        if before:
+            means = [step(*before[-1][:1], x0, *before[-1][2:], x * 0)[0] for x0 in before[-1][1]]
+            std = step(*before[-1][:1], before[-1][1][0], *before[-1][2:], x * 0)[1].sqrt()
+            of_prior, of_control = (torch.distributions.Normal(mean, std).log_prob(x).sum(-1) for mean in means)
+            total.add_(of_control - of_prior)
+        x0 = denoise(x)
+        before.append((x, (x0, x0 + 0.2 * x), level, levels[len(before) + 1]))
+        return x, x0, x0 + 0.2 * x
+
+    sample = prior.sample(None, noise, control)
+    torch.testing.assert_close(sample.log_ratio, total, rtol=1e-4, atol=1e-4)
+
+
 def test_a_budget_is_spent_by_the_first_steps_and_later_ones_are_the_prior_s():
     prior = gaussian_prior(steps=6)
     noise = torch.randn(6, 2, 1, SIZE, generator=torch.Generator().manual_seed(0))

@@ -25,7 +25,17 @@ from e2rl.traffic.e2.control import ControlSettings, Pull, SparseControl
 from e2rl.traffic.e2.feasibility import FeasibilitySettings, feasible_vehicles
 from e2rl.traffic.e2.foresight import time_before
 from e2rl.traffic.e2.interception import InterceptionSettings
-from e2rl.traffic.e2.kernels import Attack, Kernels, KernelSettings, best_try, propose_kernels, sideways, tries
+from e2rl.traffic.e2.kernels import (
+    DRAWN,
+    Attack,
+    Kernels,
+    KernelSettings,
+    best_try,
+    choice_nats,
+    propose_kernels,
+    sideways,
+    tries,
+)
 from e2rl.traffic.e2.potentials import PotentialContext, PotentialSettings
 from e2rl.traffic.e2.reasoner import LanguageReasoner, ReasonerSettings
 from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, YieldingSettings, duty_of, leading, place_of
@@ -44,7 +54,7 @@ from e2rl.traffic.grouping import no_vehicles, noise_of, of_scenes, put_rows, ta
 from e2rl.traffic.nominal import NominalTraffic, PriorState, React, Replan
 from e2rl.traffic.traffic import FULL, TrafficPlan
 
-LITERAL, SUPPORT, SAMPLES = 500, 750, 2000  # numbers of draws: the literal blend's noise, a random support's, kernels'
+LITERAL, SUPPORT = 500, 750  # numbers of draws: the literal blend's noise, a random support's
 MIN_TEMPERATURE, MAX_ROUTE_NATS = 0.05, 50.0  # of the prior's choice of routes, where a new route is booked
 SUPPORTS = ("feasible", "topology", "random")
 
@@ -201,33 +211,36 @@ class E2(NominalTraffic):
         """State, x0, path KL and jump of the joint sample of highest value in each scene: a plain one, or one of those
         drawn to kernels, which has gain times its worth more and its path KL less.
 
-        Scenes without a kernel have one sample. Taking a drawn one is booked as log M, the most that a choice costs;
-        taking the plain one is not booked.
+        All of a scene have the same noise. What the choice costs is booked in row 0 (`choice_nats`). It favours noise
+        that leads where the kernel does, so drawn vehicles pay log q/p of their path where that is more than its KL.
         """
         count = self.kernels.samples - 1
         rows = ((kernels.vehicle >= 0).any(1) & self._affords(state)).nonzero()[:, 0]
-        shape = noise.shape[0], count, *noise.shape[2:]
-        extra = noise_of(state.seed[rows], SAMPLES + state.replans[rows], shape).transpose(0, 1).flatten(1, 2)
         many, goal, drawn = tries(kernels, rows)
         copies, context = take_rows(state, many), of_scenes(context, many)
         pull = Pull(goal, drawn, self.kernels.pull * copies.eta)
         given = take_rows(attack.world, many), attack.ego_plan[many], take_rows(anchor, many)
         control = self._control(copies, *given, pull)
-        choice, budget = math.log(count + 1) * drawn, self._budget(copies)
-        budget = None if budget is None else budget - choice.sum(-1)
-        sample = self.prior.sample(context, torch.cat([noise, extra], 1), control, budget)
-        kl = sample.kl + choice
+        choice = choice_nats(rows, len(state.eta), count)
+        budget = self._budget(copies)
+        sample = self.prior.sample(context, noise[:, many], control, None if budget is None else budget - choice)
+        kl = torch.where(drawn, torch.maximum(sample.kl, sample.log_ratio), sample.kl)
+        kl = torch.cat([choice[:, None], kl[:, 1:]], 1)
         worth, prevented = self._worth(attack, context, sample.x0, many)
-        pick = best_try(self.kernels.gain * copies.eta * worth.amax(-1) - kl.sum(-1), rows, len(state.eta))
+        value = self.kernels.gain * copies.eta * worth.amax(-1) - kl.sum(-1)
+        if budget is not None:
+            value = value.masked_fill(drawn.any(1) & (kl.sum(-1) > budget), -torch.inf)
+        pick = best_try(value, rows, len(state.eta))
         settled = state.settled | (drawn & (worth > 0) & prevented)[pick]
         since = time_before(attack.world, attack.ego_plan, state.since)
         state = replace(state, drawn=drawn[pick], settled=settled, since=since)
         return state, sample.x0[pick], kl[pick], control.jump[pick]
 
     def _affords(self, state: E2State) -> Tensor:
-        """Bool [B]: there are nats left for the choice of a sample."""
+        """Bool [B]: there are nats left to draw a sample to a kernel."""
         budget = self._budget(state)
-        return state.eta > 0 if budget is None else (state.eta > 0) & (budget > math.log(self.kernels.samples))
+        least = math.log((self.kernels.samples - 1) / DRAWN)
+        return state.eta > 0 if budget is None else (state.eta > 0) & (budget > least)
 
     def _worth(self, attack: Attack, context: Context, x0: Tensor, many: Tensor) -> tuple[Tensor, Tensor]:
         """What `foresee` makes of samples x0 [C, V, SIZE] of scenes many [C]: worth and prevented [C, V]."""

@@ -3,9 +3,10 @@
 A kernel shifts one vehicle's plan away from the prior's mean: another acceleration, another place across the lane. Each
 costs about delta^T C^-1 delta / 2 nats, C the covariance of the prior's samples, and is worth what `foresee` makes of
 it. Those worth the most, less what they cost, become joint samples; of these the best is driven. What a kernel moved is
-booked as path KL, step by step, and the choice among M samples as log M.
+booked as path KL, step by step, and the choice among samples as a code length (`choice_nats`).
 """
 
+import math
 from dataclasses import dataclass
 from functools import cache
 
@@ -37,6 +38,7 @@ STIRS = 1.0  # m/s that such a vehicle reaches within its expected plan
 MAX_LATERAL = 4.0  # m/s^2
 APART = 6.0  # nats between two kernels of a vehicle that are drawn
 BUMP = 2.2  # m between centres, nearer than which a plan touches somebody else
+DRAWN = 0.1  # weight of all drawn samples of a scene together in the price of a choice; the plain one has the rest
 CHECKED = 12  # plans of a vehicle that are looked at for driving against the lanes
 
 
@@ -243,3 +245,15 @@ def best_try(value: Tensor, rows: Tensor, batch: int) -> Tensor:
     place = torch.arange(batch, device=rows.device)[:, None].repeat(1, count + 1)
     place[rows, 1:] = torch.arange(batch, len(value), device=rows.device).view(len(rows), count)
     return place.gather(1, value[place].argmax(1, keepdim=True))[:, 0]
+
+
+def choice_nats(rows: Tensor, batch: int, count: int) -> Tensor:
+    """Nats [C] of taking each of the samples of `tries`: -log of its weight among the plain one and `count` drawn ones;
+    0 in those of the B = `batch` scenes that have no choice, which are not in rows [R].
+
+    Let r be the law of what is taken, m the sample that it is. r(x, m) <= q_m(x), so KL(r, p) <= E[log q_m/p - log w_m]
+    for any weights w that sum to 1.
+    """
+    plain = torch.zeros(batch, device=rows.device).index_fill(0, rows, -math.log1p(-DRAWN))
+    taken = plain.new_full((len(rows) * count,), math.log(count / DRAWN))
+    return torch.cat([plain, taken])
