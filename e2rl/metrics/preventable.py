@@ -24,6 +24,7 @@ STRAIGHT = 60.0  # m by which a way goes on straight
 NEAREST = 16  # vehicles that come nearest to the ego are seen
 AFTER = round(3.0 / DT)  # steps beyond the ego's contact for which the driver must have none
 CHAIN = 2  # followers that may be driven again
+CREEPING = 0.5  # m/s: an ego that is slower does not run into anybody
 SAME_WAY = 0.5  # cosine of the headings of a follower and its leader at least
 
 
@@ -130,11 +131,12 @@ class Collision(NamedTuple):
 
 class Prevention(NamedTuple):
     """Of B collisions: avoided [B] bool; followers [B] int64: vehicles behind the ego that had to brake for it; states
-    [B, T+1, 4]: of the driver."""
+    [B, T+1, 4]: of the driver; struck [B] bool: the partner comes to the driver, who stands (CREEPING)."""
 
     avoided: Tensor
     followers: Tensor
     states: Tensor
+    struck: Tensor
 
 
 def nearest_first(collision: Collision) -> Collision:
@@ -170,6 +172,8 @@ def prevention(driver: Driver, collision: Collision, along: Along) -> Prevention
     counts = (steps >= 1) & (steps <= stop[:, None] + AFTER)
     touched = contacts(driven, size[:, 0], others) & counts[..., None]
     avoided, followers = ~touched[:, :, 0].any(1), torch.zeros_like(stop)
+    first = touched[:, :, 0].int().argmax(1)
+    struck = ~avoided & (driven[torch.arange(len(stop), device=stop.device), first, 3] <= CREEPING)
     leader, leader_size = driven, size[:, 0]
     blamed = touched.any(1)
     blamed[:, 0] = False  # the partner
@@ -193,7 +197,7 @@ def prevention(driver: Driver, collision: Collision, along: Along) -> Prevention
         blamed = touched.any(1) & ~itself & hits[:, None] & avoided[:, None]
         touched = touched & ~itself[:, None]
         leader, leader_size = braked, track_size
-    return Prevention(avoided, followers, driven)
+    return Prevention(avoided, followers, driven, struck)
 
 
 def _follows(leader: Tensor, others: Tracks, touched: Tensor, index: Tensor) -> Tensor:

@@ -19,7 +19,16 @@ from torch import Tensor
 from e2rl.metrics.catalogue import Batch, declare, rate
 from e2rl.metrics.contact import FRONT, REAR
 from e2rl.metrics.drivers import DRIVERS, HumanDriver
-from e2rl.metrics.preventable import Collision, Tracks, along_way, driven_length, held, preventions
+from e2rl.metrics.preventable import (
+    CREEPING,
+    Collision,
+    Prevention,
+    Tracks,
+    along_way,
+    driven_length,
+    held,
+    preventions,
+)
 from e2rl.scenes.boxes import separation
 from e2rl.scenes.lane_graph import against_lanes
 from e2rl.scenes.recording import DT, VEHICLE
@@ -31,12 +40,12 @@ NONE, REAR_END, LIGHT, WRONG_WAY, RIGHT_OF_WAY, ENTRY = range(6)
 LIGHT_STEPS = round(5.0 / DT)  # before the contact in which a red light counts
 WRONG_STEPS = round(1.0 / DT)  # before the contact of which half must be against the lanes
 SAME_WAY = torch.pi / 6  # rad between headings below which a vehicle enters the way rather than crosses it
+ONCOMING = 5 * torch.pi / 6  # rad from which on it comes towards it
 TURN = torch.pi / 7  # rad of heading within the last four seconds that make a turn
 TURN_STEPS = round(4.0 / DT)
 CUT_IN_STEPS = 10  # 1 s at 10 Hz
 AHEAD = 30.0  # m, straight on from the contact, that count as the ego's path
 STOOD = round(2.0 / DT)  # steps; who keeps two seconds of distance (UK Highway Code, rule 126) stops behind what stood
-CREEPING = 0.5  # m/s: an ego that is slower does not run into anybody
 LANE_HALF = 1.75  # m from a lane's centreline to its edge
 
 
@@ -55,11 +64,10 @@ def duties(collision: Collision, rear: Tensor, red: Tensor, lanes: tuple[Tensor,
     before = (stop - 1).clamp(min=0)
     turned = torch.stack([_turn(track, stop) for track in (ego, other)])
     angle = wrap(other[row, before, 2] - ego[row, before, 2])
-    gap, closing, entered = _entry(ego, other, size, stop)
-    unsafe = entered & (gap < HumanDriver().stopping_gap(closing).clamp(min=0.0))
-    crosses = angle.abs() > SAME_WAY
-    # Who turns gives way; where both or none do, the other does if it comes from the ego's left.
+    unsafe, crosses = _unsafe_entry(ego, other, size, stop), angle.abs() > SAME_WAY
+    # Who turns gives way; where both or none do, the other does if it comes from the ego's left, or leaves its side.
     priority = torch.where(turned[0] == turned[1], angle < 0, turned[1] & ~turned[0])
+    priority = torch.where(angle.abs() > ONCOMING, ~turned[0], priority)
     result = torch.full_like(stop, NONE)
     result = torch.where(unsafe & ~crosses, ENTRY, result)
     result = torch.where(unsafe & crosses & priority, RIGHT_OF_WAY, result)
@@ -76,21 +84,22 @@ def _turn(track: Tensor, stop: Tensor) -> Tensor:
     return (wrap(track[..., 2].diff(dim=1)) * counted).sum(1).abs() > TURN
 
 
-def _entry(ego: Tensor, other: Tensor, size: Tensor, stop: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Gap [B] m along the ego's way and closing speed [B] m/s when the other last came into it, and whether it did."""
+def _unsafe_entry(ego: Tensor, other: Tensor, size: Tensor, stop: Tensor) -> Tensor:
+    """Bool [B]: when the other last came into the ego's way, and at all times since, the gap was less than a competent
+    driver needs."""
     tracks = Tracks(other[:, :, None], size[:, 1:], torch.ones_like(other[..., :1], dtype=torch.bool))
     along = along_way(ego, size[:, 0, 1], tracks)
     outside = along.lateral_gap[..., 0].T > 0
     steps = torch.arange(ego.shape[1], device=stop.device)
-    last = torch.where(outside & (steps <= stop[:, None]), steps, -1).amax(1)
-    entered = (last >= 0) & (last < stop)
-    step, row = (last + 1).clamp(max=ego.shape[1] - 1), torch.arange(len(stop), device=stop.device)
-    gap = along.rear[step, row, 0] - driven_length(ego)[row, step] - size[:, 0, 0] / 2
-    return gap, ego[row, step, 3] - along.speed[step, row, 0], entered | (last == stop)
+    last = torch.where(outside & (steps <= stop[:, None]), steps, -1).amax(1, keepdim=True)
+    gap = along.rear[..., 0].T - driven_length(ego) - size[:, :1, 0] / 2
+    safe = gap >= HumanDriver().stopping_gap(ego[..., 3] - along.speed[..., 0].T).clamp(min=0.0)
+    since = (steps > last) & (steps <= (stop[:, None]).maximum(last + 1))
+    return (last[:, 0] >= 0) & ~(safe & since).any(1)
 
 
 def _against(track: Tensor, stop: Tensor, lanes: tuple[Tensor, Tensor]) -> Tensor:
-    """Bool [B]: in half of the WRONG_STEPS before stop [B] every lane that the vehicle is on runs against it."""
+    """Bool [B]: in half of the WRONG_STEPS before stop [B] the lane that the vehicle is on runs against it."""
     row = torch.arange(len(stop), device=stop.device)[:, None]
     window = (stop[:, None] - torch.arange(1, WRONG_STEPS + 1, device=stop.device)).clamp(min=0)
     states = track[row, window]
@@ -98,17 +107,19 @@ def _against(track: Tensor, stop: Tensor, lanes: tuple[Tensor, Tensor]) -> Tenso
     return against.float().mean(-1) >= 0.5
 
 
-def at_fault(batch: Batch) -> Tensor:
+def at_fault(batch: Batch, struck: Tensor) -> Tensor:
     """Whether the ego is at fault [B]: 1 or 0, NaN without contact.
 
     It is if it moves and either its partner has stood for STOOD steps, or its front hits a partner that moves and did
-    not cut in: that entered the ego's path more than a second before the contact. An ego that stands is, if it has
-    stood for STOOD steps in the way of a lane that the partner comes along.
+    not cut in: that entered the ego's path more than a second before the contact. It is not where a competent driver
+    who stands would be struck all the same: struck [B]. An ego that stands is, if it has stood for STOOD steps in the
+    way of a lane that the partner comes along.
     """
     row, partner = torch.arange(len(batch["states"])), batch["partner"].clamp(min=0)
     speed = batch["states"][row, batch["before"], :, 3].abs()
     moves, partner_moves = speed[:, 0] > STANDING, speed[row, partner] > STANDING
-    fault = moves & (stood(batch, partner) | ((batch["kind"] == FRONT) & partner_moves & ~cuts_in(batch)))
+    runs_into = (batch["kind"] == FRONT) & partner_moves & ~cuts_in(batch) & ~struck
+    fault = moves & (stood(batch, partner) | runs_into)
     fault = fault | (~moves & stood(batch, torch.zeros_like(partner)) & blocks(batch, partner))
     return fault.to(speed.dtype).masked_fill(~batch["hit"], torch.nan)
 
@@ -195,13 +206,15 @@ def judge(batch: Batch) -> tuple[Batch, Tensor]:
             rollout: cfr_counted, cfr_preventable.
         driver: states [B, T+1, 4] of the human driver in the ego's place, NaN without a collision.
     """
-    hit, fault = batch["hit"], at_fault(batch)
-    found = {name: torch.full_like(fault, torch.nan) for name in COLUMNS}
-    duty, driver = torch.full_like(batch["stop"], -1), torch.full_like(batch["states"][:, :, 0], torch.nan)
+    hit, driver = batch["hit"], torch.full_like(batch["states"][:, :, 0], torch.nan)
+    found = {name: torch.full_like(driver[:, 0, 0], torch.nan) for name in COLUMNS}
+    duty, struck = torch.full_like(batch["stop"], -1), torch.zeros_like(hit)
     if hit.any():
-        of_hits, duty[hit], driver[hit] = collision_verdicts(batch, hit)
+        of_hits, duty[hit], human = collision_verdicts(batch, hit)
+        driver[hit], struck[hit] = human.states, human.struck
         for name, value in of_hits.items():
             found[name][hit] = value
+    fault = at_fault(batch, struck)
     counted = torch.maximum(fault, found["preventable"])
     known = torch.zeros_like(fault).masked_fill(batch["start_overlap"], torch.nan)
     rates = {"cfr_counted": counted, "cfr_preventable": found["preventable"]}
@@ -209,8 +222,8 @@ def judge(batch: Batch) -> tuple[Batch, Tensor]:
     return found | rates | {"at_fault": fault, "counted": counted, "duty": duty}, driver
 
 
-def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor, Tensor]:
-    """COLUMNS, duty and driver's states [C, T+1, 4] of the C collisions hit [B] bool."""
+def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor, Prevention]:
+    """COLUMNS, duty [C] and the human driver's Prevention of the C collisions hit [B] bool."""
     vehicles = (batch["valid"] & (batch["agent_type"] == VEHICLE)[:, None])[hit]
     collision = Collision(batch["states"][hit], vehicles, batch["size"][hit], batch["partner"][hit], batch["stop"][hit])
     row, ran = torch.arange(len(collision.stop)), batch.get("ran_light")
@@ -219,13 +232,14 @@ def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor, Tensor
     duty = duties(collision, batch["kind"][hit] == REAR, red, lanes)
     result = preventions(collision)
     dtype = batch["states"].dtype
-    moves = batch["states"][hit][row, batch["before"][hit], 0, 3].abs() > CREEPING
+    speed = batch["states"][hit][row, batch["before"][hit], :, 3].abs()
+    moves, partner_moves = speed[:, 0] > CREEPING, speed[row, collision.partner] > STANDING
     found = {f"preventable_{name}": (value.avoided & moves).to(dtype) for name, value in result.items()}
     human = result["human"]
     found["preventable"] = found.pop("preventable_human")
     found["preventable_chain"] = found["preventable"] * (human.followers > 0)
-    found["replayed"] = found["preventable"] * (batch["kind"][hit] != FRONT)
-    return found, duty, human.states
+    found["replayed"] = found["preventable"] * (partner_moves & (batch["kind"][hit] != FRONT))
+    return found, duty, human
 
 
 def clean(found: Batch) -> Tensor:

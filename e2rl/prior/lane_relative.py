@@ -24,6 +24,8 @@ KNOT_STEPS = HORIZON // KNOTS
 ACCEL_SCALE = 1.0  # m/s^2 a unit of x
 OFFSET_SCALE, BEND_SCALE = 0.5, 0.15  # m a unit of x: end offset; half-way offset from the mean of now and the end
 LEAK = 0.05  # gradient that passes where the speed is held at 0
+# Weight of the squared second differences of fitted accelerations: what changes faster is noise of the recording.
+ROUGHNESS = 0.3
 
 
 @dataclass
@@ -238,8 +240,8 @@ def _fit_knots(track: LaneState, known: Tensor, state: LaneState) -> Tensor:
     driven = track.s - state.s[..., None] - state.v[..., None] * time - state.a[..., None] * distance[:, 0]
     target = torch.cat([weight[..., 0] * speed, 0.5 * weight[..., 0] * driven], -1)
     second = torch.diff(torch.eye(KNOTS + 1, device=known.device), n=2, dim=0)
-    damp = 0.02 * second[:, 1:].T @ second[:, 1:] + 1e-3 * torch.eye(KNOTS, device=known.device)
-    pull = -0.02 * second[:, 1:].T @ second[:, 0] * state.a[..., None]
+    damp = ROUGHNESS * second[:, 1:].T @ second[:, 1:] + 1e-3 * torch.eye(KNOTS, device=known.device)
+    pull = -ROUGHNESS * second[:, 1:].T @ second[:, 0] * state.a[..., None]
     gram = rows.transpose(-1, -2) @ rows + damp
     right = (rows.transpose(-1, -2) @ target[..., None])[..., 0] + pull
     return torch.linalg.solve(gram, right[..., None])[..., 0].clamp(-8.0, 5.0)

@@ -226,22 +226,30 @@ def smooth_vertices(points: np.ndarray) -> np.ndarray:
 
 
 LANE_REACH = 2.5  # m from a lane's centreline within which a vehicle is on it
-ALONG = 0.5  # cosine between a heading and a lane above which a vehicle drives along it
+ALONG = 0.866  # cosine between a heading and a lane, either way, above which a vehicle drives along it: 30 degrees
 
 
 def against_lanes(points: Tensor, lane: Tensor, xy: Tensor, heading: Tensor) -> Tensor:
-    """Bool [B, K, H]: at xy [B, K, 2] a lane runs against vehicles of heading [B, K, H], and none runs with them.
+    """Bool [B, K, H]: of the lanes along which vehicles at xy [B, K, 2] of heading [B, K, H] drive, either way round,
+    the nearest runs against them.
 
     points [B, M, 2]: of centrelines; lane [B, M]: which one each point is of (-1: padding).
     """
-    ahead = torch.nn.functional.normalize(points.diff(dim=1), dim=-1)
+    length = points.diff(dim=1).norm(dim=-1).clamp(min=1e-6)
+    ahead = points.diff(dim=1) / length[..., None]
     same = (lane[:, 1:] == lane[:, :-1]) & (lane[:, 1:] >= 0)
     near = (torch.cdist(xy, points[:, :-1]) < LANE_REACH) & same[:, None]
     b, k, segment = near.nonzero(as_tuple=True)  # few of a map's segments are near
     towards = torch.stack([heading[b, k].cos(), heading[b, k].sin()], -1)
     cosine = (towards * ahead[b, segment][:, None]).sum(-1)
 
-    def any_of(which: Tensor) -> Tensor:
-        return torch.zeros_like(heading).index_put((b, k), which.to(heading.dtype), accumulate=True) > 0
+    offset = xy[b, k] - points[b, segment]
+    along = (offset * ahead[b, segment]).sum(-1).clamp(min=0).minimum(length[b, segment])
+    gap = (offset - along[:, None] * ahead[b, segment]).norm(dim=-1)[:, None].expand_as(cosine)
 
-    return any_of(cosine < -ALONG) & ~any_of(cosine > ALONG)
+    def nearest(which: Tensor) -> Tensor:
+        row = (b * xy.shape[1] + k)[:, None].expand_as(cosine)
+        found = torch.full_like(heading, torch.inf).flatten(0, 1)
+        return found.scatter_reduce(0, row, gap.masked_fill(~which, torch.inf), "amin").view_as(heading)
+
+    return nearest(cosine < -ALONG) < nearest(cosine > ALONG)

@@ -83,6 +83,42 @@ def test_without_another_rule_who_comes_from_the_left_gives_way(from_left, expec
     assert duty(crossing(8.0, from_left)) == expected
 
 
+def oncoming(side, heading):
+    """A collision with who comes towards the ego on the other lane and comes over to its own at the end."""
+    partner = track(8.0, math.pi, (64.0, 0.0))
+    share = ((torch.arange(81) - 20) / 8.0).clamp(0, 1)
+    partner[0, :, 1] = side * 3.5 * (1 - share)
+    partner[0, :, 2] = heading
+    return collision(track(10.0), partner)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("heading", [math.pi - 0.03, 0.03 - math.pi])
+def test_who_comes_towards_the_ego_gives_way_to_it_whatever_the_sign_of_the_angle(side, heading):
+    assert duty(oncoming(side, heading)) == "right of way"
+
+
+def test_an_entry_is_forgotten_once_the_gap_was_safe():
+    """It comes over 3 m ahead, drives off at 20 m/s for two seconds, and only then brakes to a stop."""
+    speed = torch.cat([torch.full((10,), 6.0), torch.full((20,), 25.0), torch.linspace(25, 0, 20), torch.zeros(31)])
+    partner = cut_in(3.0, 14.0, 6.0)
+    away = track(speed)
+    partner[..., 0] = partner[..., :1, 0] + away[..., 0]
+    partner[..., 3] = away[..., 3]
+    assert duty(collision(track(14.0), cut_in(3.0, 14.0, 6.0))) == "entry"
+    assert duty(collision(track(14.0), partner)) == "none"
+
+
+def test_who_is_struck_as_a_competent_driver_would_be_that_has_stood_is_not_at_fault():
+    """The ego pulls away half a second before somebody comes head-on; the driver has not started by then."""
+    speed = torch.zeros(81)
+    speed[26:] = 0.3 * torch.arange(1, 56)
+    head_on = course(4.5 + 30 * 1.0, 0, math.pi, 10.0)
+    found = row_of((track(speed)[0], head_on[1]), head_on)
+    assert found["cfr"] == 1 and found["contact_type"] == "front"
+    assert found["at_fault"] == found["counted"] == 0
+
+
 def test_against_every_lane_that_it_is_on_is_the_wrong_way():
     case = collision(track(8.0), track(8.0, math.pi, (60.0, 0.0)))
     x = torch.arange(-20, 80, 2, dtype=torch.float64)
@@ -107,7 +143,7 @@ def test_whoever_enters_the_ego_s_path_less_than_a_second_before_the_contact_cut
     assert (found["contact_step"], found["contact_type"], found["at_fault"]) == (30, "front", fault)
 
 
-@pytest.mark.parametrize(("ego", "partner", "fault"), [(0.09, 5.0, 0.0), (0.11, 5.0, 1.0), (10.0, 0.09, 1.0)])
+@pytest.mark.parametrize(("ego", "partner", "fault"), [(0.09, 5.0, 0.0), (0.11, 5.0, 0.0), (10.0, 0.09, 1.0)])
 def test_who_stands_is_not_at_fault_and_who_hits_the_standing_is(ego, partner, fault):
     """Speeds in the states alone: the ego's front is hit by a partner ahead that backs into it, or the other way."""
     states, valid = course(10, 0, 0, 0)

@@ -115,7 +115,7 @@ def test_fitting_a_decoded_plan_gives_it_back(generator):
     plan = decode(x, state, points)
     found, error = fit(plan, torch.ones_like(plan.s), state)
     assert error.max() < 0.1
-    torch.testing.assert_close(found[:, :KNOTS], x[:, :KNOTS], rtol=0, atol=0.15)
+    torch.testing.assert_close(found[:, :KNOTS], x[:, :KNOTS], rtol=0, atol=0.25)
     # The ridge pulls lateral knots towards 0; the offsets they stand for are met within centimetres.
     torch.testing.assert_close(decode(found, state, points).d, plan.d, rtol=0, atol=0.08)
 

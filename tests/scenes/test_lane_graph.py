@@ -146,6 +146,13 @@ def test_a_vehicle_is_against_the_lanes_where_none_runs_with_it():
     assert against(0.0) == [False, True, False]
     assert against(3.5) == [True, False, False]
     assert against(1.75) == against(-9.0) == [False, False, False]  # between two lanes, or off them
+    assert against(1.9) == [True, False, False]  # nearer to the other lane, though still within reach of its own
+
+
+def test_a_lane_that_crosses_is_no_lane_to_drive_along():
+    slope = torch.tensor([[[20.0, 3.5]]]) + torch.linspace(-10, 10, 21)[None, :, None] * torch.tensor([1.0, 1.0])
+    points, lane = torch.cat([ROAD, slope], 1), torch.cat([LANE, torch.full((1, 21), 2)], 1)
+    assert against_lanes(points, lane, torch.tensor([[[20.0, 3.4]]]), AHEAD)[0, 0].tolist() == [True, False, False]
 
 
 def test_the_gap_between_two_lanes_in_the_list_is_no_lane():

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import LaneState
 from e2rl.prior.prior import Context, Control, Prior
+from e2rl.prior.sde import Past
 from e2rl.run.errors import InputError
 from e2rl.run.settings import setting
 from e2rl.traffic.baselines.baseline import Baseline
@@ -41,6 +42,7 @@ class MeanGuidance:
     samples: int
     step_size: float
     iterations: int
+    past: Past = None  # of the step, where the sampler is of second order
 
     def __call__(
         self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Denoise
@@ -51,12 +53,16 @@ class MeanGuidance:
         if k == 1:
             return x, x0, x0
         sampler, schedule = self.prior.sampler, self.prior.schedule
+        past = None if k == sampler.steps else self.past
         low, zero = sampler.levels(schedule, x.device)[sampler.steps - k + 1], torch.zeros_like(level)
         step = partial(sampler.on(schedule).step, high=level, low=low, noise=zero)
-        mean, variance = step(x=x, x0=x0)
-        per_x0, _ = step(x=zero, x0=zero + 1)  # a step is affine in x0
+        mean, variance = step(x=x, x0=x0, past=past)
+        none = None if past is None else (zero, past[1])
+        per_x0, _ = step(x=zero, x0=zero + 1, past=none)  # a step is affine in x0
         shift = self._shift(mean, self.limit[:, None, None] * variance.sqrt(), context)
-        return x, x0, x0 + shift / per_x0
+        moved = x0 + shift / per_x0
+        self.past = moved, level
+        return x, x0, moved
 
     def _shift(self, mean: Tensor, limit: Tensor, context: Context) -> Tensor:
         with torch.enable_grad():
@@ -147,13 +153,13 @@ class MeanGuided(Guided):
     iterations: int = setting(low=1)
 
     def __post_init__(self) -> None:
-        """Raises InputError for samplers whose steps have no posterior mean and standard deviation."""
+        """Raises InputError for samplers whose steps have no noise."""
         super().__post_init__()
         sampler = self.prior.sampler
-        if sampler.sampler == "dpm_solver_pp" or (sampler.sampler == "ddim" and sampler.churn == 0):
+        if sampler.churn == 0 and sampler.sampler != "euler_maruyama":
             raise InputError(
-                f"prior.sampler.sampler={sampler.sampler}, churn={sampler.churn}: {type(self).__name__} moves the mean "
-                "of ancestral steps by a fraction of their noise; use ddim with churn above 0, or euler_maruyama"
+                f"prior.sampler.churn=0: {type(self).__name__} moves the mean of a step by a fraction of its noise, of "
+                "which there is none; set it above 0"
             )
 
     def guidance(self, loss: Loss, guided: Tensor, strength: Tensor) -> MeanGuidance:

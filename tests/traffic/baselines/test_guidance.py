@@ -14,7 +14,7 @@ def control_inputs():
     """A baseline's first replan, a noisy x at the third of four levels, and the denoiser there."""
     on = baseline("ctg_adv")
     (now, context), view = first_replan(on, scenes(2).scenes)
-    level, low = on.prior.schedule.levels(4)[1:3]
+    level, low = on.prior.sampler.levels(on.prior.schedule)[1:3]
     return on, now.state, view, context, now.noise[0, :, :, 0], level, low
 
 

@@ -17,7 +17,7 @@ from tests.traffic.e2.traffic_scenes import EGO, begin, scenes
 def test_latents_are_decoded_as_by_ddim_without_noise():
     on = baseline("strive")
     (now, context), _ = first_replan(on, scenes(2).scenes)
-    prior = small_prior(0, sampler=SamplerSettings(steps=4, churn=0.0))
+    prior = small_prior(0, sampler=SamplerSettings(sampler="ddim", spacing="level", steps=4, churn=0.0))
     expected = prior.sample(context, now.noise[..., 0, :]).x0
     torch.testing.assert_close(decode_latent(on.prior, now.noise[0, ..., 0, :], context, 4), expected)
 

@@ -155,7 +155,7 @@ def test_the_printed_blend_halves_the_noise_and_its_energy_is_booked():
 
 def test_the_printed_blend_happens_once_at_the_level_nearest_to_the_set_one_and_can_be_off():
     case = Case()
-    levels = case.prior.schedule.levels(case.prior.sampler.steps)
+    levels = case.prior.sampler.levels(case.prior.schedule)
     for wanted in (0.1, 0.5, 0.9):
         control = case.control(anchor_level=wanted)
         at = levels[case.prior.sampler.steps - control.anchor_step]

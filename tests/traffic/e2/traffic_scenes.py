@@ -30,7 +30,7 @@ def scenes(count: int = 3, steps: int = 20, **options) -> SceneSet:
 
 def synthesizer(seed: int = 0, steps: int = 4, sampler: str = "ddim", **settings) -> E2:
     """e2 on a small random prior of `steps` denoising steps."""
-    return E2(small_prior(seed, sampler=SamplerSettings(sampler=sampler, steps=steps)), **settings)
+    return E2(small_prior(seed, sampler=SamplerSettings(sampler=sampler, steps=steps, spacing="level")), **settings)
 
 
 def drive(scene_set: SceneSet, on: Traffic, eta: float, seeds=None, ego: Ego | None = None, **sim) -> Rollouts:
