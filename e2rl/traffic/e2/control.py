@@ -18,6 +18,7 @@ from torch import Tensor
 from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS, SIZE
 from e2rl.prior.prior import Context, Prior
 from e2rl.prior.sde import NoiseSchedule
+from e2rl.run.errors import InputError
 from e2rl.run.settings import configured, setting
 from e2rl.traffic.e2.anchoring import Anchor
 from e2rl.traffic.e2.kernels import pulled
@@ -45,9 +46,17 @@ class ControlSettings:
     adversarial_clip: float = setting(low=0)
     feasibility: float = setting()
     feasibility_clip: float = setting(low=0)
-    anchoring: str = setting(choices=("clean", "literal", "off"))
+    anchoring: str = setting(choices=("clean", "literal", "raw", "off"))
     anchor_level: float = setting(low=0, high=1)
     transport_budget: float | None = setting(low=0, optional=True)
+
+    def __post_init__(self) -> None:
+        """Raises InputError for a budget of nats beside raw proposals, which have no price."""
+        if self.anchoring == "raw" and self.transport_budget is not None:
+            raise InputError(
+                "synthesizer.control.anchoring=raw drives proposals as they are, at no price in nats: set "
+                "transport_budget=null"
+            )
 
 
 def clip_rows(gradient: Tensor, limit: float) -> Tensor:
@@ -119,7 +128,7 @@ class SparseControl:
             x = self._blended(x, level, context, denoise)
         x0, adversarial, feasibility = self._gradients(x, level, k, context, denoise)
         if k == 1:
-            return x, x0, x0
+            return x, x0, self._driven(x0)
         weight = gradient_weight(self.prior.schedule, level, settings.scaling)
         adversarial = clip_rows(weight * adversarial, settings.adversarial_clip)
         feasibility = clip_rows(settings.feasibility * weight * feasibility, settings.feasibility_clip)
@@ -129,6 +138,12 @@ class SparseControl:
             moved = pull(moved, level, self.prior.schedule)
         controlled = (context.active & (self.eta > 0)[:, None])[..., None]
         return x, x0, torch.where(controlled, moved, x0)
+
+    def _driven(self, x0: Tensor) -> Tensor:
+        """The last x0 [B, V, SIZE], where the accelerations of raw proposals take the place of the sample's."""
+        raw = (self.anchor.feasible & self.coalition & (self.eta > 0)[:, None])[..., None]
+        proposal = torch.cat([self.anchor.knots / ACCEL_SCALE, torch.zeros_like(x0[..., KNOTS:])], -1)
+        return torch.where(raw & (self.settings.anchoring == "raw"), proposal, x0)
 
     def _gradients(
         self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Callable[[Tensor], Tensor]

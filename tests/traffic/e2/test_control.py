@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE
+from e2rl.run.errors import InputError
 from e2rl.traffic.e2 import control as control_module
 from e2rl.traffic.e2.anchoring import Anchor
 from e2rl.traffic.e2.control import ControlSettings, SparseControl, clip_rows
@@ -166,6 +167,18 @@ def test_the_printed_blend_happens_once_at_the_level_nearest_to_the_set_one_and_
     assert (case.shift(k=step, strength=0.5, anchoring="off")[1] == 0).all()
     case.anchor.feasible[:] = False
     assert (case.shift(k=step, **literal)[1] == 0).all(), "members that cannot meet their target are not anchored"
+
+
+def test_raw_proposals_are_driven_as_they_are_and_have_no_budget():
+    case, options = Case(), {"anchoring": "raw", "strength": 8.0, "adversarial_clip": 0.0, "feasibility": 0.0}
+    assert (case.shift(k=3, **options)[1] == 0).all(), "nothing is pulled on the way"
+    x, level = case.noise[0], torch.tensor(0.1)
+    given = level, 1, case.context, lambda y: case.prior.denoise(y, level, case.context)
+    _, x0, driven = case.control(**options)(x, *given)
+    assert torch.equal(driven[:, OTHERS], x0[:, OTHERS])
+    torch.testing.assert_close(driven[:, MEMBER, :KNOTS] * ACCEL_SCALE, case.anchor.knots[:, MEMBER])
+    with pytest.raises(InputError, match="transport_budget"):
+        ControlSettings(anchoring="raw", transport_budget=10.0)
 
 
 def test_an_anchor_pulls_the_coalition_at_every_step_but_the_last_and_to_the_prior_as_eta_goes_to_0():
