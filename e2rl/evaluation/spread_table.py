@@ -27,6 +27,8 @@ STAGES[SPREAD_STAGE] = (
         Metric(f"{name}_ratio", f"{name} over that of {MANY} steps")
         for name in ("knot_variance", "lateral_variance", "travel_std")
     ),
+    Metric("covered_50", "recorded ways after 5 s in the central half of the samples'", fraction=True),
+    Metric("covered_90", "recorded ways after 5 s in the central nine tenths of the samples'", fraction=True),
 )
 
 
@@ -59,7 +61,7 @@ def spread_rows(
 
 
 def _sums(prior: Prior, scenes: SceneSet, samples: int, device: str) -> torch.Tensor:
-    """Sums [R, 4] of each scene: variances of knots, lateral knots and travel, and vehicles."""
+    """Sums [R, 7] of each scene: see `sample_variances`."""
     found = [
         torch.stack(list(sample_variances(prior, scenes.batch(rows).to(device), samples).values()), -1).cpu()
         for rows in torch.arange(len(scenes)).split(BATCH)
@@ -70,10 +72,14 @@ def _sums(prior: Prior, scenes: SceneSet, samples: int, device: str) -> torch.Te
 def _summary(few: torch.Tensor, many: torch.Tensor, scenes: SceneSet) -> dict[str, dict[str, float]]:
     """{metric: {mean, low, high, n}}; n counts vehicles."""
     cluster, clusters = cluster_index(scenes.location, scenes.scene_id)
-    draws, vehicles = bootstrap_draws(clusters), few[:, 3:].expand(-1, 3)
+    draws, vehicles = bootstrap_draws(clusters), few[:, 3:4].expand(-1, 3)
     of_few, of_many = (resampled_means(sums[:, :3], vehicles, cluster, draws) for sums in (few, many))
     for means in (of_few, of_many):
         means[:, 2] = means[:, 2].sqrt()
     places, names = len(cluster[few[:, 3] > 0].unique()), [metric.name for metric in STAGES[SPREAD_STAGE]]
-    columns = torch.cat([of_few, of_few / of_many], 1)
-    return {name: interval(columns[:, k], places) | {"n": int(few[:, 3].sum())} for k, name in enumerate(names)}
+    covered = resampled_means(few[:, 4:6], few[:, 6:].expand(-1, 2), cluster, draws)
+    columns, counts = (
+        torch.cat([of_few, of_few / of_many, covered], 1),
+        [*[int(few[:, 3].sum())] * 6, *[int(few[:, 6].sum())] * 2],
+    )
+    return {name: interval(columns[:, k], places) | {"n": counts[k]} for k, name in enumerate(names)}

@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 import pytest
+import torch
 
 from e2rl.prior.sde import SamplerSettings
-from e2rl.prior.spread import sample_variances
+from e2rl.prior.spread import central, sample_variances
 from tests.prior.gaussian import denoiser, moments
 from tests.prior.small import small_prior
 from tests.traffic.e2.traffic_scenes import scenes
@@ -29,3 +30,12 @@ def test_gaussian_samples_have_the_variance_of_the_sampler(sampler, monkeypatch)
     _, std = moments(exact, sampler, 1.0, prior.sampler.steps, prior.sampler.spacing)
     assert found["knots"].sum() / found["vehicles"].sum() == pytest.approx(std**2, rel=0.03)
     assert found["lateral"].sum() / found["vehicles"].sum() == pytest.approx(std**2, rel=0.05)
+
+
+@pytest.mark.parametrize("samples", [3, 16])
+@pytest.mark.parametrize("part", [0.5, 0.9])
+def test_a_value_of_the_samples_own_law_lies_in_their_central_part_that_often(samples, part):
+    """Its rank among them takes each of the samples + 1 values alike."""
+    ranks = torch.arange(samples + 1)
+    assert central(ranks, samples, part).mean().item() == pytest.approx(part)
+    assert torch.equal(central(ranks, samples, part), central(samples - ranks, samples, part))
