@@ -44,10 +44,9 @@ def sample_variances(prior: Prior, scene: TensorDictBase, samples: int, seed: in
         "travel": travel.var(0),
     }
     sums = {name: (value * counted).sum(-1).double() for name, value in parts.items()}
-    recorded = counted & (scene["route_log"] >= 0) & scene["logged_valid"][:, HORIZON, : shape[1]]
-    logged = torch.where(
-        recorded[..., None], scene["logged"][:, HORIZON, : shape[1], :2], scene["start"][:, : shape[1], :2]
-    )
+    at, vehicles = min(HORIZON, scene["logged"].shape[1] - 1), shape[1]
+    recorded = counted & (scene["route_log"] >= 0) & scene["logged_valid"][:, at, :vehicles] & (at == HORIZON)
+    logged = torch.where(recorded[..., None], scene["logged"][:, at, :vehicles, :2], scene["start"][:, :vehicles, :2])
     way = project(logged[:, :, None], routed.points, (lane.s + travel.mean(0))[..., None])[0][..., 0] - lane.s
     rank = (travel < way).sum(0)
     inside = {name: (central(rank, samples, part) * recorded).sum(-1).double() for name, part in REGIONS.items()}
