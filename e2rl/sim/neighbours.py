@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from e2rl.scenes.recording import DT
+from e2rl.sim.static import StaticScene
 from e2rl.sim.world import Agents
 
 
@@ -58,24 +60,52 @@ def separation_in_frame(position: Tensor, direction: Tensor, own: Tensor, half_s
 
 
 STANDING = 0.1  # m/s
+STOOD = round(2.0 / DT)  # steps; who keeps two seconds of distance (UK Highway Code, rule 126) stops behind what stood
 
 
-def own_fault(speed: Tensor, near: Neighbours, hit: Tensor, size: Tensor, half_size: Tensor) -> Tensor:
-    """Bool [B]: the ego overlaps an agent while it moves, and that agent stands or lies across the ego's front edge.
+def deepest_overlap(near: Neighbours, hit: Tensor) -> Tensor:
+    """Index [B] of the neighbour that each ego overlaps deepest; hit [B, M]: those that it overlaps, M > 0."""
+    return near.gap.masked_fill(~hit, torch.inf).argmin(1)
 
-    speed [B] m/s: of the ego before the contact. hit [B, M]: the neighbours that each ego overlaps; the one with the
-    deepest overlap is judged. The edge is that of the least overlap along the ego's axes, which near its corners
-    may differ from the one that touched first. size [B, 2]: length and width of the egos; half_size [B, 2, M]: of the
-    others.
+
+def standing(tracks: tuple[Tensor, Tensor], step: Tensor, agent: Tensor) -> tuple[Tensor, Tensor]:
+    """Whether agents [B] of tracks (states [B, T+1, N, 4], presence [B, T+1, N]) stand at step [B], and whether they
+    have stood for the STOOD steps up to it, or for as long as they are known; each [B] bool."""
+    window = (step[:, None] - torch.arange(STOOD + 1, device=step.device)).clamp(min=0)
+    at = torch.arange(len(step), device=step.device)[:, None], window, agent[:, None]
+    known = tracks[1][at]
+    moves = (tracks[0][..., 3][at].abs() > STANDING) & known
+    return known[:, 0] & ~moves[:, 0], known[:, 0] & ~moves.any(1)
+
+
+def own_fault(
+    speed: Tensor, near: Neighbours, hit: Tensor, static: StaticScene, tracks: tuple[Tensor, Tensor], before: Tensor
+) -> Tensor:
+    """Bool [B]: the ego overlaps an agent while it moves, and either that agent has stood (a vehicle: for STOOD steps)
+    or it moves and lies across the ego's front edge.
+
+    These are the rules of metrics/verdicts.py but for cut-ins and for an ego that stands across a lane. The edge is
+    that of the least overlap along the ego's axes, which near its corners may differ from the one that touched first.
+    An agent that is no vehicle may stand for a moment only, and is hit by the ego's front all the same.
+
+    Args:
+        speed: [B] m/s, of the ego before the contact.
+        hit: [B, M], the neighbours that each ego overlaps; the one with the deepest overlap is judged.
+        static: sizes and kinds.
+        tracks: of all agents, the ego first; what they did up to the step `before` [B], the one before the contact.
     """
     if hit.shape[1] == 0:
         return hit.any(1)
-    deepest = near.gap.masked_fill(~hit, torch.inf).argmin(1, keepdim=True)
-    pick = deepest[:, None].expand(-1, 2, -1)
-    position, turn, half = (value.gather(2, pick)[..., 0] for value in (near.position, near.direction, half_size))
+    partner = deepest_overlap(near, hit)
+    pick = partner[:, None, None].expand(-1, 2, 1)
+    position, turn, half = (
+        value.gather(2, pick)[..., 0] for value in (near.position, near.direction, static.half_size)
+    )
     turn = turn.abs()
     extent = torch.stack([(turn * half).sum(1), (turn.flip(1) * half).sum(1)], 1)
-    ahead, across = (position.abs() - size / 2 - extent).unbind(1)
+    ahead, across = (position.abs() - static.size / 2 - extent).unbind(1)
     front = (position[:, 0] > 0) & (ahead > across)
-    stands = near.agents.states[..., 3].gather(1, deepest)[:, 0].abs() <= STANDING
-    return hit.any(1) & (speed.abs() > STANDING) & (front | stands)
+    stands, stood = standing(tracks, before, partner + 1)
+    vehicle = static.vehicle.gather(1, partner[:, None])[:, 0]
+    blamed = torch.where(vehicle, stood | (front & ~stands), stands | front)
+    return hit.any(1) & (speed.abs() > STANDING) & blamed
