@@ -22,6 +22,7 @@ def judged(ego, others, since=0, vehicle=True, steps=40):
     states[:, :since, 1:2, 3] = 6.0
     tracks = states, torch.ones_like(states[..., 0], dtype=torch.bool)
     static = SimpleNamespace(size=SIZE.expand(count, 2), half_size=half, vehicle=torch.full((count, agents), vehicle))
+    static.row = torch.arange(count)[:, None]
     return own_fault(ego[:, 3], near, near.gap < 0, static, tracks, torch.full((count,), steps)).tolist()
 
 
