@@ -19,6 +19,7 @@ COMMANDS = {  # module, and what the command does
     "inspect": ("e2rl.commands.inspect", "what a data set holds, and a picture of a scene"),
     "merge": ("e2rl.commands.merge", "join the shards of an evaluation"),
     "curves": ("e2rl.report.curves", "failures over realism, of one or several runs"),
+    "policy-figure": ("e2rl.report.policy_figure", "what training was worth, of one or several splits"),
     "prior-tables": ("e2rl.commands.prior_tables", "the prior as traffic: open loop, closed loop, meta-metric"),
     "skeleton": ("e2rl.commands.draw_skeleton", "the figure of risks, skeleton and chain"),
 }

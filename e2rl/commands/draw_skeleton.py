@@ -1,4 +1,4 @@
-"""`e2rl skeleton`: the figure of the skeleton, from pairwise risk to an active chain (skeleton.png and .pdf)."""
+"""`e2rl skeleton`: the skeleton, from pairwise risk to an active chain, and what anchoring makes of it."""
 
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
 
@@ -12,12 +12,19 @@ from e2rl.run.run import Run
 
 
 def draw(run: Run) -> None:
-    """Roll out every scene in this process, listen to the selections, and draw the longest chain."""
+    """Roll out every scene in this process, listen to the selections, and draw the longest chain; with a second method
+    also the longest one of the start under both."""
     plan = begin(run)
     chain = LongestChain(plan.methods[0])
     run_protocol(plan.setup, plan.methods, plan.asked.seeds, run.folder, only=plan.only)
-    save_figure(run.folder / "skeleton.png", chain.figure(plan.scenes, plan.setup.ego_name, run.folder))
-    print(f"\ndrawn: {run.folder / 'skeleton.png'}")
+    where = plan.scenes, plan.setup.ego_name, run.folder
+    figures = {"skeleton": chain.figure(*where)}
+    for other in plan.methods[1:2]:
+        if figure := chain.beside(other, *where):
+            figures["anchoring"] = figure
+    for name, figure in figures.items():
+        save_figure(run.folder / f"{name}.png", figure)
+        print(f"drawn: {run.folder / f'{name}.png'}")
 
 
 def main() -> None:

@@ -21,7 +21,7 @@ from e2rl.run.settings import configured, setting
 from e2rl.traffic.attempt import count_reasons
 from e2rl.traffic.traffic import Traffic
 
-SOUGHT = ("cfr", "cfr_counted", "cfr_preventable")
+SOUGHT = ("cfr_preventable", "cfr_clean", "cfr_counted", "cfr")
 MEASURED = (*SOUGHT, "aor_step", "cfr_bg", "real", "real_adv", "nfe")
 ERRORED = 0.01  # fraction of rollouts that may error
 NOMINAL = "nominal"  # after a metric's name: its value in the traffic that the budget is held against
@@ -64,7 +64,7 @@ class AttackObjective:
     in any rollout has no `real_adv`, and keeps every such limit.
     """
 
-    shown: ClassVar[tuple[str, ...]] = ("cfr", "cfr_counted", "aor_step", f"aor_step {NOMINAL}", "real_adv", "errored")
+    shown: ClassVar[tuple[str, ...]] = (*SOUGHT, "aor_step", f"aor_step {NOMINAL}", "real_adv", "errored")
 
     seek: str = setting(choices=SOUGHT)
     off_road: float = setting(low=0, high=1)

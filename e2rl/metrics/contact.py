@@ -110,7 +110,11 @@ def kinds_at_stop(batch: Batch) -> Tensor:
     rate("rear_any", "ego's rear in contact at first contact", tables="egos"),
     rate("rir", "rear impacts per collision", per_collision=True, tables="main adversaries methods"),
     Metric(
-        "relvel", "speed difference before contact", "m/s", per_collision=True, tables="main adversaries methods egos"
+        "relvel",
+        "impact speed: of the ego relative to its partner, before contact",
+        "m/s",
+        per_collision=True,
+        tables="main adversaries methods egos",
     ),
     Metric(
         "contact_time",

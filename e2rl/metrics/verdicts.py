@@ -33,7 +33,7 @@ from e2rl.scenes.boxes import separation
 from e2rl.scenes.lane_graph import against_lanes
 from e2rl.scenes.recording import DT, VEHICLE
 from e2rl.sim.dynamics import wrap
-from e2rl.sim.neighbours import STANDING
+from e2rl.sim.neighbours import STANDING, STOOD
 
 DUTIES = ("none", "rear-end", "light", "wrong way", "right of way", "entry")
 NONE, REAR_END, LIGHT, WRONG_WAY, RIGHT_OF_WAY, ENTRY = range(6)
@@ -45,7 +45,6 @@ TURN = torch.pi / 7  # rad of heading within the last four seconds that make a t
 TURN_STEPS = round(4.0 / DT)
 CUT_IN_STEPS = 10  # 1 s at 10 Hz
 AHEAD = 30.0  # m, straight on from the contact, that count as the ego's path
-STOOD = round(2.0 / DT)  # steps; who keeps two seconds of distance (UK Highway Code, rule 126) stops behind what stood
 LANE_HALF = 1.75  # m from a lane's centreline to its edge
 
 

@@ -17,7 +17,11 @@ from e2rl.report.tables import UNKNOWN, closed_loop, number, plural
 LINES, NARROWEST, WIDEST = 25, 80, 100
 WEAKNESSES, MOST_ROWS = 3, 10  # lines of failure modes; rows of a comparison
 OTHER = 0  # number of the small failure modes together
-COUNTS = "count: the ego was at fault, or a careful and competent driver would prevent it."
+KINDS = {"preventable": "cfr_preventable", "clean": "cfr_clean", "count": "cfr_counted"}  # of failures, the first leads
+COUNTS = (
+    "preventable: a careful and competent driver would have had none; clean: besides, nobody else did wrong; count: "
+    "preventable, or the ego's fault."
+)
 FEW = "No intervals: they need scenes of at least ten places."
 
 
@@ -75,19 +79,15 @@ def compared_answer(before: Sequence[dict], after: Sequence[dict], folder: Path 
             f"After training, {new['ego']} was hit in {of(new, 'cfr')} rollouts {traffic(new)} ({rate(new, 'cfr')}); "
             f"before it in {of(old, 'cfr')} ({rate(old, 'cfr')})."
         )
-        kinds = {
-            "hit": "cfr",
-            "count": "cfr_counted",
-            "count per 1,000 km": "counted_per_km",
-            "progress [m]": "progress",
-        }
+        kinds = {"hit": "cfr", **KINDS, "progress [m]": "progress", "count per 1,000 km": "counted_per_km"}
         table = [["", "before", "after", "difference"]]
         table += [
             [f"{title}, {traffic_name(new)}", cell(old, name), cell(new, name), gap(new, name)]
             for title, name in kinds.items()
             for old, new in pairs
         ]
-        lines += [*columns(table[: LINES - len(lines) - len(last) - 1]), COUNTS]
+        legend = wrapped(COUNTS)
+        lines += [*columns(table[: LINES - len(lines) - len(last) - len(legend)]), *legend]
     return [*lines[: LINES - len(last)], *last]
 
 
@@ -108,21 +108,18 @@ def told(row: dict, nominal: dict | None) -> list[str]:
 
 
 def verdict(row: dict) -> str:
-    """How many of the collisions count, and why; how many a search could have avoided."""
+    """How many of the collisions were preventable, clean, and count; how many a search could have avoided."""
     hits, found = row["metrics"].get("counted", {}).get("n", 0), tally(row, "counted")
     if not hits:
         return ""
     avoidable = row["metrics"].get("avoidable", {}).get("n", 0)
     search = f" A search found a way out of {tally(row, 'avoidable')} of {avoidable}." if avoidable else ""
-    if not found:
-        return f"None counts: the ego was not at fault, and no careful driver would have prevented it.{search}"
-    reasons = {
-        "the ego was at fault": tally(row, "at_fault"),
-        "a careful and competent driver would have prevented it": tally(row, "preventable"),
-    }
-    because = " or ".join(f"{reason} ({count})" for reason, count in reasons.items() if count)
-    which = f"{found} of the {hits}" if found < hits else f"All {hits}" if hits > 1 else "It"
-    return f"{which} count{'s' if found == 1 else ''}, because {because}.{search}"
+    preventable, fault = tally(row, "preventable"), tally(row, "at_fault")
+    text = f"A careful and competent driver would have prevented {preventable or 'none'} of the {hits}"
+    if preventable:
+        text += f" ({tally(row, 'cfr_clean')} clean: nobody else did wrong)"
+    blame = f"the ego was at fault in {fault}" if fault else "the ego was never at fault"
+    return f"{text}; {blame}. So {found or 'none'} count{'s' if found == 1 else ''}.{search}"
 
 
 def effect(row: dict, nominal: dict) -> str:
@@ -151,16 +148,18 @@ def cost(row: dict, nominal: dict) -> str:
 
 
 def compared(rows: Sequence[dict]) -> list[str]:
-    """A table with a row for each ego, method and intensity. Methods: those that find most failures that count first.
-    Egos: in each traffic, the strongest first, the one with the fewest first. Unknown rates come last."""
+    """A table with a row for each ego, method and intensity. Methods: those that find most preventable failures first,
+    of equals most clean ones, then most that count. Egos: in each traffic, the strongest first, the one with the fewest
+    first. Unknown rates come last."""
     egos = list(dict.fromkeys(row["ego"] for row in rows))
     cells, labels = by_ego(rows, egos)
     several = len(egos) > 1
 
     def rank(key: tuple[str, str]) -> tuple:
-        row, counted = cells[key], cells[key]["metrics"]["cfr_counted"]["mean"]
-        counted = math.inf if math.isnan(counted) else counted if several else -counted
-        return (-row["eta"], labels.index(key[1]), counted) if several else (not row["eta"], counted, row["eta"])
+        row, sign = cells[key], 1 if several else -1
+        means = [row["metrics"].get(name, {}).get("mean", math.nan) for name in KINDS.values()]
+        found = [math.inf if math.isnan(mean) else sign * mean for mean in means]
+        return (-row["eta"], labels.index(key[1]), *found) if several else (not row["eta"], *found, row["eta"])
 
     ranked = sorted(cells, key=rank)
     ego, name = ranked[0]
@@ -168,13 +167,15 @@ def compared(rows: Sequence[dict]) -> list[str]:
     lead = f"{ego} fails most in the traffic of {name}: hit in {of(best, 'cfr')} rollouts"
     if several:
         lead = f"{ego} fails least: it was hit in {of(best, 'cfr')} rollouts {traffic(best)}"
-    lead += f", of which {of(best, 'cfr_counted').partition(' ')[0]} count."
-    table = [["ego", "traffic", "hit", "count", "realism", "count per 1,000 km"]]
-    shown = ("cfr", "cfr_counted", "real", "counted_per_km")
+    kinds = [f"{of(best, metric).partition(' ')[0]} {kind}" for kind, metric in KINDS.items()]
+    lead += f", of them {kinds[0]}, {kinds[1]}; {kinds[2]}."
+    table = [["ego", "traffic", "hit", *KINDS, "realism", "count per 1,000 km"]]
+    shown = ("cfr", *KINDS.values(), "real", "counted_per_km")
     table += [[*key, *(cell(cells[key], metric) for metric in shown)] for key in ranked[:MOST_ROWS]]
     rest = len(ranked) - MOST_ROWS
     more = [f"... and {rest} more in tables.md"] if rest > 0 else []
-    return [*wrapped(lead), *columns(table if several else [line[1:] for line in table]), *more, COUNTS]
+    shown_rows = table if several else [line[1:] for line in table]
+    return [*wrapped(lead), *columns(shown_rows), *more, *wrapped(COUNTS)]
 
 
 # --- weaknesses, and what was measured

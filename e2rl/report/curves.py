@@ -29,11 +29,11 @@ from e2rl.run.files import misfit, write_atomically
 from e2rl.run.run import read_provenance
 from e2rl.sim.rollout_file import UNPRINTABLE
 
-PANELS = (  # (horizontal, vertical): failures over realism, then the share of them that counts
+PANELS = (  # (horizontal, vertical): failures over realism, then what they are worth
     (("real", "cfr"), ("real_adv", "cfr"), ("aor_step", "cfr")),
-    (("cfr", "cfr_counted"), ("cfr", "cfr_preventable"), ("real_adv", "cfr_preventable")),
+    (("cfr", "cfr_preventable"), ("real_adv", "cfr_preventable"), ("cfr", "cfr_counted")),
 )
-COLUMNS = ("cfr", "cfr_counted", "cfr_preventable", "real", "real_adv", "aor_step", "cfr_bg", "nfe")
+COLUMNS = ("cfr", "cfr_preventable", "cfr_clean", "cfr_counted", "real", "real_adv", "aor_step", "cfr_bg", "nfe")
 OURS, NOMINAL = "e2", "nominal"
 APART = (0, 1, 2, 4, 5, 6, 7, 8, 9)  # colours of the cycle for the others: its red is too near to ours
 TABLES_ETA = 2.0  # intensity of the tables

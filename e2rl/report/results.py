@@ -14,6 +14,7 @@ from e2rl.report.curves import points_of_rows, save_curves
 from e2rl.report.drawing import save_figure
 from e2rl.report.html import write_report
 from e2rl.report.picture import intensity_figure, intensity_sweep
+from e2rl.report.policy_figure import NAME as POLICY_FIGURE
 from e2rl.report.policy_figure import policy_figure
 from e2rl.report.tables import Table, metric_tables, mode_tables, print_tables, save_tables
 from e2rl.run.run import Run
@@ -79,6 +80,6 @@ def egos_tables(run: Run, plan: Evaluation, rows: Sequence[dict], text: str) -> 
     if roles is None:
         return tables
     figure = policy_figure(rows, roles.before, roles.after, run.config.synthesizer.name)
-    save_figure(run.folder / "policy_learning.png", figure)
+    save_figure(run.folder / POLICY_FIGURE, figure)
     recorded = recorded_acceleration(plan.scenes)
     return [*tables, guard_table(rows, roles.before, roles.after, roles.planner, recorded)]

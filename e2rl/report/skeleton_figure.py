@@ -2,10 +2,13 @@
 
 Three panels: the times to collision in the reference rollout, when the links of the coalition weigh most; the risk
 graph at that time; the chain when it was chosen, with the paths that were driven after it.
+
+A second figure is the paper's qualitative skeleton: what was driven without and with anchoring, side by side, as times
+to collision and as the chain.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +28,12 @@ from e2rl.run.errors import InputError
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.rollout_file import ROLLOUTS, Rollout, rollout_name
 from e2rl.traffic.e2.skeleton import Selection, chain_depth
+from e2rl.traffic.e2.topology import STRIDE, pair_weights
 from e2rl.traffic.grouping import take_rows
 
 SIDE, GAP, HEAD, FOOT = 600, 12, 62, 34  # points: of a panel, between panels, above and below them
 NODES = 10  # of the matrix at most
+HORIZON = 50  # steps of what was driven, as long as the reference rollout
 MARGIN, SMALLEST, LARGEST = 30.0, 60.0, 140.0  # m: around the coalition, and a map's least and greatest side
 CANDIDATE, FEASIBLE = drawing.VULNERABLE, "#2e8b57"
 ON_TOP = 10  # drawing order of edges, arrows and names, above the map
@@ -60,6 +65,16 @@ class SkeletonPicture:
         self.risky = chosen.reference[0, moment].cpu().numpy()
         self.now = self.rollout.states[self.step]
         self.members = np.flatnonzero(self.coalition).tolist()
+
+    @classmethod
+    def driven(cls, rollout: Rollout, selection: Selection) -> "SkeletonPicture":
+        """The same with what the rollout drove in the five seconds after the choice in place of the reference."""
+        start, count = int(selection.step), min(selection.weights.shape[-1], rollout.states.shape[1])
+        steps = np.arange(start, min(start + HORIZON, len(rollout.states) - 1) + 1, STRIDE)
+        states, valid = (torch.as_tensor(value[steps, :count]) for value in (rollout.states, rollout.valid))
+        weights = pair_weights(states, valid, torch.as_tensor(rollout.size[:count]), selection.settings)
+        moments = torch.as_tensor((steps - start) * rollout.dt)
+        return cls(rollout, replace(selection, reference=states[None], weights=weights[None], moments=moments[None]))
 
     def nodes(self) -> list[int]:
         """Vehicles of the matrix: the ego, the coalition, then those with the heaviest edges."""
@@ -172,11 +187,13 @@ def name(agent: int) -> str:
 @dataclass
 class LongestChain:
     """Keeps a method's selection with the longest chain; ties go to the largest coalition, then to the greatest risk
-    between its members, then to the first. `longest`: that selection, B = 1."""
+    between its members, then to the first. `longest`: that selection, B = 1; `first`: that of those at the start,
+    where all methods are in the same state."""
 
     method: Method
     longest: Selection | None = None
-    rank: tuple[float, ...] = (0, 0, 0)
+    first: Selection | None = None
+    ranks: dict[str, tuple[float, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.method.traffic.on_decision = self
@@ -185,8 +202,10 @@ class LongestChain:
         depth, size = chain_depth(selection.target).amax(1), selection.coalition.sum(1)
         ranks = torch.stack([depth.double(), size.double(), link_risk(selection).amax(1).double()], 1)
         for row, rank in enumerate(map(tuple, ranks.tolist())):
-            if rank > self.rank:
-                self.longest, self.rank = take_rows(selection, torch.tensor([row])), rank
+            for kind in ("longest", *(("first",) if selection.step[row] == 0 else ())):
+                if rank > self.ranks.get(kind, (0, 0, 0)):
+                    setattr(self, kind, take_rows(selection, torch.tensor([row])))
+                    self.ranks[kind] = rank
 
     def figure(self, scenes: SceneSet, ego_name: str, folder: Path) -> Figure:
         """The figure of the longest selection and its rollout, read from a run's folder; InputError if no adversary was
@@ -196,10 +215,34 @@ class LongestChain:
                 f"skeleton: {self.method.name} at eta={self.method.eta:g} chose no adversary in any scene; name e2 "
                 "first in methods, at an eta above 0, and evaluate more scenes, or name one with scene="
             )
-        seed, scene = divmod(int(self.longest.seed), SEEDS_APART)
-        identity = {"method": self.method.name, "ego_policy": ego_name, "eta": self.method.eta}
-        name = rollout_name(identity | {"scene_id": scenes.scene_id[scene], "seed": seed})
-        return SkeletonPicture(Rollout.read(Path(folder) / ROLLOUTS / name), self.longest).figure()
+        return SkeletonPicture(rollout_of(self.longest, self.method, scenes, ego_name, folder), self.longest).figure()
+
+    def beside(self, other: Method, scenes: SceneSet, ego_name: str, folder: Path) -> Figure | None:
+        """The coalition of `first` in the rollouts of another method (left) and of this one: times to collision and
+        chain of each; None where no adversary was chosen at the start."""
+        if self.first is None:
+            return None
+        figure, axes = new_panels(4, SIDE, GAP, HEAD, FOOT)
+        for place, method in enumerate((other, self.method)):
+            picture = SkeletonPicture.driven(rollout_of(self.first, method, scenes, ego_name, folder), self.first)
+            captions = f"{method.name}: TTC {picture.time:.1f} s after the start [s]", "chain, and the paths driven"
+            draws = zip(axes[2 * place :], captions, (picture.matrix, picture.chain), strict=False)
+            for panel, caption, draw in draws:
+                panel.set_title(caption, loc="left", x=8 / SIDE, fontsize=14, color=drawing.MUTED)
+                draw(panel)
+        title = f"{shorten(picture.rollout.scene_id)}   the same coalition under {other.name} and {self.method.name}"
+        figure.suptitle(title, x=0.004, y=0.985, ha="left", fontsize=15, color=drawing.INK)
+        add_legend(figure, LEGEND, 13)
+        return figure
+
+
+def rollout_of(selection: Selection, method: Method, scenes: SceneSet, ego_name: str, folder: Path) -> Rollout:
+    """The rollout under a method in the scene and with the seed of a selection (B = 1), read from a run's folder."""
+    seed, scene = divmod(int(selection.seed), SEEDS_APART)
+    identity = {"method": method.name, "ego_policy": ego_name, "eta": method.eta}
+    return Rollout.read(
+        Path(folder) / ROLLOUTS / rollout_name(identity | {"scene_id": scenes.scene_id[scene], "seed": seed})
+    )
 
 
 def link_risk(selection: Selection) -> Tensor:

@@ -29,7 +29,7 @@ COUNTED = {  # what the count (n) of a stage's cells counts, and how its metrics
 MEANS = "Mean [95% interval, by location or scene]; (n) rollouts where fewer count."
 PAIRED = "[95% interval], paired by (scene, seed); * the interval leaves out 0."
 SYMBOLS = str.maketrans({"–": "--", "−": "$-$", "η": r"$\eta$", "²": "$^2$", "³": "$^3$", "≤": r"$\le$", "≥": r"$\ge$"})
-VERDICTS = {"counted": "counts", "preventable": "preventable", "at_fault": "at fault", "avoidable": "avoidable"}
+VERDICTS = {"preventable": "preventable", "counted": "counts", "at_fault": "at fault", "avoidable": "avoidable"}
 SPEEDS = {"ego_speed": "ego [m/s]", "partner_speed": "partner [m/s]"}
 
 

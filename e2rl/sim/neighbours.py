@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from e2rl.scenes.recording import DT
+from e2rl.sim.static import StaticScene
 from e2rl.sim.world import Agents
 
 
@@ -58,24 +60,51 @@ def separation_in_frame(position: Tensor, direction: Tensor, own: Tensor, half_s
 
 
 STANDING = 0.1  # m/s
+STOOD = round(2.0 / DT)  # steps; who keeps two seconds of distance (UK Highway Code, rule 126) stops behind what stood
+LOOKED = 4  # steps between those that are looked at
 
 
-def own_fault(speed: Tensor, near: Neighbours, hit: Tensor, size: Tensor, half_size: Tensor) -> Tensor:
-    """Bool [B]: the ego overlaps an agent while it moves, and that agent stands or lies across the ego's front edge.
+def standing(
+    tracks: tuple[Tensor, Tensor], row: Tensor, step: Tensor, agent: Tensor, long: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Whether agents [B] of tracks (states [B, T+1, N, 4], presence [B, T+1, N]) move at step [B], and whether they
+    have stood up to it: for STOOD steps, or as long as they are known, if `long` [B], else at it; each [B] bool.
 
-    speed [B] m/s: of the ego before the contact. hit [B, M]: the neighbours that each ego overlaps; the one with the
-    deepest overlap is judged. The edge is that of the least overlap along the ego's axes, which near its corners
-    may differ from the one that touched first. size [B, 2]: length and width of the egos; half_size [B, 2, M]: of the
-    others.
+    row [B, 1]: 0 .. B - 1. Every LOOKED-th step is looked at.
+    """
+    back = torch.arange(0, STOOD + 1, LOOKED, device=step.device) * long[:, None]
+    at = row, (step[:, None] - back).clamp(min=0), agent[:, None]
+    known = tracks[1][at]
+    moves = (tracks[0][..., 3][at].abs() > STANDING) & known
+    return moves[:, 0], known[:, 0] & ~moves.any(1)
+
+
+def own_fault(
+    speed: Tensor, near: Neighbours, hit: Tensor, static: StaticScene, tracks: tuple[Tensor, Tensor], before: Tensor
+) -> Tensor:
+    """Bool [B]: the ego overlaps an agent while it moves, and either that agent has stood (a vehicle: for STOOD steps;
+    another: at all) or it moves and lies across the ego's front edge.
+
+    These are the rules of metrics/verdicts.py but for cut-ins and for an ego that stands across a lane. The edge is
+    that of the least overlap along the ego's axes, which near its corners may differ from the one that touched first.
+
+    Args:
+        speed: [B] m/s, of the ego before the contact.
+        hit: [B, M], the neighbours that each ego overlaps; the one with the deepest overlap is judged.
+        static: sizes, kinds and rows.
+        tracks: of all agents, the ego first; what they did up to the step `before` [B], the one before the contact.
     """
     if hit.shape[1] == 0:
         return hit.any(1)
-    deepest = near.gap.masked_fill(~hit, torch.inf).argmin(1, keepdim=True)
-    pick = deepest[:, None].expand(-1, 2, -1)
-    position, turn, half = (value.gather(2, pick)[..., 0] for value in (near.position, near.direction, half_size))
+    partner = near.gap.masked_fill(~hit, torch.inf).argmin(1)
+    pick = partner[:, None, None].expand(-1, 2, 1)
+    position, turn, half = (
+        value.gather(2, pick)[..., 0] for value in (near.position, near.direction, static.half_size)
+    )
     turn = turn.abs()
     extent = torch.stack([(turn * half).sum(1), (turn.flip(1) * half).sum(1)], 1)
-    ahead, across = (position.abs() - size / 2 - extent).unbind(1)
+    ahead, across = (position.abs() - static.size / 2 - extent).unbind(1)
     front = (position[:, 0] > 0) & (ahead > across)
-    stands = near.agents.states[..., 3].gather(1, deepest)[:, 0].abs() <= STANDING
-    return hit.any(1) & (speed.abs() > STANDING) & (front | stands)
+    vehicle = static.vehicle.gather(1, partner[:, None])[:, 0]
+    moves, stood = standing(tracks, static.row, before, partner + 1, vehicle)
+    return hit.any(1) & (speed.abs() > STANDING) & (stood | (front & moves))

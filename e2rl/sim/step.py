@@ -84,7 +84,7 @@ def step(
     off_road = off & ego.been_on_road & present
     gone = ~present | (pose.s >= static.mission.end)
     touched = contact | contact_vru
-    fault = own_fault(ego.state[:, 3], seen.neighbours, hit, static.size, static.half_size)
+    fault = own_fault(ego.state[:, 3], seen.neighbours, hit, static, tracks, ego.step)
     progress = rewarded_progress(pose.s - ego.pose.s, seen.limit, static.top_speed)
     terms = reward_terms(progress, touched, fault, off_road, action, ego.action, state[:, 3], seen.limit, pose.d)
     outcome = {

@@ -47,10 +47,10 @@ def test_modes_have_counts_fractions_by_method_and_verdicts(tmp_path):
 def test_the_table_has_a_row_for_each_mode_and_says_what_is_missing():
     (table,) = mode_tables(find_modes(run_rows()))
     assert table.head[:5] == ["", "failures", "e2 η=2 [%]", "random η=2 [%]", "nominal [%]"]
-    assert table.head[5:] == ["counts [%]", "preventable [%]", "at fault [%]", "ego [m/s]", "partner [m/s]"]
+    assert table.head[5:] == ["preventable [%]", "counts [%]", "at fault [%]", "ego [m/s]", "partner [m/s]"]
     first, second, last = table.rows
-    assert first[0].startswith("1. crossing") and first[1:6] == ["8", "100", "33", "–", "75"]
-    assert second[1:] == ["4", "0", "67", "–", "100", "0", "100", "10.0", "5.0"]
+    assert first[0].startswith("1. crossing") and first[1:7] == ["8", "100", "33", "–", "100", "75"]
+    assert second[1:] == ["4", "0", "67", "–", "0", "100", "100", "10.0", "5.0"]
     assert last[1:5] == ["12", "6 in 1 mode", "6 in 2 modes", "0 in 0 modes"]
     assert "without duty" in table.caption and "avoidable" in table.caption
 

@@ -104,8 +104,8 @@ def test_the_limits_of_an_attack_belong_to_it():
     assert wide.judge(metrics | {"errored": 0.045, "errored nominal": 0.025}, {})[1] == pytest.approx(0.01)
     assert AttackObjective(realism=0.9, off_road=1.0).judge(metrics, {})[1] == pytest.approx(0.2)
     assert AttackObjective(realism=0.9, off_road=1.0).judge(metrics | {"real_adv": math.nan}, {})[1] == 0
-    assert math.isinf(AttackObjective().judge(metrics | {"cfr": math.nan}, {})[1])
-    assert [AttackObjective(seek).judge(metrics, {})[0] for seek in SOUGHT] == pytest.approx([-0.3, -0.15, 0.0])
+    assert math.isinf(AttackObjective().judge(metrics | {"cfr_preventable": math.nan}, {})[1])
+    assert [AttackObjective(seek).judge(metrics, {})[0] for seek in SOUGHT] == pytest.approx([0.0, 0.0, -0.15, -0.3])
 
 
 @pytest.fixture(scope="module")

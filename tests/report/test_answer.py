@@ -17,6 +17,7 @@ def row(method="nominal", eta=0.0, ego="lane_graph", cfr=0.0, n=12):
     """A row of metrics.json in which every collision counts and is the ego's fault."""
     hits = round(cfr * n)
     metrics = {"cfr": value(cfr, n), "cfr_counted": value(cfr, n), "counted_per_km": value(cfr / 0.05, n)}
+    metrics |= {"cfr_preventable": value(cfr / 3, n), "cfr_clean": value(cfr / 3, n)}
     metrics |= {"counted": value(1.0 if hits else NAN, hits), "at_fault": value(1.0 if hits else NAN, hits)}
     metrics |= {"preventable": value(1 / 3 if hits else NAN, hits), "real": value(0.9), "real_adv": value(NAN, 0)}
     metrics |= {"aor_step": value(0.01), "cfr_bg": value(0.0), "progress": value(50.0)}
@@ -36,9 +37,12 @@ def test_an_attack_is_told_with_its_numbers_and_the_weaknesses_that_count():
     attack["metrics"]["cfr"] = value(0.25, 12, 0.055, 0.572)
     attack["paired"] = {"nominal": {"cfr": {"difference": 0.17, "low": 0.02, "high": 0.31, "n": 12}}}
     text = " ".join(" ".join(answer_lines([row(cfr=1 / 12), attack], MODES)).split())
-    for part in ("3 of 12 attacked rollouts (25%, 95% interval 5.5 to 57%), 1 of 12 nominal", "ego was at fault (3)"):
+    for part in (
+        "3 of 12 attacked rollouts (25%, 95% interval 5.5 to 57%), 1 of 12 nominal",
+        "prevented 1 of the 3 (1 ",
+    ):
         assert part in text
-    for part in ("would have prevented it (1)", "5,000 attacked, 1,667 nominal", "(95% interval +2 to +31)"):
+    for part in ("the ego was at fault in 3. So 3 count.", "5,000 attacked, 1,667 nominal", "(95% interval +2 to +31)"):
         assert part in text
     assert "1. oncoming (2 of 8 failures, 2 count)" in text and "rear (" not in text and "other (" not in text
     assert "4 rollouts without a score" in text
@@ -47,6 +51,7 @@ def test_an_attack_is_told_with_its_numbers_and_the_weaknesses_that_count():
 def test_methods_stand_by_what_they_find_and_egos_by_how_little():
     lines = answer_lines([row(), row("a", 1.0, cfr=1 / 4), row("b", 1.0, cfr=1 / 2)])
     assert [line.split()[0] for line in lines if " of 12)" in line] == ["b", "a", "nominal"]
+    assert lines[0].startswith("lane_graph fails most in the traffic of b η=1: hit in 6 of 12 rollouts")
     lines = answer_lines([row("e2", 2.0, ego, cfr=cfr) for ego, cfr in (("idm", 0.5), ("actor", 0.25))])
     assert [line.split()[0] for line in lines if " of 12)" in line] == ["actor", "idm"]
 
@@ -69,3 +74,13 @@ def test_it_fits_whatever_it_is_told(tmp_path, monkeypatch, width):
     for lines in (*answers, compared_answer(pairs, pairs, tmp_path)):
         assert len(lines) <= LINES and all(len(line) <= width for line in lines if str(tmp_path) not in line)
         assert lines[-1].endswith("tables.md"), "where everything lies is never cut"
+
+
+def test_preventable_failures_decide_then_clean_ones_then_those_that_count():
+    rates = {"hits": 0.75, "clean": 0.5, "same": 0.5, "few": 0.25}
+    rows = [row(name, 1.0, cfr=cfr) for name, cfr in rates.items()]
+    for each, preventable, clean in zip(rows, (1, 4, 4, 3), (1, 2, 1, 3), strict=True):
+        each["metrics"] |= {"cfr_preventable": value(preventable / 12), "cfr_clean": value(clean / 12)}
+    lines = answer_lines(rows)
+    assert [line.split()[0] for line in lines if " of 12)" in line] == ["clean", "same", "few", "hits"]
+    assert "rollouts, of them 4 preventable, 2 clean; 6 count." in " ".join(lines[:2])

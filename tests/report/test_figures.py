@@ -61,6 +61,14 @@ def test_the_moment_is_that_of_the_greatest_risk_of_the_links_and_times_are_thos
         assert shown.ttc(weight) == pytest.approx(ttc)
 
 
+def test_what_was_driven_takes_the_place_of_the_reference(shown):
+    driven = SkeletonPicture.driven(shown.rollout, shown.selection)
+    steps = 5 * torch.arange(driven.selection.weights.shape[1])
+    torch.testing.assert_close(driven.selection.moments[0].float(), 0.1 * steps)
+    np.testing.assert_array_equal(driven.selection.reference[0], shown.rollout.states[steps])
+    assert driven.risky[0, 0] == pytest.approx(10 * driven.time), "the ego drives 10 m/s along x"
+
+
 def test_vehicles_have_the_colour_of_their_part(shown):
     assert [shown.colour(agent) for agent in (0, 1, 3)] == [drawing.EGO, drawing.ADVERSARY, drawing.VULNERABLE]
 

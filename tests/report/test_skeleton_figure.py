@@ -32,6 +32,10 @@ def test_links_then_members_then_risk_decide_and_the_first_of_equals_stays():
     ):
         chain(given)
         assert chain.longest.seed.tolist() == [seed] and len(chain.longest.target) == 1
+    later = selection([-1, 0, 1, 2], seed=50)
+    later.step.fill_(5)
+    chain(later)
+    assert (int(chain.longest.seed), int(chain.first.seed)) == (50, 31), "what other methods share is the start"
 
 
 def test_the_risk_of_links_is_that_of_each_member_with_its_target():

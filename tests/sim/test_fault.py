@@ -1,23 +1,29 @@
-"""A contact is of the ego's own making where it moves and its front, or a standing agent, is hit."""
+"""A contact is of the ego's own making where it moves and its front, or an agent that has stood, is hit."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from e2rl.sim.neighbours import neighbours_of, own_fault, rotation_into
+from e2rl.sim.neighbours import STOOD, neighbours_of, own_fault, rotation_into
 from e2rl.sim.world import Agents
 
 SIZE = torch.tensor([[4.0, 2.0]])
 
 
-def judged(ego, others):
-    """Of egos [B, 4] among agents [B, M, 4], all of one size."""
-    half = SIZE.T[None].expand(len(ego), 2, others.shape[1]) / 2
-    still = torch.zeros(others.shape[:2])
-    agents = Agents(others, still == 0, still, still)
-    near = neighbours_of(ego, rotation_into(ego), SIZE.expand(len(ego), 2), half, agents)
-    return own_fault(ego[:, 3], near, near.gap < 0, SIZE.expand(len(ego), 2), half)
+def judged(ego, others, since=0, vehicle=True, steps=40):
+    """Of egos [B, 4] among agents [B, M, 4], all of one size; the first of them have had their speed since a step."""
+    count, agents = others.shape[:2]
+    half = SIZE.T[None].expand(count, 2, agents) / 2
+    still = torch.zeros(count, agents)
+    near = neighbours_of(ego, rotation_into(ego), SIZE.expand(count, 2), half, Agents(others, still == 0, still, still))
+    states = torch.cat([ego[:, None], others], 1)[:, None].repeat(1, steps + 1, 1, 1)
+    states[:, :since, 1:2, 3] = 6.0
+    tracks = states, torch.ones_like(states[..., 0], dtype=torch.bool)
+    static = SimpleNamespace(size=SIZE.expand(count, 2), half_size=half, vehicle=torch.full((count, agents), vehicle))
+    static.row = torch.arange(count)[:, None]
+    return own_fault(ego[:, 3], near, near.gap < 0, static, tracks, torch.full((count,), steps)).tolist()
 
 
 @pytest.mark.parametrize(
@@ -37,8 +43,27 @@ def test_own_fault_by_place_and_speed(place, speed, other_speed, expected):
         there = torch.tensor([[cos, -sin], [sin, cos]]) @ torch.tensor(place) + torch.tensor([10.0, -5.0])
         ego = torch.tensor([[10.0, -5.0, heading, speed]])
         others = torch.tensor([[[*there.tolist(), heading, other_speed], [60.0, 60.0, 0.0, 5.0]]])
-        assert judged(ego, others).tolist() == [expected]
+        assert judged(ego, others) == [expected]
+
+
+@pytest.mark.parametrize(
+    ("since", "vehicle", "expected"),
+    [
+        (40 - STOOD, True, True),  # for two seconds
+        (41 - STOOD, True, False),  # a step less
+        (40, True, False),  # it has just stopped, as one that swerves in and stops
+        (40, False, True),  # a pedestrian has just stopped
+    ],
+)
+def test_what_the_front_hits_must_have_stood(since, vehicle, expected):
+    ego, others = torch.tensor([[0.0, 0.0, 0.0, 5.0]]), torch.tensor([[[3.8, 0.0, 0.0, 0.0]]])
+    assert judged(ego, others, since, vehicle) == [expected]
+
+
+def test_who_stands_since_the_start_has_stood():
+    ego, others = torch.tensor([[0.0, 0.0, 0.0, 5.0]]), torch.tensor([[[3.8, 0.0, 0.0, 0.0]]])
+    assert judged(ego, others, steps=3) == [True] and judged(ego, others, since=1, steps=3) == [False]
 
 
 def test_no_other_agent_no_fault():
-    assert judged(torch.tensor([[0.0, 0.0, 0.0, 5.0]]), torch.zeros(1, 0, 4)).tolist() == [False]
+    assert judged(torch.tensor([[0.0, 0.0, 0.0, 5.0]]), torch.zeros(1, 0, 4)) == [False]
