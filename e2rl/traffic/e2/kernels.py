@@ -31,6 +31,7 @@ from e2rl.traffic.e2.motion import smallest
 SPREAD = (0.85, 0.53, 0.51, 0.51, 0.52, 0.54, 0.57, 0.60, 0.63, 0.71, 1.02, 0.89)
 CORRELATION = 0.57
 ACCELERATIONS = (-3.0, -2.0, -1.2, -0.6, 0.0, 0.6, 1.2, 2.0)  # m/s^2, from the prior's mean
+ONSET = (0.4, 0.8)  # of such an acceleration at the first knots: a jump is what drivers do not do
 OFFSETS = (0.8, 1.6, 2.5, 3.5, 4.5)  # m, to either side of it, after the lateral horizon
 EARLY = 0.5  # of the way across that half of the kernels have come sooner, at half of the horizon
 REACH, ASIDE, NEAREST = 60.0, 10.0, 10  # m from the ego, m from its way, of vehicles that have kernels; how many
@@ -83,7 +84,9 @@ def shifts(device: torch.device) -> Tensor:
     sides = [(0.0, 0.0), *((sign * side, early) for side in OFFSETS for sign in (1, -1) for early in (0.0, EARLY))]
     moves = torch.tensor([(a, *side) for side in sides for a in sorted(ACCELERATIONS, key=abs)], device=device)
     bend = moves[:, 1:2] * moves[:, 2:] / (2 * BEND_SCALE)
-    return torch.cat([moves[:, :1].expand(-1, KNOTS), bend, moves[:, 1:2] / OFFSET_SCALE], 1)
+    ramp = torch.tensor(ONSET, device=device)
+    ramp = torch.nn.functional.pad(ramp, (0, KNOTS - len(ramp)), value=1.0)
+    return torch.cat([moves[:, :1] * ramp, bend, moves[:, 1:2] / OFFSET_SCALE], 1)
 
 
 def nats(shift: Tensor) -> Tensor:
