@@ -14,10 +14,10 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from e2rl.learning.cloning import (
     FEATURE_NOISE,
     LAST_ACTION_NOISE,
-    cloning_loss,
+    CloningLoss,
+    TeachingLoss,
     drawn,
     mirrored_demonstrations,
-    teaching_loss,
 )
 from e2rl.learning.supervised import take_step
 from e2rl.planners.network import ActorCritic, ActorNetwork
@@ -71,7 +71,9 @@ class Learner:
             entropy_coeff=settings.entropy,
             critic_coeff=CRITIC,
             normalize_advantage=False,
+            functional=False,
         )
+        self.cloning, self.teaching = CloningLoss(network.actor), TeachingLoss(network.network)
         self.optimiser = torch.optim.Adam(network.parameters(), settings.learning_rate)
 
     def update(
@@ -185,12 +187,12 @@ class Learner:
         if experts and settings.cloning > 0 and not warming:
             shown = drawn(experts, CLONED).to(self.network.device)
             with self.network.network.noisy(FEATURE_NOISE, LAST_ACTION_NOISE):
-                losses["loss_cloning"] = cloning_loss(self.network.actor, shown)
+                losses |= self.cloning(shown).items()
             total = total + settings.cloning * losses["loss_cloning"]
         if labels is not None and settings.teaching > 0 and not warming:
             shown = drawn([labels], CLONED).to(self.network.device)
             shown = torch.cat([mirrored_demonstrations(shown[::2]), shown[1::2]])  # it holds for both sides
-            losses["loss_teaching"] = teaching_loss(self.network.network, shown)
+            losses |= self.teaching(shown).items()
             total = total + settings.teaching * losses["loss_teaching"]
         take_step(self.optimiser, total, MAX_GRAD_NORM)
         return {name: value.detach().mean() for name, value in losses.items()}
