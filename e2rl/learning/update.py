@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import ReplayBuffer, SamplerWithoutReplacement, TensorStorage
 from torchrl.modules import PopArtValueNorm
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
@@ -96,10 +97,12 @@ class Learner:
         warming = self.updates < settings.critic_warmup
         flat = self._with_advantages(data, 0.0 if warming else settings.advantage_filter)
         self.optimiser.param_groups[0]["lr"] = rate = self._learning_rate()
+        storage, sampler = TensorStorage(flat, device="auto"), SamplerWithoutReplacement()
+        minibatches = ReplayBuffer(storage=storage, sampler=sampler, batch_size=settings.minibatch)
         for _ in range(settings.epochs):
             moved = []
-            for index in torch.randperm(len(flat), device=flat.device).split(settings.minibatch):
-                losses = self._step(flat[index], experts, labels, warming)
+            for minibatch in minibatches:  # every frame once
+                losses = self._step(minibatch, experts, labels, warming)
                 moved.append(losses["kl"])
                 for name, value in losses.items():
                     sums[name].append(value)
