@@ -10,11 +10,13 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.modules import ProbabilisticActor
+from torchrl.objectives import LossModule
 
 from e2rl.planners.network import ActorNetwork
 from e2rl.sim.env import DrivingEnv
 from e2rl.sim.observation import mirrored
 
+LABELLED = ("observation", "action", "weight")
 LABEL_WIDTH = (0.25, 0.12)  # of acceleration and yaw rate, in halves of the action's range
 EXPERT_RANGE = 0.99  # expert actions are clipped to this fraction of the bounds, where the squashed density is infinite
 FEATURE_NOISE = 0.3  # standard deviation of noise on the network's normalised input while cloning
@@ -46,29 +48,50 @@ def demonstrations_of(
     return TensorDict(found, batch_size=[len(scene)]).cpu()
 
 
-def cloning_loss(actor: ProbabilisticActor, shown: TensorDictBase) -> Tensor:
-    """Cross-entropy [] of the actor's density under the labels of demonstrations [M]: the mean of
-    -sum_c w_c log pi(a_c | o).
+class CloningLoss(LossModule):
+    """Cross-entropy "loss_cloning" [] of an actor's density under the labels of demonstrations [M]: the mean of
+    -sum_c w_c log pi(a_c | o), where `BCLoss` takes one label.
 
     Its gradient is the weighted mean of the gradients of the single actions. A squashed Gaussian has one mode: at the
     minimum its mean before squashing is the weighted mean of the actions there, and its variance theirs.
     """
-    density = actor.get_dist(shown.select("observation"))
-    likelihood = density.log_prob(shown["action"].transpose(0, 1)).transpose(0, 1)
-    return -(shown["weight"] * likelihood).sum(1).mean()
+
+    in_keys, out_keys, functional = [*LABELLED], ["loss_cloning"], False
+
+    def __init__(self, actor: ProbabilisticActor) -> None:
+        super().__init__()
+        self.actor = actor
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The loss on demonstrations [M]."""
+        density = self.actor.get_dist(tensordict.select("observation"))
+        likelihood = density.log_prob(tensordict["action"].transpose(0, 1)).transpose(0, 1)
+        return TensorDict({"loss_cloning": -(tensordict["weight"] * likelihood).sum(1).mean()})
 
 
-def teaching_loss(network: ActorNetwork, shown: TensorDictBase) -> Tensor:
-    """Mean [] of -log sum_c w_c exp(-|a_c - a(o)|^2 / 2), distances in units of LABEL_WIDTH, of the most central
-    actions a(o) under the labels of demonstrations [M]: least where a(o) is near one label that much speaks for.
+class TeachingLoss(LossModule):
+    """Mean "loss_teaching" [] of -log sum_c w_c exp(-|a_c - a(o)|^2 / 2), distances in units of LABEL_WIDTH, of the
+    most central actions a(o) under the labels of demonstrations [M]: least where a(o) is near one label that much
+    speaks for.
 
-    Ways out differ: the mean of one to the left and one to the right is none. `cloning_loss` has such means, and fits
+    Ways out differ: the mean of one to the left and one to the right is none. `CloningLoss` has such means, and fits
     the actor's own deviation too: late in a training, when that is a tenth, its gradient is a hundred times as large as
     early, and it widens the exploration.
     """
-    width = network.reach * network.reach.new_tensor(LABEL_WIDTH)
-    apart = (shown["action"] - network.deterministic(shown["observation"])[:, None]) / width
-    return -(shown["weight"].log() - apart.square().sum(-1) / 2).logsumexp(1).mean()
+
+    in_keys, out_keys, functional = [*LABELLED], ["loss_teaching"], False
+
+    def __init__(self, network: ActorNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The loss on demonstrations [M]."""
+        width = self.network.reach * self.network.reach.new_tensor(LABEL_WIDTH)
+        central = self.network.deterministic(tensordict["observation"])
+        apart = (tensordict["action"] - central[:, None]) / width
+        likelihood = (tensordict["weight"].log() - apart.square().sum(-1) / 2).logsumexp(1)
+        return TensorDict({"loss_teaching": -likelihood.mean()})
 
 
 def mirrored_demonstrations(shown: TensorDictBase) -> TensorDict:

@@ -17,7 +17,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from e2rl.evaluation.methods import build_ego, build_sim
-from e2rl.learning.cloning import FEATURE_NOISE, LAST_ACTION_NOISE, cloning_loss, demonstrations_of
+from e2rl.learning.cloning import FEATURE_NOISE, LAST_ACTION_NOISE, CloningLoss, demonstrations_of
 from e2rl.learning.driving import Disturbance, PoolDriver, filled_batches
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.supervised import Epochs, stage_settings
@@ -94,11 +94,12 @@ class Imitation(Epochs):
     def __init__(self, network: ActorCritic, shown: TensorDictBase, settings: ImitationSettings) -> None:
         shown = shown.select("observation", "action", "weight", "scene_index")
         super().__init__(network, shown, settings, network.network, WEIGHT_DECAY)
+        self.cloning = CloningLoss(network.actor)
 
     def loss(self, batch: TensorDictBase) -> Tensor:
         """The cloning loss [] under noise on the input."""
         with self.network.network.noisy(FEATURE_NOISE, LAST_ACTION_NOISE):
-            return cloning_loss(self.network.actor, batch)
+            return self.cloning(batch)["loss_cloning"]
 
     @torch.no_grad()
     def measure(self, data: TensorDictBase) -> dict[str, float]:
@@ -107,7 +108,7 @@ class Imitation(Epochs):
         reach = (self.network.high - self.network.low) / 2
         central = self.network.network.deterministic(data["observation"])
         miss = ((central[:, None] - data["action"]).abs() / reach).mean(-1)
-        loss = cloning_loss(self.network.actor, data).item()
+        loss = self.cloning(data)["loss_cloning"].item()
         return {"loss": loss, "miss": (miss * data["weight"]).sum(1).mean().item()}
 
     def turn(self) -> dict[str, float]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import ReplayBuffer, SamplerWithoutReplacement, TensorStorage
 from torchrl.modules import PopArtValueNorm
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
@@ -14,10 +15,10 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from e2rl.learning.cloning import (
     FEATURE_NOISE,
     LAST_ACTION_NOISE,
-    cloning_loss,
+    CloningLoss,
+    TeachingLoss,
     drawn,
     mirrored_demonstrations,
-    teaching_loss,
 )
 from e2rl.learning.supervised import take_step
 from e2rl.planners.network import ActorCritic, ActorNetwork
@@ -71,7 +72,9 @@ class Learner:
             entropy_coeff=settings.entropy,
             critic_coeff=CRITIC,
             normalize_advantage=False,
+            functional=False,
         )
+        self.cloning, self.teaching = CloningLoss(network.actor), TeachingLoss(network.network)
         self.optimiser = torch.optim.Adam(network.parameters(), settings.learning_rate)
 
     def update(
@@ -94,10 +97,12 @@ class Learner:
         warming = self.updates < settings.critic_warmup
         flat = self._with_advantages(data, 0.0 if warming else settings.advantage_filter)
         self.optimiser.param_groups[0]["lr"] = rate = self._learning_rate()
+        storage, sampler = TensorStorage(flat, device="auto"), SamplerWithoutReplacement()
+        minibatches = ReplayBuffer(storage=storage, sampler=sampler, batch_size=settings.minibatch)
         for _ in range(settings.epochs):
             moved = []
-            for index in torch.randperm(len(flat), device=flat.device).split(settings.minibatch):
-                losses = self._step(flat[index], experts, labels, warming)
+            for minibatch in minibatches:  # every frame once
+                losses = self._step(minibatch, experts, labels, warming)
                 moved.append(losses["kl"])
                 for name, value in losses.items():
                     sums[name].append(value)
@@ -185,12 +190,12 @@ class Learner:
         if experts and settings.cloning > 0 and not warming:
             shown = drawn(experts, CLONED).to(self.network.device)
             with self.network.network.noisy(FEATURE_NOISE, LAST_ACTION_NOISE):
-                losses["loss_cloning"] = cloning_loss(self.network.actor, shown)
+                losses |= self.cloning(shown).items()
             total = total + settings.cloning * losses["loss_cloning"]
         if labels is not None and settings.teaching > 0 and not warming:
             shown = drawn([labels], CLONED).to(self.network.device)
             shown = torch.cat([mirrored_demonstrations(shown[::2]), shown[1::2]])  # it holds for both sides
-            losses["loss_teaching"] = teaching_loss(self.network.network, shown)
+            losses |= self.teaching(shown).items()
             total = total + settings.teaching * losses["loss_teaching"]
         take_step(self.optimiser, total, MAX_GRAD_NORM)
         return {name: value.detach().mean() for name, value in losses.items()}

@@ -54,7 +54,9 @@ class DrivingEnv(EnvBase):
 
     An episode terminates at contact and off the road (settings). It is truncated after the scenes' T steps or when the
     ego leaves the scene. A reset takes the scenes "scene_index" [B, 1] of its input; without this key it draws them
-    uniformly (`set_seed`). The traffic is that of `set_traffic`, by default the recording.
+    uniformly. The traffic is that of `set_traffic`, by default the recording.
+
+    `set_seed` seeds the draws, those of transforms among them: it decides the episodes from the next reset on.
 
     With hold > 1 a step of the environment is so many steps of 0.1 s with the same action: rewards are summed, and an
     episode that ends in between stays at that moment. `timestep` and T count steps of 0.1 s.
@@ -69,6 +71,8 @@ class DrivingEnv(EnvBase):
         super().__init__(device=device, batch_size=[batch_size])
         self.scenes, self.settings, self.agents, self.hold = scenes, settings, agents, hold
         self._generator = torch.Generator()
+        self.generators = {self._generator}
+        """All that episodes are drawn with: `set_seed` seeds them alike. A transform adds its own."""
         self.scene = scenes.batch(torch.zeros(batch_size, dtype=torch.long)).to(device)
         """The running scenes, in one storage for the environment's lifetime: a reset overwrites its rows."""
         self.horizon = self.scene["logged"].shape[1] - 1
@@ -118,7 +122,8 @@ class DrivingEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
-            self._generator.manual_seed(seed)
+            for generator in self.generators:
+                generator.manual_seed(seed)
 
     def set_traffic(self, rows: Tensor, states: Tensor, valid: Tensor) -> None:
         """Set the traffic of environments rows [b] int64 from their next reset on, instead of the recording.

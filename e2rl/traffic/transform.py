@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import Transform
+from torchrl.envs import EnvBase, Transform
 
 from e2rl.planners.ego import Ego
 from e2rl.prior.lane_relative import HORIZON
@@ -41,8 +41,8 @@ class AdversarialSynthesizer(Transform):
         ego: Ego | None = None,
         reaction: Reaiming | None = None,
     ) -> None:
-        """traffic: drives LIVE rows; ego: the ego that a method with `queries_ego` queries; reaction: None, nobody
-        leaves replayed traffic."""
+        """draw: `env.set_seed` seeds its `generator`, if it has one; traffic: drives LIVE rows; ego: the ego that a
+        method with `queries_ego` queries; reaction: None, nobody leaves replayed traffic."""
         super().__init__()
         self.pool, self.draw, self.traffic, self.ego, self.reaction = pool, draw, traffic, ego, reaction
         self.on_plan: Callable[[TrafficPlan], None] | None = None  # called with every new plan
@@ -52,6 +52,13 @@ class AdversarialSynthesizer(Transform):
         self._state: State = None
         self._plan = torch.zeros(0)  # [B, V, HORIZON, 4] the plans being driven
         self._planned_at = nothing  # [B] step of the last replan, per environment
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Let the environment's `set_seed`, which passes transforms over, reach the draws and the reaction."""
+        super().set_container(container)
+        if self.parent is not None:  # a Compose may have no environment yet
+            found = (getattr(part, "generator", None) for part in (self.draw, self.reaction))
+            self._env.generators.update(each for each in found if each is not None)
 
     @property
     def _env(self) -> DrivingEnv:

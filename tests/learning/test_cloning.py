@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import BCLoss
 
-from e2rl.learning.cloning import cloning_loss, drawn, teaching_loss
+from e2rl.learning.cloning import CloningLoss, TeachingLoss, drawn
 from e2rl.planners.actor import ActorEgo
 from e2rl.sim.observation import OBSERVATION_SIZE
 
@@ -27,7 +27,7 @@ def shown(action, weight):
 
 def gradient(actor, given):
     """The loss and its gradient by all parameters."""
-    loss = cloning_loss(actor.actor, given)
+    loss = CloningLoss(actor.actor)(given)["loss_cloning"]
     parts = torch.autograd.grad(loss, list(actor.network.parameters()))
     return loss.detach(), torch.cat([part.flatten() for part in parts])
 
@@ -35,7 +35,8 @@ def gradient(actor, given):
 def test_one_label_is_the_hard_loss():
     actor, given = network(), shown([[-3.0, 0.2]], [1.0])
     hard = TensorDict({"observation": given["observation"], "action": given["action"][:, 0]}, [5])
-    torch.testing.assert_close(cloning_loss(actor.actor, given), BCLoss(actor.actor)(hard)["loss_bc"])
+    soft = CloningLoss(actor.actor)(given)["loss_cloning"]
+    torch.testing.assert_close(soft, BCLoss(actor.actor)(hard)["loss_bc"])
 
 
 def test_loss_and_gradient_are_the_weighted_means_of_those_of_the_labels():
@@ -64,11 +65,12 @@ def test_the_teaching_loss_is_that_of_a_mixture_round_the_labels():
     away = given["action"] - policy.deterministic(given["observation"])[:, None]
     away = away / (policy.reach * torch.tensor([0.25, 0.12]))
     likelihood = (torch.tensor(weights) * torch.exp(-away.square().sum(-1) / 2)).sum(1)
-    torch.testing.assert_close(teaching_loss(policy, given), -likelihood.log().mean())
+    torch.testing.assert_close(TeachingLoss(policy)(given)["loss_teaching"], -likelihood.log().mean())
 
 
 def test_teaching_leaves_the_explorations_width_alone():
     policy = network().network
-    loss = teaching_loss(policy, shown([[-3.0, 0.2], [1.0, -0.4]], [1.0, 0.0]))  # a weight of 0 fills up
+    given = shown([[-3.0, 0.2], [1.0, -0.4]], [1.0, 0.0])  # a weight of 0 fills up
+    loss = TeachingLoss(policy)(given)["loss_teaching"]
     assert torch.autograd.grad(loss, policy.spread, allow_unused=True, retain_graph=True) == (None,)
     assert all(part.isfinite().all() for part in torch.autograd.grad(loss, list(policy.trunk.parameters())))

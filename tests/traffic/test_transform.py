@@ -3,13 +3,15 @@
 import pytest
 import torch
 from torchrl.collectors import Collector
-from torchrl.envs import TransformedEnv
+from torchrl.envs import Compose, ParallelEnv, RewardSum, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from e2rl.learning.policy import RowDraw
 from e2rl.planners.ego import EgoPolicy
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.traffic.e2.reaiming import ReactSettings, Reaiming
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import Traffic, TrafficPlan, keep_velocity
 from e2rl.traffic.transform import AdversarialSynthesizer
@@ -88,6 +90,64 @@ def test_the_specs_hold(traffic):
     scene_set = scenes(3)
     pool = replayed(scene_set) if traffic is None else mixed(scene_set)
     check_env_specs(environment(pool, traffic, batch=6, scene_set=scene_set), seed=0)
+
+
+# --- seeds
+
+
+def random_environment(own=0, traffic=None):
+    """Draws and reactions by generators of their own, which begin with seed `own`."""
+    scene_set = scenes(3, 10)
+    pool = replayed(scene_set) if traffic is None else mixed(scene_set)
+    draw = RowDraw(torch.ones(len(pool)).double(), own)
+    reaction = Reaiming(ReactSettings(fraction=1.0, scatter=1.0), own)
+    base = DrivingEnv(scene_set, ON, 4, agents=True)
+    return TransformedEnv(base, Compose(AdversarialSynthesizer(pool, draw, traffic, None, reaction), RewardSum()))
+
+
+def same(first, second):
+    """What episodes are, bit for bit."""
+    keys = sorted(first.keys(True, True), key=str)
+    assert keys == sorted(second.keys(True, True), key=str) and ("next", "agents", "states") in keys
+    return all(torch.equal(first[key], second[key]) for key in keys)
+
+
+@pytest.mark.parametrize("traffic", [None, March()], ids=["replay", "live"])
+def test_a_seed_decides_the_episodes(traffic):
+    """Of two environments alike, and of one that has driven already."""
+
+    def episodes(env, seed):
+        env.set_seed(seed)
+        return env.rollout(25, still, break_when_any_done=False)
+
+    first, second = random_environment(0, traffic), random_environment(1, traffic)
+    once = episodes(first, 3)
+    assert same(once, episodes(second, 3)) and same(once, episodes(first, 3))
+    assert not torch.equal(once["traffic", "row"], episodes(first, 4)["traffic", "row"])
+
+
+def collected(kind, own, seed):
+    """The first batch of a collector, of one environment or of two in `kind`."""
+    env = random_environment(own) if kind is None else kind(2, random_environment, create_env_kwargs={"own": own})
+    collector = Collector(env, frames_per_batch=160, total_frames=-1, auto_register_policy_transforms=False)
+    torch.manual_seed(0)  # of the random actions
+    collector.set_seed(seed)
+    collector.reset()  # it has begun episodes when it was made
+    batch = next(iter(collector)).clone()
+    collector.shutdown()
+    return batch
+
+
+@pytest.mark.parametrize("kind", [None, SerialEnv])
+def test_a_seed_decides_what_a_collector_collects(kind):
+    once = collected(kind, 0, 3)
+    assert same(once, collected(kind, 1, 3))
+    assert not torch.equal(once["traffic", "row"], collected(kind, 0, 4)["traffic", "row"])
+
+
+@pytest.mark.slow
+def test_a_seed_decides_the_episodes_of_processes():
+    assert same(collected(ParallelEnv, 0, 3), collected(SerialEnv, 1, 3))
 
 
 # --- live rows
