@@ -109,7 +109,7 @@ class CCDiff(MeanGuided):
     margin: float = setting(low=0)
     off_road: float = setting()
 
-    tuned = {"gain": (0.05, 4.0, "log"), "step_size": (0.03, 3.0, "log")}
+    tuned = {"gain": (0.1, 40.0, "log"), "step_size": (0.03, 3.0, "log")}
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> CCDiffState:
         """Returns states of scenes [B] with their top vehicles, whose routes are the prior's; others' are recorded."""
