@@ -8,7 +8,7 @@ import torch
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.sim.env import SimSettings
 from e2rl.sim.world import World
-from e2rl.traffic.e2 import e2
+from e2rl.traffic.e2 import coalition
 from e2rl.traffic.rollout import synthesize_traffic
 from e2rl.traffic.traffic import FULL, PAIR, SINGLE
 from tests.traffic.e2.traffic_scenes import EGO, begin, replanned, scenes, synthesizer
@@ -40,7 +40,7 @@ def test_a_chain_over_a_pruned_member_is_pruned(monkeypatch):
     on, scene = synthesizer(), scenes(1).scenes
     target = torch.tensor([[-1, 0, 1, 0, 2, -1]])  # the rows in use
     acts = target >= 0
-    build, propose = e2.build_skeleton, e2.propose
+    build, propose = coalition.build_skeleton, coalition.propose
 
     def chained(*arguments):
         return replace(build(*arguments), coalition=acts, target=target, depth=torch.tensor([[0, 1, 2, 1, 3, 0]]))
@@ -50,21 +50,21 @@ def test_a_chain_over_a_pruned_member_is_pruned(monkeypatch):
         feasible[:, 1] = False
         return replace(propose(scene, world, skeleton, *arguments, **options), feasible=feasible)
 
-    monkeypatch.setattr(e2, "build_skeleton", chained)
-    monkeypatch.setattr(e2, "propose", without_one)
+    monkeypatch.setattr(coalition, "build_skeleton", chained)
+    monkeypatch.setattr(coalition, "propose", without_one)
     state, _ = replanned(on, scene, 1.0)
     assert state.coalition.nonzero()[:, 1].tolist() == [3] and state.target[0].max() == 0
 
 
 def test_pursuit_draws_vehicles_where_nobody_has_a_proposal(monkeypatch):
     """Without it nobody takes part then, and the plans are the prior's; with it V_adv alone moves the coalition."""
-    scene, propose = scenes(3).scenes, e2.propose
+    scene, propose = scenes(3).scenes, coalition.propose
 
     def nothing(*arguments, **options):
         anchor = propose(*arguments, **options)
         return replace(anchor, feasible=anchor.feasible & False, cost=anchor.cost + torch.inf)
 
-    monkeypatch.setattr(e2, "propose", nothing)
+    monkeypatch.setattr(coalition, "propose", nothing)
     for pursuit in (False, True):
         on = synthesizer(skeleton={"pursuit": pursuit}, control={"adversarial_clip": 2.0})
         state, plan = replanned(on, scene, 2.0)
