@@ -48,11 +48,12 @@ AHEAD = 30.0  # m, straight on from the contact, that count as the ego's path
 LANE_HALF = 1.75  # m from a lane's centreline to its edge
 
 
-def duties(collision: Collision, rear: Tensor, red: Tensor, lanes: tuple[Tensor, Tensor]) -> Tensor:
+def duties(collision: Collision, rear: Tensor, red: Tensor, lanes: tuple[Tensor, Tensor], struck: Tensor) -> Tensor:
     """Index [B] into DUTIES of collisions [B].
 
     rear [B] bool: the ego is hit at its rear; red [B] int64: step at which the partner last crossed a stop line at red,
-    -1 for never; lanes: points [B, M, 2] of the map's centrelines, and which line [B, M] each is of (-1: padding).
+    -1 for never; lanes: points [B, M, 2] of the map's centrelines, and which line [B, M] each is of (-1: padding);
+    struck [B] bool: see `Prevention`.
     """
     row = torch.arange(len(rear), device=rear.device)
     pair = torch.stack([torch.zeros_like(collision.partner), collision.partner], 1)
@@ -63,10 +64,12 @@ def duties(collision: Collision, rear: Tensor, red: Tensor, lanes: tuple[Tensor,
     before = (stop - 1).clamp(min=0)
     turned = torch.stack([_turn(track, stop) for track in (ego, other)])
     angle = wrap(other[row, before, 2] - ego[row, before, 2])
-    unsafe, crosses = _unsafe_entry(ego, other, size, stop), angle.abs() > SAME_WAY
+    entered, safe = _entry(ego, other, size, stop)
+    crosses, oncoming = angle.abs() > SAME_WAY, angle.abs() > ONCOMING
+    unsafe = entered & (~safe | (oncoming & struck))  # a driver who stands cannot lose the speed of who comes
     # Who turns gives way; where both or none do, the other does if it comes from the ego's left, or leaves its side.
     priority = torch.where(turned[0] == turned[1], angle < 0, turned[1] & ~turned[0])
-    priority = torch.where(angle.abs() > ONCOMING, ~turned[0], priority)
+    priority = torch.where(oncoming, ~turned[0], priority)
     result = torch.full_like(stop, NONE)
     result = torch.where(unsafe & ~crosses, ENTRY, result)
     result = torch.where(unsafe & crosses & priority, RIGHT_OF_WAY, result)
@@ -83,9 +86,9 @@ def _turn(track: Tensor, stop: Tensor) -> Tensor:
     return (wrap(track[..., 2].diff(dim=1)) * counted).sum(1).abs() > TURN
 
 
-def _unsafe_entry(ego: Tensor, other: Tensor, size: Tensor, stop: Tensor) -> Tensor:
-    """Bool [B]: when the other last came into the ego's way, and at all times since, the gap was less than a competent
-    driver needs."""
+def _entry(ego: Tensor, other: Tensor, size: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
+    """Whether the other came into the ego's way, and whether the gap has at some time since the last entry been what a
+    competent driver needs; each [B] bool."""
     tracks = Tracks(other[:, :, None], size[:, 1:], torch.ones_like(other[..., :1], dtype=torch.bool))
     along = along_way(ego, size[:, 0, 1], tracks)
     outside = along.lateral_gap[..., 0].T > 0
@@ -94,7 +97,7 @@ def _unsafe_entry(ego: Tensor, other: Tensor, size: Tensor, stop: Tensor) -> Ten
     gap = along.rear[..., 0].T - driven_length(ego) - size[:, :1, 0] / 2
     safe = gap >= HumanDriver().stopping_gap(ego[..., 3] - along.speed[..., 0].T).clamp(min=0.0)
     since = (steps > last) & (steps <= (stop[:, None]).maximum(last + 1))
-    return (last[:, 0] >= 0) & ~(safe & since).any(1)
+    return last[:, 0] >= 0, (safe & since).any(1)
 
 
 def _against(track: Tensor, stop: Tensor, lanes: tuple[Tensor, Tensor]) -> Tensor:
@@ -227,9 +230,8 @@ def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor, Preven
     collision = Collision(batch["states"][hit], vehicles, batch["size"][hit], batch["partner"][hit], batch["stop"][hit])
     row, ran = torch.arange(len(collision.stop)), batch.get("ran_light")
     red = torch.full_like(collision.stop, -1) if ran is None else ran[hit][row, collision.partner]
-    lanes = batch["lane_points"][hit], batch["lane_index"][hit]
-    duty = duties(collision, batch["kind"][hit] == REAR, red, lanes)
-    result = preventions(collision)
+    lanes, result = (batch["lane_points"][hit], batch["lane_index"][hit]), preventions(collision)
+    duty = duties(collision, batch["kind"][hit] == REAR, red, lanes, result["human"].struck)
     dtype = batch["states"].dtype
     speed = batch["states"][hit][row, batch["before"][hit], :, 3].abs()
     moves, partner_moves = speed[:, 0] > CREEPING, speed[row, collision.partner] > STANDING

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from e2rl.metrics.preventable import preventions
 from e2rl.metrics.score import score_rollouts
 from e2rl.metrics.verdicts import DUTIES, clean, duties
 from tests.metrics.random_rollouts import random_rollouts
@@ -59,7 +60,8 @@ NO_LANES = torch.zeros(1, 2, 2, dtype=torch.float64), torch.full((1, 2), -1)
 
 
 def duty(case, red=-1, lanes=NO_LANES):
-    return DUTIES[duties(case, torch.tensor([False]), torch.tensor([red]), lanes).item()]
+    struck = preventions(case)["human"].struck
+    return DUTIES[duties(case, torch.tensor([False]), torch.tensor([red]), lanes, struck).item()]
 
 
 def crossing(speed, from_left):
@@ -96,6 +98,15 @@ def oncoming(side, heading):
 @pytest.mark.parametrize("heading", [math.pi - 0.03, 0.03 - math.pi])
 def test_who_comes_towards_the_ego_gives_way_to_it_whatever_the_sign_of_the_angle(side, heading):
     assert duty(oncoming(side, heading)) == "right of way"
+
+
+def test_who_comes_over_to_a_driver_that_stands_by_then_breaks_its_right_of_way():
+    """The gap was enough to lose the closing speed; the driver did, and is struck standing."""
+    slow = track(torch.cat([torch.full((20,), 4.0), torch.linspace(4, 2, 61)]))
+    partner = track(5.0, math.pi, (45.0, 0.0))
+    partner[0, :, 1] = 3.5 * (1 - ((torch.arange(81) - 2) / 10.0).clamp(0, 1))
+    case = collision(slow, partner)
+    assert preventions(case)["human"].struck.item() and duty(case) == "right of way"
 
 
 def test_an_entry_is_forgotten_once_the_gap_was_safe():
