@@ -105,7 +105,7 @@ def test_importance_weights_of_pulled_paths_average_1(recorded):
     moves = context.active & (state.lane.v > 1.0)
     near = smallest(moves, gap, 1)
     shift = torch.nn.functional.pad(torch.full((KNOTS,), -1.0 / ACCEL_SCALE), (0, SIZE - KNOTS))
-    pull, generator = Pull(mean + shift, near, torch.full((24,), 0.3)), torch.Generator().manual_seed(0)
+    pull, generator = Pull(mean + shift, near, torch.full((24,), 0.2)), torch.Generator().manual_seed(0)
     nobody = on._anchor(state, world, EGO.plan(world))
     control = on._control(state, world, EGO.plan(world), replace(nobody, feasible=nobody.feasible & False), pull)
     weights, nats = [], []
