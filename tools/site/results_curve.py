@@ -9,12 +9,12 @@ matplotlib.use("agg")
 import matplotlib.pyplot as plt  # noqa: E402
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-ROWS = {"cfr": ("failures", "tab:red"), "cfr_counted": ("that count", "tab:blue")}
+ROWS = {"cfr": ("failures", "tab:red"), "cfr_preventable": ("preventable", "tab:blue")}
 
 
 def values(name: str) -> list[tuple[float, float, float]]:
-    """(mean, low, high) in % at each intensity of a row of the table."""
-    (row,) = re.findall(rf"^\| `{name}` \|(.*)\|$", (DOCS / "intensity.md").read_text(), re.MULTILINE)
+    """(mean, low, high) in % at each intensity of a row of the first table that has it."""
+    row = re.findall(rf"^\| `{name}` \|(.*)\|$", (DOCS / "intensity.md").read_text(), re.MULTILINE)[0]
     return [tuple(map(float, re.findall(r"[\d.]+", cell))) for cell in row.split("|")[:4]]  # type: ignore[misc]
 
 
@@ -26,7 +26,7 @@ def main() -> None:
         below, above = ([abs(a - b) for a, b in zip(mean, end, strict=True)] for end in (low, high))
         ax.errorbar(eta, mean, [below, above], label=label, color=colour, marker="o", capsize=3)
     ax.set(xlabel="intensity η", ylabel="rollouts, %", xticks=range(4), ylim=(0, None))
-    ax.set_title("lane_graph under e2, Waymo test, 275 rollouts a point", fontsize=9)
+    ax.set_title("lane_graph under e2, Waymo tune, 166 rollouts a point", fontsize=9)
     ax.legend(frameon=False)
     ax.spines[["top", "right"]].set_visible(False)
     fig.tight_layout()
