@@ -141,9 +141,11 @@ class SparseControl:
 
     def _driven(self, x0: Tensor) -> Tensor:
         """The last x0 [B, V, SIZE], where the accelerations of raw proposals take the place of the sample's."""
-        raw = (self.anchor.feasible & self.coalition & (self.eta > 0)[:, None])[..., None]
+        if self.settings.anchoring != "raw":
+            return x0
+        raw = self.anchor.feasible & self.coalition & (self.eta > 0)[:, None]
         proposal = torch.cat([self.anchor.knots / ACCEL_SCALE, torch.zeros_like(x0[..., KNOTS:])], -1)
-        return torch.where(raw & (self.settings.anchoring == "raw"), proposal, x0)
+        return torch.where(raw[..., None], proposal, x0)
 
     def _gradients(
         self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Callable[[Tensor], Tensor]
