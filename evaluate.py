@@ -6,10 +6,12 @@ import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one lin
 from functools import partial
 from typing import Any
 
+from e2rl.evaluation.budget import search_all
 from e2rl.evaluation.methods import processes_of
 from e2rl.evaluation.plan import begin
 from e2rl.evaluation.protocol import WHOLE, drive_all, record
 from e2rl.evaluation.reproduce import compared_with_run, run_of
+from e2rl.report.budget import save_budget
 from e2rl.report.results import references, write_results
 from e2rl.run.command import run_command
 from e2rl.run.run import Run
@@ -22,7 +24,11 @@ def evaluate(run: Run) -> None:
     config, folder, plan = run.config, run.folder, begin(run)
     asked, egos = plan.asked, plan.egos
     how: Any = (asked.seeds, plan.rollouts(folder), processes_of(config), plan.only, run.parts(), asked.shard)
-    scored = drive_all(egos.setups(plan.setup), plan.methods, *how)  # every ego, method, eta, scene and seed
+    if asked.budget:
+        scored, tries = search_all(egos.setups(plan.setup), plan.searches, *asked.most, *how)
+        save_budget(folder, plan, tries, *scored[:2])
+    else:
+        scored = drive_all(egos.setups(plan.setup), plan.methods, *how)  # every ego, method, eta, scene and seed
     if asked.shard != WHOLE:
         print(f"\nshard {asked.shard[0]} of {asked.shard[1]} written to {folder}; e2rl merge joins all of them")
         return

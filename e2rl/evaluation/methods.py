@@ -23,7 +23,8 @@ from e2rl.sim.env import SimSettings
 from e2rl.traffic.traffic import Traffic
 
 FIGURES = ("intensity", "curves")
-VARIED = ("prior", "synthesizer")  # groups that the variants of a table may change
+UNITS = ("nfe", "tries", "seconds")  # of a budget, a scene
+VARIED = ("prior", "synthesizer", "search")  # groups that the variants of a table may change
 ALL = "all"  # metrics
 
 
@@ -92,8 +93,15 @@ class EvaluationSettings:
     metrics: str
     compare: tuple[str, ...]
     figure: str | None = setting(choices=FIGURES, optional=True)
+    budget: tuple[float, ...] = setting(low=0)
+    budget_unit: str = setting(choices=UNITS)
     save_rollouts: bool
     report: bool
+
+    @property
+    def most(self) -> tuple[float, str]:
+        """The largest budget, and its unit."""
+        return max(self.budget), self.budget_unit
 
     def __post_init__(self) -> None:
         check_settings(self, "")
@@ -103,6 +111,8 @@ class EvaluationSettings:
                 raise InputError(f"{name}=[]: name at least one")
         if len(self.shard) != 2 or self.shard[0] >= self.shard[1]:
             raise InputError(f"shard={list(self.shard)}: expected [k, n] with k from 0 to n - 1, such as shard=[0,4]")
+        if self.budget and (self.figure or self.compare or len(self.shard) and self.shard[1] > 1):
+            raise InputError("budget: has a table and a picture of its own; leave out figure, compare and shard")
         if self.figure and len(self.eta) < 2:
             raise InputError(f"figure={self.figure}: name several intensities, such as eta=[0,1,2,3]")
         if self.figure == "intensity" and not self.save_rollouts:
@@ -112,7 +122,7 @@ class EvaluationSettings:
 def evaluation_settings(config: DictConfig) -> EvaluationSettings:
     """Returns what a configuration asks for; InputError for what cannot be run."""
     given = {field.name: config[field.name] for field in fields(EvaluationSettings)}
-    given |= {name: as_list(given[name]) for name in ("methods", "eta", "seeds", "compare")}
+    given |= {name: as_list(given[name]) for name in ("methods", "eta", "seeds", "compare", "budget")}
     settings = settings_of(EvaluationSettings, given | {"shard": config.shard or WHOLE})
     if not (settings.methods or config.variants):
         raise InputError("methods=[]: name at least one, such as [nominal,e2]")

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from e2rl.evaluation.budget import Plan, build_plans
 from e2rl.evaluation.ego_set import EgoSet, build_egos
 from e2rl.evaluation.methods import EvaluationSettings, build_methods, build_prior, build_sim, evaluation_settings
 from e2rl.evaluation.protocol import Method, Setup
@@ -25,6 +26,7 @@ class Evaluation:
     Args:
         asked: the checked settings.
         origin: of the prior, from its checkpoint.
+        methods, searches: what is driven without and with a budget.
         setup: scenes, simulator and the first of `egos`.
         only: positions of the scenes to drive (None: all).
     """
@@ -34,6 +36,7 @@ class Evaluation:
     prior: Prior
     origin: Mapping[str, Any]
     methods: list[Method]
+    searches: list[Plan]
     setup: Setup
     only: list[int] | None
 
@@ -57,10 +60,11 @@ def begin(run: Run) -> Evaluation:
     set_up(config)
     asked, egos = evaluation_settings(config), build_egos(config, run.choices["ego"])
     prior, origin = build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
-    methods = build_methods(config, prior)
+    methods = [] if asked.budget else build_methods(config, prior)
+    searches = build_plans(config, prior) if asked.budget else []
     scenes = load_scenes(config.data, asked.num_scenes, scenes=config.scenes, files=files_of_run(config))
     only = None if config.scene is None else [scenes.index(config.scene)]
     name, ego = next(iter(egos.egos.items()))
     setup = Setup(scenes, ego, name, build_sim(config), config.batch, config.device)
     run.begin({"scenes": listed(scenes)})
-    return Evaluation(asked, egos, prior, origin, methods, setup, only)
+    return Evaluation(asked, egos, prior, origin, methods, searches, setup, only)

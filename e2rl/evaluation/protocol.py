@@ -22,6 +22,7 @@ from e2rl.run.errors import InputError
 from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.processes import Processes, in_processes
 from e2rl.scenes.scene import SceneSet
+from e2rl.search.tries import Try, scripts_of
 from e2rl.sim.env import SimSettings
 from e2rl.sim.rollout_file import ROLLOUTS, UNPRINTABLE, rollout_name
 from e2rl.sim.rollouts import Rollouts
@@ -31,7 +32,7 @@ from e2rl.traffic.traffic import Traffic
 
 SEEDS_APART = 1_000_003
 WHOLE = (0, 1)  # the only shard of a run
-Task = tuple[int, int]  # position of a scene, sampling seed
+Task = tuple[int, int] | tuple[int, int, Try]  # position of a scene, sampling seed; of a search the try
 # Rows and realism samples, one of each per rollout; and the entries of errored.json of rollouts that errored.
 Scored = tuple[list[dict], list[dict[str, Tensor]], list[dict]]
 
@@ -70,11 +71,16 @@ class Setup:
 
     def roll_out(self, method: Method, tasks: Sequence[Task]) -> Rollouts:
         """The rollouts of (scene, seed) pairs under one method."""
-        index = torch.tensor([scene for scene, _ in tasks])
-        noise = torch.tensor([scene_seed(self.scenes.number[scene], seed) for scene, seed in tasks])
+        index, seed = (torch.tensor(values) for values in zip(*(task[:2] for task in tasks), strict=True))
+        tries = [task[2] for task in tasks if len(task) > 2]
+        if tries:
+            noise, script = scripts_of(tries)
+        else:
+            noise, script = torch.tensor([scene_seed(self.scenes.number[scene], own) for scene, own in tasks]), None
         eta = torch.full((len(tasks),), float(method.eta), dtype=torch.float64)
-        rollouts = roll_out(self.scenes, index, noise, eta, self.ego, method.traffic, self.sim, self.device)
-        rollouts.seed = torch.tensor([seed for _, seed in tasks])
+        given = (self.ego, method.traffic, self.sim, self.device)
+        rollouts = roll_out(self.scenes, index, noise, eta, *given, script=script)
+        rollouts.seed = seed
         for name, text in zip(SOURCE, self.source(method), strict=True):
             rollouts.set(name, [text] * len(tasks))
         return rollouts
@@ -90,14 +96,14 @@ class Setup:
         for done, rollouts in parts:
             found, features = score_rollouts(rollouts)
             if self.evasions:
-                add_avoidable(found, rollouts, self.scenes.batch([scene for scene, _ in done]), self.sim)
+                add_avoidable(found, rollouts, self.scenes.batch([task[0] for task in done]), self.sim)
             if folder is not None:
                 rollouts.to_npz(folder)
             rows += found
             samples += features
         about = dict(zip(SOURCE, self.source(method), strict=True)) | {"eta": float(method.eta)}
         names = self.scenes.scene_id
-        return rows, samples, [about | {"scene_id": names[k], "seed": seed} | why for (k, seed), why in errored]
+        return rows, samples, [about | {"scene_id": names[task[0]], "seed": task[1]} | why for task, why in errored]
 
 
 def check_names(*names: str) -> None:

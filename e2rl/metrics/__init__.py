@@ -6,6 +6,7 @@ from e2rl.metrics import (  # noqa: F401
     evasion,
     failure_features,
     failure_modes,
+    margin,
     meta_metric,
     off_road,
     proximity,

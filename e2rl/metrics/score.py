@@ -69,7 +69,7 @@ def score_batch(batch: Batch) -> tuple[Batch, list[Samples], Tensor]:
     traffic[:, 0] = False
     batch = batch | {"traffic": traffic} | first_contact(batch)
     verdicts, driver = judge(batch)
-    batch, result = batch | verdicts, verdicts
+    batch, result = batch | verdicts | {"driver": driver}, verdicts
     for name, compute in COMPUTE.items():
         found = compute(batch)
         result |= found if isinstance(found, dict) else {METRICS[name].source: found}

@@ -246,8 +246,10 @@ def inputs(config: DictConfig) -> Iterator[tuple[str, Any]]:
                 yield f"{key}={value}", sha256_of(path)
             except OSError as error:
                 raise InputError(f"{key}={value}: cannot be read: {error.strerror}; name another file") from error
-    for name in config.get("methods", ()):
-        if name not in config.variants and name != config.synthesizer.name:
+    families = config.search.families.values() if config.get("budget") else ()
+    of_families = ((family or {}).get("method", "e2") for family in families)
+    for name in dict.fromkeys([*config.get("methods", ()), *of_families]):
+        if name not in (*config.variants, config.synthesizer.name, "search"):
             yield f"synthesizer={name}", resolved(load_choice("synthesizer", name))
     for entry in config.get("egos", {}).values():
         yield f"ego={entry.ego}", OmegaConf.to_container(load_choice("ego", entry.ego))  # as written

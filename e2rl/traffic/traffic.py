@@ -69,7 +69,9 @@ class Traffic(Extension, ABC):
     """Drives all vehicles but the ego of B scenes at once. Built as `_target_(prior=prior, **settings)`.
 
     stochastic: seeds matter; adversarial: the intensity eta matters; follows_template: `reset` takes causal templates,
-    template [B] int64 (None: full for all); predicts: plans can be compared with the log in open loop; replays_log: it
+    template [B] int64 (None: full for all); follows_script: it takes decisions, script [B, S, D]
+    (e2rl/traffic/e2/decisions.py; None: by rule); branches: `reset` takes a seed for each replan, seed [B, S] instead
+    of [B], the last one also for all later; predicts: plans can be compared with the log in open loop; replays_log: it
     is the recording itself; queries_ego: `replan` takes `react`, which returns the ego's states against a plan:
     react(rows [G] of the batch, states [G, V, HORIZON, 4]) -> [G, HORIZON, 4]; knowledge, responsibility: what it knows
     of the ego and owes it, in words for captions ("": nothing to say); tuned: ranges (low, high[, "log"]) of the
@@ -80,6 +82,8 @@ class Traffic(Extension, ABC):
     stochastic = True
     adversarial = False
     follows_template = False
+    follows_script = False
+    branches = False
     predicts = True
     replays_log = False
     queries_ego = False

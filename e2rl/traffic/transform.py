@@ -114,11 +114,13 @@ class AdversarialSynthesizer(Transform):
         """Reset the traffic method's state and the plan in environments first [B] bool, which have just been reset."""
         env, rows = self._env, first.nonzero()[:, 0]
         world, drawn = env.world(), self._drawn[rows.cpu()]
-        seed, eta = (getattr(self.pool, name)[drawn].to(env.device) for name in ("seed", "eta"))
+        method, eta, seed = self._method, self.pool.eta[drawn].to(env.device), self.pool.seed[drawn].to(env.device)
         begins = not len(self._planned_at)
         whole = begins or len(rows) == len(first)
-        given = {"template": self.pool.template[drawn].to(env.device)} if self._method.follows_template else {}
-        fresh = self._method.reset(world.scene if whole else world.scene[rows], seed, eta, **given)
+        names = {"template": method.follows_template, "script": method.follows_script}
+        given = {name: getattr(self.pool, name)[drawn].to(env.device) for name, follows in names.items() if follows}
+        scene = world.scene if whole else world.scene[rows]
+        fresh = method.reset(scene, seed if method.branches else seed[:, 0], eta, **given)
         self._state = fresh if whole else put_rows(self._state, rows, fresh)
         if begins:
             shape = (*world.scene["route_log"].shape, HORIZON, 4)
@@ -154,15 +156,30 @@ class AdversarialSynthesizer(Transform):
                 )
             ego_plan = keep_velocity(world.states[:, 0])  # nobody is told it
         whole = len(rows) == len(world.step)
-        state, now = (self._state, world) if whole else (take_rows(self._state, rows), take_rows(world, rows))
+        asked, again = self._alike(rows)
+        every = len(asked) == len(world.step)
+        state, now = (self._state, world) if every else (take_rows(self._state, asked), take_rows(world, asked))
         queries = {"react": Lookahead(self.ego, now)} if self._method.queries_ego and self.ego is not None else {}
-        state, plan = self._method.replan(state, now, ego_plan if whole else ego_plan[rows], **queries)
+        state, plan = self._method.replan(state, now, ego_plan[asked], **queries)
+        if len(asked) < len(rows):
+            state, plan = take_rows(state, again), take_rows(plan, again)
         self._state = state if whole else put_rows(self._state, rows, state)
         self._plan[rows] = plan.states.to(self._plan.dtype)
         if self.on_plan is not None:
             self.on_plan(plan)
         self._planned_at[rows] = world.step[rows]
         self._env.write_traffic(rows, plan.states, plan.present)
+
+    def _alike(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Of environments rows [b] those to plan for [a], and of which of these [b] each has the plan: attempts that
+        are alike so far are planned once, where all were begun together."""
+        planned = self._planned_at[rows]
+        itself = torch.arange(len(rows))
+        if len(rows) < len(self._planned_at) or bool((planned != planned[0]).any()):
+            return rows, itself.to(rows.device)
+        first = self.pool.first_alike(self._drawn, int(planned[0]) // REPLAN_STEPS + 1)
+        own = (first == itself).nonzero()[:, 0]
+        return rows[own.to(rows.device)], torch.searchsorted(own, first).to(rows.device)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self._write(next_tensordict)

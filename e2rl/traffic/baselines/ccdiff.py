@@ -114,7 +114,7 @@ class CCDiff(MeanGuided):
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> CCDiffState:
         """Returns states of scenes [B] with their top vehicles, whose routes are the prior's; others' are recorded."""
         state = super().reset(scenes, seed, eta)
-        draw = noise_of(seed, torch.full_like(seed, TIES), tuple(state.adversary.shape[1:]), uniform=True)
+        draw = noise_of(state.seed, torch.full_like(state.seed, TIES), tuple(state.adversary.shape[1:]), uniform=True)
         top = ranked(scenes, self.controlled, draw) | (self.strength(state) <= 0)[:, None]
         logged = scenes["route_log"]
         routed, lane = self.prior.start(scenes, torch.where(top | (logged < 0), state.routed.route, logged))

@@ -18,7 +18,7 @@ from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING, interpolate, project
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
-from e2rl.traffic.e2.interception import InterceptionSettings, intercept
+from e2rl.traffic.e2.interception import InterceptionSettings, Wish, intercept
 from e2rl.traffic.e2.motion import (
     TOP_SPEED,
     compact,
@@ -218,11 +218,11 @@ def propose(
     ego_plan: Tensor,
     settings: AnchorSettings,
     interception: InterceptionSettings,
-    eta: Tensor,
+    wish: Wish,
     keep_route: bool = False,
     halt_at_red: bool = False,
 ) -> Anchor:
-    """The skeleton-consistent clean state of Sec. IV-A3 for scenes [B]; ego_plan [B, H >= 50, 4], eta [B].
+    """The skeleton-consistent clean state of Sec. IV-A3 for scenes [B]; ego_plan [B, H >= 50, 4].
 
     Proposals are made from the ego outwards. Vehicles that act on the ego meet its plan on a lane or, where that costs
     less, by an interception. The others meet their target's lane proposal; a target without one keeps its speed along
@@ -243,7 +243,7 @@ def propose(
         pick, knots, cost = _on_lane(candidates, take(expected, target), take(scene["size"], target), settings)
         cost, off_lane, found = cost.masked_fill(~present, torch.inf), torch.zeros_like(present), None
         if depth == 1 and interception.reach > 0:
-            found = intercept(world, index, target, expected, eta, interception, halt_at_red)
+            found = intercept(world, index, target, expected, wish, interception, halt_at_red)
             off_lane = present & (found.cost < cost)
         on_lane = cost.isfinite() & ~off_lane
         expected = put(expected, index, on_lane, _states(candidates, pick, knots))

@@ -18,8 +18,9 @@ from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 from e2rl.traffic.e2.anchoring import Anchor, AnchorSettings, propose
 from e2rl.traffic.e2.control import ControlSettings
+from e2rl.traffic.e2.decisions import LEADER, RULE, Decisions, decisions_at, eligible, script_of
 from e2rl.traffic.e2.feasibility import FeasibilitySettings, feasible_vehicles
-from e2rl.traffic.e2.interception import InterceptionSettings
+from e2rl.traffic.e2.interception import InterceptionSettings, Wish
 from e2rl.traffic.e2.reasoner import LanguageReasoner, ReasonerSettings
 from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, leading, place_of
 from e2rl.traffic.e2.skeleton import (
@@ -37,7 +38,7 @@ from e2rl.traffic.grouping import no_vehicles, noise_of, put_rows, take_rows
 from e2rl.traffic.nominal import NominalTraffic, PriorState
 from e2rl.traffic.traffic import FULL
 
-SUPPORT = 750  # number of the draw of a random support
+SUPPORT, SCATTER = 750, 850  # numbers of the draws of a random support, and of the noise on costs
 MIN_TEMPERATURE, MAX_ROUTE_NATS = 0.05, 50.0  # of the prior's choice of routes, where a new route is booked
 SUPPORTS = ("feasible", "topology", "random")
 
@@ -46,14 +47,16 @@ SUPPORTS = ("feasible", "topology", "random")
 class E2State(PriorState):
     """B attacked scenes.
 
-    eta [B]; near, far [B] int64: the most near and far agents of a coalition; coalition [B, V]: C*; target [B, V]
+    intensity [B] and script [B, S, D]: eta and the decisions at each replan (`decisions_at`); near, far [B] int64: the
+    most near and far agents of a coalition; coalition [B, V]: C*; target [B, V]
     int64: whom each member acts on (0 the ego, -1 none); off_lane [B, V]: on an interception instead of its lane;
     committed [B, V]: with a proposal, knots [B, V, KNOTS]: its accelerations [m/s^2]; drawn [B, V]: by a kernel; since
     [B, V] s: see `foresee`; settled [B, V]: once drawn to what the competent driver prevents; path_kl, anchor_jump [B,
     V]: path KL of the control and energy of the literal blend since the start.
     """
 
-    eta: Tensor = no_vehicles()
+    intensity: Tensor = no_vehicles()
+    script: Tensor = no_vehicles()
     near: Tensor = no_vehicles()
     far: Tensor = no_vehicles()
     coalition: Tensor
@@ -66,6 +69,16 @@ class E2State(PriorState):
     settled: Tensor
     path_kl: Tensor
     anchor_jump: Tensor
+
+    @property
+    def now(self) -> Decisions:
+        """The decisions at the next replan."""
+        return decisions_at(self.script, self.replans)
+
+    @property
+    def eta(self) -> Tensor:
+        """[B], at the next replan."""
+        return self.intensity * self.now.strength
 
 
 @dataclass(eq=False, repr=False)
@@ -88,7 +101,7 @@ class Coalitions(NominalTraffic):
     control: ControlSettings
 
     adversarial = True
-    follows_template = True
+    follows_template = follows_script = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -99,18 +112,30 @@ class Coalitions(NominalTraffic):
         rules = self.reasoner.kind == "rules"
         self.feasible_vehicles = feasible_vehicles if rules else LanguageReasoner(self.reasoner)
 
-    def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor, template: Tensor | None = None) -> E2State:
-        """Returns states of scenes [B] with routes drawn from the prior and nobody under control; template [B]: causal
-        templates that limit the coalitions, None: full for all."""
-        near, far = limits_of(torch.full_like(seed, FULL) if template is None else template, self.skeleton)
+    def reset(
+        self,
+        scenes: TensorDictBase,
+        seed: Tensor,
+        eta: Tensor,
+        template: Tensor | None = None,
+        script: Tensor | None = None,
+    ) -> E2State:
+        """Returns states of scenes [B] with routes drawn from the prior and nobody under control.
+
+        Args:
+            template: [B] causal templates that limit the coalitions (None: full for all).
+            script: [B, S, D] decisions at each replan (None: by rule).
+        """
         nominal = super().reset(scenes, seed, eta)
+        near, far = limits_of(torch.full_like(nominal.seed, FULL) if template is None else template, self.skeleton)
+        script = script_of(RULE, len(eta)).to(eta.device) if script is None else script
         none, zero = torch.zeros_like(nominal.routed.parked), torch.zeros_like(nominal.routed.length)
         nobody = {name: none for name in ("coalition", "off_lane", "committed", "drawn", "settled")}
         nobody |= {"target": none.long() - 1, "since": zero - 1}
         costs = {"path_kl": zero, "anchor_jump": zero}
         knots = zero[..., None].repeat(1, 1, KNOTS)
         begun: dict[str, Any] = {**vars(nominal), **nobody, **costs}
-        return E2State(**begun, eta=eta, near=near, far=far, knots=knots)
+        return E2State(**begun, intensity=eta, script=script, near=near, far=far, knots=knots)
 
     def _budget(self, state: E2State) -> Tensor | None:
         """Nats [B] that control may still add; None: any."""
@@ -136,7 +161,7 @@ class Coalitions(NominalTraffic):
         """Proposals for the present coalition on its present routes; whom the ego follows keeps its last one."""
         depth = chain_depth(state.target)
         if self.responsibility == "full":
-            depth = depth.masked_fill(leading(world, depth.shape[1]), 0)
+            depth = depth.masked_fill(leading(world, depth.shape[1]) & (state.now.whom != LEADER)[:, None], 0)
         skeleton = Skeleton(state.coalition, state.target, depth, depth == 1, depth > 1)
         anchor = self._propose(skeleton, state, world, ego_plan, keep_route=True)
         return self._held(anchor, state, world) if self.responsibility == "full" else anchor
@@ -159,8 +184,9 @@ class Coalitions(NominalTraffic):
     def _propose(
         self, skeleton: Skeleton, state: E2State, world: World, ego_plan: Tensor, keep_route: bool = False
     ) -> Anchor:
-        settings, lawful = (self.anchor, self.interception), self.responsibility == "full"
-        return propose(world.scene, world, skeleton, ego_plan, *settings, state.eta, keep_route, lawful)
+        settings, lawful, now = (self.anchor, self.interception), self.responsibility == "full", state.now
+        wish = Wish(state.eta, now.moment, now.wrong_way)
+        return propose(world.scene, world, skeleton, ego_plan, *settings, wish, keep_route, lawful)
 
     def _select(self, state: E2State, world: World, ego_plan: Tensor) -> E2State:
         """Topology on a reference rollout, feasibility, skeleton; the coalition takes the routes that meet targets."""
@@ -174,11 +200,12 @@ class Coalitions(NominalTraffic):
         steps = round(STEP / DT)
         expected = reference[:, steps - 1 :: steps].transpose(1, 2)
         support, fallback = self._support(state, world, found.candidates, feasible)
-        if self.responsibility == "full":  # planners know how to follow: leaders that brake hard find next to nothing
-            support, fallback = (chosen & ~leading(world, vehicles) for chosen in (support, fallback))
+        may = eligible(world, state.now.whom, self.responsibility == "full")
+        support, fallback = support & may, fallback & may
         anchor = self._propose(direct(support | fallback), state, world, ego_plan)  # its cost chooses the near agents
+        cost = anchor.cost + state.now.scatter[:, None] * noise_of(state.seed, SCATTER + state.replans, (vehicles,))
         limits = state.near, state.far
-        skeleton = build_skeleton(scene, world, support, fallback, self.skeleton, expected, anchor.cost, limits)
+        skeleton = build_skeleton(scene, world, support, fallback, self.skeleton, expected, cost, limits)
         if bool(skeleton.far.any()):  # otherwise everybody meets the ego, as just proposed
             anchor = self._propose(skeleton, state, world, ego_plan)
         # Infeasible configurations are pruned (Sec. IV-A3): members without a proposal, and whoever acts through them.

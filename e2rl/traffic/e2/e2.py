@@ -81,15 +81,16 @@ class E2(Coalitions):
         anchored = anchor.feasible & state.coalition
         acts = anchored if self.control.anchoring != "off" else anchored & state.off_lane
         state = replace(state, committed=acts, knots=anchor.knots)
-        if self.kernels.samples == 1:
+        if self.kernels.samples == 1 or not bool(self._affords(state).any()):
             control = self._control(state, world, ego_plan, anchor)
             sample = self.prior.sample(context, now.noise, control, self._budget(state))
-            x0, kl, jump = sample.x0, sample.kl, control.jump
+            x0, kl, jump, state = sample.x0, sample.kl, control.jump, replace(state, drawn=state.drawn & False)
         else:
             attack, kernels = self._kernels(state, world, ego_plan, context, acts)
             state, x0, kl, jump = self._best(state, attack, kernels, anchor, context, now.noise)
         members = state.coalition | state.drawn
-        context.obstacles.duty = duty_of(self.responsibility, self.yielding, world, members, state.eta)
+        now, given = state.now, (self.responsibility, self.yielding, world, members)
+        context.obstacles.duty = duty_of(*given, state.eta, now.patience, now.owes > 0)
         return replace(state, path_kl=state.path_kl + kl, anchor_jump=state.anchor_jump + jump), x0, context
 
     def _afforded(self, state: E2State, world: World, anchor: Anchor) -> tuple[E2State, Anchor]:
@@ -152,7 +153,8 @@ class E2(Coalitions):
         """Bool [B]: there are nats left to draw a sample to a kernel."""
         budget = self._budget(state)
         least = math.log((self.kernels.samples - 1) / DRAWN)
-        return state.eta > 0 if budget is None else (state.eta > 0) & (budget > least)
+        wanted = (state.eta > 0) & (state.now.kernels > 0)
+        return wanted if budget is None else wanted & (budget > least)
 
     def _worth(self, attack: Attack, context: Context, x0: Tensor, many: Tensor) -> tuple[Tensor, Tensor]:
         """What `foresee` makes of samples x0 [C, V, SIZE] of scenes many [C]: worth and prevented [C, V]."""

@@ -34,6 +34,7 @@ CLEARANCE = 0.3  # m kept to others on the path
 SHOULDER = 0.5  # m that its centre may leave the drivable area by
 ACCEL_COST, LATERAL_COST = 0.2, 0.2  # s that 1 m/s^2 of acceleration, and of lateral acceleration, weighs
 TIME_COST = 0.1  # s that 1 s until the meeting weighs
+MOMENT_COST = 1.0  # s that 1 s before or after the moment that is wished for weighs
 WORTH = 2.0  # s by which a path is preferred that only the competent driver survives
 
 
@@ -56,6 +57,15 @@ class Interception(NamedTuple):
     path: Tensor
     knots: Tensor
     cost: Tensor
+
+
+class Wish(NamedTuple):
+    """What is asked of interceptions, each [B]: intensity eta; moment s of the meeting, negative: the cheapest;
+    wrong_way s: weight, beside the settings', of ending against the lanes."""
+
+    eta: Tensor
+    moment: Tensor
+    wrong_way: Tensor
 
 
 class _Paths(NamedTuple):
@@ -146,11 +156,11 @@ def intercept(
     index: Tensor,
     target: Tensor,
     expected: Tensor,
-    eta: Tensor,
+    wish: Wish,
     settings: InterceptionSettings,
     halt_at_red: bool = False,
 ) -> Interception:
-    """The cheapest interception by each of vehicles index [B, M] of its target [B, M], at intensities eta [B].
+    """The cheapest interception by each of vehicles index [B, M] of its target [B, M], as wished.
 
     expected [B, V, H, 4]: states of everybody at steps 1..H; on the path nobody but the target is touched.
     halt_at_red: no path is longer than the distance to a stop line that binds the vehicle now.
@@ -166,7 +176,7 @@ def intercept(
     alike = wrap(paths.end_heading - meeting[..., 2].repeat_interleave(ENDS, -1)).cos().clamp(min=0) ** 2
     length = paths.length[..., -1] - 0.4 * (size[..., 0] + target_size[..., 0])[..., None] * alike
     accel = 2 * (length.clamp(min=0) - v * time) / time**2
-    ok = _within(settings, paths, v, accel, time, eta[:, None, None])
+    ok = _within(settings, paths, v, accel, time, wish.eta[:, None, None])
     ok &= _on_road(paths, states, scene)
     if halt_at_red:
         assert world.route is not None
@@ -179,9 +189,11 @@ def intercept(
     ok &= _clear(paths, travelled, size, (expected[:, :, steps - 1], scene["size"][:, :vehicles], counts))
     cost = ACCEL_COST * accel.abs() + LATERAL_COST * _lateral(paths, v, accel)[0]
     cost = cost + TIME_COST * time
-    if settings.wrong_way > 0:
+    cost = cost + MOMENT_COST * ((time - wish.moment[:, None, None]).abs() * (wish.moment >= 0)[:, None, None])
+    wrong_way = settings.wrong_way + wish.wrong_way
+    if bool((wrong_way > 0).any()):
         against = _against_lanes(scene, meeting, paths.end_heading)
-        cost = torch.where(against, cost + settings.wrong_way, cost)
+        cost = torch.where(against, cost + wrong_way[:, None, None], cost)
     known = expected[:, 0], states, size, torch.full_like(states[..., 3], -1.0)
     cost = cost - WORTH * _foresight(world, known, _tracks(paths, v, accel))
     cost, pick = (cost - settings.preference).masked_fill(~ok, torch.inf).min(-1)

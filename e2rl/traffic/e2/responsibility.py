@@ -55,8 +55,21 @@ def yields_at_once(world: World, vehicles: int) -> Tensor:
     return (angle < -CROSSING) & (angle > CROSSING - torch.pi)
 
 
-def duty_of(responsibility: str, settings: YieldingSettings, world: World, coalition: Tensor, eta: Tensor) -> Duty:
-    """The Duty of a coalition [B, V] at intensities eta [B]."""
+def duty_of(
+    responsibility: str,
+    settings: YieldingSettings,
+    world: World,
+    coalition: Tensor,
+    eta: Tensor,
+    lateness: Tensor | None = None,
+    owes: Tensor | None = None,
+) -> Duty:
+    """The Duty of a coalition [B, V] at intensities eta [B].
+
+    Args:
+        lateness: [B] factor of the patience, and where it is above 1 of its bound (None: 1).
+        owes: [B] bool, false: it owes the ego nothing (None: it does).
+    """
     vehicles, nobody, zero = coalition.shape[1], torch.zeros_like(coalition), torch.zeros_like(eta[:, None] * coalition)
     if responsibility == "none":
         return Duty(coalition, nobody, zero)
@@ -65,5 +78,8 @@ def duty_of(responsibility: str, settings: YieldingSettings, world: World, coali
         return Duty(ahead, nobody, zero)
     free = coalition & followed(world, vehicles)
     waits = ahead & ~yields_at_once(world, vehicles)
-    patience = (settings.patience * eta).clamp(max=settings.max_patience)[:, None] * waits
-    return Duty(free, coalition & ~free, patience)
+    lateness = torch.ones_like(eta) if lateness is None else lateness
+    patience = torch.minimum(settings.patience * eta * lateness, settings.max_patience * lateness.clamp(min=1))
+    if owes is not None:
+        free = torch.where(owes[:, None], free, coalition)
+    return Duty(free, coalition & ~free, patience[:, None] * waits)

@@ -8,6 +8,7 @@ import torch
 from e2rl.prior.lane_relative import LaneState, speeds
 from e2rl.scenes.route import SPACING
 from e2rl.sim.world import World
+from e2rl.traffic.e2.interception import Wish
 from e2rl.traffic.e2.motion import constant_speed_states
 from e2rl.traffic.e2.skeleton import STEP, Skeleton, SkeletonSettings, build_skeleton
 from tests.synthetic import BACK, make_scenes
@@ -72,3 +73,7 @@ def skeleton_of(
     return build_skeleton(
         world.scene, world, support, feasible, chosen, expected, distance if cost is None else cost, limits
     )
+
+
+def wish_of(batch, eta=2.0, moment=-1.0, wrong_way=0.0):
+    return Wish(*(torch.full((batch,), value) for value in (eta, moment, wrong_way)))

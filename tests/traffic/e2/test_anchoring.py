@@ -8,7 +8,7 @@ from e2rl.traffic.e2 import anchoring
 from e2rl.traffic.e2.anchoring import AnchorSettings, propose
 from e2rl.traffic.e2.interception import InterceptionSettings
 from e2rl.traffic.e2.motion import constant_speed_states
-from tests.traffic.e2.crossing import add_route, decoded, make_world, mask, skeleton_of
+from tests.traffic.e2.crossing import add_route, decoded, make_world, mask, skeleton_of, wish_of
 
 UP = math.pi / 2
 EGO = (0.0, 0.0, 0.0, 10.0)
@@ -17,8 +17,8 @@ LANES = InterceptionSettings(reach=0.0)
 
 
 def proposed(world, skeleton, plan, settings=None, interception=LANES, eta=2.0, **options):
-    settings, etas = settings or AnchorSettings(), torch.full((len(plan),), eta)
-    return propose(world.scene, world, skeleton, plan, settings, interception, etas, **options)
+    settings, wish = settings or AnchorSettings(), wish_of(len(plan), eta)
+    return propose(world.scene, world, skeleton, plan, settings, interception, wish, **options)
 
 
 def anchored(world, *vehicles, near=2, **settings):

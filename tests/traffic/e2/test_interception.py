@@ -10,7 +10,7 @@ from e2rl.scenes.recording import DT, LIGHT_GREEN, LIGHT_RED
 from e2rl.scenes.route import SPACING, interpolate
 from e2rl.traffic.e2.interception import InterceptionSettings, cubic, intercept
 from e2rl.traffic.e2.motion import constant_speed_states
-from tests.traffic.e2.crossing import decoded, make_world
+from tests.traffic.e2.crossing import decoded, make_world, wish_of
 
 UP = math.pi / 2
 EGO = (0.0, 0.0, 0.0, 10.0)
@@ -19,12 +19,14 @@ TIMES = DT * torch.arange(1, 51)
 FREE = replace(InterceptionSettings(), push=2.0, brake=2.0, lateral=2.0)
 
 
-def met(vehicles, eta=2.0, settings=FREE, world=None, halt_at_red=False):
+def met(vehicles, eta=2.0, settings=FREE, world=None, halt_at_red=False, moment=-1.0, wrong_way=0.0):
     """Vehicle 1's interception of the ego among the others, all of which keep their speed."""
     world = world or make_world(vehicles)
     scene, expected = world.scene, constant_speed_states(world.scene, world, TIMES)
     index, target = (torch.full((len(scene), 1), vehicle) for vehicle in (1, 0))
-    found = intercept(world, index, target, expected, torch.full((len(scene),), eta), settings, halt_at_red)
+    found = intercept(
+        world, index, target, expected, wish_of(len(scene), eta, moment, wrong_way), settings, halt_at_red
+    )
     return found, expected, scene["size"][:, :8]
 
 

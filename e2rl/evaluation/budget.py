@@ -1,0 +1,217 @@
+"""Searches for failures with a budget, round by round, and what each of their tries was (docs/search.md).
+
+Every method is tried again and again, with other noise; the method `search` spends its tries on a portfolio of
+families. What they find is told at several budgets by `evaluation.budget_table`.
+"""
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from e2rl.evaluation.methods import as_list, build_traffic, method_config, varied
+from e2rl.evaluation.protocol import WHOLE, Method, Scored, Setup, has_files
+from e2rl.metrics.failure_modes import word
+from e2rl.prior.prior import Prior
+from e2rl.run.errors import InputError
+from e2rl.run.files import write_atomically
+from e2rl.run.parts import NO_PARTS, Parts
+from e2rl.run.processes import Processes, in_processes
+from e2rl.run.settings import settings_of
+from e2rl.search.search import BRANCH, Outcome, Search, SearchSettings
+from e2rl.search.tries import Family, Try, family_of
+
+SEARCH = "search"  # the method whose tries are drawn from families
+TRIES_FILE = "tries.csv"
+TRIES = 10_000  # numbers of rollouts that one seed of a search has in a scene
+SPEED_BAND = 5.0  # m/s
+TOLD = ("scene_id", "location", "seed", "method", "ego_policy", "family", "parent", "margin", "cell", "clean")
+SPENT = ("tries", "nfe", "seconds")  # a scene, of the search so far
+UNTRIED = Outcome(float("-inf"), 0.0, "", 0.0)  # of a try that errored
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A row of the budget's table: a name, families with their traffic, and how tries are spent."""
+
+    name: str
+    families: list[Family]
+    traffic: dict[str, Method]
+    settings: SearchSettings
+
+    def begin(self, setup: Setup, seed: int, only: Sequence[int]) -> Search:
+        """The search in scenes `only`, before its first try."""
+        numbers = [setup.scenes.number[scene] for scene in only]
+        branches = {name: method.traffic.follows_script for name, method in self.traffic.items()}
+        return Search(self.families, numbers, seed, self.settings, branches)
+
+
+def build_plans(config: DictConfig, prior: Prior) -> list[Plan]:
+    """The rows of `config.methods` and `config.variants`.
+
+    Raises:
+        InputError: for a family, a method or a decision that is not there.
+    """
+    eta = [float(value) for value in as_list(config.eta)]
+    if len(eta) != 1:
+        raise InputError(f"eta={eta}: a search has one intensity, of which its families take shares; name one")
+    traffic: dict[str, Method] = {}
+
+    def method(name: str, synthesizer: DictConfig) -> Method:
+        key = name + OmegaConf.to_yaml(synthesizer)
+        if key not in traffic:
+            built = build_traffic(synthesizer, prior)
+            traffic[key] = Method(name, built, eta[0] if built.adversarial else 0.0)
+        return traffic[key]
+
+    plans = []
+    for name in dict.fromkeys([*as_list(config.methods), *config.variants]):
+        changed = varied(config, name) if name in config.variants else config
+        if name == SEARCH or any(str(key).startswith(SEARCH) for key in config.variants.get(name) or ()):
+            plans.append(portfolio_plan(name, changed, method))
+        else:
+            own = changed.synthesizer if name in config.variants else method_config(config, name)
+            again = replace(SearchSettings(), cover=TRIES, bandit=False, brood=0)
+            plans.append(Plan(name, [Family(name, name, {})], {name: method(name, own)}, again))
+    return plans
+
+
+def portfolio_plan(name: str, config: DictConfig, method: Callable[[str, DictConfig], Method]) -> Plan:
+    """The plan of the group `search`."""
+    given: Any = OmegaConf.to_container(config.search, resolve=True)
+    families = [family_of(str(key), value or {}, "search.families") for key, value in given.pop("families").items()]
+    if not families:
+        raise InputError("search.families={}: name at least one, such as {rule: {}}")
+    traffic = {each.name: method(each.method, method_config(config, each.method)) for each in families}
+    return Plan(name, families, traffic, settings_of(SearchSettings, given, "search"))
+
+
+def search_all(
+    setups: Sequence[Setup],
+    plans: Sequence[Plan],
+    budget: float,
+    unit: str,
+    seeds: Sequence[int],
+    into: Path | None = None,
+    processes: Processes = 1,
+    only: Sequence[int] | None = None,
+    parts: Parts = NO_PARTS,
+    shard: tuple[int, int] = WHOLE,
+) -> tuple[Scored, list[dict]]:
+    """What every plan finds against every ego by each seed with `budget` of a `unit` (SPENT) a scene; and the tries.
+
+    Args:
+        only: positions of the scenes (None: all).
+        into, processes, parts, shard: as of `protocol.drive_all`; a search has one shard.
+    """
+    found: Scored = ([], [], [])
+    told: list[dict] = []
+    for number, (setup, plan, seed) in enumerate((a, b, c) for a in setups for b in plans for c in seeds):
+        scenes = range(len(setup.scenes)) if only is None else only
+        own = replace(parts, stage=f"{parts.stage}search-{number:03}") if parts.folder else parts
+        scored, tries = spend(setup, plan, seed, scenes, budget, unit, into, processes, own)
+        for whole, part in zip(found, scored, strict=True):
+            whole += part
+        told += tries
+    return found, told
+
+
+def spend(
+    setup: Setup,
+    plan: Plan,
+    seed: int,
+    scenes: Sequence[int],
+    budget: float,
+    unit: str,
+    into: Path | None = None,
+    processes: Processes = 1,
+    parts: Parts = NO_PARTS,
+) -> tuple[Scored, list[dict]]:
+    """What one search finds, and its tries in their order. A try that errors counts as one that comes nowhere near."""
+    search, found, told = plan.begin(setup, seed, scenes), ([], [], []), []  # type: ignore[var-annotated]
+    spent = dict.fromkeys(SPENT, 0.0)
+    with tqdm(total=budget, desc=f"{plan.name}: {unit} a scene", disable=None) as bar:
+        while spent[unit] < budget:
+            tries = search.ask()
+            jobs, before = batches(setup, plan, seed, scenes, tries, sum(map(len, search.tries))), spent[unit]
+
+            def work(job: tuple[int, Method, list]) -> Scored:
+                number, method, tasks = job
+                identity = [plan.name, setup.ego_name, method.eta, [task[2].plain() for task in tasks]]
+                compute = partial(setup.score, method, tasks, into)
+                return parts.result(f"tries-{number:06}", identity, compute, partial(has_files, into))
+
+            known: dict[tuple[str, int], dict] = {}
+            for scored in in_processes(work, jobs, processes, lambda job: len(job[2])):
+                for whole, part in zip(found, scored, strict=True):
+                    whole += part
+                known |= {(row["scene_id"], row["seed"]): row for row in scored[0]}
+            names = [(setup.scenes.scene_id[scenes[one.scene]], row_seed(seed, one)) for one in tries]
+            rows = [known.get(name) for name in names]
+            search.tell(tries, [UNTRIED if row is None else outcome_of(row) for row in rows])
+            for one, row in zip(tries, rows, strict=True):
+                spent["tries"] += 1 / len(scenes)
+                for name, column in (("nfe", "nfe"), ("seconds", "seconds")):
+                    spent[name] += (0.0 if row is None else row[column]) / len(scenes)
+                told += [] if row is None else [told_of(one, row) | spent]
+            if spent[unit] == before:
+                raise InputError(f"{plan.name}: its tries cost no {unit}; give the budget in tries, budget_unit=tries")
+            bar.update(min(spent[unit], budget) - bar.n)
+    return found, told
+
+
+def batches(
+    setup: Setup, plan: Plan, seed: int, scenes: Sequence[int], tries: Sequence[Try], first: int
+) -> list[tuple[int, Method, list]]:
+    """Jobs (number from `first` on, method, tasks) of tries: of one traffic method each, those of a scene together."""
+    by_method: dict[str, list] = {}
+    for one in sorted(tries, key=lambda one: (one.scene, one.number)):
+        tasks = by_method.setdefault(plan.traffic[one.family].name, [])
+        tasks.append((scenes[one.scene], row_seed(seed, one), one))
+    jobs = []
+    for tasks in by_method.values():
+        method = replace(plan.traffic[tasks[0][2].family], name=plan.name)
+        count = -(-len(tasks) // setup.batch)
+        jobs += [(method, tasks[k * len(tasks) // count : (k + 1) * len(tasks) // count]) for k in range(count)]
+    return [(first + k, *job) for k, job in enumerate(jobs)]
+
+
+def row_seed(seed: int, one: Try) -> int:
+    """The `seed` of a try's rollout in the tables."""
+    return seed * TRIES + one.number
+
+
+def cell_of(row: Mapping) -> str:
+    """The cell of the atlas that a rollout's failure lies in; "" where it has no preventable one."""
+    if row["cfr_preventable"] != 1:
+        return ""
+    band = int(row["ego_speed"] // SPEED_BAND * SPEED_BAND)
+    words = [word(row, name) for name in ("approach", "partner_manoeuvre", "duty", "contact_type")]
+    return ", ".join([*words, f"{band} m/s"])
+
+
+def outcome_of(row: Mapping) -> Outcome:
+    """What the search is told of a rollout."""
+    return Outcome(row["margin"], row["hazard_step"], cell_of(row), row["nfe"])
+
+
+def told_of(one: Try, row: Mapping) -> dict[str, Any]:
+    """A line of TRIES_FILE, without SPENT."""
+    family = BRANCH if one.parent >= 0 else one.family
+    about = {"family": family, "parent": one.parent, "cell": cell_of(row), "clean": row["cfr_clean"]}
+    return {name: about[name] if name in about else row[name] for name in TOLD}
+
+
+def write_tries(path: Path, told: Sequence[Mapping]) -> None:
+    """Write the tries of a run, a line each."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [*TOLD, *SPENT], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(told)
+    write_atomically(path, text.getvalue())

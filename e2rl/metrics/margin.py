@@ -1,0 +1,59 @@
+"""How near a rollout comes to a preventable failure: the verdict made continuous, for a search to climb.
+
+Without a contact it is minus the least over time of the distance of the ego to anybody who moves relative to it, in
+time and space: (t^2 + d^2)^(1/2) of their closest approach at constant velocities, t s ahead and d m between the sides.
+A contact has 0 to 1, by how much of the ego's speed the competent driver in its place loses before its own contact; a
+preventable one has 2.
+"""
+
+import torch
+from torch import Tensor
+
+from e2rl.metrics.catalogue import Batch, Metric, columns
+from e2rl.metrics.contact import steps_until
+from e2rl.metrics.geometry import velocity
+from e2rl.metrics.preventable import CREEPING
+from e2rl.scenes.recording import VEHICLE
+
+FARTHEST = 30.0  # s and m: nobody who counts is nearer
+CLOSING = 1.0  # m/s of relative velocity from which on a pair counts
+RISE = 2.0  # s and m above its least, from which on the distance counts as the hazard's rise
+PREVENTED = 2.0
+
+
+@columns(Metric("margin", "nearness to a preventable failure (docs/search.md)"), events=("hazard_step",))
+def margin_columns(batch: Batch) -> Batch:
+    """margin [B], and hazard_step [B] at which what led to it began."""
+    apart = approach_distance(batch)  # [B, T+1]
+    least, at = apart.min(1)
+    steps = torch.arange(apart.shape[1], device=apart.device)
+    above = (apart > (least + RISE)[:, None]) & (steps <= at[:, None])
+    began = torch.where(above, steps, 0).amax(1)
+    margin = torch.where(batch["hit"], contact_margin(batch), -least)
+    return {"margin": margin, "hazard_step": began.to(margin)}
+
+
+def approach_distance(batch: Batch) -> Tensor:
+    """(t^2 + d^2)^(1/2) [B, T+1] of the ego's nearest closest approach at each step until its first contact, at most
+    FARTHEST; FARTHEST at step 0 and after a contact."""
+    states, valid, size = batch["states"], batch["valid"], batch["size"]
+    moving = velocity(states)
+    offset, closing = states[..., :2] - states[:, :, :1, :2], moving - moving[:, :, :1]
+    speed = closing.norm(dim=-1)
+    time = (-(offset * closing).sum(-1) / speed.square().clamp(min=1e-6)).clamp(min=0)
+    half = (size[:, :, 1] + size[:, :1, 1])[:, None] / 2  # as if side by side
+    miss = ((offset + closing * time[..., None]).norm(dim=-1) - half).clamp(min=0)
+    counted = valid & valid[..., :1] & (batch["agent_type"] == VEHICLE)[:, None] & (speed > CLOSING)
+    counted = counted & steps_until(batch["stop"], states.shape[1])[..., None]
+    counted[..., 0] = False
+    return torch.hypot(time, miss).masked_fill(~counted, FARTHEST).amin(-1).clamp(max=FARTHEST)
+
+
+def contact_margin(batch: Batch) -> Tensor:
+    """Of rollouts [B] with a contact: PREVENTED where it is preventable, else the share of the ego's speed that the
+    competent driver has lost at the step before the contact; 0 where the ego hardly moves."""
+    row = torch.arange(len(batch["stop"]), device=batch["stop"].device)
+    speed = batch["states"][row, batch["before"], 0, 3]
+    lost = 1 - batch["driver"][row, batch["before"], 3] / speed.clamp(min=CREEPING)
+    lost = (lost.nan_to_num(0.0) * (speed > CREEPING)).clamp(0, 1)
+    return torch.where(batch["preventable"] == 1, PREVENTED, lost)

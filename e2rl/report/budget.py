@@ -1,0 +1,222 @@
+"""What searches found within several budgets: budget.csv, budget.md and the picture (docs/search.md).
+
+Intervals are a bootstrap by place; every draw counts the cells of the atlas that the places drawn have. A search with
+several seeds is the mean of its seeds.
+"""
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from e2rl.evaluation.budget import SPENT, TRIES, TRIES_FILE, write_tries
+from e2rl.evaluation.plan import Evaluation
+from e2rl.metrics.realism import Samples, realism
+from e2rl.metrics.statistics import REALISM_DRAWS, bootstrap_draws, cluster_index, interval
+from e2rl.report.drawing import new_figure, save_figure
+from e2rl.report.tables import Table, save_tables
+from e2rl.run.files import write_atomically
+
+PANEL = 250  # points, a side
+FOUND = ("scenes", "cells", "failures", "clean")
+ABOUT = {
+    "scenes": "scenes with a preventable failure, %",
+    "cells": "cells of the atlas",
+    "failures": "preventable failures a scene",
+    "clean": "clean failures a scene",
+    "real_adv": "realism of adversaries",
+}
+CAPTION = (
+    "95% intervals by place. A cell is approach, partner's manoeuvre, broken duty, side of contact and the ego's speed "
+    "in bands of 5 m/s. Ratios are the first method's over each other's."
+)
+
+
+class Found:
+    """Resampled values [1 + draws] of what one plan found against one ego within one budget.
+
+    Args:
+        told: lines of tries.csv of one plan and ego, in their order, of all seeds.
+        scenes: (location, scene_id) of all scenes.
+        budget, unit: see `spend`.
+        samples: realism samples of the tries, by (scene_id, seed).
+    """
+
+    def __init__(
+        self,
+        told: Sequence[Mapping],
+        scenes: Sequence[tuple[str, str]],
+        budget: float,
+        unit: str,
+        samples: Mapping[tuple[str, int], Samples],
+    ) -> None:
+        within = [row for row in told if row[unit] <= budget * (1 + 1e-9)]
+        place, count = cluster_index(*zip(*scenes, strict=True))
+        draws, number = bootstrap_draws(count), {scene: k for k, (_, scene) in enumerate(scenes)}
+        seeds = sorted({row["seed"] // TRIES for row in told})
+        self.spent = {name: max((row[name] for row in within), default=0.0) for name in SPENT}
+        self.places = count
+        self.draws: dict[str, Tensor] = {name: torch.zeros(len(draws), dtype=torch.float64) for name in FOUND}
+        weight = draws @ torch.bincount(place, minlength=count).double()
+        for seed in seeds:
+            own = [row for row in within if row["seed"] // TRIES == seed and row["cell"]]
+            at = torch.tensor([number[row["scene_id"]] for row in own], dtype=torch.int64)
+            per_scene = torch.bincount(at, minlength=len(scenes)).double()
+            clean = torch.bincount(at, torch.tensor([float(row["clean"]) for row in own]), len(scenes)).double()
+            values = {"scenes": 100 * (per_scene > 0).double(), "failures": per_scene, "clean": clean}
+            for name, value in values.items():
+                of_place = torch.zeros(count, dtype=torch.float64).index_add(0, place, value)
+                self.draws[name] += (draws @ of_place) / weight / len(seeds)
+            cells = sorted({row["cell"] for row in own})
+            there = torch.zeros(count, max(len(cells), 1), dtype=torch.float64)
+            for row, scene in zip(own, at.tolist(), strict=True):
+                there[place[scene], cells.index(row["cell"])] = 1
+            self.draws["cells"] += ((draws > 0).double() @ there > 0).sum(1) / len(seeds)
+        known = [row for row in within if (row["scene_id"], row["seed"]) in samples]
+        of = torch.tensor([int(place[number[row["scene_id"]]]) for row in known], dtype=torch.int64)
+        drawn = bootstrap_draws(count, REALISM_DRAWS)
+        theirs = [samples[row["scene_id"], row["seed"]] for row in known]
+        self.draws["real_adv"] = realism(theirs, of, drawn)["real_adv"]
+
+    def value(self, name: str) -> dict[str, float]:
+        """Mean and interval."""
+        return interval(self.draws[name], self.places)
+
+    def ratio(self, other: "Found", name: str) -> dict[str, float]:
+        """Mean and interval of this over the other's."""
+        return interval(self.draws[name] / other.draws[name], self.places)
+
+
+def budget_rows(
+    told: Sequence[Mapping],
+    scenes: Sequence[tuple[str, str]],
+    budgets: Sequence[float],
+    unit: str,
+    samples: Mapping[tuple[str, str, str, int], Samples],
+) -> list[dict[str, Any]]:
+    """A row for each ego, plan and budget: SPENT a scene, FOUND and `real_adv` with intervals, and the ratios of the
+    first plan's scenes and cells to it.
+
+    samples: realism samples by (ego_policy, method, scene_id, seed).
+    """
+    rows = []
+    for ego in dict.fromkeys(row["ego_policy"] for row in told):
+        for budget in budgets:
+            found: dict[str, Found] = {}
+            for plan in dict.fromkeys(row["method"] for row in told):
+                own = [row for row in told if row["ego_policy"] == ego and row["method"] == plan]
+                of_plan = {key[2:]: value for key, value in samples.items() if key[:2] == (ego, plan)}
+                found[plan] = Found(own, scenes, budget, unit, of_plan)
+            first = next(iter(found.values()))
+            for plan, one in found.items():
+                values = {name: one.value(name) for name in (*FOUND, "real_adv")}
+                values |= {f"{name}_ratio": first.ratio(one, name) for name in ("scenes", "cells") if one is not first}
+                about = {"ego": ego, "method": plan, "budget": budget, "unit": unit}
+                rows.append(about | {f"{name}_a_scene": value for name, value in one.spent.items()} | values)
+    return rows
+
+
+def cell(value: Mapping[str, float], digits: int) -> str:
+    """A value with its interval, as text."""
+    if not math.isfinite(value["mean"]):
+        return "–"
+    text = f"{value['mean']:.{digits}f}"
+    known = math.isfinite(value["low"]) and math.isfinite(value["high"])
+    return f"{text} [{value['low']:.{digits}f}, {value['high']:.{digits}f}]" if known else text
+
+
+def budget_tables(rows: Sequence[Mapping], scenes: int) -> list[Table]:
+    """A table for each ego, a row for each method and budget."""
+    tables = []
+    digits = {"scenes": 1, "cells": 1, "failures": 2, "clean": 2, "real_adv": 3}
+    for ego in dict.fromkeys(row["ego"] for row in rows):
+        own = [row for row in rows if row["ego"] == ego]
+        head = ["method", own[0]["unit"], "tries", "NFE", "s", *ABOUT.values(), "ratio of scenes", "of cells"]
+        lines = []
+        for row in own:
+            spent = [f"{row['tries_a_scene']:.1f}", f"{row['nfe_a_scene']:.0f}", f"{row['seconds_a_scene']:.1f}"]
+            ratios = [cell(row[name], 2) if name in row else "–" for name in ("scenes_ratio", "cells_ratio")]
+            values = [cell(row[name], count) for name, count in digits.items()]
+            lines.append([row["method"], f"{row['budget']:g}", *spent, *values, *ratios])
+        title = f"Failures of {ego} within a budget of {own[0]['unit']} a scene"
+        tables.append(Table(f"{scenes} scenes. {CAPTION}", head, lines, title))
+    return tables
+
+
+def write_budget(path: Path, rows: Sequence[Mapping]) -> None:
+    """Write the rows as CSV: a value's interval in NAME_low and NAME_high."""
+    flat = []
+    for row in rows:
+        line: dict[str, Any] = {}
+        for name, value in row.items():
+            if isinstance(value, Mapping):
+                line |= {name: value["mean"], f"{name}_low": value["low"], f"{name}_high": value["high"]}
+            else:
+                line[name] = value
+        flat.append(line)
+    names = list(dict.fromkeys(name for line in flat for name in line))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(flat)
+    write_atomically(path, text.getvalue())
+
+
+def budget_figure(told: Sequence[Mapping], scenes: int) -> Figure:
+    """Scenes with a preventable failure [%], and cells, over each of SPENT a scene: a line a method, mean of seeds."""
+    egos = list(dict.fromkeys(row["ego_policy"] for row in told))
+    figure = new_figure(PANEL * len(SPENT), PANEL * 2 * len(egos))
+    axes = figure.subplots(2 * len(egos), len(SPENT), squeeze=False)
+    for line, ego in enumerate(egos):
+        for column, unit in enumerate(SPENT):
+            for row, name in enumerate(("scenes", "cells")):
+                axis = axes[2 * line + row][column]
+                for plan in dict.fromkeys(each["method"] for each in told):
+                    own = [each for each in told if each["ego_policy"] == ego and each["method"] == plan]
+                    axis.plot(*curve(own, unit, name, scenes), label=plan, linewidth=1.2)
+                axis.set_xscale("log")
+                axis.set_xlabel(f"{unit} a scene")
+                axis.set_ylabel(f"{ego}: {ABOUT[name]}")
+    axes[0][0].legend(fontsize=7, frameon=False)
+    figure.tight_layout()
+    return figure
+
+
+def curve(told: Sequence[Mapping], unit: str, name: str, scenes: int) -> tuple[list[float], list[float]]:
+    """Budgets, and what the tries of all seeds within each have found in the mean."""
+    seeds = sorted({row["seed"] // TRIES for row in told})
+    known: set[tuple] = set()
+    x, y = [], []
+    for row in sorted(told, key=lambda row: row[unit]):
+        if row["cell"]:
+            known.add((row["seed"] // TRIES, row["scene_id"] if name == "scenes" else row["cell"]))
+        x.append(row[unit])
+        y.append(len(known) / len(seeds) * (100 / scenes if name == "scenes" else 1))
+    return x, y
+
+
+def save_budget(
+    folder: Path, plan: Evaluation, told: Sequence[Mapping], rows: Sequence[Mapping], samples: Sequence[Samples]
+) -> None:
+    """Write tries.csv, budget.csv, budget.md and the picture of a run's searches; print the tables.
+
+    rows, samples: of the tries' rollouts (`Scored`).
+    """
+    scenes = plan.scenes
+    chosen = range(len(scenes)) if plan.only is None else plan.only
+    places = [(scenes.location[k], scenes.scene_id[k]) for k in chosen]
+    keys = [tuple(row[name] for name in ("ego_policy", "method", "scene_id", "seed")) for row in rows]
+    by_try = dict(zip(keys, samples, strict=True))
+    found = budget_rows(told, places, plan.asked.budget, plan.asked.budget_unit, by_try)
+    write_tries(folder / TRIES_FILE, told)
+    write_budget(folder / "budget.csv", found)
+    tables = budget_tables(found, len(places))
+    save_tables(folder / "budget.md", tables)
+    save_figure(folder / "budget.png", budget_figure(told, len(places)))
+    print("", *(table.text() for table in tables), sep="\n")

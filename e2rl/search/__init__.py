@@ -1,0 +1,1 @@
+"""The attack with a budget: tries of a scene that differ, spent where they find most (docs/search.md)."""

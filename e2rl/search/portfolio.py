@@ -1,0 +1,70 @@
+"""Which family is tried next in which scene: Thompson sampling over chances that tries have told."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from e2rl.search.tries import Family
+
+SCENE_TRIES = 1.0  # tries in one scene that weigh as much as what all scenes have told
+PRIOR_TRIES = 20.0  # that a family's chance stands for at the start
+NEARNESS = 4.0  # s and m of margin by which a scene's chance falls by e
+LEAST = 0.05  # of that chance
+
+
+@dataclass
+class Portfolio:
+    """Chances of F families in N scenes: that a try finds what the search is for.
+
+    The chance in a scene follows Beta(c m, c (1 - m)) around the family's chance m in all scenes, with c = SCENE_TRIES;
+    m has the family's own chance as its prior, worth PRIOR_TRIES. Where nothing is found yet, it counts in proportion
+    to exp(margin / NEARNESS) of the scene's nearest try: where nobody ever comes near, tries are few.
+
+    Args:
+        families: the families.
+        scenes: their number.
+        learns: false: every family has the same chance everywhere.
+    """
+
+    families: Sequence[Family]
+    scenes: int
+    learns: bool = True
+    found: Tensor = field(init=False)
+    tried: Tensor = field(init=False)
+    nearest: Tensor = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.found = torch.zeros(self.scenes, len(self.families), dtype=torch.float64)
+        self.tried = torch.zeros_like(self.found)
+        self.nearest = torch.full((self.scenes,), -torch.inf, dtype=torch.float64)
+        self.spent = torch.tensor([PRIOR_TRIES * family.nfe for family in self.families], dtype=torch.float64)
+
+    def tell(self, scene: int, family: int, found: float, margin: float, nfe: float) -> None:
+        """Learn from a try."""
+        self.found[scene, family] += found
+        self.tried[scene, family] += 1
+        self.spent[family] += nfe
+        self.nearest[scene] = max(float(self.nearest[scene]), margin)
+
+    def worth(self, generator: torch.Generator) -> Tensor:
+        """A draw of the chances [N, F] per NFE, relative to the dearest family."""
+        prior = torch.tensor([family.chance for family in self.families], dtype=torch.float64)
+        mean = (prior * PRIOR_TRIES + self.found.sum(0)) / (PRIOR_TRIES + self.tried.sum(0))
+        if not self.learns:
+            return torch.rand(self.found.shape, generator=generator, dtype=torch.float64)
+        hit = SCENE_TRIES * mean + self.found
+        missed = SCENE_TRIES * (1 - mean) + self.tried - self.found
+        drawn = beta(hit, missed, generator)
+        near = (self.nearest / NEARNESS).exp().clamp(LEAST, 1.0)
+        near = torch.where(self.nearest.isinf(), 1.0, near)[:, None]
+        cost = self.spent / (PRIOR_TRIES + self.tried.sum(0))
+        return drawn * near * cost.amax() / cost
+
+
+def beta(a: Tensor, b: Tensor, generator: torch.Generator) -> Tensor:
+    """A draw of Beta(a, b), elementwise."""
+    first = torch._standard_gamma(a, generator=generator)
+    second = torch._standard_gamma(b, generator=generator)
+    return first / (first + second).clamp(min=1e-300)

@@ -1,0 +1,125 @@
+"""A try: one attack on one scene, reproducible from its genome, and the families that tries are drawn from."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from e2rl.run.errors import InputError
+from e2rl.run.settings import check_choice
+from e2rl.traffic.e2.decisions import RULE, WHOM, Decisions
+
+ONSET = "onset"  # of a family: replans before which nobody is controlled
+MOST_REPLANS = 200
+DRAWN = (ONSET, *Decisions._fields)
+PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23)  # of the square roots that stratify the draws of one decision each
+
+
+@dataclass(frozen=True)
+class Try:
+    """One attack on one scene.
+
+    Args:
+        scene: its position.
+        number: of the try among those of the scene.
+        family: that it is drawn from.
+        seeds: of the noise of each replan; the last one also of all later ones.
+        script: decisions at each replan, rows of `Decisions`; the last one also of all later ones.
+        parent: number of the try that it branches from, -1 for none.
+    """
+
+    scene: int
+    number: int
+    family: str
+    seeds: tuple[int, ...]
+    script: tuple[tuple[float, ...], ...]
+    parent: int = -1
+
+    def branch(self, number: int, replan: int, seed: int, **changed: float) -> "Try":
+        """The same try up to a replan, with other noise and changed decisions from there on."""
+        seeds = (*(self.seeds[min(k, len(self.seeds) - 1)] for k in range(replan)), seed)
+        before = tuple(self.script[min(k, len(self.script) - 1)] for k in range(replan))
+        after = tuple(
+            tuple(Decisions(*row)._replace(**changed)) for row in self.script[min(replan, len(self.script) - 1) :]
+        )
+        return replace(self, number=number, seeds=seeds, script=before + after, parent=self.number)
+
+    def plain(self) -> dict[str, Any]:
+        """As plain values."""
+        return vars(self) | {"seeds": list(self.seeds), "script": [list(row) for row in self.script]}
+
+
+def scripts_of(tries: list[Try]) -> tuple[Tensor, Tensor]:
+    """Seeds [B, S] int64 and scripts [B, S', D] of tries, the last rows repeated."""
+    longest = max(len(each.seeds) for each in tries)
+    seeds = [each.seeds + each.seeds[-1:] * (longest - len(each.seeds)) for each in tries]
+    longest = max(len(each.script) for each in tries)
+    scripts = [each.script + each.script[-1:] * (longest - len(each.script)) for each in tries]
+    return torch.tensor(seeds, dtype=torch.int64), torch.tensor(scripts, dtype=torch.float32)
+
+
+@dataclass(frozen=True)
+class Family:
+    """Attacks of one kind: a traffic method, and a range for each decision that is not its rule's.
+
+    Args:
+        name: of the family.
+        method: of traffic, by name.
+        ranges: {decision or ONSET: (low, high) or one number}; whom: index into WHOM.
+        chance, nfe: of a failure in a try, and what a try costs, by which the portfolio begins.
+    """
+
+    name: str
+    method: str
+    ranges: Mapping[str, tuple[float, float] | float]
+    chance: float = 0.1
+    nfe: float = 160.0
+
+    def decisions(self, draw: Tensor) -> tuple[int, Decisions]:
+        """The onset and the decisions of uniform numbers draw [len(DRAWN)] in [0, 1)."""
+        found: dict[str, float] = {}
+        for name, u in zip(DRAWN, draw.tolist(), strict=True):
+            if name in self.ranges:
+                span = self.ranges[name]
+                found[name] = span[0] + u * (span[1] - span[0]) if isinstance(span, tuple) else float(span)
+        return round(found.pop(ONSET, 0)), RULE._replace(**found)
+
+    def draw(self, scene: int, number: int, seed: int, drawn: int, stratified: bool) -> Try:
+        """The try `number` of a scene, the family's `drawn`-th there; reproducible from the seed of the scene's search.
+
+        Stratified, the decisions of consecutive draws follow the additive recurrence of square roots of primes, and so
+        look elsewhere than those before.
+        """
+        generator = torch.Generator().manual_seed(seed)
+        begin = torch.rand(len(DRAWN), generator=generator, dtype=torch.float64)
+        if stratified:
+            u = (begin + drawn * torch.tensor(PRIMES, dtype=torch.float64).sqrt()) % 1
+        else:
+            u = torch.rand(len(DRAWN), generator=generator.manual_seed(seed + 7919 * (drawn + 1)), dtype=torch.float64)
+        onset, decisions = self.decisions(u)
+        rows = (tuple(RULE._replace(strength=0.0)),) * onset + (tuple(decisions),)
+        return Try(scene, number, self.name, (seed * 1009 + drawn,), rows)
+
+
+def family_of(name: str, given: Mapping[str, Any], where: str) -> Family:
+    """A family of its configuration: `method`, `chance`, and the ranges of decisions.
+
+    Raises:
+        InputError: a key is no decision, or a value no number, pair of numbers, or kind of vehicle.
+    """
+    ranges: dict[str, tuple[float, float] | float] = {}
+    for key, value in given.items():
+        if key in ("method", "chance", "nfe"):
+            continue
+        check_choice(f"{where}.{name}: decision {key}", key, DRAWN)
+        if key == "whom":
+            check_choice(f"{where}.{name}.whom", value, WHOM)
+            value = WHOM.index(value)
+        numbers = value if isinstance(value, list | tuple) else [value]
+        if not all(isinstance(number, int | float) for number in numbers) or len(numbers) not in (1, 2):
+            raise InputError(f"{where}.{name}.{key}={value}: expected a number, or [low, high]")
+        ranges[key] = tuple(map(float, numbers)) if len(numbers) == 2 else float(numbers[0])  # type: ignore[assignment]
+    about = {key: float(given[key]) for key in ("chance", "nfe") if key in given}
+    return Family(name, str(given.get("method", "e2")), ranges, **about)

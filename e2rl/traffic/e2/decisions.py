@@ -1,0 +1,62 @@
+"""What e2 decides by rule, as numbers that a search may draw for each rollout and each replan (docs/search.md).
+
+The rule is the mode of every distribution of attacks: a try of which nothing is drawn is e2 as it stands.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from e2rl.sim.world import World
+from e2rl.traffic.e2.responsibility import SAME_DIRECTION, leading, place_of
+
+WHOM = ("any", "oncoming", "crossing", "beside", "leader")  # vehicles that may act on the ego
+ANY, ONCOMING, CROSSING, BESIDE, LEADER = range(len(WHOM))
+BY_RULE = -1.0  # a moment of meeting that nobody asks for
+
+
+class Decisions(NamedTuple):
+    """Decisions of B rollouts, each [B] (or one for all).
+
+    strength: factor of eta, 0: nobody is controlled; whom: index into WHOM; patience: factor of how late adversaries
+    give way; owes: 1, or 0: they do not give way; wrong_way: s that an interception weighs more if it ends against the
+    lanes; moment: s until the ego is met, BY_RULE: the cheapest; scatter: s of noise on what it costs each vehicle to
+    meet the ego; kernels: 1, or 0: none are drawn.
+    """
+
+    strength: Tensor | float = 1.0
+    whom: Tensor | float = ANY
+    patience: Tensor | float = 1.0
+    owes: Tensor | float = 1.0
+    wrong_way: Tensor | float = 0.0
+    moment: Tensor | float = BY_RULE
+    scatter: Tensor | float = 0.0
+    kernels: Tensor | float = 1.0
+
+
+RULE = Decisions()
+
+
+def script_of(decisions: Decisions, batch: int) -> Tensor:
+    """Decisions that hold at every replan of B = `batch` rollouts, as a script [B, 1, D]: row k is of replan k, the
+    last one also of all later ones."""
+    columns = [torch.as_tensor(value, dtype=torch.float32).expand(batch) for value in decisions]
+    return torch.stack(columns, -1)[:, None]
+
+
+def decisions_at(script: Tensor, replans: Tensor) -> Decisions:
+    """The Decisions of a script [B, S, D] at replans [B]."""
+    at = replans.clamp(max=script.shape[1] - 1)
+    return Decisions(*script[torch.arange(len(script), device=script.device), at].unbind(-1))
+
+
+def eligible(world: World, whom: Tensor, lawful: bool) -> Tensor:
+    """Bool [B, V]: vehicles that whom [B] lets act; lawful: leaders act only where they are named, since planners know
+    how to follow."""
+    vehicles = world.scene["route_log"].shape[1]
+    along = (world.states[:, :vehicles, 2] - world.states[:, :1, 2]).cos()
+    leads, beside = leading(world, vehicles), place_of(world, vehicles)[1] & ~leading(world, vehicles)
+    oncoming = along < -SAME_DIRECTION
+    kinds = torch.stack([~leads if lawful else leads | ~leads, oncoming, along.abs() <= SAME_DIRECTION, beside, leads])
+    return kinds[whom.long(), torch.arange(len(whom), device=whom.device)]
