@@ -13,7 +13,7 @@ from tests.synthetic import make_scenes
 
 PACKAGE = Path(e2rl.__file__).parent
 ORDER = (  # of the rooms
-    *("run", "scenes", "sim", "prior", "planners", "metrics", "traffic", "evaluation"),
+    *("run", "scenes", "sim", "prior", "planners", "metrics", "traffic", "search", "evaluation"),
     *("learning", "report", "api", "commands"),
 )
 

@@ -4,6 +4,7 @@ Every method is tried again and again, with other noise; the method `search` spe
 families. What they find is told at several budgets by `evaluation.budget_table`.
 """
 
+import copy
 import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
 from e2rl.evaluation.methods import as_list, build_traffic, method_config, varied
@@ -85,11 +87,25 @@ def build_plans(config: DictConfig, prior: Prior) -> list[Plan]:
 def portfolio_plan(name: str, config: DictConfig, method: Callable[[str, DictConfig], Method]) -> Plan:
     """The plan of the group `search`."""
     given: Any = OmegaConf.to_container(config.search, resolve=True)
-    families = [family_of(str(key), value or {}, "search.families") for key, value in given.pop("families").items()]
-    if not families:
-        raise InputError("search.families={}: name at least one, such as {rule: {}}")
-    traffic = {each.name: method(each.method, method_config(config, each.method)) for each in families}
+    named = given.pop("families") or {}
+    if not named:
+        raise InputError("search.families: name at least one, such as {rule: {}}")
+    families = [family_of(str(key), value or {}, "search.families") for key, value in named.items()]
+    traffic = {each.name: method(each.method, changed_method(config, each)) for each in families}
     return Plan(name, families, traffic, settings_of(SearchSettings, given, "search"))
+
+
+def changed_method(config: DictConfig, family: Family) -> DictConfig:
+    """The configuration of a family's method with its changes; InputError where there is no such setting."""
+    changed = copy.deepcopy(method_config(config, family.method))
+    OmegaConf.set_struct(changed, True)
+    try:
+        for key, value in family.changes.items():
+            OmegaConf.update(changed, key, value, merge=True)
+    except OmegaConfBaseException as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"search.families.{family.name}.changes: {reason}; compare it with conf/synthesizer") from error
+    return changed
 
 
 def search_all(
@@ -170,9 +186,9 @@ def batches(
     setup: Setup, plan: Plan, seed: int, scenes: Sequence[int], tries: Sequence[Try], first: int
 ) -> list[tuple[int, Method, list]]:
     """Jobs (number from `first` on, method, tasks) of tries: of one traffic method each, those of a scene together."""
-    by_method: dict[str, list] = {}
+    by_method: dict[int, list] = {}
     for one in sorted(tries, key=lambda one: (one.scene, one.number)):
-        tasks = by_method.setdefault(plan.traffic[one.family].name, [])
+        tasks = by_method.setdefault(id(plan.traffic[one.family]), [])  # of one traffic method
         tasks.append((scenes[one.scene], row_seed(seed, one), one))
     jobs = []
     for tasks in by_method.values():

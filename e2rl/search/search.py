@@ -72,7 +72,7 @@ class Search:
     def __post_init__(self) -> None:
         self.tries, self.outcomes = ([[] for _ in self.numbers] for _ in range(2))  # type: ignore[misc]
         self._portfolio = Portfolio(
-            [*self.families, Family(BRANCH, "", {}, self.settings.branch_chance)],
+            [*self.families, Family(BRANCH, "", {}, chance=self.settings.branch_chance)],
             len(self.numbers),
             self.settings.bandit,
         )

@@ -1,7 +1,7 @@
 """A try: one attack on one scene, reproducible from its genome, and the families that tries are drawn from."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -68,12 +68,14 @@ class Family:
         name: of the family.
         method: of traffic, by name.
         ranges: {decision or ONSET: (low, high) or one number}; whom: index into WHOM.
+        changes: of the method's settings.
         chance, nfe: of a failure in a try, and what a try costs, by which the portfolio begins.
     """
 
     name: str
     method: str
     ranges: Mapping[str, tuple[float, float] | float]
+    changes: Mapping[str, Any] = field(default_factory=dict)
     chance: float = 0.1
     nfe: float = 160.0
 
@@ -104,14 +106,14 @@ class Family:
 
 
 def family_of(name: str, given: Mapping[str, Any], where: str) -> Family:
-    """A family of its configuration: `method`, `chance`, and the ranges of decisions.
+    """A family of its configuration: `method`, `changes`, `chance`, `nfe`, and the ranges of decisions.
 
     Raises:
         InputError: a key is no decision, or a value no number, pair of numbers, or kind of vehicle.
     """
     ranges: dict[str, tuple[float, float] | float] = {}
     for key, value in given.items():
-        if key in ("method", "chance", "nfe"):
+        if key in ("method", "changes", "chance", "nfe"):
             continue
         check_choice(f"{where}.{name}: decision {key}", key, DRAWN)
         if key == "whom":
@@ -121,5 +123,5 @@ def family_of(name: str, given: Mapping[str, Any], where: str) -> Family:
         if not all(isinstance(number, int | float) for number in numbers) or len(numbers) not in (1, 2):
             raise InputError(f"{where}.{name}.{key}={value}: expected a number, or [low, high]")
         ranges[key] = tuple(map(float, numbers)) if len(numbers) == 2 else float(numbers[0])  # type: ignore[assignment]
-    about = {key: float(given[key]) for key in ("chance", "nfe") if key in given}
-    return Family(name, str(given.get("method", "e2")), ranges, **about)
+    about: dict[str, Any] = {key: float(given[key]) for key in ("chance", "nfe") if key in given}
+    return Family(name, str(given.get("method", "e2")), ranges, dict(given.get("changes", {})), **about)

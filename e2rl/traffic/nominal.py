@@ -109,6 +109,10 @@ class NominalTraffic(Traffic):
             present[rows, :vehicles] = plan.on_map & valid
         return whole, TrafficPlan(states, present, route=whole.routed.route)
 
+    def with_own(self, state: State, before: State) -> State:
+        """Returns the state with the seeds of `before`."""
+        return replace(state, seeds=before.seeds)
+
     def replan_group(self, now: Replan) -> tuple[State, Tensor, Context]:
         """Returns state, joint sample x0 [G, V, SIZE] and context of a group."""
         context = self.encode(now.state, now.world, now.ego_plan)

@@ -111,6 +111,11 @@ class Traffic(Extension, ABC):
             ego_plan: [B, >= HORIZON, 4], states that the ego announces, for a method whose knowledge is its plan.
         """
 
+    def with_own(self, state: State, before: State) -> State:
+        """Returns the state of attempts that were alike so far, copied from one of them, with what is each one's own
+        for later replans, from its state before."""
+        return state
+
     def open_loop_plans(self, scene: TensorDictBase, seed: Tensor) -> Tensor:
         """Returns joint plans [B, S, V, HORIZON, 4] of scenes [B] from their start frames; seed [S, B] int64.
 

@@ -163,6 +163,7 @@ class AdversarialSynthesizer(Transform):
         state, plan = self._method.replan(state, now, ego_plan[asked], **queries)
         if len(asked) < len(rows):
             state, plan = take_rows(state, again), take_rows(plan, again)
+            state = self._method.with_own(state, take_rows(self._state, rows))
         self._state = state if whole else put_rows(self._state, rows, state)
         self._plan[rows] = plan.states.to(self._plan.dtype)
         if self.on_plan is not None:

@@ -137,6 +137,10 @@ class Coalitions(NominalTraffic):
         begun: dict[str, Any] = {**vars(nominal), **nobody, **costs}
         return E2State(**begun, intensity=eta, script=script, near=near, far=far, knots=knots)
 
+    def with_own(self, state: E2State, before: E2State) -> E2State:  # type: ignore[override]
+        """Returns the state with the seeds and the script of `before`."""
+        return replace(super().with_own(state, before), script=before.script)
+
     def _budget(self, state: E2State) -> Tensor | None:
         """Nats [B] that control may still add; None: any."""
         limit = self.control.transport_budget

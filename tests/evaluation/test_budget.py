@@ -1,0 +1,126 @@
+"""Searches with a budget: spent but not much exceeded, the same however they run, and gone on with after a kill."""
+
+from dataclasses import replace
+
+import pytest
+
+from e2rl.evaluation.budget import TRIES, Plan, build_plans, cell_of, spend, write_tries
+from e2rl.evaluation.protocol import Method, Setup
+from e2rl.planners.idm_planner import IDMEgo
+from e2rl.run.config import load_config
+from e2rl.run.errors import InputError
+from e2rl.run.parts import Parts
+from e2rl.search.search import SearchSettings
+from e2rl.search.tries import Family
+from e2rl.sim.env import SimSettings
+from e2rl.traffic.rule_based import ConstantVelocity
+from tests.prior.small import small_prior
+from tests.traffic.e2.traffic_scenes import scenes, synthesizer
+
+RULE = Family("rule", "e2", {"kernels": 0.0})
+LATE = Family("late", "e2", {"kernels": 0.0, "onset": 2.0})
+
+
+@pytest.fixture(scope="module")
+def setup():
+    return Setup(scenes(3, steps=30), IDMEgo(), "idm", SimSettings(), 2, evasions=False)
+
+
+@pytest.fixture(scope="module")
+def plan():
+    on = Method("e2", synthesizer(), 2.0)
+    settings = replace(SearchSettings(), cover=1, branch_chance=0.9)
+    return Plan("search", [RULE, LATE], {"rule": on, "late": on}, settings)
+
+
+def found(setup, plan, processes=1, parts=None, tries=4.0, unit="tries"):
+    given = {} if parts is None else {"parts": parts}
+    (rows, samples, errored), told = spend(setup, plan, 3, range(3), tries, unit, processes=processes, **given)
+    assert len(rows) == len(samples) == len(told) and not errored
+    return told
+
+
+def known(told):
+    """What does not depend on the clock."""
+    return [{name: value for name, value in row.items() if name != "seconds"} for row in told]
+
+
+def test_a_budget_of_tries_is_spent_and_hardly_exceeded(setup, plan):
+    told = found(setup, plan)
+    assert 4.0 <= told[-1]["tries"] <= 4.0 + plan.settings.brood and [row["tries"] for row in told] == sorted(
+        row["tries"] for row in told
+    )
+    assert all(row["seed"] // TRIES == 3 and row["method"] == "search" for row in told)
+    assert len({(row["scene_id"], row["seed"]) for row in told}) == len(told)
+
+
+def test_branches_are_among_the_tries_and_name_their_parent(setup, plan):
+    told = found(setup, plan)
+    by_name = {(row["scene_id"], row["seed"] % TRIES): row for row in told}
+    branches = [row for row in told if row["parent"] >= 0]
+    assert branches and all(row["family"] == "branch" for row in branches)
+    assert all((row["scene_id"], row["parent"]) in by_name for row in branches)
+
+
+def test_processes_change_nothing(setup, plan):
+    assert known(found(setup, plan, processes=2)) == known(found(setup, plan))
+
+
+def test_a_search_goes_on_where_it_was_killed(setup, plan, tmp_path):
+    parts = Parts(tmp_path, "search")
+    whole = found(setup, plan, parts=parts)
+    files = sorted(tmp_path.rglob("tries-*.pt"))
+    assert len(files) > 2
+    times = {file: file.stat().st_mtime_ns for file in files[:-2]}
+    for file in files[-2:]:
+        file.unlink()
+    assert known(found(setup, plan, parts=parts)) == known(whole)
+    assert {file: file.stat().st_mtime_ns for file in times} == times, "what was done is not done again"
+    assert sorted(tmp_path.rglob("tries-*.pt")) == files
+
+
+def test_a_method_that_evaluates_no_network_has_no_budget_of_evaluations(setup):
+    traffic = {"still": Method("still", ConstantVelocity(), 0.0)}
+    still = Plan("still", [Family("still", "still", {})], traffic, SearchSettings())
+    with pytest.raises(InputError, match="budget_unit=tries"):
+        found(setup, still, unit="nfe")
+
+
+def test_only_preventable_failures_have_a_cell():
+    row = {"cfr_preventable": 1, "ego_speed": 12.0, "approach": "oncoming", "partner_manoeuvre": "brakes"}
+    row |= {"duty": "none", "contact_type": "front"}
+    assert cell_of(row) == "oncoming, brakes, none, front, 10 m/s"
+    assert cell_of(row | {"cfr_preventable": 0}) == "" == cell_of(row | {"cfr_preventable": float("nan")})
+
+
+def test_a_line_for_each_try(setup, plan, tmp_path):
+    told = found(setup, plan, tries=1.0)
+    write_tries(tmp_path / "tries.csv", told)
+    assert len((tmp_path / "tries.csv").read_text().splitlines()) == 1 + len(told)
+
+
+def plans(*overrides):
+    return build_plans(load_config("evaluate", ["budget=640", *overrides]), small_prior())
+
+
+def test_a_row_for_each_method_and_variant_and_its_families_from_the_configuration():
+    portfolio, e2, other = plans("methods=[search,e2]", "+variants.other={search.brood: 0}")
+    assert [each.name for each in (portfolio, e2, other)] == ["search", "e2", "other"]
+    assert len(portfolio.families) > 3 and {family.name for family in portfolio.families} == set(portfolio.traffic)
+    assert (len(e2.families), e2.settings.brood, e2.settings.bandit) == (1, 0, False)
+    assert other.settings == replace(portfolio.settings, brood=0) and len(other.families) == len(portfolio.families)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("search.families=null", "name at least one"),
+        ("+search.families.odd={method: e3}", "e3"),
+        ("+search.families.odd={speed: 1}", r"search\.families\.odd: decision speed"),
+        ("+search.families.odd={changes: {reselekt: 1}}", r"search\.families\.odd\.changes"),
+        ("eta=[1,2]", "one intensity"),
+    ],
+)
+def test_what_cannot_be_searched_is_told(override, words):
+    with pytest.raises(InputError, match=words):
+        plans("methods=[search]", override)

@@ -1,0 +1,102 @@
+"""The search: it asks the same of whoever tells the same, learns where failures are, and branches from near ones."""
+
+from dataclasses import replace
+
+import torch
+
+from e2rl.metrics.margin import PREVENTED
+from e2rl.search.portfolio import Portfolio
+from e2rl.search.search import BRANCH, Outcome, Search, SearchSettings
+from e2rl.search.tries import Family
+
+FAMILIES = [Family(name, "e2", {"moment": (1.0, 5.0)}) for name in ("good", "poor", "idle")]
+CHANCE = {"good": 0.5, "poor": 0.05, "idle": 0.0}
+PLAIN = replace(SearchSettings(), brood=0)
+
+
+def search_of(scenes=40, seed=0, settings=PLAIN, families=FAMILIES):
+    return Search(families, range(100, 100 + scenes), seed, settings, {family.name: True for family in families})
+
+
+def told(search, rounds, hopeless=()):
+    """What a planner is like that fails by chance; in `hopeless` scenes nobody ever comes near."""
+    for _ in range(rounds):
+        tries = search.ask()
+        outcomes = []
+        for one in tries:
+            luck = torch.rand((), generator=torch.Generator().manual_seed(hash((one.scene, one.seeds)) % 2**31)).item()
+            fails = luck < CHANCE[one.family] and one.scene not in hopeless
+            margin = PREVENTED if fails else -25.0 if one.scene in hopeless else -2.0
+            outcomes.append(Outcome(margin, 40.0, f"cell {one.scene}" if fails else "", 100.0))
+        search.tell(tries, outcomes)
+    return search
+
+
+def tries_of(search):
+    return [one for scene in search.tries for one in scene]
+
+
+def test_the_same_answers_lead_to_the_same_questions():
+    assert tries_of(told(search_of(), 6)) == tries_of(told(search_of(), 6))
+    assert tries_of(told(search_of(), 6)) != tries_of(told(search_of(seed=1), 6))
+
+
+def test_every_scene_is_tried_before_any_is_tried_more():
+    search = told(search_of(), PLAIN.cover)
+    assert {len(tries) for tries in search.tries} == {PLAIN.cover} and search.nfe == 100 * PLAIN.cover
+
+
+def test_tries_go_to_the_family_that_finds_and_not_to_hopeless_scenes():
+    search = told(search_of(), 20, hopeless=range(20))
+    counts = {name: sum(one.family == name for one in tries_of(search)) for name in CHANCE}
+    assert counts["good"] > 2 * counts["poor"] and counts["good"] > 2 * counts["idle"]
+    hopeless, others = (sum(map(len, part)) for part in (search.tries[:20], search.tries[20:]))
+    assert others > 1.5 * hopeless
+
+
+def test_it_finds_more_scenes_than_chance_at_equal_cost():
+    idle = [Family(f"idle {k}", "e2", {}) for k in range(6)]
+    CHANCE.update({family.name: 0.0 for family in idle})
+
+    def found(bandit, seed):
+        settings = replace(PLAIN, bandit=bandit, cover=1)
+        search = told(search_of(seed=seed, settings=settings, families=[FAMILIES[0], *idle]), 9)
+        return sum(any(outcome.cell for outcome in scene) for scene in search.outcomes)
+
+    learnt, blind = (sum(found(bandit, seed) for seed in range(5)) for bandit in (True, False))
+    assert learnt > 1.2 * blind
+
+
+def test_branches_begin_at_the_rise_of_the_hazard_of_the_nearest_try():
+    settings = replace(SearchSettings(), brood=3, branch_chance=1.0, cover=1, bandit=True)
+    search = told(search_of(scenes=10, settings=settings), 1)
+    tries = search.ask()
+    branches = [one for one in tries if one.parent >= 0]
+    assert branches and len(branches) % 3 == 0
+    for one in branches:
+        parent, outcome = search.tries[one.scene][one.parent], search.outcomes[one.scene][one.parent]
+        assert outcome.margin < PREVENTED
+        shared = len(one.seeds) - 1
+        assert shared <= 40 // 5 and one.seeds[:shared] == parent.seeds * shared
+    assert len({one.seeds for one in branches}) == len(branches)
+
+
+def test_nothing_branches_from_what_cannot_keep_a_prefix_or_comes_nowhere_near():
+    settings = replace(SearchSettings(), brood=3, branch_chance=1.0, cover=1)
+    far = told(search_of(scenes=10, settings=settings), 3, hopeless=range(10))
+    assert all(one.parent < 0 for one in tries_of(far))
+    fixed = search_of(scenes=10, settings=settings)
+    fixed.branches = {family.name: False for family in FAMILIES}
+    assert all(one.parent < 0 for one in tries_of(told(fixed, 3)))
+
+
+def test_a_portfolio_s_chances_are_those_of_beta_laws():
+    """The mean of many draws, without a scene's own tries, is the family's chance; a try in a scene halves it there."""
+    families = [Family("a", "e2", {}, chance=0.2), Family(BRANCH, "", {}, chance=0.2)]
+    portfolio, generator = Portfolio(families, 2), torch.Generator().manual_seed(0)
+    mean = torch.stack([portfolio.worth(generator) for _ in range(4000)]).mean(0)
+    torch.testing.assert_close(mean, torch.full_like(mean, 0.2), atol=0.02, rtol=0)
+    portfolio.tell(0, 0, 0.0, 0.0, families[0].nfe)
+    mean = torch.stack([portfolio.worth(generator) for _ in range(4000)]).mean(0)
+    family = 0.2 * 20 / 21
+    assert abs(mean[0, 0] - family / 2) < 0.02 and abs(mean[1, 0] - family) < 0.02
