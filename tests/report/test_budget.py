@@ -1,0 +1,88 @@
+"""The budget's table: what was found within each budget, in the mean of the seeds, with intervals by place."""
+
+import csv
+
+import pytest
+import torch
+
+from e2rl.evaluation.budget import TRIES
+from e2rl.metrics.realism import KINEMATICS, OF_ADVERSARIES
+from e2rl.report.budget import budget_figure, budget_rows, budget_tables, curve, write_budget
+
+SCENES = [(f"place {k // 2}", f"scene {k}") for k in range(40)]  # two scenes at each of twenty places
+
+
+def line(scene, seed, number, cell="", method="search", clean=0.0):
+    spent = {"tries": 1.0 + number, "nfe": 100.0 * (1 + number), "seconds": 0.1 * (1 + number)}
+    about = {"scene_id": f"scene {scene}", "seed": seed * TRIES + number, "method": method, "ego_policy": "idm"}
+    return about | {"cell": cell, "clean": clean} | spent
+
+
+def searched(method, found, rounds=4, seeds=(0, 1)):
+    """A try of every scene in each round; found(scene, seed, round): the cell of its failure."""
+    triples = ((scene, seed, number) for seed in seeds for number in range(rounds) for scene in range(40))
+    return [line(scene, seed, number, found(scene, seed, number), method) for scene, seed, number in triples]
+
+
+def one_row(told, budget, unit="nfe", method=0):
+    return budget_rows(told, SCENES, [budget], unit, {})[method]
+
+
+def test_what_is_found_grows_with_the_budget_and_is_the_mean_of_the_seeds():
+    """Scene k has a failure of cell k % 5 in round k % 4 of seed 0, and none of seed 1."""
+    told = searched("search", lambda scene, seed, number: f"{scene % 5}" if not seed and scene % 4 == number else "")
+    for rounds in (1, 2, 3, 4):
+        for unit, budget in (("tries", rounds), ("nfe", 100 * rounds), ("seconds", 0.1 * rounds)):
+            row = one_row(told, budget, unit)
+            assert row["scenes"]["mean"] == pytest.approx(100 * rounds / 4 / 2)
+            assert row["failures"]["mean"] == pytest.approx(rounds / 4 / 2)
+            assert row["cells"]["mean"] == pytest.approx(5 / 2)
+            assert (row["tries_a_scene"], row["nfe_a_scene"]) == (rounds, 100 * rounds)
+
+
+def test_the_interval_of_scenes_is_that_of_places():
+    """Half of the places have failures in both scenes: a binomial share of 20 places, not of 40 scenes."""
+    told = searched("search", lambda scene, seed, number: "a" if scene // 2 % 2 else "")
+    row = one_row(told, 400)
+    low, high = row["scenes"]["low"], row["scenes"]["high"]
+    assert row["scenes"]["mean"] == 50 and low == pytest.approx(50 - 196 * (0.25 / 20) ** 0.5, abs=4)
+    assert high == pytest.approx(50 + 196 * (0.25 / 20) ** 0.5, abs=4)
+
+
+def test_ratios_compare_the_first_method_with_the_others_in_the_same_draws():
+    both = [*searched("search", lambda scene, *_: "ab"[scene % 2] if scene % 2 or scene % 4 else "")]
+    both += searched("e2", lambda scene, *_: "a" if scene % 4 == 2 else "")
+    first, second = budget_rows(both, SCENES, [400], "nfe", {})
+    assert "scenes_ratio" not in first
+    assert second["scenes_ratio"]["mean"] == pytest.approx(3) and second["cells_ratio"]["mean"] == pytest.approx(2)
+    assert second["scenes_ratio"]["low"] > 1
+
+
+def test_realism_is_of_the_adversaries_of_the_tries_within_the_budget():
+    """Tries of round 0 drive as the log does, those of round 1 are off by more than the range of the measure."""
+    told = searched("search", lambda *_: "", rounds=2, seeds=(0,))
+
+    def sample(shift):
+        pair = torch.stack([torch.linspace(0, 1, 8) + shift, torch.linspace(0, 1, 8)]).double()
+        return dict.fromkeys((*KINEMATICS, *OF_ADVERSARIES), pair)
+
+    known = {("idm", "search", row["scene_id"], row["seed"]): sample(5.0 * (row["seed"] % TRIES)) for row in told}
+    of = [budget_rows(told, SCENES, [budget], "tries", known)[0]["real_adv"]["mean"] for budget in (1, 2)]
+    assert of[0] == pytest.approx(1) and of[1] < 0.5
+
+
+def test_tables_files_and_the_picture(tmp_path):
+    told = searched("search", lambda scene, *_: f"{scene % 7}") + searched("e2", lambda scene, *_: "0")
+    rows = budget_rows(told, SCENES, [200, 400], "nfe", {})
+    (table,) = budget_tables(rows, 40)
+    assert [cells[:2] for cells in table.rows] == [["search", "200"], ["e2", "200"], ["search", "400"], ["e2", "400"]]
+    assert "ratio" in table.markdown() and "idm" in table.title
+    write_budget(tmp_path / "budget.csv", rows)
+    with (tmp_path / "budget.csv").open(newline="") as file:
+        read = list(csv.DictReader(file))
+    assert float(read[1]["cells_ratio"]) == pytest.approx(7) and read[0]["cells_ratio"] == ""
+    figure = budget_figure(told, 40)
+    lines = figure.axes[0].get_lines()
+    assert [each.get_label() for each in lines] == ["search", "e2"] and len(figure.axes) == 6
+    x, y = curve([row for row in told if row["method"] == "search"], "nfe", "cells", 40)
+    assert max(y) == 7 and x == sorted(x) and y == sorted(y)
