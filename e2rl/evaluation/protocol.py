@@ -12,6 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from e2rl.evaluation import rollout_files as files
+from e2rl.evaluation.atlas import ATLAS_FILE, find_atlas, write_atlas
 from e2rl.evaluation.modes import MODES_FILE, find_modes, write_modes
 from e2rl.evaluation.summary import empty_rows, group_of, metric_rows
 from e2rl.metrics.catalogue import SOURCE
@@ -210,8 +211,8 @@ def record(
 ) -> list[dict]:
     """The rows of metrics.json: summarise(rows, samples), with the counts of what errored where they have none.
 
-    Writes rollouts.csv, modes.json, metrics.json and, where rollouts errored, errored.json into a folder. A method of
-    which all rollouts errored has a row too, without metrics.
+    Writes rollouts.csv, modes.json, atlas.json, metrics.json and, where rollouts errored, errored.json into a folder. A
+    method of which all rollouts errored has a row too, without metrics.
 
     Raises:
         InputError: no rollout could be scored.
@@ -226,6 +227,7 @@ def record(
     ]
     if folder is not None:
         write_modes(folder / MODES_FILE, modes)
+        write_atlas(folder / ATLAS_FILE, find_atlas(rows))
         files.write_rows(folder / files.TABLE, rows)
         files.write_metrics(folder / files.METRICS_FILE, result)
     return result

@@ -1,7 +1,7 @@
 """The failure report: one HTML file that opens offline, failures.html.
 
-It shows the failure modes, a replay of each failure, an index to search, the tables of the run and collisions over
-realism. Everything is inside the file: no script, font or picture is loaded from elsewhere.
+It shows the failure modes, a replay of each failure, the atlas, an index to search, the tables of the run and
+collisions over realism. Everything is inside the file: no script, font or picture is loaded from elsewhere.
 """
 
 import hashlib
@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
 from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, nulls, read_metrics, read_rows
+from e2rl.metrics.atlas import CELL, Cell, by_likelihood, cell_of
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.failure_tracks import CHANNELS, MAP_QUANTUM, encoded_map, failure_replay
@@ -31,7 +32,7 @@ GROUP = ("ego_policy", "method", "eta")
 COLUMNS = (  # of rollouts.csv, in the page's index and facts
     *(*GROUP, "scene_id", "seed", "approach", "ego_manoeuvre", "partner_manoeuvre", "contact_type", "duty"),
     *("counted", "at_fault", "preventable", "avoidable", "avoidable_1s", "evasion_accel", "cfr_adv"),
-    *("ego_speed", "partner_speed", "relvel", "contact_time"),
+    *("ego_speed", "partner_speed", "relvel", "contact_time", "transport"),
 )
 PLOTTED = ("cfr", "cfr_counted", "real", "real_adv")
 
@@ -100,11 +101,13 @@ def page_content(run: Path, metrics: Sequence[dict], modes: Mapping, methods: Se
     rows = [row for row in read_rows(run / TABLE) if is_failure(row) and group_key(row) in groups]
     names = {mode["mode"]: mode["name"] for mode in modes["modes"]}
     typical = {mode["typical"]["file"] for mode in modes["modes"]}
+    cells, places = atlas_places(rows)
     return {
         "run": {name: metrics[0][name] for name in ("dataset", "split", "n_scenes", "n_seeds", "git", "command")},
         "groups": list(groups.values()),
         "modes": names,
-        "failures": [failure(row, names, typical) for row in rows],
+        "cells": [dict(zip(CELL, cell, strict=True)) for cell in cells],
+        "failures": [failure(row, names, typical) | place for row, place in zip(rows, places, strict=True)],
         "rows": rows,
         "points": [plotted(row) for row in metrics if row.get("stage") is None],
         "about": {metric.name: metric.about for metric in METRICS.values()},
@@ -122,6 +125,17 @@ def failure(row: Mapping, names: Mapping[int, str], typical: set[str]) -> dict[s
     mode = int(row["mode"]) if row["mode"] in names else OTHER
     values = {name: round(row[name], 4) if isinstance(row[name], float) else row[name] for name in COLUMNS}
     return values | {"mode": mode, "typical": rollout_name(row) in typical, "replay": None}
+
+
+def atlas_places(rows: Sequence[Mapping]) -> tuple[list[Cell], list[dict[str, int | None]]]:
+    """The cells of the atlas, and each failure's place in it: `cell`, a position in the list (None: not preventable),
+    and `rank`, 0 for the likeliest of all rows."""
+    found = [cell_of(row) for row in rows]
+    cells = sorted({cell for cell in found if cell})
+    order = sorted(range(len(rows)), key=lambda position: by_likelihood(rows[position]))
+    ranks = {position: rank for rank, position in enumerate(order)}
+    number = {cell: position for position, cell in enumerate(cells)}
+    return cells, [{"cell": number[cell] if cell else None, "rank": ranks[at]} for at, cell in enumerate(found)]
 
 
 def plotted(row: Mapping) -> dict[str, Any]:
@@ -146,12 +160,28 @@ def add_replays(run: Path, rows: Sequence[dict], index: Sequence[dict], count: i
 
 
 def replay_order(index: Sequence[Mapping]) -> list[int]:
-    """Positions of failures in the order in which they get a replay: the typical ones, then in turn one of each mode of
-    each method."""
+    """Positions of failures in the order in which they get a replay: the typical ones, the likeliest of each cell of
+    the atlas (of a planner, then of each of its traffic alone), then in turn one of each mode of each method."""
+    planner, alone = likeliest(index, GROUP[:1]), likeliest(index, GROUP)
     seen: Counter[tuple] = Counter()
     turns = []
     for entry in index:
         key = (*group_key(entry), entry["mode"])
         turns.append(seen[key])
         seen[key] += 1
-    return sorted(range(len(index)), key=lambda position: (not index[position]["typical"], turns[position], position))
+
+    def place(position: int) -> tuple:
+        first = index[position]["typical"], position in planner, position in alone
+        return (*(not each for each in first), turns[position], position)
+
+    return sorted(range(len(index)), key=place)
+
+
+def likeliest(index: Sequence[Mapping], among: Sequence[str]) -> set[int]:
+    """Positions of the likeliest failure of each cell, of the failures that have the same values of `among`."""
+    found: dict[tuple, int] = {}
+    for position in sorted(range(len(index)), key=lambda position: index[position]["rank"]):
+        entry = index[position]
+        if entry["cell"] is not None:
+            found.setdefault((entry["cell"], *(entry[name] for name in among)), position)
+    return set(found.values())

@@ -5,7 +5,9 @@ from pathlib import Path
 import torch
 
 from e2rl.evaluation.protocol import record
+from e2rl.evaluation.rollout_files import TABLE, read_rows, write_rows
 from e2rl.evaluation.summary import metric_rows
+from e2rl.metrics.failure_modes import is_failure
 from e2rl.metrics.score import score_rollouts
 from e2rl.sim.rollout_file import ROLLOUTS
 from e2rl.sim.rollouts import Rollouts
@@ -43,3 +45,15 @@ def write_run(folder: Path, rollouts: dict[str, Rollouts]) -> Path:
 def failed_run(folder: Path) -> Path:
     """A run of two methods with failures; those of `planned` know plans and evasions."""
     return write_run(folder, {"e2": random_rollouts(12, seed=21), "planned": planned(random_rollouts(12, seed=20))})
+
+
+def preventable_run(folder: Path) -> Path:
+    """The same run, but each failure is preventable, in one of three cells of the atlas; those of the first know no
+    nats."""
+    rows = read_rows(failed_run(folder) / TABLE)
+    same = {"cfr_preventable": 1.0, "partner_manoeuvre": "brakes", "contact_type": "front", "ego_speed": 7.0}
+    for number, row in enumerate(filter(is_failure, rows)):
+        row |= same | {"duty": ("none", "none", "light")[number % 3], "approach": ("ahead", "oncoming")[number % 3 > 0]}
+        row["transport"] = float(97 * number % 31) if number % 3 else float("nan")
+    write_rows(folder / TABLE, rows)
+    return folder

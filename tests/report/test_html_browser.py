@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from e2rl.evaluation.rollout_files import TABLE, read_rows
+from e2rl.metrics.atlas import atlas_of
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.html import PAGE, write_report
 from e2rl.sim.rollout_file import ROLLOUTS, Rollout, rollout_name
-from tests.report.failed_run import SCENE, failed_run
+from tests.report.failed_run import SCENE, failed_run, preventable_run
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
@@ -126,3 +127,31 @@ def test_filters_keep_what_they_say_and_names_from_files_are_text(run, page):
     scenes = [row[heads.index("Scene")] for row in rows_of(page)]
     assert scenes and all(name.startswith(SCENE) for name in scenes)
     assert not page.find_elements("tag name", "img") and not page.find_elements("css selector", ".caption b")
+
+
+def test_the_atlas_shows_the_likeliest_failure_of_a_cell_in_its_scope(chromium, tmp_path):
+    run = preventable_run(tmp_path)
+    chromium.get_log("browser")  # what earlier tests left
+    chromium.get(write_report(run).as_uri())
+    wait_for(chromium, "return page.player.replay !== null")
+    failures = failures_of(run)
+    for method in ("", "planned"):
+        if method:
+            select = support.Select(chromium.find_element("css selector", "#scope select"))
+            select.select_by_visible_text(next(each.text for each in select.options if each.text.startswith(method)))
+        atlas = atlas_of([row for row in failures if method in ("", row["method"])])
+        buttons = chromium.find_elements("css selector", "#atlas button")
+        assert len(buttons) == len(atlas) == 3
+        for button in buttons:  # in the order of the grid
+            approach = button.find_element("xpath", "./ancestor::tr/th").text
+            light = "light" in button.get_attribute("title")
+            found = atlas[approach, "brakes", "light" if light else "none", "5 to 10 m/s", "front"]
+            nats = "nats unknown" if approach == "ahead" else f"{found.likeliest['transport']:.0f} nats"
+            assert f"{found.failures} failure" in button.text and nats in button.text
+            button.send_keys("\n")
+            shown = failures[chromium.execute_script("return page.player.failure.number")]
+            assert shown["transport"] == found.likeliest["transport"] or approach == "ahead"
+            assert (shown["scene_id"], shown["seed"]) == (found.likeliest["scene_id"], found.likeliest["seed"])
+            pressed = [each.get_attribute("aria-pressed") for each in buttons]
+            assert pressed == [str(each == button).lower() for each in buttons]
+    assert chromium.get_log("browser") == []

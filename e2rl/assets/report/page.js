@@ -95,7 +95,7 @@ class Page {
     showRealism(document.getElementById("realism"), points, this.axes.rate, this.axes.realism);
   }
 
-  /** Show the failures of some groups: their modes, the typical case of the first, the index. */
+  /** Show the failures of some groups: their modes, the typical case of the first, the atlas, the index. */
   show(groups) {
     const among = (failure) =>
       groups.some(
@@ -106,6 +106,8 @@ class Page {
     this.summarise(failures, groups);
     this.index.load(failures);
     showModes(document.getElementById("modes"), this.modes, failures.length, this.store, (mode) => this.openMode(mode));
+    const atlas = groupByCell(failures, this.report.cells);
+    showAtlas(document.getElementById("atlas"), atlas, (failure) => this.open(failure));
     document.getElementById("player").hidden = !failures.length;
     if (failures.length) this.open(this.modes[0].typical);
   }
@@ -138,6 +140,7 @@ class Page {
     this.index.mark(failure);
     const buttons = document.querySelectorAll(".mode");
     this.modes.forEach(({ mode }, index) => buttons[index].setAttribute("aria-pressed", String(mode === failure.mode)));
+    markCell(document.getElementById("atlas"), failure);
     this.player.show(failure, capital(modeName(failure.mode, this.report.modes)));
   }
 }
