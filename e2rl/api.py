@@ -24,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from e2rl.evaluation.methods import build_ego, build_prior, build_traffic
-from e2rl.evaluation.protocol import Method, Setup
+from e2rl.evaluation.protocol import Method, Setup, Task
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.ego import Ego
 from e2rl.prior.prior import Prior
@@ -77,7 +77,7 @@ def roll_out(
     All are simulated at once. eta: adversarial intensity, 0 to 3.
     """
     setup = Setup(scenes, ego, type(ego).__name__, SimSettings(), device=device)
-    tasks = [(scene, seed) for seed in seeds for scene in range(len(scenes))]
+    tasks = [Task(scene, seed) for seed in seeds for scene in range(len(scenes))]
     return setup.roll_out(Method(type(traffic).__name__, traffic, float(eta)), tasks)
 
 
@@ -109,7 +109,7 @@ def find_failures(
     order = sorted(range(len(scenes)), key=lambda scene: (turns[scene], scene))
     failures: list[Failure] = []
     for begin in range(0, len(order), AT_ONCE):
-        tasks = [(scene, seed) for scene in order[begin : begin + AT_ONCE]]
+        tasks = [Task(scene, seed) for scene in order[begin : begin + AT_ONCE]]
         rollouts = setup.roll_out(Method(names[1], traffic, float(eta)), tasks)
         rows = score_rollouts(rollouts)[0]
         failures += [Failure(rollouts.rollout(k), row) for k, row in enumerate(rows) if row["cfr"]]

@@ -17,7 +17,13 @@ PATH = re.compile(rf"(?<![\w./<>-])(?:{FOLDERS})/[\w./<>*{{}}\[\]-]*")
 PLACEHOLDER = re.compile(r"[<>*{}\[\]]|\.\.\.|(?<![a-zA-Z])[A-Z]{3,}(?![a-zA-Z])")  # <name>, *, {a,b}, ..., NAME
 DOCUMENT = re.compile(r"(?<![\w/-])[\w-]+\.md\b")
 SECTION = re.compile(r"docs/method\.md, sections? (\d+)(?: to (\d+))?")
-WRITTEN = {"tables.md", "methods.md", "egos.md", "budget.md", "tutorial.md"}  # documents that a run writes, or the site's build
+WRITTEN = {
+    "tables.md",
+    "methods.md",
+    "egos.md",
+    "budget.md",
+    "tutorial.md",
+}  # documents that a run writes, or the site's build
 COMMANDS = r"(?:python|torchrun[^`\n]*?) (?:evaluate|train)\.py|e2rl (?:evaluate|train|tune|prior-tables|skeleton)"
 COMMAND = re.compile(rf"({COMMANDS})(?![\w-])((?:\\\n|[^`\n])*)")
 EXTENDED = "--config-dir"

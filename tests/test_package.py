@@ -7,7 +7,7 @@ import pytest
 
 import e2rl
 from e2rl.evaluation.methods import build_prior, build_sim, build_traffic
-from e2rl.evaluation.protocol import Method, Setup
+from e2rl.evaluation.protocol import Method, Setup, Task
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
 
@@ -30,7 +30,7 @@ def test_a_notebook_rolls_out_what_the_command_does():
     config = load_config("evaluate", ["num_scenes=2"])
     setup = Setup(scenes, ego, "lane_graph", build_sim(config))
     traffic = build_traffic(config.synthesizer, build_prior(config)[0])
-    theirs = setup.roll_out(Method("e2", traffic, 2.0), [(0, 0), (1, 0)])
+    theirs = setup.roll_out(Method("e2", traffic, 2.0), [Task(0, 0), Task(1, 0)])
     assert (ours.states == theirs.states).all() and ours.adversaries.any()
     rows = e2rl.score(ours)
     assert [row["scene_id"] for row in rows] == scenes.scene_id and {row["eta"] for row in rows} == {2.0}

@@ -8,7 +8,7 @@ import argparse
 from pathlib import Path
 
 from e2rl.evaluation.methods import build_ego, build_prior, build_sim, build_traffic
-from e2rl.evaluation.protocol import Method, Setup
+from e2rl.evaluation.protocol import Method, Setup, Task
 from e2rl.metrics.score import score_rollouts
 from e2rl.report.picture import Replay
 from e2rl.report.videos import save_animation
@@ -40,7 +40,7 @@ def main(arguments: list[str] | None = None) -> None:
             method = Method(
                 traffic, build_traffic(load_choice("synthesizer", traffic), prior), ETA if traffic == "e2" else 0.0
             )
-            rollouts = setup.roll_out(method, [(scenes.index(options.scene), SEED)])
+            rollouts = setup.roll_out(method, [Task(scenes.index(options.scene), SEED)])
             row = score_rollouts(rollouts)[0][0]
             frames = Replay(rollouts.rollout(0), row, METRES, PIXELS, caption=caption).frames()
             save_animation(options.out / f"{name}.gif", frames, COLOURS)

@@ -18,8 +18,8 @@ from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
 from e2rl.evaluation.methods import as_list, build_traffic, method_config, varied
-from e2rl.evaluation.protocol import WHOLE, Method, Scored, Setup, has_files
-from e2rl.metrics.failure_modes import word
+from e2rl.evaluation.protocol import WHOLE, Method, Scored, Setup, Task, has_files
+from e2rl.metrics.atlas import cell_of
 from e2rl.prior.prior import Prior
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
@@ -32,7 +32,6 @@ from e2rl.search.tries import Family, Try, family_of
 SEARCH = "search"  # the method whose tries are drawn from families
 TRIES_FILE = "tries.csv"
 TRIES = 10_000  # numbers of rollouts that one seed of a search has in a scene
-SPEED_BAND = 5.0  # m/s
 TOLD = ("scene_id", "location", "seed", "method", "ego_policy", "family", "parent", "margin", "cell", "clean")
 SPENT = ("tries", "nfe", "seconds")  # a scene, of the search so far
 UNTRIED = Outcome(float("-inf"), 0.0, "", 0.0)  # of a try that errored
@@ -103,8 +102,8 @@ def changed_method(config: DictConfig, family: Family) -> DictConfig:
         for key, value in family.changes.items():
             OmegaConf.update(changed, key, value, merge=True)
     except OmegaConfBaseException as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"search.families.{family.name}.changes: {reason}; compare it with conf/synthesizer") from error
+        where, reason = f"search.families.{family.name}.changes", str(error).splitlines()[0]
+        raise InputError(f"{where}: {reason}; compare it with conf/synthesizer") from error
     return changed
 
 
@@ -159,7 +158,7 @@ def spend(
 
             def work(job: tuple[int, Method, list]) -> Scored:
                 number, method, tasks = job
-                identity = [plan.name, setup.ego_name, method.eta, [task[2].plain() for task in tasks]]
+                identity = [plan.name, setup.ego_name, method.eta, [task.one.plain() for task in tasks]]
                 compute = partial(setup.score, method, tasks, into)
                 return parts.result(f"tries-{number:06}", identity, compute, partial(has_files, into))
 
@@ -189,10 +188,10 @@ def batches(
     by_method: dict[int, list] = {}
     for one in sorted(tries, key=lambda one: (one.scene, one.number)):
         tasks = by_method.setdefault(id(plan.traffic[one.family]), [])  # of one traffic method
-        tasks.append((scenes[one.scene], row_seed(seed, one), one))
+        tasks.append(Task(scenes[one.scene], row_seed(seed, one), one))
     jobs = []
     for tasks in by_method.values():
-        method = replace(plan.traffic[tasks[0][2].family], name=plan.name)
+        method = replace(plan.traffic[tasks[0].one.family], name=plan.name)
         count = -(-len(tasks) // setup.batch)
         jobs += [(method, tasks[k * len(tasks) // count : (k + 1) * len(tasks) // count]) for k in range(count)]
     return [(first + k, *job) for k, job in enumerate(jobs)]
@@ -203,24 +202,20 @@ def row_seed(seed: int, one: Try) -> int:
     return seed * TRIES + one.number
 
 
-def cell_of(row: Mapping) -> str:
+def cell_name(row: Mapping) -> str:
     """The cell of the atlas that a rollout's failure lies in; "" where it has no preventable one."""
-    if row["cfr_preventable"] != 1:
-        return ""
-    band = int(row["ego_speed"] // SPEED_BAND * SPEED_BAND)
-    words = [word(row, name) for name in ("approach", "partner_manoeuvre", "duty", "contact_type")]
-    return ", ".join([*words, f"{band} m/s"])
+    return ", ".join(cell_of(row) or ())
 
 
 def outcome_of(row: Mapping) -> Outcome:
     """What the search is told of a rollout."""
-    return Outcome(row["margin"], row["hazard_step"], cell_of(row), row["nfe"])
+    return Outcome(row["margin"], row["hazard_step"], cell_name(row), row["nfe"])
 
 
 def told_of(one: Try, row: Mapping) -> dict[str, Any]:
     """A line of TRIES_FILE, without SPENT."""
     family = BRANCH if one.parent >= 0 else one.family
-    about = {"family": family, "parent": one.parent, "cell": cell_of(row), "clean": row["cfr_clean"]}
+    about = {"family": family, "parent": one.parent, "cell": cell_name(row), "clean": row["cfr_clean"]}
     return {name: about[name] if name in about else row[name] for name in TOLD}
 
 

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
-from e2rl.evaluation.protocol import Method, Setup
+from e2rl.evaluation.protocol import Method, Setup, Task
 from e2rl.evaluation.summary import metric_row
 from e2rl.metrics.catalogue import META_STAGE
 from e2rl.metrics.meta_metric import (
@@ -132,14 +132,14 @@ def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, parts: Par
             done, errored, state = parts.load(name, identity) or (0, [], None)
             tally, tasks = (
                 Tally(scenes, state),
-                [(scene, seed) for seed in range(count) for scene in range(len(scenes))],
+                [Task(scene, seed) for seed in range(count) for scene in range(len(scenes))],
             )
             bar.update(done)
             for begin in range(done, len(tasks), setup.batch):
                 batch = tasks[begin : begin + setup.batch]
                 driven, others = attempt(partial(setup.roll_out, method), batch)
                 for pairs, rolled_out in driven:
-                    tally.add(torch.tensor([scene for scene, _ in pairs]), rolled_out, rollouts // count)
+                    tally.add(torch.tensor([task.scene for task in pairs]), rolled_out, rollouts // count)
                 errored += [why["reason"] for _, why in others]
                 parts.save(name, identity, (begin + len(batch), errored, tally.state))
                 bar.update(len(batch))

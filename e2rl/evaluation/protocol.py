@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -33,9 +33,16 @@ from e2rl.traffic.traffic import Traffic
 
 SEEDS_APART = 1_000_003
 WHOLE = (0, 1)  # the only shard of a run
-Task = tuple[int, int] | tuple[int, int, Try]  # position of a scene, sampling seed; of a search the try
 # Rows and realism samples, one of each per rollout; and the entries of errored.json of rollouts that errored.
 Scored = tuple[list[dict], list[dict[str, Tensor]], list[dict]]
+
+
+class Task(NamedTuple):
+    """A rollout to make: the position of its scene, its seed (of a search: its number), and its try (None: none)."""
+
+    scene: int
+    seed: int
+    one: Try | None = None
 
 
 @dataclass
@@ -72,16 +79,13 @@ class Setup:
 
     def roll_out(self, method: Method, tasks: Sequence[Task]) -> Rollouts:
         """The rollouts of (scene, seed) pairs under one method."""
-        index, seed = (torch.tensor(values) for values in zip(*(task[:2] for task in tasks), strict=True))
-        tries = [task[2] for task in tasks if len(task) > 2]
-        if tries:
-            noise, script = scripts_of(tries)
-        else:
-            noise, script = torch.tensor([scene_seed(self.scenes.number[scene], own) for scene, own in tasks]), None
+        index, tries = torch.tensor([task.scene for task in tasks]), [task.one for task in tasks if task.one]
+        noise = torch.tensor([scene_seed(self.scenes.number[task.scene], task.seed) for task in tasks])
+        noise, script = scripts_of(tries) if tries else (noise, None)
         eta = torch.full((len(tasks),), float(method.eta), dtype=torch.float64)
         given = (self.ego, method.traffic, self.sim, self.device)
         rollouts = roll_out(self.scenes, index, noise, eta, *given, script=script)
-        rollouts.seed = seed
+        rollouts.seed = torch.tensor([task.seed for task in tasks])
         for name, text in zip(SOURCE, self.source(method), strict=True):
             rollouts.set(name, [text] * len(tasks))
         return rollouts
@@ -97,14 +101,18 @@ class Setup:
         for done, rollouts in parts:
             found, features = score_rollouts(rollouts)
             if self.evasions:
-                add_avoidable(found, rollouts, self.scenes.batch([task[0] for task in done]), self.sim)
+                add_avoidable(found, rollouts, self.scenes.batch([task.scene for task in done]), self.sim)
             if folder is not None:
                 rollouts.to_npz(folder)
             rows += found
             samples += features
         about = dict(zip(SOURCE, self.source(method), strict=True)) | {"eta": float(method.eta)}
         names = self.scenes.scene_id
-        return rows, samples, [about | {"scene_id": names[task[0]], "seed": task[1]} | why for task, why in errored]
+        return (
+            rows,
+            samples,
+            [about | {"scene_id": names[task.scene], "seed": task.seed} | why for task, why in errored],
+        )
 
 
 def check_names(*names: str) -> None:
@@ -165,7 +173,7 @@ def drive_all(
         InputError: files of a worker do not arrive.
     """
     first = setups[0]
-    tasks = [(scene, seed) for seed in seeds for scene in (range(len(first.scenes)) if only is None else only)]
+    tasks = [Task(scene, seed) for seed in seeds for scene in (range(len(first.scenes)) if only is None else only)]
     count = -(-len(tasks) // first.batch)
     batches = [tasks[k * len(tasks) // count : (k + 1) * len(tasks) // count] for k in range(count)]
     jobs = list(enumerate((setup, method, batch) for setup in setups for method in methods for batch in batches))
@@ -173,7 +181,7 @@ def drive_all(
 
     def work(job: Job) -> Scored:
         number, (setup, method, batch) = job
-        identity = [setup.ego_name, method.name, float(method.eta), batch]
+        identity = [setup.ego_name, method.name, float(method.eta), [task[:2] for task in batch]]
         compute = partial(setup.score, method, batch, into)
         return parts.result(f"rollouts-{number:06}", identity, compute, partial(has_files, into))
 

@@ -65,12 +65,13 @@ class Search:
     seed: int
     settings: SearchSettings
     branches: Mapping[str, bool]
-    tries: list[list[Try]] = field(init=False)
+    tries: list[list[Try]] = field(init=False)  # of each scene
     outcomes: list[list[Outcome]] = field(init=False)
     cells: set[str] = field(init=False, default_factory=set)
 
     def __post_init__(self) -> None:
-        self.tries, self.outcomes = ([[] for _ in self.numbers] for _ in range(2))  # type: ignore[misc]
+        self.tries = [[] for _ in self.numbers]
+        self.outcomes = [[] for _ in self.numbers]
         self._portfolio = Portfolio(
             [*self.families, Family(BRANCH, "", {}, chance=self.settings.branch_chance)],
             len(self.numbers),

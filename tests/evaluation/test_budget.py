@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from e2rl.evaluation.budget import TRIES, Plan, build_plans, cell_of, spend, write_tries
+from e2rl.evaluation.budget import TRIES, Plan, build_plans, spend, write_tries
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.config import load_config
@@ -84,13 +84,6 @@ def test_a_method_that_evaluates_no_network_has_no_budget_of_evaluations(setup):
     still = Plan("still", [Family("still", "still", {})], traffic, SearchSettings())
     with pytest.raises(InputError, match="budget_unit=tries"):
         found(setup, still, unit="nfe")
-
-
-def test_only_preventable_failures_have_a_cell():
-    row = {"cfr_preventable": 1, "ego_speed": 12.0, "approach": "oncoming", "partner_manoeuvre": "brakes"}
-    row |= {"duty": "none", "contact_type": "front"}
-    assert cell_of(row) == "oncoming, brakes, none, front, 10 m/s"
-    assert cell_of(row | {"cfr_preventable": 0}) == "" == cell_of(row | {"cfr_preventable": float("nan")})
 
 
 def test_a_line_for_each_try(setup, plan, tmp_path):

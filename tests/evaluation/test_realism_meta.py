@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from e2rl.evaluation.meta_table import Tally, evaluated, log_split_half, meta_rows, summarise_meta
-from e2rl.evaluation.protocol import Method, Setup
+from e2rl.evaluation.protocol import Method, Setup, Task
 from e2rl.metrics.catalogue import META_STAGE, STAGES
 from e2rl.metrics.meta_metric import FEATURES, SMOOTHING, meta_metric
 from e2rl.planners.log_replay import ReplayEgo
@@ -48,7 +48,7 @@ def setup_of(scene_set, batch=64):
 def sampled(scene_set, seeds):
     """[(scene indices, rollouts)] of a random prior, one for each seed."""
     method, setup, index = Method("nominal", nominal()), setup_of(scene_set), torch.arange(len(scene_set))
-    return [(index, setup.roll_out(method, [(k, seed) for k in range(len(scene_set))])) for seed in seeds]
+    return [(index, setup.roll_out(method, [Task(k, seed) for k in range(len(scene_set))])) for seed in seeds]
 
 
 def likelihoods(scene_set, parts):

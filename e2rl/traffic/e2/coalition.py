@@ -137,7 +137,7 @@ class Coalitions(NominalTraffic):
         begun: dict[str, Any] = {**vars(nominal), **nobody, **costs}
         return E2State(**begun, intensity=eta, script=script, near=near, far=far, knots=knots)
 
-    def with_own(self, state: E2State, before: E2State) -> E2State:  # type: ignore[override]
+    def with_own(self, state: E2State, before: E2State) -> E2State:
         """Returns the state with the seeds and the script of `before`."""
         return replace(super().with_own(state, before), script=before.script)
 

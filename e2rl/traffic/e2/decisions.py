@@ -3,7 +3,7 @@
 The rule is the mode of every distribution of attacks: a try of which nothing is drawn is e2 as it stands.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ BY_RULE = -1.0  # a moment of meeting that nobody asks for
 
 
 class Decisions(NamedTuple):
-    """Decisions of B rollouts, each [B] (or one for all).
+    """Decisions of one rollout, or (`decisions_at`) of B rollouts, each [B].
 
     strength: factor of eta, 0: nobody is controlled; whom: index into WHOM; patience: factor of how late adversaries
     give way; owes: 1, or 0: they do not give way; wrong_way: s that an interception weighs more if it ends against the
@@ -25,14 +25,14 @@ class Decisions(NamedTuple):
     meet the ego; kernels: 1, or 0: none are drawn.
     """
 
-    strength: Tensor | float = 1.0
-    whom: Tensor | float = ANY
-    patience: Tensor | float = 1.0
-    owes: Tensor | float = 1.0
-    wrong_way: Tensor | float = 0.0
-    moment: Tensor | float = BY_RULE
-    scatter: Tensor | float = 0.0
-    kernels: Tensor | float = 1.0
+    strength: Any = 1.0
+    whom: Any = ANY
+    patience: Any = 1.0
+    owes: Any = 1.0
+    wrong_way: Any = 0.0
+    moment: Any = BY_RULE
+    scatter: Any = 0.0
+    kernels: Any = 1.0
 
 
 RULE = Decisions()

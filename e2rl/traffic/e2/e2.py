@@ -89,8 +89,8 @@ class E2(Coalitions):
             attack, kernels = self._kernels(state, world, ego_plan, context, acts)
             state, x0, kl, jump = self._best(state, attack, kernels, anchor, context, now.noise)
         members = state.coalition | state.drawn
-        now, given = state.now, (self.responsibility, self.yielding, world, members)
-        context.obstacles.duty = duty_of(*given, state.eta, now.patience, now.owes > 0)
+        decided, given = state.now, (self.responsibility, self.yielding, world, members)
+        context.obstacles.duty = duty_of(*given, state.eta, decided.patience, decided.owes > 0)
         return replace(state, path_kl=state.path_kl + kl, anchor_jump=state.anchor_jump + jump), x0, context
 
     def _afforded(self, state: E2State, world: World, anchor: Anchor) -> tuple[E2State, Anchor]:
