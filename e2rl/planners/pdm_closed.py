@@ -1,0 +1,202 @@
+"""PDM-Closed (Dauner et al., "Parting with Misconceptions about Learning-based Vehicle Motion Planning", CoRL 2023).
+
+Fifteen proposals follow the mission: IDM at five fractions of the speed limit, on three lateral offsets. Each is driven
+by the simulator's own vehicle, and scored by nuPlan's closed-loop terms against others that keep their velocity. The
+best is driven; where even that is going to collide within two seconds, the ego brakes as hard as it can.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from e2rl.planners.candidates import drive
+from e2rl.planners.ego import PLAN_STEPS, Ego
+from e2rl.planners.path import MissionPath
+from e2rl.planners.sampling import take
+from e2rl.planners.scoring import nearest
+from e2rl.run.settings import configured, setting
+from e2rl.scenes.boxes import corners, separation, to_frame
+from e2rl.scenes.drivable_area import off_road
+from e2rl.scenes.recording import DT
+from e2rl.scenes.route import project
+from e2rl.sim import dynamics
+from e2rl.sim.dynamics import constant_velocity, wrap
+from e2rl.sim.leaders import IDMParameters, idm_acceleration
+from e2rl.sim.mission import limit_at
+from e2rl.sim.world import World
+
+FRACTIONS = (1.0, 0.8, 0.6, 0.4, 0.2)  # of the speed limit
+OFFSETS = (0.0, 1.0, -1.0)  # m beside the mission
+HORIZON = 40  # steps that are scored: 4 s
+STRIDE = 2  # steps between two scored states
+LOOKS = (0.3, 0.6, 0.9)  # s ahead at constant velocity, within which nobody may be hit
+STOPPED = 0.1  # m/s: an ego that stands is not at fault
+TOLERANCE = 0.3  # m that a corner may leave the drivable area by, or more than now
+PROGRESS, TIME_TO_COLLISION, COMFORT = 5.0, 5.0, 2.0  # weights
+LEAST_PROGRESS = 0.1  # m: where no proposal drives farther, all have all progress
+ACCELERATIONS = (-4.05, 2.40)  # m/s^2, comfortable along the way; the others are bounds of the absolute value
+LATERAL, JERK, YAW_RATE, YAW_ACCELERATION = 4.89, 8.37, 0.95, 1.93  # m/s^2, m/s^3, rad/s, rad/s^2
+SOON = 2.0  # s before a collision of the best proposal from which on the ego brakes
+CHUNK = 16  # scenes planned for at a time: fits the processor's cache
+
+
+class Others(NamedTuple):
+    """M agents at constant velocity: states [B, M, T, 4] at every STRIDE-th step, size [B, M, 2], seen [B, M] bool."""
+
+    states: Tensor
+    size: Tensor
+    seen: Tensor
+
+
+class Scores(NamedTuple):
+    """Of P proposals, each [B, P]: the score in [0, 1], and the time [s] of the first collision at fault, inf: none."""
+
+    score: Tensor
+    collides: Tensor
+
+
+@configured("ego/pdm_closed")
+@dataclass(eq=False)
+class PDMClosedEgo(Ego):
+    """The best of fifteen IDM proposals by nuPlan's terms. Settings: conf/ego/pdm_closed.yaml."""
+
+    desired_speed: float = setting(low=0.1)
+    headway: float = setting(low=0)
+    standstill_gap: float = setting(low=0)
+    acceleration: float = setting(low=0.01)
+    braking: float = setting(low=0.01)
+    emergency_braking: float = setting(low=0)
+    shift_time: float = setting(low=0)
+    agents: int = setting(low=1)
+    replan_every: int = setting(low=1, high=PLAN_STEPS)
+
+    def plan(self, world: World) -> Tensor:
+        """The states [B, PLAN_STEPS, 4] of the best proposal, or of an emergency brake."""
+        rows = torch.arange(len(world.step), device=world.step.device)
+        return torch.cat([self._plan(take(world, part)) for part in rows.split(CHUNK)])
+
+    def _plan(self, world: World) -> Tensor:
+        proposals, distance = self.proposals(world)
+        scores = score(world, proposals, distance, self._others(world, range(STRIDE, HORIZON + 1, STRIDE)))
+        best = scores.score.argmax(1)
+        row = torch.arange(len(best), device=best.device)
+        brake = torch.tensor([-self.emergency_braking, 0.0], device=best.device).expand(len(best), PLAN_STEPS, 2)
+        stop = dynamics.rollout(world.states[:, 0], brake)
+        return torch.where((scores.collides[row, best] <= SOON)[:, None, None], stop, proposals[row, best])
+
+    def proposals(self, world: World) -> tuple[Tensor, Tensor]:
+        """States [B, P, PLAN_STEPS, 4] of the proposals, and the metres [B, P] along the mission to their ends."""
+        path, start = MissionPath(world), world.states[:, 0]
+        offset = start.new_tensor(OFFSETS).repeat_interleave(len(FRACTIONS))
+        speed = self.speeds(world, path, offset, start.new_tensor(FRACTIONS).repeat(len(OFFSETS)))
+        shift = offset[:, None].expand(len(start), -1, 1)
+        found = drive(start, path, speed, shift, torch.full_like(shift, self.shift_time))
+        return found.states, found.distance
+
+    def speeds(self, world: World, path: MissionPath, offset: Tensor, fraction: Tensor) -> Tensor:
+        """Speeds [B, P, PLAN_STEPS + 1] m/s by IDM behind whom the offsets [P] m meet, and before red lights, at
+        fractions [P] of the speed limit."""
+        driver = IDMParameters(self.headway, self.standstill_gap, self.acceleration, self.braking)
+        others, half = self._others(world, range(PLAN_STEPS)), world.scene["size"][:, 0] / 2
+        s, d, heading = (x.unflatten(1, others.states.shape[1:3]) for x in _onto(path, others.states))
+        turn = others.states[..., 2] - heading
+        along, side = (_extent(others.size, turn, axis) for axis in (0, 1))
+        leads = (d[:, None] - offset[:, None, None]).abs() < (side + half[:, 1, None, None])[:, None]
+        leads &= others.seen[:, None, :, None]  # [B, P, M, T]
+        rear, leading = (s - along)[:, None], (others.states[..., 3] * turn.cos())[:, None].clamp(min=0)
+        light = (path.s + path.stop_distance(self.braking) + self.standstill_gap)[:, None]
+        way = path.s[:, None].expand(-1, len(offset))
+        now = world.states[:, :1, 3].expand_as(way)
+        found = [now]
+        for t in range(PLAN_STEPS):
+            limit = limit_at(path.mission, way)
+            wanted = fraction * torch.where(limit > 0, limit, self.desired_speed)
+            front = way + half[:, :1]
+            ahead = leads[..., t] & (s[:, None, :, t] > way[..., None])
+            gap, nearest = (rear[..., t] - front[..., None]).masked_fill(~ahead, torch.inf).min(-1)
+            pace = leading[..., t].expand(ahead.shape).gather(-1, nearest[..., None])[..., 0]
+            pace, gap = torch.where(light - way < gap, 0.0, pace), torch.minimum(gap, (light - way).clamp(min=0.01))
+            asked = idm_acceleration(now, wanted, gap, pace, driver, improved=True).clamp(-dynamics.MAX_LATERAL)
+            after = (now + DT * asked).clamp(0, dynamics.MAX_SPEED)
+            way, now = way + (now + after) / 2 * DT, after
+            found.append(now)
+        return torch.stack(found, -1)
+
+    def _others(self, world: World, steps: range) -> Others:
+        """The agents that come nearest, at these steps."""
+        agents, seen = nearest(world, self.agents)
+        row = torch.arange(len(agents), device=agents.device)[:, None]
+        times = DT * torch.tensor(steps, device=agents.device)
+        return Others(constant_velocity(world.states[row, agents], times), world.scene["size"][row, agents], seen)
+
+
+def _onto(path: MissionPath, states: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Arc length, offset and heading [B, M T] of the mission at states [B, M, T, 4]."""
+    return project(states[..., :2].flatten(1, 2), path.route)
+
+
+def _extent(size: Tensor, turn: Tensor, axis: int) -> Tensor:
+    """Half of what boxes [B, M, 2] turned by turn [B, M, T] rad take along (axis 0) or across (1) a direction."""
+    own, other = size[..., axis, None] / 2, size[..., 1 - axis, None] / 2
+    return own * turn.cos().abs() + other * turn.sin().abs()
+
+
+def score(world: World, proposals: Tensor, distance: Tensor, others: Others) -> Scores:
+    """nuPlan's closed-loop score of proposals [B, P, PLAN_STEPS, 4] that end distance [B, P] m ahead.
+
+    Collision and drivable area multiply the weighted mean of progress, relative to the proposal that gets farthest of
+    those that neither excludes, time to collision and comfort. Proposals follow the mission, and so never drive against
+    its direction, which nuPlan scores too.
+    """
+    size, scored = world.scene["size"][:, 0], proposals[:, :, STRIDE - 1 : HORIZON : STRIDE]
+    hit = at_fault(scored, size, others)  # [B, P, T]
+    times = DT * STRIDE * torch.arange(1, hit.shape[-1] + 1, device=hit.device)
+    collides = torch.where(hit, times, torch.inf).amin(-1)
+    allowed = (~hit.any(-1) & on_road(scored, size, world)).to(distance)
+    farthest = (distance * allowed).amax(1, keepdim=True)
+    progress = torch.where(farthest > LEAST_PROGRESS, distance / farthest.clamp(min=LEAST_PROGRESS), 1.0).clamp(0, 1)
+    clear = torch.ones_like(allowed, dtype=torch.bool)
+    for look in LOOKS:
+        ahead = others._replace(states=_later(others.states, look))
+        clear = clear & ~at_fault(_later(scored, look), size, ahead).any(-1)
+    weighted = PROGRESS * progress + TIME_TO_COLLISION * clear + COMFORT * comfortable(world, proposals)
+    return Scores(allowed * weighted / (PROGRESS + TIME_TO_COLLISION + COMFORT), collides)
+
+
+def _later(states: Tensor, time: float) -> Tensor:
+    """States [..., 4] after `time` s at constant velocity."""
+    return constant_velocity(states, states.new_tensor([time]))[..., 0, :]
+
+
+def at_fault(states: Tensor, size: Tensor, others: Others) -> Tensor:
+    """Bool [B, P, T]: an ego that moves, at states [B, P, T, 4] of size [B, 2], touches an agent that is not behind it."""
+    own, box = states[:, :, None], size[:, None, None, None]
+    touch = separation(own, box, others.states[:, None], others.size[:, None, :, None]) < 0
+    place = to_frame(others.states[:, None, ..., :2], own)[..., 0]
+    fault = touch & (place > -box[..., 0] / 2) & (own[..., 3] > STOPPED)
+    return (fault & others.seen[:, None, :, None]).any(2)
+
+
+def on_road(states: Tensor, size: Tensor, world: World) -> Tensor:
+    """Bool [B, P]: no corner leaves the drivable area by more than TOLERANCE, or by more than now."""
+    field, origin = world.scene["field"], world.scene["field_origin"]
+    box = size[:, None, None]
+    beyond = off_road(corners(states, box).flatten(3, 3).flatten(1, 3), field, origin).view(*states.shape[:3], 4)
+    now = off_road(corners(world.states[:, 0], size), field, origin).amax(-1).clamp(min=0)
+    return beyond.amax((-2, -1)) <= now[:, None] + TOLERANCE
+
+
+def comfortable(world: World, proposals: Tensor) -> Tensor:
+    """Bool [B, P]: proposals [B, P, H, 4] keep nuPlan's bounds of comfort over the scored steps."""
+    now = world.states[:, None, None, 0].expand_as(proposals[:, :, :1])
+    speed, heading = torch.cat([now, proposals[:, :, :HORIZON]], 2)[..., 2:].flip(-1).unbind(-1)
+    accel, rate = speed.diff(dim=-1) / DT, wrap(heading.diff(dim=-1)) / DT
+    window = (accel.unfold(-1, 5, 1).mean(-1), rate.unfold(-1, 5, 1).mean(-1))  # as nuPlan smooths what it scores
+    accel, rate = window
+    lateral = rate * speed[..., 3:-2]
+    fine = (accel >= ACCELERATIONS[0]) & (accel <= ACCELERATIONS[1]) & (lateral.abs() <= LATERAL)
+    fine = fine.all(-1) & (rate.abs() <= YAW_RATE).all(-1)
+    changes = (accel.diff(dim=-1).abs() <= JERK * DT) & (rate.diff(dim=-1).abs() <= YAW_ACCELERATION * DT)
+    return fine & changes.all(-1)

@@ -1,0 +1,113 @@
+"""PDM-Closed: it follows, stops, keeps the limit, comes over, brakes; its score is that of its terms."""
+
+import pytest
+import torch
+
+from e2rl.planners.pdm_closed import (
+    COMFORT,
+    FRACTIONS,
+    OFFSETS,
+    PROGRESS,
+    TIME_TO_COLLISION,
+    PDMClosedEgo,
+    at_fault,
+    comfortable,
+    score,
+)
+from e2rl.planners.sampling import take
+from e2rl.scenes.boxes import separation
+from e2rl.scenes.recording import DT
+from e2rl.sim import dynamics
+from tests.planners.planners import driven, world_of, worlds
+from tests.synthetic import make_scenes
+
+EGO = PDMClosedEgo()
+COUNT = len(FRACTIONS) * len(OFFSETS)
+
+
+def touched(data):
+    """Whether the ego of a rollout touches anybody."""
+    return bool(data["next", "metrics", "contact"].any())
+
+
+def test_it_follows_a_slower_leader_without_contact():
+    data, last = driven(EGO, vehicles=[(0, 0, 14.0), (30, 0, 6.0)], num_vrus=0)
+    assert not touched(data) and 5.0 < float(last[3]) < 8.0
+
+
+def test_it_stops_behind_whom_stands_and_at_a_red_light():
+    data, last = driven(EGO, steps=100, vehicles=[(0, 0, 10.0), (60, 0, 0.0)], num_vrus=0)
+    assert not touched(data) and float(last[3]) < 1.5 and float(last[0]) > 45
+    _, last = driven(EGO, steps=100, vehicles=[(0, 0, 10.0)], num_vrus=0, red_light_x=50.0)
+    assert float(last[3]) < 1.5 and 35 < float(last[0]) < 50
+
+
+@pytest.mark.parametrize("limit", [8.0, 15.0])
+def test_it_keeps_the_speed_limit(limit):
+    data, last = driven(EGO, vehicles=[(0, 0, 5.0)], num_vrus=0, limit=limit)
+    assert data["next", "agents", "states"][0, :, 0, 3].max() < limit + 0.1
+    assert float(last[3]) > 0.9 * min(limit, 14.0)
+
+
+def test_it_brakes_as_hard_as_it_can_before_a_collision_that_is_near():
+    _, world = world_of(vehicles=[(0, 0, 14.0), (14, 0, 0.0)], num_vrus=0)
+    plan = EGO.plan(world)[0]
+    assert plan[:10, 3].diff().div(DT).max() < -7.9
+
+
+def test_proposals_lead_to_their_offsets_and_are_slower_by_their_fraction():
+    _, world = world_of(vehicles=[(0, 0, 10.0)], num_vrus=0, limit=10.0)
+    states, distance = EGO.proposals(world)
+    assert states.shape[:2] == (1, COUNT) and distance.shape == (1, COUNT)
+    end = states[0, :, -1].view(len(OFFSETS), len(FRACTIONS), 4)
+    torch.testing.assert_close(end[:, 0, 1], end[0, 0, 1] + torch.tensor(OFFSETS), atol=0.2, rtol=0)
+    assert (end[..., 3].diff(dim=1) < 0).all() and (distance.view(3, -1).diff(dim=1) < 0).all()
+
+
+def test_only_whoever_comes_from_behind_is_at_fault_itself():
+    _, world = world_of(vehicles=[(0, 0, 10.0), (3.0, 0, 10.0), (-3.0, 0, 10.0)], num_vrus=0)
+    others = EGO._others(world, range(1))
+    own = world.states[:, None, :1]
+    for agent, fault in ((1, True), (2, False)):
+        same = (others.states[0, :, 0, 0] - world.states[0, agent, 0]).abs() < 0.1
+        one = others._replace(seen=others.seen & same[None])
+        assert bool(at_fault(own, world.scene["size"][:, 0], one)) == fault
+        still = own.clone()
+        still[..., 3] = 0.0
+        assert not at_fault(still, world.scene["size"][:, 0], one).any(), "who stands hits nobody"
+
+
+def test_the_score_is_the_weighted_mean_of_its_terms():
+    """Alone on the road: the fastest has all; the slower lose progress in proportion; a hard brake loses comfort."""
+    _, world = world_of(vehicles=[(0, 0, 10.0)], num_vrus=0)
+    start, none = world.states[:, :1], EGO._others(world, range(2, 41, 2))
+    actions = torch.tensor([[0.0, 0.0], [-1.0, 0.0], [-6.0, 0.0]])[:, None].expand(3, 50, 2)
+    states = dynamics.rollout(start[0].expand(3, 4), actions)[None]
+    distance = (states[..., -1, 0] - start[..., 0]).expand(1, 3)
+    found = score(world, states, distance, none).score[0]
+    whole = PROGRESS + TIME_TO_COLLISION + COMFORT
+    expected = PROGRESS * distance[0] / distance[0, 0] + TIME_TO_COLLISION + COMFORT * torch.tensor([1.0, 1.0, 0.0])
+    torch.testing.assert_close(found, expected / whole, atol=1e-4, rtol=0)
+    assert comfortable(world, states)[0].tolist() == [True, True, False]
+
+
+def test_what_hits_somebody_or_leaves_the_road_scores_nothing():
+    _, world = world_of(vehicles=[(0, 0, 10.0), (20, 0, 0.0)], num_vrus=0)
+    ahead = EGO._others(world, range(2, 41, 2))
+    go = dynamics.rollout(world.states[:, 0], torch.zeros(1, 50, 2))[:, None]
+    found = score(world, go, torch.ones(1, 1), ahead)
+    size = world.scene["size"][0, 0]
+    first = int((separation(go[0, 0], size, world.states[0, 1], world.scene["size"][0, 1]) < 0).nonzero()[0, 0]) + 1
+    assert found.score.item() == 0 and found.collides.item() == pytest.approx(DT * first, abs=0.2)
+    turn = dynamics.rollout(world.states[:, 0], torch.tensor([0.0, -0.6]).expand(1, 50, 2))[:, None]
+    free = ahead._replace(seen=ahead.seen & False)
+    assert score(world, turn, torch.ones(1, 1), free).score.item() == 0
+
+
+def test_a_scene_is_planned_alike_alone_and_in_a_batch():
+    scenes = make_scenes(3, vehicles=[(0, 0, 10.0), (22, 0, 9.0), (10, 1, 10.0), (45, 1, 8.0)])
+    _, world = worlds(scenes)
+    whole = EGO.plan(world)
+    for k in range(3):
+        alone = EGO.plan(take(world, torch.tensor([k])))[0]
+        torch.testing.assert_close(alone, whole[k], atol=1e-3, rtol=0)
