@@ -171,7 +171,7 @@ def _later(states: Tensor, time: float) -> Tensor:
 
 
 def at_fault(states: Tensor, size: Tensor, others: Others) -> Tensor:
-    """Bool [B, P, T]: an ego that moves, at states [B, P, T, 4] of size [B, 2], touches an agent that is not behind it."""
+    """Bool [B, P, T]: an ego that moves, states [B, P, T, 4] of size [B, 2], touches an agent that is not behind it."""
     own, box = states[:, :, None], size[:, None, None, None]
     touch = separation(own, box, others.states[:, None], others.size[:, None, :, None]) < 0
     place = to_frame(others.states[:, None, ..., :2], own)[..., 0]
