@@ -27,11 +27,10 @@ from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.processes import Processes, in_processes
 from e2rl.run.settings import settings_of
 from e2rl.search.search import BRANCH, Outcome, Search, SearchSettings
-from e2rl.search.tries import Family, Try, family_of
+from e2rl.search.tries import TRIES, Family, Try, family_of
 
 SEARCH = "search"  # the method whose tries are drawn from families
 TRIES_FILE = "tries.csv"
-TRIES = 10_000  # numbers of rollouts that one seed of a search has in a scene
 TOLD = ("scene_id", "location", "seed", "method", "ego_policy", "family", "parent", "margin", "cell", "clean")
 SPENT = ("tries", "nfe", "seconds")  # a scene, of the search so far
 UNTRIED = Outcome(float("-inf"), 0.0, "", 0.0)  # of a try that errored

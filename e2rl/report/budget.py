@@ -15,13 +15,14 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from e2rl.evaluation.budget import SPENT, TRIES, TRIES_FILE, write_tries
+from e2rl.evaluation.budget import SPENT, TRIES_FILE, write_tries
 from e2rl.evaluation.plan import Evaluation
 from e2rl.metrics.realism import Samples, realism
 from e2rl.metrics.statistics import REALISM_DRAWS, bootstrap_draws, cluster_index, interval
 from e2rl.report.drawing import new_figure, save_figure
 from e2rl.report.tables import Table, save_tables
 from e2rl.run.files import write_atomically
+from e2rl.search.tries import TRIES
 
 PANEL = 250  # points, a side
 FOUND = ("scenes", "cells", "failures", "clean")

@@ -15,7 +15,7 @@ from torch import Tensor
 from e2rl.metrics.margin import PREVENTED
 from e2rl.run.settings import configured, setting
 from e2rl.search.portfolio import Portfolio
-from e2rl.search.tries import Family, Try
+from e2rl.search.tries import TRIES, Family, Try
 from e2rl.traffic.e2.decisions import BY_RULE, Decisions
 from e2rl.traffic.traffic import REPLAN_STEPS
 
@@ -124,19 +124,18 @@ class Search:
         count, first = self.settings.brood, len(self.tries[scene])
         rise = int(outcome.hazard_step) // REPLAN_STEPS
         replan = max(rise - LEADS[first % len(LEADS)], 0)
-        fresh = [self._seed(scene) * 1009 + 500 + first + k for k in range(count)]
+        fresh = [self._seed(scene) * TRIES + first + k for k in range(count)]
         return [parent.branch(first + k, replan, fresh[k], **self._mutation(parent)) for k in range(count)]
 
     def _mutation(self, parent: Try) -> dict[str, float]:
         """One other decision of a branch."""
         now = Decisions(*parent.script[-1])
-        name = ("strength", "patience", "owes", "kernels", "moment", "scatter", "")[self._draws(7)]
+        name = ("strength", "patience", "owes", "moment", "scatter", "")[self._draws(6)]
         u = float(torch.rand((), generator=self._generator))
         values = {
             "strength": float(now.strength) * (0.6 + 0.9 * u),
             "patience": float(now.patience) * 4 * u,
             "owes": 1 - float(now.owes),
-            "kernels": 1 - float(now.kernels),
             "moment": BY_RULE if now.moment >= 0 else 1 + 4 * u,
             "scatter": 2 * u,
         }

@@ -12,9 +12,9 @@ from e2rl.run.settings import check_choice
 from e2rl.traffic.e2.decisions import RULE, WHOM, Decisions
 
 ONSET = "onset"  # of a family: replans before which nobody is controlled
-MOST_REPLANS = 200
+TRIES = 10_000  # of a scene that have seeds of their own
 DRAWN = (ONSET, *Decisions._fields)
-PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23)  # of the square roots that stratify the draws of one decision each
+PRIMES = (2, 3, 5, 7, 11, 13, 17, 19)  # of the square roots that stratify the draws of one decision each
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Family:
             u = torch.rand(len(DRAWN), generator=generator.manual_seed(seed + 7919 * (drawn + 1)), dtype=torch.float64)
         onset, decisions = self.decisions(u)
         rows = (tuple(RULE._replace(strength=0.0)),) * onset + (tuple(decisions),)
-        return Try(scene, number, self.name, (seed * 1009 + drawn,), rows)
+        return Try(scene, number, self.name, (seed * TRIES + number,), rows)
 
 
 def family_of(name: str, given: Mapping[str, Any], where: str) -> Family:

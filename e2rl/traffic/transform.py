@@ -12,12 +12,14 @@ from e2rl.planners.ego import Ego
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv
+from e2rl.sim.world import World
 from e2rl.traffic.e2.reaiming import Reaiming
 from e2rl.traffic.grouping import put_rows, take_rows
 from e2rl.traffic.pool import LIVE, RECORDED, TrafficPool
 from e2rl.traffic.reaction import Lookahead
 from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan, keep_velocity
 
+ALIKE = 1e-3  # m, rad, m/s by which rounding tells attempts apart that are alike
 Draw = Callable[[int], Tensor]  # count -> pool rows [count] of new episodes
 
 
@@ -156,7 +158,7 @@ class AdversarialSynthesizer(Transform):
                 )
             ego_plan = keep_velocity(world.states[:, 0])  # nobody is told it
         whole = len(rows) == len(world.step)
-        asked, again = self._alike(rows)
+        asked, again = self._alike(rows, world)
         every = len(asked) == len(world.step)
         state, now = (self._state, world) if every else (take_rows(self._state, asked), take_rows(world, asked))
         queries = {"react": Lookahead(self.ego, now)} if self._method.queries_ego and self.ego is not None else {}
@@ -171,14 +173,17 @@ class AdversarialSynthesizer(Transform):
         self._planned_at[rows] = world.step[rows]
         self._env.write_traffic(rows, plan.states, plan.present)
 
-    def _alike(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+    def _alike(self, rows: Tensor, world: World) -> tuple[Tensor, Tensor]:
         """Of environments rows [b] those to plan for [a], and of which of these [b] each has the plan: attempts that
-        are alike so far are planned once, where all were begun together."""
+        are alike so far, and whose egos drive alike, are planned once, where all were begun together."""
         planned = self._planned_at[rows]
         itself = torch.arange(len(rows))
         if len(rows) < len(self._planned_at) or bool((planned != planned[0]).any()):
             return rows, itself.to(rows.device)
         first = self.pool.first_alike(self._drawn, int(planned[0]) // REPLAN_STEPS + 1)
+        states = world.states.nan_to_num().flatten(1)
+        apart = (states - states[first.to(states.device)]).abs().amax(1) > ALIKE
+        first = torch.where(apart.cpu(), itself, first)
         own = (first == itself).nonzero()[:, 0]
         return rows[own.to(rows.device)], torch.searchsorted(own, first).to(rows.device)
 

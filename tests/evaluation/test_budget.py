@@ -4,21 +4,21 @@ from dataclasses import replace
 
 import pytest
 
-from e2rl.evaluation.budget import TRIES, Plan, build_plans, spend, write_tries
+from e2rl.evaluation.budget import Plan, build_plans, spend, write_tries
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
 from e2rl.run.parts import Parts
 from e2rl.search.search import SearchSettings
-from e2rl.search.tries import Family
+from e2rl.search.tries import TRIES, Family
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.rule_based import ConstantVelocity
 from tests.prior.small import small_prior
 from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
-RULE = Family("rule", "e2", {"kernels": 0.0})
-LATE = Family("late", "e2", {"kernels": 0.0, "onset": 2.0})
+RULE = Family("rule", "e2", {})
+LATE = Family("late", "e2", {"onset": 2.0})
 
 
 @pytest.fixture(scope="module")

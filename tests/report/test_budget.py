@@ -5,9 +5,9 @@ import csv
 import pytest
 import torch
 
-from e2rl.evaluation.budget import TRIES
 from e2rl.metrics.realism import KINEMATICS, OF_ADVERSARIES
 from e2rl.report.budget import budget_figure, budget_rows, budget_tables, curve, write_budget
+from e2rl.search.tries import TRIES
 
 SCENES = [(f"place {k // 2}", f"scene {k}") for k in range(40)]  # two scenes at each of twenty places
 

@@ -238,3 +238,19 @@ def test_plans_are_for_the_policy_alone_and_are_not_stacked_over_time():
     assert ("traffic", "plan") not in data.keys(True) and ("next", "traffic", "plan") not in data.keys(True)
     torch.testing.assert_close(seen[-1][:, 1:, 0], data["next", "agents", "states"][:, -1, 1:ROWS])
     collector.shutdown()
+
+
+def test_egos_that_drive_differently_meet_plans_of_their_own():
+    """The same attempt twice, but one of the egos brakes: the plan of one is not that of the other."""
+    on = synthesizer()
+    pool = TrafficPool.live(torch.zeros(2, dtype=torch.int64), torch.full((2,), 2.0), torch.tensor([5, 5]))
+    env = environment(pool, on, steps=20, batch=2, scene_set=scenes(1, 20))
+    plans = []
+    env.transform.on_plan = lambda plan: plans.append(plan.states)
+    tensordict = env.reset()
+    for _ in range(11):
+        tensordict["action"] = torch.tensor([[0.0, 0.0], [-5.0, 0.0]])
+        tensordict["ego", "plan"] = keep_velocity(env.base_env.world().states[:, 0])
+        tensordict = env.step_mdp(env.step(tensordict))
+    assert torch.equal(plans[0][0], plans[0][1]) and len(plans) == 3
+    assert not torch.equal(plans[-1][0, 1:5], plans[-1][1, 1:5])

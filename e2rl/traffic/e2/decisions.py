@@ -22,7 +22,7 @@ class Decisions(NamedTuple):
     strength: factor of eta, 0: nobody is controlled; whom: index into WHOM; patience: factor of how late adversaries
     give way; owes: 1, or 0: they do not give way; wrong_way: s that an interception weighs more if it ends against the
     lanes; moment: s until the ego is met, BY_RULE: the cheapest; scatter: s of noise on what it costs each vehicle to
-    meet the ego; kernels: 1, or 0: none are drawn.
+    meet the ego.
     """
 
     strength: Any = 1.0
@@ -32,7 +32,6 @@ class Decisions(NamedTuple):
     wrong_way: Any = 0.0
     moment: Any = BY_RULE
     scatter: Any = 0.0
-    kernels: Any = 1.0
 
 
 RULE = Decisions()

@@ -153,8 +153,7 @@ class E2(Coalitions):
         """Bool [B]: there are nats left to draw a sample to a kernel."""
         budget = self._budget(state)
         least = math.log((self.kernels.samples - 1) / DRAWN)
-        wanted = (state.eta > 0) & (state.now.kernels > 0)
-        return wanted if budget is None else wanted & (budget > least)
+        return state.eta > 0 if budget is None else (state.eta > 0) & (budget > least)
 
     def _worth(self, attack: Attack, context: Context, x0: Tensor, many: Tensor) -> tuple[Tensor, Tensor]:
         """What `foresee` makes of samples x0 [C, V, SIZE] of scenes many [C]: worth and prevented [C, V]."""
