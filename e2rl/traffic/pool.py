@@ -161,4 +161,5 @@ def _rows(
     seed, template = like if seed is None else seed, like + FULL if template is None else template
     script = script_of(RULE, len(like)) if script is None else script
     fresh, weight = torch.ones_like(like).bool(), torch.ones(len(like))
-    return TrafficPool(scene_index, like + source, eta, template, seed.view(len(like), -1), script, weight, fresh)
+    seed = seed[:, None] if seed.ndim == 1 else seed
+    return TrafficPool(scene_index, like + source, eta, template, seed, script, weight, fresh)

@@ -134,7 +134,8 @@ def test_an_entry_is_a_file_with_changes_whose_first_weights_do_not_depend_on_th
 
 def test_table_4_compares_every_ego_with_one_of_them():
     chosen = build_egos(config_of("experiment=table4"), "ego")
-    names = ["replay", "idm", "lane_graph", "sampling", "bits", "actor_untrained", "actor"]
+    names = ["replay", "idm", "lane_graph", "sampling", "pdm_closed", "lane_graph_tuned", "bits", "actor_untrained"]
+    names.append("actor")
     assert list(chosen.egos) == names
     assert chosen.pairs == [(name, "lane_graph") for name in names if name != "lane_graph"]
     trained, untrained = (chosen.egos[name].network.weights() for name in ("actor", "actor_untrained"))
