@@ -26,6 +26,7 @@ from e2rl.search.tries import TRIES
 
 PANEL = 250  # points, a side
 FOUND = ("scenes", "cells", "failures", "clean")
+COMPARED = ("scenes", "cells", "clean")  # whose ratios are told
 ABOUT = {
     "scenes": "scenes with a preventable failure, %",
     "cells": "cells of the atlas",
@@ -35,7 +36,8 @@ ABOUT = {
 }
 CAPTION = (
     "95% intervals by place. A cell is approach, partner's manoeuvre, broken duty, side of contact and the ego's speed "
-    "in bands of 5 m/s. Ratios are the first method's over each other's."
+    "in bands of 5 m/s; a draw of places has fewer cells than all places, so that their number has no interval. Ratios "
+    "are the first method's over each other's, in the same draws."
 )
 
 
@@ -86,8 +88,8 @@ class Found:
         self.draws["real_adv"] = realism(theirs, of, drawn)["real_adv"]
 
     def value(self, name: str) -> dict[str, float]:
-        """Mean and interval."""
-        return interval(self.draws[name], self.places)
+        """Mean and interval; of the number of cells none, as a draw of places has fewer than all places."""
+        return interval(self.draws[name], self.places if name != "cells" else 0)
 
     def ratio(self, other: "Found", name: str) -> dict[str, float]:
         """Mean and interval of this over the other's."""
@@ -102,7 +104,7 @@ def budget_rows(
     samples: Mapping[tuple[str, str, str, int], Samples],
 ) -> list[dict[str, Any]]:
     """A row for each ego, plan and budget: SPENT a scene, FOUND and `real_adv` with intervals, and the ratios of the
-    first plan's scenes and cells to it.
+    first plan's COMPARED to it.
 
     samples: realism samples by (ego_policy, method, scene_id, seed).
     """
@@ -117,7 +119,7 @@ def budget_rows(
             first = next(iter(found.values()))
             for plan, one in found.items():
                 values = {name: one.value(name) for name in (*FOUND, "real_adv")}
-                values |= {f"{name}_ratio": first.ratio(one, name) for name in ("scenes", "cells") if one is not first}
+                values |= {f"{name}_ratio": first.ratio(one, name) for name in COMPARED if one is not first}
                 about = {"ego": ego, "method": plan, "budget": budget, "unit": unit}
                 rows.append(about | {f"{name}_a_scene": value for name, value in one.spent.items()} | values)
     return rows
@@ -138,11 +140,19 @@ def budget_tables(rows: Sequence[Mapping], scenes: int) -> list[Table]:
     digits = {"scenes": 1, "cells": 1, "failures": 2, "clean": 2, "real_adv": 3}
     for ego in dict.fromkeys(row["ego"] for row in rows):
         own = [row for row in rows if row["ego"] == ego]
-        head = ["method", own[0]["unit"], "tries", "NFE", "s", *ABOUT.values(), "ratio of scenes", "of cells"]
+        head = [
+            "method",
+            own[0]["unit"],
+            "tries",
+            "NFE",
+            "s",
+            *ABOUT.values(),
+            *(f"ratio of {name}" for name in COMPARED),
+        ]
         lines = []
         for row in own:
             spent = [f"{row['tries_a_scene']:.1f}", f"{row['nfe_a_scene']:.0f}", f"{row['seconds_a_scene']:.1f}"]
-            ratios = [cell(row[name], 2) if name in row else "–" for name in ("scenes_ratio", "cells_ratio")]
+            ratios = [cell(row[f"{name}_ratio"], 2) if f"{name}_ratio" in row else "–" for name in COMPARED]
             values = [cell(row[name], count) for name, count in digits.items()]
             lines.append([row["method"], f"{row['budget']:g}", *spent, *values, *ratios])
         title = f"Failures of {ego} within a budget of {own[0]['unit']} a scene"
