@@ -10,8 +10,7 @@ from e2rl.search.tries import Family
 
 SCENE_TRIES = 1.0  # tries in one scene that weigh as much as what all scenes have told
 PRIOR_TRIES = 20.0  # that a family's chance stands for at the start
-NEARNESS = 4.0  # s and m of margin by which a scene's chance falls by e
-LEAST = 0.05  # of that chance
+CONTACT, LEAST = 0.25, 0.15  # of the chance, where the nearest try of a scene has margin 0, and where nobody comes near
 
 
 @dataclass
@@ -19,8 +18,9 @@ class Portfolio:
     """Chances of F families in N scenes: that a try finds what the search is for.
 
     The chance in a scene follows Beta(c m, c (1 - m)) around the family's chance m in all scenes, with c = SCENE_TRIES;
-    m has the family's own chance as its prior, worth PRIOR_TRIES. Where nothing is found yet, it counts in proportion
-    to exp(margin / NEARNESS) of the scene's nearest try: where nobody ever comes near, tries are few.
+    m has the family's own chance as its prior, worth PRIOR_TRIES. Where nothing is found yet, it is multiplied
+    by CONTACT + (1 - CONTACT) times the margin of the scene's nearest try, at least LEAST: where nobody comes near, tries
+    are few.
 
     Args:
         families: the families.
@@ -57,7 +57,7 @@ class Portfolio:
         hit = SCENE_TRIES * mean + self.found
         missed = SCENE_TRIES * (1 - mean) + self.tried - self.found
         drawn = beta(hit, missed, generator)
-        near = (self.nearest / NEARNESS).exp().clamp(LEAST, 1.0)
+        near = (CONTACT + (1 - CONTACT) * self.nearest).clamp(LEAST, 1.0)
         near = torch.where(self.nearest.isinf(), 1.0, near)[:, None]
         cost = self.spent / (PRIOR_TRIES + self.tried.sum(0))
         return drawn * near * cost.amax() / cost

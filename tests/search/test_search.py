@@ -96,7 +96,7 @@ def test_a_portfolio_s_chances_are_those_of_beta_laws():
     portfolio, generator = Portfolio(families, 2), torch.Generator().manual_seed(0)
     mean = torch.stack([portfolio.worth(generator) for _ in range(4000)]).mean(0)
     torch.testing.assert_close(mean, torch.full_like(mean, 0.2), atol=0.02, rtol=0)
-    portfolio.tell(0, 0, 0.0, 0.0, families[0].nfe)
+    portfolio.tell(0, 0, 0.0, 1.0, families[0].nfe)
     mean = torch.stack([portfolio.worth(generator) for _ in range(4000)]).mean(0)
     family = 0.2 * 20 / 21
     assert abs(mean[0, 0] - family / 2) < 0.02 and abs(mean[1, 0] - family) < 0.02
