@@ -155,7 +155,7 @@ def budget_tables(rows: Sequence[Mapping], scenes: int) -> list[Table]:
             ratios = [cell(row[f"{name}_ratio"], 2) if f"{name}_ratio" in row else "–" for name in COMPARED]
             values = [cell(row[name], count) for name, count in digits.items()]
             lines.append([row["method"], f"{row['budget']:g}", *spent, *values, *ratios])
-        title = f"Failures of {ego} within a budget of {own[0]['unit']} a scene"
+        title = f"Failures of {ego} within a budget, in {own[0]['unit']} a scene"
         tables.append(Table(f"{scenes} scenes. {CAPTION}", head, lines, title))
     return tables
 
@@ -215,7 +215,7 @@ def curve(told: Sequence[Mapping], unit: str, name: str, scenes: int) -> tuple[l
 def save_budget(
     folder: Path, plan: Evaluation, told: Sequence[Mapping], rows: Sequence[Mapping], samples: Sequence[Samples]
 ) -> None:
-    """Write tries.csv, budget.csv, budget.md and the picture of a run's searches; print the tables.
+    """Write tries.csv, budget.csv, budget.md and the picture of a run's searches; print what they found.
 
     rows, samples: of the tries' rollouts (`Scored`).
     """
@@ -230,4 +230,16 @@ def save_budget(
     tables = budget_tables(found, len(places))
     save_tables(folder / "budget.md", tables)
     save_figure(folder / "budget.png", budget_figure(told, len(places)))
-    print("", *(table.text() for table in tables), sep="\n")
+    print("", *budget_lines(found, len(places)), f"all budgets, with intervals: {folder / 'budget.md'}", sep="\n")
+
+
+def budget_lines(rows: Sequence[Mapping], scenes: int) -> list[str]:
+    """A sentence for each ego and plan: what it found within the largest budget."""
+    most = max(row["budget"] for row in rows)
+    return [
+        f"{row['method']} against {row['ego']}: preventable failures in "
+        f"{round(row['scenes']['mean'] * scenes / 100)} of {scenes} scenes, in {round(row['cells']['mean'])} different ways,\n  within {row['tries_a_scene']:.1f} tries "
+        f"({row['nfe_a_scene']:.0f} NFE, {row['seconds_a_scene']:.1f} s) a scene."
+        for row in rows
+        if row["budget"] == most
+    ]

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from e2rl.metrics.realism import KINEMATICS, OF_ADVERSARIES
-from e2rl.report.budget import budget_figure, budget_rows, budget_tables, curve, write_budget
+from e2rl.report.budget import budget_figure, budget_lines, budget_rows, budget_tables, curve, write_budget
 from e2rl.search.tries import TRIES
 
 SCENES = [(f"place {k // 2}", f"scene {k}") for k in range(40)]  # two scenes at each of twenty places
@@ -86,3 +86,11 @@ def test_tables_files_and_the_picture(tmp_path):
     assert [each.get_label() for each in lines] == ["search", "e2"] and len(figure.axes) == 6
     x, y = curve([row for row in told if row["method"] == "search"], "nfe", "cells", 40)
     assert max(y) == 7 and x == sorted(x) and y == sorted(y)
+
+
+def test_the_answer_tells_the_largest_budget_in_a_sentence_for_each_method():
+    told = searched("search", lambda scene, *_: f"{scene % 7}") + searched("e2", lambda scene, *_: "0" if scene else "")
+    lines = budget_lines(budget_rows(told, SCENES, [100, 400], "nfe", {}), 40)
+    assert len(lines) == 2 and "40 of 40 scenes, in 7 different ways" in lines[0]
+    assert "e2 against idm: preventable failures in 39 of 40 scenes, in 1 different" in lines[1]
+    assert "4.0 tries (400 NFE" in lines[0] and all(len(part) <= 100 for line in lines for part in line.split("\n"))
