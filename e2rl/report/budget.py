@@ -236,10 +236,12 @@ def save_budget(
 def budget_lines(rows: Sequence[Mapping], scenes: int) -> list[str]:
     """A sentence for each ego and plan: what it found within the largest budget."""
     most = max(row["budget"] for row in rows)
-    return [
-        f"{row['method']} against {row['ego']}: preventable failures in "
-        f"{round(row['scenes']['mean'] * scenes / 100)} of {scenes} scenes, in {round(row['cells']['mean'])} different ways,\n  within {row['tries_a_scene']:.1f} tries "
-        f"({row['nfe_a_scene']:.0f} NFE, {row['seconds_a_scene']:.1f} s) a scene."
-        for row in rows
-        if row["budget"] == most
-    ]
+    lines = []
+    for row in (row for row in rows if row["budget"] == most):
+        found, ways = round(row["scenes"]["mean"] * scenes / 100), round(row["cells"]["mean"])
+        spent = f"{row['tries_a_scene']:.1f} tries ({row['nfe_a_scene']:.0f} NFE, {row['seconds_a_scene']:.1f} s)"
+        lines += [
+            f"{row['method']} against {row['ego']}: preventable failures in {found} of {scenes} scenes,",
+            f"  in {ways} different ways, within {spent} a scene.",
+        ]
+    return lines

@@ -18,8 +18,8 @@ class Portfolio:
     """Chances of F families in N scenes: that a try finds what the search is for.
 
     The chance in a scene follows Beta(c m, c (1 - m)) around the family's chance m in all scenes, with c = SCENE_TRIES;
-    m has the family's own chance as its prior, worth PRIOR_TRIES. Where nothing is found yet, it is multiplied by CONTACT
-    + (1 - CONTACT) times the margin of the scene's nearest try, at least LEAST: where nobody comes near, tries are few.
+    m has the family's own chance as its prior, worth PRIOR_TRIES. Where nothing is found it is multiplied by CONTACT
+    + (1 - CONTACT) times the margin of the scene's nearest try, at least LEAST: tries are few where nobody comes near.
 
     Args:
         families: the families.
