@@ -36,6 +36,7 @@ class SearchSettings:
     brood: int = setting(low=0)
     branch_chance: float = setting(low=0, high=1)
     again: float = setting(low=0, high=1)
+    climb: bool = setting()
 
 
 class Outcome(NamedTuple):
@@ -104,7 +105,8 @@ class Search:
         for one, outcome in zip(tries, outcomes, strict=True):
             kind = BRANCH if one.parent >= 0 else one.family
             new = bool(outcome.cell) and (outcome.cell not in self.cells or not self._found(one.scene))
-            self._portfolio.tell(one.scene, names.index(kind), float(new), outcome.margin, outcome.nfe)
+            margin = outcome.margin if self.settings.climb else PREVENTED
+            self._portfolio.tell(one.scene, names.index(kind), float(new), margin, outcome.nfe)
             self.cells |= {outcome.cell} if outcome.cell else set()
             self.tries[one.scene].append(one)
             self.outcomes[one.scene].append(outcome)
@@ -120,7 +122,9 @@ class Search:
             stratified = self.settings.stratified
             return [self.families[family].draw(scene, len(self.tries[scene]), seed, drawn, stratified)]
         pairs = zip(self.tries[scene], self.outcomes[scene], strict=True)
-        parent, outcome = max((pair for pair in pairs if self._near(*pair)), key=lambda pair: pair[1].margin)
+        near = [pair for pair in pairs if self._near(*pair)]
+        climbs = max(near, key=lambda pair: pair[1].margin)
+        parent, outcome = climbs if self.settings.climb else near[self._draws(len(near))]
         count, first = self.settings.brood, len(self.tries[scene])
         rise = int(outcome.hazard_step) // REPLAN_STEPS
         replan = max(rise - LEADS[first % len(LEADS)], 0)
