@@ -87,17 +87,22 @@ class Search:
         return sum(outcome.nfe for scene in self.outcomes for outcome in scene) / len(self.numbers)
 
     def ask(self) -> list[Try]:
-        """The next tries, to be told in this order: of every scene until it has `cover` of them, then of those scenes
-        in which a try is worth the most."""
+        """The next tries, to be told in this order: one of every scene until it has `cover` of them, then of those
+        families in those scenes that are worth the most, `width` times as many as there are scenes."""
         worth = self._portfolio.worth(self._generator)
         found = torch.tensor([any(outcome.cell for outcome in scene) for scene in self.outcomes])
         worth = torch.where(found[:, None], self.settings.again * worth, worth)
         worth[:, -1] = worth[:, -1].masked_fill(~self._may_branch(), -torch.inf)
-        best, family = worth.max(1)
-        fewest = min(len(tries) for tries in self.tries)
-        count = len(best) if fewest < self.settings.cover else max(1, round(self.settings.width * len(best)))
-        chosen = best.topk(count).indices.sort().values
-        return [one for scene in chosen.tolist() for one in self._draw(scene, int(family[scene]))]
+        if min(len(tries) for tries in self.tries) < self.settings.cover:
+            chosen = list(enumerate(worth.argmax(1).tolist()))
+        else:
+            best = worth.flatten().topk(max(1, round(self.settings.width * len(worth)))).indices.sort().values
+            chosen = [divmod(pair, worth.shape[1]) for pair in best.tolist()]
+        asked: list[Try] = []
+        for scene, family in chosen:
+            first = len(self.tries[scene]) + sum(one.scene == scene for one in asked)
+            asked += self._draw(scene, family, first)
+        return asked
 
     def tell(self, tries: Sequence[Try], outcomes: Sequence[Outcome]) -> None:
         """What became of tries that were asked for."""
@@ -114,18 +119,19 @@ class Search:
     def _found(self, scene: int) -> bool:
         return any(outcome.cell for outcome in self.outcomes[scene])
 
-    def _draw(self, scene: int, family: int) -> list[Try]:
+    def _draw(self, scene: int, family: int, first: int) -> list[Try]:
+        """The tries of a family in a scene, numbered from `first` on."""
         if family < len(self.families):
             drawn = int(self._drawn[scene, family])
             self._drawn[scene, family] += 1
             seed = self._seed(scene)
             stratified = self.settings.stratified
-            return [self.families[family].draw(scene, len(self.tries[scene]), seed, drawn, stratified)]
+            return [self.families[family].draw(scene, first, seed, drawn, stratified)]
         pairs = zip(self.tries[scene], self.outcomes[scene], strict=True)
         near = [pair for pair in pairs if self._near(*pair)]
         climbs = max(near, key=lambda pair: pair[1].margin)
         parent, outcome = climbs if self.settings.climb else near[self._draws(len(near))]
-        count, first = self.settings.brood, len(self.tries[scene])
+        count = self.settings.brood
         rise = int(outcome.hazard_step) // REPLAN_STEPS
         replan = max(rise - LEADS[first % len(LEADS)], 0)
         fresh = [self._seed(scene) * TRIES + first + k for k in range(count)]
