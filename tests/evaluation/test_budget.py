@@ -21,16 +21,20 @@ RULE = Family("rule", "e2", {})
 LATE = Family("late", "e2", {"onset": 2.0})
 
 
-@pytest.fixture(scope="module")
-def setup():
+def setup_of():
     return Setup(scenes(3, steps=30), IDMEgo(), "idm", SimSettings(), 2, evasions=False)
 
 
-@pytest.fixture(scope="module")
-def plan():
+def plan_of():
     on = Method("e2", synthesizer(), 2.0)
     settings = replace(SearchSettings(), cover=1, branch_chance=0.9)
     return Plan("search", [RULE, LATE], {"rule": on, "late": on}, settings)
+
+
+setup, plan = (
+    pytest.fixture(setup_of, scope="module", name="setup"),
+    pytest.fixture(plan_of, scope="module", name="plan"),
+)
 
 
 def found(setup, plan, processes=1, parts=None, tries=4.0, unit="tries"):

@@ -20,6 +20,7 @@ from e2rl.run.ray_workers import RayWorkers
 from e2rl.sim.env import SimSettings
 from e2rl.sim.rollout_file import ROLLOUTS
 from e2rl.traffic.rollout import synthesize_traffic
+from tests.evaluation.test_budget import found, known, plan_of, setup_of
 from tests.evaluation.test_protocol import SEEDS, same_runs
 from tests.learning.small import Ambush, small_run, small_scenes
 from tests.traffic.e2.traffic_scenes import scenes, synthesizer
@@ -47,7 +48,7 @@ class Mortal(Setup):
 
     def score(self, method, tasks, folder=None):
         found = super().score(method, tasks, folder)
-        if method.name == "e2" and tasks[0] == (2, 1) and not os.path.exists(self.mark):
+        if method.name == "e2" and tasks[0][:2] == (2, 1) and not os.path.exists(self.mark):
             with open(self.mark, "w") as file:
                 file.write(str(os.getpid()))
             os.kill(os.getpid(), signal.SIGKILL)
@@ -72,6 +73,12 @@ def test_two_workers_one_killed_on_the_way_give_what_two_processes_give(tmp_path
     for path in (folders[0] / ROLLOUTS).iterdir():
         one, other = np.load(path), np.load(folders[1] / ROLLOUTS / path.name)
         assert all(np.array_equal(one[key], other[key]) for key in one.files), path.name
+
+
+@needs_ray
+def test_a_search_on_workers_is_that_of_one_process(workers):
+    setup, plan = setup_of(), plan_of()
+    assert known(found(setup, plan, processes=workers)) == known(found(setup, plan))
 
 
 @needs_ray
