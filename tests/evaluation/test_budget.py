@@ -31,10 +31,14 @@ def plan_of():
     return Plan("search", [RULE, LATE], {"rule": on, "late": on}, settings)
 
 
-setup, plan = (
-    pytest.fixture(setup_of, scope="module", name="setup"),
-    pytest.fixture(plan_of, scope="module", name="plan"),
-)
+@pytest.fixture(scope="module")
+def setup():
+    return setup_of()
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return plan_of()
 
 
 def found(setup, plan, processes=1, parts=None, tries=4.0, unit="tries"):
