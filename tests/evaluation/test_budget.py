@@ -27,7 +27,7 @@ def setup_of():
 
 def plan_of():
     on = Method("e2", synthesizer(), 2.0)
-    settings = replace(SearchSettings(), cover=1, branch_chance=0.9)
+    settings = replace(SearchSettings(), cover=1, brood=3, branch_chance=0.9)
     return Plan("search", [RULE, LATE], {"rule": on, "late": on}, settings)
 
 
@@ -105,11 +105,11 @@ def plans(*overrides):
 
 
 def test_a_row_for_each_method_and_variant_and_its_families_from_the_configuration():
-    portfolio, e2, other = plans("methods=[search,e2]", "+variants.other={search.brood: 0}")
+    portfolio, e2, other = plans("methods=[search,e2]", "+variants.other={search.brood: 2}")
     assert [each.name for each in (portfolio, e2, other)] == ["search", "e2", "other"]
     assert len(portfolio.families) > 3 and {family.name for family in portfolio.families} == set(portfolio.traffic)
     assert (len(e2.families), e2.settings.brood, e2.settings.bandit) == (1, 0, False)
-    assert other.settings == replace(portfolio.settings, brood=0) and len(other.families) == len(portfolio.families)
+    assert other.settings == replace(portfolio.settings, brood=2) and len(other.families) == len(portfolio.families)
 
 
 @pytest.mark.parametrize(
