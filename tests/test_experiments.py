@@ -74,7 +74,8 @@ def test_egos_before_and_after_are_rated_in_one_run(evaluated):
 def test_table_4_has_a_row_for_every_ego_in_three_formats(evaluated):
     run = evaluated("experiment=table4")
     head, *rows = (run / "egos.csv").read_text().splitlines()
-    names = ["replay", "idm", "lane_graph", "sampling", "bits", "actor_untrained", "actor"]
+    names = ["replay", "idm", "lane_graph", "sampling", "pdm_closed", "lane_graph_tuned", "bits"]
+    names += ["actor_untrained", "actor"]
     assert [row.split(",")[:2] for row in rows] == [[name, "e2 η=2"] for name in names]
     columns = ("cfr", "cfr_counted", "cfr_preventable", "front", "side", "rear", "front_any", "side_any", "rear_any")
     assert head.startswith("ego,traffic,") and all(f"{name} [%]" in head.split(",") for name in columns)
