@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from e2rl.planners.ego import EgoPolicy
 from e2rl.planners.pdm_closed import (
     COMFORT,
     FRACTIONS,
@@ -53,6 +54,17 @@ def test_it_brakes_as_hard_as_it_can_before_a_collision_that_is_near():
     _, world = world_of(vehicles=[(0, 0, 14.0), (14, 0, 0.0)], num_vrus=0)
     plan = EGO.plan(world)[0]
     assert plan[:10, 3].diff().div(DT).max() < -7.9
+
+
+@pytest.mark.parametrize("beside", [1.0, -1.0])
+def test_it_comes_over_where_somebody_who_stands_beside_blocks_the_mission(beside):
+    """A parked car reaches 0.2 m into the ego's way; a metre to the other side the ego passes it."""
+    scenes = make_scenes(1, vehicles=[(0.0, 0, 10.0), (40.0, 0, 0.0)], num_vrus=0)
+    scenes.scenes["start"][0, 1, 1] = scenes.scenes["logged"][0, :, 1, 1] = 1.8 * beside
+    env, world = worlds(scenes)
+    assert EGO.plan(world)[0, -1, 1] * beside < -0.7
+    data = env.rollout(80, EgoPolicy(EGO, env))
+    assert not touched(data) and env.world().states[0, 0, 0] > 60
 
 
 def test_proposals_lead_to_their_offsets_and_are_slower_by_their_fraction():
