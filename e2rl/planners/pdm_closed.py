@@ -17,21 +17,20 @@ from e2rl.planners.path import MissionPath
 from e2rl.planners.sampling import take
 from e2rl.planners.scoring import nearest
 from e2rl.run.settings import configured, setting
-from e2rl.scenes.boxes import corners, separation, to_frame
+from e2rl.scenes.boxes import corners, overlap, to_frame
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import project
 from e2rl.sim import dynamics
 from e2rl.sim.dynamics import constant_velocity, wrap
 from e2rl.sim.leaders import IDMParameters, idm_acceleration
-from e2rl.sim.mission import limit_at
+from e2rl.sim.mission import limit_at, mission_of
 from e2rl.sim.world import World
 
-FRACTIONS = (1.0, 0.8, 0.6, 0.4, 0.2)  # of the speed limit
+FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the speed limit; of proposals that score alike the first is driven
 OFFSETS = (0.0, 1.0, -1.0)  # m beside the mission
 HORIZON = 40  # steps that are scored: 4 s
-STRIDE = 2  # steps between two scored states
-LOOKS = (0.3, 0.6, 0.9)  # s ahead at constant velocity, within which nobody may be hit
+LOOKS = (0.0, 0.3, 0.6, 0.9)  # s ahead of each step at constant velocity; after the first is the time to collision
 STOPPED = 0.1  # m/s: an ego that stands is not at fault
 TOLERANCE = 0.3  # m that a corner may leave the drivable area by, or more than now
 PROGRESS, TIME_TO_COLLISION, COMFORT = 5.0, 5.0, 2.0  # weights
@@ -39,11 +38,11 @@ LEAST_PROGRESS = 0.1  # m: where no proposal drives farther, all have all progre
 ACCELERATIONS = (-4.05, 2.40)  # m/s^2, comfortable along the way; the others are bounds of the absolute value
 LATERAL, JERK, YAW_RATE, YAW_ACCELERATION = 4.89, 8.37, 0.95, 1.93  # m/s^2, m/s^3, rad/s, rad/s^2
 SOON = 2.0  # s before a collision of the best proposal from which on the ego brakes
-CHUNK = 16  # scenes planned for at a time: fits the processor's cache
+CHUNK = 32  # scenes planned for at a time: fits the processor's cache
 
 
 class Others(NamedTuple):
-    """M agents at constant velocity: states [B, M, T, 4] at every STRIDE-th step, size [B, M, 2], seen [B, M] bool."""
+    """M agents at constant velocity: states [B, M, T, 4] at T steps, size [B, M, 2], seen [B, M] bool."""
 
     states: Tensor
     size: Tensor
@@ -78,22 +77,21 @@ class PDMClosedEgo(Ego):
         return torch.cat([self._plan(take(world, part)) for part in rows.split(CHUNK)])
 
     def _plan(self, world: World) -> Tensor:
-        proposals, distance = self.proposals(world)
-        scores = score(world, proposals, distance, self._others(world, range(STRIDE, HORIZON + 1, STRIDE)))
+        proposals = self.proposals(world)
+        scores = score(world, proposals, self._others(world, range(1, HORIZON + 1)))
         best = scores.score.argmax(1)
         row = torch.arange(len(best), device=best.device)
         brake = torch.tensor([-self.emergency_braking, 0.0], device=best.device).expand(len(best), PLAN_STEPS, 2)
         stop = dynamics.rollout(world.states[:, 0], brake)
         return torch.where((scores.collides[row, best] <= SOON)[:, None, None], stop, proposals[row, best])
 
-    def proposals(self, world: World) -> tuple[Tensor, Tensor]:
-        """States [B, P, PLAN_STEPS, 4] of the proposals, and the metres [B, P] along the mission to their ends."""
+    def proposals(self, world: World) -> Tensor:
+        """States [B, P, PLAN_STEPS, 4] of the proposals: of each offset, all fractions."""
         path, start = MissionPath(world), world.states[:, 0]
         offset = start.new_tensor(OFFSETS).repeat_interleave(len(FRACTIONS))
         speed = self.speeds(world, path, offset, start.new_tensor(FRACTIONS).repeat(len(OFFSETS)))
         shift = offset[:, None].expand(len(start), -1, 1)
-        found = drive(start, path, speed, shift, torch.full_like(shift, self.shift_time))
-        return found.states, found.distance
+        return drive(start, path, speed, shift, torch.full_like(shift, self.shift_time)).states
 
     def speeds(self, world: World, path: MissionPath, offset: Tensor, fraction: Tensor) -> Tensor:
         """Speeds [B, P, PLAN_STEPS + 1] m/s by IDM behind whom the offsets [P] m meet, and before red lights, at
@@ -143,37 +141,40 @@ def _extent(size: Tensor, turn: Tensor, axis: int) -> Tensor:
     return own * turn.cos().abs() + other * turn.sin().abs()
 
 
-def score(world: World, proposals: Tensor, distance: Tensor, others: Others) -> Scores:
-    """nuPlan's closed-loop score of proposals [B, P, PLAN_STEPS, 4] that end distance [B, P] m ahead.
+def score(world: World, proposals: Tensor, others: Others) -> Scores:
+    """nuPlan's closed-loop score of proposals [B, P, PLAN_STEPS, 4] over the HORIZON, others at its steps 1...
 
     Collision and drivable area multiply the weighted mean of progress, relative to the proposal that gets farthest of
     those that neither excludes, time to collision and comfort. Proposals follow the mission, and so never drive against
     its direction, which nuPlan scores too.
     """
-    size, scored = world.scene["size"][:, 0], proposals[:, :, STRIDE - 1 : HORIZON : STRIDE]
-    hit = at_fault(scored, size, others)  # [B, P, T]
-    times = DT * STRIDE * torch.arange(1, hit.shape[-1] + 1, device=hit.device)
+    size, scored = world.scene["size"][:, 0], proposals[:, :, :HORIZON]
+    looks = scored.new_tensor(LOOKS)
+    later, ahead = (constant_velocity(states, looks).flatten(-3, -2) for states in (scored, others.states))
+    fault = at_fault(later, size, others._replace(states=ahead)).unflatten(-1, (HORIZON, len(LOOKS)))
+    hit, clear = fault[..., 0], ~fault[..., 1:].any((-2, -1))
+    times = DT * torch.arange(1, HORIZON + 1, device=hit.device)
     collides = torch.where(hit, times, torch.inf).amin(-1)
-    allowed = (~hit.any(-1) & on_road(scored, size, world)).to(distance)
-    farthest = (distance * allowed).amax(1, keepdim=True)
-    progress = torch.where(farthest > LEAST_PROGRESS, distance / farthest.clamp(min=LEAST_PROGRESS), 1.0).clamp(0, 1)
-    clear = torch.ones_like(allowed, dtype=torch.bool)
-    for look in LOOKS:
-        ahead = others._replace(states=_later(others.states, look))
-        clear = clear & ~at_fault(_later(scored, look), size, ahead).any(-1)
-    weighted = PROGRESS * progress + TIME_TO_COLLISION * clear + COMFORT * comfortable(world, proposals)
+    allowed = ~hit.any(-1) & on_road(scored, size, world)
+    driven, smooth = progress(world, scored, allowed), comfortable(world, scored)
+    weighted = PROGRESS * driven + TIME_TO_COLLISION * clear + COMFORT * smooth
     return Scores(allowed * weighted / (PROGRESS + TIME_TO_COLLISION + COMFORT), collides)
 
 
-def _later(states: Tensor, time: float) -> Tensor:
-    """States [..., 4] after `time` s at constant velocity."""
-    return constant_velocity(states, states.new_tensor([time]))[..., 0, :]
+def progress(world: World, scored: Tensor, allowed: Tensor) -> Tensor:
+    """Metres along the mission of scored [B, P, T, 4], as a fraction [B, P] of the farthest of those allowed [B, P]."""
+    ends = torch.cat([world.states[:, :1], scored[:, :, -1]], 1)[..., :2]
+    s = project(ends, mission_of(world.scene).points)[0]
+    distance = (s[:, 1:] - s[:, :1]).clamp(min=0)
+    farthest = (distance * allowed).amax(1, keepdim=True)
+    relative = (distance / farthest.clamp(min=LEAST_PROGRESS)).clamp(max=1)
+    return torch.where(farthest > LEAST_PROGRESS, relative, 1.0)
 
 
 def at_fault(states: Tensor, size: Tensor, others: Others) -> Tensor:
     """Bool [B, P, T]: an ego that moves, states [B, P, T, 4] of size [B, 2], touches an agent that is not behind it."""
     own, box = states[:, :, None], size[:, None, None, None]
-    touch = separation(own, box, others.states[:, None], others.size[:, None, :, None]) < 0
+    touch = overlap(own, box, others.states[:, None], others.size[:, None, :, None])
     place = to_frame(others.states[:, None, ..., :2], own)[..., 0]
     fault = touch & (place > -box[..., 0] / 2) & (own[..., 3] > STOPPED)
     return (fault & others.seen[:, None, :, None]).any(2)
@@ -183,15 +184,15 @@ def on_road(states: Tensor, size: Tensor, world: World) -> Tensor:
     """Bool [B, P]: no corner leaves the drivable area by more than TOLERANCE, or by more than now."""
     field, origin = world.scene["field"], world.scene["field_origin"]
     box = size[:, None, None]
-    beyond = off_road(corners(states, box).flatten(3, 3).flatten(1, 3), field, origin).view(*states.shape[:3], 4)
+    beyond = off_road(corners(states, box).flatten(1, 3), field, origin).view(*states.shape[:3], 4)
     now = off_road(corners(world.states[:, 0], size), field, origin).amax(-1).clamp(min=0)
     return beyond.amax((-2, -1)) <= now[:, None] + TOLERANCE
 
 
-def comfortable(world: World, proposals: Tensor) -> Tensor:
-    """Bool [B, P]: proposals [B, P, H, 4] keep nuPlan's bounds of comfort over the scored steps."""
-    now = world.states[:, None, None, 0].expand_as(proposals[:, :, :1])
-    speed, heading = torch.cat([now, proposals[:, :, :HORIZON]], 2)[..., 2:].flip(-1).unbind(-1)
+def comfortable(world: World, scored: Tensor) -> Tensor:
+    """Bool [B, P]: scored [B, P, T, 4] keep nuPlan's bounds of comfort."""
+    now = world.states[:, None, None, 0].expand_as(scored[:, :, :1])
+    speed, heading = torch.cat([now, scored], 2)[..., 2:].flip(-1).unbind(-1)
     accel, rate = speed.diff(dim=-1) / DT, wrap(heading.diff(dim=-1)) / DT
     window = (accel.unfold(-1, 5, 1).mean(-1), rate.unfold(-1, 5, 1).mean(-1))  # as nuPlan smooths what it scores
     accel, rate = window

@@ -3,9 +3,11 @@
 import pytest
 import torch
 
+from e2rl.planners.ego import EgoPolicy
 from e2rl.planners.pdm_closed import (
     COMFORT,
     FRACTIONS,
+    HORIZON,
     OFFSETS,
     PROGRESS,
     TIME_TO_COLLISION,
@@ -55,13 +57,24 @@ def test_it_brakes_as_hard_as_it_can_before_a_collision_that_is_near():
     assert plan[:10, 3].diff().div(DT).max() < -7.9
 
 
+@pytest.mark.parametrize("beside", [1.0, -1.0])
+def test_it_comes_over_where_somebody_who_stands_beside_blocks_the_mission(beside):
+    """A parked car reaches 0.2 m into the ego's way; a metre to the other side the ego passes it."""
+    scenes = make_scenes(1, vehicles=[(0.0, 0, 10.0), (40.0, 0, 0.0)], num_vrus=0)
+    scenes.scenes["start"][0, 1, 1] = scenes.scenes["logged"][0, :, 1, 1] = 1.8 * beside
+    env, world = worlds(scenes)
+    assert EGO.plan(world)[0, -1, 1] * beside < -0.7
+    data = env.rollout(80, EgoPolicy(EGO, env))
+    assert not touched(data) and env.world().states[0, 0, 0] > 60
+
+
 def test_proposals_lead_to_their_offsets_and_are_slower_by_their_fraction():
     _, world = world_of(vehicles=[(0, 0, 10.0)], num_vrus=0, limit=10.0)
-    states, distance = EGO.proposals(world)
-    assert states.shape[:2] == (1, COUNT) and distance.shape == (1, COUNT)
+    states = EGO.proposals(world)
+    assert states.shape[:2] == (1, COUNT)
     end = states[0, :, -1].view(len(OFFSETS), len(FRACTIONS), 4)
-    torch.testing.assert_close(end[:, 0, 1], end[0, 0, 1] + torch.tensor(OFFSETS), atol=0.2, rtol=0)
-    assert (end[..., 3].diff(dim=1) < 0).all() and (distance.view(3, -1).diff(dim=1) < 0).all()
+    torch.testing.assert_close(end[:, -1, 1], end[0, -1, 1] + torch.tensor(OFFSETS), atol=0.2, rtol=0)
+    assert (end[..., 3].diff(dim=1) > 0).all() and (end[..., 0].diff(dim=1) > 0).all()
 
 
 def test_only_whoever_comes_from_behind_is_at_fault_itself():
@@ -80,28 +93,51 @@ def test_only_whoever_comes_from_behind_is_at_fault_itself():
 def test_the_score_is_the_weighted_mean_of_its_terms():
     """Alone on the road: the fastest has all; the slower lose progress in proportion; a hard brake loses comfort."""
     _, world = world_of(vehicles=[(0, 0, 10.0)], num_vrus=0)
-    start, none = world.states[:, :1], EGO._others(world, range(2, 41, 2))
+    start, none = world.states[:, :1], EGO._others(world, range(1, HORIZON + 1))
     actions = torch.tensor([[0.0, 0.0], [-1.0, 0.0], [-6.0, 0.0]])[:, None].expand(3, 50, 2)
     states = dynamics.rollout(start[0].expand(3, 4), actions)[None]
-    distance = (states[..., -1, 0] - start[..., 0]).expand(1, 3)
-    found = score(world, states, distance, none).score[0]
+    distance = states[0, :, HORIZON - 1, 0] - start[0, 0, 0]
+    found = score(world, states, none).score[0]
     whole = PROGRESS + TIME_TO_COLLISION + COMFORT
-    expected = PROGRESS * distance[0] / distance[0, 0] + TIME_TO_COLLISION + COMFORT * torch.tensor([1.0, 1.0, 0.0])
+    expected = PROGRESS * distance / distance[0] + TIME_TO_COLLISION + COMFORT * torch.tensor([1.0, 1.0, 0.0])
     torch.testing.assert_close(found, expected / whole, atol=1e-4, rtol=0)
-    assert comfortable(world, states)[0].tolist() == [True, True, False]
+    assert comfortable(world, states[:, :, :HORIZON])[0].tolist() == [True, True, False]
 
 
 def test_what_hits_somebody_or_leaves_the_road_scores_nothing():
     _, world = world_of(vehicles=[(0, 0, 10.0), (20, 0, 0.0)], num_vrus=0)
-    ahead = EGO._others(world, range(2, 41, 2))
+    ahead = EGO._others(world, range(1, HORIZON + 1))
     go = dynamics.rollout(world.states[:, 0], torch.zeros(1, 50, 2))[:, None]
-    found = score(world, go, torch.ones(1, 1), ahead)
+    found = score(world, go, ahead)
     size = world.scene["size"][0, 0]
     first = int((separation(go[0, 0], size, world.states[0, 1], world.scene["size"][0, 1]) < 0).nonzero()[0, 0]) + 1
-    assert found.score.item() == 0 and found.collides.item() == pytest.approx(DT * first, abs=0.2)
+    assert found.score.item() == 0 and found.collides.item() == pytest.approx(DT * first)
     turn = dynamics.rollout(world.states[:, 0], torch.tensor([0.0, -0.6]).expand(1, 50, 2))[:, None]
     free = ahead._replace(seen=ahead.seen & False)
-    assert score(world, turn, torch.ones(1, 1), free).score.item() == 0
+    assert score(world, turn, free).score.item() == 0
+
+
+def test_who_is_ahead_within_a_second_at_constant_velocity_costs_the_time_to_collision():
+    """Braking late, the ego halts 0.8 m behind whom stands, whom it would hit within 0.9 s if it let go the brake."""
+    _, world = world_of(vehicles=[(0, 0, 10.0), (20.0, 0, 0.0)], num_vrus=0)
+    ahead = EGO._others(world, range(1, HORIZON + 1))
+    actions = torch.tensor([[-3.4, 0.0], [-8.0, 0.0]])[:, None].expand(2, 50, 2)
+    states = dynamics.rollout(world.states[0, :1].expand(2, 4), actions)[None]
+    found = score(world, states, ahead)
+    late, early = states[0, :, HORIZON - 1, 0]
+    expected = torch.stack([late / late * PROGRESS + COMFORT, early / late * PROGRESS + TIME_TO_COLLISION])
+    assert found.collides.isinf().all()
+    torch.testing.assert_close(found.score[0], expected / (PROGRESS + TIME_TO_COLLISION + COMFORT), atol=1e-4, rtol=0)
+
+
+def test_where_every_proposal_is_excluded_it_drives_the_slowest():
+    """The road ends ahead: no proposal is better than another, and no collision makes it brake."""
+    scenes = make_scenes(1, vehicles=[(0, 0, 10.0)], num_vrus=0)
+    scenes.scenes["field"][:, 86:] = 10.0  # from x = 6 m on
+    _, world = worlds(scenes)
+    states = EGO.proposals(world)
+    assert (score(world, states, EGO._others(world, range(1, HORIZON + 1))).score == 0).all()
+    torch.testing.assert_close(EGO.plan(world)[0], states[0, 0])
 
 
 def test_a_scene_is_planned_alike_alone_and_in_a_batch():
