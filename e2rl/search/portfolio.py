@@ -33,24 +33,31 @@ class Portfolio:
     found: Tensor = field(init=False)
     tried: Tensor = field(init=False)
     nearest: Tensor = field(init=False)
+    everywhere: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
         self.found = torch.zeros(self.scenes, len(self.families), dtype=torch.float64)
         self.tried = torch.zeros_like(self.found)
         self.nearest = torch.full((self.scenes,), -torch.inf, dtype=torch.float64)
+        prior = torch.tensor([family.chance for family in self.families], dtype=torch.float64)
+        self.everywhere = PRIOR_TRIES * torch.stack([prior, torch.ones_like(prior)])  # found, tried
         self.spent = torch.tensor([PRIOR_TRIES * family.nfe for family in self.families], dtype=torch.float64)
 
     def tell(self, scene: int, family: int, found: float, margin: float, nfe: float) -> None:
         """Learn from a try."""
         self.found[scene, family] += found
         self.tried[scene, family] += 1
+        self.everywhere[:, family] += torch.tensor([found, 1.0], dtype=torch.float64)
         self.spent[family] += nfe
         self.nearest[scene] = max(float(self.nearest[scene]), margin)
 
+    def forget(self, scene: int) -> None:
+        """What the tries of a scene have told does not hold any more for this scene: another thing is searched for."""
+        self.found[scene] = self.tried[scene] = 0.0
+
     def worth(self, generator: torch.Generator) -> Tensor:
         """A draw of the chances [N, F] per NFE, relative to the dearest family."""
-        prior = torch.tensor([family.chance for family in self.families], dtype=torch.float64)
-        mean = (prior * PRIOR_TRIES + self.found.sum(0)) / (PRIOR_TRIES + self.tried.sum(0))
+        mean = self.everywhere[0] / self.everywhere[1]
         if not self.learns:
             return torch.rand(self.found.shape, generator=generator, dtype=torch.float64)
         hit = SCENE_TRIES * mean + self.found
@@ -58,7 +65,7 @@ class Portfolio:
         drawn = beta(hit, missed, generator)
         near = (CONTACT + (1 - CONTACT) * self.nearest).clamp(LEAST, 1.0)
         near = torch.where(self.nearest.isinf(), 1.0, near)[:, None]
-        cost = self.spent / (PRIOR_TRIES + self.tried.sum(0))
+        cost = self.spent / self.everywhere[1]
         return drawn * near * cost.amax() / cost
 
 

@@ -109,9 +109,12 @@ class Search:
         names = [family.name for family in self._portfolio.families]
         for one, outcome in zip(tries, outcomes, strict=True):
             kind = BRANCH if one.parent >= 0 else one.family
-            new = bool(outcome.cell) and (outcome.cell not in self.cells or not self._found(one.scene))
+            first = bool(outcome.cell) and not self._found(one.scene)
+            new = first or (bool(outcome.cell) and outcome.cell not in self.cells)
             margin = outcome.margin if self.settings.climb else PREVENTED
             self._portfolio.tell(one.scene, names.index(kind), float(new), margin, outcome.nfe)
+            if first:  # from now on other failures of this scene are searched for
+                self._portfolio.forget(one.scene)
             self.cells |= {outcome.cell} if outcome.cell else set()
             self.tries[one.scene].append(one)
             self.outcomes[one.scene].append(outcome)

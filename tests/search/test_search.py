@@ -5,8 +5,7 @@ from dataclasses import replace
 import torch
 
 from e2rl.metrics.margin import PREVENTED
-from e2rl.search.portfolio import Portfolio
-from e2rl.search.search import BRANCH, Outcome, Search, SearchSettings
+from e2rl.search.search import Outcome, Search, SearchSettings
 from e2rl.search.tries import Family
 
 FAMILIES = [Family(name, "e2", {"moment": (1.0, 5.0)}) for name in ("good", "poor", "idle")]
@@ -27,7 +26,7 @@ def told(search, rounds, hopeless=()):
             luck = torch.rand((), generator=torch.Generator().manual_seed(hash((one.scene, one.seeds)) % 2**31)).item()
             fails = luck < CHANCE[one.family] and one.scene not in hopeless
             margin = PREVENTED if fails else -25.0 if one.scene in hopeless else -2.0
-            outcomes.append(Outcome(margin, 40.0, f"cell {one.scene}" if fails else "", 100.0))
+            outcomes.append(Outcome(margin, 40.0, f"cell {one.scene} {one.number}" if fails else "", 100.0))
         search.tell(tries, outcomes)
     return search
 
@@ -51,7 +50,7 @@ def test_tries_go_to_the_family_that_finds_and_not_to_hopeless_scenes():
     counts = {name: sum(one.family == name for one in tries_of(search)) for name in CHANCE}
     assert counts["good"] > 2 * counts["poor"] and counts["good"] > 2 * counts["idle"]
     hopeless, others = (sum(map(len, part)) for part in (search.tries[:20], search.tries[20:]))
-    assert others > 1.5 * hopeless
+    assert others > 1.25 * hopeless
 
 
 def test_it_finds_more_scenes_than_chance_at_equal_cost():
@@ -88,15 +87,3 @@ def test_nothing_branches_from_what_cannot_keep_a_prefix_or_comes_nowhere_near()
     fixed = search_of(scenes=10, settings=settings)
     fixed.branches = {family.name: False for family in FAMILIES}
     assert all(one.parent < 0 for one in tries_of(told(fixed, 3)))
-
-
-def test_a_portfolio_s_chances_are_those_of_beta_laws():
-    """The mean of many draws, without a scene's own tries, is the family's chance; a try in a scene halves it there."""
-    families = [Family("a", "e2", {}, chance=0.2), Family(BRANCH, "", {}, chance=0.2)]
-    portfolio, generator = Portfolio(families, 2), torch.Generator().manual_seed(0)
-    mean = torch.stack([portfolio.worth(generator) for _ in range(4000)]).mean(0)
-    torch.testing.assert_close(mean, torch.full_like(mean, 0.2), atol=0.02, rtol=0)
-    portfolio.tell(0, 0, 0.0, 1.0, families[0].nfe)
-    mean = torch.stack([portfolio.worth(generator) for _ in range(4000)]).mean(0)
-    family = 0.2 * 20 / 21
-    assert abs(mean[0, 0] - family / 2) < 0.02 and abs(mean[1, 0] - family) < 0.02
