@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
@@ -38,18 +39,19 @@ UNTRIED = Outcome(float("-inf"), 0.0, "", 0.0)  # of a try that errored
 
 @dataclass(frozen=True)
 class Plan:
-    """A row of the budget's table: a name, families with their traffic, and how tries are spent."""
+    """A row of the budget's table: a name, families with their traffic, and how tries are spent, by `kind`."""
 
     name: str
     families: list[Family]
     traffic: dict[str, Method]
     settings: SearchSettings
+    kind: type[Search] = Search
 
     def begin(self, setup: Setup, seed: int, only: Sequence[int]) -> Search:
         """The search in scenes `only`, before its first try."""
         numbers = [setup.scenes.number[scene] for scene in only]
         branches = {name: method.traffic.follows_script for name, method in self.traffic.items()}
-        return Search(self.families, numbers, seed, self.settings, branches)
+        return self.kind(self.families, numbers, seed, self.settings, branches)
 
 
 def build_plans(config: DictConfig, prior: Prior) -> list[Plan]:
@@ -85,12 +87,12 @@ def build_plans(config: DictConfig, prior: Prior) -> list[Plan]:
 def portfolio_plan(name: str, config: DictConfig, method: Callable[[str, DictConfig], Method]) -> Plan:
     """The plan of the group `search`."""
     given: Any = OmegaConf.to_container(config.search, resolve=True)
-    named = given.pop("families") or {}
+    named, kind = given.pop("families") or {}, get_class(given.pop("_target_"))
     if not named:
         raise InputError("search.families: name at least one, such as {rule: {}}")
     families = [family_of(str(key), value or {}, "search.families") for key, value in named.items()]
     traffic = {each.name: method(each.method, changed_method(config, each)) for each in families}
-    return Plan(name, families, traffic, settings_of(SearchSettings, given, "search"))
+    return Plan(name, families, traffic, settings_of(SearchSettings, given, "search"), kind)
 
 
 def changed_method(config: DictConfig, family: Family) -> DictConfig:

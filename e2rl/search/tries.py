@@ -100,7 +100,11 @@ class Family:
             u = (begin + drawn * torch.tensor(PRIMES, dtype=torch.float64).sqrt()) % 1
         else:
             u = torch.rand(len(DRAWN), generator=generator.manual_seed(seed + 7919 * (drawn + 1)), dtype=torch.float64)
-        onset, decisions = self.decisions(u)
+        return self.attempt(scene, number, seed, u)
+
+    def attempt(self, scene: int, number: int, seed: int, draw: Tensor) -> Try:
+        """The try `number` of a scene whose decisions are those of uniform numbers draw [len(DRAWN)]."""
+        onset, decisions = self.decisions(draw)
         rows = (tuple(RULE._replace(strength=0.0)),) * onset + (tuple(decisions),)
         return Try(scene, number, self.name, (seed * TRIES + number,), rows)
 

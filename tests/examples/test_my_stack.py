@@ -54,6 +54,16 @@ def test_adversary_ego_source_and_metric_share_a_table_with_e2(tmp_path):
 
 
 @pytest.mark.slow
+def test_somebody_else_s_optimiser_spends_the_tries(tmp_path):
+    pytest.importorskip("cma")
+    asked = ("search=evolution", "methods=[search]", "budget=12", "budget_unit=tries", "num_scenes=2", "seeds=[0]")
+    run("evaluate.py", tmp_path / "run", *asked, "report=false", "save_rollouts=false")
+    with open(tmp_path / "run" / "tries.csv") as file:
+        tries = list(csv.DictReader(file))
+    assert len(tries) == 24 and len({row["family"] for row in tries}) > 4
+
+
+@pytest.mark.slow
 def test_the_curriculum_runs_a_round(tmp_path):
     out = run(
         "train.py",
