@@ -13,15 +13,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
-from e2rl.evaluation.methods import as_list, build_traffic, method_config, varied
+from e2rl.evaluation.methods import as_list, build_traffic, is_search, method_config, rows_of, varied
 from e2rl.evaluation.protocol import WHOLE, Method, Scored, Setup, Task, has_files
 from e2rl.metrics.atlas import cell_of
 from e2rl.prior.prior import Prior
+from e2rl.run.config import built
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
 from e2rl.run.parts import NO_PARTS, Parts
@@ -30,7 +30,6 @@ from e2rl.run.settings import settings_of
 from e2rl.search.search import BRANCH, Outcome, Search, SearchSettings
 from e2rl.search.tries import TRIES, Family, Try, family_of
 
-SEARCH = "search"  # the method whose tries are drawn from families
 TRIES_FILE = "tries.csv"
 TOLD = ("scene_id", "location", "seed", "method", "ego_policy", "family", "parent", "margin", "cell", "clean")
 SPENT = ("tries", "nfe", "seconds")  # a scene, of the search so far
@@ -39,19 +38,21 @@ UNTRIED = Outcome(float("-inf"), 0.0, "", 0.0)  # of a try that errored
 
 @dataclass(frozen=True)
 class Plan:
-    """A row of the budget's table: a name, families with their traffic, and how tries are spent, by `kind`."""
+    """A row of the budget's table: a name, families with their traffic, and how tries are spent, by a `search`."""
 
     name: str
     families: list[Family]
     traffic: dict[str, Method]
     settings: SearchSettings
-    kind: type[Search] = Search
+    search: Callable[..., Search] = Search
 
     def begin(self, setup: Setup, seed: int, only: Sequence[int]) -> Search:
         """The search in scenes `only`, before its first try."""
         numbers = [setup.scenes.number[scene] for scene in only]
         branches = {name: method.traffic.follows_script for name, method in self.traffic.items()}
-        return self.kind(self.families, numbers, seed, self.settings, branches)
+        return self.search(
+            families=self.families, numbers=numbers, seed=seed, settings=self.settings, branches=branches
+        )
 
 
 def build_plans(config: DictConfig, prior: Prior) -> list[Plan]:
@@ -62,7 +63,9 @@ def build_plans(config: DictConfig, prior: Prior) -> list[Plan]:
     """
     eta = [float(value) for value in as_list(config.eta)]
     if len(eta) != 1:
-        raise InputError(f"eta={eta}: a search has one intensity, of which its families take shares; name one")
+        raise InputError(
+            f"eta={eta}: a search has one intensity, of which its families take shares; name one, or set tries=1"
+        )
     traffic: dict[str, Method] = {}
 
     def method(name: str, synthesizer: DictConfig) -> Method:
@@ -73,9 +76,9 @@ def build_plans(config: DictConfig, prior: Prior) -> list[Plan]:
         return traffic[key]
 
     plans = []
-    for name in dict.fromkeys([*as_list(config.methods), *config.variants]):
+    for name in rows_of(config):
         changed = varied(config, name) if name in config.variants else config
-        if name == SEARCH or any(str(key).startswith(SEARCH) for key in config.variants.get(name) or ()):
+        if is_search(config, name):
             plans.append(portfolio_plan(name, changed, method))
         else:
             own = changed.synthesizer if name in config.variants else method_config(config, name)
@@ -87,12 +90,14 @@ def build_plans(config: DictConfig, prior: Prior) -> list[Plan]:
 def portfolio_plan(name: str, config: DictConfig, method: Callable[[str, DictConfig], Method]) -> Plan:
     """The plan of the group `search`."""
     given: Any = OmegaConf.to_container(config.search, resolve=True)
-    named, kind = given.pop("families") or {}, get_class(given.pop("_target_"))
+    named, target = given.pop("families") or {}, OmegaConf.create({"_target_": given.pop("_target_")})
     if not named:
         raise InputError("search.families: name at least one, such as {rule: {}}")
     families = [family_of(str(key), value or {}, "search.families") for key, value in named.items()]
     traffic = {each.name: method(each.method, changed_method(config, each)) for each in families}
-    return Plan(name, families, traffic, settings_of(SearchSettings, given, "search"), kind)
+    return Plan(
+        name, families, traffic, settings_of(SearchSettings, given, "search"), partial(built, target, "search", Search)
+    )
 
 
 def changed_method(config: DictConfig, family: Family) -> DictConfig:

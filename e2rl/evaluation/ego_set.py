@@ -16,7 +16,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from torch import Tensor
 
-from e2rl.evaluation.methods import as_list, build_ego
+from e2rl.evaluation.methods import as_list, build_ego, rows_of
 from e2rl.evaluation.protocol import Setup
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.proximity import ego_path, mean_acceleration
@@ -173,7 +173,7 @@ def compared(config: DictConfig) -> list[tuple[str, str]]:
     for role in ROLES:
         if roles.get(role) not in names:
             raise InputError(f"policy_learning.{role}={roles.get(role)}: none of egos ({', '.join(names)}); name one")
-    if "nominal" not in as_list(config.methods):
+    if "nominal" not in rows_of(config):
         raise InputError(f"methods={list(config.methods)}: policy_learning compares nominal driving; name nominal, too")
     if roles.after in (roles.before, roles.planner):
         raise InputError(f"policy_learning: after is {roles.after}, and before or planner, too; name another of egos")

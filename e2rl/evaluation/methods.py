@@ -24,6 +24,8 @@ from e2rl.traffic.traffic import Traffic
 
 FIGURES = ("intensity", "curves")
 UNITS = ("nfe", "tries", "seconds")  # of a budget, a scene
+SEARCH = "search"  # the method whose tries are drawn from families
+FEW = 640.0  # NFE a scene: a rollout of CCDiff
 VARIED = ("prior", "synthesizer", "search")  # groups that the variants of a table may change
 ALL = "all"  # metrics
 
@@ -43,6 +45,13 @@ def build_traffic(synthesizer: DictConfig, prior: Prior) -> Traffic:
     return built(synthesizer, "synthesizer", Traffic, prior=prior)
 
 
+def rows_of(config: DictConfig) -> list[str]:
+    """The names of `config.methods` and of those `config.variants` that it does not name. With tries=1 `search` is one
+    try of the run's synthesizer."""
+    plain = {SEARCH: config.synthesizer.name} if config.tries == 1 else {}
+    return list(dict.fromkeys([*(plain.get(name, name) for name in as_list(config.methods)), *config.variants]))
+
+
 def build_methods(config: DictConfig, prior: Prior) -> list[Method]:
     """The rows of `config.methods` and of those `config.variants` that it does not name; methods with an intensity have
     a row for each `config.eta`.
@@ -51,7 +60,7 @@ def build_methods(config: DictConfig, prior: Prior) -> list[Method]:
         InputError: for a method that is not there, and for changes of a variant that cannot be.
     """
     methods = []
-    for name in dict.fromkeys([*as_list(config.methods), *config.variants]):
+    for name in rows_of(config):
         if name in config.variants:
             changed = varied(config, name)
             own = prior if changed.prior == config.prior else build_prior(changed, config.device)[0]
@@ -93,6 +102,7 @@ class EvaluationSettings:
     metrics: str
     compare: tuple[str, ...]
     figure: str | None = setting(choices=FIGURES, optional=True)
+    tries: int | None = setting(low=1, optional=True)
     budget: tuple[float, ...] = setting(low=0)
     budget_unit: str = setting(choices=UNITS)
     save_rollouts: bool
@@ -112,7 +122,9 @@ class EvaluationSettings:
         if len(self.shard) != 2 or self.shard[0] >= self.shard[1]:
             raise InputError(f"shard={list(self.shard)}: expected [k, n] with k from 0 to n - 1, such as shard=[0,4]")
         if self.budget and (self.figure or self.compare or len(self.shard) and self.shard[1] > 1):
-            raise InputError("budget: has a table and a picture of its own; leave out figure, compare and shard")
+            raise InputError(
+                "budget: has a table and a picture of its own; leave out figure, compare and shard, or set tries=1"
+            )
         if self.figure and len(self.eta) < 2:
             raise InputError(f"figure={self.figure}: name several intensities, such as eta=[0,1,2,3]")
         if self.figure == "intensity" and not self.save_rollouts:
@@ -122,16 +134,36 @@ class EvaluationSettings:
 def evaluation_settings(config: DictConfig) -> EvaluationSettings:
     """Returns what a configuration asks for; InputError for what cannot be run."""
     given = {field.name: config[field.name] for field in fields(EvaluationSettings)}
-    given |= {name: as_list(given[name]) for name in ("methods", "eta", "seeds", "compare", "budget")}
+    given |= {name: as_list(given[name]) for name in ("eta", "seeds", "compare", "budget")}
+    given |= {"methods": rows_of(config)} | _budget(config)
     settings = settings_of(EvaluationSettings, given | {"shard": config.shard or WHOLE})
-    if not (settings.methods or config.variants):
+    if not settings.methods:
         raise InputError("methods=[]: name at least one, such as [nominal,e2]")
+    own = config.synthesizer.name
+    if SEARCH in settings.methods and own not in ("e2", *settings.methods):
+        raise InputError(f"synthesizer={own}: search does not begin with it; set tries=1, or name {own} in methods")
     for name in config.variants:
         if name in (config.synthesizer.name, *choices("synthesizer")):
             raise InputError(f"variants.{name}: {name} is a row already; choose another name")
     _check_compared(config, settings)
     processes_of(config)
     return settings
+
+
+def is_search(config: DictConfig, name: str) -> bool:
+    """Whether a row's tries are drawn from families: SEARCH and its variants."""
+    return name == SEARCH or any(str(key).startswith(SEARCH) for key in config.variants.get(name) or ())
+
+
+def _budget(config: DictConfig) -> dict[str, Any]:
+    """The budgets and their unit: of `tries` or `budget`, or else FEW where there is a search."""
+    if config.tries is not None:
+        if config.budget is not None:
+            raise InputError(f"tries={config.tries}, budget={config.budget}: name one of the two")
+        return {"budget": [] if config.tries == 1 else [config.tries], "budget_unit": "tries"}
+    if config.budget is None and any(is_search(config, name) for name in rows_of(config)):
+        return {"budget": [FEW], "budget_unit": "nfe"}
+    return {"budget": as_list(config.budget)}
 
 
 def as_list(value: Any) -> list:
@@ -178,7 +210,7 @@ def _check_compared(config: DictConfig, settings: EvaluationSettings) -> None:
         raise InputError(f"{where}: policy_learning has tables of its own; leave one of the two")
     if config.egos and (len(names) != 1 or names[0] not in config.egos):
         raise InputError(f"{where}: expected one of egos, {', '.join(map(str, config.egos))}")
-    if not config.egos and (unknown := [name for name in names if name not in (*settings.methods, *config.variants)]):
+    if not config.egos and (unknown := [name for name in names if name not in settings.methods]):
         raise InputError(f"{where}: no row of the name {unknown[0]}; add it to methods")
     if not config.egos and len(settings.eta) > 1:
         raise InputError(f"{where}: a table with a row a method has one eta; name one")

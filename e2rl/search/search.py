@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from e2rl.metrics.margin import PREVENTED
+from e2rl.run.config import Extension
 from e2rl.run.settings import configured, setting
 from e2rl.search.portfolio import Portfolio
 from e2rl.search.tries import TRIES, Family, Try
@@ -50,7 +51,7 @@ class Outcome(NamedTuple):
 
 
 @dataclass
-class Search:
+class Search(Extension):
     """The tries of N scenes so far, and what is tried next.
 
     Args:

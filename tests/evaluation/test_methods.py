@@ -83,21 +83,41 @@ def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(experimen
     [
         (["methods=[e3]"], "synthesizer=e3: none of cat, ccdiff, constant_velocity, ctg, .*, strive; add a f"),
         (["methods=[]"], r"methods=\[\]: name at least one"),
-        (["+variants.other={training: {steps: 4}}"], "variants.other: training is none of prior, synthesizer"),
-        (["+variants.other={synthesizer.contrl.feasibility: 0}"], "variants.other: .*'contrl' .*compare it with conf/"),
-        (["+variants.other={prior.sampler.temperature: -1}"], "temperature=-1"),
+        (["tries=1", "+variants.other={training: {steps: 4}}"], "variants.other: training is none of prior, synthesizer"),
+        (["tries=1", "+variants.other={synthesizer.contrl.feasibility: 0}"], "variants.other: .*'contrl' .*compare it with conf/"),
+        (["tries=1", "+variants.other={prior.sampler.temperature: -1}"], "temperature=-1"),
         (["+variants.idm={prior.sampler.steps: 4}"], "variants.idm: idm is a row already"),
         (["eta=nan"], "eta=nan: expected"),
-        (["figure=curves"], "figure=curves: name several"),
-        (["figure=intensity", "eta=[1,2]", "save_rollouts=false"], "figure=intensity: .*save_rollouts=true"),
+        (["tries=1", "figure=curves"], "figure=curves: name several"),
+        (["tries=1", "figure=intensity", "eta=[1,2]", "save_rollouts=false"], "figure=intensity: .*save_rollouts=true"),
         (["processes=2", "threads=2"], "processes=2, threads=2, device=cpu, .*: .*processes=1"),
         (["shard=[4,4]"], r"shard=\[4, 4\]: expected \[k, n\] with k from 0 to n - 1"),
-        (["compare=[e2,ctg]"], "no row of the name ctg"),
+        (["tries=1", "compare=[e2,ctg]"], "no row of the name ctg"),
+        (["compare=[search]"], "leave out figure, compare and shard, or set tries=1"),
+        (["synthesizer=ctg"], "synthesizer=ctg: search does not begin with it; set tries=1"),
+        (["tries=2", "budget=640"], "tries=2, budget=640: name one of the two"),
+        (["tries=0"], "tries=0: expected a number of at least 1"),
     ],
 )
 def test_what_cannot_run_is_named_with_its_remedy(overrides, message):
     with pytest.raises(InputError, match=message):
         methods_of(*overrides)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "rows", "budget", "unit"),
+    [
+        ((), ("search", "nominal"), (640.0,), "nfe"),
+        (("tries=1",), ("e2", "nominal"), (), "tries"),
+        (("tries=1", "synthesizer=ccdiff"), ("ccdiff", "nominal"), (), "tries"),
+        (("tries=8",), ("search", "nominal"), (8.0,), "tries"),
+        (("methods=[e2]",), ("e2",), (), "nfe"),
+        (("methods=[e2]", "budget=[2,4]", "budget_unit=tries"), ("e2",), (2.0, 4.0), "tries"),
+    ],
+)
+def test_a_search_has_a_few_tries_and_other_methods_one(overrides, rows, budget, unit):
+    asked = evaluation_settings(config_of(*overrides))
+    assert (asked.methods, asked.budget, asked.budget_unit) == (rows, budget, unit)
 
 
 def test_a_shared_device_keeps_to_one_process():
