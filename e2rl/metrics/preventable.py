@@ -18,7 +18,7 @@ from e2rl.metrics.drivers import DRIVERS, Driver, Observation, no_conflict
 from e2rl.scenes.boxes import separation, to_frame
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING, project
-from e2rl.sim.dynamics import wrap
+from e2rl.sim.dynamics import constant_velocity, wrap
 
 STRAIGHT = 60.0  # m by which a way goes on straight
 NEAREST = 16  # vehicles that come nearest to the ego are seen
@@ -153,6 +153,16 @@ def nearest_first(collision: Collision) -> Collision:
     return Collision(held(states[at], present[at]), present[at], collision.size[row, order], partner, collision.stop)
 
 
+def seen_out(collision: Collision) -> Collision:
+    """The collision with AFTER more steps, in which everybody goes on at a constant velocity: whom the end of the
+    rollout spares has not got away."""
+    states, present = collision.states, collision.present
+    times = DT * torch.arange(1, AFTER + 1, device=states.device, dtype=states.dtype)
+    more = constant_velocity(states[:, -1], times).transpose(1, 2)
+    longer = present[:, -1:].expand(-1, AFTER, -1)
+    return collision._replace(states=torch.cat([states, more], 1), present=torch.cat([present, longer], 1))
+
+
 def held(states: Tensor, present: Tensor) -> Tensor:
     """States [B, T+1, N, 4] with those of absent vehicles replaced by their last (else their first) present ones."""
     steps = torch.arange(states.shape[1], device=states.device)[None, :, None].expand_as(present)
@@ -212,7 +222,9 @@ def _follows(leader: Tensor, others: Tracks, touched: Tensor, index: Tensor) -> 
 
 def preventions(collision: Collision, drivers: dict[str, Driver] = DRIVERS) -> dict[str, Prevention]:
     """The Prevention of B collisions by each driver."""
-    collision = nearest_first(collision)
+    until = collision.states.shape[1]
+    collision = seen_out(nearest_first(collision))
     others = Tracks(collision.states[:, :, 1:], collision.size[:, 1:], collision.present[:, :, 1:])
     along = along_way(collision.states[:, :, 0], collision.size[:, 0, 1], others)
-    return {name: prevention(driver, collision, along) for name, driver in drivers.items()}
+    found = {name: prevention(driver, collision, along) for name, driver in drivers.items()}
+    return {name: each._replace(states=each.states[:, :until]) for name, each in found.items()}

@@ -120,6 +120,18 @@ def test_a_cut_in_is_preventable_where_there_is_room_to_brake():
     assert 5.0 < needed < 14.0
 
 
+@pytest.mark.parametrize("speed", [14.0, 16.0, 20.0])
+def test_a_driver_that_the_end_of_the_rollout_spares_has_not_got_away(speed):
+    """Whoever stands at this distance is hit by every driver, though later than by the ego, at whose contact the
+    rollout ends. A rollout that goes on has the same verdict."""
+    case = collision(track(speed), track(0.0, start=(4.5 + 1.6 * speed, 0.0)))
+    last = int(case.stop) + 1
+    cut = case._replace(states=case.states[:, :last], present=case.present[:, :last])
+    assert not human(case).avoided and not human(cut).avoided
+    driven = human(cut).states[0, -1, 0]
+    assert driven + 4.5 < 4.5 + 1.6 * speed, "the driver is not there yet as the rollout ends"
+
+
 def follower(gap, speed=14.0):
     return track(speed, start=(-4.5 - gap, 0.0))
 
