@@ -18,13 +18,25 @@ from memory import memory
 from peer import peer_benchmarks
 from ppo_update import ppo_update
 from scaling import scaling
+from searched_rollouts import searched_rollouts
 from simulator import simulator
 from synthesized_rollout import synthesized_rollout
 
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 
-OWN = (simulator, collector, ppo_update, learning, guided_replan, synthesized_rollout, evolution_round, memory, scaling)
+OWN = (
+    simulator,
+    collector,
+    ppo_update,
+    learning,
+    guided_replan,
+    synthesized_rollout,
+    searched_rollouts,
+    evolution_round,
+    memory,
+    scaling,
+)
 BENCHMARKS: dict[str, Benchmark] = {function.__name__: function for function in OWN} | peer_benchmarks
 
 

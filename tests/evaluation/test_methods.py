@@ -83,8 +83,14 @@ def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(experimen
     [
         (["methods=[e3]"], "synthesizer=e3: none of cat, ccdiff, constant_velocity, ctg, .*, strive; add a f"),
         (["methods=[]"], r"methods=\[\]: name at least one"),
-        (["tries=1", "+variants.other={training: {steps: 4}}"], "variants.other: training is none of prior, synthesizer"),
-        (["tries=1", "+variants.other={synthesizer.contrl.feasibility: 0}"], "variants.other: .*'contrl' .*compare it with conf/"),
+        (
+            ["tries=1", "+variants.other={training: {steps: 4}}"],
+            "variants.other: training is none of prior, synthesizer",
+        ),
+        (
+            ["tries=1", "+variants.other={synthesizer.contrl.feasibility: 0}"],
+            "variants.other: .*'contrl' .*compare it with conf/",
+        ),
         (["tries=1", "+variants.other={prior.sampler.temperature: -1}"], "temperature=-1"),
         (["+variants.idm={prior.sampler.steps: 4}"], "variants.idm: idm is a row already"),
         (["eta=nan"], "eta=nan: expected"),

@@ -1,0 +1,57 @@
+"""What a search costs beside its rollouts: its rounds, which are small batches, and its questions and answers."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+from measure import Bench, Row
+from torch import arange
+
+from e2rl.evaluation.budget import Plan, batches, build_plans, spend
+from e2rl.evaluation.protocol import Setup
+from e2rl.search.search import Search
+from e2rl.search.tries import Try
+
+SCENES, TRIES = 48, 8
+
+
+def searched_rollouts(bench: Bench) -> Iterator[Row]:
+    """CPU seconds a rollout of a search, of the same rollouts in full batches, and of questions and answers."""
+    (scenes,) = bench.batches(SCENES)
+    index, only = arange(scenes), range(scenes)
+    setup = Setup(bench.scenes, bench.ego, "lane_graph", bench.sim, 32, "cpu")
+    plan = build_plans(bench.config, bench.traffic.prior)[0]
+    tries, talk = searched(setup, plan, only)
+    count = len(tries)
+
+    def plain() -> None:
+        for _, method, tasks in batches(setup, plan, 0, only, tries, 0):
+            setup.score(method, tasks, None)
+
+    spent = bench.both(lambda: searched(setup, plan, only))[1], bench.both(plain)[1], talk
+    for name, value in zip(("searched", "in full batches", "ask and tell"), spent, strict=True):
+        yield bench.row("searched_rollouts", name, index, value / count, "CPU s/rollout")
+
+
+def searched(setup: Setup, plan: Plan, only: range) -> tuple[list[Try], float]:
+    """The tries of a search, and the seconds that it took to ask and tell."""
+    tries: list[Try] = []
+    talked = 0.0
+
+    class Timed(Search):
+        def ask(self) -> list[Try]:
+            nonlocal talked
+            begun = time.process_time()
+            asked = super().ask()
+            talked += time.process_time() - begun
+            tries.extend(asked)
+            return asked
+
+        def tell(self, *told) -> None:
+            nonlocal talked
+            begun = time.process_time()
+            super().tell(*told)
+            talked += time.process_time() - begun
+
+    spend(setup, replace(plan, search=Timed), 0, only, TRIES, "tries")
+    return tries, talked
