@@ -60,7 +60,8 @@ def test_the_public_protocol_has_crash_rates_and_route_completion_of_every_ego(e
 def test_egos_before_and_after_are_rated_in_one_run(evaluated):
     """An untrained actor and a planner in its place."""
     roles = "{before: before, after: after, planner: before}"
-    run = evaluated("+egos.before={ego: actor}", "+egos.after={ego: lane_graph}", f"policy_learning={roles}")
+    egos = "+egos.before={ego: actor}", "+egos.after={ego: lane_graph}", f"policy_learning={roles}"
+    run = evaluated("methods=[nominal,e2]", *egos)
     rows = read_metrics(run / "metrics.json")
     assert [(row["ego"], row["method"]) for row in rows] == [
         (ego, method) for ego in ("before", "after") for method in ("nominal", "e2")
