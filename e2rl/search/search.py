@@ -22,7 +22,6 @@ from e2rl.traffic.traffic import REPLAN_STEPS
 
 BRANCH = "branch"  # the family of tries that branch
 FAR = -8.0  # margin below which nothing branches from a try
-BATCH = 16  # tries of a family in a round at least: fewer at once take longer each
 LEADS = (0, 3, 6)  # replans before the rise of the hazard at which branches begin, in turn
 
 
@@ -95,7 +94,6 @@ class Search(Extension):
         found = torch.tensor([any(outcome.cell for outcome in scene) for scene in self.outcomes])
         worth = torch.where(found[:, None], self.settings.again * worth, worth)
         worth[:, -1] = worth[:, -1].masked_fill(~self._may_branch(), -torch.inf)
-        worth = self._few(worth)
         if min(len(tries) for tries in self.tries) < self.settings.cover:
             chosen = list(enumerate(worth.argmax(1).tolist()))
         else:
@@ -106,14 +104,6 @@ class Search(Extension):
             first = len(self.tries[scene]) + sum(one.scene == scene for one in asked)
             asked += self._draw(scene, family, first)
         return asked
-
-    def _few(self, worth: Tensor) -> Tensor:
-        """worth [N, F + 1] with all families out but those worth the most in so many scenes that each fills a BATCH."""
-        count = self.settings.width * len(worth)
-        families = min(max(1, round(count / BATCH)), worth.shape[1])
-        each = min(max(1, round(count / families)), len(worth))
-        best = worth.clamp(min=0).topk(each, dim=0).values.mean(0).topk(families).indices
-        return torch.full_like(worth, -torch.inf).index_copy(1, best, worth[:, best])
 
     def tell(self, tries: Sequence[Try], outcomes: Sequence[Outcome]) -> None:
         """What became of tries that were asked for."""
