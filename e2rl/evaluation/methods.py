@@ -143,6 +143,8 @@ def evaluation_settings(config: DictConfig) -> EvaluationSettings:
     if SEARCH in settings.methods and own not in ("e2", *settings.methods):
         raise InputError(f"synthesizer={own}: search does not begin with it; set tries=1, or name {own} in methods")
     for name in config.variants:
+        if not settings.budget and is_search(config, name):
+            raise InputError(f"variants.{name}: changes the search, and tries=1 is without one; leave out either")
         if name in (config.synthesizer.name, *choices("synthesizer")):
             raise InputError(f"variants.{name}: {name} is a row already; choose another name")
     _check_compared(config, settings)
@@ -162,6 +164,8 @@ def _budget(config: DictConfig) -> dict[str, Any]:
             raise InputError(f"tries={config.tries}, budget={config.budget}: name one of the two")
         return {"budget": [] if config.tries == 1 else [config.tries], "budget_unit": "tries"}
     if config.budget is None and any(is_search(config, name) for name in rows_of(config)):
+        if config.budget_unit != "nfe":
+            raise InputError(f"budget_unit={config.budget_unit}: without a budget; name one, such as budget=16")
         return {"budget": [FEW], "budget_unit": "nfe"}
     return {"budget": as_list(config.budget)}
 

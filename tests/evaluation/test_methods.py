@@ -102,6 +102,8 @@ def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(experimen
         (["compare=[search]"], "leave out figure, compare and shard, or set tries=1"),
         (["synthesizer=ctg"], "synthesizer=ctg: search does not begin with it; set tries=1"),
         (["tries=2", "budget=640"], "tries=2, budget=640: name one of the two"),
+        (["budget_unit=tries"], "budget_unit=tries: without a budget"),
+        (["tries=1", "+variants.blind={search.bandit: false}"], "variants.blind: changes the search, and tries=1"),
         (["tries=0"], "tries=0: expected a number of at least 1"),
     ],
 )
