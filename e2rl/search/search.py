@@ -23,6 +23,7 @@ from e2rl.traffic.traffic import REPLAN_STEPS
 BRANCH = "branch"  # the family of tries that branch
 FAR = -8.0  # margin below which nothing branches from a try
 LEADS = (0, 3, 6)  # replans before the rise of the hazard at which branches begin, in turn
+ROUND = 24  # tries that a round of few scenes has at least: its batches cost much the same with one try as with several
 
 
 @configured("search/portfolio")
@@ -89,15 +90,18 @@ class Search(Extension):
 
     def ask(self) -> list[Try]:
         """The next tries, to be told in this order: one of every scene until it has `cover` of them, then of those
-        families in those scenes that are worth the most, `width` times as many as there are scenes."""
+        families in those scenes that are worth the most, `width` times as many as there are scenes; ROUND at least."""
         worth = self._portfolio.worth(self._generator)
         found = torch.tensor([any(outcome.cell for outcome in scene) for scene in self.outcomes])
         worth = torch.where(found[:, None], self.settings.again * worth, worth)
         worth[:, -1] = worth[:, -1].masked_fill(~self._may_branch(), -torch.inf)
-        if min(len(tries) for tries in self.tries) < self.settings.cover:
-            chosen = list(enumerate(worth.argmax(1).tolist()))
+        uncovered = self.settings.cover - min(len(tries) for tries in self.tries)
+        if uncovered > 0:
+            each = worth.topk(min(-(-ROUND // len(worth)), uncovered, len(self.families)), dim=1).indices
+            chosen = [(scene, family) for scene, families in enumerate(each.tolist()) for family in families]
         else:
-            best = worth.flatten().topk(max(1, round(self.settings.width * len(worth)))).indices.sort().values
+            count = min(max(ROUND, round(self.settings.width * len(worth))), int(worth.isfinite().sum()))
+            best = worth.flatten().topk(count).indices.sort().values
             chosen = [divmod(pair, worth.shape[1]) for pair in best.tolist()]
         asked: list[Try] = []
         for scene, family in chosen:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from e2rl.metrics.margin import PREVENTED
-from e2rl.search.search import Outcome, Search, SearchSettings
+from e2rl.search.search import ROUND, Outcome, Search, SearchSettings
 from e2rl.search.tries import Family
 
 FAMILIES = [Family(name, "e2", {"moment": (1.0, 5.0)}) for name in ("good", "poor", "idle")]
@@ -43,6 +43,17 @@ def test_the_same_answers_lead_to_the_same_questions():
 def test_every_scene_is_tried_before_any_is_tried_more():
     search = told(search_of(), PLAIN.cover)
     assert {len(tries) for tries in search.tries} == {PLAIN.cover} and search.nfe == 100 * PLAIN.cover
+
+
+def test_a_round_of_few_scenes_has_as_many_tries_as_a_batch_is_worth_and_covers_them_all():
+    many = [Family(f"family {k}", "e2", {}) for k in range(12)]
+    CHANCE.update({family.name: 0.0 for family in many})
+    search = search_of(scenes=5, settings=replace(PLAIN, cover=7), families=many)
+    first = search.ask()
+    assert len({(one.scene, one.family) for one in first}) == len(first) == ROUND + 1  # five of each of five scenes
+    search.tell(first, [Outcome(-2.0, 40.0, "", 100.0)] * len(first))
+    assert {len(tries) for tries in told(search, 1).tries} == {7}
+    assert len(search.ask()) == ROUND
 
 
 def test_tries_go_to_the_family_that_finds_and_not_to_hopeless_scenes():
