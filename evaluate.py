@@ -3,6 +3,7 @@
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
 
 # isort: split
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -27,6 +28,7 @@ def evaluate(run: Run) -> None:
     if asked.budget:
         scored, tries = search_all(egos.setups(plan.setup), plan.searches, *asked.most, *how)
         save_budget(folder, plan, tries, *scored[:2])
+        egos = replace(egos, pairs=())  # tries of different egos are no pairs
     else:
         scored = drive_all(egos.setups(plan.setup), plan.methods, *how)  # every ego, method, eta, scene and seed
     if asked.shard != WHOLE:

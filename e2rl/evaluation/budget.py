@@ -13,13 +13,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
-from e2rl.evaluation.methods import as_list, build_traffic, is_search, method_config, rows_of, varied
+from e2rl.evaluation.methods import as_list, build_traffic, config_and_prior, is_search, method_config, rows_of
 from e2rl.evaluation.protocol import WHOLE, Method, Scored, Setup, Task, has_files
 from e2rl.metrics.atlas import cell_of
+from e2rl.metrics.margin import FARTHEST
 from e2rl.prior.prior import Prior
 from e2rl.run.config import built
 from e2rl.run.errors import InputError
@@ -33,7 +35,6 @@ from e2rl.search.tries import TRIES, Family, Try, family_of
 TRIES_FILE = "tries.csv"
 TOLD = ("scene_id", "location", "seed", "method", "ego_policy", "family", "parent", "margin", "cell", "clean")
 SPENT = ("tries", "nfe", "seconds")  # a scene, of the search so far
-UNTRIED = Outcome(float("-inf"), 0.0, "", 0.0)  # of a try that errored
 
 
 @dataclass(frozen=True)
@@ -68,33 +69,40 @@ def build_plans(config: DictConfig, prior: Prior) -> list[Plan]:
         )
     traffic: dict[str, Method] = {}
 
-    def method(name: str, synthesizer: DictConfig) -> Method:
-        key = name + OmegaConf.to_yaml(synthesizer)
+    def method(own: Prior, name: str, synthesizer: DictConfig) -> Method:
+        key = f"{id(own)} {name} {OmegaConf.to_yaml(synthesizer)}"
         if key not in traffic:
-            built = build_traffic(synthesizer, prior)
+            built = build_traffic(synthesizer, own)
             traffic[key] = Method(name, built, eta[0] if built.adversarial else 0.0)
         return traffic[key]
 
     plans = []
     for name in rows_of(config):
-        changed = varied(config, name) if name in config.variants else config
+        changed, own = config_and_prior(config, name, prior)
         if is_search(config, name):
-            plans.append(portfolio_plan(name, changed, method))
+            plans.append(portfolio_plan(name, changed, partial(method, own)))
         else:
-            own = changed.synthesizer if name in config.variants else method_config(config, name)
+            synthesizer = changed.synthesizer if name in config.variants else method_config(config, name)
             again = replace(SearchSettings(), cover=TRIES, bandit=False, brood=0)
-            plans.append(Plan(name, [Family(name, name, {})], {name: method(name, own)}, again))
+            plans.append(Plan(name, [Family(name, name, {})], {name: method(own, name, synthesizer)}, again))
     return plans
 
 
 def portfolio_plan(name: str, config: DictConfig, method: Callable[[str, DictConfig], Method]) -> Plan:
     """The plan of the group `search`."""
     given: Any = OmegaConf.to_container(config.search, resolve=True)
-    named, target = given.pop("families") or {}, OmegaConf.create({"_target_": given.pop("_target_")})
+    named = {key: value for key, value in (given.pop("families") or {}).items() if value is not None}
+    target = OmegaConf.create({"_target_": given.pop("_target_")})
     if not named:
-        raise InputError("search.families: name at least one, such as {rule: {}}")
-    families = [family_of(str(key), value or {}, "search.families") for key, value in named.items()]
+        raise InputError("search.families: name at least one, such as +search.families.rule={}")
+    families = [family_of(str(key), value, "search.families") for key, value in named.items()]
     traffic = {each.name: method(each.method, changed_method(config, each)) for each in families}
+    for each in families:
+        if each.ranges and not traffic[each.name].traffic.follows_script:
+            decision = next(iter(each.ranges))
+            raise InputError(
+                f"search.families.{each.name}.{decision}: {each.method} does not decide this; leave it out"
+            )
     return Plan(
         name, families, traffic, settings_of(SearchSettings, given, "search"), partial(built, target, "search", Search)
     )
@@ -154,12 +162,17 @@ def spend(
     processes: Processes = 1,
     parts: Parts = NO_PARTS,
 ) -> tuple[Scored, list[dict]]:
-    """What one search finds, and its tries in their order. A try that errors counts as one that comes nowhere near."""
+    """What one search finds, and its tries in their order: round by round, the scenes of a round in an order of its
+    own, so that a budget that ends within a round is spent on scenes at random. A try that errors counts as one that
+    comes nowhere near, and costs what its family is said to cost."""
     search, found, told = plan.begin(setup, seed, scenes), ([], [], []), []  # type: ignore[var-annotated]
+    errs = {family.name: Outcome(-FARTHEST, 0.0, "", family.nfe) for family in plan.families}
+    generator = torch.Generator().manual_seed(seed)
     spent = dict.fromkeys(SPENT, 0.0)
     with tqdm(total=budget, desc=f"{plan.name}: {unit} a scene", disable=None) as bar:
         while spent[unit] < budget:
-            tries = search.ask()
+            order = torch.randperm(len(scenes), generator=generator).tolist()
+            tries = sorted(search.ask(), key=lambda one: order[one.scene])
             jobs, before = batches(setup, plan, seed, scenes, tries, sum(map(len, search.tries))), spent[unit]
 
             def work(job: tuple[int, Method, list]) -> Scored:
@@ -175,12 +188,16 @@ def spend(
                 known |= {(row["scene_id"], row["seed"]): row for row in scored[0]}
             names = [(setup.scenes.scene_id[scenes[one.scene]], row_seed(seed, one)) for one in tries]
             rows = [known.get(name) for name in names]
-            search.tell(tries, [UNTRIED if row is None else outcome_of(row) for row in rows])
-            for one, row in zip(tries, rows, strict=True):
-                spent["tries"] += 1 / len(scenes)
-                for name, column in (("nfe", "nfe"), ("seconds", "seconds")):
-                    spent[name] += (0.0 if row is None else row[column]) / len(scenes)
+            outcomes = [
+                errs[one.family] if row is None else outcome_of(row) for one, row in zip(tries, rows, strict=True)
+            ]
+            search.tell(tries, outcomes)
+            for one, row, outcome in zip(tries, rows, outcomes, strict=True):
+                costs = 1.0, outcome.nfe, 0.0 if row is None else row["seconds"]
+                spent = {name: spent[name] + cost / len(scenes) for name, cost in zip(SPENT, costs, strict=True)}
                 told += [] if row is None else [told_of(one, row) | spent]
+            if not any(rows) and unit == "seconds":
+                break  # all errored, and nothing tells how long they would take
             if spent[unit] == before:
                 raise InputError(f"{plan.name}: its tries cost no {unit}; give the budget in tries, budget_unit=tries")
             bar.update(min(spent[unit], budget) - bar.n)

@@ -61,15 +61,17 @@ def build_methods(config: DictConfig, prior: Prior) -> list[Method]:
     """
     methods = []
     for name in rows_of(config):
-        if name in config.variants:
-            changed = varied(config, name)
-            own = prior if changed.prior == config.prior else build_prior(changed, config.device)[0]
-            traffic = build_traffic(changed.synthesizer, own)
-        else:
-            traffic = build_traffic(method_config(config, name), prior)
+        changed, own = config_and_prior(config, name, prior)
+        traffic = build_traffic(changed.synthesizer if name in config.variants else method_config(config, name), own)
         etas = as_list(config.eta) if traffic.adversarial else [0.0]
         methods += [Method(name, traffic, float(eta)) for eta in etas]
     return methods
+
+
+def config_and_prior(config: DictConfig, name: str, prior: Prior) -> tuple[DictConfig, Prior]:
+    """The configuration of a row, and its prior, which is the run's where the row does not change it."""
+    changed = varied(config, name) if name in config.variants else config
+    return changed, prior if changed.prior == config.prior else build_prior(changed, config.device)[0]
 
 
 def method_config(config: DictConfig, name: str) -> DictConfig:
@@ -103,7 +105,7 @@ class EvaluationSettings:
     compare: tuple[str, ...]
     figure: str | None = setting(choices=FIGURES, optional=True)
     tries: int | None = setting(low=1, optional=True)
-    budget: tuple[float, ...] = setting(low=0)
+    budget: tuple[float, ...] = setting(low=0.01)
     budget_unit: str = setting(choices=UNITS)
     save_rollouts: bool
     report: bool
@@ -145,7 +147,7 @@ def evaluation_settings(config: DictConfig) -> EvaluationSettings:
     for name in config.variants:
         if not settings.budget and is_search(config, name):
             raise InputError(f"variants.{name}: changes the search, and tries=1 is without one; leave out either")
-        if name in (config.synthesizer.name, *choices("synthesizer")):
+        if name in (config.synthesizer.name, SEARCH, *choices("synthesizer")):
             raise InputError(f"variants.{name}: {name} is a row already; choose another name")
     _check_compared(config, settings)
     processes_of(config)

@@ -246,8 +246,8 @@ def inputs(config: DictConfig) -> Iterator[tuple[str, Any]]:
                 yield f"{key}={value}", sha256_of(path)
             except OSError as error:
                 raise InputError(f"{key}={value}: cannot be read: {error.strerror}; name another file") from error
-    families = config.search.families.values() if config.get("budget") else ()
-    of_families = ((family or {}).get("method", "e2") for family in families)
+    families = config.search.families.values() if "search" in config and config.get("tries") != 1 else ()
+    of_families = (family.get("method", "e2") for family in families if isinstance(family, DictConfig))
     for name in dict.fromkeys([*config.get("methods", ()), *of_families]):
         if name not in (*config.variants, config.synthesizer.name, "search"):
             yield f"synthesizer={name}", resolved(load_choice("synthesizer", name))

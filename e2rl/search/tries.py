@@ -115,6 +115,8 @@ def family_of(name: str, given: Mapping[str, Any], where: str) -> Family:
     Raises:
         InputError: a key is no decision, or a value no number, pair of numbers, or kind of vehicle.
     """
+    if not isinstance(given, Mapping) or not isinstance(given.get("changes", {}), Mapping):
+        raise InputError(f"{where}.{name}={given}: expected {{method: NAME, changes: {{}}, DECISION: [low, high]}}")
     ranges: dict[str, tuple[float, float] | float] = {}
     for key, value in given.items():
         if key in ("method", "changes", "chance", "nfe"):
@@ -124,8 +126,13 @@ def family_of(name: str, given: Mapping[str, Any], where: str) -> Family:
             check_choice(f"{where}.{name}.whom", value, WHOM)
             value = WHOM.index(value)
         numbers = value if isinstance(value, list | tuple) else [value]
-        if not all(isinstance(number, int | float) for number in numbers) or len(numbers) not in (1, 2):
+        known = len(numbers) in (1, 2) and all(isinstance(number, int | float) for number in numbers)
+        if not known or numbers[0] > numbers[-1]:
             raise InputError(f"{where}.{name}.{key}={value}: expected a number, or [low, high]")
         ranges[key] = tuple(map(float, numbers)) if len(numbers) == 2 else float(numbers[0])  # type: ignore[assignment]
-    about: dict[str, Any] = {key: float(given[key]) for key in ("chance", "nfe") if key in given}
+    about: dict[str, Any] = {key: given[key] for key in ("chance", "nfe") if key in given}
+    for key, value in about.items():
+        most = {"chance": 1.0, "nfe": 1e9}[key]
+        if not isinstance(value, int | float) or not 0 < value <= most:
+            raise InputError(f"{where}.{name}.{key}={value}: expected a number above 0, at most {most:g}")
     return Family(name, str(given.get("method", "e2")), ranges, dict(given.get("changes", {})), **about)
