@@ -29,6 +29,7 @@ DRAWS = 1000
 REALISM_DRAWS = 400  # each costs a pass over all samples
 LEVEL = 0.95
 LEVELS = ((1 - LEVEL) / 2, (1 + LEVEL) / 2)
+Z = 1.959964  # standard deviations to either side that hold LEVEL of a normal law
 LEAST = 10  # places
 Row = Mapping[str, Any]
 
@@ -114,6 +115,16 @@ def interval(values: Tensor, places: int) -> dict[str, float]:
         low, high = values[1:].nanquantile(values.new_tensor(LEVELS)).tolist()
         low, high = (torch.nan, torch.nan) if low == high else (low, high)
     return {"mean": values[0].item(), "low": low, "high": high}
+
+
+def jackknife(values: Tensor) -> dict[str, float]:
+    """{mean, low, high} of a statistic, values [1 + P]: of all P places, then without each of them (Efron 1982). No
+    interval (NaN) from fewer than LEAST places, or where one of the values is not finite."""
+    others, count = values[1:], len(values) - 1
+    spread = ((count - 1) / max(count, 1) * (others - others.mean()).square().sum()).sqrt().item()
+    half = Z * spread if count >= LEAST and values.isfinite().all() and spread > 0 else float("nan")
+    mean = values[0].item() if values[0].isfinite() else float("nan")
+    return {"mean": mean, "low": mean - half, "high": mean + half}
 
 
 def exact_interval(fraction: float, places: int, level: float = LEVEL) -> tuple[float, float]:

@@ -1,7 +1,6 @@
 """What searches found within several budgets: budget.csv, budget.md and the picture (docs/search.md).
 
-Intervals are a bootstrap by place; every draw counts the cells of the atlas that the places drawn have. A search with
-several seeds is the mean of its seeds.
+Intervals are of places. A search with several seeds is the mean of its seeds.
 """
 
 import csv
@@ -18,7 +17,16 @@ from torch import Tensor
 from e2rl.evaluation.budget import SPENT, TRIES_FILE, write_tries
 from e2rl.evaluation.plan import Evaluation
 from e2rl.metrics.realism import Samples, realism
-from e2rl.metrics.statistics import REALISM_DRAWS, bootstrap_draws, cluster_index, interval
+from e2rl.metrics.statistics import (
+    LEAST,
+    REALISM_DRAWS,
+    bootstrap_draws,
+    cluster_index,
+    exact_interval,
+    interval,
+    jackknife,
+    ratios,
+)
 from e2rl.report.drawing import new_figure, save_figure
 from e2rl.report.tables import Table, save_tables
 from e2rl.run.files import write_atomically
@@ -35,14 +43,16 @@ ABOUT = {
     "real_adv": "realism of adversaries",
 }
 CAPTION = (
-    "95% intervals by place. A cell is approach, partner's manoeuvre, broken duty, side of contact and the ego's speed "
-    "in bands of 5 m/s; a draw of places has fewer cells than all places, so that their number has no interval. Ratios "
-    "are the first method's over each other's, in the same draws."
+    "95% intervals by place; those of numbers of cells, of which a draw of places has fewer than all places, are of a "
+    "jackknife. A cell is approach, partner's manoeuvre, broken duty, side of contact and the ego's speed in bands of "
+    "5 m/s. Ratios are the first method's over each other's, in the same draws. Rates of tries are no rates of the "
+    "planner's: tries go where failures are."
 )
 
 
 class Found:
-    """Resampled values [1 + draws] of what one plan found against one ego within one budget.
+    """Resampled values [1 + draws] of what one plan found against one ego within one budget; of the cells, what is left
+    without each place [1 + places].
 
     Args:
         told: lines of tries.csv of one plan and ego, in their order, of all seeds.
@@ -63,12 +73,16 @@ class Found:
         place, count = cluster_index(*zip(*scenes, strict=True))
         draws, number = bootstrap_draws(count), {scene: k for k, (_, scene) in enumerate(scenes)}
         seeds = sorted({row["seed"] // TRIES for row in told})
-        self.spent = {name: max((row[name] for row in within), default=0.0) for name in SPENT}
-        self.places = count
+        self.spent = dict.fromkeys(SPENT, 0.0)
+        self.places, hit = count, torch.zeros(count, dtype=torch.bool)
         self.draws: dict[str, Tensor] = {name: torch.zeros(len(draws), dtype=torch.float64) for name in FOUND}
+        self.draws["cells"] = torch.zeros(1 + count, dtype=torch.float64)
         weight = draws @ torch.bincount(place, minlength=count).double()
         for seed in seeds:
-            own = [row for row in within if row["seed"] // TRIES == seed and row["cell"]]
+            tried = [row for row in within if row["seed"] // TRIES == seed]
+            for name in SPENT:
+                self.spent[name] += max((row[name] for row in tried), default=0.0) / len(seeds)
+            own = [row for row in tried if row["cell"]]
             at = torch.tensor([number[row["scene_id"]] for row in own], dtype=torch.int64)
             per_scene = torch.bincount(at, minlength=len(scenes)).double()
             clean = torch.bincount(at, torch.tensor([float(row["clean"]) for row in own]), len(scenes)).double()
@@ -77,10 +91,12 @@ class Found:
                 of_place = torch.zeros(count, dtype=torch.float64).index_add(0, place, value)
                 self.draws[name] += (draws @ of_place) / weight / len(seeds)
             cells = sorted({row["cell"] for row in own})
-            there = torch.zeros(count, max(len(cells), 1), dtype=torch.float64)
-            for row, scene in zip(own, at.tolist(), strict=True):
-                there[place[scene], cells.index(row["cell"])] = 1
-            self.draws["cells"] += ((draws > 0).double() @ there > 0).sum(1) / len(seeds)
+            there = torch.zeros(count, len(cells), dtype=torch.int64)
+            there[place[at], torch.tensor([cells.index(row["cell"]) for row in own], dtype=torch.int64)] = 1
+            alone = (there * (there.sum(0) == 1)).sum(1)  # cells that no other place has
+            self.draws["cells"] += (len(cells) - torch.cat([alone.new_zeros(1), alone])) / len(seeds)
+            hit[place[at]] = True
+        self.failed = int(hit.sum())  # places with a failure
         known = [row for row in within if (row["scene_id"], row["seed"]) in samples]
         of = torch.tensor([int(place[number[row["scene_id"]]]) for row in known], dtype=torch.int64)
         drawn = bootstrap_draws(count, REALISM_DRAWS)
@@ -88,12 +104,22 @@ class Found:
         self.draws["real_adv"] = realism(theirs, of, drawn)["real_adv"]
 
     def value(self, name: str) -> dict[str, float]:
-        """Mean and interval; of the number of cells none, as a draw of places has fewer than all places."""
-        return interval(self.draws[name], self.places if name != "cells" else 0)
+        """Mean and interval; exact, or none, where few places have or lack a failure (`metrics.statistics`)."""
+        if name == "cells":
+            return jackknife(self.draws[name])
+        few = min(self.failed, self.places - self.failed if name == "scenes" else self.failed) < LEAST
+        found = interval(self.draws[name], 0 if few and name != "real_adv" else self.places)
+        if few and name == "scenes" and self.places >= LEAST:
+            low, high = exact_interval(found["mean"] / 100, self.places)
+            found |= {"low": 100 * low, "high": 100 * high}
+        return found
 
     def ratio(self, other: "Found", name: str) -> dict[str, float]:
         """Mean and interval of this over the other's."""
-        return interval(self.draws[name] / other.draws[name], self.places)
+        if name == "cells":
+            log = jackknife((self.draws[name] / other.draws[name]).log())
+            return {key: math.exp(value) for key, value in log.items()}
+        return interval(ratios({name: self.draws[name]}, {name: other.draws[name]})[name], self.places)
 
 
 def budget_rows(

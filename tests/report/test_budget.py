@@ -94,3 +94,32 @@ def test_the_answer_tells_the_largest_budget_in_a_sentence_for_each_method():
     assert len(lines) == 4 and "40 of 40 scenes" in lines[0] and "in 7 different ways" in lines[1]
     assert "e2 against idm: preventable failures in 39 of 40 scenes" in lines[2] and "in 1 different" in lines[3]
     assert "4.0 tries (400 NFE" in lines[1] and all(len(line) <= 100 for line in lines)
+
+
+def test_without_a_place_its_own_cells_are_gone_and_the_interval_tells_how_many_places_have_such():
+    """Each place has a cell of its own, and half of them share one besides: each has one alone."""
+    told = searched("search", lambda scene, *_: f"{scene // 2}" if scene % 4 else "shared", rounds=1, seeds=(0,))
+    row = one_row(told, 100)
+    assert row["cells"]["mean"] == 21 and row["cells"]["low"] != row["cells"]["low"]  # all alike: nothing to tell
+    uneven = searched("search", lambda scene, *_: f"{scene}" if scene < 20 else "shared", rounds=1, seeds=(0,))
+    row = one_row(uneven, 100)  # half of the places have two cells alone, half none: sd of n times the mean 2, 0
+    half = 1.96 * (19 * 20 / 20) ** 0.5
+    assert (row["cells"]["low"], row["cells"]["high"]) == (
+        pytest.approx(21 - half, abs=0.01),
+        pytest.approx(21 + half, abs=0.01),
+    )
+
+
+def test_few_places_with_failures_have_an_exact_interval_and_a_ratio_without_bounds():
+    both = searched("search", lambda scene, *_: "a" if scene < 20 else "") + searched(
+        "e2", lambda scene, *_: "a" if not scene else ""
+    )
+    first, second = budget_rows(both, SCENES, [400], "nfe", {})
+    assert second["scenes"]["mean"] == 2.5 and second["scenes"]["low"] < 1 and 10 < second["scenes"]["high"] < 25
+    assert second["failures"]["low"] != second["failures"]["low"]
+    assert (
+        second["scenes_ratio"]["mean"] == pytest.approx(20)
+        and second["scenes_ratio"]["low"] != second["scenes_ratio"]["low"]
+    )
+    nothing = budget_rows(searched("search", lambda *_: ""), SCENES, [400], "nfe", {})[0]["scenes"]
+    assert nothing["low"] == 0 and nothing["high"] == pytest.approx(100 * (1 - 0.025 ** (1 / 20)), abs=0.1)
