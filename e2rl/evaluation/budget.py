@@ -29,11 +29,11 @@ from e2rl.run.files import write_atomically
 from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.processes import Processes, in_processes
 from e2rl.run.settings import settings_of
-from e2rl.search.search import BRANCH, Outcome, Search, SearchSettings
+from e2rl.search.search import Outcome, Search, SearchSettings
 from e2rl.search.tries import TRIES, Family, Try, family_of
 
 TRIES_FILE = "tries.csv"
-TOLD = ("scene_id", "location", "seed", "method", "ego_policy", "family", "parent", "margin", "cell", "clean")
+TOLD = ("scene_id", "location", "seed", "method", "ego_policy", "family", "margin", "cell", "clean")
 SPENT = ("tries", "nfe", "seconds")  # a scene, of the search so far
 
 
@@ -50,10 +50,7 @@ class Plan:
     def begin(self, setup: Setup, seed: int, only: Sequence[int]) -> Search:
         """The search in scenes `only`, before its first try."""
         numbers = [setup.scenes.number[scene] for scene in only]
-        branches = {name: method.traffic.follows_script for name, method in self.traffic.items()}
-        return self.search(
-            families=self.families, numbers=numbers, seed=seed, settings=self.settings, branches=branches
-        )
+        return self.search(families=self.families, numbers=numbers, seed=seed, settings=self.settings)
 
 
 def build_plans(config: DictConfig, prior: Prior) -> list[Plan]:
@@ -83,7 +80,7 @@ def build_plans(config: DictConfig, prior: Prior) -> list[Plan]:
             plans.append(portfolio_plan(name, changed, partial(method, own)))
         else:
             synthesizer = changed.synthesizer if name in config.variants else method_config(config, name)
-            again = replace(SearchSettings(), cover=TRIES, bandit=False, brood=0)
+            again = replace(SearchSettings(), cover=TRIES, bandit=False)
             plans.append(Plan(name, [Family(name, name, {})], {name: method(own, name, synthesizer)}, again))
     return plans
 
@@ -98,7 +95,7 @@ def portfolio_plan(name: str, config: DictConfig, method: Callable[[str, DictCon
     families = [family_of(str(key), value, "search.families") for key, value in named.items()]
     traffic = {each.name: method(each.method, changed_method(config, each)) for each in families}
     for each in families:
-        if each.ranges and not traffic[each.name].traffic.follows_script:
+        if each.ranges and not traffic[each.name].traffic.follows_decisions:
             decision = next(iter(each.ranges))
             raise InputError(
                 f"search.families.{each.name}.{decision}: {each.method} does not decide this; leave it out"
@@ -166,18 +163,18 @@ def spend(
     own, so that a budget that ends within a round is spent on scenes at random. A try that errors counts as one that
     comes nowhere near, and costs what its family is said to cost."""
     search, found, told = plan.begin(setup, seed, scenes), ([], [], []), []  # type: ignore[var-annotated]
-    errs = {family.name: Outcome(-FARTHEST, 0.0, "", family.nfe) for family in plan.families}
+    errs = {family.name: Outcome(-FARTHEST, "", family.nfe) for family in plan.families}
     generator = torch.Generator().manual_seed(seed)
     spent = dict.fromkeys(SPENT, 0.0)
     with tqdm(total=budget, desc=f"{plan.name}: {unit} a scene", disable=None) as bar:
-        while spent[unit] < budget:
+        while spent[unit] < budget * (1 - 1e-9):
             order = torch.randperm(len(scenes), generator=generator).tolist()
             tries = sorted(search.ask(), key=lambda one: order[one.scene])
             jobs, before = batches(setup, plan, seed, scenes, tries, sum(map(len, search.tries))), spent[unit]
 
             def work(job: tuple[int, Method, list]) -> Scored:
                 number, method, tasks = job
-                identity = [plan.name, setup.ego_name, method.eta, [task.one.plain() for task in tasks]]
+                identity = [plan.name, setup.ego_name, method.eta, [list(task.one) for task in tasks]]
                 compute = partial(setup.score, method, tasks, into)
                 return parts.result(f"tries-{number:06}", identity, compute, partial(has_files, into))
 
@@ -232,13 +229,12 @@ def cell_name(row: Mapping) -> str:
 
 def outcome_of(row: Mapping) -> Outcome:
     """What the search is told of a rollout."""
-    return Outcome(row["margin"], row["hazard_step"], cell_name(row), row["nfe"])
+    return Outcome(row["margin"], cell_name(row), row["nfe"])
 
 
 def told_of(one: Try, row: Mapping) -> dict[str, Any]:
     """A line of TRIES_FILE, without SPENT."""
-    family = BRANCH if one.parent >= 0 else one.family
-    about = {"family": family, "parent": one.parent, "cell": cell_name(row), "clean": row["cfr_clean"]}
+    about = {"family": one.family, "cell": cell_name(row), "clean": row["cfr_clean"]}
     return {name: about[name] if name in about else row[name] for name in TOLD}
 
 

@@ -23,7 +23,7 @@ from e2rl.run.errors import InputError
 from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.processes import Processes, in_processes
 from e2rl.scenes.scene import SceneSet
-from e2rl.search.tries import Try, scripts_of
+from e2rl.search.tries import Try
 from e2rl.sim.env import SimSettings
 from e2rl.sim.rollout_file import ROLLOUTS, UNPRINTABLE, rollout_name
 from e2rl.sim.rollouts import Rollouts
@@ -81,10 +81,11 @@ class Setup:
         """The rollouts of (scene, seed) pairs under one method."""
         index, tries = torch.tensor([task.scene for task in tasks]), [task.one for task in tasks if task.one]
         noise = torch.tensor([scene_seed(self.scenes.number[task.scene], task.seed) for task in tasks])
-        noise, script = scripts_of(tries) if tries else (noise, None)
+        noise = torch.tensor([one.seed for one in tries]) if tries else noise
+        decisions = torch.tensor([one.decisions for one in tries]) if tries else None
         eta = torch.full((len(tasks),), float(method.eta), dtype=torch.float64)
         given = (self.ego, method.traffic, self.sim, self.device)
-        rollouts = roll_out(self.scenes, index, noise, eta, *given, script=script)
+        rollouts = roll_out(self.scenes, index, noise, eta, *given, decisions=decisions)
         rollouts.seed = torch.tensor([task.seed for task in tasks])
         for name, text in zip(SOURCE, self.source(method), strict=True):
             rollouts.set(name, [text] * len(tasks))

@@ -17,20 +17,13 @@ from e2rl.scenes.recording import VEHICLE
 
 FARTHEST = 30.0  # s and m: nobody who counts is nearer
 CLOSING = 1.0  # m/s of relative velocity from which on a pair counts
-RISE = 2.0  # s and m above its least, from which on the distance counts as the hazard's rise
 PREVENTED = 2.0
 
 
-@columns(Metric("margin", "nearness to a preventable failure (docs/search.md)"), events=("hazard_step",))
+@columns(Metric("margin", "nearness to a preventable failure (docs/search.md)"))
 def margin_columns(batch: Batch) -> Batch:
-    """margin [B], and hazard_step [B] at which what led to it began."""
-    apart = approach_distance(batch)  # [B, T+1]
-    least, at = apart.min(1)
-    steps = torch.arange(apart.shape[1], device=apart.device)
-    above = (apart > (least + RISE)[:, None]) & (steps <= at[:, None])
-    began = torch.where(above, steps, 0).amax(1)
-    margin = torch.where(batch["hit"], contact_margin(batch), -least)
-    return {"margin": margin, "hazard_step": began.to(margin)}
+    """margin [B]."""
+    return {"margin": torch.where(batch["hit"], contact_margin(batch), -approach_distance(batch).amin(1))}
 
 
 def approach_distance(batch: Batch) -> Tensor:

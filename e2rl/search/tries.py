@@ -1,8 +1,8 @@
-"""A try: one attack on one scene, reproducible from its genome, and the families that tries are drawn from."""
+"""Tries, each one attack on one scene, reproducible from its seed and decisions; families that they are drawn from."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,53 +11,23 @@ from e2rl.run.errors import InputError
 from e2rl.run.settings import check_choice
 from e2rl.traffic.e2.decisions import RULE, WHOM, Decisions
 
-ONSET = "onset"  # of a family: replans before which nobody is controlled
 TRIES = 10_000  # of a scene that have seeds of their own
-DRAWN = (ONSET, *Decisions._fields)
-PRIMES = (2, 3, 5, 7, 11, 13, 17, 19)  # of the square roots that stratify the draws of one decision each
+DRAWN = Decisions._fields
+PRIMES = (2, 3, 5, 7, 11, 13, 17)  # of the square roots that stratify the draws of one decision each
 
 
-@dataclass(frozen=True)
-class Try:
+class Try(NamedTuple):
     """One attack on one scene.
 
-    Args:
-        scene: its position.
-        number: of the try among those of the scene.
-        family: that it is drawn from.
-        seeds: of the noise of each replan; the last one also of all later ones.
-        script: decisions at each replan, rows of `Decisions`; the last one also of all later ones.
-        parent: number of the try that it branches from, -1 for none.
+    scene: its position; number: of the try among those of the scene; family: that it is drawn from; seed: of its noise;
+    decisions: `Decisions`.
     """
 
     scene: int
     number: int
     family: str
-    seeds: tuple[int, ...]
-    script: tuple[tuple[float, ...], ...]
-    parent: int = -1
-
-    def branch(self, number: int, replan: int, seed: int, **changed: float) -> "Try":
-        """The same try up to a replan, with other noise and changed decisions from there on."""
-        seeds = (*(self.seeds[min(k, len(self.seeds) - 1)] for k in range(replan)), seed)
-        before = tuple(self.script[min(k, len(self.script) - 1)] for k in range(replan))
-        after = tuple(
-            tuple(Decisions(*row)._replace(**changed)) for row in self.script[min(replan, len(self.script) - 1) :]
-        )
-        return replace(self, number=number, seeds=seeds, script=before + after, parent=self.number)
-
-    def plain(self) -> dict[str, Any]:
-        """As plain values."""
-        return vars(self) | {"seeds": list(self.seeds), "script": [list(row) for row in self.script]}
-
-
-def scripts_of(tries: list[Try]) -> tuple[Tensor, Tensor]:
-    """Seeds [B, S] int64 and scripts [B, S', D] of tries, the last rows repeated."""
-    longest = max(len(each.seeds) for each in tries)
-    seeds = [each.seeds + each.seeds[-1:] * (longest - len(each.seeds)) for each in tries]
-    longest = max(len(each.script) for each in tries)
-    scripts = [each.script + each.script[-1:] * (longest - len(each.script)) for each in tries]
-    return torch.tensor(seeds, dtype=torch.int64), torch.tensor(scripts, dtype=torch.float32)
+    seed: int
+    decisions: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -67,7 +37,7 @@ class Family:
     Args:
         name: of the family.
         method: of traffic, by name.
-        ranges: {decision or ONSET: (low, high) or one number}; whom: index into WHOM.
+        ranges: {decision: (low, high) or one number}; whom: index into WHOM.
         changes: of the method's settings.
         chance, nfe: of a failure in a try, and what a try costs, by which the portfolio begins.
     """
@@ -78,15 +48,6 @@ class Family:
     changes: Mapping[str, Any] = field(default_factory=dict)
     chance: float = 0.1
     nfe: float = 160.0
-
-    def decisions(self, draw: Tensor) -> tuple[int, Decisions]:
-        """The onset and the decisions of uniform numbers draw [len(DRAWN)] in [0, 1)."""
-        found: dict[str, float] = {}
-        for name, u in zip(DRAWN, draw.tolist(), strict=True):
-            if name in self.ranges:
-                span = self.ranges[name]
-                found[name] = span[0] + u * (span[1] - span[0]) if isinstance(span, tuple) else float(span)
-        return round(found.pop(ONSET, 0)), RULE._replace(**found)
 
     def draw(self, scene: int, number: int, seed: int, drawn: int, stratified: bool) -> Try:
         """The try `number` of a scene, the family's `drawn`-th there; reproducible from the seed of the scene's search.
@@ -103,10 +64,13 @@ class Family:
         return self.attempt(scene, number, seed, u)
 
     def attempt(self, scene: int, number: int, seed: int, draw: Tensor) -> Try:
-        """The try `number` of a scene whose decisions are those of uniform numbers draw [len(DRAWN)]."""
-        onset, decisions = self.decisions(draw)
-        rows = (tuple(RULE._replace(strength=0.0)),) * onset + (tuple(decisions),)
-        return Try(scene, number, self.name, (seed * TRIES + number,), rows)
+        """The try `number` of a scene whose decisions are those of uniform numbers draw [len(DRAWN)] in [0, 1)."""
+        found: dict[str, float] = {}
+        for name, u in zip(DRAWN, draw.tolist(), strict=True):
+            if name in self.ranges:
+                span = self.ranges[name]
+                found[name] = span[0] + u * (span[1] - span[0]) if isinstance(span, tuple) else float(span)
+        return Try(scene, number, self.name, seed * TRIES + number, tuple(RULE._replace(**found)))
 
 
 def family_of(name: str, given: Mapping[str, Any], where: str) -> Family:

@@ -33,19 +33,14 @@ React = Callable[[Tensor, Tensor], Tensor]  # rows [G], planned states [G, V, HO
 class PriorState:
     """B scenes driven by the prior; every tensor has the batch first.
 
-    seeds [B, S]: of the noise of each replan, the last one's also of all later replans; replans [B]: replans so far;
-    routed: the vehicles' routes; lane [B, V]: lane states at the end of the executed plans.
+    seed [B]: of the scene's noise; replans [B]: replans so far; routed: the vehicles' routes; lane [B, V]: lane states
+    at the end of the executed plans.
     """
 
-    seeds: Tensor = no_vehicles()
+    seed: Tensor = no_vehicles()
     replans: Tensor = no_vehicles()
     routed: RoutedScene
     lane: LaneState
-
-    @property
-    def seed(self) -> Tensor:
-        """[B], of the next replan's noise."""
-        return self.seeds.gather(1, self.replans.clamp(max=self.seeds.shape[1] - 1)[:, None])[:, 0]
 
 
 @dataclass
@@ -72,18 +67,14 @@ class NominalTraffic(Traffic):
     prior: Prior
     knowledge: str = setting(choices=KNOWLEDGE)
 
-    branches = True
-
     def __post_init__(self) -> None:
         self.prior = self.prior.requires_grad_(False).eval()
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> State:
         """Returns the states of scenes [B] with routes drawn from the prior."""
-        seeds = seed if seed.ndim == 2 else seed[:, None]
-        begun = torch.zeros_like(seeds[:, 0])
-        uniform = noise_of(seeds[:, 0], begun, tuple(scenes["route_valid"].shape[1:2]), uniform=True)
+        uniform = noise_of(seed, torch.zeros_like(seed), tuple(scenes["route_valid"].shape[1:2]), uniform=True)
         routed, lane = self.prior.start(scenes, self.prior.choose_routes(scenes, uniform))
-        return PriorState(seeds, begun, routed, lane)
+        return PriorState(seed, torch.zeros_like(seed), routed, lane)
 
     def replan(
         self, state: State, world: World, ego_plan: Tensor, react: React | None = None
@@ -108,10 +99,6 @@ class NominalTraffic(Traffic):
             valid = world.valid[rows, :vehicles, None]  # a vehicle that has left does not return
             present[rows, :vehicles] = plan.on_map & valid
         return whole, TrafficPlan(states, present, route=whole.routed.route)
-
-    def with_own(self, state: State, before: State) -> State:
-        """Returns the state with the seeds of `before`."""
-        return replace(state, seeds=before.seeds)
 
     def replan_group(self, now: Replan) -> tuple[State, Tensor, Context]:
         """Returns state, joint sample x0 [G, V, SIZE] and context of a group."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from e2rl.run.errors import InputError
-from e2rl.traffic.e2.decisions import RULE, script_of
+from e2rl.traffic.e2.decisions import RULE
 from e2rl.traffic.traffic import FULL
 
 RECORDED, LIVE = -1, -2  # sources of a row's traffic that is not a position in the stored traffic
@@ -36,9 +36,9 @@ class TrafficPool:
 
     scene_index [R] int64; source [R] int64: position in the stored traffic, RECORDED: the log is replayed, LIVE: a
     traffic method replans it against the ego; eta [R]: adversarial intensity, 0: none; template [R] int64: causal
-    template of the attack (e2rl/traffic/traffic.py); seed [R, S] int64: of the noise of LIVE rows at each replan, the
-    last one also at all later ones; script [R, S', D]: the attack's decisions (e2rl/traffic/e2/decisions.py); weight
-    [R]: in draws; fresh [R] bool: made for this round, not remembered from an earlier one.
+    template of the attack (e2rl/traffic/traffic.py); seed [R] int64: of the noise of LIVE rows; decisions [R, D]: of
+    the attack (e2rl/traffic/e2/decisions.py); weight [R]: in draws; fresh [R] bool: made for this round, not remembered
+    from an earlier one.
     parts: the stored traffic, of equal T and N; positions count through all parts. Joined pools share the tracks.
     """
 
@@ -47,7 +47,7 @@ class TrafficPool:
     eta: Tensor
     template: Tensor
     seed: Tensor
-    script: Tensor
+    decisions: Tensor
     weight: Tensor
     fresh: Tensor
     parts: list[StoredTraffic] = field(default_factory=list)
@@ -95,11 +95,11 @@ class TrafficPool:
 
     @staticmethod
     def live(
-        scene_index: Tensor, eta: Tensor, seed: Tensor, template: Tensor | None = None, script: Tensor | None = None
+        scene_index: Tensor, eta: Tensor, seed: Tensor, template: Tensor | None = None, decisions: Tensor | None = None
     ) -> "TrafficPool":
-        """Rows of scenes [R] that are replanned against the ego; eta [R], seed [R] or [R, S], template [R] (None:
-        full), script [R, S', D] (None: by rule)."""
-        return _rows(scene_index, LIVE, eta, seed, template, script)
+        """Rows of scenes [R] that are replanned against the ego; eta [R], seed [R], template [R] (None: full),
+        decisions [R, D] (None: by rule)."""
+        return _rows(scene_index, LIVE, eta, seed, template, decisions)
 
     @staticmethod
     def stored(traffic: Mapping[str, Tensor], eta: Tensor | float, template: Tensor | None = None) -> "TrafficPool":
@@ -122,19 +122,9 @@ class TrafficPool:
         """Both pools' rows, this one's first."""
         count = sum(len(part.states) for part in self.parts)
         moved = torch.where(other.source >= 0, other.source + count, other.source)
-        names = ("scene_index", "eta", "template", "seed", "script", "weight", "fresh")
+        names = ("scene_index", "eta", "template", "seed", "decisions", "weight", "fresh")
         joined = {name: torch.cat([getattr(self, name), getattr(other, name)]) for name in names}
         return TrafficPool(source=torch.cat([self.source, moved]), parts=self.parts + other.parts, **joined)
-
-    def first_alike(self, drawn: Tensor, replan: int) -> Tensor:
-        """Position [b] among rows drawn [b] of the first that is planned like each up to a replan: of the same scene
-        and intensity, with the same noise and decisions so far."""
-        names = (self.scene_index, self.source, self.eta, self.template)
-        so_far = [self.seed[drawn, : replan + 1], self.script[drawn, : replan + 1].flatten(1)]
-        key = torch.cat([value[drawn, None].double() for value in names] + [value.double() for value in so_far], 1)
-        _, kind = torch.unique(key, dim=0, return_inverse=True)
-        position = torch.arange(len(drawn))
-        return torch.full_like(position, len(drawn)).scatter_reduce(0, kind, position, "amin")[kind]
 
     def probabilities(self, priority: Tensor, fraction: float) -> Tensor:
         """Draw probability [R]: `fraction` for all adversarial rows (1 or 0 where there is one kind), within a kind in
@@ -154,12 +144,11 @@ def _rows(
     eta: Tensor,
     seed: Tensor | None = None,
     template: Tensor | None = None,
-    script: Tensor | None = None,
+    decisions: Tensor | None = None,
 ) -> TrafficPool:
     """Fresh rows of weight 1 from one source; by default of seed 0 and template full, by rule."""
     like = torch.zeros(len(scene_index), dtype=torch.int64)
     seed, template = like if seed is None else seed, like + FULL if template is None else template
-    script = script_of(RULE, len(like)) if script is None else script
+    decisions = torch.tensor(RULE).expand(len(like), -1) if decisions is None else decisions
     fresh, weight = torch.ones_like(like).bool(), torch.ones(len(like))
-    seed = seed[:, None] if seed.ndim == 1 else seed
-    return TrafficPool(scene_index, like + source, eta, template, seed, script, weight, fresh)
+    return TrafficPool(scene_index, like + source, eta, template, seed, decisions, weight, fresh)

@@ -37,22 +37,21 @@ def roll_out(
     sim: SimSettings,
     device: str = "cpu",
     template: Tensor | None = None,
-    script: Tensor | None = None,
+    decisions: Tensor | None = None,
 ) -> Rollouts:
     """Rollouts of scenes `index` [B] int64 to their last step, on through contacts and off the road.
 
     Args:
-        seed: [B] or [B, S] int64, of the noise (`TrafficPool`).
+        seed: [B] int64, of the noise.
         eta: [B], intensities.
         template: [B] int64, causal templates (None: full for all).
-        script: [B, S', D], decisions of the attack (None: by rule).
+        decisions: [B, D], of the attack (None: by rule).
     """
     begin = time.perf_counter()
     settings = replace(sim, end_on_contact=False, end_off_road=False, end_when_gone=False)
     settings.replay_ego = sim.replay_ego or ego.replays_log
-    pool = TrafficPool.live(
-        index.cpu(), eta.cpu().float(), seed.cpu(), *(None if x is None else x.cpu() for x in (template, script))
-    )
+    given = (None if x is None else x.cpu() for x in (template, decisions))
+    pool = TrafficPool.live(index.cpu(), eta.cpu().float(), seed.cpu(), *given)
     base = DrivingEnv(scenes, settings, len(index), device, agents=True)
     synthesizer, log = AdversarialSynthesizer(pool, torch.arange, traffic, ego), PlanLog()
     synthesizer.on_plan = log
@@ -62,7 +61,7 @@ def roll_out(
     known = _driven(steps, base.scene, log) | log.plans(steps["ego", "plan"])
     cost = {"seconds": time.perf_counter() - begin, "nfe": float(sum(nfe))}
     known |= {name: torch.full((len(index),), value / len(index)) for name, value in cost.items()}
-    known |= {"seed": seed if seed.ndim == 1 else seed[:, 0], "eta": eta.double()}
+    known |= {"seed": seed, "eta": eta.double()}
     return Rollouts.in_scenes(scenes, index, scene=base.scene, replays_ego=settings.replay_ego, **known)
 
 

@@ -69,21 +69,19 @@ class Traffic(Extension, ABC):
     """Drives all vehicles but the ego of B scenes at once. Built as `_target_(prior=prior, **settings)`.
 
     stochastic: seeds matter; adversarial: the intensity eta matters; follows_template: `reset` takes causal templates,
-    template [B] int64 (None: full for all); follows_script: it takes decisions, script [B, S, D]
-    (e2rl/traffic/e2/decisions.py; None: by rule); branches: `reset` takes a seed for each replan, seed [B, S] instead
-    of [B], the last one also for all later; predicts: plans can be compared with the log in open loop; replays_log: it
-    is the recording itself; queries_ego: `replan` takes `react`, which returns the ego's states against a plan:
-    react(rows [G] of the batch, states [G, V, HORIZON, 4]) -> [G, HORIZON, 4]; knowledge, responsibility: what it knows
-    of the ego and owes it, in words for captions ("": nothing to say); tuned: ranges (low, high[, "log"]) of the
-    settings that a tuning varies, by dotted name, the gain first; on_decision: called with what the method decides, if
-    it tells (e2: a `Selection` of adversaries).
+    template [B] int64 (None: full for all); follows_decisions: and decisions [B, D] (e2rl/traffic/e2/decisions.py;
+    None: by rule); predicts: plans can be compared with the log in open loop; replays_log: it is the recording itself;
+    queries_ego: `replan` takes `react`, which returns the ego's states against a plan: react(rows [G] of the batch,
+    states [G, V, HORIZON, 4]) -> [G, HORIZON, 4]; knowledge, responsibility: what it knows of the ego and owes it, in
+    words for captions ("": nothing to say); tuned: ranges (low, high[, "log"]) of the settings that a tuning varies, by
+    dotted name, the gain first; on_decision: called with what the method decides, if it tells (e2: a `Selection` of
+    adversaries).
     """
 
     stochastic = True
     adversarial = False
     follows_template = False
-    follows_script = False
-    branches = False
+    follows_decisions = False
     predicts = True
     replays_log = False
     queries_ego = False
@@ -110,11 +108,6 @@ class Traffic(Extension, ABC):
             world: the B scenes now.
             ego_plan: [B, >= HORIZON, 4], states that the ego announces, for a method whose knowledge is its plan.
         """
-
-    def with_own(self, state: State, before: State) -> State:
-        """Returns the state of attempts that were alike so far, copied from one of them, with what is each one's own
-        for later replans, from its state before."""
-        return state
 
     def open_loop_plans(self, scene: TensorDictBase, seed: Tensor) -> Tensor:
         """Returns joint plans [B, S, V, HORIZON, 4] of scenes [B] from their start frames; seed [S, B] int64.

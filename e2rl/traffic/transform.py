@@ -12,14 +12,12 @@ from e2rl.planners.ego import Ego
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv
-from e2rl.sim.world import World
 from e2rl.traffic.e2.reaiming import Reaiming
 from e2rl.traffic.grouping import put_rows, take_rows
 from e2rl.traffic.pool import LIVE, RECORDED, TrafficPool
 from e2rl.traffic.reaction import Lookahead
 from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan, keep_velocity
 
-ALIKE = 1e-3  # m, rad, m/s by which rounding tells attempts apart that are alike
 Draw = Callable[[int], Tensor]  # count -> pool rows [count] of new episodes
 
 
@@ -116,13 +114,12 @@ class AdversarialSynthesizer(Transform):
         """Reset the traffic method's state and the plan in environments first [B] bool, which have just been reset."""
         env, rows = self._env, first.nonzero()[:, 0]
         world, drawn = env.world(), self._drawn[rows.cpu()]
-        method, eta, seed = self._method, self.pool.eta[drawn].to(env.device), self.pool.seed[drawn].to(env.device)
+        seed, eta = (getattr(self.pool, name)[drawn].to(env.device) for name in ("seed", "eta"))
         begins = not len(self._planned_at)
         whole = begins or len(rows) == len(first)
-        names = {"template": method.follows_template, "script": method.follows_script}
+        names = {"template": self._method.follows_template, "decisions": self._method.follows_decisions}
         given = {name: getattr(self.pool, name)[drawn].to(env.device) for name, follows in names.items() if follows}
-        scene = world.scene if whole else world.scene[rows]
-        fresh = method.reset(scene, seed if method.branches else seed[:, 0], eta, **given)
+        fresh = self._method.reset(world.scene if whole else world.scene[rows], seed, eta, **given)
         self._state = fresh if whole else put_rows(self._state, rows, fresh)
         if begins:
             shape = (*world.scene["route_log"].shape, HORIZON, 4)
@@ -158,34 +155,15 @@ class AdversarialSynthesizer(Transform):
                 )
             ego_plan = keep_velocity(world.states[:, 0])  # nobody is told it
         whole = len(rows) == len(world.step)
-        asked, again = self._alike(rows, world)
-        every = len(asked) == len(world.step)
-        state, now = (self._state, world) if every else (take_rows(self._state, asked), take_rows(world, asked))
+        state, now = (self._state, world) if whole else (take_rows(self._state, rows), take_rows(world, rows))
         queries = {"react": Lookahead(self.ego, now)} if self._method.queries_ego and self.ego is not None else {}
-        state, plan = self._method.replan(state, now, ego_plan[asked], **queries)
-        if len(asked) < len(rows):
-            state, plan = take_rows(state, again), take_rows(plan, again)
-            state = self._method.with_own(state, take_rows(self._state, rows))
+        state, plan = self._method.replan(state, now, ego_plan if whole else ego_plan[rows], **queries)
         self._state = state if whole else put_rows(self._state, rows, state)
         self._plan[rows] = plan.states.to(self._plan.dtype)
         if self.on_plan is not None:
             self.on_plan(plan)
         self._planned_at[rows] = world.step[rows]
         self._env.write_traffic(rows, plan.states, plan.present)
-
-    def _alike(self, rows: Tensor, world: World) -> tuple[Tensor, Tensor]:
-        """Of environments rows [b] those to plan for [a], and of which of these [b] each has the plan: attempts that
-        are alike so far, and whose egos drive alike, are planned once, where all were begun together."""
-        planned = self._planned_at[rows]
-        itself = torch.arange(len(rows))
-        if len(rows) < len(self._planned_at) or bool((planned != planned[0]).any()):
-            return rows, itself.to(rows.device)
-        first = self.pool.first_alike(self._drawn, int(planned[0]) // REPLAN_STEPS + 1)
-        states = world.states.nan_to_num().flatten(1)
-        apart = (states - states[first.to(states.device)]).abs().amax(1) > ALIKE
-        first = torch.where(apart.cpu(), itself, first)
-        own = (first == itself).nonzero()[:, 0]
-        return rows[own.to(rows.device)], torch.searchsorted(own, first).to(rows.device)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self._write(next_tensordict)

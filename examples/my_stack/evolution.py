@@ -19,7 +19,7 @@ class Evolution(Search):
     def __post_init__(self):
         super().__post_init__()
         options = {"bounds": [0, 1], "popsize": POPULATION, "verbose": -9}
-        middle, seeds = np.full(1 + len(DRAWN), 0.5), [1 + self._seed(scene) for scene in range(len(self.numbers))]
+        middle, seeds = np.full(1 + len(DRAWN), 0.5), [1 + self.seed_of(scene) for scene in range(len(self.numbers))]
         self._strategies = [cma.CMAEvolutionStrategy(middle, 0.3, options | {"seed": seed}) for seed in seeds]
 
     def ask(self):
@@ -29,7 +29,7 @@ class Evolution(Search):
 
     def _try(self, scene, k, point):
         family = self.families[min(int(point[0] * len(self.families)), len(self.families) - 1)]
-        return family.attempt(scene, len(self.tries[scene]) + k, self._seed(scene), torch.from_numpy(point[1:]))
+        return family.attempt(scene, len(self.tries[scene]) + k, self.seed_of(scene), torch.from_numpy(point[1:]))
 
     def tell(self, tries, outcomes):
         """CMA-ES minimises; a try that errored comes nowhere near."""

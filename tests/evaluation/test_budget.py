@@ -18,7 +18,7 @@ from tests.prior.small import small_prior
 from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
 RULE = Family("rule", "e2", {})
-LATE = Family("late", "e2", {"onset": 2.0})
+LATE = Family("late", "e2", {"patience": 2.0})
 
 
 def setup_of():
@@ -27,7 +27,7 @@ def setup_of():
 
 def plan_of():
     on = Method("e2", synthesizer(), 2.0)
-    settings = replace(SearchSettings(), cover=1, brood=3, branch_chance=0.9)
+    settings = replace(SearchSettings(), cover=1)
     return Plan("search", [RULE, LATE], {"rule": on, "late": on}, settings)
 
 
@@ -55,19 +55,10 @@ def known(told):
 
 def test_a_budget_of_tries_is_spent_and_hardly_exceeded(setup, plan):
     told = found(setup, plan)
-    assert 4.0 <= told[-1]["tries"] <= 4.0 + plan.settings.brood and [row["tries"] for row in told] == sorted(
-        row["tries"] for row in told
-    )
+    spent = [row["tries"] for row in told]
+    assert 4.0 <= spent[-1] <= 4.0 + len(plan.families) and spent == sorted(spent)
     assert all(row["seed"] // TRIES == 3 and row["method"] == "search" for row in told)
     assert len({(row["scene_id"], row["seed"]) for row in told}) == len(told)
-
-
-def test_branches_are_among_the_tries_and_name_their_parent(setup, plan):
-    told = found(setup, plan)
-    by_name = {(row["scene_id"], row["seed"] % TRIES): row for row in told}
-    branches = [row for row in told if row["parent"] >= 0]
-    assert branches and all(row["family"] == "branch" for row in branches)
-    assert all((row["scene_id"], row["parent"]) in by_name for row in branches)
 
 
 def test_processes_change_nothing(setup, plan):
@@ -105,11 +96,29 @@ def plans(*overrides):
 
 
 def test_a_row_for_each_method_and_variant_and_its_families_from_the_configuration():
-    portfolio, e2, other = plans("methods=[search,e2]", "+variants.other={search.brood: 2}")
+    portfolio, e2, other = plans("methods=[search,e2]", "+variants.other={search.cover: 3}")
     assert [each.name for each in (portfolio, e2, other)] == ["search", "e2", "other"]
     assert len(portfolio.families) > 3 and {family.name for family in portfolio.families} == set(portfolio.traffic)
-    assert (len(e2.families), e2.settings.brood, e2.settings.bandit) == (1, 0, False)
-    assert other.settings == replace(portfolio.settings, brood=2) and len(other.families) == len(portfolio.families)
+    assert (len(e2.families), e2.settings.bandit) == (1, False)
+    assert other.settings == replace(portfolio.settings, cover=3) and len(other.families) == len(portfolio.families)
+
+
+def test_a_variant_of_the_prior_is_driven_by_its_own():
+    e2, short = plans("methods=[e2]", "+variants.short={prior.sampler.steps: 2}")
+    assert short.traffic["short"].traffic.prior.sampler.steps == 2 < e2.traffic["e2"].traffic.prior.sampler.steps
+
+
+class Broken(ConstantVelocity):
+    def reset(self, *given):
+        raise RuntimeError("broken")
+
+
+def test_tries_that_error_cost_what_they_are_said_to_cost(setup):
+    broken = Method("broken", Broken(), 0.0)
+    plan = Plan("search", [Family("broken", "broken", {}, nfe=100.0)], {"broken": broken}, SearchSettings())
+    for budget, unit, tries in ((400.0, "nfe", 4), (3.0, "tries", 3), (1.0, "seconds", 1)):
+        (rows, _, errored), told = spend(setup, plan, 0, range(3), budget, unit)
+        assert not rows and not told and len(errored) == 3 * tries
 
 
 @pytest.mark.parametrize(
@@ -119,6 +128,7 @@ def test_a_row_for_each_method_and_variant_and_its_families_from_the_configurati
         ("+search.families.odd={method: e3}", "e3"),
         ("+search.families.odd={speed: 1}", r"search\.families\.odd: decision speed"),
         ("+search.families.odd={changes: {reselekt: 1}}", r"search\.families\.odd\.changes"),
+        ("+search.families.odd={method: ccdiff, patience: 2}", r"search\.families\.odd\.patience: ccdiff"),
         ("eta=[1,2]", "one intensity"),
     ],
 )

@@ -27,8 +27,3 @@ def test_the_margin_grows_with_nearness_to_contact_to_verdict():
     assert stops["cfr_preventable"] == 1 and stops["margin"] == PREVENTED
     appears = row(course(0, 0, 0, 10), course(12, -12, math.pi / 2, 10))  # crosses so soon that nobody could brake
     assert 0 <= appears["margin"] < PREVENTED or appears["cfr"] == 0
-
-
-def test_the_hazard_begins_before_its_worst_moment():
-    found = row(course(0, 0, 0, 10), course(60, 3.0, math.pi, 10))
-    assert 0 < found["hazard_step"] < 30

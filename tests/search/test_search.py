@@ -1,4 +1,4 @@
-"""The search: it asks the same of whoever tells the same, learns where failures are, and branches from near ones."""
+"""The search: it asks the same of whoever tells the same, and learns where failures are."""
 
 from dataclasses import replace
 
@@ -10,11 +10,11 @@ from e2rl.search.tries import Family
 
 FAMILIES = [Family(name, "e2", {"moment": (1.0, 5.0)}) for name in ("good", "poor", "idle")]
 CHANCE = {"good": 0.5, "poor": 0.05, "idle": 0.0}
-PLAIN = replace(SearchSettings(), brood=0)
+PLAIN = SearchSettings()
 
 
 def search_of(scenes=40, seed=0, settings=PLAIN, families=FAMILIES):
-    return Search(families, range(100, 100 + scenes), seed, settings, {family.name: True for family in families})
+    return Search(families, range(100, 100 + scenes), seed, settings)
 
 
 def told(search, rounds, hopeless=()):
@@ -23,10 +23,10 @@ def told(search, rounds, hopeless=()):
         tries = search.ask()
         outcomes = []
         for one in tries:
-            luck = torch.rand((), generator=torch.Generator().manual_seed(hash((one.scene, one.seeds)) % 2**31)).item()
+            luck = torch.rand((), generator=torch.Generator().manual_seed(hash((one.scene, one.seed)) % 2**31)).item()
             fails = luck < CHANCE[one.family] and one.scene not in hopeless
             margin = PREVENTED if fails else -25.0 if one.scene in hopeless else -2.0
-            outcomes.append(Outcome(margin, 40.0, f"cell {one.scene} {one.number}" if fails else "", 100.0))
+            outcomes.append(Outcome(margin, f"cell {one.scene} {one.number}" if fails else "", 100.0))
         search.tell(tries, outcomes)
     return search
 
@@ -42,7 +42,7 @@ def test_the_same_answers_lead_to_the_same_questions():
 
 def test_every_scene_is_tried_before_any_is_tried_more():
     search = told(search_of(), PLAIN.cover)
-    assert {len(tries) for tries in search.tries} == {PLAIN.cover} and search.nfe == 100 * PLAIN.cover
+    assert {len(tries) for tries in search.tries} == {PLAIN.cover}
 
 
 def test_a_round_of_few_scenes_has_as_many_tries_as_a_batch_is_worth_and_covers_them_all():
@@ -51,7 +51,7 @@ def test_a_round_of_few_scenes_has_as_many_tries_as_a_batch_is_worth_and_covers_
     search = search_of(scenes=5, settings=replace(PLAIN, cover=7), families=many)
     first = search.ask()
     assert len({(one.scene, one.family) for one in first}) == len(first) == ROUND + 1  # five of each of five scenes
-    search.tell(first, [Outcome(-2.0, 40.0, "", 100.0)] * len(first))
+    search.tell(first, [Outcome(-2.0, "", 100.0)] * len(first))
     assert {len(tries) for tries in told(search, 1).tries} == {7}
     assert len(search.ask()) == ROUND
 
@@ -75,26 +75,3 @@ def test_it_finds_more_scenes_than_chance_at_equal_cost():
 
     learnt, blind = (sum(found(bandit, seed) for seed in range(5)) for bandit in (True, False))
     assert learnt > 1.2 * blind
-
-
-def test_branches_begin_at_the_rise_of_the_hazard_of_the_nearest_try():
-    settings = replace(SearchSettings(), brood=3, branch_chance=1.0, cover=1, bandit=True)
-    search = told(search_of(scenes=10, settings=settings), 1)
-    tries = search.ask()
-    branches = [one for one in tries if one.parent >= 0]
-    assert branches and len(branches) % 3 == 0
-    for one in branches:
-        parent, outcome = search.tries[one.scene][one.parent], search.outcomes[one.scene][one.parent]
-        assert outcome.margin < PREVENTED
-        shared = len(one.seeds) - 1
-        assert shared <= 40 // 5 and one.seeds[:shared] == parent.seeds * shared
-    assert len({one.seeds for one in branches}) == len(branches)
-
-
-def test_nothing_branches_from_what_cannot_keep_a_prefix_or_comes_nowhere_near():
-    settings = replace(SearchSettings(), brood=3, branch_chance=1.0, cover=1)
-    far = told(search_of(scenes=10, settings=settings), 3, hopeless=range(10))
-    assert all(one.parent < 0 for one in tries_of(far))
-    fixed = search_of(scenes=10, settings=settings)
-    fixed.branches = {family.name: False for family in FAMILIES}
-    assert all(one.parent < 0 for one in tries_of(told(fixed, 3)))

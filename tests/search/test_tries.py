@@ -1,13 +1,12 @@
-"""Tries: reproducible from their seed, spread over their ranges, and branches that keep what came before."""
+"""Tries: reproducible from their seed, and spread over their ranges."""
 
 import pytest
-import torch
 
 from e2rl.run.errors import InputError
-from e2rl.search.tries import Family, family_of, scripts_of
+from e2rl.search.tries import Family, family_of
 from e2rl.traffic.e2.decisions import RULE, WHOM, Decisions
 
-TIMED = Family("timed", "e2", {"moment": (1.0, 5.0), "strength": (0.5, 1.5), "onset": (0, 4)})
+TIMED = Family("timed", "e2", {"moment": (1.0, 5.0), "strength": (0.5, 1.5)})
 
 
 def drawn(count, stratified, family=TIMED, seed=7):
@@ -18,51 +17,29 @@ def drawn(count, stratified, family=TIMED, seed=7):
 def test_a_try_is_reproducible_from_its_seed_and_number(stratified):
     assert drawn(5, stratified) == drawn(5, stratified)
     assert drawn(5, stratified) != drawn(5, stratified, seed=8)
-    assert len({one.seeds for one in drawn(50, stratified)}) == 50
+    assert len({one.seed for one in drawn(50, stratified)}) == 50
 
 
 def test_decisions_lie_in_their_range_and_others_follow_the_rule():
     for one in drawn(50, True):
-        *before, last = (Decisions(*row) for row in one.script)
-        assert len(before) <= 4 and all(row.strength == 0 for row in before)
-        assert 1 <= last.moment <= 5 and 0.5 <= last.strength <= 1.5
-        assert last._replace(moment=RULE.moment, strength=RULE.strength) == RULE
+        found = Decisions(*one.decisions)
+        assert 1 <= found.moment <= 5 and 0.5 <= found.strength <= 1.5
+        assert found._replace(moment=RULE.moment, strength=RULE.strength) == RULE
 
 
 def test_a_family_without_ranges_is_the_rule():
-    assert [one.script for one in drawn(3, True, Family("rule", "e2", {}))] == [(tuple(RULE),)] * 3
+    assert [one.decisions for one in drawn(3, True, Family("rule", "e2", {}))] == [RULE] * 3
 
 
 def test_stratified_tries_look_elsewhere_than_those_before():
     """The largest gap between moments of ten tries is below twice its least, and below that of independent draws."""
 
     def gap(stratified, seed):
-        moments = sorted(Decisions(*one.script[-1]).moment for one in drawn(10, stratified, seed=seed))
+        moments = sorted(Decisions(*one.decisions).moment for one in drawn(10, stratified, seed=seed))
         return max(b - a for a, b in zip([1.0, *moments], [*moments, 5.0], strict=True))
 
     spread, loose = ([gap(kind, seed) for seed in range(40)] for kind in (True, False))
     assert sum(spread) / 40 < 0.8 * sum(loose) / 40 and max(spread) < max(loose)
-
-
-@pytest.mark.parametrize("replan", [0, 1, 3, 6])
-def test_a_branch_keeps_the_prefix_and_draws_the_rest_anew(replan):
-    parent = Family("late", "e2", {"onset": 2}).draw(0, 0, 3, 0, True)
-    child = parent.branch(9, replan, seed=42, patience=3.0)
-    (seeds, other), (script, changed) = scripts_of([parent, child])[0], scripts_of([parent, child])[1]
-    assert child.parent == parent.number and child.number == 9
-
-    def at(values, k):
-        return values[min(k, len(values) - 1)]
-
-    for k in range(10):
-        same = k < replan
-        assert (at(child.seeds, k) == at(parent.seeds, k)) == same
-        expected = at(parent.script, k) if same else tuple(Decisions(*at(parent.script, k))._replace(patience=3.0))
-        assert at(child.script, k) == expected
-        assert torch.equal(script[min(k, len(script) - 1)], torch.tensor(at(parent.script, k)))
-        assert torch.equal(changed[min(k, len(changed) - 1)], torch.tensor(expected))
-        assert int(other[min(k, len(other) - 1)]) == at(child.seeds, k)
-        assert int(seeds[min(k, len(seeds) - 1)]) == at(parent.seeds, k)
 
 
 def test_a_family_is_read_from_its_configuration():
@@ -72,7 +49,13 @@ def test_a_family_is_read_from_its_configuration():
     assert family.ranges == {"whom": float(WHOM.index("crossing")), "patience": (1.0, 3.0)}
 
 
-@pytest.mark.parametrize("given", [{"speed": 3}, {"whom": "trucks"}, {"patience": "late"}, {"patience": [1, 2, 3]}])
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"speed": 3}, {"whom": "trucks"}, {"patience": "late"}, {"patience": [1, 2, 3]}, {"patience": [2, 1]}, 3,
+        {"chance": 2}, {"chance": "x"}, {"nfe": 0}, {"changes": "abc"},
+    ],
+)  # fmt: skip
 def test_what_is_no_decision_is_told_where_it_stands(given):
     with pytest.raises(InputError, match=r"search\.families\.odd"):
         family_of("odd", given, "search.families")

@@ -18,7 +18,7 @@ from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 from e2rl.traffic.e2.anchoring import Anchor, AnchorSettings, propose
 from e2rl.traffic.e2.control import ControlSettings
-from e2rl.traffic.e2.decisions import LEADER, RULE, Decisions, decisions_at, eligible, script_of
+from e2rl.traffic.e2.decisions import LEADER, RULE, Decisions, eligible
 from e2rl.traffic.e2.feasibility import FeasibilitySettings, feasible_vehicles
 from e2rl.traffic.e2.interception import InterceptionSettings, Wish
 from e2rl.traffic.e2.reasoner import LanguageReasoner, ReasonerSettings
@@ -47,16 +47,15 @@ SUPPORTS = ("feasible", "topology", "random")
 class E2State(PriorState):
     """B attacked scenes.
 
-    intensity [B] and script [B, S, D]: eta and the decisions at each replan (`decisions_at`); near, far [B] int64: the
-    most near and far agents of a coalition; coalition [B, V]: C*; target [B, V]
-    int64: whom each member acts on (0 the ego, -1 none); off_lane [B, V]: on an interception instead of its lane;
-    committed [B, V]: with a proposal, knots [B, V, KNOTS]: its accelerations [m/s^2]; drawn [B, V]: by a kernel; since
-    [B, V] s: see `foresee`; settled [B, V]: once drawn to what the competent driver prevents; path_kl, anchor_jump [B,
-    V]: path KL of the control and energy of the literal blend since the start.
+    eta [B]: intensity; decided [B, D]: the decisions; near, far [B] int64: the most near and far agents of a coalition;
+    coalition [B, V]: C*; target [B, V] int64: whom each member acts on (0 the ego, -1 none); off_lane [B, V]: on an
+    interception instead of its lane; committed [B, V]: with a proposal, knots [B, V, KNOTS]: its accelerations [m/s^2];
+    drawn [B, V]: by a kernel; since [B, V] s: see `foresee`; settled [B, V]: once drawn to what the competent driver
+    prevents; path_kl, anchor_jump [B, V]: path KL of the control and energy of the literal blend since the start.
     """
 
-    intensity: Tensor = no_vehicles()
-    script: Tensor = no_vehicles()
+    eta: Tensor = no_vehicles()
+    decided: Tensor = no_vehicles()
     near: Tensor = no_vehicles()
     far: Tensor = no_vehicles()
     coalition: Tensor
@@ -72,13 +71,8 @@ class E2State(PriorState):
 
     @property
     def now(self) -> Decisions:
-        """The decisions at the next replan."""
-        return decisions_at(self.script, self.replans)
-
-    @property
-    def eta(self) -> Tensor:
-        """[B], at the next replan."""
-        return self.intensity * self.now.strength
+        """The decisions."""
+        return Decisions(*self.decided.unbind(-1))
 
 
 @dataclass(eq=False, repr=False)
@@ -101,7 +95,7 @@ class Coalitions(NominalTraffic):
     control: ControlSettings
 
     adversarial = True
-    follows_template = follows_script = True
+    follows_template = follows_decisions = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -118,28 +112,24 @@ class Coalitions(NominalTraffic):
         seed: Tensor,
         eta: Tensor,
         template: Tensor | None = None,
-        script: Tensor | None = None,
+        decisions: Tensor | None = None,
     ) -> E2State:
         """Returns states of scenes [B] with routes drawn from the prior and nobody under control.
 
         Args:
             template: [B] causal templates that limit the coalitions (None: full for all).
-            script: [B, S, D] decisions at each replan (None: by rule).
+            decisions: [B, D] (None: by rule).
         """
         nominal = super().reset(scenes, seed, eta)
         near, far = limits_of(torch.full_like(nominal.seed, FULL) if template is None else template, self.skeleton)
-        script = script_of(RULE, len(eta)).to(eta.device) if script is None else script
+        decided = eta.new_tensor(RULE).expand(len(eta), -1) if decisions is None else decisions
         none, zero = torch.zeros_like(nominal.routed.parked), torch.zeros_like(nominal.routed.length)
         nobody = {name: none for name in ("coalition", "off_lane", "committed", "drawn", "settled")}
         nobody |= {"target": none.long() - 1, "since": zero - 1}
         costs = {"path_kl": zero, "anchor_jump": zero}
         knots = zero[..., None].repeat(1, 1, KNOTS)
         begun: dict[str, Any] = {**vars(nominal), **nobody, **costs}
-        return E2State(**begun, intensity=eta, script=script, near=near, far=far, knots=knots)
-
-    def with_own(self, state: E2State, before: E2State) -> E2State:
-        """Returns the state with the seeds and the script of `before`."""
-        return replace(super().with_own(state, before), script=before.script)
+        return E2State(**begun, eta=eta * decided[:, 0], decided=decided, near=near, far=far, knots=knots)
 
     def _budget(self, state: E2State) -> Tensor | None:
         """Nats [B] that control may still add; None: any."""

@@ -1,4 +1,4 @@
-"""What e2 decides by rule, as numbers that a search may draw for each rollout and each replan (docs/search.md).
+"""What e2 decides by rule, as numbers that a search may draw for each rollout (docs/search.md).
 
 The rule is the mode of every distribution of attacks: a try of which nothing is drawn is e2 as it stands.
 """
@@ -17,7 +17,7 @@ BY_RULE = -1.0  # a moment of meeting that nobody asks for
 
 
 class Decisions(NamedTuple):
-    """Decisions of one rollout, or (`decisions_at`) of B rollouts, each [B].
+    """Decisions of one rollout, or of B rollouts, each [B]; as one tensor [B, D] in this order.
 
     strength: factor of eta, 0: nobody is controlled; whom: index into WHOM; patience: factor of how late adversaries
     give way; owes: 1, or 0: they do not give way; wrong_way: s that an interception weighs more if it ends against the
@@ -35,19 +35,6 @@ class Decisions(NamedTuple):
 
 
 RULE = Decisions()
-
-
-def script_of(decisions: Decisions, batch: int) -> Tensor:
-    """Decisions that hold at every replan of B = `batch` rollouts, as a script [B, 1, D]: row k is of replan k, the
-    last one also of all later ones."""
-    columns = [torch.as_tensor(value, dtype=torch.float32).expand(batch) for value in decisions]
-    return torch.stack(columns, -1)[:, None]
-
-
-def decisions_at(script: Tensor, replans: Tensor) -> Decisions:
-    """The Decisions of a script [B, S, D] at replans [B]."""
-    at = replans.clamp(max=script.shape[1] - 1)
-    return Decisions(*script[torch.arange(len(script), device=script.device), at].unbind(-1))
 
 
 def eligible(world: World, whom: Tensor, lawful: bool) -> Tensor:
