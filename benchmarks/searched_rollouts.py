@@ -25,7 +25,7 @@ def searched_rollouts(bench: Bench) -> Iterator[Row]:
     count = len(tries)
 
     def plain() -> None:
-        for _, method, tasks in batches(setup, plan, 0, only, tries, 0):
+        for _, (_, method, tasks) in batches(setup, plan, 0, only, tries, 0):
             setup.score(method, tasks, None)
 
     spent = bench.both(lambda: searched(setup, plan, only))[1], bench.both(plain)[1], talk

@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
 from e2rl.evaluation.methods import as_list, build_traffic, config_and_prior, is_search, method_config, rows_of
-from e2rl.evaluation.protocol import WHOLE, Method, Scored, Setup, Task, has_files
+from e2rl.evaluation.protocol import WHOLE, Job, Method, Scored, Setup, Task, extend, in_batches, score_all
 from e2rl.metrics.atlas import cell_of
 from e2rl.metrics.margin import FARTHEST
 from e2rl.prior.prior import Prior
@@ -27,7 +27,7 @@ from e2rl.run.config import built
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
 from e2rl.run.parts import NO_PARTS, Parts
-from e2rl.run.processes import Processes, in_processes
+from e2rl.run.processes import Processes
 from e2rl.run.settings import settings_of
 from e2rl.search.search import Outcome, Search, SearchSettings
 from e2rl.search.tries import TRIES, Family, Try, family_of
@@ -142,8 +142,7 @@ def search_all(
         scenes = range(len(setup.scenes)) if only is None else only
         own = replace(parts, stage=f"{parts.stage}search-{number:03}") if parts.folder else parts
         scored, tries = spend(setup, plan, seed, scenes, budget, unit, into, processes, own)
-        for whole, part in zip(found, scored, strict=True):
-            whole += part
+        extend(found, scored)
         told += tries
     return found, told
 
@@ -162,7 +161,8 @@ def spend(
     """What one search finds, and its tries in their order: round by round, the scenes of a round in an order of its
     own, so that a budget that ends within a round is spent on scenes at random. A try that errors counts as one that
     comes nowhere near, and costs what its family is said to cost."""
-    search, found, told = plan.begin(setup, seed, scenes), ([], [], []), []  # type: ignore[var-annotated]
+    search, told = plan.begin(setup, seed, scenes), list[dict]()
+    found: Scored = ([], [], [])
     errs = {family.name: Outcome(-FARTHEST, "", family.nfe) for family in plan.families}
     generator = torch.Generator().manual_seed(seed)
     spent = dict.fromkeys(SPENT, 0.0)
@@ -171,28 +171,16 @@ def spend(
             order = torch.randperm(len(scenes), generator=generator).tolist()
             tries = sorted(search.ask(), key=lambda one: order[one.scene])
             jobs, before = batches(setup, plan, seed, scenes, tries, sum(map(len, search.tries))), spent[unit]
-
-            def work(job: tuple[int, Method, list]) -> Scored:
-                number, method, tasks = job
-                identity = [plan.name, setup.ego_name, method.eta, [list(task.one) for task in tasks]]
-                compute = partial(setup.score, method, tasks, into)
-                return parts.result(f"tries-{number:06}", identity, compute, partial(has_files, into))
-
-            known: dict[tuple[str, int], dict] = {}
-            for scored in in_processes(work, jobs, processes, lambda job: len(job[2])):
-                for whole, part in zip(found, scored, strict=True):
-                    whole += part
-                known |= {(row["scene_id"], row["seed"]): row for row in scored[0]}
-            names = [(setup.scenes.scene_id[scenes[one.scene]], row_seed(seed, one)) for one in tries]
-            rows = [known.get(name) for name in names]
-            outcomes = [
-                errs[one.family] if row is None else outcome_of(row) for one, row in zip(tries, rows, strict=True)
-            ]
+            scored = score_all(jobs, "tries", into, processes, parts, lambda job: len(job[1][2]))
+            extend(found, scored)
+            known = {(row["scene_id"], row["seed"]): row for row in scored[0]}
+            rows = [known.get((setup.scenes.scene_id[scenes[one.scene]], row_seed(seed, one))) for one in tries]
+            outcomes = [outcome_of(row) if row else errs[one.family] for one, row in zip(tries, rows, strict=True)]
             search.tell(tries, outcomes)
             for one, row, outcome in zip(tries, rows, outcomes, strict=True):
-                costs = 1.0, outcome.nfe, 0.0 if row is None else row["seconds"]
+                costs = 1.0, outcome.nfe, row["seconds"] if row else 0.0
                 spent = {name: spent[name] + cost / len(scenes) for name, cost in zip(SPENT, costs, strict=True)}
-                told += [] if row is None else [told_of(one, row) | spent]
+                told += [told_of(one, row) | spent] if row else []
             if not any(rows) and unit == "seconds":
                 break  # all errored, and nothing tells how long they would take
             if spent[unit] == before:
@@ -201,10 +189,8 @@ def spend(
     return found, told
 
 
-def batches(
-    setup: Setup, plan: Plan, seed: int, scenes: Sequence[int], tries: Sequence[Try], first: int
-) -> list[tuple[int, Method, list]]:
-    """Jobs (number from `first` on, method, tasks) of tries: of one traffic method each, those of a scene together."""
+def batches(setup: Setup, plan: Plan, seed: int, scenes: Sequence[int], tries: Sequence[Try], first: int) -> list[Job]:
+    """Jobs of tries, numbered from `first` on: of one traffic method each, those of a scene together."""
     by_method: dict[int, list] = {}
     for one in sorted(tries, key=lambda one: (one.scene, one.number)):
         tasks = by_method.setdefault(id(plan.traffic[one.family]), [])  # of one traffic method
@@ -212,9 +198,8 @@ def batches(
     jobs = []
     for tasks in by_method.values():
         method = replace(plan.traffic[tasks[0].one.family], name=plan.name)
-        count = -(-len(tasks) // setup.batch)
-        jobs += [(method, tasks[k * len(tasks) // count : (k + 1) * len(tasks) // count]) for k in range(count)]
-    return [(first + k, *job) for k, job in enumerate(jobs)]
+        jobs += [(setup, method, batch) for batch in in_batches(tasks, setup.batch)]
+    return list(enumerate(jobs, first))
 
 
 def row_seed(seed: int, one: Try) -> int:

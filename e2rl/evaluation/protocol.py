@@ -158,8 +158,6 @@ def drive_all(
 ) -> Scored:
     """What every setup scores under every method on every (scene, seed); the noise is the same for all.
 
-    A batch is the unit that is checkpointed: rounding makes a rollout's last digits depend on the others of its batch.
-
     Args:
         setups: they differ in their ego.
         methods: the traffic.
@@ -169,26 +167,12 @@ def drive_all(
         only: positions of the scenes to drive in (None: all), with unchanged noise.
         parts: the batches that are done.
         shard: (k, n), only every n-th batch from the k-th on.
-
-    Raises:
-        InputError: files of a worker do not arrive.
     """
     first = setups[0]
     tasks = [Task(scene, seed) for seed in seeds for scene in (range(len(first.scenes)) if only is None else only)]
-    count = -(-len(tasks) // first.batch)
-    batches = [tasks[k * len(tasks) // count : (k + 1) * len(tasks) // count] for k in range(count)]
+    batches = in_batches(tasks, first.batch)
     jobs = list(enumerate((setup, method, batch) for setup in setups for method in methods for batch in batches))
     jobs = jobs[shard[0] :: shard[1]]
-
-    def work(job: Job) -> Scored:
-        number, (setup, method, batch) = job
-        identity = [setup.ego_name, method.name, float(method.eta), [task[:2] for task in batch]]
-        compute = partial(setup.score, method, batch, into)
-        return parts.result(f"rollouts-{number:06}", identity, compute, partial(has_files, into))
-
-    rows: list[dict] = []
-    samples: list[dict[str, Tensor]] = []
-    errored: list[dict] = []
     total = sum(len(batch) for _, (_, _, batch) in jobs)
     with tqdm(total=total, desc="rollouts", unit="rollout", disable=None) as bar:
 
@@ -197,13 +181,57 @@ def drive_all(
             bar.set_postfix(ego=setup.ego_name, method=method.name, eta=method.eta, refresh=False)
             bar.update(len(batch))
 
-        for scored in in_processes(work, jobs, processes, lambda job: job[1][1].eta, done):
-            if not has_files(into, scored):
-                reason = "rollouts that a worker wrote are not here"
-                raise InputError(f"{into}: {reason}; put the run's folder where all machines have it (hydra.run.dir)")
-            for found, more in zip((rows, samples, errored), scored, strict=True):
-                found += more
-    return rows, samples, errored
+        return score_all(jobs, "rollouts", into, processes, parts, lambda job: job[1][1].eta, done)
+
+
+def in_batches(tasks: Sequence[Task], size: int) -> list[list[Task]]:
+    """The tasks in as few batches of at most `size` as can be, of about the same length."""
+    count = -(-len(tasks) // size)
+    return [list(tasks[k * len(tasks) // count : (k + 1) * len(tasks) // count]) for k in range(count)]
+
+
+def score_all(
+    jobs: Sequence[Job],
+    prefix: str,
+    into: Path | None,
+    processes: Processes,
+    parts: Parts,
+    cost: Callable[[Job], float],
+    done: Callable[[Job], None] = lambda job: None,
+) -> Scored:
+    """What batches of rollouts score, in their order.
+
+    A batch is the unit that is checkpointed: rounding makes a rollout's last digits depend on the others of its batch.
+
+    Args:
+        prefix: of the names of their parts.
+        cost: by which a job takes longer than others.
+        done: called with each job that is done.
+
+    Raises:
+        InputError: files of a worker do not arrive.
+    """
+
+    def work(job: Job) -> Scored:
+        number, (setup, method, batch) = job
+        told = [(task.scene, task.seed) if task.one is None else list(task.one) for task in batch]
+        identity = [setup.ego_name, method.name, float(method.eta), told]
+        compute = partial(setup.score, method, batch, into)
+        return parts.result(f"{prefix}-{number:06}", identity, compute, partial(has_files, into))
+
+    found: Scored = ([], [], [])
+    for scored in in_processes(work, jobs, processes, cost, done):
+        if not has_files(into, scored):
+            reason = "rollouts that a worker wrote are not here"
+            raise InputError(f"{into}: {reason}; put the run's folder where all machines have it (hydra.run.dir)")
+        extend(found, scored)
+    return found
+
+
+def extend(found: Scored, more: Scored) -> None:
+    """Add what was scored."""
+    for whole, part in zip(found, more, strict=True):
+        whole += part
 
 
 def has_files(into: Path | None, scored: Scored) -> bool:
