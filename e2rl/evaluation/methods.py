@@ -161,13 +161,13 @@ def is_search(config: DictConfig, name: str) -> bool:
 
 def _budget(config: DictConfig) -> dict[str, Any]:
     """The budgets and their unit: of `tries` or `budget`, or else FEW where there is a search."""
+    if config.budget is None and config.budget_unit != "nfe":
+        raise InputError(f"budget_unit={config.budget_unit}: without a budget; name one, such as budget=16")
     if config.tries is not None:
         if config.budget is not None:
             raise InputError(f"tries={config.tries}, budget={config.budget}: name one of the two")
         return {"budget": [] if config.tries == 1 else [config.tries], "budget_unit": "tries"}
     if config.budget is None and any(is_search(config, name) for name in rows_of(config)):
-        if config.budget_unit != "nfe":
-            raise InputError(f"budget_unit={config.budget_unit}: without a budget; name one, such as budget=16")
         return {"budget": [FEW], "budget_unit": "nfe"}
     return {"budget": as_list(config.budget)}
 

@@ -30,8 +30,10 @@ def write_results(run: Run, plan: Evaluation, rows: Sequence[dict]) -> list[str]
         rows: of metrics.json.
     """
     folder, asked, modes = run.folder, plan.asked, read_modes(run.folder / MODES_FILE)
-    dropped = [f"left out: {count} scenes ({reason})" for reason, count in plan.scenes.dropped.items()]
-    text = "; ".join([caption(run.config, plan.origin, plan.methods), search_effort(plan.scenes.steps), *dropped])
+    notes = [f"left out: {count} scenes ({reason})" for reason, count in plan.scenes.dropped.items()]
+    notes += ["tries go where failures are: rates of tries are no rates of the planner"] if plan.searches else []
+    methods = [*plan.methods, *(next(iter(one.traffic.values())) for one in plan.searches if len(one.traffic) == 1)]
+    text = "; ".join([caption(run.config, plan.origin, methods), search_effort(plan.scenes.steps), *notes])
     tables = [*tables_of(plan, rows, text, folder), *mode_tables(modes), *egos_tables(run, plan, rows, text)]
     save_tables(folder / "tables.md", tables)
     if asked.metrics == ALL:
@@ -42,7 +44,7 @@ def write_results(run: Run, plan: Evaluation, rows: Sequence[dict]) -> list[str]
         save_curves(folder, points_of_rows(rows))
     shown = asked.report and asked.save_rollouts and modes["failures"]
     page = write_report(folder, rows, modes, tables) if shown else None
-    return answer_lines(rows, modes, folder, page, dropped)
+    return answer_lines(rows, modes, folder, page, notes)
 
 
 def references(plan: Evaluation) -> tuple[str, ...] | None:
