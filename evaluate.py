@@ -26,7 +26,7 @@ def evaluate(run: Run) -> None:
     asked, egos = plan.asked, plan.egos
     how: Any = (asked.seeds, plan.rollouts(folder), processes_of(config), plan.only, run.parts(), asked.shard)
     if asked.budget:
-        scored, tries = search_all(egos.setups(plan.setup), plan.searches, *asked.most, *how)
+        scored, tries = search_all(egos.setups(plan.setup), plan.searches, max(asked.budget), asked.budget_unit, *how)
         save_budget(folder, plan, tries, *scored[:2])
         egos = replace(egos, pairs=())  # tries of different egos are no pairs
     else:

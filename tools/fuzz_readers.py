@@ -14,7 +14,6 @@ import torch
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from e2rl.evaluation.atlas import read_atlas
 from e2rl.evaluation.modes import read_modes
 from e2rl.evaluation.rollout_files import read_metrics, read_rows
 from e2rl.metrics.score import score_rollouts
@@ -82,10 +81,10 @@ class Readers:
         return st.sampled_from(self.data).flatmap(lambda data: mutated(data, PLAIN | ARRAYS)).map(pickle.dumps), read
 
     def tables(self) -> Reader:
-        """The tables of a run: metrics, failure modes, atlas, rollouts, scenes."""
+        """The tables of a run: metrics, failure modes, rollouts, scenes."""
         run = self.folder / "run"
         readers = {"metrics.json": lambda path: metric_tables(read_metrics(path)), "modes.json": read_modes}
-        readers |= {"atlas.json": read_atlas, "rollouts.csv": read_rows, "scenes.csv": read_list}
+        readers |= {"rollouts.csv": read_rows, "scenes.csv": read_list}
 
         def inputs(name: str) -> st.SearchStrategy[bytes]:
             content = (run / name).read_bytes()

@@ -3,29 +3,14 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from types import NoneType
 
-from e2rl.evaluation.rollout_files import nulls, read_json
+from e2rl.evaluation.rollout_files import nulls
 from e2rl.evaluation.summary import GROUP, group_of
 from e2rl.metrics.atlas import CELL, Cell, Found, atlas_of
-from e2rl.run.files import misfit, write_atomically
+from e2rl.run.files import write_atomically
 from e2rl.sim.rollout_file import rollout_name
 
 ATLAS_FILE = "atlas.json"
-NUMBER = (int, float)
-SHAPE = {  # what readers of atlas.json need
-    "groups": [
-        {**dict.fromkeys(("dataset", "split", "method", "ego_policy"), str), "eta": NUMBER}
-        | dict.fromkeys(("rollouts", "preventable", "cells"), int)
-        | {
-            "atlas": [
-                {**dict.fromkeys(CELL, str), "failures": int, "scenes": int}
-                | dict.fromkeys(("transport", "real_adv"), (*NUMBER, NoneType))
-                | {"likeliest": {"scene_id": str, "seed": int, "file": str}}
-            ]
-        }
-    ]
-}
 
 
 def find_atlas(rows: Sequence[dict]) -> dict:
@@ -53,22 +38,6 @@ def describe_cell(cell: Cell, found: Found) -> dict:
     return dict(zip(CELL, cell, strict=True)) | counts | values | {"likeliest": likeliest}
 
 
-def _mismatch(found: dict) -> str | None:
-    """Which group does not say what it has, or names a file elsewhere; None: none."""
-    for group in found["groups"]:
-        if len(group["atlas"]) != group["cells"]:
-            return f"{group['method']} has {len(group['atlas'])} cells, not {group['cells']}"
-        files = [cell["likeliest"]["file"] for cell in group["atlas"]]
-        if elsewhere := [name for name in files if Path(name).name != name]:
-            return f"{group['method']} names the file {elsewhere[0][:60]!r}"
-    return None
-
-
 def write_atlas(path: Path, found: dict) -> None:
     """Write atlas.json from the result of `find_atlas`."""
     write_atomically(path, json.dumps(nulls(found), indent=1, allow_nan=False))
-
-
-def read_atlas(path: Path) -> dict:
-    """The content of an atlas.json; raises InputError where it is none."""
-    return read_json(path, lambda found: misfit(found, SHAPE) or _mismatch(found))

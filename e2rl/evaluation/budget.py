@@ -5,8 +5,6 @@ families. What they find is told at several budgets by `evaluation.budget_table`
 """
 
 import copy
-import csv
-import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,7 +23,7 @@ from e2rl.metrics.margin import FARTHEST
 from e2rl.prior.prior import Prior
 from e2rl.run.config import built
 from e2rl.run.errors import InputError
-from e2rl.run.files import write_atomically
+from e2rl.run.files import csv_text, write_atomically
 from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.processes import Processes
 from e2rl.run.settings import settings_of
@@ -203,7 +201,9 @@ def batches(setup: Setup, plan: Plan, seed: int, scenes: Sequence[int], tries: S
 
 
 def row_seed(seed: int, one: Try) -> int:
-    """The `seed` of a try's rollout in the tables."""
+    """The `seed` of a try's rollout in the tables; InputError where the scene has more than TRIES."""
+    if one.number >= TRIES:
+        raise InputError(f"budget: more than {TRIES} tries of a scene have no seeds of their own; spend less")
     return seed * TRIES + one.number
 
 
@@ -225,8 +225,5 @@ def told_of(one: Try, row: Mapping) -> dict[str, Any]:
 
 def write_tries(path: Path, told: Sequence[Mapping]) -> None:
     """Write the tries of a run, a line each."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [*TOLD, *SPENT], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(told)
-    write_atomically(path, text.getvalue())
+    names = [*TOLD, *SPENT]
+    write_atomically(path, csv_text([names, *([row[name] for name in names] for row in told)]))

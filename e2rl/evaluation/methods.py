@@ -98,7 +98,7 @@ class EvaluationSettings:
 
     methods: tuple[str, ...]
     eta: tuple[float, ...] = setting(low=0.0, high=100.0)  # 0 to 3 are sensible
-    seeds: tuple[int, ...] = setting(low=0)
+    seeds: tuple[int, ...] = setting(low=0, high=900_000_000)  # seeds of tries are 10^10 times as large
     num_scenes: int | None = setting(low=1, optional=True)
     shard: tuple[int, ...] = setting(low=0)
     metrics: str
@@ -110,11 +110,6 @@ class EvaluationSettings:
     save_rollouts: bool
     report: bool
 
-    @property
-    def most(self) -> tuple[float, str]:
-        """The largest budget, and its unit."""
-        return max(self.budget), self.budget_unit
-
     def __post_init__(self) -> None:
         check_settings(self, "")
         check_choice("metrics", self.metrics, (*table_names(), ALL))
@@ -123,7 +118,7 @@ class EvaluationSettings:
                 raise InputError(f"{name}=[]: name at least one")
         if len(self.shard) != 2 or self.shard[0] >= self.shard[1]:
             raise InputError(f"shard={list(self.shard)}: expected [k, n] with k from 0 to n - 1, such as shard=[0,4]")
-        if self.budget and (self.figure or self.compare or len(self.shard) and self.shard[1] > 1):
+        if self.budget and (self.figure or self.compare or self.shard[1] > 1):
             raise InputError(
                 "budget: has a table and a picture of its own; leave out figure, compare and shard, or set tries=1"
             )

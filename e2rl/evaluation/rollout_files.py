@@ -12,7 +12,7 @@ from typing import IO, Any
 
 from e2rl.metrics.catalogue import SOURCE, WORDS, row_columns
 from e2rl.run.errors import InputError
-from e2rl.run.files import leads_into, misfit, open_regular, read_regular, write_atomically
+from e2rl.run.files import csv_text, leads_into, misfit, open_regular, read_regular, write_atomically
 from e2rl.sim.rollout_file import UNPRINTABLE
 from e2rl.traffic.attempt import summary_of
 
@@ -38,12 +38,9 @@ def table_columns() -> tuple[str, ...]:
 
 def write_rows(path: Path, rows: Sequence[dict]) -> None:
     """Write rollouts.csv: one line per row of `score_rollouts`, NaN as an empty cell."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
     columns = table_columns()
-    writer.writerow(columns)
-    writer.writerows([cell(row.get(column, math.nan)) for column in columns] for row in rows)
-    write_atomically(path, buffer.getvalue())
+    lines = ([cell(row.get(column, math.nan)) for column in columns] for row in rows)
+    write_atomically(path, csv_text([columns, *lines]))
 
 
 def cell(value: object) -> object:

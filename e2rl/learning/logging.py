@@ -1,7 +1,5 @@
 """Logs a run's scalars and pictures to CSV files, TensorBoard or offline wandb, and a curriculum's choices."""
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
@@ -13,7 +11,7 @@ from torchrl.record.loggers.common import Logger
 
 from e2rl.learning.scheduler import COLUMNS, Choice
 from e2rl.run.errors import InputError
-from e2rl.run.files import write_atomically
+from e2rl.run.files import csv_text, write_atomically
 from e2rl.run.settings import check_choice
 
 GROUPS = ("train", "eval", "curriculum", "synthesizer", "time")
@@ -45,12 +43,10 @@ class RunLogger:
 
     def _write_choices(self, rows: Sequence[Choice], step: int) -> None:
         """Write the rows of a round below those of earlier rounds; unknown numbers stay empty."""
-        path, text = self._folder / CHOICES, io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        for row in rows:
-            writer.writerow(["" if row[name] != row[name] else row[name] for name in COLUMNS])
+        path = self._folder / CHOICES
+        lines = csv_text([["" if row[name] != row[name] else row[name] for name in COLUMNS] for row in rows])
         earlier = lines_before(path, step) if path.is_file() else []
-        write_atomically(path, "".join([",".join(COLUMNS) + "\n", *earlier, text.getvalue()]))
+        write_atomically(path, "".join([",".join(COLUMNS) + "\n", *earlier, lines]))
 
     def show(self, name: str, path: Path, step: int) -> None:
         """Put a picture (PNG) or video (GIF) on the dashboard, if there is one; name: as of a scalar."""

@@ -3,10 +3,9 @@
 Intervals are of places. A search with several seeds is the mean of its seeds.
 """
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ from e2rl.metrics.statistics import (
 )
 from e2rl.report.drawing import new_figure, save_figure
 from e2rl.report.tables import Table, save_tables
-from e2rl.run.files import write_atomically
+from e2rl.run.files import csv_text, write_atomically
 from e2rl.search.tries import TRIES
 
 PANEL = 250  # points, a side
@@ -188,21 +187,16 @@ def budget_tables(rows: Sequence[Mapping], scenes: int) -> list[Table]:
 
 def write_budget(path: Path, rows: Sequence[Mapping]) -> None:
     """Write the rows as CSV: a value's interval in NAME_low and NAME_high."""
-    flat = []
-    for row in rows:
-        line: dict[str, Any] = {}
-        for name, value in row.items():
-            if isinstance(value, Mapping):
-                line |= {name: value["mean"], f"{name}_low": value["low"], f"{name}_high": value["high"]}
-            else:
-                line[name] = value
-        flat.append(line)
-    names = list(dict.fromkeys(name for line in flat for name in line))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(flat)
-    write_atomically(path, text.getvalue())
+    flat = [dict(chain(*(ends_of(*item) for item in row.items()))) for row in rows]
+    names = list(dict.fromkeys(chain(*flat)))
+    write_atomically(path, csv_text([names, *([line.get(name, "") for name in names] for line in flat)]))
+
+
+def ends_of(name: str, value: Any) -> list[tuple[str, Any]]:
+    """(column, number) of a value, and of the ends of its interval where it has one."""
+    if not isinstance(value, Mapping):
+        return [(name, value)]
+    return [(name if end == "mean" else f"{name}_{end}", value[end]) for end in ("mean", "low", "high")]
 
 
 def budget_figure(told: Sequence[Mapping], scenes: int) -> Figure:

@@ -5,11 +5,10 @@ experiment=curves`), or the sweep of its tuning (`e2rl tune`). `e2rl curves RUN_
 """
 
 import argparse
-import csv
-import io
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from types import NoneType
 from typing import Any, NamedTuple
@@ -25,7 +24,7 @@ from e2rl.report.drawing import new_figure, save_figure
 from e2rl.report.tables import closed_loop, heading
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
-from e2rl.run.files import misfit, write_atomically
+from e2rl.run.files import csv_text, misfit, write_atomically
 from e2rl.run.run import read_provenance
 from e2rl.sim.rollout_file import UNPRINTABLE
 
@@ -111,16 +110,13 @@ def wrong_tuning(found: Any) -> str | None:
 
 def curves_csv(points: Sequence[Point]) -> str:
     """A line a point, by method and value: each of COLUMNS with its 95% interval; NaN is an empty cell."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
     ends = ("mean", "low", "high")
     names = [name if end == "mean" else f"{name}_{end}" for name in COLUMNS for end in ends]
-    writer.writerow(["method", "dial", "value", "on_curve", "chosen", *names])
-    for points_of in by_method(points).values():
-        for point in points_of:
-            found = [point.metrics.get(name, {}).get(end, math.nan) for name in COLUMNS for end in ends]
-            writer.writerow(map(cell, [*point[:5], *found]))
-    return buffer.getvalue()
+    lines: list[Iterable] = [["method", "dial", "value", "on_curve", "chosen", *names]]
+    for point in chain(*by_method(points).values()):
+        found = [point.metrics.get(name, {}).get(end, math.nan) for name in COLUMNS for end in ends]
+        lines.append(map(cell, [*point[:5], *found]))
+    return csv_text(lines)
 
 
 def by_method(points: Sequence[Point]) -> dict[str, list[Point]]:

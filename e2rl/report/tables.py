@@ -4,8 +4,6 @@ A run has a table with a row for each metric and a column for each method, one w
 one of its failure modes, from its modes.json.
 """
 
-import csv
-import io
 import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,7 +14,7 @@ from tabulate import LATEX_ESCAPE_RULES, tabulate
 
 from e2rl.metrics.catalogue import META_STAGE, METRICS, OPEN_LOOP_STAGE, SPREAD_STAGE, STAGES, Metric, table_metrics
 from e2rl.metrics.failure_modes import LEAST, MANY
-from e2rl.run.files import write_atomically
+from e2rl.run.files import csv_text, write_atomically
 
 UNKNOWN = "–"
 COUNTED = {  # what the count (n) of a stage's cells counts, and how its metrics are computed
@@ -62,9 +60,7 @@ class Table:
 
     def csv(self) -> str:
         """Head and rows, without the caption."""
-        buffer = io.StringIO()
-        csv.writer(buffer, lineterminator="\n").writerows([self.head, *self.rows])
-        return buffer.getvalue()
+        return csv_text([self.head, *self.rows])
 
     def latex(self) -> str:
         """A table environment with a tabular of package booktabs."""

@@ -5,6 +5,7 @@ Weights in safetensors files, with a hash of what was written in the header: an 
 Files of earlier versions have no hash; of those only the form is checked.
 """
 
+import csv
 import errno
 import fcntl
 import hashlib
@@ -90,6 +91,13 @@ def check_folder(folder: Path) -> None:
 def leads_into(path: Path, folder: Path) -> bool:
     """Whether a path lies in a folder once links are followed."""
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
+
+
+def csv_text(rows: Iterable[Iterable]) -> str:
+    """Rows of values as CSV."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def write_atomically(path: Path, content: bytes | str | Callable[[Path], object]) -> None:

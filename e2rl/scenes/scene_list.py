@@ -25,7 +25,7 @@ from typing import NamedTuple
 from tqdm import tqdm
 
 from e2rl.run.errors import InputError
-from e2rl.run.files import read_regular
+from e2rl.run.files import csv_text, read_regular
 from e2rl.scenes.scene import SceneSet
 
 SCENES = "scenes.csv"  # of a run's folder
@@ -51,11 +51,8 @@ def scene_hashes(scenes: SceneSet) -> list[str]:
 
 def listed(scenes: SceneSet) -> tuple[str, str]:
     """Returns the list of scenes as the content of a file, and the hash of their data's files."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    writer.writerows(zip(scenes.scene_id, scenes.location, scenes.number, scene_hashes(scenes), strict=True))
-    return buffer.getvalue(), scenes.files
+    lines = zip(scenes.scene_id, scenes.location, scenes.number, scene_hashes(scenes), strict=True)
+    return csv_text([COLUMNS, *lines]), scenes.files
 
 
 def read_list(path: str | Path) -> list[Listed]:

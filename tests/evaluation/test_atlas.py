@@ -1,11 +1,8 @@
-"""atlas.json: the cells of each ego, method and intensity; what is none of it is refused."""
+"""atlas.json: the cells of each ego, method and intensity."""
 
 import json
 
-import pytest
-
-from e2rl.evaluation.atlas import ATLAS_FILE, find_atlas, read_atlas, write_atlas
-from e2rl.run.errors import InputError
+from e2rl.evaluation.atlas import ATLAS_FILE, find_atlas, write_atlas
 from e2rl.sim.rollout_file import rollout_name
 from tests.evaluation.test_modes import crashes
 from tests.metrics.test_failure_modes import CROSSING, REAR_END
@@ -21,7 +18,7 @@ def run_rows():
 def test_every_group_has_its_own_atlas(tmp_path):
     rows = run_rows()
     write_atlas(tmp_path / ATLAS_FILE, find_atlas(rows))
-    e2, other, nominal = read_atlas(tmp_path / ATLAS_FILE)["groups"]
+    e2, other, nominal = json.loads((tmp_path / ATLAS_FILE).read_text())["groups"]
     counts = [(group["rollouts"], group["preventable"], group["cells"]) for group in (e2, other, nominal)]
     assert counts == [(5, 5, 2), (2, 1, 1), (2, 0, 0)] and nominal["atlas"] == []
     crossing, rear_end = e2["atlas"]
@@ -29,20 +26,3 @@ def test_every_group_has_its_own_atlas(tmp_path):
     assert (crossing["failures"], crossing["scenes"], crossing["transport"]) == (3, 3, 9.0)
     assert rear_end["transport"] is None and other["atlas"][0]["transport"] == 4.0
     assert crossing["likeliest"]["file"] == rollout_name(rows[0])
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda group: group.pop("cells"),
-        lambda group: group.update(cells=7),
-        lambda group: group["atlas"][0].update(transport="none"),
-        lambda group: group["atlas"][0]["likeliest"].update(file="../secret.npz"),
-    ],
-)
-def test_a_damaged_file_is_refused(tmp_path, damage):
-    found = find_atlas(run_rows())
-    damage(found["groups"][0])
-    (tmp_path / ATLAS_FILE).write_text(json.dumps(found).replace("NaN", "null"))
-    with pytest.raises(InputError, match=ATLAS_FILE):
-        read_atlas(tmp_path / ATLAS_FILE)
