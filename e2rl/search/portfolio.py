@@ -10,8 +10,6 @@ from e2rl.search.tries import Family
 
 SCENE_TRIES = 1.0  # tries in one scene that weigh as much as what all scenes have told
 PRIOR_TRIES = 20.0  # that a family's chance stands for at the start
-PRIOR_SHARE = 0.5  # of a family's contacts that are what the search is for, at the start
-POOLED = 20.0  # contacts of a family that weigh as much in this share as those of all families
 CONTACT, LEAST = 0.25, 0.15  # of the chance, where the nearest try of a scene has margin 0, and where nobody comes near
 
 
@@ -19,10 +17,8 @@ CONTACT, LEAST = 0.25, 0.15  # of the chance, where the nearest try of a scene h
 class Portfolio:
     """Chances of F families in N scenes: that a try finds what the search is for.
 
-    The chance in a scene follows Beta(c m, c (1 - m)) around the family's chance m in all scenes, with c = SCENE_TRIES.
-    m is the family's rate of contacts times the share of them that count, which is drawn towards that of all families:
-    of a planner that hardly fails, contacts tell which families to leave long before failures do. A family's own chance
-    is the prior, worth PRIOR_TRIES. Where nothing is found it is multiplied by CONTACT
+    The chance in a scene follows Beta(c m, c (1 - m)) around the family's chance m in all scenes, with c = SCENE_TRIES;
+    m has the family's own chance as its prior, worth PRIOR_TRIES. Where nothing is found it is multiplied by CONTACT
     + (1 - CONTACT) times the margin of the scene's nearest try, at least LEAST: tries are few where nobody comes near.
 
     Args:
@@ -44,15 +40,14 @@ class Portfolio:
         self.tried = torch.zeros_like(self.found)
         self.nearest = torch.full((self.scenes,), -torch.inf, dtype=torch.float64)
         prior = torch.tensor([family.chance for family in self.families], dtype=torch.float64)
-        touched = (prior / PRIOR_SHARE).clamp(max=1)
-        self.everywhere = PRIOR_TRIES * torch.stack([prior, touched, torch.ones_like(prior)])  # found, touched, tried
+        self.everywhere = PRIOR_TRIES * torch.stack([prior, torch.ones_like(prior)])  # found, tried
         self.spent = torch.tensor([PRIOR_TRIES * family.nfe for family in self.families], dtype=torch.float64)
 
     def tell(self, scene: int, family: int, found: float, margin: float, nfe: float) -> None:
         """Learn from a try."""
         self.found[scene, family] += found
         self.tried[scene, family] += 1
-        self.everywhere[:, family] += torch.tensor([found, margin >= 0, 1.0], dtype=torch.float64)
+        self.everywhere[:, family] += torch.tensor([found, 1.0], dtype=torch.float64)
         self.spent[family] += nfe
         self.nearest[scene] = max(float(self.nearest[scene]), margin)
 
@@ -62,9 +57,7 @@ class Portfolio:
 
     def worth(self, generator: torch.Generator) -> Tensor:
         """A draw of the chances [N, F] per NFE, relative to the dearest family."""
-        found, touched, tried = self.everywhere
-        share = (found + POOLED * found.sum() / touched.sum()) / (touched + POOLED)
-        mean = share * touched / tried
+        mean = self.everywhere[0] / self.everywhere[1]
         if not self.learns:
             return torch.rand(self.found.shape, generator=generator, dtype=torch.float64)
         hit = SCENE_TRIES * mean + self.found
@@ -72,7 +65,7 @@ class Portfolio:
         drawn = beta(hit, missed, generator)
         near = (CONTACT + (1 - CONTACT) * self.nearest).clamp(LEAST, 1.0)
         near = torch.where(self.nearest.isinf(), 1.0, near)[:, None]
-        cost = self.spent / tried
+        cost = self.spent / self.everywhere[1]
         return drawn * near * cost.amax() / cost
 
 

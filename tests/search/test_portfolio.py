@@ -57,12 +57,3 @@ def test_a_scene_in_which_nobody_comes_near_is_worth_the_least_share():
     found.tell(1, 1, 0.0, 0.5, 100.0)
     worth = mean_worth(found)[:, 0]
     torch.testing.assert_close(worth / worth[2], torch.tensor([LEAST, 0.625, 1.0]).double(), atol=0.06, rtol=0)
-
-
-def test_contacts_tell_families_apart_before_any_failure_does():
-    found = portfolio()
-    for one in range(60):
-        found.tell(0, 0, 0.0, 0.2 if one % 2 else -NEAR, 100.0)  # half of them are contacts
-        found.tell(0, 1, 0.0, -NEAR, 100.0)
-    worth = mean_worth(found)[1]
-    assert worth[0] > 1.5 * worth[1]
