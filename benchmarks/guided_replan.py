@@ -23,7 +23,7 @@ def guided_replan(bench: Bench) -> Iterator[Row]:
             plan = bench.ego.plan(world)
             state = bench.traffic.reset(world.scene, index, torch.full((batch,), ETA))
             state, _ = bench.traffic.replan(state, world, plan)
-            calm = replace(state, intensity=torch.zeros_like(state.intensity))
+            calm = replace(state, eta=torch.zeros_like(state.eta))
             parts = {
                 "unguided": lambda s=calm, w=world, p=plan: bench.traffic.replan(s, w, p),
                 f"guided, eta {ETA:g}": lambda s=state, w=world, p=plan: bench.traffic.replan(s, w, p),
