@@ -105,7 +105,8 @@ class Found:
     def value(self, name: str) -> dict[str, float]:
         """Mean and interval; exact, or none, where few places have or lack a failure (`metrics.statistics`)."""
         if name == "cells":
-            return jackknife(self.draws[name])
+            found = jackknife(self.draws[name])
+            return found | {"low": max(found["low"], 0.0)}
         few = min(self.failed, self.places - self.failed if name == "scenes" else self.failed) < LEAST
         found = interval(self.draws[name], 0 if few and name != "real_adv" else self.places)
         if few and name == "scenes" and self.places >= LEAST:
