@@ -61,6 +61,11 @@ def test_a_budget_of_tries_is_spent_and_hardly_exceeded(setup, plan):
     assert len({(row["scene_id"], row["seed"]) for row in told}) == len(told)
 
 
+def test_a_budget_that_ends_within_a_round_goes_to_scenes_at_random(setup, plan):
+    firsts = {spend(setup, plan, seed, range(3), 0.3, "tries")[1][0]["scene_id"] for seed in range(4)}
+    assert len(firsts) > 1
+
+
 def test_processes_change_nothing(setup, plan):
     assert known(found(setup, plan, processes=2)) == known(found(setup, plan))
 

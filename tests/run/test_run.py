@@ -162,3 +162,10 @@ def test_shards_are_joined_and_those_of_another_run_are_refused(tmp_path):
     with pytest.raises(InputError, match="began with another eta"):
         merge([tmp_path / "0", tmp_path / "other"], tmp_path / "mixed")
     assert not (tmp_path / "mixed").exists()
+
+
+def test_the_files_of_a_search_s_families_are_inputs_of_a_run_that_searches():
+    searched, plain = (
+        {name for name, _ in inputs(load_config("evaluate", [given]))} for given in ("tries=4", "tries=1")
+    )
+    assert {"synthesizer=ccdiff", "synthesizer=e2_pursuit"} <= searched - plain
