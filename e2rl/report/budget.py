@@ -13,7 +13,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from e2rl.evaluation.budget import SPENT, TRIES_FILE, write_tries
+from e2rl.evaluation.budget import SPENT, TRIES_FILE, Plan, write_tries
 from e2rl.evaluation.plan import Evaluation
 from e2rl.metrics.realism import Samples, realism
 from e2rl.metrics.statistics import (
@@ -160,7 +160,16 @@ def cell(value: Mapping[str, float], digits: int) -> str:
     return f"{text} [{value['low']:.{digits}f}, {value['high']:.{digits}f}]" if known else text
 
 
-def budget_tables(rows: Sequence[Mapping], scenes: int) -> list[Table]:
+def knowledge_text(plans: Sequence[Plan]) -> str:
+    """Which plans, and of several families which, are told the ego's plan."""
+    names = []
+    for plan in plans:
+        own = [family.name for family in plan.families if plan.traffic[family.name].traffic.knowledge == "plan"]
+        names += [plan.name if len(own) == len(plan.families) else f"{plan.name} ({', '.join(own)})"] if own else []
+    return f"Told the ego's plan: {', '.join(names) or 'nobody'}."
+
+
+def budget_tables(rows: Sequence[Mapping], scenes: int, knowledge: str) -> list[Table]:
     """A table for each ego, a row for each method and budget."""
     tables = []
     digits = {"scenes": 1, "cells": 1, "failures": 2, "clean": 2, "real_adv": 3}
@@ -182,7 +191,7 @@ def budget_tables(rows: Sequence[Mapping], scenes: int) -> list[Table]:
             values = [cell(row[name], count) for name, count in digits.items()]
             lines.append([row["method"], f"{row['budget']:g}", *spent, *values, *ratios])
         title = f"Failures of {ego} within a budget, in {own[0]['unit']} a scene"
-        tables.append(Table(f"{scenes} scenes. {CAPTION}", head, lines, title))
+        tables.append(Table(f"{scenes} scenes. {CAPTION} {knowledge}", head, lines, title))
     return tables
 
 
@@ -248,7 +257,7 @@ def save_budget(
     found = budget_rows(told, places, plan.asked.budget, plan.asked.budget_unit, by_try)
     write_tries(folder / TRIES_FILE, told)
     write_budget(folder / "budget.csv", found)
-    tables = budget_tables(found, len(places))
+    tables = budget_tables(found, len(places), knowledge_text(plan.searches))
     save_tables(folder / "budget.md", tables)
     save_figure(folder / "budget.png", budget_figure(told, len(places)))
     print("", *budget_lines(found, len(places)), f"all budgets, with intervals: {folder / 'budget.md'}", sep="\n")

@@ -44,7 +44,7 @@ class Portfolio:
         self.spent = torch.tensor([PRIOR_TRIES * family.nfe for family in self.families], dtype=torch.float64)
 
     def tell(self, scene: int, family: int, found: float, margin: float, nfe: float) -> None:
-        """Learn from a try."""
+        """Learn from a try that found so much of what is searched for, 0 to 1."""
         self.found[scene, family] += found
         self.tried[scene, family] += 1
         self.everywhere[:, family] += torch.tensor([found, 1.0], dtype=torch.float64)

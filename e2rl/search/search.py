@@ -17,6 +17,7 @@ from e2rl.search.portfolio import Portfolio
 from e2rl.search.tries import Family, Try
 
 ROUND = 24  # tries that a round of few scenes has at least: its batches cost much the same with one try as with several
+NEAR = 0.15  # of a failure, that a contact counts which the competent driver nearly prevents
 
 
 @configured("search/portfolio")
@@ -25,7 +26,7 @@ class SearchSettings:
     """How tries are spent; conf/search/portfolio.yaml explains each."""
 
     cover: int = setting(low=1)
-    width: float = setting(low=0.01, high=1)
+    growth: float = setting(low=0, high=1)
     stratified: bool = setting()
     bandit: bool = setting()
     again: float = setting(low=0, high=1)
@@ -69,7 +70,8 @@ class Search(Extension):
 
     def ask(self) -> list[Try]:
         """The next tries, to be told in this order: one of every scene until it has `cover` of them, then of those
-        families in those scenes that are worth the most, `width` times as many as there are scenes; ROUND at least."""
+        families in those scenes that are worth the most: as many as there are scenes, or `growth` of the tries so far,
+        but no more than a quarter of what could be chosen; ROUND at least."""
         worth = self._portfolio.worth(self._generator)
         found = self.settings.bandit & torch.tensor([self._found(scene) for scene in range(len(self.numbers))])
         worth = torch.where(found[:, None], self.settings.again * worth, worth)
@@ -78,7 +80,8 @@ class Search(Extension):
             each = worth.topk(min(-(-ROUND // len(worth)), uncovered, len(self.families)), dim=1).indices
             chosen = [(scene, family) for scene, families in enumerate(each.tolist()) for family in families]
         else:
-            count = min(max(ROUND, round(self.settings.width * len(worth))), worth.numel())
+            grown = min(round(self.settings.growth * sum(map(len, self.tries))), worth.numel() // 4)
+            count = min(max(ROUND, len(worth), grown), worth.numel())
             best = worth.flatten().topk(count).indices.sort().values
             chosen = [divmod(pair, worth.shape[1]) for pair in best.tolist()]
         asked: list[Try] = []
@@ -91,11 +94,13 @@ class Search(Extension):
         """What became of tries that were asked for."""
         names = [family.name for family in self._portfolio.families]
         for one, outcome in zip(tries, outcomes, strict=True):
-            first = bool(outcome.cell) and not self._found(one.scene)
-            new = first or (bool(outcome.cell) and outcome.cell not in self.cells)
+            known = self._found(one.scene)
+            new = bool(outcome.cell) and (not known or outcome.cell not in self.cells)
+            climbs = self.settings.climb and not known
+            reward = 1.0 if new else climbs * NEAR * min(max(outcome.margin, 0.0), 1.0)
             margin = outcome.margin if self.settings.climb else PREVENTED
-            self._portfolio.tell(one.scene, names.index(one.family), float(new), margin, outcome.nfe)
-            if first:  # from now on other failures of this scene are searched for
+            self._portfolio.tell(one.scene, names.index(one.family), reward, margin, outcome.nfe)
+            if new and not known:  # from now on other failures of this scene are searched for
                 self._portfolio.forget(one.scene)
             self.cells |= {outcome.cell} if outcome.cell else set()
             self.tries[one.scene].append(one)

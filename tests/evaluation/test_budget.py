@@ -108,6 +108,11 @@ def test_a_row_for_each_method_and_variant_and_its_families_from_the_configurati
     assert other.settings == replace(portfolio.settings, cover=3) and len(other.families) == len(portfolio.families)
 
 
+def test_no_family_of_the_search_is_told_the_plan_of_the_ego():
+    (portfolio,) = plans("methods=[search]")
+    assert {method.traffic.knowledge for method in portfolio.traffic.values()} == {"predicted"}
+
+
 def test_a_variant_of_the_prior_is_driven_by_its_own():
     e2, short = plans("methods=[e2]", "+variants.short={prior.sampler.steps: 2}")
     assert short.traffic["short"].traffic.prior.sampler.steps == 2 < e2.traffic["e2"].traffic.prior.sampler.steps

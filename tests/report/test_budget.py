@@ -5,9 +5,20 @@ import csv
 import pytest
 import torch
 
+from e2rl.evaluation.budget import build_plans
 from e2rl.metrics.realism import KINEMATICS, OF_ADVERSARIES
-from e2rl.report.budget import budget_figure, budget_lines, budget_rows, budget_tables, curve, write_budget
+from e2rl.report.budget import (
+    budget_figure,
+    budget_lines,
+    budget_rows,
+    budget_tables,
+    curve,
+    knowledge_text,
+    write_budget,
+)
+from e2rl.run.config import load_config
 from e2rl.search.tries import TRIES
+from tests.prior.small import small_prior
 
 SCENES = [(f"place {k // 2}", f"scene {k}") for k in range(40)]  # two scenes at each of twenty places
 
@@ -74,7 +85,7 @@ def test_realism_is_of_the_adversaries_of_the_tries_within_the_budget():
 def test_tables_files_and_the_picture(tmp_path):
     told = searched("search", lambda scene, *_: f"{scene % 7}") + searched("e2", lambda scene, *_: "0")
     rows = budget_rows(told, SCENES, [200, 400], "nfe", {})
-    (table,) = budget_tables(rows, 40)
+    (table,) = budget_tables(rows, 40, "Told the ego's plan: nobody.")
     assert [cells[:2] for cells in table.rows] == [["search", "200"], ["e2", "200"], ["search", "400"], ["e2", "400"]]
     assert "ratio" in table.markdown() and "idm" in table.title
     write_budget(tmp_path / "budget.csv", rows)
@@ -86,6 +97,14 @@ def test_tables_files_and_the_picture(tmp_path):
     assert [each.get_label() for each in lines] == ["search", "e2"] and len(figure.axes) == 6
     x, y = curve([row for row in told if row["method"] == "search"], "nfe", "cells", 40)
     assert max(y) == 7 and x == sorted(x) and y == sorted(y)
+
+
+def test_the_caption_tells_who_is_told_the_plan():
+    rammer = "+search.families.rammer={method: e2_unbound}"
+    config = load_config("evaluate", ["methods=[search,e2,ccdiff]", "budget=640", rammer])
+    plans = build_plans(config, small_prior())
+    assert knowledge_text(plans) == "Told the ego's plan: search (rammer), ccdiff."
+    assert knowledge_text(plans[1:2]) == "Told the ego's plan: nobody."
 
 
 def test_the_answer_tells_the_largest_budget_in_a_sentence_for_each_method():

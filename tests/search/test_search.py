@@ -56,6 +56,31 @@ def test_a_round_of_few_scenes_has_as_many_tries_as_a_batch_is_worth_and_covers_
     assert len(search.ask()) == ROUND
 
 
+def test_rounds_grow_with_the_tries_so_far():
+    many = [Family(f"family {k}", "e2", {}) for k in range(12)]
+    CHANCE.update({family.name: 0.0 for family in many})
+    search = told(search_of(settings=replace(PLAIN, growth=0.5), families=many), PLAIN.cover + 1)
+    for _ in range(4):
+        asked = search.ask()
+        assert len(asked) == min(max(40, len(tries_of(search)) // 2), 40 * 12 // 4)
+        assert len({(one.scene, one.family) for one in asked}) == len(asked)
+        search.tell(asked, [Outcome(-2.0, "", 100.0)] * len(asked))
+    assert len(search.ask()) == 120
+
+
+def test_a_family_that_nearly_finds_is_tried_more_unless_the_margin_does_not_count():
+    families = [Family(name, "e2", {}) for name in ("near", "far", "away")]
+
+    def share(climb):
+        search = search_of(settings=replace(PLAIN, climb=climb, again=1.0), families=families)
+        for _ in range(15):
+            tries = search.ask()
+            search.tell(tries, [Outcome(0.9 if one.family == "near" else -2.0, "", 100.0) for one in tries])
+        return sum(one.family == "near" for one in tries_of(search)) / len(tries_of(search))
+
+    assert share(climb=True) > 1.4 * share(climb=False)
+
+
 def test_tries_go_to_the_family_that_finds_and_not_to_hopeless_scenes():
     search = told(search_of(), 20, hopeless=range(20))
     counts = {name: sum(one.family == name for one in tries_of(search)) for name in CHANCE}
