@@ -1,5 +1,7 @@
 """The experiments of evaluate.py on tiny runs: their rows, tables, figures and files."""
 
+import csv
+
 import pytest
 
 from e2rl.evaluation.rollout_files import read_metrics
@@ -55,6 +57,19 @@ def test_the_public_protocol_has_crash_rates_and_route_completion_of_every_ego(e
     assert head.startswith("ego,traffic,cfr [%]")
     log = rows[0].split(",")[head.split(",").index("route_completion [%]")]
     assert float(log.split()[0]) > 99, "the recorded ego in recorded traffic drives all of its way"
+
+
+def test_the_budget_has_a_row_for_the_search_and_for_every_rival_as_its_authors_have_it_and_with_one_sample(evaluated):
+    run = evaluated("experiment=budget", "methods=[search,nominal]", "budget=[40]")
+    head, *rows = (run / "budget.csv").read_text().splitlines()
+    names = [
+        "search",
+        "nominal",
+        *(f"{name}, one sample" for name in ("ccdiff", "ctg_adv", "safe_sim_opt", "diffscene")),
+    ]
+    assert [next(csv.reader([row]))[1] for row in rows] == names and head.startswith("ego,method,budget,unit")
+    assert "Told the ego's plan: ccdiff, one sample" in (run / "budget.md").read_text()
+    assert {path.name for path in run.glob("budget.*")} == {"budget.csv", "budget.md", "budget.png", "budget.pdf"}
 
 
 def test_egos_before_and_after_are_rated_in_one_run(evaluated):

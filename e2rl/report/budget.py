@@ -166,7 +166,7 @@ def knowledge_text(plans: Sequence[Plan]) -> str:
     for plan in plans:
         own = [family.name for family in plan.families if plan.traffic[family.name].traffic.knowledge == "plan"]
         names += [plan.name if len(own) == len(plan.families) else f"{plan.name} ({', '.join(own)})"] if own else []
-    return f"Told the ego's plan: {', '.join(names) or 'nobody'}."
+    return f"Told the ego's plan: {'; '.join(names) or 'nobody'}."
 
 
 def budget_tables(rows: Sequence[Mapping], scenes: int, knowledge: str) -> list[Table]:

@@ -103,7 +103,7 @@ def test_the_caption_tells_who_is_told_the_plan():
     rammer = "+search.families.rammer={method: e2_unbound}"
     config = load_config("evaluate", ["methods=[search,e2,ccdiff]", "budget=640", rammer])
     plans = build_plans(config, small_prior())
-    assert knowledge_text(plans) == "Told the ego's plan: search (rammer), ccdiff."
+    assert knowledge_text(plans) == "Told the ego's plan: search (rammer); ccdiff."
     assert knowledge_text(plans[1:2]) == "Told the ego's plan: nobody."
 
 
