@@ -8,18 +8,20 @@ from torch import Tensor
 
 from e2rl.search.tries import Family
 
-SCENE_TRIES = 1.0  # tries in one scene that weigh as much as what all scenes have told
-PRIOR_TRIES = 20.0  # that a family's chance stands for at the start
-CONTACT, LEAST = 0.25, 0.15  # of the chance, where the nearest try of a scene has margin 0, and where nobody comes near
+PRIOR = 10.0  # first tries of scenes that a family's chance stands for at the start
+SCENE_TRIES, FAMILY_TRIES = 2.0, 4.0  # after which the next in the scene, and of the family there, has half the chance
+CONTACT, CLOSER, FARTHER, LEAST = 0.75, 2.0, 0.15, 0.1  # see `likelihood`
 
 
 @dataclass
 class Portfolio:
     """Chances of F families in N scenes: that a try finds what the search is for.
 
-    The chance in a scene follows Beta(c m, c (1 - m)) around the family's chance m in all scenes, with c = SCENE_TRIES;
-    m has the family's own chance as its prior, worth PRIOR_TRIES. Where nothing is found it is multiplied by CONTACT
-    + (1 - CONTACT) times the margin of the scene's nearest try, at least LEAST: tries are few where nobody comes near.
+    A family has a chance m of the first try in a scene. Its law is that of a rate: Gamma with shape PRIOR times the
+    family's own chance + what was found, and rate PRIOR + the x of its tries so far. In a scene with n tries, k of them
+    of the family, the chance is x m, with
+
+        x = likelihood(margin of the nearest) / ((1 + n / SCENE_TRIES) (1 + k / FAMILY_TRIES)).
 
     Args:
         families: the families.
@@ -30,47 +32,50 @@ class Portfolio:
     families: Sequence[Family]
     scenes: int
     learns: bool = True
-    found: Tensor = field(init=False)
     tried: Tensor = field(init=False)
     nearest: Tensor = field(init=False)
-    everywhere: Tensor = field(init=False)
+    found: Tensor = field(init=False)
+    exposed: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
-        self.found = torch.zeros(self.scenes, len(self.families), dtype=torch.float64)
-        self.tried = torch.zeros_like(self.found)
-        self.nearest = torch.full((self.scenes,), -torch.inf, dtype=torch.float64)
         prior = torch.tensor([family.chance for family in self.families], dtype=torch.float64)
-        self.everywhere = PRIOR_TRIES * torch.stack([prior, torch.ones_like(prior)])  # found, tried
-        self.spent = torch.tensor([PRIOR_TRIES * family.nfe for family in self.families], dtype=torch.float64)
+        self.tried = torch.zeros(self.scenes, len(self.families), dtype=torch.float64)
+        self.nearest = torch.full((self.scenes,), torch.nan, dtype=torch.float64)
+        self.found, self.exposed = PRIOR * prior, torch.full_like(prior, PRIOR)
+        self.spent = torch.tensor([PRIOR * family.nfe for family in self.families], dtype=torch.float64)
+        self.driven = torch.full_like(prior, PRIOR)
 
     def tell(self, scene: int, family: int, found: float, margin: float, nfe: float) -> None:
         """Learn from a try that found so much of what is searched for, 0 to 1."""
-        self.found[scene, family] += found
+        self.found[family] += found
+        self.exposed[family] += self.share(slice(scene, scene + 1))[0, family]
         self.tried[scene, family] += 1
-        self.everywhere[:, family] += torch.tensor([found, 1.0], dtype=torch.float64)
         self.spent[family] += nfe
-        self.nearest[scene] = max(float(self.nearest[scene]), margin)
+        self.driven[family] += 1
+        self.nearest[scene] = torch.fmax(self.nearest[scene], torch.tensor(margin, dtype=torch.float64))
 
     def forget(self, scene: int) -> None:
         """What the tries of a scene have told does not hold any more for this scene: another thing is searched for."""
-        self.found[scene] = self.tried[scene] = 0.0
+        self.tried[scene], self.nearest[scene] = 0.0, torch.nan
+
+    def share(self, scenes: slice = slice(None)) -> Tensor:
+        """x [N, F] of some scenes: what is left of the chances of a first try."""
+        tried = self.tried[scenes]
+        before = (1 + tried.sum(1, keepdim=True) / SCENE_TRIES) * (1 + tried / FAMILY_TRIES)
+        return likelihood(self.nearest[scenes])[:, None] / before
 
     def worth(self, generator: torch.Generator) -> Tensor:
-        """A draw of the chances [N, F] per NFE, relative to the dearest family."""
-        mean = self.everywhere[0] / self.everywhere[1]
+        """A draw of the chances [N, F] per NFE, relative to the dearest family; those of a scene as if tried one after
+        another, the best first."""
         if not self.learns:
-            return torch.rand(self.found.shape, generator=generator, dtype=torch.float64)
-        hit = SCENE_TRIES * mean + self.found
-        missed = SCENE_TRIES * (1 - mean) + self.tried - self.found
-        drawn = beta(hit, missed, generator)
-        near = (CONTACT + (1 - CONTACT) * self.nearest).clamp(LEAST, 1.0)
-        near = torch.where(self.nearest.isinf(), 1.0, near)[:, None]
-        cost = self.spent / self.everywhere[1]
-        return drawn * near * cost.amax() / cost
+            return torch.rand(self.tried.shape, generator=generator, dtype=torch.float64)
+        chance, cost = torch._standard_gamma(self.found, generator=generator) / self.exposed, self.spent / self.driven
+        worth = self.share() * chance * cost.amax() / cost
+        count, rank = self.tried.sum(1, keepdim=True), worth.argsort(dim=1, descending=True).argsort(dim=1)
+        return worth * (1 + count / SCENE_TRIES) / (1 + (count + rank) / SCENE_TRIES)
 
 
-def beta(a: Tensor, b: Tensor, generator: torch.Generator) -> Tensor:
-    """A draw of Beta(a, b), elementwise."""
-    first = torch._standard_gamma(a, generator=generator)
-    second = torch._standard_gamma(b, generator=generator)
-    return first / (first + second).clamp(min=1e-300)
+def likelihood(margin: Tensor) -> Tensor:
+    """How likely a find is in scenes whose nearest try has this margin, beside one without a try (NaN), which has 1."""
+    near = (CONTACT + torch.where(margin > 0, CLOSER, FARTHER) * margin.clamp(max=1)).clamp(min=LEAST)
+    return near.nan_to_num(1.0)

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import torch
 
-from e2rl.metrics.margin import PREVENTED
 from e2rl.run.config import Extension
 from e2rl.run.settings import configured, setting
 from e2rl.search.portfolio import Portfolio
@@ -98,7 +97,7 @@ class Search(Extension):
             new = bool(outcome.cell) and (not known or outcome.cell not in self.cells)
             climbs = self.settings.climb and not known
             reward = 1.0 if new else climbs * NEAR * min(max(outcome.margin, 0.0), 1.0)
-            margin = outcome.margin if self.settings.climb else PREVENTED
+            margin = outcome.margin if self.settings.climb else 0.0
             self._portfolio.tell(one.scene, names.index(one.family), reward, margin, outcome.nfe)
             if new and not known:  # from now on other failures of this scene are searched for
                 self._portfolio.forget(one.scene)

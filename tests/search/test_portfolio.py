@@ -2,58 +2,99 @@
 
 import torch
 
-from e2rl.search.portfolio import LEAST, Portfolio
+from e2rl.search.portfolio import FAMILY_TRIES, LEAST, PRIOR, SCENE_TRIES, Portfolio, likelihood
 from e2rl.search.tries import Family
 
-NEAR = 2.0  # a margin of a scene whose tries are not discounted
+SURE = 1000.0  # a chance that draws hardly differ from
 
 
-def portfolio(scenes: int = 2, chance: float = 0.1, nfe: tuple[float, ...] = (100.0, 100.0)) -> Portfolio:
+def portfolio(scenes: int = 2, chance: float = SURE, nfe: tuple[float, ...] = (100.0,)) -> Portfolio:
     return Portfolio([Family(str(k), "e2", {}, chance=chance, nfe=cost) for k, cost in enumerate(nfe)], scenes)
 
 
-def mean_worth(found: Portfolio, draws: int = 4000) -> torch.Tensor:
+def mean_worth(found: Portfolio, draws: int = 400) -> torch.Tensor:
     generator = torch.Generator().manual_seed(0)
     return torch.stack([found.worth(generator) for _ in range(draws)]).mean(0)
 
 
-def test_a_family_is_worth_its_own_chance_and_half_of_it_in_a_scene_where_it_failed_once():
-    found = portfolio(chance=0.2)
-    torch.testing.assert_close(mean_worth(found), torch.full((2, 2), 0.2).double(), atol=0.02, rtol=0)
-    found.tell(0, 0, 0.0, NEAR, 100.0)
-    worth, family = mean_worth(found), 0.2 * 20 / 21
-    torch.testing.assert_close(worth[:, 0], torch.tensor([family / 2, family]).double(), atol=0.02, rtol=0)
+def close(found: float, expected: float) -> bool:
+    return abs(found / expected - 1) < 0.01
 
 
-def test_what_a_family_finds_in_one_scene_raises_its_worth_in_all_and_there_the_most():
+def test_a_family_is_worth_its_own_chance_and_less_in_a_scene_where_it_failed():
     found = portfolio()
-    for _ in range(20):
-        found.tell(0, 0, 1.0, NEAR, 100.0)
-    worth = mean_worth(found)
-    expected = (0.1 * 20 + 20) / (20 + 20)  # of the other scene
-    torch.testing.assert_close(worth[1, 0].item(), expected, atol=0.03, rtol=0)
-    assert worth[0, 0] > worth[1, 0] > worth[1, 1]
+    torch.testing.assert_close(mean_worth(found), torch.full((2, 1), SURE).double(), rtol=0.01, atol=0)
+    found.tell(0, 0, 0.0, 0.0, 100.0)
+    worth, family = mean_worth(found), SURE * PRIOR / (PRIOR + 1)
+    after = likelihood(torch.tensor(0.0)).item() / ((1 + 1 / SCENE_TRIES) * (1 + 1 / FAMILY_TRIES))
+    assert close(worth[1].item(), family) and close(worth[0].item(), family * after)
+
+
+def test_what_a_family_finds_in_one_scene_raises_its_worth_in_all():
+    chance, finds = 0.1, 20
+    found = portfolio(chance=chance, nfe=(100.0, 100.0))
+    for _ in range(finds):
+        found.tell(0, 0, 1.0, 2.0, 100.0)
+    near, tries = likelihood(torch.tensor(2.0)), torch.arange(1, finds)
+    exposed = PRIOR + 1 + (near / ((1 + tries / SCENE_TRIES) * (1 + tries / FAMILY_TRIES))).sum().item()
+    worth = mean_worth(found, 4000)[1]
+    assert abs(worth[0].item() / ((PRIOR * chance + finds) / exposed) - 1) < 0.05 and worth[0] > 2 * worth[1]
+
+
+def test_late_tries_where_all_others_failed_tell_less_against_a_family_than_first_ones():
+    found = portfolio(scenes=20, nfe=(100.0, 100.0))
+    for scene in range(10):
+        found.tell(scene, 0, 0.0, 0.0, 100.0)
+    for _ in range(10):
+        found.tell(10, 1, 0.0, 0.0, 100.0)
+    worth = mean_worth(found)[19]
+    assert worth[1] > 1.2 * worth[0]
 
 
 def test_a_scene_forgets_what_its_tries_told_and_others_do_not():
-    found = portfolio()
+    found = portfolio(scenes=3)
     for _ in range(20):
-        found.tell(0, 0, 0.0, NEAR, 100.0)
-        found.tell(1, 0, 0.0, NEAR, 100.0)
+        found.tell(0, 0, 0.0, 0.0, 100.0)
+        found.tell(1, 0, 0.0, 0.0, 100.0)
     found.forget(0)
-    worth = mean_worth(found)
-    torch.testing.assert_close(worth[0, 0].item(), 0.1 * 20 / (20 + 40), atol=0.01, rtol=0)
-    assert worth[1, 0] < 0.2 * worth[0, 0]
+    worth = mean_worth(found)[:, 0]
+    assert close(worth[0].item(), worth[2].item()) and worth[1] < 0.05 * worth[0]
 
 
 def test_a_dear_family_is_worth_less_in_proportion():
-    worth = mean_worth(portfolio(nfe=(100.0, 400.0)))
-    torch.testing.assert_close(worth[:, 0] / worth[:, 1], torch.full((2,), 4.0).double(), atol=0.4, rtol=0)
+    found = portfolio(nfe=(100.0, 400.0))
+    worth = mean_worth(found)[0]
+    assert close(worth[0].item() / worth[1].item(), 4.0 * (1 + 1 / SCENE_TRIES))  # it would be the second, besides
+    for _ in range(int(PRIOR)):
+        found.tell(1, 1, 0.0, 0.0, 200.0)  # it costs less than it was said to: 300 in the mean
+    worth, exposed = mean_worth(found)[0], found.exposed[1].item()
+    assert close(worth[0].item() / worth[1].item(), 3.0 * (1 + 1 / SCENE_TRIES) * exposed / PRIOR)
 
 
-def test_a_scene_in_which_nobody_comes_near_is_worth_the_least_share():
+def test_tries_of_one_scene_in_a_round_are_worth_less_one_after_another():
+    found = portfolio(scenes=1, nfe=(100.0, 110.0, 120.0))
+    found.tell(0, 2, 0.0, 0.0, 120.0)
+    share, worth = found.share()[0], mean_worth(found)[0]
+    alone = share * (found.found / found.exposed) * 120.0 / torch.tensor([100.0, 110.0, 120.0])
+    rank = torch.tensor([0.0, 1.0, 2.0])
+    torch.testing.assert_close(worth, alone * (1 + 1 / SCENE_TRIES) / (1 + (1 + rank) / SCENE_TRIES), rtol=0.02, atol=0)
+
+
+def test_the_nearer_a_scene_came_the_likelier_is_a_find_there():
+    margin = torch.linspace(-30, 1, 100)
+    near = likelihood(margin)
+    assert bool((near.diff() >= 0).all()) and near[0] == LEAST and near[-1] > 2
+    assert likelihood(torch.tensor(torch.nan)) == 1 and likelihood(torch.tensor(0.0)) < 1
     found = portfolio(scenes=3)
-    found.tell(0, 1, 0.0, -30.0, 100.0)
-    found.tell(1, 1, 0.0, 0.5, 100.0)
+    for scene, nearest in enumerate((-30.0, 0.5)):
+        found.tell(scene, 0, 0.0, nearest, 100.0)
+        found.tell(scene, 0, 0.0, -40.0, 100.0)  # the nearest try tells
     worth = mean_worth(found)[:, 0]
-    torch.testing.assert_close(worth / worth[2], torch.tensor([LEAST, 0.625, 1.0]).double(), atol=0.06, rtol=0)
+    assert close((worth[1] / worth[0]).item(), (likelihood(torch.tensor(0.5)) / LEAST).item())
+
+
+def test_without_learning_nothing_that_was_told_changes_the_choice():
+    found = Portfolio([Family("a", "e2", {}), Family("b", "e2", {})], 2, learns=False)
+    for _ in range(50):
+        found.tell(0, 0, 1.0, 2.0, 100.0)
+    torch.testing.assert_close(mean_worth(found, 4000), torch.full((2, 2), 0.5).double(), atol=0.03, rtol=0)
