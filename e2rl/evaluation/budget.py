@@ -1,7 +1,7 @@
 """Searches for failures with a budget, round by round, and what each of their tries was (docs/search.md).
 
 Every method is tried again and again, with other noise; the method `search` spends its tries on a portfolio of
-families. What they find is told at several budgets by `evaluation.budget_table`.
+families. What they find is told at several budgets by `report.budget`.
 """
 
 import copy

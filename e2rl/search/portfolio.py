@@ -8,20 +8,20 @@ from torch import Tensor
 
 from e2rl.search.tries import Family
 
-PRIOR = 10.0  # first tries of scenes that a family's chance stands for at the start
+CHANCE_TRIES = 10.0  # first tries of scenes that a family's chance stands for at the start
 SCENE_TRIES, FAMILY_TRIES = 2.0, 4.0  # after which the next in the scene, and of the family there, has half the chance
-CONTACT, CLOSER, FARTHER, LEAST = 0.75, 2.0, 0.15, 0.1  # see `likelihood`
+CONTACT, CLOSER, FARTHER, LEAST = 0.75, 2.0, 0.15, 0.1  # see `nearness`
 
 
 @dataclass
 class Portfolio:
     """Chances of F families in N scenes: that a try finds what the search is for.
 
-    A family has a chance m of the first try in a scene. Its law is that of a rate: Gamma with shape PRIOR times the
-    family's own chance + what was found, and rate PRIOR + the x of its tries so far. In a scene with n tries, k of them
-    of the family, the chance is x m, with
+    A family has a chance m of the first try in a scene. Its law is that of a rate: Gamma with shape CHANCE_TRIES times
+    the family's own chance + what was found, and rate CHANCE_TRIES + the x of its tries so far. In a scene with n
+    tries, k of them of the family, the chance is x m, with
 
-        x = likelihood(margin of the nearest) / ((1 + n / SCENE_TRIES) (1 + k / FAMILY_TRIES)).
+        x = nearness(margin of the nearest) / ((1 + n / SCENE_TRIES) (1 + k / FAMILY_TRIES)).
 
     Args:
         families: the families.
@@ -34,16 +34,18 @@ class Portfolio:
     learns: bool = True
     tried: Tensor = field(init=False)
     nearest: Tensor = field(init=False)
-    found: Tensor = field(init=False)
+    found: Tensor = field(init=False)  # [F], and the x of the tries
     exposed: Tensor = field(init=False)
+    spent: Tensor = field(init=False)  # [F], NFE, of so many tries
+    driven: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
         prior = torch.tensor([family.chance for family in self.families], dtype=torch.float64)
         self.tried = torch.zeros(self.scenes, len(self.families), dtype=torch.float64)
         self.nearest = torch.full((self.scenes,), torch.nan, dtype=torch.float64)
-        self.found, self.exposed = PRIOR * prior, torch.full_like(prior, PRIOR)
-        self.spent = torch.tensor([PRIOR * family.nfe for family in self.families], dtype=torch.float64)
-        self.driven = torch.full_like(prior, PRIOR)
+        self.found, self.exposed = CHANCE_TRIES * prior, torch.full_like(prior, CHANCE_TRIES)
+        self.spent = torch.tensor([CHANCE_TRIES * family.nfe for family in self.families], dtype=torch.float64)
+        self.driven = torch.full_like(prior, CHANCE_TRIES)
 
     def tell(self, scene: int, family: int, found: float, margin: float, nfe: float) -> None:
         """Learn from a try that found so much of what is searched for, 0 to 1."""
@@ -62,7 +64,7 @@ class Portfolio:
         """x [N, F] of some scenes: what is left of the chances of a first try."""
         tried = self.tried[scenes]
         before = (1 + tried.sum(1, keepdim=True) / SCENE_TRIES) * (1 + tried / FAMILY_TRIES)
-        return likelihood(self.nearest[scenes])[:, None] / before
+        return nearness(self.nearest[scenes])[:, None] / before
 
     def worth(self, generator: torch.Generator) -> Tensor:
         """A draw of the chances [N, F] per NFE, relative to the dearest family; those of a scene as if tried one after
@@ -75,7 +77,7 @@ class Portfolio:
         return worth * (1 + count / SCENE_TRIES) / (1 + (count + rank) / SCENE_TRIES)
 
 
-def likelihood(margin: Tensor) -> Tensor:
+def nearness(margin: Tensor) -> Tensor:
     """How likely a find is in scenes whose nearest try has this margin, beside one without a try (NaN), which has 1."""
     near = (CONTACT + torch.where(margin > 0, CLOSER, FARTHER) * margin.clamp(max=1)).clamp(min=LEAST)
     return near.nan_to_num(1.0)

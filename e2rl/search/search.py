@@ -6,6 +6,7 @@ something new.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import count
 from typing import NamedTuple
 
 import torch
@@ -80,14 +81,11 @@ class Search(Extension):
             chosen = [(scene, family) for scene, families in enumerate(each.tolist()) for family in families]
         else:
             grown = min(round(self.settings.growth * sum(map(len, self.tries))), worth.numel() // 4)
-            count = min(max(ROUND, len(worth), grown), worth.numel())
-            best = worth.flatten().topk(count).indices.sort().values
+            size = min(max(ROUND, len(worth), grown), worth.numel())
+            best = worth.flatten().topk(size).indices.sort().values
             chosen = [divmod(pair, worth.shape[1]) for pair in best.tolist()]
-        asked: list[Try] = []
-        for scene, family in chosen:
-            first = len(self.tries[scene]) + sum(one.scene == scene for one in asked)
-            asked.append(self._draw(scene, family, first))
-        return asked
+        number = [count(len(tries)) for tries in self.tries]  # of the next try of each scene
+        return [self._draw(scene, family, next(number[scene])) for scene, family in chosen]
 
     def tell(self, tries: Sequence[Try], outcomes: Sequence[Outcome]) -> None:
         """What became of tries that were asked for."""

@@ -2,7 +2,7 @@
 
 import torch
 
-from e2rl.search.portfolio import FAMILY_TRIES, LEAST, PRIOR, SCENE_TRIES, Portfolio, likelihood
+from e2rl.search.portfolio import CHANCE_TRIES, FAMILY_TRIES, LEAST, SCENE_TRIES, Portfolio, nearness
 from e2rl.search.tries import Family
 
 SURE = 1000.0  # a chance that draws hardly differ from
@@ -25,8 +25,8 @@ def test_a_family_is_worth_its_own_chance_and_less_in_a_scene_where_it_failed():
     found = portfolio()
     torch.testing.assert_close(mean_worth(found), torch.full((2, 1), SURE).double(), rtol=0.01, atol=0)
     found.tell(0, 0, 0.0, 0.0, 100.0)
-    worth, family = mean_worth(found), SURE * PRIOR / (PRIOR + 1)
-    after = likelihood(torch.tensor(0.0)).item() / ((1 + 1 / SCENE_TRIES) * (1 + 1 / FAMILY_TRIES))
+    worth, family = mean_worth(found), SURE * CHANCE_TRIES / (CHANCE_TRIES + 1)
+    after = nearness(torch.tensor(0.0)).item() / ((1 + 1 / SCENE_TRIES) * (1 + 1 / FAMILY_TRIES))
     assert close(worth[1].item(), family) and close(worth[0].item(), family * after)
 
 
@@ -35,10 +35,10 @@ def test_what_a_family_finds_in_one_scene_raises_its_worth_in_all():
     found = portfolio(chance=chance, nfe=(100.0, 100.0))
     for _ in range(finds):
         found.tell(0, 0, 1.0, 2.0, 100.0)
-    near, tries = likelihood(torch.tensor(2.0)), torch.arange(1, finds)
-    exposed = PRIOR + 1 + (near / ((1 + tries / SCENE_TRIES) * (1 + tries / FAMILY_TRIES))).sum().item()
+    near, tries = nearness(torch.tensor(2.0)), torch.arange(1, finds)
+    exposed = CHANCE_TRIES + 1 + (near / ((1 + tries / SCENE_TRIES) * (1 + tries / FAMILY_TRIES))).sum().item()
     worth = mean_worth(found, 4000)[1]
-    assert abs(worth[0].item() / ((PRIOR * chance + finds) / exposed) - 1) < 0.05 and worth[0] > 2 * worth[1]
+    assert abs(worth[0].item() / ((CHANCE_TRIES * chance + finds) / exposed) - 1) < 0.05 and worth[0] > 2 * worth[1]
 
 
 def test_late_tries_where_all_others_failed_tell_less_against_a_family_than_first_ones():
@@ -65,10 +65,10 @@ def test_a_dear_family_is_worth_less_in_proportion():
     found = portfolio(nfe=(100.0, 400.0))
     worth = mean_worth(found)[0]
     assert close(worth[0].item() / worth[1].item(), 4.0 * (1 + 1 / SCENE_TRIES))  # it would be the second, besides
-    for _ in range(int(PRIOR)):
+    for _ in range(int(CHANCE_TRIES)):
         found.tell(1, 1, 0.0, 0.0, 200.0)  # it costs less than it was said to: 300 in the mean
     worth, exposed = mean_worth(found)[0], found.exposed[1].item()
-    assert close(worth[0].item() / worth[1].item(), 3.0 * (1 + 1 / SCENE_TRIES) * exposed / PRIOR)
+    assert close(worth[0].item() / worth[1].item(), 3.0 * (1 + 1 / SCENE_TRIES) * exposed / CHANCE_TRIES)
 
 
 def test_tries_of_one_scene_in_a_round_are_worth_less_one_after_another():
@@ -82,15 +82,15 @@ def test_tries_of_one_scene_in_a_round_are_worth_less_one_after_another():
 
 def test_the_nearer_a_scene_came_the_likelier_is_a_find_there():
     margin = torch.linspace(-30, 1, 100)
-    near = likelihood(margin)
+    near = nearness(margin)
     assert bool((near.diff() >= 0).all()) and near[0] == LEAST and near[-1] > 2
-    assert likelihood(torch.tensor(torch.nan)) == 1 and likelihood(torch.tensor(0.0)) < 1
+    assert nearness(torch.tensor(torch.nan)) == 1 and nearness(torch.tensor(0.0)) < 1
     found = portfolio(scenes=3)
     for scene, nearest in enumerate((-30.0, 0.5)):
         found.tell(scene, 0, 0.0, nearest, 100.0)
         found.tell(scene, 0, 0.0, -40.0, 100.0)  # the nearest try tells
     worth = mean_worth(found)[:, 0]
-    assert close((worth[1] / worth[0]).item(), (likelihood(torch.tensor(0.5)) / LEAST).item())
+    assert close((worth[1] / worth[0]).item(), (nearness(torch.tensor(0.5)) / LEAST).item())
 
 
 def test_without_learning_nothing_that_was_told_changes_the_choice():
