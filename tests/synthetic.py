@@ -111,6 +111,7 @@ def _routes(start, valid, num_routes, num_points, limit, red_light_x, road):
         "route_length": length[..., None].repeat(1, 1, num_routes),
         "route_open": first & (length < arc[-1].item())[..., None],
         "route_valid": first,
+        "route_recorded": torch.zeros_like(first),
         "route_limit": torch.full((*shape, num_points), limit),
         "route_light": light,
         "route_light_s": light_s,

@@ -2,7 +2,10 @@
 
 Fifteen proposals follow the mission: IDM at five fractions of the speed limit, on three lateral offsets. Each is driven
 by the simulator's own vehicle, and scored by nuPlan's closed-loop terms against others that keep their velocity. The
-best is driven; where even that is going to collide within two seconds, the ego brakes as hard as it can.
+best is driven; where even that is going to collide within two seconds, a slow ego brakes as hard as it can.
+
+Where the paper is silent, the numbers are those of its published code: IDM's exponent and its bounds, and the speed
+above which there is no emergency brake.
 """
 
 from dataclasses import dataclass
@@ -38,6 +41,7 @@ LEAST_PROGRESS = 0.1  # m: where no proposal drives farther, all have all progre
 ACCELERATIONS = (-4.05, 2.40)  # m/s^2, comfortable along the way; the others are bounds of the absolute value
 LATERAL, JERK, YAW_RATE, YAW_ACCELERATION = 4.89, 8.37, 0.95, 1.93  # m/s^2, m/s^3, rad/s, rad/s^2
 SOON = 2.0  # s before a collision of the best proposal from which on the ego brakes
+EXPONENT = 10.0  # of IDM's free-road term
 CHUNK = 32  # scenes planned for at a time: fits the processor's cache
 
 
@@ -67,6 +71,7 @@ class PDMClosedEgo(Ego):
     acceleration: float = setting(low=0.01)
     braking: float = setting(low=0.01)
     emergency_braking: float = setting(low=0)
+    emergency_speed: float = setting(low=0)
     shift_time: float = setting(low=0)
     agents: int = setting(low=1)
     replan_every: int = setting(low=1, high=PLAN_STEPS)
@@ -83,7 +88,8 @@ class PDMClosedEgo(Ego):
         row = torch.arange(len(best), device=best.device)
         brake = torch.tensor([-self.emergency_braking, 0.0], device=best.device).expand(len(best), PLAN_STEPS, 2)
         stop = dynamics.rollout(world.states[:, 0], brake)
-        return torch.where((scores.collides[row, best] <= SOON)[:, None, None], stop, proposals[row, best])
+        emergency = (scores.collides[row, best] <= SOON) & (world.states[:, 0, 3] <= self.emergency_speed)
+        return torch.where(emergency[:, None, None], stop, proposals[row, best])
 
     def proposals(self, world: World) -> Tensor:
         """States [B, P, PLAN_STEPS, 4] of the proposals: of each offset, all fractions."""
@@ -96,7 +102,7 @@ class PDMClosedEgo(Ego):
     def speeds(self, world: World, path: MissionPath, offset: Tensor, fraction: Tensor) -> Tensor:
         """Speeds [B, P, PLAN_STEPS + 1] m/s by IDM behind whom the offsets [P] m meet, and before red lights, at
         fractions [P] of the speed limit."""
-        driver = IDMParameters(self.headway, self.standstill_gap, self.acceleration, self.braking)
+        driver = IDMParameters(self.headway, self.standstill_gap, self.acceleration, self.braking, EXPONENT)
         others, half = self._others(world, range(PLAN_STEPS)), world.scene["size"][:, 0] / 2
         s, d, heading = (x.unflatten(1, others.states.shape[1:3]) for x in _onto(path, others.states))
         turn = others.states[..., 2] - heading
@@ -116,8 +122,8 @@ class PDMClosedEgo(Ego):
             gap, nearest = (rear[..., t] - front[..., None]).masked_fill(~ahead, torch.inf).min(-1)
             pace = leading[..., t].expand(ahead.shape).gather(-1, nearest[..., None])[..., 0]
             pace, gap = torch.where(light - way < gap, 0.0, pace), torch.minimum(gap, (light - way).clamp(min=0.01))
-            asked = idm_acceleration(now, wanted, gap, pace, driver, improved=True).clamp(-dynamics.MAX_LATERAL)
-            after = (now + DT * asked).clamp(0, dynamics.MAX_SPEED)
+            asked = idm_acceleration(now, wanted, gap, pace, driver, improved=False)
+            after = (now + DT * asked.clamp(-self.braking, self.acceleration)).clamp(0, dynamics.MAX_SPEED)
             way, now = way + (now + after) / 2 * DT, after
             found.append(now)
         return torch.stack(found, -1)

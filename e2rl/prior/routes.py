@@ -4,7 +4,7 @@ RoutedScene: the static tensors of a scene once every vehicle has been assigned 
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -138,28 +138,43 @@ FEATURES = 16
 TURN_AT = (10.0, 20.0, 35.0, 55.0, 80.0)  # m ahead
 
 
-def candidate_features(scene: TensorDictBase) -> Tensor:
-    """[B, V, R, FEATURES] of each route candidate as seen from the vehicle's start state."""
-    points = scene["route_points"]
-    vehicles = points.shape[1]
-    start = scene["start"][:, :vehicles]
-    s, d, heading = (value[..., 0] for value in project(start[:, :, None, None, :2], points))
-    v = start[..., 3][..., None].expand_as(s)
+class Moment(NamedTuple):
+    """The first V vehicles at a moment: states [B, V, 4], yaw_rate [B, V] rad/s, step [B]."""
+
+    states: Tensor
+    yaw_rate: Tensor
+    step: Tensor
+
+
+def start_of(scene: TensorDictBase) -> Moment:
+    """The vehicles at the start of scenes [B]."""
+    vehicles = scene["route_log"].shape[1]
+    step = torch.zeros(len(scene["start"]), dtype=torch.long, device=scene["start"].device)
+    return Moment(scene["start"][:, :vehicles], scene["start_yaw_rate"][:, :vehicles], step)
+
+
+def candidate_features(scene: TensorDictBase, now: Moment) -> Tensor:
+    """[B, V, R, FEATURES] of each route candidate as seen from the vehicles now."""
+    vehicles = now.states.shape[1]
+    points, length = scene["route_points"][:, :vehicles], scene["route_length"][:, :vehicles]
+    s, d, heading = (value[..., 0] for value in project(now.states[:, :, None, None, :2], points))
+    v = now.states[..., 3][..., None].expand_as(s)
     at = s[..., None] + torch.tensor((0.0, *TURN_AT), device=s.device)
     angle = interpolate(points, at)[1]
     turn = wrap(angle[..., 1:] - angle[..., :1])
     curvature = turn.abs().diff(dim=-1, prepend=torch.zeros_like(turn[..., :1])).abs()
     tight = (curvature / torch.tensor([10.0, 10.0, 15.0, 20.0, 25.0], device=s.device)).amax(-1)
     excess = (v**2 * tight / 4 - 1).clamp(0, 4)
-    limit = scene["route_limit"].gather(-1, (s / SPACING).long().clamp(0, points.shape[3] - 1)[..., None])[..., 0]
-    light = scene["route_light"][..., 0]
-    colour = light_state_at(scene["light_state"], light, torch.zeros(len(light), dtype=torch.long, device=s.device))
+    at = (s / SPACING).long().clamp(0, points.shape[3] - 1)[..., None]
+    limit = scene["route_limit"][:, :vehicles].gather(-1, at)[..., 0]
+    light = scene["route_light"][:, :vehicles, :, 0]
+    colour = light_state_at(scene["light_state"], light, now.step)
     green, red = ((light >= 0) & (colour == state) for state in (LIGHT_GREEN, LIGHT_RED))
     rank = torch.arange(s.shape[-1], device=s.device).expand_as(s)
-    yaw_rate = scene["start_yaw_rate"][:, :vehicles, None].expand_as(s)
-    rest = (scene["route_length"] - s).clamp(0, 100) / 50
-    bend = (yaw_rate / v.clamp(min=2.0) - turn[..., 0] / 10.0) * 10
-    features = [d.abs(), d, wrap(start[..., 2][..., None] - heading) * 3, *turn.unbind(-1), rest, v / 10, excess, bend]
+    rest = (length - s).clamp(0, 100) / 50
+    bend = (now.yaw_rate[..., None] / v.clamp(min=2.0) - turn[..., 0] / 10.0) * 10
+    aside = wrap(now.states[..., 2][..., None] - heading) * 3
+    features = [d.abs(), d, aside, *turn.unbind(-1), rest, v / 10, excess, bend]
     return torch.stack([*features, green.float(), red.float(), rank / 3, (v - limit) / 10], -1)
 
 
@@ -171,12 +186,14 @@ class RouteChoice(nn.Module):
         hidden = [nn.Linear(FEATURES, width), nn.GELU(), nn.Linear(width, width), nn.GELU()]
         self.net = nn.Sequential(*hidden, nn.Linear(width, 1))
 
-    def forward(self, scene: TensorDictBase) -> Tensor:
-        """Logits [B, V, R]; -inf where there is no candidate, except for candidate 0 of a vehicle without any."""
-        logits = self.net(candidate_features(scene))[..., 0]
-        valid = scene["route_valid"].clone()
-        valid[..., 0] |= ~valid.any(-1)
-        return logits.masked_fill(~valid, -torch.inf)
+    def forward(self, scene: TensorDictBase, now: Moment | None = None) -> Tensor:
+        """Logits [B, V, R] of the first V vehicles now (None: of all at the start); -inf where there is no candidate,
+        except for the first that is not recorded, straight ahead, of a vehicle without any."""
+        now = start_of(scene) if now is None else now
+        valid, recorded = (scene[f"route_{name}"][:, : now.states.shape[1]] for name in ("valid", "recorded"))
+        first = torch.zeros_like(valid).scatter(-1, recorded.int().argmin(-1, keepdim=True), True)
+        possible = valid | (first & ~valid.any(-1, keepdim=True))
+        return self.net(candidate_features(scene, now))[..., 0].masked_fill(~possible, -torch.inf)
 
 
 def sample_route(logits: Tensor, temperature: float, uniform: Tensor) -> Tensor:

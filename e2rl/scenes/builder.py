@@ -152,6 +152,7 @@ def _routes(
         "route_length": np.full(shape, reach),
         "route_open": np.zeros(shape, bool),
         "route_valid": np.zeros(shape, bool),
+        "route_recorded": np.zeros(shape, bool),
         "route_limit": np.zeros((*shape, settings.vertices), np.float32),
         "route_light": np.full((*shape, MAX_LIGHTS), -1),
         "route_light_s": np.zeros((*shape, MAX_LIGHTS)),
@@ -172,7 +173,7 @@ def _routes(
         slot = min(int(out["route_valid"][0].sum()), settings.routes - 1)
         track = scene["logged"][scene["logged_valid"][:, 0], 0] + [*origin, 0.0, 0.0]
         _write_route(out, (0, slot), route_from_log(graph, track, settings.vertices), origin, lights)
-        out["route_log"][0] = slot
+        out["route_log"][0], out["route_recorded"][0, slot] = slot, True
     return out
 
 

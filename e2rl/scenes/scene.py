@@ -12,6 +12,7 @@ P vertices; S lights; M, D map points; L lanes. Positions are relative to the sc
 | logged, logged_valid | [T+1, N, 4], [T+1, N] | smoothed recording; row 0 is the start frame |
 | route_points, route_length, route_valid | [V, R, P, 2], [V, R], [V, R] | candidates and their usable length |
 | route_open | [V, R] bool | the map ends where the route does |
+| route_recorded | [V, R] bool | the ego's recorded path, a candidate where no lane fits it: nobody else knows it |
 | route_limit | [V, R, P] | speed limit m/s, 0 unknown |
 | route_light, route_light_s | [V, R, 2] | next lights (-1 none) and the arc length of their stop lines |
 | route_log | [V] int64 | candidate nearest to the recorded future, -1 none; route_log[0] is the ego's mission |
@@ -38,7 +39,7 @@ from e2rl.run.errors import InputError
 KEYS_BY_DIMS = {  # number of dims of one scene: keys
     1: "start_accel start_yaw_rate valid parked agent_type route_log field_origin "
     "lane_index lane_width lane_left lane_right drivable_index",
-    2: "start size logged_valid route_length route_open route_valid field "
+    2: "start size logged_valid route_length route_open route_valid route_recorded field "
     "light_state light_points lane_points lane_exits drivable_points",
     3: "past logged route_limit route_light route_light_s",
     4: "route_points",

@@ -35,7 +35,7 @@ from e2rl.scenes.scene_cache import Index, cache_folder, cached, uncached
 from e2rl.scenes.scene_list import listed_scenes
 
 OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are left out
-VERSION = 4  # of the scene builder: raise it when the same recording would make another scene
+VERSION = 5  # of the scene builder: raise it when the same recording would make another scene
 AHEAD = 4  # logs for each worker that are built before their scenes are asked for
 FEW = 16  # scenes that are built here before processes would have started
 NO_MATTER = "path", "cache", "cache_gb", "workers"  # settings that do not change the scenes

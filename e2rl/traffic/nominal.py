@@ -7,14 +7,15 @@ what it announces as its plan (docs/adversaries.md). With `knowledge` "plan" it 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from typing import TypeVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate
+from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate, select
 from e2rl.prior.prior import Context, Prior
-from e2rl.prior.routes import RoutedScene
+from e2rl.prior.routes import Moment, RoutedScene, reroute
 from e2rl.prior.stratified_sampling import main_direction, stratified_noise, stratified_uniform
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
@@ -41,6 +42,9 @@ class PriorState:
     replans: Tensor = no_vehicles()
     routed: RoutedScene
     lane: LaneState
+
+
+Own = TypeVar("Own", bound=PriorState)
 
 
 @dataclass
@@ -73,6 +77,7 @@ class NominalTraffic(Traffic):
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> State:
         """Returns the states of scenes [B] with routes drawn from the prior."""
         uniform = noise_of(seed, torch.zeros_like(seed), tuple(scenes["route_valid"].shape[1:2]), uniform=True)
+        scenes = self.as_seen(World.at_start(scenes)).scene
         routed, lane = self.prior.start(scenes, self.prior.choose_routes(scenes, uniform))
         return PriorState(seed, torch.zeros_like(seed), routed, lane)
 
@@ -80,7 +85,7 @@ class NominalTraffic(Traffic):
         self, state: State, world: World, ego_plan: Tensor, react: React | None = None
     ) -> tuple[State, TrafficPlan]:
         """Returns states and plans of the coming HORIZON steps; scenes of similar size are planned together."""
-        ego_plan, noise = ego_plan.detach(), self.noise(state)
+        world, ego_plan, noise = self.as_seen(world), ego_plan.detach(), self.noise(state)
         batch, width = state.routed.route.shape
         whole = clone(state)
         states = world.states.new_zeros(batch, width, HORIZON, 4)
@@ -88,6 +93,7 @@ class NominalTraffic(Traffic):
         for group in group_scenes(world):
             rows, vehicles = group.rows, group.vehicles
             part, there = crop_state(state, group, width), crop_world(world, group)
+            part = self._expecting(part, there)
             known = ego_plan[rows] if self.knowledge == "plan" else self.predicted_ego(part, there)
             part = replace(part, lane=self.lane_now(part, there, known))
             answer = None if react is None else partial(react, rows)
@@ -99,6 +105,25 @@ class NominalTraffic(Traffic):
             valid = world.valid[rows, :vehicles, None]  # a vehicle that has left does not return
             present[rows, :vehicles] = plan.on_map & valid
         return whole, TrafficPlan(states, present, route=whole.routed.route)
+
+    @torch.no_grad()
+    def as_seen(self, world: World) -> World:
+        """Returns the World as other drivers see it: the ego's mission is the route that it is expected to follow, the
+        likeliest by how it drives now; told its plan, they know its mission, too."""
+        if self.knowledge == "plan":
+            return world
+        scene = world.scene.copy()
+        scene["route_valid"] = scene["route_valid"] & ~scene["route_recorded"]
+        ego = Moment(world.states[:, :1], world.turn_rate[:, :1], world.step)
+        route = self.prior.route_choice(scene, ego).argmax(-1)
+        scene["route_log"] = torch.cat([route, scene["route_log"][:, 1:]], 1)
+        return replace(world, scene=scene)
+
+    def _expecting(self, state: State, world: World) -> State:
+        """Returns the state with the ego on the route that it is expected to follow."""
+        expected = torch.cat([world.scene["route_log"][:, :1], state.routed.route[:, 1:]], 1)
+        moved = expected != state.routed.route
+        return onto(state, world, expected, moved) if bool(moved.any()) else state
 
     def replan_group(self, now: Replan) -> tuple[State, Tensor, Context]:
         """Returns state, joint sample x0 [G, V, SIZE] and context of a group."""
@@ -165,3 +190,14 @@ class NominalTraffic(Traffic):
             context = prior.encode(routed, lane, scene["start"], scene["valid"], step, None)
             plans.append(prior.decode(prior.sample(context, one).x0, context).states())
         return torch.stack(plans, 1)
+
+
+def onto(
+    state: Own, world: World, route: Tensor, moved: Tensor, off_lane: Tensor | None = None, paths: Tensor | None = None
+) -> Own:
+    """Returns states [B] with vehicles moved [B, V] on candidates route [B, V], or, off_lane [B, V], on paths
+    [B, V, P, 2], and with their poses there."""
+    lines = torch.zeros_like(moved) if off_lane is None else off_lane, state.routed.points if paths is None else paths
+    routed, old = reroute(state.routed, world.scene, route, moved, *lines), state.lane
+    lane = locate(world.states[:, : route.shape[1]], old.a, old.kappa * old.v, routed.points)
+    return replace(state, routed=routed, lane=select(moved, lane, old))

@@ -108,6 +108,7 @@ def test_a_mission_without_lane_is_the_recorded_way_and_ends_with_what_is_known(
     scene = build({"ego": lane_change(y_end)}, fork() | {"second": lane([[0, 7], [207, 7]])})
     slot = int(scene["route_log"][0])
     assert slot == scene["route_valid"][0].sum() - 1 > 0  # the lane routes stay
+    assert scene["route_recorded"].nonzero().tolist() == [[0, slot]]
     track, points = scene["logged"][:, 0, :2], scene["route_points"][0, slot]
     s, offset, _ = project(track, points)
     assert offset.abs().max() < 0.15 and s[0].item() == pytest.approx(20, abs=0.1)

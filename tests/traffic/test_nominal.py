@@ -5,14 +5,20 @@ from dataclasses import replace
 import pytest
 import torch
 
+from e2rl.api import build_traffic, load_prior
+from e2rl.evaluation.methods import method_config
 from e2rl.planners.ego import Ego, track
 from e2rl.prior.lane_relative import HORIZON, SIZE
 from e2rl.prior.sde import SamplerSettings
+from e2rl.run.config import load_config
 from e2rl.scenes.recording import DT
+from e2rl.scenes.route import interpolate
 from e2rl.sim.world import World
 from e2rl.traffic.grouping import noise_of
 from e2rl.traffic.nominal import KNOWLEDGE, NominalTraffic
+from e2rl.traffic.traffic import keep_velocity
 from tests.prior.small import curved_scenes, small_prior
+from tests.traffic.e2.crossing import add_route, make_world
 from tests.traffic.e2.traffic_scenes import EGO, ROWS, begin, drive, executed, scenes, synthesizer
 
 
@@ -107,3 +113,56 @@ def test_the_prediction_begins_at_the_ego():
     first = world.states[:, 0, 3] * DT
     way = (found[:, 0, :2] - world.states[:, 0, :2]).norm(dim=-1)
     torch.testing.assert_close(way, first, rtol=0.1, atol=0.05)
+
+
+def fork(copies=3):
+    """Scenes of an ego that may go on or turn, with others beside, behind and across its ways."""
+    others = [(40.0, -40.0, 1.5708, 10.0), (30.0, 3.5, 0.0, 8.0), (-20.0, 0.0, 0.0, 10.0)]
+    world = make_world([(0.0, 0.0, 0.0, 10.0), *others], copies)
+    add_route(world, 0, 1, 0.6)
+    return world.scene
+
+
+METHODS = ["nominal", "e2", "e2_pursuit", "ccdiff", "ctg_adv", "strive", "safe_sim_opt", "diffscene", "cat"]
+
+
+def plans_beside(method, scene, times=2):
+    """Plans of all but the ego, which keeps its velocity."""
+    state, world = begin(method, scene, 2.0 * method.adversarial), World.at_start(scene)
+    found = []
+    for _ in range(times):
+        known = keep_velocity(world.states[:, 0])
+        state, plan = method.replan(state, world, known)
+        found.append(plan.states[:, 1:])
+        world = executed(world, plan, known)
+    return torch.stack(found)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_who_is_not_told_the_plan_does_not_know_the_mission(name):
+    """Of two egos that drive alike and mean to go elsewhere traffic makes the same, where one's way is a candidate, and
+    where it is the recorded path, which nobody knows."""
+    scene = fork()
+    turns, recorded = scene.clone(), scene.clone()
+    turns["route_log"][:, 0] = 1
+    recorded["route_log"][:, 0] = 2
+    recorded["route_points"][:, 0, 2] += torch.linspace(0, 30, scene["route_points"].shape[3])[:, None]
+    recorded["route_valid"][:, 0, 2] = recorded["route_recorded"][:, 0, 2] = True
+    group = method_config(load_config("evaluate", []), name)
+    group.knowledge = "predicted"
+    method = build_traffic(group, small_prior(0, sampler=SamplerSettings(steps=2)))
+    assert torch.equal(plans_beside(method, scene), plans_beside(method, turns))
+    assert torch.equal(plans_beside(method, scene), plans_beside(method, recorded))
+
+
+def test_the_ego_is_expected_where_it_turns():
+    """Two ways part behind it: it is expected on that on which it drives, whatever its mission is."""
+    method, scene = NominalTraffic(load_prior(), "predicted"), fork()
+    assert scene["route_valid"][:, 0, :2].all()
+    for way in (0, 1):
+        along = interpolate(scene["route_points"][:, 0, way], torch.full((3, 1), 45.0))
+        world = World.at_start(scene)
+        states = world.states.clone()
+        states[:, 0, :2], states[:, 0, 2] = along[0][:, 0], along[1][:, 0]
+        expected = method.as_seen(replace(world, states=states)).scene["route_log"][:, 0]
+        assert (expected == way).all()

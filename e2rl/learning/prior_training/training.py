@@ -33,7 +33,7 @@ from e2rl.learning.supervised import MAX_GRAD_NORM, Supervised
 from e2rl.prior.checkpoint import save_prior
 from e2rl.prior.denoiser import Denoiser
 from e2rl.prior.prior import Prior
-from e2rl.prior.routes import candidate_features
+from e2rl.prior.routes import candidate_features, start_of
 from e2rl.run.errors import InputError
 from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.settings import configured, setting
@@ -230,7 +230,7 @@ def has_bf16(device: torch.device) -> bool:
 def train_route_choice(prior: Prior, scenes: TensorDictBase, settings: TrainingSettings) -> float:
     """Train by cross-entropy on the driven candidate, over vehicles with several; returns the training accuracy."""
     device = next(prior.route_choice.parameters()).device
-    features = torch.cat([candidate_features(part) for part in scenes.split(64)])
+    features = torch.cat([candidate_features(part, start_of(part)) for part in scenes.split(64)])
     valid, label = scenes["route_valid"], scenes["route_log"]
     use = scenes["valid"][:, : label.shape[1]] & ~scenes["parked"][:, : label.shape[1]] & (label >= 0)
     use &= valid.sum(-1) > 1

@@ -2,7 +2,6 @@
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -16,11 +15,10 @@ from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
 from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, YieldingSettings, duty_of
 from e2rl.traffic.grouping import no_vehicles, noise_of
-from e2rl.traffic.nominal import NominalTraffic, PriorState, React, Replan
+from e2rl.traffic.nominal import NominalTraffic, Own, PriorState, React, Replan
 from e2rl.traffic.rule_based import LogReplay
 from e2rl.traffic.traffic import REPLAN_STEPS, State, TrafficPlan
 
-Own = TypeVar("Own", bound=PriorState)
 RECORDED = LogReplay()
 FURTHER = 1000  # number of the draw that holds the noise of all samples but the first
 

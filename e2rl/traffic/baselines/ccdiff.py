@@ -116,7 +116,8 @@ class CCDiff(MeanGuided):
         state = super().reset(scenes, seed, eta)
         draw = noise_of(state.seed, torch.full_like(state.seed, TIES), tuple(state.adversary.shape[1:]), uniform=True)
         top = ranked(scenes, self.controlled, draw) | (self.strength(state) <= 0)[:, None]
-        logged = scenes["route_log"]
+        logged = scenes["route_log"].clone()
+        logged[:, 0] = -1  # nobody's but the ego's own business
         routed, lane = self.prior.start(scenes, torch.where(top | (logged < 0), state.routed.route, logged))
         return CCDiffState(**(vars(state) | {"routed": routed, "lane": lane, "top": top}))
 

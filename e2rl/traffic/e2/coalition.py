@@ -11,8 +11,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.prior.lane_relative import KNOTS, locate, select
-from e2rl.prior.routes import reroute, take_route
+from e2rl.prior.lane_relative import KNOTS
+from e2rl.prior.routes import take_route
 from e2rl.run.settings import setting, settings_of
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
@@ -35,7 +35,7 @@ from e2rl.traffic.e2.skeleton import (
 )
 from e2rl.traffic.e2.topology import TopologySettings, topological_candidates
 from e2rl.traffic.grouping import no_vehicles, noise_of, put_rows, take_rows
-from e2rl.traffic.nominal import NominalTraffic, PriorState
+from e2rl.traffic.nominal import NominalTraffic, PriorState, onto
 from e2rl.traffic.traffic import FULL
 
 SUPPORT, SCATTER = 750, 850  # numbers of the draws of a random support, and of the noise on costs
@@ -248,7 +248,4 @@ class Coalitions(NominalTraffic):
         changed = (route != state.routed.route) | off_lane | state.off_lane
         if not bool(changed.any()):
             return state
-        routed = reroute(state.routed, world.scene, route, changed, off_lane, paths)
-        old = state.lane
-        moved = locate(world.states[:, : route.shape[1]], old.a, old.kappa * old.v, routed.points)
-        return replace(state, routed=routed, lane=select(changed, moved, old), off_lane=off_lane)
+        return replace(onto(state, world, route, changed, off_lane, paths), off_lane=off_lane)
