@@ -27,7 +27,6 @@ def evaluate(run: Run) -> None:
     how: Any = (asked.seeds, plan.rollouts(folder), processes_of(config), plan.only, run.parts(), asked.shard)
     if asked.budget:
         scored, tries = search_all(egos.setups(plan.setup), plan.searches, max(asked.budget), asked.budget_unit, *how)
-        save_budget(folder, plan, tries, *scored[:2])
         egos = replace(egos, pairs=())  # tries of different egos are no pairs
     else:
         scored = drive_all(egos.setups(plan.setup), plan.methods, *how)  # every ego, method, eta, scene and seed
@@ -35,6 +34,8 @@ def evaluate(run: Run) -> None:
         print(f"\nshard {asked.shard[0]} of {asked.shard[1]} written to {folder}; e2rl merge joins all of them")
         return
     rows = record(*scored, folder, partial(egos.metric_rows, references=references(plan), **run.origin()))
+    if asked.budget:
+        save_budget(folder, plan, tries, *scored[:2])
     print("", *write_results(run, plan, rows), sep="\n")
     if config.reproduce:
         print(f"{config.reproduce}: {compared_with_run(config, folder).text()}")

@@ -133,9 +133,19 @@ def search_all(
     Args:
         only: positions of the scenes (None: all).
         into, processes, parts, shard: as of `protocol.drive_all`; a search has one shard.
+
+    Raises:
+        InputError: the tries of a method evaluate no network, and the budget is in evaluations.
     """
     found: Scored = ([], [], [])
     told: list[dict] = []
+    for plan in plans:
+        free = {one.name for one in plan.traffic.values() if not isinstance(getattr(one.traffic, "prior", None), Prior)}
+        if unit == "nfe" and free:
+            raise InputError(
+                f"{plan.name}: tries of {', '.join(sorted(free))} evaluate no network; give the budget in tries, "
+                "budget_unit=tries"
+            )
     for number, (setup, plan, seed) in enumerate((a, b, c) for a in setups for b in plans for c in seeds):
         scenes = range(len(setup.scenes)) if only is None else only
         own = replace(parts, stage=f"{parts.stage}search-{number:03}") if parts.folder else parts
@@ -158,31 +168,32 @@ def spend(
 ) -> tuple[Scored, list[dict]]:
     """What one search finds, and its tries in their order: round by round, the scenes of a round in an order of its
     own, so that a budget that ends within a round is spent on scenes at random. A try that errors counts as one that
-    comes nowhere near, and costs what its family is said to cost."""
+    comes nowhere near, and costs what the last one of its family did, or is said to."""
     search, told = plan.begin(setup, seed, scenes), list[dict]()
     found: Scored = ([], [], [])
-    errs = {family.name: Outcome(-FARTHEST, "", family.nfe) for family in plan.families}
+    cost = {family.name: (family.nfe, 0.0) for family in plan.families}  # of a try: NFE, seconds
     generator = torch.Generator().manual_seed(seed)
     spent = dict.fromkeys(SPENT, 0.0)
     with tqdm(total=budget, desc=f"{plan.name}: {unit} a scene", disable=None) as bar:
         while spent[unit] < budget * (1 - 1e-9):
             order = torch.randperm(len(scenes), generator=generator).tolist()
             tries = sorted(search.ask(), key=lambda one: order[one.scene])
-            jobs, before = batches(setup, plan, seed, scenes, tries, sum(map(len, search.tries))), spent[unit]
+            jobs = batches(setup, plan, seed, scenes, tries, sum(map(len, search.tries)))
             scored = score_all(jobs, "tries", into, processes, parts, lambda job: len(job[1][2]))
             extend(found, scored)
             known = {(row["scene_id"], row["seed"]): row for row in scored[0]}
             rows = [known.get((setup.scenes.scene_id[scenes[one.scene]], row_seed(seed, one))) for one in tries]
-            outcomes = [outcome_of(row) if row else errs[one.family] for one, row in zip(tries, rows, strict=True)]
-            search.tell(tries, outcomes)
-            for one, row, outcome in zip(tries, rows, outcomes, strict=True):
-                costs = 1.0, outcome.nfe, row["seconds"] if row else 0.0
-                spent = {name: spent[name] + cost / len(scenes) for name, cost in zip(SPENT, costs, strict=True)}
+            outcomes = []
+            for one, row in zip(tries, rows, strict=True):
+                if row:
+                    cost[one.family] = row["nfe"], row["seconds"]
+                each = 1.0, *cost[one.family]
+                spent = {name: spent[name] + value / len(scenes) for name, value in zip(SPENT, each, strict=True)}
+                outcomes.append(outcome_of(row) if row else Outcome(-FARTHEST, "", each[1]))
                 told += [told_of(one, row) | spent] if row else []
-            if not any(rows) and unit == "seconds":
+            search.tell(tries, outcomes)
+            if unit == "seconds" and not told:
                 break  # all errored, and nothing tells how long they would take
-            if spent[unit] == before:
-                raise InputError(f"{plan.name}: its tries cost no {unit}; give the budget in tries, budget_unit=tries")
             bar.update(min(spent[unit], budget) - bar.n)
     return found, told
 

@@ -26,7 +26,7 @@ from e2rl.metrics.statistics import (
     jackknife,
     ratios,
 )
-from e2rl.report.drawing import new_figure, save_figure
+from e2rl.report.drawing import new_figure, save_figure, without_formulas
 from e2rl.report.tables import Table, save_tables
 from e2rl.run.files import csv_text, write_atomically
 from e2rl.search.tries import TRIES
@@ -73,7 +73,9 @@ class Found:
         draws, number = bootstrap_draws(count), {scene: k for k, (_, scene) in enumerate(scenes)}
         seeds = sorted({row["seed"] // TRIES for row in told})
         self.spent = dict.fromkeys(SPENT, 0.0)
-        self.places, hit = count, torch.zeros(count, dtype=torch.bool)
+        self.tried = len({(row["scene_id"], row["seed"] // TRIES) for row in within}) / max(len(seeds), 1)  # scenes
+        self.places = dict.fromkeys((*FOUND, "real_adv"), count)
+        occurs = {name: torch.zeros(count, dtype=torch.bool) for name in (*FOUND, "without")}  # at a place
         self.draws: dict[str, Tensor] = {name: torch.zeros(len(draws), dtype=torch.float64) for name in FOUND}
         self.draws["cells"] = torch.zeros(1 + count, dtype=torch.float64)
         weight = draws @ torch.bincount(place, minlength=count).double()
@@ -86,7 +88,9 @@ class Found:
             per_scene = torch.bincount(at, minlength=len(scenes)).double()
             clean = torch.bincount(at, torch.tensor([float(row["clean"]) for row in own]), len(scenes)).double()
             values = {"scenes": 100 * (per_scene > 0).double(), "failures": per_scene, "clean": clean}
+            occurs["without"][place[per_scene == 0]] = True
             for name, value in values.items():
+                occurs[name][place[value > 0]] = True
                 of_place = torch.zeros(count, dtype=torch.float64).index_add(0, place, value)
                 self.draws[name] += (draws @ of_place) / weight / len(seeds)
             cells = sorted({row["cell"] for row in own})
@@ -94,32 +98,40 @@ class Found:
             there[place[at], torch.tensor([cells.index(row["cell"]) for row in own], dtype=torch.int64)] = 1
             alone = (there * (there.sum(0) == 1)).sum(1)  # cells that no other place has
             self.draws["cells"] += (len(cells) - torch.cat([alone.new_zeros(1), alone])) / len(seeds)
-            hit[place[at]] = True
-        self.failed = int(hit.sum())  # places with a failure
+        self.occurs = {name: int(there.sum()) for name, there in occurs.items()}
         known = [row for row in within if (row["scene_id"], row["seed"]) in samples]
         of = torch.tensor([int(place[number[row["scene_id"]]]) for row in known], dtype=torch.int64)
-        drawn = bootstrap_draws(count, REALISM_DRAWS)
+        drawn, self.places["real_adv"] = bootstrap_draws(count, REALISM_DRAWS), len(of.unique())
         theirs = [samples[row["scene_id"], row["seed"]] for row in known]
         self.draws["real_adv"] = realism(theirs, of, drawn)["real_adv"]
 
     def value(self, name: str) -> dict[str, float]:
-        """Mean and interval; exact, or none, where few places have or lack a failure (`metrics.statistics`)."""
+        """Mean and interval; exact, or none, where few places have or lack a failure (`metrics.statistics`); NaN where
+        nothing was tried."""
+        if not self.tried:
+            return dict.fromkeys(("mean", "low", "high"), math.nan)
         if name == "cells":
             found = jackknife(self.draws[name])
             return found | {"low": max(found["low"], 0.0)}
-        few = min(self.failed, self.places - self.failed if name == "scenes" else self.failed) < LEAST
-        found = interval(self.draws[name], 0 if few and name != "real_adv" else self.places)
-        if few and name == "scenes" and self.places >= LEAST:
-            low, high = exact_interval(found["mean"] / 100, self.places)
+        found = interval(self.draws[name], self.places[name] if name == "real_adv" or not self.rare(name) else 0)
+        if name == "scenes" and self.rare(name) and self.places[name] >= LEAST:
+            low, high = exact_interval(found["mean"] / 100, self.places[name])
             found |= {"low": 100 * low, "high": 100 * high}
         return found
 
+    def rare(self, name: str) -> bool:
+        """Whether few places have what is counted, or, of scenes, lack it."""
+        return min(self.occurs[name], self.occurs["without"] if name == "scenes" else math.inf) < LEAST
+
     def ratio(self, other: "Found", name: str) -> dict[str, float]:
-        """Mean and interval of this over the other's."""
+        """Mean and interval of this over the other's; no interval where either is rare, NaN where one was not tried."""
+        if not self.tried or not other.tried:
+            return dict.fromkeys(("mean", "low", "high"), math.nan)
         if name == "cells":
             log = jackknife((self.draws[name] / other.draws[name]).log())
             return {key: math.exp(value) for key, value in log.items()}
-        return interval(ratios({name: self.draws[name]}, {name: other.draws[name]})[name], self.places)
+        places = self.places[name] if min(self.occurs[name], other.occurs[name]) >= LEAST else 0
+        return interval(ratios({name: self.draws[name]}, {name: other.draws[name]})[name], places)
 
 
 def budget_rows(
@@ -128,6 +140,7 @@ def budget_rows(
     budgets: Sequence[float],
     unit: str,
     samples: Mapping[tuple[str, str, str, int], Samples],
+    plans: Sequence[str],
 ) -> list[dict[str, Any]]:
     """A row for each ego, plan and budget: SPENT a scene, FOUND and `real_adv` with intervals, and the ratios of the
     first plan's COMPARED to it.
@@ -138,7 +151,7 @@ def budget_rows(
     for ego in dict.fromkeys(row["ego_policy"] for row in told):
         for budget in budgets:
             found: dict[str, Found] = {}
-            for plan in dict.fromkeys(row["method"] for row in told):
+            for plan in plans:
                 own = [row for row in told if row["ego_policy"] == ego and row["method"] == plan]
                 of_plan = {key[2:]: value for key, value in samples.items() if key[:2] == (ego, plan)}
                 found[plan] = Found(own, scenes, budget, unit, of_plan)
@@ -147,7 +160,8 @@ def budget_rows(
                 values = {name: one.value(name) for name in (*FOUND, "real_adv")}
                 values |= {f"{name}_ratio": first.ratio(one, name) for name in COMPARED if one is not first}
                 about = {"ego": ego, "method": plan, "budget": budget, "unit": unit}
-                rows.append(about | {f"{name}_a_scene": value for name, value in one.spent.items()} | values)
+                about |= {f"{name}_a_scene": value for name, value in one.spent.items()}
+                rows.append(about | {"tried": one.tried} | values)
     return rows
 
 
@@ -186,7 +200,8 @@ def budget_tables(rows: Sequence[Mapping], scenes: int, knowledge: str) -> list[
         ]
         lines = []
         for row in own:
-            spent = [f"{row['tries_a_scene']:.1f}", f"{row['nfe_a_scene']:.0f}", f"{row['seconds_a_scene']:.1f}"]
+            some = f" in {row['tried']:.0f} scenes" if row["tried"] < scenes else ""
+            spent = [f"{row['tries_a_scene']:.1f}{some}", f"{row['nfe_a_scene']:.0f}", f"{row['seconds_a_scene']:.1f}"]
             ratios = [cell(row[f"{name}_ratio"], 2) if f"{name}_ratio" in row else "–" for name in COMPARED]
             values = [cell(row[name], count) for name, count in digits.items()]
             lines.append([row["method"], f"{row['budget']:g}", *spent, *values, *ratios])
@@ -225,6 +240,7 @@ def budget_figure(told: Sequence[Mapping], scenes: int) -> Figure:
                 axis.set_xlabel(f"{unit} a scene")
                 axis.set_ylabel(f"{ego}: {ABOUT[name]}")
     axes[0][0].legend(fontsize=7, frameon=False)
+    without_formulas(figure)
     figure.tight_layout()
     return figure
 
@@ -254,7 +270,8 @@ def save_budget(
     places = [(scenes.location[k], scenes.scene_id[k]) for k in chosen]
     keys = [tuple(row[name] for name in ("ego_policy", "method", "scene_id", "seed")) for row in rows]
     by_try = dict(zip(keys, samples, strict=True))
-    found = budget_rows(told, places, plan.asked.budget, plan.asked.budget_unit, by_try)
+    names = [each.name for each in plan.searches]
+    found = budget_rows(told, places, plan.asked.budget, plan.asked.budget_unit, by_try, names)
     write_tries(folder / TRIES_FILE, told)
     write_budget(folder / "budget.csv", found)
     tables = budget_tables(found, len(places), knowledge_text(plan.searches))
@@ -268,6 +285,9 @@ def budget_lines(rows: Sequence[Mapping], scenes: int) -> list[str]:
     most = max(row["budget"] for row in rows)
     lines = []
     for row in (row for row in rows if row["budget"] == most):
+        if not row["tried"]:
+            lines.append(f"{row['method']} against {row['ego']}: a try costs more than the budget; nothing was tried.")
+            continue
         found, ways = round(row["scenes"]["mean"] * scenes / 100), round(row["cells"]["mean"])
         spent = f"{row['tries_a_scene']:.1f} tries ({row['nfe_a_scene']:.0f} NFE, {row['seconds_a_scene']:.1f} s)"
         lines += [

@@ -157,10 +157,15 @@ def add_legend(figure: Figure | SubFigure, colours: Mapping[str, Colour], size: 
     figure.legend(handles=handles, ncols=len(handles), loc="lower left", fontsize=size, **style)
 
 
-def image_of(figure: Figure) -> Image.Image:
-    """The figure drawn as it is now; no text in it is a formula, as names may hold dollar signs."""
+def without_formulas(figure: Figure) -> None:
+    """No text in the figure is a formula: names may hold dollar signs."""
     for text in figure.findobj(Text):
         text.set_parse_math(False)
+
+
+def image_of(figure: Figure) -> Image.Image:
+    """The figure drawn as it is now, without formulas."""
+    without_formulas(figure)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])

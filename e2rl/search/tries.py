@@ -91,8 +91,8 @@ def family_of(name: str, given: Mapping[str, Any], where: str) -> Family:
             value = WHOM.index(value)
         numbers = value if isinstance(value, list | tuple) else [value]
         known = len(numbers) in (1, 2) and all(isinstance(number, int | float) for number in numbers)
-        if not known or numbers[0] > numbers[-1]:
-            raise InputError(f"{where}.{name}.{key}={value}: expected a number, or [low, high]")
+        if not known or not 0 <= numbers[0] <= numbers[-1]:
+            raise InputError(f"{where}.{name}.{key}={value}: expected a number from 0 on, or [low, high]")
         ranges[key] = tuple(map(float, numbers)) if len(numbers) == 2 else float(numbers[0])  # type: ignore[assignment]
     about: dict[str, Any] = {key: given[key] for key in ("chance", "nfe") if key in given}
     for key, value in about.items():

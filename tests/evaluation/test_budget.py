@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from e2rl.evaluation.budget import Plan, build_plans, spend, write_tries
+from e2rl.evaluation.budget import Plan, build_plans, search_all, spend, write_tries
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.config import load_config
@@ -86,8 +86,8 @@ def test_a_search_goes_on_where_it_was_killed(setup, plan, tmp_path):
 def test_a_method_that_evaluates_no_network_has_no_budget_of_evaluations(setup):
     traffic = {"still": Method("still", ConstantVelocity(), 0.0)}
     still = Plan("still", [Family("still", "still", {})], traffic, SearchSettings())
-    with pytest.raises(InputError, match="budget_unit=tries"):
-        found(setup, still, unit="nfe")
+    with pytest.raises(InputError, match="still evaluate no network.*budget_unit=tries"):
+        search_all([setup], [plan_of(), still], 640.0, "nfe", [0])
 
 
 def test_a_line_for_each_try(setup, plan, tmp_path):

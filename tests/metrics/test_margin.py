@@ -3,8 +3,9 @@
 import math
 
 import pytest
+import torch
 
-from e2rl.metrics.margin import FARTHEST, PREVENTED
+from e2rl.metrics.margin import FARTHEST, PREVENTED, contact_margin
 from tests.metrics.test_contact import course, row
 
 
@@ -25,5 +26,14 @@ def test_the_margin_grows_with_nearness_to_contact_to_verdict():
     assert passes == sorted(passes)
     stops = row(course(0, 0, 0, 10), course(60, 0, 0, 0.0))  # a wreck far ahead: the ego drives into it
     assert stops["cfr_preventable"] == 1 and stops["margin"] == PREVENTED
-    appears = row(course(0, 0, 0, 10), course(12, -12, math.pi / 2, 10))  # crosses so soon that nobody could brake
-    assert 0 <= appears["margin"] < PREVENTED or appears["cfr"] == 0
+
+
+def test_a_contact_has_the_share_of_its_speed_that_the_driver_has_lost_before_it():
+    """An ego at 10 m/s whose driver is down to 6 by then; one that creeps; one without a driver; a preventable one."""
+    states, driver = torch.zeros(4, 5, 2, 4), torch.zeros(4, 5, 4)
+    states[:, :, 0, 3], driver[:, 3, 3] = 10.0, 6.0
+    states[1, :, 0, 3], driver[2] = 0.2, torch.nan
+    step = torch.full((4,), 3)
+    batch = {"states": states, "driver": driver, "before": step, "stop": step + 1}
+    found = contact_margin(batch | {"preventable": torch.tensor([0, 0, 0, 1])})
+    torch.testing.assert_close(found, torch.tensor([0.4, 0.0, 0.0, PREVENTED]))

@@ -51,10 +51,11 @@ def test_it_keeps_the_speed_limit(limit):
     assert float(last[3]) > 0.9 * min(limit, 14.0)
 
 
-def test_it_brakes_as_hard_as_it_can_before_a_collision_that_is_near():
-    _, world = world_of(vehicles=[(0, 0, 14.0), (14, 0, 0.0)], num_vrus=0)
-    plan = EGO.plan(world)[0]
-    assert plan[:10, 3].diff().div(DT).max() < -7.9
+@pytest.mark.parametrize(("speed", "braking"), [(4.9, EGO.emergency_braking), (5.1, EGO.braking), (14.0, EGO.braking)])
+def test_a_slow_ego_brakes_as_hard_as_it_can_before_a_collision_that_is_near_a_fast_one_as_idm_may(speed, braking):
+    _, world = world_of(vehicles=[(0, 0, speed), (speed, 0, 0.0)], num_vrus=0)
+    lost = EGO.plan(world)[0, :5, 3].diff() / DT
+    torch.testing.assert_close(lost, torch.full_like(lost, -braking), atol=0.05, rtol=0)
 
 
 @pytest.mark.parametrize("beside", [1.0, -1.0])

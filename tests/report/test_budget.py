@@ -1,12 +1,14 @@
 """The budget's table: what was found within each budget, in the mean of the seeds, with intervals by place."""
 
 import csv
+import math
 
 import pytest
 import torch
 
 from e2rl.evaluation.budget import build_plans
 from e2rl.metrics.realism import KINEMATICS, OF_ADVERSARIES
+from e2rl.metrics.statistics import exact_interval
 from e2rl.report.budget import (
     budget_figure,
     budget_lines,
@@ -35,8 +37,14 @@ def searched(method, found, rounds=4, seeds=(0, 1)):
     return [line(scene, seed, number, found(scene, seed, number), method) for scene, seed, number in triples]
 
 
+def rows_of(told, *budgets, unit="nfe", known=None, plans=None):
+    return budget_rows(
+        told, SCENES, budgets, unit, known or {}, plans or list(dict.fromkeys(r["method"] for r in told))
+    )
+
+
 def one_row(told, budget, unit="nfe", method=0):
-    return budget_rows(told, SCENES, [budget], unit, {})[method]
+    return rows_of(told, budget, unit=unit)[method]
 
 
 def test_what_is_found_grows_with_the_budget_and_is_the_mean_of_the_seeds():
@@ -63,7 +71,7 @@ def test_the_interval_of_scenes_is_that_of_places():
 def test_ratios_compare_the_first_method_with_the_others_in_the_same_draws():
     both = [*searched("search", lambda scene, *_: "ab"[scene % 2] if scene % 2 or scene % 4 else "")]
     both += searched("e2", lambda scene, *_: "a" if scene % 4 == 2 else "")
-    first, second = budget_rows(both, SCENES, [400], "nfe", {})
+    first, second = rows_of(both, 400)
     assert "scenes_ratio" not in first
     assert second["scenes_ratio"]["mean"] == pytest.approx(3) and second["cells_ratio"]["mean"] == pytest.approx(2)
     assert second["scenes_ratio"]["low"] > 1
@@ -78,13 +86,13 @@ def test_realism_is_of_the_adversaries_of_the_tries_within_the_budget():
         return dict.fromkeys((*KINEMATICS, *OF_ADVERSARIES), pair)
 
     known = {("idm", "search", row["scene_id"], row["seed"]): sample(5.0 * (row["seed"] % TRIES)) for row in told}
-    of = [budget_rows(told, SCENES, [budget], "tries", known)[0]["real_adv"]["mean"] for budget in (1, 2)]
+    of = [rows_of(told, budget, unit="tries", known=known)[0]["real_adv"]["mean"] for budget in (1, 2)]
     assert of[0] == pytest.approx(1) and of[1] < 0.5
 
 
 def test_tables_files_and_the_picture(tmp_path):
     told = searched("search", lambda scene, *_: f"{scene % 7}") + searched("e2", lambda scene, *_: "0")
-    rows = budget_rows(told, SCENES, [200, 400], "nfe", {})
+    rows = rows_of(told, 200, 400)
     (table,) = budget_tables(rows, 40, "Told the ego's plan: nobody.")
     assert [cells[:2] for cells in table.rows] == [["search", "200"], ["e2", "200"], ["search", "400"], ["e2", "400"]]
     assert "ratio" in table.markdown() and "idm" in table.title
@@ -109,7 +117,7 @@ def test_the_caption_tells_who_is_told_the_plan():
 
 def test_the_answer_tells_the_largest_budget_in_a_sentence_for_each_method():
     told = searched("search", lambda scene, *_: f"{scene % 7}") + searched("e2", lambda scene, *_: "0" if scene else "")
-    lines = budget_lines(budget_rows(told, SCENES, [100, 400], "nfe", {}), 40)
+    lines = budget_lines(rows_of(told, 100, 400), 40)
     assert len(lines) == 4 and "40 of 40 scenes" in lines[0] and "in 7 different ways" in lines[1]
     assert "e2 against idm: preventable failures in 39 of 40 scenes" in lines[2] and "in 1 different" in lines[3]
     assert "4.0 tries (400 NFE" in lines[1] and all(len(line) <= 100 for line in lines)
@@ -133,12 +141,61 @@ def test_few_places_with_failures_have_an_exact_interval_and_a_ratio_without_bou
     both = searched("search", lambda scene, *_: "a" if scene < 20 else "") + searched(
         "e2", lambda scene, *_: "a" if not scene else ""
     )
-    first, second = budget_rows(both, SCENES, [400], "nfe", {})
+    first, second = rows_of(both, 400)
     assert second["scenes"]["mean"] == 2.5 and second["scenes"]["low"] < 1 and 10 < second["scenes"]["high"] < 25
     assert second["failures"]["low"] != second["failures"]["low"]
     assert (
         second["scenes_ratio"]["mean"] == pytest.approx(20)
         and second["scenes_ratio"]["low"] != second["scenes_ratio"]["low"]
     )
-    nothing = budget_rows(searched("search", lambda *_: ""), SCENES, [400], "nfe", {})[0]["scenes"]
+    nothing = rows_of(searched("search", lambda *_: ""), 400)[0]["scenes"]
     assert nothing["low"] == 0 and nothing["high"] == pytest.approx(100 * (1 - 0.025 ** (1 / 20)), abs=0.1)
+
+
+def test_rare_is_what_few_places_have_of_each_kind():
+    """Twelve places have a failure, one of them a clean one, and two have tries whose realism is known."""
+    told = searched("search", lambda scene, *_: "a" if scene < 24 else "")
+    for row in told:
+        row["clean"] = float(row["scene_id"] == "scene 0")
+    sample = dict.fromkeys((*KINEMATICS, *OF_ADVERSARIES), torch.zeros(2, 8).double())
+    known = {
+        ("idm", "search", row["scene_id"], row["seed"]): sample
+        for row in told
+        if row["scene_id"] in ("scene 0", "scene 2")
+    }
+    (row,) = rows_of(told, 400, known=known)
+    assert row["failures"]["low"] > 0 and row["scenes"]["low"] == pytest.approx(100 * exact_interval(0.6, 20)[0])
+    assert row["clean"]["mean"] > 0 and math.isnan(row["clean"]["low"]) and math.isnan(row["real_adv"]["low"])
+    assert row["real_adv"]["mean"] == pytest.approx(1)
+
+
+def test_a_place_lacks_a_failure_where_any_of_its_scenes_does_in_any_search():
+    """Every place has a failure, and half of them lack one by one of the seeds: the bootstrap tells what that is."""
+    told = searched("search", lambda scene, seed, _: "" if seed and scene % 4 == 0 else "a")
+    row = one_row(told, 400)
+    assert row["scenes"]["mean"] == pytest.approx(100 * 7 / 8)
+    half = 196 * (1 / 16 * 1 / 4 / 20 * 4) ** 0.5
+    assert row["scenes"]["low"] == pytest.approx(87.5 - half / 2, abs=2)
+
+
+def test_what_was_not_tried_is_no_zero():
+    told = searched("search", lambda *_: "a")
+    for number, row in enumerate(told):  # a try costs 100 NFE a scene it was spent on: the first ten are within 25
+        row["nfe"] = 100.0 * (1 + number % 160) / 40
+    none, some = rows_of(told, 1, 25, plans=["search"])
+    assert math.isnan(none["scenes"]["mean"]) and some["scenes"]["mean"] == 25 and some["tried"] == 10
+    (table,) = budget_tables([none, some], 40, "")
+    assert table.rows[0][5:] == ["–"] * 8 and "in 10 scenes" in table.rows[1][2]
+    assert "nothing was tried" in budget_lines([none], 40)[0]
+
+
+def test_a_method_all_of_whose_tries_errored_keeps_its_place():
+    """Ratios stay those of the first method."""
+    told = searched("e2", lambda *_: "a")
+    lost, found = rows_of(told, 400, plans=["search", "e2"])
+    assert math.isnan(lost["scenes"]["mean"]) and lost["method"] == "search"
+    assert math.isnan(found["scenes_ratio"]["mean"]) and "scenes_ratio" not in lost
+
+
+def test_names_with_dollar_signs_are_drawn():
+    assert budget_figure(searched("$\\foo$", lambda *_: "a"), 40).axes[0].get_lines()[0].get_label() == "$\\foo$"

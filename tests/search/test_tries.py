@@ -53,6 +53,7 @@ def test_a_family_is_read_from_its_configuration():
     "given",
     [
         {"speed": 3}, {"whom": "trucks"}, {"patience": "late"}, {"patience": [1, 2, 3]}, {"patience": [2, 1]}, 3,
+        {"strength": -3},
         {"chance": 2}, {"chance": "x"}, {"nfe": 0}, {"changes": "abc"},
     ],
 )  # fmt: skip

@@ -20,9 +20,9 @@ class Decisions(NamedTuple):
     """Decisions of one rollout, or of B rollouts, each [B]; as one tensor [B, D] in this order.
 
     strength: factor of eta, 0: nobody is controlled; whom: index into WHOM; patience: factor of how late adversaries
-    give way; owes: 1, or 0: they do not give way; wrong_way: s that an interception weighs more if it ends against the
-    lanes; moment: s until the ego is met, BY_RULE: the cheapest; scatter: s of noise on what it costs each vehicle to
-    meet the ego.
+    give way; owes: 1, or below 0.5: they do not give way; wrong_way: s that an interception weighs more if it ends
+    against the lanes; moment: s until the ego is met, BY_RULE: the cheapest; scatter: s of noise on what it costs each
+    vehicle to meet the ego.
     """
 
     strength: Any = 1.0

@@ -20,6 +20,7 @@ from e2rl.sim.world import World
 from e2rl.traffic.e2.anchoring import Anchor
 from e2rl.traffic.e2.coalition import Coalitions, E2State
 from e2rl.traffic.e2.control import Pull, SparseControl
+from e2rl.traffic.e2.decisions import ANY, eligible
 from e2rl.traffic.e2.foresight import time_before
 from e2rl.traffic.e2.kernels import (
     DRAWN,
@@ -90,7 +91,7 @@ class E2(Coalitions):
             state, x0, kl, jump = self._best(state, attack, kernels, anchor, context, now.noise)
         members = state.coalition | state.drawn
         decided, given = state.now, (self.responsibility, self.yielding, world, members)
-        context.obstacles.duty = duty_of(*given, state.eta, decided.patience, decided.owes > 0)
+        context.obstacles.duty = duty_of(*given, state.eta, decided.patience, decided.owes >= 0.5)
         return replace(state, path_kl=state.path_kl + kl, anchor_jump=state.anchor_jump + jump), x0, context
 
     def _afforded(self, state: E2State, world: World, anchor: Anchor) -> tuple[E2State, Anchor]:
@@ -114,6 +115,7 @@ class E2(Coalitions):
         plan = self.prior.decode(mean, context).states()
         more = state.coalition.sum(1) < state.near  # of the scene's template
         free = context.active & ~acts & (state.coalition | more[:, None]) & (state.eta > 0)[:, None]
+        free &= eligible(world, state.now.whom, False) | (state.now.whom == ANY)[:, None]
         attack = Attack.of(world, free, ego_plan, plan, state.since, state.settled)
         gain, count = self.kernels.gain * state.eta, self.kernels.samples - 1
         return attack, propose_kernels(attack, state.lane, state.routed.points, mean, gain, count)

@@ -43,3 +43,13 @@ def test_whom_names_one_kind_of_vehicle(vehicle, kind):
     assert named["any"] == (kind != "leader"), "planners know how to follow"
     assert eligible(world, torch.tensor([0]), False)[0, 1]
     assert {ONCOMING, BESIDE, LEADER} <= set(range(len(WHOM)))
+
+
+@pytest.mark.parametrize("kind", ["oncoming", "crossing", "beside"])
+def test_nobody_else_acts_by_proposal_or_by_kernel(kind):
+    others = [(40.0, 3.5, 3.1, 9.0), (-15.0, 3.5, 0.0, 9.0), (25.0, -20.0, 1.57, 9.0), (60.0, -3.5, 3.1, 9.0)]
+    world, on = make_world([EGO_STATE, *others], 4), synthesizer()
+    given = torch.tensor([RULE._replace(whom=WHOM.index(kind))] * 4)
+    state = on.reset(world.scene, torch.arange(4), torch.full((4,), 2.0), decisions=given)
+    plan = on.replan(state, world, EGO.plan(world))[1]
+    assert plan.adversary.any() and not (plan.adversary & ~eligible(world, given[:, 1], False)).any()
