@@ -1,6 +1,6 @@
 """How near a rollout comes to a preventable failure: the verdict made continuous, for a search to climb.
 
-Without a contact it is minus the least over time of the distance of the ego to anybody who moves relative to it, in
+Without a contact it is minus the least over time of the distance of the ego to a vehicle that moves relative to it, in
 time and space: (t^2 + d^2)^(1/2) of their closest approach at constant velocities, t s ahead and d m between the sides.
 A contact has 0 to 1, by how much of the ego's speed the competent driver in its place loses before its own contact; a
 preventable one has 2.
