@@ -15,7 +15,7 @@ from e2rl.evaluation.reproduce import compared_with_run, run_of
 from e2rl.report.budget import save_budget
 from e2rl.report.results import references, write_results
 from e2rl.run.command import run_command
-from e2rl.run.run import Run
+from e2rl.run.run import Run, origin_of
 
 MAY_CHANGE = ("processes", "launcher", "shard")  # when a run is resumed
 
@@ -33,7 +33,7 @@ def evaluate(run: Run) -> None:
     if asked.shard != WHOLE:
         print(f"\nshard {asked.shard[0]} of {asked.shard[1]} written to {folder}; e2rl merge joins all of them")
         return
-    rows = record(*scored, folder, partial(egos.metric_rows, references=references(plan), **run.origin()))
+    rows = record(*scored, folder, partial(egos.metric_rows, references=references(plan), **origin_of(run.folder)))
     if asked.budget:
         save_budget(folder, plan, tries, *scored[:2])
     print("", *write_results(run, plan, rows), sep="\n")

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from e2rl.evaluation.methods import build_ego, build_prior, build_traffic
 from e2rl.evaluation.protocol import Method, Setup, Task
@@ -30,8 +29,7 @@ from e2rl.planners.ego import Ego
 from e2rl.prior.prior import Prior
 from e2rl.report.picture import Replay
 from e2rl.report.videos import save_animation
-from e2rl.run.config import load_choice
-from e2rl.run.errors import InputError
+from e2rl.run.config import load_choice, with_changes
 from e2rl.scenes import source
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import SimSettings
@@ -131,11 +129,4 @@ def score(rollouts: Rollouts) -> list[dict]:
 
 def _choice(group: str, name: str, settings: dict[str, Any]) -> DictConfig:
     """A file of the configuration with changes."""
-    config = load_choice(group, name)
-    OmegaConf.set_struct(config, True)
-    try:
-        for key, value in settings.items():
-            OmegaConf.update(config, key, value, merge=True)
-    except OmegaConfBaseException as error:
-        raise InputError(f"{group}={name}: {str(error).splitlines()[0]}; compare it with conf/{group}") from error
-    return config
+    return with_changes(load_choice(group, name), settings, f"{group}={name}", group)

@@ -16,7 +16,7 @@ import submitit
 from submitit.helpers import Checkpointable, CommandFunction
 
 EVALUATE = [sys.executable, str(Path(__file__).resolve().parents[1] / "evaluate.py")]
-MERGE = [sys.executable, "-m", "e2rl.commands.merge"]
+MERGE = [sys.executable, "-m", "e2rl.commands.cli", "merge"]
 
 
 @dataclass

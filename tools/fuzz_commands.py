@@ -124,7 +124,7 @@ def called(command: list[str]) -> None:
 def started(command: list[str]) -> None:
     """The same in a process of its own."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    run = [sys.executable, "-m", *command]
+    run = [sys.executable, "-m", "e2rl.commands.cli", command[0].rpartition(".")[2], *command[1:]]
     done = subprocess.run(run, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=120)
     ended(done.returncode, done.stderr)
 

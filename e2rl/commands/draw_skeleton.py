@@ -30,7 +30,3 @@ def draw(run: Run) -> None:
 def main() -> None:
     """The command."""
     run_command("skeleton", draw)
-
-
-if __name__ == "__main__":
-    main()

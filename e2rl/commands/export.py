@@ -3,7 +3,6 @@
 import argparse
 import csv
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
 
 from tqdm import tqdm
@@ -15,6 +14,7 @@ from e2rl.report.export import commonroad_writer as commonroad
 from e2rl.report.export import scenarionet_writer as scenarionet
 from e2rl.report.export.episode import FACTS
 from e2rl.report.export.scene_files import episodes_of
+from e2rl.run.config import library
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import written_whole
@@ -40,11 +40,7 @@ def check_format(name: str, open_ego: bool) -> None:
     if open_ego and name not in OPEN_EGO:
         raise InputError(f"--open-ego: {name} has no such form; leave it out, or pass --to {' or '.join(OPEN_EGO)}")
     for module in LIBRARIES.get(name, ()):
-        try:
-            import_module(module)
-        except ImportError as error:
-            reason = f"{module} cannot be imported ({error}); install e2rl with its extra: pip install 'e2rl[{name}]'"
-            raise InputError(f"--to {name}: {reason}") from error
+        library(module, f"--to {name}", name)
 
 
 def chosen_rows(run: Path, failures: int | None, every: bool, method: str | None) -> list[dict]:
@@ -88,7 +84,8 @@ def export(
     return len(rows)
 
 
-def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
+def main(arguments: list[str] | None = None) -> None:
+    """The command."""
     parser = argparse.ArgumentParser(prog="e2rl export", description=__doc__)
     parser.add_argument("run", type=Path, metavar="RUN_DIR", help="folder of a run of evaluate.py")
     parser.add_argument("--to", required=True, choices=FORMATS, metavar="FORMAT", help=", ".join(FORMATS))
@@ -99,12 +96,7 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--open-ego", action="store_true", help="leave the ego to a planner or controller of your own")
     parser.add_argument("--no-scene", action="store_true", help="do without the data: lanes of the rollout files alone")
     parser.add_argument("--plugin", action="append", default=[], metavar="MODULE", help="the data source's; repeatable")
-    return parser.parse_args(arguments)
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """The command."""
-    options = parse_arguments(arguments)
+    options = parser.parse_args(arguments)
     with ending():
         out = options.out or own_folder(options.run, "export", options.to)
         check_format(options.to, options.open_ego)
@@ -113,7 +105,3 @@ def main(arguments: list[str] | None = None) -> None:
         rows = chosen_rows(options.run, options.failures, options.all, options.method)
         count = export(options.run, options.to, rows, out, options.plugin, not options.no_scene, options.open_ego)
         print(f"{count} rollouts written to {out}")
-
-
-if __name__ == "__main__":
-    main()

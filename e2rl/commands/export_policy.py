@@ -1,4 +1,4 @@
-"""`python -m e2rl.commands.export_policy RUN_DIR POLICY.onnx|POLICY.pt`: a trained actor as a policy's file.
+"""`e2rl export-policy RUN_DIR POLICY.onnx|POLICY.pt`: a trained actor as a policy's file.
 
 It maps observations [B, 326] to the actor's most central actions [B, 2], with the normalisation and the reference
 inside, and drives e2rl by `ego=policy_file ego.file=POLICY.onnx` (docs/observation.md).
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from e2rl.planners.network import ActorNetwork, find_weights, read_actor
 from e2rl.planners.policy_file import ONNX, TORCHSCRIPT
+from e2rl.run.config import library
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
@@ -55,12 +56,7 @@ def _write_torchscript(policy: Deterministic, file: Path) -> None:
 
 
 def _write_onnx(policy: Deterministic, file: Path) -> None:
-    try:
-        import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise InputError(
-            f"{file}: onnxscript cannot be imported ({error}); install e2rl with its extra: pip install 'e2rl[onnx]'"
-        ) from error
+    library("onnxscript", str(file), "onnx")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it tells which packages it does without
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -79,14 +75,10 @@ def _write_onnx(policy: Deterministic, file: Path) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m e2rl.commands.export_policy", description=__doc__)
+    parser = argparse.ArgumentParser(prog="e2rl export-policy", description=__doc__)
     parser.add_argument("actor", metavar="RUN_DIR", help="run of train.py, a checkpoint, an actor.safetensors; bundled")
     parser.add_argument("file", type=Path, metavar="FILE", help=f"to write: {ONNX}, or {TORCHSCRIPT} for TorchScript")
     options = parser.parse_args(arguments)
     with ending():
         export_actor(options.actor, options.file)
         print(f"{options.file}: drive with it by ego=policy_file ego.file={options.file}")
-
-
-if __name__ == "__main__":
-    main()

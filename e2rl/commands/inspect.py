@@ -182,7 +182,3 @@ def main(arguments: list[str] | None = None) -> None:
         scene, title = drawn.scene, f"{drawn.scene_id}   {drawn.location}"
         save_figure(options.out, picture(scene, title, options.metres))
         print(f"drawn        {drawn.scene_id}: {options.out}")
-
-
-if __name__ == "__main__":
-    main()

@@ -74,7 +74,3 @@ def main(arguments: list[str] | None = None) -> None:
         batches = merge(options.runs, options.into)
         go_on = shlex.join(["e2rl", "evaluate", assigned("resume", options.into), "shard=null"])
         print(f"{batches} batches in {options.into}; go on with: {go_on}")
-
-
-if __name__ == "__main__":
-    main()

@@ -21,7 +21,7 @@ from e2rl.evaluation.summary import metric_rows
 from e2rl.report.results import write_results
 from e2rl.report.tables import metric_tables, print_tables
 from e2rl.run.command import run_command
-from e2rl.run.run import Run
+from e2rl.run.run import Run, origin_of
 from e2rl.run.settings import setting, settings_of
 
 MAY_CHANGE = ("processes", "launcher")  # when a run is resumed
@@ -53,7 +53,7 @@ def prior_tables(run: Run) -> None:
         after = meta_rows(setup, methods, asked.meta_rollouts, parts)
 
     def summarise(*found: Any) -> list[dict]:
-        return [row | run.origin() for row in (*before, *metric_rows(*found), *after)]
+        return [row | origin_of(run.folder) for row in (*before, *metric_rows(*found), *after)]
 
     rows = record(*scored, folder, summarise)
     answer = write_results(run, plan, rows)
@@ -64,7 +64,3 @@ def prior_tables(run: Run) -> None:
 def main() -> None:
     """The command."""
     run_command("prior_tables", prior_tables, MAY_CHANGE)
-
-
-if __name__ == "__main__":
-    main()

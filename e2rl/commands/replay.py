@@ -56,7 +56,3 @@ def main(arguments: list[str] | None = None) -> None:
             path = folder / f"{shown.rollout.name.removesuffix('.npz')}.gif"
             save_animation(path, Replay(shown.rollout, shown.row, options.metres, options.pixels).frames())
             print(*filter(None, [title]), path, sep="\n")
-
-
-if __name__ == "__main__":
-    main()

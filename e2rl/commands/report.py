@@ -17,7 +17,3 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     with ending():
         print(write_report(options.run, replays=options.replays, methods=options.method, path=options.out))
-
-
-if __name__ == "__main__":
-    main()

@@ -7,7 +7,6 @@ those of the class (`tuned`), or tuning.space (docs/adversaries.md, docs/how-to/
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
 
 # isort: split
-import copy
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -22,7 +21,7 @@ from e2rl.evaluation.trials import NOMINAL, AttackObjective, AttackTrials, Plann
 from e2rl.evaluation.tuning import STUDY_FILE, Objective, Parameters, SearchSettings, line_of, save, search, yaml_of
 from e2rl.report.curves import points_of_tuning, save_curves
 from e2rl.run.command import run_command
-from e2rl.run.config import resolved
+from e2rl.run.config import resolved, with_changes
 from e2rl.run.errors import InputError
 from e2rl.run.run import Run
 from e2rl.run.settings import check_choice, settings_of
@@ -74,7 +73,7 @@ def planner_trials(config: DictConfig, plan: Evaluation) -> PlannerTrials:
     """Returns trials of the group `ego` against all of `config.methods`."""
 
     def make(parameters: Parameters) -> Any:
-        return build_ego(OmegaConf.create({"ego": changed(config.ego, parameters)}))
+        return build_ego(OmegaConf.create({"ego": with_changes(config.ego, parameters, "tuning.space", "ego")}))
 
     return PlannerTrials(plan.setup, plan.methods, plan.asked.seeds, make, processes_of(config))
 
@@ -86,7 +85,7 @@ def attack_trials(config: DictConfig, plan: Evaluation) -> tuple[AttackTrials, M
         raise InputError(f"eta={config.eta}: an adversary is tuned at one intensity above 0")
 
     def make(parameters: Parameters) -> Any:
-        return build_traffic(changed(config.synthesizer, parameters), plan.prior)
+        return build_traffic(with_changes(config.synthesizer, parameters, "tuning.space", "synthesizer"), plan.prior)
 
     present = make({})
     if not present.adversarial:
@@ -104,18 +103,6 @@ def flat(group: Mapping[str, Any], before: str = "") -> Parameters:
     return found
 
 
-def changed(group: DictConfig, parameters: Parameters) -> DictConfig:
-    """Returns a copy of a group with parameters of dotted names."""
-    copied = copy.deepcopy(group)
-    for name, value in parameters.items():
-        OmegaConf.update(copied, name, value)
-    return copied
-
-
 def main() -> None:
     """The command."""
     run_command("tune", tune, MAY_CHANGE)
-
-
-if __name__ == "__main__":
-    main()

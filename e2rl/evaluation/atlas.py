@@ -1,13 +1,9 @@
 """The atlas of a run's failures in a file: atlas.json, an atlas for each ego, method and intensity (docs/modes.md)."""
 
-import json
 from collections.abc import Sequence
-from pathlib import Path
 
-from e2rl.evaluation.rollout_files import nulls
 from e2rl.evaluation.summary import GROUP, group_of
 from e2rl.metrics.atlas import CELL, Cell, Found, atlas_of
-from e2rl.run.files import write_atomically
 from e2rl.sim.rollout_file import rollout_name
 
 ATLAS_FILE = "atlas.json"
@@ -36,8 +32,3 @@ def describe_cell(cell: Cell, found: Found) -> dict:
     likeliest = {"scene_id": row["scene_id"], "seed": row["seed"], "file": rollout_name(row)}
     counts = {"failures": found.failures, "scenes": found.scenes}
     return dict(zip(CELL, cell, strict=True)) | counts | values | {"likeliest": likeliest}
-
-
-def write_atlas(path: Path, found: dict) -> None:
-    """Write atlas.json from the result of `find_atlas`."""
-    write_atomically(path, json.dumps(nulls(found), indent=1, allow_nan=False))

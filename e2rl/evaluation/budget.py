@@ -4,7 +4,6 @@ Every method is tried again and again, with other noise; the method `search` spe
 families. What they find is told at several budgets by `report.budget`.
 """
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,7 +12,6 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
 from e2rl.evaluation.methods import as_list, build_traffic, config_and_prior, is_search, method_config, rows_of
@@ -21,7 +19,7 @@ from e2rl.evaluation.protocol import WHOLE, Job, Method, Scored, Setup, Task, ex
 from e2rl.metrics.atlas import cell_of
 from e2rl.metrics.margin import FARTHEST
 from e2rl.prior.prior import Prior
-from e2rl.run.config import built
+from e2rl.run.config import built, with_changes
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, write_atomically
 from e2rl.run.parts import NO_PARTS, Parts
@@ -91,8 +89,10 @@ def portfolio_plan(name: str, config: DictConfig, method: Callable[[str, DictCon
     if not named:
         raise InputError("search.families: name at least one, such as +search.families.rule={}")
     families = [family_of(str(key), value, "search.families") for key, value in named.items()]
-    traffic = {each.name: method(each.method, changed_method(config, each)) for each in families}
+    traffic = {}
     for each in families:
+        where, own = f"search.families.{each.name}.changes", method_config(config, each.method)
+        traffic[each.name] = method(each.method, with_changes(own, each.changes, where, "synthesizer"))
         if each.ranges and not traffic[each.name].traffic.follows_decisions:
             decision = next(iter(each.ranges))
             raise InputError(
@@ -101,19 +101,6 @@ def portfolio_plan(name: str, config: DictConfig, method: Callable[[str, DictCon
     return Plan(
         name, families, traffic, settings_of(SearchSettings, given, "search"), partial(built, target, "search", Search)
     )
-
-
-def changed_method(config: DictConfig, family: Family) -> DictConfig:
-    """The configuration of a family's method with its changes; InputError where there is no such setting."""
-    changed = copy.deepcopy(method_config(config, family.method))
-    OmegaConf.set_struct(changed, True)
-    try:
-        for key, value in family.changes.items():
-            OmegaConf.update(changed, key, value, merge=True)
-    except OmegaConfBaseException as error:
-        where, reason = f"search.families.{family.name}.changes", str(error).splitlines()[0]
-        raise InputError(f"{where}: {reason}; compare it with conf/synthesizer") from error
-    return changed
 
 
 def search_all(

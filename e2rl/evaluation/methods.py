@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from e2rl.evaluation.protocol import WHOLE, Method
 from e2rl.metrics.catalogue import table_names
@@ -15,7 +14,7 @@ from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.checkpoint import load_prior
 from e2rl.prior.prior import Prior
 from e2rl.prior.sde import SamplerSettings
-from e2rl.run.config import built, choices, load_choice, machine_of
+from e2rl.run.config import built, choices, load_choice, machine_of, with_changes
 from e2rl.run.errors import InputError
 from e2rl.run.processes import Processes, RayWorkers, cores
 from e2rl.run.settings import check_choice, check_settings, setting, settings_of
@@ -191,11 +190,7 @@ def varied(config: DictConfig, name: str) -> DictConfig:
     for key, value in ((str(key), value) for key, value in changes.items()):
         if key.split(".")[0] not in VARIED:
             raise InputError(f"variants.{name}: {key} is none of {', '.join(VARIED)}, nor in one of them")
-        try:
-            OmegaConf.update(changed, key, value, merge=True)
-        except OmegaConfBaseException as error:
-            reason = str(error).splitlines()[0]
-            raise InputError(f"variants.{name}: {key}={value}: {reason}; compare it with conf/") from error
+        changed = with_changes(changed, {key: value}, f"variants.{name}: {key}={value}", "")
     return changed
 
 

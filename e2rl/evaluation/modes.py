@@ -1,12 +1,11 @@
 """The failure modes of a run: modes.json, and the column `mode` of rollouts.csv (docs/modes.md)."""
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from types import NoneType
 
-from e2rl.evaluation.rollout_files import nulls, read_json
+from e2rl.evaluation.rollout_files import read_json
 from e2rl.evaluation.summary import GROUP, group_of
 from e2rl.metrics.failure_modes import (
     FEATURES,
@@ -18,7 +17,7 @@ from e2rl.metrics.failure_modes import (
     medoid,
     mode_name,
 )
-from e2rl.run.files import misfit, write_atomically
+from e2rl.run.files import misfit
 from e2rl.sim.rollout_file import rollout_name
 
 MODES_FILE = "modes.json"
@@ -115,11 +114,6 @@ def _mismatch(found: dict) -> str | None:
         if Path(mode["typical"]["file"]).name != mode["typical"]["file"]:
             return f"mode {mode['mode']} names the file {mode['typical']['file'][:60]!r}"
     return None
-
-
-def write_modes(path: Path, found: dict) -> None:
-    """Write modes.json from the result of `find_modes`."""
-    write_atomically(path, json.dumps(nulls(found), indent=1, allow_nan=False))
 
 
 def read_modes(path: Path) -> dict:

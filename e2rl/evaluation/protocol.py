@@ -12,8 +12,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from e2rl.evaluation import rollout_files as files
-from e2rl.evaluation.atlas import ATLAS_FILE, find_atlas, write_atlas
-from e2rl.evaluation.modes import MODES_FILE, find_modes, write_modes
+from e2rl.evaluation.atlas import ATLAS_FILE, find_atlas
+from e2rl.evaluation.modes import MODES_FILE, find_modes
 from e2rl.evaluation.summary import empty_rows, group_of, metric_rows
 from e2rl.metrics.catalogue import SOURCE
 from e2rl.metrics.evasion import add_avoidable
@@ -263,8 +263,8 @@ def record(
         {"errored": count_reasons(why for why in errored if group_of(why) == group_of(row))} | row for row in known
     ]
     if folder is not None:
-        write_modes(folder / MODES_FILE, modes)
-        write_atlas(folder / ATLAS_FILE, find_atlas(rows))
+        files.write_json(folder / MODES_FILE, modes)
+        files.write_json(folder / ATLAS_FILE, find_atlas(rows))
         files.write_rows(folder / files.TABLE, rows)
-        files.write_metrics(folder / files.METRICS_FILE, result)
+        files.write_json(folder / files.METRICS_FILE, result)
     return result

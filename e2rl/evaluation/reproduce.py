@@ -15,10 +15,9 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from e2rl.evaluation.rollout_files import METRICS_FILE, nulls, read_metrics
+from e2rl.evaluation.rollout_files import METRICS_FILE, read_metrics, write_json
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
-from e2rl.run.files import write_atomically
 from e2rl.run.run import ALWAYS, Run, changed, inputs, read_provenance, versions
 from e2rl.run.trust import WRITTEN, check_written, leaves, saved_configuration
 from e2rl.scenes.scene_list import SCENES
@@ -152,7 +151,7 @@ def compared_with_run(config: DictConfig, folder: Path) -> Comparison:
     """Returns the table in `folder` beside that of the run that it reproduces; also as reproduced.json in `folder`."""
     found = compare_tables(read_metrics(Path(config.reproduce) / METRICS_FILE), read_metrics(folder / METRICS_FILE))
     content = {"run": config.reproduce, "equal": found.equal, "close": found.close, "different": found.different}
-    write_atomically(folder / RESULT, json.dumps(nulls(content), indent=1))
+    write_json(folder / RESULT, content)
     return found
 
 

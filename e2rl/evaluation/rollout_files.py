@@ -96,9 +96,9 @@ def _row(line: int, row: dict[str, Any]) -> dict:
         raise ValueError(f"line {line}: {error}") from error
 
 
-def write_metrics(path: Path, rows: Sequence[dict]) -> None:
-    """Write metrics.json from the rows of `evaluation.summary.metric_rows`; NaN becomes null (strict JSON)."""
-    write_atomically(path, json.dumps(nulls(list(rows)), indent=1, allow_nan=False))
+def write_json(path: Path, content: object) -> None:
+    """Write metrics.json, modes.json, atlas.json, ...: NaN and infinite numbers become null (strict JSON)."""
+    write_atomically(path, json.dumps(nulls(content), indent=1, allow_nan=False))
 
 
 def read_metrics(path: Path) -> list[dict]:

@@ -13,7 +13,8 @@ from typing import Any, ClassVar, Protocol
 
 from omegaconf import OmegaConf
 
-from e2rl.evaluation.rollout_files import nans, nulls
+from e2rl.evaluation.rollout_files import nans, nulls, write_json
+from e2rl.run.config import library
 from e2rl.run.errors import InputError
 from e2rl.run.files import misfit, read_regular, write_atomically
 from e2rl.run.settings import configured, setting
@@ -135,7 +136,7 @@ def save(rows: Sequence[dict], folder: Path) -> dict:
     """Write tuning.json, and tuned.yaml where there is a best; returns what tuning.json holds."""
     best = best_of(rows)
     result = {"best": best and best["parameters"], "trials": list(rows)}
-    write_atomically(folder / TUNING_FILE, json.dumps(nulls(result), indent=1))
+    write_json(folder / TUNING_FILE, result)
     if best:
         write_atomically(folder / TUNED_FILE, yaml_of(best["parameters"]))
     return result
@@ -205,9 +206,6 @@ def proposal(rows: Sequence[dict], ranges: Mapping, settings: SearchSettings, ob
 
 
 def _optuna() -> Any:
-    try:
-        import optuna
-    except ImportError as error:
-        raise InputError("tuning: optuna is not installed; install its extra: pip install 'e2rl[tune]'") from error
+    optuna = library("optuna", "tuning", "tune")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna

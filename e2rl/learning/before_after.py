@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from e2rl.evaluation.protocol import Method, Setup, drive_all, record
-from e2rl.evaluation.rollout_files import METRICS_FILE, read_metrics, write_metrics
+from e2rl.evaluation.rollout_files import METRICS_FILE, read_metrics, write_json
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.realism import Samples
 from e2rl.metrics.statistics import paired_differences
@@ -44,7 +44,7 @@ class BeforeAfter:
                 row["paired"]["before"] = paired_differences(*_of_row(row, scored[:2]), *_of_row(row, before))
         file = self.folder / METRICS_FILE
         earlier = [row for row in (read_metrics(file) if file.exists() else []) if row.get("stage") != stage]
-        write_metrics(file, earlier + rows)
+        write_json(file, earlier + rows)
         return earlier + rows
 
 

@@ -22,7 +22,7 @@ from e2rl.planners.ego import PLAN_STEPS
 from e2rl.planners.path import RoutePath
 from e2rl.planners.reference import LAST_ACTION
 from e2rl.run.errors import InputError
-from e2rl.run.run import Run
+from e2rl.run.run import Run, origin_of
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import project
@@ -209,7 +209,7 @@ def run_bits_stage(run: Run, logger: RunLogger) -> dict[str, float]:
     training = BitsTraining(network, data, settings)
     run.begin({"scenes": listed(scenes)})
     row = training.fit("bits", settings.epochs, run.parts("bits"), vars(settings), logger)
-    origin = {"data": f"{scenes.dataset}/{scenes.split}", "scenes": len(scenes), **run.origin()}
+    origin = {"data": f"{scenes.dataset}/{scenes.split}", "scenes": len(scenes), **origin_of(run.folder)}
     given = {"windows": len(data), "settings": vars(settings), "result": row}
     save_bits(network, run.folder / WEIGHTS, origin | given)
     return row

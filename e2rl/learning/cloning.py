@@ -30,19 +30,14 @@ def clip_expert(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 def demonstrations_of(
-    frames: TensorDictBase,
-    kept: Tensor,
-    scene_index: Tensor,
-    env: DrivingEnv,
-    action: Tensor,
-    weight: Tensor | None = None,
+    frames: TensorDictBase, kept: Tensor, scene_index: Tensor, env: DrivingEnv, action: Tensor
 ) -> TensorDict:
     """Returns demonstrations [M] with their scene_index [M], on the CPU, of frames kept [B, T] of a `PoolDriver.drive`.
 
-    action [B, T, C, 2], clipped here, and weight [B, T, C] (None: all alike); scene_index [B].
+    action [B, T, C, 2], clipped here, all C of the same weight; scene_index [B].
     """
     action = clip_expert(action[kept], env.action_spec.space.low[0], env.action_spec.space.high[0])
-    weight = torch.full_like(action[..., 0], 1 / action.shape[1]) if weight is None else weight[kept]
+    weight = torch.full_like(action[..., 0], 1 / action.shape[1])
     scene = scene_index[:, None].to(kept.device).expand(kept.shape)[kept]
     found = {"observation": frames["observation"][kept], "action": action, "weight": weight, "scene_index": scene}
     return TensorDict(found, batch_size=[len(scene)]).cpu()

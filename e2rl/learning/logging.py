@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 
 from PIL import Image
@@ -10,6 +9,7 @@ from torchrl.record.loggers import CSVLogger, TensorboardLogger, WandbLogger
 from torchrl.record.loggers.common import Logger
 
 from e2rl.learning.scheduler import COLUMNS, Choice
+from e2rl.run.config import library
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, write_atomically
 from e2rl.run.settings import check_choice
@@ -87,11 +87,7 @@ def _logger(kind: str, folder: Path, project: str, name: str | None) -> Logger |
         given = {"offline": True, "save_dir": str(folder), "project": project, "log_env_packages": False}
         return WandbLogger(name or folder.name, **given)
     if kind == "tensorboard":
-        if find_spec("tensorboard") is None:
-            raise InputError(
-                "logger=tensorboard: tensorboard is not installed; install e2rl with its extra: pip install "
-                "'e2rl[tensorboard]'"
-            )
+        library("tensorboard", "logger=tensorboard", "tensorboard")
         return TensorboardLogger("tensorboard", log_dir=str(folder))
     return None
 

@@ -17,8 +17,6 @@ from e2rl.planners.ego import Ego
 from e2rl.run.errors import InputError
 from e2rl.run.processes import die_with_parent
 
-DONE = b"done "  # begins a message of success, before the seconds
-
 
 class Prefetch:
     """`work()`, begun at once. A forked process sees what this one holds now; later changes of either are not the
@@ -38,34 +36,32 @@ class Prefetch:
     def wait(self) -> float:
         """Wait for the end; returns the seconds that the work took. Raises InputError if it failed or was killed."""
         try:
-            message = self._receiver.recv_bytes()
+            seconds, reason = self._receiver.recv()
         except EOFError:  # it died without a word
-            message = b""
+            seconds, reason = 0.0, "its process was killed, perhaps for lack of memory"
         self._worker.join()
         self._receiver.close()
-        if message.startswith(DONE):
-            return float(message.removeprefix(DONE))
-        reason = message.decode() or "its process was killed, perhaps for lack of memory"
-        raise InputError(f"{self._name}: {reason}")
+        if reason:
+            raise InputError(f"{self._name}: {reason}")
+        return seconds
 
 
 def _run(work: Callable[[], None], sender: Connection, parent: int | None) -> None:
     if parent is not None:
         die_with_parent(parent)
         torch.set_num_threads(1)
-    begin = time.perf_counter()
+    begin, reason = time.perf_counter(), ""
     try:
         work()
-        sender.send_bytes(DONE + f"{time.perf_counter() - begin:.3f}".encode())
     except InputError as error:
-        sender.send_bytes(str(error).encode())
+        reason = str(error)
     except KeyboardInterrupt:
         os._exit(1)  # the parent was interrupted too
     except Exception as error:
         traceback.print_exc()
-        sender.send_bytes(f"{type(error).__name__}: {error}".encode())
-    finally:
-        sender.close()
+        reason = f"{type(error).__name__}: {error}"
+    sender.send((time.perf_counter() - begin, reason))
+    sender.close()
 
 
 def why_no_prefetch(device: str, threads: int, ego: Ego, traffic: str) -> str:

@@ -7,7 +7,6 @@ these files: a torn or altered one is noticed, and the one before it is used.
 """
 
 import io
-import os
 import random
 import shutil
 import sys
@@ -20,7 +19,7 @@ from e2rl.learning.evolution import Evolution
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.network import WEIGHTS
 from e2rl.run.errors import InputError
-from e2rl.run.files import altered, misfit, read_regular, seal
+from e2rl.run.files import altered, misfit, read_regular, seal, written_whole
 from e2rl.run.parts import load_plain
 
 STATE, FORMAT = "state.pt", "e2rl-checkpoint/8"
@@ -30,18 +29,10 @@ def save_checkpoint(folder: Path, run: Evolution, keep_last: int = 2) -> Path:
     """Write checkpoints/round-<rounds done> under a run's folder; only the keep_last newest are kept, and of the memory
     the files that these name."""
     parent = Path(folder) / "checkpoints"
-    parent.mkdir(parents=True, exist_ok=True)
-    target, partial = parent / f"round-{run.round:06d}", parent / f".partial-{os.getpid()}"
-    for left in parent.glob(".partial-*"):
-        shutil.rmtree(left)
-    partial.mkdir()
-    try:
-        _write(partial, run)
-    except BaseException:
-        shutil.rmtree(partial)
-        raise
-    shutil.rmtree(target, ignore_errors=True)
-    partial.replace(target)
+    target = parent / f"round-{run.round:06d}"
+    with written_whole(target) as part:
+        _write(part, run)
+        shutil.rmtree(target, ignore_errors=True)
     *older, newest = sorted(parent.glob("round-*"))
     kept = [*older, newest][-max(1, keep_last) :]
     for old in set(older) - set(kept):

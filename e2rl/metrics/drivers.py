@@ -5,7 +5,7 @@ Each driver is a NamedTuple of parameters with `step(state, observation)`, which
 react. All tensors share their leading dimensions [...].
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -51,14 +51,6 @@ class DriverState(NamedTuple):
     since: Tensor  # s since the driver has perceived the risk; -1: there is none
     braking: Tensor  # m/s^2, commanded in the step before
     decided: Tensor  # bool, whether `RegulationLimit` has judged this conflict
-
-
-class Driver(Protocol):
-    """Anything that reacts to one other vehicle."""
-
-    def step(self, state: DriverState, observation: Observation) -> tuple[DriverState, Tensor]:
-        """(next state, acceleration [...] m/s^2 for the coming step)."""
-        ...
 
 
 def no_conflict(like: Tensor) -> DriverState:
@@ -220,6 +212,7 @@ class FuzzySafetyModel(NamedTuple):
         return DriverState(since, braking, state.decided), -braking
 
 
+Driver = HumanDriver | RegulationLimit | ResponsibilitySensitiveSafety | FuzzySafetyModel
 DRIVERS: dict[str, Driver] = {
     "human": HumanDriver(),
     "regulation": RegulationLimit(),

@@ -120,18 +120,6 @@ class ActorNetwork(nn.Module):
         return self.middle + self.reach * self(observation)[0].tanh()
 
 
-class Head(nn.Module):
-    """`ActorNetwork.head` as a module of its own."""
-
-    def __init__(self, network: ActorNetwork) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, seen: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-        """loc, scale [..., 2]."""
-        return self.network.head(seen, offset)
-
-
 class ActorCritic(nn.Module):
     """TorchRL actor and critic over one normaliser.
 
@@ -171,7 +159,7 @@ class ActorCritic(nn.Module):
     def heads(self) -> tuple[ProbabilisticActor, ValueOperator]:
         """Actor and critic with the same parameters that read "seen" and "offset", which an update computes once for
         all its epochs (`prepared`), instead of the observation."""
-        head = TensorDictModule(Head(self.network), ["seen", "offset"], ["loc", "scale"])
+        head = TensorDictModule(self.network.head, ["seen", "offset"], ["loc", "scale"])
         return self._sampler(head), ValueOperator(self.critic.module[1], in_keys=["seen"])
 
     @torch.no_grad()

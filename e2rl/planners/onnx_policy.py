@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from e2rl.run.config import library
 from e2rl.run.errors import InputError
 
 MAX_FIELDS, MAX_REST = 200_000, 1 << 22  # fields, and bytes beside tensors: libraries need a hundred times as much
@@ -40,11 +41,7 @@ class OnnxPolicy:
         self._open()
 
     def _open(self) -> None:
-        try:
-            import onnxruntime
-        except ImportError as error:
-            reason = f"onnxruntime cannot be imported ({error}); pip install 'e2rl[onnx]'"
-            raise InputError(f"{self.where}: {reason}") from error
+        onnxruntime = library("onnxruntime", self.where, "onnx")
         bound_memory()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1

@@ -104,7 +104,8 @@ class PDMClosedEgo(Ego):
         fractions [P] of the speed limit."""
         driver = IDMParameters(self.headway, self.standstill_gap, self.acceleration, self.braking, EXPONENT)
         others, half = self._others(world, range(PLAN_STEPS)), world.scene["size"][:, 0] / 2
-        s, d, heading = (x.unflatten(1, others.states.shape[1:3]) for x in _onto(path, others.states))
+        onto = project(others.states[..., :2].flatten(1, 2), path.route)
+        s, d, heading = (x.unflatten(1, others.states.shape[1:3]) for x in onto)
         turn = others.states[..., 2] - heading
         along, side = (_extent(others.size, turn, axis) for axis in (0, 1))
         leads = (d[:, None] - offset[:, None, None]).abs() < (side + half[:, 1, None, None])[:, None]
@@ -134,11 +135,6 @@ class PDMClosedEgo(Ego):
         row = torch.arange(len(agents), device=agents.device)[:, None]
         times = DT * torch.tensor(steps, device=agents.device)
         return Others(constant_velocity(world.states[row, agents], times), world.scene["size"][row, agents], seen)
-
-
-def _onto(path: MissionPath, states: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Arc length, offset and heading [B, M T] of the mission at states [B, M, T, 4]."""
-    return project(states[..., :2].flatten(1, 2), path.route)
 
 
 def _extent(size: Tensor, turn: Tensor, axis: int) -> Tensor:

@@ -189,7 +189,3 @@ def main(arguments: list[str] | None = None) -> None:
     with ending():
         points = [point for run in options.runs for point in read_points(run)]
         print(*save_curves(options.out, points), sep="\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -81,7 +81,3 @@ def main(arguments: list[str] | None = None) -> None:
             raise InputError(f"policy-figure: no rows of {options.after} after {options.before} under {options.method}")
         save_figure(options.out / NAME, figure)
         print(options.out / NAME)
-
-
-if __name__ == "__main__":
-    main()

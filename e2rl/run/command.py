@@ -23,6 +23,7 @@ from e2rl.run.errors import InputError
 from e2rl.run.files import alone_in
 from e2rl.run.run import Run, how_to_go_on
 from e2rl.run.settings import conf_folder
+from e2rl.run.trust import nodes
 
 
 def run_command(
@@ -141,7 +142,7 @@ def told(name: str, arguments: Sequence[str], said: str) -> str:
     if found := re.search("Could not override '(.+?)'", said):
         groups = () if any(_further(arguments)) else _groups(name)
         config = load_config(name, [argument for argument in arguments if argument.split("=")[0] in groups])
-        return _nearest(found[1], found[1], list(_keys(OmegaConf.to_container(config))))
+        return _nearest(found[1], found[1], [key for key, _ in nodes(OmegaConf.to_container(config))])
     return said
 
 
@@ -174,11 +175,3 @@ def _groups(name: str) -> dict[str, str | None]:
         elif entry != "_self_":  # the configuration that it builds on
             groups |= _groups(entry)
     return groups
-
-
-def _keys(config: Any, prefix: str = "") -> Iterator[str]:
-    """The dotted names of all entries of nested containers."""
-    if isinstance(config, dict):
-        for key, value in config.items():
-            yield f"{prefix}{key}"
-            yield from _keys(value, f"{prefix}{key}.")

@@ -1,8 +1,9 @@
 """The configuration: files of conf/, and what they build."""
 
+import copy
 import random
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from importlib import import_module
@@ -17,6 +18,7 @@ from hydra.errors import HydraException, InstantiationException
 from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from e2rl.run.errors import InputError
 from e2rl.run.settings import conf_folder, setting, settings_of
@@ -69,6 +71,18 @@ def choices(group: str) -> list[str]:
     """Returns the names of the files in conf/<group>, as `load_choice` finds them."""
     with _hydra() as hydra:
         return hydra.config_loader().get_group_options(group)
+
+
+def with_changes(config: DictConfig, changes: Mapping[str, Any], where: str, group: str) -> DictConfig:
+    """Returns a copy of a configuration with changes of dotted keys; InputError where there is no such key in it."""
+    changed = copy.deepcopy(config)
+    OmegaConf.set_struct(changed, True)
+    try:
+        for key, value in changes.items():
+            OmegaConf.update(changed, key, value, merge=True)
+    except OmegaConfBaseException as error:
+        raise InputError(f"{where}: {str(error).splitlines()[0]}; compare it with conf/{group}") from error
+    return changed
 
 
 def resolved(config: DictConfig) -> dict[str, Any]:
@@ -136,6 +150,15 @@ def set_up(config: DictConfig) -> None:
     torch.manual_seed(seed)
     np.random.seed(seed % 2**32)
     random.seed(seed)
+
+
+def library(name: str, where: str, extra: str) -> Any:
+    """Returns a module of an optional library; InputError, beginning with `where`, where it cannot be imported."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        mend = f"install e2rl with its extra: pip install 'e2rl[{extra}]'"
+        raise InputError(f"{where}: {name} cannot be imported ({error}); {mend}") from error
 
 
 def import_plugins(names: Sequence[str], option: str) -> None:

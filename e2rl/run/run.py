@@ -11,6 +11,7 @@ import json
 import os
 import platform
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -96,8 +97,8 @@ class Run:
         if not os.access(self.folder, os.W_OK):
             raise InputError(f"{self.folder}: cannot be written; make it writable, or name another folder")
         if self.config.resume:
-            for left in self.folder.rglob(".*.part"):  # of a file that was being written at the end
-                left.unlink(missing_ok=True)
+            for left in list(self.folder.rglob(".*.part")):  # of what was being written at the end
+                shutil.rmtree(left) if left.is_dir() else left.unlink(missing_ok=True)
             return
         found = {path.relative_to(self.folder).parts[0] for path in self.folder.rglob("*") if not path.is_dir()}
         found -= {name for name in found if name.endswith(LOGS)}
@@ -112,10 +113,6 @@ class Run:
     def parts(self, stage: str = "", about: str = "") -> Parts:
         """Returns the parts of a stage that are done."""
         return Parts(self.folder, stage, about)
-
-    def origin(self) -> dict[str, Any]:
-        """Returns `git` and `command` for the rows of metrics.json."""
-        return origin_of(self.folder)
 
     def begin(self, scenes: Mapping[str, tuple[str, str]]) -> None:
         """Write what the run was begun with; or where it goes on, compare with that.

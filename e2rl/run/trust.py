@@ -151,15 +151,15 @@ def check_code(config: DictConfig, allowed: Sequence[str], where: str) -> None:
     command or an address for an extension, other than of the modules `allowed`; or another of Hydra's keys."""
     plain = OmegaConf.to_container(config)
     assert isinstance(plain, dict)
-    nodes = list(_nodes(plain))
-    keys = {part for key, _ in nodes for part in re.split(r"[.\[\]]", key)}
+    found = list(nodes(plain))
+    keys = {part for key, _ in found for part in re.split(r"[.\[\]]", key)}
     if hidden := sorted(key for key in keys if key.startswith("_") and key != "_target_"):
         raise InputError(f"{where}: its configuration has {', '.join(hidden)}, which no run of e2rl needs; take it out")
     plugins = plain.get("plugins") or []
     if not isinstance(plugins, list):
         raise InputError(f"{where}: its configuration is damaged (plugins: {str(plugins)[:40]}); restore it")
     named = [str(name) for name in plugins]
-    named += [str(target) for key, target in nodes if "_target_" in key and not _is_extension(str(target))]
+    named += [str(target) for key, target in found if "_target_" in key and not _is_extension(str(target))]
     named += starting_modules(plain)
     outside = [name for name in named if not any(name == own or name.startswith(f"{own}.") for own in allowed)]
     if outside:
@@ -187,16 +187,16 @@ def starting_modules(plain: Any) -> set[str]:
 
 def leaves(value: Any) -> Iterator[tuple[str, Any]]:
     """(dotted key, value) of every value in nested containers that is no container."""
-    return ((key, part) for key, part in _nodes(value) if not isinstance(part, dict | list))
+    return ((key, part) for key, part in nodes(value) if not isinstance(part, dict | list))
 
 
-def _nodes(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+def nodes(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
     """(dotted key, value) of every value in nested containers, containers included."""
     if isinstance(value, dict | list):
         for name, part in value.items() if isinstance(value, dict) else enumerate(value):
             below = f"{key}.{name}" if key else str(name)
             yield below, part
-            yield from _nodes(part, below)
+            yield from nodes(part, below)
 
 
 def _is_extension(target: str) -> bool:

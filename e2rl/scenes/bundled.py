@@ -141,11 +141,6 @@ def read_recordings(arrays: dict[str, np.ndarray]) -> list[Recording]:
     ]
 
 
-def load_recordings(split: str) -> list[Recording]:
-    """Returns the bundled recordings of a split; raises InputError for a missing or damaged asset."""
-    return read_recordings(unpack(split))
-
-
 @lru_cache(maxsize=1)
 def _recordings_by_id(split: str) -> dict[str, Recording]:
-    return {recording.scene_id: recording for recording in load_recordings(split)}
+    return {recording.scene_id: recording for recording in read_recordings(unpack(split))}

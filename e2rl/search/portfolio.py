@@ -1,7 +1,7 @@
 """Which family is tried next in which scene: Thompson sampling over chances that tries have told."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -32,20 +32,14 @@ class Portfolio:
     families: Sequence[Family]
     scenes: int
     learns: bool = True
-    tried: Tensor = field(init=False)
-    nearest: Tensor = field(init=False)
-    found: Tensor = field(init=False)  # [F], and the x of the tries
-    exposed: Tensor = field(init=False)
-    spent: Tensor = field(init=False)  # [F], NFE, of so many tries
-    driven: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
         prior = torch.tensor([family.chance for family in self.families], dtype=torch.float64)
         self.tried = torch.zeros(self.scenes, len(self.families), dtype=torch.float64)
         self.nearest = torch.full((self.scenes,), torch.nan, dtype=torch.float64)
-        self.found, self.exposed = CHANCE_TRIES * prior, torch.full_like(prior, CHANCE_TRIES)
+        self.found, self.exposed = CHANCE_TRIES * prior, torch.full_like(prior, CHANCE_TRIES)  # and the x of the tries
         self.spent = torch.tensor([CHANCE_TRIES * family.nfe for family in self.families], dtype=torch.float64)
-        self.driven = torch.full_like(prior, CHANCE_TRIES)
+        self.driven = torch.full_like(prior, CHANCE_TRIES)  # tries that have spent so many NFE
 
     def tell(self, scene: int, family: int, found: float, margin: float, nfe: float) -> None:
         """Learn from a try that found so much of what is searched for, 0 to 1."""

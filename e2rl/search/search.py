@@ -5,7 +5,7 @@ something new.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import count
 from typing import NamedTuple
 
@@ -57,13 +57,11 @@ class Search(Extension):
     numbers: Sequence[int]
     seed: int
     settings: SearchSettings
-    tries: list[list[Try]] = field(init=False)  # of each scene
-    outcomes: list[list[Outcome]] = field(init=False)
-    cells: set[str] = field(init=False, default_factory=set)
 
     def __post_init__(self) -> None:
-        self.tries = [[] for _ in self.numbers]
-        self.outcomes = [[] for _ in self.numbers]
+        self.tries: list[list[Try]] = [[] for _ in self.numbers]  # of each scene
+        self.outcomes: list[list[Outcome]] = [[] for _ in self.numbers]
+        self.cells: set[str] = set()
         self._portfolio = Portfolio(self.families, len(self.numbers), self.settings.bandit)
         self._generator = torch.Generator().manual_seed(self.seed)
         self._drawn = torch.zeros(len(self.numbers), len(self.families), dtype=torch.int64)

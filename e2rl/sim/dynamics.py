@@ -12,16 +12,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from e2rl.scenes.paths import wrap
 from e2rl.scenes.recording import DT
 
 MAX_SPEED = 40.0  # m/s
 MAX_LATERAL = 8.0  # m/s^2, about the grip of tyres
 MAX_CURVATURE = 0.3  # 1/m, path of a car's centre at full steering lock
-
-
-def wrap(angle: Tensor) -> Tensor:
-    """Angle [rad] in [-pi, pi)."""
-    return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
 
 
 def constant_velocity(states: Tensor, times: Tensor) -> Tensor:

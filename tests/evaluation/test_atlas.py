@@ -2,7 +2,8 @@
 
 import json
 
-from e2rl.evaluation.atlas import ATLAS_FILE, find_atlas, write_atlas
+from e2rl.evaluation.atlas import ATLAS_FILE, find_atlas
+from e2rl.evaluation.rollout_files import write_json
 from e2rl.sim.rollout_file import rollout_name
 from tests.evaluation.test_modes import crashes
 from tests.metrics.test_failure_modes import CROSSING, REAR_END
@@ -17,7 +18,7 @@ def run_rows():
 
 def test_every_group_has_its_own_atlas(tmp_path):
     rows = run_rows()
-    write_atlas(tmp_path / ATLAS_FILE, find_atlas(rows))
+    write_json(tmp_path / ATLAS_FILE, find_atlas(rows))
     e2, other, nominal = json.loads((tmp_path / ATLAS_FILE).read_text())["groups"]
     counts = [(group["rollouts"], group["preventable"], group["cells"]) for group in (e2, other, nominal)]
     assert counts == [(5, 5, 2), (2, 1, 1), (2, 0, 0)] and nominal["atlas"] == []

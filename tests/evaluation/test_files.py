@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from e2rl.evaluation import rollout_files as files
 from e2rl.evaluation.protocol import Method, Setup
-from e2rl.evaluation.rollout_files import read_metrics, read_rows, write_metrics
+from e2rl.evaluation.rollout_files import read_metrics, read_rows, write_json
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.idm_planner import IDMEgo
@@ -43,7 +43,7 @@ def test_metrics_are_strict_json_with_counts_command_and_paired_differences(tmp_
     monkeypatch.setattr(sys, "argv", ["evaluate.py", "eta=[1, 2]"])
     rows, features = score_rollouts(rollouts)
     both = rows + [row | {"eta": 0.0} for row in labelled(rows, "synthetic", "test", "nominal", "idm")]
-    write_metrics(tmp_path / "metrics.json", metric_rows(both, features * 2, draws=50, realism_draws=5, stage="after"))
+    write_json(tmp_path / "metrics.json", metric_rows(both, features * 2, draws=50, realism_draws=5, stage="after"))
     first, _ = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=pytest.fail)
     assert (first["n_scenes"], first["n_seeds"], first["n_rollouts"]) == (3, 2, 6)
     assert first["command"] == "python evaluate.py 'eta=[1, 2]'" and first["stage"] == "after" and "git" in first

@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from e2rl.evaluation.modes import MODES_FILE, find_modes, read_modes, write_modes
+from e2rl.evaluation.modes import MODES_FILE, find_modes, read_modes
+from e2rl.evaluation.rollout_files import write_json
 from e2rl.report.tables import mode_tables
 from e2rl.sim.rollout_file import rollout_name
 from tests.metrics.test_failure_modes import CROSSING, REAR_END, failure
@@ -25,7 +26,7 @@ def run_rows():
 def test_modes_have_counts_fractions_by_method_and_verdicts(tmp_path):
     rows = run_rows()
     found = find_modes(rows)
-    write_modes(tmp_path / MODES_FILE, found)
+    write_json(tmp_path / MODES_FILE, found)
     assert read_modes(tmp_path / MODES_FILE) == found
     crossing, rear_end = found["modes"]
     assert (found["failures"], found["rollouts"], found["unknown"]) == (12, 17, ["duty"])

@@ -7,7 +7,7 @@ import math
 import pytest
 from PIL import Image
 
-from e2rl.evaluation.rollout_files import write_metrics
+from e2rl.evaluation.rollout_files import write_json
 from e2rl.report.curves import main, points_of_tuning
 
 MEASURED = {"aor_step": 0.001, "cfr_bg": 0.02, "real": 0.9, "nfe": 640.0}
@@ -55,7 +55,7 @@ def test_a_tuning_s_points_are_its_ladder_and_its_best_trial(best, expected):
 
 def folders(tmp_path):
     """A run of several intensities, and a tuning."""
-    write_metrics(tmp_path / "run" / "metrics.json", ROWS)
+    write_json(tmp_path / "run" / "metrics.json", ROWS)
     found = tuning(1)
     for each in found["trials"]:
         each["metrics"] = {name: None if math.isnan(value) else value for name, value in each["metrics"].items()}

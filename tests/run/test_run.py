@@ -87,7 +87,7 @@ def test_of_a_run_s_folder_the_newest_whole_checkpoint_is_hashed(tmp_path):
 
 
 def test_other_code_is_told_and_named_in_the_rows(tmp_path, monkeypatch, capsys):
-    command = begin(tmp_path).origin()["command"]
+    command = origin_of(begin(tmp_path).folder)["command"]
     now = runs.versions(load_config("evaluate")) | {"git": "abc", "e2rl": "123"}
     monkeypatch.setattr(runs, "versions", lambda config: now)
     for _ in range(2):
@@ -145,7 +145,7 @@ def test_options_for_hydra_and_the_shell_are_quoted(tmp_path, monkeypatch):
     assert assigned("resume", "runs/a-1") == "resume=runs/a-1"
     assert assigned("resume", "it's, a=run") == r"resume='it\'s, a=run'"
     monkeypatch.setattr(sys, "argv", ["evaluate.py", "prior.checkpoint=$(touch x)"])
-    command = begin(tmp_path).origin()["command"]
+    command = origin_of(begin(tmp_path).folder)["command"]
     assert command == "python evaluate.py 'prior.checkpoint=$(touch x)'"
     assert shlex.split(command)[-1] == "prior.checkpoint=$(touch x)"
 

@@ -8,17 +8,7 @@ import pytest
 
 from e2rl.run.errors import InputError
 from e2rl.scenes import bundled
-from e2rl.scenes.bundled import (
-    CURRENT,
-    FRAMES,
-    SPLITS,
-    SceneMap,
-    asset_bytes,
-    load_recordings,
-    read_maps,
-    read_recordings,
-    unpack,
-)
+from e2rl.scenes.bundled import CURRENT, FRAMES, SPLITS, SceneMap, asset_bytes, read_maps, read_recordings, unpack
 from e2rl.scenes.paths import WHEELBASE, arc_length, wrap
 from e2rl.scenes.recording import DT, Lane, Recording
 
@@ -30,7 +20,7 @@ from scenegen.interaction import lateral_acceleration, overlapping_pairs  # noqa
 
 @pytest.fixture(scope="module")
 def sets():
-    return {split: load_recordings(split) for split in SPLITS}
+    return {split: read_recordings(unpack(split)) for split in SPLITS}
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +103,7 @@ def test_round_trip():
 
 def test_an_unknown_split_and_a_damaged_archive_are_named(monkeypatch):
     with pytest.raises(InputError, match="expected one of train, tune, test"):
-        load_recordings("validation")
+        read_recordings(unpack("validation"))
     monkeypatch.setitem(bundled.SHA256, "test", "0" * 64)  # as where the file is another one
     with pytest.raises(InputError, match="damaged"):
-        load_recordings("test")
+        read_recordings(unpack("test"))

@@ -8,7 +8,7 @@ import pytest
 
 from e2rl.run.errors import InputError
 from e2rl.scenes.builder import BuildSettings, build_scene
-from e2rl.scenes.bundled import load_recordings
+from e2rl.scenes.bundled import read_recordings, unpack
 from e2rl.scenes.lane_graph import LaneGraph
 from e2rl.scenes.plausibility import LIMITS, extent, lane_spacing, map_fit, motion
 from e2rl.scenes.recording import VEHICLE, Lane
@@ -18,7 +18,7 @@ SMALL = BuildSettings(steps=20, vehicles=4, others=2, field_cells=32)
 
 @pytest.fixture(scope="module")
 def genuine():
-    return load_recordings("tune")[0]
+    return read_recordings(unpack("tune"))[0]
 
 
 def scaled(recording, factor, *parts):
@@ -145,7 +145,7 @@ def test_a_small_log_of_large_cost_is_refused_before_it_costs(genuine, change):
 
 def test_genuine_recordings_stay_well_inside_the_limits():
     """At half of each limit and twice each least value they would still pass."""
-    for recording in load_recordings("tune")[::8]:
+    for recording in read_recordings(unpack("tune"))[::8]:
         measures = extent(recording) | motion(recording) | map_fit(recording, LaneGraph(recording.lanes))
         assert measures.keys() == LIMITS.keys() and measures["speed_ratio"] == pytest.approx(1, abs=0.05)
         for name, value in measures.items():

@@ -18,7 +18,7 @@ from e2rl.run.parts import Parts
 from e2rl.run.run import Run, origin_of
 from e2rl.run.settings import settings_of
 from e2rl.scenes.scene import SceneSet
-from e2rl.scenes.scene_list import listed
+from e2rl.scenes.scene_list import listed, scene_hashes
 from e2rl.scenes.source import load_scenes
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.nominal import NominalTraffic
@@ -41,7 +41,7 @@ def run_prior_stage(run: Run, logger: RunLogger | None) -> tuple[Path, list[dict
             lambda: load_scenes(config.data, config.num_scenes, "train", list(settings.starts), config.scenes)
         )
         processes.from_leader(lambda: run.begin({"scenes": listed(scenes)}))
-        data = fingerprint(scenes)
+        data = hashlib.sha256("\n".join(scene_hashes(scenes)).encode()).hexdigest()[:16]
         origin = {
             "data": f"{scenes.dataset}/{scenes.split}",
             "scenes": len(scenes),
@@ -67,11 +67,3 @@ def _first_starts(scenes: SceneSet) -> SceneSet:
     keep = [index for _, index in first.values()]
     names, places = ([values[i] for i in keep] for values in (scenes.scene_id, scenes.location))
     return SceneSet(scenes.batch(keep), names, places, scenes.dataset, f"{scenes.split}-held-out", {})
-
-
-def fingerprint(scenes: SceneSet) -> str:
-    """Hash of the scenes' contents, to detect checkpoints of other data."""
-    digest = hashlib.sha256("\n".join(scenes.scene_id).encode())
-    for part in scenes.parts():
-        digest.update(part["logged"].numpy().tobytes())
-    return digest.hexdigest()[:16]

@@ -43,19 +43,6 @@ NOBODY = 1e4  # m: distance of vehicles that cannot be the attacker
 Objective = Callable[[Tensor], Tensor]  # latents -> loss [B]
 
 
-@dataclass
-class Known:
-    """What network and loss know of the ego, while the planner is driven anew."""
-
-    context: Context
-    view: View
-
-    def drive(self, ego: Tensor) -> None:
-        """The ego as it has driven last, states [B, HORIZON, 4]."""
-        self.view = replace(self.view, ego=ego[:, SAMPLED_STEPS])
-        self.context = replace(self.context, ego_x=plan_to_x(ego, self.context.state, self.context.routed))
-
-
 @configured("synthesizer/strive")
 @dataclass(eq=False, repr=False)
 class Strive(OpenLoop):
@@ -88,22 +75,25 @@ class Strive(OpenLoop):
 
     def attacked(self, first: Tensor, now: Replan, context: Context) -> tuple[Tensor, View]:
         """x0 [B, V, SIZE] of optimised latents that begin at `first`, and the View with the ego as it last drove."""
-        known = Known(context, View.of(now.world, context, now.ego_plan))
+        view, told = View.of(now.world, context, now.ego_plan), context  # with the ego as it has driven last
 
         def decoded(latent: Tensor) -> Tensor:
-            x0 = decode_latent(self.prior, latent, known.context, self.steps)
+            nonlocal view, told
+            x0 = decode_latent(self.prior, latent, told, self.steps)
             if now.react is not None:
-                known.drive(now.react(self.prior.decode(x0.detach(), context).states()))
+                ego = now.react(self.prior.decode(x0.detach(), context).states())
+                view = replace(view, ego=ego[:, SAMPLED_STEPS])
+                told = replace(context, ego_x=plan_to_x(ego, context.state, context.routed))
             return x0
 
         def loss(latent: Tensor) -> Tensor:
-            motion = motion_of(self.prior, decoded(latent), known.context, 1)
-            return self.loss(motion, latent, first, now.state, known.view)
+            motion = motion_of(self.prior, decoded(latent), told, 1)
+            return self.loss(motion, latent, first, now.state, view)
 
         latent = self.optimised(first, loss)
         with torch.no_grad():
             x0 = decoded(latent)
-        return x0, known.view
+        return x0, view
 
     def optimised(self, latent: Tensor, loss: Objective) -> Tensor:
         """Latents after `iterations` steps of Adam."""

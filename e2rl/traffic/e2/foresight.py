@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from e2rl.metrics.drivers import DriverState, HumanDriver, Observation, no_conflict
+from e2rl.metrics.drivers import HumanDriver, Observation, no_conflict
 from e2rl.metrics.preventable import Along, Tracks, along_way
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.scenes.recording import DT
@@ -73,7 +73,10 @@ def _contacts(path: Tensor, length: Tensor, along: Along, since: Tensor) -> tupl
     time = path.new_full(shape[1:], torch.inf)
     for t in range(path.shape[1] - 1):
         gap = along.rear[t] - way - length / 2
-        asked, memory = _asked(drivers, memory, speed, gap, length, along, t)
+        kept = along.speed, along.lateral_gap, along.lateral_speed, along.length
+        other, aside, nearing, extent = (value[t].expand_as(gap) for value in kept)
+        seen = Observation(speed, speed * 0, gap, other, aside, nearing, aside <= 0, length, extent)
+        memory, asked = drivers.step(memory, seen)
         reacts = reacts | (asked < -1.0)
         planned = own[:, t, None].expand(shape)
         after = (speed + DT * torch.where(reacts, torch.minimum(asked, planned), planned)).clamp(min=0)
@@ -84,18 +87,6 @@ def _contacts(path: Tensor, length: Tensor, along: Along, since: Tensor) -> tupl
         time = torch.where(touch[-1], (t + 1) * DT, time)
         hit = hit | touch
     return torch.cat([hit[:1], front[1:]]), time
-
-
-def _asked(
-    drivers: HumanDriver, memory: DriverState, speed: Tensor, gap: Tensor, length: Tensor, along: Along, step: int
-) -> tuple[Tensor, DriverState]:
-    """Accelerations [D, G, O] that the drivers ask for at a step, and what they remember."""
-    other, aside, nearing, extent = (
-        value[step].expand_as(gap) for value in (along.speed, along.lateral_gap, along.lateral_speed, along.length)
-    )
-    seen = Observation(speed, speed * 0, gap, other, aside, nearing, aside <= 0, length, extent)
-    memory, asked = drivers.step(memory, seen)
-    return asked, memory
 
 
 def time_before(world: World, ego_plan: Tensor, since: Tensor) -> Tensor:

@@ -209,18 +209,10 @@ def _tracks(paths: _Paths, speed: Tensor, accel: Tensor) -> Tensor:
     time = DT * torch.arange(HORIZON + 1, device=speed.device)
     v = (speed[..., None] + accel[..., None] * time).clamp(min=0)
     driven = ((v[..., 1:] + v[..., :-1]) / 2 * DT).cumsum(-1)
-    on_path = driven.minimum(paths.length[..., -1:])
-    after = torch.searchsorted(paths.length.contiguous(), on_path.contiguous()).clamp(1, SAMPLES - 1)
-    low, high = paths.length.gather(-1, after - 1), paths.length.gather(-1, after)
-    share = ((on_path - low) / (high - low).clamp(min=1e-6))[..., None]
-
-    def between(values: Tensor) -> Tensor:
-        first, second = (values.gather(3, i[..., None].expand(*i.shape, 2)) for i in (after - 1, after))
-        return first + share * (second - first)
-
-    tangent = between(paths.tangents)
+    tangent = _at(paths.tangents, paths.length, driven)
     heading = torch.atan2(tangent[..., 1], tangent[..., 0])
-    xy = between(paths.points) + (driven - on_path)[..., None] * direction(heading)
+    beyond = (driven - paths.length[..., -1:]).clamp(min=0)
+    xy = _at(paths.points, paths.length, driven) + beyond[..., None] * direction(heading)
     return torch.cat([xy, heading[..., None], v[..., 1:, None]], -1)
 
 
@@ -249,9 +241,14 @@ def _against_lanes(scene: TensorDictBase, meeting: Tensor, end_heading: Tensor) 
 def _resampled(points: Tensor, length: Tensor, heading: Tensor, count: int) -> Tensor:
     """Vertices [B, M, count, 2] every SPACING m along points [B, M, U, 2] at length [B, M, U], then along `heading`."""
     s = SPACING * torch.arange(count, device=points.device, dtype=points.dtype).expand(*length.shape[:2], count)
+    beyond = (s - length[..., -1:]).clamp(min=0)
+    return _at(points, length, s) + beyond[..., None] * direction(heading)[:, :, None]
+
+
+def _at(values: Tensor, length: Tensor, s: Tensor) -> Tensor:
+    """Values [..., U, 2] at length [..., U] m, linear between them, after s [..., K] m: the last beyond the end."""
     after = torch.searchsorted(length.contiguous(), s.contiguous(), right=True).clamp(1, SAMPLES - 1)
     low, high = length.gather(-1, after - 1), length.gather(-1, after)
-    fraction = ((s - low) / (high - low).clamp(min=1e-6)).clamp(max=1.0)
-    a, b = (points.gather(2, i[..., None].expand(*i.shape, 2)) for i in (after - 1, after))
-    beyond = (s - length[..., -1:]).clamp(min=0)
-    return a + fraction[..., None] * (b - a) + beyond[..., None] * direction(heading)[:, :, None]
+    share = ((s - low) / (high - low).clamp(min=1e-6)).clamp(max=1.0)[..., None]
+    first, second = (values.gather(-2, i[..., None].expand(*i.shape, 2)) for i in (after - 1, after))
+    return first + share * (second - first)

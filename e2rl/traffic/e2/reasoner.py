@@ -19,6 +19,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from e2rl.run.config import library
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
 from e2rl.run.settings import configured, setting
@@ -176,11 +177,7 @@ class LanguageReasoner:
 
     def __init__(self, settings: ReasonerSettings) -> None:
         where = "synthesizer.reasoner.kind=lm"
-        try:
-            import openai
-        except ImportError as error:
-            reason = "the openai client is not installed; install e2rl with its extra: pip install 'e2rl[lm]'"
-            raise InputError(f"{where}: {reason}") from error
+        openai = library("openai", where, "lm")
         given: dict[str, Any] = {"base_url": settings.base_url, "timeout": settings.timeout}
         try:
             self._client = openai.OpenAI(**given, max_retries=settings.retries)
