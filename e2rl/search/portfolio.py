@@ -8,8 +8,7 @@ from torch import Tensor
 
 from e2rl.search.tries import Family
 
-OFTEN = 0.8  # how likely a planner is one that fails often, before its first try
-CHANCE_TRIES = (10.0, 200.0)  # first tries of scenes that `chance` and `hard` of a family stand for at the start
+CHANCE_TRIES = 10.0  # first tries of scenes that a family's chance stands for at the start
 SCENE_TRIES, FAMILY_TRIES = 2.0, 4.0  # after which the next in the scene, and of the family there, has half the chance
 CONTACT, CLOSER, FARTHER, LEAST = 0.75, 2.0, 0.15, 0.1  # see `nearness`
 
@@ -18,11 +17,9 @@ CONTACT, CLOSER, FARTHER, LEAST = 0.75, 2.0, 0.15, 0.1  # see `nearness`
 class Portfolio:
     """Chances of F families in N scenes: that a try finds what the search is for.
 
-    A family has a chance m of the first try in a scene. Its law is that of a rate: Gamma with shape r times the
-    family's own chance + what was found, and rate r + the x of its tries so far. Its own chance is `chance` against
-    planners that fail often, and `hard` against good ones; r is CHANCE_TRIES. Which of the two the planner is, the
-    tries of all families tell by Bayes' rule; each round draws it anew. In a scene with n tries, k of them of the
-    family, the chance is x m, with
+    A family has a chance m of the first try in a scene. Its law is that of a rate: Gamma with shape CHANCE_TRIES times
+    the family's own chance + what was found, and rate CHANCE_TRIES + the x of its tries so far. In a scene with n
+    tries, k of them of the family, the chance is x m, with
 
         x = nearness(margin of the nearest) / ((1 + n / SCENE_TRIES) (1 + k / FAMILY_TRIES)).
 
@@ -37,15 +34,12 @@ class Portfolio:
     learns: bool = True
 
     def __post_init__(self) -> None:
-        own = [[family.chance for family in self.families], [family.hard for family in self.families]]
-        self.rate = torch.tensor(CHANCE_TRIES, dtype=torch.float64)[:, None]
-        self.shape = self.rate * torch.tensor(own, dtype=torch.float64)  # [2, F]
+        prior = torch.tensor([family.chance for family in self.families], dtype=torch.float64)
         self.tried = torch.zeros(self.scenes, len(self.families), dtype=torch.float64)
         self.nearest = torch.full((self.scenes,), torch.nan, dtype=torch.float64)
-        self.found, self.exposed = torch.zeros(2, len(self.families), dtype=torch.float64)  # and the x of the tries
-        first = CHANCE_TRIES[0]
-        self.spent = torch.tensor([first * family.nfe for family in self.families], dtype=torch.float64)
-        self.driven = torch.full_like(self.spent, first)  # tries that have spent so many NFE
+        self.found, self.exposed = CHANCE_TRIES * prior, torch.full_like(prior, CHANCE_TRIES)  # and the x of the tries
+        self.spent = torch.tensor([CHANCE_TRIES * family.nfe for family in self.families], dtype=torch.float64)
+        self.driven = torch.full_like(prior, CHANCE_TRIES)  # tries that have spent so many NFE
 
     def tell(self, scene: int, family: int, found: float, margin: float, nfe: float) -> None:
         """Learn from a try that found so much of what is searched for, 0 to 1."""
@@ -66,21 +60,12 @@ class Portfolio:
         before = (1 + tried.sum(1, keepdim=True) / SCENE_TRIES) * (1 + tried / FAMILY_TRIES)
         return nearness(self.nearest[scenes])[:, None] / before
 
-    def kinds(self) -> Tensor:
-        """How likely the planner is one that fails often, and a good one, by what was found."""
-        shape, rate = self.shape, self.rate
-        law = torch.lgamma(shape + self.found) - torch.lgamma(shape) + shape * rate.log()
-        law = law - (shape + self.found) * (rate + self.exposed).log()
-        return torch.softmax(torch.tensor([OFTEN, 1 - OFTEN], dtype=torch.float64).log() + law.sum(1), 0)
-
     def worth(self, generator: torch.Generator) -> Tensor:
         """A draw of the chances [N, F] per NFE, relative to the dearest family; those of a scene as if tried one after
         another, the best first."""
         if not self.learns:
             return torch.rand(self.tried.shape, generator=generator, dtype=torch.float64)
-        kind = int(torch.multinomial(self.kinds(), 1, generator=generator))
-        drawn = torch._standard_gamma(self.shape[kind] + self.found, generator=generator)
-        chance, cost = drawn / (self.rate[kind] + self.exposed), self.spent / self.driven
+        chance, cost = torch._standard_gamma(self.found, generator=generator) / self.exposed, self.spent / self.driven
         worth = self.share() * chance * cost.amax() / cost
         count, rank = self.tried.sum(1, keepdim=True), worth.argsort(dim=1, descending=True).argsort(dim=1)
         return worth * (1 + count / SCENE_TRIES) / (1 + (count + rank) / SCENE_TRIES)

@@ -39,8 +39,7 @@ class Family:
         method: of traffic, by name.
         ranges: {decision: (low, high) or one number}; whom: index into WHOM.
         changes: of the method's settings.
-        chance, hard: of a failure in a scene's first try, of planners that fail often and of good ones; nfe: what a try
-            costs. The portfolio begins by them.
+        chance, nfe: of a failure in a try, and what a try costs, by which the portfolio begins.
     """
 
     name: str
@@ -48,7 +47,6 @@ class Family:
     ranges: Mapping[str, tuple[float, float] | float]
     changes: Mapping[str, Any] = field(default_factory=dict)
     chance: float = 0.1
-    hard: float = 0.005
     nfe: float = 160.0
 
     def draw(self, scene: int, number: int, seed: int, drawn: int, stratified: bool) -> Try:
@@ -76,7 +74,7 @@ class Family:
 
 
 def family_of(name: str, given: Mapping[str, Any], where: str) -> Family:
-    """A family of its configuration: `method`, `changes`, `chance`, `hard`, `nfe`, and the ranges of decisions.
+    """A family of its configuration: `method`, `changes`, `chance`, `nfe`, and the ranges of decisions.
 
     Raises:
         InputError: a key is no decision, or a value no number, pair of numbers, or kind of vehicle.
@@ -84,9 +82,8 @@ def family_of(name: str, given: Mapping[str, Any], where: str) -> Family:
     if not isinstance(given, Mapping) or not isinstance(given.get("changes", {}), Mapping):
         raise InputError(f"{where}.{name}={given}: expected {{method: NAME, changes: {{}}, DECISION: [low, high]}}")
     ranges: dict[str, tuple[float, float] | float] = {}
-    most = {"chance": 1.0, "hard": 1.0, "nfe": 1e9}
     for key, value in given.items():
-        if key in ("method", "changes", *most):
+        if key in ("method", "changes", "chance", "nfe"):
             continue
         check_choice(f"{where}.{name}: decision {key}", key, DRAWN)
         if key == "whom":
@@ -97,8 +94,9 @@ def family_of(name: str, given: Mapping[str, Any], where: str) -> Family:
         if not known or not 0 <= numbers[0] <= numbers[-1]:
             raise InputError(f"{where}.{name}.{key}={value}: expected a number from 0 on, or [low, high]")
         ranges[key] = tuple(map(float, numbers)) if len(numbers) == 2 else float(numbers[0])  # type: ignore[assignment]
-    about: dict[str, Any] = {key: given[key] for key in most if key in given}
+    about: dict[str, Any] = {key: given[key] for key in ("chance", "nfe") if key in given}
     for key, value in about.items():
-        if not isinstance(value, int | float) or not 0 < value <= most[key]:
-            raise InputError(f"{where}.{name}.{key}={value}: expected a number above 0, at most {most[key]:g}")
+        most = {"chance": 1.0, "nfe": 1e9}[key]
+        if not isinstance(value, int | float) or not 0 < value <= most:
+            raise InputError(f"{where}.{name}.{key}={value}: expected a number above 0, at most {most:g}")
     return Family(name, str(given.get("method", "e2")), ranges, dict(given.get("changes", {})), **about)

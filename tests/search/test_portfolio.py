@@ -1,23 +1,15 @@
 """Tests of e2rl/search/portfolio.py."""
 
-import math
-
-import pytest
 import torch
 
-from e2rl.search.portfolio import CHANCE_TRIES, FAMILY_TRIES, LEAST, OFTEN, SCENE_TRIES, Portfolio, nearness
+from e2rl.search.portfolio import CHANCE_TRIES, FAMILY_TRIES, LEAST, SCENE_TRIES, Portfolio, nearness
 from e2rl.search.tries import Family
 
-FIRST = CHANCE_TRIES[0]
 SURE = 1000.0  # a chance that draws hardly differ from
 
 
 def portfolio(scenes: int = 2, chance: float = SURE, nfe: tuple[float, ...] = (100.0,)) -> Portfolio:
-    """Of families whose chance is the same against any planner."""
-    families = [Family(str(k), "e2", {}, chance=chance, hard=chance, nfe=cost) for k, cost in enumerate(nfe)]
-    found = Portfolio(families, scenes)
-    found.rate, found.shape = found.rate[:1].expand(2, 1), found.shape[:1].expand(2, -1)
-    return found
+    return Portfolio([Family(str(k), "e2", {}, chance=chance, nfe=cost) for k, cost in enumerate(nfe)], scenes)
 
 
 def mean_worth(found: Portfolio, draws: int = 400) -> torch.Tensor:
@@ -33,7 +25,7 @@ def test_a_family_is_worth_its_own_chance_and_less_in_a_scene_where_it_failed():
     found = portfolio()
     torch.testing.assert_close(mean_worth(found), torch.full((2, 1), SURE).double(), rtol=0.01, atol=0)
     found.tell(0, 0, 0.0, 0.0, 100.0)
-    worth, family = mean_worth(found), SURE * FIRST / (FIRST + 1)
+    worth, family = mean_worth(found), SURE * CHANCE_TRIES / (CHANCE_TRIES + 1)
     after = nearness(torch.tensor(0.0)).item() / ((1 + 1 / SCENE_TRIES) * (1 + 1 / FAMILY_TRIES))
     assert close(worth[1].item(), family) and close(worth[0].item(), family * after)
 
@@ -44,9 +36,9 @@ def test_what_a_family_finds_in_one_scene_raises_its_worth_in_all():
     for _ in range(finds):
         found.tell(0, 0, 1.0, 2.0, 100.0)
     near, tries = nearness(torch.tensor(2.0)), torch.arange(1, finds)
-    exposed = FIRST + 1 + (near / ((1 + tries / SCENE_TRIES) * (1 + tries / FAMILY_TRIES))).sum().item()
+    exposed = CHANCE_TRIES + 1 + (near / ((1 + tries / SCENE_TRIES) * (1 + tries / FAMILY_TRIES))).sum().item()
     worth = mean_worth(found, 4000)[1]
-    assert abs(worth[0].item() / ((FIRST * chance + finds) / exposed) - 1) < 0.05 and worth[0] > 2 * worth[1]
+    assert abs(worth[0].item() / ((CHANCE_TRIES * chance + finds) / exposed) - 1) < 0.05 and worth[0] > 2 * worth[1]
 
 
 def test_late_tries_where_all_others_failed_tell_less_against_a_family_than_first_ones():
@@ -73,17 +65,17 @@ def test_a_dear_family_is_worth_less_in_proportion():
     found = portfolio(nfe=(100.0, 400.0))
     worth = mean_worth(found)[0]
     assert close(worth[0].item() / worth[1].item(), 4.0 * (1 + 1 / SCENE_TRIES))  # it would be the second, besides
-    for _ in range(int(FIRST)):
+    for _ in range(int(CHANCE_TRIES)):
         found.tell(1, 1, 0.0, 0.0, 200.0)  # it costs less than it was said to: 300 in the mean
     worth, exposed = mean_worth(found)[0], found.exposed[1].item()
-    assert close(worth[0].item() / worth[1].item(), 3.0 * (1 + 1 / SCENE_TRIES) * (FIRST + exposed) / FIRST)
+    assert close(worth[0].item() / worth[1].item(), 3.0 * (1 + 1 / SCENE_TRIES) * exposed / CHANCE_TRIES)
 
 
 def test_tries_of_one_scene_in_a_round_are_worth_less_one_after_another():
     found = portfolio(scenes=1, nfe=(100.0, 110.0, 120.0))
     found.tell(0, 2, 0.0, 0.0, 120.0)
     share, worth = found.share()[0], mean_worth(found)[0]
-    alone = share * SURE * FIRST / (FIRST + found.exposed) * 120.0 / torch.tensor([100.0, 110.0, 120.0])
+    alone = share * (found.found / found.exposed) * 120.0 / torch.tensor([100.0, 110.0, 120.0])
     rank = torch.tensor([0.0, 1.0, 2.0])
     torch.testing.assert_close(worth, alone * (1 + 1 / SCENE_TRIES) / (1 + (1 + rank) / SCENE_TRIES), rtol=0.02, atol=0)
 
@@ -106,31 +98,3 @@ def test_without_learning_nothing_that_was_told_changes_the_choice():
     for _ in range(50):
         found.tell(0, 0, 1.0, 2.0, 100.0)
     torch.testing.assert_close(mean_worth(found, 4000), torch.full((2, 2), 0.5).double(), atol=0.03, rtol=0)
-
-
-def test_the_kind_of_planner_follows_by_bayes_from_what_was_found():
-    """One family, 0.3 against planners that fail often and 0.01 against good ones: with e finds in x first tries the
-    marginal is r^a G(a + e) / (G(a) (r + x)^(a + e)), a = r times the chance."""
-    family = Family("a", "e2", {}, chance=0.3, hard=0.01)
-    found = Portfolio([family], 200)
-    torch.testing.assert_close(found.kinds(), torch.tensor([OFTEN, 1 - OFTEN], dtype=torch.float64))
-    for scene in range(12):
-        found.tell(scene, 0, float(scene < 2), 0.0, 100.0)
-    law = []
-    for rate, chance in zip(CHANCE_TRIES, (0.3, 0.01), strict=True):
-        a = rate * chance
-        law.append(rate**a * math.gamma(a + 2) / math.gamma(a) / (rate + 12) ** (a + 2))
-    often = OFTEN * law[0] / (OFTEN * law[0] + (1 - OFTEN) * law[1])
-    assert found.kinds()[0].item() == pytest.approx(often)
-
-
-def test_against_a_planner_that_hardly_fails_the_families_for_such_are_tried():
-    """The one that finds most against bad planners is not, after a round without a find."""
-    often, hard = Family("often", "e2", {}, chance=0.4, hard=0.001), Family("hard", "e2", {}, chance=0.1, hard=0.03)
-    found = Portfolio([often, hard], 100)
-    first = mean_worth(found)[0]
-    assert first[0] > first[1]
-    for scene in range(60):
-        found.tell(scene, 0, 0.0, 0.0, 100.0)
-    later = mean_worth(found)[99]
-    assert found.kinds()[1] > 0.99 and later[1] > 3 * later[0]

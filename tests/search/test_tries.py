@@ -54,7 +54,7 @@ def test_a_family_is_read_from_its_configuration():
     [
         {"speed": 3}, {"whom": "trucks"}, {"patience": "late"}, {"patience": [1, 2, 3]}, {"patience": [2, 1]}, 3,
         {"strength": -3},
-        {"chance": 2}, {"hard": 0}, {"chance": "x"}, {"nfe": 0}, {"changes": "abc"},
+        {"chance": 2}, {"chance": "x"}, {"nfe": 0}, {"changes": "abc"},
     ],
 )  # fmt: skip
 def test_what_is_no_decision_is_told_where_it_stands(given):
