@@ -12,7 +12,7 @@ from e2rl.evaluation.protocol import Setup
 from e2rl.search.search import Search
 from e2rl.search.tries import Try
 
-SCENES, TRIES = 48, 8
+SCENES, TRIES = 32, 4
 
 
 def searched_rollouts(bench: Bench) -> Iterator[Row]:
