@@ -1,7 +1,8 @@
 """The prior as background traffic: every 0.5 s a joint sample of the reverse SDE, given the ego's plan, no control.
 
-Traffic predicts the ego from its state and past, as other drivers see it. So no planner can mislead its adversaries by
-what it announces as its plan (docs/adversaries.md). With `knowledge` "plan" it is told the plan.
+Traffic predicts the ego from its state and past, as other drivers see it: on the route that is the likeliest by how it
+drives. So no planner can mislead its adversaries by what it announces as its plan (docs/adversaries.md). With
+`knowledge` "plan" it is told the plan and the mission.
 """
 
 from collections.abc import Callable

@@ -36,7 +36,8 @@ class FeasibilitySettings:
 
 @dataclass(frozen=True)
 class Conflicts:
-    """Conflict points of the candidate routes with the ego's mission route; each [B, V, R], 0 where `exists` is false.
+    """Conflict points of the candidate routes with the ego's mission route, or with that on which it is expected
+    (`NominalTraffic.as_seen`); each [B, V, R], 0 where `exists` is false.
 
     exists: the routes meet, and both vehicles can be there at the same time within the horizon; s [m]: arc length of
     the conflict point on the candidate; earliest, latest [s]: times at which both can be there; time_gap [s]: between
