@@ -97,7 +97,8 @@ def small_stage(monkeypatch, folder, scenes=None):
     """stage=bits on small scenes."""
     options = ["stage=bits", "stage.hidden=16", "stage.epochs=3", "stage.minibatch=16"]
     monkeypatch.setattr(bits_training, "load_scenes", lambda *given, **named: scenes or braking_scenes())
-    monkeypatch.setattr(Run, "begin", lambda run, inputs: None), monkeypatch.setattr(Run, "origin", lambda run: {})
+    monkeypatch.setattr(Run, "begin", lambda run, inputs: None)
+    monkeypatch.setattr(bits_training, "origin_of", lambda folder: {})
     torch.manual_seed(0)
     return run_bits_stage(Run(load_config("train", options), folder, {}), RunLogger("csv", folder))
 
