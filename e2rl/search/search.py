@@ -64,7 +64,6 @@ class Search(Extension):
         self.cells: set[str] = set()
         self._portfolio = Portfolio(self.families, len(self.numbers), self.settings.bandit)
         self._generator = torch.Generator().manual_seed(self.seed)
-        self._drawn = torch.zeros(len(self.numbers), len(self.families), dtype=torch.int64)
 
     def ask(self) -> list[Try]:
         """The next tries, to be told in this order: one of every scene until it has `cover` of them, then of those
@@ -106,9 +105,7 @@ class Search(Extension):
 
     def _draw(self, scene: int, family: int, number: int) -> Try:
         """The next try of a family in a scene, the scene's `number`-th."""
-        drawn = int(self._drawn[scene, family])
-        self._drawn[scene, family] += 1
-        return self.families[family].draw(scene, number, self.seed_of(scene), drawn, self.settings.stratified)
+        return self.families[family].draw(scene, number, self.seed_of(scene), self.settings.stratified)
 
     def seed_of(self, scene: int) -> int:
         """Of the draws of a scene."""

@@ -49,18 +49,16 @@ class Family:
     chance: float = 0.1
     nfe: float = 160.0
 
-    def draw(self, scene: int, number: int, seed: int, drawn: int, stratified: bool) -> Try:
-        """The try `number` of a scene, the family's `drawn`-th there; reproducible from the seed of the scene's search.
+    def draw(self, scene: int, number: int, seed: int, stratified: bool) -> Try:
+        """The try `number` of a scene; reproducible from the seed of the scene's search.
 
-        Stratified, the decisions of consecutive draws follow the additive recurrence of square roots of primes, and so
-        look elsewhere than those before.
+        Stratified, the decisions of consecutive tries of a scene, of whatever families, follow the additive recurrence
+        of square roots of primes, and so look elsewhere than those before.
         """
-        generator = torch.Generator().manual_seed(seed)
-        begin = torch.rand(len(DRAWN), generator=generator, dtype=torch.float64)
+        generator = torch.Generator().manual_seed(seed if stratified else seed + 7919 * (number + 1))
+        u = torch.rand(len(DRAWN), generator=generator, dtype=torch.float64)
         if stratified:
-            u = (begin + drawn * torch.tensor(PRIMES, dtype=torch.float64).sqrt()) % 1
-        else:
-            u = torch.rand(len(DRAWN), generator=generator.manual_seed(seed + 7919 * (drawn + 1)), dtype=torch.float64)
+            u = (u + number * torch.tensor(PRIMES, dtype=torch.float64).sqrt()) % 1
         return self.attempt(scene, number, seed, u)
 
     def attempt(self, scene: int, number: int, seed: int, draw: Tensor) -> Try:
