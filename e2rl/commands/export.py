@@ -2,45 +2,29 @@
 
 import argparse
 import csv
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from tqdm import tqdm
 
 from e2rl.evaluation.rollout_files import TABLE, own_folder, read_rows
 from e2rl.metrics.failure_modes import is_failure
-from e2rl.report.export import archive, mcap, openscenario
-from e2rl.report.export import commonroad_writer as commonroad
-from e2rl.report.export import scenarionet_writer as scenarionet
-from e2rl.report.export.episode import FACTS
+from e2rl.report.export.episode import FACTS, Episode
 from e2rl.report.export.scene_files import episodes_of
 from e2rl.run.config import library
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import written_whole
 
-FORMATS = {
-    "commonroad": commonroad.write,
-    "openscenario": openscenario.write,
-    "scenarionet": scenarionet.write,
-    "mcap": mcap.write,
-    "npz": archive.write,
+FORMATS = {  # modules of e2rl.report.export; what a module imports is in the extra of the format's name
+    "commonroad": "commonroad_writer",
+    "openscenario": "openscenario",
+    "scenarionet": "scenarionet_writer",
+    "mcap": "mcap",
+    "npz": "archive",
 }
 OPEN_EGO = ("commonroad", "openscenario")  # formats in which the ego's place may be left open
 LIST = "exported.csv"
-LIBRARIES = {  # modules that a format needs, from the extra of its name
-    "commonroad": ("commonroad.common.writer.file_writer_xml",),
-    "openscenario": ("scenariogeneration",),
-    "mcap": ("mcap.writer", "mcap_protobuf.schema", "foxglove_schemas_protobuf.SceneUpdate_pb2"),
-}
-
-
-def check_format(name: str, open_ego: bool) -> None:
-    """InputError for a format whose library is missing, and for an open ego in a format without one."""
-    if open_ego and name not in OPEN_EGO:
-        raise InputError(f"--open-ego: {name} has no such form; leave it out, or pass --to {' or '.join(OPEN_EGO)}")
-    for module in LIBRARIES.get(name, ()):
-        library(module, f"--to {name}", name)
 
 
 def chosen_rows(run: Path, failures: int | None, every: bool, method: str | None) -> list[dict]:
@@ -61,27 +45,16 @@ def chosen_rows(run: Path, failures: int | None, every: bool, method: str | None
     return found[:failures]
 
 
-def export(
-    run: Path,
-    target: str,
-    rows: Sequence[dict],
-    out: Path,
-    plugins: Sequence[str] = (),
-    scene: bool = True,
-    open_ego: bool = False,
-) -> int:
-    """Write the rollouts of rows of rollouts.csv into a new folder, and return how many."""
+def export(episodes: Iterator[Episode], write: Callable[..., Iterator], out: Path, open_ego: bool) -> None:
+    """Write episodes by the `write` of a format into a new folder, with a list of the files and their facts."""
     if out.exists():
         raise InputError(f"{out}: is there already; remove it, or pass another folder with --out")
-    episodes = episodes_of(run, rows, plugins, scene)
-    shown = tqdm(episodes, "exporting", len(rows), unit="rollout", leave=False, disable=None)
     with written_whole(out) as folder, (folder / LIST).open("w", newline="") as file:
         writer = csv.DictWriter(file, ("file", *FACTS, "adversaries"), restval="", lineterminator="\n")
         writer.writeheader()
-        for episode, path in FORMATS[target](shown, folder, open_ego):
+        for episode, path in write(episodes, folder, open_ego):
             facts = episode.facts | {"adversaries": " ".join(map(str, episode.facts["adversaries"]))}
             writer.writerow({"file": str(path.relative_to(folder))} | facts)
-    return len(rows)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -99,9 +72,14 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     with ending():
         out = options.out or own_folder(options.run, "export", options.to)
-        check_format(options.to, options.open_ego)
+        if options.open_ego and options.to not in OPEN_EGO:
+            others = " or ".join(OPEN_EGO)
+            raise InputError(f"--open-ego: {options.to} has no such form; leave it out, or pass --to {others}")
+        write = library(f"e2rl.report.export.{FORMATS[options.to]}", f"--to {options.to}", options.to).write
         if options.failures is not None and options.failures < 1:
             raise InputError(f"--failures {options.failures}: expected at least 1")
         rows = chosen_rows(options.run, options.failures, options.all, options.method)
-        count = export(options.run, options.to, rows, out, options.plugin, not options.no_scene, options.open_ego)
-        print(f"{count} rollouts written to {out}")
+        episodes = episodes_of(options.run, rows, options.plugin, not options.no_scene)
+        shown = tqdm(episodes, "exporting", len(rows), unit="rollout", leave=False, disable=None)
+        export(shown, write, out, options.open_ego)
+        print(f"{len(rows)} rollouts written to {out}")

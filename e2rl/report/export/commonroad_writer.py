@@ -12,13 +12,36 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
+from commonroad.common.common_scenario import GeoTransformation, Location, ScenarioID
+from commonroad.common.util import Interval
+from commonroad.common.writer.file_writer_interface import OverwriteExistingFile
+from commonroad.common.writer.file_writer_xml import XMLFileWriter
+from commonroad.geometry.obstacle_shapes.rect_obstacle_shape import RectObstacleShape
+from commonroad.geometry.occupancy.rect_occupancy import RectOccupancy
+from commonroad.planning.goal import GoalRegion
+from commonroad.planning.planning_problem import PlanningProblem, PlanningProblemSet
+from commonroad.prediction.prediction import TrajectoryPrediction
+from commonroad.scenario.lanelet import Lanelet, LaneletType
+from commonroad.scenario.obstacle import DynamicObstacle, ObstacleType
+from commonroad.scenario.scenario import Scenario, Tag
+from commonroad.scenario.state import CustomState, InitialState
+from commonroad.scenario.traffic_light import (
+    TrafficLight,
+    TrafficLightCycle,
+    TrafficLightCycleElement,
+    TrafficLightDirection,
+    TrafficLightState,
+)
+from commonroad.scenario.traffic_sign import TrafficSign, TrafficSignElement, TrafficSignIDZamunda
+from commonroad.scenario.trajectory import Trajectory
+from lxml import etree
 
-from e2rl.report.export.episode import Episode
+from e2rl.report.export.episode import LONG, Episode
 from e2rl.scenes.paths import shift_left, tangent_angle, wrap
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW
 
 TYPES = {"vehicle": "CAR", "pedestrian": "PEDESTRIAN", "cyclist": "BICYCLE", "other": "UNKNOWN"}  # of ObstacleType
-LONG = 7.0  # m: longer vehicles are trucks
 LIGHTS = {LIGHT_RED: "RED", LIGHT_YELLOW: "YELLOW", LIGHT_GREEN: "GREEN", LIGHT_UNKNOWN: "INACTIVE"}
 GOAL_LENGTH, GOAL_WIDTH = 10.0, 4.0  # m
 STRAIGHT = 0.5  # rad that a lane may turn and still lead straight on
@@ -27,11 +50,6 @@ MOST_CHARACTERS = 40  # of a map's name
 
 def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> Iterator[tuple[Episode, Path]]:
     """Write ZAM_<place>-<n>_1_T-1.xml of each episode; open_ego: the ego is a planning problem only, no obstacle."""
-    from commonroad.common.writer.file_writer_interface import OverwriteExistingFile
-    from commonroad.common.writer.file_writer_xml import XMLFileWriter
-    from commonroad.scenario.scenario import Tag
-    from lxml import etree
-
     for number, episode in enumerate(episodes, 1):
         made, problems = scenario(episode, number, open_ego)
         known = {"author": "", "affiliation": "", "source": "e2rl", "tags": {Tag.CRITICAL, Tag.SIMULATED}}
@@ -45,10 +63,6 @@ def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> 
 
 def scenario(episode: Episode, number: int, open_ego: bool) -> tuple[Any, Any]:
     """The Scenario, whose map is called `number`, and the PlanningProblemSet of an episode."""
-    from commonroad.common.common_scenario import GeoTransformation, Location, ScenarioID
-    from commonroad.planning.planning_problem import PlanningProblemSet
-    from commonroad.scenario.scenario import Scenario
-
     place = re.sub(r"[^A-Za-z0-9]", "", episode.rollout.location)[:MOST_CHARACTERS] or "E2rl"
     name = ScenarioID(map_name=place, map_id=number, configuration_id=1, obstacle_behavior="T", prediction_id=1)
     made = Scenario(episode.rollout.dt, name)
@@ -68,8 +82,6 @@ def scenario(episode: Episode, number: int, open_ego: bool) -> tuple[Any, Any]:
 
 def lanelets(episode: Episode, ids: Iterator[int]) -> list:
     """A lanelet for each lane, half its width to both sides of the centreline."""
-    from commonroad.scenario.lanelet import Lanelet, LaneletType
-
     number = {name: next(ids) for name in episode.lanes}
     entries, made = episode.entries(), []
     for name, lane in episode.lanes.items():
@@ -94,8 +106,6 @@ def lanelets(episode: Episode, ids: Iterator[int]) -> list:
 
 def speed_limits(episode: Episode, made: Any, ids: Iterator[int]) -> list:
     """A virtual sign for each speed limit; lanelets refer to theirs."""
-    from commonroad.scenario.traffic_sign import TrafficSign, TrafficSignElement, TrafficSignIDZamunda
-
     signs = {}
     for lane, lanelet in zip(episode.lanes.values(), made.lanelet_network.lanelets, strict=True):
         if lane.speed_limit <= 0:
@@ -110,8 +120,6 @@ def speed_limits(episode: Episode, made: Any, ids: Iterator[int]) -> list:
 
 def traffic_lights(episode: Episode, made: Any, ids: Iterator[int]) -> list:
     """A light at the end of each lanelet before one with a light; where it leads to several, one for each direction."""
-    from commonroad.scenario.traffic_light import TrafficLight, TrafficLightDirection
-
     number = dict(zip(episode.lanes, made.lanelet_network.lanelets, strict=True))
     found = []
     for name, lane in episode.lanes.items():
@@ -130,8 +138,6 @@ def traffic_lights(episode: Episode, made: Any, ids: Iterator[int]) -> list:
 
 def cycle(states: Iterable[int]) -> Any:
     """Light states, one a time step, as a cycle."""
-    from commonroad.scenario.traffic_light import TrafficLightCycle, TrafficLightCycleElement, TrafficLightState
-
     runs = [(TrafficLightState[LIGHTS[state]], len(list(group))) for state, group in groupby(states)]
     return TrafficLightCycle([TrafficLightCycleElement(state, length) for state, length in runs])
 
@@ -148,11 +154,6 @@ def turn(episode: Episode, name: str) -> str:
 
 def obstacles(episode: Episode, ids: Iterator[int], open_ego: bool) -> list:
     """A dynamic obstacle for each appearance of an agent of at least two steps, which is the least of the format."""
-    from commonroad.geometry.obstacle_shapes.rect_obstacle_shape import RectObstacleShape
-    from commonroad.prediction.prediction import TrajectoryPrediction
-    from commonroad.scenario.obstacle import DynamicObstacle, ObstacleType
-    from commonroad.scenario.trajectory import Trajectory
-
     made = []
     for row in episode.agents[1:] if open_ego else episode.agents:
         kind, (length, width) = str(episode.rollout.agent_type[row]), episode.size(row)
@@ -169,8 +170,6 @@ def obstacles(episode: Episode, ids: Iterator[int], open_ego: bool) -> list:
 
 def state(episode: Episode, step: int, row: int, **more: float) -> Any:
     """An agent's state at a step: the middle of its box, heading and speed."""
-    from commonroad.scenario.state import InitialState
-
     x, y, heading, speed = episode.rollout.states[step, row].astype(float).tolist()
     position, turned = np.array([x, y]), float(wrap(heading))
     return InitialState(time_step=step, position=position, orientation=turned, velocity=speed, **more)
@@ -178,13 +177,6 @@ def state(episode: Episode, step: int, row: int, **more: float) -> Any:
 
 def planning_problem(episode: Episode, number: int) -> Any:
     """From the ego's start to where its recording ends, at any time; the route between is the planner's."""
-    import shapely
-    from commonroad.common.util import Interval
-    from commonroad.geometry.occupancy.rect_occupancy import RectOccupancy
-    from commonroad.planning.goal import GoalRegion
-    from commonroad.planning.planning_problem import PlanningProblem
-    from commonroad.scenario.state import CustomState
-
     last = int(np.flatnonzero(episode.rollout.logged_valid[:, 0])[-1])
     x, y, heading, _ = episode.rollout.logged[last, 0].astype(float).tolist()
     there = RectOccupancy(shapely.Point(x, y), GOAL_WIDTH, GOAL_LENGTH, float(wrap(heading)))

@@ -23,6 +23,7 @@ FACTS = (  # columns of rollouts.csv that go along; docs/verdicts.md and docs/mo
     *("partner", "contact_step", "contact_type", "approach", "ego_manoeuvre", "partner_manoeuvre", "duty"),
     *("counted", "at_fault", "preventable", "avoidable"),
 )
+LONG = 7.0  # m: longer vehicles are trucks
 SAME = 0.01  # m: a map or a start that differs by more is another one
 
 

@@ -18,7 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from matplotlib.colors import to_rgba
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import register_schema
 
 from e2rl.report import drawing
 from e2rl.report.export.episode import Episode
@@ -48,11 +52,6 @@ def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> 
 
 def content(episode: Episode) -> bytes:
     """The file of an episode."""
-    from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
-    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-    from mcap.writer import CompressionType, Writer
-    from mcap_protobuf.schema import register_schema
-
     buffer = io.BytesIO()
     writer = Writer(buffer, compression=CompressionType.ZSTD)
     writer.start(profile="", library="e2rl")

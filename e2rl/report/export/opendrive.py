@@ -10,6 +10,8 @@ from xml.etree import ElementTree
 
 import networkx as nx
 import numpy as np
+from pyclothoids import Clothoid
+from scenariogeneration import xodr
 
 from e2rl.report.export.episode import Episode
 from e2rl.scenes.paths import resample, tangent_angle
@@ -40,8 +42,6 @@ def write_roads(episode: Episode, path: Path) -> None:
 
 def road_network(episode: Episode) -> Any:
     """The xodr.OpenDrive of an episode; road n + 1 is lane n."""
-    from scenariogeneration import xodr
-
     made = xodr.OpenDrive(episode.rollout.location or episode.rollout.scene_id, revMinor="7")
     number = {name: index for index, name in enumerate(episode.lanes, 1)}
     plain, connecting = links(episode.lanes)
@@ -117,8 +117,6 @@ def road(
     name: str,
 ) -> Any:
     """The xodr.Road of a lane. before, after: the road and the junction that it is linked with, None for none."""
-    from scenariogeneration import xodr
-
     plan = xodr.PlanView()
     for geometry, x, y, heading in geometries(lane.points, tangent_angle(lane.points)):
         plan.add_fixed_geometry(geometry, x, y, heading)
@@ -144,9 +142,6 @@ def road(
 def geometries(points: np.ndarray, angle: np.ndarray) -> list[tuple[Any, float, float, float]]:
     """(geometry, x, y, heading) of clothoids through some of the points [P, 2] of a centreline, in the directions [P]
     that it has there: one clothoid, or, where that lies more than FIT beside the centreline, those of both halves."""
-    from pyclothoids import Clothoid
-    from scenariogeneration import xodr
-
     (x0, y0), (x1, y1) = points[0].tolist(), points[-1].tolist()
     curve = Clothoid.G1Hermite(x0, y0, float(angle[0]), x1, y1, float(angle[-1]))
     length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scenariogeneration import xosc
 
-from e2rl.report.export.commonroad_writer import LONG
-from e2rl.report.export.episode import Episode
+from e2rl.report.export.episode import LONG, Episode
 from e2rl.report.export.opendrive import write_roads
 from e2rl.scenes.paths import WHEELBASE
 
@@ -37,8 +37,6 @@ def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> 
 
 def scenario(episode: Episode, road: str | None, open_ego: bool) -> Any:
     """The xosc.Scenario of an episode on the roads in the file `road`."""
-    from scenariogeneration import xosc
-
     entities, init = xosc.Entities(), xosc.Init()
     act = xosc.Act("replay", at(0.0, "replay begins"))
     for row in episode.agents:
@@ -86,8 +84,6 @@ def rear_axle(episode: Episode, row: int) -> float:
 
 def entity(episode: Episode, row: int) -> Any:
     """The Vehicle, Pedestrian or MiscObject of an agent."""
-    from scenariogeneration import xosc
-
     kind, (length, width), back = kind_of(episode, row), episode.size(row), rear_axle(episode, row)
     name, height = f"{name_of(row)} {kind}", HEIGHT[kind]
     box = xosc.BoundingBox(width, length, height, back, 0.0, height / 2)
@@ -109,8 +105,6 @@ def entity(episode: Episode, row: int) -> Any:
 
 def events_of(episode: Episode, row: int) -> list:
     """The events of an agent: it appears and follows its polyline, and it vanishes, as often as the rollout has it."""
-    from scenariogeneration import xosc
-
     name, events = name_of(row), []
     for first, end in episode.appearances(row):
         begin, gone = (round(step * episode.rollout.dt, 6) for step in (first, end))
@@ -134,8 +128,6 @@ def events_of(episode: Episode, row: int) -> list:
 
 def places(episode: Episode, row: int, first: int, end: int) -> list:
     """WorldPositions of an agent's reference point at steps first to end - 1; headings are continuous."""
-    from scenariogeneration import xosc
-
     states = episode.rollout.states[first:end, row].astype(float)
     heading = np.unwrap(states[:, 2])
     ahead = np.stack([np.cos(heading), np.sin(heading)], -1)
@@ -148,7 +140,5 @@ def places(episode: Episode, row: int, first: int, end: int) -> list:
 
 def at(seconds: float, name: str, point: str = "start") -> Any:
     """The trigger of a simulation time."""
-    from scenariogeneration import xosc
-
     condition = xosc.SimulationTimeCondition(seconds, xosc.Rule.greaterOrEqual)
     return xosc.ValueTrigger(name, 0, xosc.ConditionEdge.none, condition, point)

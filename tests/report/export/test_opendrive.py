@@ -8,10 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from e2rl.report.export.opendrive import FIT, junctions_of, left_out, links
-from e2rl.scenes.paths import resample, tangent_angle
-from e2rl.scenes.recording import Lane
-from tests.report.export.small_run import exported
+pytest.importorskip("scenariogeneration", reason="--to openscenario needs the extra openscenario")
+from e2rl.report.export.opendrive import FIT, junctions_of, left_out, links  # noqa: E402
+from e2rl.scenes.paths import resample, tangent_angle  # noqa: E402
+from e2rl.scenes.recording import Lane  # noqa: E402
+from tests.report.export.small_run import exported  # noqa: E402
 
 
 def graph(**exits: str) -> dict[str, Lane]:
@@ -45,7 +46,6 @@ def test_said_links_are_links_and_every_end_has_at_most_one_partner(pairs):
 @pytest.fixture(scope="module")
 def roads(run, tmp_path_factory):
     """(root of the OpenDRIVE file, its path) of the first rollout."""
-    pytest.importorskip("scenariogeneration", reason="--to openscenario needs the extra openscenario")
     path = exported(run, tmp_path_factory.mktemp("opendrive") / "out", "openscenario")[0].with_suffix(".xodr")
     return ElementTree.parse(path).getroot(), path
 
