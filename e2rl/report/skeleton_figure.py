@@ -8,6 +8,7 @@ to collision and as the chain.
 """
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -39,6 +40,7 @@ CANDIDATE, FEASIBLE = drawing.VULNERABLE, "#2e8b57"
 ON_TOP = 10  # drawing order of edges, arrows and names, above the map
 LEGEND = {"ego": drawing.EGO, "coalition C*": drawing.ADVERSARY, "candidate of the topology": CANDIDATE}
 LEGEND |= {"feasible, no candidate": FEASIBLE, "others": drawing.BACKGROUND}
+Part = tuple[str, Callable[[Axes], None]]  # of a figure: its caption, and what draws it
 
 
 @dataclass
@@ -98,23 +100,18 @@ class SkeletonPicture:
 
     def figure(self) -> Figure:
         """The three panels beside each other, under their titles."""
-        (figure, axes), rollout = new_panels(3, SIDE, GAP, HEAD, FOOT), self.rollout
+        rollout = self.rollout
         title = (
             f"{shorten(rollout.scene_id)}   seed {rollout.seed}   intensity {rollout.eta:g}   "
             f"{rollout.method} vs {rollout.ego_policy}   chosen at {self.step * rollout.dt:.1f} s"
         )
-        figure.suptitle(title, x=0.004, y=0.985, ha="left", fontsize=15, color=drawing.INK)
         gap, longest = f"{self.settings.clearance:g} m", f"{self.ttc(self.settings.edge_threshold):.1f} s"
-        captions = (
-            f"time to a gap of {gap} [s], {self.time:.1f} s into the reference rollout",
-            f"risk graph at that time, edges of TTC < {longest}",
-            "active chain, and the paths driven after it",
-        )
-        for panel, caption, draw in zip(axes, captions, (self.matrix, self.graph, self.chain), strict=True):
-            panel.set_title(caption, loc="left", x=8 / SIDE, fontsize=14, color=drawing.MUTED)
-            draw(panel)
-        add_legend(figure, LEGEND, 13)
-        return figure
+        parts = {
+            f"time to a gap of {gap} [s], {self.time:.1f} s into the reference rollout": self.matrix,
+            f"risk graph at that time, edges of TTC < {longest}": self.graph,
+            "active chain, and the paths driven after it": self.chain,
+        }
+        return panels(title, list(parts.items()))
 
     def matrix(self, axes: Axes) -> None:
         """TTC of every pair of nodes, red by weight; the links of the coalition are framed."""
@@ -222,18 +219,24 @@ class LongestChain:
         chain of each; None where no adversary was chosen at the start."""
         if self.first is None:
             return None
-        figure, axes = new_panels(4, SIDE, GAP, HEAD, FOOT)
-        for place, method in enumerate((other, self.method)):
+        parts: list[Part] = []
+        for method in (other, self.method):
             picture = SkeletonPicture.driven(rollout_of(self.first, method, scenes, ego_name, folder), self.first)
-            captions = f"{method.name}: TTC {picture.time:.1f} s after the start [s]", "chain, and the paths driven"
-            draws = zip(axes[2 * place :], captions, (picture.matrix, picture.chain), strict=False)
-            for panel, caption, draw in draws:
-                panel.set_title(caption, loc="left", x=8 / SIDE, fontsize=14, color=drawing.MUTED)
-                draw(panel)
+            parts.append((f"{method.name}: TTC {picture.time:.1f} s after the start [s]", picture.matrix))
+            parts.append(("chain, and the paths driven", picture.chain))
         title = f"{shorten(picture.rollout.scene_id)}   the same coalition under {other.name} and {self.method.name}"
-        figure.suptitle(title, x=0.004, y=0.985, ha="left", fontsize=15, color=drawing.INK)
-        add_legend(figure, LEGEND, 13)
-        return figure
+        return panels(title, parts)
+
+
+def panels(title: str, parts: Sequence[Part]) -> Figure:
+    """The parts beside each other under their captions; above them a title, below them what the colours mean."""
+    figure, axes = new_panels(len(parts), SIDE, GAP, HEAD, FOOT)
+    figure.suptitle(title, x=0.004, y=0.985, ha="left", fontsize=15, color=drawing.INK)
+    for panel, (caption, draw) in zip(axes, parts, strict=True):
+        panel.set_title(caption, loc="left", x=8 / SIDE, fontsize=14, color=drawing.MUTED)
+        draw(panel)
+    add_legend(figure, LEGEND, 13)
+    return figure
 
 
 def rollout_of(selection: Selection, method: Method, scenes: SceneSet, ego_name: str, folder: Path) -> Rollout:
