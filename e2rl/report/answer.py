@@ -9,6 +9,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from e2rl.evaluation.modes import OTHER
 from e2rl.evaluation.rollout_files import ERRORED_FILE
 from e2rl.metrics.catalogue import METRICS
 from e2rl.report.comparison_tables import by_ego
@@ -16,7 +17,6 @@ from e2rl.report.tables import UNKNOWN, closed_loop, number, plural
 
 LINES, NARROWEST, WIDEST = 25, 80, 100
 WEAKNESSES, MOST_ROWS = 3, 10  # lines of failure modes; rows of a comparison
-OTHER = 0  # number of the small failure modes together
 KINDS = {"preventable": "cfr_preventable", "clean": "cfr_clean", "count": "cfr_counted"}  # of failures, the first leads
 COUNTS = (
     "preventable: a careful and competent driver would have had none; clean: besides, nobody else did wrong; count: "

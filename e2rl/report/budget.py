@@ -189,22 +189,15 @@ def budget_tables(rows: Sequence[Mapping], scenes: int, knowledge: str) -> list[
     digits = {"scenes": 1, "cells": 1, "failures": 2, "clean": 2, "real_adv": 3}
     for ego in dict.fromkeys(row["ego"] for row in rows):
         own = [row for row in rows if row["ego"] == ego]
-        head = [
-            "method",
-            own[0]["unit"],
-            "tries",
-            "NFE",
-            "s",
-            *ABOUT.values(),
-            *(f"ratio of {name}" for name in COMPARED),
-        ]
+        ratios = (f"ratio of {name}" for name in COMPARED)
+        head = ["method", own[0]["unit"], "tries", "NFE", "s", *ABOUT.values(), *ratios]
         lines = []
         for row in own:
             some = f" in {row['tried']:.0f} scenes" if row["tried"] < scenes else ""
             spent = [f"{row['tries_a_scene']:.1f}{some}", f"{row['nfe_a_scene']:.0f}", f"{row['seconds_a_scene']:.1f}"]
-            ratios = [cell(row[f"{name}_ratio"], 2) if f"{name}_ratio" in row else "–" for name in COMPARED]
+            over = [cell(row[f"{name}_ratio"], 2) if f"{name}_ratio" in row else "–" for name in COMPARED]
             values = [cell(row[name], count) for name, count in digits.items()]
-            lines.append([row["method"], f"{row['budget']:g}", *spent, *values, *ratios])
+            lines.append([row["method"], f"{row['budget']:g}", *spent, *values, *over])
         title = f"Failures of {ego} within a budget, in {own[0]['unit']} a scene"
         tables.append(Table(f"{scenes} scenes. {CAPTION} {knowledge}", head, lines, title))
     return tables

@@ -32,7 +32,8 @@ def grids(rows: Sequence[Choice]) -> tuple[list[int], list[tuple[str, float]], n
     """Rounds [R], arms [A] as (template, eta), and by arm and round the fraction of the round's draws and the
     fraction of failed episodes, both [A, R]; NaN where nobody was drawn, or no episode driven."""
     rounds = sorted({int(row["round"]) for row in rows})
-    arms = sorted({(str(row["template"]), float(row["eta"])) for row in rows}, key=_order)
+    found = {(str(row["template"]), float(row["eta"])) for row in rows}
+    arms = sorted(found, key=lambda arm: (TEMPLATES.index(arm[0]), arm[1]))
     draws, episodes, failures = np.zeros((3, len(arms), len(rounds)))
     for row in rows:
         at = arms.index((str(row["template"]), float(row["eta"]))), rounds.index(int(row["round"]))
@@ -41,10 +42,6 @@ def grids(rows: Sequence[Choice]) -> tuple[list[int], list[tuple[str, float]], n
     drawn = draws / draws.sum(0, keepdims=True).clip(min=1)
     rate = np.where(episodes > 0, failures / episodes.clip(min=1), np.nan)
     return rounds, arms, np.where(draws > 0, drawn, np.nan), rate
-
-
-def _order(arm: tuple[str, float]) -> tuple[int, float]:
-    return TEMPLATES.index(arm[0]), arm[1]
 
 
 def choice_map(rows: Sequence[Choice]) -> Figure:

@@ -34,7 +34,8 @@ PANELS = (  # (horizontal, vertical): failures over realism, then what they are 
 )
 COLUMNS = ("cfr", "cfr_preventable", "cfr_clean", "cfr_counted", "real", "real_adv", "aor_step", "cfr_bg", "nfe")
 OURS, NOMINAL = "e2", "nominal"
-APART = (0, 1, 2, 4, 5, 6, 7, 8, 9)  # colours of the cycle for the others: its red is too near to ours
+COLOURS = {OURS: drawing.ADVERSARY, NOMINAL: drawing.INK}  # what stands out
+APART = [f"C{number}" for number in (0, 1, 2, 4, 5, 6, 7, 8, 9)]  # for the others: the cycle's red is too near to ours
 TABLES_ETA = 2.0  # intensity of the tables
 SIDE, RISE, DPI = 380, 330, 144  # points: width and height of a panel
 NAME = "curves"
@@ -135,7 +136,7 @@ def curves_figure(points: Sequence[Point]) -> Figure:
     panels = figure.subplots(len(PANELS), len(PANELS[0])).ravel()
     for axes, (across, up) in zip(panels, (pair for row in PANELS for pair in row), strict=True):
         for number, (name, own) in enumerate(methods.items()):
-            draw_curve(axes, own, across, up, colour_of(name, number))
+            draw_curve(axes, own, across, up, COLOURS.get(name, APART[number % len(APART)]))
         if up != "cfr" and across == "cfr":
             most = max(axes.get_xlim()[1], axes.get_ylim()[1])
             axes.plot([0, most], [0, most], color=drawing.MUTED, linewidth=0.8, linestyle="dotted")
@@ -148,11 +149,6 @@ def curves_figure(points: Sequence[Point]) -> Figure:
     panels[0].legend(frameon=False, fontsize=7)
     figure.suptitle("A dot a gain, larger dots for larger gains; filled: the setting of the tables, with 95% intervals")
     return figure
-
-
-def colour_of(name: str, number: int) -> str:
-    """A method's colour: ours and no attack stand out."""
-    return {OURS: drawing.ADVERSARY, NOMINAL: drawing.INK}.get(name, f"C{APART[number % len(APART)]}")
 
 
 def draw_curve(axes: Axes, points: Sequence[Point], across: str, up: str, colour: str) -> None:

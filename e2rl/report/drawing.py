@@ -110,17 +110,13 @@ def vehicle(state: np.ndarray, size: np.ndarray, colour: Colour) -> list[Shape]:
     return [body, Shape(placed(WINDSCREEN, state, size), ("black", 0.45))]
 
 
-def vulnerable(state: np.ndarray, size: np.ndarray, cyclist: bool) -> list[Shape]:
-    """A pedestrian as a disc, a cyclist as a slim box with a disc."""
-    bicycle = Shape(placed(BOX, state, np.maximum(size, (1.7, 0.5))), VULNERABLE, ("black", 0.4))
-    return [*([bicycle] if cyclist else []), disc(state[:2], 0.45, VULNERABLE, ("black", 0.4))]
-
-
 def agent(kind: str, state: np.ndarray, size: np.ndarray, colour: Colour) -> list[Shape]:
-    """An agent of one of the kinds of `recording.AGENT_TYPES`; colour: of a vehicle, or of another thing."""
-    if kind in ("pedestrian", "cyclist"):
-        return vulnerable(state, size, kind == "cyclist")
-    return vehicle(state, size, colour)
+    """An agent of one of the kinds of `recording.AGENT_TYPES`: a pedestrian as a disc, a cyclist as a slim box with a
+    disc, and all others as vehicles of a colour."""
+    if kind not in ("pedestrian", "cyclist"):
+        return vehicle(state, size, colour)
+    bicycle = Shape(placed(BOX, state, np.maximum(size, (1.7, 0.5))), VULNERABLE, ("black", 0.4))
+    return [*([bicycle] if kind == "cyclist" else []), disc(state[:2], 0.45, VULNERABLE, ("black", 0.4))]
 
 
 def contact_mark(point: np.ndarray, phase: float) -> list[Shape]:

@@ -52,7 +52,9 @@ class Replay:
     def __post_init__(self):
         self.contact = None if math.isnan(self.row["contact_step"]) else int(self.row["contact_step"])
         self.last = len(self.rollout.states) - 1 if self.contact is None else self.contact
-        self.centres = camera_path(self.rollout.states[:, self.rollout.ego, :2])
+        path = self.rollout.states[:, self.rollout.ego, :2]
+        window = min(SMOOTHING, len(path))
+        self.centres = savgol_filter(path, window, min(1, window - 1), axis=0)  # smoothed, so that the camera glides
         self.panel = Panel(self, new_figure(SIDE, SIDE, dpi=72 * self.pixels / SIDE))
 
     def picture(self, time: float, phase: float | None = None) -> Image.Image:
@@ -72,11 +74,6 @@ class Replay:
         if self.contact is not None:
             pictures += [self.picture(self.contact, phase=(index % 7) / 6) for index in range(FREEZE)]
         return pictures
-
-    def draw(self, traffic_map: TrafficMap, time: float, phase: float | None) -> None:
-        """Show a moment on a map of the rollout."""
-        centre = np.array([np.interp(time, np.arange(len(self.centres)), axis) for axis in self.centres.T])
-        traffic_map.show(centre, self.trails(time), self.shapes(time, phase))
 
     def trails(self, time: float) -> list[Trail]:
         """The last two seconds of all agents that move, those of the adversaries and of the ego on top."""
@@ -142,17 +139,12 @@ class Panel:
 
     def show(self, time: float, phase: float | None) -> None:
         replay, rollout = self.replay, self.replay.rollout
-        replay.draw(self.map, time, phase)
+        centre = np.array([np.interp(time, np.arange(len(replay.centres)), axis) for axis in replay.centres.T])
+        self.map.show(centre, replay.trails(time), replay.shapes(time, phase))
         speed = interpolated(rollout.states, rollout.valid, time)[rollout.ego, 3]
         self.clock.set_text(f"{time * rollout.dt:.1f} s")
         self.speed.set_text(f"ego {speed:.1f} m/s")
         self.badge.set_visible(replay.contact is not None and time >= replay.contact)
-
-
-def camera_path(path: np.ndarray) -> np.ndarray:
-    """Map centres [T+1, 2]: the ego's path [T+1, 2], smoothed, so that the camera glides."""
-    window = min(SMOOTHING, len(path))
-    return savgol_filter(path, window, min(1, window - 1), axis=0)
 
 
 def interpolated(states: np.ndarray, valid: np.ndarray, time: float) -> np.ndarray:

@@ -151,7 +151,7 @@ def counts(group: Sequence[dict], names: Sequence[str], per: str = "method") -> 
         if row.get("n_trainings", 1) > 1:
             numbers["training"] = row["n_trainings"]
         failed = [f"{count} rollouts without a score ({reason})" for reason, count in row.get("errored", {}).items()]
-        texts.append(", ".join([*(f"{n} {word}{'' if n == 1 else 's'}" for word, n in numbers.items()), *failed]))
+        texts.append(", ".join([*(plural(n, word) for word, n in numbers.items()), *failed]))
     if len(set(texts)) == 1:
         return f"{texts[0]} per {per}."
     return "; ".join(f"{name}: {text}" for name, text in zip(names, texts, strict=True)) + "."

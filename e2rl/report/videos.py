@@ -17,16 +17,14 @@ COLOURS = 160  # of the GIF's palette
 KEYS = (drawing.EGO, drawing.ADVERSARY, drawing.BACKGROUND, drawing.VULNERABLE, drawing.INK)  # always in the palette
 
 
-def save_animation(path: Path, frames: Sequence[Image.Image], colours: int = COLOURS, every: int = 1) -> None:
-    """Write an endless GIF at 10 Hz, or of every n-th frame; all frames share a palette, from the first, middle and
-    last frame and the KEYS."""
-    frames = [*frames[:-1:every], frames[-1]]
+def save_animation(path: Path, frames: Sequence[Image.Image], colours: int = COLOURS) -> None:
+    """Write an endless GIF at 10 Hz; all frames share a palette, from the first, middle and last one and the KEYS."""
     swatch = np.tile(np.repeat([[255 * part for part in to_rgb(each)] for each in KEYS], 8, 0), (frames[0].width, 1, 1))
     parts = [*(np.asarray(frames[index]) for index in (0, len(frames) // 2, -1)), swatch.transpose(1, 0, 2)]
     sample = Image.fromarray(np.concatenate(parts).astype(np.uint8))
     palette = sample.quantize(colours, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     first, *others = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    duration = [every * FRAME_MS] * len(others) + [LAST_MS]
+    duration = [FRAME_MS] * len(others) + [LAST_MS]
     save = partial(first.save, format="GIF", save_all=True, append_images=others, loop=0, duration=duration)
     write_atomically(path, save)
 

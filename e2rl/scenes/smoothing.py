@@ -92,12 +92,6 @@ def _consistent(track: np.ndarray, valid: np.ndarray, run: np.ndarray) -> np.nda
     return keep
 
 
-def runs_of_true(valid: np.ndarray) -> list[tuple[int, int]]:
-    """[start, end) of the runs of True in valid [F]."""
-    edge = np.diff(np.concatenate([[False], valid, [False]]).astype(np.int8))
-    return list(zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1), strict=True))
-
-
 def smooth(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Tracks [F, A, 4] with smoothed positions, and the speed along the heading from their derivative.
 

@@ -15,7 +15,6 @@ from e2rl.run.errors import InputError
 from e2rl.scenes.builder import BuildSettings, build_scene
 from e2rl.scenes.lane_graph import LaneGraph
 from e2rl.scenes.recording import Lane, Recording
-from e2rl.scenes.smoothing import runs_of_true
 from e2rl.sim.rollout_file import ROLLOUTS, Failure, Rollout
 
 FACTS = (  # columns of rollouts.csv that go along; docs/verdicts.md and docs/modes.md say what they mean
@@ -58,7 +57,8 @@ class Episode:
 
     def appearances(self, row: int) -> list[tuple[int, int]]:
         """[first, end) steps of each time that an agent is there."""
-        return [(int(first), int(end)) for first, end in runs_of_true(self.rollout.valid[:, row])]
+        edges = np.flatnonzero(np.diff(self.rollout.valid[:, row], prepend=False, append=False)).tolist()
+        return list(zip(edges[::2], edges[1::2], strict=True))
 
     def size(self, row: int) -> tuple[float, float]:
         """Length and width [m] of an agent."""

@@ -22,6 +22,7 @@ SHORT = 2.0  # m: pieces up to this length are fitted as they are
 LANE = -1  # the only lane of a road, right of the (offset) reference line
 
 Link = tuple[str, str]
+End = tuple[int | None, int | None]  # of a road: the road and the junction that it is linked with, None for none
 
 
 def write_roads(episode: Episode, path: Path) -> None:
@@ -108,15 +109,8 @@ def junctions_of(connecting: dict[str, Link]) -> list[list[str]]:
     return sorted(sorted(name for kind, name in part if kind == "lane") for part in parts)
 
 
-def road(
-    lane: Lane,
-    number: int,
-    junction: int,
-    before: tuple[int | None, int | None],
-    after: tuple[int | None, int | None],
-    name: str,
-) -> Any:
-    """The xodr.Road of a lane. before, after: the road and the junction that it is linked with, None for none."""
+def road(lane: Lane, number: int, junction: int, before: End, after: End, name: str) -> Any:
+    """The xodr.Road of a lane."""
     plan = xodr.PlanView()
     for geometry, x, y, heading in geometries(lane.points, tangent_angle(lane.points)):
         plan.add_fixed_geometry(geometry, x, y, heading)
@@ -126,11 +120,10 @@ def road(
     made = xodr.Road(number, plan, lanes, road_type=junction, name=name)
     if lane.speed_limit > 0:
         made.add_type(xodr.RoadType.town, speed=round(lane.speed_limit, 3), speed_unit="m/s")
-    for side, contact, (other, through) in (
-        ("predecessor", xodr.ContactPoint.end, before),
-        ("successor", xodr.ContactPoint.start, after),
+    for side, link, contact, (other, through) in (
+        ("predecessor", made.add_predecessor, xodr.ContactPoint.end, before),
+        ("successor", made.add_successor, xodr.ContactPoint.start, after),
     ):
-        link = made.add_predecessor if side == "predecessor" else made.add_successor
         if through is not None:
             link(xodr.ElementType.junction, through)
         elif other is not None:
