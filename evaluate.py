@@ -5,12 +5,11 @@ import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one lin
 # isort: split
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 from e2rl.evaluation.budget import search_all
 from e2rl.evaluation.methods import processes_of
 from e2rl.evaluation.plan import begin
-from e2rl.evaluation.protocol import WHOLE, drive_all, record
+from e2rl.evaluation.protocol import WHOLE, Work, drive_all, record
 from e2rl.evaluation.reproduce import compared_with_run, run_of
 from e2rl.report.budget import save_budget
 from e2rl.report.results import references, write_results
@@ -24,12 +23,13 @@ def evaluate(run: Run) -> None:
     """Roll out and score what is not done yet; then summarise, draw and print."""
     config, folder, plan = run.config, run.folder, begin(run)
     asked, egos = plan.asked, plan.egos
-    how: Any = (asked.seeds, plan.rollouts(folder), processes_of(config), plan.only, run.parts(), asked.shard)
+    work = Work(plan.rollouts(folder), processes_of(config), plan.only, run.parts(), asked.shard)
+    setups, most = egos.setups(plan.setup), max(asked.budget, default=0.0)
     if asked.budget:
-        scored, tries = search_all(egos.setups(plan.setup), plan.searches, max(asked.budget), asked.budget_unit, *how)
+        scored, tries = search_all(setups, plan.searches, most, asked.budget_unit, asked.seeds, work)
         egos = replace(egos, pairs=())  # tries of different egos are no pairs
     else:
-        scored = drive_all(egos.setups(plan.setup), plan.methods, *how)  # every ego, method, eta, scene and seed
+        scored = drive_all(setups, plan.methods, asked.seeds, work)  # every ego, method, eta, scene and seed
     if asked.shard != WHOLE:
         print(f"\nshard {asked.shard[0]} of {asked.shard[1]} written to {folder}; e2rl merge joins all of them")
         return

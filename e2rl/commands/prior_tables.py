@@ -15,7 +15,7 @@ from e2rl.evaluation.displacement_table import open_loop_rows
 from e2rl.evaluation.meta_table import meta_rows
 from e2rl.evaluation.methods import processes_of
 from e2rl.evaluation.plan import begin
-from e2rl.evaluation.protocol import drive_all, record
+from e2rl.evaluation.protocol import Work, drive_all, record
 from e2rl.evaluation.spread_table import spread_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.report.results import write_results
@@ -47,8 +47,8 @@ def prior_tables(run: Run) -> None:
         before = open_loop_rows(plan.scenes, methods, asked.open_loop_samples, config.device, parts)
     if asked.spread_samples:
         before += spread_rows(plan.scenes, methods, asked.spread_samples, config.device, parts)
-    into = plan.rollouts(folder)
-    scored = drive_all([setup], methods, plan.asked.seeds, into, processes_of(config), plan.only, parts)
+    work = Work(plan.rollouts(folder), processes_of(config), plan.only, parts)
+    scored = drive_all([setup], methods, plan.asked.seeds, work)
     if asked.meta_rollouts:
         after = meta_rows(setup, methods, asked.meta_rollouts, parts)
 

@@ -15,15 +15,13 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from e2rl.evaluation.methods import as_list, build_traffic, config_and_prior, is_search, method_config, rows_of
-from e2rl.evaluation.protocol import WHOLE, Job, Method, Scored, Setup, Task, extend, in_batches, score_all
+from e2rl.evaluation.protocol import HERE, Job, Method, Scored, Setup, Task, Work, extend, in_batches, score_all
 from e2rl.metrics.atlas import cell_of
 from e2rl.metrics.margin import FARTHEST
 from e2rl.prior.prior import Prior
 from e2rl.run.config import built, with_changes
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, write_atomically
-from e2rl.run.parts import NO_PARTS, Parts
-from e2rl.run.processes import Processes
 from e2rl.run.settings import settings_of
 from e2rl.search.search import Outcome, Search, SearchSettings
 from e2rl.search.tries import TRIES, Family, Try, family_of
@@ -104,22 +102,9 @@ def portfolio_plan(name: str, config: DictConfig, method: Callable[[str, DictCon
 
 
 def search_all(
-    setups: Sequence[Setup],
-    plans: Sequence[Plan],
-    budget: float,
-    unit: str,
-    seeds: Sequence[int],
-    into: Path | None = None,
-    processes: Processes = 1,
-    only: Sequence[int] | None = None,
-    parts: Parts = NO_PARTS,
-    shard: tuple[int, int] = WHOLE,
+    setups: Sequence[Setup], plans: Sequence[Plan], budget: float, unit: str, seeds: Sequence[int], work: Work = HERE
 ) -> tuple[Scored, list[dict]]:
     """What every plan finds against every ego by each seed with `budget` of a `unit` (SPENT) a scene; and the tries.
-
-    Args:
-        only: positions of the scenes (None: all).
-        into, processes, parts, shard: as of `protocol.drive_all`; a search has one shard.
 
     Raises:
         InputError: the tries of a method evaluate no network, and the budget is in evaluations.
@@ -134,24 +119,15 @@ def search_all(
                 "budget_unit=tries"
             )
     for number, (setup, plan, seed) in enumerate((a, b, c) for a in setups for b in plans for c in seeds):
-        scenes = range(len(setup.scenes)) if only is None else only
-        own = replace(parts, stage=f"{parts.stage}search-{number:03}") if parts.folder else parts
-        scored, tries = spend(setup, plan, seed, scenes, budget, unit, into, processes, own)
+        own = replace(work, parts=replace(work.parts, stage=f"{work.parts.stage}search-{number:03}"))
+        scored, tries = spend(setup, plan, seed, work.scenes(setup), budget, unit, own)
         extend(found, scored)
         told += tries
     return found, told
 
 
 def spend(
-    setup: Setup,
-    plan: Plan,
-    seed: int,
-    scenes: Sequence[int],
-    budget: float,
-    unit: str,
-    into: Path | None = None,
-    processes: Processes = 1,
-    parts: Parts = NO_PARTS,
+    setup: Setup, plan: Plan, seed: int, scenes: Sequence[int], budget: float, unit: str, work: Work = HERE
 ) -> tuple[Scored, list[dict]]:
     """What one search finds, and its tries in their order: round by round, the scenes of a round in an order of its
     own, so that a budget that ends within a round is spent on scenes at random. A try that errors counts as one that
@@ -166,7 +142,7 @@ def spend(
             order = torch.randperm(len(scenes), generator=generator).tolist()
             tries = sorted(search.ask(), key=lambda one: order[one.scene])
             jobs = batches(setup, plan, seed, scenes, tries, sum(map(len, search.tries)))
-            scored = score_all(jobs, "tries", into, processes, parts, lambda job: len(job[1][2]))
+            scored = score_all(jobs, "tries", work, lambda job: len(job[1][2]))
             extend(found, scored)
             known = {(row["scene_id"], row["seed"]): row for row in scored[0]}
             rows = [known.get((setup.scenes.scene_id[scenes[one.scene]], row_seed(seed, one))) for one in tries]
@@ -176,7 +152,8 @@ def spend(
                     cost[one.family] = row["nfe"], row["seconds"]
                 each = 1.0, *cost[one.family]
                 spent = {name: spent[name] + value / len(scenes) for name, value in zip(SPENT, each, strict=True)}
-                outcomes.append(outcome_of(row) if row else Outcome(-FARTHEST, "", each[1]))
+                told_search = (row["margin"], cell_name(row), row["nfe"]) if row else (-FARTHEST, "", each[1])
+                outcomes.append(Outcome(*told_search))
                 told += [told_of(one, row) | spent] if row else []
             search.tell(tries, outcomes)
             if unit == "seconds" and not told:
@@ -208,11 +185,6 @@ def row_seed(seed: int, one: Try) -> int:
 def cell_name(row: Mapping) -> str:
     """The cell of the atlas that a rollout's failure lies in; "" where it has no preventable one."""
     return ", ".join(cell_of(row) or ())
-
-
-def outcome_of(row: Mapping) -> Outcome:
-    """What the search is told of a rollout."""
-    return Outcome(row["margin"], cell_name(row), row["nfe"])
 
 
 def told_of(one: Try, row: Mapping) -> dict[str, Any]:

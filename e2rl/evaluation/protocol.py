@@ -109,11 +109,8 @@ class Setup:
             samples += features
         about = dict(zip(SOURCE, self.source(method), strict=True)) | {"eta": float(method.eta)}
         names = self.scenes.scene_id
-        return (
-            rows,
-            samples,
-            [about | {"scene_id": names[task.scene], "seed": task.seed} | why for task, why in errored],
-        )
+        lost = [about | {"scene_id": names[task.scene], "seed": task.seed} | why for task, why in errored]
+        return rows, samples, lost
 
 
 def check_names(*names: str) -> None:
@@ -130,6 +127,32 @@ def scene_seed(number: int, seed: int) -> int:
     return seed * SEEDS_APART + number
 
 
+@dataclass(frozen=True)
+class Work:
+    """How rollouts are driven, which changes none of them.
+
+    Args:
+        into: folder of the rollouts' files (None: none).
+        processes: over which the batches are spread.
+        only: positions of the scenes to drive in (None: all), with unchanged noise.
+        parts: the batches that are done.
+        shard: (k, n), only every n-th batch from the k-th on; a search has one shard.
+    """
+
+    into: Path | None = None
+    processes: Processes = 1
+    only: Sequence[int] | None = None
+    parts: Parts = NO_PARTS
+    shard: tuple[int, ...] = WHOLE
+
+    def scenes(self, setup: Setup) -> Sequence[int]:
+        """Positions of the scenes to drive in."""
+        return range(len(setup.scenes)) if self.only is None else self.only
+
+
+HERE = Work()  # in this process, and nothing is written
+
+
 def run_protocol(
     setup: Setup,
     methods: Sequence[Method],
@@ -142,37 +165,19 @@ def run_protocol(
 ) -> list[dict]:
     """The rows of metrics.json of every method on every (scene, seed): `drive_all`, then `record` into a folder (None:
     nothing is written). fields: added to each row, or further arguments of `metric_rows`."""
-    scored = drive_all([setup], methods, seeds, folder and folder / ROLLOUTS, processes, only, parts)
+    scored = drive_all([setup], methods, seeds, Work(folder and folder / ROLLOUTS, processes, only, parts))
     return record(*scored, folder, partial(metric_rows, **fields))
 
 
-def drive_all(
-    setups: Sequence[Setup],
-    methods: Sequence[Method],
-    seeds: Sequence[int],
-    into: Path | None = None,
-    processes: Processes = 1,
-    only: Sequence[int] | None = None,
-    parts: Parts = NO_PARTS,
-    shard: tuple[int, int] = WHOLE,
-) -> Scored:
+def drive_all(setups: Sequence[Setup], methods: Sequence[Method], seeds: Sequence[int], work: Work = HERE) -> Scored:
     """What every setup scores under every method on every (scene, seed); the noise is the same for all.
 
-    Args:
-        setups: they differ in their ego.
-        methods: the traffic.
-        seeds: sampling seeds.
-        into: folder of the rollouts' files (None: none).
-        processes: over which the batches are spread, with the same result.
-        only: positions of the scenes to drive in (None: all), with unchanged noise.
-        parts: the batches that are done.
-        shard: (k, n), only every n-th batch from the k-th on.
+    setups: they differ in their ego.
     """
     first = setups[0]
-    tasks = [Task(scene, seed) for seed in seeds for scene in (range(len(first.scenes)) if only is None else only)]
-    batches = in_batches(tasks, first.batch)
+    batches = in_batches([Task(scene, seed) for seed in seeds for scene in work.scenes(first)], first.batch)
     jobs = list(enumerate((setup, method, batch) for setup in setups for method in methods for batch in batches))
-    jobs = jobs[shard[0] :: shard[1]]
+    jobs = jobs[work.shard[0] :: work.shard[1]]
     total = sum(len(batch) for _, (_, _, batch) in jobs)
     with tqdm(total=total, desc="rollouts", unit="rollout", disable=None) as bar:
 
@@ -181,7 +186,7 @@ def drive_all(
             bar.set_postfix(ego=setup.ego_name, method=method.name, eta=method.eta, refresh=False)
             bar.update(len(batch))
 
-        return score_all(jobs, "rollouts", into, processes, parts, lambda job: job[1][1].eta, done)
+        return score_all(jobs, "rollouts", work, lambda job: job[1][1].eta, done)
 
 
 def in_batches(tasks: Sequence[Task], size: int) -> list[list[Task]]:
@@ -193,9 +198,7 @@ def in_batches(tasks: Sequence[Task], size: int) -> list[list[Task]]:
 def score_all(
     jobs: Sequence[Job],
     prefix: str,
-    into: Path | None,
-    processes: Processes,
-    parts: Parts,
+    how: Work,
     cost: Callable[[Job], float],
     done: Callable[[Job], None] = lambda job: None,
 ) -> Scored:
@@ -205,6 +208,7 @@ def score_all(
 
     Args:
         prefix: of the names of their parts.
+        how: of the work, `only` and `shard` are in the jobs.
         cost: by which a job takes longer than others.
         done: called with each job that is done.
 
@@ -216,14 +220,14 @@ def score_all(
         number, (setup, method, batch) = job
         told = [(task.scene, task.seed) if task.one is None else list(task.one) for task in batch]
         identity = [setup.ego_name, method.name, float(method.eta), told]
-        compute = partial(setup.score, method, batch, into)
-        return parts.result(f"{prefix}-{number:06}", identity, compute, partial(has_files, into))
+        compute = partial(setup.score, method, batch, how.into)
+        return how.parts.result(f"{prefix}-{number:06}", identity, compute, partial(has_files, how.into))
 
     found: Scored = ([], [], [])
-    for scored in in_processes(work, jobs, processes, cost, done):
-        if not has_files(into, scored):
+    for scored in in_processes(work, jobs, how.processes, cost, done):
+        if not has_files(how.into, scored):
             reason = "rollouts that a worker wrote are not here"
-            raise InputError(f"{into}: {reason}; put the run's folder where all machines have it (hydra.run.dir)")
+            raise InputError(f"{how.into}: {reason}; put the run's folder where all machines have it (hydra.run.dir)")
         extend(found, scored)
     return found
 

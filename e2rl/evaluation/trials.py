@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import torch
 
-from e2rl.evaluation.protocol import Method, Setup, drive_all
+from e2rl.evaluation.protocol import Method, Setup, Work, drive_all
 from e2rl.evaluation.rollout_files import require_rows
 from e2rl.evaluation.tuning import Parameters
 from e2rl.metrics.statistics import summarise
@@ -99,7 +99,7 @@ class PlannerTrials:
         |acceleration| [m/s^2]; progress [m]; errored: fraction without a score, `errored: REASON` for each reason.
         """
         setup = replace(self.setup, ego=self.make(parameters), evasions=False)
-        rows, _, errored = drive_all([setup], self.methods, self.seeds, processes=self.processes)
+        rows, _, errored = drive_all([setup], self.methods, self.seeds, Work(processes=self.processes))
         metrics = driving(rows)
         for method in self.methods:
             own = [row for row in rows if row["method"] == method.name and row["eta"] == method.eta]
@@ -144,7 +144,7 @@ class AttackTrials:
     def measure(self, method: Method) -> dict[str, float]:
         """Returns the metrics of a method; InputError where no rollout has a score."""
         setup = replace(self.setup, evasions=False)  # no trial is judged by them
-        rows, samples, errored = drive_all([setup], [method], self.seeds, processes=self.processes)
+        rows, samples, errored = drive_all([setup], [method], self.seeds, Work(processes=self.processes))
         require_rows(rows, errored, None)
         found = summarise(rows, samples, realism_draws=0)
         metrics = {name: found[name]["mean"] for name in MEASURED}

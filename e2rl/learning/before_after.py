@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from e2rl.evaluation.protocol import Method, Setup, drive_all, record
+from e2rl.evaluation.protocol import Method, Setup, Work, drive_all, record
 from e2rl.evaluation.rollout_files import METRICS_FILE, read_metrics, write_json
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.realism import Samples
@@ -35,7 +35,8 @@ class BeforeAfter:
         """
         setup, folder = replace(self.setup, ego=ego), self.folder / stage
         parts, measured = Parts(self.folder, stage, f"after {rounds} rounds"), Parts(self.folder, "measured")
-        scored = drive_all([setup], self.methods, self.seeds, folder / ROLLOUTS, processes=self.processes, parts=parts)
+        work = Work(folder / ROLLOUTS, self.processes, parts=parts)
+        scored = drive_all([setup], self.methods, self.seeds, work)
         rows = record(*scored, folder, partial(metric_rows, stage=stage, **origin_of(self.folder)))
         if stage == "before":
             measured.save(stage, None, scored[:2])

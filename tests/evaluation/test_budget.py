@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 
 from e2rl.evaluation.budget import Plan, build_plans, search_all, spend, write_tries
-from e2rl.evaluation.protocol import Method, Setup
+from e2rl.evaluation.protocol import Method, Setup, Work
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
-from e2rl.run.parts import Parts
+from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.search.search import SearchSettings
 from e2rl.search.tries import TRIES, Family
 from e2rl.sim.env import SimSettings
@@ -41,9 +41,9 @@ def plan():
     return plan_of()
 
 
-def found(setup, plan, processes=1, parts=None, tries=4.0, unit="tries"):
-    given = {} if parts is None else {"parts": parts}
-    (rows, samples, errored), told = spend(setup, plan, 3, range(3), tries, unit, processes=processes, **given)
+def found(setup, plan, processes=1, parts=NO_PARTS, tries=4.0, unit="tries"):
+    work = Work(processes=processes, parts=parts)
+    (rows, samples, errored), told = spend(setup, plan, 3, range(3), tries, unit, work)
     assert len(rows) == len(samples) == len(told) and not errored
     return told
 

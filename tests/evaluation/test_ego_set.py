@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from e2rl.evaluation.ego_set import EgoSet, build_egos, pool_trainings, recorded_acceleration
-from e2rl.evaluation.protocol import Method, Setup, drive_all, record, run_protocol
+from e2rl.evaluation.protocol import Method, Setup, Work, drive_all, record, run_protocol
 from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
@@ -41,7 +41,7 @@ def run(tmp_path_factory):
     chosen = EgoSet(egos, ["one", "same", "fast"], pairs, {"fast": ["fast_0", "fast_1"]})
     scenes = small_scenes(3)
     scenes.location[:] = ["a", "b", "c"]
-    scored = drive_all(chosen.setups(setup_of(scenes)), METHODS, [0], folder / ROLLOUTS)
+    scored = drive_all(chosen.setups(setup_of(scenes)), METHODS, [0], Work(folder / ROLLOUTS))
     return record(*scored, folder, chosen.metric_rows), folder
 
 
