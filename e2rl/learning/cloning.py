@@ -19,8 +19,9 @@ from e2rl.sim.observation import mirrored
 LABELLED = ("observation", "action", "weight")
 LABEL_WIDTH = (0.25, 0.12)  # of acceleration and yaw rate, in halves of the action's range
 EXPERT_RANGE = 0.99  # expert actions are clipped to this fraction of the bounds, where the squashed density is infinite
-FEATURE_NOISE = 0.3  # standard deviation of noise on the network's normalised input while cloning
-LAST_ACTION_NOISE = 1.0  # the same on the last executed action, which an imitator otherwise just repeats
+# Standard deviations of noise on the network's normalised input while cloning, and on the last executed action in it,
+# which an imitator otherwise just repeats.
+NOISE = (0.3, 1.0)
 
 
 def clip_expert(action: Tensor, low: Tensor, high: Tensor) -> Tensor:

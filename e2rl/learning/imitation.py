@@ -17,7 +17,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from e2rl.evaluation.methods import build_ego, build_sim
-from e2rl.learning.cloning import FEATURE_NOISE, LAST_ACTION_NOISE, CloningLoss, demonstrations_of
+from e2rl.learning.cloning import NOISE, CloningLoss, demonstrations_of
 from e2rl.learning.driving import Disturbance, PoolDriver, filled_batches
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.supervised import Epochs, stage_settings
@@ -65,10 +65,8 @@ def recorded_demonstrations(scenes: SceneSet, sim: SimSettings, seed: int, drive
     free = PoolDriver(scenes, replace(sim, replay_ego=False), batch)
     todo = [(rows, number) for number in range(drives + 1) for rows in filled_batches(len(pool), batch)]
     for rows, number in tqdm(todo, "demonstrations", unit="batch", leave=False, disable=None):
-        driver, label, disturb = (
-            (exact, "executed", None) if number == 0 else (free, "intended", _bursts(len(rows), generator))
-        )
-        frames = driver.drive(ReplayEgo(), pool, rows, disturb)
+        driver, label = (free, "intended") if number else (exact, "executed")
+        frames = driver.drive(ReplayEgo(), pool, rows, _bursts(len(rows), generator) if number else None)
         action = frames[label][:, :, None]
         parts.append(demonstrations_of(frames, frames["alive"], pool.scene_index[rows], driver.env, action))
     return torch.cat(parts)
@@ -98,7 +96,7 @@ class Imitation(Epochs):
 
     def loss(self, batch: TensorDictBase) -> Tensor:
         """The cloning loss [] under noise on the input."""
-        with self.network.network.noisy(FEATURE_NOISE, LAST_ACTION_NOISE):
+        with self.network.network.noisy(*NOISE):
             return self.cloning(batch)["loss_cloning"]
 
     @torch.no_grad()

@@ -12,14 +12,7 @@ from torchrl.modules import PopArtValueNorm
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from e2rl.learning.cloning import (
-    FEATURE_NOISE,
-    LAST_ACTION_NOISE,
-    CloningLoss,
-    TeachingLoss,
-    drawn,
-    mirrored_demonstrations,
-)
+from e2rl.learning.cloning import NOISE, CloningLoss, TeachingLoss, drawn, mirrored_demonstrations
 from e2rl.learning.supervised import take_step
 from e2rl.planners.network import ActorCritic, ActorNetwork
 from e2rl.run.settings import configured, setting
@@ -189,7 +182,7 @@ class Learner:
             total = total + settings.action_penalty * losses["action_penalty"]
         if experts and settings.cloning > 0 and not warming:
             shown = drawn(experts, CLONED).to(self.network.device)
-            with self.network.network.noisy(FEATURE_NOISE, LAST_ACTION_NOISE):
+            with self.network.network.noisy(*NOISE):
                 losses |= self.cloning(shown).items()
             total = total + settings.cloning * losses["loss_cloning"]
         if labels is not None and settings.teaching > 0 and not warming:
