@@ -18,8 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 from e2rl.evaluation.rollout_files import METRICS_FILE, read_metrics, write_json
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
-from e2rl.run.run import ALWAYS, Run, changed, inputs, read_provenance, versions
-from e2rl.run.trust import WRITTEN, check_written, leaves, saved_configuration
+from e2rl.run.run import Run, changed, inputs, read_provenance, versions
+from e2rl.run.trust import ALWAYS, WRITTEN, check_written, leaves, saved_configuration
 from e2rl.scenes.scene_list import SCENES
 
 HERE = ("processes", "data.cache", "data.cache_gb", "data.workers")  # of this machine: always the command line's

@@ -30,19 +30,10 @@ from e2rl.run.endings import command_line, program
 from e2rl.run.errors import InputError
 from e2rl.run.files import MAX_RECORD, altered, hash_files, read_regular, sha256_of, write_atomically
 from e2rl.run.parts import PARTS, Parts
-from e2rl.run.trust import (
-    CONFIG,
-    ENDPOINT,
-    check_written,
-    leaves,
-    outside_modules,
-    saved_configuration,
-    written_outside,
-)
+from e2rl.run.trust import ALWAYS, CONFIG, check_written, leaves, outside_modules, saved_configuration, written_outside
 
 PROVENANCE = "provenance.json"
 PACKAGE = Path(__file__).parents[1]
-ALWAYS = ("resume", "plugins", ENDPOINT)  # keys that a command line may hold anyway
 LOGS = (".log", ".out", ".err")  # files that whatever starts a command may write into its run's folder
 READ_OTHERWISE = ("data", "tuning")  # groups whose files are not hashed: scenes are, and a study is to grow
 
@@ -236,8 +227,9 @@ def inputs(config: DictConfig) -> Iterator[tuple[str, Any]]:
         if not isinstance(value, str) or not value or key == "resume":
             continue
         path = Path(value)
-        if "checkpoint" in key and path.is_dir():
-            path = _weights(path)
+        if "checkpoint" in key and path.is_dir():  # perhaps a run's folder, of which the newest whole checkpoint counts
+            whole = [each for each in sorted(path.glob("checkpoints/*/")) if altered(each) is None]
+            path = next(iter(sorted((whole[-1] if whole else path).glob("*.safetensors"))), path)
         if path.is_file():
             try:
                 yield f"{key}={value}", sha256_of(path)
@@ -250,12 +242,6 @@ def inputs(config: DictConfig) -> Iterator[tuple[str, Any]]:
             yield f"synthesizer={name}", resolved(load_choice("synthesizer", name))
     for entry in config.get("egos", {}).values():
         yield f"ego={entry.ego}", OmegaConf.to_container(load_choice("ego", entry.ego))  # as written
-
-
-def _weights(folder: Path) -> Path:
-    """The weights in a folder, or in the newest whole checkpoint of a run's folder."""
-    whole = [each for each in sorted(folder.glob("checkpoints/*/")) if altered(each) is None]
-    return next(iter(sorted((whole[-1] if whole else folder).glob("*.safetensors"))), folder)
 
 
 @cache

@@ -25,12 +25,8 @@ CONFIG = Path(".hydra", "config.yaml")  # of a run's folder
 MAX_BYTES, MAX_NODES, MAX_DEPTH, MAX_TEXT = 1 << 18, 20_000, 50, 1024  # of it; the last of a text that others refer to
 REFERENCES = re.compile(r"([^$\\]|\$\{[A-Za-z_][\w.]*\})*")  # a text that refers to other values and does nothing else
 ENDPOINT = "synthesizer.reasoner.base_url"
-WRITTEN = (
-    "data.cache",
-    "data.cache_gb",
-    "tuning.study",
-    "synthesizer.reasoner.cache",
-)  # paths to write to, and how much
+ALWAYS = ("resume", "plugins", ENDPOINT)  # keys that a command line may hold although a run's configuration has them
+WRITTEN = ("data.cache", "data.cache_gb", "tuning.study", "synthesizer.reasoner.cache")  # paths to write, and how much
 STARTING = {"command": "e2rl.planners.external", "address": "e2rl.planners.external"}  # by a part of the key
 PROGRAM, ARITHMETIC = "e2rl.planners.policy_file", ".onnx"  # other files of policies are programs
 
