@@ -76,7 +76,11 @@ def _lower(field: np.ndarray, x: np.ndarray, y: np.ndarray, points: np.ndarray, 
 
 def _border_distance(ring: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Distance [Q] of points [Q, 2] from a closed ring: to the two segments that meet at its nearest dense vertex."""
-    dense = _dense(ring)
+    closed = np.concatenate([ring, ring[:1]])
+    sides = []  # of points at most 0.5 m apart
+    for a, b in zip(closed[:-1], closed[1:], strict=True):
+        sides.append(np.linspace(a, b, max(int(np.ceil(np.linalg.norm(b - a) / 0.5)), 1), endpoint=False))
+    dense = np.concatenate(sides)
     index = cKDTree(dense).query(points)[1]
     best = np.full(len(points), np.inf)
     for a, b in ((dense[index - 1], dense[index]), (dense[index], dense[(index + 1) % len(dense)])):
@@ -84,15 +88,6 @@ def _border_distance(ring: np.ndarray, points: np.ndarray) -> np.ndarray:
         t = ((points - a) * along).sum(1) / np.maximum((along**2).sum(1), 1e-12)
         best = np.minimum(best, np.linalg.norm(points - a - np.clip(t, 0, 1)[:, None] * along, axis=1))
     return best
-
-
-def _dense(ring: np.ndarray) -> np.ndarray:
-    """Points at most 0.5 m apart along a closed ring."""
-    closed = np.concatenate([ring, ring[:1]])
-    sides = []
-    for a, b in zip(closed[:-1], closed[1:], strict=True):
-        sides.append(np.linspace(a, b, max(int(np.ceil(np.linalg.norm(b - a) / 0.5)), 1), endpoint=False))
-    return np.concatenate(sides)
 
 
 def off_road(points: Tensor, field: Tensor, origin: Tensor, row: Tensor | None = None) -> Tensor:

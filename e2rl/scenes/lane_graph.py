@@ -205,16 +205,13 @@ class LaneGraph:
                 route = self.route([*behind, *branch], begin, vertices)
                 route.vehicle_s = before + s - begin
                 probes = np.clip(PROBES + int(round(route.vehicle_s / SPACING)), 0, vertices - 1)
-                if not any(_coincide(route.points[probes], other.points) for other in found):
+                at = route.points[probes][:, None]
+                gaps = (np.linalg.norm(at - other.points, axis=-1).min(1).max() for other in found)
+                if not any(gap < SAME_GAP for gap in gaps):
                     found.append(route)
                 if len(found) == count:
                     return found
         return found
-
-
-def _coincide(probes: np.ndarray, points: np.ndarray) -> bool:
-    """Whether all probes [Q, 2] lie near one of the points [P, 2]."""
-    return np.linalg.norm(probes[:, None] - points[None], axis=-1).min(1).max() < SAME_GAP
 
 
 def smooth_vertices(points: np.ndarray) -> np.ndarray:
