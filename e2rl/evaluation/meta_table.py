@@ -130,10 +130,8 @@ def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, parts: Par
         for number, (method, count) in enumerate(zip(methods, seeds, strict=True)):
             name, identity = f"meta-{number:03}", [method.name, float(method.eta), rollouts, "with errored"]
             done, errored, state = parts.load(name, identity) or (0, [], None)
-            tally, tasks = (
-                Tally(scenes, state),
-                [Task(scene, seed) for seed in range(count) for scene in range(len(scenes))],
-            )
+            tally = Tally(scenes, state)
+            tasks = [Task(scene, seed) for seed in range(count) for scene in range(len(scenes))]
             bar.update(done)
             for begin in range(done, len(tasks), setup.batch):
                 batch = tasks[begin : begin + setup.batch]

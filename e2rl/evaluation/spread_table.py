@@ -78,8 +78,6 @@ def _summary(few: torch.Tensor, many: torch.Tensor, scenes: SceneSet) -> dict[st
         means[:, 2] = means[:, 2].sqrt()
     places, names = len(cluster[few[:, 3] > 0].unique()), [metric.name for metric in STAGES[SPREAD_STAGE]]
     covered = resampled_means(few[:, 4:6], few[:, 6:].expand(-1, 2), cluster, draws)
-    columns, counts = (
-        torch.cat([of_few, of_few / of_many, covered], 1),
-        [*[int(few[:, 3].sum())] * 6, *[int(few[:, 6].sum())] * 2],
-    )
+    columns = torch.cat([of_few, of_few / of_many, covered], 1)
+    counts = [*[int(few[:, 3].sum())] * 6, *[int(few[:, 6].sum())] * 2]
     return {name: interval(columns[:, k], places) | {"n": counts[k]} for k, name in enumerate(names)}

@@ -34,19 +34,16 @@ class RunLogger:
         wrong = [name for name in metrics if name.split("/")[0] not in GROUPS or "/" not in name]
         if wrong:
             raise InputError(f"metrics {', '.join(wrong)}: begin each with {'/, '.join(GROUPS)}/")
-        if self._logger is not None:
-            for name, value in metrics.items():
-                if not math.isnan(value):
-                    self._logger.log_scalar(name, float(value), step=step)
-            if choices:
-                self._write_choices(choices, step)
-
-    def _write_choices(self, rows: Sequence[Choice], step: int) -> None:
-        """Write the rows of a round below those of earlier rounds; unknown numbers stay empty."""
-        path = self._folder / CHOICES
-        lines = csv_text([["" if row[name] != row[name] else row[name] for name in COLUMNS] for row in rows])
-        earlier = lines_before(path, step) if path.is_file() else []
-        write_atomically(path, "".join([",".join(COLUMNS) + "\n", *earlier, lines]))
+        if self._logger is None:
+            return
+        for name, value in metrics.items():
+            if not math.isnan(value):
+                self._logger.log_scalar(name, float(value), step=step)
+        if choices:
+            path = self._folder / CHOICES
+            earlier = lines_before(path, step) if path.is_file() else []
+            rows = [["" if row[name] != row[name] else row[name] for name in COLUMNS] for row in choices]  # NaN: empty
+            write_atomically(path, "".join([",".join(COLUMNS) + "\n", *earlier, csv_text(rows)]))
 
     def show(self, name: str, path: Path, step: int) -> None:
         """Put a picture (PNG) or video (GIF) on the dashboard, if there is one; name: as of a scalar."""

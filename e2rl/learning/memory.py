@@ -75,9 +75,8 @@ class Memory:
     def pool(self, fresh: float) -> TrafficPool:
         """Rows of all rounds, the newest first, whose rows weigh `fresh` times as much as the others'. The tracks stay
         in their files."""
-        *older, newest = (
-            TrafficPool.stored(one.traffic, one.traffic["eta"], one.traffic["template"]) for one in self.rounds
-        )
+        made = [one.traffic for one in self.rounds]
+        *older, newest = (TrafficPool.stored(each, each["eta"], each["template"]) for each in made)
         joined = replace(newest, weight=newest.weight * fresh)
         for pool in reversed(older):
             joined = joined + replace(pool, fresh=torch.zeros_like(pool.fresh))

@@ -17,8 +17,7 @@ from e2rl.run.settings import check_range, configured
 from e2rl.traffic.traffic import FULL, TEMPLATES
 
 Choice = dict[str, int | float | str]  # a row of the table, by COLUMNS
-COLUMNS = {"round": int, "eta": float, "template": str, "draws": int, "left_out": int, "episodes": int, "failures": int}
-COLUMNS |= {"failure_rate": float, "value": float}
+COLUMNS = ("round", "eta", "template", "draws", "left_out", "episodes", "failures", "failure_rate", "value")
 TEMPERATURE = 2.0  # of the ranks of learnability: at 2 the first tenth of the scenes has a quarter of the draws
 STALENESS = 0.2  # fraction of the draws that goes by the rounds since a scene was last drawn
 SMOOTHING = 0.3  # weight of a round in a scene's moving failure rate
