@@ -35,9 +35,6 @@ def run_command(
 ) -> None:
     """Do the work of a command that Hydra configures by conf/<name>.yaml.
 
-    `--help` prints the files of the configuration, with the files that the command line chooses. An option that there
-    is not ends the command with the nearest one, status 2.
-
     Args:
         may_change: keys that may be others when a run is resumed.
         begun: makes the run of a configuration.

@@ -79,15 +79,11 @@ def cache_folder() -> Path:
 def cached(path: Path, build: Build, gigabytes: float) -> SceneSet:
     """Returns the scenes in a cache file; where it is not there or damaged, it is built.
 
-    Of several processes one builds, and the others wait for it.
+    Of several processes one builds, and the others wait for it. Raises InputError where the file cannot be written.
 
     Args:
         path: of the file, with a NAME.
-        build: yields the scenes.
-        gigabytes: 10^9 bytes of all files of the folder; beyond them those not used for longest are removed.
-
-    Raises:
-        InputError: where the file cannot be written.
+        gigabytes: see `make_room`.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -259,8 +259,6 @@ def load_scenes(
     """Returns at most `num_scenes` scenes of a source, or of the source that a `data` group (conf/data/*.yaml) names.
 
     Args:
-        data: a source, or a group.
-        num_scenes: None: all.
         split: overrides the source's own where `Source.has_splits`.
         starts: overrides the source's start frames.
         scenes: a list (e2rl/scenes/scene_list.py), of which all or the first `num_scenes` are taken.
