@@ -45,21 +45,8 @@ rate = partial(Metric, fraction=True)  # a metric in [0, 1]
 TABLES = ("main", "traffic", "adversaries", "methods", "egos", "public")  # of the package
 ORDER = (  # of columns in every table (docs/method.md, section 10); others follow as they are declared
     *("cfr", "cfr_preventable", "cfr_clean", "cfr_counted", "cfr_adv", "cfr_vru", "cfr_bg", "avoidable"),
-    *(
-        "front",
-        "side",
-        "rear",
-        "rir",
-        "preventable",
-        "counted",
-        "at_fault",
-        "relvel",
-        "contact_time",
-        "min_dtc",
-        "ttc_c",
-        "macc",
-        "progress",
-    ),
+    *("front", "side", "rear", "rir", "preventable", "counted", "at_fault"),
+    *("relvel", "contact_time", "min_dtc", "ttc_c", "macc", "progress"),
     *("aor_step", "aor_any", "real", "real_adv", "real_norm", "transport", "seconds_per_rollout", "nfe"),
 )
 METRICS: dict[str, Metric] = {}  # of rollouts, in ORDER

@@ -42,13 +42,8 @@ def run_prior_stage(run: Run, logger: RunLogger | None) -> tuple[Path, list[dict
         )
         processes.from_leader(lambda: run.begin({"scenes": listed(scenes)}))
         data = hashlib.sha256("\n".join(scene_hashes(scenes)).encode()).hexdigest()[:16]
-        origin = {
-            "data": f"{scenes.dataset}/{scenes.split}",
-            "scenes": len(scenes),
-            "fingerprint": data,
-            **origin_of(folder),
-            "settings": vars(settings),
-        }
+        about = {"data": f"{scenes.dataset}/{scenes.split}", "scenes": len(scenes), "fingerprint": data}
+        origin = about | origin_of(folder) | {"settings": vars(settings)}
         parts = Parts(folder, "training", data)
         path = train_prior(prior, scenes, settings, folder, origin, processes, logger, parts)
         if path is None:
