@@ -1,4 +1,4 @@
-"""`python -m e2rl.commands.showcase`: the pictures of the README, from bundled scenes and weights.
+"""`python tools/showcase.py`: the pictures of the README, from bundled scenes and weights.
 
 Moving, of one scene and seed: nominal traffic around the untrained actor; the same actor attacked by e2; the trained
 actor, which e2 attacks anew.
@@ -27,7 +27,7 @@ PICTURES = {  # file: the ego's checkpoint, traffic, two lines of the picture
 
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m e2rl.commands.showcase", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python tools/showcase.py", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/assets"), help="folder (default %(default)s)")
     parser.add_argument("--scene", default=SCENE, metavar="ID", help="a bundled test scene (default %(default)s)")
     options = parser.parse_args(arguments)
