@@ -24,11 +24,8 @@ OWN = ("shard=", "hydra.run.dir=")  # what the commands of shards differ in
 
 
 def merge(runs: Sequence[Path], into: Path) -> int:
-    """Copies the batches of shards that are done into a new run's folder; returns how many there are.
-
-    Raises:
-        InputError: where a folder is no run, `into` is there, or runs differ in scenes, inputs or settings.
-    """
+    """Copies the batches of shards that are done into a new run's folder; returns how many there are. Raises InputError
+    where a folder is no run, `into` is there, or runs differ in scenes, inputs or settings."""
     known = {run: read_provenance(run) for run in runs}
     first = known[runs[0]]
     for run in runs[1:]:

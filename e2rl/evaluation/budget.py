@@ -48,11 +48,8 @@ class Plan:
 
 
 def build_plans(config: DictConfig, prior: Prior) -> list[Plan]:
-    """The rows of `config.methods` and `config.variants`.
-
-    Raises:
-        InputError: for a family, a method or a decision that is not there.
-    """
+    """The rows of `config.methods` and `config.variants`. Raises InputError for a family, a method or a decision that
+    is not there."""
     eta = [float(value) for value in as_list(config.eta)]
     if len(eta) != 1:
         raise InputError(
@@ -105,10 +102,7 @@ def search_all(
     setups: Sequence[Setup], plans: Sequence[Plan], budget: float, unit: str, seeds: Sequence[int], work: Work = HERE
 ) -> tuple[Scored, list[dict]]:
     """What every plan finds against every ego by each seed with `budget` of a `unit` (SPENT) a scene; and the tries.
-
-    Raises:
-        InputError: the tries of a method evaluate no network, and the budget is in evaluations.
-    """
+    Raises InputError where the tries of a method evaluate no network, and the budget is in evaluations."""
     found: Scored = ([], [], [])
     told: list[dict] = []
     for plan in plans:

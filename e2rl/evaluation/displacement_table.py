@@ -47,11 +47,7 @@ def open_loop_rows(
 
 def open_loop_metrics(scenes: SceneSet, method: Method, count: int, device: str) -> dict[str, Any]:
     """`metrics` of `count` open-loop samples of every scene, the number of `scenes` that they are of, and `errored`:
-    how many others errored, for each reason.
-
-    Raises:
-        InputError: all errored.
-    """
+    how many others errored, for each reason. Raises InputError where all errored."""
 
     def plan(tasks: Sequence[int]) -> TensorDict:
         index = torch.tensor(tasks)

@@ -95,10 +95,8 @@ def recorded_acceleration(scenes: SceneSet) -> float:
 def build_egos(config: DictConfig, name: str) -> EgoSet:
     """Returns the egos of `config.egos`, or where it names none the one of the group `ego`, a file called `name`.
 
-    An entry with `checkpoints` is an ego for each of them.
-
-    Raises:
-        InputError: for an ego, a field or a checkpoint that is not there, and for names that collide.
+    An entry with `checkpoints` is an ego for each of them. Raises InputError for an ego, a field or a checkpoint that
+    is not there, and for names that collide.
     """
     if not config.egos:
         if config.policy_learning is not None:

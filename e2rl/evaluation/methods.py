@@ -53,11 +53,8 @@ def rows_of(config: DictConfig) -> list[str]:
 
 def build_methods(config: DictConfig, prior: Prior) -> list[Method]:
     """The rows of `config.methods` and of those `config.variants` that it does not name; methods with an intensity have
-    a row for each `config.eta`.
-
-    Raises:
-        InputError: for a method that is not there, and for changes of a variant that cannot be.
-    """
+    a row for each `config.eta`. Raises InputError for a method that is not there, and for changes of a variant that
+    cannot be."""
     methods = []
     for name in rows_of(config):
         changed, own = config_and_prior(config, name, prior)

@@ -51,11 +51,8 @@ class Evaluation:
 
 
 def begin(run: Run) -> Evaluation:
-    """Returns the plan of a run, which begins or goes on with it.
-
-    Raises:
-        InputError: for a configuration that cannot be run, and for inputs that changed since the run began.
-    """
+    """Returns the plan of a run, which begins or goes on with it. Raises InputError for a configuration that cannot be
+    run, and for inputs that changed since the run began."""
     config = run.config
     set_up(config)
     asked, egos = evaluation_settings(config), build_egos(config, run.choices["ego"])

@@ -205,15 +205,13 @@ def score_all(
     """What batches of rollouts score, in their order.
 
     A batch is the unit that is checkpointed: rounding makes a rollout's last digits depend on the others of its batch.
+    Raises InputError where files of a worker do not arrive.
 
     Args:
         prefix: of the names of their parts.
         how: of the work, `only` and `shard` are in the jobs.
         cost: by which a job takes longer than others.
         done: called with each job that is done.
-
-    Raises:
-        InputError: files of a worker do not arrive.
     """
 
     def work(job: Job) -> Scored:
@@ -253,10 +251,8 @@ def record(
     """The rows of metrics.json: summarise(rows, samples), with the counts of what errored where they have none.
 
     Writes rollouts.csv, modes.json, atlas.json, metrics.json and, where rollouts errored, errored.json into a folder. A
-    method of which all rollouts errored has a row too, without metrics.
-
-    Raises:
-        InputError: no rollout could be scored.
+    method of which all rollouts errored has a row too, without metrics. Raises InputError where no rollout could be
+    scored.
     """
     if folder is not None:
         files.write_errored(folder / files.ERRORED_FILE, errored)

@@ -37,11 +37,8 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
     """Returns the run that the command line asks for; with `config.reproduce` the configuration of that run, in a new
     folder.
 
-    Tells on stderr where versions differ.
-
-    Raises:
-        InputError: where there is no finished table, where its configuration names code (`e2rl.run.trust`), for weights
-            that are others or not there, and for settings that cannot change.
+    Tells on stderr where versions differ. Raises InputError where there is no finished table, where its configuration
+    names code (`e2rl.run.trust`), for weights that are others or not there, and for settings that cannot change.
     """
     if config.resume or not config.reproduce:
         return Run.of(config, free)

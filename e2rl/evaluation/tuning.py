@@ -65,16 +65,14 @@ def search(
 ) -> list[dict]:
     """Returns a row a trial: parameters, metrics, objective, admissible.
 
-    The present parameters come first, then a sweep over the first one of the space, then optuna's proposals.
+    The present parameters come first, then a sweep over the first one of the space, then optuna's proposals. Raises
+    InputError for a space that does not fit, for a study of another task, and where the present parameters have no
+    metrics.
 
     Args:
         file: of the study; one that is there goes on, as it would have gone on without the interruption.
         about: what the study must agree in besides, such as its scenes.
         told: called with all rows after each trial.
-
-    Raises:
-        InputError: for a space that does not fit, for a study of another task, and where the present parameters have no
-            metrics.
     """
     ranges = distributions(present, space)
     given = [{name: present[name] for name in space}, *sweep(present, space, settings.sweep)]

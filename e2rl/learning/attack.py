@@ -120,13 +120,11 @@ def make_traffic(
     both without errored rows. Equal orders yield equal traffic, in whichever processes: `batch` scenes are the unit
     that one makes. It has scene_index [R], eta [R], template [R], states [R, T+1, N, 4], valid [R, T+1, N], adversaries
     [R, N]; evasion [R, T, 2] and span [R, 2] as in `Solved`; of the attack entered [S] bool (rows in D') and the
-    fractions of the made rows that were attacked [] (have an adversary) and in contact [] (the ego was hit).
+    fractions of the made rows that were attacked [] (have an adversary) and in contact [] (the ego was hit). Raises
+    InputError where no attack could be made.
 
     Args:
         synthesize: see `Evolution`; templates are given to it only where one is not full.
-
-    Raises:
-        InputError: where no attack could be made.
     """
     rows = torch.arange(len(order.scenes)).split(batch)
     jobs = [(part, attack) for attack in ((True, False) if nominal else (True,)) for part in rows]

@@ -87,7 +87,8 @@ class PolicyImprovement(Improvement):
         react: Mapping[str, Any] | None,
         rounds: int,
     ) -> None:
-        """Settings: conf/learner/ppo_bc.yaml.
+        """Settings: conf/learner/ppo_bc.yaml. Raises InputError if the ego is no actor, the teacher no ScoringEgo, or a
+        round shorter than an episode.
 
         Args:
             recorded, evasions: with ppo.cloning > 0, clone the recorded egos, and the evasions in the pool's traffic.
@@ -95,9 +96,6 @@ class PolicyImprovement(Improvement):
                 says.
             react: vehicles that leave the replayed traffic; None: nobody.
             rounds: of the run, over which the learning rate falls.
-
-        Raises:
-            InputError: if the ego is no actor, the teacher no ScoringEgo, or a round shorter than an episode.
         """
         if not isinstance(ego, ActorEgo):
             raise InputError(f"learner=ppo_bc improves ego=actor, not {type(ego).__name__}; use learner=planner_tuning")

@@ -46,7 +46,8 @@ def write_report(
     methods: Sequence[str] = (),
     path: Path | None = None,
 ) -> Path:
-    """Write the page of a run's folder; returns its path.
+    """Write the page of a run's folder; returns its path. Raises InputError where files of the run are missing, or no
+    method has the name.
 
     Args:
         run: the folder, with its rollouts and their table.
@@ -55,9 +56,6 @@ def write_report(
         replays: at most so many failures are shown moving.
         methods: only their failures; (): those of all.
         path: of the file; None: PAGE in the folder.
-
-    Raises:
-        InputError: files of the run are missing, or no method has the name.
     """
     metrics = read_metrics(run / METRICS_FILE) if metrics is None else metrics
     modes = read_modes(run / MODES_FILE) if modes is None else modes

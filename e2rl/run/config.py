@@ -49,11 +49,8 @@ def assigned(key: str, value: object) -> str:
 
 
 def load_choice(group: str, name: str) -> DictConfig:
-    """Returns the file conf/<group>/<name>.yaml, of the running script's search path where there is one.
-
-    Raises:
-        InputError: where there is none of this name; it lists the choices.
-    """
+    """Returns the file conf/<group>/<name>.yaml, of the running script's search path where there is one. Raises
+    InputError where there is none of this name; it lists the choices."""
     if not CHOICE.fullmatch(name):  # a path could lead out of conf/, into a stranger's folder
         raise InputError(f"{group}={name}: no name of a file in conf/{group}")
     further = HydraConfig.get().overrides.hydra if HydraConfig.initialized() else ()
@@ -97,11 +94,8 @@ class Extension:
 
 
 def built(config: DictConfig, where: str, kind: type, **given: Any) -> Any:
-    """Returns what `_target_` of a group builds, outside code included.
-
-    Raises:
-        InputError: where it cannot be built or is no `kind`.
-    """
+    """Returns what `_target_` of a group builds, outside code included. Raises InputError where it cannot be built or
+    is no `kind`."""
     settings = {key: value for key, value in config.items() if key != "name"}
     target = settings.get("_target_")
     try:
@@ -134,11 +128,8 @@ def machine_of(config: DictConfig) -> Machine:
 
 
 def set_up(config: DictConfig) -> None:
-    """Import the plugins; set the threads, the device and the seeds of torch, numpy and python.
-
-    Raises:
-        InputError: for a plugin or device that is not there, and a size that is impossible.
-    """
+    """Import the plugins; set the threads, the device and the seeds of torch, numpy and python. Raises InputError for a
+    plugin or device that is not there, and a size that is impossible."""
     machine_of(config)
     import_plugins(config.plugins, "plugins: ")
     torch.set_num_threads(config.threads)

@@ -45,15 +45,13 @@ def in_processes(
     """Returns function(job) of each job, in their order, computed by several processes.
 
     Forks share the parent's scenes and weights, and Ray workers are sent them, so results do not depend on `processes`.
+    Raises InputError where a process was killed.
 
     Args:
         processes: number of forked processes of one thread each, or Ray workers. With one process or one job nothing is
             forked.
         cost: the jobs of greatest cost start first.
         ended: called with each job that has ended, in whatever order they do.
-
-    Raises:
-        InputError: where a process was killed.
     """
     if isinstance(processes, int) and min(processes, len(jobs)) <= 1:
         for job in jobs:

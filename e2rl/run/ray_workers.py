@@ -29,14 +29,12 @@ VARIABLES = {  # of Ray, where the environment has none of its own
 
 @dataclass(frozen=True)
 class RayWorkers:
-    """Workers of one torch thread each, of the cluster at RAY_ADDRESS, or else started here.
+    """Workers of one torch thread each, of the cluster at RAY_ADDRESS, or else started here. Raises InputError where
+    Ray is not installed.
 
     Args:
         count: of those started here (None: one a core).
         modules: that a worker imports first, such as plugins.
-
-    Raises:
-        InputError: where Ray is not installed.
     """
 
     count: int | None = None
@@ -50,11 +48,8 @@ class RayWorkers:
     def tasks(self, function: Callable[[Any], bytes], jobs: Sequence) -> Iterator[Callable[[int], Future]]:
         """Gives a function that submits a job by its number. Function and jobs are sent once, whole.
 
-        Left by an exception, it cancels the tasks.
-
-        Raises:
-            InputError: where a job lost its worker RETRIES + 1 times, or where what is sent, such as an ego of one's
-                own, cannot be pickled. What a task raised is raised here.
+        Left by an exception, it cancels the tasks. Raises InputError where a job lost its worker RETRIES + 1 times, or
+        where what is sent, such as an ego of one's own, cannot be pickled. What a task raised is raised here.
         """
         ray, begun = self.connect(), []
         task = ray.remote(num_cpus=1, max_retries=RETRIES, scheduling_strategy="SPREAD")(_work)

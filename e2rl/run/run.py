@@ -55,11 +55,8 @@ class Run:
     @classmethod
     def of(cls, config: DictConfig, free: Sequence[str] = ()) -> "Run":
         """Returns the run that the command line asks for: a new one, or the one that `config.resume` goes on with.
-
-        Raises:
-            InputError: where there is none to go on with; where its configuration names what the command line does not
-                (`e2rl.run.trust`); for settings that are fixed.
-        """
+        Raises InputError where there is none to go on with; where its configuration names what the command line does
+        not (`e2rl.run.trust`); for settings that are fixed."""
         hydra = HydraConfig.get()
         if not config.resume:
             return cls(config, Path(hydra.runtime.output_dir), dict(hydra.runtime.choices), free)
@@ -79,12 +76,8 @@ class Run:
         return cls(saved, folder, known["choices"], free)
 
     def enter(self) -> None:
-        """Make the folder ready, once nobody else is at work in it.
-
-        Raises:
-            InputError: where it cannot be written; where a new run's is not empty, but for logs and for what is left of
-                a run that was killed as it began.
-        """
+        """Make the folder ready, once nobody else is at work in it. Raises InputError where it cannot be written; where
+        a new run's is not empty, but for logs and for what is left of a run that was killed as it began."""
         if not os.access(self.folder, os.W_OK):
             raise InputError(f"{self.folder}: cannot be written; make it writable, or name another folder")
         if self.config.resume:
@@ -106,15 +99,12 @@ class Run:
         return Parts(self.folder, stage, about)
 
     def begin(self, scenes: Mapping[str, tuple[str, str]]) -> None:
-        """Write what the run was begun with; or where it goes on, compare with that.
+        """Write what the run was begun with; or where it goes on, compare with that. Raises InputError for other inputs
+        or settings than those that the run was begun with. Other versions are told on stderr.
 
         Args:
             scenes: of each set of scenes, by its name, the content of its list and the hash of its data's files
                 (`e2rl.scenes.scene_list.listed`).
-
-        Raises:
-            InputError: for other inputs or settings than those that the run was begun with. Other versions are told on
-                stderr.
         """
         lists = {name: hashlib.sha256(text.encode()).hexdigest() for name, (text, _) in scenes.items()}
         now = {

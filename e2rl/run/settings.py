@@ -90,10 +90,8 @@ def _plain(file: str, part: str) -> dict[str, Any]:
 def settings_of(kind: type[Settings], values: Mapping, where: str = "") -> Settings:
     """Returns an instance of the dataclass `kind` (fields of plain types) with the values of the group `where`.
 
-    Keys that are not given keep their defaults; lists become tuples.
-
-    Raises:
-        InputError: for a key that the dataclass does not have, a value of another type, or one out of its range.
+    Keys that are not given keep their defaults; lists become tuples. Raises InputError for a key that the dataclass
+    does not have, a value of another type, or one out of its range.
     """
     try:
         typed = OmegaConf.merge(OmegaConf.structured(kind), OmegaConf.create(dict(values)))

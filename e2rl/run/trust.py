@@ -32,14 +32,12 @@ PROGRAM, ARITHMETIC = "e2rl.planners.policy_file", ".onnx"  # other files of pol
 
 
 def saved_configuration(config: DictConfig, folder: Path, where: str) -> DictConfig:
-    """Returns the configuration that the run in `folder` was begun with, checked.
+    """Returns the configuration that the run in `folder` was begun with, checked. Raises InputError where it is none,
+    or names what the command line does not.
 
     Args:
         config: that of the command line: its keys must be there; its plugins and endpoint are trusted.
         where: the option that names the folder, for messages.
-
-    Raises:
-        InputError: where it is none, or names what the command line does not.
     """
     file = folder / CONFIG
     if not file.is_file():

@@ -257,16 +257,14 @@ def load_scenes(
     files: str = "",
 ) -> SceneSet:
     """Returns at most `num_scenes` scenes of a source, or of the source that a `data` group (conf/data/*.yaml) names.
+    Raises InputError for a source that cannot be built, for a missing or empty path, for a scene of the list that is
+    not there and, unless data.skip_invalid, for an invalid scene.
 
     Args:
         split: overrides the source's own where `Source.has_splits`.
         starts: overrides the source's start frames.
         scenes: a list (e2rl/scenes/scene_list.py), of which all or the first `num_scenes` are taken.
         files: see `listed_scenes`.
-
-    Raises:
-        InputError: for a source that cannot be built, for a missing or empty path, for a scene of the list that is not
-            there and, unless data.skip_invalid, for an invalid scene.
     """
     if num_scenes is not None:
         check_range("num_scenes", num_scenes, 1)

@@ -289,15 +289,13 @@ def train_prior(
     logger: RunLogger | None = None,
     parts: Parts = NO_PARTS,
 ) -> Path | None:
-    """Train `prior` on scenes; returns the path of the checkpoint, None in processes other than the leader.
+    """Train `prior` on scenes; returns the path of the checkpoint, None in processes other than the leader. Raises
+    InputError for too few scenes.
 
     Args:
         folder: for the checkpoint, which has the averaged weights of the lowest held-out loss.
         origin: data and command, for the checkpoint's header, which also has the results of the training.
         parts: of the run, from which an interrupted training goes on exactly.
-
-    Raises:
-        InputError: for too few scenes.
     """
     begin = time.perf_counter()
     windows, test = window_sets(scenes)
