@@ -142,13 +142,16 @@ def spend(
             rows = [known.get((setup.scenes.scene_id[scenes[one.scene]], row_seed(seed, one))) for one in tries]
             outcomes = []
             for one, row in zip(tries, rows, strict=True):
+                margin, cell = -FARTHEST, ""  # of one that errored
                 if row:
                     cost[one.family] = row["nfe"], row["seconds"]
+                    margin, cell = row["margin"], ", ".join(cell_of(row) or ())
                 each = 1.0, *cost[one.family]
                 spent = {name: spent[name] + value / len(scenes) for name, value in zip(SPENT, each, strict=True)}
-                told_search = (row["margin"], cell_name(row), row["nfe"]) if row else (-FARTHEST, "", each[1])
-                outcomes.append(Outcome(*told_search))
-                told += [told_of(one, row) | spent] if row else []
+                outcomes.append(Outcome(margin, cell, each[1]))
+                if row:
+                    line = row | {"family": one.family, "cell": cell, "clean": row["cfr_clean"]} | spent
+                    told.append({name: line[name] for name in (*TOLD, *SPENT)})
             search.tell(tries, outcomes)
             if unit == "seconds" and not told:
                 break  # all errored, and nothing tells how long they would take
@@ -174,17 +177,6 @@ def row_seed(seed: int, one: Try) -> int:
     if one.number >= TRIES:
         raise InputError(f"budget: more than {TRIES} tries of a scene have no seeds of their own; spend less")
     return seed * TRIES + one.number
-
-
-def cell_name(row: Mapping) -> str:
-    """The cell of the atlas that a rollout's failure lies in; "" where it has no preventable one."""
-    return ", ".join(cell_of(row) or ())
-
-
-def told_of(one: Try, row: Mapping) -> dict[str, Any]:
-    """A line of TRIES_FILE, without SPENT."""
-    about = {"family": one.family, "cell": cell_name(row), "clean": row["cfr_clean"]}
-    return {name: about[name] if name in about else row[name] for name in TOLD}
 
 
 def write_tries(path: Path, told: Sequence[Mapping]) -> None:
