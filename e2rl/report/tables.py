@@ -196,7 +196,8 @@ def mode_table(found: Mapping, ego: str, several: bool) -> Table:
             fractions = [mode["groups"][index]["fraction"] for index in chosen] + [mode[name] for name in known]
             name = mode["name"] if mode["name"] == "other" else f"{mode['mode']}. {mode['name']}"
             speeds = [UNKNOWN if mode[name] is None else f"{mode[name]:.1f}" for name in SPEEDS]
-            rows.append([name, str(count), *map(percent, fractions), *speeds])
+            percent = [UNKNOWN if part is None else f"{100 * part:.0f}" for part in fractions]
+            rows.append([name, str(count), *percent, *speeds])
     if rows:
         cells = [f"{each['failures']} in {plural(each['modes'], 'mode')}" for each in groups]
         rows.append(["all failures", str(failures), *cells, *[""] * (len(known) + len(SPEEDS))])
@@ -212,10 +213,6 @@ def mode_table(found: Mapping, ego: str, several: bool) -> Table:
         text += f" Grouped without {', '.join(found['unknown'])}, which the rollouts do not know."
     absent = [title for name, title in VERDICTS.items() if name not in known]
     return Table(text + (f" Not computable here: {', '.join(absent)}." if absent else ""), head, rows)
-
-
-def percent(fraction: float | None) -> str:
-    return UNKNOWN if fraction is None else f"{100 * fraction:.0f}"
 
 
 # --- cells

@@ -17,7 +17,7 @@ WRITING = {
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EEXIST, errno.ENAMETOOLONG),
     *(errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EISDIR, errno.ELOOP),
 }
-MEMORY = ("can't allocate memory", "not enough memory", "out of memory")  # in what torch raises
+MEMORY = ("can't allocate memory", "not enough memory", "out of memory")  # in what torch raises, of a GPU's memory, too
 
 
 def program() -> list[str]:
@@ -66,20 +66,14 @@ def ending(go_on: Callable[[], str] = command_line) -> Iterator[None]:
             where = failed.filename or "a file"
             reason = f"{where}: cannot be written ({failed.strerror}); what was written before is whole"
             _end(f"\nerror: {reason}. Mend that, then go on with: {go_on()}", 1)
-        if _lacks_memory(error):
+        memory = isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
+        if memory or (isinstance(error, RuntimeError) and any(words in str(error) for words in MEMORY)):
             reason = "out of memory; what was written before is whole"
             _end(f"\nerror: {reason}. Free memory, or use fewer processes, then go on with: {go_on()}", 1)
         raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _lacks_memory(error: BaseException) -> bool:
-    """Whether an error says that there was no memory, that of a GPU included."""
-    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
-        return True
-    return isinstance(error, RuntimeError) and any(words in str(error) for words in MEMORY)
 
 
 def kill_workers(others: set | None = None) -> None:
