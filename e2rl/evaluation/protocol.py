@@ -214,18 +214,20 @@ def score_all(
         done: called with each job that is done.
     """
 
+    into, parts = how.into, how.parts  # what goes to the workers
+
     def work(job: Job) -> Scored:
         number, (setup, method, batch) = job
         told = [(task.scene, task.seed) if task.one is None else list(task.one) for task in batch]
         identity = [setup.ego_name, method.name, float(method.eta), told]
-        compute = partial(setup.score, method, batch, how.into)
-        return how.parts.result(f"{prefix}-{number:06}", identity, compute, partial(has_files, how.into))
+        compute = partial(setup.score, method, batch, into)
+        return parts.result(f"{prefix}-{number:06}", identity, compute, partial(has_files, into))
 
     found: Scored = ([], [], [])
     for scored in in_processes(work, jobs, how.processes, cost, done):
-        if not has_files(how.into, scored):
+        if not has_files(into, scored):
             reason = "rollouts that a worker wrote are not here"
-            raise InputError(f"{how.into}: {reason}; put the run's folder where all machines have it (hydra.run.dir)")
+            raise InputError(f"{into}: {reason}; put the run's folder where all machines have it (hydra.run.dir)")
         extend(found, scored)
     return found
 
