@@ -36,7 +36,11 @@ def test_settings_dataclasses_have_no_defaults():
     for path in root.rglob("*.py"):
         if path.parent.name in ("scripts", "commands") or path.stem.startswith("__"):
             continue
-        module = import_module(".".join(("e2rl", *path.relative_to(root).with_suffix("").parts)))
+        try:
+            module = import_module(".".join(("e2rl", *path.relative_to(root).with_suffix("").parts)))
+        except ModuleNotFoundError as missing:
+            assert missing.name and not missing.name.startswith("e2rl"), missing
+            continue  # of an extra that is not installed here
         own = [kind for kind in vars(module).values() if isinstance(kind, type) and kind.__module__ == module.__name__]
         for kind in (kind for kind in own if "__configured__" in vars(kind) and is_dataclass(kind)):
             known = file_values(*kind.__configured__).keys() - BASES
