@@ -42,7 +42,7 @@ class Observation(NamedTuple):
     @property
     def resolved(self) -> Tensor:
         """Whether [...] the ego has passed the other's front, or is behind it and does not gain, or is alone."""
-        return ~self.other_is_ahead | ((self.closing <= 0) & (self.gap > 0)) | self.gap.isinf()
+        return ~self.other_is_ahead | ((self.closing <= 0) & (self.gap > 0)) | (self.gap == torch.inf)
 
 
 class DriverState(NamedTuple):

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from e2rl.metrics.drivers import DRIVERS, Driver, Observation, no_conflict
+from e2rl.run.kernels import kernel
 from e2rl.scenes.boxes import separation, to_frame
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING, project
@@ -69,19 +70,25 @@ def along_way(states: Tensor, width: Tensor, others: Tracks) -> Along:
     reach = STRAIGHT + (driven_length(states).amax().item() if len(states) else 0.0)
     vertices = SPACING * torch.arange(int(reach / SPACING) + 2, device=states.device, dtype=states.dtype)
     route = poses(states, vertices.expand(len(states), -1))[..., :2]
-    s, d, heading = project(others.states[..., :2].flatten(1, 2), route)
-    s, d, heading = (value.unflatten(1, others.present.shape[1:]) for value in (s, d, heading))
-    turn, speed = others.states[..., 2] - heading, others.states[..., 3]
+    return Along(*seen_along(route, width, others.states, others.size, others.present))
+
+
+@kernel("B P 2", "B", "B T N 4", "B N 2", "B T N:bool")
+def seen_along(route: Tensor, width: Tensor, states: Tensor, size: Tensor, present: Tensor) -> tuple[Tensor, ...]:
+    """The fields of Along of others states [B, T+1, N, 4], size [B, N, 2] along routes [B, P, 2]."""
+    s, d, heading = project(states[..., :2].flatten(1, 2), route)
+    s, d, heading = (value.unflatten(1, present.shape[1:]) for value in (s, d, heading))
+    turn, speed = states[..., 2] - heading, states[..., 3]
     cos, sin = turn.cos(), turn.sin()
-    half = others.size[:, None] / 2
+    half = size[:, None] / 2
     extent = half[..., 0] * cos.abs() + half[..., 1] * sin.abs()
     side = half[..., 0] * sin.abs() + half[..., 1] * cos.abs()
     gap = d.abs() - side - width[:, None, None] / 2
-    enters = ((gap <= 0) & others.present).any(1, keepdim=True)
-    away = ~others.present | ~enters
+    enters = ((gap <= 0) & present).any(1, keepdim=True)
+    away = ~present | ~enters
     rear, gap = (value.masked_fill(away, torch.inf) for value in (s - extent, gap))
     values = rear, speed * cos, gap, -d.sign() * speed * sin, 2 * extent
-    return Along(*(value.transpose(0, 1) for value in values))
+    return tuple(value.transpose(0, 1).contiguous() for value in values)
 
 
 def redrive(driver: Driver, states: Tensor, size: Tensor, others: Along) -> Tensor:

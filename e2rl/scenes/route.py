@@ -27,6 +27,11 @@ def nearest_vertex(points: Tensor, route: Tensor, hint: Tensor | None = None, wi
     """
     count = route.shape[-2]
     if hint is None:
+        if torch.compiler.is_compiling():  # the compiler makes a vector loop of a minimum, but not of argmin
+            x, y = ((points[..., None, axis] - route[..., None, :, axis]).square() for axis in range(2))
+            first = torch.arange(count, dtype=points.dtype, device=points.device)
+            squared = x + y
+            return torch.where(squared == squared.amin(-1, keepdim=True), first, count).amin(-1).long()
         squared = (route**2).sum(-1)[..., None, :] - 2 * points @ route.transpose(-1, -2)
         return squared.argmin(-1)
     near = hint.clamp(0, SPACING * (count - 1))  # beyond the ends, the end is what is near
@@ -61,25 +66,27 @@ def onto_segments(
     """
     start = torch.stack([vertex - 1, vertex]).clamp(0, last)
     a = take(start)
-    return onto_nearer(points, start, last, a, *segment(a, take(start + 1)))
+    along, length, unit = segment(a, take(start + 1))
+    s, d, second = onto_nearer(points, start, last, a, along, length, unit)
+    x, y = torch.where(second[..., None], unit[1], unit[0]).unbind(-1)
+    return s, d, torch.atan2(y, x)
 
 
-def segment(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """From a to b [..., 2]: the difference, its length [...] (at least 1e-6), its direction, its heading [...]."""
+def segment(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """From a to b [..., 2]: the difference, its length [...] (at least 1e-6), its direction."""
     along = b - a
     length = along.norm(dim=-1).clamp(min=1e-6)
-    unit = along / length[..., None]
-    return along, length, unit, torch.atan2(unit[..., 1], unit[..., 0])
+    return along, length, along / length[..., None]
 
 
 def onto_nearer(
-    points: Tensor, start: Tensor, last: int, a: Tensor, along: Tensor, length: Tensor, unit: Tensor, heading: Tensor
+    points: Tensor, start: Tensor, last: int, a: Tensor, along: Tensor, length: Tensor, unit: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Arc length, offset and heading [...] of points [..., 2] on the nearer of two segments, the first where both are
-    equally near.
+    """Arc length, offset [...] of points [..., 2] on the nearer of two segments, and whether that is the second; it is
+    the first where both are equally near.
 
     start [2, ...], a [2, ..., 2]: index and position of the vertex where each segment begins; last: index of the last
-    segment; along, length, unit, heading [2, ...]: see `segment`.
+    segment; along, length, unit [2, ...]: see `segment`.
     """
     offset = points - a
     t = (offset * unit).sum(-1) / length
@@ -89,9 +96,8 @@ def onto_nearer(
     gap = (offset - t[..., None] * along).norm(dim=-1)
     d = unit[..., 0] * offset[..., 1] - unit[..., 1] * offset[..., 0]
     second = gap[1] < gap[0]
-    first, other = torch.stack([SPACING * (start + t), torch.where(d < 0, -gap, gap), heading], -1)
-    s, d, heading = torch.where(second[..., None], other, first).unbind(-1)
-    return s, d, heading
+    s, d = (torch.where(second, x[1], x[0]) for x in (SPACING * (start + t), torch.where(d < 0, -gap, gap)))
+    return s, d, second
 
 
 def interpolate(route: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:

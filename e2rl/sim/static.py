@@ -76,7 +76,8 @@ def segment_table(points: Tensor, limit: Tensor) -> Tensor:
     ends (2).
     """
     a, b = points[:, :-1], points[:, 1:]
-    along, length, unit, heading = segment(a, b)
+    along, length, unit = segment(a, b)
+    heading = torch.atan2(unit[..., 1], unit[..., 0])
     first = b - torch.cat([points[:, :1], points[:, :-2]], 1)
     second = torch.cat([points[:, 2:], points[:, -1:]], 1) - a
     tangent = torch.atan2(first[..., 1], first[..., 0])
@@ -106,7 +107,8 @@ def follow(static: StaticScene, xy: Tensor, hint: Tensor) -> FrenetPose:
     start = torch.stack([vertex - 1, vertex], 1).clamp(0, last)
     table = rows_at(static.segments, static.row, start).transpose(0, 1)
     a, along, unit, length, heading, _ = table.split((2, 2, 2, 1, 1, 4), -1)
-    return FrenetPose(*onto_nearer(xy, start.T, last, a, along, length[..., 0], unit, heading[..., 0]))
+    s, d, second = onto_nearer(xy, start.T, last, a, along, length[..., 0], unit)
+    return FrenetPose(s, d, torch.where(second, heading[1, :, 0], heading[0, :, 0]))
 
 
 def look_along(static: StaticScene, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -10,9 +10,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from e2rl.metrics.drivers import HumanDriver, Observation, no_conflict
+from e2rl.metrics.drivers import DriverState, HumanDriver, Observation
 from e2rl.metrics.preventable import Along, Tracks, along_way
 from e2rl.prior.lane_relative import HORIZON
+from e2rl.run.kernels import kernel
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 from e2rl.traffic.traffic import REPLAN_STEPS
@@ -23,6 +24,7 @@ BRAKING = (7.59, 6.5, 5.5, 5.0, 4.0, 1.0)  # m/s^2
 WEIGHTS = (0.4, 0.3, 0.15, 0.1, 0.05)  # of the failures of all but the first
 FRONT_GAP = 0.8  # m before the ego's front, a step before the contact, at least which makes it the ego's front
 MOVING = 1.0  # m/s: slower drivers do not run into anybody
+STEPS = 5  # of DT in one kernel
 SOON = 0.1  # share of the worth that a failure at the end of the horizon loses
 
 
@@ -33,12 +35,6 @@ class Foresight(NamedTuple):
     worth: Tensor
     prevented: Tensor
     time: Tensor
-
-
-def population(like: Tensor) -> HumanDriver:
-    """The drivers, parameters [D, 1, 1]."""
-    delay, braking = (like.new_tensor(values)[:, None, None] for values in (DELAYS, BRAKING))
-    return HumanDriver(delay=delay, braking=braking, release=0.0)  # type: ignore[arg-type]
 
 
 def foresee(path: Tensor, size: Tensor, tracks: Tensor, sizes: Tensor, since: Tensor, settled: Tensor) -> Foresight:
@@ -64,29 +60,66 @@ def _contacts(path: Tensor, length: Tensor, along: Along, since: Tensor) -> tupl
 
     The competent driver counts any contact as its own.
     """
-    drivers = population(path)
-    shape = torch.broadcast_shapes(drivers.delay.shape, along.rear.shape[1:])  # type: ignore[attr-defined]
-    speed, way = path[:, 0, 3, None].expand(shape), path.new_zeros(shape)
-    memory = no_conflict(way)._replace(since=since[:, None].expand(shape))
-    own, length = path[..., 3].diff(dim=1) / DT, length[:, None].expand(shape)
-    hit, front, reacts = (torch.zeros_like(way, dtype=torch.bool) for _ in range(3))
-    time = path.new_full(shape[1:], torch.inf)
-    for t in range(path.shape[1] - 1):
-        gap = along.rear[t] - way - length / 2
-        kept = along.speed, along.lateral_gap, along.lateral_speed, along.length
-        other, aside, nearing, extent = (value[t].expand_as(gap) for value in kept)
-        seen = Observation(speed, speed * 0, gap, other, aside, nearing, aside <= 0, length, extent)
+    plans, steps = along.rear.shape[1:], path.shape[1] - 1
+    delay, braking = (path.new_tensor(values) for values in (DELAYS, BRAKING))
+    own = (path[..., 3].diff(dim=1) / DT).T
+    begin = length, path[:, 0, 3], since, *own
+    length, speed, since, *own = (value[:, None].expand(plans).flatten() for value in begin)
+    way = path.new_zeros(len(DELAYS), plans.numel())
+    met = speed.expand_as(way), way, since.expand_as(way), way, way, way, way, torch.full_like(way, torch.inf)
+    seen = [value.flatten(1) for value in (along.rear, along.speed, along.lateral_gap, along.length)]
+    for t in range(0, steps, STEPS):
+        moments = path.new_tensor([DT * (k + 1) for k in range(t, t + STEPS)])
+        part = [value[t : t + STEPS + 1] for value in seen]
+        met = meet(delay, braking, moments, length, torch.stack(own[t : t + STEPS]), *met, *part)
+    hit, front = (value.unflatten(1, plans) > 0 for value in met[4:6])
+    return torch.cat([hit[:1], front[1:]]), met[7][-1].view(plans)
+
+
+@kernel("D", "D", f"{STEPS}", "C", f"{STEPS} C", *["D C"] * 8, *[f"{STEPS + 1} C"] * 4)
+def meet(
+    delay: Tensor,
+    braking: Tensor,
+    moments: Tensor,
+    length: Tensor,
+    own: Tensor,
+    speed: Tensor,
+    way: Tensor,
+    since: Tensor,
+    brakes: Tensor,
+    hit: Tensor,
+    front: Tensor,
+    reacts: Tensor,
+    time: Tensor,
+    rear: Tensor,
+    other: Tensor,
+    aside: Tensor,
+    extent: Tensor,
+) -> tuple[Tensor, ...]:
+    """STEPS steps, which end at moments [STEPS], of drivers [D] and plans [C]: their speed, way, since, braking, and as 0 or 1, which a kernel
+    loads faster than truth values, whether they have been hit, by their front, and react; and the time of the contact.
+
+    all [D, C]. length [C] and own [STEPS, C] acceleration of the ego; rear, other (speed), aside and extent [STEPS + 1, C] of what it meets.
+    """
+    drivers = HumanDriver(delay=delay[:, None], braking=braking[:, None], release=0.0)  # type: ignore
+    length = length.expand_as(speed)
+    hit, front, reacts = hit > 0, front > 0, reacts > 0
+    memory = DriverState(since, brakes, hit)
+    for t in range(own.shape[0]):
+        gap = rear[t] - way - length / 2
+        met, lateral, long = (value[t].expand_as(gap) for value in (other, aside, extent))
+        seen = Observation(speed, way, gap, met, lateral, way, lateral <= 0, length, long)
         memory, asked = drivers.step(memory, seen)
         reacts = reacts | (asked < -1.0)
-        planned = own[:, t, None].expand(shape)
+        planned = own[t].expand_as(speed)
         after = (speed + DT * torch.where(reacts, torch.minimum(asked, planned), planned)).clamp(min=0)
         way, speed = way + (speed + after) / 2 * DT, after
-        now = along.rear[t + 1] - way - length / 2
-        touch = (now < 0) & (now > -(length + along.length[t + 1])) & (along.lateral_gap[t + 1] < 0) & ~hit
+        now = rear[t + 1] - way - length / 2
+        touch = (now < 0) & (now > -(length + extent[t + 1])) & (aside[t + 1] < 0) & ~hit
         front = front | (touch & (gap > -FRONT_GAP) & (speed > MOVING))
-        time = torch.where(touch[-1], (t + 1) * DT, time)
+        time = torch.where(touch, moments[t], time)
         hit = hit | touch
-    return torch.cat([hit[:1], front[1:]]), time
+    return speed, way, *memory[:2], *(torch.where(value, 1.0, 0.0) for value in (hit, front, reacts)), time
 
 
 def time_before(world: World, ego_plan: Tensor, since: Tensor) -> Tensor:
