@@ -14,6 +14,7 @@ from torch import Tensor
 
 from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.planners.path import MissionPath, RoutePath, look_up
+from e2rl.run.kernels import kernel
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
@@ -95,19 +96,22 @@ def collision_hazard(ego: Tensor, ego_size: Tensor, others: Prediction, slope: f
     """
     batch, count, times, _ = ego.shape
     weight = slope + growth * torch.arange(times, device=ego.device, dtype=ego.dtype)
-    hazard = ego.new_zeros(batch * count)
-    centre = ego[others.scene, :, :, :2].transpose(1, 2)  # [J, T, C, 2]
-    apart = _squared(centre, others.poses[:, :, None, :2])
     reach = (ego_size[others.scene].norm(dim=-1) + others.size.norm(dim=-1))[:, None] / 2
     cut = reach + math.atanh(1 - NEGLIGIBLE) / weight  # [J, T]
-    other, time, profile = (apart < cut.square()[..., None]).nonzero(as_tuple=True)
-    scene = others.scene[other]
-    for part in torch.arange(len(other), device=ego.device).split(CHUNK):
-        j, t, c, b = other[part], time[part], profile[part], scene[part]
-        gap = circle_gap(ego[b, c, t], ego_size[b], others.poses[j, t], others.size[j])
-        safe = torch.tanh(gap.clamp(min=0) * weight[t]).clamp(min=CERTAIN)
-        hazard.index_add_(0, b * count + c, -safe.log())
+    centre = ego[others.scene, :, :, :2].transpose(1, 2)  # [J, T, C, 2]
+    j, t, c = (_squared(centre, others.poses[:, :, None, :2]) < cut.square()[..., None]).nonzero(as_tuple=True)
+    b, hazard = others.scene[j], ego.new_zeros(batch * count)
+    for j, t, c, b in zip(*(index.split(CHUNK) for index in (j, t, c, b)), strict=True):
+        each = hazard_of(ego[b, c, t], ego_size[b], others.poses[j, t], others.size[j], weight[t])
+        hazard.index_add_(0, b * count + c, each)
     return hazard.view(batch, count)
+
+
+@kernel("Q 3", "Q 2", "Q 3", "Q 2", "Q")
+def hazard_of(ego: Tensor, ego_size: Tensor, other: Tensor, size: Tensor, weight: Tensor) -> Tensor:
+    """-log(1 - p) [Q] of pairs of boxes."""
+    gap = circle_gap(ego, ego_size, other, size)
+    return -torch.tanh(gap.clamp(min=0) * weight).clamp(min=CERTAIN).log()
 
 
 def _squared(first: Tensor, second: Tensor) -> Tensor:
@@ -115,24 +119,23 @@ def _squared(first: Tensor, second: Tensor) -> Tensor:
     return (first[..., 0] - second[..., 0]).square() + (first[..., 1] - second[..., 1]).square()
 
 
-def circles(pose: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
-    """Centres [..., 5, 2] and radii [..., 5] of five circles in a box: one of radius width / 2 at the centre, four of
-    radius width / 4 in the corners."""
+def circles(pose: Tensor, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """x, y and radii [5, ...] of five circles in a box: one of radius width / 2 at the centre, four of radius width / 4
+    in the corners."""
     length, width = size.unbind(-1)
     along, across = (length - width) / 2 + width / 4, width / 4
-    x = torch.stack([torch.zeros_like(along), along, along, -along, -along], -1)
-    y = torch.stack([torch.zeros_like(across), across, -across, across, -across], -1)
-    cos, sin = pose[..., 2:3].cos(), pose[..., 2:3].sin()
-    centre = torch.stack([pose[..., 0:1] + cos * x - sin * y, pose[..., 1:2] + sin * x + cos * y], -1)
-    return centre, torch.stack([width / 2, *[width / 4] * 4], -1)
+    x = torch.stack([torch.zeros_like(along), along, along, -along, -along])
+    y = torch.stack([torch.zeros_like(across), across, -across, across, -across])
+    cos, sin = pose[..., 2].cos(), pose[..., 2].sin()
+    radius = torch.stack([width / 2, *[width / 4] * 4])
+    return pose[..., 0] + cos * x - sin * y, pose[..., 1] + sin * x + cos * y, radius
 
 
 def circle_gap(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor) -> Tensor:
     """Smallest distance [...] m between the circles of two boxes; negative where circles overlap."""
-    a, ra = circles(first, first_size)
-    b, rb = circles(second, second_size)
-    apart = _squared(a[..., :, None, :], b[..., None, :, :]).sqrt()
-    return (apart - ra[..., :, None] - rb[..., None, :]).flatten(-2).amin(-1)
+    (ax, ay, ra), (bx, by, rb) = circles(first, first_size), circles(second, second_size)
+    apart = ((ax[:, None] - bx).square() + (ay[:, None] - by).square()).sqrt()
+    return (apart - ra[:, None] - rb).flatten(0, 1).amin(0)
 
 
 @configured("ego/lane_graph")

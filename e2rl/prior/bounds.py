@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from e2rl.prior.lane_relative import ACCEL_SCALE, LaneState, select
+from e2rl.run.kernels import kernel
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import overlap
 from e2rl.scenes.recording import DT
@@ -105,13 +106,9 @@ def _meeting_braking(motion: LaneState, state: LaneState, obstacles: Obstacles, 
     """`meeting_braking` [B, V] of planned motions, towards the agent that each runs into first."""
     vehicles = state.v.shape[1]
     others = constant_velocity(obstacles.agents[:, vehicles:], DT * (steps + 1))
-    tracks = torch.cat([motion.states()[:, :, steps], others], 1)  # [B, N, len(steps), 4]
-    first, meet = _first_meeting(tracks, obstacles, vehicles)
-    index = first[..., None, None].expand(*first.shape, 1, 4)
-    other = tracks[:, None].expand(-1, vehicles, -1, -1, -1).gather(3, index)[..., 0, :]
-    own = tracks[:, :vehicles, None].expand(-1, -1, first.shape[2], -1, -1).gather(3, index)[..., 0, :]
-    driven = (motion.s[..., steps] - state.s[..., None]).gather(-1, first)
-    meeting = Meeting(own, other, driven, steps[first] + 1, meet)
+    own, driven = motion.states()[:, :, steps], motion.s[..., steps] - state.s[..., None]
+    there = obstacles.size[:, :vehicles], obstacles.size, obstacles.present[:, :vehicles], obstacles.present
+    meeting = first_meeting(own, torch.cat([own, others], 1), driven, *there, steps + 1)
     length = (obstacles.size[:, :vehicles, 0] + obstacles.size[:, :1, 0]) / 2
     return meeting_braking(meeting, state.v, length, obstacles.duty)
 
@@ -125,6 +122,38 @@ class Meeting(NamedTuple):
     driven: Tensor
     steps: Tensor
     happens: Tensor
+
+
+@kernel("B V K 4", "B N K 4", "B V K", "B V 2", "B N 2", "B V:bool", "B N:bool", "K:int64")
+def first_meeting(
+    own: Tensor,
+    everybody: Tensor,
+    driven: Tensor,
+    own_size: Tensor,
+    size: Tensor,
+    here: Tensor,
+    present: Tensor,
+    steps: Tensor,
+) -> Meeting:
+    """Where boxes of vehicles, wider by LATERAL_MARGIN on both sides, first overlap those of everybody.
+
+    own, everybody: states after steps [K], when vehicles have driven so many m; size, whether present.
+    """
+    vehicles = own.shape[1]
+    wide = torch.stack([own_size[..., 0], own_size[..., 1] + 2 * LATERAL_MARGIN], -1)
+    meets = overlap(own[:, :, None], wide[:, :, None, None], everybody[:, None], size[:, None, :, None])
+    other = torch.arange(present.shape[1], device=present.device)
+    itself = other == torch.arange(vehicles, device=own.device)[:, None]
+    counts = present[:, None, :] & here[..., None] & ~itself
+    meets = meets & counts[..., None]
+    count = steps.shape[0]
+    left = torch.where(meets, torch.arange(count, 0, -1, dtype=own.dtype, device=own.device), 0.0).amax(-1)
+    first = torch.where(left > 0, count - left, 0.0).long()
+    index = first[..., None, None].expand(*first.shape, 1, 4)
+    they = everybody[:, None].expand(-1, vehicles, -1, -1, -1).gather(3, index)[..., 0, :]
+    mine = own[:, :, None].expand(-1, -1, first.shape[2], -1, -1).gather(3, index)[..., 0, :]
+    way = driven[:, :, None].expand(-1, -1, first.shape[2], -1).gather(3, first[..., None])[..., 0]
+    return Meeting(mine, they, way, steps[first], left > 0)
 
 
 def meeting_braking(meeting: Meeting, speed: Tensor, length: Tensor, duty: Duty | None = None) -> Tensor:
@@ -167,18 +196,6 @@ def _towards_ego(duty: Duty, meets: Tensor, yields: Tensor, room: Tensor, closin
     later = room - closing * WAIT
     waits = (closing**2 < 2 * later * duty.patience) & (later > 0)
     return meets & ~duty.exempt & (yields | duty.yields) & ~waits
-
-
-def _first_meeting(tracks: Tensor, obstacles: Obstacles, vehicles: int) -> tuple[Tensor, Tensor]:
-    """Index of the time [B, V, N] at which i's box, wider by LATERAL_MARGIN on both sides, first overlaps j's, and
-    whether it does at all."""
-    size, present = obstacles.size, obstacles.present
-    wide = size[:, :vehicles] + size.new_tensor([0.0, 2 * LATERAL_MARGIN])
-    meets = overlap(tracks[:, :vehicles, None], wide[:, :, None, None], tracks[:, None], size[:, None, :, None])
-    itself = torch.eye(vehicles, present.shape[1], dtype=torch.bool, device=meets.device)
-    counts = present[:, None, :] & present[:, :vehicles, None] & ~itself
-    meets = meets & counts[..., None]
-    return meets.int().argmax(-1), meets.any(-1)
 
 
 def _curve_braking(settings: BoundSettings, motion: LaneState, state: LaneState, steps: Tensor) -> Tensor:

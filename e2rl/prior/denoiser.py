@@ -3,7 +3,8 @@
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import cast
+from functools import cache
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +13,7 @@ from e2rl.prior.features import EDGE, NODE
 from e2rl.prior.lane_relative import SIZE
 from e2rl.prior.sde import NoiseSchedule
 from e2rl.run.errors import InputError
+from e2rl.run.kernels import Kernel, is_on
 from e2rl.run.settings import configured, setting
 
 
@@ -140,9 +142,50 @@ class Denoiser(nn.Module):
 
     def forward(self, x: Tensor, level: Tensor, encoding: Encoding) -> Tensor:
         """Denoised estimate x0 [B, V, SIZE] of x [B, V, SIZE] at noise level [B, V], or [1, V] for all scenes."""
+        if self.training or len(level) > 1 or not is_on():
+            return self.estimate(x, level, encoding)
+        scene = encoding.nodes, encoding.pairs, *encoding.biases, *encoding.modulations
+        return estimate_kernel(self.settings)(x, level, *scene, *_weights(self))
+
+    def estimate(self, x: Tensor, level: Tensor, encoding: Encoding) -> Tensor:
+        """`forward`, operation by operation."""
         h = self.embed_x(x) + encoding.nodes
         parts = zip(self.blocks, encoding.biases, encoding.modulations, self.modulated(level), strict=True)
         for block, bias, of_node, of_level in parts:
             h = block(h, of_node + of_level, bias, encoding.pairs)
         alpha, sigma = self.schedule.alpha(level)[..., None], self.schedule.sigma(level)[..., None]
         return alpha * x + sigma * self.head(h).to(x.dtype)
+
+
+def _weights(network: Denoiser) -> list[Tensor]:
+    """What `Denoiser.estimate` reads of a network."""
+    return [*network.parameters(), *network.buffers()]
+
+
+class _Estimate(nn.Module):
+    """`Denoiser.estimate` as a module of its own, for `functional_call`."""
+
+    def __init__(self, network: Denoiser) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, *given: Any) -> Tensor:
+        return self.network.estimate(*given)
+
+
+@cache
+def estimate_kernel(settings: DenoiserSettings) -> Kernel:
+    """`Denoiser.estimate` of networks of these sizes: of x, level, nodes, pairs, biases, modulations and weights."""
+    module = _Estimate(Denoiser(settings).eval())
+    names = [name for name, _ in (*module.named_parameters(), *module.named_buffers())]
+    sizes = [" ".join(map(str, value.shape)) for value in _weights(module.network)]
+
+    def denoise(x: Tensor, level: Tensor, nodes: Tensor, pairs: Tensor, *given: Tensor) -> Tensor:
+        biases, modulations = given[: settings.blocks], given[settings.blocks : 2 * settings.blocks]
+        encoding = Encoding(nodes, pairs, list(biases), list(modulations))
+        weights = dict(zip(names, given[2 * settings.blocks :], strict=True))
+        return torch.func.functional_call(module, weights, (x, level, encoding))
+
+    scene = [f"B V {settings.width}", f"B V V {settings.pair}", *[f"B {settings.heads} V V"] * settings.blocks]
+    scene += [f"B V {6 * settings.width}"] * settings.blocks
+    return Kernel(denoise, (f"B V {SIZE}", "1 V", *scene, *sizes))

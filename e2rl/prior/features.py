@@ -9,7 +9,7 @@ from e2rl.scenes.recording import DT, LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
 from e2rl.scenes.route import SPACING, interpolate
 from e2rl.scenes.smoothing import PAST
 from e2rl.sim.dynamics import constant_velocity
-from e2rl.sim.leaders import FREE_GAP, IDMParameters, idm_acceleration, leaders
+from e2rl.sim.leaders import FREE_GAP, IDMParameters, idm_acceleration, leaders_at
 from e2rl.sim.mission import light_state_at
 
 CURVATURE_AT = (0.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)  # m ahead
@@ -72,12 +72,11 @@ def _leader_features(
     routed: RoutedScene, state: LaneState, agents: Tensor, present: Tensor
 ) -> tuple[list[Tensor], Tensor, Tensor]:
     """Nearness of the leader and closing speed at LEADER_AT, and the present leader's gap and speed [B, V]."""
-    ahead = constant_velocity(agents, torch.tensor(LEADER_AT, device=agents.device)).unbind(2)
-    found = [leaders(state.s, routed.points, there, routed.size, present) for there in ahead]
-    features = []
-    for gap, speed, _ in found:
-        features += [torch.exp(-gap.clamp(min=0) / 20.0), torch.where(gap < FREE_GAP, (state.v - speed) / 5.0, 0.0)]
-    return features, found[0].gap, found[0].speed
+    there = constant_velocity(agents, torch.tensor(LEADER_AT, device=agents.device))
+    gap, speed, _ = leaders_at(state.s, routed.points, there, routed.size, present)
+    near = torch.exp(-gap.clamp(min=0) / 20.0)
+    closing = torch.where(gap < FREE_GAP, (state.v[..., None] - speed) / 5.0, 0.0)
+    return list(torch.stack([near, closing], -1).flatten(2).unbind(-1)), gap[..., 0], speed[..., 0]
 
 
 def _light_features(routed: RoutedScene, state: LaneState, step: Tensor) -> list[Tensor]:

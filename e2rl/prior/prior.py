@@ -145,7 +145,10 @@ class Prior(nn.Module):
         """Planned motion of x0, fields [B, V, HORIZON] or those `steps` of it; cap [B, V]: of the acceleration in the
         executed part."""
         x0, state = apply_cap(cap, x0, context.state)
-        lane = lane_relative.decode(x0, state, context.routed.points, steps)
+        if steps == slice(None):
+            lane = lane_relative.decode_plans(x0, state, context.routed.points)
+        else:
+            lane = lane_relative.decode(x0, state, context.routed.points, steps)
         if context.all_on_lane:
             return lane
         return select(context.routed.has_lane, lane, free_space.decode(x0, state).map(lambda value: value[..., steps]))

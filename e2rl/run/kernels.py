@@ -13,11 +13,12 @@ import os
 import platform
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import fields, is_dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, get_type_hints
 
 import torch
 from torch import Tensor, nn
@@ -28,6 +29,7 @@ from e2rl.run.files import locked
 KERNELS: dict[str, "Kernel"] = {}
 """All kernels of the modules that are imported, by name."""
 COMPILERS = ("c++", "g++", "clang++")
+VECTOR = 8  # components of a vector, at most
 FIRST = 17  # sizes of the tensors that a kernel is traced with: distinct primes from here on
 _on = False
 
@@ -36,40 +38,67 @@ class Kernel:
     """A function of tensors, compiled where `switch` is on: on the CPU, of the types declared, without gradients.
 
     shapes: of each argument, names of sizes that vary and numbers that do not, then ":" and a type (float32 by
-    default). Equal names are equal sizes, none of them 0.
+    default). Equal names are equal sizes. The shape of a dataclass or a named tuple is that of all its tensors. Where
+    a size is 0, or anything is not as declared, the function runs as it is.
     """
 
     def __init__(self, function: Callable[..., Any], shapes: tuple[str, ...]) -> None:
-        self.function = function
+        self.function, self.shapes = function, shapes
         self.name = f"{function.__module__}.{function.__qualname__}"
-        self.sizes = [shape.partition(":")[0].split() for shape in shapes]
-        self.vectors = [len(names) > 1 and names[-1].isdigit() for names in self.sizes]
-        self.types = [getattr(torch, shape.partition(":")[2] or "float32") for shape in shapes]
         self.__doc__ = function.__doc__
         KERNELS[self.name] = self
 
-    def __call__(self, *given: Tensor) -> Any:
-        """What the function returns: a tensor or a tuple of them."""
-        if not _on or not self._fits(given):
+    def __call__(self, *given: Any) -> Any:
+        """What the function returns: a tensor, or a tuple, a named tuple or a dataclass of them."""
+        if not _on:
             return self.function(*given)
-        apart = zip(given, self.vectors, strict=True)
-        found = self._run([(value.movedim(-1, 0) if vector else value).contiguous() for value, vector in apart])
-        return found[0] if len(found) == 1 else tuple(found)
+        flat = [tensor for value in given for tensor in _tensors(value)]
+        if not self._fits(flat):
+            return self.function(*given)
+        found = self._run([_apart(value) if vector else value.contiguous() for value, vector in zip(flat, self.vectors)])
+        return found[0] if self.returns is Tensor else self.returns(*found) if _made(self.returns) else tuple(found)
 
-    def _fits(self, given: tuple[Tensor, ...]) -> bool:
+    def _fits(self, flat: list[Tensor]) -> bool:
         size: dict[str, int] = {}
-        for value, names, kind in zip(given, self.sizes, self.types, strict=True):
+        for value, (names, kind) in zip(flat, self.declared, strict=True):
             if value.dtype != kind or value.is_cuda or value.dim() != len(names):
                 return False
             for name, length in zip(names, value.shape, strict=True):
-                if length == 0 or length != (int(name) if name.isdigit() else size.setdefault(name, length)):
+                if length == 0 or length != (name if isinstance(name, int) else size.setdefault(name, length)):
                     return False
-        return not (torch.is_grad_enabled() and any(value.requires_grad for value in given))
+        return not (torch.is_grad_enabled() and any(value.requires_grad for value in flat))
+
+    @cached_property
+    def kinds(self) -> list[Any]:
+        """The type of each argument."""
+        found = [kind for name, kind in get_type_hints(self.function).items() if name != "return"]
+        return found + found[-1:] * (len(self.shapes) - len(found))  # the last may be any number of tensors
+
+    @cached_property
+    def returns(self) -> Any:
+        """The type of the result."""
+        return get_type_hints(self.function)["return"]
+
+    @cached_property
+    def declared(self) -> list[tuple[list[str | int], torch.dtype]]:
+        """Sizes and type of each tensor."""
+        found: list[tuple[list[str | int], torch.dtype]] = []
+        for shape, kind in zip(self.shapes, self.kinds, strict=True):
+            sizes, _, name = shape.partition(":")
+            names = [int(size) if size.isdigit() else size for size in sizes.split()]
+            found += [(names, getattr(torch, name or "float32"))] * len(_fields(kind))
+        return found
+
+    @cached_property
+    def vectors(self) -> list[bool]:
+        """Which tensors are of vectors: these come component by component, so that loops over rows are contiguous."""
+        last = [names[-1] if len(names) > 1 else "" for names, _ in self.declared]
+        return [isinstance(size, int) and size <= VECTOR for size in last]
 
     @cached_property
     def file(self) -> Path:
         """Where the compiled kernel lies."""
-        mark = hashlib.sha256(repr(machine()).encode())
+        mark = hashlib.sha256(repr((machine(), self.shapes)).encode())
         for module in sorted(_sources(sys.modules[self.function.__module__]), key=lambda module: module.__name__):
             mark.update(Path(str(module.__file__)).read_bytes())
         return cache_folder() / "kernels" / f"{self.function.__qualname__}-{mark.hexdigest()[:32]}.pt2"
@@ -92,16 +121,17 @@ class Kernel:
                 self._compile()
 
     def _compile(self) -> None:
-        free = sorted({name for names in self.sizes for name in names if not name.isdigit()})
-        size = dict(zip(free, _primes(), strict=False))
+        free = sorted({name for names, _ in self.declared for name in names if isinstance(name, str)})
+        size: dict[Any, int] = dict(zip(free, _primes(), strict=False))
         examples, dynamic = [], []
-        for names, kind, vector in zip(self.sizes, self.types, self.vectors, strict=True):
+        for (names, kind), vector in zip(self.declared, self.vectors, strict=True):
             names = [names[-1], *names[:-1]] if vector else names
-            examples.append(torch.zeros([size.get(name) or int(name) for name in names], dtype=kind))
+            examples.append(torch.zeros([size.get(name, name) for name in names], dtype=kind))
             dynamic.append({at: torch.export.Dim.DYNAMIC for at, name in enumerate(names) if name in size})
-        made = self.file.with_name(f"{self.file.stem}.{os.getpid()}.pt2")
+        made, module = self.file.with_name(f"{self.file.stem}.{os.getpid()}.pt2"), _Module(self)
         with torch.no_grad(), torch.fx.experimental._config.patch(backed_size_oblivious=True):
-            graph = torch.export.export(_Module(self.function, self.vectors), tuple(examples), dynamic_shapes=(tuple(dynamic),))
+            module(*examples)  # fills the caches of constants
+            graph = torch.export.export(module, tuple(examples), dynamic_shapes=(tuple(dynamic),))
             torch._inductor.aoti_compile_and_package(graph, package_path=str(made))
         made.replace(self.file)
 
@@ -117,21 +147,50 @@ def switch(on: bool) -> None:
     _on = on
 
 
+def is_on() -> bool:
+    """Whether kernels run compiled."""
+    return _on
+
+
 def cache_folder() -> Path:
     """Returns the folder of caches of this user: that of XDG_CACHE_HOME, or ~/.cache."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "e2rl"
 
 
 class _Module(nn.Module):
-    """A function whose vectors come component by component, which makes its loops over rows contiguous."""
+    """The function of a Kernel, from tensors to tensors."""
 
-    def __init__(self, function: Callable[..., Any], vectors: list[bool]) -> None:
+    def __init__(self, kernel: Kernel) -> None:
         super().__init__()
-        self.function, self.vectors = function, vectors
+        self.kernel = kernel
 
-    def forward(self, *given: Tensor) -> Any:
-        apart = zip(given, self.vectors, strict=True)
-        return self.function(*(value.movedim(0, -1) if vector else value for value, vector in apart))
+    def forward(self, *flat: Tensor) -> Any:
+        apart = zip(flat, self.kernel.vectors, strict=True)
+        rest = iter([value.movedim(0, -1) if vector else value for value, vector in apart])
+        given = []
+        for kind in self.kernel.kinds:
+            parts = [next(rest) for _ in _fields(kind)]
+            given.append(kind(*parts) if _made(kind) else parts[0])
+        return tuple(_tensors(self.kernel.function(*given)))
+
+
+def _apart(value: Tensor) -> Tensor:
+    return value.movedim(-1, 0).contiguous()
+
+
+def _made(kind: Any) -> bool:
+    """Whether a type is a dataclass or a named tuple."""
+    return is_dataclass(kind) or hasattr(kind, "_fields")
+
+
+def _fields(kind: Any) -> list[str]:
+    return [each.name for each in fields(kind)] if is_dataclass(kind) else list(getattr(kind, "_fields", ("",)))
+
+
+def _tensors(value: Any) -> Iterable[Tensor]:
+    if isinstance(value, Tensor):
+        return (value,)
+    return [getattr(value, name) for name in _fields(value)] if is_dataclass(value) else value
 
 
 def _primes() -> Iterator[int]:

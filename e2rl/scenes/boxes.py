@@ -52,6 +52,8 @@ def overlap(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tens
     reach = (first_size.norm(dim=-1) + second_size.norm(dim=-1)) / 2
     near = (first[..., :2] - second[..., :2]).square().sum(-1) < reach.square()
     boxes = (first, first_size, second, second_size)
+    if torch.compiler.is_compiling():
+        return near & (separation(*boxes) < 0)
     picked = [box.expand(*near.shape, box.shape[-1])[near] for box in boxes]
     return near.masked_scatter(near, separation(*picked) < 0)
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from e2rl.run.kernels import kernel
 from e2rl.scenes.route import SPACING, onto_segments
 
 GATE_MARGIN = 0.3  # m of lateral clearance within which an agent still is a leader
@@ -40,12 +41,28 @@ def leaders(
     with offsets d [B, V] it also covers the distance from the offset back to the route. Without a leader nearer than
     `free_gap` m, the gap is `free_gap` and the speed is the vehicle's own.
     """
+    found = leaders_at(s, points, agents[:, :, None], size, present, d, margin, free_gap)
+    return Leaders(*(value[..., 0] for value in found))
+
+
+def leaders_at(
+    s: Tensor,
+    points: Tensor,
+    agents: Tensor,
+    size: Tensor,
+    present: Tensor,
+    d: Tensor | None = None,
+    margin: float = GATE_MARGIN,
+    free_gap: float = FREE_GAP,
+) -> Leaders:
+    """`leaders` at T moments at once, fields [B, V, T]: agents [B, M, T, 4], the vehicles at s all the while."""
+    moments = agents.shape[2]
     length, width = size[:, : s.shape[1]].unbind(-1)
     reach = width / 2 + margin + (torch.zeros_like(s) if d is None else d.abs())
     room = reach[..., None] + size.norm(dim=-1)[:, None] / 2
-    scene, vehicle, other, vertex = _near_pairs(points, s, agents[..., :2], room, present)
+    scene, vehicle, other, moment, vertex = _near_pairs(points, s, agents[..., :2], room, present)
     own, them = (scene, vehicle), (scene, other)
-    agent, box = agents[them], size[them]
+    agent, box = agents[scene, other, moment], size[them]
     at, offset, heading = onto_segments(agent[:, :2], vertex, points.shape[2] - 2, lambda index: points[*own, index])
     turn = agent[:, 2] - heading
     cos, sin = torch.cos(turn), torch.sin(turn)
@@ -56,45 +73,56 @@ def leaders(
         low, high = d[own].clamp(max=0), d[own].clamp(min=0)
         offset = offset - torch.minimum(torch.maximum(offset, low), high)
     leads = (offset.abs() < side) & (ahead > 0)
-    table, pair = gap.new_full((*s.shape, agents.shape[1]), free_gap), (scene, vehicle, other)
+    table = gap.new_full((*s.shape, moments, agents.shape[1]), free_gap)
+    pair = scene, vehicle, moment, other
     nearest, index = table.index_put(pair, torch.where(leads, gap, free_gap)).min(-1)
     speed = torch.zeros_like(table).index_put(pair, agent[:, 3] * cos).gather(-1, index[..., None])[..., 0]
-    speed = torch.where(nearest < free_gap, speed, agents[:, : s.shape[1], 3])
+    speed = torch.where(nearest < free_gap, speed, agents[:, : s.shape[1], :, 3])
     return Leaders(nearest.clamp(max=free_gap), speed, index)
 
 
 def _near_pairs(points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Tensor) -> tuple[Tensor, ...]:
-    """Pairs (scene, vehicle, agent, index of the nearest vertex; each [Q]) of present agents xy [B, M, 2] within room
-    [B, V, M] m of the vehicle's route and not behind it. A route continues straight beyond its last vertex."""
+    """Pairs (scene, vehicle, agent, moment, index of the nearest vertex; each [Q]) of present agents xy [B, M, T, 2]
+    within room [B, V, M] m of the vehicle's route and not behind it. A route continues straight beyond its last
+    vertex."""
     vehicles, count = points.shape[1:3]
-    far = room + SPACING / 2
+    moments = xy.shape[2]
     stretches = _stretches(points)  # [B, V, C, 2, STRETCH + 1]
     low, high = torch.aminmax(stretches, dim=-1)
-    squared = torch.zeros_like(room)[..., None]
-    for axis in range(2):
-        at = xy[:, None, :, None, axis]
-        beside = torch.maximum(low[:, :, None, :, axis] - at, at - high[:, :, None, :, axis]).clamp_(min=0)
-        squared = torch.addcmul(squared, beside, beside)
-    near = squared < far.square()[..., None]  # [B, V, M, C]
-    tip = points[:, :, -1] - points[:, :, -2]
-    tip = tip / tip.norm(dim=-1, keepdim=True).clamp(min=1e-6)
-    past, unit = xy[:, None] - points[:, :, None, -1], tip[:, :, None]
-    across = past[..., 1] * unit[..., 0] - past[..., 0] * unit[..., 1]
-    beyond = ((past * unit).sum(-1) > 0) & (across.abs() < far)
-    near[..., -1] |= beyond
-    ends = SPACING * (STRETCH * torch.arange(1, near.shape[-1] + 1, device=s.device)).clamp(max=count - 1)
-    to_come = (ends >= s[..., None] - SPACING)[:, :, None]
+    ends = SPACING * (STRETCH * torch.arange(1, low.shape[2] + 1, device=s.device)).clamp(max=count - 1)
     itself = torch.eye(vehicles, xy.shape[1], dtype=torch.bool, device=s.device)
     counts = present[:, :vehicles, None] & present[:, None] & ~itself
-    counts = counts & ((near & to_come).any(-1) | beyond)
+    far, flat = (room + SPACING / 2).repeat_interleave(moments, -1), xy.flatten(1, 2)
+    near, beyond = near_stretches(low, high, points[:, :, -2], points[:, :, -1], flat, far)
+    to_come = (ends >= s[..., None] - SPACING)[:, :, None]
+    counts = counts.repeat_interleave(moments, -1) & ((near & to_come).any(-1) | beyond)
     b, v, m = counts.nonzero(as_tuple=True)
     near = near[counts]
     pair, stretch = near.nonzero(as_tuple=True)
-    gap = stretches[b[pair], v[pair], stretch] - xy[b, m][pair][..., None]
+    gap = stretches[b[pair], v[pair], stretch] - flat[b, m][pair][..., None]
     nearest, within = gap.square().sum(1).min(-1)
     table = nearest.new_full(near.shape, torch.inf).index_put((pair, stretch), nearest)
     vertex = torch.zeros_like(table, dtype=torch.long).index_put((pair, stretch), STRETCH * stretch + within)
-    return b, v, m, vertex.gather(1, table.argmin(1, keepdim=True))[:, 0].clamp(max=count - 1)
+    vertex = vertex.gather(1, table.argmin(1, keepdim=True))[:, 0].clamp(max=count - 1)
+    return b, v, m // moments, m % moments, vertex
+
+
+@kernel("B V C 2", "B V C 2", "B V 2", "B V 2", "B Q 2", "B V Q")
+def near_stretches(
+    low: Tensor, high: Tensor, before: Tensor, last: Tensor, xy: Tensor, far: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Whether points xy [B, Q, 2] are within far [B, V, Q] m of the boxes low to high of stretches [B, V, Q, C], and of
+    a route's straight continuation beyond its last two vertices [B, V, Q], which counts as its last stretch."""
+    x = torch.maximum(low[:, :, None, :, 0] - xy[:, None, :, None, 0], xy[:, None, :, None, 0] - high[:, :, None, :, 0])
+    y = torch.maximum(low[:, :, None, :, 1] - xy[:, None, :, None, 1], xy[:, None, :, None, 1] - high[:, :, None, :, 1])
+    near = x.clamp(min=0).square() + y.clamp(min=0).square() < far.square()[..., None]
+    tip = last - before
+    unit = (tip / tip.norm(dim=-1, keepdim=True).clamp(min=1e-6))[:, :, None]
+    past = xy[:, None] - last[:, :, None]
+    across = past[..., 1] * unit[..., 0] - past[..., 0] * unit[..., 1]
+    beyond = ((past * unit).sum(-1) > 0) & (across.abs() < far)
+    stretch = torch.arange(low.shape[2], device=low.device)
+    return near | (beyond[..., None] & (stretch == low.shape[2] - 1)), beyond
 
 
 def _stretches(points: Tensor) -> Tensor:

@@ -35,6 +35,6 @@ def test_hazard_equals_its_definition():
 
 
 def test_circles_lie_in_their_box():
-    centre, radius = circles(torch.zeros(1, 3), torch.tensor([[4.0, 2.0]]))
-    assert (centre[..., 0].abs() + radius <= 2.0 + 1e-6).all() and (centre[..., 1].abs() + radius <= 1.0 + 1e-6).all()
-    assert torch.allclose((centre[..., 0].abs() + radius).max(), torch.tensor(2.0))
+    x, y, radius = circles(torch.zeros(1, 3), torch.tensor([[4.0, 2.0]]))
+    assert (x.abs() + radius <= 2.0 + 1e-6).all() and (y.abs() + radius <= 1.0 + 1e-6).all()
+    assert torch.allclose((x.abs() + radius).max(), torch.tensor(2.0))

@@ -204,7 +204,7 @@ def propose_kernels(attack: Attack, lane: LaneState, points: Tensor, mean: Tenso
         return Kernels(mean.new_zeros(len(mean), count, SIZE), nobody, mean.shape[1])
     x = mean[at][:, None] + table
     start = lane.map(lambda value: value[at][:, None].expand(x.shape[:2]))
-    motion = lane_relative.decode(x, start, points[at][:, None])
+    motion = lane_relative.decode_options(x, start, points[at])
     tracks = motion.states()
     seen = attack.foresight(tracks)
     lateral = (motion.v**2 * motion.kappa.abs()).amax(-1)
