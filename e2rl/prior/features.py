@@ -9,7 +9,7 @@ from e2rl.scenes.recording import DT, LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
 from e2rl.scenes.route import SPACING, interpolate
 from e2rl.scenes.smoothing import PAST
 from e2rl.sim.dynamics import constant_velocity
-from e2rl.sim.leaders import FREE_GAP, IDMParameters, idm_acceleration, leaders_at
+from e2rl.sim.leaders import FREE_GAP, IDMParameters, Leaders, idm_acceleration, leaders_at
 from e2rl.sim.mission import light_state_at
 
 CURVATURE_AT = (0.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)  # m ahead
@@ -23,9 +23,9 @@ SIDED_EDGE = (1, 3, 5, 13)
 
 
 def node_features(
-    routed: RoutedScene, state: LaneState, agents: Tensor, present: Tensor, step: Tensor, estimated: Tensor
+    routed: RoutedScene, state: LaneState, followed: Leaders, step: Tensor, estimated: Tensor
 ) -> Tensor:
-    """[B, V, NODE] from lane states [B, V], agents' states [B, N, 4], present [B, N] and the simulated step [B].
+    """[B, V, NODE] from lane states [B, V], the `leaders_ahead` and the simulated step [B].
 
     estimated [B] bool: the states are a causal observer's estimates (a recording's start) instead of exact ones
     (simulated later on); how far the present speed and acceleration can be trusted depends on it.
@@ -35,7 +35,10 @@ def node_features(
     at = (state.s / SPACING).round().long().clamp(0, routed.limit.shape[-1] - 1)
     limit = routed.limit.gather(-1, at[..., None])[..., 0]
     known = limit > 0
-    lead, gap, gap_speed = _leader_features(routed, state, agents, present)
+    near = torch.exp(-followed.gap.clamp(min=0) / 20.0)
+    closing = torch.where(followed.gap < FREE_GAP, (v[..., None] - followed.speed) / 5.0, 0.0)
+    lead = torch.stack([near, closing], -1).flatten(2).unbind(-1)
+    gap, gap_speed = followed.gap[..., 0], followed.speed[..., 0]
     desired_speed = torch.where(known, limit, 15.0).clamp(min=1.0)
     idm = idm_acceleration(v, desired_speed, gap, gap_speed, DRIVER, improved=False).clamp(-6.0, 2.0)
     motion = [v / 10, state.a / 2, state.d, state.d1 * 5, state.d2 * 20, (v < 0.5).float()]
@@ -68,15 +71,11 @@ def curve_speed(state: LaneState, points: Tensor, lateral: float, brake: float) 
     return torch.sqrt(lateral / curvature.clamp(min=1e-4) + 2 * brake * ahead).min(-1).values
 
 
-def _leader_features(
-    routed: RoutedScene, state: LaneState, agents: Tensor, present: Tensor
-) -> tuple[list[Tensor], Tensor, Tensor]:
-    """Nearness of the leader and closing speed at LEADER_AT, and the present leader's gap and speed [B, V]."""
+def leaders_ahead(routed: RoutedScene, s: Tensor, agents: Tensor, present: Tensor) -> Leaders:
+    """Leaders [B, V, 3] of vehicles at arc lengths s [B, V] once agents [B, N, 4] have kept their velocity for
+    LEADER_AT."""
     there = constant_velocity(agents, torch.tensor(LEADER_AT, device=agents.device))
-    gap, speed, _ = leaders_at(state.s, routed.points, there, routed.size, present)
-    near = torch.exp(-gap.clamp(min=0) / 20.0)
-    closing = torch.where(gap < FREE_GAP, (state.v[..., None] - speed) / 5.0, 0.0)
-    return list(torch.stack([near, closing], -1).flatten(2).unbind(-1)), gap[..., 0], speed[..., 0]
+    return leaders_at(s, routed.points, there, routed.size, present)
 
 
 def _light_features(routed: RoutedScene, state: LaneState, step: Tensor) -> list[Tensor]:

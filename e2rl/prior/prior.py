@@ -11,12 +11,13 @@ from torch import Tensor, nn
 from e2rl.prior import free_space, lane_relative
 from e2rl.prior.bounds import BoundSettings, Obstacles, apply_cap, bounded
 from e2rl.prior.denoiser import Denoiser, DenoiserSettings, Encoding
-from e2rl.prior.features import edge_features, node_features
+from e2rl.prior.features import edge_features, leaders_ahead, node_features
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, select
 from e2rl.prior.routes import RouteChoice, RoutedScene, route_scene, sample_route, start_state
 from e2rl.prior.sde import SamplerSettings, path_kl, path_martingale
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import project
+from e2rl.sim.leaders import Leaders
 
 BUDGET_SPENT = 0.999  # fraction of a transport budget from which on it counts as used up
 EGO_LEVEL = 0.01  # noise level at which the network sees the ego's plan
@@ -27,13 +28,14 @@ STANDING_SPEED, HOLD_DISTANCE = 0.5, 2.0  # m/s, m: a vehicle slower than this w
 class Context:
     """What stays the same over the denoising steps of one replan of B scenes.
 
-    state [B, V]; encoding: the network's; ego_x [B, SIZE]: the ego's plan as x, None where it is unknown and the ego is
+    state [B, V]; followed: the `leaders_ahead`; encoding: the network's; ego_x [B, SIZE]: the ego's plan as x, None where it is unknown and the ego is
     sampled like every vehicle; active [B, V]: simulated vehicles that are neither parked nor the ego; all_on_lane: no
     vehicle is in free space (asked once, on the host).
     """
 
     routed: RoutedScene
     state: LaneState
+    followed: Leaders
     encoding: Encoding
     ego_x: Tensor | None
     obstacles: Obstacles
@@ -110,20 +112,24 @@ class Prior(nn.Module):
         present: Tensor,
         step: Tensor,
         ego_plan: Tensor | None,
+        known: Context | None = None,
     ) -> Context:
         """The Context of a replan.
 
         agents [B, N, 4], present [B, N]: every agent now; step [B]: simulated steps; ego_plan [B, HORIZON, 4]: states
-        of the ego ahead, None (open loop) where unknown.
+        of the ego ahead, None (open loop) where unknown; known: a context of the same moment, which gives the leaders
+        of scenes in which everybody is at the same place of the same route.
         """
         here = present[:, : state.s.shape[1]]
-        nodes = node_features(routed, state, agents, present, step, step == 0)
+        followed = _leaders_ahead(routed, state.s, agents, present, known)
+        nodes = node_features(routed, state, followed, step, step == 0)
         encoding = self.denoiser.encode(nodes, edge_features(routed, state), here)
         obstacles = Obstacles(agents, routed.size, present)
         active = here & routed.modelled
         active = torch.cat([torch.zeros_like(active[:, :1]), active[:, 1:]], 1)
         ego_x = None if ego_plan is None else plan_to_x(ego_plan, state, routed)
-        return Context(routed, state, encoding, ego_x, obstacles, active, bool((routed.has_lane | ~here).all()))
+        all_on_lane = bool((routed.has_lane | ~here).all())
+        return Context(routed, state, followed, encoding, ego_x, obstacles, active, all_on_lane)
 
     def denoise(self, x: Tensor, level: Tensor, context: Context) -> Tensor:
         """x0 [B, V, SIZE] of x at a scalar noise level; a known plan of the ego replaces its row, nearly noise-free."""
@@ -217,6 +223,21 @@ class Prior(nn.Module):
         held = state.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
         zero = torch.zeros_like(held.v)
         return select(((state.v < STANDING_SPEED) & short) | inactive, replace(held, v=zero, a=zero), motion)
+
+
+def _leaders_ahead(
+    routed: RoutedScene, s: Tensor, agents: Tensor, present: Tensor, known: Context | None
+) -> Leaders:
+    """`leaders_ahead`, of scenes in which nobody has moved those of a Context."""
+    if known is None:
+        return leaders_ahead(routed, s, agents, present)
+    moved = (s != known.state.s) | (routed.points != known.routed.points).flatten(2).any(-1)
+    rows = moved.any(1).nonzero()[:, 0]
+    if not len(rows):
+        return known.followed
+    there = replace(routed, points=routed.points[rows], size=routed.size[rows])
+    new = leaders_ahead(there, s[rows], agents[rows], present[rows])
+    return Leaders(*(old.index_copy(0, rows, now) for old, now in zip(known.followed, new, strict=True)))
 
 
 def within_budget(budget: Tensor, spent: Tensor, added: Tensor) -> Tensor:

@@ -232,15 +232,19 @@ def against_lanes(points: Tensor, lane: Tensor, xy: Tensor, heading: Tensor) -> 
 
     points [B, M, 2]: of centrelines; lane [B, M]: which one each point is of (-1: padding).
     """
-    length = points.diff(dim=1).norm(dim=-1).clamp(min=1e-6)
-    ahead = points.diff(dim=1) / length[..., None]
+    start, end = points[:, :-1], points[:, 1:]
+    low, high = xy.amin(1, keepdim=True) - LANE_REACH, xy.amax(1, keepdim=True) + LANE_REACH
+    inside = ((start > low) & (start < high)).all(-1).any(0)  # maps are large, and vehicles in one part of them
     same = (lane[:, 1:] == lane[:, :-1]) & (lane[:, 1:] >= 0)
-    near = (torch.cdist(xy, points[:, :-1]) < LANE_REACH) & same[:, None]
-    b, k, segment = near.nonzero(as_tuple=True)  # few of a map's segments are near
+    start, end, same = (value[:, inside] for value in (start, end, same))
+    length = (end - start).norm(dim=-1).clamp(min=1e-6)
+    ahead = (end - start) / length[..., None]
+    near = (torch.cdist(xy, start) < LANE_REACH) & same[:, None]
+    b, k, segment = near.nonzero(as_tuple=True)  # few of them are near
     towards = torch.stack([heading[b, k].cos(), heading[b, k].sin()], -1)
     cosine = (towards * ahead[b, segment][:, None]).sum(-1)
 
-    offset = xy[b, k] - points[b, segment]
+    offset = xy[b, k] - start[b, segment]
     along = (offset * ahead[b, segment]).sum(-1).clamp(min=0).minimum(length[b, segment])
     gap = (offset - along[:, None] * ahead[b, segment]).norm(dim=-1)[:, None].expand_as(cosine)
 

@@ -38,6 +38,8 @@ def map_tensors(function: Callable, value: Any, *others: Any) -> Any:
     """Map function over every tensor or TensorDict of a value and its counterparts in others; the rest is kept."""
     if isinstance(value, Tensor | TensorDictBase):
         return function(value, *others)
+    if isinstance(value, tuple):  # a named tuple
+        return type(value)(*(map_tensors(function, *part) for part in zip(value, *others, strict=True)))
     if not is_dataclass(value) or isinstance(value, type):
         return value
     names = [field.name for field in fields(value)]

@@ -54,7 +54,7 @@ class Replan:
 
     state: the method's, its lane states now; world: the scenes now; ego_plan [G, HORIZON, 4]: the ego's motion, known
     or predicted; noise [K, G, V, ..., SIZE]: standard normal; react: from planned states [G, V, HORIZON, 4] to
-    the ego's own answer [G, HORIZON, 4], None where it cannot be asked.
+    the ego's own answer [G, HORIZON, 4], None where it cannot be asked; before: in which the ego was predicted.
     """
 
     state: State
@@ -62,6 +62,7 @@ class Replan:
     ego_plan: Tensor
     noise: Tensor
     react: Callable[[Tensor], Tensor] | None = None
+    before: Context | None = None
 
 
 @configured("synthesizer/nominal")
@@ -95,10 +96,12 @@ class NominalTraffic(Traffic):
             rows, vehicles = group.rows, group.vehicles
             part, there = crop_state(state, group, width), crop_world(world, group)
             part = self._expecting(part, there)
-            known = ego_plan[rows] if self.knowledge == "plan" else self.predicted_ego(part, there)
+            announced = (ego_plan[rows], None)
+            known, context = announced if self.knowledge == "plan" else self.predicted_ego(part, there)
             part = replace(part, lane=self.lane_now(part, there, known))
             answer = None if react is None else partial(react, rows)
-            part, x0, context = self.replan_group(Replan(part, there, known, noise[:, rows, :vehicles], answer))
+            now = Replan(part, there, known, noise[:, rows, :vehicles], answer, context)
+            part, x0, context = self.replan_group(now)
             plan = self.prior.plan(x0, context)
             part = replace(part, replans=part.replans + 1, lane=plan.after(REPLAN_STEPS))
             write_state(whole, part, group)
@@ -128,28 +131,28 @@ class NominalTraffic(Traffic):
 
     def replan_group(self, now: Replan) -> tuple[State, Tensor, Context]:
         """Returns state, joint sample x0 [G, V, SIZE] and context of a group."""
-        context = self.encode(now.state, now.world, now.ego_plan)
+        context = self.encode(now.state, now.world, now.ego_plan, now.before)
         return now.state, self.prior.sample(context, now.noise).x0, context
 
     @torch.no_grad()
-    def predicted_ego(self, state: State, world: World) -> Tensor:
+    def predicted_ego(self, state: State, world: World) -> tuple[Tensor, Context]:
         """Returns states [G, HORIZON, 4] of the ego, predicted from its state and past: its row of the joint clean
-        estimate, which is nearer to what egos drive than a sample."""
+        estimate, which is nearer to what egos drive than a sample; and the context of that."""
         action = torch.stack([world.accel[:, 0], world.turn_rate[:, 0]], -1)
         seen = dynamics.rollout(world.states[:, 0], action[:, None].expand(-1, HORIZON, -1))
         lane = self.lane_now(state, world, seen)
         context = self.prior.encode(state.routed, lane, world.states, world.valid, world.step, None)
-        return self.prior.decode(self.prior.estimate(context), context).states()[:, 0]
+        return self.prior.decode(self.prior.estimate(context), context).states()[:, 0], context
 
     def noise(self, state: State) -> Tensor:
         """Returns standard normal noise [K, B, V, SIZE] of the next replan."""
         shape = (self.prior.sampler.steps, state.routed.route.shape[1], SIZE)
         return noise_of(state.seed, 1 + state.replans, shape).transpose(0, 1)
 
-    def encode(self, state: State, world: World, ego_plan: Tensor) -> Context:
-        """Returns the prior's context of a replan."""
+    def encode(self, state: State, world: World, ego_plan: Tensor, known: Context | None = None) -> Context:
+        """Returns the prior's context of a replan; known: see `Prior.encode`."""
         now = world.states, world.valid, world.step
-        return self.prior.encode(state.routed, state.lane, *now, ego_plan)
+        return self.prior.encode(state.routed, state.lane, *now, ego_plan, known)
 
     def lane_now(self, state: State, world: World, ego_plan: Tensor) -> LaneState:
         """Returns the current lane states: the ego's from its state and planned yaw rate, the others' from their plans.

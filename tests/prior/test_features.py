@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from e2rl.prior.features import SIDED_EDGE, SIDED_NODE, curve_speed, edge_features, node_features
+from e2rl.prior.features import SIDED_EDGE, SIDED_NODE, curve_speed, edge_features, leaders_ahead, node_features
 from e2rl.prior.lane_relative import locate
 from e2rl.prior.routes import route_scene
 from tests.prior.small import arc, curved_scenes, mirrored, moved
@@ -21,7 +21,7 @@ def features(scene, step=None):
         routed.points,
     )
     step = torch.zeros(len(scene), dtype=torch.long) if step is None else step
-    nodes = node_features(routed, state, scene["start"], scene["valid"], step, step == 0)
+    nodes = node_features(routed, state, leaders_ahead(routed, state.s, scene["start"], scene["valid"]), step, step == 0)
     here = scene["valid"][0, :vehicles]
     return nodes[:, here], edge_features(routed, state)[:, here][:, :, here]
 

@@ -33,7 +33,7 @@ def test_a_plan_is_the_prior_s_sample(knowledge):
     world, state = World.at_start(scene), begin(on, scene)
     plan = EGO.plan(world)
     after, found = on.replan(state, world, plan)
-    plan = plan if knowledge == "plan" else on.predicted_ego(state, world)
+    plan = plan if knowledge == "plan" else on.predicted_ego(state, world)[0]
     routed, lane = on.prior.start(scene, state.routed.route)
     lane = on.lane_now(replace(state, routed=routed, lane=lane), world, plan)
     context = on.prior.encode(routed, lane, world.states, world.valid, world.step, plan)
@@ -108,7 +108,7 @@ def test_nonsense_in_the_announced_plan_is_believed_only_by_whoever_is_told_the_
 def test_the_prediction_begins_at_the_ego():
     on, scene = nominal(), scenes(3).scenes
     world, state = World.at_start(scene), begin(synthesizer(), scene)
-    found = on.predicted_ego(state, world)
+    found = on.predicted_ego(state, world)[0]
     assert found.shape == (3, 50, 4) and found.isfinite().all()
     first = world.states[:, 0, 3] * DT
     way = (found[:, 0, :2] - world.states[:, 0, :2]).norm(dim=-1)

@@ -6,7 +6,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from e2rl.prior import free_space, lane_relative
-from e2rl.prior.features import edge_features, node_features
+from e2rl.prior.features import edge_features, leaders_ahead, node_features
 from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS, KNOTS, LaneState, locate
 from e2rl.prior.routes import RoutedScene, route_scene
 from e2rl.scenes.recording import DT
@@ -72,7 +72,7 @@ def _window(
     fits = (scene["route_log"] >= 0) | ~routed.has_lane
     use = here & routed.modelled & fits & (error < MAX_ERROR) & (known.sum(-1) >= KNOT_STEPS)
     columns = {name: getattr(state, name) for name in ("v", "a", "d", "d1", "d2")} | {
-        "nodes": node_features(routed, state, agents, valid, step, estimated),
+        "nodes": node_features(routed, state, leaders_ahead(routed, state.s, agents, valid), step, estimated),
         "present": here,
         "x0": x0,
         "weight": use * torch.where(moving, 1.0, STANDING_WEIGHT),

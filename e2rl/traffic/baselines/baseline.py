@@ -78,7 +78,7 @@ class Baseline(NominalTraffic):
 
     def replan_group(self, now: Replan) -> tuple[BaselineState, Tensor, Context]:
         """Returns state, joint sample x0 [G, V, SIZE] and context of a group."""
-        context = self.encode(now.state, now.world, now.ego_plan)
+        context = self.encode(now.state, now.world, now.ego_plan, now.before)
         if not bool((self.strength(now.state) > 0).any()):
             return now.state, self.prior.sample(context, now.noise[..., 0, :]).x0, context
         state, x0 = self.attack(now, context)

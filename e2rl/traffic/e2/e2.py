@@ -14,7 +14,6 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import HORIZON, SIZE
 from e2rl.prior.prior import Context
-from e2rl.prior.routes import take_route
 from e2rl.run.settings import configured
 from e2rl.sim.world import World
 from e2rl.traffic.e2.anchoring import Anchor
@@ -78,7 +77,7 @@ class E2(Coalitions):
         world = replace(now.world, route=state.routed.route)
         state, anchor = self._reselected(state, world, ego_plan)
         state, anchor = self._afforded(state, world, anchor)
-        context = self.encode(state, world, ego_plan)
+        context = self.encode(state, world, ego_plan, now.before)
         anchored = anchor.feasible & state.coalition
         acts = anchored if self.control.anchoring != "off" else anchored & state.off_lane
         state = replace(state, committed=acts, knots=anchor.knots)
@@ -97,8 +96,7 @@ class E2(Coalitions):
     def _afforded(self, state: E2State, world: World, anchor: Anchor) -> tuple[E2State, Anchor]:
         """States with the interceptions under way and their nats booked; those beyond the budget are off."""
         off_lane = anchor.off_lane & state.coalition & (state.eta > 0)[:, None]
-        lane = take_route(world.scene["route_points"], state.routed.route.clamp(min=0))
-        cost = sideways(anchor, world, state.lane, lane) * off_lane
+        cost = sideways(anchor, world, state.lane, state.routed.route, off_lane)
         budget = self._budget(state)
         if budget is not None:
             held = (cost.sum(-1) <= budget)[:, None]

@@ -107,22 +107,26 @@ def pulled(x0: Tensor, goal: Tensor, strength: Tensor, level: Tensor, schedule: 
     return x0 + ((goal - x0) @ vectors * weight) @ vectors.T
 
 
-def sideways(anchor: Anchor, world: World, lane: LaneState, points: Tensor) -> Tensor:
-    """Nats [B, V] of the interceptions of an anchor: of the two lateral knots that fit them on the lanes points [B, V,
-    P, 2] that they leave, under N(0, C). lane [B, V]: the present states, on whatever they follow.
+def sideways(anchor: Anchor, world: World, lane: LaneState, route: Tensor, off_lane: Tensor) -> Tensor:
+    """Nats [B, V] of the interceptions off_lane [B, V] of an anchor: of the two lateral knots that fit them on the
+    lanes that they leave, candidates route [B, V], under N(0, C). lane [B, V]: the present states, on whatever they
+    follow.
 
     An estimate, not a bound: the prior's law beside a lane is not known, only around it.
     """
-    states = world.states[:, : points.shape[1]]
-    now = lane_relative.locate(states, lane.a, lane.kappa * lane.v, points)
-    speed, travelled = lane_relative.speeds(now, anchor.knots)
-    start = project(states[:, :, None, :2], anchor.off_lane_path)[0]
-    xy, heading, _ = interpolate(anchor.off_lane_path, start + travelled)
+    at = off_lane.nonzero(as_tuple=True)
+    points, path = world.scene["route_points"][(*at, route.clamp(min=0)[at])], anchor.off_lane_path[at]
+    old = lane.map(lambda value: value[at])
+    now = lane_relative.locate(world.states[at], old.a, old.kappa * old.v, points)
+    speed, travelled = lane_relative.speeds(now, anchor.knots[at])
+    start = project(world.states[at][:, None, :2], path)[0]
+    xy, heading, _ = interpolate(path, start + travelled)
     s, d, _ = project(xy, points, now.s[..., None] + travelled)
     track = LaneState.from_states(torch.cat([xy, heading[..., None], speed[..., None]], -1), s, d)
     x = lane_relative.fit(track, torch.ones_like(speed), now)[0]
     variance = torch.tensor(SPREAD[KNOTS:], device=x.device).square()
-    return (x[..., KNOTS:].square() / (2 * variance)).sum(-1)
+    nats = (x[..., KNOTS:].square() / (2 * variance)).sum(-1)
+    return torch.zeros_like(lane.s).index_put(at, nats)
 
 
 @dataclass(frozen=True)
