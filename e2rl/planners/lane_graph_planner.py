@@ -98,8 +98,13 @@ def collision_hazard(ego: Tensor, ego_size: Tensor, others: Prediction, slope: f
     weight = slope + growth * torch.arange(times, device=ego.device, dtype=ego.dtype)
     reach = (ego_size[others.scene].norm(dim=-1) + others.size.norm(dim=-1))[:, None] / 2
     cut = reach + math.atanh(1 - NEGLIGIBLE) / weight  # [J, T]
-    centre = ego[others.scene, :, :, :2].transpose(1, 2)  # [J, T, C, 2]
-    j, t, c = (_squared(centre, others.poses[:, :, None, :2]) < cut.square()[..., None]).nonzero(as_tuple=True)
+    centre, at = ego[..., :2], others.poses[..., :2]
+    low, high = (bound(1)[others.scene] for bound in (centre.amin, centre.amax))  # [J, T, 2], of all profiles
+    beside = torch.maximum(low - at, at - high).clamp(min=0)
+    j, t = (_squared(beside, torch.zeros_like(beside)) < cut.square()).nonzero(as_tuple=True)
+    near = _squared(centre[others.scene[j], :, t], at[j, t][:, None]) < cut[j, t].square()[:, None]
+    pair, c = near.nonzero(as_tuple=True)
+    j, t = j[pair], t[pair]
     b, hazard = others.scene[j], ego.new_zeros(batch * count)
     for j, t, c, b in zip(*(index.split(CHUNK) for index in (j, t, c, b)), strict=True):
         each = hazard_of(ego[b, c, t], ego_size[b], others.poses[j, t], others.size[j], weight[t])

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, cast
 
 import torch
@@ -145,7 +145,12 @@ class Denoiser(nn.Module):
         if self.training or len(level) > 1 or not is_on():
             return self.estimate(x, level, encoding)
         scene = encoding.nodes, encoding.pairs, *encoding.biases, *encoding.modulations
-        return estimate_kernel(self.settings)(x, level, *scene, *_weights(self))
+        return estimate_kernel(self.settings)(x, level, *scene, *self._read)
+
+    @cached_property
+    def _read(self) -> list[Tensor]:
+        """The weights and constants that `estimate` reads."""
+        return [*self.parameters(), *self.buffers()]
 
     def estimate(self, x: Tensor, level: Tensor, encoding: Encoding) -> Tensor:
         """`forward`, operation by operation."""
@@ -155,11 +160,6 @@ class Denoiser(nn.Module):
             h = block(h, of_node + of_level, bias, encoding.pairs)
         alpha, sigma = self.schedule.alpha(level)[..., None], self.schedule.sigma(level)[..., None]
         return alpha * x + sigma * self.head(h).to(x.dtype)
-
-
-def _weights(network: Denoiser) -> list[Tensor]:
-    """What `Denoiser.estimate` reads of a network."""
-    return [*network.parameters(), *network.buffers()]
 
 
 class _Estimate(nn.Module):
@@ -178,7 +178,7 @@ def estimate_kernel(settings: DenoiserSettings) -> Kernel:
     """`Denoiser.estimate` of networks of these sizes: of x, level, nodes, pairs, biases, modulations and weights."""
     module = _Estimate(Denoiser(settings).eval())
     names = [name for name, _ in (*module.named_parameters(), *module.named_buffers())]
-    sizes = [" ".join(map(str, value.shape)) for value in _weights(module.network)]
+    sizes = [" ".join(map(str, value.shape)) for value in module.network._read]
 
     def denoise(x: Tensor, level: Tensor, nodes: Tensor, pairs: Tensor, *given: Tensor) -> Tensor:
         biases, modulations = given[: settings.blocks], given[settings.blocks : 2 * settings.blocks]

@@ -59,11 +59,17 @@ class Kernel:
         return found[0] if self.returns is Tensor else self.returns(*found) if _made(self.returns) else tuple(found)
 
     def _fits(self, flat: list[Tensor]) -> bool:
-        size: dict[str, int] = {}
-        for value, (names, kind) in zip(flat, self.declared, strict=True):
-            if value.dtype != kind or value.is_cuda or value.dim() != len(names):
+        size: dict[Any, int] = {}
+        for value, (names, kind, fixed) in zip(flat, self.declared, strict=True):
+            if value.dtype != kind or value.is_cuda:
                 return False
-            for name, length in zip(names, value.shape, strict=True):
+            if fixed is not None:
+                if value.shape != fixed:
+                    return False
+                continue
+            if value.dim() != len(names):
+                return False
+            for name, length in zip(names, value.shape):
                 if length == 0 or length != (name if isinstance(name, int) else size.setdefault(name, length)):
                     return False
         return not (torch.is_grad_enabled() and any(value.requires_grad for value in flat))
@@ -80,19 +86,20 @@ class Kernel:
         return get_type_hints(self.function)["return"]
 
     @cached_property
-    def declared(self) -> list[tuple[list[str | int], torch.dtype]]:
-        """Sizes and type of each tensor."""
-        found: list[tuple[list[str | int], torch.dtype]] = []
+    def declared(self) -> list[tuple[list[str | int], torch.dtype, torch.Size | None]]:
+        """Sizes and type of each tensor, and its shape where no size varies."""
+        found: list[tuple[list[str | int], torch.dtype, torch.Size | None]] = []
         for shape, kind in zip(self.shapes, self.kinds, strict=True):
             sizes, _, name = shape.partition(":")
             names = [int(size) if size.isdigit() else size for size in sizes.split()]
-            found += [(names, getattr(torch, name or "float32"))] * len(_fields(kind))
+            fixed = torch.Size(names) if all(isinstance(size, int) for size in names) else None
+            found += [(names, getattr(torch, name or "float32"), fixed)] * len(_fields(kind))
         return found
 
     @cached_property
     def vectors(self) -> list[bool]:
         """Which tensors are of vectors: these come component by component, so that loops over rows are contiguous."""
-        last = [names[-1] if len(names) > 1 else "" for names, _ in self.declared]
+        last = [names[-1] if len(names) > 1 else "" for names, *_ in self.declared]
         return [isinstance(size, int) and size <= VECTOR for size in last]
 
     @cached_property
@@ -121,10 +128,10 @@ class Kernel:
                 self._compile()
 
     def _compile(self) -> None:
-        free = sorted({name for names, _ in self.declared for name in names if isinstance(name, str)})
+        free = sorted({name for names, *_ in self.declared for name in names if isinstance(name, str)})
         size: dict[Any, int] = dict(zip(free, _primes(), strict=False))
         examples, dynamic = [], []
-        for (names, kind), vector in zip(self.declared, self.vectors, strict=True):
+        for (names, kind, _), vector in zip(self.declared, self.vectors, strict=True):
             names = [names[-1], *names[:-1]] if vector else names
             examples.append(torch.zeros([size.get(name, name) for name in names], dtype=kind))
             dynamic.append({at: torch.export.Dim.DYNAMIC for at, name in enumerate(names) if name in size})

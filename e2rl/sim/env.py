@@ -17,7 +17,7 @@ from e2rl.run.settings import configured, setting
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.mission import Mission, mission_of
-from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, observation_config, observe, placed_ego
+from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, glance, observation_config, observe, placed_ego
 from e2rl.sim.reward import check_weights
 from e2rl.sim.static import FrenetPose, static_scene, write_rows
 from e2rl.sim.step import Outcome, StepConfig, hold_step, step
@@ -63,13 +63,15 @@ class DrivingEnv(EnvBase):
     """
 
     def __init__(
-        self, scenes: SceneSet, settings: SimSettings, batch_size: int, device="cpu", agents=False, hold: int = 1
+        self, scenes: SceneSet, settings: SimSettings, batch_size: int, device="cpu", agents=False, hold: int = 1, observed=True
     ) -> None:
-        """Raises InputError if hold is below 1."""
+        """observed: false for egos that do not read the observation, which is then empty. Raises InputError if hold is
+        below 1."""
         if hold < 1:
             raise InputError(f"DrivingEnv: hold={hold}; an action lasts at least one step")
         super().__init__(device=device, batch_size=[batch_size])
         self.scenes, self.settings, self.agents, self.hold = scenes, settings, agents, hold
+        self._sense, width = (observe, OBSERVATION_SIZE) if observed else (glance, 0)
         self._generator = torch.Generator()
         self.generators = {self._generator}
         """All that episodes are drawn with: `set_seed` seeds them alike. A transform adds its own."""
@@ -91,7 +93,7 @@ class DrivingEnv(EnvBase):
         self._ego = EgoState(
             zeros.long(), zeros[:, None].repeat(1, 4), zeros[:, None].repeat(1, 2), pose, flags, flags.clone(), zeros
         )
-        self._features = torch.zeros(batch_size, OBSERVATION_SIZE, device=device)  # as last observed
+        self._features = torch.zeros(batch_size, width, device=device)  # as last observed
         self._make_specs(batch_size, self.scene["start"].shape[1])
 
     def _make_specs(self, batch: int, agents: int) -> None:
@@ -108,7 +110,7 @@ class DrivingEnv(EnvBase):
             return Composite(**specs, shape=[batch], device=self.device)
 
         specs = {
-            "observation": number(OBSERVATION_SIZE),
+            "observation": number(self._features.shape[1]),
             "scene_index": number(dtype=torch.int64),
             "timestep": number(dtype=torch.int64),
             "metrics": group(contact=flag(), contact_vru=flag(), off_road=flag(), progress=number()),
@@ -182,7 +184,7 @@ class DrivingEnv(EnvBase):
         if len(index) < batch:
             static = static._replace(field=self.scene["field"][index], light_state=self.scene["light_state"][index])
         others = Agents(*(fresh[name][:, 1:] for name in ("start", "valid", "start_accel", "start_yaw_rate")))
-        features = observe(self._config.observation, static, begun, others, self.horizon).features
+        features = self._sense(self._config.observation, static, begun, others, self.horizon).features
         self._features = self._features.index_copy(0, index, features)
         ego = self._ego
         outcome = dict.fromkeys((*FLAGS, *METRICS), torch.zeros_like(ego.present))
@@ -215,7 +217,7 @@ class DrivingEnv(EnvBase):
         recording = self.scene["logged"], self.scene["logged_valid"]
         function = compiled(step) if self.settings.compile else step
         given = recording if self.settings.replay_ego else tensordict["action"]
-        self._ego, outcome = hold_step(function, self.hold, self._ego, given, tracks, self._static, self._config)
+        self._ego, outcome = hold_step(function, self.hold, self._sense, self._ego, given, tracks, self._static, self._config)
         self._features = outcome["observation"]
         return self._output(outcome).set("reward", outcome["reward"][:, None])
 

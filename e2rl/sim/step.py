@@ -101,16 +101,17 @@ def step(
 
 
 def hold_step(
-    function: Callable[..., tuple[EgoState, Outcome]], hold: int, ego: EgoState, *given
+    function: Callable[..., tuple[EgoState, Outcome]], hold: int, sense: Callable[..., Observed], ego: EgoState, *given
 ) -> tuple[EgoState, Outcome]:
-    """`hold` steps of function (`step`) under one action: rewards are summed, flags are of any step.
+    """`hold` steps of function (`step`) under one action: rewards are summed, flags are of any step; `sense` is for the
+    last.
 
     Egos whose episode ends stay at that moment, which is also the one they observe; the others observe the last one.
     """
-    ego, outcome = function(ego, *given, observe if hold == 1 else glance)
+    ego, outcome = function(ego, *given, sense if hold == 1 else glance)
     for last in range(2, hold + 1):
         ended = outcome["terminated"] | outcome["truncated"]
-        ego, later = function(ego, *given, observe if last == hold else glance, ended)
+        ego, later = function(ego, *given, sense if last == hold else glance, ended)
         flags = {name: outcome[name] | (later[name] & ~ended) for name in FLAGS}
         outcome = later | flags | {"reward": outcome["reward"] + later["reward"].masked_fill(ended, 0)}
     return ego, outcome

@@ -52,7 +52,8 @@ def roll_out(
     settings.replay_ego = sim.replay_ego or ego.replays_log
     given = (None if x is None else x.cpu() for x in (template, decisions))
     pool = TrafficPool.live(index.cpu(), eta.cpu().float(), seed.cpu(), *given)
-    base = DrivingEnv(scenes, settings, len(index), device, agents=True)
+    looks = type(ego).act is not Ego.act
+    base = DrivingEnv(scenes, settings, len(index), device, agents=True, observed=looks)
     synthesizer, log = AdversarialSynthesizer(pool, torch.arange, traffic, ego), PlanLog()
     synthesizer.on_plan = log
     env = TransformedEnv(base, synthesizer)

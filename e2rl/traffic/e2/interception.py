@@ -15,6 +15,7 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS
 from e2rl.prior.routes import take_route
+from e2rl.run.kernels import kernel
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import overlap
 from e2rl.scenes.drivable_area import off_road
@@ -145,10 +146,15 @@ def _clear(paths: _Paths, travelled: Tensor, size: Tensor, others: tuple[Tensor,
     tangent = paths.tangents.gather(3, index)
     heading = torch.atan2(tangent[..., 1:], tangent[..., :1])
     pose = torch.cat([paths.points.gather(3, index), heading, torch.zeros_like(heading)], -1)
-    states, sizes, counts = others
-    boxes = (pose[:, :, :, None], (size + CLEARANCE)[:, :, None, None, None])
-    hit = overlap(*boxes, states[:, None, None], sizes[:, None, None, :, None])
-    return ~(hit & counts[:, :, None, :, None] & (travelled >= 0)[:, :, :, None]).flatten(3).any(-1)
+    return ~touched(pose, size + CLEARANCE, *others, travelled)
+
+
+@kernel("B M O W 4", "B M 2", "B J W 4", "B J 2", "B M J:bool", "B M O W")
+def touched(pose: Tensor, size: Tensor, states: Tensor, sizes: Tensor, counts: Tensor, travelled: Tensor) -> Tensor:
+    """Bool [B, M, O]: boxes at pose [B, M, O, W, 4] touch one that counts, before they arrive (see `_clear`)."""
+    boxes = (pose[:, :, :, :, None], size[:, :, None, None, None], states.transpose(1, 2)[:, None, None])
+    hit = overlap(*boxes, sizes[:, None, None, None])
+    return (hit & counts[:, :, None, None] & (travelled >= 0)[..., None]).flatten(3).any(-1)
 
 
 def intercept(
