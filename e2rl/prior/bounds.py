@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from e2rl.prior.lane_relative import ACCEL_SCALE, LaneState, select
+from e2rl.prior.lane_relative import ACCEL_SCALE, LaneState
 from e2rl.run.kernels import kernel
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import overlap
@@ -65,18 +65,27 @@ class Obstacles:
     duty: Duty | None = None
 
 
+Rows = tuple[Tensor, ...]  # scene and vehicle [Q] int64 of Q vehicles
+
+
 def bounded(
-    settings: BoundSettings, decode: Callable[[Tensor | None], LaneState], state: LaneState, obstacles: Obstacles
+    settings: BoundSettings,
+    decode: Callable[[Rows | None, Tensor | None], LaneState],
+    state: LaneState,
+    obstacles: Obstacles,
 ) -> LaneState:
-    """The motion decode(None), fields [B, V, HORIZON], or decode(cap) for vehicles that get a cap [B, V].
+    """The motion decode(None, None), fields [B, V, HORIZON], with that of decode(rows, cap), fields [Q, HORIZON], of
+    the vehicles that get a cap [Q].
 
     Braking may put a vehicle in the way of the one behind it, so plans are compared twice.
     """
-    motion = decode(None)
+    motion = decode(None, None)
     cap = torch.full_like(state.v, NO_CAP)
     for _ in range(2):
         cap = torch.minimum(cap, acceleration_caps(settings, motion, state, obstacles))
-        motion = select(cap < NO_CAP, decode(cap), motion)
+        rows = (cap < NO_CAP).nonzero(as_tuple=True)
+        if len(rows[0]):
+            motion = motion.put(rows, decode(rows, cap[rows]))
     return motion
 
 

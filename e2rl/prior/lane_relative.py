@@ -15,7 +15,7 @@ from torch import Tensor
 
 from e2rl.run.kernels import kernel
 from e2rl.scenes.recording import DT
-from e2rl.scenes.route import interpolate, project
+from e2rl.scenes.route import interpolate, project, tangents
 from e2rl.sim.dynamics import wrap
 
 HORIZON = 50  # steps of DT
@@ -58,6 +58,10 @@ class LaneState:
     def map(self, function: Callable[[Tensor], Tensor]) -> "LaneState":
         """A LaneState with `function` applied to every field."""
         return LaneState(*(function(getattr(self, field.name)) for field in fields(self)))
+
+    def put(self, rows: tuple[Tensor, ...], other: "LaneState") -> "LaneState":
+        """A LaneState with `rows` of every field replaced by `other`."""
+        return LaneState(*(old.index_put(rows, new) for old, new in zip(vars(self).values(), vars(other).values())))
 
     def states(self) -> Tensor:
         """[..., 4]: x, y, heading, speed."""
@@ -149,8 +153,11 @@ def split(x: Tensor, state: LaneState) -> tuple[Tensor, Tensor, Tensor]:
     return ACCEL_SCALE * x[..., :KNOTS], half, end
 
 
-def decode(x: Tensor, state: LaneState, points: Tensor, steps: slice = slice(None)) -> LaneState:
-    """Planned motion [..., V, HORIZON] of x [..., V, SIZE] on routes [..., V, P, 2], or those `steps` of it."""
+def decode(
+    x: Tensor, state: LaneState, points: Tensor, steps: slice = slice(None), along: tuple[Tensor, Tensor] | None = None
+) -> LaneState:
+    """Planned motion [..., V, HORIZON] of x [..., V, SIZE] on routes [..., V, P, 2], or those `steps` of it; along: the
+    routes' tangents, see `interpolate`."""
     knots, half, end = split(x, state)
     v, travelled = speeds(state, knots)
     accel = torch.diff(v, dim=-1, prepend=state.v[..., None])[..., steps] / DT
@@ -159,23 +166,24 @@ def decode(x: Tensor, state: LaneState, points: Tensor, steps: slice = slice(Non
     d, d1, d2 = polynomial(offset_coefficients(state, half, end), (travelled / reach).clamp(max=1.0))
     d1, d2 = d1 / reach, d2 / reach**2
     s = state.s[..., None] + travelled
-    xy, heading, curvature = interpolate(points, s)
+    xy, heading, curvature = interpolate(points, s, along)
     normal = torch.stack([-torch.sin(heading), torch.cos(heading)], -1)
     xy = xy + d[..., None] * normal
     heading = heading + torch.atan(d1 / (1 - curvature * d).clamp(min=0.3))
     return LaneState(s, d, d1, d2, v, accel, xy[..., 0], xy[..., 1], heading, curvature + d2)
 
 
-@kernel(f"B V {SIZE}", "B V", "B V P 2")
+@kernel(f"B V {SIZE}", "B V", "B V P 2!")
 def decode_plans(x: Tensor, state: LaneState, points: Tensor) -> LaneState:
     """`decode` of every vehicle's plan."""
     return decode(x, state, points)
 
 
-@kernel(f"G O {SIZE}", "G O", "G P 2")
+@kernel(f"G O {SIZE}", "G O", "G P 2!")
 def decode_options(x: Tensor, state: LaneState, points: Tensor) -> LaneState:
     """`decode` of O plans of each of G vehicles on its route."""
-    return decode(x, state, points[:, None])
+    routes = points[:, None]
+    return decode(x, state, routes, along=tangents(routes))
 
 
 class _Polynomial(torch.autograd.Function):

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from e2rl.prior import free_space, lane_relative
-from e2rl.prior.bounds import BoundSettings, Obstacles, apply_cap, bounded
+from e2rl.prior.bounds import BoundSettings, Obstacles, Rows, apply_cap, bounded
 from e2rl.prior.denoiser import Denoiser, DenoiserSettings, Encoding
 from e2rl.prior.features import edge_features, leaders_ahead, node_features
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, select
@@ -207,27 +207,34 @@ class Prior(nn.Module):
     def plan(self, x0: Tensor, context: Context) -> Plan:
         """The motion that is executed: decoded and bounded, with standing vehicles held and routes ended."""
 
-        def decode(cap: Tensor | None) -> LaneState:
-            return self._held(self.decode(x0, context, cap), context)
+        held, routed, state = ~context.active, context.routed, context.state
+        held[:, 0] = False
 
-        motion, routed = bounded(self.bounds, decode, context.state, context.obstacles), context.routed
+        def decode(rows: Rows | None, cap: Tensor | None) -> LaneState:
+            if rows is None:
+                return _held(self.decode(x0, context), state, held)
+            some = {name: getattr(routed, name)[rows][:, None] for name in ("points", "has_lane")}
+            now = state.map(lambda value: value[rows][:, None])
+            part = replace(context, routed=replace(routed, **some), state=now)
+            assert cap is not None
+            motion = self.decode(x0[rows][:, None], part, cap[:, None])
+            return _held(motion, now, held[rows][:, None]).map(lambda value: value[:, 0])
+
+        motion = bounded(self.bounds, decode, state, context.obstacles)
         ended = routed.open[..., None] & (motion.s >= routed.length[..., None]) & routed.has_lane[..., None]
         return Plan(motion, ~(ended.cumsum(-1) > 0))
 
-    def _held(self, motion: LaneState, context: Context) -> LaneState:
-        """The motion with inactive vehicles, and standing ones whose plan is too short for a start, held in place."""
-        state = context.state
-        inactive = ~context.active
-        inactive[:, 0] = False
-        short = (motion.s[..., -1] - state.s) < HOLD_DISTANCE
-        held = state.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
-        zero = torch.zeros_like(held.v)
-        return select(((state.v < STANDING_SPEED) & short) | inactive, replace(held, v=zero, a=zero), motion)
+
+def _held(motion: LaneState, state: LaneState, always: Tensor) -> LaneState:
+    """The motion with vehicles `always` [B, V], and standing ones whose plan is too short for a start, held in
+    place."""
+    short = (motion.s[..., -1] - state.s) < HOLD_DISTANCE
+    held = state.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
+    zero = torch.zeros_like(held.v)
+    return select(((state.v < STANDING_SPEED) & short) | always, replace(held, v=zero, a=zero), motion)
 
 
-def _leaders_ahead(
-    routed: RoutedScene, s: Tensor, agents: Tensor, present: Tensor, known: Context | None
-) -> Leaders:
+def _leaders_ahead(routed: RoutedScene, s: Tensor, agents: Tensor, present: Tensor, known: Context | None) -> Leaders:
     """`leaders_ahead`, of scenes in which nobody has moved those of a Context."""
     if known is None:
         return leaders_ahead(routed, s, agents, present)

@@ -18,13 +18,15 @@ from dataclasses import fields, is_dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from types import ModuleType
-from typing import Any, get_type_hints
+from typing import Any, NamedTuple, get_type_hints
 
 import torch
 from torch import Tensor, nn
 
 from e2rl.run.errors import InputError
 from e2rl.run.files import locked
+
+Shape = str | tuple[str, ...]  # of a tensor or of all of a dataclass, or of each of them
 
 KERNELS: dict[str, "Kernel"] = {}
 """All kernels of the modules that are imported, by name."""
@@ -38,11 +40,12 @@ class Kernel:
     """A function of tensors, compiled where `switch` is on: on the CPU, of the types declared, without gradients.
 
     shapes: of each argument, names of sizes that vary and numbers that do not, then ":" and a type (float32 by
-    default). Equal names are equal sizes. The shape of a dataclass or a named tuple is that of all its tensors. Where
+    default). Equal names are equal sizes. Vectors, of few numbers, are copied component by component, so that loops
+    over rows are contiguous; "!" leaves them as they lie, as is better for tables. The shape of a dataclass or a named tuple is that of all its tensors, or one for each. Where
     a size is 0, or anything is not as declared, the function runs as it is.
     """
 
-    def __init__(self, function: Callable[..., Any], shapes: tuple[str, ...]) -> None:
+    def __init__(self, function: Callable[..., Any], shapes: tuple[Shape, ...]) -> None:
         self.function, self.shapes = function, shapes
         self.name = f"{function.__module__}.{function.__qualname__}"
         self.__doc__ = function.__doc__
@@ -55,12 +58,12 @@ class Kernel:
         flat = [tensor for value in given for tensor in _tensors(value)]
         if not self._fits(flat):
             return self.function(*given)
-        found = self._run([_apart(value) if vector else value.contiguous() for value, vector in zip(flat, self.vectors)])
+        found = self._run([given.laid_out(value) for given, value in zip(self.declared, flat)])
         return found[0] if self.returns is Tensor else self.returns(*found) if _made(self.returns) else tuple(found)
 
     def _fits(self, flat: list[Tensor]) -> bool:
         size: dict[Any, int] = {}
-        for value, (names, kind, fixed) in zip(flat, self.declared, strict=True):
+        for value, (names, kind, fixed, _) in zip(flat, self.declared, strict=True):
             if value.dtype != kind or value.is_cuda:
                 return False
             if fixed is not None:
@@ -86,21 +89,17 @@ class Kernel:
         return get_type_hints(self.function)["return"]
 
     @cached_property
-    def declared(self) -> list[tuple[list[str | int], torch.dtype, torch.Size | None]]:
-        """Sizes and type of each tensor, and its shape where no size varies."""
-        found: list[tuple[list[str | int], torch.dtype, torch.Size | None]] = []
-        for shape, kind in zip(self.shapes, self.kinds, strict=True):
-            sizes, _, name = shape.partition(":")
-            names = [int(size) if size.isdigit() else size for size in sizes.split()]
-            fixed = torch.Size(names) if all(isinstance(size, int) for size in names) else None
-            found += [(names, getattr(torch, name or "float32"), fixed)] * len(_fields(kind))
+    def declared(self) -> list["_Declared"]:
+        """What is said of each tensor."""
+        found = []
+        for given, kind in zip(self.shapes, self.kinds, strict=True):
+            for shape in (given,) * len(_fields(kind)) if isinstance(given, str) else given:
+                sizes, _, name = shape.removesuffix("!").partition(":")
+                names = [int(size) if size.isdigit() else size for size in sizes.split()]
+                fixed = torch.Size(names) if all(isinstance(size, int) for size in names) else None
+                apart = len(names) > 1 and isinstance(names[-1], int) and names[-1] <= VECTOR and shape[-1] != "!"
+                found.append(_Declared(names, getattr(torch, name or "float32"), fixed, apart))
         return found
-
-    @cached_property
-    def vectors(self) -> list[bool]:
-        """Which tensors are of vectors: these come component by component, so that loops over rows are contiguous."""
-        last = [names[-1] if len(names) > 1 else "" for names, *_ in self.declared]
-        return [isinstance(size, int) and size <= VECTOR for size in last]
 
     @cached_property
     def file(self) -> Path:
@@ -121,18 +120,20 @@ class Kernel:
             return
         names = (os.environ.get("CXX"), *COMPILERS)
         if not any(name and shutil.which(name) for name in names):
-            raise InputError(f"compile=true: no C++ compiler found (CXX, {', '.join(COMPILERS)}): install one, or compile=false")
+            raise InputError(
+                f"compile=true: no C++ compiler found (CXX, {', '.join(COMPILERS)}): install one, or compile=false"
+            )
         self.file.parent.mkdir(parents=True, exist_ok=True)
         with locked(self.file.with_suffix(".lock")):
             if not self.file.exists():
                 self._compile()
 
     def _compile(self) -> None:
-        free = sorted({name for names, *_ in self.declared for name in names if isinstance(name, str)})
+        free = sorted({name for given in self.declared for name in given.sizes if isinstance(name, str)})
         size: dict[Any, int] = dict(zip(free, _primes(), strict=False))
         examples, dynamic = [], []
-        for (names, kind, _), vector in zip(self.declared, self.vectors, strict=True):
-            names = [names[-1], *names[:-1]] if vector else names
+        for names, kind, _, apart in self.declared:
+            names = [names[-1], *names[:-1]] if apart else names
             examples.append(torch.zeros([size.get(name, name) for name in names], dtype=kind))
             dynamic.append({at: torch.export.Dim.DYNAMIC for at, name in enumerate(names) if name in size})
         made, module = self.file.with_name(f"{self.file.stem}.{os.getpid()}.pt2"), _Module(self)
@@ -143,7 +144,7 @@ class Kernel:
         made.replace(self.file)
 
 
-def kernel(*shapes: str) -> Callable[[Callable[..., Any]], Kernel]:
+def kernel(*shapes: Shape) -> Callable[[Callable[..., Any]], Kernel]:
     """Decorator: makes a Kernel of a function of tensors of these shapes."""
     return lambda function: Kernel(function, shapes)
 
@@ -172,8 +173,8 @@ class _Module(nn.Module):
         self.kernel = kernel
 
     def forward(self, *flat: Tensor) -> Any:
-        apart = zip(flat, self.kernel.vectors, strict=True)
-        rest = iter([value.movedim(0, -1) if vector else value for value, vector in apart])
+        declared = zip(flat, self.kernel.declared, strict=True)
+        rest = iter([value.movedim(0, -1) if given.apart else value for value, given in declared])
         given = []
         for kind in self.kernel.kinds:
             parts = [next(rest) for _ in _fields(kind)]
@@ -181,8 +182,18 @@ class _Module(nn.Module):
         return tuple(_tensors(self.kernel.function(*given)))
 
 
-def _apart(value: Tensor) -> Tensor:
-    return value.movedim(-1, 0).contiguous()
+class _Declared(NamedTuple):
+    """A tensor of a kernel: its sizes, its type, its shape where no size varies, and whether vectors come component by
+    component."""
+
+    sizes: list[Any]
+    kind: torch.dtype
+    fixed: torch.Size | None
+    apart: bool
+
+    def laid_out(self, value: Tensor) -> Tensor:
+        """The tensor as the compiled kernel reads it."""
+        return value.movedim(-1, 0).contiguous() if self.apart else value.contiguous()
 
 
 def _made(kind: Any) -> bool:

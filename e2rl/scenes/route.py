@@ -100,23 +100,41 @@ def onto_nearer(
     return s, d, second
 
 
-def interpolate(route: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def interpolate(
+    route: Tensor, s: Tensor, tangents: tuple[Tensor, Tensor] | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """Point [..., K, 2], heading [rad], curvature [1/m] (each [..., K]) of route [..., P, 2] at arc length s [..., K].
 
     Points lie on the chords; the heading turns linearly from vertex to vertex, so it is continuous in s. Beyond the
-    ends the route goes on straight. Differentiable in s.
+    ends the route goes on straight. Differentiable in s. tangents: those of the route, for many more points than it
+    has vertices.
     """
     last = route.shape[-2] - 2
     u = s / SPACING
     i = u.detach().floor().clamp(0, last).long()
     t = u - i
-    four = torch.cat([i - 1, i, i + 1, i + 2], -1).clamp(0, last + 1)
-    before, a, b, after = _take(route, four).unflatten(-2, (4, i.shape[-1])).unbind(-3)
+    if tangents is None:
+        four = torch.cat([i - 1, i, i + 1, i + 2], -1).clamp(0, last + 1)
+        before, a, b, after = _take(route, four).unflatten(-2, (4, i.shape[-1])).unbind(-3)
+        angle, turn = _tangent(before, a, b, after)
+    else:
+        a, b = _take(route, i), _take(route, i + 1)
+        angle, turn = (values.expand(*i.shape[:-1], last + 1).gather(-1, i) for values in tangents)
     xy = a + t[..., None] * (b - a)
-    first, second = b - before, after - a
-    angle = torch.atan2(first[..., 1], first[..., 0])
-    cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
-    turn = torch.atan2(cross, (first * second).sum(-1))
     inside = (t >= 0) & (t <= 1)
     heading = angle + t.clamp(0, 1) * turn
     return xy, heading, torch.where(inside, turn / SPACING, 0.0)
+
+
+def tangents(route: Tensor) -> tuple[Tensor, Tensor]:
+    """Angle [..., P - 1] rad of a route's tangent at the first vertex of each segment, and its turn to the next."""
+    before = torch.cat([route[..., :1, :], route[..., :-2, :]], -2)
+    after = torch.cat([route[..., 2:, :], route[..., -1:, :]], -2)
+    return _tangent(before, route[..., :-1, :], route[..., 1:, :], after)
+
+
+def _tangent(before: Tensor, a: Tensor, b: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
+    """`tangents` of segments from a to b [..., 2] and the vertices before and after them."""
+    first, second = b - before, after - a
+    cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+    return torch.atan2(first[..., 1], first[..., 0]), torch.atan2(cross, (first * second).sum(-1))

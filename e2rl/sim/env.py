@@ -63,7 +63,14 @@ class DrivingEnv(EnvBase):
     """
 
     def __init__(
-        self, scenes: SceneSet, settings: SimSettings, batch_size: int, device="cpu", agents=False, hold: int = 1, observed=True
+        self,
+        scenes: SceneSet,
+        settings: SimSettings,
+        batch_size: int,
+        device="cpu",
+        agents=False,
+        hold: int = 1,
+        observed=True,
     ) -> None:
         """observed: false for egos that do not read the observation, which is then empty. Raises InputError if hold is
         below 1."""
@@ -217,7 +224,9 @@ class DrivingEnv(EnvBase):
         recording = self.scene["logged"], self.scene["logged_valid"]
         function = compiled(step) if self.settings.compile else step
         given = recording if self.settings.replay_ego else tensordict["action"]
-        self._ego, outcome = hold_step(function, self.hold, self._sense, self._ego, given, tracks, self._static, self._config)
+        self._ego, outcome = hold_step(
+            function, self.hold, self._sense, self._ego, given, tracks, self._static, self._config
+        )
         self._features = outcome["observation"]
         return self._output(outcome).set("reward", outcome["reward"][:, None])
 

@@ -20,7 +20,7 @@ def light_state_at(light_state: Tensor, light: Tensor, step: Tensor) -> Tensor:
     """
     if not light_state.shape[-1]:
         return torch.full_like(light, LIGHT_UNKNOWN)
-    row = torch.arange(len(step), device=step.device)
+    row = torch.arange(step.shape[0], device=step.device)
     now = light_state[row, step.clamp(0, light_state.shape[1] - 1)]
     state = now.gather(1, light.clamp(min=0).flatten(1)).view(light.shape)
     return state.masked_fill(light < 0, LIGHT_UNKNOWN)

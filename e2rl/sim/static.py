@@ -7,7 +7,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.scenes.recording import VEHICLE
-from e2rl.scenes.route import SPACING, onto_nearer, segment
+from e2rl.scenes.route import SPACING, onto_nearer, segment, tangents
 from e2rl.sim.mission import Mission
 
 WINDOW = 20.0  # m of the mission on either side of the ego's expected arc length
@@ -78,11 +78,7 @@ def segment_table(points: Tensor, limit: Tensor) -> Tensor:
     a, b = points[:, :-1], points[:, 1:]
     along, length, unit = segment(a, b)
     heading = torch.atan2(unit[..., 1], unit[..., 0])
-    first = b - torch.cat([points[:, :1], points[:, :-2]], 1)
-    second = torch.cat([points[:, 2:], points[:, -1:]], 1) - a
-    tangent = torch.atan2(first[..., 1], first[..., 0])
-    cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
-    turn = torch.atan2(cross, (first * second).sum(-1))
+    tangent, turn = tangents(points)
     rest = torch.stack([length, heading, tangent, turn, limit[:, :-1], limit[:, 1:]], -1)
     return torch.cat([a, along, unit, rest], -1)
 

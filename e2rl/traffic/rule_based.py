@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.planners.path import STOP_GAP
-from e2rl.prior.bounds import Obstacles, apply_cap, bounded
+from e2rl.prior.bounds import Obstacles, Rows, apply_cap, bounded
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, decode, locate, select
 from e2rl.prior.prior import STANDING_SPEED, Prior
 from e2rl.prior.routes import RoutedScene, route_scene, start_state
@@ -98,8 +98,11 @@ class IDM(Traffic):
         x = torch.cat([x, x.new_zeros(*lane.v.shape, SIZE - KNOTS)], -1)
         frozen = routed.parked | (world.scene["start"][:, :vehicles, 3] < STANDING_SPEED) | ~present
 
-        def decoded(cap: Tensor | None) -> LaneState:
-            return _held(decode(*apply_cap(cap, x, lane), routed.points), lane, frozen)
+        def decoded(rows: Rows | None, cap: Tensor | None) -> LaneState:
+            if rows is None:
+                return _held(decode(x, lane, routed.points), lane, frozen)
+            now = lane.map(lambda value: value[rows])
+            return _held(decode(*apply_cap(cap, x[rows], now), routed.points[rows]), now, frozen[rows])
 
         obstacles = Obstacles(world.states, routed.size, world.valid)
         motion = bounded(self.bounds, decoded, lane, obstacles)

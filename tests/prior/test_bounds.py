@@ -28,7 +28,7 @@ CAR = (4.0, 2.0)
 
 
 def traffic(*cars, turn=0.0, exempt=(), yields=(), patience=0.0):
-    """Vehicles (x, y, heading, speed) on routes of curvature `turn`: decode(cap) at constant speed, state, others.
+    """Vehicles (x, y, heading, speed) on routes of curvature `turn`: decode(rows, cap) at constant speed, state, others.
 
     exempt, yields: vehicles of such a duty; patience [m/s^2]: see Duty.
     """
@@ -41,17 +41,18 @@ def traffic(*cars, turn=0.0, exempt=(), yields=(), patience=0.0):
     duty.exempt[0, list(exempt)] = True
     duty.yields[0, list(yields)] = True
 
-    def decode(cap):
+    def decode(rows=None, cap=None):
         x = torch.zeros(1, len(cars), SIZE)
-        if cap is not None:
-            x[..., 0] = torch.minimum(x[..., 0], cap)
-        return lane_relative.decode(x, state, routes)
+        if rows is None:
+            return lane_relative.decode(x, state, routes)
+        x[(*rows, torch.zeros_like(rows[0]))] = cap.clamp(max=0.0)
+        return lane_relative.decode(x, state, routes).map(lambda value: value[rows])
 
     return decode, state, Obstacles(agents, size, torch.ones(1, len(cars), dtype=torch.bool), duty)
 
 
 def caps(decode, state, obstacles, **settings):
-    return acceleration_caps(BoundSettings(**settings), decode(None), state, obstacles)[0]
+    return acceleration_caps(BoundSettings(**settings), decode(), state, obstacles)[0]
 
 
 def contact_time(seconds):
@@ -63,7 +64,7 @@ def test_plans_that_meet_nobody_are_free():
     decode, state, obstacles = traffic((0, 0, 0, 10), (30, 0, 0, 10), (0, 3.5, 0, 12), (40, -3.5, math.pi, 9))
     assert (caps(decode, state, obstacles) == NO_CAP).all()
     motion = bounded(BoundSettings(), decode, state, obstacles)
-    assert torch.equal(motion.states(), decode(None).states())
+    assert torch.equal(motion.states(), decode().states())
 
 
 @pytest.mark.parametrize("speed", [0.0, 4.0])
@@ -153,7 +154,7 @@ def test_whoever_follows_a_braking_vehicle_brakes_too():
     decode, state, obstacles = traffic((20, 0, 0, 0), (0, 0, 0, 12), (-5.0, 0, 0, 12))
     assert caps(decode, state, obstacles, look=1.6)[2] == NO_CAP, "its plan meets nobody's as they stand"
     motion = bounded(BoundSettings(look=1.6), decode, state, obstacles)
-    assert (motion.v <= decode(None).v + 1e-5).all() and motion.v[0, 2, 10] < 12 - 0.2
+    assert (motion.v <= decode().v + 1e-5).all() and motion.v[0, 2, 10] < 12 - 0.2
 
 
 def test_a_cap_lowers_the_next_knot_and_at_most_by_its_onset_the_present_acceleration():

@@ -21,7 +21,9 @@ def features(scene, step=None):
         routed.points,
     )
     step = torch.zeros(len(scene), dtype=torch.long) if step is None else step
-    nodes = node_features(routed, state, leaders_ahead(routed, state.s, scene["start"], scene["valid"]), step, step == 0)
+    nodes = node_features(
+        routed, state, leaders_ahead(routed, state.s, scene["start"], scene["valid"]), step, step == 0
+    )
     here = scene["valid"][0, :vehicles]
     return nodes[:, here], edge_features(routed, state)[:, here][:, :, here]
 
