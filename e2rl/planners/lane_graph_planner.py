@@ -103,10 +103,9 @@ def collision_hazard(ego: Tensor, ego_size: Tensor, others: Prediction, slope: f
     beside = torch.maximum(low - at, at - high).clamp(min=0)
     j, t = (_squared(beside, torch.zeros_like(beside)) < cut.square()).nonzero(as_tuple=True)
     near = _squared(centre[others.scene[j], :, t], at[j, t][:, None]) < cut[j, t].square()[:, None]
-    pair, c = near.nonzero(as_tuple=True)
-    j, t = j[pair], t[pair]
-    b, hazard = others.scene[j], ego.new_zeros(batch * count)
-    for j, t, c, b in zip(*(index.split(CHUNK) for index in (j, t, c, b)), strict=True):
+    pair, profile = near.nonzero(as_tuple=True)
+    pairs, hazard = torch.stack([j[pair], t[pair], profile, others.scene[j[pair]]]), ego.new_zeros(batch * count)
+    for j, t, c, b in pairs.split(CHUNK, 1):
         each = hazard_of(ego[b, c, t], ego_size[b], others.poses[j, t], others.size[j], weight[t])
         hazard.index_add_(0, b * count + c, each)
     return hazard.view(batch, count)

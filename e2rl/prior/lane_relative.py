@@ -61,7 +61,8 @@ class LaneState:
 
     def put(self, rows: tuple[Tensor, ...], other: "LaneState") -> "LaneState":
         """A LaneState with `rows` of every field replaced by `other`."""
-        return LaneState(*(old.index_put(rows, new) for old, new in zip(vars(self).values(), vars(other).values())))
+        fresh = vars(other)
+        return LaneState(**{name: old.index_put(rows, fresh[name]) for name, old in vars(self).items()})
 
     def states(self) -> Tensor:
         """[..., 4]: x, y, heading, speed."""

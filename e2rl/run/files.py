@@ -43,6 +43,11 @@ SEAL = "sha256.json"  # of a sealed folder: {file: hash}
 DAMAGED = (OSError, EOFError, LookupError, TypeError, ValueError, RuntimeError, MemoryError, SyntaxError)
 
 
+def cache_folder() -> Path:
+    """Returns the folder of caches of this user: that of XDG_CACHE_HOME, or ~/.cache."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "e2rl"
+
+
 def open_regular(path: Path, limit: int = MAX_FILE, within: Path | None = None) -> io.BufferedReader:
     """Open a regular file to read, which never blocks.
 

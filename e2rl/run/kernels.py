@@ -13,6 +13,7 @@ import os
 import platform
 import shutil
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache, cached_property
@@ -24,7 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from e2rl.run.errors import InputError
-from e2rl.run.files import locked
+from e2rl.run.files import cache_folder, locked
 
 Shape = str | tuple[str, ...]  # of a tensor or of all of a dataclass, or of each of them
 
@@ -40,9 +41,10 @@ class Kernel:
     """A function of tensors, compiled where `switch` is on: on the CPU, of the types declared, without gradients.
 
     shapes: of each argument, names of sizes that vary and numbers that do not, then ":" and a type (float32 by
-    default). Equal names are equal sizes. Vectors, of few numbers, are copied component by component, so that loops
-    over rows are contiguous; "!" leaves them as they lie, as is better for tables. The shape of a dataclass or a named tuple is that of all its tensors, or one for each. Where
-    a size is 0, or anything is not as declared, the function runs as it is.
+    default). Equal names are equal sizes. The shape of a dataclass or a named tuple is that of all its tensors, or one
+    for each. Vectors, of few numbers, are copied component by component, so that loops over rows are contiguous; "!"
+    leaves them as they lie, as is better for tables. Where a size is 0, or anything is not as declared, the function
+    runs as it is.
     """
 
     def __init__(self, function: Callable[..., Any], shapes: tuple[Shape, ...]) -> None:
@@ -72,7 +74,7 @@ class Kernel:
                 continue
             if value.dim() != len(names):
                 return False
-            for name, length in zip(names, value.shape):
+            for name, length in zip(names, value.shape, strict=True):
                 if length == 0 or length != (name if isinstance(name, int) else size.setdefault(name, length)):
                     return False
         return not (torch.is_grad_enabled() and any(value.requires_grad for value in flat))
@@ -96,7 +98,7 @@ class Kernel:
             for shape in (given,) * len(_fields(kind)) if isinstance(given, str) else given:
                 sizes, _, name = shape.removesuffix("!").partition(":")
                 names = [int(size) if size.isdigit() else size for size in sizes.split()]
-                fixed = torch.Size(names) if all(isinstance(size, int) for size in names) else None
+                fixed = torch.Size(map(int, names)) if all(isinstance(size, int) for size in names) else None
                 apart = len(names) > 1 and isinstance(names[-1], int) and names[-1] <= VECTOR and shape[-1] != "!"
                 found.append(_Declared(names, getattr(torch, name or "float32"), fixed, apart))
         return found
@@ -137,10 +139,12 @@ class Kernel:
             examples.append(torch.zeros([size.get(name, name) for name in names], dtype=kind))
             dynamic.append({at: torch.export.Dim.DYNAMIC for at, name in enumerate(names) if name in size})
         made, module = self.file.with_name(f"{self.file.stem}.{os.getpid()}.pt2"), _Module(self)
-        with torch.no_grad(), torch.fx.experimental._config.patch(backed_size_oblivious=True):
+        sizes_of_1 = torch.fx.experimental._config.patch(backed_size_oblivious=True)  # type: ignore[attr-defined]
+        with torch.no_grad(), sizes_of_1, warnings.catch_warnings(action="ignore"):
             module(*examples)  # fills the caches of constants
             graph = torch.export.export(module, tuple(examples), dynamic_shapes=(tuple(dynamic),))
-            torch._inductor.aoti_compile_and_package(graph, package_path=str(made))
+            settings = {"cpp.threads": 1}  # processes run beside each other
+            torch._inductor.aoti_compile_and_package(graph, package_path=str(made), inductor_configs=settings)
         made.replace(self.file)
 
 
@@ -160,9 +164,17 @@ def is_on() -> bool:
     return _on
 
 
-def cache_folder() -> Path:
-    """Returns the folder of caches of this user: that of XDG_CACHE_HOME, or ~/.cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "e2rl"
+def has_compiler() -> bool:
+    """Whether there is a C++ compiler."""
+    return any(name and shutil.which(name) for name in (os.environ.get("CXX"), *COMPILERS))
+
+
+def check_compiler(option: str) -> None:
+    """Raises InputError without a C++ compiler."""
+    if not has_compiler():
+        raise InputError(
+            f"{option}=true: no C++ compiler found (CXX, {', '.join(COMPILERS)}); install one, or set false"
+        )
 
 
 class _Module(nn.Module):

@@ -17,6 +17,7 @@ from typing import Any
 import torch
 
 from e2rl.run.errors import InputError
+from e2rl.run.kernels import is_on, switch
 
 RETRIES = 3  # times that a job is done again whose worker was lost
 ADDRESS = "RAY_ADDRESS"  # environment variable: the cluster; without it, workers are started on this machine
@@ -60,7 +61,7 @@ class RayWorkers:
             raise InputError(f"launcher=ray: cannot be sent to workers: {reason}; set launcher=processes") from error
 
         def submit(number: int) -> Future:
-            begun.append(task.remote(given, number, self.modules, _code()))
+            begun.append(task.remote(given, number, self.modules, _code(), is_on()))
             return begun[-1].future()
 
         try:
@@ -97,11 +98,12 @@ class RayWorkers:
         return ray
 
 
-def _work(given: list, number: int, modules: tuple[str, ...], code: str) -> bytes:
+def _work(given: list, number: int, modules: tuple[str, ...], code: str, compiled: bool) -> bytes:
     """The result of a job, in a worker."""
     if code != _code():
         raise InputError("launcher=ray: a worker has another version of e2rl or torch; install the same everywhere")
     torch.set_num_threads(1)
+    switch(compiled)
     for name in modules:
         importlib.import_module(name)
     function, jobs = _sent(given[0])

@@ -71,11 +71,6 @@ class Index:
 Build = Callable[[Index], Iterator[Mapping[str, np.ndarray]]]  # yields a set's scenes when they are in its index
 
 
-def cache_folder() -> Path:
-    """Returns the folder of caches of this user: that of XDG_CACHE_HOME, or ~/.cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "e2rl"
-
-
 def cached(path: Path, build: Build, gigabytes: float) -> SceneSet:
     """Returns the scenes in a cache file; where it is not there or damaged, it is built.
 

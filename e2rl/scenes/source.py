@@ -26,12 +26,13 @@ from tqdm import tqdm
 
 from e2rl.run.config import Extension
 from e2rl.run.errors import InputError
+from e2rl.run.files import cache_folder
 from e2rl.run.processes import interrupts_held, without_main, worker_pool
 from e2rl.run.settings import check_range, check_settings, file_values, setting, settings_of
 from e2rl.scenes.builder import BuildSettings, SceneBuilder, ego_overlaps
 from e2rl.scenes.recording import Recording
 from e2rl.scenes.scene import SceneSet, validate
-from e2rl.scenes.scene_cache import Index, cache_folder, cached, uncached
+from e2rl.scenes.scene_cache import Index, cached, uncached
 from e2rl.scenes.scene_list import listed_scenes
 
 OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are left out

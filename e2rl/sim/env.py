@@ -1,7 +1,5 @@
 """DrivingEnv: a batch of B scenes; actions drive the ego, given trajectories drive the traffic."""
 
-import os
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -13,6 +11,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from e2rl.run.errors import InputError
+from e2rl.run.kernels import check_compiler
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.scene import SceneSet
@@ -251,9 +250,5 @@ class DrivingEnv(EnvBase):
 @cache
 def compiled(function: Callable) -> Callable:
     """torch.compile of a step, shared by all environments; raises InputError without a C++ compiler."""
-    names = (os.environ.get("CXX", "c++"), "c++", "g++", "clang++")
-    if not any(shutil.which(name) for name in names):
-        raise InputError(
-            "sim.compile=true: no C++ compiler found (CXX, c++, g++, clang++); install one or leave it false"
-        )
+    check_compiler("sim.compile")
     return torch.compile(function, fullgraph=True)

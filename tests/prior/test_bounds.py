@@ -28,7 +28,7 @@ CAR = (4.0, 2.0)
 
 
 def traffic(*cars, turn=0.0, exempt=(), yields=(), patience=0.0):
-    """Vehicles (x, y, heading, speed) on routes of curvature `turn`: decode(rows, cap) at constant speed, state, others.
+    """Vehicles (x, y, heading, speed) on routes of curvature `turn`: decode(rows, cap) at even speed, state, others.
 
     exempt, yields: vehicles of such a duty; patience [m/s^2]: see Duty.
     """

@@ -62,16 +62,15 @@ def _contacts(path: Tensor, length: Tensor, along: Along, since: Tensor) -> tupl
     """
     plans, steps = along.rear.shape[1:], path.shape[1] - 1
     delay, braking = (path.new_tensor(values) for values in (DELAYS, BRAKING))
-    own = (path[..., 3].diff(dim=1) / DT).T
-    begin = length, path[:, 0, 3], since, *own
-    length, speed, since, *own = (value[:, None].expand(plans).flatten() for value in begin)
+    own = (path[..., 3].diff(dim=1) / DT).T[..., None].expand(steps, *plans).flatten(1)
+    length, speed, since = (value[:, None].expand(plans).flatten() for value in (length, path[:, 0, 3], since))
     way = path.new_zeros(len(DELAYS), plans.numel())
     met = speed.expand_as(way), way, since.expand_as(way), way, way, way, way, torch.full_like(way, torch.inf)
     seen = [value.flatten(1) for value in (along.rear, along.speed, along.lateral_gap, along.length)]
     for t in range(0, steps, STEPS):
-        moments = path.new_tensor([DT * (k + 1) for k in range(t, t + STEPS)])
+        moments = path.new_tensor([DT * (k + 1) for k in range(t, min(t + STEPS, steps))])
         part = [value[t : t + STEPS + 1] for value in seen]
-        met = meet(delay, braking, moments, length, torch.stack(own[t : t + STEPS]), *met, *part)
+        met = meet(delay, braking, moments, length, own[t : t + STEPS], *met, *part)
     hit, front = (value.unflatten(1, plans) > 0 for value in met[4:6])
     return torch.cat([hit[:1], front[1:]]), met[7][-1].view(plans)
 
@@ -96,10 +95,11 @@ def meet(
     aside: Tensor,
     extent: Tensor,
 ) -> tuple[Tensor, ...]:
-    """STEPS steps, which end at moments [STEPS], of drivers [D] and plans [C]: their speed, way, since, braking, and as 0 or 1, which a kernel
-    loads faster than truth values, whether they have been hit, by their front, and react; and the time of the contact.
+    """Some steps, which end at `moments`, of drivers [D] who meet plans [C].
 
-    all [D, C]. length [C] and own [STEPS, C] acceleration of the ego; rear, other (speed), aside and extent [STEPS + 1, C] of what it meets.
+    Returns, each [D, C], their speed, way, since and braking; as 0 or 1, which a kernel loads faster than truth values,
+    whether they have been hit, by their front, and react; and when they are hit. length [C] and own [STEPS, C]: the
+    ego's, and its planned acceleration; rear, other (speed), aside and extent [STEPS + 1, C]: of what it meets.
     """
     drivers = HumanDriver(delay=delay[:, None], braking=braking[:, None], release=0.0)  # type: ignore
     length = length.expand_as(speed)
