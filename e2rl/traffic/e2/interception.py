@@ -200,8 +200,7 @@ def intercept(
     if bool((wrong_way > 0).any()):
         against = _against_lanes(scene, meeting, paths.end_heading)
         cost = torch.where(against, cost + wrong_way[:, None, None], cost)
-    known = expected[:, 0], states, size, torch.full_like(states[..., 3], -1.0)
-    cost = cost - WORTH * _foresight(world, known, _tracks(paths, v, accel))
+    cost = cost - WORTH * _foresight(world, expected[:, 0], states, size, paths, accel, ok)
     cost, pick = (cost - settings.preference).masked_fill(~ok, torch.inf).min(-1)
     knot_times = DT * KNOT_STEPS * torch.arange(1, HORIZON // KNOT_STEPS + 1, device=cost.device)
     knots = take_route(accel, pick)[..., None] * (knot_times <= take_route(time, pick)[..., None])
@@ -210,7 +209,7 @@ def intercept(
 
 
 def _tracks(paths: _Paths, speed: Tensor, accel: Tensor) -> Tensor:
-    """States [B, M, O, HORIZON, 4] of vehicles at speed [B, M, 1] that drive paths at accel [B, M, O], then straight
+    """States [G, O, HORIZON, 4] of vehicles at speed [G, 1] that drive paths [G, O, U] at accel [G, O], then straight
     on."""
     time = DT * torch.arange(HORIZON + 1, device=speed.device)
     v = (speed[..., None] + accel[..., None] * time).clamp(min=0)
@@ -222,18 +221,21 @@ def _tracks(paths: _Paths, speed: Tensor, accel: Tensor) -> Tensor:
     return torch.cat([xy, heading[..., None], v[..., 1:, None]], -1)
 
 
-def _foresight(world: World, known: tuple[Tensor, Tensor, Tensor, Tensor], tracks: Tensor) -> Tensor:
-    """Worth [B, M, O] of plans tracks [B, M, O, H, 4] (`foresee`).
-
-    known: the ego's expected states [B, H, 4], and of the vehicles states [B, M, 4], size [B, M, 2], since [B, M].
-    """
-    expected, states, size, since = known
-    count = states.shape[1]
-    path = torch.cat([world.states[:, :1], expected], 1).repeat_interleave(count, 0)
-    plans = torch.cat([states[:, :, None, None].expand(*tracks.shape[:3], 1, 4), tracks], 3).flatten(0, 1)
-    ego = world.scene["size"][:, 0].repeat_interleave(count, 0)
-    flat = since.flatten()
-    return foresee(path, ego, plans, size.flatten(0, 1), flat, flat > 0).worth.view(tracks.shape[:3])
+def _foresight(
+    world: World, ego_plan: Tensor, states: Tensor, size: Tensor, paths: _Paths, accel: Tensor, ok: Tensor
+) -> Tensor:
+    """Worth [B, M, O] of driving paths at accel [B, M, O] (`foresee`) of vehicles at states [B, M, 4], size [B, M, 2];
+    0 for vehicles that have no path that is ok [B, M, O]. ego_plan [B, H, 4]: the ego's expected states."""
+    row, vehicle = at = ok.any(-1).nonzero(as_tuple=True)
+    worth = torch.zeros_like(accel)
+    if not len(row):
+        return worth
+    tracks = _tracks(_Paths(*(value[at] for value in paths)), states[at][:, None, 3], accel[at])
+    plans = torch.cat([states[at][:, None, None].expand(*tracks.shape[:2], 1, 4), tracks], 2)
+    path = torch.cat([world.states[:, :1], ego_plan], 1)[row]
+    never = torch.full_like(path[:, 0, 3], -1.0)
+    seen = foresee(path, world.scene["size"][row, 0], plans, size[at], never, never > 0)
+    return worth.index_put(at, seen.worth)
 
 
 def _against_lanes(scene: TensorDictBase, meeting: Tensor, end_heading: Tensor) -> Tensor:
