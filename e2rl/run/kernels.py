@@ -15,6 +15,7 @@ import shutil
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -55,7 +56,7 @@ class Kernel:
 
     def __call__(self, *given: Any) -> Any:
         """What the function returns: a tensor, or a tuple, a named tuple or a dataclass of them."""
-        if not _on:
+        if not is_on():
             return self.function(*given)
         flat = [tensor for value in given for tensor in _tensors(value)]
         if not self._fits(flat):
@@ -141,7 +142,8 @@ class Kernel:
         made, module = self.file.with_name(f"{self.file.stem}.{os.getpid()}.pt2"), _Module(self)
         sizes_of_1 = torch.fx.experimental._config.patch(backed_size_oblivious=True)  # type: ignore[attr-defined]
         with torch.no_grad(), sizes_of_1, warnings.catch_warnings(action="ignore"):
-            module(*examples)  # fills the caches of constants
+            with switched_off():
+                module(*examples)  # fills the caches of constants
             graph = torch.export.export(module, tuple(examples), dynamic_shapes=(tuple(dynamic),))
             settings = {"cpp.threads": 1}  # processes run beside each other
             torch._inductor.aoti_compile_and_package(graph, package_path=str(made), inductor_configs=settings)
@@ -159,9 +161,20 @@ def switch(on: bool) -> None:
     _on = on
 
 
+@contextmanager
+def switched_off() -> Iterator[None]:
+    """Kernels run as plain PyTorch meanwhile."""
+    before = _on
+    switch(False)
+    try:
+        yield
+    finally:
+        switch(before)
+
+
 def is_on() -> bool:
-    """Whether kernels run compiled."""
-    return _on
+    """Whether kernels run compiled, now; what is being compiled is not in parts."""
+    return _on and not torch.compiler.is_compiling()
 
 
 def has_compiler() -> bool:

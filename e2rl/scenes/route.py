@@ -8,7 +8,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from e2rl.run.kernels import is_on, kernel
+
 SPACING = 2.0  # m of arc length between vertices
+WINDOW = 20.0  # m
 
 
 def _take(route: Tensor, index: Tensor) -> Tensor:
@@ -20,7 +23,7 @@ def _take(route: Tensor, index: Tensor) -> Tensor:
     return route.gather(-2, index[..., None].expand(*index.shape, 2))
 
 
-def nearest_vertex(points: Tensor, route: Tensor, hint: Tensor | None = None, window: float = 20.0) -> Tensor:
+def nearest_vertex(points: Tensor, route: Tensor, hint: Tensor | None = None, window: float = WINDOW) -> Tensor:
     """Index [..., K] of the vertex of route [..., P, 2] nearest to points [..., K, 2].
 
     hint [..., K]: expected arc length; only vertices within `window` m of it count, for routes that cross themselves.
@@ -29,9 +32,7 @@ def nearest_vertex(points: Tensor, route: Tensor, hint: Tensor | None = None, wi
     if hint is None:
         if torch.compiler.is_compiling():  # the compiler makes a vector loop of a minimum, but not of argmin
             x, y = ((points[..., None, axis] - route[..., None, :, axis]).square() for axis in range(2))
-            first = torch.arange(count, dtype=points.dtype, device=points.device)
-            squared = x + y
-            return torch.where(squared == squared.amin(-1, keepdim=True), first, count).amin(-1).long()
+            return _first_least(x + y)
         squared = (route**2).sum(-1)[..., None, :] - 2 * points @ route.transpose(-1, -2)
         return squared.argmin(-1)
     near = hint.clamp(0, SPACING * (count - 1))  # beyond the ends, the end is what is near
@@ -40,20 +41,46 @@ def nearest_vertex(points: Tensor, route: Tensor, hint: Tensor | None = None, wi
     index = first[..., None] + torch.arange(width, device=first.device)
     gap = _take(route, index.flatten(-2)).unflatten(-2, index.shape[-2:]) - points[..., None, :]
     outside = (SPACING * index - near[..., None]).abs() > window
-    return first + gap.square().sum(-1).masked_fill(outside, torch.inf).argmin(-1)
+    squared = gap.square().sum(-1).masked_fill(outside, torch.inf)
+    return first + (_first_least(squared) if torch.compiler.is_compiling() else squared.argmin(-1))
+
+
+def _first_least(values: Tensor) -> Tensor:
+    """`values.argmin(-1)` by minima."""
+    order = torch.arange(values.shape[-1], dtype=values.dtype, device=values.device)
+    return torch.where(values == values.amin(-1, keepdim=True), order, values.shape[-1]).amin(-1).long()
 
 
 def project(
-    points: Tensor, route: Tensor, hint: Tensor | None = None, window: float = 20.0
+    points: Tensor, route: Tensor, hint: Tensor | None = None, window: float = WINDOW
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Frenet coordinates of points [..., K, 2] on route [..., P, 2]: arc length s [m], offset d [m] (left positive) and
     the route's heading [rad] at s; each [..., K].
 
     hint, window: see `nearest_vertex`. Leading dims broadcast. Beyond the ends the route goes on straight.
     """
-    last = route.shape[-2] - 2
+    if is_on() and window == WINDOW and points.shape[:-2] == route.shape[:-2]:
+        rows, route = points.flatten(0, -3), route.flatten(0, -3)
+        found = project_rows(rows, route) if hint is None else project_near(rows, route, hint.flatten(0, -2))
+        return tuple(value.view(points.shape[:-1]) for value in found)
+    return _project(points, route, hint, window)
+
+
+def _project(points: Tensor, route: Tensor, hint: Tensor | None, window: float) -> tuple[Tensor, Tensor, Tensor]:
     vertex = nearest_vertex(points, route, hint, window)
-    return onto_segments(points, vertex, last, lambda index: _take(route, index))
+    return onto_segments(points, vertex, route.shape[-2] - 2, lambda index: _take(route, index))
+
+
+@kernel("R K 2", "R P 2!")
+def project_rows(points: Tensor, route: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`project` of points [R, K, 2] on routes [R, P, 2]."""
+    return _project(points, route, None, WINDOW)
+
+
+@kernel("R K 2", "R P 2!", "R K")
+def project_near(points: Tensor, route: Tensor, hint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`project_rows` near hints [R, K]."""
+    return _project(points, route, hint, WINDOW)
 
 
 def onto_segments(
@@ -109,6 +136,21 @@ def interpolate(
     ends the route goes on straight. Differentiable in s. tangents: those of the route, for many more points than it
     has vertices.
     """
+    if is_on() and tangents is None and route.shape[:-2] == s.shape[:-1]:
+        xy, heading, curvature = interpolate_rows(route.flatten(0, -3), s.flatten(0, -2))
+        return xy.view(*s.shape, 2), heading.view(s.shape), curvature.view(s.shape)
+    return _interpolate(route, s, tangents)
+
+
+@kernel("R P 2!", "R K")
+def interpolate_rows(route: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`interpolate` of routes [R, P, 2] at s [R, K]."""
+    return _interpolate(route, s, None)
+
+
+def _interpolate(
+    route: Tensor, s: Tensor, tangents: tuple[Tensor, Tensor] | None
+) -> tuple[Tensor, Tensor, Tensor]:
     last = route.shape[-2] - 2
     u = s / SPACING
     i = u.detach().floor().clamp(0, last).long()
