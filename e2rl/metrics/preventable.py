@@ -70,12 +70,12 @@ def along_way(states: Tensor, width: Tensor, others: Tracks) -> Along:
     reach = STRAIGHT + (driven_length(states).amax().item() if len(states) else 0.0)
     vertices = SPACING * torch.arange(int(reach / SPACING) + 2, device=states.device, dtype=states.dtype)
     route = poses(states, vertices.expand(len(states), -1))[..., :2]
-    return Along(*seen_along(route, width, others.states, others.size, others.present))
+    return Along(*seen_along(route, width, others.states, others.size, others.present.to(route.dtype)))
 
 
-@kernel("B P 2", "B", "B T N 4", "B N 2", "B T N:bool")
+@kernel("B P 2", "B", "B T N 4", "B N 2", "B T N")
 def seen_along(route: Tensor, width: Tensor, states: Tensor, size: Tensor, present: Tensor) -> tuple[Tensor, ...]:
-    """The fields of Along of others states [B, T+1, N, 4], size [B, N, 2] along routes [B, P, 2]."""
+    """The fields of Along of others states [B, T+1, N, 4], size [B, N, 2], present (1 or 0) along routes [B, P, 2]."""
     s, d, heading = project(states[..., :2].flatten(1, 2), route)
     s, d, heading = (value.unflatten(1, present.shape[1:]) for value in (s, d, heading))
     turn, speed = states[..., 2] - heading, states[..., 3]
@@ -84,8 +84,8 @@ def seen_along(route: Tensor, width: Tensor, states: Tensor, size: Tensor, prese
     extent = half[..., 0] * cos.abs() + half[..., 1] * sin.abs()
     side = half[..., 0] * sin.abs() + half[..., 1] * cos.abs()
     gap = d.abs() - side - width[:, None, None] / 2
-    enters = ((gap <= 0) & present).any(1, keepdim=True)
-    away = ~present | ~enters
+    enters = torch.where(gap <= 0, present, 0.0).amax(1, keepdim=True)
+    away = (present == 0) | (enters == 0)
     rear, gap = (value.masked_fill(away, torch.inf) for value in (s - extent, gap))
     values = rear, speed * cos, gap, -d.sign() * speed * sin, 2 * extent
     return tuple(value.transpose(0, 1).contiguous() for value in values)

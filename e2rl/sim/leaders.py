@@ -90,14 +90,16 @@ def _near_pairs(points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Te
     stretches = _stretches(points)  # [B, V, C, 2, STRETCH + 1]
     low, high = torch.aminmax(stretches, dim=-1)
     ends = SPACING * (STRETCH * torch.arange(1, low.shape[2] + 1, device=s.device)).clamp(max=count - 1)
+    to_come = (ends >= s[..., None] - SPACING).to(s.dtype)
     itself = torch.eye(vehicles, xy.shape[1], dtype=torch.bool, device=s.device)
     counts = present[:, :vehicles, None] & present[:, None] & ~itself
     far, flat = (room + SPACING / 2).repeat_interleave(moments, -1), xy.flatten(1, 2)
-    near, beyond = near_stretches(low, high, points[:, :, -2], points[:, :, -1], flat, far)
-    to_come = (ends >= s[..., None] - SPACING)[:, :, None]
-    counts = counts.repeat_interleave(moments, -1) & ((near & to_come).any(-1) | beyond)
-    b, v, m = counts.nonzero(as_tuple=True)
-    near = near[counts]
+    ends_at = points[:, :, -2], points[:, :, -1]
+    some = near_some(low, high, *ends_at, to_come, flat, far) > 0
+    b, v, m = (counts.repeat_interleave(moments, -1) & some).nonzero(as_tuple=True)
+    there, within = flat[b, m], far[b, v, m]
+    near = _near(low[b, v], high[b, v], there[:, None], within[:, None])
+    near[:, -1] |= _beyond(ends_at[0][b, v], ends_at[1][b, v], there, within)
     pair, stretch = near.nonzero(as_tuple=True)
     gap = stretches[b[pair], v[pair], stretch] - flat[b, m][pair][..., None]
     nearest, within = gap.square().sum(1).min(-1)
@@ -107,22 +109,30 @@ def _near_pairs(points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Te
     return b, v, m // moments, m % moments, vertex
 
 
-@kernel("B V C 2", "B V C 2", "B V 2", "B V 2", "B Q 2", "B V Q")
-def near_stretches(
-    low: Tensor, high: Tensor, before: Tensor, last: Tensor, xy: Tensor, far: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Whether points xy [B, Q, 2] are within far [B, V, Q] m of the boxes low to high of stretches [B, V, Q, C], and of
-    a route's straight continuation beyond its last two vertices [B, V, Q], which counts as its last stretch."""
-    x = torch.maximum(low[:, :, None, :, 0] - xy[:, None, :, None, 0], xy[:, None, :, None, 0] - high[:, :, None, :, 0])
-    y = torch.maximum(low[:, :, None, :, 1] - xy[:, None, :, None, 1], xy[:, None, :, None, 1] - high[:, :, None, :, 1])
-    near = x.clamp(min=0).square() + y.clamp(min=0).square() < far.square()[..., None]
+@kernel("B V C 2", "B V C 2", "B V 2", "B V 2", "B V C", "B Q 2", "B V Q")
+def near_some(
+    low: Tensor, high: Tensor, before: Tensor, last: Tensor, to_come: Tensor, xy: Tensor, far: Tensor
+) -> Tensor:
+    """1 where points xy [B, Q, 2] are within far [B, V, Q] m of the box, low to high, of a stretch that is to come (1,
+    else 0), or of the route's straight continuation beyond its last two vertices; else 0."""
+    near = _near(low[..., None, :], high[..., None, :], xy[:, None, None], far[:, :, None])
+    beyond = _beyond(before[:, :, None], last[:, :, None], xy[:, None], far)
+    return torch.maximum(torch.where(near, to_come[..., None], 0.0).amax(2), torch.where(beyond, 1.0, 0.0))
+
+
+def _near(low: Tensor, high: Tensor, xy: Tensor, far: Tensor) -> Tensor:
+    """Bool [...]: points xy [..., 2] are within far [...] m of boxes low to high [..., 2]."""
+    x, y = torch.maximum(low - xy, xy - high).clamp(min=0).unbind(-1)
+    return x.square() + y.square() < far.square()
+
+
+def _beyond(before: Tensor, last: Tensor, xy: Tensor, far: Tensor) -> Tensor:
+    """Bool [...]: points are within far m of a line that goes on straight beyond its last two vertices [..., 2]."""
     tip = last - before
-    unit = (tip / tip.norm(dim=-1, keepdim=True).clamp(min=1e-6))[:, :, None]
-    past = xy[:, None] - last[:, :, None]
+    unit = tip / tip.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    past = xy - last
     across = past[..., 1] * unit[..., 0] - past[..., 0] * unit[..., 1]
-    beyond = ((past * unit).sum(-1) > 0) & (across.abs() < far)
-    stretch = torch.arange(low.shape[2], device=low.device)
-    return near | (beyond[..., None] & (stretch == low.shape[2] - 1)), beyond
+    return ((past * unit).sum(-1) > 0) & (across.abs() < far)
 
 
 def _stretches(points: Tensor) -> Tensor:

@@ -146,15 +146,17 @@ def _clear(paths: _Paths, travelled: Tensor, size: Tensor, others: tuple[Tensor,
     tangent = paths.tangents.gather(3, index)
     heading = torch.atan2(tangent[..., 1:], tangent[..., :1])
     pose = torch.cat([paths.points.gather(3, index), heading, torch.zeros_like(heading)], -1)
-    return ~touched(pose, size + CLEARANCE, *others, travelled)
+    states, sizes, counts = others
+    return ~touched(pose, size + CLEARANCE, states, sizes, counts.to(size.dtype), travelled)
 
 
-@kernel("B M O W 4", "B M 2", "B J W 4", "B J 2", "B M J:bool", "B M O W")
+@kernel("B M O W 4", "B M 2", "B J W 4", "B J 2", "B M J", "B M O W")
 def touched(pose: Tensor, size: Tensor, states: Tensor, sizes: Tensor, counts: Tensor, travelled: Tensor) -> Tensor:
-    """Bool [B, M, O]: boxes at pose [B, M, O, W, 4] touch one that counts, before they arrive (see `_clear`)."""
+    """Bool [B, M, O]: boxes at pose [B, M, O, W, 4] touch one that counts (1, else 0), before they arrive (see `_clear`)."""
     boxes = (pose[:, :, :, :, None], size[:, :, None, None, None], states.transpose(1, 2)[:, None, None])
     hit = overlap(*boxes, sizes[:, None, None, None])
-    return (hit & counts[:, :, None, None] & (travelled >= 0)[..., None]).flatten(3).any(-1)
+    before = torch.where(travelled >= 0, 1.0, 0.0)[..., None]
+    return torch.where(hit, counts[:, :, None, None] * before, 0.0).flatten(3).amax(-1) > 0
 
 
 def intercept(
