@@ -1,50 +1,138 @@
-"""A whole rollout: 8 s, 16 replans of the traffic, ego lane_graph."""
+"""A whole rollout: 8 s, 16 replans of the traffic, ego lane_graph; what its parts and kinds of work take of it."""
 
-import cProfile
-import inspect
-import pstats
+import time
+from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+from unittest.mock import patch
 
 import torch
 from measure import Bench, Row
+from torch.utils._python_dispatch import TorchDispatchMode
 
+from e2rl.metrics.score import score_rollouts
+from e2rl.planners.lane_graph_planner import LaneGraphEgo
+from e2rl.prior import prior
+from e2rl.run import kernels
 from e2rl.sim.env import DrivingEnv
-from e2rl.traffic.e2.skeleton import build_skeleton
-from e2rl.traffic.e2.topology import topological_candidates
+from e2rl.traffic import nominal
+from e2rl.traffic.e2 import coalition, control, e2, interception
+from e2rl.traffic.e2 import kernels as importance
 from e2rl.traffic.rollout import roll_out
+
+PARTS = {  # each without the others that it calls
+    "encoding": [(prior.Prior, "encode")],
+    "denoising": [(prior.Prior, "denoise")],
+    "decoding": [(prior.Prior, "decode")],
+    "V_feas": [(control.SparseControl, "_gradients")],
+    "control, and steps of the SDE": [(prior.Prior, "sample")],
+    "bounds": [(prior, "bounded")],
+    "foresight": [(importance, "foresee"), (interception, "foresee")],
+    "kernels proposed": [(e2, "propose_kernels")],
+    "proposals and interceptions": [(coalition, "propose")],
+    "topology and feasibility": [(coalition, "topological_candidates"), (coalition, "feasible_vehicles")],
+    "skeleton": [(coalition, "build_skeleton")],
+    "groups of scenes": [(nominal, name) for name in ("crop_world", "crop_state", "write_state", "group_scenes")],
+    "planner": [(LaneGraphEgo, "plan")],
+    "simulator": [(DrivingEnv, "_step")],
+}
+aten = torch.ops.aten
+PRODUCTS = (aten.mm, aten.addmm, aten.bmm, aten.baddbmm, aten.linear)
 
 
 def synthesized_rollout(bench: Bench) -> Iterator[Row]:
-    """Seconds a rollout of the nominal prior and of e2, and shares of e2's time by part."""
-    (batch,) = bench.batches(32)
-    index = bench.pick(batch)
+    """Seconds a rollout of the nominal prior and of e2, eager and compiled; of e2's time, shares by part and kind."""
+    for batch in bench.batches(1, 32, 128):
+        index = bench.pick(batch)
 
-    def run(eta: float) -> None:
-        roll_out(bench.scenes, index, index, torch.full((batch,), eta), bench.ego, bench.traffic, bench.sim)
+        def run(eta: float, index: torch.Tensor = index) -> Any:
+            etas = torch.full((len(index),), eta)
+            return roll_out(bench.scenes, index, index, etas, bench.ego, bench.traffic, bench.sim)
 
-    for name, eta in (("nominal", 0.0), ("e2, eta 2", 2.0)):
-        wall, cpu = bench.both(lambda e=eta: run(e))
-        yield bench.row("synthesized_rollout", name, index, wall / batch, "s/rollout")
-        yield bench.row("synthesized_rollout", name, index, cpu / batch, "CPU s/rollout")
-    prior = type(bench.traffic.prior)
-    parts = {
-        "topology, feasibility and skeleton": (topological_candidates, bench.traffic.feasible_vehicles, build_skeleton),
-        "sampling": (prior.sample,),
-        "bounds and decoding of the plan": (prior.plan,),
-        "plans of lane_graph": (type(bench.ego).plan,),
-        "simulator": (DrivingEnv._step,),
-    }
-    profile = cProfile.Profile(builtins=False)  # Python's functions alone: little beside torch's operations
-    profile.runcall(run, 2.0)
-    for name, functions in parts.items():
-        yield bench.row(
-            "synthesized_rollout", f"e2: {name}", index, 100 * share(profile, functions), "% of the rollout"
-        )
+        for compiled in (False, True) if bench.compile else (False,):
+            kernels.switch(compiled)
+            how = ", compiled" if compiled else ""
+            for name, eta in (("nominal", 0.0), ("e2, eta 2", 2.0)):
+                wall, cpu = bench.both(lambda e=eta: run(e))
+                yield bench.row("synthesized_rollout", name + how, index, wall / batch, "s/rollout")
+                yield bench.row("synthesized_rollout", name + how, index, cpu / batch, "CPU s/rollout")
+            rollouts = run(2.0)
+            scoring = bench.both(lambda made=rollouts: score_rollouts(made))[1]
+            yield bench.row(
+                "synthesized_rollout", f"metrics and verdicts{how}", index, scoring / batch, "CPU s/rollout"
+            )
+            for kind, shares in (("part", parts(lambda: run(2.0))), ("kind", kinds(lambda: run(2.0)))):
+                for name, share in shares.items():
+                    variant = f"e2{how}, {kind}: {name}"
+                    yield bench.row("synthesized_rollout", variant, index, 100 * share, "% of the rollout")
+        kernels.switch(False)
 
 
-def share(profile: cProfile.Profile, functions: tuple[Callable, ...]) -> float:
-    """Of a profile's time, what was spent inside `functions`."""
-    stats = pstats.Stats(profile)
-    spent = {(file, line): row[3] for (file, line, _), row in stats.stats.items()}  # row: calls, own and total time
-    code = [inspect.unwrap(function).__code__ for function in functions]
-    return sum(spent.get((part.co_filename, part.co_firstlineno), 0.0) for part in code) / stats.total_tt
+def parts(run: Callable[[], object]) -> dict[str, float]:
+    """Shares of a run's time inside each of PARTS, and of the rest."""
+    spent, inside = Counter[str](), ["rest"]
+    since = [time.perf_counter()]
+
+    def enter(part: str) -> None:
+        now = time.perf_counter()
+        spent[inside[-1]] += now - since[0]
+        since[0] = now
+        inside.append(part)
+
+    def leave() -> None:
+        now = time.perf_counter()
+        spent[inside.pop()] += now - since[0]
+        since[0] = now
+
+    def timed(function: Callable, part: str) -> Callable:
+        def wrapper(*given: Any, **named: Any) -> Any:
+            enter(part)
+            try:
+                return function(*given, **named)
+            finally:
+                leave()
+
+        return wrapper
+
+    with ExitStack() as stack:
+        for part, places in PARTS.items():
+            for owner, name in places:
+                stack.enter_context(patch.object(owner, name, timed(getattr(owner, name), part)))
+        since[0] = time.perf_counter()
+        run()
+    enter("end")
+    return {part: spent[part] / sum(spent.values()) for part in (*PARTS, "rest")}
+
+
+def kinds(run: Callable[[], object]) -> dict[str, float]:
+    """Shares of a run's time in kernels, in PyTorch's products of matrices and in its other operations outside of them;
+    what is left is Python's."""
+    begin = time.perf_counter()
+    run()
+    total = time.perf_counter() - begin
+    spent, called = Counter[str](), kernels.Kernel.__call__
+
+    def timed(*given: Any) -> Any:
+        begin = time.perf_counter()
+        try:
+            return called(*given)
+        finally:
+            spent["kernels"] += time.perf_counter() - begin
+
+    class Timed(TorchDispatchMode):
+        def __torch_dispatch__(self, function: Any, types: Any, given: Any = (), named: Any = None) -> Any:
+            begin = time.perf_counter()
+            try:
+                return function(*given, **(named or {}))
+            finally:
+                kind = "products of matrices" if function.overloadpacket in PRODUCTS else "other operations"
+                spent[kind] += time.perf_counter() - begin
+
+    with patch.object(kernels.Kernel, "__call__", timed if kernels.is_on() else called):
+        run()
+        in_kernels = spent["kernels"]
+        with Timed():
+            run()
+    shares = {name: spent[name] / total for name in ("products of matrices", "other operations")}
+    return {"kernels": in_kernels / total} | shares

@@ -28,9 +28,9 @@ STANDING_SPEED, HOLD_DISTANCE = 0.5, 2.0  # m/s, m: a vehicle slower than this w
 class Context:
     """What stays the same over the denoising steps of one replan of B scenes.
 
-    state [B, V]; followed: the `leaders_ahead`; encoding: the network's; ego_x [B, SIZE]: the ego's plan as x, None where
-    it is unknown and the ego is sampled like every vehicle; active [B, V]: simulated vehicles that are neither parked
-    nor the ego; all_on_lane: no vehicle is in free space (asked once, on the host).
+    state [B, V]; followed: the `leaders_ahead`; encoding: the network's; ego_x [B, SIZE]: the ego's plan as x, None
+    where it is unknown and the ego is sampled like every vehicle; active [B, V]: simulated vehicles that are neither
+    parked nor the ego; all_on_lane: no vehicle is in free space (asked once, on the host).
     """
 
     routed: RoutedScene

@@ -61,7 +61,7 @@ class Kernel:
         flat = [tensor for value in given for tensor in _tensors(value)]
         if not self._fits(flat):
             return self.function(*given)
-        found = self._run([given.laid_out(value) for given, value in zip(self.declared, flat)])
+        found = self._run([given.laid_out(value) for given, value in zip(self.declared, flat, strict=True)])
         return found[0] if self.returns is Tensor else self.returns(*found) if _made(self.returns) else tuple(found)
 
     def _fits(self, flat: list[Tensor]) -> bool:

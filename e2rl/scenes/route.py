@@ -148,9 +148,7 @@ def interpolate_rows(route: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return _interpolate(route, s, None)
 
 
-def _interpolate(
-    route: Tensor, s: Tensor, tangents: tuple[Tensor, Tensor] | None
-) -> tuple[Tensor, Tensor, Tensor]:
+def _interpolate(route: Tensor, s: Tensor, tangents: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor, Tensor]:
     last = route.shape[-2] - 2
     u = s / SPACING
     i = u.detach().floor().clamp(0, last).long()

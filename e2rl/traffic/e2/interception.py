@@ -152,7 +152,8 @@ def _clear(paths: _Paths, travelled: Tensor, size: Tensor, others: tuple[Tensor,
 
 @kernel("B M O W 4", "B M 2", "B J W 4", "B J 2", "B M J", "B M O W")
 def touched(pose: Tensor, size: Tensor, states: Tensor, sizes: Tensor, counts: Tensor, travelled: Tensor) -> Tensor:
-    """Bool [B, M, O]: boxes at pose [B, M, O, W, 4] touch one that counts (1, else 0), before they arrive (see `_clear`)."""
+    """Bool [B, M, O]: boxes at pose [B, M, O, W, 4] touch one that counts (1, else 0), before they arrive (see
+    `_clear`)."""
     boxes = (pose[:, :, :, :, None], size[:, :, None, None, None], states.transpose(1, 2)[:, None, None])
     hit = overlap(*boxes, sizes[:, None, None, None])
     before = torch.where(travelled >= 0, 1.0, 0.0)[..., None]
