@@ -62,8 +62,10 @@ def synthesized_rollout(bench: Bench) -> Iterator[Row]:
             yield bench.row(
                 "synthesized_rollout", f"metrics and verdicts{how}", index, scoring / batch, "CPU s/rollout"
             )
-            for kind, shares in (("part", parts(lambda: run(2.0))), ("kind", kinds(lambda: run(2.0)))):
-                for name, share in shares.items():
+            shares, operations = kinds(lambda: run(2.0))
+            yield bench.row("synthesized_rollout", f"e2{how}", index, operations / batch, "operations/rollout")
+            for kind, each in (("part", parts(lambda: run(2.0))), ("kind", shares)):
+                for name, share in each.items():
                     variant = f"e2{how}, {kind}: {name}"
                     yield bench.row("synthesized_rollout", variant, index, 100 * share, "% of the rollout")
         kernels.switch(False)
@@ -105,9 +107,9 @@ def parts(run: Callable[[], object]) -> dict[str, float]:
     return {part: spent[part] / sum(spent.values()) for part in (*PARTS, "rest")}
 
 
-def kinds(run: Callable[[], object]) -> dict[str, float]:
-    """Shares of a run's time in kernels, in PyTorch's products of matrices and in its other operations outside of them;
-    what is left is Python's."""
+def kinds(run: Callable[[], object]) -> tuple[dict[str, float], int]:
+    """Shares of a run's time in kernels and in PyTorch's products of matrices outside of them; and PyTorch's
+    operations, which are too short for a clock beside them."""
     begin = time.perf_counter()
     run()
     total = time.perf_counter() - begin
@@ -120,19 +122,18 @@ def kinds(run: Callable[[], object]) -> dict[str, float]:
         finally:
             spent["kernels"] += time.perf_counter() - begin
 
-    class Timed(TorchDispatchMode):
+    class Counted(TorchDispatchMode):
         def __torch_dispatch__(self, function: Any, types: Any, given: Any = (), named: Any = None) -> Any:
             begin = time.perf_counter()
-            try:
-                return function(*given, **(named or {}))
-            finally:
-                kind = "products of matrices" if function.overloadpacket in PRODUCTS else "other operations"
-                spent[kind] += time.perf_counter() - begin
+            result = function(*given, **(named or {}))
+            if function.overloadpacket in PRODUCTS:
+                spent["products of matrices"] += time.perf_counter() - begin
+            counts["operations"] += 1
+            return result
 
+    counts = Counter[str]()
     with patch.object(kernels.Kernel, "__call__", timed if kernels.is_on() else called):
         run()
-        in_kernels = spent["kernels"]
-        with Timed():
-            run()
-    shares = {name: spent[name] / total for name in ("products of matrices", "other operations")}
-    return {"kernels": in_kernels / total} | shares
+    with Counted():
+        run()
+    return {name: spent[name] / total for name in ("kernels", "products of matrices")}, counts["operations"]

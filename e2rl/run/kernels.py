@@ -9,11 +9,13 @@ that its source, PyTorch and the processor have in it, so that a process that fi
 """
 
 import hashlib
+import io
 import os
 import platform
 import shutil
 import sys
 import warnings
+import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
@@ -26,7 +28,7 @@ import torch
 from torch import Tensor, nn
 
 from e2rl.run.errors import InputError
-from e2rl.run.files import cache_folder, locked
+from e2rl.run.files import cache_folder, locked, write_atomically
 
 Shape = str | tuple[str, ...]  # of a tensor or of all of a dataclass, or of each of them
 
@@ -110,12 +112,12 @@ class Kernel:
         mark = hashlib.sha256(repr((machine(), self.shapes)).encode())
         for module in sorted(_sources(sys.modules[self.function.__module__]), key=lambda module: module.__name__):
             mark.update(Path(str(module.__file__)).read_bytes())
-        return cache_folder() / "kernels" / f"{self.function.__qualname__}-{mark.hexdigest()[:32]}.pt2"
+        return cache_folder() / "kernels" / f"{self.function.__qualname__}-{mark.hexdigest()[:32]}.so"
 
     @cached_property
     def _run(self) -> Callable[[list[Tensor]], list[Tensor]]:
         self.compile()
-        return torch._inductor.aoti_load_package(str(self.file), run_single_threaded=True).loader.run
+        return torch._C._aoti.AOTIModelContainerRunnerCpu(str(self.file), 1).run
 
     def compile(self) -> None:
         """Compile the kernel, where it is not in the cache. Raises InputError without a C++ compiler."""
@@ -139,15 +141,17 @@ class Kernel:
             names = [names[-1], *names[:-1]] if apart else names
             examples.append(torch.zeros([size.get(name, name) for name in names], dtype=kind))
             dynamic.append({at: torch.export.Dim.DYNAMIC for at, name in enumerate(names) if name in size})
-        made, module = self.file.with_name(f"{self.file.stem}.{os.getpid()}.pt2"), _Module(self)
+        module, package = _Module(self), io.BytesIO()
         sizes_of_1 = torch.fx.experimental._config.patch(backed_size_oblivious=True)  # type: ignore[attr-defined]
         with torch.no_grad(), sizes_of_1, warnings.catch_warnings(action="ignore"):
             with switched_off():
                 module(*examples)  # fills the caches of constants
             graph = torch.export.export(module, tuple(examples), dynamic_shapes=(tuple(dynamic),))
             settings = {"cpp.threads": 1}  # processes run beside each other
-            torch._inductor.aoti_compile_and_package(graph, package_path=str(made), inductor_configs=settings)
-        made.replace(self.file)
+            torch._inductor.aoti_compile_and_package(graph, package_path=package, inductor_configs=settings)
+        with zipfile.ZipFile(package) as whole:  # the library alone: packages are unpacked anew by every process
+            (library,) = (name for name in whole.namelist() if name.endswith(".so"))
+            write_atomically(self.file, whole.read(library))
 
 
 def kernel(*shapes: Shape) -> Callable[[Callable[..., Any]], Kernel]:

@@ -1,0 +1,97 @@
+"""A kernel does what its function does, for every size, and leaves to the function what it was not declared for."""
+
+from typing import NamedTuple
+
+import pytest
+import torch
+from torch import Tensor
+
+from e2rl.run import kernels
+from e2rl.run.errors import InputError
+from e2rl.run.kernels import KERNELS, Kernel, has_compiler, kernel, switched_off
+
+
+class Line(NamedTuple):
+    """Distance and direction of lines, each [B]."""
+
+    offset: Tensor
+    angle: Tensor
+
+
+calls = []
+
+
+@kernel("B K 2", "B", "3!", "B:bool")
+def across(points: Tensor, line: Line, weight: Tensor, counts: Tensor) -> Line:
+    """Largest distance [B] of points from lines, where they count, and the lines' angles."""
+    calls.append(points.shape[0])
+    normal = torch.stack([-line.angle.sin(), line.angle.cos()], -1)
+    distance = (points * normal[:, None]).sum(-1) - line.offset[:, None]
+    return Line(torch.where(counts, distance.amax(-1) * weight.sum(), 0.0), line.angle)
+
+
+def given(batch: int, count: int) -> tuple:
+    draw = torch.Generator().manual_seed(batch)
+    points, angle = (torch.randn(batch, *shape, generator=draw) for shape in ((count, 2), ()))
+    return points, Line(angle / 3, angle), torch.arange(3.0), angle > 0
+
+
+@pytest.fixture
+def on():
+    with switched_off():
+        kernels.switch(True)
+        yield
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler")
+@pytest.mark.parametrize(("batch", "count"), [(1, 1), (1, 40), (5, 1), (19, 33)])
+def test_a_kernel_gives_what_its_function_gives_for_every_size(on, batch, count):
+    arguments = given(batch, count)
+    across(*arguments)  # compiles it, which calls the function
+    calls.clear()
+    found = across(*arguments)
+    assert not calls, "the function itself was called"
+    for one, other in zip(found, across.function(*arguments), strict=True):
+        assert torch.allclose(one, other, atol=1e-6)
+    assert isinstance(found, Line) and across.file.exists()
+    views = arguments[0].transpose(0, 1).contiguous().transpose(0, 1), *arguments[1:]
+    assert torch.equal(across(*views).offset, found.offset), "it depends on how a tensor lies in memory"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda p, line, w, c: (p.double(), Line(*(x.double() for x in line)), w.double(), c),
+        lambda p, line, w, c: (p[:0], Line(*(x[:0] for x in line)), w, c[:0]),
+        lambda p, line, w, c: (p.requires_grad_(), line, w, c),
+        lambda p, line, w, c: (p, line, w[:2], c),
+    ],
+    ids=["doubles", "no rows", "gradients", "another size"],
+)
+def test_what_is_not_as_declared_runs_as_it_is(on, change):
+    arguments = change(*given(4, 3))
+    calls.clear()
+    found = across(*arguments)
+    assert calls == [len(arguments[0])]
+    assert all(torch.equal(one, other) for one, other in zip(found, across.function(*arguments), strict=True))
+
+
+def test_kernels_run_as_they_are_until_they_are_switched_on():
+    calls.clear()
+    across(*given(4, 3))
+    assert calls == [4]
+
+
+def test_a_kernel_s_file_depends_on_its_shapes_and_sources():
+    other = Kernel(across.function, ("B K 2", "B", "3", "B:bool"))
+    KERNELS[across.name] = across
+    assert across.file.name.startswith("across-") and other.file != across.file
+    assert across.file.parent.name == "kernels"
+
+
+def test_without_a_compiler_compiling_is_refused(monkeypatch):
+    monkeypatch.setattr(kernels.shutil, "which", lambda name: None)
+    with pytest.raises(InputError, match="compile=true: no C"):
+        Kernel(across.function, ("B K 2", "B", "3", "B:bool")).compile()
+    KERNELS[across.name] = across
