@@ -27,7 +27,7 @@ from e2rl.run.errors import InputError
 from e2rl.run.run import Run
 from e2rl.scenes.scene_list import listed
 from e2rl.scenes.source import load_scenes
-from e2rl.traffic.compiled import prepare_kernels
+from e2rl.traffic.fusing import prepare_fused
 
 MAY_CHANGE = ("rounds", "device", "threads", "launcher")  # when a run is resumed
 
@@ -120,7 +120,7 @@ def train(task: Run) -> None:
     if started_by_torchrun() and config.stage.name != "prior":
         raise InputError(f"torchrun: stage={config.stage.name} runs in one process, started with python")
     set_up(config)
-    prepare_kernels(config)
+    prepare_fused(config)
     check_training(config)
     STAGES[config.stage.name](task)
 

@@ -14,7 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.lane_graph_planner import LaneGraphEgo
 from e2rl.prior import prior
-from e2rl.run import kernels
+from e2rl.run import fused
 from e2rl.sim.env import DrivingEnv
 from e2rl.traffic import nominal
 from e2rl.traffic.e2 import coalition, control, e2, interception
@@ -51,7 +51,7 @@ def synthesized_rollout(bench: Bench) -> Iterator[Row]:
             return roll_out(bench.scenes, index, index, etas, bench.ego, bench.traffic, bench.sim)
 
         for compiled in (False, True) if bench.compile else (False,):
-            kernels.switch(compiled)
+            fused.switch(compiled)
             how = ", compiled" if compiled else ""
             for name, eta in (("nominal", 0.0), ("e2, eta 2", 2.0)):
                 wall, cpu = bench.both(lambda e=eta: run(e))
@@ -68,7 +68,7 @@ def synthesized_rollout(bench: Bench) -> Iterator[Row]:
                 for name, share in each.items():
                     variant = f"e2{how}, {kind}: {name}"
                     yield bench.row("synthesized_rollout", variant, index, 100 * share, "% of the rollout")
-        kernels.switch(False)
+        fused.switch(False)
 
 
 def parts(run: Callable[[], object]) -> dict[str, float]:
@@ -108,19 +108,19 @@ def parts(run: Callable[[], object]) -> dict[str, float]:
 
 
 def kinds(run: Callable[[], object]) -> tuple[dict[str, float], int]:
-    """Shares of a run's time in kernels and in PyTorch's products of matrices outside of them; and PyTorch's
+    """Shares of a run's time in fused functions and in PyTorch's products of matrices outside of them; and PyTorch's
     operations, which are too short for a clock beside them."""
     begin = time.perf_counter()
     run()
     total = time.perf_counter() - begin
-    spent, called = Counter[str](), kernels.Kernel.__call__
+    spent, called = Counter[str](), fused.Fused.__call__
 
     def timed(*given: Any) -> Any:
         begin = time.perf_counter()
         try:
             return called(*given)
         finally:
-            spent["kernels"] += time.perf_counter() - begin
+            spent["fused functions"] += time.perf_counter() - begin
 
     class Counted(TorchDispatchMode):
         def __torch_dispatch__(self, function: Any, types: Any, given: Any = (), named: Any = None) -> Any:
@@ -132,8 +132,8 @@ def kinds(run: Callable[[], object]) -> tuple[dict[str, float], int]:
             return result
 
     counts = Counter[str]()
-    with patch.object(kernels.Kernel, "__call__", timed if kernels.is_on() else called):
+    with patch.object(fused.Fused, "__call__", timed if fused.is_on() else called):
         run()
     with Counted():
         run()
-    return {name: spent[name] / total for name in ("kernels", "products of matrices")}, counts["operations"]
+    return {name: spent[name] / total for name in ("fused functions", "products of matrices")}, counts["operations"]

@@ -17,7 +17,7 @@ from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.scene_list import listed
 from e2rl.scenes.source import load_scenes
 from e2rl.sim.rollout_file import ROLLOUTS
-from e2rl.traffic.compiled import prepare_kernels
+from e2rl.traffic.fusing import prepare_fused
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def begin(run: Run) -> Evaluation:
     run, and for inputs that changed since the run began."""
     config = run.config
     set_up(config)
-    prepare_kernels(config)
+    prepare_fused(config)
     asked, egos = evaluation_settings(config), build_egos(config, run.choices["ego"])
     prior, origin = build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
     methods = [] if asked.budget else build_methods(config, prior)

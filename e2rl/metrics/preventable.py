@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from e2rl.metrics.drivers import DRIVERS, Driver, Observation, no_conflict
-from e2rl.run.kernels import kernel
+from e2rl.run.fused import fused
 from e2rl.scenes.boxes import separation, to_frame
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING, project
@@ -73,7 +73,7 @@ def along_way(states: Tensor, width: Tensor, others: Tracks) -> Along:
     return Along(*seen_along(route, width, others.states, others.size, others.present.to(route.dtype)))
 
 
-@kernel("B P 2", "B", "B T N 4", "B N 2", "B T N")
+@fused("B P 2", "B", "B T N 4", "B N 2", "B T N")
 def seen_along(route: Tensor, width: Tensor, states: Tensor, size: Tensor, present: Tensor) -> tuple[Tensor, ...]:
     """The fields of Along of others states [B, T+1, N, 4], size [B, N, 2], present (1 or 0) along routes [B, P, 2]."""
     s, d, heading = project(states[..., :2].flatten(1, 2), route)

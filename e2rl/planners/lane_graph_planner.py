@@ -14,7 +14,7 @@ from torch import Tensor
 
 from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.planners.path import MissionPath, RoutePath, look_up
-from e2rl.run.kernels import kernel
+from e2rl.run.fused import fused
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
@@ -111,7 +111,7 @@ def collision_hazard(ego: Tensor, ego_size: Tensor, others: Prediction, slope: f
     return hazard.view(batch, count)
 
 
-@kernel("Q 3", "Q 2", "Q 3", "Q 2", "Q")
+@fused("Q 3", "Q 2", "Q 3", "Q 2", "Q")
 def hazard_of(ego: Tensor, ego_size: Tensor, other: Tensor, size: Tensor, weight: Tensor) -> Tensor:
     """-log(1 - p) [Q] of pairs of boxes."""
     gap = circle_gap(ego, ego_size, other, size)
@@ -126,7 +126,7 @@ def _squared(first: Tensor, second: Tensor) -> Tensor:
 def circles(pose: Tensor, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """x, y and radii [5, ...] of five circles in a box: one of radius width / 2 at the centre, four of radius width / 4
     in the corners."""
-    length, width = size.unbind(-1)
+    length, width = (value.expand(pose.shape[:-1]) for value in size.unbind(-1))
     along, across = (length - width) / 2 + width / 4, width / 4
     x = torch.stack([torch.zeros_like(along), along, along, -along, -along])
     y = torch.stack([torch.zeros_like(across), across, -across, across, -across])
@@ -137,6 +137,7 @@ def circles(pose: Tensor, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def circle_gap(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor) -> Tensor:
     """Smallest distance [...] m between the circles of two boxes; negative where circles overlap."""
+    first, second = torch.broadcast_tensors(first[..., :3], second[..., :3])
     (ax, ay, ra), (bx, by, rb) = circles(first, first_size), circles(second, second_size)
     apart = ((ax[:, None] - bx).square() + (ay[:, None] - by).square()).sqrt()
     return (apart - ra[:, None] - rb).flatten(0, 1).amin(0)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from e2rl.prior.lane_relative import ACCEL_SCALE, LaneState
-from e2rl.run.kernels import kernel
+from e2rl.run.fused import fused
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import overlap
 from e2rl.scenes.recording import DT
@@ -133,7 +133,7 @@ class Meeting(NamedTuple):
     happens: Tensor
 
 
-@kernel("B V K 4", "B N K 4", "B V K", "B V 2", "B N 2", "B V:bool", "B N:bool", "K:int64")
+@fused("B V K 4", "B N K 4", "B V K", "B V 2", "B N 2", "B V:bool", "B N:bool", "K:int64")
 def first_meeting(
     own: Tensor,
     everybody: Tensor,

@@ -13,7 +13,7 @@ from e2rl.prior.features import EDGE, NODE
 from e2rl.prior.lane_relative import SIZE
 from e2rl.prior.sde import NoiseSchedule
 from e2rl.run.errors import InputError
-from e2rl.run.kernels import Kernel, is_on
+from e2rl.run.fused import Fused, is_on
 from e2rl.run.settings import configured, setting
 
 
@@ -145,7 +145,7 @@ class Denoiser(nn.Module):
         if self.training or len(level) > 1 or not is_on():
             return self.estimate(x, level, encoding)
         scene = encoding.nodes, encoding.pairs, *encoding.biases, *encoding.modulations
-        return estimate_kernel(self.settings)(x, level, *scene, *self._read)
+        return fused_estimate(self.settings)(x, level, *scene, *self._read)
 
     @cached_property
     def _read(self) -> list[Tensor]:
@@ -174,7 +174,7 @@ class _Estimate(nn.Module):
 
 
 @cache
-def estimate_kernel(settings: DenoiserSettings) -> Kernel:
+def fused_estimate(settings: DenoiserSettings) -> Fused:
     """`Denoiser.estimate` of networks of these sizes: of x, level, nodes, pairs, biases, modulations and weights."""
     module = _Estimate(Denoiser(settings).eval())
     names = [name for name, _ in (*module.named_parameters(), *module.named_buffers())]
@@ -188,4 +188,4 @@ def estimate_kernel(settings: DenoiserSettings) -> Kernel:
 
     scene = [f"B V {settings.width}", f"B V V {settings.pair}", *[f"B {settings.heads} V V"] * settings.blocks]
     scene += [f"B V {6 * settings.width}"] * settings.blocks
-    return Kernel(denoise, (f"B V {SIZE}", "1 V", *scene, *sizes))
+    return Fused(denoise, (f"B V {SIZE}", "1 V", *scene, *sizes))

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import LaneState
 from e2rl.prior.routes import ROUTED, RoutedScene
-from e2rl.run.kernels import kernel
+from e2rl.run.fused import fused
 from e2rl.scenes.recording import DT, LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
 from e2rl.scenes.route import SPACING, interpolate
 from e2rl.scenes.smoothing import PAST
@@ -23,7 +23,7 @@ SIDED_NODE = (2, 3, 4, *range(9, 22), *range(51 + PAST, NODE))  # features that 
 SIDED_EDGE = (1, 3, 5, 13)
 
 
-@kernel(ROUTED, "B V", ("B V 3", "B V 3", "B V 3:int64"), "B:int64", "B:bool")
+@fused(ROUTED, "B V", ("B V 3", "B V 3", "B V 3:int64"), "B:int64", "B:bool")
 def node_features(routed: RoutedScene, state: LaneState, followed: Leaders, step: Tensor, estimated: Tensor) -> Tensor:
     """[B, V, NODE] from lane states [B, V], the `leaders_ahead` and the simulated step [B].
 
@@ -102,7 +102,7 @@ def past_features(past: Tensor, v: Tensor, estimated: Tensor) -> list[Tensor]:
     return list((features * estimated[:, None, None]).unbind(-1))
 
 
-@kernel(ROUTED, "B V")
+@fused(ROUTED, "B V")
 def edge_features(routed: RoutedScene, state: LaneState) -> Tensor:
     """[B, V, V, EDGE] of each pair (i, j): j in i's frame, and where their routes meet."""
     x, y, heading, v = state.x, state.y, state.heading, state.v

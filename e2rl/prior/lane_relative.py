@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from e2rl.run.kernels import kernel
+from e2rl.run.fused import fused
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import interpolate, project, tangents
 from e2rl.sim.dynamics import wrap
@@ -174,13 +174,13 @@ def decode(
     return LaneState(s, d, d1, d2, v, accel, xy[..., 0], xy[..., 1], heading, curvature + d2)
 
 
-@kernel(f"B V {SIZE}", "B V", "B V P 2!")
+@fused(f"B V {SIZE}", "B V", "B V P 2!")
 def decode_plans(x: Tensor, state: LaneState, points: Tensor) -> LaneState:
     """`decode` of every vehicle's plan."""
     return decode(x, state, points)
 
 
-@kernel(f"G O {SIZE}", "G O", "G P 2!")
+@fused(f"G O {SIZE}", "G O", "G P 2!")
 def decode_options(x: Tensor, state: LaneState, points: Tensor) -> LaneState:
     """`decode` of O plans of each of G vehicles on its route."""
     routes = points[:, None]

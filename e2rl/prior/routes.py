@@ -54,7 +54,7 @@ class RoutedScene:
     has_lane: Tensor
 
 
-# Shapes of a RoutedScene's tensors, see `kernel`; X agents in all.
+# Shapes of a RoutedScene's tensors, see `fused`; X agents in all.
 ROUTED = (
     *("B X 2", "B T L:int64", "B V 10 3", "B V:int64", "B V P 2!", "B V", "B V:bool", "B V P", "B V 2:int64", "B V 2"),
     *("B V V:bool", "B V V", "B V V", "B V:bool", "B V:bool", "B V:bool"),

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from e2rl.run.errors import InputError
-from e2rl.run.kernels import is_on, switch
+from e2rl.run.fused import is_on, switch
 
 RETRIES = 3  # times that a job is done again whose worker was lost
 ADDRESS = "RAY_ADDRESS"  # environment variable: the cluster; without it, workers are started on this machine

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from e2rl.run.kernels import is_on, kernel
+from e2rl.run.fused import fused, is_on
 
 SPACING = 2.0  # m of arc length between vertices
 WINDOW = 20.0  # m
@@ -71,13 +71,13 @@ def _project(points: Tensor, route: Tensor, hint: Tensor | None, window: float) 
     return onto_segments(points, vertex, route.shape[-2] - 2, lambda index: _take(route, index))
 
 
-@kernel("R K 2", "R P 2!")
+@fused("R K 2", "R P 2!")
 def project_rows(points: Tensor, route: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`project` of points [R, K, 2] on routes [R, P, 2]."""
     return _project(points, route, None, WINDOW)
 
 
-@kernel("R K 2", "R P 2!", "R K")
+@fused("R K 2", "R P 2!", "R K")
 def project_near(points: Tensor, route: Tensor, hint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`project_rows` near hints [R, K]."""
     return _project(points, route, hint, WINDOW)
@@ -142,7 +142,7 @@ def interpolate(
     return _interpolate(route, s, tangents)
 
 
-@kernel("R P 2!", "R K")
+@fused("R P 2!", "R K")
 def interpolate_rows(route: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`interpolate` of routes [R, P, 2] at s [R, K]."""
     return _interpolate(route, s, None)

@@ -11,7 +11,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from e2rl.run.errors import InputError
-from e2rl.run.kernels import check_compiler
+from e2rl.run.fused import check_compiler
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.scene import SceneSet

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from e2rl.run.kernels import kernel
+from e2rl.run.fused import fused
 from e2rl.scenes.route import SPACING, onto_segments
 
 GATE_MARGIN = 0.3  # m of lateral clearance within which an agent still is a leader
@@ -109,7 +109,7 @@ def _near_pairs(points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Te
     return b, v, m // moments, m % moments, vertex
 
 
-@kernel("B V C 2", "B V C 2", "B V 2", "B V 2", "B V C", "B Q 2", "B V Q")
+@fused("B V C 2", "B V C 2", "B V 2", "B V 2", "B V C", "B Q 2", "B V Q")
 def near_some(
     low: Tensor, high: Tensor, before: Tensor, last: Tensor, to_come: Tensor, xy: Tensor, far: Tensor
 ) -> Tensor:

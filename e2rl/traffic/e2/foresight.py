@@ -13,7 +13,7 @@ from torch import Tensor
 from e2rl.metrics.drivers import DriverState, HumanDriver, Observation
 from e2rl.metrics.preventable import Along, Tracks, along_way
 from e2rl.prior.lane_relative import HORIZON
-from e2rl.run.kernels import kernel
+from e2rl.run.fused import fused
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 from e2rl.traffic.traffic import REPLAN_STEPS
@@ -24,7 +24,7 @@ BRAKING = (7.59, 6.5, 5.5, 5.0, 4.0, 1.0)  # m/s^2
 WEIGHTS = (0.4, 0.3, 0.15, 0.1, 0.05)  # of the failures of all but the first
 FRONT_GAP = 0.8  # m before the ego's front, a step before the contact, at least which makes it the ego's front
 MOVING = 1.0  # m/s: slower drivers do not run into anybody
-STEPS = 5  # of DT in one kernel
+STEPS = 5  # of DT in one fused function
 SOON = 0.1  # share of the worth that a failure at the end of the horizon loses
 
 
@@ -75,7 +75,7 @@ def _contacts(path: Tensor, length: Tensor, along: Along, since: Tensor) -> tupl
     return torch.cat([hit[:1], front[1:]]), met[7][-1].view(plans)
 
 
-@kernel("D", "D", f"{STEPS}", "C", f"{STEPS} C", *["D C"] * 8, *[f"{STEPS + 1} C"] * 4)
+@fused("D", "D", f"{STEPS}", "C", f"{STEPS} C", *["D C"] * 8, *[f"{STEPS + 1} C"] * 4)
 def meet(
     delay: Tensor,
     braking: Tensor,
@@ -97,7 +97,7 @@ def meet(
 ) -> tuple[Tensor, ...]:
     """Some steps, which end at `moments`, of drivers [D] who meet plans [C].
 
-    Returns, each [D, C], their speed, way, since and braking; as 0 or 1, which a kernel loads faster than truth values,
+    Returns, each [D, C], their speed, way, since and braking; as 0 or 1, which compiled code loads faster than truth values,
     whether they have been hit, by their front, and react; and when they are hit. length [C] and own [STEPS, C]: the
     ego's, and its planned acceleration; rear, other (speed), aside and extent [STEPS + 1, C]: of what it meets.
     """

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS
 from e2rl.prior.routes import take_route
-from e2rl.run.kernels import kernel
+from e2rl.run.fused import fused
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import overlap
 from e2rl.scenes.drivable_area import off_road
@@ -150,7 +150,7 @@ def _clear(paths: _Paths, travelled: Tensor, size: Tensor, others: tuple[Tensor,
     return ~touched(pose, size + CLEARANCE, states, sizes, counts.to(size.dtype), travelled)
 
 
-@kernel("B M O W 4", "B M 2", "B J W 4", "B J 2", "B M J", "B M O W")
+@fused("B M O W 4", "B M 2", "B J W 4", "B J 2", "B M J", "B M O W")
 def touched(pose: Tensor, size: Tensor, states: Tensor, sizes: Tensor, counts: Tensor, travelled: Tensor) -> Tensor:
     """Bool [B, M, O]: boxes at pose [B, M, O, W, 4] touch one that counts (1, else 0), before they arrive (see
     `_clear`)."""

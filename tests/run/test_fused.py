@@ -1,4 +1,4 @@
-"""A kernel does what its function does, for every size, and leaves to the function what it was not declared for."""
+"""A fused function does what it does eagerly, for every size, and leaves to the function what it was not declared for."""
 
 from typing import NamedTuple
 
@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from e2rl.run import kernels
+from e2rl.run import fused as module
 from e2rl.run.errors import InputError
-from e2rl.run.kernels import KERNELS, Kernel, has_compiler, kernel, switched_off
+from e2rl.run.fused import FUSED, Fused, fused, has_compiler, switched_off
 
 
 class Line(NamedTuple):
@@ -21,7 +21,7 @@ class Line(NamedTuple):
 calls = []
 
 
-@kernel("B K 2", "B", "3!", "B:bool")
+@fused("B K 2", "B", "3!", "B:bool")
 def across(points: Tensor, line: Line, weight: Tensor, counts: Tensor) -> Line:
     """Largest distance [B] of points from lines, where they count, and the lines' angles."""
     calls.append(points.shape[0])
@@ -39,14 +39,14 @@ def given(batch: int, count: int) -> tuple:
 @pytest.fixture
 def on():
     with switched_off():
-        kernels.switch(True)
+        module.switch(True)
         yield
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler")
 @pytest.mark.parametrize(("batch", "count"), [(1, 1), (1, 40), (5, 1), (19, 33)])
-def test_a_kernel_gives_what_its_function_gives_for_every_size(on, batch, count):
+def test_compiled_it_gives_what_it_gives_eagerly_for_every_size(on, batch, count):
     arguments = given(batch, count)
     across(*arguments)  # compiles it, which calls the function
     calls.clear()
@@ -77,21 +77,21 @@ def test_what_is_not_as_declared_runs_as_it_is(on, change):
     assert all(torch.equal(one, other) for one, other in zip(found, across.function(*arguments), strict=True))
 
 
-def test_kernels_run_as_they_are_until_they_are_switched_on():
+def test_fused_functions_run_as_they_are_until_they_are_switched_on():
     calls.clear()
     across(*given(4, 3))
     assert calls == [4]
 
 
-def test_a_kernel_s_file_depends_on_its_shapes_and_sources():
-    other = Kernel(across.function, ("B K 2", "B", "3", "B:bool"))
-    KERNELS[across.name] = across
+def test_its_file_depends_on_its_shapes_and_sources():
+    other = Fused(across.function, ("B K 2", "B", "3", "B:bool"))
+    FUSED[across.name] = across
     assert across.file.name.startswith("across-") and other.file != across.file
-    assert across.file.parent.name == "kernels"
+    assert across.file.parent.name == "fused"
 
 
 def test_without_a_compiler_compiling_is_refused(monkeypatch):
-    monkeypatch.setattr(kernels.shutil, "which", lambda name: None)
+    monkeypatch.setattr(module.shutil, "which", lambda name: None)
     with pytest.raises(InputError, match="compile=true: no C"):
-        Kernel(across.function, ("B K 2", "B", "3", "B:bool")).compile()
-    KERNELS[across.name] = across
+        Fused(across.function, ("B K 2", "B", "3", "B:bool")).compile()
+    FUSED[across.name] = across

@@ -1,4 +1,4 @@
-"""The kernels of rollouts: what `compile` of a configuration means, before the first rollout."""
+"""The fused functions of rollouts: what `compile` of a configuration means, before the first rollout."""
 
 import sys
 
@@ -8,9 +8,9 @@ from tqdm import tqdm
 from e2rl.metrics import preventable
 from e2rl.planners import lane_graph_planner
 from e2rl.prior import bounds, features, lane_relative
-from e2rl.prior.denoiser import DenoiserSettings, estimate_kernel
+from e2rl.prior.denoiser import DenoiserSettings, fused_estimate
 from e2rl.run.errors import InputError
-from e2rl.run.kernels import KERNELS, Kernel, check_compiler, has_compiler, switch
+from e2rl.run.fused import FUSED, Fused, check_compiler, has_compiler, switch
 from e2rl.run.processes import cores, in_processes
 from e2rl.sim import leaders
 from e2rl.traffic.e2 import foresight, interception
@@ -18,27 +18,27 @@ from e2rl.traffic.e2 import foresight, interception
 MODULES = (bounds, features, foresight, interception, lane_graph_planner, lane_relative, leaders, preventable)
 
 
-def prepare_kernels(config: DictConfig) -> None:
-    """Switch kernels on or off as `compile` says, and write what auto means here into the configuration.
+def prepare_fused(config: DictConfig) -> None:
+    """Switch fused functions on or off as `compile` says, and write what auto means here into the configuration.
 
-    auto: on where all are compiled on this machine already. Raises InputError for another value, and where kernels are
-    to be compiled and there is no compiler.
+    auto: on where all are compiled on this machine already. Raises InputError for another value, and where they are to be
+    compiled and there is no compiler.
     """
     if config.compile not in ("auto", True, False):
         raise InputError(f"compile={config.compile}: choose one of auto, true, false")
     names = {module.__name__ for module in MODULES}
-    found = [each for each in KERNELS.values() if each.function.__module__ in names]
-    missing = [each for each in (*found, estimate_kernel(DenoiserSettings())) if not each.file.exists()]
+    found = [each for each in FUSED.values() if each.function.__module__ in names]
+    missing = [each for each in (*found, fused_estimate(DenoiserSettings())) if not each.file.exists()]
     on = config.compile is not False and config.device == "cpu"
     if on and missing and config.compile == "auto":
         on = False
         if has_compiler():
-            told = f"compile=true compiles the {len(missing)} kernels of rollouts, once; then these take half the time"
+            told = f"compile=true compiles {len(missing)} functions of rollouts, once; then these take half the time"
             print(told, file=sys.stderr)
     elif on and missing:
         check_compiler("compile")
-        done = in_processes(Kernel.compile, missing, cores(), lambda each: 1.0)
-        for _ in tqdm(done, "kernels", len(missing), unit="kernel", disable=None):
+        done = in_processes(Fused.compile, missing, cores(), lambda each: 1.0)
+        for _ in tqdm(done, "compiling", len(missing), unit="function", disable=None):
             pass
     if config.compile == "auto":
         config.compile = on

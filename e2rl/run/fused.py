@@ -1,11 +1,11 @@
-"""Pure functions of tensors that run as one compiled kernel each, where that is switched on.
+"""Fused functions: pure functions of tensors, each compiled into a few loops, where that is switched on.
 
-    @kernel("G P 2", "G K 2", "G K:bool")
+    @fused("G P 2", "G K 2", "G K:bool")
     def function(route, points, counts): ...
 
-Eager PyTorch is the reference: a kernel does the same operations in the same order, as a few loops of machine code
-instead of a pass over memory for each. `AOTInductor` makes it, once on a machine; it is kept in the cache under a name
-that its source, PyTorch and the processor have in it, so that a process that finds it there only loads it (ms).
+Eager PyTorch is the reference: a fused function does the same operations in the same order, without a pass over memory
+for each. AOTInductor compiles it, once on a machine; it is kept in the cache, under a hash of its source, of PyTorch's
+version and of the processor's instructions, where processes find it.
 """
 
 import hashlib
@@ -32,15 +32,15 @@ from e2rl.run.files import cache_folder, locked, write_atomically
 
 Shape = str | tuple[str, ...]  # of a tensor or of all of a dataclass, or of each of them
 
-KERNELS: dict[str, "Kernel"] = {}
-"""All kernels of the modules that are imported, by name."""
+FUSED: dict[str, "Fused"] = {}
+"""All fused functions of the modules that are imported, by name."""
 COMPILERS = ("c++", "g++", "clang++")
 VECTOR = 8  # components of a vector, at most
-FIRST = 17  # sizes of the tensors that a kernel is traced with: distinct primes from here on
+FIRST = 17  # sizes of the tensors that a function is traced with: distinct primes from here on
 _on = False
 
 
-class Kernel:
+class Fused:
     """A function of tensors, compiled where `switch` is on: on the CPU, of the types declared, without gradients.
 
     shapes: of each argument, names of sizes that vary and numbers that do not, then ":" and a type (float32 by
@@ -54,7 +54,7 @@ class Kernel:
         self.function, self.shapes = function, shapes
         self.name = f"{function.__module__}.{function.__qualname__}"
         self.__doc__ = function.__doc__
-        KERNELS[self.name] = self
+        FUSED[self.name] = self
 
     def __call__(self, *given: Any) -> Any:
         """What the function returns: a tensor, or a tuple, a named tuple or a dataclass of them."""
@@ -108,11 +108,11 @@ class Kernel:
 
     @cached_property
     def file(self) -> Path:
-        """Where the compiled kernel lies."""
+        """Where the compiled function lies."""
         mark = hashlib.sha256(repr((machine(), self.shapes)).encode())
         for module in sorted(_sources(sys.modules[self.function.__module__]), key=lambda module: module.__name__):
             mark.update(Path(str(module.__file__)).read_bytes())
-        return cache_folder() / "kernels" / f"{self.function.__qualname__}-{mark.hexdigest()[:32]}.so"
+        return cache_folder() / "fused" / f"{self.function.__qualname__}-{mark.hexdigest()[:32]}.so"
 
     @cached_property
     def _run(self) -> Callable[[list[Tensor]], list[Tensor]]:
@@ -120,7 +120,7 @@ class Kernel:
         return torch._C._aoti.AOTIModelContainerRunnerCpu(str(self.file), 1).run
 
     def compile(self) -> None:
-        """Compile the kernel, where it is not in the cache. Raises InputError without a C++ compiler."""
+        """Compile the function, where it is not in the cache. Raises InputError without a C++ compiler."""
         if self.file.exists():
             return
         names = (os.environ.get("CXX"), *COMPILERS)
@@ -154,20 +154,20 @@ class Kernel:
             write_atomically(self.file, whole.read(library))
 
 
-def kernel(*shapes: Shape) -> Callable[[Callable[..., Any]], Kernel]:
-    """Decorator: makes a Kernel of a function of tensors of these shapes."""
-    return lambda function: Kernel(function, shapes)
+def fused(*shapes: Shape) -> Callable[[Callable[..., Any]], Fused]:
+    """Decorator: makes a Fused of a function of tensors of these shapes."""
+    return lambda function: Fused(function, shapes)
 
 
 def switch(on: bool) -> None:
-    """Let kernels run compiled from now on, or as plain PyTorch."""
+    """Let fused functions run compiled from now on, or as plain PyTorch."""
     global _on
     _on = on
 
 
 @contextmanager
 def switched_off() -> Iterator[None]:
-    """Kernels run as plain PyTorch meanwhile."""
+    """Fused functions run as plain PyTorch meanwhile."""
     before = _on
     switch(False)
     try:
@@ -177,7 +177,7 @@ def switched_off() -> Iterator[None]:
 
 
 def is_on() -> bool:
-    """Whether kernels run compiled, now; what is being compiled is not in parts."""
+    """Whether fused functions run compiled, now; what is being compiled is not in parts."""
     return _on and not torch.compiler.is_compiling()
 
 
@@ -195,24 +195,24 @@ def check_compiler(option: str) -> None:
 
 
 class _Module(nn.Module):
-    """The function of a Kernel, from tensors to tensors."""
+    """A fused function, from tensors to tensors."""
 
-    def __init__(self, kernel: Kernel) -> None:
+    def __init__(self, fused: Fused) -> None:
         super().__init__()
-        self.kernel = kernel
+        self.fused = fused
 
     def forward(self, *flat: Tensor) -> Any:
-        declared = zip(flat, self.kernel.declared, strict=True)
+        declared = zip(flat, self.fused.declared, strict=True)
         rest = iter([value.movedim(0, -1) if given.apart else value for value, given in declared])
         given = []
-        for kind in self.kernel.kinds:
+        for kind in self.fused.kinds:
             parts = [next(rest) for _ in _fields(kind)]
             given.append(kind(*parts) if _made(kind) else parts[0])
-        return tuple(_tensors(self.kernel.function(*given)))
+        return tuple(_tensors(self.fused.function(*given)))
 
 
 class _Declared(NamedTuple):
-    """A tensor of a kernel: its sizes, its type, its shape where no size varies, and whether vectors come component by
+    """A tensor of a fused function: its sizes, its type, its shape where no size varies, and whether vectors come component by
     component."""
 
     sizes: list[Any]
@@ -221,7 +221,7 @@ class _Declared(NamedTuple):
     apart: bool
 
     def laid_out(self, value: Tensor) -> Tensor:
-        """The tensor as the compiled kernel reads it."""
+        """The tensor as compiled code reads it."""
         return value.movedim(-1, 0).contiguous() if self.apart else value.contiguous()
 
 
