@@ -212,8 +212,8 @@ class _Module(nn.Module):
 
 
 class _Declared(NamedTuple):
-    """A tensor of a fused function: its sizes, its type, its shape where no size varies, and whether vectors come component by
-    component."""
+    """A tensor of a fused function: its sizes, its type, its shape where no size varies, and whether vectors come
+    component by component."""
 
     sizes: list[Any]
     kind: torch.dtype

@@ -21,8 +21,8 @@ MODULES = (bounds, features, foresight, interception, lane_graph_planner, lane_r
 def prepare_fused(config: DictConfig) -> None:
     """Switch fused functions on or off as `compile` says, and write what auto means here into the configuration.
 
-    auto: on where all are compiled on this machine already. Raises InputError for another value, and where they are to be
-    compiled and there is no compiler.
+    auto: on where all are compiled on this machine already. Raises InputError for another value, and where they are to
+    be compiled and there is no compiler.
     """
     if config.compile not in ("auto", True, False):
         raise InputError(f"compile={config.compile}: choose one of auto, true, false")

@@ -1,4 +1,4 @@
-"""A fused function does what it does eagerly, for every size, and leaves to the function what it was not declared for."""
+"""A fused function gives what it gives eagerly, for every size; what it was not declared for runs eagerly."""
 
 from typing import NamedTuple
 

@@ -97,9 +97,9 @@ def meet(
 ) -> tuple[Tensor, ...]:
     """Some steps, which end at `moments`, of drivers [D] who meet plans [C].
 
-    Returns, each [D, C], their speed, way, since and braking; as 0 or 1, which compiled code loads faster than truth values,
-    whether they have been hit, by their front, and react; and when they are hit. length [C] and own [STEPS, C]: the
-    ego's, and its planned acceleration; rear, other (speed), aside and extent [STEPS + 1, C]: of what it meets.
+    Returns, each [D, C], their speed, way, since and braking; whether they have been hit, by their front, and react, as
+    0 or 1, which compiled code loads faster than truth values; and when they are hit. length [C] and own [STEPS, C]:
+    the ego's, and its planned acceleration; rear, other (speed), aside and extent [STEPS + 1, C]: of what it meets.
     """
     drivers = HumanDriver(delay=delay[:, None], braking=braking[:, None], release=0.0)  # type: ignore
     length = length.expand_as(speed)
