@@ -3,8 +3,8 @@
     @fused("G P 2", "G K 2", "G K:bool")
     def function(route, points, counts): ...
 
-Eager PyTorch is the reference: a fused function does the same operations in the same order, without a pass over memory
-for each. AOTInductor compiles it, once on a machine; it is kept in the cache, under a hash of its source, of PyTorch's
+Eager PyTorch is the reference: a fused function does the same operations, but for what compilers are slow at
+(`torch.compiler.is_compiling`), without a pass over memory for each. AOTInductor compiles it, once on a machine; it is kept in the cache, under a hash of its source, of PyTorch's
 version and of the processor's instructions, where processes find it.
 """
 
@@ -123,11 +123,7 @@ class Fused:
         """Compile the function, where it is not in the cache. Raises InputError without a C++ compiler."""
         if self.file.exists():
             return
-        names = (os.environ.get("CXX"), *COMPILERS)
-        if not any(name and shutil.which(name) for name in names):
-            raise InputError(
-                f"compile=true: no C++ compiler found (CXX, {', '.join(COMPILERS)}): install one, or compile=false"
-            )
+        check_compiler("compile")
         self.file.parent.mkdir(parents=True, exist_ok=True)
         with locked(self.file.with_suffix(".lock")):
             if not self.file.exists():

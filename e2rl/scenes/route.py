@@ -11,7 +11,7 @@ from torch import Tensor
 from e2rl.run.fused import fused, is_on
 
 SPACING = 2.0  # m of arc length between vertices
-WINDOW = 20.0  # m
+WINDOW = 20.0  # m on either side of an expected arc length
 
 
 def _take(route: Tensor, index: Tensor) -> Tensor:

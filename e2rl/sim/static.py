@@ -7,10 +7,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.scenes.recording import VEHICLE
-from e2rl.scenes.route import SPACING, onto_nearer, segment, tangents
+from e2rl.scenes.route import SPACING, WINDOW, onto_nearer, segment, tangents
 from e2rl.sim.mission import Mission
-
-WINDOW = 20.0  # m of the mission on either side of the ego's expected arc length
 
 
 class FrenetPose(NamedTuple):

@@ -12,10 +12,11 @@ from e2rl.prior.denoiser import DenoiserSettings, fused_estimate
 from e2rl.run.errors import InputError
 from e2rl.run.fused import FUSED, Fused, check_compiler, has_compiler, switch
 from e2rl.run.processes import cores, in_processes
+from e2rl.scenes import route
 from e2rl.sim import leaders
 from e2rl.traffic.e2 import foresight, interception
 
-MODULES = (bounds, features, foresight, interception, lane_graph_planner, lane_relative, leaders, preventable)
+MODULES = bounds, features, foresight, interception, lane_graph_planner, lane_relative, leaders, preventable, route
 
 
 def prepare_fused(config: DictConfig) -> None:
@@ -24,13 +25,14 @@ def prepare_fused(config: DictConfig) -> None:
     auto: on where all are compiled on this machine already. Raises InputError for another value, and where they are to
     be compiled and there is no compiler.
     """
-    if config.compile not in ("auto", True, False):
-        raise InputError(f"compile={config.compile}: choose one of auto, true, false")
+    asked = config.get("compile", False)  # runs of earlier versions have none
+    if asked not in ("auto", True, False):
+        raise InputError(f"compile={asked}: choose one of auto, true, false")
     names = {module.__name__ for module in MODULES}
     found = [each for each in FUSED.values() if each.function.__module__ in names]
     missing = [each for each in (*found, fused_estimate(DenoiserSettings())) if not each.file.exists()]
-    on = config.compile is not False and config.device == "cpu"
-    if on and missing and config.compile == "auto":
+    on = asked is not False and config.device == "cpu"
+    if on and missing and asked == "auto":
         on = False
         if has_compiler():
             told = f"compile=true compiles {len(missing)} functions of rollouts, once; then these take half the time"
@@ -40,6 +42,6 @@ def prepare_fused(config: DictConfig) -> None:
         done = in_processes(Fused.compile, missing, cores(), lambda each: 1.0)
         for _ in tqdm(done, "compiling", len(missing), unit="function", disable=None):
             pass
-    if config.compile == "auto":
+    if asked == "auto":
         config.compile = on
     switch(on)

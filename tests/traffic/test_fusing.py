@@ -8,7 +8,7 @@ from e2rl.planners.lane_graph_planner import LaneGraphEgo
 from e2rl.run import fused
 from e2rl.run.errors import InputError
 from e2rl.run.fused import FUSED, Fused, has_compiler, is_on, switched_off
-from e2rl.traffic.fusing import prepare_fused
+from e2rl.traffic.fusing import MODULES, prepare_fused
 from tests.traffic.e2.traffic_scenes import drive, scenes, synthesizer
 
 
@@ -22,6 +22,12 @@ def prepared(compile, device="cpu"):
     config = OmegaConf.create({"compile": compile, "device": device})
     prepare_fused(config)
     return config.compile
+
+
+def test_whatever_is_fused_is_prepared():
+    """Else it would be compiled in the middle of a run."""
+    fused = {each.function.__module__ for each in FUSED.values()} - {"e2rl.prior.denoiser"}
+    assert {name for name in fused if name.startswith("e2rl.")} == {module.__name__ for module in MODULES}
 
 
 @pytest.mark.slow
