@@ -4,8 +4,9 @@
     def function(route, points, counts): ...
 
 Eager PyTorch is the reference: a fused function does the same operations, but for what compilers are slow at
-(`torch.compiler.is_compiling`), without a pass over memory for each. AOTInductor compiles it, once on a machine; it is kept in the cache, under a hash of its source, of PyTorch's
-version and of the processor's instructions, where processes find it.
+(`torch.compiler.is_compiling`), without a pass over memory for each. AOTInductor compiles it, once on a machine; it is
+kept in the cache, under a hash of its source, of PyTorch's version and of the processor's instructions, where processes
+find it.
 """
 
 import hashlib

@@ -1,5 +1,7 @@
 """The prior as a whole: nominal reverse SDE, path KL, the ego's row, bounds, ends of routes."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -241,6 +243,19 @@ def test_the_ego_follows_its_mission_whatever_is_drawn():
     scene["route_log"][:, 0] = 1
     chosen = prior.choose_routes(scene, torch.zeros(scene["route_valid"].shape[:2]))
     assert chosen[0, 0] == 1 and (chosen[0, 1:] == 0).all()
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_what_is_known_of_the_moment_changes_no_context(moved):
+    """A context of the same moment gives leaders, but not of a vehicle that is elsewhere on its route by now."""
+    scene, prior = curved_scenes(), small_prior()
+    before = context_of(prior, scene)
+    state = replace(before.state, s=before.state.s + 7.0 * moved)
+    given = before.routed, state, scene["start"], scene["valid"], torch.zeros(len(scene), dtype=torch.long), None
+    known, anew = prior.encode(*given, known=before), prior.encode(*given)
+    assert torch.equal(known.encoding.nodes, anew.encoding.nodes)
+    assert all(torch.equal(one, other) for one, other in zip(known.followed, anew.followed, strict=True))
+    assert (known.followed is before.followed) == (not moved)
 
 
 def test_without_a_plan_the_ego_is_sampled_like_everybody_else():

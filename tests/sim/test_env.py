@@ -52,6 +52,21 @@ def test_specs():
     check_env_specs(DrivingEnv(make_scenes(3), SimSettings(), 2, agents=True), seed=0)
 
 
+def test_what_is_not_observed_drives_alike():
+    """The observation takes no part in what happens; an environment without it has none."""
+    scenes = make_scenes(3)
+    seen, blind = (DrivingEnv(scenes, SimSettings(), 2, observed=observed) for observed in (True, False))
+    check_env_specs(DrivingEnv(scenes, SimSettings(), 2, observed=False), seed=0)
+    begin = TensorDict({"scene_index": torch.tensor([[0], [2]])}, batch_size=[2])
+    one, other = seen.reset(begin.clone()), blind.reset(begin.clone())
+    for _ in range(15):
+        action = torch.tensor([[1.0, 0.1], [-1.0, 0.2]])
+        one, other = (env.step(td.set("action", action))["next"] for env, td in ((seen, one), (blind, other)))
+        assert other["observation"].shape == (2, 0)
+        for key in ("reward", "done", ("metrics", "off_road"), ("metrics", "contact"), ("metrics", "progress")):
+            assert torch.equal(one[key], other[key]), key
+
+
 def test_the_reported_agents_are_the_environments_world():
     """A policy that reads the TensorDict sees the same moment as who asks the environment."""
     env = DrivingEnv(make_scenes(3), SimSettings(), 2, agents=True)
