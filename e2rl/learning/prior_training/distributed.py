@@ -99,6 +99,7 @@ def process_group(device: str) -> Iterator[tuple[Processes, str]]:
                 stack.enter_context(contextlib.redirect_stdout(devnull))
                 stack.enter_context(contextlib.redirect_stderr(devnull))
             yield processes, device
+        dist.barrier()  # nobody leaves while another still talks to it
     finally:
         dist.destroy_process_group()
 
