@@ -113,13 +113,37 @@ def apply_cap(cap: Tensor | None, x0: Tensor, state: LaneState) -> tuple[Tensor,
 
 def _meeting_braking(motion: LaneState, state: LaneState, obstacles: Obstacles, steps: Tensor) -> Tensor:
     """`meeting_braking` [B, V] of planned motions, towards the agent that each runs into first."""
-    vehicles = state.v.shape[1]
+    vehicles, duty = state.v.shape[1], obstacles.duty
     others = constant_velocity(obstacles.agents[:, vehicles:], DT * (steps + 1))
     own, driven = motion.states()[:, :, steps], motion.s[..., steps] - state.s[..., None]
     there = obstacles.size[:, :vehicles], obstacles.size, obstacles.present[:, :vehicles], obstacles.present
-    meeting = first_meeting(own, torch.cat([own, others], 1), driven, *there, steps + 1)
     length = (obstacles.size[:, :vehicles, 0] + obstacles.size[:, :1, 0]) / 2
-    return meeting_braking(meeting, state.v, length, obstacles.duty)
+    if duty is None:  # nobody is behind the ego by any duty
+        none = torch.zeros_like(there[2])
+        duty, length = Duty(none, none, torch.zeros_like(length)), torch.full_like(length, -torch.inf)
+    return braking_for_meetings(own, torch.cat([own, others], 1), driven, *there, steps + 1, state.v, length, duty)
+
+
+@fused(
+    *("B V K 4", "B N K 4", "B V K", "B V 2", "B N 2", "B V:bool", "B N:bool", "K:int64", "B V", "B V"),
+    ("B V:bool", "B V:bool", "B V"),
+)
+def braking_for_meetings(
+    own: Tensor,
+    everybody: Tensor,
+    driven: Tensor,
+    own_size: Tensor,
+    size: Tensor,
+    here: Tensor,
+    present: Tensor,
+    steps: Tensor,
+    speed: Tensor,
+    length: Tensor,
+    duty: Duty,
+) -> Tensor:
+    """`meeting_braking` [B, V] for the `first_meeting`."""
+    meeting = first_meeting(own, everybody, driven, own_size, size, here, present, steps)
+    return meeting_braking(meeting, speed, length, duty)
 
 
 class Meeting(NamedTuple):
@@ -133,7 +157,6 @@ class Meeting(NamedTuple):
     happens: Tensor
 
 
-@fused("B V K 4", "B N K 4", "B V K", "B V 2", "B N 2", "B V:bool", "B N:bool", "K:int64")
 def first_meeting(
     own: Tensor,
     everybody: Tensor,
@@ -165,7 +188,7 @@ def first_meeting(
     return Meeting(mine, they, way, steps[first], left > 0)
 
 
-def meeting_braking(meeting: Meeting, speed: Tensor, length: Tensor, duty: Duty | None = None) -> Tensor:
+def meeting_braking(meeting: Meeting, speed: Tensor, length: Tensor, duty: Duty) -> Tensor:
     """Braking [B, V] m/s^2 that keeps vehicles GAP short of what they meet, -NO_CAP where nobody has to brake.
 
     It is (v - u)^2 / (2 room), u the other's speed along the vehicle's heading, 0 if it crosses or comes towards it. Of
@@ -175,7 +198,7 @@ def meeting_braking(meeting: Meeting, speed: Tensor, length: Tensor, duty: Duty 
     Args:
         meeting: with whom, and where.
         speed: v [B, V] m/s.
-        length: [B, V] m between the centres if the vehicle were just behind the ego.
+        length: [B, V] m between the centres if the vehicle were just behind the ego; -inf: nobody falls behind it.
         duty: of adversaries to the ego.
     """
     own, other, driven, steps, happens = meeting
@@ -188,12 +211,11 @@ def meeting_braking(meeting: Meeting, speed: Tensor, length: Tensor, duty: Duty 
     room = (driven - GAP - u * DT * steps).clamp(min=0.3)
     closing = (speed[..., None] - u).clamp(min=0)
     braking = closing**2 / (2 * room)
-    if duty is not None:
-        to_ego = _towards_ego(duty, happens[..., 0], yields[..., 0], room[..., 0], closing[..., 0])
-        yields = torch.cat([to_ego[..., None], yields[..., 1:]], -1)
-        back = 2 * (length + GAP - ahead[..., 0]).clamp(min=0) / (DT * steps[..., 0]) ** 2
-        back = back * (along[..., 0] > ALONGSIDE)  # who comes into the ego's side is behind it when they would touch
-        braking = torch.cat([torch.maximum(braking[..., 0], back)[..., None], braking[..., 1:]], -1)
+    to_ego = _towards_ego(duty, happens[..., 0], yields[..., 0], room[..., 0], closing[..., 0])
+    yields = torch.cat([to_ego[..., None], yields[..., 1:]], -1)
+    back = 2 * (length + GAP - ahead[..., 0]).clamp(min=0) / (DT * steps[..., 0]) ** 2
+    back = back * (along[..., 0] > ALONGSIDE)  # who comes into the ego's side is behind it when they would touch
+    braking = torch.cat([torch.maximum(braking[..., 0], back)[..., None], braking[..., 1:]], -1)
     return torch.where(yields, braking.clamp(min=MIN_BRAKING), -NO_CAP).amax(-1)
 
 

@@ -7,7 +7,9 @@ along and at the end of the lateral horizon: linear in between, from the current
 import torch
 from torch import Tensor
 
-from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS, LaneState, lateral_horizon, ridge, speeds
+from e2rl.prior import lane_relative
+from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS, SIZE, LaneState, lateral_horizon, ridge, select, speeds
+from e2rl.run.fused import fused
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
 
@@ -47,6 +49,12 @@ def decode(x: Tensor, state: LaneState) -> LaneState:
     accel = (v - torch.cat([state.v[..., None], v[..., :-1]], -1)) / DT
     s, zero = state.s[..., None] + travelled, torch.zeros_like(v)
     return LaneState(s, state.d[..., None] + zero, zero, zero, v, accel, xs, ys, heading, kappa)
+
+
+@fused(f"B V {SIZE}", "B V", "B V P 2!", "B V:bool")
+def decode_plans(x: Tensor, state: LaneState, points: Tensor, on_lane: Tensor) -> LaneState:
+    """Planned motion of every vehicle, on its route where on_lane [B, V], in free space elsewhere."""
+    return select(on_lane, lane_relative.decode(x, state, points), decode(x, state))
 
 
 def fit(heading: Tensor, known: Tensor, state: LaneState, knots: Tensor) -> Tensor:

@@ -78,7 +78,23 @@ def select(rows: Tensor, one: LaneState, other: LaneState) -> LaneState:
 
 def locate(states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hint: Tensor | None = None) -> LaneState:
     """LaneState of vehicles states [B, V, 4] on their routes points [B, V, P, 2]; hint [B, V]: expected arc length."""
-    hint = None if hint is None else hint[..., None]
+    given = states, accel, yaw_rate, points
+    return locate_anywhere(*given) if hint is None else locate_near(*given, hint)
+
+
+@fused("B V 4", "B V", "B V", "B V P 2!")
+def locate_anywhere(states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor) -> LaneState:
+    """`locate` without a hint."""
+    return _locate(states, accel, yaw_rate, points, None)
+
+
+@fused("B V 4", "B V", "B V", "B V P 2!", "B V")
+def locate_near(states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hint: Tensor) -> LaneState:
+    """`locate` with a hint."""
+    return _locate(states, accel, yaw_rate, points, hint[..., None])
+
+
+def _locate(states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hint: Tensor | None) -> LaneState:
     s, d, _ = (value[..., 0] for value in project(states[..., None, :2], points, hint))
     heading, curvature = (value[..., 0] for value in interpolate(points, s[..., None])[1:])
     turn = wrap(states[..., 2] - heading)
@@ -222,13 +238,14 @@ def polynomial(c: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return _Polynomial.apply(c, u)
 
 
-def fit(track: LaneState, known: Tensor, state: LaneState) -> tuple[Tensor, Tensor]:
+def fit(track: LaneState, known: Tensor | None, state: LaneState) -> tuple[Tensor, Tensor]:
     """x [..., V, SIZE] that reproduces recorded motion, and its mean error [..., V] in m.
 
-    track: fields s, d, v [..., V, HORIZON] of the steps ahead; known: their mask; state: at the start. Ridge least
-    squares on speed and distance for the knots (second differences damped), on offset for the lateral knots.
+    track: fields s, d, v [..., V, HORIZON] of the steps ahead; known: their mask, None: all; state: at the start. Ridge
+    least squares on speed and distance for the knots (second differences damped), on offset for the lateral knots.
     """
     knots = _fit_knots(track, known, state)
+    known = torch.ones_like(track.v) if known is None else known
     _, travelled = speeds(state, knots)
     u = (travelled / lateral_horizon(state.v)[..., None]).clamp(max=1.0)
     zero = torch.zeros_like(state.d)
@@ -248,22 +265,46 @@ def fit(track: LaneState, known: Tensor, state: LaneState) -> tuple[Tensor, Tens
 
 def ridge(unit: Tensor, target: Tensor, damping: Tensor) -> Tensor:
     """Weights [..., D] of columns unit [..., H, D] that fit target [..., H], with damping [D, D] on their squares."""
-    gram = unit.transpose(-1, -2) @ unit + damping
-    return torch.linalg.solve(gram, (unit * target[..., None]).sum(-2)[..., None])[..., 0]
+    right = (unit * target[..., None]).sum(-2)
+    if torch.compiler.is_compiling() and unit.shape[-1] == 2:  # Cramer's rule, as the compiler has no `solve`
+        one, two = unit.unbind(-1)
+        a, b, d = (one * one).sum(-1), (one * two).sum(-1), (two * two).sum(-1)
+        a, d, (e, f) = a + damping[0, 0], d + damping[1, 1], right.unbind(-1)
+        return torch.stack([d * e - b * f, a * f - b * e], -1) / (a * d - b * b)[..., None]
+    return torch.linalg.solve(unit.transpose(-1, -2) @ unit + damping, right[..., None])[..., 0]
 
 
-def _fit_knots(track: LaneState, known: Tensor, state: LaneState) -> Tensor:
+def _fit_knots(track: LaneState, known: Tensor | None, state: LaneState) -> Tensor:
     """Acceleration knots [..., V, KNOTS] m/s^2 of recorded motion."""
-    basis, distance = _speed_basis(known.device), _distance_basis(known.device)
-    time = DT * torch.arange(1, HORIZON + 1, device=known.device)
-    weight = known.to(basis.dtype)[..., None]
+    device = track.v.device
+    basis, distance = _speed_basis(device), _distance_basis(device)
+    time = DT * torch.arange(1, HORIZON + 1, device=device)
+    weight = torch.ones_like(track.v)[..., None] if known is None else known.to(basis.dtype)[..., None]
+    rows_of_all, inverse = _fit_of_all(device)
     rows = torch.cat([weight * basis[:, 1:], 0.5 * weight * distance[:, 1:]], -2)
     speed = track.v - state.v[..., None] - state.a[..., None] * basis[:, 0]
     driven = track.s - state.s[..., None] - state.v[..., None] * time - state.a[..., None] * distance[:, 0]
     target = torch.cat([weight[..., 0] * speed, 0.5 * weight[..., 0] * driven], -1)
-    second = torch.diff(torch.eye(KNOTS + 1, device=known.device), n=2, dim=0)
-    damp = ROUGHNESS * second[:, 1:].T @ second[:, 1:] + 1e-3 * torch.eye(KNOTS, device=known.device)
-    pull = -ROUGHNESS * second[:, 1:].T @ second[:, 0] * state.a[..., None]
+    damp, bend = _roughness(device)
+    pull = bend * state.a[..., None]
+    if known is None and torch.compiler.is_compiling():  # the same system for all, which is solved already
+        return ((target @ rows_of_all + pull) @ inverse).clamp(-8.0, 5.0)
     gram = rows.transpose(-1, -2) @ rows + damp
     right = (rows.transpose(-1, -2) @ target[..., None])[..., 0] + pull
     return torch.linalg.solve(gram, right[..., None])[..., 0].clamp(-8.0, 5.0)
+
+
+@cache
+def _roughness(device: torch.device) -> tuple[Tensor, Tensor]:
+    """The damping [KNOTS, KNOTS] of fitted knots, and the pull [KNOTS] of a present acceleration of 1 on them."""
+    second = torch.diff(torch.eye(KNOTS + 1, device=device), n=2, dim=0)
+    damp = ROUGHNESS * second[:, 1:].T @ second[:, 1:] + 1e-3 * torch.eye(KNOTS, device=device)
+    return damp, -ROUGHNESS * second[:, 1:].T @ second[:, 0]
+
+
+@cache
+def _fit_of_all(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Of motion that is known throughout: the rows [2 HORIZON, KNOTS] of the least squares, and the inverse of their
+    damped Gram matrix [KNOTS, KNOTS]."""
+    rows = torch.cat([_speed_basis(device)[:, 1:], 0.5 * _distance_basis(device)[:, 1:]])
+    return rows, torch.linalg.inv(rows.double().T @ rows.double() + _roughness(device)[0]).float()

@@ -14,7 +14,8 @@ from e2rl.prior.denoiser import Denoiser, DenoiserSettings, Encoding
 from e2rl.prior.features import edge_features, leaders_ahead, node_features
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, select
 from e2rl.prior.routes import RouteChoice, RoutedScene, route_scene, sample_route, start_state
-from e2rl.prior.sde import SamplerSettings, path_kl, path_martingale
+from e2rl.prior.sde import SamplerSettings, fused_controlled_step, fused_step
+from e2rl.run.fused import fused
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import project
 from e2rl.sim.leaders import Leaders
@@ -151,6 +152,8 @@ class Prior(nn.Module):
         """Planned motion of x0, fields [B, V, HORIZON] or those `steps` of it; cap [B, V]: of the acceleration in the
         executed part."""
         x0, state = apply_cap(cap, x0, context.state)
+        if steps == slice(None) and not context.all_on_lane:
+            return free_space.decode_plans(x0, state, context.routed.points, context.routed.has_lane)
         if steps == slice(None):
             lane = lane_relative.decode_plans(x0, state, context.routed.points)
         else:
@@ -171,11 +174,11 @@ class Prior(nn.Module):
             budget: [B], path KL that control may add to a scene, all vehicles together (None: any). A step that would
                 exceed it takes the fraction of its control that uses the budget up; no later step is controlled.
         """
-        settings, sampler = self.sampler, self.sampler.on(self.schedule)
-        levels = settings.levels(self.schedule, noise.device)
+        settings, levels = self.sampler, self.sampler.levels(self.schedule, noise.device)
         noise = settings.temperature * noise
-        x, past, nominal_past = noise[0], None, None
+        x, past, last = noise[0], None, levels[1]
         kl = log_ratio = torch.zeros(noise.shape[1:3], device=noise.device)
+        any_budget = kl.new_full(kl.shape[:1], torch.inf) if budget is None else budget
         for k in range(settings.steps, 0, -1):
             index = settings.steps - k
             high, low = levels[index], levels[index + 1]
@@ -185,20 +188,13 @@ class Prior(nn.Module):
             else:
                 x, nominal, x0 = control(x, high, k, context, partial(self.denoise, level=high, context=context))
             if k > 1:  # the last step takes x0 itself
-                injected = noise[index + 1]
-                step = partial(sampler.step, x, high=high, low=low, noise=injected)
-                x, variance = step(x0=x0, past=past)
-                if control is not None:  # against what the prior would do from the same visited states
-                    plain = step(x0=nominal, past=nominal_past)[0]
-                    variance = variance * settings.temperature**2
-                    added = path_kl(x - plain, variance)
-                    if budget is not None:
-                        fraction = within_budget(budget, kl, added)[:, None, None]
-                        x, x0 = plain + fraction * (x - plain), nominal + fraction * (x0 - nominal)
-                        added = fraction[..., 0] ** 2 * added
-                    kl = kl + added
-                    log_ratio = log_ratio + added + path_martingale(x - plain, injected, variance, settings.temperature)
-                past, nominal_past = (x0, high), (nominal, high)
+                before, walk = past or (x0, nominal), (last, high, low, noise[index + 1])
+                if control is None:
+                    x = fused_step(settings, SIZE)(x, x0, before[0], *walk)
+                else:
+                    step = fused_controlled_step(settings, SIZE, budget is not None)
+                    x, x0, kl, log_ratio = step(x, x0, nominal, *before, *walk, kl, log_ratio, any_budget)
+                past, last = (x0, nominal), high
             elif budget is not None and control is not None:  # without noise there is no KL to count
                 x0 = torch.where((kl.sum(-1) < BUDGET_SPENT * budget)[:, None, None], x0, nominal)
         return Sample(x0, kl, log_ratio)
@@ -247,21 +243,19 @@ def _leaders_ahead(routed: RoutedScene, s: Tensor, agents: Tensor, present: Tens
     return Leaders(*(old.index_copy(0, rows, now) for old, now in zip(known.followed, new, strict=True)))
 
 
-def within_budget(budget: Tensor, spent: Tensor, added: Tensor) -> Tensor:
-    """Fraction [B] of a step's shift that keeps the path KL within the budget [B]; spent, added [B, V]: path KL so far
-    and of the whole shift. KL grows with the square of the shift."""
-    left = (budget - spent.sum(-1)).clamp(min=0)
-    return (left / added.sum(-1).clamp(min=1e-12)).clamp(max=1.0).sqrt()
-
-
 def plan_to_x(plan: Tensor, state: LaneState, routed: RoutedScene) -> Tensor:
     """The ego's planned states [B, HORIZON, 4] as x [B, SIZE]: on its mission route, or in free space where the ego has
     no lane."""
     ego = state.map(lambda value: value[:, 0])
+    return mission_x(plan, ego, routed.points[:, 0], routed.has_lane[:, :1])
+
+
+@fused("B 50 4", "B", "B P 2!", "B 1:bool")
+def mission_x(plan: Tensor, ego: LaneState, points: Tensor, on_lane: Tensor) -> Tensor:
+    """`plan_to_x` of an ego on a route [B, P, 2], or, where it is not on_lane [B, 1], in free space."""
     before = torch.cat([ego.v[:, None], plan[..., :-1, 3]], 1)
     hint = ego.s[:, None] + ((plan[..., 3] + before) / 2 * DT).cumsum(-1)
-    s, d, _ = project(plan[..., :2], routed.points[:, 0], hint)
-    known = torch.ones_like(s)
-    x = lane_relative.fit(LaneState.from_states(plan, s, d), known, ego)[0]
-    lateral = free_space.fit(plan[..., 2], known, ego, ACCEL_SCALE * x[..., :KNOTS])
-    return torch.where(routed.has_lane[:, :1], x, torch.cat([x[..., :KNOTS], lateral], -1))
+    s, d, _ = project(plan[..., :2], points, hint)
+    x = lane_relative.fit(LaneState.from_states(plan, s, d), None, ego)[0]
+    lateral = free_space.fit(plan[..., 2], torch.ones_like(s), ego, ACCEL_SCALE * x[..., :KNOTS])
+    return torch.where(on_lane, x, torch.cat([x[..., :KNOTS], lateral], -1))

@@ -10,10 +10,12 @@ adversarial intensity.
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
 
+from e2rl.run.fused import Fused
 from e2rl.run.settings import configured, setting
 
 END = 0.24  # noise level of the last of `steps` steps, times steps, where levels are spaced by log(alpha / sigma)
@@ -149,6 +151,64 @@ class SamplerSettings:
     def levels(self, schedule: NoiseSchedule, device: torch.device | None = None) -> Tensor:
         """The noise levels [steps + 1] of a replan."""
         return schedule.levels(self.steps, device, self.spacing)
+
+
+@cache
+def fused_step(settings: SamplerSettings, size: int) -> Fused:
+    """`Sampler.step` of these settings for x [B, V, size]: of x, x0, past x0, the levels past, high and low and noise,
+    to x at level low. In the first step the past is x0 at any other level."""
+    sampler = settings.on(NoiseSchedule())
+
+    def step(x: Tensor, x0: Tensor, past: Tensor, last: Tensor, high: Tensor, low: Tensor, noise: Tensor) -> Tensor:
+        return sampler.step(x, x0, high, low, noise, (past, last))[0]
+
+    each = f"B V {size}"
+    return Fused(step, (each, each, each, "", "", "", each), settings)
+
+
+@cache
+def fused_controlled_step(settings: SamplerSettings, size: int, limited: bool) -> Fused:
+    """A step under control, against what the prior would do from the same visited states; see `Prior.sample`.
+
+    Of x, clean estimates x0 and nominal, those of the past, the levels past, high and low, noise, the KL and log ratio
+    [B, V] so far and the budget [B] to x, x0, KL and log ratio. limited: there is a budget.
+    """
+    sampler, temperature = settings.on(NoiseSchedule()), settings.temperature
+
+    def step(
+        x: Tensor,
+        x0: Tensor,
+        nominal: Tensor,
+        past: Tensor,
+        past_nominal: Tensor,
+        last: Tensor,
+        high: Tensor,
+        low: Tensor,
+        noise: Tensor,
+        kl: Tensor,
+        log_ratio: Tensor,
+        budget: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        moved, variance = sampler.step(x, x0, high, low, noise, (past, last))
+        plain = sampler.step(x, nominal, high, low, noise, (past_nominal, last))[0]
+        variance = variance * temperature**2
+        added = path_kl(moved - plain, variance)
+        if limited:
+            fraction = within_budget(budget, kl, added)[:, None, None]
+            moved, x0 = plain + fraction * (moved - plain), nominal + fraction * (x0 - nominal)
+            added = fraction[..., 0] ** 2 * added
+        martingale = path_martingale(moved - plain, noise, variance, temperature)
+        return moved, x0, kl + added, log_ratio + added + martingale
+
+    each = f"B V {size}"
+    return Fused(step, (*[each] * 5, "", "", "", each, "B V", "B V", "B"), (settings, limited))
+
+
+def within_budget(budget: Tensor, spent: Tensor, added: Tensor) -> Tensor:
+    """Fraction [B] of a step's shift that keeps the path KL within the budget [B]; spent, added [B, V]: path KL so far
+    and of the whole shift. KL grows with the square of the shift."""
+    left = (budget - spent.sum(-1)).clamp(min=0)
+    return (left / added.sum(-1).clamp(min=1e-12)).clamp(max=1.0).sqrt()
 
 
 def path_kl(shift: Tensor, variance: Tensor) -> Tensor:

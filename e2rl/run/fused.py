@@ -20,7 +20,7 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, get_type_hints
@@ -48,11 +48,11 @@ class Fused:
     default). Equal names are equal sizes. The shape of a dataclass or a named tuple is that of all its tensors, or one
     for each. Vectors, of few numbers, are copied component by component, so that loops over rows are contiguous; "!"
     leaves them as they lie, as is better for tables. Where a size is 0, or anything is not as declared, the function
-    runs as it is.
+    runs as it is. settings: on which the function depends besides, which their `repr` tells apart.
     """
 
-    def __init__(self, function: Callable[..., Any], shapes: tuple[Shape, ...]) -> None:
-        self.function, self.shapes = function, shapes
+    def __init__(self, function: Callable[..., Any], shapes: tuple[Shape, ...], settings: object = None) -> None:
+        self.function, self.shapes, self.settings = function, shapes, settings
         self.name = f"{function.__module__}.{function.__qualname__}"
         self.__doc__ = function.__doc__
         FUSED[self.name] = self
@@ -64,24 +64,41 @@ class Fused:
         flat = [tensor for value in given for tensor in _tensors(value)]
         if not self._fits(flat):
             return self.function(*given)
-        found = self._run([given.laid_out(value) for given, value in zip(self.declared, flat, strict=True)])
+        laid = zip(self._apart, flat, strict=True)
+        found = self._run([value.movedim(-1, 0).contiguous() if apart else value.contiguous() for apart, value in laid])
         return found[0] if self.returns is Tensor else self.returns(*found) if _made(self.returns) else tuple(found)
 
     def _fits(self, flat: list[Tensor]) -> bool:
-        size: dict[Any, int] = {}
-        for value, (names, kind, fixed, _) in zip(flat, self.declared, strict=True):
-            if value.dtype != kind or value.is_cuda:
-                return False
-            if fixed is not None:
-                if value.shape != fixed:
+        if [value.dtype for value in flat] != self._types or flat[0].is_cuda:
+            return False
+        if torch.is_grad_enabled() and any(value.requires_grad for value in flat):
+            return False
+        return self._sizes_fit(tuple([value.shape for value in flat]))
+
+    @cached_property
+    def _sizes_fit(self) -> Callable[[tuple[torch.Size, ...]], bool]:
+        """Whether tensors of these shapes have the sizes declared, none of them 0; remembered, as it is asked often."""
+
+        @lru_cache(4096)
+        def fit(shapes: tuple[torch.Size, ...]) -> bool:
+            size: dict[Any, int] = {}
+            for shape, (names, _, _) in zip(shapes, self.declared, strict=True):
+                if len(shape) != len(names):
                     return False
-                continue
-            if value.dim() != len(names):
-                return False
-            for name, length in zip(names, value.shape, strict=True):
-                if length == 0 or length != (name if isinstance(name, int) else size.setdefault(name, length)):
-                    return False
-        return not (torch.is_grad_enabled() and any(value.requires_grad for value in flat))
+                for name, length in zip(names, shape, strict=True):
+                    if length == 0 or length != (name if isinstance(name, int) else size.setdefault(name, length)):
+                        return False
+            return True
+
+        return fit
+
+    @cached_property
+    def _types(self) -> list[torch.dtype]:
+        return [kind for _, kind, _ in self.declared]
+
+    @cached_property
+    def _apart(self) -> list[bool]:
+        return [apart for _, _, apart in self.declared]
 
     @cached_property
     def kinds(self) -> list[Any]:
@@ -102,15 +119,14 @@ class Fused:
             for shape in (given,) * len(_fields(kind)) if isinstance(given, str) else given:
                 sizes, _, name = shape.removesuffix("!").partition(":")
                 names = [int(size) if size.isdigit() else size for size in sizes.split()]
-                fixed = torch.Size(map(int, names)) if all(isinstance(size, int) for size in names) else None
                 apart = len(names) > 1 and isinstance(names[-1], int) and names[-1] <= VECTOR and shape[-1] != "!"
-                found.append(_Declared(names, getattr(torch, name or "float32"), fixed, apart))
+                found.append(_Declared(names, getattr(torch, name or "float32"), apart))
         return found
 
     @cached_property
     def file(self) -> Path:
         """Where the compiled function lies."""
-        mark = hashlib.sha256(repr((machine(), self.shapes)).encode())
+        mark = hashlib.sha256(repr((machine(), self.shapes, self.settings)).encode())
         for module in sorted(_sources(sys.modules[self.function.__module__]), key=lambda module: module.__name__):
             mark.update(Path(str(module.__file__)).read_bytes())
         return cache_folder() / "fused" / f"{self.function.__qualname__}-{mark.hexdigest()[:32]}.so"
@@ -134,7 +150,7 @@ class Fused:
         free = sorted({name for given in self.declared for name in given.sizes if isinstance(name, str)})
         size: dict[Any, int] = dict(zip(free, _primes(), strict=False))
         examples, dynamic = [], []
-        for names, kind, _, apart in self.declared:
+        for names, kind, apart in self.declared:
             names = [names[-1], *names[:-1]] if apart else names
             examples.append(torch.zeros([size.get(name, name) for name in names], dtype=kind))
             dynamic.append({at: torch.export.Dim.DYNAMIC for at, name in enumerate(names) if name in size})
@@ -209,17 +225,11 @@ class _Module(nn.Module):
 
 
 class _Declared(NamedTuple):
-    """A tensor of a fused function: its sizes, its type, its shape where no size varies, and whether vectors come
-    component by component."""
+    """A tensor of a fused function: its sizes, its type, and whether vectors come component by component."""
 
     sizes: list[Any]
     kind: torch.dtype
-    fixed: torch.Size | None
     apart: bool
-
-    def laid_out(self, value: Tensor) -> Tensor:
-        """The tensor as compiled code reads it."""
-        return value.movedim(-1, 0).contiguous() if self.apart else value.contiguous()
 
 
 def _made(kind: Any) -> bool:

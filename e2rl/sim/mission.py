@@ -71,7 +71,7 @@ class Mission(NamedTuple):
 
 def mission_of(scene: TensorDictBase) -> Mission:
     """The ego's mission in scenes [B]: candidate route_log[0] of vehicle 0."""
-    row = torch.arange(scene.batch_size[0], device=scene["route_log"].device)
+    row = torch.arange(len(scene["route_log"]), device=scene["route_log"].device)
     pick = scene["route_log"][:, 0]
 
     def of(key: str) -> Tensor:

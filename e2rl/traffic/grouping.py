@@ -6,10 +6,10 @@ Vehicles and other agents fill their rows from the front, so a group is cropped 
 
 from collections.abc import Callable
 from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.prior.prior import Context
@@ -19,7 +19,7 @@ Value = TypeVar("Value")  # a tensor, a TensorDict, a (nested) dataclass of them
 
 
 def take_rows(value: Value, rows: Tensor) -> Value:
-    """Rows of every tensor; None stays None."""
+    """Rows of every tensor; None stays None. `SceneRows` are not read for it."""
     return map_tensors(lambda tensor: tensor[rows], value)
 
 
@@ -36,7 +36,7 @@ def put_rows(value: Value, rows: Tensor, new: Value) -> Value:
 
 def map_tensors(function: Callable, value: Any, *others: Any) -> Any:
     """Map function over every tensor or TensorDict of a value and its counterparts in others; the rest is kept."""
-    if isinstance(value, Tensor | TensorDictBase):
+    if isinstance(value, Tensor | TensorDictBase | SceneRows):
         return function(value, *others)
     if isinstance(value, tuple):  # a named tuple
         return type(value)(*(map_tensors(function, *part) for part in zip(value, *others, strict=True)))
@@ -72,8 +72,6 @@ SHRUNK = 0.55  # a scene of at most this fraction of the group's largest scene s
 OF_ALL = {"size", "start", "start_accel", "start_yaw_rate", "valid", "agent_type", "parked"}  # keys with all agents
 OF_VEHICLES = {"past", "route_points", "route_length", "route_open", "route_valid", "route_recorded", "route_limit"}
 OF_VEHICLES |= {"route_light", "route_light_s", "route_log"}
-WHOLE = {"field", "field_origin", "light_state", "lane_points", "lane_index", "lane_exits", "lane_left", "lane_right"}
-WHOLE |= {"scene_index"}
 
 
 def no_vehicles() -> Any:
@@ -114,21 +112,39 @@ def group_scenes(world: World) -> list[Group]:
     return groups
 
 
+class SceneRows:
+    """Rows of scenes with the vehicles and others in use, read by key as a TensorDict is.
+
+    A tensor is taken when it is read first: maps are large, and most of them are not read in most replans.
+    """
+
+    def __init__(self, scene: TensorDictBase, group: Group) -> None:
+        self._scene, self._group, self._taken = scene, group, dict[str, Tensor]()
+
+    def __getitem__(self, key: Any) -> Any:
+        """The tensor of a name, or what rows hold, as SceneRows."""
+        if not isinstance(key, str):
+            return SceneRows(self._scene, replace(self._group, rows=self._group.rows[key]))
+        if key not in self._taken:
+            self._taken[key] = self._take(key)
+        return self._taken[key]
+
+    def _take(self, key: str) -> Tensor:
+        rows, vehicles = self._group.rows, self._group.vehicles
+        if key in OF_ALL:
+            width = self._scene["route_log"].shape[1]
+            agents = torch.cat([torch.arange(vehicles), width + torch.arange(self._group.others)])
+            return self._scene[key][rows][:, agents.to(rows.device)]
+        return self._scene[key][rows, :vehicles] if key in OF_VEHICLES else self._scene[key][rows]
+
+
 def crop_world(world: World, group: Group) -> World:
-    """The group's World [G], with the scene keys that planning reads."""
+    """The group's World [G]."""
     width, rows = world.scene["route_log"].shape[1], group.rows
     agents = torch.cat([torch.arange(group.vehicles), width + torch.arange(group.others)]).to(rows.device)
-    scene = {}
-    for key in world.scene.keys():  # noqa: SIM118 - not a dict
-        if key in OF_ALL:
-            scene[key] = world.scene[key][rows][:, agents]
-        elif key in OF_VEHICLES:
-            scene[key] = world.scene[key][rows, : group.vehicles]
-        elif key in WHOLE:
-            scene[key] = world.scene[key][rows]
     states, valid, accel = (getattr(world, name)[rows][:, agents] for name in ("states", "valid", "accel"))
-    cropped = TensorDict(scene, batch_size=[len(rows)])
-    return World(cropped, world.step[rows], states, valid, accel, world.turn_rate[rows][:, agents])
+    scene = cast(TensorDictBase, SceneRows(world.scene, group))
+    return World(scene, world.step[rows], states, valid, accel, world.turn_rate[rows][:, agents])
 
 
 def crop_state(value: Any, group: Group, width: int, axes: int | None = 1) -> Any:

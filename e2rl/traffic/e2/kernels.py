@@ -123,7 +123,7 @@ def sideways(anchor: Anchor, world: World, lane: LaneState, route: Tensor, off_l
     xy, heading, _ = interpolate(path, start + travelled)
     s, d, _ = project(xy, points, now.s[..., None] + travelled)
     track = LaneState.from_states(torch.cat([xy, heading[..., None], speed[..., None]], -1), s, d)
-    x = lane_relative.fit(track, torch.ones_like(speed), now)[0]
+    x = lane_relative.fit(track, None, now)[0]
     variance = torch.tensor(SPREAD[KNOTS:], device=x.device).square()
     nats = (x[..., KNOTS:].square() / (2 * variance)).sum(-1)
     return torch.zeros_like(lane.s).index_put(at, nats)

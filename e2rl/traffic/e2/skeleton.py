@@ -90,7 +90,7 @@ def _on_ego_lanes(states: Tensor, asked: Tensor, scene: TensorDictBase) -> Tenso
     or on a successor of these (maps cut lanes). Only scenes with any `asked` [B, K] are looked at: maps are large.
     """
     rows = asked.any(1).nonzero()[:, 0]
-    scene = scene.select("lane_points", "lane_index", "lane_left", "lane_right", "lane_exits")[rows]
+    scene = scene[rows]
     lanes = lane_of(states[rows], scene)
     lane, ego_lane = lanes[:, 1:], lanes[:, 0]
     known = ego_lane.clamp(min=0)[:, None]
