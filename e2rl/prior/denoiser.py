@@ -188,4 +188,4 @@ def fused_estimate(settings: DenoiserSettings) -> Fused:
 
     scene = [f"B V {settings.width}", f"B V V {settings.pair}", *[f"B {settings.heads} V V"] * settings.blocks]
     scene += [f"B V {6 * settings.width}"] * settings.blocks
-    return Fused(denoise, (f"B V {SIZE}", "1 V", *scene, *sizes))
+    return Fused(denoise, (f"B V {SIZE}", "1 V", *scene, *sizes), constants=len(sizes))

@@ -48,11 +48,14 @@ class Fused:
     default). Equal names are equal sizes. The shape of a dataclass or a named tuple is that of all its tensors, or one
     for each. Vectors, of few numbers, are copied component by component, so that loops over rows are contiguous; "!"
     leaves them as they lie, as is better for tables. Where a size is 0, or anything is not as declared, the function
-    runs as it is. settings: on which the function depends besides, which their `repr` tells apart.
+    runs as it is. settings: on which the function depends besides, which their `repr` tells apart; constants: so many
+    tensors at the end, such as weights, are always as declared, and not looked at.
     """
 
-    def __init__(self, function: Callable[..., Any], shapes: tuple[Shape, ...], settings: object = None) -> None:
-        self.function, self.shapes, self.settings = function, shapes, settings
+    def __init__(
+        self, function: Callable[..., Any], shapes: tuple[Shape, ...], settings: object = None, constants: int = 0
+    ) -> None:
+        self.function, self.shapes, self.settings, self.constants = function, shapes, settings, constants
         self.name = f"{function.__module__}.{function.__qualname__}"
         self.__doc__ = function.__doc__
         FUSED[self.name] = self
@@ -62,14 +65,16 @@ class Fused:
         if not is_on():
             return self.function(*given)
         flat = [tensor for value in given for tensor in _tensors(value)]
-        if not self._fits(flat):
+        varied = len(flat) - self.constants
+        if not self._fits(flat[:varied]):
             return self.function(*given)
-        laid = zip(self._apart, flat, strict=True)
-        found = self._run([value.movedim(-1, 0).contiguous() if apart else value.contiguous() for apart, value in laid])
+        laid = zip(self._apart, flat[:varied], strict=False)
+        read = [value.movedim(-1, 0).contiguous() if apart else value.contiguous() for apart, value in laid]
+        found = self._run([*read, *flat[varied:]])
         return found[0] if self.returns is Tensor else self.returns(*found) if _made(self.returns) else tuple(found)
 
     def _fits(self, flat: list[Tensor]) -> bool:
-        if [value.dtype for value in flat] != self._types or flat[0].is_cuda:
+        if [value.dtype for value in flat] != self._types[: len(flat)] or flat[0].is_cuda:
             return False
         if torch.is_grad_enabled() and any(value.requires_grad for value in flat):
             return False
@@ -82,7 +87,7 @@ class Fused:
         @lru_cache(4096)
         def fit(shapes: tuple[torch.Size, ...]) -> bool:
             size: dict[Any, int] = {}
-            for shape, (names, _, _) in zip(shapes, self.declared, strict=True):
+            for shape, (names, _, _) in zip(shapes, self.declared, strict=False):
                 if len(shape) != len(names):
                     return False
                 for name, length in zip(names, shape, strict=True):

@@ -9,6 +9,8 @@ from matplotlib.path import Path
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from e2rl.run.fused import fused
+
 CELL = 1.0  # m
 MARGIN = 1.0  # m beyond half the lane width that still counts as on the road
 FAR = 10.0  # m, the field's largest value
@@ -97,20 +99,22 @@ def off_road(points: Tensor, field: Tensor, origin: Tensor, row: Tensor | None =
     between cell centres, FAR outside the grid. row [B] int64: which rows of larger field and origin the points are on;
     default: each its own. Differentiable in the points; the cost does not depend on them.
     """
-    batch, cells = len(points), field.shape[-1]
-    origin = origin if row is None else origin[row]
-    cell = (points - origin.view(batch, *[1] * (points.ndim - 2), 2)) / CELL
+    row = torch.arange(len(points), device=points.device) if row is None else row
+    return off_road_rows(points.flatten(1, -2), field, origin, row).view(points.shape[:-1])
+
+
+@fused("R K 2", "F G G:float16", "F 2", "R:int64")
+def off_road_rows(points: Tensor, field: Tensor, origin: Tensor, row: Tensor) -> Tensor:
+    """`off_road` [R, K] of points [R, K, 2] on fields row [R]."""
+    cells = field.shape[-1]
+    cell = (points - origin[row][:, None]) / CELL
     outside = ((cell < 0) | (cell > cells - 1)).any(-1)
     low = cell.detach().floor().clamp(0, cells - 2)
     share = (cell - low).clamp(0, 1)
-    index = (low[..., 0] * cells + low[..., 1]).long()
+    index = (low[..., 0] * cells + low[..., 1]).long() + row[:, None] * cells**2
     four = index[..., None] + torch.arange(2, device=index.device) * cells  # rows x and x + 1 of the cell
     four = four[..., None] + torch.arange(2, device=index.device)
-    if row is None:
-        value = field.flatten(1).gather(1, four.view(batch, -1))
-    else:  # without a copy of the fields
-        value = field.flatten().take(four.view(batch, -1) + row[:, None] * cells**2)
-    value = value.view(four.shape).to(points.dtype)
+    value = field.flatten()[four].to(points.dtype)
     sx, sy = share[..., 0], share[..., 1:]
     value = (1 - sy) * value[..., 0] + sy * value[..., 1]
     return ((1 - sx) * value[..., 0] + sx * value[..., 1]).masked_fill(outside, FAR)

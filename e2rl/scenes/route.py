@@ -59,10 +59,12 @@ def project(
 
     hint, window: see `nearest_vertex`. Leading dims broadcast. Beyond the ends the route goes on straight.
     """
-    if is_on() and window == WINDOW and points.shape[:-2] == route.shape[:-2]:
-        rows, route = points.flatten(0, -3), route.flatten(0, -3)
-        found = project_rows(rows, route) if hint is None else project_near(rows, route, hint.flatten(0, -2))
-        return tuple(value.view(points.shape[:-1]) for value in found)
+    lead = route.shape[:-2]
+    if is_on() and window == WINDOW and torch.broadcast_shapes(points.shape[:-2], lead) == lead:
+        rows, route = points.expand(*lead, *points.shape[-2:]).flatten(0, -3), route.flatten(0, -3)
+        near = None if hint is None else hint.expand(*lead, rows.shape[1]).flatten(0, -2)
+        found = project_rows(rows, route) if near is None else project_near(rows, route, near)
+        return tuple(value.view(*lead, points.shape[-2]) for value in found)
     return _project(points, route, hint, window)
 
 

@@ -7,16 +7,21 @@ from tqdm import tqdm
 
 from e2rl.metrics import preventable
 from e2rl.planners import lane_graph_planner
-from e2rl.prior import bounds, features, lane_relative
+from e2rl.prior import bounds, features, free_space, lane_relative, prior
 from e2rl.prior.denoiser import DenoiserSettings, fused_estimate
+from e2rl.prior.lane_relative import SIZE
+from e2rl.prior.sde import SamplerSettings, fused_controlled_step, fused_step
 from e2rl.run.errors import InputError
 from e2rl.run.fused import FUSED, Fused, check_compiler, has_compiler, switch
 from e2rl.run.processes import cores, in_processes
-from e2rl.scenes import route
+from e2rl.scenes import drivable_area, route
 from e2rl.sim import leaders
-from e2rl.traffic.e2 import foresight, interception
+from e2rl.traffic.e2 import anchoring, foresight, interception, kernels
 
-MODULES = bounds, features, foresight, interception, lane_graph_planner, lane_relative, leaders, preventable, route
+MODULES = (
+    *(anchoring, bounds, drivable_area, features, foresight, free_space, interception, kernels, lane_graph_planner),
+    *(lane_relative, leaders, preventable, prior, route),
+)
 
 
 def prepare_fused(config: DictConfig) -> None:
@@ -30,7 +35,9 @@ def prepare_fused(config: DictConfig) -> None:
         raise InputError(f"compile={asked}: choose one of auto, true, false")
     names = {module.__name__ for module in MODULES}
     found = [each for each in FUSED.values() if each.function.__module__ in names]
-    missing = [each for each in (*found, fused_estimate(DenoiserSettings())) if not each.file.exists()]
+    sampler = SamplerSettings()
+    found += fused_estimate(DenoiserSettings()), fused_step(sampler, SIZE), fused_controlled_step(sampler, SIZE, False)
+    missing = [each for each in found if not each.file.exists()]
     on = asked is not False and config.device == "cpu"
     if on and missing and asked == "auto":
         on = False

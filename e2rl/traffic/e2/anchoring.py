@@ -13,6 +13,7 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS, KNOTS, LaneState, lateral_horizon, speeds
 from e2rl.prior.routes import take_route
+from e2rl.run.fused import fused
 from e2rl.run.settings import check_range, configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING, interpolate, project
@@ -148,14 +149,14 @@ def _along(candidates: _Candidates, path: Tensor, size: Tensor) -> _Target:
     return _Target(s, d, slack, crossing_time, touch[..., 1])
 
 
-def _knots(candidates: _Candidates, accel: Tensor, settings: AnchorSettings) -> Tensor:
+def _knots(candidates: _Candidates, accel: Tensor, limits: Tensor) -> Tensor:
     """Knots [B, M, R, A, 10] that hold accelerations accel [B, M, R, A] but for standstill, top speed and bends: the
     bound depends on the distance, which depends on speed, so three fixed-point steps from the free motion."""
     time = DT * torch.arange(HORIZON + EXTRA + 1, device=accel.device)
     v0 = candidates.speed[..., None, None, None]
     free = v0 + accel[..., None] * time
     free = torch.minimum(free.clamp(min=0), v0.clamp(min=TOP_SPEED))
-    braking = (v0 + settings.min_accel * time).clamp(min=0)  # nobody loses speed faster, bend or not
+    braking = (v0 + limits[0] * time).clamp(min=0)  # nobody loses speed faster, bend or not
     speed = free
     for _ in range(3):
         travelled = torch.nn.functional.pad(((speed[..., 1:] + speed[..., :-1]) / 2 * DT).cumsum(-1), (1, 0))
@@ -166,7 +167,7 @@ def _knots(candidates: _Candidates, accel: Tensor, settings: AnchorSettings) -> 
         speed = torch.maximum(torch.minimum(free, bound.clamp(min=0).sqrt()), braking)
     knot = KNOT_STEPS * torch.arange(1, KNOTS + 1, device=accel.device)
     slope = (speed[..., knot + EXTRA] - speed[..., knot - EXTRA]) / (2 * EXTRA * DT)
-    return slope.clamp(settings.min_accel, settings.max_accel)
+    return slope.clamp(limits[0], limits[1])
 
 
 def _decode(candidates: _Candidates, knots: Tensor) -> tuple[Tensor, Tensor]:
@@ -176,14 +177,21 @@ def _decode(candidates: _Candidates, knots: Tensor) -> tuple[Tensor, Tensor]:
     return speeds(LaneState(zero, zero, zero, zero, v, a, zero, zero, zero, zero), knots)
 
 
-def _score(
-    candidates: _Candidates, accel: Tensor, target: _Target, settings: AnchorSettings
+@fused(
+    ("B M R:int64", "B M R P 2!", "B M R:bool", *["B M R"] * 3, f"B M R {BEND_VERTICES}", "B M", "B M", "B M 2"),
+    "B M R A",
+    (*[f"B M R {HORIZON}"] * 4, "B M"),
+    "2",
+)
+def scored(
+    candidates: _Candidates, accel: Tensor, target: _Target, limits: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Cost and time gap [s] (both [B, M, R, A]) and knots [B, M, R, A, 10] of accelerations accel [B, M, R, A].
+    """Cost and time gap [s] (both [B, M, R, A]) and knots [B, M, R, A, 10] of accelerations accel [B, M, R, A] within
+    limits [2].
 
     Time gap: distance to the target over speed, least over the steps at which the target is on the candidate.
     """
-    knots = _knots(candidates, accel, settings)
+    knots = _knots(candidates, accel, limits)
     v, travelled = _decode(candidates, knots)
     offset = candidates.d[..., None, None] * remaining_offset(travelled, candidates.speed[..., None, None, None])
     lateral = (target.d[..., None, :] - offset).abs()
@@ -202,10 +210,11 @@ def _on_lane(
     """The proposal of least cost on the candidates: candidate [B, M], knots [B, M, 10], cost [B, M] (inf for none)."""
     target = _along(candidates, path, size)
     low, high = settings.min_accel, settings.max_accel
+    limits = path.new_tensor((low, high))
     grid = torch.linspace(low, high, COARSE, device=path.device).expand(*candidates.s.shape, COARSE)
-    best = _score(candidates, grid, target, settings)[0].argmin(-1, keepdim=True)  # per candidate
+    best = scored(candidates, grid, target, limits)[0].argmin(-1, keepdim=True)  # per candidate
     fine = grid.gather(-1, best) + (high - low) / (COARSE - 1) * torch.linspace(-1, 1, FINE, device=path.device)
-    cost, time_gap, knots = _score(candidates, fine.clamp(low, high), target, settings)
+    cost, time_gap, knots = scored(candidates, fine.clamp(low, high), target, limits)
     pick = cost.flatten(2).argmin(-1)
     cost, time_gap, knots = (take_route(value.flatten(2, 3), pick) for value in (cost, time_gap, knots))
     return pick // FINE, knots, cost.masked_fill(time_gap > MAX_OFFSET, torch.inf)

@@ -16,6 +16,7 @@ from torch import Tensor
 from e2rl.prior import lane_relative
 from e2rl.prior.lane_relative import BEND_SCALE, HORIZON, KNOTS, OFFSET_SCALE, SIZE, LaneState
 from e2rl.prior.sde import NoiseSchedule
+from e2rl.run.fused import fused
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.lane_graph import against_lanes
@@ -116,17 +117,22 @@ def sideways(anchor: Anchor, world: World, lane: LaneState, route: Tensor, off_l
     """
     at = off_lane.nonzero(as_tuple=True)
     points, path = world.scene["route_points"][(*at, route.clamp(min=0)[at])], anchor.off_lane_path[at]
-    old = lane.map(lambda value: value[at])
-    now = lane_relative.locate(world.states[at], old.a, old.kappa * old.v, points)
-    speed, travelled = lane_relative.speeds(now, anchor.knots[at])
-    start = project(world.states[at][:, None, :2], path)[0]
+    nats = lateral_nats(world.states[at], lane.map(lambda value: value[at]), points, path, anchor.knots[at])
+    return torch.zeros_like(lane.s).index_put(at, nats)
+
+
+@fused("Q 4", "Q", "Q P 2!", "Q P 2!", f"Q {KNOTS}")
+def lateral_nats(states: Tensor, lane: LaneState, points: Tensor, path: Tensor, knots: Tensor) -> Tensor:
+    """`sideways` [Q] of vehicles that leave lanes points [Q, P, 2] for a path [Q, P, 2]."""
+    now = lane_relative.locate(states, lane.a, lane.kappa * lane.v, points)
+    speed, travelled = lane_relative.speeds(now, knots)
+    start = project(states[:, None, :2], path)[0]
     xy, heading, _ = interpolate(path, start + travelled)
     s, d, _ = project(xy, points, now.s[..., None] + travelled)
     track = LaneState.from_states(torch.cat([xy, heading[..., None], speed[..., None]], -1), s, d)
     x = lane_relative.fit(track, None, now)[0]
     variance = torch.tensor(SPREAD[KNOTS:], device=x.device).square()
-    nats = (x[..., KNOTS:].square() / (2 * variance)).sum(-1)
-    return torch.zeros_like(lane.s).index_put(at, nats)
+    return (x[..., KNOTS:].square() / (2 * variance)).sum(-1)
 
 
 @dataclass(frozen=True)
