@@ -25,7 +25,7 @@ def searched_rollouts(bench: Bench) -> Iterator[Row]:
     count = len(tries)
 
     def plain() -> None:
-        for _, (_, method, tasks) in batches(setup, plan, 0, only, tries, 0):
+        for _, method, tasks in batches(setup, plan, 0, only, tries):
             setup.score(method, tasks, None)
 
     spent = bench.both(lambda: searched(setup, plan, only))[1], bench.both(plain)[1], talk
@@ -53,5 +53,5 @@ def searched(setup: Setup, plan: Plan, only: range) -> tuple[list[Try], float]:
             super().tell(*told)
             talked += time.process_time() - begun
 
-    spend(setup, replace(plan, search=Timed), 0, only, TRIES, "tries")
+    spend([(setup, replace(plan, search=Timed), 0, only, TRIES, "tries")])
     return tries, talked

@@ -4,7 +4,7 @@ Every method is tried again and again, with other noise; the method `search` spe
 families. What they find is told at several budgets by `report.budget`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from e2rl.evaluation.methods import as_list, build_traffic, config_and_prior, is_search, method_config, rows_of
-from e2rl.evaluation.protocol import HERE, Job, Method, Scored, Setup, Task, Work, extend, in_batches, score_all
+from e2rl.evaluation.protocol import HERE, Method, Part, Scored, Setup, Task, Work, extend, in_batches, score_all
 from e2rl.metrics.atlas import cell_of
 from e2rl.metrics.margin import FARTHEST
 from e2rl.prior.prior import Prior
@@ -112,20 +112,43 @@ def search_all(
                 f"{plan.name}: tries of {', '.join(sorted(free))} evaluate no network; give the budget in tries, "
                 "budget_unit=tries"
             )
-    for number, (setup, plan, seed) in enumerate((a, b, c) for a in setups for b in plans for c in seeds):
-        own = replace(work, parts=replace(work.parts, stage=f"{work.parts.stage}search-{number:03}"))
-        scored, tries = spend(setup, plan, seed, work.scenes(setup), budget, unit, own)
+    asked = [
+        (setup, plan, seed, work.scenes(setup), budget, unit) for setup in setups for plan in plans for seed in seeds
+    ]
+    for scored, tries in spend(asked, work):
         extend(found, scored)
         told += tries
     return found, told
 
 
-def spend(
-    setup: Setup, plan: Plan, seed: int, scenes: Sequence[int], budget: float, unit: str, work: Work = HERE
-) -> tuple[Scored, list[dict]]:
-    """What one search finds, and its tries in their order: round by round, the scenes of a round in an order of its
-    own, so that a budget that ends within a round is spent on scenes at random. A try that errors counts as one that
-    comes nowhere near, and costs what the last one of its family did, or is said to."""
+def spend(searches: Sequence[tuple], work: Work = HERE) -> list[tuple[Scored, list[dict]]]:
+    """What each of some searches finds, and its tries; each: the arguments of `spending`. Their rounds are driven
+    together, so that none waits for another."""
+    all_spent: list[tuple[Scored, list[dict]]] = [(([], [], []), []) for _ in searches]
+    begun = {number: spending(*given) for number, given in enumerate(searches)}
+    rounds = {number: next(each) for number, each in begun.items()}
+    while rounds:
+        jobs = [(f"search-{number:03}/tries-{job:06}", part) for number, jobs in rounds.items() for job, part in jobs]
+        scored, after = score_all(jobs, work, lambda job: len(job[1][2])), {}
+        for number, asked in rounds.items():
+            found: Scored = ([], [], [])
+            for _ in asked:
+                extend(found, next(scored))
+            try:
+                after[number] = begun[number].send(found)
+            except StopIteration as end:
+                all_spent[number] = end.value
+        rounds = after
+    return all_spent
+
+
+def spending(
+    setup: Setup, plan: Plan, seed: int, scenes: Sequence[int], budget: float, unit: str
+) -> Generator[list[tuple[int, Part]], Scored, tuple[Scored, list[dict]]]:
+    """One search: yields the numbered parts of each round, is sent what they scored, and returns what it found, and its
+    tries in their order: round by round, the scenes of a round in an order of its own, so that a budget that ends
+    within a round is spent on scenes at random. A try that errors counts as one that comes nowhere near, and costs what
+    the last one of its family did, or is said to."""
     search, told = plan.begin(setup, seed, scenes), list[dict]()
     found: Scored = ([], [], [])
     cost = {family.name: (family.nfe, 0.0) for family in plan.families}  # of a try: NFE, seconds
@@ -135,8 +158,7 @@ def spend(
         while spent[unit] < budget * (1 - 1e-9):
             order = torch.randperm(len(scenes), generator=generator).tolist()
             tries = sorted(search.ask(), key=lambda one: order[one.scene])
-            jobs = batches(setup, plan, seed, scenes, tries, sum(map(len, search.tries)))
-            scored = score_all(jobs, "tries", work, lambda job: len(job[1][2]))
+            scored = yield list(enumerate(batches(setup, plan, seed, scenes, tries), sum(map(len, search.tries))))
             extend(found, scored)
             known = {(row["scene_id"], row["seed"]): row for row in scored[0]}
             rows = [known.get((setup.scenes.scene_id[scenes[one.scene]], row_seed(seed, one))) for one in tries]
@@ -159,17 +181,17 @@ def spend(
     return found, told
 
 
-def batches(setup: Setup, plan: Plan, seed: int, scenes: Sequence[int], tries: Sequence[Try], first: int) -> list[Job]:
-    """Jobs of tries, numbered from `first` on: of one traffic method each, those of a scene together."""
+def batches(setup: Setup, plan: Plan, seed: int, scenes: Sequence[int], tries: Sequence[Try]) -> list[Part]:
+    """Parts of tries: of one traffic method each, those of a scene together."""
     by_method: dict[int, list] = {}
     for one in sorted(tries, key=lambda one: (one.scene, one.number)):
         tasks = by_method.setdefault(id(plan.traffic[one.family]), [])  # of one traffic method
         tasks.append(Task(scenes[one.scene], row_seed(seed, one), one))
-    jobs = []
+    parts = []
     for tasks in by_method.values():
         method = replace(plan.traffic[tasks[0].one.family], name=plan.name)
-        jobs += [(setup, method, batch) for batch in in_batches(tasks, setup.batch)]
-    return list(enumerate(jobs, first))
+        parts += [(setup, method, batch) for batch in in_batches(tasks, setup.batch)]
+    return parts
 
 
 def row_seed(seed: int, one: Try) -> int:

@@ -1,7 +1,7 @@
 """The closed-loop protocol: methods x scenes x seeds with one ego, the files of a run (docs/method.md, section 11)."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -119,7 +119,8 @@ def check_names(*names: str) -> None:
         raise InputError(f"the name {odd!r}: holds control characters; rename it in the data or the configuration")
 
 
-Job = tuple[int, tuple[Setup, Method, list[Task]]]  # with its number
+Part = tuple[Setup, Method, list[Task]]
+Job = tuple[str, Part]  # with its name
 
 
 def scene_seed(number: int, seed: int) -> int:
@@ -176,8 +177,9 @@ def drive_all(setups: Sequence[Setup], methods: Sequence[Method], seeds: Sequenc
     """
     first = setups[0]
     batches = in_batches([Task(scene, seed) for seed in seeds for scene in work.scenes(first)], first.batch)
-    jobs = list(enumerate((setup, method, batch) for setup in setups for method in methods for batch in batches))
-    jobs = jobs[work.shard[0] :: work.shard[1]]
+    parts = enumerate((setup, method, batch) for setup in setups for method in methods for batch in batches)
+    jobs = [(f"rollouts-{number:06}", part) for number, part in parts][work.shard[0] :: work.shard[1]]
+    found: Scored = ([], [], [])
     total = sum(len(batch) for _, (_, _, batch) in jobs)
     with tqdm(total=total, desc="rollouts", unit="rollout", disable=None) as bar:
 
@@ -186,7 +188,9 @@ def drive_all(setups: Sequence[Setup], methods: Sequence[Method], seeds: Sequenc
             bar.set_postfix(ego=setup.ego_name, method=method.name, eta=method.eta, refresh=False)
             bar.update(len(batch))
 
-        return score_all(jobs, "rollouts", work, lambda job: job[1][1].eta, done)
+        for scored in score_all(jobs, work, lambda job: job[1][1].eta, done):
+            extend(found, scored)
+    return found
 
 
 def in_batches(tasks: Sequence[Task], size: int) -> list[list[Task]]:
@@ -196,19 +200,15 @@ def in_batches(tasks: Sequence[Task], size: int) -> list[list[Task]]:
 
 
 def score_all(
-    jobs: Sequence[Job],
-    prefix: str,
-    how: Work,
-    cost: Callable[[Job], float],
-    done: Callable[[Job], None] = lambda job: None,
-) -> Scored:
-    """What batches of rollouts score, in their order.
+    jobs: Sequence[Job], how: Work, cost: Callable[[Job], float], done: Callable[[Job], None] = lambda job: None
+) -> Iterator[Scored]:
+    """What each of some batches of rollouts scores, in their order.
 
     A batch is the unit that is checkpointed: rounding makes a rollout's last digits depend on the others of its batch.
     Raises InputError where files of a worker do not arrive.
 
     Args:
-        prefix: of the names of their parts.
+        jobs: with names for their parts.
         how: of the work, `only` and `shard` are in the jobs.
         cost: by which a job takes longer than others.
         done: called with each job that is done.
@@ -217,19 +217,16 @@ def score_all(
     into, parts = how.into, how.parts  # what goes to the workers
 
     def work(job: Job) -> Scored:
-        number, (setup, method, batch) = job
+        name, (setup, method, batch) = job
         told = [(task.scene, task.seed) if task.one is None else list(task.one) for task in batch]
         identity = [setup.ego_name, method.name, float(method.eta), told]
-        compute = partial(setup.score, method, batch, into)
-        return parts.result(f"{prefix}-{number:06}", identity, compute, partial(has_files, into))
+        return parts.result(name, identity, partial(setup.score, method, batch, into), partial(has_files, into))
 
-    found: Scored = ([], [], [])
     for scored in in_processes(work, jobs, how.processes, cost, done):
         if not has_files(into, scored):
             reason = "rollouts that a worker wrote are not here"
             raise InputError(f"{into}: {reason}; put the run's folder where all machines have it (hydra.run.dir)")
-        extend(found, scored)
-    return found
+        yield scored
 
 
 def extend(found: Scored, more: Scored) -> None:

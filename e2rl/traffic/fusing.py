@@ -16,11 +16,11 @@ from e2rl.run.fused import FUSED, Fused, check_compiler, has_compiler, switch
 from e2rl.run.processes import cores, in_processes
 from e2rl.scenes import drivable_area, route
 from e2rl.sim import leaders
-from e2rl.traffic.e2 import anchoring, foresight, interception, kernels
+from e2rl.traffic.e2 import anchoring, control, foresight, interception, kernels
 
 MODULES = (
-    *(anchoring, bounds, drivable_area, features, foresight, free_space, interception, kernels, lane_graph_planner),
-    *(lane_relative, leaders, preventable, prior, route),
+    *(anchoring, bounds, control, drivable_area, features, foresight, free_space, interception, kernels),
+    *(lane_graph_planner, lane_relative, leaders, preventable, prior, route),
 )
 
 

@@ -43,7 +43,7 @@ def plan():
 
 def found(setup, plan, processes=1, parts=NO_PARTS, tries=4.0, unit="tries"):
     work = Work(processes=processes, parts=parts)
-    (rows, samples, errored), told = spend(setup, plan, 3, range(3), tries, unit, work)
+    (((rows, samples, errored), told),) = spend([(setup, plan, 3, range(3), tries, unit)], work)
     assert len(rows) == len(samples) == len(told) and not errored
     return told
 
@@ -62,7 +62,9 @@ def test_a_budget_of_tries_is_spent_and_hardly_exceeded(setup, plan):
 
 
 def test_a_budget_that_ends_within_a_round_goes_to_scenes_at_random(setup, plan):
-    firsts = {spend(setup, plan, seed, range(3), 0.3, "tries")[1][0]["scene_id"] for seed in range(4)}
+    firsts = {
+        told[0]["scene_id"] for _, told in spend([(setup, plan, seed, range(3), 0.3, "tries") for seed in range(4)])
+    }
     assert len(firsts) > 1
 
 
@@ -127,7 +129,7 @@ def test_tries_that_error_cost_what_they_are_said_to_cost(setup):
     broken = Method("broken", Broken(), 0.0)
     plan = Plan("search", [Family("broken", "broken", {}, nfe=100.0)], {"broken": broken}, SearchSettings())
     for budget, unit, tries in ((400.0, "nfe", 4), (3.0, "tries", 3), (1.0, "seconds", 1)):
-        (rows, _, errored), told = spend(setup, plan, 0, range(3), budget, unit)
+        (((rows, _, errored), told),) = spend([(setup, plan, 0, range(3), budget, unit)])
         assert not rows and not told and len(errored) == 3 * tries
 
 

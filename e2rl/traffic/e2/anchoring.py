@@ -183,9 +183,7 @@ def _decode(candidates: _Candidates, knots: Tensor) -> tuple[Tensor, Tensor]:
     (*[f"B M R {HORIZON}"] * 4, "B M"),
     "2",
 )
-def scored(
-    candidates: _Candidates, accel: Tensor, target: _Target, limits: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def scored(candidates: _Candidates, accel: Tensor, target: _Target, limits: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Cost and time gap [s] (both [B, M, R, A]) and knots [B, M, R, A, 10] of accelerations accel [B, M, R, A] within
     limits [2].
 

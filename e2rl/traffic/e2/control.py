@@ -19,6 +19,7 @@ from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS, SIZE
 from e2rl.prior.prior import Context, Prior
 from e2rl.prior.sde import NoiseSchedule
 from e2rl.run.errors import InputError
+from e2rl.run.fused import fused
 from e2rl.run.settings import configured, setting
 from e2rl.traffic.e2.anchoring import Anchor
 from e2rl.traffic.e2.kernels import pulled
@@ -78,11 +79,17 @@ class Pull:
     vehicles: Tensor
     strength: Tensor
 
-    def __call__(self, x0: Tensor, level: Tensor, schedule: NoiseSchedule) -> Tensor:
+    def __call__(self, x0: Tensor, level: Tensor) -> Tensor:
         """x0 [B, V, SIZE] after the pull at a noise level; where a goal is NaN nothing pulls."""
-        goal = torch.where(self.goal.isnan(), x0, self.goal)
-        moved = pulled(x0, goal, self.strength[:, None, None], level, schedule)
-        return torch.where(self.vehicles[..., None], moved, x0)
+        return pull_to(x0, self.goal, self.vehicles, self.strength, level)
+
+
+@fused(f"B V {SIZE}", f"B V {SIZE}", "B V:bool", "B", "")
+def pull_to(x0: Tensor, goal: Tensor, vehicles: Tensor, strength: Tensor, level: Tensor) -> Tensor:
+    """`Pull` of x0 at a noise level."""
+    goal = torch.where(goal.isnan(), x0, goal)
+    moved = pulled(x0, goal, strength[:, None, None], level, NoiseSchedule())
+    return torch.where(vehicles[..., None], moved, x0)
 
 
 @dataclass
@@ -129,13 +136,15 @@ class SparseControl:
         x0, adversarial, feasibility = self._gradients(x, level, k, context, denoise)
         if k == 1:
             return x, x0, self._driven(x0)
-        weight = gradient_weight(self.prior.schedule, level, settings.scaling)
-        adversarial = clip_rows(weight * adversarial, settings.adversarial_clip)
-        feasibility = clip_rows(settings.feasibility * weight * feasibility, settings.feasibility_clip)
-        shift = self.eta[:, None, None] * adversarial * self.coalition[..., None]
-        moved = x0 - shift - feasibility * context.active[..., None]
+        weight, moved = gradient_weight(self.prior.schedule, level, settings.scaling), x0
+        if self.has_coalition:
+            adversarial = clip_rows(weight * adversarial, settings.adversarial_clip)
+            moved = moved - self.eta[:, None, None] * adversarial * self.coalition[..., None]
+        if 1 < k <= self.feasibility_step:
+            feasibility = clip_rows(settings.feasibility * weight * feasibility, settings.feasibility_clip)
+            moved = moved - feasibility * context.active[..., None]
         for pull in self.pulls:
-            moved = pull(moved, level, self.prior.schedule)
+            moved = pull(moved, level)
         controlled = (context.active & (self.eta > 0)[:, None])[..., None]
         return x, x0, torch.where(controlled, moved, x0)
 
