@@ -84,9 +84,9 @@ def portfolio_plan(name: str, config: DictConfig, method: Callable[[str, DictCon
     if not named:
         raise InputError("search.families: name at least one, such as +search.families.rule={}")
     families = [family_of(str(key), value, "search.families") for key, value in named.items()]
-    traffic = {}
+    traffic, methods = {}, {name: method_config(config, name) for name in {each.method for each in families}}
     for each in families:
-        where, own = f"search.families.{each.name}.changes", method_config(config, each.method)
+        where, own = f"search.families.{each.name}.changes", methods[each.method]
         traffic[each.name] = method(each.method, with_changes(own, each.changes, where, "synthesizer"))
         if each.ranges and not traffic[each.name].traffic.follows_decisions:
             decision = next(iter(each.ranges))

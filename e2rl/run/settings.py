@@ -79,12 +79,18 @@ def file_values(file: str, part: str = "") -> dict[str, Any]:
 
 @cache
 def _plain(file: str, part: str) -> dict[str, Any]:
+    own = _loaded(file)
+    plain = OmegaConf.to_container(OmegaConf.select(own, part) if part else own, resolve=True)
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
+
+
+@cache
+def _loaded(file: str) -> Any:
     root = OmegaConf.load(conf_folder() / "train.yaml")  # what the file's ${...} may refer to
     OmegaConf.update(root, "sim", OmegaConf.load(conf_folder() / "sim" / "default.yaml"))
     OmegaConf.update(root, "own", OmegaConf.load(conf_folder() / f"{file}.yaml"))
-    plain = OmegaConf.to_container(OmegaConf.select(root, f"own.{part}" if part else "own"), resolve=True)
-    assert isinstance(plain, dict)
-    return {str(key): value for key, value in plain.items()}
+    return root.own
 
 
 def settings_of(kind: type[Settings], values: Mapping, where: str = "") -> Settings:
