@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from e2rl.run.errors import InputError
 from e2rl.run.settings import configured, setting
 from e2rl.scenes import boxes
-from e2rl.scenes.drivable_area import drivable_field
+from e2rl.scenes.drivable_area import DrivableArea
 from e2rl.scenes.lane_graph import BEHIND, LaneGraph, Route, plausible_width
 from e2rl.scenes.log_route import route_from_log
 from e2rl.scenes.paths import wrap
@@ -61,6 +61,9 @@ class SceneBuilder:
             raise InputError(f"scene {recording.scene_id!r}: no lane is at least 0.5 m long; leave the scene out")
         check(map_fit(recording, self.graph), recording.scene_id)
         self.states = smooth(recording.states, self.valid)
+        widths = np.array([plausible_width(lane.width) for lane in self.graph.lanes.values()])
+        rings = [ring for ring in recording.drivable if len(ring) >= 3]
+        self.drivable = DrivableArea(list(self.graph.line.values()), widths, rings)
         self.settings = settings
 
     def scene(self, recording: Recording) -> TensorDict:
@@ -72,7 +75,7 @@ class SceneBuilder:
         lights = {name: index for index, name in enumerate(recording.lights)}
         scene |= _routes(scene, self.graph, origin, lights, self.settings)
         scene |= _lights(recording, frame, origin, self.settings.steps)
-        scene |= _map(recording, self.graph, scene, origin, self.settings)
+        scene |= _map(self.graph, self.drivable, scene, origin, self.settings)
         return TensorDict({key: _tensor(value) for key, value in scene.items()}, batch_size=[])
 
 
@@ -223,7 +226,9 @@ def _lights(recording: Recording, frame: int, origin: np.ndarray, steps: int) ->
     return {"light_state": states[frames].astype(np.int64), "light_points": points - origin}
 
 
-def _map(recording: Recording, graph: LaneGraph, scene: Arrays, origin: np.ndarray, settings: BuildSettings) -> Arrays:
+def _map(
+    graph: LaneGraph, drivable: DrivableArea, scene: Arrays, origin: np.ndarray, settings: BuildSettings
+) -> Arrays:
     """Lane centrelines at 1 m with widths and neighbours, polygons, and the drivable field."""
     number = {name: index for index, name in enumerate(graph.ids)}
     lanes = [graph.lanes[name] for name in graph.ids]
@@ -233,9 +238,9 @@ def _map(recording: Recording, graph: LaneGraph, scene: Arrays, origin: np.ndarr
     for index, name in enumerate(graph.ids):
         nexts = [number[other] for other in graph.graph.successors(name)][:MAX_EXITS]
         exits[index, : len(nexts)] = nexts
-    rings = [ring - origin for ring in recording.drivable if len(ring) >= 3]
+    rings = [ring - origin for ring in drivable.polygons]
     ego = scene["logged"][scene["logged_valid"][:, 0], 0, :2]
-    field, field_origin = drivable_field(lines, widths, rings, (ego.min(0) + ego.max(0)) / 2, settings.field_cells)
+    field, field_origin = drivable.field(origin, (ego.min(0) + ego.max(0)) / 2, settings.field_cells)
     lane_points, lane_index = _joined(lines)
     drivable_points, drivable_index = _joined(rings)
     return {
