@@ -160,6 +160,7 @@ def _routes(
         "route_light": np.full((*shape, MAX_LIGHTS), -1),
         "route_light_s": np.zeros((*shape, MAX_LIGHTS)),
     }
+    standing: list[tuple[int, Route]] = []  # whose candidates, one by one
     for row in range(settings.vehicles):
         x, y, heading, speed = scene["start"][row]
         ahead = np.arange(settings.vertices)[:, None] * SPACING - BEHIND
@@ -170,7 +171,11 @@ def _routes(
         found = graph.candidates(position, heading, speed, settings.routes, settings.vertices)
         for index, route in enumerate(found):
             _write_route(out, (row, index), route, origin, lights)
-        scene["parked"][row] = speed < STANDING and not any(_on_lane(graph, route, position) for route in found)
+        scene["parked"][row] = speed < STANDING
+        standing += [(row, route) for route in found if speed < STANDING]
+    if standing:
+        rows, routes = map(list, zip(*standing, strict=True))
+        scene["parked"][np.array(rows)[_on_lane(graph, routes, scene["start"][rows, :2] + origin)]] = False
     out["route_log"] = _driven(scene, out)
     if out["route_log"][0] < 0:  # no lane route fits the ego's recorded path: it becomes the last candidate
         slot = min(int(out["route_valid"][0].sum()), settings.routes - 1)
@@ -189,11 +194,15 @@ def _write_route(out: Arrays, at: tuple[int, int], route: Route, origin: np.ndar
         out["route_light"][at][k], out["route_light_s"][at][k] = index, s
 
 
-def _on_lane(graph: LaneGraph, route: Route, position: np.ndarray) -> bool:
-    """Whether a position [2] on the map lies within the lane of a route there."""
-    s, d, _ = project(torch.from_numpy(position[None]), torch.from_numpy(route.points), torch.full((1,), BEHIND))
-    lane = [name for name, start in route.lanes if start <= s.item() + 1e-6][-1:] or [route.lanes[0][0]]
-    return abs(d.item()) < plausible_width(graph.lanes[lane[0]].width) / 2 + 0.3
+def _on_lane(graph: LaneGraph, routes: list[Route], position: np.ndarray) -> np.ndarray:
+    """Whether positions [R, 2] on the map lie within the lane of the route of each there [R]."""
+    points = torch.from_numpy(np.stack([route.points for route in routes]))
+    along, across, _ = project(torch.from_numpy(position[:, None]), points, torch.full((len(routes), 1), BEHIND))
+    width = []
+    for route, s in zip(routes, along[:, 0].tolist(), strict=True):
+        lane = [name for name, start in route.lanes if start <= s + 1e-6][-1:] or [route.lanes[0][0]]
+        width.append(plausible_width(graph.lanes[lane[0]].width))
+    return np.abs(across[:, 0].numpy()) < np.array(width) / 2 + 0.3
 
 
 def _driven(scene: Arrays, routes: Arrays) -> np.ndarray:
