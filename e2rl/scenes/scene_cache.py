@@ -149,12 +149,12 @@ def write(path: Path, build: Build) -> None:
                 os.posix_fallocate(file.fileno(), 0, size)
         content = np.memmap(path, np.uint8, "r+")
         arrays = index.arrays(content)
-        for number, sizes in enumerate(shapes):
-            for (key, rows), size in zip(arrays.items(), sizes, strict=True):
-                if size != rows.shape[1:]:
+        for number, own in enumerate(shapes):
+            for (key, rows), shape in zip(arrays.items(), own, strict=True):
+                if shape != rows.shape[1:]:
                     rows[number] = RAGGED[key]
-                value = np.ndarray(size, rows.dtype, waiting.read(prod(size) * rows.itemsize))
-                rows[number][tuple(map(slice, size))] = value
+                value = np.ndarray(shape, rows.dtype, waiting.read(prod(shape) * rows.itemsize))
+                rows[number][tuple(slice(end) for end in shape)] = value
         content.flush()
     about = json.dumps(vars(index)).encode()
     digest = hashlib.sha256(content.data)
