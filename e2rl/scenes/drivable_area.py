@@ -9,7 +9,7 @@ from matplotlib.path import Path
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from e2rl.scenes.lane_cover import CELL, FAR, TILE, LaneCover
+from e2rl.scenes.lane_cover import CELL, FAR, RADIUS, TILE, LaneCover
 
 DENSE = 0.5  # m at most between the points of a polygon's border
 
@@ -42,16 +42,13 @@ class DrivableArea:
 
 def _near(x: np.ndarray, y: np.ndarray, points: np.ndarray, reach: float) -> tuple[slice, slice]:
     """The cells, at x [G] and y [G], within `reach` m of the bounding box of points [P, 2]."""
-    low, high = points.min(0) - reach, points.max(0) + reach
-    return (
-        slice(np.searchsorted(x, low[0], "left"), np.searchsorted(x, high[0], "right")),
-        slice(np.searchsorted(y, low[1], "left"), np.searchsorted(y, high[1], "right")),
-    )
+    ends = zip((x, y), points.min(0) - reach, points.max(0) + reach, strict=True)
+    rows, columns = (slice(*np.searchsorted(axis, [low, np.nextafter(high, np.inf)])) for axis, low, high in ends)
+    return rows, columns
 
 
 def _lower(field: np.ndarray, x: np.ndarray, y: np.ndarray, ring: np.ndarray) -> None:
-    """Lower the field [G, G] of cells at x [G], y [G] to the distance beyond a polygon [P, 2], where that is less; in
-    place.
+    """Lower the field [G, G] of cells at x [G], y [G] to the distance beyond a polygon [P, 2], in place.
 
     The distance from a tile's middle bounds that of its cells, so cells outside which cannot change are not searched.
     """
@@ -59,12 +56,9 @@ def _lower(field: np.ndarray, x: np.ndarray, y: np.ndarray, ring: np.ndarray) ->
     part, x, y = field[rows, columns], x[rows], y[columns]
     if not part.size:
         return
-    dense = _dense(ring)
-    tree = cKDTree(dense)
-    middle, radius = (TILE - 1) / 2 * CELL, (TILE - 1) / 2 * CELL * np.sqrt(2) + DENSE / 2 + 1e-6
-    tiles = np.stack(np.meshgrid(x[::TILE] + middle, y[::TILE] + middle, indexing="ij"), -1)
-    least = (tree.query(tiles)[0] - radius).repeat(TILE, 0).repeat(TILE, 1)[: len(x), : len(y)]
-    cell = np.stack(np.meshgrid(x, y, indexing="ij"), -1)
+    tree, cell = cKDTree(dense := _dense(ring)), np.stack(np.meshgrid(x, y, indexing="ij"), -1)
+    least = tree.query(cell[::TILE, ::TILE] + (TILE - CELL) / 2)[0] - RADIUS - DENSE / 2
+    least = least.repeat(TILE, 0).repeat(TILE, 1)[: len(x), : len(y)]
     inside, box = np.zeros(part.shape, bool), _near(x, y, ring, 0.0)
     inside[box] = Path(ring).contains_points(cell[box].reshape(-1, 2)).reshape(inside[box].shape)
     change = inside | (least < part)
@@ -76,9 +70,8 @@ def _dense(ring: np.ndarray) -> np.ndarray:
     """A closed ring [P, 2] with points at most DENSE apart."""
     side = np.concatenate([ring[1:], ring[:1]]) - ring
     count = np.maximum(np.ceil(np.sqrt(np.vecdot(side, side)) / DENSE), 1).astype(int)
-    of = np.repeat(np.arange(len(ring)), count)
-    share = (np.arange(len(of)) - (np.cumsum(count) - count)[of])[:, None] / count[of, None]
-    return ring[of] + share * side[of]
+    share = (np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)) / np.repeat(count, count)
+    return np.repeat(ring, count, 0) + share[:, None] * np.repeat(side, count, 0)
 
 
 def _border_distance(dense: np.ndarray, tree: cKDTree, points: np.ndarray) -> np.ndarray:

@@ -142,7 +142,6 @@ ATTACKS = {
     "buffer": b"\x80\x05\x97.",
     "nothing": b"",
     "no end": b"\x80\x04}",
-    "frame beyond the end": b"\x80\x04\x95" + struct.pack("<Q", 5 * 10**9) + b"}.",
     "frame of no length": b"\x80\x04}\x95\x01",
 }
 
