@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from e2rl.run.errors import InputError
 from e2rl.run.settings import configured, setting
 from e2rl.scenes import boxes
-from e2rl.scenes.drivable_area import drivable_field
+from e2rl.scenes.drivable_area import DrivableArea
 from e2rl.scenes.lane_graph import BEHIND, LaneGraph, Route, plausible_width
 from e2rl.scenes.log_route import route_from_log
 from e2rl.scenes.paths import wrap
@@ -61,6 +61,9 @@ class SceneBuilder:
             raise InputError(f"scene {recording.scene_id!r}: no lane is at least 0.5 m long; leave the scene out")
         check(map_fit(recording, self.graph), recording.scene_id)
         self.states = smooth(recording.states, self.valid)
+        widths = np.array([plausible_width(lane.width) for lane in self.graph.lanes.values()])
+        rings = [ring for ring in recording.drivable if len(ring) >= 3]
+        self.drivable = DrivableArea(list(self.graph.line.values()), widths, rings)
         self.settings = settings
 
     def scene(self, recording: Recording) -> TensorDict:
@@ -72,7 +75,7 @@ class SceneBuilder:
         lights = {name: index for index, name in enumerate(recording.lights)}
         scene |= _routes(scene, self.graph, origin, lights, self.settings)
         scene |= _lights(recording, frame, origin, self.settings.steps)
-        scene |= _map(recording, self.graph, scene, origin, self.settings)
+        scene |= _map(self.graph, self.drivable, scene, origin, self.settings)
         return TensorDict({key: _tensor(value) for key, value in scene.items()}, batch_size=[])
 
 
@@ -157,6 +160,7 @@ def _routes(
         "route_light": np.full((*shape, MAX_LIGHTS), -1),
         "route_light_s": np.zeros((*shape, MAX_LIGHTS)),
     }
+    standing: list[tuple[int, Route]] = []  # whose candidates, one by one
     for row in range(settings.vehicles):
         x, y, heading, speed = scene["start"][row]
         ahead = np.arange(settings.vertices)[:, None] * SPACING - BEHIND
@@ -167,7 +171,11 @@ def _routes(
         found = graph.candidates(position, heading, speed, settings.routes, settings.vertices)
         for index, route in enumerate(found):
             _write_route(out, (row, index), route, origin, lights)
-        scene["parked"][row] = speed < STANDING and not any(_on_lane(graph, route, position) for route in found)
+        scene["parked"][row] = speed < STANDING
+        standing += [(row, route) for route in found if speed < STANDING]
+    if standing:
+        rows, routes = map(list, zip(*standing, strict=True))
+        scene["parked"][np.array(rows)[_on_lane(graph, routes, scene["start"][rows, :2] + origin)]] = False
     out["route_log"] = _driven(scene, out)
     if out["route_log"][0] < 0:  # no lane route fits the ego's recorded path: it becomes the last candidate
         slot = min(int(out["route_valid"][0].sum()), settings.routes - 1)
@@ -186,11 +194,15 @@ def _write_route(out: Arrays, at: tuple[int, int], route: Route, origin: np.ndar
         out["route_light"][at][k], out["route_light_s"][at][k] = index, s
 
 
-def _on_lane(graph: LaneGraph, route: Route, position: np.ndarray) -> bool:
-    """Whether a position [2] on the map lies within the lane of a route there."""
-    s, d, _ = project(torch.from_numpy(position[None]), torch.from_numpy(route.points), torch.full((1,), BEHIND))
-    lane = [name for name, start in route.lanes if start <= s.item() + 1e-6][-1:] or [route.lanes[0][0]]
-    return abs(d.item()) < plausible_width(graph.lanes[lane[0]].width) / 2 + 0.3
+def _on_lane(graph: LaneGraph, routes: list[Route], position: np.ndarray) -> np.ndarray:
+    """Whether positions [R, 2] on the map lie within the lane of the route of each there [R]."""
+    points = torch.from_numpy(np.stack([route.points for route in routes]))
+    along, across, _ = project(torch.from_numpy(position[:, None]), points, torch.full((len(routes), 1), BEHIND))
+    width = []
+    for route, s in zip(routes, along[:, 0].tolist(), strict=True):
+        lane = [name for name, start in route.lanes if start <= s + 1e-6][-1:] or [route.lanes[0][0]]
+        width.append(plausible_width(graph.lanes[lane[0]].width))
+    return np.abs(across[:, 0].numpy()) < np.array(width) / 2 + 0.3
 
 
 def _driven(scene: Arrays, routes: Arrays) -> np.ndarray:
@@ -223,7 +235,9 @@ def _lights(recording: Recording, frame: int, origin: np.ndarray, steps: int) ->
     return {"light_state": states[frames].astype(np.int64), "light_points": points - origin}
 
 
-def _map(recording: Recording, graph: LaneGraph, scene: Arrays, origin: np.ndarray, settings: BuildSettings) -> Arrays:
+def _map(
+    graph: LaneGraph, drivable: DrivableArea, scene: Arrays, origin: np.ndarray, settings: BuildSettings
+) -> Arrays:
     """Lane centrelines at 1 m with widths and neighbours, polygons, and the drivable field."""
     number = {name: index for index, name in enumerate(graph.ids)}
     lanes = [graph.lanes[name] for name in graph.ids]
@@ -233,9 +247,9 @@ def _map(recording: Recording, graph: LaneGraph, scene: Arrays, origin: np.ndarr
     for index, name in enumerate(graph.ids):
         nexts = [number[other] for other in graph.graph.successors(name)][:MAX_EXITS]
         exits[index, : len(nexts)] = nexts
-    rings = [ring - origin for ring in recording.drivable if len(ring) >= 3]
+    rings = [ring - origin for ring in drivable.polygons]
     ego = scene["logged"][scene["logged_valid"][:, 0], 0, :2]
-    field, field_origin = drivable_field(lines, widths, rings, (ego.min(0) + ego.max(0)) / 2, settings.field_cells)
+    field, field_origin = drivable.field(origin, (ego.min(0) + ego.max(0)) / 2, settings.field_cells)
     lane_points, lane_index = _joined(lines)
     drivable_points, drivable_index = _joined(rings)
     return {

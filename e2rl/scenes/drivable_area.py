@@ -10,80 +10,74 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from e2rl.run.fused import fused
+from e2rl.scenes.lane_cover import CELL, FAR, RADIUS, TILE, LaneCover
 
-CELL = 1.0  # m
-MARGIN = 1.0  # m beyond half the lane width that still counts as on the road
-FAR = 10.0  # m, the field's largest value
-INSIDE = 1.0  # m: cells at least this deep inside one lane are not compared with others
-TILE = 8  # cells, the side of the squares that are searched first
+DENSE = 0.5  # m at most between the points of a polygon's border
 
 
-def drivable_field(
-    lines: list[np.ndarray], widths: np.ndarray, polygons: list[np.ndarray], center: np.ndarray, cells: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Field [cells, cells] float16 of m beyond the border (negative inside), and the centre [2] of its cell (0, 0).
+class DrivableArea:
+    """The drivable area of a log, of which scenes have fields.
 
     A point is off the road when it lies outside every polygon and farther than half the width + MARGIN from every lane
-    centreline (lines: points every 1 m). Outside the field is exact to 0.1 m (the points' spacing, widths in steps of
-    0.1 m); inside it is at most the depth, since each shape is taken by itself.
+    centreline.
     """
-    origin = center - (cells - 1) / 2 * CELL
-    x, y = origin[:, None] + np.arange(cells) * CELL
-    field = np.full((cells, cells), FAR)
-    if lines:
-        # One search per width, the widest first: the nearest line is not always the one whose border is nearest.
-        width = np.round(np.repeat(widths, [len(line) for line in lines]), 1)
-        points = np.concatenate(lines)
-        for each in np.unique(width)[::-1]:
-            _lower(field, x, y, points[width == each], each / 2 + MARGIN)
-    for ring in polygons:
-        rows, columns = _near(x, y, ring, FAR)
-        near = np.stack(np.meshgrid(x[rows], y[columns], indexing="ij"), -1)
-        if near.size:
-            cell = near.reshape(-1, 2)
-            border = _border_distance(ring, cell)
-            signed = np.where(Path(ring).contains_points(cell), -border, border).reshape(near.shape[:2])
-            field[rows, columns] = np.minimum(field[rows, columns], signed)
-    return field.astype(np.float16), origin
+
+    def __init__(self, lines: list[np.ndarray], widths: np.ndarray, polygons: list[np.ndarray]) -> None:
+        """lines: of lanes, points every 1 m; widths [lanes] m; polygons: [P, 2] each."""
+        self.lanes, self.polygons = LaneCover(lines, widths), polygons
+
+    def field(self, origin: np.ndarray, center: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
+        """Field [cells, cells] float16 of m beyond the border (negative inside) around center [2] m from the scene's
+        origin [2], and the centre [2] of its cell (0, 0).
+
+        Outside the field is exact to 0.1 m (the points' spacing, widths in steps of 0.1 m); inside it is at most the
+        depth, since each shape is taken by itself.
+        """
+        corner = center - (cells - 1) / 2 * CELL
+        x, y = corner[:, None] + np.arange(cells) * CELL
+        field = self.lanes.beyond(origin, corner, cells)
+        for polygon in self.polygons:
+            _lower(field, x, y, polygon - origin)
+        return field.astype(np.float16), corner
 
 
 def _near(x: np.ndarray, y: np.ndarray, points: np.ndarray, reach: float) -> tuple[slice, slice]:
     """The cells, at x [G] and y [G], within `reach` m of the bounding box of points [P, 2]."""
-    low, high = points.min(0) - reach, points.max(0) + reach
-    return (
-        slice(np.searchsorted(x, low[0], "left"), np.searchsorted(x, high[0], "right")),
-        slice(np.searchsorted(y, low[1], "left"), np.searchsorted(y, high[1], "right")),
-    )
+    ends = zip((x, y), points.min(0) - reach, points.max(0) + reach, strict=True)
+    rows, columns = (slice(*np.searchsorted(axis, [low, np.nextafter(high, np.inf)])) for axis, low, high in ends)
+    return rows, columns
 
 
-def _lower(field: np.ndarray, x: np.ndarray, y: np.ndarray, points: np.ndarray, reach: float) -> None:
-    """Lower the field [G, G] of cells at x [G], y [G] to the distance from points [P, 2] less `reach`, where that is
-    less; in place, without the cells that are at least INSIDE already.
+def _lower(field: np.ndarray, x: np.ndarray, y: np.ndarray, ring: np.ndarray) -> None:
+    """Lower the field [G, G] of cells at x [G], y [G] to the distance beyond a polygon [P, 2], in place.
 
-    The distance from a tile's middle bounds that of its cells, so cells which cannot change are not searched.
+    The distance from a tile's middle bounds that of its cells, so cells outside which cannot change are not searched.
     """
-    rows, columns = _near(x, y, points, FAR + reach)
+    rows, columns = _near(x, y, ring, FAR)
     part, x, y = field[rows, columns], x[rows], y[columns]
     if not part.size:
         return
-    tree = cKDTree(points, compact_nodes=False, balanced_tree=False)
-    middle, radius = (TILE - 1) / 2 * CELL, (TILE - 1) / 2 * CELL * np.sqrt(2) + 1e-6
-    tiles = np.stack(np.meshgrid(x[::TILE] + middle, y[::TILE] + middle, indexing="ij"), -1)
-    least = tree.query(tiles, distance_upper_bound=FAR + reach + radius)[0] - radius - reach
+    tree, cell = cKDTree(dense := _dense(ring)), np.stack(np.meshgrid(x, y, indexing="ij"), -1)
+    least = tree.query(cell[::TILE, ::TILE] + (TILE - CELL) / 2)[0] - RADIUS - DENSE / 2
     least = least.repeat(TILE, 0).repeat(TILE, 1)[: len(x), : len(y)]
-    i, j = ((part > -INSIDE) & (least < part)).nonzero()
-    distance = tree.query(np.stack([x[i], y[j]], -1), distance_upper_bound=FAR + reach)[0]
-    part[i, j] = np.minimum(part[i, j], distance - reach)
+    inside, box = np.zeros(part.shape, bool), _near(x, y, ring, 0.0)
+    inside[box] = Path(ring).contains_points(cell[box].reshape(-1, 2)).reshape(inside[box].shape)
+    change = inside | (least < part)
+    border = _border_distance(dense, tree, cell[change])
+    part[change] = np.minimum(part[change], np.where(inside[change], -border, border))
 
 
-def _border_distance(ring: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _dense(ring: np.ndarray) -> np.ndarray:
+    """A closed ring [P, 2] with points at most DENSE apart."""
+    side = np.concatenate([ring[1:], ring[:1]]) - ring
+    count = np.maximum(np.ceil(np.sqrt(np.vecdot(side, side)) / DENSE), 1).astype(int)
+    share = (np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)) / np.repeat(count, count)
+    return np.repeat(ring, count, 0) + share[:, None] * np.repeat(side, count, 0)
+
+
+def _border_distance(dense: np.ndarray, tree: cKDTree, points: np.ndarray) -> np.ndarray:
     """Distance [Q] of points [Q, 2] from a closed ring: to the two segments that meet at its nearest dense vertex."""
-    closed = np.concatenate([ring, ring[:1]])
-    sides = []  # of points at most 0.5 m apart
-    for a, b in zip(closed[:-1], closed[1:], strict=True):
-        sides.append(np.linspace(a, b, max(int(np.ceil(np.linalg.norm(b - a) / 0.5)), 1), endpoint=False))
-    dense = np.concatenate(sides)
-    index = cKDTree(dense).query(points)[1]
+    index = tree.query(points)[1]
     best = np.full(len(points), np.inf)
     for a, b in ((dense[index - 1], dense[index]), (dense[index], dense[(index + 1) % len(dense)])):
         along = b - a

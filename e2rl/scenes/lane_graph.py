@@ -9,7 +9,7 @@ from heapq import heappop, heappush
 import networkx as nx
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import convolve1d
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -22,6 +22,8 @@ MAX_START_LANES, MAX_BRANCHES = 6, 4
 BEHIND, AHEAD = 20.0, 300.0  # m of route behind and ahead of the vehicle
 BUCKET = 20.0  # m to which distances on the start lane are rounded up, so that vehicles share a search
 SMOOTHING, SMOOTHED_ENDS = 1.3, 6  # vertices: standard deviation of the filter, odd extension beyond the ends
+FILTER = np.exp(-0.5 / (SMOOTHING * SMOOTHING) * np.arange(-5, 6) ** 2)  # of a Gaussian, to four standard deviations
+FILTER /= FILTER.sum()
 JOIN_GAP, JOIN_ANGLE, JOIN_HEIGHT = 1.5, 0.6, 2.0  # where connectivity is inferred: m, rad, m
 SAME_GAP = 1.2  # m: routes closer than this at all probes are one
 PROBES = np.array([2, 8, 16, 28, 45])  # vertices ahead of the vehicle where routes are compared
@@ -96,6 +98,7 @@ class LaneGraph:
         self.lane_of = np.repeat(np.arange(len(self.ids)), counts)
         self.first_point = np.cumsum([0, *counts])
         self.tree = cKDTree(self.points)
+        self.nexts_of: dict[str, list[str]] = {}
         self.branches_of: dict[tuple[str, float, float], list[list[str]]] = {}
         self.path_of: dict[tuple[str, ...], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
@@ -149,9 +152,10 @@ class LaneGraph:
 
     def _successors(self, path: list[str]) -> list[str]:
         """Successors of a path's last lane, the straightest first; lanes of the path only where there is no other."""
-        nexts = list(self.graph.successors(path[-1]))
-        fresh = [name for name in nexts if name not in path] or nexts
-        return sorted(fresh, key=lambda name: self.turn(path[-1], name))
+        last = path[-1]
+        if last not in self.nexts_of:
+            self.nexts_of[last] = sorted(self.graph.successors(last), key=lambda name: self.turn(last, name))
+        return [name for name in self.nexts_of[last] if name not in path] or self.nexts_of[last]
 
     def behind(self, lane: str, length: float) -> list[str]:
         """Lanes before `lane`, of several the straightest, until `length` m are covered."""
@@ -197,6 +201,7 @@ class LaneGraph:
         """
         reach = float(np.clip(5.0 * speed + 25.0, 40.0, 120.0))
         found: list[Route] = []
+        points = np.empty((count, vertices, 2))
         for lane, s in self.near_lanes(position, heading):
             behind = self.behind(lane, BEHIND - s)
             before = sum(self.arc[name] for name in behind)
@@ -205,9 +210,9 @@ class LaneGraph:
                 route = self.route([*behind, *branch], begin, vertices)
                 route.vehicle_s = before + s - begin
                 probes = np.clip(PROBES + int(round(route.vehicle_s / SPACING)), 0, vertices - 1)
-                at = route.points[probes][:, None]
-                gaps = (np.linalg.norm(at - other.points, axis=-1).min(1).max() for other in found)
-                if not any(gap < SAME_GAP for gap in gaps):
+                dx, dy = (route.points[probes, axis, None] - points[: len(found), None, :, axis] for axis in range(2))
+                if not (np.sqrt((dx * dx + dy * dy).min(-1).max(-1)) < SAME_GAP).any():
+                    points[len(found)] = route.points
                     found.append(route)
                 if len(found) == count:
                     return found
@@ -219,7 +224,7 @@ def smooth_vertices(points: np.ndarray) -> np.ndarray:
     pad = SMOOTHED_ENDS
     head = 2 * points[0] - points[pad:0:-1]
     tail = 2 * points[-1] - points[-2 : -pad - 2 : -1]
-    return gaussian_filter1d(np.concatenate([head, points, tail]), SMOOTHING, axis=0)[pad:-pad]
+    return convolve1d(np.concatenate([head, points, tail]), FILTER, axis=0)[pad:-pad]
 
 
 LANE_REACH = 2.5  # m from a lane's centreline within which a vehicle is on it

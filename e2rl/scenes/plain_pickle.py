@@ -34,8 +34,7 @@ def load_plain(content: bytes) -> Any:
     they are not writeable.
     """
     machine = _Machine(BytesIO(content), encoding="latin-1")
-    machine.dispatch = _Opcodes(HANDLERS)
-    made = machine.load()
+    made = machine.run()
     if machine.stack or machine.metastack:
         raise ValueError("is not one object")
     machine.measure(made, 0)
@@ -47,16 +46,33 @@ class _Machine(LIBRARY):
 
     def __init__(self, file: BytesIO, *, encoding: str) -> None:
         super().__init__(file, encoding=encoding)
+        self.read, self.readline = file.read, file.readline
+        self.metastack: list[list] = []
+        self.stack: list[Any] = []
+        self.append = self.stack.append
         self.containers = 0
         self.shared: dict[int, tuple[Any, int, int]] = {}  # by id: a container that is complete, its depth and items
 
-    def fetched(self) -> None:
-        """What a reference to an object of the memo stands for; if it is a container, it is complete from now on."""
-        value = self.stack[-1]
+    def run(self) -> Any:
+        """Returns what the program leaves at its end."""
+        read = self.read
+        try:
+            for _ in range(MAX_OPCODES):
+                HANDLERS[read(1)](self)
+        except pickle._Stop as end:  # type: ignore[attr-defined]
+            return end.value
+        except KeyError as error:
+            raise ValueError(f"uses {error}, which is none of its objects and no opcode of plain data") from error
+        raise ValueError(f"has more than {MAX_OPCODES} opcodes")
+
+    def fetch(self, index: int) -> None:
+        """Push an object of the memo; if it is a container, it is complete from now on."""
+        value = self.memo[index]
         if type(value) in HOLDING:
-            value = self.stack[-1] = value.value if type(value) is Unbuilt else value
+            value = value.value if type(value) is Unbuilt else value
             if type(value) in HOLDING and id(value) not in self.shared:
                 self.shared[id(value)] = (value, *self.measure(value, 0))
+        self.append(value)
 
     def measure(self, value: Any, level: int) -> tuple[int, int]:
         """Returns (depth, items) of an object at `level` of another one: how deep it nests, and how many items it holds
@@ -164,23 +180,7 @@ class _Machine(LIBRARY):
         self.append(target.value)
 
 
-Handler = Callable[[_Machine], None]
-
-
-class _Opcodes(dict[int, Handler]):
-    """Handlers by opcode, each good for one look-up of MAX_OPCODES in all."""
-
-    def __init__(self, handlers: dict[int, Handler]) -> None:
-        super().__init__(handlers)
-        self.used = 0
-
-    def __getitem__(self, code: int) -> Handler:
-        self.used += 1
-        if self.used > MAX_OPCODES:
-            raise ValueError(f"has more than {MAX_OPCODES} opcodes")
-        if code not in self:
-            raise ValueError(f"holds more than plain data (opcode {bytes([code])!r})")
-        return super().__getitem__(code)
+Handler = Callable[[_Machine], Any]
 
 
 def _handler(name: str, before: Handler | None = None, after: Handler | None = None) -> Handler:
@@ -198,7 +198,7 @@ def _handler(name: str, before: Handler | None = None, after: Handler | None = N
 
 
 AS_THEY_ARE = (
-    "PROTO FRAME STOP NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 FLOAT BINFLOAT STRING BINSTRING SHORT_BINSTRING "
+    "PROTO STOP NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 FLOAT BINFLOAT STRING BINSTRING SHORT_BINSTRING "
     "UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 BINBYTES SHORT_BINBYTES BINBYTES8 "
     "PUT BINPUT LONG_BINPUT MEMOIZE GLOBAL STACK_GLOBAL"
 )
@@ -207,7 +207,10 @@ OWN: dict[str, Handler] = {
     **{name: _handler(name) for name in AS_THEY_ARE.split()},
     **{name: _handler(name, before=_Machine.counted) for name in CONTAINERS.split()},
     **{name: _handler(name, after=_Machine.bounded) for name in ("INT", "LONG", "LONG1", "LONG4")},
-    **{name: _handler(name, after=_Machine.fetched) for name in ("GET", "BINGET", "LONG_BINGET")},
+    "GET": lambda machine: machine.fetch(int(machine.readline())),
+    "BINGET": lambda machine: machine.fetch(machine.read(1)[0]),
+    "LONG_BINGET": lambda machine: machine.fetch(int.from_bytes(machine.read(4), "little")),
+    "FRAME": lambda machine: machine.read(8),  # of use to those who read from streams
     "BYTEARRAY8": _handler("BINBYTES8"),  # the other allocates what it only announces
     "APPEND": _Machine.append_item,
     "APPENDS": _Machine.append_items,
@@ -219,4 +222,4 @@ OWN: dict[str, Handler] = {
     "REDUCE": _Machine.call,
     "BUILD": _Machine.build,
 }
-HANDLERS = {getattr(pickle, name)[0]: handler for name, handler in OWN.items()}
+HANDLERS = {getattr(pickle, name): handler for name, handler in OWN.items()}

@@ -223,15 +223,14 @@ def map_fit(recording: Recording, graph: LaneGraph) -> dict[str, float]:
 def lane_spacing(graph: LaneGraph) -> float:
     """Median distance [m] from points of a lane, evenly chosen, to the nearest parallel lane beside (NaN: none)."""
     chosen = np.unique(np.linspace(0, len(graph.points) - 1, SAMPLES).astype(int))
-    direction = np.stack([np.cos(graph.heading), np.sin(graph.heading)], -1)
+    place, direction = graph.points @ [1, 1j], np.exp(1j * graph.heading)
     nearest = np.full(len(chosen), inf)
     for row, point in enumerate(chosen):  # one by one: a map may have all its points at one place
         other = np.array(graph.tree.query_ball_point(graph.points[point], BESIDE[1]), dtype=int)
-        away, ahead = graph.points[other] - graph.points[point], direction[point]
-        across = np.abs(away[:, 1] * ahead[0] - away[:, 0] * ahead[1])
-        along = np.abs((away * ahead).sum(-1))
-        parallel = np.abs((direction[other] * ahead).sum(-1)) > np.cos(PARALLEL)
-        nearest[row] = across[parallel & (along < 1.0) & (across > BESIDE[0])].min(initial=inf)
+        turn = direction[point].conj()
+        away, parallel = (place[other] - place[point]) * turn, np.abs((direction[other] * turn).real) > np.cos(PARALLEL)
+        across = np.abs(away.imag)
+        nearest[row] = across[parallel & (np.abs(away.real) < 1.0) & (across > BESIDE[0])].min(initial=inf)
     return _median(nearest[nearest < inf])
 
 

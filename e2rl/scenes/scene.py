@@ -56,7 +56,8 @@ RAGGED = {  # keys whose first dims differ between scenes: the value that pads t
 def validate(scene: TensorDictBase, name: str) -> None:
     """Raises InputError naming the scene and the key that is not finite or of other dims."""
     for key, dims in KEYS.items():
-        if scene[key].ndim != dims or not torch.isfinite(scene[key]).all():
+        value = scene[key]
+        if value.ndim != dims or (value.is_floating_point() and not torch.isfinite(value).all()):
             raise InputError(f"scene {name!r}: {key} has not {dims} dims, or holds NaN or infinite values")
     if not scene["valid"][0] or scene["route_log"][0] < 0:
         raise InputError(f"scene {name!r}: the ego is absent or has no route")

@@ -13,6 +13,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from math import prod
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
 
@@ -56,7 +57,7 @@ class Index:
         """Returns the bytes of a file that each key's array has, and how many all have, at least one."""
         found, begin = {}, 0
         for key, (kind, shape) in self.layout.items():
-            size = len(self.scene_id) * int(np.prod(shape)) * np.dtype(kind).itemsize
+            size = len(self.scene_id) * prod(shape) * np.dtype(kind).itemsize
             found[key] = slice(begin, begin + size)
             begin += -(-size // ALIGN) * ALIGN
         return found, max(begin, 1)
@@ -134,10 +135,12 @@ def read(path: Path) -> SceneSet | None:
 def write(path: Path, build: Build) -> None:
     """Writes the file of a set. Scenes wait in a temporary file until the largest is known: they may be many."""
     index = Index()
+    shapes: list[list[tuple[int, ...]]] = []
     with TemporaryFile(dir=path.parent) as waiting:
         for scene in build(index):
-            for key in index.layout:
-                np.save(waiting, scene[key])
+            shapes.append([scene[key].shape for key in index.layout])
+            for key, (kind, _) in index.layout.items():
+                waiting.write(scene[key].astype(kind, copy=False).tobytes())
         waiting.seek(0)
         size = index.places()[1]
         with path.open("wb") as file:
@@ -146,11 +149,12 @@ def write(path: Path, build: Build) -> None:
                 os.posix_fallocate(file.fileno(), 0, size)
         content = np.memmap(path, np.uint8, "r+")
         arrays = index.arrays(content)
-        for number in range(len(index.scene_id)):
-            for key, rows in arrays.items():
-                value = np.load(waiting, allow_pickle=False)
-                rows[number] = RAGGED.get(key, 0)
-                rows[number][tuple(map(slice, value.shape))] = value
+        for number, own in enumerate(shapes):
+            for (key, rows), shape in zip(arrays.items(), own, strict=True):
+                if shape != rows.shape[1:]:
+                    rows[number] = RAGGED[key]
+                value = np.ndarray(shape, rows.dtype, waiting.read(prod(shape) * rows.itemsize))
+                rows[number][tuple(slice(end) for end in shape)] = value
         content.flush()
     about = json.dumps(vars(index)).encode()
     digest = hashlib.sha256(content.data)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from e2rl.run.errors import InputError
-from e2rl.scenes.builder import BuildSettings, build_scene, ego_overlaps
+from e2rl.scenes.builder import BuildSettings, SceneBuilder, build_scene, ego_overlaps
 from e2rl.scenes.recording import PEDESTRIAN, VEHICLE
 from e2rl.scenes.route import project
 from e2rl.scenes.scenarionet import ScenarioNetSource, recording_of
@@ -43,6 +43,14 @@ def lane_change(y_end: float = 3.5) -> dict:
     x = 15 + 0.8 * ALL
     y = y_end * (1 - np.cos(np.pi * np.clip((x - 30) / 40, 0, 1))) / 2
     return track(np.stack([x, y], 1), np.arctan2(np.gradient(y), np.gradient(x)), 8.0)
+
+
+def test_scenes_of_one_log_are_those_built_one_by_one():
+    windows = list(recorded({"ego": left_turn(), "7": straight(50, 3.5, 0)}).windows([10, 12, 30, 48], 80))
+    builder = SceneBuilder(windows[0], SETTINGS)
+    for window in windows:
+        scene, alone = builder.scene(window), build_scene(window, SETTINGS)
+        assert all(torch.equal(scene[key], alone[key]) for key in KEYS)
 
 
 def test_a_scene_keeps_the_schema_and_its_frame():

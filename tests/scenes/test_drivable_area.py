@@ -7,7 +7,8 @@ from shapely import contains_xy, distance, points
 from shapely.geometry import LineString, Polygon
 from shapely.ops import unary_union
 
-from e2rl.scenes.drivable_area import FAR, MARGIN, drivable_field, off_road
+from e2rl.scenes.drivable_area import DrivableArea, off_road
+from e2rl.scenes.lane_cover import FAR, MARGIN
 from e2rl.scenes.paths import resample
 
 
@@ -21,7 +22,7 @@ def bent(seed: int) -> np.ndarray:
 
 def compare(lines, widths, rings, cells: int = 121) -> None:
     dense = [resample(line, 1.0) for line in lines]
-    field, origin = drivable_field(dense, np.array(widths), rings, np.array([3.3, -2.7]), cells)
+    field, origin = DrivableArea(dense, np.array(widths), rings).field(np.zeros(2), np.array([3.3, -2.7]), cells)
     axis = np.arange(cells)
     x, y = (grid.ravel() for grid in np.meshgrid(origin[0] + axis, origin[1] + axis, indexing="ij"))
     shapes = [LineString(line).buffer(w / 2 + MARGIN, quad_segs=64) for line, w in zip(dense, widths, strict=True)]

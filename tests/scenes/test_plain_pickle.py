@@ -142,6 +142,7 @@ ATTACKS = {
     "buffer": b"\x80\x05\x97.",
     "nothing": b"",
     "no end": b"\x80\x04}",
+    "frame of no length": b"\x80\x04}\x95\x01",
 }
 
 
