@@ -12,6 +12,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from e2rl.run.fused import fused
+from e2rl.scenes.route import first_least
 from e2rl.sim.leaders import IDMParameters, idm_acceleration
 from e2rl.sim.observation import FAR, LOOK_AHEAD, NEAR, NEAREST, OBSERVATION_SIZE, PER_AGENT, PROBE_X, PROBE_Y, SPEED
 
@@ -35,6 +37,12 @@ LINE_GAP = 1.0  # m kept to a stop line
 
 def reference_action(observation: Tensor) -> Tensor:
     """Action [..., 2] (m/s^2, rad/s) of the route follower at observation [..., D]."""
+    return reference_rows(observation.reshape(-1, OBSERVATION_SIZE)).view(*observation.shape[:-1], 2)
+
+
+@fused(f"B {OBSERVATION_SIZE}")
+def reference_rows(observation: Tensor) -> Tensor:
+    """`reference_action` [B, 2] at observations [B, D]."""
     ego = observation[..., EGO]
     route = observation[..., ROUTE].unflatten(-1, (len(LOOK_AHEAD), 5))
     speed = ego[..., 0] * SPEED
@@ -116,7 +124,8 @@ def _on_path(position: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     unit = (leg / length[..., None])[..., None, :, :]
     offset = position[..., :, None, :] - corner[..., None, :-1, :]
     t = torch.minimum((offset * unit).sum(-1).clamp(min=0), length[..., None, :])
-    apart, index = (offset - t[..., None] * unit).norm(dim=-1).min(-1)
+    distance = (offset - t[..., None] * unit).norm(dim=-1)
+    apart, index = distance.amin(-1), first_least(distance)
     begun = (length.cumsum(-1) - length)[..., None, :]
     along = (begun + t).gather(-1, index[..., None])[..., 0]
     direction = unit.expand(*t.shape, 2).gather(-2, index[..., None, None].expand(*index.shape, 1, 2))[..., 0, :]

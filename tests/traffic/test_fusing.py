@@ -4,6 +4,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from e2rl.planners.actor import ActorEgo
 from e2rl.planners.lane_graph_planner import LaneGraphEgo
 from e2rl.run import fused
 from e2rl.run.errors import InputError
@@ -40,6 +41,7 @@ def test_compiled_rollouts_are_the_eager_ones_to_millimetres(capsys):
         run = each._run
         each.__dict__["_run"] = lambda flat, run=run, name=each.name: called.add(name) or run(flat)
     fast = drive(scene_set, on, 2.0, ego=ego)
+    drive(scene_set, on, 2.0, ego=ActorEgo())
     assert torch.equal(eager.valid, fast.valid) and torch.equal(eager.adversaries, fast.adversaries)
     assert (eager.states[..., :2] - fast.states[..., :2]).abs().max() < 2e-3
     torch.testing.assert_close(eager.transport_adversary, fast.transport_adversary, rtol=1e-3, atol=1e-3)
