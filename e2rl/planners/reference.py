@@ -8,11 +8,12 @@ agents joins the rest of the scene (Qi et al., PointNet, 2017; what it is worth 
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from e2rl.run.fused import fused
+from e2rl.run.fused import fused, is_on
 from e2rl.scenes.route import first_least
 from e2rl.sim.leaders import IDMParameters, idm_acceleration
 from e2rl.sim.observation import FAR, LOOK_AHEAD, NEAR, NEAREST, OBSERVATION_SIZE, PER_AGENT, PROBE_X, PROBE_Y, SPEED
@@ -141,6 +142,27 @@ def _halts(observation: Tensor, speed: Tensor) -> Tensor:
     return ahead.masked_fill(~binds | (ahead <= 0), torch.inf)
 
 
+class Largest(torch.autograd.Function):
+    """`amax(1)` of [B, K, U], whose gradient is a fused function."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor) -> Tensor:
+        largest = values.amax(1)
+        ctx.save_for_backward(values, largest)
+        return largest
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        return shared(*ctx.saved_tensors, grad)
+
+
+@fused("B K U", "B U", "B U")
+def shared(values: Tensor, largest: Tensor, grad: Tensor) -> Tensor:
+    """The gradient of `Largest`: grad [B, U] is shared equally among the values [B, K, U] that are the largest."""
+    those = torch.where(values == largest[:, None], 1.0, 0.0)
+    return those * (grad / those.sum(1))[:, None]
+
+
 class Trunk(nn.Module):
     """Normalised observations [..., D] -> [..., out]; orthogonal weights, the last layer's (`last`) scaled."""
 
@@ -157,7 +179,8 @@ class Trunk(nn.Module):
 
     def forward(self, seen: Tensor) -> Tensor:
         """[..., out]."""
-        agents = self.agent(seen[..., AGENTS].unflatten(-1, (NEAREST, PER_AGENT))).amax(-2)
+        agents = self.agent(seen[..., AGENTS].unflatten(-1, (NEAREST, PER_AGENT)))
+        agents = Largest.apply(agents) if is_on() and agents.requires_grad and agents.dim() == 3 else agents.amax(-2)
         rest = self.rest(torch.cat([seen[..., : AGENTS.start], seen[..., AGENTS.stop :]], -1))
         return self.last(self.joint(torch.cat([rest, agents], -1)))
 
