@@ -2,12 +2,14 @@
 
 import time
 from collections.abc import Iterator
+from itertools import product
 
 import torch
 from measure import Bench, Row
 from torchrl.collectors import Collector
 
 from e2rl.planners.actor import ActorEgo
+from e2rl.run import fused
 from e2rl.sim.env import DrivingEnv
 
 STEPS = 40
@@ -15,7 +17,9 @@ STEPS = 40
 
 def collector(bench: Bench) -> Iterator[Row]:
     """Ego steps per second at 32 to 512 scenes a batch."""
-    for batch in bench.batches(32, 128, 512):
+    sizes = bench.batches(32, 128, 512)
+    for batch, fast in product(sizes, (False, True) if bench.compile else (False,)):
+        fused.switch(fast)
         env, actor = DrivingEnv(bench.scenes, bench.sim, batch), ActorEgo().network.actor
         source = Collector(
             env,
@@ -33,4 +37,11 @@ def collector(bench: Bench) -> Iterator[Row]:
                 times.append(time.perf_counter() - begin)
                 begin = time.perf_counter()
         source.shutdown()
-        yield bench.row("collector", "with the actor", bench.pick(batch), batch * STEPS / min(times[1:]), "ego steps/s")
+        yield bench.row(
+            "collector",
+            f"with the actor{', compiled' if fast else ''}",
+            bench.pick(batch),
+            batch * STEPS / min(times[1:]),
+            "ego steps/s",
+        )
+    fused.switch(False)

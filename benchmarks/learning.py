@@ -8,13 +8,25 @@ from measure import Bench, Row
 
 from e2rl.evaluation.methods import build_ego, build_sim
 from e2rl.learning.policy import PolicyImprovement, steps_of
+from e2rl.run import fused
 
 WARM_UP = 2  # iterations that are not counted: the first updates fit the critic alone
 
 
 def learning(bench: Bench) -> Iterator[Row]:
     """Simulator steps of 0.1 s per second of CPU: of collecting a batch, and of collecting and updating; the best of
-    the repeats, without cloning."""
+    the repeats, without cloning, eager and compiled."""
+    for fast in (False, True) if bench.compile else (False,):
+        fused.switch(fast)
+        collected, whole = rates(bench)
+        index, how = bench.pick(bench.configured("train").learner.collect.batch), ", compiled" if fast else ""
+        yield bench.row("learning", f"collect{how}", index, collected, "simulator steps/CPU s")
+        yield bench.row("learning", f"collect and update{how}", index, whole, "simulator steps/CPU s")
+    fused.switch(False)
+
+
+def rates(bench: Bench) -> tuple[float, float]:
+    """Steps per second of CPU of collecting, and of collecting and updating."""
     config = bench.configured("train")
     torch.manual_seed(0)
     collect, ppo = dict(config.learner.collect), {**config.learner.ppo, "cloning": 0.0}
@@ -31,6 +43,4 @@ def learning(bench: Bench) -> Iterator[Row]:
             steps = steps_of(data)
             collected.append(steps / (between - begin))
             whole.append(steps / (time.process_time() - begin))
-    index = bench.pick(config.learner.collect.batch)
-    yield bench.row("learning", "collect", index, max(collected), "simulator steps/CPU s")
-    yield bench.row("learning", "collect and update", index, max(whole), "simulator steps/CPU s")
+    return max(collected), max(whole)

@@ -6,7 +6,7 @@ agents, contact of all pairs, off-road of all, no observation. vehicles re-aim: 
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -15,10 +15,11 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from e2rl.run import fused
 from e2rl.scenes.boxes import separation
 from e2rl.scenes.drivable_area import off_road
 from e2rl.sim import dynamics
-from e2rl.sim.env import DrivingEnv, compiled
+from e2rl.sim.env import DrivingEnv
 from e2rl.traffic.e2.reaiming import ReactSettings, Reaiming
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.transform import AdversarialSynthesizer
@@ -33,43 +34,30 @@ def simulator(bench: Bench) -> Iterator[Row]:
     kinds = (False, True) if bench.compile else (False,)
     for fast in kinds:
         name = ", compiled" if fast else ""
+        fused.switch(fast)
         for batch in bench.batches(*BATCHES):
             index = bench.pick(batch, AGENTS)
             agents = bench.scenes.scenes["valid"][index].sum().item()
-            env = DrivingEnv(bench.scenes, replace(bench.sim, compile=fast), batch)
+            env = DrivingEnv(bench.scenes, bench.sim, batch)
             wall, cpu = bench.both(lambda e=env, i=index: run(e, i))
             yield bench.row("simulator", f"step and observation{name}", index, STEPS * agents / wall, "agent-steps/s")
             yield bench.row(
                 "simulator", f"step and observation{name}", index, STEPS * agents / cpu, "agent-steps/CPU s"
             )
-        for batch in bench.batches(1, 16, 64):
-            index = bench.pick(batch, AGENTS)
-            function = compiled(everybody) if fast else everybody
-            rates = all_driven(bench, index, function)
-            for value, unit in zip(rates, ("agent-steps/s", "agent-steps/CPU s"), strict=True):
-                yield bench.row("simulator", f"everybody driven{name}", index, value, unit)
+    fused.switch(False)
+    for batch in bench.batches(1, 16, 64):
+        index = bench.pick(batch, AGENTS)
+        for value, unit in zip(all_driven(bench, index), ("agent-steps/s", "agent-steps/CPU s"), strict=True):
+            yield bench.row("simulator", "everybody driven", index, value, unit)
     yield from reacting(bench)
-    if bench.compile:
-        index = bench.pick(*bench.batches(32), AGENTS)
-        one, two = (
-            run(DrivingEnv(bench.scenes, replace(bench.sim, compile=fast), len(index)), index) for fast in kinds
-        )
-        yield bench.row(
-            "simulator",
-            "compiled against eager, largest difference",
-            index,
-            (one - two).abs().max().item(),
-            "of a feature",
-        )
 
 
-def run(env: DrivingEnv, index: Tensor) -> Tensor:
-    """STEPS steps of scenes index [B] from their start; the last observation."""
+def run(env: DrivingEnv, index: Tensor) -> None:
+    """STEPS steps of scenes index [B] from their start."""
     action = TensorDict({"action": torch.zeros(len(index), 2)}, batch_size=[len(index)])
     env.reset(TensorDict({"scene_index": index[:, None]}, batch_size=[len(index)]))
     for _ in range(STEPS):
-        done = env._step(action)
-    return done["observation"]
+        env._step(action)
 
 
 def reacting(bench: Bench) -> Iterator[Row]:
@@ -109,7 +97,7 @@ def everybody(
     return states, touch, off_road(states[..., :2], field, origin)
 
 
-def all_driven(bench: Bench, index: Tensor, function: Callable) -> tuple[float, float]:
+def all_driven(bench: Bench, index: Tensor) -> tuple[float, float]:
     """Agent-steps per second and per CPU second of `everybody`, AGENTS rows a scene, all counted: absent ones
     cost the same."""
     scene = bench.scenes.batch(index)
@@ -121,7 +109,7 @@ def all_driven(bench: Bench, index: Tensor, function: Callable) -> tuple[float, 
     def steps() -> None:
         states = start
         for _ in range(STEPS):
-            states, *_ = function(states, action, size, pairs, scene["field"], scene["field_origin"])
+            states, *_ = everybody(states, action, size, pairs, scene["field"], scene["field_origin"])
 
     wall, cpu = bench.both(steps)
     return STEPS * len(index) * agents / wall, STEPS * len(index) * agents / cpu

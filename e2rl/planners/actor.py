@@ -17,7 +17,7 @@ from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
 from e2rl.sim.mission import mission_of
-from e2rl.sim.observation import observation_config, observe, placed_ego
+from e2rl.sim.observation import features, placed_ego
 from e2rl.sim.static import static_scene
 from e2rl.sim.world import Agents, World
 
@@ -45,13 +45,13 @@ class ObservingEgo(Ego):
         Vehicles follow their plans where these are known; all other agents keep their velocity.
         """
         static, expected = static_scene(world.scene, mission_of(world.scene)), expected_states(world)
-        config, horizon = observation_config(world.states.device), world.scene["logged"].shape[1] - 1
+        horizon = world.scene["logged"].shape[1] - 1
         state, present, action = world.states[:, 0], world.valid[:, 0], world.ego_action()
         pieces = []
         for done in range(0, PLAN_STEPS, HOLD):
             ego = placed_ego(static.mission, world.step + done, state, action, present, present)
-            seen = observe(config, static, ego, others_at(world, expected, done), horizon)
-            action = self.decide(seen.features)
+            seen = features(static, ego, others_at(world, expected, done), ego.step / horizon)
+            action = self.decide(seen)
             driven = dynamics.rollout(state, action[:, None].expand(-1, HOLD, -1))
             last_two = torch.cat([state[:, None], driven], 1)[:, -2:]
             state, action = driven[:, -1], dynamics.inverse(last_two)[:, 0]

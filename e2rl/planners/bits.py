@@ -15,7 +15,7 @@ from e2rl.planners.path import MissionPath
 from e2rl.planners.sampling import SCENE_KEYS, ScoringEgo
 from e2rl.run.settings import configured, setting
 from e2rl.sim.mission import mission_of
-from e2rl.sim.observation import ELAPSED, observation_config, observe, placed_ego
+from e2rl.sim.observation import ELAPSED, features, placed_ego
 from e2rl.sim.static import static_scene
 from e2rl.sim.world import World
 
@@ -62,5 +62,5 @@ def observed(world: World) -> Tensor:
     """The environment's observations [B, D] of Worlds, but for the elapsed time, which is 0."""
     static, state, present = static_scene(world.scene, mission_of(world.scene)), world.states[:, 0], world.valid[:, 0]
     ego = placed_ego(static.mission, world.step, state, world.ego_action(), present, present)
-    features = observe(observation_config(state.device), static, ego, world.others(), 1).features
-    return features.index_fill(1, torch.tensor([ELAPSED], device=state.device), 0.0)
+    seen = features(static, ego, world.others(), world.step.to(state.dtype))
+    return seen.index_fill(1, torch.tensor([ELAPSED], device=state.device), 0.0)

@@ -15,6 +15,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from e2rl.planners.reference import LAST_ACTION, Trunk, linear, reference_action
 from e2rl.run.errors import InputError
 from e2rl.run.files import altered, read_weights, weight_bytes, write_atomically
+from e2rl.run.fused import is_on
 from e2rl.sim.observation import OBSERVATION_SIZE
 
 DEEPEST, WIDEST = 16, 1 << 13  # layers, and units of a layer, that a file may ask for
@@ -41,8 +42,10 @@ class Normaliser(nn.Module):
         """Update the statistics with observations [..., D] (Chan et al.'s pairwise update)."""
         flat = observation.reshape(-1, observation.shape[-1])
         total = self.count + len(flat)
-        weight, delta = (len(flat) / total).float(), flat.mean(0) - self.mean
-        spread = self.variance * (1 - weight) + flat.var(0, correction=0) * weight
+        weight, mean = (len(flat) / total).float(), flat.mean(0)
+        delta = mean - self.mean
+        variance = (flat - mean).square().mean(0) if is_on() else flat.var(0, correction=0)  # which takes long
+        spread = self.variance * (1 - weight) + variance * weight
         self.variance.copy_(spread + delta**2 * weight * (1 - weight))
         self.mean.add_(delta * weight)
         self.count.copy_(total)

@@ -8,10 +8,13 @@ agents joins the rest of the scene (Qi et al., PointNet, 2017; what it is worth 
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from e2rl.run.fused import fused, is_on
+from e2rl.scenes.route import first_least
 from e2rl.sim.leaders import IDMParameters, idm_acceleration
 from e2rl.sim.observation import FAR, LOOK_AHEAD, NEAR, NEAREST, OBSERVATION_SIZE, PER_AGENT, PROBE_X, PROBE_Y, SPEED
 
@@ -35,6 +38,12 @@ LINE_GAP = 1.0  # m kept to a stop line
 
 def reference_action(observation: Tensor) -> Tensor:
     """Action [..., 2] (m/s^2, rad/s) of the route follower at observation [..., D]."""
+    return reference_rows(observation.reshape(-1, OBSERVATION_SIZE)).view(*observation.shape[:-1], 2)
+
+
+@fused(f"B {OBSERVATION_SIZE}")
+def reference_rows(observation: Tensor) -> Tensor:
+    """`reference_action` [B, 2] at observations [B, D]."""
     ego = observation[..., EGO]
     route = observation[..., ROUTE].unflatten(-1, (len(LOOK_AHEAD), 5))
     speed = ego[..., 0] * SPEED
@@ -116,7 +125,8 @@ def _on_path(position: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     unit = (leg / length[..., None])[..., None, :, :]
     offset = position[..., :, None, :] - corner[..., None, :-1, :]
     t = torch.minimum((offset * unit).sum(-1).clamp(min=0), length[..., None, :])
-    apart, index = (offset - t[..., None] * unit).norm(dim=-1).min(-1)
+    distance = (offset - t[..., None] * unit).norm(dim=-1)
+    apart, index = distance.amin(-1), first_least(distance)
     begun = (length.cumsum(-1) - length)[..., None, :]
     along = (begun + t).gather(-1, index[..., None])[..., 0]
     direction = unit.expand(*t.shape, 2).gather(-2, index[..., None, None].expand(*index.shape, 1, 2))[..., 0, :]
@@ -130,6 +140,27 @@ def _halts(observation: Tensor, speed: Tensor) -> Tensor:
     needed = speed[..., None] ** 2 / (2 * ahead.clamp(min=1e-3))
     binds = ((light[..., 0] > 0) & (needed < 2 * BRAKING)) | ((light[..., 1] > 0) & (needed < BRAKING))
     return ahead.masked_fill(~binds | (ahead <= 0), torch.inf)
+
+
+class Largest(torch.autograd.Function):
+    """`amax(1)` of [B, K, U], whose gradient is a fused function."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor) -> Tensor:
+        largest = values.amax(1)
+        ctx.save_for_backward(values, largest)
+        return largest
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        return shared(*ctx.saved_tensors, grad)
+
+
+@fused("B K U", "B U", "B U")
+def shared(values: Tensor, largest: Tensor, grad: Tensor) -> Tensor:
+    """The gradient of `Largest`: grad [B, U] is shared equally among the values [B, K, U] that are the largest."""
+    those = torch.where(values == largest[:, None], 1.0, 0.0)
+    return those * (grad / those.sum(1))[:, None]
 
 
 class Trunk(nn.Module):
@@ -148,7 +179,8 @@ class Trunk(nn.Module):
 
     def forward(self, seen: Tensor) -> Tensor:
         """[..., out]."""
-        agents = self.agent(seen[..., AGENTS].unflatten(-1, (NEAREST, PER_AGENT))).amax(-2)
+        agents = self.agent(seen[..., AGENTS].unflatten(-1, (NEAREST, PER_AGENT)))
+        agents = Largest.apply(agents) if is_on() and agents.requires_grad and agents.dim() == 3 else agents.amax(-2)
         rest = self.rest(torch.cat([seen[..., : AGENTS.start], seen[..., AGENTS.stop :]], -1))
         return self.last(self.joint(torch.cat([rest, agents], -1)))
 

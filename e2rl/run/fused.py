@@ -46,10 +46,11 @@ class Fused:
 
     shapes: of each argument, names of sizes that vary and numbers that do not, then ":" and a type (float32 by
     default). Equal names are equal sizes. The shape of a dataclass or a named tuple is that of all its tensors, or one
-    for each. Vectors, of few numbers, are copied component by component, so that loops over rows are contiguous; "!"
-    leaves them as they lie, as is better for tables. Where a size is 0, or anything is not as declared, the function
-    runs as it is. settings: on which the function depends besides, which their `repr` tells apart; constants: so many
-    tensors at the end, such as weights, are always as declared, and not looked at.
+    for each, those of what it holds in their order. Vectors, of few numbers, are copied component by component, so that
+    loops over rows are contiguous, and truth values as 0 and 1; "!" leaves both as they lie, as is better for tables.
+    Where a size is 0, or anything is not as declared, the function runs as it is. settings: on which the function
+    depends besides, which their `repr` tells apart; constants: so many tensors at the end, such as weights, are always
+    as declared, and not looked at.
     """
 
     def __init__(
@@ -68,8 +69,7 @@ class Fused:
         varied = len(flat) - self.constants
         if not self._fits(flat[:varied]):
             return self.function(*given)
-        laid = zip(self._apart, flat[:varied], strict=False)
-        read = [value.movedim(-1, 0).contiguous() if apart else value.contiguous() for apart, value in laid]
+        read = [given.laid_out(value) for given, value in zip(self.declared, flat[:varied], strict=False)]
         found = self._run([*read, *flat[varied:]])
         return found[0] if self.returns is Tensor else self.returns(*found) if _made(self.returns) else tuple(found)
 
@@ -87,7 +87,7 @@ class Fused:
         @lru_cache(4096)
         def fit(shapes: tuple[torch.Size, ...]) -> bool:
             size: dict[Any, int] = {}
-            for shape, (names, _, _) in zip(shapes, self.declared, strict=False):
+            for shape, (names, *_) in zip(shapes, self.declared, strict=False):
                 if len(shape) != len(names):
                     return False
                 for name, length in zip(names, shape, strict=True):
@@ -99,11 +99,7 @@ class Fused:
 
     @cached_property
     def _types(self) -> list[torch.dtype]:
-        return [kind for _, kind, _ in self.declared]
-
-    @cached_property
-    def _apart(self) -> list[bool]:
-        return [apart for _, _, apart in self.declared]
+        return [each.kind for each in self.declared]
 
     @cached_property
     def kinds(self) -> list[Any]:
@@ -121,11 +117,12 @@ class Fused:
         """What is said of each tensor."""
         found = []
         for given, kind in zip(self.shapes, self.kinds, strict=True):
-            for shape in (given,) * len(_fields(kind)) if isinstance(given, str) else given:
+            for shape in (given,) * _count(kind) if isinstance(given, str) else given:
                 sizes, _, name = shape.removesuffix("!").partition(":")
                 names = [int(size) if size.isdigit() else size for size in sizes.split()]
                 apart = len(names) > 1 and isinstance(names[-1], int) and names[-1] <= VECTOR and shape[-1] != "!"
-                found.append(_Declared(names, getattr(torch, name or "float32"), apart))
+                truth = name == "bool" and shape[-1] != "!"
+                found.append(_Declared(names, getattr(torch, name or "float32"), apart, truth))
         return found
 
     @cached_property
@@ -155,8 +152,9 @@ class Fused:
         free = sorted({name for given in self.declared for name in given.sizes if isinstance(name, str)})
         size: dict[Any, int] = dict(zip(free, _primes(), strict=False))
         examples, dynamic = [], []
-        for names, kind, apart in self.declared:
+        for names, kind, apart, truth in self.declared:
             names = [names[-1], *names[:-1]] if apart else names
+            kind = torch.float32 if truth else kind
             examples.append(torch.zeros([size.get(name, name) for name in names], dtype=kind))
             dynamic.append({at: torch.export.Dim.DYNAMIC for at, name in enumerate(names) if name in size})
         module, package = _Module(self), io.BytesIO()
@@ -199,6 +197,16 @@ def is_on() -> bool:
     return _on and not torch.compiler.is_compiling()
 
 
+def product(a: Tensor, b: Tensor) -> Tensor:
+    """`a.bmm(b)` of few numbers each, which is no call of its own in what is compiled."""
+    return (a[..., None] * b[:, None]).sum(2) if torch.compiler.is_compiling() else a.bmm(b)
+
+
+def some(truths: Tensor) -> Tensor:
+    """`truths.any(1)`, by a maximum in what is compiled."""
+    return torch.where(truths, 1.0, 0.0).amax(1) > 0 if torch.compiler.is_compiling() else truths.any(1)
+
+
 def has_compiler() -> bool:
     """Whether there is a C++ compiler."""
     return any(name and shutil.which(name) for name in (os.environ.get("CXX"), *COMPILERS))
@@ -220,21 +228,28 @@ class _Module(nn.Module):
         self.fused = fused
 
     def forward(self, *flat: Tensor) -> Any:
-        declared = zip(flat, self.fused.declared, strict=True)
-        rest = iter([value.movedim(0, -1) if given.apart else value for value, given in declared])
-        given = []
-        for kind in self.fused.kinds:
-            parts = [next(rest) for _ in _fields(kind)]
-            given.append(kind(*parts) if _made(kind) else parts[0])
-        return tuple(_tensors(self.fused.function(*given)))
+        rest = iter([given.as_given(value) for value, given in zip(flat, self.fused.declared, strict=True)])
+        return tuple(_tensors(self.fused.function(*(_built(kind, rest) for kind in self.fused.kinds))))
 
 
 class _Declared(NamedTuple):
-    """A tensor of a fused function: its sizes, its type, and whether vectors come component by component."""
+    """A tensor of a fused function: its sizes, its type, and whether vectors come component by component, and truth
+    values as 0 and 1."""
 
     sizes: list[Any]
     kind: torch.dtype
     apart: bool
+    truth: bool
+
+    def laid_out(self, value: Tensor) -> Tensor:
+        """The tensor as compiled code reads it."""
+        value = value.float() if self.truth else value
+        return value.movedim(-1, 0).contiguous() if self.apart else value.contiguous()
+
+    def as_given(self, value: Tensor) -> Tensor:
+        """The tensor that was laid out."""
+        value = value > 0 if self.truth else value
+        return value.movedim(0, -1) if self.apart else value
 
 
 def _made(kind: Any) -> bool:
@@ -242,14 +257,25 @@ def _made(kind: Any) -> bool:
     return is_dataclass(kind) or hasattr(kind, "_fields")
 
 
-def _fields(kind: Any) -> list[str]:
-    return [each.name for each in fields(kind)] if is_dataclass(kind) else list(getattr(kind, "_fields", ("",)))
+def _kinds(kind: Any) -> list[Any]:
+    """The types of what a dataclass or a named tuple holds."""
+    names = [each.name for each in fields(kind)] if is_dataclass(kind) else kind._fields
+    return [get_type_hints(kind)[name] for name in names]
+
+
+def _count(kind: Any) -> int:
+    return sum(map(_count, _kinds(kind))) if _made(kind) else 1
+
+
+def _built(kind: Any, rest: Iterator[Tensor]) -> Any:
+    return kind(*(_built(each, rest) for each in _kinds(kind))) if _made(kind) else next(rest)
 
 
 def _tensors(value: Any) -> Iterable[Tensor]:
     if isinstance(value, Tensor):
         return (value,)
-    return [getattr(value, name) for name in _fields(value)] if is_dataclass(value) else value
+    parts = [getattr(value, each.name) for each in fields(value)] if is_dataclass(value) else value
+    return [tensor for part in parts for tensor in _tensors(part)]
 
 
 def _primes() -> Iterator[int]:

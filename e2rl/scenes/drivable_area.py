@@ -93,7 +93,7 @@ def off_road(points: Tensor, field: Tensor, origin: Tensor, row: Tensor | None =
     between cell centres, FAR outside the grid. row [B] int64: which rows of larger field and origin the points are on;
     default: each its own. Differentiable in the points; the cost does not depend on them.
     """
-    row = torch.arange(len(points), device=points.device) if row is None else row
+    row = torch.arange(points.shape[0], device=points.device) if row is None else row
     return off_road_rows(points.flatten(1, -2), field, origin, row).view(points.shape[:-1])
 
 
@@ -112,3 +112,16 @@ def off_road_rows(points: Tensor, field: Tensor, origin: Tensor, row: Tensor) ->
     sx, sy = share[..., 0], share[..., 1:]
     value = (1 - sy) * value[..., 0] + sy * value[..., 1]
     return ((1 - sx) * value[..., 0] + sx * value[..., 1]).masked_fill(outside, FAR)
+
+
+def off_road_at(x: Tensor, y: Tensor, field: Tensor, origin: Tensor) -> Tensor:
+    """`off_road` of points x, y [B, K], apart as compiled code wants them."""
+    cells, values = field.shape[-1], field.flatten(1)
+    x, y = ((value - origin[:, axis, None]) / CELL for axis, value in enumerate((x, y)))
+    outside = (torch.minimum(x, y) < 0) | (torch.maximum(x, y) > cells - 1)
+    low_x, low_y = (value.floor().clamp(0, cells - 2) for value in (x, y))
+    index, sx, sy = (low_x * cells + low_y).long(), (x - low_x).clamp(0, 1), (y - low_y).clamp(0, 1)
+    first, second, third, fourth = (
+        values.gather(1, index + row * cells + column).to(x.dtype) for row in (0, 1) for column in (0, 1)
+    )
+    return torch.lerp(torch.lerp(first, second, sy), torch.lerp(third, fourth, sy), sx).masked_fill(outside, FAR)

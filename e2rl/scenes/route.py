@@ -32,7 +32,7 @@ def nearest_vertex(points: Tensor, route: Tensor, hint: Tensor | None = None, wi
     if hint is None:
         if torch.compiler.is_compiling():  # the compiler makes a vector loop of a minimum, but not of argmin
             x, y = ((points[..., None, axis] - route[..., None, :, axis]).square() for axis in range(2))
-            return _first_least(x + y)
+            return first_least(x + y)
         squared = (route**2).sum(-1)[..., None, :] - 2 * points @ route.transpose(-1, -2)
         return squared.argmin(-1)
     near = hint.clamp(0, SPACING * (count - 1))  # beyond the ends, the end is what is near
@@ -42,11 +42,13 @@ def nearest_vertex(points: Tensor, route: Tensor, hint: Tensor | None = None, wi
     gap = _take(route, index.flatten(-2)).unflatten(-2, index.shape[-2:]) - points[..., None, :]
     outside = (SPACING * index - near[..., None]).abs() > window
     squared = gap.square().sum(-1).masked_fill(outside, torch.inf)
-    return first + (_first_least(squared) if torch.compiler.is_compiling() else squared.argmin(-1))
+    return first + first_least(squared)
 
 
-def _first_least(values: Tensor) -> Tensor:
-    """`values.argmin(-1)` by minima."""
+def first_least(values: Tensor) -> Tensor:
+    """`values.argmin(-1)`, by minima while it is compiled."""
+    if not torch.compiler.is_compiling():
+        return values.argmin(-1)
     order = torch.arange(values.shape[-1], dtype=values.dtype, device=values.device)
     return torch.where(values == values.amin(-1, keepdim=True), order, values.shape[-1]).amin(-1).long()
 

@@ -148,7 +148,7 @@ class SceneSet:
                 for row, index in zip(rows.tolist(), indices.tolist(), strict=True):
                     target[row].copy_(source[index])
             else:
-                target[rows] = source[indices].to(target.device)
+                target.index_copy_(0, rows, source.index_select(0, indices).to(target.device))
 
     def first(self, count: int | None) -> "SceneSet":
         """Returns the first `count` scenes (all for None)."""

@@ -133,7 +133,17 @@ def along_arc(
     present speed drives in `turn` s; then speed and heading stay.
     """
     x, y, heading, v = (value[..., None] for value in states.unbind(-1))
-    accel, curvature = arc.accel[..., None], arc.curvature[..., None]
+    arc = Arc(*(value[..., None] for value in arc))
+    *places, driven = arc_places(x, y, heading, v, arc, times, hold, turn)
+    return torch.stack(torch.broadcast_tensors(*places), -1), driven
+
+
+def arc_places(
+    x: Tensor, y: Tensor, heading: Tensor, v: Tensor, arc: Arc, times: Tensor, hold: float, turn: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """`along_arc` of x, y, heading, speed, accelerations, curvatures and times that broadcast: these four then, and the
+    metres driven."""
+    accel, curvature = arc
     halt = torch.where(accel < 0, v / (-accel).clamp(min=1e-6), torch.inf)
     held = torch.minimum(times.clamp(max=hold), halt)
     speed = (v + accel * held).clamp(min=0)
@@ -144,4 +154,4 @@ def along_arc(
     x, y = x + chord * middle.cos(), y + chord * middle.sin()
     if turn < torch.inf:
         x, y = x + (driven - bent) * end.cos(), y + (driven - bent) * end.sin()
-    return torch.stack([x, y, wrap(end), speed.expand_as(x)], -1), driven
+    return x, y, wrap(end), speed, driven

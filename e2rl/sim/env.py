@@ -1,8 +1,6 @@
 """DrivingEnv: a batch of B scenes; actions drive the ego, given trajectories drive the traffic."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,19 +9,18 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from e2rl.run.errors import InputError
-from e2rl.run.fused import check_compiler
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.mission import Mission, mission_of
-from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, glance, observation_config, observe, placed_ego
+from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, features, placed_ego
 from e2rl.sim.reward import check_weights
 from e2rl.sim.static import FrenetPose, static_scene, write_rows
-from e2rl.sim.step import Outcome, StepConfig, hold_step, step
+from e2rl.sim.step import Outcome, StepConfig, hold_step
 from e2rl.sim.world import AGENT_KEYS, Agents, Trajectories, World, trajectories_at
 
 OF_ROUTE = ("points", "length", "open", "limit", "light", "light_s", "log")
-OF_SCENE = ("start", "valid", "start_accel", "start_yaw_rate", "size", "agent_type", "field_origin")
+OF_SCENE = ("start", "valid", "start_accel", "start_yaw_rate", "size", "agent_type", "field_origin", "light_state")
 FLAGS, METRICS = ("terminated", "truncated"), ("contact", "contact_vru", "off_road", "progress")
 
 
@@ -39,7 +36,6 @@ class SimSettings:
     end_off_road: bool = setting()
     end_when_gone: bool = setting()
     replay_ego: bool = setting()
-    compile: bool = setting()
     reward: dict[str, float] = setting()
 
 
@@ -77,7 +73,7 @@ class DrivingEnv(EnvBase):
             raise InputError(f"DrivingEnv: hold={hold}; an action lasts at least one step")
         super().__init__(device=device, batch_size=[batch_size])
         self.scenes, self.settings, self.agents, self.hold = scenes, settings, agents, hold
-        self._sense, width = (observe, OBSERVATION_SIZE) if observed else (glance, 0)
+        self._look, width = observed, OBSERVATION_SIZE if observed else 0
         self._generator = torch.Generator()
         self.generators = {self._generator}
         """All that episodes are drawn with: `set_seed` seeds them alike. A transform adds its own."""
@@ -88,7 +84,7 @@ class DrivingEnv(EnvBase):
         high = torch.tensor([settings.max_acceleration, settings.max_yaw_rate], device=device)
         weights = torch.tensor(check_weights(settings.reward), device=device)
         ends = settings.end_on_contact, settings.end_off_road, settings.end_when_gone
-        self._config = StepConfig(self.horizon, *ends, weights, low, high, observation_config(self.device))
+        self._config = StepConfig(torch.tensor(ends, device=device), weights, low, high)
         self.clock = 0
         """Steps simulated so far, resets or not."""
         self._trajectories = Trajectories(self.scene)
@@ -188,21 +184,23 @@ class DrivingEnv(EnvBase):
         self._trajectories.reset(self.scene, index)
         begun = self._restart(index, fresh, static.mission)
         if len(index) < batch:
-            static = static._replace(field=self.scene["field"][index], light_state=self.scene["light_state"][index])
+            static = static._replace(field=self.scene["field"].index_select(0, index))
         others = Agents(*(fresh[name][:, 1:] for name in ("start", "valid", "start_accel", "start_yaw_rate")))
-        features = self._sense(self._config.observation, static, begun, others, self.horizon).features
-        self._features = self._features.index_copy(0, index, features)
+        if self._look:
+            seen = features(static, begun, others, begun.step / self.horizon)
+            self._features = self._features.index_copy(0, index, seen)
         ego = self._ego
         outcome = dict.fromkeys((*FLAGS, *METRICS), torch.zeros_like(ego.present))
         return self._output(outcome | {"observation": self._features, "progress": ego.pose.s - ego.start_s})
 
     def _beginning(self, index: Tensor) -> TensorDict:
         """What a reset of environments index [b] needs of their scenes; of routes and recording, that of the ego."""
-        scene = {name: self.scene[name][index] for name in OF_SCENE}
+        scene = {name: self.scene[name].index_select(0, index) for name in OF_SCENE}
         scene |= {name: self.scene[name][:, :1][index] for name in (f"route_{key}" for key in OF_ROUTE)}
         scene |= {name: self.scene[name][:, :, :1][index] for name in ("logged", "logged_valid")}
-        for name in ("field", "light_state"):  # views of the environment's storage, which write_rows leaves alone
-            scene[name] = self.scene[name][: len(index)]
+        scene["field"] = self.scene["field"][
+            : len(index)
+        ]  # of the environment's storage, which write_rows leaves alone
         return TensorDict(scene, batch_size=[len(index)], device=self.device)
 
     def _restart(self, index: Tensor, scene: TensorDictBase, mission: Mission) -> EgoState:
@@ -221,11 +219,8 @@ class DrivingEnv(EnvBase):
         self.clock += 1
         tracks = self._trajectories.states, self._trajectories.valid
         recording = self.scene["logged"], self.scene["logged_valid"]
-        function = compiled(step) if self.settings.compile else step
         given = recording if self.settings.replay_ego else tensordict["action"]
-        self._ego, outcome = hold_step(
-            function, self.hold, self._sense, self._ego, given, tracks, self._static, self._config
-        )
+        self._ego, outcome = hold_step(self.hold, self._look, self._ego, given, tracks, self._static, self._config)
         self._features = outcome["observation"]
         return self._output(outcome).set("reward", outcome["reward"][:, None])
 
@@ -245,10 +240,3 @@ class DrivingEnv(EnvBase):
             now = self.world()
             result["agents"] = TensorDict({key: getattr(now, key) for key in AGENT_KEYS}, shape, device=device)
         return TensorDict(result, shape, device=device)
-
-
-@cache
-def compiled(function: Callable) -> Callable:
-    """torch.compile of a step, shared by all environments; raises InputError without a C++ compiler."""
-    check_compiler("sim.compile")
-    return torch.compile(function, fullgraph=True)

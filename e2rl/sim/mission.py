@@ -26,6 +26,14 @@ def light_state_at(light_state: Tensor, light: Tensor, step: Tensor) -> Tensor:
     return state.masked_fill(light < 0, LIGHT_UNKNOWN)
 
 
+def lights_of(light_state: Tensor, light: Tensor) -> Tensor:
+    """`light_state_at` at every step: [B, T + 1, K] of light [B, K]."""
+    if not light_state.shape[-1]:
+        return light.new_full((*light_state.shape[:2], light.shape[1]), LIGHT_UNKNOWN)
+    state = light_state.gather(2, light.clamp(min=0)[:, None].expand(-1, light_state.shape[1], -1))
+    return state.masked_fill((light < 0)[:, None], LIGHT_UNKNOWN)
+
+
 def stop_line_distance(
     state: Tensor, ahead: Tensor, speed: Tensor, red_braking: float, yellow_braking: float
 ) -> Tensor:
@@ -84,7 +92,7 @@ def mission_of(scene: TensorDictBase) -> Mission:
 def limit_at(mission: Mission, s: Tensor) -> Tensor:
     """Speed limit [B, ...] m/s at arc lengths s [B, ...], 0 where unknown."""
     index = (s / SPACING).round().long().clamp(0, mission.limit.shape[-1] - 1)
-    return mission.limit.gather(1, index.view(len(s), -1)).view(s.shape)
+    return mission.limit.gather(1, index.view(s.shape[0], -1)).view(s.shape)
 
 
 def stop_ahead(

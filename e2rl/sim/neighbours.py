@@ -8,7 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from e2rl.run.fused import product, some
 from e2rl.scenes.recording import DT
+from e2rl.scenes.route import first_least
 from e2rl.sim.static import StaticScene
 from e2rl.sim.world import Agents
 
@@ -39,7 +41,7 @@ def neighbours_of(ego: Tensor, rotation: Tensor, size: Tensor, half_size: Tensor
     """
     x, y, heading, _ = agents.states.unbind(-1)
     poses = torch.stack([x - ego[:, :1], heading.cos(), y - ego[:, 1:2], heading.sin()], 1)
-    seen = rotation.bmm(poses.view(len(ego), 2, -1)).view(len(ego), 2, 2, -1)
+    seen = product(rotation, poses.view(ego.shape[0], 2, -1)).view(ego.shape[0], 2, 2, -1)
     position, direction = seen.unbind(2)
     gap = separation_in_frame(position, direction, size[..., None] / 2, half_size)
     return Neighbours(position, direction, gap, agents)
@@ -76,7 +78,7 @@ def standing(
     at = row, (step[:, None] - back).clamp(min=0), agent[:, None]
     known = tracks[1][at]
     moves = (tracks[0][..., 3][at].abs() > STANDING) & known
-    return moves[:, 0], known[:, 0] & ~moves.any(1)
+    return moves[:, 0], known[:, 0] & ~some(moves)
 
 
 def own_fault(
@@ -96,7 +98,7 @@ def own_fault(
     """
     if hit.shape[1] == 0:
         return hit.any(1)
-    partner = near.gap.masked_fill(~hit, torch.inf).argmin(1)
+    partner = first_least(near.gap.masked_fill(~hit, torch.inf))
     pick = partner[:, None, None].expand(-1, 2, 1)
     position, turn, half = (
         value.gather(2, pick)[..., 0] for value in (near.position, near.direction, static.half_size)
@@ -107,4 +109,4 @@ def own_fault(
     front = (position[:, 0] > 0) & (ahead > across)
     vehicle = static.vehicle.gather(1, partner[:, None])[:, 0]
     moves, stood = standing(tracks, static.row, before, partner + 1, vehicle)
-    return hit.any(1) & (speed.abs() > STANDING) & (stood | (front & moves))
+    return some(hit) & (speed.abs() > STANDING) & (stood | (front & moves))

@@ -15,14 +15,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from e2rl.scenes.drivable_area import off_road
+from e2rl.run.fused import fused
+from e2rl.scenes.drivable_area import off_road, off_road_at
 from e2rl.scenes.route import project
 from e2rl.sim.dynamics import Arc, curvature_of
-from e2rl.sim.mission import Mission, light_state_at, limit_at
+from e2rl.sim.mission import Mission, limit_at
 from e2rl.sim.neighbours import Neighbours, neighbours_of, rotation_into
 from e2rl.sim.prospects import ACCELERATIONS, OFFSETS, PROSPECTS, TIMES, WIDEST, Others, prospects
-from e2rl.sim.static import FrenetPose, StaticScene, look_along
-from e2rl.sim.world import Agents
+from e2rl.sim.static import STATIC, FrenetPose, StaticScene, look_along, seen_from
+from e2rl.sim.world import AGENTS, Agents
 
 LOOK_AHEAD = (2.0, 4.0, 7.0, 10.0, 14.0, 19.0, 25.0, 32.0, 40.0, 50.0, 62.0, 75.0)  # m along the mission
 PROBE_X, PROBE_Y = (-3.0, 0.0, 5.0, 11.0, 20.0), (-5.0, -2.5, 0.0, 2.5, 5.0)  # m in the ego's frame
@@ -67,13 +68,16 @@ def placed_ego(
     return EgoState(step, state, action, pose, present, on_road, pose.s)
 
 
+EGO_STATE = ("B:int64", "B 4!", "B 2!", "B", "B", "B", "B:bool", "B:bool", "B")
+"""Shapes of an EgoState's tensors in fused functions."""
+
+
 class ObservationConfig(NamedTuple):
     """The constants of the observation as tensors: arc lengths ahead [13] m, the last one 0; probes [25, 2] m; scales
-    of a route point [2] and of an agent's features [11, 1]; light colours [3]."""
+    of an agent's features [11, 1]; light colours [3]."""
 
     ahead: Tensor
     probes: Tensor
-    point: Tensor
     agent: Tensor
     colours: Tensor
 
@@ -98,19 +102,26 @@ def observation_config(device: torch.device) -> ObservationConfig:
 
     scales = numbers(FAR, NEAR, 1.0, 1.0, SPEED, SPEED, SPEED, 4.0, 2.5, 1.0, 1.0)[:, None]
     probes = torch.cartesian_prod(numbers(*PROBE_X), numbers(*PROBE_Y))
-    return ObservationConfig(numbers(*LOOK_AHEAD, 0.0), probes, numbers(FAR, NEAR), scales, numbers(1, 2, 3))
+    return ObservationConfig(numbers(*LOOK_AHEAD, 0.0), probes, scales, numbers(1, 2, 3))
 
 
-def observe(config: ObservationConfig, static: StaticScene, ego: EgoState, agents: Agents, horizon: int) -> Observed:
-    """The observation of egos in scenes of `horizon` steps."""
-    rotation = rotation_into(ego.state)
+def observe(static: StaticScene, ego: EgoState, agents: Agents, time: Tensor) -> Observed:
+    """The observation of egos at a time [B], the elapsed fraction of the episode."""
+    config, rotation = observation_config(ego.state.device), rotation_into(ego.state)
     neighbours = neighbours_of(ego.state, rotation, static.size, static.half_size, agents)
-    probes = torch.baddbmm(ego.state[:, None, :2], config.probes.expand(len(rotation), -1, -1), rotation)
-    border = off_road(probes, static.field, static.origin)
+    if torch.compiler.is_compiling():
+        ahead, left = config.probes.unbind(1)
+        x, y = (
+            ego.state[:, k, None] + ahead * rotation[:, 0, k, None] + left * rotation[:, 1, k, None] for k in (0, 1)
+        )
+        border = off_road_at(x, y, static.field, static.origin)
+    else:
+        probes = torch.baddbmm(ego.state[:, None, :2], config.probes.expand(len(rotation), -1, -1), rotation)
+        border = off_road(probes, static.field, static.origin)
     route, limit = route_features(config, static, ego, rotation)
     near = nearest(static, neighbours)
     blocks = [
-        ego_features(static, ego, limit, ego.step / horizon),
+        ego_features(static, ego, limit, time),
         route,
         light_features(config, static, ego.step, ego.pose.s),
         (border / 4).clamp(-1, 1),
@@ -120,7 +131,13 @@ def observe(config: ObservationConfig, static: StaticScene, ego: EgoState, agent
     return Observed(neighbours, border[:, CENTRE], limit, torch.cat(blocks, -1))
 
 
-def glance(config: ObservationConfig, static: StaticScene, ego: EgoState, agents: Agents, horizon: int) -> Observed:
+@fused(STATIC, EGO_STATE, AGENTS, "B")
+def features(static: StaticScene, ego: EgoState, agents: Agents, time: Tensor) -> Tensor:
+    """The features [B, OBSERVATION_SIZE] of `observe`, alone."""
+    return observe(static, ego, agents, time).features
+
+
+def glance(static: StaticScene, ego: EgoState, agents: Agents, time: Tensor) -> Observed:
     """`observe` without the features: what events and reward need, at a moment at which no policy looks."""
     neighbours = neighbours_of(ego.state, rotation_into(ego.state), static.size, static.half_size, agents)
     beyond = off_road(ego.state[:, None, :2], static.field, static.origin)[:, 0]
@@ -144,20 +161,19 @@ def route_features(
 ) -> tuple[Tensor, Tensor]:
     """[B, 12 * 5]: mission points ahead in the ego's frame (2), relative heading, curvature, speed limit; and the speed
     limit at the ego [B]."""
-    xy, heading, curvature, limit = look_along(static, ego.pose.s[:, None] + config.ahead)
-    local = (xy - ego.state[:, None, :2]).bmm(rotation.transpose(1, 2)) / config.point
+    x, y, heading, curvature, limit = look_along(static, ego.pose.s[:, None] + config.ahead)
+    x, y = seen_from(ego.state, rotation, x, y)
     turned = (heading - ego.state[:, 2:3]).sin()
-    features = torch.cat([local, torch.stack([turned, (10 * curvature).clamp(-2, 2), limit / SPEED], -1)], -1)
+    features = torch.stack([x / FAR, y / NEAR, turned, (10 * curvature).clamp(-2, 2), limit / SPEED], -1)
     return features[:, :-1].clamp(-5, 5).flatten(1), limit[:, -1]
 
 
 def light_features(config: ObservationConfig, static: StaticScene, step: Tensor, s: Tensor) -> Tensor:
     """[B, 2 * 4]: the mission's lights red, yellow, green (one-hot while ahead) and nearness (1 at the line, 0 far)."""
-    if not static.light_state.shape[2]:
-        return s.new_zeros(len(s), 8)
     light, ahead = static.mission.light, static.mission.light_s - s[:, None]
     seen = (light >= 0) & (ahead > -2)
-    colours = light_state_at(static.light_state, light, step)[..., None] == config.colours
+    state = static.lights[static.row[:, 0], step.clamp(0, static.lights.shape[1] - 1)]
+    colours = state[..., None] == config.colours
     near = (-ahead.clamp(min=0) / 30).exp()
     return (torch.cat([colours.to(s.dtype), near[..., None]], -1) * seen[..., None]).flatten(1)
 
@@ -167,10 +183,16 @@ def nearest(static: StaticScene, others: Neighbours) -> Tensor:
     acceleration, turn rate, whether it is a vehicle, presence."""
     states, present, accel, turn_rate = others.agents
     apart = others.position.square().sum(1).masked_fill(~present, torch.inf)
-    index = apart.topk(min(NEAREST, apart.shape[1]), dim=1, largest=False).indices
-    scalars = torch.stack([others.gap, states[..., 3], accel, turn_rate, static.vehicle, present], 1)
-    table = torch.cat([others.position, others.direction, static.half_size, scalars], 1)
-    return table.gather(2, index[:, None].expand(-1, table.shape[1], -1))
+    scalars = others.gap, states[..., 3], accel, turn_rate, static.vehicle, present
+    columns = [others.position, others.direction, static.half_size, *(value[:, None] for value in scalars)]
+    if torch.compiler.is_compiling():  # for any number of agents; of none but the nearest more than its place
+        apart = torch.nn.functional.pad(apart, (0, NEAREST), value=torch.inf)
+        index = apart.topk(NEAREST, dim=1, largest=False).indices[:, None]
+        columns = [torch.nn.functional.pad(value.to(apart.dtype), (0, NEAREST)) for value in columns]
+        return torch.cat([value.gather(2, index.expand(-1, value.shape[1], -1)) for value in columns], 1)
+    index = apart.topk(min(NEAREST, apart.shape[1]), dim=1, largest=False).indices[:, None]
+    table = torch.cat(columns, 1)
+    return table.gather(2, index.expand(-1, table.shape[1], -1))
 
 
 def agent_features(config: ObservationConfig, ego: EgoState, near: Tensor) -> Tensor:

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from e2rl.sim.dynamics import HOLD, TURN, Arc, along_arc
-from e2rl.sim.static import FrenetPose, StaticScene, look_along
+from e2rl.sim.dynamics import HOLD, TURN, Arc, arc_places
+from e2rl.sim.static import FrenetPose, StaticScene, look_along, seen_from
 
 ACCELERATIONS = (-7.0, -3.5, -1.0, 1.0, 3.5)  # m/s^2, held, never backwards
 OFFSETS = (-2.5, 0.0, 2.5)  # m to the left of the mission
@@ -36,10 +36,11 @@ class Others(NamedTuple):
 
 
 class Manoeuvres(NamedTuple):
-    """The manoeuvres as tensors: accelerations [A] m/s^2, offsets [O, 1] m, times [T] s, fraction [T] of the offset
-    that is reached then, ends [3, 1]: circles of a box along its length."""
+    """The manoeuvres as tensors: accelerations m/s^2 and times s [T A], offsets [O, 1] m, time [T] s, fraction [T] of
+    the offset that is reached then, ends [3, 1]: circles of a box along its length."""
 
     accel: Tensor
+    moment: Tensor
     offset: Tensor
     time: Tensor
     fraction: Tensor
@@ -53,7 +54,8 @@ def manoeuvres_on(device: torch.device) -> Manoeuvres:
         torch.tensor(x, device=device) for x in (ACCELERATIONS, OFFSETS, TIMES, (-1.0, 0.0, 1.0))
     )
     fraction = (time / MOVED_OVER).clamp(max=1)
-    return Manoeuvres(accel, offset[:, None], time, fraction**2 * (3 - 2 * fraction), ends[:, None])
+    every = accel.repeat(len(time)), time.repeat_interleave(len(accel))
+    return Manoeuvres(*every, offset[:, None], time, fraction**2 * (3 - 2 * fraction), ends[:, None])
 
 
 def travelled(speed: Tensor, accel: Tensor, time: Tensor) -> Tensor:
@@ -62,62 +64,72 @@ def travelled(speed: Tensor, accel: Tensor, time: Tensor) -> Tensor:
     return speed * moving + accel * moving**2 / 2
 
 
-def manoeuvres(static: StaticScene, state: Tensor, pose: FrenetPose, rotation: Tensor) -> tuple[Tensor, Tensor]:
-    """Places and directions [B, C, T, 2] of egos [B, 4] in their own frames; C: accelerations x offsets."""
+def manoeuvres(static: StaticScene, state: Tensor, pose: FrenetPose, rotation: Tensor) -> Tensor:
+    """x, y, cosine and sine of the direction [4, B, T, C] of egos [B, 4] in their own frames; C: accelerations x
+    offsets."""
     plan = manoeuvres_on(state.device)
-    distance = travelled(state[:, 3, None, None], plan.accel[:, None], plan.time)
-    xy, heading, *_ = look_along(static, pose.s[:, None] + distance.flatten(1))
-    local = (xy - state[:, None, :2]).bmm(rotation.transpose(1, 2)).unflatten(1, distance.shape[1:])[:, :, None]
-    turned = (heading - state[:, 2:3]).unflatten(1, distance.shape[1:])[:, :, None]
-    along = torch.stack([turned.cos(), turned.sin()], -1)
-    across = pose.d[:, None, None] * (1 - plan.fraction) + plan.offset * plan.fraction
-    left = torch.stack([-along[..., 1], along[..., 0]], -1)
-    place = local + across[:, None, ..., None] * left
-    return place.flatten(1, 2), along.expand_as(place).flatten(1, 2)
+    distance = travelled(state[:, 3:], plan.accel, plan.moment)  # [B, T A]
+    x, y, heading, *_ = look_along(static, pose.s[:, None] + distance)
+    turned = heading - state[:, 2:3]
+    places = *seen_from(state, rotation, x, y), turned.cos(), turned.sin()
+    x, y, cos, sin = (value.unflatten(1, (len(TIMES), -1))[..., None] for value in places)
+    across = (pose.d[:, None, None] * (1 - plan.fraction) + plan.offset * plan.fraction).transpose(1, 2)[:, :, None]
+    found = torch.broadcast_tensors(x - across * sin, y + across * cos, cos, sin)
+    return torch.stack(found).flatten(3)
 
 
-def later(others: Others, time: Tensor) -> tuple[Tensor, Tensor]:
-    """Places and directions [B, T, 2, K] of the others at times [T] s, if they go on along their arcs."""
-    speed, none = others.speed, torch.zeros_like(others.speed)
-    own, _ = along_arc(torch.stack([none, none, none, speed], -1), others.arc, time, HOLD, TURN)  # [B, K, T, 4]
-    ahead, across, heading, _ = own.permute(3, 0, 2, 1)
+def later(others: Others, time: Tensor) -> Tensor:
+    """x, y, cosine and sine of the direction [4, B, T, K] of others at times [T] s, if they go on along their arcs."""
+    arc, speed = Arc(*(value[:, None] for value in others.arc)), others.speed[:, None]
+    none = torch.zeros_like(speed)
+    ahead, across, heading, *_ = arc_places(none, none, none, speed, arc, time[:, None], HOLD, TURN)
     cos, sin = heading.cos(), heading.sin()
-    x, y = others.direction[:, 0, None], others.direction[:, 1, None]
-    moved = torch.stack([x * ahead - y * across, y * ahead + x * across], 2)
-    return others.position[:, None] + moved, torch.stack([x * cos - y * sin, y * cos + x * sin], 2)
+    (x, y), (ux, uy) = (value[:, :, None].unbind(1) for value in (others.position, others.direction))
+    place = x + (ux * ahead - uy * across), y + (uy * ahead + ux * across)
+    return torch.stack([*place, ux * cos - uy * sin, uy * cos + ux * sin])
 
 
-def gaps(place: Tensor, along: Tensor, size: Tensor, others: Others) -> Tensor:
-    """Least gap [B, C, T] m between egos of size [B, 2] at `place`, `along` [B, C, T, 2] and the others then; inf where
-    there are none."""
-    plan, steps = manoeuvres_on(place.device), place.shape[2]
+def gaps(ego: Tensor, size: Tensor, others: Others) -> Tensor:
+    """Least gap [B, T, C] m between egos of size [B, 2] at x, y, cosine, sine [4, B, T, C] and the others then; inf
+    where there are none."""
+    x, y, cos, sin = ego
+    plan = manoeuvres_on(x.device)
     if not others.present.shape[1]:
-        return place.new_full(place.shape[:3], torch.inf)
-    position, direction = (x.flatten(0, 1) for x in later(others, plan.time))  # [B T, 2, K]
-    length, width = others.half_size.repeat_interleave(steps, 0).unbind(1)
-    shift = (length - width).clamp(min=0)[:, None, None] * plan.ends  # [B T, 1, 3, K]
-    centre = (position[:, :, None] + direction[:, :, None] * shift).flatten(2)
-    centre = torch.cat([centre, torch.ones_like(centre[:, :1])], 1).transpose(1, 2)  # [B T, 3 K, 3]
-    own = (size / 2).repeat_interleave(steps, 0)[..., None, None]
+        return torch.full_like(x, torch.inf)
+    place, direction = later(others, plan.time)[..., None, :].chunk(2)  # [2, B, T, 1, K]
+    length, width = others.half_size.unbind(1)
+    shift = (length - width).clamp(min=0)[:, None] * plan.ends  # [B, 3, K]
+    own = (size / 2)[:, :, None, None]
     unit = (own[:, 0] - own[:, 1]).clamp(min=SHORTEST)  # half of the capsule's axis: lengths are in this unit below
-    place, along = (x.permute(0, 2, 3, 1).flatten(0, 1) for x in (place, along))  # [B T, 2, C]
-    along = along / unit
-    across = torch.stack([-along[:, 1], along[:, 0]], 1)
-    axes = (torch.cat([axis, -(axis * place).sum(1, True)], 1) for axis in (along, across))  # [B T, 3, C]
-    ahead, across = (centre.bmm(axis) for axis in axes)  # [B T, 3 K, C]
-    beyond = torch.nn.functional.softshrink(ahead, 1.0)
-    front, middle, back = across.square_().addcmul_(beyond, beyond).chunk(3, 1)
-    apart = torch.minimum(torch.minimum(front, middle), back).sqrt_().mul_(unit)
-    absent = ~others.present.repeat_interleave(steps, 0)[..., None]
-    reach = (own[:, 1] + width[..., None]).masked_fill(absent, -torch.inf)
-    return apart.sub_(reach).amin(1).unflatten(0, (-1, steps)).transpose(1, 2)
+    cos, sin = cos / unit, sin / unit
+    centre = place + direction * shift[:, None]  # [2, B, T, 3, K]
+    axes = (torch.stack([*axis, -(axis[0] * x + axis[1] * y)], 2) for axis in ((cos, sin), (-sin, cos)))
+    ahead, across = (_along(centre, axis) for axis in axes)  # [B, T, 3, K, C]
+    if torch.compiler.is_compiling():  # in one pass
+        beyond = (ahead.abs() - 1).clamp(min=0)
+    else:
+        beyond = torch.nn.functional.softshrink(ahead, 1.0)
+    apart = across.square_().addcmul_(beyond, beyond).amin(2).sqrt_().mul_(unit[..., None])
+    reach = (own[:, 1] + width[:, None]).masked_fill(~others.present[:, None], -torch.inf)
+    return apart.sub_(reach[..., None]).amin(2)
+
+
+def _along(points: Tensor, axes: Tensor) -> Tensor:
+    """How far points [2, B, T, 3, K] are along axes [B, T, 3, C] (direction, minus what the ego's place is): [B, T, 3,
+    K, C]."""
+    x, y = points
+    if torch.compiler.is_compiling():
+        ux, uy, rest = axes[:, :, None, None].unbind(-2)
+        return x[..., None] * ux + y[..., None] * uy + rest
+    rows = torch.stack([x, y, torch.ones_like(x)], -1).flatten(2, 3).flatten(0, 1)  # [B T, 3 K, 3]
+    return rows.bmm(axes.flatten(0, 1)).view(*x.shape, -1)
 
 
 def prospects(static: StaticScene, state: Tensor, pose: FrenetPose, rotation: Tensor, others: Others) -> Tensor:
     """[B, PROSPECTS] of every manoeuvre: its least gap, then the time of its first gap below TIGHT, in [-1/3, 1]."""
-    gap, end = gaps(*manoeuvres(static, state, pose, rotation), static.size, others), TIMES[-1] + TIMES[0]
-    first = torch.where(gap < TIGHT, manoeuvres_on(gap.device).time, end).amin(-1) / end
-    return torch.cat([gap.amin(-1).clamp(-1, WIDEST) / WIDEST, first], -1)
+    gap, end = gaps(manoeuvres(static, state, pose, rotation), static.size, others), TIMES[-1] + TIMES[0]
+    first = torch.where(gap < TIGHT, manoeuvres_on(gap.device).time[:, None], end).amin(1) / end
+    return torch.cat([gap.amin(1).clamp(-1, WIDEST) / WIDEST, first], -1)
 
 
 def time_to_contact(observation: Tensor) -> Tensor:

@@ -7,8 +7,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.scenes.recording import VEHICLE
-from e2rl.scenes.route import SPACING, WINDOW, onto_nearer, segment, tangents
-from e2rl.sim.mission import Mission
+from e2rl.scenes.route import SPACING, WINDOW, first_least, onto_nearer, segment, tangents
+from e2rl.sim.mission import Mission, lights_of
 
 
 class FrenetPose(NamedTuple):
@@ -23,15 +23,15 @@ class StaticScene(NamedTuple):
     """Static tensors of B scenes.
 
     mission; segments [B, P - 1, 12]: table of the mission's segments (`segment_table`); row [B, 1]: 0 .. B - 1;
-    light_state [B, T + 1, S]; field [B, G, G], origin [B, 2]: the drivable field; size [B, 2]: length and width of the
-    ego; half_size [B, 2, M]: half lengths and widths of the others; vehicle [B, M] bool; top_speed [B]: the recorded
-    ego's highest speed [m/s].
+    lights [B, T + 1, 2]: states of the mission's lights; field [B, G, G], origin [B, 2]: the drivable field; size
+    [B, 2]: length and width of the ego; half_size [B, 2, M]: half lengths and widths of the others; vehicle [B, M]
+    bool; top_speed [B]: the recorded ego's highest speed [m/s].
     """
 
     mission: Mission
     segments: Tensor
     row: Tensor
-    light_state: Tensor
+    lights: Tensor
     field: Tensor
     origin: Tensor
     size: Tensor
@@ -40,15 +40,30 @@ class StaticScene(NamedTuple):
     top_speed: Tensor
 
 
+OF_MISSION = ("B P 2!", "B P!", "B", "B 2:int64!", "B 2!")
+STATIC = (
+    *OF_MISSION,
+    "B S 12!",
+    "B 1:int64!",
+    "B T 2:int64!",
+    "B G G:float16",
+    *["B 2!"] * 2,
+    "B 2 M",
+    "B M:bool",
+    "B",
+)
+"""Shapes of a StaticScene's tensors in fused functions."""
+
+
 def static_scene(scene: TensorDictBase, mission: Mission) -> StaticScene:
-    """The StaticScene of scenes [B] with these missions; field, lights and sizes are views of the scenes' storage."""
+    """The StaticScene of scenes [B] with these missions; field and sizes are views of the scenes' storage."""
     half_size = (scene["size"][:, 1:].transpose(1, 2) / 2).contiguous()
     row = torch.arange(len(half_size), device=half_size.device)[:, None]
     return StaticScene(
         mission,
         segment_table(mission.points, mission.limit),
         row,
-        scene["light_state"],
+        lights_of(scene["light_state"], mission.light),
         scene["field"],
         scene["field_origin"],
         scene["size"][:, 0],
@@ -61,9 +76,9 @@ def static_scene(scene: TensorDictBase, mission: Mission) -> StaticScene:
 def write_rows(static: StaticScene, rows: Tensor, new: StaticScene) -> None:
     """Overwrite rows [b] of a StaticScene, in place; views of the scenes' storage need no copy."""
     for old, fresh in zip(static.mission, new.mission, strict=True):
-        old[rows] = fresh
-    for name in ("segments", "half_size", "vehicle", "top_speed"):
-        getattr(static, name)[rows] = getattr(new, name)
+        old.index_copy_(0, rows, fresh)
+    for name in ("segments", "lights", "half_size", "vehicle", "top_speed"):
+        getattr(static, name).index_copy_(0, rows, getattr(new, name))
 
 
 def segment_table(points: Tensor, limit: Tensor) -> Tensor:
@@ -91,13 +106,13 @@ def follow(static: StaticScene, xy: Tensor, hint: Tensor) -> FrenetPose:
     """Frenet pose of positions xy [B, 2] on the mission near arc length hint [B]; equals `scene.route.project`."""
     points = static.mission.points
     count = points.shape[1]
-    width, last = min(int(2 * WINDOW / SPACING) + 1, count), count - 2
+    width, last = int(2 * WINDOW / SPACING) + 1, count - 2
     near = hint.clamp(0, SPACING * (count - 1))  # beyond an end of the route, the end is nearest
-    first = ((near - WINDOW) / SPACING).ceil().clamp(0, count - width).long()
-    index = first[:, None] + torch.arange(width, device=first.device)
+    first = ((near - WINDOW) / SPACING).ceil().clamp(max=count - width).clamp(min=0).long()
+    index = (first[:, None] + torch.arange(width, device=first.device)).clamp(max=count - 1)
     gap = rows_at(points, static.row, index) - xy[:, None]
     outside = (SPACING * index - near[:, None]).abs() > WINDOW
-    vertex = first + gap.square().sum(-1).masked_fill(outside, torch.inf).argmin(-1)
+    vertex = first + first_least(gap.square().sum(-1).masked_fill(outside, torch.inf))
     start = torch.stack([vertex - 1, vertex], 1).clamp(0, last)
     table = rows_at(static.segments, static.row, start).transpose(0, 1)
     a, along, unit, length, heading, _ = table.split((2, 2, 2, 1, 1, 4), -1)
@@ -105,17 +120,26 @@ def follow(static: StaticScene, xy: Tensor, hint: Tensor) -> FrenetPose:
     return FrenetPose(s, d, torch.where(second, heading[1, :, 0], heading[0, :, 0]))
 
 
-def look_along(static: StaticScene, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The mission at arc lengths s [B, K]: points [B, K, 2], headings, curvatures (as `scene.route.interpolate`) and
-    speed limits of the nearest vertices; each [B, K]."""
+def look_along(static: StaticScene, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """The mission at arc lengths s [B, K]: x, y, headings, curvatures (as `scene.route.interpolate`) and speed limits
+    of the nearest vertices; each [B, K]."""
     u = s / SPACING
     index = u.floor().clamp(0, static.segments.shape[1] - 1)
     table = rows_at(static.segments, static.row, index.long())
-    a, along, _, rest, limits = table.split((2, 2, 2, 4, 2), -1)
-    tangent, turn = rest[..., 2], rest[..., 3]
+    x, y, ahead_x, ahead_y, _, _, _, _, tangent, turn, before, after = table.unbind(-1)
     t = u - index
     within = t.clamp(0, 1)
     heading = tangent + within * turn
     curvature = torch.where(within == t, turn / SPACING, 0.0)
-    limit = torch.where(u.round() > index, limits[..., 1], limits[..., 0])
-    return a + t[..., None] * along, heading, curvature, limit
+    limit = torch.where(u.round() > index, after, before)
+    return x + t * ahead_x, y + t * ahead_y, heading, curvature, limit
+
+
+def seen_from(ego: Tensor, rotation: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Places x, y [B, K] in the frame of ego states [B, 4], in which `rotation` [B, 2, 2] turns vectors."""
+    x, y = x - ego[:, :1], y - ego[:, 1:2]
+    if torch.compiler.is_compiling():
+        cos, sin = rotation[:, 0].split(1, 1)
+        return cos * x + sin * y, cos * y - sin * x
+    ahead, left = torch.stack([x, y], -1).bmm(rotation.transpose(1, 2)).unbind(-1)
+    return ahead, left

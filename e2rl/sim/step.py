@@ -3,19 +3,19 @@
 Only the ego's motion is integrated; the other agents' states are looked up in given trajectories.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from e2rl.run.fused import fused, is_on, some
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
 from e2rl.sim.neighbours import own_fault
-from e2rl.sim.observation import EgoState, ObservationConfig, Observed, glance, observe
+from e2rl.sim.observation import EGO_STATE, EgoState, features, glance, observe
 from e2rl.sim.reward import reward_terms, rewarded_progress, weighted_sum
-from e2rl.sim.static import StaticScene, follow
-from e2rl.sim.world import Agents, trajectories_at
+from e2rl.sim.static import STATIC, FrenetPose, StaticScene, follow
+from e2rl.sim.world import AGENTS, Agents, trajectories_at
 
 Tracks = tuple[Tensor, Tensor]  # states [B, T+1, N, 4] and presence [B, T+1, N] of all agents
 Outcome = dict[str, Tensor]  # see `step`
@@ -25,18 +25,28 @@ FLAGS = ("contact", "contact_vru", "off_road", "terminated", "truncated")
 class StepConfig(NamedTuple):
     """What a step needs to know of the settings.
 
-    horizon: steps of an episode; end_...: what ends it early; weights [8] of reward.TERMS; low, high [2]: bounds of the
-    action.
+    ends [3] bool: whether contact, leaving the road and leaving the scene end an episode; weights [8] of reward.TERMS;
+    low, high [2]: bounds of the action.
     """
 
-    horizon: int
-    end_on_contact: bool
-    end_off_road: bool
-    end_when_gone: bool
+    ends: Tensor
     weights: Tensor
     low: Tensor
     high: Tensor
-    observation: ObservationConfig
+
+
+class Driven(NamedTuple):
+    """Egos after a step (`EgoState`, whose pose is s, d, heading), and of its outcome reward and progress, each [B];
+    truths [7, B], 0 or 1: FLAGS, and whether the egos are still in the scene and have been on the road."""
+
+    state: Tensor
+    action: Tensor
+    s: Tensor
+    d: Tensor
+    heading: Tensor
+    reward: Tensor
+    progress: Tensor
+    truths: Tensor
 
 
 def step(
@@ -45,7 +55,7 @@ def step(
     tracks: Tracks,
     static: StaticScene,
     config: StepConfig,
-    sense: Callable[..., Observed] = observe,
+    look: bool = True,
     ended: Tensor | None = None,
 ) -> tuple[EgoState, Outcome]:
     """The egos after a step, and the outcome of the step.
@@ -55,31 +65,77 @@ def step(
         given: their actions [B, 2] (acceleration m/s^2, yaw rate rad/s), which are clamped to the bounds; or the
             recording, which they follow, and leave the scene at its end.
         tracks: what all agents do.
-        sense: `observe`, or `glance` where no policy looks.
+        look: whether a policy looks at the observation.
         ended: [B] bool, egos that stay where they are.
 
     Returns:
-        The egos, and observation [B, D] ([B, 0] of a glance), reward, contact (with a vehicle), contact_vru (with
+        The egos, and observation [B, D] ([B, 0] without a look), reward, contact (with a vehicle), contact_vru (with
         another agent), off_road, terminated, truncated and progress (m along the mission since the start), each [B].
     """
-    now = (ego.step + 1).clamp(max=config.horizon)
+    horizon = tracks[0].shape[1] - 1
+    now = (ego.step + 1).clamp(max=horizon)
+    if ended is not None:
+        now = torch.where(ended, ego.step, now)
+    others = Agents(*(value[:, 1:] for value in trajectories_at(*tracks, now)))
+    if not isinstance(given, Tensor):
+        row = static.row[:, 0]
+        given = given[0][row, now, 0], given[1][row, now, 0]
+    elif is_on():
+        stay = torch.zeros_like(ego.present) if ended is None else ended
+        driven = drive(ego, given, now, others, *tracks, static, config, stay)
+        *flags, present, on_road = (driven.truths > 0).unbind()
+        pose = FrenetPose(driven.s, driven.d, driven.heading)
+        moved = EgoState(now, driven.state, driven.action, pose, present, on_road, ego.start_s)
+        seen = features(static, moved, others, now / horizon) if look else ego.state[:, :0]
+        numbers = {"observation": seen, "reward": driven.reward, "progress": driven.progress}
+        return moved, numbers | dict(zip(FLAGS, flags, strict=True))
+    return _step(ego, given, now, others, tracks, static, config, look, ended)
+
+
+@fused(EGO_STATE, "B 2!", "B:int64", AGENTS, "B T N 4!", "B T N:bool!", STATIC, ("3:bool!", "8", "2", "2"), "B:bool")
+def drive(
+    ego: EgoState,
+    given: Tensor,
+    now: Tensor,
+    others: Agents,
+    states: Tensor,
+    known: Tensor,
+    static: StaticScene,
+    config: StepConfig,
+    ended: Tensor,
+) -> Driven:
+    """`step` of actions without a look; now [B] is the step that the egos come to, at which others are met."""
+    moved, of = _step(ego, given, now, others, (states, known), static, config, False, ended)
+    truths = torch.stack([*(of[name] for name in FLAGS), moved.present, moved.been_on_road]).to(given.dtype)
+    return Driven(moved.state, moved.action, *moved.pose, of["reward"], of["progress"], truths)
+
+
+def _step(
+    ego: EgoState,
+    given: Tensor | Tracks,
+    now: Tensor,
+    others: Agents,
+    tracks: Tracks,
+    static: StaticScene,
+    config: StepConfig,
+    look: bool,
+    ended: Tensor | None,
+) -> tuple[EgoState, Outcome]:
+    horizon = tracks[0].shape[1] - 1
     if isinstance(given, Tensor):
         state, present = dynamics.step(ego.state, torch.clamp(given, config.low, config.high)), ego.present
     else:
-        row = static.row[:, 0]
-        known = given[1][row, now, 0]
-        state, present = torch.where(known[:, None], given[0][row, now, 0], ego.state), ego.present & known
+        state, present = torch.where(given[1][:, None], given[0], ego.state), ego.present & given[1]
     action = dynamics.inverse(torch.stack([ego.state, state], 1))[:, 0]
     pose = follow(static, state[:, :2], ego.pose.s + ego.state[:, 3] * DT)
     moved = EgoState(now, state, action, pose, present, ego.been_on_road, ego.start_s)
     if ended is not None:
         stay = ended
         moved = ego.merged(moved, lambda old, new: torch.where(stay.view(-1, *[1] * (new.ndim - 1)), old, new))
-        now, state, action, pose, present, *_ = moved
-    others = Agents(*(value[:, 1:] for value in trajectories_at(*tracks, now)))
-    seen = sense(config.observation, static, moved, others, config.horizon)
+        _, state, action, pose, present, *_ = moved
+    seen = (observe if look else glance)(static, moved, others, now / horizon)
     hit = (seen.neighbours.gap < 0) & others.present & present[:, None]
-    contact, contact_vru = (hit & static.vehicle).any(1), (hit & ~static.vehicle).any(1)
+    contact, contact_vru = some(hit & static.vehicle), some(hit & ~static.vehicle)
     off = seen.beyond > 0
     off_road = off & ego.been_on_road & present
     gone = ~present | (pose.s >= static.mission.end)
@@ -87,31 +143,37 @@ def step(
     fault = own_fault(ego.state[:, 3], seen.neighbours, hit, static, tracks, ego.step)
     progress = rewarded_progress(pose.s - ego.pose.s, seen.limit, static.top_speed)
     terms = reward_terms(progress, touched, fault, off_road, action, ego.action, state[:, 3], seen.limit, pose.d)
+    on_contact, off_the_road, when_gone = config.ends.unbind()
     outcome = {
         "observation": seen.features,
         "reward": weighted_sum(terms, config.weights),
         "contact": contact,
         "contact_vru": contact_vru,
         "off_road": off_road,
-        "terminated": (touched & config.end_on_contact) | (off_road & config.end_off_road),
-        "truncated": (now >= config.horizon) | (gone & config.end_when_gone),
+        "terminated": (touched & on_contact) | (off_road & off_the_road),
+        "truncated": (now >= horizon) | (gone & when_gone),
         "progress": pose.s - ego.start_s,
     }
     return moved._replace(present=~gone, been_on_road=ego.been_on_road | ~off), outcome
 
 
 def hold_step(
-    function: Callable[..., tuple[EgoState, Outcome]], hold: int, sense: Callable[..., Observed], ego: EgoState, *given
+    hold: int,
+    look: bool,
+    ego: EgoState,
+    given: Tensor | Tracks,
+    tracks: Tracks,
+    static: StaticScene,
+    config: StepConfig,
 ) -> tuple[EgoState, Outcome]:
-    """`hold` steps of function (`step`) under one action: rewards are summed, flags are of any step; `sense` is for the
-    last.
+    """`hold` times `step` under one action: rewards are summed, flags are of any step; a policy looks after the last.
 
     Egos whose episode ends stay at that moment, which is also the one they observe; the others observe the last one.
     """
-    ego, outcome = function(ego, *given, sense if hold == 1 else glance)
+    ego, outcome = step(ego, given, tracks, static, config, look and hold == 1)
     for last in range(2, hold + 1):
         ended = outcome["terminated"] | outcome["truncated"]
-        ego, later = function(ego, *given, sense if last == hold else glance, ended)
+        ego, later = step(ego, given, tracks, static, config, look and last == hold, ended)
         flags = {name: outcome[name] | (later[name] & ~ended) for name in FLAGS}
         outcome = later | flags | {"reward": outcome["reward"] + later["reward"].masked_fill(ended, 0)}
     return ego, outcome

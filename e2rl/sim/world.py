@@ -94,6 +94,10 @@ class Agents(NamedTuple):
     turn_rate: Tensor
 
 
+AGENTS = ("B M 4", "B M:bool", "B M", "B M")
+"""Shapes of Agents' tensors in fused functions."""
+
+
 class Trajectories:
     """Trajectories states [B, T+1, N, 4], valid [B, T+1, N] of B running scenes.
 
@@ -121,7 +125,8 @@ class Trajectories:
         if len(index) == len(self.states):
             self.states.copy_(scene["logged"]), self.valid.copy_(scene["logged_valid"])
         else:
-            self.states[index], self.valid[index] = scene["logged"][index], scene["logged_valid"][index]
+            self.states.index_copy_(0, index, scene["logged"].index_select(0, index))
+            self.valid.index_copy_(0, index, scene["logged_valid"].index_select(0, index))
         waiting, self._scheduled = self._scheduled, []
         for rows, states, valid in waiting:
             now = torch.isin(rows, index)
@@ -152,8 +157,10 @@ def trajectories_at(states: Tensor, valid: Tensor, step: Tensor) -> Agents:
 
     Acceleration and turn rate are differences of speed and heading over the last step, 0 without a last step.
     """
-    row, before = torch.arange(len(step), device=step.device), (step - 1).clamp(min=0)
-    now, there = states[row, step], valid[row, step]
-    change = now[..., 2:] - states[row, before, :, 2:]
-    known = there & valid[row, before]
+    first = torch.arange(0, valid.shape[0] * valid.shape[1], valid.shape[1], device=step.device)
+    at = torch.cat([first + step, first + (step - 1).clamp(min=0)])  # whole rows are copied faster than picked numbers
+    now, before = states.flatten(0, 1).index_select(0, at).chunk(2)
+    there, was = valid.flatten(0, 1).index_select(0, at).chunk(2)
+    change = now[..., 2:] - before[..., 2:]
+    known = there & was
     return Agents(now, there, change[..., 1] / DT * known, wrap(change[..., 0]) / DT * known)

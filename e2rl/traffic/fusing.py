@@ -1,4 +1,4 @@
-"""The fused functions of rollouts: what `compile` of a configuration means, before the first rollout."""
+"""The fused functions of rollouts and learning: what `compile` of a configuration means, before the first rollout."""
 
 import sys
 
@@ -6,7 +6,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from e2rl.metrics import preventable
-from e2rl.planners import lane_graph_planner
+from e2rl.planners import lane_graph_planner, reference
 from e2rl.prior import bounds, features, free_space, lane_relative, prior
 from e2rl.prior.denoiser import DenoiserSettings, fused_estimate
 from e2rl.prior.lane_relative import SIZE
@@ -15,12 +15,12 @@ from e2rl.run.errors import InputError
 from e2rl.run.fused import FUSED, Fused, check_compiler, has_compiler, switch
 from e2rl.run.processes import cores, in_processes
 from e2rl.scenes import drivable_area, route
-from e2rl.sim import leaders
+from e2rl.sim import leaders, observation, step
 from e2rl.traffic.e2 import anchoring, control, foresight, interception, kernels
 
 MODULES = (
     *(anchoring, bounds, control, drivable_area, features, foresight, free_space, interception, kernels),
-    *(lane_graph_planner, lane_relative, leaders, preventable, prior, route),
+    *(lane_graph_planner, lane_relative, leaders, observation, preventable, prior, reference, route, step),
 )
 
 
@@ -42,7 +42,7 @@ def prepare_fused(config: DictConfig) -> None:
     if on and missing and asked == "auto":
         on = False
         if has_compiler():
-            told = f"compile=true compiles {len(missing)} functions of rollouts, once; then these take half the time"
+            told = f"compile=true compiles {len(missing)} functions, once; then rollouts take half the time"
             print(told, file=sys.stderr)
     elif on and missing:
         check_compiler("compile")

@@ -4,7 +4,7 @@ import torch
 
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import EgoPolicy
-from e2rl.planners.reference import AGENTS, Trunk, reference_action
+from e2rl.planners.reference import AGENTS, Largest, Trunk, reference_action
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.observation import NEAREST, OBSERVATION_SIZE, PER_AGENT
 from tests.synthetic import make_scenes
@@ -70,3 +70,12 @@ def test_the_rest_of_the_scene_counts_and_a_last_layer_of_zeros_says_nothing():
     (gradient,) = torch.autograd.grad(Trunk((32,), 8, 1, last_gain=1.0)(seen).sum(), seen)
     assert (gradient[: AGENTS.start] != 0).all() and (gradient[AGENTS.stop :] != 0).all()
     assert torch.equal(Trunk((32, 16), 8, 2, last_gain=0.0)(seen), torch.zeros(2))
+
+
+def test_the_gradient_of_the_largest_is_shared_among_equals():
+    values = torch.randint(3, (4, 5, 6), dtype=torch.float32).requires_grad_()
+    weight = torch.randn(4, 6)
+    (own,), (other,) = (
+        torch.autograd.grad((f(values) * weight).sum(), values) for f in (Largest.apply, lambda x: x.amax(1))
+    )
+    torch.testing.assert_close(own, other)

@@ -23,10 +23,10 @@ def others(*cars):
 
 
 def straight_on(speed, accel=0.0):
-    """One manoeuvre of an ego that drives straight on: places, directions [1, 1, T, 2]."""
+    """One manoeuvre of an ego that drives straight on: x, y, cosine, sine [4, 1, T, 1]."""
     way = travelled(torch.tensor(speed), torch.tensor(accel), torch.tensor(TIMES))
-    place = torch.stack([way, torch.zeros_like(way)], -1)[None, None]
-    return place, torch.tensor([1.0, 0.0]).expand_as(place)
+    none = torch.zeros_like(way)
+    return torch.stack([way, none, none + 1, none])[:, None, :, None]
 
 
 def test_the_way_is_driven_to_the_halt_and_never_backwards():
@@ -44,32 +44,32 @@ def polygon(x, y, heading):
 def test_gaps_are_those_of_the_boxes_but_for_rounded_corners(seed):
     generator = torch.Generator().manual_seed(seed)
     poses = torch.rand(40, 3, generator=generator) * torch.tensor([30.0, 16.0, 6.3]) - torch.tensor([5.0, 8.0, 0.0])
-    place, along = straight_on(9.0)
+    ego = straight_on(9.0)
     rounded = 2 * (2**0.5 - 1) * CAR[1] / 2
     for pose in poses.tolist():
-        found = gaps(place, along, torch.tensor([CAR]), others((*pose, 0.0, 0.0)))[0, 0]
-        boxes = [polygon(x, 0.0, 0.0) for x in place[0, 0, :, 0].tolist()]
+        found = gaps(ego, torch.tensor([CAR]), others((*pose, 0.0, 0.0)))[0, :, 0]
+        boxes = [polygon(x, 0.0, 0.0) for x in ego[0, 0, :, 0].tolist()]
         exact = torch.tensor([box.distance(polygon(*pose)) for box in boxes], dtype=torch.float32)
         apart = exact > 0
         assert (found[apart] >= exact[apart] - 1e-3).all() and (found[apart] <= exact[apart] + rounded + 0.1).all()
 
 
 def test_others_keep_their_acceleration_for_a_second_then_their_speed():
-    place, along = straight_on(0.0)
+    ego = straight_on(0.0)
     size = torch.tensor([CAR])
-    found = gaps(place, along, size, others((20.0, 0.0, torch.pi, 5.0, -2.0)))[0, 0]
+    found = gaps(ego, size, others((20.0, 0.0, torch.pi, 5.0, -2.0)))[0, :, 0]
     way = [5 * t - t**2 if t <= 1 else 4 + 3 * (t - 1) for t in TIMES]
     assert found.tolist() == pytest.approx([20 - driven - CAR[0] for driven in way], abs=0.05)
 
 
 def test_who_turns_goes_on_turning():
     """The gap to a car in a curve is the one to the same car placed where its arc leads."""
-    place, along = straight_on(0.0)
+    ego = straight_on(0.0)
     size, pose, speed, curvature = torch.tensor([CAR]), (12.0, -14.0, 1.4), 6.0, 0.06
-    found = gaps(place, along, size, others((*pose, speed, 0.0, curvature)))[0, 0]
+    found = gaps(ego, size, others((*pose, speed, 0.0, curvature)))[0, :, 0]
     arc = Arc(torch.tensor(0.0), torch.tensor(curvature))
     path, _ = along_arc(torch.tensor([*pose, speed]), arc, torch.tensor(TIMES[:4]))
-    standing = [gaps(place, along, size, others((*state[:3], 0.0, 0.0)))[0, 0, 0] for state in path.tolist()]
+    standing = [gaps(ego, size, others((*state[:3], 0.0, 0.0)))[0, 0, 0] for state in path.tolist()]
     torch.testing.assert_close(found[:4], torch.stack(standing))
 
 

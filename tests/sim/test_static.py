@@ -38,7 +38,8 @@ def test_the_pose_is_the_projection_on_the_mission():
 def test_the_way_ahead_is_interpolated_with_its_limit():
     static, mission, draw = winding()
     s = 160 * torch.rand(BATCH, 40, generator=draw) - 20
-    xy, heading, curvature, limit = look_along(static, s)
+    x, y, heading, curvature, limit = look_along(static, s)
+    xy = torch.stack([x, y], -1)
     for found, value in zip((xy, heading, curvature), interpolate(mission.points, s), strict=True):
         assert torch.allclose(found, value, atol=1e-5)
     assert torch.equal(limit, limit_at(mission, s))

@@ -4,10 +4,12 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from e2rl.planners.actor import ActorEgo
 from e2rl.planners.lane_graph_planner import LaneGraphEgo
 from e2rl.run import fused
 from e2rl.run.errors import InputError
 from e2rl.run.fused import FUSED, Fused, has_compiler, is_on, switched_off
+from e2rl.sim.observation import OBSERVATION_SIZE
 from e2rl.traffic.fusing import MODULES, prepare_fused
 from tests.traffic.e2.traffic_scenes import drive, scenes, synthesizer
 
@@ -40,6 +42,9 @@ def test_compiled_rollouts_are_the_eager_ones_to_millimetres(capsys):
         run = each._run
         each.__dict__["_run"] = lambda flat, run=run, name=each.name: called.add(name) or run(flat)
     fast = drive(scene_set, on, 2.0, ego=ego)
+    actor = ActorEgo()
+    drive(scene_set, on, 2.0, ego=actor)
+    actor.network.network.trunk(torch.zeros(2, OBSERVATION_SIZE)).sum().backward()
     assert torch.equal(eager.valid, fast.valid) and torch.equal(eager.adversaries, fast.adversaries)
     assert (eager.states[..., :2] - fast.states[..., :2]).abs().max() < 2e-3
     torch.testing.assert_close(eager.transport_adversary, fast.transport_adversary, rtol=1e-3, atol=1e-3)
