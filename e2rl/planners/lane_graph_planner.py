@@ -102,13 +102,23 @@ def collision_hazard(ego: Tensor, ego_size: Tensor, others: Prediction, slope: f
     low, high = (bound(1)[others.scene] for bound in (centre.amin, centre.amax))  # [J, T, 2], of all profiles
     beside = torch.maximum(low - at, at - high).clamp(min=0)
     j, t = (_squared(beside, torch.zeros_like(beside)) < cut.square()).nonzero(as_tuple=True)
-    near = _squared(centre[others.scene[j], :, t], at[j, t][:, None]) < cut[j, t].square()[:, None]
+    near = profiles_near(ego, others.poses, cut, j, t, others.scene[j])
     pair, profile = near.nonzero(as_tuple=True)
     pairs, hazard = torch.stack([j[pair], t[pair], profile, others.scene[j[pair]]]), ego.new_zeros(batch * count)
+    poses, other_poses = ego.flatten(0, 2), others.poses.flatten(0, 1)
     for j, t, c, b in pairs.split(CHUNK, 1):
-        each = hazard_of(ego[b, c, t], ego_size[b], others.poses[j, t], others.size[j], weight[t])
-        hazard.index_add_(0, b * count + c, each)
+        row = b * count + c
+        mine, its = poses.index_select(0, row * times + t), other_poses.index_select(0, j * times + t)
+        sizes = ego_size.index_select(0, b), others.size.index_select(0, j)
+        hazard.index_add_(0, row, hazard_of(mine, sizes[0], its, sizes[1], weight.index_select(0, t)))
     return hazard.view(batch, count)
+
+
+@fused("B C T 3!", "J T 3!", "J T", "S:int64", "S:int64", "S:int64")
+def profiles_near(ego: Tensor, other: Tensor, cut: Tensor, j: Tensor, t: Tensor, b: Tensor) -> Tensor:
+    """1 where profiles [S, C] of scenes b are within the cut of others j at times t, else 0."""
+    apart = _squared(ego[..., :2][b, :, t], other[..., :2][j, t][:, None])
+    return torch.where(apart < cut[j, t].square()[:, None], 1.0, 0.0)
 
 
 @fused("Q 3", "Q 2", "Q 3", "Q 2", "Q")

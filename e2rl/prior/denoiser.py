@@ -126,6 +126,13 @@ class Denoiser(nn.Module):
 
     def encode(self, nodes: Tensor, pairs: Tensor, present: Tensor) -> Encoding:
         """Encoding of node features [B, V, NODE], pair features [B, V, V, EDGE] and presence [B, V]."""
+        if self.training or not is_on():
+            return self.encoding(nodes, pairs, present)
+        node, pair, *rest = fused_encoding(self.settings)(nodes, pairs, present, *self._read)
+        return Encoding(node, pair, rest[: self.settings.blocks], rest[self.settings.blocks :])
+
+    def encoding(self, nodes: Tensor, pairs: Tensor, present: Tensor) -> Encoding:
+        """`encode`, operation by operation."""
         node = self.encode_node(((nodes - self.node_mean) / self.node_std).clamp(-6, 6))
         pair = self.encode_pair(pairs)
         absent = torch.zeros_like(present, dtype=pair.dtype).masked_fill(~present, -1e4)[:, None, None, :]
@@ -162,30 +169,45 @@ class Denoiser(nn.Module):
         return alpha * x + sigma * self.head(h).to(x.dtype)
 
 
-class _Estimate(nn.Module):
-    """`Denoiser.estimate` as a module of its own, for `functional_call`."""
+class _Module(nn.Module):
+    """A method of a Denoiser as a module of its own, for `functional_call`."""
 
-    def __init__(self, network: Denoiser) -> None:
+    def __init__(self, settings: DenoiserSettings, method: str) -> None:
         super().__init__()
-        self.network = network
+        self.network, self.method = Denoiser(settings).eval(), method
+        self.names = [name for name, _ in (*self.named_parameters(), *self.named_buffers())]
+        self.sizes = [" ".join(map(str, value.shape)) for value in self.network._read]
 
-    def forward(self, *given: Any) -> Tensor:
-        return self.network.estimate(*given)
+    def forward(self, *given: Any) -> Any:
+        return getattr(self.network, self.method)(*given)
+
+    def call(self, weights: Iterable[Tensor], *given: Any) -> Any:
+        """The method with these weights and constants."""
+        return torch.func.functional_call(self, dict(zip(self.names, weights, strict=True)), given)
 
 
 @cache
 def fused_estimate(settings: DenoiserSettings) -> Fused:
     """`Denoiser.estimate` of networks of these sizes: of x, level, nodes, pairs, biases, modulations and weights."""
-    module = _Estimate(Denoiser(settings).eval())
-    names = [name for name, _ in (*module.named_parameters(), *module.named_buffers())]
-    sizes = [" ".join(map(str, value.shape)) for value in module.network._read]
+    module, blocks = _Module(settings, "estimate"), settings.blocks
 
     def denoise(x: Tensor, level: Tensor, nodes: Tensor, pairs: Tensor, *given: Tensor) -> Tensor:
-        biases, modulations = given[: settings.blocks], given[settings.blocks : 2 * settings.blocks]
-        encoding = Encoding(nodes, pairs, list(biases), list(modulations))
-        weights = dict(zip(names, given[2 * settings.blocks :], strict=True))
-        return torch.func.functional_call(module, weights, (x, level, encoding))
+        encoding = Encoding(nodes, pairs, list(given[:blocks]), list(given[blocks : 2 * blocks]))
+        return module.call(given[2 * blocks :], x, level, encoding)
 
-    scene = [f"B V {settings.width}", f"B V V {settings.pair}", *[f"B {settings.heads} V V"] * settings.blocks]
-    scene += [f"B V {6 * settings.width}"] * settings.blocks
-    return Fused(denoise, (f"B V {SIZE}", "1 V", *scene, *sizes), constants=len(sizes))
+    scene = [f"B V {settings.width}", f"B V V {settings.pair}", *[f"B {settings.heads} V V"] * blocks]
+    scene += [f"B V {6 * settings.width}"] * blocks
+    return Fused(denoise, (f"B V {SIZE}", "1 V", *scene, *module.sizes), constants=len(module.sizes))
+
+
+@cache
+def fused_encoding(settings: DenoiserSettings) -> Fused:
+    """`Denoiser.encoding` of networks of these sizes: nodes, pairs, biases and modulations."""
+    module = _Module(settings, "encoding")
+
+    def encode(nodes: Tensor, pairs: Tensor, present: Tensor, *weights: Tensor) -> tuple[Tensor, ...]:
+        found = module.call(weights, nodes, pairs, present)
+        return found.nodes, found.pairs, *found.biases, *found.modulations
+
+    scene = f"B V {NODE}", f"B V V {EDGE}", "B V:bool"
+    return Fused(encode, (*scene, *module.sizes), constants=len(module.sizes))

@@ -234,7 +234,9 @@ def _leaders_ahead(routed: RoutedScene, s: Tensor, agents: Tensor, present: Tens
     """`leaders_ahead`, of scenes in which nobody has moved those of a Context."""
     if known is None:
         return leaders_ahead(routed, s, agents, present)
-    moved = (s != known.state.s) | (routed.points != known.routed.points).flatten(2).any(-1)
+    moved = s != known.state.s
+    if routed.points is not known.routed.points:
+        moved = moved | (routed.points != known.routed.points).flatten(2).any(-1)
     rows = moved.any(1).nonzero()[:, 0]
     if not len(rows):
         return known.followed

@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from e2rl.prior.lane_relative import LaneState, locate
+from e2rl.run.fused import fused
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED
 from e2rl.scenes.route import SPACING, interpolate, project
 from e2rl.sim.dynamics import wrap
@@ -129,16 +130,30 @@ def _conflicts(points: Tensor, rows: Tensor) -> tuple[tuple[Tensor, ...], tuple[
     vehicles, count, _ = line.shape
     flat = line.reshape(-1, 2)
     flat = flat - flat.mean(0)
-    near = torch.cdist(flat.view(vehicles, count, 2)[rows].flatten(0, 1), flat) < CONFLICT_GAP
-    near = near.view(len(rows), count, vehicles, count)
-    meets = near.any(3)  # [C, K, V]: this vertex of a row's route meets the other route somewhere
-    first, other = meets.float().argmax(1), near.any(1).float().argmax(2)  # one point, unless they share a stretch
-    conflict = meets.any(1) & (rows[:, None] != torch.arange(vehicles, device=rows.device))
+    apart = torch.cdist(flat.view(vehicles, count, 2)[rows].flatten(0, 1), flat)
+    meets, first, other = first_conflicts(apart.view(len(rows), count, vehicles, count))
+    conflict = meets & (rows[:, None] != torch.arange(vehicles, device=rows.device))
     tangent = torch.gradient(line, dim=1)[0]
     angle = torch.atan2(tangent[..., 1], tangent[..., 0])
     crossing = (angle.gather(1, other.T).T - angle[rows].gather(1, first) + torch.pi) % (2 * torch.pi) - torch.pi
     spacing = SPACING * CONFLICT_STRIDE
     return (conflict, first * spacing, crossing), (conflict, other * spacing, wrap(-crossing))
+
+
+@fused("C K V K")
+def first_conflicts(apart: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Whether lines [C, V] are in conflict, of their distances [C, K, V, K], and the first vertex of each that is."""
+    if torch.compiler.is_compiling():  # without truth values, which are slow
+        left = torch.arange(apart.shape[1], 0, -1, dtype=apart.dtype, device=apart.device)
+        own, others = (
+            torch.where(apart < CONFLICT_GAP, each, 0.0).amax((1, 3)) for each in (left[:, None, None], left)
+        )
+        count = apart.shape[1]
+        return own > 0, torch.where(own > 0, count - own, 0.0).long(), torch.where(own > 0, count - others, 0.0).long()
+    near = apart < CONFLICT_GAP
+    meets = near.any(3)  # [C, K, V]: this vertex of a row's route meets the other route somewhere
+    # The first of several points, where they share a stretch.
+    return meets.any(1), meets.float().argmax(1), near.any(1).float().argmax(2)
 
 
 FEATURES = 16

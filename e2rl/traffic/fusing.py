@@ -7,8 +7,8 @@ from tqdm import tqdm
 
 from e2rl.metrics import preventable
 from e2rl.planners import lane_graph_planner, reference
-from e2rl.prior import bounds, features, free_space, lane_relative, prior
-from e2rl.prior.denoiser import DenoiserSettings, fused_estimate
+from e2rl.prior import bounds, features, free_space, lane_relative, prior, routes
+from e2rl.prior.denoiser import DenoiserSettings, fused_encoding, fused_estimate
 from e2rl.prior.lane_relative import SIZE
 from e2rl.prior.sde import SamplerSettings, fused_controlled_step, fused_step
 from e2rl.run.errors import InputError
@@ -20,7 +20,7 @@ from e2rl.traffic.e2 import anchoring, control, foresight, interception, kernels
 
 MODULES = (
     *(anchoring, bounds, control, drivable_area, features, foresight, free_space, interception, kernels),
-    *(lane_graph_planner, lane_relative, leaders, observation, preventable, prior, reference, route, step),
+    *(lane_graph_planner, lane_relative, leaders, observation, preventable, prior, reference, route, routes, step),
 )
 
 
@@ -35,8 +35,9 @@ def prepare_fused(config: DictConfig) -> None:
         raise InputError(f"compile={asked}: choose one of auto, true, false")
     names = {module.__name__ for module in MODULES}
     found = [each for each in FUSED.values() if each.function.__module__ in names]
-    sampler = SamplerSettings()
-    found += fused_estimate(DenoiserSettings()), fused_step(sampler, SIZE), fused_controlled_step(sampler, SIZE, False)
+    sampler, network = SamplerSettings(), DenoiserSettings()
+    found += fused_encoding(network), fused_estimate(network)
+    found += fused_step(sampler, SIZE), fused_controlled_step(sampler, SIZE, False)
     missing = [each for each in found if not each.file.exists()]
     on = asked is not False and config.device == "cpu"
     if on and missing and asked == "auto":

@@ -185,6 +185,8 @@ class AdversarialSynthesizer(Transform):
         """States [B, V, H, 4] planned for the steps after `step` [B]; the last state is held."""
         age = (step - self._planned_at.clamp(min=0)).clamp(min=0)
         ahead = (age[:, None] + torch.arange(HORIZON, device=age.device)).clamp(max=HORIZON - 1)
+        if bool((age == age[0]).all()):  # as where all scenes are replanned together
+            return self._plan.index_select(2, ahead[0])
         row = torch.arange(len(age), device=age.device)[:, None]
         return self._plan.transpose(1, 2)[row, ahead].transpose(1, 2)
 
