@@ -57,28 +57,47 @@ def leaders_at(
 ) -> Leaders:
     """`leaders` at T moments at once, fields [B, V, T]: agents [B, M, T, 4], the vehicles at s all the while."""
     moments = agents.shape[2]
-    length, width = size[:, : s.shape[1]].unbind(-1)
-    reach = width / 2 + margin + (torch.zeros_like(s) if d is None else d.abs())
+    reach = size[:, : s.shape[1], 1] / 2 + margin + (torch.zeros_like(s) if d is None else d.abs())
     room = reach[..., None] + size.norm(dim=-1)[:, None] / 2
-    scene, vehicle, other, moment, vertex = _near_pairs(points, s, agents[..., :2], room, present)
-    own, them = (scene, vehicle), (scene, other)
-    agent, box = agents[scene, other, moment], size[them]
+    pairs = scene, vehicle, other, moment, _ = _near_pairs(points, s, agents[..., :2], room, present)
+    aside = torch.zeros_like(s) if d is None else d
+    gap, along, leads = ahead_of(s, aside, agents, size, points, s.new_tensor(margin), *pairs)
+    table = gap.new_full((*s.shape, moments, agents.shape[1]), free_gap)
+    pair = scene, vehicle, moment, other
+    nearest, index = table.index_put(pair, torch.where(leads > 0, gap, free_gap)).min(-1)
+    speed = torch.zeros_like(table).index_put(pair, along).gather(-1, index[..., None])[..., 0]
+    speed = torch.where(nearest < free_gap, speed, agents[:, : s.shape[1], :, 3])
+    return Leaders(nearest.clamp(max=free_gap), speed, index)
+
+
+@fused("B V", "B V", "B X T 4!", "B X 2!", "B V P 2!", "", *["Q:int64"] * 5)
+def ahead_of(
+    s: Tensor,
+    d: Tensor,
+    agents: Tensor,
+    size: Tensor,
+    points: Tensor,
+    margin: Tensor,
+    scene: Tensor,
+    vehicle: Tensor,
+    other: Tensor,
+    moment: Tensor,
+    vertex: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Of pairs [Q] of a vehicle and an agent at a moment, by the nearest vertex of the vehicle's route: the gap m, the
+    agent's speed along the route m/s, and 1 where it is a leader (see `leaders`), else 0."""
+    own = scene, vehicle
+    agent, box = agents[scene, other, moment], size[scene, other]
     at, offset, heading = onto_segments(agent[:, :2], vertex, points.shape[2] - 2, lambda index: points[*own, index])
     turn = agent[:, 2] - heading
     cos, sin = torch.cos(turn), torch.sin(turn)
-    side = width[own] / 2 + (box[:, 0] * sin.abs() + box[:, 1] * cos.abs()) / 2 + margin
+    length, width = size[scene, vehicle].unbind(-1)
+    side = width / 2 + (box[:, 0] * sin.abs() + box[:, 1] * cos.abs()) / 2 + margin
     ahead = at - s[own]
-    gap = ahead - length[own] / 2 - (box[:, 0] * cos.abs() + box[:, 1] * sin.abs()) / 2
-    if d is not None:
-        low, high = d[own].clamp(max=0), d[own].clamp(min=0)
-        offset = offset - torch.minimum(torch.maximum(offset, low), high)
-    leads = (offset.abs() < side) & (ahead > 0)
-    table = gap.new_full((*s.shape, moments, agents.shape[1]), free_gap)
-    pair = scene, vehicle, moment, other
-    nearest, index = table.index_put(pair, torch.where(leads, gap, free_gap)).min(-1)
-    speed = torch.zeros_like(table).index_put(pair, agent[:, 3] * cos).gather(-1, index[..., None])[..., 0]
-    speed = torch.where(nearest < free_gap, speed, agents[:, : s.shape[1], :, 3])
-    return Leaders(nearest.clamp(max=free_gap), speed, index)
+    gap = ahead - length / 2 - (box[:, 0] * cos.abs() + box[:, 1] * sin.abs()) / 2
+    low, high = d[own].clamp(max=0), d[own].clamp(min=0)
+    offset = offset - torch.minimum(torch.maximum(offset, low), high)
+    return gap, agent[:, 3] * cos, torch.where((offset.abs() < side) & (ahead > 0), 1.0, 0.0)
 
 
 def _near_pairs(points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Tensor) -> tuple[Tensor, ...]:
