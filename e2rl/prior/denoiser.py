@@ -149,7 +149,7 @@ class Denoiser(nn.Module):
 
     def forward(self, x: Tensor, level: Tensor, encoding: Encoding) -> Tensor:
         """Denoised estimate x0 [B, V, SIZE] of x [B, V, SIZE] at noise level [B, V], or [1, V] for all scenes."""
-        if self.training or len(level) > 1 or not is_on():
+        if self.training or len(level) > 1 or not is_on() or (torch.is_grad_enabled() and x.requires_grad):
             return self.estimate(x, level, encoding)
         scene = encoding.nodes, encoding.pairs, *encoding.biases, *encoding.modulations
         return fused_estimate(self.settings)(x, level, *scene, *self._read)
