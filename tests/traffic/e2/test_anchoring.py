@@ -135,11 +135,11 @@ def test_the_time_gap_is_the_missing_distance_over_speed_and_what_the_target_sti
     candidates = anchoring._Candidates(
         one.long(), one, one.bool(), 200 * one, 0 * one, 0 * one, ample, speed, 0 * speed, size
     )
-    steps = torch.ones(1, 1, 1, 50)
+    steps, limits = torch.ones(1, 1, 1, 50), torch.tensor((-3.0, 2.0))
     target = anchoring._Target(30.5 * steps, beside * steps, slack * steps, crossing * steps, torch.full((1, 1), 2.0))
-    cost, gap, _ = anchoring._score(candidates, torch.zeros(1, 1, 1, 1), target, AnchorSettings())
+    cost, gap, _ = anchoring.scored(candidates, torch.zeros(1, 1, 1, 1), target, limits)
     expected = max(0.5 - slack, 0.0) / 10 + abs(beside) * crossing
     assert gap.item() == pytest.approx(expected, abs=1e-4) and cost.item() == pytest.approx(expected, abs=1e-4)
     shifted = candidates._replace(d=-0.4 * one)
-    cost, gap, _ = anchoring._score(shifted, torch.full((1, 1, 1, 1), -1.5), target, AnchorSettings())
+    cost, gap, _ = anchoring.scored(shifted, torch.full((1, 1, 1, 1), -1.5), target, limits)
     assert (cost - gap).item() == pytest.approx(0.2 * 1.5 + 0.05 * 0.4, abs=1e-5)
