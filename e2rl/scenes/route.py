@@ -62,11 +62,9 @@ def project(
     hint, window: see `nearest_vertex`. Leading dims broadcast. Beyond the ends the route goes on straight.
     """
     lead = route.shape[:-2]
-    if is_on() and window == WINDOW and torch.broadcast_shapes(points.shape[:-2], lead) == lead:
-        rows, route = points.expand(*lead, *points.shape[-2:]).flatten(0, -3), route.flatten(0, -3)
-        near = None if hint is None else hint.expand(*lead, rows.shape[1]).flatten(0, -2)
-        found = project_rows(rows, route) if near is None else project_near(rows, route, near)
-        return tuple(value.view(*lead, points.shape[-2]) for value in found)
+    if is_on() and hint is None and torch.broadcast_shapes(points.shape[:-2], lead) == lead:
+        rows = points.expand(*lead, *points.shape[-2:]).flatten(0, -3)
+        return tuple(value.view(*lead, points.shape[-2]) for value in project_rows(rows, route.flatten(0, -3)))
     return _project(points, route, hint, window)
 
 
@@ -79,12 +77,6 @@ def _project(points: Tensor, route: Tensor, hint: Tensor | None, window: float) 
 def project_rows(points: Tensor, route: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`project` of points [R, K, 2] on routes [R, P, 2]."""
     return _project(points, route, None, WINDOW)
-
-
-@fused("R K 2", "R P 2!", "R K")
-def project_near(points: Tensor, route: Tensor, hint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`project_rows` near hints [R, K]."""
-    return _project(points, route, hint, WINDOW)
 
 
 def onto_segments(

@@ -6,9 +6,12 @@ from omegaconf import OmegaConf
 
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.lane_graph_planner import LaneGraphEgo
+from e2rl.prior.free_space import decode_plans
+from e2rl.prior.lane_relative import SIZE, LaneState
 from e2rl.run import fused
 from e2rl.run.errors import InputError
 from e2rl.run.fused import FUSED, Fused, has_compiler, is_on, switched_off
+from e2rl.scenes.route import SPACING
 from e2rl.sim.observation import OBSERVATION_SIZE
 from e2rl.traffic.fusing import MODULES, prepare_fused
 from tests.traffic.e2.traffic_scenes import drive, scenes, synthesizer
@@ -42,6 +45,13 @@ def test_compiled_rollouts_are_the_eager_ones_to_millimetres(capsys):
         run = each._run
         each.__dict__["_run"] = lambda flat, run=run, name=each.name: called.add(name) or run(flat)
     fast = drive(scene_set, on, 2.0, ego=ego)
+    torch.manual_seed(0)
+    x, points, moving = torch.rand(1, 2, SIZE), SPACING * torch.arange(40.0), LaneState(*torch.rand(10, 1, 2))
+    given = x, moving, torch.stack([points, 0 * points], -1).expand(1, 2, -1, -1), torch.tensor([[True, False]])
+    for one, other in zip(
+        *(vars(decode(*given)).values() for decode in (decode_plans, decode_plans.function)), strict=True
+    ):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
     actor = ActorEgo()
     drive(scene_set, on, 2.0, ego=actor)
     actor.network.network.trunk(torch.zeros(2, OBSERVATION_SIZE)).sum().backward()
