@@ -38,10 +38,9 @@ class IDMEgo(Ego):
         """The current IDM acceleration held for the whole plan, within the path's speed caps."""
         path, speed = MissionPath(world), world.states[:, 0, 3]
         caps = path.speed_caps(self.desired_speed, self.braking, self.use_limits, lights=False)
-        found = leaders(
-            path.s[:, None], path.route[:, None], world.states, world.scene["size"], world.valid, free_gap=torch.inf
-        )
-        gap, leading = found.gap[:, 0], found.speed[:, 0].clamp(min=0)
+        now, size = world.states[:, :, None], world.scene["size"]
+        found = leaders(path.s[:, None], path.route[:, None], now, size, world.valid, free_gap=torch.inf)
+        gap, leading = found.gap[:, 0, 0], found.speed[:, 0, 0].clamp(min=0)
         light = path.stop_distance(self.braking) + self.standstill_gap
         gap, leading = torch.minimum(gap, light), torch.where(light < gap, 0.0, leading)
         desired = torch.full_like(path.s, self.desired_speed)

@@ -116,34 +116,37 @@ def _meeting_braking(motion: LaneState, state: LaneState, obstacles: Obstacles, 
     vehicles, duty = state.v.shape[1], obstacles.duty
     others = constant_velocity(obstacles.agents[:, vehicles:], DT * (steps + 1))
     own, driven = motion.states()[:, :, steps], motion.s[..., steps] - state.s[..., None]
-    there = obstacles.size[:, :vehicles], obstacles.size, obstacles.present[:, :vehicles], obstacles.present
+    sizes = obstacles.size[:, :vehicles], obstacles.size
+    here = obstacles.present[:, :vehicles]
+    plans = Plans(own, torch.cat([own, others], 1), driven, *sizes, here, obstacles.present, steps + 1)
     length = (obstacles.size[:, :vehicles, 0] + obstacles.size[:, :1, 0]) / 2
     if duty is None:  # nobody is behind the ego by any duty
-        none = torch.zeros_like(there[2])
+        none = torch.zeros_like(here)
         duty, length = Duty(none, none, torch.zeros_like(length)), torch.full_like(length, -torch.inf)
-    return braking_for_meetings(own, torch.cat([own, others], 1), driven, *there, steps + 1, state.v, length, duty)
+    return braking_for_meetings(plans, state.v, length, duty)
 
 
-@fused(
-    *("B V K 4", "B N K 4", "B V K", "B V 2", "B N 2", "B V:bool", "B N:bool", "K:int64", "B V", "B V"),
-    ("B V:bool", "B V:bool", "B V"),
-)
-def braking_for_meetings(
-    own: Tensor,
-    everybody: Tensor,
-    driven: Tensor,
-    own_size: Tensor,
-    size: Tensor,
-    here: Tensor,
-    present: Tensor,
-    steps: Tensor,
-    speed: Tensor,
-    length: Tensor,
-    duty: Duty,
-) -> Tensor:
+class Plans(NamedTuple):
+    """Vehicles and everybody after steps [K]: own [B, V, K, 4] and everybody [B, N, K, 4], their states; driven
+    [B, V, K] m; own_size [B, V, 2], size [B, N, 2]; whether vehicles are here [B, V] and agents present [B, N]."""
+
+    own: Tensor
+    everybody: Tensor
+    driven: Tensor
+    own_size: Tensor
+    size: Tensor
+    here: Tensor
+    present: Tensor
+    steps: Tensor
+
+
+PLANS = ("B V K 4", "B N K 4", "B V K", "B V 2", "B N 2", "B V:bool", "B N:bool", "K:int64")
+
+
+@fused(PLANS, "B V", "B V", ("B V:bool", "B V:bool", "B V"))
+def braking_for_meetings(plans: Plans, speed: Tensor, length: Tensor, duty: Duty) -> Tensor:
     """`meeting_braking` [B, V] for the `first_meeting`."""
-    meeting = first_meeting(own, everybody, driven, own_size, size, here, present, steps)
-    return meeting_braking(meeting, speed, length, duty)
+    return meeting_braking(first_meeting(plans), speed, length, duty)
 
 
 class Meeting(NamedTuple):
@@ -157,20 +160,9 @@ class Meeting(NamedTuple):
     happens: Tensor
 
 
-def first_meeting(
-    own: Tensor,
-    everybody: Tensor,
-    driven: Tensor,
-    own_size: Tensor,
-    size: Tensor,
-    here: Tensor,
-    present: Tensor,
-    steps: Tensor,
-) -> Meeting:
-    """Where boxes of vehicles, wider by LATERAL_MARGIN on both sides, first overlap those of everybody.
-
-    own, everybody: states after steps [K], when vehicles have driven so many m; size, whether present.
-    """
+def first_meeting(plans: Plans) -> Meeting:
+    """Where boxes of vehicles, wider by LATERAL_MARGIN on both sides, first overlap those of everybody."""
+    own, everybody, driven, own_size, size, here, present, steps = plans
     vehicles = own.shape[1]
     wide = torch.stack([own_size[..., 0], own_size[..., 1] + 2 * LATERAL_MARGIN], -1)
     meets = overlap(own[:, :, None], wide[:, :, None, None], everybody[:, None], size[:, None, :, None])

@@ -10,7 +10,7 @@ from e2rl.scenes.recording import DT, LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
 from e2rl.scenes.route import SPACING, interpolate
 from e2rl.scenes.smoothing import PAST
 from e2rl.sim.dynamics import constant_velocity
-from e2rl.sim.leaders import FREE_GAP, IDMParameters, Leaders, idm_acceleration, leaders_at
+from e2rl.sim.leaders import FREE_GAP, IDMParameters, Leaders, idm_acceleration, leaders
 from e2rl.sim.mission import light_state_at
 
 CURVATURE_AT = (0.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)  # m ahead
@@ -75,7 +75,7 @@ def leaders_ahead(routed: RoutedScene, s: Tensor, agents: Tensor, present: Tenso
     """Leaders [B, V, 3] of vehicles at arc lengths s [B, V] once agents [B, N, 4] have kept their velocity for
     LEADER_AT."""
     there = constant_velocity(agents, torch.tensor(LEADER_AT, device=agents.device))
-    return leaders_at(s, routed.points, there, routed.size, present)
+    return leaders(s, routed.points, there, routed.size, present)
 
 
 def _light_features(routed: RoutedScene, state: LaneState, step: Tensor) -> list[Tensor]:

@@ -175,20 +175,8 @@ def fused_controlled_step(settings: SamplerSettings, size: int, limited: bool) -
     """
     sampler, temperature = settings.on(NoiseSchedule()), settings.temperature
 
-    def step(
-        x: Tensor,
-        x0: Tensor,
-        nominal: Tensor,
-        past: Tensor,
-        past_nominal: Tensor,
-        last: Tensor,
-        high: Tensor,
-        low: Tensor,
-        noise: Tensor,
-        kl: Tensor,
-        log_ratio: Tensor,
-        budget: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def step(*given: Tensor) -> tuple[Tensor, ...]:
+        x, x0, nominal, past, past_nominal, last, high, low, noise, kl, log_ratio, budget = given
         moved, variance = sampler.step(x, x0, high, low, noise, (past, last))
         plain = sampler.step(x, nominal, high, low, noise, (past_nominal, last))[0]
         variance = variance * temperature**2

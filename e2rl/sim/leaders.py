@@ -21,7 +21,8 @@ STRETCH = 10  # vertices
 
 # Called, because a field `index` of a class statement hides tuple.index for the type checker.
 class Leaders(NamedTuple("Leaders", [("gap", Tensor), ("speed", Tensor), ("index", Tensor)])):
-    """Per vehicle [B, V]: bumper-to-bumper gap [m], speed of the leader along the route [m/s], index of the leader."""
+    """Per vehicle and moment [B, V, T]: gap from bumper to bumper [m], the leader's speed along the route [m/s], its
+    index."""
 
 
 def leaders(
@@ -36,26 +37,13 @@ def leaders(
 ) -> Leaders:
     """The nearest agent ahead of each vehicle whose box is within `margin` m of the vehicle's lateral range.
 
-    s [B, V]: arc lengths of the vehicles on their routes points [B, V, P, 2]; agents [B, M, 4], size [B, M, 2] and
-    present [B, M]: of all agents, the vehicles in rows 0..V-1. A vehicle's lateral range is its width around the route;
-    with offsets d [B, V] it also covers the distance from the offset back to the route. Without a leader nearer than
-    `free_gap` m, the gap is `free_gap` and the speed is the vehicle's own.
+    Fields [B, V, T]: at T moments of the agents.
+
+    s [B, V]: arc lengths of the vehicles on their routes points [B, V, P, 2], where they are all the while; agents
+    [B, M, T, 4], size [B, M, 2] and present [B, M]: of all agents, the vehicles in rows 0..V-1. A vehicle's lateral
+    range is its width around the route; with offsets d [B, V] it also covers the distance from the offset back to the
+    route. Without a leader nearer than `free_gap` m, the gap is `free_gap` and the speed is the vehicle's own.
     """
-    found = leaders_at(s, points, agents[:, :, None], size, present, d, margin, free_gap)
-    return Leaders(*(value[..., 0] for value in found))
-
-
-def leaders_at(
-    s: Tensor,
-    points: Tensor,
-    agents: Tensor,
-    size: Tensor,
-    present: Tensor,
-    d: Tensor | None = None,
-    margin: float = GATE_MARGIN,
-    free_gap: float = FREE_GAP,
-) -> Leaders:
-    """`leaders` at T moments at once, fields [B, V, T]: agents [B, M, T, 4], the vehicles at s all the while."""
     moments = agents.shape[2]
     reach = size[:, : s.shape[1], 1] / 2 + margin + (torch.zeros_like(s) if d is None else d.abs())
     room = reach[..., None] + size.norm(dim=-1)[:, None] / 2

@@ -114,7 +114,9 @@ class IDM(Traffic):
         """IDM acceleration [B, V] behind the leader or the light, whichever brakes harder."""
         vehicles = lane.v.shape[1]
         length = routed.size[:, :vehicles, 0]
-        gap, speed, _ = leaders(lane.s, routed.points, world.states, routed.size, world.valid, lane.d)
+        now = world.states[:, :, None]
+        gap, speed, _ = leaders(lane.s, routed.points, now, routed.size, world.valid, lane.d)
+        gap, speed = gap[..., 0], speed[..., 0]
         gap = torch.where(gap < FREE_GAP, gap, torch.inf)
         at = (lane.s / SPACING).round().long().clamp(0, routed.limit.shape[-1] - 1)
         limit = routed.limit.gather(-1, at[..., None])[..., 0]

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from e2rl.scenes.route import project
-from e2rl.sim.leaders import FREE_GAP, IDMParameters, desired_gap, idm_acceleration, leaders
+from e2rl.sim.leaders import FREE_GAP, IDMParameters, Leaders, desired_gap, idm_acceleration, leaders
 from tests.prior.small import arc
 
 LENGTH, WIDTH = 4.0, 2.0
@@ -15,8 +15,8 @@ def lead(agents):
     """Leaders of the first of agents (x, y, heading, speed), whose route is the x axis."""
     agents = torch.tensor(agents, dtype=torch.float32)[None]
     size, present = torch.tensor([LENGTH, WIDTH]).expand(1, agents.shape[1], 2), torch.ones(agents.shape[:2]).bool()
-    found = leaders(agents[:, :1, 0] + 20.0, arc(0.0, 0.0, 0.0, 0.0)[None, None], agents, size, present)
-    return tuple(value[0] for value in found)
+    found = leaders(agents[:, :1, 0] + 20.0, arc(0.0, 0.0, 0.0, 0.0)[None, None], agents[:, :, None], size, present)
+    return tuple(value[0, :, 0] for value in found)
 
 
 def test_the_gap_is_between_bumpers_of_the_nearest():
@@ -61,7 +61,8 @@ def test_pruned_pairs_are_those_that_could_not_lead(vehicles, offsets, free_gap)
     present, d = draw(batch, count) < 0.8, 6 * (draw(batch, vehicles) - 0.5) * offsets
     given = (60 * draw(batch, vehicles), points, agents, size, present)
     expected = all_pairs(*given, d, 0.5, free_gap)
-    found = leaders(*given, d if offsets else None, 0.5, free_gap)
+    at = (*given[:2], agents[:, :, None], *given[3:], d if offsets else None, 0.5, free_gap)
+    found = Leaders(*(value[..., 0] for value in leaders(*at)))
     led = expected[0] < free_gap
     assert led.sum() > 40 and torch.equal(found.index[led], expected[2][led])
     torch.testing.assert_close(found.gap, expected[0], rtol=0, atol=1e-4)
