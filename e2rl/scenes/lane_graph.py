@@ -231,6 +231,13 @@ LANE_REACH = 2.5  # m from a lane's centreline within which a vehicle is on it
 ALONG = 0.866  # cosine between a heading and a lane, either way, above which a vehicle drives along it: 30 degrees
 
 
+def packed(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Indices [B, S] of the true ones of each row of rows [B, M], first come those, and which of the S they are [B, S]."""
+    count = rows.sum(1)
+    there = torch.arange(int(count.max()), device=rows.device) < count[:, None]
+    return torch.zeros_like(there, dtype=torch.long).masked_scatter(there, rows.nonzero()[:, 1]), there
+
+
 def against_lanes(points: Tensor, lane: Tensor, xy: Tensor, heading: Tensor) -> Tensor:
     """Bool [B, K, H]: of the lanes along which vehicles at xy [B, K, 2] of heading [B, K, H] drive, either way round,
     the nearest runs against them.
@@ -239,12 +246,12 @@ def against_lanes(points: Tensor, lane: Tensor, xy: Tensor, heading: Tensor) -> 
     """
     start, end = points[:, :-1], points[:, 1:]
     low, high = xy.amin(1, keepdim=True) - LANE_REACH, xy.amax(1, keepdim=True) + LANE_REACH
-    inside = ((start > low) & (start < high)).all(-1).any(0)  # maps are large, and vehicles in one part of them
-    same = (lane[:, 1:] == lane[:, :-1]) & (lane[:, 1:] >= 0)
-    start, end, same = (value[:, inside] for value in (start, end, same))
+    inside = ((start > low) & (start < high)).all(-1) & (lane[:, 1:] == lane[:, :-1]) & (lane[:, 1:] >= 0)
+    place, there = packed(inside)  # maps are large, and vehicles in one part of them
+    start, end = (value.gather(1, place[..., None].expand(-1, -1, 2)) for value in (start, end))
     length = (end - start).norm(dim=-1).clamp(min=1e-6)
     ahead = (end - start) / length[..., None]
-    near = (torch.cdist(xy, start) < LANE_REACH) & same[:, None]
+    near = (torch.cdist(xy, start) < LANE_REACH) & there[:, None]
     b, k, segment = near.nonzero(as_tuple=True)  # few of them are near
     towards = torch.stack([heading[b, k].cos(), heading[b, k].sin()], -1)
     cosine = (towards * ahead[b, segment][:, None]).sum(-1)

@@ -19,7 +19,7 @@ from e2rl.prior.sde import NoiseSchedule
 from e2rl.run.fused import fused
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.drivable_area import off_road
-from e2rl.scenes.lane_graph import against_lanes
+from e2rl.scenes.lane_graph import against_lanes, packed
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import interpolate, project
 from e2rl.sim.world import World
@@ -193,13 +193,15 @@ class Attack:
         tracks = tracks.gather(1, plans[..., None, None].expand(*plans.shape, *tracks.shape[2:]))
         at = torch.stack([(at - 5).clamp(min=0), at], -1)
         pose = tracks.gather(2, at[..., None].expand(*at.shape, 4)).flatten(1, 2)
+        scene, of = self.row.unique(return_inverse=True)
+        own = of == torch.arange(len(scene), device=of.device)[:, None]  # [S, G]
+        place, there = packed(own)
+        place = torch.where(there, place, place[:, :1])
+        every = pose[place].flatten(1, 2)
+        lanes = (self.world.scene[name][scene] for name in ("lane_points", "lane_index"))
+        found = against_lanes(*lanes, every[..., :2], every[..., 2, None]).view(*place.shape, -1)
         wrong = torch.zeros(pose.shape[:2], dtype=torch.bool, device=pose.device)
-        points, line = self.world.scene["lane_points"], self.world.scene["lane_index"]
-        for scene in self.row.unique().tolist():  # maps are large
-            mine = self.row == scene
-            flat = pose[mine].flatten(0, 1)[None]
-            found = against_lanes(points[scene, None], line[scene, None], flat[..., :2], flat[..., 2, None])[..., 0]
-            wrong[mine] = found.view(-1, pose.shape[1])
+        wrong[place[there]] = found[there]
         return wrong.view(at.shape).any(-1)
 
 
