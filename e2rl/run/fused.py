@@ -17,7 +17,7 @@ import shutil
 import sys
 import warnings
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import cache, cached_property, lru_cache
@@ -65,12 +65,12 @@ class Fused:
         """What the function returns: a tensor, or a tuple, a named tuple or a dataclass of them."""
         if not is_on():
             return self.function(*given)
-        flat = [tensor for value in given for tensor in _tensors(value)]
+        flat = _tensors(given)
         varied = len(flat) - self.constants
         if not self._fits(flat[:varied]):
             return self.function(*given)
-        read = [given.laid_out(value) for given, value in zip(self.declared, flat[:varied], strict=False)]
-        found = self._run([*read, *flat[varied:]])
+        read = [each.laid_out(value) for each, value in zip(self.declared, flat[:varied], strict=False)]
+        found = self._run(read + flat[varied:])
         return found[0] if self.returns is Tensor else self.returns(*found) if _made(self.returns) else tuple(found)
 
     def _fits(self, flat: list[Tensor]) -> bool:
@@ -243,8 +243,10 @@ class _Declared(NamedTuple):
 
     def laid_out(self, value: Tensor) -> Tensor:
         """The tensor as compiled code reads it."""
-        value = value.float() if self.truth else value
-        return value.movedim(-1, 0).contiguous() if self.apart else value.contiguous()
+        if self.apart or self.truth:
+            value = value.float() if self.truth else value
+            value = value.movedim(-1, 0) if self.apart else value
+        return value.contiguous()
 
     def as_given(self, value: Tensor) -> Tensor:
         """The tensor that was laid out."""
@@ -259,8 +261,7 @@ def _made(kind: Any) -> bool:
 
 def _kinds(kind: Any) -> list[Any]:
     """The types of what a dataclass or a named tuple holds."""
-    names = [each.name for each in fields(kind)] if is_dataclass(kind) else kind._fields
-    return [get_type_hints(kind)[name] for name in names]
+    return [get_type_hints(kind)[name] for name in _names(kind)]
 
 
 def _count(kind: Any) -> int:
@@ -271,11 +272,23 @@ def _built(kind: Any, rest: Iterator[Tensor]) -> Any:
     return kind(*(_built(each, rest) for each in _kinds(kind))) if _made(kind) else next(rest)
 
 
-def _tensors(value: Any) -> Iterable[Tensor]:
+def _tensors(value: Any) -> list[Tensor]:
     if isinstance(value, Tensor):
-        return (value,)
-    parts = [getattr(value, each.name) for each in fields(value)] if is_dataclass(value) else value
-    return [tensor for part in parts for tensor in _tensors(part)]
+        return [value]
+    found = []
+    kind: Any = type(value)
+    for part in [getattr(value, name) for name in _names(kind)] if is_dataclass(value) else value:
+        if isinstance(part, Tensor):
+            found.append(part)
+        else:
+            found += _tensors(part)
+    return found
+
+
+@cache
+def _names(kind: Any) -> list[str]:
+    """The names of what a dataclass or a named tuple holds."""
+    return [each.name for each in fields(kind)] if is_dataclass(kind) else list(kind._fields)
 
 
 def _primes() -> Iterator[int]:

@@ -232,7 +232,7 @@ ALONG = 0.866  # cosine between a heading and a lane, either way, above which a 
 
 
 def packed(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Indices [B, S] of the true ones of each row of rows [B, M], first come those, and which of the S they are [B, S]."""
+    """Indices [B, S] of what is true in rows [B, M], filled up by 0, and bool [B, S]: which are no filling."""
     count = rows.sum(1)
     there = torch.arange(int(count.max()), device=rows.device) < count[:, None]
     return torch.zeros_like(there, dtype=torch.long).masked_scatter(there, rows.nonzero()[:, 1]), there

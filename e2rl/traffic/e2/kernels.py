@@ -198,8 +198,8 @@ class Attack:
         place, there = packed(own)
         place = torch.where(there, place, place[:, :1])
         every = pose[place].flatten(1, 2)
-        lanes = (self.world.scene[name][scene] for name in ("lane_points", "lane_index"))
-        found = against_lanes(*lanes, every[..., :2], every[..., 2, None]).view(*place.shape, -1)
+        points, line = self.world.scene["lane_points"][scene], self.world.scene["lane_index"][scene]
+        found = against_lanes(points, line, every[..., :2], every[..., 2, None]).view(*place.shape, -1)
         wrong = torch.zeros(pose.shape[:2], dtype=torch.bool, device=pose.device)
         wrong[place[there]] = found[there]
         return wrong.view(at.shape).any(-1)
