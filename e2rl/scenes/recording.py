@@ -17,7 +17,6 @@ LIGHTS = {  # by the upper-case names in logs
 }
 DT = 0.1  # s, the time step of every recording, scene and simulation
 HISTORY = 10  # frames of history before a start frame that is chosen here
-MIRRORED = "~mirrored"  # ends the ids of logs in a mirror
 MAX_NAME = 128  # characters of the name of a scene, a place or a data set
 
 
@@ -85,17 +84,6 @@ class Recording:
                 return
         for start in starts:
             yield replace(self, current=start, scene_id=f"{self.scene_id}@{start}")
-
-    def mirrored(self) -> "Recording":
-        """Returns the traffic in a mirror, y to -y: who turned left turns right, and left-hand traffic keeps right."""
-        states = self.states * np.array([1.0, -1.0, -1.0, 1.0])
-        mirror = np.array([1.0, -1.0])
-        lanes = {
-            name: replace(lane, points=lane.points * mirror, left=lane.right, right=lane.left)
-            for name, lane in self.lanes.items()
-        }
-        drivable = [ring * mirror for ring in self.drivable]
-        return replace(self, scene_id=f"{self.scene_id}{MIRRORED}", states=states, lanes=lanes, drivable=drivable)
 
     def validate_names(self) -> "Recording":
         """Returns self; raises InputError for a name that is no short text: files, tables and messages hold it."""

@@ -34,6 +34,7 @@ from e2rl.scenes.recording import Recording
 from e2rl.scenes.scene import SceneSet, validate
 from e2rl.scenes.scene_cache import Index, cached, uncached
 from e2rl.scenes.scene_list import listed_scenes
+from e2rl.scenes.variants import check_variants, variant_of
 
 OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are left out
 VERSION = 5  # of the scene builder: raise it when the same recording would make another scene
@@ -62,14 +63,13 @@ class Source(Extension, ABC):
     """Where recordings come from. A subclass is a dataclass whose fields are the keys of its YAML file.
 
     It defines `logs` and `read`, and `fingerprint` where its scenes are to be cached. path: file or folder of the logs,
-    for sources that need one; the other settings of every source: conf/data/source.yaml. Of a log in a mirror the place
-    is the log's.
+    for sources that need one; the other settings of every source: conf/data/source.yaml.
     """
 
     path: str | None = None
     split: str | None = default_of("split")
     starts: tuple[int, ...] | None = default_of("starts", optional=True)
-    mirror: bool = default_of("mirror")
+    variants: tuple[str, ...] = default_of("variants")
     skip_invalid: bool = default_of("skip_invalid")
     cache: str | None = default_of("cache")
     cache_gb: float = default_of("cache_gb", low=0.0)
@@ -85,6 +85,7 @@ class Source(Extension, ABC):
         if isinstance(self.build, Mapping):
             self.build = settings_of(BuildSettings, self.build, "data.build")
         check_settings(self, "data")
+        check_variants(self.variants)
 
     @abstractmethod
     def logs(self) -> list[str]:
@@ -147,10 +148,10 @@ class Source(Extension, ABC):
         with self.named(log):
             for recording in self.read(log):
                 recording.validate_names()
-                if self.mirror:  # both are of one place, or else of one log
+                if len(self.variants) > 1:  # all are of one place, or else of one log
                     recording = replace(recording, location=recording.location or recording.scene_id)
-                for each in (recording, recording.mirrored()) if self.mirror else (recording,):
-                    yield list(each.windows(self.starts, self.build.steps))
+                for name in self.variants:
+                    yield list(variant_of(recording, name).windows(self.starts, self.build.steps))
 
     @contextmanager
     def named(self, log: str) -> Iterator[None]:
