@@ -176,6 +176,8 @@ class Source(Extension, ABC):
         try:
             rows = [row for windows in self._windows(log) for row in self._rows(log, windows)]
         except InputError as error:
+            if isinstance(error.__cause__, ImportError):  # no log can be read
+                raise
             return [Row(log, reason=str(error))]
         return rows or [Row(log, reason=TOO_SHORT)]
 

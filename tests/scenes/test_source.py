@@ -227,6 +227,20 @@ def test_what_reading_a_log_raises_is_told_where_the_source_knows_what_to_do(tmp
         Mended(str(tmp_path), cache=str(tmp_path), workers=1).load()
 
 
+class Unread(Mended):
+    extra = "files"
+
+    def read(self, log: str) -> Iterator[Recording]:
+        raise ImportError("No module named 'files'")
+
+
+def test_a_library_that_is_missing_ends_the_load_whatever_may_be_skipped(tmp_path):
+    (tmp_path / "a.txt").write_text("5.0")
+    (tmp_path / "b.txt").write_text("5.0")
+    with pytest.raises(InputError, match=r"a\.txt: a library of its reader .* pip install 'e2rl\[files\]'"):
+        Unread(str(tmp_path), cache=str(tmp_path), workers=1, skip_invalid=True).load()
+
+
 def test_split_chooses_only_where_a_source_has_splits(tmp_path):
     bundled = BundledSource(cache=str(tmp_path / "cache"), workers=1, build=BuildSettings(field_cells=32, steps=20))
     assert load_scenes(bundled, 1).split == "test" and load_scenes(bundled, 1, split="tune").split == "tune"
