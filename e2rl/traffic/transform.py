@@ -95,11 +95,12 @@ class AdversarialSynthesizer(Transform):
     def _begin_reaction(self, reaction: Reaiming, rows: Tensor) -> None:
         """Who reacts in the new episodes of environments rows [b]."""
         env, drawn = self._env, self._drawn[rows]
-        adversarial = self.pool.adversarial[drawn] & (self.pool.source[drawn] != LIVE)
+        eta = self.pool.eta[drawn] * (self.pool.source[drawn] != LIVE)
+        attack = eta.to(env.device), self.pool.template[drawn].to(env.device)
         if len(rows) == len(self._drawn):
             self._next_reaction = env.clock
         rows = rows.to(env.device)
-        reaction.begin(rows, adversarial.to(env.device), self._stored_adversaries()[rows], env.horizon)
+        reaction.begin(rows, *attack, self._stored_adversaries()[rows], env.horizon)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         if self.traffic is not None:

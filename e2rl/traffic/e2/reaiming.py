@@ -32,7 +32,7 @@ from e2rl.traffic.e2.interception import (
 )
 from e2rl.traffic.e2.motion import TOP_SPEED
 from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, YieldingSettings, duty_of, leading
-from e2rl.traffic.traffic import REPLAN_STEPS
+from e2rl.traffic.traffic import REPLAN_STEPS, SINGLE
 
 MOMENTS = 10  # at which the ego may be met, one every 0.5 s
 CHECKED, RUN_ON = 3, 2.0  # points of a path that must be drivable, evenly spaced in time, for at least so many s
@@ -175,33 +175,46 @@ class ReactSettings:
 
     fraction: float = setting(low=0, high=1)
     others: float = setting(low=0, high=1)
-    eta: tuple[float, float] = setting(low=0)
+    eta: tuple[float, float] | None = setting(low=0, optional=True)
     scatter: float = setting(low=0)
     responsibility: str = setting(choices=RESPONSIBILITIES)
     reckless: float = setting(low=0, high=1)
 
     def __post_init__(self) -> None:
-        if not self.eta[0] <= self.eta[1]:
+        if self.eta is not None and not self.eta[0] <= self.eta[1]:
             raise InputError(f"learner.react.eta={list(self.eta)}: expected the lowest and the highest intensity")
 
 
 def drawn(
-    settings: ReactSettings, adversarial: Tensor, adversaries: Tensor, horizon: int, generator: torch.Generator
+    settings: ReactSettings,
+    eta: Tensor,
+    template: Tensor,
+    adversaries: Tensor,
+    horizon: int,
+    generator: torch.Generator,
 ) -> TensorDict:
-    """The part of the traffic in b new episodes of `horizon` steps: start [b]: step from which on vehicles react
-    (NEVER: they do not), eta [b], count [b] of them, others [b] bool: not the traffic's own adversaries; reckless [b]
-    bool: they owe the ego nothing; rank [b, V]: random, the lowest react; adversaries [b, V]; vehicle [b, MOST] and
-    acts [b, MOST]: who they are, nobody yet; chosen [b]."""
+    """The part of the traffic in b new episodes of `horizon` steps, of attacks of eta [b] (0: none), template [b] and
+    adversaries [b, V].
+
+    start [b]: step from which on vehicles react (NEVER: they do not), eta [b], count [b] of them, others [b] bool: not
+    the traffic's own adversaries; reckless [b] bool: they owe the ego nothing; rank [b, V]: random, the lowest react;
+    adversaries [b, V]; vehicle [b, MOST] and acts [b, MOST]: who they are, nobody yet; chosen [b].
+    """
     size, device = adversaries.shape, adversaries.device
     draws = torch.rand(size[0], 6 + size[1], generator=generator).to(device)
     reacts, others, when, how, many, reckless = draws[:, :6].unbind(1)
     start = (when * LATEST * horizon).long()
-    low, high = settings.eta
+    count = 1 + (many * MOST).long()
+    if settings.eta is None:
+        count = torch.where(template == SINGLE, 1, MOST)
+    else:
+        low, high = settings.eta
+        eta = torch.where(eta > 0, low + (high - low) * how, 0.0)
     nobody = torch.zeros(size[0], MOST, dtype=torch.int64, device=device)
     part = {
-        "start": torch.where(adversarial & (reacts < settings.fraction), start, NEVER),
-        "eta": low + (high - low) * how,
-        "count": 1 + (many * MOST).long(),
+        "start": torch.where((eta > 0) & (reacts < settings.fraction), start, NEVER),
+        "eta": eta,
+        "count": count,
         "others": others < settings.others,
         "reckless": reckless < settings.reckless,
         "rank": draws[:, 6:],
@@ -240,12 +253,12 @@ class Reaiming:
         self.law = Law(settings.responsibility)
         self._part: TensorDict | None = None  # [B] `drawn`
 
-    def begin(self, rows: Tensor, adversarial: Tensor, adversaries: Tensor, horizon: int) -> None:
+    def begin(self, rows: Tensor, eta: Tensor, template: Tensor, adversaries: Tensor, horizon: int) -> None:
         """Draws for new episodes of environments rows [b] whether, who and when.
 
-        adversarial [b] bool: replayed traffic with an intensity; adversaries [b, V] bool: of that traffic.
+        eta [b]: of replayed attacks, 0 of other traffic; template [b], adversaries [b, V] bool: of these attacks.
         """
-        part = drawn(self.settings, adversarial, adversaries, horizon, self.generator)
+        part = drawn(self.settings, eta, template, adversaries, horizon, self.generator)
         if self._part is None or len(part) == len(self._part):
             self._part = part  # the first reset is of all environments
         else:

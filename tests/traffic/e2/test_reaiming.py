@@ -14,8 +14,19 @@ from e2rl.sim import dynamics
 from e2rl.sim.dynamics import Arc, along_arc
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.traffic.e2.interception import MAX_CURVATURE, InterceptionSettings
-from e2rl.traffic.e2.reaiming import LATEST, Ground, Law, ReactSettings, Reaiming, best_aim, moments, surroundings
+from e2rl.traffic.e2.reaiming import (
+    LATEST,
+    Ground,
+    Law,
+    ReactSettings,
+    Reaiming,
+    best_aim,
+    drawn,
+    moments,
+    surroundings,
+)
 from e2rl.traffic.pool import TrafficPool
+from e2rl.traffic.traffic import FULL, PAIR, SINGLE
 from e2rl.traffic.transform import AdversarialSynthesizer
 from tests.traffic.e2.crossing import make_world
 from tests.traffic.e2.traffic_scenes import scenes
@@ -80,6 +91,16 @@ def test_other_vehicles_that_move_near_the_ego_react(scene_set):
     full = driven(pool, scene_set, ReactSettings(fraction=1.0, others=1.0))
     leads = (tracks(full) != pool.parts[0].states[:, 1:]).any(-1)[..., 4]
     assert not leads.any(), "under full responsibility none that leads the ego's way"
+
+
+def test_the_attack_s_intensity_and_template_may_say_how_they_react():
+    eta, template = torch.tensor([0.0, 0.5, 2.5, 2.5]), torch.tensor([FULL, SINGLE, SINGLE, PAIR])
+    given = torch.ones(4, 6, dtype=torch.bool), STEPS, torch.Generator().manual_seed(0)
+    part = drawn(ReactSettings(fraction=1.0, eta=None), eta, template, *given)
+    assert torch.equal(part["eta"], eta) and part["count"][1:].tolist() == [1, 1, 2]
+    assert ((part["start"] < STEPS) == (eta > 0)).all()
+    part = drawn(ReactSettings(fraction=1.0, eta=(1.0, 1.0)), eta, template, *given)
+    assert part["eta"].tolist() == [0.0, 1.0, 1.0, 1.0]
 
 
 # --- the law: closed forms, its limits, the drivable area, and what it owes the ego and others
