@@ -24,7 +24,6 @@ LIGHTS = slice(ROUTE.stop, ROUTE.stop + 8)
 PROBED = LIGHTS.stop + len(PROBE_X) * len(PROBE_Y)
 AGENTS = slice(PROBED, PROBED + PER_AGENT * NEAREST)
 
-DESIRED_SPEED = 12.0  # m/s without a known limit
 PURSUIT_TIME, PURSUIT_MIN, PURSUIT_MAX = 1.5, 6.0, 30.0  # s, m, m: look-ahead of the pursuit
 ACCELERATION, BRAKING, HARDEST_BRAKING = 1.5, 2.5, 7.0  # m/s^2
 HEADWAY, STANDSTILL_GAP, EXPONENT = 1.2, 3.0, 4.0  # s, m
@@ -48,8 +47,7 @@ def reference_rows(observation: Tensor) -> Tensor:
     route = observation[..., ROUTE].unflatten(-1, (len(LOOK_AHEAD), 5))
     speed = ego[..., 0] * SPEED
     path = torch.stack([route[..., 0] * FAR, route[..., 1] * NEAR], -1)
-    limit = ego[..., 6] * SPEED
-    desired = torch.where(limit > 0, limit, DESIRED_SPEED).clamp(min=1.0)
+    desired = (ego[..., 6] * SPEED).clamp(min=1.0)
     follow = _following(speed[..., None], desired[..., None], *_leaders(observation, path)).amin(-1)
     accel = torch.minimum(follow, _capped(route, speed)).clamp(-HARDEST_BRAKING, ACCELERATION)
     accel = torch.maximum(accel, -speed / REACTION)  # no braking at standstill, as in recordings
@@ -89,7 +87,7 @@ def _pursuit(path: Tensor, speed: Tensor) -> Tensor:
 def _capped(route: Tensor, speed: Tensor) -> Tensor:
     """Acceleration [...] that reaches the speed cap by limits and curves ahead within REACTION."""
     ahead, curvature, limit = route.new_tensor(LOOK_AHEAD), route[..., 3].abs() / 10, route[..., 4] * SPEED
-    squared = torch.minimum(LATERAL / curvature.clamp(min=1e-3), torch.where(limit > 0, limit, torch.inf) ** 2)
+    squared = torch.minimum(LATERAL / curvature.clamp(min=1e-3), limit**2)
     allowed = (squared + 2 * BRAKING * (ahead - speed[..., None] * REACTION).clamp(min=0)).amin(-1).sqrt()
     return (allowed - speed) / REACTION
 

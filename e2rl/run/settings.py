@@ -121,7 +121,8 @@ def check_settings(made: Any, where: str) -> None:
             continue
         if rule["choices"]:
             check_choice(_dotted(where, each.name), value, rule["choices"])
-        for number in () if rule["choices"] else value if isinstance(value, tuple) else (value,):
+            continue
+        for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, int | float):
                 check_range(_dotted(where, each.name), number, rule["low"], rule["high"])
 

@@ -234,7 +234,8 @@ ALONG = 0.866  # cosine between a heading and a lane, either way, above which a 
 def packed(rows: Tensor) -> tuple[Tensor, Tensor]:
     """Indices [B, S] of what is true in rows [B, M], filled up by 0, and bool [B, S]: which are no filling."""
     count = rows.sum(1)
-    there = torch.arange(int(count.max()), device=rows.device) < count[:, None]
+    most = int(count.max()) if len(count) else 0
+    there = torch.arange(most, device=rows.device) < count[:, None]
     return torch.zeros_like(there, dtype=torch.long).masked_scatter(there, rows.nonzero()[:, 1]), there
 
 

@@ -34,7 +34,7 @@ from e2rl.scenes.recording import Recording
 from e2rl.scenes.scene import SceneSet, validate
 from e2rl.scenes.scene_cache import Index, cached, uncached
 from e2rl.scenes.scene_list import listed_scenes
-from e2rl.scenes.variants import check_variants, variant_of
+from e2rl.scenes.versions import check_versions, version_of
 
 OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are left out
 VERSION = 5  # of the scene builder: raise it when the same recording would make another scene
@@ -69,7 +69,7 @@ class Source(Extension, ABC):
     path: str | None = None
     split: str | None = default_of("split")
     starts: tuple[int, ...] | None = default_of("starts", optional=True)
-    variants: tuple[str, ...] = default_of("variants")
+    versions: tuple[str, ...] = default_of("versions")
     skip_invalid: bool = default_of("skip_invalid")
     cache: str | None = default_of("cache")
     cache_gb: float = default_of("cache_gb", low=0.0)
@@ -85,7 +85,7 @@ class Source(Extension, ABC):
         if isinstance(self.build, Mapping):
             self.build = settings_of(BuildSettings, self.build, "data.build")
         check_settings(self, "data")
-        check_variants(self.variants)
+        check_versions(self.versions)
 
     @abstractmethod
     def logs(self) -> list[str]:
@@ -148,10 +148,10 @@ class Source(Extension, ABC):
         with self.named(log):
             for recording in self.read(log):
                 recording.validate_names()
-                if len(self.variants) > 1:  # all are of one place, or else of one log
+                if len(self.versions) > 1:  # all are of one place, or else of one log
                     recording = replace(recording, location=recording.location or recording.scene_id)
-                for name in self.variants:
-                    yield list(variant_of(recording, name).windows(self.starts, self.build.steps))
+                for name in self.versions:
+                    yield list(version_of(recording, name).windows(self.starts, self.build.steps))
 
     @contextmanager
     def named(self, log: str) -> Iterator[None]:

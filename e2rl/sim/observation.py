@@ -27,6 +27,7 @@ from e2rl.sim.world import AGENTS, Agents
 
 LOOK_AHEAD = (2.0, 4.0, 7.0, 10.0, 14.0, 19.0, 25.0, 32.0, 40.0, 50.0, 62.0, 75.0)  # m along the mission
 PROBE_X, PROBE_Y = (-3.0, 0.0, 5.0, 11.0, 20.0), (-5.0, -2.5, 0.0, 2.5, 5.0)  # m in the ego's frame
+UNLIMITED = 12.0  # m/s, the limit that a policy reads at least where none is known
 CENTRE = PROBE_X.index(0.0) * len(PROBE_Y) + PROBE_Y.index(0.0)  # the probe at the ego itself
 NEAREST = 12  # agents
 SPEED, FAR, NEAR, TURNING = 15.0, 40.0, 10.0, 0.5  # scales: m/s, m, m, rad/s
@@ -151,9 +152,15 @@ def ego_features(static: StaticScene, ego: EgoState, limit: Tensor, time: Tensor
     state, action, pose, size = ego.state, ego.action, ego.pose, static.size
     turned = state[:, 2] - pose.heading
     left = ((static.mission.end - pose.s) / 100).clamp(0, 1)
+    limit = read_as(limit, state[:, 3])
     features = [state[:, 3] / SPEED, action[:, 0] / 4, action[:, 1], (pose.d / 3).clamp(-2, 2), turned.sin()]
     features += [turned.cos(), limit / SPEED, left, size[:, 0] / 5, size[:, 1] / 2, time]
     return torch.stack(features, -1)
+
+
+def read_as(limit: Tensor, speed: Tensor) -> Tensor:
+    """Speed limits [...] m/s as a policy reads them: UNLIMITED where they are unknown (0), or its speed, if higher."""
+    return torch.where(limit > 0, limit, speed.clamp(min=UNLIMITED))
 
 
 def route_features(
@@ -163,8 +170,8 @@ def route_features(
     limit at the ego [B]."""
     x, y, heading, curvature, limit = look_along(static, ego.pose.s[:, None] + config.ahead)
     x, y = seen_from(ego.state, rotation, x, y)
-    turned = (heading - ego.state[:, 2:3]).sin()
-    features = torch.stack([x / FAR, y / NEAR, turned, (10 * curvature).clamp(-2, 2), limit / SPEED], -1)
+    turned, seen = (heading - ego.state[:, 2:3]).sin(), read_as(limit, ego.state[:, 3:])
+    features = torch.stack([x / FAR, y / NEAR, turned, (10 * curvature).clamp(-2, 2), seen / SPEED], -1)
     return features[:, :-1].clamp(-5, 5).flatten(1), limit[:, -1]
 
 

@@ -92,7 +92,7 @@ def test_mirror_images_are_scenes_of_the_same_place(tmp_path):
     """Drawn in the mirror, a scene is the other one: states, lanes and what is drivable."""
     turned = description({"ego": straight(20, 0, 8), "7": straight(50, 3.5, 6)}) | {"id": "turned"}
     found = load_scenes(
-        data_config(write_folder(tmp_path / "x", [turned]), tmp_path / "cache", variants=("recorded", "mirrored"))
+        data_config(write_folder(tmp_path / "x", [turned]), tmp_path / "cache", versions=("recorded", "mirrored"))
     )
     assert found.scene_id == ["turned", "turned~mirrored"] and found.location == ["turned", "turned"]
     scene, other = found.scenes
@@ -102,7 +102,7 @@ def test_mirror_images_are_scenes_of_the_same_place(tmp_path):
     assert torch.allclose(scene["lane_points"] * sign[:2], other["lane_points"], atol=1e-5)
     assert torch.equal(scene["field"], other["field"].flip(1)) and torch.equal(scene["valid"], other["valid"])
     cut = load_scenes(
-        data_config(tmp_path / "x", tmp_path / "cache", variants=("recorded", "mirrored")), starts=[10, 20]
+        data_config(tmp_path / "x", tmp_path / "cache", versions=("recorded", "mirrored")), starts=[10, 20]
     )
     assert cut.scene_id == ["turned@10", "turned@20", "turned~mirrored@10", "turned~mirrored@20"]
 

@@ -94,7 +94,7 @@ def test_other_vehicles_that_move_near_the_ego_react(scene_set):
 
 
 def test_the_attack_s_intensity_and_template_may_say_how_they_react():
-    eta, template = torch.tensor([0.0, 0.5, 2.5, 2.5]), torch.tensor([FULL, SINGLE, SINGLE, PAIR])
+    eta, template = torch.tensor([0.0, 0.5, 2.5, 2.5]), torch.tensor([PAIR, SINGLE, SINGLE, FULL])
     given = torch.ones(4, 6, dtype=torch.bool), STEPS, torch.Generator().manual_seed(0)
     part = drawn(ReactSettings(fraction=1.0, eta=None), eta, template, *given)
     assert torch.equal(part["eta"], eta) and part["count"][1:].tolist() == [1, 1, 2]
