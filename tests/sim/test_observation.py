@@ -1,5 +1,6 @@
 """Observations: the same under a rigid motion of the scene and in any order of the others; blind to padding."""
 
+import pytest
 import torch
 
 import e2rl
@@ -7,7 +8,7 @@ from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.mission import mission_of
-from e2rl.sim.observation import light_features, mirrored, observation_config
+from e2rl.sim.observation import UNLIMITED, light_features, mirrored, observation_config
 from e2rl.sim.static import static_scene
 from tests.synthetic import make_scenes
 
@@ -68,6 +69,13 @@ def test_absent_agents_leave_no_trace():
         absent = ~scenes.scenes["valid" if key == "start" else "logged_valid"]
         scenes.scenes[key] = torch.where(absent[..., None], 1e3, scenes.scenes[key])
     assert torch.equal(observe(scenes), observe(scenes_with_everything()))
+
+
+@pytest.mark.parametrize(("speed", "limit"), [(8.0, UNLIMITED), (15.0, 15.5)])  # m/s; the ego accelerates by half
+def test_a_map_without_limits_looks_like_one_with_the_usual_one_or_that_of_the_ego_s_speed(speed, limit):
+    unknown, known = (observe(make_scenes(2, speed=speed, limit=value)) for value in (0.0, limit))
+    assert torch.allclose(unknown, known, atol=1e-6)
+    assert not torch.allclose(known, observe(make_scenes(2, speed=speed, limit=limit + 1.0)), atol=1e-3)
 
 
 def test_beyond_the_recording_a_light_keeps_its_last_state_in_its_own_scene():
