@@ -21,6 +21,7 @@ from e2rl.prior.checkpoint import save_prior
 from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.prior import Prior
 from e2rl.run.files import HASH
+from e2rl.run.fused import switched_off
 from tests.scenes.descriptions import Malicious, description, numbered, straight, write_folder
 
 if "E2RL_TESTS" not in os.environ:  # the folder of caches of these tests and all processes that they start
@@ -28,6 +29,13 @@ if "E2RL_TESTS" not in os.environ:  # the folder of caches of these tests and al
     atexit.register(shutil.rmtree, os.environ["E2RL_TESTS"], ignore_errors=True)
 os.environ.setdefault("MPLCONFIGDIR", matplotlib.get_cachedir())  # its list of fonts takes long to make
 os.environ["XDG_CACHE_HOME"] = os.environ["E2RL_TESTS"]
+
+
+@pytest.fixture(autouse=True)
+def nothing_compiled():
+    """Each test begins eagerly, whatever the one before has switched on."""
+    with switched_off():
+        yield
 
 
 @pytest.fixture(scope="module")

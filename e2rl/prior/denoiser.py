@@ -126,7 +126,7 @@ class Denoiser(nn.Module):
 
     def encode(self, nodes: Tensor, pairs: Tensor, present: Tensor) -> Encoding:
         """Encoding of node features [B, V, NODE], pair features [B, V, V, EDGE] and presence [B, V]."""
-        if self.training or not is_on():
+        if self._learns() or not is_on():
             return self.encoding(nodes, pairs, present)
         node, pair, *rest = fused_encoding(self.settings)(nodes, pairs, present, *self._read)
         return Encoding(node, pair, rest[: self.settings.blocks], rest[self.settings.blocks :])
@@ -149,10 +149,14 @@ class Denoiser(nn.Module):
 
     def forward(self, x: Tensor, level: Tensor, encoding: Encoding) -> Tensor:
         """Denoised estimate x0 [B, V, SIZE] of x [B, V, SIZE] at noise level [B, V], or [1, V] for all scenes."""
-        if self.training or len(level) > 1 or not is_on() or (torch.is_grad_enabled() and x.requires_grad):
+        if self._learns() or len(level) > 1 or not is_on() or (torch.is_grad_enabled() and x.requires_grad):
             return self.estimate(x, level, encoding)
         scene = encoding.nodes, encoding.pairs, *encoding.biases, *encoding.modulations
         return fused_estimate(self.settings)(x, level, *scene, *self._read)
+
+    def _learns(self) -> bool:
+        """Whether dropout acts, or gradients by the weights are wanted: fused functions have neither."""
+        return self.training or (torch.is_grad_enabled() and self.embed_x.weight.requires_grad)
 
     @cached_property
     def _read(self) -> list[Tensor]:

@@ -5,6 +5,7 @@ import torch
 from e2rl.prior.denoiser import Denoiser
 from e2rl.prior.features import EDGE, NODE
 from e2rl.prior.lane_relative import SIZE
+from e2rl.run.fused import switch
 from tests.prior.small import small_prior
 
 BATCH, VEHICLES = 2, 6
@@ -60,3 +61,10 @@ def test_a_repeated_encoding_is_that_of_a_repeated_batch():
     tiled = net.encode(nodes, pairs, present).repeat(2)
     both = net(torch.cat([x, x + 1]), torch.cat([level, level]), tiled)
     torch.testing.assert_close(both[BATCH:], run(net, x + 1, level, nodes, pairs, present), rtol=0, atol=1e-5)
+
+
+def test_weights_have_gradients_where_functions_are_fused_too():
+    net, (x, level, *scene) = small_prior().denoiser.requires_grad_(True).eval(), inputs()
+    switch(True)
+    run(net, x, level[:1], *scene).square().sum().backward()
+    assert all(weight.grad is not None for weight in net.parameters())
