@@ -160,3 +160,8 @@ def test_the_gap_between_two_lanes_in_the_list_is_no_lane():
     far[:, len(X) :, 1] = 100.0  # the list jumps from (38, 0) to (38, 100)
     middle = against_lanes(far, LANE, torch.tensor([[[38.0, 50.0]]]), torch.tensor([[[-math.pi / 2]]]))
     assert not middle.any()
+
+
+def test_nobody_drives_against_anything_where_nobody_is():
+    none = torch.zeros(0, 3, 2), torch.zeros(0, 3, 4)
+    assert against_lanes(ROAD[:0], LANE[:0], *none).shape == (0, 3, 4)
