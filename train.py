@@ -80,7 +80,8 @@ def evolve(task: Run) -> None:
         rows = measure("after", run.ego, run.round)
     save_tables(folder / "tables.md", metric_tables(rows, caption(config, origin)))
     before, after = ([row for row in rows if row["stage"] == stage] for stage in ("before", "after"))
-    print("", *compared_answer(before, after, folder=folder), run.improve.outcome(folder), sep="\n")
+    answer = compared_answer(before, after, measure.atlases(), folder)
+    print("", *answer, run.improve.outcome(folder), sep="\n")
 
 
 def train_prior(task: Run) -> None:

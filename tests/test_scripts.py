@@ -55,7 +55,7 @@ def test_bad_input_is_one_line_and_leaves_nothing_but_scenes(
 ROUND = [
     *("data.build.steps=20", "prior.sampler.steps=2", "rounds=1", "batch=2", "curriculum=bandit"),
     *("learner.collect.batch=2", "learner.collect.steps=20", "learner.collect.iterations=1"),
-    *("learner.round.scenes=4", "measure.scenes=2", "measure.seeds=[0]"),
+    *("learner.round.scenes=4", "measure.scenes=2", "measure.seeds=[0]", "measure.budget=100"),
 ]
 
 
@@ -69,6 +69,8 @@ def test_rounds_of_evolution_from_the_first_command_to_tables_and_a_resume(world
     }
     tables = (run / "tables.md").read_text()
     assert "cfr [%]" in tables and "cfr [points]" in tables and "after" in tables
+    tries = [len((run / stage / "search" / "tries.csv").read_text().splitlines()) for stage in ("before", "after")]
+    assert min(tries) > 2, "a header, and a try of each scene at least"
     again = [f"resume={run}", "rounds=2", f"data.cache={tmp_path / 'cache'}", f"hydra.run.dir={tmp_path / 'again'}"]
     status, said = call("train.py", again, monkeypatch, capsys)
     assert status == 0, said

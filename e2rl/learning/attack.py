@@ -90,7 +90,7 @@ Synthesize = Callable[..., Mapping[str, Any]]  # (ego, scene_index [S], eta [S],
 Solvable = Callable[[Mapping[str, Tensor]], Solved]
 ATTACK, NOMINAL = "attack", "nominal traffic"  # of a round: what was made
 FLAGS = ("attacked", "contact", "entered")
-TRACKS = ("scene_index", "states", "valid", "adversaries")
+TRACKS = ("scene_index", "states", "valid", "adversaries", "owes")
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ def _make_part(
     there = torch.tensor([row for row in range(len(rows)) if row not in why], dtype=torch.int64)
     searching = solvable if attack and len(there) else None
     solved = unsearched(made["states"]) if searching is None else searching(made)
-    every = {name: made[name] for name in TRACKS} | {"eta": eta[there], "template": template[there]}
+    every = {name: made[name] for name in TRACKS if name in made} | {"eta": eta[there], "template": template[there]}
     every |= {"evasion": solved.evasion, "span": solved.span}
     entered = torch.zeros(len(rows), dtype=torch.bool).index_fill(0, there[solved.entered], True)
     flags = dict(zip(FLAGS, (made["adversaries"].any(-1), made["contact"], entered), strict=True))

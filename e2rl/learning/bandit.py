@@ -1,9 +1,9 @@
 """A bandit over intensity and causal template: it draws what the policy fails in neither never nor always.
 
 An arm is an intensity with a causal template. What there is to learn from an attack whose failure rate is p is scored
-as p (1 - p), the learnability of Rutherford et al. ("No Regrets", 2024): the variance of the outcome, 0 for what is
-mastered and for what is hopeless. Each arm has its own p from the policy's episodes. Counts are forgotten
-exponentially, so an arm that is no longer drawn drifts back to the prior and is tried again.
+as the regret p s of `CurriculumScheduler`: 0 for what is mastered and for what is hopeless. Each arm has its own p and
+s from the policy's episodes. Counts are forgotten exponentially, so an arm that is no longer drawn drifts back to the
+prior and is tried again.
 """
 
 from collections.abc import Sequence
@@ -25,8 +25,9 @@ EXPLORATION = 0.1  # fraction of the draws that goes to all arms alike
 class BanditCurriculum(CurriculumScheduler):
     """Draws an arm for each scene of a round, by a softmax of the arms' values and some exploration.
 
-    State of A arms: counts [4, A] of attacks that failed, survived, entered D' and were left out. An attack of this
-    round counts once, however many episodes are driven in it: they are alike. Settings: conf/curriculum/bandit.yaml.
+    State of A arms: counts [6, A] of attacks that failed, survived, entered D', were left out, were looked at by the
+    teacher, and of what of these it would survive. An attack of this round counts once, however many episodes are
+    driven in it: they are alike. Settings: conf/curriculum/bandit.yaml.
     """
 
     lasting = ("_counts",)
@@ -52,7 +53,7 @@ class BanditCurriculum(CurriculumScheduler):
         levels = torch.tensor(sorted(set(etas)), dtype=torch.float32)
         codes = torch.tensor([TEMPLATES.index(name) for name in self.templates])
         self._eta, self._template = levels.repeat(len(codes)), codes.repeat_interleave(len(levels))
-        self._counts = torch.zeros(4, len(self._eta), dtype=torch.float64)
+        self._counts = torch.zeros(6, len(self._eta), dtype=torch.float64)
         self._forgetting, self.fraction = forgetting, fraction
 
     @property
@@ -61,12 +62,14 @@ class BanditCurriculum(CurriculumScheduler):
         return (self.probability() * self._eta).sum().item()
 
     def value(self) -> Tensor:
-        """What an attack of each arm [A] teaches, in expectation: the fraction of its attacks that enter D'
-        times p (1 - p) under the Beta posterior of its failure rate p, whose prior is uniform."""
-        failed, survived, entered, left_out = self._counts
+        """What an attack of each arm [A] teaches, in expectation: the fraction of its attacks that enter D' times p s,
+        where p is the failure rate, whose prior is uniform, and s what the teacher would survive, beside one attack of
+        which it would survive 1 - p."""
+        failed, survived, entered, left_out, looked_at, survivable = self._counts
         failed, survived = failed + 1, survived + 1
         total = failed + survived
-        return (entered + 1) / (entered + left_out + 1) * failed * survived / (total * (total + 1))
+        share = (survivable + survived / (total + 1)) / (looked_at + 1)  # E[p (1 - p)] / E[p] where nobody tells
+        return (entered + 1) / (entered + left_out + 1) * failed / total * share
 
     def probability(self) -> Tensor:
         """Probability [A] with which an arm is drawn."""
@@ -86,8 +89,9 @@ class BanditCurriculum(CurriculumScheduler):
         """Forget a fraction of all counts, then count the round's attacks."""
         same = (outcomes.eta[:, None] == self._eta) & (outcomes.template[:, None] == self._template)
         driven, rate = outcomes.episodes > 0, outcomes.failure_rate.nan_to_num()
-        left_out = outcomes.left_out
-        seen = torch.stack([rate * driven, (1 - rate) * driven, ~left_out, left_out]).double()
+        left_out, told = outcomes.left_out, ~outcomes.survivable.isnan() & self._teacher_tells
+        looked_at = told, outcomes.survivable.nan_to_num() * told
+        seen = torch.stack([rate * driven, (1 - rate) * driven, ~left_out, left_out, *looked_at]).double()
         self._counts = (1 - self._forgetting) * self._counts + seen @ same.double()
 
     def level(self, eta: Tensor) -> Tensor:

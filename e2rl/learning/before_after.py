@@ -1,10 +1,14 @@
-"""The before/after table of an evolution run: the same scenes and seeds, nominal and adversarial, for both policies."""
+"""What an evolution run changes: the same scenes and seeds, nominal and adversarial, for the policies before and after
+it; and the atlas of what a search finds against each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from e2rl.evaluation.atlas import ATLAS_FILE, read_atlas
+from e2rl.evaluation.budget import TRIES_FILE, Plan, search_all, write_tries
+from e2rl.evaluation.methods import SEARCH
 from e2rl.evaluation.protocol import Method, Setup, Work, drive_all, record
 from e2rl.evaluation.rollout_files import METRICS_FILE, read_metrics, write_json
 from e2rl.evaluation.summary import metric_rows
@@ -19,13 +23,18 @@ from e2rl.sim.rollout_file import ROLLOUTS
 
 @dataclass
 class BeforeAfter:
-    """Evaluates an ego and keeps the rows of both stages in folder/metrics.json."""
+    """Evaluates an ego and keeps the rows of both stages in folder/metrics.json.
+
+    search: what is tried with `budget` NFE a scene, from the first of the seeds; None: there is no search.
+    """
 
     setup: Setup
     methods: Sequence[Method]
     seeds: Sequence[int]
     folder: Path
     processes: Processes = 1
+    search: Plan | None = None
+    budget: float = 0.0
 
     def __call__(self, stage: str, ego: Ego, rounds: int) -> list[dict]:
         """Evaluate an ego as `stage` (before or after) that was trained for some rounds; returns the rows of all stages
@@ -37,6 +46,8 @@ class BeforeAfter:
         parts, measured = Parts(self.folder, stage, f"after {rounds} rounds"), Parts(self.folder, "measured")
         work = Work(folder / ROLLOUTS, self.processes, parts=parts)
         scored = drive_all([setup], self.methods, self.seeds, work)
+        if self.search is not None:
+            self._search(self.search, setup, work, folder / SEARCH)
         rows = record(*scored, folder, partial(metric_rows, stage=stage, **origin_of(self.folder)))
         if stage == "before":
             measured.save(stage, None, scored[:2])
@@ -47,6 +58,20 @@ class BeforeAfter:
         earlier = [row for row in (read_metrics(file) if file.exists() else []) if row.get("stage") != stage]
         write_json(file, earlier + rows)
         return earlier + rows
+
+    def _search(self, plan: Plan, setup: Setup, work: Work, folder: Path) -> None:
+        """Write the tries of a stage, their rollouts and their atlas into a folder."""
+        work = replace(work, into=folder / ROLLOUTS)
+        found, tries = search_all([setup], [plan], self.budget, "nfe", self.seeds[:1], work)
+        record(*found, folder, metric_rows)
+        write_tries(folder / TRIES_FILE, tries)
+
+    def atlases(self) -> tuple[dict, dict] | None:
+        """The atlas of each stage (`evaluation.atlas.describe`); None without a search."""
+        if self.search is None:
+            return None
+        before, after = (read_atlas(self.folder / stage / SEARCH / ATLAS_FILE) for stage in ("before", "after"))
+        return before, after
 
 
 def _of_row(row: dict, scored: tuple[list[dict], list[Samples]]) -> tuple[list[dict], list[Samples]]:

@@ -11,7 +11,8 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf, open_dict
 from tqdm import tqdm
 
-from e2rl.evaluation.methods import as_list, build_prior, build_sim, build_traffic, processes_of
+from e2rl.evaluation.budget import portfolio_plan
+from e2rl.evaluation.methods import SEARCH, as_list, build_prior, build_sim, build_traffic, processes_of
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.learning.attack import Synthesize, mixture, solvable
 from e2rl.learning.before_after import BeforeAfter
@@ -105,6 +106,7 @@ class MeasureSettings:
     scenes: int = setting(low=1)
     seeds: tuple[int, ...] = setting(low=0)
     eta: tuple[float, ...] = setting(low=0)
+    budget: float = setting(low=0)
 
 
 def measure_settings(config: DictConfig) -> MeasureSettings:
@@ -129,7 +131,7 @@ def build_logger(config: DictConfig, folder: Path) -> RunLogger:
 def build_measure(
     config: DictConfig, ego: Ego, ego_name: str, traffic: Traffic, prior: Prior, folder: Path
 ) -> BeforeAfter:
-    """The before/after table: nominal and adversarial traffic on the scenes of `config.measure`.
+    """The before/after table: nominal and adversarial traffic, and a search, on the scenes of `config.measure`.
 
     Sources with splits are measured on their tune split; a path's scenes on `measure.path`, or without it on the first
     training scenes (see `split` in the rows).
@@ -143,10 +145,17 @@ def build_measure(
     nominal = built(load_choice("synthesizer", "nominal"), "synthesizer", Traffic, prior=prior)
     methods = [Method("nominal", nominal), *(Method(config.synthesizer.name, traffic, eta) for eta in options.eta)]
     setup = Setup(scenes, ego, ego_name, build_sim(config), config.batch, config.device)
-    return BeforeAfter(setup, methods, options.seeds, folder, processes_of(config))
+    given = (setup, methods, options.seeds, folder, processes_of(config))
+    if not options.budget:
+        return BeforeAfter(*given)
+
+    def method(name: str, synthesizer: DictConfig) -> Method:
+        return Method(name, build_traffic(synthesizer, prior), max(options.eta))
+
+    return BeforeAfter(*given, portfolio_plan(SEARCH, config, method), options.budget)
 
 
-ROLLOUT = 0.7  # s on one core, measured and scored
+ROLLOUT, TRY = 0.7, 150.0  # s on one core of a rollout that is measured and scored; NFE of a try of a search
 FRAMES = 7_000  # simulated steps a second that are collected and learned from
 BEGIN = 20.0  # s to read what a run begins with
 
@@ -194,7 +203,7 @@ def duration(seconds: float) -> str:
 def build_progress(config: DictConfig, done: int = 0) -> Progress:
     """The phases of an evolution of which so many rounds are done, by what they take on one core of 2020."""
     measured, collect = measure_settings(config), config.learner.get("collect", {})
-    rollouts = measured.scenes * len(measured.seeds) * (1 + len(measured.eta))
+    rollouts = measured.scenes * (len(measured.seeds) * (1 + len(measured.eta)) + measured.budget / TRY)
     workers = processes_of(config)
     seconds = ROLLOUT * rollouts / (workers if isinstance(workers, int) else cores())
     frames = collect.get("batch", 0) * collect.get("steps", 0) * collect.get("hold", 1) * collect.get("iterations", 0)

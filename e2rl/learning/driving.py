@@ -29,7 +29,8 @@ OUTCOME_KEYS = (
 @tensorclass
 class Episodes:
     """E finished episodes, each field [E]: pool row and scene (int64), adversarial traffic, contact with any agent,
-    off the road (bool), return, progress [m] and mean |acceleration| [m/s^2] (NaN if not measured)."""
+    off the road (bool), return, progress [m] and mean |acceleration| [m/s^2] (NaN if not measured); survivable: the
+    share of the row's critical moments that a teacher would survive (NaN if none tells)."""
 
     row: Tensor
     scene_index: Tensor
@@ -39,6 +40,7 @@ class Episodes:
     returns: Tensor
     progress: Tensor
     acceleration: Tensor
+    survivable: Tensor
 
     @property
     def failed(self) -> Tensor:
@@ -77,6 +79,7 @@ def finished_episodes(batches: list[TensorDictBase], adversarial: Tensor, horizo
     begin = torch.arange(data.shape[1]) + 1 - decisions(after["timestep"][..., 0], hold)
     ended = after["done"][..., 0] & (begin + decisions(horizon, hold) <= data.shape[1])
     row, contact = data["traffic", "row"][ended][:, 0], metrics["contact"] | metrics["contact_vru"]
+    unknown = torch.full((len(row),), torch.nan)
     return Episodes(
         row,
         data["scene_index"][ended][:, 0],
@@ -85,7 +88,8 @@ def finished_episodes(batches: list[TensorDictBase], adversarial: Tensor, horizo
         metrics["off_road"][ended][:, 0],
         after["episode_reward"][ended][:, 0],
         metrics["progress"][ended][:, 0],
-        torch.full((len(row),), torch.nan),
+        unknown,
+        unknown.clone(),
         batch_size=[len(row)],
     )
 
@@ -147,7 +151,7 @@ class PoolDriver:
         """Outcomes of one episode in every row of the pool, in their order, but for those in which the ego raises or
         becomes NaN; and these, each with its row and reason."""
         none, never = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool)
-        parts = [Episodes(none, none, never, never, never, *[torch.zeros(0)] * 3, batch_size=[0])]
+        parts = [Episodes(none, none, never, never, never, *[torch.zeros(0)] * 4, batch_size=[0])]
         errored: list[dict] = []
         for rows in torch.arange(len(pool)).split(self.env.batch_size[0]):
             found, failed = attempt(lambda tasks: self._frames(ego, pool, tasks), rows.tolist())
@@ -186,4 +190,5 @@ def episodes_of(frames: TensorDictBase, pool: TrafficPool, rows: Tensor) -> Epis
     effort = (frames["executed"][..., 0].abs() * frames["alive"]).sum(1) / count
     ended = frames["contact"].any(1), frames["off_road"].any(1)
     of_rows = pool.scene_index[rows], pool.adversarial[rows]
-    return Episodes(rows, *of_rows, *ended, frames["reward"].sum(1), progress, effort, batch_size=[len(rows)])
+    driven = frames["reward"].sum(1), progress, effort, torch.full_like(effort, torch.nan)
+    return Episodes(rows, *of_rows, *ended, *driven, batch_size=[len(rows)])

@@ -67,9 +67,10 @@ class Evolution:
 
     Args:
         synthesize: (ego, scene_index [S], eta [S], seed) -> {scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N],
-            adversaries [S, N] bool, contact [S] bool}: closed-loop traffic against that ego; contact: it was hit. Rows
-            that cannot be made are left out, and `errored` {position in S: why} names them. A curriculum that chooses
-            causal templates gives template [S], too.
+            adversaries [S, N] bool, contact [S] bool, owes [S] bool}: closed-loop traffic against that ego; contact: it
+            was hit; owes: adversaries give way to it (left out: they do). Rows that cannot be made are left out, and
+            `errored` {position in S: why} names them. A curriculum that chooses causal templates gives template [S],
+            too.
         solvable: traffic -> Solved: the rows that enter D', and evasions; None: all, and none.
         memory: None: in a temporary folder.
         batch: scenes that are synthesized at once.
@@ -144,9 +145,10 @@ class Evolution:
         curriculum/, synthesizer/, time/)."""
         curriculum, episodes, state = self.curriculum, self.episodes, self.curriculum.summary()
         assert episodes is not None
-        outcomes = outcomes_of(order.eta, order.template, attack.drawn, episodes.row, episodes.failed)
+        told = episodes.row, episodes.failed, episodes.survivable
+        outcomes = outcomes_of(order.eta, order.template, attack.drawn, *told)
         contact = learned.get("contact_adversarial") if attack.contact is None else attack.contact
-        curriculum.update(episodes.scene_index, episodes.failed, episodes.adversarial)
+        curriculum.update(episodes.scene_index, episodes.failed, episodes.adversarial, episodes.survivable)
         curriculum.observe(outcomes)
         curriculum.leave_out(order.scenes[outcomes.left_out])
         self.choices = tally(order.number, curriculum.level(order.eta), outcomes, curriculum.values())

@@ -165,6 +165,8 @@ class PolicyImprovement(Improvement):
             rows.append(self.learner.update(data, [*experts.values()], labels) | made)
             bar.set_postfix(reward=f"{data['next', 'reward'].mean().item():.3f}", kl=f"{rows[-1]['kl']:.4f}")
         episodes = finished_episodes(outcomes, pool.adversarial, self.horizon, self.settings.hold)
+        if self.teacher is not None:
+            episodes.survivable = self.teacher.survivable(len(pool))[episodes.row]
         counts |= {"frames": float(self.frames), "collect": collecting}
         counts["steps_per_second"] = (self.frames - begun) / collecting
         return _means(rows) | episodes.summary() | counts, episodes

@@ -1,8 +1,10 @@
 """The extension point for curricula: intensity, causal template, fraction of adversarial episodes, scene priorities.
 
 Scenes are prioritised by rank, mixed with staleness, as in prioritised level replay (Jiang et al. 2021). What is ranked
-is the learnability of Rutherford et al. ("No Regrets", 2024): p (1 - p), where p is the recent failure rate of the ego
-in a scene's adversarial traffic. It is 0 for a scene that is solved and for one that is hopeless.
+is the regret p s: p is the recent failure rate of the ego in a scene's adversarial traffic, s the share of its critical
+moments that a teacher would survive, who knows no more than the ego does. Where no teacher tells, s = 1 - p: that is
+the learnability of Rutherford et al. ("No Regrets", 2024). It is 0 for a scene that is solved and for one that is
+hopeless.
 """
 
 from collections.abc import Mapping
@@ -18,7 +20,7 @@ from e2rl.traffic.traffic import FULL, TEMPLATES
 
 Choice = dict[str, int | float | str]  # a row of the table, by COLUMNS
 COLUMNS = ("round", "eta", "template", "draws", "left_out", "episodes", "failures", "failure_rate", "value")
-TEMPERATURE = 2.0  # of the ranks of learnability: at 2 the first tenth of the scenes has a quarter of the draws
+TEMPERATURE = 2.0  # of the ranks of regret: at 2 the first tenth of the scenes has a quarter of the draws
 STALENESS = 0.2  # fraction of the draws that goes by the rounds since a scene was last drawn
 SMOOTHING = 0.3  # weight of a round in a scene's moving failure rate
 BIN = 0.5  # intensities are counted under multiples of it
@@ -29,7 +31,8 @@ class Outcomes:
     """What became of the S attacks of a round.
 
     eta [S]; template [S] int64; left_out [S] bool: no driver avoids it, so it did not enter D'; episodes [S] int64: how
-    many the learning policy drove in it; failures [S] int64: how many of these ended by contact or off the road.
+    many the learning policy drove in it; failures [S] int64: how many of these ended by contact or off the road;
+    survivable [S]: the share of its critical moments that the teacher would survive, NaN where none tells.
     """
 
     eta: Tensor
@@ -37,6 +40,7 @@ class Outcomes:
     left_out: Tensor
     episodes: Tensor
     failures: Tensor
+    survivable: Tensor
 
     @property
     def failure_rate(self) -> Tensor:
@@ -44,16 +48,20 @@ class Outcomes:
         return self.failures / self.episodes
 
 
-def outcomes_of(eta: Tensor, template: Tensor, drawn: Tensor, row: Tensor, failed: Tensor) -> Outcomes:
-    """Returns the Outcomes of attacks [S], of episodes [E] in rows `row` of the pool that failed or not.
+def outcomes_of(
+    eta: Tensor, template: Tensor, drawn: Tensor, row: Tensor, failed: Tensor, survivable: Tensor
+) -> Outcomes:
+    """Returns the Outcomes of attacks [S], of episodes [E] in rows `row` of the pool that failed or not, and were
+    survivable [E] in part.
 
     drawn [K] int64: the attack of each of the pool's first K rows; episodes in other rows do not count.
     """
     count, known = len(eta), row < len(drawn)
-    attack, failed = drawn[row[known]], failed[known]
+    attack, failed, told = drawn[row[known]], failed[known], survivable[known]
     left_out = torch.ones(count, dtype=torch.bool).index_fill(0, drawn, False)
     episodes, failures = (torch.bincount(each, minlength=count) for each in (attack, attack[failed]))
-    return Outcomes(eta, template, left_out, episodes, failures)
+    share = torch.full((count,), torch.nan).index_copy(0, attack, told)  # the same in all episodes of a row
+    return Outcomes(eta, template, left_out, episodes, failures, share)
 
 
 def tally(number: int, level: Tensor, outcomes: Outcomes, value: Mapping[tuple[float, str], float]) -> list[Choice]:
@@ -89,7 +97,7 @@ class CurriculumScheduler(Extension):
 
     Args:
         rounds: of the whole run.
-        prioritised, solvable_only: see conf/curriculum/adaptive.yaml.
+        prioritised, regret, solvable_only: see conf/curriculum/adaptive.yaml.
     """
 
     eta: float  # adversarial intensity of this round
@@ -97,12 +105,15 @@ class CurriculumScheduler(Extension):
     templates: tuple[str, ...] = (TEMPLATES[FULL],)
     lasting: tuple[str, ...] = ()  # names of a subclass's attributes (numbers and tensors) that checkpoints hold
 
-    def __init__(self, num_scenes: int, rounds: int, seed: int = 0, *, prioritised: bool, solvable_only: bool) -> None:
+    def __init__(
+        self, num_scenes: int, rounds: int, seed: int = 0, *, prioritised: bool, regret: bool, solvable_only: bool
+    ) -> None:
         if num_scenes < 1:
             raise InputError("curriculum: no scenes; check data.path and data.split")
         self.rounds, self.round, self.prioritised, self.solvable_only = rounds, 0, prioritised, solvable_only
-        self._generator = torch.Generator().manual_seed(seed)
+        self._teacher_tells, self._generator = regret, torch.Generator().manual_seed(seed)
         self._failing = torch.full((num_scenes,), torch.nan)
+        self._survivable = torch.full((num_scenes,), torch.nan)
         self._drawn = torch.full((num_scenes,), -1, dtype=torch.int64)
 
     def etas(self, scenes: Tensor) -> Tensor:
@@ -119,17 +130,18 @@ class CurriculumScheduler(Extension):
         first, last = max(self.eta - spread, low), min(self.eta + spread, high)
         return first + (last - first) * torch.rand(count, generator=self._generator)
 
-    def learnability(self) -> Tensor:
-        """p (1 - p) [S] of the recent failure rate p; NaN for scenes never driven in adversarial traffic."""
-        return self._failing * (1 - self._failing)
+    def regret(self) -> Tensor:
+        """p s [S] of the recent failure rate p and the share s of what the teacher would survive, 1 - p where that is
+        unknown; NaN for scenes never driven in adversarial traffic."""
+        return self._failing * torch.where(self._survivable.isnan(), 1 - self._failing, self._survivable)
 
     def priority(self) -> Tensor:
-        """Probability [S] with which scenes are drawn: 1 - STALENESS of it by rank of learnability, scenes not yet
-        driven in adversarial traffic first, the rest by the rounds since they were last drawn."""
+        """Probability [S] with which scenes are drawn: 1 - STALENESS of it by rank of regret, scenes not yet driven in
+        adversarial traffic first, the rest by the rounds since they were last drawn."""
         count = len(self._failing)
         if not self.prioritised:
             return torch.full((count,), 1 / count)
-        weight = (1 / ranks(self.learnability().nan_to_num(nan=torch.inf))) ** (1 / TEMPERATURE)
+        weight = (1 / ranks(self.regret().nan_to_num(nan=torch.inf))) ** (1 / TEMPERATURE)
         age = (self.round - self._drawn).float()
         old = age / age.sum() if age.sum() > 0 else torch.full((count,), 1 / count)
         return (1 - STALENESS) * weight / weight.sum() + STALENESS * old
@@ -145,15 +157,17 @@ class CurriculumScheduler(Extension):
         self._drawn[chosen] = self.round
         return chosen
 
-    def update(self, scene_index: Tensor, failed: Tensor, adversarial: Tensor) -> None:
-        """Update with episodes [E]: scene, whether the ego failed, and whether the traffic was adversarial."""
+    def update(self, scene_index: Tensor, failed: Tensor, adversarial: Tensor, survivable: Tensor) -> None:
+        """Update with episodes [E]: scene, whether the ego failed, whether the traffic was adversarial, and the share
+        of its row's critical moments that the teacher would survive (NaN: unknown)."""
         scene_index, adversarial = scene_index.cpu(), adversarial.cpu()
-        scenes, inverse = scene_index[adversarial].unique(return_inverse=True)
-        total = torch.zeros(len(scenes)).index_add(0, inverse, failed.cpu().float()[adversarial])
-        mean = total / torch.bincount(inverse, minlength=len(scenes)).clamp(min=1)
-        before = self._failing[scenes]
-        moved = before + SMOOTHING * (mean - before)
-        self._failing[scenes] = torch.where(before.isnan(), mean, moved)
+        told = adversarial & ~survivable.isnan() & self._teacher_tells
+        for known, value, of in ((self._failing, failed.float(), adversarial), (self._survivable, survivable, told)):
+            scenes, inverse = scene_index[of].unique(return_inverse=True)
+            total = torch.zeros(len(scenes)).index_add(0, inverse, value.cpu()[of])
+            mean = total / torch.bincount(inverse, minlength=len(scenes)).clamp(min=1)
+            before = known[scenes]
+            known[scenes] = torch.where(before.isnan(), mean, before + SMOOTHING * (mean - before))
 
     def observe(self, outcomes: Outcomes) -> None:
         """Learn from what became of the round's attacks; by default nothing."""
@@ -178,14 +192,14 @@ class CurriculumScheduler(Extension):
 
     def summary(self) -> dict[str, float]:
         """Metrics to log."""
-        learnability, seen = self.learnability(), ~self._failing.isnan()
+        regret, seen = self.regret(), ~self._failing.isnan()
         result = {"eta": self.eta, "fraction": self.fraction, "scenes_seen": seen.float().mean().item()}
-        return result | ({"learnability": learnability[seen].mean().item()} if seen.any() else {})
+        return result | ({"regret": regret[seen].mean().item()} if seen.any() else {})
 
     def state_dict(self) -> dict:
         """All state."""
         own = {name: getattr(self, name) for name in self.lasting}
-        scenes = {"failing": self._failing, "drawn": self._drawn}
+        scenes = {"failing": self._failing, "survivable": self._survivable, "drawn": self._drawn}
         return scenes | {"round": self.round, "generator": self._generator.get_state(), "own": own}
 
     def load_state_dict(self, state: dict) -> None:
@@ -195,7 +209,9 @@ class CurriculumScheduler(Extension):
                 f"the checkpoint's curriculum holds {len(state['failing'])} scenes, the data {len(self._failing)}; "
                 "resume with the data of the run"
             )
-        self._failing, self._drawn = (state[key].clone() for key in ("failing", "drawn"))
+        self._failing, self._survivable, self._drawn = (
+            state[key].clone() for key in ("failing", "survivable", "drawn")
+        )
         self.round = state["round"]
         self._generator.set_state(state["generator"].cpu())
         for name in self.lasting:

@@ -28,6 +28,11 @@ BATCH = 32  # states that are labelled at once
 
 CANDIDATES = 48  # soft labels: the teacher's cheapest candidates, of which the nearest ones draw
 TEMPERATURE = 5.0  # of their weights softmax(-cost / TEMPERATURE)
+COSTLY = 60.0  # cost from which on a plan counts as one that ends in a contact
+NOTHING = (
+    torch.zeros(0, dtype=torch.int64),
+    torch.zeros(0, dtype=torch.bool),
+)  # rows of decisions, and which are survived
 
 
 @configured("learner/ppo_bc", "teaching")
@@ -62,7 +67,11 @@ def _coming(flag: Tensor) -> Tensor:
 
 
 class Teacher:
-    """Labels states of collected batches; `labelled` [M] (e2rl.learning.cloning) are the newest ones of all rounds."""
+    """Labels states of collected batches; `labelled` [M] (e2rl.learning.cloning) are the newest ones of all rounds.
+
+    It knows of the others what it sees, so that a critical decision from which it would get away, where the policy
+    would not, is one that the policy has to learn: `survivable`.
+    """
 
     def __init__(
         self, planner: Ego, scenes: SceneSet, bounds: tuple[Tensor, Tensor], hold: int, settings: Mapping[str, Any]
@@ -77,6 +86,14 @@ class Teacher:
         self.settings = settings_of(TeachingSettings, settings, "learner.teaching")
         self.planner, self.scenes, self.bounds, self.hold = planner, scenes, bounds, hold
         self.labelled: TensorDict | None = None
+        self._looked_at = NOTHING
+
+    def survivable(self, rows: int) -> Tensor:
+        """The share [R], of the decisions looked at in each of the pool's rows, of those that the planner survives and
+        the policy's plan does not; NaN in rows without any. Then it begins anew."""
+        row, away = self._looked_at
+        self._looked_at = NOTHING
+        return torch.bincount(row, away.float(), rows) / torch.bincount(row, minlength=rows)
 
     def watch(self, data: TensorDictBase, adversarial: Tensor, ego: Ego, count: int) -> dict[str, float]:
         """Look at up to `count` critical decisions, drawn evenly, of adversarial episodes in a batch [B, T] that `ego`
@@ -85,15 +102,20 @@ class Teacher:
         places = (attacked & critical(data, self.settings.window, self.settings.near)).nonzero()
         row, column = places[torch.randperm(len(places), device=places.device)[:count]].unbind(1)
         frames = data.select("observation", "timestep", "scene_index", "agents")[row, column]
-        parts = [self.labels(part, ego) for part in frames.split(BATCH)] if len(frames) else []
+        if not len(frames):
+            return {"critical": 0.0, "labels": 0.0}
+        parts, away = zip(*(self.labels(part, ego) for part in frames.split(BATCH)), strict=True)
         known = [] if self.labelled is None else [self.labelled]
-        if parts:
-            self.labelled = torch.cat([*known, *parts])[-self.settings.memory :]
+        self.labelled = torch.cat([*known, *parts])[-self.settings.memory :]
+        rows, survived = self._looked_at
+        rows = torch.cat([rows, data["traffic", "row"][row, column, 0].cpu()])
+        self._looked_at = rows, torch.cat([survived, *(each.cpu() for each in away)])
         return {"critical": float(len(places)), "labels": float(sum(map(len, parts)))}
 
-    def labels(self, frames: TensorDictBase, ego: Ego) -> TensorDict:
+    def labels(self, frames: TensorDictBase, ego: Ego) -> tuple[TensorDict, Tensor]:
         """Labels [K] of the states frames [M] of a DrivingEnv with `agents=True` in which ego's plan costs at least
-        `regret` more than the planner's, whose own cost is below `survivable`."""
+        `regret` more than the planner's, whose own cost is below `survivable`; and bool [M]: where the planner survives
+        and ego's plan does not."""
         settings = self.settings
         world = World.of(frames, self.scenes.batch(frames["scene_index"][:, 0].cpu()).to(frames.device))
         action, cost = ranked_actions(self.planner, world, CANDIDATES, self.hold)
@@ -101,7 +123,7 @@ class Teacher:
         weight = torch.softmax(-cost / TEMPERATURE, -1)
         found = {"observation": frames["observation"], "action": clip_expert(action, *self.bounds), "weight": weight}
         kept = (own - cost[:, 0] >= settings.regret) & (cost[:, 0] < settings.survivable)
-        return TensorDict(found, batch_size=frames.batch_size)[kept]
+        return TensorDict(found, batch_size=frames.batch_size)[kept], (own >= COSTLY) & (cost[:, 0] < COSTLY)
 
     def state_dict(self) -> dict:
         """The labels, of plain tensors."""

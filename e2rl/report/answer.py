@@ -1,6 +1,6 @@
 """The answer of a run: the last lines on the terminal, in sentences, at most 25 of them and at most 100 columns wide.
 
-It reads the rows of metrics.json and the content of modes.json, and computes nothing anew.
+It reads the rows of metrics.json, and the contents of modes.json and atlas.json, and computes nothing anew.
 """
 
 import math
@@ -9,14 +9,17 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from e2rl.evaluation.atlas import ATLAS_FILE
+from e2rl.evaluation.methods import SEARCH
 from e2rl.evaluation.modes import OTHER
 from e2rl.evaluation.rollout_files import ERRORED_FILE
+from e2rl.metrics.atlas import CELL
 from e2rl.metrics.catalogue import METRICS
 from e2rl.report.comparison_tables import by_ego
 from e2rl.report.tables import UNKNOWN, closed_loop, number, plural
 
 LINES, NARROWEST, WIDEST = 25, 80, 100
-WEAKNESSES, MOST_ROWS = 3, 10  # lines of failure modes; rows of a comparison
+WEAKNESSES, MOST_ROWS, MOST_CELLS = 3, 10, 7  # lines of failure modes; rows of a comparison, of an atlas
 KINDS = {"preventable": "cfr_preventable", "clean": "cfr_clean", "count": "cfr_counted"}  # of failures, the first leads
 COUNTS = (
     "preventable: a careful and competent driver would have had none; clean: besides, nobody else did wrong; count: "
@@ -61,18 +64,25 @@ def answer_lines(
     return [*lines[: LINES - len(last)], *last]
 
 
-def compared_answer(before: Sequence[dict], after: Sequence[dict], folder: Path | None = None) -> list[str]:
+def compared_answer(
+    before: Sequence[dict],
+    after: Sequence[dict],
+    atlases: tuple[Mapping, Mapping] | None = None,
+    folder: Path | None = None,
+) -> list[str]:
     """Returns the lines that say what training changed: the ego before and after it, side by side.
 
     Args:
         before: rows of metrics.json of the stage `before`.
         after: rows of the stage `after`, which are paired with those before under the name `before`.
+        atlases: of both stages (`evaluation.atlas.describe`); None: nothing was searched for.
         folder: of the run, which holds tables.md.
     """
     earlier = {(row["method"], row["eta"]): row for row in closed_loop(before)}
     later = {(row["method"], row["eta"]): row for row in closed_loop(after)}
     pairs = [(earlier[key], row) for key, row in later.items() if key in earlier]
-    last, lines = closing(after, folder), []
+    last = [*(wrapped(COUNTS) if pairs else []), *closing(after, folder)]
+    lines = atlas_lines(*atlases) if atlases else []
     if pairs:
         old, new = max(pairs, key=lambda pair: pair[1]["eta"])
         lines += wrapped(
@@ -86,9 +96,27 @@ def compared_answer(before: Sequence[dict], after: Sequence[dict], folder: Path 
             for title, name in kinds.items()
             for old, new in pairs
         ]
-        legend = wrapped(COUNTS)
-        lines += [*columns(table[: LINES - len(lines) - len(last) - len(legend)]), *legend]
+        lines += columns(table[: max(2, LINES - len(lines) - len(last))])
     return [*lines[: LINES - len(last)], *last]
+
+
+def atlas_lines(before: Mapping, after: Mapping) -> list[str]:
+    """The cells of two atlases with their numbers of scenes, those of most scenes before first."""
+    scenes = [
+        {tuple(cell[name] for name in CELL): cell["scenes"] for cell in atlas["atlas"]} for atlas in (before, after)
+    ]
+    every = {key: tuple(each.get(key, 0) for each in scenes) for key in (*scenes[0], *scenes[1])}
+    ranked = sorted(every.items(), key=lambda cell: (-cell[1][0], -cell[1][1], cell[0]))
+    failed = [f"{each['failed_scenes']} of {plural(each['scenes'], 'scene')}" for each in (before, after)]
+    gone, new = (sum(not counts[place] for counts in every.values()) for place in (1, 0))
+    lines = wrapped(
+        f"A search finds preventable failures in {failed[0]} before training, in {plural(before['cells'], 'way')}, and "
+        f"in {failed[1]} after it, in {plural(after['cells'], 'way')}: {gone} are gone, {new} are new."
+    )
+    rows = [[", ".join(filter(None, key)), *map(str, counts)] for key, counts in ranked]
+    table = columns([["scenes that fail so", "before", "after"], *rows[:MOST_CELLS]]) if rows else []
+    rest = len(rows) - MOST_CELLS
+    return [*lines, *table, *([f"... and {rest} more in {{before,after}}/{SEARCH}/{ATLAS_FILE}"] if rest > 0 else [])]
 
 
 # --- one attack on one ego

@@ -228,7 +228,7 @@ def inputs(config: DictConfig) -> Iterator[tuple[str, Any]]:
     families = config.search.families.values() if "search" in config and config.get("tries") != 1 else ()
     of_families = (family.get("method", "e2") for family in families if isinstance(family, DictConfig))
     for name in dict.fromkeys([*config.get("methods", ()), *of_families]):
-        if name not in (*config.variants, config.synthesizer.name, "search"):
+        if name not in (*config.get("variants", ()), config.synthesizer.name, "search"):
             yield f"synthesizer={name}", resolved(load_choice("synthesizer", name))
     for entry in config.get("egos", {}).values():
         yield f"ego={entry.ego}", OmegaConf.to_container(load_choice("ego", entry.ego))  # as written

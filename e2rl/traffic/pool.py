@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from e2rl.run.errors import InputError
-from e2rl.traffic.e2.decisions import RULE
+from e2rl.traffic.e2.decisions import OWES, RULE
 from e2rl.traffic.traffic import FULL
 
 RECORDED, LIVE = -1, -2  # sources of a row's traffic that is not a position in the stored traffic
@@ -105,7 +105,8 @@ class TrafficPool:
     def stored(traffic: Mapping[str, Tensor], eta: Tensor | float, template: Tensor | None = None) -> "TrafficPool":
         """Rows of a synthesizer's traffic at intensities eta [S], or one for all, and templates [S] (None: full for
         all): scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N] and adversaries [S, N] bool, and if known
-        evasion [S, T, 2] with span [S, 2]. Raises InputError for a missing key."""
+        evasion [S, T, 2] with span [S, 2], and owes [S] bool (True for all): adversaries give way. Raises InputError
+        for a missing key."""
         missing = {"scene_index", *TRACKS} - set(traffic)
         if missing:
             raise InputError(f"synthesized traffic lacks {', '.join(sorted(missing))}; return them from synthesize()")
@@ -114,7 +115,9 @@ class TrafficPool:
         given = dict(zip(EVASIONS, none, strict=True)) | dict(traffic)
         part = StoredTraffic(*(given[name].cpu() for name in StoredTraffic._fields))
         eta = torch.as_tensor(eta, dtype=torch.float32).cpu().expand(len(index))
+        owes = given.get("owes", torch.ones(len(index))).cpu()
         pool = _rows(index, RECORDED, eta, template=None if template is None else template.cpu())
+        pool.decisions[:, OWES] = owes.to(pool.decisions)
         pool.source, pool.parts = torch.arange(len(index)), [part]
         return pool
 
@@ -149,6 +152,6 @@ def _rows(
     """Fresh rows of weight 1 from one source; by default of seed 0 and template full, by rule."""
     like = torch.zeros(len(scene_index), dtype=torch.int64)
     seed, template = like if seed is None else seed, like + FULL if template is None else template
-    decisions = torch.tensor(RULE).expand(len(like), -1) if decisions is None else decisions
+    decisions = torch.tensor(RULE).repeat(len(like), 1) if decisions is None else decisions
     fresh, weight = torch.ones_like(like).bool(), torch.ones(len(like))
     return TrafficPool(scene_index, like + source, eta, template, seed, decisions, weight, fresh)

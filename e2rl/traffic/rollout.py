@@ -99,7 +99,8 @@ def synthesize_traffic(scenes: SceneSet, traffic: Traffic, sim: SimSettings, bat
     of Algorithm 1 against that ego.
 
     D': scene_index [K], states [K, T+1, N, 4], valid [K, T+1, N], adversaries [K, N], contact [K] (the ego touched a
-    vehicle), and errored {position in S: why} of the S - K rows in which the ego or the traffic raised or became NaN.
+    vehicle), owes [K] bool (the method's adversaries give way to the ego), and errored {position in S: why} of the
+    S - K rows in which the ego or the traffic raised or became NaN.
     """
 
     scene = scenes.batch([0])[:0]
@@ -127,6 +128,7 @@ def synthesize_traffic(scenes: SceneSet, traffic: Traffic, sim: SimSettings, bat
         at = torch.tensor(done, dtype=torch.int64)
         order = at.argsort()
         made = {name: torch.cat([nothing[name], *(part.get(name) for part in parts)])[order] for name in MADE}
-        return made | {"scene_index": scene_index[at[order]], "errored": errored}
+        owes = torch.full((len(at),), traffic.responsibility == "full")
+        return made | {"scene_index": scene_index[at[order]], "owes": owes, "errored": errored}
 
     return synthesize

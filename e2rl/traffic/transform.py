@@ -12,6 +12,7 @@ from e2rl.planners.ego import Ego
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv
+from e2rl.traffic.e2.decisions import OWES
 from e2rl.traffic.e2.reaiming import Reaiming
 from e2rl.traffic.grouping import put_rows, take_rows
 from e2rl.traffic.pool import LIVE, RECORDED, TrafficPool
@@ -96,7 +97,8 @@ class AdversarialSynthesizer(Transform):
         """Who reacts in the new episodes of environments rows [b]."""
         env, drawn = self._env, self._drawn[rows]
         eta = self.pool.eta[drawn] * (self.pool.source[drawn] != LIVE)
-        attack = eta.to(env.device), self.pool.template[drawn].to(env.device)
+        owes = self.pool.decisions[drawn, OWES] >= 0.5
+        attack = eta.to(env.device), self.pool.template[drawn].to(env.device), owes.to(env.device)
         if len(rows) == len(self._drawn):
             self._next_reaction = env.clock
         rows = rows.to(env.device)

@@ -25,6 +25,7 @@ SHORT = [
     "learner.ppo.epochs=1",
     "learner.recorded=false",
     "measure.scenes=1",
+    "measure.budget=0",
 ]
 
 

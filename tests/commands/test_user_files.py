@@ -37,7 +37,7 @@ PRIOR += ["prior.network.width=16", "prior.network.heads=2", "prior.network.bloc
 SMALL = {  # what makes a command of README.md quick, by a part of it
     "python evaluate.py": [*SIZE, "processes=1", "num_scenes=2", "seeds=[0]"],
     "stage=prior": [*SIZE, *PRIOR],
-    "python train.py": [*SIZE, *ROUND, "num_scenes=4", "measure.scenes=2"],
+    "python train.py": [*SIZE, *ROUND, "num_scenes=4", "measure.scenes=2", "measure.budget=100"],
 }
 
 

@@ -22,6 +22,10 @@ def test_every_group_has_its_own_atlas(tmp_path):
     e2, other, nominal = json.loads((tmp_path / ATLAS_FILE).read_text())["groups"]
     counts = [(group["rollouts"], group["preventable"], group["cells"]) for group in (e2, other, nominal)]
     assert counts == [(5, 5, 2), (2, 1, 1), (2, 0, 0)] and nominal["atlas"] == []
+    assert [(group["scenes"], group["failed_scenes"]) for group in (e2, nominal)] == [
+        (len({row["scene_id"] for row in rows if row["method"] == name}), failed)
+        for name, failed in ((e2["method"], 5), ("nominal", 0))
+    ]
     crossing, rear_end = e2["atlas"]
     assert (crossing["approach"], crossing["speed_band"]) == (CROSSING["approach"], "10 to 15 m/s")
     assert (crossing["failures"], crossing["scenes"], crossing["transport"]) == (3, 3, 9.0)

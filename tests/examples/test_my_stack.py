@@ -78,6 +78,7 @@ def test_the_curriculum_runs_a_round(tmp_path):
         "learner.recorded=false",
         "measure.scenes=1",
         "measure.seeds=[0]",
+        "measure.budget=0",
     )
     assert "(eta 1.50)" in out
 

@@ -11,12 +11,13 @@ from e2rl.traffic.traffic import FULL, PAIR, SINGLE
 ETAS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 
 
-def told(curriculum, eta, template, rate, attacks=20, left_out=0):
-    """Attacks of one arm, each driven 10 times, that fail at a rate; `left_out` of them did not enter D'."""
+def told(curriculum, eta, template, rate, attacks=20, left_out=0, survivable=torch.nan):
+    """Attacks of one arm, each driven 10 times, that fail at a rate; `left_out` of them did not enter D', a teacher
+    would survive a share of each."""
     gone = torch.arange(attacks) < left_out
     episodes = torch.full((attacks,), 10).masked_fill(gone, 0)
     arm = torch.full((attacks,), eta), torch.full((attacks,), template)
-    curriculum.observe(Outcomes(*arm, gone, episodes, (rate * episodes).long()))
+    curriculum.observe(Outcomes(*arm, gone, episodes, (rate * episodes).long(), torch.full((attacks,), survivable)))
 
 
 def test_arms_that_never_or_always_fail_are_drawn_less_than_those_in_between():
@@ -43,8 +44,10 @@ def test_an_attack_counts_once_however_many_episodes_are_driven_in_it():
     eta, template = torch.tensor([1.0, 1.0, 1.0, 2.0]), torch.tensor([PAIR, PAIR, PAIR, FULL])
     gone, episodes = torch.tensor([False, True, False, False]), torch.tensor([4, 0, 0, 10])
     for _ in range(2):
-        curriculum.observe(Outcomes(eta, template, gone, episodes, torch.tensor([1, 0, 0, 10])))
-    counts = 1.75 * torch.tensor([[0.25, 0, 0, 1], [0.75, 0, 0, 0], [2, 0, 0, 1], [1, 0, 0, 0]])
+        share = torch.tensor([0.5, torch.nan, 0.2, torch.nan])
+        curriculum.observe(Outcomes(eta, template, gone, episodes, torch.tensor([1, 0, 0, 10]), share))
+    counts = [[0.25, 0, 0, 1], [0.75, 0, 0, 0], [2, 0, 0, 1], [1, 0, 0, 0], [2, 0, 0, 0], [0.7, 0, 0, 0]]
+    counts = 1.75 * torch.tensor(counts)
     torch.testing.assert_close(curriculum._counts, counts.double())
 
 
@@ -54,6 +57,16 @@ def test_failures_that_nobody_prevents_teach_nothing():
     told(curriculum, 2.0, FULL, 0.5, attacks=40, left_out=20)
     value = curriculum.values()
     assert value[2.0, "full"] == pytest.approx(value[1.0, "full"] * (21 / 41), rel=1e-6)
+
+
+def test_of_failures_those_that_the_teacher_would_survive_are_drawn():
+    arms = {"etas": [1.0, 2.0, 3.0], "templates": ["single"], "forgetting": 0.0}
+    for regret in (True, False):
+        curriculum = BanditCurriculum(6, 10, regret=regret, **arms)
+        for eta, rate, survivable in ((1.0, 0.5, 0.1), (2.0, 0.9, 0.8), (3.0, 0.5, torch.nan)):
+            told(curriculum, eta, SINGLE, rate, survivable=survivable)
+        hopeless, survived, untold = curriculum.value().tolist()
+        assert (hopeless < untold < survived) if regret else (survived < hopeless == untold)
 
 
 def test_the_value_is_the_expected_learnability_under_the_posterior():

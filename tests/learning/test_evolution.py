@@ -121,7 +121,7 @@ def test_planners_are_tuned_and_attacked_as_tuned():
     assert metrics["train/trials"] == 3 and len(run.improve.trials) == 3
     assert run.ego.desired_speed > 5, "standing still is no improvement"
     assert metrics["train/objective"] <= metrics["train/objective_before"]
-    assert not torch.isnan(run.curriculum.learnability()).any(), "its episodes feed the curriculum"
+    assert not torch.isnan(run.curriculum.regret()).any(), "its episodes feed the curriculum"
     asked = []
     attack = run.synthesize
     run.synthesize = lambda ego, *rest: asked.append(ego) or attack(ego, *rest)

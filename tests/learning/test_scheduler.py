@@ -16,7 +16,8 @@ def curriculum_of(num_scenes=6, **settings):
 
 def episodes(curriculum, scenes, failed, adversarial=True):
     """Episodes in scenes, each failed or not."""
-    curriculum.update(torch.tensor(scenes), torch.tensor(failed), torch.full((len(scenes),), adversarial))
+    untold = torch.full((len(scenes),), torch.nan)
+    curriculum.update(torch.tensor(scenes), torch.tensor(failed), torch.full((len(scenes),), adversarial), untold)
 
 
 def failing(curriculum, *rates):
@@ -25,18 +26,18 @@ def failing(curriculum, *rates):
         episodes(curriculum, [scene] * 10, [k < round(10 * rate) for k in range(10)])
 
 
-def test_learnability_is_the_variance_of_recent_failures_in_adversarial_traffic(monkeypatch):
+def test_regret_is_the_variance_of_recent_failures_in_adversarial_traffic(monkeypatch):
     monkeypatch.setattr(scheduler, "SMOOTHING", 0.25)
     curriculum = curriculum_of()
     episodes(curriculum, [0, 1, 1], [True, False, True], adversarial=False)
-    assert curriculum.learnability().isnan().all(), "nothing is known of adversarial traffic yet"
+    assert curriculum.regret().isnan().all(), "nothing is known of adversarial traffic yet"
     failing(curriculum, 0.2, 1.0, 0.0)
-    torch.testing.assert_close(curriculum.learnability()[:3], torch.tensor([0.16, 0.0, 0.0]))
+    torch.testing.assert_close(curriculum.regret()[:3], torch.tensor([0.16, 0.0, 0.0]))
     episodes(curriculum, [1], [False])
-    assert curriculum.learnability()[1] == pytest.approx(0.75 * 0.25), "the rate is a moving average"
+    assert curriculum.regret()[1] == pytest.approx(0.75 * 0.25), "the rate is a moving average"
 
 
-def test_priorities_are_by_rank_of_learnability_and_by_staleness(monkeypatch):
+def test_priorities_are_by_rank_of_regret_and_by_staleness(monkeypatch):
     monkeypatch.setattr(scheduler, "STALENESS", 0.0)
     curriculum = curriculum_of(4)
     assert curriculum.priority().tolist() == [0.25] * 4
@@ -68,6 +69,17 @@ def test_a_drawn_scene_is_not_stale():
     assert (curriculum._drawn == 5).nonzero()[:, 0].tolist() == sorted(drawn.tolist())
 
 
+def test_regret_is_what_a_teacher_would_have_survived_where_one_tells():
+    given, told = [torch.tensor([0, 0, 1, 2])] + [torch.tensor([True, False, True, True])], [0.25, 0.75, torch.nan, 1.0]
+    adversarial = torch.tensor([True, True, True, False])
+    curriculum, deaf = curriculum_of(), curriculum_of(regret=False)
+    for each in (curriculum, deaf):
+        each.update(*given, adversarial, torch.tensor(told))
+    assert curriculum.regret()[:3].nan_to_num(-1).tolist() == [0.5 * 0.5, 0.0, -1.0]
+    curriculum.update(torch.tensor([1]), torch.tensor([True]), torch.tensor([True]), torch.tensor([0.75]))
+    assert curriculum.regret()[1] == 0.75 and deaf.regret()[:2].tolist() == [0.25, 0.0]
+
+
 def test_ranks_share_ties():
     assert ranks(torch.tensor([5.0, 1.0, 5.0, torch.inf, 0.0])).tolist() == [2.5, 4.0, 2.5, 1.0, 5.0]
 
@@ -76,7 +88,7 @@ def test_scenes_left_out_are_not_drawn_first():
     curriculum = curriculum_of(4)
     failing(curriculum, 0.5)
     curriculum.leave_out(torch.tensor([0, 1]))
-    assert curriculum.learnability().nan_to_num(-1).tolist() == [0.25, 0.0, -1.0, -1.0]
+    assert curriculum.regret().nan_to_num(-1).tolist() == [0.25, 0.0, -1.0, -1.0]
 
 
 def test_state_goes_on_exactly():
@@ -101,7 +113,9 @@ def test_episodes_count_for_the_attack_whose_row_they_drove():
     """Attacks 0 and 2 of three entered D'; rows beyond them are nominal or remembered."""
     eta, template = torch.tensor([1.0, 2.0, 2.0]), torch.tensor([SINGLE, PAIR, PAIR])
     row, failed = torch.tensor([0, 0, 1, 2, 5, 1]), torch.tensor([True, False, True, True, True, True])
-    outcomes = outcomes_of(eta, template, torch.tensor([0, 2]), row, failed)
+    share = torch.tensor([0.5, 0.5, 0.25, torch.nan, 1.0, 0.25])
+    outcomes = outcomes_of(eta, template, torch.tensor([0, 2]), row, failed, share)
+    assert outcomes.survivable.nan_to_num(-1).tolist() == [0.5, -1.0, 0.25]
     assert outcomes.left_out.tolist() == [False, True, False]
     assert outcomes.episodes.tolist() == [2, 0, 2] and outcomes.failures.tolist() == [1, 0, 2]
     assert outcomes.failure_rate.nan_to_num(-1).tolist() == [0.5, -1.0, 1.0]
@@ -110,7 +124,7 @@ def test_episodes_count_for_the_attack_whose_row_they_drove():
 def test_the_table_counts_draws_episodes_and_failures_by_arm():
     eta, template = torch.tensor([1.0, 2.0, 2.0]), torch.tensor([SINGLE, PAIR, PAIR])
     flags = torch.tensor([False, True, False])
-    outcomes = Outcomes(eta, template, flags, torch.tensor([2, 0, 2]), torch.tensor([1, 0, 2]))
+    outcomes = Outcomes(eta, template, flags, torch.tensor([2, 0, 2]), torch.tensor([1, 0, 2]), torch.zeros(3))
     rows = tally(4, eta, outcomes, {(0.5, "full"): 0.2, (1.0, "single"): 0.1})
     plain = [tuple(-1 if value != value else value for value in row.values()) for row in rows]
     assert plain == [

@@ -80,7 +80,7 @@ def test_a_label_is_what_the_planner_would_do_in_the_same_state():
         frames, world = data[:, step], env.world()
         for name in ("states", "valid", "accel", "turn_rate"):
             assert torch.equal(frames["agents", name], getattr(world, name)), name
-        labels = improve.teacher.labels(frames, improve.ego)
+        labels, _ = improve.teacher.labels(frames, improve.ego)
         actions, costs = ranked_actions(planner, world, 48, 2)
         assert torch.equal(labels["action"], clip_expert(actions, low, high))
         assert torch.equal(labels["weight"], torch.softmax(-costs / 5.0, -1))
@@ -105,12 +105,27 @@ def test_only_what_the_teacher_does_better_by_far_and_survives_is_labelled():
     data, improve = collected(scenes, attacked(scenes, 3.0))
     start = data[:, 2]  # the leader is there from the first step on
     strict = Teacher(SamplingEgo(), scenes, BOUNDS, 2, {})
-    assert len(strict.labels(start, Blind())) == len(start)
-    assert len(strict.labels(start, SamplingEgo())) == 0
+    assert len(strict.labels(start, Blind())[0]) == len(start)
+    assert len(strict.labels(start, SamplingEgo())[0]) == 0
     hopeless = start.clone()
     hopeless["agents", "states"][:, 1, :2] = hopeless["agents", "states"][:, 0, :2] + torch.tensor([3.0, 0.0])
-    assert len(strict.labels(hopeless, Blind())) == 0
-    assert len(improve.teacher.labels(hopeless, Blind())) == len(start), "of which all are with these settings"
+    assert len(strict.labels(hopeless, Blind())[0]) == 0
+    assert len(improve.teacher.labels(hopeless, Blind())[0]) == len(start), "of which all are with these settings"
+
+
+def test_a_row_is_survivable_where_the_teacher_gets_away_and_the_policy_does_not():
+    scenes = small_scenes(3, steps=40)
+    pool = attacked(scenes, 3.0)
+    data, improve = collected(scenes, pool)
+    teacher, row = improve.teacher, data["traffic", "row"][..., 0].unique()
+    teacher.watch(data, pool.adversarial, SamplingEgo(), 1000)
+    share = teacher.survivable(len(pool))
+    assert (share[row] == 0).all(), "who plans as the teacher does loses nothing that it would survive"
+    assert teacher.survivable(len(pool)).isnan().all(), "of a round alone"
+    _, away = teacher.labels(data[:, 2], Blind())
+    hopeless = data[:, 2].clone()
+    hopeless["agents", "states"][:, 1, :2] = hopeless["agents", "states"][:, 0, :2] + torch.tensor([3.0, 0.0])
+    assert away.all() and not teacher.labels(hopeless, Blind())[1].any()
 
 
 def test_nominal_episodes_are_not_labelled_and_the_newest_labels_stay():

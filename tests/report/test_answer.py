@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from e2rl.metrics.atlas import CELL
 from e2rl.report.answer import LINES, answer_lines, compared_answer
 
 NAN = math.nan
@@ -63,6 +64,24 @@ def test_before_and_after_stand_side_by_side():
     assert line.split("  ")[-1].strip() == "-25 [-40, -10]" and "50% (6 of 12)" in line and "25% (3 of 12)" in line
 
 
+def atlas(failed, **scenes):
+    """An atlas of ways to fail, each with its number of scenes."""
+    cells = [dict.fromkeys(CELL, "") | {"approach": name, "scenes": count} for name, count in scenes.items()]
+    return {"scenes": 12, "failed_scenes": failed, "cells": len(cells), "atlas": cells}
+
+
+def test_the_ways_before_and_after_training_stand_side_by_side(tmp_path):
+    old, new = row("e2", 2.0, cfr=0.5), row("e2", 2.0, cfr=0.25)
+    lines = compared_answer([old], [new], (atlas(4, rear=1, oncoming=3), atlas(2, crossing=1, oncoming=1)), tmp_path)
+    said = " ".join(" ".join(lines).split())
+    assert "in 4 of 12 scenes before training, in 2 ways, and in 2 of 12 scenes after it, in 2 ways" in said
+    assert "1 are gone, 1 are new" in said
+    ways = [line.split() for line in lines if line.split()[:1] in (["oncoming"], ["rear"], ["crossing"])]
+    assert ways == [["oncoming", "3", "1"], ["rear", "1", "0"], ["crossing", "0", "1"]]
+    none = compared_answer([old], [new], (atlas(0), atlas(0)), tmp_path)
+    assert "in 0 of 12 scenes before training" in " ".join(" ".join(none).split())
+
+
 @pytest.mark.parametrize("width", [80, 100])
 def test_it_fits_whatever_it_is_told(tmp_path, monkeypatch, width):
     monkeypatch.setenv("COLUMNS", str(width))
@@ -70,8 +89,9 @@ def test_it_fits_whatever_it_is_told(tmp_path, monkeypatch, width):
     egos = [row(method, eta, ego, 0.5, 9999) for ego in "uvwxyz" for method, eta in (("n", 0.0), ("ctg_adv", 2.5))]
     notes = ["12 scenes left out: the ego overlaps another vehicle at the start of the recording."] * 4
     pairs = [row(f"a_long_name_of_a_method_{k}", 1.0, cfr=0.5) for k in range(9)]
+    ways = atlas(9, **{"crossing from the right, " * 9 + str(k): k for k in range(20)})
     answers = [answer_lines(rows, long, tmp_path, None, notes) for rows in (pairs[:1], egos, egos[:1])]
-    for lines in (*answers, compared_answer(pairs, pairs, tmp_path)):
+    for lines in (*answers, *(compared_answer(pairs, pairs, each, tmp_path) for each in (None, (ways, ways)))):
         assert len(lines) <= LINES and all(len(line) <= width for line in lines if str(tmp_path) not in line)
         assert lines[-1].endswith("tables.md"), "where everything lies is never cut"
 

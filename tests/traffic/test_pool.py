@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from e2rl.run.errors import InputError
+from e2rl.traffic.e2.decisions import OWES
 from e2rl.traffic.pool import LIVE, RECORDED, TrafficPool
 from tests.learning.small import brake_check, small_scenes
 
@@ -34,6 +35,13 @@ def test_joined_rows_keep_their_traffic():
         assert pool.parts[0] is attack.parts[0] and len(pool) == 9, "the tracks are shared"
         assert torch.equal(pool.scene_index, INDEX.repeat(3))
     assert both.seed.tolist() == [0] * 6 + [7, 8, 9] and both.eta.tolist() == [2.0] * 3 + [0.0] * 3 + [1.0] * 3
+
+
+def test_whether_adversaries_give_way_stays_with_their_rows():
+    traffic = brake_check(small_scenes())(None, INDEX, 2.0, 0)
+    some = TrafficPool.stored({**traffic, "owes": torch.tensor([True, False, True])}, 2.0)
+    both = (recorded() + some).decisions[:, OWES].tolist()
+    assert both == [1, 1, 1, 1, 0, 1] and stored().decisions[:, OWES].tolist() == [1, 1, 1]
 
 
 def test_tracks_are_gathered_from_the_parts_as_from_one():

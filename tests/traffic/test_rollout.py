@@ -100,7 +100,7 @@ def test_the_traffic_of_a_round_is_the_rollouts_and_its_seeds_are_the_scenes_own
     synthesize = synthesize_traffic(scene_set, synthesizer(), SimSettings(), batch=2)
     found = synthesize(EGO, rows, 2.0, 5)
     assert torch.equal(found["scene_index"], rows) and found["states"].shape[:2] == (3, 21)
-    assert found["adversaries"].any(1).all() and found["contact"].shape == (3,)
+    assert found["adversaries"].any(1).all() and found["contact"].shape == (3,) and found["owes"].all()
     alone = synthesize(EGO, rows[1:2], 2.0, 5)
     torch.testing.assert_close(alone["states"][0], found["states"][1], rtol=0, atol=2e-2)
     assert not torch.equal(synthesize(EGO, rows, 2.0, 6)["states"], found["states"])

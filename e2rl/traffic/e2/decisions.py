@@ -34,7 +34,7 @@ class Decisions(NamedTuple):
     scatter: Any = 0.0
 
 
-RULE = Decisions()
+RULE, OWES = Decisions(), Decisions._fields.index("owes")
 
 
 def eligible(world: World, whom: Tensor, lawful: bool) -> Tensor:

@@ -178,7 +178,7 @@ class ReactSettings:
     eta: tuple[float, float] | None = setting(low=0, optional=True)
     scatter: float = setting(low=0)
     responsibility: str = setting(choices=RESPONSIBILITIES)
-    reckless: float = setting(low=0, high=1)
+    reckless: float | None = setting(low=0, high=1, optional=True)
 
     def __post_init__(self) -> None:
         if self.eta is not None and not self.eta[0] <= self.eta[1]:
@@ -189,12 +189,13 @@ def drawn(
     settings: ReactSettings,
     eta: Tensor,
     template: Tensor,
+    owes: Tensor,
     adversaries: Tensor,
     horizon: int,
     generator: torch.Generator,
 ) -> TensorDict:
-    """The part of the traffic in b new episodes of `horizon` steps, of attacks of eta [b] (0: none), template [b] and
-    adversaries [b, V].
+    """The part of the traffic in b new episodes of `horizon` steps, of attacks of eta [b] (0: none), template [b], owes
+    [b] bool (they give way to the ego) and adversaries [b, V].
 
     start [b]: step from which on vehicles react (NEVER: they do not), eta [b], count [b] of them, others [b] bool: not
     the traffic's own adversaries; reckless [b] bool: they owe the ego nothing; rank [b, V]: random, the lowest react;
@@ -216,7 +217,7 @@ def drawn(
         "eta": eta,
         "count": count,
         "others": others < settings.others,
-        "reckless": reckless < settings.reckless,
+        "reckless": ~owes if settings.reckless is None else reckless < settings.reckless,
         "rank": draws[:, 6:],
         "adversaries": adversaries,
         "vehicle": nobody,
@@ -253,12 +254,15 @@ class Reaiming:
         self.law = Law(settings.responsibility)
         self._part: TensorDict | None = None  # [B] `drawn`
 
-    def begin(self, rows: Tensor, eta: Tensor, template: Tensor, adversaries: Tensor, horizon: int) -> None:
+    def begin(
+        self, rows: Tensor, eta: Tensor, template: Tensor, owes: Tensor, adversaries: Tensor, horizon: int
+    ) -> None:
         """Draws for new episodes of environments rows [b] whether, who and when.
 
-        eta [b]: of replayed attacks, 0 of other traffic; template [b], adversaries [b, V] bool: of these attacks.
+        eta [b]: of replayed attacks, 0 of other traffic; template [b], owes [b] bool, adversaries [b, V] bool: of these
+        attacks.
         """
-        part = drawn(self.settings, eta, template, adversaries, horizon, self.generator)
+        part = drawn(self.settings, eta, template, owes, adversaries, horizon, self.generator)
         if self._part is None or len(part) == len(self._part):
             self._part = part  # the first reset is of all environments
         else:

@@ -93,10 +93,12 @@ def test_other_vehicles_that_move_near_the_ego_react(scene_set):
     assert not leads.any(), "under full responsibility none that leads the ego's way"
 
 
-def test_the_attack_s_intensity_and_template_may_say_how_they_react():
+def test_the_attack_s_intensity_template_and_duty_may_say_how_they_react():
     eta, template = torch.tensor([0.0, 0.5, 2.5, 2.5]), torch.tensor([PAIR, SINGLE, SINGLE, FULL])
-    given = torch.ones(4, 6, dtype=torch.bool), STEPS, torch.Generator().manual_seed(0)
-    part = drawn(ReactSettings(fraction=1.0, eta=None), eta, template, *given)
+    owes = torch.tensor([True, True, False, True])
+    given = owes, torch.ones(4, 6, dtype=torch.bool), STEPS, torch.Generator().manual_seed(0)
+    part = drawn(ReactSettings(fraction=1.0, eta=None, reckless=None), eta, template, *given)
+    assert torch.equal(part["reckless"], ~owes)
     assert torch.equal(part["eta"], eta) and part["count"][1:].tolist() == [1, 1, 2]
     assert ((part["start"] < STEPS) == (eta > 0)).all()
     part = drawn(ReactSettings(fraction=1.0, eta=(1.0, 1.0)), eta, template, *given)
