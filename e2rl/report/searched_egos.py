@@ -18,9 +18,9 @@ from e2rl.search.tries import TRIES
 EVENTS = ("cfr_preventable", "cfr_counted", "cfr")
 TITLE = "Scenes in which each ego fails"
 CAPTION = (
-    "Scenes with a try that ends in a contact (`cfr`), in one that counts, in a preventable one. Each search of a "
-    "scene counts once. 95% intervals by place and, of several trainings of one policy, by training. Differences are of the "
-    "same scenes; a star: the interval leaves out 0."
+    "Scenes with a try that ends in a contact (`cfr`), in one that counts, in a preventable one. Each search of a scene"
+    " counts once. 95% intervals by place and, of several trainings of one policy, by training. Differences are of the"
+    " same scenes; a star: the interval leaves out 0."
 )
 NOTHING = {name: torch.zeros(2, 0) for name in (*KINEMATICS, *OF_ADVERSARIES)}
 
