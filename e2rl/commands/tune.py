@@ -9,14 +9,16 @@ import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one lin
 # isort: split
 from collections.abc import Mapping
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from e2rl.evaluation.methods import build_ego, build_traffic, method_config, processes_of
+from e2rl.evaluation.budget import TRIES_FILE, failures_of, methods_at, portfolio_plan
+from e2rl.evaluation.methods import SEARCH, build_ego, build_traffic, method_config, processes_of
 from e2rl.evaluation.plan import Evaluation, begin
-from e2rl.evaluation.protocol import Method
+from e2rl.evaluation.protocol import Method, Part
 from e2rl.evaluation.trials import NOMINAL, AttackObjective, AttackTrials, PlannerObjective, PlannerTrials
 from e2rl.evaluation.tuning import STUDY_FILE, Objective, Parameters, SearchSettings, line_of, save, search, yaml_of
 from e2rl.report.curves import points_of_tuning, save_curves
@@ -53,6 +55,7 @@ def tune(run: Run) -> dict:
     about = {name: resolved(config[name]) for name in ("ego", "prior", "sim")} | {
         "rows": [f"{method.name}@{method.eta:g}" for method in plan.methods] if group == "ego" else [NOMINAL],
         "seeds": list(plan.asked.seeds),
+        "failures": [[list(task.one or ()) for task in part[2]] for part in getattr(trials, "failures", ())],
         "scenes": plan.scenes.scene_id,
         "eta": list(plan.asked.eta),
     }
@@ -70,12 +73,17 @@ def tune(run: Run) -> dict:
 
 
 def planner_trials(config: DictConfig, plan: Evaluation) -> PlannerTrials:
-    """Returns trials of the group `ego` against all of `config.methods`."""
+    """Returns trials of the group `ego` against all of `config.methods`, and in the tries of `tuning.failures`."""
 
     def make(parameters: Parameters) -> Any:
         return build_ego(OmegaConf.create({"ego": with_changes(config.ego, parameters, "tuning.space", "ego")}))
 
-    return PlannerTrials(plan.setup, plan.methods, plan.asked.seeds, make, processes_of(config))
+    failures: list[Part] = []
+    if config.tuning.failures is not None:
+        portfolio = portfolio_plan(SEARCH, config, partial(methods_at(max(plan.asked.eta)), plan.prior))
+        file = Path(config.tuning.failures) / TRIES_FILE
+        failures = failures_of(file, plan.setup.ego_name, portfolio, plan.setup)
+    return PlannerTrials(plan.setup, plan.methods, plan.asked.seeds, make, processes_of(config), failures)
 
 
 def attack_trials(config: DictConfig, plan: Evaluation) -> tuple[AttackTrials, Mapping]:

@@ -4,6 +4,7 @@ Every method is tried again and again, with other noise; the method `search` spe
 families. What they find is told at several budgets by `report.budget`.
 """
 
+import csv
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -55,16 +56,7 @@ def build_plans(config: DictConfig, prior: Prior) -> list[Plan]:
         raise InputError(
             f"eta={eta}: a search has one intensity, of which its families take shares; name one, or set tries=1"
         )
-    traffic: dict[str, Method] = {}
-
-    def method(own: Prior, name: str, synthesizer: DictConfig) -> Method:
-        key = f"{id(own)} {name} {OmegaConf.to_yaml(synthesizer)}"
-        if key not in traffic:
-            built = build_traffic(synthesizer, own)
-            traffic[key] = Method(name, built, eta[0] if built.adversarial else 0.0)
-        return traffic[key]
-
-    plans = []
+    method, plans = methods_at(eta[0]), []
     for name in rows_of(config):
         changed, own = config_and_prior(config, name, prior)
         if is_search(config, name):
@@ -74,6 +66,20 @@ def build_plans(config: DictConfig, prior: Prior) -> list[Plan]:
             again = replace(SearchSettings(), cover=TRIES, bandit=False)
             plans.append(Plan(name, [Family(name, name, {})], {name: method(own, name, synthesizer)}, again))
     return plans
+
+
+def methods_at(eta: float) -> Callable[[Prior, str, DictConfig], Method]:
+    """A function that builds the methods of a name and a configuration on a prior, equal ones once, at an intensity."""
+    known: dict[str, Method] = {}
+
+    def method(prior: Prior, name: str, synthesizer: DictConfig) -> Method:
+        key = f"{id(prior)} {name} {OmegaConf.to_yaml(synthesizer)}"
+        if key not in known:
+            built = build_traffic(synthesizer, prior)
+            known[key] = Method(name, built, eta if built.adversarial else 0.0)
+        return known[key]
+
+    return method
 
 
 def portfolio_plan(name: str, config: DictConfig, method: Callable[[str, DictConfig], Method]) -> Plan:
@@ -199,6 +205,33 @@ def row_seed(seed: int, one: Try) -> int:
     if one.number >= TRIES:
         raise InputError(f"budget: more than {TRIES} tries of a scene have no seeds of their own; spend less")
     return seed * TRIES + one.number
+
+
+def failures_of(file: Path, ego_name: str, plan: Plan, setup: Setup) -> list[Part]:
+    """The tries of a `write_tries` file that hit an ego, as parts to be driven again; plan: the portfolio that they are
+    of. Raises InputError for a file that is none, and for tries of other scenes, egos or families."""
+    try:
+        with file.open(newline="", encoding="utf-8") as lines:
+            rows = [
+                (row["scene_id"], int(row["seed"]), row["family"])
+                for row in csv.DictReader(lines)
+                if (row["method"], row["ego_policy"]) == (plan.name, ego_name) and float(row["margin"]) >= 0
+            ]
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{file}: no table of a search's tries ({error!r}); name the folder of a search") from None
+    if not rows:
+        raise InputError(f"{file}: no try of {plan.name} hits {ego_name}; name a search against it")
+    families = {family.name: family for family in plan.families}
+    if unknown := {family for _, _, family in rows} - set(families):
+        raise InputError(f"{file}: family {min(unknown)} is none of search.families; set these as in its run")
+    every = range(len(setup.scenes))
+    searches = {seed: plan.begin(setup, seed, every) for seed in {seed // TRIES for _, seed, _ in rows}}
+    tries: dict[int, list[Try]] = {}
+    for scene_id, number, name in rows:
+        seed, scene = number // TRIES, setup.scenes.index(scene_id)
+        drawn = families[name].draw(scene, number % TRIES, searches[seed].seed_of(scene), plan.settings.stratified)
+        tries.setdefault(seed, []).append(drawn)
+    return [part for seed, own in tries.items() for part in batches(setup, plan, seed, every, own)]
 
 
 def write_tries(path: Path, told: Sequence[Mapping]) -> None:

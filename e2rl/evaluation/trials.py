@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import torch
 
-from e2rl.evaluation.protocol import Method, Setup, Work, drive_all
+from e2rl.evaluation.protocol import Method, Part, Setup, Work, drive_all, extend, score_all
 from e2rl.evaluation.rollout_files import require_rows
 from e2rl.evaluation.tuning import Parameters
 from e2rl.metrics.statistics import summarise
@@ -84,13 +84,15 @@ class AttackObjective:
 
 @dataclass
 class PlannerTrials:
-    """The metrics of a planner in all scenes, seeds and methods; make: the planner of some parameters."""
+    """The metrics of a planner in all scenes, seeds and methods, and in the tries of a search that hit it once; make:
+    the planner of some parameters; failures: these tries, which are driven again."""
 
     setup: Setup
     methods: Sequence[Method]
     seeds: Sequence[int]
     make: Callable[[Parameters], Ego]
     processes: Processes = 1
+    failures: Sequence[Part] = ()
 
     def __call__(self, parameters: Parameters) -> dict[str, float]:
         """Returns the means of DRIVING, also of every method alone as `NAME METHOD@ETA`, and `errored`.
@@ -99,11 +101,17 @@ class PlannerTrials:
         |acceleration| [m/s^2]; progress [m]; errored: fraction without a score, `errored: REASON` for each reason.
         """
         setup = replace(self.setup, ego=self.make(parameters), evasions=False)
-        rows, _, errored = drive_all([setup], self.methods, self.seeds, Work(processes=self.processes))
+        work = Work(processes=self.processes)
+        found = drive_all([setup], self.methods, self.seeds, work)
+        jobs = [(f"{number}", (setup, method, tasks)) for number, (_, method, tasks) in enumerate(self.failures)]
+        for scored in score_all(jobs, work, lambda job: len(job[1][2])):
+            extend(found, scored)
+        rows, _, errored = found
         metrics = driving(rows)
-        for method in self.methods:
-            own = [row for row in rows if row["method"] == method.name and row["eta"] == method.eta]
-            metrics |= {f"{name} {method.name}@{method.eta:g}": value for name, value in driving(own).items()}
+        driven = [*self.methods, *(method for _, method, _ in self.failures)]
+        for method, eta in dict.fromkeys((each.name, each.eta) for each in driven):
+            own = [row for row in rows if (row["method"], row["eta"]) == (method, eta)]
+            metrics |= {f"{name} {method}@{eta:g}": value for name, value in driving(own).items()}
         count = len(rows) + len(errored)
         metrics |= {f"errored: {reason}": number / count for reason, number in count_reasons(errored).items()}
         return metrics | {"errored": len(errored) / count}

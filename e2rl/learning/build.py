@@ -11,7 +11,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf, open_dict
 from tqdm import tqdm
 
-from e2rl.evaluation.budget import portfolio_plan
+from e2rl.evaluation.budget import methods_at, portfolio_plan
 from e2rl.evaluation.methods import SEARCH, as_list, build_prior, build_sim, build_traffic, processes_of
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.learning.attack import Synthesize, mixture, solvable
@@ -149,10 +149,8 @@ def build_measure(
     if not options.budget:
         return BeforeAfter(*given)
 
-    def method(name: str, synthesizer: DictConfig) -> Method:
-        return Method(name, build_traffic(synthesizer, prior), max(options.eta))
-
-    return BeforeAfter(*given, portfolio_plan(SEARCH, config, method), options.budget)
+    search = portfolio_plan(SEARCH, config, partial(methods_at(max(options.eta)), prior))
+    return BeforeAfter(*given, search, options.budget)
 
 
 ROLLOUT, TRY = 0.7, 150.0  # s on one core of a rollout that is measured and scored; NFE of a try of a search

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from e2rl.evaluation.budget import Plan, build_plans, search_all, spend, write_tries
+from e2rl.evaluation.budget import Plan, build_plans, failures_of, search_all, spend, write_tries
 from e2rl.evaluation.protocol import Method, Setup, Work
+from e2rl.evaluation.trials import PlannerTrials
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
@@ -83,6 +84,40 @@ def test_a_search_goes_on_where_it_was_killed(setup, plan, tmp_path):
     assert known(found(setup, plan, parts=parts)) == known(whole)
     assert {file: file.stat().st_mtime_ns for file in times} == times, "what was done is not done again"
     assert sorted(tmp_path.rglob("tries-*.pt")) == files
+
+
+def test_the_tries_that_hit_an_ego_are_driven_again_as_they_were(setup, plan, tmp_path):
+    (((rows, _, _), told),) = spend([(setup, plan, 3, range(3), 4.0, "tries")])
+    chosen = [k for k in range(len(told)) if k % 3 != 1]
+    write_tries(tmp_path / "tries.csv", [row | {"margin": 0.5 if k in chosen else -1.0} for k, row in enumerate(told)])
+    parts = failures_of(tmp_path / "tries.csv", "idm", plan, setup)
+    again = {}
+    for part, method, tasks in parts:
+        again |= {(row["scene_id"], row["seed"]): row for row in part.score(method, tasks)[0]}
+    keys = [(told[k]["scene_id"], told[k]["seed"]) for k in chosen]
+    before = {(row["scene_id"], row["seed"]): row for row in rows if (row["scene_id"], row["seed"]) in keys}
+    assert again.keys() == before.keys() and len(before) == len(chosen) > 4
+    for key, row in before.items():
+        for name in ("progress", "min_dtc", "transport"):
+            assert again[key][name] == pytest.approx(row[name], rel=1e-3, abs=1e-3), name
+    measured = PlannerTrials(setup, [], [0], lambda _: setup.ego, failures=parts)({})
+    assert measured["progress"] == pytest.approx(
+        sum(row["progress"] for row in before.values()) / len(before), rel=1e-3
+    )
+
+
+def test_tries_that_are_not_of_this_search_are_refused(setup, plan, tmp_path):
+    (((rows, _, _), told),) = spend([(setup, plan, 3, range(3), 1.0, "tries")])
+    file = tmp_path / "tries.csv"
+    with pytest.raises(InputError, match="no table of a search's tries"):
+        failures_of(file, "idm", plan, setup)
+    write_tries(file, [row | {"margin": -1.0} for row in told])
+    with pytest.raises(InputError, match="no try of search hits idm"):
+        failures_of(file, "idm", plan, setup)
+    for change, what in (({"family": "other"}, "family other"), ({"scene_id": "elsewhere"}, "scene=elsewhere")):
+        write_tries(file, [row | {"margin": 1.0} | change for row in told])
+        with pytest.raises(InputError, match=what):
+            failures_of(file, "idm", plan, setup)
 
 
 def test_a_method_that_evaluates_no_network_has_no_budget_of_evaluations(setup):
