@@ -21,6 +21,7 @@ from e2rl.sim.observation import OBSERVATION_SIZE
 DEEPEST, WIDEST = 16, 1 << 13  # layers, and units of a layer, that a file may ask for
 WEIGHTS = "actor.safetensors"  # file name of an ActorCritic inside a checkpoint
 NARROWEST = 0.01  # least standard deviation before squashing, as a fraction of half the action range
+LAST = ("network.trunk.last.weight", "network.trunk.last.bias")
 STEEPEST = 0.95  # reference actions are kept within this fraction of the bounds, so that their atanh stays finite
 
 
@@ -58,9 +59,10 @@ class Normaliser(nn.Module):
 class ActorNetwork(nn.Module):
     """Mean and standard deviation of the action before squashing.
 
-    The mean is the reference's action (if `reference`) plus the network's output, which is unbounded and can override
-    the reference. The output starts at zero: an untrained actor executes the reference's action, or without a reference
-    the middle of the action's bounds.
+    The mean is c + (1 + w) r: r is the reference's action (if `reference`, else 0), c and w [2] the network's output.
+    It can let go of the reference (w = -1), which it could not cancel without knowing it: near a contact r jumps from
+    full speed to full braking. The output starts at zero: an untrained actor executes the reference's action, or
+    without a reference the middle of the action's bounds.
     """
 
     middle: Tensor
@@ -78,7 +80,7 @@ class ActorNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.normaliser, self.reference = normaliser, reference
-        self.trunk = Trunk(hidden, agent_units, 2, last_gain=0.0)
+        self.trunk = Trunk(hidden, agent_units, 4 if reference else 2, last_gain=0.0)
         self.spread = nn.Parameter((torch.tensor(initial_std) - NARROWEST).logit(1e-4))
         self.noise: Tensor | None = None  # [D], set by `noisy`
         self.register_buffer("middle", (high + low) / 2, persistent=False)
@@ -92,7 +94,7 @@ class ActorNetwork(nn.Module):
         return self.head(seen, self.offset(observation))
 
     def offset(self, observation: Tensor) -> Tensor:
-        """What the network's output [..., 2] is added to at observation [..., D]: no parameter changes it."""
+        """r [..., 2] at observation [..., D]: no parameter changes it."""
         if not self.reference:
             return torch.zeros_like(observation[..., :2])
         part = (reference_action(observation) - self.middle) / self.reach
@@ -100,7 +102,9 @@ class ActorNetwork(nn.Module):
 
     def head(self, seen: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
         """loc, scale [..., 2] from the normalised observation [..., D] and the `offset` [..., 2]."""
-        loc = self.trunk(seen) + offset
+        loc = self.trunk(seen)
+        if self.reference:
+            loc = loc[..., :2] + (1 + loc[..., 2:]) * offset
         return loc, self.std.expand_as(loc)
 
     @contextmanager
@@ -223,6 +227,7 @@ def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
             raise ValueError(f"of {saved['observation']} numbers, {units} units an agent, layers of {sizes} units")
         actor = ActorCritic(low, high, sizes, units, bool(saved["reference"]), device=device)
         own = actor.weights()
+        weights |= {key: padded(weights[key], own[key]) for key in LAST if key in own and key in weights}
         wrong = set(own) ^ set(weights) or {key for key in own if own[key].shape != weights[key].shape}
         if wrong:
             raise ValueError(f"weights {', '.join(sorted(wrong))} do not fit")
@@ -230,6 +235,12 @@ def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
         raise InputError(f"{path}: damaged, or an actor of another version ({error}); train it again") from None
     actor.set_weights(weights)
     return actor
+
+
+def padded(value: Tensor, like: Tensor) -> Tensor:
+    """The trunk's last layer of an earlier version, which had no w, with w = 0."""
+    missing = len(like) - len(value)
+    return torch.cat([value, value.new_zeros(missing, *value.shape[1:])]) if len(value) == 2 and missing == 2 else value
 
 
 def find_weights(path: str | Path) -> Path:

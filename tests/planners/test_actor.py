@@ -85,6 +85,34 @@ def test_file_round_trip(tmp_path):
         assert torch.equal(ask(first), ask(second))
 
 
+def test_a_file_without_the_reference_s_weight_drives_as_it_did(tmp_path):
+    """Earlier versions added the network's output to the reference's action."""
+    first = wild(ActorEgo(hidden=(8,)))
+    network, file = first.network.network, tmp_path / "actor.safetensors"
+    with torch.no_grad():
+        for value in network.trunk.last.parameters():
+            value[2:] = 0.0
+    observation = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()["observation"]
+    with torch.no_grad():
+        added = network.trunk(network.normaliser(observation))[:, :2] + network.offset(observation)
+        expected = network.middle + network.reach * added.tanh()
+    of = first.network.weights()
+    shorter = {key: value[:2] if key.startswith("network.trunk.last") else value for key, value in of.items()}
+    first.network.weights = lambda: shorter
+    first.network.save(file)
+    second = ActorEgo(hidden=(8,), checkpoint=str(file))
+    torch.testing.assert_close(second.decide(observation), expected)
+
+
+def test_the_network_can_let_go_of_the_reference():
+    network = ActorEgo(hidden=(8,)).network.network
+    observation = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()["observation"]
+    with torch.no_grad():
+        network.trunk.last.bias[:] = torch.tensor([0.3, -0.2, -1.0, -1.0])
+    expected = network.middle + network.reach * torch.tensor([0.3, -0.2]).tanh()
+    torch.testing.assert_close(network.deterministic(observation), expected.expand(2, 2))
+
+
 def test_other_bounds_damage_and_other_versions_are_refused(tmp_path, monkeypatch):
     file, network = tmp_path / "actor.safetensors", ActorEgo(hidden=(8,)).network
     network.save(file)
