@@ -12,7 +12,7 @@ from torchrl.modules import PopArtValueNorm
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from e2rl.learning.cloning import LABEL_WIDTH, NOISE, CloningLoss, TeachingLoss, drawn, mirrored_demonstrations
+from e2rl.learning.cloning import NOISE, CloningLoss, TeachingLoss, drawn, mirrored_demonstrations
 from e2rl.learning.supervised import take_step
 from e2rl.planners.network import ActorCritic, ActorNetwork
 from e2rl.run.settings import configured, setting
@@ -24,11 +24,6 @@ PEAK_MEMORY = 0.75  # of the past in the running maximum of |advantage|, per upd
 CRITIC = 0.5  # weight of the critic's loss
 MAX_GRAD_NORM = 0.5
 CLONED = 256  # demonstrations of an optimiser step, as many of each kind; also labels of a teacher
-LABELS, CALM, KEPT = (
-    512,
-    4096,
-    10.0,
-)  # of steps on labels alone: labels, calm frames at hand, and what moving there costs
 
 
 @configured("learner/ppo_bc", "ppo")
@@ -49,7 +44,6 @@ class UpdateSettings:
     critic_warmup: int = setting(low=0)
     action_penalty: float = setting(low=0)
     teaching: float = setting(low=0)
-    label_steps: int = setting(low=0)
     cloning: float = setting(low=0)
 
 
@@ -108,9 +102,6 @@ class Learner:
             stopped = not warming and torch.stack(moved).mean().item() > settings.target_kl
             if stopped:
                 break
-        if labels is not None and settings.teaching > 0 and not warming:
-            for name, value in self._imitate(flat, labels).items():
-                sums[name].append(value)
         if seen_before:
             self.network.normaliser.observe(data["observation"].to(self.network.device))
         self.updates += 1
@@ -201,26 +192,6 @@ class Learner:
             total = total + settings.teaching * losses["loss_teaching"]
         take_step(self.optimiser, total, MAX_GRAD_NORM)
         return {name: value.detach().mean() for name, value in losses.items()}
-
-    def _imitate(self, frames: TensorDictBase, labels: TensorDictBase) -> dict[str, Tensor]:
-        """`label_steps` optimiser steps on the teacher's labels alone, in which the policy stays as it is in calm
-        frames: no contact is in sight there. Returns the means of both losses, {} without a step."""
-        network, found = self.network.network, list[Tensor]()
-        calm = frames[frames["calm"]]
-        calm = calm[torch.randperm(len(calm), device=calm.device)[:CALM]].select("seen", "offset")
-        with torch.no_grad():
-            before = network.head(calm["seen"], calm["offset"])[0].tanh()
-        for _ in range(self.settings.label_steps):
-            shown = drawn([labels], LABELS).to(network.reach.device)
-            taught = self.teaching(torch.cat([mirrored_demonstrations(shown[::2]), shown[1::2]]))["loss_teaching"]
-            at = torch.randint(len(calm), (LABELS,), device=calm.device) if len(calm) else torch.zeros(0).long()
-            now = network.head(calm["seen"][at], calm["offset"][at])[0].tanh()
-            apart = (now - before[at]) / now.new_tensor(LABEL_WIDTH)
-            moved = apart.square().sum() / LABELS
-            take_step(self.optimiser, self.settings.teaching * (taught + KEPT * moved), MAX_GRAD_NORM)
-            found.append(torch.stack([taught.detach(), moved.detach()]))
-        means = torch.stack(found).mean(0) if found else ()
-        return dict(zip(("loss_labels", "moved_calm"), means, strict=False))
 
     def state_dict(self) -> dict:
         """Optimiser, counter and running statistics; the weights are the network's."""

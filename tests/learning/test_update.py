@@ -74,23 +74,6 @@ def test_ppo_learns_to_drive_from_standing():
     assert not data["next", "metrics", "contact"].any()
 
 
-def test_steps_on_labels_alone_follow_the_teacher_and_leave_calm_states_as_they_are():
-    """Labels brake hard in states of which the first agent is near; PPO itself learns nothing (no rate but theirs)."""
-    frames, labels_of = {}, {}
-    for keeps in (0, 60):
-        ego, learner, data = begun(critic_warmup=0, teaching=1e-3, learning_rate=3e-3, label_steps=keeps, epochs=1)
-        data["next", "reward"].zero_()  # no advantage: PPO moves nothing
-        (labels,) = expert_of(data, [-6.0, 0.0])
-        labels["observation"] = labels["observation"].clone()
-        labels["observation"][:, 100:200] += 3.0  # states unlike those that were driven
-        before = ego.network.network.deterministic(data["observation"]).clone()
-        losses = learner.update(data, labels=labels)
-        frames[keeps] = (ego.network.network.deterministic(data["observation"]) - before).abs().mean().item()
-        labels_of[keeps] = ego.network.network.deterministic(labels["observation"])[:, 0].mean().item()
-        assert ("loss_labels" in losses) == (keeps > 0)
-    assert labels_of[60] < labels_of[0] - 1.5 and frames[60] < 0.5 * (labels_of[0] - labels_of[60])
-
-
 def test_a_teacher_of_the_left_teaches_the_right_too():
     """Labels steer to the left; in the mirror of the same states, which nobody labelled, the policy steers right."""
     ego, learner, data = begun(critic_warmup=0, teaching=1.0, learning_rate=3e-3, target_kl=1e9)
