@@ -31,6 +31,7 @@ from e2rl.run.ray_workers import RayWorkers
 from e2rl.run.settings import setting, settings_of
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.source import load_scenes, source_of
+from e2rl.scenes.versions import RECORDED
 from e2rl.traffic.rollout import synthesize_traffic
 from e2rl.traffic.traffic import Traffic
 
@@ -133,12 +134,13 @@ def build_measure(
 ) -> BeforeAfter:
     """The before/after table: nominal and adversarial traffic, and a search, on the scenes of `config.measure`.
 
-    Sources with splits are measured on their tune split; a path's scenes on `measure.path`, or without it on the first
-    training scenes (see `split` in the rows).
+    Sources with splits are measured on their tune split; a path's scenes on `measure.path`, both as recorded; or
+    without it on the first training scenes (see `split` in the rows).
     """
     options, data = measure_settings(config), config.data.copy()
-    if options.path:
-        with open_dict(data):
+    with open_dict(data):
+        data.versions = [RECORDED]
+        if options.path:
             data.path, data.split = options.path, None
     apart = options.path or source_of(data).has_splits
     scenes = load_scenes(data, options.scenes, split="tune", scenes=None if apart else config.scenes)

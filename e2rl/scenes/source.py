@@ -34,9 +34,10 @@ from e2rl.scenes.recording import Recording
 from e2rl.scenes.scene import SceneSet, validate
 from e2rl.scenes.scene_cache import Index, cached, uncached
 from e2rl.scenes.scene_list import listed_scenes
-from e2rl.scenes.versions import check_versions, version_of
+from e2rl.scenes.versions import RECORDED, check_versions, version_of
 
 OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are left out
+NO_VERSION = "too short, or without such a version"
 VERSION = 5  # of the scene builder: raise it when the same recording would make another scene
 AHEAD = 4  # logs for each worker that are built before their scenes are asked for
 FEW = 16  # scenes that are built here before processes would have started
@@ -150,8 +151,8 @@ class Source(Extension, ABC):
                 recording.validate_names()
                 if len(self.versions) > 1:  # all are of one place, or else of one log
                     recording = replace(recording, location=recording.location or recording.scene_id)
-                for name in self.versions:
-                    yield list(version_of(recording, name).windows(self.starts, self.build.steps))
+                for version in filter(None, (version_of(recording, name) for name in self.versions)):
+                    yield list(version.windows(self.starts, self.build.steps))
 
     @contextmanager
     def named(self, log: str) -> Iterator[None]:
@@ -179,7 +180,7 @@ class Source(Extension, ABC):
             if isinstance(error.__cause__, ImportError):  # no log can be read
                 raise
             return [Row(log, reason=str(error))]
-        return rows or [Row(log, reason=TOO_SHORT)]
+        return rows or [Row(log, reason=TOO_SHORT if RECORDED in self.versions else NO_VERSION)]
 
     def _rows(self, log: str, windows: list[Recording]) -> Iterator[Row]:
         """Yields what recordings of the same tracks and map make."""
@@ -239,7 +240,7 @@ class Source(Extension, ABC):
                     yield row.scene
                     if len(index.scene_id) == most:
                         break
-                elif row.reason in (OVERLAP, TOO_SHORT):
+                elif row.reason in (OVERLAP, TOO_SHORT, NO_VERSION):
                     index.dropped[row.reason] += 1
                 elif self.skip_invalid:
                     index.dropped["invalid"] += 1

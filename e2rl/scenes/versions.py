@@ -32,15 +32,15 @@ def check_versions(names: Sequence[str]) -> None:
             raise InputError(f"data.versions: {part!r} is none of {known}; a+b is b of a, of those but {RECORDED}")
 
 
-def version_of(recording: Recording, name: str) -> Recording:
-    """The version of a log, whose id ends in its name unless it is the log itself; `a+b` is b of a. Raises InputError
-    for a log that makes no scene, and where there is no such version of it."""
+def version_of(recording: Recording, name: str) -> Recording | None:
+    """The version of a log, whose id ends in its name unless it is the log itself; `a+b` is b of a. None where there is
+    no such version of it. Raises InputError for a log that makes no scene."""
     if name == RECORDED:
         return recording
-    made = recording.validate_log()
+    made: Recording | None = recording.validate_log()
     for part in name.split("+"):
-        made = VERSIONS[part](made)
-    return replace(made, scene_id=f"{recording.scene_id}{MARK}{name}").validate_names()
+        made = made and VERSIONS[part](made)
+    return made and replace(made, scene_id=f"{recording.scene_id}{MARK}{name}").validate_names()
 
 
 def mirrored(recording: Recording) -> Recording:
@@ -109,18 +109,16 @@ def cropped(recording: Recording) -> Recording:
     return replace(recording, lanes=lanes, lights=lights)
 
 
-def other_ego(recording: Recording) -> Recording:
-    """With another vehicle as ego: that which drives farthest of those recorded throughout. Raises InputError where
-    none of them moves."""
+def other_ego(recording: Recording) -> Recording | None:
+    """With another vehicle as ego: that which drives farthest of those recorded throughout. None where none of them
+    moves."""
     whole = recording.valid.all(0) & (recording.agent_type == VEHICLE)
     whole[recording.ego] = False
     driven = np.linalg.norm(recording.states[-1, :, :2] - recording.states[0, :, :2], axis=-1) * whole
-    if driven.max() <= MOVES:
-        raise InputError("no other vehicle that moves is recorded throughout; leave it out (data.skip_invalid=true)")
-    return replace(recording, ego=int(driven.argmax()))
+    return replace(recording, ego=int(driven.argmax())) if driven.max() > MOVES else None
 
 
-VERSIONS: dict[str, Callable[[Recording], Recording]] = {
+VERSIONS: dict[str, Callable[[Recording], Recording | None]] = {
     "mirrored": mirrored,
     "unconnected": _lanes(lambda lane: replace(lane, exits=[], left=[], right=[])),
     "unlit": unlit,

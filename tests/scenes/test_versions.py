@@ -128,8 +128,23 @@ def test_another_ego_is_the_one_that_drives_farthest_and_there_must_be_one(recor
             assert able[other] and driven[other] == driven[able].max()
     assert found > 0
     alone = replace(log, valid=log.valid & (np.arange(len(driven)) == log.ego))
-    with pytest.raises(InputError, match="no other vehicle that moves is recorded throughout"):
-        version_of(alone, "other_ego")
+    assert version_of(alone, "other_ego") is None and version_of(alone, "other_ego+unlit") is None
+
+
+def test_a_log_without_a_version_makes_the_scenes_of_the_others(monkeypatch, tmp_path):
+    known, asked = VERSIONS["other_ego"], []
+
+    def some(log):
+        asked.append(log.scene_id)
+        return None if len(asked) % 2 else known(log)
+
+    recorded = e2rl.load_scenes("bundled", num_scenes=6)
+    monkeypatch.setitem(VERSIONS, "other_ego", some)
+    given = {"versions": ["recorded", "other_ego"], "cache": str(tmp_path), "workers": 1}
+    both = e2rl.load_scenes("bundled", num_scenes=9, **given)
+    others = [name for name in both.scene_id if name.endswith("~other_ego")]
+    assert len(others) >= 2 and len(both) - len(others) > len(others)
+    assert recorded.scene_id[:3] == [name for name in both.scene_id if name not in others][:3]
 
 
 @pytest.mark.parametrize(
