@@ -34,10 +34,10 @@ from e2rl.scenes.recording import Recording
 from e2rl.scenes.scene import SceneSet, validate
 from e2rl.scenes.scene_cache import Index, cached, uncached
 from e2rl.scenes.scene_list import listed_scenes
-from e2rl.scenes.versions import RECORDED, check_versions, version_of
+from e2rl.scenes.versions import MARK, RECORDED, check_versions, version_of
 
 OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are left out
-NO_VERSION = "too short, or without such a version"
+NO_VERSION = "without such a version"  # or it is invalid, where the log itself makes scenes, too
 VERSION = 5  # of the scene builder: raise it when the same recording would make another scene
 AHEAD = 4  # logs for each worker that are built before their scenes are asked for
 FEW = 16  # scenes that are built here before processes would have started
@@ -192,7 +192,8 @@ class Source(Extension, ABC):
                 scene = builder.scene(window)
                 validate(scene, window.scene_id)
             except InputError as error:
-                yield row._replace(reason=_naming(log, error))
+                beside = RECORDED in self.versions and any(f"{MARK}{name}" in row.scene_id for name in self.versions)
+                yield row._replace(reason=NO_VERSION if beside else _naming(log, error))
                 continue
             if ego_overlaps(scene):
                 yield row._replace(reason=OVERLAP)

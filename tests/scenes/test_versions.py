@@ -147,6 +147,15 @@ def test_a_log_without_a_version_makes_the_scenes_of_the_others(monkeypatch, tmp
     assert recorded.scene_id[:3] == [name for name in both.scene_id if name not in others][:3]
 
 
+def test_an_invalid_version_beside_the_log_is_left_out_and_alone_is_told(monkeypatch, tmp_path):
+    monkeypatch.setitem(VERSIONS, "shifted", lambda log: replace(log, states=log.states + [1e5, 0, 0, 0]))
+    given = {"cache": str(tmp_path), "workers": 1}
+    both = e2rl.load_scenes("bundled", num_scenes=3, versions=["recorded", "shifted"], **given)
+    assert len(both) == 3 and not any("~" in name for name in both.scene_id)
+    with pytest.raises(InputError, match="plausible"):
+        e2rl.load_scenes("bundled", num_scenes=3, versions=["shifted"], **given)
+
+
 @pytest.mark.parametrize(
     ("versions", "message"),
     [
