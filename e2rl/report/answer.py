@@ -89,7 +89,10 @@ def compared_answer(
             f"After training, {new['ego']} was hit in {of(new, 'cfr')} rollouts {traffic(new)} ({rate(new, 'cfr')}); "
             f"before it in {of(old, 'cfr')} ({rate(old, 'cfr')})."
         )
-        kinds = {"hit": "cfr", **KINDS, "progress [m]": "progress", "count per 1,000 km": "counted_per_km"}
+        kinds = {"hit": "cfr", **{kind: KINDS[kind] for kind in ("preventable", "count")}, "progress [m]": "progress"}
+        kinds |= {"clean": KINDS["clean"], "count per 1,000 km": "counted_per_km"}
+        if atlases:  # which leave room for the traffic at the ends
+            pairs = [pair for pair in pairs if pair[1]["eta"] in (0, new["eta"])]
         table = [["", "before", "after", "difference"]]
         table += [
             [f"{title}, {traffic_name(new)}", cell(old, name), cell(new, name), gap(new, name)]

@@ -78,6 +78,11 @@ def test_the_ways_before_and_after_training_stand_side_by_side(tmp_path):
     assert "1 are gone, 1 are new" in said
     ways = [line.split() for line in lines if line.split()[:1] in (["oncoming"], ["rear"], ["crossing"])]
     assert ways == [["oncoming", "3", "1"], ["rear", "1", "0"], ["crossing", "0", "1"]]
+    milder, nominal = row("e2", 1.0, cfr=0.5), row("nominal", 0.0)
+    rows = [old, milder, nominal]
+    for atlases, shown in ((None, 3), ((atlas(0), atlas(0)), 2)):
+        hits = [line for line in compared_answer(rows, rows, atlases, tmp_path) if line.startswith("hit, ")]
+        assert len(hits) == shown, "beside an atlas nominal traffic and the strongest attack"
     none = compared_answer([old], [new], (atlas(0), atlas(0)), tmp_path)
     assert "in 0 of 12 scenes before training" in " ".join(" ".join(none).split())
 
