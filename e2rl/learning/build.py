@@ -64,7 +64,8 @@ def build_evolution(
     parameters = {key: value for key, value in resolved(config.ego).items() if key != "_target_"}
     live = traffic if settings.traffic == "live" else None
     given = {"ego": ego, "parameters": parameters, "scenes": scenes, "sim": sim, "traffic": live, "seed": seed}
-    improve = built(learner, "learner", Improvement, device=config.device, **given)
+    given["device"] = learner.pop("device", config.device)
+    improve = built(learner, "learner", Improvement, **given)
     keep = partial(solvable, scenes=scenes, sim=sim) if curriculum.solvable_only else None
     workers = processes_of(config)
     how = (keep, Memory(folder, settings.memory), config.batch, workers if isinstance(workers, RayWorkers) else None)
@@ -83,7 +84,9 @@ def check_templates(curriculum: CurriculumScheduler, name: str, traffic: Traffic
 def _with_prefetch(config: DictConfig, ego: Ego) -> dict:
     """`config.learner.round`, with a `prefetch` that is left open decided by what is possible."""
     options = {"traffic": "replay", "prefetch": None} | resolved(config.learner.round)
-    reason = why_no_prefetch(str(config.device), config.threads, ego, options["traffic"])
+    learns = config.learner.get("device", "cpu")
+    device = str(learns if config.device == "cpu" else config.device)
+    reason = why_no_prefetch(device, config.threads, ego, options["traffic"])
     if options["prefetch"] and reason:
         raise InputError(f"learner.round.prefetch=true: {reason}; set it to null or false")
     return options | ({"prefetch": not reason} if options["prefetch"] is None else {})

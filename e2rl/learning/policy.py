@@ -1,5 +1,6 @@
 """The update of a learned ego: PPO and behaviour cloning on episodes collected in the round's pool."""
 
+import copy
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -57,6 +58,15 @@ class RowDraw:
         return torch.multinomial(self.probability, count, replacement=True, generator=self.generator)
 
 
+def on_device(ego: ActorEgo, device: str) -> ActorEgo:
+    """The ego itself, or a copy where it is on another device."""
+    if ego.network.device == torch.device(device):
+        return ego
+    found = copy.deepcopy(ego)
+    found.network = ego.network.copied(device)
+    return found
+
+
 def steps_of(data: TensorDictBase) -> int:
     """Steps of 0.1 s that were driven in a batch of decisions."""
     return int((data["next", "timestep"] - data["timestep"]).sum())
@@ -108,7 +118,9 @@ class PolicyImprovement(Improvement):
                 f"learner.collect: {self.settings.steps} x {iterations} decisions of {hold} steps a round cannot hold "
                 f"an episode of {self.horizon} steps"
             )
-        self.ego, self.learner, self.frames = ego, Learner(ego.network, update, rounds * iterations), 0
+        self.ego, self._learning = ego, on_device(ego, device)
+        self.learner, self.frames = Learner(self._learning.network, update, rounds * iterations), 0
+        placed = scenes.to(device)
         self.experts: Experts | None = None
         self.teacher: Teacher | None = None
         if update.cloning > 0:
@@ -116,18 +128,21 @@ class PolicyImprovement(Improvement):
             self.experts = Experts(scenes, sim, hold, device, known, evasions)
         if update.teaching > 0:
             planner = teacher if isinstance(teacher, Ego) else built(OmegaConf.create(dict(teacher)), "teacher", Ego)
-            self.teacher = Teacher(planner, scenes, (ego.network.low, ego.network.high), hold, teaching)
+            bounds = self._learning.network.low, self._learning.network.high
+            self.teacher = Teacher(planner, placed, bounds, hold, teaching)
         every = torch.arange(len(scenes))
         self.draw = RowDraw(torch.full((len(scenes),), 1 / len(scenes), dtype=torch.float64), seed)
         self.reaction = None
         if react is not None:
             self.reaction = Reaiming(settings_of(ReactSettings, react, "learner.react"), seed)
-        self.synthesizer = AdversarialSynthesizer(TrafficPool.recorded(every), self.draw, traffic, ego, self.reaction)
+        pool = TrafficPool.recorded(every)
+        self.synthesizer = AdversarialSynthesizer(pool, self.draw, traffic, self._learning, self.reaction)
         agents = traffic is not None or self.teacher is not None
-        base = DrivingEnv(scenes, sim, batch, device, agents=agents, hold=hold)
+        base = DrivingEnv(placed, sim, batch, device, agents=agents, hold=hold)
         self.env = TransformedEnv(base, Compose(self.synthesizer, RewardSum()))
-        actor = ego.network.actor
-        self._collect_by(actor if traffic is None else TensorDictSequential(EgoPlanner(ego, base), actor), device)
+        actor = self._learning.network.actor
+        planning = actor if traffic is None else TensorDictSequential(EgoPlanner(self._learning, base), actor)
+        self._collect_by(planning, device)
 
     def _collect_by(self, policy: TensorDictModuleBase, device: str) -> None:
         """Collect batches [B, steps] of decisions of a policy from here on."""
@@ -147,6 +162,7 @@ class PolicyImprovement(Improvement):
         """Reset every environment; `iterations` times: collect [B, steps] decisions, update. `frames` are steps of
         0.1 s."""
         begin = time.perf_counter()
+        self._learning.network.set_weights(self.ego.network.weights())  # those of a checkpoint, in a resumed run
         experts = {} if self.experts is None else self.experts.demonstrations(pool)
         counts = {f"{kind}_demonstrations": float(len(found)) for kind, found in experts.items()}
         counts["demonstrations"] = time.perf_counter() - begin
@@ -164,6 +180,7 @@ class PolicyImprovement(Improvement):
             labels, made = self._labels(data, pool.adversarial)
             rows.append(self.learner.update(data, [*experts.values()], labels) | made)
             bar.set_postfix(reward=f"{data['next', 'reward'].mean().item():.3f}", kl=f"{rows[-1]['kl']:.4f}")
+        self.ego.network.set_weights(self._learning.network.weights())
         episodes = finished_episodes(outcomes, pool.adversarial, self.horizon, self.settings.hold)
         if self.teacher is not None:
             episodes.survivable = self.teacher.survivable(len(pool))[episodes.row]
@@ -181,7 +198,7 @@ class PolicyImprovement(Improvement):
         if self.teacher is None:
             return None, {}
         begin, count = time.perf_counter(), -(-self.teacher.settings.states // self.settings.iterations)
-        made = self.teacher.watch(data, adversarial, self.ego, count)
+        made = self.teacher.watch(data, adversarial, self._learning, count)
         return self.teacher.labelled, {**made, "label_seconds": time.perf_counter() - begin}
 
     def outcome(self, folder: Path) -> str:

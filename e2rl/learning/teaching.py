@@ -23,7 +23,7 @@ from e2rl.scenes.scene import SceneSet
 from e2rl.sim.prospects import time_to_contact
 from e2rl.sim.world import World
 
-BATCH = 32  # states that are labelled at once
+BATCH, GPU_BATCH = 32, 2048  # states that are labelled at once
 
 
 CANDIDATES = 48  # soft labels: the teacher's cheapest candidates, of which the nearest ones draw
@@ -104,7 +104,8 @@ class Teacher:
         frames = data.select("observation", "timestep", "scene_index", "agents")[row, column]
         if not len(frames):
             return {"critical": 0.0, "labels": 0.0}
-        parts, away = zip(*(self.labels(part, ego) for part in frames.split(BATCH)), strict=True)
+        size = GPU_BATCH if frames.device.type == "cuda" else BATCH
+        parts, away = zip(*(self.labels(part, ego) for part in frames.split(size)), strict=True)
         known = [] if self.labelled is None else [self.labelled]
         self.labelled = torch.cat([*known, *parts])[-self.settings.memory :]
         rows, survived = self._looked_at
@@ -117,7 +118,7 @@ class Teacher:
         `regret` more than the planner's, whose own cost is below `survivable`; and bool [M]: where the planner survives
         and ego's plan does not."""
         settings = self.settings
-        world = World.of(frames, self.scenes.batch(frames["scene_index"][:, 0].cpu()).to(frames.device))
+        world = World.of(frames, self.scenes.batch(frames["scene_index"][:, 0]).to(frames.device))
         action, cost = ranked_actions(self.planner, world, CANDIDATES, self.hold)
         own = self.planner.rated(world, ask(ego, "plan", world)[:, None])[:, 0]
         weight = torch.softmax(-cost / TEMPERATURE, -1)

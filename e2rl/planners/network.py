@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -207,6 +208,15 @@ class ActorCritic(nn.Module):
         """Load the values of `weights()`, in place."""
         for key, value in self.weights().items():
             value.copy_(weights[key])
+
+    def copied(self, device: str | torch.device) -> "ActorCritic":
+        """A copy on another device."""
+        of: dict[str, Any] = self.architecture
+        sizes = of["hidden"], of["agent_units"], of["reference"]
+        with torch.random.fork_rng(devices=[]):  # building it draws its first weights
+            found = ActorCritic(self.low, self.high, *sizes, device=device)
+        found.set_weights(self.weights())
+        return found
 
     def weights(self) -> dict[str, Tensor]:
         """Every parameter and buffer once (actor and critic share the normaliser)."""

@@ -22,6 +22,7 @@ from e2rl.scenes.route import project
 from e2rl.sim import dynamics
 from e2rl.sim.world import AGENT_KEYS, World
 
+GPU_CHUNK = 512  # scenes that are planned for at a time on a GPU
 STRIDE = 2  # steps between two scored states
 WIDER = 4  # times as many candidates are ranked as asked for, among which those driven alike are dropped
 ALIKE = 1e-4  # m, rad, m/s and cost below which two candidates are driven alike
@@ -105,7 +106,8 @@ class ScoringEgo(Weights, Ego):
 
     def _chunks(self, world: World) -> list[World]:
         rows = torch.arange(len(world.step), device=world.step.device)
-        return [take(world, part, self.READS) for part in rows.split(self.CHUNK)]
+        size = GPU_CHUNK if rows.is_cuda else self.CHUNK
+        return [take(world, part, self.READS) for part in rows.split(size)]
 
 
 def take(world: World, rows: Tensor, keys: tuple[str, ...] = SCENE_KEYS) -> World:

@@ -35,6 +35,7 @@ Shape = str | tuple[str, ...]  # of a tensor or of all of a dataclass, or of eac
 
 FUSED: dict[str, "Fused"] = {}
 """All fused functions of the modules that are imported, by name."""
+COMPILES = "2.13"  # the version of PyTorch that all fused functions were compiled with
 COMPILERS = ("c++", "g++", "clang++")
 VECTOR = 8  # components of a vector, at most
 FIRST = 17  # sizes of the tensors that a function is traced with: distinct primes from here on
@@ -146,7 +147,14 @@ class Fused:
         self.file.parent.mkdir(parents=True, exist_ok=True)
         with locked(self.file.with_suffix(".lock")):
             if not self.file.exists():
-                self._compile()
+                try:
+                    self._compile()
+                except Exception as error:  # not pickled between processes, and hundreds of lines long
+                    why = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+                    raise InputError(
+                        f"compile=true: torch {torch.__version__} cannot compile {self.name} ({why}); torch "
+                        f"{COMPILES} can; or set compile=false"
+                    ) from None
 
     def _compile(self) -> None:
         free = sorted({name for given in self.declared for name in given.sizes if isinstance(name, str)})

@@ -142,9 +142,10 @@ class SceneSet:
         whole = len(rows) == len(batch)
         for key, source in self.scenes.items():
             target = batch[key]
-            if whole and source.device == target.device:  # a second copy would cost more pages than the first
+            indices, there = indices.to(source.device), source.device == target.device
+            if whole and there:  # a second copy would cost more pages than the first
                 torch.index_select(source, 0, indices, out=target)
-            elif source.device == target.device and source[0].numel() > LARGE:  # scene by scene, without a copy between
+            elif there and not source.is_cuda and source[0].numel() > LARGE:  # scene by scene, without a copy between
                 for row, index in zip(rows.tolist(), indices.tolist(), strict=True):
                     target[row].copy_(source[index])
             else:

@@ -18,7 +18,7 @@ from e2rl.planners.lane_graph_planner import LaneGraphEgo
 from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.traffic import CHAIN, FULL, PAIR, keep_velocity
-from tests.learning.small import Ambush, brake_check, small_run, small_scenes
+from tests.learning.small import Ambush, brake_check, rounds, small_run, small_scenes
 
 
 def test_a_round_improves_moves_on_and_reports():
@@ -138,3 +138,13 @@ def test_unfit_combinations_are_refused():
         small_run(collect={"steps": 5})
     with pytest.raises(InputError, match="traffic=live"):
         planner_run({"headway": [1.0, 2.0]}, live=Ambush())
+
+
+def test_a_copy_on_another_device_learns_what_the_ego_itself_would():
+    """cpu:0 is a device of its own to the code, and the same to arithmetic; attacks meet the ego at home."""
+    run = small_run(seed=3)
+    expected, weights = rounds(run, 2), run.ego.network.weights()
+    run = small_run(seed=3, expert={"device": "cpu:0"})
+    assert run.improve._learning is not run.ego
+    assert rounds(run, 2) == expected
+    assert all(torch.equal(value, weights[name]) for name, value in run.ego.network.weights().items())

@@ -95,3 +95,18 @@ def test_without_a_compiler_compiling_is_refused(monkeypatch):
     with pytest.raises(InputError, match="compile=true: no C"):
         Fused(across.function, ("B K 2", "B", "3", "B:bool")).compile()
     FUSED[across.name] = across
+
+
+def one_sided(points: Tensor) -> Tensor:
+    """Points [B], if their sum is positive: what no compiler can trace."""
+    return points if points.sum().item() > 0 else -points
+
+
+@pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler")
+def test_what_cannot_be_compiled_is_named_in_one_line():
+    function = Fused(one_sided, ("B",))
+    try:
+        with pytest.raises(InputError, match=r"^compile=true: torch .* cannot compile .*one_sided \(.*\); torch .*$"):
+            function.compile()
+    finally:
+        del FUSED[function.name]
