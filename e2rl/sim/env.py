@@ -167,13 +167,6 @@ class DrivingEnv(EnvBase):
             torch.cat([ego.action[:, 1:], turn[:, 1:]], 1),
         )
 
-    def world_of(self, rows: Tensor) -> World:
-        """The current World of environments rows [b]; of its scene what planning needs: of routes and recording, that
-        of the ego."""
-        now, scene = self.world(), self._beginning(rows)
-        scene["field"] = self.scene["field"].index_select(0, rows)
-        return World(scene, now.step[rows], *(getattr(now, key)[rows] for key in AGENT_KEYS))
-
     def _reset(self, tensordict: TensorDictBase | None = None, **_) -> TensorDict:
         batch = self.batch_size[0]
         mask = None if tensordict is None else tensordict.get("_reset", None)

@@ -24,8 +24,9 @@ from e2rl.sim import dynamics
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
 from e2rl.traffic.grouping import clone, crop_state, crop_world, group_scenes, no_vehicles, noise_of, write_state
-from e2rl.traffic.traffic import KNOWLEDGE, REPLAN_STEPS, State, Traffic, TrafficPlan
+from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan
 
+KNOWLEDGE = ("predicted", "plan")
 LOOK = 5  # steps of the ego's plan over which its current yaw rate is estimated
 React = Callable[[Tensor, Tensor], Tensor]  # rows [G], planned states [G, V, HORIZON, 4] -> the egos' [G, HORIZON, 4]
 

@@ -41,7 +41,6 @@ from e2rl.sim.world import World
 TEMPLATES = ("single", "pair", "chain", "full")
 SINGLE, PAIR, CHAIN, FULL = range(len(TEMPLATES))
 
-KNOWLEDGE = ("predicted", "plan")  # of the ego: from its present motion, or it announces its plan
 REPLAN_STEPS = 5  # steps of DT between two replans: 0.5 s, for every method
 POINT_STEPS = 5  # steps between two points of a plan that are kept in a rollout's file: 0.5 s
 State = Any  # of B running scenes: a tensor, a TensorDict or a (nested) dataclass of them, batch first; or None

@@ -141,15 +141,10 @@ class AdversarialSynthesizer(Transform):
         env = self._env
         if self.reaction is not None and env.clock >= self._next_reaction:
             self._next_reaction = env.clock + REPLAN_STEPS
-            motion = self.reaction.react(env.world(), self._announced)
+            motion = self.reaction.react(env.world())
             if motion is not None:
                 env.write_agents(*motion)
         return tensordict
-
-    def _announced(self, rows: Tensor) -> Tensor:
-        """States [b, PLAN_STEPS, 4] that the egos of environments rows [b] plan."""
-        assert self.ego is not None
-        return self.ego.plan(self._env.world_of(rows))
 
     @torch.no_grad()
     def _replan(self, rows: Tensor, ego_plan: Tensor | None) -> None:

@@ -15,8 +15,8 @@ from e2rl.scenes.recording import DT
 from e2rl.scenes.route import interpolate
 from e2rl.sim.world import World
 from e2rl.traffic.grouping import noise_of
-from e2rl.traffic.nominal import NominalTraffic
-from e2rl.traffic.traffic import KNOWLEDGE, keep_velocity
+from e2rl.traffic.nominal import KNOWLEDGE, NominalTraffic
+from e2rl.traffic.traffic import keep_velocity
 from tests.prior.small import curved_scenes, small_prior
 from tests.traffic.e2.crossing import add_route, make_world
 from tests.traffic.e2.traffic_scenes import EGO, ROWS, begin, drive, executed, scenes, synthesizer

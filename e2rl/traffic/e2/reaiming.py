@@ -6,7 +6,6 @@ limits of an interception (`InterceptionSettings`). It knows of the ego, and owe
 predicts it from its present motion, and gives way by the same rules (`responsibility`, `prior.bounds`).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -33,7 +32,7 @@ from e2rl.traffic.e2.interception import (
 )
 from e2rl.traffic.e2.motion import TOP_SPEED
 from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, YieldingSettings, duty_of, leading
-from e2rl.traffic.traffic import KNOWLEDGE, REPLAN_STEPS, SINGLE
+from e2rl.traffic.traffic import REPLAN_STEPS, SINGLE
 
 MOMENTS = 10  # at which the ego may be met, one every 0.5 s
 CHECKED, RUN_ON = 3, 2.0  # points of a path that must be drivable, evenly spaced in time, for at least so many s
@@ -142,27 +141,16 @@ class Law:
     yielding: YieldingSettings = field(default_factory=YieldingSettings)
     bounds: BoundSettings = field(default_factory=BoundSettings)
 
-    def __call__(
-        self,
-        world: World,
-        eta: Tensor,
-        shift: Tensor,
-        ground: Ground,
-        reckless: Tensor,
-        announced: Tensor | None = None,
-    ) -> Arc:
+    def __call__(self, world: World, eta: Tensor, shift: Tensor, ground: Ground, reckless: Tensor) -> Arc:
         """The Arc of K vehicles in their `surroundings` at intensities eta [K].
 
-        announced [K, MOMENTS, 4]: the ego's states as planned; None: they predict it from its present motion. shift
-        [K, 2]: m by which they misjudge the ego's place; reckless [K] bool: those that owe it nothing. Without an aim
-        they halve their curvature and brake gently.
+        shift [K, 2]: m by which they misjudge the ego's place; reckless [K] bool: those that owe it nothing. Without an
+        aim they halve their curvature and brake gently.
         """
         states, length = world.states[:, 1], world.scene["size"][..., 0]
         motion = Arc(world.accel, curvature_of(world.turn_rate, world.states[..., 3]))
         its_motion = Arc(*(value[:, 0] for value in motion))
-        expected = announced
-        if expected is None:
-            expected, _ = along_arc(world.states[:, 0], its_motion, moments(states), HOLD, TURN)
+        expected, _ = along_arc(world.states[:, 0], its_motion, moments(states), HOLD, TURN)
         expected = expected + torch.nn.functional.pad(shift, (0, 2))[:, None]
         aim = best_aim(states, expected, length[:, 0] + length[:, 1], eta, ground, self.limits)
         none = aim.accel.isnan()
@@ -189,7 +177,6 @@ class ReactSettings:
     others: float = setting(low=0, high=1)
     eta: tuple[float, float] | None = setting(low=0, optional=True)
     scatter: float = setting(low=0)
-    knowledge: str = setting(choices=KNOWLEDGE)
     responsibility: str = setting(choices=RESPONSIBILITIES)
     reckless: float | None = setting(low=0, high=1, optional=True)
 
@@ -282,11 +269,8 @@ class Reaiming:
             self._part[rows] = part
 
     @torch.no_grad()
-    def react(self, world: World, plan: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Environments rows [K], agents [K] and their states [K, H, 4] of the coming 1 s; None where nobody reacts.
-
-        plan: environments rows [E] -> the states [E, PLAN_STEPS, 4] that their egos announce.
-        """
+    def react(self, world: World) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Environments rows [K], agents [K] and their states [K, H, 4] of the coming 1 s; None where nobody reacts."""
         part = self._part
         assert part is not None
         due = ~part["chosen"] & (part["start"] <= world.step)
@@ -301,11 +285,7 @@ class Reaiming:
         agents = part["vehicle"][row, slot]
         shift = self.settings.scatter * torch.randn(len(row), 2, generator=self.generator).to(row.device)
         ground, seen = Ground(world.scene["field"], world.scene["field_origin"], row), surroundings(world, row, agents)
-        announced = None
-        if self.settings.knowledge == "plan":
-            environments, at = row.unique(return_inverse=True)
-            announced = plan(environments)[at, REPLAN_STEPS - 1 :: REPLAN_STEPS]
-        aim = self.law(seen, part["eta"][row], shift, ground, part["reckless"][row], announced)
+        aim = self.law(seen, part["eta"][row], shift, ground, part["reckless"][row])
         times = DT * torch.arange(1, 2 * REPLAN_STEPS + 1, device=row.device)
         states, _ = along_arc(seen.states[:, 1], aim, times)
         return row, agents, states

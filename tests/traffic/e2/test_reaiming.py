@@ -6,7 +6,6 @@ import pytest
 import torch
 from torchrl.envs import TransformedEnv
 
-from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import EgoPolicy
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.scenes.boxes import overlap
@@ -164,34 +163,6 @@ def test_it_aims_where_the_ego_is_expected_by_its_motion():
     assert straight.curvature.abs() < 1e-3 and turning.curvature < -1e-2
     _, misjudged = aimed([(0, 0, 0, 8.0), (40, 0, math.pi, 8.0)], shift=torch.tensor([[0.0, 2.0]]))
     assert -0.05 < misjudged.curvature < -1e-3
-
-
-def test_told_the_plan_it_aims_where_the_ego_announces_to_be():
-    """To the left of a straight ego's way, if it announces to turn there; where it goes straight on, as if untold."""
-    seen, ground = seen_by([(0, 0, 0, 8.0), (40, 0, math.pi, 8.0)])
-    straight, _ = along_arc(seen.states[:, 0], Arc(torch.zeros(1), torch.zeros(1)), moments(seen.states))
-    turning, _ = along_arc(seen.states[:, 0], Arc(torch.zeros(1), torch.full((1,), 0.03)), moments(seen.states))
-    law, given = Law("none"), (seen, torch.tensor([2.0]), STILL, ground, LAWFUL)
-    untold, told, misled = law(*given), law(*given, straight), law(*given, turning)
-    assert told.curvature == pytest.approx(untold.curvature, abs=1e-5) and misled.curvature < -1e-2
-
-
-def test_those_told_are_told_the_plan_of_their_own_environment(scene_set):
-    """As every environment's World has it, which also holds what planning does not read."""
-    base = DrivingEnv(scene_set, ON, 4, agents=True)
-    ego, asked = ActorEgo(hidden=(8,)), []
-    reaction, pool = Reaiming(ReactSettings(fraction=1.0, others=0.0, knowledge="plan")), stored(scene_set)
-    env = TransformedEnv(base, AdversarialSynthesizer(pool, in_turn(pool), ego=ego, reaction=reaction))
-
-    class Listening(Law):
-        def __call__(self, seen, eta, shift, ground, reckless, announced):
-            asked.append((ground.row, announced, ego.plan(base.world())[ground.row][:, 4::5]))
-            return super().__call__(seen, eta, shift, ground, reckless, announced)
-
-    reaction.law = Listening(reaction.settings.responsibility)
-    env.rollout(STEPS, EgoPolicy(IDMEgo(), env), break_when_any_done=False)
-    assert {int(row) for rows, *_ in asked for row in rows} == {0, 1, 2, 3}
-    assert all(torch.allclose(told, expected, atol=1e-4) for _, told, expected in asked)
 
 
 def test_without_a_drivable_aim_it_unwinds_its_curvature_and_brakes_gently():
