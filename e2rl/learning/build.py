@@ -24,7 +24,7 @@ from e2rl.learning.prefetch import why_no_prefetch
 from e2rl.learning.scheduler import CurriculumScheduler
 from e2rl.planners.ego import Ego
 from e2rl.prior.prior import Prior
-from e2rl.run.config import built, load_choice, resolved
+from e2rl.run.config import built, check_device, load_choice, resolved
 from e2rl.run.errors import InputError
 from e2rl.run.processes import cores
 from e2rl.run.ray_workers import RayWorkers
@@ -64,7 +64,9 @@ def build_evolution(
     parameters = {key: value for key, value in resolved(config.ego).items() if key != "_target_"}
     live = traffic if settings.traffic == "live" else None
     given = {"ego": ego, "parameters": parameters, "scenes": scenes, "sim": sim, "traffic": live, "seed": seed}
-    given["device"] = learner.pop("device", config.device)
+    given["device"] = device = learner.pop("device", config.device)
+    if live is not None and device != config.device:
+        raise InputError(f"learner.device={device}: live traffic is made where the policy drives; set device={device}")
     improve = built(learner, "learner", Improvement, **given)
     keep = partial(solvable, scenes=scenes, sim=sim) if curriculum.solvable_only else None
     workers = processes_of(config)
@@ -123,6 +125,7 @@ def check_training(config: DictConfig) -> MeasureSettings:
     """Returns what is measured; InputError for what train.py cannot run, before anything is built."""
     settings_of(TrainSettings, {field.name: config[field.name] for field in fields(TrainSettings)})
     processes_of(config)
+    check_device("learner.device", config.learner.get("device", config.device))
     build_sim(config)
     return measure_settings(config)
 

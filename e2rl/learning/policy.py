@@ -62,7 +62,7 @@ def on_device(ego: ActorEgo, device: str) -> ActorEgo:
     """The ego itself, or a copy where it is on another device."""
     if ego.network.device == torch.device(device):
         return ego
-    found = copy.deepcopy(ego)
+    found = copy.copy(ego)
     found.network = ego.network.copied(device)
     return found
 

@@ -118,7 +118,7 @@ class Teacher:
         `regret` more than the planner's, whose own cost is below `survivable`; and bool [M]: where the planner survives
         and ego's plan does not."""
         settings = self.settings
-        world = World.of(frames, self.scenes.batch(frames["scene_index"][:, 0]).to(frames.device))
+        world = World.of(frames, self.scenes.batch(frames["scene_index"][:, 0]))
         action, cost = ranked_actions(self.planner, world, CANDIDATES, self.hold)
         own = self.planner.rated(world, ask(ego, "plan", world)[:, None])[:, 0]
         weight = torch.softmax(-cost / TEMPERATURE, -1)

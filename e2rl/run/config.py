@@ -127,16 +127,21 @@ def machine_of(config: DictConfig) -> Machine:
     return settings_of(Machine, {each.name: config.get(each.name) for each in fields(Machine)})
 
 
+def check_device(key: str, device: str) -> None:
+    """Raises InputError for a device that is not there; key: whose value it is."""
+    try:
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(f"{key}={device}: {str(error).splitlines()[0]}; use {key}=cpu or cuda") from error
+
+
 def set_up(config: DictConfig) -> None:
     """Import the plugins; set the threads, the device and the seeds of torch, numpy and python. Raises InputError for a
     plugin or device that is not there, and a size that is impossible."""
     machine_of(config)
     import_plugins(config.plugins, "plugins: ")
     torch.set_num_threads(config.threads)
-    try:
-        torch.empty(1, device=config.device)
-    except (RuntimeError, AssertionError) as error:
-        raise InputError(f"device={config.device}: {str(error).splitlines()[0]}; use device=cpu or cuda") from error
+    check_device("device", config.device)
     seed = config.get("seed", 0)  # first weights and exploration; evaluation's noise has seeds of its own
     torch.manual_seed(seed)
     np.random.seed(seed % 2**32)

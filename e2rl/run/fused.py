@@ -149,11 +149,13 @@ class Fused:
             if not self.file.exists():
                 try:
                     self._compile()
+                except (InputError, OSError):  # of the cache
+                    raise
                 except Exception as error:  # not pickled between processes, and hundreds of lines long
                     why = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
                     raise InputError(
-                        f"compile=true: torch {torch.__version__} cannot compile {self.name} ({why}); torch "
-                        f"{COMPILES} can; or set compile=false"
+                        f"compile=true: torch {torch.__version__} cannot compile {self.name} ({why}); take "
+                        f"torch {COMPILES}, with which all were compiled, or set compile=false"
                     ) from None
 
     def _compile(self) -> None:

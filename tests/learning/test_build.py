@@ -6,7 +6,7 @@ from omegaconf import open_dict
 
 from e2rl.evaluation.methods import build_ego
 from e2rl.learning.bandit import BanditCurriculum
-from e2rl.learning.build import build_evolution, build_progress
+from e2rl.learning.build import build_evolution, build_progress, check_training
 from e2rl.learning.policy import PolicyImprovement
 from e2rl.learning.run_checkpoint import load_checkpoint, save_checkpoint
 from e2rl.learning.scheduler import CurriculumScheduler
@@ -101,3 +101,17 @@ def test_the_time_left_is_known_at_once_and_follows_what_phases_take(monkeypatch
             now[0] += seconds
         said.append(progress.left())
     assert said[2:] == ["about 11 min left", "about 10 min left", "done"], "as long as those of its kind took"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["learner.device=banana"], "learner.device=banana: .*use learner.device=cpu or cuda"),
+        (["learner.device=cpu:0", "learner.round.traffic=live"], "live traffic .*set device=cpu:0"),
+    ],
+)
+def test_a_device_for_learning_that_cannot_be_used_is_refused(options, message):
+    config = config_of(*options, *POLICY)
+    with pytest.raises(InputError, match=message):
+        check_training(config)
+        built(config)
