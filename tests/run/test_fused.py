@@ -106,9 +106,7 @@ def one_sided(points: Tensor) -> Tensor:
 def test_what_cannot_be_compiled_is_named_in_one_line():
     function = Fused(one_sided, ("B",))
     try:
-        with pytest.raises(
-            InputError, match=r"^compile=true: torch .* cannot compile .*one_sided \(.*\); take .*$"
-        ):
+        with pytest.raises(InputError, match=r"^compile=true: torch .* cannot compile .*one_sided \(.*\); take .*$"):
             function.compile()
     finally:
         del FUSED[function.name]
