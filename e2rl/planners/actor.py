@@ -88,6 +88,8 @@ class ActorEgo(ObservingEgo):
     hidden: Sequence[int] = setting()
     agent_units: int = setting(low=1)
     reference: bool = setting()
+    slack: float | None = setting(low=0, optional=True)
+    room: float | None = setting(low=0.1, optional=True)
     initial_std: Sequence[float] = setting()
     max_acceleration: float = setting()
     max_braking: float = setting()
@@ -101,7 +103,7 @@ class ActorEgo(ObservingEgo):
             raise InputError("ego.hidden=[]: give the units of one layer at least")
         low = torch.tensor([-self.max_braking, -self.max_yaw_rate])
         high = torch.tensor([self.max_acceleration, self.max_yaw_rate])
-        sizes = self.hidden, self.agent_units, self.reference, self.initial_std
+        sizes = self.hidden, self.agent_units, self.reference, self.slack, self.room, self.initial_std
         self.network = ActorCritic(low, high, *sizes, self.device)
         if self.checkpoint is not None:
             asked, path = self.network.architecture, find_weights(self.checkpoint)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
-from e2rl.planners.reference import LAST_ACTION, Trunk, linear, reference_action
+from e2rl.planners.reference import LAST_ACTION, Trunk, follow, linear
 from e2rl.run.errors import InputError
 from e2rl.run.files import altered, read_weights, weight_bytes, write_atomically
 from e2rl.run.fused import is_on
@@ -24,6 +24,8 @@ WEIGHTS = "actor.safetensors"  # file name of an ActorCritic inside a checkpoint
 NARROWEST = 0.01  # least standard deviation before squashing, as a fraction of half the action range
 LAST = ("network.trunk.last.weight", "network.trunk.last.bias")
 STEEPEST = 0.95  # reference actions are kept within this fraction of the bounds, so that their atanh stays finite
+UNBOUNDED = 0.999  # and a bound of the acceleration, where nobody is ahead
+LEAST_SCALE = 0.2  # an observed number's: one that hardly varied in training, as the ego's size, may vary elsewhere
 
 
 class Normaliser(nn.Module):
@@ -33,8 +35,9 @@ class Normaliser(nn.Module):
     mean: Tensor
     variance: Tensor
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, least_scale: float = 0.05) -> None:
         super().__init__()
+        self.least_scale = least_scale
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("mean", torch.zeros(size))
         self.register_buffer("variance", torch.ones(size))
@@ -53,17 +56,21 @@ class Normaliser(nn.Module):
         self.count.copy_(total)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Observations normalised to zero mean and unit variance, clipped to [-5, 5]."""
-        return ((observation - self.mean) / self.variance.sqrt().clamp(min=0.05)).clamp(-5, 5)
+        """Observations less their mean, over their standard deviation or `least_scale`, clipped to [-5, 5]."""
+        return ((observation - self.mean) / self.variance.sqrt().clamp(min=self.least_scale)).clamp(-5, 5)
 
 
 class ActorNetwork(nn.Module):
     """Mean and standard deviation of the action before squashing.
 
-    The mean is c + (1 + w) r: r is the reference's action (if `reference`, else 0), c and w [2] the network's output.
+    The mean is r + g (c + w r): r is the reference's action (if `reference`, else 0), c and w [2] the network's output.
     It can let go of the reference (w = -1), which it could not cancel without knowing it: near a contact r jumps from
     full speed to full braking. The output starts at zero: an untrained actor executes the reference's action, or
     without a reference the middle of the action's bounds.
+
+    With `room` the gate g rises from 0 where the reference has `room` m left (`follow`) to 1 where it has half of it,
+    so that the network drives in danger alone; else g = 1. With `slack` the mean's acceleration exceeds the bound of
+    `follow` by `slack` m/s^2 at most: what is learned against attackers keeps the distance to the vehicle ahead.
     """
 
     middle: Tensor
@@ -75,12 +82,14 @@ class ActorNetwork(nn.Module):
         hidden: Sequence[int],
         agent_units: int,
         reference: bool,
+        slack: float | None,
+        room: float | None,
         initial_std: Sequence[float],
         low: Tensor,
         high: Tensor,
     ) -> None:
         super().__init__()
-        self.normaliser, self.reference = normaliser, reference
+        self.normaliser, self.reference, self.slack, self.room = normaliser, reference, slack, room
         self.trunk = Trunk(hidden, agent_units, 4 if reference else 2, last_gain=0.0)
         self.spread = nn.Parameter((torch.tensor(initial_std) - NARROWEST).logit(1e-4))
         self.noise: Tensor | None = None  # [D], set by `noisy`
@@ -95,17 +104,23 @@ class ActorNetwork(nn.Module):
         return self.head(seen, self.offset(observation))
 
     def offset(self, observation: Tensor) -> Tensor:
-        """r [..., 2] at observation [..., D]: no parameter changes it."""
+        """r, the bound of the acceleration and g, [..., 4], at observation [..., D]: no parameter changes them."""
         if not self.reference:
-            return torch.zeros_like(observation[..., :2])
-        part = (reference_action(observation) - self.middle) / self.reach
-        return part.clamp(-STEEPEST, STEEPEST).atanh()
+            return torch.zeros_like(observation[..., :4])
+        found = follow(observation)
+        part = ((found[..., :2] - self.middle) / self.reach).clamp(-STEEPEST, STEEPEST)
+        bound = (found[..., 2:3] + (self.slack or 0.0) - self.middle[:1]) / self.reach[:1]
+        gate = torch.ones_like(bound) if self.room is None else (2 - 2 * found[..., 3:] / self.room).clamp(0, 1)
+        return torch.cat([part.atanh(), bound.clamp(-STEEPEST, UNBOUNDED).atanh(), gate], -1)
 
     def head(self, seen: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-        """loc, scale [..., 2] from the normalised observation [..., D] and the `offset` [..., 2]."""
+        """loc, scale [..., 2] from the normalised observation [..., D] and the `offset` [..., 4]."""
         loc = self.trunk(seen)
         if self.reference:
-            loc = loc[..., :2] + (1 + loc[..., 2:]) * offset
+            usual, bound, gate = offset.split((2, 1, 1), -1)
+            loc = usual + gate * (loc[..., :2] + loc[..., 2:] * usual)
+            if self.slack is not None:
+                loc = torch.cat([torch.minimum(loc[..., :1], bound), loc[..., 1:]], -1)
         return loc, self.std.expand_as(loc)
 
     @contextmanager
@@ -141,10 +156,14 @@ class ActorCritic(nn.Module):
         hidden: Sequence[int] = (128, 128),
         agent_units: int = 32,
         reference: bool = True,
+        slack: float | None = None,
+        room: float | None = None,
         initial_std: Sequence[float] = (0.25, 0.12),
         device: str | torch.device = "cpu",
+        least_scale: float = LEAST_SCALE,
     ) -> None:
-        """low, high [2]: bounds of (acceleration, yaw rate); other fields: conf/ego/actor.yaml."""
+        """low, high [2]: bounds of (acceleration, yaw rate); least_scale: of an observed number; other fields:
+        conf/ego/actor.yaml."""
         super().__init__()
         device = torch.device(device)
         low, high = low.to(device, torch.float32), high.to(device, torch.float32)
@@ -154,11 +173,15 @@ class ActorCritic(nn.Module):
             "hidden": [int(size) for size in hidden],
             "agent_units": int(agent_units),
             "reference": bool(reference),
+            "slack": None if slack is None else float(slack),
+            "room": None if room is None else float(room),
+            "least_scale": least_scale,
             "low": _rounded(low),
             "high": _rounded(high),
         }
-        self.normaliser = Normaliser(OBSERVATION_SIZE)
-        self.network = ActorNetwork(self.normaliser, hidden, agent_units, reference, initial_std, low.cpu(), high.cpu())
+        self.normaliser = Normaliser(OBSERVATION_SIZE, least_scale)
+        sizes = hidden, agent_units, reference, slack, room, initial_std
+        self.network = ActorNetwork(self.normaliser, *sizes, low.cpu(), high.cpu())
         values = nn.Sequential(self.normaliser, Trunk(hidden, agent_units, 1, last_gain=1.0))
         self.to(device)
         self.actor = self._sampler(TensorDictModule(self.network, ["observation"], ["loc", "scale"]))
@@ -172,7 +195,7 @@ class ActorCritic(nn.Module):
 
     @torch.no_grad()
     def prepared(self, observation: Tensor) -> dict[str, Tensor]:
-        """What `heads` read, of observations [..., D]: seen [..., D] and offset [..., 2]."""
+        """What `heads` read, of observations [..., D]: seen [..., D] and offset [..., 4]."""
         return {"seen": self.normaliser(observation), "offset": self.network.offset(observation)}
 
     def _sampler(self, module: TensorDictModule) -> ProbabilisticActor:
@@ -212,9 +235,9 @@ class ActorCritic(nn.Module):
     def copied(self, device: str | torch.device) -> "ActorCritic":
         """A copy on another device."""
         of: dict[str, Any] = self.architecture
-        sizes = of["hidden"], of["agent_units"], of["reference"]
+        sizes = of["hidden"], of["agent_units"], of["reference"], of["slack"], of["room"]
         with torch.random.fork_rng(devices=[]):  # building it draws its first weights
-            found = ActorCritic(self.low, self.high, *sizes, device=device)
+            found = ActorCritic(self.low, self.high, *sizes, device=device, least_scale=of["least_scale"])
         found.set_weights(self.weights())
         return found
 
@@ -232,10 +255,13 @@ def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
         saved = json.loads(header.get("architecture", "null"))
         low, high = (torch.tensor(saved[key], dtype=torch.float32).reshape(2) for key in ("low", "high"))
         sizes, units = [int(size) for size in saved["hidden"]], int(saved["agent_units"])
+        bounds = [None if saved.get(key) is None else float(saved[key]) for key in ("slack", "room")]
+        least = float(saved.get("least_scale", 0.05))  # of earlier versions, which had no bounds either
         fits = 0 < len(sizes) <= DEEPEST and all(0 < size <= WIDEST for size in [*sizes, units])
         if saved["observation"] != OBSERVATION_SIZE or not fits:
             raise ValueError(f"of {saved['observation']} numbers, {units} units an agent, layers of {sizes} units")
-        actor = ActorCritic(low, high, sizes, units, bool(saved["reference"]), device=device)
+        how = units, bool(saved["reference"]), *bounds
+        actor = ActorCritic(low, high, sizes, *how, device=device, least_scale=least)
         own = actor.weights()
         weights |= {key: padded(weights[key], own[key]) for key in LAST if key in own and key in weights}
         wrong = set(own) ^ set(weights) or {key for key in own if own[key].shape != weights[key].shape}

@@ -17,12 +17,15 @@ from e2rl.run.fused import fused, is_on
 from e2rl.scenes.route import first_least
 from e2rl.sim.leaders import IDMParameters, idm_acceleration
 from e2rl.sim.observation import FAR, LOOK_AHEAD, NEAR, NEAREST, OBSERVATION_SIZE, PER_AGENT, PROBE_X, PROBE_Y, SPEED
+from e2rl.sim.prospects import ACCELERATIONS, OFFSETS, PROSPECTS, WIDEST
 
 EGO, LAST_ACTION = slice(0, 11), (1, 2)
 ROUTE = slice(11, 11 + 5 * len(LOOK_AHEAD))
 LIGHTS = slice(ROUTE.stop, ROUTE.stop + 8)
 PROBED = LIGHTS.stop + len(PROBE_X) * len(PROBE_Y)
 AGENTS = slice(PROBED, PROBED + PER_AGENT * NEAREST)
+ROOMS = slice(AGENTS.stop, AGENTS.stop + PROSPECTS // 2)
+MILD = slice(ACCELERATIONS.index(-1.0), ACCELERATIONS.index(1.0) + 1)
 
 PURSUIT_TIME, PURSUIT_MIN, PURSUIT_MAX = 1.5, 6.0, 30.0  # s, m, m: look-ahead of the pursuit
 ACCELERATION, BRAKING, HARDEST_BRAKING = 1.5, 2.5, 7.0  # m/s^2
@@ -33,25 +36,40 @@ LATERAL = 2.5  # m/s^2 in curves
 GATE_MARGIN = 0.3  # m beyond the half widths
 REACTION = 0.5  # s in which a speed cap is met
 LINE_GAP = 1.0  # m kept to a stop line
+OWN_WAY = 0.7  # least cosine between the headings of the path and of a vehicle that drives the ego's way
+UNCAPPED = 1e3  # m/s
 
 
 def reference_action(observation: Tensor) -> Tensor:
     """Action [..., 2] (m/s^2, rad/s) of the route follower at observation [..., D]."""
-    return reference_rows(observation.reshape(-1, OBSERVATION_SIZE)).view(*observation.shape[:-1], 2)
+    return follow(observation)[..., :2]
+
+
+def follow(observation: Tensor) -> Tensor:
+    """[..., 4] at observation [..., D]: the `reference_action`; the bound, an acceleration (m/s^2); the room in m.
+
+    The bound is what IDM allows behind whoever is ahead and drives the ego's way, or is no vehicle; inf without one.
+    The room is the least gap that going on with -1 or 1 m/s^2 leaves within the observation's manoeuvres.
+    """
+    return reference_rows(observation.reshape(-1, OBSERVATION_SIZE)).view(*observation.shape[:-1], 4)
 
 
 @fused(f"B {OBSERVATION_SIZE}")
 def reference_rows(observation: Tensor) -> Tensor:
-    """`reference_action` [B, 2] at observations [B, D]."""
+    """`follow` [B, 4] at observations [B, D]."""
     ego = observation[..., EGO]
     route = observation[..., ROUTE].unflatten(-1, (len(LOOK_AHEAD), 5))
     speed = ego[..., 0] * SPEED
     path = torch.stack([route[..., 0] * FAR, route[..., 1] * NEAR], -1)
     desired = (ego[..., 6] * SPEED).clamp(min=1.0)
-    follow = _following(speed[..., None], desired[..., None], *_leaders(observation, path)).amin(-1)
-    accel = torch.minimum(follow, _capped(route, speed)).clamp(-HARDEST_BRAKING, ACCELERATION)
-    accel = torch.maximum(accel, -speed / REACTION)  # no braking at standstill, as in recordings
-    return torch.stack([accel, speed * _pursuit(path, speed)], -1)
+    *leaders, own_way = _leaders(observation, path)
+    follow = _following(speed[..., None], desired[..., None], *leaders).amin(-1)
+    least = (-speed / REACTION).clamp(min=-HARDEST_BRAKING)  # no braking at standstill, as in recordings
+    accel = torch.maximum(torch.minimum(follow, _capped(route, speed)).clamp(max=ACCELERATION), least)
+    behind = _following(speed[..., None], torch.full_like(desired, UNCAPPED)[..., None], *leaders)
+    bound = torch.maximum(torch.where(own_way, behind, torch.inf).amin(-1), least)
+    room = observation[..., ROOMS].unflatten(-1, (len(ACCELERATIONS), len(OFFSETS)))[..., MILD, OFFSETS.index(0.0)]
+    return torch.stack([accel, speed * _pursuit(path, speed), bound, WIDEST * room.amin(-1)], -1)
 
 
 def _following(speed: Tensor, desired: Tensor, gap: Tensor, leading: Tensor, acceleration: Tensor) -> Tensor:
@@ -92,9 +110,9 @@ def _capped(route: Tensor, speed: Tensor) -> Tensor:
     return (allowed - speed) / REACTION
 
 
-def _leaders(observation: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _leaders(observation: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Free gap [..., NEAREST + 2] m along path [..., K, 2], inf for none, speed along it and acceleration, of agents
-    and stop lines."""
+    and stop lines; and whether the bound of `follow` holds behind it."""
     ego = observation[..., EGO]
     half_length, half_width = 2.5 * ego[..., 8, None], ego[..., 9, None]
     agents = observation[..., AGENTS].unflatten(-1, (NEAREST, PER_AGENT))
@@ -111,7 +129,10 @@ def _leaders(observation: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor]
     halt = _halts(observation, ego[..., 0] * SPEED) - half_length - LINE_GAP + STANDSTILL_GAP
     still = torch.zeros_like(halt)
     steady = 4 * agents[..., 8] * aligned
-    return torch.cat([gap, halt], -1), torch.cat([leading, still], -1), torch.cat([steady, still], -1)
+    own_way = leads & ((aligned > OWN_WAY) | (agents[..., 11] < 0.5))
+    pairs = (gap, halt), (leading, still), (steady, still), (own_way, torch.zeros_like(halt, dtype=torch.bool))
+    gap, leading, steady, own_way = (torch.cat(pair, -1) for pair in pairs)
+    return gap, leading, steady, own_way
 
 
 def _on_path(position: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor]:

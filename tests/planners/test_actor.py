@@ -1,15 +1,18 @@
 """The learned ego: its observation is the environment's, its plan comes true, its file fits or is refused."""
 
+import copy
+
 import pytest
 import torch
 
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import PLAN_STEPS
 from e2rl.planners.network import Normaliser, find_weights
-from e2rl.planners.reference import reference_action
+from e2rl.planners.reference import follow, reference_action
 from e2rl.run.errors import InputError
 from e2rl.run.files import seal
 from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.observation import observation_layout
 from tests.synthetic import make_scenes
 
 
@@ -25,7 +28,7 @@ def test_its_plan_comes_true(vehicles, true):
     """Planning sees what the environment observes: among others the first step is where the action leads; alone on the
     road the whole plan is, with the actions held as in it."""
     env = DrivingEnv(make_scenes(2, num_vehicles=vehicles, num_vrus=2 * (vehicles > 1)), SimSettings(), 2)
-    ego, td = wild(ActorEgo(hidden=(16,)), 0.1), env.reset()
+    ego, td = wild(ActorEgo(hidden=(16,), room=None), 0.1), env.reset()
     for step in range(15):
         if step % true == 0:
             plan = ego.plan(env.world())
@@ -49,13 +52,52 @@ def test_plans_expect_the_others_plans():
 
 
 def test_the_network_can_override_the_reference():
-    ego = ActorEgo(hidden=(8,))
+    ego = ActorEgo(hidden=(8,), slack=None, room=None)
     env = DrivingEnv(make_scenes(2), SimSettings(), 2)
     observation = env.reset()["observation"]
     assert torch.allclose(ego.network.network.deterministic(observation), reference_action(observation), atol=1e-4)
     with torch.no_grad():
         ego.network.network.trunk.last.bias[:2] = torch.tensor([8.0, -8.0])
     assert torch.allclose(ego.network.network.deterministic(observation), torch.tensor([5.0, -1.6]), atol=1e-2)
+
+
+def test_nothing_learned_accelerates_into_a_vehicle_that_is_followed_or_a_pedestrian():
+    """It may brake harder than its reference; against oncoming traffic, whose duty it is too, it decides alone."""
+    follows = make_scenes(2, vehicles=[(0.0, 0, 10.0), (18.0, 0, 6.0)])
+    oncoming = make_scenes(2, vehicles=[(0.0, 0, 10.0), (18.0, 0, 6.0)])
+    oncoming.scenes["start"][:, 1, 2] = torch.pi
+    walks = make_scenes(2, num_vehicles=1, num_vrus=1)
+    walks.scenes["start"][:, 32, :3] = torch.tensor([18.0, 0.0, torch.pi / 2])
+    bounded, free = ActorEgo(hidden=(8,), slack=0.5, room=None), ActorEgo(hidden=(8,), slack=None, room=None)
+
+    def accelerations(scenes, push):
+        observation = DrivingEnv(scenes, SimSettings(), 2).reset()["observation"]
+        for ego in (bounded, free):
+            with torch.no_grad():
+                ego.network.network.trunk.last.bias[0] = push
+        found = [ego.decide(observation)[:, 0] for ego in (bounded, free)]
+        return *found, follow(observation)
+
+    for scenes in (follows, walks):
+        own, unbound, reference = accelerations(scenes, 8.0)
+        assert (unbound > 4.9).all() and torch.allclose(own, reference[:, 2] + 0.5, atol=1e-3) and (own < -1.0).all()
+        own, unbound, reference = accelerations(scenes, -8.0)
+        assert torch.equal(own, unbound) and (own < reference[:, 0] - 0.5).all()
+    own, _, _ = accelerations(oncoming, 8.0)
+    assert (own > 4.9).all()
+
+
+def test_with_room_ahead_the_reference_drives_and_without_it_the_network():
+    ego = wild(ActorEgo(hidden=(8,), slack=None, room=2.0))
+    alone = copy.deepcopy(ego)
+    alone.network.network.room = None
+    observation = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()["observation"]
+    names = [entry.name for entry in observation_layout()]
+    for room, weight in ((2.5, 0.0), (2.0, 0.0), (1.5, 0.5), (1.0, 1.0), (-0.5, 1.0)):
+        observation[:, [names.index(f"manoeuvre.{accel}.+0.gap") for accel in ("-1", "+1")]] = room / 3.0
+        (own, _), (network, _) = ego.network.network(observation), alone.network.network(observation)
+        usual = ego.network.network.offset(observation)[:, :2]
+        torch.testing.assert_close(own, torch.lerp(usual, network, weight))
 
 
 def test_normaliser_equals_the_statistics_of_all_it_saw_and_is_frozen_otherwise():
@@ -69,7 +111,7 @@ def test_normaliser_equals_the_statistics_of_all_it_saw_and_is_frozen_otherwise(
 
 
 def test_file_round_trip(tmp_path):
-    first = wild(ActorEgo(hidden=(8,)))
+    first = wild(ActorEgo(hidden=(8,), slack=0.3, room=3.0))
     first.network.normaliser.observe(torch.randn(10, first.network.normaliser.mean.shape[0]))
     folder = tmp_path / "checkpoints" / "round-000001"
     folder.mkdir(parents=True)
@@ -77,6 +119,7 @@ def test_file_round_trip(tmp_path):
     seal(folder)
     assert find_weights(tmp_path) == find_weights(folder) == folder / "actor.safetensors"
     second = ActorEgo(hidden=(8,), checkpoint=str(tmp_path))
+    assert second.network.architecture == first.network.architecture
     seen = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()
     for ask in (
         lambda ego: ego.decide(seen["observation"]),
@@ -86,15 +129,15 @@ def test_file_round_trip(tmp_path):
 
 
 def test_a_file_without_the_reference_s_weight_drives_as_it_did(tmp_path):
-    """Earlier versions added the network's output to the reference's action."""
-    first = wild(ActorEgo(hidden=(8,)))
+    """Earlier versions added the network's output to the reference's action, and did not bound it."""
+    first = wild(ActorEgo(hidden=(8,), slack=None, room=None))
     network, file = first.network.network, tmp_path / "actor.safetensors"
     with torch.no_grad():
         for value in network.trunk.last.parameters():
             value[2:] = 0.0
     observation = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()["observation"]
     with torch.no_grad():
-        added = network.trunk(network.normaliser(observation))[:, :2] + network.offset(observation)
+        added = network.trunk(network.normaliser(observation))[:, :2] + network.offset(observation)[:, :2]
         expected = network.middle + network.reach * added.tanh()
     of = first.network.weights()
     shorter = {key: value[:2] if key.startswith("network.trunk.last") else value for key, value in of.items()}
@@ -105,7 +148,7 @@ def test_a_file_without_the_reference_s_weight_drives_as_it_did(tmp_path):
 
 
 def test_the_network_can_let_go_of_the_reference():
-    network = ActorEgo(hidden=(8,)).network.network
+    network = ActorEgo(hidden=(8,), room=None).network.network
     observation = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()["observation"]
     with torch.no_grad():
         network.trunk.last.bias[:] = torch.tensor([0.3, -0.2, -1.0, -1.0])
@@ -129,7 +172,7 @@ def test_other_bounds_damage_and_other_versions_are_refused(tmp_path, monkeypatc
 
 
 def test_noise_is_the_networks_alone_and_ends_with_the_block():
-    ego, env = wild(ActorEgo(hidden=(8,))), DrivingEnv(make_scenes(2), SimSettings(), 2)
+    ego, env = wild(ActorEgo(hidden=(8,), room=None)), DrivingEnv(make_scenes(2), SimSettings(), 2)
     observation, network = env.reset()["observation"], ego.network.network
     clean = network.deterministic(observation)
     with network.noisy(0.3, 1.0):
