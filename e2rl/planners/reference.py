@@ -63,9 +63,9 @@ def reference_rows(observation: Tensor) -> Tensor:
     path = torch.stack([route[..., 0] * FAR, route[..., 1] * NEAR], -1)
     desired = (ego[..., 6] * SPEED).clamp(min=1.0)
     *leaders, own_way = _leaders(observation, path)
-    follow = _following(speed[..., None], desired[..., None], *leaders).amin(-1)
+    wanted = _following(speed[..., None], desired[..., None], *leaders).amin(-1)
     least = (-speed / REACTION).clamp(min=-HARDEST_BRAKING)  # no braking at standstill, as in recordings
-    accel = torch.maximum(torch.minimum(follow, _capped(route, speed)).clamp(max=ACCELERATION), least)
+    accel = torch.maximum(torch.minimum(wanted, _capped(route, speed)).clamp(max=ACCELERATION), least)
     behind = _following(speed[..., None], torch.full_like(desired, UNCAPPED)[..., None], *leaders)
     bound = torch.maximum(torch.where(own_way, behind, torch.inf).amin(-1), least)
     room = observation[..., ROOMS].unflatten(-1, (len(ACCELERATIONS), len(OFFSETS)))[..., MILD, OFFSETS.index(0.0)]

@@ -74,7 +74,7 @@ def small_run(
     torch.manual_seed(seed)
     scenes = scenes or small_scenes()
     improve = PolicyImprovement(
-        ActorEgo(hidden=hidden),
+        ActorEgo(hidden=hidden, room=None),
         scenes,
         SimSettings(),
         live,

@@ -12,7 +12,7 @@ from e2rl.sim.observation import OBSERVATION_SIZE
 
 def network():
     torch.manual_seed(0)
-    ego = ActorEgo(hidden=(16,))
+    ego = ActorEgo(hidden=(16,), room=None)
     torch.nn.init.normal_(ego.network.network.trunk.last.weight, std=0.1)
     return ego.network
 

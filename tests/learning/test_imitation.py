@@ -50,7 +50,7 @@ def test_clipping_keeps_actions_off_the_bounds():
 
 def test_cloning_reduces_the_held_out_loss_and_takes_the_best_weights():
     torch.manual_seed(0)
-    ego = ActorEgo(hidden=(32,))
+    ego = ActorEgo(hidden=(32,), room=None)
     shown = recorded_demonstrations(braking_log(), SimSettings(), 0, drives=1)
     training = Imitation(ego.network, shown, settings())
     before = training.measure(training.held_out)

@@ -43,7 +43,7 @@ def batch_of(ego, batch=8, steps=20):
 def begun(std=None, **changes):
     """A new ego, its learner, and a batch that the ego has driven."""
     torch.manual_seed(0)
-    ego = ActorEgo(hidden=(16,), **({} if std is None else {"initial_std": (std, std)}))
+    ego = ActorEgo(hidden=(16,), room=None, **({} if std is None else {"initial_std": (std, std)}))
     return ego, Learner(ego.network, settings_of(**changes)), batch_of(ego)
 
 
@@ -131,7 +131,7 @@ def test_passes_stop_at_the_target_kl():
 def test_advantages_are_those_of_torchrl():
     """Of one pass over the observations, where TorchRL takes two; with episodes that end and are cut off inside."""
     torch.manual_seed(0)
-    ego = ActorEgo(hidden=(16,), initial_std=(0.9, 0.9))
+    ego = ActorEgo(hidden=(16,), room=None, initial_std=(0.9, 0.9))
     learner, data = Learner(ego.network, settings_of(gamma=0.9, lmbda=0.8)), batch_of(ego, 16, 50)
     assert data["next", "terminated"].any() and data["next", "truncated"].any()
     learner.returns.update(5 * torch.randn(100, 1) + 3)
@@ -157,7 +157,7 @@ def test_the_critic_learns_values_of_any_size():
 
 
 def test_the_learning_rate_falls_to_its_end_over_the_run():
-    ego = ActorEgo(hidden=(16,))
+    ego = ActorEgo(hidden=(16,), room=None)
     settings, data = settings_of(learning_rate=1e-3, final_lr=0.2, epochs=1), batch_of(ego)
     learner = Learner(ego.network, settings, total=4)
     rates = [learner.update(data)["learning_rate"] for _ in range(6)]

@@ -174,7 +174,7 @@ def drive(ego, **options):
 def actor():
     """With an opinion, and statistics of observations of its own."""
     torch.manual_seed(1)
-    ego = wild(ActorEgo(hidden=(16, 8)), 0.1)
+    ego = wild(ActorEgo(hidden=(16, 8), room=3.0), 0.1)
     ego.network.normaliser.observe(torch.randn(50, OBSERVATION_SIZE))
     return ego
 
