@@ -255,12 +255,15 @@ def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
         saved = json.loads(header.get("architecture", "null"))
         low, high = (torch.tensor(saved[key], dtype=torch.float32).reshape(2) for key in ("low", "high"))
         sizes, units = [int(size) for size in saved["hidden"]], int(saved["agent_units"])
-        bounds = [None if saved.get(key) is None else float(saved[key]) for key in ("slack", "room")]
+        slack, room = (None if saved.get(key) is None else float(saved[key]) for key in ("slack", "room"))
         least = float(saved.get("least_scale", 0.05))  # of earlier versions, which had no bounds either
         fits = 0 < len(sizes) <= DEEPEST and all(0 < size <= WIDEST for size in [*sizes, units])
         if saved["observation"] != OBSERVATION_SIZE or not fits:
             raise ValueError(f"of {saved['observation']} numbers, {units} units an agent, layers of {sizes} units")
-        how = units, bool(saved["reference"]), *bounds
+        positive = all(0 < value < torch.inf for value in (least, 1.0 if room is None else room))
+        if not (positive and 0 <= (slack or 0.0) < torch.inf):
+            raise ValueError(f"slack {slack}, room {room}, least_scale {least}")
+        how = units, bool(saved["reference"]), slack, room
         actor = ActorCritic(low, high, sizes, *how, device=device, least_scale=least)
         own = actor.weights()
         weights |= {key: padded(weights[key], own[key]) for key in LAST if key in own and key in weights}

@@ -161,7 +161,8 @@ def test_other_bounds_damage_and_other_versions_are_refused(tmp_path, monkeypatc
     network.save(file)
     with pytest.raises(InputError, match=r"bounds .*5\.0, .* not .*2\.0.*set sim\.max_"):
         ActorEgo(hidden=(8,), max_acceleration=2.0, checkpoint=str(file))
-    for change in ({"observation": 12}, {"hidden": [10**9]}):
+    bounds = {"room": 0.0}, {"room": float("nan")}, {"slack": float("nan")}, {"least_scale": -1}
+    for change in ({"observation": 12}, {"hidden": [10**9]}, *bounds):
         monkeypatch.setattr(network, "architecture", network.architecture | change)
         network.save(file)
         with pytest.raises(InputError, match="another version"):
