@@ -48,6 +48,17 @@ def test_the_curves_have_a_line_for_every_method_and_eta(evaluated):
     assert "Difference of each method to nominal" in (run / "methods.md").read_text()
 
 
+def test_nuplan_s_scores_are_a_table_of_their_own(evaluated):
+    """The recorded ego in its own recording drives all of its way, hits nobody, and is within 1 m of the road."""
+    run = evaluated("experiment=nuplan", "methods=[replay,idm]", "ego=replay")
+    rows = {row["method"]: row["metrics"] for row in read_metrics(run / "metrics.json")}
+    for method in ("replay", "idm"):
+        assert rows[method]["ego_progress_along_expert_route"]["mean"] > 0.99
+        assert 0 < rows[method]["nuplan_score"]["mean"] <= 1
+    assert rows["replay"]["no_ego_at_fault_collisions"]["mean"] == 1
+    assert "| nuplan_score [%]" in (run / "tables.md").read_text()
+
+
 def test_the_public_protocol_has_crash_rates_and_route_completion_of_every_ego(evaluated):
     overrides = ["experiment=public_protocol", "methods=[replay,cat]", "egos.policy.checkpoint=bundled"]
     run = evaluated(*overrides)

@@ -115,7 +115,7 @@ def unregister(name: str) -> None:
 
 def table_names() -> tuple[str, ...]:
     """Names of the closed-loop tables."""
-    return tuple(dict.fromkeys([*TABLES, *(table for metric in METRICS.values() for table in metric.tables)]))
+    return tuple(dict.fromkeys([*TABLES, *(table for metric in METRICS.values() for table in metric.tables.split())]))
 
 
 def table_metrics(table: str) -> tuple[Metric, ...]:

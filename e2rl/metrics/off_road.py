@@ -37,18 +37,26 @@ def line_segments(points: Tensor, index: Tensor, closed: bool = False) -> tuple[
     return rollout, line, ends
 
 
-def near_lane(points: Tensor, rollout: Tensor, lane_points: Tensor, lane_index: Tensor, lane_width: Tensor) -> Tensor:
-    """Bool [n]: points [n, 2] of rollouts [n] within width / 2 + MARGIN of a lane's centreline.
+def near_lane(
+    points: Tensor, rollout: Tensor, lane_points: Tensor, lane_index: Tensor, lane_width: Tensor, margin: float = MARGIN
+) -> Tensor:
+    """Bool [n]: points [n, 2] of rollouts [n] within width / 2 + margin of a lane's centreline.
 
     lane_points [B, M, 2], lane_index [B, M] (-1 padding), lane_width [B, L].
     """
     owner, lane, ends = line_segments(lane_points, lane_index)
-    reach = lane_width[owner, lane] / 2 + MARGIN
+    point, _ = near_segments(points, rollout, owner, ends, lane_width[owner, lane] / 2 + margin)
+    return torch.zeros(len(points), dtype=torch.bool).index_fill(0, point, True)
+
+
+def near_segments(points: Tensor, rollout: Tensor, owner: Tensor, ends: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+    """(point, segment) of all pairs of a point [n, 2] of rollouts [n] and a segment [m, 2, 2] of rollouts `owner` [m]
+    that is at most reach [m] m away."""
     low, high = ends.amin(1) - reach[:, None], ends.amax(1) + reach[:, None]
     point, segment = candidates(points, rollout, low, high, owner, LANE_CELL)
     start, along = ends[segment, 0], (ends[:, 1] - ends[:, 0])[segment]
     near = from_segment(points[point], start, along).square().sum(-1) <= reach[segment].square()
-    return torch.zeros(len(points), dtype=torch.bool).index_fill(0, point[near], True)
+    return point[near], segment[near]
 
 
 def inside_polygon(points: Tensor, rollout: Tensor, polygon_points: Tensor, polygon_index: Tensor) -> Tensor:

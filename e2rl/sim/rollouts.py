@@ -48,6 +48,7 @@ class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` a
     ego_policy: list[str] | None = None
     parked: Tensor | None = None  # [B, N] bool
     ran_light: Tensor | None = None  # [B, N] int64: step of the last stop line crossed at red, -1 never
+    speed_limit: Tensor | None = None  # [B, T+1] m/s: of the ego's mission where it is, 0 unknown
     routes: Tensor | None = None  # [B, V] int64: route candidates followed, -1 none
     contact: Tensor | None = None  # [B] bool: the ego touched a vehicle
     transport_adversary: Tensor | None = None  # [B]: path KL of the control

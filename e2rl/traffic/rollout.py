@@ -13,10 +13,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from e2rl.planners.ego import Ego, EgoPolicy
 from e2rl.prior.routes import take_route
-from e2rl.scenes.route import project
+from e2rl.scenes.route import SPACING, project
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.sim.mission import ran_red
+from e2rl.sim.mission import Mission, mission_of, ran_red
 from e2rl.sim.rollouts import Rollouts
 from e2rl.traffic.attempt import attempt
 from e2rl.traffic.pool import TrafficPool
@@ -75,9 +75,16 @@ def _driven(steps: TensorDictBase, scene: TensorDictBase, log: PlanLog) -> dict[
         "adversaries": torch.nn.functional.pad(log.acted, (0, tracks["states"].shape[2] - route.shape[1])),
         "routes": route,
         "ran_light": red_lights(tracks, scene, route),
+        "speed_limit": limits(tracks["states"][:, :, 0, :2], mission_of(scene)),
         **log.transport(),
         "contact": steps["next", "metrics", "contact"].any(1)[:, 0],
     }
+
+
+def limits(points: Tensor, mission: Mission) -> Tensor:
+    """Speed limit [B, K] [m/s] at the place of a mission that is nearest to points [B, K, 2]; 0 unknown."""
+    s, _, _ = project(points, mission.points)
+    return mission.limit.gather(1, (s / SPACING).long().clamp(0, mission.limit.shape[1] - 1))
 
 
 def red_lights(tracks: dict[str, Tensor], scene: TensorDictBase, route: Tensor) -> Tensor:

@@ -1,0 +1,186 @@
+"""nuPlan's score: terms of courses for which they are computed by hand, and bounds that hold for any rollout."""
+
+import math
+
+import pytest
+import torch
+
+from e2rl.metrics.contact import first_contact
+from e2rl.metrics.nuplan_scores import MULTIPLIERS, WEIGHTS, nuplan_columns
+from e2rl.metrics.score import as_doubles
+from e2rl.scenes.recording import CYCLIST, OTHER, VEHICLE
+from tests.metrics.random_rollouts import random_rollouts
+from tests.metrics.test_contact import course, scene
+
+TERMS = (*MULTIPLIERS, *WEIGHTS)
+AWAY = course(0, 400, 0, 0)  # an agent that nobody meets
+
+
+def scores(*courses, lanes=None, limit=None, logged=None, **options):
+    """The terms of one rollout; lanes: [(points, width)], by default one along x of 4 m."""
+    rollouts = scene(*courses, **options)
+    if lanes is not None:
+        points = [torch.tensor(line, dtype=torch.float32) for line, _ in lanes]
+        index = torch.cat([torch.full((len(line),), number) for number, line in enumerate(points)])
+        widths = torch.tensor([[width for _, width in lanes]])
+        rollouts = rollouts.replace(lane_points=torch.cat(points)[None], lane_index=index[None], lane_width=widths)
+    if logged is not None:
+        rollouts = rollouts.replace(logged=torch.stack([logged[0]] * len(courses), 1)[None].float())
+    if limit is not None:
+        rollouts = rollouts.replace(speed_limit=torch.full(rollouts.states.shape[:2], float(limit)))
+    return terms(rollouts)
+
+
+def terms(rollouts):
+    batch = as_doubles(rollouts)
+    found = nuplan_columns(batch | first_contact(batch))
+    return {name: value.tolist()[0] if len(value) == 1 else value for name, value in found.items()}
+
+
+def track(x, y, heading, speed):
+    """A course by arrays."""
+    states = torch.stack([torch.as_tensor(value, dtype=torch.float64) for value in (x, y, heading, speed)], -1)
+    return states, torch.ones(len(states), dtype=torch.bool)
+
+
+def test_alone_on_the_road_all_terms_are_one():
+    found = scores(course(0, 0, 0, 10), AWAY, limit=12)
+    assert all(found[name] == pytest.approx(1) for name in (*TERMS, "nuplan_score"))
+
+
+COLLISIONS = {  # the ego, the other, its kind, lanes; the score of collisions
+    "the front bumper": (course(0, 0, 0, 12), course(30, 0, 0, 5), VEHICLE, 0),
+    "a cyclist": (course(0, 0, 0, 12), course(30, 0, 0, 5), CYCLIST, 0),
+    "one object": (course(0, 0, 0, 12), course(30, 0, 0, 0), OTHER, 0.5),
+    "hit from behind": (course(0, 0, 0, 5), course(-20, 0, 0, 10), VEHICLE, 1),
+    "standing": (course(0, 0, 0, 0), course(30, 0, math.pi, 10), VEHICLE, 1),
+    "beside, within its lane": (course(0, 0, 0, 10), course(8, 9.2, -math.pi / 2, 8), VEHICLE, 1),
+    "a standing one beside": (course(0, 0, 0, 10), course(20, 1.9, 0, 0), VEHICLE, 0),
+}
+
+
+@pytest.mark.parametrize("name", COLLISIONS)
+def test_whose_fault_a_collision_is(name):
+    ego, other, kind, expected = COLLISIONS[name]
+    found = scores(ego, other, kinds=[VEHICLE, kind], limit=20)
+    assert found["no_ego_at_fault_collisions"] == expected
+    assert found["nuplan_score"] <= expected
+
+
+def test_beside_it_is_the_ego_s_fault_where_it_is_in_two_lanes():
+    """It drives on the border of two lanes; in one that is twice as wide it is not at fault."""
+    ego, other = course(0, 2, 0, 10), course(0.5, 9, -0.35, 10.2)
+    two = [([[-500, 0], [500, 0]], 4), ([[-500, 4], [500, 4]], 4)]
+    assert scores(ego, other, lanes=two)["no_ego_at_fault_collisions"] == 0
+    assert scores(ego, other, lanes=[([[-500, 2], [500, 2]], 8)])["no_ego_at_fault_collisions"] == 1
+
+
+def test_lanes_that_follow_each_other_are_one():
+    """The same with the road cut into pieces of 7 m, at each of which the ego is in two lanes at a time."""
+    ego, other = course(0, 2, 0, 10), course(0.5, 9, -0.35, 10.2)
+    pieces = [([[x, 2], [x + 7, 2]], 8) for x in range(-21, 200, 7)]
+    assert scores(ego, other, lanes=pieces)["no_ego_at_fault_collisions"] == 1
+    gaps = [([[x, 2], [x + 6.3, 2]], 8) for x in range(-21, 200, 7)]
+    assert scores(ego, other, lanes=gaps)["no_ego_at_fault_collisions"] == 0
+
+
+@pytest.mark.parametrize(("y", "expected"), [(1.0, 1), (1.25, 1), (1.35, 0), (-1.35, 0)])
+def test_a_corner_may_be_0_3_m_outside(y, expected):
+    """The lane reaches to 2 m; the ego is 2 m wide."""
+    assert scores(course(0, y, 0, 10), AWAY)["drivable_area_compliance"] == expected
+
+
+@pytest.mark.parametrize(("speed", "expected"), [(1.7, 1), (1.9, 0.5), (5.3, 0.5), (5.6, 0)])
+def test_metres_against_the_lane_within_a_second(speed, expected):
+    """The devkit sums the last 11 steps, so that 1.1 s of driving count."""
+    found = scores(course(100, 0, math.pi, speed), AWAY)
+    assert found["driving_direction_compliance"] == expected
+    assert scores(course(100, 0, 0, speed), AWAY)["driving_direction_compliance"] == 1
+
+
+@pytest.mark.parametrize(("gap", "expected"), [(9.6, 1), (9.4, 1), (8.9, 0)])
+def test_time_to_collision(gap, expected):
+    """At a closing speed of 10 m/s the last projection that counts is 0.9 s ahead, where 9 m are gone. The vehicle
+    ahead drives off before the ego is there."""
+    time = torch.arange(81, dtype=torch.float64) * 0.1
+    ahead = track(4.8 + gap + 10 * (time > 0.05) * time, 0 * time, 0 * time, 10.0 * (time > 0.05))
+    assert scores(course(0, 0, 0, 10), ahead)["time_to_collision_within_bound"] == expected
+
+
+def test_time_to_collision_looks_beside_in_two_lanes_alone():
+    """One 6 m to the left, level with the ego's front and closing at 6.5 m/s, turns away before it is there."""
+    time = torch.arange(81, dtype=torch.float64) * 0.1
+    near = track(3 + 10 * time, 8 + 0 * time, torch.where(time < 0.15, -0.6, 0.0), torch.full_like(time, 12.0))
+    two = [([[-500, 0], [500, 0]], 4), ([[-500, 4], [500, 4]], 4)]
+    assert scores(course(0, 2, 0, 10), near, lanes=two)["time_to_collision_within_bound"] == 0
+    one = [([[-500, 2], [500, 2]], 8)]
+    assert scores(course(0, 2, 0, 10), near, lanes=one)["time_to_collision_within_bound"] == 1
+
+
+@pytest.mark.parametrize(("speed", "progress", "moving"), [(10, 1, 1), (12, 1, 1), (5, 0.5, 1), (1.9, 0.19, 0)])
+def test_progress_is_the_fraction_of_the_recorded_way(speed, progress, moving):
+    found = scores(course(0, 0, 0, speed), AWAY, logged=course(0, 0, 0, 10))
+    assert found["ego_progress_along_expert_route"] == pytest.approx(progress, abs=1e-6)
+    assert found["ego_is_making_progress"] == moving
+
+
+def test_where_the_recorded_ego_stands_progress_is_whole():
+    found = scores(course(0, 0, 0, 5), AWAY, logged=course(0, 0, 0, 0))
+    assert found["ego_progress_along_expert_route"] == 1
+
+
+@pytest.mark.parametrize(("limit", "expected"), [(10, 1), (9, 1 - 81 / 80 / 2.23), (7, 0), (0, 1)])
+def test_speeding(limit, expected):
+    """The integral over time of the speed beyond the limit, by 2.23 m/s times the duration; 81 steps in 8 s."""
+    assert scores(course(0, 0, 0, 10), AWAY, limit=limit)["speed_limit_compliance"] == pytest.approx(expected)
+
+
+def test_speeding_is_unknown_without_limits():
+    found = scores(course(0, 0, 0, 10), AWAY)
+    assert math.isnan(found["speed_limit_compliance"]) and math.isnan(found["nuplan_score"])
+
+
+@pytest.mark.parametrize(
+    ("accel", "turn", "expected"),
+    [(2.3, 0, 1), (2.5, 0, 0), (-3.9, 0, 1), (-4.2, 0, 0), (0, 0.45, 1), (0, 0.55, 0), (0, -0.55, 0)],
+)
+def test_comfort_of_constant_motion(accel, turn, expected):
+    """Constant acceleration from 35 m/s, and constant turns at 9.5 m/s: at 0.45 rad/s that is 4.3 m/s^2."""
+    speed = 35.0 if accel < 0 else 9.5
+    states, valid = course(0, 0, 0, speed, accel=accel)
+    time = torch.arange(len(states), dtype=torch.float64) * 0.1
+    if turn:
+        radius = speed / turn
+        states, valid = track(
+            radius * (turn * time).sin(), radius * (1 - (turn * time).cos()), turn * time, states[:, 3]
+        )
+    assert scores((states, valid), AWAY)["ego_is_comfortable"] == expected
+
+
+def test_a_jerk_is_uncomfortable_where_its_acceleration_is_not():
+    time = torch.arange(81, dtype=torch.float64) * 0.1
+    accel = 2.0 * torch.sin(2 * math.pi * time / 2.0)  # m/s^2, with a jerk of up to 6.3 m/s^3
+    speed = 10 + torch.cat([torch.zeros(1, dtype=torch.float64), accel[:-1].cumsum(0) * 0.1])
+    states = track(torch.cat([torch.zeros(1), speed[:-1].cumsum(0) * 0.1]), 0 * time, 0 * time, speed)
+    slow = track(states[0][:, 0], 0 * time, 0 * time, 10 + (speed - 10) / 2)
+    assert scores(states, AWAY)["ego_is_comfortable"] == 0
+    assert scores(slow, AWAY)["ego_is_comfortable"] == 1
+
+
+def test_the_score_is_the_product_of_multipliers_and_the_weighted_mean():
+    """Half the recorded way, and 1 m/s too fast throughout: (5 + 5 / 2 + 4 * s + 2) / 16."""
+    found = scores(course(0, 0, 0, 5), AWAY, limit=4, logged=course(0, 0, 0, 10))
+    assert found["nuplan_score"] == pytest.approx((5 + 2.5 + 4 * (1 - 81 / 80 / 2.23) + 2) / 16, abs=1e-6)
+
+
+def test_terms_are_in_0_to_1_and_rows_do_not_depend_on_the_batch():
+    rollouts = random_rollouts(12, seed=4).replace(speed_limit=torch.full((12, 81), 9.0))
+    found = terms(rollouts)
+    for name, value in found.items():
+        known = value[~value.isnan()]
+        assert len(known) and bool(((known >= 0) & (known <= 1)).all()), name
+    for index in range(12):
+        alone = terms(rollouts[index : index + 1])
+        assert {name: alone[name] for name in alone} == pytest.approx(
+            {name: value[index].item() for name, value in found.items()}, nan_ok=True
+        )
