@@ -57,6 +57,8 @@ def evolve(task: Run) -> None:
         task.begin({"scenes": listed(scenes), "measured scenes": listed(measure.setup.scenes)})
         logger.forget(load_checkpoint(config.resume, run) if done else 0)
     progress.say(f"{len(scenes)} scenes to train on, {len(measure.setup.scenes)} to measure on, in {folder}")
+    if (task.choices["data"], task.choices["experiment"]) == ("bundled", "harden"):
+        progress.say("these are the bundled scenes: experiment=harden is for logs of your own (data=, data.path=)")
     if not done:
         with progress.phase("measurement"):
             measure("before", run.ego, 0)

@@ -93,7 +93,7 @@ class EvaluationSettings:
     """Keys of conf/evaluate.yaml, checked. shard: (k, n), only every n-th batch from the k-th on."""
 
     methods: tuple[str, ...]
-    eta: tuple[float, ...] = setting(low=0.0, high=100.0)  # 0 to 3 are sensible
+    eta: tuple[float, ...] = setting(low=0.0, high=3.0)
     seeds: tuple[int, ...] = setting(low=0, high=900_000_000)  # seeds of tries are 10^10 times as large
     num_scenes: int | None = setting(low=1, optional=True)
     shard: tuple[int, ...] = setting(low=0)

@@ -1,11 +1,9 @@
 """One interface for all egos: planners, the learned actor, outside code.
 
 An outside planner is a class and a YAML file in conf/ego with its `_target_` and arguments (docs/how-to/planner.md,
-examples/). Only `plan` is required: `act` tracks the plan. An ego that maps observations to actions overrides `act`;
-its `plan` returns its own predicted motion.
+examples/). It overrides `plan`, and `act` tracks the plan; or `act`, which maps observations to actions.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -15,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from e2rl.run.config import Extension
+from e2rl.run.errors import InputError
 from e2rl.run.settings import check_range
 from e2rl.scenes.boxes import to_frame
 from e2rl.scenes.recording import DT
@@ -26,12 +25,18 @@ RETURN_TIME, RETURN_LENGTH = 0.7, 1.5  # s, m: a lateral error decays over max(R
 CATCH_UP = 1.0  # 1/s: rate at which a longitudinal error is corrected
 FASTEST = 50.0  # m/s: a plan that is faster, in its speeds or from pose to pose, is nonsense
 LARGEST = 100.0  # m/s^2, rad/s: so is a larger action
+ASIDE, TURNED = 2.0, 1.0  # m, rad: a plan that begins farther from the ego is in another frame, or of another time
+CREEP = 0.5  # m/s below which a heading may be anything
 JUMPS = f"a plan that is not finite, or jumps (above {FASTEST:g} m/s)"
+STRAYS = (
+    f"a plan that begins more than {ASIDE:g} m or {TURNED:g} rad from where the ego will be 0.1 s from now: its states "
+    "are of the scene's frame, the first of them 0.1 s ahead"
+)
 WILD = f"an action that is not finite, or above {LARGEST:g}"
 
 
-class Ego(Extension, ABC):
-    """Drives the ego of B scenes at once. `plan` is a pure function of the World; `act` follows it.
+class Ego(Extension):
+    """Drives the ego of B scenes at once, by its plans, a pure function of the World, or by its actions.
 
     replan_every: steps between two plans (5 is 2 Hz, 1 every step), at most PLAN_STEPS; replays_log: the environment
     moves this ego along its recording (`SimSettings.replay_ego`) and ignores its actions; tuned: what `e2rl tune`
@@ -48,9 +53,18 @@ class Ego(Extension, ABC):
     def reset(self, world: World) -> None:  # noqa: B027 - most egos have no memory
         """Called before the first plan of new episodes (world.step 0). An ego with memory clears it here."""
 
-    @abstractmethod
+    def __new__(cls, *args: Any, **settings: Any) -> "Ego":
+        if cls.plan is Ego.plan and cls.act is Ego.act:
+            raise TypeError(f"{cls.__name__} overrides neither plan nor act, so that it does not drive")
+        return super().__new__(cls)
+
     def plan(self, world: World) -> Tensor:
-        """Planned states [B, PLAN_STEPS, 4] of the egos at steps 1.. from now, 0.1 s apart, without side effects."""
+        """Planned states [B, PLAN_STEPS, 4] of the egos at steps 1.. from now, 0.1 s apart, without side effects.
+
+        By default, for an ego that acts, its present velocity held.
+        """
+        ahead = DT * torch.arange(1, PLAN_STEPS + 1, device=world.states.device)
+        return dynamics.constant_velocity(world.states[:, 0], ahead)
 
     def act(self, world: World, observation: Tensor, plan: Tensor) -> Tensor:
         """Action [B, 2] (acceleration [m/s^2], yaw rate [rad/s]) for the next step; by default it tracks the plan.
@@ -119,6 +133,28 @@ def drivable(now: Tensor, given: Tensor, known: Tensor | int = PLAN_STEPS) -> Te
     return (fine | ~counts).all(1)
 
 
+def strays(now: Tensor, first: Tensor) -> Tensor:
+    """Bool [B]: the first planned state [B, 4] is elsewhere than the ego at states now [B, 4] will be in a step."""
+    due = dynamics.constant_velocity(now, torch.full_like(now[:, :1], DT))[:, 0]
+    moves = torch.minimum(now[:, 3].abs(), first[:, 3].abs()) > CREEP
+    turned = dynamics.wrap(first[:, 2] - due[:, 2]).abs() > TURNED
+    return ((first[:, :2] - due[:, :2]).norm(dim=-1) > ASIDE) | (turned & moves)
+
+
+def checked(given: Any, shape: tuple[int, ...], ego: Ego, method: str) -> Tensor:
+    """What `plan` or `act` of an ego returned; raises InputError where it is no tensor of floats of this shape, and
+    NotFinite where it is not finite."""
+    floats = isinstance(given, Tensor) and given.is_floating_point()
+    if not floats or tuple(given.shape) != shape:
+        found = f"{given.dtype} {list(given.shape)}" if hasattr(given, "shape") else type(given).__name__
+        mend = "" if isinstance(given, Tensor) else "; torch.as_tensor makes one of an array"
+        raise InputError(
+            f"{type(ego).__name__}.{method}: returns {type(given).__module__.partition('.')[0]} {found}, expected a "
+            f"tensor of floats {list(shape)}{mend} (docs/how-to/planner.md)"
+        )
+    return finite(given, "plan" if method == "plan" else "action")
+
+
 def from_outside(ego: Ego) -> bool:
     """Whether the class of the ego is not e2rl's own."""
     return not type(ego).__module__.startswith("e2rl.")
@@ -172,8 +208,10 @@ class EgoPlanner(TensorDictModuleBase):
         age = world.step - self._planned_at
         due = (age >= self.ego.replan_every) | (age < 0) | (world.step == 0)
         if bool(due.any()):
-            fresh = finite(self._ask("plan", world), "plan")
-            self._refuse(due & ~drivable(world.states[:, 0], fresh), JUMPS)
+            now = world.states[:, 0]
+            fresh = checked(self._ask("plan", world), (len(now), PLAN_STEPS, 4), self.ego, "plan").to(now)
+            self._refuse(due & ~drivable(now, fresh), JUMPS)
+            self._refuse(due & strays(now, fresh[:, 0]), STRAYS)
             fresh = torch.cat([world.states[:, :1], fresh], 1)
             self._plan = torch.where(due[:, None, None], fresh, self._plan)
             self._planned_at = torch.where(due, world.step, self._planned_at)
@@ -198,7 +236,7 @@ class EgoPolicy(EgoPlanner):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         world = World.of(tensordict, self.scene)
         plan = self.plan(world)
-        action = finite(self._ask("act", world, tensordict["observation"], plan), "action")
+        action = checked(self._ask("act", world, tensordict["observation"], plan), (len(plan), 2), self.ego, "act")
         self._refuse((action.abs() > LARGEST).any(1), WILD)
         tensordict["action"] = action.clamp(self.bounds.low, self.bounds.high)
         tensordict["ego", "plan"] = plan[:, 1:]

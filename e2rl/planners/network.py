@@ -252,7 +252,12 @@ def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
     """The actor of a file of `ActorCritic.save`, whatever its architecture; raises InputError."""
     try:
         weights, header = read_weights(path)
-        saved = json.loads(header.get("architecture", "null"))
+        if "architecture" not in header:
+            raise InputError(
+                f"{path}: no actor (format {header.get('format')}); pass actor.safetensors, or the folder of a run of "
+                "train.py (a prior is given by prior.checkpoint=)"
+            )
+        saved = json.loads(header["architecture"])
         low, high = (torch.tensor(saved[key], dtype=torch.float32).reshape(2) for key in ("low", "high"))
         sizes, units = [int(size) for size in saved["hidden"]], int(saved["agent_units"])
         slack, room = (None if saved.get(key) is None else float(saved[key]) for key in ("slack", "room"))
@@ -270,6 +275,8 @@ def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
         wrong = set(own) ^ set(weights) or {key for key in own if own[key].shape != weights[key].shape}
         if wrong:
             raise ValueError(f"weights {', '.join(sorted(wrong))} do not fit")
+    except InputError:
+        raise
     except (TypeError, KeyError, ValueError, RuntimeError) as error:  # RecursionError among them
         raise InputError(f"{path}: damaged, or an actor of another version ({error}); train it again") from None
     actor.set_weights(weights)

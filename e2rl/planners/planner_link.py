@@ -124,6 +124,7 @@ def _bytes(words: Tensor) -> bytes:
 
 STDERR = 2  # file descriptor
 PAUSE = 0.02  # s between two attempts to connect
+ANSWERS = 5.0  # s in which a planner that runs takes a connection
 GRACE = 1.0  # s between SIGTERM and SIGKILL
 Process = subprocess.Popen[bytes]
 
@@ -141,12 +142,14 @@ class PlannerLink:
         """What came beyond the last message taken."""
         self._name = f"ego.address={address}" if command is None else f"ego.command={command}"
         folder = None if command is None else tempfile.mkdtemp(prefix="e2rl-")
-        self._process, deadline = None, time.monotonic() + timeout
+        self._process, begun = None, time.monotonic()
+        deadline = begun + timeout
         try:
             if command is not None:
                 address = f"unix:{folder}/planner"
                 self._process = start(command, address)
-            self._socket = connect(str(address), self._process, deadline, self._name)
+            listens = begun + (timeout if command is not None else min(timeout, ANSWERS))
+            self._socket = connect(str(address), self._process, listens, self._name)
         except BaseException:
             close(None, self._process)
             raise
@@ -231,7 +234,8 @@ def connect(address: str, process: Process | None, deadline: float, name: str) -
             if process is not None and process.poll() is not None:
                 raise InputError(f"{name}: ended with status {process.returncode} before it listened") from error
             if time.monotonic() > deadline:
-                raise InputError(f"{name}: nothing listens at {address} ({error}); start the planner") from error
+                mend = "start the planner first, or let e2rl start it by ego.command"
+                raise InputError(f"{name}: nothing listens at {address} ({error}); {mend}") from error
         time.sleep(PAUSE)
 
 

@@ -59,7 +59,10 @@ def load_prior(
     except ValueError as error:
         raise InputError(f"{path}: not a readable safetensors file ({error}); train the prior again") from error
     if header.get("format") != FORMAT:
-        raise InputError(f"{path}: format {header.get('format')!r}, expected {FORMAT!r}; is it a prior checkpoint?")
+        raise InputError(
+            f"{path}: format {header.get('format')!r}, expected {FORMAT!r}: no prior; train one by `python train.py "
+            f"stage=prior`, or use prior.checkpoint={BUNDLED} (an actor is given by ego=actor ego.checkpoint=)"
+        )
     try:
         architecture, origin = json.loads(header["architecture"]), json.loads(header["origin"])
         if architecture["features"] != FEATURES:

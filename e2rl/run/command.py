@@ -99,7 +99,7 @@ def check_keys(config: DictConfig, name: str) -> None:
     """Raises InputError for keys that conf/<name>.yaml does not have, which do nothing: added by +, or by an experiment
     of another command."""
     known = [*map(str, load_config(name)), *_groups(name)]
-    if wrong := [_nearest(str(key), str(key), known) for key in config if key not in known]:
+    if wrong := [_told(str(key), _near(str(key), known)) for key in config if key not in known]:
         raise InputError(f"{'; '.join(wrong)} ({' '.join(program())})")
 
 
@@ -131,23 +131,45 @@ def _file_texts(folders: Sequence[Path], group: str, name: str) -> Iterator[str]
             yield from _file_texts(folders, group, base)
 
 
+DATA = dict.fromkeys(("waymo", "nuscenes", "nuplan", "lyft"), "scenarionet") | {"av2": "argoverse2"}  # their readers
+
+
 def told(name: str, arguments: Sequence[str], said: str) -> str:
-    """Returns what Hydra said of a wrong option or choice, in short and with the nearest that there is."""
+    """Returns what Hydra said of a wrong option or choice, in short and with what there is instead."""
     if found := re.search("Could not find '(.+)/(.+?)'", said):
         group, file = found.groups()
-        return _nearest(f"{group}={file}", file, choices(group))
+        known = choices(group)
+        near = [DATA[file]] if group == "data" and file in DATA else get_close_matches(file, known, 1, 0.5)
+        own = f"one of your own is FOLDER/{group}/{file}.yaml, with --config-dir FOLDER"
+        return _told(f"{group}={file}", [f"{group}={each}" for each in near], f"of {', '.join(known)}; {own}")
     if found := re.search("Could not override '(.+?)'", said):
         groups = () if any(_further(arguments)) else _groups(name)
         config = load_config(name, [argument for argument in arguments if argument.split("=")[0] in groups])
-        return _nearest(found[1], found[1], [key for key, _ in nodes(OmegaConf.to_container(config))])
+        known = [key for key, _ in nodes(OmegaConf.to_container(config))]
+        if found[1] in known:
+            return f"{found[1]}: what it does not have yet is added by +: '+{found[1]}=...'"
+        group = found[1].partition(".")[0]
+        others = [f"{group}={each}" for each in choices(group) if group in groups and _has(name, group, each, found[1])]
+        return _told(found[1], others and [f"{found[1]} with {', '.join(others)}"] or _near(found[1], known))
     return said
 
 
-def _nearest(option: str, given: str, known: Sequence[str]) -> str:
-    near = get_close_matches(given, known, 1, 0.5) or get_close_matches(
-        given.rpartition(".")[2], [key.rpartition(".")[2] for key in known], 1, 0.5
-    )
-    return f"{option}: there is no such option" + (f"; the nearest is {near[0]}" if near else "; see --help")
+def _has(name: str, group: str, choice: str, key: str) -> bool:
+    """Whether a file of a group has an option."""
+    config = load_config(name, [f"{group}={choice}"])
+    return key in [each for each, _ in nodes(OmegaConf.to_container(config[group]), group)]
+
+
+def _near(given: str, known: Sequence[str]) -> list[str]:
+    """The options that an option which is none may stand for: those of its last name, or the nearest."""
+    last = given.rpartition(".")[2]
+    same = [key for key in known if key.rpartition(".")[2] == last]
+    return same[:3] or get_close_matches(given, known, 1, 0.6)
+
+
+def _told(option: str, near: Sequence[str], otherwise: str = "see --help") -> str:
+    advice = f"did you mean {' or '.join(near)}?" if near else otherwise
+    return f"{option}: there is no such option; {advice}"
 
 
 def _further(arguments: Sequence[str]) -> Iterator[Path]:

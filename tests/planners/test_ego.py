@@ -87,6 +87,72 @@ def test_a_reset_in_between_makes_a_new_plan_there():
     assert data["action"].abs().max() < 1e-3
 
 
+class Planned(Ego):
+    """What a function of the World returns as its plans."""
+
+    def __init__(self, of):
+        super().__init__(5)
+        self.of = of
+
+    def plan(self, world):
+        return self.of(keep(world))
+
+
+def keep(world):
+    ahead = 0.1 * torch.arange(1, PLAN_STEPS + 1)
+    return dynamics.constant_velocity(world.states[:, 0], ahead)
+
+
+def drive(ego, scenes, steps=12):
+    env = make_env(scenes, len(scenes))
+    return env.rollout(steps, EgoPolicy(ego, env), break_when_any_done=False)
+
+
+@pytest.mark.parametrize(
+    ("of", "told"),
+    [
+        (lambda plan: plan[:, :30], r"Planned.plan: returns torch torch.float32 \[2, 30, 4\], .*floats \[2, 50, 4\]"),
+        (lambda plan: plan[0], r"\[50, 4\], expected a tensor of floats \[2, 50, 4\]"),
+        (lambda plan: plan.numpy(), "returns numpy float32 .*torch.as_tensor"),
+        (lambda plan: plan.long(), "torch.int64"),
+        (lambda plan: None, "NoneType"),
+    ],
+)
+def test_plans_of_another_shape_or_type_are_told_so(of, told):
+    with pytest.raises(InputError, match=told):
+        drive(Planned(of), make_scenes(2))
+
+
+@pytest.mark.parametrize(
+    "of",
+    [
+        lambda plan: 0 * plan,
+        lambda plan: plan - plan[:, :1],  # in the frame of the ego
+        lambda plan: plan + torch.tensor([0.0, 0, torch.pi / 2, 0]),
+        lambda plan: plan + torch.tensor([2.5, 0, 0, 0]),  # of another time
+    ],
+)
+def test_a_plan_that_begins_elsewhere_ends_its_rollout(of):
+    with pytest.raises(Undrivable, match="begins more than 2 m or 1 rad from") as refused:
+        drive(Planned(of), make_scenes(2, vehicles=[(5.0, 0, 10.0)]))
+    assert set(refused.value.rows) == {0, 1}
+    drive(Planned(lambda plan: plan + torch.tensor([0.5, 0.5, 0.2, 0])), make_scenes(2))
+
+
+class Braking(Ego):
+    """A policy: it has no plan."""
+
+    def act(self, world, observation, plan):
+        return torch.tensor([-2.0, 0.0]).expand(len(plan), 2)
+
+
+def test_a_policy_overrides_act_alone():
+    """It is announced to hold its velocity, and does what it acts."""
+    steps = drive(Braking(), make_scenes(2, speed=10.0), 20)
+    assert torch.allclose(steps["next", "agents", "states"][:, -1, 0, 3], torch.full((2,), 6.0), atol=1e-4)
+    assert torch.allclose(steps["ego", "plan"][:, 0, :, 3], torch.full((2, PLAN_STEPS), 10.0))
+
+
 def test_replayed_log_is_tracked():
     env = make_env(make_scenes(1, num_vehicles=2), 1)
     env.rollout(80, EgoPolicy(ReplayEgo(), env))

@@ -25,11 +25,17 @@ def test_help_has_every_line_of_the_files_that_are_chosen(tmp_path):
 @pytest.mark.parametrize(
     ("script", "option", "told"),
     [
-        ("evaluate.py", "num_scene=3", "num_scene: there is no such option; the nearest is num_scenes"),
-        ("evaluate.py", "sim.maxacceleration=2", "the nearest is sim.max_acceleration"),
-        ("evaluate.py", "ego=lanegraph", "ego=lanegraph: there is no such option; the nearest is lane_graph"),
+        ("evaluate.py", "num_scene=3", "num_scene: there is no such option; did you mean num_scenes?"),
+        ("evaluate.py", "sim.maxacceleration=2", "did you mean sim.max_acceleration?"),
+        ("evaluate.py", "ego=lanegraph", "ego=lanegraph: there is no such option; did you mean ego=lane_graph?"),
+        ("evaluate.py", "ego=cruise", "ego/cruise.yaml, with --config-dir FOLDER"),
+        ("evaluate.py", "data=waymo", "did you mean data=scenarionet?"),
+        ("evaluate.py", "data.path=x.zip", "data.path with data=argoverse2, data=commonroad, data=py123d, data=scenar"),
+        ("evaluate.py", "egos={mine:{ego:idm}}", "egos: what it does not have yet is added by +: '+egos=...'"),
+        ("evaluate.py", "eta=50", "eta=50"),
         ("evaluate.py", "curriculum=linear", "curriculum: there is no such option"),
-        ("train.py", "+round=3", "round: there is no such option; the nearest is rounds"),  # would do nothing
+        ("train.py", "eta=2", "or measure.eta?"),
+        ("train.py", "+round=3", "round: there is no such option; did you mean rounds?"),  # would do nothing
         ("train.py", "experiment=table1", "methods: there is no such option"),  # of evaluate.py
     ],
 )
@@ -56,7 +62,7 @@ class Cruise(Ego):
 
 
 class Unfinished(Ego):
-    """It has no `plan`."""
+    """It has neither `plan` nor `act`."""
 
 
 def ego_of(target):
@@ -68,7 +74,7 @@ def ego_of(target):
     ("target", "message"),
     [
         ("no.such.Ego", "(?s)ego=no.such.Ego: cannot be built: .*conf/ego"),
-        (f"{HERE}.Unfinished", "Unfinished: cannot be built: .*"),
+        (f"{HERE}.Unfinished", "Unfinished: cannot be built: Unfinished overrides neither plan nor act"),
         ("builtins.dict", "ego=builtins.dict: is no e2rl.planners.ego.Ego; subclass it"),
     ],
 )
