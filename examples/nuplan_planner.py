@@ -176,21 +176,25 @@ class Scene:
         )
 
     def _sampled(self, trajectory, now, ego):
-        """A trajectory every 0.1 s; its rear axle is moved to the centre of the scene's ego, for planners may assume
-        another vehicle."""
-        end, ahead, found = trajectory.end_time.time_us, self.vehicle.rear_axle_to_center, []
-        for k in range(1, min(STEPS, round((end - now) / STEP_US)) + 1):
-            state = trajectory.get_state_at_time(TimePoint(min(now + k * STEP_US, end)))
-            x, y, heading = state.rear_axle.x, state.rear_axle.y, state.rear_axle.heading
-            speed = state.dynamic_car_state.rear_axle_velocity_2d.x
-            found.append((x + ahead * math.cos(heading), y + ahead * math.sin(heading), heading, speed))
-        if not found:
-            raise ValueError("the trajectory ends within 0.1 s")
-        states = np.array([ego[2:6], *found])
-        driven, told = np.hypot(*np.diff(states[:, :2], axis=0).T).sum(), STEP * np.abs(states[1:, 3]).sum()
+        """A trajectory every 0.1 s, linear between its states as nuPlan's InterpolatedTrajectory is. The rear axle is
+        moved to the centre of the scene's ego, for planners may assume another vehicle."""
+        planned = trajectory.get_sampled_trajectory()
+        times = np.array([state.time_point.time_us for state in planned])
+        if not times[0] - STEP_US <= now <= times[-1] - STEP_US:
+            raise ValueError(
+                f"the trajectory is of {(times[0] - now) / 1e6:g} to {(times[-1] - now) / 1e6:g} s from now"
+            )
+        axles = [(one.rear_axle, one.dynamic_car_state.rear_axle_velocity_2d.x) for one in planned]
+        x, y, heading, speed = np.array([(axle.x, axle.y, axle.heading, v) for axle, v in axles], float).T
+        at = now + STEP_US * np.arange(1, min(STEPS, round((times[-1] - now) / STEP_US)) + 1)
+        x, y, heading, speed = (np.interp(at, times, one) for one in (x, y, np.unwrap(heading), speed))
+        ahead = self.vehicle.rear_axle_to_center
+        states = np.stack([x + ahead * np.cos(heading), y + ahead * np.sin(heading), wrap(heading), speed], 1)
+        driven = np.hypot(*np.diff(states[:, :2], axis=0, prepend=[ego[2:4]]).T).sum()
+        told = STEP * np.abs(speed).sum()
         if abs(driven - told) > 2.0 + 0.25 * driven:  # e2rl follows poses and speeds
             raise ValueError(f"the trajectory's poses move {driven:.1f} m, its rear-axle velocities {told:.1f} m")
-        return found
+        return states
 
 
 def lines_of(points):
@@ -265,8 +269,8 @@ class Connection(socketserver.StreamRequestHandler):
                         if isinstance(scenes[scene], bytes):
                             scenes[scene] = Scene(scenes[scene], self.server.make)
                         states = scenes[scene].plan(*moment)
-                        numbers = [number for state in states for number in state]
-                        self.reply(TRAJECTORY, struct.pack(f"<2I{len(numbers)}f", scene, len(states), *numbers))
+                        plan = struct.pack("<2I", scene, len(states)) + states.astype("<f4").tobytes()
+                        self.reply(TRAJECTORY, plan)
                     except Exception as error:  # ends this scene's rollout only
                         traceback.print_exc()
                         last = traceback.extract_tb(error.__traceback__)[-1]

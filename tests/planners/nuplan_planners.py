@@ -89,7 +89,7 @@ class Witness(Straight):
             "egos": [state_of(one) for one in history.ego_states],
             "rear": [*pose_of(ego.rear_axle), ego.dynamic_car_state.rear_axle_velocity_2d.y],
             "yaw_rate": ego.dynamic_car_state.angular_velocity,
-            "size": [ego.vehicle.length, ego.vehicle.width],
+            "size": [ego.car_footprint.vehicle_parameters.length, ego.car_footprint.vehicle_parameters.width],
             "agents": {one.track_token: agent_of(one) for one in observation.tracked_objects.tracked_objects},
             "before": [
                 sorted(a.track_token for a in one.tracked_objects.tracked_objects) for one in history.observations
@@ -104,7 +104,7 @@ class Witness(Straight):
             seen["on"] = [lane.id for layer in LANES for lane in api.get_all_map_objects(ego.center, layer)]
             seen["near"] = [lane.id for lanes in around.values() for lane in lanes]
             seen["route"] = [[lane_of(lane) for lane in block.interior_edges] for block in blocks]
-            seen["linked"] = [after in block.outgoing_edges for block, after in zip(blocks, blocks[1:], strict=False)]
+            seen["linked"] = [after in block.outgoing_edges for block, after in zip(blocks, blocks[1:])]
             seen["drivable"] = api.is_in_layer(ego.center, layers.DRIVABLE_AREA)
             seen["goal"] = pose_of(self.initialization.mission_goal)
             seen["lights"] = [
@@ -117,7 +117,8 @@ class Witness(Straight):
 
     def turning(self, ego, rate=0.1):
         """An arc of the centre; the rear axle is where this vehicle's lies."""
-        speed, found = ego.dynamic_car_state.center_velocity_2d.x, []
+        vehicle, found = ego.car_footprint.vehicle_parameters, []
+        speed = ego.dynamic_car_state.center_velocity_2d.x
         for step in range(51):
             turn = rate * step / 10
             chord = speed * step / 10 * (math.sin(turn / 2) / (turn / 2) if turn else 1.0)
@@ -127,7 +128,7 @@ class Witness(Straight):
             time = TimePoint(ego.time_point.time_us + step * SECOND // 10)
             velocity, zero = StateVector2D(speed, 0.0), StateVector2D(0.0, 0.0)
             pose = StateSE2(x, y, heading)
-            found.append(EgoState.build_from_center(pose, velocity, zero, 0.0, time, ego.vehicle, angular_vel=rate))
+            found.append(EgoState.build_from_center(pose, velocity, zero, 0.0, time, vehicle, angular_vel=rate))
         return InterpolatedTrajectory(found)
 
 

@@ -8,7 +8,6 @@ from collections import deque
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 
-import numpy as np
 from shapely.geometry import Point
 
 MODULES = """
@@ -73,6 +72,11 @@ class OrientedBox:
 
 
 @dataclass
+class CarFootprint:
+    vehicle_parameters: VehicleParameters
+
+
+@dataclass
 class DynamicCarState:
     rear_axle_velocity_2d: StateVector2D
     center_velocity_2d: StateVector2D
@@ -86,7 +90,7 @@ class EgoState:
     rear_axle: StateSE2
     dynamic_car_state: DynamicCarState
     time_point: TimePoint
-    vehicle: VehicleParameters
+    car_footprint: CarFootprint
 
     @classmethod
     def build_from_center(
@@ -104,7 +108,7 @@ class EgoState:
         back = vehicle_parameters.rear_axle_to_center
         rear = StateVector2D(center_velocity_2d.x, center_velocity_2d.y - back * angular_vel)
         dynamic = DynamicCarState(rear, center_velocity_2d, center_acceleration_2d, angular_vel)
-        return cls(center, moved(center, -back), dynamic, time_point, vehicle_parameters)
+        return cls(center, moved(center, -back), dynamic, time_point, CarFootprint(vehicle_parameters))
 
     @classmethod
     def build_from_rear_axle(
@@ -121,7 +125,7 @@ class EgoState:
         ahead, rear = vehicle_parameters.rear_axle_to_center, rear_axle_velocity_2d
         velocity = StateVector2D(rear.x, rear.y + ahead * angular_vel)
         dynamic = DynamicCarState(rear, velocity, rear_axle_acceleration_2d, angular_vel)
-        return cls(moved(rear_axle_pose, ahead), rear_axle_pose, dynamic, time_point, vehicle_parameters)
+        return cls(moved(rear_axle_pose, ahead), rear_axle_pose, dynamic, time_point, CarFootprint(vehicle_parameters))
 
 
 def moved(pose, ahead):
@@ -264,24 +268,11 @@ AbstractPlanner = interface("AbstractPlanner", "name initialize observation_type
 
 
 class InterpolatedTrajectory:
-    """Between states, linearly."""
-
     def __init__(self, trajectory):
         self._states = trajectory
-        self.start_time, self.end_time = trajectory[0].time_point, trajectory[-1].time_point
-        rows = [(one.rear_axle.x, one.rear_axle.y, one.rear_axle.heading, speed_of(one)) for one in trajectory]
-        self._rows, self._times = np.array(rows), [one.time_point.time_us for one in trajectory]
 
-    def get_state_at_time(self, time_point):
-        assert self.start_time <= time_point <= self.end_time
-        x, y, heading, speed = (float(np.interp(time_point.time_us, self._times, column)) for column in self._rows.T)
-        vehicle, zero = self._states[0].vehicle, StateVector2D(0.0, 0.0)
-        velocity = StateVector2D(speed, 0.0)
-        return EgoState.build_from_rear_axle(StateSE2(x, y, heading), velocity, zero, 0.0, time_point, vehicle)
-
-
-def speed_of(state):
-    return state.dynamic_car_state.rear_axle_velocity_2d.x
+    def get_sampled_trajectory(self):
+        return self._states
 
 
 for module in MODULES.split():
