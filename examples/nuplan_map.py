@@ -20,6 +20,7 @@ ASIDE, JUMP = 3.0, 1000.0  # cost, in m of distance, of a lane change and of goi
 LIT = 0.5  # m from where a lane begins to the point of its light
 LANES = (SemanticMapLayer.LANE, SemanticMapLayer.LANE_CONNECTOR)
 BLOCKS = (SemanticMapLayer.ROADBLOCK, SemanticMapLayer.ROADBLOCK_CONNECTOR)
+AREAS = {SemanticMapLayer.DRIVABLE_AREA: LANES, SemanticMapLayer.INTERSECTION: LANES[1:]}  # made of what
 EMPTY = (
     SemanticMapLayer.STOP_LINE,
     SemanticMapLayer.CROSSWALK,
@@ -164,14 +165,16 @@ class SceneRoadblock(RoadBlockGraphEdgeMapObject):
     def polygon(self):
         """The lanes, and the gaps of up to 2 m between them."""
         lanes = unary_union([lane.polygon for lane in self.lanes])
-        return lanes.buffer(1.0, join_style=2).buffer(-1.0, join_style=2)  # mitred
+        joined = lanes.buffer(1.0, join_style=2).buffer(-1.0, join_style=2)  # mitred
+        return joined if joined.geom_type == "Polygon" else joined.convex_hull
 
     def _blocks(self, edges):
         return list({edge.block.id: edge.block for lane in self.lanes for edge in getattr(lane, edges)}.values())
 
 
 class SceneMap(AbstractMap):
-    """The lanes and roadblocks of a scene. The drivable area is that of the lanes; the layers of EMPTY hold nothing."""
+    """The lanes and roadblocks of a scene. Inside of the drivable area is who is inside of a lane, inside of an
+    intersection who is inside of a connector; the layers of EMPTY hold no objects."""
 
     def __init__(self, name, lines, about, lights):
         """lines: centrelines [P, 2], P >= 2, by lane; about [L, 9]: width, left, right and 6 exits of each, -1 none;
@@ -233,8 +236,7 @@ class SceneMap(AbstractMap):
         return found[0] if found else None
 
     def is_in_layer(self, point, layer):
-        layers = LANES if layer == SemanticMapLayer.DRIVABLE_AREA else (layer,)
-        return any(self.get_all_map_objects(point, one) for one in layers)
+        return any(self.get_all_map_objects(point, one) for one in AREAS.get(layer, (layer,)))
 
     def get_proximal_map_objects(self, point, radius, layers):
         """Objects that touch the square of half the side `radius` around a point, as in nuPlan."""
