@@ -58,6 +58,8 @@ def test_a_planner_that_keeps_its_velocity_moves_as_at_constant_velocity(nuplan,
 @pytest.mark.parametrize("replan_every", [1, 5])
 def test_it_sees_the_ego_and_everybody_else_where_they_are(nuplan, tmp_path, replan_every):
     scenes = make_scenes(1, num_vrus=1)
+    scenes.scenes["start"][:, 1, 2] = 1.0  # one looks along no axis
+    scenes.scenes["logged"][:, :, 1, 2] = 1.0
     rollouts = e2rl.roll_out(scenes, nuplan("--planner nuplan_planners:Witness", replan_every), LogReplay())
     seen = written(tmp_path)
     states = rollouts.states[0]
