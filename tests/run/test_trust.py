@@ -44,7 +44,7 @@ def test_a_run_of_ones_own_goes_on(tmp_path, config):
 
 @pytest.mark.parametrize("group", ["learner", "ego", "curriculum", "synthesizer"])
 def test_every_file_of_ones_own_goes_on(tmp_path, group):
-    for name in set(choices(group)) - {"external", "policy_file"}:
+    for name in set(choices(group)) - {"external", "nuplan", "policy_file"}:
         own = changed(TRAIN, with_choice(group, name))
         assert reading(tmp_path, own, TRAIN) == own, name
 

@@ -1,0 +1,186 @@
+"""A planner of nuPlan's interface sees the scene as it is and drives where it plans to, by the adapter in examples/.
+
+The devkit is on no package index: a stand-in has what the adapter and the planners of these tests import."""
+
+import json
+import math
+import os
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import e2rl
+from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.evaluation.rollout_files import ERRORED_FILE
+from e2rl.planners.external import ExternalEgo
+from e2rl.scenes.recording import DT
+from e2rl.sim import dynamics
+from e2rl.sim.env import SimSettings
+from e2rl.sim.mission import mission_of
+from e2rl.sim.world import World
+from e2rl.traffic.rule_based import LogReplay
+from tests.planners.test_external import BAD, scene_set
+from tests.synthetic import LANE_WIDTH, make_scenes
+
+HERE = Path(__file__).parent
+ADAPTER = HERE.parents[1] / "examples" / "nuplan_planner.py"
+REAR = 0.2823 * 4.5  # m from the rear axle to the centre of the scenes' egos, in proportion to nuPlan's vehicle
+LIGHTS = ("UNKNOWN", "RED", "YELLOW", "GREEN")  # by state
+
+
+@pytest.fixture
+def nuplan(monkeypatch, tmp_path):
+    """Returns the ego of a planner of nuplan_planners.py, with arguments."""
+    path = os.pathsep.join([str(HERE / "nuplan_stand_in"), str(HERE)])
+    monkeypatch.setenv("PYTHONPATH", path)
+    monkeypatch.setenv("E2RL_WITNESS", str(tmp_path / "seen"))
+
+    def ego(planner, replan_every=1):
+        return ExternalEgo(f"{sys.executable} {ADAPTER} {planner}", replan_every=replan_every, timeout=20.0)
+
+    return ego
+
+
+@pytest.mark.parametrize("replan_every", [1, 5])
+def test_a_planner_that_keeps_its_velocity_moves_as_at_constant_velocity(nuplan, replan_every):
+    """Whatever vehicle it plans for: the rear axle of its plan is that of the scene's ego."""
+    scenes = make_scenes(2)
+    heading = torch.tensor([0.0, 0.4])
+    scenes.scenes["start"][:, 0, 2] = scenes.scenes["logged"][:, 0, 0, 2] = heading
+    start = scenes.scenes["start"][:, 0].clone()
+    states = e2rl.roll_out(scenes, nuplan("--planner nuplan_planners:Straight", replan_every), LogReplay()).states
+    expected = dynamics.constant_velocity(start, torch.tensor([4.0]))[:, 0]
+    assert torch.allclose(states[:, 40, 0], expected, atol=2e-3)
+
+
+@pytest.mark.parametrize("replan_every", [1, 5])
+def test_it_sees_the_ego_and_everybody_else_where_they_are(nuplan, tmp_path, replan_every):
+    scenes = make_scenes(1, num_vrus=1)
+    scenes.scenes["start"][:, 1, 2] = 1.0  # one looks along no axis
+    scenes.scenes["logged"][:, :, 1, 2] = 1.0
+    rollouts = e2rl.roll_out(scenes, nuplan("--planner nuplan_planners:Witness", replan_every), LogReplay())
+    seen = written(tmp_path)
+    states = rollouts.states[0]
+    assert [one["index"] for one in seen] == list(range(0, 80, replan_every))
+    for one in seen[:: 20 // replan_every]:
+        step = one["index"]
+        x, y, heading, speed = states[step, 0].tolist()
+        assert one["egos"][-1] == pytest.approx([x, y, heading, speed], abs=1e-4)
+        back = x - REAR * math.cos(heading), y - REAR * math.sin(heading), heading, -REAR * one["yaw_rate"]
+        assert one["rear"] == pytest.approx(back, abs=2e-3) and one["size"] == [4.5, 2.0]
+        present = (rollouts.valid[0, step].nonzero()[:, 0].tolist())[1:]
+        assert set(one["agents"]) == {f"agent-{k}" for k in present}
+        for k in present:
+            x, y, heading, speed = states[step, k].tolist()
+            size = scenes.scenes["size"][0, k].tolist()
+            velocity = [speed * math.cos(heading), speed * math.sin(heading)]
+            assert one["agents"][f"agent-{k}"][:7] == pytest.approx([x, y, heading, *velocity, *size], abs=1e-4)
+            assert one["agents"][f"agent-{k}"][7] == ("PEDESTRIAN" if k >= 32 else "VEHICLE")
+    assert seen[-1]["yaw_rate"] == pytest.approx(0.1, abs=0.01)
+
+
+@pytest.mark.parametrize("replan_every", [1, 5])
+def test_its_history_is_what_was_driven_and_before_that_steady(nuplan, tmp_path, replan_every):
+    scenes = make_scenes(1)
+    scenes.scenes["start_yaw_rate"][0, 0], scenes.scenes["start_accel"][0, 0] = 0.2, -1.0
+    states = e2rl.roll_out(scenes, nuplan("--planner nuplan_planners:Witness", replan_every), LogReplay()).states[
+        0, :, 0
+    ]
+    first, *_, last = written(tmp_path)
+    for one in (first, last):
+        assert len(one["egos"]) == len(one["before"]) == 21 and one["interval"] == DT
+        assert {later - earlier for earlier, later in zip(one["times"], one["times"][1:], strict=False)} == {100_000}
+    came = states[last["index"] - 20 : last["index"] + 1]
+    tolerance = 1e-4 if replan_every == 1 else 0.03  # between two plans it is interpolated
+    assert torch.allclose(torch.tensor(last["egos"]), came, atol=tolerance)
+    past = torch.tensor(first["egos"])
+    assert torch.allclose(past[-1], states[0], atol=1e-5)
+    steady = torch.tensor([0.0, 0.2]).expand(20, 2)  # from where it was 2 s ago, it arrives
+    assert torch.allclose(dynamics.rollout(past[:1], steady[None])[0], past[1:], atol=2e-2)
+
+
+def written(folder):
+    """What a Witness saw, a dict a plan."""
+    return [json.loads(line) for line in (folder / "seen").read_text().splitlines()]
+
+
+def bundled_seen(nuplan, tmp_path):
+    """The bundled scenes, and what a Witness sees at their start."""
+    scenes = e2rl.load_scenes().scenes
+    nuplan("--planner nuplan_planners:Witness").plan(World.at_start(scenes))
+    return scenes, written(tmp_path)
+
+
+def test_lanes_of_the_map_hold_the_ego_and_lead_along_its_route(nuplan, tmp_path):
+    scenes, seen = bundled_seen(nuplan, tmp_path)
+    mission = mission_of(scenes)
+    assert len(seen) == len(scenes) == 48
+    for row, one in enumerate(seen):
+        assert one["on"] and set(one["on"]) <= set(one["near"]) and one["drivable"]
+        route = [lane["id"] for block in one["route"] for lane in block]
+        assert set(route) & set(one["near"]) and all(one["linked"]), row
+        assert (torch.tensor(one["goal"][:2]) - mission.points[row]).norm(dim=-1).min() < 1e-3
+    limits = {lane["limit"] for one in seen for block in one["route"] for lane in block}
+    given = mission.limit[mission.limit > 0].unique().tolist()
+    assert limits - {None} and all(min(abs(limit - k) for k in given) < 1e-4 for limit in limits - {None})
+
+
+def test_lights_of_the_route_are_those_of_the_lanes_that_begin_there(nuplan, tmp_path):
+    scenes, seen = bundled_seen(nuplan, tmp_path)
+    mission, checked = mission_of(scenes), 0
+    for row, column in (mission.light >= 0).nonzero().tolist():
+        light = int(mission.light[row, column])
+        begin, state = scenes["light_points"][row, light].tolist(), int(scenes["light_state"][row, 0, light])
+        status = {name: what for what, name in seen[row]["lights"]}
+        lanes = [lane for block in seen[row]["route"] for lane in block if math.dist(lane["begin"][:2], begin) < 0.5]
+        assert not lanes or LIGHTS[state] in [status.get(lane["id"]) for lane in lanes]
+        checked += bool(lanes)
+    assert checked >= 9
+
+
+def test_lanes_side_by_side_are_a_roadblock(nuplan, tmp_path):
+    scenes = make_scenes(1, limit=12.0)
+    nuplan("--planner nuplan_planners:Witness").plan(World.at_start(scenes.scenes))
+    (one,) = written(tmp_path)
+    (left, right), half = one["route"][0], LANE_WIDTH / 2
+    assert (left["id"], left["index"], left["right"], left["left"]) == ("1", 1, "0", None)
+    assert (right["id"], right["index"], right["left"], right["right"]) == ("0", 2, "1", None)
+    for lane in (left, right):
+        assert lane["limit"] == 12.0 and lane["width"] == pytest.approx(LANE_WIDTH, rel=0.01)
+        assert lane["borders"] == pytest.approx([half, -half], abs=1e-3) and lane["turns"] == pytest.approx(
+            0.0, abs=1e-6
+        )
+
+
+WRONG = {
+    "raises": ("PlannerFailed", "RuntimeError: no way out (nuplan_planners.py, line"),
+    "velocities": ("PlannerFailed", "the trajectory's poses move 50.0 m, its rear-axle velocities 0.0 m"),
+    "short": ("BadReply", "fewer than the 5 steps until the next plan"),
+}
+
+
+@pytest.mark.parametrize("how", WRONG)
+def test_what_goes_wrong_in_a_scene_costs_that_scene_and_is_told(nuplan, tmp_path, how):
+    ego = nuplan(f"--planner nuplan_planners:Wrong how={how} bad=3.5", replan_every=5)
+    setup = Setup(scene_set(), ego, "nuplan", SimSettings(), 4)
+    (row,) = run_protocol(setup, [Method("replay", LogReplay())], [0], tmp_path)
+    (entry,) = json.loads((tmp_path / ERRORED_FILE).read_text())
+    reason, detail = WRONG[how]
+    assert row["errored"] == {f"raised {reason}": 1} and row["n_rollouts"] == 3
+    assert entry["scene_id"] == scene_set().scene_id[BAD] and detail in entry["detail"]
+
+
+def test_a_planner_of_cameras_is_refused(nuplan):
+    with pytest.raises(Exception, match="Camera observes Sensors; e2rl has DetectionsTracks only"):
+        nuplan("--planner nuplan_planners:Camera").plan(World.at_start(make_scenes(1).scenes))
+
+
+def test_a_configuration_of_the_devkit_names_the_planner(nuplan, tmp_path):
+    (tmp_path / "planner.yaml").write_text("mine:\n  _target_: nuplan_planners.Straight\n  seconds: 2.0\n")
+    ego = nuplan(f"--config {tmp_path / 'planner.yaml'}")
+    world = World.at_start(make_scenes(1).scenes)
+    plan = ego.plan(world)
+    expected = dynamics.constant_velocity(world.states[:, 0], torch.tensor([5.0]))[:, 0]
+    assert torch.allclose(plan[:, -1], expected, atol=1e-3)
