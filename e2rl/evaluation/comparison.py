@@ -19,6 +19,7 @@ from e2rl.run.errors import InputError
 from e2rl.run.run import read_provenance
 from e2rl.search.tries import TRIES
 
+PAIR = ("method", "eta", "scene_id", "seed")
 CHANGES = ("new", "gone", "moved", "same")
 SHARED = ("sim", "prior", "synthesizer", "search", "variants", "methods", "tries", "budget", "budget_unit", "eta")
 SHARED += ("seeds", "scene")  # settings without which rollouts are no pairs
@@ -73,9 +74,9 @@ class Driven(NamedTuple):
 def check_pairs(first: Driven, second: Driven) -> None:
     """Raises InputError, saying what differs, where rollouts of two runs are no pairs."""
     known = [read_provenance(each.run) for each in (first, second)]
-    names = {"settings": SHARED, "inputs": OF_FILES}
-    parts = [{key: each[kind][key] for kind in names for key in each[kind] if key.partition("=")[0].partition(".")[0] in names[kind]} for each in known]
-    found = list(unlike(*parts))
+    shared = [{name: each["settings"].get(name) for name in SHARED} for each in known]
+    files = [{name: value for name, value in each["inputs"].items() if name.startswith(OF_FILES)} for each in known]
+    found = [*unlike(*shared), *unlike(*files)]
     if known[0]["inputs"].get("scenes") != known[1]["inputs"].get("scenes"):
         ours, theirs = ({row["scene_id"] for row in each.rows} for each in (first, second))
         found.insert(0, f"scenes ({len(ours)} and {len(theirs)}, {len(ours & theirs)} of one id; contents differ)")
@@ -109,7 +110,7 @@ def pairs_of(first: Driven, second: Driven) -> list[dict[str, Any]]:
         if any(failed):
             what = (ways_moved(tries, theirs[key]) if searched else moved(*rows)) if all(failed) else []
             change = ("moved" if what else "same") if all(failed) else "gone" if failed[0] else "new"
-            about = dict(zip(("method", "eta", "scene_id", "seed"), key, strict=True))
+            about = dict(zip(PAIR, key, strict=True))
             found.append({"change": change, "what": what, **about, "a": rows[0], "b": rows[1]})
     return found
 

@@ -57,9 +57,9 @@ class Track(NamedTuple):
     present: np.ndarray
 
 
-def failure_replay(failure: Failure, other: Failure | None = None) -> dict[str, Any]:
+def failure_replay(failure: Failure, beside: Failure | None = None) -> dict[str, Any]:
     """The replay of a failure, from the start to AFTER steps beyond the contact, for the data block of the page. Of a
-    rollout without a contact, that of as many steps beside the failure `other` of the scene, with its partner.
+    rollout without a contact: as many steps as of the failure `beside` it in the same scene, with that one's partner.
 
     `tracks` has the role, length and width [m] of each track, `partner` and `contact` are a track and a step, `point`
     [m] is where they touch; without a contact the last step and None. `motion` encodes the second differences over time
@@ -67,8 +67,8 @@ def failure_replay(failure: Failure, other: Failure | None = None) -> dict[str, 
     partner. `plans` may be None.
     """
     rollout, contact, like = failure.rollout, failure.contact, failure
-    if contact is None and other is not None:
-        like = other
+    if contact is None and beside is not None:
+        like = beside
     assert like.contact is not None
     partner, steps = like.partner, min(like.contact + AFTER + 1, len(rollout.states))
     rows = np.union1d(np.flatnonzero(rollout.valid[:steps].any(0)), partner)
