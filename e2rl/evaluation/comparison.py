@@ -72,9 +72,11 @@ class Driven(NamedTuple):
 
 def compared(first: Driven, second: Driven) -> tuple[list[dict], list[dict]]:
     """What has changed in each traffic, and the pairs of rollouts of which one has failed (`pair_of`), in the order of
-    CHANGES. A traffic has the number `of` rollouts, or of searches of a scene, that both have, the numbers of CHANGES, those of
-    `preventable` ones, and paired `differences` of RATES, second minus first. Raises InputError, saying what differs,
-    where the two are no pairs."""
+    CHANGES. Raises InputError, saying what differs, where the two are no pairs.
+
+    A traffic has the number `of` units that both have, the numbers of CHANGES and of `preventable` ones among them, and
+    paired `differences` of RATES, second minus first.
+    """
     check_shared(first, second)
     ours, theirs, others, groups = first.rollouts(), second.rollouts(), second.units(), []
     pairs = [pair_of(key, ours[key], theirs[key], first.searched) for key in ours if key in theirs]
