@@ -71,7 +71,7 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
         places = cluster_index(*([row[name] for row in rows] for name in ("location", "scene_id")))[1]
         factor = growth(ends, limit, places, metric.fraction and not change)
         more = factor and max(1, math.ceil(count * (factor - 1)))
-        advice = f"about {more} more" if more else "no number decides, the estimate is at the limit"
+        advice = f"about {more} more, at further places" if more else "no number decides, the estimate is at the limit"
         advice += f" ({places} places, an interval needs {LEAST})" if places < LEAST else ""
         reason = f"{advice}; {reason}"
     about = {"rule": text, "outcome": outcome, "reason": f"{outcome}: {reason}", "more": more, "unit": driven.unit}

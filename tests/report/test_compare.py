@@ -20,11 +20,12 @@ STEP = "return comparison.player.time"
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """Two runs of the same scenes in which some of the same and some other failures occur."""
+    """Two runs of the same scenes: one failure is gone, one new, two are the same."""
     folder = tmp_path_factory.mktemp("runs")
     first, second = planned(random_rollouts(12, seed=20)), planned(random_rollouts(12, seed=20))
-    other = random_rollouts(12, seed=23).states.nan_to_num()[6:]
-    second.states[6:] = other.where(second.valid[6:][..., None], second.states[6:])
+    other = random_rollouts(12, seed=21).states.nan_to_num()
+    for rollouts, index in ((first, 10), (second, 6)):  # a failure that the other run keeps
+        rollouts.states[index] = other[index].where(rollouts.valid[index][..., None], rollouts.states[index])
     found = []
     for name, rollouts in (("one", first), ("two", second)):
         rollouts.seed[:] = 0
@@ -58,7 +59,7 @@ def test_page_json_and_csv_tell_the_same_pairs(made):
     keys = [(pair["change"], pair["scene_id"], str(pair["seed"])) for pair in whole["pairs"]]
     assert keys == [(row["change"], row["scene_id"], row["seed"]) for row in rows] and len(set(keys)) == len(keys)
     assert [sum(key[0] == change for key in keys) for change in CHANGES] == [group[change] for change in CHANGES]
-    assert group["new"] and group["gone"] and group["same"]
+    assert (group["new"], group["gone"], group["moved"], group["same"]) == (1, 1, 0, 2)
     changed = [pair for pair in whole["pairs"] if pair["change"] != "same"]
     assert page["pairs"] == changed and len(page["replays"]) == 2 * len(changed)
     text = " ".join(said)
