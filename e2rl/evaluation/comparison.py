@@ -21,13 +21,15 @@ from e2rl.search.tries import TRIES
 
 PAIR = ("method", "eta", "scene_id", "seed")
 CHANGES = ("new", "gone", "moved", "same")
-SHARED = {  # settings and inputs without which rollouts are no pairs
+SHARED = (  # settings and inputs without which rollouts are no pairs
     *("scenes", "scene", "seeds", "eta", "methods", "variants", "tries", "budget", "budget_unit"),
     *("prior", "sim", "synthesizer", "search"),
-}
+)
 LATER = 0.5  # s from which on a contact has moved: a replan
-RATES = {name: f"cfr_{name}" for name in ("counted", "preventable", "clean")}
-RATES = {"contacts": "cfr", **RATES, "progress": "progress"}  # what is compared, and the columns of the tables
+RATES = {  # what is compared, and the columns of the tables
+    **{"contacts": "cfr", "counted": "cfr_counted", "preventable": "cfr_preventable", "clean": "cfr_clean"},
+    "progress": "progress",
+}
 
 
 class Driven(NamedTuple):
@@ -44,7 +46,7 @@ class Driven(NamedTuple):
         rows = read_rows(run / TABLE)
         egos = list(dict.fromkeys(row["ego_policy"] for row in rows))
         if ego not in egos and (ego or len(egos) != 1):
-            raise InputError(f"{run}: has the egos {', '.join(egos) or 'none'}; name one of them")
+            raise InputError(f"{run}: has the egos {', '.join(egos) or 'none'}; name one by --ego, or two by --egos")
         ego = ego or egos[0]
         return cls(run, ego, [row for row in rows if row["ego_policy"] == ego], (run / TRIES_FILE).is_file())
 
@@ -65,7 +67,8 @@ class Driven(NamedTuple):
         """The rows that rates are of, by method and intensity: rollouts, or of a search its scenes, 1 where any try has
         what is counted."""
         found: dict[tuple[str, float], list[dict]] = {}
-        for row in scene_rows(self.rows, list(RATES.values())[:-1]) if self.searched else self.rows:
+        events = [column for column in RATES.values() if column != "progress"]
+        for row in scene_rows(self.rows, events) if self.searched else self.rows:
             found.setdefault((row["method"], row["eta"]), []).append(row)
         return found
 
@@ -108,13 +111,14 @@ def check_shared(first: Driven, second: Driven) -> None:
     known = [read_provenance(one.run) for one in (first, second)]
     each = [{**one["settings"], **one["inputs"]} for one in known]
     names = [name for name in changed(*each) if re.split("[.=]", name)[0] in SHARED and not name.startswith("scenes=")]
-    told = {name: f"{name} ({' and '.join(str(one.get(name))[:40] for one in each)})" for name in names}
-    if "scenes" in told:
+    names.sort(key=lambda name: SHARED.index(re.split("[.=]", name)[0]))
+    told = [f"{name} ({' and '.join(str(one.get(name))[:20] for one in each)})" for name in names]
+    if names[:1] == ["scenes"]:
         ours, theirs = ({row["scene_id"] for row in one.rows} for one in (first, second))
-        told["scenes"] = f"scenes ({len(ours)} and {len(theirs)}, {len(ours & theirs)} of one id)"
+        told[0] = f"scenes ({len(ours)} and {len(theirs)}, {len(ours & theirs)} of one id)"
     if told:
         mend = "run both with the same scenes, seeds, traffic and prior"
-        raise InputError(f"{second.run}: no pairs with {first.run}, which has other {', '.join(told.values())}; {mend}")
+        raise InputError(f"{second.run}: no pairs with {first.run}, which has other {', '.join(told)}; {mend}")
 
 
 def pair_of(key: Sequence, tries: Sequence[Row], others: Sequence[Row], searched: bool) -> dict[str, Any] | None:

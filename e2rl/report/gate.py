@@ -1,11 +1,8 @@
 """`e2rl gate RUN RULE ...`: whether rates of a run, or their changes against a former run, are within limits.
 
 The 95% interval decides, not the estimate: a rule holds where the whole interval does, fails where none of it does.
-Else rollouts are too few; about n (m/k - 1) more than the n there are decide, if the estimate stays. Of a fraction, k
-and m are the places of which the exact interval (Clopper and Pearson) ends where the one found does, and at the limit:
-where nothing has happened m = ln(0.025) / ln(1 - limit). Of progress and of changes m/k is the square of half-width
-over distance to the limit. The status is 0 where all rules hold, 1 where one fails, 3 where none fails and rollouts are
-too few, 2 for bad input (docs/how-to/compare.md).
+The status is 0 where all hold, 1 where one fails, 3 where none fails and rollouts are too few, 2 for bad input
+(docs/how-to/compare.md).
 """
 
 import argparse
@@ -91,8 +88,12 @@ def traffic_of(rule: re.Match, driven: Driven) -> list[dict]:
 
 
 def growth(found: tuple[float, float, float], limit: float, places: int, fraction: bool) -> float | None:
-    """By which factor places, and so rollouts, must grow until the interval (value, low, high) ends at the limit (see
-    above), without an interval to LEAST places; None: none decides."""
+    """By which factor places, and so rollouts, must grow until the interval (value, low, high) ends at the limit if the
+    value stays; without an interval, to LEAST places; None: none decides.
+
+    Of a fraction it is m/k, the places of which the exact interval (Clopper and Pearson) ends at the limit, and where
+    the one found does; else the square of half-width over distance to the limit.
+    """
     value, low, high = found
     upper, end = value < limit, high if value < limit else low
     if math.isnan(end) or value == limit:

@@ -74,7 +74,7 @@ def test_two_egos_of_one_run_and_none_by_chance(tmp_path):
     run = run_of(tmp_path, rows)
     (group,), _ = compared(Driven.read(run, "a"), Driven.read(run, "b"))
     assert (group["new"], group["gone"]) == (1, 1)
-    with pytest.raises(InputError, match="has the egos a, b; name one"):
+    with pytest.raises(InputError, match="has the egos a, b; name one by"):
         Driven.read(run)
 
 

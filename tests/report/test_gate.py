@@ -55,7 +55,10 @@ def test_the_rollouts_that_it_asks_for_decide(tmp_path, capsys):
     run, file = run_with(tmp_path / "few", 30, 0), tmp_path / "gate.json"
     status, said = gate(capsys, run, "preventable<=0.05", "--json", file)
     (result,) = json.loads(file.read_text())
-    assert status == 3 and f"not enough rollouts: about {result['more']} more, at further places; preventable<=0.05: found 0.0" in said
+    assert (
+        status == 3
+        and f"not enough rollouts: about {result['more']} more, at further places; preventable<=0.05: found 0.0" in said
+    )
     enough = run_with(tmp_path / "enough", 30 + result["more"], 0)
     assert gate(capsys, enough, "preventable<=0.05")[0] == 0
     assert gate(capsys, run_with(tmp_path / "short", 29 + result["more"], 0), "preventable<=0.05")[0] == 3

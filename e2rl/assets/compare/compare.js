@@ -1,6 +1,7 @@
 // Two egos side by side: the failures that are new, gone or moved, and both replays with one clock.
 
 const SIDES = ["first", "second"];
+const VIEW = ["name", "scene", "clock", "badge", "scale", "curves", "verdict"]; // of each side
 
 /** A player whose clock moves two replays, each with a canvas and a camera of its own. */
 class Duo extends Player {
@@ -57,17 +58,9 @@ function joined(replays) {
   return { ...longer, contact, tracks: replays.flatMap(({ tracks }) => tracks) };
 }
 
-/** Canvas, clock, badge and scale, and below them curves and verdict; those of the first have the player's ids. */
-function buildView(name, index) {
-  const tags = { scene: "canvas", clock: "output", badge: "p", scale: "div", curves: "div", verdict: "dl" };
-  const view = {};
-  for (const [id, tag] of Object.entries(tags)) view[id] = element(tag, index ? { class: id } : { class: id, id });
-  const { scene, clock, badge, scale, curves, verdict } = view;
-  const stage = element("div", { class: "stage" }, scene, clock, badge, scale);
-  document.getElementById("views").append(element("div", {}, element("h3", {}, name), stage));
-  document.getElementById("details").append(element("div", {}, curves, verdict));
-  return view;
-}
+/** The nodes of one side; those of the first have the ids of the player's. */
+const viewOf = (suffix) =>
+  Object.fromEntries(VIEW.map((id) => [id, document.getElementById(`${id}${suffix}`)]));
 
 /** The later one's failure, where it has one. */
 const failed = ({ change, first, second }) => (change === "gone" ? first : second);
@@ -82,7 +75,8 @@ class Comparison {
     document.getElementById("told").append(...data.told.map((text) => element("li", {}, text)));
     document.getElementById("origin").textContent = data.names.map((name, k) => `${name}: ${data.runs[k]}`).join("; ");
     document.getElementById("player").hidden = !data.pairs.length;
-    this.player = new Duo(new Store(data), (direction) => this.step(direction), data.names.map(buildView));
+    this.player = new Duo(new Store(data), (direction) => this.step(direction), ["", "-second"].map(viewOf));
+    this.player.views.forEach(({ name }, k) => (name.textContent = data.names[k]));
     onPaletteChange(() => this.player.repaint());
     const kinds = ["new", "gone", "moved"].map((change) => [change, change]);
     const show = (change) => this.show(data.pairs.filter((pair) => [pair.change, "", String(pair.preventable)].includes(change)));
