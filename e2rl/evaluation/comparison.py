@@ -87,9 +87,8 @@ def compared(first: Driven, second: Driven) -> tuple[list[dict], list[dict]]:
     found.sort(key=lambda pair: (CHANGES.index(pair["change"]), -pair["preventable"]))
     for (method, eta), rows in first.units().items():
         values = difference(others.get((method, eta), []), rows)
-        changes = [
-            (each["change"], each["preventable"]) for each in found if (each["method"], each["eta"]) == (method, eta)
-        ]
+        own = [pair for pair in found if (pair["method"], pair["eta"]) == (method, eta)]
+        changes = [(pair["change"], pair["preventable"]) for pair in own]
         groups.append(
             {"method": method, "eta": eta, "unit": first.unit}
             | {"of": sum(key[:2] == (method, eta) and key in theirs for key in ours)}

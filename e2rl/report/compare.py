@@ -30,18 +30,7 @@ from e2rl.sim.rollout_file import ROLLOUTS, Failure, rollout_name
 PAGE = "compare.html"
 MOST = 200  # pairs that the page shows moving
 FOLDER = ASSETS.parent / "compare"
-SCRIPTS = (
-    "palette",
-    "plot",
-    "decode",
-    "scene",
-    "plans",
-    "curves",
-    "verdict",
-    "modes",
-    "index",
-    "player",
-)  # of the report
+SCRIPTS = "palette plot decode scene plans curves verdict modes index player".split()  # of the report
 FACTS = (*COLUMNS[COLUMNS.index("approach") :], "partner", "min_dtc", "progress")  # of a rollout
 SIDES = ("first", "second")
 
@@ -81,13 +70,10 @@ def sentences(groups: Sequence[Mapping], searched: bool) -> Iterator[str]:
             text += f"preventable failures in {gone + moved + same} before, in {new + moved + same} after: "
             yield f"{text}{new} new, {gone} gone, {moved} moved to other ways, {same} the same way."
         else:
-            text += (
-                f"{new} failures are new ({counts['new']} preventable), {gone} gone ({counts['gone']} preventable), "
-            )
-            yield f"{text}{moved} moved, {same} the same."
-        cells = [
-            f"{rate} {difference_cell(METRICS[RATES[rate]], value)}" for rate, value in group["differences"].items()
-        ]
+            text += f"{new} failures are new ({counts['new']} preventable), "
+            yield f"{text}{gone} gone ({counts['gone']} preventable), {moved} moved, {same} the same."
+        values = group["differences"].items()
+        cells = [f"{rate} {difference_cell(METRICS[RATES[rate]], value)}" for rate, value in values]
         yield f"After minus before, in points (progress: m), 95% interval: {'; '.join(cells)}."
 
 
@@ -128,9 +114,7 @@ def page(content: Mapping[str, Any]) -> str:
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="e2rl compare", description=__doc__)
-    parser.add_argument(
-        "runs", type=Path, nargs="+", metavar="RUN", help="the run before and the one after, or one run"
-    )
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="the one before, the one after; or one run")
     parser.add_argument("--egos", nargs=2, metavar="NAME", help="the ego before and the one after")
     parser.add_argument("--out", type=Path, metavar="FILE", help=f"the page (default: {PAGE} in the last run's folder)")
     options = parser.parse_args(arguments)
@@ -138,5 +122,7 @@ def main(arguments: list[str] | None = None) -> None:
         runs, egos = options.runs, options.egos or (None, None)
         if len(runs) > 2 or (len(runs) == 1 and not options.egos):
             raise InputError("give two runs, or one with several egos and --egos BEFORE AFTER")
+        if options.out is not None and options.out.suffix != ".html":
+            raise InputError(f"--out {options.out}: name a file that ends in .html; .csv and .json come beside it")
         first, second = (Driven.read(run, ego) for run, ego in zip((runs[0], runs[-1]), egos, strict=True))
         print(*compare(first, second, options.out or own_folder(runs[-1], PAGE)), sep="\n")

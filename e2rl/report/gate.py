@@ -30,7 +30,7 @@ PASSED, FAILED, UNDECIDED = "passed", "failed", "not enough rollouts"
 STATUS = {FAILED: 1, UNDECIDED: 3, PASSED: 0}  # of the command, the first that applies
 KINDS = {FAILED: "failure", UNDECIDED: "error"}  # of JUnit
 RULE = re.compile(rf"(?:(?P<method>[^:<>=]+):)?(?P<rate>{'|'.join(RATES)})(?P<sign><=|>=)(?P<limit>[+-]?\d*\.?\d+)")
-MOST = 1e9  # places
+MOST, NEAR = 1e9, 1e-4  # places; distance to a limit within which no number of them decides
 
 
 def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
@@ -96,7 +96,7 @@ def growth(found: tuple[float, float, float], limit: float, places: int, fractio
     """
     value, low, high = found
     upper, end = value < limit, high if value < limit else low
-    if math.isnan(end) or value == limit:
+    if math.isnan(end) or abs(value - limit) < NEAR:
         return LEAST / places if places < LEAST else None
     if not fraction:
         return ((end - value) / (limit - value)) ** 2

@@ -92,10 +92,12 @@ def test_without_rollout_files_the_pairs_are_still_told(runs, tmp_path):
     assert page["pairs"] and not page["replays"]
 
 
-def test_the_command_needs_two(runs, capsys):
-    with pytest.raises(SystemExit) as end:
-        main([str(runs[0])])
-    assert end.value.code == 2 and "give two runs, or one with several egos" in capsys.readouterr().err
+def test_the_command_needs_two_and_a_page(runs, capsys):
+    one, two = map(str, runs)
+    for given, said in (([one], "give two runs, or one with"), ([one, two, "--out", "x.json"], "ends in .html")):
+        with pytest.raises(SystemExit) as end:
+            main(given)
+        assert end.value.code == 2 and said in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -48,6 +48,7 @@ def test_intervals_of_means_shrink_with_the_root():
     half, gap = 4.0, 1.0
     assert growth((30.0, 30 - half, 30 + half), 30 - gap, 50, False) == pytest.approx((half / gap) ** 2)
     assert growth((30.0, 26.0, 34.0), 30.0, 50, False) is None
+    assert growth((0.2, 0.1, 0.3), 0.2 + 1e-12, 50, True) is None
     assert growth((0.1, math.nan, math.nan), 0.2, 4, True) == LEAST / 4
 
 
