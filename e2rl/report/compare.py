@@ -30,7 +30,8 @@ from e2rl.sim.rollout_file import ROLLOUTS, Failure, rollout_name
 PAGE = "compare.html"
 MOST = 200  # pairs that the page shows moving
 FOLDER = ASSETS.parent / "compare"
-SCRIPTS = "palette plot decode scene plans curves verdict modes index player".split()  # of the report
+# scripts of the report that the page uses
+SCRIPTS = ("palette", "plot", "decode", "scene", "plans", "curves", "verdict", "modes", "index", "player")
 FACTS = (*COLUMNS[COLUMNS.index("approach") :], "partner", "min_dtc", "progress")  # of a rollout
 SIDES = ("first", "second")
 
