@@ -17,6 +17,8 @@ COMMANDS = {  # module, and what the command does
     "export": ("e2rl.commands.export", "failures of a run in the format of another tool"),
     "export-policy": ("e2rl.commands.export_policy", "a trained actor as ONNX or TorchScript"),
     "inspect": ("e2rl.commands.inspect", "what a data set holds, and a picture of a scene"),
+    "compare": ("e2rl.report.compare", "which failures of one run, or ego, are new or gone in another"),
+    "gate": ("e2rl.report.gate", "whether a run keeps within limits, for continuous integration"),
     "merge": ("e2rl.commands.merge", "join the shards of an evaluation"),
     "curves": ("e2rl.report.curves", "failures over realism, of one or several runs"),
     "policy-figure": ("e2rl.report.policy_figure", "what training was worth, of one or several splits"),

@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from e2rl.evaluation.methods import as_list, build_traffic, config_and_prior, is_search, method_config, rows_of
 from e2rl.evaluation.protocol import HERE, Method, Part, Scored, Setup, Task, Work, extend, in_batches, score_all
+from e2rl.evaluation.summary import GROUP
 from e2rl.metrics.atlas import cell_of
 from e2rl.metrics.margin import FARTHEST
 from e2rl.prior.prior import Prior
@@ -29,6 +30,7 @@ from e2rl.search.tries import TRIES, Family, Try, family_of
 
 TRIES_FILE = "tries.csv"
 TOLD = ("scene_id", "location", "seed", "method", "ego_policy", "family", "margin", "cell", "clean")
+EVENTS = ("cfr_preventable", "cfr_counted", "cfr")  # of a try
 SPENT = ("tries", "nfe", "seconds")  # a scene, of the search so far
 
 
@@ -232,6 +234,17 @@ def failures_of(file: Path, ego_name: str, plan: Plan, setup: Setup) -> list[Par
         drawn = families[name].draw(scene, number % TRIES, searches[seed].seed_of(scene), plan.settings.stratified)
         tries.setdefault(seed, []).append(drawn)
     return [part for seed, own in tries.items() for part in batches(setup, plan, seed, every, own)]
+
+
+def scene_rows(rows: Sequence[Mapping], events: Sequence[str] = EVENTS) -> list[dict]:
+    """A row for each search of each scene, from the rows of its tries: `events`, 1 where any try has one; seed: of the
+    search."""
+    found: dict[tuple, dict] = {}
+    for row in rows:
+        identity = {name: row[name] for name in (*GROUP, "scene_id", "location")} | {"seed": row["seed"] // TRIES}
+        one = found.setdefault(tuple(identity.values()), identity | dict.fromkeys(events, 0.0))
+        one |= {name: max(one[name], float(row[name])) for name in events}
+    return list(found.values())
 
 
 def write_tries(path: Path, told: Sequence[Mapping]) -> None:

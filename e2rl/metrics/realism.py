@@ -19,6 +19,7 @@ from e2rl.sim.dynamics import wrap
 CLIP = {"a_lon": 10.0, "a_lat": 10.0, "jerk": 20.0}  # m/s2, m/s2, m/s3
 KINEMATICS = tuple(CLIP)
 OF_ADVERSARIES = tuple(f"{name}_adversary" for name in KINEMATICS)
+NO_SAMPLES = {name: torch.zeros(2, 0) for name in (*KINEMATICS, *OF_ADVERSARIES)}  # of a rollout
 W1 = tuple(f"w1_{name}" for name in KINEMATICS)
 BLOCK = round(0.5 / DT)  # steps
 MOVING = 0.5  # m/s

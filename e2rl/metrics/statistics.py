@@ -127,7 +127,7 @@ def jackknife(values: Tensor) -> dict[str, float]:
     return {"mean": mean, "low": mean - half, "high": mean + half}
 
 
-def exact_interval(fraction: float, places: int, level: float = LEVEL) -> tuple[float, float]:
+def exact_interval(fraction: float, places: float, level: float = LEVEL) -> tuple[float, float]:
     """Bounds of Clopper and Pearson for a fraction in [0, 1] of so many independent places, a whole number or not."""
     events, tail = fraction * places, (1 - level) / 2
     low = float(betaincinv(events, places - events + 1, tail)) if events > 0 else 0.0

@@ -57,17 +57,21 @@ class Track(NamedTuple):
     present: np.ndarray
 
 
-def failure_replay(failure: Failure) -> dict[str, Any]:
-    """The replay of a failure, from the start to AFTER steps beyond the contact, for the data block of the page.
+def failure_replay(failure: Failure, beside: Failure | None = None) -> dict[str, Any]:
+    """The replay of a failure, from the start to AFTER steps beyond the contact, for the data block of the page. Of a
+    rollout without a contact: as many steps as of the failure `beside` it in the same scene, with that one's partner.
 
     `tracks` has the role, length and width [m] of each track, `partner` and `contact` are a track and a step, `point`
-    [m] is where they touch. `motion` encodes the second differences over time of the CHANNELS [6, tracks, K] in their
-    quanta; the gap [m] is that of the ego, and of those in its place, to the partner. `plans` may be None.
+    [m] is where they touch; without a contact the last step and None. `motion` encodes the second differences over time
+    of the CHANNELS [6, tracks, K] in their quanta; the gap [m] is that of the ego, and of those in its place, to the
+    partner. `plans` may be None.
     """
-    rollout, contact, partner = failure.rollout, failure.contact, failure.partner
-    assert contact is not None
-    steps = min(contact + AFTER + 1, len(rollout.states))
-    rows = np.flatnonzero(rollout.valid[:steps].any(0))
+    rollout, contact, like = failure.rollout, failure.contact, failure
+    if contact is None and beside is not None:
+        like = beside
+    assert like.contact is not None
+    partner, steps = like.partner, min(like.contact + AFTER + 1, len(rollout.states))
+    rows = np.union1d(np.flatnonzero(rollout.valid[:steps].any(0)), partner)
     driven = rollout.states[:steps], rollout.valid[:steps]
     tracks = [
         Track(role_of(rollout, row), rollout.size[row], *(part[:, row] for part in driven)) for row in rows.tolist()
@@ -79,8 +83,8 @@ def failure_replay(failure: Failure) -> dict[str, Any]:
     return {
         "tracks": [[track.role, *(round(float(side), 2) for side in track.size)] for track in tracks],
         "partner": other,
-        "contact": contact,
-        "point": [round(float(value), 2) for value in contact_point(rollout, contact, partner)],
+        "contact": steps - 1 if contact is None else contact,
+        "point": None if contact is None else contact_point(rollout, contact, partner).round(2).tolist(),
         "dt": rollout.dt,
         "motion": encode(second_difference(quantised(motion, quanta))),
         "plans": encoded_plans(rollout, rows) if rollout.plans is not None else None,
@@ -130,7 +134,7 @@ def channels_of(track: Track, partner: Track) -> np.ndarray:
 def held(states: np.ndarray, present: np.ndarray) -> np.ndarray:
     """States [K, 4] with those of absent steps replaced by the last present ones, before any by the first."""
     step = np.maximum.accumulate(np.where(present, np.arange(len(present)), -1))
-    return states[np.where(step < 0, present.argmax(), step)].astype(np.float64)
+    return np.nan_to_num(states[np.where(step < 0, present.argmax(), step)].astype(np.float64))
 
 
 def encoded_plans(rollout: Rollout, rows: np.ndarray) -> dict[str, Any]:

@@ -6,41 +6,25 @@ Tries of different egos are no pairs, since a search goes on by what it has foun
 import math
 from collections.abc import Mapping, Sequence
 
-import torch
-
+from e2rl.evaluation.budget import EVENTS, scene_rows
 from e2rl.evaluation.ego_set import EgoSet
-from e2rl.evaluation.summary import GROUP
 from e2rl.metrics.catalogue import METRICS
-from e2rl.metrics.realism import KINEMATICS, OF_ADVERSARIES
+from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.report.tables import Table, difference_cell, mean_cell
-from e2rl.search.tries import TRIES
 
-EVENTS = ("cfr_preventable", "cfr_counted", "cfr")
 TITLE = "Scenes in which each ego fails"
 CAPTION = (
     "Scenes with a try that ends in a contact (`cfr`), in one that counts, in a preventable one. Each search of a scene"
     " counts once. 95% intervals by place and, of several trainings of one policy, by training. Differences are of the"
     " same scenes; a star: the interval leaves out 0."
 )
-NOTHING = {name: torch.zeros(2, 0) for name in (*KINEMATICS, *OF_ADVERSARIES)}
-
-
-def scene_rows(rows: Sequence[Mapping]) -> list[dict]:
-    """A row for each search of each scene, from the rows of its tries: EVENTS, 1 where any try has one; seed: of the
-    search."""
-    found: dict[tuple, dict] = {}
-    for row in rows:
-        identity = {name: row[name] for name in (*GROUP, "scene_id", "location")} | {"seed": row["seed"] // TRIES}
-        one = found.setdefault(tuple(identity.values()), identity | dict.fromkeys(EVENTS, 0.0))
-        one |= {name: max(one[name], float(row[name])) for name in EVENTS}
-    return list(found.values())
 
 
 def ego_table(rows: Sequence[Mapping], egos: EgoSet) -> Table:
     """The table of egos, from the rows of all tries: EVENTS of scenes, and differences to the ego that all are compared
     with, in points and relative to it."""
     every = scene_rows(rows)
-    summaries = egos.metric_rows(every, [NOTHING] * len(every))
+    summaries = egos.metric_rows(every, [NO_SAMPLES] * len(every))
     others = {first: second for first, second in reversed(egos.pairs)}
     lines = []
     for row in summaries:

@@ -49,9 +49,8 @@ function curvePlot(curve, replay, shown) {
     y: { range: [0, Math.min(top, 60)], label: curve.label },
   });
   const contact = plot.x(replay.contact * replay.dt);
-  plot.node.append(
-    svg("line", { class: "contact", x1: contact, x2: contact, y1: plot.frame.top, y2: plot.frame.bottom }),
-  );
+  const mark = { class: "contact", x1: contact, x2: contact, y1: plot.frame.top, y2: plot.frame.bottom };
+  if (replay.point) plot.node.append(svg("line", mark));
   plot.node.append(...lines.map((line) => curveLine(line, curve.channel, plot, replay)));
   plot.cursor = svg("line", { class: "cursor", y1: plot.frame.top, y2: plot.frame.bottom });
   plot.node.append(plot.cursor);

@@ -1,28 +1,5 @@
 // The page: what is shown of the report, and how its parts work together.
 
-/** Decoded replays with the paths of their maps; both are kept once decoded. */
-class Store {
-  constructor(report) {
-    Object.assign(this, { report, replays: new Map(), maps: new Map() });
-  }
-
-  replay(index) {
-    if (!this.replays.has(index)) this.replays.set(index, this.decode(this.report.replays[index]));
-    return this.replays.get(index);
-  }
-
-  async decode(raw) {
-    const [replay, paths] = await Promise.all([decodeReplay(raw, this.report.channels), this.map(raw.map)]);
-    return { replay, paths };
-  }
-
-  map(index) {
-    const { maps, map_quantum: quantum } = this.report;
-    if (!this.maps.has(index)) this.maps.set(index, decodeMap(maps[index], quantum).then(mapPaths));
-    return this.maps.get(index);
-  }
-}
-
 class Page {
   constructor(report) {
     this.report = report;

@@ -123,6 +123,9 @@ class Player {
   seek(time) {
     const last = this.replay ? this.replay.steps - 1 : 0;
     this.time = Math.max(0, Math.min(time, last));
+    this.node.scrubber.value = Math.round(this.time);
+    if (this.replay)
+      this.node.scrubber.setAttribute("aria-valuetext", `${(this.time * this.replay.dt).toFixed(1)} s`);
     this.draw();
   }
 
@@ -170,8 +173,7 @@ class Player {
     this.draw();
   }
 
-  resize() {
-    const { scene } = this.node;
+  resize(scene = this.node.scene) {
     scene.width = Math.round(scene.clientWidth * devicePixelRatio);
     scene.height = Math.round(scene.clientHeight * devicePixelRatio);
     this.draw();
@@ -187,23 +189,19 @@ class Player {
     const view = { centre: cameraAt(this.replay, this.time), metres: this.metres };
     drawScene(scene, this.paths, this.replay, this.time, view, this.shown, this.palette);
     this.moveCursors(this.time);
-    this.describe();
+    this.describe(this.node, this.replay, this.time);
   }
 
   /** Clock, badge, scale and the canvas's description. */
-  describe() {
-    const { replay, time } = this;
+  describe({ scene, clock, badge, scale }, replay, time) {
     const ego = replay.tracks.find((track) => track.role === "ego");
     const seconds = (time * replay.dt).toFixed(1);
     const speed = poseAt(ego, Math.min(time, replay.contact)).speed.toFixed(1);
-    this.node.scrubber.value = Math.round(time);
-    this.node.scrubber.setAttribute("aria-valuetext", `${seconds} s`);
-    this.node.clock.textContent = `${seconds} s\nego ${speed} m/s`;
-    this.node.badge.hidden = time < replay.contact;
-    this.node.scene.setAttribute("aria-label", `Traffic from above at ${seconds} s; the ego drives ${speed} m/s`);
-    const { clientWidth, clientHeight } = this.node.scene;
-    this.node.scale.style.width = `${(10 * Math.min(clientWidth, clientHeight)) / this.metres}px`;
-    this.node.scale.textContent = "10 m";
+    clock.textContent = `${seconds} s\nego ${speed} m/s`;
+    badge.hidden = time < replay.contact;
+    scene.setAttribute("aria-label", `Traffic from above at ${seconds} s; the ego drives ${speed} m/s`);
+    scale.style.width = `${(10 * Math.min(scene.clientWidth, scene.clientHeight)) / this.metres}px`;
+    scale.textContent = "10 m";
   }
 
   /** Keys that the page itself does not need: a button takes the space bar, fields take all keys. */

@@ -77,7 +77,7 @@ function drawScene(canvas, paths, replay, time, view, shown, palette) {
   drawAgents(context, replay, time, palette);
   drawGhosts(context, replay, time, shown, palette);
   if (shown.has("aims")) drawAims(context, replay, time, palette);
-  if (time >= replay.contact) drawContact(context, replay, palette);
+  if (time >= replay.contact && replay.point) drawContact(context, replay, palette);
 }
 
 function drawMap(context, paths, palette) {

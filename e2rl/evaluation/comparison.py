@@ -1,0 +1,141 @@
+"""Two egos in the same scenes, seeds and traffic, of two runs or of one: which failures are new, gone, moved.
+
+A search goes on by what it has found, so its tries are no pairs. Of a run with a budget, scenes are: one fails where a
+try ends in a preventable failure, and has moved where the two searches share no way of failing (cell of the atlas).
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from e2rl.evaluation.budget import TRIES_FILE, scene_rows
+from e2rl.evaluation.rollout_files import TABLE, cell, read_rows
+from e2rl.metrics.atlas import cell_of
+from e2rl.metrics.failure_modes import Row, is_failure
+from e2rl.metrics.realism import NO_SAMPLES
+from e2rl.metrics.statistics import paired_differences
+from e2rl.run.errors import InputError
+from e2rl.run.run import changed, read_provenance
+from e2rl.search.tries import TRIES
+
+PAIR = ("method", "eta", "scene_id", "seed")
+CHANGES = ("new", "gone", "moved", "same")
+SHARED = (  # settings and inputs without which rollouts are no pairs
+    *("scenes", "scene", "seeds", "eta", "methods", "variants", "tries", "budget", "budget_unit"),
+    *("prior", "sim", "synthesizer", "search"),
+)
+LATER = 0.5  # s from which on a contact has moved: a replan
+RATES = {  # what is compared, and the columns of the tables
+    **{"contacts": "cfr", "counted": "cfr_counted", "preventable": "cfr_preventable", "clean": "cfr_clean"},
+    "progress": "progress",
+}
+
+
+class Driven(NamedTuple):
+    """The rollouts of one ego in one run; searched: they are the tries of searches."""
+
+    run: Path
+    ego: str
+    rows: list[dict]
+    searched: bool
+
+    @classmethod
+    def read(cls, run: Path, ego: str | None = None) -> "Driven":
+        """The rollouts of a run's ego, None: of its only one; InputError where it is not there."""
+        rows = read_rows(run / TABLE)
+        egos = list(dict.fromkeys(row["ego_policy"] for row in rows))
+        if ego not in egos and (ego or len(egos) != 1):
+            raise InputError(f"{run}: has the egos {', '.join(egos) or 'none'}; name one by --ego, or two by --egos")
+        ego = ego or egos[0]
+        return cls(run, ego, [row for row in rows if row["ego_policy"] == ego], (run / TRIES_FILE).is_file())
+
+    @property
+    def unit(self) -> str:
+        """What rates are of."""
+        return "searches of a scene" if self.searched else "rollouts"
+
+    def rollouts(self) -> dict[tuple, list[dict]]:
+        """The rows of each PAIR: one, or of a search its tries."""
+        found: dict[tuple, list[dict]] = {}
+        for row in self.rows:
+            key = (row["method"], row["eta"], row["scene_id"], row["seed"] // (TRIES if self.searched else 1))
+            found.setdefault(key, []).append(row)
+        return found
+
+    def units(self) -> dict[tuple[str, float], list[dict]]:
+        """The rows that rates are of, by method and intensity: rollouts, or of a search its scenes, 1 where any try has
+        what is counted."""
+        found: dict[tuple[str, float], list[dict]] = {}
+        events = [column for column in RATES.values() if column != "progress"]
+        for row in scene_rows(self.rows, events) if self.searched else self.rows:
+            found.setdefault((row["method"], row["eta"]), []).append(row)
+        return found
+
+
+def compared(first: Driven, second: Driven) -> tuple[list[dict], list[dict]]:
+    """What has changed in each traffic, and the pairs of rollouts of which one has failed (`pair_of`), in the order of
+    CHANGES. Raises InputError, saying what differs, where the two are no pairs.
+
+    A traffic has the number `of` units that both have, the numbers of CHANGES and of `preventable` ones among them, and
+    paired `differences` of RATES, second minus first.
+    """
+    check_shared(first, second)
+    ours, theirs, others, groups = first.rollouts(), second.rollouts(), second.units(), []
+    pairs = [pair_of(key, ours[key], theirs[key], first.searched) for key in ours if key in theirs]
+    found = [pair for pair in pairs if pair]
+    found.sort(key=lambda pair: (CHANGES.index(pair["change"]), -pair["preventable"]))
+    for (method, eta), rows in first.units().items():
+        values = difference(others.get((method, eta), []), rows)
+        own = [pair for pair in found if (pair["method"], pair["eta"]) == (method, eta)]
+        changes = [(pair["change"], pair["preventable"]) for pair in own]
+        groups.append(
+            {"method": method, "eta": eta, "unit": first.unit}
+            | {"of": sum(key[:2] == (method, eta) and key in theirs for key in ours)}
+            | {name: sum(change == name for change, _ in changes) for name in CHANGES}
+            | {"preventable": {name: changes.count((name, True)) for name in CHANGES}}
+            | {"differences": {name: values[column] for name, column in RATES.items() if values[column]["n"]}}
+        )
+    return groups, found
+
+
+def difference(rows: Sequence[Row], others: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Paired differences of all metrics that need no samples (`paired_differences`)."""
+    samples = [[NO_SAMPLES] * len(each) for each in (rows, others)]
+    return paired_differences(rows, samples[0], others, samples[1], realism_draws=0)
+
+
+def check_shared(first: Driven, second: Driven) -> None:
+    """Raises InputError, saying what differs, where the rollouts of two runs are no pairs."""
+    known = [read_provenance(one.run) for one in (first, second)]
+    each = [{**one["settings"], **one["inputs"]} for one in known]
+    names = [name for name in changed(*each) if re.split("[.=]", name)[0] in SHARED and not name.startswith("scenes=")]
+    names.sort(key=lambda name: SHARED.index(re.split("[.=]", name)[0]))
+    told = [f"{name} ({' and '.join(str(one.get(name))[:20] for one in each)})" for name in names]
+    if names[:1] == ["scenes"]:
+        ours, theirs = ({row["scene_id"] for row in one.rows} for one in (first, second))
+        told[0] = f"scenes ({len(ours)} and {len(theirs)}, {len(ours & theirs)} of one id)"
+    if told:
+        mend = "run both with the same scenes, seeds, traffic and prior"
+        raise InputError(f"{second.run}: no pairs with {first.run}, which has other {', '.join(told)}; {mend}")
+
+
+def pair_of(key: Sequence, tries: Sequence[Row], others: Sequence[Row], searched: bool) -> dict[str, Any] | None:
+    """Two rollouts of one PAIR of which one has failed, None: none has; of a search the tries that are nearest to a
+    preventable failure. `change` is of CHANGES, `what` differs between two failures: verdict, side of the ego,
+    counterpart, time by LATER; of searches way. `preventable`: whether one is."""
+    first, second = (max(each, key=lambda row: row["margin"]) for each in (tries, others))
+    ways = [{cell_of(row) for row in each} - {None} for each in (tries, others)]
+    failed = [bool(each) for each in ways] if searched else [is_failure(first), is_failure(second)]
+    differs = {
+        "verdict": any(cell(first[name]) != cell(second[name]) for name in ("counted", "at_fault", "preventable")),
+        "side": first["contact_type"] != second["contact_type"],
+        "counterpart": first["partner"] != second["partner"],
+        "time": abs(first["contact_time"] - second["contact_time"]) > LATER + 1e-9,
+    }
+    if searched:
+        differs = {"way": not ways[0] & ways[1]}
+    what = [name for name, there in differs.items() if there] if all(failed) else []
+    change = ("moved" if what else "same") if all(failed) else "gone" if failed[0] else "new"
+    about = {"change": change, "what": what, "preventable": any(map(bool, ways)), **dict(zip(PAIR, key, strict=True))}
+    return about | {"first": first, "second": second} if any(failed) else None

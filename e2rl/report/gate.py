@@ -1,0 +1,148 @@
+"""`e2rl gate RUN RULE ...`: whether rates of a run, or their changes against a former run, are within limits.
+
+The 95% interval decides, not the estimate: a rule holds where the whole interval does, fails where none of it does.
+The status is 0 where all hold, 1 where one fails, 3 where none fails and rollouts are too few, 2 for bad input
+(docs/how-to/compare.md).
+"""
+
+import argparse
+import math
+import re
+import sys
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from scipy.optimize import brentq
+
+from e2rl.evaluation.comparison import RATES, Driven, check_shared, difference
+from e2rl.evaluation.rollout_files import write_json
+from e2rl.metrics.catalogue import METRICS
+from e2rl.metrics.realism import NO_SAMPLES
+from e2rl.metrics.statistics import LEAST, cluster_index, exact_interval, summarise
+from e2rl.report.tables import estimate
+from e2rl.run.endings import ending
+from e2rl.run.errors import InputError
+from e2rl.run.files import write_atomically
+
+PASSED, FAILED, UNDECIDED = "passed", "failed", "not enough rollouts"
+STATUS = {FAILED: 1, UNDECIDED: 3, PASSED: 0}  # of the command, the first that applies
+KINDS = {FAILED: "failure", UNDECIDED: "error"}  # of JUnit
+RULE = re.compile(rf"(?:(?P<method>[^:<>=]+):)?(?P<rate>{'|'.join(RATES)})(?P<sign><=|>=)(?P<limit>[+-]?\d*\.?\d+)")
+MOST, NEAR = 1e9, 1e-4  # places; distance to a limit within which no number of them decides
+
+
+def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
+    """What becomes of a rule: `outcome`, `reason`, value and interval, `more` rollouts (None: no number decides).
+
+    Args:
+        text: [METHOD:]RATE<=LIMIT or >=, such as "preventable<=0.05", "nominal:contacts<=0.1", "e2@2:clean<=0.1"; the
+            method may be left out where one attack was driven. A limit with a sign, "counted<=+0.02", is one on the
+            change against `former`.
+
+    Raises:
+        InputError: it is no rule, names no or several traffic, or what the run does not know.
+    """
+    rule = RULE.fullmatch(text.replace(" ", ""))
+    if rule is None or (rule["limit"][0] in "+-" and former is None):
+        raise InputError(
+            f"{text!r}: no rule; write [METHOD:]RATE<=LIMIT or >=, such as 'preventable<=0.05', or with --against RUN "
+            f"a change, 'preventable<=+0.02'; rates: {', '.join(RATES)}"
+        )
+    limit, metric, change = float(rule["limit"]), METRICS[RATES[rule["rate"]]], rule["limit"][0] in "+-"
+    rows = traffic_of(rule, driven)
+    if change and former is not None:
+        found = difference(rows, traffic_of(rule, former))[metric.name]
+    else:
+        found = summarise(rows, [NO_SAMPLES] * len(rows), realism_draws=0)[metric.name]
+    if not (count := int(found["n"])):
+        raise InputError(f"{text}: {driven.run} knows no {rule['rate']}; searches know no progress")
+    ends = found["difference" if change else "mean"], found["low"], found["high"]
+    value, low, high = ends
+    holds, broken = (high <= limit, low > limit) if rule["sign"] == "<=" else (low >= limit, high < limit)
+    outcome, more = PASSED if holds else FAILED if broken else UNDECIDED, None
+    told = estimate(metric, dict(zip(("mean", "low", "high"), ends, strict=True)), "mean", "+" if change else "")
+    reason = f"{text}: found {told} {metric.unit or ('points' if change else '%')}, {count} {driven.unit}"
+    if outcome == UNDECIDED:
+        places = cluster_index(*([row[name] for row in rows] for name in ("location", "scene_id")))[1]
+        factor = growth(ends, limit, places, metric.fraction and not change)
+        more = factor and max(1, math.ceil(count * (factor - 1)))
+        advice = f"about {more} more, at further places" if more else "no number decides, the estimate is at the limit"
+        advice += f" ({places} places, an interval needs {LEAST})" if places < LEAST else ""
+        reason = f"{advice}; {reason}"
+    about = {"rule": text, "outcome": outcome, "reason": f"{outcome}: {reason}", "more": more, "unit": driven.unit}
+    return about | {"value": value, "low": low, "high": high, "n": count}
+
+
+def traffic_of(rule: re.Match, driven: Driven) -> list[dict]:
+    """The rows of the traffic that a rule names, or of the only attack; InputError for none or several."""
+    units = {f"{method}@{eta:g}": rows for (method, eta), rows in driven.units().items()}
+    found = [name for name in units if rule["method"] in (name, name.rpartition("@")[0])]
+    if rule["method"] is None:
+        found = [name for name in units if not name.endswith("@0")] or list(units)
+    if len(found) != 1:
+        names = ", ".join(f"{name}:{rule['rate']}" for name in units)
+        raise InputError(f"{rule[0]}: of which traffic in {driven.run}? write one of {names}")
+    return units[found[0]]
+
+
+def growth(found: tuple[float, float, float], limit: float, places: int, fraction: bool) -> float | None:
+    """By which factor places, and so rollouts, must grow until the interval (value, low, high) ends at the limit if the
+    value stays; without an interval, to LEAST places; None: none decides.
+
+    Of a fraction it is m/k, the places of which the exact interval (Clopper and Pearson) ends at the limit, and where
+    the one found does; else the square of half-width over distance to the limit.
+    """
+    value, low, high = found
+    upper, end = value < limit, high if value < limit else low
+    if math.isnan(end) or abs(value - limit) < NEAR:
+        return LEAST / places if places < LEAST else None
+    if not fraction:
+        return ((end - value) / (limit - value)) ** 2
+
+    def sample(end: float) -> float:
+        """The places of which the exact interval of the value ends there."""
+        return math.exp(brentq(lambda log: exact_interval(value, math.exp(log))[upper] - end, 0, math.log(MOST)))
+
+    return sample(limit) / sample(end)
+
+
+def junit(results: Sequence[Mapping[str, Any]], run: str) -> bytes:
+    """JUnit's XML: a test case for each rule, a failure or, where rollouts are too few, an error."""
+    counts = {f"{kind}s": str(sum(each["outcome"] == name for each in results)) for name, kind in KINDS.items()}
+    suite = ET.Element("testsuite", {"name": "e2rl gate", "tests": str(len(results)), **counts})
+    for each in results:
+        case = ET.SubElement(suite, "testcase", classname=run, name=each["rule"])
+        if each["outcome"] in KINDS:
+            ET.SubElement(case, KINDS[each["outcome"]], message=each["reason"], type=each["outcome"])
+        ET.SubElement(case, "system-out").text = each["reason"]
+    root = ET.Element("testsuites")
+    root.append(suite)
+    return ET.tostring(root, "utf-8", xml_declaration=True)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(prog="e2rl gate", description=__doc__)
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run of evaluate.py")
+    parser.add_argument("rules", nargs="+", metavar="RULE", help="such as 'preventable<=0.05', 'nominal:contacts<=0.1'")
+    parser.add_argument("--against", type=Path, metavar="RUN", help="a former run, for rules as 'counted<=+0.02'")
+    parser.add_argument("--ego", metavar="NAME", help="where a run has several")
+    parser.add_argument("--junit", type=Path, metavar="FILE", help="write JUnit's XML")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the values")
+    options = parser.parse_intermixed_args(arguments)
+    with ending():
+        driven, former = Driven.read(options.run, options.ego), None
+        if options.against is not None:
+            former = Driven.read(options.against, options.ego)
+            check_shared(former, driven)
+            if not any(re.search("=[+-]", text) for text in options.rules):
+                raise InputError("--against: no rule is on a change; write one as 'counted<=+0.02'")
+        results = [judged(text, driven, former) for text in options.rules]
+        if options.junit is not None:
+            write_atomically(options.junit, junit(results, str(options.run)))
+        if options.json is not None:
+            write_json(options.json, results)
+        print(*(each["reason"] for each in results), sep="\n")
+    sys.exit(next(status for outcome, status in STATUS.items() if outcome in {each["outcome"] for each in results}))
