@@ -1,19 +1,42 @@
-"""`e2rl report RUN_DIR`: the failure report of a run, one HTML file that opens offline."""
+"""`e2rl report RUN_DIR`: the failure report of a run, one HTML file that opens offline, and a list of its failures."""
 
 import argparse
 from pathlib import Path
 
+from e2rl.evaluation.methods import SEARCH
+from e2rl.evaluation.rollout_files import TABLE
 from e2rl.report.html import PAGE, REPLAYS, write_report
 from e2rl.run.endings import ending
+from e2rl.run.errors import InputError
+
+MEASURED = [Path(stage, part) for stage in ("before", "after") for part in ("", SEARCH)]  # in a training's folder
+
+
+def measured(run: Path) -> list[Path]:
+    """Returns the folders with rollouts: the run's own, or those that a training measured before and after it;
+    InputError where there are none."""
+    found = [each for each in (run, *(run / part for part in MEASURED)) if (each / TABLE).is_file()]
+    if not found:
+        raise InputError(
+            f"{run}: no {TABLE}, so nothing was measured in closed loop; give the folder of a run of evaluate.py, or of "
+            "train.py whose first measurement is done. What another stage of training made is driven first, such as by: "
+            "python evaluate.py prior.checkpoint=RUN, or ego=actor ego.checkpoint=RUN"
+        )
+    return found[:1] if found[0] == run else found
 
 
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="e2rl report", description=__doc__)
-    parser.add_argument("run", type=Path, metavar="RUN_DIR", help="folder of a run of evaluate.py")
+    parser.add_argument("run", type=Path, metavar="RUN_DIR", help="folder of a run of evaluate.py or train.py")
     parser.add_argument("--replays", type=int, default=REPLAYS, metavar="N", help="at most so many (%(default)s)")
     parser.add_argument("--method", action="append", default=[], metavar="NAME", help="its failures only; repeatable")
     parser.add_argument("--out", type=Path, help=f"file to write (default: RUN_DIR/{PAGE})")
     options = parser.parse_args(arguments)
     with ending():
-        print(write_report(options.run, replays=options.replays, methods=options.method, path=options.out))
+        folders = measured(options.run)
+        if (options.out or options.method) and len(folders) > 1:
+            several = f"{options.run} is a training, with a page for each of {len(folders)} folders"
+            raise InputError(f"--out, --method: {several}; name one, such as {folders[-1]}")
+        for folder in folders:
+            print(write_report(folder, replays=options.replays, methods=options.method, path=options.out))

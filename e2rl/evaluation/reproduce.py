@@ -40,6 +40,8 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
     Tells on stderr where versions differ. Raises InputError where there is no finished table, where its configuration
     names code (`e2rl.run.trust`), for weights that are others or not there, and for settings that cannot change.
     """
+    if config.failure and not (config.reproduce or config.resume):
+        raise InputError(f"failure={config.failure}: is one of a run; name its folder by reproduce=RUN_DIR")
     if config.resume or not config.reproduce:
         return Run.of(config, free)
     where, old = f"reproduce={config.reproduce}", Path(config.reproduce).resolve()
@@ -51,6 +53,7 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
     _move(config, saved, [_key(name) for name in files], known["choices"], where)
     check_written(saved, old, where, config, load_config())
     saved.plugins, saved.resume, saved.reproduce, saved.scenes = config.plugins, None, str(old), str(old / SCENES)
+    saved.failure = config.failure
     _check_weights(config, saved, files, where)
     _tell_versions(saved, known, where)
     return Run(saved, Run.of(config).folder, known["choices"])
@@ -66,7 +69,7 @@ def _move(
 ) -> None:
     """Set in `saved` what the command line may set anew."""
     given = [item.lstrip("+~").partition("=")[::2] for item in HydraConfig.get().overrides.task]
-    names = [name for name, value in given if name not in ("reproduce", *ALWAYS) and choices.get(name) != value]
+    names = [name for name, value in given if name not in ("reproduce", "failure", *ALWAYS) and choices.get(name) != value]
     if wrong := [name for name in names if name not in (*MOVED, *WRITTEN, *files)]:
         raise InputError(
             f"{where}: is made again as it was; leave out {', '.join(wrong)} (only {', '.join(MOVED)} and files of "

@@ -1,12 +1,16 @@
-"""The failure report: one HTML file that opens offline, failures.html.
+"""The failure report: one HTML file that opens offline, failures.html; and a list for other programs, failures.csv.
 
-It shows the failure modes, a replay of each failure, the atlas, an index to search, the tables of the run and
-collisions over realism. Everything is inside the file: no script, font or picture is loaded from elsewhere.
+The page shows how often one setting fails, the failure modes, a replay of each failure, the atlas, an index to search,
+the tables of the run and collisions over realism. Everything is inside the file: no script, font or picture is loaded
+from elsewhere.
 """
 
 import hashlib
 import html
 import json
+import math
+import os
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,27 +18,32 @@ from typing import Any
 
 from tqdm import tqdm
 
+from e2rl.evaluation.budget import TRIES_FILE
 from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
-from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, nulls, read_metrics, read_rows
+from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, cell, nulls, read_metrics, read_rows
 from e2rl.metrics.atlas import CELL, Cell, by_likelihood, cell_of
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import is_failure
+from e2rl.report.answer import of
 from e2rl.report.failure_tracks import CHANNELS, MAP_QUANTUM, encoded_map, failure_replay
-from e2rl.report.tables import Table, column_names, metric_tables, mode_tables
+from e2rl.report.tables import Table, closed_loop, column_names, metric_tables, mode_tables, number
+from e2rl.run.config import assigned
 from e2rl.run.errors import InputError
-from e2rl.run.files import write_atomically
-from e2rl.sim.rollout_file import Failure, rollout_name
+from e2rl.run.files import csv_text, write_atomically
+from e2rl.run.trust import CONFIG, read_yaml
+from e2rl.sim.rollout_file import Failure, rollout_key, rollout_name
 
 PAGE = "failures.html"
 REPLAYS = 300  # in the page at most
 ASSETS = Path(__file__).parents[1] / "assets" / "report"
 GROUP = ("ego_policy", "method", "eta")
-COLUMNS = (  # of rollouts.csv, in the page's index and facts
-    *(*GROUP, "scene_id", "seed", "approach", "ego_manoeuvre", "partner_manoeuvre", "contact_type", "duty"),
-    *("counted", "at_fault", "preventable", "avoidable", "avoidable_1s", "evasion_accel", "cfr_adv"),
-    *("ego_speed", "partner_speed", "relvel", "contact_time", "transport"),
+COLUMNS = (  # of rollouts.csv, in failures.csv and in the page's index and facts
+    *("scene_id", "location", *GROUP, "seed", "contact_time", "counted", "at_fault", "preventable", "cfr_clean"),
+    *("duty", "contact_type", "partner", "relvel", "approach", "ego_manoeuvre", "partner_manoeuvre"),
+    *("ego_speed", "partner_speed", "avoidable", "avoidable_1s", "evasion_accel", "cfr_adv", "transport"),
 )
 PLOTTED = ("cfr", "cfr_counted", "real", "real_adv")
+RATES = ("cfr", "cfr_counted", "cfr_preventable")  # in the page's first lines
 
 
 def write_report(
@@ -46,8 +55,8 @@ def write_report(
     methods: Sequence[str] = (),
     path: Path | None = None,
 ) -> Path:
-    """Write the page of a run's folder; returns its path. Raises InputError where files of the run are missing, or no
-    method has the name.
+    """Write the page of a run's folder, and the list of its failures beside it, in a file of the same name that ends in
+    .csv; returns the page's path. Raises InputError where files of the run are missing, or no method has the name.
 
     Args:
         run: the folder, with its rollouts and their table.
@@ -63,8 +72,21 @@ def write_report(
     content = page_content(run, metrics, modes, methods) | {"tables": [vars(table) for table in tables]}
     content |= add_replays(run, content.pop("rows"), content["failures"], replays)
     path = path or run / PAGE
+    write_atomically(path.with_suffix(".csv"), failure_list(content, path.name))
     write_atomically(path, page(content))
     return path
+
+
+def failure_list(content: Mapping[str, Any], page_name: str) -> str:
+    """failures.csv: a line for each failure of the data block: its name, COLUMNS, its mode in words, the link to it in
+    the page, and the command that drives it again."""
+    lines = []
+    for entry in content["failures"]:
+        mode, again = content["modes"].get(entry["mode"], ""), content["run"]["again"]
+        command = f"{again} {shlex.quote(assigned('failure', entry['key']))}" if again else ""
+        values = [cell(entry[name]) for name in COLUMNS]
+        lines.append([entry["key"], *values, mode, f"{page_name}#failure={entry['key']}", command])
+    return csv_text([["failure", *COLUMNS, "mode", "link", "again"], *lines])
 
 
 def page(content: Mapping[str, Any]) -> str:
@@ -91,7 +113,7 @@ def page_content(run: Path, metrics: Sequence[dict], modes: Mapping, methods: Se
         raise InputError(f"--method {wrong[0]}: not in {run / TABLE}; choose among {', '.join(known)}")
     labels = zip(modes["groups"], column_names(modes["groups"]), strict=True)
     groups = {
-        group_key(group): {"ego": group["ego_policy"], "label": label}
+        group_key(group): {"ego": group["ego_policy"], "label": label, "rates": rates(group, metrics)}
         | {name: group[name] for name in ("method", "eta", "rollouts", "failures")}
         for group, label in labels
         if not methods or group["method"] in methods
@@ -101,13 +123,15 @@ def page_content(run: Path, metrics: Sequence[dict], modes: Mapping, methods: Se
     typical = {mode["typical"]["file"] for mode in modes["modes"]}
     cells, places = atlas_places(rows)
     return {
-        "run": {name: metrics[0][name] for name in ("dataset", "split", "n_scenes", "n_seeds", "git", "command")},
+        "run": {name: metrics[0][name] for name in ("dataset", "split", "n_scenes", "git", "command")}
+        | {"stage": metrics[0].get("stage"), "tries": (run / TRIES_FILE).is_file()}
+        | commands(run),
         "groups": list(groups.values()),
         "modes": names,
         "cells": [dict(zip(CELL, cell, strict=True)) for cell in cells],
         "failures": [failure(row, names, typical) | place for row, place in zip(rows, places, strict=True)],
         "rows": rows,
-        "points": [plotted(row) for row in metrics if row.get("stage") is None],
+        "points": [plotted(row) for row in closed_loop(metrics)],
         "about": {metric.name: metric.about for metric in METRICS.values()},
         "channels": CHANNELS,
         "map_quantum": MAP_QUANTUM,
@@ -118,11 +142,37 @@ def group_key(row: Mapping) -> tuple:
     return tuple(row[name] for name in GROUP)
 
 
+def rates(group: Mapping, metrics: Sequence[Mapping]) -> dict[str, str]:
+    """What the page's first lines say of a group of modes.json: its RATES as the tables have them, such as "34 of 120
+    rollouts (28.3%, 95% interval 20.1 to 37.4%)"; {} where metrics.json knows the group in a pool only."""
+    own = [row for row in closed_loop(metrics) if group_key(row | {"ego_policy": row["ego"]}) == group_key(group)]
+    return {name: rate(row, name) for row in own for name in RATES if row["metrics"].get(name, {}).get("n")}
+
+
+def rate(row: dict, name: str) -> str:
+    value = row["metrics"][name]
+    centre, low, high = (number(METRICS[name], value[end]) for end in ("mean", "low", "high"))
+    interval = "" if math.isnan(value["low"]) else f", 95% interval {low} to {high}%"
+    return f"{of(row, name)} rollouts ({centre}%{interval})"
+
+
+def commands(run: Path) -> dict[str, str | None]:
+    """`again`: the command that drives a failure again, but for `failure=`; None where the folder is not that of an
+    evaluation. `folder`: of the run. Both are quoted for a shell; paths below the working directory begin there."""
+    again, folder = None, os.path.relpath(run) if run.resolve().is_relative_to(Path.cwd()) else str(run)
+    if (run / CONFIG).is_file():
+        saved = read_yaml(run / CONFIG)
+        of_run = saved.reproduce if saved.get("failure") else folder  # one failure, driven again, has no tries
+        again = shlex.join(["e2rl", "evaluate", assigned("reproduce", of_run)])
+    return {"again": again, "folder": shlex.quote(folder)}
+
+
 def failure(row: Mapping, names: Mapping[int, str], typical: set[str]) -> dict[str, Any]:
-    """What the page's index knows of a failure: COLUMNS, its mode (OTHER for small ones), and whether it is typical."""
+    """What the page's index knows of a failure: its name, COLUMNS, its mode (OTHER for small ones), whether it is
+    typical."""
     mode = int(row["mode"]) if row["mode"] in names else OTHER
     values = {name: round(row[name], 4) if isinstance(row[name], float) else row[name] for name in COLUMNS}
-    return values | {"mode": mode, "typical": rollout_name(row) in typical, "replay": None}
+    return values | {"key": rollout_key(row), "mode": mode, "typical": rollout_name(row) in typical, "replay": None}
 
 
 def atlas_places(rows: Sequence[Mapping]) -> tuple[list[Cell], list[dict[str, int | None]]]:

@@ -43,24 +43,33 @@ class Page {
       repaintModes(document.getElementById("modes"), this.modes);
     });
     this.choose(report.groups[0].ego);
-    const linked = report.failures[Number(location.hash.slice(1)) - 1];
-    if (linked) this.open(linked);
+    addEventListener("hashchange", () => this.follow());
+    this.follow();
+  }
+
+  /** Go to the failure that the address names. */
+  follow() {
+    const [, key] = location.hash.match(/^#failure=(.+)/) ?? [];
+    const failure = this.report.failures.find((each) => [each.key, encodeURIComponent(each.key)].includes(key));
+    document.getElementById("lost").hidden = !key || Boolean(failure);
+    if (!failure) return;
+    if (failure.ego_policy !== this.ego) this.choose(failure.ego_policy);
+    this.pick(this.groups.findIndex((group) => isOf(failure, group)));
+    this.open(failure);
   }
 
   /** Selects of the planner, where there are several, and of its traffic. */
   buildScope() {
     const egos = [...new Set(this.report.groups.map(({ ego }) => ego))];
     const scope = document.getElementById("scope");
-    if (egos.length > 1)
-      scope.append(
-        choice(
-          "Planner",
-          egos.map((ego) => [ego, ego]),
-          (ego) => this.choose(ego),
-        ),
-      );
-    this.traffic = choice("Traffic", [], (index) => this.show(index === "" ? this.groups : [this.groups[index]]));
-    scope.append(this.traffic);
+    this.planner = choice(
+      "Planner",
+      egos.map((ego) => [ego, ego]),
+      (ego) => this.choose(ego),
+    );
+    this.planner.hidden = egos.length < 2;
+    this.traffic = choice("Traffic", [], (index) => this.pick(index));
+    scope.append(this.planner, this.traffic);
   }
 
   buildAxes() {
@@ -73,21 +82,29 @@ class Page {
     document.getElementById("axes").append(pick("rate", "Upwards", RATES), pick("realism", "To the right", REALISMS));
   }
 
-  /** Show a planner in all its traffic. */
+  /** Show a planner: all its failures in the index, else those in the traffic that the run was about. */
   choose(ego) {
     this.ego = ego;
+    this.planner.querySelector("select").value = ego;
     this.groups = this.report.groups.filter((group) => group.ego === ego);
     document.getElementById("ego-name").textContent = ego;
     const options = [
+      ...this.groups.map(({ label, failures }, index) => [index, `${label} (${plural(failures, "failure")})`]),
       ["", "all"],
-      ...this.groups.map(({ label, failures }, index) => [index, `${label} (${failures} failures)`]),
     ];
     this.traffic
       .querySelector("select")
       .replaceChildren(...options.map(([value, text]) => element("option", { value }, text)));
     this.traffic.hidden = this.groups.length < 2;
     this.showRealism();
-    this.show(this.groups);
+    this.index.load(this.report.failures.filter((failure) => failure.ego_policy === ego));
+    this.pick(this.groups.indexOf(mainOf(this.groups)));
+  }
+
+  /** Show the group of this index, or "": all. */
+  pick(index) {
+    this.traffic.querySelector("select").value = index;
+    this.show(index === "" ? this.groups : [this.groups[index]]);
   }
 
   showRealism() {
@@ -95,16 +112,12 @@ class Page {
     showRealism(document.getElementById("realism"), points, this.axes.rate, this.axes.realism);
   }
 
-  /** Show the failures of some groups: their modes, the typical case of the first, the atlas, the index. */
+  /** Show the failures of some groups: their modes, the typical case of the first, the atlas. */
   show(groups) {
-    const among = (failure) =>
-      groups.some(
-        ({ ego, method, eta }) => failure.ego_policy === ego && failure.method === method && failure.eta === eta,
-      );
-    const failures = this.report.failures.filter(among);
+    const failures = this.report.failures.filter((failure) => groups.some((group) => isOf(failure, group)));
+    this.shown = groups;
     this.modes = groupByMode(failures, this.report.modes);
     this.summarise(failures, groups);
-    this.index.load(failures);
     showModes(document.getElementById("modes"), this.modes, failures.length, this.store, (mode) => this.openMode(mode));
     const atlas = groupByCell(failures, this.report.cells);
     showAtlas(document.getElementById("atlas"), atlas, (failure) => this.open(failure));
@@ -112,37 +125,67 @@ class Page {
     if (failures.length) this.open(this.modes[0].typical);
   }
 
+  /** The first lines: how often the planner fails in one setting. Rates of several are not pooled. */
   summarise(failures, groups) {
-    const rollouts = groups.reduce((sum, group) => sum + group.rollouts, 0);
-    const traffic = groups.length === 1 ? ` in ${groups[0].label}` : "";
     const named = this.modes.filter(({ mode, counted }) => mode !== OTHER && counted > 0).length;
-    const { dataset, split, n_scenes: scenes, n_seeds: seeds } = this.report.run;
-    const counted = meanOf(failures, "counted");
+    const { dataset, split, n_scenes: scenes, stage, tries } = this.report.run;
+    const [{ label, rates, rollouts }] = groups;
+    const found = new Set(failures.filter(({ preventable }) => preventable === 1).map((failure) => failure.scene_id));
+    const lines = [`${plural(failures.length, "failure")} in ${plural(groups.length, "setting")}; choose one for its rate.`];
+    if (groups.length === 1) {
+      lines[0] = `In ${label} it was hit in ${rates.cfr ?? `${failures.length} of ${rollouts} rollouts`}.`;
+      if (rates.cfr_counted) lines.push(`${rates.cfr_counted} count: its fault, or a competent driver prevents it.`);
+      if (rates.cfr_preventable) lines.push(`Preventable: ${rates.cfr_preventable}, in ${found.size} of ${scenes} scenes.`);
+      if (!rates.cfr?.includes("interval")) lines.push("No intervals: they need scenes of at least ten places.");
+      if (tries) lines.push("Tries go where failures are: rates of tries are no rates of the planner.");
+    }
+    document.getElementById("stage").textContent = stage ? `, ${stage} training` : "";
     document.getElementById("modes-title").textContent = failures.length
       ? `Its ${named} weakness${named === 1 ? "" : "es"}`
       : "No failure found";
-    document.getElementById("summary").textContent =
-      `${failures.length} failures in ${rollouts} rollouts${traffic} (${percent(failures.length / rollouts)})` +
-      `${counted === null ? "" : `; ${percent(counted)} count: the ego's fault, or a competent driver prevents it`}. ` +
-      `${dataset}/${split}, ${scenes} scenes, ${seeds} seed${seeds === 1 ? "" : "s"}.`;
+    lines.push(`${dataset}/${split}, ${scenes} scenes.`);
+    document.getElementById("summary").replaceChildren(element("strong", {}, lines.shift()), ` ${lines.join(" ")}`);
   }
 
   /** Show the typical case of a mode, and its failures in the index. */
   openMode(mode) {
-    this.index.chooseMode(mode.mode);
+    this.index.filterBy({ Mode: mode.mode, Traffic: this.shown.length === 1 ? trafficOf(mode.typical) : "" });
     this.open(mode.typical);
     if (matchMedia("(max-width: 900px)").matches) document.getElementById("player").scrollIntoView();
   }
 
+  /** What can be copied of a failure: the link to it, and commands. */
+  copies({ key }) {
+    const { again, folder } = this.report.run;
+    const given = key.includes("~") ? `"failure='${key}'"` : `failure=${key}`; // for Hydra, in a shell
+    return {
+      Link: `${location.href.split("#")[0]}#failure=${key}`,
+      "Drive it again": again && `${again} ${given}`,
+      "Export it": `e2rl export ${folder} --to openscenario --failure ${key}`,
+      "Its video": `e2rl replay ${folder}/rollouts/${key}.npz`,
+    };
+  }
+
   open(failure) {
     if (!failure) return;
-    history.replaceState(null, "", `#${failure.number + 1}`);
+    history.replaceState(null, "", `#failure=${failure.key}`);
+    showCopies(document.getElementById("copies"), this.copies(failure));
     this.index.mark(failure);
     const buttons = document.querySelectorAll(".mode");
     this.modes.forEach(({ mode }, index) => buttons[index].setAttribute("aria-pressed", String(mode === failure.mode)));
     markCell(document.getElementById("atlas"), failure);
     this.player.show(failure, capital(modeName(failure.mode, this.report.modes)));
   }
+}
+
+const isOf = (failure, { ego, method, eta }) =>
+  failure.ego_policy === ego && failure.method === method && failure.eta === eta;
+
+/** The group that the run was about: the search, else the first attack, at its highest intensity. */
+function mainOf(groups) {
+  const attacks = groups.filter(({ eta }) => eta > 0);
+  const { method } = attacks.find((group) => group.method === "search") ?? attacks[0] ?? groups[0];
+  return groups.filter((group) => group.method === method).reduce((most, each) => (each.eta > most.eta ? each : most));
 }
 
 const page = new Page(JSON.parse(document.getElementById("report").textContent));

@@ -198,7 +198,7 @@ class Player {
     const speed = poseAt(ego, Math.min(time, replay.contact)).speed.toFixed(1);
     this.node.scrubber.value = Math.round(time);
     this.node.scrubber.setAttribute("aria-valuetext", `${seconds} s`);
-    this.node.clock.textContent = `${seconds} s\nego ${speed} m/s`;
+    this.node.clock.textContent = `${seconds} s\nego ${time > replay.contact ? "hit at " : ""}${speed} m/s`;
     this.node.badge.hidden = time < replay.contact;
     this.node.scene.setAttribute("aria-label", `Traffic from above at ${seconds} s; the ego drives ${speed} m/s`);
     const { clientWidth, clientHeight } = this.node.scene;
