@@ -7,12 +7,11 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from e2rl.evaluation.again import failure_row, outcome, part_of
 from e2rl.evaluation.budget import search_all
 from e2rl.evaluation.methods import processes_of
 from e2rl.evaluation.plan import begin
 from e2rl.evaluation.protocol import WHOLE, Work, drive_all, record, score_all
-from e2rl.evaluation.reproduce import compared_with_run, run_of
+from e2rl.evaluation.reproduce import compared_with_run, failure_row, outcome, run_of
 from e2rl.report.budget import save_budget
 from e2rl.report.results import references, write_results
 from e2rl.run.command import run_command
@@ -29,7 +28,7 @@ def evaluate(run: Run) -> None:
     setups, most = egos.setups(plan.setup), max(asked.budget, default=0.0)
     then = failure_row(Path(config.reproduce), config.failure) if config.failure else None
     if then is not None:
-        (scored,) = score_all([("failure", part_of(plan, then, Path(config.reproduce)))], work, lambda job: 1)
+        (scored,) = score_all([("failure", plan.part_of(then, Path(config.reproduce)))], work, lambda job: 1)
     elif asked.budget:
         scored, tries = search_all(setups, plan.searches, most, asked.budget_unit, asked.seeds, work)
         egos = replace(egos, pairs=())  # tries of different egos are no pairs
@@ -43,7 +42,7 @@ def evaluate(run: Run) -> None:
         save_budget(folder, plan, tries, *scored[:2])
     print("", *write_results(run, plan, rows), sep="\n")
     if then is not None:
-        print(f"{config.failure}: {outcome(then, scored[0])}")
+        print(f"{config.failure}: {outcome(then, scored[0][0])}")
     elif config.reproduce:
         print(f"{config.reproduce}: {compared_with_run(config, folder).text()}")
 

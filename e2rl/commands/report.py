@@ -9,20 +9,15 @@ from e2rl.report.html import PAGE, REPLAYS, write_report
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 
-MEASURED = [Path(stage, part) for stage in ("before", "after") for part in ("", SEARCH)]  # in a training's folder
+MEASURED = ("before", f"before/{SEARCH}", "after", f"after/{SEARCH}")  # of a training
 
 
-def measured(run: Path) -> list[Path]:
-    """Returns the folders with rollouts: the run's own, or those that a training measured before and after it;
-    InputError where there are none."""
-    found = [each for each in (run, *(run / part for part in MEASURED)) if (each / TABLE).is_file()]
-    if not found:
-        raise InputError(
-            f"{run}: no {TABLE}, so nothing was measured in closed loop; give the folder of a run of evaluate.py, or of "
-            "train.py whose first measurement is done. What another stage of training made is driven first, such as by: "
-            "python evaluate.py prior.checkpoint=RUN, or ego=actor ego.checkpoint=RUN"
-        )
-    return found[:1] if found[0] == run else found
+def folders_of(run: Path) -> list[Path]:
+    """Returns the folders with rollouts: the run's own, or those of a training; InputError where there are none."""
+    if found := [each for each in (run, *(run / part for part in MEASURED)) if (each / TABLE).is_file()]:
+        return found[:1] if found[0] == run else found
+    mend = "give a run of evaluate.py, which drives what another training made by its checkpoint"
+    raise InputError(f"{run}: no {TABLE}, neither of an evaluation nor measured by a training; {mend}")
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -34,9 +29,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, help=f"file to write (default: RUN_DIR/{PAGE})")
     options = parser.parse_args(arguments)
     with ending():
-        folders = measured(options.run)
+        folders = folders_of(options.run)
         if (options.out or options.method) and len(folders) > 1:
-            several = f"{options.run} is a training, with a page for each of {len(folders)} folders"
-            raise InputError(f"--out, --method: {several}; name one, such as {folders[-1]}")
+            raise InputError(f"{options.run}: a training has {len(folders)} pages; name one, such as {folders[-1]}")
         for folder in folders:
             print(write_report(folder, replays=options.replays, methods=options.method, path=options.out))

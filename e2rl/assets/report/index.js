@@ -99,10 +99,10 @@ class Index {
   /** Set some filters, {label: value}. */
   filterBy(wanted) {
     for (const label of this.filters.querySelectorAll("label")) {
-      const select = label.querySelector("select");
-      if (!(label.firstChild.data in wanted)) continue;
-      select.value = wanted[label.firstChild.data];
-      select.dispatchEvent(new Event("change"));
+      const value = wanted[label.firstChild.data];
+      if (value === undefined) continue;
+      label.lastChild.value = value;
+      label.lastChild.dispatchEvent(new Event("change"));
     }
   }
 
@@ -112,9 +112,7 @@ class Index {
     const { value } = COLUMNS[this.order.column];
     const compare = (first, second) => (first < second ? -1 : first > second ? 1 : 0);
     const passed = this.failures.filter((failure) => keeps.every((keep) => keep(failure)));
-    return passed.sort(
-      (first, second) => this.order.sign * compare(value(first), value(second)) || first.number - second.number,
-    );
+    return passed.sort((first, second) => this.order.sign * compare(value(first), value(second)));
   }
 
   show() {

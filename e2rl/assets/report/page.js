@@ -26,9 +26,6 @@ class Store {
 class Page {
   constructor(report) {
     this.report = report;
-    report.failures.forEach((failure, number) => {
-      failure.number = number;
-    });
     this.store = new Store(report);
     this.player = new Player(this.store, (direction) => this.open(this.index.neighbour(direction)));
     this.index = new Index((failure) => this.open(failure), report.modes);
@@ -54,7 +51,7 @@ class Page {
     document.getElementById("lost").hidden = !key || Boolean(failure);
     if (!failure) return;
     if (failure.ego_policy !== this.ego) this.choose(failure.ego_policy);
-    this.pick(this.groups.findIndex((group) => isOf(failure, group)));
+    this.show(this.groups.find((group) => isOf(failure, group)));
     this.open(failure);
   }
 
@@ -68,7 +65,7 @@ class Page {
       (ego) => this.choose(ego),
     );
     this.planner.hidden = egos.length < 2;
-    this.traffic = choice("Traffic", [], (index) => this.pick(index));
+    this.traffic = choice("Traffic", [], (index) => this.show(this.groups[index]));
     scope.append(this.planner, this.traffic);
   }
 
@@ -88,23 +85,14 @@ class Page {
     this.planner.querySelector("select").value = ego;
     this.groups = this.report.groups.filter((group) => group.ego === ego);
     document.getElementById("ego-name").textContent = ego;
-    const options = [
-      ...this.groups.map(({ label, failures }, index) => [index, `${label} (${plural(failures, "failure")})`]),
-      ["", "all"],
-    ];
+    const options = this.groups.map(({ label, failures }) => `${label} (${plural(failures, "failure")})`);
     this.traffic
       .querySelector("select")
-      .replaceChildren(...options.map(([value, text]) => element("option", { value }, text)));
+      .replaceChildren(...options.map((text, value) => element("option", { value }, text)));
     this.traffic.hidden = this.groups.length < 2;
     this.showRealism();
     this.index.load(this.report.failures.filter((failure) => failure.ego_policy === ego));
-    this.pick(this.groups.indexOf(mainOf(this.groups)));
-  }
-
-  /** Show the group of this index, or "": all. */
-  pick(index) {
-    this.traffic.querySelector("select").value = index;
-    this.show(index === "" ? this.groups : [this.groups[index]]);
+    this.show(mainOf(this.groups));
   }
 
   showRealism() {
@@ -112,12 +100,12 @@ class Page {
     showRealism(document.getElementById("realism"), points, this.axes.rate, this.axes.realism);
   }
 
-  /** Show the failures of some groups: their modes, the typical case of the first, the atlas. */
-  show(groups) {
-    const failures = this.report.failures.filter((failure) => groups.some((group) => isOf(failure, group)));
-    this.shown = groups;
+  /** Show the failures of a group: their modes, the typical case of the first, the atlas. */
+  show(group) {
+    const failures = this.report.failures.filter((failure) => isOf(failure, group));
+    this.traffic.querySelector("select").value = this.groups.indexOf(group);
     this.modes = groupByMode(failures, this.report.modes);
-    this.summarise(failures, groups);
+    this.summarise(failures, group);
     showModes(document.getElementById("modes"), this.modes, failures.length, this.store, (mode) => this.openMode(mode));
     const atlas = groupByCell(failures, this.report.cells);
     showAtlas(document.getElementById("atlas"), atlas, (failure) => this.open(failure));
@@ -125,51 +113,40 @@ class Page {
     if (failures.length) this.open(this.modes[0].typical);
   }
 
-  /** The first lines: how often the planner fails in one setting. Rates of several are not pooled. */
-  summarise(failures, groups) {
+  /** The first lines: how often the planner fails in one traffic; rates of several are not pooled. */
+  summarise(failures, { label, rates, rollouts }) {
     const named = this.modes.filter(({ mode, counted }) => mode !== OTHER && counted > 0).length;
     const { dataset, split, n_scenes: scenes, stage, tries } = this.report.run;
-    const [{ label, rates, rollouts }] = groups;
     const found = new Set(failures.filter(({ preventable }) => preventable === 1).map((failure) => failure.scene_id));
-    const lines = [`${plural(failures.length, "failure")} in ${plural(groups.length, "setting")}; choose one for its rate.`];
-    if (groups.length === 1) {
-      lines[0] = `In ${label} it was hit in ${rates.cfr ?? `${failures.length} of ${rollouts} rollouts`}.`;
-      if (rates.cfr_counted) lines.push(`${rates.cfr_counted} count: its fault, or a competent driver prevents it.`);
-      if (rates.cfr_preventable) lines.push(`Preventable: ${rates.cfr_preventable}, in ${found.size} of ${scenes} scenes.`);
-      if (!rates.cfr?.includes("interval")) lines.push("No intervals: they need scenes of at least ten places.");
-      if (tries) lines.push("Tries go where failures are: rates of tries are no rates of the planner.");
-    }
+    const hit = rates.cfr ?? `${failures.length} of ${rollouts} rollouts`;
+    const lines = [
+      rates.cfr_counted && `${rates.cfr_counted} count: its fault, or a competent driver prevents it.`,
+      rates.cfr_preventable && `Preventable: ${rates.cfr_preventable}, in ${found.size} of ${scenes} scenes.`,
+      !hit.includes("interval") && "No intervals: they need scenes of at least ten places.",
+      tries && "Tries go where failures are: rates of tries are no rates of the planner.",
+      `${dataset}/${split}, ${scenes} scenes.`,
+    ];
+    const first = element("strong", {}, `In ${label} it was hit in ${hit}.`);
+    document.getElementById("summary").replaceChildren(first, ` ${lines.filter(Boolean).join(" ")}`);
     document.getElementById("stage").textContent = stage ? `, ${stage} training` : "";
     document.getElementById("modes-title").textContent = failures.length
       ? `Its ${named} weakness${named === 1 ? "" : "es"}`
       : "No failure found";
-    lines.push(`${dataset}/${split}, ${scenes} scenes.`);
-    document.getElementById("summary").replaceChildren(element("strong", {}, lines.shift()), ` ${lines.join(" ")}`);
   }
 
   /** Show the typical case of a mode, and its failures in the index. */
   openMode(mode) {
-    this.index.filterBy({ Mode: mode.mode, Traffic: this.shown.length === 1 ? trafficOf(mode.typical) : "" });
+    this.index.filterBy({ Mode: mode.mode, Traffic: trafficOf(mode.typical) });
     this.open(mode.typical);
     if (matchMedia("(max-width: 900px)").matches) document.getElementById("player").scrollIntoView();
-  }
-
-  /** What can be copied of a failure: the link to it, and commands. */
-  copies({ key }) {
-    const { again, folder } = this.report.run;
-    const given = key.includes("~") ? `"failure='${key}'"` : `failure=${key}`; // for Hydra, in a shell
-    return {
-      Link: `${location.href.split("#")[0]}#failure=${key}`,
-      "Drive it again": again && `${again} ${given}`,
-      "Export it": `e2rl export ${folder} --to openscenario --failure ${key}`,
-      "Its video": `e2rl replay ${folder}/rollouts/${key}.npz`,
-    };
   }
 
   open(failure) {
     if (!failure) return;
     history.replaceState(null, "", `#failure=${failure.key}`);
-    showCopies(document.getElementById("copies"), this.copies(failure));
+    const copies = Object.entries({ Link: `${location.href.split("#")[0]}#failure=@NAME@`, ...this.report.commands });
+    const fields = copies.map(([label, text]) => copyField(label, text.replaceAll("@NAME@", failure.key)));
+    document.getElementById("copies").replaceChildren(...fields);
     this.index.mark(failure);
     const buttons = document.querySelectorAll(".mode");
     this.modes.forEach(({ mode }, index) => buttons[index].setAttribute("aria-pressed", String(mode === failure.mode)));

@@ -63,19 +63,14 @@ function chainText({ plans, contact, tracks }) {
   return null;
 }
 
-/** Fields to copy from, of the {label: text} that are known. */
-function showCopies(container, texts) {
-  const known = Object.entries(texts).filter(([, text]) => text);
-  container.replaceChildren(
-    ...known.map(([label, text]) => {
-      const field = element("input", { readonly: "", value: text });
-      const button = element("button", { type: "button", "aria-label": `Copy: ${label}` }, "Copy");
-      button.addEventListener("click", () => {
-        field.select();
-        document.execCommand("copy"); // which a page from a file, or without https, may use, too
-        button.textContent = "Copied";
-      });
-      return element("div", {}, element("label", {}, label, field), button);
-    }),
-  );
+/** A field to copy from, with its button. */
+function copyField(label, text) {
+  const field = element("input", { readonly: "", value: text });
+  const button = element("button", { type: "button", "aria-label": `Copy: ${label}` }, "Copy");
+  button.addEventListener("click", () => {
+    field.select();
+    document.execCommand("copy"); // which a page from a file, or without https, may use, too
+    button.textContent = "Copied";
+  });
+  return element("div", {}, element("label", {}, label, field), button);
 }
