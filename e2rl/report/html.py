@@ -155,7 +155,7 @@ def commands(run: Path, quoted: bool) -> dict[str, str]:
     found = {"Export it": export, "Its video": ["e2rl", "replay", f"{path}/{ROLLOUTS}/@NAME@.npz"]}
     if (run / CONFIG).is_file():  # an evaluation's
         saved = read_yaml(run / CONFIG)
-        whole = saved.reproduce if saved.get("failure") else path  # one failure, driven again, has no tries
+        whole = saved.get("reproduce") if saved.get("failure") else path  # one failure, driven again, has no tries
         again = [assigned("reproduce", whole), "failure='@NAME@'" if quoted else "failure=@NAME@"]
         found = {AGAIN: ["e2rl", "evaluate", *again], **found}
     return {what: shlex.join(words) for what, words in found.items()}

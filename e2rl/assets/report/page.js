@@ -39,14 +39,15 @@ class Page {
       this.player.repaint();
       repaintModes(document.getElementById("modes"), this.modes);
     });
+    const asked = location.hash; // which `open` changes
     this.choose(report.groups[0].ego);
-    addEventListener("hashchange", () => this.follow());
-    this.follow();
+    addEventListener("hashchange", () => this.follow(location.hash));
+    this.follow(asked);
   }
 
-  /** Go to the failure that the address names. */
-  follow() {
-    const [, key] = location.hash.match(/^#failure=(.+)/) ?? [];
+  /** Go to the failure that the end of an address names. */
+  follow(hash) {
+    const [, key] = hash.match(/^#failure=(.+)/) ?? [];
     const failure = this.report.failures.find((each) => [each.key, encodeURIComponent(each.key)].includes(key));
     document.getElementById("lost").hidden = !key || Boolean(failure);
     if (!failure) return;
@@ -59,11 +60,8 @@ class Page {
   buildScope() {
     const egos = [...new Set(this.report.groups.map(({ ego }) => ego))];
     const scope = document.getElementById("scope");
-    this.planner = choice(
-      "Planner",
-      egos.map((ego) => [ego, ego]),
-      (ego) => this.choose(ego),
-    );
+    const named = egos.map((ego) => [ego, ego]);
+    this.planner = choice("Planner", named, (ego) => this.choose(ego));
     this.planner.hidden = egos.length < 2;
     this.traffic = choice("Traffic", [], (index) => this.show(this.groups[index]));
     scope.append(this.planner, this.traffic);
