@@ -156,7 +156,7 @@ def commands(run: Path, quoted: bool) -> dict[str, str]:
     if (run / CONFIG).is_file():  # an evaluation's
         saved = read_yaml(run / CONFIG)
         whole = saved.get("reproduce") if saved.get("failure") else path  # one failure, driven again, has no tries
-        again = [assigned("reproduce", whole), "failure='@NAME@'" if quoted else "failure=@NAME@"]
+        again = [assigned("reproduce", whole), 'failure="@NAME@"' if quoted else "failure=@NAME@"]
         found = {AGAIN: ["e2rl", "evaluate", *again], **found}
     return {what: shlex.join(words) for what, words in found.items()}
 
