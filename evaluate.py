@@ -5,12 +5,13 @@ import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one lin
 # isort: split
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 from e2rl.evaluation.budget import search_all
 from e2rl.evaluation.methods import processes_of
 from e2rl.evaluation.plan import begin
-from e2rl.evaluation.protocol import WHOLE, Work, drive_all, record
-from e2rl.evaluation.reproduce import compared_with_run, run_of
+from e2rl.evaluation.protocol import WHOLE, Work, drive_all, record, score_all
+from e2rl.evaluation.reproduce import compared_with_run, failure_row, outcome, run_of
 from e2rl.report.budget import save_budget
 from e2rl.report.results import references, write_results
 from e2rl.run.command import run_command
@@ -25,7 +26,10 @@ def evaluate(run: Run) -> None:
     asked, egos = plan.asked, plan.egos
     work = Work(plan.rollouts(folder), processes_of(config), plan.only, run.parts(), asked.shard)
     setups, most = egos.setups(plan.setup), max(asked.budget, default=0.0)
-    if asked.budget:
+    then = failure_row(Path(config.reproduce), config.failure) if config.failure else None
+    if then is not None:
+        (scored,) = score_all([("failure", plan.part_of(then, Path(config.reproduce)))], work, lambda job: 1)
+    elif asked.budget:
         scored, tries = search_all(setups, plan.searches, most, asked.budget_unit, asked.seeds, work)
         egos = replace(egos, pairs=())  # tries of different egos are no pairs
     else:
@@ -34,10 +38,12 @@ def evaluate(run: Run) -> None:
         print(f"\nshard {asked.shard[0]} of {asked.shard[1]} written to {folder}; e2rl merge joins all of them")
         return
     rows = record(*scored, folder, partial(egos.metric_rows, references=references(plan), **origin_of(run.folder)))
-    if asked.budget:
+    if asked.budget and then is None:
         save_budget(folder, plan, tries, *scored[:2])
     print("", *write_results(run, plan, rows), sep="\n")
-    if config.reproduce:
+    if then is not None:
+        print(f"{config.failure}: {outcome(then, scored[0][0])}")
+    elif config.reproduce:
         print(f"{config.reproduce}: {compared_with_run(config, folder).text()}")
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from e2rl.evaluation.reproduce import failure_row
 from e2rl.evaluation.rollout_files import TABLE, own_folder, read_rows
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.export.episode import FACTS, Episode
@@ -63,22 +64,24 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("run", type=Path, metavar="RUN_DIR", help="folder of a run of evaluate.py")
     parser.add_argument("--to", required=True, choices=FORMATS, metavar="FORMAT", help=", ".join(FORMATS))
     parser.add_argument("--failures", type=int, metavar="N", help="at most so many failures (default: all)")
+    parser.add_argument("--failure", metavar="NAME", help="only this failure, as failures.csv names it")
     parser.add_argument("--all", action="store_true", help="every rollout, not only failures")
     parser.add_argument("--method", metavar="NAME", help="rollouts in its traffic only")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="a new folder (default: RUN_DIR/export/FORMAT)")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="a new folder (default: below RUN_DIR/export)")
     parser.add_argument("--open-ego", action="store_true", help="leave the ego to a planner or controller of your own")
     parser.add_argument("--no-scene", action="store_true", help="do without the data: lanes of the rollout files alone")
     parser.add_argument("--plugin", action="append", default=[], metavar="MODULE", help="the data source's; repeatable")
     options = parser.parse_args(arguments)
     with ending():
-        out = options.out or own_folder(options.run, "export", options.to)
+        out = options.out or own_folder(options.run, "export", *filter(None, [options.failure]), options.to)
         if options.open_ego and options.to not in OPEN_EGO:
             others = " or ".join(OPEN_EGO)
             raise InputError(f"--open-ego: {options.to} has no such form; leave it out, or pass --to {others}")
         write = library(f"e2rl.report.export.{FORMATS[options.to]}", f"--to {options.to}", options.to).write
         if options.failures is not None and options.failures < 1:
             raise InputError(f"--failures {options.failures}: expected at least 1")
-        rows = chosen_rows(options.run, options.failures, options.all, options.method)
+        given = (options.run, options.failures, options.all, options.method)
+        rows = [failure_row(options.run, options.failure)] if options.failure else chosen_rows(*given)
         episodes = episodes_of(options.run, rows, options.plugin, not options.no_scene)
         shown = tqdm(episodes, "exporting", len(rows), unit="rollout", leave=False, disable=None)
         export(shown, write, out, options.open_ego)

@@ -1,4 +1,4 @@
-"""`e2rl replay RUN_DIR`: videos (GIF) of the first failures of a run."""
+"""`e2rl replay RUN_DIR`: videos (GIF) of failures of a run, first those that count, one of a scene."""
 
 import argparse
 from collections.abc import Iterator

@@ -1,19 +1,36 @@
-"""`e2rl report RUN_DIR`: the failure report of a run, one HTML file that opens offline."""
+"""`e2rl report RUN_DIR`: the failure report of a run, one HTML file that opens offline, and a list of its failures."""
 
 import argparse
 from pathlib import Path
 
+from e2rl.evaluation.methods import SEARCH
+from e2rl.evaluation.rollout_files import TABLE
 from e2rl.report.html import PAGE, REPLAYS, write_report
 from e2rl.run.endings import ending
+from e2rl.run.errors import InputError
+
+MEASURED = ("before", f"before/{SEARCH}", "after", f"after/{SEARCH}")  # of a training
+
+
+def folders_of(run: Path) -> list[Path]:
+    """Returns the folders with rollouts: the run's own, or those of a training; InputError where there are none."""
+    if found := [each for each in (run, *(run / part for part in MEASURED)) if (each / TABLE).is_file()]:
+        return found[:1] if found[0] == run else found
+    mend = "give a run of evaluate.py, which drives what another training made by its checkpoint"
+    raise InputError(f"{run}: no {TABLE}, neither of an evaluation nor measured by a training; {mend}")
 
 
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="e2rl report", description=__doc__)
-    parser.add_argument("run", type=Path, metavar="RUN_DIR", help="folder of a run of evaluate.py")
+    parser.add_argument("run", type=Path, metavar="RUN_DIR", help="folder of a run of evaluate.py or train.py")
     parser.add_argument("--replays", type=int, default=REPLAYS, metavar="N", help="at most so many (%(default)s)")
     parser.add_argument("--method", action="append", default=[], metavar="NAME", help="its failures only; repeatable")
     parser.add_argument("--out", type=Path, help=f"file to write (default: RUN_DIR/{PAGE})")
     options = parser.parse_args(arguments)
     with ending():
-        print(write_report(options.run, replays=options.replays, methods=options.method, path=options.out))
+        folders = folders_of(options.run)
+        if (options.out or options.method) and len(folders) > 1:
+            raise InputError(f"{options.run}: a training has {len(folders)} pages; name one, such as {folders[-1]}")
+        for folder in folders:
+            print(write_report(folder, replays=options.replays, methods=options.method, path=options.out))

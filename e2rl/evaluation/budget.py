@@ -228,6 +228,8 @@ def failures_of(file: Path, ego_name: str, plan: Plan, setup: Setup) -> list[Par
         raise InputError(f"{file}: family {min(unknown)} is none of search.families; set these as in its run")
     every = range(len(setup.scenes))
     searches = {seed: plan.begin(setup, seed, every) for seed in {seed // TRIES for _, seed, _ in rows}}
+    if other := next((type(each).__name__ for each in searches.values() if type(each) is not Search), None):
+        raise InputError(f"{file}: a try of {other} depends on those before it; make the whole search again")
     tries: dict[int, list[Try]] = {}
     for scene_id, number, name in rows:
         seed, scene = number // TRIES, setup.scenes.index(scene_id)

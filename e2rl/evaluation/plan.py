@@ -5,13 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from e2rl.evaluation.budget import Plan, build_plans
+from e2rl.evaluation.budget import TRIES_FILE, Plan, build_plans, failures_of
 from e2rl.evaluation.ego_set import EgoSet, build_egos
 from e2rl.evaluation.methods import EvaluationSettings, build_methods, build_prior, build_sim, evaluation_settings
-from e2rl.evaluation.protocol import Method, Setup
+from e2rl.evaluation.protocol import Method, Part, Setup, Task
 from e2rl.evaluation.reproduce import files_of_run
 from e2rl.prior.prior import Prior
 from e2rl.run.config import set_up
+from e2rl.run.errors import InputError
 from e2rl.run.run import Run
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.scene_list import listed
@@ -49,6 +50,20 @@ class Evaluation:
     def scenes(self) -> SceneSet:
         """The scenes, of which `only` may be a part."""
         return self.setup.scenes
+
+    def part_of(self, row: Mapping[str, Any], run: Path) -> Part:
+        """Returns the rollout of a row in the table of a run of this plan, to be driven again, in a batch of its own.
+        Raises InputError where the run's folder does not say what was tried."""
+        setup = next(each for each in self.egos.setups(self.setup) if each.ego_name == row["ego_policy"])
+        name, task = row["method"], Task(self.scenes.index(row["scene_id"]), row["seed"])
+        methods = [each for each in self.methods if (each.name, each.eta) == (name, row["eta"])]
+        parts: list[Part] = [(setup, method, [task]) for method in methods]
+        for search in (each for each in self.searches if each.name == name):
+            parts += failures_of(run / TRIES_FILE, setup.ego_name, search, setup)
+        for _, method, tasks in parts:
+            if found := [each for each in tasks if each[:2] == task[:2]]:
+                return setup, method, found
+        raise InputError(f"{run}: does not say how {row['scene_id']} was driven; give the whole folder of the run")
 
 
 def begin(run: Run) -> Evaluation:

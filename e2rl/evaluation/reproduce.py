@@ -1,4 +1,5 @@
-"""`reproduce=RUN_DIR`: the table of a run made again in a new folder, with its configuration, scenes and weights.
+"""`reproduce=RUN_DIR`: the table of a run made again in a new folder, with its configuration, scenes and weights; with
+`failure=NAME` one of its failures alone.
 
 The folder may be a stranger's, so what holds for `resume` holds here, too: no code of its takes part that the command
 line does not name. Where data and weights lie, and what fits a machine, is the command line's own.
@@ -15,12 +16,14 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from e2rl.evaluation.rollout_files import METRICS_FILE, read_metrics, write_json
+from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, read_metrics, read_rows, write_json
+from e2rl.metrics.failure_modes import is_failure
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
 from e2rl.run.run import Run, changed, inputs, read_provenance, versions
 from e2rl.run.trust import ALWAYS, WRITTEN, check_written, leaves, saved_configuration
 from e2rl.scenes.scene_list import SCENES
+from e2rl.sim.rollout_file import rollout_key
 
 HERE = ("processes", "data.cache", "data.cache_gb", "data.workers")  # of this machine: always the command line's
 MOVED = ("device", "data.path", *HERE)  # what the command line may set, besides files of weights
@@ -40,6 +43,8 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
     Tells on stderr where versions differ. Raises InputError where there is no finished table, where its configuration
     names code (`e2rl.run.trust`), for weights that are others or not there, and for settings that cannot change.
     """
+    if config.failure and not (config.reproduce or config.resume):
+        raise InputError(f"failure={config.failure}: is one of a run; name its folder by reproduce=RUN_DIR")
     if config.resume or not config.reproduce:
         return Run.of(config, free)
     where, old = f"reproduce={config.reproduce}", Path(config.reproduce).resolve()
@@ -51,6 +56,7 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
     _move(config, saved, [_key(name) for name in files], known["choices"], where)
     check_written(saved, old, where, config, load_config())
     saved.plugins, saved.resume, saved.reproduce, saved.scenes = config.plugins, None, str(old), str(old / SCENES)
+    saved.failure = config.failure or saved.failure
     _check_weights(config, saved, files, where)
     _tell_versions(saved, known, where)
     return Run(saved, Run.of(config).folder, known["choices"])
@@ -66,7 +72,8 @@ def _move(
 ) -> None:
     """Set in `saved` what the command line may set anew."""
     given = [item.lstrip("+~").partition("=")[::2] for item in HydraConfig.get().overrides.task]
-    names = [name for name, value in given if name not in ("reproduce", *ALWAYS) and choices.get(name) != value]
+    free = ("reproduce", "failure", *ALWAYS)
+    names = [name for name, value in given if name not in free and choices.get(name) != value]
     if wrong := [name for name in names if name not in (*MOVED, *WRITTEN, *files)]:
         raise InputError(
             f"{where}: is made again as it was; leave out {', '.join(wrong)} (only {', '.join(MOVED)} and files of "
@@ -116,6 +123,23 @@ def _tell_versions(saved: DictConfig, known: Mapping[str, Any], where: str) -> N
 
 def _short(value: Any) -> str:
     return str(value)[:12] if value else "none"
+
+
+# --- one failure
+
+
+def failure_row(run: Path, name: str) -> dict[str, Any]:
+    """Returns the row of a run's failure of this name; InputError where the run has none."""
+    rows = {rollout_key(row): row for row in read_rows(run / TABLE) if is_failure(row)}
+    if name not in rows:
+        raise InputError(f"{name}: none of the {len(rows)} failures of {run}; take a name from its failures.csv")
+    return rows[name]
+
+
+def outcome(*rows: Mapping[str, Any]) -> str:
+    """Returns whether a failure, then and now, is the same: with whom the ego collides, and when."""
+    hits = [f"agent {row['partner']} after {row['contact_time']:.1f} s" if row["cfr"] == 1 else "none" for row in rows]
+    return f"the same contact: {hits[0]}" if hits[0] == hits[1] else f"another contact: {hits[1]}; it was {hits[0]}"
 
 
 # --- tables

@@ -1,4 +1,4 @@
-"""The failure report: one HTML file that opens offline, failures.html.
+"""The failure report: one HTML file that opens offline, failures.html; and a list for other programs, failures.csv.
 
 It shows the failure modes, a replay of each failure, the atlas, an index to search, the tables of the run and
 collisions over realism. Everything is inside the file: no script, font or picture is loaded from elsewhere.
@@ -7,6 +7,8 @@ collisions over realism. Everything is inside the file: no script, font or pictu
 import hashlib
 import html
 import json
+import os
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,27 +16,33 @@ from typing import Any
 
 from tqdm import tqdm
 
+from e2rl.evaluation.budget import TRIES_FILE
 from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
-from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, nulls, read_metrics, read_rows
+from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, cell, nulls, read_metrics, read_rows
 from e2rl.metrics.atlas import CELL, Cell, by_likelihood, cell_of
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import is_failure
+from e2rl.report.answer import of, rate
 from e2rl.report.failure_tracks import CHANNELS, MAP_QUANTUM, encoded_map, failure_replay
-from e2rl.report.tables import Table, column_names, metric_tables, mode_tables
+from e2rl.report.tables import Table, closed_loop, column_names, metric_tables, mode_tables
+from e2rl.run.config import assigned
 from e2rl.run.errors import InputError
-from e2rl.run.files import write_atomically
-from e2rl.sim.rollout_file import Failure, rollout_name
+from e2rl.run.files import csv_text, write_atomically
+from e2rl.run.trust import CONFIG, read_yaml
+from e2rl.sim.rollout_file import ROLLOUTS, Failure, rollout_key, rollout_name
 
 PAGE = "failures.html"
 REPLAYS = 300  # in the page at most
 ASSETS = Path(__file__).parents[1] / "assets" / "report"
 GROUP = ("ego_policy", "method", "eta")
-COLUMNS = (  # of rollouts.csv, in the page's index and facts
-    *(*GROUP, "scene_id", "seed", "approach", "ego_manoeuvre", "partner_manoeuvre", "contact_type", "duty"),
-    *("counted", "at_fault", "preventable", "avoidable", "avoidable_1s", "evasion_accel", "cfr_adv"),
-    *("ego_speed", "partner_speed", "relvel", "contact_time", "transport"),
+COLUMNS = (  # of rollouts.csv, in failures.csv and in the page's index and facts
+    *("scene_id", "location", *GROUP, "seed", "contact_time", "counted", "at_fault", "preventable", "cfr_clean"),
+    *("duty", "contact_type", "partner", "relvel", "approach", "ego_manoeuvre", "partner_manoeuvre"),
+    *("ego_speed", "partner_speed", "avoidable", "avoidable_1s", "evasion_accel", "cfr_adv", "transport"),
 )
 PLOTTED = ("cfr", "cfr_counted", "real", "real_adv")
+AGAIN = "Drive it again"
+RATES = ("cfr", "cfr_counted", "cfr_preventable")  # in the page's first lines
 
 
 def write_report(
@@ -46,8 +54,8 @@ def write_report(
     methods: Sequence[str] = (),
     path: Path | None = None,
 ) -> Path:
-    """Write the page of a run's folder; returns its path. Raises InputError where files of the run are missing, or no
-    method has the name.
+    """Write the page of a run's folder, and the list of its failures beside it, in a file of the same name that ends in
+    .csv; returns the page's path. Raises InputError where files of the run are missing, or no method has the name.
 
     Args:
         run: the folder, with its rollouts and their table.
@@ -63,8 +71,21 @@ def write_report(
     content = page_content(run, metrics, modes, methods) | {"tables": [vars(table) for table in tables]}
     content |= add_replays(run, content.pop("rows"), content["failures"], replays)
     path = path or run / PAGE
+    write_atomically(path.with_suffix(".csv"), failure_list(content, path.name))
     write_atomically(path, page(content))
     return path
+
+
+def failure_list(content: Mapping[str, Any], page_name: str) -> str:
+    """failures.csv: a line for each failure of the data block: its name, COLUMNS, its mode in words, the link to it in
+    the page, and the command that drives it again."""
+    again = content["commands"].get(AGAIN, "")
+    lines = (
+        [entry["key"], *(cell(entry[name]) for name in COLUMNS), content["modes"].get(entry["mode"], "")]
+        + [f"{page_name}#failure={entry['key']}", again.replace("@NAME@", entry["key"])]
+        for entry in content["failures"]
+    )
+    return csv_text([["failure", *COLUMNS, "mode", "link", "again"], *lines])
 
 
 def page(content: Mapping[str, Any]) -> str:
@@ -91,7 +112,7 @@ def page_content(run: Path, metrics: Sequence[dict], modes: Mapping, methods: Se
         raise InputError(f"--method {wrong[0]}: not in {run / TABLE}; choose among {', '.join(known)}")
     labels = zip(modes["groups"], column_names(modes["groups"]), strict=True)
     groups = {
-        group_key(group): {"ego": group["ego_policy"], "label": label}
+        group_key(group): {"ego": group["ego_policy"], "label": label, "rates": rates(group, metrics)}
         | {name: group[name] for name in ("method", "eta", "rollouts", "failures")}
         for group, label in labels
         if not methods or group["method"] in methods
@@ -101,13 +122,15 @@ def page_content(run: Path, metrics: Sequence[dict], modes: Mapping, methods: Se
     typical = {mode["typical"]["file"] for mode in modes["modes"]}
     cells, places = atlas_places(rows)
     return {
-        "run": {name: metrics[0][name] for name in ("dataset", "split", "n_scenes", "n_seeds", "git", "command")},
+        "run": {name: metrics[0][name] for name in ("dataset", "split", "n_scenes", "git", "command")}
+        | {"stage": metrics[0].get("stage"), "tries": (run / TRIES_FILE).is_file()},
+        "commands": commands(run, "~" in "".join(map(rollout_key, rows))),
         "groups": list(groups.values()),
         "modes": names,
         "cells": [dict(zip(CELL, cell, strict=True)) for cell in cells],
         "failures": [failure(row, names, typical) | place for row, place in zip(rows, places, strict=True)],
         "rows": rows,
-        "points": [plotted(row) for row in metrics if row.get("stage") is None],
+        "points": [plotted(row) for row in closed_loop(metrics)],
         "about": {metric.name: metric.about for metric in METRICS.values()},
         "channels": CHANNELS,
         "map_quantum": MAP_QUANTUM,
@@ -118,11 +141,31 @@ def group_key(row: Mapping) -> tuple:
     return tuple(row[name] for name in GROUP)
 
 
+def rates(group: Mapping, metrics: Sequence[dict]) -> dict[str, str]:
+    """The RATES of a group of modes.json in words; {} where metrics.json knows the group in a pool only."""
+    own = [row for row in closed_loop(metrics) if group_key(row | {"ego_policy": row["ego"]}) == group_key(group)]
+    known = [(row, name) for row in own for name in RATES if row["metrics"].get(name, {}).get("n")]
+    return {name: f"{of(row, name)} rollouts ({rate(row, name)})" for row, name in known}
+
+
+def commands(run: Path, quoted: bool) -> dict[str, str]:
+    """Commands about the failure @NAME@ of a run, by what they do; quoted: names that Hydra takes in quotes only."""
+    path = os.path.relpath(run) if run.resolve().is_relative_to(Path.cwd()) else str(run)
+    export = ["e2rl", "export", path, "--to", "openscenario", "--failure", "@NAME@"]
+    found = {"Export it": export, "Its video": ["e2rl", "replay", f"{path}/{ROLLOUTS}/@NAME@.npz"]}
+    if (run / CONFIG).is_file():  # an evaluation's
+        saved = read_yaml(run / CONFIG)
+        whole = saved.get("reproduce") if saved.get("failure") else path  # one failure, driven again, has no tries
+        again = [assigned("reproduce", whole), 'failure="@NAME@"' if quoted else "failure=@NAME@"]
+        found = {AGAIN: ["e2rl", "evaluate", *again], **found}
+    return {what: shlex.join(words) for what, words in found.items()}
+
+
 def failure(row: Mapping, names: Mapping[int, str], typical: set[str]) -> dict[str, Any]:
-    """What the page's index knows of a failure: COLUMNS, its mode (OTHER for small ones), and whether it is typical."""
+    """What the page knows of a failure: its name, COLUMNS, its mode (OTHER for small ones), whether it is typical."""
     mode = int(row["mode"]) if row["mode"] in names else OTHER
     values = {name: round(row[name], 4) if isinstance(row[name], float) else row[name] for name in COLUMNS}
-    return values | {"mode": mode, "typical": rollout_name(row) in typical, "replay": None}
+    return values | {"key": rollout_key(row), "mode": mode, "typical": rollout_name(row) in typical, "replay": None}
 
 
 def atlas_places(rows: Sequence[Mapping]) -> tuple[list[Cell], list[dict[str, int | None]]]:
@@ -159,27 +202,19 @@ def add_replays(run: Path, rows: Sequence[dict], index: Sequence[dict], count: i
 
 def replay_order(index: Sequence[Mapping]) -> list[int]:
     """Positions of failures in the order in which they get a replay: the typical ones, the likeliest of each cell of
-    the atlas (of a planner, then of each of its traffic alone), then in turn one of each mode of each method."""
-    planner, alone = likeliest(index, GROUP[:1]), likeliest(index, GROUP)
+    the atlas in each traffic, then in turn one of each mode of each method."""
     seen: Counter[tuple] = Counter()
-    turns = []
-    for entry in index:
-        key = (*group_key(entry), entry["mode"])
-        turns.append(seen[key])
+
+    def turn(position: int, name: str) -> int:
+        key = (*group_key(index[position]), name, index[position][name])
         seen[key] += 1
+        return seen[key]
+
+    of_cell = {each: turn(each, "cell") for each in sorted(range(len(index)), key=lambda each: index[each]["rank"])}
+    of_mode = [turn(each, "mode") for each in range(len(index))]
 
     def place(position: int) -> tuple:
-        first = index[position]["typical"], position in planner, position in alone
-        return (*(not each for each in first), turns[position], position)
+        likeliest = index[position]["cell"] is not None and of_cell[position] == 1
+        return not index[position]["typical"], not likeliest, of_mode[position], position
 
     return sorted(range(len(index)), key=place)
-
-
-def likeliest(index: Sequence[Mapping], among: Sequence[str]) -> set[int]:
-    """Positions of the likeliest failure of each cell, of the failures that have the same values of `among`."""
-    found: dict[tuple, int] = {}
-    for position in sorted(range(len(index)), key=lambda position: index[position]["rank"]):
-        entry = index[position]
-        if entry["cell"] is not None:
-            found.setdefault((entry["cell"], *(entry[name] for name in among)), position)
-    return set(found.values())

@@ -32,13 +32,15 @@ def save_animation(path: Path, frames: Sequence[Image.Image], colours: int = COL
 def found_failures(rows: Sequence[dict], count: int) -> list[dict]:
     """Returns the first `count` rows, one per scene, in which the ego hits a vehicle.
 
-    Adversarial rollouts (eta > 0) come first, then kinds of contact that are not among the chosen, then hits of
-    adversaries.
+    Adversarial rollouts (eta > 0) come first, then failures that count, then kinds of contact that are not among the
+    chosen, then hits of adversaries.
     """
     hits = sorted((row for row in rows if row["cfr"] == 1), key=lambda row: row["cfr_adv"] != 1)
     chosen: list[dict] = []
     while hits and len(chosen) < count:
         kinds = [row["contact_type"] for row in chosen]
-        chosen.append(min(hits, key=lambda row: (row["eta"] <= 0, kinds.count(row["contact_type"]))))
+        chosen.append(
+            min(hits, key=lambda row: (row["eta"] <= 0, row["counted"] != 1, kinds.count(row["contact_type"])))
+        )
         hits = [row for row in hits if row["scene_id"] != chosen[-1]["scene_id"]]
     return chosen

@@ -157,10 +157,15 @@ class Failure:
 
 
 def rollout_name(row: Mapping[str, Any]) -> str:
-    """<method>__<ego>__<eta>__<scene_id>__<seed>.npz of a row or rollout, as `file_stem` writes it."""
+    """Name of the file of a row or rollout."""
+    return f"{rollout_key(row)}.npz"
+
+
+def rollout_key(row: Mapping[str, Any]) -> str:
+    """<method>__<ego>__<eta>__<scene_id>__<seed> of a row or rollout, as `file_stem` writes it."""
     eta = float(row["eta"])
     short = f"{eta:g}" if float(f"{eta:g}") == eta else eta
-    return file_stem(row["method"], row["ego_policy"], short, row["scene_id"], row["seed"]) + ".npz"
+    return file_stem(row["method"], row["ego_policy"], short, row["scene_id"], row["seed"])
 
 
 def file_stem(*parts: object) -> str:

@@ -11,7 +11,7 @@ from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
 from e2rl.run.parts import NO_PARTS, Parts
-from e2rl.search.search import SearchSettings
+from e2rl.search.search import Search, SearchSettings
 from e2rl.search.tries import TRIES, Family
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.rule_based import ConstantVelocity
@@ -118,6 +118,9 @@ def test_tries_that_are_not_of_this_search_are_refused(setup, plan, tmp_path):
         write_tries(file, [row | {"margin": 1.0} | change for row in told])
         with pytest.raises(InputError, match=what):
             failures_of(file, "idm", plan, setup)
+    write_tries(file, [row | {"margin": 1.0} for row in told])
+    with pytest.raises(InputError, match="a try of Own depends on those before it"):
+        failures_of(file, "idm", replace(plan, search=type("Own", (Search,), {})), setup)
 
 
 def test_a_method_that_evaluates_no_network_has_no_budget_of_evaluations(setup):

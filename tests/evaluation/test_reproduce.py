@@ -1,5 +1,6 @@
 """reproduce=RUN_DIR: the table of a run again, from its folder alone, with its configuration, scenes and weights."""
 
+import csv
 import json
 import math
 import shlex
@@ -12,7 +13,9 @@ from omegaconf import OmegaConf
 
 from e2rl.evaluation.protocol import Setup
 from e2rl.evaluation.reproduce import compare_tables
+from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.scenes.scene_list import read_list
+from e2rl.sim.rollout_file import rollout_key
 from tests.evaluation.test_protocol import same_runs
 from tests.scripts import arguments, call, error_line, left_behind
 
@@ -130,6 +133,35 @@ def test_other_scenes_are_refused_by_name(world, then, tmp_path, monkeypatch, ca
 def test_what_would_be_another_table_is_refused(then, tmp_path, monkeypatch, capsys):
     status, said = call("evaluate.py", again(then, tmp_path / "now", "seeds=[1]"), monkeypatch, capsys)
     assert status == 2 and "leave out seeds (only" in error_line(said) and not left_behind(tmp_path / "now")
+
+
+def test_a_failure_that_the_run_does_not_have_is_refused(then, tmp_path, monkeypatch, capsys):
+    for given in (again(then, tmp_path / "now", "failure=none"), ["failure=none"]):
+        status, said = call("evaluate.py", given, monkeypatch, capsys)
+        assert status == 2 and ("none of the 0 failures" in said or "reproduce=RUN_DIR" in said)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more", [["tries=1", "methods=[nominal,e2]", "eta=[1,2]"], ["budget=640", "methods=[search]"]])
+def test_the_command_of_a_failure_drives_the_same_contact(more, tmp_path, monkeypatch, capsys):
+    """In its folder's failures.csv; also that of the run that it makes."""
+    (tmp_path / "list.csv").write_text("scene_id,number\nallway_stop_043_0200,7\n")
+    given = [f"scenes={tmp_path / 'list.csv'}", "seeds=[0]", "processes=1", *more]
+    assert call("evaluate.py", [*given, f"hydra.run.dir={tmp_path / 'then'}"], monkeypatch, capsys)[0] == 0
+    rows = {rollout_key(row): row for row in read_rows(tmp_path / "then" / TABLE)}
+    lines = list(csv.DictReader((tmp_path / "then" / "failures.csv").open(newline="")))
+    assert lines
+    for number, line in enumerate([lines[0], lines[-1]]):
+        folder = tmp_path / str(number)
+        program, command, *options = shlex.split(line["again"])
+        assert (program, command) == ("e2rl", "evaluate")
+        assert call("evaluate.py", [*options, f"hydra.run.dir={folder}"], monkeypatch, capsys)[0] == 0
+        (row,) = read_rows(folder / TABLE)
+        known = rows[line["failure"]]
+        for name in ("scene_id", "method", "eta", "seed", "partner", "contact_step", "contact_type"):
+            assert row[name] == known[name]
+        (twin,) = csv.DictReader((folder / "failures.csv").open(newline=""))
+        assert twin["again"] == line["again"]
 
 
 def test_a_stranger_s_run_runs_nothing(sent, tmp_path, monkeypatch, capsys):

@@ -1,6 +1,9 @@
 """The failure report in Chromium: it loads without a complaint, shows what the files hold, and obeys."""
 
 import shutil
+import threading
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
@@ -9,7 +12,7 @@ from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.metrics.atlas import atlas_of
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.html import PAGE, write_report
-from e2rl.sim.rollout_file import ROLLOUTS, Rollout, rollout_name
+from e2rl.sim.rollout_file import ROLLOUTS, Rollout, rollout_key, rollout_name
 from tests.report.failed_run import SCENE, failed_run, preventable_run
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -72,7 +75,7 @@ def wait_for(browser, condition):
 def rows_of(browser) -> list[list[str]]:
     """The cells of the index."""
     return browser.execute_script(
-        """const rows = document.querySelectorAll("#index tbody tr");
+        """const rows = document.querySelectorAll("#index tbody tr:not(.scene)");
         return [...rows].map((row) => [...row.cells].map((cell) => cell.textContent));"""
     )
 
@@ -83,6 +86,20 @@ def heads_of(browser) -> list[str]:
 
 def failures_of(run) -> list[dict]:
     return [row for row in read_rows(run / TABLE) if is_failure(row)]
+
+
+def shown_in(browser, run) -> dict:
+    """The row of the failure that is shown."""
+    key = browser.execute_script("return page.player.failure.key")
+    return next(row for row in failures_of(run) if rollout_key(row) == key)
+
+
+def choose(browser, label: str, starts: str) -> None:
+    """Choose, in the select of this label, what begins so."""
+    labels = browser.find_elements("css selector", "#scope label, #filters label")
+    node = next(each for each in labels if each.text.splitlines() and each.text.splitlines()[0].strip() == label)
+    select = support.Select(node.find_element("tag name", "select"))
+    select.select_by_visible_text(next(each.text for each in select.options if each.text.startswith(starts)))
 
 
 def test_it_opens_without_a_complaint(run, page):
@@ -106,7 +123,7 @@ def test_the_browser_decodes_what_the_files_hold(run, page):
 
 
 def test_scrubbing_moves_the_ego_on_the_canvas(run, page):
-    row = failures_of(run)[page.execute_script("return page.player.failure.number")]
+    row = shown_in(page, run)
     states = Rollout.read(run / ROLLOUTS / rollout_name(row)).states[:, 0]
     for step in (0, 4, 8):
         page.execute_script("page.player.seek(arguments[0])", step)
@@ -117,13 +134,11 @@ def test_scrubbing_moves_the_ego_on_the_canvas(run, page):
 def test_filters_keep_what_they_say_and_names_from_files_are_text(run, page):
     heads = heads_of(page)
     side = [row for row in failures_of(run) if row["contact_type"] == "side"]
-    labels = page.find_elements("css selector", "#filters label")
-    contact = next(node for node in labels if node.text.splitlines()[0].strip() == "Contact")
-    choice = support.Select(contact.find_element("tag name", "select"))
-    choice.select_by_visible_text("side")
+    choose(page, "Contact", "side")
     shown = rows_of(page)
     assert 0 < len(shown) == len(side) and {row[heads.index("Contact")] for row in shown} == {"side"}
-    choice.select_by_visible_text("all")
+    page.find_element("css selector", "#filters button").click()  # reset
+    assert len(rows_of(page)) == len(failures_of(run))
     scenes = [row[heads.index("Scene")] for row in rows_of(page)]
     assert scenes and all(name.startswith(SCENE) for name in scenes)
     assert not page.find_elements("tag name", "img") and not page.find_elements("css selector", ".caption b")
@@ -134,12 +149,9 @@ def test_the_atlas_shows_the_likeliest_failure_of_a_cell_in_its_scope(chromium, 
     chromium.get_log("browser")  # what earlier tests left
     chromium.get(write_report(run).as_uri())
     wait_for(chromium, "return page.player.replay !== null")
-    failures = failures_of(run)
-    for method in ("", "planned"):
-        if method:
-            select = support.Select(chromium.find_element("css selector", "#scope select"))
-            select.select_by_visible_text(next(each.text for each in select.options if each.text.startswith(method)))
-        atlas = atlas_of([row for row in failures if method in ("", row["method"])])
+    for method in ("e2", "planned"):
+        choose(chromium, "Traffic", method)
+        atlas = atlas_of([row for row in failures_of(run) if row["method"] == method])
         buttons = chromium.find_elements("css selector", "#atlas button")
         assert len(buttons) == len(atlas) == 3
         for button in buttons:  # in the order of the grid
@@ -149,9 +161,83 @@ def test_the_atlas_shows_the_likeliest_failure_of_a_cell_in_its_scope(chromium, 
             nats = "nats unknown" if approach == "ahead" else f"{found.likeliest['transport']:.0f} nats"
             assert f"{found.failures} failure" in button.text and nats in button.text
             button.send_keys("\n")
-            shown = failures[chromium.execute_script("return page.player.failure.number")]
+            shown = shown_in(chromium, run)
             assert shown["transport"] == found.likeliest["transport"] or approach == "ahead"
             assert (shown["scene_id"], shown["seed"]) == (found.likeliest["scene_id"], found.likeliest["seed"])
             pressed = [each.get_attribute("aria-pressed") for each in buttons]
             assert pressed == [str(each == button).lower() for each in buttons]
     assert chromium.get_log("browser") == []
+
+
+def test_a_link_opens_at_its_failure_from_a_folder_and_from_a_server(run, page):
+    handler = partial(SimpleHTTPRequestHandler, directory=run)
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        rows = failures_of(run)
+        for base in ((run / PAGE).as_uri(), f"http://127.0.0.1:{server.server_port}/{PAGE}"):
+            for number, row in enumerate(rows):
+                if number % 2:  # else only the end of the address changes
+                    page.get("about:blank")
+                page.get(f"{base}#failure={rollout_key(row)}")
+                wait_for(
+                    page, f"return page.player.failure.key === {rollout_key(row)!r} && page.player.replay !== null"
+                )
+                assert page.current_url == page.find_element("css selector", "#copies input").get_attribute("value")
+                first = page.find_element("id", "summary").text.partition(".")[0]
+                assert f"In {row['method']} η=2 it was hit in" in first  # the traffic of the failure
+                assert not page.find_element("id", "lost").is_displayed()
+        page.get(f"{base}#failure=none")
+        wait_for(page, "return !document.getElementById('lost').hidden")
+        server.shutdown()
+
+
+def test_the_first_lines_are_of_one_traffic_and_others_can_be_chosen(run, page):
+    for method in (None, "planned", "e2"):
+        if method:
+            choose(page, "Traffic", method)
+        rows = [row for row in read_rows(run / TABLE) if row["method"] == (method or "e2")]
+        known = [row["cfr"] for row in rows if row["cfr"] == row["cfr"]]
+        assert f"hit in {sum(known):.0f} of {len(known)} rollouts" in page.find_element("id", "summary").text
+        assert len(rows_of(page)) == len(failures_of(run))  # the index has those of all traffic
+
+
+def test_failures_of_a_scene_stand_together_whatever_the_traffic(run, page):
+    groups = page.execute_script(
+        """return [...document.querySelectorAll("#index tbody tr")].map((row) => [row.className, row.textContent]);"""
+    )
+    scenes, under = [], {}
+    for kind, text in groups:
+        if kind == "scene":
+            scenes.append(text)
+        else:
+            under.setdefault(scenes[-1], []).append(text)
+    names = {row["scene_id"] for row in failures_of(run)}
+    assert len(scenes) == len(names) == len(under) and sum(map(len, under.values())) == len(failures_of(run))
+    for name in names:
+        own = [row for row in failures_of(run) if row["scene_id"] == name]
+        (head,) = [text for text in scenes if text.startswith(f"{name}: {len(own)} failure")]
+        assert len(under[head]) == len(own) and all(row["method"] in head for row in own)
+    assert any("e2 η=2, planned η=2" in text for text in scenes)
+
+
+def test_the_speed_that_is_shown_is_the_speed_driven(run, page):
+    """At every moment, and at whatever rate the replay is played."""
+    row = shown_in(page, run)
+    states = Rollout.read(run / ROLLOUTS / rollout_name(row)).states[:, 0]
+    for rate in ("1", "0.25"):
+        page.execute_script("document.getElementById('rate').value = arguments[0]", rate)
+        for step in range(int(row["contact_step"]) + 1):
+            page.execute_script("page.player.seek(arguments[0])", step)
+            seconds, speed = page.find_element("id", "clock").text.split("\n")
+            assert float(seconds.split()[0]) == pytest.approx(0.1 * step, abs=1e-6)
+            assert float(speed.split()[1]) == pytest.approx(states[step, 3], abs=0.0551) and speed.endswith(" m/s")
+    assert page.find_element("css selector", ".controls label").text.startswith("Playback")
+
+
+def test_what_is_copied_is_the_whole_field(page):
+    for line in page.find_elements("css selector", "#copies div"):
+        page.execute_script("arguments[0].scrollIntoView()", line)
+        line.find_element("tag name", "button").click()
+        field = line.find_element("tag name", "input")
+        ends = page.execute_script("return [arguments[0].selectionStart, arguments[0].selectionEnd]", field)
+        assert ends == [0, len(field.get_attribute("value"))] and "Copied" in line.text

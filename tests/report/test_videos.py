@@ -21,8 +21,11 @@ def replay_of(*courses, **options):
     return Replay(rollouts.rollout(0), score_rollouts(rollouts)[0][0], pixels=200)
 
 
-def row(scene_id, eta=2.0, cfr=1.0, cfr_adv=1.0, kind="front"):
-    return {"scene_id": scene_id, "eta": eta, "cfr": cfr, "cfr_adv": cfr_adv, "contact_type": kind}
+def row(scene_id, eta=2.0, cfr=1.0, cfr_adv=1.0, kind="front", counted=0.0):
+    return {
+        **{"scene_id": scene_id, "eta": eta, "cfr": cfr, "cfr_adv": cfr_adv, "contact_type": kind},
+        "counted": counted,
+    }
 
 
 def test_failures_are_distinct_found_and_of_different_kinds():
@@ -30,6 +33,7 @@ def test_failures_are_distinct_found_and_of_different_kinds():
     rows += [row("e", kind="side", cfr_adv=0.0), row("f")]
     assert [part["scene_id"] for part in found_failures(rows, 3)] == ["b", "e", "d"]
     assert [part["scene_id"] for part in found_failures(rows, 9)] == ["b", "e", "d", "f", "a"]
+    assert [part["scene_id"] for part in found_failures([*rows, row("g", counted=1.0)], 1)] == ["g"]
     assert found_failures([row("c", cfr=0.0), row("n", cfr=float("nan"))], 3) == []
 
 

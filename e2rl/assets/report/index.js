@@ -11,7 +11,9 @@ const measure = (title, name, kind = "") => ({
 });
 
 const SCENE = words("Scene", (failure) => failure.scene_id);
+const trafficOf = ({ method, eta }) => `${method} η=${eta}`;
 const FILTERED = [
+  words("Traffic", trafficOf),
   words("Contact", (failure) => failure.contact_type),
   words("Approach", (failure) => failure.approach),
   words("Verdict", verdictOf),
@@ -27,7 +29,6 @@ const COLUMNS = [
   },
   SCENE,
   words("Seed", (failure) => String(failure.seed), "number wide"),
-  words("Traffic", (failure) => `${failure.method} η=${failure.eta}`, "wide"),
   ...FILTERED,
   measure("Ego [m/s]", "ego_speed"),
   measure("Partner [m/s]", "partner_speed", "wide"),
@@ -38,7 +39,8 @@ const COLUMNS = [
 class Index {
   /** choose: called with the failure that is clicked; names: of the modes. */
   constructor(choose, names) {
-    Object.assign(this, { choose, names, failures: [], wanted: {}, order: { column: 0, sign: 1 }, rows: new Map() });
+    const order = { column: COLUMNS.indexOf(SCENE), sign: 1 };
+    Object.assign(this, { choose, names, failures: [], wanted: {}, order, rows: new Map() });
     this.filters = document.getElementById("filters");
     this.table = document.getElementById("index");
     this.title = document.getElementById("index-title");
@@ -65,12 +67,14 @@ class Index {
         (failure, text) => value(failure) === text,
       );
     });
-    this.modeFilter = this.filter("Mode", named, (failure, mode) => String(failure.mode) === mode);
+    const reset = element("button", { type: "button" }, "Reset");
+    reset.addEventListener("click", () => this.load(this.failures));
     this.filters.replaceChildren(
-      this.modeFilter,
+      this.filter("Mode", named, (failure, mode) => String(failure.mode) === mode),
       ...selects,
       this.field("Ego faster than [m/s]", "number", (failure, least) => failure.ego_speed > Number(least)),
       this.field("Scene", "search", (failure, text) => failure.scene_id.includes(text)),
+      reset,
     );
   }
 
@@ -92,10 +96,14 @@ class Index {
     this.show();
   }
 
-  chooseMode(mode) {
-    const select = this.modeFilter.querySelector("select");
-    select.value = mode;
-    select.dispatchEvent(new Event("change"));
+  /** Set some filters, {label: value}. */
+  filterBy(wanted) {
+    for (const label of this.filters.querySelectorAll("label")) {
+      const value = wanted[label.firstChild.data];
+      if (value === undefined) continue;
+      label.lastChild.value = value;
+      label.lastChild.dispatchEvent(new Event("change"));
+    }
   }
 
   /** The failures that pass all filters, in order. */
@@ -104,9 +112,7 @@ class Index {
     const { value } = COLUMNS[this.order.column];
     const compare = (first, second) => (first < second ? -1 : first > second ? 1 : 0);
     const passed = this.failures.filter((failure) => keeps.every((keep) => keep(failure)));
-    return passed.sort(
-      (first, second) => this.order.sign * compare(value(first), value(second)) || first.number - second.number,
-    );
+    return passed.sort((first, second) => this.order.sign * compare(value(first), value(second)));
   }
 
   show() {
@@ -118,9 +124,20 @@ class Index {
     this.rows = new Map(found.map((failure) => [failure, this.row(failure)]));
     this.table.replaceChildren(
       element("thead", {}, element("tr", {}, ...COLUMNS.map((_, column) => this.head(column)))),
-      element("tbody", {}, ...this.rows.values()),
+      element("tbody", {}, ...(COLUMNS[this.order.column] === SCENE ? this.byScene(found) : this.rows.values())),
     );
     this.mark(this.current);
+  }
+
+  /** The rows with a heading for each scene, which says in which traffic it fails. */
+  byScene(found) {
+    const scenes = new Map(found.map(({ scene_id: scene }) => [scene, []]));
+    for (const failure of found) scenes.get(failure.scene_id).push(failure);
+    return [...scenes].flatMap(([scene, ours]) => {
+      const text = `${scene}: ${plural(ours.length, "failure")} in ${[...new Set(ours.map(trafficOf))].join(", ")}`;
+      const head = element("th", { colspan: COLUMNS.length, scope: "rowgroup" }, element("span", {}, text));
+      return [element("tr", { class: "scene" }, head), ...ours.map((failure) => this.rows.get(failure))];
+    });
   }
 
   head(column) {

@@ -3,9 +3,6 @@
 class Page {
   constructor(report) {
     this.report = report;
-    report.failures.forEach((failure, number) => {
-      failure.number = number;
-    });
     this.store = new Store(report);
     this.player = new Player(this.store, (direction) => this.open(this.index.neighbour(direction)));
     this.index = new Index((failure) => this.open(failure), report.modes);
@@ -19,25 +16,32 @@ class Page {
       this.player.repaint();
       repaintModes(document.getElementById("modes"), this.modes);
     });
+    const asked = location.hash; // which `open` changes
     this.choose(report.groups[0].ego);
-    const linked = report.failures[Number(location.hash.slice(1)) - 1];
-    if (linked) this.open(linked);
+    addEventListener("hashchange", () => this.follow(location.hash));
+    this.follow(asked);
+  }
+
+  /** Go to the failure that the end of an address names. */
+  follow(hash) {
+    const [, key] = hash.match(/^#failure=(.+)/) ?? [];
+    const failure = this.report.failures.find((each) => [each.key, encodeURIComponent(each.key)].includes(key));
+    document.getElementById("lost").hidden = !key || Boolean(failure);
+    if (!failure) return;
+    if (failure.ego_policy !== this.ego) this.choose(failure.ego_policy);
+    this.show(this.groups.find((group) => isOf(failure, group)));
+    this.open(failure);
   }
 
   /** Selects of the planner, where there are several, and of its traffic. */
   buildScope() {
     const egos = [...new Set(this.report.groups.map(({ ego }) => ego))];
     const scope = document.getElementById("scope");
-    if (egos.length > 1)
-      scope.append(
-        choice(
-          "Planner",
-          egos.map((ego) => [ego, ego]),
-          (ego) => this.choose(ego),
-        ),
-      );
-    this.traffic = choice("Traffic", [], (index) => this.show(index === "" ? this.groups : [this.groups[index]]));
-    scope.append(this.traffic);
+    const named = egos.map((ego) => [ego, ego]);
+    this.planner = choice("Planner", named, (ego) => this.choose(ego));
+    this.planner.hidden = egos.length < 2;
+    this.traffic = choice("Traffic", [], (index) => this.show(this.groups[index]));
+    scope.append(this.planner, this.traffic);
   }
 
   buildAxes() {
@@ -50,21 +54,20 @@ class Page {
     document.getElementById("axes").append(pick("rate", "Upwards", RATES), pick("realism", "To the right", REALISMS));
   }
 
-  /** Show a planner in all its traffic. */
+  /** Show a planner: all its failures in the index, else those in the traffic that the run was about. */
   choose(ego) {
     this.ego = ego;
+    this.planner.querySelector("select").value = ego;
     this.groups = this.report.groups.filter((group) => group.ego === ego);
     document.getElementById("ego-name").textContent = ego;
-    const options = [
-      ["", "all"],
-      ...this.groups.map(({ label, failures }, index) => [index, `${label} (${failures} failures)`]),
-    ];
+    const options = this.groups.map(({ label, failures }) => `${label} (${plural(failures, "failure")})`);
     this.traffic
       .querySelector("select")
-      .replaceChildren(...options.map(([value, text]) => element("option", { value }, text)));
+      .replaceChildren(...options.map((text, value) => element("option", { value }, text)));
     this.traffic.hidden = this.groups.length < 2;
     this.showRealism();
-    this.show(this.groups);
+    this.index.load(this.report.failures.filter((failure) => failure.ego_policy === ego));
+    this.show(mainOf(this.groups));
   }
 
   showRealism() {
@@ -72,16 +75,12 @@ class Page {
     showRealism(document.getElementById("realism"), points, this.axes.rate, this.axes.realism);
   }
 
-  /** Show the failures of some groups: their modes, the typical case of the first, the atlas, the index. */
-  show(groups) {
-    const among = (failure) =>
-      groups.some(
-        ({ ego, method, eta }) => failure.ego_policy === ego && failure.method === method && failure.eta === eta,
-      );
-    const failures = this.report.failures.filter(among);
+  /** Show the failures of a group: their modes, the typical case of the first, the atlas. */
+  show(group) {
+    const failures = this.report.failures.filter((failure) => isOf(failure, group));
+    this.traffic.querySelector("select").value = this.groups.indexOf(group);
     this.modes = groupByMode(failures, this.report.modes);
-    this.summarise(failures, groups);
-    this.index.load(failures);
+    this.summarise(failures, group);
     showModes(document.getElementById("modes"), this.modes, failures.length, this.store, (mode) => this.openMode(mode));
     const atlas = groupByCell(failures, this.report.cells);
     showAtlas(document.getElementById("atlas"), atlas, (failure) => this.open(failure));
@@ -89,37 +88,56 @@ class Page {
     if (failures.length) this.open(this.modes[0].typical);
   }
 
-  summarise(failures, groups) {
-    const rollouts = groups.reduce((sum, group) => sum + group.rollouts, 0);
-    const traffic = groups.length === 1 ? ` in ${groups[0].label}` : "";
+  /** The first lines: how often the planner fails in one traffic; rates of several are not pooled. */
+  summarise(failures, { label, rates, rollouts }) {
     const named = this.modes.filter(({ mode, counted }) => mode !== OTHER && counted > 0).length;
-    const { dataset, split, n_scenes: scenes, n_seeds: seeds } = this.report.run;
-    const counted = meanOf(failures, "counted");
+    const { dataset, split, n_scenes: scenes, stage, tries } = this.report.run;
+    const found = new Set(failures.filter(({ preventable }) => preventable === 1).map((failure) => failure.scene_id));
+    const hit = rates.cfr ?? `${failures.length} of ${rollouts} rollouts`;
+    const lines = [
+      rates.cfr_counted && `${rates.cfr_counted} count: its fault, or a competent driver prevents it.`,
+      rates.cfr_preventable && `Preventable: ${rates.cfr_preventable}, in ${found.size} of ${scenes} scenes.`,
+      !hit.includes("interval") && "No intervals: they need scenes of at least ten places.",
+      tries && "Tries go where failures are: rates of tries are no rates of the planner.",
+      `${dataset}/${split}, ${scenes} scenes.`,
+    ];
+    const first = element("strong", {}, `In ${label} it was hit in ${hit}.`);
+    document.getElementById("summary").replaceChildren(first, ` ${lines.filter(Boolean).join(" ")}`);
+    document.getElementById("stage").textContent = stage ? `, ${stage} training` : "";
     document.getElementById("modes-title").textContent = failures.length
       ? `Its ${named} weakness${named === 1 ? "" : "es"}`
       : "No failure found";
-    document.getElementById("summary").textContent =
-      `${failures.length} failures in ${rollouts} rollouts${traffic} (${percent(failures.length / rollouts)})` +
-      `${counted === null ? "" : `; ${percent(counted)} count: the ego's fault, or a competent driver prevents it`}. ` +
-      `${dataset}/${split}, ${scenes} scenes, ${seeds} seed${seeds === 1 ? "" : "s"}.`;
   }
 
   /** Show the typical case of a mode, and its failures in the index. */
   openMode(mode) {
-    this.index.chooseMode(mode.mode);
+    this.index.filterBy({ Mode: mode.mode, Traffic: trafficOf(mode.typical) });
     this.open(mode.typical);
     if (matchMedia("(max-width: 900px)").matches) document.getElementById("player").scrollIntoView();
   }
 
   open(failure) {
     if (!failure) return;
-    history.replaceState(null, "", `#${failure.number + 1}`);
+    history.replaceState(null, "", `#failure=${failure.key}`);
+    const copies = Object.entries({ Link: `${location.href.split("#")[0]}#failure=@NAME@`, ...this.report.commands });
+    const fields = copies.map(([label, text]) => copyField(label, text.replaceAll("@NAME@", failure.key)));
+    document.getElementById("copies").replaceChildren(...fields);
     this.index.mark(failure);
     const buttons = document.querySelectorAll(".mode");
     this.modes.forEach(({ mode }, index) => buttons[index].setAttribute("aria-pressed", String(mode === failure.mode)));
     markCell(document.getElementById("atlas"), failure);
     this.player.show(failure, capital(modeName(failure.mode, this.report.modes)));
   }
+}
+
+const isOf = (failure, { ego, method, eta }) =>
+  failure.ego_policy === ego && failure.method === method && failure.eta === eta;
+
+/** The group that the run was about: the search, else the first attack, at its highest intensity. */
+function mainOf(groups) {
+  const attacks = groups.filter(({ eta }) => eta > 0);
+  const { method } = attacks.find((group) => group.method === "search") ?? attacks[0] ?? groups[0];
+  return groups.filter((group) => group.method === method).reduce((most, each) => (each.eta > most.eta ? each : most));
 }
 
 const page = new Page(JSON.parse(document.getElementById("report").textContent));

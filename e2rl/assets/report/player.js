@@ -197,7 +197,7 @@ class Player {
     const ego = replay.tracks.find((track) => track.role === "ego");
     const seconds = (time * replay.dt).toFixed(1);
     const speed = poseAt(ego, Math.min(time, replay.contact)).speed.toFixed(1);
-    clock.textContent = `${seconds} s\nego ${speed} m/s`;
+    clock.textContent = `${seconds} s\nego ${time > replay.contact ? "hit at " : ""}${speed} m/s`;
     badge.hidden = time < replay.contact;
     scene.setAttribute("aria-label", `Traffic from above at ${seconds} s; the ego drives ${speed} m/s`);
     scale.style.width = `${(10 * Math.min(scene.clientWidth, scene.clientHeight)) / this.metres}px`;

@@ -6,9 +6,9 @@ function showVerdict(list, failure, replay) {
     Verdict: verdictOf(failure),
     "Duty broken": failure.duty && (failure.duty === "none" ? "none" : `${failure.duty}, by the partner`),
     Approach: failure.approach,
-    Ego: `${failure.ego_manoeuvre}, ${speed(failure.ego_speed)}`,
-    Partner: `${failure.partner_manoeuvre}, ${speed(failure.partner_speed)}; ${roleOf(failure)}`,
-    Contact: `${failure.contact_type} of the ego after ${fixed(failure.contact_time)} s at ${speed(failure.relvel)}`,
+    Ego: `${failure.ego_manoeuvre}, ${speed(failure.ego_speed)} 0.1 s before the contact`,
+    Partner: `${failure.partner_manoeuvre}, ${speed(failure.partner_speed)} then; ${roleOf(failure)}, agent ${failure.partner}`,
+    Contact: `${failure.contact_type} of the ego after ${fixed(failure.contact_time)} s, closing at ${speed(failure.relvel)}`,
     "Competent driver": replay && driverText(failure, replay),
     Evasion: evasionText(failure),
     "Causal chain": replay?.plans && chainText(replay),
@@ -61,4 +61,16 @@ function chainText({ plans, contact, tracks }) {
       .join("; ");
   }
   return null;
+}
+
+/** A field to copy from, with its button. */
+function copyField(label, text) {
+  const field = element("input", { readonly: "", value: text });
+  const button = element("button", { type: "button", "aria-label": `Copy: ${label}` }, "Copy");
+  button.addEventListener("click", () => {
+    field.select();
+    document.execCommand("copy"); // which a page from a file, or without https, may use, too
+    button.textContent = "Copied";
+  });
+  return element("div", {}, element("label", {}, label, field), button);
 }

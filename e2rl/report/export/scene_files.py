@@ -39,7 +39,7 @@ def episodes_of(run: Path, rows: Sequence[Mapping], plugins: Sequence[str], scen
 def source_of_run(run: Path, split: str, plugins: Sequence[str]) -> Source:
     """The source that a run's configuration names, on `split`. The folder may be a stranger's: code of others takes
     part only where `plugins` names its modules."""
-    folder = next((folder for folder in (run, run.parent) if (folder / CONFIG).is_file()), None)
+    folder = next((folder for folder in (run, *run.resolve().parents[:2]) if (folder / CONFIG).is_file()), None)
     if folder is None:
         raise InputError(f"{run}: no {CONFIG} says where its scenes come from; restore it, {WITHOUT}")
     config = read_yaml(folder / CONFIG)
