@@ -32,7 +32,8 @@ MOST = 200  # pairs that the page shows moving
 FOLDER = ASSETS.parent / "compare"
 # scripts of the report that the page uses
 SCRIPTS = ("palette", "plot", "decode", "scene", "plans", "curves", "verdict", "modes", "index", "player")
-FACTS = (*COLUMNS[COLUMNS.index("approach") :], "partner", "min_dtc", "progress")  # of a rollout
+OF_BOTH = (*PAIR, "location", "ego_policy")
+FACTS = (*(name for name in COLUMNS if name not in OF_BOTH), "min_dtc", "progress")  # of a rollout
 SIDES = ("first", "second")
 
 
