@@ -17,25 +17,34 @@ Keyword arguments are keys of the file, nested ones as mappings. Everything runs
 """
 
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
+from torchrl.envs import TransformedEnv
 
-from e2rl.evaluation.methods import build_ego, build_prior, build_traffic
+from e2rl.evaluation.methods import build_ego, build_prior, build_sim, build_traffic
 from e2rl.evaluation.protocol import Method, Setup, Task
+from e2rl.learning.environment import training_env
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.ego import Ego
 from e2rl.prior.prior import Prior
 from e2rl.report.picture import Replay
 from e2rl.report.videos import save_animation
-from e2rl.run.config import load_choice, with_changes
+from e2rl.run.config import library, load_choice, with_changes
 from e2rl.scenes import source
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import SimSettings
 from e2rl.sim.rollout_file import Failure
 from e2rl.sim.rollouts import Rollouts
+from e2rl.traffic.fusing import prepare_fused
 from e2rl.traffic.traffic import Traffic
+
+if TYPE_CHECKING:  # libraries of the extra `gym`
+    import gymnasium
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.vec_env import VecEnv
 
 AT_ONCE = 4  # scenes that are driven together while failures are sought
 
@@ -116,6 +125,62 @@ def find_failures(
     return failures
 
 
+def make_env(
+    num_envs: int = 16,
+    scenes: SceneSet | None = None,
+    method: str | Traffic = "e2",
+    eta: float | Sequence[float] = (0.0, 1.0),
+    hold: int = 1,
+    seed: int = 0,
+    compile: bool | str = "auto",
+    **sim: Any,
+) -> TransformedEnv:
+    """Returns TorchRL environments [num_envs] to train in: scenes, noise and intensity are drawn for each episode.
+
+    Traffic is replanned against the policy every 0.5 s. Raises InputError for traffic that is told the ego's plan.
+
+    Args:
+        scenes: None: the bundled training scenes.
+        method: the traffic, or the name of a file in conf/synthesizer, on the bundled prior.
+        eta: adversarial intensity, 0 to 3, or several, of which one is drawn.
+        hold: steps of 0.1 s that an action lasts.
+        seed: of the draws; `env.set_seed` sets it anew.
+        compile: as in conf/evaluate.yaml; it holds for the whole process.
+        sim: settings of conf/sim/default.yaml, such as reward={"contact": -30.0}.
+    """
+    scenes = load_scenes("bundled", split="train") if scenes is None else scenes
+    traffic = make_traffic(method, load_prior()) if isinstance(method, str) else method
+    settings = build_sim(OmegaConf.create({"sim": _choice("sim", "default", sim)}))
+    prepare_fused(OmegaConf.create({"compile": compile, "device": "cpu"}))
+    etas = [float(each) for each in (eta if isinstance(eta, Sequence) else [eta])]
+    return training_env(scenes, traffic, settings, num_envs, etas, hold, seed)
+
+
+def make_gym_env(**settings: Any) -> "gymnasium.Env":
+    """Returns a gymnasium.Env of one scene (e2rl/learning/gym_env.py); settings: those of make_env but num_envs."""
+    return _of_gym("gym_env", "gymnasium").DrivingGymEnv(make_env(1, **settings))
+
+
+def make_gym_vector_env(num_envs: int = 16, **settings: Any) -> "gymnasium.vector.VectorEnv":
+    """Returns a gymnasium VectorEnv that drives all scenes as one batch; settings: those of make_env."""
+    return _of_gym("gym_env", "gymnasium").DrivingVectorEnv(make_env(num_envs, **settings))
+
+
+def make_sb3_env(num_envs: int = 16, **settings: Any) -> "VecEnv":
+    """Returns the same batch as a VecEnv of Stable-Baselines3; settings: those of make_env."""
+    return _of_gym("sb3", "stable_baselines3").SB3Env(make_gym_vector_env(num_envs, **settings))
+
+
+def save_policy(model: "BaseAlgorithm", path: str | Path) -> Path:
+    """Writes the deterministic policy of a Stable-Baselines3 model as POLICY.onnx (or POLICY.pt), for ego=policy_file.
+
+    The statistics of a VecNormalize go with it, and the scale of the actions. Raises InputError for a model without an
+    environment of e2rl.
+    """
+    _of_gym("sb3", "stable_baselines3").save_policy(model, Path(path))
+    return Path(path)
+
+
 def save_gif(failure: Failure, path: str | Path) -> Path:
     """Writes the moving picture of a failure; returns its path."""
     save_animation(Path(path), Replay(failure.rollout, failure.row).frames())
@@ -130,3 +195,9 @@ def score(rollouts: Rollouts) -> list[dict]:
 def _choice(group: str, name: str, settings: dict[str, Any]) -> DictConfig:
     """A file of the configuration with changes."""
     return with_changes(load_choice(group, name), settings, f"{group}={name}", group)
+
+
+def _of_gym(module: str, needs: str) -> Any:
+    """A module of e2rl.learning that needs a library of the extra `gym`."""
+    library(needs, module, "gym")
+    return import_module(f"e2rl.learning.{module}")
