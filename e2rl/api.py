@@ -17,36 +17,36 @@ Keyword arguments are keys of the file, nested ones as mappings. Everything runs
 """
 
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import TransformedEnv
 
 from e2rl.evaluation.methods import build_ego, build_prior, build_sim, build_traffic
 from e2rl.evaluation.protocol import Method, Setup, Task
-from e2rl.learning.environment import training_env
+from e2rl.learning.policy import RowDraw
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.ego import Ego
+from e2rl.planners.policy_file import write_policy
 from e2rl.prior.prior import Prior
 from e2rl.report.picture import Replay
 from e2rl.report.videos import save_animation
 from e2rl.run.config import library, load_choice, with_changes
+from e2rl.run.settings import check_range
 from e2rl.scenes import source
 from e2rl.scenes.scene import SceneSet
-from e2rl.sim.env import SimSettings
+from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.rollout_file import Failure
 from e2rl.sim.rollouts import Rollouts
 from e2rl.traffic.fusing import prepare_fused
+from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import Traffic
-
-if TYPE_CHECKING:  # libraries of the extra `gym`
-    import gymnasium
-    from stable_baselines3.common.base_class import BaseAlgorithm
-    from stable_baselines3.common.vec_env import VecEnv
+from e2rl.traffic.transform import AdversarialSynthesizer
 
 AT_ONCE = 4  # scenes that are driven together while failures are sought
+SEEDS = 256  # of the noise, for each scene and intensity that a policy is trained in
 
 
 def load_scenes(
@@ -135,49 +135,49 @@ def make_env(
     compile: bool | str = "auto",
     **sim: Any,
 ) -> TransformedEnv:
-    """Returns TorchRL environments [num_envs] to train in: scenes, noise and intensity are drawn for each episode.
-
-    Traffic is replanned against the policy every 0.5 s. Raises InputError for traffic that is told the ego's plan.
+    """Returns TorchRL environments [num_envs] to train in, whose traffic is replanned against the policy every 0.5 s.
 
     Args:
-        scenes: None: the bundled training scenes.
+        scenes: of which one is drawn for each episode; None: the bundled training scenes.
         method: the traffic, or the name of a file in conf/synthesizer, on the bundled prior.
         eta: adversarial intensity, 0 to 3, or several, of which one is drawn.
         hold: steps of 0.1 s that an action lasts.
-        seed: of the draws; `env.set_seed` sets it anew.
-        compile: as in conf/evaluate.yaml; it holds for the whole process.
+        compile: as in conf/evaluate.yaml, for the whole process.
         sim: settings of conf/sim/default.yaml, such as reward={"contact": -30.0}.
     """
+    check_range("num_envs", num_envs, low=1)
+    etas = torch.tensor(eta if isinstance(eta, Sequence) else [eta], dtype=torch.float32)
     scenes = load_scenes("bundled", split="train") if scenes is None else scenes
     traffic = make_traffic(method, load_prior()) if isinstance(method, str) else method
     settings = build_sim(OmegaConf.create({"sim": _choice("sim", "default", sim)}))
     prepare_fused(OmegaConf.create({"compile": compile, "device": "cpu"}))
-    etas = [float(each) for each in (eta if isinstance(eta, Sequence) else [eta])]
-    return training_env(scenes, traffic, settings, num_envs, etas, hold, seed)
+    row = torch.arange(len(etas) * SEEDS * len(scenes))
+    pool = TrafficPool.live(row % len(scenes), etas.repeat_interleave(SEEDS * len(scenes)), row)
+    draw = RowDraw(torch.ones(len(row), dtype=torch.float64), seed)
+    base = DrivingEnv(scenes, settings, num_envs, hold=hold)
+    return TransformedEnv(base, AdversarialSynthesizer(pool, draw, traffic))
 
 
-def make_gym_env(**settings: Any) -> "gymnasium.Env":
-    """Returns a gymnasium.Env of one scene (e2rl/learning/gym_env.py); settings: those of make_env but num_envs."""
-    return _of_gym("gym_env", "gymnasium").DrivingGymEnv(make_env(1, **settings))
+def make_gym_env(num_envs: int | None = None, **settings: Any) -> Any:
+    """Returns a gymnasium.Env of one scene, or with num_envs a VectorEnv, one batch. settings: of make_env."""
+    module, env = library("e2rl.learning.gym_env", "make_gym_env", "gym"), make_env(num_envs or 1, **settings)
+    return module.DrivingGymEnv(env) if num_envs is None else module.DrivingVectorEnv(env)
 
 
-def make_gym_vector_env(num_envs: int = 16, **settings: Any) -> "gymnasium.vector.VectorEnv":
-    """Returns a gymnasium VectorEnv that drives all scenes as one batch; settings: those of make_env."""
-    return _of_gym("gym_env", "gymnasium").DrivingVectorEnv(make_env(num_envs, **settings))
+def make_sb3_env(num_envs: int = 16, **settings: Any) -> Any:
+    """Returns the batch as a VecEnv of Stable-Baselines3. settings: of make_env."""
+    module = library("e2rl.learning.sb3", "make_sb3_env", "gym")
+    return module.SB3Env(make_gym_env(num_envs, **settings))
 
 
-def make_sb3_env(num_envs: int = 16, **settings: Any) -> "VecEnv":
-    """Returns the same batch as a VecEnv of Stable-Baselines3; settings: those of make_env."""
-    return _of_gym("sb3", "stable_baselines3").SB3Env(make_gym_vector_env(num_envs, **settings))
+def save_policy(policy: Any, path: str | Path) -> Path:
+    """Writes POLICY.onnx, or POLICY.pt of TorchScript, for ego=policy_file; returns its path.
 
-
-def save_policy(model: "BaseAlgorithm", path: str | Path) -> Path:
-    """Writes the deterministic policy of a Stable-Baselines3 model as POLICY.onnx (or POLICY.pt), for ego=policy_file.
-
-    The statistics of a VecNormalize go with it, and the scale of the actions. Raises InputError for a model without an
-    environment of e2rl.
+    policy: a Stable-Baselines3 model trained here, or a module of such a map (docs/observation.md).
     """
-    _of_gym("sb3", "stable_baselines3").save_policy(model, Path(path))
+    if not isinstance(policy, torch.nn.Module):
+        policy = library("e2rl.learning.sb3", "save_policy", "gym").Deterministic(policy)
+    write_policy(policy, Path(path))
     return Path(path)
 
 
@@ -195,9 +195,3 @@ def score(rollouts: Rollouts) -> list[dict]:
 def _choice(group: str, name: str, settings: dict[str, Any]) -> DictConfig:
     """A file of the configuration with changes."""
     return with_changes(load_choice(group, name), settings, f"{group}={name}", group)
-
-
-def _of_gym(module: str, needs: str) -> Any:
-    """A module of e2rl.learning that needs a library of the extra `gym`."""
-    library(needs, module, "gym")
-    return import_module(f"e2rl.learning.{module}")

@@ -10,8 +10,7 @@ from pathlib import Path
 from torch import Tensor, nn
 
 from e2rl.planners.network import ActorNetwork, find_weights, read_actor
-from e2rl.planners.policy_export import write_policy
-from e2rl.planners.policy_file import ONNX, TORCHSCRIPT
+from e2rl.planners.policy_file import ONNX, TORCHSCRIPT, write_policy
 from e2rl.run.endings import ending
 
 
