@@ -62,7 +62,7 @@ class Deterministic(nn.Module):
         env, normal = model.get_env(), model.get_vec_normalize_env()
         if env is None or not env.has_attr("bounds"):
             raise InputError("the model has no environment of e2rl: load it with env=e2rl.make_sb3_env(...)")
-        self.policy, self.bounds = model.policy, env.get_attr("bounds")[0]
+        self.policy, (self.low, self.high) = model.policy, env.get_attr("bounds")[0]
         self.mean, self.scale, self.clip = torch.zeros(1), torch.ones(1), torch.inf
         if normal is not None and normal.norm_obs:
             known, self.clip = normal.obs_rms, normal.clip_obs
@@ -72,4 +72,4 @@ class Deterministic(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         seen = ((observation - self.mean) / self.scale).clamp(-self.clip, self.clip)
-        return in_units(self.policy._predict(seen, deterministic=True), *self.bounds)
+        return in_units(self.policy._predict(seen, deterministic=True), self.low, self.high)
