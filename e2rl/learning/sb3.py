@@ -65,10 +65,9 @@ class Deterministic(nn.Module):
         self.policy, (self.low, self.high) = model.policy, env.get_attr("bounds")[0]
         self.mean, self.scale, self.clip = torch.zeros(1), torch.ones(1), torch.inf
         if normal is not None and normal.norm_obs:
-            known, self.clip = normal.obs_rms, normal.clip_obs
-            self.mean, self.scale = (
-                torch.tensor(each).float() for each in (known.mean, (known.var + normal.epsilon) ** 0.5)
-            )
+            known: Any = normal.obs_rms
+            self.mean, self.scale = (torch.tensor(x).float() for x in (known.mean, (known.var + normal.epsilon) ** 0.5))
+            self.clip = normal.clip_obs
 
     def forward(self, observation: Tensor) -> Tensor:
         seen = ((observation - self.mean) / self.scale).clamp(-self.clip, self.clip)
