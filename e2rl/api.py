@@ -160,14 +160,15 @@ def make_env(
 
 def make_gym_env(num_envs: int | None = None, **settings: Any) -> Any:
     """Returns a gymnasium.Env of one scene, or with num_envs a VectorEnv, one batch. settings: of make_env."""
-    module, env = library("e2rl.learning.gym_env", "make_gym_env", "gym"), make_env(num_envs or 1, **settings)
-    return module.DrivingGymEnv(env) if num_envs is None else module.DrivingVectorEnv(env)
+    module = library("e2rl.learning.gym_env", "make_gym_env", "gym")
+    if num_envs is None:
+        return module.DrivingGymEnv(make_env(1, **settings))
+    return module.DrivingVectorEnv(make_env(num_envs, **settings))
 
 
 def make_sb3_env(num_envs: int = 16, **settings: Any) -> Any:
     """Returns the batch as a VecEnv of Stable-Baselines3. settings: of make_env."""
-    module = library("e2rl.learning.sb3", "make_sb3_env", "gym")
-    return module.SB3Env(make_gym_env(num_envs, **settings))
+    return library("e2rl.learning.sb3", "make_sb3_env", "gym").SB3Env(make_gym_env(num_envs, **settings))
 
 
 def save_policy(policy: Any, path: str | Path) -> Path:

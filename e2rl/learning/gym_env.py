@@ -51,7 +51,7 @@ class DrivingVectorEnv(VectorEnv):
             synthesizer.draw.probability = every * (synthesizer.pool.scene_index == self.env.scenes.index(scene))
         self._now = self.env.reset()
         synthesizer.draw.probability = every
-        return self._now["observation"].numpy().copy(), self._info(self._now)
+        return self._shown(self._now)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """A step of all environments."""
@@ -59,17 +59,18 @@ class DrivingVectorEnv(VectorEnv):
         stepped, self._now = self.env.step_and_maybe_reset(self._now)
         last = stepped["next"]
         reward, terminated, truncated = (last[key][:, 0].numpy() for key in ("reward", "terminated", "truncated"))
-        info, done = self._info(self._now), terminated | truncated
+        (seen, info), done = self._shown(self._now), terminated | truncated
         if done.any():
-            info |= {"final_obs": last["observation"].numpy(), "final_info": self._info(last)}
+            info |= dict(zip(("final_obs", "final_info"), self._shown(last), strict=True))
             info |= {"_final_obs": done, "_final_info": done}
-        return self._now["observation"].numpy().copy(), reward, terminated, truncated, info
+        return seen, reward, terminated, truncated, info
 
-    def _info(self, found: TensorDictBase) -> Info:
+    def _shown(self, found: TensorDictBase) -> tuple[np.ndarray, Info]:
+        """Observation and info."""
         told = {name: value[:, 0].numpy() for name, value in found["metrics"].items()}
         ids = [self.env.scenes.scene_id[scene] for scene in found["scene_index"][:, 0].tolist()]
-        eta = self.env.transform.pool.eta[found["traffic", "row"][:, 0]]
-        return told | {"scene": np.array(ids, dtype=object), "eta": eta.numpy()}
+        eta = self.env.transform.pool.eta[found["traffic", "row"][:, 0]].numpy()
+        return found["observation"].numpy().copy(), told | {"scene": np.array(ids, dtype=object), "eta": eta}
 
 
 class DrivingGymEnv(gymnasium.Env):

@@ -43,11 +43,10 @@ class SB3Env(VecEnv):
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         return [getattr(self.batch, attr_name) for _ in self._get_indices(indices)]
 
-    def set_attr(self, *_: Any, **__: Any) -> None:
+    def set_attr(self, *_: Any, **__: Any) -> Any:
         raise NotImplementedError("the environments are one batch")
 
-    def env_method(self, *_: Any, **__: Any) -> list[Any]:
-        raise NotImplementedError("the environments are one batch")
+    env_method = set_attr
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         return [False for _ in self._get_indices(indices)]

@@ -105,7 +105,7 @@ def test_what_cannot_be_is_named(given, monkeypatch):
     before = env.reset(seed=1)[1]["scene"]
     assert len({env.reset(seed=seed)[1]["scene"] for seed in range(8)}) > 1 and env.reset(seed=1)[1]["scene"] == before
     with pytest.raises(InputError, match="num_envs=0"):
-        e2rl.make_env(0, **given)
+        e2rl.make_gym_env(0, **given)
     with pytest.raises(InputError, match="max_speed"):
         e2rl.make_env(1, **given, max_speed=3.0)
     monkeypatch.delitem(sys.modules, "e2rl.learning.gym_env")
