@@ -31,12 +31,12 @@ class DrivingVectorEnv(VectorEnv):
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
-    single_observation_space = Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
-    single_action_space = Box(-1.0, 1.0, (2,), np.float32)
 
     def __init__(self, env: TransformedEnv) -> None:
         self.env, self.num_envs, space = env, env.batch_size[0], env.action_spec_unbatched.space
         self.bounds = torch.stack([space.low, space.high])
+        self.single_observation_space = Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
+        self.single_action_space = Box(-1.0, 1.0, (2,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
@@ -76,11 +76,10 @@ class DrivingVectorEnv(VectorEnv):
 class DrivingGymEnv(gymnasium.Env):
     """One scene: a batch of one, whose arrays have no B."""
 
-    observation_space, action_space = DrivingVectorEnv.single_observation_space, DrivingVectorEnv.single_action_space
-
     def __init__(self, env: TransformedEnv) -> None:
         self._batch = DrivingVectorEnv(env)
-        self.bounds = self._batch.bounds
+        self.bounds, self.observation_space = self._batch.bounds, self._batch.single_observation_space
+        self.action_space = self._batch.single_action_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
         super().reset(seed=seed)

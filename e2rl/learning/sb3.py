@@ -61,7 +61,9 @@ class Deterministic(nn.Module):
         env, normal = model.get_env(), model.get_vec_normalize_env()
         if env is None or not env.has_attr("bounds"):
             raise InputError("the model has no environment of e2rl: load it with env=e2rl.make_sb3_env(...)")
-        self.policy, (self.low, self.high) = model.policy, env.get_attr("bounds")[0]
+        self.low, self.high = env.get_attr("bounds")[0]
+        self.policy = type(model.policy)(**model.policy._get_constructor_parameters())  # a copy on the CPU
+        self.policy.load_state_dict(model.policy.state_dict())
         self.mean, self.scale, self.clip = torch.zeros(1), torch.ones(1), torch.inf
         if normal is not None and normal.norm_obs:
             known: Any = normal.obs_rms

@@ -21,6 +21,8 @@ def given():
 
 def trained(env, kind):
     """A model after a few updates, whose actions vary."""
+    if kind == "one":
+        return PPO("MlpPolicy", env, n_steps=16, batch_size=8, device="cpu", seed=0).learn(16)
     if kind == "sac":
         return SAC("MlpPolicy", env, learning_starts=8, device="cpu", seed=0).learn(40)
     return PPO("MlpPolicy", VecNormalize(env), n_steps=8, batch_size=16, device="cpu", seed=0).learn(64)
@@ -55,18 +57,19 @@ def test_it_is_the_batch_of_gymnasium(given):
     assert min(ends.values()) > 0
 
 
-@pytest.mark.parametrize("suffix", ["pt", "onnx"])
-@pytest.mark.parametrize("kind", ["ppo", "sac"])
+@pytest.mark.parametrize(("kind", "suffix"), [("ppo", "pt"), ("ppo", "onnx"), ("sac", "onnx"), ("one", "onnx")])
 def test_a_saved_policy_does_what_the_model_predicts(given, tmp_path, kind, suffix):
     """Statistics of VecNormalize and the scale of the actions included; the file holds arithmetic, no pickle."""
-    model = trained(e2rl.make_sb3_env(4, **given), kind)
+    model = trained(e2rl.make_gym_env(**given) if kind == "one" else e2rl.make_sb3_env(4, **given), kind)
+    training = model.policy.training
     ego = e2rl.make_ego("policy_file", file=str(e2rl.save_policy(model, tmp_path / f"policy.{suffix}")))
     observation = 3 * np.random.default_rng(0).normal(size=(200, OBSERVATION_SIZE)).astype(np.float32)
+    assert model.policy.training == training, "the model goes on as it was"
     normaliser = model.get_vec_normalize_env()
     seen = normaliser.normalize_obs(observation) if normaliser else observation
     predicted = torch.tensor(model.predict(seen, deterministic=True)[0])
     wanted = in_units(predicted, torch.tensor([-8.0, -1.6]), torch.tensor([5.0, 1.6]))
-    assert torch.allclose(ego.decide(torch.tensor(observation)), wanted, atol=1e-4) and wanted.std(0).min() > 0.01
+    assert torch.allclose(ego.decide(torch.tensor(observation)), wanted, atol=1e-4) and wanted.std(0).min() > 5e-3
 
 
 def test_a_model_that_was_trained_elsewhere_is_refused(given, tmp_path):
