@@ -20,24 +20,33 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import DictConfig, OmegaConf
+from torchrl.envs import TransformedEnv
 
-from e2rl.evaluation.methods import build_ego, build_prior, build_traffic
+from e2rl.evaluation.methods import build_ego, build_prior, build_sim, build_traffic
 from e2rl.evaluation.protocol import Method, Setup, Task
+from e2rl.learning.policy import RowDraw
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.ego import Ego
+from e2rl.planners.policy_file import write_policy
 from e2rl.prior.prior import Prior
 from e2rl.report.picture import Replay
 from e2rl.report.videos import save_animation
-from e2rl.run.config import load_choice, with_changes
+from e2rl.run.config import library, load_choice, with_changes
+from e2rl.run.settings import check_range
 from e2rl.scenes import source
 from e2rl.scenes.scene import SceneSet
-from e2rl.sim.env import SimSettings
+from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.rollout_file import Failure
 from e2rl.sim.rollouts import Rollouts
+from e2rl.traffic.fusing import prepare_fused
+from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import Traffic
+from e2rl.traffic.transform import AdversarialSynthesizer
 
 AT_ONCE = 4  # scenes that are driven together while failures are sought
+SEEDS = 256  # of the noise, for each scene and intensity that a policy is trained in
 
 
 def load_scenes(
@@ -114,6 +123,63 @@ def find_failures(
         if len(failures) >= most:
             break
     return failures
+
+
+def make_env(
+    num_envs: int = 16,
+    scenes: SceneSet | None = None,
+    method: str | Traffic = "e2",
+    eta: float | Sequence[float] = (0.0, 1.0),
+    hold: int = 1,
+    seed: int = 0,
+    compile: bool | str = "auto",
+    **sim: Any,
+) -> TransformedEnv:
+    """Returns TorchRL environments [num_envs] to train in, whose traffic is replanned against the policy every 0.5 s.
+
+    Args:
+        scenes: of which one is drawn for each episode; None: the bundled training scenes.
+        method: the traffic, or the name of a file in conf/synthesizer, on the bundled prior.
+        eta: adversarial intensity, 0 to 3, or several, of which one is drawn.
+        hold: steps of 0.1 s that an action lasts.
+        compile: as in conf/evaluate.yaml, for the whole process.
+        sim: settings of conf/sim/default.yaml, such as reward={"contact": -30.0}.
+    """
+    check_range("num_envs", num_envs, low=1)
+    etas = torch.tensor(eta if isinstance(eta, Sequence) else [eta], dtype=torch.float32)
+    scenes = load_scenes("bundled", split="train") if scenes is None else scenes
+    traffic = make_traffic(method, load_prior()) if isinstance(method, str) else method
+    settings = build_sim(OmegaConf.create({"sim": _choice("sim", "default", sim)}))
+    prepare_fused(OmegaConf.create({"compile": compile, "device": "cpu"}))
+    row = torch.arange(len(etas) * SEEDS * len(scenes))
+    pool = TrafficPool.live(row % len(scenes), etas.repeat_interleave(SEEDS * len(scenes)), row)
+    draw = RowDraw(torch.ones(len(row), dtype=torch.float64), seed)
+    base = DrivingEnv(scenes, settings, num_envs, hold=hold)
+    return TransformedEnv(base, AdversarialSynthesizer(pool, draw, traffic))
+
+
+def make_gym_env(num_envs: int | None = None, **settings: Any) -> Any:
+    """Returns a gymnasium.Env of one scene, or with num_envs a VectorEnv, one batch. settings: of make_env."""
+    module = library("e2rl.learning.gym_env", "make_gym_env", "gym")
+    if num_envs is None:
+        return module.DrivingGymEnv(make_env(1, **settings))
+    return module.DrivingVectorEnv(make_env(num_envs, **settings))
+
+
+def make_sb3_env(num_envs: int = 16, **settings: Any) -> Any:
+    """Returns the batch as a VecEnv of Stable-Baselines3. settings: of make_env."""
+    return library("e2rl.learning.sb3", "make_sb3_env", "gym").SB3Env(make_gym_env(num_envs, **settings))
+
+
+def save_policy(policy: Any, path: str | Path) -> Path:
+    """Writes POLICY.onnx, or POLICY.pt of TorchScript, for ego=policy_file; returns its path.
+
+    policy: a Stable-Baselines3 model trained here, or a module of such a map (docs/observation.md).
+    """
+    if not isinstance(policy, torch.nn.Module):
+        policy = library("e2rl.learning.sb3", "save_policy", "gym").Deterministic(policy)
+    write_policy(policy, Path(path))
+    return Path(path)
 
 
 def save_gif(failure: Failure, path: str | Path) -> Path:

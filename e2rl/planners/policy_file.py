@@ -4,20 +4,24 @@ An ONNX file holds arithmetic. A TorchScript file is a program, which may write 
 """
 
 import io
+import logging
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from threading import Thread
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from e2rl.planners.actor import ObservingEgo
 from e2rl.planners.ego import finite
 from e2rl.planners.onnx_policy import OnnxPolicy
+from e2rl.run.config import library
 from e2rl.run.errors import InputError
-from e2rl.run.files import read_regular
+from e2rl.run.files import read_regular, write_atomically
 from e2rl.run.settings import configured, setting
 from e2rl.sim.observation import OBSERVATION_SIZE
 
@@ -26,6 +30,7 @@ MAPS = f"it maps float32 observations [B, {OBSERVATION_SIZE}] to actions [B, 2] 
 PROBED = (1, 3)  # batches that a file is tried with
 MAX_FILE = 1 << 26  # bytes: 16 million weights
 SECONDS = 20.0  # to open and try a file
+EXAMPLE = 2  # observations that a network is traced with
 
 
 @configured("ego/policy_file")
@@ -112,3 +117,38 @@ def torchscript_policy(content: bytes, where: str) -> Callable[[Tensor], Any]:
         reason = str(error).strip().splitlines()[0][:200]
         raise InputError(f"{where}: no TorchScript archive ({reason}); write one by torch.jit.save") from error
     return torch.no_grad()(module)
+
+
+def write_policy(policy: nn.Module, file: Path) -> None:
+    """Write a module of such a map, whose argument is `observation`, as the suffix says; raises InputError."""
+    writers: dict[str, Callable[[nn.Module, Path], None]] = {ONNX: _write_onnx, TORCHSCRIPT: _write_torchscript}
+    if file.suffix not in writers:
+        raise InputError(f"{file}: no kind of policy; name it {ONNX}, or {TORCHSCRIPT} for TorchScript")
+    write_atomically(file, partial(writers[file.suffix], policy.eval()))
+
+
+def _write_torchscript(policy: nn.Module, file: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        traced = torch.jit.trace(policy, torch.zeros(EXAMPLE, OBSERVATION_SIZE))
+        buffer = io.BytesIO()
+        torch.jit.save(traced, buffer)
+    file.write_bytes(buffer.getvalue())
+
+
+def _write_onnx(policy: nn.Module, file: Path) -> None:
+    library("onnxscript", str(file), "onnx")
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it tells which packages it does without
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            policy,
+            (torch.zeros(EXAMPLE, OBSERVATION_SIZE),),
+            input_names=["observation"],
+            output_names=["action"],
+            dynamic_shapes={"observation": {0: torch.export.Dim("batch")}},
+            dynamo=True,
+            verbose=False,
+        )
+    assert program is not None
+    file.write_bytes(program.model_proto.SerializeToString())

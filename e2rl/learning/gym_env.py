@@ -1,0 +1,97 @@
+"""The environment of `e2rl.make_env` by gymnasium's interfaces: a batch of scenes, or one (extra `gym`)."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+
+from e2rl.sim.observation import OBSERVATION_SIZE
+
+Info = dict[str, Any]
+
+
+def in_units(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Actions [..., 2] in m/s^2 and rad/s of those in [-1, 1], from low < 0 over 0 to high > 0 [2]; 0 is 0."""
+    return action.clamp(0.0, 1.0) * high - action.clamp(-1.0, 0.0) * low
+
+
+class DrivingVectorEnv(VectorEnv):
+    """B scenes as one batch; what ends is reset in the same step.
+
+    Observations [B, OBSERVATION_SIZE], actions [B, 2] in [-1, 1] of bounds [2, 2] (low, high; m/s^2, rad/s). The info
+    has arrays [B]: the metrics of DrivingEnv, scene (its id) and eta; of those that end they are in final_info.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(self, env: TransformedEnv) -> None:
+        self.env, self.num_envs, space = env, env.batch_size[0], env.action_spec_unbatched.space
+        self.bounds = torch.stack([space.low, space.high])
+        self.single_observation_space = Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
+        self.single_action_space = Box(-1.0, 1.0, (2,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[np.ndarray, Info]:
+        """New episodes; options: scene: id or position of the scene of all. InputError for one that is not there."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self.env.set_seed(seed)
+        synthesizer, scene = self.env.transform, (options or {}).get("scene")
+        every = synthesizer.draw.probability
+        if scene is not None:
+            synthesizer.draw.probability = every * (synthesizer.pool.scene_index == self.env.scenes.index(scene))
+        self._now = self.env.reset()
+        synthesizer.draw.probability = every
+        return self._shown(self._now)
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
+        """A step of all environments."""
+        self._now["action"] = in_units(torch.as_tensor(actions, dtype=torch.float32), *self.bounds)
+        stepped, self._now = self.env.step_and_maybe_reset(self._now)
+        last = stepped["next"]
+        reward, terminated, truncated = (last[key][:, 0].numpy() for key in ("reward", "terminated", "truncated"))
+        (seen, info), done = self._shown(self._now), terminated | truncated
+        if done.any():
+            info |= dict(zip(("final_obs", "final_info"), self._shown(last), strict=True))
+            info |= {"_final_obs": done, "_final_info": done}
+        return seen, reward, terminated, truncated, info
+
+    def _shown(self, found: TensorDictBase) -> tuple[np.ndarray, Info]:
+        """Observation and info."""
+        told = {name: value[:, 0].numpy() for name, value in found["metrics"].items()}
+        ids = [self.env.scenes.scene_id[scene] for scene in found["scene_index"][:, 0].tolist()]
+        eta = self.env.transform.pool.eta[found["traffic", "row"][:, 0]].numpy()
+        return found["observation"].numpy().copy(), told | {"scene": np.array(ids, dtype=object), "eta": eta}
+
+
+class DrivingGymEnv(gymnasium.Env):
+    """One scene: a batch of one, whose arrays have no B."""
+
+    def __init__(self, env: TransformedEnv) -> None:
+        self._batch = DrivingVectorEnv(env)
+        self.bounds, self.observation_space = self._batch.bounds, self._batch.single_observation_space
+        self.action_space = self._batch.single_action_space
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
+        super().reset(seed=seed)
+        observation, info = self._batch.reset(seed=seed, options=options)
+        return observation[0], row_of(info, 0)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
+        observation, reward, terminated, truncated, info = self._batch.step(np.asarray(action)[None])
+        seen, told = info.get("final_obs", observation)[0], row_of(info.get("final_info", info), 0)
+        return seen, float(reward[0]), bool(terminated[0]), bool(truncated[0]), told
+
+
+def row_of(info: Info, row: int) -> Info:
+    """The info of one environment of a batch."""
+    return {name: values[row] for name, values in info.items()}

@@ -1,0 +1,114 @@
+"""gymnasium sees the same episodes as TorchRL, by interfaces that pass both checkers."""
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from torchrl.envs.utils import check_env_specs
+
+import e2rl
+from e2rl.learning.gym_env import in_units
+from e2rl.run.errors import InputError
+from e2rl.sim.observation import ELAPSED
+
+SPEED = 0  # of the observation
+
+
+@pytest.fixture(scope="module")
+def given():
+    """Three scenes with recorded traffic."""
+    return {"scenes": e2rl.load_scenes("bundled", 3), "method": "replay", "eta": 0.0, "compile": False}
+
+
+def actions(batch, seed=0):
+    """Scaled actions [B, 2], some of which leave the road before long."""
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (batch, 2)).astype(np.float32)
+
+
+def test_the_checkers_of_gymnasium_and_torchrl_pass(given):
+    attacked = given | {"method": "e2", "eta": (0.0, 2.0)}
+    check_env(e2rl.make_gym_env(**attacked), skip_render_check=True)
+    check_env_specs(e2rl.make_env(3, **attacked))
+
+
+def test_a_batch_has_the_episodes_of_the_torchrl_environment(given):
+    """Through ends and resets: observations, rewards, flags and what ended, from equal seeds and actions."""
+    env, batch = e2rl.make_env(4, **given), e2rl.make_gym_env(4, **given)
+    env.set_seed(5)
+    td, (seen, info) = env.reset(), batch.reset(seed=5)
+    ended = 0
+    for step in range(90):
+        assert (seen == td["observation"].numpy()).all() and seen.dtype == np.float32
+        assert [given["scenes"].index(scene) for scene in info["scene"]] == td["scene_index"][:, 0].tolist()
+        action = actions(4, step)
+        td["action"] = in_units(torch.tensor(action), *batch.bounds)
+        done, td = env.step_and_maybe_reset(td)
+        seen, *flags, info = batch.step(action)
+        for key, value in zip(("reward", "terminated", "truncated"), flags, strict=True):
+            assert (value == done["next", key][:, 0].numpy()).all()
+        over = done["next", "done"][:, 0].numpy()
+        assert (over == info.get("_final_obs", False)).all()
+        for row in over.nonzero()[0]:
+            assert (info["final_obs"][row] == done["next", "observation"][row].numpy()).all()
+            assert info["final_info"]["off_road"][row] == done["next", "metrics", "off_road"][row, 0]
+            assert seen[row, ELAPSED] == 0, "the next episode's first"
+            ended += 1
+    assert ended > 4
+
+
+def test_a_scene_drives_alone_as_in_a_batch(given):
+    """In a chosen scene, to the end of the episode, whose observation and info are those of the step."""
+    one, batch = e2rl.make_gym_env(**given), e2rl.make_gym_env(2, **given)
+    name = given["scenes"].scene_id[1]
+    (alone, info), (both, _) = one.reset(options={"scene": name}), batch.reset(options={"scene": 1})
+    assert info["scene"] == name
+    for step in range(200):
+        assert np.allclose(alone, both, atol=1e-5)
+        action = actions(1, step)[0]
+        alone, reward, terminated, truncated, info = one.step(action)
+        both, rewards, *_, infos = batch.step(np.stack([action, action]))
+        assert reward == pytest.approx(rewards[0], abs=1e-5) and info["scene"] == name
+        if terminated or truncated:
+            assert np.allclose(alone, infos["final_obs"][0], atol=1e-5) and alone[ELAPSED] > 0
+            assert terminated == (info["contact"] or info["off_road"])
+            return
+    pytest.fail("no end")
+
+
+def test_a_seed_decides_the_episodes_in_attacked_traffic(given):
+    batch = e2rl.make_gym_env(3, **given | {"method": "e2", "eta": 2.0})
+
+    def driven(seed):
+        first, info = batch.reset(seed=seed)
+        return [first, *(batch.step(np.zeros((3, 2)))[0] for _ in range(12))], info["scene"].tolist()
+
+    (ours, scenes), (again, same), (_, others) = driven(1), driven(1), driven(3)
+    assert all(map(np.array_equal, ours, again)) and scenes == same != others
+
+
+def test_actions_are_scaled_about_keeping_speed_and_heading(given):
+    low, high = torch.tensor([-8.0, -1.6]), torch.tensor([5.0, 1.6])
+    found = in_units(torch.tensor([[-2.0, -1.0], [-0.5, 0.0], [0.0, 0.5], [1.0, 3.0]]), low, high)
+    assert found.tolist() == [pytest.approx(row) for row in ([-8.0, -1.6], [-4.0, 0.0], [0.0, 0.8], [5.0, 1.6])]
+    env = e2rl.make_gym_env(**given, max_acceleration=2.0)
+    assert env.bounds.tolist() == [pytest.approx([-8.0, -1.6]), pytest.approx([2.0, 1.6])]
+    before = env.reset(options={"scene": 0})[0][SPEED]
+    assert env.step(np.zeros(2))[0][SPEED] == pytest.approx(before, abs=1e-5)
+
+
+def test_what_cannot_be_is_named(given, monkeypatch):
+    env = e2rl.make_gym_env(**given)
+    with pytest.raises(InputError, match="scene=nowhere"):
+        env.reset(options={"scene": "nowhere"})
+    before = env.reset(seed=1)[1]["scene"]
+    assert len({env.reset(seed=seed)[1]["scene"] for seed in range(8)}) > 1 and env.reset(seed=1)[1]["scene"] == before
+    with pytest.raises(InputError, match="num_envs=0"):
+        e2rl.make_gym_env(0, **given)
+    with pytest.raises(InputError, match="max_speed"):
+        e2rl.make_env(1, **given, max_speed=3.0)
+    monkeypatch.delitem(sys.modules, "e2rl.learning.gym_env")
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(InputError, match=r"pip install 'e2rl\[gym\]'"):
+        e2rl.make_gym_env(**given)
