@@ -4,22 +4,20 @@ Writes a page with both replays in step, and the pairs as CSV and JSON (docs/how
 """
 
 import argparse
-import html
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from string import Template
 from typing import Any
 
 from tqdm import tqdm
 
 from e2rl.evaluation.comparison import CHANGES, PAIR, RATES, Driven, compared
-from e2rl.evaluation.rollout_files import cell, nulls, own_folder, write_json
+from e2rl.evaluation.rollout_files import cell, own_folder, write_json
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import Row, is_failure, mode_name
 from e2rl.report.answer import FEW, traffic_name, wrapped
 from e2rl.report.failure_tracks import CHANNELS, MAP_QUANTUM, encoded_map, failure_replay
-from e2rl.report.html import ASSETS, COLUMNS
+from e2rl.report.html import ASSETS, COLUMNS, page
 from e2rl.report.tables import difference_cell
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
@@ -46,7 +44,8 @@ def compare(first: Driven, second: Driven, path: Path) -> list[str]:
     shown = [pair for pair in pairs if pair["change"] != "same"]
     about = {"names": names, "runs": [str(first.run), str(second.run)], "groups": groups, "pairs": rows}
     content = {**about, "told": told, "pairs": rows[: len(shown)], **replays_of((first.run, second.run), shown[:MOST])}
-    write_atomically(path, page(content))
+    scripts = [*(ASSETS / f"{name}.js" for name in SCRIPTS), FOLDER / "compare.js"]
+    write_atomically(path, page(FOLDER / PAGE, " against ".join(names[::-1]), scripts, content))
     write_json(path.with_suffix(".json"), about)
     columns = [*PAIR, "change", "what", *(f"{name}_{side}" for side in SIDES for name in (*FACTS, "file"))]
     flat = [row | {f"{name}_{side}": cell(row[side][name]) for side in SIDES for name in row[side]} for row in rows]
@@ -100,17 +99,6 @@ def replays_of(runs: Sequence[Path], pairs: Sequence[Mapping]) -> dict[str, Any]
             number = maps.setdefault(json.dumps(encoded_map(one.rollout)), len(maps))
             replays.append(failure_replay(one, other) | {"map": number})
     return {"maps": list(map(json.loads, maps)), "replays": replays, "channels": CHANNELS, "map_quantum": MAP_QUANTUM}
-
-
-def page(content: Mapping[str, Any]) -> str:
-    """The page with its data block."""
-    scripts = [*(ASSETS / f"{name}.js" for name in SCRIPTS), FOLDER / "compare.js"]
-    return Template((FOLDER / PAGE).read_text()).substitute(
-        title=html.escape(" against ".join(content["names"][::-1])),
-        style=(ASSETS / "page.css").read_text(),
-        script="\n".join(path.read_text() for path in scripts),
-        data=json.dumps(nulls(content), allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
-    )
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -72,7 +72,9 @@ def write_report(
     content |= add_replays(run, content.pop("rows"), content["failures"], replays)
     path = path or run / PAGE
     write_atomically(path.with_suffix(".csv"), failure_list(content, path.name))
-    write_atomically(path, page(content))
+    scripts = sorted(ASSETS.glob("*.js"), key=lambda script: script.stem == "page")  # which uses all others
+    title = f"Failures of {', '.join(dict.fromkeys(group['ego'] for group in content['groups']))}"
+    write_atomically(path, page(ASSETS / "page.html", title, scripts, content))
     return path
 
 
@@ -88,17 +90,15 @@ def failure_list(content: Mapping[str, Any], page_name: str) -> str:
     return csv_text([["failure", *COLUMNS, "mode", "link", "again"], *lines])
 
 
-def page(content: Mapping[str, Any]) -> str:
-    """The page with its data block."""
-    data = json.dumps(nulls(content), allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    scripts = sorted(ASSETS.glob("*.js"), key=lambda path: path.stem == "page")  # which uses all others
+def page(template: Path, title: str, scripts: Sequence[Path], content: Mapping[str, Any]) -> str:
+    """A template filled with a title, the report's style, scripts and a data block."""
     parts = {
-        "TITLE": html.escape(f"Failures of {', '.join(dict.fromkeys(group['ego'] for group in content['groups']))}"),
+        "TITLE": html.escape(title),
         "STYLE": (ASSETS / "page.css").read_text(),
         "SCRIPT": "\n".join(path.read_text() for path in scripts),
-        "DATA": data,
+        "DATA": json.dumps(nulls(content), allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
     }
-    before, *rest = (ASSETS / "page.html").read_text().split("{{")
+    before, *rest = template.read_text().split("{{")
     pieces = (piece.split("}}", 1) for piece in rest)
     return before + "".join(parts[name] + text for name, text in pieces)
 
