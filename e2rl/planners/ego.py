@@ -25,7 +25,10 @@ RETURN_TIME, RETURN_LENGTH = 0.7, 1.5  # s, m: a lateral error decays over max(R
 CATCH_UP = 1.0  # 1/s: rate at which a longitudinal error is corrected
 FASTEST = 50.0  # m/s: a plan that is faster, in its speeds or from pose to pose, is nonsense
 LARGEST = 100.0  # m/s^2, rad/s: so is a larger action
-ASIDE, TURNED = 2.0, 1.0  # m, rad: a plan that begins farther from the ego is in another frame, or of another time
+ASIDE, TURNED = (
+    5.0,
+    1.0,
+)  # m, rad: a plan that begins farther from the ego is in another frame; some begin on a lane beside
 CREEP = 0.5  # m/s below which a heading may be anything
 JUMPS = f"a plan that is not finite, or jumps (above {FASTEST:g} m/s)"
 STRAYS = (
