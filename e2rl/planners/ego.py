@@ -25,15 +25,13 @@ RETURN_TIME, RETURN_LENGTH = 0.7, 1.5  # s, m: a lateral error decays over max(R
 CATCH_UP = 1.0  # 1/s: rate at which a longitudinal error is corrected
 FASTEST = 50.0  # m/s: a plan that is faster, in its speeds or from pose to pose, is nonsense
 LARGEST = 100.0  # m/s^2, rad/s: so is a larger action
-ASIDE, TURNED = (
-    5.0,
-    1.0,
-)  # m, rad: a plan that begins farther from the ego is in another frame; some begin on a lane beside
+# A plan that begins farther away is in another frame, or of another time; some begin on a lane beside.
+ALONG, ASIDE, TURNED = 2.0, 5.0, 1.0  # m, m, rad
 CREEP = 0.5  # m/s below which a heading may be anything
 JUMPS = f"a plan that is not finite, or jumps (above {FASTEST:g} m/s)"
 STRAYS = (
-    f"a plan that begins more than {ASIDE:g} m or {TURNED:g} rad from where the ego will be 0.1 s from now: its states "
-    "are of the scene's frame, the first of them 0.1 s ahead"
+    f"a plan that begins more than {ALONG:g} m ahead of, behind, {ASIDE:g} m beside or {TURNED:g} rad from where the "
+    "ego will be 0.1 s from now: its states are of the scene's frame, the first of them 0.1 s ahead"
 )
 WILD = f"an action that is not finite, or above {LARGEST:g}"
 
@@ -141,7 +139,8 @@ def strays(now: Tensor, first: Tensor) -> Tensor:
     due = dynamics.constant_velocity(now, torch.full_like(now[:, :1], DT))[:, 0]
     moves = torch.minimum(now[:, 3].abs(), first[:, 3].abs()) > CREEP
     turned = dynamics.wrap(first[:, 2] - due[:, 2]).abs() > TURNED
-    return ((first[:, :2] - due[:, :2]).norm(dim=-1) > ASIDE) | (turned & moves)
+    away = to_frame(first[:, :2], due).abs() > torch.tensor([ALONG, ASIDE], device=due.device)
+    return away.any(-1) | (turned & moves)
 
 
 def checked(given: Any, shape: tuple[int, ...], ego: Ego, method: str) -> Tensor:
