@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from e2rl.planners.ego import JUMPS, LARGEST, PLAN_STEPS, STRAYS, WILD, Ego, PlannerError, drivable, strays
+from e2rl.planners.ego import JUMPS, LARGEST, PLAN_STEPS, WILD, Ego, PlannerError, drivable
 from e2rl.planners.planner_link import (
     BadReply,
     PlannerFailed,
@@ -163,7 +163,6 @@ def plans_of(now: Tensor, replies: list[tuple[int, bytes]], steps: int) -> Tenso
         WILD: acts & ~(actions.abs() <= LARGEST).all(1),
         f"a TRAJECTORY of fewer than the {steps} steps until the next plan": known < steps,
         JUMPS: ~drivable(now, given, known),
-        STRAYS: strays(now, given[:, 0]),
     }.items():
         bad = dict.fromkeys(wrong.nonzero()[:, 0].tolist(), why) | bad
     if bad:

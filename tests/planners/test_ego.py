@@ -134,7 +134,7 @@ def test_plans_of_another_shape_or_type_are_told_so(of, told):
 )
 def test_a_plan_that_begins_elsewhere_ends_its_rollout(of):
     with pytest.raises(Undrivable, match="begins more than 2 m ahead of, behind, 5 m beside or 1 rad") as refused:
-        drive(Planned(of), make_scenes(2, vehicles=[(5.0, 0, 10.0)]))
+        drive(Planned(of), make_scenes(2, vehicles=[(3.5, 0, 10.0)]))
     assert set(refused.value.rows) == {0, 1}
     drive(Planned(lambda plan: plan + torch.tensor([0.5, 3.5, 0.2, 0])), make_scenes(2))
 
