@@ -136,7 +136,7 @@ def test_a_plan_that_begins_elsewhere_ends_its_rollout(of):
     with pytest.raises(Undrivable, match="begins more than 2 m ahead of, behind, 5 m beside or 1 rad") as refused:
         drive(Planned(of), make_scenes(2, vehicles=[(3.5, 0, 10.0)]))
     assert set(refused.value.rows) == {0, 1}
-    drive(Planned(lambda plan: plan + torch.tensor([0.5, 3.0, 0.1, 0])), make_scenes(2))
+    drive(Planned(lambda plan: plan + torch.tensor([0.5, 3.0, 0.1, 0])), make_scenes(2), steps=8)  # on the lane beside
 
 
 class Braking(Ego):
