@@ -124,6 +124,8 @@ def write_policy(policy: nn.Module, file: Path) -> None:
     writers: dict[str, Callable[[nn.Module, Path], None]] = {ONNX: _write_onnx, TORCHSCRIPT: _write_torchscript}
     if file.suffix not in writers:
         raise InputError(f"{file}: no kind of policy; name it {ONNX}, or {TORCHSCRIPT} for TorchScript")
+    if file.suffix == ONNX:
+        library("onnxscript", str(file), "onnx")
     write_atomically(file, partial(writers[file.suffix], policy.eval()))
 
 
@@ -137,7 +139,6 @@ def _write_torchscript(policy: nn.Module, file: Path) -> None:
 
 
 def _write_onnx(policy: nn.Module, file: Path) -> None:
-    library("onnxscript", str(file), "onnx")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it tells which packages it does without
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
