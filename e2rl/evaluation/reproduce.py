@@ -48,7 +48,8 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
     if config.resume or not config.reproduce:
         return Run.of(config, free)
     where, old = f"reproduce={config.reproduce}", Path(config.reproduce).resolve()
-    saved, known = saved_configuration(config, old, where), read_provenance(old)
+    whole = OmegaConf.merge(config, {"failure": None})
+    saved, known = saved_configuration(whole, old, where), read_provenance(old)
     if missing := [name for name in (METRICS_FILE, SCENES) if not (old / name).is_file()]:
         raise InputError(f"{where}: {missing[0]} is missing; give a finished run of evaluate.py that has tables")
     read_metrics(old / METRICS_FILE)  # what is damaged is told now, and not at the end

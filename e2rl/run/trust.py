@@ -36,7 +36,8 @@ def saved_configuration(config: DictConfig, folder: Path, where: str) -> DictCon
     or names what the command line does not.
 
     Args:
-        config: that of the command line: its keys must be there; its plugins and endpoint are trusted.
+        config: that of the command line: its keys must be there, unless they are null, as new options are that an
+            earlier version did not have; its plugins and endpoint are trusted.
         where: the option that names the folder, for messages.
     """
     file = folder / CONFIG
@@ -44,9 +45,11 @@ def saved_configuration(config: DictConfig, folder: Path, where: str) -> DictCon
         raise InputError(f"{where}: no run found ({file} is missing); give the folder that the run printed")
     check_folder(folder)
     saved = read_yaml(file)
-    if missing := sorted({str(key) for key in config} - {str(key) for key in saved}):
+    absent = [str(key) for key in config if key not in saved]
+    if missing := sorted(key for key in absent if config[key] is not None):
         reason = "of the other command, of another version, or cut off"
         raise InputError(f"{file}: {reason} ({', '.join(missing)}: missing); give another run, or begin a new one")
+    saved.update(dict.fromkeys(absent))
     check_code(saved, [str(name) for name in config.plugins], where)
     named = {str(value) for key, value in leaves(OmegaConf.to_container(saved)) if key.endswith("base_url") and value}
     if unknown := sorted(named - {str(OmegaConf.select(config, ENDPOINT))}):

@@ -42,6 +42,14 @@ def test_a_run_of_ones_own_goes_on(tmp_path, config):
     check_written(saved, tmp_path, "resume=x", config)
 
 
+def test_a_run_of_a_version_without_an_option_that_is_off_goes_on(tmp_path):
+    earlier = changed(EVALUATE, {})
+    del earlier["failure"]
+    assert reading(tmp_path, earlier, EVALUATE) == EVALUATE
+    with pytest.raises(InputError, match="failure: missing"):
+        reading(tmp_path, earlier, changed(EVALUATE, {"failure": "one"}))
+
+
 @pytest.mark.parametrize("group", ["learner", "ego", "curriculum", "synthesizer"])
 def test_every_file_of_ones_own_goes_on(tmp_path, group):
     for name in set(choices(group)) - {"external", "nuplan", "policy_file"}:
