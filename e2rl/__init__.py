@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import Any
 
 __all__ = ["find_failures", "load_prior", "load_scenes", "make_ego", "make_env", "make_gym_env", "make_sb3_env"]
-__all__ += ["make_traffic", "roll_out", "save_gif", "save_policy", "score"]
+__all__ += ["make_traffic", "roll_out", "save_policy", "save_video", "score"]
 
 
 def __getattr__(name: str) -> Any:

@@ -4,7 +4,7 @@
 
     failure = e2rl.find_failures(ego="lane_graph", method="e2")[0]
     print(failure.row["scene_id"], "hit after", failure.row["contact_time"], "s; counts:", failure.row["counted"] == 1)
-    e2rl.save_gif(failure, "failure.gif")
+    e2rl.save_video(failure, "failure.gif")
 
 Step by step:
 
@@ -182,8 +182,8 @@ def save_policy(policy: Any, path: str | Path) -> Path:
     return Path(path)
 
 
-def save_gif(failure: Failure, path: str | Path) -> Path:
-    """Writes the moving picture of a failure; returns its path."""
+def save_video(failure: Failure, path: str | Path) -> Path:
+    """Writes the video of a failure, FILE.gif or FILE.mp4; returns its path."""
     save_animation(Path(path), Replay(failure.rollout, failure.row).frames())
     return Path(path)
 

@@ -42,7 +42,7 @@ def test_a_failure_is_found_in_a_few_rollouts(tmp_path):
     found = e2rl.find_failures("lane_graph", "e2", scenes=scenes)
     assert found and all(failure.row["cfr"] == 1 and failure.contact is not None for failure in found)
     assert {failure.rollout.scene_id for failure in found} <= set(scenes.scene_id)
-    assert e2rl.save_gif(found[0], tmp_path / "failure.gif").stat().st_size > 10_000
+    assert e2rl.save_video(found[0], tmp_path / "failure.gif").stat().st_size > 10_000
 
 
 def test_settings_reach_the_objects_and_wrong_ones_are_named():

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -41,9 +42,15 @@ class Page(HTMLParser):
 def site(tmp_path_factory):
     """The pages of the site by path, and its folder."""
     folder = tmp_path_factory.mktemp("site")
+    return built(ROOT, folder, execute="")
+
+
+def built(source, folder, execute):
+    """The pages by path, and the folder, of the site of the mkdocs.yml in a folder."""
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
-    variables = os.environ | {"E2RL_EXECUTE": "", "NO_MKDOCS_2_WARNING": "1"}
-    done = subprocess.run(command, cwd=ROOT, env=variables, capture_output=True, text=True, timeout=600)
+    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    variables = os.environ | {"E2RL_EXECUTE": execute, "NO_MKDOCS_2_WARNING": "1", "PYTHONPATH": paths}
+    done = subprocess.run(command, cwd=source, env=variables, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
     return {path.relative_to(folder).as_posix(): Page(path) for path in folder.rglob("*.html")}, folder
 
@@ -96,3 +103,23 @@ def test_the_search_finds_pages_docstrings_and_the_notebook(site):
         ("tutorial.html", "which duty did the other vehicle break"),
     ):
         assert any(entry["location"].startswith(page) and words in entry["text"].lower() for entry in entries), page
+
+
+def test_the_gallery_is_made_by_the_commands_on_its_page(site, tmp_path):
+    """Of six scenes, once each, in a site of this page alone; without E2RL_EXECUTE the page says how it is made."""
+    pages, folder = site
+    assert "E2RL_EXECUTE=true mkdocs build" in (folder / "gallery.html").read_text()
+    assert "iframe" not in pages["gallery.html"].tags and not (folder / "assets" / "gallery.html").exists()
+    text = (ROOT / "docs" / "gallery.md").read_text()
+    small = text.split("The folder of a run")[0].replace("num_scenes=16", "num_scenes=6 tries=1")
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "gallery.md").write_text(small)
+    lines = (ROOT / "mkdocs.yml").read_text().splitlines()
+    execute = next(line for line in lines if line.startswith("  execute:"))
+    hooks = f"hooks: [{ROOT / 'tools' / 'site' / 'gallery.py'}]"
+    (tmp_path / "mkdocs.yml").write_text(f"site_name: gallery\nuse_directory_urls: false\n{hooks}\nextra:\n{execute}\n")
+    pages, folder = built(tmp_path, tmp_path / "site", execute="true")
+    shown = [address for address in pages["gallery.html"].loads if address.endswith("gallery.html")]
+    assert shown == ["assets/gallery.html"] and "assets/gallery.html" in pages["gallery.html"].links
+    report = (folder / "assets" / "gallery.html").read_text()
+    assert '"n_scenes":6' in report and '"replay":0' in report and tempfile.gettempdir() not in report

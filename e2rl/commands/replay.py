@@ -1,4 +1,4 @@
-"""`e2rl replay RUN_DIR`: videos (GIF) of failures of a run, first those that count, one of a scene."""
+"""`e2rl replay RUN_DIR`: videos of failures of a run, first those that count, one of a scene."""
 
 import argparse
 from collections.abc import Iterator
@@ -46,6 +46,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("run", type=Path, metavar="RUN_DIR", help="a run's folder, or one rollout .npz")
     parser.add_argument("--failures", type=int, default=3, metavar="N", help="how many failures (default %(default)s)")
     parser.add_argument("--modes", action="store_true", help="instead, a typical failure of each mode")
+    parser.add_argument("--to", choices=("gif", "mp4"), default="gif", help="kind of file (default %(default)s)")
     parser.add_argument("--out", type=Path, help="folder to write to (default: RUN_DIR/replays)")
     parser.add_argument("--metres", type=float, default=70.0, help="side of the picture, m (default %(default)s)")
     parser.add_argument("--pixels", type=int, default=720, help="side of the picture, pixels (default %(default)s)")
@@ -53,6 +54,6 @@ def main(arguments: list[str] | None = None) -> None:
     with ending():
         folder = options.out or own_folder(options.run.parent if options.run.is_file() else options.run, "replays")
         for title, shown in chosen(options.run, options.failures, options.modes):
-            path = folder / f"{shown.rollout.name.removesuffix('.npz')}.gif"
+            path = folder / f"{shown.rollout.name.removesuffix('.npz')}.{options.to}"
             save_animation(path, Replay(shown.rollout, shown.row, options.metres, options.pixels).frames())
             print(*filter(None, [title]), path, sep="\n")

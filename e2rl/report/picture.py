@@ -1,7 +1,7 @@
 """One rollout as pictures: any moment of it, and all frames of its replay; one scene at several intensities."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,17 +63,16 @@ class Replay:
         assert isinstance(self.panel.figure, Figure)
         return image_of(self.panel.figure)
 
-    def frames(self) -> list[Image.Image]:
-        """All frames: real time, half speed just before contact, then the contact held."""
+    def frames(self) -> Iterator[Image.Image]:
+        """All frames, drawn as they are asked for: real time, half speed just before contact, then the contact held."""
         if self.contact is None:
             times = list(range(self.last + 1))
         else:
             slow_from = max(0, self.contact - round(SLOW / self.rollout.dt))
             times = [*range(slow_from), *np.arange(slow_from, self.contact, 0.5)]
-        pictures = [self.picture(time) for time in tqdm(times, desc="frames", leave=False, disable=None)]
+        yield from map(self.picture, tqdm(times, desc="frames", leave=False, disable=None))
         if self.contact is not None:
-            pictures += [self.picture(self.contact, phase=(index % 7) / 6) for index in range(FREEZE)]
-        return pictures
+            yield from (self.picture(self.contact, phase=(index % 7) / 6) for index in range(FREEZE))
 
     def trails(self, time: float) -> list[Trail]:
         """The last two seconds of all agents that move, those of the adversaries and of the ego on top."""

@@ -14,7 +14,6 @@ from e2rl.report.videos import save_animation
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.rollouts import Rollouts
 
-VIDEOS = "videos"
 METRES, PIXELS = 60.0, 360  # side of a video's picture
 
 
@@ -45,8 +44,7 @@ def save_videos(
         The path of each video.
     """
     for k, row in enumerate(hits(traffic, scenes)[:count].tolist()):
-        path = folder / VIDEOS / f"round-{number:03d}-{k + 1}.gif"
-        path.parent.mkdir(exist_ok=True)
+        path = folder / "videos" / f"round-{number:03d}-{k + 1}.gif"
         save_animation(path, replay_of(traffic, row, scenes, method).frames())
         yield path
 

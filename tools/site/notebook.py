@@ -5,7 +5,6 @@ takes some two minutes, and the page shows what its cells print and draw.
 """
 
 import json
-import os
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
@@ -19,7 +18,7 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
     """Add the page to those of docs/; the notebook itself can be downloaded."""
     path = Path(config.docs_dir) / NOTEBOOK
     notebook = json.loads(path.read_text())
-    if os.environ.get("E2RL_EXECUTE", "").lower() in ("1", "true"):
+    if config.extra["execute"]:
         notebook = executed(notebook, path.parent)
     files.append(File.generated(config, PAGE, content=page(notebook)))
 
