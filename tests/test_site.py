@@ -111,7 +111,7 @@ def test_the_gallery_is_made_by_the_commands_on_its_page(site, tmp_path):
     assert "E2RL_EXECUTE=true mkdocs build" in (folder / "gallery.html").read_text()
     assert "iframe" not in pages["gallery.html"].tags and not (folder / "assets" / "gallery.html").exists()
     text = (ROOT / "docs" / "gallery.md").read_text()
-    small = text.split("The folder of a run")[0].replace("num_scenes=16", "num_scenes=6 tries=1")
+    small = text.split("[Watch the failures]")[0].replace("num_scenes=16", "num_scenes=6 tries=1")
     (tmp_path / "docs").mkdir()
     (tmp_path / "docs" / "gallery.md").write_text(small)
     lines = (ROOT / "mkdocs.yml").read_text().splitlines()
