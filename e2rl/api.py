@@ -183,7 +183,7 @@ def save_policy(policy: Any, path: str | Path) -> Path:
 
 
 def save_gif(failure: Failure, path: str | Path) -> Path:
-    """Writes a video (GIF) of a failure; returns its path."""
+    """Writes the moving picture of a failure; returns its path."""
     save_animation(Path(path), Replay(failure.rollout, failure.row).frames())
     return Path(path)
 
