@@ -37,7 +37,7 @@ Ctrl-C ends a command in one line, which says how to go on with it."""
 
 
 def help_text() -> str:
-    """Returns what there is, with examples."""
+    """Returns the list of commands, with examples."""
     width = max(map(len, COMMANDS))
     lines = [f"  {name.ljust(width)}  {about}" for name, (_, about) in COMMANDS.items()]
     return "\n".join(["usage: e2rl COMMAND ... | --version", "", *lines, "", EXAMPLES])

@@ -1,4 +1,4 @@
-"""`e2rl skeleton`: the skeleton, from pairwise risk to an active chain, and what anchoring makes of it."""
+"""`e2rl skeleton`: figures of the skeleton, from pairwise risk to an active chain, and of the effect of anchoring."""
 
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
 
@@ -12,7 +12,7 @@ from e2rl.run.run import Run
 
 
 def draw(run: Run) -> None:
-    """Roll out every scene in this process, listen to the selections, and draw the longest chain; with a second method
+    """Roll out every scene in this process and draw the longest chain selected; with a second method
     also the longest one of the start under both."""
     plan = begin(run)
     chain = LongestChain(plan.methods[0])

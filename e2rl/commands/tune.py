@@ -1,4 +1,4 @@
-"""`e2rl tune synthesizer=NAME`, or `e2rl tune tuning.group=ego ego=NAME`: the parameters that find, or avoid, most.
+"""`e2rl tune synthesizer=NAME`, or `e2rl tune tuning.group=ego ego=NAME`: parameters of most, or fewest, failures.
 
 Writes tuning.json, tuned.yaml (the lines to keep in conf/) and of an adversary the curve over its gain. The ranges are
 those of the class (`tuned`), or tuning.space (docs/adversaries.md, docs/how-to/planner.md).

@@ -1,7 +1,7 @@
 """The egos that a run rates, in the same traffic: the same scenes, noise, methods and intensities for each of them.
 
-The noise of a rollout depends on its scene and seed alone, so egos are compared rollout by rollout. The adversaries are
-made anew against each of them. Trainings of one policy with different seeds are egos of their own in the files, and are
+The noise of a rollout depends on its scene and seed alone, so egos are compared rollout by rollout. Each is
+attacked by adversaries of its own. Trainings of one policy with different seeds are separate egos in the files, and are
 also pooled under one name, as `metrics.statistics` says.
 """
 

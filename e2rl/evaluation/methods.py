@@ -76,7 +76,7 @@ def method_config(config: DictConfig, name: str) -> DictConfig:
 
 
 def build_ego(config: DictConfig) -> Ego:
-    """The ego of the `ego` group, an outside planner's class included."""
+    """The ego of the `ego` group, a class from outside of e2rl included."""
     return built(config.ego, "ego", Ego)
 
 

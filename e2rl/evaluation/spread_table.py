@@ -1,4 +1,4 @@
-"""The spread of the prior's samples beside that of MANY steps: what few network evaluations cost of the trained law."""
+"""The spread of the prior's samples beside that of MANY steps: what few network evaluations lose of it."""
 
 import copy
 from collections.abc import Sequence

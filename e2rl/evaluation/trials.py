@@ -1,4 +1,4 @@
-"""What a trial of a tuning is: rollouts made anew with its parameters; and what their metrics are worth.
+"""What a trial of a tuning is: new rollouts with its parameters, and the objective of their metrics.
 
 A replay of stored attacks would not do: it does not react to the planner under trial.
 """

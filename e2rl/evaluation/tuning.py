@@ -1,4 +1,4 @@
-"""Tuning: optuna proposes parameters, every trial is measured anew, the best is kept.
+"""Tuning: optuna proposes parameters, every trial is measured, the best is kept.
 
 What a trial is and what its metrics are worth is told by `e2rl.evaluation.trials`.
 """
@@ -30,7 +30,7 @@ STUDY_FILE, TUNING_FILE, TUNED_FILE = "study.json", "tuning.json", "tuned.yaml"
 
 
 class Objective(Protocol):
-    """What metrics are worth; shown: names of those that a trial's line tells."""
+    """The objective of metrics; shown: names of those in a trial's line."""
 
     shown: ClassVar[tuple[str, ...]]
 

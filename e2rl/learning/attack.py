@@ -96,7 +96,7 @@ TRACKS = ("scene_index", "states", "valid", "adversaries", "owes")
 @dataclass(frozen=True)
 class Order:
     """What is to be synthesized: for round `number`, in scenes [S], at intensities eta [S], by causal templates [S]
-    int64, from a seed, against an ego that nobody changes meanwhile."""
+    int64, from a seed, against an ego that does not change meanwhile."""
 
     number: int
     scenes: Tensor

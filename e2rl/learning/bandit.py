@@ -1,4 +1,4 @@
-"""A bandit over intensity and causal template: it draws what the policy fails in neither never nor always.
+"""A bandit over intensity and causal template: it prefers what the policy sometimes fails, but not always.
 
 An arm is an intensity with a causal template. What there is to learn from an attack whose failure rate is p is scored
 as the regret p s of `CurriculumScheduler`: 0 for what is mastered and for what is hopeless. Each arm has its own p and

@@ -1,4 +1,4 @@
-"""Training of the ego `bits` on recordings: every moving vehicle of a scene plays the ego, along its own route.
+"""Training of the ego `bits` on recordings: every moving vehicle takes the ego's place, along its own route.
 
 A window is a vehicle at a frame and its next 5 s. Where they end is the goal. The goal head learns it by cross-entropy;
 the policy, told the goal, learns to drive there through the unicycle. Half of the windows begin beside the recording,

@@ -67,10 +67,10 @@ class CloningLoss(LossModule):
 
 class TeachingLoss(LossModule):
     """Mean "loss_teaching" [] of -log sum_c w_c exp(-|a_c - a(o)|^2 / 2), distances in units of LABEL_WIDTH, of the
-    most central actions a(o) under the labels of demonstrations [M]: least where a(o) is near one label that much
-    speaks for.
+    most central actions a(o) under the labels of demonstrations [M]: least where a(o) is near one label of large
+    weight.
 
-    Ways out differ: the mean of one to the left and one to the right is none. `CloningLoss` has such means, and fits
+    Evasions differ: the mean of one to the left and one to the right is none. `CloningLoss` has such means, and fits
     the actor's own deviation too: late in a training, when that is a tenth, its gradient is a hundred times as large as
     early, and it widens the exploration.
     """
@@ -91,7 +91,7 @@ class TeachingLoss(LossModule):
 
 
 def mirrored_demonstrations(shown: TensorDictBase) -> TensorDict:
-    """The demonstrations [M] in a mirror: left and right exchanged."""
+    """The demonstrations [M] with left and right exchanged."""
     action = shown["action"] * shown["action"].new_tensor([1.0, -1.0])
     found = {"observation": mirrored(shown["observation"]), "action": action, "weight": shown["weight"]}
     return TensorDict(found, batch_size=shown.batch_size)

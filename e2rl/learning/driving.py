@@ -30,7 +30,7 @@ OUTCOME_KEYS = (
 class Episodes:
     """E finished episodes, each field [E]: pool row and scene (int64), adversarial traffic, contact with any agent,
     off the road (bool), return, progress [m] and mean |acceleration| [m/s^2] (NaN if not measured); survivable: the
-    share of the row's critical moments that a teacher would survive (NaN if none tells)."""
+    fraction of the row's critical moments that a teacher would survive (NaN: unknown)."""
 
     row: Tensor
     scene_index: Tensor

@@ -1,9 +1,9 @@
 """The extension point for curricula: intensity, causal template, fraction of adversarial episodes, scene priorities.
 
 Scenes are prioritised by rank, mixed with staleness, as in prioritised level replay (Jiang et al. 2021). What is ranked
-is the regret p s: p is the recent failure rate of the ego in a scene's adversarial traffic, s the share of its critical
-moments that a teacher would survive, who knows no more than the ego does. Where no teacher tells, s = 1 - p: that is
-the learnability of Rutherford et al. ("No Regrets", 2024). It is 0 for a scene that is solved and for one that is
+is the regret p s: p is the recent failure rate of the ego in a scene's adversarial traffic, s the fraction of its
+critical moments that a teacher would survive, who knows no more than the ego does. Without a teacher, s = 1 - p: that
+is the learnability of Rutherford et al. ("No Regrets", 2024). It is 0 for a scene that is solved and for one that is
 hopeless.
 """
 
@@ -131,8 +131,8 @@ class CurriculumScheduler(Extension):
         return first + (last - first) * torch.rand(count, generator=self._generator)
 
     def regret(self) -> Tensor:
-        """p s [S] of the recent failure rate p and the share s of what the teacher would survive, 1 - p where that is
-        unknown; NaN for scenes never driven in adversarial traffic."""
+        """p s [S] of the recent failure rate p and the fraction s of what the teacher would survive, 1 - p where that
+        is unknown; NaN for scenes never driven in adversarial traffic."""
         return self._failing * torch.where(self._survivable.isnan(), 1 - self._failing, self._survivable)
 
     def priority(self) -> Tensor:
@@ -158,8 +158,8 @@ class CurriculumScheduler(Extension):
         return chosen
 
     def update(self, scene_index: Tensor, failed: Tensor, adversarial: Tensor, survivable: Tensor) -> None:
-        """Update with episodes [E]: scene, whether the ego failed, whether the traffic was adversarial, and the share
-        of its row's critical moments that the teacher would survive (NaN: unknown)."""
+        """Update with episodes [E]: scene, whether the ego failed, whether the traffic was adversarial, and the
+        fraction of its row's critical moments that the teacher would survive (NaN: unknown)."""
         scene_index, adversarial = scene_index.cpu(), adversarial.cpu()
         told = adversarial & ~survivable.isnan() & self._teacher_tells
         for known, value, of in ((self._failing, failed.float(), adversarial), (self._survivable, survivable, told)):

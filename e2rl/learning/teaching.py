@@ -89,8 +89,8 @@ class Teacher:
         self._looked_at = NOTHING
 
     def survivable(self, rows: int) -> Tensor:
-        """The share [R], of the decisions looked at in each of the pool's rows, of those that the planner survives and
-        the policy's plan does not; NaN in rows without any. Then it begins anew."""
+        """Of the decisions judged in each of the pool's rows, the fraction [R] that the planner survives and the
+        policy's plan does not; NaN in rows without any. Then all counts are reset."""
         row, away = self._looked_at
         self._looked_at = NOTHING
         return torch.bincount(row, away.float(), rows) / torch.bincount(row, minlength=rows)

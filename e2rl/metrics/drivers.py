@@ -17,7 +17,7 @@ MAX_JERK = 12.65  # m/s^3, at which brakes build up
 
 
 class Observation(NamedTuple):
-    """What a driver sees at one step, each field [...]: itself and the other vehicle, along and across its own way."""
+    """What a driver sees at one step, each field [...]: itself and the other vehicle, along and across its own path."""
 
     speed: Tensor  # m/s, the ego's
     acceleration: Tensor  # m/s^2, the ego's in the step before

@@ -1,6 +1,6 @@
 """Manoeuvres: knots of acceleration and lateral shift along a route, executed by the unicycle within its limits.
 
-By how much trajectories of the ego fail as evasions: clearance to everybody, and the road.
+`violations` measures by how much the ego's trajectories fail as evasions: clearance to others, and the road.
 """
 
 import torch

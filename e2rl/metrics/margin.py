@@ -1,4 +1,4 @@
-"""How near a rollout comes to a preventable failure: the verdict made continuous, for a search to climb.
+"""How near a rollout comes to a preventable failure: a continuous verdict that guides a search.
 
 Without a contact it is minus the least over time of the distance of the ego to a vehicle that moves relative to it, in
 time and space: (t^2 + d^2)^(1/2) of their closest approach at constant velocities, t s ahead and d m between the sides.
@@ -43,7 +43,7 @@ def approach_distance(batch: Batch) -> Tensor:
 
 
 def contact_margin(batch: Batch) -> Tensor:
-    """Of rollouts [B] with a contact: PREVENTED where it is preventable, else the share of the ego's speed that the
+    """Of rollouts [B] with a contact: PREVENTED where it is preventable, else the fraction of the ego's speed that the
     competent driver has lost at the step before the contact; 0 where the ego hardly moves."""
     row = torch.arange(len(batch["stop"]), device=batch["stop"].device)
     speed = batch["states"][row, batch["before"], 0, 3]

@@ -242,7 +242,7 @@ def time_to_collision(batch: Batch, places: Places, fault: Tensor, new: Tensor) 
 
 
 def expert_progress(batch: Batch) -> Tensor:
-    """Fraction [B] of the recorded ego's way driven to the last step; 1 where it hardly moved."""
+    """Fraction [B] of the recorded ego's path driven to the last step; 1 where it hardly moved."""
     last = torch.full_like(batch["stop"], batch["states"].shape[1] - 1)
     way = ego_path(batch["states"], batch["valid"], last)
     return route_completion(*way, batch["logged"], batch["logged_valid"]).nan_to_num(1.0)

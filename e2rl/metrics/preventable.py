@@ -1,10 +1,10 @@
 """Would a competent driver in the ego's place have had the collision (docs/verdicts.md)?
 
-The ego is driven again along its own way; all others are replayed. A vehicle behind that is replayed into a driver who
+The ego is driven again along its own path; all others are replayed. A vehicle behind that is replayed into a driver who
 brakes earlier than the ego did is driven again, too: if its own competent braking avoids the contact, it does not
 count. Such chains are at most two vehicles long.
 
-Shapes: B rollouts, T + 1 states of DT, N others. A vehicle's way is the path that it drove, straight on from its end.
+Shapes: B rollouts, T + 1 states of DT, N others. A vehicle's path is the one that it drove, straight on from its end.
 The driver keeps the recorded acceleration until it reacts, then what it asks for; it never steers and never drives
 faster than recorded.
 """
@@ -38,7 +38,7 @@ class Tracks(NamedTuple):
 
 
 class Along(NamedTuple):
-    """Others seen along a way, each [T+1, B, N]. Those absent or never on the way are at an infinite distance."""
+    """Others seen along a path, each [T+1, B, N]. Those absent or never on it are at an infinite distance."""
 
     rear: Tensor  # m, arc length of its near end
     speed: Tensor  # m/s, along the way
@@ -48,12 +48,12 @@ class Along(NamedTuple):
 
 
 def driven_length(states: Tensor) -> Tensor:
-    """Arc length [B, T+1] m at each step of a way states [B, T+1, 4], 0 at its start."""
+    """Arc length [B, T+1] m at each step of a path states [B, T+1, 4], 0 at its start."""
     return torch.nn.functional.pad(states[..., :2].diff(dim=1).norm(dim=-1).cumsum(-1), (1, 0))
 
 
 def poses(states: Tensor, s: Tensor) -> Tensor:
-    """Poses [B, K, 3] at arc lengths s [B, K] of a way states [B, T+1, 4], straight on beyond its end."""
+    """Poses [B, K, 3] at arc lengths s [B, K] of a path states [B, T+1, 4], straight on beyond its end."""
     length = driven_length(states)
     after = torch.searchsorted(length, s.contiguous(), right=True).clamp(1, length.shape[1] - 1)
     low, high = length.gather(1, after - 1), length.gather(1, after)
@@ -66,7 +66,7 @@ def poses(states: Tensor, s: Tensor) -> Tensor:
 
 
 def along_way(states: Tensor, width: Tensor, others: Tracks) -> Along:
-    """Others seen along the way states [B, T+1, 4] of a vehicle of `width` [B] m."""
+    """Others seen along the path states [B, T+1, 4] of a vehicle of `width` [B] m."""
     reach = STRAIGHT + (driven_length(states).amax().item() if len(states) else 0.0)
     vertices = SPACING * torch.arange(int(reach / SPACING) + 2, device=states.device, dtype=states.dtype)
     route = poses(states, vertices.expand(len(states), -1))[..., :2]
@@ -92,7 +92,7 @@ def seen_along(route: Tensor, width: Tensor, states: Tensor, size: Tensor, prese
 
 
 def redrive(driver: Driver, states: Tensor, size: Tensor, others: Along) -> Tensor:
-    """States [B, T+1, 4] of a vehicle whose way is states [B, T+1, 4] and whose driver sees `others`; size [B, 2].
+    """States [B, T+1, 4] of a vehicle whose path is states [B, T+1, 4] and whose driver sees `others`; size [B, 2].
 
     It reacts to each of the others as if that were alone, and brakes for the one that asks most.
     """
@@ -161,8 +161,7 @@ def nearest_first(collision: Collision) -> Collision:
 
 
 def seen_out(collision: Collision) -> Collision:
-    """The collision with AFTER more steps, in which everybody goes on at a constant velocity: whom the end of the
-    rollout spares has not got away."""
+    """The collision with AFTER more steps at constant velocity, so that the end of a rollout saves nobody."""
     states, present = collision.states, collision.present
     times = DT * torch.arange(1, AFTER + 1, device=states.device, dtype=states.dtype)
     more = constant_velocity(states[:, -1], times).transpose(1, 2)

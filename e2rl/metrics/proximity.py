@@ -1,4 +1,4 @@
-"""The ego's distance to others, acceleration, progress and fraction of the recorded way until its first contact
+"""The ego's distance to others, acceleration, progress and fraction of the recorded path until its first contact
 (docs/method.md, section 10).
 
 Vehicles that stand at the start: parked ones should stay, some of those on a lane should start.
@@ -99,7 +99,7 @@ def progress(path: Tensor, count: Tensor) -> Tensor:
 
 
 def route_completion(path: Tensor, count: Tensor, logged: Tensor, logged_valid: Tensor) -> Tensor:
-    """Fraction [B] in [0, 1] of the recorded ego's way that lies behind the ego at the end of its path.
+    """Fraction [B] in [0, 1] of the recorded ego's path that lies behind the ego at the end of its path.
 
     path [B, T+1, 4] of `count` [B] states; logged [B, T+1, N, 4], logged_valid [B, T+1, N]: the recording. The end is
     projected onto the nearest piece of the recorded way, as MetaDrive does. NaN where the ego is in no step, or where

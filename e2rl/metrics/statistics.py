@@ -2,7 +2,7 @@
 
 The interval is a cluster bootstrap: whole locations (or logs) are drawn, not rollouts. A draw holds each cluster with a
 multiplicity. Every resampled mean is a quotient of two sums that are linear in the multiplicities, hence one matrix
-product serves all draws and metrics. Where the bootstrap would lie:
+product serves all draws and metrics. Where the bootstrap would mislead:
 
 - fewer than LEAST places that know a metric give no interval;
 - a fraction with fewer than LEAST places at which the event occurs, or at which it does not, has the exact interval of

@@ -2,11 +2,11 @@
 
 A collision counts if it is the ego's fault or a careful and competent driver in its place would have prevented it.
 Nobody prevents by braking what comes to an ego that stands. A verdict on a partner that strikes the ego is `replayed`:
-it would have driven otherwise towards another ego. A clean failure is preventable and not replayed, its partner broke
+it would have driven differently towards another ego. A clean failure is preventable and not replayed, its partner broke
 no duty, no other vehicles hit each other, and nobody left the road.
 
 The partner broke the first of these duties that applies: it ran into the ego from behind; it had crossed a stop line at
-red; it drove against its lane; it crossed the ego's way, or came into it, leaving less than a careful and competent
+red; it drove against its lane; it crossed the ego's path, or came into it, leaving less than a careful and competent
 driver needs to brake.
 """
 

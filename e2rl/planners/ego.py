@@ -1,6 +1,6 @@
-"""One interface for all egos: planners, the learned actor, outside code.
+"""One interface for all egos: planners, the learned actor, users' code.
 
-An outside planner is a class and a YAML file in conf/ego with its `_target_` and arguments (docs/how-to/planner.md,
+A user's planner is a class and a YAML file in conf/ego with its `_target_` and arguments (docs/how-to/planner.md,
 examples/). It overrides `plan`, and `act` tracks the plan; or `act`, which maps observations to actions.
 """
 

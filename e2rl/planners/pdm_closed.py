@@ -100,7 +100,7 @@ class PDMClosedEgo(Ego):
         return drive(start, path, speed, shift, torch.full_like(shift, self.shift_time)).states
 
     def speeds(self, world: World, path: MissionPath, offset: Tensor, fraction: Tensor) -> Tensor:
-        """Speeds [B, P, PLAN_STEPS + 1] m/s by IDM behind whom the offsets [P] m meet, and before red lights, at
+        """Speeds [B, P, PLAN_STEPS + 1] m/s by IDM behind leaders on the offsets [P] m, and before red lights, at
         fractions [P] of the speed limit."""
         driver = IDMParameters(self.headway, self.standstill_gap, self.acceleration, self.braking, EXPONENT)
         others, half = self._others(world, range(PLAN_STEPS)), world.scene["size"][:, 0] / 2

@@ -4,7 +4,7 @@ Steering is pure pursuit of the mission. The acceleration is the minimum over ID
 IDM behind stop lines that bind, and the speed caps by limits and curves. Pure functions of e2rl.sim.observation.
 
 The network of the learned ego: every nearby agent goes through the same layers, and the largest of each unit over the
-agents joins the rest of the scene (Qi et al., PointNet, 2017; what it is worth here stands in docs/learning.md).
+agents joins the rest of the scene (Qi et al., PointNet, 2017; its effect: docs/notes/training.md).
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """A sampling planner: hundreds of candidates, each driven by the unicycle and scored on a forecast of the others.
 
-It proposes, simulates, scores and takes the best, in the manner of PDM-Closed (Dauner et al. 2023), and looks at
-nobody's plan. Vectorised over scenes, candidates and agents. What all egos share that choose among candidates by their
+It proposes, simulates, scores and takes the best, in the manner of PDM-Closed (Dauner et al. 2023), and ignores
+others' plans. Vectorised over scenes, candidates and agents. What all egos share that choose among candidates by their
 cost: `ScoringEgo`; how its candidates rank are soft labels for an imitator.
 """
 
@@ -34,7 +34,7 @@ SCENE_KEYS = (
 
 @dataclass(eq=False)
 class ScoringEgo(Weights, Ego):
-    """Plans the cheapest of its `candidates` by `scoring.score` on a forecast of the others. It looks at nobody's plan.
+    """Plans the cheapest of its `candidates` by `scoring.score` on a forecast of the others, whose plans it ignores.
 
     CHUNK: scenes that are planned for at a time; READS: keys of the scene that are looked at.
     """
@@ -99,7 +99,7 @@ class ScoringEgo(Weights, Ego):
         return states[row, best], costs
 
     def rated(self, world: World, states: Tensor) -> Tensor:
-        """Costs [B, C] of driving along anybody's states [B, C, PLAN_STEPS, 4], which lead where they end."""
+        """Costs [B, C] of driving along any states [B, C, PLAN_STEPS, 4], which lead where they end."""
         path = MissionPath(world)
         end, shift, _ = project(states[:, :, -1, :2], path.route)
         return self.costs(world, Candidates(states, end - path.s[:, None], shift))
@@ -111,7 +111,7 @@ class ScoringEgo(Weights, Ego):
 
 
 def take(world: World, rows: Tensor, keys: tuple[str, ...] = SCENE_KEYS) -> World:
-    """Scenes rows [b] of a World with these keys of the scene, and nobody's plan or route."""
+    """Scenes rows [b] of a World with these keys of the scene, without plans and routes."""
     now = (getattr(world, key)[rows] for key in ("step", *AGENT_KEYS))
     return World(world.scene.select(*keys)[rows], *now)
 

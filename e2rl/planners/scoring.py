@@ -1,4 +1,4 @@
-"""Costs of a planner's candidates: contact, room to others, the drivable border, progress, comfort.
+"""Costs of a planner's candidates: contact, distance to others, the drivable border, progress, comfort.
 
 Forecasts of the agents nearest to the ego: their present acceleration and turn, each held for a while.
 """
@@ -31,7 +31,7 @@ class Forecast:
 
 
 def nearest(world: World, count: int) -> tuple[Tensor, Tensor]:
-    """Agents [B, M] that come nearest to the ego within 3 s if everybody keeps its velocity, and whether they are there
+    """Agents [B, M] that come nearest to the ego within 3 s if all keep their velocity, and whether they are there
     [B, M]; M: count, or fewer where a scene has no more rows."""
     times = torch.tensor(LOOK, device=world.states.device)
     xy = constant_velocity(world.states, times)[..., :2]

@@ -181,7 +181,7 @@ def first_meeting(plans: Plans) -> Meeting:
 
 
 def meeting_braking(meeting: Meeting, speed: Tensor, length: Tensor, duty: Duty) -> Tensor:
-    """Braking [B, V] m/s^2 that keeps vehicles GAP short of what they meet, -NO_CAP where nobody has to brake.
+    """Braking [B, V] m/s^2 that keeps vehicles GAP short of what they meet, -NO_CAP where none has to brake.
 
     It is (v - u)^2 / (2 room), u the other's speed along the vehicle's heading, 0 if it crosses or comes towards it. Of
     two that meet, the one that has the other farther ahead of itself brakes. Adversaries that come into the ego's side

@@ -17,8 +17,8 @@ REGIONS = {"covered_50": 0.5, "covered_90": 0.9}  # central regions of the sampl
 @torch.no_grad()
 def sample_variances(prior: Prior, scene: TensorDictBase, samples: int, seed: int = 0) -> dict[str, Tensor]:
     """Sums [B] over the moving vehicles on lanes of scenes [B] of the variance over `samples` joint samples, and their
-    number: `knots` and `lateral`, mean over the knots of x; `travel` [m^2], of the way after 5 s; `vehicles`. Of those
-    recorded for 5 s: in how many the recorded way lies in each of REGIONS of the samples' ways, and their number
+    number: `knots` and `lateral`, mean over the knots of x; `travel` [m^2], of the distance after 5 s; `vehicles`. Of
+    those recorded for 5 s: in how many the recorded distance lies in each of REGIONS of the samples', and their number
     `recorded`.
 
     Routes are the recorded ones, drawn where there is none; the ego is sampled like every vehicle. So what varies is

@@ -1,6 +1,6 @@
 """The answer of a run: the last lines on the terminal, in sentences, at most 25 of them and at most 100 columns wide.
 
-It reads the rows of metrics.json, and the contents of modes.json and atlas.json, and computes nothing anew.
+It reads the rows of metrics.json, and the contents of modes.json and atlas.json, and computes nothing.
 """
 
 import math

@@ -116,7 +116,7 @@ def by_ego(rows: Sequence[dict], names: Sequence[str]) -> tuple[dict[tuple[str, 
 
 
 def relative_cell(value: dict | None) -> str:
-    """Such as `-31 [-42, -17]*`, per cent; the interval is unknown where a draw has nothing to be a share of."""
+    """Such as `-31 [-42, -17]*`, per cent; the interval is unknown where a draw has nothing to divide by."""
     if not value or not math.isfinite(value["relative"]):
         return UNKNOWN
     centre, low, high = (100 * value[name] for name in ("relative", "relative_low", "relative_high"))

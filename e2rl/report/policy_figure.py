@@ -1,4 +1,4 @@
-"""What training was worth: the paper's four panels of policy improvement, as gains over the policy before it.
+"""What training gained: the paper's four panels of policy improvement, as gains over the policy before it.
 
 `e2rl policy-figure RUN_DIR...` draws runs of experiment=policy_learning on several splits, as tune and test, as one.
 """

@@ -1,4 +1,4 @@
-"""Tables of metrics from the rows of metrics.json, for a terminal, Markdown, LaTeX and CSV. Shares are in per cent.
+"""Tables of metrics from the rows of metrics.json, for a terminal, Markdown, LaTeX and CSV. Fractions are in per cent.
 
 A run has a table with a row for each metric and a column for each method, one with the differences to the first, and
 one of its failure modes, from its modes.json.
@@ -107,8 +107,8 @@ def means_table(group: Sequence[dict], settings: str, metrics: Sequence[Metric])
 
 
 def paired_table(group: Sequence[dict], metrics: Sequence[Metric]) -> Table:
-    """Paired differences, of shares in per cent points: of each method to the first one or, where rows have the stages
-    before and after training, of each method after training to itself before. No rows where nothing is paired."""
+    """Paired differences, of fractions in percentage points: of each method to the first one or, where rows have
+    stages, of each method after training to itself before. No rows where nothing is paired."""
     first, names = group[0], column_names(group)
     # A method with several etas is named method@eta in `paired`.
     reference, keys = names[0], [f"{first['method']}@{first['eta']:g}", first["method"]]

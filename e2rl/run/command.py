@@ -1,4 +1,4 @@
-"""A command that Hydra configures: `--help` prints all options; an option that is none is told the nearest."""
+"""A command that Hydra configures: `--help` prints all options; an unknown option is answered with the nearest name."""
 
 import logging
 import os
@@ -74,7 +74,7 @@ def run_command(
 
 
 def end_log() -> None:
-    """End the run's log, so that what else this process logs neither goes there nor makes the file anew."""
+    """End the run's log, so that what else this process logs neither goes there nor creates the file again."""
     root = logging.getLogger()
     for handler in [each for each in root.handlers if isinstance(each, logging.FileHandler)]:
         root.removeHandler(handler)
@@ -135,7 +135,7 @@ DATA = dict.fromkeys(("waymo", "nuscenes", "nuplan", "lyft"), "scenarionet") | {
 
 
 def told(name: str, arguments: Sequence[str], said: str) -> str:
-    """Returns what Hydra said of a wrong option or choice, in short and with what there is instead."""
+    """Returns Hydra's message on a wrong option or choice, shortened, with the valid ones."""
     if found := re.search("Could not find '(.+)/(.+?)'", said):
         group, file = found.groups()
         known = choices(group)

@@ -94,7 +94,7 @@ class Extension:
 
 
 def built(config: DictConfig, where: str, kind: type, **given: Any) -> Any:
-    """Returns what `_target_` of a group builds, outside code included. Raises InputError where it cannot be built or
+    """Returns what `_target_` of a group builds, users' code included. Raises InputError where it cannot be built or
     is no `kind`."""
     settings = {key: value for key, value in config.items() if key != "name"}
     target = settings.get("_target_")

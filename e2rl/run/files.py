@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and that tell whether they still are what was written.
+"""Files that appear whole or not at all, and whose later changes are detected.
 
 Weights in safetensors files, with a hash of what was written in the header: an altered file is noticed.
 
@@ -208,7 +208,7 @@ def locked(path: Path) -> Iterator[None]:
 
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Have a run's folder for oneself; raises InputError where another process is at work there."""
+    """Hold a run's folder for this process alone; raises InputError where another process is at work there."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         for remaining in reversed(range(WAIT)):

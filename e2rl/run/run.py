@@ -1,8 +1,8 @@
 """One run of a command: its folder, its configuration, and what it was begun with.
 
 `provenance.json` has the command, versions, configuration and hashes of the inputs, `scenes.csv` the scenes. A run that
-goes on (`resume=FOLDER`) must find the same inputs and configuration. Another version of the code is told, not refused:
-the user may have mended what ended the run.
+goes on (`resume=FOLDER`) must find the same inputs and configuration. Other code is reported, not refused: the user may
+have mended what ended the run.
 """
 
 import copy

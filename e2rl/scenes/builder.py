@@ -48,7 +48,7 @@ def build_scene(recording: Recording, settings: BuildSettings) -> TensorDict:
 
 
 class SceneBuilder:
-    """The scenes of one log from whatever start frames: what does not depend on these is computed once."""
+    """The scenes of one log from any start frames: what does not depend on these is computed once."""
 
     def __init__(self, recording: Recording, settings: BuildSettings) -> None:
         """Raises InputError for what `build_scene` does, the start frame apart."""

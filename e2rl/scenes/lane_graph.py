@@ -1,6 +1,6 @@
 """The lane graph of a recording on the host (networkx), and the route candidates of a vehicle on it.
 
-And who drives against the lanes of a map.
+`against_lanes` tells which vehicles drive against the lanes of a map.
 """
 
 from dataclasses import dataclass
@@ -240,8 +240,8 @@ def packed(rows: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def against_lanes(points: Tensor, lane: Tensor, xy: Tensor, heading: Tensor) -> Tensor:
-    """Bool [B, K, H]: of the lanes along which vehicles at xy [B, K, 2] of heading [B, K, H] drive, either way round,
-    the nearest runs against them.
+    """Bool [B, K, H]: of the lanes along which vehicles at xy [B, K, 2] of heading [B, K, H] drive, in either
+    direction, the nearest runs against them.
 
     points [B, M, 2]: of centrelines; lane [B, M]: which one each point is of (-1: padding).
     """

@@ -1,4 +1,4 @@
-"""Versions of a log: as recorded, in a mirror, or with what other converters leave out or get wrong (`data.versions`).
+"""Versions of a log: as recorded, mirrored, or with what other converters leave out or get wrong (`data.versions`).
 
 A policy that learns one converter's conventions fails on another's. Each version takes one thing away, so that a
 measurement shows what a policy leans on, and a training on several leans on none.
@@ -44,7 +44,7 @@ def version_of(recording: Recording, name: str) -> Recording | None:
 
 
 def mirrored(recording: Recording) -> Recording:
-    """The traffic in a mirror, y to -y: who turned left turns right, and left-hand traffic keeps right."""
+    """The mirrored traffic, y to -y: left turns become right turns, and left-hand traffic keeps right."""
     mirror = np.array([1.0, -1.0])
     lanes = {
         name: replace(lane, points=lane.points * mirror, left=lane.right, right=lane.left)
@@ -90,7 +90,7 @@ def turned(recording: Recording) -> Recording:
 
 
 def shifted(recording: Recording) -> Recording:
-    """With a map that lies SHIFT beside its tracks, in a direction of the log's own."""
+    """With a map that lies SHIFT beside its tracks, in a direction that depends on the log."""
     angle = _draws(recording).uniform(0.0, 2 * np.pi)
     step = SHIFT * np.array([np.cos(angle), np.sin(angle)])
     moved = _lanes(lambda lane: replace(lane, points=lane.points + step))(recording)

@@ -1,4 +1,4 @@
-"""Which family is tried next in which scene: Thompson sampling over chances that tries have told."""
+"""Which family is tried next in which scene: Thompson sampling over chances learned from tries."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ class Portfolio:
         self.driven = torch.full_like(prior, CHANCE_TRIES)  # tries that have spent so many NFE
 
     def tell(self, scene: int, family: int, found: float, margin: float, nfe: float) -> None:
-        """Learn from a try that found so much of what is searched for, 0 to 1."""
+        """Learn from a try whose find is worth 0 to 1."""
         self.found[family] += found
         self.exposed[family] += self.share(slice(scene, scene + 1))[0, family]
         self.tried[scene, family] += 1
@@ -51,7 +51,7 @@ class Portfolio:
         self.nearest[scene] = torch.fmax(self.nearest[scene], torch.tensor(margin, dtype=torch.float64))
 
     def forget(self, scene: int) -> None:
-        """What the tries of a scene have told does not hold any more for this scene: another thing is searched for."""
+        """Forget what the tries of a scene have told of it: something else is searched for now."""
         self.tried[scene], self.nearest[scene] = 0.0, torch.nan
 
     def share(self, scenes: slice = slice(None)) -> Tensor:
@@ -61,8 +61,8 @@ class Portfolio:
         return nearness(self.nearest[scenes])[:, None] / before
 
     def worth(self, generator: torch.Generator) -> Tensor:
-        """A draw of the chances [N, F] per NFE, relative to the dearest family; those of a scene as if tried one after
-        another, the best first."""
+        """A draw of the chances [N, F] per NFE, relative to the most expensive family; those of a scene as if tried one
+        after another, the best first."""
         if not self.learns:
             return torch.rand(self.tried.shape, generator=generator, dtype=torch.float64)
         chance, cost = torch._standard_gamma(self.found, generator=generator) / self.exposed, self.spent / self.driven

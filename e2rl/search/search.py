@@ -108,5 +108,5 @@ class Search(Extension):
         return self.families[family].draw(scene, number, self.seed_of(scene), self.settings.stratified)
 
     def seed_of(self, scene: int) -> int:
-        """Of the draws of a scene."""
+        """The seed of the draws of a scene."""
         return self.seed * 1_000_003 + int(self.numbers[scene])

@@ -159,7 +159,7 @@ def ego_features(static: StaticScene, ego: EgoState, limit: Tensor, time: Tensor
 
 
 def read_as(limit: Tensor, speed: Tensor) -> Tensor:
-    """Speed limits [...] m/s as a policy reads them: UNLIMITED where they are unknown (0), or its speed, if higher."""
+    """Speed limits [...] m/s as a policy reads them: UNLIMITED where unknown (0), or the ego's speed, if higher."""
     return torch.where(limit > 0, limit, speed.clamp(min=UNLIMITED))
 
 
@@ -315,6 +315,6 @@ def _mirror(device: torch.device) -> tuple[Tensor, Tensor]:
 
 
 def mirrored(observation: Tensor) -> Tensor:
-    """Observations [..., D] in a mirror; twice is none."""
+    """Observations [..., D] with left and right exchanged; twice gives the original."""
     source, sign = _mirror(observation.device)
     return observation[..., source] * sign

@@ -1,4 +1,4 @@
-"""How a few short manoeuvres of the ego would end, if everybody else goes on as it does: part of its observation.
+"""How a few short manoeuvres of the ego would end, if all others keep their motion: part of its observation.
 
 A network that sees poses and speeds alone has to learn geometry before it can learn to evade. Here 15 manoeuvres
 (accelerations x offsets from the mission) are laid on the mission, and the nearest agents keep their acceleration and

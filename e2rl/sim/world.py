@@ -51,8 +51,8 @@ class World:
         return cls(scene, tensordict["timestep"][:, 0], states, valid, accel, turn_rate, plan=plan)
 
     def shown(self, scene: TensorDictBase | None = None) -> "World":
-        """A copy for code from outside the package: what it changes there moves nobody, and it tells nothing of what
-        comes. Lights stay as they are now, whoever is not there has no size and type, and nobody's plan is known.
+        """A copy for code from outside the package: changes to it have no effect, and it holds nothing of the future.
+        Lights stay as they are now, absent agents have no size and type, and no plan is known.
 
         scene: `without_future` of this World's scene, where it is made already.
         """

@@ -1,7 +1,7 @@
-"""The prior as background traffic: every 0.5 s a joint sample of the reverse SDE, given the ego's plan, no control.
+"""The prior as background traffic: every 0.5 s an uncontrolled joint sample, given what is known of the ego.
 
-Traffic predicts the ego from its state and past, as other drivers see it: on the route that is the likeliest by how it
-drives. So no planner can mislead its adversaries by what it announces as its plan (docs/adversaries.md). With
+Traffic predicts the ego from its state and past, as other drivers see it: on the route that its motion makes
+likeliest. So no planner can mislead its adversaries by what it announces as its plan (docs/adversaries.md). With
 `knowledge` "plan" it is told the plan and the mission.
 """
 
@@ -113,7 +113,7 @@ class NominalTraffic(Traffic):
     @torch.no_grad()
     def as_seen(self, world: World) -> World:
         """Returns the World as other drivers see it: the ego's mission is the route that it is expected to follow, the
-        likeliest by how it drives now; told its plan, they know its mission, too."""
+        one that its present motion makes likeliest; told its plan, they know its mission, too."""
         if self.knowledge == "plan":
             return world
         scene = world.scene.copy()

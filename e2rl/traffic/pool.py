@@ -105,7 +105,7 @@ class TrafficPool:
     def stored(traffic: Mapping[str, Tensor], eta: Tensor | float, template: Tensor | None = None) -> "TrafficPool":
         """Rows of a synthesizer's traffic at intensities eta [S], or one for all, and templates [S] (None: full for
         all): scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N] and adversaries [S, N] bool, and if known
-        evasion [S, T, 2] with span [S, 2], and owes [S] bool (True for all): adversaries give way. Raises InputError
+        evasion [S, T, 2] with span [S, 2], and owes [S] bool (True for all): adversaries yield. Raises InputError
         for a missing key."""
         missing = {"scene_index", *TRACKS} - set(traffic)
         if missing:

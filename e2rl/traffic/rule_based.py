@@ -62,7 +62,7 @@ class IDMState:
 @configured("synthesizer/idm")
 @dataclass(eq=False, repr=False)
 class IDM(Traffic):
-    """Car-following on the nearest route candidate, within the prior's bounds; who stands at the start never moves."""
+    """Car-following on the nearest route candidate, within the prior's bounds; standing vehicles stay."""
 
     prior: Prior
     headway: float = setting()

@@ -55,7 +55,7 @@ class AdversarialSynthesizer(Transform):
         self._planned_at = nothing  # [B] step of the last replan, per environment
 
     def set_container(self, container: Transform | EnvBase) -> None:
-        """Let the environment's `set_seed`, which passes transforms over, reach the draws and the reaction."""
+        """Let the environment's `set_seed`, which skips transforms, reach the draws and the reaction."""
         super().set_container(container)
         if self.parent is not None:  # a Compose may have no environment yet
             found = (getattr(part, "generator", None) for part in (self.draw, self.reaction))

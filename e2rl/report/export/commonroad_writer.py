@@ -1,7 +1,7 @@
 """CommonRoad scenarios, format 2020a, by commonroad-io (extra `commonroad`; docs/export.md).
 
 Obstacle 1 is the ego, obstacle n + 1 the agent of row n. An agent that comes back after a gap is a further obstacle,
-since a CommonRoad trajectory has no gaps. Who appears late has a late initial state: commonroad-io and its tools read
+since a CommonRoad trajectory has no gaps. Late agents have a late initial state: commonroad-io and its tools read
 it, while the format's schema admits only obstacles that are there from the start.
 """
 

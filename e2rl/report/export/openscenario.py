@@ -1,6 +1,6 @@
 """ASAM OpenSCENARIO XML 1.2 with its road in OpenDRIVE, by scenariogeneration (extra `openscenario`; docs/export.md).
 
-Everybody follows a polyline with a time at every vertex (FollowTrajectoryAction, following mode `position`). A vertex
+Every agent follows a polyline with a time at every vertex (FollowTrajectoryAction, following mode `position`). A vertex
 is the place of an entity's reference point, which for vehicles is the middle of the rear axle; BoundingBox.Center says
 where the box lies from there.
 """

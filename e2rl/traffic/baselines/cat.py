@@ -1,4 +1,4 @@
-"""CAT (Zhang et al. 2023): of likely futures, that which overlaps most with the ego's recent tracks."""
+"""CAT (Zhang et al. 2023): of likely futures, the one that overlaps most with the ego's recent tracks."""
 
 from dataclasses import dataclass
 

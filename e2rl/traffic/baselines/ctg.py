@@ -41,7 +41,7 @@ class CTG(MeanGuided):
         return state.eta * 0 + self.gain
 
     def attackers(self, state: BaselineState, view: View) -> Tensor:
-        """Nobody."""
+        """No vehicle."""
         return view.active & False
 
     def loss(self, state: BaselineState, view: View) -> Loss:

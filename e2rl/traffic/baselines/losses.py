@@ -1,7 +1,7 @@
 """Terms of the baselines' losses, of plans at SAMPLED_STEPS.
 
 A motion has fields [S, B, V, T]: S samples of B scenes; states are its [S, B, V, T, 4] with the ego's known motion in
-row 0. Every term is one value per vehicle, [S, B, V], in which everybody else is detached.
+row 0. Every term is one value per vehicle, [S, B, V], in which all others are detached.
 """
 
 import math

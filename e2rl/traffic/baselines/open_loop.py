@@ -53,7 +53,7 @@ class OpenLoop(Baseline):
     """A scenario is generated every EVERY replans, as long as a plan lasts; until then it is driven."""
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> OpenLoopState:
-        """States of scenes [B] in which nobody is held."""
+        """States of scenes [B] in which no vehicle is held."""
         state = super().reset(scenes, seed, eta)
         x = torch.zeros(*state.adversary.shape, SIZE, device=eta.device)
         return OpenLoopState(**vars(state), held=state.adversary.clone(), x=x, begun=state.lane)

@@ -1,4 +1,4 @@
-"""STRIVE (Rempe et al. 2022): the latents of a scenario are optimised until the planner, driven anew at every
+"""STRIVE (Rempe et al. 2022): the latents of a scenario are optimised until the planner, driven again at every
 iteration, is hit; scenarios that no ego could survive are discarded.
 
 The prior as a decoder of latents: deterministic DDIM from pure noise, differentiable, in few steps.
@@ -60,7 +60,7 @@ class Strive(OpenLoop):
         self.queries_ego = self.knowledge == "plan"
 
     def scenario(self, now: Replan, context: Context, nominal: Tensor) -> Scenario:
-        """The optimised scenario, in which everybody is held; the nominal sample where it has no solution."""
+        """The optimised scenario, in which all vehicles are held; the nominal sample where it has no solution."""
         first, acts = now.noise[0, :, :, 0].contiguous(), self.strength(now.state) > 0
         x0, view = self.attacked(first, now, context)
         motion = motion_of(self.prior, x0, context, 1)

@@ -114,7 +114,7 @@ class Coalitions(NominalTraffic):
         template: Tensor | None = None,
         decisions: Tensor | None = None,
     ) -> E2State:
-        """Returns states of scenes [B] with routes drawn from the prior and nobody under control.
+        """Returns states of scenes [B] with routes drawn from the prior and no vehicle under control.
 
         Args:
             template: [B] causal templates that limit the coalitions (None: full for all).

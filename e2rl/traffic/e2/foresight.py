@@ -1,8 +1,8 @@
-"""V, the predicted verdict: would a plan make a driver fail whose place a competent one could take?
+"""V, the predicted verdict: does a plan make a driver fail where a competent driver would not?
 
 Each plan is met by a population of drivers who go the way that the ego is expected to go: the competent driver of UN
-R157, four who react later and brake less, and one who does not react. A plan is worth the share of those that run into
-it from behind, weighed towards the better ones, if the competent driver does not; it is worth nothing if that one does.
+R157, four who react later and brake less, and one who does not react. A plan is worth the fraction that runs into it
+from behind, weighed towards the better drivers, if the competent one does not; it is worth nothing if that one does.
 """
 
 from typing import NamedTuple

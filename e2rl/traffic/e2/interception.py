@@ -2,7 +2,7 @@
 
 Every planner expects a vehicle where its lane leads. One that cuts in or turns in early leaves it for a few seconds: on
 a cubic from its pose to where the target will be at one of several moments, at one constant acceleration, on the
-drivable area, clear of everybody else, within limits that are proportional to the intensity. The prior then plans along
+drivable area, clear of all others, within limits that are proportional to the intensity. The prior then plans along
 it as along any route, so what is driven stays a sample of the prior.
 """
 

@@ -152,7 +152,7 @@ class Attack:
     def of(
         cls, world: World, active: Tensor, ego_plan: Tensor, plan: Tensor, since: Tensor, settled: Tensor
     ) -> "Attack":
-        """Of the NEAREST active [B, V] vehicles that move, within REACH of the ego and ASIDE of its way."""
+        """Of the NEAREST active [B, V] vehicles that move, within REACH of the ego and ASIDE of its path."""
         gap = (world.states[:, : active.shape[1], :2] - world.states[:, :1, :2]).norm(dim=-1)
         way, points = ego_plan[:, None, 4::5, :2], plan[..., 4::5, :2]
         aside = torch.cdist(points, way.expand(*points.shape[:2], -1, -1)).flatten(2).amin(-1)

@@ -1,7 +1,7 @@
 """The potentials of the control, eq. (potential_decomp): V_feas of every vehicle, V_adv of the coalition.
 
 Both take decoded states [B, V, H', 4] (x, y [m], heading [rad], speed [m/s]) at SAMPLED_STEPS of a plan and return one
-value per vehicle, [B, V]. In a vehicle's own term everybody else is detached: the ego is a black box, targets are not
+value per vehicle, [B, V]. In a vehicle's own term all others are detached: the ego is a black box, targets are not
 drawn to their pursuers, and the gradient of row i is that of V_i alone. Gradients are finite everywhere.
 """
 

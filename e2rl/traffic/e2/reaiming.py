@@ -3,7 +3,7 @@
 A policy that trains on replayed attacks learns where the adversary will not be. One that re-aims must be reacted to.
 It takes the constant acceleration and path curvature that best meet the ego at one of ten moments ahead, within the
 limits of an interception (`InterceptionSettings`). It knows of the ego, and owes it, what adversaries of e2 do: it
-predicts it from its present motion, and gives way by the same rules (`responsibility`, `prior.bounds`).
+predicts it from its present motion, and yields by the same rules (`responsibility`, `prior.bounds`).
 """
 
 from dataclasses import dataclass, field
@@ -59,7 +59,7 @@ def surroundings(world: World, rows: Tensor, agents: Tensor) -> World:
 
 
 class Ground(NamedTuple):
-    """Drivable fields [B, G, G] of environments, their origins [B, 2], and whose K vehicles stand on: row [K]."""
+    """Drivable fields [B, G, G] of environments, their origins [B, 2], and the environments row [K] of K vehicles."""
 
     field: Tensor
     origin: Tensor
@@ -134,7 +134,7 @@ def braking_for(world: World, aim: Arc, motion: Arc, duty: Duty, bounds: BoundSe
 
 @dataclass(frozen=True)
 class Law:
-    """How vehicles re-aim: what they owe, limits of the aims, how late they give way, bounds of their braking."""
+    """How vehicles re-aim: what they owe, limits of the aims, how late they yield, bounds of their braking."""
 
     responsibility: str
     limits: InterceptionSettings = field(default_factory=InterceptionSettings)
@@ -195,7 +195,7 @@ def drawn(
     generator: torch.Generator,
 ) -> TensorDict:
     """The part of the traffic in b new episodes of `horizon` steps, of attacks of eta [b] (0: none), template [b], owes
-    [b] bool (they give way to the ego) and adversaries [b, V].
+    [b] bool (they yield to the ego) and adversaries [b, V].
 
     start [b]: step from which on vehicles react (NEVER: they do not), eta [b], count [b] of them, others [b] bool: not
     the traffic's own adversaries; reckless [b] bool: they owe the ego nothing; rank [b, V]: random, the lowest react;
@@ -270,7 +270,7 @@ class Reaiming:
 
     @torch.no_grad()
     def react(self, world: World) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Environments rows [K], agents [K] and their states [K, H, 4] of the coming 1 s; None where nobody reacts."""
+        """Environments rows [K], agents [K] and their states [K, H, 4] of the coming 1 s; None where none reacts."""
         part = self._part
         assert part is not None
         due = ~part["chosen"] & (part["start"] <= world.step)

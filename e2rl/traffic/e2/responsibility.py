@@ -1,6 +1,6 @@
 """The yielding rule: what adversaries owe the ego (docs/adversaries.md).
 
-full: an adversary gives way to the ego wherever its plan meets the ego's expected motion, late but in time, unless the
+full: an adversary yields to the ego wherever its plan meets the ego's expected motion, late but in time, unless the
 ego follows it; rear: adversaries behind the ego brake for it like any driver; none: no adversary does.
 """
 
@@ -24,7 +24,7 @@ SAME_DIRECTION = 0.5  # cosine between the headings of vehicles that drive in th
 @configured("synthesizer/e2", "yielding")
 @dataclass(frozen=True)
 class YieldingSettings:
-    """How late adversaries give way; conf/synthesizer/e2.yaml explains each."""
+    """How late adversaries yield; conf/synthesizer/e2.yaml explains each."""
 
     patience: float = setting(low=0)
     max_patience: float = setting(low=0)
@@ -50,7 +50,7 @@ def leading(world: World, vehicles: int) -> Tensor:
 
 
 def yields_at_once(world: World, vehicles: int) -> Tensor:
-    """Bool [B, V]: vehicles that cross the ego's path from its left, and so give way where nothing else decides."""
+    """Bool [B, V]: vehicles that cross the ego's path from its left, and so yield where nothing else decides."""
     angle = wrap(world.states[:, :vehicles, 2] - world.states[:, :1, 2])
     return (angle < -CROSSING) & (angle > CROSSING - torch.pi)
 

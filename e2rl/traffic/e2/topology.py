@@ -1,4 +1,4 @@
-"""Topological bifurcation (Sec. IV-A1): the vehicles that a reference rollout entangles with the ego.
+"""Topological bifurcation (Sec. IV-A1): the vehicles that a reference rollout couples with the ego.
 
 Pairs are weighted by their time to collision (eq. ttc_weight), the maximal cliques of each step's risk graph are ranked
 by mean weight, and members of the top cliques score over time (eq. temporal_scoring). Only maximal cliques compete:
