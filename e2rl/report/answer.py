@@ -180,7 +180,7 @@ def cost(row: dict, nominal: dict) -> str:
 
 def compared(rows: Sequence[dict]) -> list[str]:
     """A table with a row for each ego, method and intensity. Methods: those that find most preventable failures first,
-    of equals most clean ones, then most that count. Egos: in each traffic, the strongest first, the one with the fewest
+    of equals most clean ones, then most that count, then most contacts. Egos: in each traffic, the strongest first, the one with the fewest
     first. Unknown rates come last."""
     egos = list(dict.fromkeys(row["ego"] for row in rows))
     cells, labels = by_ego(rows, egos)
@@ -188,14 +188,15 @@ def compared(rows: Sequence[dict]) -> list[str]:
 
     def rank(key: tuple[str, str]) -> tuple:
         row, sign = cells[key], 1 if several else -1
-        means = [row["metrics"].get(name, {}).get("mean", math.nan) for name in KINDS.values()]
+        means = [row["metrics"].get(name, {}).get("mean", math.nan) for name in (*KINDS.values(), "cfr")]
         found = [math.inf if math.isnan(mean) else sign * mean for mean in means]
         return (-row["eta"], labels.index(key[1]), *found) if several else (not row["eta"], *found, row["eta"])
 
     ranked = sorted(cells, key=rank)
     ego, name = ranked[0]
     best = cells[ranked[0]]
-    lead = f"{ego} fails most in the traffic of {name}: hit in {of(best, 'cfr')} rollouts"
+    most = "fails most" if best["metrics"]["cfr"]["mean"] else "does not fail, not even"
+    lead = f"{ego} {most} in the traffic of {name}: hit in {of(best, 'cfr')} rollouts"
     if several:
         lead = f"{ego} fails least: it was hit in {of(best, 'cfr')} rollouts {traffic(best)}"
     kinds = [f"{of(best, metric).partition(' ')[0]} {kind}" for kind, metric in KINDS.items()]
