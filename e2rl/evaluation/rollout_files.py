@@ -66,7 +66,8 @@ def read_rows(path: Path) -> list[dict]:
             raise ValueError(f"more than {MOST_ROWS:,} rows")
         return found
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such table; give the folder of a run of evaluate.py (shards: after e2rl merge)") from error
+        mend = "give the folder of a run of evaluate.py; shards are merged first"
+        raise InputError(f"{path}: no such table; {mend}") from error
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(f"{path}: damaged ({cause(error)}); run evaluate.py again to rewrite it") from error
 

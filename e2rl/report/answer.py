@@ -180,8 +180,8 @@ def cost(row: dict, nominal: dict) -> str:
 
 def compared(rows: Sequence[dict]) -> list[str]:
     """A table with a row for each ego, method and intensity. Methods: those that find most preventable failures first,
-    of equals most clean ones, then most that count, then most contacts. Egos: in each traffic, the strongest first, the one with the fewest
-    first. Unknown rates come last."""
+    of equals most clean ones, then most that count, then most contacts. Egos: in each traffic, the strongest first, the
+    one with the fewest first. Unknown rates come last."""
     egos = list(dict.fromkeys(row["ego"] for row in rows))
     cells, labels = by_ego(rows, egos)
     several = len(egos) > 1
