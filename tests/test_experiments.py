@@ -1,10 +1,12 @@
 """The experiments of evaluate.py on tiny runs: their rows, tables, figures and files."""
 
 import csv
+import sys
 
 import pytest
 
 from e2rl.evaluation.rollout_files import read_metrics
+from e2rl.metrics.catalogue import COMPUTE, METRICS
 from tests.scripts import SHORT, arguments, call
 
 pytestmark = pytest.mark.slow  # whole runs
@@ -12,7 +14,8 @@ pytestmark = pytest.mark.slow  # whole runs
 
 @pytest.fixture
 def evaluated(world, tmp_path, monkeypatch, capsys):
-    """Runs evaluate.py with options on two short bundled scenes in tmp_path / "run", its folder."""
+    """Runs evaluate.py with options on two short bundled scenes in tmp_path / "run", its folder. Metrics of plugins are
+    unknown to the tests after this one, whose workers would not have them."""
 
     def run(*options):
         given = [*SHORT, f"data.cache={world / 'bundled'}", "seeds=[0]", f"hydra.run.dir={tmp_path / 'run'}"]
@@ -22,7 +25,12 @@ def evaluated(world, tmp_path, monkeypatch, capsys):
         assert status == 0, said
         return tmp_path / "run"
 
-    return run
+    known = METRICS.copy(), COMPUTE.copy()
+    yield run
+    for registered, before in zip((METRICS, COMPUTE), known, strict=True):
+        registered.clear()
+        registered.update(before)
+    sys.modules.pop("e2rl.metrics.nuplan", None)
 
 
 def test_the_dial_has_a_row_and_a_picture_for_every_eta(evaluated):
