@@ -48,7 +48,8 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
     if config.resume or not config.reproduce:
         return Run.of(config, free)
     where, old = f"reproduce={config.reproduce}", Path(config.reproduce).resolve()
-    whole = OmegaConf.merge(config, {"failure": None})
+    whole = config.copy()
+    whole.failure = None
     saved, known = saved_configuration(whole, old, where), read_provenance(old)
     if missing := [name for name in (METRICS_FILE, SCENES) if not (old / name).is_file()]:
         raise InputError(f"{where}: {missing[0]} is missing; give a finished run of evaluate.py that has tables")
