@@ -7,6 +7,7 @@ import io
 import logging
 import warnings
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -63,23 +64,18 @@ class PolicyFileEgo(ObservingEgo):
 
 def within_time(work: Callable[[], Any], where: str) -> Any:
     """What work() returns or raises; raises InputError where it goes on for longer than SECONDS."""
-    ended: list[tuple[Any, BaseException | None]] = []
+    ended: Future = Future()
 
     def run() -> None:
         try:
-            ended.append((work(), None))
+            ended.set_result(work())
         except BaseException as error:
-            ended.append((None, error))
+            ended.set_exception(error)
 
-    thread = Thread(target=run, daemon=True)  # what does not end is left behind
-    thread.start()
-    thread.join(SECONDS)
-    if not ended:
+    Thread(target=run, daemon=True).start()  # what does not end is left behind
+    if wait([ended], SECONDS).not_done:
         raise InputError(f"{where}: opening it takes longer than {SECONDS} s; give a smaller policy")
-    result, error = ended[0]
-    if error is not None:
-        raise error
-    return result
+    return ended.result()
 
 
 def probe(policy: Callable[[Tensor], Any], where: str, count: int) -> None:

@@ -40,13 +40,8 @@ OWN_WAY = 0.7  # least cosine between the headings of the path and of a vehicle 
 UNCAPPED = 1e3  # m/s
 
 
-def reference_action(observation: Tensor) -> Tensor:
-    """Action [..., 2] (m/s^2, rad/s) of the route follower at observation [..., D]."""
-    return follow(observation)[..., :2]
-
-
 def follow(observation: Tensor) -> Tensor:
-    """[..., 4] at observation [..., D]: the `reference_action`; the bound, an acceleration (m/s^2); the room in m.
+    """[..., 4] at observation [..., D]: the action (m/s^2, rad/s); the bound, an acceleration (m/s^2); the room in m.
 
     The bound is what IDM allows behind whoever is ahead and drives the ego's way, or is no vehicle; inf without one.
     The room is the least gap that going on with -1 or 1 m/s^2 leaves within the observation's manoeuvres.
