@@ -115,37 +115,26 @@ def _extremes(sizes: np.ndarray, name: str) -> dict[str, float]:
     return {name: float(sizes.min() if sizes.min() < low else sizes.max())}
 
 
-class Displacements(NamedTuple):
-    """Of vehicles that are recorded for FRAMES frames on end and drive: displacement [K, 2] m, the pose [K, 3] in its
-    middle, the mean recorded speed [K] m/s, whose it is [K], and whether it is the ego's [K]."""
-
-    moved: np.ndarray
-    pose: np.ndarray
-    speed: np.ndarray
-    track: np.ndarray
-    ego: np.ndarray
-
-
-def displacements(recording: Recording) -> Displacements:
-    """All displacements of a recording, overlapping ones included."""
+def displacements(recording: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """All displacements [K, 2] m, overlapping ones included, of vehicles that are recorded for FRAMES frames on end and
+    drive; the pose [K, 3] in its middle, the mean recorded speed [K] m/s, and the track [K] whose it is."""
     states, valid = recording.states, recording.valid
     count = len(states) - FRAMES
     if count < 1:
-        return Displacements(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool))
+        return np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, int)
     known = np.logical_and.reduce([valid[k : count + k] for k in range(FRAMES + 1)])
     speed = np.mean([states[k : count + k, :, 3] for k in range(FRAMES + 1)], axis=0)
     moved = states[FRAMES:, :, :2] - states[:count, :, :2]
     drives = (np.linalg.norm(moved, axis=-1) > MOVED) | (speed > DRIVES)
     chosen = known & drives & (recording.agent_type == VEHICLE)
     middle = states[FRAMES // 2 :][:count]
-    track = chosen.nonzero()[1]
-    return Displacements(moved[chosen], middle[chosen][:, :3], speed[chosen], track, track == recording.ego)
+    return moved[chosen], middle[chosen][:, :3], speed[chosen], chosen.nonzero()[1]
 
 
 def motion(recording: Recording) -> dict[str, float]:
     """Sizes of vehicles, and whether headings and speeds are those of the displacements."""
-    moved, pose, speed, track, ego = displacements(recording)
-    distance = np.linalg.norm(moved, axis=-1)
+    moved, pose, speed, track = displacements(recording)
+    distance, ego = np.linalg.norm(moved, axis=-1), track == recording.ego
     ratio, far = (speed * FRAMES * DT + 0.05) / (distance + 0.05), distance > MOVED
     turned = np.abs(wrap(np.arctan2(moved[:, 1], moved[:, 0]) - pose[:, 2]))
     size = recording.size[recording.valid.any(0) & (recording.agent_type == VEHICLE)]

@@ -198,9 +198,7 @@ class DrivingEnv(EnvBase):
         scene = {name: self.scene[name].index_select(0, index) for name in OF_SCENE}
         scene |= {name: self.scene[name][:, :1][index] for name in (f"route_{key}" for key in OF_ROUTE)}
         scene |= {name: self.scene[name][:, :, :1][index] for name in ("logged", "logged_valid")}
-        scene["field"] = self.scene["field"][
-            : len(index)
-        ]  # of the environment's storage, which write_rows leaves alone
+        scene["field"] = self.scene["field"][: len(index)]  # storage that write_rows leaves alone
         return TensorDict(scene, batch_size=[len(index)], device=self.device)
 
     def _restart(self, index: Tensor, scene: TensorDictBase, mission: Mission) -> EgoState:
