@@ -1,8 +1,6 @@
-"""The connection to a planner outside of e2rl, and the process that it runs in where e2rl starts it.
+"""The connection to a planner outside of e2rl, the process that it runs in where e2rl starts it, and their messages.
 
-The bytes that e2rl and a planner outside of it exchange (docs/how-to/planner.md has them field by field).
-
-A message is a header, (kind, length of the payload in bytes), and a payload. All numbers have 4 bytes, little-endian.
+docs/how-to/planner.md has these field by field. All numbers have 4 bytes, little-endian.
 """
 
 import os

@@ -3,8 +3,6 @@
 A state is (x [m], y [m], heading [rad], speed [m/s]); a step lasts DT and moves at the mean of the old and the new
 speed along the mean of the two headings. Speeds are clamped to [0, MAX_SPEED], yaw rates by curvature and lateral
 acceleration (`yaw_rate_bound`).
-
-Motion at constant acceleration and path curvature, in closed form: how others are expected to go on.
 """
 
 from typing import NamedTuple
@@ -113,7 +111,7 @@ SHARPEST = 0.12  # 1/m, of a path that is expected of a vehicle
 
 
 class Arc(NamedTuple):
-    """Constant acceleration [...] m/s^2 and path curvature [...] 1/m (left positive)."""
+    """Constant acceleration [...] m/s^2 and path curvature [...] 1/m (left positive): how others may go on."""
 
     accel: Tensor
     curvature: Tensor

@@ -1,7 +1,4 @@
-"""The input of planners and traffic methods: the current state of a batch of running scenes.
-
-Trajectories of all agents but the ego: recorded, stored, or written plan by plan.
-"""
+"""The input of planners and traffic methods, the current state of running scenes, and the trajectories of others."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
