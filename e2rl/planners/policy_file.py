@@ -48,13 +48,8 @@ class PolicyFileEgo(ObservingEgo):
         """Raises InputError where the file is none, maps other shapes, or takes longer than SECONDS to find out."""
         self.low = torch.tensor([-self.max_braking, -self.max_yaw_rate])
         self.high = torch.tensor([self.max_acceleration, self.max_yaw_rate])
-        self.policy = within_time(self._opened, f"ego.file={self.file}")
-
-    def _opened(self) -> Callable[[Tensor], Any]:
-        policy = open_policy(Path(self.file or ""), f"ego.file={self.file}")
-        for count in PROBED:
-            probe(policy, f"ego.file={self.file}", count)
-        return policy
+        where = f"ego.file={self.file}"
+        self.policy = within_time(partial(open_policy, Path(self.file or ""), where), where)
 
     def decide(self, observation: Tensor) -> Tensor:
         """The file's action [B, 2] at the observation; raises NotFinite where it is NaN or infinite."""
@@ -91,7 +86,7 @@ def probe(policy: Callable[[Tensor], Any], where: str, count: int) -> None:
 
 
 def open_policy(file: Path, where: str) -> Callable[[Tensor], Any]:
-    """The function of a policy's file, told by the file's suffix."""
+    """The function of a policy's file, told by the file's suffix and tried."""
     kinds: dict[str, Callable[[bytes, str], Callable[[Tensor], Any]]] = {
         ONNX: OnnxPolicy,
         TORCHSCRIPT: torchscript_policy,
@@ -102,7 +97,10 @@ def open_policy(file: Path, where: str) -> Callable[[Tensor], Any]:
         content = read_regular(file, MAX_FILE)
     except OSError as error:
         raise InputError(f"{where}: cannot be read ({error.strerror}); pass a file of a policy") from error
-    return kinds[file.suffix](content, where)
+    policy = kinds[file.suffix](content, where)
+    for count in PROBED:
+        probe(policy, where, count)
+    return policy
 
 
 def torchscript_policy(content: bytes, where: str) -> Callable[[Tensor], Any]:

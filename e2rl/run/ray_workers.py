@@ -1,6 +1,5 @@
 """Workers of a Ray cluster (extra `ray`): jobs are done again where a worker was lost."""
 
-import hashlib
 import importlib
 import os
 import signal
@@ -17,6 +16,7 @@ from typing import Any
 import torch
 
 from e2rl.run.errors import InputError
+from e2rl.run.files import hash_files
 from e2rl.run.fused import is_on, switch
 
 RETRIES = 3  # times that a job is done again whose worker was lost
@@ -119,8 +119,6 @@ def _sent(reference: Any) -> tuple[Callable[[Any], bytes], Sequence]:
 @cache
 def _code() -> str:
     """Torch's version and a hash of e2rl's code, the scripts apart, which an installed package holds, too."""
-    digest, package = hashlib.sha256(torch.__version__.encode()), Path(__file__).parents[1]
-    for path in sorted(package.rglob("*.py")):
-        if path.relative_to(package).parts[0] != "scripts":
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
+    package = Path(__file__).parents[1]
+    own = (path for path in sorted(package.rglob("*.py")) if path.relative_to(package).parts[0] != "scripts")
+    return torch.__version__ + hash_files(own).hex()
