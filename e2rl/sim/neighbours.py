@@ -91,7 +91,6 @@ def own_fault(
     Args:
         speed: [B] m/s, of the ego before the contact.
         hit: [B, M], the neighbours that each ego overlaps; the one with the deepest overlap is judged.
-        static: sizes, kinds and rows.
         tracks: of all agents, the ego first; what they did up to the step `before` [B], the one before the contact.
     """
     if hit.shape[1] == 0:
