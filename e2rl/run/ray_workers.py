@@ -30,13 +30,8 @@ VARIABLES = {  # of Ray, where the environment has none of its own
 
 @dataclass(frozen=True)
 class RayWorkers:
-    """Workers of one torch thread each, of the cluster at RAY_ADDRESS, or else started here. Raises InputError where
-    Ray is not installed.
-
-    Args:
-        count: of those started here (None: one a core).
-        modules: that a worker imports first, such as plugins.
-    """
+    """Workers of one torch thread each, of the cluster at RAY_ADDRESS, or else `count` (None: one a core) started here;
+    they import `modules` first, such as plugins. Raises InputError where Ray is not installed."""
 
     count: int | None = None
     modules: tuple[str, ...] = ()

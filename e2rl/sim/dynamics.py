@@ -84,13 +84,9 @@ def bounded_speed(v0: Tensor, change: Tensor, low: float = 0.0, high: float = MA
     lo, hi = torch.full_like(change, low), torch.full_like(change, high)
     horizon, width = change.shape[-1], 1
     while width < horizon:
-        c, tail_lo, tail_hi = change[..., width:], lo[..., width:], hi[..., width:]
-
-        def later(value: Tensor, c=c, tail_lo=tail_lo, tail_hi=tail_hi, width=width) -> Tensor:
-            moved = torch.minimum(torch.maximum(value[..., :-width] + c, tail_lo), tail_hi)
-            return torch.cat([value[..., :width], moved], -1)
-
-        lo, hi = later(lo), later(hi)
+        c, low_then, high_then = change[..., width:], lo[..., width:], hi[..., width:]
+        moved = [torch.minimum(torch.maximum(bound[..., :-width] + c, low_then), high_then) for bound in (lo, hi)]
+        lo, hi = (torch.cat([bound[..., :width], then], -1) for bound, then in zip((lo, hi), moved, strict=True))
         change = torch.cat([change[..., :width], change[..., :-width] + c], -1)
         width *= 2
     return torch.minimum(torch.maximum(v0 + change, lo), hi)
