@@ -38,13 +38,15 @@ class World:
     def at_start(cls, scene: TensorDictBase) -> "World":
         """Scenes [B] at their start frames."""
         step = torch.zeros(scene.batch_size[0], dtype=torch.int64, device=scene["start"].device)
-        return cls(scene, step, *(scene[key] for key in START_KEYS), scene["route_log"])
+        states, valid, accel, turn_rate = (scene[key] for key in START_KEYS)
+        return cls(scene, step, states, valid, accel, turn_rate, scene["route_log"])
 
     @classmethod
     def of(cls, tensordict: TensorDictBase, scene: TensorDictBase) -> "World":
         """The World that a DrivingEnv with `agents=True` reports in a TensorDict [B]; scene: `DrivingEnv.scene`."""
-        now = (tensordict["agents"][key] for key in AGENT_KEYS)
-        return cls(scene, tensordict["timestep"][:, 0], *now, plan=tensordict.get(("traffic", "plan"), None))
+        states, valid, accel, turn_rate = (tensordict["agents"][key] for key in AGENT_KEYS)
+        plan = tensordict.get(("traffic", "plan"), None)
+        return cls(scene, tensordict["timestep"][:, 0], states, valid, accel, turn_rate, plan=plan)
 
     def shown(self, scene: TensorDictBase | None = None) -> "World":
         """A copy for code from outside the package: changes to it have no effect, and it holds nothing of the future.
