@@ -15,13 +15,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from scenegen.archive import pack  # noqa: E402
+from scenegen.archive import Place, pack  # noqa: E402
 from scenegen.families import schedule  # noqa: E402
 from scenegen.simulate import DT, RECORDED, convert, densify, run  # noqa: E402
 from scenegen.tracks import park, stack_tracks  # noqa: E402
 from scenegen.windows import cut_windows  # noqa: E402
 
-from e2rl.scenes.bundled import SPLITS, SceneMap
+from e2rl.scenes.bundled import SPLITS
 
 PATTERN = ("train", "train", "tune", "train", "test")  # of every five nets: 60 / 20 / 20 per cent
 
@@ -35,7 +35,7 @@ def make_net(index: int, family, seed: int, most: int, folder: Path):
     states, valid, size = stack_tracks(tracks, round(RECORDED / DT), rng)
     densify(net.lanes)
     parking = park(net, states, valid, size, rng)
-    scene_map = SceneMap(layout.name, net.lanes, net.drivable + parking.strips, lights, parking.pose, parking.size)
+    scene_map = Place(layout.name, net.lanes, net.drivable + parking.strips, lights, parking.pose, parking.size)
     scenes, refused = cut_windows(scene_map, states, valid, size, net.border, most, rng)
     return scene_map, scenes, refused
 

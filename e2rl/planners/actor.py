@@ -1,7 +1,4 @@
-"""Egos that map the environment's observation to an action, the learned one among them.
-
-Their plan is a rollout of their own policy.
-"""
+"""Egos that map the environment's observation to an action, the learned one among them."""
 
 from abc import abstractmethod
 from collections.abc import Sequence

@@ -49,10 +49,8 @@ def drive(start: Tensor, path: RoutePath, speed: Tensor, shift: Tensor, time: Te
     Its headings become yaw rates, within MAX_YAW_RATE and the tyres' grip, which braking shares; the unicycle makes
     states of them.
 
-    Args:
-        start: states [B, 4].
-        speed: profiles [B, L, PLAN_STEPS + 1] m/s.
-        shift, time: m and s, [B, L, S] or what broadcasts to it.
+    start: states [B, 4]; speed: profiles [B, L, PLAN_STEPS + 1] m/s; shift m, time s: [B, L, S] or what broadcasts to
+    it.
     """
     shift, time = (value.expand(*speed.shape[:2], value.shape[-1]) for value in (shift, time))
     speed = speed[:, :, None]

@@ -191,8 +191,9 @@ class EgoPlanner(TensorDictModuleBase):
         super().__init__()
         base = getattr(env, "base_env", env)
         self.ego, self.scene, self.bounds = ego, base.scene, base.action_spec.space
-        self._plan: Tensor | None = None  # [B, 1 + PLAN_STEPS, 4], the state at the time of planning first
-        self._planned_at: Tensor | None = None  # [B] step of planning
+        start = self.scene["start"][:, :1]
+        self._plan = torch.zeros_like(start).repeat(1, 1 + PLAN_STEPS, 1)  # the state at the time of planning first
+        self._planned_at = torch.full(start.shape[:1], -PLAN_STEPS, device=start.device)  # step of planning
         self._shown: TensorDictBase | None = None  # the scenes as a planner from outside sees them
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -204,9 +205,6 @@ class EgoPlanner(TensorDictModuleBase):
         if bool((world.step == 0).any()):
             self._shown = without_future(self.scene) if from_outside(self.ego) else None
             self._ask("reset", world)
-        if self._plan is None or self._planned_at is None:
-            self._plan = torch.zeros(len(world.step), 1 + PLAN_STEPS, 4, device=world.states.device)
-            self._planned_at = torch.full_like(world.step, -PLAN_STEPS)
         age = world.step - self._planned_at
         due = (age >= self.ego.replan_every) | (age < 0) | (world.step == 0)
         if bool(due.any()):

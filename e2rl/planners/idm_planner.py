@@ -20,10 +20,7 @@ REACTION = 0.5  # s ahead at which the speed caps are met
 @configured("ego/idm")
 @dataclass(eq=False)
 class IDMEgo(Ego):
-    """Stays on its mission and follows the nearest agent or red light ahead; never changes lanes.
-
-    An agent leads if its box is laterally within half the ego's width + GATE_MARGIN of the route.
-    """
+    """Stays on its mission and follows the nearest of `leaders` or red lights ahead; never changes lanes."""
 
     desired_speed: float = setting(low=0.1)
     headway: float = setting(low=0)

@@ -22,7 +22,7 @@ from e2rl.sim.observation import OBSERVATION_SIZE
 DEEPEST, WIDEST = 16, 1 << 13  # layers, and units of a layer, that a file may ask for
 WEIGHTS = "actor.safetensors"  # file name of an ActorCritic inside a checkpoint
 NARROWEST = 0.01  # least standard deviation before squashing, as a fraction of half the action range
-LAST = ("network.trunk.last.weight", "network.trunk.last.bias")
+LAST = {"network.trunk.last.weight", "network.trunk.last.bias"}
 STEEPEST = 0.95  # reference actions are kept within this fraction of the bounds, so that their atanh stays finite
 UNBOUNDED = 0.999  # and a bound of the acceleration, where nobody is ahead
 LEAST_SCALE = 0.2  # an observed number's: one that hardly varied in training, as the ego's size, may vary elsewhere
@@ -271,7 +271,9 @@ def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
         how = units, bool(saved["reference"]), slack, room
         actor = ActorCritic(low, high, sizes, *how, device=device, least_scale=least)
         own = actor.weights()
-        weights |= {key: padded(weights[key], own[key]) for key in LAST if key in own and key in weights}
+        for key in LAST.intersection(weights) if saved["reference"] else ():
+            if len(weights[key]) == 2:  # of an earlier version, which had no w: it is 0
+                weights[key] = torch.cat([weights[key], torch.zeros_like(weights[key])])
         wrong = set(own) ^ set(weights) or {key for key in own if own[key].shape != weights[key].shape}
         if wrong:
             raise ValueError(f"weights {', '.join(sorted(wrong))} do not fit")
@@ -283,27 +285,18 @@ def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
     return actor
 
 
-def padded(value: Tensor, like: Tensor) -> Tensor:
-    """The trunk's last layer of an earlier version, which had no w, with w = 0."""
-    missing = len(like) - len(value)
-    return torch.cat([value, value.new_zeros(missing, *value.shape[1:])]) if len(value) == 2 and missing == 2 else value
-
-
 def find_weights(path: str | Path) -> Path:
     """The actor file that `path` names: the file, a checkpoint folder, the newest whole checkpoint of a run folder, or
     with "bundled" the package's own, trained on the bundled scenes."""
     path = Path(str(files("e2rl") / "assets" / "actor" / WEIGHTS)) if path == "bundled" else Path(path)
-    if path.is_dir():
-        if (path / WEIGHTS).is_file():
-            return path / WEIGHTS
-        found = sorted(path.glob(f"checkpoints/round-*/{WEIGHTS}"))
+    if (path / WEIGHTS).is_file():
+        return path / WEIGHTS
+    if found := sorted(path.glob(f"checkpoints/round-*/{WEIGHTS}")):
         whole = [file for file in found if altered(file.parent) is None]
-        if found and not whole:
-            raise InputError(
-                f"{found[-1].parent}: damaged ({altered(found[-1].parent)}), as all of {path}; train again"
-            )
-        if whole:
-            return whole[-1]
+        if not whole:
+            last = found[-1].parent
+            raise InputError(f"{last}: damaged ({altered(last)}), as all of {path}; train again")
+        return whole[-1]
     if not path.is_file():
         raise InputError(f"{path}: no actor there; give an {WEIGHTS}, a checkpoint folder or a run folder")
     return path

@@ -9,7 +9,7 @@ from e2rl.planners.ego import return_length
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING, interpolate, project
 from e2rl.sim.dynamics import wrap
-from e2rl.sim.mission import limit_at, mission_of, stop_ahead
+from e2rl.sim.mission import light_state_at, limit_at, mission_of, stop_line_distance
 from e2rl.sim.world import World
 
 MAX_SLOPE = 1.0  # rad, bound of the angle between vehicle and route at the start of a path
@@ -101,11 +101,13 @@ class MissionPath(RoutePath):
 
     def stop_distance(self, braking: float = BRAKING) -> Tensor:
         """Metres [B] until the ego's front is STOP_GAP m before the next stop line that binds; negative beyond that
-        point, inf for none."""
-        world = self.world
-        speed, half = world.states[:, 0, 3], world.scene["size"][:, 0, 0] / 2
-        ahead = stop_ahead(self.mission, world.scene, world.step, self.s, speed, braking)
-        return ahead - half - STOP_GAP
+        point, inf for none. A yellow light binds if `braking` m/s^2 halts before it, a red one if twice as much does.
+        """
+        scene, mission = self.world.scene, self.mission
+        lights, ahead = light_state_at(scene["light_state"], mission.light, self.world.step), mission.light_s
+        speed = self.world.states[:, 0, 3]
+        line = stop_line_distance(lights, ahead - self.s[:, None], speed, 2 * braking, braking)
+        return line - scene["size"][:, 0, 0] / 2 - STOP_GAP
 
 
 def look_up(caps: Tensor, ahead: Tensor) -> Tensor:

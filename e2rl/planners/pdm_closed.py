@@ -53,13 +53,6 @@ class Others(NamedTuple):
     seen: Tensor
 
 
-class Scores(NamedTuple):
-    """Of P proposals, each [B, P]: the score in [0, 1], and the time [s] of the first collision at fault, inf: none."""
-
-    score: Tensor
-    collides: Tensor
-
-
 @configured("ego/pdm_closed")
 @dataclass(eq=False)
 class PDMClosedEgo(Ego):
@@ -83,12 +76,12 @@ class PDMClosedEgo(Ego):
 
     def _plan(self, world: World) -> Tensor:
         proposals = self.proposals(world)
-        scores = score(world, proposals, self._others(world, range(1, HORIZON + 1)))
-        best = scores.score.argmax(1)
+        scores, collides = score(world, proposals, self._others(world, range(1, HORIZON + 1)))
+        best = scores.argmax(1)
         row = torch.arange(len(best), device=best.device)
         brake = torch.tensor([-self.emergency_braking, 0.0], device=best.device).expand(len(best), PLAN_STEPS, 2)
         stop = dynamics.rollout(world.states[:, 0], brake)
-        emergency = (scores.collides[row, best] <= SOON) & (world.states[:, 0, 3] <= self.emergency_speed)
+        emergency = (collides[row, best] <= SOON) & (world.states[:, 0, 3] <= self.emergency_speed)
         return torch.where(emergency[:, None, None], stop, proposals[row, best])
 
     def proposals(self, world: World) -> Tensor:
@@ -143,8 +136,9 @@ def _extent(size: Tensor, turn: Tensor, axis: int) -> Tensor:
     return own * turn.cos().abs() + other * turn.sin().abs()
 
 
-def score(world: World, proposals: Tensor, others: Others) -> Scores:
-    """nuPlan's closed-loop score of proposals [B, P, PLAN_STEPS, 4] over the HORIZON, others at its steps 1...
+def score(world: World, proposals: Tensor, others: Others) -> tuple[Tensor, Tensor]:
+    """nuPlan's closed-loop score, in [0, 1], of proposals [B, P, PLAN_STEPS, 4] over the HORIZON, others at its steps
+    1..., and the time [s] of their first collision at fault, inf: none; each [B, P].
 
     Collision and drivable area multiply the weighted mean of progress, relative to the proposal that gets farthest of
     those that neither excludes, time to collision and comfort. Proposals follow the mission, and so never drive against
@@ -160,7 +154,7 @@ def score(world: World, proposals: Tensor, others: Others) -> Scores:
     allowed = ~hit.any(-1) & on_road(scored, size, world)
     driven, smooth = progress(world, scored, allowed), comfortable(world, scored)
     weighted = PROGRESS * driven + TIME_TO_COLLISION * clear + COMFORT * smooth
-    return Scores(allowed * weighted / (PROGRESS + TIME_TO_COLLISION + COMFORT), collides)
+    return allowed * weighted / (PROGRESS + TIME_TO_COLLISION + COMFORT), collides
 
 
 def progress(world: World, scored: Tensor, allowed: Tensor) -> Tensor:
@@ -196,8 +190,7 @@ def comfortable(world: World, scored: Tensor) -> Tensor:
     now = world.states[:, None, None, 0].expand_as(scored[:, :, :1])
     speed, heading = torch.cat([now, scored], 2)[..., 2:].flip(-1).unbind(-1)
     accel, rate = speed.diff(dim=-1) / DT, wrap(heading.diff(dim=-1)) / DT
-    window = (accel.unfold(-1, 5, 1).mean(-1), rate.unfold(-1, 5, 1).mean(-1))  # as nuPlan smooths what it scores
-    accel, rate = window
+    accel, rate = (value.unfold(-1, 5, 1).mean(-1) for value in (accel, rate))  # as nuPlan smooths what it scores
     lateral = rate * speed[..., 3:-2]
     fine = (accel >= ACCELERATIONS[0]) & (accel <= ACCELERATIONS[1]) & (lateral.abs() <= LATERAL)
     fine = fine.all(-1) & (rate.abs() <= YAW_RATE).all(-1)

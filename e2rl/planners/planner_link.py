@@ -1,13 +1,10 @@
-"""The connection to a planner outside of e2rl, and the process that it runs in where e2rl starts it.
+"""The connection to a planner outside of e2rl, the process that it runs in where e2rl starts it, and their messages.
 
-The bytes that e2rl and a planner outside of it exchange (docs/how-to/planner.md has them field by field).
-
-A message is a header, (kind, length of the payload in bytes), and a payload. All numbers have 4 bytes, little-endian.
+docs/how-to/planner.md has these field by field. All numbers have 4 bytes, little-endian.
 """
 
 import os
 import shlex
-import shutil
 import signal
 import socket
 import struct
@@ -141,21 +138,18 @@ class PlannerLink:
         self.buffer = bytearray()
         """What came beyond the last message taken."""
         self._name = f"ego.address={address}" if command is None else f"ego.command={command}"
-        folder = None if command is None else tempfile.mkdtemp(prefix="e2rl-")
         self._process, begun = None, time.monotonic()
         deadline = begun + timeout
         try:
-            if command is not None:
-                address = f"unix:{folder}/planner"
-                self._process = start(command, address)
-            listens = begun + (timeout if command is not None else min(timeout, ANSWERS))
-            self._socket = connect(str(address), self._process, listens, self._name)
+            if command is None:
+                self._socket = connect(str(address), None, begun + min(timeout, ANSWERS), self._name)
+            else:  # a connection does not need its path
+                with tempfile.TemporaryDirectory(prefix="e2rl-", ignore_cleanup_errors=True) as folder:
+                    self._process = start(command, f"unix:{folder}/planner")
+                    self._socket = connect(f"unix:{folder}/planner", self._process, deadline, self._name)
         except BaseException:
             close(None, self._process)
             raise
-        finally:
-            if folder is not None:
-                shutil.rmtree(folder, ignore_errors=True)  # a connection does not need its path
         self.close = Finalize(self, close, (self._socket, self._process), exitpriority=10)
         self._greet(replan_every, deadline)
 

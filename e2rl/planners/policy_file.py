@@ -7,6 +7,7 @@ import io
 import logging
 import warnings
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -47,13 +48,8 @@ class PolicyFileEgo(ObservingEgo):
         """Raises InputError where the file is none, maps other shapes, or takes longer than SECONDS to find out."""
         self.low = torch.tensor([-self.max_braking, -self.max_yaw_rate])
         self.high = torch.tensor([self.max_acceleration, self.max_yaw_rate])
-        self.policy = within_time(self._opened, f"ego.file={self.file}")
-
-    def _opened(self) -> Callable[[Tensor], Any]:
-        policy = open_policy(Path(self.file or ""), f"ego.file={self.file}")
-        for count in PROBED:
-            probe(policy, f"ego.file={self.file}", count)
-        return policy
+        where = f"ego.file={self.file}"
+        self.policy = within_time(partial(open_policy, Path(self.file or ""), where), where)
 
     def decide(self, observation: Tensor) -> Tensor:
         """The file's action [B, 2] at the observation; raises NotFinite where it is NaN or infinite."""
@@ -63,23 +59,18 @@ class PolicyFileEgo(ObservingEgo):
 
 def within_time(work: Callable[[], Any], where: str) -> Any:
     """What work() returns or raises; raises InputError where it goes on for longer than SECONDS."""
-    ended: list[tuple[Any, BaseException | None]] = []
+    ended: Future = Future()
 
     def run() -> None:
         try:
-            ended.append((work(), None))
+            ended.set_result(work())
         except BaseException as error:
-            ended.append((None, error))
+            ended.set_exception(error)
 
-    thread = Thread(target=run, daemon=True)  # what does not end is left behind
-    thread.start()
-    thread.join(SECONDS)
-    if not ended:
+    Thread(target=run, daemon=True).start()  # what does not end is left behind
+    if wait([ended], SECONDS).not_done:
         raise InputError(f"{where}: opening it takes longer than {SECONDS} s; give a smaller policy")
-    result, error = ended[0]
-    if error is not None:
-        raise error
-    return result
+    return ended.result()
 
 
 def probe(policy: Callable[[Tensor], Any], where: str, count: int) -> None:
@@ -95,7 +86,7 @@ def probe(policy: Callable[[Tensor], Any], where: str, count: int) -> None:
 
 
 def open_policy(file: Path, where: str) -> Callable[[Tensor], Any]:
-    """The function of a policy's file, told by the file's suffix."""
+    """The function of a policy's file, told by the file's suffix and tried."""
     kinds: dict[str, Callable[[bytes, str], Callable[[Tensor], Any]]] = {
         ONNX: OnnxPolicy,
         TORCHSCRIPT: torchscript_policy,
@@ -106,7 +97,10 @@ def open_policy(file: Path, where: str) -> Callable[[Tensor], Any]:
         content = read_regular(file, MAX_FILE)
     except OSError as error:
         raise InputError(f"{where}: cannot be read ({error.strerror}); pass a file of a policy") from error
-    return kinds[file.suffix](content, where)
+    policy = kinds[file.suffix](content, where)
+    for count in PROBED:
+        probe(policy, where, count)
+    return policy
 
 
 def torchscript_policy(content: bytes, where: str) -> Callable[[Tensor], Any]:

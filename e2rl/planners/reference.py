@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from e2rl.run.fused import fused, is_on
 from e2rl.scenes.route import first_least
-from e2rl.sim.leaders import IDMParameters, idm_acceleration
+from e2rl.sim.leaders import GATE_MARGIN, IDMParameters, idm_acceleration
 from e2rl.sim.observation import FAR, LOOK_AHEAD, NEAR, NEAREST, OBSERVATION_SIZE, PER_AGENT, PROBE_X, PROBE_Y, SPEED
 from e2rl.sim.prospects import ACCELERATIONS, OFFSETS, PROSPECTS, WIDEST
 
@@ -33,20 +33,14 @@ HEADWAY, STANDSTILL_GAP, EXPONENT = 1.2, 3.0, 4.0  # s, m
 DRIVER = IDMParameters(HEADWAY, STANDSTILL_GAP, ACCELERATION, BRAKING, EXPONENT)
 COOLNESS = 0.99  # of the ACC model: 0 is IDM
 LATERAL = 2.5  # m/s^2 in curves
-GATE_MARGIN = 0.3  # m beyond the half widths
 REACTION = 0.5  # s in which a speed cap is met
 LINE_GAP = 1.0  # m kept to a stop line
 OWN_WAY = 0.7  # least cosine between the headings of the path and of a vehicle that drives the ego's way
 UNCAPPED = 1e3  # m/s
 
 
-def reference_action(observation: Tensor) -> Tensor:
-    """Action [..., 2] (m/s^2, rad/s) of the route follower at observation [..., D]."""
-    return follow(observation)[..., :2]
-
-
 def follow(observation: Tensor) -> Tensor:
-    """[..., 4] at observation [..., D]: the `reference_action`; the bound, an acceleration (m/s^2); the room in m.
+    """[..., 4] at observation [..., D]: the action (m/s^2, rad/s); the bound, an acceleration (m/s^2); the room in m.
 
     The bound is what IDM allows behind whoever is ahead and drives the ego's way, or is no vehicle; inf without one.
     The room is the least gap that going on with -1 or 1 m/s^2 leaves within the observation's manoeuvres.

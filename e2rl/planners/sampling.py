@@ -1,8 +1,7 @@
 """A sampling planner: hundreds of candidates, each driven by the unicycle and scored on a forecast of the others.
 
 It proposes, simulates, scores and takes the best, in the manner of PDM-Closed (Dauner et al. 2023), and ignores
-others' plans. Vectorised over scenes, candidates and agents. What all egos share that choose among candidates by their
-cost: `ScoringEgo`; how its candidates rank are soft labels for an imitator.
+others' plans. Vectorised over scenes, candidates and agents.
 """
 
 from abc import abstractmethod

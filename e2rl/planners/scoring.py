@@ -1,7 +1,4 @@
-"""Costs of a planner's candidates: contact, distance to others, the drivable border, progress, comfort.
-
-Forecasts of the agents nearest to the ego: their present acceleration and turn, each held for a while.
-"""
+"""Costs of a planner's candidates by a forecast of others: contact, distance, drivable border, progress, comfort."""
 
 from dataclasses import dataclass
 

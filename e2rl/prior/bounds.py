@@ -187,11 +187,8 @@ def meeting_braking(meeting: Meeting, speed: Tensor, length: Tensor, duty: Duty)
     two that meet, the one that has the other farther ahead of itself brakes. Adversaries that come into the ego's side
     fall behind it.
 
-    Args:
-        meeting: with whom, and where.
-        speed: v [B, V] m/s.
-        length: [B, V] m between the centres if the vehicle were just behind the ego; -inf: nobody falls behind it.
-        duty: of adversaries to the ego.
+    speed: v [B, V] m/s; length [B, V] m: between the centres if the vehicle were just behind the ego, -inf: nobody
+    falls behind it.
     """
     own, other, driven, steps, happens = meeting
     dx, dy = (other[..., :2] - own[..., :2]).unbind(-1)

@@ -49,11 +49,11 @@ class LaneState:
     kappa: Tensor
 
     @classmethod
-    def from_states(cls, states: Tensor, s: Tensor | None = None, d: Tensor | None = None) -> "LaneState":
-        """States [..., 4] with arc length s and offset d [...] where these are known; what is not known is 0."""
+    def from_states(cls, states: Tensor, s: Tensor, d: Tensor) -> "LaneState":
+        """States [..., 4] with arc length s and offset d [...]; what is not known is 0."""
         x, y, heading, v = states.unbind(-1)
         zero = torch.zeros_like(v)
-        return cls(zero if s is None else s, zero if d is None else d, zero, zero, v, zero, x, y, heading, zero)
+        return cls(s, d, zero, zero, v, zero, x, y, heading, zero)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "LaneState":
         """A LaneState with `function` applied to every field."""

@@ -1,7 +1,4 @@
-"""Route choice: a distribution over each vehicle's route candidates.
-
-RoutedScene: the static tensors of a scene once every vehicle has been assigned a route.
-"""
+"""Route choice, a distribution over each vehicle's route candidates, and scenes whose vehicles are assigned one."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple

@@ -2,9 +2,6 @@
 
 Noise level t in [0, 1]: x_t = alpha(t) x_0 + sigma(t) eps with alpha = cos(pi t / 2), sigma = sin(pi t / 2); as an SDE
 dx = f dt + g dw with f = -beta(t) x / 2, g^2 = beta(t) = pi tan(pi t / 2). The paper's gamma-bar_t is alpha(t)^2.
-
-DDIM's eta (Song et al. 2021, eq. 16: the fraction of ancestral noise in a step) is called `churn`: eta always means the
-adversarial intensity.
 """
 
 import math
@@ -75,7 +72,8 @@ class Sampler(ABC):
     """Steps of the reverse process from one noise level to a lower one.
 
     Given `past`, a step is affine in x0, so that two steps with the same noise differ by the shift of their means.
-    churn (DDIM's eta): 1 is the reverse SDE, 0 deterministic.
+    churn: DDIM's eta (Song et al. 2021, eq. 16), the fraction of ancestral noise in a step: 1 is the reverse SDE, 0
+    deterministic. eta always means the adversarial intensity.
     """
 
     def __init__(self, schedule: NoiseSchedule, churn: float = 1.0) -> None:
@@ -83,14 +81,8 @@ class Sampler(ABC):
 
     @abstractmethod
     def step(self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor, past: Past = None) -> Stepped:
-        """Returns x at level low, and the variance of the noise in it.
-
-        Args:
-            x, x0: at level high, and its clean estimate.
-            high, low: noise levels; low is above 0.
-            noise: standard normal, of the shape of x.
-            past: clean estimate and level of the previous step, None at the first.
-        """
+        """Returns x at the noise level `low`, above 0, from x and its clean estimate x0 at level `high`. noise:
+        standard normal, of the shape of x; past: of the previous step, None at the first."""
 
 
 class DDIM(Sampler):

@@ -40,10 +40,8 @@ def ending(go_on: Callable[[], str] = command_line) -> Iterator[None]:
     """End the process where the block ends early, with one line on stderr.
 
     The status is 2 for bad input, 1 for a full disk or memory, 130 for Ctrl-C, 143 for SIGTERM. Libraries may turn the
-    interrupt into an error of their own, or lose it on the way; what counts is that the signal arrived.
-
-    Args:
-        go_on: returns the command that goes on where this one ends; by default the same again.
+    interrupt into an error of their own, or lose it on the way; what counts is that the signal arrived. go_on: returns
+    the command that goes on where this one ends.
     """
     arrived: list[int] = []
 

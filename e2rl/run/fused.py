@@ -38,7 +38,7 @@ FUSED: dict[str, "Fused"] = {}
 COMPILES = "2.13"  # the version of PyTorch that all fused functions were compiled with
 COMPILERS = ("c++", "g++", "clang++")
 VECTOR = 8  # components of a vector, at most
-FIRST = 17  # sizes of the tensors that a function is traced with: distinct primes from here on
+SIZES = (17, 19, 23, 29, 31, 37, 41, 43, 47, 53, 59, 61)  # of tensors that a function is traced with: distinct primes
 _on = False
 
 
@@ -160,7 +160,7 @@ class Fused:
 
     def _compile(self) -> None:
         free = sorted({name for given in self.declared for name in given.sizes if isinstance(name, str)})
-        size: dict[Any, int] = dict(zip(free, _primes(), strict=False))
+        size: dict[Any, int] = dict(zip(free, SIZES, strict=False))
         examples, dynamic = [], []
         for names, kind, apart, truth in self.declared:
             names = [names[-1], *names[:-1]] if apart else names
@@ -299,14 +299,6 @@ def _tensors(value: Any) -> list[Tensor]:
 def _names(kind: Any) -> list[str]:
     """The names of what a dataclass or a named tuple holds."""
     return [each.name for each in fields(kind)] if is_dataclass(kind) else list(kind._fields)
-
-
-def _primes() -> Iterator[int]:
-    number = FIRST
-    while True:
-        if all(number % k for k in range(2, number)):
-            yield number
-        number += 1
 
 
 @cache

@@ -73,14 +73,8 @@ def state_bytes(state: Any) -> bytes:
 
 
 def read_state(file: Path, folder: Path | None = None) -> Any:
-    """Returns what `state_bytes` made, on the CPU; nothing but plain values and tensors is unpickled.
-
-    Args:
-        folder: in which the file must lie, links followed.
-
-    Raises:
-        ValueError: where the file is damaged.
-    """
+    """Returns what `state_bytes` made, on the CPU; nothing but plain values and tensors is unpickled. Raises ValueError
+    where the file is damaged, or lies outside of `folder` once links are followed."""
     try:
         content = read_regular(file, within=folder)
         begin = len(HASHED) + hashlib.sha256().digest_size
@@ -92,12 +86,8 @@ def read_state(file: Path, folder: Path | None = None) -> Any:
 
 
 def load_plain(content: bytes) -> Any:
-    """Returns what torch.save wrote, plain values and tensors on the CPU.
-
-    Raises:
-        ValueError: where it would grow as it is read: torch packs nothing, and repeats nothing. Damaged bytes raise
-            anything.
-    """
+    """Returns what torch.save wrote, plain values and tensors on the CPU. Raises ValueError where it would grow as it
+    is read, as torch packs nothing and repeats nothing; damaged bytes raise anything."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         members = archive.infolist()
     packed = any(each.compress_type != zipfile.ZIP_STORED for each in members) or content[:2] != b"PK"

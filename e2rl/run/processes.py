@@ -110,12 +110,9 @@ def _do(number: int) -> bytes:
 def worker_pool(
     processes: int, method: str, begin: Callable[..., object] | None = None, *arguments: Any
 ) -> Iterator[ProcessPoolExecutor]:
-    """A pool of processes of one thread each, which call begin(*arguments) first.
+    """A pool of processes of one thread each, started by `method` (fork or spawn), which call begin(*arguments) first.
 
     Left by an exception, KeyboardInterrupt included, it kills its workers instead of waiting for them.
-
-    Args:
-        method: fork or spawn.
     """
     others = set(multiprocessing.active_children())
     given = (os.getpid(), begin, arguments)

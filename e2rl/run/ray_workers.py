@@ -1,6 +1,5 @@
 """Workers of a Ray cluster (extra `ray`): jobs are done again where a worker was lost."""
 
-import hashlib
 import importlib
 import os
 import signal
@@ -17,6 +16,7 @@ from typing import Any
 import torch
 
 from e2rl.run.errors import InputError
+from e2rl.run.files import hash_files
 from e2rl.run.fused import is_on, switch
 
 RETRIES = 3  # times that a job is done again whose worker was lost
@@ -30,13 +30,8 @@ VARIABLES = {  # of Ray, where the environment has none of its own
 
 @dataclass(frozen=True)
 class RayWorkers:
-    """Workers of one torch thread each, of the cluster at RAY_ADDRESS, or else started here. Raises InputError where
-    Ray is not installed.
-
-    Args:
-        count: of those started here (None: one a core).
-        modules: that a worker imports first, such as plugins.
-    """
+    """Workers of one torch thread each, of the cluster at RAY_ADDRESS, or else `count` (None: one a core) started here;
+    they import `modules` first, such as plugins. Raises InputError where Ray is not installed."""
 
     count: int | None = None
     modules: tuple[str, ...] = ()
@@ -119,8 +114,6 @@ def _sent(reference: Any) -> tuple[Callable[[Any], bytes], Sequence]:
 @cache
 def _code() -> str:
     """Torch's version and a hash of e2rl's code, the scripts apart, which an installed package holds, too."""
-    digest, package = hashlib.sha256(torch.__version__.encode()), Path(__file__).parents[1]
-    for path in sorted(package.rglob("*.py")):
-        if path.relative_to(package).parts[0] != "scripts":
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
+    package = Path(__file__).parents[1]
+    own = (path for path in sorted(package.rglob("*.py")) if path.relative_to(package).parts[0] != "scripts")
+    return torch.__version__ + hash_files(own).hex()

@@ -102,9 +102,7 @@ class Run:
         """Write what the run was begun with; or where it goes on, compare with that. Raises InputError for other inputs
         or settings than those that the run was begun with. Other versions are told on stderr.
 
-        Args:
-            scenes: of each set of scenes, by its name, the content of its list and the hash of its data's files
-                (`e2rl.scenes.scene_list.listed`).
+        scenes: of each set of scenes, by its name, what `e2rl.scenes.scene_list.listed` returns.
         """
         lists = {name: hashlib.sha256(text.encode()).hexdigest() for name, (text, _) in scenes.items()}
         now = {

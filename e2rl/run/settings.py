@@ -2,7 +2,6 @@
 
 import inspect
 from collections.abc import Callable, Collection, Mapping
-from copy import deepcopy
 from dataclasses import field, fields, is_dataclass
 from functools import cache, wraps
 from pathlib import Path
@@ -72,17 +71,10 @@ def configured(file: str, part: str = "") -> Callable[[Kind], Kind]:
 
 def file_values(file: str, part: str = "") -> dict[str, Any]:
     """Returns the plain values of conf/<file>.yaml, or of one mapping in it; lists are tuples."""
-    return {
-        key: tuple(value) if isinstance(value, list) else value for key, value in deepcopy(_plain(file, part)).items()
-    }
-
-
-@cache
-def _plain(file: str, part: str) -> dict[str, Any]:
     own = _loaded(file)
     plain = OmegaConf.to_container(OmegaConf.select(own, part) if part else own, resolve=True)
     assert isinstance(plain, dict)
-    return {str(key): value for key, value in plain.items()}
+    return {str(key): tuple(value) if isinstance(value, list) else value for key, value in plain.items()}
 
 
 @cache

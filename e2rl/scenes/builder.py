@@ -76,12 +76,9 @@ class SceneBuilder:
         scene |= _routes(scene, self.graph, origin, lights, self.settings)
         scene |= _lights(recording, frame, origin, self.settings.steps)
         scene |= _map(self.graph, self.drivable, scene, origin, self.settings)
-        return TensorDict({key: _tensor(value) for key, value in scene.items()}, batch_size=[])
-
-
-def _tensor(value: np.ndarray) -> torch.Tensor:
-    tensor = torch.from_numpy(np.ascontiguousarray(value))
-    return tensor.float() if tensor.dtype == torch.float64 else tensor
+        tensors = {key: torch.from_numpy(np.ascontiguousarray(value)) for key, value in scene.items()}
+        doubles = {key: value.float() for key, value in tensors.items() if value.dtype == torch.float64}
+        return TensorDict(tensors | doubles, batch_size=[])
 
 
 def _agents(

@@ -8,7 +8,7 @@ after another, with counts.
 import hashlib
 import io
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
 
@@ -36,16 +36,13 @@ MEND = "restore the file from git, or write it again with tools/generate_scenes.
 class SceneMap:
     """The map of one synthetic place.
 
-    drivable: polygons; lights: lane id -> [T] states over the whole simulation of the place at 10 Hz; parked [Q, 3],
-    parked_size [Q, 2]: poses and sizes of the cars parked there.
+    drivable: polygons; lights: lane id -> [T] states over the whole simulation of the place at 10 Hz.
     """
 
     name: str
     lanes: dict[str, Lane]
     drivable: list[np.ndarray]
     lights: dict[str, np.ndarray]
-    parked: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    parked_size: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
     def recording(
         self, scene_id: str, first: int, states: np.ndarray, valid: np.ndarray, size: np.ndarray, ego: int
@@ -103,7 +100,7 @@ def _split(values: np.ndarray, counts: np.ndarray) -> list[np.ndarray]:
 
 
 def read_maps(arrays: dict[str, np.ndarray]) -> list[SceneMap]:
-    """Returns the maps of an archive, without what is parked there: recordings have it as tracks."""
+    """Returns the maps of an archive; what is parked there is among the tracks of recordings."""
     ids = [str(name) for name in arrays["lane_id"]]
     centrelines = _split(arrays["lane_points"] * MILLI, arrays["lane_counts"])
     rows = zip(centrelines, arrays["lane_width"] * MILLI, arrays["lane_speed"] * MILLI, strict=True)

@@ -1,7 +1,4 @@
-"""Look-up of the drivable field: metres beyond the border of the drivable area (docs/method.md, section 1).
-
-The drivable area as a field: distance beyond its border, on a 1 m grid around the ego's recorded path.
-"""
+"""The drivable area as a field, metres beyond its border on a 1 m grid, and its look-up (docs/method.md, section 1)."""
 
 import numpy as np
 import torch

@@ -1,7 +1,4 @@
-"""The lane graph of a recording on the host (networkx), and the route candidates of a vehicle on it.
-
-`against_lanes` tells which vehicles drive against the lanes of a map.
-"""
+"""The lane graph of a recording (networkx), route candidates of a vehicle on it, and who drives against its lanes."""
 
 from dataclasses import dataclass
 from heapq import heappop, heappush

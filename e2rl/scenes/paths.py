@@ -44,21 +44,13 @@ def resample(points: np.ndarray, spacing: float) -> np.ndarray:
 
 def tangent_angle(points: np.ndarray) -> np.ndarray:
     """Direction [P] rad of a polyline [P, 2] at its points."""
-    tangent = tangents(points)
-    return np.arctan2(tangent[:, 1], tangent[:, 0])
-
-
-def tangents(points: np.ndarray) -> np.ndarray:
-    """Central differences [P, 2] of a polyline [P, 2] over its index, at its ends one-sided."""
-    out = np.empty_like(points, float)
-    out[1:-1] = (points[2:] - points[:-2]) / 2
-    out[0], out[-1] = points[1] - points[0], points[-1] - points[-2]
-    return out
+    x, y = np.gradient(points, axis=0).T
+    return np.arctan2(y, x)
 
 
 def shift_left(points: np.ndarray, distance: np.ndarray | float) -> np.ndarray:
     """Polyline [P, 2] shifted `distance` m (scalar or [P]) to its left."""
-    tangent = tangents(points)
+    tangent = np.gradient(points, axis=0)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-9)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], -1)
     return points + np.broadcast_to(distance, len(points))[:, None] * normal

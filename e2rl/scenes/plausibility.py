@@ -6,7 +6,6 @@ measured (443 of Waymo, 10 of nuScenes, 239 bundled ones) stay far inside: their
 """
 
 from math import inf, isnan, pi
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -26,46 +25,37 @@ LANE_RADIUS, LANE_ANGLE, LANES = 3.0, 0.6, 8  # m, rad, neighbours: a vehicle on
 PARALLEL, BESIDE = 0.2, (1.5, 20.0)  # rad, m: lanes side by side
 SAMPLES = 300  # lane points at most whose neighbours are looked at
 
-
-class Limit(NamedTuple):
-    """The least and the most of a measure; what it is, and how a log outside of it is mended."""
-
-    low: float
-    high: float
-    what: str
-    mend: str
-
-
-LIMITS = {
+# Of a measure the least and the most; what it is, and how a log outside of it is mended.
+LIMITS: dict[str, tuple[float, float, str, str]] = {
     # `extent`
-    "states": Limit(2, 4e6, "frames x agents", "cut the log"),  # 400 to 45,000
-    "coordinate": Limit(0, 2e7, "m is the largest coordinate", "give positions in m"),  # 44 to 40,000
-    "heading": Limit(0, 10 * pi, "rad is the largest heading", "give headings in rad"),  # 3 to 14
-    "reach": Limit(0, 10_000, "m is an agent from the ego", "give positions in m, or leave the agent out"),  # 31 to 323
-    "map_reach": Limit(0, 50_000, "m is a point of the map from the ego", "cut the map, or give it in m"),  # 126 to 770
-    "lane": Limit(0, 10_000, "m is the longest lane", "cut the map, or give it in m"),  # 72 to 676
-    "lanes": Limit(0, 500_000, "m are all lanes together", "cut the map"),  # 620 to 32,000
-    "borders": Limit(0, 5_000_000, "m are the borders of all drivable areas", "cut the map"),  # 0 to 41,000
-    "links": Limit(0, 100, "lanes begin at one place, or follow one lane", "draw each lane once"),  # 1 to 5
-    "length": Limit(0.05, 40, "m is an agent's length", "give sizes in m"),  # 0.2 to 17
-    "width": Limit(0.05, 15, "m is an agent's width", "give sizes in m"),  # 0.2 to 10, of a glitch
+    "states": (2, 4e6, "frames x agents", "cut the log"),  # 400 to 45,000
+    "coordinate": (0, 2e7, "m is the largest coordinate", "give positions in m"),  # 44 to 40,000
+    "heading": (0, 10 * pi, "rad is the largest heading", "give headings in rad"),  # 3 to 14
+    "reach": (0, 10_000, "m is an agent from the ego", "give positions in m, or leave the agent out"),  # 31 to 323
+    "map_reach": (0, 50_000, "m is a point of the map from the ego", "cut the map, or give it in m"),  # 126 to 770
+    "lane": (0, 10_000, "m is the longest lane", "cut the map, or give it in m"),  # 72 to 676
+    "lanes": (0, 500_000, "m are all lanes together", "cut the map"),  # 620 to 32,000
+    "borders": (0, 5_000_000, "m are the borders of all drivable areas", "cut the map"),  # 0 to 41,000
+    "links": (0, 100, "lanes begin at one place, or follow one lane", "draw each lane once"),  # 1 to 5
+    "length": (0.05, 40, "m is an agent's length", "give sizes in m"),  # 0.2 to 17
+    "width": (0.05, 15, "m is an agent's width", "give sizes in m"),  # 0.2 to 10, of a glitch
     # `motion`
-    "vehicle_length": Limit(2.5, 9, "m is the median length of vehicles", "give sizes in m"),  # 3.9 to 5.9
-    "vehicle_width": Limit(1.0, 4, "m is the median width of vehicles", "give sizes in m"),  # 1.7 to 2.8
-    "speed": Limit(0, 45, "m/s is the median speed of moving vehicles", "give speeds in m/s"),  # 2.7 to 22
-    "speed_ratio": Limit(0.7, 1.4, "times the displacement is what the recorded speeds make", "give m, m/s and s"),  # 1
+    "vehicle_length": (2.5, 9, "m is the median length of vehicles", "give sizes in m"),  # 3.9 to 5.9
+    "vehicle_width": (1.0, 4, "m is the median width of vehicles", "give sizes in m"),  # 1.7 to 2.8
+    "speed": (0, 45, "m/s is the median speed of moving vehicles", "give speeds in m/s"),  # 2.7 to 22
+    "speed_ratio": (0.7, 1.4, "times the displacement is what the recorded speeds make", "give m, m/s and s"),  # 1
     # 0.001 to 0.16
-    "direction": Limit(0, 0.4, "rad lie between heading and displacement", "give rad from x to y, mirror no axes"),
-    "ego_speed_ratio": Limit(0.7, 1.4, "times its displacement is what the ego's speeds make", "give m, m/s and s"),
-    "ego_direction": Limit(0, 0.45, "rad lie between the ego's heading and displacement", "give rad"),  # 0.28
-    "track_direction": Limit(0, 0.45, "rad lie between heading and displacement of a vehicle", "give rad"),  # 0.20
-    "slow_direction": Limit(0, 0.8, "rad lie between heading and displacement of a slow vehicle", "give rad"),  # 0.43
-    "twins": Limit(0, 2.0, "s are two vehicles that drive at the same place", "leave one of the two out"),  # 0 to 0.5
-    "track_speed": Limit(1, 2.0, "is the factor between speeds and displacement of a vehicle", "give m/s"),  # 1.5
+    "direction": (0, 0.4, "rad lie between heading and displacement", "give rad from x to y, mirror no axes"),
+    "ego_speed_ratio": (0.7, 1.4, "times its displacement is what the ego's speeds make", "give m, m/s and s"),
+    "ego_direction": (0, 0.45, "rad lie between the ego's heading and displacement", "give rad"),  # 0.28
+    "track_direction": (0, 0.45, "rad lie between heading and displacement of a vehicle", "give rad"),  # 0.20
+    "slow_direction": (0, 0.8, "rad lie between heading and displacement of a slow vehicle", "give rad"),  # 0.43
+    "twins": (0, 2.0, "s are two vehicles that drive at the same place", "leave one of the two out"),  # 0 to 0.5
+    "track_speed": (1, 2.0, "is the factor between speeds and displacement of a vehicle", "give m/s"),  # 1.5
     # `map_fit`
-    "lane_distance": Limit(0, 10, "m is the ego from the nearest lane", "give the map of this place"),  # 0.2 to 3.5
-    "on_lanes": Limit(0.3, 1, "of the moving vehicles drive along a lane", "give the map of this place"),  # 0.36 to 1
-    "lane_spacing": Limit(0, 7.5, "m lie between lanes side by side", "give positions and map in m"),  # 2.8 to 5.7
+    "lane_distance": (0, 10, "m is the ego from the nearest lane", "give the map of this place"),  # 0.2 to 3.5
+    "on_lanes": (0.3, 1, "of the moving vehicles drive along a lane", "give the map of this place"),  # 0.36 to 1
+    "lane_spacing": (0, 7.5, "m lie between lanes side by side", "give positions and map in m"),  # 2.8 to 5.7
 }
 
 
@@ -115,37 +105,26 @@ def _extremes(sizes: np.ndarray, name: str) -> dict[str, float]:
     return {name: float(sizes.min() if sizes.min() < low else sizes.max())}
 
 
-class Displacements(NamedTuple):
-    """Of vehicles that are recorded for FRAMES frames on end and drive: displacement [K, 2] m, the pose [K, 3] in its
-    middle, the mean recorded speed [K] m/s, whose it is [K], and whether it is the ego's [K]."""
-
-    moved: np.ndarray
-    pose: np.ndarray
-    speed: np.ndarray
-    track: np.ndarray
-    ego: np.ndarray
-
-
-def displacements(recording: Recording) -> Displacements:
-    """All displacements of a recording, overlapping ones included."""
+def displacements(recording: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """All displacements [K, 2] m, overlapping ones included, of vehicles that are recorded for FRAMES frames on end and
+    drive; the pose [K, 3] in its middle, the mean recorded speed [K] m/s, and the track [K] whose it is."""
     states, valid = recording.states, recording.valid
     count = len(states) - FRAMES
     if count < 1:
-        return Displacements(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool))
+        return np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, int)
     known = np.logical_and.reduce([valid[k : count + k] for k in range(FRAMES + 1)])
     speed = np.mean([states[k : count + k, :, 3] for k in range(FRAMES + 1)], axis=0)
     moved = states[FRAMES:, :, :2] - states[:count, :, :2]
     drives = (np.linalg.norm(moved, axis=-1) > MOVED) | (speed > DRIVES)
     chosen = known & drives & (recording.agent_type == VEHICLE)
     middle = states[FRAMES // 2 :][:count]
-    track = chosen.nonzero()[1]
-    return Displacements(moved[chosen], middle[chosen][:, :3], speed[chosen], track, track == recording.ego)
+    return moved[chosen], middle[chosen][:, :3], speed[chosen], chosen.nonzero()[1]
 
 
 def motion(recording: Recording) -> dict[str, float]:
     """Sizes of vehicles, and whether headings and speeds are those of the displacements."""
-    moved, pose, speed, track, ego = displacements(recording)
-    distance = np.linalg.norm(moved, axis=-1)
+    moved, pose, speed, track = displacements(recording)
+    distance, ego = np.linalg.norm(moved, axis=-1), track == recording.ego
     ratio, far = (speed * FRAMES * DT + 0.05) / (distance + 0.05), distance > MOVED
     turned = np.abs(wrap(np.arctan2(moved[:, 1], moved[:, 0]) - pose[:, 2]))
     size = recording.size[recording.valid.any(0) & (recording.agent_type == VEHICLE)]

@@ -75,11 +75,8 @@ Build = Callable[[Index], Iterator[Mapping[str, np.ndarray]]]  # yields a set's 
 def cached(path: Path, build: Build, gigabytes: float) -> SceneSet:
     """Returns the scenes in a cache file; where it is not there or damaged, it is built.
 
-    Of several processes one builds, and the others wait for it. Raises InputError where the file cannot be written.
-
-    Args:
-        path: of the file, with a NAME.
-        gigabytes: see `make_room`.
+    Of several processes one builds, and the others wait for it. Raises InputError where the file, which has a NAME,
+    cannot be written. gigabytes: see `make_room`.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

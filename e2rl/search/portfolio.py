@@ -23,10 +23,7 @@ class Portfolio:
 
         x = nearness(margin of the nearest) / ((1 + n / SCENE_TRIES) (1 + k / FAMILY_TRIES)).
 
-    Args:
-        families: the families.
-        scenes: their number.
-        learns: false: every family has the same chance everywhere.
+    Unless it `learns`, every family has the same chance everywhere.
     """
 
     families: Sequence[Family]

@@ -46,11 +46,7 @@ class Outcome(NamedTuple):
 class Search(Extension):
     """The tries of N scenes so far, and what is tried next.
 
-    Args:
-        families: that tries are drawn from.
-        numbers: [N] that tell the scenes apart in seeds, whatever scenes are beside them.
-        seed: of the search.
-        settings: how tries are spent.
+    Tries are drawn from `families`. The `numbers` [N] tell scenes apart in seeds, whatever scenes are beside them.
     """
 
     families: Sequence[Family]

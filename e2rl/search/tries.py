@@ -72,11 +72,8 @@ class Family:
 
 
 def family_of(name: str, given: Mapping[str, Any], where: str) -> Family:
-    """A family of its configuration: `method`, `changes`, `chance`, `nfe`, and the ranges of decisions.
-
-    Raises:
-        InputError: a key is no decision, or a value no number, pair of numbers, or kind of vehicle.
-    """
+    """A family of its configuration: `method`, `changes`, `chance`, `nfe`, and the ranges of decisions. Raises
+    InputError where a key is no decision, or a value no number, pair of numbers, or kind of vehicle."""
     if not isinstance(given, Mapping) or not isinstance(given.get("changes", {}), Mapping):
         raise InputError(f"{where}.{name}={given}: expected {{method: NAME, changes: {{}}, DECISION: [low, high]}}")
     ranges: dict[str, tuple[float, float] | float] = {}

@@ -3,8 +3,6 @@
 A state is (x [m], y [m], heading [rad], speed [m/s]); a step lasts DT and moves at the mean of the old and the new
 speed along the mean of the two headings. Speeds are clamped to [0, MAX_SPEED], yaw rates by curvature and lateral
 acceleration (`yaw_rate_bound`).
-
-Motion at constant acceleration and path curvature, in closed form: how others are expected to go on.
 """
 
 from typing import NamedTuple
@@ -86,13 +84,9 @@ def bounded_speed(v0: Tensor, change: Tensor, low: float = 0.0, high: float = MA
     lo, hi = torch.full_like(change, low), torch.full_like(change, high)
     horizon, width = change.shape[-1], 1
     while width < horizon:
-        c, tail_lo, tail_hi = change[..., width:], lo[..., width:], hi[..., width:]
-
-        def later(value: Tensor, c=c, tail_lo=tail_lo, tail_hi=tail_hi, width=width) -> Tensor:
-            moved = torch.minimum(torch.maximum(value[..., :-width] + c, tail_lo), tail_hi)
-            return torch.cat([value[..., :width], moved], -1)
-
-        lo, hi = later(lo), later(hi)
+        c, low_then, high_then = change[..., width:], lo[..., width:], hi[..., width:]
+        moved = [torch.minimum(torch.maximum(bound[..., :-width] + c, low_then), high_then) for bound in (lo, hi)]
+        lo, hi = (torch.cat([bound[..., :width], then], -1) for bound, then in zip((lo, hi), moved, strict=True))
         change = torch.cat([change[..., :width], change[..., :-width] + c], -1)
         width *= 2
     return torch.minimum(torch.maximum(v0 + change, lo), hi)
@@ -113,7 +107,7 @@ SHARPEST = 0.12  # 1/m, of a path that is expected of a vehicle
 
 
 class Arc(NamedTuple):
-    """Constant acceleration [...] m/s^2 and path curvature [...] 1/m (left positive)."""
+    """Constant acceleration [...] m/s^2 and path curvature [...] 1/m (left positive): how others may go on."""
 
     accel: Tensor
     curvature: Tensor

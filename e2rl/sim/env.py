@@ -15,12 +15,12 @@ from e2rl.scenes.scene import SceneSet
 from e2rl.sim.mission import Mission, mission_of
 from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, features, placed_ego
 from e2rl.sim.reward import check_weights
-from e2rl.sim.static import FrenetPose, static_scene, write_rows
+from e2rl.sim.static import static_scene, write_rows
 from e2rl.sim.step import Outcome, StepConfig, hold_step
-from e2rl.sim.world import AGENT_KEYS, Agents, Trajectories, World, trajectories_at
+from e2rl.sim.world import AGENT_KEYS, START_KEYS, Agents, Trajectories, World, trajectories_at
 
 OF_ROUTE = ("points", "length", "open", "limit", "light", "light_s", "log")
-OF_SCENE = ("start", "valid", "start_accel", "start_yaw_rate", "size", "agent_type", "field_origin", "light_state")
+OF_SCENE = (*START_KEYS, "size", "agent_type", "field_origin", "light_state")
 FLAGS, METRICS = ("terminated", "truncated"), ("contact", "contact_vru", "off_road", "progress")
 
 
@@ -88,13 +88,10 @@ class DrivingEnv(EnvBase):
         self.clock = 0
         """Steps simulated so far, resets or not."""
         self._trajectories = Trajectories(self.scene)
-        self._static = static_scene(self.scene, mission_of(self.scene))
-        zeros = torch.zeros(batch_size, device=device)
+        mission, start = mission_of(self.scene), self.scene["start"][:, 0]
+        self._static = static_scene(self.scene, mission)
         flags = torch.zeros(batch_size, dtype=torch.bool, device=device)
-        pose = FrenetPose(zeros, zeros.clone(), zeros.clone())
-        self._ego = EgoState(
-            zeros.long(), zeros[:, None].repeat(1, 4), zeros[:, None].repeat(1, 2), pose, flags, flags.clone(), zeros
-        )
+        self._ego = placed_ego(mission, flags.long(), start, torch.zeros_like(start[:, :2]), flags, flags)
         self._features = torch.zeros(batch_size, width, device=device)  # as last observed
         self._make_specs(batch_size, self.scene["start"].shape[1])
 
@@ -151,28 +148,21 @@ class DrivingEnv(EnvBase):
 
     def world(self) -> World:
         """The current World. Its `scene` is the environment's own storage, which the next reset overwrites."""
-        ego = self._ego
-        states, valid, accel, turn = trajectories_at(self._trajectories.states, self._trajectories.valid, ego.step)
-        first = (ego.step == 0)[:, None]
-        states = torch.where(first[..., None], self.scene["start"], states)
-        valid = torch.where(first, self.scene["valid"], valid)
-        accel = torch.where(first, self.scene["start_accel"], accel)
-        turn = torch.where(first, self.scene["start_yaw_rate"], turn)
-        return World(
-            self.scene,
-            ego.step,
-            torch.cat([ego.state[:, None], states[:, 1:]], 1),
-            torch.cat([ego.present[:, None], valid[:, 1:]], 1),
-            torch.cat([ego.action[:, :1], accel[:, 1:]], 1),
-            torch.cat([ego.action[:, 1:], turn[:, 1:]], 1),
-        )
+        ego, begins = self._ego, (self._ego.step == 0)[:, None]
+        own = ego.state, ego.present, ego.action[:, 0], ego.action[:, 1]
+        start = (self.scene[key] for key in START_KEYS)
+        driven, now = trajectories_at(self._trajectories.states, self._trajectories.valid, ego.step), []
+        for mine, first, later in zip(own, start, driven, strict=True):
+            known = torch.where(begins[..., None] if first.ndim > 2 else begins, first, later)
+            now.append(torch.cat([mine[:, None], known[:, 1:]], 1))
+        return World(self.scene, ego.step, *now)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_) -> TensorDict:
         batch = self.batch_size[0]
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        mask = torch.ones(batch, dtype=torch.bool, device=self.device) if mask is None else mask.view(batch)
-        index = mask.nonzero().squeeze(-1)
-        chosen = None if tensordict is None else tensordict.get("scene_index", None)
+        given = TensorDict() if tensordict is None else tensordict
+        every = torch.ones(batch, dtype=torch.bool, device=self.device)
+        index = given.get("_reset", every).view(batch).nonzero().squeeze(-1)
+        chosen = given.get("scene_index", None)
         if chosen is None:
             rows = torch.randint(len(self.scenes), (len(index),), generator=self._generator)
         else:
@@ -185,7 +175,7 @@ class DrivingEnv(EnvBase):
         begun = self._restart(index, fresh, static.mission)
         if len(index) < batch:
             static = static._replace(field=self.scene["field"].index_select(0, index))
-        others = Agents(*(fresh[name][:, 1:] for name in ("start", "valid", "start_accel", "start_yaw_rate")))
+        others = Agents(*(fresh[name][:, 1:] for name in START_KEYS))
         if self._look:
             seen = features(static, begun, others, begun.step / self.horizon)
             self._features = self._features.index_copy(0, index, seen)
@@ -198,9 +188,7 @@ class DrivingEnv(EnvBase):
         scene = {name: self.scene[name].index_select(0, index) for name in OF_SCENE}
         scene |= {name: self.scene[name][:, :1][index] for name in (f"route_{key}" for key in OF_ROUTE)}
         scene |= {name: self.scene[name][:, :, :1][index] for name in ("logged", "logged_valid")}
-        scene["field"] = self.scene["field"][
-            : len(index)
-        ]  # of the environment's storage, which write_rows leaves alone
+        scene["field"] = self.scene["field"][: len(index)]  # storage that write_rows leaves alone
         return TensorDict(scene, batch_size=[len(index)], device=self.device)
 
     def _restart(self, index: Tensor, scene: TensorDictBase, mission: Mission) -> EgoState:

@@ -2,8 +2,6 @@
 
 Most agents are far from most routes, so only near pairs are projected: routes are cut into stretches with bounding
 boxes, and an agent is compared with the vertices of the stretches near it.
-
-The Intelligent Driver Model (IDM): Treiber, Hennecke and Helbing, Physical Review E 62 (2000), eqs. (3) and (4).
 """
 
 from typing import NamedTuple
@@ -32,10 +30,9 @@ def leaders(
     size: Tensor,
     present: Tensor,
     d: Tensor | None = None,
-    margin: float = GATE_MARGIN,
     free_gap: float = FREE_GAP,
 ) -> Leaders:
-    """The nearest agent ahead of each vehicle whose box is within `margin` m of the vehicle's lateral range.
+    """The nearest agent ahead of each vehicle whose box is within GATE_MARGIN of the vehicle's lateral range.
 
     Fields [B, V, T]: at T moments of the agents.
 
@@ -45,11 +42,11 @@ def leaders(
     route. Without a leader nearer than `free_gap` m, the gap is `free_gap` and the speed is the vehicle's own.
     """
     moments = agents.shape[2]
-    reach = size[:, : s.shape[1], 1] / 2 + margin + (torch.zeros_like(s) if d is None else d.abs())
+    reach = size[:, : s.shape[1], 1] / 2 + GATE_MARGIN + (torch.zeros_like(s) if d is None else d.abs())
     room = reach[..., None] + size.norm(dim=-1)[:, None] / 2
     pairs = scene, vehicle, other, moment, _ = _near_pairs(points, s, agents[..., :2], room, present)
     aside = torch.zeros_like(s) if d is None else d
-    gap, along, leads = ahead_of(s, aside, agents, size, points, s.new_tensor(margin), *pairs)
+    gap, along, leads = ahead_of(s, aside, agents, size, points, *pairs)
     table = gap.new_full((*s.shape, moments, agents.shape[1]), free_gap)
     pair = scene, vehicle, moment, other
     nearest, index = table.index_put(pair, torch.where(leads > 0, gap, free_gap)).min(-1)
@@ -58,14 +55,13 @@ def leaders(
     return Leaders(nearest.clamp(max=free_gap), speed, index)
 
 
-@fused("B V", "B V", "B X T 4!", "B X 2!", "B V P 2!", "", *["Q:int64"] * 5)
+@fused("B V", "B V", "B X T 4!", "B X 2!", "B V P 2!", *["Q:int64"] * 5)
 def ahead_of(
     s: Tensor,
     d: Tensor,
     agents: Tensor,
     size: Tensor,
     points: Tensor,
-    margin: Tensor,
     scene: Tensor,
     vehicle: Tensor,
     other: Tensor,
@@ -80,7 +76,7 @@ def ahead_of(
     turn = agent[:, 2] - heading
     cos, sin = torch.cos(turn), torch.sin(turn)
     length, width = size[scene, vehicle].unbind(-1)
-    side = width / 2 + (box[:, 0] * sin.abs() + box[:, 1] * cos.abs()) / 2 + margin
+    side = width / 2 + (box[:, 0] * sin.abs() + box[:, 1] * cos.abs()) / 2 + GATE_MARGIN
     ahead = at - s[own]
     gap = ahead - length / 2 - (box[:, 0] * cos.abs() + box[:, 1] * sin.abs()) / 2
     low, high = d[own].clamp(max=0), d[own].clamp(min=0)
@@ -172,8 +168,9 @@ def idm_acceleration(
 ) -> Tensor:
     """IDM acceleration [...] m/s^2: the free-road term less a (s* / s)^2. Speeds in m/s; gap s [...] m, inf: no leader.
 
-    The free-road term is a (1 - (v / v0)^n). `improved`: above the desired speed v0 it is -b (1 - (v0 / v)^(a n / b)),
-    which brakes by b at most (Treiber and Kesting, Traffic Flow Dynamics, 2013, eq. 11.23).
+    Treiber, Hennecke and Helbing, Physical Review E 62 (2000), eqs. (3) and (4), whose free-road term is
+    a (1 - (v / v0)^n). `improved`: above the desired speed v0 it is -b (1 - (v0 / v)^(a n / b)), which brakes by b at
+    most (Treiber and Kesting, Traffic Flow Dynamics, 2013, eq. 11.23).
     """
     a, b, n = driver.acceleration, driver.braking, driver.exponent
     interaction = (desired_gap(speed, leader_speed, driver) / gap.clamp(min=0.1)) ** 2

@@ -1,7 +1,4 @@
-"""The ego's mission: the route candidate that fits its recording, with speed limits, lights and end.
-
-Traffic light states: one look-up for planners, observations, features of the prior and metrics.
-"""
+"""The ego's mission, the route candidate that fits its recording, with speed limits and end; traffic lights."""
 
 from typing import NamedTuple
 
@@ -53,11 +50,8 @@ def ran_red(light_state: Tensor, light: Tensor, line: Tensor, front: Tensor) -> 
     light_state [Q, T + 1, S]; light, line [Q, K]: indices of lights (-1 none) and arc lengths of their stop lines;
     front [Q, T + 1]: arc length of the front bumper, on the same route.
     """
-    if not light_state.shape[-1]:
-        return torch.full_like(light[:, 0], -1)
-    state = light_state.gather(2, light.clamp(min=0)[:, None].expand(-1, front.shape[1], -1))
     crossed = (front[:, :-1, None] < line[:, None]) & (front[:, 1:, None] >= line[:, None])
-    wrong = crossed & (state[:, 1:] == LIGHT_RED) & (light >= 0)[:, None]
+    wrong = crossed & (lights_of(light_state, light)[:, 1:] == LIGHT_RED)
     steps = torch.arange(1, front.shape[1], device=front.device)
     return torch.where(wrong.any(-1), steps, -1).amax(1)
 
@@ -93,15 +87,3 @@ def limit_at(mission: Mission, s: Tensor) -> Tensor:
     """Speed limit [B, ...] m/s at arc lengths s [B, ...], 0 where unknown."""
     index = (s / SPACING).round().long().clamp(0, mission.limit.shape[-1] - 1)
     return mission.limit.gather(1, index.view(s.shape[0], -1)).view(s.shape)
-
-
-def stop_ahead(
-    mission: Mission, scene: TensorDictBase, step: Tensor, s: Tensor, speed: Tensor, braking: float
-) -> Tensor:
-    """Metres [B] from arc length s [B] to the next stop line that binds, inf for none.
-
-    A yellow light binds if braking at `braking` m/s^2 from speed [B] halts before the line, a red light if braking at
-    twice that does.
-    """
-    state = light_state_at(scene["light_state"], mission.light, step)
-    return stop_line_distance(state, mission.light_s - s[:, None], speed, 2 * braking, braking)

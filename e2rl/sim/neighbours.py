@@ -1,7 +1,4 @@
-"""The other agents in the ego's frame, for a batch of scenes in one pass; agents are on the last axis.
-
-Which contacts are of the ego's own making, by their step alone; metrics/verdicts.py judges whole rollouts.
-"""
+"""The other agents in the ego's frame, on the last axis, and which contacts are of the ego's own making."""
 
 from typing import NamedTuple
 
@@ -87,13 +84,13 @@ def own_fault(
     """Bool [B]: the ego overlaps an agent while it moves, and either that agent has stood (a vehicle: for STOOD steps;
     another: at all) or it moves and lies across the ego's front edge.
 
-    These are the rules of metrics/verdicts.py but for cut-ins and for an ego that stands across a lane. The edge is
-    that of the least overlap along the ego's axes, which near its corners may differ from the one that touched first.
+    By the step alone, these are the rules of metrics/verdicts.py but for cut-ins and for an ego that stands across a
+    lane. The edge is that of the least overlap along the ego's axes, which near its corners may differ from the one
+    that touched first.
 
     Args:
         speed: [B] m/s, of the ego before the contact.
         hit: [B, M], the neighbours that each ego overlaps; the one with the deepest overlap is judged.
-        static: sizes, kinds and rows.
         tracks: of all agents, the ego first; what they did up to the step `before` [B], the one before the contact.
     """
     if hit.shape[1] == 0:

@@ -2,10 +2,6 @@
 
 Blocks: ego (11), mission route ahead (12 x 5), lights (2 x 4), drivable border (5 x 5), nearest agents (12 x 16),
 manoeuvres (15 x 2, see `prospects`).
-
-What each number of the observation is: names, units, scales, for policies from elsewhere (docs/observation.md).
-
-The observation of a mirrored scene, y to -y, from that of the scene: what was on the left is on the right.
 """
 
 from collections.abc import Callable
@@ -274,7 +270,7 @@ AGENT = (
 
 
 def observation_layout() -> list[Entry]:
-    """The OBSERVATION_SIZE entries of an observation, in order, named `block.number.quantity`."""
+    """The OBSERVATION_SIZE entries of an observation, in order, named `block.number.quantity` (docs/observation.md)."""
     manoeuvres = [f"{accel:+g}.{offset:+g}" for accel in ACCELERATIONS for offset in OFFSETS]
     blocks = [
         _named("ego", EGO),
@@ -315,6 +311,6 @@ def _mirror(device: torch.device) -> tuple[Tensor, Tensor]:
 
 
 def mirrored(observation: Tensor) -> Tensor:
-    """Observations [..., D] with left and right exchanged; twice gives the original."""
+    """The observations [..., D] of the mirrored scenes, y to -y; twice gives the original."""
     source, sign = _mirror(observation.device)
     return observation[..., source] * sign

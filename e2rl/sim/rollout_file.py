@@ -59,10 +59,9 @@ class Road:
 class Rollout(Road):
     """One rollout as numpy arrays without padding: the content of its file.
 
-    Optional are `ran_light` [N], the step
-    at which each vehicle last crossed a stop line at red; `evasion` and `driver` [T+1, 4], the ego as the search for
-    evasions and as the competent driver of the verdict drive it; `plans` [R, P, K, 2] m and `targets` [R, P] of the
-    agents `planners` [P] at each of R replans.
+    Optional are `ran_light` [N], the step at which each vehicle last crossed a stop line at red; `evasion` and `driver`
+    [T+1, 4], the ego as the search for evasions and as the competent driver of the verdict drive it; `plans`
+    [R, P, K, 2] m and `targets` [R, P] of the agents `planners` [P] at each of R replans.
     """
 
     scene_id: str = array("U", "")
@@ -184,10 +183,9 @@ def file_stem(*parts: object) -> str:
 def _misfit(data: Mapping[str, np.ndarray], known: Iterable[Field]) -> str | None:
     """Which array of a file has another type, shape or range than its field; None: none."""
     sizes: dict[str, int] = {}
-    for each in known:
-        if each.name not in data:
-            continue
-        value, (kinds, shape, low, high) = data[each.name], each.metadata.values()
+    given = [each for each in known if each.name in data]
+    for each in given:
+        value, kinds, shape = data[each.name], each.metadata["kinds"], each.metadata["shape"]
         if not shape and (value.shape != () or value.dtype.kind not in kinds):
             return f"{each.name} is no single {'text' if kinds == 'U' else 'number'}"
         if not shape and kinds == "U" and UNPRINTABLE.search(value.item()):
@@ -202,9 +200,9 @@ def _misfit(data: Mapping[str, np.ndarray], known: Iterable[Field]) -> str | Non
         return "it holds no agent, or as many lanes as borders between them"
     if len(data.keys() & {"planners", "plans", "targets"}) not in (0, 3):
         return "of planners, plans, targets some are missing"
-    for each in known:
+    for each in given:
         low, high = each.metadata["low"], each.metadata["high"]
-        if low is not None and each.name in data:
+        if low is not None:
             most = high + sizes["N"] if high < 0 else high
             if not ((data[each.name] >= low) & (data[each.name] <= most)).all():  # NaN is not, either
                 return f"{each.name} is out of range"

@@ -72,12 +72,9 @@ class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` a
         replays_ego: bool = False,
         **known: Any,
     ) -> "Rollouts":
-        """Rollouts of scenes, with what these tell: sizes, types, recording, map and names.
+        """Rollouts of scenes, those at index [B], with what these tell: sizes, types, recording, map and names.
 
         Args:
-            scenes: the scenes.
-            index: [B] int64, which of them.
-            states, valid: the motion.
             scene: the batch of these scenes, where it is at hand.
             replays_ego: the ego is its recording, not simulated.
             known: further fields, among them adversaries, seed and eta.

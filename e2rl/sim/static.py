@@ -43,14 +43,7 @@ class StaticScene(NamedTuple):
 OF_MISSION = ("B P 2!", "B P!", "B", "B 2:int64!", "B 2!")
 STATIC = (
     *OF_MISSION,
-    "B S 12!",
-    "B 1:int64!",
-    "B T 2:int64!",
-    "B G G:float16",
-    *["B 2!"] * 2,
-    "B 2 M",
-    "B M:bool",
-    "B",
+    *("B S 12!", "B 1:int64!", "B T 2:int64!", "B G G:float16", "B 2!", "B 2!", "B 2 M", "B M:bool", "B"),
 )
 """Shapes of a StaticScene's tensors in fused functions."""
 

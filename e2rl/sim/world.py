@@ -1,7 +1,4 @@
-"""The input of planners and traffic methods: the current state of a batch of running scenes.
-
-Trajectories of all agents but the ego: recorded, stored, or written plan by plan.
-"""
+"""The input of planners and traffic methods, the current state of running scenes, and the trajectories of others."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,6 +12,7 @@ from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
 
 AGENT_KEYS = ("states", "valid", "accel", "turn_rate")  # of World, of the environment's `agents`, and of Agents
+START_KEYS = ("start", "valid", "start_accel", "start_yaw_rate")  # of a scene: the same at its start
 
 
 @dataclass
@@ -40,8 +38,8 @@ class World:
     def at_start(cls, scene: TensorDictBase) -> "World":
         """Scenes [B] at their start frames."""
         step = torch.zeros(scene.batch_size[0], dtype=torch.int64, device=scene["start"].device)
-        start, valid, accel, turn_rate = (scene[key] for key in ("start", "valid", "start_accel", "start_yaw_rate"))
-        return cls(scene, step, start, valid, accel, turn_rate, scene["route_log"])
+        states, valid, accel, turn_rate = (scene[key] for key in START_KEYS)
+        return cls(scene, step, states, valid, accel, turn_rate, scene["route_log"])
 
     @classmethod
     def of(cls, tensordict: TensorDictBase, scene: TensorDictBase) -> "World":

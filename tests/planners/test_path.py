@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from e2rl.planners.path import MissionPath, RoutePath, fading, look_up
+from e2rl.planners.path import STOP_GAP, MissionPath, RoutePath, fading, look_up
 from e2rl.sim.dynamics import inverse
 from tests.planners.planners import world_of, worlds
 from tests.synthetic import make_scenes
@@ -54,6 +54,21 @@ def test_caps_halt_at_red_lights_and_obey_limits():
     at = torch.tensor([[stop - 6.0, stop - 1.5, stop, stop + 1.0]])
     assert torch.allclose(look_up(caps, at), torch.tensor([36.0, 9.0, 0.0, 0.0]).sqrt(), atol=0.02)
     assert torch.allclose(path.speed_caps(20.0, limits=False, lights=False), torch.tensor(400.0), atol=0.1)
+
+
+def stop(colour, speed, light_x=50.0):
+    """Metres from the ego's centre to the stop line that binds."""
+    world = world_of(num_vehicles=1, red_light_x=light_x)[1]
+    world.scene["light_state"][:], world.states[:, 0, 3] = colour, speed
+    return MissionPath(world).stop_distance(braking=3.0).item() + 4.5 / 2 + STOP_GAP
+
+
+def test_red_binds_unless_halting_is_hopeless_yellow_where_it_is_comfortable():
+    assert stop(colour=1, speed=10) == 50.0 and stop(colour=2, speed=10) == 50.0
+    assert stop(colour=1, speed=20) == 50.0 and stop(colour=2, speed=20) == float("inf")
+    assert stop(colour=1, speed=30) == float("inf")
+    assert stop(colour=3, speed=10) == float("inf") and stop(colour=0, speed=10) == float("inf")
+    assert stop(colour=1, speed=1, light_x=-5.0) == float("inf"), "a line passed binds no longer"
 
 
 @pytest.mark.parametrize(("d", "turned", "length"), [(1.5, 0.2, 8.0), (-0.7, -0.4, 1.5)])

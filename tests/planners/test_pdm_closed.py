@@ -98,7 +98,7 @@ def test_the_score_is_the_weighted_mean_of_its_terms():
     actions = torch.tensor([[0.0, 0.0], [-1.0, 0.0], [-6.0, 0.0]])[:, None].expand(3, 50, 2)
     states = dynamics.rollout(start[0].expand(3, 4), actions)[None]
     distance = states[0, :, HORIZON - 1, 0] - start[0, 0, 0]
-    found = score(world, states, none).score[0]
+    found = score(world, states, none)[0][0]
     whole = PROGRESS + TIME_TO_COLLISION + COMFORT
     expected = PROGRESS * distance / distance[0] + TIME_TO_COLLISION + COMFORT * torch.tensor([1.0, 1.0, 0.0])
     torch.testing.assert_close(found, expected / whole, atol=1e-4, rtol=0)
@@ -109,13 +109,13 @@ def test_what_hits_somebody_or_leaves_the_road_scores_nothing():
     _, world = world_of(vehicles=[(0, 0, 10.0), (20, 0, 0.0)], num_vrus=0)
     ahead = EGO._others(world, range(1, HORIZON + 1))
     go = dynamics.rollout(world.states[:, 0], torch.zeros(1, 50, 2))[:, None]
-    found = score(world, go, ahead)
+    found, collides = score(world, go, ahead)
     size = world.scene["size"][0, 0]
     first = int((separation(go[0, 0], size, world.states[0, 1], world.scene["size"][0, 1]) < 0).nonzero()[0, 0]) + 1
-    assert found.score.item() == 0 and found.collides.item() == pytest.approx(DT * first)
+    assert found.item() == 0 and collides.item() == pytest.approx(DT * first)
     turn = dynamics.rollout(world.states[:, 0], torch.tensor([0.0, -0.6]).expand(1, 50, 2))[:, None]
     free = ahead._replace(seen=ahead.seen & False)
-    assert score(world, turn, free).score.item() == 0
+    assert score(world, turn, free)[0].item() == 0
 
 
 def test_who_is_ahead_within_a_second_at_constant_velocity_costs_the_time_to_collision():
@@ -124,11 +124,11 @@ def test_who_is_ahead_within_a_second_at_constant_velocity_costs_the_time_to_col
     ahead = EGO._others(world, range(1, HORIZON + 1))
     actions = torch.tensor([[-3.4, 0.0], [-8.0, 0.0]])[:, None].expand(2, 50, 2)
     states = dynamics.rollout(world.states[0, :1].expand(2, 4), actions)[None]
-    found = score(world, states, ahead)
+    found, collides = score(world, states, ahead)
     late, early = states[0, :, HORIZON - 1, 0]
     expected = torch.stack([late / late * PROGRESS + COMFORT, early / late * PROGRESS + TIME_TO_COLLISION])
-    assert found.collides.isinf().all()
-    torch.testing.assert_close(found.score[0], expected / (PROGRESS + TIME_TO_COLLISION + COMFORT), atol=1e-4, rtol=0)
+    assert collides.isinf().all()
+    torch.testing.assert_close(found[0], expected / (PROGRESS + TIME_TO_COLLISION + COMFORT), atol=1e-4, rtol=0)
 
 
 def test_where_every_proposal_is_excluded_it_drives_the_slowest():
@@ -137,7 +137,7 @@ def test_where_every_proposal_is_excluded_it_drives_the_slowest():
     scenes.scenes["field"][:, 86:] = 10.0  # from x = 6 m on
     _, world = worlds(scenes)
     states = EGO.proposals(world)
-    assert (score(world, states, EGO._others(world, range(1, HORIZON + 1))).score == 0).all()
+    assert (score(world, states, EGO._others(world, range(1, HORIZON + 1)))[0] == 0).all()
     torch.testing.assert_close(EGO.plan(world)[0], states[0, 0])
 
 

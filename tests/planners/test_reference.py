@@ -4,7 +4,7 @@ import torch
 
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import EgoPolicy
-from e2rl.planners.reference import AGENTS, Largest, Trunk, reference_action
+from e2rl.planners.reference import AGENTS, Largest, Trunk, follow
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.observation import NEAREST, OBSERVATION_SIZE, PER_AGENT
 from tests.synthetic import make_scenes
@@ -47,8 +47,8 @@ def test_an_offset_is_steered_back():
 def test_leading_dims_do_not_matter():
     env = DrivingEnv(make_scenes(3, num_vehicles=12, red_light_x=60.0), SimSettings(), 3)
     observation = env.rollout(10)["observation"]
-    one_by_one = torch.stack([reference_action(row) for row in observation.flatten(0, 1)])
-    assert torch.allclose(reference_action(observation).flatten(0, 1), one_by_one, atol=1e-5)
+    one_by_one = torch.stack([follow(row) for row in observation.flatten(0, 1)])
+    assert torch.allclose(follow(observation).flatten(0, 1), one_by_one, atol=1e-5)
 
 
 def test_the_order_of_the_agents_changes_nothing_and_each_of_them_counts():

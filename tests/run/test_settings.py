@@ -20,9 +20,9 @@ def conf(tmp_path, monkeypatch):
         (tmp_path / other).parent.mkdir(exist_ok=True)
         (tmp_path / other).write_text("device: cpu\n")
     monkeypatch.setattr(settings, "conf_folder", lambda: tmp_path)
-    settings._plain.cache_clear()
+    settings._loaded.cache_clear()
     yield
-    settings._plain.cache_clear()
+    settings._loaded.cache_clear()
 
 
 @configured("driver/calm", "reach")

@@ -8,13 +8,13 @@ import pytest
 
 from e2rl.run.errors import InputError
 from e2rl.scenes import bundled
-from e2rl.scenes.bundled import CURRENT, FRAMES, SPLITS, SceneMap, asset_bytes, read_maps, read_recordings, unpack
+from e2rl.scenes.bundled import CURRENT, FRAMES, SPLITS, asset_bytes, read_maps, read_recordings, unpack
 from e2rl.scenes.paths import WHEELBASE, arc_length, wrap
 from e2rl.scenes.recording import DT, Lane, Recording
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
-from scenegen.archive import pack  # noqa: E402
+from scenegen.archive import Place, pack  # noqa: E402
 from scenegen.interaction import lateral_acceleration, overlapping_pairs  # noqa: E402
 
 
@@ -69,7 +69,7 @@ def test_lane_ends_meet():
                     assert name in scene_map.lanes[other].right
 
 
-def small_set() -> tuple[SceneMap, Recording]:
+def small_set() -> tuple[Place, Recording]:
     rng = np.random.default_rng(1)
     lanes = {
         "a": Lane(np.array([[0.0, 0.0], [50.0, 1.5]]), 3.4, 13.9, ["b"], ["c"]),
@@ -77,7 +77,7 @@ def small_set() -> tuple[SceneMap, Recording]:
         "c": Lane(np.array([[0.0, 3.4], [50.0, 5.0]]), 3.4, 13.9, right=["a"]),
     }
     lights = {"b": rng.integers(0, 4, 200).astype(np.int8)}
-    scene_map = SceneMap("here", lanes, [np.eye(3)[:, :2]], lights, rng.normal(size=(2, 3)), np.full((2, 2), 2.0))
+    scene_map = Place("here", lanes, [np.eye(3)[:, :2]], lights, rng.normal(size=(2, 3)), np.full((2, 2), 2.0))
     states = rng.normal(size=(FRAMES, 3, 4)).cumsum(0)
     states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
     valid = rng.random((FRAMES, 3)) < 0.8

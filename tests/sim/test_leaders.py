@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from e2rl.scenes.route import project
-from e2rl.sim.leaders import FREE_GAP, IDMParameters, Leaders, desired_gap, idm_acceleration, leaders
+from e2rl.sim.leaders import FREE_GAP, GATE_MARGIN, IDMParameters, Leaders, desired_gap, idm_acceleration, leaders
 from tests.prior.small import arc
 
 LENGTH, WIDTH = 4.0, 2.0
@@ -30,7 +30,7 @@ def test_a_vehicle_across_the_lane_leads_with_its_side_and_stands_along_it():
     assert speed.item() == pytest.approx(0, abs=1e-4)
 
 
-def all_pairs(s, points, agents, size, present, d, margin, free_gap):
+def all_pairs(s, points, agents, size, present, d, free_gap):
     """The definition, with every agent projected onto every route."""
     length, width = size[:, : s.shape[1]].unbind(-1)
     at, offset, heading = project(agents[:, None, :, :2], points)
@@ -39,7 +39,7 @@ def all_pairs(s, points, agents, size, present, d, margin, free_gap):
     side = (size[:, None, :, 0] * sin.abs() + size[:, None, :, 1] * cos.abs()) / 2
     along = (size[:, None, :, 0] * cos.abs() + size[:, None, :, 1] * sin.abs()) / 2
     aside = offset - torch.minimum(torch.maximum(offset, d[..., None].clamp(max=0)), d[..., None].clamp(min=0))
-    leads = (aside.abs() < width[..., None] / 2 + side + margin) & (at > s[..., None]) & present[:, None]
+    leads = (aside.abs() < width[..., None] / 2 + side + GATE_MARGIN) & (at > s[..., None]) & present[:, None]
     leads &= ~torch.eye(*leads.shape[1:], dtype=torch.bool) & present[:, : s.shape[1], None]
     gap, index = torch.where(leads, at - s[..., None] - length[..., None] / 2 - along, free_gap).min(-1)
     return gap.clamp(max=free_gap), (agents[:, None, :, 3] * cos).gather(-1, index[..., None])[..., 0], index
@@ -60,8 +60,8 @@ def test_pruned_pairs_are_those_that_could_not_lead(vehicles, offsets, free_gap)
     size = torch.tensor([4.5, 2.0]).expand(batch, count, 2)
     present, d = draw(batch, count) < 0.8, 6 * (draw(batch, vehicles) - 0.5) * offsets
     given = (60 * draw(batch, vehicles), points, agents, size, present)
-    expected = all_pairs(*given, d, 0.5, free_gap)
-    at = (*given[:2], agents[:, :, None], *given[3:], d if offsets else None, 0.5, free_gap)
+    expected = all_pairs(*given, d, free_gap)
+    at = (*given[:2], agents[:, :, None], *given[3:], d if offsets else None, free_gap)
     found = Leaders(*(value[..., 0] for value in leaders(*at)))
     led = expected[0] < free_gap
     assert led.sum() > 40 and torch.equal(found.index[led], expected[2][led])

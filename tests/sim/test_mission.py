@@ -1,9 +1,9 @@
-"""Mission: limits along it, the state of its lights, and which of them bind."""
+"""Mission: limits along it, and lines that are run at red."""
 
 import torch
 
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED
-from e2rl.sim.mission import limit_at, mission_of, ran_red, stop_ahead
+from e2rl.sim.mission import limit_at, mission_of, ran_red
 from tests.synthetic import BACK, make_scenes
 
 
@@ -17,21 +17,6 @@ def test_limits_are_read_at_the_nearest_vertex():
 def test_end_is_infinite_where_the_route_goes_on():
     assert mission_of(make_scenes(1, road=(-60.0, 90.0)).scenes).end.item() == 90.0 + BACK
     assert mission_of(make_scenes(1).scenes).end.isinf().all()
-
-
-def stop(colour, speed, light_x=50.0):
-    scene = make_scenes(1, red_light_x=light_x).scenes
-    scene["light_state"][:] = colour
-    where = torch.tensor([BACK]), torch.tensor([float(speed)])
-    return stop_ahead(mission_of(scene), scene, torch.zeros(1, dtype=torch.long), *where, braking=3.0).item()
-
-
-def test_red_binds_unless_halting_is_hopeless_yellow_where_it_is_comfortable():
-    assert stop(colour=1, speed=10) == 50.0 and stop(colour=2, speed=10) == 50.0
-    assert stop(colour=1, speed=20) == 50.0 and stop(colour=2, speed=20) == float("inf")
-    assert stop(colour=1, speed=30) == float("inf")
-    assert stop(colour=3, speed=10) == float("inf") and stop(colour=0, speed=10) == float("inf")
-    assert stop(colour=1, speed=1, light_x=-5.0) == float("inf"), "a line passed binds no longer"
 
 
 def test_a_line_is_run_at_the_step_at_which_the_front_passes_it_at_red():

@@ -1,12 +1,22 @@
 """Writes the archive of a split that e2rl/scenes/bundled.py reads (format e2rl-scenes/1)."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from e2rl.scenes.bundled import FORMAT, MILLI, UNIT, SceneMap
 from e2rl.scenes.recording import Recording
 
 
-def pack(maps: list[SceneMap], scenes: list[tuple[Recording, int]]) -> dict[str, np.ndarray]:
+@dataclass
+class Place(SceneMap):
+    """A map with the cars parked there, their poses [Q, 3] and sizes [Q, 2]."""
+
+    parked: np.ndarray
+    parked_size: np.ndarray
+
+
+def pack(maps: list[Place], scenes: list[tuple[Recording, int]]) -> dict[str, np.ndarray]:
     """Arrays of an archive from maps and (recording, first frame on its map's light programme) on them."""
     lanes = [(scene_map.name, name, lane) for scene_map in maps for name, lane in scene_map.lanes.items()]
     number = {(scene_map, name): index for index, (scene_map, name, _) in enumerate(lanes)}

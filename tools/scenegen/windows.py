@@ -4,8 +4,9 @@ from collections import Counter
 
 import numpy as np
 
-from e2rl.scenes.bundled import CURRENT, FRAMES, SceneMap
+from e2rl.scenes.bundled import CURRENT, FRAMES
 from e2rl.scenes.recording import Recording
+from scenegen.archive import Place
 from scenegen.interaction import interaction_score, lateral_acceleration, overlapping_pairs
 
 STRIDE = 40  # frames between the windows that are looked at
@@ -58,7 +59,7 @@ def flaw(states, valid, size) -> str | None:
 
 
 def cut_windows(
-    scene_map: SceneMap, states, valid, size, border, most: int, rng
+    scene_map: Place, states, valid, size, border, most: int, rng
 ) -> tuple[list[tuple[Recording, int]], Counter[str]]:
     """Up to `most` (Recording, first frame) of a simulation, of different egos and at least 5.5 s apart, and why others
     were refused."""
