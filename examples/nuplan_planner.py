@@ -40,6 +40,8 @@ STEPS, STEP = 50, 0.1  # of a plan, at most; s
 STEP_US, START_US = 100_000, 10_000_000  # us of a step; time of step 0, which leaves room for a past
 PAST = 20  # steps of history besides the present, as in nuPlan's simulation
 SPACING = 2.0  # m between two points of a route
+HORIZON = 10  # steps to the speed at which nuPlan's controller aims
+RETURN_TIME, RETURN_LENGTH = 0.7, 1.5  # s, m: the way back to a path is max(RETURN_LENGTH, RETURN_TIME * v), as e2rl's
 TYPES = (
     TrackedObjectType.VEHICLE,
     TrackedObjectType.PEDESTRIAN,
@@ -186,15 +188,39 @@ class Scene:
             )
         axles = [(one.rear_axle, one.dynamic_car_state.rear_axle_velocity_2d.x) for one in planned]
         x, y, heading, speed = np.array([(axle.x, axle.y, axle.heading, v) for axle, v in axles], float).T
-        at = now + STEP_US * np.arange(1, min(STEPS, round((times[-1] - now) / STEP_US)) + 1)
+        at = now + STEP_US * np.arange(min(STEPS, round((times[-1] - now) / STEP_US)) + 1)
         x, y, heading, speed = (np.interp(at, times, one) for one in (x, y, np.unwrap(heading), speed))
         ahead = self.vehicle.rear_axle_to_center
-        states = np.stack([x + ahead * np.cos(heading), y + ahead * np.sin(heading), wrap(heading), speed], 1)
-        driven = np.hypot(*np.diff(states[:, :2], axis=0, prepend=[ego[2:4]]).T).sum()
-        told = STEP * np.abs(speed).sum()
-        if abs(driven - told) > 2.0 + 0.25 * driven:  # e2rl follows poses and speeds
-            raise ValueError(f"the trajectory's poses move {driven:.1f} m, its rear-axle velocities {told:.1f} m")
-        return states
+        x, y = x + ahead * np.cos(heading), y + ahead * np.sin(heading)
+        if speed.any():
+            driven, told = np.hypot(np.diff(x), np.diff(y)).sum(), STEP * np.abs(speed[1:]).sum()
+            if abs(driven - told) > 2.0 + 0.25 * driven:  # e2rl follows poses and speeds
+                raise ValueError(f"the trajectory's poses move {driven:.1f} m, its rear-axle velocities {told:.1f} m")
+        else:
+            speed = speeds_of(x, y, heading, ego[5])
+        return returning(np.stack([x, y, heading, speed], 1), ego)[1:]
+
+
+def speeds_of(x, y, heading, now):
+    """Speeds of poses [K] that come without, from the speed now. As nuPlan's controller does it, the speed goes evenly
+    to the one that the poses have at its horizon; after that it is theirs."""
+    speed = (np.gradient(x) * np.cos(heading) + np.gradient(y) * np.sin(heading)) / STEP
+    until = min(HORIZON, len(speed) - 1)
+    speed[: until + 1] = np.linspace(now, speed[until], until + 1)
+    return speed
+
+
+def returning(states, ego):
+    """States [K, 4] that begin where the ego is, beside the planned ones where those begin on a path of the planner's,
+    and come to them. e2rl follows a plan from the ego; nuPlan's controller steers back."""
+    x, y, heading = states[0, :3]
+    beside = math.cos(heading) * (ego[3] - y) - math.sin(heading) * (ego[2] - x)
+    length = max(RETURN_LENGTH, RETURN_TIME * ego[5])
+    way = np.append(0.0, np.hypot(*np.diff(states[:, :2], axis=0).T).cumsum())
+    beside *= np.exp(-way / length)
+    x, y, heading, speed = states.T
+    turned = wrap(heading - np.arctan(beside / length))
+    return np.stack([x - beside * np.sin(heading), y + beside * np.cos(heading), turned, speed], 1)
 
 
 def lines_of(points):
