@@ -14,6 +14,7 @@ import torch
 import e2rl
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.evaluation.rollout_files import ERRORED_FILE
+from e2rl.planners.ego import RETURN_LENGTH, RETURN_TIME
 from e2rl.planners.external import ExternalEgo
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
@@ -22,7 +23,7 @@ from e2rl.sim.mission import mission_of
 from e2rl.sim.world import World
 from e2rl.traffic.rule_based import LogReplay
 from tests.planners.test_external import BAD, scene_set
-from tests.synthetic import LANE_WIDTH, make_scenes
+from tests.synthetic import LANE_WIDTH, MARGIN, make_scenes
 
 HERE = Path(__file__).parent
 ADAPTER = HERE.parents[1] / "examples" / "nuplan_planner.py"
@@ -53,6 +54,20 @@ def test_a_planner_that_keeps_its_velocity_moves_as_at_constant_velocity(nuplan,
     states = e2rl.roll_out(scenes, nuplan("--planner nuplan_planners:Straight", replan_every), LogReplay()).states
     expected = dynamics.constant_velocity(start, torch.tensor([4.0]))[:, 0]
     assert torch.allclose(states[:, 40, 0], expected, atol=2e-3)
+
+
+@pytest.mark.parametrize("replan_every", [1, 5])
+@pytest.mark.parametrize("acceleration", [1.0, -2.0])
+def test_a_planner_of_poses_alone_moves_as_they_do_and_comes_to_its_path(nuplan, replan_every, acceleration):
+    """What it is beside decays as e2rl's tracker has it, by 1/e over RETURN_TIME seconds of way, once it has turned."""
+    scenes, beside, seconds = make_scenes(2), torch.tensor([1.0, -0.6]), DT * torch.arange(41)
+    scenes.scenes["start"][:, 0, 1] = scenes.scenes["logged"][:, 0, 0, 1] = beside
+    ego = nuplan(f"--planner nuplan_planners:Centred acceleration={acceleration}", replan_every)
+    states = e2rl.roll_out(scenes, ego, LogReplay()).states[:, :41, 0]
+    assert torch.allclose(states[..., 3], (10.0 + acceleration * seconds).expand(2, -1), atol=0.05)
+    x, length = states[..., 0], (RETURN_TIME * states[..., 3]).clamp(min=RETURN_LENGTH)
+    expected = beside[:, None] * torch.exp(-((x.diff(dim=1) / length[:, 1:]).cumsum(1)))
+    assert torch.allclose(states[:, 2:, 1], expected[:, :-1], atol=0.05)
 
 
 @pytest.mark.parametrize("replan_every", [1, 5])
@@ -154,9 +169,20 @@ def test_lanes_side_by_side_are_a_roadblock(nuplan, tmp_path):
         )
 
 
+def test_the_road_reaches_as_far_beside_the_lanes_as_the_metrics_have_it(nuplan, tmp_path):
+    scenes = make_scenes(1)
+    nuplan("--planner nuplan_planners:Witness").plan(World.at_start(scenes.scenes))
+    (one,) = written(tmp_path)
+    border = -LANE_WIDTH / 2, 1.5 * LANE_WIDTH
+    for aside, drivable, lane, beside in one["aside"]:
+        beyond = max(border[0] - aside, aside - border[1])  # m outside of the lanes
+        if min(abs(beyond), abs(beyond - MARGIN), abs(aside - LANE_WIDTH / 2)) > 0.1:
+            assert (drivable, lane, beside) == (beyond < MARGIN, beyond < 0, 0 < beyond < MARGIN), aside
+
+
 WRONG = {
     "raises": ("PlannerFailed", "RuntimeError: no way out (nuplan_planners.py, line"),
-    "velocities": ("PlannerFailed", "the trajectory's poses move 50.0 m, its rear-axle velocities 0.0 m"),
+    "velocities": ("PlannerFailed", "the trajectory's poses move 50.0 m, its rear-axle velocities 5.0 m"),
     "short": ("BadReply", "fewer than the 5 steps until the next plan"),
 }
 
