@@ -40,8 +40,9 @@ STEPS, STEP = 50, 0.1  # of a plan, at most; s
 STEP_US, START_US = 100_000, 10_000_000  # us of a step; time of step 0, which leaves room for a past
 PAST = 20  # steps of history besides the present, as in nuPlan's simulation
 SPACING = 2.0  # m between two points of a route
+AWAY = 5.0  # m from the ego: a trajectory that begins farther is in another frame, or on another road
 HORIZON = 10  # steps to the speed at which nuPlan's controller aims
-RETURN_TIME, RETURN_LENGTH = 0.7, 1.5  # s, m: the way back to a path is max(RETURN_LENGTH, RETURN_TIME * v), as e2rl's
+RETURN_TIME, RETURN_LENGTH = 0.7, 1.5  # s, m: a plan beside the ego is 1/e so far beside after as long a way as e2rl's
 TYPES = (
     TrackedObjectType.VEHICLE,
     TrackedObjectType.PEDESTRIAN,
@@ -192,6 +193,9 @@ class Scene:
         x, y, heading, speed = (np.interp(at, times, one) for one in (x, y, np.unwrap(heading), speed))
         ahead = self.vehicle.rear_axle_to_center
         x, y = x + ahead * np.cos(heading), y + ahead * np.sin(heading)
+        away = math.hypot(x[0] - ego[2], y[0] - ego[3])
+        if away > AWAY:
+            raise ValueError(f"the trajectory begins {away:.1f} m from the ego")
         if speed.any():
             driven, told = np.hypot(np.diff(x), np.diff(y)).sum(), STEP * np.abs(speed[1:]).sum()
             if abs(driven - told) > 2.0 + 0.25 * driven:  # e2rl follows poses and speeds
@@ -202,8 +206,8 @@ class Scene:
 
 
 def speeds_of(x, y, heading, now):
-    """Speeds of poses [K] that come without, from the speed now. As nuPlan's controller does it, the speed goes evenly
-    to the one that the poses have at its horizon; after that it is theirs."""
+    """Speeds [K] for poses [K] that tell none, from the speed now: an even change to that of the poses 1 s ahead, at
+    which nuPlan's controller aims, then that of the poses."""
     speed = (np.gradient(x) * np.cos(heading) + np.gradient(y) * np.sin(heading)) / STEP
     until = min(HORIZON, len(speed) - 1)
     speed[: until + 1] = np.linspace(now, speed[until], until + 1)
@@ -211,14 +215,13 @@ def speeds_of(x, y, heading, now):
 
 
 def returning(states, ego):
-    """States [K, 4] that begin where the ego is, beside the planned ones where those begin on a path of the planner's,
-    and come to them. e2rl follows a plan from the ego; nuPlan's controller steers back."""
-    x, y, heading = states[0, :3]
-    beside = math.cos(heading) * (ego[3] - y) - math.sin(heading) * (ego[2] - x)
-    length = max(RETURN_LENGTH, RETURN_TIME * ego[5])
-    way = np.append(0.0, np.hypot(*np.diff(states[:, :2], axis=0).T).cumsum())
-    beside *= np.exp(-way / length)
+    """Planned states [K, 4], moved aside to the ego at first and ever less later. Planners plan on a path beside which
+    the ego may be, and nuPlan's controller steers to it; e2rl takes a plan to begin at the ego."""
     x, y, heading, speed = states.T
+    length = max(RETURN_LENGTH, RETURN_TIME * ego[5])
+    way = np.append(0.0, np.hypot(np.diff(x), np.diff(y)).cumsum())
+    beside = math.cos(heading[0]) * (ego[3] - y[0]) - math.sin(heading[0]) * (ego[2] - x[0])
+    beside = beside * np.exp(-way / length)
     turned = wrap(heading - np.arctan(beside / length))
     return np.stack([x - beside * np.sin(heading), y + beside * np.cos(heading), turned, speed], 1)
 

@@ -66,6 +66,9 @@ class Wrong(Straight):
             raise RuntimeError("no way out")
         if self.how == "short":
             self.seconds = 0.3
+        if self.how == "elsewhere":
+            ego.rear_axle.y += 20.0
+            return self.straight(ego, 10.0)
         return self.straight(ego, 10.0, told=1.0 if self.how == "velocities" else None)
 
 

@@ -183,6 +183,7 @@ def test_the_road_reaches_as_far_beside_the_lanes_as_the_metrics_have_it(nuplan,
 WRONG = {
     "raises": ("PlannerFailed", "RuntimeError: no way out (nuplan_planners.py, line"),
     "velocities": ("PlannerFailed", "the trajectory's poses move 50.0 m, its rear-axle velocities 5.0 m"),
+    "elsewhere": ("PlannerFailed", "the trajectory begins 20.0 m from the ego"),
     "short": ("BadReply", "fewer than the 5 steps until the next plan"),
 }
 
