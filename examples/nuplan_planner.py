@@ -42,7 +42,7 @@ PAST = 20  # steps of history besides the present, as in nuPlan's simulation
 SPACING = 2.0  # m between two points of a route
 AWAY = 5.0  # m from the ego: a trajectory that begins farther is in another frame, or on another road
 HORIZON = 10  # steps to the speed at which nuPlan's controller aims
-RETURN_TIME, RETURN_LENGTH = 0.7, 1.5  # s, m: a plan beside the ego is 1/e so far beside after as long a way as e2rl's
+SHIFT_TIME, SHIFT_LENGTH = 1.5, 6.0  # s, m: way in which the ego comes over to a path beside it; the longer of the two
 TYPES = (
     TrackedObjectType.VEHICLE,
     TrackedObjectType.PEDESTRIAN,
@@ -215,15 +215,18 @@ def speeds_of(x, y, heading, now):
 
 
 def returning(states, ego):
-    """Planned states [K, 4], moved aside to the ego at first and ever less later. Planners plan on a path beside which
-    the ego may be, and nuPlan's controller steers to it; e2rl takes a plan to begin at the ego."""
+    """Planned states [K, 4], from the ego's pose on. Planners plan on a path beside which the ego may be; nuPlan's
+    controller steers to it, and e2rl takes a plan to begin at the ego. The way over is a cubic polynomial."""
     x, y, heading, speed = states.T
-    length = max(RETURN_LENGTH, RETURN_TIME * ego[5])
+    length = max(SHIFT_LENGTH, SHIFT_TIME * ego[5])
     way = np.append(0.0, np.hypot(np.diff(x), np.diff(y)).cumsum())
+    part = np.minimum(way / length, 1.0)
     beside = math.cos(heading[0]) * (ego[3] - y[0]) - math.sin(heading[0]) * (ego[2] - x[0])
-    beside = beside * np.exp(-way / length)
-    turned = wrap(heading - np.arctan(beside / length))
-    return np.stack([x - beside * np.sin(heading), y + beside * np.cos(heading), turned, speed], 1)
+    turned = math.tan(np.clip(wrap(ego[4] - heading[0]), -1.0, 1.0))
+    aside = (1 - part) ** 2 * (beside * (1 + 2 * part) + turned * length * part)
+    slope = (1 - part) * (turned * (1 - 3 * part) - 6 * beside * part / length)
+    x, y = x - aside * np.sin(heading), y + aside * np.cos(heading)
+    return np.stack([x, y, wrap(heading + np.arctan(slope)), speed], 1)
 
 
 def lines_of(points):
