@@ -10,23 +10,30 @@ from functools import cached_property
 import numpy as np
 from nuplan.common.actor_state.state_representation import StateSE2
 from nuplan.common.maps.abstract_map import AbstractMap
-from nuplan.common.maps.abstract_map_objects import Lane, LaneConnector, PolylineMapObject, RoadBlockGraphEdgeMapObject
+from nuplan.common.maps.abstract_map_objects import (
+    Lane,
+    LaneConnector,
+    PolygonMapObject,
+    PolylineMapObject,
+    RoadBlockGraphEdgeMapObject,
+)
 from nuplan.common.maps.maps_datatypes import LaneConnectorType, SemanticMapLayer
 from shapely.geometry import LineString, Point, box
 from shapely.ops import unary_union
 
 STRAY, DISTANT = math.radians(60), 4.0  # rad, m: a point of the route is on a lane that is within both
 ASIDE, JUMP = 3.0, 1000.0  # cost, in m of distance, of a lane change and of going where no lane leads
+SHOULDER = 1.0  # m beside a lane that e2rl counts as road
 LIT = 0.5  # m from where a lane begins to the point of its light
 LANES = (SemanticMapLayer.LANE, SemanticMapLayer.LANE_CONNECTOR)
 BLOCKS = (SemanticMapLayer.ROADBLOCK, SemanticMapLayer.ROADBLOCK_CONNECTOR)
-AREAS = {SemanticMapLayer.DRIVABLE_AREA: LANES, SemanticMapLayer.INTERSECTION: LANES[1:]}  # made of what
+BESIDE = SemanticMapLayer.CARPARK_AREA  # nuPlan's layer of what is drivable and no lane
+AREAS = {SemanticMapLayer.DRIVABLE_AREA: (*LANES, BESIDE), SemanticMapLayer.INTERSECTION: LANES[1:]}  # made of what
 EMPTY = (
     SemanticMapLayer.STOP_LINE,
     SemanticMapLayer.CROSSWALK,
     SemanticMapLayer.INTERSECTION,
     SemanticMapLayer.WALKWAYS,
-    SemanticMapLayer.CARPARK_AREA,
 )
 
 
@@ -172,14 +179,24 @@ class SceneRoadblock(RoadBlockGraphEdgeMapObject):
         return list({edge.block.id: edge.block for lane in self.lanes for edge in getattr(lane, edges)}.values())
 
 
+class Shoulder(PolygonMapObject):
+    """Road beside the lanes."""
+
+    polygon = None
+
+    def __init__(self, name, polygon):
+        super().__init__(name)
+        self.polygon = polygon
+
+
 class SceneMap(AbstractMap):
-    """The lanes and roadblocks of a scene. Inside of the drivable area is who is inside of a lane, inside of an
-    intersection who is inside of a connector; the layers of EMPTY hold no objects."""
+    """The lanes and roadblocks of a scene. Inside of the drivable area is who is inside of a lane or beside one, inside
+    of an intersection who is inside of a connector; the layers of EMPTY hold no objects."""
 
     def __init__(self, name, lines, about, lights):
         """lines: centrelines [P, 2], P >= 2, by lane; about [L, 9]: width, left, right and 6 exits of each, -1 none;
         lights [S, 2]: where lanes with lights begin."""
-        self._name, self._boxes, self._objects = name, {}, {layer: {} for layer in LANES + BLOCKS + EMPTY}
+        self._name, self._boxes, self._objects = name, {}, {layer: {} for layer in (*LANES, *BLOCKS, BESIDE, *EMPTY)}
         left, right = ([int(row[k]) if row[k] in lines else -1 for row in about] for k in (1, 2))
         exits = [{int(lane) for lane in row[3:] if lane in lines} for row in about]
         entries = [sum(lane in after for after in exits) for lane in range(len(about))]
@@ -203,6 +220,10 @@ class SceneMap(AbstractMap):
             lane.outgoing = [self.lanes[after] for after in sorted(exits[number])]
             for after in lane.outgoing:
                 after.incoming.append(lane)
+        area = unary_union([lane.polygon for lane in self.lanes.values()])
+        beside = area.buffer(SHOULDER, quad_segs=2).difference(area)
+        for number, part in enumerate(getattr(beside, "geoms", [beside])):
+            self._objects[BESIDE][f"beside-{number}"] = Shoulder(f"beside-{number}", part)
 
     map_name = property(lambda self: self._name)
 

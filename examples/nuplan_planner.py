@@ -40,6 +40,9 @@ STEPS, STEP = 50, 0.1  # of a plan, at most; s
 STEP_US, START_US = 100_000, 10_000_000  # us of a step; time of step 0, which leaves room for a past
 PAST = 20  # steps of history besides the present, as in nuPlan's simulation
 SPACING = 2.0  # m between two points of a route
+AWAY = 5.0  # m from the ego: a trajectory that begins farther is in another frame, or on another road
+HORIZON = 10  # steps to the speed at which nuPlan's controller aims
+SHIFT_TIME, SHIFT_LENGTH = 1.5, 6.0  # s, m: way in which the ego comes over to a path beside it; the longer of the two
 TYPES = (
     TrackedObjectType.VEHICLE,
     TrackedObjectType.PEDESTRIAN,
@@ -186,15 +189,44 @@ class Scene:
             )
         axles = [(one.rear_axle, one.dynamic_car_state.rear_axle_velocity_2d.x) for one in planned]
         x, y, heading, speed = np.array([(axle.x, axle.y, axle.heading, v) for axle, v in axles], float).T
-        at = now + STEP_US * np.arange(1, min(STEPS, round((times[-1] - now) / STEP_US)) + 1)
+        at = now + STEP_US * np.arange(min(STEPS, round((times[-1] - now) / STEP_US)) + 1)
         x, y, heading, speed = (np.interp(at, times, one) for one in (x, y, np.unwrap(heading), speed))
         ahead = self.vehicle.rear_axle_to_center
-        states = np.stack([x + ahead * np.cos(heading), y + ahead * np.sin(heading), wrap(heading), speed], 1)
-        driven = np.hypot(*np.diff(states[:, :2], axis=0, prepend=[ego[2:4]]).T).sum()
-        told = STEP * np.abs(speed).sum()
-        if abs(driven - told) > 2.0 + 0.25 * driven:  # e2rl follows poses and speeds
-            raise ValueError(f"the trajectory's poses move {driven:.1f} m, its rear-axle velocities {told:.1f} m")
-        return states
+        x, y = x + ahead * np.cos(heading), y + ahead * np.sin(heading)
+        away = math.hypot(x[0] - ego[2], y[0] - ego[3])
+        if away > AWAY:
+            raise ValueError(f"the trajectory begins {away:.1f} m from the ego")
+        if speed.any():
+            driven, told = np.hypot(np.diff(x), np.diff(y)).sum(), STEP * np.abs(speed[1:]).sum()
+            if abs(driven - told) > 2.0 + 0.25 * driven:  # e2rl follows poses and speeds
+                raise ValueError(f"the trajectory's poses move {driven:.1f} m, its rear-axle velocities {told:.1f} m")
+        else:
+            speed = speeds_of(x, y, heading, ego[5])
+        return returning(np.stack([x, y, heading, speed], 1), ego)[1:]
+
+
+def speeds_of(x, y, heading, now):
+    """Speeds [K] for poses [K] that tell none, from the speed now: an even change to that of the poses 1 s ahead, at
+    which nuPlan's controller aims, then that of the poses."""
+    speed = (np.gradient(x) * np.cos(heading) + np.gradient(y) * np.sin(heading)) / STEP
+    until = min(HORIZON, len(speed) - 1)
+    speed[: until + 1] = np.linspace(now, speed[until], until + 1)
+    return speed
+
+
+def returning(states, ego):
+    """Planned states [K, 4], from the ego's pose on. Planners plan on a path beside which the ego may be; nuPlan's
+    controller steers to it, and e2rl takes a plan to begin at the ego. The way over is a cubic polynomial."""
+    x, y, heading, speed = states.T
+    length = max(SHIFT_LENGTH, SHIFT_TIME * ego[5])
+    way = np.append(0.0, np.hypot(np.diff(x), np.diff(y)).cumsum())
+    part = np.minimum(way / length, 1.0)
+    beside = math.cos(heading[0]) * (ego[3] - y[0]) - math.sin(heading[0]) * (ego[2] - x[0])
+    turned = math.tan(np.clip(wrap(ego[4] - heading[0]), -1.0, 1.0))
+    aside = (1 - part) ** 2 * (beside * (1 + 2 * part) + turned * length * part)
+    slope = (1 - part) * (turned * (1 - 3 * part) - 6 * beside * part / length)
+    x, y = x - aside * np.sin(heading), y + aside * np.cos(heading)
+    return np.stack([x, y, wrap(heading + np.arctan(slope)), speed], 1)
 
 
 def lines_of(points):

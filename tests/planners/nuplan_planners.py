@@ -66,7 +66,32 @@ class Wrong(Straight):
             raise RuntimeError("no way out")
         if self.how == "short":
             self.seconds = 0.3
-        return self.straight(ego, 10.0, told=0.0 if self.how == "velocities" else None)
+        if self.how == "elsewhere":
+            ego.rear_axle.y += 20.0
+            return self.straight(ego, 10.0)
+        return self.straight(ego, 10.0, told=1.0 if self.how == "velocities" else None)
+
+
+class Centred(Straight):
+    """Plans on the centre of the ego's lane, wherever the ego is, at an acceleration. It tells poses only."""
+
+    def __init__(self, acceleration):
+        super().__init__()
+        self.acceleration, self.path = acceleration, None
+
+    def compute_planner_trajectory(self, current_input):
+        ego, _ = current_input.history.current_state
+        if self.path is None:
+            (lane,) = self.initialization.map_api.get_all_map_objects(ego.center, SemanticMapLayer.LANE)
+            self.path = lane.baseline_path
+        nearest, speed = self.path.get_nearest_pose_from_position(ego.rear_axle), state_of(ego)[3]
+        return InterpolatedTrajectory([self.later(ego, nearest, speed, step / 10) for step in range(81)])
+
+    def later(self, ego, begin, speed, seconds):
+        way, zero = speed * seconds + self.acceleration * seconds**2 / 2, StateVector2D(0.0, 0.0)
+        pose = StateSE2(begin.x + way * math.cos(begin.heading), begin.y + way * math.sin(begin.heading), begin.heading)
+        time = TimePoint(ego.time_point.time_us + round(seconds * SECOND))
+        return EgoState.build_from_rear_axle(pose, zero, zero, 0.0, time, ego.car_footprint.vehicle_parameters)
 
 
 class Camera(Straight):
@@ -106,6 +131,7 @@ class Witness(Straight):
             seen["route"] = [[lane_of(lane) for lane in block.interior_edges] for block in blocks]
             seen["linked"] = [after in block.outgoing_edges for block, after in zip(blocks, blocks[1:])]
             seen["drivable"] = api.is_in_layer(ego.center, layers.DRIVABLE_AREA)
+            seen["aside"] = [aside_of(api, ego.center, 0.25 * k) for k in range(-40, 41)]
             seen["goal"] = pose_of(self.initialization.mission_goal)
             seen["lights"] = [
                 [one.status.name, api.get_map_object(one.lane_connector_id, layers.LANE_CONNECTOR).id]
@@ -138,6 +164,13 @@ def pose_of(pose):
 
 def state_of(ego):
     return [*pose_of(ego.center), ego.dynamic_car_state.center_velocity_2d.x]
+
+
+def aside_of(api, pose, aside):
+    """Where a point beside a pose lies: in the drivable area, in lanes and in what is drivable and no lane."""
+    point = StateSE2(pose.x - aside * math.sin(pose.heading), pose.y + aside * math.cos(pose.heading), pose.heading)
+    layers = ([SemanticMapLayer.DRIVABLE_AREA], LANES, [SemanticMapLayer.CARPARK_AREA])
+    return [aside, *(any(api.is_in_layer(point, layer) for layer in one) for one in layers)]
 
 
 def agent_of(agent):

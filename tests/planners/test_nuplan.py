@@ -22,7 +22,7 @@ from e2rl.sim.mission import mission_of
 from e2rl.sim.world import World
 from e2rl.traffic.rule_based import LogReplay
 from tests.planners.test_external import BAD, scene_set
-from tests.synthetic import LANE_WIDTH, make_scenes
+from tests.synthetic import LANE_WIDTH, MARGIN, make_scenes
 
 HERE = Path(__file__).parent
 ADAPTER = HERE.parents[1] / "examples" / "nuplan_planner.py"
@@ -53,6 +53,22 @@ def test_a_planner_that_keeps_its_velocity_moves_as_at_constant_velocity(nuplan,
     states = e2rl.roll_out(scenes, nuplan("--planner nuplan_planners:Straight", replan_every), LogReplay()).states
     expected = dynamics.constant_velocity(start, torch.tensor([4.0]))[:, 0]
     assert torch.allclose(states[:, 40, 0], expected, atol=2e-3)
+
+
+@pytest.mark.parametrize("replan_every", [1, 5])
+@pytest.mark.parametrize("acceleration", [1.0, -1.0])
+def test_a_planner_of_poses_alone_moves_as_they_do_and_comes_softly_to_its_path(nuplan, replan_every, acceleration):
+    """From e beside the path a cubic of length S begins with curvature 6 e / S^2, which is its largest."""
+    scenes, beside, seconds = make_scenes(2), torch.tensor([1.0, -0.6]), DT * torch.arange(51)
+    scenes.scenes["start"][:, 0, 1] = scenes.scenes["logged"][:, 0, 0, 1] = beside
+    ego = nuplan(f"--planner nuplan_planners:Centred acceleration={acceleration}", replan_every)
+    states = e2rl.roll_out(scenes, ego, LogReplay()).states[:, :51, 0]
+    speed = 10.0 + acceleration * seconds
+    assert torch.allclose(states[..., 3], speed.expand(2, -1), atol=0.05)
+    left = states[..., 1] / beside[:, None]
+    assert left.max() < 1.001 and left.min() > -0.05 and left[:, 40:].abs().max() < 0.05
+    sharpest = states[..., 2].diff(dim=1).abs() / (DT * speed[1:]) / beside[:, None].abs()  # 1/m, a metre beside
+    assert sharpest.max() < 1.1 * 6 / (1.5 * 10.0) ** 2
 
 
 @pytest.mark.parametrize("replan_every", [1, 5])
@@ -154,9 +170,21 @@ def test_lanes_side_by_side_are_a_roadblock(nuplan, tmp_path):
         )
 
 
+def test_the_road_reaches_as_far_beside_the_lanes_as_the_metrics_have_it(nuplan, tmp_path):
+    scenes = make_scenes(1)
+    nuplan("--planner nuplan_planners:Witness").plan(World.at_start(scenes.scenes))
+    (one,) = written(tmp_path)
+    border = -LANE_WIDTH / 2, 1.5 * LANE_WIDTH
+    for aside, drivable, lane, beside in one["aside"]:
+        beyond = max(border[0] - aside, aside - border[1])  # m outside of the lanes
+        if min(abs(beyond), abs(beyond - MARGIN), abs(aside - LANE_WIDTH / 2)) > 0.1:
+            assert (drivable, lane, beside) == (beyond < MARGIN, beyond < 0, 0 < beyond < MARGIN), aside
+
+
 WRONG = {
     "raises": ("PlannerFailed", "RuntimeError: no way out (nuplan_planners.py, line"),
-    "velocities": ("PlannerFailed", "the trajectory's poses move 50.0 m, its rear-axle velocities 0.0 m"),
+    "velocities": ("PlannerFailed", "the trajectory's poses move 50.0 m, its rear-axle velocities 5.0 m"),
+    "elsewhere": ("PlannerFailed", "the trajectory begins 20.0 m from the ego"),
     "short": ("BadReply", "fewer than the 5 steps until the next plan"),
 }
 
