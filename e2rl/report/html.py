@@ -4,17 +4,15 @@ It shows the failure modes, a replay of each failure, the atlas, an index to sea
 collisions over realism. Everything is inside the file: no script, font or picture is loaded from elsewhere.
 """
 
-import hashlib
 import html
 import json
 import os
+import re
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-from tqdm import tqdm
 
 from e2rl.evaluation.budget import TRIES_FILE
 from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
@@ -23,7 +21,7 @@ from e2rl.metrics.atlas import CELL, Cell, by_likelihood, cell_of
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.answer import of, rate
-from e2rl.report.failure_tracks import CHANNELS, MAP_QUANTUM, encoded_map, failure_replay
+from e2rl.report.failure_tracks import replay_data
 from e2rl.report.tables import Table, closed_loop, column_names, metric_tables, mode_tables
 from e2rl.run.config import assigned
 from e2rl.run.errors import InputError
@@ -90,17 +88,17 @@ def failure_list(content: Mapping[str, Any], page_name: str) -> str:
     return csv_text([["failure", *COLUMNS, "mode", "link", "again"], *lines])
 
 
-def page(template: Path, title: str, scripts: Sequence[Path], content: Mapping[str, Any]) -> str:
-    """A template filled with a title, the report's style, scripts and a data block."""
+def page(body: Path, title: str, scripts: Sequence[Path], content: Mapping[str, Any]) -> str:
+    """The frame of all pages with a body, the report's style and that beside the body, scripts and a data block."""
+    styles = dict.fromkeys((ASSETS / "page.css", body.with_suffix(".css")))
     parts = {
         "TITLE": html.escape(title),
-        "STYLE": (ASSETS / "page.css").read_text(),
+        "STYLE": "".join(path.read_text() for path in styles),
         "SCRIPT": "\n".join(path.read_text() for path in scripts),
         "DATA": json.dumps(nulls(content), allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
     }
-    before, *rest = template.read_text().split("{{")
-    pieces = (piece.split("}}", 1) for piece in rest)
-    return before + "".join(parts[name] + text for name, text in pieces)
+    whole = (ASSETS / "frame.html").read_text().replace("{{BODY}}\n", body.read_text())
+    return re.sub("{{([A-Z]+)}}", lambda field: parts[field[1]], whole)
 
 
 def page_content(run: Path, metrics: Sequence[dict], modes: Mapping, methods: Sequence[str]) -> dict[str, Any]:
@@ -132,8 +130,6 @@ def page_content(run: Path, metrics: Sequence[dict], modes: Mapping, methods: Se
         "rows": rows,
         "points": [plotted(row) for row in closed_loop(metrics)],
         "about": {metric.name: metric.about for metric in METRICS.values()},
-        "channels": CHANNELS,
-        "map_quantum": MAP_QUANTUM,
     }
 
 
@@ -186,18 +182,11 @@ def plotted(row: Mapping) -> dict[str, Any]:
 
 
 def add_replays(run: Path, rows: Sequence[dict], index: Sequence[dict], count: int) -> dict[str, Any]:
-    """`maps` and `replays` of the data block, for `count` failures; writes the number of its replay into each of
-    `index`. Scenes share their map."""
-    maps: dict[str, dict] = {}
-    replays: list[dict] = []
-    for position in tqdm(replay_order(index)[:count], desc="replays", leave=False, disable=None):
-        shown = Failure.read(run, rows[position])
-        drawn = encoded_map(shown.rollout)
-        key = hashlib.sha256(json.dumps(drawn).encode()).hexdigest()
-        maps.setdefault(key, drawn)
-        index[position]["replay"] = len(replays)
-        replays.append(failure_replay(shown) | {"map": list(maps).index(key)})
-    return {"maps": list(maps.values()), "replays": replays}
+    """`replay_data` of `count` failures; writes the number of its replay into each of `index`."""
+    chosen = replay_order(index)[:count]
+    for number, position in enumerate(chosen):
+        index[position]["replay"] = number
+    return replay_data(((Failure.read(run, rows[position]), None) for position in chosen), len(chosen))
 
 
 def replay_order(index: Sequence[Mapping]) -> list[int]:
