@@ -131,7 +131,7 @@ def test_the_page_knows_the_atlas_and_replays_its_likeliest_failures_first(tmp_p
             found.setdefault(tuple(data["cells"][entries[k]["cell"]][name] for name in CELL), k)
         atlas = atlas_of([rows[k] for k in ours])
         assert len(atlas) == 3 and list(found) == list(atlas)
-        assert [rows[k] for k in found.values()] == [cell.likeliest for cell in atlas.values()]
+        assert [rows[k] for k in found.values()] == [failures[0] for failures in atlas.values()]
         first = replay_order(entries)[: typical + 6]
         assert all(entries[k]["typical"] for k in first[:typical]) and set(found.values()) <= set(first)
 
