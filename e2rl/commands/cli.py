@@ -12,7 +12,7 @@ COMMANDS = {  # module, and what the command does
     "evaluate": ("e2rl.scripts.evaluate", "how often, and how, an ego fails in attacked traffic"),
     "train": ("e2rl.scripts.train", "improve a policy on the failures that are found; train a prior"),
     "tune": ("e2rl.commands.tune", "tune the parameters of an adversary or a planner"),
-    "report": ("e2rl.commands.report", "the page with a replay of every failure of a run"),
+    "report": ("e2rl.report.html", "the page with a replay of every failure of a run"),
     "replay": ("e2rl.commands.replay", "videos and pictures of rollouts of a run"),
     "export": ("e2rl.commands.export", "failures of a run in the format of another tool"),
     "export-policy": ("e2rl.commands.export_policy", "a trained actor as ONNX or TorchScript"),

@@ -1,9 +1,10 @@
-"""The failure report: one HTML file that opens offline, failures.html; and a list for other programs, failures.csv.
+"""`e2rl report RUN_DIR`: the failure report of a run, one HTML file that opens offline, and a list of its failures.
 
 It shows the failure modes, a replay of each failure, the atlas, an index to search, the tables of the run and
 collisions over realism. Everything is inside the file: no script, font or picture is loaded from elsewhere.
 """
 
+import argparse
 import html
 import json
 import os
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from e2rl.evaluation.budget import TRIES_FILE
+from e2rl.evaluation.methods import SEARCH
 from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
 from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, cell, nulls, read_metrics, read_rows
 from e2rl.metrics.atlas import CELL, Cell, by_likelihood, cell_of
@@ -24,6 +26,7 @@ from e2rl.report.answer import of, rate
 from e2rl.report.failure_tracks import replay_data
 from e2rl.report.tables import Table, closed_loop, column_names, metric_tables, mode_tables
 from e2rl.run.config import assigned
+from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, write_atomically
 from e2rl.run.trust import CONFIG, read_yaml
@@ -40,6 +43,7 @@ COLUMNS = (  # of rollouts.csv, in failures.csv and in the page's index and fact
 )
 PLOTTED = ("cfr", "cfr_counted", "real", "real_adv")
 AGAIN = "Drive it again"
+MEASURED = ("before", f"before/{SEARCH}", "after", f"after/{SEARCH}")  # folders of a training
 RATES = ("cfr", "cfr_counted", "cfr_preventable")  # in the page's first lines
 
 
@@ -207,3 +211,27 @@ def replay_order(index: Sequence[Mapping]) -> list[int]:
         return not index[position]["typical"], not likeliest, of_mode[position], position
 
     return sorted(range(len(index)), key=place)
+
+
+def folders_of(run: Path) -> list[Path]:
+    """Returns the folders with rollouts: the run's own, or those of a training; InputError where there are none."""
+    if found := [each for each in (run, *(run / part for part in MEASURED)) if (each / TABLE).is_file()]:
+        return found[:1] if found[0] == run else found
+    mend = "give a run of evaluate.py, which drives what another training made by its checkpoint"
+    raise InputError(f"{run}: no {TABLE}, neither of an evaluation nor measured by a training; {mend}")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(prog="e2rl report", description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path, metavar="RUN_DIR", help="folder of a run of evaluate.py or train.py")
+    parser.add_argument("--replays", type=int, default=REPLAYS, metavar="N", help="at most so many (%(default)s)")
+    parser.add_argument("--method", action="append", default=[], metavar="NAME", help="its failures only; repeatable")
+    parser.add_argument("--out", type=Path, help=f"file to write (default: RUN_DIR/{PAGE})")
+    options = parser.parse_args(arguments)
+    with ending():
+        folders = folders_of(options.run)
+        if (options.out or options.method) and len(folders) > 1:
+            raise InputError(f"{options.run}: a training has {len(folders)} pages; name one, such as {folders[-1]}")
+        for folder in folders:
+            print(write_report(folder, replays=options.replays, methods=options.method, path=options.out))
