@@ -7,12 +7,7 @@ const OTHER = 0;
  * the small groups if any of theirs counts. A mode whose failures nobody holds against the ego says little about it.
  */
 function groupByMode(failures, names) {
-  const members = new Map();
-  for (const failure of failures) {
-    if (!members.has(failure.mode)) members.set(failure.mode, []);
-    members.get(failure.mode).push(failure);
-  }
-  const modes = [...members].map(([mode, ours]) => ({
+  const modes = [...groupBy(failures, ({ mode }) => mode)].map(([mode, ours]) => ({
     mode,
     name: modeName(mode, names),
     failures: ours,
