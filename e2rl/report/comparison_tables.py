@@ -23,7 +23,7 @@ from e2rl.report.tables import (
     mean_cell,
     origin,
 )
-from e2rl.run.files import write_atomically
+from e2rl.run.files import csv_text, write_atomically
 
 METHODS, EGOS = "methods", "egos"  # tables of the catalogue, and names of the files
 Terms = Mapping[str, tuple[str, str]]  # by method: what it knows of the ego and owes it, "" for nothing to say
@@ -108,7 +108,7 @@ def save_compared(folder: Path, tables: Sequence[Table], name: str = METHODS) ->
     write_atomically(folder / f"{name}.md", "\n".join(table.markdown() for table in tables))
     write_atomically(folder / f"{name}.tex", "\n".join(table.latex() for table in tables))
     for table, suffix in zip(tables, ("", "_differences"), strict=False):
-        write_atomically(folder / f"{name}{suffix}.csv", table.csv())
+        write_atomically(folder / f"{name}{suffix}.csv", csv_text([table.head, *table.rows]))
 
 
 # --- egos side by side
