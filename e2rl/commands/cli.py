@@ -23,7 +23,7 @@ COMMANDS = {  # module, and what the command does
     "curves": ("e2rl.report.curves", "failures over realism, of one or several runs"),
     "policy-figure": ("e2rl.report.policy_figure", "what training was worth, of one or several splits"),
     "prior-tables": ("e2rl.commands.prior_tables", "the prior as traffic: open loop, closed loop, meta-metric"),
-    "skeleton": ("e2rl.commands.draw_skeleton", "the figure of risks, skeleton and chain"),
+    "skeleton": ("e2rl.report.skeleton_figure", "the figure of risks, skeleton and chain"),
 }
 EXAMPLES = """examples:
   e2rl evaluate num_scenes=12                    the lane-graph planner on twelve bundled scenes
