@@ -62,4 +62,4 @@ def test_rooms_have_no_cycle():
 def test_learning_can_be_imported_after_an_ego_was_built():
     """TorchRL changes a module class when it is first built: other classes must not copy its attributes."""
     EgoPolicy(IDMEgo(), DrivingEnv(make_scenes(1), SimSettings(), 1, agents=True))
-    assert "Disturbed" in runpy.run_path(str(PACKAGE / "learning" / "driving.py"))
+    assert "PoolDriver" in runpy.run_path(str(PACKAGE / "learning" / "driving.py"))

@@ -34,7 +34,7 @@ COMMANDS = {  # module, and arguments in the folder of the case; {cache}: of sce
     "resume": ("evaluate", "resume=run", "data.cache={cache}"),
     "reproduce": ("evaluate", "reproduce=run", "data.cache={cache}", "hydra.run.dir=out"),
     "merge": ("e2rl.commands.merge", "run", "whole", "--into", "out"),
-    "report": ("e2rl.commands.report", "run"),
+    "report": ("e2rl.report.html", "run"),
     "replay": ("e2rl.commands.replay", "run", "--pixels", "60"),
     "replay of a file": ("e2rl.commands.replay", "{rollout}", "--pixels", "60", "--out", "out"),
     "curves": ("e2rl.report.curves", "run", "whole", "--out", "out"),

@@ -12,7 +12,7 @@ COMMANDS = {  # module, and what the command does
     "evaluate": ("e2rl.scripts.evaluate", "how often, and how, an ego fails in attacked traffic"),
     "train": ("e2rl.scripts.train", "improve a policy on the failures that are found; train a prior"),
     "tune": ("e2rl.commands.tune", "tune the parameters of an adversary or a planner"),
-    "report": ("e2rl.commands.report", "the page with a replay of every failure of a run"),
+    "report": ("e2rl.report.html", "the page with a replay of every failure of a run"),
     "replay": ("e2rl.commands.replay", "videos and pictures of rollouts of a run"),
     "export": ("e2rl.commands.export", "failures of a run in the format of another tool"),
     "export-policy": ("e2rl.commands.export_policy", "a trained actor as ONNX or TorchScript"),
@@ -23,7 +23,7 @@ COMMANDS = {  # module, and what the command does
     "curves": ("e2rl.report.curves", "failures over realism, of one or several runs"),
     "policy-figure": ("e2rl.report.policy_figure", "what training was worth, of one or several splits"),
     "prior-tables": ("e2rl.commands.prior_tables", "the prior as traffic: open loop, closed loop, meta-metric"),
-    "skeleton": ("e2rl.commands.draw_skeleton", "the figure of risks, skeleton and chain"),
+    "skeleton": ("e2rl.report.skeleton_figure", "the figure of risks, skeleton and chain"),
 }
 EXAMPLES = """examples:
   e2rl evaluate num_scenes=12                    the lane-graph planner on twelve bundled scenes

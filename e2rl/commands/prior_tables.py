@@ -11,12 +11,11 @@ import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one lin
 # isort: split
 from dataclasses import dataclass, fields
 
-from e2rl.evaluation.displacement_table import open_loop_rows
 from e2rl.evaluation.meta_table import meta_rows
 from e2rl.evaluation.methods import processes_of
+from e2rl.evaluation.open_loop import open_loop_rows, spread_rows
 from e2rl.evaluation.plan import begin
 from e2rl.evaluation.protocol import Work, drive_all, record
-from e2rl.evaluation.spread_table import spread_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.report.results import write_results
 from e2rl.report.tables import metric_tables, print_tables

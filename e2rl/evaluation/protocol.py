@@ -12,8 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from e2rl.evaluation import rollout_files as files
-from e2rl.evaluation.atlas import ATLAS_FILE, find_atlas
-from e2rl.evaluation.modes import MODES_FILE, find_modes
+from e2rl.evaluation.modes import ATLAS_FILE, MODES_FILE, find_atlas, find_modes
 from e2rl.evaluation.summary import empty_rows, group_of, metric_rows
 from e2rl.metrics.catalogue import SOURCE
 from e2rl.metrics.evasion import add_avoidable

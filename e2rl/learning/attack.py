@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from e2rl.metrics.contact import first_contact
-from e2rl.metrics.evasion import find_evasions
+from e2rl.metrics.evasion import find_evasions, spliced
 from e2rl.planners.ego import Ego
 from e2rl.run.errors import InputError
 from e2rl.run.processes import Processes, in_processes
@@ -59,19 +59,11 @@ def solvable(traffic: Mapping[str, Tensor], scenes: SceneSet, sim: SimSettings) 
             begin = begin.index_fill(0, again, 0)
         solved.entered[hit] = result.found
         shown = (result.found & first["hit"]).nonzero()[:, 0]
-        actions = from_start(dynamics.inverse(states[shown, :, 0]), result.actions[shown], begin[shown])
+        actions = spliced(dynamics.inverse(states[shown, :, 0]), result.actions[shown], begin[shown])
         evasion = dynamics.rollout(states[shown, 0, 0], actions)
         solved.evasion[hit[shown]] = actions
         solved.span[hit[shown]] = acting(evasion, states[shown, 1:, 0], begin[shown], first["stop"][shown])
     return solved
-
-
-def from_start(driven: Tensor, evasion: Tensor, begin: Tensor) -> Tensor:
-    """Actions [S, T, 2]: those driven [S, T, 2] before step begin [S], then those of an evasion [S, T, 2] that begins
-    there."""
-    since = torch.arange(driven.shape[1]) - begin[:, None]
-    late = evasion.gather(1, since.clamp(min=0)[..., None].expand_as(evasion))
-    return torch.where((since >= 0)[..., None], late, driven)
 
 
 def acting(evasion: Tensor, driven: Tensor, begin: Tensor, stop: Tensor) -> Tensor:

@@ -88,7 +88,7 @@ class BanditCurriculum(CurriculumScheduler):
     def observe(self, outcomes: Outcomes) -> None:
         """Forget a fraction of all counts, then count the round's attacks."""
         same = (outcomes.eta[:, None] == self._eta) & (outcomes.template[:, None] == self._template)
-        driven, rate = outcomes.episodes > 0, outcomes.failure_rate.nan_to_num()
+        driven, rate = outcomes.episodes > 0, (outcomes.failures / outcomes.episodes).nan_to_num()
         left_out, told = outcomes.left_out, ~outcomes.survivable.isnan() & self._teacher_tells
         looked_at = told, outcomes.survivable.nan_to_num() * told
         seen = torch.stack([rate * driven, (1 - rate) * driven, ~left_out, left_out, *looked_at]).double()

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from e2rl.evaluation.atlas import ATLAS_FILE, read_atlas
 from e2rl.evaluation.budget import TRIES_FILE, Plan, search_all, write_tries
 from e2rl.evaluation.methods import SEARCH
+from e2rl.evaluation.modes import ATLAS_FILE, read_atlas
 from e2rl.evaluation.protocol import Method, Setup, Work, drive_all, record
 from e2rl.evaluation.rollout_files import METRICS_FILE, read_metrics, write_json
 from e2rl.evaluation.summary import metric_rows
@@ -67,7 +67,7 @@ class BeforeAfter:
         write_tries(folder / TRIES_FILE, tries)
 
     def atlases(self) -> tuple[dict, dict] | None:
-        """The atlas of each stage (`evaluation.atlas.describe`); None without a search."""
+        """The atlas of each stage (`evaluation.modes.group_atlas`); None without a search."""
         if self.search is None:
             return None
         before, after = (read_atlas(self.folder / stage / SEARCH / ATLAS_FILE) for stage in ("before", "after"))

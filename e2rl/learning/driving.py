@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase, tensorclass
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
@@ -97,22 +96,6 @@ def finished_episodes(batches: list[TensorDictBase], adversarial: Tensor, horizo
 Disturbance = Callable[[Tensor, Tensor], Tensor]  # (action [B, 2], step [B]) -> the action [B, 2] executed instead
 
 
-class Disturbed(TensorDictModuleBase):
-    """An ego's policy whose action is disturbed; "intended" [B, 2] is the undisturbed action."""
-
-    def __init__(self, policy: EgoPolicy, disturb: Disturbance | None) -> None:
-        super().__init__()
-        self.policy, self.disturb = policy, disturb
-        self.in_keys, self.out_keys = policy.in_keys, [*policy.out_keys, "intended"]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = self.policy(tensordict)
-        tensordict["intended"] = intended = tensordict["action"]
-        if self.disturb is not None:
-            tensordict["action"] = self.disturb(intended, tensordict["timestep"][:, 0])
-        return tensordict
-
-
 class PoolDriver:
     """Environments in which egos drive rows of pools with recorded or stored traffic."""
 
@@ -128,7 +111,15 @@ class PoolDriver:
         """
         transform = AdversarialSynthesizer(pool, lambda count: rows[:count])
         env = TransformedEnv(self.env, transform)
-        disturbed = Disturbed(EgoPolicy(ego, env), disturb)
+        policy = EgoPolicy(ego, env)
+
+        def disturbed(tensordict: TensorDictBase) -> TensorDictBase:
+            tensordict = policy(tensordict)
+            tensordict["intended"] = intended = tensordict["action"]
+            if disturb is not None:
+                tensordict["action"] = disturb(intended, tensordict["timestep"][:, 0])
+            return tensordict
+
         length = decisions(self.env.horizon, self.env.hold)
         steps = env.rollout(length, disturbed, break_when_any_done=False)
         after, metrics = steps["next"], steps["next", "metrics"]

@@ -42,11 +42,6 @@ class Outcomes:
     failures: Tensor
     survivable: Tensor
 
-    @property
-    def failure_rate(self) -> Tensor:
-        """Failures per episode [S]; NaN without an episode."""
-        return self.failures / self.episodes
-
 
 def outcomes_of(
     eta: Tensor, template: Tensor, drawn: Tensor, row: Tensor, failed: Tensor, survivable: Tensor

@@ -22,6 +22,7 @@ from e2rl.scenes.recording import DT
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.prospects import time_to_contact
 from e2rl.sim.world import World
+from e2rl.traffic.e2.skeleton import first_after
 
 BATCH, GPU_BATCH = 32, 2048  # states that are labelled at once
 
@@ -53,17 +54,11 @@ def critical(data: TensorDictBase, window: float, near: float) -> Tensor:
     `near` s to a contact if the ego goes on. Both in the same episode."""
     metrics, length = data["next", "metrics"], data.shape[1]
     contact = (metrics["contact"] | metrics["contact_vru"])[..., 0]
-    event = _coming(contact | (time_to_contact(data["observation"]) < near))
+    event = first_after(contact | (time_to_contact(data["observation"]) < near))[:, :-1]
     step = data["timestep"][..., 0]
     wait = step.gather(1, event.clamp(max=length - 1)) - step
-    same = (event < length) & (event <= _coming(data["next", "done"][..., 0]))
+    same = (event < length) & (event <= first_after(data["next", "done"][..., 0])[:, :-1])
     return same & (wait * DT <= window)
-
-
-def _coming(flag: Tensor) -> Tensor:
-    """Index [B, T] of the next flag [B, T], this one included; T where there is none."""
-    index = torch.arange(flag.shape[1], device=flag.device)
-    return torch.where(flag, index, flag.shape[1]).flip(1).cummin(1).values.flip(1)
 
 
 class Teacher:

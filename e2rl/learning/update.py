@@ -89,7 +89,8 @@ class Learner:
             self.network.normaliser.observe(data["observation"].to(self.network.device))
         warming = self.updates < settings.critic_warmup
         flat = self._with_advantages(data, 0.0 if warming else settings.advantage_filter)
-        self.optimiser.param_groups[0]["lr"] = rate = self._learning_rate()
+        done = 0.0 if self.total is None else min(self.updates / self.total, 1.0)
+        self.optimiser.param_groups[0]["lr"] = rate = settings.learning_rate * (1 - (1 - settings.final_lr) * done)
         storage, sampler = TensorStorage(flat, device="auto"), SamplerWithoutReplacement()
         minibatches = ReplayBuffer(storage=storage, sampler=sampler, batch_size=settings.minibatch)
         for _ in range(settings.epochs):
@@ -114,10 +115,6 @@ class Learner:
             "learning_rate": rate,
             "frames_used": len(flat) / data.numel(),
         }
-
-    def _learning_rate(self) -> float:
-        done = 0.0 if self.total is None else min(self.updates / self.total, 1.0)
-        return self.settings.learning_rate * (1 - (1 - self.settings.final_lr) * done)
 
     @torch.no_grad()
     def _with_advantages(self, data: TensorDictBase, least: float) -> TensorDict:

@@ -7,21 +7,12 @@ was hit. Only preventable failures enter. A cell keeps the failure that moved th
 
 import math
 from collections.abc import Iterable
-from typing import NamedTuple
 
 from e2rl.metrics.failure_modes import Row, identity, is_failure, word
 
 CELL = ("approach", "partner_manoeuvre", "duty", "speed_band", "contact_type")  # names of a cell's words
 BAND = 5.0  # m/s of the ego, width of a speed band
 Cell = tuple[str, ...]  # values of CELL
-
-
-class Found(NamedTuple):
-    """What an atlas knows of a cell: its likeliest failure, its number of failures, and of scenes that have one."""
-
-    likeliest: Row
-    failures: int
-    scenes: int
 
 
 def cell_of(row: Row) -> Cell | None:
@@ -54,11 +45,11 @@ def number(row: Row, column: str, unknown: float) -> float:
     return unknown if math.isnan(value) else value
 
 
-def atlas_of(rows: Iterable[Row]) -> dict[Cell, Found]:
-    """The atlas of rows of rollouts.csv: what is found in each cell, that of the likeliest failure first. The order of
+def atlas_of(rows: Iterable[Row]) -> dict[Cell, list[Row]]:
+    """The atlas of rows of rollouts.csv: the failures in each cell, the likeliest first, as are the cells. The order of
     the rows does not matter."""
-    members: dict[Cell, list[Row]] = {}
+    found: dict[Cell, list[Row]] = {}
     for row in sorted(rows, key=by_likelihood):
         if (cell := cell_of(row)) is not None:
-            members.setdefault(cell, []).append(row)
-    return {cell: Found(ours[0], len(ours), len({row["scene_id"] for row in ours})) for cell, ours in members.items()}
+            found.setdefault(cell, []).append(row)
+    return found

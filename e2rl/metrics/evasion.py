@@ -209,17 +209,18 @@ def add_avoidable(rows: list[dict], rollouts: Rollouts, scene: TensorDictBase, s
             "avoidable_1s": float(late.found[row]),
             "evasion_accel": peak[row].item(),
         }
-    driven = given[1][:, :, 0]
-    rollouts.evasion[picked[late.found]] = spliced(driven, late.states, moment)[late.found]
-    rollouts.evasion[picked[early.found]] = spliced(driven, early.states, torch.zeros_like(moment))[early.found]
+    start, driven = given[1][:, :1, 0], given[1][:, 1:, 0]
+    for evasion, begin in ((late, moment), (early, torch.zeros_like(moment))):
+        whole = torch.cat([start, spliced(driven, evasion.states, begin)], 1)
+        rollouts.evasion[picked[evasion.found]] = whole[evasion.found]
 
 
-def spliced(driven: Tensor, states: Tensor, moment: Tensor) -> Tensor:
-    """States [B, T+1, 4] `driven` up to the step `moment` [B], then those of an evasion [B, T, 4] from there on."""
-    steps = torch.arange(driven.shape[1], device=driven.device)
-    since = (steps - 1 - moment[:, None]).clamp(min=0)
-    after = states.gather(1, since[..., None].expand(-1, -1, 4))
-    return torch.where((steps > moment[:, None])[..., None], after, driven)
+def spliced(driven: Tensor, evasion: Tensor, moment: Tensor) -> Tensor:
+    """States or actions [B, T, C] of the T steps: those driven [B, T, C] before `moment` [B], then those of an evasion
+    [B, T, C] that begins there."""
+    since = torch.arange(driven.shape[1], device=driven.device) - moment[:, None]
+    after = evasion.gather(1, since.clamp(min=0)[..., None].expand_as(evasion))
+    return torch.where((since >= 0)[..., None], after, driven)
 
 
 def search_effort(steps: int) -> str:

@@ -106,34 +106,27 @@ def off_road_columns(batch: Batch) -> Batch:
     [B], 0 or 1: the ego leaves the road.
 
     Vehicles absent or off the road at step 0 are left out (`aor_left_out` counts the latter). NaN where no vehicle is
-    left or the rollout has no map.
+    left, of the ego where it is left out, or where the rollout has no map.
     """
     states, stop = batch["states"], batch["stop"]
     counted = batch["traffic"] & batch["valid"][:, 0]
+    looked_at = counted.clone()
+    looked_at[:, 0] = True
     steps = torch.arange(states.shape[1], device=states.device)
-    asked = batch["valid"] & counted[:, None] & (steps <= stop[:, None])[..., None]
+    asked = batch["valid"] & looked_at[:, None] & (steps <= stop[:, None])[..., None]
     index = asked.nonzero(as_tuple=True)
     road_here = torch.zeros_like(asked)
     road_here[index] = on_road(states[index][:, :2], index[0], batch)
-    seen = asked & road_here[:, :1] & steps_until(stop, states.shape[1])[..., None]
+    ego_off = (asked & ~road_here)[..., 0]
+    seen = asked & counted[:, None] & road_here[:, :1] & steps_until(stop, states.shape[1])[..., None]
     mapped = has_lines(batch["lane_index"]) | has_lines(batch["drivable_index"])
     number = seen.sum((1, 2)) * mapped
     off = (seen & ~road_here).sum((1, 2)).to(states.dtype)
-    unknown = number == 0
+    unknown, beside = number == 0, ~road_here[:, 0, 0]  # the ego is beside the road, or not there, at the start
     return {
         "aor_step": (off / number.clamp(min=1)).masked_fill(unknown, torch.nan),
         "aor_any": (off > 0).to(states.dtype).masked_fill(unknown, torch.nan),
         "aor_left_out": (counted & ~road_here[:, 0]).sum(-1).to(states.dtype).masked_fill(~mapped, torch.nan),
         "aor_vehicle_steps": number,
-        "ego_off_road": ego_off_road(batch).masked_fill(~mapped, torch.nan),
+        "ego_off_road": ego_off.any(1).to(states.dtype).masked_fill(beside | ~mapped, torch.nan),
     }
-
-
-def ego_off_road(batch: Batch) -> Tensor:
-    """1 where the ego is off the road at some of steps 1..stop, else 0 [B]; NaN where it is so at step 0, too."""
-    states, stop = batch["states"][:, :, 0], batch["stop"]
-    asked = batch["valid"][..., 0] & (torch.arange(states.shape[1], device=states.device) <= stop[:, None])
-    index = asked.nonzero(as_tuple=True)
-    off = torch.zeros_like(asked)
-    off[index] = ~on_road(states[index][:, :2], index[0], batch)
-    return off.any(1).to(states.dtype).masked_fill(off[:, 0] | ~asked[:, 0], torch.nan)

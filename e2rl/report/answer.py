@@ -9,9 +9,8 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from e2rl.evaluation.atlas import ATLAS_FILE
 from e2rl.evaluation.methods import SEARCH
-from e2rl.evaluation.modes import OTHER
+from e2rl.evaluation.modes import ATLAS_FILE, OTHER
 from e2rl.evaluation.rollout_files import ERRORED_FILE
 from e2rl.metrics.atlas import CELL
 from e2rl.metrics.catalogue import METRICS
@@ -75,7 +74,7 @@ def compared_answer(
     Args:
         before: rows of metrics.json of the stage `before`.
         after: rows of the stage `after`, which are paired with those before under the name `before`.
-        atlases: of both stages (`evaluation.atlas.describe`); None: nothing was searched for.
+        atlases: of both stages (`evaluation.modes.group_atlas`); None: nothing was searched for.
         folder: of the run, which holds tables.md.
     """
     earlier = {(row["method"], row["eta"]): row for row in closed_loop(before)}

@@ -26,8 +26,8 @@ from e2rl.metrics.statistics import (
     jackknife,
     ratios,
 )
+from e2rl.report.comparison_tables import searched_table
 from e2rl.report.drawing import new_figure, save_figure, without_formulas
-from e2rl.report.searched_egos import ego_table
 from e2rl.report.tables import Table, save_tables
 from e2rl.run.files import csv_text, write_atomically
 from e2rl.search.tries import TRIES
@@ -269,7 +269,7 @@ def save_budget(
     write_tries(folder / TRIES_FILE, told)
     write_budget(folder / "budget.csv", found)
     tables = budget_tables(found, len(places), knowledge_text(plan.searches))
-    tables += [ego_table(rows, plan.egos)] if len(plan.egos.egos) > 1 else []
+    tables += [searched_table(rows, plan.egos)] if len(plan.egos.egos) > 1 else []
     save_tables(folder / "budget.md", tables)
     save_figure(folder / "budget.png", budget_figure(told, len(places)))
     print("", *budget_lines(found, len(places)), f"all budgets, with intervals: {folder / 'budget.md'}", sep="\n")

@@ -4,19 +4,16 @@ Writes a page with both replays in step, and the pairs as CSV and JSON (docs/how
 """
 
 import argparse
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-from tqdm import tqdm
 
 from e2rl.evaluation.comparison import CHANGES, PAIR, RATES, Driven, compared
 from e2rl.evaluation.rollout_files import cell, own_folder, write_json
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import Row, is_failure, mode_name
 from e2rl.report.answer import FEW, traffic_name, wrapped
-from e2rl.report.failure_tracks import CHANNELS, MAP_QUANTUM, encoded_map, failure_replay
+from e2rl.report.failure_tracks import replay_data
 from e2rl.report.html import ASSETS, COLUMNS, page
 from e2rl.report.tables import difference_cell
 from e2rl.run.endings import ending
@@ -41,9 +38,12 @@ def compare(first: Driven, second: Driven, path: Path) -> list[str]:
     names = [f"{one.ego} of {one.run}" if first.ego == second.ego else one.ego for one in (first, second)]
     rows = [pair | {side: facts(pair[side]) for side in SIDES} for pair in pairs]
     told = [*sentences(groups, first.searched), *notes(first, second, groups)]
-    shown = [pair for pair in pairs if pair["change"] != "same"]
-    about = {"names": names, "runs": [str(first.run), str(second.run)], "groups": groups, "pairs": rows}
-    content = {**about, "told": told, "pairs": rows[: len(shown)], **replays_of((first.run, second.run), shown[:MOST])}
+    changed = [pair for pair in pairs if pair["change"] != "same"]
+    runs = first.run, second.run
+    shown = changed[:MOST] if all((run / ROLLOUTS).is_dir() for run in runs) else []
+    about = {"names": names, "runs": [*map(str, runs)], "groups": groups, "pairs": rows}
+    replays = replay_data(replayed(runs, shown), 2 * len(shown))
+    content = {**about, "told": told, "pairs": rows[: len(changed)], **replays}
     scripts = [*(ASSETS / f"{name}.js" for name in SCRIPTS), FOLDER / "compare.js"]
     write_atomically(path, page(FOLDER / PAGE, " against ".join(names[::-1]), scripts, content))
     write_json(path.with_suffix(".json"), about)
@@ -88,17 +88,11 @@ def notes(first: Driven, second: Driven, groups: Sequence[Mapping]) -> Iterator[
         yield "The runs are of two versions of e2rl: what traffic does, and verdicts, may have changed, too."
 
 
-def replays_of(runs: Sequence[Path], pairs: Sequence[Mapping]) -> dict[str, Any]:
-    """`maps` and `replays` of the data block, two for each pair; none where a run has no files of rollouts."""
-    maps: dict[str, int] = {}
-    replays = []
-    there = all((run / ROLLOUTS).is_dir() for run in runs)
-    for pair in tqdm(pairs if there else [], desc="replays", leave=False, disable=None):
-        both = [Failure.read(run, pair[side]) for run, side in zip(runs, SIDES, strict=True)]
-        for one, other in (both, both[::-1]):
-            number = maps.setdefault(json.dumps(encoded_map(one.rollout)), len(maps))
-            replays.append(failure_replay(one, other) | {"map": number})
-    return {"maps": list(map(json.loads, maps)), "replays": replays, "channels": CHANNELS, "map_quantum": MAP_QUANTUM}
+def replayed(runs: Sequence[Path], pairs: Sequence[Mapping]) -> Iterator[tuple[Failure, Failure]]:
+    """Both rollouts of each pair, each with the other beside it."""
+    for pair in pairs:
+        one, other = (Failure.read(run, pair[side]) for run, side in zip(runs, SIDES, strict=True))
+        yield from ((one, other), (other, one))
 
 
 def main(arguments: list[str] | None = None) -> None:

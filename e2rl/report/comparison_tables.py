@@ -1,11 +1,14 @@
-"""Tables that compare methods or egos: a row each, with their differences to some of them (tables 1 and 4); and whether
-an ego that was trained still drives as it should."""
+"""Tables that compare methods or egos: a row each, with their differences to some of them (tables 1 and 4); in how many
+scenes searches have failed each ego; and whether an ego that was trained still drives as it should."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
+from e2rl.evaluation.budget import EVENTS, scene_rows
+from e2rl.evaluation.ego_set import EgoSet
 from e2rl.metrics.catalogue import METRICS, table_metrics
+from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.report.tables import (
     MEANS,
     PAIRED,
@@ -20,13 +23,18 @@ from e2rl.report.tables import (
     mean_cell,
     origin,
 )
-from e2rl.run.files import write_atomically
+from e2rl.run.files import csv_text, write_atomically
 
 METHODS, EGOS = "methods", "egos"  # tables of the catalogue, and names of the files
 Terms = Mapping[str, tuple[str, str]]  # by method: what it knows of the ego and owes it, "" for nothing to say
 TRAININGS = (
     "An ego of several trainings is their pool: the intervals draw trainings as well as places, with replacement, and "
     "with few trainings are too narrow rather than too wide."
+)
+SEARCHED = (
+    "Scenes with a try that ends in a contact (`cfr`), in one that counts, in a preventable one. Each search of a scene"
+    " counts once. 95% intervals by place and, of several trainings of one policy, by training. Differences are of the"
+    " same scenes; a star: the interval leaves out 0."
 )
 UP, PROGRESS, ROUGHNESS = 0.01, 0.97, 1.25  # fraction of rollouts; of the planner's; of the recorded egos'
 
@@ -100,7 +108,7 @@ def save_compared(folder: Path, tables: Sequence[Table], name: str = METHODS) ->
     write_atomically(folder / f"{name}.md", "\n".join(table.markdown() for table in tables))
     write_atomically(folder / f"{name}.tex", "\n".join(table.latex() for table in tables))
     for table, suffix in zip(tables, ("", "_differences"), strict=False):
-        write_atomically(folder / f"{name}{suffix}.csv", table.csv())
+        write_atomically(folder / f"{name}{suffix}.csv", csv_text([table.head, *table.rows]))
 
 
 # --- egos side by side
@@ -113,6 +121,27 @@ def by_ego(rows: Sequence[dict], names: Sequence[str]) -> tuple[dict[tuple[str, 
         group = [row for row in rows if row["ego"] == name and row.get("stage") is None]
         cells |= {(name, label): row for label, row in zip(column_names(group), group, strict=True)}
     return cells, list(dict.fromkeys(label for _, label in cells))
+
+
+def searched_table(rows: Sequence[Mapping], egos: EgoSet) -> Table:
+    """Returns in how many scenes searches have failed each ego, from the rows of all tries: EVENTS of scenes, and
+    differences to the ego that all are compared with, in points and relative to it.
+
+    Tries of different egos are no pairs, since a search goes on by what it has found; scenes with equal budgets are.
+    """
+    every = scene_rows(rows)
+    others = {first: second for first, second in reversed(egos.pairs)}
+    lines = []
+    for row in egos.metric_rows(every, [NO_SAMPLES] * len(every)):
+        pair = row["paired"].get(f"ego {others.get(row['ego'])}", {})
+        several = f" ({row['n_trainings']} trainings)" if "n_trainings" in row else ""
+        cells = [mean_cell(METRICS[name], row) for name in EVENTS]
+        cells += [difference_cell(METRICS[name], pair.get(name)) for name in EVENTS]
+        lines.append([f"{row['ego']}{several}, {row['method']}", *cells, relative_cell(pair.get(EVENTS[0]))])
+    (reference,) = set(others.values()) or {""}
+    head = ["ego", *(f"{name} [%]" for name in EVENTS), *(f"{name} minus {reference}" for name in EVENTS)]
+    head.append(f"{EVENTS[0]} relative to {reference} [%]")
+    return Table(SEARCHED, head, lines, "Scenes in which each ego fails")
 
 
 def relative_cell(value: dict | None) -> str:

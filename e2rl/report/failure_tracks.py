@@ -7,11 +7,14 @@ Smooth motion has small second differences, whose upper bytes are zero; deflate 
 """
 
 import base64
+import json
 import zlib
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from e2rl.metrics.preventable import AFTER
 from e2rl.report.picture import contact_point
@@ -89,6 +92,17 @@ def failure_replay(failure: Failure, beside: Failure | None = None) -> dict[str,
         "motion": encode(second_difference(quantised(motion, quanta))),
         "plans": encoded_plans(rollout, rows) if rollout.plans is not None else None,
     }
+
+
+def replay_data(pairs: Iterable[tuple[Failure, Failure | None]], count: int) -> dict[str, Any]:
+    """The fields of the data block that hold `count` replays, of failures and what is beside them; scenes share their
+    map."""
+    maps: dict[str, int] = {}
+    replays = []
+    for one, beside in tqdm(pairs, "replays", count, leave=False, disable=None):
+        number = maps.setdefault(json.dumps(encoded_map(one.rollout)), len(maps))
+        replays.append(failure_replay(one, beside) | {"map": number})
+    return {"maps": list(map(json.loads, maps)), "replays": replays, "channels": CHANNELS, "map_quantum": MAP_QUANTUM}
 
 
 def role_of(rollout: Rollout, row: int) -> str:

@@ -1,31 +1,32 @@
-"""The failure report: one HTML file that opens offline, failures.html; and a list for other programs, failures.csv.
+"""`e2rl report RUN_DIR`: the failure report of a run, one HTML file that opens offline, and a list of its failures.
 
 It shows the failure modes, a replay of each failure, the atlas, an index to search, the tables of the run and
 collisions over realism. Everything is inside the file: no script, font or picture is loaded from elsewhere.
 """
 
-import hashlib
+import argparse
 import html
 import json
 import os
+import re
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from e2rl.evaluation.budget import TRIES_FILE
+from e2rl.evaluation.methods import SEARCH
 from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
 from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, cell, nulls, read_metrics, read_rows
 from e2rl.metrics.atlas import CELL, Cell, by_likelihood, cell_of
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.answer import of, rate
-from e2rl.report.failure_tracks import CHANNELS, MAP_QUANTUM, encoded_map, failure_replay
+from e2rl.report.failure_tracks import replay_data
 from e2rl.report.tables import Table, closed_loop, column_names, metric_tables, mode_tables
 from e2rl.run.config import assigned
+from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, write_atomically
 from e2rl.run.trust import CONFIG, read_yaml
@@ -42,6 +43,7 @@ COLUMNS = (  # of rollouts.csv, in failures.csv and in the page's index and fact
 )
 PLOTTED = ("cfr", "cfr_counted", "real", "real_adv")
 AGAIN = "Drive it again"
+MEASURED = ("before", f"before/{SEARCH}", "after", f"after/{SEARCH}")  # folders of a training
 RATES = ("cfr", "cfr_counted", "cfr_preventable")  # in the page's first lines
 
 
@@ -90,17 +92,17 @@ def failure_list(content: Mapping[str, Any], page_name: str) -> str:
     return csv_text([["failure", *COLUMNS, "mode", "link", "again"], *lines])
 
 
-def page(template: Path, title: str, scripts: Sequence[Path], content: Mapping[str, Any]) -> str:
-    """A template filled with a title, the report's style, scripts and a data block."""
+def page(body: Path, title: str, scripts: Sequence[Path], content: Mapping[str, Any]) -> str:
+    """The frame of all pages with a body, the report's style and that beside the body, scripts and a data block."""
+    styles = dict.fromkeys((ASSETS / "page.css", body.with_suffix(".css")))
     parts = {
         "TITLE": html.escape(title),
-        "STYLE": (ASSETS / "page.css").read_text(),
+        "STYLE": "".join(path.read_text() for path in styles),
         "SCRIPT": "\n".join(path.read_text() for path in scripts),
         "DATA": json.dumps(nulls(content), allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
     }
-    before, *rest = template.read_text().split("{{")
-    pieces = (piece.split("}}", 1) for piece in rest)
-    return before + "".join(parts[name] + text for name, text in pieces)
+    whole = (ASSETS / "frame.html").read_text().replace("{{BODY}}\n", body.read_text())
+    return re.sub("{{([A-Z]+)}}", lambda field: parts[field[1]], whole)
 
 
 def page_content(run: Path, metrics: Sequence[dict], modes: Mapping, methods: Sequence[str]) -> dict[str, Any]:
@@ -132,8 +134,6 @@ def page_content(run: Path, metrics: Sequence[dict], modes: Mapping, methods: Se
         "rows": rows,
         "points": [plotted(row) for row in closed_loop(metrics)],
         "about": {metric.name: metric.about for metric in METRICS.values()},
-        "channels": CHANNELS,
-        "map_quantum": MAP_QUANTUM,
     }
 
 
@@ -186,18 +186,11 @@ def plotted(row: Mapping) -> dict[str, Any]:
 
 
 def add_replays(run: Path, rows: Sequence[dict], index: Sequence[dict], count: int) -> dict[str, Any]:
-    """`maps` and `replays` of the data block, for `count` failures; writes the number of its replay into each of
-    `index`. Scenes share their map."""
-    maps: dict[str, dict] = {}
-    replays: list[dict] = []
-    for position in tqdm(replay_order(index)[:count], desc="replays", leave=False, disable=None):
-        shown = Failure.read(run, rows[position])
-        drawn = encoded_map(shown.rollout)
-        key = hashlib.sha256(json.dumps(drawn).encode()).hexdigest()
-        maps.setdefault(key, drawn)
-        index[position]["replay"] = len(replays)
-        replays.append(failure_replay(shown) | {"map": list(maps).index(key)})
-    return {"maps": list(maps.values()), "replays": replays}
+    """`replay_data` of `count` failures; writes the number of its replay into each of `index`."""
+    chosen = replay_order(index)[:count]
+    for number, position in enumerate(chosen):
+        index[position]["replay"] = number
+    return replay_data(((Failure.read(run, rows[position]), None) for position in chosen), len(chosen))
 
 
 def replay_order(index: Sequence[Mapping]) -> list[int]:
@@ -218,3 +211,27 @@ def replay_order(index: Sequence[Mapping]) -> list[int]:
         return not index[position]["typical"], not likeliest, of_mode[position], position
 
     return sorted(range(len(index)), key=place)
+
+
+def folders_of(run: Path) -> list[Path]:
+    """Returns the folders with rollouts: the run's own, or those of a training; InputError where there are none."""
+    if found := [each for each in (run, *(run / part for part in MEASURED)) if (each / TABLE).is_file()]:
+        return found[:1] if found[0] == run else found
+    mend = "give a run of evaluate.py, which drives what another training made by its checkpoint"
+    raise InputError(f"{run}: no {TABLE}, neither of an evaluation nor measured by a training; {mend}")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(prog="e2rl report", description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path, metavar="RUN_DIR", help="folder of a run of evaluate.py or train.py")
+    parser.add_argument("--replays", type=int, default=REPLAYS, metavar="N", help="at most so many (%(default)s)")
+    parser.add_argument("--method", action="append", default=[], metavar="NAME", help="its failures only; repeatable")
+    parser.add_argument("--out", type=Path, help=f"file to write (default: RUN_DIR/{PAGE})")
+    options = parser.parse_args(arguments)
+    with ending():
+        folders = folders_of(options.run)
+        if (options.out or options.method) and len(folders) > 1:
+            raise InputError(f"{options.run}: a training has {len(folders)} pages; name one, such as {folders[-1]}")
+        for folder in folders:
+            print(write_report(folder, replays=options.replays, methods=options.method, path=options.out))

@@ -1,4 +1,4 @@
-"""The skeleton figure: from pairwise risk to an active chain, for one coalition of a real rollout (Sec. IV-A).
+"""`e2rl skeleton`: from pairwise risk to an active chain, for one coalition of a real rollout (Sec. IV-A).
 
 Three panels: the times to collision in the reference rollout, when the links of the coalition weigh most; the risk
 graph at that time; the chain when it was chosen, with the paths that were driven after it.
@@ -21,11 +21,14 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from torch import Tensor
 
-from e2rl.evaluation.protocol import SEEDS_APART, Method
+from e2rl.evaluation.plan import begin
+from e2rl.evaluation.protocol import SEEDS_APART, Method, run_protocol
 from e2rl.report import drawing
-from e2rl.report.drawing import TrafficMap, Trail, add_legend, new_panels
+from e2rl.report.drawing import TrafficMap, Trail, add_legend, new_panels, save_figure
 from e2rl.report.picture import shorten
+from e2rl.run.command import run_command
 from e2rl.run.errors import InputError
+from e2rl.run.run import Run
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.rollout_file import ROLLOUTS, Rollout, rollout_name
 from e2rl.traffic.e2.skeleton import Selection, chain_depth
@@ -252,3 +255,24 @@ def link_risk(selection: Selection) -> Tensor:
     """Sum [B, T'] of the weights between the coalition's members and their targets, at each time."""
     onto = selection.target.clamp(min=0)[:, None, :, None].expand(*selection.weights.shape[:3], 1)
     return (selection.weights.gather(3, onto)[..., 0] * selection.coalition[:, None]).sum(-1)
+
+
+def draw(run: Run) -> None:
+    """Roll out every scene in this process and draw the longest chain selected; with a second method
+    also the longest one of the start under both."""
+    plan = begin(run)
+    chain = LongestChain(plan.methods[0])
+    run_protocol(plan.setup, plan.methods, plan.asked.seeds, run.folder, only=plan.only)
+    where = plan.scenes, plan.setup.ego_name, run.folder
+    figures = {"skeleton": chain.figure(*where)}
+    for other in plan.methods[1:2]:
+        if figure := chain.beside(other, *where):
+            figures["anchoring"] = figure
+    for name, figure in figures.items():
+        save_figure(run.folder / f"{name}.png", figure)
+        print(f"drawn: {run.folder / f'{name}.png'}")
+
+
+def main() -> None:
+    """The command."""
+    run_command("skeleton", draw)

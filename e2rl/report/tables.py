@@ -14,7 +14,7 @@ from tabulate import LATEX_ESCAPE_RULES, tabulate
 
 from e2rl.metrics.catalogue import META_STAGE, METRICS, OPEN_LOOP_STAGE, SPREAD_STAGE, STAGES, Metric, table_metrics
 from e2rl.metrics.failure_modes import LEAST, MANY
-from e2rl.run.files import csv_text, write_atomically
+from e2rl.run.files import write_atomically
 
 UNKNOWN = "–"
 COUNTED = {  # what the count (n) of a stage's cells counts, and how its metrics are computed
@@ -57,10 +57,6 @@ class Table:
         head, *rows = [[cell.replace("|", "&#124;") for cell in line] for line in (self.head, *self.rows)]
         title = f"## {self.title}\n\n" if self.title else ""
         return f"{title}{Table('', head, rows).grid('pipe')}\n\n{self.caption}\n"
-
-    def csv(self) -> str:
-        """Head and rows, without the caption."""
-        return csv_text([self.head, *self.rows])
 
     def latex(self) -> str:
         """A table environment with a tabular of package booktabs."""

@@ -50,18 +50,13 @@ def attempt(
         own = [(tasks[row], why | {"detail": detail}) for row, detail in rows.items()]
         parts, further = attempt(roll_out, others) if others else ([], [])
         return parts, own + further
-    finite = finite_rollouts(rollouts)
-    kept = [task for task, known in zip(tasks, finite, strict=True) if known]
-    why = {"reason": NOT_FINITE, "detail": "", "traceback": ""}
-    errored = [(task, dict(why)) for task, known in zip(tasks, finite, strict=True) if not known]
-    good = rollouts if all(finite) else rollouts[torch.tensor(finite)]
-    return ([(kept, good)] if kept else []), errored
-
-
-def finite_rollouts(rollouts: Batch) -> list[bool]:
-    """Whether all states of agents that are there are finite, by rollout."""
     known = rollouts.get("states").isfinite().all(-1) | ~rollouts.get("valid")
-    return known.flatten(1).all(1).tolist()
+    finite = known.flatten(1).all(1).tolist()
+    kept = [task for task, good in zip(tasks, finite, strict=True) if good]
+    why = {"reason": NOT_FINITE, "detail": "", "traceback": ""}
+    errored = [(task, dict(why)) for task, good in zip(tasks, finite, strict=True) if not good]
+    rest = rollouts if all(finite) else rollouts[torch.tensor(finite)]
+    return ([(kept, rest)] if kept else []), errored
 
 
 def summary_of(errored: Iterable[dict]) -> str:

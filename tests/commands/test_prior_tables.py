@@ -5,9 +5,10 @@ import sys
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from e2rl.commands import draw_skeleton, prior_tables
+from e2rl.commands import prior_tables
 from e2rl.evaluation.rollout_files import read_metrics
 from e2rl.metrics.catalogue import META_STAGE, OPEN_LOOP_STAGE, SPREAD_STAGE, STAGES
+from e2rl.report import skeleton_figure
 from tests.scripts import SHORT
 
 pytestmark = pytest.mark.slow
@@ -48,6 +49,6 @@ def test_the_prior_s_tables_have_rows_of_all_stages(world, tmp_path, monkeypatch
 
 
 def test_the_skeleton_is_drawn(world, tmp_path, monkeypatch, capsys):
-    run(draw_skeleton, tmp_path / "run", world, monkeypatch)
+    run(skeleton_figure, tmp_path / "run", world, monkeypatch)
     drawn = {path.name for path in (tmp_path / "run").glob("*.p*") if path.suffix in (".png", ".pdf")}
     assert drawn == {f"{name}.{suffix}" for name in ("skeleton", "anchoring") for suffix in ("png", "pdf")}

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from e2rl.evaluation.displacement_table import open_loop_rows
+from e2rl.evaluation.open_loop import open_loop_rows
 from e2rl.evaluation.protocol import Method
 from e2rl.metrics.catalogue import OPEN_LOOP_STAGE, STAGES
 from e2rl.metrics.displacement import HORIZONS

@@ -2,9 +2,9 @@
 
 import pytest
 
-from e2rl.evaluation import spread_table
+from e2rl.evaluation import open_loop
+from e2rl.evaluation.open_loop import spread_rows
 from e2rl.evaluation.protocol import Method
-from e2rl.evaluation.spread_table import spread_rows
 from e2rl.metrics.catalogue import SPREAD_STAGE, STAGES
 from e2rl.prior.sde import SamplerSettings
 from e2rl.traffic.nominal import NominalTraffic
@@ -14,7 +14,7 @@ from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
 
 def test_the_prior_alone_has_a_row_and_many_steps_are_their_own_measure(monkeypatch):
-    monkeypatch.setattr(spread_table, "MANY", 6)
+    monkeypatch.setattr(open_loop, "MANY", 6)
     few, many = (NominalTraffic(small_prior(sampler=SamplerSettings(steps=steps))) for steps in (2, 6))
     methods = [Method("cv", ConstantVelocity()), Method("few", few), Method("many", many)]
     rows = spread_rows(scenes(3), [*methods, Method("e2", synthesizer(), 2.0)], 4)

@@ -118,7 +118,6 @@ def test_episodes_count_for_the_attack_whose_row_they_drove():
     assert outcomes.survivable.nan_to_num(-1).tolist() == [0.5, -1.0, 0.25]
     assert outcomes.left_out.tolist() == [False, True, False]
     assert outcomes.episodes.tolist() == [2, 0, 2] and outcomes.failures.tolist() == [1, 0, 2]
-    assert outcomes.failure_rate.nan_to_num(-1).tolist() == [0.5, -1.0, 1.0]
 
 
 def test_the_table_counts_draws_episodes_and_failures_by_arm():

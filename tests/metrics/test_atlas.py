@@ -5,7 +5,7 @@ import random
 
 import pytest
 
-from e2rl.metrics.atlas import CELL, Found, atlas_of, by_likelihood, cell_of
+from e2rl.metrics.atlas import CELL, atlas_of, by_likelihood, cell_of
 from tests.metrics.test_failure_modes import CROSSING, crowd, failure
 
 DUTIES = ("none", "wrong way")
@@ -35,7 +35,7 @@ def test_only_preventable_failures_enter():
     preventable = [row for row in rows if row["cfr_preventable"] == 1]
     atlas = atlas_of(rows)
     assert 0 < len(preventable) < len(rows) and atlas == atlas_of(preventable)
-    assert sum(cell.failures for cell in atlas.values()) == len(preventable)
+    assert sum(map(len, atlas.values())) == len(preventable)
     for value in (0.0, math.nan):
         assert cell_of(found(cfr_preventable=value)) is None
     assert cell_of(failure(CROSSING)) is None  # a run that knows no verdicts
@@ -50,11 +50,11 @@ def test_a_cell_keeps_its_failure_with_the_least_nats_and_counts_all():
         if (cell := cell_of(row)) is not None:
             nats.setdefault(cell, []).append((math.inf if math.isnan(row["transport"]) else row["transport"], row))
     assert set(atlas) == set(nats) and len(atlas) > 20
-    for cell, (likeliest, failures, scenes) in atlas.items():
+    for cell, failures in atlas.items():
         least = min(value for value, _ in nats[cell])
-        assert cell_of(likeliest) == cell and (likeliest["transport"] == least or least == math.inf)
-        assert failures == len(nats[cell]) and scenes == len({row["scene_id"] for _, row in nats[cell]})
-    order = [by_likelihood(cell.likeliest) for cell in atlas.values()]
+        assert cell_of(failures[0]) == cell and (failures[0]["transport"] == least or least == math.inf)
+        assert len(failures) == len(nats[cell]) and all(row in failures for _, row in nats[cell])
+    order = [by_likelihood(failures[0]) for failures in atlas.values()]
     assert order == sorted(order)  # the cells, too, by likelihood
 
 
@@ -79,7 +79,7 @@ def test_ties_go_to_the_realism_then_to_scene_and_seed():
     ]
     for start in range(len(rows)):  # each is the likeliest of those after it
         left = rows[start:]
-        assert atlas_of(left[::-1]) == {cell_of(rows[0]): Found(left[0], len(left), len({r["scene_id"] for r in left}))}
+        assert atlas_of(left[::-1]) == {cell_of(rows[0]): left}
 
 
 @pytest.mark.parametrize(

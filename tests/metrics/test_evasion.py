@@ -112,10 +112,10 @@ def test_a_collision_has_an_evasion_that_touches_nobody_and_a_clean_rollout_has_
 
 
 def test_an_evasion_from_a_moment_on_follows_what_was_driven_until_then():
-    driven, after = torch.zeros(3, 11, 4), torch.arange(1, 11.0)[None, :, None].expand(3, -1, 4)
+    driven, after = torch.zeros(3, 10, 4), torch.arange(1, 11.0)[None, :, None].expand(3, -1, 4)
     found = spliced(driven, after, torch.tensor([0, 4, 10]))[..., 0]
-    assert found[0].tolist() == list(range(11))
-    assert found[1].tolist() == [0] * 5 + [1, 2, 3, 4, 5, 6] and found[2].tolist() == [0] * 11
+    assert found[0].tolist() == list(range(1, 11))
+    assert found[1].tolist() == [0] * 4 + [1, 2, 3, 4, 5, 6] and found[2].tolist() == [0] * 10
 
 
 def test_the_late_search_begins_a_second_before_the_contact_and_is_enough(monkeypatch):

@@ -7,11 +7,12 @@ from functools import reduce
 
 import pytest
 
-from e2rl.commands import export, merge, replay, report
+from e2rl.commands import export, merge, replay
 from e2rl.evaluation.modes import MODES_FILE
 from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, read_rows, write_rows
 from e2rl.evaluation.tuning import TUNING_FILE
 from e2rl.report import curves
+from e2rl.report import html as report
 from e2rl.report.curriculum_figure import CHOICES, draw_choices
 from e2rl.run.errors import InputError
 from e2rl.run.run import PROVENANCE

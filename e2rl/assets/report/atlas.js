@@ -7,13 +7,8 @@ const SHADES = [55, 5]; // % of the accent in a button's colour: fewest nats, mo
  * of its failures is its likeliest.
  */
 function groupByCell(failures, cells) {
-  const members = new Map();
   const placed = failures.filter(({ cell }) => cell !== null).sort((first, second) => first.rank - second.rank);
-  for (const failure of placed) {
-    if (!members.has(failure.cell)) members.set(failure.cell, []);
-    members.get(failure.cell).push(failure);
-  }
-  return [...members].map(([cell, ours]) => ({
+  return [...groupBy(placed, ({ cell }) => cell)].map(([cell, ours]) => ({
     ...cells[cell],
     cell,
     failures: ours,

@@ -131,9 +131,7 @@ class Index {
 
   /** The rows with a heading for each scene, which says in which traffic it fails. */
   byScene(found) {
-    const scenes = new Map(found.map(({ scene_id: scene }) => [scene, []]));
-    for (const failure of found) scenes.get(failure.scene_id).push(failure);
-    return [...scenes].flatMap(([scene, ours]) => {
+    return [...groupBy(found, ({ scene_id: scene }) => scene)].flatMap(([scene, ours]) => {
       const text = `${scene}: ${plural(ours.length, "failure")} in ${[...new Set(ours.map(trafficOf))].join(", ")}`;
       const head = element("th", { colspan: COLUMNS.length, scope: "rowgroup" }, element("span", {}, text));
       return [element("tr", { class: "scene" }, head), ...ours.map((failure) => this.rows.get(failure))];

@@ -7,12 +7,7 @@ const OTHER = 0;
  * the small groups if any of theirs counts. A mode whose failures nobody holds against the ego says little about it.
  */
 function groupByMode(failures, names) {
-  const members = new Map();
-  for (const failure of failures) {
-    if (!members.has(failure.mode)) members.set(failure.mode, []);
-    members.get(failure.mode).push(failure);
-  }
-  const modes = [...members].map(([mode, ours]) => ({
+  const modes = [...groupBy(failures, ({ mode }) => mode)].map(([mode, ours]) => ({
     mode,
     name: modeName(mode, names),
     failures: ours,
@@ -59,13 +54,12 @@ function showModes(container, modes, total, store, choose) {
 
 function modeText({ name, failures, counted }, total) {
   const [what, duty] = name.split(": ");
-  const fraction = failures.length / total;
   const bars = [
     element("i", { class: "counts", style: `width: ${(100 * counted) / total}%` }),
     element("i", { style: `width: ${(100 * (failures.length - counted)) / total}%` }),
   ];
-  const facts = [`${percent(fraction)}, ${failures.length} failure${failures.length === 1 ? "" : "s"}`];
-  if (meanOf(failures, "counted") !== null) facts.push(counted ? `${counted} count` : "none counts");
+  const facts = [`${Math.round(100 * (failures.length / total))}%, ${plural(failures.length, "failure")}`];
+  if (failures.some((failure) => failure.counted !== null)) facts.push(counted ? `${counted} count` : "none counts");
   return element(
     "span",
     {},
@@ -89,10 +83,4 @@ function repaintModes(container, modes) {
   modes.forEach(({ found }, index) => found && drawTypical(pictures[index], found));
 }
 
-function meanOf(failures, column) {
-  const known = failures.map((failure) => failure[column]).filter((value) => value !== null);
-  return known.length ? known.reduce((sum, value) => sum + value, 0) / known.length : null;
-}
-
-const percent = (fraction) => `${Math.round(100 * fraction)}%`;
 const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);

@@ -7,22 +7,6 @@ const LAYER_NAMES = {
   evasion: "evasion found by search",
   recorded: "ego as recorded",
 };
-const PARTS = [
-  "scene",
-  "clock",
-  "badge",
-  "absent",
-  "scrubber",
-  "play",
-  "rate",
-  "layers",
-  "curves",
-  "verdict",
-  "scale",
-  "contact-mark",
-  "failure-title",
-  "failure-facts",
-]; // of the page
 const PLAY_ICON = "M1.5 0v10l8-5z",
   PAUSE_ICON = "M1 0h3v10h-3zM6 0h3v10h-3z";
 const NEAREST_VIEW = 15,
@@ -32,7 +16,7 @@ class Player {
   /** store: of decoded replays and maps; step(direction): go to another failure. */
   constructor(store, step) {
     this.store = store;
-    this.node = Object.fromEntries(PARTS.map((id) => [id, document.getElementById(id)]));
+    this.node = Object.fromEntries([...document.querySelectorAll("[id]")].map((node) => [node.id, node]));
     this.shown = new Set(["driver", "plans", "aims"]);
     Object.assign(this, { replay: null, time: 0, playing: false, metres: 60 });
     this.palette = readPalette();

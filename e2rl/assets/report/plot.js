@@ -14,6 +14,13 @@ function filled(node, attributes, children) {
   return node;
 }
 
+/** Items by their key, a Map in the order in which keys appear. */
+function groupBy(items, keyOf) {
+  const groups = new Map(items.map((item) => [keyOf(item), []]));
+  for (const item of items) groups.get(keyOf(item)).push(item);
+  return groups;
+}
+
 /** A number with one decimal, or a dash where it is unknown. */
 const fixed = (value) => (value === null ? "–" : value.toFixed(1));
 

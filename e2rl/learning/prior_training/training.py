@@ -67,11 +67,6 @@ class TrainingSettings:
             raise InputError("stage.starts=[]: expected frame numbers, e.g. [10,30,50]")
         object.__setattr__(self, "starts", tuple(sorted(set(self.starts))))
 
-    @property
-    def turns(self) -> int:
-        """Validations of the whole training."""
-        return -(-self.steps // self.validate_every)
-
 
 class PriorTraining(Supervised):
     """The training of a prior: a turn is `validate_every` steps and a validation of the averaged weights.
@@ -301,7 +296,8 @@ def train_prior(
     windows, test = window_sets(scenes)
     run = PriorTraining(prior, windows, test, settings, processes)
     run.routes = scenes.batch((~held_out(scenes)).nonzero()[:, 0])
-    best = run.fit("prior", settings.turns, parts, vars(settings), logger)
+    validations = -(-settings.steps // settings.validate_every)
+    best = run.fit("prior", validations, parts, vars(settings), logger)
     if not processes.leader:
         return None
     results = {

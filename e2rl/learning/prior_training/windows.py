@@ -12,6 +12,7 @@ from e2rl.prior.routes import RoutedScene, route_scene
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import project
 from e2rl.sim.dynamics import wrap
+from e2rl.traffic.e2.motion import take
 
 OFFSETS = (0, 5, 10, 15)  # frames after a scene's start frame at which a window begins
 ROWS = 16  # vehicles of a window: the modelled ones nearest to the ego
@@ -85,13 +86,8 @@ def _window(
     distance = (logged[:, :vehicles, :2] - logged[:, :1, :2]).norm(dim=-1)
     distance[:, 0] = -1e6  # the ego comes first
     order = (distance + 1e3 * ~use + 1e4 * ~here).argsort(1)[:, :ROWS]
-
-    def take(value: Tensor) -> Tensor:
-        index = order.reshape(*order.shape, *[1] * (value.ndim - 2))
-        return value.gather(1, index.expand(*order.shape, *value.shape[2:]))
-
-    pairs = take(take(edge_features(routed, state)).transpose(1, 2)).transpose(1, 2)
-    window = {key: take(value) for key, value in columns.items()} | {"pairs": pairs, "causal": estimated}
+    pairs = take(take(edge_features(routed, state), order).transpose(1, 2), order).transpose(1, 2)
+    window = {key: take(value, order) for key, value in columns.items()} | {"pairs": pairs, "causal": estimated}
     return TensorDict(window, batch_size=[len(logged)])
 
 

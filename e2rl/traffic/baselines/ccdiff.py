@@ -15,7 +15,7 @@ from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 from e2rl.traffic.baselines.baseline import BaselineState, replay_others
-from e2rl.traffic.baselines.guidance import Loss, MeanGuided
+from e2rl.traffic.baselines.guidance import MeanGuided
 from e2rl.traffic.baselines.losses import discounts, disk_overlap, off_road_term, pair_term
 from e2rl.traffic.baselines.view import View
 from e2rl.traffic.e2.motion import direction, smallest
@@ -132,15 +132,10 @@ class CCDiff(MeanGuided):
         """The top vehicles."""
         return state.top & view.active
 
-    def loss(self, state: CCDiffState, view: View) -> Loss:
+    def loss(self, motion: LaneState, state: CCDiffState, view: View) -> Tensor:
         """Minus the collision cost with the ego, and metres off the road."""
-        others = torch.ones_like(view.routed.conflict)
+        states, others = view.with_ego(motion), torch.ones_like(view.routed.conflict)
         others[:, :, 0] = False
-
-        def value(motion: LaneState) -> Tensor:
-            states = view.with_ego(motion)
-            weights = torch.full_like(discounts(states), 1 / states.shape[-2])
-            near = pair_term(states, view, disk_overlap(self.margin), self.margin, weights, others)
-            return self.off_road * off_road_term(states, view, discounts(states)) - self.collision * near
-
-        return value
+        weights = torch.full_like(discounts(states), 1 / states.shape[-2])
+        near = pair_term(states, view, disk_overlap(self.margin), self.margin, weights, others)
+        return self.off_road * off_road_term(states, view, discounts(states)) - self.collision * near

@@ -10,7 +10,7 @@ from torch import Tensor
 from e2rl.prior.lane_relative import LaneState
 from e2rl.run.settings import configured, setting
 from e2rl.traffic.baselines.baseline import BaselineState
-from e2rl.traffic.baselines.guidance import Loss, MeanGuided
+from e2rl.traffic.baselines.guidance import MeanGuided
 from e2rl.traffic.baselines.losses import (
     approach_term,
     discounts,
@@ -44,17 +44,13 @@ class CTG(MeanGuided):
         """No vehicle."""
         return view.active & False
 
-    def loss(self, state: BaselineState, view: View) -> Loss:
+    def loss(self, motion: LaneState, state: BaselineState, view: View) -> Tensor:
         """Weighted collision, off-road and speeding terms."""
-
-        def value(motion: LaneState) -> Tensor:
-            states = view.with_ego(motion)
-            weights = discounts(states)
-            total = self.collision * pair_term(states, view, disk_overlap(self.margin), self.margin, weights)
-            total = total + self.off_road * off_road_term(states, view, weights)
-            return total + self.speed * speeding_term(motion, view)
-
-        return value
+        states = view.with_ego(motion)
+        weights = discounts(states)
+        total = self.collision * pair_term(states, view, disk_overlap(self.margin), self.margin, weights)
+        total = total + self.off_road * off_road_term(states, view, weights)
+        return total + self.speed * speeding_term(motion, view)
 
 
 @configured("synthesizer/ctg_adv")
@@ -68,16 +64,12 @@ class CTGAdv(MeanGuided):
 
     tuned = {"gain": (0.05, 4.0, "log"), "step_size": (0.03, 3.0, "log")}
 
-    def loss(self, state: BaselineState, view: View) -> Loss:
+    def loss(self, motion: LaneState, state: BaselineState, view: View) -> Tensor:
         """Soft-min distance to the ego, and metres off the road."""
-
-        def value(motion: LaneState) -> Tensor:
-            states = view.with_ego(motion)
-            near = approach_term(states, self.temperature)
-            return self.approach * near + self.off_road * off_road_term(states, view, discounts(states))
-
-        return value
+        states = view.with_ego(motion)
+        near = approach_term(states, self.temperature)
+        return self.approach * near + self.off_road * off_road_term(states, view, discounts(states))
 
     def chosen(self, motion: LaneState, state: BaselineState, view: View, guided: Tensor) -> Tensor:
         """Sample [B] in which some vehicle comes nearest to the ego."""
-        return self.loss(state, view)(motion).masked_fill(~guided, float("inf")).amin(-1).argmin(0)
+        return self.loss(motion, state, view).masked_fill(~guided, float("inf")).amin(-1).argmin(0)

@@ -1,6 +1,7 @@
 """DiffScene (Xu et al. 2025): one adversary, generated once by three objectives and driven open loop."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -9,7 +10,7 @@ from e2rl.prior.lane_relative import LaneState
 from e2rl.prior.prior import Context
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.route import project
-from e2rl.traffic.baselines.guidance import CleanGuidance, Loss
+from e2rl.traffic.baselines.guidance import CleanGuidance
 from e2rl.traffic.baselines.losses import approach_term, comfort_term, off_road_term, off_route_term, speeding_term
 from e2rl.traffic.baselines.open_loop import OpenLoop, OpenLoopState, Scenario
 from e2rl.traffic.baselines.view import View, folded, motion_of, pick, tiled
@@ -39,27 +40,23 @@ class DiffScene(OpenLoop):
         """The guided joint sample of least loss; the adversary alone is held."""
         view, count = View.of(now.world, context, now.ego_plan), now.noise.shape[3]
         adversary = smallest(view.active, view.distance_to_ego(), 1) & (self.strength(now.state) > 0)[:, None]
-        loss, many = self.loss(now.state, view, adversary), tiled(context, count)
+        loss = partial(self.loss, state=now.state, view=view, adversary=adversary)
         control = CleanGuidance(self.prior, loss, adversary.repeat(count, 1), count, self.step_size, self.clip)
+        many = tiled(context, count)
         sample = self.prior.sample(many, folded(now.noise), control)
         index = loss(motion_of(self.prior, sample.x0, many, count)).sum(-1).argmin(0)
         x0, kl = (pick(value.unflatten(0, (count, -1)), index) for value in (sample.x0, sample.kl))
         return Scenario(x0, adversary, adversary, kl)
 
-    def loss(self, state: OpenLoopState, view: View, adversary: Tensor) -> Loss:
+    def loss(self, motion: LaneState, state: OpenLoopState, view: View, adversary: Tensor) -> Tensor:
         """The three objectives of the adversary [B, V]; 0 for others."""
-        strength = self.strength(state)[:, None]
-
-        def value(motion: LaneState) -> Tensor:
-            states = view.with_ego(motion)
-            attack = self.safety * approach_term(states, self.temperature)
-            attack = attack + self.functionality * corridor_term(states, view, adversary)
-            even = torch.full_like(states[0, 0, 0, :, 0], 1 / states.shape[-2])
-            lawful = off_route_term(motion, view) + comfort_term(motion, LOW, HIGH, JERK)
-            lawful = lawful + off_road_term(states, view, even) + speeding_term(motion, view)
-            return (strength * attack + self.constraint * lawful) * adversary
-
-        return value
+        states = view.with_ego(motion)
+        attack = self.safety * approach_term(states, self.temperature)
+        attack = attack + self.functionality * corridor_term(states, view, adversary)
+        even = torch.full_like(states[0, 0, 0, :, 0], 1 / states.shape[-2])
+        lawful = off_route_term(motion, view) + comfort_term(motion, LOW, HIGH, JERK)
+        lawful = lawful + off_road_term(states, view, even) + speeding_term(motion, view)
+        return (self.strength(state)[:, None] * attack + self.constraint * lawful) * adversary
 
 
 def corridor_term(states: Tensor, view: View, adversary: Tensor) -> Tensor:

@@ -119,8 +119,8 @@ class Guided(Baseline):
         adversary = self.attackers(state, view) & acts[:, None]
         state = replace(state, adversary=adversary)
         guided = (context.active if self.guides_everybody else adversary) & acts[:, None]
-        control = self.guidance(self.loss(state, view), guided.repeat(count, 1), self.strength(state).repeat(count))
-        many = tiled(context, count)
+        loss, many = partial(self.loss, state=state, view=view), tiled(context, count)
+        control = self.guidance(loss, guided.repeat(count, 1), self.strength(state).repeat(count))
         sample = self.prior.sample(many, folded(now.noise), control)
         motion = motion_of(self.prior, sample.x0, many, count)
         index = self.chosen(motion, state, view, guided)
@@ -130,15 +130,15 @@ class Guided(Baseline):
 
     def chosen(self, motion: LaneState, state: State, view: View, guided: Tensor) -> Tensor:
         """Sample [B] of each scene that is driven: that of least loss over the guided vehicles."""
-        return torch.where(guided, self.loss(state, view)(motion), 0.0).sum(-1).argmin(0)
+        return torch.where(guided, self.loss(motion, state, view), 0.0).sum(-1).argmin(0)
 
     def attackers(self, state: State, view: View) -> Tensor:
         """Bool [B, V]: vehicles under adversarial control, all that the prior moves by default."""
         return view.active
 
     @abstractmethod
-    def loss(self, state: State, view: View) -> Loss:
-        """The loss of a replan."""
+    def loss(self, motion: LaneState, state: State, view: View) -> Tensor:
+        """The loss of a replan (`Loss`)."""
 
     @abstractmethod
     def guidance(self, loss: Loss, guided: Tensor, strength: Tensor) -> Control:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from e2rl.metrics.geometry import velocity
 from e2rl.prior.lane_relative import LaneState
 from e2rl.scenes.boxes import corners, to_frame
 from e2rl.scenes.drivable_area import off_road
@@ -105,9 +106,8 @@ def approach_term(states: Tensor, temperature: float) -> Tensor:
 
 def ttc_term(states: Tensor) -> Tensor:
     """Minus the time-to-collision cost with the ego, mean over time (Safe-Sim, with the closest point of approach)."""
-    velocity = states[..., 3:] * direction(states[..., 2])
-    ego = states[:, :, :1]
-    return -closest_approach_cost(ego[..., :2] - states[..., :2], velocity[:, :, :1] - velocity).mean(-1)
+    moving = velocity(states)
+    return -closest_approach_cost(states[:, :, :1, :, :2] - states[..., :2], moving[:, :, :1] - moving).mean(-1)
 
 
 def off_route_term(motion: LaneState, view: View) -> Tensor:

@@ -44,17 +44,12 @@ class SafeSimOpt(Guided):
         distance = view.distance_to_ego()
         return smallest(distance <= self.reach, distance, self.adversaries)
 
-    def loss(self, state: BaselineState, view: View) -> Loss:
+    def loss(self, motion: LaneState, state: BaselineState, view: View) -> Tensor:
         """Route and Gaussian terms of all; collision and TTC terms of adversaries, by the strength."""
-        strength, meets = self.strength(state)[:, None] * state.adversary, in_conflict(view)
-
-        def value(motion: LaneState) -> Tensor:
-            states = view.with_ego(motion)
-            calm = self.route * off_route_term(motion, view) + self.gaussian * self._overlap(states, view, state)
-            attack = self.collision * collision_term(states) * meets + self.ttc * ttc_term(states)
-            return calm + strength * attack
-
-        return value
+        states, strength = view.with_ego(motion), self.strength(state)[:, None] * state.adversary
+        calm = self.route * off_route_term(motion, view) + self.gaussian * self._overlap(states, view, state)
+        attack = self.collision * collision_term(states) * in_conflict(view) + self.ttc * ttc_term(states)
+        return calm + strength * attack
 
     def _overlap(self, states: Tensor, view: View, state: BaselineState) -> Tensor:
         """Gaussian collision term [S, B, V] over the first GAUSSIAN_TIME; adversaries may come near the ego."""

@@ -64,7 +64,7 @@ class Strive(OpenLoop):
         first, acts = now.noise[0, :, :, 0].contiguous(), self.strength(now.state) > 0
         x0, view = self.attacked(first, now, context)
         motion = motion_of(self.prior, x0, context, 1)
-        weight = attacker_weight(view.with_ego(motion), view)
+        weight = softmin(view.with_ego(motion), view).sum(-1)  # of each vehicle
         attacker = torch.nn.functional.one_hot(weight.argmax(-1), weight.shape[1]).bool()
         holds = acts & (weight.sum(-1) > 0)
         if self.solution:
@@ -173,8 +173,3 @@ def softmin(states: Tensor, view: View) -> Tensor:
         counts = (ahead.any(-1) & view.active)[..., None] & late
         weight = torch.softmax(-distance.masked_fill(~counts, NOBODY).flatten(1), -1).view_as(distance)
         return weight * counts
-
-
-def attacker_weight(states: Tensor, view: View) -> Tensor:
-    """Fraction [B, V] of `softmin` that each vehicle has."""
-    return softmin(states, view).sum(-1)

@@ -52,13 +52,7 @@ class View:
 
 def tiled(context: Context, count: int) -> Context:
     """The Context of scenes [B] `count` times along the batch, [count * B]."""
-    if count == 1:
-        return context
-
-    def tile(value: Tensor) -> Tensor:
-        return value.repeat(count, *[1] * (value.ndim - 1))
-
-    return mapped(context, tile)
+    return context if count == 1 else mapped(context, lambda value: value.repeat(count, *[1] * (value.ndim - 1)))
 
 
 def folded(noise: Tensor) -> Tensor:

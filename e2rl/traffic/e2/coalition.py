@@ -1,7 +1,4 @@
-"""Whom the attack controls, and what they aim at: coalitions in scenes (docs/method.md, sections 5 to 8).
-
-When a coalition is due: reference rollout, topology, feasibility, skeleton. At every replan: proposals for its members.
-"""
+"""Whom the attack controls, and what they aim at: coalitions in scenes (docs/method.md, sections 5 to 8)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace

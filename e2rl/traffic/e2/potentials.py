@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from e2rl.metrics.geometry import velocity
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import to_frame
 from e2rl.scenes.drivable_area import off_road
@@ -96,10 +97,6 @@ def annealed_temperature(noise_level: Tensor | float, settings: PotentialSetting
 def _length(vector: Tensor) -> Tensor:
     """Length [...] of vector [..., 2] with a finite gradient (0) at 0."""
     return (vector.square().sum(-1) + 1e-6).sqrt() - 1e-3
-
-
-def _velocity(states: Tensor) -> Tensor:
-    return states[..., 3:] * direction(states[..., 2])
 
 
 def box_gap(states: Tensor, size: Tensor, other: Tensor, other_size: Tensor, disks: int = DISKS) -> Tensor:
@@ -209,7 +206,7 @@ def adversarial_potential(
     states = _with_ego(states, context)
     index = context.target.clamp(min=0)
     target = states.detach().gather(1, index[..., None, None].expand_as(states))
-    offset, closing = target[..., :2] - states[..., :2], _velocity(target) - _velocity(states)
+    offset, closing = target[..., :2] - states[..., :2], velocity(target) - velocity(states)
     distance = _length(offset)
     temperature = settings.narrow if temperature is None else temperature
     nearest = -temperature * (torch.logsumexp(-distance / temperature, -1) - math.log(distance.shape[-1]))

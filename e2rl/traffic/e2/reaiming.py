@@ -6,7 +6,7 @@ limits of an interception (`InterceptionSettings`). It knows of the ego, and owe
 predicts it from its present motion, and yields by the same rules (`responsibility`, `prior.bounds`).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -132,36 +132,6 @@ def braking_for(world: World, aim: Arc, motion: Arc, duty: Duty, bounds: BoundSe
     return meeting_braking(meeting, speed[:, None], length, duty)[:, 0]
 
 
-@dataclass(frozen=True)
-class Law:
-    """How vehicles re-aim: what they owe, limits of the aims, how late they yield, bounds of their braking."""
-
-    responsibility: str
-    limits: InterceptionSettings = field(default_factory=InterceptionSettings)
-    yielding: YieldingSettings = field(default_factory=YieldingSettings)
-    bounds: BoundSettings = field(default_factory=BoundSettings)
-
-    def __call__(self, world: World, eta: Tensor, shift: Tensor, ground: Ground, reckless: Tensor) -> Arc:
-        """The Arc of K vehicles in their `surroundings` at intensities eta [K].
-
-        shift [K, 2]: m by which they misjudge the ego's place; reckless [K] bool: those that owe it nothing. Without an
-        aim they halve their curvature and brake gently.
-        """
-        states, length = world.states[:, 1], world.scene["size"][..., 0]
-        motion = Arc(world.accel, curvature_of(world.turn_rate, world.states[..., 3]))
-        its_motion = Arc(*(value[:, 0] for value in motion))
-        expected, _ = along_arc(world.states[:, 0], its_motion, moments(states), HOLD, TURN)
-        expected = expected + torch.nn.functional.pad(shift, (0, 2))[:, None]
-        aim = best_aim(states, expected, length[:, 0] + length[:, 1], eta, ground, self.limits)
-        none = aim.accel.isnan()
-        aim = Arc(aim.accel.masked_fill(none, -UNAIMED), torch.where(none, motion.curvature[:, 1] / 2, aim.curvature))
-        itself = torch.tensor([[False, True]], device=eta.device).expand(len(eta), -1)
-        duty = duty_of(self.responsibility, self.yielding, world, itself, eta)
-        duty = Duty(duty.exempt[:, 1:] | reckless[:, None], duty.yields[:, 1:], duty.patience[:, 1:])
-        braking = braking_for(world, aim, motion, duty, self.bounds)
-        return aim._replace(accel=torch.minimum(aim.accel, (-braking).clamp(min=self.bounds.floor)))
-
-
 NEAR, MOVING = 50.0, 1.0  # m from the ego and m/s: other vehicles that may react
 LATEST = 0.6  # fraction of the episode in which vehicles begin to react
 MOST = 2  # vehicles that react in an episode
@@ -251,7 +221,7 @@ class Reaiming:
 
     def __init__(self, settings: ReactSettings, seed: int = 0) -> None:
         self.settings, self.generator = settings, torch.Generator().manual_seed(seed)
-        self.law = Law(settings.responsibility)
+        self.limits, self.yielding, self.bounds = InterceptionSettings(), YieldingSettings(), BoundSettings()
         self._part: TensorDict | None = None  # [B] `drawn`
 
     def begin(
@@ -275,7 +245,7 @@ class Reaiming:
         assert part is not None
         due = ~part["chosen"] & (part["start"] <= world.step)
         if bool(due.any()):
-            vehicle, acts = chosen(part, world, self.law.responsibility)
+            vehicle, acts = chosen(part, world, self.settings.responsibility)
             part["vehicle"] = torch.where(due[:, None], vehicle, part["vehicle"])
             part["acts"] = part["acts"] | (acts & due[:, None])
             part["chosen"] = part["chosen"] | due
@@ -285,7 +255,27 @@ class Reaiming:
         agents = part["vehicle"][row, slot]
         shift = self.settings.scatter * torch.randn(len(row), 2, generator=self.generator).to(row.device)
         ground, seen = Ground(world.scene["field"], world.scene["field_origin"], row), surroundings(world, row, agents)
-        aim = self.law(seen, part["eta"][row], shift, ground, part["reckless"][row])
+        aim = self.aims(seen, part["eta"][row], shift, ground, part["reckless"][row])
         times = DT * torch.arange(1, 2 * REPLAN_STEPS + 1, device=row.device)
         states, _ = along_arc(seen.states[:, 1], aim, times)
         return row, agents, states
+
+    def aims(self, world: World, eta: Tensor, shift: Tensor, ground: Ground, reckless: Tensor) -> Arc:
+        """The Arc of K vehicles in their `surroundings` at intensities eta [K].
+
+        shift [K, 2]: m by which they misjudge the ego's place; reckless [K] bool: those that owe it nothing. Without an
+        aim they halve their curvature and brake gently.
+        """
+        states, length = world.states[:, 1], world.scene["size"][..., 0]
+        motion = Arc(world.accel, curvature_of(world.turn_rate, world.states[..., 3]))
+        its_motion = Arc(*(value[:, 0] for value in motion))
+        expected, _ = along_arc(world.states[:, 0], its_motion, moments(states), HOLD, TURN)
+        expected = expected + torch.nn.functional.pad(shift, (0, 2))[:, None]
+        aim = best_aim(states, expected, length[:, 0] + length[:, 1], eta, ground, self.limits)
+        none = aim.accel.isnan()
+        aim = Arc(aim.accel.masked_fill(none, -UNAIMED), torch.where(none, motion.curvature[:, 1] / 2, aim.curvature))
+        itself = torch.tensor([[False, True]], device=eta.device).expand(len(eta), -1)
+        duty = duty_of(self.settings.responsibility, self.yielding, world, itself, eta)
+        duty = Duty(duty.exempt[:, 1:] | reckless[:, None], duty.yields[:, 1:], duty.patience[:, 1:])
+        braking = braking_for(world, aim, motion, duty, self.bounds)
+        return aim._replace(accel=torch.minimum(aim.accel, (-braking).clamp(min=self.bounds.floor)))

@@ -130,11 +130,11 @@ def influence(
     return by_slot & (present[:, :, None] & there[:, None] & ~itself)[..., None]
 
 
-def _first_after(link: Tensor) -> Tensor:
-    """Index [..., K + 1] of the first true of link [..., K] at or after each index; K for none."""
-    count = link.shape[-1]
-    steps = torch.arange(count, device=link.device).expand_as(link)
-    when = torch.where(link, steps, count).flip(-1).cummin(-1).values.flip(-1)
+def first_after(flag: Tensor) -> Tensor:
+    """Index [..., K + 1] of the first true of flag [..., K] at or after each index; K for none."""
+    count = flag.shape[-1]
+    steps = torch.arange(count, device=flag.device).expand_as(flag)
+    when = torch.where(flag, steps, count).flip(-1).cummin(-1).values.flip(-1)
     return torch.cat([when, torch.full_like(when[..., :1], count)], -1)
 
 
@@ -142,7 +142,7 @@ def _shortest_chain(
     after: Tensor, start: Tensor, near: Tensor, blocked: Tensor, links: int
 ) -> tuple[Tensor, Tensor, list[Tensor]]:
     """Fewest links [B] (0 none) from slot start [B] to a near slot that can still act on the ego, each no earlier than
-    the last; that slot [B]; each layer's predecessors [B, M]. after: of _first_after; blocked: slots not to pass.
+    the last; that slot [B]; each layer's predecessors [B, M]. after: of `first_after`; blocked: slots not to pass.
 
     Breadth-first by the earliest arrival at every slot, since departing later never arrives earlier.
     """
@@ -217,7 +217,7 @@ def build_skeleton(
     distant &= ~_on_ego_lanes(torch.cat([states[:, :1], take(states, index)], 1), distant, scene)
     far = smallest(distant, -take(distance, index), most_far)
     linked = present & far.any(1, keepdim=True)  # no far agent, no chain to look for
-    after = _first_after(influence(scene, world, (index, linked), expected, settings))
+    after = first_after(influence(scene, world, (index, linked), expected, settings))
     slot_target, viable = _link_chains(after, present & take(near, index), far, settings.max_chain - 1)
     vehicle = torch.cat([index, torch.zeros_like(index[:, :1])], 1)  # of each slot; the last is the ego
     target = torch.full_like(support, -1, dtype=torch.int64)

@@ -1,5 +1,7 @@
 """Guidance: the posterior mean moves as far as it is said to, masked rows not at all, and the loss falls."""
 
+from functools import partial
+
 import pytest
 import torch
 
@@ -22,7 +24,7 @@ def test_the_mean_of_a_step_moves_by_adam_s_step_within_the_limit():
     on, state, view, context, x, level, low = control_inputs()
     guided, limit = context.active.clone(), torch.tensor([0.05, 10.0])
     guided[1, 1] = False
-    control = MeanGuidance(on.prior, on.loss(state, view), guided, limit, 1, 0.3, 1)
+    control = MeanGuidance(on.prior, partial(on.loss, state=state, view=view), guided, limit, 1, 0.3, 1)
     _, nominal, x0 = control(x, level, 3, context, lambda value: on.prior.denoise(value, level, context))
 
     def mean(clean):
@@ -38,7 +40,7 @@ def test_the_mean_of_a_step_moves_by_adam_s_step_within_the_limit():
 
 def test_the_last_step_of_mean_guidance_is_free():
     on, state, view, context, x, level, _ = control_inputs()
-    control = MeanGuidance(on.prior, on.loss(state, view), context.active, torch.ones(2), 1, 0.3, 1)
+    control = MeanGuidance(on.prior, partial(on.loss, state=state, view=view), context.active, torch.ones(2), 1, 0.3, 1)
     _, nominal, x0 = control(x, level, 1, context, lambda value: on.prior.denoise(value, level, context))
     assert torch.equal(nominal, x0)
 
@@ -47,7 +49,7 @@ def test_clean_guidance_is_clipped_and_leaves_masked_rows_alone():
     on, state, view, context, x, level, _ = control_inputs()
     guided = context.active.clone()
     guided[:, 1] = False
-    control = CleanGuidance(on.prior, on.loss(state, view), guided, 1, 1e6, 0.25)
+    control = CleanGuidance(on.prior, partial(on.loss, state=state, view=view), guided, 1, 1e6, 0.25)
     _, nominal, x0 = control(x, level, 3, context, lambda value: on.prior.denoise(value, level, context))
     shift = (x0 - nominal).abs()
     assert (shift[~guided] == 0).all() and shift.max().item() == pytest.approx(0.25, rel=1e-4)
@@ -78,7 +80,8 @@ def test_guidance_lowers_the_loss_of_bundled_scenes(name, bundled):
     (now, context), view = first_replan(on, scene)
     state, x0 = on.attack(now, context)
     nominal = prior.sample(context, now.noise[..., 0, :].contiguous()).x0
-    loss = on.loss(state, view, state.adversary) if name == "diffscene" else on.loss(state, view)
+    given = {"adversary": state.adversary} if name == "diffscene" else {}
+    loss = partial(on.loss, state=state, view=view, **given)
     values = [loss(motion_of(prior, value, context, 1)) for value in (x0, nominal)]
     guided = state.adversary if on.adversarial else context.active
     after, before = (torch.where(guided, value[0], 0.0).sum() for value in values)

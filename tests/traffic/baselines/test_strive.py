@@ -6,9 +6,9 @@ import torch
 
 from e2rl.prior.sde import SamplerSettings
 from e2rl.sim.world import World
-from e2rl.traffic.baselines.strive import attacker_weight, blend, decode_latent
+from e2rl.traffic.baselines.strive import blend, decode_latent, softmin
 from e2rl.traffic.baselines.view import motion_of
-from e2rl.traffic.reaction import Lookahead
+from e2rl.traffic.transform import Lookahead
 from tests.prior.small import small_prior
 from tests.traffic.baselines.attacks import baseline, first_replan
 from tests.traffic.e2.traffic_scenes import EGO, begin, scenes
@@ -51,10 +51,10 @@ def test_nobody_behind_the_ego_is_the_attacker():
     on = baseline("strive")
     _, view = first_replan(on, scenes(1).scenes)
     states = view.states[None, :, :, None].repeat(1, 1, 1, 10, 1)
-    weight = attacker_weight(states, view)[0]
+    weight = softmin(states, view)[0].sum(-1)
     assert weight[3] == 0 and weight.argmax() == 2  # 20 m behind; 10 m ahead in the next lane
     assert abs(weight.sum().item() - 1) < 1e-4
-    alone = attacker_weight(states, replace(view, active=view.active & False))
+    alone = softmin(states, replace(view, active=view.active & False))
     assert (alone == 0).all()
     torch.testing.assert_close(blend((1.0, 0.1), torch.tensor([0.0, 0.5, 1.0])), torch.tensor([1.0, 0.55, 0.1]))
 

@@ -1,6 +1,7 @@
 """Vehicles that leave replayed traffic: who, from when on, what stays as it was, and that seeds decide."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,17 +15,7 @@ from e2rl.sim import dynamics
 from e2rl.sim.dynamics import Arc, along_arc
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.traffic.e2.interception import MAX_CURVATURE, InterceptionSettings
-from e2rl.traffic.e2.reaiming import (
-    LATEST,
-    Ground,
-    Law,
-    ReactSettings,
-    Reaiming,
-    best_aim,
-    drawn,
-    moments,
-    surroundings,
-)
+from e2rl.traffic.e2.reaiming import LATEST, Ground, ReactSettings, Reaiming, best_aim, drawn, moments, surroundings
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import FULL, PAIR, SINGLE
 from e2rl.traffic.transform import AdversarialSynthesizer
@@ -110,6 +101,10 @@ def test_the_attack_s_intensity_template_and_duty_may_say_how_they_react():
 STILL, LAWFUL = torch.zeros(1, 2), torch.tensor([False])
 
 
+def law(responsibility):
+    return Reaiming(replace(EVERYBODY, responsibility=responsibility)).aims
+
+
 def ground_of(world):
     return Ground(torch.full_like(world.scene["field"], -5.0), world.scene["field_origin"], torch.tensor([0]))
 
@@ -122,7 +117,7 @@ def seen_by(vehicles):
 
 def aimed(vehicles, eta=2.0, responsibility="none", shift=STILL):
     seen, ground = seen_by(vehicles)
-    return seen, Law(responsibility)(seen, torch.tensor([eta]), shift, ground, LAWFUL)
+    return seen, law(responsibility)(seen, torch.tensor([eta]), shift, ground, LAWFUL)
 
 
 @pytest.mark.parametrize("distance, speed", [(30.0, 8.0), (12.0, 4.0), (45.0, 10.0), (20.0, 0.0)])
@@ -157,9 +152,9 @@ def test_aims_keep_the_limits_at_every_intensity():
 def test_it_aims_where_the_ego_is_expected_by_its_motion():
     """To the left of a turning ego's way straight on; and the nearer the misjudged place, the more to that side."""
     seen, ground = seen_by([(0, 0, 0, 8.0), (40, 0, math.pi, 8.0)])
-    straight = Law("none")(seen, torch.tensor([2.0]), STILL, ground, LAWFUL)
+    straight = law("none")(seen, torch.tensor([2.0]), STILL, ground, LAWFUL)
     seen.turn_rate[:, 0] = 0.2
-    turning = Law("none")(seen, torch.tensor([2.0]), STILL, ground, LAWFUL)
+    turning = law("none")(seen, torch.tensor([2.0]), STILL, ground, LAWFUL)
     assert straight.curvature.abs() < 1e-3 and turning.curvature < -1e-2
     _, misjudged = aimed([(0, 0, 0, 8.0), (40, 0, math.pi, 8.0)], shift=torch.tensor([[0.0, 2.0]]))
     assert -0.05 < misjudged.curvature < -1e-3
@@ -171,7 +166,7 @@ def test_without_a_drivable_aim_it_unwinds_its_curvature_and_brakes_gently():
     seen.turn_rate[:, 1] = 0.8
     column, row = (seen.states[0, 1, :2] - ground.origin[0]).round().long()
     ground.field.fill_(5.0)[:, column - 1 : column + 2, row - 1 : row + 2] = -1.0
-    aim = Law("none")(seen, torch.tensor([2.0]), STILL, ground, LAWFUL)
+    aim = law("none")(seen, torch.tensor([2.0]), STILL, ground, LAWFUL)
     assert aim.curvature.item() == pytest.approx(0.05) and aim.accel.item() == pytest.approx(-1.0)
     _, away = aimed([(0, 0, 0, 5.0), (10, 0, 0, 20.0)], eta=0.1)
     assert away.accel.item() <= 0
@@ -179,9 +174,9 @@ def test_without_a_drivable_aim_it_unwinds_its_curvature_and_brakes_gently():
 
 def test_only_paths_on_the_drivable_area_are_taken():
     seen, ground = seen_by([(0, 20, 0, 5.0), (-20, 0, 0, 8.0)])
-    free = Law("none")(seen, torch.tensor([2.0]), STILL, ground, LAWFUL)
+    free = law("none")(seen, torch.tensor([2.0]), STILL, ground, LAWFUL)
     ground.field[:] = (torch.arange(ground.field.shape[-1]) + ground.origin[0, 1] - 3.0).clamp(-5, 5)
-    kerb = Law("none")(seen, torch.tensor([2.0]), STILL, ground, LAWFUL)
+    kerb = law("none")(seen, torch.tensor([2.0]), STILL, ground, LAWFUL)
     assert free.curvature > 0.01
     end = along_arc(seen.states[:, 1], kerb, torch.tensor([2.0]))[0]
     assert end[0, 0, 1] < 3.6
@@ -190,10 +185,10 @@ def test_only_paths_on_the_drivable_area_are_taken():
 def followed_for(seconds, responsibility, vehicles):
     """Whether vehicle 1, re-aiming every 0.5 s, touches an ego that keeps its velocity."""
     world = make_world(vehicles)
-    law, generator, touched = Law(responsibility), torch.Generator().manual_seed(0), False
+    aims, generator, touched = law(responsibility), torch.Generator().manual_seed(0), False
     for _ in range(round(seconds / 0.5)):
         seen = surroundings(world, torch.tensor([0]), torch.tensor([1]))
-        aim = law(seen, torch.tensor([3.0]), 0.7 * torch.randn(1, 2, generator=generator), ground_of(world), LAWFUL)
+        aim = aims(seen, torch.tensor([3.0]), 0.7 * torch.randn(1, 2, generator=generator), ground_of(world), LAWFUL)
         states = world.states.clone()
         path, _ = along_arc(states[:, 1], aim, DT * torch.arange(1, 6))
         still = Arc(torch.zeros(1), torch.zeros(1))
@@ -216,9 +211,9 @@ def test_from_behind_it_hits_a_steady_ego_without_responsibility_and_never_with_
 
 def test_a_reckless_vehicle_owes_the_ego_nothing_whatever_the_law():
     (seen, ground), eta, reckless = seen_by([(0, 0, 0, 9.0), (-12, 0, 0, 14.0)]), torch.tensor([3.0]), ~LAWFUL
-    free, lawful = (Law(name)(seen, eta, STILL, ground, LAWFUL) for name in ("none", "full"))
-    assert Law("full")(seen, eta, STILL, ground, reckless) == free
-    assert Law("full")(seen, eta, STILL, ground, ~reckless) == lawful and lawful.accel < free.accel
+    free, lawful = (law(name)(seen, eta, STILL, ground, LAWFUL) for name in ("none", "full"))
+    assert law("full")(seen, eta, STILL, ground, reckless) == free
+    assert law("full")(seen, eta, STILL, ground, ~reckless) == lawful and lawful.accel < free.accel
 
 
 def test_ahead_it_gives_way_late_but_in_time_under_full_responsibility():

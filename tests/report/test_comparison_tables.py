@@ -2,8 +2,9 @@
 
 import pytest
 
+from e2rl.evaluation.budget import scene_rows
 from e2rl.evaluation.ego_set import EgoSet
-from e2rl.report.searched_egos import ego_table, scene_rows
+from e2rl.report.comparison_tables import searched_table
 from e2rl.search.tries import TRIES
 
 TRAINED, OTHERS = ["a_0", "a_1"], ["b_0", "b_1"]
@@ -34,7 +35,7 @@ def test_trainings_are_pooled_and_compared_by_scene():
     """Policy a fails in 12 and 18 of 60 scenes, policy b in 30 in both of its trainings."""
     rows = tries("a_0", set(range(12))) + tries("a_1", set(range(18)))
     rows += tries("b_0", set(range(30))) + tries("b_1", set(range(30)))
-    table = ego_table(rows, EGOS)
+    table = searched_table(rows, EGOS)
     lines = {line[0]: line[1:] for line in table.rows}
     ours, theirs = (lines[f"{name} (2 trainings), search"] for name in ("a", "b"))
     assert ours[0].split()[0] == "25.0" and theirs[0].split()[0] == "50.0" and ours[3].split()[0] == "-25.0"
@@ -47,6 +48,6 @@ def test_trainings_are_pooled_and_compared_by_scene():
 @pytest.mark.parametrize("pairs", [[], [("a_0", "b_0"), ("a_0", "b_1")]])
 def test_egos_may_be_compared_with_none_or_with_the_first(pairs):
     rows = tries("a_0", {1}) + tries("b_0", {1}) + tries("b_1", set())
-    table = ego_table(rows, EgoSet({}, ["a_0", "b_0", "b_1"], pairs))
+    table = searched_table(rows, EgoSet({}, ["a_0", "b_0", "b_1"], pairs))
     assert [line[0] for line in table.rows] == ["a_0, search", "b_0, search", "b_1, search"]
     assert (table.rows[0][4] == "–") == (not pairs)
