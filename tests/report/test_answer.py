@@ -56,7 +56,7 @@ def test_methods_stand_by_what_they_find_and_egos_by_how_little():
     lines = answer_lines([row("e2", 2.0, ego, cfr=cfr) for ego, cfr in (("idm", 0.5), ("actor", 0.25))])
     assert [line.split()[0] for line in lines if " of 12)" in line] == ["actor", "idm"]
     lines = answer_lines([row(), row("a", 1.0), row("b", 1.0)])
-    assert lines[0].startswith("lane_graph does not fail, not even in the traffic of a η=1: hit in 0 of 12 rollouts")
+    assert lines[0].startswith("lane_graph does not fail, not even in the traffic of a η=1: hit in 0 of 12")
     contacts = row("b", 2.0, cfr=0.5)
     contacts["metrics"] |= dict.fromkeys(("cfr_preventable", "cfr_clean", "cfr_counted"), value(0.0))
     lines = answer_lines([row(), row("a", 1.0), contacts])
