@@ -19,17 +19,17 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
     path = Path(config.docs_dir) / NOTEBOOK
     notebook = json.loads(path.read_text())
     if config.extra["execute"]:
-        notebook = executed(notebook, path.parent)
+        notebook = executed(path)
     files.append(File.generated(config, PAGE, content=page(notebook)))
 
 
-def executed(notebook: dict, folder: Path) -> dict:
-    """The notebook with the outputs of its cells, run in a folder."""
+def executed(path: Path) -> dict:
+    """The notebook with the outputs of its cells, run in its folder."""
     import nbformat  # of the extra test, as nbclient is
     from nbclient import NotebookClient
 
-    node = nbformat.from_dict(notebook)
-    NotebookClient(node, timeout=600, resources={"metadata": {"path": str(folder)}}).execute()
+    node = nbformat.read(path, as_version=4)
+    NotebookClient(node, timeout=600, resources={"metadata": {"path": str(path.parent)}}).execute()
     return node
 
 
