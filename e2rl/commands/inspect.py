@@ -68,6 +68,8 @@ def report(source: Source, rows: Sequence[Row], contents: Sequence[Counts]) -> l
         f"left out     {sum(reasons.values())}",
         *(f"             {count} x {reason}" for reason, count in reasons.most_common()),
     ]
+    repairs = sum((row.repairs for row in rows), Counter())
+    lines += [f"mended       {count} {phrase}" for phrase, count in repairs.most_common()]
     if contents:
         about = "of the agents that take part, those present at the start frame"
         lines.append(f"in a scene   median (least to most); {about}")

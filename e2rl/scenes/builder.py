@@ -1,5 +1,6 @@
 """From a Recording to a Scene: who takes part, from which start state, on which routes, on which map."""
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,11 +49,15 @@ def build_scene(recording: Recording, settings: BuildSettings) -> TensorDict:
 
 
 class SceneBuilder:
-    """The scenes of one log from any start frames: what does not depend on these is computed once."""
+    """The scenes of one log from any start frames: what does not depend on these is computed once.
+
+    repairs: what was mended or left out of its tracks and map, by a phrase in the plural.
+    """
 
     def __init__(self, recording: Recording, settings: BuildSettings) -> None:
         """Raises InputError for what `build_scene` does, the start frame apart."""
         recording.validate_log()
+        self.repairs = Counter(recording.repairs)
         check(extent(recording) | motion(recording), recording.scene_id)
         self.valid = drop_jumps(recording.states, recording.valid)
         self.valid[:, recording.ego] = recording.valid[:, recording.ego]  # without the ego there is no scene

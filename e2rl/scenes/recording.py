@@ -1,5 +1,6 @@
 """What a source yields: one recorded or generated piece of traffic with its map, on the host, in numpy."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -52,7 +53,8 @@ class Recording:
 
     states [F, A, 4]: x, y [m], heading [rad], speed [m/s]; valid [F, A]; size [A, 2]: length, width [m];
     agent_type [A]; ego: index of the ego's track; lights: lane id -> [F] light state; drivable: polygons [P, 2];
-    current: the start frame, with at least one frame of history before it; None where the log names none.
+    current: the start frame, with at least one frame of history before it; None where the log names none;
+    repairs: how often reading mended something, by a phrase in the plural, such as "headings turned round".
     """
 
     scene_id: str
@@ -67,6 +69,7 @@ class Recording:
     drivable: list[np.ndarray] = field(default_factory=list)
     lights: dict[str, np.ndarray] = field(default_factory=dict)
     current: int | None = HISTORY
+    repairs: Counter[str] = field(default_factory=Counter)
 
     def windows(self, starts: Sequence[int] | None, steps: int) -> Iterator["Recording"]:
         """Yields the recordings of `steps` simulated steps that this log makes, with ids of the form `id@start`.

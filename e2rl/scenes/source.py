@@ -9,7 +9,7 @@ import hashlib
 import json
 import sys
 from abc import ABC, abstractmethod
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
@@ -45,13 +45,17 @@ NO_MATTER = "path", "cache", "cache_gb", "workers"  # settings that do not chang
 
 
 class Row(NamedTuple):
-    """What one recording made: a scene's arrays, or the reason why there is none."""
+    """What one recording made: a scene's arrays, or the reason why there is none.
+
+    repairs: what was mended in its tracks and map; they stand with the first recording of a log alone.
+    """
 
     scene_id: str
     location: str = ""
     dataset: str = ""
     scene: dict[str, np.ndarray] | None = None
     reason: str = ""
+    repairs: Counter[str] = Counter()  # never changed in place
 
 
 def default_of(key: str, file: str = "data/source", **rule: Any) -> Any:
@@ -189,6 +193,8 @@ class Source(Extension, ABC):
             row = Row(window.scene_id, window.location, window.dataset)
             try:
                 builder = builder or SceneBuilder(window, self.build)
+                if window is windows[0]:
+                    row = row._replace(repairs=builder.repairs)
                 scene = builder.scene(window)
                 validate(scene, window.scene_id)
             except InputError as error:
